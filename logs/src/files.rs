@@ -1,0 +1,84 @@
+//! Which files make a log: the data, and the description beside it.
+
+use std::path::{Path, PathBuf};
+
+use crate::LogError;
+
+/// How the data is stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Format {
+    Csv,
+    CsvGz,
+    Parquet,
+}
+
+/// The two files of a log.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Files {
+    pub data: PathBuf,
+    pub format: Format,
+    pub meta: PathBuf,
+}
+
+const ENDINGS: [(&str, Format); 3] = [(".parquet", Format::Parquet), (".csv", Format::Csv), (".csv.gz", Format::CsvGz)];
+
+impl Files {
+    /// Finds the files of a log from its folder or its data file.
+    pub fn find(path: &Path) -> Result<Files, LogError> {
+        let data = if path.is_dir() { data_file_in(path)? } else { path.to_owned() };
+        if !data.is_file() {
+            return Err(LogError::NoData { path: path.into() });
+        }
+        let (stem, format) = split(&data).ok_or_else(|| LogError::UnknownFormat { file: data.clone() })?;
+        let [wanted, other] = meta_names(stem).map(|name| data.with_file_name(name));
+        let meta = [&wanted, &other].into_iter().find(|meta| meta.is_file()).cloned();
+        let Some(meta) = meta else { return Err(LogError::NoMeta { data, wanted }) };
+        Ok(Files { data, format, meta })
+    }
+
+    /// Chooses the files to write from a data file's name or a folder's.
+    pub fn choose(path: &Path) -> Result<Files, LogError> {
+        if let Some((stem, format)) = split(path) {
+            let [meta, _] = meta_names(stem);
+            return Ok(Files { data: path.to_owned(), format, meta: path.with_file_name(meta) });
+        }
+        let mut found = data_files_in(path);
+        found.retain(|name| name != "data.parquet");
+        if !found.is_empty() {
+            found.push("data.parquet".to_owned());
+            return Err(LogError::SeveralDataFiles { folder: path.into(), found });
+        }
+        Ok(Files { data: path.join("data.parquet"), format: Format::Parquet, meta: path.join("meta.json") })
+    }
+}
+
+/// A data file's name without its ending, and its format.
+fn split(path: &Path) -> Option<(&str, Format)> {
+    let name = path.file_name()?.to_str()?;
+    ENDINGS.iter().find_map(|(ending, format)| {
+        let stem = name.strip_suffix(ending)?;
+        (!stem.is_empty()).then_some((stem, *format))
+    })
+}
+
+/// The names of a data file's description: the one that is written, then the other that is accepted.
+///
+/// `meta.json` belongs to `data.*`. Another stem has its own, so that several logs fit into one folder.
+fn meta_names(stem: &str) -> [String; 2] {
+    let (shared, own) = ("meta.json".to_owned(), format!("{stem}.json"));
+    if stem == "data" { [shared, own] } else { [own, shared] }
+}
+
+fn data_file_in(folder: &Path) -> Result<PathBuf, LogError> {
+    let found = data_files_in(folder);
+    match found.as_slice() {
+        [] => Err(LogError::NoData { path: folder.into() }),
+        [name] => Ok(folder.join(name)),
+        _ => Err(LogError::SeveralDataFiles { folder: folder.into(), found }),
+    }
+}
+
+fn data_files_in(folder: &Path) -> Vec<String> {
+    let names = ENDINGS.iter().map(|(ending, _)| format!("data{ending}"));
+    names.filter(|name| folder.join(name).is_file()).collect()
+}

@@ -1,0 +1,140 @@
+//! The seams below an environment: who steps the robots, and who turns commands into torque.
+
+use crate::{Command, PerJoint, Placement, RobotModel, RobotStates};
+
+/// Many robots that are commanded and observed together: a simulator, a replayed log or the real robot.
+pub trait Backend: Send {
+    /// The full state of one robot; restoring it continues bit for bit as if nothing had happened.
+    type Snapshot: Clone + Send;
+
+    /// Number of robots.
+    fn num_robots(&self) -> usize {
+        self.states().q.len()
+    }
+
+    /// The nominal robot.
+    fn robot(&self) -> &RobotModel;
+
+    /// States after the last [`Backend::reset`] or [`Backend::step`].
+    fn states(&self) -> &RobotStates;
+
+    /// Puts robots down anew; each pair is a robot's index and its place.
+    fn reset(&mut self, placements: &[(usize, Placement)]) -> Result<(), BackendError>;
+
+    /// Advances every robot that is `active` by `drive_periods` periods of the drive under its command.
+    ///
+    /// `commands` and `active` have one entry a robot. The others stay as they are.
+    fn step(&mut self, commands: &[Command], active: &[bool], drive_periods: usize) -> Result<(), BackendError>;
+
+    /// The full state of `robot`.
+    fn snapshot(&self, robot: usize) -> Self::Snapshot;
+
+    /// Puts `robot` back into the state of `snapshot`.
+    fn restore(&mut self, robot: usize, snapshot: &Self::Snapshot);
+}
+
+/// The drives of many robots: turns commands and measured states into joint torque, once a drive period.
+///
+/// Batch first, so that a learned drive serves all robots with one forward pass.
+pub trait Actuator: Send {
+    /// Writes the torque of each joint [N·m] into `tau`, for every robot that is `active`.
+    fn torques(&mut self, commands: &[Command], active: &[bool], states: &RobotStates, tau: &mut [PerJoint]);
+
+    /// Forgets what the drive remembers of `robot`.
+    fn reset(&mut self, robot: usize);
+}
+
+/// The ideal drive: PD on the sampled state plus feed-forward, clipped to the joint's torque limit.
+#[derive(Clone, Debug)]
+pub struct PdDrive {
+    torque_limits: PerJoint,
+}
+
+impl PdDrive {
+    /// The ideal drive of `robot`.
+    pub fn new(robot: &RobotModel) -> Self {
+        Self { torque_limits: robot.torque_limits() }
+    }
+}
+
+impl Actuator for PdDrive {
+    fn torques(&mut self, commands: &[Command], active: &[bool], states: &RobotStates, tau: &mut [PerJoint]) {
+        for (robot, command) in commands.iter().enumerate().filter(|(robot, _)| active[*robot]) {
+            let (q, dq) = (&states.q[robot], &states.dq[robot]);
+            tau[robot] = std::array::from_fn(|j| {
+                let torque =
+                    command.kp[j] * (command.q[j] - q[j]) + command.kd[j] * (command.dq[j] - dq[j]) + command.tau_ff[j];
+                torque.clamp(-self.torque_limits[j], self.torque_limits[j])
+            });
+        }
+    }
+
+    fn reset(&mut self, _robot: usize) {}
+}
+
+/// Why a backend could not do what it was asked.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum BackendError {
+    /// An argument has the wrong number of entries.
+    #[error("`{field}` has {given} entries, but there are {wanted} robots")]
+    WrongLength {
+        /// The argument.
+        field: &'static str,
+        /// How many entries it has.
+        given: usize,
+        /// How many it must have.
+        wanted: usize,
+    },
+    /// A robot index is too large.
+    #[error("robot {robot} does not exist; there are {num_robots}")]
+    NoSuchRobot {
+        /// The index that was asked for.
+        robot: usize,
+        /// The number of robots.
+        num_robots: usize,
+    },
+    /// The simulation of some robots gave numbers that are not finite; the others were stepped.
+    #[error("the simulation of robot {robot} diverged: `{quantity}` is not finite ({more} more); place it anew")]
+    Diverged {
+        /// The first robot that diverged.
+        robot: usize,
+        /// Its first quantity that is not finite.
+        quantity: &'static str,
+        /// How many other robots diverged in the same step.
+        more: usize,
+    },
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::{NUM_JOINTS, go2};
+
+    proptest! {
+        #[test]
+        fn ideal_drive_is_pd_within_the_limits(target in -4.0f32..4.0, q in -3.0f32..3.0, dq in -20.0f32..20.0) {
+            let robot = go2();
+            let mut states = RobotStates::new(1);
+            states.q[0] = [q; NUM_JOINTS];
+            states.dq[0] = [dq; NUM_JOINTS];
+            let mut tau = [[0.0; NUM_JOINTS]];
+            PdDrive::new(&robot).torques(&[Command::hold([target; NUM_JOINTS], 30.0, 0.75)], &[true], &states, &mut tau);
+            for (torque, joint) in tau[0].iter().zip(&robot.joints) {
+                let limit = joint.torque_limit as f32;
+                let expected = (30.0 * (target - q) - 0.75 * dq).clamp(-limit, limit);
+                prop_assert!((torque - expected).abs() < 1e-4);
+            }
+        }
+    }
+
+    #[test]
+    fn inactive_robot_keeps_its_torque() {
+        let mut tau = [[1.0; NUM_JOINTS]; 2];
+        let command = Command::hold([1.0; NUM_JOINTS], 30.0, 0.75);
+        PdDrive::new(&go2()).torques(&[command; 2], &[false, true], &RobotStates::new(2), &mut tau);
+        assert_eq!(tau[0], [1.0; NUM_JOINTS]);
+        assert_ne!(tau[1], [1.0; NUM_JOINTS]);
+    }
+}

@@ -1,0 +1,37 @@
+//! The core that every Twinstep crate shares.
+//!
+//! A handful of types carries everything:
+//!
+//! - [`Joint`] and its one order; [`RobotModel`] and [`go2`], the nominal robot with the source of each number.
+//! - [`Command`], [`RobotStates`] and [`Placement`]: what a robot is told, found doing, and how it is put down.
+//! - [`Backend`]: many robots that are commanded and observed together (simulator, replayed log, real robot).
+//! - [`Actuator`]: the drives between command and torque. Effects of reality and learned drives enter here.
+//! - [`VecEnv`]: many environments that are reset and stepped together, in process or over a network, and
+//!   [`EnvSpec`], what a client must know of them.
+//! - [`stream`]: one seed gives every consumer its own reproducible random numbers.
+//!
+//! SI units, radians, seconds. Vectors live in the world or the base frame, as their docs say; the base frame is the
+//! trunk's: x forward, y left, z up. Quaternions in arrays are `[w, x, y, z]` and turn base into world.
+
+mod backend;
+mod body;
+pub mod frames;
+mod go2;
+mod joint;
+mod model_file;
+mod robot;
+mod spec;
+mod state;
+mod stream;
+mod vec_env;
+
+pub use backend::{Actuator, Backend, BackendError, PdDrive};
+pub use body::RigidBody;
+pub use go2::go2;
+pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};
+pub use model_file::ModelFileError;
+pub use robot::{Contact, Control, JointModel, LegModel, RobotModel, Shapes};
+pub use spec::{EnvSpec, Field};
+pub use state::{Command, Placement, RobotStates, Variation};
+pub use stream::{Stream, stream};
+pub use vec_env::{AutoresetMode, EndedEpisode, EnvError, ResetRequest, StepBatch, VecEnv};

@@ -1,0 +1,148 @@
+//! What a robot is told and what it is found doing: commands, states, placements.
+
+use crate::{NUM_JOINTS, PerJoint, PerLeg};
+
+/// What the drives of one robot are told for one control period.
+///
+/// Each joint's torque is `kp (q − q_measured) + kd (dq − dq_measured) + tau_ff`, within the joint's limit.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Command {
+    /// Wanted joint position [rad].
+    pub q: PerJoint,
+    /// Wanted joint velocity [rad/s].
+    pub dq: PerJoint,
+    /// Feed-forward torque [N·m].
+    pub tau_ff: PerJoint,
+    /// Position gain [N·m/rad].
+    pub kp: PerJoint,
+    /// Velocity gain [N·m·s/rad].
+    pub kd: PerJoint,
+}
+
+impl Command {
+    /// Holds `q` [rad] with the same gains `kp` [N·m/rad] and `kd` [N·m·s/rad] on every joint.
+    pub fn hold(q: PerJoint, kp: f32, kd: f32) -> Self {
+        Self { q, dq: [0.0; NUM_JOINTS], tau_ff: [0.0; NUM_JOINTS], kp: [kp; NUM_JOINTS], kd: [kd; NUM_JOINTS] }
+    }
+}
+
+/// The states of many robots, one entry a robot in every array.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RobotStates {
+    /// Joint position [rad].
+    pub q: Vec<PerJoint>,
+    /// Joint velocity [rad/s].
+    pub dq: Vec<PerJoint>,
+    /// Torque that the drive applied in its last period [N·m].
+    pub tau: Vec<PerJoint>,
+    /// Origin of the trunk's frame in the world [m].
+    pub base_position: Vec<[f32; 3]>,
+    /// Rotation world-from-base, `[w, x, y, z]`.
+    pub base_orientation: Vec<[f32; 4]>,
+    /// Velocity of the trunk frame's origin, in the world frame [m/s].
+    pub base_linear_velocity: Vec<[f32; 3]>,
+    /// Angular velocity of the trunk, in the base frame [rad/s].
+    pub base_angular_velocity: Vec<[f32; 3]>,
+    /// Normal force on each foot, mean over the last physics step [N].
+    pub foot_force: Vec<PerLeg>,
+    /// True where the trunk or a thigh touches the ground.
+    pub body_contact: Vec<bool>,
+}
+
+impl RobotStates {
+    /// States of `num_robots` robots at rest at the origin.
+    pub fn new(num_robots: usize) -> Self {
+        Self {
+            q: vec![[0.0; NUM_JOINTS]; num_robots],
+            dq: vec![[0.0; NUM_JOINTS]; num_robots],
+            tau: vec![[0.0; NUM_JOINTS]; num_robots],
+            base_position: vec![[0.0; 3]; num_robots],
+            base_orientation: vec![[1.0, 0.0, 0.0, 0.0]; num_robots],
+            base_linear_velocity: vec![[0.0; 3]; num_robots],
+            base_angular_velocity: vec![[0.0; 3]; num_robots],
+            foot_force: vec![[0.0; 4]; num_robots],
+            body_contact: vec![false; num_robots],
+        }
+    }
+
+    /// Copies the state of robot `from` of `other` to `robot`.
+    pub fn copy_robot(&mut self, robot: usize, other: &RobotStates, from: usize) {
+        self.q[robot] = other.q[from];
+        self.dq[robot] = other.dq[from];
+        self.tau[robot] = other.tau[from];
+        self.base_position[robot] = other.base_position[from];
+        self.base_orientation[robot] = other.base_orientation[from];
+        self.base_linear_velocity[robot] = other.base_linear_velocity[from];
+        self.base_angular_velocity[robot] = other.base_angular_velocity[from];
+        self.foot_force[robot] = other.foot_force[from];
+        self.body_contact[robot] = other.body_contact[from];
+    }
+
+    /// The name of the first quantity of `robot` that is not a finite number, if any.
+    pub fn first_not_finite(&self, robot: usize) -> Option<&'static str> {
+        let quantities: [(&'static str, &[f32]); 7] = [
+            ("q", &self.q[robot]),
+            ("dq", &self.dq[robot]),
+            ("tau", &self.tau[robot]),
+            ("base_position", &self.base_position[robot]),
+            ("base_orientation", &self.base_orientation[robot]),
+            ("base_linear_velocity", &self.base_linear_velocity[robot]),
+            ("base_angular_velocity", &self.base_angular_velocity[robot]),
+        ];
+        quantities.into_iter().find(|(_, values)| values.iter().any(|value| !value.is_finite())).map(|(name, _)| name)
+    }
+}
+
+/// Where and how a robot is put down.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Placement {
+    /// Origin of the trunk's frame in the world [m].
+    pub base_position: [f32; 3],
+    /// Rotation world-from-base, `[w, x, y, z]`.
+    pub base_orientation: [f32; 4],
+    /// Velocity of the trunk frame's origin, in the world frame [m/s].
+    pub base_linear_velocity: [f32; 3],
+    /// Angular velocity of the trunk, in the base frame [rad/s].
+    pub base_angular_velocity: [f32; 3],
+    /// Joint position [rad].
+    pub q: PerJoint,
+    /// Joint velocity [rad/s].
+    pub dq: PerJoint,
+    /// How this robot's body and ground differ from the model's.
+    pub variation: Variation,
+}
+
+impl Placement {
+    /// At rest and upright at height `base_height` [m], with joints at `q` [rad].
+    pub fn at_rest(base_height: f32, q: PerJoint) -> Self {
+        Self {
+            base_position: [0.0, 0.0, base_height],
+            base_orientation: [1.0, 0.0, 0.0, 0.0],
+            base_linear_velocity: [0.0; 3],
+            base_angular_velocity: [0.0; 3],
+            q,
+            dq: [0.0; NUM_JOINTS],
+            variation: Variation::default(),
+        }
+    }
+}
+
+/// How one robot's body and ground differ from the model's.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Variation {
+    /// Factor on the mass and inertia of every body.
+    pub mass_scale: f32,
+    /// Point mass at the trunk's centre of mass [kg].
+    pub payload: f32,
+    /// Shift of the trunk's centre of mass in the base frame [m].
+    pub com_shift: [f32; 3],
+    /// Factor on the ground's friction coefficient.
+    pub friction_scale: f32,
+}
+
+impl Default for Variation {
+    /// The robot exactly as its model has it.
+    fn default() -> Self {
+        Self { mass_scale: 1.0, payload: 0.0, com_shift: [0.0; 3], friction_scale: 1.0 }
+    }
+}

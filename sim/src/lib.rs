@@ -1,0 +1,15 @@
+//! The Go2 as a simulated [`twinstep_model::Backend`] for many robots.
+//!
+//! - [`SimConfig`]: engine, rates, terrain, base, threads; the `[sim]` table of a config file.
+//! - [`RapierBackend`]: one rapier3d world a robot, stepped on all cores; equal inputs give equal bits on any number
+//!   of threads.
+//!
+//! A drive period is one sample of the state, one torque for each joint, and `physics_hz / drive_hz` physics steps
+//! under that torque.
+
+mod config;
+mod rapier;
+mod robot_world;
+
+pub use config::{Base, Engine, SimConfig, SimConfigError, Terrain};
+pub use rapier::{BuildError, RapierBackend, RobotSnapshot};

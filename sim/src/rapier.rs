@@ -1,0 +1,167 @@
+//! The rapier engine: one world a robot, stepped on all cores.
+
+use rayon::prelude::*;
+use twinstep_model::{Actuator, Backend, BackendError, Command, PdDrive, PerJoint, Placement, RobotModel, RobotStates};
+
+use crate::robot_world::{RobotWorld, WorldSnapshot};
+use crate::{SimConfig, SimConfigError};
+
+/// Many Go2 in rapier3d.
+pub struct RapierBackend {
+    robot: RobotModel,
+    config: SimConfig,
+    worlds: Vec<RobotWorld>,
+    states: RobotStates,
+    drive: Box<dyn Actuator>,
+    pool: rayon::ThreadPool,
+}
+
+/// Why a backend could not be built.
+#[derive(Debug, thiserror::Error)]
+pub enum BuildError {
+    /// A setting is not allowed.
+    #[error(transparent)]
+    Config(#[from] SimConfigError),
+    /// The system gave no threads.
+    #[error("cannot start {threads} simulation threads: {source}")]
+    Threads {
+        /// How many were asked for.
+        threads: usize,
+        /// What the system said.
+        source: rayon::ThreadPoolBuildError,
+    },
+}
+
+/// The state of one robot; restoring it continues bit for bit.
+#[derive(Clone)]
+pub struct RobotSnapshot {
+    world: WorldSnapshot,
+    state: RobotStates,
+}
+
+impl RapierBackend {
+    /// `num_robots` robots that stand in their default pose.
+    pub fn new(robot: RobotModel, config: SimConfig, num_robots: usize) -> Result<Self, BuildError> {
+        let drive = Box::new(PdDrive::new(&robot));
+        Self::with_drive(robot, config, num_robots, drive)
+    }
+
+    /// As [`RapierBackend::new`], with another drive than the ideal one.
+    pub fn with_drive(
+        robot: RobotModel,
+        config: SimConfig,
+        num_robots: usize,
+        drive: Box<dyn Actuator>,
+    ) -> Result<Self, BuildError> {
+        config.check(&robot.control)?;
+        let threads = match config.threads {
+            0 => std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
+            threads => threads,
+        };
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .map_err(|source| BuildError::Threads { threads, source })?;
+        let placement = Placement::at_rest(0.32, robot.control.default_pose_f32());
+        let worlds = (0..num_robots).map(|_| RobotWorld::new(&robot, &config, &placement)).collect();
+        let mut this = Self { robot, config, worlds, states: RobotStates::new(num_robots), drive, pool };
+        for index in 0..num_robots {
+            this.read_state(index);
+        }
+        Ok(this)
+    }
+
+    fn check_index(&self, robot: usize) -> Result<(), BackendError> {
+        let num_robots = self.worlds.len();
+        if robot < num_robots { Ok(()) } else { Err(BackendError::NoSuchRobot { robot, num_robots }) }
+    }
+
+    fn read_state(&mut self, robot: usize) {
+        let (world, states) = (&self.worlds[robot], &mut self.states);
+        world.read_joints(&mut states.q[robot], &mut states.dq[robot]);
+        let base = world.read_base();
+        states.base_position[robot] = base.position;
+        states.base_orientation[robot] = base.orientation;
+        states.base_linear_velocity[robot] = base.linear_velocity;
+        states.base_angular_velocity[robot] = base.angular_velocity;
+        states.foot_force[robot] = world.foot_forces();
+        states.body_contact[robot] = world.body_contact();
+    }
+
+    /// One drive period of all active robots: torque from the sampled state, held over the physics steps.
+    fn drive_period(&mut self, commands: &[Command], active: &[bool], steps: usize) {
+        let mut tau = std::mem::take(&mut self.states.tau);
+        self.drive.torques(commands, active, &self.states, &mut tau);
+        let robots = (&mut self.worlds, &tau, &mut self.states.q, &mut self.states.dq, active);
+        self.pool.install(|| {
+            robots.into_par_iter().filter(|(.., active)| **active).for_each(|(world, tau, q, dq, _)| {
+                world.step(tau, steps);
+                world.read_joints(q, dq);
+            });
+        });
+        self.states.tau = tau;
+    }
+
+    fn first_diverged(&self, active: &[bool]) -> Option<BackendError> {
+        let mut diverged = (0..self.worlds.len()).filter(|robot| active[*robot]).filter_map(|robot| {
+            let quantity = self.states.first_not_finite(robot);
+            quantity.or_else(|| self.worlds[robot].diverged().then_some("dq")).map(|quantity| (robot, quantity))
+        });
+        let (robot, quantity) = diverged.next()?;
+        Some(BackendError::Diverged { robot, quantity, more: diverged.count() })
+    }
+}
+
+impl Backend for RapierBackend {
+    type Snapshot = RobotSnapshot;
+
+    fn robot(&self) -> &RobotModel {
+        &self.robot
+    }
+
+    fn states(&self) -> &RobotStates {
+        &self.states
+    }
+
+    fn reset(&mut self, placements: &[(usize, Placement)]) -> Result<(), BackendError> {
+        for (robot, _) in placements {
+            self.check_index(*robot)?;
+        }
+        for (robot, placement) in placements {
+            let robot = *robot;
+            self.worlds[robot] = RobotWorld::new(&self.robot, &self.config, placement);
+            self.drive.reset(robot);
+            self.read_state(robot);
+            self.states.tau[robot] = PerJoint::default();
+        }
+        Ok(())
+    }
+
+    fn step(&mut self, commands: &[Command], active: &[bool], drive_periods: usize) -> Result<(), BackendError> {
+        let wanted = self.worlds.len();
+        for (field, given) in [("commands", commands.len()), ("active", active.len())] {
+            if given != wanted {
+                return Err(BackendError::WrongLength { field, given, wanted });
+            }
+        }
+        let steps = self.config.steps_per_drive_period(&self.robot.control);
+        for _ in 0..drive_periods {
+            self.drive_period(commands, active, steps);
+        }
+        for robot in (0..wanted).filter(|robot| active[*robot]) {
+            self.read_state(robot);
+        }
+        self.first_diverged(active).map_or(Ok(()), Err)
+    }
+
+    fn snapshot(&self, robot: usize) -> RobotSnapshot {
+        let mut state = RobotStates::new(1);
+        state.copy_robot(0, &self.states, robot);
+        RobotSnapshot { world: self.worlds[robot].snapshot(), state }
+    }
+
+    fn restore(&mut self, robot: usize, snapshot: &RobotSnapshot) {
+        self.worlds[robot].restore(&snapshot.world);
+        self.states.copy_robot(robot, &snapshot.state, 0);
+    }
+}

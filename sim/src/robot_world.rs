@@ -1,0 +1,341 @@
+//! One Go2 in its own rapier world: how it is built, driven and read.
+//!
+//! What rapier 0.36 needs to be right about a legged robot, each found by a test in `tests/it/physics.rs`:
+//!
+//! - *Default damping.* A multibody joint damps its angular axes by 0.1 N·m·s, the free root's too: it is set to zero.
+//! - *Root frame.* A free root with its centre of mass off its origin drifts in flight, because the origin is moved with
+//!   the centre's velocity. The root body's frame sits at the trunk's centre of mass; anchors and shapes are shifted.
+//! - *Torque.* There is no generalised force. A soft spring (k = 1 mN·m/rad) whose rest position is far away,
+//!   `q + τ/k`, gives one without world-frame sums, and keeps its value over the steps of a drive period.
+//! - *Reset.* Contact caches and joint coordinates survive an in-place reset, so a robot is placed by building its world
+//!   anew (31 µs); where it stood before can then not matter.
+
+use glam::{DVec3, Quat, Vec3};
+use rapier3d::prelude::*;
+use twinstep_model::{Joint, JointKind, Leg, NUM_JOINTS, PerJoint, PerLeg, Placement, RigidBody, RobotModel, frames};
+
+use crate::{Base, SimConfig, Terrain};
+
+/// Stiffness of the spring that carries a joint's torque [N·m/rad].
+const TORQUE_SPRING: f32 = 1e-3;
+/// Axis of a revolute joint's rotation in rapier's six-axis layout.
+const REVOLUTE_AXIS: usize = 3;
+/// The robot's own parts do not touch each other; they touch the ground.
+const ROBOT_GROUP: InteractionGroups = InteractionGroups::new(Group::GROUP_1, Group::GROUP_2, InteractionTestMode::And);
+const GROUND_GROUP: InteractionGroups =
+    InteractionGroups::new(Group::GROUP_2, Group::GROUP_1, InteractionTestMode::And);
+
+/// One robot and the ground under it.
+pub struct RobotWorld {
+    world: PhysicsWorld,
+    trunk: RigidBodyHandle,
+    multibody: MultibodyJointHandle,
+    /// Trunk's centre of mass in the base frame [m].
+    trunk_com: Vec3,
+    /// Root degrees of freedom before the first joint's: 6 or, with the base fixed, 0.
+    root_dofs: usize,
+    feet: [ColliderHandle; 4],
+    upper_body: Vec<ColliderHandle>,
+}
+
+/// Everything of a world that a step depends on.
+#[derive(Clone)]
+pub struct WorldSnapshot {
+    islands: IslandManager,
+    broad_phase: DefaultBroadPhase,
+    narrow_phase: NarrowPhase,
+    bodies: RigidBodySet,
+    colliders: ColliderSet,
+    multibody_joints: MultibodyJointSet,
+    root: RootFrame,
+}
+
+/// What a world keeps besides rapier's sets; another placement may have another trunk and other handles.
+#[derive(Clone)]
+struct RootFrame {
+    trunk: RigidBodyHandle,
+    multibody: MultibodyJointHandle,
+    trunk_com: Vec3,
+    feet: [ColliderHandle; 4],
+    upper_body: Vec<ColliderHandle>,
+}
+
+impl RobotWorld {
+    /// Builds the robot where `placement` has it.
+    pub fn new(robot: &RobotModel, config: &SimConfig, placement: &Placement) -> Self {
+        let mut world = PhysicsWorld { gravity: Vec3::new(0.0, 0.0, -9.81), ..PhysicsWorld::default() };
+        world.integration_parameters = integration_parameters(robot, config);
+        let friction = robot.contact.friction as f32 * placement.variation.friction_scale;
+        insert_ground(&mut world, config.terrain, friction);
+
+        let (trunk_body, leg_scale) = varied_bodies(robot, placement);
+        let trunk_com = trunk_body.com.as_vec3();
+        let trunk = insert_trunk(&mut world, config.base, &trunk_body, placement);
+        let mut upper_body = vec![insert_shape(&mut world, trunk, trunk_box(robot).translation(-trunk_com), friction)];
+        let mut feet = Vec::with_capacity(4);
+        let mut multibody = None;
+        for leg in Leg::ALL {
+            let mut parent = (trunk, -trunk_body.com);
+            for kind in JointKind::ALL {
+                let joint = Joint { leg, kind };
+                let body = robot.legs[leg as usize].bodies[kind as usize].scaled(leg_scale);
+                let child = world.insert_body(moving_body(RigidBodyBuilder::dynamic(), &body, body.com));
+                let origin = robot.legs[leg as usize].origins[kind as usize] + parent.1;
+                multibody = world.insert_multibody_joint(parent.0, child, revolute(robot, joint, origin));
+                parent = (child, DVec3::ZERO);
+                match kind {
+                    JointKind::Hip => {}
+                    JointKind::Thigh => upper_body.push(insert_shape(&mut world, child, thigh_box(robot), friction)),
+                    JointKind::Calf => {
+                        insert_shape(&mut world, child, calf_capsule(robot), friction);
+                        feet.push(insert_shape(&mut world, child, foot_sphere(robot), friction));
+                    }
+                }
+            }
+        }
+        let mut this = Self {
+            world,
+            trunk,
+            multibody: multibody.expect("a leg's joints close no loop"),
+            trunk_com,
+            root_dofs: if config.base == Base::Floating { 6 } else { 0 },
+            feet: feet.try_into().expect("one foot a leg"),
+            upper_body,
+        };
+        this.place_joints(robot, placement);
+        this
+    }
+
+    fn place_joints(&mut self, robot: &RobotModel, placement: &Placement) {
+        let root_dofs = self.root_dofs;
+        let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
+        // Takes over the trunk's pose, and drops the root's six axes when the trunk is fixed.
+        multibody.forward_kinematics(&self.world.bodies, true);
+        multibody.damping_mut().fill(0.0);
+        for (dof, joint) in robot.joints.iter().enumerate() {
+            multibody.armature_mut()[root_dofs + dof] = joint.armature as f32;
+        }
+        let mut displacement = vec![0.0; root_dofs + NUM_JOINTS];
+        displacement[root_dofs..].copy_from_slice(&placement.q);
+        multibody.apply_displacements(&displacement);
+
+        let mut velocity = vec![0.0; root_dofs + NUM_JOINTS];
+        velocity[root_dofs..].copy_from_slice(&placement.dq);
+        if root_dofs > 0 {
+            let world_from_base = frames::world_from_base(placement.base_orientation);
+            let angular_world = world_from_base * Vec3::from(placement.base_angular_velocity);
+            let linear_com =
+                Vec3::from(placement.base_linear_velocity) + angular_world.cross(world_from_base * self.trunk_com);
+            velocity[..3].copy_from_slice(&linear_com.to_array());
+            velocity[3..6].copy_from_slice(&angular_world.to_array());
+        }
+        multibody.generalized_velocity_mut().as_mut_slice().copy_from_slice(&velocity);
+        multibody.forward_kinematics(&self.world.bodies, false);
+        multibody.update_rigid_bodies(&mut self.world.bodies, true);
+    }
+
+    /// Holds the joint torques `tau` [N·m] for `steps` physics steps.
+    pub fn step(&mut self, tau: &PerJoint, steps: usize) {
+        let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
+        for (link, torque) in multibody.links_mut().skip(1).zip(tau) {
+            let position = link.joint().coords()[REVOLUTE_AXIS];
+            link.joint.set_spring(REVOLUTE_AXIS, TORQUE_SPRING, position + torque / TORQUE_SPRING);
+        }
+        for _ in 0..steps {
+            self.world.step();
+        }
+    }
+
+    /// True if the last step met a number that is not finite; rapier then freezes the body concerned.
+    pub fn diverged(&self) -> bool {
+        !self.world.quarantine().bodies().is_empty() || !self.world.quarantine().colliders().is_empty()
+    }
+
+    /// Reads joint positions [rad] and velocities [rad/s].
+    pub fn read_joints(&self, q: &mut PerJoint, dq: &mut PerJoint) {
+        let (multibody, _) = self.world.multibody_joints.get(self.multibody).expect("built with the world");
+        for (position, link) in q.iter_mut().zip(multibody.links().skip(1)) {
+            *position = link.joint().coords()[REVOLUTE_AXIS];
+        }
+        dq.copy_from_slice(&multibody.generalized_velocity().as_slice()[self.root_dofs..]);
+    }
+
+    /// Pose and velocity of the base frame.
+    ///
+    /// The velocity comes from the joint coordinates: the trunk body's own is one physics step old.
+    pub fn read_base(&self) -> BaseState {
+        let trunk = &self.world.bodies[self.trunk];
+        let rotation = Quat::from_array(trunk.position().rotation.to_array());
+        let offset_world = rotation * self.trunk_com;
+        let (linear_com, angular_world) = self.root_velocity();
+        BaseState {
+            position: (trunk.translation() - offset_world).to_array(),
+            orientation: frames::to_wxyz(rotation),
+            linear_velocity: (linear_com - angular_world.cross(offset_world)).to_array(),
+            angular_velocity: (rotation.inverse() * angular_world).to_array(),
+        }
+    }
+
+    /// Velocity of the trunk's centre of mass [m/s] and of its rotation [rad/s], both in the world frame.
+    fn root_velocity(&self) -> (Vec3, Vec3) {
+        if self.root_dofs == 0 {
+            return (Vec3::ZERO, Vec3::ZERO);
+        }
+        let (multibody, _) = self.world.multibody_joints.get(self.multibody).expect("built with the world");
+        let velocity = multibody.generalized_velocity();
+        (Vec3::new(velocity[0], velocity[1], velocity[2]), Vec3::new(velocity[3], velocity[4], velocity[5]))
+    }
+
+    /// Normal force on each foot, mean over the last physics step [N].
+    pub fn foot_forces(&self) -> PerLeg {
+        self.feet.map(|foot| self.normal_impulse(foot) / self.world.integration_parameters.dt)
+    }
+
+    /// True if the trunk or a thigh touches the ground.
+    pub fn body_contact(&self) -> bool {
+        self.upper_body.iter().any(|shape| self.normal_impulse(*shape) > 0.0)
+    }
+
+    fn normal_impulse(&self, shape: ColliderHandle) -> f32 {
+        self.world.narrow_phase.contact_pairs_with(shape).map(ContactPair::total_impulse_magnitude).sum()
+    }
+
+    /// Everything that the next step depends on.
+    pub fn snapshot(&self) -> WorldSnapshot {
+        WorldSnapshot {
+            islands: self.world.islands.clone(),
+            broad_phase: self.world.broad_phase.clone(),
+            narrow_phase: self.world.narrow_phase.clone(),
+            bodies: self.world.bodies.clone(),
+            colliders: self.world.colliders.clone(),
+            multibody_joints: self.world.multibody_joints.clone(),
+            root: RootFrame {
+                trunk: self.trunk,
+                multibody: self.multibody,
+                trunk_com: self.trunk_com,
+                feet: self.feet,
+                upper_body: self.upper_body.clone(),
+            },
+        }
+    }
+
+    /// Goes back to `snapshot`.
+    pub fn restore(&mut self, snapshot: &WorldSnapshot) {
+        let WorldSnapshot { islands, broad_phase, narrow_phase, bodies, colliders, multibody_joints, root } =
+            snapshot.clone();
+        self.world = PhysicsWorld {
+            gravity: self.world.gravity,
+            integration_parameters: self.world.integration_parameters,
+            islands,
+            broad_phase,
+            narrow_phase,
+            bodies,
+            colliders,
+            multibody_joints,
+            ..PhysicsWorld::default()
+        };
+        let RootFrame { trunk, multibody, trunk_com, feet, upper_body } = root;
+        (self.trunk, self.multibody, self.trunk_com, self.feet, self.upper_body) =
+            (trunk, multibody, trunk_com, feet, upper_body);
+    }
+}
+
+/// Pose and velocity of the base frame, as in [`twinstep_model::RobotStates`].
+pub struct BaseState {
+    /// Origin in the world [m].
+    pub position: [f32; 3],
+    /// World-from-base, `[w, x, y, z]`.
+    pub orientation: [f32; 4],
+    /// Velocity of the origin in the world frame [m/s].
+    pub linear_velocity: [f32; 3],
+    /// Angular velocity in the base frame [rad/s].
+    pub angular_velocity: [f32; 3],
+}
+
+fn integration_parameters(robot: &RobotModel, config: &SimConfig) -> IntegrationParameters {
+    let softness =
+        SpringCoefficients::new(robot.contact.natural_frequency() as f32, robot.contact.damping_ratio as f32);
+    IntegrationParameters {
+        dt: 1.0 / config.physics_hz as f32,
+        num_solver_iterations: config.solver_iterations as usize,
+        max_ccd_substeps: 0,
+        contact_softness: softness,
+        static_contact_softness: softness,
+        ..IntegrationParameters::default()
+    }
+}
+
+fn insert_ground(world: &mut PhysicsWorld, terrain: Terrain, friction: f32) {
+    let normal = match terrain {
+        Terrain::Flat => Vec3::Z,
+        Terrain::SlopeRad(angle) => Vec3::new(-angle.sin(), 0.0, angle.cos()),
+    };
+    let ground = SharedShape::halfspace(normal);
+    world.insert_collider(ColliderBuilder::new(ground).friction(friction).collision_groups(GROUND_GROUP), None);
+}
+
+/// The trunk with this placement's payload and shift, and the factor on the legs' bodies.
+fn varied_bodies(robot: &RobotModel, placement: &Placement) -> (RigidBody, f64) {
+    let variation = &placement.variation;
+    let scale = f64::from(variation.mass_scale);
+    let trunk = robot.trunk.scaled(scale).with_point_mass(f64::from(variation.payload), robot.trunk.com);
+    let shift = DVec3::from(variation.com_shift.map(f64::from));
+    (RigidBody { com: trunk.com + shift, ..trunk }, scale)
+}
+
+fn insert_trunk(world: &mut PhysicsWorld, base: Base, trunk: &RigidBody, placement: &Placement) -> RigidBodyHandle {
+    let world_from_base = frames::world_from_base(placement.base_orientation);
+    let centre = Vec3::from(placement.base_position) + world_from_base * trunk.com.as_vec3();
+    let builder = match base {
+        Base::Floating => RigidBodyBuilder::dynamic(),
+        Base::Fixed => RigidBodyBuilder::fixed(),
+    };
+    let pose = Pose::from_parts(centre, world_from_base);
+    world.insert_body(moving_body(builder, trunk, DVec3::ZERO).pose(pose))
+}
+
+/// A body with the mass and inertia of `body`, its centre of mass at `com` in its own frame.
+fn moving_body(builder: RigidBodyBuilder, body: &RigidBody, com: DVec3) -> RigidBodyBuilder {
+    let inertia = body.inertia.as_mat3();
+    builder
+        .additional_mass_properties(MassProperties::with_inertia_matrix(com.as_vec3(), body.mass as f32, inertia))
+        .can_sleep(false)
+}
+
+fn revolute(robot: &RobotModel, joint: Joint, origin: DVec3) -> GenericJoint {
+    let range = robot.joints[joint.index()].range.map(|limit| limit as f32);
+    RevoluteJointBuilder::new(RobotModel::axis(joint).as_vec3())
+        .local_anchor1(origin.as_vec3())
+        .limits(range)
+        .contacts_enabled(false)
+        .build()
+        .into()
+}
+
+fn insert_shape(
+    world: &mut PhysicsWorld,
+    body: RigidBodyHandle,
+    shape: ColliderBuilder,
+    friction: f32,
+) -> ColliderHandle {
+    world.insert_collider(shape.friction(friction).density(0.0).collision_groups(ROBOT_GROUP), Some(body))
+}
+
+fn trunk_box(robot: &RobotModel) -> ColliderBuilder {
+    let half = robot.shapes.trunk_half_size.as_vec3();
+    ColliderBuilder::cuboid(half.x, half.y, half.z)
+}
+
+fn thigh_box(robot: &RobotModel) -> ColliderBuilder {
+    let half = robot.shapes.thigh_half_size.as_vec3();
+    ColliderBuilder::cuboid(half.x, half.y, half.z).translation(robot.shapes.thigh_centre.as_vec3())
+}
+
+fn calf_capsule(robot: &RobotModel) -> ColliderBuilder {
+    let [knee, shin] = [robot.shapes.calf_ends[0].as_vec3(), robot.shapes.calf_ends[1].as_vec3()];
+    ColliderBuilder::capsule_from_endpoints(knee, shin, robot.shapes.calf_radius as f32)
+}
+
+fn foot_sphere(robot: &RobotModel) -> ColliderBuilder {
+    ColliderBuilder::ball(robot.shapes.foot_radius as f32).translation(robot.shapes.foot_centre.as_vec3())
+}

@@ -1,0 +1,5 @@
+//! Tests that cross crates, in one binary.
+
+#![allow(clippy::unwrap_used)]
+
+mod physics;
