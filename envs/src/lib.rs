@@ -1,1 +1,21 @@
-//! .
+//! Observation, reward, termination and tasks on any [`twinstep_model::Backend`].
+//!
+//! - [`TaskEnv`]: the task `walk`, a [`twinstep_model::VecEnv`] on any backend. [`TaskConfig`] and [`Randomisation`]
+//!   are the `[task]` and `[randomise]` tables of a config file.
+//! - [`observe`] and [`walk_spec`]: the observation of U2E eq. 14, for simulator, log and robot alike.
+//! - [`reward`]: one function a term; its name is the config key and the log key.
+//! - [`CounterEnv`]: no physics; its observation proves which steps were executed.
+//! - [`check()`]: what every vector environment must keep, local or remote.
+
+mod check;
+mod config;
+mod counter;
+mod observation;
+pub mod reward;
+mod task_env;
+
+pub use check::{CheckError, check};
+pub use config::{CommandRanges, ConfigError, Randomisation, RewardWeights, TaskConfig};
+pub use counter::{Counter, CounterEnv};
+pub use observation::{OBS_LEN, observe, walk_spec};
+pub use task_env::{TaskEnv, TaskSettings};

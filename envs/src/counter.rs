@@ -1,0 +1,128 @@
+//! The task `counter`: no physics, an observation that proves what was executed.
+//!
+//! It has the shapes of `walk`. Its observation holds the number of steps of the environment's life, the number of its
+//! resets, and a running mix of all actions in their order: a step executed twice, skipped or invented shows in the next
+//! observation. It also makes the transport alone measurable.
+
+use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, RobotModel, StepBatch, VecEnv};
+
+use crate::TaskConfig;
+use crate::observation::{OBS_LEN, walk_spec};
+
+/// Many counters in place of robots.
+pub struct CounterEnv {
+    spec: EnvSpec,
+    autoreset: AutoresetMode,
+    batch: StepBatch,
+    counters: Vec<Counter>,
+}
+
+/// What one counter has seen. A client that keeps its own and compares [`Counter::observation`] proves every step.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counter {
+    /// Steps executed since the environment was made.
+    pub steps: u32,
+    /// Resets executed since the environment was made.
+    pub resets: u32,
+    /// Mix of all actions in their order.
+    pub mix: u32,
+}
+
+impl Counter {
+    /// Takes in one step.
+    pub fn step(&mut self, action: &[f32]) {
+        self.steps += 1;
+        for value in action {
+            self.mix = (self.mix ^ value.to_bits()).wrapping_mul(0x0100_0193).rotate_left(5);
+        }
+    }
+
+    /// Takes in one reset.
+    pub fn reset(&mut self) {
+        self.resets += 1;
+    }
+
+    /// The first entries of the observation: numbers below 2²⁴, which a float holds exactly.
+    pub fn observation(&self) -> [f32; 4] {
+        [(self.steps & 0xff_ffff) as f32, self.resets as f32, (self.mix >> 16) as f32, (self.mix & 0xffff) as f32]
+    }
+}
+
+impl CounterEnv {
+    /// `num_envs` counters.
+    pub fn new(robot: &RobotModel, num_envs: usize, autoreset: AutoresetMode) -> Self {
+        let mut spec = walk_spec(robot, &TaskConfig::default());
+        spec.task = "counter".to_owned();
+        spec.reward_terms.clear();
+        for field in &mut spec.observation {
+            (field.low, field.high) = (-16_777_216.0, 16_777_216.0);
+        }
+        Self { spec, autoreset, batch: StepBatch::new(num_envs, OBS_LEN), counters: vec![Counter::default(); num_envs] }
+    }
+
+    fn observe(&mut self, env: usize) {
+        let row = &mut self.batch.obs[env * OBS_LEN..(env + 1) * OBS_LEN];
+        row[..4].copy_from_slice(&self.counters[env].observation());
+    }
+}
+
+impl VecEnv for CounterEnv {
+    fn spec(&self) -> &EnvSpec {
+        &self.spec
+    }
+
+    fn num_envs(&self) -> usize {
+        self.counters.len()
+    }
+
+    fn autoreset(&self) -> AutoresetMode {
+        self.autoreset
+    }
+
+    fn reset(&mut self, request: &ResetRequest) -> Result<&[f32], EnvError> {
+        request.check(self.num_envs())?;
+        for env in (0..self.num_envs()).filter(|env| request.wants(*env)) {
+            self.counters[env].reset();
+            self.observe(env);
+        }
+        Ok(&self.batch.obs)
+    }
+
+    fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
+        let action_len = self.spec.action_len();
+        let wanted = self.num_envs() * action_len;
+        if actions.len() != wanted {
+            return Err(EnvError::WrongLength { field: "actions", given: actions.len(), wanted });
+        }
+        if let Some(index) = actions.iter().position(|value| !value.is_finite()) {
+            let entry = self.spec.action_entry(index % action_len);
+            return Err(EnvError::ActionNotFinite { env: index / action_len, entry, value: actions[index] });
+        }
+        if let Some(env) = self.counters.iter().position(|counter| counter.resets == 0) {
+            return Err(EnvError::NeedsReset { env });
+        }
+        for (env, action) in actions.chunks_exact(action_len).enumerate() {
+            self.counters[env].step(action);
+            self.observe(env);
+            self.batch.obs[env * OBS_LEN + 33..(env + 1) * OBS_LEN].copy_from_slice(action);
+            self.batch.reward[env] = self.counters[env].steps as f32;
+        }
+        Ok(&self.batch)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn order_of_actions_shows_in_the_mix() {
+        let (mut forth, mut back) = (Counter::default(), Counter::default());
+        forth.step(&[0.1, 0.2]);
+        forth.step(&[0.3, 0.4]);
+        back.step(&[0.3, 0.4]);
+        back.step(&[0.1, 0.2]);
+        assert_eq!(forth.steps, back.steps);
+        assert_ne!(forth.mix, back.mix);
+    }
+}

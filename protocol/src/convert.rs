@@ -1,0 +1,112 @@
+//! Between messages and the types of `twinstep-model`.
+
+use twinstep_model::{EndedEpisode, EnvError, EnvSpec, ResetRequest, StepBatch};
+
+use crate::{Code, PROTOCOL, WireError, encode, message, tensor};
+
+/// A reset as sent.
+pub fn encode_reset(request: &ResetRequest, epoch: u64, seq: u64) -> Vec<u8> {
+    let mask = request.mask.as_ref().map(|mask| tensor::flags_to_bytes(mask));
+    encode(&message::ResetRequest {
+        protocol: PROTOCOL,
+        epoch,
+        seq,
+        seeds: request.seeds.as_ref().map(|seeds| tensor::as_bytes(seeds)),
+        mask: mask.as_deref(),
+    })
+}
+
+/// A reset as received.
+pub fn read_reset(request: &message::ResetRequest<'_>) -> Result<ResetRequest, WireError> {
+    let seeds = request.seeds.map(|bytes| tensor::read(bytes, "seeds")).transpose()?;
+    Ok(ResetRequest { seeds, mask: request.mask.map(tensor::flags_from_bytes) })
+}
+
+/// A step's result as sent.
+pub fn encode_step(batch: &StepBatch, seq: u64) -> Vec<u8> {
+    let ended = &batch.ended;
+    let env: Vec<u32> = ended.iter().map(|episode| episode.env as u32).collect();
+    let length: Vec<u32> = ended.iter().map(|episode| episode.length).collect();
+    let episode_return: Vec<f32> = ended.iter().map(|episode| episode.episode_return).collect();
+    let terms: Vec<f32> = ended.iter().flat_map(|episode| episode.terms.iter().copied()).collect();
+    let final_obs: Vec<f32> = ended.iter().flat_map(|episode| episode.final_obs.iter().copied()).collect();
+    encode(&message::StepReply {
+        protocol: PROTOCOL,
+        seq,
+        obs: tensor::as_bytes(&batch.obs),
+        reward: tensor::as_bytes(&batch.reward),
+        terminated: &tensor::flags_to_bytes(&batch.terminated),
+        truncated: &tensor::flags_to_bytes(&batch.truncated),
+        ended_env: tensor::as_bytes(&env),
+        ended_length: tensor::as_bytes(&length),
+        ended_return: tensor::as_bytes(&episode_return),
+        ended_terms: tensor::as_bytes(&terms),
+        final_obs: tensor::as_bytes(&final_obs),
+    })
+}
+
+/// A step's result as received, into `batch`. Every length must fit `num_envs` environments of `spec`.
+pub fn read_step(
+    reply: &message::StepReply<'_>,
+    spec: &EnvSpec,
+    num_envs: usize,
+    batch: &mut StepBatch,
+) -> Result<(), WireError> {
+    tensor::read_into(reply.obs, &mut batch.obs, "obs")?;
+    tensor::read_into(reply.reward, &mut batch.reward, "reward")?;
+    batch.terminated = tensor::flags_from_bytes(reply.terminated);
+    batch.truncated = tensor::flags_from_bytes(reply.truncated);
+    let env: Vec<u32> = tensor::read(reply.ended_env, "ended_env")?;
+    let length: Vec<u32> = tensor::read(reply.ended_length, "ended_length")?;
+    let episode_return: Vec<f32> = tensor::read(reply.ended_return, "ended_return")?;
+    let terms: Vec<f32> = tensor::read(reply.ended_terms, "ended_terms")?;
+    let final_obs: Vec<f32> = tensor::read(reply.final_obs, "final_obs")?;
+    let (ended, obs_len, num_terms) = (env.len(), spec.obs_len(), spec.reward_terms.len());
+    for (field, given, wanted) in [
+        ("obs", batch.obs.len(), num_envs * obs_len),
+        ("reward", batch.reward.len(), num_envs),
+        ("terminated", batch.terminated.len(), num_envs),
+        ("truncated", batch.truncated.len(), num_envs),
+        ("ended_length", length.len(), ended),
+        ("ended_return", episode_return.len(), ended),
+        ("ended_terms", terms.len(), ended * num_terms),
+        ("final_obs", final_obs.len(), if final_obs.is_empty() { 0 } else { ended * obs_len }),
+    ] {
+        check_length(field, given, wanted)?;
+    }
+    if let Some(env) = env.iter().find(|env| **env as usize >= num_envs) {
+        let message = format!("`ended_env` has environment {env}; there are {num_envs}");
+        return Err(WireError::new(Code::OutOfRange, "ended_env", message));
+    }
+    batch.ended = (0..ended)
+        .map(|k| EndedEpisode {
+            env: env[k] as usize,
+            length: length[k],
+            episode_return: episode_return[k],
+            terms: terms[k * num_terms..(k + 1) * num_terms].to_vec(),
+            final_obs: final_obs.get(k * obs_len..(k + 1) * obs_len).unwrap_or_default().to_vec(),
+        })
+        .collect();
+    Ok(())
+}
+
+/// Fails if `given` is not `wanted`.
+pub fn check_length(field: &'static str, given: usize, wanted: usize) -> Result<(), WireError> {
+    if given == wanted {
+        return Ok(());
+    }
+    let message = format!("`{field}` has {given} entries; {wanted} are wanted");
+    Err(WireError::new(Code::BadShape, field, message))
+}
+
+/// An environment's error as sent.
+pub fn wire_error(error: &EnvError) -> WireError {
+    let (code, field, hint) = match error {
+        EnvError::WrongLength { field, .. } => (Code::BadShape, *field, "shapes are num_envs × the spec's lengths"),
+        EnvError::ActionNotFinite { .. } => (Code::NotFinite, "actions", "look at what computed the action"),
+        EnvError::NeedsReset { .. } => (Code::NeedsReset, "", "send `reset`, with `mask` to reset only some"),
+        EnvError::Diverged { .. } => (Code::Diverged, "", "send `reset` with `mask`"),
+        EnvError::Backend(_) | EnvError::Remote(_) => (Code::Internal, "", "the server's log says more"),
+    };
+    WireError::new(code, field, error.to_string()).with_hint(hint)
+}

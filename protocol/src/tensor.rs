@@ -1,0 +1,68 @@
+//! Tensors as bytes: little-endian, C order.
+
+use crate::{Code, WireError};
+
+const _: () = assert!(cfg!(target_endian = "little"), "tensors are sent as they lie in memory");
+
+/// Bytes of `values`, without copying.
+pub fn as_bytes<T: bytemuck::NoUninit>(values: &[T]) -> &[u8] {
+    bytemuck::cast_slice(values)
+}
+
+/// Bytes of flags: 0 or 1 each.
+pub fn flags_to_bytes(flags: &[bool]) -> Vec<u8> {
+    flags.iter().map(|flag| u8::from(*flag)).collect()
+}
+
+/// Reads flags; anything but 0 is true.
+pub fn flags_from_bytes(bytes: &[u8]) -> Vec<bool> {
+    bytes.iter().map(|byte| *byte != 0).collect()
+}
+
+/// Reads numbers into `values`, whatever its length was. `field` is named if the bytes are not whole numbers.
+pub fn read_into<T: bytemuck::AnyBitPattern>(
+    bytes: &[u8],
+    values: &mut Vec<T>,
+    field: &'static str,
+) -> Result<(), WireError> {
+    let size = size_of::<T>();
+    if !bytes.len().is_multiple_of(size) {
+        let message = format!("`{field}` has {} bytes, which is no multiple of {size}", bytes.len());
+        return Err(WireError::new(Code::BadShape, field, message));
+    }
+    values.clear();
+    // A `bin` starts anywhere in a message, so its numbers may be unaligned.
+    values.extend(bytes.chunks_exact(size).map(bytemuck::pod_read_unaligned::<T>));
+    Ok(())
+}
+
+/// Reads numbers. `field` is named if the bytes are not whole numbers.
+pub fn read<T: bytemuck::AnyBitPattern>(bytes: &[u8], field: &'static str) -> Result<Vec<T>, WireError> {
+    let mut values = Vec::new();
+    read_into(bytes, &mut values, field)?;
+    Ok(values)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn numbers_survive_at_any_alignment(values: Vec<f32>, offset in 0usize..4) {
+            let mut buffer = vec![0; offset];
+            buffer.extend_from_slice(as_bytes(&values));
+            let read: Vec<f32> = read(&buffer[offset..], "values").expect("whole numbers");
+            let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
+            prop_assert_eq!(bits(&read), bits(&values));
+        }
+    }
+
+    #[test]
+    fn half_a_number_is_refused_by_name() {
+        let error = read::<f32>(&[0; 7], "actions").expect_err("7 bytes");
+        assert_eq!(error.message, "`actions` has 7 bytes, which is no multiple of 4");
+    }
+}
