@@ -1,3 +1,38 @@
-//! Placeholder.
+//! The command line `twinstep`: one subcommand a file.
 
-fn main() {}
+mod demo;
+mod exit;
+mod joint_plot;
+mod replay;
+mod serve;
+mod trot;
+
+use clap::{Parser, Subcommand};
+
+/// Thousands of simulated Unitree Go2 for reinforcement learning, and an honest look at the gap to the real one.
+#[derive(Parser)]
+#[command(version, propagate_version = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Verb,
+}
+
+#[derive(Subcommand)]
+enum Verb {
+    Demo(demo::Args),
+    Serve(serve::Args),
+}
+
+fn main() -> std::process::ExitCode {
+    tracing_subscriber::fmt()
+        .with_env_filter(
+            tracing_subscriber::EnvFilter::try_from_env("TWINSTEP_LOG").unwrap_or_else(|_| "warn,twinstep=info".into()),
+        )
+        .with_writer(std::io::stderr)
+        .init();
+    let result = match Cli::parse().command {
+        Verb::Demo(args) => demo::run(&args),
+        Verb::Serve(args) => serve::run(&args),
+    };
+    exit::code(result)
+}

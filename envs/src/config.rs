@@ -9,6 +9,8 @@ pub type Range = [f32; 2];
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TaskConfig {
+    /// Which task.
+    pub name: TaskName,
     /// Time after which an episode is truncated [s].
     pub max_episode_s: f32,
     /// Time after which a new velocity command is drawn [s].
@@ -30,6 +32,7 @@ pub struct TaskConfig {
 impl Default for TaskConfig {
     fn default() -> Self {
         Self {
+            name: TaskName::Walk,
             max_episode_s: 20.0,
             command_resample_s: 10.0,
             command: CommandRanges::default(),
@@ -40,6 +43,17 @@ impl Default for TaskConfig {
             start_position_noise_rad: 0.1,
         }
     }
+}
+
+/// The tasks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TaskName {
+    /// Follow velocity commands.
+    #[default]
+    Walk,
+    /// No physics: count steps, to prove and to measure the transport. The other settings do not matter to it.
+    Counter,
 }
 
 /// Ranges of the velocity command, in the base frame.
@@ -231,7 +245,10 @@ mod tests {
     #[test]
     fn reversed_range_is_refused_by_name() {
         let config = Randomisation { payload_kg: [2.0, 1.0], ..Randomisation::default() };
-        expect!["`randomise.payload_kg` = [2.0, 1.0] is not allowed: [low, high] with low <= high, both within -3 to 20"].assert_eq(&config.check().expect_err("reversed").to_string());
+        expect![
+            "`randomise.payload_kg` = [2.0, 1.0] is not allowed: [low, high] with low <= high, both within -3 to 20"
+        ]
+        .assert_eq(&config.check().expect_err("reversed").to_string());
     }
 
     #[test]

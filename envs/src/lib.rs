@@ -15,7 +15,7 @@ pub mod reward;
 mod task_env;
 
 pub use check::{CheckError, check};
-pub use config::{CommandRanges, ConfigError, Randomisation, RewardWeights, TaskConfig};
+pub use config::{CommandRanges, ConfigError, Randomisation, RewardWeights, TaskConfig, TaskName};
 pub use counter::{Counter, CounterEnv};
 pub use observation::{OBS_LEN, observe, walk_spec};
 pub use task_env::{TaskEnv, TaskSettings};

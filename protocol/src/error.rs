@@ -46,6 +46,13 @@ pub enum Code {
     Internal,
 }
 
+impl Code {
+    /// True if the request had effects, so that its sequence number is used up; false if the number is still free.
+    pub fn counts_as_executed(self) -> bool {
+        matches!(self, Code::Diverged)
+    }
+}
+
 /// An error reply.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, thiserror::Error)]
 pub struct WireError {
@@ -82,7 +89,8 @@ impl WireError {
         self
     }
 
-    pub(crate) fn version(theirs: u16) -> Self {
+    /// The answer to a request of the protocol version `theirs`.
+    pub fn version(theirs: u16) -> Self {
         Self::new(Code::Version, "protocol", format!("`protocol` = {theirs} is not spoken here; {PROTOCOL} is"))
             .with_hint("install the same Twinstep on both ends; `hello` tells what the server speaks")
     }

@@ -1,0 +1,136 @@
+//! `twinstep demo`: robots stepped over Zenoh, then a real recording beside the simulation.
+
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::Instant;
+
+use indicatif::{ProgressBar, ProgressStyle};
+use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_logs::Log;
+use twinstep_model::{ResetRequest, VecEnv, go2};
+use twinstep_sim::SimConfig;
+
+use crate::exit::{Failure, Outcome, Signals, input, other};
+use crate::replay::replay;
+use crate::{joint_plot, trot};
+
+/// The recording, so that the demo needs nothing but the binary.
+const RECORDING: [(&str, &[u8]); 3] = [
+    ("data.csv.gz", include_bytes!("../../data/go2_air_chirp/data.csv.gz")),
+    ("meta.json", include_bytes!("../../data/go2_air_chirp/meta.json")),
+    ("LICENSE", include_bytes!("../../data/go2_air_chirp/LICENSE")),
+];
+
+/// The whole story in a minute, nothing but this program needed.
+///
+/// Starts a server, connects an agent to it from another process over Zenoh, and steps robots in a scripted trot. Then
+/// replays a recording of a real Go2, held in the air, on the simulated one, and shows joint by joint what the
+/// simulation gets wrong.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Robots to step.
+    #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    envs: u32,
+    /// Seconds of robot time to step them.
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=3600))]
+    seconds: u32,
+    /// Folder for the picture and the recording.
+    #[arg(long, default_value = "twinstep-demo", value_name = "DIR")]
+    out: PathBuf,
+}
+
+/// Both halves of the story.
+pub fn run(args: &Args) -> Outcome {
+    let signals = Signals::listen()?;
+    walk(args, &signals)?;
+    compare(&args.out, &signals)
+}
+
+fn walk(args: &Args, signals: &Signals) -> Outcome {
+    let num_envs = args.envs as usize;
+    eprintln!("1. A server in another process, {num_envs} simulated Go2, an agent that talks to it over Zenoh.");
+    let server = ServerProcess::start(num_envs)?;
+    let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&server.endpoint, num_envs)).map_err(other)?;
+    env.reset(&ResetRequest::seeded(1, num_envs)).map_err(other)?;
+    let dt = env.spec().policy_dt as f32;
+    let steps = (args.seconds as f32 / dt) as u64;
+    let bar = ProgressBar::new(steps * num_envs as u64).with_style(
+        ProgressStyle::with_template("   {bar:32} {pos}/{len} env-steps  {per_sec}  {eta} left")
+            .expect("the template is valid"),
+    );
+    let (since, mut ended) = (Instant::now(), 0);
+    for step in 0..steps {
+        signals.check()?;
+        let action = trot::action(step as f32 * dt);
+        let batch = env.step(&action.repeat(num_envs)).map_err(other)?;
+        ended += batch.ended.len();
+        bar.inc(num_envs as u64);
+    }
+    bar.finish_and_clear();
+    let (wall, env_steps) = (since.elapsed().as_secs_f64(), steps * num_envs as u64);
+    println!(
+        "stepped {num_envs} robots for {} s of their time in {wall:.1} s: {:.0} env-steps/s, {:.0} times real time",
+        args.seconds,
+        env_steps as f64 / wall,
+        env_steps as f64 * f64::from(dt) / wall,
+    );
+    println!("episodes that ended (falls): {ended}");
+    env.close().map_err(other)
+}
+
+fn compare(out: &Path, signals: &Signals) -> Outcome {
+    eprintln!("\n2. A recording of a real Go2, held in the air, beside the ideal simulated one.");
+    let folder = out.join("go2_air_chirp");
+    std::fs::create_dir_all(&folder).map_err(input)?;
+    for (name, bytes) in RECORDING {
+        std::fs::write(folder.join(name), bytes).map_err(input)?;
+    }
+    let log = Log::open(&folder).map_err(other)?;
+    let bar = ProgressBar::new(log.rows() as u64);
+    let mut advance = |row: usize| bar.set_position(row as u64);
+    let replayed = replay(&log, &go2(), SimConfig::default(), &mut advance).map_err(other)?;
+    bar.finish_and_clear();
+    signals.check()?;
+    println!("\n{}", replayed.table());
+    let picture = out.join("replay.svg");
+    joint_plot::write_svg(&replayed, "Real Go2 in the air against the ideal simulation", &picture).map_err(other)?;
+    println!("measured against simulated, joint by joint: {}", picture.display());
+    println!("the recording, in the project's log format: {}", folder.display());
+    Ok(())
+}
+
+/// A server as another process, which ends with this one however that ends.
+struct ServerProcess {
+    child: Child,
+    endpoint: String,
+}
+
+impl ServerProcess {
+    fn start(num_envs: usize) -> Result<Self, Failure> {
+        let program = std::env::current_exe().map_err(other)?;
+        let mut child = Command::new(program)
+            .args(["serve", "--until-stdin-closes", "--listen", "tcp/127.0.0.1:0", "--envs", &num_envs.to_string()])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .map_err(other)?;
+        let mut line = String::new();
+        if let Some(stdout) = child.stdout.take() {
+            BufReader::new(stdout).read_line(&mut line).map_err(other)?;
+        }
+        match line.trim().strip_prefix("listening ") {
+            Some(endpoint) => Ok(Self { endpoint: endpoint.to_owned(), child }),
+            None => Err(Failure::Other(miette::miette!("the server did not start; `twinstep serve` says why"))),
+        }
+    }
+}
+
+impl Drop for ServerProcess {
+    fn drop(&mut self) {
+        // The server ends when its stdin closes.
+        drop(self.child.stdin.take());
+        let _ = self.child.wait();
+    }
+}

@@ -1,0 +1,190 @@
+//! A vector environment at the other end of Zenoh.
+
+use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv};
+use twinstep_protocol::keys::Verb;
+use twinstep_protocol::{PROTOCOL, WireError, convert, decode, encode, keys, message, tensor};
+use zenoh::bytes::ZBytes;
+use zenoh::query::Querier;
+
+use crate::link::{Pending, read_answer, send};
+use crate::{ClientError, ConnectOptions, Link};
+
+/// What it takes to take a lease over from another process: keep it where a crash does not lose it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Ticket {
+    /// The lease's id.
+    pub lease: String,
+    /// Its epoch.
+    pub epoch: u64,
+}
+
+/// Environments on a server, for this client alone.
+pub struct RemoteVecEnv {
+    link: Link,
+    ticket: Ticket,
+    spec: EnvSpec,
+    num_envs: usize,
+    autoreset: AutoresetMode,
+    last_seq: u64,
+    step: Querier<'static>,
+    reset: Querier<'static>,
+    /// The request under way, with its verb.
+    pending: Option<(Verb, Pending)>,
+    batch: StepBatch,
+}
+
+impl RemoteVecEnv {
+    /// Leases environments of the server at `options.endpoint`.
+    pub fn connect(options: &ConnectOptions) -> Result<Self, ClientError> {
+        Self::open(options, None)
+    }
+
+    /// Takes over a lease whose client is lost, within the server's grace. The environments are as they were left.
+    pub fn reclaim(options: &ConnectOptions, ticket: &Ticket) -> Result<Self, ClientError> {
+        Self::open(options, Some(ticket))
+    }
+
+    fn open(options: &ConnectOptions, ticket: Option<&Ticket>) -> Result<Self, ClientError> {
+        let link = Link::open(options)?;
+        link.hello()?;
+        let request = message::LeaseRequest {
+            protocol: PROTOCOL,
+            client: link.client().to_owned(),
+            num_envs: options.num_envs as u64,
+            autoreset: options.autoreset,
+            max_episode_steps: options.max_episode_steps,
+            spec_hash: options.spec_hash.clone(),
+            reclaim: ticket.map(|ticket| message::Reclaim { lease: ticket.lease.clone(), epoch: ticket.epoch }),
+        };
+        let querier = link.querier(keys::lease(link.sid()))?;
+        let answer = link.ask(&querier, encode(&request))?;
+        let granted: message::LeaseReply = read_answer(&answer, "lease")?;
+        let key = |verb| keys::env(link.sid(), &granted.lease, verb);
+        let (step, reset) = (link.querier(key(Verb::Step))?, link.querier(key(Verb::Reset))?);
+        let num_envs = granted.num_envs as usize;
+        Ok(Self {
+            batch: StepBatch::new(num_envs, granted.spec.obs_len()),
+            ticket: Ticket { lease: granted.lease, epoch: granted.epoch },
+            spec: granted.spec,
+            num_envs,
+            autoreset: granted.autoreset,
+            last_seq: granted.last_seq,
+            step,
+            reset,
+            pending: None,
+            link,
+        })
+    }
+
+    /// What it takes to take this lease over from another process.
+    pub fn ticket(&self) -> &Ticket {
+        &self.ticket
+    }
+
+    /// Sends actions without waiting: the policy may compute while the server steps. [`RemoteVecEnv::recv`] is next.
+    pub fn send(&mut self, actions: &[f32]) -> Result<(), EnvError> {
+        if let Some((verb, _)) = &self.pending {
+            return Err(remote(ClientError::Unanswered(verb.name())));
+        }
+        let wanted = self.num_envs * self.spec.action_len();
+        if actions.len() != wanted {
+            return Err(EnvError::WrongLength { field: "actions", given: actions.len(), wanted });
+        }
+        let (epoch, seq) = (self.ticket.epoch, self.last_seq + 1);
+        let actions = tensor::as_bytes(actions);
+        let request = encode(&message::StepRequest { protocol: PROTOCOL, epoch, seq, actions });
+        self.pending = Some((Verb::Step, send(&self.step, request).map_err(remote)?));
+        Ok(())
+    }
+
+    /// Waits for what the sent actions gave. After a [`ClientError::NoAnswer`] it may be called again: the step is then
+    /// repeated under its number, and still executed once.
+    pub fn recv(&mut self) -> Result<&StepBatch, EnvError> {
+        match &self.pending {
+            Some((Verb::Step, _)) => {}
+            Some((verb, _)) => return Err(remote(ClientError::Unanswered(verb.name()))),
+            None => return Err(remote(ClientError::NothingSent)),
+        }
+        let answer = self.settle()?;
+        let bytes = answer.to_bytes();
+        let reply: message::StepReply<'_> = decode(&bytes).map_err(|error| malformed("step", error))?;
+        convert::read_step(&reply, &self.spec, self.num_envs, &mut self.batch)
+            .map_err(|error| malformed("step", error))?;
+        Ok(&self.batch)
+    }
+
+    /// Gives the environments back at once, in place of leaving them to the server's grace.
+    pub fn close(mut self) -> Result<(), ClientError> {
+        if self.pending.is_some() {
+            // What it gave no longer matters, but its number must be settled.
+            let _ = self.settle();
+        }
+        let querier = self.link.querier(keys::env(self.link.sid(), &self.ticket.lease, Verb::Close))?;
+        let (epoch, seq) = (self.ticket.epoch, self.last_seq + 1);
+        self.link.ask(&querier, encode(&message::CloseRequest { protocol: PROTOCOL, epoch, seq })).map(drop)
+    }
+
+    /// Waits for the answer to the pending request. Without an answer it stays pending, because it may have been
+    /// executed; its number is used up by an answer, or by an error that had effects.
+    fn settle(&mut self) -> Result<ZBytes, EnvError> {
+        let Some((verb, pending)) = &mut self.pending else { return Err(remote(ClientError::NothingSent)) };
+        let querier = if *verb == Verb::Reset { &self.reset } else { &self.step };
+        let answer = self.link.wait(querier, pending);
+        let executed = match &answer {
+            Ok(_) => true,
+            Err(ClientError::NoAnswer { .. }) => return answer.map_err(remote),
+            Err(ClientError::Refused(refusal)) => refusal.code.counts_as_executed(),
+            Err(_) => false,
+        };
+        self.pending = None;
+        self.last_seq += u64::from(executed);
+        answer.map_err(remote)
+    }
+}
+
+impl VecEnv for RemoteVecEnv {
+    fn spec(&self) -> &EnvSpec {
+        &self.spec
+    }
+
+    fn num_envs(&self) -> usize {
+        self.num_envs
+    }
+
+    fn autoreset(&self) -> AutoresetMode {
+        self.autoreset
+    }
+
+    fn reset(&mut self, request: &ResetRequest) -> Result<&[f32], EnvError> {
+        if self.pending.is_some() {
+            // A step that was given up: what it gave or why it was refused no longer matters, whether it was executed does.
+            let settled = self.settle().map(drop);
+            if self.pending.is_some() {
+                return settled.map(|()| self.batch.obs.as_slice());
+            }
+        }
+        request.check(self.num_envs)?;
+        let payload = convert::encode_reset(request, self.ticket.epoch, self.last_seq + 1);
+        self.pending = Some((Verb::Reset, send(&self.reset, payload).map_err(remote)?));
+        let answer = self.settle()?;
+        let bytes = answer.to_bytes();
+        let reply: message::ResetReply<'_> = decode(&bytes).map_err(|error| malformed("reset", error))?;
+        tensor::read_into(reply.obs, &mut self.batch.obs, "obs").map_err(|error| malformed("reset", error))?;
+        convert::check_length("obs", self.batch.obs.len(), self.num_envs * self.spec.obs_len())
+            .map_err(|error| malformed("reset", error))?;
+        Ok(&self.batch.obs)
+    }
+
+    fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
+        self.send(actions)?;
+        self.recv()
+    }
+}
+
+fn remote(error: ClientError) -> EnvError {
+    EnvError::Remote(Box::new(error))
+}
+
+fn malformed(request: &str, error: WireError) -> EnvError {
+    remote(ClientError::Malformed { request: request.to_owned(), reason: error.message })
+}

@@ -1,0 +1,76 @@
+//! Who builds the environments that a client asked for.
+
+use twinstep_envs::{CounterEnv, TaskEnv, TaskName, TaskSettings};
+use twinstep_model::{AutoresetMode, ModelFileError, RobotModel, VecEnv, go2};
+use twinstep_sim::{BuildError, RapierBackend};
+
+use crate::Config;
+
+/// Builds environments.
+pub trait Host: Send + Sync + 'static {
+    /// `num_envs` environments; `max_episode_steps` in place of the task's own.
+    fn build(
+        &self,
+        num_envs: usize,
+        autoreset: AutoresetMode,
+        max_episode_steps: Option<u32>,
+    ) -> Result<Box<dyn VecEnv>, HostError>;
+}
+
+/// Why environments could not be built.
+#[derive(Debug, thiserror::Error)]
+pub enum HostError {
+    /// The model file was refused.
+    #[error(transparent)]
+    Model(#[from] ModelFileError),
+    /// The simulation was refused.
+    #[error(transparent)]
+    Sim(#[from] BuildError),
+    /// The task was refused.
+    #[error(transparent)]
+    Task(#[from] twinstep_envs::ConfigError),
+}
+
+/// Builds simulated robots as a [`Config`] says.
+pub struct SimHost {
+    config: Config,
+    robot: RobotModel,
+    seed: u64,
+}
+
+impl SimHost {
+    /// Reads the model file and checks the simulation's settings.
+    pub fn new(config: Config) -> Result<Self, HostError> {
+        let robot = match &config.server.model {
+            Some(path) => RobotModel::load(path)?,
+            None => go2(),
+        };
+        config.sim.check(&robot.control).map_err(BuildError::Config)?;
+        let seed = config.server.seed.unwrap_or_else(crate::server::random_u64);
+        Ok(Self { config, robot, seed })
+    }
+}
+
+impl Host for SimHost {
+    fn build(
+        &self,
+        num_envs: usize,
+        autoreset: AutoresetMode,
+        max_episode_steps: Option<u32>,
+    ) -> Result<Box<dyn VecEnv>, HostError> {
+        match self.config.task.name {
+            TaskName::Counter => Ok(Box::new(CounterEnv::new(&self.robot, num_envs, autoreset))),
+            TaskName::Walk => {
+                let backend = RapierBackend::new(self.robot.clone(), self.config.sim, num_envs)?;
+                let settings = TaskSettings {
+                    task: self.config.task.clone(),
+                    randomise: self.config.randomise,
+                    autoreset,
+                    max_episode_steps,
+                    seed: self.seed,
+                };
+                Ok(Box::new(TaskEnv::new(backend, settings)?))
+            }
+        }
+    }
+}

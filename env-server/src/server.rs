@@ -1,0 +1,214 @@
+//! One start of the server: its Zenoh session, its desk, its end.
+
+use std::collections::HashMap;
+use std::collections::hash_map::RandomState;
+use std::hash::{BuildHasher, Hasher};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{SyncSender, sync_channel};
+use std::sync::{Arc, RwLock};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use twinstep_model::AutoresetMode;
+use twinstep_protocol::keys;
+use zenoh::liveliness::LivelinessToken;
+use zenoh::query::Queryable;
+use zenoh::sample::SampleKind;
+use zenoh::{Session, Wait};
+
+use crate::desk::{Desk, DeskJob, Facts, accept};
+use crate::worker::Shared;
+use crate::{Host, HostError, ServerConfig};
+
+/// Requests that may wait at the desk.
+const DESK_QUEUE: usize = 1024;
+/// How long clients that ask on are told of the shutdown before the session closes.
+const FAREWELL: Duration = Duration::from_millis(200);
+
+/// A running server.
+pub struct Server {
+    sid: String,
+    session: Session,
+    queryable: Queryable<()>,
+    token: LivelinessToken,
+    desk: SyncSender<DeskJob>,
+    desk_thread: JoinHandle<()>,
+    shared: Arc<Shared>,
+}
+
+/// Why a server could not start.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// The Zenoh configuration file was refused.
+    #[error("the Zenoh configuration {}: {reason}", path.display())]
+    ZenohConfig {
+        /// The file.
+        path: PathBuf,
+        /// What Zenoh said.
+        reason: String,
+    },
+    /// A value was refused by Zenoh.
+    #[error("`server.{field}` = {value} is refused by Zenoh: {reason}")]
+    Setting {
+        /// The key.
+        field: &'static str,
+        /// Its value.
+        value: String,
+        /// What Zenoh said.
+        reason: String,
+    },
+    /// The session could not be opened.
+    #[error(
+        "cannot listen at {listen}: {reason}\n  if another server runs there, give this one another endpoint: \
+         `--listen tcp/127.0.0.1:0` takes a free port"
+    )]
+    Open {
+        /// The endpoint.
+        listen: String,
+        /// What Zenoh said.
+        reason: String,
+    },
+    /// The session refused a declaration.
+    #[error("cannot answer at {key}: {reason}")]
+    Declare {
+        /// The key.
+        key: String,
+        /// What Zenoh said.
+        reason: String,
+    },
+    /// The environments cannot be built.
+    #[error(transparent)]
+    Host(#[from] HostError),
+    /// The system gave no thread.
+    #[error("cannot start the desk's thread: {0}")]
+    Thread(std::io::Error),
+}
+
+impl Server {
+    /// Opens Zenoh as `config` says and answers with the environments of `host`.
+    pub fn start(config: &ServerConfig, host: Arc<dyn Host>) -> Result<Self, ServerError> {
+        // One environment tells the spec, and that the host can build any.
+        let spec = host.build(1, AutoresetMode::NextStep, None)?.spec().clone();
+        let sid = random_id();
+        let session = zenoh::open(zenoh_config(config)?)
+            .wait()
+            .map_err(|error| ServerError::Open { listen: config.listen.clone(), reason: error.to_string() })?;
+        let (desk, jobs) = sync_channel(DESK_QUEUE);
+        let routes = Arc::new(RwLock::new(HashMap::new()));
+        let shared = Arc::new(Shared { shutting_down: AtomicBool::new(false), env_steps: AtomicU64::new(0) });
+        let facts = Facts {
+            name: config.name.clone(),
+            sid: sid.clone(),
+            spec,
+            max_envs: config.envs,
+            lease_grace: config.lease_grace(),
+        };
+        let own = Desk::new(facts, host, Arc::clone(&shared), Arc::clone(&routes), desk.clone());
+        let desk_thread = std::thread::Builder::new()
+            .name("desk".to_owned())
+            .spawn(move || own.run(&jobs))
+            .map_err(ServerError::Thread)?;
+        watch_clients(&session, &sid, desk.clone())?;
+        let queryable = {
+            let (sid, desk, key) = (sid.clone(), desk.clone(), keys::server(&sid));
+            session
+                .declare_queryable(&key)
+                .complete(true)
+                .callback(move |query| accept(query, &sid, &routes, &desk))
+                .wait()
+                .map_err(|error| ServerError::Declare { key, reason: error.to_string() })?
+        };
+        // Last, so that whoever sees the token is answered.
+        let key = keys::live_server(&sid, &config.name);
+        let token = session
+            .liveliness()
+            .declare_token(&key)
+            .wait()
+            .map_err(|error| ServerError::Declare { key, reason: error.to_string() })?;
+        Ok(Self { sid, session, queryable, token, desk, desk_thread, shared })
+    }
+
+    /// The server's id, new with each start.
+    pub fn sid(&self) -> &str {
+        &self.sid
+    }
+
+    /// Where the server listens, with the port that the system gave.
+    pub fn endpoints(&self) -> Vec<String> {
+        self.session.info().locators().wait().iter().map(ToString::to_string).collect()
+    }
+
+    /// Environment steps executed so far.
+    pub fn env_steps(&self) -> u64 {
+        self.shared.env_steps.load(Ordering::Relaxed)
+    }
+
+    /// Finishes the steps in progress, tells the clients, and closes the session.
+    pub fn stop(self) {
+        self.shared.shutting_down.store(true, Ordering::Release);
+        // Clients that watch see the token go; those that ask get `shutting_down`.
+        let _ = self.token.undeclare().wait();
+        let _ = self.desk.send(DeskJob::Stop);
+        std::thread::sleep(FAREWELL);
+        let _ = self.queryable.undeclare().wait();
+        let _ = self.desk_thread.join();
+        let _ = self.session.close().wait();
+    }
+}
+
+fn watch_clients(session: &Session, sid: &str, desk: SyncSender<DeskJob>) -> Result<(), ServerError> {
+    let key = keys::live_clients(sid);
+    let own_sid = sid.to_owned();
+    session
+        .liveliness()
+        .declare_subscriber(&key)
+        .history(true)
+        .callback(move |sample| {
+            if let Some(client) = keys::parse_live_client(sample.key_expr().as_str(), &own_sid) {
+                // Blocks only while a thousand requests wait; losing the news would keep a dead client's environments.
+                let _ = desk.send(DeskJob::Client(client.to_owned(), sample.kind() == SampleKind::Put));
+            }
+        })
+        .background()
+        .wait()
+        .map_err(|error| ServerError::Declare { key, reason: error.to_string() })
+}
+
+/// The Zenoh configuration: the user's file, then what Twinstep relies on.
+fn zenoh_config(config: &ServerConfig) -> Result<zenoh::Config, ServerError> {
+    let mut zenoh = match &config.zenoh {
+        Some(path) => zenoh::Config::from_file(path)
+            .map_err(|error| ServerError::ZenohConfig { path: path.clone(), reason: error.to_string() })?,
+        None => zenoh::Config::default(),
+    };
+    let listen = serde_json::json!([config.listen]).to_string();
+    let connect = serde_json::json!(config.connect).to_string();
+    let settings: [(&'static str, &str, &str); 6] = [
+        ("listen", "listen/endpoints", &listen),
+        ("connect", "connect/endpoints", &connect),
+        ("zenoh", "mode", "\"peer\""),
+        ("zenoh", "scouting/multicast/enabled", "false"),
+        // A frozen peer is noticed after 2 s in place of Zenoh's 10.
+        ("zenoh", "transport/link/tx/lease", "2000"),
+        ("shared_memory", "transport/shared_memory/enabled", if config.shared_memory { "true" } else { "false" }),
+    ];
+    for (field, key, value) in settings {
+        zenoh.insert_json5(key, value).map_err(|error| ServerError::Setting {
+            field,
+            value: value.to_owned(),
+            reason: error.to_string(),
+        })?;
+    }
+    Ok(zenoh)
+}
+
+/// A random number from the system's entropy.
+pub fn random_u64() -> u64 {
+    RandomState::new().build_hasher().finish()
+}
+
+/// A random id of 16 hexadecimal digits.
+pub fn random_id() -> String {
+    format!("{:016x}", random_u64())
+}

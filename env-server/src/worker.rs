@@ -1,0 +1,277 @@
+//! The worker of one lease: owns its environments and executes every request exactly once, in order.
+//!
+//! Requests carry the lease's epoch and a sequence number. The next number is executed and its reply kept; the same
+//! number again gets that reply again; anything else is a typed error. A request that is refused without effect leaves
+//! its number free.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender};
+
+use twinstep_model::{AutoresetMode, EnvError, VecEnv};
+use twinstep_protocol::keys::Verb;
+use twinstep_protocol::{Code, PROTOCOL, WireError, convert, decode, encode, message, tensor};
+use zenoh::Wait;
+use zenoh::bytes::ZBytes;
+use zenoh::query::Query;
+
+use crate::Host;
+use crate::desk::DeskJob;
+
+/// What a worker is asked.
+pub enum Job {
+    /// A query at one of the lease's keys.
+    Env(Verb, Query),
+    /// A request for the lease itself: tell it again, or hand it over under a new epoch.
+    Lease {
+        /// The query to answer.
+        query: Query,
+        /// The epoch that the client knows, if it takes the lease over.
+        reclaim: Option<u64>,
+    },
+}
+
+/// What a worker shares with the desk.
+pub struct Shared {
+    /// Set when the server shuts down: nothing new is executed.
+    pub shutting_down: AtomicBool,
+    /// Environment steps executed by all workers.
+    pub env_steps: AtomicU64,
+}
+
+/// What was granted.
+pub struct Grant {
+    /// The lease's id.
+    pub lease: String,
+    /// Number of environments.
+    pub num_envs: usize,
+    /// When an ended episode starts anew.
+    pub autoreset: AutoresetMode,
+    /// Policy steps after which an episode is truncated, in place of the task's own.
+    pub max_episode_steps: Option<u32>,
+}
+
+/// Owns the environments of one lease.
+pub struct Worker {
+    grant: Grant,
+    env: Box<dyn VecEnv>,
+    shared: Arc<Shared>,
+    desk: SyncSender<DeskJob>,
+    epoch: u64,
+    last_seq: u64,
+    /// Verb and reply of `last_seq`.
+    last_reply: Option<(Verb, Answer)>,
+    actions: Vec<f32>,
+    /// Why the environments can no longer be used, once they cannot.
+    broken: Option<String>,
+}
+
+/// An encoded reply, kept for repeats. Cloning shares the bytes.
+#[derive(Clone)]
+enum Answer {
+    Ok(ZBytes),
+    Err(WireError),
+}
+
+impl Worker {
+    /// Builds the environments and answers until the lease is freed. Runs on the worker's own thread.
+    pub fn run(grant: Grant, host: &dyn Host, shared: Arc<Shared>, desk: SyncSender<DeskJob>, jobs: &Receiver<Job>) {
+        let built = catch_unwind(AssertUnwindSafe(|| {
+            host.build(grant.num_envs, grant.autoreset, grant.max_episode_steps).map_err(|error| error.to_string())
+        }));
+        let env = match built.unwrap_or_else(|panic| Err(panic_text(&panic))) {
+            Ok(env) => env,
+            Err(reason) => return refuse_all(jobs, &desk, &grant.lease, &reason),
+        };
+        let mut worker = Self {
+            env,
+            shared,
+            desk,
+            epoch: 1,
+            last_seq: 0,
+            last_reply: None,
+            actions: Vec::new(),
+            broken: None,
+            grant,
+        };
+        // Ends when the desk drops the lease, and with it the sender.
+        while let Ok(job) = jobs.recv() {
+            match job {
+                Job::Env(verb, query) => {
+                    let answer = worker.answer(verb, &query);
+                    send(&query, answer);
+                }
+                Job::Lease { query, reclaim } => {
+                    let answer = worker.hand_over(reclaim);
+                    send(&query, answer);
+                }
+            }
+        }
+    }
+
+    fn hand_over(&mut self, reclaim: Option<u64>) -> Answer {
+        if let Some(known) = reclaim {
+            if known != self.epoch {
+                return Answer::Err(stale_epoch(known, self.epoch));
+            }
+            self.epoch += 1;
+        }
+        Answer::Ok(ZBytes::from(encode(&message::LeaseReply {
+            protocol: PROTOCOL,
+            lease: self.grant.lease.clone(),
+            epoch: self.epoch,
+            num_envs: self.grant.num_envs as u64,
+            autoreset: self.grant.autoreset,
+            last_seq: self.last_seq,
+            spec: self.env.spec().clone(),
+        })))
+    }
+
+    fn answer(&mut self, verb: Verb, query: &Query) -> Answer {
+        let payload = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
+        let header = match decode::<message::EnvHeader>(&payload) {
+            Ok(header) => header,
+            Err(error) => return Answer::Err(error),
+        };
+        if let Err(error) = self.check_header(&header) {
+            return Answer::Err(error);
+        }
+        if header.seq == self.last_seq {
+            return match &self.last_reply {
+                Some((answered, answer)) if *answered == verb => answer.clone(),
+                _ => Answer::Err(stale_sequence(header.seq, self.last_seq)),
+            };
+        }
+        if self.shared.shutting_down.load(Ordering::Acquire) {
+            return Answer::Err(shutting_down());
+        }
+        if let Some(reason) = &self.broken {
+            return Answer::Err(broken(reason));
+        }
+        let outcome = catch_unwind(AssertUnwindSafe(|| self.execute(verb, &payload)));
+        let answer = match outcome {
+            Ok(Ok(bytes)) => Answer::Ok(ZBytes::from(bytes)),
+            // Refused without effect: the number stays free.
+            Ok(Err(error)) if !error.code.counts_as_executed() => return Answer::Err(error),
+            Ok(Err(error)) => Answer::Err(error),
+            Err(panic) => {
+                let reason = panic_text(&panic);
+                tracing::error!(lease = self.grant.lease, reason, "environments panicked");
+                self.broken = Some(reason.clone());
+                Answer::Err(broken(&reason))
+            }
+        };
+        self.last_seq = header.seq;
+        self.last_reply = Some((verb, answer.clone()));
+        answer
+    }
+
+    fn check_header(&self, header: &message::EnvHeader) -> Result<(), WireError> {
+        if header.protocol != PROTOCOL {
+            return Err(WireError::version(header.protocol));
+        }
+        if header.epoch != self.epoch {
+            return Err(stale_epoch(header.epoch, self.epoch));
+        }
+        if header.seq < self.last_seq {
+            return Err(stale_sequence(header.seq, self.last_seq));
+        }
+        if header.seq > self.last_seq + 1 {
+            let message = format!("`seq` = {} skips: the last executed is {}", header.seq, self.last_seq);
+            return Err(WireError::new(Code::SequenceGap, "seq", message)
+                .with_hint("send every number once, and repeat it until it is answered"));
+        }
+        Ok(())
+    }
+
+    fn execute(&mut self, verb: Verb, payload: &[u8]) -> Result<Vec<u8>, WireError> {
+        match verb {
+            Verb::Reset => {
+                let request: message::ResetRequest<'_> = decode(payload)?;
+                let wanted = convert::read_reset(&request)?;
+                let obs = self.env.reset(&wanted).map_err(|error| convert::wire_error(&error))?;
+                let obs = tensor::as_bytes(obs);
+                Ok(encode(&message::ResetReply { protocol: PROTOCOL, seq: request.seq, obs }))
+            }
+            Verb::Step => {
+                let request: message::StepRequest<'_> = decode(payload)?;
+                tensor::read_into(request.actions, &mut self.actions, "actions")?;
+                let batch = self.env.step(&self.actions).map_err(|error| logged(&error))?;
+                self.shared.env_steps.fetch_add(batch.reward.len() as u64, Ordering::Relaxed);
+                Ok(convert::encode_step(batch, request.seq))
+            }
+            Verb::Close => {
+                let request: message::CloseRequest = decode(payload)?;
+                self.broken = Some("the client closed it".to_owned());
+                // A full desk only delays this: the lease is then freed when its client is gone.
+                let _ = self.desk.try_send(DeskJob::Closed(self.grant.lease.clone()));
+                Ok(encode(&message::CloseReply { protocol: PROTOCOL, seq: request.seq }))
+            }
+        }
+    }
+}
+
+fn logged(error: &EnvError) -> WireError {
+    if matches!(error, EnvError::Diverged { .. } | EnvError::Backend(_)) {
+        tracing::warn!(%error, "step failed");
+    }
+    convert::wire_error(error)
+}
+
+/// Answers everything with the reason why the environments could not be built, until the lease is freed.
+fn refuse_all(jobs: &Receiver<Job>, desk: &SyncSender<DeskJob>, lease: &str, reason: &str) {
+    tracing::error!(lease, reason, "environments could not be built");
+    let _ = desk.try_send(DeskJob::Closed(lease.to_owned()));
+    while let Ok(job) = jobs.recv() {
+        let (Job::Env(_, query) | Job::Lease { query, .. }) = job;
+        let message = format!("the environments could not be built: {reason}");
+        send(&query, Answer::Err(WireError::new(Code::Internal, "", message)));
+    }
+}
+
+fn send(query: &Query, answer: Answer) {
+    match answer {
+        Answer::Ok(bytes) => reply(query, bytes),
+        Answer::Err(error) => reply_error(query, &error),
+    }
+}
+
+/// Sends a reply; a client that is gone by now is told nothing.
+pub fn reply(query: &Query, bytes: ZBytes) {
+    if let Err(error) = query.reply(query.key_expr(), bytes).express(true).wait() {
+        tracing::debug!(%error, key = %query.key_expr(), "reply not sent");
+    }
+}
+
+/// Sends an error reply; a client that is gone by now is told nothing.
+pub fn reply_error(query: &Query, error: &WireError) {
+    if let Err(failure) = query.reply_err(encode(error)).wait() {
+        tracing::debug!(%failure, key = %query.key_expr(), "error reply not sent");
+    }
+}
+
+fn panic_text(panic: &Box<dyn std::any::Any + Send>) -> String {
+    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+    text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "panicked".to_owned())
+}
+
+fn broken(reason: &str) -> WireError {
+    WireError::new(Code::LeaseLost, "lease", format!("the environments of this lease are gone: {reason}"))
+        .with_hint("ask for a new lease")
+}
+
+/// The answer to everything while the server shuts down.
+pub fn shutting_down() -> WireError {
+    WireError::new(Code::ShuttingDown, "", "the server is shutting down; nothing was executed")
+}
+
+fn stale_epoch(given: u64, current: u64) -> WireError {
+    let message = format!("`epoch` = {given} is not the lease's: it is {current}");
+    WireError::new(Code::StaleEpoch, "epoch", message).with_hint("another client took the lease over, or never had it")
+}
+
+fn stale_sequence(given: u64, last: u64) -> WireError {
+    let message = format!("`seq` = {given} was answered before: the last executed is {last}");
+    WireError::new(Code::StaleSequence, "seq", message)
+}
