@@ -1,6 +1,6 @@
 //! The desk: greets, grants leases, watches which clients live, frees what is lost.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, RwLock};
@@ -67,7 +67,7 @@ pub struct Desk {
     own_queue: SyncSender<DeskJob>,
     leases: HashMap<String, Lease>,
     /// Clients whose token is visible.
-    present: std::collections::HashSet<String>,
+    present: HashSet<String>,
 }
 
 struct Lease {
@@ -108,7 +108,7 @@ impl Desk {
         routes: Routes,
         own_queue: SyncSender<DeskJob>,
     ) -> Self {
-        Self { facts, host, shared, routes, own_queue, leases: HashMap::new(), present: Default::default() }
+        Self { facts, host, shared, routes, own_queue, leases: HashMap::new(), present: HashSet::new() }
     }
 
     /// Serves until told to stop, then waits for the workers. Runs on the desk's own thread.
@@ -159,10 +159,10 @@ impl Desk {
     fn hello(&self, query: &Query) -> Result<Vec<u8>, WireError> {
         let payload = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
         // Any version may ask, so that it learns which are spoken.
-        if let Err(error) = decode::<message::HelloRequest>(&payload) {
-            if error.code != Code::Version {
-                return Err(error);
-            }
+        if let Err(error) = decode::<message::HelloRequest>(&payload)
+            && error.code != Code::Version
+        {
+            return Err(error);
         }
         Ok(encode(&message::HelloReply {
             protocol: PROTOCOL,
@@ -281,8 +281,8 @@ impl Desk {
 
     fn pass_on(&self, lease: &str, job: Job) -> Result<(), WireError> {
         let routes = self.routes.read().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let sent = routes.get(lease).map(|route| route.jobs.try_send(job));
-        if matches!(sent, Some(Ok(()))) { Ok(()) } else { Err(WireError::new(Code::Busy, "", "the lease is busy")) }
+        let sent = routes.get(lease).is_some_and(|route| route.jobs.try_send(job).is_ok());
+        if sent { Ok(()) } else { Err(WireError::new(Code::Busy, "", "the lease is busy")) }
     }
 
     fn note_client(&mut self, client: String, present: bool) {

@@ -1,0 +1,227 @@
+//! The server and its client in one process, over a real Zenoh link on loopback.
+
+use std::sync::Arc;
+
+use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv};
+use twinstep_env_server::{Config, Host, HostError, Server, SimHost};
+use twinstep_envs::{Counter, OBS_LEN, TaskName, check};
+use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv, go2};
+use twinstep_protocol::Code;
+
+fn config(task: TaskName) -> Config {
+    let mut config = Config::default();
+    config.task.name = task;
+    config.server.listen = "tcp/127.0.0.1:0".to_owned();
+    config.server.envs = 64;
+    config.server.seed = Some(1);
+    config
+}
+
+fn start(config: &Config) -> (Server, String) {
+    start_with(config, Arc::new(SimHost::new(config.clone()).unwrap()))
+}
+
+fn start_with(config: &Config, host: Arc<dyn Host>) -> (Server, String) {
+    let server = Server::start(&config.server, host).unwrap();
+    let endpoint = server.endpoints().into_iter().find(|endpoint| endpoint.starts_with("tcp/127.0.0.1")).unwrap();
+    (server, endpoint)
+}
+
+fn refusal(error: &EnvError) -> Code {
+    let EnvError::Remote(error) = error else { panic!("{error}") };
+    match error.downcast_ref::<ClientError>() {
+        Some(ClientError::Refused(refusal)) => refusal.code,
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn remote_walk_passes_the_checker_in_every_autoreset_mode() {
+    let (server, endpoint) = start(&config(TaskName::Walk));
+    for autoreset in [AutoresetMode::NextStep, AutoresetMode::SameStep, AutoresetMode::Disabled] {
+        let options = ConnectOptions { autoreset, max_episode_steps: Some(7), ..ConnectOptions::new(&endpoint, 3) };
+        let mut env = RemoteVecEnv::connect(&options).unwrap();
+        check(&mut env, 30).unwrap();
+        env.close().unwrap();
+    }
+    server.stop();
+}
+
+#[test]
+fn remote_and_local_walk_give_the_same_bits() {
+    let config = config(TaskName::Walk);
+    let (server, endpoint) = start(&config);
+    let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
+    let mut local = SimHost::new(config).unwrap().build(2, AutoresetMode::NextStep, None).unwrap();
+    let request = ResetRequest::seeded(5, 2);
+    assert_eq!(remote.reset(&request).unwrap(), local.reset(&request).unwrap());
+    for step in 0..50 {
+        let actions: Vec<f32> = (0..24).map(|index| ((step * 7 + index) as f32).sin()).collect();
+        assert_eq!(remote.step(&actions).unwrap(), local.step(&actions).unwrap(), "step {step}");
+    }
+    server.stop();
+}
+
+#[test]
+fn several_clients_have_their_own_environments() {
+    let (server, endpoint) = start(&config(TaskName::Counter));
+    let clients: Vec<_> = (1..4usize)
+        .map(|num_envs| {
+            let endpoint = endpoint.clone();
+            std::thread::spawn(move || {
+                let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, num_envs)).unwrap();
+                env.reset(&ResetRequest::default()).unwrap();
+                let mut own = vec![Counter { resets: 1, ..Counter::default() }; num_envs];
+                for step in 0..200 {
+                    let actions: Vec<f32> = (0..12 * num_envs).map(|index| (step + index * num_envs) as f32).collect();
+                    let batch = env.step(&actions).unwrap();
+                    for (index, counter) in own.iter_mut().enumerate() {
+                        counter.step(&actions[12 * index..12 * (index + 1)]);
+                        assert_eq!(batch.obs[index * OBS_LEN..][..4], counter.observation());
+                    }
+                }
+            })
+        })
+        .collect();
+    for client in clients {
+        client.join().unwrap();
+    }
+    server.stop();
+}
+
+#[test]
+fn overlapped_steps_are_executed_once_each() {
+    let (server, endpoint) = start(&config(TaskName::Counter));
+    let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 1)).unwrap();
+    env.reset(&ResetRequest::default()).unwrap();
+    for step in 1..=20u32 {
+        env.send(&[0.5; 12]).unwrap();
+        assert!(env.send(&[0.5; 12]).is_err(), "one request at a time");
+        assert_eq!(env.recv().unwrap().obs[0], step as f32);
+    }
+    assert!(env.recv().is_err(), "nothing was sent");
+    server.stop();
+}
+
+#[test]
+fn bad_input_is_refused_by_name_and_the_next_good_step_works() {
+    let (server, endpoint) = start(&config(TaskName::Walk));
+    let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
+    assert_eq!(refusal(&env.step(&[0.0; 24]).unwrap_err()), Code::NeedsReset);
+    env.reset(&ResetRequest::seeded(1, 2)).unwrap();
+    let mut actions = [0.0; 24];
+    actions[13] = f32::NAN;
+    let error = env.step(&actions).unwrap_err();
+    assert_eq!(refusal(&error), Code::NotFinite);
+    assert!(error.to_string().contains("environment 1, joint_position_offset[FL_thigh], is NaN"), "{error}");
+    assert!(env.step(&[0.0; 24]).is_ok());
+    server.stop();
+}
+
+#[test]
+fn more_environments_than_there_are_are_refused_with_both_numbers() {
+    let (server, endpoint) = start(&config(TaskName::Walk));
+    for num_envs in [65, 1_000_000_000] {
+        let error = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, num_envs)).err().unwrap().to_string();
+        assert!(error.contains(&format!("{num_envs} are too many: 64 of 64 are free")), "{error}");
+    }
+    assert!(RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 64)).is_ok());
+    server.stop();
+}
+
+#[test]
+fn policy_made_for_another_robot_is_refused() {
+    let (server, endpoint) = start(&config(TaskName::Walk));
+    let options = ConnectOptions { spec_hash: Some("0".repeat(32)), ..ConnectOptions::new(&endpoint, 1) };
+    let Some(ClientError::Refused(error)) = RemoteVecEnv::connect(&options).err() else { panic!("accepted") };
+    assert_eq!(error.code, Code::SpecMismatch);
+    server.stop();
+}
+
+#[test]
+fn lease_is_reclaimed_with_its_number_and_the_old_client_is_told() {
+    let (server, endpoint) = start(&config(TaskName::Counter));
+    let options = ConnectOptions::new(&endpoint, 1);
+    let mut first = RemoteVecEnv::connect(&options).unwrap();
+    first.reset(&ResetRequest::default()).unwrap();
+    first.step(&[1.0; 12]).unwrap();
+    let mut second = RemoteVecEnv::reclaim(&options, first.ticket()).unwrap();
+    assert_eq!(second.step(&[2.0; 12]).unwrap().obs[0], 2.0, "it continues where the first was");
+    assert_eq!(refusal(&first.step(&[3.0; 12]).unwrap_err()), Code::StaleEpoch);
+    assert_eq!(second.step(&[4.0; 12]).unwrap().obs[0], 3.0, "the old client executed nothing");
+    server.stop();
+}
+
+#[test]
+fn nobody_at_the_endpoint_is_said_with_the_command_to_start_one() {
+    let mut options = ConnectOptions::new("tcp/127.0.0.1:9", 1);
+    options.connect_timeout = std::time::Duration::from_millis(300);
+    let error = RemoteVecEnv::connect(&options).err().unwrap().to_string();
+    assert!(error.starts_with("no server answers at tcp/127.0.0.1:9"), "{error}");
+    assert!(error.contains("twinstep serve"), "{error}");
+}
+
+/// A host whose environments panic at their third step.
+struct Fragile;
+
+struct FragileEnv(Box<dyn VecEnv>, u32);
+
+impl Host for Fragile {
+    fn build(&self, num_envs: usize, autoreset: AutoresetMode, _: Option<u32>) -> Result<Box<dyn VecEnv>, HostError> {
+        let inner = Box::new(twinstep_envs::CounterEnv::new(&go2(), num_envs, autoreset));
+        Ok(Box::new(FragileEnv(inner, 0)))
+    }
+}
+
+impl VecEnv for FragileEnv {
+    fn spec(&self) -> &EnvSpec {
+        self.0.spec()
+    }
+    fn num_envs(&self) -> usize {
+        self.0.num_envs()
+    }
+    fn autoreset(&self) -> AutoresetMode {
+        self.0.autoreset()
+    }
+    fn reset(&mut self, request: &ResetRequest) -> Result<&[f32], EnvError> {
+        self.0.reset(request)
+    }
+    fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
+        self.1 += 1;
+        assert!(self.1 < 3, "planted in the third step");
+        self.0.step(actions)
+    }
+}
+
+#[test]
+fn panic_in_an_environment_is_answered_and_the_server_lives_on() {
+    let (server, endpoint) = start_with(&config(TaskName::Counter), Arc::new(Fragile));
+    let options = ConnectOptions::new(&endpoint, 1);
+    let mut env = RemoteVecEnv::connect(&options).unwrap();
+    env.reset(&ResetRequest::default()).unwrap();
+    env.step(&[0.0; 12]).unwrap();
+    env.step(&[0.0; 12]).unwrap();
+    for _ in 0..2 {
+        let error = env.step(&[0.0; 12]).unwrap_err();
+        assert_eq!(refusal(&error), Code::LeaseLost);
+        assert!(error.to_string().contains("planted in the third step"), "{error}");
+    }
+    let mut other = RemoteVecEnv::connect(&options).unwrap();
+    assert!(other.reset(&ResetRequest::default()).is_ok());
+    server.stop();
+}
+
+#[test]
+fn stopping_server_tells_its_client() {
+    let (server, endpoint) = start(&config(TaskName::Counter));
+    let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 1)).unwrap();
+    env.reset(&ResetRequest::default()).unwrap();
+    let stopper = std::thread::spawn(move || server.stop());
+    let error = loop {
+        if let Err(error) = env.step(&[0.0; 12]) {
+            break error.to_string();
+        }
+    };
+    assert!(error.contains("is shutting down"), "{error}");
+    stopper.join().unwrap();
+}
