@@ -1,8 +1,6 @@
 //! `twinstep demo`: robots stepped over Zenoh, then a real recording beside the simulation.
 
-use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
 use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
@@ -11,8 +9,9 @@ use twinstep_logs::Log;
 use twinstep_model::{ResetRequest, VecEnv, go2};
 use twinstep_sim::SimConfig;
 
-use crate::exit::{Failure, Outcome, Signals, input, other};
+use crate::exit::{Outcome, Signals, input, other};
 use crate::replay::replay;
+use crate::server_process::ServerProcess;
 use crate::{joint_plot, trot};
 
 /// The recording, so that the demo needs nothing but the binary.
@@ -50,7 +49,7 @@ pub fn run(args: &Args) -> Outcome {
 fn walk(args: &Args, signals: &Signals) -> Outcome {
     let num_envs = args.envs as usize;
     eprintln!("1. A server in another process, {num_envs} simulated Go2, an agent that talks to it over Zenoh.");
-    let server = ServerProcess::start(num_envs)?;
+    let server = ServerProcess::start(&["--envs", &num_envs.to_string()])?;
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&server.endpoint, num_envs)).map_err(other)?;
     env.reset(&ResetRequest::seeded(1, num_envs)).map_err(other)?;
     let dt = env.spec().policy_dt as f32;
@@ -98,39 +97,4 @@ fn compare(out: &Path, signals: &Signals) -> Outcome {
     println!("measured against simulated, joint by joint: {}", picture.display());
     println!("the recording, in the project's log format: {}", folder.display());
     Ok(())
-}
-
-/// A server as another process, which ends with this one however that ends.
-struct ServerProcess {
-    child: Child,
-    endpoint: String,
-}
-
-impl ServerProcess {
-    fn start(num_envs: usize) -> Result<Self, Failure> {
-        let program = std::env::current_exe().map_err(other)?;
-        let mut child = Command::new(program)
-            .args(["serve", "--until-stdin-closes", "--listen", "tcp/127.0.0.1:0", "--envs", &num_envs.to_string()])
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::null())
-            .spawn()
-            .map_err(other)?;
-        let mut line = String::new();
-        if let Some(stdout) = child.stdout.take() {
-            BufReader::new(stdout).read_line(&mut line).map_err(other)?;
-        }
-        match line.trim().strip_prefix("listening ") {
-            Some(endpoint) => Ok(Self { endpoint: endpoint.to_owned(), child }),
-            None => Err(Failure::Other(miette::miette!("the server did not start; `twinstep serve` says why"))),
-        }
-    }
-}
-
-impl Drop for ServerProcess {
-    fn drop(&mut self) {
-        // The server ends when its stdin closes.
-        drop(self.child.stdin.take());
-        let _ = self.child.wait();
-    }
 }

@@ -1,10 +1,12 @@
 //! The command line `twinstep`: one subcommand a file.
 
+mod bench;
 mod demo;
 mod exit;
 mod joint_plot;
 mod replay;
 mod serve;
+mod server_process;
 mod trot;
 
 use clap::{Parser, Subcommand};
@@ -19,6 +21,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Verb {
+    Bench(bench::Args),
     Demo(demo::Args),
     Serve(serve::Args),
 }
@@ -31,6 +34,7 @@ fn main() -> std::process::ExitCode {
         .with_writer(std::io::stderr)
         .init();
     let result = match Cli::parse().command {
+        Verb::Bench(args) => bench::run(&args),
         Verb::Demo(args) => demo::run(&args),
         Verb::Serve(args) => serve::run(&args),
     };

@@ -27,8 +27,8 @@ impl Default for SimConfig {
     fn default() -> Self {
         Self {
             engine: Engine::Rapier,
-            physics_hz: 400,
-            solver_iterations: 1,
+            physics_hz: 200,
+            solver_iterations: 2,
             terrain: Terrain::Flat,
             base: Base::Floating,
             threads: 0,

@@ -1,0 +1,61 @@
+//! Environments with physics: the same walk over Zenoh and in process, in turn.
+
+use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_env_server::{Config, Host, SimHost};
+use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
+
+use super::Row;
+use super::pace::{Pace, WINDOWS, measure as pace, median};
+use crate::exit::{Failure, Signals, other};
+use crate::server_process::ServerProcess;
+use crate::trot;
+
+/// Environment steps a second, remote beside in process.
+pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+    let mut rows = Vec::new();
+    for num_envs in [64, 1024] {
+        let (remote, local) = side_by_side(num_envs, window_s, signals)?;
+        let env_steps = num_envs as f64;
+        rows.push(Row {
+            case: format!("walk in process, {num_envs} envs"),
+            value: local.per_second * env_steps,
+            unit: "env-steps/s",
+            reference: None,
+            ratio: None,
+        });
+        rows.push(Row {
+            case: format!("walk over Zenoh, {num_envs} envs"),
+            value: remote.per_second * env_steps,
+            unit: "env-steps/s",
+            reference: Some("the same envs in process".to_owned()),
+            ratio: Some(remote.per_second / local.per_second),
+        });
+    }
+    Ok(rows)
+}
+
+fn side_by_side(num_envs: usize, window_s: f64, signals: &Signals) -> Result<(Pace, Pace), Failure> {
+    let server = ServerProcess::start(&[])?;
+    let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&server.endpoint, num_envs)).map_err(other)?;
+    let mut local = SimHost::new(Config::default())
+        .and_then(|host| host.build(num_envs, AutoresetMode::NextStep, None))
+        .map_err(other)?;
+    let request = ResetRequest::seeded(1, num_envs);
+    remote.reset(&request).map_err(other)?;
+    local.reset(&request).map_err(other)?;
+    // The same trot in both, so that both meet the same contacts.
+    let (mut remote_steps, mut local_steps) = (0, 0);
+    let (mut ours, mut reference) = (Vec::new(), Vec::new());
+    for _ in 0..WINDOWS {
+        signals.check()?;
+        ours.push(pace(window_s, || step(&mut remote, &mut remote_steps))?);
+        reference.push(pace(window_s, || step(&mut *local, &mut local_steps))?);
+    }
+    Ok((median(&ours), median(&reference)))
+}
+
+fn step(env: &mut dyn VecEnv, steps: &mut u32) -> Result<(), Failure> {
+    let action = trot::action(*steps as f32 * env.spec().policy_dt as f32);
+    *steps += 1;
+    env.step(&action.repeat(env.num_envs())).map(drop).map_err(other)
+}

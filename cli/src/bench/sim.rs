@@ -1,0 +1,111 @@
+//! Physics on one core: what each setting costs, and what accuracy it buys against the finest one.
+
+use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, go2};
+use twinstep_sim::{RapierBackend, SimConfig};
+
+use super::Row;
+use super::pace::{WINDOWS, measure as pace, median};
+use crate::exit::{Failure, Signals, other};
+use crate::trot;
+
+/// Physics rate [Hz] and solver iterations.
+type Setting = (u32, u32);
+
+/// The shipped settings.
+const SETTINGS: [Setting; 6] = [(200, 1), (200, 2), (200, 4), (400, 1), (1000, 1), (1000, 4)];
+/// What the others are compared with.
+const FINEST: Setting = (4000, 4);
+/// Robots in a measured batch.
+const ROBOTS: usize = 16;
+/// Drive periods in the second that accuracy is measured over.
+const SECOND: usize = 200;
+
+/// Environment steps a second and joint error of every setting.
+pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+    let motions: [(&str, fn(usize) -> PerJoint); 2] = [("stance step", stance_step), ("trot", trot_target)];
+    let finest = motions.map(|(_, target)| joint_positions(FINEST, target));
+    let finest_name = format!("{} Hz x {}", FINEST.0, FINEST.1);
+    let mut rows = Vec::new();
+    for setting in SETTINGS {
+        signals.check()?;
+        let name = format!("physics {} Hz x {}", setting.0, setting.1);
+        rows.push(Row {
+            case: format!("{name}, one core"),
+            value: env_steps_per_second(setting, window_s)?,
+            unit: "env-steps/s",
+            reference: None,
+            ratio: None,
+        });
+        for ((motion, target), finest) in motions.iter().zip(&finest) {
+            let positions = joint_positions(setting, *target)?;
+            rows.push(Row {
+                case: format!("{name}, joint error, 1 s of {motion}"),
+                value: rms_difference(&positions, finest.as_ref().map_err(|_| Failure::Interrupted)?),
+                unit: "rad",
+                reference: Some(finest_name.clone()),
+                ratio: None,
+            });
+        }
+    }
+    Ok(rows)
+}
+
+fn backend((physics_hz, solver_iterations): Setting, robots: usize) -> Result<RapierBackend, Failure> {
+    let config = SimConfig { physics_hz, solver_iterations, threads: 1, ..SimConfig::default() };
+    let mut backend = RapierBackend::new(go2(), config, robots).map_err(other)?;
+    let placement = Placement::at_rest(0.31, go2().control.default_pose_f32());
+    let placements: Vec<_> = (0..robots).map(|robot| (robot, placement)).collect();
+    backend.reset(&placements).map_err(other)?;
+    Ok(backend)
+}
+
+fn command(target: PerJoint) -> Command {
+    // kp 40, kd 1: stiff enough to stand on, in the range of policies for this robot.
+    Command::hold(target, 40.0, 1.0)
+}
+
+fn env_steps_per_second(setting: Setting, window_s: f64) -> Result<f64, Failure> {
+    let mut backend = backend(setting, ROBOTS)?;
+    let decimation = go2().control.decimation;
+    let mut period = 0;
+    let mut windows = Vec::new();
+    for _ in 0..WINDOWS {
+        windows.push(pace(window_s, || {
+            period += decimation;
+            let commands = vec![command(trot_target(period)); ROBOTS];
+            backend.step(&commands, &[true; ROBOTS], decimation).map_err(other)
+        })?);
+    }
+    Ok(median(&windows).per_second * ROBOTS as f64)
+}
+
+/// Joint positions after each drive period of one second, after half a second to settle.
+fn joint_positions(setting: Setting, target: fn(usize) -> PerJoint) -> Result<Vec<PerJoint>, Failure> {
+    let mut backend = backend(setting, 1)?;
+    let stand = command(go2().control.default_pose_f32());
+    backend.step(&[stand], &[true], SECOND / 2).map_err(other)?;
+    (0..SECOND)
+        .map(|period| {
+            backend.step(&[command(target(period))], &[true], 1).map_err(other)?;
+            Ok(backend.states().q[0])
+        })
+        .collect()
+}
+
+/// Every joint is told to move by 0.2 rad at once.
+fn stance_step(_: usize) -> PerJoint {
+    let pose = go2().control.default_pose_f32();
+    std::array::from_fn(|j| pose[j] + if j % 3 == 2 { -0.2 } else { 0.1 })
+}
+
+fn trot_target(period: usize) -> PerJoint {
+    let control = go2().control;
+    let (pose, action) = (control.default_pose_f32(), trot::action(period as f32 * control.drive_dt() as f32));
+    std::array::from_fn(|j| pose[j] + control.action_scale as f32 * action[j])
+}
+
+fn rms_difference(one: &[PerJoint], other: &[PerJoint]) -> f64 {
+    let squares: f64 =
+        one.iter().flatten().zip(other.iter().flatten()).map(|(one, other)| f64::from(one - other).powi(2)).sum();
+    (squares / (one.len() * NUM_JOINTS) as f64).sqrt()
+}

@@ -1,0 +1,1 @@
+//! Examples: one idea each. They are the files beside this one.
