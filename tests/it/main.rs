@@ -2,5 +2,7 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod layering;
 mod physics;
 mod remote;
+mod tidy;

@@ -11,6 +11,9 @@ use crate::trot;
 /// Physics rate [Hz] and solver iterations.
 type Setting = (u32, u32);
 
+/// Wanted joint positions [rad] in a drive period of a motion.
+type Target = fn(usize) -> PerJoint;
+
 /// The shipped settings.
 const SETTINGS: [Setting; 6] = [(200, 1), (200, 2), (200, 4), (400, 1), (1000, 1), (1000, 4)];
 /// What the others are compared with.
@@ -22,8 +25,8 @@ const SECOND: usize = 200;
 
 /// Environment steps a second and joint error of every setting.
 pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
-    let motions: [(&str, fn(usize) -> PerJoint); 2] = [("stance step", stance_step), ("trot", trot_target)];
-    let finest = motions.map(|(_, target)| joint_positions(FINEST, target));
+    let motions: [(&str, Target); 2] = [("stance step", stance_step), ("trot", trot_target)];
+    let finest = motions.iter().map(|(_, target)| joint_positions(FINEST, *target)).collect::<Result<Vec<_>, _>>()?;
     let finest_name = format!("{} Hz x {}", FINEST.0, FINEST.1);
     let mut rows = Vec::new();
     for setting in SETTINGS {
@@ -40,7 +43,7 @@ pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
             let positions = joint_positions(setting, *target)?;
             rows.push(Row {
                 case: format!("{name}, joint error, 1 s of {motion}"),
-                value: rms_difference(&positions, finest.as_ref().map_err(|_| Failure::Interrupted)?),
+                value: rms_difference(&positions, finest),
                 unit: "rad",
                 reference: Some(finest_name.clone()),
                 ratio: None,
@@ -80,7 +83,7 @@ fn env_steps_per_second(setting: Setting, window_s: f64) -> Result<f64, Failure>
 }
 
 /// Joint positions after each drive period of one second, after half a second to settle.
-fn joint_positions(setting: Setting, target: fn(usize) -> PerJoint) -> Result<Vec<PerJoint>, Failure> {
+fn joint_positions(setting: Setting, target: Target) -> Result<Vec<PerJoint>, Failure> {
     let mut backend = backend(setting, 1)?;
     let stand = command(go2().control.default_pose_f32());
     backend.step(&[stand], &[true], SECOND / 2).map_err(other)?;

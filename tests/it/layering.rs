@@ -1,0 +1,75 @@
+//! Who may use whom: the star around `model`, and one wall around each big library.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// Crate folder and the workspace crates it may depend on. Leaves import only the core; the edge composes them.
+const MAY_USE: [(&str, &[&str]); 10] = [
+    ("model", &[]),
+    ("logs", &["model"]),
+    ("protocol", &["model"]),
+    ("sim", &["model"]),
+    ("envs", &["model"]),
+    ("env-server", &["model", "protocol", "sim", "envs"]),
+    ("clients/rust", &["model", "protocol"]),
+    ("cli", &["model", "logs", "protocol", "sim", "envs", "env-server", "client"]),
+    ("examples", &["model", "logs", "protocol", "sim", "envs", "env-server", "client"]),
+    ("tests", &["model", "logs", "protocol", "sim", "envs", "env-server", "client"]),
+];
+
+/// A library that stands behind one wall, and the crates inside it.
+const WALLS: [(&str, &[&str]); 5] = [
+    ("rapier3d", &["sim"]),
+    ("zenoh", &["env-server", "clients/rust", "tests"]),
+    ("clap", &["cli", "tests"]),
+    ("plotters", &["cli"]),
+    ("parquet", &["logs"]),
+];
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_owned()
+}
+
+/// Names of all dependencies in the manifest of `folder`, of every kind.
+fn dependencies(folder: &str) -> BTreeSet<String> {
+    let text = std::fs::read_to_string(root().join(folder).join("Cargo.toml")).unwrap();
+    let manifest: toml::Table = text.parse().unwrap();
+    ["dependencies", "dev-dependencies", "build-dependencies"]
+        .iter()
+        .filter_map(|kind| manifest.get(*kind)?.as_table())
+        .flat_map(|table| table.keys().cloned())
+        .collect()
+}
+
+#[test]
+fn every_member_of_the_workspace_has_its_place_in_the_star() {
+    let text = std::fs::read_to_string(root().join("Cargo.toml")).unwrap();
+    let manifest: toml::Table = text.parse().unwrap();
+    let members: BTreeSet<&str> =
+        manifest["workspace"]["members"].as_array().unwrap().iter().filter_map(toml::Value::as_str).collect();
+    assert_eq!(members, MAY_USE.iter().map(|(folder, _)| *folder).collect());
+}
+
+#[test]
+fn crates_use_only_what_the_star_allows() {
+    for (folder, allowed) in MAY_USE {
+        for name in dependencies(folder) {
+            if let Some(used) = name.strip_prefix("twinstep-") {
+                assert!(allowed.contains(&used), "{folder}/Cargo.toml uses {name}; it may use {allowed:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn big_libraries_stay_behind_their_walls() {
+    for (folder, _) in MAY_USE {
+        let used = dependencies(folder);
+        for (library, inside) in WALLS {
+            assert!(
+                !used.contains(library) || inside.contains(&folder),
+                "{folder} uses {library}; only {inside:?} may"
+            );
+        }
+    }
+}

@@ -1,0 +1,78 @@
+//! What a reader relies on and nobody would notice going stale.
+
+use std::path::{Path, PathBuf};
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_owned()
+}
+
+/// Every file of the project with one of `extensions`, outside build outputs.
+fn files(folder: &Path, extensions: &[&str], found: &mut Vec<PathBuf>) {
+    for entry in std::fs::read_dir(folder).unwrap().map(Result::unwrap) {
+        let (path, name) = (entry.path(), entry.file_name());
+        if path.is_dir() {
+            if !["target", ".git", ".venv", "node_modules", "twinstep-demo"].contains(&name.to_str().unwrap()) {
+                files(&path, extensions, found);
+            }
+        } else if path.extension().is_some_and(|extension| extensions.contains(&extension.to_str().unwrap())) {
+            found.push(path);
+        }
+    }
+}
+
+fn sources(extensions: &[&str]) -> Vec<(PathBuf, String)> {
+    let mut found = Vec::new();
+    files(&root(), extensions, &mut found);
+    assert!(found.len() > 2, "the search found its files");
+    found.into_iter().map(|path| (path.clone(), std::fs::read_to_string(&path).unwrap())).collect()
+}
+
+#[test]
+fn nothing_is_left_to_do_in_the_code() {
+    // Put together at run time, so that this file does not find itself.
+    let marks =
+        [["TO", "DO"].concat(), ["FIX", "ME"].concat(), ["todo", "!("].concat(), ["unimplemented", "!("].concat()];
+    for (path, text) in sources(&["rs", "py", "toml", "md"]) {
+        for (line, content) in text.lines().enumerate() {
+            assert!(!marks.iter().any(|mark| content.contains(mark)), "{}:{}: {content}", path.display(), line + 1);
+        }
+    }
+}
+
+#[test]
+fn every_rust_file_says_first_what_it_holds() {
+    for (path, text) in sources(&["rs"]) {
+        assert!(text.starts_with("//! "), "{} starts without `//!`", path.display());
+    }
+}
+
+#[test]
+fn readme_gives_the_two_commands_and_ci_runs_the_same_test_command() {
+    let read = |path: &str| std::fs::read_to_string(root().join(path)).unwrap();
+    let (readme, ci) = (read("README.md"), read(".ci/run"));
+    assert!(readme.contains("cargo run --release -- demo"));
+    assert!(readme.contains("cargo test --release --workspace") && ci.contains("cargo test --release --workspace"));
+}
+
+#[test]
+fn links_in_the_documents_lead_somewhere() {
+    for (path, text) in sources(&["md"]) {
+        for target in text.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
+            let file = target.split('#').next().unwrap();
+            if file.is_empty() || file.contains("://") {
+                continue;
+            }
+            assert!(path.parent().unwrap().join(file).exists(), "{} links to {target}", path.display());
+        }
+    }
+}
+
+#[test]
+fn examples_are_short_enough_to_read_at_once() {
+    let mut found = Vec::new();
+    files(&root().join("examples"), &["rs"], &mut found);
+    for path in found {
+        let lines = std::fs::read_to_string(&path).unwrap().lines().count();
+        assert!(lines <= 60, "{} has {lines} lines", path.display());
+    }
+}
