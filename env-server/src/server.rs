@@ -184,13 +184,15 @@ fn zenoh_config(config: &ServerConfig) -> Result<zenoh::Config, ServerError> {
     };
     let listen = serde_json::json!([config.listen]).to_string();
     let connect = serde_json::json!(config.connect).to_string();
-    let settings: [(&'static str, &str, &str); 6] = [
+    let settings: [(&'static str, &str, &str); 7] = [
         ("listen", "listen/endpoints", &listen),
         ("connect", "connect/endpoints", &connect),
         ("zenoh", "mode", "\"peer\""),
         ("zenoh", "scouting/multicast/enabled", "false"),
         // A frozen peer is noticed after 2 s in place of Zenoh's 10.
         ("zenoh", "transport/link/tx/lease", "2000"),
+        // A router that comes back is found within a second in place of Zenoh's four.
+        ("zenoh", "connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
         ("shared_memory", "transport/shared_memory/enabled", if config.shared_memory { "true" } else { "false" }),
     ];
     for (field, key, value) in settings {

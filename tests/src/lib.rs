@@ -1,1 +1,14 @@
-//! .
+//! Faults injected into real processes, and the proof that no step is executed twice, skipped or invented.
+//!
+//! A [`lane::Lane`] is a server, a client and, on every second lane, a router between them, each a process of its own
+//! ([`roles`]). Faults ([`fault::Fault`]) hit it one after another while the client steps counters (task `counter`) at full
+//! speed. The client compares every observation with a counter of its own ([`ledger::Ledger`]), which also survives the
+//! client's death. [`campaign`] runs many lanes at once and adds up.
+
+pub mod campaign;
+pub mod fault;
+pub mod lane;
+pub mod ledger;
+pub mod process;
+pub mod repeats;
+pub mod roles;

@@ -19,6 +19,9 @@ use crate::ClientError;
 const QUERY_TIMEOUT: Duration = Duration::from_secs(2);
 /// Pause before a repeat, doubled each time up to the second.
 const PAUSES: [Duration; 2] = [Duration::from_millis(2), Duration::from_millis(200)];
+/// How long another server must stand in the place of ours before ours counts as restarted. A server that lost its
+/// router is back within a second.
+const REPLACED_FOR: Duration = Duration::from_secs(2);
 
 /// Where to connect and what to ask for.
 #[derive(Clone, Debug)]
@@ -146,7 +149,7 @@ impl Link {
     pub fn wait(&self, querier: &Querier<'static>, pending: &mut Pending) -> Result<ZBytes, ClientError> {
         let since = Instant::now();
         let mut pause = PAUSES[0];
-        let mut missed = 0;
+        let mut replaced_since: Option<Instant> = None;
         loop {
             match outcome(&pending.replies) {
                 Outcome::Answer(bytes) => return Ok(bytes),
@@ -156,9 +159,8 @@ impl Link {
                 Outcome::Error(error) if !error.retry => return Err(error.into()),
                 Outcome::Error(_) | Outcome::Timeout => {}
                 Outcome::Nobody => {
-                    missed = if self.is_replaced() { missed + 1 } else { 0 };
-                    // Seen twice, so that a moment of an old and a new token together is no restart.
-                    if missed >= 2 {
+                    replaced_since = self.is_replaced().then(|| replaced_since.unwrap_or_else(Instant::now));
+                    if replaced_since.is_some_and(|since| since.elapsed() >= REPLACED_FOR) {
                         return Err(ClientError::Restarted { endpoint: self.endpoint.clone() });
                     }
                 }
@@ -267,6 +269,8 @@ fn zenoh_config(options: &ConnectOptions) -> Result<zenoh::Config, ClientError> 
         ("connect/endpoints", endpoints.as_str()),
         ("scouting/multicast/enabled", "false"),
         ("transport/link/tx/lease", "2000"),
+        // A server or router that comes back is found within a second in place of Zenoh's four.
+        ("connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
         ("transport/shared_memory/enabled", if options.shared_memory { "true" } else { "false" }),
     ] {
         config.insert_json5(key, value).map_err(|error| refuse(format!("`{key}` = {value}: {error}")))?;

@@ -1,0 +1,32 @@
+//! Some thirty faults through real processes. `target/release/faults --faults 1000` injects many more.
+
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+use twinstep_tests::campaign::{self, Plan, Tally};
+
+fn inject(faults: usize, lanes: usize, server_arguments: &[&str]) -> Tally {
+    let plan = Plan {
+        program: Path::new(env!("CARGO_BIN_EXE_faults")),
+        faults,
+        lanes,
+        seed: 1,
+        server_arguments: server_arguments.iter().map(|argument| (*argument).to_owned()).collect(),
+    };
+    campaign::run(&plan, &AtomicBool::new(false), |_| ()).unwrap()
+}
+
+#[test]
+fn faults_never_execute_a_step_twice_skip_or_invent_one() {
+    let tally = inject(32, 8, &[]);
+    println!("{tally}");
+    assert_eq!(tally.total(), 32);
+    assert_eq!(tally.injected.len(), 7, "every kind was injected");
+    assert!(tally.failures.is_empty(), "{:#?}", tally.failures);
+}
+
+#[test]
+fn server_that_executes_a_step_twice_is_found_out() {
+    let tally = inject(1, 1, &["--double-every", "20"]);
+    assert!(tally.failures.iter().any(|(_, evidence)| evidence.starts_with("violation")), "{:#?}", tally.failures);
+}

@@ -1,0 +1,116 @@
+//! Many faults on many lanes at once, added up.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::channel;
+
+use twinstep_model::stream;
+
+use crate::fault::Fault;
+use crate::lane::Lane;
+
+/// What to inject.
+pub struct Plan<'a> {
+    /// The program with the roles of [`crate::roles`].
+    pub program: &'a Path,
+    /// Number of faults.
+    pub faults: usize,
+    /// Lanes at once; every second one has a router.
+    pub lanes: usize,
+    /// Seed of the faults and their moments.
+    pub seed: u64,
+    /// Further arguments of the servers.
+    pub server_arguments: Vec<String>,
+}
+
+/// What came of it.
+#[derive(Debug, Default)]
+pub struct Tally {
+    /// How often each fault was injected.
+    pub injected: BTreeMap<Fault, usize>,
+    /// The fault and the evidence of everything that went wrong.
+    pub failures: Vec<(Fault, String)>,
+    /// Steps that clients acknowledged, each checked.
+    pub steps: u64,
+}
+
+impl Tally {
+    /// Faults injected in all.
+    pub fn total(&self) -> usize {
+        self.injected.values().sum()
+    }
+}
+
+impl std::fmt::Display for Tally {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let mut table = format!("{:<42}{:>9}{:>8}\n", "fault", "injected", "failed");
+        for (fault, count) in &self.injected {
+            let failed = self.failures.iter().filter(|(failed, _)| failed == fault).count();
+            writeln!(table, "{:<42}{count:>9}{failed:>8}", fault.name())?;
+        }
+        writeln!(table, "{:<42}{:>9}{:>8}", "all", self.total(), self.failures.len())?;
+        write!(table, "{} acknowledged steps, each compared with the client's own counters", self.steps)?;
+        formatter.write_str(&table)
+    }
+}
+
+/// Injects the faults of `plan`. `progress` is told of each; `stop` ends early.
+pub fn run(plan: &Plan<'_>, stop: &AtomicBool, progress: impl Fn(Fault)) -> Result<Tally, String> {
+    let (sender, outcomes) = channel();
+    std::thread::scope(|scope| {
+        let threads: Vec<_> = (0..plan.lanes)
+            .map(|index| {
+                let sender = sender.clone();
+                let share = plan.faults / plan.lanes + usize::from(index < plan.faults % plan.lanes);
+                scope.spawn(move || {
+                    run_lane(plan, index, share, stop, |fault, failure| {
+                        // The receiver outlives every lane.
+                        let _ = sender.send((fault, failure));
+                    })
+                })
+            })
+            .collect();
+        drop(sender);
+        let mut tally = Tally::default();
+        for (fault, failure) in outcomes {
+            *tally.injected.entry(fault).or_default() += 1;
+            tally.failures.extend(failure.map(|evidence| (fault, evidence)));
+            progress(fault);
+        }
+        for thread in threads {
+            tally.steps += thread.join().map_err(|_| "a lane panicked".to_owned())??;
+        }
+        Ok(tally)
+    })
+}
+
+/// Injects `share` faults; a lane that does not go on is started anew. Returns the acknowledged steps.
+fn run_lane(
+    plan: &Plan<'_>,
+    index: usize,
+    share: usize,
+    stop: &AtomicBool,
+    report: impl Fn(Fault, Option<String>),
+) -> Result<u64, String> {
+    let with_router = index % 2 == 1;
+    let mut random = stream(plan.seed, "faults", index as u64);
+    let start = || Lane::start(plan.program, with_router, &plan.server_arguments);
+    let mut lane = start()?;
+    let mut steps = 0;
+    for _ in 0..share {
+        if stop.load(Ordering::Acquire) {
+            break;
+        }
+        let fault = Fault::draw(&mut random, lane.has_router());
+        let outcome = lane.inject(fault, &mut random);
+        let failed = outcome.is_err();
+        report(fault, outcome.err());
+        if failed {
+            steps += lane.steps;
+            lane = start()?;
+        }
+    }
+    Ok(steps + lane.steps)
+}

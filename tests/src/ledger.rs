@@ -1,0 +1,107 @@
+//! What a client knows about its counters, and whether an observation can be true.
+
+use twinstep_envs::{Counter, OBS_LEN};
+
+/// Counters a client steps. They differ in their actions, so that mixed up rows show.
+pub const NUM_ENVS: usize = 2;
+
+/// The states that the counters may be in.
+///
+/// Usually one. After a client's death two: its last request was executed, or was not.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Ledger {
+    possible: Vec<[Counter; NUM_ENVS]>,
+}
+
+impl Ledger {
+    /// Freshly built environments that were reset once.
+    pub fn after_first_reset() -> Self {
+        Self { possible: vec![[Counter { resets: 1, ..Counter::default() }; NUM_ENVS]] }
+    }
+
+    /// The last acknowledged state of a client that died with a request under way.
+    pub fn inherited(acknowledged: [Counter; NUM_ENVS]) -> Self {
+        let mut executed = acknowledged;
+        step(&mut executed, &actions(&acknowledged));
+        Self { possible: vec![acknowledged, executed] }
+    }
+
+    /// The actions to send next: they follow from the state, so that an heir knows what its predecessor sent.
+    pub fn actions(&self) -> Vec<f32> {
+        actions(&self.possible[0])
+    }
+
+    /// Takes in the observations after `actions`; an error if no possible state explains them.
+    pub fn observe(&mut self, actions: &[f32], obs: &[f32]) -> Result<[Counter; NUM_ENVS], String> {
+        for counters in &mut self.possible {
+            step(counters, actions);
+        }
+        self.settle(obs)
+    }
+
+    /// Checks observations that no step came before.
+    pub fn settle(&mut self, obs: &[f32]) -> Result<[Counter; NUM_ENVS], String> {
+        let seen: Vec<&[f32]> = obs.chunks_exact(OBS_LEN).map(|row| &row[..4]).collect();
+        let expected = self.possible.clone();
+        self.possible.retain(|counters| counters.iter().map(Counter::observation).eq(seen.iter().copied()));
+        match self.possible[..] {
+            [counters] => Ok(counters),
+            _ => Err(format!("observed {seen:?}, possible were {expected:?}")),
+        }
+    }
+}
+
+/// Sixteen-bit numbers that the state determines.
+fn actions(counters: &[Counter; NUM_ENVS]) -> Vec<f32> {
+    let value = |counter: &Counter, env: usize, joint: usize| {
+        let seed = counter.mix ^ (counter.steps * 97 + env as u32 * 31 + joint as u32);
+        (seed.wrapping_mul(0x9e37_79b9) >> 16) as f32
+    };
+    let entries =
+        counters.iter().enumerate().flat_map(|(env, counter)| (0..12).map(move |joint| (counter, env, joint)));
+    entries.map(|(counter, env, joint)| value(counter, env, joint)).collect()
+}
+
+fn step(counters: &mut [Counter; NUM_ENVS], actions: &[f32]) {
+    for (counter, action) in counters.iter_mut().zip(actions.chunks_exact(12)) {
+        counter.step(action);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn observation(counters: &[Counter; NUM_ENVS]) -> Vec<f32> {
+        counters.iter().flat_map(|counter| [counter.observation().to_vec(), vec![0.0; OBS_LEN - 4]].concat()).collect()
+    }
+
+    #[test]
+    fn step_executed_twice_or_skipped_is_noticed() {
+        for executed in [0, 2] {
+            let mut ledger = Ledger::after_first_reset();
+            let mut counters = ledger.possible[0];
+            let actions = ledger.actions();
+            for _ in 0..executed {
+                step(&mut counters, &actions);
+            }
+            assert!(ledger.observe(&actions, &observation(&counters)).is_err(), "{executed} times");
+        }
+    }
+
+    #[test]
+    fn heir_accepts_the_last_request_executed_once_or_not_at_all() {
+        let acknowledged = [Counter { steps: 5, resets: 1, mix: 77 }; NUM_ENVS];
+        let sent = actions(&acknowledged);
+        for executed in 0..3 {
+            let mut counters = acknowledged;
+            for _ in 0..executed {
+                step(&mut counters, &sent);
+            }
+            let mut ledger = Ledger::inherited(acknowledged);
+            let next = ledger.actions();
+            step(&mut counters, &next);
+            assert_eq!(ledger.observe(&next, &observation(&counters)).is_ok(), executed < 2, "{executed} times");
+        }
+    }
+}

@@ -1,0 +1,90 @@
+//! A child process that can be killed, frozen and thawed, and whose lines can be awaited.
+
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::time::{Duration, Instant};
+
+/// A child process; killed when dropped.
+pub struct Process {
+    child: Child,
+    lines: Receiver<String>,
+}
+
+impl Process {
+    /// Starts `program` with `arguments`; its stdout is read line by line.
+    pub fn start(program: &Path, arguments: &[String]) -> Result<Self, String> {
+        let mut child = Command::new(program)
+            .args(arguments)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .map_err(|error| format!("{} {}: {error}", program.display(), arguments.join(" ")))?;
+        let (sender, lines) = channel();
+        let stdout = child.stdout.take().ok_or("the child has no stdout")?;
+        std::thread::spawn(move || {
+            for line in BufReader::new(stdout).lines().map_while(Result::ok) {
+                if sender.send(line).is_err() {
+                    break;
+                }
+            }
+        });
+        Ok(Self { child, lines })
+    }
+
+    /// The next line, or `None` after `timeout` or once the process has ended.
+    pub fn line(&self, timeout: Duration) -> Option<String> {
+        self.lines.recv_timeout(timeout).ok()
+    }
+
+    /// Every line that is there already.
+    pub fn lines_so_far(&self) -> Vec<String> {
+        self.lines.try_iter().collect()
+    }
+
+    /// SIGKILL, and what it still printed.
+    pub fn kill(&mut self) -> Vec<String> {
+        // Both fail only if it has ended already.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        self.lines.iter().collect()
+    }
+
+    /// SIGSTOP.
+    pub fn freeze(&self) -> Result<(), String> {
+        self.signal("STOP")
+    }
+
+    /// SIGCONT.
+    pub fn thaw(&self) -> Result<(), String> {
+        self.signal("CONT")
+    }
+
+    fn signal(&self, name: &str) -> Result<(), String> {
+        let status = Command::new("kill").args([&format!("-{name}"), &self.child.id().to_string()]).status();
+        match status {
+            Ok(status) if status.success() => Ok(()),
+            other => Err(format!("kill -{name}: {other:?}")),
+        }
+    }
+
+    /// The exit code, once the process has ended by itself.
+    pub fn exit_code(&mut self, timeout: Duration) -> Option<i32> {
+        let since = Instant::now();
+        while since.elapsed() < timeout {
+            match self.lines.recv_timeout(Duration::from_millis(10)) {
+                Err(RecvTimeoutError::Disconnected) => return self.child.wait().ok()?.code(),
+                Ok(_) | Err(RecvTimeoutError::Timeout) => {}
+            }
+        }
+        None
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        self.kill();
+    }
+}

@@ -1,0 +1,227 @@
+//! What the processes of a lane do.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv, Ticket};
+use twinstep_env_server::{Host, HostError, Server, ServerConfig};
+use twinstep_envs::{Counter, CounterEnv};
+use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv, go2};
+use zenoh::Wait;
+
+use crate::ledger::{Ledger, NUM_ENVS};
+
+/// One process of a lane.
+#[derive(clap::Subcommand, Clone, Debug)]
+pub enum Role {
+    /// A server whose steps take time, so that it can be hit in the middle of one.
+    Server(ServerArgs),
+    /// A client that steps counters and checks every observation.
+    Client(ClientArgs),
+    /// A Zenoh session in router mode.
+    Router {
+        /// Where it listens.
+        listen: String,
+    },
+}
+
+/// Of [`Role::Server`].
+#[derive(clap::Args, Clone, Debug)]
+pub struct ServerArgs {
+    /// Where it listens.
+    pub listen: String,
+    /// Router that it connects to.
+    #[arg(long)]
+    pub connect: Option<String>,
+    /// Duration of a step [ms].
+    #[arg(long, default_value_t = 4)]
+    pub step_ms: u64,
+    /// Plants the error that all this is here to find: every so many steps, one is executed twice.
+    #[arg(long)]
+    pub double_every: Option<u32>,
+}
+
+/// Of [`Role::Client`].
+#[derive(clap::Args, Clone, Debug)]
+pub struct ClientArgs {
+    /// Where it connects.
+    pub endpoint: String,
+    /// The dead client's lease to take over, its epoch, and steps, resets and mixes it had acknowledged.
+    #[arg(long, num_args = 2 + 3 * NUM_ENVS)]
+    pub inherit: Option<Vec<String>>,
+}
+
+impl Role {
+    /// Does what the role does; ends only with an error, or by a signal.
+    pub fn run(&self) -> Result<(), Box<dyn std::error::Error>> {
+        match self {
+            Role::Server(arguments) => serve(arguments),
+            Role::Client(arguments) => Ok(client(arguments)?),
+            Role::Router { listen } => route(listen),
+        }
+    }
+}
+
+fn route(listen: &str) -> Result<(), Box<dyn std::error::Error>> {
+    let mut config = zenoh::Config::default();
+    for (key, value) in [
+        ("mode", "\"router\"".to_owned()),
+        ("listen/endpoints", format!("[\"{listen}\"]")),
+        ("scouting/multicast/enabled", "false".to_owned()),
+        ("transport/link/tx/lease", "2000".to_owned()),
+    ] {
+        config.insert_json5(key, &value).map_err(|error| error.to_string())?;
+    }
+    let _session = zenoh::open(config).wait().map_err(|error| error.to_string())?;
+    println!("listening {listen}");
+    wait_for_a_signal()
+}
+
+fn serve(arguments: &ServerArgs) -> Result<(), Box<dyn std::error::Error>> {
+    let config = ServerConfig {
+        listen: arguments.listen.clone(),
+        connect: arguments.connect.iter().cloned().collect(),
+        envs: 64,
+        ..ServerConfig::default()
+    };
+    let server = Server::start(&config, Arc::new(SlowHost(arguments.clone())))?;
+    println!("listening {}", server.endpoints().join(" "));
+    wait_for_a_signal()
+}
+
+fn wait_for_a_signal() -> ! {
+    loop {
+        std::thread::park();
+    }
+}
+
+struct SlowHost(ServerArgs);
+
+struct SlowEnv {
+    inner: CounterEnv,
+    step: Duration,
+    double_every: Option<u32>,
+    steps: u32,
+}
+
+impl Host for SlowHost {
+    fn build(&self, num_envs: usize, autoreset: AutoresetMode, _: Option<u32>) -> Result<Box<dyn VecEnv>, HostError> {
+        let inner = CounterEnv::new(&go2(), num_envs, autoreset);
+        let step = Duration::from_millis(self.0.step_ms);
+        Ok(Box::new(SlowEnv { inner, step, double_every: self.0.double_every, steps: 0 }))
+    }
+}
+
+impl VecEnv for SlowEnv {
+    fn spec(&self) -> &EnvSpec {
+        self.inner.spec()
+    }
+
+    fn num_envs(&self) -> usize {
+        self.inner.num_envs()
+    }
+
+    fn autoreset(&self) -> AutoresetMode {
+        self.inner.autoreset()
+    }
+
+    fn reset(&mut self, request: &ResetRequest) -> Result<&[f32], EnvError> {
+        self.inner.reset(request)
+    }
+
+    fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
+        self.steps += 1;
+        if self.double_every.is_some_and(|every| self.steps.is_multiple_of(every)) {
+            self.inner.step(actions)?;
+        }
+        // Half of the time before and half after, so that a fault hits both sides of the execution.
+        std::thread::sleep(self.step / 2);
+        let batch = self.inner.step(actions)?;
+        std::thread::sleep(self.step / 2);
+        Ok(batch)
+    }
+}
+
+/// Steps until killed. Prints `lease ID EPOCH`, `acked` with the counters of each step, `lost REASON` when its
+/// environments are gone, and `violation` with the evidence.
+fn client(arguments: &ClientArgs) -> Result<(), ClientError> {
+    // Shorter than a freeze, so that the client gives up a request and takes it up again.
+    let options = ConnectOptions {
+        timeout: Duration::from_secs(2),
+        connect_timeout: Duration::from_secs(20),
+        ..ConnectOptions::new(&arguments.endpoint, NUM_ENVS)
+    };
+    let mut heritage = arguments.inherit.as_deref().map(read_heritage);
+    loop {
+        let (env, ledger) = match heritage.take() {
+            Some((ticket, counters)) => (RemoteVecEnv::reclaim(&options, &ticket)?, Ledger::inherited(counters)),
+            None => match fresh(&options) {
+                Ok(started) => started,
+                Err(reason) => {
+                    println!("lost {}", reason.replace('\n', " "));
+                    continue;
+                }
+            },
+        };
+        let Ticket { lease, epoch } = env.ticket();
+        println!("lease {lease} {epoch}");
+        match step_until_lost(env, ledger) {
+            Ended::Lost(reason) => println!("lost {}", reason.replace('\n', " ")),
+            Ended::Violation(evidence) => println!("violation {evidence}"),
+        }
+    }
+}
+
+fn fresh(options: &ConnectOptions) -> Result<(RemoteVecEnv, Ledger), String> {
+    let mut env = RemoteVecEnv::connect(options).map_err(|error| error.to_string())?;
+    let mut ledger = Ledger::after_first_reset();
+    let obs = env.reset(&ResetRequest::default()).map_err(|error| error.to_string())?;
+    ledger.settle(obs)?;
+    Ok((env, ledger))
+}
+
+enum Ended {
+    Lost(String),
+    Violation(String),
+}
+
+fn step_until_lost(mut env: RemoteVecEnv, mut ledger: Ledger) -> Ended {
+    loop {
+        let actions = ledger.actions();
+        if let Err(error) = env.send(&actions) {
+            return Ended::Lost(error.to_string());
+        }
+        let batch = loop {
+            match env.recv().cloned() {
+                Ok(batch) => break batch,
+                Err(error) if gave_up(&error) => println!("waiting {}", error.to_string().replace('\n', " ")),
+                Err(error) => return Ended::Lost(error.to_string()),
+            }
+        };
+        match ledger.observe(&actions, &batch.obs) {
+            Ok(counters) => println!("acked {}", write_counters(&counters)),
+            Err(evidence) => return Ended::Violation(evidence),
+        }
+    }
+}
+
+/// True if nobody knows whether the request was executed: it is asked for again.
+fn gave_up(error: &EnvError) -> bool {
+    let EnvError::Remote(error) = error else { return false };
+    matches!(error.downcast_ref(), Some(ClientError::NoAnswer { .. }))
+}
+
+fn write_counters(counters: &[Counter; NUM_ENVS]) -> String {
+    let numbers = counters.iter().flat_map(|counter| [counter.steps, counter.resets, counter.mix]);
+    numbers.map(|number| number.to_string()).collect::<Vec<_>>().join(" ")
+}
+
+fn read_heritage(words: &[String]) -> (Ticket, [Counter; NUM_ENVS]) {
+    let number = |index: usize| words[index].parse::<u64>().expect("the lane passes what a client printed");
+    let counter = |env: usize| Counter {
+        steps: number(2 + 3 * env) as u32,
+        resets: number(3 + 3 * env) as u32,
+        mix: number(4 + 3 * env) as u32,
+    };
+    (Ticket { lease: words[0].clone(), epoch: number(1) }, std::array::from_fn(counter))
+}
