@@ -140,7 +140,7 @@ fn twenty_thousand_bad_requests() {
     client.reset(&lease, 1).unwrap();
     let (keys, good) = (all_keys(server.sid(), &lease.lease), all_messages(&client, &lease));
     let mut large = step_bytes(&lease, 2);
-    large.extend([0; 100_000]);
+    large.extend(vec![0; 100_000]);
     let bad = |index: usize| {
         let key = &keys[index % keys.len()];
         let mut payload = if index.is_multiple_of(100) { large.clone() } else { good[index % good.len()].clone() };
