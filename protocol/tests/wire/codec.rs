@@ -188,6 +188,12 @@ fn missing_optional_fields_take_their_defaults() {
 }
 
 #[test]
+fn integers_may_have_any_width() {
+    let close = decode::<CloseReply>(b"\x82\xa8protocol\xcf\0\0\0\0\0\0\0\x01\xa3seq\xd2\0\0\0\x07");
+    assert_eq!(close, Ok(CloseReply { protocol: PROTOCOL, seq: 7 }));
+}
+
+#[test]
 fn missing_required_fields_are_named() {
     let close = encode(&CloseRequest { protocol: PROTOCOL, epoch: 1, seq: 1 });
     let error = decode::<StepRequest<'_>>(&close).expect_err("it has no actions");
