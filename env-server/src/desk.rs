@@ -15,7 +15,7 @@ use zenoh::query::Query;
 
 use crate::Host;
 use crate::server::random_id;
-use crate::worker::{Grant, Job, Shared, Worker, reply, reply_error, shutting_down};
+use crate::worker::{Grant, Job, Shared, Worker, reply, reply_error, shutting_down, stale_epoch};
 
 /// Requests that may wait at one worker. A client has one under way; the rest is room for its repeats.
 const WORKER_QUEUE: usize = 32;
@@ -73,6 +73,8 @@ pub struct Desk {
 struct Lease {
     client: String,
     num_envs: usize,
+    /// Goes up with every reclaim; the worker follows.
+    epoch: u64,
     /// Since when the client's token is gone; `None` while it is there.
     absent_since: Option<Instant>,
     thread: JoinHandle<()>,
@@ -227,7 +229,7 @@ impl Desk {
         let held = self.leases.iter().find(|(_, lease)| lease.client == request.client);
         if let Some((id, lease)) = held {
             if lease.num_envs as u64 == request.num_envs {
-                return self.pass_on(&id.clone(), Job::Lease { query: query.clone(), reclaim: None });
+                return self.pass_on(id, Job::Lease { query: query.clone(), epoch: lease.epoch });
             }
             let message = format!("client `{}` holds {} environments already", request.client, lease.num_envs);
             return Err(WireError::new(Code::OutOfRange, "client", message)
@@ -242,7 +244,7 @@ impl Desk {
         }
         let id = random_id();
         self.start_worker(&id, request)?;
-        self.pass_on(&id, Job::Lease { query: query.clone(), reclaim: None })
+        self.pass_on(&id, Job::Lease { query: query.clone(), epoch: 1 })
     }
 
     fn start_worker(&mut self, id: &str, request: &message::LeaseRequest) -> Result<(), WireError> {
@@ -263,20 +265,29 @@ impl Desk {
         let route = Route { jobs: sender, last_request: RwLock::new(Instant::now()) };
         self.routes.write().unwrap_or_else(std::sync::PoisonError::into_inner).insert(id.to_owned(), route);
         let absent_since = (!self.present.contains(&request.client)).then(Instant::now);
-        let lease = Lease { client: request.client.clone(), num_envs, absent_since, thread };
+        let lease = Lease { client: request.client.clone(), num_envs, epoch: 1, absent_since, thread };
         self.leases.insert(id.to_owned(), lease);
         Ok(())
     }
 
     fn reclaim(&mut self, client: &str, reclaim: &message::Reclaim, query: &Query) -> Result<(), WireError> {
-        let present = self.present.contains(client);
-        let Some(lease) = self.leases.get_mut(&reclaim.lease) else {
+        let Some(lease) = self.leases.get(&reclaim.lease) else {
             let message = format!("there is no lease `{}`: it was closed or its grace passed", reclaim.lease);
             return Err(WireError::new(Code::LeaseLost, "reclaim.lease", message).with_hint("ask for a new lease"));
         };
-        client.clone_into(&mut lease.client);
-        lease.absent_since = (!present).then(Instant::now);
-        self.pass_on(&reclaim.lease, Job::Lease { query: query.clone(), reclaim: Some(reclaim.epoch) })
+        let epoch = lease.epoch;
+        // Its reply was lost: tell the new owner again.
+        let repeated = lease.client == client && reclaim.epoch == epoch - 1;
+        if !repeated && reclaim.epoch != epoch {
+            return Err(stale_epoch("reclaim.epoch", reclaim.epoch, epoch));
+        }
+        let epoch = if repeated { epoch } else { epoch + 1 };
+        self.pass_on(&reclaim.lease, Job::Lease { query: query.clone(), epoch })?;
+        let absent_since = (!self.present.contains(client)).then(Instant::now);
+        if let Some(lease) = self.leases.get_mut(&reclaim.lease) {
+            (lease.client, lease.epoch, lease.absent_since) = (client.to_owned(), epoch, absent_since);
+        }
+        Ok(())
     }
 
     fn pass_on(&self, lease: &str, job: Job) -> Result<(), WireError> {

@@ -23,12 +23,12 @@ use crate::desk::DeskJob;
 pub enum Job {
     /// A query at one of the lease's keys.
     Env(Verb, Query),
-    /// A request for the lease itself: tell it again, or hand it over under a new epoch.
+    /// A request for the lease itself.
     Lease {
         /// The query to answer.
         query: Query,
-        /// The epoch that the client knows, if it takes the lease over.
-        reclaim: Option<u64>,
+        /// The lease's epoch from here on; a new one if it is handed over.
+        epoch: u64,
     },
 }
 
@@ -102,20 +102,20 @@ impl Worker {
                     let answer = worker.answer(verb, &query);
                     send(&query, answer);
                 }
-                Job::Lease { query, reclaim } => {
-                    let answer = worker.hand_over(reclaim);
+                Job::Lease { query, epoch } => {
+                    let answer = worker.hand_over(epoch);
                     send(&query, answer);
                 }
             }
         }
     }
 
-    fn hand_over(&mut self, reclaim: Option<u64>) -> Answer {
-        if let Some(known) = reclaim {
-            if known != self.epoch {
-                return Answer::Err(stale_epoch(known, self.epoch));
-            }
-            self.epoch += 1;
+    fn hand_over(&mut self, epoch: u64) -> Answer {
+        self.epoch = epoch;
+        if let Some(reason) = &self.broken {
+            // Nothing can be done with this lease: make room for the next.
+            self.give_back();
+            return Answer::Err(broken(reason));
         }
         Answer::Ok(ZBytes::from(encode(&message::LeaseReply {
             protocol: PROTOCOL,
@@ -126,6 +126,11 @@ impl Worker {
             last_seq: self.last_seq,
             spec: self.env.spec().clone(),
         })))
+    }
+
+    /// Asks the desk to free the lease. A full desk only delays it: to the next request, or until the client is gone.
+    fn give_back(&self) {
+        let _ = self.desk.try_send(DeskJob::Closed(self.grant.lease.clone()));
     }
 
     fn answer(&mut self, verb: Verb, query: &Query) -> Answer {
@@ -146,7 +151,7 @@ impl Worker {
         if self.shared.shutting_down.load(Ordering::Acquire) {
             return Answer::Err(shutting_down());
         }
-        if let Some(reason) = &self.broken {
+        if let Some(reason) = self.broken.as_ref().filter(|_| verb != Verb::Close) {
             return Answer::Err(broken(reason));
         }
         let outcome = catch_unwind(AssertUnwindSafe(|| self.execute(verb, &payload)));
@@ -172,7 +177,7 @@ impl Worker {
             return Err(WireError::version(header.protocol));
         }
         if header.epoch != self.epoch {
-            return Err(stale_epoch(header.epoch, self.epoch));
+            return Err(stale_epoch("epoch", header.epoch, self.epoch));
         }
         if header.seq < self.last_seq {
             return Err(stale_sequence(header.seq, self.last_seq));
@@ -196,6 +201,9 @@ impl Worker {
             }
             Verb::Step => {
                 let request: message::StepRequest<'_> = decode(payload)?;
+                // Before they are copied: the buffer keeps the size of the largest.
+                let wanted = self.env.num_envs() * self.env.spec().action_len();
+                convert::check_length("actions", request.actions.len() / size_of::<f32>(), wanted)?;
                 tensor::read_into(request.actions, &mut self.actions, "actions")?;
                 let batch = self.env.step(&self.actions).map_err(|error| logged(&error))?;
                 self.shared.env_steps.fetch_add(batch.reward.len() as u64, Ordering::Relaxed);
@@ -204,8 +212,7 @@ impl Worker {
             Verb::Close => {
                 let request: message::CloseRequest = decode(payload)?;
                 self.broken = Some("the client closed it".to_owned());
-                // A full desk only delays this: the lease is then freed when its client is gone.
-                let _ = self.desk.try_send(DeskJob::Closed(self.grant.lease.clone()));
+                self.give_back();
                 Ok(encode(&message::CloseReply { protocol: PROTOCOL, seq: request.seq }))
             }
         }
@@ -266,9 +273,10 @@ pub fn shutting_down() -> WireError {
     WireError::new(Code::ShuttingDown, "", "the server is shutting down; nothing was executed")
 }
 
-fn stale_epoch(given: u64, current: u64) -> WireError {
-    let message = format!("`epoch` = {given} is not the lease's: it is {current}");
-    WireError::new(Code::StaleEpoch, "epoch", message).with_hint("another client took the lease over, or never had it")
+/// The answer to a request under another epoch than the lease's.
+pub fn stale_epoch(field: &'static str, given: u64, current: u64) -> WireError {
+    let message = format!("`{field}` = {given} is not the lease's: it is {current}");
+    WireError::new(Code::StaleEpoch, field, message).with_hint("another client took the lease over, or never had it")
 }
 
 fn stale_sequence(given: u64, last: u64) -> WireError {

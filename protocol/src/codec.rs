@@ -19,9 +19,16 @@ pub fn encode(message: &impl Serialize) -> Vec<u8> {
 
 /// Reads a message; the error says whether the version is foreign or the bytes are not the message.
 pub fn decode<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, WireError> {
+    // Serde would also take fields by position, in an order that no document promises.
+    if !matches!(bytes.first(), Some(0x80..=0x8f | 0xde | 0xdf)) {
+        return Err(malformed("the bytes are no MessagePack map"));
+    }
     rmp_serde::from_slice(bytes).map_err(|error| match rmp_serde::from_slice::<Version>(bytes) {
         Ok(Version { protocol }) if protocol != PROTOCOL => WireError::version(protocol),
-        _ => WireError::new(Code::Malformed, "", error.to_string())
-            .with_hint("a request is one MessagePack map with the fields of SPEC.md"),
+        _ => malformed(&error.to_string()),
     })
+}
+
+fn malformed(reason: &str) -> WireError {
+    WireError::new(Code::Malformed, "", reason).with_hint("a message is one MessagePack map with the fields of SPEC.md")
 }

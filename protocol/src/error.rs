@@ -47,6 +47,27 @@ pub enum Code {
 }
 
 impl Code {
+    /// Every code.
+    pub const ALL: [Code; 17] = [
+        Code::Version,
+        Code::Malformed,
+        Code::UnknownKey,
+        Code::BadShape,
+        Code::NotFinite,
+        Code::OutOfRange,
+        Code::TooManyEnvs,
+        Code::LeaseLost,
+        Code::StaleEpoch,
+        Code::StaleSequence,
+        Code::SequenceGap,
+        Code::NeedsReset,
+        Code::Diverged,
+        Code::SpecMismatch,
+        Code::Busy,
+        Code::ShuttingDown,
+        Code::Internal,
+    ];
+
     /// True if the request had effects, so that its sequence number is used up; false if the number is still free.
     pub fn counts_as_executed(self) -> bool {
         matches!(self, Code::Diverged)

@@ -2,8 +2,13 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod exactly_once;
 mod faults;
 mod layering;
+mod leases;
 mod physics;
+mod raw_client;
 mod remote;
+mod security;
 mod tidy;
+mod wire;

@@ -8,7 +8,7 @@ use twinstep_envs::{Counter, OBS_LEN, TaskName, check};
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv, go2};
 use twinstep_protocol::Code;
 
-fn config(task: TaskName) -> Config {
+pub fn config(task: TaskName) -> Config {
     let mut config = Config::default();
     config.task.name = task;
     config.server.listen = "tcp/127.0.0.1:0".to_owned();
@@ -17,11 +17,11 @@ fn config(task: TaskName) -> Config {
     config
 }
 
-fn start(config: &Config) -> (Server, String) {
+pub fn start(config: &Config) -> (Server, String) {
     start_with(config, Arc::new(SimHost::new(config.clone()).unwrap()))
 }
 
-fn start_with(config: &Config, host: Arc<dyn Host>) -> (Server, String) {
+pub fn start_with(config: &Config, host: Arc<dyn Host>) -> (Server, String) {
     let server = Server::start(&config.server, host).unwrap();
     let endpoint = server.endpoints().into_iter().find(|endpoint| endpoint.starts_with("tcp/127.0.0.1")).unwrap();
     (server, endpoint)
@@ -162,7 +162,7 @@ fn nobody_at_the_endpoint_is_said_with_the_command_to_start_one() {
 }
 
 /// A host whose environments panic at their third step.
-struct Fragile;
+pub struct Fragile;
 
 struct FragileEnv(Box<dyn VecEnv>, u32);
 

@@ -2,7 +2,7 @@
 
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv};
 use twinstep_protocol::keys::Verb;
-use twinstep_protocol::{PROTOCOL, WireError, convert, decode, encode, keys, message, tensor};
+use twinstep_protocol::{Code, PROTOCOL, WireError, convert, decode, encode, keys, message, tensor};
 use zenoh::bytes::ZBytes;
 use zenoh::query::Querier;
 
@@ -121,7 +121,11 @@ impl RemoteVecEnv {
         }
         let querier = self.link.querier(keys::env(self.link.sid(), &self.ticket.lease, Verb::Close))?;
         let (epoch, seq) = (self.ticket.epoch, self.last_seq + 1);
-        self.link.ask(&querier, encode(&message::CloseRequest { protocol: PROTOCOL, epoch, seq })).map(drop)
+        match self.link.ask(&querier, encode(&message::CloseRequest { protocol: PROTOCOL, epoch, seq })) {
+            // The first answer was lost, or the grace has passed: they are free either way.
+            Err(ClientError::Refused(refusal)) if refusal.code == Code::LeaseLost => Ok(()),
+            answer => answer.map(drop),
+        }
     }
 
     /// Waits for the answer to the pending request. Without an answer it stays pending, because it may have been

@@ -1,0 +1,232 @@
+//! What the codec holds for all messages and all bytes.
+
+use std::fmt::Debug;
+
+use proptest::prelude::*;
+use serde::{Deserialize, Serialize};
+use twinstep_model::{AutoresetMode, EndedEpisode, StepBatch};
+use twinstep_protocol::message::{
+    CloseReply, CloseRequest, EnvHeader, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, ResetReply,
+    ResetRequest, StepReply, StepRequest,
+};
+use twinstep_protocol::{Code, PROTOCOL, WireError, convert, decode, encode, tensor};
+
+use crate::golden;
+
+/// Decodes `bytes` as every kind of message; the codes of those that were refused.
+fn refusals(bytes: &[u8]) -> Vec<Code> {
+    fn refusal<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Option<Code> {
+        decode::<T>(bytes).err().map(|error| error.code)
+    }
+    [
+        refusal::<HelloRequest>(bytes),
+        refusal::<HelloReply>(bytes),
+        refusal::<LeaseRequest>(bytes),
+        refusal::<LeaseReply>(bytes),
+        refusal::<ResetRequest<'_>>(bytes),
+        refusal::<ResetReply<'_>>(bytes),
+        refusal::<StepRequest<'_>>(bytes),
+        refusal::<StepReply<'_>>(bytes),
+        refusal::<CloseRequest>(bytes),
+        refusal::<CloseReply>(bytes),
+        refusal::<EnvHeader>(bytes),
+        refusal::<WireError>(bytes),
+    ]
+    .into_iter()
+    .flatten()
+    .collect()
+}
+
+fn round_trips<'a, T: Serialize + Deserialize<'a> + PartialEq + Debug>(message: &T, buffer: &'a mut Vec<u8>) {
+    *buffer = encode(message);
+    assert_eq!(&decode::<T>(buffer).expect("what was encoded decodes"), message);
+}
+
+fn any_autoreset() -> impl Strategy<Value = AutoresetMode> {
+    prop::sample::select(vec![AutoresetMode::NextStep, AutoresetMode::SameStep, AutoresetMode::Disabled])
+}
+
+/// The same message with one more field, first or last.
+fn with_unknown_field(message: &[u8], first: bool, value: &[u8]) -> Vec<u8> {
+    assert!((0x80..0x8f).contains(&message[0]), "a map of at most 14 fields");
+    let mut field = b"\xa7unknown".to_vec();
+    // `value` as MessagePack `bin 8`.
+    field.extend([0xc4, value.len() as u8]);
+    field.extend(value);
+    let (before, after) = if first { (field, Vec::new()) } else { (Vec::new(), field) };
+    [vec![message[0] + 1], before, message[1..].to_vec(), after].concat()
+}
+
+proptest! {
+    #[test]
+    fn requests_for_a_lease_round_trip(
+        protocol: u16, client: String, num_envs: u64, autoreset in any_autoreset(), max_episode_steps: Option<u32>,
+        spec_hash: Option<String>, reclaim: Option<(String, u64)>,
+    ) {
+        round_trips(&HelloRequest { protocol, client: client.clone() }, &mut Vec::new());
+        let reclaim = reclaim.map(|(lease, epoch)| Reclaim { lease, epoch });
+        let request =
+            LeaseRequest { protocol, client, num_envs, autoreset, max_episode_steps, spec_hash, reclaim };
+        round_trips(&request, &mut Vec::new());
+    }
+
+    #[test]
+    fn what_a_server_tells_of_itself_round_trips(
+        protocols: [u16; 2], name: String, counts: [u64; 3], lease_grace_s in 0.0..1e9, autoreset in any_autoreset(),
+    ) {
+        let [max_envs, free_envs, env_steps] = counts;
+        let spec = golden::small_spec();
+        let hello = HelloReply {
+            protocol: PROTOCOL, protocols, build: name.clone(), sid: name.clone(), spec_hash: spec.hash(),
+            spec: spec.clone(), max_envs, free_envs, lease_grace_s, env_steps, name: name.clone(),
+        };
+        round_trips(&hello, &mut Vec::new());
+        let granted = LeaseReply {
+            protocol: PROTOCOL, lease: name, epoch: max_envs, num_envs: free_envs, autoreset, last_seq: env_steps, spec,
+        };
+        round_trips(&granted, &mut Vec::new());
+    }
+
+    #[test]
+    fn requests_of_a_lease_round_trip(
+        protocol: u16, epoch: u64, seq: u64, bytes: Vec<u8>, seeds: Option<Vec<u8>>, mask: Option<Vec<u8>>,
+    ) {
+        let (seeds, mask) = (seeds.as_deref(), mask.as_deref());
+        round_trips(&ResetRequest { protocol, epoch, seq, seeds, mask }, &mut Vec::new());
+        round_trips(&ResetReply { protocol, seq, obs: &bytes }, &mut Vec::new());
+        round_trips(&StepRequest { protocol, epoch, seq, actions: &bytes }, &mut Vec::new());
+        round_trips(&CloseRequest { protocol, epoch, seq }, &mut Vec::new());
+        round_trips(&CloseReply { protocol, seq }, &mut Vec::new());
+    }
+
+    #[test]
+    fn errors_round_trip(code in prop::sample::select(Code::ALL.to_vec()), words: [String; 3]) {
+        let [field, message, hint] = words;
+        round_trips(&WireError::new(code, field, message).with_hint(hint), &mut Vec::new());
+    }
+
+    #[test]
+    fn steps_round_trip_with_their_ended_episodes(
+        rows in prop::collection::vec((-1e9f32..1e9, any::<bool>(), any::<bool>(), any::<u32>()), 1..6), seq: u64,
+    ) {
+        let spec = golden::small_spec();
+        let mut batch = StepBatch::new(rows.len(), spec.obs_len());
+        for (env, (reward, terminated, truncated, length)) in rows.iter().copied().enumerate() {
+            batch.reward[env] = reward;
+            batch.terminated[env] = terminated;
+            batch.truncated[env] = truncated;
+            batch.obs[env] = -reward;
+            if batch.done(env) {
+                let terms = vec![reward, -reward];
+                let final_obs = vec![reward; spec.obs_len()];
+                batch.ended.push(EndedEpisode { env, length, episode_return: reward, terms, final_obs });
+            }
+        }
+        let bytes = convert::encode_step(&batch, seq);
+        let reply: StepReply<'_> = decode(&bytes).expect("what was encoded decodes");
+        let mut read = StepBatch::default();
+        convert::read_step(&reply, &spec, rows.len(), &mut read).expect("the lengths fit");
+        prop_assert_eq!(read, batch);
+    }
+
+    #[test]
+    fn unknown_fields_are_ignored(
+        name in prop::sample::select(golden::NAMES.to_vec()), first: bool,
+        value in prop::collection::vec(any::<u8>(), 0..20),
+    ) {
+        let message = golden::read(name);
+        prop_assert_eq!(refusals(&with_unknown_field(message, first, &value)), refusals(message));
+    }
+
+    #[test]
+    fn truncated_messages_are_malformed(
+        name in prop::sample::select(golden::NAMES.to_vec()), cut in any::<prop::sample::Index>(),
+    ) {
+        let message = golden::read(name);
+        let codes = refusals(&message[..cut.index(message.len())]);
+        prop_assert_eq!(codes, vec![Code::Malformed; 12]);
+    }
+
+    #[test]
+    fn mutated_messages_are_refused_or_read(
+        name in prop::sample::select(golden::NAMES.to_vec()),
+        changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..5),
+    ) {
+        let mut message = golden::read(name).to_vec();
+        for (at, byte) in changes {
+            let at = at.index(message.len());
+            message[at] = byte;
+        }
+        prop_assert!(refusals(&message).iter().all(|code| matches!(code, Code::Malformed | Code::Version)));
+    }
+
+    #[test]
+    fn random_bytes_are_refused(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+        let codes = refusals(&bytes);
+        prop_assert_eq!(codes.len(), 12);
+        prop_assert!(codes.iter().all(|code| matches!(code, Code::Malformed | Code::Version)));
+    }
+}
+
+#[test]
+fn missing_optional_fields_take_their_defaults() {
+    #[derive(Serialize)]
+    struct Lease {
+        protocol: u16,
+        client: &'static str,
+        num_envs: u64,
+        autoreset: &'static str,
+    }
+    let lease = encode(&Lease { protocol: PROTOCOL, client: "c1", num_envs: 3, autoreset: "NextStep" });
+    let lease: LeaseRequest = decode(&lease).expect("the rest is optional");
+    assert_eq!((lease.max_episode_steps, lease.spec_hash, lease.reclaim), (None, None, None));
+    let least = encode(&CloseRequest { protocol: PROTOCOL, epoch: 1, seq: 1 });
+    let reset: ResetRequest<'_> = decode(&least).expect("the rest is optional");
+    assert_eq!((reset.seeds, reset.mask), (None, None));
+    let hello: HelloRequest = decode(b"\x81\xa8protocol\x01").expect("the rest is optional");
+    assert_eq!(hello.client, "");
+}
+
+#[test]
+fn integers_may_have_any_width() {
+    let close = decode::<CloseReply>(b"\x82\xa8protocol\xcf\0\0\0\0\0\0\0\x01\xa3seq\xd2\0\0\0\x07");
+    assert_eq!(close, Ok(CloseReply { protocol: PROTOCOL, seq: 7 }));
+}
+
+#[test]
+fn missing_required_fields_are_named() {
+    let close = encode(&CloseRequest { protocol: PROTOCOL, epoch: 1, seq: 1 });
+    let error = decode::<StepRequest<'_>>(&close).expect_err("it has no actions");
+    assert_eq!((error.code, error.message.as_str()), (Code::Malformed, "missing field `actions`"));
+}
+
+#[test]
+fn fields_by_position_are_malformed() {
+    // [1, 1, 1] would be a close request if fields could go without names.
+    assert_eq!(refusals(&[0x93, 1, 1, 1]), vec![Code::Malformed; 12]);
+}
+
+#[test]
+fn foreign_version_is_told_apart_even_if_the_fields_changed() {
+    let error = decode::<StepRequest<'_>>(b"\x82\xa8protocol\x02\xa3new\x01").expect_err("version 2");
+    assert_eq!(error.code, Code::Version);
+}
+
+#[test]
+fn deep_nesting_is_malformed() {
+    // {"protocol": [[[…]]]} with a hundred thousand brackets.
+    let bytes = [b"\x81\xa8protocol".to_vec(), vec![0x91; 100_000]].concat();
+    assert_eq!(refusals(&bytes), vec![Code::Malformed; 12]);
+}
+
+#[test]
+fn tensors_are_read_from_golden_bytes() {
+    let reply: StepReply<'_> = decode(golden::read("step_reply_ended")).expect("golden");
+    let mut batch = StepBatch::default();
+    convert::read_step(&reply, &golden::small_spec(), 2, &mut batch).expect("the lengths fit");
+    assert_eq!(batch.reward, [0.75, -1.25]);
+    assert_eq!((batch.ended[0].env, batch.ended[0].length), (1, 300));
+    assert_eq!(batch.ended[0].final_obs, [0.5, 0.5, -0.5, 1.5, -2.5]);
+    let reset: ResetRequest<'_> = decode(golden::read("reset_request_seeds_mask")).expect("golden");
+    assert_eq!(tensor::read::<u64>(reset.seeds.expect("seeds"), "seeds").expect("whole numbers"), [7, u64::MAX]);
+}

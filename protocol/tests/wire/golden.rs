@@ -1,0 +1,218 @@
+//! The bytes of every kind of message, kept in `golden/` for the clients in other languages to read as well.
+//!
+//! `UPDATE_GOLDEN=1 cargo test --release --workspace --test wire golden` writes the files anew. Other bytes are another
+//! protocol: clients in the field stop understanding the server unless the change only adds an optional field.
+
+use std::fmt::Debug;
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+use twinstep_model::{AutoresetMode, EnvSpec, Field};
+use twinstep_protocol::message::{
+    CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, ResetReply, ResetRequest,
+    StepReply, StepRequest,
+};
+use twinstep_protocol::tensor::as_bytes;
+use twinstep_protocol::{Code, PROTOCOL, WireError, decode, encode};
+
+/// Name of every golden file, without `.msgpack`.
+pub const NAMES: [&str; 15] = [
+    "hello_request",
+    "hello_reply",
+    "lease_request",
+    "lease_request_reclaim",
+    "lease_reply",
+    "lease_reply_reclaimed",
+    "reset_request",
+    "reset_request_seeds_mask",
+    "reset_reply",
+    "step_request",
+    "step_reply",
+    "step_reply_ended",
+    "close_request",
+    "close_reply",
+    "error",
+];
+
+const LEASE: &str = "00c0ffee00c0ffee";
+
+fn folder() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("golden")
+}
+
+/// The bytes of the golden file `name`. Leaked, because messages borrow from them.
+pub fn read(name: &str) -> &'static [u8] {
+    let path = folder().join(name).with_extension("msgpack");
+    let bytes = std::fs::read(&path).unwrap_or_else(|error| {
+        panic!(
+            "{}: {error}\n  UPDATE_GOLDEN=1 cargo test --release --workspace --test wire golden writes it",
+            path.display()
+        )
+    });
+    bytes.leak()
+}
+
+/// `message` encodes to the bytes of the file `name`, and they decode to `message`.
+fn check<T: Serialize + Deserialize<'static> + PartialEq + Debug>(name: &str, message: &T) {
+    assert!(NAMES.contains(&name), "{name} is missing in NAMES");
+    let bytes = encode(message);
+    if std::env::var_os("UPDATE_GOLDEN").is_some() {
+        std::fs::write(folder().join(name).with_extension("msgpack"), &bytes).expect("the folder can be written");
+    }
+    let golden = read(name);
+    assert!(
+        golden == bytes,
+        "`{name}` is no longer what golden/{name}.msgpack holds: a change of bytes is a change of protocol\n  \
+         if it is meant: raise PROTOCOL unless old clients still understand it, write it into SPEC.md, then\n  \
+         UPDATE_GOLDEN=1 cargo test --release --workspace --test wire golden\n  file {}\n  now  {}",
+        golden.escape_ascii(),
+        bytes.escape_ascii(),
+    );
+    assert_eq!(&decode::<T>(golden).expect("golden bytes are a message"), message, "{name}");
+}
+
+/// A robot with two joints: observations of 5, actions of 2 entries.
+pub fn small_spec() -> EnvSpec {
+    let field = |name: &str, size, unit: &str, bound: f32, text: &str| Field {
+        name: name.to_owned(),
+        size,
+        unit: unit.to_owned(),
+        low: -bound,
+        high: bound,
+        text: text.to_owned(),
+    };
+    EnvSpec {
+        task: "walk".to_owned(),
+        robot: "go2".to_owned(),
+        observation: vec![
+            field("gravity", 3, "", 1.0, "unit vector of gravity in the base frame"),
+            field("joint_position", 2, "rad", 6.25, "q - q_default"),
+        ],
+        action: vec![field("joint_position_offset", 2, "action_scale", 1.0, "offset from q_default")],
+        joint_order: vec!["FL_hip".to_owned(), "FL_thigh".to_owned()],
+        policy_dt: 0.02,
+        drive_dt: 0.005,
+        kp: 20.0,
+        kd: 0.5,
+        action_scale: 0.25,
+        default_pose: vec![0.1, 0.8],
+        reward_terms: vec!["tracking".to_owned(), "torque".to_owned()],
+        max_episode_steps: 1000,
+    }
+}
+
+#[test]
+fn hello_has_its_golden_bytes() {
+    check("hello_request", &HelloRequest { protocol: PROTOCOL, client: "golden 1.0".to_owned() });
+    let reply = HelloReply {
+        protocol: PROTOCOL,
+        protocols: [1, 1],
+        build: "twinstep 0.1.0".to_owned(),
+        name: "go2".to_owned(),
+        sid: "0123456789abcdef".to_owned(),
+        spec_hash: small_spec().hash(),
+        spec: small_spec(),
+        max_envs: 4096,
+        free_envs: 4032,
+        lease_grace_s: 10.0,
+        env_steps: 1_000_000_007,
+    };
+    check("hello_reply", &reply);
+}
+
+#[test]
+fn lease_has_its_golden_bytes() {
+    let request = LeaseRequest {
+        protocol: PROTOCOL,
+        client: "golden-1".to_owned(),
+        num_envs: 2,
+        autoreset: AutoresetMode::SameStep,
+        max_episode_steps: None,
+        spec_hash: None,
+        reclaim: None,
+    };
+    check("lease_request", &request);
+    let reclaim = LeaseRequest {
+        autoreset: AutoresetMode::NextStep,
+        max_episode_steps: Some(500),
+        spec_hash: Some(small_spec().hash()),
+        reclaim: Some(Reclaim { lease: LEASE.to_owned(), epoch: 1 }),
+        ..request
+    };
+    check("lease_request_reclaim", &reclaim);
+    let reply = LeaseReply {
+        protocol: PROTOCOL,
+        lease: LEASE.to_owned(),
+        epoch: 1,
+        num_envs: 2,
+        autoreset: AutoresetMode::SameStep,
+        last_seq: 0,
+        spec: small_spec(),
+    };
+    check("lease_reply", &reply);
+    check("lease_reply_reclaimed", &LeaseReply { epoch: 2, autoreset: AutoresetMode::Disabled, last_seq: 77, ..reply });
+}
+
+#[test]
+fn reset_has_its_golden_bytes() {
+    let request = ResetRequest { protocol: PROTOCOL, epoch: 1, seq: 1, seeds: None, mask: None };
+    check("reset_request", &request);
+    let seeds = [7u64, u64::MAX];
+    check("reset_request_seeds_mask", &ResetRequest { seeds: Some(as_bytes(&seeds)), mask: Some(&[0, 1]), ..request });
+    let obs = [0.0f32, 0.0, -1.0, 0.125, -0.25, 0.5, 0.5, -0.5, 1.5, -2.5];
+    check("reset_reply", &ResetReply { protocol: PROTOCOL, seq: 1, obs: as_bytes(&obs) });
+}
+
+#[test]
+fn step_has_its_golden_bytes() {
+    let actions = [0.5f32, -0.5, 1.0, -1.0];
+    check("step_request", &StepRequest { protocol: PROTOCOL, epoch: 1, seq: 2, actions: as_bytes(&actions) });
+    let obs = [0.0f32, 0.0, -1.0, 0.25, -0.5, 0.0, 0.0, -1.0, 0.0, 0.125];
+    let running = StepReply {
+        protocol: PROTOCOL,
+        seq: 2,
+        obs: as_bytes(&obs),
+        reward: as_bytes(&[0.75f32, -1.25]),
+        terminated: &[0, 0],
+        truncated: &[0, 0],
+        ended_env: &[],
+        ended_length: &[],
+        ended_return: &[],
+        ended_terms: &[],
+        final_obs: &[],
+    };
+    check("step_reply", &running);
+    let ended = StepReply {
+        seq: 3,
+        terminated: &[0, 1],
+        ended_env: as_bytes(&[1u32]),
+        ended_length: as_bytes(&[300u32]),
+        ended_return: as_bytes(&[12.5f32]),
+        ended_terms: as_bytes(&[15.0f32, -2.5]),
+        final_obs: as_bytes(&[0.5f32, 0.5, -0.5, 1.5, -2.5]),
+        ..running
+    };
+    check("step_reply_ended", &ended);
+}
+
+#[test]
+fn close_has_its_golden_bytes() {
+    check("close_request", &CloseRequest { protocol: PROTOCOL, epoch: 2, seq: 300 });
+    check("close_reply", &CloseReply { protocol: PROTOCOL, seq: 300 });
+}
+
+#[test]
+fn error_has_its_golden_bytes() {
+    let error = WireError::new(Code::BadShape, "actions", "`actions` has 3 entries; 4 are wanted")
+        .with_hint("shapes are num_envs × the spec's lengths");
+    check("error", &error);
+}
+
+#[test]
+fn every_golden_file_belongs_to_a_message() {
+    for entry in std::fs::read_dir(folder()).expect("the folder is there") {
+        let path = entry.expect("the folder can be read").path();
+        let name = path.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
+        assert!(NAMES.contains(&name), "no test reads {}", path.display());
+    }
+}

@@ -1,0 +1,108 @@
+//! `SPEC.md` names everything that the wire has.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::Deserialize;
+use serde::de::IgnoredAny;
+use twinstep_model::AutoresetMode;
+use twinstep_protocol::keys::{self, Verb};
+use twinstep_protocol::{Code, PROTOCOL};
+
+use crate::golden;
+
+const SPEC: &str = include_str!("../../SPEC.md");
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Value {
+    Map(BTreeMap<String, Value>),
+    List(Vec<Value>),
+    Other(IgnoredAny),
+}
+
+fn collect_fields(value: Value, fields: &mut BTreeSet<String>) {
+    match value {
+        Value::Map(map) => {
+            for (name, value) in map {
+                fields.insert(name);
+                collect_fields(value, fields);
+            }
+        }
+        Value::List(values) => values.into_iter().for_each(|value| collect_fields(value, fields)),
+        Value::Other(_) => {}
+    }
+}
+
+/// The text under `title`, up to the next title.
+fn section(title: &str) -> &'static str {
+    let start = SPEC.find(title).unwrap_or_else(|| panic!("SPEC.md has no `{title}`"));
+    let rest = &SPEC[start + title.len()..];
+    &rest[..rest.find("\n#").unwrap_or(rest.len())]
+}
+
+/// First cells of the tables in `text`, without backticks.
+fn first_cells(text: &str) -> BTreeSet<String> {
+    let cells = text.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next());
+    cells.map(str::to_owned).collect()
+}
+
+fn golden_map(name: &str) -> BTreeMap<String, Value> {
+    rmp_serde::from_slice(golden::read(name)).expect("golden bytes are a map")
+}
+
+#[test]
+fn tables_have_exactly_the_fields_of_the_messages() {
+    let tables = [
+        ("### hello request", "hello_request"),
+        ("### hello reply", "hello_reply"),
+        ("### lease request", "lease_request"),
+        ("### lease reply", "lease_reply"),
+        ("### reset request", "reset_request"),
+        ("### reset reply", "reset_reply"),
+        ("### step request", "step_request"),
+        ("### step reply", "step_reply"),
+        ("### close request", "close_request"),
+        ("### close reply", "close_reply"),
+        ("### error reply", "error"),
+    ];
+    for (title, name) in tables {
+        let fields: BTreeSet<String> = golden_map(name).into_keys().collect();
+        assert_eq!(first_cells(section(title)), fields, "{title}");
+    }
+    let Some(Value::Map(spec)) = golden_map("hello_reply").remove("spec") else { panic!("`spec` is a map") };
+    assert_eq!(first_cells(section("### spec")), spec.keys().cloned().collect());
+}
+
+#[test]
+fn every_field_at_any_depth_is_named() {
+    let mut fields = BTreeSet::new();
+    for name in golden::NAMES {
+        collect_fields(Value::Map(golden_map(name)), &mut fields);
+    }
+    for field in fields {
+        assert!(SPEC.contains(&format!("`{field}`")), "SPEC.md says nothing of the field `{field}`");
+    }
+}
+
+#[test]
+fn table_of_errors_has_exactly_the_codes() {
+    let codes = Code::ALL.map(|code| {
+        let quoted = rmp_serde::to_vec_named(&code).expect("a code is a string");
+        rmp_serde::from_slice::<String>(&quoted).expect("a code is a string")
+    });
+    assert_eq!(first_cells(section("## Error codes")), codes.into());
+}
+
+#[test]
+fn every_verb_key_and_mode_is_named() {
+    let verbs = Verb::ALL.map(|verb| keys::env("<sid>", "<lease>", verb));
+    let places = [keys::hello("<sid>"), keys::lease("<sid>"), keys::LIVE_SERVERS.to_owned()];
+    let tokens = [keys::live_server("<sid>", "<name>"), keys::live_client("<sid>", "<client>")];
+    for key in verbs.iter().chain(&places).chain(&tokens) {
+        assert!(SPEC.contains(&format!("`{key}`")), "SPEC.md says nothing of the key `{key}`");
+    }
+    for mode in [AutoresetMode::NextStep, AutoresetMode::SameStep, AutoresetMode::Disabled] {
+        assert!(SPEC.contains(&format!("`\"{mode:?}\"`")), "SPEC.md says nothing of the mode {mode:?}");
+    }
+    assert!(SPEC.contains(&format!("`protocol` = {PROTOCOL}")));
+}

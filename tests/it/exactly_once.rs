@@ -1,0 +1,167 @@
+//! Every sequence number is executed once, and what is refused is executed never. The task `counter` proves it.
+
+use std::sync::Arc;
+
+use twinstep_envs::TaskName;
+use twinstep_protocol::keys::Verb;
+use twinstep_protocol::message::{CloseRequest, LeaseReply, ResetRequest};
+use twinstep_protocol::tensor::as_bytes;
+use twinstep_protocol::{Code, PROTOCOL, encode, keys};
+
+use crate::raw_client::{RawClient, only_reply, reset_bytes, resets_in, step_bytes, step_with, steps_in};
+use crate::remote::{Fragile, config, start, start_with};
+
+/// Runs `test` with a client whose lease of two counters was reset under number 1.
+fn with_counters(test: impl FnOnce(&RawClient, &LeaseReply)) {
+    let (server, endpoint) = start(&config(TaskName::Counter));
+    let client = RawClient::connect(&endpoint, server.sid(), "c1");
+    let lease = client.lease(2);
+    client.reset(&lease, 1).unwrap();
+    test(&client, &lease);
+    server.stop();
+}
+
+#[test]
+fn request_sent_three_times_is_executed_once_with_equal_bytes() {
+    with_counters(|client, lease| {
+        let step = client.step(lease, 2).unwrap();
+        assert_eq!(steps_in(&step), 1.0);
+        assert_eq!([client.step(lease, 2).unwrap(), client.step(lease, 2).unwrap()], [step.clone(), step]);
+        assert_eq!(steps_in(&client.step(lease, 3).unwrap()), 2.0);
+        let reset = client.reset(lease, 4).unwrap();
+        assert_eq!(resets_in(&reset), 2.0);
+        assert_eq!([client.reset(lease, 4).unwrap(), client.reset(lease, 4).unwrap()], [reset.clone(), reset]);
+        assert_eq!(resets_in(&client.reset(lease, 5).unwrap()), 3.0);
+    });
+}
+
+#[test]
+fn request_sent_again_while_it_is_in_progress_is_executed_once() {
+    with_counters(|client, lease| {
+        let key = keys::env(&client.sid, &lease.lease, Verb::Step);
+        for seq in 2..50 {
+            let sent: Vec<_> = (0..3).map(|_| client.send(&key, &step_bytes(lease, seq))).collect();
+            let answers: Vec<_> = sent.iter().map(|replies| only_reply(replies, &key).unwrap()).collect();
+            assert_eq!(steps_in(&answers[0]), (seq - 1) as f32);
+            assert!(answers.iter().all(|answer| *answer == answers[0]));
+        }
+    });
+}
+
+#[test]
+fn repeated_close_gives_its_answer_or_finds_no_lease() {
+    with_counters(|client, lease| {
+        let closed = client.close(lease, 2).unwrap();
+        match client.close(lease, 2) {
+            Ok(again) => assert_eq!(again, closed),
+            Err(error) => assert_eq!(error.code, Code::LeaseLost),
+        }
+        assert_eq!(client.hello().free_envs, 64);
+    });
+}
+
+#[test]
+fn numbers_and_epochs_out_of_order_are_refused_without_effect() {
+    with_counters(|client, lease| {
+        client.step(lease, 2).unwrap();
+        let other_epoch = |epoch| LeaseReply { epoch, ..lease.clone() };
+        for (epoch, seq, expected) in [
+            (1, 4, Code::SequenceGap),
+            (1, u64::MAX, Code::SequenceGap),
+            (1, 1, Code::StaleSequence),
+            (1, 0, Code::StaleSequence),
+            (0, 3, Code::StaleEpoch),
+            (2, 3, Code::StaleEpoch),
+            (u64::MAX, 3, Code::StaleEpoch),
+        ] {
+            let error = client.step(&other_epoch(epoch), seq).unwrap_err();
+            assert_eq!(error.code, expected, "epoch {epoch}, seq {seq}");
+        }
+        assert_eq!(client.reset(lease, 2).unwrap_err().code, Code::StaleSequence, "number 2 was a step");
+        assert_eq!(steps_in(&client.step(lease, 3).unwrap()), 2.0);
+    });
+}
+
+#[test]
+fn wrong_arrays_are_refused_by_name_without_effect() {
+    with_counters(|client, lease| {
+        let step = |actions: &[f32]| client.ask_env(lease, Verb::Step, &step_with(lease, 2, actions)).unwrap_err();
+        // The last is a payload of 16 MiB.
+        for length in [0, 12, 23, 25, 48, 4 << 20] {
+            let error = step(&vec![0.0; length]);
+            assert_eq!((error.code, error.field.as_str()), (Code::BadShape, "actions"), "{length} actions");
+        }
+        for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            let mut actions = [0.0; 24];
+            actions[23] = value;
+            assert_eq!(step(&actions).code, Code::NotFinite, "{value}");
+        }
+        let (seeds, mask) = ([0u64; 3], [1u8; 3]);
+        let reset = ResetRequest { protocol: PROTOCOL, epoch: 1, seq: 2, seeds: None, mask: None };
+        for (field, request) in [
+            ("seeds", ResetRequest { seeds: Some(as_bytes(&seeds)), ..reset.clone() }),
+            ("seeds", ResetRequest { seeds: Some(&[0; 15]), ..reset.clone() }),
+            ("mask", ResetRequest { mask: Some(&mask), ..reset.clone() }),
+            ("mask", ResetRequest { mask: Some(&[]), ..reset }),
+        ] {
+            let error = client.ask_env(lease, Verb::Reset, &encode(&request)).unwrap_err();
+            assert_eq!((error.code, error.field.as_str()), (Code::BadShape, field));
+        }
+        assert_eq!(steps_in(&client.step(lease, 2).unwrap()), 1.0, "the number was free");
+    });
+}
+
+#[test]
+fn foreign_version_is_refused_at_every_key_but_hello() {
+    with_counters(|client, lease| {
+        for key in [
+            keys::lease(&client.sid),
+            keys::env(&client.sid, &lease.lease, Verb::Reset),
+            keys::env(&client.sid, &lease.lease, Verb::Step),
+            keys::env(&client.sid, &lease.lease, Verb::Close),
+        ] {
+            // Once with all fields of the message, once with none that version 1 knows.
+            let close = encode(&CloseRequest { protocol: 2, epoch: 1, seq: 2 });
+            for payload in [close.as_slice(), b"\x82\xa8protocol\x02\xa3new\xc0"] {
+                assert_eq!(client.ask(&key, payload).unwrap_err().code, Code::Version, "{key}");
+            }
+        }
+        assert!(client.ask(&keys::hello(&client.sid), b"\x81\xa8protocol\x02").is_ok());
+        assert_eq!(steps_in(&client.step(lease, 2).unwrap()), 1.0);
+    });
+}
+
+#[test]
+fn lease_that_never_was_is_told_apart_from_unknown_keys() {
+    with_counters(|client, lease| {
+        let foreign = LeaseReply { lease: "0123456789abcdef".to_owned(), ..lease.clone() };
+        assert_eq!(client.step(&foreign, 2).unwrap_err().code, Code::LeaseLost);
+        for rest in ["", "/env", "/lease/x", "/*", "/**"] {
+            let key = format!("twinstep/{}{rest}", client.sid);
+            assert_eq!(client.ask(&key, b"").unwrap_err().code, Code::UnknownKey, "{key}");
+        }
+        let key = format!("twinstep/{}/env/{}/jump", client.sid, lease.lease);
+        assert_eq!(client.ask(&key, &step_bytes(lease, 2)).unwrap_err().code, Code::UnknownKey);
+        assert_eq!(steps_in(&client.step(lease, 2).unwrap()), 1.0);
+    });
+}
+
+#[test]
+fn lease_whose_environments_panicked_can_be_closed_or_asked_anew() {
+    let (server, endpoint) = start_with(&config(TaskName::Counter), Arc::new(Fragile));
+    let client = RawClient::connect(&endpoint, server.sid(), "c1");
+    let panicked = || {
+        let lease = client.lease(64);
+        client.reset(&lease, 1).unwrap();
+        (2..4).for_each(|seq| drop(client.step(&lease, seq).unwrap()));
+        assert_eq!(client.step(&lease, 4).unwrap_err().code, Code::LeaseLost);
+        lease
+    };
+    let first = panicked();
+    client.close(&first, 5).unwrap();
+    panicked();
+    assert_eq!(client.ask_lease(&client.lease_request(64)).unwrap_err().code, Code::LeaseLost);
+    let third = client.lease(64);
+    client.ask_env(&third, Verb::Reset, &reset_bytes(&third, 1)).unwrap();
+    server.stop();
+}

@@ -1,0 +1,170 @@
+//! A client without the client library: any bytes at any key, and every reply is seen.
+
+use std::time::Duration;
+
+use twinstep_model::AutoresetMode;
+use twinstep_protocol::keys::Verb;
+use twinstep_protocol::message::{
+    CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, ResetReply, ResetRequest, StepReply,
+    StepRequest,
+};
+use twinstep_protocol::tensor::{self, as_bytes};
+use twinstep_protocol::{PROTOCOL, WireError, decode, encode, keys};
+use zenoh::handlers::FifoChannelHandler;
+use zenoh::liveliness::LivelinessToken;
+use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
+use zenoh::{Session, Wait};
+
+/// The bytes of a good reply, or the error that was replied.
+pub type Answer = Result<Vec<u8>, WireError>;
+
+/// A session at one server.
+pub struct RawClient {
+    session: Session,
+    pub sid: String,
+    pub client: String,
+    token: Option<LivelinessToken>,
+    pub query_timeout: Duration,
+}
+
+impl RawClient {
+    /// Connects to the server `sid` and declares the client's token.
+    pub fn connect(endpoint: &str, sid: &str, client: &str) -> Self {
+        let mut this = Self::without_token(endpoint, sid, client);
+        let key = keys::live_client(sid, client);
+        this.token = Some(this.session.liveliness().declare_token(key).wait().unwrap());
+        this
+    }
+
+    /// Connects to the server `sid` as a client that nobody sees.
+    pub fn without_token(endpoint: &str, sid: &str, client: &str) -> Self {
+        let mut config = zenoh::Config::default();
+        let endpoints = format!("[\"{endpoint}\"]");
+        for (key, value) in [
+            ("mode", "\"client\""),
+            ("connect/endpoints", endpoints.as_str()),
+            ("scouting/multicast/enabled", "false"),
+            ("transport/shared_memory/enabled", "false"),
+        ] {
+            config.insert_json5(key, value).unwrap();
+        }
+        let session = zenoh::open(config).wait().unwrap();
+        let (sid, client) = (sid.to_owned(), client.to_owned());
+        Self { session, sid, client, token: None, query_timeout: Duration::from_secs(5) }
+    }
+
+    /// Ends as a crashed client does, without closing its lease.
+    pub fn vanish(self) {
+        self.session.close().wait().unwrap();
+    }
+
+    /// True while the server's other clients see the token of `client`.
+    pub fn sees(&self, client: &str) -> bool {
+        let key = keys::live_client(&self.sid, client);
+        let replies = self.session.liveliness().get(key).timeout(self.query_timeout).wait().unwrap();
+        replies.recv().is_ok()
+    }
+
+    /// Sends a query without waiting.
+    pub fn send(&self, key: &str, payload: &[u8]) -> FifoChannelHandler<Reply> {
+        self.session
+            .get(key)
+            .payload(payload)
+            .target(QueryTarget::BestMatching)
+            .consolidation(ConsolidationMode::None)
+            .timeout(self.query_timeout)
+            .wait()
+            .unwrap()
+    }
+
+    /// Asks, and fails unless there is exactly one reply, good or a typed error.
+    pub fn ask(&self, key: &str, payload: &[u8]) -> Answer {
+        only_reply(&self.send(key, payload), key)
+    }
+
+    pub fn hello(&self) -> HelloReply {
+        let request = encode(&HelloRequest { protocol: PROTOCOL, client: String::new() });
+        decode(&self.ask(&keys::hello(&self.sid), &request).unwrap()).unwrap()
+    }
+
+    pub fn lease_request(&self, num_envs: u64) -> LeaseRequest {
+        LeaseRequest {
+            protocol: PROTOCOL,
+            client: self.client.clone(),
+            num_envs,
+            autoreset: AutoresetMode::NextStep,
+            max_episode_steps: None,
+            spec_hash: None,
+            reclaim: None,
+        }
+    }
+
+    pub fn ask_lease(&self, request: &LeaseRequest) -> Result<LeaseReply, WireError> {
+        self.ask(&keys::lease(&self.sid), &encode(request)).map(|bytes| decode(&bytes).unwrap())
+    }
+
+    pub fn lease(&self, num_envs: u64) -> LeaseReply {
+        self.ask_lease(&self.lease_request(num_envs)).unwrap()
+    }
+
+    pub fn reclaim(&self, lease: &str, epoch: u64) -> Result<LeaseReply, WireError> {
+        let reclaim = Some(Reclaim { lease: lease.to_owned(), epoch });
+        self.ask_lease(&LeaseRequest { reclaim, ..self.lease_request(1) })
+    }
+
+    pub fn ask_env(&self, lease: &LeaseReply, verb: Verb, payload: &[u8]) -> Answer {
+        self.ask(&keys::env(&self.sid, &lease.lease, verb), payload)
+    }
+
+    pub fn reset(&self, lease: &LeaseReply, seq: u64) -> Answer {
+        self.ask_env(lease, Verb::Reset, &reset_bytes(lease, seq))
+    }
+
+    pub fn step(&self, lease: &LeaseReply, seq: u64) -> Answer {
+        self.ask_env(lease, Verb::Step, &step_bytes(lease, seq))
+    }
+
+    pub fn close(&self, lease: &LeaseReply, seq: u64) -> Answer {
+        self.ask_env(lease, Verb::Close, &encode(&CloseRequest { protocol: PROTOCOL, epoch: lease.epoch, seq }))
+    }
+}
+
+/// The one reply to a query at `key`.
+pub fn only_reply(replies: &FifoChannelHandler<Reply>, key: &str) -> Answer {
+    let mut replies: Vec<Reply> = std::iter::from_fn(|| replies.recv().ok()).collect();
+    assert_eq!(replies.len(), 1, "replies at {key}: {replies:?}");
+    match replies.remove(0).into_result() {
+        Ok(sample) => Ok(sample.payload().to_bytes().into_owned()),
+        Err(error) => {
+            let bytes = error.payload().to_bytes();
+            Err(decode(&bytes).unwrap_or_else(|_| panic!("{key}: {} is no typed error", bytes.escape_ascii())))
+        }
+    }
+}
+
+/// A reset of everything.
+pub fn reset_bytes(lease: &LeaseReply, seq: u64) -> Vec<u8> {
+    encode(&ResetRequest { protocol: PROTOCOL, epoch: lease.epoch, seq, seeds: None, mask: None })
+}
+
+/// A step with the actions 0.5.
+pub fn step_bytes(lease: &LeaseReply, seq: u64) -> Vec<u8> {
+    step_with(lease, seq, &vec![0.5; lease.num_envs as usize * lease.spec.action_len()])
+}
+
+/// A step with these actions, whatever their number.
+pub fn step_with(lease: &LeaseReply, seq: u64, actions: &[f32]) -> Vec<u8> {
+    encode(&StepRequest { protocol: PROTOCOL, epoch: lease.epoch, seq, actions: as_bytes(actions) })
+}
+
+/// Steps that the first environment of the task `counter` has executed in its life, from a step's reply.
+pub fn steps_in(step: &[u8]) -> f32 {
+    let reply: StepReply<'_> = decode(step).unwrap();
+    tensor::read::<f32>(reply.obs, "obs").unwrap()[0]
+}
+
+/// Resets that the first environment of the task `counter` has executed in its life, from a reset's reply.
+pub fn resets_in(reset: &[u8]) -> f32 {
+    let reply: ResetReply<'_> = decode(reset).unwrap();
+    tensor::read::<f32>(reply.obs, "obs").unwrap()[1]
+}
