@@ -5,4 +5,5 @@
 mod layering;
 mod physics;
 mod remote;
+mod security;
 mod tidy;

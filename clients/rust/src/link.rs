@@ -1,5 +1,6 @@
 //! The connection to one server: opening, finding, asking until answered, and saying why not.
 
+use std::net::{TcpStream, ToSocketAddrs};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -19,6 +20,8 @@ use crate::ClientError;
 const QUERY_TIMEOUT: Duration = Duration::from_secs(2);
 /// Pause before a repeat, doubled each time up to the second.
 const PAUSES: [Duration; 2] = [Duration::from_millis(2), Duration::from_millis(200)];
+/// How long a port may take to accept a connection.
+const PROBE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Where to connect and what to ask for.
 #[derive(Clone, Debug)]
@@ -248,11 +251,20 @@ fn open_session(options: &ConnectOptions) -> Result<Session, ClientError> {
                     endpoint: options.endpoint.clone(),
                     waited_s: since.elapsed().as_secs_f64(),
                     reason: error.to_string(),
+                    port_open: port_open(&options.endpoint),
                 });
             }
             Err(_) => std::thread::sleep(PAUSES[1]),
         }
     }
+}
+
+/// True if a program accepts connections at the endpoint: a server that refuses a client does, an absent one does not.
+fn port_open(endpoint: &str) -> bool {
+    let address = endpoint.split_once('/').map_or(endpoint, |(_, rest)| rest);
+    let address = address.split(['?', '#']).next().unwrap_or_default();
+    let mut addresses = address.to_socket_addrs().into_iter().flatten();
+    addresses.any(|address| TcpStream::connect_timeout(&address, PROBE_TIMEOUT).is_ok())
 }
 
 fn zenoh_config(options: &ConnectOptions) -> Result<zenoh::Config, ClientError> {
