@@ -86,6 +86,16 @@ fn user_file_without_users_does_not_open_the_server() {
 }
 
 #[test]
+fn refusals_with_a_reason_pass_access_control() {
+    let folder = SecurityFolder::new().unwrap();
+    let (server, endpoint) = serve("tcp", &folder.path("server-acl.json5"));
+    let mut env = connect(&endpoint, Some(folder.path("client-user.json5"))).unwrap();
+    let error = env.step(&[0.0; 48]).unwrap_err().to_string();
+    assert!(error.contains("reset"), "{error}");
+    server.stop();
+}
+
+#[test]
 fn allowed_user_steps_and_is_seen_by_the_server() {
     let folder = SecurityFolder::new().unwrap();
     let (server, endpoint) = serve("tcp", &folder.path("server-acl.json5"));
