@@ -102,7 +102,7 @@ pub enum ClientError {
 }
 
 /// What makes a server log whom it refuses, and why.
-const SERVER_LOG: &str = "warn,twinstep=info,zenoh_transport=debug,zenoh::net::routing::interceptor=trace";
+const SERVER_LOG: &str = "warn,twinstep=info,zenoh_transport=debug,zenoh::net::routing=info";
 
 fn refused_or_absent(port_open: bool) -> String {
     if !port_open {
