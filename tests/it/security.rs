@@ -68,6 +68,7 @@ fn wrong_password_unknown_user_and_no_password_are_refused() {
     ] {
         assert!(text.contains(said), "{text}");
     }
+    assert!(!text.contains(".rs:"), "{text}");
     refused(&endpoint, Some(folder.edited("client-user.json5", "alice", "mallory").unwrap()));
     refused(&endpoint, None);
     server.stop();

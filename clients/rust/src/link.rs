@@ -250,13 +250,18 @@ fn open_session(options: &ConnectOptions) -> Result<Session, ClientError> {
                 return Err(ClientError::NoServer {
                     endpoint: options.endpoint.clone(),
                     waited_s: since.elapsed().as_secs_f64(),
-                    reason: error.to_string(),
+                    reason: without_source_line(&error.to_string()),
                     port_open: port_open(&options.endpoint),
                 });
             }
             Err(_) => std::thread::sleep(PAUSES[1]),
         }
     }
+}
+
+/// Zenoh's errors end with the place in Zenoh's source where they arose.
+fn without_source_line(error: &str) -> String {
+    error.split(" at /").next().unwrap_or(error).trim_end().to_owned()
 }
 
 /// True if a program accepts connections at the endpoint: a server that refuses a client does, an absent one does not.
