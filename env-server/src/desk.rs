@@ -14,7 +14,7 @@ use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
 use crate::Host;
-use crate::server::random_id;
+use crate::server::{FAREWELL, random_id};
 use crate::worker::{Grant, Job, Shared, Worker, reply, reply_error, shutting_down, stale_epoch};
 
 /// Requests that may wait at one worker. A client has one under way; the rest is room for its repeats.
@@ -131,7 +131,7 @@ impl Desk {
             let _ = lease.thread.join();
         }
         // Clients that ask on are told, until the server closes its session.
-        while let Ok(job) = jobs.recv_timeout(WATCH_PERIOD) {
+        while let Ok(job) = jobs.recv_timeout(FAREWELL) {
             if let DeskJob::Query(query) = job {
                 reply_error(&query, &shutting_down());
             }

@@ -24,7 +24,7 @@ use crate::{Host, HostError, ServerConfig};
 /// Requests that may wait at the desk.
 const DESK_QUEUE: usize = 1024;
 /// How long clients that ask on are told of the shutdown before the session closes.
-const FAREWELL: Duration = Duration::from_millis(200);
+pub const FAREWELL: Duration = Duration::from_millis(200);
 
 /// A running server.
 pub struct Server {
@@ -182,6 +182,7 @@ fn zenoh_config(config: &ServerConfig) -> Result<zenoh::Config, ServerError> {
             .map_err(|error| ServerError::ZenohConfig { path: path.clone(), reason: error.to_string() })?,
         None => zenoh::Config::default(),
     };
+    check_users(config, &zenoh)?;
     let listen = serde_json::json!([config.listen]).to_string();
     let connect = serde_json::json!(config.connect).to_string();
     let settings: [(&'static str, &str, &str); 7] = [
@@ -203,6 +204,22 @@ fn zenoh_config(config: &ServerConfig) -> Result<zenoh::Config, ServerError> {
         })?;
     }
     Ok(zenoh)
+}
+
+/// Fails if the configuration asks for users and their file names none: Zenoh would then let everyone in.
+fn check_users(config: &ServerConfig, zenoh: &zenoh::Config) -> Result<(), ServerError> {
+    let Some(path) = &config.zenoh else { return Ok(()) };
+    let setting = zenoh.get_json("transport/auth/usrpwd/dictionary_file").unwrap_or_default();
+    let Ok(Some(users)) = serde_json::from_str::<Option<PathBuf>>(&setting) else { return Ok(()) };
+    let refuse = |reason: String| Err(ServerError::ZenohConfig { path: path.clone(), reason });
+    match std::fs::read_to_string(&users) {
+        Ok(text) if text.trim().is_empty() => refuse(format!(
+            "its `dictionary_file` {} names no user, and Zenoh would let everyone in\n  write one `user:password` a line",
+            users.display()
+        )),
+        Ok(_) => Ok(()),
+        Err(error) => refuse(format!("its `dictionary_file` {}: {error}", users.display())),
+    }
 }
 
 /// A random number from the system's entropy.

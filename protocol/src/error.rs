@@ -70,7 +70,7 @@ impl Code {
 
     /// True if the request had effects, so that its sequence number is used up; false if the number is still free.
     pub fn counts_as_executed(self) -> bool {
-        matches!(self, Code::Diverged)
+        matches!(self, Code::Diverged | Code::Internal)
     }
 }
 

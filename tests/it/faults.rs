@@ -27,6 +27,6 @@ fn faults_never_execute_a_step_twice_skip_or_invent_one() {
 
 #[test]
 fn server_that_executes_a_step_twice_is_found_out() {
-    let tally = inject(1, 1, &["--double-every", "20"]);
+    let tally = inject(2, 1, &["--double-every", "5"]);
     assert!(tally.failures.iter().any(|(_, evidence)| evidence.starts_with("violation")), "{:#?}", tally.failures);
 }

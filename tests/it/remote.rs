@@ -158,7 +158,7 @@ fn nobody_at_the_endpoint_is_said_with_the_command_to_start_one() {
     options.connect_timeout = std::time::Duration::from_millis(300);
     let error = RemoteVecEnv::connect(&options).err().unwrap().to_string();
     assert!(error.starts_with("no server answers at tcp/127.0.0.1:9"), "{error}");
-    assert!(error.contains("twinstep serve"), "{error}");
+    assert!(error.contains("no program accepts connections there: start a server with `twinstep serve"), "{error}");
 }
 
 /// A host whose environments panic at their third step.

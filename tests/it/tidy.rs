@@ -11,7 +11,9 @@ fn files(folder: &Path, extensions: &[&str], found: &mut Vec<PathBuf>) {
     for entry in std::fs::read_dir(folder).unwrap().map(Result::unwrap) {
         let (path, name) = (entry.path(), entry.file_name());
         if path.is_dir() {
-            if !["target", ".git", ".venv", "node_modules", "twinstep-demo"].contains(&name.to_str().unwrap()) {
+            if !["target", ".git", ".venv", "node_modules", "twinstep-demo", "third_party"]
+                .contains(&name.to_str().unwrap())
+            {
                 files(&path, extensions, found);
             }
         } else if path.extension().is_some_and(|extension| extensions.contains(&extension.to_str().unwrap())) {

@@ -4,6 +4,8 @@
 //! ([`roles`]). Faults ([`fault::Fault`]) hit it one after another while the client steps counters (task `counter`) at full
 //! speed. The client compares every observation with a counter of its own ([`ledger::Ledger`]), which also survives the
 //! client's death. [`campaign`] runs many lanes at once and adds up.
+//!
+//! [`security`] has what the tests of TLS, users and access control need.
 
 pub mod campaign;
 pub mod fault;
@@ -12,3 +14,4 @@ pub mod ledger;
 pub mod process;
 pub mod repeats;
 pub mod roles;
+pub mod security;

@@ -6,6 +6,9 @@ use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
+/// How long a server may take to start.
+const STARTUP: Duration = Duration::from_secs(20);
+
 /// A child process; killed when dropped.
 pub struct Process {
     child: Child,
@@ -17,7 +20,8 @@ impl Process {
     pub fn start(program: &Path, arguments: &[String]) -> Result<Self, String> {
         let mut child = Command::new(program)
             .args(arguments)
-            .stdin(Stdio::null())
+            // Closes when this process dies, which tells the child to end.
+            .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
             .spawn()
@@ -32,6 +36,16 @@ impl Process {
             }
         });
         Ok(Self { child, lines })
+    }
+
+    /// Starts a program that prints `listening ENDPOINT` once it answers, and waits for that.
+    pub fn listening(program: &Path, arguments: &[String]) -> Result<(Self, String), String> {
+        let process = Self::start(program, arguments)?;
+        let line = process.line(STARTUP).unwrap_or_default();
+        match line.strip_prefix("listening ") {
+            Some(endpoint) => Ok((process, endpoint.to_owned())),
+            None => Err(format!("`{} {}` did not start", program.display(), arguments.join(" "))),
+        }
     }
 
     /// The next line, or `None` after `timeout` or once the process has ended.

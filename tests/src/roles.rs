@@ -1,5 +1,6 @@
 //! What the processes of a lane do.
 
+use std::io::Read;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -52,8 +53,12 @@ pub struct ClientArgs {
 }
 
 impl Role {
-    /// Does what the role does; ends only with an error, or by a signal.
+    /// Does what the role does, until killed or until stdin closes, as it does when the lane's process dies.
     pub fn run(&self) -> Result<(), Box<dyn std::error::Error>> {
+        std::thread::spawn(|| {
+            while matches!(std::io::stdin().read(&mut [0; 64]), Ok(1..)) {}
+            std::process::exit(0);
+        });
         match self {
             Role::Server(arguments) => serve(arguments),
             Role::Client(arguments) => Ok(client(arguments)?),

@@ -16,11 +16,7 @@ pub enum ClientError {
         reason: String,
     },
     /// No connection could be opened.
-    #[error(
-        "no server answers at {endpoint} after {waited_s:.1} s ({reason})\n  start one: `twinstep serve --task walk`\n  \
-         if one runs there, its TLS certificate, user or password may be refused: its log says so, Zenoh does not tell \
-         the client"
-    )]
+    #[error("no server answers at {endpoint} after {waited_s:.1} s ({reason})\n  {}", refused_or_absent(*port_open))]
     NoServer {
         /// Where the client tried.
         endpoint: String,
@@ -28,12 +24,15 @@ pub enum ClientError {
         waited_s: f64,
         /// What Zenoh said.
         reason: String,
+        /// True if a program accepts connections there.
+        port_open: bool,
     },
     /// The connection stands, but no server is visible.
     #[error(
         "connected to {endpoint}, but no server is visible there after {waited_s:.1} s\n  either none runs behind it, or \
-         access control hides it from this user: the server's `access_control` must allow `liveliness_query` and \
-         `query` on `twinstep/**`"
+         access control hides it from this user: Zenoh tells the client nothing of either\n  to find out, look at what the \
+         server says: `TWINSTEP_LOG={SERVER_LOG} twinstep serve --zenoh FILE`; its `access_control` must allow this \
+         user what `examples/security/server-acl.json5` allows `alice`"
     )]
     Invisible {
         /// Where the client is connected.
@@ -100,4 +99,20 @@ pub enum ClientError {
         /// What is wrong with the answer.
         reason: String,
     },
+}
+
+/// What makes a server log whom it refuses, and why.
+const SERVER_LOG: &str = "warn,twinstep=info,zenoh_transport=debug,zenoh::net::routing=info";
+
+fn refused_or_absent(port_open: bool) -> String {
+    if !port_open {
+        return "no program accepts connections there: start a server with `twinstep serve --listen ENDPOINT`, or look \
+                for its address, port or firewall"
+            .to_owned();
+    }
+    format!(
+        "a program accepts connections there: either it is no Zenoh server, or this client is refused: its user, \
+         password or certificate, or tcp in place of tls; Zenoh does not tell the client which\n  to find out, look at \
+         what the server says: `TWINSTEP_LOG={SERVER_LOG} twinstep serve --zenoh FILE`"
+    )
 }

@@ -1,5 +1,6 @@
 //! The connection to one server: opening, finding, asking until answered, and saying why not.
 
+use std::net::{TcpStream, ToSocketAddrs};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -22,6 +23,8 @@ const PAUSES: [Duration; 2] = [Duration::from_millis(2), Duration::from_millis(2
 /// How long another server must stand in the place of ours before ours counts as restarted. A server that lost its
 /// router is back within a second.
 const REPLACED_FOR: Duration = Duration::from_secs(2);
+/// How long a port may take to accept a connection.
+const PROBE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Where to connect and what to ask for.
 #[derive(Clone, Debug)]
@@ -249,12 +252,26 @@ fn open_session(options: &ConnectOptions) -> Result<Session, ClientError> {
                 return Err(ClientError::NoServer {
                     endpoint: options.endpoint.clone(),
                     waited_s: since.elapsed().as_secs_f64(),
-                    reason: error.to_string(),
+                    reason: without_source_line(&error.to_string()),
+                    port_open: port_open(&options.endpoint),
                 });
             }
             Err(_) => std::thread::sleep(PAUSES[1]),
         }
     }
+}
+
+/// Zenoh's errors end with the place in Zenoh's source where they arose.
+fn without_source_line(error: &str) -> String {
+    error.split(" at /").next().unwrap_or(error).trim_end().to_owned()
+}
+
+/// True if a program accepts connections at the endpoint: a server that refuses a client does, an absent one does not.
+fn port_open(endpoint: &str) -> bool {
+    let address = endpoint.split_once('/').map_or(endpoint, |(_, rest)| rest);
+    let address = address.split(['?', '#']).next().unwrap_or_default();
+    let mut addresses = address.to_socket_addrs().into_iter().flatten();
+    addresses.any(|address| TcpStream::connect_timeout(&address, PROBE_TIMEOUT).is_ok())
 }
 
 fn zenoh_config(options: &ConnectOptions) -> Result<zenoh::Config, ClientError> {
