@@ -1,7 +1,8 @@
 //! Who may use whom: the star around `model`, and one wall around each big library.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 /// Crate folder and the workspace crates it may depend on. Leaves import only the core; the edge composes them.
 const MAY_USE: [(&str, &[&str]); 10] = [
@@ -71,5 +72,31 @@ fn big_libraries_stay_behind_their_walls() {
                 "{folder} uses {library}; only {inside:?} may"
             );
         }
+    }
+}
+
+/// Every third-party crate that `arguments` select, with the features it is built with.
+fn features(arguments: &[&str]) -> BTreeMap<String, BTreeSet<String>> {
+    let tree = Command::new(env!("CARGO"))
+        .args(["tree", "--offline", "--prefix", "none", "--no-dedupe", "--format", "{p}\t{f}"])
+        .args(arguments)
+        .current_dir(root())
+        .output()
+        .unwrap();
+    assert!(tree.status.success(), "{}", String::from_utf8_lossy(&tree.stderr));
+    let mut found = BTreeMap::<String, BTreeSet<String>>::new();
+    for (package, features) in String::from_utf8(tree.stdout).unwrap().lines().filter_map(|line| line.split_once('\t'))
+    {
+        found.entry(package.to_owned()).or_default().extend(features.split(',').map(str::to_owned));
+    }
+    found
+}
+
+#[test]
+fn program_and_tests_share_one_build_of_every_dependency() {
+    let everything = features(&["--workspace", "--edges", "normal,build,dev"]);
+    for (package, features) in features(&["--package", "twinstep-cli", "--edges", "normal,build"]) {
+        let more: Vec<_> = everything[&package].difference(&features).collect();
+        assert!(more.is_empty(), "{package} is built a second time for the tests, with {more:?}: add them in `cli`");
     }
 }
