@@ -7,6 +7,7 @@ mod faults;
 mod layering;
 mod leases;
 mod physics;
+mod python;
 mod raw_client;
 mod remote;
 mod security;

@@ -2,27 +2,24 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
-use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::channel;
 
 use twinstep_model::stream;
 
 use crate::fault::Fault;
-use crate::lane::Lane;
+use crate::lane::{Commands, Lane};
 
 /// What to inject.
-pub struct Plan<'a> {
-    /// The program with the roles of [`crate::roles`].
-    pub program: &'a Path,
+pub struct Plan {
+    /// What the processes run.
+    pub commands: Commands,
     /// Number of faults.
     pub faults: usize,
     /// Lanes at once; every second one has a router.
     pub lanes: usize,
     /// Seed of the faults and their moments.
     pub seed: u64,
-    /// Further arguments of the servers.
-    pub server_arguments: Vec<String>,
 }
 
 /// What came of it.
@@ -57,7 +54,7 @@ impl std::fmt::Display for Tally {
 }
 
 /// Injects the faults of `plan`. `progress` is told of each; `stop` ends early.
-pub fn run(plan: &Plan<'_>, stop: &AtomicBool, progress: impl Fn(Fault)) -> Result<Tally, String> {
+pub fn run(plan: &Plan, stop: &AtomicBool, progress: impl Fn(Fault)) -> Result<Tally, String> {
     let (sender, outcomes) = channel();
     std::thread::scope(|scope| {
         let threads: Vec<_> = (0..plan.lanes)
@@ -88,7 +85,7 @@ pub fn run(plan: &Plan<'_>, stop: &AtomicBool, progress: impl Fn(Fault)) -> Resu
 
 /// Injects `share` faults; a lane that does not go on is started anew. Returns the acknowledged steps.
 fn run_lane(
-    plan: &Plan<'_>,
+    plan: &Plan,
     index: usize,
     share: usize,
     stop: &AtomicBool,
@@ -96,7 +93,7 @@ fn run_lane(
 ) -> Result<u64, String> {
     let with_router = index % 2 == 1;
     let mut random = stream(plan.seed, "faults", index as u64);
-    let start = || Lane::start(plan.program, with_router, &plan.server_arguments);
+    let start = || Lane::start(&plan.commands, with_router);
     let mut lane = start()?;
     let mut steps = 0;
     for _ in 0..share {

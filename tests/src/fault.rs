@@ -10,7 +10,8 @@ use twinstep_model::Stream;
 pub enum Fault {
     /// SIGKILL in the middle of a step, then a new start: the client is told, leases anew and goes on.
     ServerKilled,
-    /// SIGKILL, then another client that reclaims the lease: the counters go on where they were.
+    /// SIGKILL, then another client that reclaims the lease: the counters go on where they were. A client that cannot
+    /// reclaim starts anew.
     ClientKilled,
     /// SIGKILL of the router, then a new one: the lease goes on.
     RouterKilled,
@@ -18,6 +19,8 @@ pub enum Fault {
     ClientFrozen,
     /// SIGSTOP and SIGCONT, past the client's timeout: the lease goes on.
     ServerFrozen,
+    /// Every message between client and server held back for a while: the lease goes on.
+    MessagesDelayed,
     /// Every request sent three times at once: executed once, answered three times alike.
     RequestRepeated,
     /// A second server of the same name or at the same endpoint: refused, and the client goes on.
@@ -26,12 +29,13 @@ pub enum Fault {
 
 impl Fault {
     /// Every fault.
-    pub const ALL: [Fault; 7] = [
+    pub const ALL: [Fault; 8] = [
         Fault::ServerKilled,
         Fault::ClientKilled,
         Fault::RouterKilled,
         Fault::ClientFrozen,
         Fault::ServerFrozen,
+        Fault::MessagesDelayed,
         Fault::RequestRepeated,
         Fault::SecondServer,
     ];
@@ -44,6 +48,7 @@ impl Fault {
             Fault::RouterKilled => "router killed, restarted",
             Fault::ClientFrozen => "client frozen, thawed",
             Fault::ServerFrozen => "server frozen past the timeout, thawed",
+            Fault::MessagesDelayed => "messages delayed",
             Fault::RequestRepeated => "requests sent three times at once",
             Fault::SecondServer => "second server started by mistake",
         }

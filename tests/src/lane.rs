@@ -8,30 +8,55 @@ use twinstep_model::Stream;
 
 use crate::fault::{Fault, moment};
 use crate::process::Process;
+use crate::proxy::Proxy;
 use crate::repeats;
 
 /// How long a lane may take to go on after a fault.
 const PATIENCE: Duration = Duration::from_secs(30);
+/// How long the news of a server may take through the router.
+const NEWS: Duration = Duration::from_secs(3);
 /// Steps after which a lane counts as going on.
 const PROGRESS: usize = 3;
 
 /// The processes of one lane.
 pub struct Lane {
-    program: PathBuf,
     router: Option<Process>,
     server: Process,
     client: Process,
     /// Where the server listens.
     listen: String,
-    /// Where clients connect, and the server too if it is a router.
+    /// Where other clients connect, and the server too if it is a router.
     endpoint: String,
-    extra: Vec<String>,
+    /// Where the client connects, on its way to `endpoint`.
+    proxy: Proxy,
+    plan: Commands,
     /// The client's lease and epoch.
     lease: [String; 2],
     /// Counters after the last acknowledged step, as the client printed them.
     acknowledged: Vec<String>,
     /// Steps that the client acknowledged.
     pub steps: u64,
+}
+
+/// What the processes of a lane run.
+#[derive(Clone, Debug)]
+pub struct Commands {
+    /// The program with the roles of [`crate::roles`].
+    pub program: PathBuf,
+    /// Further arguments of the server.
+    pub server: Vec<String>,
+    /// Program and first arguments of another client, which prints the same lines and does not reclaim.
+    pub client: Option<Vec<String>>,
+}
+
+impl Commands {
+    fn start_client(&self, endpoint: &str, heritage: &[String]) -> Result<Process, String> {
+        let own = vec![self.program.display().to_string(), "client".to_owned()];
+        let mut words = self.client.clone().unwrap_or(own);
+        words.push(endpoint.to_owned());
+        words.extend_from_slice(heritage);
+        Process::start(Path::new(&words[0]), &words[1..])
+    }
 }
 
 /// Whether the lease must outlive a fault.
@@ -42,21 +67,23 @@ enum Lease {
 }
 
 impl Lane {
-    /// Starts the processes from `program` and waits until the client steps. `extra` is passed to the server.
-    pub fn start(program: &Path, with_router: bool, extra: &[String]) -> Result<Self, String> {
+    /// Starts the processes and waits until the client steps.
+    pub fn start(plan: &Commands, with_router: bool) -> Result<Self, String> {
+        let program = &plan.program;
         let listen = free_endpoint()?;
         let endpoint = if with_router { free_endpoint()? } else { listen.clone() };
         let router = if with_router { Some(start_router(program, &endpoint)?) } else { None };
-        let server = start_server(program, &listen, router.as_ref().map(|_| endpoint.as_str()), extra)?;
-        let client = Process::start(program, &["client".to_owned(), endpoint.clone()])?;
+        let server = start_server(program, &listen, router.as_ref().map(|_| endpoint.as_str()), &plan.server)?;
+        let proxy = Proxy::start(&endpoint)?;
+        let client = plan.start_client(&proxy.endpoint, &[])?;
         let mut lane = Self {
-            program: program.to_owned(),
             router,
             server,
             client,
             listen,
             endpoint,
-            extra: extra.to_vec(),
+            proxy,
+            plan: plan.clone(),
             lease: Default::default(),
             acknowledged: Vec::new(),
             steps: 0,
@@ -85,6 +112,10 @@ impl Lane {
                 freeze(&self.server, moment(random, 2500..4000))?;
                 self.goes_on(Lease::GoesOn)
             }
+            Fault::MessagesDelayed => {
+                self.proxy.hold(moment(random, 50..3000));
+                self.goes_on(Lease::GoesOn)
+            }
             Fault::RequestRepeated => {
                 repeats::three_times(&self.endpoint)?;
                 self.goes_on(Lease::GoesOn)
@@ -99,7 +130,7 @@ impl Lane {
 
     fn kill_server(&mut self) -> Result<(), String> {
         self.server.kill();
-        self.server = start_server(&self.program, &self.listen, self.router_endpoint(), &self.extra)?;
+        self.server = start_server(&self.plan.program, &self.listen, self.router_endpoint(), &self.plan.server)?;
         self.goes_on(Lease::IsNew)
     }
 
@@ -107,10 +138,14 @@ impl Lane {
         for line in self.client.kill() {
             self.note(&line)?;
         }
+        if self.plan.client.is_some() {
+            self.client = self.plan.start_client(&self.proxy.endpoint, &[])?;
+            return self.goes_on(Lease::IsNew);
+        }
         let [lease, epoch] = self.lease.clone();
-        let mut arguments = vec!["client".to_owned(), self.endpoint.clone(), "--inherit".to_owned(), lease, epoch];
-        arguments.extend(self.acknowledged.iter().cloned());
-        self.client = Process::start(&self.program, &arguments)?;
+        let mut heritage = vec!["--inherit".to_owned(), lease, epoch];
+        heritage.extend(self.acknowledged.iter().cloned());
+        self.client = self.plan.start_client(&self.proxy.endpoint, &heritage)?;
         self.goes_on(Lease::GoesOn)
     }
 
@@ -118,7 +153,7 @@ impl Lane {
         let Some(router) = &mut self.router else { return Err("this lane has no router".to_owned()) };
         router.kill();
         std::thread::sleep(pause);
-        self.router = Some(start_router(&self.program, &self.endpoint)?);
+        self.router = Some(start_router(&self.plan.program, &self.endpoint)?);
         self.goes_on(Lease::GoesOn)
     }
 
@@ -126,18 +161,23 @@ impl Lane {
     /// cannot even start.
     fn start_second_server(&mut self) -> Result<(), String> {
         if self.has_router() {
-            let _second = start_server(&self.program, &free_endpoint()?, self.router_endpoint(), &[])?;
+            let _second = start_server(&self.plan.program, &free_endpoint()?, self.router_endpoint(), &[])?;
             let options = ConnectOptions {
                 connect_timeout: Duration::from_millis(500),
                 ..ConnectOptions::new(&self.endpoint, 1)
             };
-            match RemoteVecEnv::connect(&options) {
-                Err(ClientError::NoUniqueRobot { .. }) => self.goes_on(Lease::GoesOn),
-                Err(error) => Err(format!("two servers: {error}")),
-                Ok(_) => Err("a client chose one of two servers".to_owned()),
+            let since = Instant::now();
+            loop {
+                match RemoteVecEnv::connect(&options) {
+                    Err(ClientError::NoUniqueRobot { .. }) => return self.goes_on(Lease::GoesOn),
+                    Err(error) => return Err(format!("two servers: {error}")),
+                    // The router may not have heard of the second server yet.
+                    Ok(_) if since.elapsed() < NEWS => {}
+                    Ok(_) => return Err("a client chose one of two servers".to_owned()),
+                }
             }
         } else {
-            let mut second = Process::start(&self.program, &["server".to_owned(), self.listen.clone()])?;
+            let mut second = Process::start(&self.plan.program, &["server".to_owned(), self.listen.clone()])?;
             match second.exit_code(PATIENCE) {
                 Some(0) | None => Err("a second server started at the same endpoint".to_owned()),
                 Some(_) => self.goes_on(Lease::GoesOn),

@@ -9,6 +9,7 @@ use std::time::Instant;
 use clap::Parser;
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_tests::campaign::{self, Plan};
+use twinstep_tests::lane::Commands;
 use twinstep_tests::roles::Role;
 
 /// Kill, freeze and confuse servers, clients and routers, and count what goes wrong.
@@ -27,6 +28,9 @@ struct Arguments {
     /// Seed of the faults and their moments.
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Another client, program and first arguments, in place of the Rust one; it is given the endpoint.
+    #[arg(long, num_args = 1.., value_name = "COMMAND")]
+    client: Option<Vec<String>>,
     /// One process of a lane; the lanes start these themselves.
     #[command(subcommand)]
     role: Option<Role>,
@@ -51,11 +55,10 @@ fn main() -> ExitCode {
 fn inject(arguments: &Arguments) -> Result<bool, Box<dyn std::error::Error>> {
     let program = std::env::current_exe()?;
     let plan = Plan {
-        program: &program,
+        commands: Commands { program, server: Vec::new(), client: arguments.client.clone() },
         faults: arguments.faults,
         lanes: usize::from(arguments.lanes),
         seed: arguments.seed,
-        server_arguments: Vec::new(),
     };
     let style = ProgressStyle::with_template("{bar:40} {pos}/{len} faults, {per_sec}, {eta} left: {msg}")?;
     let bar = ProgressBar::new(arguments.faults as u64).with_style(style);

@@ -1,0 +1,64 @@
+"""Simulated and real Unitree Go2 robots as Gymnasium environments.
+
+>>> import gymnasium as gym
+>>> import twinstep
+>>> envs = gym.make_vec("twinstep/Go2-Walk-v0", num_envs=64)  # doctest: +SKIP
+
+``endpoint=`` names a remote server or the robot; without, the bundled server starts on this machine and ends with this
+process.
+"""
+
+import gymnasium
+
+from .codec import MalformedError, Part, Spec
+from .env import Go2Env
+from .errors import (
+    Error,
+    InvalidActionError,
+    InvalidOptionError,
+    LeaseLostError,
+    NoAnswerError,
+    NoServerError,
+    NoUniqueRobotError,
+    RefusedError,
+    ResetNeededError,
+    ServerDiedError,
+    SpecMismatchError,
+    VersionError,
+)
+from .remote import Options
+from .server import EmbeddedServer, ServerNotFoundError, ServerStartError
+from .vector_env import Go2VectorEnv
+
+__all__ = [
+    "EmbeddedServer",
+    "Error",
+    "Go2Env",
+    "Go2VectorEnv",
+    "InvalidActionError",
+    "InvalidOptionError",
+    "LeaseLostError",
+    "MalformedError",
+    "NoAnswerError",
+    "NoServerError",
+    "NoUniqueRobotError",
+    "Options",
+    "Part",
+    "RefusedError",
+    "ResetNeededError",
+    "ServerDiedError",
+    "ServerNotFoundError",
+    "ServerStartError",
+    "Spec",
+    "SpecMismatchError",
+    "VersionError",
+]
+
+gymnasium.register(
+    id="twinstep/Go2-Walk-v0",
+    entry_point="twinstep.env:Go2Env",
+    vector_entry_point="twinstep.vector_env:Go2VectorEnv",
+    # Twenty seconds, the task's own limit.
+    max_episode_steps=1000,
+    kwargs={"task": "walk"},
+)

@@ -1,0 +1,131 @@
+"""Messages of the wire (``protocol/SPEC.md``) to bytes and back, and the server's spec."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import Error
+
+PROTOCOL = 1
+"""Version of the protocol that this client speaks."""
+
+
+class MalformedError(Error):
+    """The server's answer is not what the protocol says."""
+
+
+def encode(message: Mapping[str, object]) -> bytes:
+    """Encode a request; the protocol's version is added."""
+    return cast(bytes, msgpack.packb({"protocol": PROTOCOL, **message}))
+
+
+def decode(payload: bytes) -> dict[str, Any]:
+    """Decode a message.
+
+    Raises
+    ------
+    MalformedError
+        The bytes are not a MessagePack map.
+    """
+    try:
+        message = cast(object, msgpack.unpackb(payload))
+    except Exception as error:  # msgpack raises many kinds
+        raise MalformedError(f"the answer is not MessagePack: {error}") from error
+    if not isinstance(message, dict):
+        raise MalformedError(f"the answer is {type(message).__name__}, not a map")
+    return cast(dict[str, Any], message)
+
+
+def tensor(message: Mapping[str, Any], field: str, dtype: str, *shape: int) -> NDArray[Any]:
+    """Read a tensor of ``message`` into a fresh, writable array.
+
+    Parameters
+    ----------
+    message
+        A decoded message.
+    field
+        Name of the tensor.
+    dtype
+        Little-endian NumPy type, such as ``"<f4"``.
+    shape
+        What is expected; the first entry may be -1.
+    """
+    payload = message.get(field)
+    if not isinstance(payload, bytes):
+        raise MalformedError(f"`{field}` is {type(payload).__name__}, not bytes")
+    try:
+        return np.frombuffer(payload, dtype).reshape(shape).copy()
+    except ValueError as error:
+        raise MalformedError(f"`{field}` has {len(payload)} bytes; {dtype} {shape} is wanted") from error
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of an observation or action: ``size`` entries with a common name, unit and bounds."""
+
+    name: str
+    size: int
+    unit: str
+    low: float
+    high: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What a server says about its task: layouts, rates, gains. ``hash`` is equal where an agent may run on both."""
+
+    task: str
+    robot: str
+    observation: tuple[Part, ...]
+    action: tuple[Part, ...]
+    joint_order: tuple[str, ...]
+    policy_dt: float
+    drive_dt: float
+    kp: float
+    kd: float
+    action_scale: float
+    default_pose: tuple[float, ...]
+    reward_terms: tuple[str, ...]
+    max_episode_steps: int
+    hash: str
+
+    @property
+    def obs_len(self) -> int:
+        """Entries of an observation."""
+        return sum(part.size for part in self.observation)
+
+    @property
+    def action_len(self) -> int:
+        """Entries of an action."""
+        return sum(part.size for part in self.action)
+
+    def action_entry(self, index: int) -> str:
+        """Name entry ``index`` of an action, such as ``joint_position_offset[FL_thigh]``."""
+        for part in self.action:
+            if index < part.size:
+                per_joint = part.size == len(self.joint_order)
+                return f"{part.name}[{self.joint_order[index] if per_joint else index}]"
+            index -= part.size
+        raise IndexError(index)
+
+
+def read_spec(message: Mapping[str, Any], spec_hash: str) -> Spec:
+    """Read the ``spec`` of a hello or lease reply."""
+    try:
+        fields = dict(cast(Mapping[str, Any], message["spec"]))
+        for name in ("observation", "action"):
+            fields[name] = tuple(
+                Part(**{key: part[key] for key in ("name", "size", "unit", "low", "high", "text")})
+                for part in fields[name]
+            )
+        for name in ("joint_order", "default_pose", "reward_terms"):
+            fields[name] = tuple(fields[name])
+        known = set(Spec.__dataclass_fields__) - {"hash"}
+        return Spec(**{name: fields[name] for name in known}, hash=spec_hash)
+    except (KeyError, TypeError) as error:
+        raise MalformedError(f"the server's spec lacks or garbles {error}") from error

@@ -1,0 +1,172 @@
+"""One robot as a Gymnasium environment."""
+
+from typing import Any, Literal, TypedDict, Unpack
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InvalidActionError, InvalidOptionError
+from .remote import UNLIMITED, Batch, Options, RemoteEnvs
+from .render import Viewer
+from .spaces import action_space, observation_space
+
+RenderMode = Literal["rgb_array", "human"]
+
+
+class OptionArguments(TypedDict, total=False):
+    """Keyword arguments that :class:`Go2Env` and :class:`Go2VectorEnv` pass on to :class:`twinstep.Options`."""
+
+    endpoint: str | None
+    robot: str | None
+    task: str
+    config: str | None
+    model: str | None
+    zenoh_config: str | None
+    spec_hash: str | None
+    timeout_s: float
+    reset_timeout_s: float
+
+
+class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One robot, simulated or real.
+
+    Parameters
+    ----------
+    render_mode
+        ``"rgb_array"``, ``"human"`` (needs the extra ``[render]``), or ``None``.
+    max_episode_steps
+        Policy steps after which the server truncates an episode. ``None`` leaves the time limit to
+        ``gymnasium.make``, which adds one.
+    info_timing
+        Adds ``round_trip_s`` [s] to every info of a step. Off, infos depend on seed and actions alone.
+    **options
+        See :class:`twinstep.Options`.
+
+    Notes
+    -----
+    Observation (45,) and action (12,) are float32; ``docs/go2-walk.md`` lists their entries with units and frames.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}  # noqa: RUF012
+
+    def __init__(
+        self,
+        *,
+        render_mode: RenderMode | None = None,
+        max_episode_steps: int | None = None,
+        info_timing: bool = False,
+        **options: Unpack[OptionArguments],
+    ) -> None:
+        self.render_mode = checked_render_mode(render_mode)
+        self._info_timing = info_timing
+        self._remote = RemoteEnvs(
+            Options(**options),
+            num_envs=1,
+            autoreset="Disabled",
+            max_episode_steps=UNLIMITED if max_episode_steps is None else max_episode_steps,
+        )
+        self.twinstep_spec = self._remote.spec
+        self.observation_space = observation_space(self._remote.spec)
+        self.action_space = action_space(self._remote.spec)
+        self._viewer: Viewer | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode.
+
+        Parameters
+        ----------
+        seed
+            Equal seeds give equal episodes. ``None`` continues the random stream.
+        options
+            None are known.
+
+        Returns
+        -------
+        obs : (45,) float32
+        info : dict
+            Empty.
+        """
+        super().reset(seed=seed)
+        if options:
+            raise InvalidOptionError(f"`options` has {sorted(options)}; a single environment knows none")
+        seeds = None if seed is None else np.array([seed], dtype=np.uint64)
+        obs = self._remote.reset(seeds, None)[0]
+        self._show()
+        return obs, {}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Advance by one policy period (20 ms).
+
+        Parameters
+        ----------
+        action : (12,) float32
+            Offsets from the default pose in units of ``action_scale``, joints in the spec's order.
+
+        Returns
+        -------
+        obs : (45,) float32
+        reward : float
+        terminated, truncated : bool
+        info : dict
+            At the end of an episode ``reward_terms``, the episode's sum of each weighted reward term.
+        """
+        self.send(action)
+        return self.recv()
+
+    def send(self, action: NDArray[np.float32]) -> None:
+        """Send an action without waiting; :meth:`recv` is next."""
+        given = np.asarray(action)
+        if given.shape != self.action_space.shape:
+            raise InvalidActionError(f"`action` has shape {given.shape}; {self.action_space.shape} is wanted")
+        self._remote.send(given[None])
+
+    def recv(self) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Wait for what the sent action gave; may be called again after a ``NoAnswerError``."""
+        batch = self._remote.recv()
+        info: dict[str, Any] = {}
+        if len(batch.ended):
+            info["reward_terms"] = reward_terms(batch, 0, self.twinstep_spec.reward_terms)
+        if self._info_timing:
+            info["round_trip_s"] = batch.round_trip_s
+        self._show()
+        return batch.obs[0], float(batch.reward[0]), bool(batch.terminated[0]), bool(batch.truncated[0]), info
+
+    def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Draw the robot: (480, 640, 3) uint8 with ``render_mode="rgb_array"``, else ``None``."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render was called, but `render_mode` is not set: make(..., render_mode='rgb_array')")
+            return None
+        picture = self._draw()
+        return picture if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Give the environment back and close the window."""
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
+        self._remote.close()
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self._draw()
+
+    def _draw(self) -> NDArray[np.uint8]:
+        if self._viewer is None:
+            assert self.render_mode is not None
+            self._viewer = Viewer(self.render_mode)
+        return self._viewer.draw(self._remote.scene(0))
+
+
+def checked_render_mode(mode: str | None) -> RenderMode | None:
+    """Return ``mode`` if it is one."""
+    if mode is None or mode == "rgb_array" or mode == "human":
+        return mode
+    raise InvalidOptionError(f"`render_mode` = {mode!r}; 'rgb_array', 'human' and None are known")
+
+
+def reward_terms(batch: Batch, index: int, names: tuple[str, ...]) -> dict[str, float]:
+    """Sums of the weighted reward terms of the ``index``-th episode that ended."""
+    return {name: float(value) for name, value in zip(names, batch.ended_terms[index], strict=True)}

@@ -1,0 +1,275 @@
+"""The connection to one server: opening, finding, asking until answered, and saying why not."""
+
+import json
+import os
+import socket
+import time
+import uuid
+from pathlib import Path
+from typing import Any, cast
+
+import zenoh
+
+from . import codec
+from .errors import (
+    Error,
+    InvalidOptionError,
+    LeaseLostError,
+    NoAnswerError,
+    NoServerError,
+    NoUniqueRobotError,
+    ServerDiedError,
+    VersionError,
+    from_reply,
+)
+from .server import EmbeddedServer
+
+QUERY_TIMEOUT_S = 1.0
+"""A query is repeated after this time; Zenoh keeps state for each as long. A longer step is waited for by repeating."""
+
+CONNECT_TIMEOUT_S = 5.0
+"""How long to look for a server."""
+
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.002, 0.2
+_REPLACED_FOR_S = 2.0
+_LIVE_SERVERS = "twinstep/live/server/*/*"
+
+
+class Pending:
+    """A request that was sent and not yet answered."""
+
+    def __init__(self, querier: zenoh.Querier, payload: bytes) -> None:
+        self.querier = querier
+        self.payload = payload
+        self.replies = self._get()
+
+    def repeat(self) -> None:
+        """Send it again under the same number, so that it is executed once."""
+        self.replies = self._get()
+
+    def _get(self) -> Any:
+        try:
+            return self.querier.get(payload=self.payload)
+        except zenoh.ZError as error:
+            raise NoServerError(f"the Zenoh session is closed: {error}") from error
+
+
+class Link:
+    """A connection to one server.
+
+    Parameters
+    ----------
+    endpoint
+        Zenoh endpoint of the server or of a router, such as ``tcp/127.0.0.1:7447``.
+    robot
+        The robot's name; needed where several are visible.
+    zenoh_config
+        Zenoh configuration file (JSON5) for TLS, user and password.
+    server
+        The server at ``endpoint``, if this process started it.
+    """
+
+    def __init__(
+        self, endpoint: str, *, robot: str | None, zenoh_config: str | None, server: EmbeddedServer | None
+    ) -> None:
+        self.endpoint = endpoint
+        self._server = server
+        self._pid = os.getpid()
+        self._session = _open_session(endpoint, zenoh_config, server)
+        try:
+            self.sid, self.name = self._find_server(robot)
+            self.client = uuid.uuid4().hex
+            self.hello = self._greet()
+            self._token = self._session.liveliness().declare_token(f"twinstep/live/client/{self.sid}/{self.client}")
+        except BaseException:
+            self._session.close()
+            raise
+
+    def close(self) -> None:
+        """Close the session."""
+        # A child made by fork has the object, but not the session's threads.
+        if self._pid == os.getpid():
+            self._session.close()
+
+    def querier(self, key: str) -> zenoh.Querier:
+        """Declare a querier for ``twinstep/<sid>/<key>``."""
+        return self._session.declare_querier(
+            f"twinstep/{self.sid}/{key}",
+            target=zenoh.QueryTarget.BEST_MATCHING,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            express=True,
+            timeout=QUERY_TIMEOUT_S,
+        )
+
+    def ask(self, querier: zenoh.Querier, request: dict[str, object], timeout_s: float) -> dict[str, Any]:
+        """Send a request and wait for its answer."""
+        return self.wait(Pending(querier, codec.encode(request)), timeout_s)
+
+    def wait(self, pending: Pending, timeout_s: float) -> dict[str, Any]:
+        """Wait for the answer to a request, repeating it. May be called again after a :class:`NoAnswerError`."""
+        since, pause, replaced_since = time.monotonic(), _FIRST_PAUSE_S, None
+        while True:
+            answer = _outcome(pending)
+            if isinstance(answer, dict):
+                return answer
+            if self._server is not None and not self._server.alive:
+                raise ServerDiedError(self._server.obituary())
+            now = time.monotonic()
+            # Only silence tells of a restart: a query that times out had somebody at its end.
+            replaced = answer is _Silence.NOBODY and self._replaced()
+            replaced_since = (replaced_since or now) if replaced else None
+            if replaced_since is not None and now - replaced_since >= _REPLACED_FOR_S:
+                raise LeaseLostError(
+                    f"the server at {self.endpoint} was restarted: its environments are gone\n  make a new environment"
+                )
+            if now - since >= timeout_s:
+                raise NoAnswerError(
+                    f"no answer from {self.endpoint} to `{pending.querier.key_expr}` after {now - since:.1f} s: "
+                    f"{self._diagnose()}"
+                )
+            time.sleep(pause)
+            pause = min(2 * pause, _LONGEST_PAUSE_S)
+            pending.repeat()
+
+    def _greet(self) -> dict[str, Any]:
+        request: dict[str, object] = {"client": "twinstep-python"}
+        hello = self.ask(self.querier("hello"), request, CONNECT_TIMEOUT_S)
+        low, high = hello["protocols"]
+        if not low <= codec.PROTOCOL <= high:
+            raise VersionError(
+                f"the server at {self.endpoint} ({hello['build']}) speaks protocol {low} to {high}, this client "
+                f"{codec.PROTOCOL}\n  install the same Twinstep at both ends"
+            )
+        return hello
+
+    def _visible_servers(self) -> list[tuple[str, str]]:
+        """Server id and robot name of every visible server."""
+        replies = self._session.liveliness().get(_LIVE_SERVERS, timeout=QUERY_TIMEOUT_S)
+        keys = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+        return sorted((key.split("/")[3], key.split("/")[4]) for key in keys)
+
+    def _find_server(self, robot: str | None) -> tuple[str, str]:
+        since = time.monotonic()
+        while True:
+            visible = self._visible_servers()
+            fitting = [server for server in visible if robot in (None, server[1])]
+            if len(fitting) == 1:
+                return fitting[0]
+            waited_s = time.monotonic() - since
+            if waited_s < CONNECT_TIMEOUT_S:
+                # A restarted server's old token may still be there for a moment.
+                time.sleep(0.05)
+                continue
+            if not visible:
+                raise NoServerError(
+                    f"connected to {self.endpoint}, but no server is visible there after {waited_s:.1f} s\n"
+                    "  either none runs behind it, or access control hides it from this user: the server's log tells"
+                )
+            wanted = f"{len(fitting)} robots are named `{robot}`" if robot else f"{len(fitting)} robots are there"
+            names = ", ".join(f"{name} ({sid})" for sid, name in visible)
+            raise NoUniqueRobotError(f"{wanted}; visible: {names}\n  choose one by its name: `robot=`")
+
+    def _replaced(self) -> bool:
+        visible = self._visible_servers()
+        return all(sid != self.sid for sid, _ in visible) and any(name == self.name for _, name in visible)
+
+    def _diagnose(self) -> str:
+        info = self._session.info
+        if not info.routers_zid() and not info.peers_zid():
+            return "the connection is down and could not be opened again; does the server or the router still run?"
+        if all(sid != self.sid for sid, _ in self._visible_servers()):
+            return "the connection stands, but the server is gone from it: it ended, or its own link did"
+        hello = _outcome(Pending(self.querier("hello"), codec.encode({"client": "twinstep-python"})))
+        if isinstance(hello, dict):
+            return (
+                "the server answers `hello`, but not this: it is still executing the request (raise `timeout_s`), or "
+                "access control or a size limit on the way refuses it"
+            )
+        if hello is _Silence.TIMEOUT:
+            return "the server is visible but frozen: it accepts requests and answers none"
+        return "the server is visible but nothing comes back: access control may deny queries to this user"
+
+
+class _Silence:
+    """What came in place of an answer."""
+
+    NOBODY: "_Silence"
+    TIMEOUT: "_Silence"
+    BUSY: "_Silence"
+
+
+_Silence.NOBODY, _Silence.TIMEOUT, _Silence.BUSY = _Silence(), _Silence(), _Silence()
+
+
+def _outcome(pending: Pending) -> dict[str, Any] | _Silence:
+    """The answer to one query, or why there is none; the server's refusals are raised."""
+    for reply in pending.replies:
+        if reply.ok is not None:
+            return codec.decode(reply.ok.payload.to_bytes())
+        payload = cast(bytes, reply.err.payload.to_bytes())
+        # Zenoh's own errors, such as its timeout, are plain text; a map starts with 0x80 to 0x8f, 0xde or 0xdf.
+        if not payload or not (0x80 <= payload[0] <= 0x8F or payload[0] in (0xDE, 0xDF)):
+            return _Silence.TIMEOUT
+        error = codec.decode(payload)
+        if error.get("retry"):
+            return _Silence.BUSY
+        raise from_reply(error["code"], error["field"], error["message"], error["hint"])
+    return _Silence.NOBODY
+
+
+def _open_session(endpoint: str, path: str | None, server: EmbeddedServer | None) -> zenoh.Session:
+    config = _zenoh_config(endpoint, path)
+    since = time.monotonic()
+    while True:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            if server is not None and not server.alive:
+                raise ServerDiedError(server.obituary()) from error
+            waited_s = time.monotonic() - since
+            if waited_s < CONNECT_TIMEOUT_S:
+                time.sleep(0.2)
+                continue
+            raise _nobody(endpoint, waited_s) from error
+
+
+def _nobody(endpoint: str, waited_s: float) -> Error:
+    if _accepts(endpoint):
+        reason = (
+            "something accepts connections there: either it is no Twinstep server, or it refuses this client's user, "
+            "password or certificate; the server's log tells which"
+        )
+    else:
+        reason = "nothing accepts connections there\n  start a server: `twinstep serve`, or leave `endpoint` out"
+    return NoServerError(f"no server answers at {endpoint} after {waited_s:.1f} s: {reason}")
+
+
+def _accepts(endpoint: str) -> bool:
+    address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def _zenoh_config(endpoint: str, path: str | None) -> zenoh.Config:
+    if path is not None and not Path(path).is_file():
+        raise InvalidOptionError(f"`zenoh_config` = {path}: there is no such file")
+    try:
+        config = zenoh.Config() if path is None else zenoh.Config.from_file(path)
+        for key, value in (
+            ("mode", '"client"'),
+            ("connect/endpoints", json.dumps([endpoint])),
+            ("connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
+            ("scouting/multicast/enabled", "false"),
+            ("transport/link/tx/lease", "2000"),
+            ("transport/shared_memory/enabled", "false"),
+        ):
+            config.insert_json5(key, value)
+    except zenoh.ZError as error:
+        wrong = f"`zenoh_config` = {path}" if path else f"`endpoint` = {endpoint}"
+        raise InvalidOptionError(f"{wrong} is refused by Zenoh: {error}") from error
+    return config

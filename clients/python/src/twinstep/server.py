@@ -1,0 +1,154 @@
+"""The bundled server: found, started, shared within the process, and gone with it."""
+
+import os
+import shutil
+import subprocess
+import sysconfig
+import threading
+from collections import deque
+from pathlib import Path
+from typing import IO
+
+from .errors import Error
+
+_STARTUP_S = 20.0
+_GOODBYE_S = 5.0
+_LAST_LINES = 15
+
+
+class ServerNotFoundError(Error):
+    """The program ``twinstep`` is not installed."""
+
+
+class ServerStartError(Error):
+    """The bundled server ended before it answered."""
+
+
+def find_program() -> str:
+    """Path of the program ``twinstep``: the variable ``TWINSTEP_SERVER``, this installation's scripts, or ``PATH``."""
+    override = os.environ.get("TWINSTEP_SERVER")
+    if override:
+        if not os.access(override, os.X_OK):
+            raise ServerNotFoundError(f"`TWINSTEP_SERVER` = {override} is no program")
+        return override
+    for scheme in (None, f"{os.name}_user"):
+        scripts = sysconfig.get_path("scripts", scheme) if scheme else sysconfig.get_path("scripts")
+        program = Path(scripts) / "twinstep"
+        if os.access(program, os.X_OK):
+            return str(program)
+    program = shutil.which("twinstep")
+    if program is None:
+        raise ServerNotFoundError(
+            "the program `twinstep` is not installed here\n"
+            "  install the package with pip, put `twinstep` on the PATH, or name it in TWINSTEP_SERVER"
+        )
+    return program
+
+
+class EmbeddedServer:
+    """A server on a free port of this machine, as a child process.
+
+    It ends when its stdin closes, which happens however this process ends. Environments with the same ``arguments``
+    share one: :meth:`shared` and :meth:`release` count its users.
+
+    Parameters
+    ----------
+    arguments
+        Flags of ``twinstep serve``.
+    """
+
+    _shared: "dict[tuple[int, tuple[str, ...]], tuple[EmbeddedServer, int]]" = {}  # noqa: RUF012
+    _lock = threading.Lock()
+
+    def __init__(self, arguments: tuple[str, ...]) -> None:
+        self._arguments = arguments
+        self._owner = os.getpid()
+        self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)
+        command = [find_program(), "serve", "--until-stdin-closes", "--listen", "tcp/127.0.0.1:0", *arguments]
+        # A group of its own: Ctrl-C in a terminal is for the agent, which then closes the environment.
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            process_group=0,
+        )
+        assert self._process.stdout is not None
+        assert self._process.stderr is not None
+        self._reader = threading.Thread(target=self._keep_lines, args=(self._process.stderr,), daemon=True)
+        self._reader.start()
+        self.endpoint = self._await_endpoint(self._process.stdout)
+
+    @classmethod
+    def shared(cls, arguments: tuple[str, ...]) -> "EmbeddedServer":
+        """The server of this process with these arguments; started if there is none, or if it has died."""
+        # A child made by fork shares its parent's memory, not its server.
+        key = (os.getpid(), arguments)
+        with cls._lock:
+            known = cls._shared.get(key)
+            if known is None or not known[0].alive:
+                known = (cls(arguments), 0)
+            server, users = known
+            cls._shared[key] = (server, users + 1)
+            return server
+
+    def release(self) -> None:
+        """Give the server up; the last user stops it."""
+        key = (self._owner, self._arguments)
+        if os.getpid() != self._owner:
+            return
+        with self._lock:
+            server, users = self._shared.get(key, (None, 0))
+            if server is self and users > 1:
+                self._shared[key] = (server, users - 1)
+                return
+            if server is self:
+                del self._shared[key]
+        self._stop()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process.poll() is None
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    def obituary(self) -> str:
+        """How the server ended, and its last log lines."""
+        code = self._process.poll()
+        self._reader.join(timeout=1.0)
+        lines = "\n  ".join(self._last_lines) or "it logged nothing"
+        ended = f"by signal {-code}" if code is not None and code < 0 else f"with exit code {code}"
+        return f"the server that this process started (pid {self.pid}) ended {ended}; its last log lines:\n  {lines}"
+
+    def _await_endpoint(self, stdout: IO[str]) -> str:
+        watchdog = threading.Timer(_STARTUP_S, self._process.kill)
+        watchdog.start()
+        line = stdout.readline()
+        watchdog.cancel()
+        if not line.startswith("listening "):
+            self._stop()
+            raise ServerStartError(self.obituary())
+        return line.split()[1]
+
+    def _keep_lines(self, stderr: IO[str]) -> None:
+        for line in stderr:
+            self._last_lines.append(line.rstrip())
+        stderr.close()
+
+    def _stop(self) -> None:
+        """End the process; does nothing the second time."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.close()
+        try:
+            self._process.wait(_GOODBYE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+        self._reader.join(timeout=1.0)

@@ -1,0 +1,26 @@
+"""Gymnasium spaces from a server's spec."""
+
+from typing import cast
+
+import numpy as np
+from gymnasium.spaces import Box, Space
+from numpy.typing import NDArray
+
+from .codec import Part, Spec
+
+
+def observation_space(spec: Spec) -> Space[NDArray[np.float32]]:
+    """Bounds of one observation, ``(obs_len,)`` float32."""
+    return _box(spec.observation)
+
+
+def action_space(spec: Spec) -> Space[NDArray[np.float32]]:
+    """Bounds of one action, ``(action_len,)`` float32."""
+    return _box(spec.action)
+
+
+def _box(parts: tuple[Part, ...]) -> Space[NDArray[np.float32]]:
+    low = np.concatenate([np.full(part.size, part.low, np.float32) for part in parts])
+    high = np.concatenate([np.full(part.size, part.high, np.float32) for part in parts])
+    # Gymnasium types a Box by any number; its dtype says which.
+    return cast(Space[NDArray[np.float32]], Box(low, high, dtype=np.float32))

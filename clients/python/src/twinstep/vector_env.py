@@ -1,0 +1,202 @@
+"""Many robots as a Gymnasium vector environment; one message steps them all."""
+
+from collections.abc import Sequence
+from typing import Any, Unpack
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from .env import OptionArguments, RenderMode, checked_render_mode, reward_terms
+from .errors import InvalidOptionError
+from .remote import Batch, Options, RemoteEnvs
+from .render import Viewer
+from .spaces import action_space, observation_space
+
+StepResult = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
+
+
+class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
+    """``num_envs`` robots on one server. Row i with seed s is the single environment with seed s + i.
+
+    Parameters
+    ----------
+    num_envs
+        Number of robots.
+    autoreset_mode
+        ``AutoresetMode`` or its value, ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``; done in the server.
+    max_episode_steps
+        Policy steps after which an episode is truncated; the task's own number if ``None``.
+    render_mode
+        As for :class:`Go2Env`; ``"human"`` shows the first robot.
+    info_timing
+        Adds ``round_trip_s`` [s] to every info of a step. Off, infos depend on seeds and actions alone.
+    **options
+        See :class:`twinstep.Options`.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
+        render_mode: RenderMode | None = None,
+        info_timing: bool = False,
+        **options: Unpack[OptionArguments],
+    ) -> None:
+        mode = _autoreset_mode(autoreset_mode)
+        self.metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 50, "autoreset_mode": mode}
+        self.render_mode = checked_render_mode(render_mode)
+        self._mode = mode
+        self._info_timing = info_timing
+        self._remote = RemoteEnvs(
+            Options(**options), num_envs=num_envs, autoreset=mode.value, max_episode_steps=max_episode_steps
+        )
+        self.num_envs = num_envs
+        self.twinstep_spec = self._remote.spec
+        self.single_observation_space = observation_space(self._remote.spec)
+        self.single_action_space = action_space(self._remote.spec)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._viewer: Viewer | None = None
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int] | None = None,  # pyright: ignore[reportIncompatibleMethodOverride]
+        options: dict[str, Any] | None = None,
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start episodes.
+
+        Parameters
+        ----------
+        seed
+            Environment i gets ``seed + i``, or entry i of a sequence. ``None`` continues the random streams.
+        options
+            ``{"reset_mask": mask}``, mask (num_envs,) bool, resets only where it is true.
+
+        Returns
+        -------
+        obs : (num_envs, 45) float32
+            Of all environments, reset or not.
+        info : dict
+            Empty.
+        """
+        if seed is None or isinstance(seed, int | np.integer):
+            super().reset(seed=None if seed is None else int(seed))
+        obs = self._remote.reset(self._seeds(seed), self._mask(options))
+        self._show()
+        return obs, {}
+
+    @property
+    def lease(self) -> str:
+        """Id of the lease, as in the server's log."""
+        return self._remote.lease
+
+    def step(self, actions: NDArray[np.float32]) -> StepResult:
+        """Advance every environment by one policy period (20 ms).
+
+        Parameters
+        ----------
+        actions : (num_envs, 12) float32
+            Offsets from the default pose in units of ``action_scale``, joints in the spec's order.
+
+        Returns
+        -------
+        obs : (num_envs, 45) float32
+        reward : (num_envs,) float64
+        terminated, truncated : (num_envs,) bool
+        info : dict
+            ``reward_terms`` of the episodes that ended; with ``"SameStep"`` in ``final_info``, beside ``final_obs``.
+        """
+        self.send(actions)
+        return self.recv()
+
+    def send(self, actions: NDArray[np.float32]) -> None:
+        """Send actions without waiting: the policy may compute while the server steps. :meth:`recv` is next."""
+        self._remote.send(actions)
+
+    def recv(self) -> StepResult:
+        """Wait for what the sent actions gave; may be called again after a ``NoAnswerError``."""
+        batch = self._remote.recv()
+        infos = self._infos(batch)
+        self._show()
+        return batch.obs, batch.reward.astype(np.float64), batch.terminated, batch.truncated, infos
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Draw every robot: a tuple of (480, 640, 3) uint8 with ``render_mode="rgb_array"``, else ``None``."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render was called, but `render_mode` is not set: make(..., render_mode='rgb_array')")
+            return None
+        if self.render_mode == "human":
+            self._show()
+            return None
+        return tuple(self._draw(env) for env in range(self.num_envs))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Give the environments back and close the window."""
+        if getattr(self, "_viewer", None) is not None:
+            assert self._viewer is not None
+            self._viewer.close()
+            self._viewer = None
+        if hasattr(self, "_remote"):
+            self._remote.close()
+
+    def _seeds(self, seed: int | Sequence[int] | None) -> NDArray[np.uint64] | None:
+        if seed is None:
+            return None
+        if isinstance(seed, int | np.integer):
+            return (np.arange(self.num_envs, dtype=np.uint64) + np.uint64(seed)).astype(np.uint64)
+        if len(seed) != self.num_envs:
+            raise InvalidOptionError(f"`seed` has {len(seed)} entries; {self.num_envs} are wanted")
+        return np.array(seed, dtype=np.uint64)
+
+    def _mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_] | None:
+        unknown = sorted(set(options or ()) - {"reset_mask"})
+        if unknown:
+            raise InvalidOptionError(f"`options` has {unknown}; only 'reset_mask' is known")
+        mask = (options or {}).get("reset_mask")
+        if mask is None:
+            return None
+        mask = np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
+            raise InvalidOptionError(
+                f"`options['reset_mask']` is {mask.dtype} {mask.shape}; bool ({self.num_envs},) is wanted"
+            )
+        if not mask.any():
+            raise InvalidOptionError("`options['reset_mask']` is nowhere true: nothing would be reset")
+        return mask
+
+    def _infos(self, batch: Batch) -> dict[str, Any]:
+        infos: dict[str, Any] = {}
+        names = self.twinstep_spec.reward_terms
+        for index, env in enumerate(batch.ended):
+            info = {"reward_terms": reward_terms(batch, index, names)}
+            if self._mode is AutoresetMode.SAME_STEP:
+                info = {"final_obs": batch.final_obs[index], "final_info": info}
+            infos = self._add_info(infos, info, int(env))
+        if self._info_timing:
+            infos["round_trip_s"] = np.full(self.num_envs, batch.round_trip_s)
+            infos["_round_trip_s"] = np.ones(self.num_envs, dtype=np.bool_)
+        return infos
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self._draw(0)
+
+    def _draw(self, env: int) -> NDArray[np.uint8]:
+        if self._viewer is None:
+            assert self.render_mode is not None
+            self._viewer = Viewer(self.render_mode)
+        return self._viewer.draw(self._remote.scene(env))
+
+
+def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError as error:
+        known = ", ".join(repr(known.value) for known in AutoresetMode)
+        raise InvalidOptionError(f"`autoreset_mode` = {mode!r}; {known} are known") from error

@@ -1,0 +1,180 @@
+"""One robot and many, on the bundled server."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+import twinstep
+from twinstep import Go2Env, Go2VectorEnv
+
+
+@pytest.fixture
+def counters() -> Iterator[Go2VectorEnv]:
+    envs = Go2VectorEnv(3, task="counter")
+    envs.reset()
+    yield envs
+    envs.close()
+
+
+def test_observation_and_action_have_the_shapes_and_bounds_of_the_spec() -> None:
+    with Go2Env() as env:
+        obs, info = env.reset(seed=1)
+        assert env.observation_space.contains(obs)
+        assert (obs.shape, obs.dtype, info) == ((45,), np.float32, {})
+        obs, reward, terminated, truncated, info = env.step(np.zeros(12, np.float32))
+        assert env.observation_space.contains(obs)
+        assert (type(reward), terminated, truncated, info) == (float, False, False, {})
+        assert env.twinstep_spec.joint_order[:3] == ("FL_hip", "FL_thigh", "FL_calf")
+
+
+def test_row_of_a_vector_is_the_single_environment_with_its_seed() -> None:
+    actions = np.random.default_rng(1).uniform(-1, 1, (100, 3, 12)).astype(np.float32)
+    envs = gym.make_vec("twinstep/Go2-Walk-v0", num_envs=3, max_episode_steps=40)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    rows = [envs.reset(seed=5)[0]] + [envs.step(action)[0] for action in actions[:39]]
+    envs.close()
+    with Go2Env(max_episode_steps=40) as env:
+        single = [env.reset(seed=6)[0]] + [env.step(action[1])[0] for action in actions[:39]]
+    np.testing.assert_array_equal(np.array(rows)[:, 1], single)
+
+
+def test_seeds_may_be_given_one_by_one() -> None:
+    with Go2Env() as env:
+        first = env.reset(seed=9)[0]
+    envs = Go2VectorEnv(2)
+    obs, _ = envs.reset(seed=[3, 9])
+    np.testing.assert_array_equal(obs[1], first)
+    with pytest.raises(twinstep.InvalidOptionError, match="`seed` has 1 entries; 2 are wanted"):
+        envs.reset(seed=[3])
+    envs.close()
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_end_of_an_episode_tells_its_reward_terms(mode: str) -> None:
+    envs = Go2VectorEnv(2, autoreset_mode=mode, max_episode_steps=4)
+    envs.reset(seed=1)
+    total = np.zeros(2)
+    for _ in range(4):
+        obs, reward, _, truncated, infos = envs.step(np.zeros((2, 12), np.float32))
+        total += reward
+    assert truncated.all()
+    if mode == "SameStep":
+        assert infos["_final_obs"].all()
+        assert not np.array_equal(infos["final_obs"][0], obs[0])
+        infos = infos["final_info"]
+    terms = infos["reward_terms"]
+    assert infos["_reward_terms"].all()
+    np.testing.assert_allclose(sum(terms[name] for name in envs.twinstep_spec.reward_terms), total, atol=1e-5)
+    if mode == "Disabled":
+        with pytest.raises(twinstep.ResetNeededError):
+            envs.step(np.zeros((2, 12), np.float32))
+        envs.reset(options={"reset_mask": np.array([True, True])})
+    envs.step(np.zeros((2, 12), np.float32))
+    envs.close()
+
+
+def test_reset_mask_resets_where_it_is_true(counters: Go2VectorEnv) -> None:
+    obs, _ = counters.reset(options={"reset_mask": np.array([False, True, False])})
+    assert obs[:, 1].tolist() == [1, 2, 1]
+    for mask, words in (
+        (np.array([True]), r"bool \(1,\); bool \(3,\) is wanted"),
+        (np.array([1, 0, 0]), r"int64 \(3,\); bool \(3,\) is wanted"),
+        (np.zeros(3, np.bool_), "nowhere true"),
+    ):
+        with pytest.raises(twinstep.InvalidOptionError, match=words):
+            counters.reset(options={"reset_mask": mask})
+    with pytest.raises(twinstep.InvalidOptionError, match="'speed'.*only 'reset_mask' is known"):
+        counters.reset(options={"speed": 1})
+
+
+def test_returned_arrays_are_fresh_and_writable(counters: Go2VectorEnv) -> None:
+    first = counters.step(np.zeros((3, 12), np.float32))
+    kept = [array.copy() for array in first[:4]]
+    counters.step(np.ones((3, 12), np.float32))
+    for array, copy in zip(first[:4], kept, strict=True):
+        np.testing.assert_array_equal(array, copy)
+        assert array.flags.writeable
+
+
+def test_sent_actions_overlap_with_the_policy(counters: Go2VectorEnv) -> None:
+    for step in range(1, 20):
+        counters.send(np.zeros((3, 12), np.float32))
+        with pytest.raises(twinstep.Error, match="last `step` is not answered yet"):
+            counters.send(np.zeros((3, 12), np.float32))
+        assert (counters.recv()[0][:, 0] == step).all()
+    with pytest.raises(twinstep.Error, match="call `send` before `recv`"):
+        counters.recv()
+
+
+def test_round_trip_is_told_only_when_asked_for(counters: Go2VectorEnv) -> None:
+    assert counters.step(np.zeros((3, 12), np.float32))[4] == {}
+    envs = Go2VectorEnv(2, task="counter", info_timing=True)
+    envs.reset()
+    infos = envs.step(np.zeros((2, 12), np.float32))[4]
+    assert 0 < infos["round_trip_s"][0] < 5
+    envs.close()
+
+
+@pytest.mark.parametrize(
+    ("actions", "words"),
+    [
+        (np.zeros((3, 11), np.float32), r"`actions` has shape \(3, 11\); \(3, 12\) is wanted"),
+        (np.zeros((3, 12), np.complex64), "`actions` has dtype complex64; float32 is wanted"),
+        (np.full((3, 12), np.nan), r"environment 0, joint_position_offset\[FL_hip\], is nan"),
+        (np.where(np.eye(3, 12, 4), np.inf, 0), r"environment 0, joint_position_offset\[FR_thigh\], is inf"),
+    ],
+)
+def test_bad_actions_are_named_and_nothing_is_stepped(
+    counters: Go2VectorEnv, actions: np.ndarray, words: str
+) -> None:
+    with pytest.raises(twinstep.InvalidActionError, match=words):
+        counters.step(actions)
+    assert counters.step(np.zeros((3, 12), np.float32))[0][0, 0] == 1
+
+
+def test_environments_of_one_process_share_a_server_that_ends_with_the_last() -> None:
+    first, second = Go2VectorEnv(1, task="counter"), Go2VectorEnv(1, task="counter")
+    server = first._remote._link._server
+    assert server is second._remote._link._server
+    first.close()
+    assert server.alive
+    second.close()
+    assert not server.alive
+
+
+@pytest.mark.parametrize("death", ["exit", "SIGKILL"])
+def test_server_ends_with_its_parent_however_that_ends(death: str) -> None:
+    program = textwrap.dedent("""
+        import sys, twinstep
+        envs = twinstep.Go2VectorEnv(1, task="counter")
+        print(envs._remote._link._server.pid, flush=True)
+        sys.stdin.read()
+    """)
+    parent = subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    server = int(parent.stdout.readline())
+    if death == "SIGKILL":
+        parent.kill()
+    parent.communicate()
+    for _ in range(100):
+        if not is_running(server):
+            return
+        time.sleep(0.05)
+    os.kill(server, signal.SIGKILL)
+    raise AssertionError("the server outlived its parent by 5 s")
+
+
+def is_running(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat") as stat:
+            return stat.read().split()[2] != "Z"
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,91 @@
+//! The Python client: its lints, its types, its tests, its installation, and faults around it.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::atomic::AtomicBool;
+
+use twinstep_tests::campaign::{self, Plan};
+use twinstep_tests::lane::Commands;
+use twinstep_tests::python::{Programs, python, root, run};
+
+const FAULTS: &str = env!("CARGO_BIN_EXE_faults");
+
+fn target() -> PathBuf {
+    Path::new(FAULTS).ancestors().nth(2).unwrap().to_owned()
+}
+
+fn client() -> PathBuf {
+    root().join("clients/python")
+}
+
+/// Runs a module of the tests' environment in the client's folder; does nothing where there is no Python.
+fn check(module: &str, arguments: &[&str]) {
+    let Some(python) = python(&target()).unwrap() else { return };
+    let programs = Programs::beside(FAULTS).unwrap();
+    let mut command = Command::new(&python);
+    command
+        .args(["-m", module])
+        .args(arguments)
+        .current_dir(client())
+        .env("TWINSTEP_SERVER", programs.0.join("twinstep"))
+        .env("PYTHONPATH", client().join("src"));
+    run(&mut command).unwrap_or_else(|printed| panic!("{printed}"));
+}
+
+#[test]
+fn python_is_formatted_and_linted() {
+    check("ruff", &["check", "."]);
+    check("ruff", &["format", "--check", "."]);
+}
+
+#[test]
+fn python_types_hold() {
+    let python = target().join("python/bin/python");
+    check("pyright", &["--pythonpath", python.to_str().unwrap()]);
+}
+
+#[test]
+fn python_tests_pass() {
+    check("pytest", &["-q", "-x"]);
+}
+
+#[test]
+fn python_client_survives_faults() {
+    let Some(python) = python(&target()).unwrap() else { return };
+    let script = client().join("tests/fault_client.py");
+    // The lanes' processes inherit it.
+    let program = vec!["env".to_owned(), format!("PYTHONPATH={}", client().join("src").display())];
+    let client = [program, vec![python.display().to_string(), script.display().to_string()]].concat();
+    let plan = Plan {
+        commands: Commands { program: FAULTS.into(), server: Vec::new(), client: Some(client) },
+        faults: 30,
+        lanes: 6,
+        seed: 2,
+    };
+    let tally = campaign::run(&plan, &AtomicBool::new(false), |_| ()).unwrap();
+    assert!(tally.failures.is_empty(), "{:#?}", tally.failures);
+}
+
+#[test]
+fn package_installs_into_an_empty_environment_and_steps() {
+    let Some(python) = python(&target()).unwrap() else { return };
+    Programs::beside(FAULTS).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let venv = folder.path().join("venv");
+    run(Command::new(&python).args(["-m", "venv"]).arg(&venv)).unwrap();
+    let empty = venv.join("bin/python");
+    let install = ["-m", "pip", "install", "--quiet", "--no-deps"];
+    // Its dependencies are the tests' own; what is tried is the wheel and the program in it.
+    run(Command::new(&empty).args(install).arg(client()).env("CARGO_TARGET_DIR", target())).unwrap();
+    let site = run(Command::new(&python).args(["-c", "import site; print(site.getsitepackages()[0])"])).unwrap();
+    let site = String::from_utf8(site.stdout).unwrap();
+    let first_step = "import gymnasium, twinstep\n\
+                      env = gymnasium.make('twinstep/Go2-Walk-v0')\n\
+                      env.reset(seed=1)\n\
+                      env.step(env.action_space.sample())\n\
+                      env.close()\n\
+                      assert 'venv' in twinstep.__file__";
+    let mut command = Command::new(&empty);
+    command.args(["-c", first_step]).current_dir(folder.path()).env("PYTHONPATH", site.trim());
+    run(&mut command).unwrap_or_else(|printed| panic!("{printed}"));
+}
