@@ -29,7 +29,8 @@ enum Verb {
 fn main() -> std::process::ExitCode {
     tracing_subscriber::fmt()
         .with_env_filter(
-            tracing_subscriber::EnvFilter::try_from_env("TWINSTEP_LOG").unwrap_or_else(|_| "warn,zenoh::api::session=error,twinstep=info".into()),
+            tracing_subscriber::EnvFilter::try_from_env("TWINSTEP_LOG")
+                .unwrap_or_else(|_| "warn,zenoh::api::session=error,twinstep=info".into()),
         )
         .with_writer(std::io::stderr)
         .init();

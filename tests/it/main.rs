@@ -9,6 +9,7 @@ mod leases;
 mod physics;
 mod raw_client;
 mod remote;
+mod render;
 mod security;
 mod tidy;
 mod wire;
