@@ -117,7 +117,7 @@ fn sphere(body: u32, radius: f64, centre: DVec3) -> SceneShape {
 
 /// A capsule around the line between `ends`.
 fn capsule(body: u32, radius: f64, ends: [DVec3; 2]) -> SceneShape {
-    let [from, to] = ends.map(|end| end.as_vec3());
+    let [from, to] = ends.map(DVec3::as_vec3);
     let rotation = Quat::from_rotation_arc(Vec3::Z, (to - from).normalize_or(Vec3::Z));
     let offset = Pose { position: from.midpoint(to), rotation }.to_array();
     let size = [radius as f32, 0.5 * from.distance(to), 0.0];
