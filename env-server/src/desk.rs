@@ -148,7 +148,7 @@ impl Desk {
             }
             None => {
                 let message = format!("nothing is answered at `{}`", query.key_expr());
-                let hint = "ask at hello, lease, or env/<lease>/reset, step or close";
+                let hint = "ask at hello, lease, or env/<lease>/reset, step, close or render";
                 Err(WireError::new(Code::UnknownKey, "", message).with_hint(hint))
             }
         };

@@ -2,7 +2,7 @@
 //!
 //! Requests carry the lease's epoch and a sequence number. The next number is executed and its reply kept; the same
 //! number again gets that reply again; anything else is a typed error. A request that is refused without effect leaves
-//! its number free.
+//! its number free. `render` has no number: it reads, and is answered between two requests.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -135,6 +135,9 @@ impl Worker {
 
     fn answer(&mut self, verb: Verb, query: &Query) -> Answer {
         let payload = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
+        if verb == Verb::Render {
+            return self.render(&payload).map_or_else(Answer::Err, |bytes| Answer::Ok(ZBytes::from(bytes)));
+        }
         let header = match decode::<message::EnvHeader>(&payload) {
             Ok(header) => header,
             Err(error) => return Answer::Err(error),
@@ -173,12 +176,7 @@ impl Worker {
     }
 
     fn check_header(&self, header: &message::EnvHeader) -> Result<(), WireError> {
-        if header.protocol != PROTOCOL {
-            return Err(WireError::version(header.protocol));
-        }
-        if header.epoch != self.epoch {
-            return Err(stale_epoch("epoch", header.epoch, self.epoch));
-        }
+        self.check_owner(header.protocol, header.epoch)?;
         if header.seq < self.last_seq {
             return Err(stale_sequence(header.seq, self.last_seq));
         }
@@ -188,6 +186,32 @@ impl Worker {
                 .with_hint("send every number once, and repeat it until it is answered"));
         }
         Ok(())
+    }
+
+    fn check_owner(&self, protocol: u16, epoch: u64) -> Result<(), WireError> {
+        if protocol != PROTOCOL {
+            return Err(WireError::version(protocol));
+        }
+        if epoch != self.epoch {
+            return Err(stale_epoch("epoch", epoch, self.epoch));
+        }
+        Ok(())
+    }
+
+    fn render(&self, payload: &[u8]) -> Result<Vec<u8>, WireError> {
+        let request: message::RenderRequest = decode(payload)?;
+        self.check_owner(request.protocol, request.epoch)?;
+        if self.shared.shutting_down.load(Ordering::Acquire) {
+            return Err(shutting_down());
+        }
+        if let Some(reason) = &self.broken {
+            return Err(broken(reason));
+        }
+        let env = usize::try_from(request.env).unwrap_or(usize::MAX);
+        // Nothing was changed, so that the environments are as good after a panic as before.
+        let scene = catch_unwind(AssertUnwindSafe(|| self.env.scene(env)))
+            .map_err(|panic| WireError::new(Code::Internal, "", panic_text(&panic)))?;
+        scene.map(convert::encode_scene).map_err(|error| convert::wire_error(&error))
     }
 
     fn execute(&mut self, verb: Verb, payload: &[u8]) -> Result<Vec<u8>, WireError> {
@@ -215,6 +239,7 @@ impl Worker {
                 self.give_back();
                 Ok(encode(&message::CloseReply { protocol: PROTOCOL, seq: request.seq }))
             }
+            Verb::Render => self.render(payload),
         }
     }
 }

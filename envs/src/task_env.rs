@@ -4,7 +4,7 @@ use glam::Vec3;
 use rand::RngExt;
 use twinstep_model::{
     AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, PerJoint, PerLeg, Placement,
-    ResetRequest, StepBatch, Stream, Variation, VecEnv, frames, stream,
+    ResetRequest, Scene, StepBatch, Stream, Variation, VecEnv, frames, stream,
 };
 
 use crate::config::Range;
@@ -303,6 +303,17 @@ impl<B: Backend> VecEnv for TaskEnv<B> {
             self.start_episodes(&ended)?;
         }
         Ok(&self.batch)
+    }
+
+    fn scene(&self, env: usize) -> Result<Scene, EnvError> {
+        let num_envs = self.num_envs();
+        let episode = self.episodes.get(env).ok_or(EnvError::NoSuchEnv { env, num_envs })?;
+        if !episode.running && !episode.was_started() {
+            return Err(EnvError::NeedsReset { env });
+        }
+        let backend = &self.backend;
+        let scene = Scene::new(backend.robot(), backend.states(), env, backend.ground());
+        Ok(Scene { command: Some(episode.command), ..scene })
     }
 }
 

@@ -1,6 +1,6 @@
 //! The seams below an environment: who steps the robots, and who turns commands into torque.
 
-use crate::{Command, PerJoint, Placement, RobotModel, RobotStates};
+use crate::{Command, Ground, PerJoint, Placement, RobotModel, RobotStates};
 
 /// Many robots that are commanded and observed together: a simulator, a replayed log or the real robot.
 pub trait Backend: Send {
@@ -17,6 +17,11 @@ pub trait Backend: Send {
 
     /// States after the last [`Backend::reset`] or [`Backend::step`].
     fn states(&self) -> &RobotStates;
+
+    /// The ground that the robots stand on.
+    fn ground(&self) -> Ground {
+        Ground::FLAT
+    }
 
     /// Puts robots down anew; each pair is a robot's index and its place.
     fn reset(&mut self, placements: &[(usize, Placement)]) -> Result<(), BackendError>;

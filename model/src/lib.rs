@@ -8,6 +8,7 @@
 //! - [`Actuator`]: the drives between command and torque. Effects of reality and learned drives enter here.
 //! - [`VecEnv`]: many environments that are reset and stepped together, in process or over a network, and
 //!   [`EnvSpec`], what a client must know of them.
+//! - [`Scene`]: what it takes to draw a robot; [`body_poses`], where its bodies are.
 //! - [`stream`]: one seed gives every consumer its own reproducible random numbers.
 //!
 //! SI units, radians, seconds. Vectors live in the world or the base frame, as their docs say; the base frame is the
@@ -18,8 +19,10 @@ mod body;
 pub mod frames;
 mod go2;
 mod joint;
+mod kinematics;
 mod model_file;
 mod robot;
+mod scene;
 mod spec;
 mod state;
 mod stream;
@@ -29,8 +32,10 @@ pub use backend::{Actuator, Backend, BackendError, PdDrive};
 pub use body::RigidBody;
 pub use go2::go2;
 pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};
+pub use kinematics::{NUM_BODIES, Pose, body_poses};
 pub use model_file::ModelFileError;
 pub use robot::{Contact, Control, JointModel, LegModel, RobotModel, Shapes};
+pub use scene::{Ground, Scene, SceneShape, ShapeKind};
 pub use spec::{EnvSpec, Field};
 pub use state::{Command, Placement, RobotStates, Variation};
 pub use stream::{Stream, stream};

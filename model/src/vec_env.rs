@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::EnvSpec;
+use crate::{EnvSpec, Scene};
 
 /// Many environments of one task, in this process or at the other end of a network.
 ///
@@ -24,6 +24,11 @@ pub trait VecEnv: Send {
     ///
     /// `actions` are offsets from the default pose in units of `action_scale`, clipped to [−1, 1]; NaN is refused.
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError>;
+
+    /// What it takes to draw environment `env` as it is now. Changes nothing.
+    fn scene(&self, _env: usize) -> Result<Scene, EnvError> {
+        Err(EnvError::NothingToDraw { task: self.spec().task.clone() })
+    }
 }
 
 /// When an ended episode starts anew, as in Gymnasium.
@@ -146,10 +151,24 @@ pub enum EnvError {
         value: f32,
     },
     /// The environment was never reset, or its episode ended and nobody reset it; nothing was stepped.
-    #[error("environment {env} has no episode: reset it before stepping; nothing was stepped")]
+    #[error("environment {env} has no episode: reset it first; nothing was stepped")]
     NeedsReset {
         /// The environment.
         env: usize,
+    },
+    /// There is no such environment.
+    #[error("`env` = {env} does not exist; there are {num_envs}")]
+    NoSuchEnv {
+        /// The environment that was asked for.
+        env: usize,
+        /// The number of environments.
+        num_envs: usize,
+    },
+    /// The task has no robot that could be seen.
+    #[error("the task `{task}` has nothing to draw")]
+    NothingToDraw {
+        /// The task.
+        task: String,
     },
     /// The simulation of an environment gave numbers that are not finite. The others were stepped.
     #[error("environment {env} diverged: `{quantity}` is not finite; reset it (`mask`) before the next step")]

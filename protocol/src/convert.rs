@@ -1,6 +1,6 @@
 //! Between messages and the types of `twinstep-model`.
 
-use twinstep_model::{EndedEpisode, EnvError, EnvSpec, ResetRequest, StepBatch};
+use twinstep_model::{EndedEpisode, EnvError, EnvSpec, ResetRequest, Scene, StepBatch};
 
 use crate::{Code, PROTOCOL, WireError, encode, message, tensor};
 
@@ -90,6 +90,25 @@ pub fn read_step(
     Ok(())
 }
 
+/// A scene as sent.
+pub fn encode_scene(scene: Scene) -> Vec<u8> {
+    let Scene { bodies, pose, shapes, ground, command } = scene;
+    let pose = tensor::as_bytes(&pose);
+    encode(&message::RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground, command })
+}
+
+/// A scene as received. Every body must have a pose, and every shape a body.
+pub fn read_scene(reply: message::RenderReply<'_>) -> Result<Scene, WireError> {
+    let message::RenderReply { bodies, pose, shapes, ground, command, .. } = reply;
+    let pose: Vec<[f32; 7]> = tensor::read(pose, "pose")?;
+    check_length("pose", pose.len(), bodies.len())?;
+    if let Some(shape) = shapes.iter().find(|shape| shape.body as usize >= bodies.len()) {
+        let message = format!("`shapes` has body {}; there are {}", shape.body, bodies.len());
+        return Err(WireError::new(Code::OutOfRange, "shapes", message));
+    }
+    Ok(Scene { bodies, pose, shapes, ground, command })
+}
+
 /// Fails if `given` is not `wanted`.
 pub fn check_length(field: &'static str, given: usize, wanted: usize) -> Result<(), WireError> {
     if given == wanted {
@@ -105,6 +124,8 @@ pub fn wire_error(error: &EnvError) -> WireError {
         EnvError::WrongLength { field, .. } => (Code::BadShape, *field, "shapes are num_envs × the spec's lengths"),
         EnvError::ActionNotFinite { .. } => (Code::NotFinite, "actions", "look at what computed the action"),
         EnvError::NeedsReset { .. } => (Code::NeedsReset, "", "send `reset`, with `mask` to reset only some"),
+        EnvError::NoSuchEnv { .. } => (Code::OutOfRange, "env", "environments are counted from 0"),
+        EnvError::NothingToDraw { .. } => (Code::UnknownKey, "", "pictures are of tasks with a robot, such as `walk`"),
         EnvError::Diverged { .. } => (Code::Diverged, "", "send `reset` with `mask`"),
         EnvError::Backend(_) | EnvError::Remote(_) => (Code::Internal, "", "the server's log says more"),
     };

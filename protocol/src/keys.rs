@@ -52,11 +52,13 @@ pub enum Verb {
     Step,
     /// Give the environments back.
     Close,
+    /// Tell what it takes to draw one environment. Carries no sequence number.
+    Render,
 }
 
 impl Verb {
     /// Every verb.
-    pub const ALL: [Verb; 3] = [Verb::Reset, Verb::Step, Verb::Close];
+    pub const ALL: [Verb; 4] = [Verb::Reset, Verb::Step, Verb::Close, Verb::Render];
 
     /// The verb's last part of the key.
     pub const fn name(self) -> &'static str {
@@ -64,6 +66,7 @@ impl Verb {
             Verb::Reset => "reset",
             Verb::Step => "step",
             Verb::Close => "close",
+            Verb::Render => "render",
         }
     }
 }

@@ -4,7 +4,7 @@
 //! left out.
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::{AutoresetMode, EnvSpec};
+use twinstep_model::{AutoresetMode, EnvSpec, Ground, SceneShape};
 
 /// Asks a server who it is.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -190,6 +190,36 @@ pub struct CloseReply {
     pub protocol: u16,
     /// Sequence number of the request.
     pub seq: u64,
+}
+
+/// Asks what it takes to draw one environment. It reads only: no sequence number.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RenderRequest {
+    /// Protocol version of the client.
+    pub protocol: u16,
+    /// Epoch of the lease.
+    pub epoch: u64,
+    /// The environment.
+    pub env: u64,
+}
+
+/// What it takes to draw one robot without knowing it, as [`twinstep_model::Scene`] has it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RenderReply<'a> {
+    /// Protocol version of the server.
+    pub protocol: u16,
+    /// Names of the bodies; the first is the trunk.
+    pub bodies: Vec<String>,
+    /// World-from-body, `bodies` × 7 × f32: position [m], then quaternion `[w, x, y, z]`.
+    #[serde(borrow, with = "serde_bytes")]
+    pub pose: &'a [u8],
+    /// What the bodies look like.
+    pub shapes: Vec<SceneShape>,
+    /// The plane that the robot stands on.
+    pub ground: Ground,
+    /// Wanted velocity in the base frame: forward [m/s], left [m/s], yaw [rad/s].
+    #[serde(default)]
+    pub command: Option<[f32; 3]>,
 }
 
 /// What [`ResetRequest`], [`StepRequest`] and [`CloseRequest`] have in common: enough to tell whether to execute one.

@@ -1,7 +1,7 @@
 //! How robots are simulated: the `[sim]` table of the server's config file.
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::Control;
+use twinstep_model::{Control, Ground};
 
 /// Settings of the simulation.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -52,6 +52,16 @@ pub enum Terrain {
     Flat,
     /// A plane through the origin that rises along x by this angle [rad].
     SlopeRad(f32),
+}
+
+impl Terrain {
+    /// The plane.
+    pub fn ground(self) -> Ground {
+        match self {
+            Terrain::Flat => Ground::FLAT,
+            Terrain::SlopeRad(angle) => Ground { normal: [-angle.sin(), 0.0, angle.cos()], ..Ground::FLAT },
+        }
+    }
 }
 
 /// Whether the trunk moves.

@@ -1,7 +1,9 @@
 //! The rapier engine: one world a robot, stepped on all cores.
 
 use rayon::prelude::*;
-use twinstep_model::{Actuator, Backend, BackendError, Command, PdDrive, PerJoint, Placement, RobotModel, RobotStates};
+use twinstep_model::{
+    Actuator, Backend, BackendError, Command, Ground, PdDrive, PerJoint, Placement, RobotModel, RobotStates,
+};
 
 use crate::robot_world::{RobotWorld, WorldSnapshot};
 use crate::{SimConfig, SimConfigError};
@@ -121,6 +123,10 @@ impl Backend for RapierBackend {
 
     fn states(&self) -> &RobotStates {
         &self.states
+    }
+
+    fn ground(&self) -> Ground {
+        self.config.terrain.ground()
     }
 
     fn reset(&mut self, placements: &[(usize, Placement)]) -> Result<(), BackendError> {

@@ -266,11 +266,7 @@ fn integration_parameters(robot: &RobotModel, config: &SimConfig) -> Integration
 }
 
 fn insert_ground(world: &mut PhysicsWorld, terrain: Terrain, friction: f32) {
-    let normal = match terrain {
-        Terrain::Flat => Vec3::Z,
-        Terrain::SlopeRad(angle) => Vec3::new(-angle.sin(), 0.0, angle.cos()),
-    };
-    let ground = SharedShape::halfspace(normal);
+    let ground = SharedShape::halfspace(Vec3::from(terrain.ground().normal));
     world.insert_collider(ColliderBuilder::new(ground).friction(friction).collision_groups(GROUND_GROUP), None);
 }
 
@@ -338,4 +334,44 @@ fn calf_capsule(robot: &RobotModel) -> ColliderBuilder {
 
 fn foot_sphere(robot: &RobotModel) -> ColliderBuilder {
     ColliderBuilder::ball(robot.shapes.foot_radius as f32).translation(robot.shapes.foot_centre.as_vec3())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f32::consts::TAU;
+
+    use twinstep_model::{body_poses, go2};
+
+    use super::*;
+
+    /// The model's forward kinematics must say what the engine simulates: a picture shows the one, physics has the other.
+    #[test]
+    fn bodies_are_where_the_forward_kinematics_have_them() {
+        let robot = go2();
+        let q = std::array::from_fn(|j| robot.control.default_pose[j] as f32 + 0.2 * (j as f32).sin());
+        let tilted = Quat::from_euler(glam::EulerRot::ZYX, 0.1 * TAU, 0.05 * TAU, -0.03 * TAU);
+        let placement = Placement { base_orientation: frames::to_wxyz(tilted), ..Placement::at_rest(0.6, q) };
+        let mut world = RobotWorld::new(&robot, &SimConfig::default(), &placement);
+        for steps in [0, 40] {
+            world.step(&std::array::from_fn(|j| (j as f32).cos()), steps);
+            let (mut q, mut dq) = (PerJoint::default(), PerJoint::default());
+            world.read_joints(&mut q, &mut dq);
+            let base = world.read_base();
+            let world_from_base = twinstep_model::Pose {
+                position: Vec3::from(base.position),
+                rotation: frames::world_from_base(base.orientation),
+            };
+            let (multibody, _) = world.world.multibody_joints.get(world.multibody).expect("built with the world");
+            let expected = body_poses(&robot, world_from_base, &q);
+            for (link, expected) in multibody.links().skip(1).zip(&expected[1..]) {
+                let body = &world.world.bodies[link.rigid_body_handle()];
+                assert!((body.translation() - expected.position).length() < 1e-5, "after {steps} steps");
+                let rotation = Quat::from_array(body.position().rotation.to_array());
+                // Not by angle: the arc cosine of nearly 1 loses half the digits.
+                for axis in [Vec3::X, Vec3::Y, Vec3::Z] {
+                    assert!((rotation * axis - expected.rotation * axis).length() < 1e-4, "after {steps} steps");
+                }
+            }
+        }
+    }
 }

@@ -119,6 +119,7 @@ fn foreign_version_is_refused_at_every_key_but_hello() {
             keys::env(&client.sid, &lease.lease, Verb::Reset),
             keys::env(&client.sid, &lease.lease, Verb::Step),
             keys::env(&client.sid, &lease.lease, Verb::Close),
+            keys::env(&client.sid, &lease.lease, Verb::Render),
         ] {
             // Once with all fields of the message, once with none that version 1 knows.
             let close = encode(&CloseRequest { protocol: 2, epoch: 1, seq: 2 });

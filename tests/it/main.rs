@@ -10,6 +10,7 @@ mod physics;
 mod python;
 mod raw_client;
 mod remote;
+mod render;
 mod security;
 mod tidy;
 mod wire;

@@ -10,7 +10,7 @@ use proptest::test_runner::TestRunner;
 use serde::de::IgnoredAny;
 use twinstep_envs::TaskName;
 use twinstep_protocol::keys::Verb;
-use twinstep_protocol::message::{CloseRequest, HelloRequest, LeaseReply};
+use twinstep_protocol::message::{CloseRequest, HelloRequest, LeaseReply, RenderRequest};
 use twinstep_protocol::{Code, PROTOCOL, decode, encode, keys};
 
 use crate::raw_client::{RawClient, reset_bytes, step_bytes, step_with, steps_in};
@@ -37,6 +37,7 @@ fn all_messages(client: &RawClient, lease: &LeaseReply) -> Vec<Vec<u8>> {
         reset_bytes(lease, seq),
         step_bytes(lease, seq),
         encode(&CloseRequest { protocol: PROTOCOL, epoch: lease.epoch, seq }),
+        encode(&RenderRequest { protocol: PROTOCOL, epoch: lease.epoch, env: 0 }),
     ]
 }
 

@@ -1,6 +1,8 @@
 //! A vector environment at the other end of Zenoh.
 
-use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv};
+use std::sync::OnceLock;
+
+use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, Scene, StepBatch, VecEnv};
 use twinstep_protocol::keys::Verb;
 use twinstep_protocol::{Code, PROTOCOL, WireError, convert, decode, encode, keys, message, tensor};
 use zenoh::bytes::ZBytes;
@@ -28,6 +30,8 @@ pub struct RemoteVecEnv {
     last_seq: u64,
     step: Querier<'static>,
     reset: Querier<'static>,
+    /// Declared with the first picture: an agent that draws none pays nothing.
+    render: OnceLock<Querier<'static>>,
     /// The request under way, with its verb.
     pending: Option<(Verb, Pending)>,
     batch: StepBatch,
@@ -71,6 +75,7 @@ impl RemoteVecEnv {
             last_seq: granted.last_seq,
             step,
             reset,
+            render: OnceLock::new(),
             pending: None,
             link,
         })
@@ -128,6 +133,14 @@ impl RemoteVecEnv {
         }
     }
 
+    fn render_querier(&self) -> Result<&Querier<'static>, ClientError> {
+        if let Some(querier) = self.render.get() {
+            return Ok(querier);
+        }
+        let querier = self.link.querier(keys::env(self.link.sid(), &self.ticket.lease, Verb::Render))?;
+        Ok(self.render.get_or_init(|| querier))
+    }
+
     /// Waits for the answer to the pending request. Without an answer it stays pending, because it may have been
     /// executed; its number is used up by an answer, or by an error that had effects.
     fn settle(&mut self) -> Result<ZBytes, EnvError> {
@@ -182,6 +195,15 @@ impl VecEnv for RemoteVecEnv {
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
         self.send(actions)?;
         self.recv()
+    }
+
+    /// While a step is under way, it is drawn after the step.
+    fn scene(&self, env: usize) -> Result<Scene, EnvError> {
+        let querier = self.render_querier().map_err(remote)?;
+        let request = message::RenderRequest { protocol: PROTOCOL, epoch: self.ticket.epoch, env: env as u64 };
+        let answer = self.link.ask(querier, encode(&request)).map_err(remote)?;
+        let bytes = answer.to_bytes();
+        decode(&bytes).and_then(convert::read_scene).map_err(|error| malformed("render", error))
     }
 }
 

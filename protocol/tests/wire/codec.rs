@@ -6,12 +6,15 @@ use proptest::prelude::*;
 use serde::{Deserialize, Serialize};
 use twinstep_model::{AutoresetMode, EndedEpisode, StepBatch};
 use twinstep_protocol::message::{
-    CloseReply, CloseRequest, EnvHeader, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, ResetReply,
-    ResetRequest, StepReply, StepRequest,
+    CloseReply, CloseRequest, EnvHeader, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply,
+    RenderRequest, ResetReply, ResetRequest, StepReply, StepRequest,
 };
 use twinstep_protocol::{Code, PROTOCOL, WireError, convert, decode, encode, tensor};
 
 use crate::golden;
+
+/// Kinds of messages.
+const KINDS: usize = 14;
 
 /// Decodes `bytes` as every kind of message; the codes of those that were refused.
 fn refusals(bytes: &[u8]) -> Vec<Code> {
@@ -29,6 +32,8 @@ fn refusals(bytes: &[u8]) -> Vec<Code> {
         refusal::<StepReply<'_>>(bytes),
         refusal::<CloseRequest>(bytes),
         refusal::<CloseReply>(bytes),
+        refusal::<RenderRequest>(bytes),
+        refusal::<RenderReply<'_>>(bytes),
         refusal::<EnvHeader>(bytes),
         refusal::<WireError>(bytes),
     ]
@@ -97,6 +102,7 @@ proptest! {
         round_trips(&StepRequest { protocol, epoch, seq, actions: &bytes }, &mut Vec::new());
         round_trips(&CloseRequest { protocol, epoch, seq }, &mut Vec::new());
         round_trips(&CloseReply { protocol, seq }, &mut Vec::new());
+        round_trips(&RenderRequest { protocol, epoch, env: seq }, &mut Vec::new());
     }
 
     #[test]
@@ -144,7 +150,7 @@ proptest! {
     ) {
         let message = golden::read(name);
         let codes = refusals(&message[..cut.index(message.len())]);
-        prop_assert_eq!(codes, vec![Code::Malformed; 12]);
+        prop_assert_eq!(codes, vec![Code::Malformed; KINDS]);
     }
 
     #[test]
@@ -163,7 +169,7 @@ proptest! {
     #[test]
     fn random_bytes_are_refused(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
         let codes = refusals(&bytes);
-        prop_assert_eq!(codes.len(), 12);
+        prop_assert_eq!(codes.len(), KINDS);
         prop_assert!(codes.iter().all(|code| matches!(code, Code::Malformed | Code::Version)));
     }
 }
@@ -203,7 +209,7 @@ fn missing_required_fields_are_named() {
 #[test]
 fn fields_by_position_are_malformed() {
     // [1, 1, 1] would be a close request if fields could go without names.
-    assert_eq!(refusals(&[0x93, 1, 1, 1]), vec![Code::Malformed; 12]);
+    assert_eq!(refusals(&[0x93, 1, 1, 1]), vec![Code::Malformed; KINDS]);
 }
 
 #[test]
@@ -216,7 +222,7 @@ fn foreign_version_is_told_apart_even_if_the_fields_changed() {
 fn deep_nesting_is_malformed() {
     // {"protocol": [[[…]]]} with a hundred thousand brackets.
     let bytes = [b"\x81\xa8protocol".to_vec(), vec![0x91; 100_000]].concat();
-    assert_eq!(refusals(&bytes), vec![Code::Malformed; 12]);
+    assert_eq!(refusals(&bytes), vec![Code::Malformed; KINDS]);
 }
 
 #[test]
@@ -229,4 +235,18 @@ fn tensors_are_read_from_golden_bytes() {
     assert_eq!(batch.ended[0].final_obs, [0.5, 0.5, -0.5, 1.5, -2.5]);
     let reset: ResetRequest<'_> = decode(golden::read("reset_request_seeds_mask")).expect("golden");
     assert_eq!(tensor::read::<u64>(reset.seeds.expect("seeds"), "seeds").expect("whole numbers"), [7, u64::MAX]);
+}
+
+#[test]
+fn scene_survives_the_wire_and_a_shape_without_a_body_is_refused() {
+    let scene = golden::small_scene();
+    let bytes = convert::encode_scene(scene.clone());
+    let reply: RenderReply<'_> = decode(&bytes).expect("what was encoded decodes");
+    assert_eq!(convert::read_scene(reply.clone()).expect("it fits"), scene);
+    let mut stray = reply.clone();
+    stray.shapes[0].body = 2;
+    let error = convert::read_scene(stray).expect_err("there are two bodies");
+    assert_eq!((error.code, error.message.as_str()), (Code::OutOfRange, "`shapes` has body 2; there are 2"));
+    let error = convert::read_scene(RenderReply { pose: &reply.pose[..28], ..reply }).expect_err("one pose of two");
+    assert_eq!((error.code, error.field.as_str()), (Code::BadShape, "pose"));
 }

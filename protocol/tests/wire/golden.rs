@@ -7,16 +7,16 @@ use std::fmt::Debug;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::{AutoresetMode, EnvSpec, Field};
+use twinstep_model::{AutoresetMode, EnvSpec, Field, Ground, Scene, SceneShape, ShapeKind};
 use twinstep_protocol::message::{
-    CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, ResetReply, ResetRequest,
-    StepReply, StepRequest,
+    CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply, RenderRequest,
+    ResetReply, ResetRequest, StepReply, StepRequest,
 };
 use twinstep_protocol::tensor::as_bytes;
 use twinstep_protocol::{Code, PROTOCOL, WireError, decode, encode};
 
 /// Name of every golden file, without `.msgpack`.
-pub const NAMES: [&str; 15] = [
+pub const NAMES: [&str; 17] = [
     "hello_request",
     "hello_reply",
     "lease_request",
@@ -31,6 +31,8 @@ pub const NAMES: [&str; 15] = [
     "step_reply_ended",
     "close_request",
     "close_reply",
+    "render_request",
+    "render_reply",
     "error",
 ];
 
@@ -199,6 +201,30 @@ fn step_has_its_golden_bytes() {
 fn close_has_its_golden_bytes() {
     check("close_request", &CloseRequest { protocol: PROTOCOL, epoch: 2, seq: 300 });
     check("close_reply", &CloseReply { protocol: PROTOCOL, seq: 300 });
+}
+
+/// A box with a leg that hangs 0.2 m below it.
+pub fn small_scene() -> Scene {
+    let shape = |body, kind, size, z| SceneShape { body, kind, size, offset: [0.0, 0.0, z, 1.0, 0.0, 0.0, 0.0] };
+    Scene {
+        bodies: vec!["trunk".to_owned(), "FL_hip".to_owned()],
+        pose: vec![[0.5, 0.0, 0.25, 1.0, 0.0, 0.0, 0.0], [0.75, 0.125, 0.25, 0.5, 0.5, 0.5, 0.5]],
+        shapes: vec![
+            shape(0, ShapeKind::Box, [0.25, 0.125, 0.0625], 0.0),
+            shape(1, ShapeKind::Capsule, [0.03125, 0.09375, 0.0], -0.125),
+            shape(1, ShapeKind::Sphere, [0.03125, 0.0, 0.0], -0.25),
+        ],
+        ground: Ground { point: [0.0; 3], normal: [0.0, 0.0, 1.0] },
+        command: Some([1.0, 0.0, -0.5]),
+    }
+}
+
+#[test]
+fn render_has_its_golden_bytes() {
+    check("render_request", &RenderRequest { protocol: PROTOCOL, epoch: 1, env: 1 });
+    let Scene { bodies, pose, shapes, ground, command } = small_scene();
+    let pose = as_bytes(&pose);
+    check("render_reply", &RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground, command });
 }
 
 #[test]

@@ -63,6 +63,8 @@ fn tables_have_exactly_the_fields_of_the_messages() {
         ("### step reply", "step_reply"),
         ("### close request", "close_request"),
         ("### close reply", "close_reply"),
+        ("### render request", "render_request"),
+        ("### render reply", "render_reply"),
         ("### error reply", "error"),
     ];
     for (title, name) in tables {
@@ -71,6 +73,11 @@ fn tables_have_exactly_the_fields_of_the_messages() {
     }
     let Some(Value::Map(spec)) = golden_map("hello_reply").remove("spec") else { panic!("`spec` is a map") };
     assert_eq!(first_cells(section("### spec")), spec.keys().cloned().collect());
+    let Some(Value::List(shapes)) = golden_map("render_reply").remove("shapes") else { panic!("`shapes` is a list") };
+    for shape in shapes {
+        let Value::Map(shape) = shape else { panic!("a shape is a map") };
+        assert_eq!(first_cells(section("### shape\n")), shape.into_keys().collect());
+    }
 }
 
 #[test]

@@ -1,0 +1,408 @@
+"""Pictures of one robot on the ground, drawn from the server's answer to ``render``.
+
+Every shape is met by one ray a pixel inside its silhouette's rectangle: numpy is enough, and a picture takes
+milliseconds. World frame: z up; SI units.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating[Any]]
+"""32 bits throughout: a picture is limited by memory."""
+
+_SKY_TOP, _SKY_LOW = np.array([[92, 138, 190], [214, 226, 236]], dtype=np.float32)
+_TILES = np.array([[150, 158, 164], [178, 186, 190]], dtype=np.float32)
+_COLOURS: dict[str, tuple[float, float, float]] = {
+    "box": (208, 212, 218),
+    "capsule": (122, 130, 142),
+    "sphere": (38, 40, 46),
+}
+_TILE_M = 0.25
+_FOG_M = 9.0
+"""Distance over which the ground fades into the horizon."""
+_SUN = np.array([0.3, -0.6, 0.74], dtype=np.float32) / np.float32(np.linalg.norm([0.3, -0.6, 0.74]))
+_AMBIENT, _DIFFUSE, _SHADOW = 0.5, 0.55, 0.55
+_CAMERA_OFFSET_M = np.array([0.62, -1.25, 0.55], dtype=np.float32)
+"""From the point looked at to the camera: from the front right and above."""
+_FOCAL = 2.3
+"""Focal length in units of half the picture's height."""
+_FOLLOW = 0.2
+"""Share of the way to the robot that the camera goes with each picture: steps of a trot do not shake it."""
+_CUT_M = 1.0
+"""The camera jumps when the robot is farther from where it looks, as after a reset."""
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """One shape in the world: a box, a capsule or a sphere (a capsule of length 0)."""
+
+    kind: str
+    size: Array
+    """(3,) as sent [m]."""
+    centre: Array
+    """(3,) [m]."""
+    axes: Array
+    """(3, 3) world-from-shape rotation."""
+
+    @property
+    def radius(self) -> float:
+        """Radius of the ball around the shape [m]."""
+        return float(np.linalg.norm(self.size)) if self.kind == "box" else float(self.size[0] + self.size[1])
+
+    def corners(self) -> Array:
+        """Points [m] whose convex hull holds the shape: (8, 3)."""
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float32)
+        half = self.size if self.kind == "box" else self.size[0] + np.array([0, 0, self.size[1]], dtype=np.float32)
+        return self.centre + (signs * half) @ self.axes.T
+
+    def meet(self, origins: Array, rays: Array) -> Array:
+        """Distance along each ray to the shape.
+
+        Parameters
+        ----------
+        origins : (1, 3) or (n, 3) float32
+            Where the rays start [m].
+        rays : (n, 3) or (1, 3) float32
+            Unit directions.
+
+        Returns
+        -------
+        (n,) float32
+            [m], infinite without a hit.
+        """
+        start, ray = (origins - self.centre) @ self.axes, rays @ self.axes
+        if self.kind == "box":
+            return _meet_box(start, ray, self.size)
+        return _meet_capsule(start, ray, float(self.size[0]), float(self.size[1]))
+
+    def normal(self, points: Array) -> Array:
+        """Unit normals (n, 3) in the world at ``points`` (n, 3) [m] of the surface."""
+        own = (points - self.centre) @ self.axes
+        if self.kind == "box":
+            face = np.abs(own / self.size).argmax(axis=1)
+            rows = np.arange(len(own))
+            normal = np.zeros_like(own)
+            normal[rows, face] = np.sign(own[rows, face])
+        else:
+            own[:, 2] -= np.clip(own[:, 2], -self.size[1], self.size[1])
+            normal = own / self.size[0]
+        return normal @ self.axes.T
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """A pinhole camera that looks at a point."""
+
+    position: Array
+    axes: Array
+    """(3, 3) columns: right, up, backward."""
+    width: int
+    height: int
+
+    def rays(self, left: int, right: int, top: int, bottom: int) -> Array:
+        """Unit directions in the world of a rectangle of pixels: (bottom - top, right - left, 3)."""
+        half = 0.5 * self.height
+        x = ((np.arange(left, right, dtype=np.float32) + 0.5) - 0.5 * self.width) / half
+        y = (half - (np.arange(top, bottom, dtype=np.float32) + 0.5)) / half
+        rays = x[None, :, None] * self.axes[:, 0] + y[:, None, None] * self.axes[:, 1] - _FOCAL * self.axes[:, 2]
+        return rays / np.sqrt(x[None, :, None] ** 2 + y[:, None, None] ** 2 + _FOCAL**2)
+
+    def rectangle(self, points: Array) -> tuple[int, int, int, int]:
+        """Pixels (left, right, top, bottom) that hold the hull of ``points`` [m]; none if it is behind the camera."""
+        seen = (points - self.position) @ self.axes
+        depth = -seen[:, 2]
+        if depth.max() < 0.05:
+            return 0, 0, 0, 0
+        if depth.min() < 0.05:
+            return 0, self.width, 0, self.height
+        half = 0.5 * self.height
+        x = 0.5 * self.width + half * _FOCAL * seen[:, 0] / depth
+        y = half - half * _FOCAL * seen[:, 1] / depth
+        left, top = max(int(x.min()) - 1, 0), max(int(y.min()) - 1, 0)
+        return left, min(int(x.max()) + 2, self.width), top, min(int(y.max()) + 2, self.height)
+
+
+class Viewer:
+    """Draws one robot, as an array or in a window.
+
+    Parameters
+    ----------
+    mode : {"rgb_array", "human"}
+        "human" also shows every picture in a window, which needs pygame.
+    width, height : int
+        Size of a picture [pixels].
+    fps : int
+        Pictures a second that the window shows at most. [Hz]
+
+    Raises
+    ------
+    ImportError
+        ``mode`` is "human" and pygame is missing.
+    """
+
+    def __init__(self, mode: Literal["rgb_array", "human"], width: int = 640, height: int = 480, fps: int = 50) -> None:
+        if mode not in ("rgb_array", "human"):
+            raise ValueError(f'`mode` = {mode!r} is not allowed: "rgb_array" or "human"')
+        self._width, self._height = width, height
+        self._target: Array | None = None
+        self._backdrop: _Backdrop | None = None
+        self._window = _Window(width, height, fps) if mode == "human" else None
+
+    def draw(self, scene: Mapping[str, object]) -> NDArray[np.uint8]:
+        """Draw what the server answered to ``render``.
+
+        Parameters
+        ----------
+        scene : mapping
+            The decoded reply: ``bodies``, ``pose``, ``shapes``, ``ground``.
+
+        Returns
+        -------
+        (height, width, 3) uint8
+            Red, green, blue.
+        """
+        shapes = _shapes_of(scene)
+        ground = cast(Mapping[str, Sequence[float]], scene["ground"])
+        point, normal = (np.asarray(ground[key], dtype=np.float32) for key in ("point", "normal"))
+        base = np.frombuffer(cast(bytes, scene["pose"]), dtype="<f4", count=3).astype(np.float32)
+        camera = self._camera(base, point, normal)
+        offset = camera.position - point
+        height = float(np.dot(offset, normal))
+        if self._backdrop is None or not self._backdrop.fits(camera, height, normal):
+            self._backdrop = _Backdrop(camera, height, normal)
+        picture = _Picture(camera, self._backdrop, offset)
+        for shape in shapes:
+            picture.draw_shadow(shape, point, normal)
+        for shape in shapes:
+            picture.draw_shape(shape)
+        image = picture.image()
+        if self._window is not None:
+            self._window.show(image)
+        return image
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+
+    def _camera(self, base: Array, point: Array, normal: Array) -> _Camera:
+        # Looks at the ground under the robot, not at the robot: its own ups and downs stay visible.
+        under = base - normal * np.dot(base - point, normal)
+        last = self._target
+        if last is None or np.linalg.norm(under - last) > _CUT_M:
+            last = under
+        followed = last + np.float32(_FOLLOW) * (under - last)
+        self._target = followed
+        target = followed + np.float32(0.17) * normal
+        backward = _CAMERA_OFFSET_M / np.float32(np.linalg.norm(_CAMERA_OFFSET_M))
+        right = np.cross(np.array([0, 0, 1], dtype=np.float32), backward)
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(backward, right), backward], axis=1).astype(np.float32)
+        return _Camera(target + _CAMERA_OFFSET_M, axes, self._width, self._height)
+
+
+class _Backdrop:
+    """Sky, and chequered ground as seen from one height and direction: all that does not depend on where."""
+
+    def __init__(self, camera: _Camera, height: float, normal: Array) -> None:
+        self.rays = camera.rays(0, camera.width, 0, camera.height)
+        self.axes, self.height, self.normal = camera.axes, height, normal
+        rise = np.clip(self.rays[..., 2] * 3, 0, 1)
+        # By planes, (3, height, width): numpy is slow where the last axis is short.
+        self._far = _SKY_LOW[:, None, None] + (_SKY_TOP - _SKY_LOW)[:, None, None] * rise
+        downward = self.rays @ normal
+        self.distance = np.full(downward.shape, np.inf, dtype=np.float32)
+        np.divide(-height, downward, out=self.distance, where=downward < -1e-3)
+        seen = np.isfinite(self.distance)
+        # Whole rows, because a slice is faster than a mask.
+        rows = np.flatnonzero(seen.any(axis=1))
+        self._first_row = int(rows[0]) if len(rows) else camera.height
+        seen = seen[self._first_row :]
+        distance = np.where(seen, self.distance[self._first_row :], 0)
+        first = np.cross(np.array([0, 1, 0], dtype=np.float32), normal)
+        first /= np.linalg.norm(first)
+        self._tiles_from_world = np.stack([first, np.cross(normal, first)]) / np.float32(_TILE_M)
+        rays = self.rays[self._first_row :]
+        self._tile = [np.ascontiguousarray((rays @ axis) * distance) for axis in self._tiles_from_world]
+        # A pixel far away covers many tiles: average over its footprint, or they flicker.
+        footprint = distance / (0.5 * camera.height * _FOCAL * _TILE_M)
+        slant = np.sqrt(np.clip(-downward[self._first_row :], 0.02, 1))
+        self._width = np.maximum(footprint / slant, 1e-3).astype(np.float32)
+        # Sky among the rows is ground in the thickest fog.
+        clear = np.where(seen, np.exp(-np.square(distance / _FOG_M)), 0)
+        mean = _SKY_LOW + 0.5 * (_TILES[0] + _TILES[1] - 2 * _SKY_LOW)
+        far = self._far[:, self._first_row :]
+        far += (mean[:, None, None] - far) * clear
+        self._contrast = 0.5 * (_TILES[0] - _TILES[1])[:, None, None] * clear
+
+    def fits(self, camera: _Camera, height: float, normal: Array) -> bool:
+        """True if another picture can use it."""
+        same = np.array_equal(camera.axes, self.axes) and np.array_equal(normal, self.normal)
+        return same and abs(height - self.height) < 1e-3
+
+    def paint(self, offset: Array) -> Array:
+        """Picture without a robot, (3, height, width); ``offset`` [m] leads from the ground's point to the camera."""
+        colour = self._far.copy()
+        across = [
+            _blurred_stripes(tile + np.float32(np.mod(axis @ offset, 2)), self._width)
+            for tile, axis in zip(self._tile, self._tiles_from_world, strict=True)
+        ]
+        colour[:, self._first_row :] += self._contrast * (across[0] * across[1])
+        return colour
+
+
+class _Picture:
+    """Colour and distance of every pixel, while shapes are drawn one by one."""
+
+    def __init__(self, camera: _Camera, backdrop: _Backdrop, offset: Array) -> None:
+        self._camera = camera
+        self._rays = backdrop.rays
+        self._colour = backdrop.paint(offset)
+        self._distance = backdrop.distance.copy()
+        self._shadowed = np.zeros(self._distance.shape, dtype=np.bool_)
+
+    def image(self) -> NDArray[np.uint8]:
+        """The picture so far: (height, width, 3) uint8."""
+        return np.ascontiguousarray(self._colour.astype(np.uint8).transpose(1, 2, 0))
+
+    def draw_shadow(self, shape: _Shape, point: Array, normal: Array) -> None:
+        """Darkens the ground that the shape hides from the sun."""
+        corners = shape.corners()
+        corners = corners - ((corners - point) @ normal / np.dot(_SUN, normal))[:, None] * _SUN
+        left, right, top, bottom = self._camera.rectangle(corners)
+        if left >= right or top >= bottom:
+            return
+        distance = self._distance[top:bottom, left:right]
+        candidates = np.isfinite(distance) & ~self._shadowed[top:bottom, left:right]
+        if not candidates.any():
+            return
+        rays = self._rays[top:bottom, left:right][candidates]
+        ground = self._camera.position + rays * distance[candidates][:, None]
+        hit = np.isfinite(shape.meet(ground, _SUN[None]))
+        rows, columns = (index[hit] for index in np.nonzero(candidates))
+        self._shadowed[top + rows, left + columns] = True
+        self._colour[:, top + rows, left + columns] *= _SHADOW
+
+    def draw_shape(self, shape: _Shape) -> None:
+        """Draws the shape where nothing nearer was drawn."""
+        left, right, top, bottom = self._camera.rectangle(shape.corners())
+        if left >= right or top >= bottom:
+            return
+        rays = self._rays[top:bottom, left:right]
+        distance = shape.meet(self._camera.position[None], rays.reshape(-1, 3)).reshape(rays.shape[:2])
+        nearest = self._distance[top:bottom, left:right]
+        seen = distance < nearest
+        nearest[seen] = distance[seen]
+        light = shape.normal(self._camera.position + rays[seen] * distance[seen][:, None])
+        facing = np.clip(light @ _SUN, 0, 1)
+        # The half towards the sky gets more of the scattered light.
+        brightness = _AMBIENT * (0.75 + 0.25 * light[:, 2]) + _DIFFUSE * facing
+        shine = facing**24
+        colour = np.array(_COLOURS[shape.kind], dtype=np.float32)
+        shaded = np.minimum(colour[:, None] * brightness + 40 * shine, 255)
+        self._colour[:, top:bottom, left:right][:, seen] = shaded
+
+
+class _Window:
+    """A pygame window that shows pictures no faster than ``fps``."""
+
+    def __init__(self, width: int, height: int, fps: int) -> None:
+        try:
+            # By name, because it is an optional dependency.
+            self._pygame: Any = importlib.import_module("pygame")
+        except ImportError as error:
+            message = 'render mode "human" needs pygame\n  pip install "twinstep[render]"'
+            raise ImportError(message) from error
+        self._pygame.display.init()
+        self._pygame.display.set_caption("twinstep")
+        self._surface: Any = self._pygame.display.set_mode((width, height))
+        self._period_s = 1.0 / fps
+        self._next_s = time.monotonic()
+
+    def show(self, image: NDArray[np.uint8]) -> None:
+        """Show ``image``, (height, width, 3), when it is its turn."""
+        time.sleep(max(0.0, self._next_s - time.monotonic()))
+        self._next_s = max(self._next_s, time.monotonic() - self._period_s) + self._period_s
+        # Without reading its events a window counts as hanging.
+        self._pygame.event.pump()
+        self._pygame.surfarray.blit_array(self._surface, image.swapaxes(0, 1))
+        self._pygame.display.flip()
+
+    def close(self) -> None:
+        self._pygame.display.quit()
+
+
+def _shapes_of(scene: Mapping[str, object]) -> list[_Shape]:
+    pose = np.frombuffer(cast(bytes, scene["pose"]), dtype="<f4").reshape(-1, 7).astype(np.float32)
+    rotations = [_rotation(body[3:]) for body in pose]
+    shapes: list[_Shape] = []
+    for sent in cast(Sequence[Mapping[str, Any]], scene["shapes"]):
+        offset, size = (np.asarray(sent[key], dtype=np.float32) for key in ("offset", "size"))
+        body = int(sent["body"])
+        world_from_body, origin = rotations[body], pose[body, :3]
+        axes = world_from_body @ _rotation(offset[3:])
+        shapes.append(_Shape(sent["kind"], size, origin + world_from_body @ offset[:3], axes))
+    return shapes
+
+
+def _rotation(quaternion: Array) -> Array:
+    """Rotation matrix (3, 3) of a quaternion [w, x, y, z]."""
+    w, x, y, z = (quaternion / np.linalg.norm(quaternion)).tolist()
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ],
+        dtype=np.float32,
+    )
+
+
+def _meet_box(start: Array, ray: Array, half: Array) -> Array:
+    """Distances (n,) of rays to a box around the origin, in its frame; ``start`` or ``ray`` may be (1, 3)."""
+    enter, leave = np.float32(-np.inf), np.float32(np.inf)
+    for axis in range(3):
+        direction = ray[:, axis]
+        direction = np.where(np.abs(direction) < 1e-7, np.float32(1e-7), direction)
+        middle, reach = -start[:, axis] / direction, half[axis] / np.abs(direction)
+        enter, leave = np.maximum(enter, middle - reach), np.minimum(leave, middle + reach)
+    return np.where((enter < leave) & (enter > 0), enter, np.float32(np.inf)).astype(np.float32)
+
+
+def _meet_capsule(start: Array, ray: Array, radius: float, half_length: float) -> Array:
+    """Distances (n,) of rays to a capsule along z around the origin, as in :func:`_meet_box`; a ball has no length."""
+    (x, y, z), (u, v, w) = start.T, ray.T
+    infinite = np.float32(np.inf)
+    across = x * u + y * v
+    outside = x * x + y * y - np.float32(radius**2)
+    flat = u * u + v * v + np.float32(1e-9)
+    under = across * across - flat * outside
+    along = (-across - np.sqrt(np.maximum(under, 0))) / flat
+    on_side = (under > 0) & (along > 0) & (np.abs(z + along * w) <= half_length)
+    distance = np.where(on_side, along, infinite)
+    for end in {half_length, -half_length}:
+        height = z - np.float32(end)
+        across_ball = across + height * w
+        under = across_ball * across_ball - outside - height * height
+        along = -across_ball - np.sqrt(np.maximum(under, 0))
+        # The ball's inner half lies in the cylinder, which is met first.
+        distance = np.where((under > 0) & (along > 0) & (along < distance), along, distance)
+    return distance
+
+
+def _blurred_stripes(where: Array, width: Array) -> Array:
+    """Stripes of ±1 that change at every integer, averaged over ``width``: the triangle wave is their integral."""
+
+    def integral(x: Array) -> Array:
+        return np.abs(x - 2 * np.floor(0.5 * x) - 1)
+
+    half = 0.5 * width
+    return (integral(where + half) - integral(where - half)) / width
