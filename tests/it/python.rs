@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 
 use twinstep_tests::campaign::{self, Plan};
 use twinstep_tests::lane::Commands;
-use twinstep_tests::python::{Programs, python, root, run};
+use twinstep_tests::python::{Programs, outside_cargo, python, root, run};
 
 const FAULTS: &str = env!("CARGO_BIN_EXE_faults");
 
@@ -76,7 +76,8 @@ fn package_installs_into_an_empty_environment_and_steps() {
     let empty = venv.join("bin/python");
     let install = ["-m", "pip", "install", "--quiet", "--no-deps"];
     // Its dependencies are the tests' own; what is tried is the wheel and the program in it.
-    run(Command::new(&empty).args(install).arg(client()).env("CARGO_TARGET_DIR", target())).unwrap();
+    run(outside_cargo(&mut Command::new(&empty)).args(install).arg(client()).env("CARGO_TARGET_DIR", target()))
+        .unwrap();
     let site = run(Command::new(&python).args(["-c", "import site; print(site.getsitepackages()[0])"])).unwrap();
     let site = String::from_utf8(site.stdout).unwrap();
     let first_step = "import gymnasium, twinstep\n\

@@ -44,7 +44,7 @@ impl Proxy {
 }
 
 fn forward(mut from: TcpStream, mut to: TcpStream, held_until: &Mutex<Instant>) {
-    let mut buffer = [0; 65536];
+    let mut buffer = vec![0; 65536];
     // Small messages must not wait for each other.
     let _ = to.set_nodelay(true);
     while let Ok(length @ 1..) = from.read(&mut buffer) {

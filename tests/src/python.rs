@@ -19,7 +19,8 @@ pub struct Programs(pub PathBuf);
 impl Programs {
     /// The folder of `faults`; builds `twinstep`, which Cargo leaves out of test builds, beside it.
     pub fn beside(faults: &str) -> Result<Self, String> {
-        run(Command::new(env!("CARGO")).args(["build", "--release", "--quiet"]).current_dir(root()))?;
+        let mut build = Command::new(env!("CARGO"));
+        run(outside_cargo(&mut build).args(["build", "--release", "--quiet"]).current_dir(root()))?;
         let folder = Path::new(faults).parent().ok_or("a program has a folder")?.to_owned();
         Ok(Self(folder))
     }
@@ -68,6 +69,15 @@ fn requirements(pyproject: &str) -> Result<Vec<String>, String> {
     let lists = std::iter::once(&project["dependencies"]).chain(extras);
     let words = lists.filter_map(toml::Value::as_array).flatten().filter_map(toml::Value::as_str);
     Ok(words.map(str::to_owned).collect())
+}
+
+/// Takes away what Cargo tells a test: build scripts that look at it would build their crates, and all above, again.
+pub fn outside_cargo(command: &mut Command) -> &mut Command {
+    let told = std::env::vars_os().filter_map(|(name, _)| name.into_string().ok());
+    for name in told.filter(|name| name.starts_with("CARGO_") && name != "CARGO_HOME") {
+        command.env_remove(name);
+    }
+    command
 }
 
 /// Runs a command; an error has what it printed.

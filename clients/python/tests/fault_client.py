@@ -2,8 +2,8 @@
 
 ``target/release/faults --faults 1000 --client target/python/bin/python clients/python/tests/fault_client.py``
 
-Prints ``lease ID EPOCH`` for each lease, ``acked`` with the counters of each step, ``waiting`` and ``lost`` with the typed
-exception, and ``violation`` with the evidence.
+Prints ``lease ID EPOCH`` for each lease, ``acked`` with the counters of each step, ``waiting`` and ``lost`` with the
+typed exception, and ``violation`` with the evidence.
 """
 
 import os

@@ -1,5 +1,6 @@
 """The wire's bytes: the golden files that the server's own tests hold, and properties."""
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -40,10 +41,8 @@ def test_tensors_survive(values: list[float]) -> None:
 
 @given(st.binary())
 def test_any_bytes_give_a_map_or_a_typed_error(payload: bytes) -> None:
-    try:
+    with contextlib.suppress(codec.MalformedError):
         assert isinstance(codec.decode(payload), dict)
-    except codec.MalformedError:
-        pass
 
 
 def test_wrong_length_is_named() -> None:

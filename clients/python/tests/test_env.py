@@ -92,7 +92,7 @@ def test_reset_mask_resets_where_it_is_true(counters: Go2VectorEnv) -> None:
     ):
         with pytest.raises(twinstep.InvalidOptionError, match=words):
             counters.reset(options={"reset_mask": mask})
-    with pytest.raises(twinstep.InvalidOptionError, match="'speed'.*only 'reset_mask' is known"):
+    with pytest.raises(twinstep.InvalidOptionError, match=r"'speed'.*only 'reset_mask' is known"):
         counters.reset(options={"speed": 1})
 
 
@@ -133,9 +133,7 @@ def test_round_trip_is_told_only_when_asked_for(counters: Go2VectorEnv) -> None:
         (np.where(np.eye(3, 12, 4), np.inf, 0), r"environment 0, joint_position_offset\[FR_thigh\], is inf"),
     ],
 )
-def test_bad_actions_are_named_and_nothing_is_stepped(
-    counters: Go2VectorEnv, actions: np.ndarray, words: str
-) -> None:
+def test_bad_actions_are_named_and_nothing_is_stepped(counters: Go2VectorEnv, actions: np.ndarray, words: str) -> None:
     with pytest.raises(twinstep.InvalidActionError, match=words):
         counters.step(actions)
     assert counters.step(np.zeros((3, 12), np.float32))[0][0, 0] == 1

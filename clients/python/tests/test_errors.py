@@ -106,7 +106,7 @@ def test_frozen_server_is_told_after_the_timeout_and_its_step_is_executed_once()
     envs.reset()
     server = envs._remote._link._server
     os.kill(server.pid, signal.SIGSTOP)
-    with pytest.raises(twinstep.NoAnswerError, match="no answer from tcp/127.0.0.1"):
+    with pytest.raises(twinstep.NoAnswerError, match=r"no answer from tcp/127\.0\.0\.1"):
         envs.step(STILL)
     with pytest.raises(twinstep.Error, match="not answered yet"):
         envs.send(STILL)

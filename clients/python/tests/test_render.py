@@ -45,7 +45,8 @@ def test_robot_and_its_shadow_stand_out_in_the_middle() -> None:
     robot = differing(Viewer("rgb_array").draw(scene()), Viewer("rgb_array").draw(empty()))
     assert 2_000 < robot.sum() < 200_000
     rows, columns = (index.mean() for index in np.nonzero(robot))
-    assert (120 < rows < 400) and (160 < columns < 480)
+    assert 120 < rows < 400
+    assert 160 < columns < 480
 
 
 def test_equal_scenes_give_equal_pictures() -> None:

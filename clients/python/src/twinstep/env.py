@@ -58,7 +58,9 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         info_timing: bool = False,
         **options: Unpack[OptionArguments],
     ) -> None:
-        self.render_mode = checked_render_mode(render_mode)
+        mode_of_pictures = checked_render_mode(render_mode)
+        self.render_mode = mode_of_pictures
+        self._viewer = Viewer(mode_of_pictures) if mode_of_pictures else None
         self._info_timing = info_timing
         self._remote = RemoteEnvs(
             Options(**options),
@@ -69,7 +71,6 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.twinstep_spec = self._remote.spec
         self.observation_space = observation_space(self._remote.spec)
         self.action_space = action_space(self._remote.spec)
-        self._viewer: Viewer | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -146,7 +147,6 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Give the environment back and close the window."""
         if self._viewer is not None:
             self._viewer.close()
-            self._viewer = None
         self._remote.close()
 
     def _show(self) -> None:
@@ -154,9 +154,7 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._draw()
 
     def _draw(self) -> NDArray[np.uint8]:
-        if self._viewer is None:
-            assert self.render_mode is not None
-            self._viewer = Viewer(self.render_mode)
+        assert self._viewer is not None
         return self._viewer.draw(self._remote.scene(0))
 
 

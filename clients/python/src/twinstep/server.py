@@ -101,7 +101,7 @@ class EmbeddedServer:
         with self._lock:
             server, users = self._shared.get(key, (None, 0))
             if server is self and users > 1:
-                self._shared[key] = (server, users - 1)
+                self._shared[key] = (self, users - 1)
                 return
             if server is self:
                 del self._shared[key]

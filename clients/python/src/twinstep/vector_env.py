@@ -49,7 +49,9 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
     ) -> None:
         mode = _autoreset_mode(autoreset_mode)
         self.metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 50, "autoreset_mode": mode}
-        self.render_mode = checked_render_mode(render_mode)
+        mode_of_pictures = checked_render_mode(render_mode)
+        self.render_mode = mode_of_pictures
+        self._viewer = Viewer(mode_of_pictures) if mode_of_pictures else None
         self._mode = mode
         self._info_timing = info_timing
         self._remote = RemoteEnvs(
@@ -61,7 +63,6 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         self.single_action_space = action_space(self._remote.spec)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._viewer: Viewer | None = None
 
     def reset(
         self,
@@ -138,10 +139,9 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
 
     def close_extras(self, **kwargs: Any) -> None:
         """Give the environments back and close the window."""
-        if getattr(self, "_viewer", None) is not None:
-            assert self._viewer is not None
-            self._viewer.close()
-            self._viewer = None
+        viewer: Viewer | None = getattr(self, "_viewer", None)
+        if viewer is not None:
+            viewer.close()
         if hasattr(self, "_remote"):
             self._remote.close()
 
@@ -188,9 +188,7 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
             self._draw(0)
 
     def _draw(self, env: int) -> NDArray[np.uint8]:
-        if self._viewer is None:
-            assert self.render_mode is not None
-            self._viewer = Viewer(self.render_mode)
+        assert self._viewer is not None
         return self._viewer.draw(self._remote.scene(env))
 
 
