@@ -1,0 +1,156 @@
+"""How fast environments step from Python, side by side with the peers: ``python -m twinstep.bench [--json]``.
+
+Peers that are not installed are left out and named on stderr: ``pip install "twinstep[bench]"``.
+"""
+
+import argparse
+import importlib.util
+import json
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from .server import find_program
+from .vector_env import Go2VectorEnv
+
+WINDOWS = 5
+NUM_ENVS = (1, 64, 1024)
+ANT_ENVS = 64
+
+Row = dict[str, Any]
+
+
+def pace(once: Callable[[], object], window_s: float) -> tuple[float, float]:
+    """Repeats a second and median time of one [µs], each the median of five windows."""
+    once()
+    rates, medians = list[float](), list[float]()
+    for _ in range(WINDOWS):
+        times = list[float]()
+        since = last = time.perf_counter()
+        while last - since < window_s:
+            once()
+            now = time.perf_counter()
+            times.append(now - last)
+            last = now
+        rates.append(len(times) / (last - since))
+        medians.append(1e6 * statistics.median(times))
+    return statistics.median(rates), statistics.median(medians)
+
+
+@contextmanager
+def stepping(num_envs: int, task: str) -> Iterator[Callable[[], object]]:
+    """A function that steps ``num_envs`` robots of the bundled server once."""
+    envs = Go2VectorEnv(num_envs, task=task)
+    envs.reset(seed=1)
+    actions = np.zeros((num_envs, 12), np.float32)
+    try:
+        yield lambda: envs.step(actions)
+    finally:
+        envs.close()
+
+
+def transport(window_s: float) -> Iterator[Row]:
+    """Physics off, beside dm_env_rpc serving the same observation."""
+    reference = dm_env_rpc_rate(window_s)
+    for num_envs in NUM_ENVS:
+        with stepping(num_envs, "counter") as step:
+            rate, median_us = pace(step, window_s)
+        yield row(f"physics off, {num_envs} envs", rate, "round trips/s")
+        yield row(f"physics off, {num_envs} envs, p50", median_us, "us")
+        yield row(f"physics off, {num_envs} envs", rate * num_envs, "env-steps/s", "dm_env_rpc", reference)
+
+
+def physics(window_s: float) -> Iterator[Row]:
+    """Physics on, beside the same environments in process and beside Ant-v5 of the peers."""
+    program = subprocess.run(
+        [find_program(), "bench", "remote", "--json", "--window-s", str(window_s)], capture_output=True, check=True
+    )
+    in_process = {each["case"]: each["value"] for each in json.loads(program.stdout)["rows"]}
+    for num_envs in NUM_ENVS:
+        with stepping(num_envs, "walk") as step:
+            rate = pace(step, window_s)[0] * num_envs
+        local = in_process.get(f"walk in process, {num_envs} envs")
+        yield row(f"walk, {num_envs} envs", rate, "env-steps/s", "the same in process, in Rust", local)
+        if num_envs == ANT_ENVS:
+            for peer, peers_rate in ant_rates(window_s):
+                yield row(f"walk, {num_envs} envs", rate, "env-steps/s", f"{peer}, Ant-v5", peers_rate)
+
+
+def row(case: str, value: float, unit: str, reference: str | None = None, theirs: float | None = None) -> Row:
+    """One number; ``ratio`` is ours to the reference's."""
+    known = theirs is not None
+    return {
+        "case": case,
+        "value": value,
+        "unit": unit,
+        "reference": f"{reference}: {theirs:.0f}" if known else None,
+        "ratio": value / theirs if known else None,
+    }
+
+
+def ant_rates(window_s: float) -> Iterator[tuple[str, float]]:
+    """Env-steps a second of 64 Ant-v5 in each peer that is installed."""
+    actions = np.zeros((ANT_ENVS, 8), np.float32)
+    if installed("mujoco"):
+        for mode in ("sync", "async"):
+            envs = gymnasium.make_vec("Ant-v5", num_envs=ANT_ENVS, vectorization_mode=mode)
+            envs.reset(seed=1)
+            yield f"Gymnasium {mode}", pace(lambda envs=envs: envs.step(actions), window_s)[0] * ANT_ENVS
+            envs.close()
+    if installed("envpool"):
+        envpool: Any = importlib.import_module("envpool")
+        pool = envpool.make_gymnasium("Ant-v5", num_envs=ANT_ENVS)
+        pool.reset()
+        yield "EnvPool", pace(lambda: pool.step(actions.astype(np.float64)), window_s)[0] * ANT_ENVS
+        pool.close()
+
+
+def dm_env_rpc_rate(window_s: float) -> float | None:
+    """Env-steps a second of one dm_env_rpc environment with our shapes, server and client on loopback."""
+    if not installed("dm_env_rpc"):
+        return None
+    from .peer_dm_env_rpc import remote_step
+
+    with remote_step() as step:
+        return pace(step, window_s)[0]
+
+
+def installed(module: str) -> bool:
+    """Whether a peer is there; its absence is said."""
+    if importlib.util.find_spec(module) is not None:
+        return True
+    print(f'left out: {module} is not installed (pip install "twinstep[bench]")', file=sys.stderr)
+    return False
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(prog="python -m twinstep.bench", description=__doc__)
+    parser.add_argument("what", nargs="?", choices=["transport", "physics"], help="both without")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--window-s", type=float, default=1.0, help="length of one of the five windows of each case")
+    arguments = parser.parse_args()
+    parts = {"transport": transport, "physics": physics}
+    chosen = [parts[arguments.what]] if arguments.what else list(parts.values())
+    rows = list[Row]()
+    for part in chosen:
+        for each in part(arguments.window_s):
+            rows.append(each)
+            if not arguments.json:
+                beside = f"   {each['ratio']:.2f} of {each['reference']}" if each["ratio"] is not None else ""
+                print(f"{each['case']:<32}{each['value']:>12.0f} {each['unit']:<14}{beside}", flush=True)
+    if arguments.json:
+        machine = f"{platform.processor() or platform.machine()}, Python {platform.python_version()}"
+        print(json.dumps({"rows": rows, "machine": machine}))
+
+
+if __name__ == "__main__":
+    main()

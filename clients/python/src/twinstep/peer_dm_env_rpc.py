@@ -1,0 +1,67 @@
+# pyright: basic
+"""The reference of the bench: dm_env_rpc serving one environment with our shapes and no physics.
+
+``python -m twinstep.peer_dm_env_rpc`` is the server; it prints its port and ends with its stdin.
+"""
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent import futures
+from contextlib import contextmanager
+
+import grpc
+import numpy as np
+from dm_env_rpc.v1 import connection, dm_env_rpc_pb2, dm_env_rpc_pb2_grpc, tensor_utils
+
+OBSERVATION, ACTION = 1, 1
+
+
+class Servicer(dm_env_rpc_pb2_grpc.EnvironmentServicer):
+    """Answers every step with the same 45 floats."""
+
+    def Process(self, request_iterator, context):  # noqa: N802
+        """One stream of requests and replies."""
+        obs = np.zeros(45, np.float32)
+        for request in request_iterator:
+            tensor_utils.unpack_tensor(request.step.actions[ACTION])
+            reply = dm_env_rpc_pb2.EnvironmentResponse()
+            reply.step.state = dm_env_rpc_pb2.RUNNING
+            reply.step.observations[OBSERVATION].CopyFrom(tensor_utils.pack_tensor(obs))
+            yield reply
+
+
+def serve() -> None:
+    """Serve on a free port until stdin closes."""
+    server = grpc.server(futures.ThreadPoolExecutor(max_workers=2))
+    dm_env_rpc_pb2_grpc.add_EnvironmentServicer_to_server(Servicer(), server)
+    print(server.add_insecure_port("127.0.0.1:0"), flush=True)
+    server.start()
+    sys.stdin.read()
+    server.stop(0)
+
+
+@contextmanager
+def remote_step() -> Iterator[Callable[[], object]]:
+    """A function that steps an environment in another process once."""
+    server = subprocess.Popen(
+        [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert server.stdout is not None
+    assert server.stdin is not None
+    action = np.zeros(12, np.float32)
+
+    def step() -> object:
+        request = dm_env_rpc_pb2.StepRequest(requested_observations=[OBSERVATION])
+        request.actions[ACTION].CopyFrom(tensor_utils.pack_tensor(action))
+        return tensor_utils.unpack_tensor(link.send(request).observations[OBSERVATION])
+
+    with grpc.insecure_channel(f"127.0.0.1:{int(server.stdout.readline())}") as channel:
+        with connection.Connection(channel) as link:
+            yield step
+    server.stdin.close()
+    server.wait()
+
+
+if __name__ == "__main__":
+    serve()

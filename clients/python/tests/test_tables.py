@@ -1,0 +1,13 @@
+"""The documents that are generated from the server's spec."""
+
+from pathlib import Path
+
+from twinstep import Go2VectorEnv
+from twinstep.tables import tables
+
+
+def test_page_of_the_walk_task_is_what_the_server_says() -> None:
+    page = Path(__file__).parents[3] / "docs" / "go2-walk.md"
+    envs = Go2VectorEnv(1)
+    assert page.read_text() == tables(envs.twinstep_spec), "renew: python -m twinstep.tables > docs/go2-walk.md"
+    envs.close()
