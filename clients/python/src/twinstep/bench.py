@@ -11,7 +11,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -46,7 +46,7 @@ def pace(once: Callable[[], object], window_s: float) -> tuple[float, float]:
 
 
 @contextmanager
-def stepping(num_envs: int, task: str) -> Iterator[Callable[[], object]]:
+def stepping(num_envs: int, task: str) -> Generator[Callable[[], object], None, None]:
     """A function that steps ``num_envs`` robots of the bundled server once."""
     envs = Go2VectorEnv(num_envs, task=task)
     envs.reset(seed=1)

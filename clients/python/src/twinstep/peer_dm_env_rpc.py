@@ -1,4 +1,4 @@
-# pyright: basic
+# pyright: basic, reportMissingImports=false
 """The reference of the bench: dm_env_rpc serving one environment with our shapes and no physics.
 
 ``python -m twinstep.peer_dm_env_rpc`` is the server; it prints its port and ends with its stdin.
@@ -6,7 +6,7 @@
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent import futures
 from contextlib import contextmanager
 
@@ -42,7 +42,7 @@ def serve() -> None:
 
 
 @contextmanager
-def remote_step() -> Iterator[Callable[[], object]]:
+def remote_step() -> Generator[Callable[[], object], None, None]:
     """A function that steps an environment in another process once."""
     server = subprocess.Popen(
         [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -56,9 +56,9 @@ def remote_step() -> Iterator[Callable[[], object]]:
         request.actions[ACTION].CopyFrom(tensor_utils.pack_tensor(action))
         return tensor_utils.unpack_tensor(link.send(request).observations[OBSERVATION])
 
-    with grpc.insecure_channel(f"127.0.0.1:{int(server.stdout.readline())}") as channel:
-        with connection.Connection(channel) as link:
-            yield step
+    address = f"127.0.0.1:{int(server.stdout.readline())}"
+    with grpc.insecure_channel(address) as channel, connection.Connection(channel) as link:
+        yield step
     server.stdin.close()
     server.wait()
 

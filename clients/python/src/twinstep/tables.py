@@ -10,8 +10,9 @@ def tables(spec: Spec) -> str:
 
 Made by `python -m twinstep.tables` from the server's spec; a test keeps it true.
 
-One step is one policy period of {spec.policy_dt:g} s; the drive runs at {1 / spec.drive_dt:g} Hz with kp = {spec.kp:g}
-N·m/rad and kd = {spec.kd:g} N·m·s/rad. An action of 1 offsets a joint by {spec.action_scale:g} rad from the default pose.
+One step is one policy period of {spec.policy_dt:g} s; the drive runs at {1 / spec.drive_dt:g} Hz with
+kp = {spec.kp:g} N·m/rad and kd = {spec.kd:g} N·m·s/rad. An action of 1 offsets a joint by {spec.action_scale:g} rad
+from the default pose.
 Episodes are truncated after {spec.max_episode_steps} steps.
 """
     parts = [("Observation", spec.observation, spec.obs_len), ("Action", spec.action, spec.action_len)]
