@@ -113,9 +113,10 @@ def _check_end(env: "VecEnv", info: dict[str, Any], index: int, obs: list[Result
         found = f"done, but infos' `TimeLimit.truncated` is {truncated!r}"
         raise VecEnvError(found, wanted="a bool: true if the time limit ended it and the task did not", env=index)
     results: list[Result] = []
-    for name, space, value in _leaves(
-        env.observation_space, info["terminal_observation"], "terminal_observation", index
-    ):
+    whole = cast(AnySpace, env.observation_space)
+    for name, space, value in _leaves(whole, info["terminal_observation"], "terminal_observation", index):
+        # An environment's Discrete observation is often an int, which Stable-Baselines3 reads as well.
+        value = np.asarray(value, space.dtype) if isinstance(value, int) else value
         array = _check_array(value, name, space.shape or (), space.dtype, index)
         _check_in_space(space, array[np.newaxis], name, [index])
         if any(np.shares_memory(array, current.array) for current in obs):
@@ -157,7 +158,7 @@ def _check_array(array: Any, name: str, shape: tuple[int, ...], dtype: Any, env:
     given = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray | np.generic) else _shown(array)
     if given != f"{np.dtype(dtype)} {shape}":
         raise VecEnvError(f"{name} is {given}", wanted=f"a NumPy array, {np.dtype(dtype)} {shape}", env=env)
-    return cast(Array, np.asarray(cast(Any, array)))
+    return np.asarray(cast(Any, array))
 
 
 def _check_in_space(space: AnySpace, rows: Array, name: str, envs: Sequence[int]) -> None:
