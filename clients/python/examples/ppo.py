@@ -35,7 +35,7 @@ def main() -> None:
         "MlpPolicy",
         envs,
         n_steps=64,
-        batch_size=1024,
+        batch_size=16 * args.envs,
         n_epochs=5,
         # Full actions throw the robot over before it can learn: begin with a standard deviation of 0.37.
         policy_kwargs={"net_arch": [128, 128], "log_std_init": -1.0},

@@ -46,7 +46,7 @@ def check_vec_env(env: "VecEnv", *, steps: int = 200) -> None:
     _check_equal(first, _rollout(env, steps, _step_in_two), "`step`, and `step_async` followed by `step_wait`,")
     _check_seed_is_used_once(env)
     for _ in range(2):
-        _ask(env.close)
+        _ask("close", env.close)
     if not any(result.name.startswith("terminal_observation") for results in first for result in results):
         warnings.warn(f"no episode ended within {steps} steps, so no end was checked; raise `steps`", stacklevel=2)
 
@@ -72,9 +72,9 @@ def _check_attributes(env: "VecEnv") -> None:
     # As callers ask: for all, for one, for several out of order.
     for indices, meant in ((None, everywhere), (last, [last]), (everywhere[::-1], everywhere[::-1])):
         asked = f"indices={indices}"
-        _ask(env.set_attr, _ATTRIBUTE, "before")
-        _ask(env.set_attr, _ATTRIBUTE, "after", indices=indices)
-        values = _ask(env.get_attr, _ATTRIBUTE)
+        _ask("set_attr", env.set_attr, _ATTRIBUTE, "before")
+        _ask("set_attr", env.set_attr, _ATTRIBUTE, "after", indices=indices)
+        values = _ask("get_attr", env.get_attr, _ATTRIBUTE)
         check_list(values, "`get_attr`", env.num_envs)
         for index, value in enumerate(values):
             expected = "after" if index in meant else "before"
@@ -82,18 +82,18 @@ def _check_attributes(env: "VecEnv") -> None:
                 found = f"`set_attr` with {asked} left the attribute at {value!r}"
                 raise VecEnvError(found, wanted=f"{expected!r}: set where `indices` says, nowhere else", env=index)
         for index in everywhere:
-            _ask(env.set_attr, _ATTRIBUTE, index, indices=index)
-        values = _ask(env.get_attr, _ATTRIBUTE, indices=indices)
+            _ask("set_attr", env.set_attr, _ATTRIBUTE, index, indices=index)
+        values = _ask("get_attr", env.get_attr, _ATTRIBUTE, indices=indices)
         check_list(values, f"`get_attr` with {asked}", len(meant))
         if list(values) != meant:
             found = f"`get_attr` with {asked} gave the attributes of the environments {list(values)}"
             raise VecEnvError(found, wanted=f"those of {meant}, in this order")
-        _ask(env.set_attr, _METHOD, _method)
-        answers = _ask(cast(Any, env).env_method, _METHOD, 1, indices=indices, keyword=2)
+        _ask("set_attr", env.set_attr, _METHOD, _method)
+        answers = _ask("env_method", cast(Any, env).env_method, _METHOD, 1, indices=indices, keyword=2)
         check_list(answers, f"`env_method` with {asked}", len(meant))
         if any(answer != (1, 2) for answer in answers):
             raise VecEnvError(f"`env_method` with {asked} gave {answers!r}", wanted="what the method returned: (1, 2)")
-        wrapped = _ask(env.env_is_wrapped, gymnasium.Wrapper, indices=indices)
+        wrapped = _ask("env_is_wrapped", env.env_is_wrapped, gymnasium.Wrapper, indices=indices)
         check_list(wrapped, f"`env_is_wrapped` with {asked}", len(meant))
         if any(not isinstance(one, bool | np.bool_) for one in wrapped):
             raise VecEnvError(f"`env_is_wrapped` with {asked} gave {wrapped!r}", wanted="a bool for each environment")
@@ -104,13 +104,13 @@ def _method(positional: int, *, keyword: int) -> tuple[int, int]:
     return positional, keyword
 
 
-def _ask(method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+def _ask(name: str, method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     """Call a method of the ``VecEnv`` that must not raise."""
     try:
         return method(*args, **kwargs)
     except Exception as error:
         given = ", ".join([*map(repr, args), *(f"{key}={value!r}" for key, value in kwargs.items())])
-        found = f"`{getattr(method, '__name__', method)}({given})` raised {type(error).__name__}: {error}"
+        found = f"`{name}({given})` raised {type(error).__name__}: {error}"
         raise VecEnvError(found, wanted="it works: algorithms, wrappers and callbacks call it") from error
 
 
@@ -127,7 +127,7 @@ def _rollout(env: "VecEnv", steps: int, step: Callable[["VecEnv", Array], object
     """Reset from the seed and step, checking all that comes back; the first entry is the reset's."""
     space: spaces.Space[Any] = copy.deepcopy(cast(Any, env.action_space))
     space.seed(_SEED)
-    check_list(_ask(env.seed, _SEED), "`seed`", env.num_envs)
+    check_list(_ask("seed", env.seed, _SEED), "`seed`", env.num_envs)
     rollout = [check_reset(env, env.reset())]
     for _ in range(steps):
         actions: Array = np.array([space.sample() for _ in range(env.num_envs)])
