@@ -147,6 +147,10 @@ def first_only(method: Any) -> Any:
     return lambda self, *args, indices=None, **kwargs: method(self, *args, indices=0, **kwargs)
 
 
+def set_everywhere(self: Any, attr_name: str, value: Any, indices: Any = None) -> None:
+    Good.set_attr(self, attr_name, value, range(N) if indices is not None else None)
+
+
 def refuses(self: Any, *args: Any, **kwargs: Any) -> None:
     raise NotImplementedError("not for this simulator")
 
@@ -189,10 +193,7 @@ BROKEN: dict[str, tuple[Any, str]] = {
     "step differs": (lambda: changed(step=step_that_differs), "`step`, and `step_async` .* differ in obs of step 1"),
     "close once": (lambda: changed(close=close_once), r"`close\(\)` raised AttributeError"),
     "get_attr of one": (lambda: changed(get_attr=first_only(Good.get_attr)), "`get_attr` gave 1 entries"),
-    "set_attr of one": (
-        lambda: changed(set_attr=first_only(Good.set_attr)),
-        "environment 1: `set_attr` with indices=None left",
-    ),
+    "set_attr everywhere": (lambda: changed(set_attr=set_everywhere), "environment 0: `set_attr` with indices=2 left"),
     "no env_method": (lambda: changed(env_method=refuses), "raised NotImplementedError: not for this simulator"),
     "env_is_wrapped of none": (lambda: changed(env_is_wrapped=lambda *a, **k: False), "`env_is_wrapped` .* gave bool"),
 }
