@@ -148,7 +148,7 @@ def first_only(method: Any) -> Any:
 
 
 def set_everywhere(self: Any, attr_name: str, value: Any, indices: Any = None) -> None:
-    Good.set_attr(self, attr_name, value, range(N) if indices is not None else None)
+    Good.set_attr(self, attr_name, value)
 
 
 def refuses(self: Any, *args: Any, **kwargs: Any) -> None:

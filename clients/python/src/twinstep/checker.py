@@ -70,33 +70,47 @@ def _check_itself(env: object) -> None:
 def _check_attributes(env: "VecEnv") -> None:
     everywhere, last = list(range(env.num_envs)), env.num_envs - 1
     # As callers ask: for all, for one, for several out of order.
-    for indices, meant in ((None, everywhere), (last, [last]), (everywhere[::-1], everywhere[::-1])):
-        asked = f"indices={indices}"
-        _ask("set_attr", env.set_attr, _ATTRIBUTE, "before")
-        _ask("set_attr", env.set_attr, _ATTRIBUTE, "after", indices=indices)
-        values = _ask("get_attr", env.get_attr, _ATTRIBUTE)
-        check_list(values, "`get_attr`", env.num_envs)
-        for index, value in enumerate(values):
-            expected = "after" if index in meant else "before"
-            if value != expected:
-                found = f"`set_attr` with {asked} left the attribute at {value!r}"
-                raise VecEnvError(found, wanted=f"{expected!r}: set where `indices` says, nowhere else", env=index)
-        for index in everywhere:
-            _ask("set_attr", env.set_attr, _ATTRIBUTE, index, indices=index)
-        values = _ask("get_attr", env.get_attr, _ATTRIBUTE, indices=indices)
-        check_list(values, f"`get_attr` with {asked}", len(meant))
-        if list(values) != meant:
-            found = f"`get_attr` with {asked} gave the attributes of the environments {list(values)}"
-            raise VecEnvError(found, wanted=f"those of {meant}, in this order")
-        _ask("set_attr", env.set_attr, _METHOD, _method)
-        answers = _ask("env_method", cast(Any, env).env_method, _METHOD, 1, indices=indices, keyword=2)
-        check_list(answers, f"`env_method` with {asked}", len(meant))
-        if any(answer != (1, 2) for answer in answers):
-            raise VecEnvError(f"`env_method` with {asked} gave {answers!r}", wanted="what the method returned: (1, 2)")
-        wrapped = _ask("env_is_wrapped", env.env_is_wrapped, gymnasium.Wrapper, indices=indices)
-        check_list(wrapped, f"`env_is_wrapped` with {asked}", len(meant))
-        if any(not isinstance(one, bool | np.bool_) for one in wrapped):
-            raise VecEnvError(f"`env_is_wrapped` with {asked} gave {wrapped!r}", wanted="a bool for each environment")
+    asked: list[tuple[int | list[int] | None, list[int]]] = [
+        (None, everywhere),
+        (last, [last]),
+        (everywhere[::-1], everywhere[::-1]),
+    ]
+    for indices, meant in asked:
+        _check_set_attr(env, indices, meant)
+    for indices, meant in asked:
+        _check_answers(env, indices, meant)
+
+
+def _check_set_attr(env: "VecEnv", indices: int | list[int] | None, meant: list[int]) -> None:
+    _ask("set_attr", env.set_attr, _ATTRIBUTE, "before")
+    _ask("set_attr", env.set_attr, _ATTRIBUTE, "after", indices=indices)
+    values = _ask("get_attr", env.get_attr, _ATTRIBUTE)
+    check_list(values, "`get_attr`", env.num_envs)
+    for index, value in enumerate(values):
+        expected = "after" if index in meant else "before"
+        if value != expected:
+            found = f"`set_attr` with indices={indices} left the attribute at {value!r}"
+            raise VecEnvError(found, wanted=f"{expected!r}: set where `indices` says, nowhere else", env=index)
+
+
+def _check_answers(env: "VecEnv", indices: int | list[int] | None, meant: list[int]) -> None:
+    asked = f"with indices={indices}"
+    for index in range(env.num_envs):
+        _ask("set_attr", env.set_attr, _ATTRIBUTE, index, indices=index)
+    values = _ask("get_attr", env.get_attr, _ATTRIBUTE, indices=indices)
+    check_list(values, f"`get_attr` {asked}", len(meant))
+    if list(values) != meant:
+        found = f"`get_attr` {asked} gave the attributes of the environments {list(values)}"
+        raise VecEnvError(found, wanted=f"those of {meant}, in this order")
+    _ask("set_attr", env.set_attr, _METHOD, _method)
+    answers = _ask("env_method", cast(Any, env).env_method, _METHOD, 1, indices=indices, keyword=2)
+    check_list(answers, f"`env_method` {asked}", len(meant))
+    if any(answer != (1, 2) for answer in answers):
+        raise VecEnvError(f"`env_method` {asked} gave {answers!r}", wanted="what the method returned: (1, 2)")
+    wrapped = _ask("env_is_wrapped", env.env_is_wrapped, gymnasium.Wrapper, indices=indices)
+    check_list(wrapped, f"`env_is_wrapped` {asked}", len(meant))
+    if any(not isinstance(one, bool | np.bool_) for one in wrapped):
+        raise VecEnvError(f"`env_is_wrapped` {asked} gave {wrapped!r}", wanted="a bool for each environment")
 
 
 def _method(positional: int, *, keyword: int) -> tuple[int, int]:
