@@ -69,7 +69,9 @@ def check_step(env: "VecEnv", returned: object) -> list[Result]:
         raise VecEnvError(f"`step_wait` gave {_shown(returned)}", wanted="a tuple of 4: obs, reward, done, infos")
     obs, reward, done, infos = cast(tuple[Any, ...], returned)
     results = _check_obs(env, obs)
-    reward = _check_array(reward, "reward", (env.num_envs,), "float32")
+    # DummyVecEnv gives float32, SubprocVecEnv float64.
+    wide = isinstance(reward, np.ndarray) and cast(Array, reward).dtype == np.float64
+    reward = _check_array(reward, "reward", (env.num_envs,), "float64" if wide else "float32")
     done = _check_array(done, "done", (env.num_envs,), "bool")
     for index in np.flatnonzero(~np.isfinite(reward)):
         raise VecEnvError(f"reward is {reward[index]}", wanted="a finite number", env=int(index))
