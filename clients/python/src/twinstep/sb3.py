@@ -150,7 +150,7 @@ class Go2VecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of :class:`Row` on each of the environments ``indices``."""
+        """Call a method of :class:`Row`, or ``render``, on each of the environments ``indices``."""
         if method_name == "render":
             # All are drawn at once: row by row, n robots would be drawn n times.
             images = self.get_images()
