@@ -36,12 +36,11 @@ def main() -> None:
     config.insert_json5("connect/endpoints", f'["{parser.parse_args().endpoint}"]')
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config) as session:
-        found = {str(reply.ok.key_expr) for reply in session.liveliness().get("twinstep/live/server/*/*") if reply.ok}
-        (sid,) = {key.split("/")[3] for key in found}
+        servers = session.liveliness().get("twinstep/live/server/*/*")
+        (sid,) = {str(reply.ok.key_expr).split("/")[3] for reply in servers if reply.ok}
         low, high = ask(session, f"twinstep/{sid}/hello", client="minimal_client.py")["protocols"]
         assert low <= 1 <= high, f"the server speaks protocol {low} to {high}, this client 1"
         client = uuid.uuid4().hex
-        # Before the lease: it keeps what is leased.
         token = session.liveliness().declare_token(f"twinstep/live/client/{sid}/{client}")
         lease = ask(session, f"twinstep/{sid}/lease", client=client, num_envs=ENVS, autoreset="NextStep")
         env, epoch, seq = f"twinstep/{sid}/env/{lease['lease']}", lease["epoch"], lease["last_seq"] + 1
