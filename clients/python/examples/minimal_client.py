@@ -1,0 +1,60 @@
+"""Step robots with nothing but Zenoh and MessagePack, as ``protocol/SPEC.md`` says: a start for other languages."""
+
+import argparse
+import struct
+import time
+import uuid
+from typing import Any, cast
+
+import msgpack as untyped_msgpack
+import zenoh
+
+msgpack: Any = untyped_msgpack
+ENVS, STEPS, PATIENCE_S = 2, 10, 20.0
+
+
+def ask(session: zenoh.Session, key: str, **request: object) -> dict[str, Any]:
+    """Repeat a request until it is answered; its number makes the repeats harmless."""
+    payload, deadline = msgpack.packb({"protocol": 1, **request}), time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        for reply in session.get(key, payload=payload, consolidation=zenoh.ConsolidationMode.NONE, timeout=2.0):
+            if reply.ok:
+                return msgpack.unpackb(reply.ok.payload.to_bytes())
+            error = cast(zenoh.ReplyError, reply.err).payload.to_bytes()
+            # Zenoh's own error is a text, "Timeout"; Twinstep's is a map.
+            if error[0] >= 0x80 and not (told := msgpack.unpackb(error))["retry"]:
+                raise RuntimeError(f"{told['code']}: {told['message']}\n  {told['hint']}")
+        time.sleep(0.05)
+    raise TimeoutError(f"no answer at {key}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("endpoint", help="such as tcp/127.0.0.1:7447")
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", f'["{parser.parse_args().endpoint}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as session:
+        servers = session.liveliness().get("twinstep/live/server/*/*")
+        (sid,) = {str(reply.ok.key_expr).split("/")[3] for reply in servers if reply.ok}
+        low, high = ask(session, f"twinstep/{sid}/hello", client="minimal_client.py")["protocols"]
+        assert low <= 1 <= high, f"the server speaks protocol {low} to {high}, this client 1"
+        client = uuid.uuid4().hex
+        token = session.liveliness().declare_token(f"twinstep/live/client/{sid}/{client}")
+        lease = ask(session, f"twinstep/{sid}/lease", client=client, num_envs=ENVS, autoreset="NextStep")
+        env, epoch, seq = f"twinstep/{sid}/env/{lease['lease']}", lease["epoch"], lease["last_seq"] + 1
+        ask(session, f"{env}/reset", epoch=epoch, seq=seq, seeds=struct.pack(f"<{ENVS}Q", *range(ENVS)))
+        entries = ENVS * sum(part["size"] for part in lease["spec"]["action"])
+        for _ in range(STEPS):
+            seq += 1
+            step = ask(
+                session, f"{env}/step", epoch=epoch, seq=seq, actions=struct.pack(f"<{entries}f", *[0] * entries)
+            )
+            print(*struct.unpack(f"<{ENVS}f", step["reward"]))
+        ask(session, f"{env}/close", epoch=epoch, seq=seq + 1)
+        token.undeclare()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,190 @@
+"""The checker for ``VecEnv`` that Stable-Baselines3 does not have: its own checks single environments."""
+
+import copy
+import warnings
+from collections.abc import Callable
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, cast
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from .checker_results import Array, Result, VecEnvError, check_list, check_reset, check_step
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+__all__ = ["VecEnvError", "check_vec_env"]
+
+_SEED, _OTHER_SEED = 1234, 987654
+_ATTRIBUTE, _METHOD = "twinstep_check_attribute", "twinstep_check_method"
+
+
+def check_vec_env(env: "VecEnv", *, steps: int = 200) -> None:
+    """Check anybody's ``VecEnv`` of Stable-Baselines3, and close it.
+
+    It is stepped with random actions, three times from the same seed. Check it without ``VecNormalize``, whose
+    statistics go on from rollout to rollout.
+
+    Parameters
+    ----------
+    env
+        What is checked.
+    steps
+        Steps of a rollout. Warns if no episode ends within them: then what is due at an end was not checked.
+
+    Raises
+    ------
+    VecEnvError
+        Something is wrong: the message says what, in which environment, and what is wanted.
+    """
+    _check_itself(env)
+    _check_attributes(env)
+    first = _rollout(env, steps, _step_at_once)
+    _check_equal(first, _rollout(env, steps, _step_at_once), "two rollouts from the same seed with the same actions")
+    _check_equal(first, _rollout(env, steps, _step_in_two), "`step`, and `step_async` followed by `step_wait`,")
+    _check_seed_is_used_once(env)
+    for _ in range(2):
+        _ask("close", env.close)
+    if not any(result.name.startswith("terminal_observation") for results in first for result in results):
+        warnings.warn(f"no episode ended within {steps} steps, so no end was checked; raise `steps`", stacklevel=2)
+
+
+def _check_itself(env: object) -> None:
+    from stable_baselines3.common.vec_env import VecEnv
+
+    if not isinstance(env, VecEnv):
+        kind = f"{type(env).__module__}.{type(env).__qualname__}"
+        raise VecEnvError(f"{kind} is no `VecEnv`", wanted="a subclass of `stable_baselines3.common.vec_env.VecEnv`")
+    num_envs = cast(object, env.num_envs)
+    if not isinstance(num_envs, int) or num_envs < 1:
+        raise VecEnvError(f"`num_envs` = {num_envs!r}", wanted="an int, at least 1")
+    for name in ("observation_space", "action_space"):
+        space: object = getattr(env, name, None)
+        if not isinstance(space, spaces.Space):
+            found = f"`{name}` is {type(space).__name__}"
+            raise VecEnvError(found, wanted="a `gymnasium.Space`: that of one environment, not of all")
+
+
+def _check_attributes(env: "VecEnv") -> None:
+    everywhere, last = list(range(env.num_envs)), env.num_envs - 1
+    # As callers ask: for all, for one, for several out of order.
+    asked: list[tuple[int | list[int] | None, list[int]]] = [
+        (None, everywhere),
+        (last, [last]),
+        (everywhere[::-1], everywhere[::-1]),
+    ]
+    for indices, meant in asked:
+        _check_set_attr(env, indices, meant)
+    for indices, meant in asked:
+        _check_answers(env, indices, meant)
+
+
+def _check_set_attr(env: "VecEnv", indices: int | list[int] | None, meant: list[int]) -> None:
+    _ask("set_attr", env.set_attr, _ATTRIBUTE, "before")
+    _ask("set_attr", env.set_attr, _ATTRIBUTE, "after", indices=indices)
+    values = _ask("get_attr", env.get_attr, _ATTRIBUTE)
+    check_list(values, "`get_attr`", env.num_envs)
+    for index, value in enumerate(values):
+        expected = "after" if index in meant else "before"
+        if value != expected:
+            found = f"`set_attr` with indices={indices} left the attribute at {value!r}"
+            raise VecEnvError(found, wanted=f"{expected!r}: set where `indices` says, nowhere else", env=index)
+
+
+def _check_answers(env: "VecEnv", indices: int | list[int] | None, meant: list[int]) -> None:
+    asked = f"with indices={indices}"
+    for index in range(env.num_envs):
+        _ask("set_attr", env.set_attr, _ATTRIBUTE, index, indices=index)
+    values = _ask("get_attr", env.get_attr, _ATTRIBUTE, indices=indices)
+    check_list(values, f"`get_attr` {asked}", len(meant))
+    if list(values) != meant:
+        found = f"`get_attr` {asked} gave the attributes of the environments {list(values)}"
+        raise VecEnvError(found, wanted=f"those of {meant}, in this order")
+    _ask("set_attr", env.set_attr, _METHOD, _method)
+    answers = _ask("env_method", cast(Any, env).env_method, _METHOD, 1, indices=indices, keyword=2)
+    check_list(answers, f"`env_method` {asked}", len(meant))
+    if any(answer != (1, 2) for answer in answers):
+        raise VecEnvError(f"`env_method` {asked} gave {answers!r}", wanted="what the method returned: (1, 2)")
+    wrapped = _ask("env_is_wrapped", env.env_is_wrapped, gymnasium.Wrapper, indices=indices)
+    check_list(wrapped, f"`env_is_wrapped` {asked}", len(meant))
+    if any(not isinstance(one, bool | np.bool_) for one in wrapped):
+        raise VecEnvError(f"`env_is_wrapped` {asked} gave {wrapped!r}", wanted="a bool for each environment")
+
+
+def _method(positional: int, *, keyword: int) -> tuple[int, int]:
+    """What ``env_method`` is made to call; at the top of the module, so that ``SubprocVecEnv`` can pickle it."""
+    return positional, keyword
+
+
+def _ask(name: str, method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """Call a method of the ``VecEnv`` that must not raise."""
+    try:
+        return method(*args, **kwargs)
+    except Exception as error:
+        given = ", ".join([*map(repr, args), *(f"{key}={value!r}" for key, value in kwargs.items())])
+        found = f"`{name}({given})` raised {type(error).__name__}: {error}"
+        raise VecEnvError(found, wanted="it works: algorithms, wrappers and callbacks call it") from error
+
+
+def _step_at_once(env: "VecEnv", actions: Array) -> object:
+    return cast(object, env.step(actions))
+
+
+def _step_in_two(env: "VecEnv", actions: Array) -> object:
+    env.step_async(actions)
+    return cast(object, env.step_wait())
+
+
+def _rollout(env: "VecEnv", steps: int, step: Callable[["VecEnv", Array], object]) -> list[list[Result]]:
+    """Reset from the seed and step, checking all that comes back; the first entry is the reset's."""
+    space: spaces.Space[Any] = copy.deepcopy(cast(Any, env.action_space))
+    space.seed(_SEED)
+    check_list(_ask("seed", env.seed, _SEED), "`seed`", env.num_envs)
+    rollout = [check_reset(env, env.reset())]
+    for _ in range(steps):
+        actions: Array = np.array([space.sample() for _ in range(env.num_envs)])
+        given = actions.copy()
+        rollout.append(check_step(env, step(env, given)))
+        if not np.array_equal(given, actions):
+            raise VecEnvError("a step wrote into the actions that it was given", wanted="they are left as they are")
+    _check_fresh(rollout)
+    return rollout
+
+
+def _check_fresh(rollout: list[list[Result]]) -> None:
+    wanted = "fresh arrays from each step: agents keep them until they learn"
+    for number, (results, after) in enumerate(pairwise(rollout)):
+        for old in results:
+            if not np.array_equal(old.array, old.then):
+                raise VecEnvError(f"a later step overwrote {old.name} of step {number}", wanted=wanted, env=old.env)
+            if any(np.shares_memory(old.array, new.array) for new in after):
+                found = f"{old.name} of step {number} shares memory with what the next step gave"
+                raise VecEnvError(found, wanted=wanted, env=old.env)
+
+
+def _check_equal(one: list[list[Result]], other: list[list[Result]], which: str) -> None:
+    for number, (results, others) in enumerate(zip(one, other, strict=True)):
+        # Their numbers differ only where `done` does, which comes before the ends.
+        for a, b in zip(results, others, strict=False):
+            if np.array_equal(a.then, b.then):
+                continue
+            env = a.env if a.env is not None else int(np.argwhere(a.then != b.then)[0, 0])
+            found = f"{which} differ in {a.name} of step {number}"
+            raise VecEnvError(found, wanted="equal seeds and actions give equal results", env=env)
+
+
+def _check_seed_is_used_once(env: "VecEnv") -> None:
+    env.seed(_SEED)
+    seeded, next_one = check_reset(env, env.reset()), check_reset(env, env.reset())
+    env.seed(_OTHER_SEED)
+    other = check_reset(env, env.reset())
+    # Where every seed gives the same start, nothing can be told.
+    if _same(seeded, next_one) and not _same(seeded, other):
+        found = "the second `reset` after `seed` gave the same observations again"
+        raise VecEnvError(found, wanted="a seed is used by one reset (`_reset_seeds`); then the random streams go on")
+
+
+def _same(one: list[Result], other: list[Result]) -> bool:
+    return all(np.array_equal(a.then, b.then) for a, b in zip(one, other, strict=True))

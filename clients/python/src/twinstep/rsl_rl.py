@@ -1,0 +1,139 @@
+"""Many robots as an ``rsl_rl`` 5 ``VecEnv``. Needs the extra ``[rsl-rl]``."""
+
+from dataclasses import asdict
+from typing import Any, Unpack, cast
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from .env import OptionArguments
+from .errors import InvalidOptionError
+from .vector_env import Go2VectorEnv
+
+try:
+    import torch
+    from rsl_rl.env import VecEnv
+    from tensordict import TensorDict
+except ImportError as error:
+    raise ImportError('rsl_rl is not installed here\n  pip install "twinstep[rsl-rl]"') from error
+
+
+def make_vec_env(
+    env_id: str = "twinstep/Go2-Walk-v0",
+    num_envs: int = 1,
+    *,
+    seed: int | None = None,
+    max_episode_steps: int | None = None,
+    device: str = "cpu",
+    **options: Unpack[OptionArguments],
+) -> "Go2VecEnv":
+    """Make robots for an ``OnPolicyRunner``.
+
+    Parameters
+    ----------
+    env_id
+        Registered id of the task.
+    num_envs
+        Number of robots.
+    seed
+        Environment i starts with ``seed + i``.
+    max_episode_steps
+        Policy steps after which an episode is truncated; the task's own number if ``None``.
+    device
+        Where the tensors are that the agent gets.
+    **options
+        See :class:`twinstep.Options`.
+    """
+    arguments: dict[str, Any] = dict(options)
+    if max_episode_steps is not None:
+        arguments["max_episode_steps"] = max_episode_steps
+    envs = gymnasium.make_vec(env_id, num_envs=num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **arguments)
+    return Go2VecEnv(cast(Go2VectorEnv, envs), seed=seed, device=device)
+
+
+class Go2VecEnv(VecEnv):
+    """Robots on one server as a ``VecEnv``; their observation group is ``"policy"``.
+
+    Parameters
+    ----------
+    envs
+        Robots with ``autoreset_mode="SameStep"``, as rsl_rl wants it.
+    seed
+        Environment i starts with ``seed + i``.
+    device
+        Where the tensors are that the agent gets.
+
+    Attributes
+    ----------
+    episode_length_buf : (num_envs,) int64
+        Policy steps since each episode began. The runner writes here so that episodes end at different times.
+    """
+
+    def __init__(self, envs: Go2VectorEnv, *, seed: int | None = None, device: str = "cpu") -> None:
+        mode = envs.metadata["autoreset_mode"]
+        if mode is not AutoresetMode.SAME_STEP:
+            raise InvalidOptionError(f"`autoreset_mode` = {mode.value!r}; rsl_rl needs 'SameStep'")
+        self.envs = envs
+        self.twinstep_spec = envs.twinstep_spec
+        self.num_envs = envs.num_envs
+        self.num_actions = envs.twinstep_spec.action_len
+        self.max_episode_length = envs.twinstep_spec.max_episode_steps
+        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=device)
+        self.device = device
+        self.cfg = asdict(envs.twinstep_spec)
+        self._obs, _ = envs.reset(seed=seed)
+
+    def get_observations(self) -> TensorDict:
+        """The last observations: ``policy``, (num_envs, 45) float32."""
+        return TensorDict({"policy": self._tensor(self._obs)}, batch_size=[self.num_envs])
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advance every environment by one policy period (20 ms).
+
+        Parameters
+        ----------
+        actions : (num_envs, 12) float32
+            Offsets from the default pose in units of ``action_scale``; the server clips them to [-1, 1].
+
+        Returns
+        -------
+        obs : TensorDict
+            ``policy``, (num_envs, 45) float32; where an episode ended, the first of the next.
+        reward : (num_envs,) float32
+        done : (num_envs,) bool
+        extras : dict
+            ``time_outs``, (num_envs,) float32, 1 where the time limit ended the episode; in a step that ended episodes
+            also ``log`` with the mean of each of their weighted reward terms.
+        """
+        self._obs, reward, terminated, truncated, vector_info = self.envs.step(actions.detach().cpu().numpy())
+        self.episode_length_buf += 1
+        # Only after the runner wrote into the buffer does it run ahead of the server's own count.
+        used_up = self.episode_length_buf.cpu().numpy() >= self.max_episode_length
+        early = used_up & ~terminated & ~truncated
+        if early.any():
+            self._obs, _ = self.envs.reset(options={"reset_mask": early})
+            truncated = truncated | early
+        done = self._tensor(terminated | truncated)
+        self.episode_length_buf[done] = 0
+        extras: dict[str, Any] = {"time_outs": self._tensor((truncated & ~terminated).astype(np.float32))}
+        if "final_info" in vector_info:
+            extras["log"] = _mean_terms(vector_info["final_info"]["reward_terms"])
+        return self.get_observations(), self._tensor(reward.astype(np.float32)), done, extras
+
+    def close(self) -> None:
+        """Give the robots back; does nothing the second time."""
+        self.envs.close()
+
+    def _tensor(self, array: NDArray[Any]) -> torch.Tensor:
+        return torch.from_numpy(array).to(self.device)
+
+
+def _mean_terms(terms: dict[str, NDArray[Any]]) -> dict[str, float]:
+    """Mean of each reward term over the environments whose episode ended: those in the mask ``_<term>``."""
+    return {
+        f"/reward/{name}": float(values[terms[f"_{name}"]].mean())
+        for name, values in terms.items()
+        if not name.startswith("_")
+    }

@@ -1,0 +1,226 @@
+"""Many robots as a Stable-Baselines3 ``VecEnv``. Needs the extra ``[sb3]``."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Unpack, cast
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from .env import OptionArguments, RenderMode
+from .errors import InvalidOptionError
+from .vector_env import Go2VectorEnv
+
+try:
+    from stable_baselines3.common.vec_env import VecEnv
+except ImportError as error:
+    raise ImportError('Stable-Baselines3 is not installed here\n  pip install "twinstep[sb3]"') from error
+
+Indices = int | Iterable[int] | None
+"""Which environments are meant; ``None`` means all."""
+
+
+def make_vec_env(
+    env_id: str = "twinstep/Go2-Walk-v0",
+    n_envs: int = 1,
+    *,
+    seed: int | None = None,
+    max_episode_steps: int | None = None,
+    render_mode: RenderMode | None = None,
+    **options: Unpack[OptionArguments],
+) -> "Go2VecEnv":
+    """Make robots for an agent of Stable-Baselines3, as its own ``make_vec_env`` does.
+
+    Parameters
+    ----------
+    env_id
+        Registered id of the task.
+    n_envs
+        Number of robots.
+    seed
+        Environment i starts with ``seed + i``. ``None`` draws a seed from NumPy's global generator.
+    max_episode_steps
+        Policy steps after which an episode is truncated; the task's own number if ``None``.
+    render_mode
+        ``"rgb_array"``, ``"human"`` (shows the first robot), or ``None``.
+    **options
+        See :class:`twinstep.Options`.
+
+    Notes
+    -----
+    Episodes' rewards and lengths come from ``VecMonitor(make_vec_env(...))``.
+    """
+    arguments: dict[str, Any] = {**options, "render_mode": render_mode}
+    if max_episode_steps is not None:
+        arguments["max_episode_steps"] = max_episode_steps
+    envs = gymnasium.make_vec(env_id, num_envs=n_envs, autoreset_mode=AutoresetMode.SAME_STEP, **arguments)
+    vec_env = Go2VecEnv(cast(Go2VectorEnv, envs))
+    vec_env.seed(seed)
+    return vec_env
+
+
+class Go2VecEnv(VecEnv):
+    """Robots on one server as a ``VecEnv``.
+
+    Parameters
+    ----------
+    envs
+        Robots with ``autoreset_mode="SameStep"``, as Stable-Baselines3 wants it.
+    """
+
+    def __init__(self, envs: Go2VectorEnv) -> None:
+        mode = envs.metadata["autoreset_mode"]
+        if mode is not AutoresetMode.SAME_STEP:
+            raise InvalidOptionError(f"`autoreset_mode` = {mode.value!r}; Stable-Baselines3 needs 'SameStep'")
+        self.envs = envs
+        self.twinstep_spec = envs.twinstep_spec
+        # Before the base class, which asks each row for its `render_mode`.
+        self._rows = [Row(envs, index) for index in range(envs.num_envs)]
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+        # VecVideoRecorder reads the frame rate here.
+        self.metadata = {**envs.metadata, **self.metadata}
+
+    def reset(self) -> NDArray[np.float32]:
+        """Start all episodes, with the seeds that :meth:`seed` left, once; then each random stream goes on.
+
+        Returns
+        -------
+        obs : (n_envs, 45) float32
+        """
+        seeds = [seed for seed in self._seeds if seed is not None]
+        obs, _ = self.envs.reset(seed=seeds or None)
+        self._reset_seeds()
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        return obs
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        """Send actions, (n_envs, 12) float32, without waiting: the server steps while the caller goes on."""
+        self.envs.send(actions)
+
+    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Wait for what the sent actions gave.
+
+        Returns
+        -------
+        obs : (n_envs, 45) float32
+            Where an episode ended, the first of the next.
+        reward : (n_envs,) float32
+        done : (n_envs,) bool
+        infos : list of dict
+            ``TimeLimit.truncated``; where an episode ended also ``terminal_observation`` and ``reward_terms``, the
+            episode's sum of each weighted reward term.
+        """
+        obs, reward, terminated, truncated, vector_info = self.envs.recv()
+        done = terminated | truncated
+        infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
+        for env in np.flatnonzero(done):
+            infos[env] = {
+                "TimeLimit.truncated": bool(truncated[env] and not terminated[env]),
+                "terminal_observation": vector_info["final_obs"][env],
+                **_info_of(vector_info["final_info"], int(env)),
+            }
+            self.reset_infos[env] = {}
+        return obs, reward.astype(np.float32), done, infos
+
+    def close(self) -> None:
+        """Give the robots back; does nothing the second time."""
+        self.envs.close()
+
+    def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
+        """Refuse options: a robot's reset knows none."""
+        given = options if isinstance(options, list) else [options or {}]
+        names = sorted({name for of_env in given for name in of_env})
+        if names:
+            raise InvalidOptionError(f"`options` has {names}; a robot's reset knows none")
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """Draw every robot, (480, 640, 3) uint8 each; ``None`` each unless ``render_mode="rgb_array"``."""
+        return self.envs.render() or [None] * self.num_envs
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """Read an attribute of :class:`Row` from each of the environments ``indices``."""
+        return [getattr(row, attr_name) for row in self._rows_at(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Keep an attribute of your own with each of the environments ``indices``; it does not reach the server."""
+        for row in self._rows_at(indices):
+            setattr(row, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of :class:`Row`, or ``render``, on each of the environments ``indices``."""
+        if method_name == "render":
+            # All are drawn at once: row by row, n robots would be drawn n times.
+            images = self.get_images()
+            return [images[row.index] for row in self._rows_at(indices)]
+        return [getattr(row, method_name)(*method_args, **method_kwargs) for row in self._rows_at(indices)]
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Indices = None
+    ) -> list[bool]:
+        """Say for each of the environments ``indices`` that it has no such wrapper."""
+        return [False for _ in self._rows_at(indices)]
+
+    def _rows_at(self, indices: Indices) -> "list[Row]":
+        return [self._rows[index] for index in self._get_indices(indices)]
+
+
+class Row:
+    """One robot of many, as ``get_attr``, ``set_attr`` and ``env_method`` see it.
+
+    Attributes
+    ----------
+    index
+        Its row in every array.
+    spec, twinstep_spec, render_mode, metadata, observation_space, action_space
+        As of a single environment.
+    """
+
+    def __init__(self, envs: Go2VectorEnv, index: int) -> None:
+        shared: dict[str, object] = {
+            "spec": envs.spec,
+            "twinstep_spec": envs.twinstep_spec,
+            "render_mode": envs.render_mode,
+            "metadata": envs.metadata,
+            "observation_space": envs.single_observation_space,
+            "action_space": envs.single_action_space,
+        }
+        self.index = index
+        self._envs = envs
+        self.__dict__.update(shared)
+        self._fixed = frozenset(shared)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in self.__dict__.get("_fixed", ()):
+            raise AttributeError(
+                f"`{name}` is the same for all robots and cannot be set: make new environments with it"
+            )
+        super().__setattr__(name, value)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode of this robot alone; the others go on.
+
+        Returns
+        -------
+        obs : (45,) float32
+        info : dict
+            Empty.
+        """
+        mask = np.arange(self._envs.num_envs) == self.index
+        seeds = None if seed is None else np.where(mask, seed, 0).tolist()
+        obs, info = self._envs.reset(seed=seeds, options={**(options or {}), "reset_mask": mask})
+        return obs[self.index], info
+
+
+def _info_of(vector_info: dict[str, Any], env: int) -> dict[str, Any]:
+    """The info of one environment, taken from those of all: each ``key`` has a mask ``_key``."""
+    info: dict[str, Any] = {}
+    for key, values in vector_info.items():
+        if not key.startswith("_") and vector_info[f"_{key}"][env]:
+            nested = isinstance(values, dict)
+            info[key] = _info_of(cast(dict[str, Any], values), env) if nested else values[env].item()
+    return info

@@ -1,0 +1,42 @@
+"""Every example runs."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import twinstep
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def run(name: str, *arguments: str) -> str:
+    """Run an example and return what it printed."""
+    command = [sys.executable, "-W", "error", str(EXAMPLES / name), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_random_agent() -> None:
+    assert "mean reward of a step" in run("random_agent.py", "--envs", "2", "--steps", "10")
+
+
+def test_overlap() -> None:
+    assert "overlap " in run("overlap.py", "--envs", "2", "--steps", "10")
+
+
+def test_minimal_client() -> None:
+    server = twinstep.EmbeddedServer(("--task", "walk", "--envs", "64"))
+    assert len(run("minimal_client.py", server.endpoint).splitlines()) == 10
+    server.release()
+
+
+def test_an_agent_is_trained_and_runs_on_another_server(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    run("ppo.py", "--envs", "4", "--steps", "256", "--out", str(tmp_path))
+    server = twinstep.EmbeddedServer(("--task", "walk", "--envs", "64"))
+    printed = run("remote.py", "--endpoint", server.endpoint, "--policy", str(tmp_path), "--steps", "10")
+    server.release()
+    assert printed.startswith("mean reward of a step")
