@@ -65,7 +65,9 @@ fn prepare(target: &Path) -> Result<PathBuf, String> {
 fn requirements(pyproject: &str) -> Result<Vec<String>, String> {
     let project: toml::Table = pyproject.parse().map_err(|error| format!("pyproject.toml: {error}"))?;
     let project = &project["project"];
-    let extras = project["optional-dependencies"].as_table().into_iter().flatten().map(|(_, list)| list);
+    let extras = project["optional-dependencies"].as_table().into_iter().flatten();
+    // The peers of the bench are large, and no test needs them.
+    let extras = extras.filter(|(name, _)| *name != "bench").map(|(_, list)| list);
     let lists = std::iter::once(&project["dependencies"]).chain(extras);
     let words = lists.filter_map(toml::Value::as_array).flatten().filter_map(toml::Value::as_str);
     Ok(words.map(str::to_owned).collect())

@@ -10,6 +10,7 @@ process.
 
 import gymnasium
 
+from .checker import VecEnvError, check_vec_env
 from .codec import MalformedError, Part, Spec
 from .env import Go2Env
 from .errors import (
@@ -51,7 +52,9 @@ __all__ = [
     "ServerStartError",
     "Spec",
     "SpecMismatchError",
+    "VecEnvError",
     "VersionError",
+    "check_vec_env",
 ]
 
 gymnasium.register(

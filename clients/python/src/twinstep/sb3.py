@@ -152,9 +152,8 @@ class Go2VecEnv(VecEnv):
     ) -> list[Any]:
         """Call a method of :class:`Row`, or ``render``, on each of the environments ``indices``."""
         if method_name == "render":
-            # All are drawn at once: row by row, n robots would be drawn n times.
-            images = self.get_images()
-            return [images[row.index] for row in self._rows_at(indices)]
+            drawn = self.envs.render_mode == "rgb_array"
+            return [self.envs.draw(row.index) if drawn else None for row in self._rows_at(indices)]
         return [getattr(row, method_name)(*method_args, **method_kwargs) for row in self._rows_at(indices)]
 
     def env_is_wrapped(

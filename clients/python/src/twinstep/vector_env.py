@@ -135,7 +135,7 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         if self.render_mode == "human":
             self._show()
             return None
-        return tuple(self._draw(env) for env in range(self.num_envs))
+        return tuple(self.draw(env) for env in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Give the environments back and close the window."""
@@ -152,6 +152,8 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
             return (np.arange(self.num_envs, dtype=np.uint64) + np.uint64(seed)).astype(np.uint64)
         if len(seed) != self.num_envs:
             raise InvalidOptionError(f"`seed` has {len(seed)} entries; {self.num_envs} are wanted")
+        if any(one < 0 for one in seed):
+            raise InvalidOptionError(f"`seed` has {min(seed)}; 0 or more is wanted")
         return np.array(seed, dtype=np.uint64)
 
     def _mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_] | None:
@@ -185,9 +187,10 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
 
     def _show(self) -> None:
         if self.render_mode == "human":
-            self._draw(0)
+            self.draw(0)
 
-    def _draw(self, env: int) -> NDArray[np.uint8]:
+    def draw(self, env: int) -> NDArray[np.uint8]:
+        """Draw one robot: (480, 640, 3) uint8; needs a ``render_mode``."""
         assert self._viewer is not None
         return self._viewer.draw(self._remote.scene(env))
 
