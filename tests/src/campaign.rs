@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::channel;
+use std::time::Duration;
 
 use twinstep_model::stream;
 
@@ -31,6 +32,8 @@ pub struct Tally {
     pub failures: Vec<(Fault, String)>,
     /// Steps that clients acknowledged, each checked.
     pub steps: u64,
+    /// The longest time from a fault's end to the third step after it.
+    pub slowest: Duration,
 }
 
 impl Tally {
@@ -48,7 +51,12 @@ impl std::fmt::Display for Tally {
             writeln!(table, "{:<42}{count:>9}{failed:>8}", fault.name())?;
         }
         writeln!(table, "{:<42}{:>9}{:>8}", "all", self.total(), self.failures.len())?;
-        write!(table, "{} acknowledged steps, each compared with the client's own counters", self.steps)?;
+        writeln!(table, "{} acknowledged steps, each compared with the client's own counters", self.steps)?;
+        write!(
+            table,
+            "longest time from a fault's end to the third step after it: {:.1} s",
+            self.slowest.as_secs_f64()
+        )?;
         formatter.write_str(&table)
     }
 }
@@ -77,25 +85,28 @@ pub fn run(plan: &Plan, stop: &AtomicBool, progress: impl Fn(Fault)) -> Result<T
             progress(fault);
         }
         for thread in threads {
-            tally.steps += thread.join().map_err(|_| "a lane panicked".to_owned())??;
+            let (steps, slowest) = thread.join().map_err(|_| "a lane panicked".to_owned())??;
+            tally.steps += steps;
+            tally.slowest = tally.slowest.max(slowest);
         }
         Ok(tally)
     })
 }
 
-/// Injects `share` faults; a lane that does not go on is started anew. Returns the acknowledged steps.
+/// Injects `share` faults; a lane that does not go on is started anew. Returns the acknowledged steps, and the
+/// longest time to go on.
 fn run_lane(
     plan: &Plan,
     index: usize,
     share: usize,
     stop: &AtomicBool,
     report: impl Fn(Fault, Option<String>),
-) -> Result<u64, String> {
+) -> Result<(u64, Duration), String> {
     let with_router = index % 2 == 1;
     let mut random = stream(plan.seed, "faults", index as u64);
     let start = || Lane::start(&plan.commands, with_router);
     let mut lane = start()?;
-    let mut steps = 0;
+    let (mut steps, mut slowest) = (0, Duration::ZERO);
     for _ in 0..share {
         if stop.load(Ordering::Acquire) {
             break;
@@ -106,8 +117,9 @@ fn run_lane(
         report(fault, outcome.err());
         if failed {
             steps += lane.steps;
+            slowest = slowest.max(lane.slowest);
             lane = start()?;
         }
     }
-    Ok(steps + lane.steps)
+    Ok((steps + lane.steps, slowest.max(lane.slowest)))
 }

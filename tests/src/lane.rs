@@ -36,6 +36,8 @@ pub struct Lane {
     acknowledged: Vec<String>,
     /// Steps that the client acknowledged.
     pub steps: u64,
+    /// The longest time from a fault's end to the third step after it.
+    pub slowest: Duration,
 }
 
 /// What the processes of a lane run.
@@ -87,8 +89,11 @@ impl Lane {
             lease: Default::default(),
             acknowledged: Vec::new(),
             steps: 0,
+            slowest: Duration::ZERO,
         };
         lane.goes_on(Lease::IsNew)?;
+        // Starting is no fault.
+        lane.slowest = Duration::ZERO;
         Ok(lane)
     }
 
@@ -205,6 +210,7 @@ impl Lane {
         if lease == Lease::GoesOn && self.lease[0] != before {
             return Err("the lease was lost, and its counters with it".to_owned());
         }
+        self.slowest = self.slowest.max(since.elapsed());
         Ok(())
     }
 

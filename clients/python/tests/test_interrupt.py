@@ -1,0 +1,47 @@
+"""Ctrl-C in the middle of training."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import pytest
+from test_env import is_running
+
+pytest.importorskip("stable_baselines3", reason='Stable-Baselines3 is not installed: pip install "twinstep[sb3]"')
+
+PROGRAM = textwrap.dedent("""
+    import torch
+    from stable_baselines3 import PPO
+    from twinstep.sb3 import make_vec_env
+
+    torch.set_num_threads(1)
+    envs = make_vec_env(n_envs=4)
+    print(envs.envs._remote._link._server.pid, flush=True)
+    PPO("MlpPolicy", envs, n_steps=32, batch_size=64).learn(10_000_000)
+""")
+
+
+def test_interrupted_training_leaves_no_process_behind() -> None:
+    agent = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        process_group=0,
+    )
+    assert agent.stdout is not None
+    server = int(agent.stdout.readline())
+    # Into the middle of `learn`.
+    time.sleep(1.0)
+    os.killpg(agent.pid, signal.SIGINT)
+    _, printed = agent.communicate(timeout=10)
+    assert printed.rstrip().endswith("KeyboardInterrupt")
+    for _ in range(100):
+        if not is_running(server):
+            return
+        time.sleep(0.05)
+    os.kill(server, signal.SIGKILL)
+    raise AssertionError("the server outlived the interrupted training by 5 s")
