@@ -7,9 +7,11 @@
 //! A drive period is one sample of the state, one torque for each joint, and `physics_hz / drive_hz` physics steps
 //! under that torque.
 
+mod batch;
 mod config;
 mod rapier;
 mod robot_world;
 
+pub use batch::{BatchBackend, BatchSnapshot};
 pub use config::{Base, Engine, SimConfig, SimConfigError, Terrain};
 pub use rapier::{BuildError, RapierBackend, RobotSnapshot};

@@ -34,6 +34,18 @@ pub enum BuildError {
     },
 }
 
+/// Threads that step robots; 0 takes all cores.
+pub(crate) fn thread_pool(threads: usize) -> Result<rayon::ThreadPool, BuildError> {
+    let threads = match threads {
+        0 => std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
+        threads => threads,
+    };
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()
+        .map_err(|source| BuildError::Threads { threads, source })
+}
+
 /// The state of one robot; restoring it continues bit for bit.
 #[derive(Clone)]
 pub struct RobotSnapshot {
@@ -56,14 +68,7 @@ impl RapierBackend {
         drive: Box<dyn Actuator>,
     ) -> Result<Self, BuildError> {
         config.check(&robot.control)?;
-        let threads = match config.threads {
-            0 => std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
-            threads => threads,
-        };
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(threads)
-            .build()
-            .map_err(|source| BuildError::Threads { threads, source })?;
+        let pool = thread_pool(config.threads)?;
         let placement = Placement::at_rest(0.32, robot.control.default_pose_f32());
         let worlds = (0..num_robots).map(|_| RobotWorld::new(&robot, &config, &placement)).collect();
         let mut this = Self { robot, config, worlds, states: RobotStates::new(num_robots), drive, pool };

@@ -1,0 +1,260 @@
+//! Vectors and inertias of lanes.
+
+use std::ops::{Add, Neg, Sub};
+
+use glam::{DMat3, DVec3};
+use twinstep_model::RigidBody;
+
+use super::lane::Lane;
+
+/// A vector.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Vec3<T>(pub [T; 3]);
+
+impl<T: Lane> Vec3<T> {
+    /// The same for every robot.
+    #[inline(always)]
+    pub fn splat(value: DVec3) -> Self {
+        Self([T::splat(value.x), T::splat(value.y), T::splat(value.z)])
+    }
+
+    /// Zero.
+    #[inline(always)]
+    pub fn zero() -> Self {
+        Self([T::splat(0.0); 3])
+    }
+
+    /// Scalar product.
+    #[inline(always)]
+    pub fn dot(self, other: Self) -> T {
+        self.0[0] * other.0[0] + self.0[1] * other.0[1] + self.0[2] * other.0[2]
+    }
+
+    /// Vector product.
+    #[inline(always)]
+    pub fn cross(self, other: Self) -> Self {
+        let ([a, b, c], [x, y, z]) = (self.0, other.0);
+        Self([b * z - c * y, c * x - a * z, a * y - b * x])
+    }
+
+    /// Times a number.
+    #[inline(always)]
+    pub fn scaled(self, factor: T) -> Self {
+        Self(self.0.map(|value| value * factor))
+    }
+
+    /// Turned about x by the angle with this sine and cosine.
+    #[inline(always)]
+    pub fn turned_x(self, (s, c): (T, T)) -> Self {
+        let [x, y, z] = self.0;
+        Self([x, c * y - s * z, s * y + c * z])
+    }
+
+    /// Turned back about x.
+    #[inline(always)]
+    pub fn turned_back_x(self, (s, c): (T, T)) -> Self {
+        self.turned_x((-s, c))
+    }
+
+    /// Turned about y by the angle with this sine and cosine.
+    #[inline(always)]
+    pub fn turned_y(self, (s, c): (T, T)) -> Self {
+        let [x, y, z] = self.0;
+        Self([c * x + s * z, y, c * z - s * x])
+    }
+}
+
+impl<T: Lane> Add for Vec3<T> {
+    type Output = Self;
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        Self([self.0[0] + other.0[0], self.0[1] + other.0[1], self.0[2] + other.0[2]])
+    }
+}
+
+impl<T: Lane> Sub for Vec3<T> {
+    type Output = Self;
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        Self([self.0[0] - other.0[0], self.0[1] - other.0[1], self.0[2] - other.0[2]])
+    }
+}
+
+impl<T: Lane> Neg for Vec3<T> {
+    type Output = Self;
+    #[inline(always)]
+    fn neg(self) -> Self {
+        Self(self.0.map(|value| -value))
+    }
+}
+
+/// Mass, first moment `m c` and moments of inertia about the frame's origin: linear in what identification seeks.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Inertia<T> {
+    /// Mass [kg].
+    pub mass: T,
+    /// Mass times centre of mass [kg·m].
+    pub moment: Vec3<T>,
+    /// About the origin: xx, yy, zz, xy, xz, yz [kg·m²].
+    pub about_origin: [T; 6],
+}
+
+impl<T: Lane> Inertia<T> {
+    /// Of a body, the same for every robot.
+    pub fn splat(body: &RigidBody) -> Self {
+        let mut inertia = Self { mass: T::splat(0.0), moment: Vec3::zero(), about_origin: [T::splat(0.0); 6] };
+        for lane in 0..T::LANES {
+            inertia.set(lane, body);
+        }
+        inertia
+    }
+
+    /// Sets the body of one robot.
+    pub fn set(&mut self, lane: usize, body: &RigidBody) {
+        let (mass, c) = (body.mass, body.com);
+        let outer = DMat3::from_cols(c * c.x, c * c.y, c * c.z);
+        let about = body.inertia + (DMat3::from_diagonal(DVec3::splat(c.length_squared())) - outer) * mass;
+        self.mass.set(lane, mass);
+        for (component, value) in self.moment.0.iter_mut().zip((c * mass).to_array()) {
+            component.set(lane, value);
+        }
+        let entries = [about.x_axis.x, about.y_axis.y, about.z_axis.z, about.y_axis.x, about.z_axis.x, about.z_axis.y];
+        for (component, value) in self.about_origin.iter_mut().zip(entries) {
+            component.set(lane, value);
+        }
+    }
+
+    /// Times a vector: the moment of inertia's product.
+    #[inline(always)]
+    pub fn times(&self, v: Vec3<T>) -> Vec3<T> {
+        let [xx, yy, zz, xy, xz, yz] = self.about_origin;
+        let [x, y, z] = v.0;
+        Vec3([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])
+    }
+
+    /// Force and moment about the origin that move the body so: Newton and Euler.
+    #[inline(always)]
+    pub fn wrench(&self, omega: Vec3<T>, alpha: Vec3<T>, acceleration: Vec3<T>) -> (Vec3<T>, Vec3<T>) {
+        let h = self.moment;
+        let force = acceleration.scaled(self.mass) + alpha.cross(h) + omega.cross(omega.cross(h));
+        let moment = self.times(alpha) + omega.cross(self.times(omega)) + h.cross(acceleration);
+        (force, moment)
+    }
+
+    /// The same body seen from axes turned about x: `turned_x` of everything in it.
+    #[inline(always)]
+    pub fn turned_x(&self, (s, c): (T, T)) -> Self {
+        let [xx, yy, zz, xy, xz, yz] = self.about_origin;
+        let (cc, ss, cs) = (c * c, s * s, c * s);
+        let two_cross = (yz + yz) * cs;
+        let about_origin = [
+            xx,
+            cc * yy + ss * zz - two_cross,
+            ss * yy + cc * zz + two_cross,
+            c * xy - s * xz,
+            s * xy + c * xz,
+            cs * (yy - zz) + (cc - ss) * yz,
+        ];
+        Self { mass: self.mass, moment: self.moment.turned_x((s, c)), about_origin }
+    }
+
+    /// The same body seen from axes turned about y.
+    #[inline(always)]
+    pub fn turned_y(&self, (s, c): (T, T)) -> Self {
+        let [xx, yy, zz, xy, xz, yz] = self.about_origin;
+        let (cc, ss, cs) = (c * c, s * s, c * s);
+        let two_cross = (xz + xz) * cs;
+        let about_origin = [
+            cc * xx + ss * zz + two_cross,
+            yy,
+            ss * xx + cc * zz - two_cross,
+            c * xy + s * yz,
+            cs * (zz - xx) + (cc - ss) * xz,
+            c * yz - s * xy,
+        ];
+        Self { mass: self.mass, moment: self.moment.turned_y((s, c)), about_origin }
+    }
+
+    /// The same body seen from an origin that lies `offset` back: its own origin is at `offset`.
+    #[inline(always)]
+    pub fn shifted(&self, offset: Vec3<T>) -> Self {
+        let (m, h, r) = (self.mass, self.moment, offset);
+        let two_rh = r.dot(h) + r.dot(h);
+        let rr = r.dot(r) * m;
+        let diagonal =
+            |k: usize| self.about_origin[k] + two_rh - (r.0[k] * h.0[k] + r.0[k] * h.0[k]) + rr - m * r.0[k] * r.0[k];
+        let cross = |entry: usize, i: usize, j: usize| {
+            self.about_origin[entry] - (r.0[i] * h.0[j] + h.0[i] * r.0[j]) - m * r.0[i] * r.0[j]
+        };
+        let about_origin = [diagonal(0), diagonal(1), diagonal(2), cross(3, 0, 1), cross(4, 0, 2), cross(5, 1, 2)];
+        Self { mass: m, moment: h + r.scaled(m), about_origin }
+    }
+
+    /// Two bodies that move as one.
+    #[inline(always)]
+    pub fn joined(&self, other: &Self) -> Self {
+        let mut about_origin = self.about_origin;
+        for (entry, more) in about_origin.iter_mut().zip(other.about_origin) {
+            *entry += more;
+        }
+        Self { mass: self.mass + other.mass, moment: self.moment + other.moment, about_origin }
+    }
+}
+
+/// Lower triangle of a symmetric positive matrix, factored in place: `matrix = factor · factorᵀ`.
+#[derive(Clone, Copy, Debug)]
+pub struct Cholesky<T, const N: usize> {
+    factor: [[T; N]; N],
+    /// One over each diagonal entry.
+    inverse: [T; N],
+}
+
+impl<T: Lane, const N: usize> Cholesky<T, N> {
+    /// Factors `matrix`, of which only the lower triangle is read.
+    #[inline(always)]
+    pub fn new(mut matrix: [[T; N]; N]) -> Self {
+        let mut inverse = [T::splat(0.0); N];
+        for i in 0..N {
+            for j in 0..=i {
+                let mut sum = matrix[i][j];
+                for k in 0..j {
+                    sum -= matrix[i][k] * matrix[j][k];
+                }
+                if i == j {
+                    let root = sum.sqrt();
+                    matrix[i][i] = root;
+                    inverse[i] = T::splat(1.0) / root;
+                } else {
+                    matrix[i][j] = sum * inverse[j];
+                }
+            }
+        }
+        Self { factor: matrix, inverse }
+    }
+
+    /// `factor⁻¹ · vector`.
+    #[inline(always)]
+    pub fn forward(&self, mut vector: [T; N]) -> [T; N] {
+        for i in 0..N {
+            let mut sum = vector[i];
+            for k in 0..i {
+                sum -= self.factor[i][k] * vector[k];
+            }
+            vector[i] = sum * self.inverse[i];
+        }
+        vector
+    }
+
+    /// `factor⁻ᵀ · vector`.
+    #[inline(always)]
+    pub fn backward(&self, mut vector: [T; N]) -> [T; N] {
+        for i in (0..N).rev() {
+            let mut sum = vector[i];
+            for k in i + 1..N {
+                sum -= self.factor[k][i] * vector[k];
+            }
+            vector[i] = sum * self.inverse[i];
+        }
+        vector
+    }
+}

@@ -1,0 +1,162 @@
+//! The batch engine against rapier and against physics.
+
+use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, Variation, go2};
+use twinstep_sim::{Base, BatchBackend, RapierBackend, SimConfig};
+
+/// Drive periods in a second.
+const SECOND: usize = 200;
+
+fn pose() -> PerJoint {
+    go2().control.default_pose_f32()
+}
+
+fn at(physics_hz: u32, solver_iterations: u32, base: Base) -> SimConfig {
+    SimConfig { physics_hz, solver_iterations, base, threads: 1, ..SimConfig::default() }
+}
+
+fn finest_rapier(base: Base) -> RapierBackend {
+    RapierBackend::new(go2(), at(4000, 4, base), 1).unwrap()
+}
+
+fn batch(config: SimConfig, robots: usize) -> BatchBackend {
+    BatchBackend::new(go2(), config, robots).unwrap()
+}
+
+/// Every joint is told to move at once.
+fn step_target(_: usize) -> PerJoint {
+    std::array::from_fn(|j| pose()[j] + if j % 3 == 2 { -0.2 } else { 0.1 })
+}
+
+/// Diagonal legs swing in turn, 2 Hz.
+fn trot_target(period: usize) -> PerJoint {
+    let phase = std::f32::consts::TAU * 2.0 * period as f32 / SECOND as f32;
+    std::array::from_fn(|j| {
+        let leg = j / 3;
+        let swing = phase.sin() * if leg == 0 || leg == 3 { 1.0 } else { -1.0 };
+        pose()[j] + [0.0, 0.1 * phase.cos() * swing.signum(), 0.25 * swing.max(0.0) * -1.0][j % 3]
+    })
+}
+
+/// Joint positions over one second of `target`, after half a second to settle.
+fn motion(backend: &mut impl Backend, height: f32, target: fn(usize) -> PerJoint) -> Vec<PerJoint> {
+    let placement = Placement::at_rest(height, pose());
+    backend.reset(&[(0, placement)]).unwrap();
+    let robots = backend.num_robots();
+    let mut play = |target: PerJoint, periods: usize| {
+        let commands = vec![Command::hold(target, 40.0, 1.0); robots];
+        backend.step(&commands, &vec![true; robots], periods).unwrap();
+        backend.states().q[0]
+    };
+    play(pose(), SECOND / 2);
+    (0..SECOND).map(|period| play(target(period), 1)).collect()
+}
+
+fn rms_difference(one: &[PerJoint], other: &[PerJoint]) -> f32 {
+    let pairs = one.iter().flatten().zip(other.iter().flatten());
+    (pairs.map(|(one, other)| (one - other).powi(2)).sum::<f32>() / (one.len() * NUM_JOINTS) as f32).sqrt()
+}
+
+fn check(base: Base, height: f32, target: fn(usize) -> PerJoint, limit: f32) {
+    let reference = motion(&mut finest_rapier(base), height, target);
+    let ours = motion(&mut batch(at(1000, 4, base), 1), height, target);
+    let difference = rms_difference(&ours, &reference);
+    println!("{difference}");
+    assert!(difference < limit, "{difference} rad from rapier");
+}
+
+#[test]
+fn robot_on_a_stand_moves_as_in_rapier() {
+    check(Base::Fixed, 1.0, step_target, 0.001);
+    check(Base::Fixed, 1.0, trot_target, 0.001);
+}
+
+#[test]
+fn stance_step_is_as_in_rapier() {
+    check(Base::Floating, 0.335, step_target, 0.006);
+}
+
+#[test]
+fn trot_is_as_in_rapier() {
+    check(Base::Floating, 0.335, trot_target, 0.02);
+}
+
+#[test]
+fn feet_carry_the_weight() {
+    let mut backend = batch(at(1000, 4, Base::Floating), 1);
+    backend.step(&[Command::hold(pose(), 40.0, 1.0)], &[true], 10 * SECOND).unwrap();
+    let force: f32 = backend.states().foot_force[0].iter().sum();
+    let weight = go2().total_mass() as f32 * 9.81;
+    assert!((force / weight - 1.0).abs() < 1e-3, "{force} N of {weight} N");
+    assert!(!backend.states().body_contact[0]);
+}
+
+#[test]
+fn robot_gives_the_same_bits_in_any_lane_batch_and_number_of_threads() {
+    let run = |robots: usize, at_index: usize, threads: usize| {
+        let config = SimConfig { threads, ..at(400, 4, Base::Floating) };
+        let mut backend = batch(config, robots);
+        let placement = |robot: usize| {
+            let variation = Variation { mass_scale: 0.8 + 0.05 * robot as f32, ..Variation::default() };
+            Placement { variation, ..Placement::at_rest(0.3 + 0.01 * robot as f32, pose()) }
+        };
+        let chosen = Placement { base_linear_velocity: [0.5, 0.2, 0.0], ..placement(3) };
+        let placements: Vec<_> =
+            (0..robots).map(|robot| (robot, if robot == at_index { chosen } else { placement(robot) })).collect();
+        backend.reset(&placements).unwrap();
+        for period in 0..SECOND {
+            let commands = vec![Command::hold(trot_target(period), 30.0, 0.75); robots];
+            backend.step(&commands, &vec![true; robots], 1).unwrap();
+        }
+        let states = backend.states();
+        (states.q[at_index], states.base_position[at_index], states.base_orientation[at_index])
+    };
+    let alone = run(1, 0, 1);
+    for (robots, index, threads) in [(1, 0, 2), (8, 5, 1), (21, 20, 1), (21, 20, 2), (40, 9, 2)] {
+        assert_eq!(run(robots, index, threads), alone, "robot {index} of {robots} on {threads} threads");
+    }
+}
+
+#[test]
+fn robot_that_diverges_is_named_and_its_neighbours_do_not_notice() {
+    let run = |broken: bool| {
+        let mut backend = batch(at(400, 4, Base::Floating), 8);
+        let mut commands = vec![Command::hold(pose(), 30.0, 0.75); 8];
+        if broken {
+            commands[2].tau_ff[4] = f32::NAN;
+        }
+        let results: Vec<_> = (0..20).map(|_| backend.step(&commands, &[true; 8], 1)).collect();
+        (backend.states().clone(), results.into_iter().find_map(Result::err).map(|error| error.to_string()))
+    };
+    let ((sound, nothing), (states, error)) = (run(false), run(true));
+    assert_eq!(nothing, None);
+    assert!(error.unwrap().starts_with("the simulation of robot 2 diverged"));
+    for robot in (0..8).filter(|robot| *robot != 2) {
+        assert_eq!(states.q[robot], sound.q[robot], "robot {robot}");
+    }
+}
+
+#[test]
+fn snapshot_continues_bit_for_bit_in_the_same_place() {
+    let mut backend = batch(at(400, 4, Base::Floating), 3);
+    let go_on = |backend: &mut BatchBackend| {
+        for period in 0..50 {
+            backend.step(&[Command::hold(trot_target(period), 30.0, 0.75); 3], &[true; 3], 1).unwrap();
+        }
+        (backend.states().q[1], backend.states().base_position[1])
+    };
+    go_on(&mut backend);
+    let snapshot = backend.snapshot(1);
+    let first = go_on(&mut backend);
+    backend.restore(1, &snapshot);
+    assert_eq!(go_on(&mut backend), first);
+}
+
+#[test]
+fn inactive_robots_stay_as_they_are() {
+    let mut backend = batch(at(400, 4, Base::Floating), 3);
+    let before = backend.states().clone();
+    backend.step(&[Command::hold(pose(), 30.0, 0.75); 3], &[true, false, true], 10).unwrap();
+    assert_eq!(backend.states().q[1], before.q[1]);
+    assert_ne!(backend.states().q[2], before.q[2]);
+    assert_eq!(backend.states().base_position[1], before.base_position[1]);
+}
