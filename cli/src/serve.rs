@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_env_server::{Config, Server, ServerError, SimHost};
 use twinstep_envs::TaskName;
+use twinstep_sim::Engine;
 
 use crate::exit::{Outcome, Signals, input, other};
 
@@ -51,6 +52,9 @@ pub struct Args {
     /// Move large messages through shared memory when both ends are on this machine.
     #[arg(long)]
     shared_memory: bool,
+    /// Who integrates the equations of motion: rapier (the reference) or batch (many robots in SIMD lanes, fast).
+    #[arg(long, value_parser = engine)]
+    engine: Option<Engine>,
     /// Rate of the physics [Hz]; a multiple of the drive's 200.
     #[arg(long, value_name = "HZ")]
     physics_hz: Option<u32>,
@@ -112,6 +116,7 @@ impl Args {
         server.seed = self.seed.or(server.seed);
         server.shared_memory |= self.shared_memory;
         set(&mut config.task.name, self.task.as_ref());
+        set(&mut config.sim.engine, self.engine.as_ref());
         set(&mut config.sim.physics_hz, self.physics_hz.as_ref());
         set(&mut config.sim.threads, self.threads.as_ref());
         config.check().map_err(input)?;
@@ -130,6 +135,14 @@ fn task_name(text: &str) -> Result<TaskName, String> {
         "walk" => Ok(TaskName::Walk),
         "counter" => Ok(TaskName::Counter),
         _ => Err("the tasks are walk and counter".to_owned()),
+    }
+}
+
+fn engine(text: &str) -> Result<Engine, String> {
+    match text {
+        "rapier" => Ok(Engine::Rapier),
+        "batch" => Ok(Engine::Batch),
+        _ => Err("the engines are rapier and batch".to_owned()),
     }
 }
 

@@ -2,7 +2,7 @@
 
 use twinstep_envs::{CounterEnv, TaskEnv, TaskName, TaskSettings};
 use twinstep_model::{AutoresetMode, ModelFileError, RobotModel, VecEnv, go2};
-use twinstep_sim::{BuildError, RapierBackend};
+use twinstep_sim::{BatchBackend, BuildError, Engine, RapierBackend};
 
 use crate::Config;
 
@@ -61,7 +61,6 @@ impl Host for SimHost {
         match self.config.task.name {
             TaskName::Counter => Ok(Box::new(CounterEnv::new(&self.robot, num_envs, autoreset))),
             TaskName::Walk => {
-                let backend = RapierBackend::new(self.robot.clone(), self.config.sim, num_envs)?;
                 let settings = TaskSettings {
                     task: self.config.task.clone(),
                     randomise: self.config.randomise,
@@ -69,7 +68,11 @@ impl Host for SimHost {
                     max_episode_steps,
                     seed: self.seed,
                 };
-                Ok(Box::new(TaskEnv::new(backend, settings)?))
+                let (robot, sim) = (self.robot.clone(), self.config.sim);
+                match sim.engine {
+                    Engine::Rapier => Ok(Box::new(TaskEnv::new(RapierBackend::new(robot, sim, num_envs)?, settings)?)),
+                    Engine::Batch => Ok(Box::new(TaskEnv::new(BatchBackend::new(robot, sim, num_envs)?, settings)?)),
+                }
             }
         }
     }

@@ -12,7 +12,7 @@ pub struct SimConfig {
     /// Rate of the physics [Hz]; a multiple of the drive's rate.
     pub physics_hz: u32,
     /// Solver iterations a physics step. rapier integrates the joints in each of them, so two iterations cost and give
-    /// about what twice the rate does.
+    /// about what twice the rate does; in the batch engine they refine the contact forces alone.
     pub solver_iterations: u32,
     /// The ground.
     pub terrain: Terrain,
@@ -40,8 +40,10 @@ impl Default for SimConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Engine {
-    /// rapier3d: reduced-coordinate multibodies, one world a robot.
+    /// rapier3d: reduced-coordinate multibodies, one world a robot. The reference.
     Rapier,
+    /// Many robots in SIMD lanes. The fast one.
+    Batch,
 }
 
 /// The ground under the robots.

@@ -1,25 +1,38 @@
 //! Physics on one core: what each setting costs, and what accuracy it buys against the finest one.
 
 use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, go2};
-use twinstep_sim::{RapierBackend, SimConfig};
+use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 
 use super::Row;
 use super::pace::{WINDOWS, measure as pace, median};
-use crate::exit::{Failure, Signals, other};
+use crate::exit::{Failure, Outcome, Signals, other};
 use crate::trot;
 
-/// Physics rate [Hz] and solver iterations.
-type Setting = (u32, u32);
+/// Engine, physics rate [Hz] and solver iterations.
+type Setting = (Engine, u32, u32);
 
 /// Wanted joint positions [rad] in a drive period of a motion.
 type Target = fn(usize) -> PerJoint;
 
 /// The shipped settings.
-const SETTINGS: [Setting; 6] = [(200, 1), (200, 2), (200, 4), (400, 1), (1000, 1), (1000, 4)];
+const SETTINGS: [Setting; 10] = [
+    (Engine::Rapier, 200, 1),
+    (Engine::Rapier, 200, 2),
+    (Engine::Rapier, 200, 4),
+    (Engine::Rapier, 400, 1),
+    (Engine::Rapier, 1000, 1),
+    (Engine::Rapier, 1000, 4),
+    (Engine::Batch, 200, 4),
+    (Engine::Batch, 400, 4),
+    (Engine::Batch, 1000, 4),
+    (Engine::Batch, 4000, 4),
+];
 /// What the others are compared with.
-const FINEST: Setting = (4000, 4);
+const FINEST: Setting = (Engine::Rapier, 4000, 4);
 /// Robots in a measured batch.
-const ROBOTS: usize = 16;
+const ROBOTS: usize = 64;
+/// The height [m] from which the robots drop onto their feet, by millimetres.
+const START_HEIGHT: f32 = 0.335;
 /// Drive periods in the second that accuracy is measured over.
 const SECOND: usize = 200;
 
@@ -27,11 +40,11 @@ const SECOND: usize = 200;
 pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
     let motions: [(&str, Target); 2] = [("stance step", stance_step), ("trot", trot_target)];
     let finest = motions.iter().map(|(_, target)| joint_positions(FINEST, *target)).collect::<Result<Vec<_>, _>>()?;
-    let finest_name = format!("{} Hz x {}", FINEST.0, FINEST.1);
+    let finest_name = name(FINEST);
     let mut rows = Vec::new();
     for setting in SETTINGS {
         signals.check()?;
-        let name = format!("physics {} Hz x {}", setting.0, setting.1);
+        let name = name(setting);
         rows.push(Row {
             case: format!("{name}, one core"),
             value: env_steps_per_second(setting, window_s)?,
@@ -53,13 +66,22 @@ pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
     Ok(rows)
 }
 
-fn backend((physics_hz, solver_iterations): Setting, robots: usize) -> Result<RapierBackend, Failure> {
-    let config = SimConfig { physics_hz, solver_iterations, threads: 1, ..SimConfig::default() };
-    let mut backend = RapierBackend::new(go2(), config, robots).map_err(other)?;
-    let placement = Placement::at_rest(0.31, go2().control.default_pose_f32());
-    let placements: Vec<_> = (0..robots).map(|robot| (robot, placement)).collect();
-    backend.reset(&placements).map_err(other)?;
-    Ok(backend)
+fn name((engine, physics_hz, solver_iterations): Setting) -> String {
+    let engine = match engine {
+        Engine::Rapier => "rapier",
+        Engine::Batch => "batch",
+    };
+    format!("{engine} {physics_hz} Hz x {solver_iterations}")
+}
+
+fn config((engine, physics_hz, solver_iterations): Setting) -> SimConfig {
+    SimConfig { engine, physics_hz, solver_iterations, threads: 1, ..SimConfig::default() }
+}
+
+fn place(backend: &mut impl Backend) -> Outcome {
+    let placement = Placement::at_rest(START_HEIGHT, go2().control.default_pose_f32());
+    let placements: Vec<_> = (0..backend.num_robots()).map(|robot| (robot, placement)).collect();
+    backend.reset(&placements).map_err(other)
 }
 
 fn command(target: PerJoint) -> Command {
@@ -68,7 +90,14 @@ fn command(target: PerJoint) -> Command {
 }
 
 fn env_steps_per_second(setting: Setting, window_s: f64) -> Result<f64, Failure> {
-    let mut backend = backend(setting, ROBOTS)?;
+    match setting.0 {
+        Engine::Rapier => pace_of(RapierBackend::new(go2(), config(setting), ROBOTS).map_err(other)?, window_s),
+        Engine::Batch => pace_of(BatchBackend::new(go2(), config(setting), ROBOTS).map_err(other)?, window_s),
+    }
+}
+
+fn pace_of(mut backend: impl Backend, window_s: f64) -> Result<f64, Failure> {
+    place(&mut backend)?;
     let decimation = go2().control.decimation;
     let mut period = 0;
     let mut windows = Vec::new();
@@ -84,7 +113,14 @@ fn env_steps_per_second(setting: Setting, window_s: f64) -> Result<f64, Failure>
 
 /// Joint positions after each drive period of one second, after half a second to settle.
 fn joint_positions(setting: Setting, target: Target) -> Result<Vec<PerJoint>, Failure> {
-    let mut backend = backend(setting, 1)?;
+    match setting.0 {
+        Engine::Rapier => play(RapierBackend::new(go2(), config(setting), 1).map_err(other)?, target),
+        Engine::Batch => play(BatchBackend::new(go2(), config(setting), 1).map_err(other)?, target),
+    }
+}
+
+fn play(mut backend: impl Backend, target: Target) -> Result<Vec<PerJoint>, Failure> {
+    place(&mut backend)?;
     let stand = command(go2().control.default_pose_f32());
     backend.step(&[stand], &[true], SECOND / 2).map_err(other)?;
     (0..SECOND)
