@@ -99,10 +99,10 @@ impl<T: Lane> Constraints<T> {
         self.limits.clear();
         let axes = state.world_axes();
         // The ground's directions in base axes, and the base origin's height over it.
-        let to_base = |d: Vec3<T>| axes[0].scaled(d.0[0]) + axes[1].scaled(d.0[1]) + axes[2].scaled(d.0[2]);
-        let directions = surface.ground.map(to_base);
+        let [normal, first, second] = surface.ground;
+        let directions = [to_base(normal, &axes), to_base(first, &axes), to_base(second, &axes)];
         let height = surface.ground[0].dot(state.position);
-        let moving = Motion { state, velocity: to_base_velocity(state, &axes), moving: parameters.moving };
+        let moving = Motion { state, velocity: to_base(state.linear_velocity, &axes), moving: parameters.moving };
         for point in 0..POINTS {
             let (leg, centre, radius) = if point < 4 * LEG_POINTS {
                 let (leg, which) = (point / LEG_POINTS, point % LEG_POINTS);
@@ -118,12 +118,14 @@ impl<T: Lane> Constraints<T> {
             let lowest = centre - directions[0].scaled(radius);
             let softness = Softness { time_constant: surface.time_constant, distance, dt };
             let normal = contact_row(factored, &moving, leg, lowest, directions[0], &softness, None);
-            let along = |k: usize| {
-                contact_row(factored, &moving, leg, lowest, directions[k], &softness, Some(normal.regularisation))
-            };
-            let rows = [normal, along(1), along(2)];
+            let regularisation = Some(normal.regularisation);
+            let first = contact_row(factored, &moving, leg, lowest, directions[1], &softness, regularisation);
+            let second = contact_row(factored, &moving, leg, lowest, directions[2], &softness, regularisation);
+            let rows = [normal, first, second];
             let zero = T::splat(0.0);
-            impulses.points[point] = impulses.points[point].map(|old| distance.select_less(zero, old, zero));
+            for impulse in &mut impulses.points[point] {
+                *impulse = distance.select_less(zero, *impulse, zero);
+            }
             self.points.push(Block { rows, leg, index: point });
         }
         self.find_limits(factored, parameters, state, surface, impulses, dt);
@@ -196,7 +198,7 @@ fn solve_point<T: Lane>(factored: &mut Factored<T>, block: &Block<T, 3>, impulse
         [impulse[1] - excess(factored, leg, first, impulse[1]), impulse[2] - excess(factored, leg, second, impulse[2])];
     let (limit, size) = (friction * new, (along[0] * along[0] + along[1] * along[1]).sqrt());
     let scale = limit.select_less(size, limit / size.max(T::splat(1e-12)), T::splat(1.0));
-    along = along.map(|value| value * scale);
+    along = [along[0] * scale, along[1] * scale];
     push(factored, leg, first, along[0] - impulse[1]);
     push(factored, leg, second, along[1] - impulse[2]);
     (impulse[1], impulse[2]) = (along[0], along[1]);
@@ -237,10 +239,10 @@ struct Motion<'a, T> {
     moving: T,
 }
 
+/// A vector of the world in base axes.
 #[inline(always)]
-fn to_base_velocity<T: Lane>(state: &State<T>, axes: &[Vec3<T>; 3]) -> Vec3<T> {
-    let v = state.linear_velocity.0;
-    axes[0].scaled(v[0]) + axes[1].scaled(v[1]) + axes[2].scaled(v[2])
+fn to_base<T: Lane>(world: Vec3<T>, axes: &[Vec3<T>; 3]) -> Vec3<T> {
+    axes[0].scaled(world.0[0]) + axes[1].scaled(world.0[1]) + axes[2].scaled(world.0[2])
 }
 
 /// How soft a row is, and how far.
@@ -299,17 +301,24 @@ fn row<T: Lane>(
             }
         }
     }
-    let y = factored.trunk.forward(trunk).map(|value| value * moving);
+    let mut y = factored.trunk.forward(trunk);
     let mut response = zero;
-    for value in y.iter().chain(&z) {
+    for value in &mut y {
+        *value = *value * moving;
         response += *value * *value;
+    }
+    for value in z {
+        response += value * value;
     }
     let Softness { time_constant, distance, dt } = *softness;
     let [shallow, deep] = IMPEDANCE;
     let depth = ((-distance) * T::splat(1.0 / IMPEDANCE_WIDTH)).max(zero).min(one);
     let impedance = T::splat(shallow) + depth * T::splat(deep - shallow);
     let is_normal = regularisation.is_none();
-    let regularisation = regularisation.unwrap_or_else(|| (one - impedance) / impedance * response);
+    let regularisation = match regularisation {
+        Some(of_normal) => of_normal,
+        None => (one - impedance) / impedance * response,
+    };
     let rate = T::splat(2.0 / deep) / time_constant;
     let mut wanted = -(rate * velocity);
     if is_normal {

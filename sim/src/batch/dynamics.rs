@@ -111,7 +111,12 @@ impl<T: Lane> Factored<T> {
     pub fn new(parameters: &Parameters<T>, state: &State<T>, tau: &[T; 12], dt: T, gravity: T) -> Self {
         let up = state.world_axes()[2];
         let rising = up.scaled(gravity);
-        let terms: [LegTerms<T>; 4] = std::array::from_fn(|leg| leg_terms(parameters, state, tau, leg, dt, rising));
+        let terms = [
+            leg_terms(parameters, state, tau, 0, dt, rising),
+            leg_terms(parameters, state, tau, 1, dt, rising),
+            leg_terms(parameters, state, tau, 2, dt, rising),
+            leg_terms(parameters, state, tau, 3, dt, rising),
+        ];
         let omega = state.angular_velocity;
         let (mut force, mut moment) = parameters.trunk.wrench(omega, Vec3::zero(), rising);
         let mut whole = parameters.trunk;
@@ -121,7 +126,10 @@ impl<T: Lane> Factored<T> {
             moment = moment + term.moment;
         }
         let mut block = spatial_matrix(&whole);
-        let mut rhs: [T; 6] = std::array::from_fn(|i| -(if i < 3 { moment.0[i] } else { force.0[i - 3] }) * dt);
+        let mut rhs = [T::splat(0.0); 6];
+        for i in 0..3 {
+            (rhs[i], rhs[i + 3]) = (-(moment.0[i] * dt), -(force.0[i] * dt));
+        }
         for term in &terms {
             for (row, g) in term.leg.coupling.iter().zip(term.g) {
                 for i in 0..6 {
@@ -134,8 +142,12 @@ impl<T: Lane> Factored<T> {
         }
         let trunk = Cholesky::new(block);
         // A held trunk takes no part: nothing that acts on it changes its velocity.
-        let u = trunk.forward(rhs).map(|value| value * parameters.moving);
-        Self { trunk, u, g: [terms[0].g, terms[1].g, terms[2].g, terms[3].g], legs: terms.map(|term| term.leg) }
+        let mut u = trunk.forward(rhs);
+        for value in &mut u {
+            *value = *value * parameters.moving;
+        }
+        let legs = [terms[0].leg, terms[1].leg, terms[2].leg, terms[3].leg];
+        Self { trunk, u, g: [terms[0].g, terms[1].g, terms[2].g, terms[3].g], legs }
     }
 
     /// Changes of the trunk's velocity (angular, linear; base axes) and of the joints'.
@@ -178,14 +190,14 @@ fn leg_terms<T: Lane>(
 
     // Velocities and the accelerations that would be without any acceleration of the unknowns.
     let omega = state.angular_velocity;
-    let about_y = |speed: T| Vec3([zero, speed, zero]);
     let turning = omega.turned_back_x(hip_angle);
     let spin = Vec3([dq0, zero, zero]);
+    let (pitch1, pitch2) = (Vec3([zero, dq1, zero]), Vec3([zero, dq2, zero]));
     let (omega1, alpha1) = (turning + spin, turning.cross(spin));
     let acceleration1 = (rising + omega.cross(omega.cross(hip))).turned_back_x(hip_angle);
-    let (omega2, alpha2) = (omega1 + about_y(dq1), alpha1 + omega1.cross(about_y(dq1)));
+    let (omega2, alpha2) = (omega1 + pitch1, alpha1 + omega1.cross(pitch1));
     let acceleration2 = acceleration1 + alpha1.cross(thigh) + omega1.cross(omega1.cross(thigh));
-    let (omega3, alpha3) = (omega2 + about_y(dq2), alpha2 + omega2.cross(about_y(dq2)));
+    let (omega3, alpha3) = (omega2 + pitch2, alpha2 + omega2.cross(pitch2));
     let acceleration3 = acceleration2 + alpha2.cross(shank) + omega2.cross(omega2.cross(shank));
 
     let [body1, body2, body3] = &parameters.bodies[leg];
@@ -216,23 +228,27 @@ fn leg_terms<T: Lane>(
     ];
     let factor = Cholesky::new(block);
     let bias = [moment1.0[0], moment2.0[1], moment3.0[1]];
-    let g = factor.forward(std::array::from_fn(|i| (tau[joint + i] - bias[i]) * dt));
+    let mut wanted = [zero; 3];
+    for i in 0..3 {
+        wanted[i] = (tau[joint + i] - bias[i]) * dt;
+    }
+    let g = factor.forward(wanted);
 
     // To the base: W = G⁻¹ Cᵀ, column by column of the trunk's six.
-    let to_base = |push: Vec3<T>, twist: Vec3<T>| {
-        let force = push.turned_x(hip_angle);
-        (force, twist.turned_x(hip_angle) + hip.cross(force))
-    };
-    let columns = [to_base(push0, twist0), to_base(push1, twist1_hip), to_base(push2, twist2_hip)];
+    let columns = [
+        to_base(push0, twist0, hip, hip_angle),
+        to_base(push1, twist1_hip, hip, hip_angle),
+        to_base(push2, twist2_hip, hip, hip_angle),
+    ];
     let mut coupling = [[zero; 6]; 3];
-    for i in 0..6 {
-        let entry = |joint: usize| if i < 3 { columns[joint].1.0[i] } else { columns[joint].0.0[i - 3] };
-        let solved = factor.forward([entry(0), entry(1), entry(2)]);
-        for (row, value) in coupling.iter_mut().zip(solved) {
-            row[i] = value;
+    for i in 0..3 {
+        let moments = factor.forward([columns[0].1.0[i], columns[1].1.0[i], columns[2].1.0[i]]);
+        let forces = factor.forward([columns[0].0.0[i], columns[1].0.0[i], columns[2].0.0[i]]);
+        for joint in 0..3 {
+            (coupling[joint][i], coupling[joint][i + 3]) = (moments[joint], forces[joint]);
         }
     }
-    let (force, moment) = to_base(force1, moment1);
+    let (force, moment) = to_base(force1, moment1, hip, hip_angle);
     let thigh_base = thigh.turned_x(hip_angle);
     let pitch = Vec3([zero, hip_angle.1, hip_angle.0]);
     LegTerms {
@@ -249,6 +265,13 @@ fn leg_terms<T: Lane>(
         moment,
         g,
     }
+}
+
+/// Force and moment at the hip's origin in hip axes, as force and moment at the base's origin in base axes.
+#[inline(always)]
+fn to_base<T: Lane>(force: Vec3<T>, moment: Vec3<T>, hip: Vec3<T>, hip_angle: (T, T)) -> (Vec3<T>, Vec3<T>) {
+    let force = force.turned_x(hip_angle);
+    (force, moment.turned_x(hip_angle) + hip.cross(force))
 }
 
 /// Lower triangle of a body's 6 × 6 matrix: angular, then linear.

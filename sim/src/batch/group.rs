@@ -115,11 +115,12 @@ impl<T: Lane> Group<T> {
             state.dq[joint] += change;
             state.q[joint] += dt * state.dq[joint];
         }
-        let [ax, ay, az, lx, ly, lz] = trunk.map(|value| value * moving);
+        let [ax, ay, az, lx, ly, lz] = trunk;
         let axes = state.world_axes();
-        let change = Vec3([lx, ly, lz]);
-        state.angular_velocity = state.angular_velocity + Vec3([ax, ay, az]);
-        state.linear_velocity = state.linear_velocity + Vec3(axes.map(|axis| axis.dot(change)));
+        let (turn, change) = (Vec3([ax, ay, az]).scaled(moving), Vec3([lx, ly, lz]).scaled(moving));
+        state.angular_velocity = state.angular_velocity + turn;
+        state.linear_velocity =
+            state.linear_velocity + Vec3([axes[0].dot(change), axes[1].dot(change), axes[2].dot(change)]);
         state.position = state.position + state.linear_velocity.scaled(dt);
         state.orientation = turned(state.orientation, state.angular_velocity.scaled(dt));
     }
@@ -221,5 +222,5 @@ fn turned<T: Lane>(orientation: [T; 4], turn: Vec3<T>) -> [T; 4] {
         norm += value * value;
     }
     let inverse = T::splat(1.0) / norm.sqrt();
-    product.map(|value| value * inverse)
+    [product[0] * inverse, product[1] * inverse, product[2] * inverse, product[3] * inverse]
 }

@@ -3,6 +3,9 @@
 //! Only additions, multiplications, divisions, square roots and comparisons, never a fused multiply-add and never a sum
 //! over lanes: each lane's bits are the same whatever its neighbours are, how many there are, and which instruction set
 //! runs.
+//!
+//! Nothing here or above takes a closure: one that the compiler leaves out of line is compiled for the oldest processor,
+//! and costs more than all the rest.
 
 use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
 
@@ -73,7 +76,11 @@ impl Neg for F32x8 {
     type Output = Self;
     #[inline(always)]
     fn neg(self) -> Self {
-        self.map(|value| -value)
+        let mut result = self;
+        for lane in 0..8 {
+            result.0[lane] = -self.0[lane];
+        }
+        result
     }
 }
 
@@ -88,17 +95,6 @@ impl SubAssign for F32x8 {
     #[inline(always)]
     fn sub_assign(&mut self, other: Self) {
         *self = *self - other;
-    }
-}
-
-impl F32x8 {
-    #[inline(always)]
-    fn map(self, function: impl Fn(f32) -> f32) -> Self {
-        let mut result = self;
-        for lane in 0..8 {
-            result.0[lane] = function(self.0[lane]);
-        }
-        result
     }
 }
 
@@ -122,7 +118,11 @@ impl Lane for F32x8 {
 
     #[inline(always)]
     fn sqrt(self) -> Self {
-        self.map(f32::sqrt)
+        let mut result = self;
+        for lane in 0..8 {
+            result.0[lane] = self.0[lane].sqrt();
+        }
+        result
     }
 
     #[inline(always)]
@@ -155,7 +155,11 @@ impl Lane for F32x8 {
 
     #[inline(always)]
     fn sin_cos(self) -> (Self, Self) {
-        (self.map(|x| sin_cos_f32(x).0), self.map(|x| sin_cos_f32(x).1))
+        let (mut sin, mut cos) = (self, self);
+        for lane in 0..8 {
+            (sin.0[lane], cos.0[lane]) = sin_cos_f32(self.0[lane]);
+        }
+        (sin, cos)
     }
 }
 

@@ -25,6 +25,10 @@ use crate::{SimConfig, SimConfigError};
 use group::Group;
 use lane::{F32x8, Lane};
 
+/// Groups that one thread steps at a time: a drive period of one takes some ten microseconds, about what it takes to
+/// wake a thread.
+const GROUPS_A_TASK: usize = 4;
+
 /// Many Go2 in SIMD lanes.
 pub struct BatchBackend {
     robot: RobotModel,
@@ -90,7 +94,7 @@ impl BatchBackend {
         let robots = (&mut self.groups, tau.par_chunks(lanes), active.par_chunks(lanes));
         let states = (self.states.q.par_chunks_mut(lanes), self.states.dq.par_chunks_mut(lanes));
         self.pool.install(|| {
-            (robots, states).into_par_iter().for_each(|((group, tau, active), (q, dq))| {
+            (robots, states).into_par_iter().with_min_len(GROUPS_A_TASK).for_each(|((group, tau, active), (q, dq))| {
                 step_active(group, tau, active, steps);
                 for lane in 0..active.len() {
                     (q[lane], dq[lane]) = (read(&group.state.q, lane), read(&group.state.dq, lane));

@@ -40,7 +40,7 @@ impl<T: Lane> Vec3<T> {
     /// Times a number.
     #[inline(always)]
     pub fn scaled(self, factor: T) -> Self {
-        Self(self.0.map(|value| value * factor))
+        Self([self.0[0] * factor, self.0[1] * factor, self.0[2] * factor])
     }
 
     /// Turned about x by the angle with this sine and cosine.
@@ -84,7 +84,7 @@ impl<T: Lane> Neg for Vec3<T> {
     type Output = Self;
     #[inline(always)]
     fn neg(self) -> Self {
-        Self(self.0.map(|value| -value))
+        Self([-self.0[0], -self.0[1], -self.0[2]])
     }
 }
 
@@ -181,12 +181,15 @@ impl<T: Lane> Inertia<T> {
         let (m, h, r) = (self.mass, self.moment, offset);
         let two_rh = r.dot(h) + r.dot(h);
         let rr = r.dot(r) * m;
-        let diagonal =
-            |k: usize| self.about_origin[k] + two_rh - (r.0[k] * h.0[k] + r.0[k] * h.0[k]) + rr - m * r.0[k] * r.0[k];
-        let cross = |entry: usize, i: usize, j: usize| {
-            self.about_origin[entry] - (r.0[i] * h.0[j] + h.0[i] * r.0[j]) - m * r.0[i] * r.0[j]
-        };
-        let about_origin = [diagonal(0), diagonal(1), diagonal(2), cross(3, 0, 1), cross(4, 0, 2), cross(5, 1, 2)];
+        let mut about_origin = self.about_origin;
+        for k in 0..3 {
+            let twice = r.0[k] * h.0[k] + r.0[k] * h.0[k];
+            about_origin[k] = about_origin[k] + two_rh - twice + rr - m * r.0[k] * r.0[k];
+        }
+        for (entry, [i, j]) in [[0, 1], [0, 2], [1, 2]].into_iter().enumerate() {
+            let cross = r.0[i] * h.0[j] + h.0[i] * r.0[j] + m * r.0[i] * r.0[j];
+            about_origin[3 + entry] -= cross;
+        }
         Self { mass: m, moment: h + r.scaled(m), about_origin }
     }
 
