@@ -1,7 +1,10 @@
 //! The batch engine against rapier and against physics.
 
 use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, Variation, go2};
-use twinstep_sim::{Base, BatchBackend, RapierBackend, SimConfig};
+use twinstep_sim::{Base, BatchBackend, BatchBackend as Simulator, RapierBackend, SimConfig};
+
+#[path = "physics.rs"]
+mod physics;
 
 /// Drive periods in a second.
 const SECOND: usize = 200;

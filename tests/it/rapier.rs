@@ -1,0 +1,6 @@
+//! The rapier engine against physics.
+
+use twinstep_sim::RapierBackend as Simulator;
+
+#[path = "physics.rs"]
+mod physics;
