@@ -3,6 +3,7 @@
 //! - [`SimConfig`]: engine, rates, terrain, base, threads; the `[sim]` table of a config file.
 //! - [`RapierBackend`]: one rapier3d world a robot, stepped on all cores; equal inputs give equal bits on any number
 //!   of threads.
+//! - [`BatchBackend`]: many robots in SIMD lanes; the same bits in any lane, batch size and number of threads.
 //!
 //! A drive period is one sample of the state, one torque for each joint, and `physics_hz / drive_hz` physics steps
 //! under that torque.

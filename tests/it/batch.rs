@@ -4,6 +4,7 @@ use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, Variatio
 use twinstep_sim::{Base, BatchBackend, BatchBackend as Simulator, RapierBackend, SimConfig};
 
 #[path = "physics.rs"]
+#[allow(clippy::duplicate_mod, reason = "the same tests for each engine")]
 mod physics;
 
 /// Drive periods in a second.
@@ -36,7 +37,7 @@ fn trot_target(period: usize) -> PerJoint {
     std::array::from_fn(|j| {
         let leg = j / 3;
         let swing = phase.sin() * if leg == 0 || leg == 3 { 1.0 } else { -1.0 };
-        pose()[j] + [0.0, 0.1 * phase.cos() * swing.signum(), 0.25 * swing.max(0.0) * -1.0][j % 3]
+        pose()[j] + [0.0, 0.1 * phase.cos() * swing.signum(), -0.25 * swing.max(0.0)][j % 3]
     })
 }
 

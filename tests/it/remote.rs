@@ -7,6 +7,7 @@ use twinstep_env_server::{Config, Host, HostError, Server, SimHost};
 use twinstep_envs::{Counter, OBS_LEN, TaskName, check};
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv, go2};
 use twinstep_protocol::Code;
+use twinstep_sim::Engine;
 
 pub fn config(task: TaskName) -> Config {
     let mut config = Config::default();
@@ -44,6 +45,17 @@ fn remote_walk_passes_the_checker_in_every_autoreset_mode() {
         check(&mut env, 30).unwrap();
         env.close().unwrap();
     }
+    server.stop();
+}
+
+#[test]
+fn walk_on_the_batch_engine_passes_the_checker() {
+    let mut config = config(TaskName::Walk);
+    config.sim.engine = Engine::Batch;
+    config.randomise.mass_scale = [0.9, 1.1];
+    let (server, endpoint) = start(&config);
+    let options = ConnectOptions { max_episode_steps: Some(7), ..ConnectOptions::new(&endpoint, 11) };
+    check(&mut RemoteVecEnv::connect(&options).unwrap(), 30).unwrap();
     server.stop();
 }
 

@@ -157,15 +157,15 @@ fn twenty_thousand_bad_requests() {
     assert!(grown < BOUND, "{grown} bytes more after 20000 bad requests");
 
     let giant = step_with(&lease, 2, &vec![0.0; GIANT / 4]);
-    for _ in 0..3 {
+    for _ in 0..8 {
         assert_eq!(client.ask_env(&lease, Verb::Step, &giant).unwrap_err().code, Code::BadShape);
     }
     drop(giant);
     // Until Zenoh has forgotten the queries, and the allocator what it lent them.
     (0..5_000).for_each(bad);
     let kept = resident().saturating_sub(before);
-    // The allocator holds back up to one; a server that keeps one makes it two.
-    assert!(kept < GIANT * 3 / 2, "{kept} bytes more after giant requests: one is kept");
+    // The allocator holds back up to two of the eight, more on a busy machine.
+    assert!(kept < GIANT * 4, "{kept} bytes more after giant requests: they are kept");
     println!("{grown} bytes more after 20000 bad requests, {kept} after giant ones");
     assert_eq!(steps_in(&client.step(&lease, 2).unwrap()), 1.0);
     server.stop();

@@ -6,6 +6,9 @@
 //!
 //! Every instruction set gives the same bits, and so does every batch size and thread count; see [`lane`].
 
+#![allow(clippy::inline_always, reason = "what stays out of line is compiled for the oldest processor")]
+#![allow(clippy::needless_range_loop, reason = "indices of matrices read as in the textbook")]
+
 mod contact;
 mod dispatch;
 mod dynamics;
