@@ -225,10 +225,8 @@ impl Worker {
             }
             Verb::Step => {
                 let request: message::StepRequest<'_> = decode(payload)?;
-                // Before they are copied: the buffer keeps the size of the largest.
                 let wanted = self.env.num_envs() * self.env.spec().action_len();
-                convert::check_length("actions", request.actions.len() / size_of::<f32>(), wanted)?;
-                tensor::read_into(request.actions, &mut self.actions, "actions")?;
+                read_actions(request.actions, wanted, &mut self.actions)?;
                 let batch = self.env.step(&self.actions).map_err(|error| logged(&error))?;
                 self.shared.env_steps.fetch_add(batch.reward.len() as u64, Ordering::Relaxed);
                 Ok(convert::encode_step(batch, request.seq))
@@ -242,6 +240,12 @@ impl Worker {
             Verb::Render => self.render(payload),
         }
     }
+}
+
+/// Reads `wanted` actions into `actions`, which a wrong number of them leaves untouched: it keeps the size of the largest.
+fn read_actions(bytes: &[u8], wanted: usize, actions: &mut Vec<f32>) -> Result<(), WireError> {
+    convert::check_length("actions", bytes.len() / size_of::<f32>(), wanted)?;
+    tensor::read_into(bytes, actions, "actions")
 }
 
 fn logged(error: &EnvError) -> WireError {
@@ -307,4 +311,19 @@ pub fn stale_epoch(field: &'static str, given: u64, current: u64) -> WireError {
 fn stale_sequence(given: u64, last: u64) -> WireError {
     let message = format!("`seq` = {given} was answered before: the last executed is {last}");
     WireError::new(Code::StaleSequence, "seq", message)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn oversized_actions_are_refused_and_take_no_memory() {
+        let mut actions = Vec::new();
+        let error = read_actions(&vec![0; 1 << 20], 12, &mut actions).expect_err("too many");
+        assert_eq!(error.code, Code::BadShape);
+        assert_eq!(actions.capacity(), 0);
+        read_actions(&[0; 48], 12, &mut actions).expect("twelve");
+        assert_eq!(actions, [0.0; 12]);
+    }
 }
