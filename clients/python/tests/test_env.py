@@ -162,6 +162,10 @@ def test_server_ends_with_its_parent_however_that_ends(death: str) -> None:
     if death == "SIGKILL":
         parent.kill()
     parent.communicate()
+    assert_ends(server)
+
+
+def assert_ends(server: int) -> None:
     for _ in range(100):
         if not is_running(server):
             return

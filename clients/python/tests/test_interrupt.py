@@ -8,7 +8,7 @@ import textwrap
 import time
 
 import pytest
-from test_env import is_running
+from test_env import assert_ends
 
 pytest.importorskip("stable_baselines3", reason='Stable-Baselines3 is not installed: pip install "twinstep[sb3]"')
 
@@ -39,9 +39,4 @@ def test_interrupted_training_leaves_no_process_behind() -> None:
     os.killpg(agent.pid, signal.SIGINT)
     _, printed = agent.communicate(timeout=10)
     assert printed.rstrip().endswith("KeyboardInterrupt")
-    for _ in range(100):
-        if not is_running(server):
-            return
-        time.sleep(0.05)
-    os.kill(server, signal.SIGKILL)
-    raise AssertionError("the server outlived the interrupted training by 5 s")
+    assert_ends(server)
