@@ -75,7 +75,7 @@ fn joint(joint: Joint) -> JointModel {
         JointKind::Hip | JointKind::Thigh => (23.7, 30.1),
         JointKind::Calf => (45.43, 15.70),
     };
-    JointModel { range, torque_limit, speed_limit, armature: 0.01 }
+    JointModel { range, torque_limit, speed_limit, armature: 0.01, viscous_friction: 0.0, coulomb_friction: 0.0 }
 }
 
 /// Source: menagerie's geoms of the trunk, a thigh and a foot; the calf's cylinder as a capsule.

@@ -73,6 +73,10 @@ pub struct JointModel {
     pub speed_limit: f64,
     /// Inertia of the rotor seen at the joint [kg·m²].
     pub armature: f64,
+    /// Friction that grows with the joint's speed [N·m·s/rad].
+    pub viscous_friction: f64,
+    /// Friction that does not, and that holds the joint when it stands [N·m].
+    pub coulomb_friction: f64,
 }
 
 /// Collision shapes, in the frames of the bodies they belong to.

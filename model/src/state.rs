@@ -65,6 +65,28 @@ impl RobotStates {
         }
     }
 
+    /// Up to `robots` robots at a time, in their order, to be written.
+    pub fn chunks_mut(&mut self, robots: usize) -> impl Iterator<Item = RobotStatesMut<'_>> {
+        let joints = self.q.chunks_mut(robots).zip(self.dq.chunks_mut(robots)).zip(self.tau.chunks_mut(robots));
+        let poses = self.base_position.chunks_mut(robots).zip(self.base_orientation.chunks_mut(robots));
+        let velocities =
+            self.base_linear_velocity.chunks_mut(robots).zip(self.base_angular_velocity.chunks_mut(robots));
+        let contacts = self.foot_force.chunks_mut(robots).zip(self.body_contact.chunks_mut(robots));
+        joints.zip(poses).zip(velocities).zip(contacts).map(|((((joints, tau), pose), velocity), contact)| {
+            RobotStatesMut {
+                q: joints.0,
+                dq: joints.1,
+                tau,
+                base_position: pose.0,
+                base_orientation: pose.1,
+                base_linear_velocity: velocity.0,
+                base_angular_velocity: velocity.1,
+                foot_force: contact.0,
+                body_contact: contact.1,
+            }
+        })
+    }
+
     /// Copies the state of robot `from` of `other` to `robot`.
     pub fn copy_robot(&mut self, robot: usize, other: &RobotStates, from: usize) {
         self.q[robot] = other.q[from];
@@ -91,6 +113,20 @@ impl RobotStates {
         ];
         quantities.into_iter().find(|(_, values)| values.iter().any(|value| !value.is_finite())).map(|(name, _)| name)
     }
+}
+
+/// Some of the robots of a [`RobotStates`], with its fields.
+#[allow(missing_docs, reason = "those of `RobotStates`")]
+pub struct RobotStatesMut<'a> {
+    pub q: &'a mut [PerJoint],
+    pub dq: &'a mut [PerJoint],
+    pub tau: &'a mut [PerJoint],
+    pub base_position: &'a mut [[f32; 3]],
+    pub base_orientation: &'a mut [[f32; 4]],
+    pub base_linear_velocity: &'a mut [[f32; 3]],
+    pub base_angular_velocity: &'a mut [[f32; 3]],
+    pub foot_force: &'a mut [PerLeg],
+    pub body_contact: &'a mut [bool],
 }
 
 /// Where and how a robot is put down.

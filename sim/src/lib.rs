@@ -13,6 +13,6 @@ mod config;
 mod rapier;
 mod robot_world;
 
-pub use batch::{BatchBackend, BatchSnapshot};
+pub use batch::{BatchBackend, BatchSnapshot, Lanes};
 pub use config::{Base, Engine, SimConfig, SimConfigError, Terrain};
 pub use rapier::{BuildError, RapierBackend, RobotSnapshot};

@@ -1,23 +1,19 @@
-//! Contacts and joint limits: soft constraints as MuJoCo has them, solved by projected Gauss-Seidel.
+//! Contacts, joint limits and joint friction: MuJoCo's soft constraints, solved by projected Gauss-Seidel.
 //!
 //! A row wants the velocity change `J Δ + R λ = dt a_ref` with `a_ref = −b v − k d r` (MuJoCo's documentation,
 //! "Computation", reference acceleration): r is the distance, v its rate, and b, k follow from the time constant at
-//! critical damping. λ is an impulse [N·s].
+//! critical damping. λ is an impulse [N·s]. Joint friction is hard instead: it stops the joint, as far as it can.
 
-use super::dynamics::{Factored, Parameters, State};
-use super::lane::Lane;
-use super::spatial::Vec3;
+use twinstep_model::lanes::{Factored, Lane, State, Vec3};
 
-/// Impedance of a constraint at a distance of zero and, from [`IMPEDANCE_WIDTH`] on, deep inside: MuJoCo's defaults.
-const IMPEDANCE: [f64; 2] = [0.9, 0.95];
-/// Depth [m] or angle [rad] at which the impedance is the larger one.
-const IMPEDANCE_WIDTH: f64 = 0.001;
+use super::rows::{JointRow, PointRow, Row, Softness};
+
 /// Points of a leg that can touch: the foot, the calf's far end, the knee.
 pub const LEG_POINTS: usize = 3;
 /// Points of the robot that can touch: of the legs, then the trunk's corners.
 pub const POINTS: usize = 4 * LEG_POINTS + 8;
 
-/// Shapes and softness.
+/// Shapes, softness and friction.
 #[derive(Clone, Debug)]
 pub struct Surface<T> {
     /// Centres of a calf's spheres in its frame [m].
@@ -28,12 +24,18 @@ pub struct Surface<T> {
     pub corners: [Vec3<T>; 8],
     /// Normal of the ground, and two directions along it, in the world.
     pub ground: [Vec3<T>; 3],
+    /// Coefficient of friction at the ground.
+    pub friction: T,
     /// Time constant of a contact [s]; at least two steps.
     pub time_constant: T,
     /// Lower and upper joint limits [rad].
     pub limits: [[T; 2]; 12],
     /// Time constant of a joint limit [s]; at least two steps.
     pub limit_time_constant: T,
+    /// Coulomb friction of each joint [N·m].
+    pub joint_friction: [T; 12],
+    /// 1 where the trunk moves, 0 where it is held.
+    pub moving: T,
 }
 
 /// Impulses of the last step, from which the next one starts.
@@ -43,45 +45,73 @@ pub struct Impulses<T> {
     pub points: [[T; 3]; POINTS],
     /// By joint and limit [N·m·s].
     pub limits: [[T; 2]; 12],
+    /// Of the joints' friction [N·m·s].
+    pub frictions: [T; 12],
 }
 
 impl<T: Lane> Impulses<T> {
-    /// No contact.
+    /// Nothing touches.
     pub fn zero() -> Self {
         let zero = T::splat(0.0);
-        Self { points: [[zero; 3]; POINTS], limits: [[zero; 2]; 12] }
+        Self { points: [[zero; 3]; POINTS], limits: [[zero; 2]; 12], frictions: [zero; 12] }
     }
 }
 
-/// One constraint row.
+/// Rows of a point that touches: normal, and two along the ground.
 #[derive(Clone, Copy)]
-struct Row<T> {
-    y: [T; 6],
-    z: [T; 3],
-    regularisation: T,
-    /// One over A + R where the row is active, 0 elsewhere: there its impulse stays 0.
-    inverse: T,
-    /// `dt a_ref`.
-    wanted: T,
+struct PointBlock<T> {
+    rows: [Row<T>; 3],
+    /// What a unit of the normal impulse changes along the other two.
+    couplings: [T; 2],
+    /// The leg; 4 is the trunk.
+    leg: usize,
+    point: usize,
 }
 
-/// Rows of a point or of a limit, the leg they are on (4: the trunk), and where their impulses are kept.
-struct Block<T, const N: usize> {
-    rows: [Row<T>; N],
+/// The row of a joint, and where its impulse is kept.
+#[derive(Clone, Copy)]
+struct JointBlock<T> {
+    row: Row<T>,
     leg: usize,
     index: usize,
 }
 
-/// Most points and limits that are ever active at once are few; both lists hold all.
+/// The first `active` of `blocks` count; there is room for all. Written in place, because blocks are large.
+struct Active<B, const N: usize> {
+    blocks: Box<[B; N]>,
+    active: usize,
+}
+
+impl<B: Copy, const N: usize> Active<B, N> {
+    fn empty(block: B) -> Self {
+        Self { blocks: Box::new([block; N]), active: 0 }
+    }
+
+    #[inline(always)]
+    fn next(&mut self) -> &mut B {
+        self.active += 1;
+        &mut self.blocks[self.active - 1]
+    }
+
+    #[inline(always)]
+    fn all(&self) -> &[B] {
+        &self.blocks[..self.active]
+    }
+}
+
+/// What is active in one step.
 pub struct Constraints<T> {
-    points: Vec<Block<T, 3>>,
-    limits: Vec<Block<T, 1>>,
+    points: Active<PointBlock<T>, POINTS>,
+    limits: Active<JointBlock<T>, 24>,
+    frictions: Active<JointBlock<T>, 12>,
 }
 
 impl<T: Lane> Constraints<T> {
-    /// Empty lists with room for everything.
-    pub fn with_capacity() -> Self {
-        Self { points: Vec::with_capacity(POINTS), limits: Vec::with_capacity(24) }
+    /// Nothing is active. Kept from step to step, because it is large.
+    pub fn empty() -> Self {
+        let joint = JointBlock { row: Row::empty(), leg: 0, index: 0 };
+        let point = PointBlock { rows: [Row::empty(); 3], couplings: [T::splat(0.0); 2], leg: 0, point: 0 };
+        Self { points: Active::empty(point), limits: Active::empty(joint), frictions: Active::empty(joint) }
     }
 
     /// Finds what touches, and its rows. Impulses of what does not are forgotten.
@@ -89,242 +119,186 @@ impl<T: Lane> Constraints<T> {
     pub fn find(
         &mut self,
         factored: &Factored<T>,
-        parameters: &Parameters<T>,
         state: &State<T>,
         surface: &Surface<T>,
         impulses: &mut Impulses<T>,
         dt: T,
     ) {
-        self.points.clear();
-        self.limits.clear();
+        (self.points.active, self.limits.active, self.frictions.active) = (0, 0, 0);
+        self.find_points(factored, state, surface, impulses, dt);
+        for joint in 0..12 {
+            self.find_limits(factored, state, surface, impulses, joint, dt);
+            self.find_friction(factored, state, surface, joint);
+        }
+    }
+
+    #[inline(always)]
+    fn find_points(
+        &mut self,
+        factored: &Factored<T>,
+        state: &State<T>,
+        surface: &Surface<T>,
+        impulses: &mut Impulses<T>,
+        dt: T,
+    ) {
+        let zero = T::splat(0.0);
         let axes = state.world_axes();
         // The ground's directions in base axes, and the base origin's height over it.
         let [normal, first, second] = surface.ground;
         let directions = [to_base(normal, &axes), to_base(first, &axes), to_base(second, &axes)];
-        let height = surface.ground[0].dot(state.position);
-        let moving = Motion { state, velocity: to_base(state.linear_velocity, &axes), moving: parameters.moving };
-        for point in 0..POINTS {
+        let height = normal.dot(state.position);
+        let velocity = to_base(state.linear_velocity, &axes);
+        // Most of the time no corner is near the ground.
+        let half = surface.corners[7];
+        let lowest_corner = height
+            - (directions[0].0[0] * half.0[0]).abs()
+            - (directions[0].0[1] * half.0[1]).abs()
+            - (directions[0].0[2] * half.0[2]).abs();
+        let points = if lowest_corner.any_less(zero) { POINTS } else { 4 * LEG_POINTS };
+        for corner in &mut impulses.points[points..] {
+            *corner = [zero; 3];
+        }
+        for point in 0..points {
             let (leg, centre, radius) = if point < 4 * LEG_POINTS {
                 let (leg, which) = (point / LEG_POINTS, point % LEG_POINTS);
-                (leg, factored.legs[leg].calf_point(surface.leg_points[leg][which]), surface.radii[which])
+                (leg, factored.legs[leg].frames.calf_point(surface.leg_points[leg][which]), surface.radii[which])
             } else {
-                (4, surface.corners[point - 4 * LEG_POINTS], T::splat(0.0))
+                (4, surface.corners[point - 4 * LEG_POINTS], zero)
             };
             let distance = height + directions[0].dot(centre) - radius;
-            if !distance.any_less(T::splat(0.0)) {
-                impulses.points[point] = [T::splat(0.0); 3];
+            if !distance.any_less(zero) {
+                impulses.points[point] = [zero; 3];
                 continue;
             }
-            let lowest = centre - directions[0].scaled(radius);
-            let softness = Softness { time_constant: surface.time_constant, distance, dt };
-            let normal = contact_row(factored, &moving, leg, lowest, directions[0], &softness, None);
-            let regularisation = Some(normal.regularisation);
-            let first = contact_row(factored, &moving, leg, lowest, directions[1], &softness, regularisation);
-            let second = contact_row(factored, &moving, leg, lowest, directions[2], &softness, regularisation);
-            let rows = [normal, first, second];
-            let zero = T::splat(0.0);
             for impulse in &mut impulses.points[point] {
                 *impulse = distance.select_less(zero, *impulse, zero);
             }
-            self.points.push(Block { rows, leg, index: point });
+            let softness = Softness { time_constant: surface.time_constant, distance, dt };
+            let place = centre - directions[0].scaled(radius);
+            let row = PointRow { factored, state, velocity, leg, place, moving: surface.moving };
+            let block = self.points.next();
+            (block.leg, block.point) = (leg, point);
+            block.rows[0] = row.normal(directions[0], &softness);
+            for along in 1..3 {
+                block.rows[along] = row.along(directions[along], &softness, &block.rows[0]);
+                block.couplings[along - 1] = block.rows[along].response(&block.rows[0]);
+            }
         }
-        self.find_limits(factored, parameters, state, surface, impulses, dt);
     }
 
     #[inline(always)]
     fn find_limits(
         &mut self,
         factored: &Factored<T>,
-        parameters: &Parameters<T>,
         state: &State<T>,
         surface: &Surface<T>,
         impulses: &mut Impulses<T>,
+        joint: usize,
         dt: T,
     ) {
         let (zero, one) = (T::splat(0.0), T::splat(1.0));
-        for joint in 0..12 {
-            for (side, sign) in [one, -one].into_iter().enumerate() {
-                let distance = (state.q[joint] - surface.limits[joint][side]) * sign;
-                let impulse = &mut impulses.limits[joint][side];
-                if !distance.any_less(zero) {
-                    *impulse = zero;
-                    continue;
-                }
-                *impulse = distance.select_less(zero, *impulse, zero);
-                let (leg, mut along) = (joint / 3, [zero; 3]);
-                along[joint % 3] = sign;
-                let softness = Softness { time_constant: surface.limit_time_constant, distance, dt };
-                let velocity = state.dq[joint] * sign;
-                let row = row(factored, parameters.moving, leg, [zero; 6], along, velocity, &softness, None);
-                self.limits.push(Block { rows: [row], leg, index: 2 * joint + side });
+        for (side, sign) in [one, -one].into_iter().enumerate() {
+            let distance = (state.q[joint] - surface.limits[joint][side]) * sign;
+            let impulse = &mut impulses.limits[joint][side];
+            if !distance.any_less(zero) {
+                *impulse = zero;
+                continue;
             }
+            *impulse = distance.select_less(zero, *impulse, zero);
+            let softness = Softness { time_constant: surface.limit_time_constant, distance, dt };
+            let row = JointRow { factored, joint, sign, moving: surface.moving };
+            let row = row.limit(state.dq[joint] * sign, &softness);
+            *self.limits.next() = JointBlock { row, leg: joint / 3, index: 2 * joint + side };
         }
     }
 
-    /// Sweeps over all rows; friction stays inside its disc.
     #[inline(always)]
-    pub fn solve(&self, factored: &mut Factored<T>, impulses: &mut Impulses<T>, friction: T, iterations: usize) {
-        for block in &self.points {
-            for (row, impulse) in block.rows.iter().zip(impulses.points[block.index]) {
-                push(factored, block.leg, row, impulse);
+    fn find_friction(&mut self, factored: &Factored<T>, state: &State<T>, surface: &Surface<T>, joint: usize) {
+        if T::splat(0.0).any_less(surface.joint_friction[joint]) {
+            let row = JointRow { factored, joint, sign: T::splat(1.0), moving: surface.moving };
+            *self.frictions.next() = JointBlock { row: row.stop(state.dq[joint]), leg: joint / 3, index: joint };
+        }
+    }
+
+    /// Sweeps over all rows; friction at the ground stays inside its disc, friction of a joint below its largest torque.
+    #[inline(always)]
+    pub fn solve(
+        &self,
+        factored: &mut Factored<T>,
+        impulses: &mut Impulses<T>,
+        surface: &Surface<T>,
+        dt: T,
+        iterations: usize,
+    ) {
+        for block in self.points.all() {
+            for (row, impulse) in block.rows.iter().zip(impulses.points[block.point]) {
+                row.push(factored, block.leg, impulse);
             }
         }
-        for block in &self.limits {
-            push(factored, block.leg, &block.rows[0], impulses.limits[block.index / 2][block.index % 2]);
+        for block in self.limits.all() {
+            block.row.push(factored, block.leg, impulses.limits[block.index / 2][block.index % 2]);
+        }
+        for block in self.frictions.all() {
+            block.row.push(factored, block.leg, impulses.frictions[block.index]);
         }
         for _ in 0..iterations {
-            for block in &self.points {
-                solve_point(factored, block, &mut impulses.points[block.index], friction);
+            for block in self.points.all() {
+                solve_point(factored, block, &mut impulses.points[block.point], surface.friction);
             }
-            for block in &self.limits {
-                let (row, impulse) = (&block.rows[0], &mut impulses.limits[block.index / 2][block.index % 2]);
-                let new = (*impulse - excess(factored, block.leg, row, *impulse)).max(T::splat(0.0));
-                push(factored, block.leg, row, new - *impulse);
+            for block in self.limits.all() {
+                let (row, impulse) = (&block.row, &mut impulses.limits[block.index / 2][block.index % 2]);
+                let new = (*impulse - row.excess(factored, block.leg, *impulse)).max(T::splat(0.0));
+                row.push(factored, block.leg, new - *impulse);
+                *impulse = new;
+            }
+            for block in self.frictions.all() {
+                let (row, impulse) = (&block.row, &mut impulses.frictions[block.index]);
+                let most = surface.joint_friction[block.index] * dt;
+                let new = (*impulse - row.excess(factored, block.leg, *impulse)).max(-most).min(most);
+                row.push(factored, block.leg, new - *impulse);
                 *impulse = new;
             }
         }
     }
 }
 
+/// The normal impulse, then both of friction, and all three at once onto the velocities: what the normal one does to the
+/// others is known from `couplings`, so that the sweep waits once a point.
 #[inline(always)]
-fn solve_point<T: Lane>(factored: &mut Factored<T>, block: &Block<T, 3>, impulse: &mut [T; 3], friction: T) {
+fn solve_point<T: Lane>(factored: &mut Factored<T>, block: &PointBlock<T>, impulse: &mut [T; 3], friction: T) {
     let [normal, first, second] = &block.rows;
     let (zero, leg) = (T::splat(0.0), block.leg);
-    let new = (impulse[0] - excess(factored, leg, normal, impulse[0])).max(zero);
-    push(factored, leg, normal, new - impulse[0]);
-    impulse[0] = new;
-    // Both directions from the same state, then back onto the disc.
-    let mut along =
-        [impulse[1] - excess(factored, leg, first, impulse[1]), impulse[2] - excess(factored, leg, second, impulse[2])];
-    let (limit, size) = (friction * new, (along[0] * along[0] + along[1] * along[1]).sqrt());
-    let scale = limit.select_less(size, limit / size.max(T::splat(1e-12)), T::splat(1.0));
-    along = [along[0] * scale, along[1] * scale];
-    push(factored, leg, first, along[0] - impulse[1]);
-    push(factored, leg, second, along[1] - impulse[2]);
-    (impulse[1], impulse[2]) = (along[0], along[1]);
-}
-
-/// How much the row's impulse is too large.
-#[inline(always)]
-fn excess<T: Lane>(factored: &Factored<T>, leg: usize, row: &Row<T>, impulse: T) -> T {
-    let mut sum = row.regularisation * impulse - row.wanted;
-    for (y, u) in row.y.iter().zip(factored.u) {
-        sum += *y * u;
+    let missed = [
+        normal.missed(factored, leg, impulse[0]),
+        first.missed(factored, leg, impulse[1]),
+        second.missed(factored, leg, impulse[2]),
+    ];
+    let pressed = (impulse[0] - missed[0] * normal.inverse).max(zero);
+    let more = pressed - impulse[0];
+    let mut along = [
+        impulse[1] - (missed[1] + block.couplings[0] * more) * first.inverse,
+        impulse[2] - (missed[2] + block.couplings[1] * more) * second.inverse,
+    ];
+    let (limit, square) = (friction * pressed, along[0] * along[0] + along[1] * along[1]);
+    if (limit * limit).any_less(square) {
+        let size = square.sqrt();
+        let scale = limit.select_less(size, limit / size.max(T::splat(1e-12)), T::splat(1.0));
+        along = [along[0] * scale, along[1] * scale];
+    }
+    let changes = [more, along[0] - impulse[1], along[1] - impulse[2]];
+    for i in 0..6 {
+        factored.u[i] += (normal.y[i] * changes[0] + first.y[i] * changes[1]) + second.y[i] * changes[2];
     }
     if leg < 4 {
-        for (z, g) in row.z.iter().zip(factored.g[leg]) {
-            sum += *z * g;
+        for i in 0..3 {
+            factored.g[leg][i] += (normal.z[i] * changes[0] + first.z[i] * changes[1]) + second.z[i] * changes[2];
         }
     }
-    sum * row.inverse
-}
-
-#[inline(always)]
-fn push<T: Lane>(factored: &mut Factored<T>, leg: usize, row: &Row<T>, impulse: T) {
-    for (u, y) in factored.u.iter_mut().zip(row.y) {
-        *u += y * impulse;
-    }
-    if leg < 4 {
-        for (g, z) in factored.g[leg].iter_mut().zip(row.z) {
-            *g += z * impulse;
-        }
-    }
-}
-
-/// Velocities that a row's rate comes from.
-struct Motion<'a, T> {
-    state: &'a State<T>,
-    /// Linear velocity of the base origin in base axes [m/s].
-    velocity: Vec3<T>,
-    moving: T,
+    *impulse = [pressed, along[0], along[1]];
 }
 
 /// A vector of the world in base axes.
 #[inline(always)]
 fn to_base<T: Lane>(world: Vec3<T>, axes: &[Vec3<T>; 3]) -> Vec3<T> {
     axes[0].scaled(world.0[0]) + axes[1].scaled(world.0[1]) + axes[2].scaled(world.0[2])
-}
-
-/// How soft a row is, and how far.
-struct Softness<T> {
-    time_constant: T,
-    distance: T,
-    dt: T,
-}
-
-/// The row of a point at `place` (base frame) along `direction`. Along the ground it has the normal row's
-/// regularisation, and only damps.
-#[inline(always)]
-fn contact_row<T: Lane>(
-    factored: &Factored<T>,
-    motion: &Motion<'_, T>,
-    leg: usize,
-    place: Vec3<T>,
-    direction: Vec3<T>,
-    softness: &Softness<T>,
-    regularisation: Option<T>,
-) -> Row<T> {
-    let turning = place.cross(direction);
-    let trunk = [turning.0[0], turning.0[1], turning.0[2], direction.0[0], direction.0[1], direction.0[2]];
-    let mut velocity = turning.dot(motion.state.angular_velocity) + direction.dot(motion.velocity);
-    let mut joints = [T::splat(0.0); 3];
-    if leg < 4 {
-        let part = &factored.legs[leg];
-        for (i, joint) in joints.iter_mut().enumerate() {
-            *joint = part.axes[i].cross(place - part.origins[i]).dot(direction);
-            velocity += *joint * motion.state.dq[3 * leg + i];
-        }
-    }
-    row(factored, motion.moving, leg, trunk, joints, velocity, softness, regularisation)
-}
-
-#[inline(always)]
-#[allow(clippy::too_many_arguments, reason = "everything a row is made of, once")]
-fn row<T: Lane>(
-    factored: &Factored<T>,
-    moving: T,
-    leg: usize,
-    mut trunk: [T; 6],
-    joints: [T; 3],
-    velocity: T,
-    softness: &Softness<T>,
-    regularisation: Option<T>,
-) -> Row<T> {
-    let (zero, one) = (T::splat(0.0), T::splat(1.0));
-    let mut z = [zero; 3];
-    if leg < 4 {
-        let part = &factored.legs[leg];
-        z = part.factor.forward(joints);
-        for (coupling, z) in part.coupling.iter().zip(z) {
-            for (entry, w) in trunk.iter_mut().zip(coupling) {
-                *entry -= *w * z;
-            }
-        }
-    }
-    let mut y = factored.trunk.forward(trunk);
-    let mut response = zero;
-    for value in &mut y {
-        *value = *value * moving;
-        response += *value * *value;
-    }
-    for value in z {
-        response += value * value;
-    }
-    let Softness { time_constant, distance, dt } = *softness;
-    let [shallow, deep] = IMPEDANCE;
-    let depth = ((-distance) * T::splat(1.0 / IMPEDANCE_WIDTH)).max(zero).min(one);
-    let impedance = T::splat(shallow) + depth * T::splat(deep - shallow);
-    let is_normal = regularisation.is_none();
-    let regularisation = match regularisation {
-        Some(of_normal) => of_normal,
-        None => (one - impedance) / impedance * response,
-    };
-    let rate = T::splat(2.0 / deep) / time_constant;
-    let mut wanted = -(rate * velocity);
-    if is_normal {
-        let stiffness = T::splat(1.0 / (deep * deep)) / (time_constant * time_constant);
-        wanted -= stiffness * impedance * distance;
-    }
-    let inverse = distance.select_less(zero, one / (response + regularisation), zero);
-    Row { y, z, regularisation, inverse, wanted: wanted * dt }
 }

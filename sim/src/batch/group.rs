@@ -1,13 +1,11 @@
 //! As many robots as there are lanes: their numbers, and one physics step of them all.
 
-use twinstep_model::{Placement, RigidBody, RobotModel, Variation};
+use glam::{DVec3, dvec3};
+use twinstep_model::lanes::{Factored, JointLoad, Lane, State, Tree, Vec3};
+use twinstep_model::{Command, PerJoint, Placement, RigidBody, RobotModel, Variation};
 
 use super::contact::{Constraints, Impulses, LEG_POINTS, POINTS, Surface};
-use super::dynamics::{Factored, Parameters, State};
-use super::lane::Lane;
-use super::spatial::{Inertia, Vec3};
 use crate::{Base, SimConfig};
-use glam::{DVec3, dvec3};
 
 /// Gravity [m/s²].
 const GRAVITY: f64 = 9.81;
@@ -15,13 +13,87 @@ const GRAVITY: f64 = 9.81;
 /// Robots in lanes, with everything that their next step depends on.
 #[derive(Clone)]
 pub struct Group<T> {
-    parameters: Parameters<T>,
+    tree: Tree<T>,
+    viscous_friction: [T; 12],
+    torque_limit: [T; 12],
     surface: Surface<T>,
-    /// What moves.
-    pub state: State<T>,
+    state: State<T>,
+    /// Torque of the last drive period [N·m].
+    tau: [T; 12],
     impulses: Impulses<T>,
     dt: T,
     iterations: usize,
+}
+
+/// How long robots are advanced.
+#[derive(Clone, Copy)]
+pub struct Time {
+    /// Periods of the drive.
+    pub drive_periods: usize,
+    /// Physics steps in each, under one torque.
+    pub steps: usize,
+}
+
+/// Where the torque of a drive period comes from.
+#[allow(clippy::large_enum_variant, reason = "made once a step, and never moved")]
+pub enum Drive<T> {
+    /// From outside [N·m].
+    Given([T; 12]),
+    /// The ideal drive: PD on the state that the period starts from, and feed-forward, clipped to the limit.
+    Pd {
+        /// Wanted position [rad].
+        q: [T; 12],
+        /// Wanted velocity [rad/s].
+        dq: [T; 12],
+        /// [N·m/rad]
+        kp: [T; 12],
+        /// [N·m·s/rad]
+        kd: [T; 12],
+        /// [N·m]
+        tau_ff: [T; 12],
+    },
+}
+
+impl<T: Lane> Drive<T> {
+    /// Torques from outside, one entry a robot.
+    pub fn given(tau: &[PerJoint]) -> Self {
+        let mut given = [T::splat(0.0); 12];
+        for (lane, tau) in tau.iter().enumerate() {
+            set(&mut given, lane, tau);
+        }
+        Self::Given(given)
+    }
+
+    /// The ideal drive under commands, one a robot.
+    pub fn pd(commands: &[Command]) -> Self {
+        let zero = [T::splat(0.0); 12];
+        let [mut q, mut dq, mut kp, mut kd, mut tau_ff] = [zero; 5];
+        for (lane, command) in commands.iter().enumerate() {
+            set(&mut q, lane, &command.q);
+            set(&mut dq, lane, &command.dq);
+            set(&mut kp, lane, &command.kp);
+            set(&mut kd, lane, &command.kd);
+            set(&mut tau_ff, lane, &command.tau_ff);
+        }
+        Self::Pd { q, dq, kp, kd, tau_ff }
+    }
+
+    #[inline(always)]
+    fn torque(&self, state: &State<T>, limit: &[T; 12]) -> [T; 12] {
+        match self {
+            Self::Given(tau) => *tau,
+            Self::Pd { q, dq, kp, kd, tau_ff } => {
+                let mut tau = *tau_ff;
+                for joint in 0..12 {
+                    tau[joint] += kp[joint] * (q[joint] - state.q[joint]) + kd[joint] * (dq[joint] - state.dq[joint]);
+                    // A torque that is not a number must not become the limit: it is to be seen.
+                    tau[joint] = tau[joint].max(-limit[joint]);
+                    tau[joint] = limit[joint].min(tau[joint]);
+                }
+                tau
+            }
+        }
+    }
 }
 
 /// One robot of a group: its lane of every number.
@@ -31,30 +103,15 @@ pub struct LaneSnapshot(Vec<f64>);
 impl<T: Lane> Group<T> {
     /// Robots that stand as `placement` says.
     pub fn new(robot: &RobotModel, config: &SimConfig, placement: &Placement) -> Self {
-        let zero = T::splat(0.0);
-        let legs = &robot.legs;
         let dt = 1.0 / f64::from(config.physics_hz);
-        let parameters = Parameters {
-            trunk: Inertia::splat(&robot.trunk),
-            bodies: legs.map(|leg| leg.bodies.map(|body| Inertia::splat(&body))),
-            hip: legs.map(|leg| Vec3::splat(leg.origins[0])),
-            thigh: legs.map(|leg| Vec3::splat(leg.origins[1])),
-            calf: legs.map(|leg| Vec3::splat(leg.origins[2])),
-            armature: robot.joints.map(|joint| T::splat(joint.armature)),
-            friction: zero,
-            moving: T::splat(if config.base == Base::Floating { 1.0 } else { 0.0 }),
-        };
+        let zero = [T::splat(0.0); 12];
         let mut group = Self {
-            parameters,
+            tree: Tree::splat(robot),
+            viscous_friction: zero,
+            torque_limit: zero,
             surface: surface(robot, config, dt),
-            state: State {
-                position: Vec3::zero(),
-                orientation: [zero; 4],
-                linear_velocity: Vec3::zero(),
-                angular_velocity: Vec3::zero(),
-                q: [zero; 12],
-                dq: [zero; 12],
-            },
+            state: State::origin(),
+            tau: zero,
             impulses: Impulses::zero(),
             dt: T::splat(dt),
             iterations: config.solver_iterations as usize,
@@ -67,17 +124,24 @@ impl<T: Lane> Group<T> {
 
     /// Places one robot anew.
     pub fn place(&mut self, lane: usize, robot: &RobotModel, placement: &Placement) {
-        let Variation { mass_scale, friction_scale, .. } = placement.variation;
-        let (trunk, scale) = (varied_trunk(robot, &placement.variation), f64::from(mass_scale));
-        self.parameters.trunk.set(lane, &trunk);
-        for (bodies, leg) in self.parameters.bodies.iter_mut().zip(&robot.legs) {
-            for (body, nominal) in bodies.iter_mut().zip(&leg.bodies) {
-                body.set(lane, &nominal.scaled(scale));
-            }
+        let variation = &placement.variation;
+        let mut varied = robot.clone();
+        varied.trunk = varied_trunk(robot, variation);
+        for body in varied.legs.iter_mut().flat_map(|leg| &mut leg.bodies) {
+            *body = body.scaled(f64::from(variation.mass_scale));
         }
-        self.parameters.friction.set(lane, robot.contact.friction * f64::from(friction_scale));
+        self.tree.set(lane, &varied);
+        for (index, joint) in robot.joints.iter().enumerate() {
+            self.viscous_friction[index].set(lane, joint.viscous_friction);
+            self.torque_limit[index].set(lane, joint.torque_limit);
+            self.surface.joint_friction[index].set(lane, joint.coulomb_friction);
+        }
+        self.surface.friction.set(lane, robot.contact.friction * f64::from(variation.friction_scale));
+        // Softer than two steps cannot be told from the step itself (MuJoCo's `refsafe`).
+        self.surface.time_constant.set(lane, robot.contact.time_constant.max(2.0 * self.dt.get(lane)));
+
         let state = &mut self.state;
-        let held = self.parameters.moving.get(lane) == 0.0;
+        let held = self.surface.moving.get(lane) == 0.0;
         let velocity = |given: [f32; 3]| if held { [0.0; 3] } else { given };
         set(&mut state.position.0, lane, &placement.base_position);
         set(&mut state.orientation, lane, &placement.base_orientation);
@@ -85,34 +149,42 @@ impl<T: Lane> Group<T> {
         set(&mut state.angular_velocity.0, lane, &velocity(placement.base_angular_velocity));
         set(&mut state.q, lane, &placement.q);
         set(&mut state.dq, lane, &placement.dq);
-        for point in &mut self.impulses.points {
-            set(point, lane, &[0.0; 3]);
-        }
-        for limits in &mut self.impulses.limits {
-            set(limits, lane, &[0.0; 2]);
+        set(&mut self.tau, lane, &PerJoint::default());
+        let Impulses { points, limits, frictions } = &mut self.impulses;
+        let impulses = points.iter_mut().flatten().chain(limits.iter_mut().flatten()).chain(frictions);
+        impulses.for_each(|impulse| impulse.set(lane, 0.0));
+    }
+
+    /// Advances all robots.
+    #[inline(always)]
+    pub fn advance(&mut self, drive: &Drive<T>, Time { drive_periods, steps }: Time) {
+        let (mut factored, mut constraints) = (Factored::empty(), Constraints::empty());
+        for _ in 0..drive_periods {
+            self.tau = drive.torque(&self.state, &self.torque_limit);
+            for _ in 0..steps {
+                self.step(&mut factored, &mut constraints);
+            }
         }
     }
 
-    /// Advances all robots by `steps` physics steps under the joint torques `tau` [N·m].
+    /// One physics step under the torque of this drive period.
     #[inline(always)]
-    pub fn step(&mut self, tau: &[T; 12], steps: usize) {
-        let mut constraints = Constraints::with_capacity();
-        for _ in 0..steps {
-            let mut factored = Factored::new(&self.parameters, &self.state, tau, self.dt, T::splat(GRAVITY));
-            let Self { parameters, state, surface, impulses, dt, .. } = self;
-            constraints.find(&factored, parameters, state, surface, impulses, *dt);
-            constraints.solve(&mut factored, impulses, parameters.friction, self.iterations);
-            let (trunk, joints) = factored.solution();
-            self.integrate(trunk, joints);
-        }
+    fn step(&mut self, factored: &mut Factored<T>, constraints: &mut Constraints<T>) {
+        let Self { tree, state, surface, impulses, dt, .. } = self;
+        let load = JointLoad { tau: self.tau, damping: self.viscous_friction };
+        factored.set_up(tree, state, &load, *dt, T::splat(GRAVITY), surface.moving);
+        constraints.find(factored, state, surface, impulses, *dt);
+        constraints.solve(factored, impulses, surface, *dt, self.iterations);
+        let (trunk, joints) = factored.solution();
+        self.integrate(trunk, joints);
     }
 
     /// Semi-implicit Euler: velocities first, then positions with the new ones.
     #[inline(always)]
     fn integrate(&mut self, trunk: [T; 6], joints: [T; 12]) {
-        let (dt, moving, state) = (self.dt, self.parameters.moving, &mut self.state);
-        for (joint, change) in joints.into_iter().enumerate() {
-            state.dq[joint] += change;
+        let (dt, moving, state) = (self.dt, self.surface.moving, &mut self.state);
+        for joint in 0..12 {
+            state.dq[joint] += joints[joint];
             state.q[joint] += dt * state.dq[joint];
         }
         let [ax, ay, az, lx, ly, lz] = trunk;
@@ -123,6 +195,16 @@ impl<T: Lane> Group<T> {
             state.linear_velocity + Vec3([axes[0].dot(change), axes[1].dot(change), axes[2].dot(change)]);
         state.position = state.position + state.linear_velocity.scaled(dt);
         state.orientation = turned(state.orientation, state.angular_velocity.scaled(dt));
+    }
+
+    /// What moves.
+    pub fn state(&self) -> &State<T> {
+        &self.state
+    }
+
+    /// Torque of the last drive period [N·m].
+    pub fn tau(&self) -> &[T; 12] {
+        &self.tau
     }
 
     /// Normal force on each foot in the last step [N].
@@ -138,10 +220,10 @@ impl<T: Lane> Group<T> {
     }
 
     /// One robot's lane of everything that its next step depends on.
-    pub fn snapshot(&self, lane: usize) -> LaneSnapshot {
-        let mut values = Vec::new();
-        // Reading does not change the clone.
-        self.clone().visit(|value| values.push(value.get(lane)));
+    /// `&mut` because there is one visitor, which can also write.
+    pub fn snapshot(&mut self, lane: usize) -> LaneSnapshot {
+        let mut values = Vec::with_capacity(512);
+        self.visit(|value| values.push(value.get(lane)));
         LaneSnapshot(values)
     }
 
@@ -153,17 +235,23 @@ impl<T: Lane> Group<T> {
 
     /// Visits every number that differs between robots, always in the same order.
     fn visit(&mut self, mut visit: impl FnMut(&mut T)) {
-        let Self { parameters, state, impulses, .. } = self;
-        let bodies = parameters.bodies.iter_mut().flatten();
-        for body in std::iter::once(&mut parameters.trunk).chain(bodies) {
+        let Self { tree, viscous_friction, torque_limit, surface, state, tau, impulses, .. } = self;
+        let Tree { trunk, bodies, hip, thigh, calf, armature } = tree;
+        for body in std::iter::once(trunk).chain(bodies.iter_mut().flatten()) {
             visit(&mut body.mass);
             body.moment.0.iter_mut().chain(&mut body.about_origin).for_each(&mut visit);
         }
-        visit(&mut parameters.friction);
+        let origins = hip.iter_mut().chain(thigh).chain(calf);
+        origins.flat_map(|origin| &mut origin.0).for_each(&mut visit);
+        armature.iter_mut().chain(viscous_friction).chain(torque_limit).for_each(&mut visit);
+        surface.joint_friction.iter_mut().for_each(&mut visit);
+        visit(&mut surface.friction);
+        visit(&mut surface.time_constant);
         let State { position, orientation, linear_velocity, angular_velocity, q, dq } = state;
         position.0.iter_mut().chain(orientation).chain(&mut linear_velocity.0).for_each(&mut visit);
-        angular_velocity.0.iter_mut().chain(q).chain(dq).for_each(&mut visit);
-        impulses.points.iter_mut().flatten().chain(impulses.limits.iter_mut().flatten()).for_each(&mut visit);
+        angular_velocity.0.iter_mut().chain(q).chain(dq).chain(tau).for_each(&mut visit);
+        let Impulses { points, limits, frictions } = impulses;
+        points.iter_mut().flatten().chain(limits.iter_mut().flatten()).chain(frictions).for_each(&mut visit);
     }
 }
 
@@ -190,15 +278,18 @@ fn surface<T: Lane>(robot: &RobotModel, config: &SimConfig, dt: f64) -> Surface<
     };
     let normal = DVec3::from(config.terrain.ground().normal.map(f64::from));
     let across = normal.cross(DVec3::X).normalize();
+    let zero = T::splat(0.0);
     Surface {
         leg_points: [points; 4],
         radii: [shapes.foot_radius, shapes.calf_radius, shapes.calf_radius].map(T::splat),
         corners: std::array::from_fn(corner),
         ground: [normal, across.cross(normal), across].map(Vec3::splat),
-        // Softer than two steps cannot be told from the step itself (MuJoCo's `refsafe`).
-        time_constant: T::splat(robot.contact.time_constant.max(2.0 * dt)),
+        friction: zero,
+        time_constant: zero,
         limits: robot.joints.map(|joint| joint.range.map(T::splat)),
         limit_time_constant: T::splat(2.0 * dt),
+        joint_friction: [zero; 12],
+        moving: T::splat(if config.base == Base::Floating { 1.0 } else { 0.0 }),
     }
 }
 

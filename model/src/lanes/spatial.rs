@@ -3,9 +3,9 @@
 use std::ops::{Add, Neg, Sub};
 
 use glam::{DMat3, DVec3};
-use twinstep_model::RigidBody;
 
 use super::lane::Lane;
+use crate::RigidBody;
 
 /// A vector.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -16,6 +16,13 @@ impl<T: Lane> Vec3<T> {
     #[inline(always)]
     pub fn splat(value: DVec3) -> Self {
         Self([T::splat(value.x), T::splat(value.y), T::splat(value.z)])
+    }
+
+    /// Sets the vector of one robot.
+    pub fn set(&mut self, lane: usize, value: DVec3) {
+        for (component, value) in self.0.iter_mut().zip(value.to_array()) {
+            component.set(lane, value);
+        }
     }
 
     /// Zero.
@@ -213,6 +220,11 @@ pub struct Cholesky<T, const N: usize> {
 }
 
 impl<T: Lane, const N: usize> Cholesky<T, N> {
+    /// Of nothing, to be replaced.
+    pub(super) fn empty() -> Self {
+        Self { factor: [[T::splat(0.0); N]; N], inverse: [T::splat(0.0); N] }
+    }
+
     /// Factors `matrix`, of which only the lower triangle is read.
     #[inline(always)]
     pub fn new(mut matrix: [[T; N]; N]) -> Self {

@@ -1,0 +1,236 @@
+//! Groups of one lane type, below one seam: which lanes run is chosen when a backend is made.
+
+use rayon::ThreadPool;
+use rayon::prelude::*;
+#[cfg(not(target_arch = "x86_64"))]
+use twinstep_model::lanes::F32x4 as Baseline;
+#[cfg(target_arch = "x86_64")]
+use twinstep_model::lanes::{Avx2F32, Avx2F64, Avx512F32, Sse2F32 as Baseline};
+use twinstep_model::lanes::{Instructions, Lane};
+use twinstep_model::{Command, PerJoint, Placement, RobotModel, RobotStates, RobotStatesMut};
+
+use super::group::{Drive, Group, LaneSnapshot, Time};
+use crate::SimConfig;
+
+/// Groups that one thread steps at a time: a drive period of one takes some ten microseconds, about what it takes to
+/// wake a thread.
+const GROUPS_A_TASK: usize = 4;
+
+/// Which numbers robots are simulated in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Lanes {
+    /// Single precision in the registers of these instructions: for learning.
+    Single(Instructions),
+    /// Double precision in the widest registers of this processor: for identification.
+    Double,
+}
+
+/// What turns into torque.
+#[derive(Clone, Copy)]
+pub enum Input<'a> {
+    /// Commands that the ideal drive follows, one a robot.
+    Commands(&'a [Command]),
+    /// Torques [N·m], one entry a robot, held.
+    Torques(&'a [PerJoint]),
+}
+
+/// Robots in groups of any lane type.
+pub trait Robots: Send + Sync {
+    /// Places `robot` anew.
+    fn place(&mut self, robot: usize, model: &RobotModel, placement: &Placement);
+    /// Copies the state of `robot` out.
+    fn read(&self, robot: usize, states: &mut RobotStates);
+    /// Advances the active robots on the threads of `pool`, or on this one, and copies their states out. True if all
+    /// numbers are finite.
+    fn advance(
+        &mut self,
+        pool: Option<&ThreadPool>,
+        input: Input,
+        active: &[bool],
+        time: Time,
+        states: &mut RobotStates,
+    ) -> bool;
+    /// The full state of `robot`.
+    fn snapshot(&self, robot: usize) -> LaneSnapshot;
+    /// Puts `robot` back.
+    fn restore(&mut self, robot: usize, snapshot: &LaneSnapshot);
+}
+
+/// `num_robots` robots that stand as `placement` says.
+///
+/// # Panics
+/// If the processor lacks the instructions that `lanes` names.
+pub fn robots(
+    lanes: Lanes,
+    model: &RobotModel,
+    config: &SimConfig,
+    placement: &Placement,
+    num_robots: usize,
+) -> Box<dyn Robots> {
+    let instructions = match lanes {
+        Lanes::Single(instructions) => instructions,
+        Lanes::Double => Instructions::best(),
+    };
+    assert!(Instructions::available().contains(&instructions), "this processor has no {instructions:?}");
+    macro_rules! of {
+        ($lane:ty, $advance:ident) => {
+            Box::new(Groups::<$lane>::new(model, config, placement, num_robots, $advance))
+        };
+    }
+    match lanes {
+        #[cfg(target_arch = "x86_64")]
+        Lanes::Single(Instructions::Avx512) => of!(Avx512F32, advance_avx512),
+        #[cfg(target_arch = "x86_64")]
+        Lanes::Single(Instructions::Avx2) => of!(Avx2F32, advance_avx2),
+        #[cfg(target_arch = "x86_64")]
+        Lanes::Double if instructions >= Instructions::Avx2 => of!(Avx2F64, advance_avx2_double),
+        Lanes::Single(_) => of!(Baseline, advance_baseline),
+        Lanes::Double => of!(f64, advance_baseline),
+    }
+}
+
+/// Advances one group.
+type Advance<T> = fn(&mut Group<T>, &Drive<T>, Time);
+
+struct Groups<T> {
+    groups: Vec<Group<T>>,
+    advance: Advance<T>,
+}
+
+impl<T: Lane> Groups<T> {
+    fn new(
+        model: &RobotModel,
+        config: &SimConfig,
+        placement: &Placement,
+        num_robots: usize,
+        advance: Advance<T>,
+    ) -> Self {
+        let group = Group::new(model, config, placement);
+        Self { groups: vec![group; num_robots.div_ceil(T::LANES)], advance }
+    }
+}
+
+impl<T: Lane> Robots for Groups<T> {
+    fn place(&mut self, robot: usize, model: &RobotModel, placement: &Placement) {
+        self.groups[robot / T::LANES].place(robot % T::LANES, model, placement);
+    }
+
+    fn read(&self, robot: usize, states: &mut RobotStates) {
+        let mut chunk = states.chunks_mut(T::LANES).nth(robot / T::LANES).expect("the robot exists");
+        read(&self.groups[robot / T::LANES], robot % T::LANES, &mut chunk);
+    }
+
+    fn advance(
+        &mut self,
+        pool: Option<&ThreadPool>,
+        input: Input,
+        active: &[bool],
+        time: Time,
+        states: &mut RobotStates,
+    ) -> bool {
+        let (lanes, advance) = (T::LANES, self.advance);
+        let mut chunks: Vec<_> = states.chunks_mut(lanes).collect();
+        let one = |(index, (group, states)): (usize, (&mut Group<T>, &mut RobotStatesMut))| {
+            let robots = index * lanes..(index * lanes + lanes).min(active.len());
+            let drive = match input {
+                Input::Commands(commands) => Drive::pd(&commands[robots.clone()]),
+                Input::Torques(tau) => Drive::given(&tau[robots.clone()]),
+            };
+            advance_active(group, advance, &drive, &active[robots], time, states)
+        };
+        match pool {
+            Some(pool) if self.groups.len() > GROUPS_A_TASK => pool.install(|| {
+                let groups = self.groups.par_iter_mut().zip(&mut chunks).enumerate();
+                groups.with_min_len(GROUPS_A_TASK).map(one).reduce(|| true, |finite, other| finite && other)
+            }),
+            _ => {
+                self.groups.iter_mut().zip(&mut chunks).enumerate().map(one).fold(true, |finite, other| finite && other)
+            }
+        }
+    }
+
+    fn snapshot(&self, robot: usize) -> LaneSnapshot {
+        self.groups[robot / T::LANES].clone().snapshot(robot % T::LANES)
+    }
+
+    fn restore(&mut self, robot: usize, snapshot: &LaneSnapshot) {
+        self.groups[robot / T::LANES].restore(robot % T::LANES, snapshot);
+    }
+}
+
+/// Advances the active robots of a group and copies them out; the others stay as they are. True if all numbers are
+/// finite.
+fn advance_active<T: Lane>(
+    group: &mut Group<T>,
+    advance: Advance<T>,
+    drive: &Drive<T>,
+    active: &[bool],
+    time: Time,
+    states: &mut RobotStatesMut,
+) -> bool {
+    if active.iter().all(|active| !active) {
+        return true;
+    }
+    let asleep = (0..active.len()).filter(|lane| !active[*lane]);
+    let asleep: Vec<_> = asleep.map(|lane| (lane, group.snapshot(lane))).collect();
+    advance(group, drive, time);
+    for (lane, snapshot) in asleep {
+        group.restore(lane, &snapshot);
+    }
+    let mut finite = true;
+    for lane in (0..active.len()).filter(|lane| active[*lane]) {
+        finite &= read(group, lane, states);
+    }
+    finite
+}
+
+/// Copies one robot of a group out; true if all its numbers are finite.
+fn read<T: Lane>(group: &Group<T>, lane: usize, states: &mut RobotStatesMut) -> bool {
+    let state = group.state();
+    states.base_position[lane] = values(&state.position.0, lane);
+    states.base_orientation[lane] = values(&state.orientation, lane);
+    states.base_linear_velocity[lane] = values(&state.linear_velocity.0, lane);
+    states.base_angular_velocity[lane] = values(&state.angular_velocity.0, lane);
+    states.q[lane] = values(&state.q, lane);
+    states.dq[lane] = values(&state.dq, lane);
+    states.tau[lane] = values(group.tau(), lane);
+    states.foot_force[lane] = std::array::from_fn(|leg| group.foot_force(lane, leg) as f32);
+    states.body_contact[lane] = group.body_contact(lane);
+    // What is not finite anywhere makes the sum so; a sum of finite numbers as small as these is finite.
+    let sum = |values: &[f32]| values.iter().sum::<f32>();
+    let trunk = sum(&states.base_position[lane]) + sum(&states.base_orientation[lane]);
+    let velocity = sum(&states.base_linear_velocity[lane]) + sum(&states.base_angular_velocity[lane]);
+    (trunk + velocity + sum(&states.q[lane]) + sum(&states.dq[lane]) + sum(&states.tau[lane])).is_finite()
+}
+
+fn values<T: Lane, const N: usize>(values: &[T; N], lane: usize) -> [f32; N] {
+    values.map(|value| value.get(lane) as f32)
+}
+
+/// A function that advances a group, with the instructions that its lanes are made of.
+macro_rules! entry {
+    ($safe:ident, $entry:ident, $feature:literal, $lane:ty) => {
+        #[cfg(target_arch = "x86_64")]
+        fn $safe(group: &mut Group<$lane>, drive: &Drive<$lane>, time: Time) {
+            // SAFETY: `robots` has made sure that the processor has them.
+            #[allow(unsafe_code)]
+            unsafe {
+                $entry(group, drive, time);
+            }
+        }
+
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = $feature)]
+        fn $entry(group: &mut Group<$lane>, drive: &Drive<$lane>, time: Time) {
+            group.advance(drive, time);
+        }
+    };
+}
+
+entry!(advance_avx512, enter_avx512, "avx512f", Avx512F32);
+entry!(advance_avx2, enter_avx2, "avx2", Avx2F32);
+entry!(advance_avx2_double, enter_avx2_double, "avx2", Avx2F64);
+
+fn advance_baseline<T: Lane>(group: &mut Group<T>, drive: &Drive<T>, time: Time) {
+    group.advance(drive, time);
+}
