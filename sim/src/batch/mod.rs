@@ -65,6 +65,7 @@ impl BatchBackend {
     ) -> Result<Self, BuildError> {
         config.check(&robot.control)?;
         check_tree(&robot)?;
+        config.terrain.check_plane()?;
         let pool = crate::rapier::thread_pool(config.threads)?;
         let placement = Placement::at_rest(0.32, robot.control.default_pose_f32());
         let group = Group::new(&robot, &config, &placement);

@@ -1,0 +1,173 @@
+//! Rough ground: robots stand on it, and server and client have the same.
+
+use glam::{Quat, Vec3};
+use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_env_server::{Config, Host, SimHost};
+use twinstep_envs::TaskName;
+use twinstep_model::{
+    AutoresetMode, Backend, Command, Ground, NUM_LEGS, Placement, Pose, ResetRequest, ShapeKind, VecEnv, body_poses,
+    frames, go2,
+};
+use twinstep_sim::{RapierBackend, Rough, SimConfig, Terrain};
+
+use crate::remote::{config, start};
+
+fn rough(height_m: f32, cell_m: f32, seed: u64) -> Terrain {
+    Terrain::Rough(Rough { height_m, cell_m, size_m: 20.0, seed })
+}
+
+fn backend(terrain: Terrain, clearance: f32) -> RapierBackend {
+    let robot = go2();
+    let q = robot.control.default_pose_f32();
+    let mut backend = RapierBackend::new(robot, SimConfig { terrain, threads: 1, ..SimConfig::default() }, 1).unwrap();
+    let placement = Placement::above(&backend.ground(), backend.robot(), q, clearance);
+    backend.reset(&[(0, placement)]).unwrap();
+    backend
+}
+
+/// How far each foot's ball is from the nearest point of the ground [m].
+fn foot_gaps(backend: &RapierBackend, ground: &Ground) -> [f32; NUM_LEGS] {
+    let (robot, states) = (backend.robot(), backend.states());
+    let world_from_base = Pose {
+        position: Vec3::from(states.base_position[0]),
+        rotation: frames::world_from_base(states.base_orientation[0]),
+    };
+    let poses = body_poses(robot, world_from_base, &states.q[0]);
+    std::array::from_fn(|leg| {
+        let centre = poses[3 + 3 * leg].transform(robot.shapes.foot_centre.as_vec3());
+        let around = (-30..=30).flat_map(|x| (-30..=30).map(move |y| (x as f32 / 1000.0, y as f32 / 1000.0)));
+        let distance = around
+            .map(|(dx, dy)| Vec3::new(dx, dy, ground.height(centre.x + dx, centre.y + dy) - centre.z).length())
+            .fold(f32::INFINITY, f32::min);
+        let side = if centre.z < ground.height(centre.x, centre.y) { -1.0 } else { 1.0 };
+        side * distance - robot.shapes.foot_radius as f32
+    })
+}
+
+/// A robot that stood for ten seconds.
+fn stood(terrain: Terrain) -> RapierBackend {
+    let mut backend = backend(terrain, 0.01);
+    let hold = Command::hold(go2().control.default_pose_f32(), 60.0, 2.0);
+    backend.step(&[hold], &[true], 2000).unwrap();
+    backend
+}
+
+#[test]
+fn robot_stands_with_its_feet_on_rough_ground() {
+    for seed in 1..=3 {
+        let backend = stood(rough(0.05, 0.25, seed));
+        let (gaps, states) = (foot_gaps(&backend, &backend.ground()), backend.states());
+        for (gap, force) in gaps.iter().zip(states.foot_force[0]) {
+            assert!(*gap > -0.005, "seed {seed}: a foot is {gap} m in the ground");
+            assert!((force > 0.0) == (*gap < 0.001), "seed {seed}: {gap} m from the ground with {force} N");
+        }
+        assert!(!states.body_contact[0], "seed {seed}");
+        assert!(frames::gravity_in_base(states.base_orientation[0]).z < -0.98, "seed {seed}");
+    }
+}
+
+#[test]
+fn robot_on_gentle_ground_weighs_its_mass() {
+    let weight = go2().total_mass() as f32 * 9.81;
+    for seed in 1..=3 {
+        // Forces are along the normals: on triangles of slope 0.1 they add up to less than the weight, by up to 0.5 %.
+        let force: f32 = stood(rough(0.02, 0.25, seed)).states().foot_force[0].iter().sum();
+        assert!((force / weight - 1.0).abs() < 0.01, "seed {seed}: {force} N on the feet, weight {weight} N");
+    }
+}
+
+#[test]
+fn robot_that_is_dropped_or_kicks_does_not_fall_through() {
+    for (seed, height) in [(1, 0.1), (2, 0.5), (3, 1.0)] {
+        let mut backend = backend(rough(0.1, 0.2, seed), height);
+        let ground = backend.ground();
+        let pose = go2().control.default_pose_f32();
+        let mut deepest = f32::INFINITY;
+        for period in 0..1000 {
+            let kick = std::array::from_fn(|j| pose[j] + 0.5 * ((period / 20 * 12 + j) as f32 * 2.4).sin());
+            backend.step(&[Command::hold(kick, 60.0, 1.0)], &[true], 1).unwrap();
+            let [x, y, z] = backend.states().base_position[0];
+            deepest = deepest.min(z - ground.height(x, y));
+        }
+        assert!(deepest > 0.03, "dropped from {height} m: the trunk was {deepest} m above the ground");
+    }
+}
+
+#[test]
+fn robot_beside_the_field_stands_on_level_ground() {
+    let mut backend = backend(rough(0.05, 0.25, 1), 0.0);
+    let q = go2().control.default_pose_f32();
+    let placement = Placement { base_position: [10.5, -3.0, 0.34], ..Placement::at_rest(0.34, q) };
+    backend.reset(&[(0, placement)]).unwrap();
+    backend.step(&[Command::hold(q, 60.0, 2.0)], &[true], 400).unwrap();
+    assert!((0.27..0.33).contains(&backend.states().base_position[0][2]), "{:?}", backend.states().base_position[0]);
+}
+
+const CONFIG: &str = "
+[sim]
+terrain = { rough = { height_m = 0.08, cell_m = 0.25, size_m = 30.0, seed = 7 } }
+";
+
+#[test]
+fn server_with_rough_ground_in_its_file_sends_the_heights_around_the_robot() {
+    let file = Config::parse(CONFIG, "server.toml").unwrap();
+    let terrain = file.sim.terrain;
+    let (server, endpoint) = start(&Config { sim: file.sim, ..config(TaskName::Walk) });
+    let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
+    env.reset(&ResetRequest::seeded(1, 2)).unwrap();
+    for _ in 0..50 {
+        assert!(!env.step(&[0.0; 24]).unwrap().terminated.contains(&true), "who stands still does not fall");
+    }
+    let scene = env.scene(1).unwrap();
+    let (sent, whole) = (scene.ground.height_field.unwrap(), terrain.ground());
+    assert_eq!(sent.cell(), 0.25);
+    assert!(sent.shape().iter().all(|count| (64..=68).contains(count)), "8 m to each side: {:?}", sent.shape());
+    let [x, y, z, ..] = scene.pose[0];
+    for (dx, dy) in [(0.0, 0.0), (1.3, -0.7), (-3.1, 2.2)] {
+        assert!((sent.height(x + dx, y + dy) - whole.height(x + dx, y + dy)).abs() < 1e-5);
+    }
+    assert!(
+        (0.25..0.42).contains(&(z - whole.height(x, y))),
+        "the trunk is {} m above the ground",
+        z - whole.height(x, y)
+    );
+    assert!(sent.heights().iter().any(|height| *height > 0.07));
+    server.stop();
+}
+
+#[test]
+fn server_refuses_rough_ground_that_cannot_be_before_it_starts() {
+    for (text, wanted) in [
+        (
+            "[sim]\nterrain = { rough = { height_m = 9.0, cell_m = 0.25, seed = 7 } }",
+            "`sim.terrain.rough.height_m` = 9",
+        ),
+        (
+            "[sim]\nengine = \"batch\"\nterrain = { rough = { height_m = 0.1, cell_m = 0.25, seed = 7 } }",
+            "use `rapier`",
+        ),
+    ] {
+        let config = Config::parse(text, "server.toml").unwrap();
+        let error = SimHost::new(config).err().unwrap().to_string();
+        assert!(error.contains(wanted), "{error}");
+    }
+}
+
+#[test]
+fn walk_on_a_steep_slope_starts_with_the_feet_on_it() {
+    let mut config = config(TaskName::Walk);
+    config.sim.terrain = Terrain::SlopeRad(0.3);
+    config.task.start_position_noise_rad = 0.0;
+    let mut env = SimHost::new(config).unwrap().build(1, AutoresetMode::NextStep, None).unwrap();
+    env.reset(&ResetRequest::default()).unwrap();
+    let up = Ground { normal: [-0.3f32.sin(), 0.0, 0.3f32.cos()], ..Ground::FLAT }.up();
+    let scene = env.scene(0).unwrap();
+    let feet = scene.shapes.iter().filter(|shape| shape.kind == ShapeKind::Sphere && shape.body > 0).map(|shape| {
+        let [x, y, z, qw, qx, qy, qz] = scene.pose[shape.body as usize];
+        let world_from_body = Pose { position: Vec3::new(x, y, z), rotation: Quat::from_xyzw(qx, qy, qz, qw) };
+        let [x, y, z, ..] = shape.offset;
+        up.dot(world_from_body.transform(Vec3::new(x, y, z))) - shape.size[0]
+    });
+    let gaps: Vec<f32> = feet.collect();
+    assert!(gaps.len() == 4 && gaps.iter().all(|gap| (0.0..0.025).contains(gap)), "{gaps:?}");
+}
