@@ -55,7 +55,7 @@ pub struct Args {
     /// Who integrates the equations of motion: rapier (the reference) or batch (many robots in SIMD lanes, fast).
     #[arg(long, value_parser = engine)]
     engine: Option<Engine>,
-    /// Rate of the physics [Hz]; a multiple of the drive's 200.
+    /// Rate of the physics [Hz]; a multiple of the drive's 200. Without: rapier 200, batch 1000.
     #[arg(long, value_name = "HZ")]
     physics_hz: Option<u32>,
     /// Threads that step robots; 0 takes all cores.
@@ -117,7 +117,7 @@ impl Args {
         server.shared_memory |= self.shared_memory;
         set(&mut config.task.name, self.task.as_ref());
         set(&mut config.sim.engine, self.engine.as_ref());
-        set(&mut config.sim.physics_hz, self.physics_hz.as_ref());
+        config.sim.physics_hz = self.physics_hz.or(config.sim.physics_hz);
         set(&mut config.sim.threads, self.threads.as_ref());
         config.check().map_err(input)?;
         Ok(config)

@@ -23,7 +23,7 @@ pub struct TaskConfig {
     pub tracking_width: f32,
     /// The episode ends when the base tilts by more than this [rad].
     pub max_tilt_rad: f32,
-    /// The episode ends when the base sinks below this height [m].
+    /// The episode ends when the base sinks below this height above the ground under it [m].
     pub min_base_height_m: f32,
     /// Joints start within this distance of the default pose [rad].
     pub start_position_noise_rad: f32,

@@ -3,8 +3,8 @@
 use glam::Vec3;
 use rand::RngExt;
 use twinstep_model::{
-    AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, PerJoint, PerLeg, Placement,
-    ResetRequest, Scene, StepBatch, Stream, Variation, VecEnv, frames, stream,
+    AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, Ground, PerJoint, PerLeg,
+    Placement, ResetRequest, Scene, StepBatch, Stream, Variation, VecEnv, frames, stream,
 };
 
 use crate::config::Range;
@@ -14,8 +14,8 @@ use crate::{ConfigError, Randomisation, RewardWeights, TaskConfig};
 
 /// A foot counts as on the ground above this force [N].
 const FOOT_CONTACT: f32 = 1.0;
-/// Height of the base above the ground in the default pose, with a centimetre to fall [m].
-const START_HEIGHT: f32 = 0.33;
+/// Height from which the lowest foot falls when an episode starts [m].
+const START_CLEARANCE: f32 = 0.01;
 /// Share of a joint's range that counts as safe.
 const SOFT_RANGE: f32 = 0.9;
 
@@ -37,6 +37,8 @@ pub struct TaskSettings {
 /// Many walking robots on a backend.
 pub struct TaskEnv<B: Backend> {
     backend: B,
+    /// The backend's; it does not change.
+    ground: Ground,
     spec: EnvSpec,
     task: TaskConfig,
     randomise: Randomisation,
@@ -91,6 +93,7 @@ impl<B: Backend> TaskEnv<B> {
             active: vec![true; num_envs],
             batch: StepBatch::new(num_envs, OBS_LEN),
             terms: vec![0.0; terms],
+            ground: backend.ground(),
             backend,
             task,
             randomise,
@@ -143,7 +146,7 @@ impl<B: Backend> TaskEnv<B> {
         let q = self.default_pose.map(|position| position + draw(&mut episode.stream, [-noise, noise]));
         episode.start();
         self.draw_command(env);
-        Placement { variation, ..Placement::at_rest(START_HEIGHT, q) }
+        Placement { variation, ..Placement::above(&self.ground, self.backend.robot(), q, START_CLEARANCE) }
     }
 
     fn draw_command(&mut self, env: usize) {
@@ -207,8 +210,9 @@ impl<B: Backend> TaskEnv<B> {
         self.task.reward.evaluate(&moment, &mut self.terms);
         let reward = self.terms.iter().sum();
         episode.add(clipped, reward, &self.terms);
-        let fallen =
-            -gravity.z < self.task.max_tilt_rad.cos() || states.base_position[env][2] < self.task.min_base_height_m;
+        let [x, y, z] = states.base_position[env];
+        let base_height = z - self.ground.height(x, y);
+        let fallen = -gravity.z < self.task.max_tilt_rad.cos() || base_height < self.task.min_base_height_m;
         let timed_out = episode.length >= self.spec.max_episode_steps;
         let resample_steps = (self.task.command_resample_s / self.spec.policy_dt as f32).round().max(1.0) as u32;
         if episode.length.is_multiple_of(resample_steps) {
@@ -312,7 +316,7 @@ impl<B: Backend> VecEnv for TaskEnv<B> {
             return Err(EnvError::NeedsReset { env });
         }
         let backend = &self.backend;
-        let scene = Scene::new(backend.robot(), backend.states(), env, backend.ground());
+        let scene = Scene::new(backend.robot(), backend.states(), env, &self.ground);
         Ok(Scene { command: Some(episode.command), ..scene })
     }
 }

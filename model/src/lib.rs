@@ -9,6 +9,7 @@
 //! - [`VecEnv`]: many environments that are reset and stepped together, in process or over a network, and
 //!   [`EnvSpec`], what a client must know of them.
 //! - [`Scene`]: what it takes to draw a robot; [`body_poses`], where its bodies are.
+//! - [`Ground`]: what robots stand on: a plane, or a [`HeightField`] in it.
 //! - [`stream`]: one seed gives every consumer its own reproducible random numbers.
 //!
 //! SI units, radians, seconds. Vectors live in the world or the base frame, as their docs say; the base frame is the
@@ -18,6 +19,8 @@ mod backend;
 mod body;
 pub mod frames;
 mod go2;
+mod ground;
+mod height_field;
 mod joint;
 mod kinematics;
 pub mod lanes;
@@ -32,11 +35,13 @@ mod vec_env;
 pub use backend::{Actuator, Backend, BackendError, PdDrive};
 pub use body::RigidBody;
 pub use go2::go2;
+pub use ground::Ground;
+pub use height_field::{HeightField, HeightFieldError};
 pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};
 pub use kinematics::{NUM_BODIES, Pose, body_poses};
 pub use model_file::ModelFileError;
 pub use robot::{Contact, Control, JointModel, LegModel, RobotModel, Shapes};
-pub use scene::{Ground, Scene, SceneShape, ShapeKind};
+pub use scene::{Scene, SceneShape, ShapeKind};
 pub use spec::{EnvSpec, Field};
 pub use state::{Command, Placement, RobotStates, RobotStatesMut, Variation};
 pub use stream::{Stream, stream};

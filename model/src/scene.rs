@@ -4,7 +4,7 @@ use glam::{DVec3, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
 use crate::kinematics::{Pose, body_poses};
-use crate::{JOINT_NAMES, Leg, RobotModel, RobotStates, frames};
+use crate::{Ground, JOINT_NAMES, Leg, RobotModel, RobotStates, frames};
 
 /// A picture's contents. Poses are `[x, y, z, w, x, y, z]`: position [m], then quaternion.
 #[derive(Clone, Debug, PartialEq)]
@@ -15,7 +15,7 @@ pub struct Scene {
     pub pose: Vec<[f32; 7]>,
     /// What the bodies look like; the same in every scene of a robot.
     pub shapes: Vec<SceneShape>,
-    /// The ground.
+    /// The ground; of a height field the part around the robot.
     pub ground: Ground,
     /// Wanted velocity of the base, in its frame: forward [m/s], left [m/s], yaw [rad/s]. `None` if the task has none.
     pub command: Option<[f32; 3]>,
@@ -46,23 +46,9 @@ pub enum ShapeKind {
     Sphere,
 }
 
-/// The plane that the robot stands on.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Ground {
-    /// A point of it in the world [m].
-    pub point: [f32; 3],
-    /// Its unit normal in the world.
-    pub normal: [f32; 3],
-}
-
-impl Ground {
-    /// The plane z = 0.
-    pub const FLAT: Ground = Ground { point: [0.0; 3], normal: [0.0, 0.0, 1.0] };
-}
-
 impl Scene {
     /// Robot `index` of `states` on `ground`.
-    pub fn new(robot: &RobotModel, states: &RobotStates, index: usize, ground: Ground) -> Self {
+    pub fn new(robot: &RobotModel, states: &RobotStates, index: usize, ground: &Ground) -> Self {
         let world_from_base = Pose {
             position: Vec3::from(states.base_position[index]),
             rotation: frames::world_from_base(states.base_orientation[index]),
@@ -72,7 +58,7 @@ impl Scene {
             bodies: ["trunk"].iter().chain(&JOINT_NAMES).map(ToString::to_string).collect(),
             pose: poses.map(Pose::to_array).to_vec(),
             shapes: shapes(robot),
-            ground,
+            ground: ground.around(world_from_base.position.x, world_from_base.position.y),
             command: None,
         }
     }
@@ -134,7 +120,7 @@ mod tests {
         let mut states = RobotStates::new(1);
         states.q[0] = robot.control.default_pose_f32();
         states.base_position[0] = [0.0, 0.0, 0.32];
-        Scene::new(&robot, &states, 0, Ground::FLAT)
+        Scene::new(&robot, &states, 0, &Ground::FLAT)
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! What a robot is told and what it is found doing: commands, states, placements.
 
-use crate::{NUM_JOINTS, PerJoint, PerLeg};
+use glam::{Quat, Vec3};
+
+use crate::{Ground, NUM_JOINTS, PerJoint, PerLeg, Pose, RobotModel, body_poses, frames};
 
 /// What the drives of one robot are told for one control period.
 ///
@@ -161,6 +163,31 @@ impl Placement {
             variation: Variation::default(),
         }
     }
+
+    /// At rest above the origin of `ground` and along its plane, with joints at `q` [rad].
+    ///
+    /// The lowest foot is `clearance` [m] above what is under it; a knee or a corner of the trunk that meets the ground
+    /// before the feet do raises the robot further.
+    pub fn above(ground: &Ground, robot: &RobotModel, q: PerJoint, clearance: f32) -> Self {
+        let rotation = Quat::from_rotation_arc(Vec3::Z, ground.up());
+        let poses = body_poses(robot, Pose { position: Vec3::ZERO, rotation }, &q);
+        let shapes = &robot.shapes;
+        let half = shapes.trunk_half_size.as_vec3();
+        let corners = [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)].map(|(x, y)| half * Vec3::new(x, y, -1.0));
+        let trunk = corners.map(|corner| (poses[0].transform(corner), 0.0));
+        let legs = (0..4).flat_map(|leg| {
+            let calf = poses[3 + 3 * leg];
+            let [knee, shin] = shapes.calf_ends.map(|end| (end, shapes.calf_radius));
+            [knee, shin, (shapes.foot_centre, shapes.foot_radius)]
+                .map(|(centre, radius)| (calf.transform(centre.as_vec3()), radius as f32))
+        });
+        let lift = trunk
+            .into_iter()
+            .chain(legs)
+            .map(|(point, radius)| ground.clear_height(point.x, point.y, radius) - point.z)
+            .fold(f32::NEG_INFINITY, f32::max);
+        Self { base_orientation: frames::to_wxyz(rotation), ..Self::at_rest(lift + clearance, q) }
+    }
 }
 
 /// How one robot's body and ground differ from the model's.
@@ -180,5 +207,66 @@ impl Default for Variation {
     /// The robot exactly as its model has it.
     fn default() -> Self {
         Self { mass_scale: 1.0, payload: 0.0, com_shift: [0.0; 3], friction_scale: 1.0 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::{HeightField, go2};
+
+    /// Distance of each foot's ball from the ground, along the vertical [m].
+    fn gaps(placement: &Placement, ground: &Ground) -> [f32; 4] {
+        let robot = go2();
+        let world_from_base = Pose {
+            position: Vec3::from(placement.base_position),
+            rotation: frames::world_from_base(placement.base_orientation),
+        };
+        let poses = body_poses(&robot, world_from_base, &placement.q);
+        std::array::from_fn(|leg| {
+            let centre = poses[3 + 3 * leg].transform(robot.shapes.foot_centre.as_vec3());
+            centre.z - ground.clear_height(centre.x, centre.y, robot.shapes.foot_radius as f32)
+        })
+    }
+
+    /// The default pose has the rear feet 1 cm higher than the front feet, with the trunk level.
+    const REAR_FEET: f32 = 0.01;
+
+    #[test]
+    fn front_feet_of_the_default_pose_touch_flat_ground_from_0_32_m() {
+        let robot = go2();
+        let placement = Placement::above(&Ground::FLAT, &robot, robot.control.default_pose_f32(), 0.0);
+        assert!((placement.base_position[2] - 0.3235).abs() < 1e-4, "{:?}", placement.base_position);
+        let [front_left, front_right, rear_left, rear_right] = gaps(&placement, &Ground::FLAT);
+        assert!(front_left.abs().max(front_right.abs()) < 1e-6, "{front_left} {front_right}");
+        assert!((rear_left - REAR_FEET).abs().max((rear_right - REAR_FEET).abs()) < 1e-3, "{rear_left} {rear_right}");
+    }
+
+    #[test]
+    fn feet_are_as_far_from_a_slope_as_from_flat_ground() {
+        let robot = go2();
+        let ground = Ground { normal: [-0.3f32.sin(), 0.0, 0.3f32.cos()], ..Ground::FLAT };
+        let [level, sloping] = [&Ground::FLAT, &ground]
+            .map(|ground| gaps(&Placement::above(ground, &robot, robot.control.default_pose_f32(), 0.0), ground));
+        for (level, sloping) in level.iter().zip(sloping) {
+            assert!((level - sloping * 0.3f32.cos()).abs() < 1e-5, "{level} {sloping}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn no_foot_starts_in_rough_ground_and_one_is_as_near_as_asked(seed: u64, bend in -0.2f32..0.2) {
+            let robot = go2();
+            let field = HeightField::rough(0.1, 0.1, 40, seed).expect("a field");
+            let ground = Ground { height_field: Some(Arc::new(field)), ..Ground::FLAT };
+            let q = robot.control.default_pose_f32().map(|q| q + bend);
+            let gaps = gaps(&Placement::above(&ground, &robot, q, 0.01), &ground);
+            let nearest = gaps.into_iter().fold(f32::INFINITY, f32::min);
+            prop_assert!((nearest - 0.01).abs() < 1e-5, "{gaps:?}");
+        }
     }
 }

@@ -1,6 +1,8 @@
 //! Between messages and the types of `twinstep-model`.
 
-use twinstep_model::{EndedEpisode, EnvError, EnvSpec, ResetRequest, Scene, StepBatch};
+use std::sync::Arc;
+
+use twinstep_model::{EndedEpisode, EnvError, EnvSpec, Ground, HeightField, ResetRequest, Scene, StepBatch};
 
 use crate::{Code, PROTOCOL, WireError, encode, message, tensor};
 
@@ -94,10 +96,20 @@ pub fn read_step(
 pub fn encode_scene(scene: Scene) -> Vec<u8> {
     let Scene { bodies, pose, shapes, ground, command } = scene;
     let pose = tensor::as_bytes(&pose);
-    encode(&message::RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground, command })
+    encode(&message::RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground: send_ground(&ground), command })
 }
 
-/// A scene as received. Every body must have a pose, and every shape a body.
+/// The ground of a scene, for a message.
+pub fn send_ground(ground: &Ground) -> message::Ground<'_> {
+    let height_field = ground.height_field.as_deref().map(|field| {
+        let [rows, columns] = field.shape().map(|count| count as u32);
+        let heights = tensor::as_bytes(field.heights());
+        message::HeightField { corner: field.corner(), cell: field.cell(), rows, columns, heights }
+    });
+    message::Ground { point: ground.point, normal: ground.normal, height_field }
+}
+
+/// A scene as received. Every body must have a pose, every shape a body, and every vertex of the ground a height.
 pub fn read_scene(reply: message::RenderReply<'_>) -> Result<Scene, WireError> {
     let message::RenderReply { bodies, pose, shapes, ground, command, .. } = reply;
     let pose: Vec<[f32; 7]> = tensor::read(pose, "pose")?;
@@ -106,7 +118,20 @@ pub fn read_scene(reply: message::RenderReply<'_>) -> Result<Scene, WireError> {
         let message = format!("`shapes` has body {}; there are {}", shape.body, bodies.len());
         return Err(WireError::new(Code::OutOfRange, "shapes", message));
     }
-    Ok(Scene { bodies, pose, shapes, ground, command })
+    Ok(Scene { bodies, pose, shapes, ground: read_ground(ground)?, command })
+}
+
+fn read_ground(ground: message::Ground<'_>) -> Result<Ground, WireError> {
+    let message::Ground { point, normal, height_field } = ground;
+    let height_field = height_field.map(read_height_field).transpose()?.map(Arc::new);
+    Ok(Ground { point, normal, height_field })
+}
+
+fn read_height_field(field: message::HeightField<'_>) -> Result<HeightField, WireError> {
+    let message::HeightField { corner, cell, rows, columns, heights } = field;
+    let heights: Vec<f32> = tensor::read(heights, "heights")?;
+    HeightField::new(corner, cell, [rows, columns].map(|count| count as usize), heights)
+        .map_err(|error| WireError::new(Code::BadShape, "height_field", error.to_string()))
 }
 
 /// Fails if `given` is not `wanted`.

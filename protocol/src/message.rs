@@ -4,7 +4,7 @@
 //! left out.
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::{AutoresetMode, EnvSpec, Ground, SceneShape};
+use twinstep_model::{AutoresetMode, EnvSpec, SceneShape};
 
 /// Asks a server who it is.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -215,11 +215,40 @@ pub struct RenderReply<'a> {
     pub pose: &'a [u8],
     /// What the bodies look like.
     pub shapes: Vec<SceneShape>,
-    /// The plane that the robot stands on.
-    pub ground: Ground,
+    /// What the robot stands on.
+    #[serde(borrow)]
+    pub ground: Ground<'a>,
     /// Wanted velocity in the base frame: forward [m/s], left [m/s], yaw [rad/s].
     #[serde(default)]
     pub command: Option<[f32; 3]>,
+}
+
+/// The ground: a plane, with a height field in it where it is rough.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Ground<'a> {
+    /// A point of the plane in the world [m].
+    pub point: [f32; 3],
+    /// Its unit normal in the world.
+    pub normal: [f32; 3],
+    /// The heights around the robot. Left out where the ground is the plane.
+    #[serde(default, borrow, skip_serializing_if = "Option::is_none")]
+    pub height_field: Option<HeightField<'a>>,
+}
+
+/// Heights on a grid, as [`twinstep_model::HeightField`] has them.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct HeightField<'a> {
+    /// x and y of the first vertex in the world [m].
+    pub corner: [f32; 2],
+    /// Distance between neighbouring vertices [m].
+    pub cell: f32,
+    /// Number of vertices along x.
+    pub rows: u32,
+    /// Number of vertices along y.
+    pub columns: u32,
+    /// Height of every vertex in the world [m], `rows × columns` × f32.
+    #[serde(borrow, with = "serde_bytes")]
+    pub heights: &'a [u8],
 }
 
 /// What [`ResetRequest`], [`StepRequest`] and [`CloseRequest`] have in common: enough to tell whether to execute one.

@@ -10,9 +10,10 @@
 
 mod batch;
 mod config;
+mod ground_shapes;
 mod rapier;
 mod robot_world;
 
 pub use batch::{BatchBackend, BatchSnapshot, Lanes};
-pub use config::{Base, Engine, SimConfig, SimConfigError, Terrain};
+pub use config::{Base, Engine, Rough, SimConfig, SimConfigError, Terrain};
 pub use rapier::{BuildError, RapierBackend, RobotSnapshot};

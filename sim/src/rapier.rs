@@ -5,6 +5,7 @@ use twinstep_model::{
     Actuator, Backend, BackendError, Command, Ground, PdDrive, PerJoint, Placement, RobotModel, RobotStates,
 };
 
+use crate::ground_shapes::GroundShapes;
 use crate::robot_world::{RobotWorld, WorldSnapshot};
 use crate::{SimConfig, SimConfigError};
 
@@ -12,6 +13,8 @@ use crate::{SimConfig, SimConfigError};
 pub struct RapierBackend {
     robot: RobotModel,
     config: SimConfig,
+    ground: Ground,
+    ground_shapes: GroundShapes,
     worlds: Vec<RobotWorld>,
     states: RobotStates,
     drive: Box<dyn Actuator>,
@@ -69,9 +72,12 @@ impl RapierBackend {
     ) -> Result<Self, BuildError> {
         config.check(&robot.control)?;
         let pool = thread_pool(config.threads)?;
-        let placement = Placement::at_rest(0.32, robot.control.default_pose_f32());
-        let worlds = (0..num_robots).map(|_| RobotWorld::new(&robot, &config, &placement)).collect();
-        let mut this = Self { robot, config, worlds, states: RobotStates::new(num_robots), drive, pool };
+        let ground = config.terrain.ground();
+        let ground_shapes = GroundShapes::new(&ground);
+        let placement = Placement::above(&ground, &robot, robot.control.default_pose_f32(), 0.0);
+        let worlds = (0..num_robots).map(|_| RobotWorld::new(&robot, &config, &ground_shapes, &placement)).collect();
+        let states = RobotStates::new(num_robots);
+        let mut this = Self { robot, config, ground, ground_shapes, worlds, states, drive, pool };
         for index in 0..num_robots {
             this.read_state(index);
         }
@@ -131,7 +137,7 @@ impl Backend for RapierBackend {
     }
 
     fn ground(&self) -> Ground {
-        self.config.terrain.ground()
+        self.ground.clone()
     }
 
     fn reset(&mut self, placements: &[(usize, Placement)]) -> Result<(), BackendError> {
@@ -140,7 +146,7 @@ impl Backend for RapierBackend {
         }
         for (robot, placement) in placements {
             let robot = *robot;
-            self.worlds[robot] = RobotWorld::new(&self.robot, &self.config, placement);
+            self.worlds[robot] = RobotWorld::new(&self.robot, &self.config, &self.ground_shapes, placement);
             self.drive.reset(robot);
             self.read_state(robot);
             self.states.tau[robot] = PerJoint::default();

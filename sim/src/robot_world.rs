@@ -14,7 +14,8 @@ use glam::{DVec3, Quat, Vec3};
 use rapier3d::prelude::*;
 use twinstep_model::{Joint, JointKind, Leg, NUM_JOINTS, PerJoint, PerLeg, Placement, RigidBody, RobotModel, frames};
 
-use crate::{Base, SimConfig, Terrain};
+use crate::ground_shapes::GroundShapes;
+use crate::{Base, SimConfig};
 
 /// Stiffness of the spring that carries a joint's torque [N·m/rad].
 const TORQUE_SPRING: f32 = 1e-3;
@@ -62,11 +63,11 @@ struct RootFrame {
 
 impl RobotWorld {
     /// Builds the robot where `placement` has it.
-    pub fn new(robot: &RobotModel, config: &SimConfig, placement: &Placement) -> Self {
+    pub fn new(robot: &RobotModel, config: &SimConfig, ground: &GroundShapes, placement: &Placement) -> Self {
         let mut world = PhysicsWorld { gravity: Vec3::new(0.0, 0.0, -9.81), ..PhysicsWorld::default() };
         world.integration_parameters = integration_parameters(robot, config);
         let friction = robot.contact.friction as f32 * placement.variation.friction_scale;
-        insert_ground(&mut world, config.terrain, friction);
+        insert_ground(&mut world, ground, friction);
 
         let (trunk_body, leg_scale) = varied_bodies(robot, placement);
         let trunk_com = trunk_body.com.as_vec3();
@@ -256,8 +257,8 @@ fn integration_parameters(robot: &RobotModel, config: &SimConfig) -> Integration
     let softness =
         SpringCoefficients::new(robot.contact.natural_frequency() as f32, robot.contact.damping_ratio as f32);
     IntegrationParameters {
-        dt: 1.0 / config.physics_hz as f32,
-        num_solver_iterations: config.solver_iterations as usize,
+        dt: 1.0 / config.physics_hz() as f32,
+        num_solver_iterations: config.solver_iterations() as usize,
         max_ccd_substeps: 0,
         contact_softness: softness,
         static_contact_softness: softness,
@@ -265,9 +266,10 @@ fn integration_parameters(robot: &RobotModel, config: &SimConfig) -> Integration
     }
 }
 
-fn insert_ground(world: &mut PhysicsWorld, terrain: Terrain, friction: f32) {
-    let ground = SharedShape::halfspace(Vec3::from(terrain.ground().normal));
-    world.insert_collider(ColliderBuilder::new(ground).friction(friction).collision_groups(GROUND_GROUP), None);
+fn insert_ground(world: &mut PhysicsWorld, ground: &GroundShapes, friction: f32) {
+    for collider in ground.colliders() {
+        world.insert_collider(collider.friction(friction).collision_groups(GROUND_GROUP), None);
+    }
 }
 
 /// The trunk with this placement's payload and shift, and the factor on the legs' bodies.
@@ -340,7 +342,7 @@ fn foot_sphere(robot: &RobotModel) -> ColliderBuilder {
 mod tests {
     use std::f32::consts::TAU;
 
-    use twinstep_model::{body_poses, go2};
+    use twinstep_model::{Ground, body_poses, go2};
 
     use super::*;
 
@@ -351,7 +353,7 @@ mod tests {
         let q = std::array::from_fn(|j| robot.control.default_pose[j] as f32 + 0.2 * (j as f32).sin());
         let tilted = Quat::from_euler(glam::EulerRot::ZYX, 0.1 * TAU, 0.05 * TAU, -0.03 * TAU);
         let placement = Placement { base_orientation: frames::to_wxyz(tilted), ..Placement::at_rest(0.6, q) };
-        let mut world = RobotWorld::new(&robot, &SimConfig::default(), &placement);
+        let mut world = RobotWorld::new(&robot, &SimConfig::default(), &GroundShapes::new(&Ground::FLAT), &placement);
         for steps in [0, 40] {
             world.step(&std::array::from_fn(|j| (j as f32).cos()), steps);
             let (mut q, mut dq) = (PerJoint::default(), PerJoint::default());

@@ -1,7 +1,9 @@
 //! The batch engine against rapier and against physics.
 
 use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, Variation, go2};
-use twinstep_sim::{Base, BatchBackend, BatchBackend as Simulator, RapierBackend, SimConfig};
+use twinstep_sim::{Base, BatchBackend, BatchBackend as Simulator, Engine, RapierBackend, SimConfig};
+
+const ENGINE: Engine = Engine::Batch;
 
 #[path = "physics.rs"]
 #[allow(clippy::duplicate_mod, reason = "the same tests for each engine")]
@@ -15,7 +17,13 @@ fn pose() -> PerJoint {
 }
 
 fn at(physics_hz: u32, solver_iterations: u32, base: Base) -> SimConfig {
-    SimConfig { physics_hz, solver_iterations, base, threads: 1, ..SimConfig::default() }
+    SimConfig {
+        physics_hz: Some(physics_hz),
+        solver_iterations: Some(solver_iterations),
+        base,
+        threads: 1,
+        ..SimConfig::default()
+    }
 }
 
 fn finest_rapier(base: Base) -> RapierBackend {

@@ -13,5 +13,6 @@ mod raw_client;
 mod remote;
 mod render;
 mod security;
+mod terrain;
 mod tidy;
 mod wire;

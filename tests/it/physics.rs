@@ -6,12 +6,12 @@ use glam::{DMat3, DVec3, Vec3};
 use twinstep_model::{Backend, Command, Joint, NUM_JOINTS, PerJoint, Placement, RobotModel, frames, go2};
 use twinstep_sim::{Base, SimConfig, Terrain};
 
-use super::Simulator;
+use super::{ENGINE, Simulator};
 
 const GRAVITY: f32 = 9.81;
 
 fn backend(config: SimConfig, placement: Placement) -> Simulator {
-    let mut backend = Simulator::new(go2(), SimConfig { threads: 1, ..config }, 1).unwrap();
+    let mut backend = Simulator::new(go2(), SimConfig { engine: ENGINE, threads: 1, ..config }, 1).unwrap();
     backend.reset(&[(0, placement)]).unwrap();
     backend
 }
@@ -71,7 +71,7 @@ fn momentum(robot: &RobotModel, backend: &Simulator) -> (DVec3, DVec3, DVec3) {
 #[test]
 fn dropped_robot_falls_as_galilei_says() {
     let mut backend = backend(
-        SimConfig { physics_hz: 400, solver_iterations: 1, ..SimConfig::default() },
+        SimConfig { physics_hz: Some(400), solver_iterations: Some(1), ..SimConfig::default() },
         Placement::at_rest(10.0, default_pose()),
     );
     run(&mut backend, &hold_default_pose(), 1.0);
@@ -89,7 +89,7 @@ fn momentum_is_kept_in_flight_while_the_legs_swing() {
         base_angular_velocity: [1.0, 1.5, -0.8],
         ..Placement::at_rest(20.0, default_pose())
     };
-    let mut backend = backend(SimConfig { physics_hz: 1000, ..SimConfig::default() }, placement);
+    let mut backend = backend(SimConfig { physics_hz: Some(1000), ..SimConfig::default() }, placement);
     let (linear, _, com) = momentum(&robot, &backend);
     let about_com = |backend: &Simulator| {
         let (linear, angular, com) = momentum(&robot, backend);
@@ -120,7 +120,7 @@ fn torque_step_turns_the_calf_by_its_inertia() {
     for joint in (0..NUM_JOINTS).filter(|joint| *joint != calf) {
         robot.joints[joint].armature = 1e4;
     }
-    let stand = SimConfig { base: Base::Fixed, physics_hz: 1000, threads: 1, ..SimConfig::default() };
+    let stand = SimConfig { base: Base::Fixed, physics_hz: Some(1000), threads: 1, ..SimConfig::default() };
     let speed_after = |torque: f32| {
         let mut backend = Simulator::new(robot.clone(), stand, 1).unwrap();
         backend.reset(&[(0, Placement::at_rest(2.0, default_pose()))]).unwrap();
@@ -158,7 +158,7 @@ fn standing_robot_weighs_its_mass_and_stays_where_it_is() {
 fn robot_on_a_slope_slides_only_beyond_the_friction_angle() {
     let friction = go2().contact.friction as f32;
     let slid = |angle: f32| {
-        let config = SimConfig { physics_hz: 1000, terrain: Terrain::SlopeRad(angle), ..SimConfig::default() };
+        let config = SimConfig { physics_hz: Some(1000), terrain: Terrain::SlopeRad(angle), ..SimConfig::default() };
         // Crouched and stiff, so that it slides before it tips over.
         let crouch: PerJoint = Joint::map_kinds(0.0, 1.3, -2.6);
         let placement = Placement {

@@ -1,6 +1,8 @@
 //! The rapier engine against physics.
 
-use twinstep_sim::RapierBackend as Simulator;
+use twinstep_sim::{Engine, RapierBackend as Simulator};
+
+const ENGINE: Engine = Engine::Rapier;
 
 #[path = "physics.rs"]
 #[allow(clippy::duplicate_mod, reason = "the same tests for each engine")]

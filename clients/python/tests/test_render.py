@@ -12,14 +12,31 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from twinstep.render import Viewer
+from twinstep.render import Viewer, _HeightField, _meet_field  # pyright: ignore[reportPrivateUsage]
 
-GOLDEN = Path(__file__).parents[3] / "protocol" / "golden" / "render_reply.msgpack"
+GOLDEN = Path(__file__).parents[3] / "protocol" / "golden"
+
+
+def golden(name: str) -> dict[str, Any]:
+    unpack = cast(Callable[[bytes], dict[str, Any]], msgpack.unpackb)  # pyright: ignore[reportUnknownMemberType]
+    return unpack((GOLDEN / f"{name}.msgpack").read_bytes())
 
 
 def scene(**changes: Any) -> dict[str, Any]:
-    unpack = cast(Callable[[bytes], dict[str, Any]], msgpack.unpackb)  # pyright: ignore[reportUnknownMemberType]
-    return {**unpack(GOLDEN.read_bytes()), **changes}
+    return {**golden("render_reply"), **changes}
+
+
+def field(heights: NDArray[np.float32], cell: float) -> dict[str, Any]:
+    """A square of heights around the origin, as a server sends it."""
+    rows, columns = heights.shape
+    corner = [-0.5 * cell * (rows - 1), -0.5 * cell * (columns - 1)]
+    sent = heights.astype("<f4").tobytes()
+    return {"corner": corner, "cell": cell, "rows": rows, "columns": columns, "heights": sent}
+
+
+def on_field(heights: NDArray[np.float32], cell: float, **changes: Any) -> dict[str, Any]:
+    flat = scene()["ground"]
+    return scene(ground={**flat, "height_field": field(heights, cell)}, **changes)
 
 
 def moved(by: tuple[float, float, float]) -> dict[str, Any]:
@@ -73,6 +90,37 @@ def test_camera_follows_and_the_ground_passes_by() -> None:
 def test_ground_rises_with_the_slope() -> None:
     slope = scene(ground={"point": [0.0, 0.0, 0.0], "normal": [-0.38941833, 0.0, 0.92106104]})
     assert differing(Viewer("rgb_array").draw(scene()), Viewer("rgb_array").draw(slope)).mean() > 0.2
+
+
+def test_level_field_looks_like_the_plane_that_it_is() -> None:
+    level = on_field(np.zeros((81, 81), dtype=np.float32), 0.25)
+    assert differing(Viewer("rgb_array").draw(scene()), Viewer("rgb_array").draw(level)).mean() < 0.02
+
+
+def test_field_that_rises_evenly_looks_like_the_slope() -> None:
+    angle = 0.2
+    x = np.linspace(-10.0, 10.0, 81, dtype=np.float32) * np.float32(np.tan(angle))
+    rising = _HeightField.read(field(np.repeat(x[:, None], 81, axis=1), 0.25))
+    across, along = np.meshgrid(np.linspace(-1, 1, 161), np.linspace(-1, 1, 121))
+    rays = np.stack([across, along, np.full_like(across, -1)], axis=2).astype(np.float32)
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    start = np.array([0.5, -0.5, 1.0], dtype=np.float32)
+    normal = np.array([-np.sin(angle), 0.0, np.cos(angle)], dtype=np.float32)
+    expected = -(start @ normal) / (rays @ normal)
+    assert np.allclose(_meet_field(rising, start, rays), expected, atol=1e-3)
+
+
+def test_hills_and_the_golden_heights_are_drawn() -> None:
+    rough = scene(ground=golden("render_reply_rough")["ground"])
+    assert differing(Viewer("rgb_array").draw(scene()), Viewer("rgb_array").draw(rough)).mean() > 0.05
+    heights = np.zeros((41, 41), dtype=np.float32)
+    # Between the robot at (0.5, 0) and the camera, which looks from its front right.
+    heights[22:26, 17] = 0.6
+    hidden, seen = (
+        differing(Viewer("rgb_array").draw(on_field(one, 0.2)), Viewer("rgb_array").draw(on_field(one, 0.2, shapes=[])))
+        for one in (heights, np.zeros_like(heights))
+    )
+    assert hidden.sum() < 0.8 * seen.sum(), "a hill hides a part of the robot"
 
 
 def test_unknown_mode_is_refused_by_name() -> None:

@@ -4,7 +4,7 @@ use std::fmt::Debug;
 
 use proptest::prelude::*;
 use serde::{Deserialize, Serialize};
-use twinstep_model::{AutoresetMode, EndedEpisode, StepBatch};
+use twinstep_model::{AutoresetMode, EndedEpisode, Scene, StepBatch};
 use twinstep_protocol::message::{
     CloseReply, CloseRequest, EnvHeader, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply,
     RenderRequest, ResetReply, ResetRequest, StepReply, StepRequest,
@@ -249,4 +249,18 @@ fn scene_survives_the_wire_and_a_shape_without_a_body_is_refused() {
     assert_eq!((error.code, error.message.as_str()), (Code::OutOfRange, "`shapes` has body 2; there are 2"));
     let error = convert::read_scene(RenderReply { pose: &reply.pose[..28], ..reply }).expect_err("one pose of two");
     assert_eq!((error.code, error.field.as_str()), (Code::BadShape, "pose"));
+}
+
+#[test]
+fn rough_ground_survives_the_wire_and_a_grid_with_too_few_heights_is_refused() {
+    let scene = Scene { ground: golden::rough_ground(), ..golden::small_scene() };
+    let bytes = convert::encode_scene(scene.clone());
+    let mut reply: RenderReply<'_> = decode(&bytes).expect("what was encoded decodes");
+    assert_eq!(convert::read_scene(reply.clone()).expect("it fits"), scene);
+    for (rows, columns) in [(3, 2), (0, 0), (u32::MAX, u32::MAX)] {
+        let field = reply.ground.height_field.as_mut().expect("it was sent");
+        (field.rows, field.columns) = (rows, columns);
+        let error = convert::read_scene(reply.clone()).expect_err("nine heights are no such grid");
+        assert_eq!((error.code, error.field.as_str()), (Code::BadShape, "height_field"), "{rows} × {columns}");
+    }
 }

@@ -7,7 +7,8 @@ use std::fmt::Debug;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::{AutoresetMode, EnvSpec, Field, Ground, Scene, SceneShape, ShapeKind};
+use twinstep_model::{AutoresetMode, EnvSpec, Field, Ground, HeightField, Scene, SceneShape, ShapeKind};
+use twinstep_protocol::convert::send_ground;
 use twinstep_protocol::message::{
     CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply, RenderRequest,
     ResetReply, ResetRequest, StepReply, StepRequest,
@@ -16,7 +17,7 @@ use twinstep_protocol::tensor::as_bytes;
 use twinstep_protocol::{Code, PROTOCOL, WireError, decode, encode};
 
 /// Name of every golden file, without `.msgpack`.
-pub const NAMES: [&str; 17] = [
+pub const NAMES: [&str; 18] = [
     "hello_request",
     "hello_reply",
     "lease_request",
@@ -33,6 +34,7 @@ pub const NAMES: [&str; 17] = [
     "close_reply",
     "render_request",
     "render_reply",
+    "render_reply_rough",
     "error",
 ];
 
@@ -214,9 +216,16 @@ pub fn small_scene() -> Scene {
             shape(1, ShapeKind::Capsule, [0.03125, 0.09375, 0.0], -0.125),
             shape(1, ShapeKind::Sphere, [0.03125, 0.0, 0.0], -0.25),
         ],
-        ground: Ground { point: [0.0; 3], normal: [0.0, 0.0, 1.0] },
+        ground: Ground::FLAT,
         command: Some([1.0, 0.0, -0.5]),
     }
+}
+
+/// Four metres with a hill of 0.375 m on the far side and a ridge to the left.
+pub fn rough_ground() -> Ground {
+    let heights = vec![0.0, 0.0, 0.125, 0.0, 0.0625, 0.125, 0.0, 0.375, 0.25];
+    let field = HeightField::new([-2.0, -1.0], 2.0, [3, 3], heights).expect("a field");
+    Ground { height_field: Some(field.into()), ..Ground::FLAT }
 }
 
 #[test]
@@ -224,7 +233,10 @@ fn render_has_its_golden_bytes() {
     check("render_request", &RenderRequest { protocol: PROTOCOL, epoch: 1, env: 1 });
     let Scene { bodies, pose, shapes, ground, command } = small_scene();
     let pose = as_bytes(&pose);
-    check("render_reply", &RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground, command });
+    let flat = RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground: send_ground(&ground), command };
+    check("render_reply", &flat);
+    let rough = rough_ground();
+    check("render_reply_rough", &RenderReply { ground: send_ground(&rough), ..flat });
 }
 
 #[test]

@@ -81,6 +81,14 @@ fn tables_have_exactly_the_fields_of_the_messages() {
 }
 
 #[test]
+fn tables_have_exactly_the_fields_of_the_ground() {
+    let Some(Value::Map(mut ground)) = golden_map("render_reply_rough").remove("ground") else { panic!("a map") };
+    assert_eq!(first_cells(section("### ground\n")), ground.keys().cloned().collect());
+    let Some(Value::Map(field)) = ground.remove("height_field") else { panic!("a map") };
+    assert_eq!(first_cells(section("### height field\n")), field.into_keys().collect());
+}
+
+#[test]
 fn every_field_at_any_depth_is_named() {
     let mut fields = BTreeSet::new();
     for name in golden::NAMES {

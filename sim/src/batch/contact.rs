@@ -6,6 +6,7 @@
 
 use twinstep_model::lanes::{Factored, Lane, State, Vec3};
 
+use super::ground::{Patch, Terrain};
 use super::rows::{JointRow, PointRow, Row, Softness};
 
 /// Points of a leg that can touch: the foot, the calf's far end, the knee.
@@ -22,8 +23,8 @@ pub struct Surface<T> {
     pub radii: [T; LEG_POINTS],
     /// The trunk's corners in the base frame [m].
     pub corners: [Vec3<T>; 8],
-    /// Normal of the ground, and two directions along it, in the world.
-    pub ground: [Vec3<T>; 3],
+    /// What the robots stand on.
+    pub ground: Terrain<T>,
     /// Coefficient of friction at the ground.
     pub friction: T,
     /// Time constant of a contact [s]; at least two steps.
@@ -142,18 +143,9 @@ impl<T: Lane> Constraints<T> {
         dt: T,
     ) {
         let zero = T::splat(0.0);
-        let axes = state.world_axes();
-        // The ground's directions in base axes, and the base origin's height over it.
-        let [normal, first, second] = surface.ground;
-        let directions = [to_base(normal, &axes), to_base(first, &axes), to_base(second, &axes)];
-        let height = normal.dot(state.position);
-        let velocity = to_base(state.linear_velocity, &axes);
-        // Most of the time no corner is near the ground.
-        let half = surface.corners[7];
-        let lowest_corner = height
-            - (directions[0].0[0] * half.0[0]).abs()
-            - (directions[0].0[1] * half.0[1]).abs()
-            - (directions[0].0[2] * half.0[2]).abs();
+        let near = surface.ground.near(state);
+        // Most of the time no corner of the trunk is near the ground.
+        let lowest_corner = near.lowest_corner(surface.corners[7]);
         let points = if lowest_corner.any_less(zero) { POINTS } else { 4 * LEG_POINTS };
         for corner in &mut impulses.points[points..] {
             *corner = [zero; 3];
@@ -165,7 +157,8 @@ impl<T: Lane> Constraints<T> {
             } else {
                 (4, surface.corners[point - 4 * LEG_POINTS], zero)
             };
-            let distance = height + directions[0].dot(centre) - radius;
+            let Patch { height, directions } = near.below(centre);
+            let distance = height - radius;
             if !distance.any_less(zero) {
                 impulses.points[point] = [zero; 3];
                 continue;
@@ -175,7 +168,7 @@ impl<T: Lane> Constraints<T> {
             }
             let softness = Softness { time_constant: surface.time_constant, distance, dt };
             let place = centre - directions[0].scaled(radius);
-            let row = PointRow { factored, state, velocity, leg, place, moving: surface.moving };
+            let row = PointRow { factored, state, velocity: near.velocity, leg, place, moving: surface.moving };
             let block = self.points.next();
             (block.leg, block.point) = (leg, point);
             block.rows[0] = row.normal(directions[0], &softness);
@@ -295,10 +288,4 @@ fn solve_point<T: Lane>(factored: &mut Factored<T>, block: &PointBlock<T>, impul
         }
     }
     *impulse = [pressed, along[0], along[1]];
-}
-
-/// A vector of the world in base axes.
-#[inline(always)]
-fn to_base<T: Lane>(world: Vec3<T>, axes: &[Vec3<T>; 3]) -> Vec3<T> {
-    axes[0].scaled(world.0[0]) + axes[1].scaled(world.0[1]) + axes[2].scaled(world.0[2])
 }

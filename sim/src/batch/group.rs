@@ -2,9 +2,10 @@
 
 use glam::{DVec3, dvec3};
 use twinstep_model::lanes::{Factored, JointLoad, Lane, State, Tree, Vec3};
-use twinstep_model::{Command, PerJoint, Placement, RigidBody, RobotModel, Variation};
+use twinstep_model::{Command, Ground, PerJoint, Placement, RigidBody, RobotModel, Variation};
 
 use super::contact::{Constraints, Impulses, LEG_POINTS, POINTS, Surface};
+use super::ground::Terrain;
 use crate::{Base, SimConfig};
 
 /// Gravity [m/s²].
@@ -102,19 +103,19 @@ pub struct LaneSnapshot(Vec<f64>);
 
 impl<T: Lane> Group<T> {
     /// Robots that stand as `placement` says.
-    pub fn new(robot: &RobotModel, config: &SimConfig, placement: &Placement) -> Self {
-        let dt = 1.0 / f64::from(config.physics_hz);
+    pub fn new(robot: &RobotModel, config: &SimConfig, ground: &Ground, placement: &Placement) -> Self {
+        let dt = 1.0 / f64::from(config.physics_hz());
         let zero = [T::splat(0.0); 12];
         let mut group = Self {
             tree: Tree::splat(robot),
             viscous_friction: zero,
             torque_limit: zero,
-            surface: surface(robot, config, dt),
+            surface: surface(robot, config, ground, dt),
             state: State::origin(),
             tau: zero,
             impulses: Impulses::zero(),
             dt: T::splat(dt),
-            iterations: config.solver_iterations as usize,
+            iterations: config.solver_iterations() as usize,
         };
         for lane in 0..T::LANES {
             group.place(lane, robot, placement);
@@ -268,7 +269,7 @@ fn varied_trunk(robot: &RobotModel, variation: &Variation) -> RigidBody {
     RigidBody { com: trunk.com + DVec3::from(variation.com_shift.map(f64::from)), ..trunk }
 }
 
-fn surface<T: Lane>(robot: &RobotModel, config: &SimConfig, dt: f64) -> Surface<T> {
+fn surface<T: Lane>(robot: &RobotModel, config: &SimConfig, ground: &Ground, dt: f64) -> Surface<T> {
     let shapes = &robot.shapes;
     let points = [shapes.foot_centre, shapes.calf_ends[1], shapes.calf_ends[0]].map(Vec3::splat);
     let half = shapes.trunk_half_size;
@@ -276,14 +277,12 @@ fn surface<T: Lane>(robot: &RobotModel, config: &SimConfig, dt: f64) -> Surface<
         let sign = |bit: usize| if index >> bit & 1 == 0 { -1.0 } else { 1.0 };
         Vec3::splat(half * dvec3(sign(0), sign(1), sign(2)))
     };
-    let normal = DVec3::from(config.terrain.ground().normal.map(f64::from));
-    let across = normal.cross(DVec3::X).normalize();
     let zero = T::splat(0.0);
     Surface {
         leg_points: [points; 4],
         radii: [shapes.foot_radius, shapes.calf_radius, shapes.calf_radius].map(T::splat),
         corners: std::array::from_fn(corner),
-        ground: [normal, across.cross(normal), across].map(Vec3::splat),
+        ground: Terrain::new(ground),
         friction: zero,
         time_constant: zero,
         limits: robot.joints.map(|joint| joint.range.map(T::splat)),

@@ -7,7 +7,7 @@ use twinstep_model::lanes::F32x4 as Baseline;
 #[cfg(target_arch = "x86_64")]
 use twinstep_model::lanes::{Avx2F32, Avx2F64, Avx512F32, Sse2F32 as Baseline};
 use twinstep_model::lanes::{Instructions, Lane};
-use twinstep_model::{Command, PerJoint, Placement, RobotModel, RobotStates, RobotStatesMut};
+use twinstep_model::{Command, Ground, PerJoint, Placement, RobotModel, RobotStates, RobotStatesMut};
 
 use super::group::{Drive, Group, LaneSnapshot, Time};
 use crate::SimConfig;
@@ -64,6 +64,7 @@ pub fn robots(
     lanes: Lanes,
     model: &RobotModel,
     config: &SimConfig,
+    ground: &Ground,
     placement: &Placement,
     num_robots: usize,
 ) -> Box<dyn Robots> {
@@ -74,7 +75,10 @@ pub fn robots(
     assert!(Instructions::available().contains(&instructions), "this processor has no {instructions:?}");
     macro_rules! of {
         ($lane:ty, $advance:ident) => {
-            Box::new(Groups::<$lane>::new(model, config, placement, num_robots, $advance))
+            Box::new(Groups::<$lane> {
+                groups: vec![Group::new(model, config, ground, placement); num_robots.div_ceil(<$lane>::LANES)],
+                advance: $advance,
+            })
         };
     }
     match lanes {
@@ -95,19 +99,6 @@ type Advance<T> = fn(&mut Group<T>, &Drive<T>, Time);
 struct Groups<T> {
     groups: Vec<Group<T>>,
     advance: Advance<T>,
-}
-
-impl<T: Lane> Groups<T> {
-    fn new(
-        model: &RobotModel,
-        config: &SimConfig,
-        placement: &Placement,
-        num_robots: usize,
-        advance: Advance<T>,
-    ) -> Self {
-        let group = Group::new(model, config, placement);
-        Self { groups: vec![group; num_robots.div_ceil(T::LANES)], advance }
-    }
 }
 
 impl<T: Lane> Robots for Groups<T> {

@@ -2,7 +2,7 @@
 //!
 //! The Go2 is one fixed tree whose mass matrix is an arrow ([`twinstep_model::lanes`]), and robots differ in numbers
 //! alone, so that eight or sixteen of them fill one register. Contacts and joint limits are MuJoCo's soft constraints
-//! ([`contact`], [`rows`]). A [`group::Group`] holds the robots of one register; [`lanes`] steps groups on all cores in
+//! ([`contact`], [`rows`]) against the [`ground`]. A [`group::Group`] holds the robots of one register; [`lanes`] steps groups on all cores in
 //! the widest registers of the processor; [`BatchBackend`] is the engine.
 //!
 //! Every instruction set gives the same bits, and so does every batch size and thread count; see
@@ -12,6 +12,7 @@
 #![allow(clippy::needless_range_loop, reason = "indices of matrices read as in the textbook")]
 
 mod contact;
+mod ground;
 mod group;
 mod lanes;
 mod rows;
@@ -30,6 +31,7 @@ use lanes::{Input, Robots};
 pub struct BatchBackend {
     robot: RobotModel,
     config: SimConfig,
+    ground: Ground,
     robots: Box<dyn Robots>,
     states: RobotStates,
     /// In place of the ideal drive, which is part of the lanes.
@@ -64,13 +66,14 @@ impl BatchBackend {
         config.check(&robot.control)?;
         check_tree(&robot)?;
         let pool = if config.threads == 1 { None } else { Some(crate::rapier::thread_pool(config.threads)?) };
-        let placement = Placement::at_rest(0.32, robot.control.default_pose_f32());
-        let robots = lanes::robots(lanes, &robot, &config, &placement, num_robots);
+        let ground = config.terrain.ground();
+        let placement = Placement::above(&ground, &robot, robot.control.default_pose_f32(), 0.0);
+        let robots = lanes::robots(lanes, &robot, &config, &ground, &placement, num_robots);
         let mut states = RobotStates::new(num_robots);
         for index in 0..num_robots {
             robots.read(index, &mut states);
         }
-        Ok(Self { robot, config, robots, states, drive: None, pool })
+        Ok(Self { robot, config, ground, robots, states, drive: None, pool })
     }
 
     /// The same robots with another drive than the ideal one.
@@ -112,7 +115,7 @@ impl Backend for BatchBackend {
     }
 
     fn ground(&self) -> Ground {
-        self.config.terrain.ground()
+        self.ground.clone()
     }
 
     fn reset(&mut self, placements: &[(usize, Placement)]) -> Result<(), BackendError> {

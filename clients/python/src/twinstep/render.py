@@ -170,17 +170,25 @@ class Viewer:
             Red, green, blue.
         """
         shapes = _shapes_of(scene)
-        ground = cast(Mapping[str, Sequence[float]], scene["ground"])
+        ground = cast(Mapping[str, Any], scene["ground"])
         point, normal = (np.asarray(ground[key], dtype=np.float32) for key in ("point", "normal"))
         base = np.frombuffer(cast(bytes, scene["pose"]), dtype="<f4", count=3).astype(np.float32)
+        field = None if ground.get("height_field") is None else _HeightField.read(ground["height_field"])
+        if field is not None:
+            # The plane through the ground under the robot: what the camera follows.
+            point = np.append(base[:2], field.height(*base[:2, None])).astype(np.float32)
         camera = self._camera(base, point, normal)
         offset = camera.position - point
         height = float(np.dot(offset, normal))
         if self._backdrop is None or not self._backdrop.fits(camera, height, normal):
             self._backdrop = _Backdrop(camera, height, normal)
-        picture = _Picture(camera, self._backdrop, offset)
+        if field is None:
+            picture = _Picture(camera, self._backdrop.rays, self._backdrop.distance, self._backdrop.paint(offset))
+        else:
+            picture = _Picture(camera, self._backdrop.rays, *_paint_field(camera, self._backdrop.rays, field))
+        levels = [point] if field is None else [np.append(point[:2], level) for level in field.levels()]
         for shape in shapes:
-            picture.draw_shadow(shape, point, normal)
+            picture.draw_shadow(shape, levels, normal)
         for shape in shapes:
             picture.draw_shape(shape)
         image = picture.image()
@@ -259,24 +267,137 @@ class _Backdrop:
         return colour
 
 
+@dataclass(frozen=True)
+class _HeightField:
+    """Heights at the corners of square cells, each cut in two triangles, as ``height_field`` has them."""
+
+    corner: Array
+    """(2,) x and y of the first vertex [m]."""
+    cell: float
+    """[m]"""
+    heights: Array
+    """(rows, columns): along x, along y [m]."""
+
+    @classmethod
+    def read(cls, sent: Mapping[str, Any]) -> _HeightField:
+        heights = np.frombuffer(sent["heights"], dtype="<f4").reshape(sent["rows"], sent["columns"])
+        return cls(np.asarray(sent["corner"], dtype=np.float32), float(sent["cell"]), heights.astype(np.float32))
+
+    def levels(self) -> tuple[float, float]:
+        """Lowest and highest height [m]."""
+        return float(self.heights.min()), float(self.heights.max())
+
+    def height(self, x: Array, y: Array) -> Array:
+        """Heights [m] at ``x``, ``y`` [m]; outside, the edge goes on."""
+        return self.height_and_slope(x, y)[0]
+
+    def height_and_slope(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Heights [m] and their derivatives by x and y at ``x``, ``y`` [m]."""
+        rows, columns = self.heights.shape
+        along: Array = np.clip((x - self.corner[0]) / np.float32(self.cell), 0, np.float32(rows - 1))
+        across: Array = np.clip((y - self.corner[1]) / np.float32(self.cell), 0, np.float32(columns - 1))
+        row = np.minimum(along.astype(np.int32), rows - 2)
+        column = np.minimum(across.astype(np.int32), columns - 2)
+        u, v = (along - row).astype(np.float32), (across - column).astype(np.float32)
+        flat = self.heights.ravel()
+        first = row * columns + column
+        far_x, far_y = flat[first + columns], flat[first + 1]
+        # The triangles have two vertices in common; the third is the first one or the one across.
+        near = u + v <= 1
+        third = flat[first + np.where(near, 0, columns + 1)]
+        rise_x, rise_y = far_x - third, far_y - third
+        rise_x, rise_y = np.where(near, rise_x, rise_y), np.where(near, rise_y, rise_x)
+        sign = np.where(near, np.float32(1), np.float32(-1))
+        height = third + np.abs(u + sign * 0.5 - 0.5) * rise_x + np.abs(v + sign * 0.5 - 0.5) * rise_y
+        scale = sign / np.float32(self.cell)
+        return height, rise_x * scale, rise_y * scale
+
+
+_MARCH = 20
+"""Samples of a ray between a field's highest and lowest height: finds the first hill in the way."""
+
+
+def _meet_field(field: _HeightField, start: Array, rays: Array) -> Array:
+    """Distances (height, width) [m] of ``rays`` (height, width, 3) from ``start`` to a field, infinite in the sky."""
+    lowest, highest = field.levels()
+    # Half the rows and columns find the triangle; then each ray meets the triangle's plane.
+    x, y, z = np.ascontiguousarray(rays[::2, ::2].transpose(2, 0, 1))
+    down = np.maximum(-z, np.float32(1e-3))
+    enter = np.maximum((start[2] - highest) / down, np.float32(0))
+    leave = np.minimum((start[2] - lowest) / down, np.float32(4 * _FOG_M))
+    step = (leave - enter) / np.float32(_MARCH)
+    found: Array = leave
+    above = np.ones(found.shape, dtype=np.bool_)
+    for index in range(1, _MARCH + 1):
+        sample = enter + np.float32(index) * step
+        under = start[2] + sample * z < field.height(start[0] + sample * x, start[1] + sample * y)
+        found = np.where(above & under, sample - np.float32(0.5) * step, found)
+        above &= ~under
+    distance: Array = found.repeat(2, axis=0).repeat(2, axis=1)[: rays.shape[0], : rays.shape[1]]
+    x, y, z = np.ascontiguousarray(rays.transpose(2, 0, 1))
+    for _ in range(2):
+        height, slope_x, slope_y = field.height_and_slope(start[0] + distance * x, start[1] + distance * y)
+        # Newton's step along the ray is exact on a triangle; where the ray grazes, the sample stays.
+        gap: Array = start[2] + distance * z - height
+        fall: Array = slope_x * x + slope_y * y - z
+        newton = np.where(fall > 0.02, gap / np.maximum(fall, np.float32(0.02)), 0)
+        distance = distance + np.clip(newton, np.float32(-0.3), np.float32(0.3))
+    return np.where(z < -1e-3, distance, np.float32(np.inf)).astype(np.float32)
+
+
+def _paint_field(camera: _Camera, rays: Array, field: _HeightField) -> tuple[Array, Array]:
+    """Distance (height, width) [m] of the ground, and a picture (3, height, width) of it without a robot."""
+    rise = np.clip(rays[..., 2] * 3, 0, 1)
+    colour: Array = _SKY_LOW[:, None, None] + (_SKY_TOP - _SKY_LOW)[:, None, None] * rise
+    all_distance = np.full(rise.shape, np.inf, dtype=np.float32)
+    rows = np.flatnonzero((rays[..., 2] < -1e-3).any(axis=1))
+    if len(rows) == 0:
+        return all_distance, colour
+    # Whole rows, because a slice is faster than a mask.
+    rays = rays[int(rows[0]) :]
+    distance = _meet_field(field, camera.position, rays)
+    seen = np.isfinite(distance)
+    near = np.where(seen, distance, np.float32(0))
+    ray_x, ray_y, ray_z = np.ascontiguousarray(rays.transpose(2, 0, 1))
+    x, y = camera.position[0] + near * ray_x, camera.position[1] + near * ray_y
+    _, slope_x, slope_y = field.height_and_slope(x, y)
+    up = 1 / np.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
+    facing = np.clip((_SUN[2] - _SUN[0] * slope_x - _SUN[1] * slope_y) * up, 0, 1)
+    # As bright as a plane's tiles where it is level; slopes are exaggerated, or they do not show.
+    light = np.clip(1 + 1.2 * (facing - _SUN[2]), 0.4, 1.25)
+    towards = (ray_x * slope_x + ray_y * slope_y - ray_z) * up
+    # A pixel far away covers many tiles: average over its footprint, or they flicker.
+    footprint = near / np.float32(0.5 * camera.height * _FOCAL * _TILE_M)
+    width = np.maximum(footprint / np.sqrt(np.clip(towards, 0.02, 1)), np.float32(1e-3))
+    tiles = _blurred_stripes(x / np.float32(_TILE_M), width) * _blurred_stripes(y / np.float32(_TILE_M), width)
+    clear = np.where(seen, np.exp(-np.square(near / np.float32(_FOG_M))), 0)
+    mean, half = 0.5 * (_TILES[0] + _TILES[1]), 0.5 * (_TILES[0] - _TILES[1])
+    own = (mean[:, None, None] + half[:, None, None] * tiles) * light
+    all_distance[int(rows[0]) :] = distance
+    colour[:, int(rows[0]) :] += (own - colour[:, int(rows[0]) :]) * clear
+    return all_distance, colour
+
+
 class _Picture:
     """Colour and distance of every pixel, while shapes are drawn one by one."""
 
-    def __init__(self, camera: _Camera, backdrop: _Backdrop, offset: Array) -> None:
+    def __init__(self, camera: _Camera, rays: Array, distance: Array, colour: Array) -> None:
         self._camera = camera
-        self._rays = backdrop.rays
-        self._colour = backdrop.paint(offset)
-        self._distance = backdrop.distance.copy()
+        self._rays = rays
+        self._colour = colour
+        self._distance = distance.copy()
         self._shadowed = np.zeros(self._distance.shape, dtype=np.bool_)
 
     def image(self) -> NDArray[np.uint8]:
         """The picture so far: (height, width, 3) uint8."""
         return np.ascontiguousarray(self._colour.astype(np.uint8).transpose(1, 2, 0))
 
-    def draw_shadow(self, shape: _Shape, point: Array, normal: Array) -> None:
-        """Darkens the ground that the shape hides from the sun."""
+    def draw_shadow(self, shape: _Shape, levels: Sequence[Array], normal: Array) -> None:
+        """Darkens the ground that the shape hides from the sun; it lies between planes through ``levels`` [m]."""
         corners = shape.corners()
-        corners = corners - ((corners - point) @ normal / np.dot(_SUN, normal))[:, None] * _SUN
+        corners = np.concatenate(
+            [corners - ((corners - point) @ normal / np.dot(_SUN, normal))[:, None] * _SUN for point in levels]
+        )
         left, right, top, bottom = self._camera.rectangle(corners)
         if left >= right or top >= bottom:
             return

@@ -1,0 +1,119 @@
+//! The ground as robots in lanes meet it: a plane, or a height field that each point sees as the plane below it.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+use twinstep_model::lanes::{Lane, State, Vec3};
+use twinstep_model::{Ground, HeightField};
+
+/// What the robots stand on.
+#[derive(Clone, Debug)]
+pub enum Terrain<T> {
+    /// A plane through the origin: its normal, and two directions along it, in the world.
+    Plane([Vec3<T>; 3]),
+    /// A height field, and its greatest height [m].
+    Field(Arc<HeightField>, T),
+}
+
+impl<T: Lane> Terrain<T> {
+    /// The same ground for robots in lanes.
+    pub fn new(ground: &Ground) -> Self {
+        if let Some(field) = &ground.height_field {
+            let highest = field.heights().iter().copied().fold(f32::NEG_INFINITY, f32::max);
+            return Self::Field(field.clone(), T::splat(f64::from(highest)));
+        }
+        let normal = DVec3::from(ground.normal.map(f64::from));
+        let across = normal.cross(DVec3::X).normalize();
+        Self::Plane([normal, across.cross(normal), across].map(Vec3::splat))
+    }
+
+    /// The ground as seen from trunks in this state.
+    #[inline(always)]
+    pub fn near(&self, state: &State<T>) -> Near<'_, T> {
+        let axes = state.world_axes();
+        let (plane, height) = match self {
+            Self::Plane(plane) => (*plane, plane[0].dot(state.position)),
+            Self::Field(_, highest) => {
+                let (zero, one) = (T::splat(0.0), T::splat(1.0));
+                let level = [Vec3([zero, zero, one]), Vec3([one, zero, zero]), Vec3([zero, one, zero])];
+                (level, state.position.0[2] - *highest)
+            }
+        };
+        let directions = [to_base(plane[0], &axes), to_base(plane[1], &axes), to_base(plane[2], &axes)];
+        let velocity = to_base(state.linear_velocity, &axes);
+        Near { terrain: self, position: state.position, axes, velocity, directions, height }
+    }
+}
+
+/// The ground as seen from the trunk.
+pub struct Near<'a, T> {
+    terrain: &'a Terrain<T>,
+    position: Vec3<T>,
+    /// The world's axes in base axes.
+    axes: [Vec3<T>; 3],
+    /// Velocity of the base origin in base axes [m/s].
+    pub velocity: Vec3<T>,
+    /// Normal and directions of the plane, or of the level above all heights, in base axes.
+    directions: [Vec3<T>; 3],
+    /// Of the base's origin above it [m].
+    height: T,
+}
+
+/// The ground below a point, as a plane.
+pub struct Patch<T> {
+    /// Of the point above it, along its normal [m].
+    pub height: T,
+    /// Its normal, and two directions along it, in base axes.
+    pub directions: [Vec3<T>; 3],
+}
+
+impl<T: Lane> Near<'_, T> {
+    /// A bound below the heights of all corners of a box around the base's origin with half size `half` [m].
+    #[inline(always)]
+    pub fn lowest_corner(&self, half: Vec3<T>) -> T {
+        let normal = self.directions[0].0;
+        self.height - (normal[0] * half.0[0]).abs() - (normal[1] * half.0[1]).abs() - (normal[2] * half.0[2]).abs()
+    }
+
+    /// The ground below a point of the base frame.
+    #[inline(always)]
+    pub fn below(&self, point: Vec3<T>) -> Patch<T> {
+        match self.terrain {
+            Terrain::Plane(_) => {
+                Patch { height: self.height + self.directions[0].dot(point), directions: self.directions }
+            }
+            Terrain::Field(field, _) => self.below_on_field(field, point),
+        }
+    }
+
+    #[inline(always)]
+    fn below_on_field(&self, field: &HeightField, point: Vec3<T>) -> Patch<T> {
+        let zero = T::splat(0.0);
+        let [x, y, z] = (self.position + in_world(point, &self.axes)).0;
+        let (mut ground, mut normal): (T, Vec3<T>) = (zero, Vec3::zero());
+        for lane in 0..T::LANES {
+            let (height, upward) = field.sample(x.get(lane) as f32, y.get(lane) as f32);
+            ground.set(lane, f64::from(height));
+            normal.set(lane, DVec3::from(upward.map(f64::from)));
+        }
+        // The second direction has no x: normal × x, made a unit.
+        let [_, ny, nz] = normal.0;
+        let size = (ny * ny + nz * nz).sqrt();
+        let across = Vec3([zero, nz / size, -(ny / size)]);
+        let directions =
+            [to_base(normal, &self.axes), to_base(across.cross(normal), &self.axes), to_base(across, &self.axes)];
+        Patch { height: (z - ground) * nz, directions }
+    }
+}
+
+/// A vector of the world in base axes.
+#[inline(always)]
+fn to_base<T: Lane>(world: Vec3<T>, axes: &[Vec3<T>; 3]) -> Vec3<T> {
+    axes[0].scaled(world.0[0]) + axes[1].scaled(world.0[1]) + axes[2].scaled(world.0[2])
+}
+
+/// A vector in base axes in the world.
+#[inline(always)]
+fn in_world<T: Lane>(base: Vec3<T>, axes: &[Vec3<T>; 3]) -> Vec3<T> {
+    Vec3([axes[0].dot(base), axes[1].dot(base), axes[2].dot(base)])
+}

@@ -1,0 +1,208 @@
+//! Rough ground: robots stand on it, and server and client have the same.
+
+use glam::{Quat, Vec3};
+use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_env_server::{Config, Host, SimHost};
+use twinstep_envs::TaskName;
+use twinstep_model::{
+    AutoresetMode, Backend, Command, Ground, NUM_LEGS, Placement, Pose, ResetRequest, ShapeKind, VecEnv, body_poses,
+    frames, go2,
+};
+use twinstep_sim::{BatchBackend, Engine, RapierBackend, Rough, SimConfig, Terrain};
+
+use crate::remote::{config, start};
+
+fn rough(height_m: f32, cell_m: f32, seed: u64) -> Terrain {
+    Terrain::Rough(Rough { height_m, cell_m, size_m: 20.0, seed })
+}
+
+/// Makes a robot of one engine.
+type Make<B> = fn(SimConfig) -> B;
+
+fn rapier(config: SimConfig) -> RapierBackend {
+    RapierBackend::new(go2(), SimConfig { engine: Engine::Rapier, ..config }, 1).unwrap()
+}
+
+fn batch(config: SimConfig) -> BatchBackend {
+    BatchBackend::new(go2(), config, 1).unwrap()
+}
+
+fn backend<B: Backend>(make: Make<B>, terrain: Terrain, clearance: f32) -> B {
+    let q = go2().control.default_pose_f32();
+    let mut backend = make(SimConfig { terrain, threads: 1, ..SimConfig::default() });
+    let placement = Placement::above(&backend.ground(), backend.robot(), q, clearance);
+    backend.reset(&[(0, placement)]).unwrap();
+    backend
+}
+
+fn foot_centres(backend: &impl Backend) -> [Vec3; NUM_LEGS] {
+    let (robot, states) = (backend.robot(), backend.states());
+    let world_from_base = Pose {
+        position: Vec3::from(states.base_position[0]),
+        rotation: frames::world_from_base(states.base_orientation[0]),
+    };
+    let poses = body_poses(robot, world_from_base, &states.q[0]);
+    std::array::from_fn(|leg| poses[3 + 3 * leg].transform(robot.shapes.foot_centre.as_vec3()))
+}
+
+/// How far each foot's ball is from the nearest point of the ground [m].
+fn foot_gaps(backend: &impl Backend, ground: &Ground) -> [f32; NUM_LEGS] {
+    foot_centres(backend).map(|centre| {
+        let around = (-30..=30).flat_map(|x| (-30..=30).map(move |y| (x as f32 / 1000.0, y as f32 / 1000.0)));
+        let distance = around
+            .map(|(dx, dy)| Vec3::new(dx, dy, ground.height(centre.x + dx, centre.y + dy) - centre.z).length())
+            .fold(f32::INFINITY, f32::min);
+        let side = if centre.z < ground.height(centre.x, centre.y) { -1.0 } else { 1.0 };
+        side * distance - backend.robot().shapes.foot_radius as f32
+    })
+}
+
+/// A robot that stood for ten seconds.
+fn stood<B: Backend>(make: Make<B>, terrain: Terrain) -> B {
+    let mut backend = backend(make, terrain, 0.01);
+    let hold = Command::hold(go2().control.default_pose_f32(), 60.0, 2.0);
+    backend.step(&[hold], &[true], 2000).unwrap();
+    backend
+}
+
+#[test]
+fn robot_stands_with_its_feet_on_rough_ground() {
+    stands_on_its_feet(rapier);
+    stands_on_its_feet(batch);
+}
+
+fn stands_on_its_feet<B: Backend>(make: Make<B>) {
+    for seed in 1..=3 {
+        let backend = stood(make, rough(0.05, 0.25, seed));
+        let (gaps, states) = (foot_gaps(&backend, &backend.ground()), backend.states());
+        for (gap, force) in gaps.iter().zip(states.foot_force[0]) {
+            assert!(*gap > -0.005, "seed {seed}: a foot is {gap} m in the ground");
+            assert!((force > 0.0) == (*gap < 0.001), "seed {seed}: {gap} m from the ground with {force} N");
+        }
+        assert!(!states.body_contact[0], "seed {seed}");
+        assert!(frames::gravity_in_base(states.base_orientation[0]).z < -0.98, "seed {seed}");
+    }
+}
+
+#[test]
+fn robot_on_gentle_ground_weighs_its_mass() {
+    weighs_its_mass(rapier);
+    weighs_its_mass(batch);
+}
+
+fn weighs_its_mass<B: Backend>(make: Make<B>) {
+    let weight = go2().total_mass() as f32 * 9.81;
+    for seed in 1..=3 {
+        // Forces are along the normals: on triangles of slope 0.1 they add up to less than the weight, by up to 0.5 %.
+        let force: f32 = stood(make, rough(0.02, 0.25, seed)).states().foot_force[0].iter().sum();
+        assert!((force / weight - 1.0).abs() < 0.01, "seed {seed}: {force} N on the feet, weight {weight} N");
+    }
+}
+
+#[test]
+fn robot_that_is_dropped_and_kicks_does_not_fall_through() {
+    // rapier's field is a surface with nothing in it: a foot that lands from 1 m may go through for as long as it is
+    // pressed.
+    does_not_fall_through(rapier, -0.15);
+    does_not_fall_through(batch, 0.005);
+}
+
+fn does_not_fall_through<B: Backend>(make: Make<B>, from_high: f32) {
+    for (seed, height, lowest_allowed) in [(1, 0.1, 0.01), (2, 0.5, 0.01), (3, 1.0, from_high)] {
+        let mut backend = backend(make, rough(0.1, 0.2, seed), height);
+        let ground = backend.ground();
+        let pose = go2().control.default_pose_f32();
+        let (mut lowest_trunk, mut lowest_foot) = (f32::INFINITY, f32::INFINITY);
+        for period in 0..1000 {
+            let kick = std::array::from_fn(|j| pose[j] + 0.5 * ((period / 20 * 12 + j) as f32 * 2.4).sin());
+            backend.step(&[Command::hold(kick, 60.0, 1.0)], &[true], 1).unwrap();
+            let [x, y, z] = backend.states().base_position[0];
+            lowest_trunk = lowest_trunk.min(z - ground.height(x, y));
+            let feet = foot_centres(&backend).map(|centre| centre.z - ground.height(centre.x, centre.y));
+            lowest_foot = feet.into_iter().fold(lowest_foot, f32::min);
+        }
+        assert!(lowest_trunk > 0.03, "dropped from {height} m: the trunk was {lowest_trunk} m above the ground");
+        assert!(lowest_foot > lowest_allowed, "dropped from {height} m: a foot was {lowest_foot} m above the ground");
+    }
+}
+
+#[test]
+fn robot_beside_the_field_stands_on_level_ground() {
+    stands_beside_the_field(rapier);
+    stands_beside_the_field(batch);
+}
+
+fn stands_beside_the_field<B: Backend>(make: Make<B>) {
+    let mut backend = backend(make, rough(0.05, 0.25, 1), 0.0);
+    let q = go2().control.default_pose_f32();
+    let placement = Placement { base_position: [10.5, -3.0, 0.34], ..Placement::at_rest(0.34, q) };
+    backend.reset(&[(0, placement)]).unwrap();
+    backend.step(&[Command::hold(q, 60.0, 2.0)], &[true], 400).unwrap();
+    assert!((0.27..0.33).contains(&backend.states().base_position[0][2]), "{:?}", backend.states().base_position[0]);
+}
+
+const CONFIG: &str = "
+[sim]
+terrain = { rough = { height_m = 0.08, cell_m = 0.25, size_m = 30.0, seed = 7 } }
+";
+
+#[test]
+fn server_with_rough_ground_in_its_file_sends_the_heights_around_the_robot() {
+    let file = Config::parse(CONFIG, "server.toml").unwrap();
+    let terrain = file.sim.terrain;
+    let (server, endpoint) = start(&Config { sim: file.sim, ..config(TaskName::Walk) });
+    let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
+    env.reset(&ResetRequest::seeded(1, 2)).unwrap();
+    for _ in 0..50 {
+        assert!(!env.step(&[0.0; 24]).unwrap().terminated.contains(&true), "who stands still does not fall");
+    }
+    let scene = env.scene(1).unwrap();
+    let (sent, whole) = (scene.ground.height_field.unwrap(), terrain.ground());
+    assert_eq!(sent.cell(), 0.25);
+    assert!(sent.shape().iter().all(|count| (64..=68).contains(count)), "8 m to each side: {:?}", sent.shape());
+    let [x, y, z, ..] = scene.pose[0];
+    for (dx, dy) in [(0.0, 0.0), (1.3, -0.7), (-3.1, 2.2)] {
+        assert!((sent.height(x + dx, y + dy) - whole.height(x + dx, y + dy)).abs() < 1e-5);
+    }
+    assert!(
+        (0.25..0.42).contains(&(z - whole.height(x, y))),
+        "the trunk is {} m above the ground",
+        z - whole.height(x, y)
+    );
+    assert!(sent.heights().iter().any(|height| *height > 0.07));
+    server.stop();
+}
+
+#[test]
+fn server_refuses_rough_ground_that_cannot_be_before_it_starts() {
+    for (text, wanted) in [
+        (
+            "[sim]\nterrain = { rough = { height_m = 9.0, cell_m = 0.25, seed = 7 } }",
+            "`sim.terrain.rough.height_m` = 9",
+        ),
+        ("[sim]\nterrain = { rough = { height_m = 0.1, cell_m = 0.0, seed = 7 } }", "`sim.terrain.rough.cell_m` = 0"),
+    ] {
+        let config = Config::parse(text, "server.toml").unwrap();
+        let error = SimHost::new(config).err().unwrap().to_string();
+        assert!(error.contains(wanted), "{error}");
+    }
+}
+
+#[test]
+fn walk_on_a_steep_slope_starts_with_the_feet_on_it() {
+    let mut config = config(TaskName::Walk);
+    config.sim.terrain = Terrain::SlopeRad(0.3);
+    config.task.start_position_noise_rad = 0.0;
+    let mut env = SimHost::new(config).unwrap().build(1, AutoresetMode::NextStep, None).unwrap();
+    env.reset(&ResetRequest::default()).unwrap();
+    let up = Ground { normal: [-0.3f32.sin(), 0.0, 0.3f32.cos()], ..Ground::FLAT }.up();
+    let scene = env.scene(0).unwrap();
+    let feet = scene.shapes.iter().filter(|shape| shape.kind == ShapeKind::Sphere && shape.body > 0).map(|shape| {
+        let [x, y, z, qw, qx, qy, qz] = scene.pose[shape.body as usize];
+        let world_from_body = Pose { position: Vec3::new(x, y, z), rotation: Quat::from_xyzw(qx, qy, qz, qw) };
+        let [x, y, z, ..] = shape.offset;
+        up.dot(world_from_body.transform(Vec3::new(x, y, z))) - shape.size[0]
+    });
+    let gaps: Vec<f32> = feet.collect();
+    assert!(gaps.len() == 4 && gaps.iter().all(|gap| (0.0..0.025).contains(gap)), "{gaps:?}");
+}
