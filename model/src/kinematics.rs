@@ -2,10 +2,12 @@
 
 use glam::{Quat, Vec3};
 
-use crate::{Joint, NUM_JOINTS, PerJoint, RobotModel};
+use crate::{Joint, Leg, NUM_JOINTS, PerJoint, RobotModel};
 
 /// Number of bodies of the robot: the trunk and one behind each joint.
 pub const NUM_BODIES: usize = 1 + NUM_JOINTS;
+/// Height of the base [m] at which a held robot hangs: no foot reaches the ground.
+pub const HELD_HEIGHT: f64 = 1.0;
 
 /// Pose of a frame in another one.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -48,12 +50,19 @@ pub fn body_poses(robot: &RobotModel, world_from_base: Pose, q: &PerJoint) -> [P
     poses
 }
 
+/// Height of the upright base [m] at which the lowest foot touches flat ground, with the joints at `q` [rad].
+pub fn standing_height(robot: &RobotModel, q: &PerJoint) -> f64 {
+    let (poses, foot) = (body_poses(robot, Pose::IDENTITY, q), robot.shapes.foot_centre.as_vec3());
+    let feet = Leg::ALL.map(|leg| poses[3 + 3 * leg as usize].transform(foot).z);
+    robot.shapes.foot_radius - f64::from(feet.into_iter().fold(f32::MAX, f32::min))
+}
+
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::{Leg, go2};
+    use crate::go2;
 
     fn foot(robot: &RobotModel, leg: Leg, world_from_base: Pose, q: &PerJoint) -> Vec3 {
         let calf = body_poses(robot, world_from_base, q)[3 + 3 * leg as usize];
@@ -76,13 +85,13 @@ mod tests {
     }
 
     #[test]
-    fn feet_of_the_default_pose_stand_at_the_height_that_the_robot_stands_at() {
-        let robot = go2();
-        for leg in Leg::ALL {
-            let foot = foot(&robot, leg, Pose::IDENTITY, &robot.control.default_pose_f32());
-            let base_height = robot.shapes.foot_radius as f32 - foot.z;
-            assert!((0.29..0.34).contains(&base_height), "{leg:?}: {base_height} m");
-        }
+    fn lowest_foot_of_a_standing_robot_touches_the_ground() {
+        let (robot, q) = (go2(), go2().control.default_pose_f32());
+        let position = Vec3::Z * standing_height(&robot, &q) as f32;
+        let base = Pose { position, rotation: Quat::IDENTITY };
+        let heights = Leg::ALL.map(|leg| foot(&robot, leg, base, &q).z - robot.shapes.foot_radius as f32);
+        assert!(heights.iter().all(|height| (-1e-6..0.02).contains(height)), "{heights:?}");
+        assert!(heights.iter().any(|height| height.abs() < 1e-6), "{heights:?}");
     }
 
     proptest! {

@@ -9,6 +9,7 @@
 //! - [`VecEnv`]: many environments that are reset and stepped together, in process or over a network, and
 //!   [`EnvSpec`], what a client must know of them.
 //! - [`Scene`]: what it takes to draw a robot; [`body_poses`], where its bodies are.
+//! - [`mjcf()`]: the robot as a MuJoCo model.
 //! - [`stream`]: one seed gives every consumer its own reproducible random numbers.
 //!
 //! SI units, radians, seconds. Vectors live in the world or the base frame, as their docs say; the base frame is the
@@ -20,6 +21,7 @@ pub mod frames;
 mod go2;
 mod joint;
 mod kinematics;
+mod mjcf;
 mod model_file;
 mod robot;
 mod scene;
@@ -32,7 +34,8 @@ pub use backend::{Actuator, Backend, BackendError, PdDrive};
 pub use body::RigidBody;
 pub use go2::go2;
 pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};
-pub use kinematics::{NUM_BODIES, Pose, body_poses};
+pub use kinematics::{HELD_HEIGHT, NUM_BODIES, Pose, body_poses, standing_height};
+pub use mjcf::{MjcfBase, MjcfDrive, MjcfOptions, mjcf};
 pub use model_file::ModelFileError;
 pub use robot::{Contact, Control, JointModel, LegModel, RobotModel, Shapes};
 pub use scene::{Ground, Scene, SceneShape, ShapeKind};
