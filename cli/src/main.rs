@@ -5,6 +5,8 @@ mod demo;
 mod exit;
 mod joint_plot;
 mod mjcf;
+mod motion;
+mod play;
 mod replay;
 mod robot_file;
 mod serve;
@@ -26,6 +28,7 @@ enum Verb {
     Bench(bench::Args),
     Demo(demo::Args),
     Mjcf(mjcf::Args),
+    Play(play::Args),
     Serve(serve::Args),
 }
 
@@ -41,6 +44,7 @@ fn main() -> std::process::ExitCode {
         Verb::Bench(args) => bench::run(&args),
         Verb::Demo(args) => demo::run(&args),
         Verb::Mjcf(args) => mjcf::run(&args),
+        Verb::Play(args) => play::run(&args),
         Verb::Serve(args) => serve::run(&args),
     };
     exit::code(result)
