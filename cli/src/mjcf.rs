@@ -17,9 +17,8 @@ const TIMESTEPS: std::ops::RangeInclusive<f64> = 1e-5..=0.02;
 /// `--engine batch` knows: feet, both ends of each calf, and the trunk's corners against the ground. `ctrl` is torque
 /// [N·m] in the joint order FL, FR, RL, RR; hip, thigh, calf. The keyframe `default_pose` is the start.
 ///
-///   twinstep mjcf --out go2.xml && python -m mujoco.viewer --mjcf go2.xml
+/// Example: `twinstep mjcf --out go2.xml && python -m mujoco.viewer --mjcf go2.xml`
 #[derive(clap::Args)]
-#[command(verbatim_doc_comment)]
 pub struct Args {
     /// Model file of the robot; the ideal Go2 without.
     #[arg(long, value_name = "FILE")]

@@ -40,15 +40,16 @@ pub struct Args {
     /// Whether the trunk moves: floating or fixed; as meta.json says of each segment without.
     #[arg(long, value_parser = base)]
     base: Option<Base>,
-    /// Who integrates the equations of motion: rapier (the reference) or batch (the fast one).
+    /// Who integrates the equations of motion: rapier (the reference) or batch (the fast one); the server's default
+    /// without.
     #[arg(long, value_parser = engine)]
     engine: Option<Engine>,
     /// Rate of the physics [Hz]; a multiple of the drive's 200.
-    #[arg(long, value_name = "HZ")]
-    physics_hz: Option<u32>,
+    #[arg(long, value_name = "HZ", default_value_t = SimConfig::default().physics_hz)]
+    physics_hz: u32,
     /// Solver iterations a physics step.
-    #[arg(long, value_name = "N")]
-    solver_iterations: Option<u32>,
+    #[arg(long, value_name = "N", default_value_t = SimConfig::default().solver_iterations)]
+    solver_iterations: u32,
     /// The log to write: *.parquet, *.csv or *.csv.gz, or a folder, which gets data.parquet and meta.json.
     #[arg(long, value_name = "LOG")]
     out: PathBuf,
@@ -75,8 +76,8 @@ impl Args {
         let default = SimConfig { threads: 1, ..SimConfig::default() };
         SimConfig {
             engine: self.engine.unwrap_or(default.engine),
-            physics_hz: self.physics_hz.unwrap_or(default.physics_hz),
-            solver_iterations: self.solver_iterations.unwrap_or(default.solver_iterations),
+            physics_hz: self.physics_hz,
+            solver_iterations: self.solver_iterations,
             ..default
         }
     }
