@@ -55,8 +55,16 @@ pub struct Args {
     out: PathBuf,
 }
 
+/// The log would replace the motion.
+#[derive(Debug, thiserror::Error)]
+#[error("`--out` = {} is the motion itself\n  name another file or folder", .0.display())]
+struct SameFile(PathBuf);
+
 /// Plays and writes.
 pub fn run(args: &Args) -> Outcome {
+    if args.motion.canonicalize().is_ok_and(|motion| args.out.canonicalize().is_ok_and(|out| out == motion)) {
+        return Err(input(SameFile(args.out.clone())));
+    }
     let robot = robot_model(args.model.as_deref())?;
     let config = args.config();
     config.check(&robot.control).map_err(input)?;

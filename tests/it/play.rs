@@ -129,6 +129,17 @@ fn motion_between_the_periods_of_the_drive_is_refused() {
 }
 
 #[test]
+fn motion_is_not_overwritten() {
+    let folder = tempfile::tempdir().unwrap();
+    let source = folder.path().join("sway.csv");
+    motion(LoggedBase::Fixed, 0.02).write(&source).unwrap();
+    let output = play(&source, &source, &[]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("is the motion itself"));
+    assert!(Log::open_motion(&source).unwrap().q("FL_hip").is_none());
+}
+
+#[test]
 fn rate_that_the_drive_does_not_divide_is_refused_by_name() {
     check_refusal(
         &play(Path::new("none.csv"), Path::new("out.csv"), &["--physics-hz", "500"]),
