@@ -4,7 +4,11 @@ mod bench;
 mod demo;
 mod exit;
 mod joint_plot;
+mod mjcf;
+mod motion;
+mod play;
 mod replay;
+mod robot_file;
 mod serve;
 mod server_process;
 mod trot;
@@ -23,6 +27,8 @@ struct Cli {
 enum Verb {
     Bench(bench::Args),
     Demo(demo::Args),
+    Mjcf(mjcf::Args),
+    Play(play::Args),
     Serve(serve::Args),
 }
 
@@ -37,6 +43,8 @@ fn main() -> std::process::ExitCode {
     let result = match Cli::parse().command {
         Verb::Bench(args) => bench::run(&args),
         Verb::Demo(args) => demo::run(&args),
+        Verb::Mjcf(args) => mjcf::run(&args),
+        Verb::Play(args) => play::run(&args),
         Verb::Serve(args) => serve::run(&args),
     };
     exit::code(result)

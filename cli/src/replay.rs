@@ -4,13 +4,11 @@ use std::fmt::Write as _;
 use std::ops::Range;
 
 use twinstep_logs::{Base as MeasuredBase, Log};
-use twinstep_model::{Backend, BackendError, Command, JOINT_NAMES, Joint, Placement, RobotModel};
-use twinstep_sim::{Base, BuildError, RapierBackend, SimConfig};
+use twinstep_model::{Backend, HELD_HEIGHT, Placement, RobotModel};
+use twinstep_sim::{Base, BatchBackend, BuildError, SimConfig};
 
-/// Height at which the trunk is held [m]: no foot reaches the ground.
-const HELD_HEIGHT: f32 = 1.0;
-/// How far the log's period may be from a whole number of drive periods, as a fraction of it.
-const PERIOD_TOLERANCE: f64 = 0.02;
+use crate::motion::{DriveClock, FailedAt, JointCommands, MotionError, cell_or_zero, command, joint_commands};
+
 /// Columns of the longest bar of [`Replay::table`].
 const BAR_WIDTH: f64 = 24.0;
 /// The longest bar stands for at least this RMSE [rad], so that rounding errors draw no bars.
@@ -58,52 +56,21 @@ pub enum ReplayError {
         /// The segment's name.
         segment: String,
     },
-    /// The robot model has no joint of this name.
-    #[error(
-        "joint `{joint}` of the log is none of the robot's\n  its joints are {names}",
-        names = JOINT_NAMES.join(", ")
-    )]
-    UnknownJoint {
-        /// The joint's name.
-        joint: String,
-    },
     /// A motion was given, which holds commands but no measurement.
-    #[error("joint `{joint}` of the log has no `{quantity}`: a replay needs measured `q`, `q_cmd`, `kp` and `kd`")]
+    #[error("joint `{joint}` of the log has no `q`: a replay needs measured positions")]
     NotMeasured {
         /// The joint's name.
         joint: String,
-        /// The quantity that is missing.
-        quantity: &'static str,
     },
-    /// No part of the log has two rows.
-    #[error("the log has no two rows that follow one another in a segment, so there is nothing to simulate")]
-    NoSteps,
-    /// The drive's rate does not fit the log's.
-    #[error(
-        "the log's median sample period is {period_ms:.3} ms, not a whole number of the drive's {drive_ms:.3} ms \
-         within 2 %\n  resample the log, or give the robot model a `drive_hz` that the log's rate divides"
-    )]
-    Period {
-        /// Median time between two rows [ms].
-        period_ms: f64,
-        /// One period of the drive [ms].
-        drive_ms: f64,
-    },
+    /// The log's commands or its time do not fit the robot.
+    #[error(transparent)]
+    Motion(#[from] MotionError),
     /// The simulation could not be built.
     #[error(transparent)]
     Build(#[from] BuildError),
     /// The simulation failed.
-    #[error("segment `{segment}`, row {row} (t = {t} s): {cause}")]
-    Simulation {
-        /// The segment's name.
-        segment: String,
-        /// The data row from which was stepped, from 1.
-        row: usize,
-        /// Its time [s].
-        t: f64,
-        /// What the simulation said.
-        cause: BackendError,
-    },
+    #[error(transparent)]
+    Simulation(#[from] FailedAt),
 }
 
 /// Puts `robot` down at the first measured state of each part of `log` and commands it as logged to the part's end.
@@ -121,23 +88,24 @@ pub fn replay(
     if let Some((segment, _)) = log.segments().find(|(segment, _)| segment.base == MeasuredBase::Floating) {
         return Err(ReplayError::FloatingBase { segment: segment.name.clone() });
     }
-    let joints = measured_joints(log)?;
+    let commands = joint_commands(log)?;
+    let joints = commands.iter().map(|commands| MeasuredJoint::of(log, commands)).collect::<Result<Vec<_>, _>>()?;
     let clock = DriveClock::of(log, robot)?;
-    let mut backend = RapierBackend::new(robot.clone(), SimConfig { base: Base::Fixed, ..config }, 1)?;
+    let mut backend = BatchBackend::new(robot.clone(), SimConfig { base: Base::Fixed, ..config }, 1)?;
     let mut simulated = vec![Vec::with_capacity(log.rows()); joints.len()];
     for (segment, rows) in log.segments() {
         let failed = |row: usize| {
             let (segment, t) = (segment.name.clone(), log.t()[row]);
-            move |cause| ReplayError::Simulation { segment, row: row + 1, t, cause }
+            move |cause| FailedAt { segment, row: row + 1, t, cause }
         };
         backend.reset(&[(0, placement(robot, &joints, rows.start))]).map_err(failed(rows.start))?;
         for row in rows.clone() {
             for (joint, simulated) in joints.iter().zip(&mut simulated) {
-                simulated.push(f64::from(backend.states().q[0][joint.joint.index()]));
+                simulated.push(f64::from(backend.states().q[0][joint.commands.joint.index()]));
             }
             if row + 1 < rows.end {
                 let drive_periods = clock.periods_between(&log.t()[rows.start..], row - rows.start);
-                backend.step(&[command(robot, &joints, row)], &[true], drive_periods).map_err(failed(row))?;
+                backend.step(&[command(robot, &commands, row)], &[true], drive_periods).map_err(failed(row))?;
             }
             progress(row + 1);
         }
@@ -167,107 +135,39 @@ impl Replay {
 
 /// What the log holds of one joint.
 struct MeasuredJoint<'a> {
-    joint: Joint,
+    commands: &'a JointCommands<'a>,
     q: &'a [f64],
     dq: Option<&'a [f64]>,
-    q_cmd: &'a [f64],
-    dq_cmd: Option<&'a [f64]>,
-    tau_ff: Option<&'a [f64]>,
-    kp: Vec<f64>,
-    kd: Vec<f64>,
 }
 
 impl<'a> MeasuredJoint<'a> {
-    fn of(log: &'a Log, name: &str) -> Result<Self, ReplayError> {
-        let lacks = |quantity| move || ReplayError::NotMeasured { joint: name.to_owned(), quantity };
-        let gains =
-            |gain: fn(&Log, &str, usize) -> Option<f64>| (0..log.rows()).map(|row| gain(log, name, row)).collect();
-        Ok(Self {
-            joint: name.parse().map_err(|_| ReplayError::UnknownJoint { joint: name.to_owned() })?,
-            q: log.q(name).ok_or_else(lacks("q"))?,
-            dq: log.dq(name),
-            q_cmd: log.q_cmd(name).ok_or_else(lacks("q_cmd"))?,
-            dq_cmd: log.dq_cmd(name),
-            tau_ff: log.tau_ff(name),
-            kp: Option::ok_or_else(gains(Log::kp), lacks("kp"))?,
-            kd: Option::ok_or_else(gains(Log::kd), lacks("kd"))?,
-        })
+    fn of(log: &'a Log, commands: &'a JointCommands<'a>) -> Result<Self, ReplayError> {
+        let name = commands.joint.name();
+        let q = log.q(name).ok_or_else(|| ReplayError::NotMeasured { joint: name.to_owned() })?;
+        Ok(Self { commands, q, dq: log.dq(name) })
     }
 
     fn compare(&self, simulated: Vec<f64>) -> JointError {
         let errors = || simulated.iter().zip(self.q).map(|(simulated, measured)| simulated - measured);
         JointError {
-            name: self.joint.name().to_owned(),
+            name: self.commands.joint.name().to_owned(),
             rmse_rad: root_mean_square(errors()),
             max_rad: errors().map(f64::abs).fold(0.0, f64::max),
             measured: self.q.to_vec(),
-            command: self.q_cmd.to_vec(),
+            command: self.commands.q_cmd.to_vec(),
             simulated,
         }
     }
 }
 
-/// The log's joints, in the order of [`Joint::ALL`].
-fn measured_joints(log: &Log) -> Result<Vec<MeasuredJoint<'_>>, ReplayError> {
-    let mut joints: Vec<_> = log.joints().iter().map(|name| MeasuredJoint::of(log, name)).collect::<Result<_, _>>()?;
-    joints.sort_by_key(|joint| joint.joint);
-    Ok(joints)
-}
-
 fn placement(robot: &RobotModel, joints: &[MeasuredJoint], row: usize) -> Placement {
-    let mut placement = Placement::at_rest(HELD_HEIGHT, robot.control.default_pose_f32());
+    let mut placement = Placement::at_rest(HELD_HEIGHT as f32, robot.control.default_pose_f32());
     for joint in joints {
-        placement.q[joint.joint.index()] = joint.q[row] as f32;
-        placement.dq[joint.joint.index()] = cell_or_zero(joint.dq, row);
+        let index = joint.commands.joint.index();
+        placement.q[index] = joint.q[row] as f32;
+        placement.dq[index] = cell_or_zero(joint.dq, row);
     }
     placement
-}
-
-fn command(robot: &RobotModel, joints: &[MeasuredJoint], row: usize) -> Command {
-    let control = &robot.control;
-    let mut command = Command::hold(control.default_pose_f32(), control.kp as f32, control.kd as f32);
-    for joint in joints {
-        let index = joint.joint.index();
-        command.q[index] = joint.q_cmd[row] as f32;
-        command.dq[index] = cell_or_zero(joint.dq_cmd, row);
-        command.tau_ff[index] = cell_or_zero(joint.tau_ff, row);
-        command.kp[index] = joint.kp[row] as f32;
-        command.kd[index] = joint.kd[row] as f32;
-    }
-    command
-}
-
-fn cell_or_zero(column: Option<&[f64]>, row: usize) -> f32 {
-    column.map(|cells| cells[row]).filter(|cell| cell.is_finite()).unwrap_or(0.0) as f32
-}
-
-/// How the log's time counts in periods of the drive.
-struct DriveClock {
-    /// One period of the drive on the log's clock [s].
-    period: f64,
-}
-
-impl DriveClock {
-    fn of(log: &Log, robot: &RobotModel) -> Result<Self, ReplayError> {
-        let mut steps: Vec<f64> =
-            log.segments().flat_map(|(_, rows)| log.t()[rows].windows(2).map(|pair| pair[1] - pair[0])).collect();
-        steps.sort_by(f64::total_cmp);
-        let median = *steps.get(steps.len() / 2).ok_or(ReplayError::NoSteps)?;
-        let drive_dt = robot.control.drive_dt();
-        let periods = (median / drive_dt).round();
-        if periods < 1.0 || (median / (periods * drive_dt) - 1.0).abs() > PERIOD_TOLERANCE {
-            return Err(ReplayError::Period { period_ms: median * 1e3, drive_ms: drive_dt * 1e3 });
-        }
-        Ok(Self { period: median / periods })
-    }
-
-    /// Drive periods from `row` to the next, of a part that begins at `t[0]`.
-    ///
-    /// Both ends are counted from the part's start, so that jitter does not add up and a gap has its length.
-    fn periods_between(&self, t: &[f64], row: usize) -> usize {
-        let periods_to = |row: usize| ((t[row] - t[0]) / self.period).round() as usize;
-        periods_to(row + 1) - periods_to(row)
-    }
 }
 
 fn root_mean_square(values: impl Iterator<Item = f64>) -> f64 {
@@ -286,7 +186,7 @@ fn bar(share: f64) -> String {
 mod tests {
     use expect_test::expect;
     use twinstep_logs::{Gain, LogError, Meta, Segment, TauSensor};
-    use twinstep_model::go2;
+    use twinstep_model::{Command, Joint, go2};
 
     use super::*;
 
@@ -309,8 +209,8 @@ mod tests {
         let robot = go2();
         let pose = robot.control.default_pose_f32();
         let fixed = SimConfig { base: Base::Fixed, ..config() };
-        let mut backend = RapierBackend::new(robot.clone(), fixed, 1).expect("a simulation");
-        backend.reset(&[(0, Placement::at_rest(HELD_HEIGHT, pose))]).expect("placed");
+        let mut backend = BatchBackend::new(robot.clone(), fixed, 1).expect("a simulation");
+        backend.reset(&[(0, Placement::at_rest(HELD_HEIGHT as f32, pose))]).expect("placed");
         let t = (0..ROWS).map(|row| row as f64 * 0.005).collect();
         let [mut q, mut q_cmd] = [0, 1].map(|_| vec![Vec::new(); Joint::ALL.len()]);
         for row in 0..ROWS {

@@ -138,7 +138,8 @@ fn task_name(text: &str) -> Result<TaskName, String> {
     }
 }
 
-fn engine(text: &str) -> Result<Engine, String> {
+/// The engine of that name.
+pub fn engine(text: &str) -> Result<Engine, String> {
     match text {
         "rapier" => Ok(Engine::Rapier),
         "batch" => Ok(Engine::Batch),

@@ -10,6 +10,8 @@
 //!   [`EnvSpec`], what a client must know of them.
 //! - [`Scene`]: what it takes to draw a robot; [`body_poses`], where its bodies are.
 //! - [`Ground`]: what robots stand on: a plane, or a [`HeightField`] in it.
+//! - [`mjcf()`]: the robot as a MuJoCo model.
+//! - [`lanes`]: many robots in SIMD lanes, and the equations of motion of the Go2's tree in them.
 //! - [`stream`]: one seed gives every consumer its own reproducible random numbers.
 //!
 //! SI units, radians, seconds. Vectors live in the world or the base frame, as their docs say; the base frame is the
@@ -24,6 +26,7 @@ mod height_field;
 mod joint;
 mod kinematics;
 pub mod lanes;
+mod mjcf;
 mod model_file;
 mod robot;
 mod scene;
@@ -38,7 +41,8 @@ pub use go2::go2;
 pub use ground::Ground;
 pub use height_field::{HeightField, HeightFieldError};
 pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};
-pub use kinematics::{NUM_BODIES, Pose, body_poses};
+pub use kinematics::{HELD_HEIGHT, NUM_BODIES, Pose, body_poses};
+pub use mjcf::{MjcfBase, MjcfDrive, MjcfOptions, mjcf};
 pub use model_file::ModelFileError;
 pub use robot::{Contact, Control, JointModel, LegModel, RobotModel, Shapes};
 pub use scene::{Scene, SceneShape, ShapeKind};

@@ -1,10 +1,13 @@
 //! `twinstep bench`: our numbers beside their references, in one run.
 
 mod pace;
+mod peers;
 mod remote;
 mod sim;
 mod tcp;
 mod transport;
+
+use std::path::PathBuf;
 
 use serde::Serialize;
 
@@ -24,13 +27,17 @@ pub struct Args {
     /// Length of one measuring window [s]; each case takes the median of several.
     #[arg(long, default_value_t = 1.0, value_name = "S", value_parser = window)]
     window_s: f64,
+    /// Python for the other simulators beside which `sim` measures, with MuJoCo and EnvPool: `pip install
+    /// "./clients/python[bench]"`. What it lacks is left out.
+    #[arg(long, default_value = "python3", value_name = "PATH")]
+    python: PathBuf,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum What {
     /// Round trips without physics, beside a raw TCP ping-pong with the same payloads.
     Transport,
-    /// Physics: env-steps/s on one core at each setting, and the accuracy it buys.
+    /// Physics: env-steps/s on one core at each setting, beside MuJoCo and EnvPool, and the accuracy it buys.
     Sim,
     /// Environments with physics: over Zenoh, beside the same in process.
     Remote,
@@ -85,7 +92,7 @@ pub fn run(args: &Args) -> Outcome {
         rows.extend(transport::measure(args.window_s, &signals)?);
     }
     if wanted(What::Sim) {
-        rows.extend(sim::measure(args.window_s, &signals)?);
+        rows.extend(sim::measure(&args.python, args.window_s, &signals)?);
     }
     if wanted(What::Remote) {
         rows.extend(remote::measure(args.window_s, &signals)?);
@@ -101,7 +108,12 @@ pub fn run(args: &Args) -> Outcome {
 
 fn print(results: &Results) {
     for row in &results.rows {
-        let value = if row.value.abs() < 1.0 { format!("{:.5}", row.value) } else { format!("{:.0}", row.value) };
+        let decimals = match row.value.abs() {
+            ..1.0 => 5,
+            ..100.0 => 2,
+            _ => 0,
+        };
+        let value = format!("{:.decimals$}", row.value);
         let comparison = match (&row.reference, row.ratio) {
             (Some(reference), Some(ratio)) => format!("  {ratio:.3} of {reference}"),
             (Some(reference), None) => format!("  against {reference}"),

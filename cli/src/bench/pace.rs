@@ -34,10 +34,12 @@ pub fn measure(window_s: f64, mut once: impl FnMut() -> Result<(), Failure>) -> 
 
 /// The median of several windows, number by number.
 pub fn median(paces: &[Pace]) -> Pace {
-    let middle = |pick: fn(&Pace) -> f64| {
-        let mut values: Vec<f64> = paces.iter().map(pick).collect();
-        values.sort_by(f64::total_cmp);
-        values[values.len() / 2]
-    };
+    let middle = |pick: fn(&Pace) -> f64| median_of(paces.iter().map(pick).collect());
     Pace { per_second: middle(|pace| pace.per_second), median_us: middle(|pace| pace.median_us) }
+}
+
+/// The median of a few numbers.
+pub fn median_of(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
 }

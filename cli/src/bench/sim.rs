@@ -1,57 +1,99 @@
-//! Physics on one core: what each setting costs, and what accuracy it buys against the finest one.
+//! Physics on one core: what each setting costs beside other simulators, and what accuracy it buys against the finest one.
 
-use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, go2};
-use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use twinstep_env_server::{Config, Host, SimHost};
+use twinstep_model::lanes::Instructions;
+use twinstep_model::{
+    AutoresetMode, Backend, Command, MjcfBase, MjcfDrive, MjcfOptions, NUM_JOINTS, PerJoint, Placement, ResetRequest,
+    go2, mjcf,
+};
+use twinstep_sim::{BatchBackend, Engine, Lanes, RapierBackend, SimConfig};
 
 use super::Row;
-use super::pace::{WINDOWS, measure as pace, median};
+use super::pace::{WINDOWS, measure as pace, median_of};
+use super::peers::{Peers, Setup};
 use crate::exit::{Failure, Outcome, Signals, other};
 use crate::trot;
 
-/// Engine, physics rate [Hz] and solver iterations.
-type Setting = (Engine, u32, u32);
+/// One way to simulate a robot.
+#[derive(Clone, Copy)]
+struct Setting {
+    simulator: Simulator,
+    physics_hz: u32,
+    solver_iterations: u32,
+}
+
+#[derive(Clone, Copy)]
+enum Simulator {
+    Rapier,
+    Batch(Lanes),
+}
 
 /// Wanted joint positions [rad] in a drive period of a motion.
 type Target = fn(usize) -> PerJoint;
 
-/// The shipped settings.
-const SETTINGS: [Setting; 10] = [
-    (Engine::Rapier, 200, 1),
-    (Engine::Rapier, 200, 2),
-    (Engine::Rapier, 200, 4),
-    (Engine::Rapier, 400, 1),
-    (Engine::Rapier, 1000, 1),
-    (Engine::Rapier, 1000, 4),
-    (Engine::Batch, 200, 4),
-    (Engine::Batch, 400, 4),
-    (Engine::Batch, 1000, 4),
-    (Engine::Batch, 4000, 4),
-];
+const fn rapier(physics_hz: u32, solver_iterations: u32) -> Setting {
+    Setting { simulator: Simulator::Rapier, physics_hz, solver_iterations }
+}
+
+fn batch(lanes: Lanes, physics_hz: u32) -> Setting {
+    Setting { simulator: Simulator::Batch(lanes), physics_hz, solver_iterations: 4 }
+}
+
+fn fastest(physics_hz: u32) -> Setting {
+    batch(Lanes::Single(Instructions::best()), physics_hz)
+}
+
+/// Everything that is measured: rapier, and the batch engine with each instruction set that this processor has.
+fn settings() -> Vec<Setting> {
+    let mut settings =
+        vec![rapier(200, 1), rapier(200, 2), rapier(200, 4), rapier(400, 1), rapier(1000, 1), rapier(1000, 4)];
+    for instructions in Instructions::available() {
+        settings.extend([200, 400, 1000].map(|physics_hz| batch(Lanes::Single(instructions), physics_hz)));
+    }
+    settings.extend([fastest(4000), batch(Lanes::Double, 1000)]);
+    settings
+}
+
 /// What the others are compared with.
-const FINEST: Setting = (Engine::Rapier, 4000, 4);
+const FINEST: Setting = rapier(4000, 4);
+/// Rates at which MuJoCo runs beside ours [Hz].
+const MUJOCO_HZ: [u32; 3] = [200, 400, 1000];
+/// Numbers of threads at which EnvPool runs beside our environments.
+const ENVPOOL_THREADS: [usize; 2] = [1, 2];
+/// Rate of the environments' physics [Hz]: the default; EnvPool's has 250.
+const ENVS_HZ: u32 = 1000;
+/// Robots that are stepped on two cores and on one.
+const MANY: usize = 1024;
 /// Robots in a measured batch.
 const ROBOTS: usize = 64;
 /// The height [m] from which the robots drop onto their feet, by millimetres.
 const START_HEIGHT: f32 = 0.335;
 /// Drive periods in the second that accuracy is measured over.
 const SECOND: usize = 200;
+/// Policy periods of the peers' motion: one cycle of the trot.
+const CYCLE: usize = 25;
+/// Gains [N·m/rad, N·m·s/rad]: stiff enough to stand on, in the range of policies for this robot.
+const KP: f32 = 40.0;
+const KD: f32 = 1.0;
 
-/// Environment steps a second and joint error of every setting.
-pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+/// Environment steps a second and joint error of every setting, beside the simulators that `python` has.
+pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
     let motions: [(&str, Target); 2] = [("stance step", stance_step), ("trot", trot_target)];
     let finest = motions.iter().map(|(_, target)| joint_positions(FINEST, *target)).collect::<Result<Vec<_>, _>>()?;
     let finest_name = name(FINEST);
-    let mut rows = Vec::new();
-    for setting in SETTINGS {
+    let mut peers = Peers::start(python, &setup(window_s));
+    let (mut rows, mut mujoco) = (Vec::new(), BTreeMap::<u32, Vec<f64>>::new());
+    for setting in settings() {
         signals.check()?;
         let name = name(setting);
-        rows.push(Row {
-            case: format!("{name}, one core"),
-            value: env_steps_per_second(setting, window_s)?,
-            unit: "env-steps/s",
-            reference: None,
-            ratio: None,
-        });
+        let case = format!("{name}, one core");
+        let (ours, theirs) = beside_mujoco(setting, &mut peers, window_s)?;
+        let reference = mujoco_name(setting.physics_hz);
+        rows.extend(speed_rows(&case, setting.physics_hz, ours, theirs.map(|rate| (&*reference, rate))));
+        mujoco.entry(setting.physics_hz).or_default().extend(theirs);
         for ((motion, target), finest) in motions.iter().zip(&finest) {
             let positions = joint_positions(setting, *target)?;
             rows.push(Row {
@@ -63,18 +105,168 @@ pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
             });
         }
     }
+    for (physics_hz, rates) in mujoco.into_iter().filter(|(_, rates)| !rates.is_empty()) {
+        rows.extend(speed_rows(&mujoco_name(physics_hz), physics_hz, median_of(rates), None));
+    }
+    for threads in ENVPOOL_THREADS {
+        signals.check()?;
+        rows.extend(beside_envpool(threads, &mut peers, window_s)?);
+    }
+    rows.extend(whole_and_parts(window_s)?);
     Ok(rows)
 }
 
-fn name((engine, physics_hz, solver_iterations): Setting) -> String {
-    let engine = match engine {
-        Engine::Rapier => "rapier",
-        Engine::Batch => "batch",
+/// Env-steps a second, and the time that one robot's physics step takes of it, beside a reference.
+fn speed_rows(case: &str, physics_hz: u32, rate: f64, reference: Option<(&str, f64)>) -> [Row; 2] {
+    let steps = go2().control.policy_dt() * f64::from(physics_hz);
+    let row = |case: String, value: f64, unit: &'static str| Row {
+        case,
+        value,
+        unit,
+        reference: reference.map(|(name, _)| name.to_owned()),
+        // Both rows compare the same speeds.
+        ratio: reference.map(|(_, theirs)| rate / theirs),
     };
-    format!("{engine} {physics_hz} Hz x {solver_iterations}")
+    [
+        row(case.to_owned(), rate, "env-steps/s"),
+        row(format!("{case}, a physics step of a robot"), 1e6 / (rate * steps), "us"),
+    ]
 }
 
-fn config((engine, physics_hz, solver_iterations): Setting) -> SimConfig {
+/// Env-steps a second of ours, and of MuJoCo at the same rate if it is there, in turn.
+fn beside_mujoco(setting: Setting, peers: &mut Peers, window_s: f64) -> Result<(f64, Option<f64>), Failure> {
+    let peer = format!("mujoco {}", setting.physics_hz);
+    match setting.simulator {
+        Simulator::Rapier => {
+            let backend = RapierBackend::new(go2(), config(setting), ROBOTS).map_err(other)?;
+            beside_peer(trotting(backend)?, peers, &peer, window_s)
+        }
+        Simulator::Batch(lanes) => {
+            let backend = BatchBackend::with_lanes(go2(), config(setting), ROBOTS, lanes).map_err(other)?;
+            beside_peer(trotting(backend)?, peers, &peer, window_s)
+        }
+    }
+}
+
+/// Our environments beside EnvPool's, with observations, rewards and resets on both sides.
+fn beside_envpool(threads: usize, peers: &mut Peers, window_s: f64) -> Result<Vec<Row>, Failure> {
+    let peer = format!("EnvPool Go1 (flat), {ROBOTS} envs, {threads} thread(s)");
+    let (ours, theirs) = beside_peer(walking(ROBOTS, threads)?, peers, &format!("envpool {threads}"), window_s)?;
+    let case = format!("walk, {}, {ROBOTS} envs, {threads} thread(s)", name(fastest(ENVS_HZ)));
+    let mut rows = vec![row(case, ours, theirs.map(|theirs| (&*peer, theirs)))];
+    rows.extend(theirs.map(|theirs| row(peer.clone(), theirs, None)));
+    Ok(rows)
+}
+
+/// What the task costs on top of the bare engine, and what the second core brings.
+fn whole_and_parts(window_s: f64) -> Result<[Row; 2], Failure> {
+    let bare = |threads| {
+        let config = SimConfig { threads, ..config(fastest(ENVS_HZ)) };
+        trotting(BatchBackend::new(go2(), config, MANY).map_err(other)?)
+    };
+    let (walk, engine) = in_turn(walking(MANY, 1)?, bare(1)?, window_s)?;
+    let (both, one) = in_turn(bare(2)?, bare(1)?, window_s)?;
+    let name = name(fastest(ENVS_HZ));
+    let reference = format!("bare {name}, {MANY} robots, one core");
+    Ok([
+        row(format!("walk, {name}, {MANY} envs, one core"), walk, Some((&reference, engine))),
+        row(format!("bare {name}, {MANY} robots, two threads"), both, Some((&reference, one))),
+    ])
+}
+
+/// A policy period of `num_envs` environments of the task `walk`, again and again.
+fn walking(num_envs: usize, threads: usize) -> Result<impl FnMut() -> Outcome, Failure> {
+    let config = Config { sim: SimConfig { threads, ..config(fastest(ENVS_HZ)) }, ..Config::default() };
+    let mut envs =
+        SimHost::new(config).and_then(|host| host.build(num_envs, AutoresetMode::NextStep, None)).map_err(other)?;
+    envs.reset(&ResetRequest::seeded(1, num_envs)).map_err(other)?;
+    let mut step = 0;
+    Ok(move || {
+        let action = trot::action(step as f32 * envs.spec().policy_dt as f32);
+        step += 1;
+        envs.step(&action.repeat(num_envs)).map(drop).map_err(other)
+    })
+}
+
+fn row(case: String, value: f64, reference: Option<(&str, f64)>) -> Row {
+    Row {
+        case,
+        value,
+        unit: "env-steps/s",
+        reference: reference.map(|(name, _)| name.to_owned()),
+        ratio: reference.map(|(_, theirs)| value / theirs),
+    }
+}
+
+/// Env-steps a second of two of ours with [`MANY`] robots; windows of both in turn.
+fn in_turn(
+    mut one: impl FnMut() -> Outcome,
+    mut other: impl FnMut() -> Outcome,
+    window_s: f64,
+) -> Result<(f64, f64), Failure> {
+    let (mut first, mut second) = (Vec::new(), Vec::new());
+    for _ in 0..WINDOWS {
+        first.push(pace(window_s, &mut one)?.per_second * MANY as f64);
+        second.push(pace(window_s, &mut other)?.per_second * MANY as f64);
+    }
+    Ok((median_of(first), median_of(second)))
+}
+
+/// Env-steps a second of `once`, which steps [`ROBOTS`] robots, and of a peer; windows of both in turn.
+fn beside_peer(
+    mut once: impl FnMut() -> Outcome,
+    peers: &mut Peers,
+    peer: &str,
+    window_s: f64,
+) -> Result<(f64, Option<f64>), Failure> {
+    let (mut ours, mut theirs) = (Vec::new(), Vec::new());
+    for _ in 0..WINDOWS {
+        ours.push(pace(window_s, &mut once)?.per_second * ROBOTS as f64);
+        if peers.has(peer) {
+            theirs.push(peers.window(peer)?);
+        }
+    }
+    Ok((median_of(ours), (!theirs.is_empty()).then(|| median_of(theirs))))
+}
+
+/// What the peers need to trot as ours do.
+fn setup(window_s: f64) -> Setup {
+    let control = go2().control;
+    let model = |physics_hz: u32| {
+        let drive = MjcfDrive::Position { kp: f64::from(KP), kd: f64::from(KD) };
+        let timestep = 1.0 / f64::from(physics_hz);
+        (physics_hz, mjcf(&go2(), &MjcfOptions { base: MjcfBase::Floating, timestep, drive }))
+    };
+    Setup {
+        models: MUJOCO_HZ.into_iter().map(model).collect(),
+        threads: ENVPOOL_THREADS.to_vec(),
+        targets: (0..CYCLE).map(|period| trot_target(period * control.decimation).to_vec()).collect(),
+        actions: (0..CYCLE).map(|period| trot::action(period as f32 * control.policy_dt() as f32).to_vec()).collect(),
+        policy_dt: control.policy_dt(),
+        num_envs: ROBOTS,
+        window_s,
+    }
+}
+
+fn name(Setting { simulator, physics_hz, solver_iterations }: Setting) -> String {
+    let simulator = match simulator {
+        Simulator::Rapier => "rapier".to_owned(),
+        Simulator::Batch(Lanes::Single(instructions)) => format!("batch {instructions}"),
+        Simulator::Batch(Lanes::Double) => "batch f64".to_owned(),
+    };
+    format!("{simulator} {physics_hz} Hz x {solver_iterations}")
+}
+
+fn mujoco_name(physics_hz: u32) -> String {
+    format!("MuJoCo C {physics_hz} Hz, one thread")
+}
+
+fn config(Setting { simulator, physics_hz, solver_iterations }: Setting) -> SimConfig {
+    let engine = match simulator {
+        Simulator::Rapier => Engine::Rapier,
+        Simulator::Batch(_) => Engine::Batch,
+    };
+    let (physics_hz, solver_iterations) = (Some(physics_hz), Some(solver_iterations));
     SimConfig { engine, physics_hz, solver_iterations, threads: 1, ..SimConfig::default() }
 }
 
@@ -85,37 +277,28 @@ fn place(backend: &mut impl Backend) -> Outcome {
 }
 
 fn command(target: PerJoint) -> Command {
-    // kp 40, kd 1: stiff enough to stand on, in the range of policies for this robot.
-    Command::hold(target, 40.0, 1.0)
+    Command::hold(target, KP, KD)
 }
 
-fn env_steps_per_second(setting: Setting, window_s: f64) -> Result<f64, Failure> {
-    match setting.0 {
-        Engine::Rapier => pace_of(RapierBackend::new(go2(), config(setting), ROBOTS).map_err(other)?, window_s),
-        Engine::Batch => pace_of(BatchBackend::new(go2(), config(setting), ROBOTS).map_err(other)?, window_s),
-    }
-}
-
-fn pace_of(mut backend: impl Backend, window_s: f64) -> Result<f64, Failure> {
+/// A policy period of all robots of `backend`, again and again.
+fn trotting(mut backend: impl Backend) -> Result<impl FnMut() -> Outcome, Failure> {
     place(&mut backend)?;
-    let decimation = go2().control.decimation;
+    let (decimation, active) = (go2().control.decimation, vec![true; backend.num_robots()]);
     let mut period = 0;
-    let mut windows = Vec::new();
-    for _ in 0..WINDOWS {
-        windows.push(pace(window_s, || {
-            period += decimation;
-            let commands = vec![command(trot_target(period)); ROBOTS];
-            backend.step(&commands, &[true; ROBOTS], decimation).map_err(other)
-        })?);
-    }
-    Ok(median(&windows).per_second * ROBOTS as f64)
+    Ok(move || {
+        period += decimation;
+        let commands = vec![command(trot_target(period)); active.len()];
+        backend.step(&commands, &active, decimation).map_err(other)
+    })
 }
 
 /// Joint positions after each drive period of one second, after half a second to settle.
 fn joint_positions(setting: Setting, target: Target) -> Result<Vec<PerJoint>, Failure> {
-    match setting.0 {
-        Engine::Rapier => play(RapierBackend::new(go2(), config(setting), 1).map_err(other)?, target),
-        Engine::Batch => play(BatchBackend::new(go2(), config(setting), 1).map_err(other)?, target),
+    match setting.simulator {
+        Simulator::Rapier => play(RapierBackend::new(go2(), config(setting), 1).map_err(other)?, target),
+        Simulator::Batch(lanes) => {
+            play(BatchBackend::with_lanes(go2(), config(setting), 1, lanes).map_err(other)?, target)
+        }
     }
 }
 

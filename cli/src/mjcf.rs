@@ -1,0 +1,70 @@
+//! `twinstep mjcf`: the robot as a MuJoCo model.
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use twinstep_model::{MjcfBase, MjcfDrive, MjcfOptions, mjcf};
+
+use crate::exit::{Outcome, input, other};
+use crate::robot_file::robot_model;
+
+/// Shortest and longest step [s].
+const TIMESTEPS: std::ops::RangeInclusive<f64> = 1e-5..=0.02;
+
+/// Write the robot as a MuJoCo model (MJCF, XML), for a second opinion on the physics.
+///
+/// The model has the tree, masses, inertias, armature, joint ranges and torque limits of the robot, and the contacts that
+/// `--engine batch` knows: feet, both ends of each calf, and the trunk's corners against the ground. `ctrl` is torque
+/// [N·m] in the joint order FL, FR, RL, RR; hip, thigh, calf. The keyframe `default_pose` is the start.
+///
+/// Example: `twinstep mjcf --out go2.xml && python -m mujoco.viewer --mjcf go2.xml`
+#[derive(clap::Args)]
+pub struct Args {
+    /// Model file of the robot; the ideal Go2 without.
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// Whether the trunk moves: floating, or fixed 1 m above the ground.
+    #[arg(long, default_value = "floating", value_parser = base)]
+    base: MjcfBase,
+    /// One step of the physics [s], 0.00001 to 0.02.
+    #[arg(long, default_value_t = 0.001, value_name = "S")]
+    timestep: f64,
+    /// File to write; stdout without.
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+}
+
+/// A flag outside what is allowed.
+#[derive(Debug, thiserror::Error)]
+#[error("`--timestep` = {0} is not allowed: {low} to {high} s", low = TIMESTEPS.start(), high = TIMESTEPS.end())]
+struct TimestepError(f64);
+
+/// A file that cannot be written.
+#[derive(Debug, thiserror::Error)]
+#[error("`--out`: cannot write {}: {cause}", path.display())]
+struct WriteError {
+    path: PathBuf,
+    cause: std::io::Error,
+}
+
+/// Writes the model.
+pub fn run(args: &Args) -> Outcome {
+    if !TIMESTEPS.contains(&args.timestep) {
+        return Err(input(TimestepError(args.timestep)));
+    }
+    let robot = robot_model(args.model.as_deref())?;
+    let options = MjcfOptions { base: args.base, timestep: args.timestep, drive: MjcfDrive::Torque };
+    let text = mjcf(&robot, &options);
+    match &args.out {
+        Some(path) => std::fs::write(path, text).map_err(|cause| input(WriteError { path: path.clone(), cause })),
+        None => std::io::stdout().write_all(text.as_bytes()).map_err(other),
+    }
+}
+
+fn base(text: &str) -> Result<MjcfBase, String> {
+    match text {
+        "floating" => Ok(MjcfBase::Floating),
+        "fixed" => Ok(MjcfBase::Fixed),
+        _ => Err("the base is floating or fixed".to_owned()),
+    }
+}

@@ -1,0 +1,144 @@
+"""The physics against MuJoCo: the same motions through ``twinstep play`` and through the model of ``twinstep mjcf``.
+
+Both start from the same state, and hold the same PD torque over each 5 ms of the drive.
+"""
+
+import json
+import math
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from twinstep.server import find_program
+
+Array = NDArray[np.float64]
+
+LEGS = ("FL", "FR", "RL", "RR")
+JOINTS = tuple(f"{leg}_{part}" for leg in LEGS for part in ("hip", "thigh", "calf"))
+POSE = np.array([[0.1 if leg[1] == "L" else -0.1, 0.8 if leg[0] == "F" else 1.0, -1.5] for leg in LEGS]).ravel()
+DRIVE_HZ = 200
+KP, KD = 40.0, 1.0
+SETTLING = DRIVE_HZ // 2
+GRAVITY = 9.81
+
+
+def step_target(_: int) -> Array:
+    """Every joint is told to move at once."""
+    return POSE + np.tile([0.1, 0.1, -0.2], 4)
+
+
+def trot_target(period: int) -> Array:
+    """Diagonal legs swing in turn, 2 Hz."""
+    phase = math.tau * 2 * period / DRIVE_HZ
+    target = POSE.reshape(4, 3).copy()
+    for leg in range(4):
+        swing = math.sin(phase) * (1 if leg in (0, 3) else -1)
+        target[leg] += [0.0, 0.1 * math.cos(phase) * math.copysign(1.0, swing), -0.25 * max(swing, 0.0)]
+    return target.ravel()
+
+
+def motion(target: Callable[[int], Array]) -> Array:
+    """Half a second in the default pose, then a second of ``target``: (rows, 12)."""
+    return np.array([*[POSE] * SETTLING, *[target(period) for period in range(DRIVE_HZ + 1)]])
+
+
+def play(folder: Path, targets: Array, base: str, physics_hz: int) -> dict[str, Array]:
+    """The columns of what ``twinstep play`` makes of ``targets``."""
+    source, log = folder / "motion.csv", folder / "played.csv"
+    columns = np.column_stack([np.arange(len(targets)) / DRIVE_HZ, targets])
+    header = ",".join(["t", *(f"q_cmd_{joint}" for joint in JOINTS)])
+    np.savetxt(source, columns, delimiter=",", header=header, comments="", fmt="%.17g")
+    meta = {"rate_hz": DRIVE_HZ, "tau_sensor": "none", "kp": KP, "kd": KD}
+    (folder / "motion.json").write_text(json.dumps({**meta, "segments": [{"name": "motion", "base": base}]}))
+    engine = ["--engine", "batch", "--physics-hz", str(physics_hz)]
+    subprocess.run([find_program(), "play", source, *engine, "--out", log], check=True)
+    played = np.genfromtxt(log, delimiter=",", names=True)
+    return {name: played[name] for name in played.dtype.names}
+
+
+def rows_of(played: dict[str, Array], quantity: str, parts: tuple[str, ...]) -> Array:
+    return np.column_stack([played[f"{quantity}_{part}"] for part in parts])
+
+
+def in_mujoco(targets: Array, played: dict[str, Array], base: str, timestep: float) -> tuple[Array, Array]:
+    """Joint positions (rows, 12) and base positions (rows, 3) in MuJoCo, from the first row of ``played``."""
+    command = [find_program(), "mjcf", "--base", base, "--timestep", str(timestep)]
+    text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    start = rows_of(played, "q", JOINTS)[0]
+    if base == "floating":
+        place, turn = rows_of(played, "pos", ("x", "y", "z"))[0], rows_of(played, "quat", ("w", "x", "y", "z"))[0]
+        start = np.concatenate([place, turn, start])
+    data.qpos[:] = start
+    steps = round(1 / (DRIVE_HZ * timestep))
+    joints, bases = np.zeros((len(targets), 12)), np.zeros((len(targets), 3))
+    for row, target in enumerate(targets):
+        joints[row], bases[row] = data.qpos[-12:], data.qpos[:3]
+        data.ctrl[:] = KP * (target - joints[row]) - KD * data.qvel[-12:]
+        mujoco.mj_step(model, data, nstep=steps)
+    return joints, bases
+
+
+def rmse(one: Array, other: Array) -> float:
+    return float(np.sqrt(np.mean((one - other) ** 2)))
+
+
+@pytest.mark.parametrize("target", [step_target, trot_target])
+def test_robot_on_a_stand_moves_as_in_mujoco_at_the_same_step(tmp_path: Path, target: Callable[[int], Array]) -> None:
+    targets = motion(target)
+    played = play(tmp_path, targets, "fixed", 1000)
+    joints, _ = in_mujoco(targets, played, "fixed", 0.001)
+    error = rmse(rows_of(played, "q", JOINTS), joints)
+    print(f"{target.__name__} on a stand: {error:.2e} rad")
+    assert error < 1e-4
+
+
+@pytest.mark.parametrize(("target", "limit"), [(step_target, 0.003), (trot_target, 0.015)])
+def test_robot_on_its_feet_moves_as_in_fine_mujoco(
+    tmp_path: Path, target: Callable[[int], Array], limit: float
+) -> None:
+    targets = motion(target)
+    played = play(tmp_path, targets, "floating", 1000)
+    joints, _ = in_mujoco(targets, played, "floating", 0.0005)
+    error = rmse(rows_of(played, "q", JOINTS)[SETTLING:], joints[SETTLING:])
+    print(f"{target.__name__}: {error:.5f} rad")
+    assert error < limit
+
+
+@pytest.mark.parametrize("target", [step_target, trot_target])
+@pytest.mark.parametrize("physics_hz", [200, 400, 1000])
+def test_rate_costs_as_much_accuracy_as_it_costs_mujoco(
+    tmp_path: Path, target: Callable[[int], Array], physics_hz: int
+) -> None:
+    targets = motion(target)
+    played = play(tmp_path, targets, "floating", physics_hz)
+    fine, _ = in_mujoco(targets, played, "floating", 0.0005)
+    coarse, _ = in_mujoco(targets, played, "floating", 1 / physics_hz)
+    ours, theirs = (rmse(q[SETTLING:], fine[SETTLING:]) for q in (rows_of(played, "q", JOINTS), coarse))
+    print(f"{target.__name__} {physics_hz} Hz: {ours:.5f} rad, MuJoCo {theirs:.5f} rad from MuJoCo at 2 kHz")
+    # A quarter more, and the half milliradian that the contacts differ by at any rate.
+    assert ours < 1.25 * theirs + 0.0005
+
+
+def test_standing_robot_weighs_what_it_should_and_creeps_no_more_than_twice_mujocos(tmp_path: Path) -> None:
+    targets = np.tile(POSE, (60 * DRIVE_HZ + 1, 1))
+    played = play(tmp_path, targets, "floating", 1000)
+    mass = 15.206408
+    force = rows_of(played, "foot_force", LEGS)[-DRIVE_HZ:].sum(axis=1).mean()
+    print(f"feet carry {force:.3f} N of {mass * GRAVITY:.3f} N")
+    assert abs(force / (mass * GRAVITY) - 1) < 1e-3
+    _, bases = in_mujoco(targets, played, "floating", 0.001)
+    ours, theirs = (creep(path) for path in (rows_of(played, "pos", ("x", "y", "z")), bases))
+    print(f"creep in 5..60 s: {1e3 * ours:.2f} mm, MuJoCo {1e3 * theirs:.2f} mm")
+    assert ours <= 2 * theirs
+
+
+def creep(path: Array) -> float:
+    """How far the base went after the first 5 s [m]."""
+    return float(np.linalg.norm(path[-1] - path[5 * DRIVE_HZ]))

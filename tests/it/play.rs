@@ -1,0 +1,159 @@
+//! `twinstep play` and `twinstep mjcf` through the real program.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use expect_test::{Expect, expect};
+use twinstep_logs::{Base as LoggedBase, Gain, Log, Meta, Segment, TauSensor};
+use twinstep_model::{Backend, Command as RobotCommand, Ground, JOINT_NAMES, NUM_JOINTS, PerJoint, Placement, go2};
+use twinstep_sim::{BatchBackend, Engine, SimConfig};
+use twinstep_tests::python::Programs;
+
+/// Rows of the motion at 50 Hz, four drive periods each.
+const ROWS: usize = 40;
+/// The row at which the robot is placed anew.
+const ANEW: usize = 25;
+const KP: f64 = 40.0;
+
+fn twinstep(arguments: &[&str]) -> Output {
+    let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
+    Command::new(programs.0.join("twinstep")).args(arguments).output().unwrap()
+}
+
+fn play(motion: &Path, out: &Path, more: &[&str]) -> Output {
+    let files = ["play", motion.to_str().unwrap(), "--out", out.to_str().unwrap()];
+    twinstep(&[&files, more].concat())
+}
+
+fn target(row: usize) -> PerJoint {
+    let pose = go2().control.default_pose_f32();
+    std::array::from_fn(|joint| pose[joint] + 0.1 * (0.3 * row as f32 + joint as f32).sin())
+}
+
+fn motion(base: LoggedBase, seconds_a_row: f64) -> Log {
+    let segments = vec![Segment { name: "sway".to_owned(), base }];
+    let meta = Meta { kp: Some(Gain::Same(KP)), ..Meta::new(50.0, TauSensor::None, segments) };
+    let episode = |row| f64::from(u8::from(row >= ANEW));
+    let mut columns = vec![
+        ("t".to_owned(), (0..ROWS).map(|row| row as f64 * seconds_a_row).collect()),
+        ("episode".to_owned(), (0..ROWS).map(episode).collect()),
+    ];
+    // The last joint has no column, and holds its pose.
+    for (joint, name) in JOINT_NAMES.iter().enumerate().take(NUM_JOINTS - 1) {
+        columns.push((format!("q_cmd_{name}"), (0..ROWS).map(|row| f64::from(target(row)[joint])).collect()));
+    }
+    Log::new_motion(meta, columns).unwrap()
+}
+
+#[test]
+fn played_motion_is_a_log_of_what_the_model_does() {
+    let folder = tempfile::tempdir().unwrap();
+    let (source, out) = (folder.path().join("sway.csv"), folder.path().join("played"));
+    motion(LoggedBase::Floating, 0.02).write(&source).unwrap();
+    let settings = ["--engine", "batch", "--physics-hz", "400"];
+    let output = play(&source, &out, &settings);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(output.stdout.is_empty());
+    let log = Log::open(&out).unwrap();
+
+    let robot = go2();
+    let config = SimConfig { engine: Engine::Batch, physics_hz: Some(400), threads: 1, ..SimConfig::default() };
+    let mut backend = BatchBackend::new(robot.clone(), config, 1).unwrap();
+    let pose = robot.control.default_pose_f32();
+    let start = Placement::above(&Ground::FLAT, &robot, pose, 0.0);
+    assert_eq!(log.rows(), ROWS);
+    for row in 0..ROWS {
+        if row == 0 || row == ANEW {
+            backend.reset(&[(0, start)]).unwrap();
+        }
+        let states = backend.states();
+        for (joint, name) in JOINT_NAMES.iter().enumerate() {
+            assert_eq!(log.q(name).unwrap()[row], f64::from(states.q[0][joint]), "row {row}");
+            assert_eq!(log.dq(name).unwrap()[row], f64::from(states.dq[0][joint]), "row {row}");
+        }
+        assert_eq!(log.channel("pos_z").unwrap()[row], f64::from(states.base_position[0][2]));
+        assert_eq!(log.channel("gyro_y").unwrap()[row], f64::from(states.base_angular_velocity[0][1]));
+        let mut command = RobotCommand::hold(target(row), KP as f32, robot.control.kd as f32);
+        (command.q[NUM_JOINTS - 1], command.kp[NUM_JOINTS - 1]) = (pose[NUM_JOINTS - 1], robot.control.kp as f32);
+        let mut torque = 0.0;
+        for _ in 0..4 {
+            backend.step(&[command], &[true], 1).unwrap();
+            torque += f64::from(backend.states().tau[0][1]) / 4.0;
+        }
+        let logged = log.tau_measured("FL_thigh").unwrap()[row];
+        if row + 1 == ANEW || row + 1 == ROWS {
+            assert!(logged.is_nan(), "no interval follows the last row of a part");
+        } else {
+            assert!((logged - torque).abs() < 1e-9, "row {row}: {logged} N·m, not {torque}");
+        }
+    }
+    assert_eq!((log.kp("FL_hip", 0), log.kp("RR_calf", 0)), (Some(KP), Some(robot.control.kp)));
+    assert_eq!(log.kd("FL_hip", 0), Some(robot.control.kd));
+    let forces = log.channel("foot_force_FL").unwrap();
+    assert!(forces[0].is_nan() && forces[1].is_finite());
+}
+
+#[test]
+fn flag_goes_before_the_base_of_the_motion() {
+    let folder = tempfile::tempdir().unwrap();
+    let (source, out) = (folder.path().join("sway.parquet"), folder.path().join("held.parquet"));
+    motion(LoggedBase::Floating, 0.02).write(&source).unwrap();
+    assert!(play(&source, &out, &["--base", "fixed"]).status.success());
+    let log = Log::open(&out).unwrap();
+    assert_eq!(log.meta().segments[0].base, LoggedBase::Fixed);
+    assert!(log.channel("pos_z").is_none() && log.tau_measured("RR_calf").is_some());
+}
+
+fn check_refusal(output: &Output, message: &Expect) {
+    assert_eq!(output.status.code(), Some(2));
+    assert!(output.stdout.is_empty());
+    message.assert_eq(&String::from_utf8_lossy(&output.stderr));
+}
+
+#[test]
+fn motion_between_the_periods_of_the_drive_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let (source, out) = (folder.path().join("sway.csv"), folder.path().join("played.csv"));
+    motion(LoggedBase::Fixed, 0.013).write(&source).unwrap();
+    check_refusal(
+        &play(&source, &out, &[]),
+        &expect![[r"
+            error: the log's median sample period is 13.000 ms, not a whole number of the drive's 5.000 ms within 2 %
+              resample the log, or give the robot model a `drive_hz` that the log's rate divides
+        "]],
+    );
+    assert!(!out.exists());
+}
+
+#[test]
+fn motion_is_not_overwritten() {
+    let folder = tempfile::tempdir().unwrap();
+    let source = folder.path().join("sway.csv");
+    motion(LoggedBase::Fixed, 0.02).write(&source).unwrap();
+    let output = play(&source, &source, &[]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("is the motion itself"));
+    assert!(Log::open_motion(&source).unwrap().q("FL_hip").is_none());
+}
+
+#[test]
+fn rate_that_the_drive_does_not_divide_is_refused_by_name() {
+    check_refusal(
+        &play(Path::new("none.csv"), Path::new("out.csv"), &["--physics-hz", "500"]),
+        &expect![[r"
+            error: `sim.physics_hz` = 500 is not allowed: a multiple of the drive's 200 Hz up to 20000
+        "]],
+    );
+}
+
+#[test]
+fn step_of_a_mujoco_model_is_checked() {
+    check_refusal(
+        &twinstep(&["mjcf", "--timestep", "5"]),
+        &expect![[r"
+            error: `--timestep` = 5 is not allowed: 0.00001 to 0.02 s
+        "]],
+    );
+    let output = twinstep(&["mjcf", "--base", "fixed"]);
+    assert!(output.status.success() && output.stdout.starts_with(b"<mujoco model=\"go2\">"));
+}
