@@ -106,7 +106,7 @@ macro_rules! lanewise {
         #[inline(always)]
         fn $function(mut self, other: Self) -> Self {
             for lane in 0..4 {
-                self.0[lane] = self.0[lane] $operator other.0[lane];
+                self.0[lane] $operator other.0[lane];
             }
             self
         }
@@ -114,10 +114,10 @@ macro_rules! lanewise {
 }
 
 impl F32x4 {
-    lanewise!(plus, +);
-    lanewise!(minus, -);
-    lanewise!(times, *);
-    lanewise!(over, /);
+    lanewise!(plus, +=);
+    lanewise!(minus, -=);
+    lanewise!(times, *=);
+    lanewise!(over, /=);
 
     #[inline(always)]
     fn negated(mut self) -> Self {

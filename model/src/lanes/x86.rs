@@ -5,6 +5,7 @@
 
 #![allow(unsafe_code, reason = "the intrinsics want the instruction set, which whoever makes a value has checked")]
 
+#[allow(clippy::wildcard_imports, reason = "the names say where they are from")]
 use std::arch::x86_64::*;
 
 use super::lane::{Lane, operators, sin_cos_double, sin_cos_single};

@@ -135,7 +135,9 @@ impl<T: Lane> Robots for Groups<T> {
                 groups.with_min_len(GROUPS_A_TASK).map(one).reduce(|| true, |finite, other| finite && other)
             }),
             _ => {
-                self.groups.iter_mut().zip(&mut chunks).enumerate().map(one).fold(true, |finite, other| finite && other)
+                // Every group is to be stepped, also after one that is not finite.
+                let groups = self.groups.iter_mut().zip(&mut chunks).enumerate();
+                groups.map(one).filter(|finite| !finite).count() == 0
             }
         }
     }
