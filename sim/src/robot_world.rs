@@ -115,6 +115,8 @@ impl RobotWorld {
         multibody.damping_mut().fill(0.0);
         for (dof, joint) in robot.joints.iter().enumerate() {
             multibody.armature_mut()[root_dofs + dof] = joint.armature as f32;
+            multibody.damping_mut()[root_dofs + dof] = joint.viscous_friction as f32;
+            multibody.frictions_mut()[root_dofs + dof] = joint.coulomb_friction as f32;
         }
         let mut displacement = vec![0.0; root_dofs + NUM_JOINTS];
         displacement[root_dofs..].copy_from_slice(&placement.q);

@@ -1,7 +1,9 @@
 //! The batch engine against rapier and against physics.
 
-use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, Variation, go2};
-use twinstep_sim::{Base, BatchBackend, BatchBackend as Simulator, Engine, RapierBackend, SimConfig};
+use rand::RngExt;
+use twinstep_model::lanes::Instructions;
+use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, Variation, go2, stream};
+use twinstep_sim::{Base, BatchBackend, BatchBackend as Simulator, Engine, Lanes, RapierBackend, SimConfig};
 
 const ENGINE: Engine = Engine::Batch;
 
@@ -125,6 +127,77 @@ fn robot_gives_the_same_bits_in_any_lane_batch_and_number_of_threads() {
     let alone = run(1, 0, 1);
     for (robots, index, threads) in [(1, 0, 2), (8, 5, 1), (21, 20, 1), (21, 20, 2), (40, 9, 2)] {
         assert_eq!(run(robots, index, threads), alone, "robot {index} of {robots} on {threads} threads");
+    }
+}
+
+/// A robot that trots for a second, in the numbers that `lanes` names: joints after each drive period.
+fn trot_in(lanes: Lanes) -> Vec<PerJoint> {
+    motion(&mut BatchBackend::with_lanes(go2(), at(1000, 4, Base::Floating), 1, lanes).unwrap(), 0.335, trot_target)
+}
+
+#[test]
+fn every_instruction_set_gives_the_same_bits() {
+    let baseline = trot_in(Lanes::Single(Instructions::Baseline));
+    for instructions in Instructions::available() {
+        assert_eq!(trot_in(Lanes::Single(instructions)), baseline, "{instructions}");
+    }
+}
+
+#[test]
+fn single_precision_is_enough() {
+    let (single, double) = (trot_in(Lanes::Single(Instructions::best())), trot_in(Lanes::Double));
+    let difference = rms_difference(&single, &double);
+    assert!(difference > 0.0 && difference < 1e-4, "{difference} rad");
+}
+
+#[test]
+fn joint_limits_hold_against_targets_beyond_them() {
+    let robot = go2();
+    let (lower, upper) = (robot.lower_limits(), robot.upper_limits());
+    let mut random = stream(1, "targets", 0);
+    let mut backend = batch(SimConfig { base: Base::Fixed, threads: 1, ..SimConfig::default() }, 64);
+    let mut beyond = 0.0f32;
+    for _ in 0..200 {
+        let commands: Vec<_> = (0..64)
+            .map(|_| {
+                let target = std::array::from_fn(|j| random.random_range(lower[j] - 0.5..upper[j] + 0.5));
+                Command::hold(target, 40.0, 1.0)
+            })
+            .collect();
+        backend.step(&commands, &[true; 64], 4).unwrap();
+        for q in &backend.states().q {
+            beyond = (0..12).map(|j| (lower[j] - q[j]).max(q[j] - upper[j])).fold(beyond, f32::max);
+        }
+    }
+    assert!(beyond > 0.001 && beyond < 0.05, "{beyond} rad beyond the limits");
+}
+
+#[test]
+fn a_million_random_steps_of_random_robots_stay_finite() {
+    const ROBOTS: usize = 1024;
+    let mut random = stream(2, "robots", 0);
+    let mut backend = batch(SimConfig::default(), ROBOTS);
+    let mut placements = Vec::new();
+    for robot in 0..ROBOTS {
+        let variation = Variation {
+            mass_scale: random.random_range(0.7..1.3),
+            payload: random.random_range(-1.0..5.0),
+            com_shift: std::array::from_fn(|_| random.random_range(-0.05..0.05)),
+            friction_scale: random.random_range(0.2..1.7),
+        };
+        placements.push((robot, Placement { variation, ..Placement::at_rest(0.4, pose()) }));
+    }
+    backend.reset(&placements).unwrap();
+    for _ in 0..1_000_000 / ROBOTS {
+        let commands: Vec<_> =
+            (0..ROBOTS).map(|_| Command::hold(pose().map(|q| q + random.random_range(-0.8..0.8)), 40.0, 1.0)).collect();
+        backend.step(&commands, &[true; ROBOTS], 4).unwrap();
+    }
+    let states = backend.states();
+    for robot in 0..ROBOTS {
+        let [.., z] = states.base_position[robot];
+        assert!((-0.05..2.0).contains(&z), "robot {robot} is at a height of {z} m");
+        assert!(states.dq[robot].iter().all(|dq| dq.abs() < 100.0), "robot {robot}: {:?}", states.dq[robot]);
     }
 }
 

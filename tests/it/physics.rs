@@ -3,12 +3,16 @@
 use std::f32::consts::PI;
 
 use glam::{DMat3, DVec3, Vec3};
+use proptest::prelude::*;
+use twinstep_model::lanes::{Acceleration, State, Tree, Vec3 as LaneVec3, forward_dynamics};
 use twinstep_model::{Backend, Command, Joint, NUM_JOINTS, PerJoint, Placement, RobotModel, frames, go2};
 use twinstep_sim::{Base, SimConfig, Terrain};
 
 use super::{ENGINE, Simulator};
 
 const GRAVITY: f32 = 9.81;
+/// The joint `FL_calf`.
+const CALF: usize = 2;
 
 fn backend(config: SimConfig, placement: Placement) -> Simulator {
     let mut backend = Simulator::new(go2(), SimConfig { engine: ENGINE, threads: 1, ..config }, 1).unwrap();
@@ -36,19 +40,30 @@ fn run(backend: &mut Simulator, command: &Command, seconds: f32) {
 
 /// Momentum, angular momentum about the world's origin, and centre of mass of the whole robot, from its state alone.
 fn momentum(robot: &RobotModel, backend: &Simulator) -> (DVec3, DVec3, DVec3) {
+    let (linear, angular, com, _) = motion(robot, backend);
+    (linear, angular, com)
+}
+
+/// As [`momentum`], and kinetic and potential energy [J].
+fn motion(robot: &RobotModel, backend: &Simulator) -> (DVec3, DVec3, DVec3, f64) {
     let states = backend.states();
     let rotation = frames::world_from_base(states.base_orientation[0]).as_dquat();
     let origin = Vec3::from(states.base_position[0]).as_dvec3();
     let velocity = Vec3::from(states.base_linear_velocity[0]).as_dvec3();
     let spin = rotation * Vec3::from(states.base_angular_velocity[0]).as_dvec3();
     let (mut linear, mut angular, mut first_moment) = (DVec3::ZERO, DVec3::ZERO, DVec3::ZERO);
+    let rotors = robot.joints.iter().zip(states.dq[0]).map(|(joint, dq)| 0.5 * joint.armature * f64::from(dq).powi(2));
+    let mut energy: f64 = rotors.sum();
     let mut add =
         |body: &twinstep_model::RigidBody, rotation: glam::DQuat, origin: DVec3, velocity: DVec3, spin: DVec3| {
             let offset = rotation * body.com;
             let (com, com_velocity) = (origin + offset, velocity + spin.cross(offset));
             let axes = DMat3::from_quat(rotation);
             linear += body.mass * com_velocity;
-            angular += body.mass * com.cross(com_velocity) + axes * body.inertia * axes.transpose() * spin;
+            let own_spin = axes * body.inertia * axes.transpose() * spin;
+            angular += body.mass * com.cross(com_velocity) + own_spin;
+            energy += 0.5 * body.mass * com_velocity.length_squared() + 0.5 * spin.dot(own_spin);
+            energy += body.mass * f64::from(GRAVITY) * com.z;
             first_moment += body.mass * com;
         };
     add(&robot.trunk, rotation, origin, velocity, spin);
@@ -65,7 +80,29 @@ fn momentum(robot: &RobotModel, backend: &Simulator) -> (DVec3, DVec3, DVec3) {
             add(&model.bodies[kind], rotation, origin, velocity, spin);
         }
     }
-    (linear, angular, first_moment / robot.total_mass())
+    (linear, angular, first_moment / robot.total_mass(), energy)
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(16))]
+    #[test]
+    fn limp_robot_in_flight_keeps_momentum_and_energy(
+        spin in prop::array::uniform3(-2.0f32..2.0),
+        dq in prop::array::uniform12(-2.0f32..2.0),
+    ) {
+        let robot = go2();
+        let placement = Placement { base_angular_velocity: spin, dq, ..Placement::at_rest(20.0, default_pose()) };
+        let mut backend = backend(SimConfig { physics_hz: Some(4000), ..SimConfig::default() }, placement);
+        let (linear, angular, com, energy) = motion(&robot, &backend);
+        run(&mut backend, &limp(), 0.1);
+        let (linear_after, angular_after, com_after, energy_after) = motion(&robot, &backend);
+        let fallen = DVec3::new(0.0, 0.0, -9.81 * robot.total_mass() * 0.1);
+        prop_assert!((linear_after - linear - fallen).length() < 0.01);
+        let own = |angular: DVec3, com: DVec3, linear: DVec3| angular - com.cross(linear);
+        prop_assert!((own(angular_after, com_after, linear_after) - own(angular, com, linear)).length() < 0.01);
+        let moving = energy - robot.total_mass() * f64::from(GRAVITY) * com.z;
+        prop_assert!((energy_after - energy).abs() < 0.01 * moving + 0.1, "{energy} J, then {energy_after} J");
+    }
 }
 
 #[test]
@@ -111,30 +148,133 @@ fn momentum_is_kept_in_flight_while_the_legs_swing() {
     assert!((flown - ballistic).length() < 0.008, "flew {flown}, ballistic {ballistic}");
 }
 
-/// The calf alone turns about a fixed knee: ddq = tau / (I + m r² + armature). Every other joint gets so heavy a rotor
-/// that it stays; gravity drops out of the difference between a positive and a negative torque.
 #[test]
 fn torque_step_turns_the_calf_by_its_inertia() {
-    let calf = 2;
+    let robot = lone_calf(0.0, 0.0);
+    let closed_form = 0.5 * 0.02 / calf_inertia(&robot);
+    let gained = calf_velocity(&robot, 0.0, 0.5);
+    assert!((gained / closed_form - 1.0).abs() < 0.005, "{gained} rad/s, closed form {closed_form}");
+}
+
+/// A robot whose calf `CALF` turns alone, with this friction: every other joint has so heavy a rotor that it stays.
+fn lone_calf(viscous: f64, coulomb: f64) -> RobotModel {
     let mut robot = go2();
-    for joint in (0..NUM_JOINTS).filter(|joint| *joint != calf) {
-        robot.joints[joint].armature = 1e4;
+    for (joint, model) in robot.joints.iter_mut().enumerate() {
+        if joint == CALF {
+            (model.viscous_friction, model.coulomb_friction) = (viscous, coulomb);
+        } else {
+            model.armature = 1e4;
+        }
     }
-    let stand = SimConfig { base: Base::Fixed, physics_hz: Some(1000), threads: 1, ..SimConfig::default() };
-    let speed_after = |torque: f32| {
+    robot
+}
+
+/// Velocity of the lone calf [rad/s] after 20 ms, from a velocity [rad/s] and under a torque [N·m]; half the difference
+/// to the opposite of both, so that gravity drops out.
+fn calf_velocity(robot: &RobotModel, dq: f32, tau: f32) -> f64 {
+    let stand =
+        SimConfig { engine: ENGINE, base: Base::Fixed, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
+    let [forth, back] = [1.0, -1.0].map(|sign| {
         let mut backend = Simulator::new(robot.clone(), stand, 1).unwrap();
+        let mut placement = Placement::at_rest(2.0, default_pose());
+        placement.dq[CALF] = sign * dq;
+        backend.reset(&[(0, placement)]).unwrap();
+        let mut command = limp();
+        command.tau_ff[CALF] = sign * tau;
+        run(&mut backend, &command, 0.02);
+        f64::from(backend.states().dq[0][CALF])
+    });
+    (forth - back) / 2.0
+}
+
+/// Of the lone calf about its joint, with its rotor [kg·m²].
+fn calf_inertia(robot: &RobotModel) -> f64 {
+    let body = &robot.legs[0].bodies[2];
+    body.inertia.y_axis.y + body.mass * (body.com.x.powi(2) + body.com.z.powi(2)) + robot.joints[CALF].armature
+}
+
+#[test]
+fn viscous_friction_slows_the_calf_exponentially() {
+    let robot = lone_calf(0.3, 0.0);
+    let closed_form = 5.0 * (-0.3 * 0.02 / calf_inertia(&robot)).exp();
+    let slowed = calf_velocity(&robot, 5.0, 0.0);
+    assert!((slowed / closed_form - 1.0).abs() < 0.01, "{slowed} rad/s, closed form {closed_form}");
+}
+
+#[test]
+fn coulomb_friction_takes_its_torque_from_a_moving_calf() {
+    let robot = lone_calf(0.0, 0.4);
+    let closed_form = 2.0 + (1.0 - 0.4) * 0.02 / calf_inertia(&robot);
+    let gained = calf_velocity(&robot, 2.0, 1.0);
+    assert!((gained / closed_form - 1.0).abs() < 0.01, "{gained} rad/s, closed form {closed_form}");
+}
+
+#[test]
+fn coulomb_friction_holds_what_is_weaker() {
+    let stand = SimConfig { engine: ENGINE, base: Base::Fixed, threads: 1, ..SimConfig::default() };
+    let angle_after = |tau: f32| {
+        let mut backend = Simulator::new(lone_calf(0.0, 0.8), stand, 1).unwrap();
         backend.reset(&[(0, Placement::at_rest(2.0, default_pose()))]).unwrap();
         let mut command = limp();
-        command.tau_ff[calf] = torque;
-        run(&mut backend, &command, 0.02);
-        backend.states().dq[0][calf]
+        command.tau_ff[CALF] = tau;
+        run(&mut backend, &command, 1.0);
+        (backend.states().q[0][CALF] - default_pose()[CALF]).abs()
     };
-    let body = &robot.legs[0].bodies[2];
-    let lever = body.com.x.powi(2) + body.com.z.powi(2);
-    let inertia = body.inertia.y_axis.y + body.mass * lever + robot.joints[calf].armature;
-    let gained = f64::from(speed_after(0.5) - speed_after(-0.5)) / 2.0;
-    let closed_form = 0.5 * 0.02 / inertia;
-    assert!((gained / closed_form - 1.0).abs() < 0.005, "{gained} rad/s, closed form {closed_form}");
+    // Gravity pulls with 0.2 N·m.
+    assert!(angle_after(0.4) < 1e-3, "moved by {} rad", angle_after(0.4));
+    assert!(angle_after(1.5) > 0.5, "moved by {} rad", angle_after(1.5));
+}
+
+/// Velocities over 5 ms of flight are those of the equations of motion, integrated in double precision in steps of
+/// 10 µs.
+#[test]
+fn engine_accelerates_as_the_equations_of_motion_say() {
+    let tree = Tree::<f64>::splat(&go2());
+    let placement = Placement {
+        base_linear_velocity: [0.3, -0.2, 1.0],
+        base_angular_velocity: [1.0, 1.5, -0.8],
+        dq: std::array::from_fn(|joint| (joint as f32 - 5.0) * 0.5),
+        ..Placement::at_rest(20.0, default_pose())
+    };
+    let mut command = limp();
+    command.tau_ff = std::array::from_fn(|joint| ((joint * 7 % 12) as f32 - 5.5) * 0.8);
+    let mut backend = backend(SimConfig { physics_hz: Some(4000), ..SimConfig::default() }, placement);
+    backend.step(&[command], &[true], 1).unwrap();
+
+    let mut state = State::<f64> {
+        linear_velocity: LaneVec3(placement.base_linear_velocity.map(f64::from)),
+        angular_velocity: LaneVec3(placement.base_angular_velocity.map(f64::from)),
+        q: placement.q.map(f64::from),
+        dq: placement.dq.map(f64::from),
+        ..State::origin()
+    };
+    const DT: f64 = 1e-5;
+    for _ in 0..500 {
+        let Acceleration { angular, linear, ddq } =
+            forward_dynamics(&tree, &state, &command.tau_ff.map(f64::from), f64::from(GRAVITY));
+        let [w, x, y, z] = state.orientation;
+        let rotation = glam::DQuat::from_xyzw(x, y, z, w);
+        let push = rotation * DVec3::from(linear.0) * DT;
+        state.linear_velocity = state.linear_velocity + LaneVec3(push.to_array());
+        state.angular_velocity = state.angular_velocity + angular.scaled(DT);
+        let turned = rotation * glam::DQuat::from_scaled_axis(DVec3::from(state.angular_velocity.0) * DT);
+        state.orientation = [turned.w, turned.x, turned.y, turned.z];
+        for joint in 0..NUM_JOINTS {
+            state.dq[joint] += DT * ddq[joint];
+            state.q[joint] += DT * state.dq[joint];
+        }
+    }
+    let states = backend.states();
+    for joint in 0..NUM_JOINTS {
+        let (ours, exact) = (f64::from(states.dq[0][joint]), state.dq[joint]);
+        assert!((ours - exact).abs() < 0.01 + 0.01 * exact.abs(), "joint {joint}: {ours} and {exact} rad/s");
+    }
+    for axis in 0..3 {
+        let (ours, exact) = (f64::from(states.base_angular_velocity[0][axis]), state.angular_velocity.0[axis]);
+        assert!((ours - exact).abs() < 0.01, "{ours} and {exact} rad/s");
+        let (ours, exact) = (f64::from(states.base_linear_velocity[0][axis]), state.linear_velocity.0[axis]);
+        assert!((ours - exact).abs() < 0.002, "{ours} and {exact} m/s");
+    }
 }
 
 #[test]
