@@ -7,7 +7,10 @@
 
 use glam::{DQuat, DVec3, dvec3};
 
-use crate::{Contact, Control, Joint, JointKind, JointModel, Leg, LegModel, RigidBody, RobotModel, Shapes};
+use crate::{
+    Contact, Control, Derating, Joint, JointDrive, JointKind, JointModel, JointSpring, Leg, LegModel, RigidBody,
+    RobotModel, Shapes, Stribeck,
+};
 
 /// The built-in ideal robot: no friction, no damping, no delay.
 pub fn go2() -> RobotModel {
@@ -19,6 +22,8 @@ pub fn go2() -> RobotModel {
         shapes: shapes(),
         contact: contact(),
         control: control(),
+        gyro_bias: DVec3::ZERO,
+        derating: Derating::NONE,
     }
 }
 
@@ -75,7 +80,18 @@ fn joint(joint: Joint) -> JointModel {
         JointKind::Hip | JointKind::Thigh => (23.7, 30.1),
         JointKind::Calf => (45.43, 15.70),
     };
-    JointModel { range, torque_limit, speed_limit, armature: 0.01, viscous_friction: 0.0, coulomb_friction: 0.0 }
+    JointModel {
+        range,
+        torque_limit,
+        speed_limit,
+        armature: 0.01,
+        viscous_friction: 0.0,
+        coulomb_friction: 0.0,
+        stribeck_friction: Stribeck { breakaway: 0.0, speed: 0.1 },
+        load_friction: 0.0,
+        spring: JointSpring { stiffness: 0.0, torque_at_zero: 0.0 },
+        drive: JointDrive::IDEAL,
+    }
 }
 
 /// Source: menagerie's geoms of the trunk, a thigh and a foot; the calf's cylinder as a capsule.

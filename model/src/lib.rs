@@ -44,7 +44,9 @@ pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoi
 pub use kinematics::{HELD_HEIGHT, NUM_BODIES, Pose, body_poses};
 pub use mjcf::{MjcfBase, MjcfDrive, MjcfOptions, mjcf};
 pub use model_file::ModelFileError;
-pub use robot::{Contact, Control, JointModel, LegModel, RobotModel, Shapes};
+pub use robot::{
+    Contact, Control, Derating, JointDrive, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes, Stribeck,
+};
 pub use scene::{Scene, SceneShape, ShapeKind};
 pub use spec::{EnvSpec, Field};
 pub use state::{Command, Placement, RobotStates, RobotStatesMut, Variation};

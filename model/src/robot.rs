@@ -21,6 +21,27 @@ pub struct RobotModel {
     pub contact: Contact,
     /// Drive gains, rates and the pose that actions are offsets from.
     pub control: Control,
+    /// What the gyroscope shows of a robot at rest [rad/s].
+    pub gyro_bias: DVec3,
+    /// How supply and heat weaken the motors.
+    pub derating: Derating,
+}
+
+/// How supply voltage and heat weaken the motors; both act where a log tells voltage and temperature.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Derating {
+    /// n of `τ · (V / V_ref)ⁿ`; 0 for none.
+    pub voltage_exponent: f64,
+    /// Torque lost a kelvin above [`Derating::above_c`], by joint [1/K].
+    pub per_kelvin: [f64; NUM_JOINTS],
+    /// Temperature from which heat counts, by joint [°C].
+    pub above_c: [f64; NUM_JOINTS],
+}
+
+impl Derating {
+    /// Full torque at any voltage and temperature.
+    pub const NONE: Derating =
+        Derating { voltage_exponent: 0.0, per_kelvin: [0.0; NUM_JOINTS], above_c: [35.0; NUM_JOINTS] };
 }
 
 impl RobotModel {
@@ -77,6 +98,92 @@ pub struct JointModel {
     pub viscous_friction: f64,
     /// Friction that does not, and that holds the joint when it stands [N·m].
     pub coulomb_friction: f64,
+    /// Friction on top at low speed.
+    pub stribeck_friction: Stribeck,
+    /// Friction in proportion to the motor's torque.
+    pub load_friction: f64,
+    /// A spring between the links, such as a cable.
+    pub spring: JointSpring,
+    /// From command to torque.
+    pub drive: JointDrive,
+}
+
+/// Friction `breakaway · e^(−(dq/speed)²)` on top of the Coulomb friction.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Stribeck {
+    /// At rest [N·m]; 0 for none.
+    pub breakaway: f64,
+    /// Speed at which it has fallen to 1/e [rad/s].
+    pub speed: f64,
+}
+
+/// Torque `−stiffness · q + torque_at_zero` on the joint.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct JointSpring {
+    /// [N·m/rad]
+    pub stiffness: f64,
+    /// At q = 0 [N·m]: stiffness times rest position.
+    pub torque_at_zero: f64,
+}
+
+/// What stands between a joint's command and the torque at its gear; [`JointDrive::IDEAL`] has none of it.
+///
+/// In the order in which it acts. Delays are at most [`JointDrive::LONGEST_DELAY`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct JointDrive {
+    /// Commands reach the drive so late [s].
+    pub command_delay: f64,
+    /// Drive and log see q plus this [rad].
+    pub encoder_offset: f64,
+    /// κ of `κ · tanh(τ / κ)` [N·m]; infinite for none.
+    pub saturation: f64,
+    /// The whole loop acts so late [s].
+    pub torque_delay: f64,
+    /// Speed at which back-EMF leaves no torque [rad/s]; infinite for none.
+    pub no_load_speed: f64,
+    /// Time constant of the torque [s]; 0 for none.
+    pub lag: f64,
+    /// Factor on the torque between the current's sensor and the gear.
+    pub gain: f64,
+    /// Torque that the position ripples by.
+    pub ripple: Ripple,
+    /// Play of the gear [rad].
+    pub gap: f64,
+    /// Stiffness of the gear [N·m/rad]; infinite for a rigid one.
+    pub stiffness: f64,
+    /// What a log shows of the torque is so old [s].
+    pub sensor_delay: f64,
+}
+
+/// Torque `amplitude · sin(cycles · q + phase)`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ripple {
+    /// [N·m]
+    pub amplitude: f64,
+    /// Periods in a turn of the joint.
+    pub cycles: f64,
+    /// [rad]
+    pub phase: f64,
+}
+
+impl JointDrive {
+    /// The longest delay [s]: eight periods of the drive.
+    pub const LONGEST_DELAY: f64 = 0.04;
+
+    /// Commands become torque at once and exactly.
+    pub const IDEAL: JointDrive = JointDrive {
+        command_delay: 0.0,
+        encoder_offset: 0.0,
+        saturation: f64::INFINITY,
+        torque_delay: 0.0,
+        no_load_speed: f64::INFINITY,
+        lag: 0.0,
+        gain: 1.0,
+        ripple: Ripple { amplitude: 0.0, cycles: 0.0, phase: 0.0 },
+        gap: 0.0,
+        stiffness: f64::INFINITY,
+        sensor_delay: 0.0,
+    };
 }
 
 /// Collision shapes, in the frames of the bodies they belong to.
