@@ -49,34 +49,6 @@ pub trait Actuator: Send {
     fn reset(&mut self, robot: usize);
 }
 
-/// The ideal drive: PD on the sampled state plus feed-forward, clipped to the joint's torque limit.
-#[derive(Clone, Debug)]
-pub struct PdDrive {
-    torque_limits: PerJoint,
-}
-
-impl PdDrive {
-    /// The ideal drive of `robot`.
-    pub fn new(robot: &RobotModel) -> Self {
-        Self { torque_limits: robot.torque_limits() }
-    }
-}
-
-impl Actuator for PdDrive {
-    fn torques(&mut self, commands: &[Command], active: &[bool], states: &RobotStates, tau: &mut [PerJoint]) {
-        for (robot, command) in commands.iter().enumerate().filter(|(robot, _)| active[*robot]) {
-            let (q, dq) = (&states.q[robot], &states.dq[robot]);
-            tau[robot] = std::array::from_fn(|j| {
-                let torque =
-                    command.kp[j] * (command.q[j] - q[j]) + command.kd[j] * (command.dq[j] - dq[j]) + command.tau_ff[j];
-                torque.clamp(-self.torque_limits[j], self.torque_limits[j])
-            });
-        }
-    }
-
-    fn reset(&mut self, _robot: usize) {}
-}
-
 /// Why a backend could not do what it was asked.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum BackendError {
@@ -108,38 +80,4 @@ pub enum BackendError {
         /// How many other robots diverged in the same step.
         more: usize,
     },
-}
-
-#[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-    use crate::{NUM_JOINTS, go2};
-
-    proptest! {
-        #[test]
-        fn ideal_drive_is_pd_within_the_limits(target in -4.0f32..4.0, q in -3.0f32..3.0, dq in -20.0f32..20.0) {
-            let robot = go2();
-            let mut states = RobotStates::new(1);
-            states.q[0] = [q; NUM_JOINTS];
-            states.dq[0] = [dq; NUM_JOINTS];
-            let mut tau = [[0.0; NUM_JOINTS]];
-            PdDrive::new(&robot).torques(&[Command::hold([target; NUM_JOINTS], 30.0, 0.75)], &[true], &states, &mut tau);
-            for (torque, joint) in tau[0].iter().zip(&robot.joints) {
-                let limit = joint.torque_limit as f32;
-                let expected = (30.0 * (target - q) - 0.75 * dq).clamp(-limit, limit);
-                prop_assert!((torque - expected).abs() < 1e-4);
-            }
-        }
-    }
-
-    #[test]
-    fn inactive_robot_keeps_its_torque() {
-        let mut tau = [[1.0; NUM_JOINTS]; 2];
-        let command = Command::hold([1.0; NUM_JOINTS], 30.0, 0.75);
-        PdDrive::new(&go2()).torques(&[command; 2], &[false, true], &RobotStates::new(2), &mut tau);
-        assert_eq!(tau[0], [1.0; NUM_JOINTS]);
-        assert_ne!(tau[1], [1.0; NUM_JOINTS]);
-    }
 }

@@ -35,7 +35,7 @@ mod state;
 mod stream;
 mod vec_env;
 
-pub use backend::{Actuator, Backend, BackendError, PdDrive};
+pub use backend::{Actuator, Backend, BackendError};
 pub use body::RigidBody;
 pub use go2::go2;
 pub use ground::Ground;

@@ -19,12 +19,21 @@ pub struct Command {
     pub kp: PerJoint,
     /// Velocity gain [N·m·s/rad].
     pub kd: PerJoint,
+    /// Share of the torque that supply and heat leave: 1 unless a log tells voltage and temperature.
+    pub strength: PerJoint,
 }
 
 impl Command {
     /// Holds `q` [rad] with the same gains `kp` [N·m/rad] and `kd` [N·m·s/rad] on every joint.
     pub fn hold(q: PerJoint, kp: f32, kd: f32) -> Self {
-        Self { q, dq: [0.0; NUM_JOINTS], tau_ff: [0.0; NUM_JOINTS], kp: [kp; NUM_JOINTS], kd: [kd; NUM_JOINTS] }
+        Self {
+            q,
+            dq: [0.0; NUM_JOINTS],
+            tau_ff: [0.0; NUM_JOINTS],
+            kp: [kp; NUM_JOINTS],
+            kd: [kd; NUM_JOINTS],
+            strength: [1.0; NUM_JOINTS],
+        }
     }
 }
 

@@ -1,12 +1,10 @@
 //! The rapier engine: one world a robot, stepped on all cores.
 
 use rayon::prelude::*;
-use twinstep_model::{
-    Actuator, Backend, BackendError, Command, Ground, PdDrive, PerJoint, Placement, RobotModel, RobotStates,
-};
+use twinstep_model::{Actuator, Backend, BackendError, Command, Ground, PerJoint, Placement, RobotModel, RobotStates};
 
 use crate::ground_shapes::GroundShapes;
-use crate::robot_world::{RobotWorld, WorldSnapshot};
+use crate::robot_world::{Input, RobotWorld, WorldSnapshot};
 use crate::{SimConfig, SimConfigError};
 
 /// Many Go2 in rapier3d.
@@ -17,7 +15,8 @@ pub struct RapierBackend {
     ground_shapes: GroundShapes,
     worlds: Vec<RobotWorld>,
     states: RobotStates,
-    drive: Box<dyn Actuator>,
+    /// In place of the robots' own drives.
+    drive: Option<Box<dyn Actuator>>,
     pool: rayon::ThreadPool,
 }
 
@@ -59,17 +58,6 @@ pub struct RobotSnapshot {
 impl RapierBackend {
     /// `num_robots` robots that stand in their default pose.
     pub fn new(robot: RobotModel, config: SimConfig, num_robots: usize) -> Result<Self, BuildError> {
-        let drive = Box::new(PdDrive::new(&robot));
-        Self::with_drive(robot, config, num_robots, drive)
-    }
-
-    /// As [`RapierBackend::new`], with another drive than the ideal one.
-    pub fn with_drive(
-        robot: RobotModel,
-        config: SimConfig,
-        num_robots: usize,
-        drive: Box<dyn Actuator>,
-    ) -> Result<Self, BuildError> {
         config.check(&robot.control)?;
         let pool = thread_pool(config.threads)?;
         let ground = config.terrain.ground();
@@ -77,11 +65,17 @@ impl RapierBackend {
         let placement = Placement::above(&ground, &robot, robot.control.default_pose_f32(), 0.0);
         let worlds = (0..num_robots).map(|_| RobotWorld::new(&robot, &config, &ground_shapes, &placement)).collect();
         let states = RobotStates::new(num_robots);
-        let mut this = Self { robot, config, ground, ground_shapes, worlds, states, drive, pool };
+        let mut this = Self { robot, config, ground, ground_shapes, worlds, states, drive: None, pool };
         for index in 0..num_robots {
             this.read_state(index);
         }
         Ok(this)
+    }
+
+    /// The same robots with another drive than their own.
+    #[must_use]
+    pub fn with_drive(self, drive: Box<dyn Actuator>) -> Self {
+        Self { drive: Some(drive), ..self }
     }
 
     fn check_index(&self, robot: usize) -> Result<(), BackendError> {
@@ -103,16 +97,24 @@ impl RapierBackend {
 
     /// One drive period of all active robots: torque from the sampled state, held over the physics steps.
     fn drive_period(&mut self, commands: &[Command], active: &[bool], steps: usize) {
-        let mut tau = std::mem::take(&mut self.states.tau);
-        self.drive.torques(commands, active, &self.states, &mut tau);
-        let robots = (&mut self.worlds, &tau, &mut self.states.q, &mut self.states.dq, active);
+        let given = self.drive.as_mut().map(|drive| {
+            let mut tau = self.states.tau.clone();
+            drive.torques(commands, active, &self.states, &mut tau);
+            tau
+        });
+        let input = |robot: usize| match &given {
+            Some(tau) => Input::Torques(&tau[robot]),
+            None => Input::Command(&commands[robot]),
+        };
+        let states = &mut self.states;
+        let robots = (&mut self.worlds, &mut states.tau, &mut states.q, &mut states.dq, active);
         self.pool.install(|| {
-            robots.into_par_iter().filter(|(.., active)| **active).for_each(|(world, tau, q, dq, _)| {
-                world.step(tau, steps);
+            let robots = robots.into_par_iter().enumerate().filter(|(_, (.., active))| **active);
+            robots.for_each(|(robot, (world, tau, q, dq, _))| {
+                *tau = world.drive_period(input(robot), steps);
                 world.read_joints(q, dq);
             });
         });
-        self.states.tau = tau;
     }
 
     fn first_diverged(&self, active: &[bool]) -> Option<BackendError> {
@@ -147,7 +149,9 @@ impl Backend for RapierBackend {
         for (robot, placement) in placements {
             let robot = *robot;
             self.worlds[robot] = RobotWorld::new(&self.robot, &self.config, &self.ground_shapes, placement);
-            self.drive.reset(robot);
+            if let Some(drive) = &mut self.drive {
+                drive.reset(robot);
+            }
             self.read_state(robot);
             self.states.tau[robot] = PerJoint::default();
         }

@@ -12,7 +12,10 @@
 
 use glam::{DVec3, Quat, Vec3};
 use rapier3d::prelude::*;
-use twinstep_model::{Joint, JointKind, Leg, NUM_JOINTS, PerJoint, PerLeg, Placement, RigidBody, RobotModel, frames};
+use twinstep_model::lanes::{Commands, Drive, JointForces};
+use twinstep_model::{
+    Command, Joint, JointKind, Leg, NUM_JOINTS, PerJoint, PerLeg, Placement, RigidBody, RobotModel, frames,
+};
 
 use crate::ground_shapes::GroundShapes;
 use crate::{Base, SimConfig};
@@ -37,6 +40,20 @@ pub struct RobotWorld {
     root_dofs: usize,
     feet: [ColliderHandle; 4],
     upper_body: Vec<ColliderHandle>,
+    drive: Drive<f64>,
+    /// What the encoders show beyond the joints' positions [rad].
+    encoder_offset: PerJoint,
+    /// What the gyroscopes show at rest [rad/s].
+    gyro_bias: Vec3,
+}
+
+/// What turns into torque, for one robot.
+#[derive(Clone, Copy)]
+pub enum Input<'a> {
+    /// A command, which the robot's own drives follow.
+    Command(&'a Command),
+    /// Torques from outside [N·m].
+    Torques(&'a PerJoint),
 }
 
 /// Everything of a world that a step depends on.
@@ -59,6 +76,7 @@ struct RootFrame {
     trunk_com: Vec3,
     feet: [ColliderHandle; 4],
     upper_body: Vec<ColliderHandle>,
+    drive: Drive<f64>,
 }
 
 impl RobotWorld {
@@ -94,7 +112,11 @@ impl RobotWorld {
                 }
             }
         }
+        let encoder_offset = robot.joints.map(|joint| joint.drive.encoder_offset as f32);
         let mut this = Self {
+            drive: Drive::new(robot, 1.0 / f64::from(config.physics_hz())),
+            encoder_offset,
+            gyro_bias: robot.gyro_bias.as_vec3(),
             world,
             trunk,
             multibody: multibody.expect("a leg's joints close no loop"),
@@ -109,17 +131,19 @@ impl RobotWorld {
 
     fn place_joints(&mut self, robot: &RobotModel, placement: &Placement) {
         let root_dofs = self.root_dofs;
+        // What a placement gives is what the encoders show.
+        let q: PerJoint = std::array::from_fn(|joint| placement.q[joint] - self.encoder_offset[joint]);
+        let rotors = self.drive.set(0, robot, &q, &placement.dq);
         let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
         // Takes over the trunk's pose, and drops the root's six axes when the trunk is fixed.
         multibody.forward_kinematics(&self.world.bodies, true);
         multibody.damping_mut().fill(0.0);
-        for (dof, joint) in robot.joints.iter().enumerate() {
-            multibody.armature_mut()[root_dofs + dof] = joint.armature as f32;
+        for (dof, (joint, rotor)) in robot.joints.iter().zip(rotors).enumerate() {
+            multibody.armature_mut()[root_dofs + dof] = rotor as f32;
             multibody.damping_mut()[root_dofs + dof] = joint.viscous_friction as f32;
-            multibody.frictions_mut()[root_dofs + dof] = joint.coulomb_friction as f32;
         }
         let mut displacement = vec![0.0; root_dofs + NUM_JOINTS];
-        displacement[root_dofs..].copy_from_slice(&placement.q);
+        displacement[root_dofs..].copy_from_slice(&q);
         multibody.apply_displacements(&displacement);
 
         let mut velocity = vec![0.0; root_dofs + NUM_JOINTS];
@@ -137,16 +161,43 @@ impl RobotWorld {
         multibody.update_rigid_bodies(&mut self.world.bodies, true);
     }
 
-    /// Holds the joint torques `tau` [N·m] for `steps` physics steps.
-    pub fn step(&mut self, tau: &PerJoint, steps: usize) {
-        let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
-        for (link, torque) in multibody.links_mut().skip(1).zip(tau) {
-            let position = link.joint().coords()[REVOLUTE_AXIS];
-            link.joint.set_spring(REVOLUTE_AXIS, TORQUE_SPRING, position + torque / TORQUE_SPRING);
+    /// One drive period of `steps` physics steps; what the current's sensors showed in it [N·m].
+    pub fn drive_period(&mut self, input: Input, steps: usize) -> PerJoint {
+        let (mut q, mut dq) = self.joints();
+        match input {
+            Input::Command(command) => self.drive.tick(&Commands::new(std::slice::from_ref(command)), &q, &dq),
+            Input::Torques(tau) => self.drive.ask(tau.map(f64::from)),
         }
-        for _ in 0..steps {
+        let mut shown = [0.0; NUM_JOINTS];
+        for index in 0..steps {
+            let JointForces { tau, dry, .. } = self.drive.push(index, &q, &dq);
+            let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
+            for (joint, link) in multibody.links_mut().skip(1).enumerate() {
+                let position = link.joint().coords()[REVOLUTE_AXIS];
+                link.joint.set_spring(REVOLUTE_AXIS, TORQUE_SPRING, position + tau[joint] as f32 / TORQUE_SPRING);
+            }
+            for (joint, dry) in dry.into_iter().enumerate() {
+                multibody.frictions_mut()[self.root_dofs + joint] = dry as f32;
+            }
             self.world.step();
+            (q, dq) = self.joints();
+            for (shown, current) in shown.iter_mut().zip(self.drive.current()) {
+                *shown += current / steps as f64;
+            }
         }
+        shown.map(|tau| tau as f32)
+    }
+
+    /// Positions [rad] and velocities [rad/s] of the joints.
+    fn joints(&self) -> ([f64; NUM_JOINTS], [f64; NUM_JOINTS]) {
+        let (multibody, _) = self.world.multibody_joints.get(self.multibody).expect("built with the world");
+        let (mut q, mut dq) = ([0.0; NUM_JOINTS], [0.0; NUM_JOINTS]);
+        let velocities = &multibody.generalized_velocity().as_slice()[self.root_dofs..];
+        for (joint, link) in multibody.links().skip(1).enumerate() {
+            q[joint] = f64::from(link.joint().coords()[REVOLUTE_AXIS]);
+            dq[joint] = f64::from(velocities[joint]);
+        }
+        (q, dq)
     }
 
     /// True if the last step met a number that is not finite; rapier then freezes the body concerned.
@@ -154,13 +205,11 @@ impl RobotWorld {
         !self.world.quarantine().bodies().is_empty() || !self.world.quarantine().colliders().is_empty()
     }
 
-    /// Reads joint positions [rad] and velocities [rad/s].
+    /// What the encoders show: positions [rad] and velocities [rad/s].
     pub fn read_joints(&self, q: &mut PerJoint, dq: &mut PerJoint) {
-        let (multibody, _) = self.world.multibody_joints.get(self.multibody).expect("built with the world");
-        for (position, link) in q.iter_mut().zip(multibody.links().skip(1)) {
-            *position = link.joint().coords()[REVOLUTE_AXIS];
-        }
-        dq.copy_from_slice(&multibody.generalized_velocity().as_slice()[self.root_dofs..]);
+        let (positions, velocities) = self.joints();
+        *q = std::array::from_fn(|joint| positions[joint] as f32 + self.encoder_offset[joint]);
+        *dq = velocities.map(|velocity| velocity as f32);
     }
 
     /// Pose and velocity of the base frame.
@@ -175,7 +224,7 @@ impl RobotWorld {
             position: (trunk.translation() - offset_world).to_array(),
             orientation: frames::to_wxyz(rotation),
             linear_velocity: (linear_com - angular_world.cross(offset_world)).to_array(),
-            angular_velocity: (rotation.inverse() * angular_world).to_array(),
+            angular_velocity: (rotation.inverse() * angular_world + self.gyro_bias).to_array(),
         }
     }
 
@@ -218,6 +267,7 @@ impl RobotWorld {
                 trunk_com: self.trunk_com,
                 feet: self.feet,
                 upper_body: self.upper_body.clone(),
+                drive: self.drive.clone(),
             },
         }
     }
@@ -237,9 +287,9 @@ impl RobotWorld {
             multibody_joints,
             ..PhysicsWorld::default()
         };
-        let RootFrame { trunk, multibody, trunk_com, feet, upper_body } = root;
-        (self.trunk, self.multibody, self.trunk_com, self.feet, self.upper_body) =
-            (trunk, multibody, trunk_com, feet, upper_body);
+        let RootFrame { trunk, multibody, trunk_com, feet, upper_body, drive } = root;
+        (self.trunk, self.multibody, self.trunk_com, self.feet, self.upper_body, self.drive) =
+            (trunk, multibody, trunk_com, feet, upper_body, drive);
     }
 }
 
@@ -357,7 +407,7 @@ mod tests {
         let placement = Placement { base_orientation: frames::to_wxyz(tilted), ..Placement::at_rest(0.6, q) };
         let mut world = RobotWorld::new(&robot, &SimConfig::default(), &GroundShapes::new(&Ground::FLAT), &placement);
         for steps in [0, 40] {
-            world.step(&std::array::from_fn(|j| (j as f32).cos()), steps);
+            world.drive_period(Input::Torques(&std::array::from_fn(|j| (j as f32).cos())), steps);
             let (mut q, mut dq) = (PerJoint::default(), PerJoint::default());
             world.read_joints(&mut q, &mut dq);
             let base = world.read_base();

@@ -298,6 +298,23 @@ fn series<T: Lane, const TERMS: usize>(s: T, first: usize) -> T {
     sum
 }
 
+/// `e^x` for x ≤ 0, within a few parts in a million of single precision and in 10¹³ of double; 0 below −40.
+///
+/// The 64th root by its series, squared six times: no integers, so that lanes stay together.
+#[inline(always)]
+pub(super) fn exponential<T: Lane>(x: T) -> T {
+    const TERMS: usize = 18;
+    let root = x.max(T::splat(-40.0)) * T::splat(1.0 / 64.0);
+    let mut sum = T::splat(1.0);
+    for k in (1..TERMS).rev() {
+        sum = T::splat(1.0) + root * sum * T::splat(1.0 / k as f64);
+    }
+    for _ in 0..6 {
+        sum = sum * sum;
+    }
+    sum
+}
+
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
@@ -314,6 +331,15 @@ mod tests {
             let (sin, cos) = x.sin_cos();
             let (ours_sin, ours_cos) = Lane::sin_cos(x);
             prop_assert!((sin - ours_sin).abs() < 2e-15 && (cos - ours_cos).abs() < 2e-15, "{x}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn exponential_is_the_librarys(x in -39.0f64..0.0) {
+            prop_assert!((exponential(x) / x.exp() - 1.0).abs() < 1e-13, "{x}");
+            let single = exponential(F32x4::splat(x)).get(1);
+            prop_assert!((single / x.exp() - 1.0).abs() < 2e-5, "{x}: {single}");
         }
     }
 

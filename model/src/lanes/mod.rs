@@ -7,12 +7,14 @@
 //! - [`Frames`]: where bodies and points of them are ([`Frames::calf_point`], [`Frames::calf_jacobian`]).
 //! - [`inverse_dynamics`], [`mass_matrix`], [`forward_dynamics`]: the equations of motion.
 //! - [`Factored`]: the equations of one time step, factored so that constraint rows are cheap. The engine's core.
+//! - [`Drive`]: from command to torque, with friction and springs behind it.
 //!
 //! Base quantities are in base axes at the base's origin. Joint order is [`crate::Joint::ALL`].
 
 #![allow(clippy::inline_always, reason = "what stays out of line is compiled for the oldest processor")]
 #![allow(clippy::needless_range_loop, reason = "indices of matrices read as in the textbook")]
 
+mod drive;
 mod dynamics;
 mod factored;
 mod instructions;
@@ -24,6 +26,7 @@ mod tree;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
+pub use drive::{Commands, Drive, JointForces};
 pub use dynamics::{Acceleration, Wrench, forward_dynamics, inverse_dynamics, mass_matrix};
 pub use factored::{Factored, FactoredLeg, JointLoad};
 pub use instructions::Instructions;

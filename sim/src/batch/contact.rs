@@ -33,8 +33,6 @@ pub struct Surface<T> {
     pub limits: [[T; 2]; 12],
     /// Time constant of a joint limit [s]; at least two steps.
     pub limit_time_constant: T,
-    /// Coulomb friction of each joint [N·m].
-    pub joint_friction: [T; 12],
     /// 1 where the trunk moves, 0 where it is held.
     pub moving: T,
 }
@@ -115,13 +113,15 @@ impl<T: Lane> Constraints<T> {
         Self { points: Active::empty(point), limits: Active::empty(joint), frictions: Active::empty(joint) }
     }
 
-    /// Finds what touches, and its rows. Impulses of what does not are forgotten.
+    /// Finds what touches, and its rows. Impulses of what does not are forgotten. `dry` is the largest torque of each
+    /// joint's dry friction [N·m].
     #[inline(always)]
     pub fn find(
         &mut self,
         factored: &Factored<T>,
         state: &State<T>,
         surface: &Surface<T>,
+        dry: &[T; 12],
         impulses: &mut Impulses<T>,
         dt: T,
     ) {
@@ -129,7 +129,9 @@ impl<T: Lane> Constraints<T> {
         self.find_points(factored, state, surface, impulses, dt);
         for joint in 0..12 {
             self.find_limits(factored, state, surface, impulses, joint, dt);
-            self.find_friction(factored, state, surface, joint);
+            if T::splat(0.0).any_less(dry[joint]) {
+                self.find_friction(factored, state, surface, joint);
+            }
         }
     }
 
@@ -207,10 +209,8 @@ impl<T: Lane> Constraints<T> {
 
     #[inline(always)]
     fn find_friction(&mut self, factored: &Factored<T>, state: &State<T>, surface: &Surface<T>, joint: usize) {
-        if T::splat(0.0).any_less(surface.joint_friction[joint]) {
-            let row = JointRow { factored, joint, sign: T::splat(1.0), moving: surface.moving };
-            *self.frictions.next() = JointBlock { row: row.stop(state.dq[joint]), leg: joint / 3, index: joint };
-        }
+        let row = JointRow { factored, joint, sign: T::splat(1.0), moving: surface.moving };
+        *self.frictions.next() = JointBlock { row: row.stop(state.dq[joint]), leg: joint / 3, index: joint };
     }
 
     /// Sweeps over all rows; friction at the ground stays inside its disc, friction of a joint below its largest torque.
@@ -220,6 +220,7 @@ impl<T: Lane> Constraints<T> {
         factored: &mut Factored<T>,
         impulses: &mut Impulses<T>,
         surface: &Surface<T>,
+        dry: &[T; 12],
         dt: T,
         iterations: usize,
     ) {
@@ -246,7 +247,7 @@ impl<T: Lane> Constraints<T> {
             }
             for block in self.frictions.all() {
                 let (row, impulse) = (&block.row, &mut impulses.frictions[block.index]);
-                let most = surface.joint_friction[block.index] * dt;
+                let most = dry[block.index] * dt;
                 let new = (*impulse - row.excess(factored, block.leg, *impulse)).max(-most).min(most);
                 row.push(factored, block.leg, new - *impulse);
                 *impulse = new;

@@ -1,8 +1,8 @@
 //! As many robots as there are lanes: their numbers, and one physics step of them all.
 
 use glam::{DVec3, dvec3};
-use twinstep_model::lanes::{Factored, JointLoad, Lane, State, Tree, Vec3};
-use twinstep_model::{Command, Ground, PerJoint, Placement, RigidBody, RobotModel, Variation};
+use twinstep_model::lanes::{Commands, Drive, Factored, JointLoad, Lane, State, Tree, Vec3};
+use twinstep_model::{Ground, PerJoint, Placement, RigidBody, RobotModel, Variation};
 
 use super::contact::{Constraints, Impulses, LEG_POINTS, POINTS, Surface};
 use super::ground::Terrain;
@@ -15,12 +15,13 @@ const GRAVITY: f64 = 9.81;
 #[derive(Clone)]
 pub struct Group<T> {
     tree: Tree<T>,
-    viscous_friction: [T; 12],
-    torque_limit: [T; 12],
+    drive: Drive<T>,
     surface: Surface<T>,
     state: State<T>,
-    /// Torque of the last drive period [N·m].
+    /// What the current's sensor showed, mean over the last drive period [N·m].
     tau: [T; 12],
+    /// What the gyroscopes show at rest [rad/s].
+    gyro_bias: Vec3<T>,
     impulses: Impulses<T>,
     dt: T,
     iterations: usize,
@@ -37,63 +38,21 @@ pub struct Time {
 
 /// Where the torque of a drive period comes from.
 #[allow(clippy::large_enum_variant, reason = "made once a step, and never moved")]
-pub enum Drive<T> {
-    /// From outside [N·m].
-    Given([T; 12]),
-    /// The ideal drive: PD on the state that the period starts from, and feed-forward, clipped to the limit.
-    Pd {
-        /// Wanted position [rad].
-        q: [T; 12],
-        /// Wanted velocity [rad/s].
-        dq: [T; 12],
-        /// [N·m/rad]
-        kp: [T; 12],
-        /// [N·m·s/rad]
-        kd: [T; 12],
-        /// [N·m]
-        tau_ff: [T; 12],
-    },
+pub enum Input<T> {
+    /// Commands, which the robot's own drives follow.
+    Commands(Commands<T>),
+    /// Torques from outside [N·m].
+    Torques([T; 12]),
 }
 
-impl<T: Lane> Drive<T> {
+impl<T: Lane> Input<T> {
     /// Torques from outside, one entry a robot.
-    pub fn given(tau: &[PerJoint]) -> Self {
+    pub fn torques(tau: &[PerJoint]) -> Self {
         let mut given = [T::splat(0.0); 12];
         for (lane, tau) in tau.iter().enumerate() {
             set(&mut given, lane, tau);
         }
-        Self::Given(given)
-    }
-
-    /// The ideal drive under commands, one a robot.
-    pub fn pd(commands: &[Command]) -> Self {
-        let zero = [T::splat(0.0); 12];
-        let [mut q, mut dq, mut kp, mut kd, mut tau_ff] = [zero; 5];
-        for (lane, command) in commands.iter().enumerate() {
-            set(&mut q, lane, &command.q);
-            set(&mut dq, lane, &command.dq);
-            set(&mut kp, lane, &command.kp);
-            set(&mut kd, lane, &command.kd);
-            set(&mut tau_ff, lane, &command.tau_ff);
-        }
-        Self::Pd { q, dq, kp, kd, tau_ff }
-    }
-
-    #[inline(always)]
-    fn torque(&self, state: &State<T>, limit: &[T; 12]) -> [T; 12] {
-        match self {
-            Self::Given(tau) => *tau,
-            Self::Pd { q, dq, kp, kd, tau_ff } => {
-                let mut tau = *tau_ff;
-                for joint in 0..12 {
-                    tau[joint] += kp[joint] * (q[joint] - state.q[joint]) + kd[joint] * (dq[joint] - state.dq[joint]);
-                    // A torque that is not a number must not become the limit: it is to be seen.
-                    tau[joint] = tau[joint].max(-limit[joint]);
-                    tau[joint] = limit[joint].min(tau[joint]);
-                }
-                tau
-            }
-        }
+        Self::Torques(given)
     }
 }
 
@@ -105,14 +64,13 @@ impl<T: Lane> Group<T> {
     /// Robots that stand as `placement` says.
     pub fn new(robot: &RobotModel, config: &SimConfig, ground: &Ground, placement: &Placement) -> Self {
         let dt = 1.0 / f64::from(config.physics_hz());
-        let zero = [T::splat(0.0); 12];
         let mut group = Self {
             tree: Tree::splat(robot),
-            viscous_friction: zero,
-            torque_limit: zero,
+            drive: Drive::new(robot, dt),
             surface: surface(robot, config, ground, dt),
             state: State::origin(),
-            tau: zero,
+            tau: [T::splat(0.0); 12],
+            gyro_bias: Vec3::splat(robot.gyro_bias),
             impulses: Impulses::zero(),
             dt: T::splat(dt),
             iterations: config.solver_iterations() as usize,
@@ -132,11 +90,14 @@ impl<T: Lane> Group<T> {
             *body = body.scaled(f64::from(variation.mass_scale));
         }
         self.tree.set(lane, &varied);
-        for (index, joint) in robot.joints.iter().enumerate() {
-            self.viscous_friction[index].set(lane, joint.viscous_friction);
-            self.torque_limit[index].set(lane, joint.torque_limit);
-            self.surface.joint_friction[index].set(lane, joint.coulomb_friction);
+        // What a placement gives is what the encoders show.
+        let offsets = robot.joints.map(|joint| joint.drive.encoder_offset as f32);
+        let q: PerJoint = std::array::from_fn(|joint| placement.q[joint] - offsets[joint]);
+        let rotors = self.drive.set(lane, robot, &q, &placement.dq);
+        for (armature, rotor) in self.tree.armature.iter_mut().zip(rotors) {
+            armature.set(lane, rotor);
         }
+        self.gyro_bias.set(lane, robot.gyro_bias);
         self.surface.friction.set(lane, robot.contact.friction * f64::from(variation.friction_scale));
         // Softer than two steps cannot be told from the step itself (MuJoCo's `refsafe`).
         self.surface.time_constant.set(lane, robot.contact.time_constant.max(2.0 * self.dt.get(lane)));
@@ -148,7 +109,7 @@ impl<T: Lane> Group<T> {
         set(&mut state.orientation, lane, &placement.base_orientation);
         set(&mut state.linear_velocity.0, lane, &velocity(placement.base_linear_velocity));
         set(&mut state.angular_velocity.0, lane, &velocity(placement.base_angular_velocity));
-        set(&mut state.q, lane, &placement.q);
+        set(&mut state.q, lane, &q);
         set(&mut state.dq, lane, &placement.dq);
         set(&mut self.tau, lane, &PerJoint::default());
         let Impulses { points, limits, frictions } = &mut self.impulses;
@@ -158,24 +119,33 @@ impl<T: Lane> Group<T> {
 
     /// Advances all robots.
     #[inline(always)]
-    pub fn advance(&mut self, drive: &Drive<T>, Time { drive_periods, steps }: Time) {
+    pub fn advance(&mut self, input: &Input<T>, Time { drive_periods, steps }: Time) {
         let (mut factored, mut constraints) = (Factored::empty(), Constraints::empty());
+        let share = T::splat(1.0 / steps as f64);
         for _ in 0..drive_periods {
-            self.tau = drive.torque(&self.state, &self.torque_limit);
-            for _ in 0..steps {
-                self.step(&mut factored, &mut constraints);
+            match input {
+                Input::Commands(commands) => self.drive.tick(commands, &self.state.q, &self.state.dq),
+                Input::Torques(tau) => self.drive.ask(*tau),
+            }
+            self.tau = [T::splat(0.0); 12];
+            for index in 0..steps {
+                self.step(index, &mut factored, &mut constraints);
+                for joint in 0..12 {
+                    self.tau[joint] += self.drive.current()[joint] * share;
+                }
             }
         }
     }
 
-    /// One physics step under the torque of this drive period.
+    /// One physics step of the drive period.
     #[inline(always)]
-    fn step(&mut self, factored: &mut Factored<T>, constraints: &mut Constraints<T>) {
-        let Self { tree, state, surface, impulses, dt, .. } = self;
-        let load = JointLoad { tau: self.tau, damping: self.viscous_friction };
+    fn step(&mut self, index: usize, factored: &mut Factored<T>, constraints: &mut Constraints<T>) {
+        let Self { tree, drive, state, surface, impulses, dt, .. } = self;
+        let forces = drive.push(index, &state.q, &state.dq);
+        let load = JointLoad { tau: forces.tau, damping: forces.viscous };
         factored.set_up(tree, state, &load, *dt, T::splat(GRAVITY), surface.moving);
-        constraints.find(factored, state, surface, impulses, *dt);
-        constraints.solve(factored, impulses, surface, *dt, self.iterations);
+        constraints.find(factored, state, surface, &forces.dry, impulses, *dt);
+        constraints.solve(factored, impulses, surface, &forces.dry, *dt, self.iterations);
         let (trunk, joints) = factored.solution();
         self.integrate(trunk, joints);
     }
@@ -203,7 +173,17 @@ impl<T: Lane> Group<T> {
         &self.state
     }
 
-    /// Torque of the last drive period [N·m].
+    /// What the encoder of a joint shows [rad].
+    pub fn measured_q(&self, joint: usize) -> T {
+        self.state.q[joint] + self.drive.encoder_offset(joint)
+    }
+
+    /// What the gyroscopes show [rad/s].
+    pub fn gyro(&self) -> Vec3<T> {
+        self.state.angular_velocity + self.gyro_bias
+    }
+
+    /// What the current's sensor showed, mean over the last drive period [N·m].
     pub fn tau(&self) -> &[T; 12] {
         &self.tau
     }
@@ -232,11 +212,12 @@ impl<T: Lane> Group<T> {
     pub fn restore(&mut self, lane: usize, snapshot: &LaneSnapshot) {
         let mut values = snapshot.0.iter();
         self.visit(|value| value.set(lane, *values.next().expect("a snapshot of the same kind of group")));
+        self.drive.restored();
     }
 
     /// Visits every number that differs between robots, always in the same order.
     fn visit(&mut self, mut visit: impl FnMut(&mut T)) {
-        let Self { tree, viscous_friction, torque_limit, surface, state, tau, impulses, .. } = self;
+        let Self { tree, drive, surface, state, tau, gyro_bias, impulses, .. } = self;
         let Tree { trunk, bodies, hip, thigh, calf, armature } = tree;
         for body in std::iter::once(trunk).chain(bodies.iter_mut().flatten()) {
             visit(&mut body.mass);
@@ -244,8 +225,8 @@ impl<T: Lane> Group<T> {
         }
         let origins = hip.iter_mut().chain(thigh).chain(calf);
         origins.flat_map(|origin| &mut origin.0).for_each(&mut visit);
-        armature.iter_mut().chain(viscous_friction).chain(torque_limit).for_each(&mut visit);
-        surface.joint_friction.iter_mut().for_each(&mut visit);
+        armature.iter_mut().chain(&mut gyro_bias.0).for_each(&mut visit);
+        drive.visit(&mut visit);
         visit(&mut surface.friction);
         visit(&mut surface.time_constant);
         let State { position, orientation, linear_velocity, angular_velocity, q, dq } = state;
@@ -287,7 +268,6 @@ fn surface<T: Lane>(robot: &RobotModel, config: &SimConfig, ground: &Ground, dt:
         time_constant: zero,
         limits: robot.joints.map(|joint| joint.range.map(T::splat)),
         limit_time_constant: T::splat(2.0 * dt),
-        joint_friction: [zero; 12],
         moving: T::splat(if config.base == Base::Floating { 1.0 } else { 0.0 }),
     }
 }

@@ -6,10 +6,10 @@ use rayon::prelude::*;
 use twinstep_model::lanes::F32x4 as Baseline;
 #[cfg(target_arch = "x86_64")]
 use twinstep_model::lanes::{Avx2F32, Avx2F64, Avx512F32, Sse2F32 as Baseline};
-use twinstep_model::lanes::{Instructions, Lane};
+use twinstep_model::lanes::{Commands, Instructions, Lane};
 use twinstep_model::{Command, Ground, PerJoint, Placement, RobotModel, RobotStates, RobotStatesMut};
 
-use super::group::{Drive, Group, LaneSnapshot, Time};
+use super::group::{Group, Input, LaneSnapshot, Time};
 use crate::SimConfig;
 
 /// Groups that one thread steps at a time: a drive period of one takes some ten microseconds, about what it takes to
@@ -25,10 +25,10 @@ pub enum Lanes {
     Double,
 }
 
-/// What turns into torque.
+/// What turns into torque, for all robots.
 #[derive(Clone, Copy)]
-pub enum Input<'a> {
-    /// Commands that the ideal drive follows, one a robot.
+pub enum Inputs<'a> {
+    /// Commands that the robots' own drives follow, one a robot.
     Commands(&'a [Command]),
     /// Torques [N·m], one entry a robot, held.
     Torques(&'a [PerJoint]),
@@ -45,7 +45,7 @@ pub trait Robots: Send + Sync {
     fn advance(
         &mut self,
         pool: Option<&ThreadPool>,
-        input: Input,
+        inputs: Inputs,
         active: &[bool],
         time: Time,
         states: &mut RobotStates,
@@ -94,7 +94,7 @@ pub fn robots(
 }
 
 /// Advances one group.
-type Advance<T> = fn(&mut Group<T>, &Drive<T>, Time);
+type Advance<T> = fn(&mut Group<T>, &Input<T>, Time);
 
 struct Groups<T> {
     groups: Vec<Group<T>>,
@@ -114,7 +114,7 @@ impl<T: Lane> Robots for Groups<T> {
     fn advance(
         &mut self,
         pool: Option<&ThreadPool>,
-        input: Input,
+        inputs: Inputs,
         active: &[bool],
         time: Time,
         states: &mut RobotStates,
@@ -123,11 +123,11 @@ impl<T: Lane> Robots for Groups<T> {
         let mut chunks: Vec<_> = states.chunks_mut(lanes).collect();
         let one = |(index, (group, states)): (usize, (&mut Group<T>, &mut RobotStatesMut))| {
             let robots = index * lanes..(index * lanes + lanes).min(active.len());
-            let drive = match input {
-                Input::Commands(commands) => Drive::pd(&commands[robots.clone()]),
-                Input::Torques(tau) => Drive::given(&tau[robots.clone()]),
+            let input = match inputs {
+                Inputs::Commands(commands) => Input::Commands(Commands::new(&commands[robots.clone()])),
+                Inputs::Torques(tau) => Input::torques(&tau[robots.clone()]),
             };
-            advance_active(group, advance, &drive, &active[robots], time, states)
+            advance_active(group, advance, &input, &active[robots], time, states)
         };
         match pool {
             Some(pool) if self.groups.len() > GROUPS_A_TASK => pool.install(|| {
@@ -156,7 +156,7 @@ impl<T: Lane> Robots for Groups<T> {
 fn advance_active<T: Lane>(
     group: &mut Group<T>,
     advance: Advance<T>,
-    drive: &Drive<T>,
+    input: &Input<T>,
     active: &[bool],
     time: Time,
     states: &mut RobotStatesMut,
@@ -166,7 +166,7 @@ fn advance_active<T: Lane>(
     }
     let asleep = (0..active.len()).filter(|lane| !active[*lane]);
     let asleep: Vec<_> = asleep.map(|lane| (lane, group.snapshot(lane))).collect();
-    advance(group, drive, time);
+    advance(group, input, time);
     for (lane, snapshot) in asleep {
         group.restore(lane, &snapshot);
     }
@@ -183,8 +183,8 @@ fn read<T: Lane>(group: &Group<T>, lane: usize, states: &mut RobotStatesMut) -> 
     states.base_position[lane] = values(&state.position.0, lane);
     states.base_orientation[lane] = values(&state.orientation, lane);
     states.base_linear_velocity[lane] = values(&state.linear_velocity.0, lane);
-    states.base_angular_velocity[lane] = values(&state.angular_velocity.0, lane);
-    states.q[lane] = values(&state.q, lane);
+    states.base_angular_velocity[lane] = values(&group.gyro().0, lane);
+    states.q[lane] = std::array::from_fn(|joint| group.measured_q(joint).get(lane) as f32);
     states.dq[lane] = values(&state.dq, lane);
     states.tau[lane] = values(group.tau(), lane);
     states.foot_force[lane] = std::array::from_fn(|leg| group.foot_force(lane, leg) as f32);
@@ -204,18 +204,18 @@ fn values<T: Lane, const N: usize>(values: &[T; N], lane: usize) -> [f32; N] {
 macro_rules! entry {
     ($safe:ident, $entry:ident, $feature:literal, $lane:ty) => {
         #[cfg(target_arch = "x86_64")]
-        fn $safe(group: &mut Group<$lane>, drive: &Drive<$lane>, time: Time) {
+        fn $safe(group: &mut Group<$lane>, input: &Input<$lane>, time: Time) {
             // SAFETY: `robots` has made sure that the processor has them.
             #[allow(unsafe_code)]
             unsafe {
-                $entry(group, drive, time);
+                $entry(group, input, time);
             }
         }
 
         #[cfg(target_arch = "x86_64")]
         #[target_feature(enable = $feature)]
-        fn $entry(group: &mut Group<$lane>, drive: &Drive<$lane>, time: Time) {
-            group.advance(drive, time);
+        fn $entry(group: &mut Group<$lane>, input: &Input<$lane>, time: Time) {
+            group.advance(input, time);
         }
     };
 }
@@ -224,6 +224,6 @@ entry!(advance_avx512, enter_avx512, "avx512f", Avx512F32);
 entry!(advance_avx2, enter_avx2, "avx2", Avx2F32);
 entry!(advance_avx2_double, enter_avx2_double, "avx2", Avx2F64);
 
-fn advance_baseline<T: Lane>(group: &mut Group<T>, drive: &Drive<T>, time: Time) {
-    group.advance(drive, time);
+fn advance_baseline<T: Lane>(group: &mut Group<T>, input: &Input<T>, time: Time) {
+    group.advance(input, time);
 }

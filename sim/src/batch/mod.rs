@@ -25,7 +25,7 @@ pub use lanes::Lanes;
 use crate::rapier::BuildError;
 use crate::{SimConfig, SimConfigError};
 use group::{LaneSnapshot, Time};
-use lanes::{Input, Robots};
+use lanes::{Inputs, Robots};
 
 /// Many Go2 in SIMD lanes.
 pub struct BatchBackend {
@@ -34,7 +34,7 @@ pub struct BatchBackend {
     ground: Ground,
     robots: Box<dyn Robots>,
     states: RobotStates,
-    /// In place of the ideal drive, which is part of the lanes.
+    /// In place of the robots' own drives, which are part of the lanes.
     drive: Option<Box<dyn Actuator>>,
     /// None with one thread: then the caller's does the work.
     pool: Option<rayon::ThreadPool>,
@@ -76,7 +76,7 @@ impl BatchBackend {
         Ok(Self { robot, config, ground, robots, states, drive: None, pool })
     }
 
-    /// The same robots with another drive than the ideal one.
+    /// The same robots with another drive than their own.
     #[must_use]
     pub fn with_drive(self, drive: Box<dyn Actuator>) -> Self {
         Self { drive: Some(drive), ..self }
@@ -149,10 +149,10 @@ impl Backend for BatchBackend {
             for _ in 0..drive_periods {
                 drive.torques(commands, active, states, &mut tau);
                 let period = Time { drive_periods: 1, steps };
-                finite &= robots.advance(pool, Input::Torques(&tau), active, period, states);
+                finite &= robots.advance(pool, Inputs::Torques(&tau), active, period, states);
             }
         } else {
-            finite = robots.advance(pool, Input::Commands(commands), active, Time { drive_periods, steps }, states);
+            finite = robots.advance(pool, Inputs::Commands(commands), active, Time { drive_periods, steps }, states);
         }
         let diverged = if finite { None } else { self.first_diverged(active) };
         diverged.map_or(Ok(()), Err)

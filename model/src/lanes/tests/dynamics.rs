@@ -3,7 +3,7 @@
 use glam::{DMat3, DQuat, DVec3};
 use proptest::prelude::*;
 
-use super::*;
+use super::super::*;
 use crate::{Pose, RigidBody, RobotModel, body_poses, go2};
 
 /// Gravity [m/s²].

@@ -1,0 +1,380 @@
+//! From command to torque: the drives of robots in lanes, and friction and springs behind them.
+//!
+//! [`Drive::tick`] runs once a drive period on what the drive samples then; [`Drive::push`] once a physics step. Both
+//! engines use them, so that an effect of reality has one law. What no robot of the lanes has costs one test a step.
+
+use super::lane::{Lane, exponential};
+use crate::{Command, JointDrive, JointModel, PerJoint, RobotModel};
+
+/// Drive periods that are remembered: the longest delay at 200 Hz, and the two that a fraction lies between.
+const REMEMBERED: usize = 10;
+/// Stiffness of a gear that has play and no stiffness of its own [N·m/rad].
+const STIFF_GEAR: f64 = 2000.0;
+
+/// What the drives of robots in lanes are told for a drive period.
+#[derive(Clone, Copy, Debug)]
+pub struct Commands<T> {
+    /// Wanted position [rad].
+    pub q: [T; 12],
+    /// Wanted velocity [rad/s].
+    pub dq: [T; 12],
+    /// Feed-forward torque [N·m].
+    pub tau_ff: [T; 12],
+    /// [N·m/rad]
+    pub kp: [T; 12],
+    /// [N·m·s/rad]
+    pub kd: [T; 12],
+    /// Share of the torque that supply and heat leave.
+    pub strength: [T; 12],
+}
+
+impl<T: Lane> Commands<T> {
+    /// Of up to as many robots as there are lanes.
+    pub fn new(commands: &[Command]) -> Self {
+        let zero = [T::splat(0.0); 12];
+        let mut this = Self { q: zero, dq: zero, tau_ff: zero, kp: zero, kd: zero, strength: zero };
+        for (lane, command) in commands.iter().enumerate() {
+            for joint in 0..12 {
+                this.q[joint].set(lane, f64::from(command.q[joint]));
+                this.dq[joint].set(lane, f64::from(command.dq[joint]));
+                this.tau_ff[joint].set(lane, f64::from(command.tau_ff[joint]));
+                this.kp[joint].set(lane, f64::from(command.kp[joint]));
+                this.kd[joint].set(lane, f64::from(command.kd[joint]));
+                this.strength[joint].set(lane, f64::from(command.strength[joint]));
+            }
+        }
+        this
+    }
+}
+
+/// Which effects any robot of the lanes has.
+#[derive(Clone, Copy, Debug, Default)]
+struct Uses {
+    command_delay: bool,
+    saturation: bool,
+    torque_delay: bool,
+    back_emf: bool,
+    ripple: bool,
+    elastic: bool,
+    speed_friction: bool,
+    spring: bool,
+}
+
+/// Defines the numbers of a joint, each with what it is of a [`JointModel`], a physics step and a drive period.
+macro_rules! numbers {
+    (|$joint:ident, $dt:ident, $drive_dt:ident| $($(#[$doc:meta])* $name:ident = $value:expr;)*) => {
+        /// Numbers of a joint's drive, friction and spring.
+        #[derive(Clone, Copy, Debug)]
+        struct Numbers<T> {
+            $($(#[$doc])* $name: T,)*
+        }
+
+        impl<T: Lane> Numbers<T> {
+            fn splat($joint: &JointModel, $dt: f64, $drive_dt: f64) -> Self {
+                Self { $($name: T::splat($value),)* }
+            }
+
+            fn set(&mut self, lane: usize, $joint: &JointModel, $dt: f64, $drive_dt: f64) {
+                $(self.$name.set(lane, $value);)*
+            }
+
+            fn visit(&mut self, mut visit: impl FnMut(&mut T)) {
+                $(visit(&mut self.$name);)*
+            }
+        }
+    };
+}
+
+numbers! { |joint, dt, drive_dt|
+    torque_limit = joint.torque_limit;
+    encoder_offset = joint.drive.encoder_offset;
+    /// In drive periods.
+    command_delay = joint.drive.command_delay / drive_dt;
+    /// One over κ; 0 for none.
+    saturation = 1.0 / joint.drive.saturation;
+    /// In drive periods.
+    torque_delay = joint.drive.torque_delay / drive_dt;
+    /// One over the no-load speed; 0 for none.
+    back_emf = 1.0 / joint.drive.no_load_speed;
+    /// Share of the way to its input that the torque goes in a physics step.
+    lag = if joint.drive.lag > 0.0 { 1.0 - (-dt / joint.drive.lag).exp() } else { 1.0 };
+    gain = joint.drive.gain;
+    ripple_amplitude = joint.drive.ripple.amplitude;
+    ripple_cycles = joint.drive.ripple.cycles;
+    ripple_phase = joint.drive.ripple.phase;
+    half_gap = 0.5 * joint.drive.gap;
+    /// Of the gear beyond its play [N·m/rad]; 0 where it is rigid.
+    gear = elasticity(&joint.drive);
+    /// Inertia of a rotor on an elastic gear [kg·m²].
+    rotor = joint.armature;
+    viscous = joint.viscous_friction;
+    coulomb = joint.coulomb_friction;
+    breakaway = joint.stribeck_friction.breakaway;
+    /// One over the speed at which the breakaway fades [s/rad].
+    fading = 1.0 / joint.stribeck_friction.speed;
+    load = joint.load_friction;
+    spring = joint.spring.stiffness;
+    spring_at_zero = joint.spring.torque_at_zero;
+}
+
+/// Stiffness of the gear [N·m/rad]; 0 where rotor and link move as one.
+fn elasticity(drive: &JointDrive) -> f64 {
+    if drive.stiffness.is_finite() {
+        drive.stiffness
+    } else if drive.gap > 0.0 {
+        STIFF_GEAR
+    } else {
+        0.0
+    }
+}
+
+/// What the drives remember.
+#[derive(Clone, Debug)]
+struct Memory<T> {
+    /// Position, velocity and feed-forward torque of the last commands, newest first.
+    commands: [[[T; 12]; 3]; REMEMBERED],
+    /// Torque that the loop asked for in the last drive periods, newest first [N·m].
+    asked: [[T; 12]; REMEMBERED],
+    /// Behind the bandwidth: what the motor's current shows [N·m].
+    current: [T; 12],
+    /// Where the rotor of an elastic gear is [rad], and how fast [rad/s].
+    rotor: [[T; 12]; 2],
+}
+
+/// The drives of robots in lanes.
+#[derive(Clone, Debug)]
+pub struct Drive<T> {
+    numbers: [Numbers<T>; 12],
+    memory: Memory<T>,
+    uses: Uses,
+    /// One physics step, in drive periods.
+    step: T,
+    /// One physics step [s].
+    dt: f64,
+    drive_dt: f64,
+}
+
+/// What acts at the joints in one physics step.
+#[derive(Clone, Copy, Debug)]
+pub struct JointForces<T> {
+    /// Torque [N·m].
+    pub tau: [T; 12],
+    /// Viscous friction [N·m·s/rad].
+    pub viscous: [T; 12],
+    /// Largest torque of the dry friction [N·m].
+    pub dry: [T; 12],
+}
+
+impl<T: Lane> Drive<T> {
+    /// The drives of `robot` in every lane, without torque, for physics steps of `dt` [s].
+    pub fn new(robot: &RobotModel, dt: f64) -> Self {
+        let (zero, drive_dt) = ([T::splat(0.0); 12], robot.control.drive_dt());
+        let numbers = robot.joints.map(|joint| Numbers::splat(&joint, dt, drive_dt));
+        let memory =
+            Memory { commands: [[zero; 3]; REMEMBERED], asked: [zero; REMEMBERED], current: zero, rotor: [zero; 2] };
+        Self { numbers, memory, uses: Uses::default(), step: T::splat(dt / drive_dt), dt, drive_dt }
+    }
+
+    /// Puts the drives of `robot`, with its joints at `q` [rad] and `dq` [rad/s], into one lane; they have no torque yet.
+    ///
+    /// Returns the rotor inertia that moves with each link [kg·m²]: none of a rotor behind an elastic gear.
+    pub fn set(&mut self, lane: usize, robot: &RobotModel, q: &PerJoint, dq: &PerJoint) -> [f64; 12] {
+        let mut on_link = [0.0; 12];
+        for (index, joint) in robot.joints.iter().enumerate() {
+            on_link[index] = if elasticity(&joint.drive) > 0.0 { 0.0 } else { joint.armature };
+            self.numbers[index].set(lane, joint, self.dt, self.drive_dt);
+            let memory = &mut self.memory;
+            // Before the first command a robot held still where it was put.
+            for command in &mut memory.commands {
+                command[0][index].set(lane, f64::from(q[index]) + joint.drive.encoder_offset);
+                command[1][index].set(lane, 0.0);
+                command[2][index].set(lane, 0.0);
+            }
+            for asked in &mut memory.asked {
+                asked[index].set(lane, 0.0);
+            }
+            memory.current[index].set(lane, 0.0);
+            memory.rotor[0][index].set(lane, f64::from(q[index]));
+            memory.rotor[1][index].set(lane, f64::from(dq[index]));
+        }
+        self.find_uses();
+        on_link
+    }
+
+    fn find_uses(&mut self) {
+        let (zero, mut uses) = (T::splat(0.0), Uses::default());
+        for n in &self.numbers {
+            uses.command_delay |= zero.any_less(n.command_delay);
+            uses.saturation |= zero.any_less(n.saturation);
+            uses.torque_delay |= zero.any_less(n.torque_delay);
+            uses.back_emf |= zero.any_less(n.back_emf);
+            uses.ripple |= zero.any_less(n.ripple_amplitude);
+            uses.elastic |= zero.any_less(n.gear);
+            uses.speed_friction |= zero.any_less(n.breakaway) || zero.any_less(n.load);
+            uses.spring |= zero.any_less(n.spring);
+        }
+        self.uses = uses;
+    }
+
+    /// What drive and log see of the joints beyond their position [rad].
+    pub fn encoder_offset(&self, joint: usize) -> T {
+        self.numbers[joint].encoder_offset
+    }
+
+    /// What a sensor of the motors' current shows now [N·m].
+    pub fn current(&self) -> &[T; 12] {
+        &self.memory.current
+    }
+
+    /// The loop closes: commands and sampled state become the torque of the coming drive period.
+    #[inline(always)]
+    pub fn tick(&mut self, commands: &Commands<T>, q: &[T; 12], dq: &[T; 12]) {
+        let now =
+            if self.uses.command_delay { self.delayed(commands) } else { [commands.q, commands.dq, commands.tau_ff] };
+        let mut asked = [T::splat(0.0); 12];
+        for joint in 0..12 {
+            let n = &self.numbers[joint];
+            let (kp, kd) = (commands.kp[joint], commands.kd[joint]);
+            let seen = q[joint] + n.encoder_offset;
+            let mut tau = now[2][joint] + (kp * (now[0][joint] - seen) + kd * (now[1][joint] - dq[joint]));
+            if self.uses.saturation {
+                tau = saturated(tau, n.saturation);
+            }
+            // A torque that is not a number must not become the limit: it is to be seen.
+            let limit = n.torque_limit;
+            asked[joint] = limit.min((tau * commands.strength[joint]).max(-limit));
+        }
+        self.ask(asked);
+    }
+
+    /// A torque from outside for the coming drive period [N·m], in place of [`Drive::tick`].
+    #[inline(always)]
+    pub fn ask(&mut self, asked: [T; 12]) {
+        if self.uses.torque_delay {
+            self.memory.asked.copy_within(0..REMEMBERED - 1, 1);
+        }
+        self.memory.asked[0] = asked;
+    }
+
+    /// Remembers the commands; those that arrive now.
+    #[inline(always)]
+    fn delayed(&mut self, commands: &Commands<T>) -> [[T; 12]; 3] {
+        let (zero, one) = (T::splat(0.0), T::splat(1.0));
+        self.memory.commands.copy_within(0..REMEMBERED - 1, 1);
+        self.memory.commands[0] = [commands.q, commands.dq, commands.tau_ff];
+        let mut arrived = [[zero; 12]; 3];
+        for (age, command) in self.memory.commands.iter().enumerate() {
+            for joint in 0..12 {
+                // A fraction of a period lies between two commands.
+                let off = (self.numbers[joint].command_delay - T::splat(age as f64)).abs();
+                let weight = (one - off).max(zero);
+                for quantity in 0..3 {
+                    arrived[quantity][joint] += weight * command[quantity][joint];
+                }
+            }
+        }
+        arrived
+    }
+
+    /// What acts in physics step `index` of the drive period, with the joints at `q` and `dq`.
+    #[inline(always)]
+    pub fn push(&mut self, index: usize, q: &[T; 12], dq: &[T; 12]) -> JointForces<T> {
+        let uses = self.uses;
+        let input = if uses.torque_delay { self.late(index) } else { self.memory.asked[0] };
+        let (zero, one) = (T::splat(0.0), T::splat(1.0));
+        let mut forces = JointForces { tau: [zero; 12], viscous: [zero; 12], dry: [zero; 12] };
+        for joint in 0..12 {
+            let n = &self.numbers[joint];
+            let mut tau = input[joint];
+            if uses.back_emf {
+                let (limit, share) = (n.torque_limit, dq[joint] * n.back_emf);
+                let forth = limit * (one - share).max(zero).min(one);
+                let back = limit * (one + share).max(zero).min(one);
+                tau = forth.min(tau.max(-back));
+            }
+            let current = &mut self.memory.current[joint];
+            *current += n.lag * (tau - *current);
+            tau = n.gain * *current;
+            if uses.ripple {
+                let (sin, _) = (n.ripple_cycles * q[joint] + n.ripple_phase).sin_cos();
+                tau += n.ripple_amplitude * sin;
+            }
+            (forces.viscous[joint], forces.dry[joint]) = (n.viscous, n.coulomb);
+            if uses.speed_friction {
+                let speed = dq[joint] * n.fading;
+                forces.dry[joint] += n.breakaway * exponential(-(speed * speed)) + n.load * tau.abs();
+            }
+            forces.tau[joint] = tau;
+        }
+        if uses.elastic {
+            self.through_gear(&mut forces.tau, q);
+        }
+        if uses.spring {
+            for joint in 0..12 {
+                let n = &self.numbers[joint];
+                forces.tau[joint] += n.spring_at_zero - n.spring * q[joint];
+            }
+        }
+        forces
+    }
+
+    /// The mean of the delayed torque over physics step `index`.
+    #[inline(always)]
+    fn late(&self, index: usize) -> [T; 12] {
+        let (zero, one) = (T::splat(0.0), T::splat(1.0));
+        let start = self.step * T::splat(index as f64);
+        let mut late = [zero; 12];
+        for joint in 0..12 {
+            let from = start - self.numbers[joint].torque_delay;
+            let to = from + self.step;
+            for (age, asked) in self.memory.asked.iter().enumerate() {
+                let period = T::splat(-(age as f64));
+                let shared = (to.min(period + one) - from.max(period)).max(zero);
+                late[joint] += shared / self.step * asked[joint];
+            }
+        }
+        late
+    }
+
+    /// Moves the rotors behind elastic gears; what reaches the links replaces `tau`.
+    #[inline(always)]
+    fn through_gear(&mut self, tau: &mut [T; 12], q: &[T; 12]) {
+        let (zero, dt) = (T::splat(0.0), T::splat(self.dt));
+        let [angle, speed] = &mut self.memory.rotor;
+        for joint in 0..12 {
+            let Numbers { half_gap, gear: stiffness, rotor, .. } = self.numbers[joint];
+            let twist = angle[joint] - q[joint];
+            let beyond = (twist - half_gap).max(zero) + (twist + half_gap).min(zero);
+            let carried = stiffness * beyond;
+            speed[joint] += dt * (tau[joint] - carried) / rotor;
+            angle[joint] += dt * speed[joint];
+            tau[joint] = zero.select_less(stiffness, carried, tau[joint]);
+        }
+    }
+
+    /// Visits every number that differs between robots, always in the same order.
+    pub fn visit(&mut self, mut visit: impl FnMut(&mut T)) {
+        for numbers in &mut self.numbers {
+            numbers.visit(&mut visit);
+        }
+        let Memory { commands, asked, current, rotor } = &mut self.memory;
+        commands.iter_mut().flatten().chain(asked).chain([current]).chain(rotor).flatten().for_each(visit);
+    }
+
+    /// After [`Drive::visit`] has written.
+    pub fn restored(&mut self) {
+        self.find_uses();
+    }
+}
+
+/// `κ · tanh(τ / κ)`, given one over κ.
+#[inline(always)]
+fn saturated<T: Lane>(tau: T, inverse: T) -> T {
+    let one = T::splat(1.0);
+    // tanh x = sign(x) (1 − e) / (1 + e) with e = exp(−2 |x|).
+    let e = exponential(-((tau * inverse).abs() * T::splat(2.0)));
+    let size = (one - e) / ((one + e) * inverse.max(T::splat(1e-9)));
+    let limited = tau.select_less(T::splat(0.0), -size, size);
+    // Without saturation, and where tanh cannot be told from its argument.
+    inverse.select_less(T::splat(1e-9), tau, limited)
+}

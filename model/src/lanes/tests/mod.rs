@@ -1,0 +1,4 @@
+//! What the lanes compute, in double precision.
+
+mod drive;
+mod dynamics;
