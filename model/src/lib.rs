@@ -19,6 +19,7 @@
 
 mod backend;
 mod body;
+pub mod effects;
 pub mod frames;
 mod go2;
 mod ground;
@@ -26,6 +27,7 @@ mod height_field;
 mod joint;
 mod kinematics;
 pub mod lanes;
+mod log_cholesky;
 mod mjcf;
 mod model_file;
 mod robot;

@@ -1,0 +1,141 @@
+//! Entries of a model file, and the robot that they make.
+
+use super::{Composition, Effect, Place, Scope, Target};
+use crate::{Joint, RobotModel};
+
+/// An effect with its scope and values.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Entry {
+    /// The effect.
+    pub effect: &'static Effect,
+    /// What it is about.
+    pub scope: Scope,
+    /// Its values, parameter after parameter.
+    pub values: Vec<f64>,
+    /// The 95 % intervals of the values, low and high, where somebody measured them.
+    pub intervals: Vec<Option<[f64; 2]>>,
+}
+
+/// Why an entry is not allowed.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum EntryError {
+    /// The effect cannot be about this.
+    #[error("`{effect}` cannot have scope \"{scope}\"; possible: {possible}")]
+    Scope {
+        /// The effect.
+        effect: &'static str,
+        /// The scope.
+        scope: Scope,
+        /// What is possible.
+        possible: &'static str,
+    },
+    /// A value is outside its bounds.
+    #[error("`{effect}` on {scope}: `{parameter}` = {value} is not allowed: {low} to {high}")]
+    Value {
+        /// The effect.
+        effect: &'static str,
+        /// The scope.
+        scope: Scope,
+        /// The parameter.
+        parameter: &'static str,
+        /// Its value.
+        value: f64,
+        /// The lowest that is allowed.
+        low: f64,
+        /// The highest that is allowed.
+        high: f64,
+    },
+    /// Entries that meet at a joint cannot be made one.
+    #[error("`{effect}` on {scope} does not go with another entry: {reason}")]
+    Conflict {
+        /// The effect.
+        effect: &'static str,
+        /// The scope.
+        scope: Scope,
+        /// Why.
+        reason: &'static str,
+    },
+}
+
+impl Entry {
+    /// An entry without intervals; `values` are the effect's, parameter after parameter.
+    ///
+    /// # Panics
+    /// If the number of values is wrong.
+    pub fn new(effect: &'static Effect, scope: Scope, values: Vec<f64>) -> Result<Self, EntryError> {
+        assert_eq!(values.len(), effect.count(), "values of `{}`", effect.name);
+        let intervals = vec![None; values.len()];
+        let entry = Self { effect, scope, values, intervals };
+        entry.check()?;
+        Ok(entry)
+    }
+
+    fn check(&self) -> Result<(), EntryError> {
+        let (effect, scope) = (self.effect, self.scope);
+        let (fits, possible) = match effect.target {
+            Target::Joints => {
+                (scope.joints() > 0, "all, hip, thigh, calf, FL, FR, RL, RR, left, right, or a joint such as FL_hip")
+            }
+            Target::Supply => (scope == Scope::All, "all"),
+            Target::Bodies => {
+                (matches!(scope, Scope::Base | Scope::Joint(_)), "base, or a joint for the link behind it")
+            }
+            Target::Base => (scope == Scope::Base, "base"),
+            Target::Ground => (scope == Scope::Ground, "ground"),
+        };
+        if !fits {
+            return Err(EntryError::Scope { effect: effect.name, scope, possible });
+        }
+        let parameters = effect.parameters.iter().flat_map(|parameter| std::iter::repeat_n(parameter, parameter.count));
+        for (parameter, value) in parameters.zip(&self.values) {
+            let [low, high] = parameter.bounds;
+            if !(low..=high).contains(value) {
+                let (effect, value, parameter) = (effect.name, *value, parameter.name);
+                return Err(EntryError::Value { effect, scope, parameter, value, low, high });
+            }
+        }
+        Ok(())
+    }
+
+    /// Where it is applied.
+    fn places(&self) -> Vec<Place> {
+        match (self.effect.target, self.scope) {
+            (Target::Joints, scope) => Joint::ALL
+                .into_iter()
+                .filter(|joint| scope.contains(*joint))
+                .map(|joint| Place::Joint(joint.index()))
+                .collect(),
+            (Target::Bodies, Scope::Joint(joint)) => vec![Place::Joint(joint.index())],
+            _ => vec![Place::Whole],
+        }
+    }
+
+    /// True if another entry of the same name replaces this one at `place`.
+    fn is_replaced(&self, own: usize, place: Place, entries: &[Entry]) -> bool {
+        if self.effect.composition != Composition::Replace {
+            return false;
+        }
+        let rank = |index: usize| (std::cmp::Reverse(entries[index].scope.joints()), index);
+        let others = entries.iter().enumerate().filter(|(_, other)| other.effect == self.effect);
+        others.filter(|(_, other)| other.places().contains(&place)).any(|(index, _)| rank(index) > rank(own))
+    }
+}
+
+/// `robot` with the effects of `entries`: each adds, multiplies or replaces as its [`Composition`] says.
+pub fn compose(robot: &RobotModel, entries: &[Entry]) -> Result<RobotModel, EntryError> {
+    let mut composed = robot.clone();
+    for (index, entry) in entries.iter().enumerate() {
+        entry.check()?;
+        for place in entry.places() {
+            if !entry.is_replaced(index, place, entries) {
+                let (effect, scope) = (entry.effect.name, entry.scope);
+                (entry.effect.apply)(&mut composed, place, &entry.values).map_err(|reason| EntryError::Conflict {
+                    effect,
+                    scope,
+                    reason,
+                })?;
+            }
+        }
+    }
+    Ok(composed)
+}

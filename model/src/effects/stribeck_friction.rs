@@ -1,0 +1,44 @@
+//! Breakaway friction that fades as the joint moves.
+
+use super::{Composition, Confusion, Effect, Parameter, Target};
+
+/// Breakaway friction that fades as the joint moves.
+pub const EFFECT: Effect = Effect {
+    name: "stribeck_friction",
+    what: "Breakaway friction that fades as the joint moves.",
+    equation: "-F_s exp(-(dq / v_s)^2) sign(dq)",
+    place: "13, friction",
+    parameters: &[
+        Parameter {
+            name: "breakaway_nm",
+            unit: "N·m",
+            count: 1,
+            bounds: [0.0, 20.0],
+            plausible: [0.0, 1.0],
+            neutral: 0.0,
+            source: "published servos and gears have 0.05 to 1 N·m",
+        },
+        Parameter {
+            name: "speed_rad_s",
+            unit: "rad/s",
+            count: 1,
+            bounds: [0.01, 10.0],
+            plausible: [0.1, 3.0],
+            neutral: 0.1,
+            source: "published servos and gears",
+        },
+    ],
+    composition: Composition::Add,
+    target: Target::Joints,
+    signature: "Friction is largest near standstill; slow motion sticks and slips.",
+    confusions: &[Confusion { with: "coulomb_friction", experiment: "Creep, then move fast: Coulomb friction stays." }],
+    apply: |robot, place, values| {
+        let friction = &mut super::joint(robot, place).stribeck_friction;
+        if friction.breakaway > 0.0 && (friction.speed - values[1]).abs() > 1e-9 {
+            return Err("two Stribeck frictions of different `speed_rad_s` on one joint");
+        }
+        friction.breakaway += values[0];
+        friction.speed = values[1];
+        Ok(())
+    },
+};

@@ -1,0 +1,28 @@
+//! A log shows the torque late; the robot is not.
+
+use super::{Composition, Confusion, Effect, Parameter, Target};
+
+/// A log shows the torque late; the robot is not.
+pub const EFFECT: Effect = Effect {
+    name: "torque_sensor_delay",
+    what: "A log shows the torque late; the robot is not.",
+    equation: "tau_measured(t) = tau(t - T)",
+    place: "tap `current`",
+    parameters: &[Parameter {
+        name: "delay_s",
+        unit: "s",
+        count: 1,
+        bounds: [0.0, 0.04],
+        plausible: [0.0, 0.02],
+        neutral: 0.0,
+        source: "published logs hold torque samples for 2 to 23 ms",
+    }],
+    composition: Composition::Add,
+    target: Target::Joints,
+    signature: "Shifting the torque channel in time removes the error, and the simulated motion was right before.",
+    confusions: &[Confusion { with: "torque_delay", experiment: "Compare the motion: a late loop changes it." }],
+    apply: |robot, place, values| {
+        super::joint(robot, place).drive.sensor_delay += values[0];
+        Ok(())
+    },
+};
