@@ -45,7 +45,7 @@ pub use height_field::{HeightField, HeightFieldError};
 pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};
 pub use kinematics::{HELD_HEIGHT, NUM_BODIES, Pose, body_poses};
 pub use mjcf::{MjcfBase, MjcfDrive, MjcfOptions, mjcf};
-pub use model_file::ModelFileError;
+pub use model_file::{EffectProblem, ModelFile, ModelFileError};
 pub use robot::{
     Contact, Control, Derating, JointDrive, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes, Stribeck,
 };
