@@ -5,7 +5,6 @@ mod demo;
 mod exit;
 mod joint_plot;
 mod mjcf;
-mod motion;
 mod play;
 mod replay;
 mod robot_file;

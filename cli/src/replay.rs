@@ -7,7 +7,7 @@ use twinstep_logs::{Base as MeasuredBase, Log};
 use twinstep_model::{Backend, HELD_HEIGHT, Placement, RobotModel};
 use twinstep_sim::{Base, BatchBackend, BuildError, SimConfig};
 
-use crate::motion::{DriveClock, FailedAt, JointCommands, MotionError, cell_or_zero, command, joint_commands};
+use twinstep_sysid::motion::{DriveClock, FailedAt, JointCommands, MotionError, cell_or_zero, command, joint_commands};
 
 /// Columns of the longest bar of [`Replay::table`].
 const BAR_WIDTH: f64 = 24.0;

@@ -12,6 +12,8 @@
 //! - [`Ground`]: what robots stand on: a plane, or a [`HeightField`] in it.
 //! - [`mjcf()`]: the robot as a MuJoCo model.
 //! - [`lanes`]: many robots in SIMD lanes, and the equations of motion of the Go2's tree in them.
+//! - [`effects`]: what real robots do and ideal ones do not; [`ModelFile`] is a robot with some of them.
+//! - [`Rollout`]: commands through many candidate robots at once.
 //! - [`stream`]: one seed gives every consumer its own reproducible random numbers.
 //!
 //! SI units, radians, seconds. Vectors live in the world or the base frame, as their docs say; the base frame is the
@@ -31,6 +33,7 @@ mod log_cholesky;
 mod mjcf;
 mod model_file;
 mod robot;
+mod rollout;
 mod scene;
 mod spec;
 mod state;
@@ -49,6 +52,7 @@ pub use model_file::{EffectProblem, ModelFile, ModelFileError};
 pub use robot::{
     Contact, Control, Derating, JointDrive, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes, Stribeck,
 };
+pub use rollout::{Job, Rollout};
 pub use scene::{Scene, SceneShape, ShapeKind};
 pub use spec::{EnvSpec, Field};
 pub use state::{Command, Placement, RobotStates, RobotStatesMut, Variation};

@@ -13,7 +13,9 @@ mod config;
 mod ground_shapes;
 mod rapier;
 mod robot_world;
+mod rollout;
 
 pub use batch::{BatchBackend, BatchSnapshot, Lanes};
 pub use config::{Base, Engine, Rough, SimConfig, SimConfigError, Terrain};
 pub use rapier::{BuildError, RapierBackend, RobotSnapshot};
+pub use rollout::BatchRollout;

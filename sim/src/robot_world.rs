@@ -41,8 +41,6 @@ pub struct RobotWorld {
     feet: [ColliderHandle; 4],
     upper_body: Vec<ColliderHandle>,
     drive: Drive<f64>,
-    /// What the encoders show beyond the joints' positions [rad].
-    encoder_offset: PerJoint,
     /// What the gyroscopes show at rest [rad/s].
     gyro_bias: Vec3,
 }
@@ -112,10 +110,8 @@ impl RobotWorld {
                 }
             }
         }
-        let encoder_offset = robot.joints.map(|joint| joint.drive.encoder_offset as f32);
         let mut this = Self {
             drive: Drive::new(robot, 1.0 / f64::from(config.physics_hz())),
-            encoder_offset,
             gyro_bias: robot.gyro_bias.as_vec3(),
             world,
             trunk,
@@ -132,7 +128,8 @@ impl RobotWorld {
     fn place_joints(&mut self, robot: &RobotModel, placement: &Placement) {
         let root_dofs = self.root_dofs;
         // What a placement gives is what the encoders show.
-        let q: PerJoint = std::array::from_fn(|joint| placement.q[joint] - self.encoder_offset[joint]);
+        let q: PerJoint =
+            std::array::from_fn(|joint| placement.q[joint] - robot.joints[joint].drive.encoder_offset as f32);
         let rotors = self.drive.set(0, robot, &q, &placement.dq);
         let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
         // Takes over the trunk's pose, and drops the root's six axes when the trunk is fixed.
@@ -192,10 +189,10 @@ impl RobotWorld {
     fn joints(&self) -> ([f64; NUM_JOINTS], [f64; NUM_JOINTS]) {
         let (multibody, _) = self.world.multibody_joints.get(self.multibody).expect("built with the world");
         let (mut q, mut dq) = ([0.0; NUM_JOINTS], [0.0; NUM_JOINTS]);
-        let velocities = &multibody.generalized_velocity().as_slice()[self.root_dofs..];
+        let velocities = multibody.generalized_velocity();
         for (joint, link) in multibody.links().skip(1).enumerate() {
             q[joint] = f64::from(link.joint().coords()[REVOLUTE_AXIS]);
-            dq[joint] = f64::from(velocities[joint]);
+            dq[joint] = f64::from(velocities[self.root_dofs + joint]);
         }
         (q, dq)
     }
@@ -208,8 +205,10 @@ impl RobotWorld {
     /// What the encoders show: positions [rad] and velocities [rad/s].
     pub fn read_joints(&self, q: &mut PerJoint, dq: &mut PerJoint) {
         let (positions, velocities) = self.joints();
-        *q = std::array::from_fn(|joint| positions[joint] as f32 + self.encoder_offset[joint]);
-        *dq = velocities.map(|velocity| velocity as f32);
+        for joint in 0..NUM_JOINTS {
+            let (seen_q, seen_dq) = self.drive.seen(joint, positions[joint], velocities[joint]);
+            (q[joint], dq[joint]) = (seen_q as f32, seen_dq as f32);
+        }
     }
 
     /// Pose and velocity of the base frame.

@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod batch;
+mod effects;
 mod exactly_once;
 mod faults;
 mod layering;

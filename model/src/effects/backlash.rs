@@ -6,7 +6,7 @@ use super::{Composition, Confusion, Effect, Parameter, Target};
 pub const EFFECT: Effect = Effect {
     name: "backlash",
     what: "The gear has play.",
-    equation: "no torque while |rotor - link| < gap / 2; beyond, a stiff spring",
+    equation: "no torque while |rotor - link| < gap / 2; beyond, a spring of 2000 N·m/rad or that of joint_elasticity. The encoder is at the rotor",
     place: "12, gear",
     parameters: &[Parameter {
         name: "gap_rad",

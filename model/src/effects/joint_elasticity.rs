@@ -6,7 +6,7 @@ use super::{Composition, Confusion, Effect, Parameter, Target};
 pub const EFFECT: Effect = Effect {
     name: "joint_elasticity",
     what: "The gear is a spring.",
-    equation: "rotor and link are two inertias, joined by k (rotor - link)",
+    equation: "rotor and link are two inertias, joined by k (rotor - link). The encoder is at the rotor",
     place: "12, gear",
     parameters: &[Parameter {
         name: "stiffness_nm_rad",

@@ -11,6 +11,9 @@ const REMEMBERED: usize = 10;
 /// Stiffness of a gear that has play and no stiffness of its own [N·m/rad].
 const STIFF_GEAR: f64 = 2000.0;
 
+/// Steps of a rotor on an elastic gear in a physics step.
+const GEAR_STEPS: usize = 8;
+
 /// What the drives of robots in lanes are told for a drive period.
 #[derive(Clone, Copy, Debug)]
 pub struct Commands<T> {
@@ -216,9 +219,12 @@ impl<T: Lane> Drive<T> {
         self.uses = uses;
     }
 
-    /// What drive and log see of the joints beyond their position [rad].
-    pub fn encoder_offset(&self, joint: usize) -> T {
-        self.numbers[joint].encoder_offset
+    /// What drive and log see of a joint whose link is at `q` [rad] with `dq` [rad/s]. The encoder sits at the rotor.
+    #[inline(always)]
+    pub fn seen(&self, joint: usize, q: T, dq: T) -> (T, T) {
+        let (n, zero, [angle, speed]) = (&self.numbers[joint], T::splat(0.0), &self.memory.rotor);
+        let q = zero.select_less(n.gear, angle[joint], q);
+        (q + n.encoder_offset, zero.select_less(n.gear, speed[joint], dq))
     }
 
     /// What a sensor of the motors' current shows now [N·m].
@@ -235,8 +241,8 @@ impl<T: Lane> Drive<T> {
         for joint in 0..12 {
             let n = &self.numbers[joint];
             let (kp, kd) = (commands.kp[joint], commands.kd[joint]);
-            let seen = q[joint] + n.encoder_offset;
-            let mut tau = now[2][joint] + (kp * (now[0][joint] - seen) + kd * (now[1][joint] - dq[joint]));
+            let (seen_q, seen_dq) = self.seen(joint, q[joint], dq[joint]);
+            let mut tau = now[2][joint] + (kp * (now[0][joint] - seen_q) + kd * (now[1][joint] - seen_dq));
             if self.uses.saturation {
                 tau = saturated(tau, n.saturation);
             }
@@ -307,7 +313,7 @@ impl<T: Lane> Drive<T> {
             forces.tau[joint] = tau;
         }
         if uses.elastic {
-            self.through_gear(&mut forces.tau, q);
+            self.through_gear(&mut forces.tau, q, dq);
         }
         if uses.spring {
             for joint in 0..12 {
@@ -336,19 +342,24 @@ impl<T: Lane> Drive<T> {
         late
     }
 
-    /// Moves the rotors behind elastic gears; what reaches the links replaces `tau`.
+    /// Moves the rotors behind elastic gears, in finer steps while the links keep their speeds; the mean of what reaches
+    /// the links replaces `tau`.
     #[inline(always)]
-    fn through_gear(&mut self, tau: &mut [T; 12], q: &[T; 12]) {
-        let (zero, dt) = (T::splat(0.0), T::splat(self.dt));
+    fn through_gear(&mut self, tau: &mut [T; 12], q: &[T; 12], dq: &[T; 12]) {
+        let (zero, dt) = (T::splat(0.0), T::splat(self.dt / GEAR_STEPS as f64));
         let [angle, speed] = &mut self.memory.rotor;
         for joint in 0..12 {
             let Numbers { half_gap, gear: stiffness, rotor, .. } = self.numbers[joint];
-            let twist = angle[joint] - q[joint];
-            let beyond = (twist - half_gap).max(zero) + (twist + half_gap).min(zero);
-            let carried = stiffness * beyond;
-            speed[joint] += dt * (tau[joint] - carried) / rotor;
-            angle[joint] += dt * speed[joint];
-            tau[joint] = zero.select_less(stiffness, carried, tau[joint]);
+            let (mut link, mut mean) = (q[joint], zero);
+            for _ in 0..GEAR_STEPS {
+                let twist = angle[joint] - link;
+                let carried = stiffness * ((twist - half_gap).max(zero) + (twist + half_gap).min(zero));
+                speed[joint] += dt * (tau[joint] - carried) / rotor;
+                angle[joint] += dt * speed[joint];
+                link += dt * dq[joint];
+                mean += carried * T::splat(1.0 / GEAR_STEPS as f64);
+            }
+            tau[joint] = zero.select_less(stiffness, mean, tau[joint]);
         }
     }
 

@@ -173,9 +173,9 @@ impl<T: Lane> Group<T> {
         &self.state
     }
 
-    /// What the encoder of a joint shows [rad].
-    pub fn measured_q(&self, joint: usize) -> T {
-        self.state.q[joint] + self.drive.encoder_offset(joint)
+    /// What the encoder of a joint shows [rad, rad/s].
+    pub fn encoder(&self, joint: usize) -> (T, T) {
+        self.drive.seen(joint, self.state.q[joint], self.state.dq[joint])
     }
 
     /// What the gyroscopes show [rad/s].

@@ -184,8 +184,10 @@ fn read<T: Lane>(group: &Group<T>, lane: usize, states: &mut RobotStatesMut) -> 
     states.base_orientation[lane] = values(&state.orientation, lane);
     states.base_linear_velocity[lane] = values(&state.linear_velocity.0, lane);
     states.base_angular_velocity[lane] = values(&group.gyro().0, lane);
-    states.q[lane] = std::array::from_fn(|joint| group.measured_q(joint).get(lane) as f32);
-    states.dq[lane] = values(&state.dq, lane);
+    for joint in 0..12 {
+        let (q, dq) = group.encoder(joint);
+        (states.q[lane][joint], states.dq[lane][joint]) = (q.get(lane) as f32, dq.get(lane) as f32);
+    }
     states.tau[lane] = values(group.tau(), lane);
     states.foot_force[lane] = std::array::from_fn(|leg| group.foot_force(lane, leg) as f32);
     states.body_contact[lane] = group.body_contact(lane);

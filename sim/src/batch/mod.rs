@@ -24,8 +24,9 @@ pub use lanes::Lanes;
 
 use crate::rapier::BuildError;
 use crate::{SimConfig, SimConfigError};
-use group::{LaneSnapshot, Time};
-use lanes::{Inputs, Robots};
+use group::LaneSnapshot;
+pub(crate) use group::Time;
+pub(crate) use lanes::{Inputs, Robots, robots as lane_robots};
 
 /// Many Go2 in SIMD lanes.
 pub struct BatchBackend {

@@ -182,7 +182,9 @@ fn gear_with_play_carries_nothing_inside_it() {
     let mut drive = drive(&robot);
     let inside = |twist: f64| [-twist; NUM_JOINTS];
     assert_eq!(drive.push(0, &inside(0.009), &[0.0; NUM_JOINTS]).tau[0], 0.0);
-    assert!((drive.push(0, &inside(0.011), &[0.0; NUM_JOINTS]).tau[0] - 2000.0 * 0.001).abs() < 1e-9);
+    // The rotor gives way within the step by J/k-th parts of a second squared.
+    let carried = drive.push(0, &inside(0.011), &[0.0; NUM_JOINTS]).tau[0];
+    assert!((carried / (2000.0 * 0.001) - 1.0).abs() < 0.05, "{carried} N·m");
 }
 
 #[test]

@@ -1,0 +1,21 @@
+//! The seam between identification and simulators: commands in, motion out, for many candidate robots at once.
+
+use crate::{Command, Placement, RobotModel, RobotStates};
+
+/// What one candidate robot does.
+#[derive(Clone, Copy, Debug)]
+pub struct Job<'a> {
+    /// The candidate.
+    pub robot: &'a RobotModel,
+    /// Where it starts.
+    pub start: Placement,
+    /// One command a drive period.
+    pub commands: &'a [Command],
+}
+
+/// Plays commands through candidate robots.
+pub trait Rollout {
+    /// The states of every job: one entry in each array at its start and one after each drive period. From where a job
+    /// diverged its numbers are not finite.
+    fn play(&mut self, jobs: &[Job]) -> Vec<RobotStates>;
+}

@@ -1,0 +1,25 @@
+//! Measured logs against simulations: what a model gets wrong, and which numbers would mend it.
+//!
+//! - [`motion`]: the commands of a log, row by row, in periods of the drive.
+//! - [`Experiment`]: a log cut into windows that are simulated from measured states, and what is compared, each channel
+//!   in units of its noise.
+//! - [`evaluate()`]: the errors of a model on a log.
+//! - [`Unknown`]: a number of a model file that is sought, with bounds and prior.
+//! - [`identify()`]: CMA-ES, then Gauss-Newton, then intervals, and what the log cannot tell.
+//!
+//! Simulators come in as a [`twinstep_model::Rollout`]: this crate knows none.
+
+mod cmaes;
+mod evaluate;
+mod experiment;
+mod identify;
+mod jacobian;
+pub mod motion;
+mod refine;
+mod torque;
+mod unknown;
+
+pub use evaluate::{Evaluation, JointEvaluation, evaluate};
+pub use experiment::{Experiment, ExperimentError};
+pub use identify::{Finding, Identification, IdentifyError, Options, Progress, Stage, Verdict, identify};
+pub use unknown::{Unknown, unknowns};

@@ -1,0 +1,142 @@
+//! The numbers that are sought: of entries of a model file, with bounds and prior.
+
+use twinstep_model::effects::{Composition, Effect, Entry, EntryError, Scope};
+use twinstep_model::{ModelFile, RobotModel};
+
+/// A number of an entry of a model file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Unknown {
+    /// The effect.
+    pub effect: &'static Effect,
+    /// What it is about.
+    pub scope: Scope,
+    /// The parameter; of a vector its index after a dot, as in `shift_m.0`.
+    pub parameter: String,
+    /// Its unit.
+    pub unit: &'static str,
+    /// What is allowed.
+    pub bounds: [f64; 2],
+    /// Prior mean and standard deviation, in the coordinate of [`Unknown::coordinate`].
+    pub prior: [f64; 2],
+    /// Sought as its inverse, because none of it is infinity.
+    inverse: bool,
+    /// Which entry of the candidate's file, and which of its values.
+    place: (usize, usize),
+}
+
+impl Unknown {
+    /// The number as the search sees it: itself, or its inverse.
+    pub fn coordinate(&self, value: f64) -> f64 {
+        if self.inverse { 1.0 / value } else { value }
+    }
+
+    /// Back from [`Unknown::coordinate`], within the bounds.
+    pub fn value(&self, coordinate: f64) -> f64 {
+        let [low, high] = self.bounds;
+        let value = if self.inverse { 1.0 / coordinate.max(1e-12) } else { coordinate };
+        value.clamp(low, high)
+    }
+
+    /// The bounds of the coordinate.
+    pub fn coordinate_bounds(&self) -> [f64; 2] {
+        let [low, high] = self.bounds;
+        if self.inverse { [1.0 / high, 1.0 / low] } else { [low, high] }
+    }
+
+    /// Its name for people, as in `coulomb_friction@calf torque_nm`.
+    pub fn name(&self) -> String {
+        format!("{}@{} {}", self.effect.name, self.scope, self.parameter)
+    }
+}
+
+/// The numbers of `effects`, to be sought on top of `model`; and the model with an entry for each.
+///
+/// An effect that replaces takes the place of the model's entry of the same scope; others are added to what is there.
+pub fn unknowns(
+    model: &ModelFile,
+    effects: &[(&'static Effect, Scope)],
+) -> Result<(ModelFile, Vec<Unknown>), EntryError> {
+    let (mut file, mut unknowns) = (model.clone(), Vec::new());
+    for (effect, scope) in effects {
+        let start: Vec<f64> = effect
+            .parameters
+            .iter()
+            .flat_map(|parameter| {
+                let [low, high] = parameter.plausible;
+                let value = if parameter.neutral.is_finite() { parameter.neutral } else { high };
+                std::iter::repeat_n(if low < value { value } else { low + 0.1 * (high - low) }, parameter.count)
+            })
+            .collect();
+        let start = if effect.name == "inertia" { nominal_inertia(model, *scope)? } else { start };
+        if effect.composition == Composition::Replace {
+            file.effects.retain(|entry| entry.effect != *effect || entry.scope != *scope);
+        }
+        file.effects.push(Entry::new(effect, *scope, start.clone())?);
+        let index = file.effects.len() - 1;
+        let mut place = 0;
+        for parameter in effect.parameters {
+            for component in 0..parameter.count {
+                let inverse = parameter.neutral.is_infinite();
+                let [low, high] = parameter.plausible.map(|value| if inverse { 1.0 / value } else { value });
+                let (low, high) = if inverse { (0.0, low) } else { (low, high) };
+                let middle = if effect.name == "inertia" { start[place] } else { 0.5 * (low + high) };
+                let deviation = if effect.name == "inertia" { 0.3 } else { (high - low).abs() / 3.92 };
+                unknowns.push(Unknown {
+                    effect,
+                    scope: *scope,
+                    parameter: if parameter.count == 1 {
+                        parameter.name.to_owned()
+                    } else {
+                        format!("{}.{component}", parameter.name)
+                    },
+                    unit: parameter.unit,
+                    bounds: parameter.bounds,
+                    prior: [middle, deviation],
+                    inverse,
+                    place: (index, place),
+                });
+                place += 1;
+            }
+        }
+    }
+    Ok((file, unknowns))
+}
+
+/// Log-Cholesky coordinates of the link that the model has.
+fn nominal_inertia(model: &ModelFile, scope: Scope) -> Result<Vec<f64>, EntryError> {
+    let robot = model.robot_model()?;
+    let body = match scope {
+        Scope::Joint(joint) => robot.legs[joint.leg as usize].bodies[joint.kind as usize],
+        _ => robot.trunk,
+    };
+    Ok(body.log_cholesky().to_vec())
+}
+
+/// The candidate's file with these coordinates, each brought within its bounds.
+pub fn with_values(file: &ModelFile, unknowns: &[Unknown], coordinates: &[f64]) -> ModelFile {
+    let mut file = file.clone();
+    for (unknown, coordinate) in unknowns.iter().zip(coordinates) {
+        let (entry, value) = unknown.place;
+        file.effects[entry].values[value] = unknown.value(*coordinate);
+    }
+    file
+}
+
+/// The candidate robot; none where entries do not go together or a body could not be.
+pub fn candidate(file: &ModelFile, unknowns: &[Unknown], coordinates: &[f64]) -> Option<RobotModel> {
+    with_values(file, unknowns, coordinates).robot_model().ok()
+}
+
+/// Where an unknown starts [coordinate].
+pub fn start(file: &ModelFile, unknown: &Unknown) -> f64 {
+    let (entry, value) = unknown.place;
+    unknown.coordinate(file.effects[entry].values[value])
+}
+
+/// Writes intervals, low and high, beside the values of the unknowns.
+pub fn set_intervals(file: &mut ModelFile, unknowns: &[Unknown], intervals: &[Option<[f64; 2]>]) {
+    for (unknown, interval) in unknowns.iter().zip(intervals) {
+        let (entry, value) = unknown.place;
+        file.effects[entry].intervals[value] = *interval;
+    }
+}

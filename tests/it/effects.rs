@@ -1,0 +1,92 @@
+//! Every effect of the catalogue does the same in both engines.
+
+use twinstep_model::effects::{CATALOGUE, Effect, Entry, Scope, Target, compose};
+use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, RobotModel, go2};
+use twinstep_sim::{Base, BatchBackend, Engine, RapierBackend, SimConfig};
+
+/// Drive periods of the motion.
+const PERIODS: usize = 200;
+
+fn config(engine: Engine, base: Base) -> SimConfig {
+    SimConfig { engine, base, physics_hz: Some(2000), threads: 1, ..SimConfig::default() }
+}
+
+/// Joint positions and torques in each drive period of a chirp in the air, or of a sway on the feet.
+fn motion(backend: &mut impl Backend, base: Base) -> Vec<PerJoint> {
+    let pose = go2().control.default_pose_f32();
+    let height = if base == Base::Fixed { 1.0 } else { 0.3236 };
+    backend.reset(&[(0, Placement::at_rest(height, pose))]).unwrap();
+    let mut rows = Vec::new();
+    for period in 0..PERIODS {
+        let t = period as f32 * 0.005;
+        let swing = (std::f32::consts::TAU * (1.0 + 1.5 * t) * t).sin();
+        let target = std::array::from_fn(|j| pose[j] + if base == Base::Fixed { 0.3 * swing } else { 0.08 * swing });
+        backend.step(&[Command::hold(target, 30.0, 0.75)], &[true], 1).unwrap();
+        rows.push(backend.states().q[0]);
+        rows.push(backend.states().tau[0].map(|tau| 0.02 * tau));
+        let [x, y, z] = backend.states().base_angular_velocity[0];
+        rows.push([[x, y, z].map(|rate| 0.2 * rate); 4].concat().try_into().unwrap());
+    }
+    rows
+}
+
+fn in_both(robot: &RobotModel, base: Base) -> [Vec<PerJoint>; 2] {
+    let mut rapier = RapierBackend::new(robot.clone(), config(Engine::Rapier, base), 1).unwrap();
+    let mut batch = BatchBackend::new(robot.clone(), config(Engine::Batch, base), 1).unwrap();
+    [motion(&mut rapier, base), motion(&mut batch, base)]
+}
+
+fn rms(one: &[PerJoint], other: &[PerJoint]) -> f32 {
+    let squares = one.iter().flatten().zip(other.iter().flatten()).map(|(one, other)| (one - other).powi(2));
+    (squares.sum::<f32>() / (one.len() * NUM_JOINTS) as f32).sqrt()
+}
+
+fn entry(effect: &'static Effect) -> Entry {
+    let scope = match effect.target {
+        Target::Joints | Target::Supply => Scope::All,
+        Target::Bodies | Target::Base => Scope::Base,
+        Target::Ground => Scope::Ground,
+    };
+    let values = effect.parameters.iter().flat_map(|parameter| {
+        let [low, high] = parameter.plausible;
+        std::iter::repeat_n(low + 0.7 * (high - low), parameter.count)
+    });
+    let values = match effect.name {
+        // A trunk twice as heavy and wide.
+        "inertia" => {
+            let body = go2().trunk;
+            body.scaled(1.5).log_cholesky().to_vec()
+        }
+        "torque_saturation" => vec![4.0],
+        "torque_speed_limit" => vec![6.0],
+        "ground_friction" => vec![0.05],
+        _ => values.collect(),
+    };
+    Entry::new(effect, scope, values).unwrap()
+}
+
+#[test]
+fn every_effect_does_the_same_in_both_engines() {
+    // These need a log's voltage, temperature or torque channel, and leave the motion alone.
+    let elsewhere = ["supply_sag", "thermal_derating", "torque_sensor_delay"];
+    for effect in CATALOGUE.into_iter().filter(|effect| !elsewhere.contains(&effect.name)) {
+        let base = if effect.target == Target::Joints { Base::Fixed } else { Base::Floating };
+        let ideal = in_both(&go2(), base);
+        let [rapier, batch] = in_both(&compose(&go2(), &[entry(effect)]).unwrap(), base);
+        let (apart, changed) = (rms(&rapier, &batch), rms(&batch, &ideal[1]));
+        println!(
+            "{:<20} changes {changed:.5}, engines {apart:.5} apart, ideal {:.5}",
+            effect.name,
+            rms(&ideal[0], &ideal[1])
+        );
+        let ideal_apart = rms(&ideal[0], &ideal[1]);
+        assert!(
+            changed > 3.0 * ideal_apart,
+            "`{}` changes {changed}, the engines differ by {ideal_apart}",
+            effect.name
+        );
+        // A joint rattles in its play, and small differences grow.
+        let allowed = if effect.name == "backlash" { 1.0 } else { 0.15 };
+        assert!(apart < allowed * changed + 2.0 * ideal_apart, "`{}`: {apart} apart, it changes {changed}", effect.name);
+    }
+}
