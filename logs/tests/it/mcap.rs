@@ -163,7 +163,12 @@ struct Recorder {
 
 impl Recorder {
     fn create(path: &Path) -> Recorder {
-        Recorder { writer: mcap::Writer::new(fs::File::create(path).expect("a file")).expect("a writer") }
+        Recorder::compressed(path, Some(mcap::Compression::Zstd))
+    }
+
+    fn compressed(path: &Path, compression: Option<mcap::Compression>) -> Recorder {
+        let options = mcap::WriteOptions::new().compression(compression);
+        Recorder { writer: options.create(fs::File::create(path).expect("a file")).expect("a writer") }
     }
 
     fn send(&mut self, topic: &str, schema: &str, encoding: &str, nanoseconds: u64, data: &[u8]) {
@@ -273,6 +278,21 @@ fn recording_of_the_robot_is_read_in_our_order() {
         ]
     "#]]
     .assert_debug_eq(&log.reading_notes());
+}
+
+#[test]
+fn chunks_of_every_compression_are_read() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for (name, compression) in
+        [("plain", None), ("lz4", Some(mcap::Compression::Lz4)), ("zstd", Some(mcap::Compression::Zstd))]
+    {
+        let path = folder.path().join(format!("{name}.mcap"));
+        let mut recorder = Recorder::compressed(&path, compression);
+        recorder.state("/rt/lowstate", 0, &state_bytes());
+        recorder.command("/rt/lowcmd", 0, &command_bytes(FIRST));
+        recorder.finish();
+        assert_eq!(Log::open(&path).expect("a log").q("FR_hip"), Some(&[1.0][..]), "{name}");
+    }
 }
 
 #[test]
