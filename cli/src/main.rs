@@ -4,6 +4,7 @@ mod bench;
 mod demo;
 mod exit;
 mod joint_plot;
+mod log;
 mod mjcf;
 mod motion;
 mod play;
@@ -27,6 +28,7 @@ struct Cli {
 enum Verb {
     Bench(bench::Args),
     Demo(demo::Args),
+    Log(log::Args),
     Mjcf(mjcf::Args),
     Play(play::Args),
     Serve(serve::Args),
@@ -43,6 +45,7 @@ fn main() -> std::process::ExitCode {
     let result = match Cli::parse().command {
         Verb::Bench(args) => bench::run(&args),
         Verb::Demo(args) => demo::run(&args),
+        Verb::Log(args) => log::run(&args),
         Verb::Mjcf(args) => mjcf::run(&args),
         Verb::Play(args) => play::run(&args),
         Verb::Serve(args) => serve::run(&args),
