@@ -4,6 +4,7 @@ mod bench;
 mod demo;
 mod exit;
 mod joint_plot;
+mod log;
 mod mjcf;
 mod play;
 mod replay;
@@ -26,6 +27,7 @@ struct Cli {
 enum Verb {
     Bench(bench::Args),
     Demo(demo::Args),
+    Log(log::Args),
     Mjcf(mjcf::Args),
     Play(play::Args),
     Serve(serve::Args),
@@ -42,6 +44,7 @@ fn main() -> std::process::ExitCode {
     let result = match Cli::parse().command {
         Verb::Bench(args) => bench::run(&args),
         Verb::Demo(args) => demo::run(&args),
+        Verb::Log(args) => log::run(&args),
         Verb::Mjcf(args) => mjcf::run(&args),
         Verb::Play(args) => play::run(&args),
         Verb::Serve(args) => serve::run(&args),

@@ -185,13 +185,17 @@ fn zenoh_config(config: &ServerConfig) -> Result<zenoh::Config, ServerError> {
     check_users(config, &zenoh)?;
     let listen = serde_json::json!([config.listen]).to_string();
     let connect = serde_json::json!(config.connect).to_string();
-    let settings: [(&'static str, &str, &str); 7] = [
+    let settings: [(&'static str, &str, &str); 9] = [
         ("listen", "listen/endpoints", &listen),
         ("connect", "connect/endpoints", &connect),
         ("zenoh", "mode", "\"peer\""),
         ("zenoh", "scouting/multicast/enabled", "false"),
         // A frozen peer is noticed after 2 s in place of Zenoh's 10.
         ("zenoh", "transport/link/tx/lease", "2000"),
+        // Room for a step of 4096 robots, which Zenoh sends in twelve parts: with its own two, whoever writes waits for
+        // whoever sends after every second part, and whoever receives takes new memory for each.
+        ("zenoh", "transport/link/tx/queue/size/data", "16"),
+        ("zenoh", "transport/link/rx/buffer_size", "2097152"),
         // A router that comes back is found within a second in place of Zenoh's four.
         ("zenoh", "connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
         ("shared_memory", "transport/shared_memory/enabled", if config.shared_memory { "true" } else { "false" }),

@@ -74,6 +74,9 @@ impl Default for CommandRanges {
     }
 }
 
+/// Number of reward terms.
+pub const TERMS: usize = RewardWeights::NAMES.len();
+
 macro_rules! reward_weights {
     ($($(#[$doc:meta])* $name:ident = $weight:expr),+ $(,)?) => {
         /// Weights of the reward terms, per second: a term counts `weight · value · policy_dt` each step.
@@ -91,12 +94,9 @@ macro_rules! reward_weights {
             /// Names of the terms, in the order of every per-term array.
             pub const NAMES: &'static [&'static str] = &[$(stringify!($name)),+];
 
-            /// Writes each weighted term of `moment` into `terms`, in the order of [`RewardWeights::NAMES`].
-            pub fn evaluate(&self, moment: &crate::reward::Moment<'_>, terms: &mut [f32]) {
-                let weighted = [$(self.$name * crate::reward::$name(moment)),+];
-                for (term, value) in terms.iter_mut().zip(weighted) {
-                    *term = value * moment.policy_dt;
-                }
+            /// Each weighted term of `moment`, in the order of [`RewardWeights::NAMES`].
+            pub fn evaluate(&self, moment: &crate::reward::Moment<'_>) -> [f32; TERMS] {
+                [$(self.$name * crate::reward::$name(moment) * moment.policy_dt),+]
             }
 
             fn values(&self) -> impl Iterator<Item = (&'static str, f32)> {

@@ -10,6 +10,7 @@
 mod check;
 mod config;
 mod counter;
+mod episode;
 mod observation;
 pub mod reward;
 mod task_env;

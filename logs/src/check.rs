@@ -3,6 +3,8 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
+use twinstep_model::JOINT_NAMES;
+
 use crate::LogError;
 use crate::columns::{Cells, Column};
 use crate::log::{Log, parts};
@@ -20,6 +22,7 @@ pub(crate) enum Need {
 
 /// Checks a table against its description and makes the log of both.
 pub(crate) fn assemble(mut table: Table, meta: Meta, meta_file: &Path, need: Need) -> Result<Log, LogError> {
+    check_joint_names(&table)?;
     let joints = joints_of(&table, &meta, need)?;
     leave_out_other_joints(&mut table, &joints);
     require_columns(&table, &joints, need)?;
@@ -35,7 +38,7 @@ pub(crate) fn assemble(mut table: Table, meta: Meta, meta_file: &Path, need: Nee
 
     let t = table.take("t").unwrap_or_default();
     let channels = table.columns.into_iter().collect();
-    Ok(Log { meta, t, segment, episode, joints, channels, ignored: table.ignored })
+    Ok(Log { meta, t, segment, episode, joints, channels, ignored: table.ignored, notes: table.notes })
 }
 
 /// The joints that the description lists, or all that have a position (in a motion: a command).
@@ -77,7 +80,45 @@ fn require_columns(table: &Table, joints: &[String], need: Need) -> Result<(), L
 }
 
 fn missing(table: &Table, column: &str) -> LogError {
-    LogError::MissingColumn { file: table.file.clone(), column: column.to_owned(), columns: table.names() }
+    // Names that other recorders give.
+    let (what, others): (_, &[&str]) = match column {
+        "t" => ("the time of each row [s]", &["time", "timestamp", "time_s", "t_s", "stamp", "sec", "seconds"]),
+        "q_cmd_<joint>" => ("what a joint is told, such as `q_cmd_FL_hip` [rad]", &["q_des_", "q_target_", "q_ref_"]),
+        _ => ("a joint's measured position, such as `q_FL_hip` [rad]", &["pos_", "position_", "joint_pos_"]),
+    };
+    let names = table.columns.iter().map(|(name, _)| name).chain(&table.ignored);
+    let meant = |name: &&String| {
+        others
+            .iter()
+            .any(|other| if other.ends_with('_') { name.starts_with(other) } else { name.eq_ignore_ascii_case(other) })
+    };
+    let similar = names.into_iter().find(meant).cloned();
+    LogError::MissingColumn {
+        file: table.file.clone(),
+        column: column.to_owned(),
+        what,
+        columns: table.names(),
+        similar,
+    }
+}
+
+/// No joint's name is one of the Go2's with something behind it, or in other letters.
+fn check_joint_names(table: &Table) -> Result<(), LogError> {
+    for (name, _) in &table.columns {
+        let Some((column, joint)) = Column::parse(name).and_then(|column| Some((column, column.joint()?))) else {
+            continue;
+        };
+        let similar = |known: &&&str| {
+            joint != **known && joint.get(..known.len()).is_some_and(|start| start.eq_ignore_ascii_case(known))
+        };
+        if let Some(known) = JOINT_NAMES.iter().find(similar) {
+            let meant = format!("{}_{known}", column.quantity.name);
+            let (file, column, joint, unit) =
+                (table.file.clone(), name.clone(), joint.to_owned(), column.quantity.unit);
+            return Err(LogError::JointName { file, column, joint, meant, unit });
+        }
+    }
+    Ok(())
 }
 
 fn check_lengths(table: &Table) -> Result<(), LogError> {

@@ -1,9 +1,13 @@
 //! A log in numbers: its size, its timing, what it holds, and how much its joints moved.
 
 use serde::Serialize;
+use twinstep_model::Joint;
 
 use crate::absence::absent;
 use crate::columns::{Column, QUANTITIES, Quantity};
+use crate::conclusions::{Conclusion, conclusions};
+use crate::excitation::{Excitation, excitation};
+use crate::falls::{Fall, falls};
 use crate::{Base, Log, TauSensor};
 
 /// What a log holds, for a person (`Display`) or a program (`Serialize`).
@@ -23,6 +27,10 @@ pub struct Description {
     pub absent: Vec<Absence>,
     /// How much each joint moved.
     pub joints: Vec<Excitation>,
+    /// Where a robot with a floating base fell over; none where the log cannot tell.
+    pub falls: Option<Vec<Fall>>,
+    /// What the log can tell about each effect of the catalogue; empty for a motion.
+    pub conclusions: Vec<Conclusion>,
     /// Columns of the file that were left out.
     pub ignored: Vec<String>,
     /// What is odd about the log and yet no error.
@@ -38,8 +46,12 @@ pub struct Timing {
     pub rate_hz: Option<f64>,
     /// Standard deviation of the step [s].
     pub step_std_s: Option<f64>,
+    /// What half of the steps differ by from the median at most [s].
+    pub jitter_p50_s: Option<f64>,
     /// What 99 % of the steps differ by from the median at most [s].
     pub jitter_p99_s: Option<f64>,
+    /// What every step differs by from the median at most [s].
+    pub jitter_max_s: Option<f64>,
     /// Number of steps longer than 1.5 medians.
     pub gaps: usize,
     /// The longest of them [s].
@@ -83,46 +95,25 @@ pub struct Absence {
     pub cost: &'static str,
 }
 
-/// How much a joint moved; of a motion, how much it is told to.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Excitation {
-    /// The joint's name.
-    pub joint: String,
-    /// Lowest position [rad].
-    pub q_min: f64,
-    /// Highest position [rad].
-    pub q_max: f64,
-    /// Highest speed [rad/s]; none without two rows in a segment.
-    pub speed_max: Option<f64>,
-    /// Whether the speed was measured, or derived from the position by differences.
-    pub speed_from: SpeedSource,
-}
-
-/// Where a speed comes from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum SpeedSource {
-    /// The column `dq_<joint>`.
-    Measured,
-    /// Differences of positions.
-    Derived,
-}
-
 impl Log {
     /// Describes the log.
     pub fn describe(&self) -> Description {
         let timing = self.timing();
-        Description {
+        let mut description = Description {
             rows: self.rows(),
             duration_s: self.duration_s(),
             segments: self.described_segments(),
             channels: self.described_channels(),
             absent: absent(self).into_iter().map(|(quantity, cost)| Absence { quantity, cost }).collect(),
-            joints: self.joints().iter().filter_map(|joint| self.excitation(joint)).collect(),
+            joints: self.joints().iter().filter_map(|joint| excitation(self, joint)).collect(),
+            falls: falls(self),
+            conclusions: Vec::new(),
             ignored: self.ignored().to_vec(),
             notes: self.notes(&timing),
             timing,
-        }
+        };
+        description.conclusions = conclusions(self, &description);
+        description
     }
 
     fn timing(&self) -> Timing {
@@ -137,7 +128,9 @@ impl Log {
             stated_rate_hz: self.meta().rate_hz,
             rate_hz: median.map(f64::recip),
             step_std_s: median.map(|_| standard_deviation(&steps)),
+            jitter_p50_s: quantile(&jitter, 0.5),
             jitter_p99_s: quantile(&jitter, 0.99),
+            jitter_max_s: jitter.last().copied(),
             gaps,
             largest_gap_s: steps.last().copied().filter(|_| gaps > 0),
         }
@@ -177,22 +170,11 @@ impl Log {
         QUANTITIES.iter().filter_map(described).collect()
     }
 
-    fn excitation(&self, joint: &str) -> Option<Excitation> {
-        let q = self.q(joint).or_else(|| self.q_cmd(joint))?;
-        let measured = self.dq(joint).and_then(|dq| largest(dq.iter().map(|dq| dq.abs())));
-        let derived = || largest(self.differences(q).map(|(row, step)| (step / (self.t[row + 1] - self.t[row])).abs()));
-        Some(Excitation {
-            joint: joint.to_owned(),
-            q_min: -largest(q.iter().map(|q| -q))?,
-            q_max: largest(q.iter().copied())?,
-            speed_max: measured.or_else(derived),
-            speed_from: if measured.is_some() { SpeedSource::Measured } else { SpeedSource::Derived },
-        })
-    }
-
     fn notes(&self, timing: &Timing) -> Vec<String> {
         const TOLERANCE: f64 = 0.05;
-        let mut notes = Vec::new();
+        // No joint of a Go2 turns that far; degrees do.
+        const MOST: f64 = 7.0;
+        let mut notes = self.reading_notes().to_vec();
         if let Some(rate) = timing.rate_hz
             && (rate / timing.stated_rate_hz - 1.0).abs() > TOLERANCE
         {
@@ -208,6 +190,17 @@ impl Log {
         if !torque && self.meta().tau_sensor != TauSensor::None {
             notes.push("the meta file names a `tau_sensor`, but there is no tau_measured".to_owned());
         }
+        for quantity in ["q", "q_cmd"] {
+            let far = |joint: &&Joint| {
+                let cells = self.channel(&format!("{quantity}_{joint}"));
+                cells.is_some_and(|cells| cells.iter().any(|cell| cell.abs() > MOST))
+            };
+            if let Some(joint) = Joint::ALL.iter().find(far) {
+                notes.push(format!(
+                    "{quantity}_{joint} goes beyond {MOST} rad: is it in degrees? Positions are in radians"
+                ));
+            }
+        }
         notes
     }
 
@@ -218,12 +211,12 @@ impl Log {
 }
 
 /// The largest number; NaN does not count.
-fn largest(values: impl Iterator<Item = f64>) -> Option<f64> {
+pub(crate) fn largest(values: impl Iterator<Item = f64>) -> Option<f64> {
     values.filter(|value| !value.is_nan()).reduce(f64::max)
 }
 
 /// A quantile of sorted numbers, the nearest of them.
-fn quantile(sorted: &[f64], fraction: f64) -> Option<f64> {
+pub(crate) fn quantile(sorted: &[f64], fraction: f64) -> Option<f64> {
     let place = (fraction * sorted.len().saturating_sub(1) as f64).round() as usize;
     sorted.get(place).copied()
 }

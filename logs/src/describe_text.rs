@@ -2,8 +2,11 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use crate::Base;
-use crate::describe::{ChannelDescription, Description, Excitation, SpeedSource, Timing};
+use crate::conclusions::Verdict;
+use crate::describe::{ChannelDescription, Description, Timing};
+use crate::excitation::{Excitation, SpeedSource, TorqueSource};
+use crate::falls::Fall;
+use crate::{Base, Conclusion};
 
 impl Display for Description {
     fn fmt(&self, out: &mut Formatter<'_>) -> fmt::Result {
@@ -19,7 +22,14 @@ impl Display for Description {
         })?;
         section(out, "channels", &self.channels, channel)?;
         section(out, "absent", &self.absent, |absence| format!("{:<14} {}", absence.quantity, absence.cost))?;
-        section(out, "joints", &self.joints, excitation)?;
+        joints(out, &self.joints)?;
+        if let Some(falls) = &self.falls {
+            match falls.as_slice() {
+                [] => writeln!(out, "falls\n  none")?,
+                falls => section(out, "falls", falls, fall)?,
+            }
+        }
+        section(out, "what this log can tell", &self.conclusions, conclusion)?;
         section(out, "ignored columns", &self.ignored, String::clone)?;
         section(out, "notes", &self.notes, String::clone)
     }
@@ -27,12 +37,15 @@ impl Display for Description {
 
 impl Display for Timing {
     fn fmt(&self, out: &mut Formatter<'_>) -> fmt::Result {
-        let (Some(rate), Some(std), Some(jitter)) = (self.rate_hz, self.step_std_s, self.jitter_p99_s) else {
+        let (Some(rate), Some(std), Some(half), Some(jitter), Some(most)) =
+            (self.rate_hz, self.step_std_s, self.jitter_p50_s, self.jitter_p99_s, self.jitter_max_s)
+        else {
             return writeln!(out, "stated {} Hz; no two rows to measure it", self.stated_rate_hz);
         };
-        let (std, jitter) = (std * 1e3, jitter * 1e3);
+        let [std, half, jitter, most] = [std, half, jitter, most].map(|seconds| seconds * 1e3);
         write!(out, "{rate:.1} Hz (stated {}), ", self.stated_rate_hz)?;
-        write!(out, "steps: σ {std:.3} ms, 99 % within {jitter:.3} ms of the median, ")?;
+        write!(out, "steps: σ {std:.3} ms; 50 % within {half:.3} ms of the median, 99 % within {jitter:.3} ms, ")?;
+        write!(out, "all within {most:.3} ms; ")?;
         match self.largest_gap_s {
             Some(largest) if self.gaps == 1 => writeln!(out, "one gap of {:.1} ms", largest * 1e3),
             Some(largest) => writeln!(out, "{} gaps, the largest {:.1} ms", self.gaps, largest * 1e3),
@@ -61,10 +74,70 @@ fn channel(channel: &ChannelDescription) -> String {
     format!("{:<14} {columns}{unit}{missing}", channel.quantity)
 }
 
-fn excitation(joint: &Excitation) -> String {
-    let speed = joint.speed_max.map_or_else(String::new, |speed| {
-        let derived = if joint.speed_from == SpeedSource::Derived { ", derived" } else { "" };
-        format!(", up to {speed:.2} rad/s{derived}")
-    });
-    format!("{:<14} {:6.3} to {:6.3} rad{speed}", joint.joint, joint.q_min, joint.q_max)
+/// One line a joint, under two lines of heads.
+fn joints(out: &mut Formatter<'_>, joints: &[Excitation]) -> fmt::Result {
+    let derived = joints.iter().any(|joint| joint.speed_from == SpeedSource::Derived);
+    let commanded =
+        joints.iter().any(|joint| joint.torque_from == TorqueSource::Commanded && joint.torque_max.is_some());
+    writeln!(
+        out,
+        "joints             position [rad]          speed [rad/s]        torque [N·m]         turns    moves at"
+    )?;
+    writeln!(
+        out,
+        "                 low    high  to limit    RMS   peak  limit    RMS   peak  limit              [Hz]"
+    )?;
+    for joint in joints {
+        let name = &joint.joint;
+        write!(out, "  {name:<12} {:6.3}  {:6.3}  {}  ", joint.q_min, joint.q_max, number(joint.limit_distance, 8, 3))?;
+        write!(
+            out,
+            "{} {}  {}",
+            number(joint.speed_rms, 6, 2),
+            number(joint.speed_max, 6, 2),
+            percent(joint.speed_max, joint.speed_limit)
+        )?;
+        write!(
+            out,
+            " {} {}  {}",
+            number(joint.torque_rms, 6, 2),
+            number(joint.torque_max, 6, 2),
+            percent(joint.torque_max, joint.torque_limit)
+        )?;
+        let band = joint.band_hz.map_or_else(|| "–".to_owned(), |[low, high]| format!("{low:.2}–{high:.2}"));
+        writeln!(out, "  {:6}  {band:>10}", joint.turns)?;
+    }
+    if derived {
+        writeln!(out, "  speed is derived from position by differences")?;
+    }
+    if commanded {
+        writeln!(out, "  torque is what the PD law asks for, by the measured position; none was measured")?;
+    }
+    Ok(())
+}
+
+fn number(value: Option<f64>, width: usize, decimals: usize) -> String {
+    value.map_or_else(|| format!("{:>width$}", "–"), |value| format!("{value:width$.decimals$}"))
+}
+
+/// How much of a limit was reached.
+fn percent(reached: Option<f64>, limit: Option<f64>) -> String {
+    reached
+        .zip(limit)
+        .map_or_else(|| "   – ".to_owned(), |(reached, limit)| format!("{:3.0} %", 100.0 * reached / limit))
+}
+
+fn fall(fall: &Fall) -> String {
+    let tilt = fall.tilt_deg.map_or_else(String::new, |tilt| format!(", tilted by {tilt:.0}°"));
+    let height = fall.height_m.map_or_else(String::new, |height| format!(", trunk at {height:.2} m"));
+    format!("{:<14} at {:.2} s (row {}){tilt}{height}", fall.segment, fall.t, fall.row)
+}
+
+fn conclusion(conclusion: &Conclusion) -> String {
+    let verdict = match conclusion.verdict {
+        Verdict::Can => "can",
+        Verdict::Weakly => "weakly",
+        Verdict::Cannot => "cannot",
+    };
+    format!("{:<20} {verdict:<7} {}", conclusion.effect, conclusion.because)
 }

@@ -10,17 +10,24 @@ pub(crate) enum Format {
     Csv,
     CsvGz,
     Parquet,
+    Mcap,
 }
 
-/// The two files of a log.
+/// The files of a log.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Files {
     pub data: PathBuf,
     pub format: Format,
-    pub meta: PathBuf,
+    /// The description: none is there, or none is wanted.
+    pub meta: Option<PathBuf>,
 }
 
-const ENDINGS: [(&str, Format); 3] = [(".parquet", Format::Parquet), (".csv", Format::Csv), (".csv.gz", Format::CsvGz)];
+const ENDINGS: [(&str, Format); 4] =
+    [(".parquet", Format::Parquet), (".csv", Format::Csv), (".csv.gz", Format::CsvGz), (".mcap", Format::Mcap)];
+
+/// Endings that mean a file of another format, and not a folder.
+const FOREIGN: [&str; 14] =
+    ["bag", "db3", "feather", "gz", "h5", "hdf5", "json", "mat", "npy", "npz", "pkl", "tsv", "txt", "xlsx"];
 
 impl Files {
     /// Finds the files of a log from its folder or its data file.
@@ -31,16 +38,28 @@ impl Files {
         }
         let (stem, format) = split(&data).ok_or_else(|| LogError::UnknownFormat { file: data.clone() })?;
         let [wanted, other] = meta_names(stem).map(|name| data.with_file_name(name));
-        let meta = [&wanted, &other].into_iter().find(|meta| meta.is_file()).cloned();
-        let Some(meta) = meta else { return Err(LogError::NoMeta { data, wanted }) };
+        let meta = [wanted, other].into_iter().find(|meta| meta.is_file());
         Ok(Files { data, format, meta })
+    }
+
+    /// Where the description of the data is looked for first.
+    pub fn wanted_meta(&self) -> PathBuf {
+        let stem = split(&self.data).map_or("data", |(stem, _)| stem);
+        let [wanted, _] = meta_names(stem);
+        self.data.with_file_name(wanted)
     }
 
     /// Chooses the files to write from a data file's name or a folder's.
     pub fn choose(path: &Path) -> Result<Files, LogError> {
         if let Some((stem, format)) = split(path) {
             let [meta, _] = meta_names(stem);
-            return Ok(Files { data: path.to_owned(), format, meta: path.with_file_name(meta) });
+            // MCAP carries its description.
+            let meta = (format != Format::Mcap).then(|| path.with_file_name(meta));
+            return Ok(Files { data: path.to_owned(), format, meta });
+        }
+        let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase());
+        if ending.is_some_and(|ending| FOREIGN.contains(&ending.as_str())) && !path.is_dir() {
+            return Err(LogError::UnknownFormat { file: path.into() });
         }
         let mut found = data_files_in(path);
         found.retain(|name| name != "data.parquet");
@@ -48,7 +67,7 @@ impl Files {
             found.push("data.parquet".to_owned());
             return Err(LogError::SeveralDataFiles { folder: path.into(), found });
         }
-        Ok(Files { data: path.join("data.parquet"), format: Format::Parquet, meta: path.join("meta.json") })
+        Ok(Files { data: path.join("data.parquet"), format: Format::Parquet, meta: Some(path.join("meta.json")) })
     }
 }
 
@@ -67,6 +86,14 @@ fn split(path: &Path) -> Option<(&str, Format)> {
 fn meta_names(stem: &str) -> [String; 2] {
     let (shared, own) = ("meta.json".to_owned(), format!("{stem}.json"));
     if stem == "data" { [shared, own] } else { [own, shared] }
+}
+
+/// The file of the log at `input` that writing a log to `output` would replace.
+pub fn would_replace(input: &Path, output: &Path) -> Result<Option<PathBuf>, LogError> {
+    let (input, output) = (Files::find(input)?, Files::choose(output)?);
+    let of = |files: Files| [Some(files.data), files.meta].into_iter().flatten();
+    let written: Vec<_> = of(output).filter_map(|file| file.canonicalize().ok()).collect();
+    Ok(of(input).find(|file| file.canonicalize().is_ok_and(|file| written.contains(&file))))
 }
 
 fn data_file_in(folder: &Path) -> Result<PathBuf, LogError> {

@@ -1,7 +1,7 @@
 //! Measured logs of a robot: what it was told and what it did, row by row.
 //!
-//! A log is a data file (`data.parquet`, `data.csv` or `data.csv.gz`) and a description beside it (`meta.json`). Four
-//! types carry the crate:
+//! A log is a data file (`data.parquet`, `data.csv` or `data.csv.gz`) and a description beside it (`meta.json`), or an
+//! MCAP file with the robot's own messages. Four types carry the crate:
 //!
 //! - [`Log`] is a log in memory, read with [`Log::open`] or made with [`Log::new`], and written with [`Log::write`].
 //!   Whatever way it came, everything in it is checked, so that nothing later has to ask.
@@ -25,24 +25,35 @@
 //! # Ok::<(), twinstep_logs::LogError>(())
 //! ```
 //!
-//! Inside, a file goes through `files` (which files?), `csv_table` or `parquet_table` (which cells?), `columns` (which
+//! Inside, a file goes through `files` (which files?), `csv_table`, `parquet_table` or `mcap_file` (which cells?), `columns` (which
 //! names mean something?) and `check` (is it a log?).
 
 mod absence;
+mod cdr;
 mod check;
 mod columns;
+mod conclusions;
 mod csv_table;
 mod describe;
 mod describe_text;
 mod error;
+mod excitation;
+mod falls;
 mod files;
+mod go2_message;
 mod log;
+mod mcap_file;
 mod meta;
 mod parquet_table;
 mod table;
 mod write;
 
-pub use describe::{Absence, ChannelDescription, Description, Excitation, SegmentDescription, SpeedSource, Timing};
+pub use cdr::CdrError;
+pub use conclusions::{Conclusion, Verdict};
+pub use describe::{Absence, ChannelDescription, Description, SegmentDescription, Timing};
 pub use error::{LogError, Place};
+pub use excitation::{Excitation, SpeedSource, TorqueSource};
+pub use falls::Fall;
+pub use files::would_replace;
 pub use log::Log;
 pub use meta::{Base, Gain, Meta, Segment, TauSensor};

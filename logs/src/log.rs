@@ -11,7 +11,7 @@ use crate::columns::Column;
 use crate::files::{Files, Format};
 use crate::meta::{Gain, Meta, Segment};
 use crate::table::Table;
-use crate::{LogError, csv_table, parquet_table};
+use crate::{LogError, csv_table, mcap_file, parquet_table};
 
 /// What a robot was told and what it did, row by row, with everything checked.
 ///
@@ -27,13 +27,15 @@ pub struct Log {
     pub(crate) joints: Vec<String>,
     pub(crate) channels: BTreeMap<String, Vec<f64>>,
     pub(crate) ignored: Vec<String>,
+    pub(crate) notes: Vec<String>,
 }
 
 impl Log {
     /// Reads a log from its folder, or from its data file with the description beside it.
     ///
-    /// A folder holds `meta.json` and one of `data.parquet`, `data.csv` and `data.csv.gz`. Beside a data file
-    /// `walk.csv` is `walk.json`, or `meta.json`.
+    /// A folder holds `meta.json` and one of `data.parquet`, `data.csv`, `data.csv.gz` and `data.mcap`. Beside a data
+    /// file `walk.csv` is `walk.json`, or `meta.json`. MCAP needs no description: a log that [`Log::write`] wrote
+    /// carries its own, and of any other recording one is made of what it holds.
     pub fn open(path: impl AsRef<Path>) -> Result<Log, LogError> {
         read(path.as_ref(), Need::Measurement)
     }
@@ -88,6 +90,11 @@ impl Log {
     /// Columns of the file that were left out: unknown names, and joints that the description does not list.
     pub fn ignored(&self) -> &[String] {
         &self.ignored
+    }
+
+    /// What was odd about the file and yet no error, in sentences.
+    pub fn reading_notes(&self) -> &[String] {
+        &self.notes
     }
 
     /// Number of rows, at least one.
@@ -248,14 +255,19 @@ pub(crate) fn parts<'a>(segment: &'a [u32], episode: &'a [u32]) -> impl Iterator
 
 fn read(path: &Path, need: Need) -> Result<Log, LogError> {
     let files = Files::find(path)?;
-    let meta = Meta::read(&files.meta)?;
-    let open = || std::fs::File::open(&files.data).map_err(|cause| LogError::Read { file: files.data.clone(), cause });
-    let table = match files.format {
-        Format::Csv => csv_table::read(&files.data, open()?)?,
-        Format::CsvGz => csv_table::read(&files.data, flate2::read::MultiGzDecoder::new(open()?))?,
-        Format::Parquet => parquet_table::read(&files.data)?,
+    let meta = files.meta.as_deref().map(Meta::read).transpose()?;
+    let meta_file = files.meta.as_ref().unwrap_or(&files.data);
+    let needed = |meta: Option<Meta>| {
+        meta.ok_or_else(|| LogError::NoMeta { wanted: files.wanted_meta(), data: files.data.clone() })
     };
-    check::assemble(table, meta, &files.meta, need)
+    let open = || std::fs::File::open(&files.data).map_err(|cause| LogError::Read { file: files.data.clone(), cause });
+    let (table, meta) = match files.format {
+        Format::Csv => (csv_table::read(&files.data, open()?)?, needed(meta)?),
+        Format::CsvGz => (csv_table::read(&files.data, flate2::read::MultiGzDecoder::new(open()?))?, needed(meta)?),
+        Format::Parquet => (parquet_table::read(&files.data)?, needed(meta)?),
+        Format::Mcap => mcap_file::read(&files.data, meta)?,
+    };
+    check::assemble(table, meta, meta_file, need)
 }
 
 fn from_columns(

@@ -16,6 +16,8 @@ pub(crate) struct Table {
     pub ignored: Vec<String>,
     /// The line of each row, for text.
     pub lines: Vec<u64>,
+    /// What was odd about the file and yet no error.
+    pub notes: Vec<String>,
 }
 
 impl Table {
@@ -23,7 +25,8 @@ impl Table {
     ///
     /// Gives, for each name, the place of its column in the table; none if it is ignored.
     pub fn from_header<N: AsRef<str>>(file: &Path, names: &[N]) -> Result<(Table, Vec<Option<usize>>), LogError> {
-        let mut table = Table { file: file.into(), columns: Vec::new(), ignored: Vec::new(), lines: Vec::new() };
+        let mut table =
+            Table { file: file.into(), columns: Vec::new(), ignored: Vec::new(), lines: Vec::new(), notes: Vec::new() };
         let mut seen = BTreeSet::new();
         let mut places = Vec::with_capacity(names.len());
         for name in names.iter().map(|name| name.as_ref().trim()) {

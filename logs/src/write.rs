@@ -6,10 +6,13 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::files::{Files, Format};
-use crate::{Log, LogError, csv_table, parquet_table};
+use crate::{Log, LogError, csv_table, mcap_file, parquet_table};
 
 impl Log {
-    /// Writes the log to a data file (`*.parquet`, `*.csv` or `*.csv.gz`) and its description, or to a folder.
+    /// Writes the log to a data file (`*.parquet`, `*.csv`, `*.csv.gz` or `*.mcap`) and its description, or to a folder.
+    ///
+    /// MCAP carries the description itself, holds time to the nanosecond and numbers in single precision, and lacks the
+    /// columns that [`Log::left_out_of`] names.
     ///
     /// The description of `data.*` is `meta.json`, that of `walk.*` is `walk.json`. A path with another ending is a
     /// folder, made if need be, which gets `data.parquet` and `meta.json`. Both files are complete before either
@@ -18,10 +21,19 @@ impl Log {
         let files = Files::choose(path.as_ref())?;
         let data = Unfinished::create(&files.data)?;
         self.write_data(&data, files.format)?;
-        let meta = Unfinished::create(&files.meta)?;
-        self.write_meta(&meta).map_err(|cause| LogError::Write { file: files.meta.clone(), cause })?;
+        let Some(meta_file) = files.meta else { return data.finish() };
+        let meta = Unfinished::create(&meta_file)?;
+        self.write_meta(&meta).map_err(|cause| LogError::Write { file: meta_file, cause })?;
         data.finish()?;
         meta.finish()
+    }
+
+    /// The columns that the format of the data file `path` cannot hold.
+    pub fn left_out_of(&self, path: impl AsRef<Path>) -> Vec<String> {
+        match Files::choose(path.as_ref()) {
+            Ok(Files { format: Format::Mcap, .. }) => mcap_file::left_out(self),
+            _ => Vec::new(),
+        }
     }
 
     fn write_data(&self, data: &Unfinished, format: Format) -> Result<(), LogError> {
@@ -36,6 +48,7 @@ impl Log {
             }
             Format::Parquet => parquet_table::write(&columns, &mut target)
                 .map_err(|cause| LogError::Parquet { file: data.target.clone(), cause })?,
+            Format::Mcap => mcap_file::write(self, &data.target, &mut target)?,
         }
         target.flush().map_err(refused)
     }

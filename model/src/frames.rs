@@ -3,6 +3,7 @@
 use glam::{Quat, Vec3};
 
 /// `world_from_base` of an orientation given as `[w, x, y, z]`.
+#[inline]
 pub fn world_from_base([w, x, y, z]: [f32; 4]) -> Quat {
     Quat::from_xyzw(x, y, z, w)
 }
@@ -13,6 +14,7 @@ pub fn to_wxyz(rotation: Quat) -> [f32; 4] {
 }
 
 /// Unit vector of gravity in the base frame; (0, 0, −1) for an upright robot (U2E eq. 14, `g_t`).
+#[inline]
 pub fn gravity_in_base(orientation_wxyz: [f32; 4]) -> Vec3 {
     world_from_base(orientation_wxyz).inverse() * Vec3::NEG_Z
 }

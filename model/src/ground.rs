@@ -25,11 +25,13 @@ impl Ground {
     pub const FLAT: Ground = Ground { point: [0.0; 3], normal: [0.0, 0.0, 1.0], height_field: None };
 
     /// Height of the ground at (`x`, `y`) [m].
+    #[inline]
     pub fn height(&self, x: f32, y: f32) -> f32 {
         self.sample(x, y).0
     }
 
     /// Height [m] and unit normal of the ground at (`x`, `y`) [m].
+    #[inline]
     pub fn sample(&self, x: f32, y: f32) -> (f32, [f32; 3]) {
         if let Some(field) = &self.height_field {
             return field.sample(x, y);

@@ -14,7 +14,16 @@ struct Version {
 
 /// A message as MessagePack, a map with field names.
 pub fn encode(message: &impl Serialize) -> Vec<u8> {
-    rmp_serde::to_vec_named(message).expect("messages hold only numbers, strings and bytes, which always encode")
+    encode_with_capacity(message, 256)
+}
+
+/// As [`encode`], into `capacity` bytes taken at once: a large message that grows is copied each time.
+pub fn encode_with_capacity(message: &impl Serialize, capacity: usize) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(capacity);
+    message
+        .serialize(&mut rmp_serde::Serializer::new(&mut bytes).with_struct_map())
+        .expect("messages hold only numbers, strings and bytes, which always encode");
+    bytes
 }
 
 /// Reads a message; the error says whether the version is foreign or the bytes are not the message.

@@ -4,17 +4,20 @@ use std::sync::Arc;
 
 use twinstep_model::{EndedEpisode, EnvError, EnvSpec, Ground, HeightField, ResetRequest, Scene, StepBatch};
 
+use crate::codec::encode_with_capacity;
 use crate::{Code, PROTOCOL, WireError, encode, message, tensor};
+
+/// More bytes than the field names, lengths and numbers of a message take besides its tensors.
+const MAP_OVERHEAD: usize = 256;
 
 /// A reset as sent.
 pub fn encode_reset(request: &ResetRequest, epoch: u64, seq: u64) -> Vec<u8> {
-    let mask = request.mask.as_ref().map(|mask| tensor::flags_to_bytes(mask));
     encode(&message::ResetRequest {
         protocol: PROTOCOL,
         epoch,
         seq,
         seeds: request.seeds.as_ref().map(|seeds| tensor::as_bytes(seeds)),
-        mask: mask.as_deref(),
+        mask: request.mask.as_ref().map(|mask| tensor::flags_as_bytes(mask)),
     })
 }
 
@@ -32,19 +35,29 @@ pub fn encode_step(batch: &StepBatch, seq: u64) -> Vec<u8> {
     let episode_return: Vec<f32> = ended.iter().map(|episode| episode.episode_return).collect();
     let terms: Vec<f32> = ended.iter().flat_map(|episode| episode.terms.iter().copied()).collect();
     let final_obs: Vec<f32> = ended.iter().flat_map(|episode| episode.final_obs.iter().copied()).collect();
-    encode(&message::StepReply {
+    let reply = message::StepReply {
         protocol: PROTOCOL,
         seq,
         obs: tensor::as_bytes(&batch.obs),
         reward: tensor::as_bytes(&batch.reward),
-        terminated: &tensor::flags_to_bytes(&batch.terminated),
-        truncated: &tensor::flags_to_bytes(&batch.truncated),
+        terminated: tensor::flags_as_bytes(&batch.terminated),
+        truncated: tensor::flags_as_bytes(&batch.truncated),
         ended_env: tensor::as_bytes(&env),
         ended_length: tensor::as_bytes(&length),
         ended_return: tensor::as_bytes(&episode_return),
         ended_terms: tensor::as_bytes(&terms),
         final_obs: tensor::as_bytes(&final_obs),
-    })
+    };
+    let numbers = batch.obs.len() + batch.reward.len() + 3 * ended.len() + terms.len() + final_obs.len();
+    let flags = batch.terminated.len() + batch.truncated.len();
+    encode_with_capacity(&reply, MAP_OVERHEAD + numbers * size_of::<f32>() + flags)
+}
+
+/// A step request as sent.
+pub fn encode_actions(actions: &[f32], epoch: u64, seq: u64) -> Vec<u8> {
+    let actions = tensor::as_bytes(actions);
+    let request = message::StepRequest { protocol: PROTOCOL, epoch, seq, actions };
+    encode_with_capacity(&request, MAP_OVERHEAD + actions.len())
 }
 
 /// A step's result as received, into `batch`. Every length must fit `num_envs` environments of `spec`.
@@ -56,8 +69,8 @@ pub fn read_step(
 ) -> Result<(), WireError> {
     tensor::read_into(reply.obs, &mut batch.obs, "obs")?;
     tensor::read_into(reply.reward, &mut batch.reward, "reward")?;
-    batch.terminated = tensor::flags_from_bytes(reply.terminated);
-    batch.truncated = tensor::flags_from_bytes(reply.truncated);
+    tensor::read_flags_into(reply.terminated, &mut batch.terminated);
+    tensor::read_flags_into(reply.truncated, &mut batch.truncated);
     let env: Vec<u32> = tensor::read(reply.ended_env, "ended_env")?;
     let length: Vec<u32> = tensor::read(reply.ended_length, "ended_length")?;
     let episode_return: Vec<f32> = tensor::read(reply.ended_return, "ended_return")?;

@@ -9,14 +9,22 @@ pub fn as_bytes<T: bytemuck::NoUninit>(values: &[T]) -> &[u8] {
     bytemuck::cast_slice(values)
 }
 
-/// Bytes of flags: 0 or 1 each.
-pub fn flags_to_bytes(flags: &[bool]) -> Vec<u8> {
-    flags.iter().map(|flag| u8::from(*flag)).collect()
+/// Bytes of flags, without copying: 0 or 1 each.
+pub fn flags_as_bytes(flags: &[bool]) -> &[u8] {
+    bytemuck::cast_slice(flags)
 }
 
 /// Reads flags; anything but 0 is true.
 pub fn flags_from_bytes(bytes: &[u8]) -> Vec<bool> {
-    bytes.iter().map(|byte| *byte != 0).collect()
+    let mut flags = Vec::new();
+    read_flags_into(bytes, &mut flags);
+    flags
+}
+
+/// As [`flags_from_bytes`], into `flags`, whatever its length was.
+pub fn read_flags_into(bytes: &[u8], flags: &mut Vec<bool>) {
+    flags.clear();
+    flags.extend(bytes.iter().map(|byte| *byte != 0));
 }
 
 /// Reads numbers into `values`, whatever its length was. `field` is named if the bytes are not whole numbers.

@@ -8,6 +8,7 @@ mod exactly_once;
 mod faults;
 mod layering;
 mod leases;
+mod log;
 mod play;
 mod python;
 mod rapier;

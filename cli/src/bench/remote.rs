@@ -13,7 +13,7 @@ use crate::trot;
 /// Environment steps a second, remote beside in process.
 pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
     let mut rows = Vec::new();
-    for num_envs in [64, 1024] {
+    for num_envs in [64, 1024, 4096] {
         let (remote, local) = side_by_side(num_envs, window_s, signals)?;
         let env_steps = num_envs as f64;
         rows.push(Row {

@@ -159,18 +159,21 @@ fn beside_envpool(threads: usize, peers: &mut Peers, window_s: f64) -> Result<Ve
 }
 
 /// What the task costs on top of the bare engine, and what the second core brings.
-fn whole_and_parts(window_s: f64) -> Result<[Row; 2], Failure> {
+fn whole_and_parts(window_s: f64) -> Result<[Row; 3], Failure> {
     let bare = |threads| {
         let config = SimConfig { threads, ..config(fastest(ENVS_HZ)) };
         trotting(BatchBackend::new(go2(), config, MANY).map_err(other)?)
     };
     let (walk, engine) = in_turn(walking(MANY, 1)?, bare(1)?, window_s)?;
     let (both, one) = in_turn(bare(2)?, bare(1)?, window_s)?;
+    let (walk_both, engine_both) = in_turn(walking(MANY, 2)?, bare(2)?, window_s)?;
     let name = name(fastest(ENVS_HZ));
     let reference = format!("bare {name}, {MANY} robots, one core");
+    let reference_both = format!("bare {name}, {MANY} robots, two threads");
     Ok([
         row(format!("walk, {name}, {MANY} envs, one core"), walk, Some((&reference, engine))),
-        row(format!("bare {name}, {MANY} robots, two threads"), both, Some((&reference, one))),
+        row(reference_both.clone(), both, Some((&reference, one))),
+        row(format!("walk, {name}, {MANY} envs, two threads"), walk_both, Some((&reference_both, engine_both))),
     ])
 }
 

@@ -2,7 +2,7 @@
 
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_model::{ResetRequest, StepBatch, VecEnv};
-use twinstep_protocol::{PROTOCOL, convert, encode, message, tensor};
+use twinstep_protocol::convert;
 
 use super::Row;
 use super::pace::{Pace, WINDOWS, measure as pace, median};
@@ -11,7 +11,7 @@ use crate::exit::{Failure, Signals, other};
 use crate::server_process::ServerProcess;
 
 /// Environments in a message, and whether through shared memory.
-const CASES: [(usize, bool); 4] = [(1, false), (64, false), (1024, false), (1024, true)];
+const CASES: [(usize, bool); 6] = [(1, false), (64, false), (1024, false), (1024, true), (4096, false), (4096, true)];
 
 /// Round trips a second and median latency of each case.
 pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
@@ -55,8 +55,7 @@ fn side_by_side(
     env.reset(&ResetRequest::default()).map_err(other)?;
     let actions = vec![0.1; num_envs * env.spec().action_len()];
     let mut tcp = {
-        let actions = tensor::as_bytes(&actions);
-        let request = encode(&message::StepRequest { protocol: PROTOCOL, epoch: 1, seq: 1, actions });
+        let request = convert::encode_actions(&actions, 1, 1);
         let reply = convert::encode_step(&StepBatch::new(num_envs, env.spec().obs_len()), 1);
         PingPong::start(request.len(), reply.len())?
     };

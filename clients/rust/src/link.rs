@@ -286,6 +286,10 @@ fn zenoh_config(options: &ConnectOptions) -> Result<zenoh::Config, ClientError> 
         ("connect/endpoints", endpoints.as_str()),
         ("scouting/multicast/enabled", "false"),
         ("transport/link/tx/lease", "2000"),
+        // Room for a step of 4096 robots, which Zenoh sends in twelve parts: with its own two, whoever writes waits for
+        // whoever sends after every second part, and whoever receives takes new memory for each.
+        ("transport/link/tx/queue/size/data", "16"),
+        ("transport/link/rx/buffer_size", "2097152"),
         // A server or router that comes back is found within a second in place of Zenoh's four.
         ("connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
         ("transport/shared_memory/enabled", if options.shared_memory { "true" } else { "false" }),

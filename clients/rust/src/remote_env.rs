@@ -96,8 +96,7 @@ impl RemoteVecEnv {
             return Err(EnvError::WrongLength { field: "actions", given: actions.len(), wanted });
         }
         let (epoch, seq) = (self.ticket.epoch, self.last_seq + 1);
-        let actions = tensor::as_bytes(actions);
-        let request = encode(&message::StepRequest { protocol: PROTOCOL, epoch, seq, actions });
+        let request = convert::encode_actions(actions, epoch, seq);
         self.pending = Some((Verb::Step, send(&self.step, request).map_err(remote)?));
         Ok(())
     }

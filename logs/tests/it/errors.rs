@@ -34,7 +34,7 @@ fn missing_files_are_named_with_what_to_give() {
     let empty = tempfile::tempdir().expect("a folder");
     expect![[r#"
         no log is at `log`
-          give a folder with meta.json and one of data.parquet, data.csv and data.csv.gz, or the data file itself"#]]
+          give a folder with meta.json and one of data.parquet, data.csv, data.csv.gz and data.mcap, or the data file itself"#]]
     .assert_eq(&error(empty.path()));
     write(empty.path(), "data.csv", CSV);
     expect![[r#"
@@ -55,7 +55,7 @@ fn an_unknown_format_is_answered_with_the_known_ones() {
     let error = Log::open(file).expect_err("no log").to_string();
     expect![[r#"
         the format of `log/walk.xlsx` is unknown
-          name it *.parquet, *.csv or *.csv.gz"#]]
+          name it *.parquet, *.csv, *.csv.gz or *.mcap"#]]
     .assert_eq(&error.replace(&folder.path().display().to_string(), "log"));
 }
 
@@ -63,11 +63,15 @@ fn an_unknown_format_is_answered_with_the_known_ones() {
 fn missing_columns_are_named() {
     check_csv(
         "time,q_a,q_cmd_a\n0,0,0\n",
-        &expect!["`log/data.csv` has no column `t`; its columns are `q_a`, `q_cmd_a`, `time`"],
+        &expect![[r#"
+            `log/data.csv` has no column `t` (the time of each row [s]); its columns are `q_a`, `q_cmd_a`, `time`
+              is it `time`? call it `t`"#]],
     );
     check_csv(
         "t,position\n0,0\n",
-        &expect!["`log/data.csv` has no column `q_<joint>`; its columns are `t`, `position`"],
+        &expect![
+            "`log/data.csv` has no column `q_<joint>` (a joint's measured position, such as `q_FL_hip` [rad]); its columns are `t`, `position`"
+        ],
     );
     check_csv(
         "t,kp,kd,q_a\n0,1,1,0\n",
@@ -95,7 +99,10 @@ fn a_joint_of_the_description_needs_columns() {
 
 #[test]
 fn an_empty_log_is_named() {
-    check_csv("t,kp,kd,q_a,q_cmd_a\n", &expect!["`log/data.csv` has no rows; a log needs at least one"]);
+    check_csv(
+        "t,kp,kd,q_a,q_cmd_a\n",
+        &expect!["`log/data.csv` has no rows; a log needs at least one under its header"],
+    );
 }
 
 #[test]
@@ -120,7 +127,9 @@ fn a_cell_with_text_is_named_with_its_line() {
 fn a_ragged_row_is_named_with_its_line() {
     check_csv(
         &CSV.replace(",28\n", "\n"),
-        &expect!["`log/data.csv`, row 3 (line 4) has 5 cells, but the header has 6"],
+        &expect![[r#"
+            `log/data.csv`, row 3 (line 4) has 5 cells, but the header has 6
+              write an empty cell where nothing is known, and one comma fewer than columns"#]],
     );
 }
 
@@ -128,7 +137,9 @@ fn a_ragged_row_is_named_with_its_line() {
 fn an_empty_cell_of_a_needed_column_is_named() {
     check_csv(
         &CSV.replace("0.2,", ","),
-        &expect!["`log/data.csv`, column `q_FL_hip`, row 2 (line 3) is empty, but it must be a finite number"],
+        &expect![[r#"
+            `log/data.csv`, column `q_FL_hip`, row 2 (line 3) is empty or NaN, but it must be a finite number
+              leave the row out, or fill the cell with what was in force"#]],
     );
 }
 
@@ -146,7 +157,9 @@ fn time_that_stands_still_is_named() {
 fn a_negative_gain_is_named() {
     check_csv(
         &CSV.replace("0.01,20", "0.01,-20"),
-        &expect!["`log/data.csv`, column `kp`, row 3 (line 4): a gain of -20 is negative"],
+        &expect![[r#"
+            `log/data.csv`, column `kp`, row 3 (line 4): a gain of -20 is negative
+              kp [N·m/rad] and kd [N·m·s/rad] act as kp·(q_cmd − q) + kd·(dq_cmd − dq): change its sign"#]],
     );
 }
 
@@ -154,17 +167,21 @@ fn a_negative_gain_is_named() {
 fn cells_out_of_range_are_named() {
     check_columns(
         [("segment", vec![0.0, 2.0])],
-        &expect![
-            "`columns in memory`, column `segment`, row 2: segment 2 is not in `segments` of the meta file, which has 2, counted from 0"
-        ],
+        &expect![[r#"
+        `columns in memory`, column `segment`, row 2: segment 2 is not in `segments` of the meta file, which has 2, counted from 0
+          add {"name": …, "base": "fixed" or "floating"} to `segments`, or correct the column"#]],
     );
     check_columns(
         [("episode", vec![0.0, 0.5])],
-        &expect!["`columns in memory`, column `episode`, row 2 is 0.5, but it must be a whole number from 0"],
+        &expect![[r#"
+        `columns in memory`, column `episode`, row 2 is 0.5, but it must be a whole number from 0
+          leave the column out where it never changes"#]],
     );
     check_columns(
         [("episode", vec![0.0, -1.0])],
-        &expect!["`columns in memory`, column `episode`, row 2 is -1, but it must be a whole number from 0"],
+        &expect![[r#"
+        `columns in memory`, column `episode`, row 2 is -1, but it must be a whole number from 0
+          leave the column out where it never changes"#]],
     );
     check_columns(
         [("gyro_x", vec![0.0, f64::INFINITY])],
@@ -174,7 +191,9 @@ fn cells_out_of_range_are_named() {
     );
     check_columns(
         [("t", vec![f64::NAN, 0.0])],
-        &expect!["`columns in memory`, column `t`, row 1 is empty, but it must be a finite number"],
+        &expect![[r#"
+        `columns in memory`, column `t`, row 1 is empty or NaN, but it must be a finite number
+          leave the row out, or fill the cell with what was in force"#]],
     );
 }
 
@@ -184,9 +203,9 @@ fn a_quaternion_is_a_unit_one() {
     let quaternion = |w| [("quat_w", part(w)), ("quat_x", part(0.5)), ("quat_y", part(0.5)), ("quat_z", part(0.5))];
     check_columns(
         quaternion(0.6),
-        &expect![
-            "`columns in memory`, column `quat_w`, row 2: the quaternion's norm is 1.0536, but it must be within 0.01 of 1"
-        ],
+        &expect![[r#"
+        `columns in memory`, column `quat_w`, row 2: the quaternion's norm is 1.0536, but it must be within 0.01 of 1
+          quat_w, quat_x, quat_y, quat_z turn the trunk's frame into the world's; leave the cells empty where it is unknown"#]],
     );
     let mut all = columns([("t", vec![0.0, 0.1]), ("q_a", vec![0.0; 2]), ("q_cmd_a", vec![0.0; 2])]);
     all.extend(columns(quaternion(f64::NAN)));
@@ -259,6 +278,24 @@ fn values_of_the_description_are_in_range() {
 }
 
 #[test]
+fn a_joint_s_name_with_something_behind_it_is_answered_with_the_column_that_is_meant() {
+    for name in ["q_FL_hip_deg", "q_FL_hip [rad]", "q_FL_hip_joint", "q_fl_hip"] {
+        let error = error(folder(&CSV.replace(",q_FL_hip", &format!(",{name}")), META).path());
+        assert!(
+            error.contains(&format!("column `{name}`")) && error.contains("call the column `q_FL_hip`, in rad"),
+            "{error}"
+        );
+    }
+}
+
+#[test]
+fn positions_in_degrees_are_noted() {
+    let log = Log::open(folder(&CSV.replace("0.3,", "85,"), META).path()).expect("a log");
+    expect!["q_FL_hip goes beyond 7 rad: is it in degrees? Positions are in radians"]
+        .assert_eq(&log.describe().notes.join("; "));
+}
+
+#[test]
 fn a_place_is_data_for_programs() {
     let folder = folder(&CSV.replace("0.3,", "?,"), META);
     let Err(LogError::NotANumber { place, text }) = Log::open(folder.path()) else { panic!("another error") };
@@ -272,5 +309,6 @@ fn a_truncated_archive_is_an_error() {
     Log::open(folder.path()).expect("a log").write(&file).expect("written");
     let whole = fs::read(&file).expect("a file");
     fs::write(&file, &whole[..whole.len() / 2]).expect("a file");
-    assert!(matches!(Log::open(&file), Err(LogError::Read { .. })));
+    let error = Log::open(&file).expect_err("no log").to_string();
+    assert!(error.ends_with("it may have been cut off or damaged: copy or write it anew"), "{error}");
 }

@@ -5,6 +5,7 @@
 
 mod description;
 mod errors;
+mod mcap;
 mod parquet;
 mod reading;
 mod round_trip;

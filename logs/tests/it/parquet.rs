@@ -93,6 +93,8 @@ fn a_file_that_is_no_parquet_is_named() {
     let file = write(folder.path(), "data.parquet", "t,q_a,q_cmd_a\n0,0,0\n");
     write(folder.path(), "meta.json", META);
     let error = Log::open(file).expect_err("no log").to_string();
-    expect!["`log/data.parquet` as Parquet: Parquet error: Invalid Parquet file. Corrupt footer"]
-        .assert_eq(&error.replace(&folder.path().display().to_string(), "log"));
+    expect![[r#"
+        `log/data.parquet` is no whole Parquet file: Parquet error: Invalid Parquet file. Corrupt footer
+          it may have been cut off or damaged: copy or write it anew"#]]
+    .assert_eq(&error.replace(&folder.path().display().to_string(), "log"));
 }

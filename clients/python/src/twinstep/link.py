@@ -266,6 +266,9 @@ def _zenoh_config(endpoint: str, path: str | None) -> zenoh.Config:
             ("connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
             ("scouting/multicast/enabled", "false"),
             ("transport/link/tx/lease", "2000"),
+            # Room for a step of 4096 robots, which Zenoh sends in twelve parts.
+            ("transport/link/tx/queue/size/data", "16"),
+            ("transport/link/rx/buffer_size", "2097152"),
             ("transport/shared_memory/enabled", "false"),
         ):
             config.insert_json5(key, value)

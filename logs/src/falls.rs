@@ -1,0 +1,59 @@
+//! Where the robot fell over.
+
+use serde::Serialize;
+
+use crate::{Base, Log};
+
+/// Cosine of the tilt beyond which the robot has fallen: 60°.
+const FALLEN_COSINE: f64 = 0.5;
+/// Height of the trunk below which it has fallen, as a fraction of the median of the part.
+const FALLEN_HEIGHT: f64 = 0.5;
+
+/// A moment at which a robot that was upright no longer is.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Fall {
+    /// The segment's name.
+    pub segment: String,
+    /// The data row, from 1.
+    pub row: usize,
+    /// Its time [s].
+    pub t: f64,
+    /// Angle between the trunk's z and the world's [°]; none without an orientation.
+    pub tilt_deg: Option<f64>,
+    /// Height of the trunk in the world [m]; none without a position.
+    pub height_m: Option<f64>,
+}
+
+/// The falls in the parts with a floating base; none at all where neither orientation nor height is known.
+pub(crate) fn falls(log: &Log) -> Option<Vec<Fall>> {
+    let (x, y, height) = (log.channel("quat_x"), log.channel("quat_y"), log.channel("pos_z"));
+    let floating = log.segments().any(|(segment, _)| segment.base == Base::Floating);
+    if !floating || ((x.is_none() || y.is_none()) && height.is_none()) {
+        return None;
+    }
+    let cosine = |row: usize| Some(1.0 - 2.0 * (x?[row].powi(2) + y?[row].powi(2))).filter(|cosine| !cosine.is_nan());
+    let metres = |row: usize| Some(height?[row]).filter(|metres| !metres.is_nan());
+    let mut falls = Vec::new();
+    for (segment, rows) in log.segments().filter(|(segment, _)| segment.base == Base::Floating) {
+        let mut heights: Vec<f64> = rows.clone().filter_map(metres).collect();
+        heights.sort_by(f64::total_cmp);
+        let low = crate::describe::quantile(&heights, 0.5).map(|median| FALLEN_HEIGHT * median);
+        let mut upright = false;
+        for row in rows {
+            let tilted = cosine(row).is_some_and(|cosine| cosine < FALLEN_COSINE);
+            let sunk = metres(row).zip(low).is_some_and(|(metres, low)| metres < low);
+            if upright && (tilted || sunk) {
+                let tilt_deg = cosine(row).map(|cosine| cosine.clamp(-1.0, 1.0).acos().to_degrees());
+                falls.push(Fall {
+                    segment: segment.name.clone(),
+                    row: row + 1,
+                    t: log.t()[row],
+                    tilt_deg,
+                    height_m: metres(row),
+                });
+            }
+            upright = !(tilted || sunk);
+        }
+    }
+    Some(falls)
+}

@@ -1,0 +1,243 @@
+//! `twinstep log` through the real program.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use expect_test::{Expect, expect};
+use twinstep_logs::{Base, Gain, Log, Meta, Segment, TauSensor};
+use twinstep_tests::python::Programs;
+
+/// The real robot in the air, 16 s at 200 Hz.
+const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../data/go2_air_chirp");
+
+fn log(arguments: &[&str]) -> Output {
+    let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
+    Command::new(programs.0.join("twinstep")).arg("log").args(arguments).output().unwrap()
+}
+
+fn stdout(arguments: &[&str]) -> String {
+    let output = log(arguments);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn convert(from: &Path, to: &Path) -> String {
+    stdout(&[from.to_str().unwrap(), "--convert", to.to_str().unwrap()])
+}
+
+fn check_refusal(output: &Output, folder: &Path, message: &Expect) {
+    assert_eq!(output.status.code(), Some(2));
+    assert!(output.stdout.is_empty(), "on failure stdout stays empty");
+    message.assert_eq(&String::from_utf8_lossy(&output.stderr).replace(&folder.display().to_string(), "log"));
+}
+
+/// A robot with a free trunk that turns over after a second.
+fn tumble() -> Log {
+    const ROWS: usize = 400;
+    let t = |row: usize| row as f64 * 0.005;
+    let column = |of: &dyn Fn(f64) -> f64| (0..ROWS).map(|row| of(t(row))).collect::<Vec<_>>();
+    let swing = |seconds: f64| 0.3 * (20.0 * seconds).sin();
+    let tilt = |seconds: f64| (2.0 * (seconds - 1.0)).clamp(0.0, 3.0);
+    let columns = [
+        ("t", column(&|seconds| seconds)),
+        ("q_FL_hip", column(&swing)),
+        ("dq_FL_hip", column(&|seconds| 6.0 * (20.0 * seconds).cos())),
+        ("q_cmd_FL_hip", column(&|seconds| 1.2 * swing(seconds))),
+        ("tau_measured_FL_hip", column(&|seconds| 18.0 * (20.0 * seconds).cos())),
+        ("quat_w", column(&|seconds| (tilt(seconds) / 2.0).cos())),
+        ("quat_x", column(&|seconds| (tilt(seconds) / 2.0).sin())),
+        ("quat_y", vec![0.0; ROWS]),
+        ("quat_z", vec![0.0; ROWS]),
+        ("gyro_x", column(&|seconds| if tilt(seconds) > 0.0 { 2.0 } else { 0.0 })),
+        ("pos_z", column(&|seconds| 0.3 - 0.07 * tilt(seconds))),
+    ];
+    let segments = vec![Segment { name: "tumble".to_owned(), base: Base::Floating }];
+    let meta = Meta {
+        kp: Some(Gain::Same(30.0)),
+        kd: Some(Gain::Same(0.75)),
+        ..Meta::new(200.0, TauSensor::Current, segments)
+    };
+    Log::new(meta, columns.map(|(name, cells)| (name.to_owned(), cells))).unwrap()
+}
+
+#[test]
+fn log_of_the_real_robot_is_described() {
+    let text = stdout(&[RECORDING]);
+    for line in [
+        "3200 rows, 16.00 s\n",
+        "no gap\n",
+        "  air_chirp      base fixed, 3200 rows, 16.00 s\n",
+        "  payload              cannot  the trunk is held: record a floating base\n",
+        "  coulomb_friction     weakly  no torque was measured: motion alone must show it\n",
+    ] {
+        assert!(text.contains(line), "{line} is not in\n{text}");
+    }
+}
+
+#[test]
+fn description_of_a_tumble_has_the_fall_and_what_it_can_tell() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("tumble.csv.gz");
+    tumble().write(&path).unwrap();
+    let text = stdout(&[path.to_str().unwrap()]);
+    let told = text.split_once("joints  ").unwrap().1;
+    expect![[r#"
+                   position [rad]          speed [rad/s]        torque [N·m]         turns    moves at
+                         low    high  to limit    RMS   peak  limit    RMS   peak  limit              [Hz]
+          FL_hip       -0.300   0.300     0.747    4.22   6.00   20 %  12.66  18.00   76 %      13   3.12–3.23
+        falls
+          tumble         at 1.53 s (row 306), tilted by 60°, trunk at 0.23 m
+        what this log can tell
+          command_delay        can     FL_hip moves both ways, recorded at 200 Hz; armature looks alike in slow motion
+          encoder_offset       weakly  kp never changes: repeat the motion at another kp; a constant load looks alike at one kp
+          torque_saturation    can     FL_hip reaches 76 % of its highest torque
+          supply_sag           cannot  no battery_V was recorded
+          thermal_derating     cannot  no temp was recorded
+          torque_delay         can     FL_hip moves both ways, recorded at 200 Hz; command_delay differs only where the joint is pushed
+          torque_speed_limit   cannot  no joint passes 20 % of its highest speed: reach 50 % or more
+          drive_lag            can     FL_hip moves both ways, recorded at 200 Hz, motion reaches 3.2 Hz; its gain falls with frequency, a delay's does not
+          torque_sensor_delay  can     torque was measured, FL_hip moves both ways, recorded at 200 Hz
+          torque_gain          can     FL_hip moves both ways; a wrong kp or mass looks alike
+          torque_ripple        weakly  no joint moves slowly: add motion of 0.02 to 0.3 rad/s
+          backlash             weakly  no joint moves slowly: add motion of 0.02 to 0.3 rad/s; it shows where the load changes its sign
+          joint_elasticity     cannot  200 Hz is too slow: record at 500 Hz or more
+          coulomb_friction     can     FL_hip moves both ways
+          viscous_friction     weakly  kd never changes: repeat the motion at another kd; at one kd it is the same as a wrong kd
+          stribeck_friction    cannot  no joint moves slowly: add motion of 0.02 to 0.3 rad/s
+          load_friction        can     FL_hip moves both ways, FL_hip reaches 76 % of its highest torque; only loads that differ tell it from coulomb_friction
+          armature             can     FL_hip moves both ways, recorded at 200 Hz, motion reaches 3.2 Hz; a delay looks alike: two spectra, or the first 10 ms of a step, tell them apart
+          joint_spring         can     positions span up to 0.60 rad
+          payload              can     the trunk is free for 2.0 s; a load on a leg shows with the trunk held too
+          com_shift            can     the trunk is free for 2.0 s
+          inertia              can     the trunk is free for 2.0 s, the gyro reaches 2.00 rad/s
+          ground_friction      can     the trunk is free for 2.0 s; only feet that slip tell its size
+          ground_stiffness     weakly  no foot_force or contact was recorded
+          gyro_bias            can     the gyro reaches 2.00 rad/s
+    "#]].assert_eq(told);
+}
+
+#[test]
+fn description_is_one_json_object() {
+    let text = stdout(&[RECORDING, "--json"]);
+    let json: serde_json::Value = serde_json::from_str(&text).unwrap();
+    assert_eq!(text.lines().count(), 1);
+    assert_eq!((&json["rows"], &json["segments"][0]["base"]), (&3200.into(), &"fixed".into()));
+    assert_eq!(json["joints"].as_array().unwrap().len(), 12);
+    let verdict = |effect: &str| {
+        let conclusions = json["conclusions"].as_array().unwrap();
+        conclusions.iter().find(|conclusion| conclusion["effect"] == effect).unwrap()["verdict"].clone()
+    };
+    assert_eq!((verdict("coulomb_friction"), verdict("payload")), ("weakly".into(), "cannot".into()));
+}
+
+#[test]
+fn log_goes_through_every_format_and_comes_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let original = Log::open(RECORDING).unwrap();
+    for (from, to) in
+        [("start.csv", "a.parquet"), ("a.parquet", "b.csv.gz"), ("b.csv.gz", "a_folder"), ("a_folder", "c.mcap")]
+    {
+        if from == "start.csv" {
+            original.write(path(from)).unwrap();
+        }
+        assert_eq!(
+            convert(&path(from), &path(to)).lines().next(),
+            Some(&*format!("wrote {} (3200 rows)", path(to).display()))
+        );
+        if to != "c.mcap" {
+            assert_eq!(Log::open(path(to)).unwrap(), original);
+        }
+    }
+    convert(&path("c.mcap"), &path("end.csv"));
+    let end = Log::open(path("end.csv")).unwrap();
+    assert_eq!((end.meta(), end.joints(), end.segment()), (original.meta(), original.joints(), original.segment()));
+    for (name, cells) in original.channels() {
+        // MCAP holds single precision.
+        assert!(cells.iter().zip(end.channel(name).unwrap()).all(|(a, b)| f64::from(*a as f32) == *b), "{name}");
+    }
+}
+
+#[test]
+fn conversion_says_what_it_leaves_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let (csv, mcap) = (folder.path().join("tumble.csv"), folder.path().join("tumble.mcap"));
+    tumble().write(&csv).unwrap();
+    assert!(convert(&csv, &mcap).contains("left out, as the format has no place for it: pos_z\n"));
+    let json = stdout(&[csv.to_str().unwrap(), "--json", "--convert", mcap.to_str().unwrap()]);
+    let json: serde_json::Value = serde_json::from_str(&json).unwrap();
+    assert_eq!(json["converted"]["left_out"][0], "pos_z");
+}
+
+#[test]
+fn log_is_not_overwritten_with_itself() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).display().to_string();
+    tumble().write(path("data.csv")).unwrap();
+    let refused = |from: &str, to: &str| log(&[&path(from), "--convert", &path(to)]);
+    check_refusal(
+        &refused("data.csv", "data.csv"),
+        folder.path(),
+        &expect![[r#"
+        error: `--convert log/data.csv` would replace `log/data.csv`, which belongs to the log itself
+          name another file or folder
+    "#]],
+    );
+    // Another data file, but the same meta.json.
+    check_refusal(
+        &refused("", "data.parquet"),
+        folder.path(),
+        &expect![[r#"
+        error: `--convert log/data.parquet` would replace `log/meta.json`, which belongs to the log itself
+          name another file or folder
+    "#]],
+    );
+    assert_eq!(Log::open(path("data.csv")).unwrap(), tumble());
+}
+
+#[test]
+fn bad_input_is_named_and_stdout_stays_empty() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("walk.csv");
+    std::fs::write(&path, "t,q_FL_hip_deg,q_cmd_FL_hip,kp,kd\n0,0,0,20,0.5\n").unwrap();
+    let segments = vec![Segment { name: "walk".to_owned(), base: Base::Floating }];
+    let meta = serde_json::to_string(&Meta::new(200.0, TauSensor::None, segments)).unwrap();
+    std::fs::write(folder.path().join("walk.json"), meta).unwrap();
+    check_refusal(
+        &log(&[path.to_str().unwrap(), "--json"]),
+        folder.path(),
+        &expect![[r#"
+        error: `log/walk.csv`, column `q_FL_hip_deg`: the Go2 has no joint `FL_hip_deg`
+          call the column `q_FL_hip`, in rad; columns carry no unit in their names
+    "#]],
+    );
+    check_refusal(
+        &log(&["nowhere"]),
+        folder.path(),
+        &expect![[r#"
+        error: no log is at `nowhere`
+          give a folder with meta.json and one of data.parquet, data.csv, data.csv.gz and data.mcap, or the data file itself
+    "#]],
+    );
+    check_refusal(
+        &log(&[RECORDING, "--convert", "walk.xlsx"]),
+        folder.path(),
+        &expect![[r#"
+        error: the format of `walk.xlsx` is unknown
+          name it *.parquet, *.csv, *.csv.gz or *.mcap
+    "#]],
+    );
+}
+
+#[test]
+fn motion_is_described_without_conclusions() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("sway.csv");
+    let segments = vec![Segment { name: "sway".to_owned(), base: Base::Fixed }];
+    let columns = [("t", vec![0.0, 0.02, 0.04]), ("q_cmd_FL_hip", vec![0.0, 0.1, 0.2])];
+    let meta = Meta::new(50.0, TauSensor::None, segments);
+    Log::new_motion(meta, columns.map(|(name, cells)| (name.to_owned(), cells))).unwrap().write(&path).unwrap();
+    let text = stdout(&[path.to_str().unwrap()]);
+    assert!(text.contains("nothing was measured: this is a motion to play"), "{text}");
+    assert!(!text.contains("what this log can tell"));
+}
