@@ -2,7 +2,10 @@
 
 mod bench;
 mod demo;
+mod effects;
+mod evaluate;
 mod exit;
+mod identify;
 mod joint_plot;
 mod log;
 mod mjcf;
@@ -27,6 +30,9 @@ struct Cli {
 enum Verb {
     Bench(bench::Args),
     Demo(demo::Args),
+    Effects(effects::Args),
+    Evaluate(evaluate::Args),
+    Identify(identify::Args),
     Log(log::Args),
     Mjcf(mjcf::Args),
     Play(play::Args),
@@ -44,6 +50,9 @@ fn main() -> std::process::ExitCode {
     let result = match Cli::parse().command {
         Verb::Bench(args) => bench::run(&args),
         Verb::Demo(args) => demo::run(&args),
+        Verb::Effects(args) => effects::run(&args),
+        Verb::Evaluate(args) => evaluate::run(&args),
+        Verb::Identify(args) => identify::run(&args),
         Verb::Log(args) => log::run(&args),
         Verb::Mjcf(args) => mjcf::run(&args),
         Verb::Play(args) => play::run(&args),

@@ -9,9 +9,9 @@ use twinstep_model::{Backend, Ground, HELD_HEIGHT, JOINT_NAMES, Joint, Leg, Plac
 use twinstep_sim::{Base, BatchBackend, Engine, RapierBackend, SimConfig};
 
 use crate::exit::{Failure, Outcome, Signals, input, other};
-use twinstep_sysid::motion::{DriveClock, FailedAt, JointCommands, command, joint_commands};
 use crate::robot_file::robot_model;
 use crate::serve::engine;
+use twinstep_sysid::motion::{DriveClock, FailedAt, JointCommands, command, joint_commands};
 
 /// Play a motion file through a robot model, and write what the robot did as a measured log.
 ///

@@ -84,16 +84,10 @@ impl CmaEs {
             .zip(&self.weights)
             .map(|(step, weight)| *weight * step * step.transpose())
             .sum::<DMatrix<f64>>();
-        self.covariance = (1.0 - c_one - c_mu + lost) * &self.covariance
-            + c_one * &self.path * self.path.transpose()
-            + c_mu * spread;
+        self.covariance =
+            (1.0 - c_one - c_mu + lost) * &self.covariance + c_one * &self.path * self.path.transpose() + c_mu * spread;
         self.sigma *= ((c_sigma / damping) * (self.sigma_path.norm() / length - 1.0)).exp().min(2.0);
         self.factor();
-    }
-
-    /// The distribution's middle.
-    pub fn mean(&self) -> Vec<f64> {
-        self.mean.iter().copied().collect()
     }
 
     /// Standard deviation along the widest axis.
@@ -137,8 +131,8 @@ mod tests {
             let costs: Vec<f64> = points.iter().map(|point| rosenbrock(point)).collect();
             search.tell(&points, &costs);
         }
-        let cost = rosenbrock(&search.mean());
-        assert!(cost < 1e-8, "{cost} at {:?}", search.mean());
+        let cost = rosenbrock(search.mean.as_slice());
+        assert!(cost < 1e-8, "{cost} at {:?}", search.mean);
         assert!(search.width() < 1e-3);
     }
 }

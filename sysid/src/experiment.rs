@@ -14,15 +14,8 @@ pub const FLOATING_WINDOW_S: f64 = 0.5;
 const HELD_HEIGHT: f32 = twinstep_model::HELD_HEIGHT as f32;
 
 /// Noise that is assumed of a channel whose noise nobody stated: of a quantity, its σ.
-const ASSUMED_NOISE: [(&str, f64); 7] = [
-    ("q", 0.002),
-    ("dq", 0.05),
-    ("tau_measured", 0.2),
-    ("pos", 0.005),
-    ("quat", 0.01),
-    ("vel", 0.05),
-    ("gyro", 0.02),
-];
+const ASSUMED_NOISE: [(&str, f64); 7] =
+    [("q", 0.002), ("dq", 0.05), ("tau_measured", 0.2), ("pos", 0.005), ("quat", 0.01), ("vel", 0.05), ("gyro", 0.02)];
 
 /// Why a log is no experiment.
 #[derive(Debug, thiserror::Error)]
@@ -108,7 +101,8 @@ impl Experiment {
                 first = end - 1;
             }
         }
-        let orientations = if floating { (0..log.rows()).map(|row| player.orientation(row)).collect() } else { Vec::new() };
+        let orientations =
+            if floating { (0..log.rows()).map(|row| player.orientation(row)).collect() } else { Vec::new() };
         Ok(Self { floating, windows, channels: channels(log, &joints, floating), orientations, joints })
     }
 
@@ -127,8 +121,15 @@ impl Experiment {
                 }
             }
         }
-        let measured = |rows: &Range<usize>| rows.clone().any(|row| keep(row));
-        self.windows.retain(|window| measured(&window.rows));
+        for window in &mut self.windows {
+            // What is not compared is not simulated: a window ends with its last row that counts.
+            let last = window.rows.clone().rev().find(|row| keep(*row)).unwrap_or(window.rows.start);
+            let count = last + 1 - window.rows.start;
+            window.rows.end = last + 1;
+            window.period.truncate(count);
+            window.commands.truncate(window.period[count - 1] + 1);
+        }
+        self.windows.retain(|window| window.rows.len() > 1);
         self
     }
 
@@ -142,7 +143,9 @@ impl Experiment {
             .map(|(robot, windows)| {
                 let mut residuals = Vec::new();
                 for (channel, window, states) in self.compared(windows) {
-                    self.compare(channel, window, states, robot, |_, difference| residuals.push(difference / channel.sigma));
+                    self.compare(channel, window, states, robot, |_, difference| {
+                        residuals.push(difference / channel.sigma)
+                    });
                 }
                 residuals
             })
@@ -369,8 +372,8 @@ impl Player<'_> {
     }
 
     fn orientation(&self, row: usize) -> DQuat {
-        let [w, x, y, z] =
-            ["w", "x", "y", "z"].map(|part| self.log.channel(&format!("quat_{part}")).map_or(f64::NAN, |cells| cells[row]));
+        let [w, x, y, z] = ["w", "x", "y", "z"]
+            .map(|part| self.log.channel(&format!("quat_{part}")).map_or(f64::NAN, |cells| cells[row]));
         let turn = DQuat::from_xyzw(x, y, z, w);
         if turn.is_finite() && turn.length() > 0.5 { turn.normalize() } else { DQuat::IDENTITY }
     }

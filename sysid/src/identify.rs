@@ -7,12 +7,14 @@ use crate::cmaes::CmaEs;
 use crate::experiment::Experiment;
 use crate::jacobian::{linear, residuals};
 use crate::refine::{cost, covariance, information, refine};
-use crate::unknown::{Unknown, set_intervals, start, unknowns, with_values};
+use crate::unknown::{Unknown, set_intervals, start, unknowns, with_values, without_untold};
 
 /// An unknown that keeps more than this share of its prior deviation is left at its prior: the log cannot tell.
 const TELLING: f64 = 0.7;
 /// Correlations of this size and above are named.
 const CORRELATED: f64 = 0.9;
+/// Generations in which the search has to get better by a hundredth.
+const PATIENCE: usize = 10;
 /// The normal distribution's two-sided 95 %.
 const TWO_SIDED_95: f64 = 1.96;
 
@@ -121,7 +123,8 @@ pub fn identify(
     let told = if options.force { vec![true; all.len()] } else { can_tell(&file, &all, experiments, simulator) };
     progress(Stage::Check, 1, rms(&first));
     // What the log cannot tell stays where it starts: at its neutral value where it has one.
-    let free: Vec<Unknown> = all.iter().zip(&told).filter(|(_, told)| **told).map(|(unknown, _)| unknown.clone()).collect();
+    let free: Vec<Unknown> =
+        all.iter().zip(&told).filter(|(_, told)| **told).map(|(unknown, _)| unknown.clone()).collect();
     let mut point: Vec<f64> = begin.iter().zip(&told).filter(|(_, told)| **told).map(|(value, _)| *value).collect();
     let mut interrupted = false;
     let mut scale = 1.0;
@@ -142,11 +145,13 @@ pub fn identify(
     let last = at(simulator, &free, &file, &point).unwrap_or_else(|| first.clone());
     let scale = (rms(&last) * rms(&last)).max(1.0);
     let blocks: Vec<usize> = blocks(experiments, options.rows_a_block);
-    let spread = linear(experiments, simulator, &file, &free, &point).and_then(|here| covariance(&here, &blocks, scale));
+    let spread =
+        linear(experiments, simulator, &file, &free, &point).and_then(|here| covariance(&here, &blocks, scale));
     let mut found = with_values(&file, &free, &point);
     let (findings, confusable) = judge(&all, &told, &free, &point, &begin, spread.as_ref());
     let intervals: Vec<_> = findings.iter().map(|finding| finding.interval).collect();
     set_intervals(&mut found, &all, &intervals);
+    without_untold(&mut found, &all, &told);
     Ok(Identification { model: found, findings, rms: [rms(&first), rms(&last)], confusable, interrupted })
 }
 
@@ -196,7 +201,7 @@ fn search(
         free.iter().zip(point).map(|(unknown, value)| (value - unknown.prior[0]) / unknown.prior[1]).collect()
     };
     let mut search = CmaEs::new(&scaled(&begin), 0.5);
-    let (mut best, mut lowest) = (begin, f64::INFINITY);
+    let (mut best, mut lowest, mut lows) = (begin, f64::INFINITY, Vec::new());
     for generation in 1..=options.generations {
         let asked = search.ask(&mut random);
         // A point beyond a bound is judged at the bound, and pays for the way.
@@ -228,7 +233,10 @@ fn search(
         if !progress(Stage::Search, generation, lowest) {
             return (best, true);
         }
-        if search.width() < 0.01 {
+        // Gauss-Newton is faster in a valley: the search has only to find it.
+        lows.push(lowest);
+        let before = lows.len().checked_sub(PATIENCE).map(|index| lows[index]);
+        if search.width() < 0.01 || before.is_some_and(|before| before - lowest < 0.01 * lowest) {
             break;
         }
     }

@@ -64,7 +64,8 @@ pub fn linear(
     let mut slopes = DMatrix::zeros(here.len(), unknowns.len());
     for (index, width) in widths.into_iter().enumerate() {
         let (below, above) = (all.next()??, all.next()??);
-        let slope = DVector::from_iterator(here.len(), above.iter().zip(&below).map(|(above, below)| (above - below) / width));
+        let slope =
+            DVector::from_iterator(here.len(), above.iter().zip(&below).map(|(above, below)| (above - below) / width));
         slopes.set_column(index, &slope);
     }
     Some(Linear { residuals: here, slopes })

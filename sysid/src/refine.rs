@@ -36,7 +36,8 @@ pub fn refine(
     for _ in 0..STEPS {
         let Some(here) = linear(experiments, simulator, file, unknowns, &point) else { break };
         let now = cost(here.residuals.as_slice(), unknowns, &point, scale);
-        let tries: Vec<_> = DAMPINGS.iter().filter_map(|damping| step(&here, unknowns, &point, scale, *damping)).collect();
+        let tries: Vec<_> =
+            DAMPINGS.iter().filter_map(|damping| step(&here, unknowns, &point, scale, *damping)).collect();
         let costs: Vec<f64> = residuals(experiments, simulator, file, unknowns, &tries)
             .iter()
             .zip(&tries)

@@ -44,7 +44,8 @@ pub fn torque_errors(log: &Log, robot: &RobotModel) -> Result<Option<[(f64, usiz
                     let ddq = (next[joint] - dq[joint]) / (t[index + 1] - t[index]);
                     mean[joint] += match sensor {
                         TauSensor::Output => {
-                            let friction = forces.viscous[joint] * dq[joint] + forces.dry[joint] * smooth_sign(dq[joint]);
+                            let friction =
+                                forces.viscous[joint] * dq[joint] + forces.dry[joint] * smooth_sign(dq[joint]);
                             forces.tau[joint] - friction - robot.joints[joint].armature * ddq
                         }
                         _ => drive.current()[joint],

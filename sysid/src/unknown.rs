@@ -62,9 +62,9 @@ pub fn unknowns(
             .parameters
             .iter()
             .flat_map(|parameter| {
-                let [low, high] = parameter.plausible;
-                let value = if parameter.neutral.is_finite() { parameter.neutral } else { high };
-                std::iter::repeat_n(if low < value { value } else { low + 0.1 * (high - low) }, parameter.count)
+                // Where there is none of it, or next to none.
+                let value = if parameter.neutral.is_finite() { parameter.neutral } else { parameter.bounds[1] };
+                std::iter::repeat_n(value, parameter.count)
             })
             .collect();
         let start = if effect.name == "inertia" { nominal_inertia(model, *scope)? } else { start };
@@ -131,6 +131,17 @@ pub fn candidate(file: &ModelFile, unknowns: &[Unknown], coordinates: &[f64]) ->
 pub fn start(file: &ModelFile, unknown: &Unknown) -> f64 {
     let (entry, value) = unknown.place;
     unknown.coordinate(file.effects[entry].values[value])
+}
+
+/// Takes entries out of the file of which nothing was found; `told` says of each unknown whether it was.
+pub fn without_untold(file: &mut ModelFile, unknowns: &[Unknown], told: &[bool]) {
+    let about = |index: usize| unknowns.iter().zip(told).filter(move |(unknown, _)| unknown.place.0 == index);
+    let mut index = 0;
+    file.effects.retain(|_| {
+        let untold = about(index).count() > 0 && about(index).all(|(_, told)| !told);
+        index += 1;
+        !untold
+    });
 }
 
 /// Writes intervals, low and high, beside the values of the unknowns.

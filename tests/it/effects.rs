@@ -87,6 +87,10 @@ fn every_effect_does_the_same_in_both_engines() {
         );
         // A joint rattles in its play, and small differences grow.
         let allowed = if effect.name == "backlash" { 1.0 } else { 0.15 };
-        assert!(apart < allowed * changed + 2.0 * ideal_apart, "`{}`: {apart} apart, it changes {changed}", effect.name);
+        assert!(
+            apart < allowed * changed + 2.0 * ideal_apart,
+            "`{}`: {apart} apart, it changes {changed}",
+            effect.name
+        );
     }
 }

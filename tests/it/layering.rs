@@ -20,12 +20,14 @@ const MAY_USE: [(&str, &[&str]); 11] = [
 ];
 
 /// A library that stands behind one wall, and the crates inside it.
-const WALLS: [(&str, &[&str]); 5] = [
+const WALLS: [(&str, &[&str]); 7] = [
     ("rapier3d", &["sim"]),
     ("zenoh", &["env-server", "clients/rust", "tests"]),
     ("clap", &["cli", "tests"]),
     ("plotters", &["cli"]),
     ("parquet", &["logs"]),
+    ("mcap", &["logs"]),
+    ("nalgebra", &["sysid"]),
 ];
 
 fn root() -> PathBuf {

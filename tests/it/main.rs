@@ -6,6 +6,7 @@ mod batch;
 mod effects;
 mod exactly_once;
 mod faults;
+mod identify;
 mod layering;
 mod leases;
 mod log;

@@ -1,0 +1,78 @@
+//! `twinstep effects`: what the catalogue knows.
+
+use twinstep_model::effects::{CATALOGUE, Composition, Effect, Target};
+
+use crate::exit::{Outcome, input};
+
+/// Explain what real robots do and ideal ones do not.
+///
+/// Without a name: the catalogue, in the order in which effects act from command to motion. With a name: the effect's law,
+/// its parameters with what is plausible for a Go2, what it looks like in a log, what it is taken for, and the experiment
+/// that tells them apart.
+///
+/// Example: `twinstep effects coulomb_friction`
+#[derive(clap::Args)]
+pub struct Args {
+    /// The effect.
+    name: Option<String>,
+}
+
+/// The catalogue has no such effect.
+#[derive(Debug, thiserror::Error)]
+#[error("`{0}` is not in the catalogue; possible: {}", CATALOGUE.map(|effect| effect.name).join(", "))]
+struct Unknown(String);
+
+/// Prints.
+pub fn run(args: &Args) -> Outcome {
+    match &args.name {
+        None => {
+            for effect in CATALOGUE {
+                println!("{:<20}  {:<18}  {}", effect.name, effect.place, effect.what);
+            }
+            println!("\n`twinstep effects NAME` explains one.");
+        }
+        Some(name) => print!("{}", text(Effect::named(name).ok_or_else(|| input(Unknown(name.clone())))?)),
+    }
+    Ok(())
+}
+
+/// The page of an effect.
+fn text(effect: &Effect) -> String {
+    let mut lines = vec![format!("{}: {}", effect.name, effect.what), String::new()];
+    lines.push(format!("  law        {}", effect.equation));
+    lines.push(format!("  acts at    {}", effect.place));
+    let scopes = match effect.target {
+        Target::Joints => "all, hip, thigh, calf, FL, FR, RL, RR, left, right, or a joint such as FL_hip",
+        Target::Supply => "all",
+        Target::Bodies => "base, or a joint for the link behind it",
+        Target::Base => "base",
+        Target::Ground => "ground",
+    };
+    lines.push(format!("  scopes     {scopes}"));
+    let composition = match effect.composition {
+        Composition::Add => "entries that overlap add up",
+        Composition::Multiply => "entries that overlap multiply",
+        Composition::Replace => "the entry with the narrowest scope counts, of equal ones the last",
+    };
+    lines.push(format!("  compose    {composition}"));
+    lines.push(format!("  in data    {}", effect.signature));
+    lines.push("\nparameters".to_owned());
+    for parameter in effect.parameters {
+        let vector = if parameter.count > 1 { format!("[{}]", parameter.count) } else { String::new() };
+        let [low, high] = parameter.plausible;
+        let [least, most] = parameter.bounds;
+        lines.push(format!(
+            "  {}{vector}  plausible {low} to {high} {}, allowed {least} to {most}; {} changes nothing",
+            parameter.name, parameter.unit, parameter.neutral
+        ));
+        lines.push(format!("      source: {}", parameter.source));
+    }
+    if !effect.confusions.is_empty() {
+        lines.push("\ntaken for".to_owned());
+        for confusion in effect.confusions {
+            lines.push(format!("  {:<20}  {}", confusion.with, confusion.experiment));
+        }
+    }
+    lines.push(String::new());
+    lines.join("\n")
+}

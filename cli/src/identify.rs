@@ -1,0 +1,169 @@
+//! `twinstep identify`: numbers for a model from measured logs.
+
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use indicatif::{ProgressBar, ProgressStyle};
+use twinstep_logs::Log;
+use twinstep_model::ModelFile;
+use twinstep_model::effects::{CATALOGUE, Effect, Scope, UnknownScope};
+use twinstep_sysid::{Experiment, Identification, Options, Stage, Verdict, evaluate, identify};
+
+use crate::evaluate::{Rows, simulator};
+use crate::exit::{Failure, Outcome, Signals, input, other};
+
+/// What is sought without `--effects`: what a real Go2 in the air has shown most of.
+const DEFAULT_EFFECTS: &str = "armature@hip,armature@thigh,armature@calf,coulomb_friction@hip,coulomb_friction@thigh,\
+                               coulomb_friction@calf,viscous_friction@hip,viscous_friction@thigh,viscous_friction@calf,\
+                               command_delay@all";
+
+/// Find the numbers of effects from measured logs (SPI: sampling-based parameter identification).
+///
+/// Simulations of the log's commands, thousands of candidates in the lanes of the batch engine, are compared with what was
+/// measured, each channel in units of its noise: CMA-ES finds the valley, Gauss-Newton its bottom. Every number comes with
+/// a 95 % interval. First it is predicted what this log can tell; what it cannot is left where it is and said, unless
+/// --force is given. Numbers that cannot be told apart are named, with the experiment that would.
+///
+/// The model that is written loads in `twinstep serve --model` and `twinstep evaluate --model`. Ctrl-C ends the search and
+/// writes the best so far.
+///
+/// Example: `twinstep identify data/go2_air_chirp --until 10 --out fitted.toml`
+#[derive(clap::Args)]
+pub struct Args {
+    /// The logs: data files, or folders that hold one. All with the base held, or all with it free.
+    #[arg(required = true)]
+    logs: Vec<PathBuf>,
+    /// The model to start from; the ideal Go2 without.
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// What to seek: effects with scopes, as in `coulomb_friction@calf,payload@base`; `twinstep effects` lists them.
+    #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = DEFAULT_EFFECTS, hide_default_value = true)]
+    effects: Vec<Sought>,
+    #[command(flatten)]
+    rows: Rows,
+    /// Seek also what the log cannot tell.
+    #[arg(long)]
+    force: bool,
+    /// Most generations of the search.
+    #[arg(long, value_name = "N", default_value_t = Options::default().generations)]
+    generations: usize,
+    /// Seed of the search.
+    #[arg(long, default_value_t = Options::default().seed)]
+    seed: u64,
+    /// The model file to write.
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+}
+
+/// An effect with its scope, as in `coulomb_friction@calf`.
+#[derive(Clone, Debug)]
+struct Sought(&'static Effect, Scope);
+
+/// Not an effect with its scope.
+#[derive(Debug, thiserror::Error)]
+enum SoughtError {
+    #[error("`{0}` has no scope: write it as in coulomb_friction@calf")]
+    NoScope(String),
+    #[error("`{0}` is not in the catalogue; possible: {}", CATALOGUE.map(|effect| effect.name).join(", "))]
+    NoEffect(String),
+    #[error(transparent)]
+    Scope(#[from] UnknownScope),
+}
+
+impl FromStr for Sought {
+    type Err = SoughtError;
+
+    fn from_str(text: &str) -> Result<Self, SoughtError> {
+        let (name, scope) = text.trim().split_once('@').ok_or_else(|| SoughtError::NoScope(text.to_owned()))?;
+        let effect = Effect::named(name).ok_or_else(|| SoughtError::NoEffect(name.to_owned()))?;
+        Ok(Sought(effect, scope.parse()?))
+    }
+}
+
+/// The file cannot be written.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot write {}: {source}", path.display())]
+struct Unwritable {
+    path: PathBuf,
+    source: std::io::Error,
+}
+
+/// Identifies, prints and writes.
+pub fn run(args: &Args) -> Outcome {
+    let model = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load).map_err(input)?;
+    let robot = model.robot_model().map_err(input)?;
+    let (mut experiments, mut logs) = (Vec::new(), Vec::new());
+    for path in &args.logs {
+        let log = Log::open(path).map_err(input)?;
+        let rows = args.rows.of(&log)?;
+        experiments.push(Experiment::new(&log, &robot).map_err(input)?.only(|row| rows[row]));
+        logs.push((path, log, rows));
+    }
+    let signals = Signals::listen()?;
+    let mut simulator = simulator(&logs[0].1, &robot)?;
+    let effects: Vec<_> = args.effects.iter().map(|Sought(effect, scope)| (*effect, *scope)).collect();
+    let options = Options { generations: args.generations, seed: args.seed, force: args.force, ..Options::default() };
+    let bar = progress_bar(args.generations);
+    let found = identify(&model, &effects, &experiments, &mut simulator, &options, &mut |stage, step, cost| {
+        bar.set_message(match stage {
+            Stage::Check => "what the log can tell".to_owned(),
+            Stage::Search => format!("search, cost {cost:.4e}"),
+            Stage::Refine => format!("refine {step}, cost {cost:.4e}"),
+        });
+        if stage == Stage::Search {
+            bar.set_position(step as u64);
+        }
+        matches!(signals.check(), Ok(()))
+    });
+    bar.finish_and_clear();
+    let found = found.map_err(input)?;
+    std::fs::write(&args.out, found.model.to_toml())
+        .map_err(|source| other(Unwritable { path: args.out.clone(), source }))?;
+    print!("{}", text(&found));
+    let fitted = found.model.robot_model().map_err(other)?;
+    for (path, log, rows) in &logs {
+        let mut error = |robot| evaluate(log, robot, &mut simulator, |row| rows[row]).map(|found| found.q_rmse_rad);
+        if let (Some(before), Some(after)) = (error(&robot).map_err(input)?, error(&fitted).map_err(input)?) {
+            println!(
+                "{}: closed-loop joint RMSE {before:.4} -> {after:.4} rad on the rows it was fitted to",
+                path.display()
+            );
+        }
+    }
+    println!("written to {}; judge it on rows it has not seen: twinstep evaluate --model", args.out.display());
+    if found.interrupted { Err(Failure::Interrupted) } else { Ok(()) }
+}
+
+fn progress_bar(generations: usize) -> ProgressBar {
+    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} generations, {per_sec}, ETA {eta}  {msg}");
+    ProgressBar::new(generations as u64).with_style(style.expect("a template"))
+}
+
+/// A line an unknown, and what cannot be told apart.
+fn text(found: &Identification) -> String {
+    let mut text = format!("{:<44}  {:>10}  95 % interval\n", "", "value");
+    for finding in &found.findings {
+        let interval = finding.interval.map_or(String::new(), |[low, high]| format!("{low:.4} to {high:.4}"));
+        let remark = match finding.verdict {
+            Verdict::Found => "",
+            Verdict::AtBound => "at its bound: the truth may lie beyond",
+            Verdict::CannotTell => "this log cannot tell: left as it was",
+        };
+        let line = format!(
+            "{:<44}  {:>10.4}  {interval:<22} {} {remark}",
+            finding.unknown.name(),
+            finding.value,
+            finding.unknown.unit
+        );
+        text += line.trim_end();
+        text += "\n";
+    }
+    for (one, other, correlation, experiment) in &found.confusable {
+        text += &format!("cannot be told apart: {one} and {other} (correlation {correlation:.2})\n");
+        if let Some(experiment) = experiment {
+            text += &format!("    what would: {experiment}\n");
+        }
+    }
+    text += &format!("residuals: {:.2} -> {:.2} times the noise (RMS)\n", found.rms[0], found.rms[1]);
+    text
+}

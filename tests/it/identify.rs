@@ -1,0 +1,202 @@
+//! Identification: what was put into a plant is found again, and the real recording through the real process.
+
+use std::collections::BTreeMap;
+use std::process::Command as Process;
+
+use rand::RngExt;
+use twinstep_logs::{Base as LoggedBase, Gain, Log, Meta, Segment, TauSensor};
+use twinstep_model::effects::{Effect, Entry, Scope, compose};
+use twinstep_model::{Backend, Command, HELD_HEIGHT, JOINT_NAMES, ModelFile, Placement, RobotModel, go2, stream};
+use twinstep_sim::{Base, BatchRollout, Engine, RapierBackend, SimConfig};
+use twinstep_sysid::{Experiment, Options, Verdict, evaluate, identify};
+use twinstep_tests::python::{Programs, root};
+
+/// What is sought, and the truth.
+const HIDDEN: [(&str, &str, f64); 5] = [
+    ("coulomb_friction", "calf", 0.8),
+    ("coulomb_friction", "hip", 0.25),
+    ("viscous_friction", "thigh", 0.2),
+    ("armature", "calf", 0.015),
+    ("command_delay", "all", 0.007),
+];
+
+fn named(name: &str) -> &'static Effect {
+    Effect::named(name).unwrap()
+}
+
+fn scope(text: &str) -> Scope {
+    text.parse().unwrap()
+}
+
+fn plant() -> RobotModel {
+    let entries: Vec<_> = HIDDEN
+        .iter()
+        .map(|(name, place, value)| Entry::new(named(name), scope(place), vec![*value]).unwrap())
+        .collect();
+    compose(&go2(), &entries).unwrap()
+}
+
+/// Eight seconds of chirps in the air, measured by encoders with noise, from the other engine at a finer step.
+fn log_of(robot: &RobotModel) -> Log {
+    let config = SimConfig {
+        engine: Engine::Rapier,
+        base: Base::Fixed,
+        physics_hz: Some(2000),
+        threads: 1,
+        ..SimConfig::default()
+    };
+    let mut backend = RapierBackend::new(robot.clone(), config, 1).unwrap();
+    let pose = go2().control.default_pose_f32();
+    backend.reset(&[(0, Placement::at_rest(HELD_HEIGHT as f32, pose))]).unwrap();
+    let mut columns = BTreeMap::<String, Vec<f64>>::new();
+    let mut random = stream(5, "noise", 0);
+    for row in 0..1600 {
+        let t = f64::from(row) * 0.005;
+        let phase = std::f64::consts::TAU * (0.4 + 0.15 * t) * t;
+        let mut command = Command::hold(pose, 25.0, 0.6);
+        columns.entry("t".to_owned()).or_default().push(t);
+        for (joint, name) in JOINT_NAMES.iter().enumerate() {
+            command.q[joint] += (0.3 * (phase + joint as f64).sin()) as f32;
+            let noise = 0.002 * (random.random::<f64>() + random.random::<f64>() + random.random::<f64>() - 1.5);
+            // The encoder's steps.
+            let measured = ((f64::from(backend.states().q[0][joint]) + noise) / 0.0005).round() * 0.0005;
+            columns.entry(format!("q_{name}")).or_default().push(measured);
+            columns.entry(format!("dq_{name}")).or_default().push(f64::from(backend.states().dq[0][joint]));
+            columns.entry(format!("q_cmd_{name}")).or_default().push(f64::from(command.q[joint]));
+        }
+        backend.step(&[command], &[true], 1).unwrap();
+    }
+    let segments = vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }];
+    let mut meta = Meta::new(200.0, TauSensor::None, segments);
+    (meta.kp, meta.kd) = (Some(Gain::Same(25.0)), Some(Gain::Same(0.6)));
+    meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
+    Log::new(meta, columns).unwrap()
+}
+
+fn simulator() -> BatchRollout {
+    BatchRollout::new(&go2(), &SimConfig { base: Base::Fixed, ..SimConfig::default() }).unwrap()
+}
+
+#[test]
+fn hidden_effects_are_found_with_intervals_that_hold_them() {
+    let log = log_of(&plant());
+    let experiment = Experiment::new(&log, &go2()).unwrap();
+    let effects: Vec<_> = HIDDEN.iter().map(|(name, place, _)| (named(name), scope(place))).collect();
+    let found = identify(
+        &ModelFile::default(),
+        &effects,
+        &[experiment],
+        &mut simulator(),
+        &Options::default(),
+        &mut |_, _, _| true,
+    )
+    .unwrap();
+    for (finding, (name, _, truth)) in found.findings.iter().zip(HIDDEN) {
+        println!("{name}: {} {:?}, truth {truth}", finding.value, finding.interval);
+        assert_eq!(finding.verdict, Verdict::Found);
+        let tolerance = if name == "command_delay" { 0.0005 } else { 0.1 * truth };
+        assert!((finding.value - truth).abs() < tolerance, "{name}: {} instead of {truth}", finding.value);
+        let [low, high] = finding.interval.unwrap();
+        assert!(low < finding.value && finding.value < high && high - low < truth, "{name}: {low} to {high}");
+    }
+    let before = evaluate(&log, &go2(), &mut simulator(), |_| true).unwrap().q_rmse_rad.unwrap();
+    let fitted = found.model.robot_model().unwrap();
+    let after = evaluate(&log, &fitted, &mut simulator(), |_| true).unwrap().q_rmse_rad.unwrap();
+    assert!(after < 0.1 * before, "{before} -> {after} rad");
+    assert_eq!(ModelFile::parse(&found.model.to_toml(), "fitted").unwrap(), found.model);
+}
+
+#[test]
+fn what_a_log_cannot_tell_is_left_and_said() {
+    // A held trunk: neither a payload on it nor the ground show.
+    let log = log_of(&go2());
+    let experiment = Experiment::new(&log, &go2()).unwrap();
+    let effects = [(named("payload"), scope("base")), (named("ground_friction"), scope("ground"))];
+    let found = identify(
+        &ModelFile::default(),
+        &effects,
+        &[experiment],
+        &mut simulator(),
+        &Options::default(),
+        &mut |_, _, _| true,
+    )
+    .unwrap();
+    assert!(found.findings.iter().all(|finding| finding.verdict == Verdict::CannotTell));
+    assert_eq!(found.model, ModelFile::default());
+}
+
+#[test]
+fn search_that_is_ended_keeps_the_best_so_far() {
+    let log = log_of(&plant());
+    let experiment = Experiment::new(&log, &go2()).unwrap();
+    let effects = [(named("coulomb_friction"), scope("calf"))];
+    let found = identify(
+        &ModelFile::default(),
+        &effects,
+        &[experiment],
+        &mut simulator(),
+        &Options::default(),
+        &mut |_, step, _| step < 2,
+    )
+    .unwrap();
+    assert!(found.interrupted);
+    assert!(found.rms[1] < found.rms[0], "{:?}", found.rms);
+}
+
+fn twinstep(arguments: &[&str]) -> std::process::Output {
+    let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
+    Process::new(programs.0.join("twinstep")).args(arguments).current_dir(root()).output().unwrap()
+}
+
+fn q_rmse(arguments: &[&str]) -> f64 {
+    let output = twinstep(&[&["evaluate", "--json", "data/go2_air_chirp"], arguments].concat());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let evaluation: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(evaluation["torque_rmse_nm"].is_null(), "this log has no torque");
+    evaluation["q_rmse_rad"].as_f64().unwrap()
+}
+
+/// Fitted to the first ten seconds, judged on the last six: the split was chosen before the first fit.
+#[test]
+fn real_go2_is_followed_far_better_after_identification() {
+    let folder = tempfile::tempdir().unwrap();
+    let fitted = folder.path().join("fitted.toml");
+    let fitted = fitted.to_str().unwrap();
+    let output = twinstep(&["identify", "data/go2_air_chirp", "--until", "10", "--out", fitted]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    println!("{}", String::from_utf8_lossy(&output.stdout));
+    let (ideal, after) = (q_rmse(&["--from", "10"]), q_rmse(&["--from", "10", "--model", fitted]));
+    println!("unseen rows: {ideal} -> {after} rad");
+    assert!(after < 0.35 * ideal, "{ideal} -> {after} rad on rows that it has not seen");
+}
+
+#[test]
+fn mistakes_on_the_command_line_are_named() {
+    for (effects, wanted) in [
+        ("coulomb_friction", "has no scope"),
+        ("friction@calf", "not in the catalogue"),
+        ("coulomb_friction@knee", "is no scope"),
+        ("payload@all", "cannot have scope"),
+    ] {
+        let output = twinstep(&["identify", "data/go2_air_chirp", "--effects", effects, "--out", "/dev/null"]);
+        assert_eq!(output.status.code(), Some(2));
+        assert!(output.stdout.is_empty());
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert!(told.contains(wanted), "{told}");
+    }
+    let output = twinstep(&["evaluate", "data/go2_air_chirp", "--from", "100"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("leave no row"));
+    let output = twinstep(&["effects", "friction"]);
+    assert_eq!(output.status.code(), Some(2));
+}
+
+#[test]
+fn catalogue_explains_every_effect() {
+    let list = String::from_utf8(twinstep(&["effects"]).stdout).unwrap();
+    for effect in twinstep_model::effects::CATALOGUE {
+        assert!(list.contains(effect.name));
+        let page = String::from_utf8(twinstep(&["effects", effect.name]).stdout).unwrap();
+        assert!(page.contains(effect.equation) && page.contains(effect.parameters[0].name), "{page}");
+    }
+}
