@@ -1,52 +1,50 @@
-//! Rollouts in the batch engine: every candidate has a lane.
+//! Rollouts in the batch engine: every candidate has a lane, and a register of candidates goes its whole way on one thread.
 
+use rayon::prelude::*;
 use twinstep_model::lanes::Instructions;
-use twinstep_model::{Ground, Job, Placement, RobotModel, RobotStates, Rollout};
+use twinstep_model::{Command, Ground, Job, Placement, RobotModel, RobotStates, Rollout};
 
-use crate::batch::{Inputs, Lanes, Robots, Time, lane_robots};
+use crate::batch::{Inputs, Lanes, Time, lane_robots};
 use crate::{BuildError, SimConfig};
 
-/// Most candidates that are stepped together: enough for all cores, few enough for their caches.
-const TOGETHER: usize = 512;
+/// Candidates that are stepped together: the widest register.
+const TOGETHER: usize = 16;
 
-/// Candidates in the lanes of the batch engine.
+/// Candidates in the lanes of the batch engine, on flat ground.
 pub struct BatchRollout {
-    robots: Box<dyn Robots>,
-    pool: Option<rayon::ThreadPool>,
-    steps: usize,
+    robot: RobotModel,
+    config: SimConfig,
+    pool: rayon::ThreadPool,
 }
 
 impl BatchRollout {
-    /// Rollouts on flat ground, at the rate, base and threads of `config`, for robots with the drive's rate of `robot`.
+    /// At the rate, base and threads of `config`, for candidates with the drive's rate of `robot`.
     pub fn new(robot: &RobotModel, config: &SimConfig) -> Result<Self, BuildError> {
         config.check(&robot.control)?;
-        let pool = if config.threads == 1 { None } else { Some(crate::rapier::thread_pool(config.threads)?) };
-        let (start, lanes) =
-            (Placement::at_rest(1.0, robot.control.default_pose_f32()), Lanes::Single(Instructions::best()));
-        let robots = lane_robots(lanes, robot, config, &Ground::FLAT, &start, TOGETHER);
-        Ok(Self { robots, pool, steps: config.steps_per_drive_period(&robot.control) })
+        let pool = crate::rapier::thread_pool(config.threads)?;
+        Ok(Self { robot: robot.clone(), config: *config, pool })
     }
 
-    fn play_together(&mut self, jobs: &[Job]) -> Vec<RobotStates> {
-        let mut now = RobotStates::new(TOGETHER);
+    fn play_together(&self, jobs: &[Job]) -> Vec<RobotStates> {
+        let start = Placement::at_rest(1.0, self.robot.control.default_pose_f32());
+        let lanes = Lanes::Single(Instructions::best());
+        let mut robots = lane_robots(lanes, &self.robot, &self.config, &Ground::FLAT, &start, jobs.len());
+        let mut now = RobotStates::new(jobs.len());
         let mut records: Vec<_> = jobs.iter().map(|job| RobotStates::new(job.commands.len() + 1)).collect();
         for (robot, job) in jobs.iter().enumerate() {
-            self.robots.place(robot, job.robot, &job.start);
-            self.robots.read(robot, &mut now);
+            robots.place(robot, job.robot, &job.start);
+            robots.read(robot, &mut now);
             records[robot].copy_robot(0, &now, robot);
         }
         let longest = jobs.iter().map(|job| job.commands.len()).max().unwrap_or(0);
-        let hold = twinstep_model::Command::hold([0.0; 12], 0.0, 0.0);
-        let (mut commands, mut active) = (vec![hold; TOGETHER], vec![false; TOGETHER]);
+        let mut commands = vec![Command::hold([0.0; 12], 0.0, 0.0); jobs.len()];
+        let time = Time { drive_periods: 1, steps: self.config.steps_per_drive_period(&self.robot.control) };
         for period in 0..longest {
-            for (robot, job) in jobs.iter().enumerate() {
-                active[robot] = period < job.commands.len();
-                if active[robot] {
-                    commands[robot] = job.commands[period];
-                }
+            let active: Vec<bool> = jobs.iter().map(|job| period < job.commands.len()).collect();
+            for (command, job) in commands.iter_mut().zip(jobs) {
+                *command = job.commands.get(period).copied().unwrap_or(*command);
             }
-            let time = Time { drive_periods: 1, steps: self.steps };
-            self.robots.advance(self.pool.as_ref(), Inputs::Commands(&commands), &active, time, &mut now);
+            robots.advance(None, Inputs::Commands(&commands), &active, time, &mut now);
             for (robot, record) in records.iter_mut().enumerate().filter(|(robot, _)| active[*robot]) {
                 record.copy_robot(period + 1, &now, robot);
             }
@@ -57,6 +55,7 @@ impl BatchRollout {
 
 impl Rollout for BatchRollout {
     fn play(&mut self, jobs: &[Job]) -> Vec<RobotStates> {
-        jobs.chunks(TOGETHER).flat_map(|jobs| self.play_together(jobs)).collect()
+        let this = &*self;
+        self.pool.install(|| jobs.par_chunks(TOGETHER).flat_map_iter(|jobs| this.play_together(jobs)).collect())
     }
 }

@@ -26,7 +26,8 @@ use crate::rapier::BuildError;
 use crate::{SimConfig, SimConfigError};
 use group::LaneSnapshot;
 pub(crate) use group::Time;
-pub(crate) use lanes::{Inputs, Robots, robots as lane_robots};
+use lanes::Robots;
+pub(crate) use lanes::{Inputs, robots as lane_robots};
 
 /// Many Go2 in SIMD lanes.
 pub struct BatchBackend {
