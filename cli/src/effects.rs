@@ -19,8 +19,15 @@ pub struct Args {
 
 /// The catalogue has no such effect.
 #[derive(Debug, thiserror::Error)]
-#[error("`{0}` is not in the catalogue; possible: {}", CATALOGUE.map(|effect| effect.name).join(", "))]
-struct Unknown(String);
+#[error("`{name}` is not in the catalogue; possible: {}", CATALOGUE.map(|effect| effect.name).join(", "))]
+pub struct UnknownEffect {
+    name: String,
+}
+
+/// The effect of this name.
+pub fn named(name: &str) -> Result<&'static Effect, UnknownEffect> {
+    Effect::named(name).ok_or_else(|| UnknownEffect { name: name.to_owned() })
+}
 
 /// Prints.
 pub fn run(args: &Args) -> Outcome {
@@ -31,7 +38,7 @@ pub fn run(args: &Args) -> Outcome {
             }
             println!("\n`twinstep effects NAME` explains one.");
         }
-        Some(name) => print!("{}", text(Effect::named(name).ok_or_else(|| input(Unknown(name.clone())))?)),
+        Some(name) => print!("{}", text(named(name).map_err(input)?)),
     }
     Ok(())
 }

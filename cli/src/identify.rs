@@ -6,9 +6,10 @@ use std::str::FromStr;
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_logs::Log;
 use twinstep_model::ModelFile;
-use twinstep_model::effects::{CATALOGUE, Effect, Scope, UnknownScope};
+use twinstep_model::effects::{Effect, Scope, UnknownScope};
 use twinstep_sysid::{Experiment, Identification, Options, Stage, Verdict, evaluate, identify};
 
+use crate::effects::{UnknownEffect, named};
 use crate::evaluate::{Rows, simulator};
 use crate::exit::{Failure, Outcome, Signals, input, other};
 
@@ -64,8 +65,8 @@ struct Sought(&'static Effect, Scope);
 enum SoughtError {
     #[error("`{0}` has no scope: write it as in coulomb_friction@calf")]
     NoScope(String),
-    #[error("`{0}` is not in the catalogue; possible: {}", CATALOGUE.map(|effect| effect.name).join(", "))]
-    NoEffect(String),
+    #[error(transparent)]
+    NoEffect(#[from] UnknownEffect),
     #[error(transparent)]
     Scope(#[from] UnknownScope),
 }
@@ -75,8 +76,7 @@ impl FromStr for Sought {
 
     fn from_str(text: &str) -> Result<Self, SoughtError> {
         let (name, scope) = text.trim().split_once('@').ok_or_else(|| SoughtError::NoScope(text.to_owned()))?;
-        let effect = Effect::named(name).ok_or_else(|| SoughtError::NoEffect(name.to_owned()))?;
-        Ok(Sought(effect, scope.parse()?))
+        Ok(Sought(named(name)?, scope.parse::<Scope>()?))
     }
 }
 
@@ -113,7 +113,7 @@ pub fn run(args: &Args) -> Outcome {
         if stage == Stage::Search {
             bar.set_position(step as u64);
         }
-        matches!(signals.check(), Ok(()))
+        !signals.check().unwrap_or(true)
     });
     bar.finish_and_clear();
     let found = found.map_err(input)?;
@@ -141,7 +141,7 @@ fn progress_bar(generations: usize) -> ProgressBar {
 
 /// A line an unknown, and what cannot be told apart.
 fn text(found: &Identification) -> String {
-    let mut text = format!("{:<44}  {:>10}  95 % interval\n", "", "value");
+    let mut lines = vec![format!("{:<44}  {:>10}  95 % interval", "", "value")];
     for finding in &found.findings {
         let interval = finding.interval.map_or(String::new(), |[low, high]| format!("{low:.4} to {high:.4}"));
         let remark = match finding.verdict {
@@ -149,21 +149,14 @@ fn text(found: &Identification) -> String {
             Verdict::AtBound => "at its bound: the truth may lie beyond",
             Verdict::CannotTell => "this log cannot tell: left as it was",
         };
-        let line = format!(
-            "{:<44}  {:>10.4}  {interval:<22} {} {remark}",
-            finding.unknown.name(),
-            finding.value,
-            finding.unknown.unit
-        );
-        text += line.trim_end();
-        text += "\n";
+        let (name, value) = (finding.unknown.name(), finding.value);
+        let line = format!("{name:<44}  {value:>10.4}  {interval:<22} {} {remark}", finding.unknown.unit);
+        lines.push(line.trim_end().to_owned());
     }
     for (one, other, correlation, experiment) in &found.confusable {
-        text += &format!("cannot be told apart: {one} and {other} (correlation {correlation:.2})\n");
-        if let Some(experiment) = experiment {
-            text += &format!("    what would: {experiment}\n");
-        }
+        lines.push(format!("cannot be told apart: {one} and {other} (correlation {correlation:.2})"));
+        lines.extend(experiment.map(|experiment| format!("    what would: {experiment}")));
     }
-    text += &format!("residuals: {:.2} -> {:.2} times the noise (RMS)\n", found.rms[0], found.rms[1]);
-    text
+    lines.push(format!("residuals: {:.2} -> {:.2} times the noise (RMS)\n", found.rms[0], found.rms[1]));
+    lines.join("\n")
 }

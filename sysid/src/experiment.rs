@@ -144,7 +144,7 @@ impl Experiment {
                 let mut residuals = Vec::new();
                 for (channel, window, states) in self.compared(windows) {
                     self.compare(channel, window, states, robot, |_, difference| {
-                        residuals.push(difference / channel.sigma)
+                        residuals.push(difference / channel.sigma);
                     });
                 }
                 residuals

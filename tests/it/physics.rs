@@ -11,6 +11,8 @@ use twinstep_sim::{Base, SimConfig, Terrain};
 use super::{ENGINE, Simulator};
 
 const GRAVITY: f32 = 9.81;
+/// Step of the reference integration [s].
+const DT: f64 = 1e-5;
 /// The joint `FL_calf`.
 const CALF: usize = 2;
 
@@ -248,7 +250,6 @@ fn engine_accelerates_as_the_equations_of_motion_say() {
         dq: placement.dq.map(f64::from),
         ..State::origin()
     };
-    const DT: f64 = 1e-5;
     for _ in 0..500 {
         let Acceleration { angular, linear, ddq } =
             forward_dynamics(&tree, &state, &command.tau_ff.map(f64::from), f64::from(GRAVITY));
@@ -259,9 +260,9 @@ fn engine_accelerates_as_the_equations_of_motion_say() {
         state.angular_velocity = state.angular_velocity + angular.scaled(DT);
         let turned = rotation * glam::DQuat::from_scaled_axis(DVec3::from(state.angular_velocity.0) * DT);
         state.orientation = [turned.w, turned.x, turned.y, turned.z];
-        for joint in 0..NUM_JOINTS {
-            state.dq[joint] += DT * ddq[joint];
-            state.q[joint] += DT * state.dq[joint];
+        for ((q, dq), ddq) in state.q.iter_mut().zip(&mut state.dq).zip(ddq) {
+            *dq += DT * ddq;
+            *q += DT * *dq;
         }
     }
     let states = backend.states();

@@ -33,7 +33,7 @@ pub const EFFECT: Effect = Effect {
             unit: "rad",
             count: 1,
             bounds: [-6.3, 6.3],
-            plausible: [-3.1416, 3.1416],
+            plausible: [-3.0, 3.0],
             neutral: 0.0,
             source: "where the magnets are",
         },

@@ -52,6 +52,7 @@ impl<T: Lane> Commands<T> {
 
 /// Which effects any robot of the lanes has.
 #[derive(Clone, Copy, Debug, Default)]
+#[allow(clippy::struct_excessive_bools, reason = "each of them stands for itself")]
 struct Uses {
     command_delay: bool,
     saturation: bool,
