@@ -61,6 +61,7 @@ fn entry(effect: &'static Effect) -> Entry {
         "torque_speed_limit" => vec![6.0],
         "ground_friction" => vec![0.05],
         "joint_elasticity" => vec![250.0],
+        "gyro_bias" => vec![0.3, -0.2, 0.1],
         _ => values.collect(),
     };
     Entry::new(effect, scope, values).unwrap()

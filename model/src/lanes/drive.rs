@@ -233,6 +233,14 @@ impl<T: Lane> Drive<T> {
         &self.memory.current
     }
 
+    /// As [`Drive::seen`], of one robot: for code that is not compiled for the lanes' instructions.
+    pub fn seen_by(&self, lane: usize, joint: usize, q: &T, dq: &T) -> (f64, f64) {
+        let (n, [angle, speed]) = (&self.numbers[joint], &self.memory.rotor);
+        let elastic = n.gear.get(lane) > 0.0;
+        let (q, dq) = if elastic { (&angle[joint], &speed[joint]) } else { (q, dq) };
+        (q.get(lane) + n.encoder_offset.get(lane), dq.get(lane))
+    }
+
     /// The loop closes: commands and sampled state become the torque of the coming drive period.
     #[inline(always)]
     pub fn tick(&mut self, commands: &Commands<T>, q: &[T; 12], dq: &[T; 12]) {

@@ -56,6 +56,19 @@ impl<T: Lane> Input<T> {
     }
 }
 
+/// Room for the equations of one step: large, so that one serves many groups and steps.
+pub struct Scratch<T> {
+    factored: Factored<T>,
+    constraints: Constraints<T>,
+}
+
+impl<T: Lane> Scratch<T> {
+    /// Room, with nothing in it.
+    pub fn empty() -> Self {
+        Self { factored: Factored::empty(), constraints: Constraints::empty() }
+    }
+}
+
 /// One robot of a group: its lane of every number.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LaneSnapshot(Vec<f64>);
@@ -119,8 +132,7 @@ impl<T: Lane> Group<T> {
 
     /// Advances all robots.
     #[inline(always)]
-    pub fn advance(&mut self, input: &Input<T>, Time { drive_periods, steps }: Time) {
-        let (mut factored, mut constraints) = (Factored::empty(), Constraints::empty());
+    pub fn advance(&mut self, input: &Input<T>, Time { drive_periods, steps }: Time, scratch: &mut Scratch<T>) {
         let share = T::splat(1.0 / steps as f64);
         for _ in 0..drive_periods {
             match input {
@@ -129,7 +141,7 @@ impl<T: Lane> Group<T> {
             }
             self.tau = [T::splat(0.0); 12];
             for index in 0..steps {
-                self.step(index, &mut factored, &mut constraints);
+                self.step(index, scratch);
                 for joint in 0..12 {
                     self.tau[joint] += self.drive.current()[joint] * share;
                 }
@@ -139,7 +151,7 @@ impl<T: Lane> Group<T> {
 
     /// One physics step of the drive period.
     #[inline(always)]
-    fn step(&mut self, index: usize, factored: &mut Factored<T>, constraints: &mut Constraints<T>) {
+    fn step(&mut self, index: usize, Scratch { factored, constraints }: &mut Scratch<T>) {
         let Self { tree, drive, state, surface, impulses, dt, .. } = self;
         let forces = drive.push(index, &state.q, &state.dq);
         let load = JointLoad { tau: forces.tau, damping: forces.viscous };
@@ -173,14 +185,14 @@ impl<T: Lane> Group<T> {
         &self.state
     }
 
-    /// What the encoder of a joint shows [rad, rad/s].
-    pub fn encoder(&self, joint: usize) -> (T, T) {
-        self.drive.seen(joint, self.state.q[joint], self.state.dq[joint])
+    /// What the encoder of a robot's joint shows [rad, rad/s].
+    pub fn encoder(&self, lane: usize, joint: usize) -> (f64, f64) {
+        self.drive.seen_by(lane, joint, &self.state.q[joint], &self.state.dq[joint])
     }
 
-    /// What the gyroscopes show [rad/s].
-    pub fn gyro(&self) -> Vec3<T> {
-        self.state.angular_velocity + self.gyro_bias
+    /// What a robot's gyroscope shows about an axis [rad/s].
+    pub fn gyro(&self, lane: usize, axis: usize) -> f64 {
+        self.state.angular_velocity.0[axis].get(lane) + self.gyro_bias.0[axis].get(lane)
     }
 
     /// What the current's sensor showed, mean over the last drive period [N·m].

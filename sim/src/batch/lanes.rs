@@ -9,12 +9,8 @@ use twinstep_model::lanes::{Avx2F32, Avx2F64, Avx512F32, Sse2F32 as Baseline};
 use twinstep_model::lanes::{Commands, Instructions, Lane};
 use twinstep_model::{Command, Ground, PerJoint, Placement, RobotModel, RobotStates, RobotStatesMut};
 
-use super::group::{Group, Input, LaneSnapshot, Time};
+use super::group::{Group, Input, LaneSnapshot, Scratch, Time};
 use crate::SimConfig;
-
-/// Groups that one thread steps at a time: a drive period of one takes some ten microseconds, about what it takes to
-/// wake a thread.
-const GROUPS_A_TASK: usize = 4;
 
 /// Which numbers robots are simulated in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -94,7 +90,7 @@ pub fn robots(
 }
 
 /// Advances one group.
-type Advance<T> = fn(&mut Group<T>, &Input<T>, Time);
+type Advance<T> = fn(&mut Group<T>, &Input<T>, Time, &mut Scratch<T>);
 
 struct Groups<T> {
     groups: Vec<Group<T>>,
@@ -121,23 +117,25 @@ impl<T: Lane> Robots for Groups<T> {
     ) -> bool {
         let (lanes, advance) = (T::LANES, self.advance);
         let mut chunks: Vec<_> = states.chunks_mut(lanes).collect();
-        let one = |(index, (group, states)): (usize, (&mut Group<T>, &mut RobotStatesMut))| {
+        let one = |scratch: &mut Scratch<T>,
+                   (index, (group, states)): (usize, (&mut Group<T>, &mut RobotStatesMut))| {
             let robots = index * lanes..(index * lanes + lanes).min(active.len());
             let input = match inputs {
                 Inputs::Commands(commands) => Input::Commands(Commands::new(&commands[robots.clone()])),
                 Inputs::Torques(tau) => Input::torques(&tau[robots.clone()]),
             };
-            advance_active(group, advance, &input, &active[robots], time, states)
+            advance_active(group, advance, &input, &active[robots], time, scratch, states)
         };
         match pool {
-            Some(pool) if self.groups.len() > GROUPS_A_TASK => pool.install(|| {
+            Some(pool) if self.groups.len() > 1 => pool.install(|| {
                 let groups = self.groups.par_iter_mut().zip(&mut chunks).enumerate();
-                groups.with_min_len(GROUPS_A_TASK).map(one).reduce(|| true, |finite, other| finite && other)
+                groups.map_init(Scratch::empty, one).reduce(|| true, |finite, other| finite && other)
             }),
             _ => {
-                // Every group is to be stepped, also after one that is not finite.
+                let mut scratch = Scratch::empty();
                 let groups = self.groups.iter_mut().zip(&mut chunks).enumerate();
-                groups.map(one).filter(|finite| !finite).count() == 0
+                // Every group is to be stepped, also after one that is not finite.
+                groups.map(|group| one(&mut scratch, group)).filter(|finite| !finite).count() == 0
             }
         }
     }
@@ -159,6 +157,7 @@ fn advance_active<T: Lane>(
     input: &Input<T>,
     active: &[bool],
     time: Time,
+    scratch: &mut Scratch<T>,
     states: &mut RobotStatesMut,
 ) -> bool {
     if active.iter().all(|active| !active) {
@@ -166,7 +165,7 @@ fn advance_active<T: Lane>(
     }
     let asleep = (0..active.len()).filter(|lane| !active[*lane]);
     let asleep: Vec<_> = asleep.map(|lane| (lane, group.snapshot(lane))).collect();
-    advance(group, input, time);
+    advance(group, input, time, scratch);
     for (lane, snapshot) in asleep {
         group.restore(lane, &snapshot);
     }
@@ -183,10 +182,10 @@ fn read<T: Lane>(group: &Group<T>, lane: usize, states: &mut RobotStatesMut) -> 
     states.base_position[lane] = values(&state.position.0, lane);
     states.base_orientation[lane] = values(&state.orientation, lane);
     states.base_linear_velocity[lane] = values(&state.linear_velocity.0, lane);
-    states.base_angular_velocity[lane] = values(&group.gyro().0, lane);
+    states.base_angular_velocity[lane] = std::array::from_fn(|axis| group.gyro(lane, axis) as f32);
     for joint in 0..12 {
-        let (q, dq) = group.encoder(joint);
-        (states.q[lane][joint], states.dq[lane][joint]) = (q.get(lane) as f32, dq.get(lane) as f32);
+        let (q, dq) = group.encoder(lane, joint);
+        (states.q[lane][joint], states.dq[lane][joint]) = (q as f32, dq as f32);
     }
     states.tau[lane] = values(group.tau(), lane);
     states.foot_force[lane] = std::array::from_fn(|leg| group.foot_force(lane, leg) as f32);
@@ -199,25 +198,29 @@ fn read<T: Lane>(group: &Group<T>, lane: usize, states: &mut RobotStatesMut) -> 
 }
 
 fn values<T: Lane, const N: usize>(values: &[T; N], lane: usize) -> [f32; N] {
-    values.map(|value| value.get(lane) as f32)
+    let mut read = [0.0; N];
+    for (read, value) in read.iter_mut().zip(values) {
+        *read = value.get(lane) as f32;
+    }
+    read
 }
 
 /// A function that advances a group, with the instructions that its lanes are made of.
 macro_rules! entry {
     ($safe:ident, $entry:ident, $feature:literal, $lane:ty) => {
         #[cfg(target_arch = "x86_64")]
-        fn $safe(group: &mut Group<$lane>, input: &Input<$lane>, time: Time) {
+        fn $safe(group: &mut Group<$lane>, input: &Input<$lane>, time: Time, scratch: &mut Scratch<$lane>) {
             // SAFETY: `robots` has made sure that the processor has them.
             #[allow(unsafe_code)]
             unsafe {
-                $entry(group, input, time);
+                $entry(group, input, time, scratch);
             }
         }
 
         #[cfg(target_arch = "x86_64")]
         #[target_feature(enable = $feature)]
-        fn $entry(group: &mut Group<$lane>, input: &Input<$lane>, time: Time) {
-            group.advance(input, time);
+        fn $entry(group: &mut Group<$lane>, input: &Input<$lane>, time: Time, scratch: &mut Scratch<$lane>) {
+            group.advance(input, time, scratch);
         }
     };
 }
@@ -226,6 +229,6 @@ entry!(advance_avx512, enter_avx512, "avx512f", Avx512F32);
 entry!(advance_avx2, enter_avx2, "avx2", Avx2F32);
 entry!(advance_avx2_double, enter_avx2_double, "avx2", Avx2F64);
 
-fn advance_baseline<T: Lane>(group: &mut Group<T>, input: &Input<T>, time: Time) {
-    group.advance(input, time);
+fn advance_baseline<T: Lane>(group: &mut Group<T>, input: &Input<T>, time: Time, scratch: &mut Scratch<T>) {
+    group.advance(input, time, scratch);
 }
