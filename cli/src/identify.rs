@@ -102,7 +102,7 @@ pub fn run(args: &Args) -> Outcome {
     let signals = Signals::listen()?;
     let mut simulator = simulator(&logs[0].1, &robot)?;
     let effects: Vec<_> = args.effects.iter().map(|Sought(effect, scope)| (*effect, *scope)).collect();
-    let options = Options { generations: args.generations, seed: args.seed, force: args.force, ..Options::default() };
+    let options = Options { generations: args.generations, seed: args.seed, force: args.force };
     let bar = progress_bar(args.generations);
     let found = identify(&model, &effects, &experiments, &mut simulator, &options, &mut |stage, step, cost| {
         bar.set_message(match stage {

@@ -48,6 +48,16 @@ pub(crate) fn thread_pool(threads: usize) -> Result<rayon::ThreadPool, BuildErro
         .map_err(|source| BuildError::Threads { threads, source })
 }
 
+/// Fails unless a step has one command and one flag a robot.
+pub(crate) fn check_lengths(commands: &[Command], active: &[bool], robots: usize) -> Result<(), BackendError> {
+    for (field, given) in [("commands", commands.len()), ("active", active.len())] {
+        if given != robots {
+            return Err(BackendError::WrongLength { field, given, wanted: robots });
+        }
+    }
+    Ok(())
+}
+
 /// The state of one robot; restoring it continues bit for bit.
 #[derive(Clone)]
 pub struct RobotSnapshot {
@@ -159,17 +169,13 @@ impl Backend for RapierBackend {
     }
 
     fn step(&mut self, commands: &[Command], active: &[bool], drive_periods: usize) -> Result<(), BackendError> {
-        let wanted = self.worlds.len();
-        for (field, given) in [("commands", commands.len()), ("active", active.len())] {
-            if given != wanted {
-                return Err(BackendError::WrongLength { field, given, wanted });
-            }
-        }
+        let robots = self.num_robots();
+        check_lengths(commands, active, robots)?;
         let steps = self.config.steps_per_drive_period(&self.robot.control);
         for _ in 0..drive_periods {
             self.drive_period(commands, active, steps);
         }
-        for robot in (0..wanted).filter(|robot| active[*robot]) {
+        for robot in (0..robots).filter(|robot| active[*robot]) {
             self.read_state(robot);
         }
         self.first_diverged(active).map_or(Ok(()), Err)

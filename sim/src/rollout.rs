@@ -1,14 +1,13 @@
 //! Rollouts in the batch engine: every candidate has a lane, and a register of candidates goes its whole way on one thread.
 
 use rayon::prelude::*;
-use twinstep_model::lanes::Instructions;
 use twinstep_model::{Command, Ground, Job, Placement, RobotModel, RobotStates, Rollout};
 
 use crate::batch::{Inputs, Lanes, Time, lane_robots};
 use crate::{BuildError, SimConfig};
 
-/// Candidates that are stepped together: the widest register.
-const TOGETHER: usize = 16;
+/// Candidates that are stepped together: a register in double precision, because slopes are small differences.
+const TOGETHER: usize = 4;
 
 /// Candidates in the lanes of the batch engine, on flat ground.
 pub struct BatchRollout {
@@ -27,8 +26,7 @@ impl BatchRollout {
 
     fn play_together(&self, jobs: &[Job]) -> Vec<RobotStates> {
         let start = Placement::at_rest(1.0, self.robot.control.default_pose_f32());
-        let lanes = Lanes::Single(Instructions::best());
-        let mut robots = lane_robots(lanes, &self.robot, &self.config, &Ground::FLAT, &start, jobs.len());
+        let mut robots = lane_robots(Lanes::Double, &self.robot, &self.config, &Ground::FLAT, &start, jobs.len());
         let mut now = RobotStates::new(jobs.len());
         let mut records: Vec<_> = jobs.iter().map(|job| RobotStates::new(job.commands.len() + 1)).collect();
         for (robot, job) in jobs.iter().enumerate() {

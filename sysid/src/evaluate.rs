@@ -35,9 +35,9 @@ pub fn evaluate(
     simulator: &mut dyn Rollout,
     keep: impl Fn(usize) -> bool,
 ) -> Result<Evaluation, ExperimentError> {
-    let experiment = Experiment::new(log, robot)?.only(keep);
+    let experiment = Experiment::new(log, robot)?.only(&keep);
     let positions = experiment.position_errors(simulator, robot);
-    let torques = torque_errors(log, robot)?;
+    let torques = torque_errors(log, robot, &keep)?;
     let root = |(sum, count): (f64, usize)| (count > 0).then(|| (sum / count as f64).sqrt());
     let whole = |sums: &[(f64, usize)]| {
         root(sums.iter().fold((0.0, 0), |(sum, count), (more, others)| (sum + more, count + others)))

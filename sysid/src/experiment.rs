@@ -10,6 +10,8 @@ use crate::motion::{DriveClock, JointCommands, MotionError, command, joint_comma
 
 /// Length of a window with a free trunk [s]; with a held one a window is a whole part of the log.
 pub const FLOATING_WINDOW_S: f64 = 0.5;
+/// Rows this long apart [s] count as independent.
+const BLOCK_S: f64 = 0.5;
 /// Height at which a held trunk hangs [m].
 const HELD_HEIGHT: f32 = twinstep_model::HELD_HEIGHT as f32;
 
@@ -80,6 +82,8 @@ pub struct Experiment {
     orientations: Vec<DQuat>,
     /// The log's own joints.
     joints: Vec<Joint>,
+    /// Rows in half a second.
+    rows_a_block: usize,
 }
 
 impl Experiment {
@@ -91,6 +95,7 @@ impl Experiment {
         let floating = floating(log)?;
         let joints: Vec<_> = commands.iter().map(|joint| joint.joint).collect();
         let player = Player { log, robot, commands, clock, floating };
+        let rows_a_block = ((BLOCK_S * log.meta().rate_hz).round() as usize).max(1);
         let mut windows = Vec::new();
         for (_, rows) in log.segments() {
             let length = if floating { (FLOATING_WINDOW_S * log.meta().rate_hz).round() as usize } else { rows.len() };
@@ -103,7 +108,7 @@ impl Experiment {
         }
         let orientations =
             if floating { (0..log.rows()).map(|row| player.orientation(row)).collect() } else { Vec::new() };
-        Ok(Self { floating, windows, channels: channels(log, &joints, floating), orientations, joints })
+        Ok(Self { floating, windows, channels: channels(log, &joints, floating), orientations, joints, rows_a_block })
     }
 
     /// The joints that the log has.
@@ -152,13 +157,14 @@ impl Experiment {
             .collect()
     }
 
-    /// For every residual, the block of rows that it belongs to, of about `block_s` seconds at `rate_hz`.
-    pub fn blocks(&self, rows_a_block: usize) -> Vec<usize> {
+    /// For every residual, the block of half a second that it belongs to.
+    pub fn blocks(&self) -> Vec<usize> {
         let mut blocks = Vec::new();
         for channel in &self.channels {
             for window in &self.windows {
-                let rows = window.rows.clone().skip(1).filter(|row| channel.measured[*row].is_finite());
-                blocks.extend(rows.map(|row| row / rows_a_block.max(1)));
+                let end = window.rows.end - usize::from(matches!(channel.quantity, Quantity::Torque(_)));
+                let rows = (window.rows.start + 1..end).filter(|row| channel.measured[*row].is_finite());
+                blocks.extend(rows.map(|row| row / self.rows_a_block));
             }
         }
         blocks
@@ -183,7 +189,14 @@ impl Experiment {
         let jobs: Vec<_> = candidates
             .iter()
             .flat_map(|robot| {
-                self.windows.iter().map(move |window| Job { robot, start: window.start, commands: &window.commands })
+                self.windows.iter().map(move |window| {
+                    // Where the gyroscope is off, so is the measured start.
+                    let mut start = window.start;
+                    for (rate, bias) in start.base_angular_velocity.iter_mut().zip(robot.gyro_bias.to_array()) {
+                        *rate -= bias as f32;
+                    }
+                    Job { robot, start, commands: &window.commands }
+                })
             })
             .collect();
         simulator.play(&jobs)
@@ -213,6 +226,10 @@ impl Experiment {
                 continue;
             }
             let period = window.period[index];
+            if matches!(channel.quantity, Quantity::Torque(_)) && row + 1 == window.rows.end {
+                // The mean to the next row: there is none.
+                continue;
+            }
             let simulated = match channel.quantity {
                 Quantity::Position(joint) => f64::from(states.q[period][joint]),
                 Quantity::Velocity(joint) => f64::from(states.dq[period][joint]),
@@ -287,7 +304,12 @@ fn channels(log: &Log, joints: &[Joint], floating: bool) -> Vec<Channel> {
         }
     }
     if floating {
-        let zeros = vec![0.0; log.rows()];
+        let known = |row: usize| {
+            ["w", "x", "y", "z"]
+                .iter()
+                .all(|part| log.channel(&format!("quat_{part}")).is_some_and(|cells| cells[row].is_finite()))
+        };
+        let zeros: Vec<f64> = (0..log.rows()).map(|row| if known(row) { 0.0 } else { f64::NAN }).collect();
         for (axis, letter) in ["x", "y", "z"].into_iter().enumerate() {
             let of = |kind: &str| format!("{kind}_{letter}");
             add(Quantity::BasePosition(axis), of("pos"), "pos", log.channel(&of("pos")));
@@ -316,28 +338,11 @@ impl Player<'_> {
             period.push(commands.len());
             if row + 1 < rows.end {
                 let mut command = command(self.robot, &self.commands, row);
-                command.strength = self.strength(row);
+                command.strength = strength(self.log, self.robot, row);
                 commands.extend(std::iter::repeat_n(command, self.clock.periods_between(t, index)));
             }
         }
         Window { start: self.start(rows.clone()), rows, commands, period }
-    }
-
-    /// What supply and heat leave of each joint's torque.
-    fn strength(&self, row: usize) -> [f32; NUM_JOINTS] {
-        let derating = &self.robot.derating;
-        let voltage = self.log.channel("battery_V").map_or(1.0, |cells| {
-            let highest = cells.iter().copied().filter(|cell| cell.is_finite()).fold(f64::MIN_POSITIVE, f64::max);
-            if cells[row].is_finite() { cells[row] / highest } else { 1.0 }
-        });
-        std::array::from_fn(|joint| {
-            let name = Joint::ALL[joint].name();
-            let hot = self.log.channel(&format!("temp_{name}")).map_or(0.0, |cells| {
-                let above = cells[row] - derating.above_c[joint];
-                if above.is_finite() { above.max(0.0) } else { 0.0 }
-            });
-            (voltage.powf(derating.voltage_exponent) * (1.0 - derating.per_kelvin[joint] * hot)) as f32
-        })
     }
 
     fn start(&self, rows: Range<usize>) -> Placement {
@@ -377,6 +382,23 @@ impl Player<'_> {
         let turn = DQuat::from_xyzw(x, y, z, w);
         if turn.is_finite() && turn.length() > 0.5 { turn.normalize() } else { DQuat::IDENTITY }
     }
+}
+
+/// What supply and heat leave of each joint's torque in a row.
+pub fn strength(log: &Log, robot: &RobotModel, row: usize) -> [f32; NUM_JOINTS] {
+    let derating = &robot.derating;
+    let voltage = log.channel("battery_V").map_or(1.0, |cells| {
+        let highest = cells.iter().copied().filter(|cell| cell.is_finite()).fold(f64::MIN_POSITIVE, f64::max);
+        if cells[row].is_finite() { cells[row] / highest } else { 1.0 }
+    });
+    std::array::from_fn(|joint| {
+        let name = Joint::ALL[joint].name();
+        let hot = log.channel(&format!("temp_{name}")).map_or(0.0, |cells| {
+            let above = cells[row] - derating.above_c[joint];
+            if above.is_finite() { above.max(0.0) } else { 0.0 }
+        });
+        (voltage.powf(derating.voltage_exponent) * (1.0 - derating.per_kelvin[joint] * hot)) as f32
+    })
 }
 
 /// Velocity at the start of a part whose velocities were not measured: the slope of a line through its first samples.

@@ -13,6 +13,8 @@ use crate::unknown::{Unknown, set_intervals, start, unknowns, with_values, witho
 const TELLING: f64 = 0.7;
 /// Correlations of this size and above are named.
 const CORRELATED: f64 = 0.9;
+/// Effects whose share of the torque is computed from the log once, for all candidates.
+const WEAKENING: [&str; 2] = ["supply_sag", "thermal_derating"];
 /// Generations in which the search has to get better by a hundredth.
 const PATIENCE: usize = 10;
 /// The normal distribution's two-sided 95 %.
@@ -27,13 +29,11 @@ pub struct Options {
     pub seed: u64,
     /// Seek also what the log cannot tell.
     pub force: bool,
-    /// Rows whose residuals may depend on each other.
-    pub rows_a_block: usize,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { generations: 60, seed: 1, force: false, rows_a_block: 100 }
+        Self { generations: 60, seed: 1, force: false }
     }
 }
 
@@ -99,6 +99,15 @@ pub enum IdentifyError {
     /// The given model, played through the log's commands, diverges.
     #[error("the simulation of the given model diverges on this log: start from a model that does not")]
     Diverges,
+    /// No cell of the logs is left.
+    #[error("nothing is left to compare: the rows that count hold no measurement after a window's first row")]
+    NothingToCompare,
+    /// A held trunk and a free one cannot be simulated by one simulator.
+    #[error("one log has its base held and another free: identify from one kind at a time")]
+    BothBases,
+    /// What weakens the motors comes with the log, not with the candidate.
+    #[error("`{0}` cannot be identified yet: give its value in the model file")]
+    Weakening(&'static str),
 }
 
 /// Seeks the numbers of `effects` on top of `model`, so that simulations follow the logs of `experiments`.
@@ -114,21 +123,29 @@ pub fn identify(
     options: &Options,
     progress: &mut Progress,
 ) -> Result<Identification, IdentifyError> {
+    if let Some((effect, _)) = effects.iter().find(|(effect, _)| WEAKENING.contains(&effect.name)) {
+        return Err(IdentifyError::Weakening(effect.name));
+    }
+    if experiments.windows(2).any(|pair| pair[0].floating != pair[1].floating) {
+        return Err(IdentifyError::BothBases);
+    }
     let (file, all) = unknowns(model, effects)?;
     let begin: Vec<f64> = all.iter().map(|unknown| start(&file, unknown)).collect();
     let at = |simulator: &mut dyn Rollout, unknowns: &[Unknown], file: &ModelFile, point: &[f64]| {
         residuals(experiments, simulator, file, unknowns, &[point.to_vec()]).remove(0)
     };
     let first = at(simulator, &[], model, &[]).ok_or(IdentifyError::Diverges)?;
+    if first.is_empty() {
+        return Err(IdentifyError::NothingToCompare);
+    }
     let told = if options.force { vec![true; all.len()] } else { can_tell(&file, &all, experiments, simulator) };
-    progress(Stage::Check, 1, rms(&first));
+    let mut interrupted = !progress(Stage::Check, 1, rms(&first));
     // What the log cannot tell stays where it starts: at its neutral value where it has one.
     let free: Vec<Unknown> =
         all.iter().zip(&told).filter(|(_, told)| **told).map(|(unknown, _)| unknown.clone()).collect();
     let mut point: Vec<f64> = begin.iter().zip(&told).filter(|(_, told)| **told).map(|(value, _)| *value).collect();
-    let mut interrupted = false;
     let mut scale = 1.0;
-    if !free.is_empty() {
+    if !free.is_empty() && !interrupted {
         (point, interrupted) = search(&file, &free, experiments, simulator, options, point, progress);
         if let Some(found) = at(simulator, &free, &file, &point) {
             scale = (rms(&found) * rms(&found)).max(1.0);
@@ -144,14 +161,14 @@ pub fn identify(
     }
     let last = at(simulator, &free, &file, &point).unwrap_or_else(|| first.clone());
     let scale = (rms(&last) * rms(&last)).max(1.0);
-    let blocks: Vec<usize> = blocks(experiments, options.rows_a_block);
+    let blocks: Vec<usize> = blocks(experiments);
     let spread =
         linear(experiments, simulator, &file, &free, &point).and_then(|here| covariance(&here, &blocks, scale));
     let mut found = with_values(&file, &free, &point);
     let (findings, confusable) = judge(&all, &told, &free, &point, &begin, spread.as_ref());
     let intervals: Vec<_> = findings.iter().map(|finding| finding.interval).collect();
     set_intervals(&mut found, &all, &intervals);
-    without_untold(&mut found, &all, &told);
+    without_untold(&mut found, model, &all, &told);
     Ok(Identification { model: found, findings, rms: [rms(&first), rms(&last)], confusable, interrupted })
 }
 
@@ -160,11 +177,11 @@ fn rms(residuals: &[f64]) -> f64 {
 }
 
 /// Blocks of all experiments, each with numbers of its own.
-fn blocks(experiments: &[Experiment], rows_a_block: usize) -> Vec<usize> {
+fn blocks(experiments: &[Experiment]) -> Vec<usize> {
     let mut all = Vec::new();
     for experiment in experiments {
         let first = all.iter().max().map_or(0, |last| last + 1);
-        all.extend(experiment.blocks(rows_a_block).into_iter().map(|block| first + block));
+        all.extend(experiment.blocks().into_iter().map(|block| first + block));
     }
     all
 }
@@ -201,7 +218,9 @@ fn search(
         free.iter().zip(point).map(|(unknown, value)| (value - unknown.prior[0]) / unknown.prior[1]).collect()
     };
     let mut search = CmaEs::new(&scaled(&begin), 0.5);
-    let (mut best, mut lowest, mut lows) = (begin, f64::INFINITY, Vec::new());
+    let judged = residuals(experiments, simulator, file, free, std::slice::from_ref(&begin)).remove(0);
+    let mut lowest = judged.map_or(f64::MAX, |found| cost(&found, free, &begin, 1.0));
+    let (mut best, mut lows) = (begin, Vec::new());
     for generation in 1..=options.generations {
         let asked = search.ask(&mut random);
         // A point beyond a bound is judged at the bound, and pays for the way.

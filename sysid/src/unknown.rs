@@ -67,7 +67,12 @@ pub fn unknowns(
                 std::iter::repeat_n(value, parameter.count)
             })
             .collect();
-        let start = if effect.name == "inertia" { nominal_inertia(model, *scope)? } else { start };
+        let own = file.effects.iter().rfind(|entry| entry.effect == *effect && entry.scope == *scope);
+        let start = match own {
+            Some(entry) if effect.composition == Composition::Replace => entry.values.clone(),
+            _ if effect.name == "inertia" => nominal_inertia(model, *scope)?,
+            _ => start,
+        };
         if effect.composition == Composition::Replace {
             file.effects.retain(|entry| entry.effect != *effect || entry.scope != *scope);
         }
@@ -133,14 +138,17 @@ pub fn start(file: &ModelFile, unknown: &Unknown) -> f64 {
     unknown.coordinate(file.effects[entry].values[value])
 }
 
-/// Takes entries out of the file of which nothing was found; `told` says of each unknown whether it was.
-pub fn without_untold(file: &mut ModelFile, unknowns: &[Unknown], told: &[bool]) {
+/// Takes entries out of the file that were added to `model` and of which nothing was found; `told` says of each unknown
+/// whether it was.
+pub fn without_untold(file: &mut ModelFile, model: &ModelFile, unknowns: &[Unknown], told: &[bool]) {
     let about = |index: usize| unknowns.iter().zip(told).filter(move |(unknown, _)| unknown.place.0 == index);
     let mut index = 0;
-    file.effects.retain(|_| {
+    file.effects.retain(|entry| {
         let untold = about(index).count() > 0 && about(index).all(|(_, told)| !told);
+        let replaced = entry.effect.composition == Composition::Replace;
+        let own = replaced && model.effects.iter().any(|own| own.effect == entry.effect && own.scope == entry.scope);
         index += 1;
-        !untold
+        !untold || own
     });
 }
 

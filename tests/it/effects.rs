@@ -1,8 +1,12 @@
 //! Every effect of the catalogue does the same in both engines.
 
+use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_envs::TaskName;
 use twinstep_model::effects::{CATALOGUE, Effect, Entry, Scope, Target, compose};
-use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, RobotModel, go2};
+use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, ResetRequest, RobotModel, VecEnv, go2};
 use twinstep_sim::{Base, BatchBackend, Engine, RapierBackend, SimConfig};
+
+use crate::remote;
 
 /// Drive periods of the motion.
 const PERIODS: usize = 200;
@@ -100,4 +104,29 @@ fn every_effect_does_the_same_in_both_engines() {
             effect.name
         );
     }
+}
+
+/// Joints that are held by more friction than their drives have torque stay where they are, over the wire too.
+#[test]
+fn server_simulates_the_effects_of_its_model_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("stiff.toml");
+    let friction = "[[effect]]\nname = \"coulomb_friction\"\nscope = \"all\"\ntorque_nm = 20.0\n";
+    std::fs::write(&path, format!("robot = \"go2\"\n{friction}")).unwrap();
+    let moved = |model: Option<std::path::PathBuf>| {
+        let mut config = remote::config(TaskName::Walk);
+        config.server.model = model;
+        let (server, endpoint) = remote::start(&config);
+        let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 1)).unwrap();
+        let before = env.reset(&ResetRequest::seeded(1, 1)).unwrap()[9..21].to_vec();
+        let mut after = before.clone();
+        for _ in 0..5 {
+            after = env.step(&[0.3; 12]).unwrap().obs[9..21].to_vec();
+        }
+        server.stop();
+        before.iter().zip(&after).map(|(before, after)| (before - after).abs()).fold(0.0, f32::max)
+    };
+    let (ideal, held) = (moved(None), moved(Some(path)));
+    assert!(ideal > 0.05, "{ideal} rad");
+    assert!(held < 0.3 * ideal, "{held} rad, without friction {ideal}");
 }

@@ -8,7 +8,7 @@ use twinstep_logs::{Base as LoggedBase, Gain, Log, Meta, Segment, TauSensor};
 use twinstep_model::effects::{Effect, Entry, Scope, compose};
 use twinstep_model::{Backend, Command, HELD_HEIGHT, JOINT_NAMES, ModelFile, Placement, RobotModel, go2, stream};
 use twinstep_sim::{Base, BatchRollout, Engine, RapierBackend, SimConfig};
-use twinstep_sysid::{Experiment, Options, Verdict, evaluate, identify};
+use twinstep_sysid::{Experiment, Identification, Options, Stage, Verdict, evaluate, identify};
 use twinstep_tests::python::{Programs, root};
 
 /// What is sought, and the truth.
@@ -77,20 +77,19 @@ fn simulator() -> BatchRollout {
     BatchRollout::new(&go2(), &SimConfig { base: Base::Fixed, ..SimConfig::default() }).unwrap()
 }
 
+/// Seeks `effects` in `log`; `progress` may end it.
+fn seek(log: &Log, effects: &[(&str, &str)], progress: fn(usize) -> bool) -> Identification {
+    let experiment = Experiment::new(log, &go2()).unwrap();
+    let effects: Vec<_> = effects.iter().map(|(name, place)| (named(name), scope(place))).collect();
+    let model = ModelFile::default();
+    let mut progress = |_: Stage, step: usize, _: f64| progress(step);
+    identify(&model, &effects, &[experiment], &mut simulator(), &Options::default(), &mut progress).unwrap()
+}
+
 #[test]
 fn hidden_effects_are_found_with_intervals_that_hold_them() {
     let log = log_of(&plant());
-    let experiment = Experiment::new(&log, &go2()).unwrap();
-    let effects: Vec<_> = HIDDEN.iter().map(|(name, place, _)| (named(name), scope(place))).collect();
-    let found = identify(
-        &ModelFile::default(),
-        &effects,
-        &[experiment],
-        &mut simulator(),
-        &Options::default(),
-        &mut |_, _, _| true,
-    )
-    .unwrap();
+    let found = seek(&log, &HIDDEN.map(|(name, place, _)| (name, place)), |_| true);
     for (finding, (name, _, truth)) in found.findings.iter().zip(HIDDEN) {
         println!("{name}: {} {:?}, truth {truth}", finding.value, finding.interval);
         assert_eq!(finding.verdict, Verdict::Found);
@@ -110,17 +109,7 @@ fn hidden_effects_are_found_with_intervals_that_hold_them() {
 fn what_a_log_cannot_tell_is_left_and_said() {
     // A held trunk: neither a payload on it nor the ground show.
     let log = log_of(&go2());
-    let experiment = Experiment::new(&log, &go2()).unwrap();
-    let effects = [(named("payload"), scope("base")), (named("ground_friction"), scope("ground"))];
-    let found = identify(
-        &ModelFile::default(),
-        &effects,
-        &[experiment],
-        &mut simulator(),
-        &Options::default(),
-        &mut |_, _, _| true,
-    )
-    .unwrap();
+    let found = seek(&log, &[("payload", "base"), ("ground_friction", "ground")], |_| true);
     assert!(found.findings.iter().all(|finding| finding.verdict == Verdict::CannotTell));
     assert_eq!(found.model, ModelFile::default());
 }
@@ -128,17 +117,7 @@ fn what_a_log_cannot_tell_is_left_and_said() {
 #[test]
 fn search_that_is_ended_keeps_the_best_so_far() {
     let log = log_of(&plant());
-    let experiment = Experiment::new(&log, &go2()).unwrap();
-    let effects = [(named("coulomb_friction"), scope("calf"))];
-    let found = identify(
-        &ModelFile::default(),
-        &effects,
-        &[experiment],
-        &mut simulator(),
-        &Options::default(),
-        &mut |_, step, _| step < 2,
-    )
-    .unwrap();
+    let found = seek(&log, &[("coulomb_friction", "calf")], |step| step < 2);
     assert!(found.interrupted);
     assert!(found.rms[1] < found.rms[0], "{:?}", found.rms);
 }

@@ -34,8 +34,5 @@ pub const EFFECT: Effect = Effect {
             experiment: "Hold the command and push the joint by hand or let gravity swing it: a late command shows nothing, a late loop does.",
         },
     ],
-    apply: |robot, place, values| {
-        super::joint(robot, place).drive.command_delay += values[0];
-        Ok(())
-    },
+    apply: |robot, place, values| super::delayed(&mut super::joint(robot, place).drive.command_delay, values[0]),
 };

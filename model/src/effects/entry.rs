@@ -124,7 +124,10 @@ impl Entry {
 /// `robot` with the effects of `entries`: each adds, multiplies or replaces as its [`Composition`] says.
 pub fn compose(robot: &RobotModel, entries: &[Entry]) -> Result<RobotModel, EntryError> {
     let mut composed = robot.clone();
-    for (index, entry) in entries.iter().enumerate() {
+    // A body that is replaced altogether is there before anything is added to it.
+    let (whole, others): (Vec<_>, Vec<_>) =
+        entries.iter().enumerate().partition(|(_, entry)| entry.effect.name == "inertia");
+    for (index, entry) in whole.into_iter().chain(others) {
         entry.check()?;
         for place in entry.places() {
             if !entry.is_replaced(index, place, entries) {
@@ -137,5 +140,27 @@ pub fn compose(robot: &RobotModel, entries: &[Entry]) -> Result<RobotModel, Entr
             }
         }
     }
-    Ok(composed)
+    match entries.last().zip(impossible(&composed)) {
+        Some((entry, reason)) => Err(EntryError::Conflict { effect: entry.effect.name, scope: entry.scope, reason }),
+        None => Ok(composed),
+    }
+}
+
+/// Why no such robot can be, if so.
+fn impossible(robot: &RobotModel) -> Option<&'static str> {
+    for joint in &robot.joints {
+        if joint.armature < 0.0 {
+            return Some("the armature of a joint adds up to less than zero");
+        }
+        if joint.armature <= 0.0 && (joint.drive.gap > 0.0 || joint.drive.stiffness.is_finite()) {
+            return Some("a rotor behind a gear with play or a spring needs an armature above zero");
+        }
+    }
+    let bodies = robot.legs.iter().flat_map(|leg| &leg.bodies).chain([&robot.trunk]);
+    let definite = |body: &crate::RigidBody| {
+        let i = &body.inertia;
+        let minor = i.x_axis.x * i.y_axis.y - i.x_axis.y * i.y_axis.x;
+        body.mass > 0.0 && i.x_axis.x > 0.0 && minor > 0.0 && i.determinant() > 0.0
+    };
+    (!bodies.into_iter().all(definite)).then_some("a body's mass or inertia is no longer positive")
 }

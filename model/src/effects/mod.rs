@@ -184,6 +184,15 @@ fn joint(robot: &mut RobotModel, place: Place) -> &mut crate::JointModel {
     }
 }
 
+/// Adds to a delay [s].
+fn delayed(delay: &mut f64, more: f64) -> Result<(), &'static str> {
+    *delay += more;
+    if *delay > crate::JointDrive::LONGEST_DELAY + 1e-9 {
+        return Err("the delays of a joint add up to more than 0.04 s");
+    }
+    Ok(())
+}
+
 /// The body that an effect is about.
 fn body(robot: &mut RobotModel, place: Place) -> &mut crate::RigidBody {
     match place {

@@ -17,7 +17,7 @@ pub const EFFECT: Effect = Effect {
         neutral: 0.0,
         source: "BAM's servo logs: a sagging supply explains them better than any friction model",
     }],
-    composition: Composition::Add,
+    composition: Composition::Replace,
     target: Target::Supply,
     signature: "All joints lose torque together, when the battery's voltage falls.",
     confusions: &[

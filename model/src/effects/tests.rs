@@ -124,6 +124,28 @@ fn ripples_of_two_frequencies_are_refused() {
 }
 
 #[test]
+fn what_adds_up_to_no_robot_is_refused() {
+    let refused = |entries: &[Entry], part: &str| {
+        let error = compose(&go2(), entries).expect_err("refused").to_string();
+        assert!(error.contains(part), "{error}");
+    };
+    // More than the drives remember.
+    refused(&[entry("command_delay", "all", &[0.03]), entry("command_delay", "FL", &[0.03])], "more than 0.04 s");
+    refused(&[entry("armature", "all", &[-0.01]), entry("armature", "FL_hip", &[-0.01])], "less than zero");
+    refused(&[entry("armature", "all", &[-0.01]), entry("backlash", "calf", &[0.01])], "above zero");
+    refused(&[entry("payload", "base", &[-3.0, 0.5, 0.5, 0.5])], "no longer positive");
+}
+
+#[test]
+fn payload_stays_on_a_body_that_is_replaced_whatever_the_order() {
+    let theta = go2().trunk.scaled(1.2).log_cholesky();
+    let (body, load) = (entry("inertia", "base", &theta), entry("payload", "base", &[2.0, 0.1, 0.0, 0.0]));
+    let one = compose(&go2(), &[body.clone(), load.clone()]).expect("no conflict").trunk;
+    assert_eq!(compose(&go2(), &[load, body]).expect("no conflict").trunk, one);
+    assert!((one.mass - 1.2 * go2().trunk.mass - 2.0).abs() < 1e-9);
+}
+
+#[test]
 fn scope_that_an_effect_cannot_have_is_refused_with_what_it_can() {
     let error = Entry::new(named("payload"), Scope::All, vec![1.0, 0.0, 0.0, 0.0]).expect_err("refused").to_string();
     assert_eq!(error, "`payload` cannot have scope \"all\"; possible: base, or a joint for the link behind it");

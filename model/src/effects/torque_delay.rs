@@ -31,8 +31,5 @@ pub const EFFECT: Effect = Effect {
             experiment: "Compare with the motion: a late sensor leaves it alone.",
         },
     ],
-    apply: |robot, place, values| {
-        super::joint(robot, place).drive.torque_delay += values[0];
-        Ok(())
-    },
+    apply: |robot, place, values| super::delayed(&mut super::joint(robot, place).drive.torque_delay, values[0]),
 };

@@ -21,8 +21,5 @@ pub const EFFECT: Effect = Effect {
     target: Target::Joints,
     signature: "Shifting the torque channel in time removes the error, and the simulated motion was right before.",
     confusions: &[Confusion { with: "torque_delay", experiment: "Compare the motion: a late loop changes it." }],
-    apply: |robot, place, values| {
-        super::joint(robot, place).drive.sensor_delay += values[0];
-        Ok(())
-    },
+    apply: |robot, place, values| super::delayed(&mut super::joint(robot, place).drive.sensor_delay, values[0]),
 };

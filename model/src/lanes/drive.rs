@@ -11,6 +11,9 @@ const REMEMBERED: usize = 10;
 /// Stiffness of a gear that has play and no stiffness of its own [N·m/rad].
 const STIFF_GEAR: f64 = 2000.0;
 
+/// Stiffness of a gear times the square of the physics step [kg·m²]: a calf of 0.006 kg·m² behind a stiffer one would be
+/// thrown about, because it feels the gear once a step.
+const STIFFEST: f64 = 0.006;
 /// Steps of a rotor on an elastic gear in a physics step.
 const GEAR_STEPS: usize = 8;
 
@@ -108,7 +111,7 @@ numbers! { |joint, dt, drive_dt|
     ripple_phase = joint.drive.ripple.phase;
     half_gap = 0.5 * joint.drive.gap;
     /// Of the gear beyond its play [N·m/rad]; 0 where it is rigid.
-    gear = elasticity(&joint.drive);
+    gear = elasticity(&joint.drive).min(STIFFEST / (dt * dt));
     /// Inertia of a rotor on an elastic gear [kg·m²].
     rotor = joint.armature;
     viscous = joint.viscous_friction;
@@ -300,9 +303,12 @@ impl<T: Lane> Drive<T> {
         let mut forces = JointForces { tau: [zero; 12], viscous: [zero; 12], dry: [zero; 12] };
         for joint in 0..12 {
             let n = &self.numbers[joint];
+            // Back-EMF and ripple are the motor's: of the rotor, where it moves on its own.
+            let rotor_q = zero.select_less(n.gear, self.memory.rotor[0][joint], q[joint]);
+            let rotor_dq = zero.select_less(n.gear, self.memory.rotor[1][joint], dq[joint]);
             let mut tau = input[joint];
             if uses.back_emf {
-                let (limit, share) = (n.torque_limit, dq[joint] * n.back_emf);
+                let (limit, share) = (n.torque_limit, rotor_dq * n.back_emf);
                 let forth = limit * (one - share).max(zero).min(one);
                 let back = limit * (one + share).max(zero).min(one);
                 tau = forth.min(tau.max(-back));
@@ -311,7 +317,7 @@ impl<T: Lane> Drive<T> {
             *current += n.lag * (tau - *current);
             tau = n.gain * *current;
             if uses.ripple {
-                let (sin, _) = (n.ripple_cycles * q[joint] + n.ripple_phase).sin_cos();
+                let (sin, _) = (n.ripple_cycles * rotor_q + n.ripple_phase).sin_cos();
                 tau += n.ripple_amplitude * sin;
             }
             (forces.viscous[joint], forces.dry[joint]) = (n.viscous, n.coulomb);
@@ -347,6 +353,8 @@ impl<T: Lane> Drive<T> {
                 let shared = (to.min(period + one) - from.max(period)).max(zero);
                 late[joint] += shared / self.step * asked[joint];
             }
+            // Exactly as without neighbours that are late.
+            late[joint] = zero.select_less(self.numbers[joint].torque_delay, late[joint], self.memory.asked[0][joint]);
         }
         late
     }

@@ -131,6 +131,8 @@ impl<T: Lane> Constraints<T> {
             self.find_limits(factored, state, surface, impulses, joint, dt);
             if T::splat(0.0).any_less(dry[joint]) {
                 self.find_friction(factored, state, surface, joint);
+            } else {
+                impulses.frictions[joint] = T::splat(0.0);
             }
         }
     }

@@ -22,7 +22,7 @@ use twinstep_model::{Actuator, Backend, BackendError, Command, Ground, Placement
 
 pub use lanes::Lanes;
 
-use crate::rapier::BuildError;
+use crate::rapier::{BuildError, check_lengths};
 use crate::{SimConfig, SimConfigError};
 use group::LaneSnapshot;
 pub(crate) use group::Time;
@@ -136,12 +136,7 @@ impl Backend for BatchBackend {
     }
 
     fn step(&mut self, commands: &[Command], active: &[bool], drive_periods: usize) -> Result<(), BackendError> {
-        let wanted = self.num_robots();
-        for (field, given) in [("commands", commands.len()), ("active", active.len())] {
-            if given != wanted {
-                return Err(BackendError::WrongLength { field, given, wanted });
-            }
-        }
+        check_lengths(commands, active, self.num_robots())?;
         let steps = self.config.steps_per_drive_period(&self.robot.control);
         let Self { robots, states, drive, pool, .. } = self;
         let pool = pool.as_ref();
