@@ -99,6 +99,9 @@ pub fn run(args: &Args) -> Outcome {
         experiments.push(Experiment::new(&log, &robot).map_err(input)?.only(|row| rows[row]));
         logs.push((path, log, rows));
     }
+    // Before the search, not after it: what it finds must not be lost.
+    let unwritable = |source| input(Unwritable { path: args.out.clone(), source });
+    std::fs::OpenOptions::new().append(true).create(true).open(&args.out).map_err(unwritable)?;
     let signals = Signals::listen()?;
     let mut simulator = simulator(&logs[0].1, &robot)?;
     let effects: Vec<_> = args.effects.iter().map(|Sought(effect, scope)| (*effect, *scope)).collect();
@@ -117,8 +120,7 @@ pub fn run(args: &Args) -> Outcome {
     });
     bar.finish_and_clear();
     let found = found.map_err(input)?;
-    std::fs::write(&args.out, found.model.to_toml())
-        .map_err(|source| other(Unwritable { path: args.out.clone(), source }))?;
+    std::fs::write(&args.out, found.model.to_toml()).map_err(unwritable)?;
     print!("{}", text(&found));
     let fitted = found.model.robot_model().map_err(other)?;
     for (path, log, rows) in &logs {

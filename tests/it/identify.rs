@@ -163,6 +163,9 @@ fn mistakes_on_the_command_line_are_named() {
         let told = String::from_utf8_lossy(&output.stderr);
         assert!(told.contains(wanted), "{told}");
     }
+    let output = twinstep(&["identify", "data/go2_air_chirp", "--out", "/nowhere/fitted.toml"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&output.stderr).starts_with("error: cannot write /nowhere/fitted.toml"));
     let output = twinstep(&["evaluate", "data/go2_air_chirp", "--from", "100"]);
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).contains("leave no row"));
