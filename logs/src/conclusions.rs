@@ -336,3 +336,25 @@ fn reaches(reached: f64, least: f64, joint: &str, what: &str) -> Result<String, 
     }
     Err(format!("no joint passes {percent:.0} % of its highest {what}: reach {least_percent:.0} % or more"))
 }
+
+#[cfg(test)]
+mod tests {
+    use twinstep_model::effects::{CATALOGUE, Effect};
+
+    use super::RULES;
+
+    #[test]
+    fn there_is_a_rule_for_each_effect_of_the_catalogue_in_its_order() {
+        assert_eq!(RULES.map(|rule| rule.effect), CATALOGUE.map(|effect| effect.name));
+    }
+
+    #[test]
+    fn names_in_cautions_are_in_the_catalogue() {
+        for rule in RULES {
+            let words = rule.caution.split(|letter: char| !letter.is_ascii_alphanumeric() && letter != '_');
+            for word in words.filter(|word| word.contains('_')) {
+                assert!(Effect::named(word).is_some(), "the caution of `{}` names `{word}`", rule.effect);
+            }
+        }
+    }
+}

@@ -12,6 +12,9 @@ use crate::{RobotModel, go2};
 /// The names that `robot` may have.
 const BUILT_IN: [&str; 1] = ["go2"];
 
+/// The interval of a component that nobody measured, where others of its vector were: it may be anything.
+const UNKNOWN: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
+
 /// Why a model file was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelFileError {
@@ -167,9 +170,10 @@ impl ModelFile {
                 writeln!(text, "{} = {}", parameter.name, written(values)).expect("a String takes every text");
             }
             for (parameter, values) in of_parameters(entry.effect, &entry.intervals) {
-                if let Some(known) = values.iter().copied().collect::<Option<Vec<_>>>() {
+                if values.iter().any(Option::is_some) {
+                    let ends = values.iter().map(|interval| interval.unwrap_or(UNKNOWN));
                     let [low, high] =
-                        [0, 1].map(|end| written(&known.iter().map(|ends| ends[end]).collect::<Vec<_>>()));
+                        [0, 1].map(|end| written(&ends.clone().map(|ends| ends[end]).collect::<Vec<_>>()));
                     intervals.push(format!("{} = [{low}, {high}]", parameter.name));
                 }
             }
@@ -240,15 +244,26 @@ fn read_intervals(effect: &'static Effect, given: Option<&Value>) -> Result<Vec<
             Some(Value::Array(ends)) if ends.len() == 2 => {
                 let [low, high] =
                     [read_numbers(&key, Some(&ends[0]), *count)?, read_numbers(&key, Some(&ends[1]), *count)?];
-                if low.iter().zip(&high).any(|(low, high)| low > high) {
-                    return Err(wrong(&key, table.get(*name), "the low end before the high one"));
+                for ends in low.into_iter().zip(high).map(|(low, high)| [low, high]) {
+                    if let Some(wanted) = missing_of_interval(ends) {
+                        return Err(wrong(&key, table.get(*name), wanted));
+                    }
+                    intervals.push(Some(ends).filter(|ends| *ends != UNKNOWN));
                 }
-                intervals.extend(low.into_iter().zip(high).map(|(low, high)| Some([low, high])));
             }
             other => return Err(wrong(&key, other, "[low, high]")),
         }
     }
     Ok(intervals)
+}
+
+/// What an interval should be and is not.
+fn missing_of_interval(ends: [f64; 2]) -> Option<&'static str> {
+    let [low, high] = ends;
+    if !ends.into_iter().all(f64::is_finite) && ends != UNKNOWN {
+        return Some("a pair of numbers, or -inf and inf where nobody measured,");
+    }
+    (low > high).then_some("the low end before the high one")
 }
 
 /// A number, or a list of `count`.
@@ -383,9 +398,26 @@ mod tests {
         );
     }
 
+    const SHIFT: &str =
+        "robot = \"go2\"\n[[effect]]\nname = \"com_shift\"\nscope = \"base\"\nshift_m = [0.0, 0.0, 0.0]\n";
+
+    #[test]
+    fn component_that_nobody_measured_is_from_minus_to_plus_infinity() {
+        let text = format!("{SHIFT}interval = {{ shift_m = [[-0.1, -inf, 0.0], [0.1, inf, 0.0]] }}\n");
+        let file = ModelFile::parse(&text, "robot.toml").expect("valid");
+        assert_eq!(file.effects[0].intervals, [Some([-0.1, 0.1]), None, Some([0.0, 0.0])]);
+        assert!(file.to_toml().contains("[[-0.1, -inf, 0.0], [0.1, inf, 0.0]]"), "{}", file.to_toml());
+        check_refusal(
+            &format!("{SHIFT}interval = {{ shift_m = [[-0.1, nan, 0.0], [0.1, inf, 0.0]] }}\n"),
+            &expect![[
+                r#"robot.toml: effect 1: `interval.shift_m` is [[-0.1, nan, 0.0], [0.1, inf, 0.0]]; a pair of numbers, or -inf and inf where nobody measured, is wanted"#
+            ]],
+        );
+    }
+
     fn some_entry() -> impl Strategy<Value = Entry> {
         let scopes = Scope::of_joints().len();
-        (0..CATALOGUE.len(), 0..scopes, prop::array::uniform10(0.0..1.0f64), any::<bool>()).prop_map(
+        (0..CATALOGUE.len(), 0..scopes, prop::array::uniform10(0.0..1.0f64), any::<u16>()).prop_map(
             |(index, scope, shares, measured)| {
                 let effect = CATALOGUE[index];
                 let scope = match effect.target {
@@ -401,9 +433,10 @@ mod tests {
                     low + share * (high - low)
                 });
                 let mut entry = Entry::new(effect, scope, values.collect()).expect("plausible values are allowed");
-                if measured {
-                    entry.intervals = entry.values.iter().map(|value| Some([value - 0.1, value + 0.1])).collect();
-                }
+                // Any of its components may have been measured.
+                let interval =
+                    |(bit, value): (usize, &f64)| (measured >> bit & 1 == 1).then_some([value - 0.1, value + 0.1]);
+                entry.intervals = entry.values.iter().enumerate().map(interval).collect();
                 entry
             },
         )
