@@ -61,6 +61,9 @@ pub struct Args {
     /// Threads that step robots; 0 takes all cores.
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
+    /// Draw every value of the model file that has an interval from it, anew in each episode.
+    #[arg(long)]
+    randomise_effects: bool,
     /// Time that a lost client's environments wait for it [s].
     #[arg(long, value_name = "S")]
     lease_grace_s: Option<f64>,
@@ -118,6 +121,7 @@ impl Args {
         set(&mut config.task.name, self.task.as_ref());
         set(&mut config.sim.engine, self.engine.as_ref());
         config.sim.physics_hz = self.physics_hz.or(config.sim.physics_hz);
+        config.randomise.effects |= self.randomise_effects;
         set(&mut config.sim.threads, self.threads.as_ref());
         config.check().map_err(input)?;
         Ok(config)

@@ -1,7 +1,8 @@
 //! Who builds the environments that a client asked for.
 
 use twinstep_envs::{CounterEnv, TaskEnv, TaskName, TaskSettings};
-use twinstep_model::{AutoresetMode, ModelFileError, RobotModel, VecEnv, go2};
+use twinstep_model::effects::{DrawError, RobotDraws};
+use twinstep_model::{AutoresetMode, ModelFile, ModelFileError, RobotModel, VecEnv};
 use twinstep_sim::{BatchBackend, BuildError, Engine, RapierBackend};
 
 use crate::Config;
@@ -23,6 +24,9 @@ pub enum HostError {
     /// The model file was refused.
     #[error(transparent)]
     Model(#[from] ModelFileError),
+    /// The intervals of the model file are of hardly any robot.
+    #[error("`randomise.effects`: {0}")]
+    Draws(#[from] DrawError),
     /// The simulation was refused.
     #[error(transparent)]
     Sim(#[from] BuildError),
@@ -35,19 +39,23 @@ pub enum HostError {
 pub struct SimHost {
     config: Config,
     robot: RobotModel,
+    /// If effects are to be drawn anew in each episode.
+    robots: Option<RobotDraws>,
     seed: u64,
 }
 
 impl SimHost {
     /// Reads the model file and checks the simulation's settings.
     pub fn new(config: Config) -> Result<Self, HostError> {
-        let robot = match &config.server.model {
-            Some(path) => RobotModel::load(path)?,
-            None => go2(),
+        let file = match &config.server.model {
+            Some(path) => ModelFile::load(path)?,
+            None => ModelFile::default(),
         };
+        let robot = file.robot_model().expect("a file that was read is of a robot");
         config.sim.check(&robot.control).map_err(BuildError::Config)?;
         let seed = config.server.seed.unwrap_or_else(crate::server::random_u64);
-        Ok(Self { config, robot, seed })
+        let robots = if config.randomise.effects { Some(RobotDraws::new(file)?) } else { None };
+        Ok(Self { config, robot, robots, seed })
     }
 }
 
@@ -64,6 +72,7 @@ impl Host for SimHost {
                 let settings = TaskSettings {
                     task: self.config.task.clone(),
                     randomise: self.config.randomise,
+                    robots: self.robots.clone(),
                     autoreset,
                     max_episode_steps,
                     seed: self.seed,

@@ -150,6 +150,8 @@ pub struct Randomisation {
     pub kp_scale: Range,
     /// Factor on the velocity gain.
     pub kd_scale: Range,
+    /// True to draw every value of the model file that has an interval from it.
+    pub effects: bool,
 }
 
 impl Default for Randomisation {
@@ -162,6 +164,7 @@ impl Default for Randomisation {
             friction_scale: [1.0, 1.0],
             kp_scale: [1.0, 1.0],
             kd_scale: [1.0, 1.0],
+            effects: false,
         }
     }
 }

@@ -37,7 +37,10 @@ pub struct Rules {
 /// What an environment remembers of its running episode.
 pub struct Episode {
     /// Where its random numbers come from.
-    pub stream: Stream,
+    stream: Stream,
+    seed: u64,
+    /// Episodes that were started under this seed.
+    started: u64,
     /// False before the first reset, and after the end of an episode that nobody has reset.
     pub running: bool,
     /// Policy steps so far.
@@ -58,6 +61,8 @@ pub struct Episode {
 pub struct Start {
     /// How body and ground differ from the model's.
     pub variation: Variation,
+    /// Where the effects of the model file are drawn from.
+    pub effects: Stream,
     /// Joint position [rad].
     pub q: PerJoint,
     /// Position gain [N·m/rad].
@@ -108,7 +113,9 @@ impl Episode {
     /// None yet; the first will draw from `seed`.
     pub fn idle(seed: u64) -> Self {
         Self {
-            stream: seeded(seed),
+            stream: stream(seed, "walk", 0),
+            seed,
+            started: 0,
             running: false,
             length: 0,
             episode_return: 0.0,
@@ -121,6 +128,11 @@ impl Episode {
         }
     }
 
+    /// The next episodes will draw from `seed`.
+    pub fn seed(&mut self, seed: u64) {
+        (self.stream, self.seed, self.started) = (stream(seed, "walk", 0), seed, 0);
+    }
+
     /// True if an episode ended here; false if none ever ran or the last one diverged.
     pub fn was_started(&self) -> bool {
         self.length > 0
@@ -130,6 +142,8 @@ impl Episode {
     pub fn start(&mut self, rules: &Rules) -> Start {
         let Rules { randomise, control, .. } = rules;
         let noise = rules.task.start_position_noise_rad;
+        // A stream of its own, so that poses and commands are the same with and without.
+        let effects = stream(self.seed, "effects", self.started);
         let stream = &mut self.stream;
         let variation = Variation {
             mass_scale: draw(stream, randomise.mass_scale),
@@ -141,13 +155,14 @@ impl Episode {
         let kd = control.kd as f32 * draw(stream, randomise.kd_scale);
         let q = rules.default_pose.map(|position| position + draw(stream, [-noise, noise]));
         self.draw_command(rules);
+        self.started += 1;
         self.running = true;
         self.length = 0;
         self.episode_return = 0.0;
         self.term_sums = [0.0; TERMS];
         self.action = [0.0; NUM_JOINTS];
         self.air_time = [0.0; 4];
-        Start { variation, q, kp, kd }
+        Start { variation, effects, q, kp, kd }
     }
 
     /// Takes the action in, before the step, and returns the joint positions that it wants [rad].
@@ -219,11 +234,6 @@ impl Episode {
             landed
         })
     }
-}
-
-/// The random numbers of an environment whose seed is `seed`.
-pub fn seeded(seed: u64) -> Stream {
-    stream(seed, "walk", 0)
 }
 
 fn draw(stream: &mut Stream, [low, high]: Range) -> f32 {

@@ -1,11 +1,12 @@
 //! The task `walk` on any backend: many robots that follow velocity commands.
 
+use twinstep_model::effects::RobotDraws;
 use twinstep_model::{
-    AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, Placement, ResetRequest, Scene,
-    StepBatch, VecEnv,
+    AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, Placement, ResetRequest,
+    RobotModel, Scene, StepBatch, VecEnv,
 };
 
-use crate::episode::{Episode, Rules, Verdict, seeded};
+use crate::episode::{Episode, Rules, Verdict};
 use crate::observation::{OBS_LEN, walk_spec};
 use crate::{ConfigError, Randomisation, TaskConfig};
 
@@ -19,6 +20,8 @@ pub struct TaskSettings {
     pub task: TaskConfig,
     /// What varies from episode to episode.
     pub randomise: Randomisation,
+    /// Where each episode's robot is drawn from; the backend's own without.
+    pub robots: Option<RobotDraws>,
     /// When an ended episode starts anew.
     pub autoreset: AutoresetMode,
     /// Policy steps after which an episode is truncated, in place of the task's own time.
@@ -32,6 +35,7 @@ pub struct TaskEnv<B: Backend> {
     backend: B,
     spec: EnvSpec,
     rules: Rules,
+    robots: Option<RobotDraws>,
     autoreset: AutoresetMode,
     episodes: Vec<Episode>,
     commands: Vec<Command>,
@@ -42,7 +46,7 @@ pub struct TaskEnv<B: Backend> {
 impl<B: Backend> TaskEnv<B> {
     /// The task on every robot of `backend`.
     pub fn new(backend: B, settings: TaskSettings) -> Result<Self, ConfigError> {
-        let TaskSettings { task, randomise, autoreset, max_episode_steps, seed } = settings;
+        let TaskSettings { task, randomise, robots, autoreset, max_episode_steps, seed } = settings;
         task.check()?;
         randomise.check()?;
         let robot = backend.robot();
@@ -52,6 +56,7 @@ impl<B: Backend> TaskEnv<B> {
         Ok(Self {
             rules: Rules::new(task, randomise, robot, backend.ground(), &spec),
             spec,
+            robots,
             autoreset,
             episodes: (0..num_envs as u64).map(|env| Episode::idle(seed.wrapping_add(env))).collect(),
             commands: vec![Command::hold(robot.control.default_pose_f32(), 0.0, 0.0); num_envs],
@@ -84,20 +89,24 @@ impl<B: Backend> TaskEnv<B> {
     }
 
     fn start_episodes(&mut self, envs: &[usize]) -> Result<(), BackendError> {
-        let placements: Vec<(usize, Placement)> = envs.iter().map(|env| (*env, self.start(*env))).collect();
-        self.backend.reset(&placements)?;
         for env in envs {
+            let (placement, robot) = self.start(*env);
+            match robot {
+                Some(robot) => self.backend.reset_as(*env, &robot, &placement)?,
+                None => self.backend.reset(&[(*env, placement)])?,
+            }
             let row = &mut self.batch.obs[env * OBS_LEN..(env + 1) * OBS_LEN];
             self.episodes[*env].observe(&self.rules, self.backend.states(), *env, row);
         }
         Ok(())
     }
 
-    fn start(&mut self, env: usize) -> Placement {
-        let start = self.episodes[env].start(&self.rules);
+    fn start(&mut self, env: usize) -> (Placement, Option<RobotModel>) {
+        let mut start = self.episodes[env].start(&self.rules);
         self.commands[env] = Command::hold(start.q, start.kp, start.kd);
         let placement = Placement::above(self.rules.ground(), self.backend.robot(), start.q, START_CLEARANCE);
-        Placement { variation: start.variation, ..placement }
+        let robot = self.robots.as_ref().map(|robots| robots.draw(&mut start.effects));
+        (Placement { variation: start.variation, ..placement }, robot)
     }
 
     /// Sets the commands of all running environments, and restarts those that wait for it (NextStep).
@@ -170,7 +179,7 @@ impl<B: Backend> VecEnv for TaskEnv<B> {
         let envs: Vec<usize> = (0..self.num_envs()).filter(|env| request.wants(*env)).collect();
         if let Some(seeds) = &request.seeds {
             for env in &envs {
-                self.episodes[*env].stream = seeded(seeds[*env]);
+                self.episodes[*env].seed(seeds[*env]);
             }
         }
         self.start_episodes(&envs)?;

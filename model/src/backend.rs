@@ -23,8 +23,11 @@ pub trait Backend: Send {
         Ground::FLAT
     }
 
-    /// Puts robots down anew; each pair is a robot's index and its place.
+    /// Puts nominal robots down anew; each pair is a robot's index and its place.
     fn reset(&mut self, placements: &[(usize, Placement)]) -> Result<(), BackendError>;
+
+    /// Puts one robot down anew as `model`: the nominal robot with other numbers. It is that until its next reset.
+    fn reset_as(&mut self, robot: usize, model: &RobotModel, placement: &Placement) -> Result<(), BackendError>;
 
     /// Advances every robot that is `active` by `drive_periods` periods of the drive under its command.
     ///

@@ -93,6 +93,15 @@ impl RapierBackend {
         if robot < num_robots { Ok(()) } else { Err(BackendError::NoSuchRobot { robot, num_robots }) }
     }
 
+    fn replace_world(&mut self, robot: usize, world: RobotWorld) {
+        self.worlds[robot] = world;
+        if let Some(drive) = &mut self.drive {
+            drive.reset(robot);
+        }
+        self.read_state(robot);
+        self.states.tau[robot] = PerJoint::default();
+    }
+
     fn read_state(&mut self, robot: usize) {
         let (world, states) = (&self.worlds[robot], &mut self.states);
         world.read_joints(&mut states.q[robot], &mut states.dq[robot]);
@@ -157,14 +166,16 @@ impl Backend for RapierBackend {
             self.check_index(*robot)?;
         }
         for (robot, placement) in placements {
-            let robot = *robot;
-            self.worlds[robot] = RobotWorld::new(&self.robot, &self.config, &self.ground_shapes, placement);
-            if let Some(drive) = &mut self.drive {
-                drive.reset(robot);
-            }
-            self.read_state(robot);
-            self.states.tau[robot] = PerJoint::default();
+            let world = RobotWorld::new(&self.robot, &self.config, &self.ground_shapes, placement);
+            self.replace_world(*robot, world);
         }
+        Ok(())
+    }
+
+    fn reset_as(&mut self, robot: usize, model: &RobotModel, placement: &Placement) -> Result<(), BackendError> {
+        self.check_index(robot)?;
+        let world = RobotWorld::new(model, &self.config, &self.ground_shapes, placement);
+        self.replace_world(robot, world);
         Ok(())
     }
 

@@ -75,6 +75,9 @@ struct RootFrame {
     feet: [ColliderHandle; 4],
     upper_body: Vec<ColliderHandle>,
     drive: Drive<f64>,
+    gyro_bias: Vec3,
+    /// With the contacts' softness, which another robot may have otherwise.
+    integration_parameters: IntegrationParameters,
 }
 
 impl RobotWorld {
@@ -267,6 +270,8 @@ impl RobotWorld {
                 feet: self.feet,
                 upper_body: self.upper_body.clone(),
                 drive: self.drive.clone(),
+                gyro_bias: self.gyro_bias,
+                integration_parameters: self.world.integration_parameters,
             },
         }
     }
@@ -277,7 +282,7 @@ impl RobotWorld {
             snapshot.clone();
         self.world = PhysicsWorld {
             gravity: self.world.gravity,
-            integration_parameters: self.world.integration_parameters,
+            integration_parameters: root.integration_parameters,
             islands,
             broad_phase,
             narrow_phase,
@@ -286,9 +291,9 @@ impl RobotWorld {
             multibody_joints,
             ..PhysicsWorld::default()
         };
-        let RootFrame { trunk, multibody, trunk_com, feet, upper_body, drive } = root;
-        (self.trunk, self.multibody, self.trunk_com, self.feet, self.upper_body, self.drive) =
-            (trunk, multibody, trunk_com, feet, upper_body, drive);
+        let RootFrame { trunk, multibody, trunk_com, feet, upper_body, drive, gyro_bias, .. } = root;
+        (self.trunk, self.multibody, self.trunk_com, self.feet, self.upper_body, self.drive, self.gyro_bias) =
+            (trunk, multibody, trunk_com, feet, upper_body, drive, gyro_bias);
     }
 }
 

@@ -12,6 +12,7 @@ mod leases;
 mod log;
 mod play;
 mod python;
+mod randomise;
 mod rapier;
 mod raw_client;
 mod remote;

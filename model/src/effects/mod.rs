@@ -5,6 +5,7 @@
 //! - [`CATALOGUE`]: all of them, in the order of the chain from command to motion.
 //! - [`Scope`]: the joints, or the part of the robot, that an entry of a model file is about.
 //! - [`Entry`]: an effect with a scope and values; [`compose`] makes a robot of several.
+//! - [`RobotDraws`]: robots that differ as far as measured intervals allow.
 //!
 //! An effect acts by changing numbers alone; [`crate::lanes::Drive`] and the engines have the laws.
 
@@ -13,6 +14,7 @@ mod backlash;
 mod com_shift;
 mod command_delay;
 mod coulomb_friction;
+mod draw;
 mod drive_lag;
 mod encoder_offset;
 mod entry;
@@ -36,6 +38,7 @@ mod torque_sensor_delay;
 mod torque_speed_limit;
 mod viscous_friction;
 
+pub use draw::{DrawError, RobotDraws};
 pub use entry::{Entry, EntryError, compose};
 pub use scope::{Scope, UnknownScope};
 

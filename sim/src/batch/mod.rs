@@ -84,6 +84,18 @@ impl BatchBackend {
         Self { drive: Some(drive), ..self }
     }
 
+    fn check_index(&self, robot: usize) -> Result<(), BackendError> {
+        let num_robots = self.num_robots();
+        if robot < num_robots { Ok(()) } else { Err(BackendError::NoSuchRobot { robot, num_robots }) }
+    }
+
+    fn after_place(&mut self, robot: usize) {
+        self.robots.read(robot, &mut self.states);
+        if let Some(drive) = &mut self.drive {
+            drive.reset(robot);
+        }
+    }
+
     fn first_diverged(&self, active: &[bool]) -> Option<BackendError> {
         let active = (0..active.len()).filter(|robot| active[*robot]);
         let mut diverged = active.filter_map(|robot| Some((robot, self.states.first_not_finite(robot)?)));
@@ -121,17 +133,20 @@ impl Backend for BatchBackend {
     }
 
     fn reset(&mut self, placements: &[(usize, Placement)]) -> Result<(), BackendError> {
-        let num_robots = self.num_robots();
-        if let Some((robot, _)) = placements.iter().find(|(robot, _)| *robot >= num_robots) {
-            return Err(BackendError::NoSuchRobot { robot: *robot, num_robots });
+        for (robot, _) in placements {
+            self.check_index(*robot)?;
         }
         for (robot, placement) in placements {
             self.robots.place(*robot, &self.robot, placement);
-            self.robots.read(*robot, &mut self.states);
-            if let Some(drive) = &mut self.drive {
-                drive.reset(*robot);
-            }
+            self.after_place(*robot);
         }
+        Ok(())
+    }
+
+    fn reset_as(&mut self, robot: usize, model: &RobotModel, placement: &Placement) -> Result<(), BackendError> {
+        self.check_index(robot)?;
+        self.robots.place(robot, model, placement);
+        self.after_place(robot);
         Ok(())
     }
 
