@@ -3,6 +3,9 @@
 #![allow(clippy::unwrap_used)]
 
 mod batch;
+mod effect_bodies;
+mod effect_laws;
+mod effect_readings;
 mod effects;
 mod exactly_once;
 mod faults;

@@ -1,0 +1,265 @@
+//! Effects of bodies and ground against closed forms.
+
+use std::f64::consts::TAU;
+
+use glam::{DVec3, Vec3};
+use twinstep_model::effects::{Effect, Entry, compose};
+use twinstep_model::{
+    Backend, Command, Joint, PerJoint, Placement, Pose, RigidBody, RobotModel, RobotStates, body_poses, frames, go2,
+};
+use twinstep_sim::{Base, BatchBackend, Engine, RapierBackend, SimConfig};
+
+const GRAVITY: f64 = 9.81;
+const CALF: usize = 2;
+/// Log-Cholesky coordinates of a body without products of inertia.
+const ALPHA: f64 = -0.55;
+const D1: f64 = -3.2;
+const D2: f64 = -3.0;
+const D3: f64 = -2.4;
+
+pub fn with(robot: &RobotModel, effects: &[(&str, &str, &[f64])]) -> RobotModel {
+    let entry = |(name, scope, values): &(&str, &str, &[f64])| {
+        Entry::new(Effect::named(name).unwrap(), scope.parse().unwrap(), values.to_vec()).unwrap()
+    };
+    compose(robot, &effects.iter().map(entry).collect::<Vec<_>>()).unwrap()
+}
+
+pub fn config(base: Base, physics_hz: u32) -> SimConfig {
+    SimConfig { base, physics_hz: Some(physics_hz), threads: 1, ..SimConfig::default() }
+}
+
+pub fn batch(robot: &RobotModel, config: SimConfig, placement: Placement) -> BatchBackend {
+    let mut backend = BatchBackend::new(robot.clone(), config, 1).unwrap();
+    backend.reset(&[(0, placement)]).unwrap();
+    backend
+}
+
+pub fn rapier(robot: &RobotModel, config: SimConfig, placement: Placement) -> RapierBackend {
+    let config = SimConfig { engine: Engine::Rapier, ..config };
+    let mut backend = RapierBackend::new(robot.clone(), config, 1).unwrap();
+    backend.reset(&[(0, placement)]).unwrap();
+    backend
+}
+
+pub fn run(backend: &mut impl Backend, command: &Command, seconds: f64) {
+    backend.step(&[*command], &[true], (seconds * 200.0).round() as usize).unwrap();
+}
+
+pub fn pose() -> PerJoint {
+    go2().control.default_pose_f32()
+}
+
+/// Where the frames of the bodies are, trunk first.
+fn frames_of(states: &RobotStates) -> Vec<Pose> {
+    let trunk = Pose {
+        position: Vec3::from(states.base_position[0]),
+        rotation: frames::world_from_base(states.base_orientation[0]),
+    };
+    body_poses(&go2(), trunk, &states.q[0]).to_vec()
+}
+
+/// Masses [kg] and where they are in their bodies' frames [m]: the nominal ones, and `body` with what `change` makes of
+/// it.
+fn masses(body: usize, change: impl Fn(&RigidBody) -> Vec<(f64, DVec3)>) -> Vec<(usize, f64, DVec3)> {
+    let robot = go2();
+    let bodies = std::iter::once(&robot.trunk).chain(robot.legs.iter().flat_map(|leg| &leg.bodies));
+    let masses = bodies.enumerate().flat_map(|(index, own)| {
+        let parts = if index == body { change(own) } else { vec![(own.mass, own.com)] };
+        parts.into_iter().map(move |(mass, place)| (index, mass, place))
+    });
+    masses.collect()
+}
+
+/// Effects of a body, and the masses that it consists of then.
+type BodyCase<'a> = ((&'a str, &'a [f64]), fn(&RigidBody) -> Vec<(f64, DVec3)>);
+
+const LINK_CASES: [BodyCase; 3] = [
+    (("payload", &[0.4, 0.05, 0.03, -0.1]), |own| vec![(own.mass, own.com), (0.4, DVec3::new(0.05, 0.03, -0.1))]),
+    (("com_shift", &[0.04, -0.02, -0.06]), |own| vec![(own.mass, own.com + DVec3::new(0.04, -0.02, -0.06))]),
+    (("inertia", &[ALPHA, D1, D2, D3, 0.0, 0.0, 0.0, 0.03, 0.02, -0.12]), |_| {
+        vec![((2.0 * ALPHA).exp(), DVec3::new(0.03, 0.02, -0.12))]
+    }),
+];
+
+#[test]
+fn held_leg_carries_the_weight_of_its_links() {
+    for ((name, values), change) in LINK_CASES {
+        let robot = with(&go2(), &[(name, "FL_calf", values)]);
+        let mut backend = batch(&robot, config(Base::Fixed, 1000), Placement::at_rest(1.0, pose()));
+        run(&mut backend, &Command::hold(pose(), 60.0, 2.0), 3.0);
+        let (states, frames) = (backend.states(), frames_of(backend.states()));
+        for joint in 0..3 {
+            let axis = frames[1 + joint].rotation * RobotModel::axis(Joint::ALL[joint]).as_vec3();
+            let carried: f64 = masses(1 + CALF, change)
+                .iter()
+                .filter(|(body, ..)| (1 + joint..=3).contains(body))
+                .map(|(body, mass, place)| {
+                    let lever = frames[*body].transform(place.as_vec3()) - frames[1 + joint].position;
+                    mass * GRAVITY * f64::from(axis.dot(lever.cross(Vec3::Z)))
+                })
+                .sum();
+            let tau = f64::from(states.tau[0][joint]);
+            assert!((tau - carried).abs() < 2e-3, "`{name}`, joint {joint}: {tau} N·m carry {carried}");
+        }
+    }
+}
+
+/// Every joint but one has so heavy a rotor that it stays.
+fn lone_calf(robot: &RobotModel) -> RobotModel {
+    let mut robot = robot.clone();
+    for (_, model) in robot.joints.iter_mut().enumerate().filter(|(joint, _)| *joint != CALF) {
+        model.armature = 1e4;
+    }
+    robot.joints[CALF].range = [-6.0, 6.0];
+    robot
+}
+
+#[test]
+fn limp_calf_swings_with_the_period_of_its_pendulum() {
+    // Moments about the calf's axis, y, beside those of the masses.
+    let own = go2().legs[0].bodies[2].inertia.y_axis.y;
+    let moments = [own, own, (2.0 * ALPHA).exp() * ((2.0 * D1).exp() + (2.0 * D3).exp())];
+    for (((name, values), change), moment) in LINK_CASES.into_iter().zip(moments) {
+        let robot = lone_calf(&with(&go2(), &[(name, "FL_calf", values)]));
+        let (mut inertia, mut lever) = (moment + robot.joints[CALF].armature, DVec3::ZERO);
+        for (_, mass, place) in masses(1 + CALF, change).iter().filter(|(body, ..)| *body == 1 + CALF) {
+            inertia += mass * (place.x.powi(2) + place.z.powi(2));
+            lever += *mass * *place;
+        }
+        let expected = TAU * (inertia / (GRAVITY * lever.x.hypot(lever.z))).sqrt();
+
+        let rest = lever.x.atan2(-lever.z);
+        let mut placement = Placement::at_rest(2.0, [0.0; 12]);
+        placement.q[CALF] = rest as f32 + 0.1;
+        let mut backend = batch(&robot, config(Base::Fixed, 1000), placement);
+        let mut crossings = Vec::new();
+        let mut before = 1.0;
+        for period in 1..=1000 {
+            run(&mut backend, &Command::hold([0.0; 12], 0.0, 0.0), 0.005);
+            let now = f64::from(backend.states().q[0][CALF]) - rest;
+            if before > 0.0 && now <= 0.0 {
+                crossings.push(0.005 * (f64::from(period) - now / (now - before)));
+            }
+            before = now;
+        }
+        let swings = (crossings.len() - 1) as f64;
+        let measured = (crossings[crossings.len() - 1] - crossings[0]) / swings;
+        assert!((measured / expected - 1.0).abs() < 2e-3, "`{name}`: {measured} s, closed form {expected} s");
+    }
+}
+
+#[test]
+fn feet_of_a_standing_robot_carry_its_trunk_where_its_mass_is() {
+    let cases: [BodyCase; 3] = [
+        (("payload", &[3.0, 0.12, 0.05, 0.1]), |own| vec![(own.mass, own.com), (3.0, DVec3::new(0.12, 0.05, 0.1))]),
+        (("com_shift", &[-0.05, 0.03, 0.02]), |own| vec![(own.mass, own.com + DVec3::new(-0.05, 0.03, 0.02))]),
+        (("inertia", &[1.1, -1.9, -2.3, -2.8, 0.0, 0.0, 0.0, 0.04, -0.02, 0.01]), |_| {
+            vec![(2.2f64.exp(), DVec3::new(0.04, -0.02, 0.01))]
+        }),
+    ];
+    for ((name, values), change) in cases {
+        let robot = with(&go2(), &[(name, "base", values)]);
+        let mut backend = batch(&robot, config(Base::Floating, 1000), Placement::at_rest(0.33, pose()));
+        run(&mut backend, &Command::hold(pose(), 100.0, 3.0), 4.0);
+        let (states, frames) = (backend.states(), frames_of(backend.states()));
+        let (mut weight, mut moment) = (0.0, DVec3::ZERO);
+        for (body, mass, place) in masses(0, change) {
+            weight += GRAVITY * mass;
+            moment += GRAVITY * mass * frames[body].transform(place.as_vec3()).as_dvec3();
+        }
+        let (mut carried, mut foot_moment) = (0.0, DVec3::ZERO);
+        for (leg, force) in states.foot_force[0].into_iter().enumerate() {
+            carried += f64::from(force);
+            let foot = frames[3 + 3 * leg].transform(robot.shapes.foot_centre.as_vec3());
+            foot_moment += f64::from(force) * foot.as_dvec3();
+        }
+        assert!((carried / weight - 1.0).abs() < 2e-3, "`{name}`: {carried} N of {weight} N");
+        let off = (foot_moment / carried - moment / weight).truncate();
+        assert!(off.length() < 1e-3, "`{name}`: the feet's centre of pressure is {off} m off");
+    }
+}
+
+#[test]
+fn sliding_robot_is_slowed_by_friction_times_gravity() {
+    fn slowed(mut backend: impl Backend, hold: &Command) -> f64 {
+        run(&mut backend, hold, 0.1);
+        let before = backend.states().base_linear_velocity[0][0];
+        run(&mut backend, hold, 0.2);
+        f64::from(before - backend.states().base_linear_velocity[0][0]) / 0.2
+    }
+    // Crouched and stiff, so that it does not tip over.
+    let crouch = Joint::map_kinds(0.0, 1.3, -2.6);
+    let ground = Placement::above(&twinstep_model::Ground::FLAT, &go2(), crouch, 0.0);
+    let placement = Placement { base_linear_velocity: [2.0, 0.0, 0.0], ..ground };
+    let hold = Command::hold(crouch, 200.0, 5.0);
+    for coefficient in [0.1, 0.3] {
+        let robot = with(&go2(), &[("ground_friction", "ground", &[coefficient])]);
+        let stand = config(Base::Floating, 1000);
+        let engines = [slowed(batch(&robot, stand, placement), &hold), slowed(rapier(&robot, stand, placement), &hold)];
+        for slowed in engines {
+            let expected = coefficient * GRAVITY;
+            assert!((slowed / expected - 1.0).abs() < 0.03, "{slowed} m/s², closed form {expected}: {engines:?}");
+        }
+    }
+}
+
+/// Heights [m] of a point on MuJoCo's contact of time constant T [s] after each 5 ms, from 0 under a pull of `free`
+/// [m/s²]: `a = d (−b v − k d r) + (1 − d) free`, where the impedance d grows with the depth from 0.9 to 0.95 in 1 mm.
+fn sinking(time_constant: f64, free: f64, periods: usize) -> Vec<f64> {
+    let (h, [mut r, mut v]) = (5e-6, [0.0, 0.0]);
+    let (b, k) = (2.0 / (0.95 * time_constant), (0.95 * time_constant).powi(-2));
+    let mut after_5_ms = || {
+        for _ in 0..1000 {
+            let d = 0.9 + 0.05 * (-r / 0.001f64).clamp(0.0, 1.0);
+            v += h * (d * (-b * v - k * d * r) + (1.0 - d) * free);
+            r += h * v;
+        }
+        r
+    };
+    (0..periods).map(|_| after_5_ms()).collect()
+}
+
+/// A foot that a constant torque presses onto the ground without friction, its joint alone free to move.
+#[test]
+fn pressed_foot_sinks_in_and_settles_with_the_grounds_time_constant() {
+    for time_constant in [0.05, 0.1] {
+        let mut robot = lone_calf(&with(&go2(), &[("ground_stiffness", "ground", &[time_constant])]));
+        robot.contact.friction = 0.0;
+        let height = |states: &RobotStates| {
+            let foot = frames_of(states)[3].transform(robot.shapes.foot_centre.as_vec3());
+            f64::from(foot.z) - robot.shapes.foot_radius
+        };
+        // Above it first, to know how high it is; the other legs are out of the way.
+        let mut q = pose();
+        for leg in 1..4 {
+            (q[3 * leg + 1], q[3 * leg + 2]) = (1.5, -2.7);
+        }
+        let far = batch(&robot, config(Base::Fixed, 2000), Placement::at_rest(1.0, q));
+        let touching = 1.0 - height(far.states());
+        let mut backend = batch(&robot, config(Base::Fixed, 2000), Placement::at_rest(touching as f32, q));
+
+        let body = &robot.legs[0].bodies[2];
+        let inertia =
+            body.inertia.y_axis.y + body.mass * (body.com.x.powi(2) + body.com.z.powi(2)) + robot.joints[CALF].armature;
+        // As much as sinks the foot 4 mm.
+        let pull = -0.004 / (0.05 * time_constant * time_constant);
+        let pushing = |states: &RobotStates| {
+            let rotation = frames_of(states)[3].rotation;
+            // The foot's height by the joint's angle, about y.
+            let slope = -f64::from((rotation * robot.shapes.foot_centre.as_vec3()).x);
+            let weight = body.mass * GRAVITY * f64::from((rotation * body.com.as_vec3()).x);
+            let mut command = Command::hold(q, 0.0, 0.0);
+            command.tau_ff[CALF] = (pull / slope * inertia - weight) as f32;
+            command
+        };
+        let expected = sinking(time_constant, pull, (10.0 * time_constant / 0.005) as usize);
+        for (period, expected) in expected.iter().enumerate() {
+            let command = pushing(backend.states());
+            run(&mut backend, &command, 0.005);
+            let measured = height(backend.states());
+            assert!((measured - expected).abs() < 4e-5, "T = {time_constant} s, {period}: {measured} m, {expected} m");
+        }
+        // At full impedance: a spring of 1/T² against a twentieth of the pull.
+        assert!((expected[expected.len() - 1] / -0.004 - 1.0).abs() < 0.01, "{expected:?}");
+    }
+}

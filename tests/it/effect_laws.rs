@@ -1,0 +1,258 @@
+//! Effects of the joints against their laws, integrated here anew: one joint, plain numbers, steps ten times finer.
+//!
+//! A calf turns alone, its centre of mass on its axis, so that neither gravity nor other joints act on it; it follows a
+//! chirp under PD. [`Law`] is written from `twinstep effects`, not from the engines.
+
+use glam::DVec3;
+use twinstep_model::effects::{Effect, Entry, compose};
+use twinstep_model::{Backend, Command, Job, Placement, RobotModel, RobotStates, Rollout, go2};
+use twinstep_sim::{Base, BatchRollout, Engine, RapierBackend, SimConfig};
+
+const CALF: usize = 2;
+const PERIODS: usize = 200;
+/// One drive period [s].
+const PERIOD: f64 = 0.005;
+/// Physics steps in a drive period, of the engines and of the integration here.
+const STEPS: usize = 20;
+const FINE_STEPS: usize = 10 * STEPS;
+const KP: f64 = 30.0;
+const KD: f64 = 0.75;
+
+/// One joint with what it may have; the default has nothing.
+#[derive(Clone, Copy, Default)]
+struct Law {
+    command_delay: f64,
+    encoder_offset: f64,
+    /// κ; 0 for none, as with all that follows.
+    saturation: f64,
+    torque_delay: f64,
+    no_load_speed: f64,
+    lag: f64,
+    /// The torque constant's error: gain − 1.
+    gain_error: f64,
+    /// Amplitude, cycles, phase.
+    ripple: [f64; 3],
+    gap: f64,
+    stiffness: f64,
+    coulomb: f64,
+    viscous: f64,
+    /// Breakaway, speed.
+    stribeck: [f64; 2],
+    load: f64,
+    armature: f64,
+    /// Stiffness, rest.
+    spring: [f64; 2],
+}
+
+/// Effects of a model file by name, with their values.
+type Effects = &'static [(&'static str, &'static [f64])];
+type Change = fn(&mut Law);
+
+/// Entries of a model file, and what the law has then.
+const CASES: [(Effects, Change); 19] = [
+    (&[("command_delay", &[0.0123])], |law| law.command_delay = 0.0123),
+    (&[("encoder_offset", &[0.04]), ("joint_spring", &[4.0, -1.0])], |law| {
+        (law.encoder_offset, law.spring) = (0.04, [4.0, -1.0]);
+    }),
+    (&[("torque_saturation", &[2.0]), ("joint_spring", &[6.0, -1.5])], |law| {
+        (law.saturation, law.spring) = (2.0, [6.0, -1.5]);
+    }),
+    (&[("torque_delay", &[0.0087])], |law| law.torque_delay = 0.0087),
+    (&[("torque_speed_limit", &[6.0])], |law| law.no_load_speed = 6.0),
+    (&[("drive_lag", &[0.01])], |law| law.lag = 0.01),
+    (&[("torque_gain", &[0.7])], |law| law.gain_error = -0.3),
+    (&[("torque_ripple", &[0.5, 14.0, 0.4])], |law| law.ripple = [0.5, 14.0, 0.4]),
+    (&[("backlash", &[0.05]), ("viscous_friction", &[0.3])], |law| {
+        (law.gap, law.stiffness, law.viscous) = (0.05, 2000.0, 0.3);
+    }),
+    (&[("joint_elasticity", &[60.0]), ("viscous_friction", &[0.1])], |law| (law.stiffness, law.viscous) = (60.0, 0.1)),
+    (&[("backlash", &[0.03]), ("joint_elasticity", &[100.0]), ("viscous_friction", &[0.2])], |law| {
+        (law.gap, law.stiffness, law.viscous) = (0.03, 100.0, 0.2);
+    }),
+    (&[("coulomb_friction", &[0.8])], |law| law.coulomb = 0.8),
+    (&[("viscous_friction", &[0.3])], |law| law.viscous = 0.3),
+    (&[("stribeck_friction", &[1.2, 0.4])], |law| law.stribeck = [1.2, 0.4]),
+    (&[("coulomb_friction", &[0.2]), ("load_friction", &[0.2])], |law| (law.coulomb, law.load) = (0.2, 0.2)),
+    (&[("armature", &[0.015])], |law| law.armature = 0.015),
+    (&[("joint_spring", &[4.0, -1.0])], |law| law.spring = [4.0, -1.0]),
+    // The order of the chain up to the gear.
+    (
+        &[
+            ("command_delay", &[0.007]),
+            ("encoder_offset", &[-0.03]),
+            ("torque_saturation", &[6.0]),
+            ("torque_delay", &[0.004]),
+            ("torque_speed_limit", &[15.0]),
+            ("drive_lag", &[0.003]),
+            ("torque_gain", &[0.8]),
+            ("torque_ripple", &[0.3, 10.0, -1.0]),
+        ],
+        |law| {
+            (law.command_delay, law.encoder_offset, law.saturation, law.torque_delay) = (0.007, -0.03, 6.0, 0.004);
+            (law.no_load_speed, law.lag, law.gain_error, law.ripple) = (15.0, 0.003, -0.2, [0.3, 10.0, -1.0]);
+        },
+    ),
+    // And from there on.
+    (
+        &[
+            ("torque_gain", &[1.2]),
+            ("joint_elasticity", &[150.0]),
+            ("coulomb_friction", &[0.3]),
+            ("viscous_friction", &[0.1]),
+            ("stribeck_friction", &[0.4, 0.3]),
+            ("load_friction", &[0.1]),
+            ("armature", &[0.01]),
+            ("joint_spring", &[2.0, -0.5]),
+        ],
+        |law| {
+            (law.gain_error, law.stiffness, law.coulomb, law.viscous) = (0.2, 150.0, 0.3, 0.1);
+            (law.stribeck, law.load, law.armature, law.spring) = ([0.4, 0.3], 0.1, 0.01, [2.0, -0.5]);
+        },
+    ),
+];
+
+/// The calf alone: its centre of mass on the axis, no end to its range, every other joint too heavy to move.
+fn lone_calf() -> RobotModel {
+    let mut robot = go2();
+    for (joint, model) in robot.joints.iter_mut().enumerate().filter(|(joint, _)| *joint != CALF) {
+        model.armature = 1e4 + joint as f64;
+    }
+    robot.legs[0].bodies[2].com = DVec3::ZERO;
+    robot.joints[CALF].range = [-6.0, 6.0];
+    robot
+}
+
+fn start() -> f64 {
+    go2().control.default_pose[CALF]
+}
+
+/// Position [rad] and velocity [rad/s] that are asked for; at rest before 0.
+fn chirp(t: f64) -> [f64; 2] {
+    let t = t.max(0.0);
+    let (phase, rate) = (std::f64::consts::TAU * (0.5 + 1.25 * t) * t, std::f64::consts::TAU * (0.5 + 2.5 * t));
+    [start() + 0.4 * (1.0 - phase.cos()), 0.4 * rate * phase.sin()]
+}
+
+/// What encoder [rad] and current sensor [N·m, mean over the period before] show after each drive period.
+fn integrate(law: &Law) -> Vec<[f64; 2]> {
+    let robot = lone_calf();
+    let (limit, rotor_inertia) = (robot.joints[CALF].torque_limit, robot.joints[CALF].armature + law.armature);
+    let elastic = law.stiffness > 0.0;
+    let inertia = robot.legs[0].bodies[2].inertia.y_axis.y + if elastic { 0.0 } else { rotor_inertia };
+    let h = PERIOD / FINE_STEPS as f64;
+    let mut link = [start() - law.encoder_offset, 0.0];
+    let (mut rotor, mut current, mut asked, mut rows) = (link, 0.0, Vec::new(), Vec::new());
+    for period in 0..PERIODS {
+        let start = period as f64 * PERIOD;
+        let [target, speed] = chirp(start - law.command_delay);
+        let mut tau = KP * (target - rotor[0] - law.encoder_offset) + KD * (speed - rotor[1]);
+        if law.saturation > 0.0 {
+            tau = law.saturation * (tau / law.saturation).tanh();
+        }
+        asked.push(tau.clamp(-limit, limit));
+        let mut shown = 0.0;
+        for step in 0..FINE_STEPS {
+            let then = start + (step as f64 + 0.5) * h - law.torque_delay;
+            let mut tau = if then < 0.0 { 0.0 } else { asked[(then / PERIOD) as usize] };
+            if law.no_load_speed > 0.0 {
+                let left = limit * (1.0 - rotor[1] * tau.signum() / law.no_load_speed).clamp(0.0, 1.0);
+                tau = tau.clamp(-left, left);
+            }
+            current = if law.lag > 0.0 { current + h * (tau - current) / law.lag } else { tau };
+            shown += current / FINE_STEPS as f64;
+            let [amplitude, cycles, phase] = law.ripple;
+            let motor = (1.0 + law.gain_error) * current + amplitude * (cycles * rotor[0] + phase).sin();
+            let mut through = motor;
+            if elastic {
+                let twist = rotor[0] - link[0];
+                through = law.stiffness * (twist - twist.clamp(-0.5 * law.gap, 0.5 * law.gap));
+                rotor[1] += h * (motor - through) / rotor_inertia;
+                rotor[0] += h * rotor[1];
+            }
+            let [breakaway, fading] = law.stribeck;
+            let stribeck = if breakaway > 0.0 { breakaway * (-(link[1] / fading).powi(2)).exp() } else { 0.0 };
+            let dry = law.coulomb + stribeck + law.load * motor.abs();
+            let [spring, rest] = law.spring;
+            let free = link[1] + h * (through - law.viscous * link[1] - spring * (link[0] - rest)) / inertia;
+            link[1] = free.signum() * (free.abs() - h * dry / inertia).max(0.0);
+            link[0] += h * link[1];
+            if !elastic {
+                rotor = link;
+            }
+        }
+        rows.push([rotor[0] + law.encoder_offset, shown]);
+    }
+    rows
+}
+
+fn placement() -> Placement {
+    Placement::at_rest(2.0, go2().control.default_pose_f32())
+}
+
+fn commands() -> Vec<Command> {
+    let command = |period: usize| {
+        let mut command = Command::hold(placement().q, KP as f32, KD as f32);
+        let [q, dq] = chirp(period as f64 * PERIOD);
+        (command.q[CALF], command.dq[CALF]) = (q as f32, dq as f32);
+        command
+    };
+    (0..PERIODS).map(command).collect()
+}
+
+fn config(engine: Engine) -> SimConfig {
+    let physics_hz = Some((STEPS as f64 / PERIOD) as u32);
+    SimConfig { engine, base: Base::Fixed, physics_hz, threads: 1, ..SimConfig::default() }
+}
+
+fn shown(states: &RobotStates, entry: usize) -> [f64; 2] {
+    [states.q[entry][CALF], states.tau[entry][CALF]].map(f64::from)
+}
+
+fn in_rapier(robot: RobotModel) -> Vec<[f64; 2]> {
+    let mut backend = RapierBackend::new(robot, config(Engine::Rapier), 1).unwrap();
+    backend.reset(&[(0, placement())]).unwrap();
+    let step = |command: &Command| {
+        backend.step(&[*command], &[true], 1).unwrap();
+        shown(backend.states(), 0)
+    };
+    commands().iter().map(step).collect()
+}
+
+/// Root mean square; torques count as the positions that a spring of 50 N·m/rad would turn them into.
+fn rms(one: &[[f64; 2]], other: &[[f64; 2]]) -> f64 {
+    let square =
+        |(one, other): (&[f64; 2], &[f64; 2])| (one[0] - other[0]).powi(2) + (0.02 * (one[1] - other[1])).powi(2);
+    (one.iter().zip(other).map(square).sum::<f64>() / one.len() as f64).sqrt()
+}
+
+#[test]
+fn effects_of_joints_follow_their_laws_in_both_engines() {
+    let robot = |entries: &[(&str, &[f64])]| {
+        let entry = |(name, values): &(&str, &[f64])| {
+            Entry::new(Effect::named(name).unwrap(), "FL_calf".parse().unwrap(), values.to_vec()).unwrap()
+        };
+        compose(&lone_calf(), &entries.iter().map(entry).collect::<Vec<_>>()).unwrap()
+    };
+    let commands = commands();
+    let robots: Vec<_> = std::iter::once(lone_calf()).chain(CASES.iter().map(|(entries, _)| robot(entries))).collect();
+    let jobs: Vec<_> = robots.iter().map(|robot| Job { robot, start: placement(), commands: &commands }).collect();
+    let played = BatchRollout::new(&lone_calf(), &config(Engine::Batch)).unwrap().play(&jobs);
+    let in_batch = |index: usize| -> Vec<_> { (1..=PERIODS).map(|entry| shown(&played[index], entry)).collect() };
+
+    let ideal = integrate(&Law::default());
+    assert!(rms(&in_batch(0), &ideal) < 2e-4, "{} rad", rms(&in_batch(0), &ideal));
+    for (index, (entries, change)) in CASES.iter().enumerate() {
+        let mut law = Law::default();
+        change(&mut law);
+        let expected = integrate(&law);
+        let changed = rms(&expected, &ideal);
+        let batch = rms(&in_batch(index + 1), &expected);
+        let rapier = rms(&in_rapier(robots[index + 1].clone()), &expected);
+        let names: Vec<_> = entries.iter().map(|(name, _)| *name).collect();
+        println!("{:<50} changes {changed:.4}, batch {batch:.5}, rapier {rapier:.5} off", names.join(" "));
+        assert!(changed > 0.002, "{names:?} changes {changed} only");
+        for off in [batch, rapier] {
+            assert!(off < 0.01 * changed + 2e-4, "{names:?} changes {changed}, batch is {batch} off, rapier {rapier}");
+        }
+    }
+}

@@ -1,0 +1,92 @@
+//! What sensors show and a log tells, against the definitions of the effects.
+
+use glam::Vec3;
+use twinstep_logs::{Base as LoggedBase, Log, Meta, Segment, TauSensor};
+use twinstep_model::{Backend, Command, Job, Placement, RobotModel, RobotStates, Rollout, go2};
+use twinstep_sim::{Base, SimConfig};
+use twinstep_sysid::Experiment;
+
+use crate::effect_bodies::{batch, config, pose, rapier, run, with};
+
+const CALF: usize = 2;
+
+fn check_gyroscope<B: Backend>(of: impl Fn(&RobotModel, SimConfig, Placement) -> B) {
+    let biased = [("gyro_bias", "base", &[0.3, -0.2, 0.1][..]), ("gyro_bias", "base", &[0.1, 0.0, 0.0])];
+    let thrown = Placement { base_angular_velocity: [1.0, 0.5, -0.8], ..Placement::at_rest(3.0, pose()) };
+    let [mut biased, mut ideal] =
+        [with(&go2(), &biased), go2()].map(|robot| of(&robot, config(Base::Floating, 1000), thrown));
+    for _ in 0..20 {
+        run(&mut biased, &Command::hold(pose(), 30.0, 0.75), 0.02);
+        run(&mut ideal, &Command::hold(pose(), 30.0, 0.75), 0.02);
+        assert_eq!(biased.states().base_orientation, ideal.states().base_orientation);
+        let [shown, turning] = [&biased, &ideal].map(|one| Vec3::from(one.states().base_angular_velocity[0]));
+        assert!((shown - turning - Vec3::new(0.4, -0.2, 0.1)).length() < 1e-6, "{shown} of {turning}");
+    }
+}
+
+#[test]
+fn gyroscope_shows_its_bias_and_the_motion_is_the_same() {
+    check_gyroscope(batch);
+    check_gyroscope(rapier);
+}
+
+/// Keeps what it is told, and answers with a torque that grows by 0.1 N·m a drive period.
+#[derive(Default)]
+struct Told(Vec<Command>);
+
+impl Rollout for Told {
+    fn play(&mut self, jobs: &[Job]) -> Vec<RobotStates> {
+        self.0 = jobs[0].commands.to_vec();
+        let mut states = RobotStates::new(self.0.len() + 1);
+        for (entry, tau) in states.tau.iter_mut().enumerate().skip(1) {
+            *tau = [0.1 * (entry - 1) as f32; 12];
+        }
+        vec![states]
+    }
+}
+
+/// Residuals and commands of a log of the FL calf at 200 Hz: 30 to 24 V, 30 to 90 °C, a torque `late` periods late.
+fn told(robot: &RobotModel, late: f64) -> (Vec<f64>, Vec<Command>) {
+    let rows = 60;
+    let column = |of: &dyn Fn(f64) -> f64| (0..rows).map(|row| of(f64::from(row))).collect::<Vec<_>>();
+    let segments = vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }];
+    let columns = [
+        ("t", column(&|row| 0.005 * row)),
+        ("kp", column(&|_| 30.0)),
+        ("kd", column(&|_| 0.75)),
+        ("q_FL_calf", column(&|_| 0.0)),
+        ("q_cmd_FL_calf", column(&|_| 0.0)),
+        ("tau_measured_FL_calf", column(&|row| 0.1 * (row - late))),
+        ("battery_V", column(&|row| 30.0 - 0.1 * row)),
+        ("temp_FL_calf", column(&|row| 30.0 + row)),
+    ];
+    let log =
+        Log::new(Meta::new(200.0, TauSensor::Current, segments), columns.map(|(name, cells)| (name.to_owned(), cells)));
+    let mut simulator = Told::default();
+    let experiment = Experiment::new(&log.unwrap(), robot).unwrap().only(|row| row >= 10);
+    let residuals = experiment.residuals(&mut simulator, std::slice::from_ref(robot));
+    (residuals.into_iter().next().unwrap(), simulator.0)
+}
+
+#[test]
+fn late_torque_sensor_shows_what_was() {
+    for (delay, late) in [(0.0, 0.0), (0.01, 2.0), (0.0065, 1.3)] {
+        let (residuals, _) = told(&with(&go2(), &[("torque_sensor_delay", "all", &[delay])]), late);
+        let worst = residuals.iter().fold(0.0f64, |worst, residual| worst.max(residual.abs()));
+        assert!(worst < 1e-3, "{delay} s: {worst} deviations");
+    }
+    let (residuals, _) = told(&go2(), 2.0);
+    assert!(residuals.iter().any(|residual| residual.abs() > 0.1), "{residuals:?}");
+}
+
+#[test]
+fn supply_and_heat_leave_the_share_of_torque_that_their_laws_say() {
+    let robot = with(&go2(), &[("supply_sag", "all", &[1.7]), ("thermal_derating", "FL_calf", &[0.004, 40.0])]);
+    for (row, command) in told(&robot, 0.0).1.iter().enumerate() {
+        let row = row as f64;
+        let cold = ((30.0 - 0.1 * row) / 30.0).powf(1.7);
+        let hot = cold * (1.0 - 0.004 * (row - 10.0).max(0.0));
+        let [of_calf, of_thigh] = [CALF, CALF - 1].map(|joint| f64::from(command.strength[joint]));
+        assert!((of_calf - hot).abs() < 1e-6 && (of_thigh - cold).abs() < 1e-6, "row {row}: {of_calf} {of_thigh}");
+    }
+}
