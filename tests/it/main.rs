@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod any_robot;
 mod batch;
 mod effect_bodies;
 mod effect_laws;
