@@ -136,19 +136,17 @@ mod tests {
         assert_eq!(random, stream(1, "draws", 0));
     }
 
-    fn delays(scope: &str, high: f64) -> String {
-        let delay = |scope: &str| {
-            effect(&format!(
-                "name = \"command_delay\"; scope = \"{scope}\"; delay_s = 0.01; interval = {{ delay_s = [0.0, {high}] }}"
-            ))
-        };
-        delay("all") + &delay(scope)
+    /// Two delays that add up at the hips.
+    fn delays(high: f64) -> String {
+        let of = |scope: &str| format!("name = \"command_delay\"; scope = \"{scope}\"; delay_s = 0.01");
+        let interval = format!("; interval = {{ delay_s = [0.0, {high}] }}");
+        effect(&(of("all") + &interval)) + &effect(&(of("hip") + &interval))
     }
 
     #[test]
     fn what_is_no_robot_is_drawn_again() {
         // Each is 0.015 s in the middle: they add up to more than 0.04 s now and then.
-        let (draws, mut random) = (draws(&delays("hip", 0.03)).expect("robots"), stream(1, "draws", 0));
+        let (draws, mut random) = (draws(&delays(0.03)).expect("robots"), stream(1, "draws", 0));
         assert!((0..200).any(|_| draws.attempt(&mut random).is_err()));
         for _ in 0..200 {
             assert!(draws.draw(&mut random).joints[0].drive.command_delay <= JointDrive::LONGEST_DELAY);
@@ -157,10 +155,10 @@ mod tests {
 
     #[test]
     fn intervals_that_are_of_hardly_any_robot_are_refused_with_the_reason() {
-        let error = draws(&delays("hip", 0.06)).expect_err("refused");
+        let error = draws(&delays(0.06)).expect_err("refused");
         expect![["of 100 robots drawn from the intervals of the model file only 19 can be, at least half must: \
-                  `command_delay` on hip does not go with another entry: the delays of a joint add up to more than 0.04 s; \
-                  make the intervals narrower"]]
+                  `command_delay` on hip does not go with another entry: the delays of a joint add up to more than \
+                  0.04 s; make the intervals narrower"]]
         .assert_eq(&error.to_string());
     }
 }
