@@ -42,6 +42,13 @@ impl Derating {
     /// Full torque at any voltage and temperature.
     pub const NONE: Derating =
         Derating { voltage_exponent: 0.0, per_kelvin: [0.0; NUM_JOINTS], above_c: [35.0; NUM_JOINTS] };
+
+    /// What is left of a joint's torque at a share of the reference voltage and a motor temperature [°C]; a temperature
+    /// that nobody knows is NaN.
+    pub fn strength(&self, joint: usize, voltage_share: f64, temperature_c: f64) -> f64 {
+        let hot = (temperature_c - self.above_c[joint]).max(0.0);
+        voltage_share.powf(self.voltage_exponent) * (1.0 - self.per_kelvin[joint] * hot)
+    }
 }
 
 impl RobotModel {

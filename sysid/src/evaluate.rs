@@ -3,7 +3,7 @@
 use serde::Serialize;
 use std::collections::BTreeMap;
 use twinstep_logs::Log;
-use twinstep_model::{JOINT_NAMES, RobotModel, Rollout};
+use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout};
 
 use crate::experiment::{Experiment, ExperimentError};
 use crate::torque::torque_errors;
@@ -36,7 +36,9 @@ pub fn evaluate(
     keep: impl Fn(usize) -> bool,
 ) -> Result<Evaluation, ExperimentError> {
     let experiment = Experiment::new(log, robot)?.only(&keep);
-    let positions = experiment.position_errors(simulator, robot);
+    let positions = experiment
+        .position_errors(simulator, robot)
+        .map(|errors| (errors.iter().map(|(_, error)| error * error).sum(), errors.len()));
     let torques = torque_errors(log, robot, &keep)?;
     let root = |(sum, count): (f64, usize)| (count > 0).then(|| (sum / count as f64).sqrt());
     let whole = |sums: &[(f64, usize)]| {
@@ -55,4 +57,16 @@ pub fn evaluate(
         q_rmse_rad: whole(&positions),
         per_joint: per_joint.collect(),
     })
+}
+
+/// Simulated less measured position [rad] in closed loop, by joint: each with its row, of the rows that `keep` chooses.
+///
+/// A row where the robot is put down as it was measured has none.
+pub fn position_errors(
+    log: &Log,
+    robot: &RobotModel,
+    simulator: &mut dyn Rollout,
+    keep: impl Fn(usize) -> bool,
+) -> Result<[Vec<(usize, f64)>; NUM_JOINTS], ExperimentError> {
+    Ok(Experiment::new(log, robot)?.only(keep).position_errors(simulator, robot))
 }

@@ -170,19 +170,16 @@ impl Experiment {
         blocks
     }
 
-    /// Sums of squares and counts of the position errors of each joint [rad²], simulated from measured states.
-    pub fn position_errors(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> [(f64, usize); NUM_JOINTS] {
+    /// Simulated less measured position of each joint [rad] with its row, simulated from measured states.
+    pub fn position_errors(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> [Vec<(usize, f64)>; NUM_JOINTS] {
         let windows = self.play(simulator, std::slice::from_ref(robot));
-        let mut sums = [(0.0, 0); NUM_JOINTS];
+        let mut errors = [const { Vec::new() }; NUM_JOINTS];
         for (channel, window, states) in self.compared(&windows) {
             if let Quantity::Position(joint) = channel.quantity {
-                self.compare(channel, window, states, robot, |_, difference| {
-                    sums[joint].0 += difference * difference;
-                    sums[joint].1 += 1;
-                });
+                self.compare(channel, window, states, robot, |row, difference| errors[joint].push((row, difference)));
             }
         }
-        sums
+        errors
     }
 
     fn play(&self, simulator: &mut dyn Rollout, candidates: &[RobotModel]) -> Vec<RobotStates> {
@@ -386,18 +383,13 @@ impl Player<'_> {
 
 /// What supply and heat leave of each joint's torque in a row.
 pub fn strength(log: &Log, robot: &RobotModel, row: usize) -> [f32; NUM_JOINTS] {
-    let derating = &robot.derating;
     let voltage = log.channel("battery_V").map_or(1.0, |cells| {
         let highest = cells.iter().copied().filter(|cell| cell.is_finite()).fold(f64::MIN_POSITIVE, f64::max);
         if cells[row].is_finite() { cells[row] / highest } else { 1.0 }
     });
     std::array::from_fn(|joint| {
-        let name = Joint::ALL[joint].name();
-        let hot = log.channel(&format!("temp_{name}")).map_or(0.0, |cells| {
-            let above = cells[row] - derating.above_c[joint];
-            if above.is_finite() { above.max(0.0) } else { 0.0 }
-        });
-        (voltage.powf(derating.voltage_exponent) * (1.0 - derating.per_kelvin[joint] * hot)) as f32
+        let temperature = log.channel(&format!("temp_{}", Joint::ALL[joint])).map_or(f64::NAN, |cells| cells[row]);
+        robot.derating.strength(joint, voltage, temperature) as f32
     })
 }
 

@@ -3,7 +3,7 @@
 //! - [`motion`]: the commands of a log, row by row, in periods of the drive.
 //! - [`Experiment`]: a log cut into windows that are simulated from measured states, and what is compared, each channel
 //!   in units of its noise.
-//! - [`evaluate()`]: the errors of a model on a log.
+//! - [`evaluate()`]: the errors of a model on a log; [`position_errors`]: the same over time.
 //! - [`Unknown`]: a number of a model file that is sought, with bounds and prior.
 //! - [`identify()`]: CMA-ES, then Gauss-Newton, then intervals, and what the log cannot tell.
 //!
@@ -19,7 +19,7 @@ mod refine;
 mod torque;
 mod unknown;
 
-pub use evaluate::{Evaluation, JointEvaluation, evaluate};
+pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};
 pub use experiment::{Experiment, ExperimentError};
 pub use identify::{Finding, Identification, IdentifyError, Options, Progress, Stage, Verdict, identify};
 pub use unknown::{Unknown, unknowns};
