@@ -1,7 +1,10 @@
 //! `twinstep effects`: what the catalogue knows.
 
+use std::path::PathBuf;
+
 use twinstep_model::effects::{CATALOGUE, Composition, Effect, Target};
 
+use crate::effect_plot;
 use crate::exit::{Outcome, input};
 
 /// Explain what real robots do and ideal ones do not.
@@ -10,11 +13,15 @@ use crate::exit::{Outcome, input};
 /// its parameters with what is plausible for a Go2, what it looks like in a log, what it is taken for, and the experiment
 /// that tells them apart.
 ///
-/// Example: `twinstep effects coulomb_friction`
+/// Example: `twinstep effects coulomb_friction --plot friction.svg`
 #[derive(clap::Args)]
 pub struct Args {
     /// The effect.
     name: Option<String>,
+    /// Write a picture of the effect: a simulated motion without it and with its low, middle and high plausible size,
+    /// the difference, and its law in what a log shows.
+    #[arg(long, value_name = "FILE.svg", requires = "name")]
+    plot: Option<PathBuf>,
 }
 
 /// The catalogue has no such effect.
@@ -38,7 +45,13 @@ pub fn run(args: &Args) -> Outcome {
             }
             println!("\n`twinstep effects NAME` explains one.");
         }
-        Some(name) => print!("{}", text(named(name).map_err(input)?)),
+        Some(name) => {
+            let effect = named(name).map_err(input)?;
+            if let Some(path) = &args.plot {
+                effect_plot::write_svg(effect, path)?;
+            }
+            print!("{}", text(effect));
+        }
     }
     Ok(())
 }
@@ -80,6 +93,6 @@ fn text(effect: &Effect) -> String {
             lines.push(format!("  {:<20}  {}", confusion.with, confusion.experiment));
         }
     }
-    lines.push(String::new());
+    lines.push(format!("\n`twinstep effects {} --plot FILE.svg` draws it.\n", effect.name));
     lines.join("\n")
 }

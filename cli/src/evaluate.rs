@@ -5,10 +5,11 @@ use std::path::PathBuf;
 use twinstep_logs::{Base as LoggedBase, Log};
 use twinstep_model::RobotModel;
 use twinstep_sim::{Base, BatchRollout, SimConfig};
-use twinstep_sysid::{Evaluation, evaluate};
+use twinstep_sysid::{Evaluation, evaluate, position_errors};
 
 use crate::exit::{Failure, Outcome, input, other};
 use crate::robot_file::robot_model;
+use crate::{chart, evaluation_plot};
 
 /// How far a model is from a measured log: the number that says whether a model got better.
 ///
@@ -16,7 +17,7 @@ use crate::robot_file::robot_model;
 /// in closed loop, under the log's commands; with the base held from each part's first measured state to its end, with a
 /// free base in windows of 0.5 s from measured states. Root mean squares over all rows and joints.
 ///
-/// Example: `twinstep evaluate --model extended.toml data/go2_air_chirp`
+/// Example: `twinstep evaluate --model extended.toml data/go2_air_chirp --plot errors.svg`
 #[derive(clap::Args)]
 pub struct Args {
     /// The log: a data file, or a folder that holds one.
@@ -29,6 +30,9 @@ pub struct Args {
     /// Print one JSON object and nothing else on stdout.
     #[arg(long)]
     json: bool,
+    /// Write a picture: the errors joint by joint, and the worst joint over time.
+    #[arg(long, value_name = "FILE.svg")]
+    plot: Option<PathBuf>,
 }
 
 /// Which rows count.
@@ -75,7 +79,17 @@ pub fn run(args: &Args) -> Outcome {
     let robot = robot_model(args.model.as_deref())?;
     let log = Log::open(&args.log).map_err(input)?;
     let rows = args.rows.of(&log)?;
-    let evaluation = evaluate(&log, &robot, &mut simulator(&log, &robot)?, |row| rows[row]).map_err(input)?;
+    if let Some(path) = &args.plot {
+        chart::check_writable(path).map_err(input)?;
+    }
+    let mut simulator = simulator(&log, &robot)?;
+    let evaluation = evaluate(&log, &robot, &mut simulator, |row| rows[row]).map_err(input)?;
+    if let Some(path) = &args.plot {
+        let errors = position_errors(&log, &robot, &mut simulator, |row| rows[row]).map_err(input)?;
+        let model = args.model.as_ref().map_or("the ideal go2".to_owned(), |model| model.display().to_string());
+        let title = format!("{model} on {}", args.log.display());
+        evaluation_plot::write_svg(&log, &evaluation, &errors, &title, path).map_err(input)?;
+    }
     if args.json {
         println!("{}", serde_json::to_string_pretty(&evaluation).map_err(other)?);
     } else {

@@ -1,9 +1,12 @@
 //! The command line `twinstep`: one subcommand a file.
 
 mod bench;
+mod chart;
 mod demo;
+mod effect_plot;
 mod effects;
 mod evaluate;
+mod evaluation_plot;
 mod exit;
 mod identify;
 mod joint_plot;
@@ -14,6 +17,7 @@ mod replay;
 mod robot_file;
 mod serve;
 mod server_process;
+mod timeline;
 mod trot;
 
 use clap::{Parser, Subcommand};

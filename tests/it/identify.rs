@@ -180,5 +180,6 @@ fn catalogue_explains_every_effect() {
         assert!(list.contains(effect.name));
         let page = String::from_utf8(twinstep(&["effects", effect.name]).stdout).unwrap();
         assert!(page.contains(effect.equation) && page.contains(effect.parameters[0].name), "{page}");
+        assert!(page.contains("--plot"));
     }
 }

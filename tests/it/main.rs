@@ -15,6 +15,7 @@ mod layering;
 mod leases;
 mod log;
 mod play;
+mod plots;
 mod python;
 mod randomise;
 mod rapier;

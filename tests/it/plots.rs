@@ -1,0 +1,100 @@
+//! Pictures of effects and of evaluations, through the real program.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use twinstep_logs::{Base as LoggedBase, Gain, Log, Meta, Segment, TauSensor};
+use twinstep_model::JOINT_NAMES;
+use twinstep_model::effects::CATALOGUE;
+use twinstep_tests::python::{Programs, root};
+
+const LOG: &str = "data/go2_air_chirp";
+
+fn twinstep(arguments: &[&str]) -> Output {
+    let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
+    Command::new(programs.0.join("twinstep")).args(arguments).current_dir(root()).output().unwrap()
+}
+
+/// The picture that a command writes.
+fn picture(arguments: &[&str]) -> String {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("picture.svg");
+    let output = twinstep(&[arguments, &["--plot", path.to_str().unwrap()]].concat());
+    assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    assert!(!output.stdout.is_empty(), "the page is printed all the same");
+    let svg = std::fs::read_to_string(path).unwrap();
+    assert!(svg.starts_with("<svg ") && svg.trim_end().ends_with("</svg>"), "{arguments:?}");
+    assert!(!svg.contains("NaN") && !svg.contains("inf"), "{arguments:?}");
+    svg
+}
+
+/// Points of every line in a colour, as written.
+fn lines<'a>(svg: &'a str, colour: &str) -> Vec<&'a str> {
+    let of_colour = |line: &&str| line.contains("<polyline") && line.contains(&format!("stroke=\"{colour}\""));
+    svg.lines().filter(of_colour).filter_map(|line| line.split("points=\"").nth(1)?.split('"').next()).collect()
+}
+
+#[test]
+fn every_effect_is_drawn_with_a_difference_that_can_be_seen() {
+    for effect in CATALOGUE {
+        let svg = picture(&["effects", effect.name]);
+        assert!(svg.contains(effect.name) && svg.contains("difference that it makes"), "{}", effect.name);
+        // The legend's sample first, then a line in each of the three panels.
+        let (without, with) = (lines(&svg, "#262626"), lines(&svg, "#F2A71B"));
+        assert_eq!([without.len(), with.len()], [4, 4], "{}", effect.name);
+        // Points of the panel's y axis, over which the largest difference spans nearly all.
+        let heights = |line: &str| -> Vec<f64> {
+            line.split_whitespace().map(|point| point.split_once(',').unwrap().1.parse().unwrap()).collect()
+        };
+        let [same, other] = [without[2], with[2]].map(heights);
+        let apart = same.iter().zip(&other).map(|(one, other)| (one - other).abs()).fold(0.0, f64::max);
+        assert!(apart > 10.0, "{}: {apart} half pixels apart", effect.name);
+    }
+}
+
+#[test]
+fn evaluation_is_drawn_with_every_joint_and_the_worst_one_over_time() {
+    let svg = picture(&["evaluate", LOG, "--from", "10"]);
+    for name in JOINT_NAMES {
+        assert!(svg.contains(name), "{name}");
+    }
+    assert!(svg.contains("RL_calf, the joint with the largest error") && svg.contains("measured"));
+    assert!(!svg.contains("[N·m]"), "this log has no torque");
+}
+
+#[test]
+fn torque_has_bars_of_its_own_where_it_was_measured() {
+    let segments = vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }];
+    let meta = Meta {
+        kp: Some(Gain::Same(30.0)),
+        kd: Some(Gain::Same(0.7)),
+        ..Meta::new(200.0, TauSensor::Current, segments)
+    };
+    let column =
+        |name: &str, of: fn(f64) -> f64| (name.to_owned(), (0..50).map(|row| of(f64::from(row) * 0.005)).collect());
+    let columns = [
+        column("t", |t| t),
+        column("q_FL_calf", |t| -1.8 + 0.1 * t),
+        column("dq_FL_calf", |_| 0.1),
+        column("q_cmd_FL_calf", |t| -1.7 + 0.1 * t),
+        column("tau_measured_FL_calf", |_| 2.0),
+    ];
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("log");
+    Log::new(meta, columns).unwrap().write(&path).unwrap();
+    let svg = picture(&["evaluate", path.to_str().unwrap()]);
+    assert!(svg.contains("torque, RMSE [N·m]") && svg.contains("joint position, RMSE [rad]"));
+}
+
+#[test]
+fn place_that_cannot_be_written_is_refused_before_the_work() {
+    let nowhere = Path::new("/nowhere/picture.svg").to_str().unwrap();
+    for arguments in [&["effects", "armature"][..], &["evaluate", LOG]] {
+        let output = twinstep(&[arguments, &["--plot", nowhere]].concat());
+        assert_eq!(output.status.code(), Some(2));
+        assert!(output.stdout.is_empty());
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert!(told.starts_with("error: cannot write `/nowhere/picture.svg`"), "{told}");
+    }
+    assert_eq!(twinstep(&["effects", "--plot", "list.svg"]).status.code(), Some(2), "the list has no picture");
+}
