@@ -5,21 +5,13 @@ use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
-use twinstep_logs::Log;
 use twinstep_model::{ResetRequest, VecEnv, go2};
 use twinstep_sim::SimConfig;
 
-use crate::exit::{Outcome, Signals, input, other};
+use crate::exit::{Outcome, Signals, other};
 use crate::replay::replay;
 use crate::server_process::ServerProcess;
-use crate::{joint_plot, trot};
-
-/// The recording, so that the demo needs nothing but the binary.
-const RECORDING: [(&str, &[u8]); 3] = [
-    ("data.csv.gz", include_bytes!("../../data/go2_air_chirp/data.csv.gz")),
-    ("meta.json", include_bytes!("../../data/go2_air_chirp/meta.json")),
-    ("LICENSE", include_bytes!("../../data/go2_air_chirp/LICENSE")),
-];
+use crate::{joint_plot, recording, trot};
 
 /// The whole story in a minute, nothing but this program needed.
 ///
@@ -81,11 +73,7 @@ fn walk(args: &Args, signals: &Signals) -> Outcome {
 fn compare(out: &Path, signals: &Signals) -> Outcome {
     eprintln!("\n2. A recording of a real Go2, held in the air, beside the ideal simulated one.");
     let folder = out.join("go2_air_chirp");
-    std::fs::create_dir_all(&folder).map_err(input)?;
-    for (name, bytes) in RECORDING {
-        std::fs::write(folder.join(name), bytes).map_err(input)?;
-    }
-    let log = Log::open(&folder).map_err(other)?;
+    let log = recording::unpack(&folder)?;
     let bar = ProgressBar::new(log.rows() as u64);
     let mut advance = |row: usize| bar.set_position(row as u64);
     let replayed = replay(&log, &go2(), SimConfig::default(), &mut advance).map_err(other)?;

@@ -80,6 +80,12 @@ impl FromStr for Sought {
     }
 }
 
+/// What is sought without `--effects`.
+pub fn default_effects() -> Vec<(&'static Effect, Scope)> {
+    let parsed = |text: &str| text.parse().map(|Sought(effect, scope)| (effect, scope));
+    DEFAULT_EFFECTS.split(',').map(|text| parsed(text).expect("the defaults are in the catalogue")).collect()
+}
+
 /// The file cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write {}: {source}", path.display())]

@@ -13,6 +13,7 @@ mod joint_plot;
 mod log;
 mod mjcf;
 mod play;
+mod recording;
 mod replay;
 mod robot_file;
 mod serve;

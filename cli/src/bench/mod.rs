@@ -1,5 +1,6 @@
 //! `twinstep bench`: our numbers beside their references, in one run.
 
+mod identify;
 mod pace;
 mod peers;
 mod remote;
@@ -27,7 +28,7 @@ pub struct Args {
     /// Length of one measuring window [s]; each case takes the median of several.
     #[arg(long, default_value_t = 1.0, value_name = "S", value_parser = window)]
     window_s: f64,
-    /// Python for the other simulators beside which `sim` measures, with MuJoCo and EnvPool: `pip install
+    /// Python for the other simulators beside which `sim` and `identify` measure, with MuJoCo and EnvPool: `pip install
     /// "./clients/python[bench]"`. What it lacks is left out.
     #[arg(long, default_value = "python3", value_name = "PATH")]
     python: PathBuf,
@@ -41,6 +42,8 @@ enum What {
     Sim,
     /// Environments with physics: over Zenoh, beside the same in process.
     Remote,
+    /// Identification: closed-loop rollouts of the built-in recording beside MuJoCo, and the time of a whole search.
+    Identify,
     /// The other end of the TCP ping-pong.
     #[value(hide = true)]
     TcpEcho,
@@ -96,6 +99,9 @@ pub fn run(args: &Args) -> Outcome {
     }
     if wanted(What::Remote) {
         rows.extend(remote::measure(args.window_s, &signals)?);
+    }
+    if wanted(What::Identify) {
+        rows.extend(identify::measure(&args.python, args.window_s, &signals)?);
     }
     let results = Results { rows, machine: machine() };
     if args.json {

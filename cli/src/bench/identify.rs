@@ -1,0 +1,166 @@
+//! Identification: closed-loop rollouts of the built-in recording's commands, and a whole search.
+
+use std::path::Path;
+use std::time::Instant;
+
+use rand::RngExt;
+use twinstep_logs::Log;
+use twinstep_model::effects::{Entry, compose};
+use twinstep_model::{JOINT_NAMES, MjcfBase, MjcfDrive, MjcfOptions, ModelFile, RobotModel, go2, mjcf, stream};
+use twinstep_sim::{Base, BatchRollout, SimConfig};
+use twinstep_sysid::{Experiment, Options, identify};
+
+use super::Row;
+use super::pace::{WINDOWS, measure as pace, median_of};
+use super::peers::{Peers, Setup};
+use crate::exit::{Failure, Signals, other};
+use crate::identify::default_effects;
+use crate::recording;
+
+/// Rollouts that are timed on all cores, and the length of each [s].
+const ROLLOUTS: usize = 1000;
+const ROLLOUT_S: f64 = 10.0;
+/// Candidates that are judged at a time: their trajectories fit into memory, and there is work for many cores.
+const TOGETHER: usize = 100;
+/// Candidates that are judged at a time on one core: two registers.
+const ON_ONE_CORE: usize = 8;
+/// Robots in MuJoCo: it steps them one after the other.
+const MUJOCO_ROBOTS: usize = 2;
+/// What the rollouts, and a whole identification, may take on two cores [s].
+const ROLLOUTS_AIM_S: f64 = 10.0;
+const IDENTIFICATION_AIM_S: f64 = 20.0;
+
+/// Robot-seconds a second, seconds for a thousand rollouts, and seconds for an identification.
+pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+    let folder = std::env::temp_dir().join(format!("twinstep-bench-{}", std::process::id()));
+    let log = recording::unpack(&folder);
+    std::fs::remove_dir_all(&folder).map_err(other)?;
+    let log = log?;
+    let first = log.t()[0];
+    let experiment = Experiment::new(&log, &go2()).map_err(other)?;
+    let rollouts = experiment.clone().only(|row| log.t()[row] - first <= ROLLOUT_S);
+    let candidates = candidates()?;
+    let mut rows =
+        vec![on_one_core(&rollouts, &candidates, &mut Peers::start(python, &setup(&log, window_s)), window_s)?];
+    rows.extend(on_all_cores(&rollouts, &candidates, signals)?);
+    rows.push(whole_search(&experiment, signals)?);
+    Ok(rows)
+}
+
+/// Robots with a random value of every effect that `twinstep identify` seeks by itself, within what is plausible.
+fn candidates() -> Result<Vec<RobotModel>, Failure> {
+    let mut random = stream(1, "bench identify", 0);
+    let mut candidate = || {
+        let entries = default_effects().into_iter().map(|(effect, scope)| {
+            let values = effect.parameters.iter().map(|parameter| {
+                let [low, high] = parameter.plausible;
+                random.random_range(low..high)
+            });
+            Entry::new(effect, scope, values.collect()).map_err(other)
+        });
+        compose(&go2(), &entries.collect::<Result<Vec<_>, _>>()?).map_err(other)
+    };
+    (0..ROLLOUTS).map(|_| candidate()).collect()
+}
+
+fn simulator(threads: usize) -> Result<BatchRollout, Failure> {
+    BatchRollout::new(&go2(), &SimConfig { base: Base::Fixed, threads, ..SimConfig::default() }).map_err(other)
+}
+
+/// Windows of ours and of MuJoCo in turn.
+fn on_one_core(
+    rollouts: &Experiment,
+    candidates: &[RobotModel],
+    peers: &mut Peers,
+    window_s: f64,
+) -> Result<Row, Failure> {
+    let hz = SimConfig::default().physics_hz();
+    let (mut simulator, peer) = (simulator(1)?, format!("mujoco {hz}"));
+    let (mut ours, mut theirs) = (Vec::new(), Vec::new());
+    for _ in 0..WINDOWS {
+        let judged = pace(window_s, || {
+            rollouts.residuals(&mut simulator, &candidates[..ON_ONE_CORE]);
+            Ok(())
+        })?;
+        ours.push(judged.per_second * ON_ONE_CORE as f64 * ROLLOUT_S);
+        if peers.has(&peer) {
+            // It counts drive periods.
+            theirs.push(peers.window(&peer)? * go2().control.drive_dt());
+        }
+    }
+    let value = median_of(ours);
+    let theirs = (!theirs.is_empty()).then(|| median_of(theirs));
+    Ok(Row {
+        case: format!("closed-loop rollouts, batch f64 {hz} Hz, one core"),
+        value,
+        unit: "robot-s/s",
+        reference: theirs.map(|theirs| format!("MuJoCo C {hz} Hz, one thread, {theirs:.0} robot-s/s")),
+        ratio: theirs.map(|theirs| value / theirs),
+    })
+}
+
+fn on_all_cores(rollouts: &Experiment, candidates: &[RobotModel], signals: &Signals) -> Result<[Row; 2], Failure> {
+    let mut simulator = simulator(0)?;
+    let since = Instant::now();
+    for candidates in candidates.chunks(TOGETHER) {
+        signals.check()?;
+        rollouts.residuals(&mut simulator, candidates);
+    }
+    let seconds = since.elapsed().as_secs_f64();
+    let row = |case: &str, value: f64, unit: &'static str| Row {
+        case: format!("{ROLLOUTS} closed-loop rollouts of {ROLLOUT_S} s, {case}"),
+        value,
+        unit,
+        reference: Some(format!("the aim of {ROLLOUTS_AIM_S} s for all")),
+        ratio: Some(ROLLOUTS_AIM_S / seconds),
+    };
+    Ok([row("all cores", ROLLOUTS as f64 * ROLLOUT_S / seconds, "robot-s/s"), row("time", seconds, "s")])
+}
+
+fn whole_search(experiment: &Experiment, signals: &Signals) -> Result<Row, Failure> {
+    let (model, effects, mut simulator) = (ModelFile::default(), default_effects(), simulator(0)?);
+    let since = Instant::now();
+    let found = identify(
+        &model,
+        &effects,
+        std::slice::from_ref(experiment),
+        &mut simulator,
+        &Options::default(),
+        &mut |_, _, _| !signals.check().unwrap_or(true),
+    );
+    let seconds = since.elapsed().as_secs_f64();
+    if found.map_err(other)?.interrupted {
+        return Err(Failure::Interrupted);
+    }
+    Ok(Row {
+        case: format!("identify {} numbers from 16 s of twelve joints", effects.len()),
+        value: seconds,
+        unit: "s",
+        reference: Some(format!("the aim of {IDENTIFICATION_AIM_S} s")),
+        ratio: Some(IDENTIFICATION_AIM_S / seconds),
+    })
+}
+
+/// What MuJoCo needs to follow the same commands, its drive in the model.
+fn setup(log: &Log, window_s: f64) -> Setup {
+    let (control, hz) = (go2().control, SimConfig::default().physics_hz());
+    let drive = MjcfDrive::Position {
+        kp: log.kp(JOINT_NAMES[0], 0).unwrap_or(control.kp),
+        kd: log.kd(JOINT_NAMES[0], 0).unwrap_or(control.kd),
+    };
+    let model = mjcf(&go2(), &MjcfOptions { base: MjcfBase::Fixed, timestep: 1.0 / f64::from(hz), drive });
+    let periods = (ROLLOUT_S / control.drive_dt()).round() as usize;
+    let target = |row: usize| {
+        let command = |(name, pose): (&&str, f64)| log.q_cmd(name).map_or(pose, |cells| cells[row]) as f32;
+        JOINT_NAMES.iter().zip(control.default_pose).map(command).collect()
+    };
+    Setup {
+        models: [(hz, model)].into(),
+        threads: Vec::new(),
+        targets: (0..periods).map(target).collect(),
+        actions: Vec::new(),
+        policy_dt: control.drive_dt(),
+        num_envs: MUJOCO_ROBOTS,
+        window_s,
+    }
+}
