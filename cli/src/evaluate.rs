@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
-use twinstep_logs::{Base as LoggedBase, Log};
+use twinstep_logs::Log;
 use twinstep_model::RobotModel;
-use twinstep_sim::{Base, BatchRollout, SimConfig};
+use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_sysid::{Evaluation, evaluate, position_errors};
 
 use crate::exit::{Failure, Outcome, input, other};
@@ -67,11 +67,9 @@ impl Rows {
     }
 }
 
-/// A simulator for robots as in `log`.
-pub fn simulator(log: &Log, robot: &RobotModel) -> Result<BatchRollout, Failure> {
-    let floating = log.segments().any(|(segment, _)| segment.base == LoggedBase::Floating);
-    let base = if floating { Base::Floating } else { Base::Fixed };
-    BatchRollout::new(robot, &SimConfig { base, ..SimConfig::default() }).map_err(input)
+/// The simulator that candidates are judged in.
+pub fn simulator(robot: &RobotModel) -> Result<BatchRollout, Failure> {
+    BatchRollout::new(robot, &SimConfig::default()).map_err(input)
 }
 
 /// Evaluates and prints.
@@ -82,7 +80,7 @@ pub fn run(args: &Args) -> Outcome {
     if let Some(path) = &args.plot {
         chart::check_writable(path).map_err(input)?;
     }
-    let mut simulator = simulator(&log, &robot)?;
+    let mut simulator = simulator(&robot)?;
     let evaluation = evaluate(&log, &robot, &mut simulator, |row| rows[row]).map_err(input)?;
     if let Some(path) = &args.plot {
         let errors = position_errors(&log, &robot, &mut simulator, |row| rows[row]).map_err(input)?;

@@ -1,13 +1,15 @@
 //! `twinstep identify`: numbers for a model from measured logs.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_logs::Log;
 use twinstep_model::ModelFile;
 use twinstep_model::effects::{Effect, Scope, UnknownScope};
-use twinstep_sysid::{Experiment, Identification, Options, Stage, Verdict, evaluate, identify};
+use twinstep_sysid::{
+    Experiment, Finding, Horizon, Identification, Options, Search, Stage, Verdict, evaluate, identify,
+};
 
 use crate::effects::{UnknownEffect, named};
 use crate::evaluate::{Rows, simulator};
@@ -26,12 +28,12 @@ const DEFAULT_EFFECTS: &str = "armature@hip,armature@thigh,armature@calf,coulomb
 /// --force is given. Numbers that cannot be told apart are named, with the experiment that would.
 ///
 /// The model that is written loads in `twinstep serve --model` and `twinstep evaluate --model`. Ctrl-C ends the search and
-/// writes the best so far.
+/// writes the best so far, and beside it OUT.search.json, from which the same command with --resume goes on.
 ///
 /// Example: `twinstep identify data/go2_air_chirp --until 10 --out fitted.toml`
 #[derive(clap::Args)]
 pub struct Args {
-    /// The logs: data files, or folders that hold one. All with the base held, or all with it free.
+    /// The logs: data files, or folders that hold one; with the base held, free, or parts of both.
     #[arg(required = true)]
     logs: Vec<PathBuf>,
     /// The model to start from; the ideal Go2 without.
@@ -51,6 +53,9 @@ pub struct Args {
     /// Seed of the search.
     #[arg(long, default_value_t = Options::default().seed)]
     seed: u64,
+    /// Go on with the search that Ctrl-C ended, from OUT.search.json.
+    #[arg(long)]
+    resume: bool,
     /// The model file to write.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
@@ -94,6 +99,27 @@ struct Unwritable {
     source: std::io::Error,
 }
 
+/// There is no search to go on with.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot resume from {}: {cause}\n  without --resume the search starts anew", path.display())]
+struct NotResumable {
+    path: PathBuf,
+    cause: String,
+}
+
+/// Where an ended search is kept.
+fn search_file(out: &Path) -> PathBuf {
+    let mut name = out.as_os_str().to_owned();
+    name.push(".search.json");
+    name.into()
+}
+
+fn resumed(path: &Path) -> Result<Search, NotResumable> {
+    let failed = |cause: String| NotResumable { path: path.to_owned(), cause };
+    let text = std::fs::read_to_string(path).map_err(|error| failed(error.to_string()))?;
+    serde_json::from_str(&text).map_err(|error| failed(error.to_string()))
+}
+
 /// Identifies, prints and writes.
 pub fn run(args: &Args) -> Outcome {
     let model = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load).map_err(input)?;
@@ -102,16 +128,18 @@ pub fn run(args: &Args) -> Outcome {
     for path in &args.logs {
         let log = Log::open(path).map_err(input)?;
         let rows = args.rows.of(&log)?;
-        experiments.push(Experiment::new(&log, &robot).map_err(input)?.only(|row| rows[row]));
+        experiments.push(Experiment::new(&log, &robot, Horizon::IDENTIFICATION).map_err(input)?.only(|row| rows[row]));
         logs.push((path, log, rows));
     }
     // Before the search, not after it: what it finds must not be lost.
     let unwritable = |source| input(Unwritable { path: args.out.clone(), source });
     std::fs::OpenOptions::new().append(true).create(true).open(&args.out).map_err(unwritable)?;
     let signals = Signals::listen()?;
-    let mut simulator = simulator(&logs[0].1, &robot)?;
+    let mut simulator = simulator(&robot)?;
     let effects: Vec<_> = args.effects.iter().map(|Sought(effect, scope)| (*effect, *scope)).collect();
-    let options = Options { generations: args.generations, seed: args.seed, force: args.force };
+    let search = search_file(&args.out);
+    let resume = if args.resume { Some(resumed(&search).map_err(input)?) } else { None };
+    let options = Options { generations: args.generations, seed: args.seed, force: args.force, resume };
     let bar = progress_bar(args.generations);
     let found = identify(&model, &effects, &experiments, &mut simulator, &options, &mut |stage, step, cost| {
         bar.set_message(match stage {
@@ -127,6 +155,11 @@ pub fn run(args: &Args) -> Outcome {
     bar.finish_and_clear();
     let found = found.map_err(input)?;
     std::fs::write(&args.out, found.model.to_toml()).map_err(unwritable)?;
+    match &found.interrupted {
+        Some(ended) => std::fs::write(&search, serde_json::to_string(ended).map_err(other)?).map_err(unwritable)?,
+        None if search.exists() => std::fs::remove_file(&search).map_err(unwritable)?,
+        None => {}
+    }
     print!("{}", text(&found));
     let fitted = found.model.robot_model().map_err(other)?;
     for (path, log, rows) in &logs {
@@ -139,7 +172,11 @@ pub fn run(args: &Args) -> Outcome {
         }
     }
     println!("written to {}; judge it on rows it has not seen: twinstep evaluate --model", args.out.display());
-    if found.interrupted { Err(Failure::Interrupted) } else { Ok(()) }
+    if found.interrupted.is_some() {
+        println!("ended before it was done; the same command with --resume goes on");
+        return Err(Failure::Interrupted);
+    }
+    Ok(())
 }
 
 fn progress_bar(generations: usize) -> ProgressBar {
@@ -161,10 +198,25 @@ fn text(found: &Identification) -> String {
         let line = format!("{name:<44}  {value:>10.4}  {interval:<22} {} {remark}", finding.unknown.unit);
         lines.push(line.trim_end().to_owned());
     }
+    lines.extend(found.findings.iter().filter_map(reading));
     for (one, other, correlation, experiment) in &found.confusable {
         lines.push(format!("cannot be told apart: {one} and {other} (correlation {correlation:.2})"));
         lines.extend(experiment.map(|experiment| format!("    what would: {experiment}")));
     }
     lines.push(format!("residuals: {:.2} -> {:.2} times the noise (RMS)\n", found.rms[0], found.rms[1]));
     lines.join("\n")
+}
+
+/// What people call a log-Cholesky coordinate, where they have a name for it.
+fn reading(finding: &Finding) -> Option<String> {
+    let unknown = &finding.unknown;
+    let (name, unit, convert): (_, _, fn(f64) -> f64) = match unknown.parameter.as_str() {
+        "theta.0" => ("mass", "kg", |alpha| (2.0 * alpha).exp()),
+        "theta.7" => ("centre of mass, x", "m", |t| t),
+        "theta.8" => ("centre of mass, y", "m", |t| t),
+        "theta.9" => ("centre of mass, z", "m", |t| t),
+        _ => return None,
+    };
+    let [low, high] = finding.interval?.map(convert);
+    Some(format!("{} of the {}: {:.4} {unit} ({low:.4} to {high:.4})", name, unknown.scope, convert(finding.value)))
 }

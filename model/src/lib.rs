@@ -56,5 +56,5 @@ pub use rollout::{Job, Rollout};
 pub use scene::{Scene, SceneShape, ShapeKind};
 pub use spec::{EnvSpec, Field};
 pub use state::{Command, Placement, RobotStates, RobotStatesMut, Variation};
-pub use stream::{Stream, stream};
+pub use stream::{Stream, standard_normal, stream};
 pub use vec_env::{AutoresetMode, EndedEpisode, EnvError, ResetRequest, StepBatch, VecEnv};

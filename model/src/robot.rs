@@ -47,7 +47,7 @@ impl Derating {
     /// that nobody knows is NaN.
     pub fn strength(&self, joint: usize, voltage_share: f64, temperature_c: f64) -> f64 {
         let hot = (temperature_c - self.above_c[joint]).max(0.0);
-        voltage_share.powf(self.voltage_exponent) * (1.0 - self.per_kelvin[joint] * hot)
+        voltage_share.max(0.0).powf(self.voltage_exponent) * (1.0 - self.per_kelvin[joint] * hot).max(0.0)
     }
 }
 

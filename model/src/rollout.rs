@@ -7,6 +7,8 @@ use crate::{Command, Placement, RobotModel, RobotStates};
 pub struct Job<'a> {
     /// The candidate.
     pub robot: &'a RobotModel,
+    /// Whether its trunk is held.
+    pub held: bool,
     /// Where it starts.
     pub start: Placement,
     /// One command a drive period.

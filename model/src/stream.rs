@@ -1,6 +1,6 @@
 //! Named random streams: one seed gives every consumer its own reproducible numbers.
 
-use rand::SeedableRng;
+use rand::{Rng, RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use sha2::{Digest, Sha256};
 
@@ -14,6 +14,12 @@ pub fn stream(seed: u64, name: &str, index: u64) -> Stream {
     let digest =
         Sha256::new().chain_update(seed.to_le_bytes()).chain_update(index.to_le_bytes()).chain_update(name).finalize();
     Stream::from_seed(digest.into())
+}
+
+/// A normal number of mean 0 and deviation 1 (Box and Muller).
+pub fn standard_normal(random: &mut impl Rng) -> f64 {
+    let (u, v): (f64, f64) = (random.random(), random.random());
+    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 use twinstep_model::{Command, Ground, Job, Placement, RobotModel, RobotStates, Rollout};
 
 use crate::batch::{Inputs, Lanes, Time, lane_robots};
-use crate::{BuildError, SimConfig};
+use crate::{Base, BuildError, SimConfig};
 
 /// Candidates that are stepped together: a register in double precision, because slopes are small differences.
 const TOGETHER: usize = 4;
@@ -17,16 +17,19 @@ pub struct BatchRollout {
 }
 
 impl BatchRollout {
-    /// At the rate, base and threads of `config`, for candidates with the drive's rate of `robot`.
+    /// At the rate and on the threads of `config`, for candidates with the drive's rate of `robot`.
     pub fn new(robot: &RobotModel, config: &SimConfig) -> Result<Self, BuildError> {
         config.check(&robot.control)?;
         let pool = crate::rapier::thread_pool(config.threads)?;
         Ok(Self { robot: robot.clone(), config: *config, pool })
     }
 
-    fn play_together(&self, jobs: &[Job]) -> Vec<RobotStates> {
+    /// Plays jobs whose trunks are all held, or all free.
+    fn play_together(&self, jobs: &[&Job]) -> Vec<RobotStates> {
+        let base = if jobs[0].held { Base::Fixed } else { Base::Floating };
+        let config = SimConfig { base, ..self.config };
         let start = Placement::at_rest(1.0, self.robot.control.default_pose_f32());
-        let mut robots = lane_robots(Lanes::Double, &self.robot, &self.config, &Ground::FLAT, &start, jobs.len());
+        let mut robots = lane_robots(Lanes::Double, &self.robot, &config, &Ground::FLAT, &start, jobs.len());
         let mut now = RobotStates::new(jobs.len());
         let mut records: Vec<_> = jobs.iter().map(|job| RobotStates::new(job.commands.len() + 1)).collect();
         for (robot, job) in jobs.iter().enumerate() {
@@ -54,6 +57,14 @@ impl BatchRollout {
 impl Rollout for BatchRollout {
     fn play(&mut self, jobs: &[Job]) -> Vec<RobotStates> {
         let this = &*self;
-        self.pool.install(|| jobs.par_chunks(TOGETHER).flat_map_iter(|jobs| this.play_together(jobs)).collect())
+        let (held, free): (Vec<usize>, Vec<usize>) = (0..jobs.len()).partition(|index| jobs[*index].held);
+        let chunks: Vec<&[usize]> = held.chunks(TOGETHER).chain(free.chunks(TOGETHER)).collect();
+        let play = |chunk: &&[usize]| {
+            let together: Vec<_> = chunk.iter().map(|index| &jobs[*index]).collect();
+            chunk.iter().copied().zip(this.play_together(&together)).collect::<Vec<_>>()
+        };
+        let mut played: Vec<_> = self.pool.install(|| chunks.par_iter().flat_map_iter(play).collect());
+        played.sort_by_key(|(index, _)| *index);
+        played.into_iter().map(|(_, states)| states).collect()
     }
 }

@@ -1,10 +1,12 @@
 //! CMA-ES, ask and tell (Hansen, "The CMA Evolution Strategy: A Tutorial", 2016).
 
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
-use rand::{Rng, RngExt};
+use rand::Rng;
+use serde::{Deserialize, Serialize};
+use twinstep_model::standard_normal;
 
 /// A search distribution over coordinates whose scales are about one.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CmaEs {
     mean: DVector<f64>,
     sigma: f64,
@@ -105,12 +107,6 @@ impl CmaEs {
         self.root = rebuilt(roots.clone());
         self.inverse_root = rebuilt(roots.map(|root| 1.0 / root));
     }
-}
-
-/// A normal number of mean 0 and deviation 1 (Box and Muller).
-fn standard_normal(random: &mut impl Rng) -> f64 {
-    let (u, v): (f64, f64) = (random.random(), random.random());
-    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
 }
 
 #[cfg(test)]

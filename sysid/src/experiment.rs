@@ -1,20 +1,15 @@
 //! A log as an experiment: windows that are simulated from measured states, and what is compared.
 
-use std::ops::Range;
-
 use glam::DQuat;
 use twinstep_logs::{Base, Log, TauSensor};
-use twinstep_model::{Command, Ground, Job, Joint, NUM_JOINTS, Placement, RobotModel, RobotStates, Rollout};
+use twinstep_model::{Command, Job, Joint, NUM_JOINTS, RobotModel, RobotStates, Rollout};
 
-use crate::motion::{DriveClock, JointCommands, MotionError, command, joint_commands};
+use crate::conditions::Conditions;
+use crate::motion::{MotionError, joint_commands};
+use crate::window::{Horizon, Window, orientation, windows};
 
-/// Length of a window with a free trunk [s]; with a held one a window is a whole part of the log.
-pub const FLOATING_WINDOW_S: f64 = 0.5;
 /// Rows this long apart [s] count as independent.
 const BLOCK_S: f64 = 0.5;
-/// Height at which a held trunk hangs [m].
-const HELD_HEIGHT: f32 = twinstep_model::HELD_HEIGHT as f32;
-
 /// Noise that is assumed of a channel whose noise nobody stated: of a quantity, its σ.
 const ASSUMED_NOISE: [(&str, f64); 7] =
     [("q", 0.002), ("dq", 0.05), ("tau_measured", 0.2), ("pos", 0.005), ("quat", 0.01), ("vel", 0.05), ("gyro", 0.02)];
@@ -33,9 +28,6 @@ pub enum ExperimentError {
         /// The channels that are missing.
         missing: &'static str,
     },
-    /// Segments of both kinds.
-    #[error("the log has segments with base \"fixed\" and with base \"floating\"\n  give them as two logs")]
-    BothBases,
 }
 
 /// What is compared in every row.
@@ -60,22 +52,26 @@ enum Quantity {
     BaseRate(usize),
 }
 
-/// Rows that are simulated from the first of them.
-#[derive(Clone, Debug)]
-struct Window {
-    rows: Range<usize>,
-    start: Placement,
-    /// One a drive period.
-    commands: Vec<Command>,
-    /// For every row, the drive period at whose start it was sampled.
-    period: Vec<usize>,
+impl Channel {
+    /// Rows of `window` that are compared, with their index in it: not the first at least, which was given.
+    fn rows<'a>(&'a self, window: &'a Window) -> impl Iterator<Item = (usize, usize)> + 'a {
+        let of_trunk = matches!(
+            self.quantity,
+            Quantity::BasePosition(_)
+                | Quantity::BaseOrientation(_)
+                | Quantity::BaseVelocity(_)
+                | Quantity::BaseRate(_)
+        );
+        // A torque is the mean to the next row, and the last has none.
+        let end = window.rows.len() - usize::from(matches!(self.quantity, Quantity::Torque(_)));
+        let first = if of_trunk && window.held { end } else { window.settling };
+        (first..end).map(|index| (index, window.rows.start + index)).filter(|(_, row)| self.measured[*row].is_finite())
+    }
 }
 
 /// A log cut into windows.
 #[derive(Clone, Debug)]
 pub struct Experiment {
-    /// Whether the trunk was free.
-    pub floating: bool,
     windows: Vec<Window>,
     channels: Vec<Channel>,
     /// Measured orientations, by row, where the trunk was free.
@@ -84,31 +80,25 @@ pub struct Experiment {
     joints: Vec<Joint>,
     /// Rows in half a second.
     rows_a_block: usize,
+    conditions: Conditions,
 }
 
 impl Experiment {
-    /// `log` as an experiment on robots like `robot`: a held trunk from each part's start to its end, a free one in windows
-    /// of half a second. Voltage and temperature weaken the motors as `robot` says.
-    pub fn new(log: &Log, robot: &RobotModel) -> Result<Self, ExperimentError> {
-        let commands = joint_commands(log)?;
-        let clock = DriveClock::of(log, robot)?;
-        let floating = floating(log)?;
-        let joints: Vec<_> = commands.iter().map(|joint| joint.joint).collect();
-        let player = Player { log, robot, commands, clock, floating };
-        let rows_a_block = ((BLOCK_S * log.meta().rate_hz).round() as usize).max(1);
-        let mut windows = Vec::new();
-        for (_, rows) in log.segments() {
-            let length = if floating { (FLOATING_WINDOW_S * log.meta().rate_hz).round() as usize } else { rows.len() };
-            let mut first = rows.start;
-            while first + 1 < rows.end {
-                let end = (first + length + 1).min(rows.end);
-                windows.push(player.window(first..end));
-                first = end - 1;
-            }
-        }
+    /// `log` as an experiment on robots with the gains and rates of `robot`.
+    pub fn new(log: &Log, robot: &RobotModel, horizon: Horizon) -> Result<Self, ExperimentError> {
+        let joints: Vec<_> = joint_commands(log)?.iter().map(|joint| joint.joint).collect();
+        let windows = windows(log, robot, horizon)?;
+        let floating = windows.iter().any(|window| !window.held);
         let orientations =
-            if floating { (0..log.rows()).map(|row| player.orientation(row)).collect() } else { Vec::new() };
-        Ok(Self { floating, windows, channels: channels(log, &joints, floating), orientations, joints, rows_a_block })
+            if floating { (0..log.rows()).map(|row| orientation(log, row)).collect() } else { Vec::new() };
+        Ok(Self {
+            windows,
+            channels: channels(log, &joints),
+            orientations,
+            joints,
+            rows_a_block: ((BLOCK_S * log.meta().rate_hz).round() as usize).max(1),
+            conditions: Conditions::of(log),
+        })
     }
 
     /// The joints that the log has.
@@ -157,17 +147,41 @@ impl Experiment {
             .collect()
     }
 
-    /// For every residual, the block of half a second that it belongs to.
+    /// As many groups as [`Experiment::groups`] has at most.
+    pub const GROUPS: usize = 14;
+
+    /// Whether a group is of a held trunk.
+    pub fn is_held(group: usize) -> bool {
+        group % 2 == 1
+    }
+
+    /// For every residual, a number for its quantity and for whether the trunk was held.
+    pub fn groups(&self) -> Vec<usize> {
+        let group = |channel: &Channel, window: &Window| {
+            let quantity = match channel.quantity {
+                Quantity::Position(_) => 0,
+                Quantity::Velocity(_) => 1,
+                Quantity::Torque(_) => 2,
+                Quantity::BasePosition(_) => 3,
+                Quantity::BaseOrientation(_) => 4,
+                Quantity::BaseVelocity(_) => 5,
+                Quantity::BaseRate(_) => 6,
+            };
+            2 * quantity + usize::from(window.held)
+        };
+        let windows = self.channels.iter().flat_map(|channel| self.windows.iter().map(move |window| (channel, window)));
+        let same = windows.flat_map(|(channel, window)| channel.rows(window).map(move |_| group(channel, window)));
+        same.collect()
+    }
+
+    /// For every residual, the block that it belongs to: half a second, or a window with a free trunk.
     pub fn blocks(&self) -> Vec<usize> {
-        let mut blocks = Vec::new();
-        for channel in &self.channels {
-            for window in &self.windows {
-                let end = window.rows.end - usize::from(matches!(channel.quantity, Quantity::Torque(_)));
-                let rows = (window.rows.start + 1..end).filter(|row| channel.measured[*row].is_finite());
-                blocks.extend(rows.map(|row| row / self.rows_a_block));
-            }
-        }
-        blocks
+        let windows = self.channels.iter().flat_map(|channel| self.windows.iter().map(move |window| (channel, window)));
+        let block = |window: &Window, row: usize| {
+            // What a window with a free trunk starts with is carried through all of it.
+            (if window.held { row } else { window.rows.start }) / self.rows_a_block
+        };
+        windows.flat_map(|(channel, window)| channel.rows(window).map(move |(_, row)| block(window, row))).collect()
     }
 
     /// Simulated less measured position of each joint [rad] with its row, simulated from measured states.
@@ -183,20 +197,36 @@ impl Experiment {
     }
 
     fn play(&self, simulator: &mut dyn Rollout, candidates: &[RobotModel]) -> Vec<RobotStates> {
-        let jobs: Vec<_> = candidates
-            .iter()
-            .flat_map(|robot| {
-                self.windows.iter().map(move |window| {
-                    // Where the gyroscope is off, so is the measured start.
-                    let mut start = window.start;
-                    for (rate, bias) in start.base_angular_velocity.iter_mut().zip(robot.gyro_bias.to_array()) {
-                        *rate -= bias as f32;
-                    }
-                    Job { robot, start, commands: &window.commands }
-                })
-            })
-            .collect();
+        let weakened: Vec<_> = candidates.iter().map(|robot| self.weakened(robot)).collect();
+        let mut jobs = Vec::new();
+        for (robot, weakened) in candidates.iter().zip(&weakened) {
+            for (index, window) in self.windows.iter().enumerate() {
+                // Where the gyroscope is off, so is the measured start.
+                let mut start = window.start;
+                for (rate, bias) in start.base_angular_velocity.iter_mut().zip(robot.gyro_bias.to_array()) {
+                    *rate -= bias as f32;
+                }
+                let commands = weakened.get(index).unwrap_or(&window.commands);
+                jobs.push(Job { robot, held: window.held, start, commands });
+            }
+        }
         simulator.play(&jobs)
+    }
+
+    /// The windows' commands to motors as supply and heat leave them; empty where the log tells neither.
+    fn weakened(&self, robot: &RobotModel) -> Vec<Vec<Command>> {
+        if self.conditions.is_empty() {
+            return Vec::new();
+        }
+        let of = |window: &Window| {
+            let mut commands = window.commands.clone();
+            for (pair, row) in window.period.windows(2).zip(window.rows.clone()) {
+                let strength = self.conditions.strength(&robot.derating, row);
+                commands[pair[0]..pair[1]].iter_mut().for_each(|command| command.strength = strength);
+            }
+            commands
+        };
+        self.windows.iter().map(of).collect()
     }
 
     fn compared<'a>(
@@ -208,7 +238,7 @@ impl Experiment {
         })
     }
 
-    /// Hands on the difference in each row of a window but its first, which was given.
+    /// Hands on the difference in each row that is compared.
     fn compare(
         &self,
         channel: &Channel,
@@ -217,16 +247,8 @@ impl Experiment {
         robot: &RobotModel,
         mut each: impl FnMut(usize, f64),
     ) {
-        for (index, row) in window.rows.clone().enumerate().skip(1) {
-            let measured = channel.measured[row];
-            if !measured.is_finite() {
-                continue;
-            }
+        for (index, row) in channel.rows(window) {
             let period = window.period[index];
-            if matches!(channel.quantity, Quantity::Torque(_)) && row + 1 == window.rows.end {
-                // The mean to the next row: there is none.
-                continue;
-            }
             let simulated = match channel.quantity {
                 Quantity::Position(joint) => f64::from(states.q[period][joint]),
                 Quantity::Velocity(joint) => f64::from(states.dq[period][joint]),
@@ -244,7 +266,7 @@ impl Experiment {
                 Quantity::BaseVelocity(axis) => f64::from(states.base_linear_velocity[period][axis]),
                 Quantity::BaseRate(axis) => f64::from(states.base_angular_velocity[period][axis]),
             };
-            each(row, simulated - measured);
+            each(row, simulated - channel.measured[row]);
         }
     }
 }
@@ -263,27 +285,7 @@ fn shown_torque(states: &RobotStates, robot: &RobotModel, joint: usize, from: us
     (0..periods).map(|index| at((from + index) as f64 - late)).sum::<f64>() / periods as f64
 }
 
-fn floating(log: &Log) -> Result<bool, ExperimentError> {
-    let (mut fixed, mut free) = (false, None);
-    for (segment, _) in log.segments() {
-        match segment.base {
-            Base::Fixed => fixed = true,
-            Base::Floating => free = Some(segment),
-        }
-    }
-    let Some(segment) = free else { return Ok(false) };
-    if fixed {
-        return Err(ExperimentError::BothBases);
-    }
-    for missing in ["pos_z", "quat_w", "vel_x"] {
-        if log.channel(missing).is_none() {
-            return Err(ExperimentError::NoBase { segment: segment.name.clone(), missing });
-        }
-    }
-    Ok(true)
-}
-
-fn channels(log: &Log, joints: &[Joint], floating: bool) -> Vec<Channel> {
+fn channels(log: &Log, joints: &[Joint]) -> Vec<Channel> {
     let mut channels = Vec::new();
     let mut add = |quantity: Quantity, name: String, kind: &str, measured: Option<&[f64]>| {
         let assumed = ASSUMED_NOISE.iter().find(|(quantity, _)| *quantity == kind).expect("a known kind").1;
@@ -300,7 +302,7 @@ fn channels(log: &Log, joints: &[Joint], floating: bool) -> Vec<Channel> {
             add(Quantity::Torque(index), format!("tau_measured_{name}"), "tau_measured", log.tau_measured(name));
         }
     }
-    if floating {
+    if log.segments().any(|(segment, _)| segment.base == Base::Floating) {
         let known = |row: usize| {
             ["w", "x", "y", "z"]
                 .iter()
@@ -316,93 +318,4 @@ fn channels(log: &Log, joints: &[Joint], floating: bool) -> Vec<Channel> {
         }
     }
     channels
-}
-
-/// A log whose parts become windows.
-struct Player<'a> {
-    log: &'a Log,
-    robot: &'a RobotModel,
-    commands: Vec<JointCommands<'a>>,
-    clock: DriveClock,
-    floating: bool,
-}
-
-impl Player<'_> {
-    fn window(&self, rows: Range<usize>) -> Window {
-        let t = &self.log.t()[rows.clone()];
-        let (mut commands, mut period) = (Vec::new(), Vec::new());
-        for (index, row) in rows.clone().enumerate() {
-            period.push(commands.len());
-            if row + 1 < rows.end {
-                let mut command = command(self.robot, &self.commands, row);
-                command.strength = strength(self.log, self.robot, row);
-                commands.extend(std::iter::repeat_n(command, self.clock.periods_between(t, index)));
-            }
-        }
-        Window { start: self.start(rows.clone()), rows, commands, period }
-    }
-
-    fn start(&self, rows: Range<usize>) -> Placement {
-        let mut start = Placement::above(&Ground::FLAT, self.robot, self.robot.control.default_pose_f32(), 0.0);
-        if !self.floating {
-            start = Placement::at_rest(HELD_HEIGHT, self.robot.control.default_pose_f32());
-        }
-        let row = rows.start;
-        for joint in &self.commands {
-            let (index, name) = (joint.joint.index(), joint.joint.name());
-            let q = self.log.q(name).expect("every joint of a log has its position");
-            start.q[index] = q[row] as f32;
-            start.dq[index] = match self.log.dq(name).map(|dq| dq[row]).filter(|dq| dq.is_finite()) {
-                Some(dq) => dq as f32,
-                None => slope(&self.log.t()[rows.clone()], &q[rows.clone()]) as f32,
-            };
-        }
-        if self.floating {
-            let vector = |kind: &str| {
-                ["x", "y", "z"].map(|axis| {
-                    let cells = self.log.channel(&format!("{kind}_{axis}"));
-                    cells.map(|cells| cells[row]).filter(|cell| cell.is_finite()).unwrap_or(0.0) as f32
-                })
-            };
-            let DQuat { x, y, z, w } = self.orientation(row);
-            start.base_orientation = [w, x, y, z].map(|part| part as f32);
-            start.base_position = vector("pos");
-            start.base_linear_velocity = vector("vel");
-            start.base_angular_velocity = vector("gyro");
-        }
-        start
-    }
-
-    fn orientation(&self, row: usize) -> DQuat {
-        let [w, x, y, z] = ["w", "x", "y", "z"]
-            .map(|part| self.log.channel(&format!("quat_{part}")).map_or(f64::NAN, |cells| cells[row]));
-        let turn = DQuat::from_xyzw(x, y, z, w);
-        if turn.is_finite() && turn.length() > 0.5 { turn.normalize() } else { DQuat::IDENTITY }
-    }
-}
-
-/// What supply and heat leave of each joint's torque in a row.
-pub fn strength(log: &Log, robot: &RobotModel, row: usize) -> [f32; NUM_JOINTS] {
-    let voltage = log.channel("battery_V").map_or(1.0, |cells| {
-        let highest = cells.iter().copied().filter(|cell| cell.is_finite()).fold(f64::MIN_POSITIVE, f64::max);
-        if cells[row].is_finite() { cells[row] / highest } else { 1.0 }
-    });
-    std::array::from_fn(|joint| {
-        let temperature = log.channel(&format!("temp_{}", Joint::ALL[joint])).map_or(f64::NAN, |cells| cells[row]);
-        robot.derating.strength(joint, voltage, temperature) as f32
-    })
-}
-
-/// Velocity at the start of a part whose velocities were not measured: the slope of a line through its first samples.
-fn slope(t: &[f64], q: &[f64]) -> f64 {
-    const SAMPLES: usize = 4;
-    let count = t.len().min(SAMPLES);
-    let mean = |values: &[f64]| values[..count].iter().sum::<f64>() / count as f64;
-    let (mean_t, mean_q) = (mean(t), mean(q));
-    let (mut over, mut under) = (0.0, 0.0);
-    for (t, q) in t.iter().zip(q).take(count) {
-        over += (t - mean_t) * (q - mean_q);
-        under += (t - mean_t).powi(2);
-    }
-    if under > 0.0 { over / under } else { 0.0 }
 }

@@ -1,22 +1,18 @@
 //! Identification: a global search, a local one, and what the data can and cannot tell.
 
 use twinstep_model::effects::{Effect, EntryError, Scope};
-use twinstep_model::{ModelFile, Rollout, stream};
+use twinstep_model::{ModelFile, Rollout};
 
-use crate::cmaes::CmaEs;
 use crate::experiment::Experiment;
-use crate::jacobian::{linear, residuals};
-use crate::refine::{cost, covariance, information, refine};
+use crate::refine::{SIMULATORS, covariance, information, refine};
+use crate::search::Search;
+use crate::task::Task;
 use crate::unknown::{Unknown, set_intervals, start, unknowns, with_values, without_untold};
 
 /// An unknown that keeps more than this share of its prior deviation is left at its prior: the log cannot tell.
 const TELLING: f64 = 0.7;
 /// Correlations of this size and above are named.
 const CORRELATED: f64 = 0.9;
-/// Effects whose share of the torque is computed from the log once, for all candidates.
-const WEAKENING: [&str; 2] = ["supply_sag", "thermal_derating"];
-/// Generations in which the search has to get better by a hundredth.
-const PATIENCE: usize = 10;
 /// The normal distribution's two-sided 95 %.
 const TWO_SIDED_95: f64 = 1.96;
 
@@ -29,11 +25,13 @@ pub struct Options {
     pub seed: u64,
     /// Seek also what the log cannot tell.
     pub force: bool,
+    /// A search that was ended, to be taken up again.
+    pub resume: Option<Search>,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { generations: 60, seed: 1, force: false }
+        Self { generations: 60, seed: 1, force: false, resume: None }
     }
 }
 
@@ -60,6 +58,8 @@ pub struct Finding {
     pub value: f64,
     /// 95 %; none where the log cannot tell.
     pub interval: Option<[f64; 2]>,
+    /// The 95 % interval that was predicted before the search, around the prior's middle.
+    pub predicted: [f64; 2],
     /// What is to be said of it.
     pub verdict: Verdict,
 }
@@ -86,8 +86,8 @@ pub struct Identification {
     pub rms: [f64; 2],
     /// Pairs of unknowns that the log cannot part, with their correlation and the experiment that would.
     pub confusable: Vec<(String, String, f64, Option<&'static str>)>,
-    /// True if it was ended before it was done.
-    pub interrupted: bool,
+    /// Where it was ended before it was done, to be taken up again.
+    pub interrupted: Option<Search>,
 }
 
 /// Why there is no identification.
@@ -99,15 +99,17 @@ pub enum IdentifyError {
     /// The given model, played through the log's commands, diverges.
     #[error("the simulation of the given model diverges on this log: start from a model that does not")]
     Diverges,
+    /// The search that is to be taken up again sought something else.
+    #[error("the search to be resumed is another one\n  it:   {resumed}\n  this: {asked}")]
+    AnotherSearch {
+        /// What it sought.
+        resumed: String,
+        /// What is sought now.
+        asked: String,
+    },
     /// No cell of the logs is left.
     #[error("nothing is left to compare: the rows that count hold no measurement after a window's first row")]
     NothingToCompare,
-    /// A held trunk and a free one cannot be simulated by one simulator.
-    #[error("one log has its base held and another free: identify from one kind at a time")]
-    BothBases,
-    /// What weakens the motors comes with the log, not with the candidate.
-    #[error("`{0}` cannot be identified yet: give its value in the model file")]
-    Weakening(&'static str),
 }
 
 /// Seeks the numbers of `effects` on top of `model`, so that simulations follow the logs of `experiments`.
@@ -123,53 +125,76 @@ pub fn identify(
     options: &Options,
     progress: &mut Progress,
 ) -> Result<Identification, IdentifyError> {
-    if let Some((effect, _)) = effects.iter().find(|(effect, _)| WEAKENING.contains(&effect.name)) {
-        return Err(IdentifyError::Weakening(effect.name));
-    }
-    if experiments.windows(2).any(|pair| pair[0].floating != pair[1].floating) {
-        return Err(IdentifyError::BothBases);
-    }
     let (file, all) = unknowns(model, effects)?;
-    let begin: Vec<f64> = all.iter().map(|unknown| start(&file, unknown)).collect();
-    let at = |simulator: &mut dyn Rollout, unknowns: &[Unknown], file: &ModelFile, point: &[f64]| {
-        residuals(experiments, simulator, file, unknowns, &[point.to_vec()]).remove(0)
-    };
-    let first = at(simulator, &[], model, &[]).ok_or(IdentifyError::Diverges)?;
+    let whole = Task { file: &file, unknowns: &all, experiments, spread: &[] };
+    let given = Task { file: model, unknowns: &[], experiments, spread: &[] };
+    let first = given.residuals(simulator, &[Vec::new()]).remove(0).ok_or(IdentifyError::Diverges)?;
     if first.is_empty() {
         return Err(IdentifyError::NothingToCompare);
     }
-    let told = if options.force { vec![true; all.len()] } else { can_tell(&file, &all, experiments, simulator) };
-    let mut interrupted = !progress(Stage::Check, 1, rms(&first));
+    let begin: Vec<f64> = all.iter().map(|unknown| start(&file, unknown)).collect();
+    let predicted = predicted(&whole, simulator);
+    let told: Vec<bool> = predicted.iter().map(|deviation| options.force || *deviation < TELLING).collect();
     // What the log cannot tell stays where it starts: at its neutral value where it has one.
-    let free: Vec<Unknown> =
-        all.iter().zip(&told).filter(|(_, told)| **told).map(|(unknown, _)| unknown.clone()).collect();
-    let mut point: Vec<f64> = begin.iter().zip(&told).filter(|(_, told)| **told).map(|(value, _)| *value).collect();
-    let mut scale = 1.0;
-    if !free.is_empty() && !interrupted {
-        (point, interrupted) = search(&file, &free, experiments, simulator, options, point, progress);
-        if let Some(found) = at(simulator, &free, &file, &point) {
-            scale = (rms(&found) * rms(&found)).max(1.0);
+    let free: Vec<Unknown> = kept(&all, &told);
+    let task = Task { unknowns: &free, ..whole };
+    let mut search = match &options.resume {
+        Some(resumed) => resumed.clone(),
+        None => {
+            Search::new(question(&free, first.len(), rms(&first), options.seed), &task, kept(&begin, &told), simulator)
         }
-        let mut steps = 0;
-        if !interrupted {
-            point = refine(experiments, simulator, &file, &free, point, scale, |cost| {
-                steps += 1;
-                interrupted = !progress(Stage::Refine, steps, cost);
-                !interrupted
-            });
-        }
+    };
+    let asked = question(&free, first.len(), rms(&first), options.seed);
+    if search.question != asked {
+        return Err(IdentifyError::AnotherSearch { resumed: search.question, asked });
     }
-    let last = at(simulator, &free, &file, &point).unwrap_or_else(|| first.clone());
-    let scale = (rms(&last) * rms(&last)).max(1.0);
-    let blocks: Vec<usize> = blocks(experiments);
-    let spread =
-        linear(experiments, simulator, &file, &free, &point).and_then(|here| covariance(&here, &blocks, scale));
+    let mut interrupted = !progress(Stage::Check, 1, rms(&first));
+    if !free.is_empty() && !interrupted {
+        let mut each = |step, cost| progress(Stage::Search, step, cost);
+        interrupted = search.run(&task, simulator, options.generations, options.seed, &mut each);
+    }
+    let mut point = search.best.clone();
+    let mut spread = task.spread(simulator, &point);
+    let mut steps = 0;
+    // What the model cannot follow shows better after the first descent.
+    for _ in 0..2 {
+        if free.is_empty() || interrupted {
+            break;
+        }
+        point = refine(&Task { spread: &spread, ..task }, simulator, point, |cost| {
+            steps += 1;
+            interrupted = !progress(Stage::Refine, steps, cost);
+            !interrupted
+        });
+        spread = task.spread(simulator, &point);
+    }
+    let last = task.residuals(simulator, std::slice::from_ref(&point)).remove(0).unwrap_or_else(|| first.clone());
+    let here = Task { spread: &spread, ..task }.linear(simulator, &point);
+    let spread = here.and_then(|here| covariance(&here, &blocks(experiments)));
     let mut found = with_values(&file, &free, &point);
-    let (findings, confusable) = judge(&all, &told, &free, &point, &begin, spread.as_ref());
+    let (findings, confusable) = judge(&all, &predicted, &told, &free, &point, &begin, spread.as_ref());
     let intervals: Vec<_> = findings.iter().map(|finding| finding.interval).collect();
     set_intervals(&mut found, &all, &intervals);
     without_untold(&mut found, model, &all, &told);
+    let interrupted = interrupted.then_some(search);
     Ok(Identification { model: found, findings, rms: [rms(&first), rms(&last)], confusable, interrupted })
+}
+
+fn kept<T: Clone>(all: &[T], told: &[bool]) -> Vec<T> {
+    all.iter().zip(told).filter(|(_, told)| **told).map(|(one, _)| one.clone()).collect()
+}
+
+/// What a search is about, in words.
+fn question(free: &[Unknown], residuals: usize, rms: f64, seed: u64) -> String {
+    let names: Vec<_> = free.iter().map(Unknown::name).collect();
+    format!("seed {seed}, {residuals} residuals of RMS {rms:.6e}, unknowns {}", names.join(", "))
+}
+
+/// The 95 % interval of a deviation [prior deviations] around a coordinate.
+fn around(unknown: &Unknown, coordinate: f64, deviation: f64) -> [f64; 2] {
+    let half = TWO_SIDED_95 * deviation * unknown.prior[1];
+    let ends = [unknown.value(coordinate - half), unknown.value(coordinate + half)];
+    [ends[0].min(ends[1]), ends[0].max(ends[1])]
 }
 
 fn rms(residuals: &[f64]) -> f64 {
@@ -186,86 +211,27 @@ fn blocks(experiments: &[Experiment]) -> Vec<usize> {
     all
 }
 
-/// For each unknown, whether its predicted deviation (Fisher information on this motion, prior included) is clearly less
-/// than its prior's. Predicted in the middle of the priors, where every effect is there.
-fn can_tell(file: &ModelFile, all: &[Unknown], experiments: &[Experiment], simulator: &mut dyn Rollout) -> Vec<bool> {
-    let middle: Vec<f64> = all
-        .iter()
-        .map(|unknown| {
-            let [low, high] = unknown.coordinate_bounds();
-            unknown.prior[0].clamp(low, high)
-        })
-        .collect();
-    let Some(here) = linear(experiments, simulator, file, all, &middle) else { return vec![true; all.len()] };
-    // Closed loops leave errors that go on for long: count a tenth of the rows as independent.
-    match information(&here, 10.0).cholesky() {
-        Some(factor) => factor.inverse().diagonal().iter().map(|variance| variance.sqrt() < TELLING).collect(),
-        None => vec![true; all.len()],
-    }
-}
-
-fn search(
-    file: &ModelFile,
-    free: &[Unknown],
-    experiments: &[Experiment],
-    simulator: &mut dyn Rollout,
-    options: &Options,
-    begin: Vec<f64>,
-    progress: &mut Progress,
-) -> (Vec<f64>, bool) {
-    let mut random = stream(options.seed, "identify", 0);
-    let scaled = |point: &[f64]| -> Vec<f64> {
-        free.iter().zip(point).map(|(unknown, value)| (value - unknown.prior[0]) / unknown.prior[1]).collect()
-    };
-    let mut search = CmaEs::new(&scaled(&begin), 0.5);
-    let judged = residuals(experiments, simulator, file, free, std::slice::from_ref(&begin)).remove(0);
-    let mut lowest = judged.map_or(f64::MAX, |found| cost(&found, free, &begin, 1.0));
-    let (mut best, mut lows) = (begin, Vec::new());
-    for generation in 1..=options.generations {
-        let asked = search.ask(&mut random);
-        // A point beyond a bound is judged at the bound, and pays for the way.
-        let points: Vec<Vec<f64>> = asked
-            .iter()
-            .map(|point| {
-                let back = free.iter().zip(point).map(|(unknown, value)| {
-                    let [low, high] = unknown.coordinate_bounds();
-                    (unknown.prior[0] + value * unknown.prior[1]).clamp(low, high)
-                });
-                back.collect()
-            })
-            .collect();
-        let costs: Vec<f64> = residuals(experiments, simulator, file, free, &points)
-            .iter()
-            .zip(points.iter().zip(&asked))
-            .map(|(found, (point, asked))| {
-                let beyond: f64 = scaled(point).iter().zip(asked).map(|(one, other)| (one - other).powi(2)).sum();
-                found.as_ref().map_or(f64::MAX, |found| cost(found, free, point, 1.0) * (1.0 + beyond))
-            })
-            .collect();
-        for (point, cost) in points.iter().zip(&costs) {
-            if *cost < lowest {
-                lowest = *cost;
-                best.clone_from(point);
-            }
-        }
-        search.tell(&asked, &costs);
-        if !progress(Stage::Search, generation, lowest) {
-            return (best, true);
-        }
-        // Gauss-Newton is faster in a valley: the search has only to find it.
-        lows.push(lowest);
-        let before = lows.len().checked_sub(PATIENCE).map(|index| lows[index]);
-        if search.width() < 0.01 || before.is_some_and(|before| before - lowest < 0.01 * lowest) {
-            break;
-        }
-    }
-    (best, false)
+/// The deviation of each unknown [prior deviations] that the Fisher information of this motion, prior included, lets
+/// expect in the middle of the priors, where every effect is there.
+fn predicted(task: &Task, simulator: &mut dyn Rollout) -> Vec<f64> {
+    let middle = task.within_bounds(&vec![0.0; task.unknowns.len()]);
+    // Errors go on for long: count one row in thirty as independent, and with a free trunk one in a window.
+    let independent = |group: &usize| if Experiment::is_held(*group) { 30f64.sqrt() } else { 200f64.sqrt() };
+    let groups: Vec<usize> = task.experiments.iter().flat_map(Experiment::groups).collect();
+    let spread: Vec<f64> = groups.iter().map(independent).collect();
+    let here = Task { spread: &spread, ..*task }.linear(simulator, &middle);
+    let factor = here.and_then(|here| information(&here).cholesky());
+    factor.map_or_else(
+        || vec![0.0; task.unknowns.len()],
+        |factor| factor.inverse().diagonal().iter().map(|variance| variance.sqrt().hypot(SIMULATORS)).collect(),
+    )
 }
 
 type Confusable = Vec<(String, String, f64, Option<&'static str>)>;
 
 fn judge(
     all: &[Unknown],
+    predicted: &[f64],
     told: &[bool],
     free: &[Unknown],
     point: &[f64],
@@ -275,20 +241,18 @@ fn judge(
     let mut findings = Vec::new();
     let mut place = 0;
     for (index, unknown) in all.iter().enumerate() {
+        let predicted = around(unknown, unknown.prior[0], predicted[index]);
         if !told[index] {
             let (unknown, value) = (unknown.clone(), unknown.value(begin[index]));
-            findings.push(Finding { unknown, value, interval: None, verdict: Verdict::CannotTell });
+            findings.push(Finding { unknown, value, interval: None, predicted, verdict: Verdict::CannotTell });
             continue;
         }
         let [low, high] = unknown.coordinate_bounds();
         let at_bound = |end: f64| (point[place] - end).abs() < 1e-6 * unknown.prior[1];
         let verdict = if at_bound(low) || at_bound(high) { Verdict::AtBound } else { Verdict::Found };
-        let interval = spread.map(|spread| {
-            let half = TWO_SIDED_95 * spread[(place, place)].sqrt() * unknown.prior[1];
-            let ends = [unknown.value(point[place] - half), unknown.value(point[place] + half)];
-            [ends[0].min(ends[1]), ends[0].max(ends[1])]
-        });
-        findings.push(Finding { unknown: unknown.clone(), value: unknown.value(point[place]), interval, verdict });
+        let interval = spread.map(|spread| around(unknown, point[place], spread[(place, place)].sqrt()));
+        let (unknown, value) = (unknown.clone(), unknown.value(point[place]));
+        findings.push(Finding { unknown, value, interval, predicted, verdict });
         place += 1;
     }
     let mut confusable = Vec::new();

@@ -1,25 +1,37 @@
 //! Measured logs against simulations: what a model gets wrong, and which numbers would mend it.
 //!
 //! - [`motion`]: the commands of a log, row by row, in periods of the drive.
+//! - [`record()`]: a motion through a robot in a backend, as a log.
+//! - [`measured()`]: an exact log as sensors show it.
 //! - [`Experiment`]: a log cut into windows that are simulated from measured states, and what is compared, each channel
 //!   in units of its noise.
 //! - [`evaluate()`]: the errors of a model on a log; [`position_errors`]: the same over time.
 //! - [`Unknown`]: a number of a model file that is sought, with bounds and prior.
+//! - [`Search`]: the global search, which can be ended and taken up again.
 //! - [`identify()`]: CMA-ES, then Gauss-Newton, then intervals, and what the log cannot tell.
 //!
 //! Simulators come in as a [`twinstep_model::Rollout`]: this crate knows none.
 
 mod cmaes;
+mod conditions;
 mod evaluate;
 mod experiment;
 mod identify;
-mod jacobian;
 pub mod motion;
+mod record;
 mod refine;
+mod search;
+mod sensors;
+mod task;
 mod torque;
 mod unknown;
+mod window;
 
 pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};
 pub use experiment::{Experiment, ExperimentError};
 pub use identify::{Finding, Identification, IdentifyError, Options, Progress, Stage, Verdict, identify};
-pub use unknown::{Unknown, unknowns};
+pub use record::{RecordError, record};
+pub use search::Search;
+pub use sensors::{Sensor, measured};
+pub use unknown::{Unknown, candidate, start, unknowns, with_values};
+pub use window::Horizon;

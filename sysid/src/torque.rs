@@ -4,7 +4,7 @@ use twinstep_logs::{Log, TauSensor};
 use twinstep_model::lanes::{Commands, Drive};
 use twinstep_model::{JointSpring, NUM_JOINTS, RobotModel};
 
-use crate::experiment::strength;
+use crate::conditions::Conditions;
 use crate::motion::{DriveClock, MotionError, command, joint_commands};
 
 /// Sums of squares and counts of the torque errors of each joint [N²·m²], at the log's tap; none without a sensor, or
@@ -21,6 +21,7 @@ pub fn torque_errors(
         return Ok(None);
     }
     let mut sums = [(0.0, 0); NUM_JOINTS];
+    let conditions = Conditions::of(log);
     let robot = &before_the_tap(robot);
     let dt = robot.control.drive_dt();
     for (_, rows) in log.segments() {
@@ -40,7 +41,7 @@ pub fn torque_errors(
         drive.set(0, robot, &q.map(|q| q as f32), &[0.0; NUM_JOINTS]);
         for (index, row) in rows.clone().enumerate().take(rows.len() - 1) {
             let mut command = command(robot, &joints, row);
-            command.strength = strength(log, robot, row);
+            command.strength = conditions.strength(&robot.derating, row);
             let commands = Commands::new(&[command]);
             let ((q, dq), (_, next)) = (state(row), state(row + 1));
             let periods = clock.periods_between(t, index).max(1);

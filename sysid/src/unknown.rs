@@ -3,6 +3,10 @@
 use twinstep_model::effects::{Composition, Effect, Entry, EntryError, Scope};
 use twinstep_model::{ModelFile, RobotModel};
 
+/// Prior deviations of log-Cholesky coordinates `[α, d1, d2, d3, s12, s23, s13, t1, t2, t3]` around the given body: mass
+/// to 30 %, extents to a third, centre of mass to 5 cm.
+const INERTIA_PRIOR: [f64; 10] = [0.15, 0.3, 0.3, 0.3, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05];
+
 /// A number of an entry of a model file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Unknown {
@@ -84,8 +88,9 @@ pub fn unknowns(
                 let inverse = parameter.neutral.is_infinite();
                 let [low, high] = parameter.plausible.map(|value| if inverse { 1.0 / value } else { value });
                 let (low, high) = if inverse { (0.0, low) } else { (low, high) };
-                let middle = if effect.name == "inertia" { start[place] } else { 0.5 * (low + high) };
-                let deviation = if effect.name == "inertia" { 0.3 } else { (high - low).abs() / 3.92 };
+                let inertia = effect.name == "inertia";
+                let middle = if inertia { start[place] } else { 0.5 * (low + high) };
+                let deviation = if inertia { INERTIA_PRIOR[place] } else { (high - low).abs() / 3.92 };
                 unknowns.push(Unknown {
                     effect,
                     scope: *scope,

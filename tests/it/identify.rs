@@ -7,8 +7,11 @@ use rand::RngExt;
 use twinstep_logs::{Base as LoggedBase, Gain, Log, Meta, Segment, TauSensor};
 use twinstep_model::effects::{Effect, Entry, Scope, compose};
 use twinstep_model::{Backend, Command, HELD_HEIGHT, JOINT_NAMES, ModelFile, Placement, RobotModel, go2, stream};
-use twinstep_sim::{Base, BatchRollout, Engine, RapierBackend, SimConfig};
-use twinstep_sysid::{Experiment, Identification, Options, Stage, Verdict, evaluate, identify};
+use twinstep_sim::{Base, BatchBackend, BatchRollout, Engine, RapierBackend, SimConfig};
+use twinstep_sysid::{
+    Experiment, Horizon, Identification, IdentifyError, Options, RecordError, Search, Stage, Verdict, evaluate,
+    identify, record,
+};
 use twinstep_tests::python::{Programs, root};
 
 /// What is sought, and the truth.
@@ -74,16 +77,26 @@ fn log_of(robot: &RobotModel) -> Log {
 }
 
 fn simulator() -> BatchRollout {
-    BatchRollout::new(&go2(), &SimConfig { base: Base::Fixed, ..SimConfig::default() }).unwrap()
+    BatchRollout::new(&go2(), &SimConfig::default()).unwrap()
 }
 
 /// Seeks `effects` in `log`; `progress` may end it.
 fn seek(log: &Log, effects: &[(&str, &str)], progress: fn(usize) -> bool) -> Identification {
-    let experiment = Experiment::new(log, &go2()).unwrap();
+    resume(None, log, effects, progress).unwrap()
+}
+
+fn resume(
+    search: Option<Search>,
+    log: &Log,
+    effects: &[(&str, &str)],
+    progress: fn(usize) -> bool,
+) -> Result<Identification, IdentifyError> {
+    let experiment = Experiment::new(log, &go2(), Horizon::IDENTIFICATION).unwrap();
     let effects: Vec<_> = effects.iter().map(|(name, place)| (named(name), scope(place))).collect();
     let model = ModelFile::default();
     let mut progress = |_: Stage, step: usize, _: f64| progress(step);
-    identify(&model, &effects, &[experiment], &mut simulator(), &Options::default(), &mut progress).unwrap()
+    let options = Options { resume: search, ..Options::default() };
+    identify(&model, &effects, &[experiment], &mut simulator(), &options, &mut progress)
 }
 
 #[test]
@@ -115,11 +128,37 @@ fn what_a_log_cannot_tell_is_left_and_said() {
 }
 
 #[test]
-fn search_that_is_ended_keeps_the_best_so_far() {
+fn search_that_is_ended_keeps_the_best_so_far_and_can_be_taken_up_again() {
     let log = log_of(&plant());
-    let found = seek(&log, &[("coulomb_friction", "calf")], |step| step < 2);
-    assert!(found.interrupted);
+    let effects = [("coulomb_friction", "calf")];
+    let found = seek(&log, &effects, |step| step < 2);
     assert!(found.rms[1] < found.rms[0], "{:?}", found.rms);
+    let search = found.interrupted.expect("it was ended");
+    let stored = serde_json::to_string(&search).unwrap();
+    let resumed = resume(Some(serde_json::from_str(&stored).unwrap()), &log, &effects, |_| true).unwrap();
+    assert_eq!(resumed.model, seek(&log, &effects, |_| true).model, "as if it had never been ended");
+    let other = resume(Some(search), &log, &[("coulomb_friction", "hip")], |_| true);
+    assert!(matches!(other, Err(IdentifyError::AnotherSearch { .. })));
+}
+
+#[test]
+fn supply_and_heat_are_identified_from_logs_that_tell_them() {
+    let mut robot = go2();
+    robot.derating.voltage_exponent = 1.5;
+    let rows = 1600;
+    // The battery sags and recovers in waves.
+    let voltage: Vec<f64> = (0..rows).map(|row| 25.0 + 3.0 * (f64::from(row) * 0.005).sin()).collect();
+    let motion = log_of(&go2());
+    let columns = motion.channels().map(|(name, cells)| (name.to_owned(), cells.to_vec()));
+    let columns = columns.chain([("t".to_owned(), motion.t().to_vec()), ("battery_V".to_owned(), voltage)]);
+    let motion = Log::new(motion.meta().clone(), columns).unwrap();
+    let config = SimConfig { base: Base::Fixed, threads: 1, ..SimConfig::default() };
+    let backend =
+        |_| BatchBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)));
+    let log = record(&motion, &robot, None, backend, "sagging".to_owned(), &mut |_| true).unwrap();
+    let found = seek(&log, &[("supply_sag", "all")], |_| true);
+    let [low, high] = found.findings[0].interval.unwrap();
+    assert!((low..high).contains(&1.5) && high - low < 0.5, "{:?}", found.findings[0]);
 }
 
 fn twinstep(arguments: &[&str]) -> std::process::Output {
@@ -163,6 +202,11 @@ fn mistakes_on_the_command_line_are_named() {
         let told = String::from_utf8_lossy(&output.stderr);
         assert!(told.contains(wanted), "{told}");
     }
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("fitted.toml");
+    let output = twinstep(&["identify", "data/go2_air_chirp", "--resume", "--out", out.to_str().unwrap()]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("cannot resume from"));
     let output = twinstep(&["identify", "data/go2_air_chirp", "--out", "/nowhere/fitted.toml"]);
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).starts_with("error: cannot write /nowhere/fitted.toml"));

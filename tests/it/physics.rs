@@ -6,7 +6,7 @@ use glam::{DMat3, DVec3, Vec3};
 use proptest::prelude::*;
 use twinstep_model::lanes::{Acceleration, State, Tree, Vec3 as LaneVec3, forward_dynamics};
 use twinstep_model::{Backend, Command, Joint, NUM_JOINTS, PerJoint, Placement, RobotModel, frames, go2};
-use twinstep_sim::{Base, SimConfig, Terrain};
+use twinstep_sim::{Base, Engine, SimConfig, Terrain};
 
 use super::{ENGINE, Simulator};
 
@@ -115,8 +115,10 @@ fn dropped_robot_falls_as_galilei_says() {
     );
     run(&mut backend, &hold_default_pose(), 1.0);
     let fallen = 10.0 - backend.states().base_position[0][2];
-    // Semi-implicit Euler falls g·dt·t/2 too far: 12 mm at 400 Hz. The legs may move the trunk a little about the CoM.
-    assert!((fallen - GRAVITY / 2.0 - 0.01226).abs() < 0.004, "fell {fallen} m");
+    // Semi-implicit Euler falls g·dt·t/2 too far, 12 mm at 400 Hz, which the batch engine takes off where it is read. The
+    // legs may move the trunk a little about the CoM.
+    let excess = if ENGINE == Engine::Rapier { 0.01226 } else { 0.0 };
+    assert!((fallen - GRAVITY / 2.0 - excess).abs() < 0.004, "fell {fallen} m");
     assert!((backend.states().base_linear_velocity[0][2] + GRAVITY).abs() < 0.02);
 }
 

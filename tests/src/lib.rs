@@ -5,10 +5,11 @@
 //! speed. The client compares every observation with a counter of its own ([`ledger::Ledger`]), which also survives the
 //! client's death. [`campaign`] runs many lanes at once and adds up.
 //!
-//! [`security`] has what the tests of TLS, users and access control need, [`python`] what those of the Python client do.
+//! [`hidden_robot`] has the robots that identification is tried on, [`security`] what the tests of TLS, users and access control need, [`python`] what those of the Python client do.
 
 pub mod campaign;
 pub mod fault;
+pub mod hidden_robot;
 pub mod lane;
 pub mod ledger;
 pub mod process;

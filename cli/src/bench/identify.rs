@@ -7,8 +7,8 @@ use rand::RngExt;
 use twinstep_logs::Log;
 use twinstep_model::effects::{Entry, compose};
 use twinstep_model::{JOINT_NAMES, MjcfBase, MjcfDrive, MjcfOptions, ModelFile, RobotModel, go2, mjcf, stream};
-use twinstep_sim::{Base, BatchRollout, SimConfig};
-use twinstep_sysid::{Experiment, Options, identify};
+use twinstep_sim::{BatchRollout, SimConfig};
+use twinstep_sysid::{Experiment, Horizon, Options, identify};
 
 use super::Row;
 use super::pace::{WINDOWS, measure as pace, median_of};
@@ -37,7 +37,7 @@ pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Ro
     std::fs::remove_dir_all(&folder).map_err(other)?;
     let log = log?;
     let first = log.t()[0];
-    let experiment = Experiment::new(&log, &go2()).map_err(other)?;
+    let experiment = Experiment::new(&log, &go2(), Horizon::IDENTIFICATION).map_err(other)?;
     let rollouts = experiment.clone().only(|row| log.t()[row] - first <= ROLLOUT_S);
     let candidates = candidates()?;
     let mut rows =
@@ -64,7 +64,7 @@ fn candidates() -> Result<Vec<RobotModel>, Failure> {
 }
 
 fn simulator(threads: usize) -> Result<BatchRollout, Failure> {
-    BatchRollout::new(&go2(), &SimConfig { base: Base::Fixed, threads, ..SimConfig::default() }).map_err(other)
+    BatchRollout::new(&go2(), &SimConfig { threads, ..SimConfig::default() }).map_err(other)
 }
 
 /// Windows of ours and of MuJoCo in turn.
@@ -129,7 +129,7 @@ fn whole_search(experiment: &Experiment, signals: &Signals) -> Result<Row, Failu
         &mut |_, _, _| !signals.check().unwrap_or(true),
     );
     let seconds = since.elapsed().as_secs_f64();
-    if found.map_err(other)?.interrupted {
+    if found.map_err(other)?.interrupted.is_some() {
         return Err(Failure::Interrupted);
     }
     Ok(Row {

@@ -77,7 +77,7 @@ fn variants(effect: &'static Effect) -> Result<Vec<(String, RobotModel)>, Failur
 
 /// What the robots do in a motion.
 fn play<'a>(motion: &Motion, robots: impl Iterator<Item = &'a RobotModel>) -> Result<Vec<Run>, Failure> {
-    let config = SimConfig { base: motion.base, threads: 1, ..SimConfig::default() };
+    let config = SimConfig { threads: 1, ..SimConfig::default() };
     let mut simulator = BatchRollout::new(&go2(), &config).map_err(other)?;
     let runs = robots.map(|robot| {
         let (commands, supply) = commands(motion, robot);
@@ -86,7 +86,8 @@ fn play<'a>(motion: &Motion, robots: impl Iterator<Item = &'a RobotModel>) -> Re
             Base::Fixed => Placement::at_rest(HELD_HEIGHT as f32, pose),
             Base::Floating => Placement::above(&Ground::FLAT, robot, pose, motion.clearance),
         };
-        let states = simulator.play(&[Job { robot, start, commands: &commands }]).remove(0);
+        let states =
+            simulator.play(&[Job { robot, held: motion.base == Base::Fixed, start, commands: &commands }]).remove(0);
         let joint = Joint { leg: Leg::FL, kind: motion.joint }.index();
         let settle = (motion.settle / robot.control.drive_dt()).round() as usize;
         Run { robot: robot.clone(), commands, supply, joint, settle, states }

@@ -90,13 +90,16 @@ def rmse(one: Array, other: Array) -> float:
 
 
 @pytest.mark.parametrize("target", [step_target, trot_target])
-def test_robot_on_a_stand_moves_as_in_mujoco_at_the_same_step(tmp_path: Path, target: Callable[[int], Array]) -> None:
+def test_robot_on_a_stand_is_closer_to_fine_mujoco_than_mujoco_at_the_same_step(
+    tmp_path: Path, target: Callable[[int], Array]
+) -> None:
     targets = motion(target)
     played = play(tmp_path, targets, "fixed", 1000)
-    joints, _ = in_mujoco(targets, played, "fixed", 0.001)
-    error = rmse(rows_of(played, "q", JOINTS), joints)
-    print(f"{target.__name__} on a stand: {error:.2e} rad")
-    assert error < 1e-4
+    fine, _ = in_mujoco(targets, played, "fixed", 0.00005)
+    coarse, _ = in_mujoco(targets, played, "fixed", 0.001)
+    ours, theirs = (rmse(q, fine) for q in (rows_of(played, "q", JOINTS), coarse))
+    print(f"{target.__name__} on a stand, 1 kHz: {ours:.2e} rad, MuJoCo {theirs:.2e} rad from MuJoCo at 20 kHz")
+    assert ours < min(1e-4, theirs / 3)
 
 
 @pytest.mark.parametrize(("target", "limit"), [(step_target, 0.003), (trot_target, 0.015)])

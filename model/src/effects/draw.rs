@@ -1,9 +1,7 @@
 //! Domain randomisation: robots drawn from the intervals of a model file.
 
-use rand::{Rng, RngExt};
-
 use super::{Entry, EntryError};
-use crate::{ModelFile, RobotModel, Stream, stream};
+use crate::{ModelFile, RobotModel, Stream, standard_normal, stream};
 
 /// Draws that are tried to see whether the intervals are of any robots.
 const TRIALS: usize = 100;
@@ -76,12 +74,6 @@ impl Entry {
         }
         drawn
     }
-}
-
-/// A normal number of mean 0 and deviation 1 (Box and Muller).
-fn standard_normal(random: &mut impl Rng) -> f64 {
-    let (u, v): (f64, f64) = (random.random(), random.random());
-    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
 }
 
 #[cfg(test)]

@@ -50,7 +50,7 @@ impl<T: Lane> Input<T> {
     pub fn torques(tau: &[PerJoint]) -> Self {
         let mut given = [T::splat(0.0); 12];
         for (lane, tau) in tau.iter().enumerate() {
-            set(&mut given, lane, tau);
+            set(&mut given, lane, tau.map(f64::from));
         }
         Self::Torques(given)
     }
@@ -115,16 +115,21 @@ impl<T: Lane> Group<T> {
         // Softer than two steps cannot be told from the step itself (MuJoCo's `refsafe`).
         self.surface.time_constant.set(lane, robot.contact.time_constant.max(2.0 * self.dt.get(lane)));
 
+        // As `sampled_q` reads: half a step further on.
+        let half = 0.5 * self.dt.get(lane);
+        let moving = self.surface.moving.get(lane);
+        let [linear, angular] = [placement.base_linear_velocity, placement.base_angular_velocity]
+            .map(|given| Vec3(given.map(|value| moving * f64::from(value))));
+        let position = Vec3(placement.base_position.map(f64::from)) + linear.scaled(half);
         let state = &mut self.state;
-        let held = self.surface.moving.get(lane) == 0.0;
-        let velocity = |given: [f32; 3]| if held { [0.0; 3] } else { given };
-        set(&mut state.position.0, lane, &placement.base_position);
-        set(&mut state.orientation, lane, &placement.base_orientation);
-        set(&mut state.linear_velocity.0, lane, &velocity(placement.base_linear_velocity));
-        set(&mut state.angular_velocity.0, lane, &velocity(placement.base_angular_velocity));
-        set(&mut state.q, lane, &q);
-        set(&mut state.dq, lane, &placement.dq);
-        set(&mut self.tau, lane, &PerJoint::default());
+        set(&mut state.position.0, lane, position.0);
+        set(&mut state.orientation, lane, turned(placement.base_orientation.map(f64::from), angular.scaled(half)));
+        set(&mut state.linear_velocity.0, lane, linear.0);
+        set(&mut state.angular_velocity.0, lane, angular.0);
+        let dq = placement.dq.map(f64::from);
+        set(&mut state.q, lane, std::array::from_fn(|joint| f64::from(q[joint]) + half * dq[joint]));
+        set(&mut state.dq, lane, dq);
+        set(&mut self.tau, lane, [0.0; 12]);
         let Impulses { points, limits, frictions } = &mut self.impulses;
         let impulses = points.iter_mut().flatten().chain(limits.iter_mut().flatten()).chain(frictions);
         impulses.for_each(|impulse| impulse.set(lane, 0.0));
@@ -136,7 +141,7 @@ impl<T: Lane> Group<T> {
         let share = T::splat(1.0 / steps as f64);
         for _ in 0..drive_periods {
             match input {
-                Input::Commands(commands) => self.drive.tick(commands, &self.state.q, &self.state.dq),
+                Input::Commands(commands) => self.drive.tick(commands, &self.sampled_q(), &self.state.dq),
                 Input::Torques(tau) => self.drive.ask(*tau),
             }
             self.tau = [T::splat(0.0); 12];
@@ -187,7 +192,25 @@ impl<T: Lane> Group<T> {
 
     /// What the encoder of a robot's joint shows [rad, rad/s].
     pub fn encoder(&self, lane: usize, joint: usize) -> (f64, f64) {
-        self.drive.seen_by(lane, joint, &self.state.q[joint], &self.state.dq[joint])
+        self.drive.seen_by(lane, joint, &self.sampled_q()[joint], &self.state.dq[joint])
+    }
+
+    /// Position and orientation of the trunk, as [`Group::sampled_q`] has the joints'.
+    pub fn sampled_trunk(&self) -> (Vec3<T>, [T; 4]) {
+        let State { position, orientation, linear_velocity, angular_velocity, .. } = &self.state;
+        let back = T::splat(-0.5) * self.dt;
+        (*position + linear_velocity.scaled(back), turned(*orientation, angular_velocity.scaled(back)))
+    }
+
+    /// Joint positions at the instant of a sample [rad].
+    ///
+    /// Semi-implicit Euler moves by the velocity at the end of a step: under a constant acceleration `a` from rest it has
+    /// `a t (t + dt) / 2`, which is `dq dt / 2` too far. Read half a step back, positions are right to the second order,
+    /// while the steps themselves stay stable for stiff contacts and springs.
+    #[inline(always)]
+    fn sampled_q(&self) -> [T; 12] {
+        let back = T::splat(-0.5) * self.dt;
+        std::array::from_fn(|joint| self.state.q[joint] + back * self.state.dq[joint])
     }
 
     /// What a robot's gyroscope shows about an axis [rad/s].
@@ -249,9 +272,9 @@ impl<T: Lane> Group<T> {
     }
 }
 
-fn set<T: Lane, const N: usize>(values: &mut [T; N], lane: usize, given: &[f32; N]) {
+fn set<T: Lane, const N: usize>(values: &mut [T; N], lane: usize, given: [f64; N]) {
     for (value, given) in values.iter_mut().zip(given) {
-        value.set(lane, f64::from(*given));
+        value.set(lane, given);
     }
 }
 

@@ -179,8 +179,9 @@ fn advance_active<T: Lane>(
 /// Copies one robot of a group out; true if all its numbers are finite.
 fn read<T: Lane>(group: &Group<T>, lane: usize, states: &mut RobotStatesMut) -> bool {
     let state = group.state();
-    states.base_position[lane] = values(&state.position.0, lane);
-    states.base_orientation[lane] = values(&state.orientation, lane);
+    let (position, orientation) = group.sampled_trunk();
+    states.base_position[lane] = values(&position.0, lane);
+    states.base_orientation[lane] = values(&orientation, lane);
     states.base_linear_velocity[lane] = values(&state.linear_velocity.0, lane);
     states.base_angular_velocity[lane] = std::array::from_fn(|axis| group.gyro(lane, axis) as f32);
     for joint in 0..12 {

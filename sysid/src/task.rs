@@ -1,0 +1,112 @@
+//! What is asked of the data: numbers of a model, and the experiments that its simulations are to follow.
+
+use nalgebra::{DMatrix, DVector};
+use twinstep_model::{ModelFile, Rollout};
+
+use crate::experiment::Experiment;
+use crate::unknown::{Unknown, candidate};
+
+/// Half a difference, in prior standard deviations.
+const STEP: f64 = 0.02;
+
+/// What is asked. A point is the unknowns' coordinates.
+#[derive(Clone, Copy)]
+pub struct Task<'a> {
+    /// The model with an entry for each unknown.
+    pub file: &'a ModelFile,
+    /// What is sought.
+    pub unknowns: &'a [Unknown],
+    /// What is to be followed.
+    pub experiments: &'a [Experiment],
+    /// What residuals are divided by, one by one, besides their noise; empty for nothing. See [`Task::spread`].
+    pub spread: &'a [f64],
+}
+
+/// Residuals at a point, and their derivatives by the coordinates in units of their prior deviations.
+pub struct Linear {
+    /// Residuals.
+    pub residuals: DVector<f64>,
+    /// One row a residual, one column an unknown.
+    pub slopes: DMatrix<f64>,
+}
+
+impl Task<'_> {
+    /// Residuals at points, one after the other; none of a point that is no robot or diverged.
+    pub fn residuals(&self, simulator: &mut dyn Rollout, points: &[Vec<f64>]) -> Vec<Option<Vec<f64>>> {
+        let robots: Vec<_> = points.iter().map(|point| candidate(self.file, self.unknowns, point)).collect();
+        let built: Vec<_> = robots.iter().flatten().cloned().collect();
+        let mut parts: Vec<std::vec::IntoIter<Vec<f64>>> =
+            self.experiments.iter().map(|experiment| experiment.residuals(simulator, &built).into_iter()).collect();
+        robots
+            .iter()
+            .map(|robot| {
+                robot.as_ref()?;
+                let mut whole: Vec<f64> = parts.iter_mut().flat_map(|part| part.next().unwrap_or_default()).collect();
+                whole.iter_mut().zip(self.spread).for_each(|(residual, spread)| *residual /= spread);
+                whole.iter().all(|residual| residual.is_finite()).then_some(whole)
+            })
+            .collect()
+    }
+
+    /// Residuals and slopes at `point`: central differences in one batch; none where a neighbour diverges.
+    pub fn linear(&self, simulator: &mut dyn Rollout, point: &[f64]) -> Option<Linear> {
+        let mut points = vec![point.to_vec()];
+        let mut widths = Vec::new();
+        for (index, unknown) in self.unknowns.iter().enumerate() {
+            let [low, high] = unknown.coordinate_bounds();
+            let ends = [-1.0, 1.0].map(|side| (point[index] + side * STEP * unknown.prior[1]).clamp(low, high));
+            widths.push((ends[1] - ends[0]) / unknown.prior[1]);
+            for end in ends {
+                let mut moved = point.to_vec();
+                moved[index] = end;
+                points.push(moved);
+            }
+        }
+        let mut all = self.residuals(simulator, &points).into_iter();
+        let here = DVector::from_vec(all.next()??);
+        let mut slopes = DMatrix::zeros(here.len(), self.unknowns.len());
+        for (index, width) in widths.into_iter().enumerate() {
+            let (below, above) = (all.next()??, all.next()??);
+            let slope = above.iter().zip(&below).map(|(above, below)| (above - below) / width);
+            slopes.set_column(index, &DVector::from_iterator(here.len(), slope));
+        }
+        Some(Linear { residuals: here, slopes })
+    }
+
+    /// How much larger than their noise the residuals of `point` are, by quantity and by whether the trunk was held; at least
+    /// 1. A model errs in some of them more than in others, and those say less.
+    pub fn spread(&self, simulator: &mut dyn Rollout, point: &[f64]) -> Vec<f64> {
+        let unspread = Task { spread: &[], ..*self };
+        let groups: Vec<usize> = self.experiments.iter().flat_map(Experiment::groups).collect();
+        let Some(residuals) = unspread.residuals(simulator, &[point.to_vec()]).remove(0) else {
+            return vec![1.0; groups.len()];
+        };
+        let mut sums = vec![(0.0, 0.0); Experiment::GROUPS];
+        for (residual, group) in residuals.iter().zip(&groups) {
+            sums[*group].0 += residual * residual;
+            sums[*group].1 += 1.0;
+        }
+        groups.iter().map(|group| (sums[*group].0 / sums[*group].1).sqrt().max(1.0)).collect()
+    }
+
+    /// Cost of residuals, and of the distance to the prior.
+    pub fn cost(&self, residuals: &[f64], point: &[f64]) -> f64 {
+        residuals.iter().map(|residual| residual * residual).sum::<f64>()
+            + self.scaled(point).map(|distance| distance * distance).sum::<f64>()
+    }
+
+    /// A point's distance from the prior means, in prior deviations.
+    pub fn scaled(&self, point: &[f64]) -> impl Iterator<Item = f64> {
+        self.unknowns.iter().zip(point).map(|(unknown, value)| (value - unknown.prior[0]) / unknown.prior[1])
+    }
+
+    /// Back from [`Task::scaled`], to the nearest point that is allowed.
+    pub fn within_bounds(&self, scaled: &[f64]) -> Vec<f64> {
+        let pairs = self.unknowns.iter().zip(scaled);
+        let back = pairs.map(|(unknown, value)| {
+            let [low, high] = unknown.coordinate_bounds();
+            (unknown.prior[0] + value * unknown.prior[1]).clamp(low, high)
+        });
+        back.collect()
+    }
+}
