@@ -6,6 +6,7 @@
 //! - [`Experiment`]: a log cut into windows that are simulated from measured states, and what is compared, each channel
 //!   in units of its noise.
 //! - [`evaluate()`]: the errors of a model on a log; [`position_errors`]: the same over time.
+//! - [`Diagnosis`]: what a diagnosis says, as in `findings.json`.
 //! - [`Unknown`]: a number of a model file that is sought, with bounds and prior.
 //! - [`Search`]: the global search, which can be ended and taken up again.
 //! - [`identify()`]: CMA-ES, then Gauss-Newton, then intervals, and what the log cannot tell.
@@ -14,6 +15,7 @@
 
 mod cmaes;
 mod conditions;
+mod diagnosis;
 mod evaluate;
 mod experiment;
 mod identify;
@@ -27,6 +29,7 @@ mod torque;
 mod unknown;
 mod window;
 
+pub use diagnosis::{Cause, Confusable, Diagnosis, Errors, Estimate, Rival, Unexplained, Value};
 pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};
 pub use experiment::{Experiment, ExperimentError};
 pub use identify::{Finding, Identification, IdentifyError, Options, Progress, Stage, Verdict, identify};

@@ -1,0 +1,110 @@
+//! What a diagnosis says: `findings.json`.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+/// What is wrong with a model, by what was held out of every choice and fit.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Diagnosis {
+    /// Errors of the model that was given.
+    pub baseline: Errors,
+    /// Errors with the findings added to it.
+    pub extended: Errors,
+    /// Errors that the sensors alone would leave.
+    pub noise_floor: Errors,
+    /// Named causes, the largest gain first; empty when nothing is wrong, or when no name is earned.
+    pub findings: Vec<Cause>,
+    /// What this log cannot tell apart.
+    pub confusable: Vec<Confusable>,
+    /// What is left.
+    pub unexplained: Unexplained,
+    /// The corrected model, beside this file.
+    pub extended_model: String,
+}
+
+/// Root mean square errors; null where the log cannot tell.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Errors {
+    /// Torque at the log's tap, driven by the measured states and commands [N·m].
+    pub torque_rmse_nm: Option<f64>,
+    /// Joint positions in closed loop [rad].
+    pub q_rmse_rad: Option<f64>,
+}
+
+/// A named cause: what is to be added to the model, multiplied into it or set in it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Cause {
+    /// The effect of the catalogue.
+    pub effect: String,
+    /// What it is about.
+    pub scope: String,
+    /// Its parameters by name; vectors are lists.
+    pub parameters: BTreeMap<String, Estimate>,
+    /// 1 − RMSE after / RMSE before, on the held-out residuals where the effect acts, on top of the causes before it.
+    pub held_out_gain: f64,
+    /// Evidence for it on held-out blocks [nats].
+    pub score_nats: f64,
+    /// What healthy robots reach by chance; it had to be more.
+    pub threshold_nats: f64,
+    /// Effects with scope, as in `armature@calf`, that explain as much: this log cannot tell.
+    pub ambiguous_with: Vec<String>,
+    /// The best of the others.
+    pub rivals: Vec<Rival>,
+    /// What a robot engineer would say.
+    pub evidence: String,
+}
+
+/// A value with its 95 % interval.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Estimate {
+    /// The value.
+    pub value: Value,
+    /// Lower end.
+    pub low: Value,
+    /// Upper end.
+    pub high: Value,
+}
+
+/// A number or a vector.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Value {
+    /// A number.
+    Number(f64),
+    /// A vector.
+    Vector(Vec<f64>),
+}
+
+/// Another cause that was tried.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Rival {
+    /// The effect.
+    pub effect: String,
+    /// What it is about.
+    pub scope: String,
+    /// Its gain in place of the cause.
+    pub held_out_gain: f64,
+}
+
+/// Effects that this log cannot tell apart.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Confusable {
+    /// Their names.
+    pub effects: [String; 2],
+    /// Correlation of their sizes.
+    pub correlation: f64,
+    /// What to run next.
+    pub experiment: String,
+}
+
+/// What is left when all that is named is explained.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Unexplained {
+    /// Share of the residual power above the noise floor.
+    pub fraction: f64,
+    /// Channels that what is left depends on, such as `q_FR_hip`, the strongest first.
+    pub depends_on: Vec<String>,
+    /// In a sentence.
+    pub text: String,
+}
