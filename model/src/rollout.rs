@@ -15,9 +15,18 @@ pub struct Job<'a> {
     pub commands: &'a [Command],
 }
 
+/// The numbers that candidates are simulated in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Precision {
+    /// Single: several times as fast, for comparing candidates that are far apart.
+    Single,
+    /// Double: for derivatives, which are small differences.
+    Double,
+}
+
 /// Plays commands through candidate robots.
 pub trait Rollout {
     /// The states of every job: one entry in each array at its start and one after each drive period. From where a job
     /// diverged its numbers are not finite.
-    fn play(&mut self, jobs: &[Job]) -> Vec<RobotStates>;
+    fn play(&mut self, jobs: &[Job], precision: Precision) -> Vec<RobotStates>;
 }

@@ -1,13 +1,19 @@
 //! Rollouts in the batch engine: every candidate has a lane, and a register of candidates goes its whole way on one thread.
 
 use rayon::prelude::*;
-use twinstep_model::{Command, Ground, Job, Placement, RobotModel, RobotStates, Rollout};
+use twinstep_model::lanes::Instructions;
+use twinstep_model::{Command, Ground, Job, Placement, Precision, RobotModel, RobotStates, Rollout};
 
 use crate::batch::{Inputs, Lanes, Time, lane_robots};
 use crate::{Base, BuildError, SimConfig};
 
-/// Candidates that are stepped together: a register in double precision, because slopes are small differences.
-const TOGETHER: usize = 4;
+/// Candidates that are stepped together: the widest register of all processors.
+fn together(precision: Precision) -> usize {
+    match precision {
+        Precision::Single => 16,
+        Precision::Double => 4,
+    }
+}
 
 /// Candidates in the lanes of the batch engine, on flat ground.
 pub struct BatchRollout {
@@ -25,11 +31,15 @@ impl BatchRollout {
     }
 
     /// Plays jobs whose trunks are all held, or all free.
-    fn play_together(&self, jobs: &[&Job]) -> Vec<RobotStates> {
+    fn play_together(&self, jobs: &[&Job], precision: Precision) -> Vec<RobotStates> {
+        let lanes = match precision {
+            Precision::Single => Lanes::Single(Instructions::best()),
+            Precision::Double => Lanes::Double,
+        };
         let base = if jobs[0].held { Base::Fixed } else { Base::Floating };
         let config = SimConfig { base, ..self.config };
         let start = Placement::at_rest(1.0, self.robot.control.default_pose_f32());
-        let mut robots = lane_robots(Lanes::Double, &self.robot, &config, &Ground::FLAT, &start, jobs.len());
+        let mut robots = lane_robots(lanes, &self.robot, &config, &Ground::FLAT, &start, jobs.len());
         let mut now = RobotStates::new(jobs.len());
         let mut records: Vec<_> = jobs.iter().map(|job| RobotStates::new(job.commands.len() + 1)).collect();
         for (robot, job) in jobs.iter().enumerate() {
@@ -55,13 +65,13 @@ impl BatchRollout {
 }
 
 impl Rollout for BatchRollout {
-    fn play(&mut self, jobs: &[Job]) -> Vec<RobotStates> {
-        let this = &*self;
+    fn play(&mut self, jobs: &[Job], precision: Precision) -> Vec<RobotStates> {
+        let (this, size) = (&*self, together(precision));
         let (held, free): (Vec<usize>, Vec<usize>) = (0..jobs.len()).partition(|index| jobs[*index].held);
-        let chunks: Vec<&[usize]> = held.chunks(TOGETHER).chain(free.chunks(TOGETHER)).collect();
+        let chunks: Vec<&[usize]> = held.chunks(size).chain(free.chunks(size)).collect();
         let play = |chunk: &&[usize]| {
             let together: Vec<_> = chunk.iter().map(|index| &jobs[*index]).collect();
-            chunk.iter().copied().zip(this.play_together(&together)).collect::<Vec<_>>()
+            chunk.iter().copied().zip(this.play_together(&together, precision)).collect::<Vec<_>>()
         };
         let mut played: Vec<_> = self.pool.install(|| chunks.par_iter().flat_map_iter(play).collect());
         played.sort_by_key(|(index, _)| *index);

@@ -2,7 +2,7 @@
 
 use glam::DQuat;
 use twinstep_logs::{Base, Log, TauSensor};
-use twinstep_model::{Command, Job, Joint, NUM_JOINTS, RobotModel, RobotStates, Rollout};
+use twinstep_model::{Command, Job, Joint, NUM_JOINTS, Precision, RobotModel, RobotStates, Rollout};
 
 use crate::conditions::Conditions;
 use crate::motion::{MotionError, joint_commands};
@@ -40,15 +40,22 @@ struct Channel {
     measured: Vec<f64>,
 }
 
+/// What is compared, with the joint or axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Quantity {
+pub enum Quantity {
+    /// Of a joint.
     Position(usize),
+    /// Of a joint.
     Velocity(usize),
+    /// Of a joint, at the current's sensor.
     Torque(usize),
+    /// Along a world axis.
     BasePosition(usize),
     /// A component of the rotation vector from the measured to the simulated orientation.
     BaseOrientation(usize),
+    /// Along a world axis.
     BaseVelocity(usize),
+    /// About an axis of the trunk.
     BaseRate(usize),
 }
 
@@ -130,8 +137,13 @@ impl Experiment {
 
     /// Differences of simulated and measured for each candidate, in units of their noise; one entry a cell that was
     /// measured, in the same order for every candidate. Not finite from where a candidate diverges.
-    pub fn residuals(&self, simulator: &mut dyn Rollout, candidates: &[RobotModel]) -> Vec<Vec<f64>> {
-        let trajectories = self.play(simulator, candidates);
+    pub fn residuals(
+        &self,
+        simulator: &mut dyn Rollout,
+        candidates: &[RobotModel],
+        precision: Precision,
+    ) -> Vec<Vec<f64>> {
+        let trajectories = self.play(simulator, candidates, precision);
         candidates
             .iter()
             .zip(trajectories.chunks(self.windows.len().max(1)))
@@ -145,6 +157,43 @@ impl Experiment {
                 residuals
             })
             .collect()
+    }
+
+    /// The experiment with the parts whose trunk was held alone, if there are any.
+    #[must_use]
+    pub fn held_first(mut self) -> Self {
+        if self.windows.iter().any(|window| window.held) {
+            self.windows.retain(|window| window.held);
+        }
+        self
+    }
+
+    /// Whether there are parts whose trunk was free.
+    pub fn has_free_parts(&self) -> bool {
+        self.windows.iter().any(|window| !window.held)
+    }
+
+    /// Hands on candidate, quantity, row and difference in units of its noise.
+    pub fn differences(
+        &self,
+        simulator: &mut dyn Rollout,
+        candidates: &[RobotModel],
+        mut each: impl FnMut(usize, Quantity, usize, f64),
+    ) {
+        let trajectories = self.play(simulator, candidates, Precision::Single);
+        let played = candidates.iter().zip(trajectories.chunks(self.windows.len().max(1)));
+        for (candidate, (robot, windows)) in played.enumerate() {
+            for (channel, window, states) in self.compared(windows) {
+                self.compare(channel, window, states, robot, |row, difference| {
+                    each(candidate, channel.quantity, row, difference / channel.sigma);
+                });
+            }
+        }
+    }
+
+    /// Noise of a quantity, in its unit; 1 if it is not compared.
+    pub fn sigma(&self, quantity: Quantity) -> f64 {
+        self.channels.iter().find(|channel| channel.quantity == quantity).map_or(1.0, |channel| channel.sigma)
     }
 
     /// As many groups as [`Experiment::groups`] has at most.
@@ -186,7 +235,7 @@ impl Experiment {
 
     /// Simulated less measured position of each joint [rad] with its row, simulated from measured states.
     pub fn position_errors(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> [Vec<(usize, f64)>; NUM_JOINTS] {
-        let windows = self.play(simulator, std::slice::from_ref(robot));
+        let windows = self.play(simulator, std::slice::from_ref(robot), Precision::Double);
         let mut errors = [const { Vec::new() }; NUM_JOINTS];
         for (channel, window, states) in self.compared(&windows) {
             if let Quantity::Position(joint) = channel.quantity {
@@ -196,7 +245,7 @@ impl Experiment {
         errors
     }
 
-    fn play(&self, simulator: &mut dyn Rollout, candidates: &[RobotModel]) -> Vec<RobotStates> {
+    fn play(&self, simulator: &mut dyn Rollout, candidates: &[RobotModel], precision: Precision) -> Vec<RobotStates> {
         let weakened: Vec<_> = candidates.iter().map(|robot| self.weakened(robot)).collect();
         let mut jobs = Vec::new();
         for (robot, weakened) in candidates.iter().zip(&weakened) {
@@ -210,7 +259,7 @@ impl Experiment {
                 jobs.push(Job { robot, held: window.held, start, commands });
             }
         }
-        simulator.play(&jobs)
+        simulator.play(&jobs, precision)
     }
 
     /// The windows' commands to motors as supply and heat leave them; empty where the log tells neither.

@@ -1,7 +1,7 @@
 //! Identification: a global search, a local one, and what the data can and cannot tell.
 
 use twinstep_model::effects::{Effect, EntryError, Scope};
-use twinstep_model::{ModelFile, Rollout};
+use twinstep_model::{ModelFile, Precision, Rollout};
 
 use crate::experiment::Experiment;
 use crate::refine::{SIMULATORS, covariance, information, refine};
@@ -126,8 +126,8 @@ pub fn identify(
     progress: &mut Progress,
 ) -> Result<Identification, IdentifyError> {
     let (file, all) = unknowns(model, effects)?;
-    let whole = Task { file: &file, unknowns: &all, experiments, spread: &[] };
-    let given = Task { file: model, unknowns: &[], experiments, spread: &[] };
+    let whole = Task { file: &file, unknowns: &all, experiments, spread: &[], precision: Precision::Double };
+    let given = Task { file: model, unknowns: &[], experiments, spread: &[], precision: Precision::Double };
     let first = given.residuals(simulator, &[Vec::new()]).remove(0).ok_or(IdentifyError::Diverges)?;
     if first.is_empty() {
         return Err(IdentifyError::NothingToCompare);
@@ -151,7 +151,13 @@ pub fn identify(
     let mut interrupted = !progress(Stage::Check, 1, rms(&first));
     if !free.is_empty() && !interrupted {
         let mut each = |step, cost| progress(Stage::Search, step, cost);
-        interrupted = search.run(&task, simulator, options.generations, options.seed, &mut each);
+        interrupted = search.run(
+            &Task { precision: Precision::Single, ..task },
+            simulator,
+            options.generations,
+            options.seed,
+            &mut each,
+        );
     }
     let mut point = search.best.clone();
     let mut spread = task.spread(simulator, &point);
@@ -202,7 +208,7 @@ fn rms(residuals: &[f64]) -> f64 {
 }
 
 /// Blocks of all experiments, each with numbers of its own.
-fn blocks(experiments: &[Experiment]) -> Vec<usize> {
+pub fn blocks(experiments: &[Experiment]) -> Vec<usize> {
     let mut all = Vec::new();
     for experiment in experiments {
         let first = all.iter().max().map_or(0, |last| last + 1);

@@ -15,6 +15,7 @@
 
 mod cmaes;
 mod conditions;
+mod diagnose;
 mod diagnosis;
 mod evaluate;
 mod experiment;
@@ -29,6 +30,7 @@ mod torque;
 mod unknown;
 mod window;
 
+pub use diagnose::{DiagnoseError, Diagnosed, diagnose};
 pub use diagnosis::{Cause, Confusable, Diagnosis, Errors, Estimate, Rival, Unexplained, Value};
 pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};
 pub use experiment::{Experiment, ExperimentError};

@@ -1,7 +1,7 @@
 //! What is asked of the data: numbers of a model, and the experiments that its simulations are to follow.
 
 use nalgebra::{DMatrix, DVector};
-use twinstep_model::{ModelFile, Rollout};
+use twinstep_model::{ModelFile, Precision, Rollout};
 
 use crate::experiment::Experiment;
 use crate::unknown::{Unknown, candidate};
@@ -20,6 +20,8 @@ pub struct Task<'a> {
     pub experiments: &'a [Experiment],
     /// What residuals are divided by, one by one, besides their noise; empty for nothing. See [`Task::spread`].
     pub spread: &'a [f64],
+    /// What candidates are simulated in.
+    pub precision: Precision,
 }
 
 /// Residuals at a point, and their derivatives by the coordinates in units of their prior deviations.
@@ -35,8 +37,11 @@ impl Task<'_> {
     pub fn residuals(&self, simulator: &mut dyn Rollout, points: &[Vec<f64>]) -> Vec<Option<Vec<f64>>> {
         let robots: Vec<_> = points.iter().map(|point| candidate(self.file, self.unknowns, point)).collect();
         let built: Vec<_> = robots.iter().flatten().cloned().collect();
-        let mut parts: Vec<std::vec::IntoIter<Vec<f64>>> =
-            self.experiments.iter().map(|experiment| experiment.residuals(simulator, &built).into_iter()).collect();
+        let mut parts: Vec<std::vec::IntoIter<Vec<f64>>> = self
+            .experiments
+            .iter()
+            .map(|experiment| experiment.residuals(simulator, &built, self.precision).into_iter())
+            .collect();
         robots
             .iter()
             .map(|robot| {

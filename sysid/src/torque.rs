@@ -2,7 +2,7 @@
 
 use twinstep_logs::{Log, TauSensor};
 use twinstep_model::lanes::{Commands, Drive};
-use twinstep_model::{JointSpring, NUM_JOINTS, RobotModel};
+use twinstep_model::{Command, JointModel, NUM_JOINTS, RobotModel, go2};
 
 use crate::conditions::Conditions;
 use crate::motion::{DriveClock, MotionError, command, joint_commands};
@@ -14,74 +14,131 @@ pub fn torque_errors(
     robot: &RobotModel,
     keep: impl Fn(usize) -> bool,
 ) -> Result<Option<[(f64, usize); NUM_JOINTS]>, MotionError> {
-    let joints = joint_commands(log)?;
-    let clock = DriveClock::of(log, robot)?;
-    let sensor = log.meta().tau_sensor;
-    if sensor == TauSensor::None {
-        return Ok(None);
-    }
     let mut sums = [(0.0, 0); NUM_JOINTS];
-    let conditions = Conditions::of(log);
-    let robot = &before_the_tap(robot);
-    let dt = robot.control.drive_dt();
-    for (_, rows) in log.segments() {
-        let t = &log.t()[rows.clone()];
-        let mut drive = Drive::<f64>::new(robot, dt);
-        let state = |row: usize| {
-            let (mut q, mut dq) = (robot.control.default_pose, [0.0; NUM_JOINTS]);
-            for joint in &joints {
-                let (index, name) = (joint.joint.index(), joint.joint.name());
-                // The drive adds its offset to what it is given; a log has it already.
-                q[index] = log.q(name).map_or(q[index], |q| q[row]) - robot.joints[index].drive.encoder_offset;
-                dq[index] = log.dq(name).map(|dq| dq[row]).filter(|dq| dq.is_finite()).unwrap_or(0.0);
+    MeasuredTorque::new(log, robot)?.differences(robot, |joint, row, difference| {
+        if keep(row) {
+            sums[joint].0 += difference * difference;
+            sums[joint].1 += 1;
+        }
+    });
+    Ok(sums.iter().any(|(_, count)| *count > 0).then_some(sums))
+}
+
+/// Measured torques, and what drives make them of.
+pub struct MeasuredTorque {
+    sensor: TauSensor,
+    conditions: Conditions,
+    rows: Vec<Row>,
+}
+
+/// A row of a log, to the next.
+struct Row {
+    row: usize,
+    /// The first of its part: a drive starts there without a memory.
+    first: bool,
+    q: [f64; NUM_JOINTS],
+    dq: [f64; NUM_JOINTS],
+    ddq: [f64; NUM_JOINTS],
+    command: Command,
+    periods: usize,
+    /// NaN where it was not measured, or the velocity was not.
+    torque: [f64; NUM_JOINTS],
+}
+
+impl MeasuredTorque {
+    /// Those of `log`, for robots with the gains and rates of `robot`.
+    pub fn new(log: &Log, robot: &RobotModel) -> Result<Self, MotionError> {
+        let joints = joint_commands(log)?;
+        let clock = DriveClock::of(log, robot)?;
+        let columns: Vec<_> = joints
+            .iter()
+            .map(|joint| {
+                let name = joint.joint.name();
+                (joint.joint.index(), log.q(name), log.dq(name), log.tau_measured(name))
+            })
+            .collect();
+        let mut all = Vec::new();
+        let parts = if log.meta().tau_sensor == TauSensor::None { Vec::new() } else { log.segments().collect() };
+        for (_, rows) in parts {
+            let t = &log.t()[rows.clone()];
+            for (index, row) in rows.clone().enumerate().take(rows.len() - 1) {
+                let periods = clock.periods_between(t, index).max(1);
+                let (q, none) = (robot.control.default_pose, [0.0; NUM_JOINTS]);
+                let command = command(robot, &joints, row);
+                let torque = [f64::NAN; NUM_JOINTS];
+                let mut now = Row { row, first: index == 0, q, dq: none, ddq: none, command, periods, torque };
+                for (joint, q, dq, tau) in &columns {
+                    now.q[*joint] = q.map_or(now.q[*joint], |q| q[row]);
+                    let speeds = dq.map_or([f64::NAN; 2], |dq| [dq[row], dq[row + 1]]);
+                    if speeds.iter().all(|speed| speed.is_finite()) {
+                        now.dq[*joint] = speeds[0];
+                        now.ddq[*joint] = (speeds[1] - speeds[0]) / (t[index + 1] - t[index]);
+                        now.torque[*joint] = tau.map_or(f64::NAN, |tau| tau[row]);
+                    }
+                }
+                all.push(now);
             }
-            (q, dq)
-        };
-        let (q, _) = state(rows.start);
-        drive.set(0, robot, &q.map(|q| q as f32), &[0.0; NUM_JOINTS]);
-        for (index, row) in rows.clone().enumerate().take(rows.len() - 1) {
-            let mut command = command(robot, &joints, row);
-            command.strength = conditions.strength(&robot.derating, row);
-            let commands = Commands::new(&[command]);
-            let ((q, dq), (_, next)) = (state(row), state(row + 1));
-            let periods = clock.periods_between(t, index).max(1);
+        }
+        Ok(Self { sensor: log.meta().tau_sensor, conditions: Conditions::of(log), rows: all })
+    }
+
+    /// Whether two robots make the same torque of the same states.
+    pub fn are_alike(&self, one: &RobotModel, other: &RobotModel) -> bool {
+        let [one, other] = [one, other].map(|robot| before_the_tap(robot, self.sensor));
+        one.joints == other.joints && one.derating == other.derating
+    }
+
+    /// Hands on joint, row and the torque that the drives of `robot` make, less the measured one [N·m].
+    pub fn differences(&self, robot: &RobotModel, mut each: impl FnMut(usize, usize, f64)) {
+        let robot = &before_the_tap(robot, self.sensor);
+        let dt = robot.control.drive_dt();
+        let mut drive = Drive::<f64>::new(robot, dt);
+        // The drive adds its offset to what it is given; a log has it already.
+        let offsets = robot.joints.map(|joint| joint.drive.encoder_offset);
+        for row in &self.rows {
+            let q: [f64; NUM_JOINTS] = std::array::from_fn(|joint| row.q[joint] - offsets[joint]);
+            if row.first {
+                drive = Drive::new(robot, dt);
+                drive.set(0, robot, &q.map(|q| q as f32), &[0.0; NUM_JOINTS]);
+            }
+            let strength = self.conditions.strength(&robot.derating, row.row);
+            let commands = Commands::new(&[Command { strength, ..row.command }]);
             let mut mean = [0.0; NUM_JOINTS];
-            for _ in 0..periods {
-                drive.tick(&commands, &q, &dq);
-                let forces = drive.push(0, &q, &dq);
+            for _ in 0..row.periods {
+                drive.tick(&commands, &q, &row.dq);
+                let forces = drive.push(0, &q, &row.dq);
                 for joint in 0..NUM_JOINTS {
-                    let ddq = (next[joint] - dq[joint]) / (t[index + 1] - t[index]);
-                    mean[joint] += match sensor {
+                    mean[joint] += match self.sensor {
                         TauSensor::Output => {
-                            let friction =
-                                forces.viscous[joint] * dq[joint] + forces.dry[joint] * smooth_sign(dq[joint]);
-                            forces.tau[joint] - friction - robot.joints[joint].armature * ddq
+                            let dry = forces.dry[joint] * smooth_sign(row.dq[joint]);
+                            let rotor = robot.joints[joint].armature * row.ddq[joint];
+                            forces.tau[joint] - forces.viscous[joint] * row.dq[joint] - dry - rotor
                         }
                         _ => drive.current()[joint],
-                    } / periods as f64;
+                    } / row.periods as f64;
                 }
             }
-            for joint in &joints {
-                let (joint, name) = (joint.joint.index(), joint.joint.name());
-                let measured = log.tau_measured(name).map_or(f64::NAN, |tau| tau[row]);
-                let known = log.dq(name).is_some_and(|dq| dq[row].is_finite() && dq[row + 1].is_finite());
-                if measured.is_finite() && known && keep(row) {
-                    sums[joint].0 += (mean[joint] - measured).powi(2);
-                    sums[joint].1 += 1;
+            for joint in 0..NUM_JOINTS {
+                if row.torque[joint].is_finite() {
+                    each(joint, row.row, mean[joint] - row.torque[joint]);
                 }
             }
         }
     }
-    Ok(sums.iter().any(|(_, count)| *count > 0).then_some(sums))
 }
 
 /// The robot without what lies behind the torque's sensor, or is in the measured position already: springs at the link,
 /// play and springs in the gear, whose rotor the encoder follows.
-fn before_the_tap(robot: &RobotModel) -> RobotModel {
+fn before_the_tap(robot: &RobotModel, sensor: TauSensor) -> RobotModel {
     let mut robot = robot.clone();
-    for joint in &mut robot.joints {
-        joint.spring = JointSpring { stiffness: 0.0, torque_at_zero: 0.0 };
-        (joint.drive.gap, joint.drive.stiffness) = (0.0, f64::INFINITY);
+    let ideal = go2().joints;
+    for (joint, ideal) in robot.joints.iter_mut().zip(ideal) {
+        joint.spring = ideal.spring;
+        (joint.drive.gap, joint.drive.stiffness) = (ideal.drive.gap, ideal.drive.stiffness);
+        if sensor == TauSensor::Current {
+            (joint.drive.gain, joint.drive.ripple) = (ideal.drive.gain, ideal.drive.ripple);
+            *joint = JointModel { torque_limit: joint.torque_limit, drive: joint.drive, ..ideal };
+        }
     }
     robot
 }

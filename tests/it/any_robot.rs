@@ -3,7 +3,7 @@
 use glam::DMat3;
 use proptest::prelude::*;
 use twinstep_model::effects::{CATALOGUE, Entry, Scope, Target, compose};
-use twinstep_model::{Command, Job, Joint, Placement, RobotModel, RobotStates, Rollout, go2};
+use twinstep_model::{Command, Job, Joint, Placement, Precision, RobotModel, RobotStates, Rollout, go2};
 use twinstep_sim::{Base, BatchRollout, SimConfig};
 
 /// Drive periods of a rollout.
@@ -46,7 +46,7 @@ fn play(robots: &[RobotModel], base: Base) -> Vec<RobotStates> {
     let jobs: Vec<_> =
         robots.iter().map(|robot| Job { robot, held: base == Base::Fixed, start, commands: &commands }).collect();
     let config = SimConfig { threads: 1, ..SimConfig::default() };
-    BatchRollout::new(&go2(), &config).unwrap().play(&jobs)
+    BatchRollout::new(&go2(), &config).unwrap().play(&jobs, Precision::Double)
 }
 
 proptest! {

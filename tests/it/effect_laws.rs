@@ -5,7 +5,7 @@
 
 use glam::DVec3;
 use twinstep_model::effects::{Effect, Entry, compose};
-use twinstep_model::{Backend, Command, Job, Placement, RobotModel, RobotStates, Rollout, go2};
+use twinstep_model::{Backend, Command, Job, Placement, Precision, RobotModel, RobotStates, Rollout, go2};
 use twinstep_sim::{Base, BatchRollout, Engine, RapierBackend, SimConfig};
 
 const CALF: usize = 2;
@@ -237,7 +237,7 @@ fn effects_of_joints_follow_their_laws_in_both_engines() {
     let robots: Vec<_> = std::iter::once(lone_calf()).chain(CASES.iter().map(|(entries, _)| robot(entries))).collect();
     let jobs: Vec<_> =
         robots.iter().map(|robot| Job { robot, held: true, start: placement(), commands: &commands }).collect();
-    let played = BatchRollout::new(&lone_calf(), &config(Engine::Batch)).unwrap().play(&jobs);
+    let played = BatchRollout::new(&lone_calf(), &config(Engine::Batch)).unwrap().play(&jobs, Precision::Double);
     let in_batch = |index: usize| -> Vec<_> { (1..=PERIODS).map(|entry| shown(&played[index], entry)).collect() };
 
     let ideal = integrate(&Law::default());

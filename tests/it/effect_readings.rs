@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 use twinstep_logs::{Base as LoggedBase, Log, Meta, Segment, TauSensor};
-use twinstep_model::{Backend, Command, Job, Placement, RobotModel, RobotStates, Rollout, go2};
+use twinstep_model::{Backend, Command, Job, Placement, Precision, RobotModel, RobotStates, Rollout, go2};
 use twinstep_sim::{Base, SimConfig};
 use twinstep_sysid::{Experiment, Horizon};
 
@@ -64,7 +64,7 @@ fn told(robot: &RobotModel, late: f64) -> (Vec<f64>, Vec<Command>) {
         Log::new(Meta::new(200.0, TauSensor::Current, segments), columns.map(|(name, cells)| (name.to_owned(), cells)));
     let mut simulator = Told::default();
     let experiment = Experiment::new(&log.unwrap(), robot, Horizon::EVALUATION).unwrap().only(|row| row >= 10);
-    let residuals = experiment.residuals(&mut simulator, std::slice::from_ref(robot));
+    let residuals = experiment.residuals(&mut simulator, std::slice::from_ref(robot), Precision::Double);
     (residuals.into_iter().next().unwrap(), simulator.0)
 }
 

@@ -6,7 +6,9 @@ use std::time::Instant;
 use rand::RngExt;
 use twinstep_logs::Log;
 use twinstep_model::effects::{Entry, compose};
-use twinstep_model::{JOINT_NAMES, MjcfBase, MjcfDrive, MjcfOptions, ModelFile, RobotModel, go2, mjcf, stream};
+use twinstep_model::{
+    JOINT_NAMES, MjcfBase, MjcfDrive, MjcfOptions, ModelFile, Precision, RobotModel, go2, mjcf, stream,
+};
 use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_sysid::{Experiment, Horizon, Options, identify};
 
@@ -79,7 +81,7 @@ fn on_one_core(
     let (mut ours, mut theirs) = (Vec::new(), Vec::new());
     for _ in 0..WINDOWS {
         let judged = pace(window_s, || {
-            rollouts.residuals(&mut simulator, &candidates[..ON_ONE_CORE]);
+            rollouts.residuals(&mut simulator, &candidates[..ON_ONE_CORE], Precision::Single);
             Ok(())
         })?;
         ours.push(judged.per_second * ON_ONE_CORE as f64 * ROLLOUT_S);
@@ -91,7 +93,7 @@ fn on_one_core(
     let value = median_of(ours);
     let theirs = (!theirs.is_empty()).then(|| median_of(theirs));
     Ok(Row {
-        case: format!("closed-loop rollouts, batch f64 {hz} Hz, one core"),
+        case: format!("closed-loop rollouts, batch f32 {hz} Hz, one core"),
         value,
         unit: "robot-s/s",
         reference: theirs.map(|theirs| format!("MuJoCo C {hz} Hz, one thread, {theirs:.0} robot-s/s")),
@@ -104,7 +106,7 @@ fn on_all_cores(rollouts: &Experiment, candidates: &[RobotModel], signals: &Sign
     let since = Instant::now();
     for candidates in candidates.chunks(TOGETHER) {
         signals.check()?;
-        rollouts.residuals(&mut simulator, candidates);
+        rollouts.residuals(&mut simulator, candidates, Precision::Single);
     }
     let seconds = since.elapsed().as_secs_f64();
     let row = |case: &str, value: f64, unit: &'static str| Row {

@@ -8,7 +8,7 @@ use std::path::Path;
 use plotters::prelude::RGBColor;
 use plotters::style::text_anchor::HPos;
 use twinstep_model::effects::{Effect, Entry, Scope, Target, compose};
-use twinstep_model::{Command, Ground, HELD_HEIGHT, Job, Joint, Leg, Placement, RobotModel, Rollout, go2};
+use twinstep_model::{Command, Ground, HELD_HEIGHT, Job, Joint, Leg, Placement, Precision, RobotModel, Rollout, go2};
 use twinstep_sim::{Base, BatchRollout, SimConfig};
 
 use crate::chart::{self, GREY, INK, Panel, PlotError};
@@ -86,8 +86,9 @@ fn play<'a>(motion: &Motion, robots: impl Iterator<Item = &'a RobotModel>) -> Re
             Base::Fixed => Placement::at_rest(HELD_HEIGHT as f32, pose),
             Base::Floating => Placement::above(&Ground::FLAT, robot, pose, motion.clearance),
         };
-        let states =
-            simulator.play(&[Job { robot, held: motion.base == Base::Fixed, start, commands: &commands }]).remove(0);
+        let states = simulator
+            .play(&[Job { robot, held: motion.base == Base::Fixed, start, commands: &commands }], Precision::Double)
+            .remove(0);
         let joint = Joint { leg: Leg::FL, kind: motion.joint }.index();
         let settle = (motion.settle / robot.control.drive_dt()).round() as usize;
         Run { robot: robot.clone(), commands, supply, joint, settle, states }

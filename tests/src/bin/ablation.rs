@@ -8,7 +8,7 @@ use indicatif::ProgressBar;
 use rayon::prelude::*;
 use twinstep_logs::Log;
 use twinstep_model::effects::{Effect, Scope};
-use twinstep_model::{JOINT_NAMES, ModelFile, Rollout, go2};
+use twinstep_model::{JOINT_NAMES, ModelFile, Precision, Rollout, go2};
 use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_sysid::{Experiment, Horizon, Options, candidate, evaluate, identify, start, unknowns, with_values};
 use twinstep_tests::hidden_robot::{effect, hidden_robot, log_of, motion, sought};
@@ -125,7 +125,7 @@ fn descended(effects: &[(&'static Effect, Scope)], experiment: &Experiment, simu
         let robots: Vec<_> = points.iter().filter_map(|point| candidate(&file, &unknowns, point)).collect();
         assert_eq!(robots.len(), points.len(), "every neighbour is a robot");
         let costs: Vec<f64> = experiment
-            .residuals(simulator, &robots)
+            .residuals(simulator, &robots, Precision::Double)
             .iter()
             .map(|residuals| residuals.iter().map(|residual| residual * residual).sum())
             .collect();

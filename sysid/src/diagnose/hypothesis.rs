@@ -1,0 +1,145 @@
+//! What might be wrong: an effect on a scope, with values.
+
+use twinstep_model::effects::{Composition, Effect, Entry, EntryError, Scope, Target};
+use twinstep_model::{Joint, ModelFile};
+
+/// Shares of the way from no effect to the end of its plausible range that are tried.
+const SHARES: [f64; 8] = [0.06, 0.12, 0.2, 0.32, 0.5, 0.75, 1.0, 1.5];
+/// A finding smaller than this share of its plausible range is not worth a name.
+const LEAST_SHARE: f64 = 0.08;
+/// The same of effects that errors of a millimetre or a percent in geometry and mass look like.
+const LEAST_SHARE_OF_BODY: f64 = 0.25;
+
+/// An effect on a scope, with values.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Hypothesis {
+    /// The effect.
+    pub effect: &'static Effect,
+    /// What it is about.
+    pub scope: Scope,
+    /// Its values, parameter after parameter.
+    pub values: Vec<f64>,
+}
+
+impl Hypothesis {
+    /// As people write it, `armature@calf`.
+    pub fn name(&self) -> String {
+        format!("{}@{}", self.effect.name, self.scope)
+    }
+
+    /// Whether it is large enough to be worth a name, and such as a robot may have.
+    pub fn is_worth_a_name(&self) -> bool {
+        let parameters = self.effect.parameters.iter().flat_map(|one| std::iter::repeat_n(one, one.count));
+        let plausible = parameters.zip(&self.values).all(|(parameter, value)| {
+            let [low, high] = parameter.plausible;
+            // An infinite one is none of it.
+            let beyond =
+                if parameter.neutral.is_infinite() { value < &(0.5 * low) } else { *value > high + 0.5 * (high - low) };
+            !beyond && (parameter.neutral.is_infinite() || *value >= low - 0.5 * (high - low))
+        });
+        let of_body = ["encoder_offset", "com_shift", "payload"].contains(&self.effect.name);
+        let least = if of_body { LEAST_SHARE_OF_BODY } else { LEAST_SHARE };
+        plausible && share(self.effect, &self.values) >= least
+    }
+}
+
+/// How far along the way from no effect to the end of the plausible range the largest of an effect's main values is.
+fn share(effect: &Effect, values: &[f64]) -> f64 {
+    let parameter = &effect.parameters[0];
+    let [low, high] = parameter.plausible;
+    let of = |value: &f64| {
+        if parameter.neutral.is_infinite() {
+            return low / value;
+        }
+        let end = if *value > parameter.neutral { high } else { low };
+        if (end - parameter.neutral).abs() < 1e-12 {
+            0.0
+        } else {
+            (value - parameter.neutral) / (end - parameter.neutral)
+        }
+    };
+    values[..parameter.count].iter().map(of).fold(0.0, f64::max)
+}
+
+/// The model with an effect of these values on every one of `joints`, or of the whole.
+pub fn with_effect(model: &ModelFile, effect: &'static Effect, values: &[f64]) -> Result<ModelFile, EntryError> {
+    let mut file = model.clone();
+    // One entry a joint: where an effect replaces, the narrowest counts.
+    let scopes: Vec<Scope> = match effect.target {
+        Target::Joints => Joint::ALL.map(Scope::Joint).to_vec(),
+        Target::Supply => vec![Scope::All],
+        Target::Bodies | Target::Base => vec![Scope::Base],
+        Target::Ground => vec![Scope::Ground],
+    };
+    for scope in scopes {
+        if effect.composition == Composition::Replace {
+            file.effects.retain(|entry| entry.effect != effect || entry.scope != scope);
+        }
+        file.effects.push(Entry::new(effect, scope, values.to_vec())?);
+    }
+    Ok(file)
+}
+
+/// Values to try, from small to large, of effects on joints and on the supply.
+pub fn sizes(effect: &Effect) -> Vec<Vec<f64>> {
+    let main = &effect.parameters[0];
+    let [low, high] = main.plausible;
+    let mut firsts = Vec::new();
+    for share in SHARES {
+        if main.neutral.is_infinite() {
+            firsts.push(low / share);
+            continue;
+        }
+        for end in [low, high] {
+            if (end - main.neutral).abs() > 1e-9 {
+                firsts.push(main.neutral + share * (end - main.neutral));
+            }
+        }
+    }
+    let seconds: &[&[f64]] = match effect.name {
+        "stribeck_friction" => &[&[0.15], &[0.6], &[2.0]],
+        "joint_spring" => &[&[-1.5], &[-0.8], &[0.0], &[0.8], &[1.5]],
+        "thermal_derating" => &[&[35.0]],
+        "torque_ripple" => return ripples(),
+        _ => &[&[]],
+    };
+    let [least, most] = main.bounds;
+    let firsts = firsts.into_iter().map(|first| first.clamp(least, most));
+    firsts.flat_map(|first| seconds.iter().map(move |second| [&[first][..], second].concat())).collect()
+}
+
+/// Values to try of an effect that is judged by the whole log; each component of a vector alone.
+pub fn whole_sizes(effect: &Effect) -> Vec<Vec<f64>> {
+    match effect.name {
+        "payload" => [-0.5, 0.3, 0.8, 1.5, 3.0].map(|mass| vec![mass, 0.0, 0.0, 0.0]).to_vec(),
+        "com_shift" | "gyro_bias" => {
+            let size = 0.4 * effect.parameters[0].plausible[1];
+            let along = |axis: usize| {
+                [-size, size].map(|size| (0..3).map(|one| if one == axis { size } else { 0.0 }).collect())
+            };
+            (0..3).flat_map(along).collect()
+        }
+        "encoder_offset" => [-0.02, 0.02].map(|offset| vec![offset]).to_vec(),
+        "ground_friction" => [0.3, 0.5, 0.65, 1.1].map(|friction| vec![friction]).to_vec(),
+        "ground_stiffness" => [0.005, 0.01, 0.02, 0.04].map(|time| vec![time]).to_vec(),
+        _ => Vec::new(),
+    }
+}
+
+/// Ripples of one size, every whole number of cycles and four phases: between them a descent finds its way.
+fn ripples() -> Vec<Vec<f64>> {
+    let phases = [0.0, 0.5, 1.0, -0.5].map(|turn| turn * std::f64::consts::PI);
+    (6..=150).flat_map(|cycles| phases.map(|phase| vec![0.12, f64::from(cycles), phase])).collect()
+}
+
+/// What having chosen among all scopes of its kind costs [nats].
+pub fn choice(scope: Scope) -> f64 {
+    let kinds: f64 = match scope {
+        Scope::Kind(_) => 3.0,
+        Scope::Leg(_) => 4.0,
+        Scope::Left | Scope::Right => 2.0,
+        Scope::Joint(_) => 12.0,
+        Scope::All | Scope::Base | Scope::Ground => 1.0,
+    };
+    kinds.ln()
+}

@@ -1,0 +1,228 @@
+//! Diagnosis: what a model gets wrong, by name, on evidence that took no part in the choice.
+//!
+//! - [`evidence`]: what a candidate model leaves of each channel, in two folds of alternating seconds.
+//! - [`hypothesis`]: an effect on a scope, with values.
+//! - [`scan`]: every effect on every joint at once; the best go on.
+//! - [`trial`]: one hypothesis fitted to one fold and judged on the other, in full simulation.
+//! - [`healthy`]: what robots without a fault reach by chance.
+//! - [`unexplained`]: what is left, and what it depends on.
+//!
+//! The best trial is accepted if its evidence exceeds the threshold and it explains a good part of what is above the noise;
+//! all that is accepted is fitted anew together, and the search goes on from there.
+
+mod evidence;
+mod healthy;
+mod hypothesis;
+mod scan;
+mod trial;
+mod unexplained;
+mod words;
+
+use twinstep_logs::Log;
+use twinstep_model::effects::{Effect, Scope, Target};
+use twinstep_model::{ModelFile, Precision, RobotModel, Rollout};
+
+use crate::diagnosis::{Cause, Confusable, Diagnosis, Errors};
+use crate::evaluate::evaluate;
+use crate::experiment::{Experiment, ExperimentError};
+use crate::identify::blocks;
+use crate::refine::{SIMULATORS, covariance};
+use crate::task::Task;
+use evidence::{Evidence, Leftover};
+use hypothesis::Hypothesis;
+use scan::{Scored, scan};
+use trial::{Fit, Trial, trial};
+
+/// Most causes that are named.
+const MOST_CAUSES: usize = 4;
+/// Hypotheses about joints that are tried in full.
+const TRIED: usize = 5;
+/// And about the trunk, the ground and the gyroscope.
+const TRIED_OF_WHOLE: usize = 2;
+/// Share of the power above noise that a cause has to explain.
+const LEAST_SHARE: f64 = 0.3;
+/// Power above the noise, in units of it, below which nothing is wrong.
+const LEAST_EXCESS: f64 = 0.1;
+/// A rival this close [nats] cannot be told from the cause.
+const CLOSE: f64 = 6.0;
+/// Why there is no diagnosis.
+#[derive(Debug, thiserror::Error)]
+pub enum DiagnoseError {
+    /// A log is no experiment.
+    #[error(transparent)]
+    Experiment(#[from] ExperimentError),
+    /// The given model cannot be simulated.
+    #[error("the simulation of the given model diverges on this log: start from a model that does not")]
+    Diverges,
+    /// The given model is none.
+    #[error(transparent)]
+    Model(#[from] twinstep_model::effects::EntryError),
+    /// Ended by `progress`.
+    #[error("ended before it was done")]
+    Ended,
+}
+
+/// What is being done, said now and then; ends the diagnosis when it returns false.
+pub type Progress<'a> = dyn FnMut(&str) -> bool + 'a;
+
+/// A diagnosis and the model that it makes.
+#[derive(Clone, Debug)]
+pub struct Diagnosed {
+    /// What is said; `extended_model` is left to who writes the files.
+    pub diagnosis: Diagnosis,
+    /// The given model with the causes, and intervals.
+    pub extended: ModelFile,
+}
+
+/// Names what `model` gets wrong in `logs` of one robot.
+pub fn diagnose(
+    logs: Vec<Log>,
+    model: &ModelFile,
+    simulator: &mut dyn Rollout,
+    progress: &mut Progress,
+) -> Result<Diagnosed, DiagnoseError> {
+    let robot = model.robot_model()?;
+    let evidence = Evidence::new(logs, &robot)?;
+    let folds = [evidence.fold(0), evidence.fold(1)];
+    let given = evidence.leftover(simulator, &robot);
+    if given.diverged() {
+        return Err(DiagnoseError::Diverges);
+    }
+    let mut say = |text: &str| if progress(text) { Ok(()) } else { Err(DiagnoseError::Ended) };
+    say("what healthy robots reach by chance")?;
+    let threshold = healthy::threshold(&evidence, model, simulator);
+    let mut accepted: Vec<(Trial, Vec<Trial>)> = Vec::new();
+    let judged = on_fitted_ground(&evidence, model, simulator);
+    let mut current = judged.clone();
+    let mut left = evidence.leftover(simulator, &current.robot_model()?);
+    while accepted.len() < MOST_CAUSES && left.excess(|_| true) > LEAST_EXCESS * count(&left) {
+        say(&format!("scanning, {} named", accepted.len()))?;
+        let mut trials = Vec::new();
+        for hypothesis in candidates(&evidence, &current, simulator) {
+            say(&format!("trying {}, {} named", hypothesis.name(), accepted.len()))?;
+            trials.extend(trial(&evidence, &folds, &current, &left, &hypothesis, simulator));
+        }
+        trials.sort_by(|one, other| other.score.total_cmp(&one.score));
+        let named = |trial: &Trial| {
+            trial.score >= threshold && trial.explains >= LEAST_SHARE && trial.hypothesis.is_worth_a_name()
+        };
+        let Some(place) = trials.iter().position(named) else { break };
+        let best = trials.remove(place);
+        accepted.push((best, trials));
+        current = refitted(&judged, &mut accepted, evidence.experiments(), simulator);
+        left = evidence.leftover(simulator, &current.robot_model()?);
+    }
+    say("intervals")?;
+    let (extended, confusable) = intervals(model, &accepted, &evidence, simulator);
+    let causes = accepted.iter().map(|(best, others)| cause(best, others, threshold, &extended)).collect();
+    let diagnosis = Diagnosis {
+        baseline: errors(&evidence, &robot, simulator)?,
+        extended: errors(&evidence, &extended.robot_model()?, simulator)?,
+        noise_floor: words::noise_floor(&evidence),
+        findings: causes,
+        confusable,
+        unexplained: unexplained::unexplained(&evidence, &extended.robot_model()?, &given, &left, simulator),
+        extended_model: String::new(),
+    };
+    Ok(Diagnosed { diagnosis, extended })
+}
+
+fn count(left: &Leftover) -> f64 {
+    left.counts.iter().flatten().sum()
+}
+
+/// The model on ground of a hardness that suits the log, as long as the difference is not worth a name: how a foot meets the
+/// ground differs between a simulator and anything else, and would pass for a shifted mass or a softer gear.
+fn on_fitted_ground(evidence: &Evidence, model: &ModelFile, simulator: &mut dyn Rollout) -> ModelFile {
+    let effect = Effect::named("ground_stiffness").expect("an effect of the catalogue");
+    let own = model.effects.iter().rfind(|entry| entry.effect == effect);
+    let values = own.map_or(vec![effect.parameters[0].neutral], |entry| entry.values.clone());
+    let hypothesis = Hypothesis { effect, scope: Scope::Ground, values };
+    let Some(fit) = Fit::new(model, std::slice::from_ref(&hypothesis)).filter(|_| evidence.has_free_parts()) else {
+        return model.clone();
+    };
+    let point = fit.to(evidence.experiments(), simulator);
+    let fitted = Hypothesis { values: vec![fit.unknowns[0].value(point[0])], ..hypothesis };
+    if fitted.is_worth_a_name() { model.clone() } else { fit.model(&point) }
+}
+
+/// What is tried in full: the best of the scan, of the joints and of the rest, which have seen different parts of the logs.
+fn candidates(evidence: &Evidence, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<Hypothesis> {
+    let (joints, whole): (Vec<_>, Vec<_>) =
+        scan(evidence, model, simulator).into_iter().filter(|scored| scored.score > 0.0).partition(|scored| {
+            let effect = scored.hypothesis.effect;
+            matches!(effect.target, Target::Joints | Target::Supply) && effect.name != "encoder_offset"
+        });
+    let tried = |scored: Vec<Scored>, most: usize| {
+        let least = 0.3 * scored.first().map_or(0.0, |best| best.score);
+        scored.into_iter().filter(move |scored| scored.score >= least).take(most).map(|scored| scored.hypothesis)
+    };
+    tried(joints, TRIED).chain(tried(whole, TRIED_OF_WHOLE)).collect()
+}
+
+/// All accepted causes fitted together to everything.
+fn refitted(
+    model: &ModelFile,
+    accepted: &mut [(Trial, Vec<Trial>)],
+    experiments: &[Experiment],
+    simulator: &mut dyn Rollout,
+) -> ModelFile {
+    let hypotheses: Vec<_> = accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
+    let Some(fit) = Fit::new(model, &hypotheses) else { return model.clone() };
+    let point = fit.to(experiments, simulator);
+    let mut values = fit.unknowns.iter().zip(&point).map(|(unknown, coordinate)| unknown.value(*coordinate));
+    for (best, _) in accepted {
+        best.hypothesis.values = values.by_ref().take(best.hypothesis.values.len()).collect();
+    }
+    fit.model(&point)
+}
+
+/// The model with the causes and their 95 % intervals, and what cannot be told apart.
+fn intervals(
+    model: &ModelFile,
+    accepted: &[(Trial, Vec<Trial>)],
+    evidence: &Evidence,
+    simulator: &mut dyn Rollout,
+) -> (ModelFile, Vec<Confusable>) {
+    let hypotheses: Vec<_> = accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
+    let Some(fit) = Fit::new(model, &hypotheses).filter(|_| !hypotheses.is_empty()) else {
+        return (model.clone(), Vec::new());
+    };
+    let experiments = evidence.experiments();
+    let task =
+        Task { file: &fit.file, unknowns: &fit.unknowns, experiments, spread: &[], precision: Precision::Double };
+    let spread = task.spread(simulator, &fit.begin);
+    let here = Task { spread: &spread, ..task }.linear(simulator, &fit.begin);
+    let covariance = here.and_then(|here| covariance(&here, &blocks(experiments)));
+    words::with_intervals(&fit, covariance.as_ref(), SIMULATORS)
+}
+
+fn errors(evidence: &Evidence, robot: &RobotModel, simulator: &mut dyn Rollout) -> Result<Errors, DiagnoseError> {
+    let (mut torque, mut q) = (Vec::new(), Vec::new());
+    for log in evidence.logs() {
+        let evaluation = evaluate(log, robot, simulator, |row| evidence::fold_of(log, row) == 1)?;
+        torque.extend(evaluation.torque_rmse_nm);
+        q.extend(evaluation.q_rmse_rad);
+    }
+    let whole = |errors: Vec<f64>| {
+        let squares: f64 = errors.iter().map(|error| error * error).sum();
+        (!errors.is_empty()).then(|| (squares / errors.len() as f64).sqrt())
+    };
+    Ok(Errors { torque_rmse_nm: whole(torque), q_rmse_rad: whole(q) })
+}
+
+fn cause(best: &Trial, others: &[Trial], threshold: f64, extended: &ModelFile) -> Cause {
+    let hypothesis = &best.hypothesis;
+    let close = others.iter().filter(|other| best.score - other.score < CLOSE);
+    Cause {
+        effect: hypothesis.effect.name.to_owned(),
+        scope: hypothesis.scope.to_string(),
+        parameters: words::estimates(hypothesis, extended),
+        held_out_gain: best.gain,
+        score_nats: best.score,
+        threshold_nats: threshold,
+        ambiguous_with: close.map(|other| other.hypothesis.name()).collect(),
+        rivals: others.iter().take(5).map(words::rival).collect(),
+        evidence: words::evidence(best, others),
+    }
+}

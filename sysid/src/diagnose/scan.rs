@@ -1,0 +1,120 @@
+//! The scan: every effect on every joint at once, a few simulations an effect. With the trunk held joints hardly disturb
+//! each other, so that one simulation judges all twelve, and any scope is a sum over its joints. Effects on the trunk, the
+//! ground and the gyroscope are judged by the whole log.
+
+use twinstep_model::effects::{CATALOGUE, Effect, Entry, Scope, Target};
+use twinstep_model::{Joint, ModelFile, RobotModel, Rollout};
+
+use super::evidence::{CHANNELS, Evidence, Leftover, TORQUE};
+use super::hypothesis::{Hypothesis, choice, sizes, whole_sizes, with_effect};
+
+/// Scopes of one effect that go on.
+const OF_ONE_EFFECT: usize = 2;
+
+/// A hypothesis with its evidence on held-out blocks [nats].
+#[derive(Clone, Debug)]
+pub struct Scored {
+    /// The hypothesis, with the best of the values that were tried.
+    pub hypothesis: Hypothesis,
+    /// Evidence, less the price of choosing.
+    pub score: f64,
+}
+
+/// Effects that one simulation of all joints can judge, the best first.
+pub fn scan(evidence: &Evidence, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<Scored> {
+    let Ok(robot) = model.robot_model() else { return Vec::new() };
+    let before = evidence.leftovers(simulator, std::slice::from_ref(&robot), true).remove(0);
+    let effects = CATALOGUE.into_iter().filter(|effect| matches!(effect.target, Target::Joints | Target::Supply));
+    let mut scored: Vec<Scored> =
+        effects.flat_map(|effect| scan_effect(evidence, model, effect, &before, simulator)).collect();
+    if evidence.has_free_parts() {
+        scored.extend(scan_whole(evidence, model, &robot, simulator));
+    }
+    scored.sort_by(|one, other| other.score.total_cmp(&one.score));
+    scored
+}
+
+fn scan_effect(
+    evidence: &Evidence,
+    model: &ModelFile,
+    effect: &'static Effect,
+    before: &Leftover,
+    simulator: &mut dyn Rollout,
+) -> Vec<Scored> {
+    let built = |values: Vec<f64>| -> Option<(Vec<f64>, RobotModel)> {
+        let robot = with_effect(model, effect, &values).ok()?.robot_model().ok()?;
+        Some((values, robot))
+    };
+    let (values, robots): (Vec<_>, Vec<_>) = sizes(effect).into_iter().filter_map(built).unzip();
+    let gains: Vec<_> =
+        evidence.leftovers(simulator, &robots, true).iter().map(|now| joint_gains(evidence, now, before)).collect();
+    let scopes = if effect.target == Target::Supply { vec![Scope::All] } else { Scope::of_joints() };
+    let mut scored: Vec<Scored> = scopes
+        .into_iter()
+        .filter_map(|scope| {
+            let of = |size: usize, fold: usize| -> f64 {
+                Joint::ALL
+                    .iter()
+                    .filter(|joint| scope.contains(**joint))
+                    .map(|joint| gains[size][joint.index()][fold])
+                    .sum()
+            };
+            let best =
+                |of: &dyn Fn(usize) -> f64| (0..values.len()).max_by(|one, other| of(*one).total_cmp(&of(*other)));
+            // Chosen on one fold, judged on the other.
+            let judged = of(best(&|size| of(size, 0))?, 1) + of(best(&|size| of(size, 1))?, 0);
+            let whole = best(&|size| of(size, 0) + of(size, 1))?;
+            let hypothesis = Hypothesis { effect, scope, values: values[whole].clone() };
+            Some(Scored { hypothesis, score: judged - choice(scope) })
+        })
+        .collect();
+    scored.sort_by(|one, other| other.score.total_cmp(&one.score));
+    scored.truncate(OF_ONE_EFFECT);
+    scored
+}
+
+/// Effects that are not of joints, and offsets of encoders: with the trunk held nothing shows of those but gravity.
+fn of_the_whole() -> Vec<(&'static Effect, Scope)> {
+    let named = |name: &str| Effect::named(name).expect("an effect of the catalogue");
+    let whole = ["payload", "com_shift", "gyro_bias"].map(|name| (named(name), Scope::Base));
+    let ground = ["ground_friction", "ground_stiffness"].map(|name| (named(name), Scope::Ground));
+    let offsets = Scope::of_joints().into_iter().map(|scope| (named("encoder_offset"), scope));
+    whole.into_iter().chain(ground).chain(offsets).collect()
+}
+
+/// Judges [`of_the_whole`].
+fn scan_whole(evidence: &Evidence, model: &ModelFile, robot: &RobotModel, simulator: &mut dyn Rollout) -> Vec<Scored> {
+    let before = evidence.leftover(simulator, robot);
+    let mut scored = Vec::new();
+    for (effect, scope) in of_the_whole() {
+        let built = |values: Vec<f64>| {
+            let mut file = model.clone();
+            file.effects.push(Entry::new(effect, scope, values.clone()).ok()?);
+            Some((values, file.robot_model().ok()?))
+        };
+        let (values, robots): (Vec<_>, Vec<_>) = whole_sizes(effect).into_iter().filter_map(built).unzip();
+        let gains = evidence.leftovers(simulator, &robots, false).into_iter().map(|now| {
+            let of = |channel: usize| {
+                [0, 1].map(|fold| now.gain(&before, channel, fold, evidence.rows_in_one(channel))).iter().sum::<f64>()
+            };
+            (0..CHANNELS).map(of).sum::<f64>()
+        });
+        let best = gains.zip(values).max_by(|one, other| one.0.total_cmp(&other.0));
+        scored.extend(best.map(|(score, values)| Scored {
+            hypothesis: Hypothesis { effect, scope, values },
+            score: score - choice(scope),
+        }));
+    }
+    scored
+}
+
+/// Evidence by joint and fold, from its position and its torque [nats].
+fn joint_gains(evidence: &Evidence, now: &Leftover, before: &Leftover) -> Vec<[f64; 2]> {
+    let of = |joint: usize, fold: usize| {
+        [joint, TORQUE + joint]
+            .map(|channel| now.gain(before, channel, fold, evidence.rows_in_one(channel)))
+            .iter()
+            .sum::<f64>()
+    };
+    (0..twinstep_model::NUM_JOINTS).map(|joint| [of(joint, 0), of(joint, 1)]).collect()
+}

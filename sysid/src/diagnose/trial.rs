@@ -1,0 +1,106 @@
+//! A trial: one hypothesis fitted to one fold and judged on the other, in full simulation.
+
+use twinstep_model::effects::{Effect, Scope};
+use twinstep_model::{ModelFile, RobotModel, Rollout};
+
+use super::evidence::{CHANNELS, Evidence, Leftover, PRECISION};
+use super::hypothesis::{Hypothesis, choice};
+use crate::experiment::Experiment;
+use crate::refine::refine;
+use crate::task::Task;
+use crate::unknown::{Unknown, start, unknowns, with_values};
+
+/// Most steps of a descent: the scan has found the valley.
+const STEPS: usize = 6;
+
+/// What came of a hypothesis.
+#[derive(Clone, Debug)]
+pub struct Trial {
+    /// With values fitted to everything.
+    pub hypothesis: Hypothesis,
+    /// Evidence on held-out blocks, less the price of choosing and of its parameters [nats].
+    pub score: f64,
+    /// 1 − RMSE after / RMSE before on the held-out residuals where it acts.
+    pub gain: f64,
+    /// Share of the power above noise that it explains, in the channels where it acts.
+    pub explains: f64,
+}
+
+/// Model and unknowns of effects on top of `model`, and where a descent begins: at `hypothesis` for the last of them.
+pub struct Fit {
+    /// The model with an entry for each effect.
+    pub file: ModelFile,
+    /// Their numbers.
+    pub unknowns: Vec<Unknown>,
+    /// Where a descent begins [coordinates].
+    pub begin: Vec<f64>,
+}
+
+impl Fit {
+    /// Of `hypotheses`, all at once.
+    pub fn new(model: &ModelFile, hypotheses: &[Hypothesis]) -> Option<Self> {
+        let effects: Vec<(&'static Effect, Scope)> = hypotheses.iter().map(|one| (one.effect, one.scope)).collect();
+        let (file, unknowns) = unknowns(model, &effects).ok()?;
+        let values: Vec<f64> = hypotheses.iter().flat_map(|one| one.values.iter().copied()).collect();
+        // Where nothing is known of a value it begins where there is none of it.
+        let begin = unknowns
+            .iter()
+            .zip(&values)
+            .map(|(unknown, value)| if value.is_finite() { unknown.coordinate(*value) } else { start(&file, unknown) });
+        Some(Self { begin: begin.collect(), file, unknowns })
+    }
+
+    /// The numbers that follow `experiments` best.
+    pub fn to(&self, experiments: &[Experiment], simulator: &mut dyn Rollout) -> Vec<f64> {
+        let task = Task { file: &self.file, unknowns: &self.unknowns, experiments, spread: &[], precision: PRECISION };
+        let spread = task.spread(simulator, &self.begin);
+        let mut steps = 0;
+        refine(&Task { spread: &spread, ..task }, simulator, self.begin.clone(), |_| {
+            steps += 1;
+            steps < STEPS
+        })
+    }
+
+    /// The model with these numbers.
+    pub fn model(&self, point: &[f64]) -> ModelFile {
+        with_values(&self.file, &self.unknowns, point)
+    }
+}
+
+/// Tries `hypothesis` on top of `model`, which leaves `before`.
+pub fn trial(
+    evidence: &Evidence,
+    folds: &[Vec<Experiment>; 2],
+    model: &ModelFile,
+    before: &Leftover,
+    hypothesis: &Hypothesis,
+    simulator: &mut dyn Rollout,
+) -> Option<Trial> {
+    let fit = Fit::new(model, std::slice::from_ref(hypothesis))?;
+    let points = [0, 1].map(|fold| fit.to(&folds[fold], simulator));
+    let whole: Vec<f64> = points[0].iter().zip(&points[1]).map(|(one, other)| 0.5 * (one + other)).collect();
+    let models = [fit.model(&points[0]), fit.model(&points[1]), fit.model(&whole)];
+    let robots: Vec<RobotModel> = models.iter().map(|model| model.robot_model().ok()).collect::<Option<_>>()?;
+    let left = evidence.leftovers(simulator, &robots, false);
+    // Fitted to one fold, judged on the other.
+    let judged = |channel: usize| {
+        let rows = evidence.rows_in_one(channel);
+        left[0].gain(before, channel, 1, rows) + left[1].gain(before, channel, 0, rows)
+    };
+    let evidence_nats: f64 = (0..CHANNELS).map(judged).sum();
+    let parameters = 0.5 * fit.unknowns.len() as f64 * 200f64.ln();
+    let held_out = |channel: usize| left[0].sums[channel][1] + left[1].sums[channel][0];
+    let acts: Vec<usize> = (0..CHANNELS).filter(|channel| judged(*channel) > 1.0).collect();
+    let [then, now] = [
+        acts.iter().map(|channel| before.sums[*channel].iter().sum::<f64>()).sum::<f64>(),
+        acts.iter().map(|channel| held_out(*channel)).sum::<f64>(),
+    ];
+    let [above, left_above] = [before, &left[2]].map(|left| left.excess(|channel| acts.contains(&channel)));
+    let values = fit.unknowns.iter().zip(&whole).map(|(unknown, coordinate)| unknown.value(*coordinate)).collect();
+    Some(Trial {
+        hypothesis: Hypothesis { values, ..hypothesis.clone() },
+        score: evidence_nats - choice(hypothesis.scope) - parameters,
+        gain: if then > 0.0 { 1.0 - (now / then).sqrt() } else { 0.0 },
+        explains: if above > 0.0 { 1.0 - left_above / above } else { 0.0 },
+    })
+}

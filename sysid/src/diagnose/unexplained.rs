@@ -1,0 +1,125 @@
+//! What is left when all that is named is explained, and what it depends on.
+
+use twinstep_logs::Log;
+use twinstep_model::{JOINT_NAMES, RobotModel, Rollout};
+
+use super::evidence::{CHANNELS, Evidence, Leftover, TORQUE, TRUNK, fold_of};
+use crate::diagnosis::Unexplained;
+use crate::experiment::Quantity;
+
+/// Bins of a variable that might explain a residual.
+const BINS: usize = 12;
+/// Share of a residual's power that a variable has to explain on held-out seconds.
+const TELLING: f64 = 0.3;
+/// Power above the noise, in units of it, that is worth a word.
+const LEAST_EXCESS: f64 = 0.3;
+
+/// What `robot` leaves of what was `given`.
+pub fn unexplained(
+    evidence: &Evidence,
+    robot: &RobotModel,
+    given: &Leftover,
+    left: &Leftover,
+    simulator: &mut dyn Rollout,
+) -> Unexplained {
+    let (before, after) = (given.excess(|_| true), left.excess(|_| true));
+    let fraction = if before > 0.0 { (after / before).min(1.0) } else { 0.0 };
+    let count = |channel: usize| left.counts[channel].iter().sum::<f64>();
+    let worst = (0..TRUNK)
+        .filter(|channel| count(*channel) > 0.0)
+        .max_by(|one, other| {
+            let of = |channel: usize| left.channel_excess(channel) / count(channel);
+            of(*one).total_cmp(&of(*other))
+        })
+        .filter(|channel| left.channel_excess(*channel) > LEAST_EXCESS * count(*channel));
+    let Some(channel) = worst else {
+        return Unexplained { fraction, depends_on: Vec::new(), text: "What is left is noise.".to_owned() };
+    };
+    let log = &evidence.logs()[0];
+    let residual = residual(evidence, robot, channel, simulator);
+    let mut found: Vec<(f64, String)> = variables(log)
+        .into_iter()
+        .map(|(name, cells)| (explained(log, &residual, &cells), name))
+        .filter(|(share, _)| *share > TELLING)
+        .collect();
+    found.sort_by(|one, other| other.0.total_cmp(&one.0));
+    found.truncate(3);
+    let kind = if channel < TORQUE { "position" } else { "torque" };
+    let name = JOINT_NAMES[channel % 12];
+    let told = found.first().map_or("it depends on none of the channels".to_owned(), |(share, variable)| {
+        format!("{:.0} % of it follows {variable}", 100.0 * share)
+    });
+    let text = format!("The {kind} of {name} is off by more than noise and all that is named explain: {told}.");
+    debug_assert!(channel < CHANNELS);
+    Unexplained { fraction, depends_on: found.into_iter().map(|(_, name)| name).collect(), text }
+}
+
+/// The residual of a joint's position or torque, by row of the first log; not a number where there is none.
+fn residual(evidence: &Evidence, robot: &RobotModel, channel: usize, simulator: &mut dyn Rollout) -> Vec<f64> {
+    let log = &evidence.logs()[0];
+    let mut residual = vec![f64::NAN; log.rows()];
+    if channel >= TORQUE {
+        let each = |joint: usize, row: usize, difference: f64| {
+            if TORQUE + joint == channel {
+                residual[row] = difference;
+            }
+        };
+        evidence.torques().differences(robot, each);
+    } else {
+        evidence.experiments()[0].differences(
+            simulator,
+            std::slice::from_ref(robot),
+            |_, quantity, row, difference| {
+                if quantity == Quantity::Position(channel) {
+                    residual[row] = difference;
+                }
+            },
+        );
+    }
+    residual
+}
+
+/// What a residual might depend on: positions, velocities, commands and torques of all joints, and time.
+fn variables(log: &Log) -> Vec<(String, Vec<f64>)> {
+    let mut all: Vec<(String, Vec<f64>)> = log
+        .channels()
+        .filter(|(name, _)| {
+            ["q_", "dq_", "tau_measured_", "battery_V", "temp_"].iter().any(|start| name.starts_with(start))
+        })
+        .map(|(name, cells)| (name.to_owned(), cells.to_vec()))
+        .collect();
+    all.push(("t".to_owned(), log.t().to_vec()));
+    all
+}
+
+/// Share of the residual's variance on held-out seconds that its mean in bins of `cells`, from the other seconds, explains.
+fn explained(log: &Log, residual: &[f64], cells: &[f64]) -> f64 {
+    let rows: Vec<usize> =
+        (0..residual.len()).filter(|row| residual[*row].is_finite() && cells[*row].is_finite()).collect();
+    if rows.len() < 10 * BINS {
+        return 0.0;
+    }
+    let mut sorted: Vec<f64> = rows.iter().map(|row| cells[*row]).collect();
+    sorted.sort_by(f64::total_cmp);
+    let bin = |value: f64| {
+        let below = sorted.partition_point(|other| *other < value);
+        (below * BINS / sorted.len()).min(BINS - 1)
+    };
+    let (mut rest, mut total) = (0.0, 0.0);
+    for fold in [0, 1] {
+        let (mut sums, mut counts) = ([0.0; BINS], [0.0; BINS]);
+        let of_fold = |fold: usize| rows.iter().copied().filter(move |row| fold_of(log, *row) == fold);
+        for row in of_fold(fold) {
+            sums[bin(cells[row])] += residual[row];
+            counts[bin(cells[row])] += 1.0;
+        }
+        let mean = sums.iter().sum::<f64>() / counts.iter().sum::<f64>().max(1.0);
+        for row in of_fold(1 - fold) {
+            let bin = bin(cells[row]);
+            let expected = if counts[bin] > 0.0 { sums[bin] / counts[bin] } else { mean };
+            rest += (residual[row] - expected).powi(2);
+            total += (residual[row] - mean).powi(2);
+        }
+    }
+    if total > 0.0 { 1.0 - rest / total } else { 0.0 }
+}

@@ -1,0 +1,130 @@
+//! What is found, as people read it.
+
+use std::collections::BTreeMap;
+
+use nalgebra::DMatrix;
+use twinstep_model::ModelFile;
+
+use super::evidence::Evidence;
+use super::hypothesis::Hypothesis;
+use super::trial::{Fit, Trial};
+use crate::diagnosis::{Confusable, Errors, Estimate, Rival, Value};
+use crate::experiment::Quantity;
+use crate::unknown::set_intervals;
+
+/// Correlations of this size and above are named.
+const CORRELATED: f64 = 0.9;
+/// The normal distribution's two-sided 95 %.
+const TWO_SIDED_95: f64 = 1.96;
+
+/// The model of a fit with intervals, and what cannot be told apart; `least` is the deviation that no number is better than.
+pub fn with_intervals(fit: &Fit, covariance: Option<&DMatrix<f64>>, least: f64) -> (ModelFile, Vec<Confusable>) {
+    let mut model = fit.model(&fit.begin);
+    let deviation = |index: usize| covariance.map_or(1.0, |covariance| covariance[(index, index)].sqrt().max(least));
+    let intervals: Vec<Option<[f64; 2]>> = fit
+        .unknowns
+        .iter()
+        .enumerate()
+        .map(|(index, unknown)| {
+            let half = TWO_SIDED_95 * deviation(index) * unknown.prior[1];
+            let ends = [-half, half].map(|step| unknown.value(fit.begin[index] + step));
+            Some([ends[0].min(ends[1]), ends[0].max(ends[1])])
+        })
+        .collect();
+    set_intervals(&mut model, &fit.unknowns, &intervals);
+    let mut confusable = Vec::new();
+    for (i, one) in fit.unknowns.iter().enumerate() {
+        for (j, other) in fit.unknowns.iter().enumerate().take(i) {
+            let correlation = covariance.map_or(0.0, |covariance| covariance[(i, j)] / (deviation(i) * deviation(j)));
+            if correlation.abs() >= CORRELATED && one.effect != other.effect {
+                let told = |from: &'static twinstep_model::effects::Effect, to: &str| {
+                    from.confusions.iter().find(|confusion| confusion.with == to).map(|confusion| confusion.experiment)
+                };
+                let experiment = told(one.effect, other.effect.name).or(told(other.effect, one.effect.name));
+                confusable.push(Confusable {
+                    effects: [other.effect.name.to_owned(), one.effect.name.to_owned()],
+                    correlation,
+                    experiment: experiment.unwrap_or("Another motion, with other speeds and loads.").to_owned(),
+                });
+            }
+        }
+    }
+    (model, confusable)
+}
+
+/// The values of a cause with the intervals of its entry in the extended model.
+pub fn estimates(hypothesis: &Hypothesis, extended: &ModelFile) -> BTreeMap<String, Estimate> {
+    let mut entries = extended.effects.iter().rev();
+    let entry = entries.find(|entry| entry.effect == hypothesis.effect && entry.scope == hypothesis.scope);
+    let mut estimates = BTreeMap::new();
+    let mut place = 0;
+    for parameter in hypothesis.effect.parameters {
+        let range = place..place + parameter.count;
+        place += parameter.count;
+        let end = |side: usize| -> Vec<f64> {
+            range
+                .clone()
+                .map(|index| {
+                    let interval = entry.and_then(|entry| entry.intervals[index]);
+                    interval.map_or(hypothesis.values[index], |interval| interval[side])
+                })
+                .collect()
+        };
+        let value =
+            |values: Vec<f64>| if parameter.count == 1 { Value::Number(values[0]) } else { Value::Vector(values) };
+        let estimate = Estimate {
+            value: value(hypothesis.values[range.clone()].to_vec()),
+            low: value(end(0)),
+            high: value(end(1)),
+        };
+        estimates.insert(parameter.name.to_owned(), estimate);
+    }
+    estimates
+}
+
+/// A trial as a rival.
+pub fn rival(trial: &Trial) -> Rival {
+    Rival {
+        effect: trial.hypothesis.effect.name.to_owned(),
+        scope: trial.hypothesis.scope.to_string(),
+        held_out_gain: trial.gain,
+    }
+}
+
+/// Why, in a sentence.
+pub fn evidence(best: &Trial, others: &[Trial]) -> String {
+    let hypothesis = &best.hypothesis;
+    let size = hypothesis.effect.parameters.iter().zip(&hypothesis.values).next();
+    let size = size.map_or(String::new(), |(parameter, value)| format!(" of {value:.4} {}", parameter.unit));
+    let mut text = format!(
+        "{} at {}{}: on seconds that it was not fitted to it takes {:.0} % off the error where it acts.",
+        hypothesis.effect.name.replace('_', " "),
+        hypothesis.scope,
+        size.trim_end(),
+        100.0 * best.gain
+    );
+    if let Some(other) = others.first() {
+        text += &format!(" Next best is {}, {:.0} nats behind.", other.hypothesis.name(), best.score - other.score);
+    }
+    text + " " + hypothesis.effect.signature
+}
+
+/// What the sensors alone would leave.
+pub fn noise_floor(evidence: &Evidence) -> Errors {
+    let experiments = evidence.experiments();
+    let sigmas = experiments.iter().flat_map(|experiment| {
+        experiment.joints().iter().map(|joint| experiment.sigma(Quantity::Position(joint.index())))
+    });
+    let squares: Vec<f64> = sigmas.map(|sigma| sigma * sigma).collect();
+    let has_torque =
+        evidence.logs().iter().any(|log| log.joints().iter().any(|joint| log.tau_measured(joint).is_some()));
+    let torques: Vec<f64> = evidence
+        .logs()
+        .iter()
+        .flat_map(|log| {
+            log.joints().iter().map(|joint| log.noise(&format!("tau_measured_{joint}")).unwrap_or(0.2).powi(2))
+        })
+        .collect();
+    let mean = |squares: &[f64]| (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt();
+    Errors { torque_rmse_nm: has_torque.then(|| mean(&torques)), q_rmse_rad: Some(mean(&squares)) }
+}
