@@ -15,6 +15,8 @@ mod mjcf;
 mod play;
 mod recording;
 mod replay;
+#[cfg_attr(not(test), expect(dead_code, reason = "used by diagnose"))]
+mod report;
 mod robot_file;
 mod serve;
 mod server_process;

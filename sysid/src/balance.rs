@@ -172,15 +172,16 @@ fn or_zero(value: f64) -> f64 {
 /// Change of `cells` with time, by row: that of the parabola through the row and three on either side. NaN near the ends of
 /// the log's parts.
 fn slopes(log: &Log, cells: &[f64]) -> Vec<f64> {
+    let slope = |row: usize| {
+        let near = || row - REACH..=row + REACH;
+        let dt = |other: usize| log.t()[other] - log.t()[row];
+        let middle = near().map(dt).sum::<f64>() / near().count() as f64;
+        let spread: f64 = near().map(|other| (dt(other) - middle).powi(2)).sum();
+        near().map(|other| (dt(other) - middle) * cells[other]).sum::<f64>() / spread
+    };
     let mut slopes = vec![f64::NAN; cells.len()];
     for (_, rows) in log.segments() {
-        for row in rows.start + REACH..rows.end.saturating_sub(REACH) {
-            let near = || row - REACH..=row + REACH;
-            let dt = |other: usize| log.t()[other] - log.t()[row];
-            let middle = near().map(dt).sum::<f64>() / near().count() as f64;
-            let spread: f64 = near().map(|other| (dt(other) - middle).powi(2)).sum();
-            slopes[row] = near().map(|other| (dt(other) - middle) * cells[other]).sum::<f64>() / spread;
-        }
+        (rows.start + REACH..rows.end.saturating_sub(REACH)).for_each(|row| slopes[row] = slope(row));
     }
     slopes
 }
@@ -189,9 +190,7 @@ fn slopes(log: &Log, cells: &[f64]) -> Vec<f64> {
 fn between(log: &Log, cells: &[f64]) -> Vec<f64> {
     let mut means = vec![f64::NAN; cells.len()];
     for (_, rows) in log.segments() {
-        for row in rows.start..rows.end - 1 {
-            means[row] = f64::midpoint(cells[row], cells[row + 1]);
-        }
+        (rows.start..rows.end - 1).for_each(|row| means[row] = f64::midpoint(cells[row], cells[row + 1]));
     }
     means
 }
