@@ -15,7 +15,11 @@ pub fn cards(diagnosis: &Diagnosis, evidence: &Evidence) -> String {
     }
     let cards: String =
         diagnosis.findings.iter().enumerate().map(|(index, finding)| card(index + 1, finding, evidence)).collect();
-    format!("<section>\n<h2>What causes it</h2>\n{cards}</section>\n")
+    format!(
+        "<section>\n<h2>What causes it</h2>\n{cards}<p class=\"note\">Dots: what the extended model leaves without this one \
+         finding, so that the others do not blur it. Line: what the finding takes away of that. Unexplained torque is what \
+         the model's motors, friction and springs give, less what its bodies need for the measured motion.</p>\n</section>\n"
+    )
 }
 
 fn card(rank: usize, finding: &Cause, evidence: &Evidence) -> String {
