@@ -1,7 +1,7 @@
 //! The torques of a measured motion: what a model's drives give for it, and what its bodies need.
 //!
-//! No simulation, and so no error that adds up: what is left over stands beside the speed, position or acceleration that
-//! explains it.
+//! No simulation, and so no error that adds up: what is left over stands beside the speed, position or acceleration
+//! that explains it.
 
 use std::ops::Range;
 
@@ -169,8 +169,8 @@ fn or_zero(value: f64) -> f64 {
     if value.is_finite() { value } else { 0.0 }
 }
 
-/// Change of `cells` with time, by row: that of the parabola through the row and three on either side. NaN near the ends of
-/// the log's parts.
+/// Change of `cells` with time, by row: that of the parabola through the row and three on either side. NaN near
+/// the ends of the log's parts.
 fn slopes(log: &Log, cells: &[f64]) -> Vec<f64> {
     let slope = |row: usize| {
         let near = || row - REACH..=row + REACH;

@@ -80,8 +80,8 @@ pub struct Evidence {
 }
 
 impl Evidence {
-    /// Simulates `log` under both models, and under the extended one without each of its findings where the log's torques
-    /// do not show them.
+    /// Simulates `log` under both models, and under the extended one without each of its findings where the log's
+    /// torques do not show them.
     pub fn gather(
         log: &Log,
         given: &ModelFile,

@@ -16,9 +16,10 @@ pub fn cards(diagnosis: &Diagnosis, evidence: &Evidence) -> String {
     let cards: String =
         diagnosis.findings.iter().enumerate().map(|(index, finding)| card(index + 1, finding, evidence)).collect();
     format!(
-        "<section>\n<h2>What causes it</h2>\n{cards}<p class=\"note\">Dots: what the extended model leaves without this one \
-         finding, so that the others do not blur it. Line: what the finding takes away of that. Unexplained torque is what \
-         the model's motors, friction and springs give, less what its bodies need for the measured motion.</p>\n</section>\n"
+        "<section>\n<h2>What causes it</h2>\n{cards}<p class=\"note\">Dots: what the extended model leaves without \
+         this one finding, so that the others do not blur it. Line: what the finding takes away of that. Unexplained \
+         torque is what the model's motors, friction and springs give, less what its bodies need for the measured \
+         motion.</p>\n</section>\n"
     )
 }
 
@@ -110,16 +111,16 @@ pub fn ranking(diagnosis: &Diagnosis) -> String {
         "<section>\n<h2>What else it could have been</h2>\n<div class=\"wide\"><table class=\"ranking\">\n\
          <thead><tr><th>hypothesis</th><th>gain on held-out data</th><th></th><th>evidence</th></tr></thead>\n\
          <tbody>\n{rows}</tbody></table></div>\n\
-         <p class=\"note\">Gain: the share of the error, where the effect acts, that goes away on data that was held out. \
-         Each finding is added to those above it, and its rivals stand in its place. Evidence has to be more than healthy \
-         robots reach by chance.</p>\n</section>\n"
+         <p class=\"note\">Gain: the share of the error, where the effect acts, that goes away on data that was held \
+         out. Each finding is added to those above it, and its rivals stand in its place. Evidence has to be more than \
+         healthy robots reach by chance.</p>\n</section>\n"
     )
 }
 
 fn winner(rank: usize, finding: &Cause) -> String {
     format!(
-        "<tr class=\"winner\"><th scope=\"row\">{rank}. {}</th><td>{}</td><td>{}</td><td>{} <span class=\"small\">nats, \
-         needs {}</span></td></tr>\n",
+        "<tr class=\"winner\"><th scope=\"row\">{rank}. {}</th><td>{}</td><td>{}</td><td>{} \
+         <span class=\"small\">nats, needs {}</span></td></tr>\n",
         words::sentence(&words::cause(&finding.effect, &finding.scope)),
         bar(finding.held_out_gain, "gain"),
         percent(finding.held_out_gain),

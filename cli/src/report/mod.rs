@@ -33,8 +33,8 @@ pub fn write(diagnosis: &Diagnosis, evidence: &Evidence, path: &Path) -> Result<
     std::fs::write(path, page(diagnosis, evidence)).map_err(|cause| ReportError { path: path.to_owned(), cause })
 }
 
-/// The page. Everything in it that comes from a file went through [`html::escape`]; the policy in its head keeps a browser
-/// from running or fetching anything all the same.
+/// The page. Everything in it that comes from a file went through [`html::escape`]; the policy in its head keeps a
+/// browser from running or fetching anything all the same.
 fn page(diagnosis: &Diagnosis, evidence: &Evidence) -> String {
     let log = evidence.provenance.logs.first().map_or("", |log| log.name.as_str());
     let sections = [
@@ -53,7 +53,8 @@ fn page(diagnosis: &Diagnosis, evidence: &Evidence) -> String {
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
          <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">\n\
          <meta name=\"color-scheme\" content=\"light dark\">\n\
-         <title>Diagnosis of {}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n{}</main>\n</body>\n</html>\n",
+         <title>Diagnosis of {}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n{}</main>\n\
+         </body>\n</html>\n",
         html::escape(log),
         sections.concat()
     )

@@ -33,10 +33,10 @@ pub fn numbers(diagnosis: &Diagnosis) -> String {
     };
     format!(
         "<section>\n<h2>How large the error is</h2>\n<div class=\"wide\"><table class=\"numbers\">\n\
-         <thead><tr><th></th><th>given model</th><th>extended model</th><th>noise floor</th><th>removed</th></tr></thead>\n\
-         <tbody>\n{}{}</tbody></table></div>\n\
-         <p class=\"note\">Root mean squares on blocks of the log that took no part in any choice or fit. A dash: this log \
-         cannot tell. The noise floor is what the sensors alone would leave.</p>\n</section>\n",
+         <thead><tr><th></th><th>given model</th><th>extended model</th><th>noise floor</th><th>removed</th></tr>\
+         </thead>\n<tbody>\n{}{}</tbody></table></div>\n\
+         <p class=\"note\">Root mean squares on blocks of the log that took no part in any choice or fit. A dash: this \
+         log cannot tell. The noise floor is what the sensors alone would leave.</p>\n</section>\n",
         row("joint position, closed loop [rad]", |errors| errors.q_rmse_rad),
         row("torque at the sensor [N·m]", |errors| errors.torque_rmse_nm)
     )
@@ -63,8 +63,8 @@ pub fn heat_maps(evidence: &Evidence) -> String {
     }
     format!(
         "<section>\n<h2>Where it is</h2>\n<div class=\"pair\">\n{maps}</div>\n\
-         <p class=\"note\">Root mean square error of each joint over the whole of {}; before and after on one scale. Grey: not \
-         in the log.</p>\n</section>\n",
+         <p class=\"note\">Root mean square error of each joint over the whole of {}; before and after on one scale. \
+         Grey: not in the log.</p>\n</section>\n",
         shown_log(evidence)
     )
 }

@@ -142,7 +142,8 @@ pub fn simulated() -> (Log, Diagnosis, ModelFile) {
 /// A robot on its feet with a load on its trunk, and the model that made it.
 pub fn loaded() -> (Log, ModelFile) {
     let extended = ModelFile::parse(
-        "robot = \"go2\"\n[[effect]]\nname = \"payload\"\nscope = \"base\"\nmass_kg = 3.0\nposition_m = [0.1, 0.0, 0.05]",
+        "robot = \"go2\"\n[[effect]]\nname = \"payload\"\nscope = \"base\"\n\
+         mass_kg = 3.0\nposition_m = [0.1, 0.0, 0.05]",
         "test",
     );
     let extended = extended.unwrap();
