@@ -3,6 +3,7 @@
 mod bench;
 mod chart;
 mod demo;
+mod diagnose;
 mod effect_plot;
 mod effects;
 mod evaluate;
@@ -15,6 +16,7 @@ mod mjcf;
 mod play;
 mod recording;
 mod replay;
+mod report;
 mod robot_file;
 mod serve;
 mod server_process;
@@ -35,6 +37,7 @@ struct Cli {
 enum Verb {
     Bench(bench::Args),
     Demo(demo::Args),
+    Diagnose(diagnose::Args),
     Effects(effects::Args),
     Evaluate(evaluate::Args),
     Identify(identify::Args),
@@ -55,6 +58,7 @@ fn main() -> std::process::ExitCode {
     let result = match Cli::parse().command {
         Verb::Bench(args) => bench::run(&args),
         Verb::Demo(args) => demo::run(&args),
+        Verb::Diagnose(args) => diagnose::run(&args),
         Verb::Effects(args) => effects::run(&args),
         Verb::Evaluate(args) => evaluate::run(&args),
         Verb::Identify(args) => identify::run(&args),

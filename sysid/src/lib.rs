@@ -6,6 +6,7 @@
 //! - [`Experiment`]: a log cut into windows that are simulated from measured states, and what is compared, each channel
 //!   in units of its noise.
 //! - [`evaluate()`]: the errors of a model on a log; [`position_errors`]: the same over time.
+//! - [`Balance`]: what a model's drives give in a measured motion, less what its bodies need, row by row.
 //! - [`Diagnosis`]: what a diagnosis says, as in `findings.json`.
 //! - [`Unknown`]: a number of a model file that is sought, with bounds and prior.
 //! - [`Search`]: the global search, which can be ended and taken up again.
@@ -13,6 +14,7 @@
 //!
 //! Simulators come in as a [`twinstep_model::Rollout`]: this crate knows none.
 
+mod balance;
 mod cmaes;
 mod conditions;
 mod diagnose;
@@ -30,6 +32,7 @@ mod torque;
 mod unknown;
 mod window;
 
+pub use balance::{Balance, Kinematics, PerRow};
 pub use diagnose::{DiagnoseError, Diagnosed, diagnose};
 pub use diagnosis::{Cause, Confusable, Diagnosis, Errors, Estimate, Rival, Unexplained, Value};
 pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};

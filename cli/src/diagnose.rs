@@ -1,0 +1,160 @@
+//! `twinstep diagnose`: what a model gets wrong, by name.
+
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use indicatif::{ProgressBar, ProgressStyle};
+use twinstep_logs::Log;
+use twinstep_model::ModelFile;
+use twinstep_sysid::{DiagnoseError, Diagnosed, Diagnosis, Errors, Value, diagnose};
+
+use crate::evaluate::simulator;
+use crate::exit::{Failure, Outcome, Signals, input, other};
+use crate::report::evidence::{Evidence, LogFacts, Provenance};
+use crate::report::write;
+
+/// Show what the simulation gets wrong, name the cause, extend the model, and measure the gain.
+///
+/// Simulations of the log's commands are compared with what was measured. Every effect of the catalogue is tried on every
+/// joint, leg, side and type of joint; what explains most is fitted on one half of the log's seconds and judged on the other,
+/// and is named only if its evidence is more than chance and it explains a good part of the error. Then the search goes on
+/// from there. A name is not given when nothing is wrong, or when the cause is not in the catalogue: then the report says what
+/// the error depends on.
+///
+/// DIR gets report.html to read, findings.json for programs, and extended.toml, which `twinstep serve --model` loads.
+///
+/// Example: `twinstep diagnose data/go2_air_chirp --out diagnosis`
+#[derive(clap::Args)]
+pub struct Args {
+    /// Logs of one robot: data files, or folders that hold one.
+    #[arg(required = true)]
+    logs: Vec<PathBuf>,
+    /// The model that is to be corrected; the ideal Go2 without.
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// The folder to write.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Print findings.json on stdout too, and nothing else there.
+    #[arg(long)]
+    json: bool,
+}
+
+/// The folder cannot be written.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot write {}: {source}", path.display())]
+struct Unwritable {
+    path: PathBuf,
+    source: std::io::Error,
+}
+
+/// Diagnoses, writes and prints.
+pub fn run(args: &Args) -> Outcome {
+    let model = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load).map_err(input)?;
+    let logs = args.logs.iter().map(|path| Log::open(path).map_err(input)).collect::<Result<Vec<_>, _>>()?;
+    // Before the search, not after it: what it finds must not be lost.
+    std::fs::create_dir_all(&args.out).map_err(|source| input(Unwritable { path: args.out.clone(), source }))?;
+    let signals = Signals::listen()?;
+    let robot = model.robot_model().map_err(input)?;
+    let mut simulator = simulator(&robot)?;
+    let bar = ProgressBar::new_spinner();
+    bar.set_style(ProgressStyle::with_template("{spinner} {elapsed} {msg}").expect("a template"));
+    let diagnosed = diagnose(logs.clone(), &model, &mut simulator, &mut |text| {
+        bar.set_message(text.to_owned());
+        bar.tick();
+        !signals.check().unwrap_or(true)
+    });
+    bar.finish_and_clear();
+    let Diagnosed { mut diagnosis, extended } = diagnosed.map_err(|error| match error {
+        DiagnoseError::Ended => Failure::Interrupted,
+        error => input(error),
+    })?;
+    diagnosis.extended_model = "extended.toml".to_owned();
+    let json = serde_json::to_string_pretty(&diagnosis).map_err(other)?;
+    let written = |name: &str, text: &str| {
+        let path = args.out.join(name);
+        std::fs::write(&path, text).map_err(|source| input(Unwritable { path, source }))
+    };
+    written("extended.toml", &extended.to_toml())?;
+    written("findings.json", &json)?;
+    let provenance = Provenance {
+        command: std::env::args().collect::<Vec<_>>().join(" "),
+        date: today(),
+        model: args.model.as_ref().map_or("the ideal go2".to_owned(), |path| path.display().to_string()),
+        logs: args.logs.iter().zip(&logs).map(|(path, log)| LogFacts::of(&path.display().to_string(), log)).collect(),
+    };
+    let evidence = Evidence::gather(&logs[0], &model, &extended, &mut simulator, provenance).map_err(other)?;
+    write(&diagnosis, &evidence, &args.out.join("report.html")).map_err(input)?;
+    if args.json {
+        println!("{json}");
+    } else {
+        print!("{}", text(&diagnosis, &args.out));
+    }
+    Ok(())
+}
+
+/// What a terminal shows.
+fn text(diagnosis: &Diagnosis, out: &Path) -> String {
+    let mut lines = Vec::new();
+    for cause in &diagnosis.findings {
+        let sizes = cause.parameters.iter().map(|(name, estimate)| {
+            let numbers = [&estimate.value, &estimate.low, &estimate.high].map(number);
+            format!("{name} {} ({} to {})", numbers[0], numbers[1], numbers[2])
+        });
+        lines.push(format!("{}@{}  {}", cause.effect, cause.scope, sizes.collect::<Vec<_>>().join(", ")));
+        lines.push(format!("    {}", cause.evidence));
+        if !cause.ambiguous_with.is_empty() {
+            lines.push(format!("    or {}: this log cannot tell", cause.ambiguous_with.join(", or ")));
+        }
+    }
+    if diagnosis.findings.is_empty() {
+        lines.push("no cause is named".to_owned());
+    }
+    lines.push(diagnosis.unexplained.text.clone());
+    lines.push(error_line("closed-loop joint RMSE [rad]", diagnosis, |errors| errors.q_rmse_rad));
+    lines.push(error_line("torque RMSE [N·m]", diagnosis, |errors| errors.torque_rmse_nm));
+    lines.push(format!("report: {}\n", out.join("report.html").display()));
+    lines.join("\n")
+}
+
+fn error_line(name: &str, diagnosis: &Diagnosis, of: fn(&Errors) -> Option<f64>) -> String {
+    let errors = [&diagnosis.baseline, &diagnosis.extended, &diagnosis.noise_floor];
+    let [before, after, floor] = errors.map(|errors| of(errors).map_or("-".to_owned(), |value| format!("{value:.4}")));
+    format!("{name}, held-out seconds: {before} -> {after} (noise {floor})")
+}
+
+fn number(value: &Value) -> String {
+    match value {
+        Value::Number(value) => format!("{value:.4}"),
+        Value::Vector(values) => {
+            format!("[{}]", values.iter().map(|value| format!("{value:.4}")).collect::<Vec<_>>().join(", "))
+        }
+    }
+}
+
+/// The date in UTC, as in 2026-11-21 (days to a civil date, Howard Hinnant's algorithm).
+fn today() -> String {
+    let seconds = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
+    civil_date(seconds / 86_400)
+}
+
+fn civil_date(days: u64) -> String {
+    let shifted = days + 719_468;
+    let (era, day_of_era) = (shifted / 146_097, shifted % 146_097);
+    let year_of_era = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let shifted_month = (5 * day_of_year + 2) / 153;
+    let day = day_of_year - (153 * shifted_month + 2) / 5 + 1;
+    let month = if shifted_month < 10 { shifted_month + 3 } else { shifted_month - 9 };
+    let year = year_of_era + era * 400 + u64::from(month <= 2);
+    format!("{year}-{month:02}-{day:02}")
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn days_are_dates() {
+        let dates = [0, 11_016, 20_778].map(super::civil_date);
+        assert_eq!(dates, ["1970-01-01", "2000-02-29", "2026-11-21"]);
+    }
+}

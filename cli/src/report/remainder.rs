@@ -1,0 +1,76 @@
+//! The lower part of the page: what cannot be told apart, what is left, and where it all comes from.
+
+use twinstep_model::effects::Effect;
+use twinstep_sysid::{Cause, Confusable, Diagnosis};
+
+use super::evidence::{LogFacts, Provenance};
+use super::html::{escape, number, percent};
+use super::words;
+
+/// What this log cannot tell apart, and what to run next.
+pub fn confusions(diagnosis: &Diagnosis) -> String {
+    let doubtful = diagnosis.findings.iter().filter(|finding| !finding.ambiguous_with.is_empty());
+    let items = diagnosis.confusable.iter().map(pair).chain(doubtful.map(ambiguous)).collect::<String>();
+    let text = if items.is_empty() {
+        "<p>Nothing that matters here: no two causes explain this log equally well.</p>\n".to_owned()
+    } else {
+        format!("<ul class=\"confusions\">\n{items}</ul>\n")
+    };
+    format!("<section>\n<h2>What this log cannot tell apart, and what to run next</h2>\n{text}</section>\n")
+}
+
+fn pair(pair: &Confusable) -> String {
+    let [one, other] = pair.effects.each_ref().map(|effect| words::cause_at(effect));
+    let (one, correlation, next) = (words::sentence(&one), number(pair.correlation), escape(&pair.experiment));
+    format!("<li><strong>{one} or {other}</strong> (correlation {correlation}). Next: {next}</li>\n")
+}
+
+fn ambiguous(finding: &Cause) -> String {
+    let name = words::sentence(&words::cause(&finding.effect, &finding.scope));
+    let others = words::listed(finding.ambiguous_with.iter().map(|other| words::cause_at(other)));
+    let next = experiments(&finding.effect, &finding.ambiguous_with);
+    let next = if next.is_empty() { next } else { format!(" Next: {next}") };
+    format!("<li><strong>{name}</strong> explains as much as {others}.{next}</li>\n")
+}
+
+/// What the catalogue proposes to tell an effect from others.
+fn experiments(effect: &str, others: &[String]) -> String {
+    let among = |name: &str| others.iter().any(|other| other.split('@').next() == Some(name));
+    let confusions = Effect::named(effect).map_or(&[][..], |effect| effect.confusions);
+    let known = confusions.iter().filter(|confusion| among(confusion.with));
+    known.map(|confusion| escape(confusion.experiment)).collect::<Vec<_>>().join(" ")
+}
+
+/// What no finding explains.
+pub fn unexplained(diagnosis: &Diagnosis) -> String {
+    let left = &diagnosis.unexplained;
+    let channels = words::listed(left.depends_on.iter().map(|channel| format!("<code>{}</code>", escape(channel))));
+    let depends = if channels.is_empty() { String::new() } else { format!(" It depends on {channels}.") };
+    let text = if left.text.is_empty() { String::new() } else { format!("<p>{}</p>\n", escape(&left.text)) };
+    format!(
+        "<section>\n<h2>What is left</h2>\n<p><strong>{}</strong> of the residual power above the noise floor is \
+         unexplained.{depends}</p>\n{text}</section>\n",
+        percent(left.fraction)
+    )
+}
+
+/// Where the page comes from.
+pub fn provenance(diagnosis: &Diagnosis, provenance: &Provenance) -> String {
+    let entry = |name: &str, text: String| format!("<dt>{name}</dt><dd>{text}</dd>\n");
+    let code = |text: &str| format!("<code>{}</code>", escape(text));
+    let list = [
+        provenance.logs.iter().map(|log| entry("Log", facts(log))).collect(),
+        entry("Model given", code(&provenance.model)),
+        entry("Extended model", code(&diagnosis.extended_model)),
+        entry("Command", code(&provenance.command)),
+        entry("Version", format!("twinstep {}", env!("CARGO_PKG_VERSION"))),
+        entry("Date", escape(&provenance.date)),
+    ];
+    format!("<footer>\n<h2>Where this comes from</h2>\n<dl>\n{}</dl>\n</footer>\n", list.concat())
+}
+
+fn facts(log: &LogFacts) -> String {
+    let LogFacts { name, rows, duration_s, rate_hz, segments } = log;
+    let segments = words::listed(segments.iter().map(|segment| format!("<code>{}</code>", escape(segment))));
+    format!("<code>{}</code>: {rows} rows, {duration_s:.1} s at {rate_hz} Hz, {segments}", escape(name))
+}

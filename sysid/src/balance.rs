@@ -1,0 +1,196 @@
+//! The torques of a measured motion: what a model's drives give for it, and what its bodies need.
+//!
+//! No simulation, and so no error that adds up: what is left over stands beside the speed, position or acceleration
+//! that explains it.
+
+use std::ops::Range;
+
+use twinstep_logs::{Base, Log, TauSensor};
+use twinstep_model::lanes::{Acceleration, Commands, Drive, State, Tree, Vec3, inverse_dynamics};
+use twinstep_model::{NUM_JOINTS, RobotModel};
+
+use crate::conditions::Conditions;
+use crate::motion::{DriveClock, JointCommands, MotionError, command, joint_commands};
+
+/// [m/s²]
+const GRAVITY: f64 = 9.81;
+/// Rows on either side that a slope is taken over.
+const REACH: usize = 3;
+
+/// One number a row for each joint, in the order of [`twinstep_model::Joint::ALL`]; NaN where the log cannot tell, and
+/// nothing at all for a joint that it lacks.
+pub type PerRow = [Vec<f64>; NUM_JOINTS];
+
+/// Measured motion of the joints, each row at the middle between it and the next, where the mean torque belongs.
+#[derive(Clone, Debug)]
+pub struct Kinematics {
+    /// [rad]
+    pub q: PerRow,
+    /// Measured, or else the slope of the position [rad/s].
+    pub dq: PerRow,
+    /// Slope of the velocity [rad/s²].
+    pub ddq: PerRow,
+}
+
+/// What measured motion leaves over under a model.
+#[derive(Clone, Debug)]
+pub struct Balance {
+    /// What motor, friction and spring of the model give, less what its bodies need for the measured motion [N·m]; of a
+    /// trunk that is held, because the ground's forces are not measured.
+    pub unexplained: PerRow,
+    /// Torque that the model's drives would show at the log's sensor [N·m].
+    pub shown: PerRow,
+}
+
+impl Kinematics {
+    /// Those of `log`.
+    pub fn of(log: &Log) -> Result<Self, MotionError> {
+        let mut this = Self { q: empty(), dq: empty(), ddq: empty() };
+        for joint in joint_commands(log)? {
+            let (index, name) = (joint.joint.index(), joint.joint.name());
+            let q = log.q(name).unwrap_or_default();
+            let dq = log.dq(name).map_or_else(|| slopes(log, q), <[f64]>::to_vec);
+            this.ddq[index] = between(log, &slopes(log, &dq));
+            this.dq[index] = between(log, &dq);
+            this.q[index] = between(log, q);
+        }
+        Ok(this)
+    }
+}
+
+impl Balance {
+    /// That of `robot` on `log`.
+    pub fn of(log: &Log, robot: &RobotModel) -> Result<Self, MotionError> {
+        let (joints, clock) = (joint_commands(log)?, DriveClock::of(log, robot)?);
+        let kinematics = Kinematics::of(log)?;
+        let mut robot = robot.clone();
+        for joint in &mut robot.joints {
+            // The encoder follows the rotor: play and springs in the gear are in the measured position already.
+            (joint.drive.gap, joint.drive.stiffness) = (0.0, f64::INFINITY);
+        }
+        let player = Player { log, robot: &robot, joints, clock, kinematics };
+        let mut balance = Self { unexplained: empty(), shown: empty() };
+        for joint in &player.joints {
+            balance.unexplained[joint.joint.index()] = vec![f64::NAN; log.rows()];
+            balance.shown[joint.joint.index()] = vec![f64::NAN; log.rows()];
+        }
+        for (segment, rows) in log.segments().filter(|(_, rows)| rows.len() > 1) {
+            player.play(rows, segment.base == Base::Fixed, &mut balance);
+        }
+        Ok(balance)
+    }
+}
+
+/// A log whose commands go through a model's drives.
+struct Player<'a> {
+    log: &'a Log,
+    robot: &'a RobotModel,
+    joints: Vec<JointCommands<'a>>,
+    clock: DriveClock,
+    kinematics: Kinematics,
+}
+
+impl Player<'_> {
+    fn play(&self, rows: Range<usize>, held: bool, balance: &mut Balance) {
+        let (robot, t) = (self.robot, &self.log.t()[rows.clone()]);
+        let (conditions, tree) = (Conditions::of(self.log), Tree::splat(robot));
+        let mut drive = Drive::<f64>::new(robot, robot.control.drive_dt());
+        drive.set(0, robot, &self.sampled(rows.start).0.map(|q| q as f32), &[0.0; NUM_JOINTS]);
+        for row in rows.start..rows.end - 1 {
+            let mut command = command(robot, &self.joints, row);
+            command.strength = conditions.strength(&robot.derating, row);
+            let commands = Commands::new(&[command]);
+            let (q, dq) = self.sampled(row);
+            let middle = self.middle(row);
+            let needed = inverse_dynamics(&tree, &middle.0, &middle.1, GRAVITY).1;
+            let periods = self.clock.periods_between(t, row - rows.start).max(1);
+            let (mut given, mut shown) = ([0.0; NUM_JOINTS], [0.0; NUM_JOINTS]);
+            for _ in 0..periods {
+                drive.tick(&commands, &q, &dq);
+                let forces = drive.push(0, &middle.0.q, &middle.0.dq);
+                for joint in 0..NUM_JOINTS {
+                    let speed = middle.0.dq[joint];
+                    let friction = forces.viscous[joint] * speed + forces.dry[joint] * (speed / 0.02).tanh();
+                    let spring = robot.joints[joint].spring;
+                    let spring = spring.torque_at_zero - spring.stiffness * middle.0.q[joint];
+                    given[joint] += (forces.tau[joint] - friction) / periods as f64;
+                    shown[joint] += match self.log.meta().tau_sensor {
+                        TauSensor::Output => {
+                            let rotor = robot.joints[joint].armature * middle.1.ddq[joint];
+                            forces.tau[joint] - spring - friction - rotor
+                        }
+                        _ => drive.current()[joint],
+                    } / periods as f64;
+                }
+            }
+            for joint in self.joints.iter().map(|joint| joint.joint.index()) {
+                balance.shown[joint][row] = shown[joint];
+                if held && self.kinematics.ddq[joint][row].is_finite() {
+                    balance.unexplained[joint][row] = given[joint] - needed[joint];
+                }
+            }
+        }
+    }
+
+    /// What the drive is given in `row`, which is not the last: it adds its offset, which a log has already.
+    fn sampled(&self, row: usize) -> ([f64; NUM_JOINTS], [f64; NUM_JOINTS]) {
+        let (mut q, mut dq) = (self.robot.control.default_pose, [0.0; NUM_JOINTS]);
+        for joint in &self.joints {
+            let (index, name) = (joint.joint.index(), joint.joint.name());
+            q[index] = self.log.q(name).map_or(q[index], |q| q[row]) - self.robot.joints[index].drive.encoder_offset;
+            let measured = self.log.dq(name).map(|dq| dq[row]).filter(|dq| dq.is_finite());
+            let back = 0.5 * (self.log.t()[row + 1] - self.log.t()[row]);
+            let slope = || self.kinematics.dq[index][row] - back * self.kinematics.ddq[index][row];
+            dq[index] = measured.unwrap_or_else(|| or_zero(slope()));
+        }
+        (q, dq)
+    }
+
+    /// The measured motion between `row` and the next; a joint that nobody measured holds still.
+    fn middle(&self, row: usize) -> (State<f64>, Acceleration<f64>) {
+        let mut state = State::<f64>::origin();
+        let mut ddq = [0.0; NUM_JOINTS];
+        state.q = self.robot.control.default_pose;
+        for joint in self.joints.iter().map(|joint| joint.joint.index()) {
+            let offset = self.robot.joints[joint].drive.encoder_offset;
+            state.q[joint] = or_zero(self.kinematics.q[joint][row] - offset);
+            state.dq[joint] = or_zero(self.kinematics.dq[joint][row]);
+            ddq[joint] = or_zero(self.kinematics.ddq[joint][row]);
+        }
+        (state, Acceleration { angular: Vec3::zero(), linear: Vec3::zero(), ddq })
+    }
+}
+
+fn empty() -> PerRow {
+    [const { Vec::new() }; NUM_JOINTS]
+}
+
+fn or_zero(value: f64) -> f64 {
+    if value.is_finite() { value } else { 0.0 }
+}
+
+/// Change of `cells` with time, by row: that of the parabola through the row and three on either side. NaN near
+/// the ends of the log's parts.
+fn slopes(log: &Log, cells: &[f64]) -> Vec<f64> {
+    let slope = |row: usize| {
+        let near = || row - REACH..=row + REACH;
+        let dt = |other: usize| log.t()[other] - log.t()[row];
+        let middle = near().map(dt).sum::<f64>() / near().count() as f64;
+        let spread: f64 = near().map(|other| (dt(other) - middle).powi(2)).sum();
+        near().map(|other| (dt(other) - middle) * cells[other]).sum::<f64>() / spread
+    };
+    let mut slopes = vec![f64::NAN; cells.len()];
+    for (_, rows) in log.segments() {
+        (rows.start + REACH..rows.end.saturating_sub(REACH)).for_each(|row| slopes[row] = slope(row));
+    }
+    slopes
+}
+
+/// Means of neighbouring rows of a part; its last has none.
+fn between(log: &Log, cells: &[f64]) -> Vec<f64> {
+    let mut means = vec![f64::NAN; cells.len()];
+    for (_, rows) in log.segments() {
+        (rows.start..rows.end - 1).for_each(|row| means[row] = f64::midpoint(cells[row], cells[row + 1]));
+    }
+    means
+}
