@@ -8,6 +8,7 @@ mod effects;
 mod evaluate;
 mod evaluation_plot;
 mod exit;
+mod hunt;
 mod identify;
 mod joint_plot;
 mod log;
@@ -37,6 +38,7 @@ enum Verb {
     Demo(demo::Args),
     Effects(effects::Args),
     Evaluate(evaluate::Args),
+    Hunt(hunt::Args),
     Identify(identify::Args),
     Log(log::Args),
     Mjcf(mjcf::Args),
@@ -57,6 +59,7 @@ fn main() -> std::process::ExitCode {
         Verb::Demo(args) => demo::run(&args),
         Verb::Effects(args) => effects::run(&args),
         Verb::Evaluate(args) => evaluate::run(&args),
+        Verb::Hunt(args) => hunt::run(&args),
         Verb::Identify(args) => identify::run(&args),
         Verb::Log(args) => log::run(&args),
         Verb::Mjcf(args) => mjcf::run(&args),
