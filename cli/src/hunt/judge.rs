@@ -30,6 +30,7 @@ pub struct Verdict {
 
 /// How a hidden effect was found.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[allow(clippy::struct_excessive_bools, reason = "each is a line of the table")]
 pub struct Hit {
     /// Its name.
     pub effect: String,

@@ -117,7 +117,9 @@ fn matrix(rounds: &[Round]) -> String {
     let rows: BTreeSet<_> = counts.keys().map(|(hidden, _)| *hidden).collect();
     let columns: BTreeSet<_> = counts.keys().map(|(_, named)| *named).collect();
     let mut text = "| hidden".to_owned();
-    columns.iter().for_each(|named| text += &format!(" | {named}"));
+    for named in &columns {
+        let _ = write!(text, " | {named}");
+    }
     let _ = writeln!(text, " |\n|---{}|", "|---".repeat(columns.len()));
     for hidden in rows {
         let _ = write!(text, "| {hidden}");
