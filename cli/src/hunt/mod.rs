@@ -214,10 +214,10 @@ mod tests {
 
     /// What the table of needs in `draw.rs` promises, and what hides nothing is all but perfect.
     #[test]
-    #[ignore = "minutes: plays 56 cases"]
+    #[ignore = "minutes: plays 28 cases"]
     fn what_is_hidden_shows_in_the_log_and_the_truth_explains_it() {
         let folder = tempfile::tempdir().expect("a folder");
-        play(&args(56, 100, folder.path(), false), &nothing).expect("played");
+        play(&args(28, 100, folder.path(), false), &nothing).expect("played");
         let rounds = played(&folder.path().join("cases.jsonl"), 100).expect("lines");
         for Round { case, kind, setting, outside, nominal, truth, verdict, .. } in &rounds {
             let hidden: Vec<_> = verdict.hits.iter().map(|hit| format!("{}@{}", hit.effect, hit.scope)).collect();
