@@ -9,6 +9,7 @@ mod effects;
 mod evaluate;
 mod evaluation_plot;
 mod exit;
+mod hunt;
 mod identify;
 mod joint_plot;
 mod log;
@@ -40,6 +41,7 @@ enum Verb {
     Diagnose(diagnose::Args),
     Effects(effects::Args),
     Evaluate(evaluate::Args),
+    Hunt(hunt::Args),
     Identify(identify::Args),
     Log(log::Args),
     Mjcf(mjcf::Args),
@@ -61,6 +63,7 @@ fn main() -> std::process::ExitCode {
         Verb::Diagnose(args) => diagnose::run(&args),
         Verb::Effects(args) => effects::run(&args),
         Verb::Evaluate(args) => evaluate::run(&args),
+        Verb::Hunt(args) => hunt::run(&args),
         Verb::Identify(args) => identify::run(&args),
         Verb::Log(args) => log::run(&args),
         Verb::Mjcf(args) => mjcf::run(&args),

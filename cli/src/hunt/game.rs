@@ -1,0 +1,110 @@
+//! One case of a game: a log is made, another process diagnoses it, and its words are judged.
+
+use std::fs::File;
+use std::path::Path;
+use std::process::{Child, ExitStatus};
+use std::time::{Duration, Instant};
+
+use twinstep_model::{ModelFile, RobotModel, go2};
+use twinstep_sim::BatchRollout;
+use twinstep_sysid::{Diagnosis, Errors, RecordError, evaluate};
+
+use super::draw::Case;
+use super::judge::judge;
+use super::{Diagnose, HuntError, Round, at, plant};
+use crate::exit::{Failure, Signals, input, other};
+
+/// How often a running diagnosis is looked after.
+const LOOK: Duration = Duration::from_millis(20);
+/// How a command ends whose input is at fault; a diagnosis that cannot even start ends the game.
+const BAD_INPUT: i32 = 2;
+
+/// A game that is played.
+pub struct Game<'a> {
+    /// Where it is kept.
+    pub out: &'a Path,
+    /// What diagnoses.
+    pub diagnose: &'a Diagnose,
+    /// What may end it.
+    pub signals: Signals,
+    /// What the truth is evaluated in.
+    pub simulator: BatchRollout,
+}
+
+/// What a diagnosis said, or complained of.
+struct Answer {
+    said: Result<Diagnosis, String>,
+    seconds: f64,
+}
+
+impl Game<'_> {
+    /// Hides, diagnoses and judges.
+    pub fn round(&mut self, case: &Case) -> Result<Round, Failure> {
+        let folder = self.out.join(format!("{:04}", case.number));
+        let model = self.out.join("nominal.toml");
+        std::fs::write(&model, ModelFile::default().to_toml()).map_err(at(&model))?;
+        let log = plant::log_of(case, &mut |_| !self.signals.check().unwrap_or(true)).map_err(|error| match error {
+            RecordError::Ended => Failure::Interrupted,
+            error => other(error),
+        })?;
+        let path = folder.join("log");
+        log.write(&path).map_err(input)?;
+        let Answer { said, seconds } = self.answer(&path, &model, &folder)?;
+        // Only now: nobody can have read it before.
+        let truth = folder.join("truth.toml");
+        std::fs::write(&truth, case.truth().to_toml()).map_err(at(&truth))?;
+        let mut errors = |robot: &RobotModel| {
+            let found = evaluate(&log, robot, &mut self.simulator, |_| true).map_err(other)?;
+            Ok(Errors { torque_rmse_nm: found.torque_rmse_nm, q_rmse_rad: found.q_rmse_rad })
+        };
+        let nominal = errors(&go2())?;
+        let truth = errors(&case.truth().robot_model().map_err(other)?)?;
+        Ok(Round {
+            seed: case.seed,
+            case: case.number,
+            kind: case.kind,
+            setting: case.setting,
+            outside: case.outside,
+            nominal,
+            truth,
+            verdict: judge(case, said.as_ref().ok(), [nominal, truth]),
+            died: said.err(),
+            seconds,
+        })
+    }
+
+    /// Lets the diagnosis run; its words are kept beside the log.
+    fn answer(&self, log: &Path, model: &Path, folder: &Path) -> Result<Answer, Failure> {
+        let [stdout, stderr] = ["diagnosis.json", "diagnosis.txt"].map(|name| folder.join(name));
+        let start = Instant::now();
+        let mut command = (self.diagnose)(log, model, &folder.join("report"));
+        let create = |path: &Path| File::create(path).map_err(other);
+        let spawned = command.stdout(create(&stdout)?).stderr(create(&stderr)?).spawn();
+        let status = self.wait(spawned.map_err(other)?)?;
+        let seconds = start.elapsed().as_secs_f64();
+        let complaint = std::fs::read_to_string(&stderr).map_err(other)?.trim().to_owned();
+        if status.code() == Some(BAD_INPUT) {
+            return Err(other(HuntError::NoDiagnosis { log: log.to_owned(), said: complaint }));
+        }
+        let said = if status.success() {
+            serde_json::from_str(&std::fs::read_to_string(&stdout).map_err(other)?).map_err(|error| error.to_string())
+        } else {
+            Err(format!("{status}: {complaint}"))
+        };
+        Ok(Answer { said, seconds })
+    }
+
+    fn wait(&self, mut child: Child) -> Result<ExitStatus, Failure> {
+        loop {
+            if let Some(status) = child.try_wait().map_err(other)? {
+                // Ctrl-C reaches both; a diagnosis that it ended says nothing of the case.
+                return if self.signals.check()? { Err(Failure::Interrupted) } else { Ok(status) };
+            }
+            if self.signals.check().unwrap_or(true) {
+                child.kill().and_then(|()| child.wait()).map_err(other)?;
+                return Err(Failure::Interrupted);
+            }
+            std::thread::sleep(LOOK);
+        }
+    }
+}
