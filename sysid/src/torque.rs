@@ -107,8 +107,8 @@ impl MeasuredTorque {
             for _ in 0..row.periods {
                 drive.tick(&commands, &q, &row.dq);
                 let forces = drive.push(0, &q, &row.dq);
-                for joint in 0..NUM_JOINTS {
-                    mean[joint] += match self.sensor {
+                for (joint, mean) in mean.iter_mut().enumerate() {
+                    *mean += match self.sensor {
                         TauSensor::Output => {
                             let dry = forces.dry[joint] * smooth_sign(row.dq[joint]);
                             let rotor = robot.joints[joint].armature * row.ddq[joint];
@@ -118,9 +118,9 @@ impl MeasuredTorque {
                     } / row.periods as f64;
                 }
             }
-            for joint in 0..NUM_JOINTS {
-                if row.torque[joint].is_finite() {
-                    each(joint, row.row, mean[joint] - row.torque[joint]);
+            for (joint, (mean, measured)) in mean.iter().zip(row.torque).enumerate() {
+                if measured.is_finite() {
+                    each(joint, row.row, mean - measured);
                 }
             }
         }

@@ -35,7 +35,7 @@ fn gyroscope_shows_its_bias_and_the_motion_is_the_same() {
 struct Told(Vec<Command>);
 
 impl Rollout for Told {
-    fn play(&mut self, jobs: &[Job]) -> Vec<RobotStates> {
+    fn play(&mut self, jobs: &[Job], _: Precision) -> Vec<RobotStates> {
         self.0 = jobs[0].commands.to_vec();
         let mut states = RobotStates::new(self.0.len() + 1);
         for (entry, tau) in states.tau.iter_mut().enumerate().skip(1) {

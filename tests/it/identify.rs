@@ -40,7 +40,7 @@ fn plant() -> RobotModel {
 }
 
 /// Eight seconds of chirps in the air, measured by encoders with noise, from the other engine at a finer step.
-fn log_of(robot: &RobotModel) -> Log {
+pub fn log_of(robot: &RobotModel) -> Log {
     let config = SimConfig {
         engine: Engine::Rapier,
         base: Base::Fixed,
@@ -161,7 +161,7 @@ fn supply_and_heat_are_identified_from_logs_that_tell_them() {
     assert!((low..high).contains(&1.5) && high - low < 0.5, "{:?}", found.findings[0]);
 }
 
-fn twinstep(arguments: &[&str]) -> std::process::Output {
+pub fn twinstep(arguments: &[&str]) -> std::process::Output {
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
     Process::new(programs.0.join("twinstep")).args(arguments).current_dir(root()).output().unwrap()
 }

@@ -4,6 +4,7 @@
 
 mod any_robot;
 mod batch;
+mod diagnose;
 mod effect_bodies;
 mod effect_laws;
 mod effect_readings;

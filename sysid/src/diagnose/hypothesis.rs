@@ -8,7 +8,7 @@ const SHARES: [f64; 8] = [0.06, 0.12, 0.2, 0.32, 0.5, 0.75, 1.0, 1.5];
 /// A finding smaller than this share of its plausible range is not worth a name.
 const LEAST_SHARE: f64 = 0.08;
 /// The same of effects that errors of a millimetre or a percent in geometry and mass look like.
-const LEAST_SHARE_OF_BODY: f64 = 0.25;
+const LEAST_SHARES_OF_BODY: [(&str, f64); 3] = [("encoder_offset", 0.4), ("com_shift", 0.25), ("payload", 0.15)];
 
 /// An effect on a scope, with values.
 #[derive(Clone, Debug, PartialEq)]
@@ -27,19 +27,25 @@ impl Hypothesis {
         format!("{}@{}", self.effect.name, self.scope)
     }
 
-    /// Whether it is large enough to be worth a name, and such as a robot may have.
-    pub fn is_worth_a_name(&self) -> bool {
+    /// Whether it is large enough to be worth a name.
+    pub fn is_large_enough(&self) -> bool {
+        let of_body = LEAST_SHARES_OF_BODY.iter().find(|(name, _)| *name == self.effect.name);
+        share(self.effect, &self.values) >= of_body.map_or(LEAST_SHARE, |(_, least)| *least)
+    }
+
+    /// Whether a robot may have it: no value is further than half the plausible range outside of it.
+    pub fn is_plausible(&self) -> bool {
         let parameters = self.effect.parameters.iter().flat_map(|one| std::iter::repeat_n(one, one.count));
-        let plausible = parameters.zip(&self.values).all(|(parameter, value)| {
+        parameters.zip(&self.values).all(|(parameter, value)| {
             let [low, high] = parameter.plausible;
+            let beyond = 0.5 * (high - low);
             // An infinite one is none of it.
-            let beyond =
-                if parameter.neutral.is_infinite() { value < &(0.5 * low) } else { *value > high + 0.5 * (high - low) };
-            !beyond && (parameter.neutral.is_infinite() || *value >= low - 0.5 * (high - low))
-        });
-        let of_body = ["encoder_offset", "com_shift", "payload"].contains(&self.effect.name);
-        let least = if of_body { LEAST_SHARE_OF_BODY } else { LEAST_SHARE };
-        plausible && share(self.effect, &self.values) >= least
+            if parameter.neutral.is_infinite() {
+                *value >= 0.5 * low
+            } else {
+                (low - beyond..=high + beyond).contains(value)
+            }
+        })
     }
 }
 

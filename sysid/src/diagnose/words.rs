@@ -104,7 +104,8 @@ pub fn evidence(best: &Trial, others: &[Trial]) -> String {
         100.0 * best.gain
     );
     if let Some(other) = others.first() {
-        text += &format!(" Next best is {}, {:.0} nats behind.", other.hypothesis.name(), best.score - other.score);
+        let behind = best.score - other.score;
+        text = format!("{text} Next best is {}, {behind:.0} nats behind.", other.hypothesis.name());
     }
     text + " " + hypothesis.effect.signature
 }

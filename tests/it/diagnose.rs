@@ -1,0 +1,62 @@
+//! Diagnosis through the real process: what is hidden is named, and what is healthy is not.
+
+use std::path::Path;
+
+use twinstep_model::effects::{Effect, Entry, compose};
+use twinstep_model::{ModelFile, RobotModel, go2};
+use twinstep_sysid::{Diagnosis, Value};
+
+use crate::identify::{log_of, twinstep};
+
+/// Diagnoses what `robot`, in the other engine, leaves in the air.
+fn diagnosed(robot: &RobotModel, folder: &Path) -> Diagnosis {
+    let log = folder.join("log.parquet");
+    log_of(robot).write(&log).unwrap();
+    let out = folder.join("diagnosis");
+    let output = twinstep(&["diagnose", log.to_str().unwrap(), "--out", out.to_str().unwrap(), "--json"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let diagnosis: Diagnosis = serde_json::from_slice(&output.stdout).unwrap();
+    let written = std::fs::read_to_string(out.join("findings.json")).unwrap();
+    assert_eq!(serde_json::from_str::<Diagnosis>(&written).unwrap(), diagnosis);
+    let page = std::fs::read_to_string(out.join("report.html")).unwrap();
+    assert!(page.starts_with("<!doctype html>") && page.len() > 10_000);
+    let extended = ModelFile::load(out.join(&diagnosis.extended_model)).unwrap();
+    assert_eq!(extended.effects.len(), diagnosis.findings.len());
+    diagnosis
+}
+
+#[test]
+fn hidden_friction_is_named_with_its_scope_and_size_and_the_model_mended() {
+    let folder = tempfile::tempdir().unwrap();
+    let entry = |name, scope: &str, value| {
+        Entry::new(Effect::named(name).unwrap(), scope.parse().unwrap(), vec![value]).unwrap()
+    };
+    let robot = compose(&go2(), &[entry("coulomb_friction", "RR", 0.6)]).unwrap();
+    let diagnosis = diagnosed(&robot, folder.path());
+    let cause = &diagnosis.findings[0];
+    assert_eq!((cause.effect.as_str(), cause.scope.as_str()), ("coulomb_friction", "RR"), "{diagnosis:#?}");
+    let size = &cause.parameters["torque_nm"];
+    let Value::Number(value) = size.value else { panic!("{size:?}") };
+    assert!((value - 0.6).abs() < 0.06, "{size:?}");
+    assert!(cause.score_nats > cause.threshold_nats);
+    let [before, after] = [diagnosis.baseline, diagnosis.extended].map(|errors| errors.q_rmse_rad.unwrap());
+    assert!(after < 0.4 * before, "{before} -> {after} rad on held-out seconds");
+}
+
+#[test]
+fn healthy_robot_gets_no_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let diagnosis = diagnosed(&go2(), folder.path());
+    assert!(diagnosis.findings.is_empty(), "{:#?}", diagnosis.findings);
+    assert_eq!(diagnosis.baseline, diagnosis.extended);
+}
+
+#[test]
+fn bad_input_is_refused_before_any_work() {
+    let output = twinstep(&["diagnose", "data/go2_air_chirp", "--out", "/proc/nowhere"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(output.stdout.is_empty());
+    assert!(String::from_utf8_lossy(&output.stderr).contains("cannot write /proc/nowhere"));
+    let output = twinstep(&["diagnose", "no/such/log", "--out", "/tmp"]);
+    assert_eq!(output.status.code(), Some(2));
+}
