@@ -3,7 +3,7 @@
 use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, RobotModel, Rollout};
 
-use super::evidence::{CHANNELS, Evidence, Leftover, TORQUE, TRUNK, fold_of};
+use super::evidence::{Evidence, Leftover, TORQUE, TRUNK, fold_of};
 use crate::diagnosis::Unexplained;
 use crate::experiment::Quantity;
 
@@ -50,7 +50,6 @@ pub fn unexplained(
         format!("{:.0} % of it follows {variable}", 100.0 * share)
     });
     let text = format!("The {kind} of {name} is off by more than noise and all that is named explain: {told}.");
-    debug_assert!(channel < CHANNELS);
     Unexplained { fraction, depends_on: found.into_iter().map(|(_, name)| name).collect(), text }
 }
 
