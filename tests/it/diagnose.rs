@@ -49,6 +49,9 @@ fn healthy_robot_gets_no_name() {
     let diagnosis = diagnosed(&go2(), folder.path());
     assert!(diagnosis.findings.is_empty(), "{:#?}", diagnosis.findings);
     assert_eq!(diagnosis.baseline, diagnosis.extended);
+    assert_eq!(diagnosis.unexplained.fraction, 0.0, "{:?}", diagnosis.unexplained);
+    let page = std::fs::read_to_string(folder.path().join("diagnosis/report.html")).unwrap();
+    assert!(page.contains("Nothing is wrong above the noise"));
 }
 
 #[test]

@@ -1,4 +1,5 @@
-//! Logs as evidence: what a candidate model leaves of each channel, in two folds of alternating seconds.
+//! Logs as evidence: what a candidate model leaves of each channel, in two folds of alternating seconds. Every fifth second is
+//! set aside.
 
 use twinstep_logs::Log;
 use twinstep_model::{NUM_JOINTS, Precision, RobotModel, Rollout};
@@ -41,8 +42,11 @@ pub struct Evidence {
 impl Evidence {
     /// `logs` of a robot with the gains and rates of `robot`.
     pub fn new(logs: Vec<Log>, robot: &RobotModel) -> Result<Self, ExperimentError> {
-        let experiments =
-            logs.iter().map(|log| Experiment::new(log, robot, Horizon::IDENTIFICATION)).collect::<Result<_, _>>()?;
+        let kept = |log: &Log| -> Result<Experiment, ExperimentError> {
+            let whole = Experiment::new(log, robot, Horizon::IDENTIFICATION)?;
+            Ok(whole.only(|row| fold_of(log, row).is_some()))
+        };
+        let experiments = logs.iter().map(kept).collect::<Result<_, _>>()?;
         let torques = logs.iter().map(|log| MeasuredTorque::new(log, robot)).collect::<Result<_, _>>()?;
         Ok(Self { logs, experiments, torques })
     }
@@ -52,7 +56,7 @@ impl Evidence {
         &self.logs
     }
 
-    /// All rows.
+    /// All rows but those that are set aside.
     pub fn experiments(&self) -> &[Experiment] {
         &self.experiments
     }
@@ -65,7 +69,7 @@ impl Evidence {
     /// The rows of one fold alone.
     pub fn fold(&self, fold: usize) -> Vec<Experiment> {
         let pairs = self.logs.iter().zip(&self.experiments);
-        pairs.map(|(log, experiment)| experiment.clone().only(|row| fold_of(log, row) == fold)).collect()
+        pairs.map(|(log, experiment)| experiment.clone().only(|row| fold_of(log, row) == Some(fold))).collect()
     }
 
     /// What candidates leave; with `quick` only where the trunk was held, if it was: joints hardly disturb each other there.
@@ -126,7 +130,8 @@ impl Evidence {
 pub const PRECISION: Precision = Precision::Single;
 
 impl Leftover {
-    fn add(&mut self, channel: usize, fold: usize, difference: f64) {
+    fn add(&mut self, channel: usize, fold: Option<usize>, difference: f64) {
+        let Some(fold) = fold else { return };
         self.sums[channel][fold] += difference * difference;
         self.counts[channel][fold] += 1.0;
     }
@@ -160,9 +165,10 @@ impl Leftover {
     }
 }
 
-/// The fold of a row.
-pub fn fold_of(log: &Log, row: usize) -> usize {
-    (row as f64 / (BLOCK_S * log.meta().rate_hz)) as usize % 2
+/// The fold of a row; none where it is set aside: every fifth block takes no part in any choice or fit, and tells the gain.
+pub fn fold_of(log: &Log, row: usize) -> Option<usize> {
+    let block = (row as f64 / (BLOCK_S * log.meta().rate_hz)) as usize % 5;
+    (block < 4).then_some(block % 2)
 }
 
 /// Noise of the torques that measured states make, beside the sensor's own and any simulator's misfit [N·m].
@@ -178,4 +184,28 @@ fn torque_sigma(log: &Log, robot: &RobotModel) -> [f64; NUM_JOINTS] {
         let measured = noise("tau_measured", 0.2).hypot(MISFIT[1]);
         measured.hypot(kp * noise("q", 0.002)).hypot(kd * noise("dq", 0.05))
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use twinstep_logs::{Base, Meta, Segment, TauSensor};
+
+    use super::*;
+
+    #[test]
+    fn every_fifth_second_takes_no_part_in_choice_or_fit() {
+        let segments = vec![Segment { name: "air".to_owned(), base: Base::Fixed }];
+        let column = |name: &str, value: fn(usize) -> f64| (name.to_owned(), (0..100).map(value).collect());
+        let columns = [
+            column("t", |row| row as f64 / 10.0),
+            column("q_FL_hip", |_| 0.0),
+            column("q_cmd_FL_hip", |_| 0.0),
+            column("kp", |_| 20.0),
+            column("kd", |_| 0.5),
+        ];
+        let log = Log::new(Meta::new(10.0, TauSensor::None, segments), columns).expect("a log");
+        let folds: Vec<_> = (0..100).step_by(10).map(|row| fold_of(&log, row)).collect();
+        let five = [Some(0), Some(1), Some(0), Some(1), None];
+        assert_eq!(folds, [five, five].concat());
+    }
 }

@@ -1,4 +1,4 @@
-//! Diagnosis: what a model gets wrong, by name, on evidence that took no part in the choice.
+//! Diagnosis: what a model gets wrong, by name, and the gain on seconds that took no part in the choice.
 //!
 //! - [`evidence`]: what a candidate model leaves of each channel, in two folds of alternating seconds.
 //! - [`hypothesis`]: an effect on a scope, with values.
@@ -255,10 +255,11 @@ fn intervals(
     words::with_intervals(&fit, covariance.as_ref(), SIMULATORS)
 }
 
+/// On the seconds that are set aside.
 fn errors(evidence: &Evidence, robot: &RobotModel, simulator: &mut dyn Rollout) -> Result<Errors, DiagnoseError> {
     let (mut torque, mut q) = (Vec::new(), Vec::new());
     for log in evidence.logs() {
-        let evaluation = evaluate(log, robot, simulator, |row| evidence::fold_of(log, row) == 1)?;
+        let evaluation = evaluate(log, robot, simulator, |row| evidence::fold_of(log, row).is_none())?;
         torque.extend(evaluation.torque_rmse_nm);
         q.extend(evaluation.q_rmse_rad);
     }

@@ -33,7 +33,7 @@ pub fn unexplained(
         })
         .filter(|channel| left.channel_excess(*channel) > LEAST_EXCESS * count(*channel));
     let Some(channel) = worst else {
-        return Unexplained { fraction, depends_on: Vec::new(), text: "What is left is noise.".to_owned() };
+        return Unexplained { fraction: 0.0, depends_on: Vec::new(), text: "What is left is noise.".to_owned() };
     };
     let log = &evidence.logs()[0];
     let residual = residual(evidence, robot, channel, simulator);
@@ -107,7 +107,7 @@ fn explained(log: &Log, residual: &[f64], cells: &[f64]) -> f64 {
     let (mut rest, mut total) = (0.0, 0.0);
     for fold in [0, 1] {
         let (mut sums, mut counts) = ([0.0; BINS], [0.0; BINS]);
-        let of_fold = |fold: usize| rows.iter().copied().filter(move |row| fold_of(log, *row) == fold);
+        let of_fold = |fold: usize| rows.iter().copied().filter(move |row| fold_of(log, *row) == Some(fold));
         for row in of_fold(fold) {
             sums[bin(cells[row])] += residual[row];
             counts[bin(cells[row])] += 1.0;
