@@ -98,6 +98,21 @@ impl RobotStates {
         })
     }
 
+    /// All robots, to be written.
+    pub fn all_mut(&mut self) -> RobotStatesMut<'_> {
+        RobotStatesMut {
+            q: &mut self.q,
+            dq: &mut self.dq,
+            tau: &mut self.tau,
+            base_position: &mut self.base_position,
+            base_orientation: &mut self.base_orientation,
+            base_linear_velocity: &mut self.base_linear_velocity,
+            base_angular_velocity: &mut self.base_angular_velocity,
+            foot_force: &mut self.foot_force,
+            body_contact: &mut self.body_contact,
+        }
+    }
+
     /// Copies the state of robot `from` of `other` to `robot`.
     pub fn copy_robot(&mut self, robot: usize, other: &RobotStates, from: usize) {
         self.q[robot] = other.q[from];

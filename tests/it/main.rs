@@ -23,6 +23,7 @@ mod rapier;
 mod raw_client;
 mod remote;
 mod render;
+mod rollout;
 mod security;
 mod terrain;
 mod tidy;

@@ -40,16 +40,21 @@ impl<T: Lane> Commands<T> {
         let zero = [T::splat(0.0); 12];
         let mut this = Self { q: zero, dq: zero, tau_ff: zero, kp: zero, kd: zero, strength: zero };
         for (lane, command) in commands.iter().enumerate() {
-            for joint in 0..12 {
-                this.q[joint].set(lane, f64::from(command.q[joint]));
-                this.dq[joint].set(lane, f64::from(command.dq[joint]));
-                this.tau_ff[joint].set(lane, f64::from(command.tau_ff[joint]));
-                this.kp[joint].set(lane, f64::from(command.kp[joint]));
-                this.kd[joint].set(lane, f64::from(command.kd[joint]));
-                this.strength[joint].set(lane, f64::from(command.strength[joint]));
-            }
+            this.set(lane, command);
         }
         this
+    }
+
+    /// Sets what one robot is told.
+    pub fn set(&mut self, lane: usize, command: &Command) {
+        for joint in 0..12 {
+            self.q[joint].set(lane, f64::from(command.q[joint]));
+            self.dq[joint].set(lane, f64::from(command.dq[joint]));
+            self.tau_ff[joint].set(lane, f64::from(command.tau_ff[joint]));
+            self.kp[joint].set(lane, f64::from(command.kp[joint]));
+            self.kd[joint].set(lane, f64::from(command.kd[joint]));
+            self.strength[joint].set(lane, f64::from(command.strength[joint]));
+        }
     }
 }
 
@@ -234,14 +239,6 @@ impl<T: Lane> Drive<T> {
     /// What a sensor of the motors' current shows now [N·m].
     pub fn current(&self) -> &[T; 12] {
         &self.memory.current
-    }
-
-    /// As [`Drive::seen`], of one robot: for code that is not compiled for the lanes' instructions.
-    pub fn seen_by(&self, lane: usize, joint: usize, q: &T, dq: &T) -> (f64, f64) {
-        let (n, [angle, speed]) = (&self.numbers[joint], &self.memory.rotor);
-        let elastic = n.gear.get(lane) > 0.0;
-        let (q, dq) = if elastic { (&angle[joint], &speed[joint]) } else { (q, dq) };
-        (q.get(lane) + n.encoder_offset.get(lane), dq.get(lane))
     }
 
     /// The loop closes: commands and sampled state become the torque of the coming drive period.

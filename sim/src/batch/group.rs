@@ -69,6 +69,18 @@ impl<T: Lane> Scratch<T> {
     }
 }
 
+/// What the sensors show of all robots.
+pub struct Sample<T> {
+    /// Of the trunk [m].
+    pub position: Vec3<T>,
+    /// Of the trunk, world-from-base.
+    pub orientation: [T; 4],
+    /// At the encoders [rad].
+    pub q: [T; 12],
+    /// At the encoders [rad/s].
+    pub dq: [T; 12],
+}
+
 /// One robot of a group: its lane of every number.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LaneSnapshot(Vec<f64>);
@@ -135,9 +147,14 @@ impl<T: Lane> Group<T> {
         impulses.for_each(|impulse| impulse.set(lane, 0.0));
     }
 
-    /// Advances all robots.
+    /// Advances all robots; what their sensors show then.
     #[inline(always)]
-    pub fn advance(&mut self, input: &Input<T>, Time { drive_periods, steps }: Time, scratch: &mut Scratch<T>) {
+    pub fn advance(
+        &mut self,
+        input: &Input<T>,
+        Time { drive_periods, steps }: Time,
+        scratch: &mut Scratch<T>,
+    ) -> Sample<T> {
         let share = T::splat(1.0 / steps as f64);
         for _ in 0..drive_periods {
             match input {
@@ -152,6 +169,7 @@ impl<T: Lane> Group<T> {
                 }
             }
         }
+        self.sample()
     }
 
     /// One physics step of the drive period.
@@ -190,16 +208,22 @@ impl<T: Lane> Group<T> {
         &self.state
     }
 
-    /// What the encoder of a robot's joint shows [rad, rad/s].
-    pub fn encoder(&self, lane: usize, joint: usize) -> (f64, f64) {
-        self.drive.seen_by(lane, joint, &self.sampled_q()[joint], &self.state.dq[joint])
-    }
-
-    /// Position and orientation of the trunk, as [`Group::sampled_q`] has the joints'.
-    pub fn sampled_trunk(&self) -> (Vec3<T>, [T; 4]) {
-        let State { position, orientation, linear_velocity, angular_velocity, .. } = &self.state;
+    /// What the sensors show now.
+    #[inline(always)]
+    pub fn sample(&self) -> Sample<T> {
+        let State { position, orientation, linear_velocity, angular_velocity, dq, .. } = &self.state;
+        // The trunk as `sampled_q` has the joints.
         let back = T::splat(-0.5) * self.dt;
-        (*position + linear_velocity.scaled(back), turned(*orientation, angular_velocity.scaled(back)))
+        let mut sample = Sample {
+            position: *position + linear_velocity.scaled(back),
+            orientation: turned(*orientation, angular_velocity.scaled(back)),
+            q: self.sampled_q(),
+            dq: *dq,
+        };
+        for joint in 0..12 {
+            (sample.q[joint], sample.dq[joint]) = self.drive.seen(joint, sample.q[joint], sample.dq[joint]);
+        }
+        sample
     }
 
     /// Joint positions at the instant of a sample [rad].

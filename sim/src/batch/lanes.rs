@@ -9,7 +9,7 @@ use twinstep_model::lanes::{Avx2F32, Avx2F64, Avx512F32, Sse2F32 as Baseline};
 use twinstep_model::lanes::{Commands, Instructions, Lane};
 use twinstep_model::{Command, Ground, PerJoint, Placement, RobotModel, RobotStates, RobotStatesMut};
 
-use super::group::{Group, Input, LaneSnapshot, Scratch, Time};
+use super::group::{Group, Input, LaneSnapshot, Sample, Scratch, Time};
 use crate::SimConfig;
 
 /// Which numbers robots are simulated in.
@@ -46,6 +46,9 @@ pub trait Robots: Send + Sync {
         time: Time,
         states: &mut RobotStates,
     ) -> bool;
+    /// Plays commands, one a drive period of `steps` physics steps, through every robot on this thread. What a robot
+    /// does is written to entries 1 and up of its record.
+    fn play(&mut self, commands: &[&[Command]], steps: usize, records: &mut [RobotStates]);
     /// The full state of `robot`.
     fn snapshot(&self, robot: usize) -> LaneSnapshot;
     /// Puts `robot` back.
@@ -90,7 +93,7 @@ pub fn robots(
 }
 
 /// Advances one group.
-type Advance<T> = fn(&mut Group<T>, &Input<T>, Time, &mut Scratch<T>);
+type Advance<T> = fn(&mut Group<T>, &Input<T>, Time, &mut Scratch<T>) -> Sample<T>;
 
 struct Groups<T> {
     groups: Vec<Group<T>>,
@@ -103,8 +106,9 @@ impl<T: Lane> Robots for Groups<T> {
     }
 
     fn read(&self, robot: usize, states: &mut RobotStates) {
-        let mut chunk = states.chunks_mut(T::LANES).nth(robot / T::LANES).expect("the robot exists");
-        read(&self.groups[robot / T::LANES], robot % T::LANES, &mut chunk);
+        let mut all = states.all_mut();
+        let group = &self.groups[robot / T::LANES];
+        read(group, &group.sample(), robot % T::LANES, &mut all, robot);
     }
 
     fn advance(
@@ -140,6 +144,30 @@ impl<T: Lane> Robots for Groups<T> {
         }
     }
 
+    fn play(&mut self, commands: &[&[Command]], steps: usize, records: &mut [RobotStates]) {
+        let mut scratch = Scratch::empty();
+        let robots = commands.chunks(T::LANES).zip(records.chunks_mut(T::LANES));
+        for (group, (commands, records)) in self.groups.iter_mut().zip(robots) {
+            let mut records: Vec<_> = records.iter_mut().map(RobotStates::all_mut).collect();
+            let mut now = Commands::new(&[]);
+            let time = Time { drive_periods: 1, steps };
+            for period in 0..commands.iter().map(|commands| commands.len()).max().unwrap_or(0) {
+                for lane in 0..T::LANES {
+                    // A robot without commands does as the last: left to fall, it would touch what no other touches.
+                    if let Some(command) = commands[lane.min(commands.len() - 1)].get(period) {
+                        now.set(lane, command);
+                    }
+                }
+                // Who is done runs on unrecorded, which costs nothing: lanes do not touch each other.
+                let sample = (self.advance)(group, &Input::Commands(now), time, &mut scratch);
+                for (lane, record) in records.iter_mut().enumerate().filter(|(lane, _)| period < commands[*lane].len())
+                {
+                    read(group, &sample, lane, record, period + 1);
+                }
+            }
+        }
+    }
+
     fn snapshot(&self, robot: usize) -> LaneSnapshot {
         self.groups[robot / T::LANES].clone().snapshot(robot % T::LANES)
     }
@@ -165,37 +193,39 @@ fn advance_active<T: Lane>(
     }
     let asleep = (0..active.len()).filter(|lane| !active[*lane]);
     let asleep: Vec<_> = asleep.map(|lane| (lane, group.snapshot(lane))).collect();
-    advance(group, input, time, scratch);
+    let sample = advance(group, input, time, scratch);
     for (lane, snapshot) in asleep {
         group.restore(lane, &snapshot);
     }
     let mut finite = true;
     for lane in (0..active.len()).filter(|lane| active[*lane]) {
-        finite &= read(group, lane, states);
+        read(group, &sample, lane, states, lane);
+        finite &= is_finite(states, lane);
     }
     finite
 }
 
-/// Copies one robot of a group out; true if all its numbers are finite.
-fn read<T: Lane>(group: &Group<T>, lane: usize, states: &mut RobotStatesMut) -> bool {
+/// Copies one robot of a group out to entry `at`.
+fn read<T: Lane>(group: &Group<T>, sample: &Sample<T>, lane: usize, states: &mut RobotStatesMut, at: usize) {
     let state = group.state();
-    let (position, orientation) = group.sampled_trunk();
-    states.base_position[lane] = values(&position.0, lane);
-    states.base_orientation[lane] = values(&orientation, lane);
-    states.base_linear_velocity[lane] = values(&state.linear_velocity.0, lane);
-    states.base_angular_velocity[lane] = std::array::from_fn(|axis| group.gyro(lane, axis) as f32);
-    for joint in 0..12 {
-        let (q, dq) = group.encoder(lane, joint);
-        (states.q[lane][joint], states.dq[lane][joint]) = (q as f32, dq as f32);
-    }
-    states.tau[lane] = values(group.tau(), lane);
-    states.foot_force[lane] = std::array::from_fn(|leg| group.foot_force(lane, leg) as f32);
-    states.body_contact[lane] = group.body_contact(lane);
+    states.base_position[at] = values(&sample.position.0, lane);
+    states.base_orientation[at] = values(&sample.orientation, lane);
+    states.base_linear_velocity[at] = values(&state.linear_velocity.0, lane);
+    states.base_angular_velocity[at] = std::array::from_fn(|axis| group.gyro(lane, axis) as f32);
+    states.q[at] = values(&sample.q, lane);
+    states.dq[at] = values(&sample.dq, lane);
+    states.tau[at] = values(group.tau(), lane);
+    states.foot_force[at] = std::array::from_fn(|leg| group.foot_force(lane, leg) as f32);
+    states.body_contact[at] = group.body_contact(lane);
+}
+
+/// True if all numbers of a robot are finite.
+fn is_finite(states: &RobotStatesMut, robot: usize) -> bool {
     // What is not finite anywhere makes the sum so; a sum of finite numbers as small as these is finite.
     let sum = |values: &[f32]| values.iter().sum::<f32>();
-    let trunk = sum(&states.base_position[lane]) + sum(&states.base_orientation[lane]);
-    let velocity = sum(&states.base_linear_velocity[lane]) + sum(&states.base_angular_velocity[lane]);
-    (trunk + velocity + sum(&states.q[lane]) + sum(&states.dq[lane]) + sum(&states.tau[lane])).is_finite()
+    let trunk = sum(&states.base_position[robot]) + sum(&states.base_orientation[robot]);
+    let velocity = sum(&states.base_linear_velocity[robot]) + sum(&states.base_angular_velocity[robot]);
+    (trunk + velocity + sum(&states.q[robot]) + sum(&states.dq[robot]) + sum(&states.tau[robot])).is_finite()
 }
 
 fn values<T: Lane, const N: usize>(values: &[T; N], lane: usize) -> [f32; N] {
@@ -210,18 +240,28 @@ fn values<T: Lane, const N: usize>(values: &[T; N], lane: usize) -> [f32; N] {
 macro_rules! entry {
     ($safe:ident, $entry:ident, $feature:literal, $lane:ty) => {
         #[cfg(target_arch = "x86_64")]
-        fn $safe(group: &mut Group<$lane>, input: &Input<$lane>, time: Time, scratch: &mut Scratch<$lane>) {
+        fn $safe(
+            group: &mut Group<$lane>,
+            input: &Input<$lane>,
+            time: Time,
+            scratch: &mut Scratch<$lane>,
+        ) -> Sample<$lane> {
             // SAFETY: `robots` has made sure that the processor has them.
             #[allow(unsafe_code)]
             unsafe {
-                $entry(group, input, time, scratch);
+                $entry(group, input, time, scratch)
             }
         }
 
         #[cfg(target_arch = "x86_64")]
         #[target_feature(enable = $feature)]
-        fn $entry(group: &mut Group<$lane>, input: &Input<$lane>, time: Time, scratch: &mut Scratch<$lane>) {
-            group.advance(input, time, scratch);
+        fn $entry(
+            group: &mut Group<$lane>,
+            input: &Input<$lane>,
+            time: Time,
+            scratch: &mut Scratch<$lane>,
+        ) -> Sample<$lane> {
+            group.advance(input, time, scratch)
         }
     };
 }
@@ -230,6 +270,11 @@ entry!(advance_avx512, enter_avx512, "avx512f", Avx512F32);
 entry!(advance_avx2, enter_avx2, "avx2", Avx2F32);
 entry!(advance_avx2_double, enter_avx2_double, "avx2", Avx2F64);
 
-fn advance_baseline<T: Lane>(group: &mut Group<T>, input: &Input<T>, time: Time, scratch: &mut Scratch<T>) {
-    group.advance(input, time, scratch);
+fn advance_baseline<T: Lane>(
+    group: &mut Group<T>,
+    input: &Input<T>,
+    time: Time,
+    scratch: &mut Scratch<T>,
+) -> Sample<T> {
+    group.advance(input, time, scratch)
 }

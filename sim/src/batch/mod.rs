@@ -24,10 +24,9 @@ pub use lanes::Lanes;
 
 use crate::rapier::{BuildError, check_lengths};
 use crate::{SimConfig, SimConfigError};
-use group::LaneSnapshot;
-pub(crate) use group::Time;
-use lanes::Robots;
-pub(crate) use lanes::{Inputs, robots as lane_robots};
+use group::{LaneSnapshot, Time};
+pub(crate) use lanes::robots as lane_robots;
+use lanes::{Inputs, Robots};
 
 /// Many Go2 in SIMD lanes.
 pub struct BatchBackend {

@@ -1,0 +1,62 @@
+//! Rollouts in the batch engine: a job is the same alone and among others.
+
+use twinstep_model::effects::{Entry, compose};
+use twinstep_model::{Command, Job, Placement, Precision, RobotModel, RobotStates, Rollout, go2};
+use twinstep_sim::{BatchRollout, SimConfig};
+use twinstep_tests::hidden_robot::effect;
+
+/// More than one register of either precision, and no whole number of them.
+const JOBS: usize = 21;
+/// The job whose command is no number, from the third drive period on.
+const BROKEN: usize = 5;
+
+/// Every other robot has a delay, so that it remembers commands.
+fn robot(index: usize) -> RobotModel {
+    let (effect, scope) = effect("command_delay", "all");
+    let delay = 0.002 * (index % 2) as f64;
+    compose(&go2(), &[Entry::new(effect, scope, vec![delay]).unwrap()]).unwrap()
+}
+
+/// 3 to 60 drive periods, no neighbours alike.
+fn commands(index: usize) -> Vec<Command> {
+    let pose = go2().control.default_pose_f32();
+    let command = |period: usize| {
+        let mut command = Command::hold(pose.map(|q| q + 0.2 * (0.1 * (period + index) as f32).sin()), 30.0, 0.75);
+        if index == BROKEN && period >= 2 {
+            command.tau_ff[4] = f32::NAN;
+        }
+        command
+    };
+    (0..3 + index * 34 % 58).map(command).collect()
+}
+
+#[test]
+fn a_job_is_the_same_alone_and_among_others_of_other_lengths() {
+    let robots: Vec<_> = (0..JOBS).map(robot).collect();
+    let commands: Vec<_> = (0..JOBS).map(commands).collect();
+    let start = |index: usize| Placement::at_rest(0.3 + 0.005 * index as f32, go2().control.default_pose_f32());
+    let jobs: Vec<_> = (0..JOBS)
+        .map(|index| Job {
+            robot: &robots[index],
+            held: index % 3 == 0,
+            start: start(index),
+            commands: &commands[index],
+        })
+        .collect();
+    let mut simulator = BatchRollout::new(&go2(), &SimConfig { threads: 2, ..SimConfig::default() }).unwrap();
+    for precision in [Precision::Single, Precision::Double] {
+        let together = simulator.play(&jobs, precision);
+        for (index, states) in together.iter().enumerate() {
+            let periods = commands[index].len();
+            assert_eq!(states.q.len(), periods + 1);
+            let diverged: Vec<_> = (0..=periods).map(|entry| states.first_not_finite(entry).is_some()).collect();
+            if index == BROKEN {
+                assert!(!diverged[2] && diverged[3..].iter().all(|diverged| *diverged), "{diverged:?}");
+                continue;
+            }
+            let alone: RobotStates = simulator.play(&jobs[index..=index], precision).remove(0);
+            assert_eq!(*states, alone, "job {index} in {precision:?}");
+            assert!(diverged.iter().all(|diverged| !diverged));
+        }
+    }
+}
