@@ -24,8 +24,8 @@ const ROLLOUTS: usize = 1000;
 const ROLLOUT_S: f64 = 10.0;
 /// Candidates that are judged at a time: their trajectories fit into memory, and there is work for many cores.
 const TOGETHER: usize = 100;
-/// Candidates that are judged at a time on one core: two registers.
-const ON_ONE_CORE: usize = 8;
+/// Candidates that are judged at a time on one core: half a generation of the search, which fills every register.
+const ON_ONE_CORE: usize = 16;
 /// Robots in MuJoCo: it steps them one after the other.
 const MUJOCO_ROBOTS: usize = 2;
 /// What the rollouts, and a whole identification, may take on two cores [s].
@@ -42,8 +42,9 @@ pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Ro
     let experiment = Experiment::new(&log, &go2(), Horizon::IDENTIFICATION).map_err(other)?;
     let rollouts = experiment.clone().only(|row| log.t()[row] - first <= ROLLOUT_S);
     let candidates = candidates()?;
+    let mut peers = Peers::start(python, &setup(&log, window_s));
     let mut rows =
-        vec![on_one_core(&rollouts, &candidates, &mut Peers::start(python, &setup(&log, window_s)), window_s)?];
+        on_one_core(&rollouts, &candidates[..ON_ONE_CORE], &mut peers, window_s)?.into_iter().collect::<Vec<_>>();
     rows.extend(on_all_cores(&rollouts, &candidates, signals)?);
     rows.push(whole_search(&experiment, signals)?);
     Ok(rows)
@@ -69,36 +70,42 @@ fn simulator(threads: usize) -> Result<BatchRollout, Failure> {
     BatchRollout::new(&go2(), &SimConfig { threads, ..SimConfig::default() }).map_err(other)
 }
 
-/// Windows of ours and of MuJoCo in turn.
+/// Windows of ours in single and in double precision and of MuJoCo in turn.
 fn on_one_core(
     rollouts: &Experiment,
     candidates: &[RobotModel],
     peers: &mut Peers,
     window_s: f64,
-) -> Result<Row, Failure> {
+) -> Result<[Row; 2], Failure> {
     let hz = SimConfig::default().physics_hz();
     let (mut simulator, peer) = (simulator(1)?, format!("mujoco {hz}"));
-    let (mut ours, mut theirs) = (Vec::new(), Vec::new());
+    let (mut single, mut double, mut theirs) = (Vec::new(), Vec::new(), Vec::new());
     for _ in 0..WINDOWS {
-        let judged = pace(window_s, || {
-            rollouts.residuals(&mut simulator, &candidates[..ON_ONE_CORE], Precision::Single);
-            Ok(())
-        })?;
-        ours.push(judged.per_second * ON_ONE_CORE as f64 * ROLLOUT_S);
+        for (precision, paces) in [(Precision::Single, &mut single), (Precision::Double, &mut double)] {
+            let judged = pace(window_s, || {
+                rollouts.residuals(&mut simulator, candidates, precision);
+                Ok(())
+            })?;
+            paces.push(judged.per_second * candidates.len() as f64 * ROLLOUT_S);
+        }
         if peers.has(&peer) {
             // It counts drive periods.
             theirs.push(peers.window(&peer)? * go2().control.drive_dt());
         }
     }
-    let value = median_of(ours);
+    let (single, double) = (median_of(single), median_of(double));
     let theirs = (!theirs.is_empty()).then(|| median_of(theirs));
-    Ok(Row {
-        case: format!("closed-loop rollouts, batch f32 {hz} Hz, one core"),
+    let row = |numbers: &str, value: f64, reference: Option<(String, f64)>| Row {
+        case: format!("closed-loop rollouts, batch {numbers} {hz} Hz, one core"),
         value,
         unit: "robot-s/s",
-        reference: theirs.map(|theirs| format!("MuJoCo C {hz} Hz, one thread, {theirs:.0} robot-s/s")),
-        ratio: theirs.map(|theirs| value / theirs),
-    })
+        ratio: reference.as_ref().map(|(_, reference)| value / reference),
+        reference: reference.map(|(reference, pace)| format!("{reference}, {pace:.0} robot-s/s")),
+    };
+    Ok([
+        row("f32", single, theirs.map(|theirs| (format!("MuJoCo C {hz} Hz, one thread"), theirs))),
+        row("f64", double, Some(("f32".to_owned(), single))),
+    ])
 }
 
 fn on_all_cores(rollouts: &Experiment, candidates: &[RobotModel], signals: &Signals) -> Result<[Row; 2], Failure> {
