@@ -10,6 +10,8 @@ use crate::window::{Horizon, Window, orientation, windows};
 
 /// Rows this long apart [s] count as independent.
 const BLOCK_S: f64 = 0.5;
+/// What smoothing leaves of the noise of a start: a parabola through nine cells, at its middle.
+const SMOOTHED: f64 = 0.5;
 /// Noise that is assumed of a channel whose noise nobody stated: of a quantity, its σ.
 const ASSUMED_NOISE: [(&str, f64); 7] =
     [("q", 0.002), ("dq", 0.05), ("tau_measured", 0.2), ("pos", 0.005), ("quat", 0.01), ("vel", 0.05), ("gyro", 0.02)];
@@ -173,22 +175,41 @@ impl Experiment {
         self.windows.iter().any(|window| !window.held)
     }
 
-    /// Hands on candidate, quantity, row and difference in units of its noise.
-    pub fn differences(
-        &self,
-        simulator: &mut dyn Rollout,
-        candidates: &[RobotModel],
-        mut each: impl FnMut(usize, Quantity, usize, f64),
-    ) {
-        let trajectories = self.play(simulator, candidates, Precision::Single);
-        let played = candidates.iter().zip(trajectories.chunks(self.windows.len().max(1)));
-        for (candidate, (robot, windows)) in played.enumerate() {
-            for (channel, window, states) in self.compared(windows) {
-                self.compare(channel, window, states, robot, |row, difference| {
-                    each(candidate, channel.quantity, row, difference / channel.sigma);
-                });
+    /// For every residual, its quantity and row.
+    pub fn cells(&self) -> impl Iterator<Item = (Quantity, usize)> {
+        let windows = self.channels.iter().flat_map(|channel| self.windows.iter().map(move |window| (channel, window)));
+        windows.flat_map(|(channel, window)| channel.rows(window).map(move |(_, row)| (channel.quantity, row)))
+    }
+
+    /// Numbers of a free trunk's start: position, orientation, velocity, rate.
+    pub const STARTS: usize = 12;
+
+    /// The experiment with one number of every start off by `size` deviations of what smoothing leaves of its noise.
+    pub fn started_off(&self, number: usize, size: f64) -> Self {
+        let (of_axis, axis) = (number / 3, number % 3);
+        let quantity =
+            [Quantity::BasePosition, Quantity::BaseOrientation, Quantity::BaseVelocity, Quantity::BaseRate][of_axis];
+        let error = size * SMOOTHED * self.sigma(quantity(axis));
+        let mut off = self.clone();
+        for window in off.windows.iter_mut().filter(|window| !window.held) {
+            window.start_off(of_axis, axis, error);
+        }
+        off
+    }
+
+    /// For every window whose trunk was free, its residuals.
+    pub fn free_windows(&self) -> Vec<Vec<usize>> {
+        let mut of_window = vec![Vec::new(); self.windows.len()];
+        let mut next = 0;
+        for channel in &self.channels {
+            for (window, own) in self.windows.iter().zip(&mut of_window) {
+                let count = channel.rows(window).count();
+                own.extend(next..next + count);
+                next += count;
             }
         }
+        let pairs = self.windows.iter().zip(of_window);
+        pairs.filter(|(window, own)| !window.held && !own.is_empty()).map(|(_, own)| own).collect()
     }
 
     /// Noise of a quantity, in its unit; 1 if it is not compared.

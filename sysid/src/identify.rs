@@ -126,8 +126,10 @@ pub fn identify(
     progress: &mut Progress,
 ) -> Result<Identification, IdentifyError> {
     let (file, all) = unknowns(model, effects)?;
-    let whole = Task { file: &file, unknowns: &all, experiments, spread: &[], precision: Precision::Double };
-    let given = Task { file: model, unknowns: &[], experiments, spread: &[], precision: Precision::Double };
+    let whole =
+        Task { file: &file, unknowns: &all, experiments, spread: &[], tolerances: None, precision: Precision::Double };
+    let given =
+        Task { file: model, unknowns: &[], experiments, spread: &[], tolerances: None, precision: Precision::Double };
     let first = given.residuals(simulator, &[Vec::new()]).remove(0).ok_or(IdentifyError::Diverges)?;
     if first.is_empty() {
         return Err(IdentifyError::NothingToCompare);

@@ -28,6 +28,7 @@ mod refine;
 mod search;
 mod sensors;
 mod task;
+mod tolerance;
 mod torque;
 mod unknown;
 mod window;

@@ -4,6 +4,7 @@ use nalgebra::{DMatrix, DVector};
 use twinstep_model::{ModelFile, Precision, Rollout};
 
 use crate::experiment::Experiment;
+use crate::tolerance::Tolerances;
 use crate::unknown::{Unknown, candidate};
 
 /// Half a difference, in prior standard deviations.
@@ -20,6 +21,8 @@ pub struct Task<'a> {
     pub experiments: &'a [Experiment],
     /// What residuals are divided by, one by one, besides their noise; empty for nothing. See [`Task::spread`].
     pub spread: &'a [f64],
+    /// Errors that explain residuals at a price, for residuals that are divided by `spread`.
+    pub tolerances: Option<&'a Tolerances>,
     /// What candidates are simulated in.
     pub precision: Precision,
 }
@@ -33,7 +36,8 @@ pub struct Linear {
 }
 
 impl Task<'_> {
-    /// Residuals at points, one after the other; none of a point that is no robot or diverged.
+    /// Residuals at points, one after the other, then what tolerated errors cost; none of a point that is no robot or
+    /// diverged.
     pub fn residuals(&self, simulator: &mut dyn Rollout, points: &[Vec<f64>]) -> Vec<Option<Vec<f64>>> {
         let robots: Vec<_> = points.iter().map(|point| candidate(self.file, self.unknowns, point)).collect();
         let built: Vec<_> = robots.iter().flatten().cloned().collect();
@@ -48,7 +52,13 @@ impl Task<'_> {
                 robot.as_ref()?;
                 let mut whole: Vec<f64> = parts.iter_mut().flat_map(|part| part.next().unwrap_or_default()).collect();
                 whole.iter_mut().zip(self.spread).for_each(|(residual, spread)| *residual /= spread);
-                whole.iter().all(|residual| residual.is_finite()).then_some(whole)
+                if whole.iter().any(|residual| !residual.is_finite()) {
+                    return None;
+                }
+                if let Some(tolerances) = self.tolerances {
+                    tolerances.take(&mut whole);
+                }
+                Some(whole)
             })
             .collect()
     }

@@ -95,36 +95,46 @@ impl MeasuredTorque {
         let mut drive = Drive::<f64>::new(robot, dt);
         // The drive adds its offset to what it is given; a log has it already.
         let offsets = robot.joints.map(|joint| joint.drive.encoder_offset);
+        let late = robot.joints.map(|joint| joint.drive.sensor_delay / dt);
+        // Torques of this part, a drive period an entry.
+        let mut made: Vec<[f64; NUM_JOINTS]> = Vec::new();
         for row in &self.rows {
             let q: [f64; NUM_JOINTS] = std::array::from_fn(|joint| row.q[joint] - offsets[joint]);
             if row.first {
                 drive = Drive::new(robot, dt);
                 drive.set(0, robot, &q.map(|q| q as f32), &[0.0; NUM_JOINTS]);
+                made.clear();
             }
             let strength = self.conditions.strength(&robot.derating, row.row);
             let commands = Commands::new(&[Command { strength, ..row.command }]);
-            let mut mean = [0.0; NUM_JOINTS];
             for _ in 0..row.periods {
                 drive.tick(&commands, &q, &row.dq);
                 let forces = drive.push(0, &q, &row.dq);
-                for (joint, mean) in mean.iter_mut().enumerate() {
-                    *mean += match self.sensor {
-                        TauSensor::Output => {
-                            let dry = forces.dry[joint] * smooth_sign(row.dq[joint]);
-                            let rotor = robot.joints[joint].armature * row.ddq[joint];
-                            forces.tau[joint] - forces.viscous[joint] * row.dq[joint] - dry - rotor
-                        }
-                        _ => drive.current()[joint],
-                    } / row.periods as f64;
-                }
+                made.push(std::array::from_fn(|joint| match self.sensor {
+                    TauSensor::Output => {
+                        let dry = forces.dry[joint] * smooth_sign(row.dq[joint]);
+                        let rotor = robot.joints[joint].armature * row.ddq[joint];
+                        forces.tau[joint] - forces.viscous[joint] * row.dq[joint] - dry - rotor
+                    }
+                    _ => drive.current()[joint],
+                }));
             }
-            for (joint, (mean, measured)) in mean.iter().zip(row.torque).enumerate() {
-                if measured.is_finite() {
-                    each(joint, row.row, mean - measured);
-                }
+            for (joint, measured) in row.torque.into_iter().enumerate().filter(|(_, torque)| torque.is_finite()) {
+                each(joint, row.row, shown(&made, joint, row.periods, late[joint]) - measured);
             }
         }
     }
+}
+
+/// Mean over the last `periods` of what a sensor that is `late` periods late shows of a joint's torques.
+fn shown(made: &[[f64; NUM_JOINTS]], joint: usize, periods: usize, late: f64) -> f64 {
+    let at = |period: usize| {
+        let place = (period as f64 - late).max(0.0);
+        let (before, part) = (place as usize, place.fract());
+        let after = (before + 1).min(made.len() - 1);
+        made[before][joint] * (1.0 - part) + made[after][joint] * part
+    };
+    (made.len() - periods..made.len()).map(at).sum::<f64>() / periods as f64
 }
 
 /// The robot without what lies behind the torque's sensor, or is in the measured position already: springs at the link,

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use glam::DQuat;
+use glam::{DQuat, DVec3};
 use nalgebra::{DMatrix, DVector};
 use twinstep_logs::{Base, Log};
 use twinstep_model::{Command, Ground, Placement, RobotModel};
@@ -45,6 +45,23 @@ pub struct Window {
     pub settling: usize,
     /// For every row, the drive period at whose start it was sampled.
     pub period: Vec<usize>,
+}
+
+impl Window {
+    /// Moves the start by `error`: of position, orientation, velocity or rate, in this order, along or about an axis.
+    pub fn start_off(&mut self, quantity: usize, axis: usize, error: f64) {
+        match quantity {
+            0 => self.start.base_position[axis] += error as f32,
+            1 => {
+                let [w, x, y, z] = self.start.base_orientation.map(f64::from);
+                let turn = DQuat::from_scaled_axis(DVec3::AXES[axis] * error);
+                let DQuat { x, y, z, w } = DQuat::from_xyzw(x, y, z, w) * turn;
+                self.start.base_orientation = [w, x, y, z].map(|part| part as f32);
+            }
+            2 => self.start.base_linear_velocity[axis] += error as f32,
+            _ => self.start.base_angular_velocity[axis] += error as f32,
+        }
+    }
 }
 
 /// Cuts `log`: a held trunk from each part's start to its end, a free one in windows of a horizon.

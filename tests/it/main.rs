@@ -11,6 +11,7 @@ mod effect_readings;
 mod effects;
 mod exactly_once;
 mod faults;
+mod hunt;
 mod identify;
 mod layering;
 mod leases;

@@ -4,6 +4,9 @@ use twinstep_model::lanes::{Factored, Lane, State, Vec3};
 
 /// Impedance of a constraint at a distance of zero and, from [`IMPEDANCE_WIDTH`] on, deep inside: MuJoCo's defaults.
 const IMPEDANCE: [f64; 2] = [0.9, 0.95];
+/// How much harder friction is than the push along the normal: MuJoCo's `impratio`, as menagerie has it for the Go2. Rubber
+/// feet do not creep; with 1 a robot that stands with its feet pushed apart walks sideways by millimetres a second.
+const FRICTION_HARDNESS: f64 = 100.0;
 /// Depth [m] or angle [rad] at which the impedance is the larger one.
 const IMPEDANCE_WIDTH: f64 = 0.001;
 
@@ -159,11 +162,12 @@ impl<T: Lane> PointRow<'_, T> {
         softness.pushing(row, velocity)
     }
 
-    /// Along the ground: it has the normal row's regularisation, and only damps.
+    /// Along the ground: it has a small part of the normal row's regularisation, and only damps.
     #[inline(always)]
     pub fn along(&self, direction: Vec3<T>, softness: &Softness<T>, normal: &Row<T>) -> Row<T> {
         let (row, velocity) = self.row(direction);
-        let (zero, regularisation) = (T::splat(0.0), normal.regularisation);
+        let zero = T::splat(0.0);
+        let regularisation = normal.regularisation * T::splat(1.0 / FRICTION_HARDNESS);
         let inverse = softness.distance.select_less(zero, T::splat(1.0) / (row.response(&row) + regularisation), zero);
         Row { regularisation, inverse, wanted: -(softness.damping() * velocity) * softness.dt, ..row }
     }

@@ -5,6 +5,7 @@ use twinstep_logs::Log;
 use twinstep_model::{NUM_JOINTS, Precision, RobotModel, Rollout};
 
 use crate::experiment::{Experiment, ExperimentError, Quantity};
+use crate::tolerance::{self, Tolerances};
 use crate::torque::MeasuredTorque;
 use crate::window::Horizon;
 
@@ -20,6 +21,9 @@ const TOGETHER: usize = 64;
 const MISFIT: [f64; 2] = [0.001, 0.02];
 /// Length of a block [s]; blocks go to the two folds in turn.
 const BLOCK_S: f64 = 1.0;
+/// Power above the noise, in units of it, below which nothing is wrong; and errors of any robot, by their cost [nats].
+const LEAST_EXCESS: f64 = 0.1;
+const LEAST_TOLERATED: f64 = 30.0;
 /// Rows this long apart [s] are independent: positions, torques, the trunk.
 const INDEPENDENT_S: [f64; 3] = [0.2, 0.1, 0.5];
 
@@ -30,25 +34,121 @@ pub struct Leftover {
     pub sums: [[f64; 2]; CHANNELS],
     /// Numbers of rows.
     pub counts: [[f64; 2]; CHANNELS],
+    /// What tolerated errors cost that explain a part of the rest, of starts and of the robot [nats].
+    pub tolerated: [f64; 2],
+}
+
+/// Rows of all logs.
+pub struct Rows {
+    /// The logs, each with these rows alone.
+    pub experiments: Vec<Experiment>,
+    /// Errors of any robot, in these rows; none where every trunk was held.
+    pub tolerances: Option<Tolerances>,
+    /// For every residual its channel, its fold, and what it is multiplied by.
+    cells: Vec<(usize, Option<usize>, f64)>,
 }
 
 /// Logs of one robot.
 pub struct Evidence {
     logs: Vec<Log>,
-    experiments: Vec<Experiment>,
+    /// All rows but those that are set aside.
+    pub whole: Rows,
+    /// One half of them and the other.
+    pub folds: [Rows; 2],
+    /// Of all of them those with the trunk held, if there are any: joints hardly disturb each other there.
+    quick: Rows,
     torques: Vec<MeasuredTorque>,
+}
+
+impl Rows {
+    fn new(logs: &[Log], experiments: Vec<Experiment>) -> Self {
+        let mut cells = Vec::new();
+        for (log, experiment) in logs.iter().zip(&experiments) {
+            cells.extend(experiment.cells().map(|(quantity, row)| {
+                // A velocity says what the position does, with more noise; torques are judged without a simulation.
+                let (channel, weight) = match quantity {
+                    Quantity::Position(joint) => (joint, 1.0 / (MISFIT[0] / experiment.sigma(quantity)).hypot(1.0)),
+                    Quantity::Velocity(_) | Quantity::Torque(_) => (0, 0.0),
+                    Quantity::BasePosition(axis) => (TRUNK + axis, std::f64::consts::FRAC_1_SQRT_2),
+                    Quantity::BaseOrientation(axis) => (TRUNK + 3 + axis, std::f64::consts::FRAC_1_SQRT_2),
+                    Quantity::BaseVelocity(axis) => (TRUNK + 6 + axis, std::f64::consts::FRAC_1_SQRT_2),
+                    Quantity::BaseRate(axis) => (TRUNK + 9 + axis, std::f64::consts::FRAC_1_SQRT_2),
+                };
+                (channel, if weight > 0.0 { fold_of(log, row) } else { None }, weight)
+            }));
+        }
+        Self { experiments, tolerances: None, cells }
+    }
+
+    /// What candidates leave of the motion.
+    fn leftovers(&self, simulator: &mut dyn Rollout, robots: &[RobotModel]) -> Vec<Leftover> {
+        let mut whole = vec![Vec::new(); robots.len()];
+        for experiment in &self.experiments {
+            for (robots, whole) in robots.chunks(TOGETHER).zip(whole.chunks_mut(TOGETHER)) {
+                let residuals = experiment.residuals(simulator, robots, PRECISION);
+                whole.iter_mut().zip(residuals).for_each(|(whole, residuals)| whole.extend(residuals));
+            }
+        }
+        whole.into_iter().map(|residuals| self.leftover(residuals)).collect()
+    }
+
+    /// Residuals of a candidate less what tolerated errors explain.
+    pub fn corrected(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> Vec<f64> {
+        let one = std::slice::from_ref(robot);
+        let parts = self.experiments.iter().flat_map(|experiment| experiment.residuals(simulator, one, PRECISION));
+        let mut residuals: Vec<f64> = parts.flatten().collect();
+        if let Some(tolerances) = &self.tolerances {
+            tolerances.take(&mut residuals);
+        }
+        residuals
+    }
+
+    fn leftover(&self, mut residuals: Vec<f64>) -> Leftover {
+        if let Some(tolerances) = &self.tolerances {
+            tolerances.take(&mut residuals);
+        }
+        let mut left = Leftover {
+            sums: [[0.0; 2]; CHANNELS],
+            counts: [[0.0; 2]; CHANNELS],
+            tolerated: Tolerances::nats(&residuals[self.cells.len()..]),
+        };
+        for (residual, (channel, fold, weight)) in residuals.iter().zip(&self.cells) {
+            left.add(*channel, *fold, residual * weight);
+        }
+        left
+    }
 }
 
 impl Evidence {
     /// `logs` of a robot with the gains and rates of `robot`.
     pub fn new(logs: Vec<Log>, robot: &RobotModel) -> Result<Self, ExperimentError> {
-        let kept = |log: &Log| -> Result<Experiment, ExperimentError> {
-            let whole = Experiment::new(log, robot, Horizon::IDENTIFICATION)?;
-            Ok(whole.only(|row| fold_of(log, row).is_some()))
+        let experiments: Vec<Experiment> =
+            logs.iter().map(|log| Experiment::new(log, robot, Horizon::IDENTIFICATION)).collect::<Result<_, _>>()?;
+        let only = |keep: &dyn Fn(Option<usize>) -> bool| -> Vec<Experiment> {
+            let pairs = logs.iter().zip(&experiments);
+            pairs.map(|(log, experiment)| experiment.clone().only(|row| keep(fold_of(log, row)))).collect()
         };
-        let experiments = logs.iter().map(kept).collect::<Result<_, _>>()?;
-        let torques = logs.iter().map(|log| MeasuredTorque::new(log, robot)).collect::<Result<_, _>>()?;
-        Ok(Self { logs, experiments, torques })
+        let whole = only(&|fold| fold.is_some());
+        let quick = whole.iter().cloned().map(Experiment::held_first).collect();
+        Ok(Self {
+            torques: logs.iter().map(|log| MeasuredTorque::new(log, robot)).collect::<Result<_, _>>()?,
+            folds: [0, 1].map(|fold| Rows::new(&logs, only(&|of| of == Some(fold)))),
+            whole: Rows::new(&logs, whole),
+            quick: Rows::new(&logs, quick),
+            logs,
+        })
+    }
+
+    /// From here on, errors that any robot has are not evidence; `robot` is the model.
+    pub fn tolerate(&mut self, robot: &RobotModel, simulator: &mut dyn Rollout) {
+        if self.has_free_parts() {
+            for rows in [&mut self.whole].into_iter().chain(&mut self.folds) {
+                rows.tolerances = Tolerances::new(&rows.experiments, robot, simulator);
+            }
+            if self.quick.experiments.iter().any(Experiment::has_free_parts) {
+                self.quick.tolerances.clone_from(&self.whole.tolerances);
+            }
+        }
     }
 
     /// The logs.
@@ -56,41 +156,16 @@ impl Evidence {
         &self.logs
     }
 
-    /// All rows but those that are set aside.
-    pub fn experiments(&self) -> &[Experiment] {
-        &self.experiments
-    }
-
     /// Whether a trunk was free somewhere.
     pub fn has_free_parts(&self) -> bool {
-        self.experiments.iter().any(Experiment::has_free_parts)
+        self.whole.experiments.iter().any(Experiment::has_free_parts)
     }
 
-    /// The rows of one fold alone.
-    pub fn fold(&self, fold: usize) -> Vec<Experiment> {
-        let pairs = self.logs.iter().zip(&self.experiments);
-        pairs.map(|(log, experiment)| experiment.clone().only(|row| fold_of(log, row) == Some(fold))).collect()
-    }
-
-    /// What candidates leave; with `quick` only where the trunk was held, if it was: joints hardly disturb each other there.
+    /// What candidates leave; with `quick` only where the trunk was held, if it was.
     pub fn leftovers(&self, simulator: &mut dyn Rollout, robots: &[RobotModel], quick: bool) -> Vec<Leftover> {
-        let empty = Leftover { sums: [[0.0; 2]; CHANNELS], counts: [[0.0; 2]; CHANNELS] };
-        let mut leftovers = vec![empty; robots.len()];
-        for ((log, experiment), torques) in self.logs.iter().zip(&self.experiments).zip(&self.torques) {
-            let chosen = if quick { experiment.clone().held_first() } else { experiment.clone() };
-            for (chunk, leftovers) in robots.chunks(TOGETHER).zip(leftovers.chunks_mut(TOGETHER)) {
-                chosen.differences(simulator, chunk, |candidate, quantity, row, difference| {
-                    let (channel, misfit) = match quantity {
-                        Quantity::Position(joint) => (joint, MISFIT[0] / experiment.sigma(quantity)),
-                        Quantity::Velocity(_) | Quantity::Torque(_) => return,
-                        Quantity::BasePosition(axis) => (TRUNK + axis, 1.0),
-                        Quantity::BaseOrientation(axis) => (TRUNK + 3 + axis, 1.0),
-                        Quantity::BaseVelocity(axis) => (TRUNK + 6 + axis, 1.0),
-                        Quantity::BaseRate(axis) => (TRUNK + 9 + axis, 1.0),
-                    };
-                    leftovers[candidate].add(channel, fold_of(log, row), difference / misfit.hypot(1.0));
-                });
-            }
+        let rows = if quick { &self.quick } else { &self.whole };
+        let mut leftovers = rows.leftovers(simulator, robots);
+        for (log, torques) in self.logs.iter().zip(&self.torques) {
             for index in 0..robots.len() {
                 // Most effects are behind the torque's sensor: what it shows is as before.
                 let alike = index > 0 && torques.are_alike(&robots[index], &robots[index - 1]);
@@ -130,6 +205,11 @@ impl Evidence {
 pub const PRECISION: Precision = Precision::Single;
 
 impl Leftover {
+    /// How much less tolerated errors cost than `before` [nats].
+    pub fn tolerated_gain(&self, before: &Self) -> f64 {
+        before.tolerated.iter().sum::<f64>() - self.tolerated.iter().sum::<f64>()
+    }
+
     fn add(&mut self, channel: usize, fold: Option<usize>, difference: f64) {
         let Some(fold) = fold else { return };
         self.sums[channel][fold] += difference * difference;
@@ -153,9 +233,20 @@ impl Leftover {
         0.5 * count / rows * ((then + 1e-9) / (now + 1e-9)).ln()
     }
 
-    /// Power above noise and misfit, over the channels `of`.
-    pub fn excess(&self, of: impl Fn(usize) -> bool) -> f64 {
-        (0..CHANNELS).filter(|channel| of(*channel)).map(|channel| self.channel_excess(channel)).sum()
+    /// Power above noise and misfit, everywhere.
+    pub fn excess(&self) -> f64 {
+        (0..CHANNELS).map(|channel| self.channel_excess(channel)).sum::<f64>() + self.tolerated_excess()
+    }
+
+    /// Power that errors of the robot would have to explain beyond what any robot has.
+    pub fn tolerated_excess(&self) -> f64 {
+        tolerance::excess(self.tolerated[1])
+    }
+
+    /// Whether there is anything that is neither noise nor an error of any robot.
+    pub fn is_noise(&self) -> bool {
+        let count: f64 = self.counts.iter().flatten().sum();
+        self.tolerated[1] < LEAST_TOLERATED && self.excess() - self.tolerated_excess() < LEAST_EXCESS * count
     }
 
     /// Power above noise and misfit of a channel.

@@ -4,11 +4,11 @@ use twinstep_model::effects::{Composition, Effect, Entry, EntryError, Scope, Tar
 use twinstep_model::{Joint, ModelFile};
 
 /// Shares of the way from no effect to the end of its plausible range that are tried.
-const SHARES: [f64; 8] = [0.06, 0.12, 0.2, 0.32, 0.5, 0.75, 1.0, 1.5];
+const SHARES: [f64; 5] = [0.1, 0.2, 0.4, 0.75, 1.3];
 /// A finding smaller than this share of its plausible range is not worth a name.
 const LEAST_SHARE: f64 = 0.08;
 /// The same of effects that errors of a millimetre or a percent in geometry and mass look like.
-const LEAST_SHARES_OF_BODY: [(&str, f64); 3] = [("encoder_offset", 0.4), ("com_shift", 0.25), ("payload", 0.15)];
+const LEAST_SHARES_OF_BODY: [(&str, f64); 3] = [("encoder_offset", 0.3), ("com_shift", 0.12), ("payload", 0.1)];
 
 /// An effect on a scope, with values.
 #[derive(Clone, Debug, PartialEq)]
@@ -104,7 +104,7 @@ pub fn sizes(effect: &Effect) -> Vec<Vec<f64>> {
     }
     let seconds: &[&[f64]] = match effect.name {
         "stribeck_friction" => &[&[0.15], &[0.6], &[2.0]],
-        "joint_spring" => &[&[-1.5], &[-0.8], &[0.0], &[0.8], &[1.5]],
+        "joint_spring" => &[&[-1.2], &[0.0], &[1.2]],
         "thermal_derating" => &[&[35.0]],
         "torque_ripple" => return ripples(),
         _ => &[&[]],
@@ -117,11 +117,13 @@ pub fn sizes(effect: &Effect) -> Vec<Vec<f64>> {
 /// Values to try of an effect that is judged by the whole log; each component of a vector alone.
 pub fn whole_sizes(effect: &Effect) -> Vec<Vec<f64>> {
     match effect.name {
-        "payload" => [-0.5, 0.3, 0.8, 1.5, 3.0].map(|mass| vec![mass, 0.0, 0.0, 0.0]).to_vec(),
+        "payload" => [-0.5, 0.3, 0.8, 2.0].map(|mass| vec![mass, 0.0, 0.0, 0.0]).to_vec(),
         "com_shift" | "gyro_bias" => {
-            let size = 0.4 * effect.parameters[0].plausible[1];
             let along = |axis: usize| {
-                [-size, size].map(|size| (0..3).map(|one| if one == axis { size } else { 0.0 }).collect())
+                [-0.5, -0.15, 0.15, 0.5].map(|share| {
+                    let size = share * effect.parameters[0].plausible[1];
+                    (0..3).map(|one| if one == axis { size } else { 0.0 }).collect()
+                })
             };
             (0..3).flat_map(along).collect()
         }
@@ -132,10 +134,11 @@ pub fn whole_sizes(effect: &Effect) -> Vec<Vec<f64>> {
     }
 }
 
-/// Ripples of one size, every whole number of cycles and four phases: between them a descent finds its way.
+/// Ripples of one size, every third number of cycles and four phases. Joints move within half a radian of their middle, where
+/// two numbers next but one to each other are half a radian out of step at most, which a descent mends.
 fn ripples() -> Vec<Vec<f64>> {
     let phases = [0.0, 0.5, 1.0, -0.5].map(|turn| turn * std::f64::consts::PI);
-    (6..=150).flat_map(|cycles| phases.map(|phase| vec![0.12, f64::from(cycles), phase])).collect()
+    (7..=150).step_by(3).flat_map(|cycles| phases.map(|phase| vec![0.12, f64::from(cycles), phase])).collect()
 }
 
 /// What having chosen among all scopes of its kind costs [nats].

@@ -4,13 +4,14 @@
 //! - [`hypothesis`]: an effect on a scope, with values.
 //! - [`scan`]: every effect on every joint at once; the best go on.
 //! - [`trial`]: one hypothesis fitted to one fold and judged on the other, in full simulation.
-//! - [`unexplained`]: what is left, and what it depends on.
+//! - [`unexplained`]: what is left, and what it depends on; [`line`]: or at which frequency it shakes.
 //!
 //! The best trial is accepted if its evidence exceeds the threshold and it explains a good part of what is above the noise;
 //! all that is accepted is fitted anew together, and the search goes on from there.
 
 mod evidence;
 mod hypothesis;
+mod line;
 mod scan;
 mod trial;
 mod unexplained;
@@ -22,11 +23,10 @@ use twinstep_model::{ModelFile, Precision, RobotModel, Rollout};
 
 use crate::diagnosis::{Cause, Confusable, Diagnosis, Errors};
 use crate::evaluate::evaluate;
-use crate::experiment::{Experiment, ExperimentError};
+use crate::experiment::ExperimentError;
 use crate::identify::blocks;
 use crate::refine::{SIMULATORS, covariance};
-use crate::task::Task;
-use evidence::{Evidence, Leftover};
+use evidence::Evidence;
 use hypothesis::Hypothesis;
 use scan::{Scored, scan};
 use trial::{Fit, Trial, trial};
@@ -43,8 +43,6 @@ const TRIED: usize = 5;
 const TRIED_OF_WHOLE: usize = 2;
 /// Share of the power above noise that a cause has to explain.
 const LEAST_SHARE: f64 = 0.3;
-/// Power above the noise, in units of it, below which nothing is wrong.
-const LEAST_EXCESS: f64 = 0.1;
 /// A rival this close [nats] cannot be told from the cause.
 const CLOSE: f64 = 6.0;
 /// Why there is no diagnosis.
@@ -84,24 +82,27 @@ pub fn diagnose(
     progress: &mut Progress,
 ) -> Result<Diagnosed, DiagnoseError> {
     let robot = model.robot_model()?;
-    let evidence = Evidence::new(logs, &robot)?;
-    let folds = [evidence.fold(0), evidence.fold(1)];
-    let given = evidence.leftover(simulator, &robot);
-    if given.diverged() {
+    let mut evidence = Evidence::new(logs, &robot)?;
+    if evidence.leftover(simulator, &robot).diverged() {
         return Err(DiagnoseError::Diverges);
     }
     let mut say = |text: &str| if progress(text) { Ok(()) } else { Err(DiagnoseError::Ended) };
+    say("the ground, and errors of any robot")?;
+    let judged = on_fitted_ground(&evidence, model, simulator);
+    evidence.tolerate(&judged.robot_model()?, simulator);
+    let given = evidence.leftover(simulator, &robot);
     let mut search = Search {
         evidence: &evidence,
-        folds,
-        judged: on_fitted_ground(&evidence, model, simulator),
+        judged: judged.clone(),
+        accepted: Accepted::new(),
+        model: judged.clone(),
         simulator,
         say: &mut say,
     };
-    let mut accepted = search.run()?;
-    let left = search.left(&accepted)?;
-    (search.say)("intervals")?;
-    let judged = search.judged.clone();
+    search.run()?;
+    let Search { mut accepted, model: named, .. } = search;
+    let left = evidence.leftover(simulator, &named.robot_model()?);
+    say("intervals")?;
     let (extended, confusable) = intervals(model, &judged, &mut accepted, &evidence, simulator);
     let causes = accepted.iter().map(|(best, others)| cause(best, others, &extended)).collect();
     let diagnosis = Diagnosis {
@@ -122,9 +123,11 @@ type Accepted = Vec<(Trial, Vec<Trial>)>;
 /// The search for causes.
 struct Search<'a> {
     evidence: &'a Evidence,
-    folds: [Vec<Experiment>; 2],
     /// The given model on ground that suits the log.
     judged: ModelFile,
+    accepted: Accepted,
+    /// [`Search::judged`] with all that is accepted, fitted together to everything.
+    model: ModelFile,
     simulator: &'a mut dyn Rollout,
     say: &'a mut dyn FnMut(&str) -> Result<(), DiagnoseError>,
 }
@@ -132,73 +135,71 @@ struct Search<'a> {
 impl Search<'_> {
     /// One cause after the other, until none earns a name. What is left too small, or is more than any robot has, when all are
     /// fitted together was two others in disguise: it goes, and the search goes on without it.
-    fn run(&mut self) -> Result<Accepted, DiagnoseError> {
-        let (mut accepted, mut excluded) = (Accepted::new(), Vec::new());
+    fn run(&mut self) -> Result<(), DiagnoseError> {
+        let mut excluded = Vec::new();
         for _ in 0..MOST_SEARCHES {
-            if let Some(next) = self.next(&accepted, &excluded)?.filter(|_| accepted.len() < MOST_CAUSES) {
-                accepted.push(next);
+            let next = if self.accepted.len() < MOST_CAUSES { self.next(&excluded)? } else { None };
+            if let Some(next) = next {
+                self.accepted.push(next);
             } else {
-                let Some(place) = self.untenable(&accepted) else { break };
-                excluded.push(accepted.remove(place).0.hypothesis.name());
+                let Some(place) = self.untenable() else { break };
+                excluded.push(self.accepted.remove(place).0.hypothesis.name());
             }
+            self.fit_together();
         }
-        while let Some(place) = self.untenable(&accepted) {
-            accepted.remove(place);
+        while let Some(place) = self.untenable() {
+            self.accepted.remove(place);
+            self.fit_together();
         }
-        Ok(accepted)
+        Ok(())
     }
 
     /// A cause that does not stand when all are fitted together.
-    fn untenable(&mut self, accepted: &Accepted) -> Option<usize> {
-        let model = self.model(accepted);
-        // Entries of the causes are the last of the model, in their order.
-        let first = model.effects.len() - accepted.len();
-        accepted.iter().enumerate().position(|(index, (best, _))| {
-            let fitted = Hypothesis { values: model.effects[first + index].values.clone(), ..best.hypothesis.clone() };
-            !(fitted.is_large_enough() && fitted.is_plausible())
-        })
+    fn untenable(&self) -> Option<usize> {
+        let stands = |hypothesis: &Hypothesis| hypothesis.is_large_enough() && hypothesis.is_plausible();
+        self.accepted.iter().position(|(best, _)| !stands(&best.hypothesis))
     }
 
     /// The best cause on top of those that are accepted, if one earns a name.
-    fn next(&mut self, accepted: &Accepted, excluded: &[String]) -> Result<Option<(Trial, Vec<Trial>)>, DiagnoseError> {
-        let model = self.model(accepted);
-        let left = self.evidence.leftover(self.simulator, &model.robot_model()?);
-        if left.excess(|_| true) < LEAST_EXCESS * count(&left) {
+    fn next(&mut self, excluded: &[String]) -> Result<Option<(Trial, Vec<Trial>)>, DiagnoseError> {
+        let left = self.evidence.leftover(self.simulator, &self.model.robot_model()?);
+        if left.is_noise() {
             return Ok(None);
         }
-        (self.say)(&format!("scanning, {} named", accepted.len()))?;
+        let named = self.accepted.len();
+        (self.say)(&format!("scanning, {named} named"))?;
         let mut trials = Vec::new();
-        let mut tried = candidates(self.evidence, &model, self.simulator);
+        let mut tried = candidates(self.evidence, &self.model, self.simulator);
         tried.retain(|hypothesis| !excluded.contains(&hypothesis.name()));
         for hypothesis in tried {
-            (self.say)(&format!("trying {}, {} named", hypothesis.name(), accepted.len()))?;
-            trials.extend(trial(self.evidence, &self.folds, &model, &left, &hypothesis, self.simulator));
+            (self.say)(&format!("trying {}, {named} named", hypothesis.name()))?;
+            trials.extend(trial(self.evidence, &self.model, &left, &hypothesis, self.simulator));
         }
         trials.sort_by(|one, other| other.score.total_cmp(&one.score));
-        let named = |trial: &Trial| {
+        let earns_name = |trial: &Trial| {
             trial.score >= THRESHOLD && trial.explains >= LEAST_SHARE && trial.hypothesis.is_large_enough()
         };
-        let place = trials.iter().position(named);
+        let place = trials.iter().position(earns_name);
         Ok(place.map(|place| (trials.remove(place), trials)))
     }
 
-    /// All accepted causes fitted together to everything.
-    fn model(&mut self, accepted: &Accepted) -> ModelFile {
-        let hypotheses: Vec<_> = accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
-        match Fit::new(&self.judged, &hypotheses) {
-            Some(fit) if !hypotheses.is_empty() => fit.model(&fit.to(self.evidence.experiments(), self.simulator)),
-            _ => self.judged.clone(),
-        }
-    }
-
-    fn left(&mut self, accepted: &Accepted) -> Result<Leftover, DiagnoseError> {
-        let robot = self.model(accepted).robot_model()?;
-        Ok(self.evidence.leftover(self.simulator, &robot))
+    /// Fits all that is accepted together.
+    fn fit_together(&mut self) {
+        let hypotheses: Vec<_> = self.accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
+        self.model = self.judged.clone();
+        let Some(fit) = Fit::new(&self.judged, &hypotheses).filter(|_| !hypotheses.is_empty()) else { return };
+        let point = fit.to(&self.evidence.whole, self.simulator);
+        self.model = fit.model(&point);
+        take_values(&mut self.accepted, &fit, &point);
     }
 }
 
-fn count(left: &Leftover) -> f64 {
-    left.counts.iter().flatten().sum()
+/// Writes the values of a fit of all causes into them.
+fn take_values(accepted: &mut Accepted, fit: &Fit, point: &[f64]) {
+    let mut values = fit.unknowns.iter().zip(point).map(|(unknown, coordinate)| unknown.value(*coordinate));
+    for (best, _) in accepted {
+        best.hypothesis.values = values.by_ref().take(best.hypothesis.values.len()).collect();
+    }
 }
 
 /// The model on ground of a hardness that suits the log, as long as the difference is not worth a name: how a foot meets the
@@ -211,7 +212,7 @@ fn on_fitted_ground(evidence: &Evidence, model: &ModelFile, simulator: &mut dyn 
     let Some(fit) = Fit::new(model, std::slice::from_ref(&hypothesis)).filter(|_| evidence.has_free_parts()) else {
         return model.clone();
     };
-    let point = fit.to(evidence.experiments(), simulator);
+    let point = fit.to(&evidence.whole, simulator);
     let fitted = Hypothesis { values: vec![fit.unknowns[0].value(point[0])], ..hypothesis };
     if fitted.is_large_enough() { model.clone() } else { fit.model(&point) }
 }
@@ -239,19 +240,13 @@ fn intervals(
     simulator: &mut dyn Rollout,
 ) -> (ModelFile, Vec<Confusable>) {
     let hypotheses: Vec<_> = accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
-    let experiments = evidence.experiments();
     let fits = [judged, model].map(|model| Fit::new(model, &hypotheses).filter(|_| !hypotheses.is_empty()));
     let [Some(on_ground), Some(mut fit)] = fits else { return (model.clone(), Vec::new()) };
-    fit.begin = on_ground.to(experiments, simulator);
-    let mut values = fit.unknowns.iter().zip(&fit.begin).map(|(unknown, coordinate)| unknown.value(*coordinate));
-    for (best, _) in accepted {
-        best.hypothesis.values = values.by_ref().take(best.hypothesis.values.len()).collect();
-    }
-    let task =
-        Task { file: &fit.file, unknowns: &fit.unknowns, experiments, spread: &[], precision: Precision::Double };
-    let spread = task.spread(simulator, &fit.begin);
-    let here = Task { spread: &spread, ..task }.linear(simulator, &fit.begin);
-    let covariance = here.and_then(|here| covariance(&here, &blocks(experiments)));
+    fit.begin = on_ground.to(&evidence.whole, simulator);
+    take_values(accepted, &fit, &fit.begin);
+    let here =
+        fit.task(&evidence.whole, simulator, Precision::Double, |task, simulator| task.linear(simulator, &fit.begin));
+    let covariance = here.and_then(|here| covariance(&here, &blocks(&evidence.whole.experiments)));
     words::with_intervals(&fit, covariance.as_ref(), SIMULATORS)
 }
 

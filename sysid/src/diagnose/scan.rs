@@ -97,7 +97,7 @@ fn scan_whole(evidence: &Evidence, model: &ModelFile, robot: &RobotModel, simula
             let of = |channel: usize| {
                 [0, 1].map(|fold| now.gain(&before, channel, fold, evidence.rows_in_one(channel))).iter().sum::<f64>()
             };
-            (0..CHANNELS).map(of).sum::<f64>()
+            (0..CHANNELS).map(of).sum::<f64>() + now.tolerated_gain(&before)
         });
         let best = gains.zip(values).max_by(|one, other| one.0.total_cmp(&other.0));
         scored.extend(best.map(|(score, values)| Scored {

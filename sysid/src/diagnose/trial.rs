@@ -1,17 +1,18 @@
 //! A trial: one hypothesis fitted to one fold and judged on the other, in full simulation.
 
 use twinstep_model::effects::{Effect, Scope};
-use twinstep_model::{ModelFile, RobotModel, Rollout};
+use twinstep_model::{ModelFile, Precision, RobotModel, Rollout};
 
-use super::evidence::{CHANNELS, Evidence, Leftover, PRECISION};
+use super::evidence::{CHANNELS, Evidence, Leftover, PRECISION, Rows};
 use super::hypothesis::{Hypothesis, choice};
-use crate::experiment::Experiment;
 use crate::refine::refine;
 use crate::task::Task;
 use crate::unknown::{Unknown, start, unknowns, with_values};
 
 /// Most steps of a descent: the scan has found the valley.
 const STEPS: usize = 6;
+/// A step that lowers the cost by a smaller share ends it.
+const SETTLED: f64 = 1e-3;
 
 /// What came of a hypothesis.
 #[derive(Clone, Debug)]
@@ -50,15 +51,33 @@ impl Fit {
         Some(Self { begin: begin.collect(), file, unknowns })
     }
 
-    /// The numbers that follow `experiments` best.
-    pub fn to(&self, experiments: &[Experiment], simulator: &mut dyn Rollout) -> Vec<f64> {
-        let task = Task { file: &self.file, unknowns: &self.unknowns, experiments, spread: &[], precision: PRECISION };
-        let spread = task.spread(simulator, &self.begin);
-        let mut steps = 0;
-        refine(&Task { spread: &spread, ..task }, simulator, self.begin.clone(), |_| {
-            steps += 1;
-            steps < STEPS
+    /// The numbers that follow `rows` best.
+    pub fn to(&self, rows: &Rows, simulator: &mut dyn Rollout) -> Vec<f64> {
+        let (mut steps, mut last) = (0, f64::INFINITY);
+        self.task(rows, simulator, PRECISION, |task, simulator| {
+            refine(task, simulator, self.begin.clone(), |cost| {
+                steps += 1;
+                let settled = last - cost < SETTLED * cost;
+                last = cost;
+                steps < STEPS && !settled
+            })
         })
+    }
+
+    /// Hands on what is asked of `rows`, weighted as the beginning lets expect.
+    pub fn task<R>(
+        &self,
+        rows: &Rows,
+        simulator: &mut dyn Rollout,
+        precision: Precision,
+        ask: impl FnOnce(&Task, &mut dyn Rollout) -> R,
+    ) -> R {
+        let (file, unknowns, experiments) = (&self.file, &self.unknowns[..], &rows.experiments[..]);
+        let tolerances = rows.tolerances.as_ref();
+        let task = Task { file, unknowns, experiments, spread: &[], tolerances, precision };
+        let spread = task.spread(simulator, &self.begin);
+        let tolerances = tolerances.and_then(|tolerances| tolerances.divided(&spread));
+        ask(&Task { spread: &spread, tolerances: tolerances.as_ref(), ..task }, simulator)
     }
 
     /// The model with these numbers.
@@ -70,14 +89,13 @@ impl Fit {
 /// Tries `hypothesis` on top of `model`, which leaves `before`.
 pub fn trial(
     evidence: &Evidence,
-    folds: &[Vec<Experiment>; 2],
     model: &ModelFile,
     before: &Leftover,
     hypothesis: &Hypothesis,
     simulator: &mut dyn Rollout,
 ) -> Option<Trial> {
     let fit = Fit::new(model, std::slice::from_ref(hypothesis))?;
-    let points = [0, 1].map(|fold| fit.to(&folds[fold], simulator));
+    let points = [0, 1].map(|fold| fit.to(&evidence.folds[fold], simulator));
     let whole: Vec<f64> = points[0].iter().zip(&points[1]).map(|(one, other)| 0.5 * (one + other)).collect();
     let models = [fit.model(&points[0]), fit.model(&points[1]), fit.model(&whole)];
     let robots: Vec<RobotModel> = models.iter().map(|model| model.robot_model().ok()).collect::<Option<_>>()?;
@@ -87,7 +105,8 @@ pub fn trial(
         let rows = evidence.rows_in_one(channel);
         left[0].gain(before, channel, 1, rows) + left[1].gain(before, channel, 0, rows)
     };
-    let evidence_nats: f64 = (0..CHANNELS).map(judged).sum();
+    let tolerated: f64 = left[..2].iter().map(|left| 0.5 * left.tolerated_gain(before)).sum();
+    let evidence_nats: f64 = (0..CHANNELS).map(judged).sum::<f64>() + tolerated;
     let parameters = 0.5 * fit.unknowns.len() as f64 * 200f64.ln();
     let held_out = |channel: usize| left[0].sums[channel][1] + left[1].sums[channel][0];
     let acts: Vec<usize> = (0..CHANNELS).filter(|channel| judged(*channel) > 1.0).collect();
@@ -95,7 +114,11 @@ pub fn trial(
         acts.iter().map(|channel| before.sums[*channel].iter().sum::<f64>()).sum::<f64>(),
         acts.iter().map(|channel| held_out(*channel)).sum::<f64>(),
     ];
-    let [above, left_above] = [before, &left[2]].map(|left| left.excess(|channel| acts.contains(&channel)));
+    let above = |left: &Leftover| {
+        let tolerated = if tolerated > 1.0 { left.tolerated_excess() } else { 0.0 };
+        acts.iter().map(|channel| left.channel_excess(*channel)).sum::<f64>() + tolerated
+    };
+    let [above, left_above] = [above(before), above(&left[2])];
     let values = fit.unknowns.iter().zip(&whole).map(|(unknown, coordinate)| unknown.value(*coordinate)).collect();
     Some(Trial {
         hypothesis: Hypothesis { values, ..hypothesis.clone() },

@@ -4,8 +4,10 @@ use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, RobotModel, Rollout};
 
 use super::evidence::{Evidence, Leftover, TORQUE, TRUNK, fold_of};
+use super::line::line;
 use crate::diagnosis::Unexplained;
 use crate::experiment::Quantity;
+use crate::motion::{JointCommands, command, joint_commands};
 
 /// Bins of a variable that might explain a residual.
 const BINS: usize = 12;
@@ -22,7 +24,7 @@ pub fn unexplained(
     left: &Leftover,
     simulator: &mut dyn Rollout,
 ) -> Unexplained {
-    let (before, after) = (given.excess(|_| true), left.excess(|_| true));
+    let (before, after) = (given.excess(), left.excess());
     let fraction = if before > 0.0 { (after / before).min(1.0) } else { 0.0 };
     let count = |channel: usize| left.counts[channel].iter().sum::<f64>();
     let worst = (0..TRUNK)
@@ -37,9 +39,10 @@ pub fn unexplained(
     };
     let log = &evidence.logs()[0];
     let residual = residual(evidence, robot, channel, simulator);
-    let mut found: Vec<(f64, String)> = variables(log)
+    let mut found: Vec<(f64, String)> = variables(log, robot)
         .into_iter()
         .map(|(name, cells)| (explained(log, &residual, &cells), name))
+        .chain(line_of(log, &residual).map(|(frequency, share)| (share, format!("a line at {frequency:.2} Hz"))))
         .filter(|(share, _)| *share > TELLING)
         .collect();
     found.sort_by(|one, other| other.0.total_cmp(&one.0));
@@ -51,6 +54,16 @@ pub fn unexplained(
     });
     let text = format!("The {kind} of {name} is off by more than noise and all that is named explain: {told}.");
     Unexplained { fraction, depends_on: found.into_iter().map(|(_, name)| name).collect(), text }
+}
+
+/// The strongest line of a residual, and the share that it explains.
+fn line_of(log: &Log, residual: &[f64]) -> Option<(f64, f64)> {
+    let rows = (0..residual.len()).filter(|row| residual[*row].is_finite());
+    let rows: Vec<(usize, usize)> = rows.filter_map(|row| Some((row, fold_of(log, row)?))).collect();
+    let t: Vec<f64> = rows.iter().map(|(row, _)| log.t()[*row]).collect();
+    let values: Vec<f64> = rows.iter().map(|(row, _)| residual[*row]).collect();
+    let folds: Vec<usize> = rows.iter().map(|(_, fold)| *fold).collect();
+    line(&t, &values, &folds)
 }
 
 /// The residual of a joint's position or torque, by row of the first log; not a number where there is none.
@@ -65,21 +78,18 @@ fn residual(evidence: &Evidence, robot: &RobotModel, channel: usize, simulator: 
         };
         evidence.torques().differences(robot, each);
     } else {
-        evidence.experiments()[0].differences(
-            simulator,
-            std::slice::from_ref(robot),
-            |_, quantity, row, difference| {
-                if quantity == Quantity::Position(channel) {
-                    residual[row] = difference;
-                }
-            },
-        );
+        let corrected = evidence.whole.corrected(simulator, robot);
+        for (corrected, (quantity, row)) in corrected.into_iter().zip(evidence.whole.experiments[0].cells()) {
+            if quantity == Quantity::Position(channel) {
+                residual[row] = corrected;
+            }
+        }
     }
     residual
 }
 
 /// What a residual might depend on: positions, velocities, commands and torques of all joints, and time.
-fn variables(log: &Log) -> Vec<(String, Vec<f64>)> {
+fn variables(log: &Log, robot: &RobotModel) -> Vec<(String, Vec<f64>)> {
     let mut all: Vec<(String, Vec<f64>)> = log
         .channels()
         .filter(|(name, _)| {
@@ -87,8 +97,26 @@ fn variables(log: &Log) -> Vec<(String, Vec<f64>)> {
         })
         .map(|(name, cells)| (name.to_owned(), cells.to_vec()))
         .collect();
+    all.extend(wanted_torques(log, robot));
     all.push(("t".to_owned(), log.t().to_vec()));
     all
+}
+
+/// The torques that drives are asked for, `tau_cmd_<joint>` [N·m].
+fn wanted_torques(log: &Log, robot: &RobotModel) -> Vec<(String, Vec<f64>)> {
+    let joints = joint_commands(log).unwrap_or_default();
+    let of = |joint: &JointCommands| -> Option<(String, Vec<f64>)> {
+        let (name, index) = (joint.joint.name(), joint.joint.index());
+        let (q, dq) = (log.q(name)?, log.dq(name));
+        let wanted = |row: usize| {
+            let command = command(robot, &joints, row);
+            let [kp, kd, to, at] =
+                [command.kp, command.kd, command.q, command.dq].map(|values| f64::from(values[index]));
+            kp * (to - q[row]) + kd * (at - dq.map_or(at, |dq| dq[row]))
+        };
+        Some((format!("tau_cmd_{name}"), (0..log.rows()).map(wanted).collect()))
+    };
+    joints.iter().filter_map(of).collect()
 }
 
 /// Share of the residual's variance on held-out seconds that its mean in bins of `cells`, from the other seconds, explains.

@@ -112,7 +112,7 @@ pub fn evidence(best: &Trial, others: &[Trial]) -> String {
 
 /// What the sensors alone would leave.
 pub fn noise_floor(evidence: &Evidence) -> Errors {
-    let experiments = evidence.experiments();
+    let experiments = &evidence.whole.experiments;
     let sigmas = experiments.iter().flat_map(|experiment| {
         experiment.joints().iter().map(|joint| experiment.sigma(Quantity::Position(joint.index())))
     });
