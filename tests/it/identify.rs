@@ -235,11 +235,12 @@ fn bench_has_rollouts_and_a_whole_search_beside_their_aims() {
     assert!(output.status.success() && told.contains("left out: MuJoCo"), "{told}");
     let results: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let rows = results["rows"].as_array().unwrap();
-    assert!(rows.iter().map(|row| row["unit"].as_str().unwrap()).eq(["robot-s/s", "robot-s/s", "s", "s"]));
+    assert!(rows.iter().map(|row| row["unit"].as_str().unwrap()).eq(["robot-s/s", "robot-s/s", "robot-s/s", "s", "s"]));
     assert!(rows.iter().all(|row| row["value"].as_f64().unwrap() > 0.0));
     assert!(rows[0]["ratio"].is_null(), "without MuJoCo there is nothing beside it");
+    assert!(rows[1]["reference"].as_str().unwrap().starts_with("f32"));
     let number = |row: usize, key: &str| rows[row][key].as_f64().unwrap();
-    for (row, aim) in [(2, 10.0), (3, 20.0)] {
+    for (row, aim) in [(3, 10.0), (4, 20.0)] {
         assert!((number(row, "ratio") * number(row, "value") - aim).abs() < 1e-9);
     }
 }
