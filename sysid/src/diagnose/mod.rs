@@ -110,7 +110,7 @@ pub fn diagnose(
     (search.say)("intervals")?;
     let judged = search.judged.clone();
     let (extended, confusable) = intervals(model, &judged, &mut accepted, &evidence, simulator);
-    progress("choosing the next experiment");
+    say("choosing the next experiment")?;
     let rivalries = next::rivalries(&extended, &accepted, &confusable);
     let next = next::next_motion(&rivalries, &evidence, &robot, simulator);
     let causes = accepted.iter().map(|(best, others)| cause(best, others, &extended)).collect();

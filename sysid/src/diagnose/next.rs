@@ -98,7 +98,7 @@ fn rivalry(extended: &ModelFile, one: &Hypothesis, other: &Hypothesis) -> Rivalr
 /// Which rivals it parts, and how far.
 fn words(motion: &SafeMotion, parts: &[Parted]) -> Option<String> {
     let pairs = parts.iter().map(|Parted { effects: [one, other], predicted_nats, median_nats }| {
-        format!("{one} from {other} by {predicted_nats:.0} nats as predicted (the median motion by {median_nats:.0})")
+        format!("{one} from {other} by a predicted {predicted_nats:.0} nats (the median motion by {median_nats:.0})")
     });
     let pairs = pairs.collect::<Vec<_>>().join(", ");
     (!pairs.is_empty()).then(|| format!("Play {}, 10 s of {}: it parts {pairs}.", motion.name, motion.what))
