@@ -21,7 +21,9 @@ use crate::report::write;
 /// from there. A name is not given when nothing is wrong, or when the cause is not in the catalogue: then the report says what
 /// the error depends on.
 ///
-/// DIR gets report.html to read, findings.json for programs, and extended.toml, which `twinstep serve --model` loads.
+/// DIR gets report.html to read, findings.json for programs, and extended.toml, which `twinstep serve --model` loads. Where
+/// causes are left that the log cannot tell apart, it also gets next_experiment, the safe motion that parts them best: play it
+/// and diagnose both logs.
 ///
 /// Example: `twinstep diagnose data/go2_air_chirp --out diagnosis`
 #[derive(clap::Args)]
@@ -39,6 +41,9 @@ pub struct Args {
     #[arg(long)]
     json: bool,
 }
+
+/// The folder of the motion that is to be played next, in the folder that is written.
+const NEXT_EXPERIMENT: &str = "next_experiment";
 
 /// The folder cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -65,11 +70,20 @@ pub fn run(args: &Args) -> Outcome {
         !signals.check().unwrap_or(true)
     });
     bar.finish_and_clear();
-    let Diagnosed { mut diagnosis, extended } = diagnosed.map_err(|error| match error {
+    let Diagnosed { mut diagnosis, extended, next } = diagnosed.map_err(|error| match error {
         DiagnoseError::Ended => Failure::Interrupted,
         error => input(error),
     })?;
     diagnosis.extended_model = "extended.toml".to_owned();
+    let motion = args.out.join(NEXT_EXPERIMENT);
+    // One of an earlier diagnosis would be taken for this one's.
+    if motion.exists() {
+        std::fs::remove_dir_all(&motion).map_err(|source| input(Unwritable { path: motion.clone(), source }))?;
+    }
+    if let Some((said, next)) = diagnosis.next_experiment.as_mut().zip(next) {
+        next.motion.write(&motion).map_err(input)?;
+        NEXT_EXPERIMENT.clone_into(&mut said.motion);
+    }
     let json = serde_json::to_string_pretty(&diagnosis).map_err(other)?;
     let written = |name: &str, text: &str| {
         let path = args.out.join(name);
@@ -111,6 +125,10 @@ fn text(diagnosis: &Diagnosis, out: &Path) -> String {
         lines.push("no cause is named".to_owned());
     }
     lines.push(diagnosis.unexplained.text.clone());
+    if let Some(next) = &diagnosis.next_experiment {
+        lines.push(format!("next experiment: {}", out.join(&next.motion).display()));
+        lines.push(format!("    {}", next.text));
+    }
     lines.push(error_line("closed-loop joint RMSE [rad]", diagnosis, |errors| errors.q_rmse_rad));
     lines.push(error_line("torque RMSE [N·m]", diagnosis, |errors| errors.torque_rmse_nm));
     lines.push(format!("report: {}\n", out.join("report.html").display()));

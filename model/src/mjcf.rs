@@ -69,7 +69,7 @@ pub fn mjcf(robot: &RobotModel, options: &MjcfOptions) -> String {
             ("gravity", gravity),
             ("integrator", "Euler".to_owned()),
             ("cone", "elliptic".to_owned()),
-            ("impratio", "100".to_owned()),
+            ("impratio", "30".to_owned()),
         ],
     );
     defaults(&mut xml, robot, options.timestep);

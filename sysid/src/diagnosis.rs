@@ -19,6 +19,9 @@ pub struct Diagnosis {
     pub confusable: Vec<Confusable>,
     /// What is left.
     pub unexplained: Unexplained,
+    /// The motion that would tell apart what this log cannot; none when there is nothing to tell, or none of ours does.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub next_experiment: Option<NextExperiment>,
     /// The corrected model, beside this file.
     pub extended_model: String,
 }
@@ -96,6 +99,28 @@ pub struct Confusable {
     pub correlation: f64,
     /// What to run next.
     pub experiment: String,
+}
+
+/// What to play next.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct NextExperiment {
+    /// Its motion, a folder beside this file that `twinstep play` reads.
+    pub motion: String,
+    /// What it parts.
+    pub parts: Vec<Parted>,
+    /// In a sentence.
+    pub text: String,
+}
+
+/// Two causes that a motion parts.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Parted {
+    /// As in `["backlash@RR_calf", "joint_elasticity@RR_calf"]`.
+    pub effects: [String; 2],
+    /// Evidence for the true one that is expected of the motion [nats].
+    pub predicted_nats: f64,
+    /// The same of the median motion that was looked at.
+    pub median_nats: f64,
 }
 
 /// What is left when all that is named is explained.

@@ -342,7 +342,7 @@ impl Experiment {
 }
 
 /// Mean torque over drive periods `from..until`, as a late sensor shows it [N·m].
-fn shown_torque(states: &RobotStates, robot: &RobotModel, joint: usize, from: usize, until: usize) -> f64 {
+pub fn shown_torque(states: &RobotStates, robot: &RobotModel, joint: usize, from: usize, until: usize) -> f64 {
     let late = robot.joints[joint].drive.sensor_delay / robot.control.drive_dt();
     // Entry p + 1 holds the torque of period p.
     let at = |period: f64| {

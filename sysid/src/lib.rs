@@ -7,6 +7,7 @@
 //!   in units of its noise.
 //! - [`evaluate()`]: the errors of a model on a log; [`position_errors`]: the same over time.
 //! - [`Balance`]: what a model's drives give in a measured motion, less what its bodies need, row by row.
+//! - [`SafeMotion`]: what the next experiment is chosen from; [`Rivalry`]: how far one would part two causes.
 //! - [`Diagnosis`]: what a diagnosis says, as in `findings.json`.
 //! - [`Unknown`]: a number of a model file that is sought, with bounds and prior.
 //! - [`Search`]: the global search, which can be ended and taken up again.
@@ -25,6 +26,7 @@ mod identify;
 pub mod motion;
 mod record;
 mod refine;
+mod safe_motions;
 mod search;
 mod sensors;
 mod task;
@@ -34,12 +36,15 @@ mod unknown;
 mod window;
 
 pub use balance::{Balance, Kinematics, PerRow};
-pub use diagnose::{DiagnoseError, Diagnosed, diagnose};
-pub use diagnosis::{Cause, Confusable, Diagnosis, Errors, Estimate, Rival, Unexplained, Value};
+pub use diagnose::{DiagnoseError, Diagnosed, NextMotion, Rivalry, diagnose};
+pub use diagnosis::{
+    Cause, Confusable, Diagnosis, Errors, Estimate, NextExperiment, Parted, Rival, Unexplained, Value,
+};
 pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};
 pub use experiment::{Experiment, ExperimentError};
 pub use identify::{Finding, Identification, IdentifyError, Options, Progress, Stage, Verdict, identify};
 pub use record::{RecordError, record};
+pub use safe_motions::{SAFE_MOTIONS, SafeMotion};
 pub use search::Search;
 pub use sensors::{Sensor, measured};
 pub use unknown::{Unknown, candidate, start, unknowns, with_values};

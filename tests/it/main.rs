@@ -16,6 +16,7 @@ mod identify;
 mod layering;
 mod leases;
 mod log;
+mod next_experiment;
 mod play;
 mod plots;
 mod python;

@@ -5,7 +5,7 @@
 //! speed. The client compares every observation with a counter of its own ([`ledger::Ledger`]), which also survives the
 //! client's death. [`campaign`] runs many lanes at once and adds up.
 //!
-//! [`hidden_robot`] has the robots that identification is tried on, [`security`] what the tests of TLS, users and access control need, [`python`] what those of the Python client do.
+//! [`hidden_robot`] has the robots that identification is tried on, [`rivals`] those that are taken for each other, [`security`] what the tests of TLS, users and access control need, [`python`] what those of the Python client do.
 
 pub mod campaign;
 pub mod fault;
@@ -16,5 +16,6 @@ pub mod process;
 pub mod proxy;
 pub mod python;
 pub mod repeats;
+pub mod rivals;
 pub mod roles;
 pub mod security;

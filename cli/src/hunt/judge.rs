@@ -223,6 +223,7 @@ mod tests {
             findings,
             confusable: Vec::new(),
             unexplained: Unexplained::default(),
+            next_experiment: None,
             extended_model: "extended.toml".to_owned(),
         }
     }

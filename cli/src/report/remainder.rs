@@ -1,7 +1,7 @@
 //! The lower part of the page: what cannot be told apart, what is left, and where it all comes from.
 
 use twinstep_model::effects::Effect;
-use twinstep_sysid::{Cause, Confusable, Diagnosis};
+use twinstep_sysid::{Cause, Confusable, Diagnosis, NextExperiment};
 
 use super::evidence::{LogFacts, Provenance};
 use super::html::{escape, number, percent};
@@ -16,7 +16,18 @@ pub fn confusions(diagnosis: &Diagnosis) -> String {
     } else {
         format!("<ul class=\"confusions\">\n{items}</ul>\n")
     };
-    format!("<section>\n<h2>What this log cannot tell apart, and what to run next</h2>\n{text}</section>\n")
+    let next = diagnosis.next_experiment.as_ref().map_or(String::new(), experiment);
+    format!("<section>\n<h2>What this log cannot tell apart, and what to run next</h2>\n{text}{next}</section>\n")
+}
+
+/// The motion that is written beside the page.
+fn experiment(next: &NextExperiment) -> String {
+    let (motion, text) = (escape(&next.motion), escape(&next.text));
+    format!(
+        "<p><strong>Next experiment: <code>{motion}</code>.</strong> {text}</p>\n\
+         <p class=\"note\">Predicted by simulating every safe motion with either cause, after the other has taken the size \
+         that mimics it best. Play it, then diagnose both logs together.</p>\n"
+    )
 }
 
 fn pair(pair: &Confusable) -> String {

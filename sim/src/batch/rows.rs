@@ -4,9 +4,9 @@ use twinstep_model::lanes::{Factored, Lane, State, Vec3};
 
 /// Impedance of a constraint at a distance of zero and, from [`IMPEDANCE_WIDTH`] on, deep inside: MuJoCo's defaults.
 const IMPEDANCE: [f64; 2] = [0.9, 0.95];
-/// How much harder friction is than the push along the normal: MuJoCo's `impratio`, as menagerie has it for the Go2. Rubber
+/// How much harder friction is than the push along the normal: MuJoCo's `impratio`, which menagerie has at 100 for the Go2. Rubber
 /// feet do not creep; with 1 a robot that stands with its feet pushed apart walks sideways by millimetres a second.
-const FRICTION_HARDNESS: f64 = 100.0;
+const FRICTION_HARDNESS: f64 = 30.0;
 /// Depth [m] or angle [rad] at which the impedance is the larger one.
 const IMPEDANCE_WIDTH: f64 = 0.001;
 

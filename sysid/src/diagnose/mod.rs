@@ -4,6 +4,7 @@
 //! - [`hypothesis`]: an effect on a scope, with values.
 //! - [`scan`]: every effect on every joint at once; the best go on.
 //! - [`trial`]: one hypothesis fitted to one fold and judged on the other, in full simulation.
+//! - [`rivalry`], [`next`]: which motion would part causes that the logs cannot tell apart.
 //! - [`unexplained`]: what is left, and what it depends on; [`line`]: or at which frequency it shakes.
 //!
 //! The best trial is accepted if its evidence exceeds the threshold and it explains a good part of what is above the noise;
@@ -12,6 +13,8 @@
 mod evidence;
 mod hypothesis;
 mod line;
+mod next;
+mod rivalry;
 mod scan;
 mod trial;
 mod unexplained;
@@ -28,6 +31,8 @@ use crate::identify::blocks;
 use crate::refine::{SIMULATORS, covariance};
 use evidence::Evidence;
 use hypothesis::Hypothesis;
+pub use next::NextMotion;
+pub use rivalry::Rivalry;
 use scan::{Scored, scan};
 use trial::{Fit, Trial, trial};
 
@@ -72,6 +77,8 @@ pub struct Diagnosed {
     pub diagnosis: Diagnosis,
     /// The given model with the causes, and intervals.
     pub extended: ModelFile,
+    /// What to play next, where causes are left that the logs cannot tell apart.
+    pub next: Option<NextMotion>,
 }
 
 /// Names what `model` gets wrong in `logs` of one robot.
@@ -104,6 +111,9 @@ pub fn diagnose(
     let left = evidence.leftover(simulator, &named.robot_model()?);
     say("intervals")?;
     let (extended, confusable) = intervals(model, &judged, &mut accepted, &evidence, simulator);
+    say("choosing the next experiment")?;
+    let rivalries = next::rivalries(&extended, &accepted, &confusable);
+    let next = next::next_motion(&rivalries, &evidence, &robot, simulator);
     let causes = accepted.iter().map(|(best, others)| cause(best, others, &extended)).collect();
     let diagnosis = Diagnosis {
         baseline: errors(&evidence, &robot, simulator)?,
@@ -112,9 +122,10 @@ pub fn diagnose(
         findings: causes,
         confusable,
         unexplained: unexplained::unexplained(&evidence, &extended.robot_model()?, &given, &left, simulator),
+        next_experiment: next.as_ref().map(|next| next.said.clone()),
         extended_model: String::new(),
     };
-    Ok(Diagnosed { diagnosis, extended })
+    Ok(Diagnosed { diagnosis, extended, next })
 }
 
 /// Causes that are accepted, each with the others that were tried in its place.

@@ -5,7 +5,9 @@ use std::path::Path;
 use twinstep_logs::{Base, Gain, Log, Meta, Segment, TauSensor};
 use twinstep_model::{JOINT_NAMES, ModelFile, go2};
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_sysid::{Cause, Confusable, Diagnosis, Errors, Estimate, Rival, Unexplained, Value};
+use twinstep_sysid::{
+    Cause, Confusable, Diagnosis, Errors, Estimate, NextExperiment, Parted, Rival, Unexplained, Value,
+};
 
 use crate::play::play;
 use crate::report::evidence::{Evidence, LogFacts, Provenance};
@@ -74,6 +76,15 @@ pub fn findings() -> (Diagnosis, ModelFile) {
             depends_on: vec!["q_FR_hip".to_owned()],
             text: "A little is left at the front right hip, near its end of travel.".to_owned(),
         },
+        next_experiment: Some(NextExperiment {
+            motion: "next_experiment".to_owned(),
+            parts: vec![Parted {
+                effects: ["armature@calf".to_owned(), "command_delay@calf".to_owned()],
+                predicted_nats: 80.0,
+                median_nats: 20.0,
+            }],
+            text: "Play steps, 10 s of small steps: it parts armature@calf from command_delay@calf.".to_owned(),
+        }),
         extended_model: "extended.toml".to_owned(),
     };
     (diagnosis, extended)

@@ -1,0 +1,138 @@
+//! The next experiment: every motion that it is chosen from is safe, and the chosen one parts what another does not.
+
+use std::f64::consts::TAU;
+
+use twinstep_logs::{Base as LoggedBase, Gain, Log, Meta, Segment, TauSensor};
+use twinstep_model::effects::Entry;
+use twinstep_model::{JOINT_NAMES, Joint, ModelFile, RobotModel, go2};
+use twinstep_sim::{Base, BatchBackend, BatchRollout, SimConfig};
+use twinstep_sysid::{Diagnosis, SAFE_MOTIONS, Sensor, measured, record};
+use twinstep_tests::hidden_robot::effect;
+use twinstep_tests::rivals::PAIRS;
+
+use crate::identify::twinstep;
+
+/// Distance that joints keep from the ends of their range [rad].
+const MARGIN: f64 = 0.1;
+/// Highest speed of a joint [rad/s]; the calf's drive ends at 15.7.
+const FASTEST: f64 = 10.0;
+
+/// What `robot` does in a motion, simulated at a finer step than models are.
+fn played(motion: &Log, robot: &RobotModel) -> Log {
+    let backend = |base: LoggedBase| {
+        let base = if base == LoggedBase::Fixed { Base::Fixed } else { Base::Floating };
+        let config = SimConfig { base, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
+        Ok(BatchBackend::new(robot.clone(), config, 1).unwrap())
+    };
+    record(motion, robot, None, backend, String::new(), &mut |_| true).unwrap()
+}
+
+/// The same as encoders with noise see it, and nothing else.
+fn encoders(log: &Log) -> Log {
+    let kept = |name: &str| name.starts_with("q_") || name.starts_with('k');
+    let columns = log.channels().filter(|(name, _)| kept(name)).map(|(name, cells)| (name.to_owned(), cells.to_vec()));
+    let columns = columns.chain([("t".to_owned(), log.t().to_vec())]);
+    let log = Log::new(Meta { tau_sensor: TauSensor::None, ..log.meta().clone() }, columns).unwrap();
+    measured(&log, &[Sensor { quantity: "q", sigma: 0.002, step: 0.0 }], 1).unwrap()
+}
+
+#[test]
+fn nominal_robot_gets_through_every_safe_motion() {
+    for motion in SAFE_MOTIONS {
+        let (name, log) = (motion.name, played(&motion.motion(&go2()), &go2()));
+        let most = |cells: &[f64]| {
+            cells.iter().filter(|cell| cell.is_finite()).fold(0.0, |most: f64, cell| most.max(cell.abs()))
+        };
+        for joint in Joint::ALL {
+            let limits = go2().joints[joint.index()];
+            let [low, high] = limits.range;
+            for cells in [log.q(joint.name()).unwrap(), log.q_cmd(joint.name()).unwrap()] {
+                assert!(
+                    cells.iter().all(|q| (low + MARGIN..high - MARGIN).contains(q)),
+                    "{name}: {joint} near its end"
+                );
+            }
+            let speed = most(log.dq(joint.name()).unwrap());
+            let torque = most(log.tau_measured(joint.name()).unwrap());
+            assert!(speed < FASTEST, "{name}: {joint} at {speed} rad/s");
+            assert!(torque < 0.9 * limits.torque_limit, "{name}: {joint} with {torque} N·m");
+        }
+        if motion.base == LoggedBase::Floating {
+            let cells = |name: &str| log.channel(name).unwrap().iter();
+            assert!(cells("pos_z").all(|height| (0.2..0.4).contains(height)), "{name}: falls or jumps");
+            // 1 − 2 (x² + y²) is the cosine of the tilt.
+            let upright = cells("quat_x").zip(cells("quat_y")).all(|(x, y)| 1.0 - 2.0 * (x * x + y * y) > 0.95);
+            assert!(upright, "{name}: tips over");
+        }
+    }
+}
+
+#[test]
+fn safe_motions_have_names_of_their_own_and_begin_and_end_in_the_default_pose() {
+    for (index, motion) in SAFE_MOTIONS.iter().enumerate() {
+        assert!(SAFE_MOTIONS[..index].iter().all(|other| other.name != motion.name));
+        let log = motion.motion(&go2());
+        for (joint, name) in JOINT_NAMES.into_iter().enumerate() {
+            let (commands, pose) = (log.q_cmd(name).unwrap(), go2().control.default_pose[joint]);
+            assert!([0, log.rows() - 1].iter().all(|row| (commands[*row] - pose).abs() < 0.01), "{}", motion.name);
+        }
+    }
+}
+
+#[test]
+fn chosen_motion_beats_the_median_one() {
+    // Drive lag or torque delay; `results/next_experiment.md` has more pairs.
+    let pair = &PAIRS[2];
+    let (rivalry, robot) = (pair.rivalry(), pair.robot().robot_model().unwrap());
+    let mut simulator = BatchRollout::new(&go2(), &SimConfig::default()).unwrap();
+    let mut told: Vec<[f64; 2]> = Vec::new();
+    for motion in SAFE_MOTIONS.iter().filter(|motion| motion.base == LoggedBase::Fixed) {
+        let log = encoders(&played(&motion.motion(&go2()), &robot));
+        let predicted = rivalry.predicted(motion, &log, &mut simulator).unwrap();
+        told.push([predicted, rivalry.achieved(log, &mut simulator).unwrap()]);
+    }
+    let chosen = told.iter().max_by(|one, other| one[0].total_cmp(&other[0])).unwrap()[1];
+    told.sort_by(|one, other| one[1].total_cmp(&other[1]));
+    assert!(chosen > told[told.len() / 2][1] + 10.0, "chosen {chosen:.1}: {told:.1?}");
+}
+
+/// Six seconds of one slow sine a joint, at which a delay and viscous friction are the same.
+fn slow_sines() -> Log {
+    let segments = vec![Segment { name: "sines".to_owned(), base: LoggedBase::Fixed }];
+    let meta =
+        Meta { kp: Some(Gain::Same(30.0)), kd: Some(Gain::Same(0.8)), ..Meta::new(200.0, TauSensor::None, segments) };
+    let t: Vec<f64> = (0..1200).map(|row| f64::from(row) * 0.005).collect();
+    let commands = Joint::ALL.map(|joint| {
+        let (index, pose) = (joint.index(), go2().control.default_pose[joint.index()]);
+        let command = t.iter().map(|t| pose + 0.15 * t.min(1.0) * (TAU * t + index as f64).sin()).collect();
+        (format!("q_cmd_{}", joint.name()), command)
+    });
+    Log::new_motion(meta, commands.into_iter().chain([("t".to_owned(), t.clone())])).unwrap()
+}
+
+#[test]
+fn diagnosis_with_a_rival_writes_a_motion_that_play_takes() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let (viscous, thighs) = effect("viscous_friction", "thigh");
+    let entry = Entry::new(viscous, thighs, vec![0.15]).unwrap();
+    let robot = ModelFile { effects: vec![entry], ..ModelFile::default() };
+    std::fs::write(path("robot.toml"), robot.to_toml()).unwrap();
+    let run = |arguments: &[&str]| {
+        let output = twinstep(arguments);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        output.stdout
+    };
+    encoders(&played(&slow_sines(), &robot.robot_model().unwrap())).write(path("first.parquet")).unwrap();
+    let said = run(&["diagnose", &path("first.parquet"), "--out", &path("one"), "--json"]);
+    let diagnosis: Diagnosis = serde_json::from_slice(&said).unwrap();
+    let next = diagnosis.next_experiment.expect("a delay looks the same");
+    assert!(next.parts[0].effects.iter().any(|name| name.starts_with("command_delay@")), "{next:?}");
+    assert!(next.parts[0].predicted_nats > next.parts[0].median_nats, "{next:?}");
+    let page = std::fs::read_to_string(path("one/report.html")).unwrap();
+    assert!(page.contains("Next experiment: <code>next_experiment</code>"));
+
+    let motion = path(&format!("one/{}", next.motion));
+    run(&["play", &motion, "--model", &path("robot.toml"), "--out", &path("second")]);
+    assert_eq!(Log::open(path("second")).unwrap().rows(), 2000);
+}
