@@ -24,6 +24,9 @@ pub fn torque_errors(
     Ok(sums.iter().any(|(_, count)| *count > 0).then_some(sums))
 }
 
+/// Steps of a drive in a period of it: lag and delay act within.
+const SUBSTEPS: usize = 5;
+
 /// Measured torques, and what drives make them of.
 pub struct MeasuredTorque {
     sensor: TauSensor,
@@ -91,50 +94,57 @@ impl MeasuredTorque {
     /// Hands on joint, row and the torque that the drives of `robot` make, less the measured one [N·m].
     pub fn differences(&self, robot: &RobotModel, mut each: impl FnMut(usize, usize, f64)) {
         let robot = &before_the_tap(robot, self.sensor);
-        let dt = robot.control.drive_dt();
+        let dt = robot.control.drive_dt() / SUBSTEPS as f64;
         let mut drive = Drive::<f64>::new(robot, dt);
         // The drive adds its offset to what it is given; a log has it already.
         let offsets = robot.joints.map(|joint| joint.drive.encoder_offset);
         let late = robot.joints.map(|joint| joint.drive.sensor_delay / dt);
-        // Torques of this part, a drive period an entry.
+        // Torques of this part, a substep an entry.
         let mut made: Vec<[f64; NUM_JOINTS]> = Vec::new();
         for row in &self.rows {
-            let q: [f64; NUM_JOINTS] = std::array::from_fn(|joint| row.q[joint] - offsets[joint]);
+            let at = |time: f64| -> [[f64; NUM_JOINTS]; 2] {
+                let dq: [f64; NUM_JOINTS] = std::array::from_fn(|joint| row.dq[joint] + time * row.ddq[joint]);
+                let mean = |joint: usize| 0.5 * (row.dq[joint] + dq[joint]);
+                [std::array::from_fn(|joint| row.q[joint] - offsets[joint] + time * mean(joint)), dq]
+            };
             if row.first {
                 drive = Drive::new(robot, dt);
-                drive.set(0, robot, &q.map(|q| q as f32), &[0.0; NUM_JOINTS]);
+                drive.set(0, robot, &at(0.0)[0].map(|q| q as f32), &[0.0; NUM_JOINTS]);
                 made.clear();
             }
             let strength = self.conditions.strength(&robot.derating, row.row);
             let commands = Commands::new(&[Command { strength, ..row.command }]);
-            for _ in 0..row.periods {
-                drive.tick(&commands, &q, &row.dq);
-                let forces = drive.push(0, &q, &row.dq);
+            for step in 0..row.periods * SUBSTEPS {
+                let [q, dq] = at(step as f64 * dt);
+                if step % SUBSTEPS == 0 {
+                    drive.tick(&commands, &q, &dq);
+                }
+                let forces = drive.push(step % SUBSTEPS, &q, &dq);
                 made.push(std::array::from_fn(|joint| match self.sensor {
                     TauSensor::Output => {
-                        let dry = forces.dry[joint] * smooth_sign(row.dq[joint]);
+                        let dry = forces.dry[joint] * smooth_sign(dq[joint]);
                         let rotor = robot.joints[joint].armature * row.ddq[joint];
-                        forces.tau[joint] - forces.viscous[joint] * row.dq[joint] - dry - rotor
+                        forces.tau[joint] - forces.viscous[joint] * dq[joint] - dry - rotor
                     }
                     _ => drive.current()[joint],
                 }));
             }
             for (joint, measured) in row.torque.into_iter().enumerate().filter(|(_, torque)| torque.is_finite()) {
-                each(joint, row.row, shown(&made, joint, row.periods, late[joint]) - measured);
+                each(joint, row.row, shown(&made, joint, row.periods * SUBSTEPS, late[joint]) - measured);
             }
         }
     }
 }
 
-/// Mean over the last `periods` of what a sensor that is `late` periods late shows of a joint's torques.
-fn shown(made: &[[f64; NUM_JOINTS]], joint: usize, periods: usize, late: f64) -> f64 {
-    let at = |period: usize| {
-        let place = (period as f64 - late).max(0.0);
+/// Mean over the last `steps` of what a sensor that is `late` steps late shows of a joint's torques.
+fn shown(made: &[[f64; NUM_JOINTS]], joint: usize, steps: usize, late: f64) -> f64 {
+    let at = |step: usize| {
+        let place = (step as f64 - late).max(0.0);
         let (before, part) = (place as usize, place.fract());
         let after = (before + 1).min(made.len() - 1);
         made[before][joint] * (1.0 - part) + made[after][joint] * part
     };
-    (made.len() - periods..made.len()).map(at).sum::<f64>() / periods as f64
+    (made.len() - steps..made.len()).map(at).sum::<f64>() / steps as f64
 }
 
 /// The robot without what lies behind the torque's sensor, or is in the measured position already: springs at the link,
@@ -156,4 +166,17 @@ fn before_the_tap(robot: &RobotModel, sensor: TauSensor) -> RobotModel {
 /// The sign of a measured velocity, which is never quite zero.
 fn smooth_sign(dq: f64) -> f64 {
     (dq / 0.02).tanh()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn late_sensor_shows_the_torque_of_a_while_ago() {
+        let made: Vec<[f64; NUM_JOINTS]> = (0..10).map(|step| [f64::from(step); NUM_JOINTS]).collect();
+        assert_eq!(shown(&made, 3, 2, 0.0), 8.5);
+        assert_eq!(shown(&made, 3, 2, 2.25), 6.25);
+        assert_eq!(shown(&made[..2], 3, 2, 5.0), 0.0, "nothing is before the first");
+    }
 }

@@ -10,21 +10,25 @@ use twinstep_model::{Command, Ground, Placement, RobotModel};
 use crate::experiment::ExperimentError;
 use crate::motion::{DriveClock, JointCommands, command, joint_commands};
 
-/// The windows that a free trunk's motion is cut into; with a held one a window is a whole part of the log.
+/// The windows that a log is cut into.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Horizon {
-    /// Length of a window [s].
+    /// Length of a window with a free trunk [s].
     pub length_s: f64,
+    /// Length of one with a held trunk [s]; infinite for a whole part of the log.
+    pub held_s: f64,
     /// Its beginning that is not compared [s].
     pub settling_s: f64,
 }
 
 impl Horizon {
     /// Every row but a window's first counts.
-    pub const EVALUATION: Self = Self { length_s: 0.5, settling_s: 0.0 };
+    pub const EVALUATION: Self = Self { length_s: 0.5, held_s: f64::INFINITY, settling_s: 0.0 };
     /// The error of a measured start, a millimetre that the feet are in the ground or above it, dies away before anything is
     /// compared: it would pass for a harder ground and a lighter robot.
-    pub const IDENTIFICATION: Self = Self { length_s: 1.0, settling_s: 0.2 };
+    pub const IDENTIFICATION: Self = Self { length_s: 1.0, held_s: f64::INFINITY, settling_s: 0.2 };
+    /// With windows for a held trunk too: a loop that rings is out of step after a second or two, whatever the model.
+    pub const DIAGNOSIS: Self = Self { held_s: 2.0, ..Self::IDENTIFICATION };
 }
 
 /// Height at which a held trunk hangs [m].
@@ -76,8 +80,9 @@ pub fn windows(log: &Log, robot: &RobotModel, horizon: Horizon) -> Result<Vec<Wi
             return Err(ExperimentError::NoBase { segment: segment.name.clone(), missing });
         }
         let in_rows = |time_s: f64| (time_s * log.meta().rate_hz).round() as usize;
-        let length = if held { rows.len() } else { in_rows(horizon.length_s) };
-        let settling = if held { 1 } else { in_rows(horizon.settling_s).max(1) };
+        let whole = held && horizon.held_s.is_infinite();
+        let length = if whole { rows.len() } else { in_rows(if held { horizon.held_s } else { horizon.length_s }) };
+        let settling = if whole { 1 } else { in_rows(horizon.settling_s).max(1) };
         let mut first = rows.start;
         while first + 1 < rows.end {
             let end = (first + length + 1).min(rows.end);

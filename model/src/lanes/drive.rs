@@ -110,6 +110,8 @@ numbers! { |joint, dt, drive_dt|
     back_emf = 1.0 / joint.drive.no_load_speed;
     /// Share of the way to its input that the torque goes in a physics step.
     lag = if joint.drive.lag > 0.0 { 1.0 - (-dt / joint.drive.lag).exp() } else { 1.0 };
+    /// Mean over the step of what is left of its distance from its input.
+    lag_mean = if joint.drive.lag > 0.0 { joint.drive.lag / dt * (1.0 - (-dt / joint.drive.lag).exp()) } else { 0.0 };
     gain = joint.drive.gain;
     ripple_amplitude = joint.drive.ripple.amplitude;
     ripple_cycles = joint.drive.ripple.cycles;
@@ -158,6 +160,8 @@ struct Memory<T> {
 pub struct Drive<T> {
     numbers: [Numbers<T>; 12],
     memory: Memory<T>,
+    /// Mean over the last physics step of what the motor's current shows [N·m].
+    shown: [T; 12],
     uses: Uses,
     /// One physics step, in drive periods.
     step: T,
@@ -184,7 +188,7 @@ impl<T: Lane> Drive<T> {
         let numbers = robot.joints.map(|joint| Numbers::splat(&joint, dt, drive_dt));
         let memory =
             Memory { commands: [[zero; 3]; REMEMBERED], asked: [zero; REMEMBERED], current: zero, rotor: [zero; 2] };
-        Self { numbers, memory, uses: Uses::default(), step: T::splat(dt / drive_dt), dt, drive_dt }
+        Self { numbers, memory, shown: zero, uses: Uses::default(), step: T::splat(dt / drive_dt), dt, drive_dt }
     }
 
     /// Puts the drives of `robot`, with its joints at `q` [rad] and `dq` [rad/s], into one lane; they have no torque yet.
@@ -236,9 +240,9 @@ impl<T: Lane> Drive<T> {
         (q + n.encoder_offset, zero.select_less(n.gear, speed[joint], dq))
     }
 
-    /// What a sensor of the motors' current shows now [N·m].
+    /// What a sensor of the motors' current shows, mean over the last physics step [N·m].
     pub fn current(&self) -> &[T; 12] {
-        &self.memory.current
+        &self.shown
     }
 
     /// The loop closes: commands and sampled state become the torque of the coming drive period.
@@ -310,9 +314,10 @@ impl<T: Lane> Drive<T> {
                 let back = limit * (one + share).max(zero).min(one);
                 tau = forth.min(tau.max(-back));
             }
-            let current = &mut self.memory.current[joint];
-            *current += n.lag * (tau - *current);
-            tau = n.gain * *current;
+            let (current, input) = (&mut self.memory.current[joint], tau);
+            self.shown[joint] = input + n.lag_mean * (*current - input);
+            *current += n.lag * (input - *current);
+            tau = n.gain * self.shown[joint];
             if uses.ripple {
                 let (sin, _) = (n.ripple_cycles * rotor_q + n.ripple_phase).sin_cos();
                 tau += n.ripple_amplitude * sin;

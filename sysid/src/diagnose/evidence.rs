@@ -15,17 +15,16 @@ pub const CHANNELS: usize = 2 * NUM_JOINTS + 12;
 pub const TORQUE: usize = NUM_JOINTS;
 /// First channel of the trunk.
 pub const TRUNK: usize = 2 * NUM_JOINTS;
+/// First channel of its gyroscope.
+const GYRO: usize = TRUNK + 9;
 /// Candidates that are simulated at once, which bounds memory.
 const TOGETHER: usize = 64;
 /// Errors of this size [noise of the channel stands beside it] are any simulator's: position [rad] and torque [N·m].
 const MISFIT: [f64; 2] = [0.001, 0.02];
 /// Length of a block [s]; blocks go to the two folds in turn.
 const BLOCK_S: f64 = 1.0;
-/// Power above the noise, in units of it, below which nothing is wrong; and errors of any robot, by their cost [nats].
-const LEAST_EXCESS: f64 = 0.1;
-const LEAST_TOLERATED: f64 = 30.0;
-/// Rows this long apart [s] are independent: positions, torques, the trunk.
-const INDEPENDENT_S: [f64; 3] = [0.2, 0.1, 0.5];
+/// Rows this long apart [s] are independent: positions, torques, the trunk, and its gyroscope, which has more noise than error.
+const INDEPENDENT_S: [f64; 4] = [0.2, 0.1, 0.5, 0.05];
 
 /// Sums of squares and counts by channel and fold, in units of noise and misfit.
 #[derive(Clone, Debug)]
@@ -72,7 +71,7 @@ impl Rows {
                     Quantity::BasePosition(axis) => (TRUNK + axis, std::f64::consts::FRAC_1_SQRT_2),
                     Quantity::BaseOrientation(axis) => (TRUNK + 3 + axis, std::f64::consts::FRAC_1_SQRT_2),
                     Quantity::BaseVelocity(axis) => (TRUNK + 6 + axis, std::f64::consts::FRAC_1_SQRT_2),
-                    Quantity::BaseRate(axis) => (TRUNK + 9 + axis, std::f64::consts::FRAC_1_SQRT_2),
+                    Quantity::BaseRate(axis) => (GYRO + axis, 0.95),
                 };
                 (channel, if weight > 0.0 { fold_of(log, row) } else { None }, weight)
             }));
@@ -123,7 +122,7 @@ impl Evidence {
     /// `logs` of a robot with the gains and rates of `robot`.
     pub fn new(logs: Vec<Log>, robot: &RobotModel) -> Result<Self, ExperimentError> {
         let experiments: Vec<Experiment> =
-            logs.iter().map(|log| Experiment::new(log, robot, Horizon::IDENTIFICATION)).collect::<Result<_, _>>()?;
+            logs.iter().map(|log| Experiment::new(log, robot, Horizon::DIAGNOSIS)).collect::<Result<_, _>>()?;
         let only = |keep: &dyn Fn(Option<usize>) -> bool| -> Vec<Experiment> {
             let pairs = logs.iter().zip(&experiments);
             pairs.map(|(log, experiment)| experiment.clone().only(|row| keep(fold_of(log, row)))).collect()
@@ -191,7 +190,7 @@ impl Evidence {
 
     /// Rows of a channel that count as one.
     pub fn rows_in_one(&self, channel: usize) -> f64 {
-        let kind = if channel < TORQUE { 0 } else { 1 + usize::from(channel >= TRUNK) };
+        let kind = [TORQUE, TRUNK, GYRO].into_iter().filter(|first| channel >= *first).count();
         (INDEPENDENT_S[kind] * self.logs[0].meta().rate_hz).max(1.0)
     }
 
@@ -241,12 +240,6 @@ impl Leftover {
     /// Power that errors of the robot would have to explain beyond what any robot has.
     pub fn tolerated_excess(&self) -> f64 {
         tolerance::excess(self.tolerated[1])
-    }
-
-    /// Whether there is anything that is neither noise nor an error of any robot.
-    pub fn is_noise(&self) -> bool {
-        let count: f64 = self.counts.iter().flatten().sum();
-        self.tolerated[1] < LEAST_TOLERATED && self.excess() - self.tolerated_excess() < LEAST_EXCESS * count
     }
 
     /// Power above noise and misfit of a channel.

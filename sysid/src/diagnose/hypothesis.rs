@@ -6,9 +6,9 @@ use twinstep_model::{Joint, ModelFile};
 /// Shares of the way from no effect to the end of its plausible range that are tried.
 const SHARES: [f64; 5] = [0.1, 0.2, 0.4, 0.75, 1.3];
 /// A finding smaller than this share of its plausible range is not worth a name.
-const LEAST_SHARE: f64 = 0.08;
-/// The same of effects that errors of a millimetre or a percent in geometry and mass look like.
-const LEAST_SHARES_OF_BODY: [(&str, f64); 3] = [("encoder_offset", 0.3), ("com_shift", 0.12), ("payload", 0.1)];
+const LEAST_SHARE: f64 = 0.1;
+/// The same of effects that errors of a millimetre in geometry, or another law of contact, look like.
+const LEAST_SHARES: [(&str, f64); 3] = [("encoder_offset", 0.3), ("com_shift", 0.12), ("ground_stiffness", 0.3)];
 
 /// An effect on a scope, with values.
 #[derive(Clone, Debug, PartialEq)]
@@ -29,8 +29,8 @@ impl Hypothesis {
 
     /// Whether it is large enough to be worth a name.
     pub fn is_large_enough(&self) -> bool {
-        let of_body = LEAST_SHARES_OF_BODY.iter().find(|(name, _)| *name == self.effect.name);
-        share(self.effect, &self.values) >= of_body.map_or(LEAST_SHARE, |(_, least)| *least)
+        let own = LEAST_SHARES.iter().find(|(name, _)| *name == self.effect.name);
+        share(self.effect, &self.values) >= own.map_or(LEAST_SHARE, |(_, least)| *least)
     }
 
     /// Whether a robot may have it: no value is further than half the plausible range outside of it.

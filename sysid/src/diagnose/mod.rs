@@ -37,7 +37,7 @@ use scan::{Scored, scan};
 use trial::{Fit, Trial, trial};
 
 /// Evidence that a cause has to exceed [nats]; chosen on robots of `twinstep hunt` that are in no published table.
-const THRESHOLD: f64 = 15.0;
+const THRESHOLD: f64 = 30.0;
 /// Most causes that are named.
 const MOST_CAUSES: usize = 5;
 /// Most rounds of the search, and of taking back.
@@ -174,9 +174,6 @@ impl Search<'_> {
     /// The best cause on top of those that are accepted, if one earns a name.
     fn next(&mut self, excluded: &[String]) -> Result<Option<(Trial, Vec<Trial>)>, DiagnoseError> {
         let left = self.evidence.leftover(self.simulator, &self.model.robot_model()?);
-        if left.is_noise() {
-            return Ok(None);
-        }
         let named = self.accepted.len();
         (self.say)(&format!("scanning, {named} named"))?;
         let mut trials = Vec::new();
