@@ -10,8 +10,6 @@ use crate::window::{Horizon, Window, orientation, windows};
 
 /// Rows this long apart [s] count as independent.
 const BLOCK_S: f64 = 0.5;
-/// What smoothing leaves of the noise of a start: a parabola through nine cells, at its middle.
-const SMOOTHED: f64 = 0.5;
 /// Noise that is assumed of a channel whose noise nobody stated: of a quantity, its σ.
 const ASSUMED_NOISE: [(&str, f64); 7] =
     [("q", 0.002), ("dq", 0.05), ("tau_measured", 0.2), ("pos", 0.005), ("quat", 0.01), ("vel", 0.05), ("gyro", 0.02)];
@@ -189,7 +187,9 @@ impl Experiment {
         let (of_axis, axis) = (number / 3, number % 3);
         let quantity =
             [Quantity::BasePosition, Quantity::BaseOrientation, Quantity::BaseVelocity, Quantity::BaseRate][of_axis];
-        let error = size * SMOOTHED * self.sigma(quantity(axis));
+        // A parabola through the cells within 20 ms leaves 9 / 4n of their variance at its middle.
+        let cells = 1.0 + 0.04 * self.rows_a_block as f64 / BLOCK_S;
+        let error = size * (2.25 / cells).sqrt().min(1.0) * self.sigma(quantity(axis));
         let mut off = self.clone();
         for window in off.windows.iter_mut().filter(|window| !window.held) {
             window.start_off(of_axis, axis, error);

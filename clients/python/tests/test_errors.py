@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,14 @@ from twinstep import EmbeddedServer, Go2Env, Go2VectorEnv
 from twinstep.errors import from_reply
 
 STILL = np.zeros((2, 12), np.float32)
+
+
+def freeze(pid: int) -> None:
+    """Returns when every thread has stopped: on a busy machine one goes on for a while after the signal."""
+    os.kill(pid, signal.SIGSTOP)
+    threads = [Path(f"/proc/{pid}/task/{thread}/stat") for thread in os.listdir(f"/proc/{pid}/task")]
+    while any(stat.read_text().rsplit(") ")[1][0] != "T" for stat in threads):
+        time.sleep(0.001)
 
 
 def test_nobody_at_the_endpoint_is_said_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,7 +114,7 @@ def test_frozen_server_is_told_after_the_timeout_and_its_step_is_executed_once()
     envs = Go2VectorEnv(2, task="counter", timeout_s=1.5)
     envs.reset()
     server = envs._remote._link._server
-    os.kill(server.pid, signal.SIGSTOP)
+    freeze(server.pid)
     with pytest.raises(twinstep.NoAnswerError, match=r"no answer from tcp/127\.0\.0\.1"):
         envs.step(STILL)
     with pytest.raises(twinstep.Error, match="not answered yet"):
@@ -120,7 +129,7 @@ def test_reset_settles_a_step_that_was_given_up() -> None:
     envs = Go2VectorEnv(2, task="counter", timeout_s=0.5)
     envs.reset()
     server = envs._remote._link._server
-    os.kill(server.pid, signal.SIGSTOP)
+    freeze(server.pid)
     with pytest.raises(TimeoutError):
         envs.step(STILL)
     threading.Timer(0.3, os.kill, (server.pid, signal.SIGCONT)).start()

@@ -1,6 +1,7 @@
 //! Diagnosis: what a model gets wrong, by name, and the gain on seconds that took no part in the choice.
 //!
-//! - [`evidence`]: what a candidate model leaves of each channel, in two folds of alternating seconds.
+//! - [`rows`]: logs as residuals, in two folds of alternating seconds; [`leftover`]: what a candidate leaves of them;
+//!   [`evidence`]: of motion and torque together.
 //! - [`hypothesis`]: an effect on a scope, with values.
 //! - [`scan`]: every effect on every joint at once; the best go on.
 //! - [`trial`]: one hypothesis fitted to one fold and judged on the other, in full simulation.
@@ -12,9 +13,11 @@
 
 mod evidence;
 mod hypothesis;
+mod leftover;
 mod line;
 mod next;
 mod rivalry;
+mod rows;
 mod scan;
 mod trial;
 mod unexplained;
@@ -262,7 +265,7 @@ fn intervals(
 fn errors(evidence: &Evidence, robot: &RobotModel, simulator: &mut dyn Rollout) -> Result<Errors, DiagnoseError> {
     let (mut torque, mut q) = (Vec::new(), Vec::new());
     for log in evidence.logs() {
-        let evaluation = evaluate(log, robot, simulator, |row| evidence::fold_of(log, row).is_none())?;
+        let evaluation = evaluate(log, robot, simulator, |row| rows::fold_of(log, row).is_none())?;
         torque.extend(evaluation.torque_rmse_nm);
         q.extend(evaluation.q_rmse_rad);
     }

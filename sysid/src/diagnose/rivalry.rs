@@ -4,8 +4,10 @@ use twinstep_logs::{Base, Log, Meta, TauSensor};
 use twinstep_model::effects::{Effect, Scope};
 use twinstep_model::{Ground, HELD_HEIGHT, JOINT_NAMES, Job, ModelFile, Placement, Precision, RobotModel, Rollout};
 
-use super::evidence::{CHANNELS, Evidence, Leftover, PRECISION};
+use super::evidence::Evidence;
 use super::hypothesis::Hypothesis;
+use super::leftover::{CHANNELS, Leftover};
+use super::rows::PRECISION;
 use super::trial::Fit;
 use crate::experiment::{ExperimentError, shown_torque};
 use crate::motion::{command, joint_commands};

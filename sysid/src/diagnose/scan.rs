@@ -5,8 +5,9 @@
 use twinstep_model::effects::{CATALOGUE, Effect, Entry, Scope, Target};
 use twinstep_model::{Joint, ModelFile, RobotModel, Rollout};
 
-use super::evidence::{CHANNELS, Evidence, Leftover, TORQUE};
+use super::evidence::Evidence;
 use super::hypothesis::{Hypothesis, choice, sizes, whole_sizes, with_effect};
+use super::leftover::{CHANNELS, Leftover, TORQUE};
 
 /// Scopes of one effect that go on.
 const OF_ONE_EFFECT: usize = 2;

@@ -3,8 +3,10 @@
 use twinstep_model::effects::{Effect, Scope};
 use twinstep_model::{ModelFile, Precision, RobotModel, Rollout};
 
-use super::evidence::{CHANNELS, Evidence, Leftover, PRECISION, Rows};
+use super::evidence::Evidence;
 use super::hypothesis::{Hypothesis, choice};
+use super::leftover::{CHANNELS, Leftover};
+use super::rows::{PRECISION, Rows};
 use crate::refine::refine;
 use crate::task::Task;
 use crate::unknown::{Unknown, start, unknowns, with_values};

@@ -3,8 +3,10 @@
 use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, RobotModel, Rollout};
 
-use super::evidence::{Evidence, Leftover, TORQUE, TRUNK, fold_of};
+use super::evidence::Evidence;
+use super::leftover::{Leftover, TORQUE, TRUNK};
 use super::line::line;
+use super::rows::fold_of;
 use crate::diagnosis::Unexplained;
 use crate::experiment::Quantity;
 use crate::motion::{JointCommands, command, joint_commands};

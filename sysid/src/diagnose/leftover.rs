@@ -1,0 +1,77 @@
+//! What a candidate leaves of each channel, in units of noise and of the misfit of any simulator.
+
+use twinstep_model::NUM_JOINTS;
+
+use crate::tolerance;
+
+/// Channels: positions, torques, and of the trunk position, orientation, velocity and rate.
+pub const CHANNELS: usize = 2 * NUM_JOINTS + 12;
+/// First channel of the torques.
+pub const TORQUE: usize = NUM_JOINTS;
+/// First channel of the trunk.
+pub const TRUNK: usize = 2 * NUM_JOINTS;
+/// First channel of its gyroscope.
+pub const GYRO: usize = TRUNK + 9;
+
+/// Sums of squares and counts by channel and fold, in units of noise and misfit.
+#[derive(Clone, Debug)]
+pub struct Leftover {
+    /// Sums of squares.
+    pub sums: [[f64; 2]; CHANNELS],
+    /// Numbers of rows.
+    pub counts: [[f64; 2]; CHANNELS],
+    /// What tolerated errors cost that explain a part of the rest, of starts and of the robot [nats].
+    pub tolerated: [f64; 2],
+}
+
+impl Leftover {
+    /// Nothing yet.
+    pub fn empty() -> Self {
+        Self { sums: [[0.0; 2]; CHANNELS], counts: [[0.0; 2]; CHANNELS], tolerated: [0.0; 2] }
+    }
+
+    /// How much less tolerated errors cost than `before` [nats].
+    pub fn tolerated_gain(&self, before: &Self) -> f64 {
+        before.tolerated.iter().sum::<f64>() - self.tolerated.iter().sum::<f64>()
+    }
+
+    /// Adds a difference, in units of noise and misfit, of a row in a fold; none is set aside.
+    pub fn add(&mut self, channel: usize, fold: Option<usize>, difference: f64) {
+        let Some(fold) = fold else { return };
+        self.sums[channel][fold] += difference * difference;
+        self.counts[channel][fold] += 1.0;
+    }
+
+    /// True if the candidate diverged.
+    pub fn diverged(&self) -> bool {
+        self.sums.iter().flatten().any(|sum| !sum.is_finite())
+    }
+
+    /// Evidence for this model against `before` in a channel and fold [nats], with `rows` counting as one.
+    pub fn gain(&self, before: &Self, channel: usize, fold: usize, rows: f64) -> f64 {
+        let (now, then, count) = (self.sums[channel][fold], before.sums[channel][fold], before.counts[channel][fold]);
+        if count == 0.0 {
+            return 0.0;
+        }
+        if !now.is_finite() {
+            return f64::NEG_INFINITY;
+        }
+        0.5 * count / rows * ((then + 1e-9) / (now + 1e-9)).ln()
+    }
+
+    /// Power above noise and misfit, everywhere.
+    pub fn excess(&self) -> f64 {
+        (0..CHANNELS).map(|channel| self.channel_excess(channel)).sum::<f64>() + self.tolerated_excess()
+    }
+
+    /// Power that errors of the robot would have to explain beyond what any robot has.
+    pub fn tolerated_excess(&self) -> f64 {
+        tolerance::excess(self.tolerated[1])
+    }
+
+    /// Power above noise and misfit of a channel.
+    pub fn channel_excess(&self, channel: usize) -> f64 {
+        let sum: f64 = self.sums[channel].iter().sum();
+        (sum - self.counts[channel].iter().sum::<f64>()).max(0.0)
+    }
+}
