@@ -288,6 +288,29 @@ mod tests {
     }
 
     #[test]
+    fn network_that_is_told_the_joint_learns_drives_that_differ() {
+        let strong = log(4000, |_, columns| {
+            let weak = |name: &str| {
+                let (_, cells) = columns.iter().find(|(column, _)| column == name).expect("a column");
+                (name.replace("knee", "ankle"), cells.clone())
+            };
+            let mut more = ["q_knee", "dq_knee", "q_cmd_knee", "tau_measured_knee"].map(weak);
+            more[3].1.iter_mut().for_each(|torque| *torque *= 0.5);
+            columns.extend(more);
+        });
+        let data = DataSet::new(&[("here".to_owned(), strong)]).expect("a set");
+        let rmse = |joint_input| {
+            let training = Training::new(&data, Options { joint_input, ..options(15) }).expect("options");
+            Calibration::of(&trained(training.run(2, None, &mut |_| true).expect("trains")).0, &data).rmse
+        };
+        let [pooled, told] = [JointInput::Pooled, JointInput::Identity].map(rmse);
+        assert!(told < 0.5 * pooled, "{told} N·m, pooled {pooled} N·m");
+        let of_a_kind = Training::new(&data, Options { joint_input: JointInput::Kind, ..options(15) });
+        let error = of_a_kind.map(|_| ()).expect_err("refused").to_string();
+        assert!(error.starts_with("joint `knee` is no hip, thigh or calf of a Go2"), "{error}");
+    }
+
+    #[test]
     fn setting_out_of_range_is_named() {
         let error = Training::new(&data(), Options { members: 0, ..options(4) }).map(|_| ()).expect_err("refused");
         assert_eq!(error.to_string(), "`members` = 0 is outside 1..=100");

@@ -123,7 +123,7 @@ fn interrupted_training_goes_on_to_the_same_bits() {
     // Once it has saved itself; wherever it is by then, the result has to be the same.
     let saved = folder.path().join("twice.training");
     while !std::fs::read(&saved).is_ok_and(|content| !content.is_empty()) && ended.try_wait().unwrap().is_none() {
-        std::thread::yield_now();
+        std::thread::sleep(std::time::Duration::from_millis(5));
     }
     Command::new("kill").args(["-INT", &ended.id().to_string()]).status().unwrap();
     let code = ended.wait().unwrap().code();
