@@ -9,6 +9,7 @@ mod effects;
 mod evaluate;
 mod evaluation_plot;
 mod exit;
+mod fit;
 mod hunt;
 mod identify;
 mod joint_plot;
@@ -41,6 +42,7 @@ enum Verb {
     Diagnose(diagnose::Args),
     Effects(effects::Args),
     Evaluate(evaluate::Args),
+    Fit(fit::Args),
     Hunt(hunt::Args),
     Identify(identify::Args),
     Log(log::Args),
@@ -63,6 +65,7 @@ fn main() -> std::process::ExitCode {
         Verb::Diagnose(args) => diagnose::run(&args),
         Verb::Effects(args) => effects::run(&args),
         Verb::Evaluate(args) => evaluate::run(&args),
+        Verb::Fit(args) => fit::run(&args),
         Verb::Hunt(args) => hunt::run(&args),
         Verb::Identify(args) => identify::run(&args),
         Verb::Log(args) => log::run(&args),

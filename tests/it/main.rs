@@ -11,6 +11,7 @@ mod effect_readings;
 mod effects;
 mod exactly_once;
 mod faults;
+mod fit;
 mod hunt;
 mod identify;
 mod layering;

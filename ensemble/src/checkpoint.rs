@@ -1,0 +1,116 @@
+//! A training that has not ended yet, in memory and as a file.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use twinstep_model::stream;
+
+use crate::EnsembleError;
+use crate::ensemble::Description;
+use crate::file::{Arrays, Bytes, write};
+use crate::train::{Epoch, Options};
+use crate::weights::{Shape, Weights};
+
+/// Where every member stands at the end of its last epoch; the training goes on from there bit for bit.
+#[derive(Clone, Debug)]
+pub struct Checkpoint {
+    options: Options,
+    data_hash: String,
+    shape: Shape,
+    pub(crate) members: Vec<MemberState>,
+}
+
+/// Where a member stands.
+#[derive(Clone, Debug)]
+pub struct MemberState {
+    /// Its weights.
+    pub weights: Weights,
+    /// Its weights at the best validation so far.
+    pub best: Weights,
+    /// Its optimiser as burn saves it; empty before the first epoch.
+    pub optimizer: Vec<u8>,
+    /// Its epochs.
+    pub curve: Vec<Epoch>,
+}
+
+/// What stands in the file beside the arrays.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Header {
+    options: Options,
+    data_hash: String,
+    inputs: usize,
+    curves: Vec<Vec<Epoch>>,
+}
+
+impl Checkpoint {
+    /// The start of a training.
+    pub(crate) fn new(options: Options, description: &Description) -> Self {
+        let shape = description.shape();
+        let member = |index: usize| {
+            let weights = shape.random(&mut stream(options.seed, "first weights", index as u64));
+            MemberState { best: weights.clone(), weights, optimizer: Vec::new(), curve: Vec::new() }
+        };
+        let members = (0..options.members).map(member).collect();
+        Self { data_hash: description.data_hash.clone(), shape, members, options }
+    }
+
+    /// Itself, if it is of these options and data; only the number of epochs may differ.
+    pub(crate) fn of(mut self, options: &Options, data_hash: &str) -> Result<Self, EnsembleError> {
+        let mut saved = self.options;
+        saved.epochs = options.epochs;
+        if saved != *options {
+            return Err(EnsembleError::OtherTraining { what: "settings" });
+        }
+        if self.data_hash != data_hash {
+            return Err(EnsembleError::OtherTraining { what: "data" });
+        }
+        self.options = saved;
+        Ok(self)
+    }
+
+    /// All epochs of each member.
+    pub fn curves(&self) -> impl Iterator<Item = &[Epoch]> {
+        self.members.iter().map(|member| member.curve.as_slice())
+    }
+
+    /// Writes it as a safetensors file, in one piece or not at all.
+    pub fn write(&self, path: &Path) -> Result<(), EnsembleError> {
+        let mut arrays = Vec::new();
+        for (index, member) in self.members.iter().enumerate() {
+            for (role, weights) in [("weights", &member.weights), ("best", &member.best)] {
+                arrays.extend(self.shape.layout().into_iter().map(|(name, dimensions)| {
+                    (format!("{index}.{role}.{name}"), Bytes::floats(dimensions, &weights[name]))
+                }));
+            }
+            arrays.push((format!("{index}.optimizer"), Bytes::plain(member.optimizer.clone())));
+        }
+        let header = Header {
+            options: self.options.clone(),
+            data_hash: self.data_hash.clone(),
+            inputs: self.shape.inputs,
+            curves: self.members.iter().map(|member| member.curve.clone()).collect(),
+        };
+        write(path, "training", &header, arrays)
+    }
+
+    /// Reads what [`Checkpoint::write`] wrote.
+    pub fn read(path: &Path) -> Result<Self, EnsembleError> {
+        let arrays = Arrays::read(path)?;
+        let Header { options, data_hash, inputs, curves } = arrays.header("training")?;
+        let shape = Shape { inputs, hidden: options.hidden };
+        let mut members = Vec::new();
+        for (index, curve) in curves.into_iter().enumerate() {
+            members.push(MemberState {
+                weights: arrays.weights(shape, &format!("{index}.weights"))?,
+                best: arrays.weights(shape, &format!("{index}.best"))?,
+                optimizer: arrays.bytes(&format!("{index}.optimizer"))?,
+                curve,
+            });
+        }
+        if members.len() != options.members {
+            return Err(arrays.problem(format!("has {} of {} members", members.len(), options.members)));
+        }
+        Ok(Self { options, data_hash, shape, members })
+    }
+}

@@ -1,0 +1,315 @@
+//! Measured logs as what networks learn from.
+
+use std::ops::Range;
+
+use sha2::{Digest, Sha256};
+use twinstep_logs::{Log, TauSensor};
+
+use crate::EnsembleError;
+
+/// Longest block [s]: long beside a drive's memory, short beside a motion.
+const LONGEST_BLOCK_S: f64 = 2.0;
+/// Shortest block [rows].
+const SHORTEST_BLOCK: usize = 60;
+/// Of this many blocks that follow one another, one is to stop by and one to judge by.
+const CYCLE: usize = 10;
+/// A step that differs from the log's rate by more than this share is a gap.
+const JITTER: f64 = 0.25;
+
+/// What the rows of a block are for. Blocks are whole stretches of time, the same for all joints, because neighbouring rows
+/// know each other's noise and each other's motion.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Block {
+    /// To learn from: eight of ten.
+    Training,
+    /// To stop by, and to scale variances by: one of ten.
+    Validation,
+    /// To judge by: one of ten.
+    Test,
+}
+
+/// Rows of one joint that follow one another without a gap, within one block.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Run {
+    /// Index into [`DataSet::joints`].
+    pub joint: usize,
+    /// Whether the drive was put down anew just before: no row of it has an unseen past.
+    pub starts_part: bool,
+    /// ξ = [q_cmd − q, dq_cmd − dq] of each row [rad, rad/s].
+    pub errors: Vec<[f64; 2]>,
+    /// Measured torque of each row, its mean to the next row [N·m].
+    pub torques: Vec<f64>,
+}
+
+/// Runs of rows with what they have in common.
+///
+/// Channels are taken as measured: U2E §IV-B smooths them by a cubic spline first, which no drive in a simulator could do
+/// with what is yet to come. Where a log has no velocity, it is the central difference of position over two rows, which
+/// looks one row ahead too.
+#[derive(Clone, Debug)]
+pub struct DataSet {
+    /// Time from a row to the next [s].
+    pub dt: f64,
+    /// Joints with measured torque.
+    pub joints: Vec<String>,
+    /// Where torque was measured.
+    pub tau_sensor: TauSensor,
+    /// kp [N·m/rad] and kd [N·m·s/rad] of each joint.
+    pub gains: Vec<[f64; 2]>,
+    runs: Vec<(Block, Run)>,
+}
+
+impl DataSet {
+    /// The runs of `logs`, each with the name that errors give it.
+    pub fn new(logs: &[(String, Log)]) -> Result<Self, EnsembleError> {
+        let (first, first_log) = logs.first().ok_or(EnsembleError::TooShort { rows: 0, blocks: 0 })?;
+        let tau_sensor = first_log.meta().tau_sensor;
+        if tau_sensor == TauSensor::None {
+            return Err(EnsembleError::NoTorque { log: first.clone() });
+        }
+        let dt = 1.0 / first_log.meta().rate_hz;
+        let mut set = Self { dt, joints: Vec::new(), tau_sensor, gains: Vec::new(), runs: Vec::new() };
+        let rows: usize = logs.iter().map(|(_, log)| log.rows()).sum();
+        let longest = ((LONGEST_BLOCK_S / dt) as usize).max(SHORTEST_BLOCK);
+        let block_rows = (rows / (2 * CYCLE)).clamp(SHORTEST_BLOCK, longest);
+        let mut blocks = 0;
+        for (name, log) in logs {
+            set.check(name, log)?;
+            let columns = set.columns(name, log)?;
+            for (_, part) in log.segments() {
+                for start in part.clone().step_by(block_rows) {
+                    let block = start..part.end.min(start + block_rows);
+                    set.add(log, &columns, &block, start == part.start, blocks);
+                    blocks += 1;
+                }
+            }
+        }
+        let has = |wanted| set.runs.iter().any(|(block, _)| *block == wanted);
+        if [Block::Training, Block::Validation, Block::Test].into_iter().all(has) {
+            return Ok(set);
+        }
+        Err(EnsembleError::TooShort { rows: set.runs.iter().map(|(_, run)| run.torques.len()).sum(), blocks })
+    }
+
+    /// The runs of one role, in the order of logs, time and joints.
+    pub fn runs(&self, wanted: Block) -> impl Iterator<Item = &Run> + Clone {
+        self.runs.iter().filter(move |(block, _)| *block == wanted).map(|(_, run)| run)
+    }
+
+    /// A fingerprint of all of it, in hexadecimal.
+    pub fn hash(&self) -> String {
+        let mut hash = Sha256::new();
+        hash.update(self.dt.to_le_bytes());
+        hash.update(self.joints.join("\n"));
+        for (block, run) in &self.runs {
+            hash.update([*block as u8, run.starts_part as u8, run.joint as u8]);
+            for number in run.errors.iter().flatten().chain(&run.torques) {
+                hash.update(number.to_le_bytes());
+            }
+        }
+        let digest = hash.finalize();
+        let start = digest.iter().take(8).fold(0, |start: u64, byte| start << 8 | u64::from(*byte));
+        format!("{start:016x}")
+    }
+
+    fn check(&self, name: &str, log: &Log) -> Result<(), EnsembleError> {
+        let given = 1.0 / log.meta().rate_hz;
+        if (given / self.dt - 1.0).abs() > 1e-6 {
+            return Err(EnsembleError::OtherStep { what: name.to_owned(), given, wanted: self.dt });
+        }
+        if log.meta().tau_sensor != self.tau_sensor {
+            return Err(EnsembleError::OtherSensor { log: name.to_owned() });
+        }
+        Ok(())
+    }
+
+    /// The channels of each joint with torque, which becomes a joint of the set if it is none yet.
+    fn columns<'a>(&mut self, name: &str, log: &'a Log) -> Result<Vec<Columns<'a>>, EnsembleError> {
+        let mut all = Vec::new();
+        for joint in log.joints() {
+            let (Some(torque), Some(q), Some(q_cmd)) = (log.tau_measured(joint), log.q(joint), log.q_cmd(joint)) else {
+                continue;
+            };
+            if let Some(row) = log.tau_ff(joint).and_then(|torque| torque.iter().position(|torque| *torque != 0.0)) {
+                return Err(EnsembleError::FeedForward { log: name.to_owned(), joint: joint.clone(), row });
+            }
+            let gains = |row| [log.kp(joint, row).unwrap_or(f64::NAN), log.kd(joint, row).unwrap_or(f64::NAN)];
+            let index = self.joints.iter().position(|known| known == joint).unwrap_or_else(|| {
+                self.joints.push(joint.clone());
+                self.gains.push(gains(0));
+                self.joints.len() - 1
+            });
+            if let Some(row) = (0..log.rows()).find(|row| gains(*row) != self.gains[index]) {
+                let [kp, kd] = gains(row);
+                return Err(EnsembleError::GainsChange { log: name.to_owned(), joint: joint.clone(), row, kp, kd });
+            }
+            all.push(Columns { joint: index, q, q_cmd, dq: log.dq(joint), dq_cmd: log.dq_cmd(joint), torque });
+        }
+        if all.is_empty() { Err(EnsembleError::NoTorque { log: name.to_owned() }) } else { Ok(all) }
+    }
+
+    /// Adds the runs of the `number`th block of all.
+    fn add(&mut self, log: &Log, columns: &[Columns], block: &Range<usize>, starts_part: bool, number: usize) {
+        let role = match number % CYCLE {
+            4 => Block::Validation,
+            9 => Block::Test,
+            _ => Block::Training,
+        };
+        let follows = |row: usize| ((log.t()[row] - log.t()[row - 1]) / self.dt - 1.0).abs() <= JITTER;
+        for column in columns {
+            let error = |row| column.error(row, block, self.dt);
+            let usable = |row| error(row).iter().chain([&column.torque[row]]).all(|cell| cell.is_finite());
+            for rows in stretches(block.clone().filter(|row| usable(*row)), follows) {
+                let run = Run {
+                    joint: column.joint,
+                    starts_part: starts_part && rows.start == block.start,
+                    errors: rows.clone().map(error).collect(),
+                    torques: column.torque[rows].to_vec(),
+                };
+                self.runs.push((role, run));
+            }
+        }
+    }
+}
+
+/// The channels of a joint.
+struct Columns<'a> {
+    joint: usize,
+    q: &'a [f64],
+    q_cmd: &'a [f64],
+    dq: Option<&'a [f64]>,
+    dq_cmd: Option<&'a [f64]>,
+    torque: &'a [f64],
+}
+
+impl Columns<'_> {
+    /// ξ at `row`; a velocity that was not measured is a difference of positions within `block`.
+    fn error(&self, row: usize, block: &Range<usize>, dt: f64) -> [f64; 2] {
+        let dq = self.dq.map_or_else(
+            || {
+                let (before, after) = (row.saturating_sub(1).max(block.start), (row + 1).min(block.end - 1));
+                (self.q[after] - self.q[before]) / ((after - before) as f64 * dt)
+            },
+            |dq| dq[row],
+        );
+        [self.q_cmd[row] - self.q[row], self.dq_cmd.map_or(0.0, |dq_cmd| dq_cmd[row]) - dq]
+    }
+}
+
+/// Ranges of `rows` that come one after another, each of which `follows` the one before it.
+fn stretches(rows: impl Iterator<Item = usize>, follows: impl Fn(usize) -> bool) -> Vec<Range<usize>> {
+    let mut found: Vec<Range<usize>> = Vec::new();
+    for row in rows {
+        match found.last_mut() {
+            Some(last) if last.end == row && follows(row) => last.end += 1,
+            _ => found.push(row..row + 1),
+        }
+    }
+    found
+}
+
+#[cfg(test)]
+pub mod tests {
+    use twinstep_logs::{Base, Gain, Meta, Segment};
+    use twinstep_model::{standard_normal, stream};
+
+    use super::*;
+
+    /// Torque's noise in [`log`] [N·m].
+    pub const NOISE: f64 = 0.1;
+
+    /// One joint in waves, whose drive acts one row late.
+    pub fn log(rows: usize, change: impl Fn(&mut Meta, &mut Vec<(String, Vec<f64>)>)) -> Log {
+        let mut random = stream(3, "noise", 0);
+        let error = |row: usize| {
+            let time = row as f64 * 0.005;
+            [0.1 * (7.0 * time).sin() + 0.05 * (23.0 * time).sin(), 0.3 * (11.0 * time).cos()]
+        };
+        let torque = |row: usize| {
+            let [dq, ddq] = error(row.saturating_sub(1));
+            20.0 * dq + 0.5 * ddq
+        };
+        let mut columns: Vec<(String, Vec<f64>)> = vec![
+            ("t".to_owned(), (0..rows).map(|row| row as f64 * 0.005).collect()),
+            ("q_knee".to_owned(), (0..rows).map(|row| -error(row)[0]).collect()),
+            ("dq_knee".to_owned(), (0..rows).map(|row| -error(row)[1]).collect()),
+            ("q_cmd_knee".to_owned(), vec![0.0; rows]),
+            (
+                "tau_measured_knee".to_owned(),
+                (0..rows).map(|row| torque(row) + NOISE * standard_normal(&mut random)).collect(),
+            ),
+        ];
+        let segments = vec![Segment { name: "air".to_owned(), base: Base::Fixed }];
+        let mut meta = Meta::new(200.0, TauSensor::Current, segments);
+        (meta.kp, meta.kd) = (Some(Gain::Same(20.0)), Some(Gain::Same(0.5)));
+        change(&mut meta, &mut columns);
+        Log::new(meta, columns).expect("a log")
+    }
+
+    type Change = dyn Fn(&mut Meta, &mut Vec<(String, Vec<f64>)>);
+
+    /// A channel that is `at` in row 7, and zero else.
+    fn column(name: &str, at: f64) -> (String, Vec<f64>) {
+        (name.to_owned(), (0..2000).map(|row| if row == 7 { at } else { 0.0 }).collect())
+    }
+
+    fn set(log: Log) -> Result<DataSet, EnsembleError> {
+        DataSet::new(&[("here".to_owned(), log)])
+    }
+
+    fn rows(set: &DataSet, block: Block) -> usize {
+        set.runs(block).map(|run| run.torques.len()).sum()
+    }
+
+    #[test]
+    fn every_row_is_in_one_block_and_a_tenth_each_stops_and_judges() {
+        let set = set(log(4000, |_, _| {})).expect("a set");
+        assert_eq!([Block::Training, Block::Validation, Block::Test].map(|block| rows(&set, block)), [3200, 400, 400]);
+        assert_eq!(set.runs(Block::Training).filter(|run| run.starts_part).count(), 1);
+    }
+
+    #[test]
+    fn gaps_and_missing_cells_part_runs() {
+        let whole = set(log(2000, |_, _| {})).expect("a set");
+        let holed = set(log(2000, |_, columns| {
+            columns[4].1[10] = f64::NAN;
+            columns[0].1[30..].iter_mut().for_each(|t| *t += 0.1);
+        }))
+        .expect("a set");
+        let lengths =
+            |set: &DataSet| set.runs(Block::Training).map(|run| run.torques.len()).take(3).collect::<Vec<_>>();
+        assert_eq!(lengths(&whole)[0], 100);
+        assert_eq!(lengths(&holed), [10, 19, 70]);
+        assert_ne!(whole.hash(), holed.hash());
+    }
+
+    #[test]
+    fn velocity_that_was_not_measured_is_the_slope_of_position() {
+        let with = set(log(2000, |_, _| {})).expect("a set");
+        let without = set(log(2000, |_, columns| {
+            columns.remove(2);
+            // The position whose slope the velocity was.
+            columns[1].1 = (0..2000).map(|row| -0.3 / 11.0 * (11.0 * row as f64 * 0.005).sin()).collect();
+        }))
+        .expect("a set");
+        let [one, other] = [&with, &without].map(|set| set.runs(Block::Training).next().expect("a run").clone());
+        for row in 1..99 {
+            assert!((one.errors[row][1] - other.errors[row][1]).abs() < 2e-4, "row {row}");
+        }
+    }
+
+    #[test]
+    fn what_a_network_could_not_know_is_refused() {
+        let refused = |change: &Change| set(log(2000, change)).expect_err("refused").to_string();
+        assert!(refused(&|_, columns| columns.push(column("tau_ff_knee", 2.0))).contains("`tau_ff_knee` at row 7"));
+        assert!(refused(&|_, columns| columns.push(column("kp", 5.0))).contains("kp 5, kd 0.5 at row 7"));
+        assert!(refused(&|meta, _| meta.tau_sensor = TauSensor::None).contains("no measured torque"));
+        assert!(
+            refused(&|_, columns| columns.iter_mut().for_each(|(_, cells)| cells.truncate(400))).contains("too few")
+        );
+        let slow = log(2000, |meta, _| meta.rate_hz = 100.0);
+        let logs = [("one".to_owned(), log(2000, |_, _| {})), ("two".to_owned(), slow)];
+        let error = DataSet::new(&logs).expect_err("refused").to_string();
+        assert!(error.starts_with("two has a step of 0.01 s, the model one of 0.005 s"), "{error}");
+    }
+}

@@ -1,0 +1,203 @@
+//! The LSTM over whole sequences, forward and backward by hand.
+//!
+//! burn's autodiff of an LSTM keeps every gate of every row as a tensor of its own, and its activations are not vectorised.
+//! Here burn multiplies the matrices and the rest is plain loops; the tests hold output and gradients to burn's own.
+
+use burn::tensor::{Device, Tensor, TensorData};
+
+use crate::windows::Batch;
+
+/// The encoder's numbers, as [`crate::weights::Shape::layout`] has them.
+pub struct Encoder {
+    /// `[inputs, 4 · hidden]`.
+    pub input_weight: Tensor<2>,
+    /// `[hidden, 4 · hidden]`.
+    pub hidden_weight: Tensor<2>,
+    /// `[4 · hidden]`.
+    pub bias: Vec<f32>,
+}
+
+/// What the way back needs of the way forward; every array is time by time, sequence by sequence.
+pub struct Tape {
+    size: usize,
+    units: usize,
+    /// Gates after their activation, `[time, batch, 4 · hidden]`.
+    gates: Vec<f32>,
+    /// Cells, before the first row and after each, `[1 + time, batch, hidden]`.
+    cells: Vec<f32>,
+    /// tanh of the cells after each row, `[time, batch, hidden]`.
+    squashed: Vec<f32>,
+    /// States, before the first row and after each, `[1 + time, batch, hidden]`.
+    states: Vec<f32>,
+}
+
+/// Gradients of the [`Encoder`]'s arrays.
+pub struct Gradients {
+    pub input_weight: Tensor<2>,
+    pub hidden_weight: Tensor<2>,
+    pub bias: Vec<f32>,
+}
+
+impl Encoder {
+    /// Runs over a batch from states of zero.
+    pub fn forward(&self, batch: &Batch) -> Tape {
+        let (size, time, [units, width]) = (batch.size, batch.time, self.hidden_weight.dims());
+        let device = self.hidden_weight.device();
+        let mut tape = Tape {
+            size,
+            units,
+            gates: numbers(Tensor::from_data(batch.inputs(), &device).matmul(self.input_weight.clone())),
+            cells: vec![0.0; (1 + time) * size * units],
+            squashed: vec![0.0; time * size * units],
+            states: vec![0.0; (1 + time) * size * units],
+        };
+        for row in 0..time {
+            let before = &tape.states[row * size * units..][..size * units];
+            let heard = numbers(matrix(before, [size, units], &device).matmul(self.hidden_weight.clone()));
+            let (cells_before, cells) = tape.cells[row * size * units..].split_at_mut(size * units);
+            let states = &mut tape.states[(row + 1) * size * units..];
+            let squashed = &mut tape.squashed[row * size * units..];
+            let gates = &mut tape.gates[row * size * width..];
+            for place in 0..size {
+                let (wide, narrow) = (place * width, place * units);
+                let gates = &mut gates[wide..wide + width];
+                for ((gate, heard), bias) in gates.iter_mut().zip(&heard[wide..wide + width]).zip(&self.bias) {
+                    *gate += heard + bias;
+                }
+                advance(
+                    gates,
+                    &cells_before[narrow..narrow + units],
+                    &mut cells[narrow..narrow + units],
+                    &mut squashed[narrow..narrow + units],
+                    &mut states[narrow..narrow + units],
+                );
+            }
+        }
+        tape
+    }
+
+    /// Gradients of a loss from its gradients with respect to the states after each row, `[time · batch, hidden]`.
+    pub fn backward(&self, batch: &Batch, tape: &Tape, by_states: &[f32]) -> Gradients {
+        let (size, time, [units, width]) = (batch.size, batch.time, self.hidden_weight.dims());
+        let device = self.hidden_weight.device();
+        let back = self.hidden_weight.clone().transpose();
+        let mut by_gates = vec![0.0; time * size * width];
+        let mut by_cells = vec![0.0; size * units];
+        let mut later = vec![0.0; size * units];
+        for row in (0..time).rev() {
+            let by_row = &mut by_gates[row * size * width..][..size * width];
+            for place in 0..size {
+                let (wide, narrow) = (place * width, place * units);
+                let at = row * size * units + narrow;
+                retreat(
+                    &tape.gates[row * size * width + wide..][..width],
+                    [&tape.cells[at..at + units], &tape.squashed[at..at + units]],
+                    [&by_states[at..at + units], &later[narrow..narrow + units]],
+                    &mut by_cells[narrow..narrow + units],
+                    &mut by_row[wide..wide + width],
+                );
+            }
+            if row > 0 {
+                later = numbers(matrix(by_row, [size, width], &device).matmul(back.clone()));
+            }
+        }
+        let mut bias = vec![0.0; width];
+        for row in by_gates.chunks_exact(width) {
+            bias.iter_mut().zip(row).for_each(|(sum, gate)| *sum += gate);
+        }
+        let states = matrix(&tape.states[..time * size * units], [time * size, units], &device);
+        let by_gates = Tensor::from_data(TensorData::new(by_gates, [time * size, width]), &device);
+        let inputs = Tensor::<2>::from_data(batch.inputs(), &device);
+        Gradients {
+            input_weight: inputs.transpose().matmul(by_gates.clone()),
+            hidden_weight: states.transpose().matmul(by_gates),
+            bias,
+        }
+    }
+}
+
+impl Tape {
+    /// The states after each row, `[time · batch, hidden]`.
+    pub fn states(&self) -> TensorData {
+        let states = self.states[self.size * self.units..].to_vec();
+        let rows = states.len() / self.units;
+        TensorData::new(states, [rows, self.units])
+    }
+}
+
+/// One row of one sequence: from what the gates hear to what they let through, and to the next cell and state.
+fn advance(gates: &mut [f32], before: &[f32], cells: &mut [f32], squashed: &mut [f32], states: &mut [f32]) {
+    let units = before.len();
+    let (input, rest) = gates.split_at_mut(units);
+    let (forget, rest) = rest.split_at_mut(units);
+    let (cell, output) = rest.split_at_mut(units);
+    for sigmoid_gates in [&mut *input, &mut *forget, &mut *output] {
+        for gate in sigmoid_gates {
+            *gate = sigmoid(*gate);
+        }
+    }
+    for gate in cell.iter_mut() {
+        *gate = tanh(*gate);
+    }
+    for unit in 0..units {
+        cells[unit] = forget[unit] * before[unit] + input[unit] * cell[unit];
+    }
+    for unit in 0..units {
+        squashed[unit] = tanh(cells[unit]);
+        states[unit] = output[unit] * squashed[unit];
+    }
+}
+
+/// The way back over [`advance`]. `by_states` are gradients with respect to the row's states from the heads and from the
+/// next row; `by_cells` goes from the gradients with respect to the row's cells to those of the row before.
+fn retreat(
+    gates: &[f32],
+    [before, squashed]: [&[f32]; 2],
+    [heads, later]: [&[f32]; 2],
+    by_cells: &mut [f32],
+    by_gates: &mut [f32],
+) {
+    let units = before.len();
+    let (input, rest) = gates.split_at(units);
+    let (forget, rest) = rest.split_at(units);
+    let (cell, output) = rest.split_at(units);
+    let (by_input, rest) = by_gates.split_at_mut(units);
+    let (by_forget, rest) = rest.split_at_mut(units);
+    let (by_cell, by_output) = rest.split_at_mut(units);
+    for unit in 0..units {
+        let by_state = heads[unit] + later[unit];
+        let by = by_cells[unit] + by_state * output[unit] * (1.0 - squashed[unit] * squashed[unit]);
+        by_output[unit] = by_state * squashed[unit] * output[unit] * (1.0 - output[unit]);
+        by_input[unit] = by * cell[unit] * input[unit] * (1.0 - input[unit]);
+        by_forget[unit] = by * before[unit] * forget[unit] * (1.0 - forget[unit]);
+        by_cell[unit] = by * input[unit] * (1.0 - cell[unit] * cell[unit]);
+        by_cells[unit] = by * forget[unit];
+    }
+}
+
+/// tanh within 3e-7: the rational function of Eigen's `generic_fast_tanh_float`, which compilers vectorise.
+fn tanh(x: f32) -> f32 {
+    let x = x.clamp(-7.905_311, 7.905_311);
+    let s = x * x;
+    let mut above = -2.760_768_5e-16;
+    for factor in [2.000_188e-13, -8.604_672e-11, 5.122_297e-8, 1.485_722_4e-5, 6.372_619_3e-4, 4.893_524_6e-3] {
+        above = above * s + factor;
+    }
+    let mut below = 1.198_258_4e-6;
+    for factor in [1.185_347_1e-4, 2.268_434_6e-3, 4.893_525e-3] {
+        below = below * s + factor;
+    }
+    x * above / below
+}
+
+fn sigmoid(x: f32) -> f32 {
+    0.5 + 0.5 * tanh(0.5 * x)
+}
+
+fn matrix(content: &[f32], dimensions: [usize; 2], device: &Device) -> Tensor<2> {
+    Tensor::from_data(TensorData::new(content.to_vec(), dimensions), device)
+}
+
+fn numbers(tensor: Tensor<2>) -> Vec<f32> {
+    tensor.into_data().try_into_vec().expect("the numbers are f32")
+}

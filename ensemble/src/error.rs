@@ -1,0 +1,119 @@
+//! What can be wrong with a log that is to be learnt from, or with a file of an ensemble.
+
+use std::path::PathBuf;
+
+/// Why there is no ensemble.
+#[derive(Debug, thiserror::Error)]
+pub enum EnsembleError {
+    /// No torque was measured.
+    #[error(
+        "{log} has no measured torque: columns `tau_measured_<joint>`, and `tau_sensor` in meta.json that says where"
+    )]
+    NoTorque {
+        /// The log.
+        log: String,
+    },
+    /// Two logs measured torque at different places.
+    #[error("{log} measured torque at another place (`tau_sensor`) than the first log; fit them apart")]
+    OtherSensor {
+        /// The log.
+        log: String,
+    },
+    /// The time step is part of a model.
+    #[error("{what} has a step of {given} s, the model one of {wanted} s; a network knows its own step only")]
+    OtherStep {
+        /// The log, or whatever asked.
+        what: String,
+        /// Its step [s].
+        given: f64,
+        /// The model's step [s].
+        wanted: f64,
+    },
+    /// A network sees position and velocity errors, and so must know the gains by heart.
+    #[error(
+        "{log}: the gains of {joint} change (kp {kp}, kd {kd} at row {row}); a network sees only errors, so every row of \
+         every log must have the gains that the first has"
+    )]
+    GainsChange {
+        /// The log.
+        log: String,
+        /// The joint.
+        joint: String,
+        /// The row of the log.
+        row: usize,
+        /// Its position gain [N·m/rad].
+        kp: f64,
+        /// Its velocity gain [N·m·s/rad].
+        kd: f64,
+    },
+    /// Torque was commanded beside the gains.
+    #[error("{log} commands `tau_ff_{joint}` at row {row}; a network sees only position and velocity errors")]
+    FeedForward {
+        /// The log.
+        log: String,
+        /// The joint.
+        joint: String,
+        /// The row of the log.
+        row: usize,
+    },
+    /// Too few rows to leave blocks out.
+    #[error(
+        "{rows} complete rows in {blocks} blocks are too few to learn from some, stop by others and judge by the rest"
+    )]
+    TooShort {
+        /// Rows with all that is needed, for any joint.
+        rows: usize,
+        /// Blocks they are cut into.
+        blocks: usize,
+    },
+    /// Hip, thigh and calf are the Go2's.
+    #[error("joint `{joint}` is no hip, thigh or calf of a Go2; give each joint its own input, or pool them")]
+    NoKind {
+        /// The joint.
+        joint: String,
+    },
+    /// A setting is out of range.
+    #[error("`{option}` = {given} is outside 1..={most}")]
+    Option {
+        /// Its name.
+        option: &'static str,
+        /// What was given.
+        given: usize,
+        /// The most there may be.
+        most: usize,
+    },
+    /// Training gave numbers that are none.
+    #[error("the loss of member {member} is no number in epoch {epoch}; smaller steps may help (learning rate {rate})")]
+    Diverged {
+        /// The member.
+        member: usize,
+        /// The epoch, from one.
+        epoch: usize,
+        /// The learning rate then.
+        rate: f64,
+    },
+    /// A saved training of other data or settings.
+    #[error("the saved training is of other {what}; go on with the same command, or start anew without it")]
+    OtherTraining {
+        /// What differs.
+        what: &'static str,
+    },
+    /// The system refused to read or write.
+    #[error("cannot {verb} `{path}`: {cause}")]
+    File {
+        /// `read` or `write`.
+        verb: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// The system's answer.
+        cause: std::io::Error,
+    },
+    /// The file is not what it should be.
+    #[error("`{path}` {problem}")]
+    Content {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it, as the end of a sentence.
+        problem: String,
+    },
+}

@@ -1,0 +1,142 @@
+//! The epistemic-uncertainty function: how much the members of an ensemble disagree.
+//!
+//! U2E derives it as the information that a measurement would give (§III-B, equations 6 to 8) and computes it as the
+//! Jensen–Rényi divergence of order two (equations 9 to 11). Both functions here take one entry a member and weigh all
+//! members alike; torques in \[N·m] give variances in \[N²·m²], and any other unit gives the same value.
+
+/// Jensen–Rényi divergence of order two of equally weighted Gaussians [nat], as U2E has it.
+///
+/// U2E §III-B, equations (9) to (11): −log Σᵢⱼ wᵢwⱼZᵢⱼ + Σᵢ wᵢ log Zᵢᵢ, where Zᵢⱼ is the density of 𝒩(0, σᵢ² + σⱼ²) at
+/// μᵢ − μⱼ. At most ln M. The paper calls it ≥ 0, and 0 for equal members only. That holds for equal variances. With unequal
+/// ones it can be anything below ln M, because this entropy is not concave: two Gaussians of one mean with σ = 1 and 0.01
+/// have −0.954. [`disagreement`] does not have this fault.
+///
+/// # Panics
+/// Without a member, or when the two slices differ in length.
+pub fn jensen_renyi(means: &[f64], variances: &[f64]) -> f64 {
+    let own = variances.iter().map(|variance| log_overlap(0.0, 2.0 * variance)).sum::<f64>() / means.len() as f64;
+    own - log_mean_over_pairs(means, variances, |_, _| 0.0)
+}
+
+/// Disagreement of equally weighted Gaussians [nat]: 0 for equal members only, at most ln M.
+///
+/// The terms of [`jensen_renyi`] with every Zᵢⱼ divided by √(ZᵢᵢZⱼⱼ), so that each pair counts by its correlation:
+/// −log Σᵢⱼ wᵢwⱼ Zᵢⱼ/√(ZᵢᵢZⱼⱼ). By Cauchy and Schwarz no ratio exceeds one, and it is one for equal Gaussians only, which
+/// gives both bounds. With equal variances it is U2E's value.
+///
+/// # Panics
+/// Without a member, or when the two slices differ in length.
+pub fn disagreement(means: &[f64], variances: &[f64]) -> f64 {
+    let own = |member: usize| log_overlap(0.0, 2.0 * variances[member]);
+    // Equal members give the logarithm of one, give or take a rounding.
+    (-log_mean_over_pairs(means, variances, |one, other| 0.5 * (own(one) + own(other)))).max(0.0)
+}
+
+/// log Z (equation 10): the integral of the product of two Gaussians whose means are `difference` apart and whose variances
+/// add up to `variance`.
+fn log_overlap(difference: f64, variance: f64) -> f64 {
+    -0.5 * ((std::f64::consts::TAU * variance).ln() + difference * difference / variance)
+}
+
+/// log of the mean over all pairs of Zᵢⱼ·exp(−less(i, j)), by its largest term: far members have Z = 0 in any float.
+fn log_mean_over_pairs(means: &[f64], variances: &[f64], less: impl Fn(usize, usize) -> f64) -> f64 {
+    assert_eq!(means.len(), variances.len(), "a mean and a variance a member");
+    assert!(!means.is_empty(), "an ensemble has a member");
+    let members = 0..means.len();
+    let term = |i: usize, j: usize| log_overlap(means[i] - means[j], variances[i] + variances[j]) - less(i, j);
+    let pairs = || members.clone().flat_map(|i| members.clone().map(move |j| (i, j)));
+    let largest = pairs().map(|(i, j)| term(i, j)).fold(f64::NEG_INFINITY, f64::max);
+    let sum: f64 = pairs().map(|(i, j)| (term(i, j) - largest).exp()).sum();
+    largest + sum.ln() - 2.0 * (means.len() as f64).ln()
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn check(value: f64, wanted: f64) {
+        assert!((value - wanted).abs() < 1e-5, "{value} is not {wanted}");
+    }
+
+    #[test]
+    fn equal_members_disagree_by_nothing_and_six_far_ones_by_log_six() {
+        check(jensen_renyi(&[0.3; 6], &[0.7; 6]), 0.0);
+        assert!(disagreement(&[0.3; 6], &[0.7; 6]) < 1e-12);
+        let far = [0.0, 1e3, 2e3, 3e3, 4e3, 5e3];
+        for euf in [jensen_renyi, disagreement] {
+            check(euf(&far, &[1.0; 6]), 6f64.ln());
+            // Nothing underflows: exp(-1e12) is zero in any float.
+            check(euf(&far, &[1e-6; 6]), 6f64.ln());
+        }
+    }
+
+    #[test]
+    fn two_groups_apart_by_a_few_deviations_have_the_known_values() {
+        for (apart, wanted) in [(0.5, 0.03076), (1.0, 0.11721), (2.0, 0.37989), (5.0, 0.69122)] {
+            let means = [0.0, 0.0, 0.0, apart, apart, apart];
+            check(jensen_renyi(&means, &[1.0; 6]), wanted);
+            check(disagreement(&means, &[1.0; 6]), wanted);
+        }
+    }
+
+    #[test]
+    fn value_of_the_paper_goes_negative_with_unequal_variances_and_the_corrected_one_does_not() {
+        for (ratio, paper) in [(4.0, 0.02271), (100.0, -0.08812), (1e4, -0.95386), (1e6, -2.0714)] {
+            check(jensen_renyi(&[0.0; 2], &[1.0, ratio]), paper);
+            assert!(disagreement(&[0.0; 2], &[1.0, ratio]) > 0.05);
+        }
+        let one_of_six = |deviation: f64| jensen_renyi(&[0.0; 6], &[1.0, 1.0, 1.0, 1.0, 1.0, deviation * deviation]);
+        assert!(one_of_six(3.6) > 0.0 && one_of_six(3.7) < 0.0);
+    }
+
+    #[test]
+    fn divergence_is_the_mixture_entropy_less_the_mean_entropy() {
+        let (means, variances) = ([0.2, -0.4, 1.1], [0.3, 0.9, 0.5]);
+        let density = |member: usize, x: f64| {
+            (-0.5 * (x - means[member]).powi(2) / variances[member]).exp()
+                / (std::f64::consts::TAU * variances[member]).sqrt()
+        };
+        let step = 1e-3;
+        let integral = |f: &dyn Fn(f64) -> f64| (-20_000..20_000).map(|i| f(f64::from(i) * step)).sum::<f64>() * step;
+        let mixture = |x: f64| (0..3).map(|member| density(member, x)).sum::<f64>() / 3.0;
+        let entropy = |f: &dyn Fn(f64) -> f64| -integral(&|x| f(x).powi(2)).ln();
+        let own = (0..3).map(|member| entropy(&|x| density(member, x))).sum::<f64>() / 3.0;
+        assert!((jensen_renyi(&means, &variances) - (entropy(&mixture) - own)).abs() < 1e-9);
+    }
+
+    /// Means and variances of an ensemble, the variances over twelve decades.
+    fn ensemble() -> impl Strategy<Value = Vec<(f64, f64)>> {
+        prop::collection::vec((-50.0..50.0, (-6.0..6.0).prop_map(|power: f64| 10f64.powf(power))), 1..9)
+    }
+
+    proptest! {
+        #[test]
+        fn disagreement_stays_within_its_bounds(members in ensemble()) {
+            let (means, variances): (Vec<_>, Vec<_>) = members.into_iter().unzip();
+            let most = (means.len() as f64).ln() + 1e-12;
+            prop_assert!((0.0..=most).contains(&disagreement(&means, &variances)));
+            prop_assert!(jensen_renyi(&means, &variances) <= most);
+        }
+
+        #[test]
+        fn both_agree_where_variances_are_equal(members in ensemble()) {
+            let means: Vec<f64> = members.iter().map(|(mean, _)| *mean).collect();
+            let variances = vec![members[0].1; means.len()];
+            prop_assert!((disagreement(&means, &variances) - jensen_renyi(&means, &variances)).abs() < 1e-9);
+        }
+
+        #[test]
+        fn neither_unit_nor_origin_nor_order_matters(members in ensemble(), scale in 0.1..10.0, shift in -9.0..9.0) {
+            let (means, variances): (Vec<_>, Vec<_>) = members.iter().copied().unzip();
+            let turned = members.iter().rev().map(|(mean, variance)| (scale * mean + shift, scale * scale * variance));
+            let (other_means, other_variances): (Vec<_>, Vec<_>) = turned.unzip();
+            for euf in [jensen_renyi, disagreement] {
+                let (one, other) = (euf(&means, &variances), euf(&other_means, &other_variances));
+                // Means in the tens that differ by less than a thousandth of themselves lose digits when they are shifted.
+                prop_assert!((one - other).abs() < 1e-6, "{one} {other}");
+            }
+        }
+    }
+}

@@ -1,0 +1,225 @@
+//! Files in the safetensors format: arrays by name, and a description as JSON in the metadata.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use safetensors::tensor::{Dtype, SafeTensors, TensorView, serialize};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::EnsembleError;
+use crate::ensemble::{Description, Ensemble};
+use crate::weights::{Shape, Weights};
+
+/// An array as it stands in a file.
+pub struct Bytes {
+    kind: Dtype,
+    dimensions: Vec<usize>,
+    content: Vec<u8>,
+}
+
+impl Bytes {
+    /// Floats, row-major.
+    pub fn floats(dimensions: Vec<usize>, numbers: &[f32]) -> Self {
+        let content = numbers.iter().flat_map(|number| number.to_le_bytes()).collect();
+        Self { kind: Dtype::F32, dimensions, content }
+    }
+
+    /// Bytes as they are.
+    pub fn plain(content: Vec<u8>) -> Self {
+        Self { kind: Dtype::U8, dimensions: vec![content.len()], content }
+    }
+}
+
+/// Writes arrays with their description under `key`, in one piece or not at all.
+pub fn write(
+    path: &Path,
+    key: &str,
+    header: &impl Serialize,
+    arrays: Vec<(String, Bytes)>,
+) -> Result<(), EnsembleError> {
+    let views = arrays.iter().map(|(name, array)| {
+        let view = TensorView::new(array.kind, array.dimensions.clone(), &array.content);
+        (name, view.expect("an array has as many numbers as its dimensions say"))
+    });
+    let header = serde_json::to_string(header).expect("a description is plain data");
+    // One key only: several would come in another order each time, and equal ensembles would not be equal files.
+    let metadata = HashMap::from([(key.to_owned(), header)]);
+    let content = serialize(views, Some(metadata)).expect("the names differ");
+    let mut beside = path.as_os_str().to_owned();
+    beside.push(".part");
+    std::fs::write(&beside, content)
+        .and_then(|()| std::fs::rename(&beside, path))
+        .map_err(|cause| EnsembleError::File { verb: "write", path: path.to_owned(), cause })
+}
+
+/// A file in memory.
+pub struct Arrays {
+    path: PathBuf,
+    content: Vec<u8>,
+}
+
+impl Arrays {
+    /// Reads the file.
+    pub fn read(path: &Path) -> Result<Self, EnsembleError> {
+        let content =
+            std::fs::read(path).map_err(|cause| EnsembleError::File { verb: "read", path: path.to_owned(), cause })?;
+        let arrays = Self { path: path.to_owned(), content };
+        arrays.tensors()?;
+        Ok(arrays)
+    }
+
+    /// The description under `key`.
+    pub fn header<T: DeserializeOwned>(&self, key: &str) -> Result<T, EnsembleError> {
+        let (_, metadata) = SafeTensors::read_metadata(&self.content).map_err(|cause| self.broken(&cause))?;
+        let metadata = metadata.metadata().clone().unwrap_or_default();
+        let text = metadata.get(key).ok_or_else(|| self.problem(format!("has no key `{key}` in its metadata")))?;
+        serde_json::from_str(text).map_err(|cause| self.problem(format!("has an unreadable `{key}`: {cause}")))
+    }
+
+    /// The weights whose names begin with `prefix`.
+    pub fn weights(&self, shape: Shape, prefix: &str) -> Result<Weights, EnsembleError> {
+        shape
+            .layout()
+            .into_iter()
+            .map(|(name, wanted)| {
+                let full = format!("{prefix}.{name}");
+                let tensors = self.tensors()?;
+                let found = tensors.tensor(&full).map_err(|_| self.problem(format!("has no array `{full}`")))?;
+                if found.dtype() != Dtype::F32 || found.shape() != wanted {
+                    let (kind, dimensions) = (found.dtype(), found.shape());
+                    return Err(
+                        self.problem(format!("has `{full}` as {kind:?} {dimensions:?} instead of F32 {wanted:?}"))
+                    );
+                }
+                let number = |bytes: &[u8]| f32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
+                let numbers: Vec<f32> = found.data().chunks_exact(4).map(number).collect();
+                if numbers.iter().any(|number| !number.is_finite()) {
+                    return Err(self.problem(format!("has a number in `{full}` that is not finite")));
+                }
+                Ok((name, numbers))
+            })
+            .collect()
+    }
+
+    /// An array of bytes.
+    pub fn bytes(&self, name: &str) -> Result<Vec<u8>, EnsembleError> {
+        let tensors = self.tensors()?;
+        let found = tensors.tensor(name).map_err(|_| self.problem(format!("has no array `{name}`")))?;
+        Ok(found.data().to_vec())
+    }
+
+    /// What is wrong with the file, as the end of a sentence.
+    pub fn problem(&self, problem: String) -> EnsembleError {
+        EnsembleError::Content { path: self.path.clone(), problem }
+    }
+
+    fn tensors(&self) -> Result<SafeTensors<'_>, EnsembleError> {
+        SafeTensors::deserialize(&self.content).map_err(|cause| self.broken(&cause))
+    }
+
+    fn broken(&self, cause: &impl std::fmt::Display) -> EnsembleError {
+        self.problem(format!("is no safetensors file: {cause}"))
+    }
+}
+
+impl Ensemble {
+    /// Writes it as a safetensors file: arrays `<member>.<name>` of 32-bit floats, and [`Description`] as JSON under the
+    /// metadata's key `ensemble`.
+    pub fn write(&self, path: impl AsRef<Path>) -> Result<(), EnsembleError> {
+        let shape = self.description.shape();
+        let arrays = self.members.iter().enumerate().flat_map(|(index, weights)| {
+            let array =
+                move |(name, dimensions)| (format!("{index}.{name}"), Bytes::floats(dimensions, &weights[name]));
+            shape.layout().into_iter().map(array)
+        });
+        write(path.as_ref(), "ensemble", &self.description, arrays.collect())
+    }
+
+    /// Reads what [`Ensemble::write`] wrote; whatever is missing or of another size is named.
+    pub fn read(path: impl AsRef<Path>) -> Result<Self, EnsembleError> {
+        let arrays = Arrays::read(path.as_ref())?;
+        let description: Description = arrays.header("ensemble")?;
+        description.check()?;
+        let shape = description.shape();
+        let members = (0..description.members).map(|index| arrays.weights(shape, &index.to_string()));
+        Ok(Self { members: members.collect::<Result<_, _>>()?, description })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use twinstep_logs::TauSensor;
+    use twinstep_model::stream;
+
+    use super::*;
+    use crate::ensemble::JointInput;
+    use crate::scales::{Scale, Scales};
+
+    fn ensemble() -> Ensemble {
+        let scale = Scale { mean: 0.1, deviation: 2.5 };
+        let description = Description {
+            members: 2,
+            hidden: 3,
+            dt: 0.005,
+            joints: vec!["FL_hip".to_owned(), "FL_calf".to_owned()],
+            joint_input: JointInput::Kind,
+            scales: Scales { errors: [scale, scale], torque: scale },
+            tau_sensor: TauSensor::Output,
+            gains: vec![[20.0, 0.5], [25.0, 0.6]],
+            variance_scale: 1.25,
+            data_hash: "0123456789abcdef".to_owned(),
+            seed: 9,
+        };
+        let members = (0..2).map(|member| description.shape().random(&mut stream(9, "weights", member))).collect();
+        Ensemble { description, members }
+    }
+
+    /// What reading says after `change` to the arrays.
+    fn refusal(change: impl Fn(&mut Vec<(String, Bytes)>)) -> String {
+        let (ensemble, folder) = (ensemble(), tempfile::tempdir().expect("a folder"));
+        let path = folder.path().join("ensemble.safetensors");
+        let mut arrays = Vec::new();
+        for (index, weights) in ensemble.members.iter().enumerate() {
+            let array = |(name, dimensions)| (format!("{index}.{name}"), Bytes::floats(dimensions, &weights[name]));
+            arrays.extend(ensemble.description.shape().layout().into_iter().map(array));
+        }
+        change(&mut arrays);
+        write(&path, "ensemble", &ensemble.description, arrays).expect("written");
+        Ensemble::read(&path).expect_err("refused").to_string()
+    }
+
+    #[test]
+    fn file_gives_back_every_bit_and_the_description() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("ensemble.safetensors");
+        ensemble().write(&path).expect("written");
+        let read = Ensemble::read(&path).expect("read");
+        assert_eq!(read, ensemble());
+        assert!(read.check_step("the simulation", 0.005).is_ok());
+        let error = read.check_step("the simulation", 0.001).expect_err("refused").to_string();
+        assert!(error.starts_with("the simulation has a step of 0.001 s, the model one of 0.005 s"), "{error}");
+    }
+
+    #[test]
+    fn what_is_missing_or_of_another_size_is_named() {
+        let missing = refusal(|arrays| arrays.retain(|(name, _)| name != "1.mean.bias"));
+        assert!(missing.ends_with("has no array `1.mean.bias`"), "{missing}");
+        let other = refusal(|arrays| arrays[1].1 = Bytes::floats(vec![12, 3], &[0.0; 36]));
+        assert!(other.contains("`0.lstm.hidden_weight` as F32 [12, 3] instead of F32 [3, 12]"), "{other}");
+        let broken = refusal(|arrays| arrays[6].1 = Bytes::floats(vec![1], &[f32::NAN]));
+        assert!(broken.contains("`0.mean.bias` that is not finite"), "{broken}");
+    }
+
+    #[test]
+    fn other_files_are_refused_by_name() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("other");
+        let refused = || Ensemble::read(&path).expect_err("refused").to_string();
+        assert!(refused().starts_with("cannot read `"));
+        std::fs::write(&path, "not at all").expect("written");
+        assert!(refused().contains("is no safetensors file"));
+        write(&path, "training", &1, Vec::new()).expect("written");
+        assert!(refused().ends_with("has no key `ensemble` in its metadata"));
+    }
+}

@@ -1,0 +1,43 @@
+//! Learned drives that know what they do not know: a deep ensemble of recurrent networks (U2E §II-B, III-A, III-B).
+//!
+//! A network sees what a joint's controller sees, ξ = [Δq, Δq̇] (command less measurement), row after row, and gives the
+//! joint's torque as a Gaussian. Several of them, which differ in their first weights and in the order of what they learnt
+//! from, agree where they have seen data and disagree where they have not. Six types carry the crate:
+//!
+//! - [`DataSet`] is measured logs as runs of rows without a gap, in three roles by blocks of time: to learn from, to stop
+//!   by, to judge by.
+//! - [`Training`] trains the members of an ensemble, tells its progress, ends when asked to, and goes on from a
+//!   [`Checkpoint`] as if it had never ended.
+//! - [`Ensemble`] is the trained members with all that their numbers depend on ([`Description`]): time step, scales, joints,
+//!   sensor, gains. It predicts, and it is read from and written to a safetensors file.
+//! - [`Calibration`] says how often the truth lies where an ensemble says it does.
+//! - [`disagreement`] and [`jensen_renyi`] turn the members' Gaussians into epistemic uncertainty, the latter as the
+//!   paper has it.
+//! - [`EnsembleError`] says what is wrong with a log or a file, and how to mend it.
+//!
+//! SI units: torques in \[N·m], errors in \[rad] and \[rad/s]. What a network computes is normalised; nothing normalised
+//! leaves the crate. The step of time is part of a model: one of another step is refused.
+
+mod calibration;
+mod checkpoint;
+mod data;
+mod encoder;
+mod ensemble;
+mod error;
+mod euf;
+mod file;
+mod member;
+mod network;
+mod scales;
+mod train;
+mod weights;
+mod windows;
+
+pub use calibration::{Calibration, Coverage};
+pub use checkpoint::Checkpoint;
+pub use data::{Block, DataSet, Run};
+pub use ensemble::{Description, Ensemble, Gaussian, JointInput};
+pub use error::EnsembleError;
+pub use euf::{disagreement, jensen_renyi};
+pub use scales::{Scale, Scales};
+pub use train::{Epoch, Options, Outcome, Progress, Training};

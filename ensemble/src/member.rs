@@ -1,0 +1,164 @@
+//! The training of one member.
+
+use burn::grad_clipping::GradientClippingConfig;
+use burn::module::Module;
+use burn::optim::{AdamConfig, ModuleOptimizer};
+use burn::tensor::{Bytes, Device};
+use rand::seq::SliceRandom;
+use twinstep_model::stream;
+
+use crate::EnsembleError;
+use crate::checkpoint::MemberState;
+use crate::network::Network;
+use crate::train::{Epoch, Options};
+use crate::weights::{Shape, Weights};
+use crate::windows::Windows;
+
+/// Most sequences of a batch, and of a part of the validation.
+const LARGEST_BATCH: usize = 256;
+/// Least sequences of a batch; small data sets have at least [`STEPS`] batches an epoch down to this.
+const SMALLEST_BATCH: usize = 16;
+const STEPS: usize = 20;
+/// Adam's first learning rate.
+const RATE: f64 = 5e-3;
+/// What the rate is multiplied by after [`PATIENCE`] epochs without a better validation.
+const CUT: f64 = 0.3;
+const PATIENCE: usize = 4;
+/// The cut that ends the training instead.
+const LAST_CUT: i32 = 4;
+/// A better validation is better by this [nat].
+const BETTER: f64 = 1e-3;
+/// Gradients of an array are no longer than this.
+const GRADIENT_NORM: f32 = 1.0;
+/// What a saved optimiser is of that burn cannot read.
+const VERSION: &str = "versions of this program";
+
+/// How a pass over the data ended.
+pub enum EpochEnd {
+    /// At its end.
+    Done,
+    /// The caller stopped it; what was learnt since the last end is to be forgotten.
+    Stopped,
+}
+
+/// A member in training.
+pub struct Member<'a> {
+    index: usize,
+    options: &'a Options,
+    shape: Shape,
+    network: Network,
+    optimizer: ModuleOptimizer,
+    best: Weights,
+    curve: Vec<Epoch>,
+}
+
+impl<'a> Member<'a> {
+    /// From where `state` left off.
+    pub fn new(index: usize, options: &'a Options, shape: Shape, state: MemberState) -> Result<Self, EnsembleError> {
+        let device = Device::flex().autodiff();
+        let new = AdamConfig::new().with_grad_clipping(Some(GradientClippingConfig::Norm(GRADIENT_NORM))).init();
+        let optimizer = match state.optimizer {
+            saved if saved.is_empty() => new,
+            saved => new
+                .from_bytes(Bytes::from_bytes_vec(saved))
+                .map_err(|_| EnsembleError::OtherTraining { what: VERSION })?,
+        };
+        let network = Network::new(shape, &state.weights, &device);
+        Ok(Self { index, options, shape, network, optimizer, best: state.best, curve: state.curve })
+    }
+
+    /// Learns from every sequence once, in an order of its own. `each` hears of every batch how many sequences it had, and
+    /// stops the epoch when it answers `false`.
+    pub fn epoch(
+        &mut self,
+        sequences: &Windows,
+        validation: &Windows,
+        each: &mut dyn FnMut(usize) -> bool,
+    ) -> Result<EpochEnd, EnsembleError> {
+        let rate = schedule(&self.curve).unwrap_or(RATE);
+        let mut order: Vec<usize> = (0..sequences.len()).collect();
+        let name = format!("order of member {}", self.index);
+        order.shuffle(&mut stream(self.options.seed, &name, self.curve.len() as u64));
+        let size = (order.len() / STEPS).clamp(SMALLEST_BATCH, LARGEST_BATCH);
+        let (mut sum, mut count) = (0.0, 0.0);
+        for chosen in order.chunks(size) {
+            let batch = sequences.batch(chosen);
+            let (nll, gradients) = self.network.learn(&batch);
+            self.network = self.optimizer.step(rate, self.network.clone(), gradients);
+            sum += f64::from(nll) * batch.counted();
+            count += batch.counted();
+            if !each(chosen.len()) {
+                return Ok(EpochEnd::Stopped);
+            }
+        }
+        let epoch = Epoch { training_nll: sum / count, validation_nll: self.nll(validation) };
+        if !(epoch.training_nll.is_finite() && epoch.validation_nll.is_finite()) {
+            return Err(EnsembleError::Diverged { member: self.index, epoch: self.curve.len() + 1, rate });
+        }
+        let best = self.curve.iter().map(|epoch| epoch.validation_nll).fold(f64::INFINITY, f64::min);
+        if epoch.validation_nll < best {
+            self.best = self.network.weights(self.shape);
+        }
+        self.curve.push(epoch);
+        Ok(EpochEnd::Done)
+    }
+
+    /// Where it stands at an epoch's end.
+    pub fn state(&self) -> Result<MemberState, EnsembleError> {
+        let optimizer = self.optimizer.into_bytes().map_err(|_| EnsembleError::OtherTraining { what: VERSION })?;
+        Ok(MemberState {
+            weights: self.network.weights(self.shape),
+            best: self.best.clone(),
+            optimizer: optimizer.to_vec(),
+            curve: self.curve.clone(),
+        })
+    }
+
+    /// Mean negative log-likelihood over `windows`.
+    fn nll(&self, windows: &Windows) -> f64 {
+        let network = self.network.valid();
+        let order: Vec<usize> = (0..windows.len()).collect();
+        let (mut sum, mut count) = (0.0, 0.0);
+        for chosen in order.chunks(LARGEST_BATCH) {
+            let batch = windows.batch(chosen);
+            sum += f64::from(network.nll(&batch)) * batch.counted();
+            count += batch.counted();
+        }
+        sum / count
+    }
+}
+
+/// Whether the training of a member with this `curve` is over.
+pub fn finished(curve: &[Epoch], options: &Options) -> bool {
+    curve.len() >= options.epochs || schedule(curve).is_none()
+}
+
+/// The learning rate after the epochs of `curve`; none when it is time to end.
+fn schedule(curve: &[Epoch]) -> Option<f64> {
+    let (mut best, mut stale, mut cuts) = (f64::INFINITY, 0, 0);
+    for epoch in curve {
+        stale = if epoch.validation_nll < best - BETTER { 0 } else { stale + 1 };
+        best = best.min(epoch.validation_nll);
+        if stale == PATIENCE {
+            (stale, cuts) = (0, cuts + 1);
+        }
+    }
+    (cuts < LAST_CUT).then(|| RATE * CUT.powi(cuts))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rate(nlls: &[f64]) -> Option<f64> {
+        schedule(&nlls.iter().map(|nll| Epoch { training_nll: *nll, validation_nll: *nll }).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn rate_falls_when_validation_stays_and_the_fourth_time_training_ends() {
+        assert_eq!(rate(&[3.0, 2.0, 1.0, 0.0, -1.0]), Some(RATE));
+        assert_eq!(rate(&[1.0, 2.0, 2.0, 2.0, 2.0]), Some(RATE * CUT));
+        assert_eq!(rate(&[1.0, 2.0, 2.0, 2.0, 0.0, 2.0]), Some(RATE));
+        assert_eq!(rate(&[1.0; 17]), None);
+    }
+}

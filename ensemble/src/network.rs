@@ -1,0 +1,243 @@
+//! One member: an LSTM encoder, and a head each for the mean and the variance of the torque.
+
+use burn::module::{Module, Param, ParamId};
+use burn::optim::GradientsParams;
+use burn::tensor::activation::relu;
+use burn::tensor::{Device, Tensor, TensorData};
+
+use crate::encoder::Encoder;
+use crate::weights::{Shape, Weights};
+use crate::windows::Batch;
+
+/// Least variance, normalised (U2E §IV-B).
+pub const VARIANCE_FLOOR: f64 = 1e-6;
+
+/// A network of U2E §IV-B; its arrays are those of [`Shape::layout`], in that order.
+#[derive(Module, Debug)]
+pub struct Network {
+    input_weight: Param<Tensor<2>>,
+    hidden_weight: Param<Tensor<2>>,
+    gate_bias: Param<Tensor<1>>,
+    mean: Head,
+    variance: Head,
+}
+
+/// One hidden layer and one output.
+#[derive(Module, Debug)]
+struct Head {
+    hidden_weight: Param<Tensor<2>>,
+    hidden_bias: Param<Tensor<1>>,
+    weight: Param<Tensor<2>>,
+    bias: Param<Tensor<1>>,
+}
+
+impl Network {
+    /// The network with `weights`, whose arrays have the lengths of `shape`.
+    pub fn new(shape: Shape, weights: &Weights, device: &Device) -> Self {
+        let mut arrays = shape.layout().into_iter().enumerate().map(|(index, (name, dimensions))| {
+            // Fixed names, so that a saved optimiser finds its parameters again.
+            (ParamId::from(index as u64 + 1), TensorData::new(weights[name].clone(), dimensions))
+        });
+        let mut next = || arrays.next().expect("the layout lists every array");
+        Self {
+            input_weight: parameter(next(), device),
+            hidden_weight: parameter(next(), device),
+            gate_bias: parameter(next(), device),
+            mean: Head::new(&mut next, device),
+            variance: Head::new(&mut next, device),
+        }
+    }
+
+    /// Its numbers.
+    pub fn weights(&self, shape: Shape) -> Weights {
+        let [mean, variance] = [&self.mean, &self.variance].map(Head::values);
+        let encoder = [values(&self.input_weight), values(&self.hidden_weight), values(&self.gate_bias)];
+        let arrays = encoder.into_iter().chain(mean).chain(variance);
+        shape.layout().into_iter().map(|(name, _)| name).zip(arrays).collect()
+    }
+
+    /// Mean and variance of the torque of every row, normalised: two of `[time · batch]`, from states of zero.
+    pub fn outputs(&self, batch: &Batch) -> [Vec<f32>; 2] {
+        self.heads(self.states(batch)).map(|tensor| tensor.into_data().try_into_vec().expect("the outputs are f32"))
+    }
+
+    /// Mean over the rows that count of the Gaussian negative log-likelihood [nat], normalised (U2E equation 5, with the
+    /// constant ½ log 2π that makes it one).
+    pub fn nll(&self, batch: &Batch) -> f32 {
+        nll(self.heads(self.states(batch)), batch).into_scalar()
+    }
+
+    /// That and its gradients, of a network on an autodiff device.
+    ///
+    /// The heads are burn's to differentiate, as far back as the encoder's states; from there it is the encoder's own way.
+    pub fn learn(&self, batch: &Batch) -> (f32, GradientsParams) {
+        let encoder = self.encoder();
+        let tape = encoder.forward(batch);
+        let states = Tensor::<2>::from_data(tape.states(), &self.hidden_weight.val().device()).require_grad();
+        let loss = nll(self.heads(states.clone()), batch);
+        let mut gradients = loss.backward();
+        let by_states = states.grad_remove(&mut gradients).expect("the loss depends on every state");
+        let by_states: Vec<f32> = by_states.into_data().try_into_vec().expect("gradients are f32");
+        let found = encoder.backward(batch, &tape, &by_states);
+        let mut gradients = GradientsParams::from_grads(gradients, self);
+        gradients.register(self.input_weight.id, found.input_weight);
+        gradients.register(self.hidden_weight.id, found.hidden_weight);
+        let bias = TensorData::new(found.bias.clone(), [found.bias.len()]);
+        gradients.register(self.gate_bias.id, Tensor::<1>::from_data(bias, &Device::flex()));
+        (loss.into_scalar(), gradients)
+    }
+
+    fn encoder(&self) -> Encoder {
+        Encoder {
+            input_weight: self.input_weight.val().inner(),
+            hidden_weight: self.hidden_weight.val().inner(),
+            bias: values(&self.gate_bias),
+        }
+    }
+
+    /// The encoder's states, outside of autodiff, `[time · batch, hidden]`.
+    fn states(&self, batch: &Batch) -> Tensor<2> {
+        Tensor::from_data(self.encoder().forward(batch).states(), &self.hidden_weight.val().device())
+    }
+
+    /// Mean and variance, two of `[time · batch, 1]`.
+    fn heads(&self, states: Tensor<2>) -> [Tensor<2>; 2] {
+        [self.mean.forward(states.clone()), softplus(self.variance.forward(states)) + VARIANCE_FLOOR]
+    }
+}
+
+fn nll([mean, variance]: [Tensor<2>; 2], batch: &Batch) -> Tensor<1> {
+    let device = mean.device();
+    let column = |data: &[f32]| Tensor::<2>::from_data(TensorData::new(data.to_vec(), [data.len(), 1]), &device);
+    let error = column(&batch.torques) - mean;
+    let nll = variance.clone().log() * 0.5 + error.powi_scalar(2) / (variance * 2.0);
+    (nll * column(&batch.counts)).sum() / batch.counted() + 0.5 * std::f32::consts::TAU.ln()
+}
+
+impl Head {
+    fn new(next: &mut impl FnMut() -> (ParamId, TensorData), device: &Device) -> Self {
+        Self {
+            hidden_weight: parameter(next(), device),
+            hidden_bias: parameter(next(), device),
+            weight: parameter(next(), device),
+            bias: parameter(next(), device),
+        }
+    }
+
+    /// `[rows, hidden]` to `[rows, 1]`.
+    fn forward(&self, rows: Tensor<2>) -> Tensor<2> {
+        let hidden = relu(rows.matmul(self.hidden_weight.val()) + self.hidden_bias.val().unsqueeze());
+        hidden.matmul(self.weight.val()) + self.bias.val().unsqueeze()
+    }
+
+    fn values(&self) -> [Vec<f32>; 4] {
+        [values(&self.hidden_weight), values(&self.hidden_bias), values(&self.weight), values(&self.bias)]
+    }
+}
+
+fn parameter<const D: usize>((id, data): (ParamId, TensorData), device: &Device) -> Param<Tensor<D>> {
+    let tensor = Tensor::from_data(data, device);
+    Param::initialized(id, if device.is_autodiff() { tensor.require_grad() } else { tensor })
+}
+
+fn values<const D: usize>(parameter: &Param<Tensor<D>>) -> Vec<f32> {
+    parameter.val().into_data().try_into_vec().expect("the parameters are f32")
+}
+
+/// log(1 + exp(x)), without overflow. burn's own passes over the tensor eight times.
+fn softplus(x: Tensor<2>) -> Tensor<2> {
+    relu(x.clone()) + (-x.abs()).exp().log1p()
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::activation::{sigmoid, tanh};
+    use twinstep_model::stream;
+
+    use super::*;
+    use crate::data::tests::log;
+    use crate::data::{Block, DataSet};
+    use crate::train::{Options, Training};
+    use crate::windows::Windows;
+
+    const SHAPE: Shape = Shape { inputs: 2, hidden: 8 };
+
+    fn network(device: &Device) -> Network {
+        Network::new(SHAPE, &SHAPE.random(&mut stream(1, "weights", 0)), device)
+    }
+
+    /// Two sequences, one of them with rows that do not count.
+    fn batch() -> Batch {
+        let data = DataSet::new(&[("here".to_owned(), log(2000, |_, _| {}))]).expect("a set");
+        let training = Training::new(&data, Options { hidden: 8, ..Options::default() }).expect("options");
+        Windows::sequences(data.runs(Block::Training), &training.description).batch(&[0, 3])
+    }
+
+    /// The whole network in burn's operations.
+    fn by_burn(network: &Network, batch: &Batch) -> Tensor<1> {
+        let device = network.hidden_weight.val().device();
+        let inputs = Tensor::<2>::from_data(batch.inputs(), &device);
+        let mut cell = Tensor::<2>::zeros([batch.size, SHAPE.hidden], &device);
+        let (mut state, mut states) = (cell.clone(), Vec::new());
+        for time in 0..batch.time {
+            let gates = inputs.clone().narrow(0, time * batch.size, batch.size).matmul(network.input_weight.val())
+                + state.matmul(network.hidden_weight.val())
+                + network.gate_bias.val().unsqueeze();
+            let gate = |index: usize| gates.clone().narrow(1, index * SHAPE.hidden, SHAPE.hidden);
+            cell = sigmoid(gate(1)) * cell + sigmoid(gate(0)) * tanh(gate(2));
+            state = sigmoid(gate(3)) * tanh(cell.clone());
+            states.push(state.clone());
+        }
+        nll(network.heads(Tensor::cat(states, 0)), batch)
+    }
+
+    #[test]
+    fn encoder_by_hand_has_the_loss_and_the_gradients_that_burn_finds() {
+        let (network, batch) = (network(&Device::flex().autodiff()), batch());
+        let (loss, found) = network.learn(&batch);
+        let reference = by_burn(&network, &batch);
+        let wanted = GradientsParams::from_grads(reference.backward(), &network);
+        assert!((loss - reference.into_scalar::<f32>()).abs() < 1e-5);
+        let largest = |one: &Tensor<2>| one.clone().abs().max().into_scalar::<f32>();
+        for id in [network.input_weight.id, network.hidden_weight.id, network.mean.hidden_weight.id] {
+            let [one, other]: [Tensor<2>; 2] = [&found, &wanted].map(|all| all.get(id).expect("a gradient"));
+            assert!(largest(&(one - other.clone())) < 1e-5 * largest(&other).max(1.0));
+        }
+        let [one, other]: [Tensor<1>; 2] = [&found, &wanted].map(|all| all.get(network.gate_bias.id).expect("one"));
+        assert!(largest(&(one - other).unsqueeze()) < 1e-5);
+    }
+
+    #[test]
+    fn gradients_are_the_slopes_of_the_loss() {
+        let (device, batch) = (Device::flex().autodiff(), batch());
+        let weights = network(&device).weights(SHAPE);
+        let (_, gradients) = network(&device).learn(&batch);
+        let network = network(&device);
+        let by_hidden: Vec<f32> = gradients
+            .get::<2>(network.hidden_weight.id)
+            .and_then(|gradient| gradient.into_data().try_into_vec().ok())
+            .expect("a gradient");
+        let loss = |place: usize, change: f32| {
+            let mut weights = weights.clone();
+            weights.get_mut("lstm.hidden_weight").expect("there")[place] += change;
+            Network::new(SHAPE, &weights, &Device::flex()).nll(&batch)
+        };
+        let step = 1e-2;
+        for place in (0..by_hidden.len()).step_by(17) {
+            let slope = (loss(place, step) - loss(place, -step)) / (2.0 * step);
+            assert!(
+                (slope - by_hidden[place]).abs() < 1e-4 + 0.02 * slope.abs(),
+                "{place}: {slope} {}",
+                by_hidden[place]
+            );
+        }
+    }
+
+    #[test]
+    fn variance_is_never_below_its_floor() {
+        let mut weights = SHAPE.random(&mut stream(1, "weights", 0));
+        weights.insert("variance.bias", vec![-1e4]);
+        let [_, variances] = Network::new(SHAPE, &weights, &Device::flex()).outputs(&batch());
+        assert!(variances.iter().all(|variance| *variance == VARIANCE_FLOOR as f32));
+    }
+}

@@ -1,0 +1,154 @@
+//! `twinstep fit` through the real program, on a robot whose drives act late and saturate.
+
+use std::collections::BTreeMap;
+use std::f64::consts::TAU;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use twinstep_ensemble::{Block, DataSet, Ensemble, disagreement};
+use twinstep_logs::{Base as LoggedBase, Gain, Log, Meta, Segment, TauSensor};
+use twinstep_model::effects::{Entry, compose};
+use twinstep_model::{JOINT_NAMES, RobotModel, go2};
+use twinstep_sim::{Base, BatchBackend, Engine, SimConfig};
+use twinstep_sysid::{RecordError, Sensor, measured, record};
+use twinstep_tests::hidden_robot::effect;
+use twinstep_tests::python::Programs;
+
+const RATE_HZ: f64 = 200.0;
+const ROWS: usize = 2400;
+/// Noise of the torque's sensor [N·m].
+const NOISE: f64 = 0.1;
+
+fn twinstep(arguments: &[&str]) -> Output {
+    let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
+    Command::new(programs.0.join("twinstep")).args(arguments).output().unwrap()
+}
+
+fn robot() -> RobotModel {
+    let entries = [("torque_delay", 0.008), ("torque_saturation", 5.0)].map(|(name, value)| {
+        let (effect, scope) = effect(name, "all");
+        Entry::new(effect, scope, vec![value]).unwrap()
+    });
+    compose(&go2(), &entries).unwrap()
+}
+
+/// Twelve seconds of steps in the air, each joint's about `amplitude` to both sides [rad].
+fn log(amplitude: f64) -> Log {
+    let mut columns = BTreeMap::<String, Vec<f64>>::new();
+    for row in 0..ROWS {
+        let time = row as f64 / RATE_HZ;
+        columns.entry("t".to_owned()).or_default().push(time);
+        for (joint, name) in JOINT_NAMES.iter().enumerate() {
+            let phase = joint as f64;
+            let side = (TAU * (0.9 + 0.05 * phase) * time + phase).sin().signum();
+            let offset = amplitude * side * (1.0 + 0.5 * (0.7 * time + phase).sin());
+            let cell = go2().control.default_pose[joint] + offset;
+            columns.entry(format!("q_cmd_{name}")).or_default().push(cell);
+        }
+    }
+    let segments = vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }];
+    let mut meta = Meta::new(RATE_HZ, TauSensor::Current, segments);
+    meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
+    (meta.kp, meta.kd) = (Some(Gain::Same(25.0)), Some(Gain::Same(0.6)));
+    let motion = Log::new_motion(meta, columns).unwrap();
+    let robot = robot();
+    let backend = |_| {
+        let config = SimConfig { engine: Engine::Batch, base: Base::Fixed, threads: 1, ..SimConfig::default() };
+        BatchBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)))
+    };
+    let exact =
+        record(&motion, &robot, None, backend, "a robot that acts late and saturates".to_owned(), &mut |_| true)
+            .unwrap();
+    measured(&exact, &[Sensor { quantity: "tau_measured", sigma: NOISE, step: 0.0 }], 1).unwrap()
+}
+
+fn fit(log: &Path, out: &Path, more: &[&str]) -> Output {
+    let files = ["fit", log.to_str().unwrap(), "--out", out.to_str().unwrap()];
+    twinstep(&[&files, more].concat())
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+#[test]
+fn ensemble_predicts_late_and_saturating_drives_and_disagrees_where_it_has_not_been() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, out, plot) =
+        (folder.path().join("air.parquet"), folder.path().join("air.safetensors"), folder.path().join("curves.svg"));
+    let gentle = log(0.1);
+    gentle.write(&path).unwrap();
+    let small = ["--members", "2", "--hidden", "8", "--epochs", "12", "--plot", plot.to_str().unwrap()];
+    let output = fit(&path, &out, &small);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(text.contains("mixture, scaled") && text.contains("epochs of each member: "), "{text}");
+    assert!(std::fs::read_to_string(&plot).unwrap().contains("networks learn"));
+
+    let ensemble = Ensemble::read(&out).unwrap();
+    let euf = |data: &DataSet| {
+        let (mut error, mut ideal, mut sum, mut count) = (0.0, 0.0, 0.0, 0.0);
+        for (run, rows) in data.runs(Block::Test).zip(ensemble.predict(data.runs(Block::Test))) {
+            let unseen = run.torques.len() - rows.len();
+            for ((members, torque), [dq, ddq]) in rows.iter().zip(&run.torques[unseen..]).zip(&run.errors[unseen..]) {
+                let (means, variances): (Vec<_>, Vec<_>) =
+                    members.iter().map(|member| (member.mean, member.variance)).unzip();
+                error += (means.iter().sum::<f64>() / means.len() as f64 - torque).powi(2);
+                ideal += (25.0 * dq + 0.6 * ddq - torque).powi(2);
+                sum += disagreement(&means, &variances);
+                count += 1.0;
+            }
+        }
+        [(error / count).sqrt(), (ideal / count).sqrt(), sum / count]
+    };
+    let [error, ideal, seen] = euf(&DataSet::new(&[("gentle".to_owned(), gentle)]).unwrap());
+    assert!(error < 0.3 * ideal, "{error} N·m, of the gains alone {ideal} N·m");
+    let [_, _, unseen] = euf(&DataSet::new(&[("violent".to_owned(), log(0.3))]).unwrap());
+    assert!(unseen > 2.0 * seen, "disagreement {seen} where it was, {unseen} where it was not");
+}
+
+#[test]
+fn interrupted_training_goes_on_to_the_same_bits() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("air.csv");
+    log(0.1).write(&path).unwrap();
+    let [once, twice] = ["once", "twice"].map(|name| folder.path().join(name));
+    let settings = ["--members", "2", "--hidden", "4", "--epochs", "40"];
+    let whole = fit(&path, &once, &settings);
+    assert!(whole.status.success(), "{}", stderr(&whole));
+
+    let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
+    let files = ["fit", path.to_str().unwrap(), "--out", twice.to_str().unwrap()];
+    let mut ended = Command::new(programs.0.join("twinstep")).args(files).args(settings).spawn().unwrap();
+    // Once it has saved itself; wherever it is by then, the result has to be the same.
+    let saved = folder.path().join("twice.training");
+    while !std::fs::read(&saved).is_ok_and(|content| !content.is_empty()) && ended.try_wait().unwrap().is_none() {
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    Command::new("kill").args(["-INT", &ended.id().to_string()]).status().unwrap();
+    let code = ended.wait().unwrap().code();
+    if code == Some(130) {
+        let resumed = fit(&path, &twice, &[&settings[..], &["--resume"]].concat());
+        assert!(resumed.status.success(), "{}", stderr(&resumed));
+    } else {
+        assert_eq!(code, Some(0));
+    }
+    assert_eq!(std::fs::read(once).unwrap(), std::fs::read(twice).unwrap());
+}
+
+#[test]
+fn logs_that_cannot_be_learnt_from_are_refused_with_the_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("none.safetensors");
+    let chirps = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().join("data/go2_air_chirp");
+    let output = fit(&chirps, &out, &[]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(stderr(&output).contains("has no measured torque"), "{}", stderr(&output));
+    assert!(!out.exists());
+
+    let path = folder.path().join("air.csv");
+    log(0.1).write(&path).unwrap();
+    let output = fit(&path, &out, &["--resume"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(stderr(&output).contains("none.safetensors.training"), "{}", stderr(&output));
+}
