@@ -78,7 +78,7 @@ fn ensemble_predicts_late_and_saturating_drives_and_disagrees_where_it_has_not_b
         (folder.path().join("air.parquet"), folder.path().join("air.safetensors"), folder.path().join("curves.svg"));
     let gentle = log(0.1);
     gentle.write(&path).unwrap();
-    let small = ["--members", "2", "--hidden", "8", "--epochs", "12", "--plot", plot.to_str().unwrap()];
+    let small = ["--members", "2", "--hidden", "8", "--epochs", "40", "--plot", plot.to_str().unwrap()];
     let output = fit(&path, &out, &small);
     assert!(output.status.success(), "{}", stderr(&output));
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
