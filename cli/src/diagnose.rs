@@ -17,7 +17,7 @@ use crate::report::write;
 ///
 /// Simulations of the log's commands are compared with what was measured. Every effect of the catalogue is tried on every
 /// joint, leg, side and type of joint; what explains most is fitted on one half of the log's seconds and judged on the other,
-/// and is named only if its evidence is more than chance and it explains a good part of the error. Then the search goes on
+/// and is named only if its evidence is above a threshold and it explains a good part of the error. Then the search goes on
 /// from there. A name is not given when nothing is wrong, or when the cause is not in the catalogue: then the report says what
 /// the error depends on.
 ///

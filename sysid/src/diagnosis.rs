@@ -48,7 +48,7 @@ pub struct Cause {
     pub held_out_gain: f64,
     /// Evidence for it on held-out blocks [nats].
     pub score_nats: f64,
-    /// It had to be more: healthy robots of `twinstep hunt` stay below.
+    /// It had to be more: a constant.
     pub threshold_nats: f64,
     /// Effects with scope, as in `armature@calf`, that explain as much: this log cannot tell.
     pub ambiguous_with: Vec<String>,

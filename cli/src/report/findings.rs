@@ -112,8 +112,8 @@ pub fn ranking(diagnosis: &Diagnosis) -> String {
          <thead><tr><th>hypothesis</th><th>gain on held-out data</th><th></th><th>evidence</th></tr></thead>\n\
          <tbody>\n{rows}</tbody></table></div>\n\
          <p class=\"note\">Gain: the share of the error, where the effect acts, that goes away on data that was held \
-         out. Each finding is added to those above it, and its rivals stand in its place. Evidence has to be more than \
-         healthy robots reach by chance.</p>\n</section>\n"
+         out. Each finding is added to those above it, and its rivals stand in its place. Evidence has to be more \
+         than a threshold that is the same for every log.</p>\n</section>\n"
     )
 }
 

@@ -111,7 +111,7 @@ proptest! {
         for (index, tau) in torques.iter().enumerate() {
             let [from, to] = [index, index + 1].map(|index| index as f64 * DT);
             let mean = 2.0 * (area(to) - area(from)) / DT;
-            prop_assert!((tau - mean).abs() < 1e-9, "{tau}, the step's mean is {mean}");
+            prop_assert!((tau - mean).abs() < 1e-12, "{tau}, the step's mean is {mean}");
         }
     }
 
