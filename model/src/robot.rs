@@ -223,13 +223,6 @@ pub struct Contact {
     pub damping_ratio: f64,
 }
 
-impl Contact {
-    /// Natural frequency of the contact [Hz].
-    pub fn natural_frequency(&self) -> f64 {
-        1.0 / (std::f64::consts::TAU * self.time_constant * self.damping_ratio)
-    }
-}
-
 /// How a policy's action becomes a command, and how the drive follows it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Control {

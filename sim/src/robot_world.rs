@@ -10,16 +10,20 @@
 //! - *Reset.* Contact caches and joint coordinates survive an in-place reset, so a robot is placed by building its world
 //!   anew (31 µs); where it stood before can then not matter.
 
+use std::f64::consts::TAU;
+
 use glam::{DVec3, Quat, Vec3};
 use rapier3d::prelude::*;
 use twinstep_model::lanes::{Commands, Drive, JointForces};
 use twinstep_model::{
-    Command, Joint, JointKind, Leg, NUM_JOINTS, PerJoint, PerLeg, Placement, RigidBody, RobotModel, frames,
+    Command, Contact, Joint, JointKind, Leg, NUM_JOINTS, PerJoint, PerLeg, Placement, RigidBody, RobotModel, frames,
 };
 
 use crate::ground_shapes::GroundShapes;
 use crate::{Base, SimConfig};
 
+/// MuJoCo's default impedance of a contact, deep inside.
+const IMPEDANCE: f64 = 0.95;
 /// Stiffness of the spring that carries a joint's torque [N·m/rad].
 const TORQUE_SPRING: f32 = 1e-3;
 /// Axis of a revolute joint's rotation in rapier's six-axis layout.
@@ -310,8 +314,7 @@ pub struct BaseState {
 }
 
 fn integration_parameters(robot: &RobotModel, config: &SimConfig) -> IntegrationParameters {
-    let softness =
-        SpringCoefficients::new(robot.contact.natural_frequency() as f32, robot.contact.damping_ratio as f32);
+    let softness = softness(&robot.contact);
     IntegrationParameters {
         dt: 1.0 / config.physics_hz() as f32,
         num_solver_iterations: config.solver_iterations() as usize,
@@ -320,6 +323,14 @@ fn integration_parameters(robot: &RobotModel, config: &SimConfig) -> Integration
         static_contact_softness: softness,
         ..IntegrationParameters::default()
     }
+}
+
+/// rapier's spring for a contact that is as soft as MuJoCo's. MuJoCo's impedance d leaves 1 − d of the acceleration to the
+/// load: what holds a load is a spring and a damper that are d / (1 − d) times as hard as those that its time constant says.
+fn softness(contact: &Contact) -> SpringCoefficients<f32> {
+    let left = (1.0 - IMPEDANCE).sqrt();
+    let frequency = 1.0 / (TAU * contact.time_constant * contact.damping_ratio * left);
+    SpringCoefficients::new(frequency as f32, (contact.damping_ratio / left) as f32)
 }
 
 fn insert_ground(world: &mut PhysicsWorld, ground: &GroundShapes, friction: f32) {

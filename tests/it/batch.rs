@@ -65,6 +65,13 @@ fn motion(backend: &mut impl Backend, height: f32, target: fn(usize) -> PerJoint
     (0..SECOND).map(|period| play(target(period), 1)).collect()
 }
 
+/// Of the trunk of a robot that stands [m].
+fn standing_height(backend: &mut impl Backend) -> f32 {
+    backend.reset(&[(0, Placement::at_rest(0.335, pose()))]).unwrap();
+    backend.step(&[Command::hold(pose(), 40.0, 1.0)], &[true], 3 * SECOND).unwrap();
+    backend.states().base_position[0][2]
+}
+
 fn rms_difference(one: &[PerJoint], other: &[PerJoint]) -> f32 {
     let pairs = one.iter().flatten().zip(other.iter().flatten());
     (pairs.map(|(one, other)| (one - other).powi(2)).sum::<f32>() / (one.len() * NUM_JOINTS) as f32).sqrt()
@@ -92,6 +99,20 @@ fn stance_step_is_as_in_rapier() {
 #[test]
 fn trot_is_as_in_rapier() {
     check(Base::Floating, 0.335, trot_target, 0.02);
+}
+
+#[test]
+fn robot_sinks_as_deep_into_soft_ground_as_in_rapier() {
+    let mut robot = go2();
+    robot.contact.time_constant = 0.05;
+    let config = || at(1000, 4, Base::Floating);
+    let hard = standing_height(&mut batch(config(), 1));
+    let [ours, rapier] = [
+        hard - standing_height(&mut BatchBackend::new(robot.clone(), config(), 1).unwrap()),
+        hard - standing_height(&mut RapierBackend::new(robot.clone(), config(), 1).unwrap()),
+    ];
+    println!("{ours} m, in rapier {rapier} m");
+    assert!(ours > 0.005 && (rapier / ours - 1.0).abs() < 0.4, "{ours} m, in rapier {rapier} m");
 }
 
 #[test]
