@@ -178,7 +178,7 @@ pub fn identify(
     }
     let last = task.residuals(simulator, std::slice::from_ref(&point)).remove(0).unwrap_or_else(|| first.clone());
     let here = Task { spread: &spread, ..task }.linear(simulator, &point);
-    let spread = here.and_then(|here| covariance(&here, &blocks(experiments)));
+    let spread = here.and_then(|here| covariance(&here, &blocks(experiments), &[]));
     let mut found = with_values(&file, &free, &point);
     let (findings, confusable) = judge(&all, &predicted, &told, &free, &point, &begin, spread.as_ref());
     let intervals: Vec<_> = findings.iter().map(|finding| finding.interval).collect();

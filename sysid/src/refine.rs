@@ -66,8 +66,9 @@ pub fn information(here: &Linear) -> DMatrix<f64> {
 /// Covariance of the estimate, in prior deviations. Residuals in a block may depend on each other; blocks do not.
 ///
 /// The sandwich `A⁻¹ B A⁻¹` with `B = Σ g gᵀ` over blocks, which holds when residuals are not white and the model is not
-/// quite right (White 1982); never less than `A⁻¹`.
-pub fn covariance(here: &Linear, blocks: &[usize]) -> Option<DMatrix<f64>> {
+/// quite right (White 1982); never less than `A⁻¹`. And what each of `errors` would move it: residuals that an error which any
+/// robot may have makes, of one standard deviation.
+pub fn covariance(here: &Linear, blocks: &[usize], errors: &[Vec<f64>]) -> Option<DMatrix<f64>> {
     let count = here.slopes.ncols();
     let inverse = information(here).cholesky()?.inverse();
     let mut gradients = std::collections::BTreeMap::<usize, DVector<f64>>::new();
@@ -87,6 +88,10 @@ pub fn covariance(here: &Linear, blocks: &[usize]) -> Option<DMatrix<f64>> {
             let grown = |k: usize| (inverse[(k, k)] / sandwich[(k, k)]).max(1.0).sqrt();
             covariance[(i, j)] *= grown(i) * grown(j);
         }
+    }
+    for error in errors {
+        let moved = &inverse * here.slopes.tr_mul(&DVector::from_column_slice(error));
+        covariance += &moved * moved.transpose();
     }
     Some(covariance)
 }

@@ -105,6 +105,19 @@ impl Tolerances {
         Self::of(self.starts.iter().map(|start| start.divided(spread)).collect::<Option<_>>()?, slopes)
     }
 
+    /// What each of the robot's errors, of one standard deviation, does to residuals that are divided by `spread` and have
+    /// what is `taken` out of them.
+    pub fn robot_errors(&self, spread: &[f64], taken: Option<&Self>) -> Vec<Vec<f64>> {
+        let error = |slopes: nalgebra::DVectorView<f64>| {
+            let mut residuals: Vec<f64> = slopes.iter().zip(spread).map(|(slope, spread)| slope / spread).collect();
+            if let Some(taken) = taken {
+                taken.take(&mut residuals);
+            }
+            residuals
+        };
+        self.slopes.column_iter().map(|column| error(column.as_view())).collect()
+    }
+
     /// Takes out of residuals what the errors explain; what that costs is added at their end, to be squared like the others.
     pub fn take(&self, residuals: &mut Vec<f64>) {
         for errors in self.starts.iter().chain([&self.robot]) {

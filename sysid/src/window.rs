@@ -29,6 +29,8 @@ impl Horizon {
     pub const IDENTIFICATION: Self = Self { length_s: 1.0, held_s: f64::INFINITY, settling_s: 0.2 };
     /// With windows for a held trunk too: a loop that rings is out of step after a second or two, whatever the model.
     pub const DIAGNOSIS: Self = Self { held_s: 2.0, ..Self::IDENTIFICATION };
+    /// And where the model's does not ring at all, only what is nearly right would stay in step for as long.
+    pub const LOST: Self = Self { held_s: 0.6, ..Self::IDENTIFICATION };
 }
 
 /// Height at which a held trunk hangs [m].

@@ -2,7 +2,7 @@
 //! set aside.
 
 use twinstep_logs::Log;
-use twinstep_model::{NUM_JOINTS, RobotModel, Rollout};
+use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout};
 
 use super::leftover::{GYRO, Leftover, TORQUE, TRUNK};
 use super::rows::{Rows, fold_of};
@@ -13,6 +13,8 @@ use crate::window::Horizon;
 
 /// Errors of a torque of this size, beside the noise, are any simulator's [N·m].
 const MISFIT_NM: f64 = 0.02;
+/// Share of a joint's motion that a model may miss before it is lost.
+const LOST: f64 = 0.5;
 /// Rows this long apart [s] are independent: positions, torques, the trunk, and its gyroscope, which has more noise than error.
 const INDEPENDENT_S: [f64; 4] = [0.2, 0.1, 0.5, 0.05];
 
@@ -29,10 +31,10 @@ pub struct Evidence {
 }
 
 impl Evidence {
-    /// `logs` of a robot with the gains and rates of `robot`.
-    pub fn new(logs: Vec<Log>, robot: &RobotModel) -> Result<Self, ExperimentError> {
+    /// `logs` of a robot with the gains and rates of `robot`, in windows of `horizon`.
+    pub fn new(logs: Vec<Log>, robot: &RobotModel, horizon: Horizon) -> Result<Self, ExperimentError> {
         let experiments: Vec<Experiment> =
-            logs.iter().map(|log| Experiment::new(log, robot, Horizon::DIAGNOSIS)).collect::<Result<_, _>>()?;
+            logs.iter().map(|log| Experiment::new(log, robot, horizon)).collect::<Result<_, _>>()?;
         let only = |keep: &dyn Fn(Option<usize>) -> bool| -> Vec<Experiment> {
             let pairs = logs.iter().zip(&experiments);
             pairs.map(|(log, experiment)| experiment.clone().only(|row| keep(fold_of(log, row)))).collect()
@@ -58,6 +60,22 @@ impl Evidence {
                 self.quick.tolerances.clone_from(&self.whole.tolerances);
             }
         }
+    }
+
+    /// Whether some joint is not followed at all by what leaves so much: as if it hung still, or worse.
+    pub fn is_lost(&self, left: &Leftover) -> bool {
+        let log = &self.logs[0];
+        (0..NUM_JOINTS).any(|joint| {
+            let rows: f64 = left.counts[joint].iter().sum();
+            let sigma = self.whole.unit_of_position(joint);
+            let error = left.sums[joint].iter().sum::<f64>() / rows.max(1.0) * sigma * sigma;
+            log.q(JOINT_NAMES[joint]).is_some_and(|q| error > LOST * variance(q))
+        })
+    }
+
+    /// The logs.
+    pub fn into_logs(self) -> Vec<Log> {
+        self.logs
     }
 
     /// The logs.
@@ -110,9 +128,16 @@ impl Evidence {
     }
 }
 
+fn variance(values: &[f64]) -> f64 {
+    let finite = || values.iter().filter(|value| value.is_finite());
+    let count = finite().count().max(1) as f64;
+    let mean = finite().sum::<f64>() / count;
+    finite().map(|value| (value - mean).powi(2)).sum::<f64>() / count
+}
+
 /// Noise of the torques that measured states make, beside the sensor's own and any simulator's misfit [N·m].
 fn torque_sigma(log: &Log, robot: &RobotModel) -> [f64; NUM_JOINTS] {
-    twinstep_model::JOINT_NAMES.map(|name| {
+    JOINT_NAMES.map(|name| {
         let noise = |channel: &str, assumed: f64| {
             log.noise(&format!("{channel}_{name}")).filter(|sigma| *sigma > 0.0).unwrap_or(assumed)
         };

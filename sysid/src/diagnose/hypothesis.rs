@@ -33,12 +33,12 @@ impl Hypothesis {
         share(self.effect, &self.values) >= own.map_or(LEAST_SHARE, |(_, least)| *least)
     }
 
-    /// Whether a robot may have it: no value is further than half the plausible range outside of it.
+    /// Whether a robot may have it: no value is half as far again from none of it as the plausible range goes.
     pub fn is_plausible(&self) -> bool {
         let parameters = self.effect.parameters.iter().flat_map(|one| std::iter::repeat_n(one, one.count));
         parameters.zip(&self.values).all(|(parameter, value)| {
             let [low, high] = parameter.plausible;
-            let beyond = 0.5 * (high - low);
+            let beyond = 0.5 * (high - parameter.neutral).max(parameter.neutral - low);
             // An infinite one is none of it.
             if parameter.neutral.is_infinite() {
                 *value >= 0.5 * low
@@ -112,6 +112,19 @@ pub fn sizes(effect: &Effect) -> Vec<Vec<f64>> {
     let [least, most] = main.bounds;
     let firsts = firsts.into_iter().map(|first| first.clamp(least, most));
     firsts.flat_map(|first| seconds.iter().map(move |second| [&[first][..], second].concat())).collect()
+}
+
+/// Values to try of an effect on one scope, from small to large. Delays and lags with which a loop rings stay in step only
+/// where they are nearly right: of those there are more.
+pub fn sizes_on_one_scope(effect: &Effect) -> Vec<Vec<f64>> {
+    let coarse = match effect.target {
+        Target::Joints | Target::Supply if effect.name != "encoder_offset" => sizes(effect),
+        _ => return whole_sizes(effect),
+    };
+    if !["command_delay", "torque_delay", "drive_lag"].contains(&effect.name) {
+        return coarse;
+    }
+    coarse.iter().flat_map(|values| [0.8, 1.0, 1.25].map(|factor| vec![factor * values[0]])).collect()
 }
 
 /// Values to try of an effect that is judged by the whole log; each component of a vector alone.

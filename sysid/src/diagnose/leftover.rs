@@ -30,9 +30,16 @@ impl Leftover {
         Self { sums: [[0.0; 2]; CHANNELS], counts: [[0.0; 2]; CHANNELS], tolerated: [0.0; 2] }
     }
 
-    /// How much less tolerated errors cost than `before` [nats].
+    /// How much less tolerated errors cost than `before` [nats]. Where more than noise is left, the errors that explain a part
+    /// of it are as uncertain.
     pub fn tolerated_gain(&self, before: &Self) -> f64 {
-        before.tolerated.iter().sum::<f64>() - self.tolerated.iter().sum::<f64>()
+        let cost = |left: &Self| left.tolerated.iter().sum::<f64>() / left.power().max(1.0);
+        cost(before) - cost(self)
+    }
+
+    /// Mean power of all rows, in units of noise and misfit.
+    fn power(&self) -> f64 {
+        self.sums.iter().flatten().sum::<f64>() / self.counts.iter().flatten().sum::<f64>().max(1.0)
     }
 
     /// Adds a difference, in units of noise and misfit, of a row in a fold; none is set aside.

@@ -25,15 +25,18 @@ mod words;
 
 use twinstep_logs::Log;
 use twinstep_model::effects::{Effect, Scope, Target};
-use twinstep_model::{ModelFile, Precision, RobotModel, Rollout};
+use twinstep_model::{Joint, ModelFile, Precision, RobotModel, Rollout};
 
 use crate::diagnosis::{Cause, Confusable, Diagnosis, Errors};
 use crate::evaluate::evaluate;
 use crate::experiment::ExperimentError;
 use crate::identify::blocks;
 use crate::refine::{SIMULATORS, covariance};
+use crate::tolerance::Tolerances;
+use crate::window::Horizon;
 use evidence::Evidence;
 use hypothesis::Hypothesis;
+use leftover::{Leftover, TORQUE};
 pub use next::NextMotion;
 pub use rivalry::Rivalry;
 use scan::{Scored, scan};
@@ -48,12 +51,19 @@ const MOST_CAUSES: usize = 5;
 const MOST_SEARCHES: usize = 10;
 /// Hypotheses about joints that are tried in full.
 const TRIED: usize = 5;
-/// And about the trunk, the ground and the gyroscope.
+/// And about the trunk, the ground and the gyroscope, and about encoders.
 const TRIED_OF_WHOLE: usize = 2;
 /// Share of the power above noise that a cause has to explain.
 const LEAST_SHARE: f64 = 0.3;
-/// A rival this close [nats] cannot be told from the cause.
+/// Share of the power above noise at a cause's own joints that may stay when all is named, and power in units of noise that
+/// is too little to tell. A gain that grows with the error is followed a part of the way by one that is higher.
+const MOST_LEFT: f64 = 0.5;
+const TOO_LITTLE: f64 = 1.0;
+/// A rival this close [nats], or within this share of the cause's own evidence, cannot be told from the cause: simulators of
+/// one law differ by as much.
 const CLOSE: f64 = 6.0;
+const CLOSE_SHARE: f64 = 0.05;
+
 /// Why there is no diagnosis.
 #[derive(Debug, thiserror::Error)]
 pub enum DiagnoseError {
@@ -93,9 +103,13 @@ pub fn diagnose(
     progress: &mut Progress,
 ) -> Result<Diagnosed, DiagnoseError> {
     let robot = model.robot_model()?;
-    let mut evidence = Evidence::new(logs, &robot)?;
-    if evidence.leftover(simulator, &robot).diverged() {
+    let mut evidence = Evidence::new(logs, &robot, Horizon::DIAGNOSIS)?;
+    let left = evidence.leftover(simulator, &robot);
+    if left.diverged() {
         return Err(DiagnoseError::Diverges);
+    }
+    if evidence.is_lost(&left) {
+        evidence = Evidence::new(evidence.into_logs(), &robot, Horizon::LOST)?;
     }
     let mut say = |text: &str| if progress(text) { Ok(()) } else { Err(DiagnoseError::Ended) };
     say("the ground, and errors of any robot")?;
@@ -104,6 +118,7 @@ pub fn diagnose(
     let given = evidence.leftover(simulator, &robot);
     let mut search = Search {
         evidence: &evidence,
+        given: &given,
         judged: judged.clone(),
         accepted: Accepted::new(),
         model: judged.clone(),
@@ -138,6 +153,8 @@ type Accepted = Vec<(Trial, Vec<Trial>)>;
 /// The search for causes.
 struct Search<'a> {
     evidence: &'a Evidence,
+    /// What the given model leaves.
+    given: &'a Leftover,
     /// The given model on ground that suits the log.
     judged: ModelFile,
     accepted: Accepted,
@@ -148,8 +165,8 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// One cause after the other, until none earns a name. What is left too small, or is more than any robot has, when all are
-    /// fitted together was two others in disguise: it goes, and the search goes on without it.
+    /// One cause after the other, until none earns a name. What is left too small, or is more than any robot has, or does not
+    /// explain its own joints when all are fitted together was another in disguise: it goes, and the search goes on without it.
     fn run(&mut self) -> Result<(), DiagnoseError> {
         let mut excluded = Vec::new();
         for _ in 0..MOST_SEARCHES {
@@ -170,8 +187,14 @@ impl Search<'_> {
     }
 
     /// A cause that does not stand when all are fitted together.
-    fn untenable(&self) -> Option<usize> {
-        let stands = |hypothesis: &Hypothesis| hypothesis.is_large_enough() && hypothesis.is_plausible();
+    fn untenable(&mut self) -> Option<usize> {
+        let robot = self.model.robot_model().expect("fitted within its bounds");
+        let left = self.evidence.leftover(self.simulator, &robot);
+        let stands = |hypothesis: &Hypothesis| {
+            hypothesis.is_large_enough()
+                && hypothesis.is_plausible()
+                && explains_its_joints(hypothesis, self.given, &left)
+        };
         self.accepted.iter().position(|(best, _)| !stands(&best.hypothesis))
     }
 
@@ -180,19 +203,44 @@ impl Search<'_> {
         let left = self.evidence.leftover(self.simulator, &self.model.robot_model()?);
         let named = self.accepted.len();
         (self.say)(&format!("scanning, {named} named"))?;
-        let mut trials = Vec::new();
-        let mut tried = candidates(self.evidence, &self.model, self.simulator);
-        tried.retain(|hypothesis| !excluded.contains(&hypothesis.name()));
-        for hypothesis in tried {
-            (self.say)(&format!("trying {}, {named} named", hypothesis.name()))?;
-            trials.extend(trial(self.evidence, &self.model, &left, &hypothesis, self.simulator));
+        let candidates = candidates(self.evidence, &self.model, self.simulator);
+        let mut trials = self.tried(candidates, excluded, &left)?;
+        if let Some(best) = trials.first().filter(|best| best.score >= THRESHOLD) {
+            // What the best is taken for, which one simulation of all joints may have missed.
+            let names: Vec<String> = trials.iter().map(|trial| trial.hypothesis.name()).collect();
+            let alike = scan::alike(self.evidence, &self.model, &best.hypothesis, &names, &left, self.simulator);
+            trials.extend(self.tried(alike, excluded, &left)?);
+            trials.sort_by(best_first);
         }
-        trials.sort_by(|one, other| other.score.total_cmp(&one.score));
         let earns_name = |trial: &Trial| {
             trial.score >= THRESHOLD && trial.explains >= LEAST_SHARE && trial.hypothesis.is_large_enough()
         };
         let place = trials.iter().position(earns_name);
         Ok(place.map(|place| (trials.remove(place), trials)))
+    }
+
+    /// Trials of hypotheses, the best first, of what leaves `left`.
+    fn tried(
+        &mut self,
+        hypotheses: Vec<Hypothesis>,
+        excluded: &[String],
+        left: &Leftover,
+    ) -> Result<Vec<Trial>, DiagnoseError> {
+        let mut trials = Vec::new();
+        for hypothesis in hypotheses {
+            if !self.is_out(&hypothesis, excluded) {
+                (self.say)(&format!("trying {}, {} named", hypothesis.name(), self.accepted.len()))?;
+                trials.extend(trial(self.evidence, &self.model, left, &hypothesis, self.simulator));
+            }
+        }
+        trials.sort_by(best_first);
+        Ok(trials)
+    }
+
+    /// Whether a hypothesis did not stand, or is named.
+    fn is_out(&self, hypothesis: &Hypothesis, excluded: &[String]) -> bool {
+        let named = |accepted: &Trial| accepted.hypothesis.name() == hypothesis.name();
+        excluded.contains(&hypothesis.name()) || self.accepted.iter().any(|(accepted, _)| named(accepted))
     }
 
     /// Fits all that is accepted together.
@@ -204,6 +252,23 @@ impl Search<'_> {
         self.model = fit.model(&point);
         take_values(&mut self.accepted, &fit, &point);
     }
+}
+
+fn best_first(one: &Trial, other: &Trial) -> std::cmp::Ordering {
+    other.score.total_cmp(&one.score)
+}
+
+/// Whether most of what was wrong at the joints of a cause is explained, in their positions and in their torques.
+fn explains_its_joints(hypothesis: &Hypothesis, given: &Leftover, left: &Leftover) -> bool {
+    if hypothesis.effect.target != Target::Joints {
+        return true;
+    }
+    let joints = || Joint::ALL.iter().filter(|joint| hypothesis.scope.contains(**joint)).map(|joint| joint.index());
+    [0, TORQUE].into_iter().all(|first| {
+        let excess = |left: &Leftover| joints().map(|joint| left.channel_excess(first + joint)).sum::<f64>();
+        let rows: f64 = joints().flat_map(|joint| left.counts[first + joint]).sum();
+        excess(left) <= TOO_LITTLE * rows || excess(left) <= MOST_LEFT * excess(given)
+    })
 }
 
 /// Writes the values of a fit of all causes into them.
@@ -231,16 +296,17 @@ fn on_fitted_ground(evidence: &Evidence, model: &ModelFile, simulator: &mut dyn 
 
 /// What is tried in full: the best of the scan, of the joints and of the rest, which have seen different parts of the logs.
 fn candidates(evidence: &Evidence, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<Hypothesis> {
-    let (joints, whole): (Vec<_>, Vec<_>) =
-        scan(evidence, model, simulator).into_iter().filter(|scored| scored.score > 0.0).partition(|scored| {
-            let effect = scored.hypothesis.effect;
-            matches!(effect.target, Target::Joints | Target::Supply) && effect.name != "encoder_offset"
-        });
+    let scored = scan(evidence, model, simulator).into_iter().filter(|scored| scored.score > 0.0);
+    let (offsets, others): (Vec<_>, Vec<_>) =
+        scored.partition(|scored| scored.hypothesis.effect.name == "encoder_offset");
+    let (joints, whole): (Vec<_>, Vec<_>) = others
+        .into_iter()
+        .partition(|scored| matches!(scored.hypothesis.effect.target, Target::Joints | Target::Supply));
     let tried = |scored: Vec<Scored>, most: usize| {
         let least = 0.3 * scored.first().map_or(0.0, |best| best.score);
         scored.into_iter().filter(move |scored| scored.score >= least).take(most).map(|scored| scored.hypothesis)
     };
-    tried(joints, TRIED).chain(tried(whole, TRIED_OF_WHOLE)).collect()
+    tried(joints, TRIED).chain(tried(whole, TRIED_OF_WHOLE)).chain(tried(offsets, TRIED_OF_WHOLE)).collect()
 }
 
 /// The model with the causes and their 95 % intervals, and what cannot be told apart.
@@ -256,9 +322,13 @@ fn intervals(
     let [Some(on_ground), Some(mut fit)] = fits else { return (model.clone(), Vec::new()) };
     fit.begin = on_ground.to(&evidence.whole, simulator);
     take_values(accepted, &fit, &fit.begin);
-    let here =
-        fit.task(&evidence.whole, simulator, Precision::Double, |task, simulator| task.linear(simulator, &fit.begin));
-    let covariance = here.and_then(|here| covariance(&here, &blocks(&evidence.whole.experiments)));
+    let experiments = &evidence.whole.experiments;
+    let tolerances =
+        fit.model(&fit.begin).robot_model().ok().and_then(|robot| Tolerances::new(experiments, &robot, simulator));
+    let covariance = fit.task(&evidence.whole, simulator, Precision::Double, |task, simulator| {
+        let errors = tolerances.map_or(Vec::new(), |all| all.robot_errors(task.spread, task.tolerances));
+        covariance(&task.linear(simulator, &fit.begin)?, &blocks(experiments), &errors)
+    });
     words::with_intervals(&fit, covariance.as_ref(), SIMULATORS)
 }
 
@@ -277,9 +347,14 @@ fn errors(evidence: &Evidence, robot: &RobotModel, simulator: &mut dyn Rollout) 
     Ok(Errors { torque_rmse_nm: whole(torque), q_rmse_rad: whole(q) })
 }
 
+/// Of the others those that the logs cannot tell from the best.
+fn close<'a>(best: &Trial, others: &'a [Trial]) -> impl Iterator<Item = &'a Trial> {
+    let least = best.score - CLOSE.max(CLOSE_SHARE * best.score);
+    others.iter().filter(move |other| other.score > least)
+}
+
 fn cause(best: &Trial, others: &[Trial], extended: &ModelFile) -> Cause {
     let hypothesis = &best.hypothesis;
-    let close = others.iter().filter(|other| best.score - other.score < CLOSE);
     Cause {
         effect: hypothesis.effect.name.to_owned(),
         scope: hypothesis.scope.to_string(),
@@ -287,7 +362,7 @@ fn cause(best: &Trial, others: &[Trial], extended: &ModelFile) -> Cause {
         held_out_gain: best.gain,
         score_nats: best.score,
         threshold_nats: THRESHOLD,
-        ambiguous_with: close.map(|other| other.hypothesis.name()).collect(),
+        ambiguous_with: close(best, others).map(|other| other.hypothesis.name()).collect(),
         rivals: others.iter().take(5).map(words::rival).collect(),
         evidence: words::evidence(best, others),
     }

@@ -7,7 +7,7 @@ use twinstep_model::{ModelFile, RobotModel, Rollout};
 use super::evidence::Evidence;
 use super::hypothesis::Hypothesis;
 use super::rivalry::Rivalry;
-use super::{Accepted, CLOSE};
+use super::{Accepted, CLOSE, close};
 use crate::diagnosis::{Confusable, NextExperiment, Parted};
 use crate::safe_motions::{SAFE_MOTIONS, SafeMotion};
 
@@ -62,7 +62,7 @@ pub fn next_motion(
 pub fn rivalries(extended: &ModelFile, accepted: &Accepted, confusable: &[Confusable]) -> Vec<Rivalry> {
     let mut rivalries = Vec::new();
     for (best, others) in accepted {
-        let close = others.iter().filter(|other| best.score - other.score < CLOSE);
+        let close = close(best, others);
         rivalries.extend(close.map(|other| rivalry(extended, &best.hypothesis, &other.hypothesis)));
     }
     for pair in confusable {

@@ -13,6 +13,7 @@ use crate::experiment::{ExperimentError, shown_torque};
 use crate::motion::{command, joint_commands};
 use crate::safe_motions::SafeMotion;
 use crate::task::Task;
+use crate::window::Horizon;
 
 /// Parts of the step to a rival's refitted numbers that are tried: a line is only so straight.
 const STEPS: [f64; 4] = [0.0, 0.25, 0.5, 1.0];
@@ -44,7 +45,7 @@ impl Rivalry {
         let nats = [(one, other), (other, one)].map(|(truth, rival)| {
             let robot = self.robot(truth)?;
             let log = simulated(motion, &robot, like, simulator)?;
-            let evidence = Evidence::new(vec![log], &robot).ok()?;
+            let evidence = Evidence::new(vec![log], &robot, Horizon::DIAGNOSIS).ok()?;
             Some(expected(&evidence, &refitted(&self.fit(rival)?, &evidence, simulator)?))
         });
         Some(0.5 * (nats[0]? + nats[1]?))
@@ -52,7 +53,8 @@ impl Rivalry {
 
     /// Evidence of `log` for the first of the two against the second [nats], both fitted to it.
     pub fn achieved(&self, log: Log, simulator: &mut dyn Rollout) -> Result<f64, ExperimentError> {
-        let evidence = Evidence::new(vec![log], &self.model.robot_model().expect("a model that was given is a robot"))?;
+        let robot = self.model.robot_model().expect("a model that was given is a robot");
+        let evidence = Evidence::new(vec![log], &robot, Horizon::DIAGNOSIS)?;
         let [one, other] = self.sides.each_ref().map(|side| {
             let fit = self.fit(side).expect("an effect of the catalogue goes on top of any model");
             let point = fit.to(&evidence.whole, simulator);

@@ -50,6 +50,11 @@ impl Rows {
         Self { experiments, tolerances: None, cells }
     }
 
+    /// What a joint's position is in units of [rad]: noise and misfit.
+    pub fn unit_of_position(&self, joint: usize) -> f64 {
+        MISFIT_RAD.hypot(self.experiments[0].sigma(Quantity::Position(joint)))
+    }
+
     /// What candidates leave of the motion.
     pub fn leftovers(&self, simulator: &mut dyn Rollout, robots: &[RobotModel]) -> Vec<Leftover> {
         let mut whole = vec![Vec::new(); robots.len()];

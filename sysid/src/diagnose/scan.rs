@@ -6,7 +6,7 @@ use twinstep_model::effects::{CATALOGUE, Effect, Entry, Scope, Target};
 use twinstep_model::{Joint, ModelFile, RobotModel, Rollout};
 
 use super::evidence::Evidence;
-use super::hypothesis::{Hypothesis, choice, sizes, whole_sizes, with_effect};
+use super::hypothesis::{Hypothesis, choice, sizes, sizes_on_one_scope, whole_sizes, with_effect};
 use super::leftover::{CHANNELS, Leftover, TORQUE};
 
 /// Scopes of one effect that go on.
@@ -74,6 +74,44 @@ fn scan_effect(
     scored
 }
 
+/// What `best` is taken for, and what is taken for it, on its scope, each with the best of its values; none of `tried`.
+pub fn alike(
+    evidence: &Evidence,
+    model: &ModelFile,
+    best: &Hypothesis,
+    tried: &[String],
+    before: &Leftover,
+    simulator: &mut dyn Rollout,
+) -> Vec<Hypothesis> {
+    let confused = |one: &Effect, other: &Effect| one.confusions.iter().any(|confusion| confusion.with == other.name);
+    let is_new = |effect: &Effect| !tried.contains(&format!("{}@{}", effect.name, best.scope));
+    let effects = CATALOGUE.into_iter().filter(|effect| {
+        let alike = confused(effect, best.effect) || confused(best.effect, effect);
+        alike && effect.target == best.effect.target && is_new(effect)
+    });
+    let scope = best.scope;
+    let of = |effect: &'static Effect| {
+        let built = |values: Vec<f64>| {
+            let mut file = model.clone();
+            file.effects.push(Entry::new(effect, scope, values.clone()).ok()?);
+            Some((values, file.robot_model().ok()?))
+        };
+        let (values, robots): (Vec<_>, Vec<_>) = sizes_on_one_scope(effect).into_iter().filter_map(built).unzip();
+        let scores = evidence.leftovers(simulator, &robots, false).into_iter().map(|now| nats(evidence, &now, before));
+        let best = scores.zip(values).max_by(|one, other| one.0.total_cmp(&other.0));
+        best.map(|(_, values)| Hypothesis { effect, scope, values })
+    };
+    effects.filter_map(of).collect()
+}
+
+/// Evidence of everything [nats].
+fn nats(evidence: &Evidence, now: &Leftover, before: &Leftover) -> f64 {
+    let of = |channel: usize| {
+        [0, 1].map(|fold| now.gain(before, channel, fold, evidence.rows_in_one(channel))).iter().sum::<f64>()
+    };
+    (0..CHANNELS).map(of).sum::<f64>() + now.tolerated_gain(before)
+}
+
 /// Effects that are not of joints, and offsets of encoders: with the trunk held nothing shows of those but gravity.
 fn of_the_whole() -> Vec<(&'static Effect, Scope)> {
     let named = |name: &str| Effect::named(name).expect("an effect of the catalogue");
@@ -94,12 +132,7 @@ fn scan_whole(evidence: &Evidence, model: &ModelFile, robot: &RobotModel, simula
             Some((values, file.robot_model().ok()?))
         };
         let (values, robots): (Vec<_>, Vec<_>) = whole_sizes(effect).into_iter().filter_map(built).unzip();
-        let gains = evidence.leftovers(simulator, &robots, false).into_iter().map(|now| {
-            let of = |channel: usize| {
-                [0, 1].map(|fold| now.gain(&before, channel, fold, evidence.rows_in_one(channel))).iter().sum::<f64>()
-            };
-            (0..CHANNELS).map(of).sum::<f64>() + now.tolerated_gain(&before)
-        });
+        let gains = evidence.leftovers(simulator, &robots, false).into_iter().map(|now| nats(evidence, &now, &before));
         let best = gains.zip(values).max_by(|one, other| one.0.total_cmp(&other.0));
         scored.extend(best.map(|(score, values)| Scored {
             hypothesis: Hypothesis { effect, scope, values },
