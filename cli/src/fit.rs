@@ -7,12 +7,13 @@ use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use plotters::style::text_anchor::HPos;
 use twinstep_ensemble::{
-    Calibration, Checkpoint, Coverage, DataSet, EnsembleError, Epoch, JointInput, Options, Outcome as Ended, Progress,
-    Training,
+    Calibration, Checkpoint, Coverage, DataSet, Ensemble, EnsembleError, Epoch, JointInput, Options, Outcome as Ended,
+    Progress, Training,
 };
 use twinstep_logs::Log;
 
 use crate::chart::{self, GREY, Line, ORANGE, Panel, PlotError};
+use crate::cross;
 use crate::exit::{Failure, Outcome, Signals, input, other};
 
 /// How often a running training is saved.
@@ -33,6 +34,10 @@ const SIZE: (u32, u32) = (900, 600);
 ///
 /// Ctrl-C ends the training and keeps it in OUT.training, from which the same command with --resume goes on; it is saved there
 /// after the first epoch and every 30 s too.
+///
+/// With --cross each log is a stage of a collection of data: an ensemble learns from each alone and is judged by the left-out
+/// stretches of every stage, as in Fig. 2 of U2E. OUT is a folder then, with `1.safetensors` and so on, the grid as
+/// `cross.svg`, and its numbers as `cross.csv`.
 ///
 /// Example: `twinstep fit walk.parquet jump.parquet --out ensemble.safetensors --plot curves.svg`
 #[derive(clap::Args)]
@@ -59,11 +64,14 @@ pub struct Args {
     #[arg(long)]
     resume: bool,
     /// Draw the learning curves.
-    #[arg(long, value_name = "FILE.svg")]
+    #[arg(long, value_name = "FILE.svg", conflicts_with = "cross")]
     plot: Option<PathBuf>,
-    /// The file to write (safetensors).
+    /// Learn from each log alone, and judge each ensemble by every log.
+    #[arg(long)]
+    cross: bool,
+    /// The file to write (safetensors); with --cross the folder.
     #[arg(long, value_name = "FILE")]
-    out: PathBuf,
+    pub out: PathBuf,
 }
 
 /// [`JointInput`] by its name.
@@ -81,26 +89,40 @@ pub fn run(args: &Args) -> Outcome {
         logs.push((path.display().to_string(), Log::open(path).map_err(input)?));
     }
     let data = DataSet::new(&logs).map_err(input)?;
-    let training = Training::new(&data, args.options()).map_err(input)?;
-    // Before the training, not after it: what was learnt must not be lost.
-    check_writable(&args.out).map_err(input)?;
+    if args.cross {
+        return cross::run(&logs, args);
+    }
     args.plot.as_deref().map_or(Ok(()), chart::check_writable).map_err(input)?;
-    let saved = training_file(&args.out);
-    let resume = if args.resume { Some(Checkpoint::read(&saved).map_err(input)?) } else { None };
+    let resume = if args.resume { Some(Checkpoint::read(&training_file(&args.out)).map_err(input)?) } else { None };
+    let (ensemble, curves) = learn(&data, args, &args.out, resume)?;
+    if let Some(path) = &args.plot {
+        chart::write(&curves_svg(&curves).map_err(other)?, path).map_err(other)?;
+    }
+    let epochs: Vec<_> = curves.iter().map(|curve| curve.len().to_string()).collect();
+    println!("epochs of each member: {}", epochs.join(", "));
+    print!("{}", text(&Calibration::of(&ensemble, &data), ensemble.description.variance_scale));
+    println!("written to {}", args.out.display());
+    Ok(())
+}
+
+/// Trains an ensemble and writes it to `out`; what is interrupted is kept beside it.
+pub fn learn(
+    data: &DataSet,
+    args: &Args,
+    out: &Path,
+    resume: Option<Checkpoint>,
+) -> Result<(Ensemble, Vec<Vec<Epoch>>), Failure> {
+    let training = Training::new(data, args.options()).map_err(input)?;
+    // Before the training, not after it: what was learnt must not be lost.
+    check_writable(out).map_err(input)?;
+    let saved = training_file(out);
     match train(&training, args, &saved, resume)? {
         Ended::Trained(ensemble, curves) => {
-            ensemble.write(&args.out).map_err(other)?;
-            if let Some(path) = &args.plot {
-                chart::write(&curves_svg(&curves).map_err(other)?, path).map_err(other)?;
-            }
+            ensemble.write(out).map_err(other)?;
             if saved.exists() {
                 std::fs::remove_file(&saved).map_err(other)?;
             }
-            let epochs: Vec<_> = curves.iter().map(|curve| curve.len().to_string()).collect();
-            println!("epochs of each member: {}", epochs.join(", "));
-            print!("{}", text(&Calibration::of(&ensemble, &data), ensemble.description.variance_scale));
-            println!("written to {}", args.out.display());
-            Ok(())
+            Ok((*ensemble, curves))
         }
         Ended::Ended(checkpoint) => {
             checkpoint.write(&saved).map_err(other)?;
@@ -111,6 +133,11 @@ pub fn run(args: &Args) -> Outcome {
 }
 
 impl Args {
+    /// Whether a training that ended is to go on.
+    pub fn resumes(&self) -> bool {
+        self.resume
+    }
+
     fn options(&self) -> Options {
         let joint_input = match self.joint_input {
             Told::Pooled => JointInput::Pooled,
@@ -122,7 +149,7 @@ impl Args {
 }
 
 /// Where a training that has not ended is kept.
-fn training_file(out: &Path) -> PathBuf {
+pub fn training_file(out: &Path) -> PathBuf {
     let mut name = out.as_os_str().to_owned();
     name.push(".training");
     name.into()

@@ -2,6 +2,7 @@
 
 mod bench;
 mod chart;
+mod cross;
 mod demo;
 mod diagnose;
 mod effect_plot;

@@ -19,6 +19,12 @@ pub enum EnsembleError {
         /// The log.
         log: String,
     },
+    /// Stages that are compared have the same joints.
+    #[error("{log} has measured torque of other joints than the first log; compare stages of the same joints")]
+    OtherJoints {
+        /// The log.
+        log: String,
+    },
     /// The time step is part of a model.
     #[error("{what} has a step of {given} s, the model one of {wanted} s; a network knows its own step only")]
     OtherStep {

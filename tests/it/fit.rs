@@ -108,6 +108,40 @@ fn ensemble_predicts_late_and_saturating_drives_and_disagrees_where_it_has_not_b
 }
 
 #[test]
+fn stages_are_judged_by_each_other_and_what_saw_more_disagrees_less() {
+    let folder = tempfile::tempdir().unwrap();
+    let paths = [("gentle.csv", 0.1), ("violent.csv", 0.3)].map(|(name, amplitude)| {
+        let path = folder.path().join(name);
+        log(amplitude).write(&path).unwrap();
+        path.to_str().unwrap().to_owned()
+    });
+    let out = folder.path().join("cross");
+    let cross = |more: &[&str]| {
+        let settings = ["--cross", "--members", "3", "--hidden", "8", "--epochs", "30", "--out", out.to_str().unwrap()];
+        let output = twinstep(&[&["fit", &paths[0], &paths[1]], &settings[..], more].concat());
+        assert!(output.status.success(), "{}", stderr(&output));
+        std::fs::read_to_string(out.join("cross.csv")).unwrap()
+    };
+    let numbers = cross(&[]);
+    let cells: Vec<Vec<f64>> = numbers
+        .lines()
+        .skip(1)
+        .map(|line| line.split(',').skip(2).map(|cell| cell.parse().unwrap()).collect())
+        .collect();
+    let [gentle_on_gentle, gentle_on_violent, violent_on_gentle, violent_on_violent] = &cells[..] else {
+        panic!("four cells: {numbers}")
+    };
+    assert!(gentle_on_violent[0] > 1.5 * violent_on_violent[0], "{numbers}");
+    assert!(gentle_on_violent[2] > 1.5 * gentle_on_gentle[2], "{numbers}");
+    assert!(violent_on_gentle[0] < gentle_on_violent[0], "{numbers}");
+    assert!(std::fs::read_to_string(out.join("cross.svg")).unwrap().contains("gentle on violent: RMSE"));
+    let written = |name: &str| std::fs::metadata(out.join(name)).unwrap().modified().unwrap();
+    let before = written("2.safetensors");
+    assert_eq!(cross(&["--resume"]), numbers);
+    assert_eq!(written("2.safetensors"), before, "what was learnt is not learnt again");
+}
+
+#[test]
 fn interrupted_training_goes_on_to_the_same_bits() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("air.csv");
