@@ -3,7 +3,7 @@
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 use twinstep_logs::TauSensor;
-use twinstep_model::{Joint, JointKind};
+use twinstep_model::{JOINT_NAMES, Joint, JointKind, stream};
 
 use crate::EnsembleError;
 use crate::data::Run;
@@ -91,6 +91,16 @@ impl Description {
         }
     }
 
+    /// The same for a joint of [`Joint::ALL`]; none where it is not an input, or not known.
+    pub(crate) fn input_of(&self, joint: usize) -> Option<usize> {
+        let name = JOINT_NAMES[joint];
+        match self.joint_input {
+            JointInput::Pooled => None,
+            JointInput::Kind => kind(name),
+            JointInput::Identity => self.joints.iter().position(|known| known == name),
+        }
+    }
+
     /// Fails if a joint is of no kind, where kinds are an input.
     pub(crate) fn check(&self) -> Result<(), EnsembleError> {
         let unknown = self.joints.iter().find(|joint| self.joint_input == JointInput::Kind && kind(joint).is_none());
@@ -104,6 +114,13 @@ fn kind(joint: &str) -> Option<usize> {
 }
 
 impl Ensemble {
+    /// Networks as they are before they learn: a fixed law without a meaning, for tests and measurements.
+    pub fn untrained(description: Description) -> Self {
+        let shape = description.shape();
+        let of = |member| shape.random(&mut stream(description.seed, "weights", member));
+        Self { members: (0..description.members as u64).map(of).collect(), description }
+    }
+
     /// Fails unless rows come every `dt` [s]; `what` is named in the error.
     pub fn check_step(&self, what: &str, dt: f64) -> Result<(), EnsembleError> {
         let wanted = self.description.dt;
