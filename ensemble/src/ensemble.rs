@@ -3,7 +3,7 @@
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 use twinstep_logs::TauSensor;
-use twinstep_model::{JOINT_NAMES, Joint, JointKind, stream};
+use twinstep_model::{JOINT_NAMES, Joint, JointKind};
 
 use crate::EnsembleError;
 use crate::data::Run;
@@ -114,13 +114,6 @@ fn kind(joint: &str) -> Option<usize> {
 }
 
 impl Ensemble {
-    /// Networks as they are before they learn: a fixed law without a meaning, for tests and measurements.
-    pub fn untrained(description: Description) -> Self {
-        let shape = description.shape();
-        let of = |member| shape.random(&mut stream(description.seed, "weights", member));
-        Self { members: (0..description.members as u64).map(of).collect(), description }
-    }
-
     /// Fails unless rows come every `dt` [s]; `what` is named in the error.
     pub fn check_step(&self, what: &str, dt: f64) -> Result<(), EnsembleError> {
         let wanted = self.description.dt;

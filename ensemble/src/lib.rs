@@ -23,6 +23,7 @@
 //! leaves the crate. The step of time is part of a model: one of another step is refused.
 
 mod activation;
+mod by_hand;
 mod calibration;
 mod checkpoint;
 mod data;

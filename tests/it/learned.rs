@@ -11,8 +11,8 @@ use twinstep_env_server::{Config, Host, HostError, SimHost};
 use twinstep_envs::TaskName;
 use twinstep_logs::{Base as LoggedBase, Log, Meta, Segment, TauSensor};
 use twinstep_model::{
-    AutoresetMode, Backend, BackendError, Command as RobotCommand, JOINT_NAMES, ModelFile, Placement, ResetRequest,
-    StepBatch, VecEnv, go2,
+    AutoresetMode, Backend, BackendError, Command as RobotCommand, JOINT_NAMES, LearnedDrive, MemberDraw, ModelFile,
+    Placement, ResetRequest, StepBatch, VecEnv, go2,
 };
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 use twinstep_tests::process::Process;
@@ -106,6 +106,50 @@ fn uncertainty_is_a_reward_and_changes_no_motion() {
         }
     }
     assert!(curious[3].reward.iter().zip(&plain[3].reward).all(|(with, without)| with > without));
+}
+
+/// Largest difference of a standing robot's joints [rad], and of its torques [N·m], from those of its own drives.
+fn away_from_own_drives(tau_sensor: TauSensor) -> [f32; 2] {
+    let description = Description { tau_sensor, ..description() };
+    let settings = LearnedDrive { ensemble: PathBuf::new(), draw: MemberDraw::Step, sample: false };
+    let learned = LearnedRobot::new(&ModelFile::default(), Ensemble::of_gains(description), settings).unwrap();
+    let sim = SimConfig { engine: Engine::Batch, threads: 1, ..SimConfig::default() };
+    let own = BatchBackend::new(go2(), sim, 1).unwrap();
+    let backend = BatchBackend::new(learned.robot.clone(), sim, 1).unwrap();
+    let pose = go2().control.default_pose_f32();
+    let [own, other] = [own, backend.with_drive(Box::new(learned.drives(1, false)))].map(|mut backend| {
+        backend.reset(&[(0, Placement::at_rest(0.34, pose))]).unwrap();
+        let command = RobotCommand::hold(pose.map(|q| q + 0.05), 30.0, 0.75);
+        backend.step(&[command], &[true], 200).unwrap();
+        let states = backend.states();
+        assert!(states.base_position[0][2] > 0.25, "{:?}", states.base_position);
+        [states.q[0], states.tau[0]]
+    });
+    [0, 1].map(|quantity| {
+        own[quantity].iter().zip(&other[quantity]).map(|(one, other)| (one - other).abs()).fold(0.0, f32::max)
+    })
+}
+
+#[test]
+fn robot_stands_on_networks_that_know_its_gains() {
+    let [q, tau] = away_from_own_drives(TauSensor::Current);
+    // The networks bend by some percent of the torque, and differ by one.
+    assert!(q < 0.02 && tau < 0.7, "{q} rad, {tau} N·m");
+    // Without the rotor, which its own drives have, it stands alike.
+    let [q, tau] = away_from_own_drives(TauSensor::Output);
+    assert!(q < 0.02 && tau < 0.7, "{q} rad, {tau} N·m");
+}
+
+#[test]
+fn rotor_is_in_what_was_learnt_behind_it() {
+    for (tau_sensor, rotor) in [(TauSensor::Current, go2().joints[0].armature), (TauSensor::Output, 0.0)] {
+        let (_folder, model) = model_with(Description { tau_sensor, ..description() }, "", "");
+        let learned = LearnedRobot::load(&ModelFile::load(&model).unwrap()).unwrap().unwrap();
+        assert!(learned.robot.joints.iter().all(|joint| joint.armature == rotor));
+        let mut config = config(Engine::Batch, &model, 1);
+        config.randomise.effects = true;
+        assert_eq!(SimHost::new(config).is_ok(), rotor > 0.0);
+    }
 }
 
 /// Steps that robots take from where they are, two of them together.
