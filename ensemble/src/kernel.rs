@@ -8,7 +8,7 @@
 
 use twinstep_model::NUM_JOINTS;
 
-use crate::activation::{wide_exp, wide_sigmoid, wide_softplus, wide_tanh};
+use crate::activation::{wide_exp, wide_softplus, wide_tanh};
 use crate::ensemble::Description;
 use crate::network::VARIANCE_FLOOR;
 use crate::weights::Weights;
@@ -16,6 +16,8 @@ use crate::wide::Wide;
 
 /// Entries of ξ.
 const ERRORS: usize = 2;
+/// What weights of the input, forget, cell and output gate are multiplied by: σ(x) = ½ + ½ tanh(x/2), and halves are exact.
+const HALVED: [f32; 4] = [0.5, 0.5, 1.0, 0.5];
 /// After so many blocks the joints of a block are the same again: 24, 48 and 96 lanes are whole robots.
 pub const PATTERNS: usize = 3;
 
@@ -89,7 +91,7 @@ impl<W: Wide> Kernel<W> {
         let [input, recurrent, bias] =
             ["lstm.input_weight", "lstm.hidden_weight", "lstm.bias"].map(|name| &weights[name]);
         let gates = |array: &[f32], row: usize, unit: usize| -> [f32; 4] {
-            std::array::from_fn(|gate| array[row * width + gate * hidden + unit])
+            std::array::from_fn(|gate| HALVED[gate] * array[row * width + gate * hidden + unit])
         };
         let encoder = (0..hidden).flat_map(|unit| {
             let errors = (0..ERRORS).map(move |row| gates(input, row, unit));
@@ -126,12 +128,12 @@ impl<W: Wide> Kernel<W> {
         }
     }
 
-    /// The active joints hear ξ. `fresh` has room for a state a unit.
+    /// The active joints hear ξ. `room` is for the gates of a unit each.
     #[inline(always)]
-    pub fn advance(&self, block: &mut Block<W>, pattern: usize, fresh: &mut [Pair<W>]) {
+    pub fn advance(&self, block: &mut Block<W>, pattern: usize, room: &mut [[Pair<W>; 4]]) {
         let Block { heard, cells, active, .. } = block;
-        let units = self.encoder.chunks_exact(ERRORS + self.hidden).zip(&self.starts[pattern]).enumerate();
-        for (unit, (weights, start)) in units {
+        let units = self.encoder.chunks_exact(ERRORS + self.hidden).zip(&self.starts[pattern]);
+        for ((weights, start), sums) in units.zip(room.iter_mut()) {
             let mut gates = *start;
             for (weights, heard) in weights.iter().zip(heard.iter()) {
                 for gate in 0..4 {
@@ -141,17 +143,21 @@ impl<W: Wide> Kernel<W> {
                     }
                 }
             }
+            *sums = gates;
+        }
+        let (one, share) = (W::splat(1.0), W::splat(0.5));
+        // Apart from the sums, so that one unit's divisions do not hold up the next one's.
+        for ((gates, cell), state) in room.iter().zip(cells.iter_mut()).zip(&mut heard[ERRORS..]) {
             for half in 0..2 {
-                let [input, forget, output] =
-                    [wide_sigmoid(gates[0][half]), wide_sigmoid(gates[1][half]), wide_sigmoid(gates[3][half])];
-                let before = cells[unit][half];
-                let cell = forget.fused(before, input.times(wide_tanh(gates[2][half])));
-                let state = output.times(wide_tanh(cell));
-                cells[unit][half] = active[half].select_positive(cell, before);
-                fresh[unit][half] = active[half].select_positive(state, heard[ERRORS + unit][half]);
+                // Twice the logistic function of what the gate heard, whose half it is given.
+                let [input, forget] = [wide_tanh(gates[0][half]).plus(one), wide_tanh(gates[1][half]).plus(one)];
+                let before = cell[half];
+                let after = share.times(forget.fused(before, input.times(wide_tanh(gates[2][half]))));
+                let output = wide_tanh(gates[3][half]).fused(share, share);
+                cell[half] = active[half].select_positive(after, before);
+                state[half] = active[half].select_positive(output.times(wide_tanh(after)), state[half]);
             }
         }
-        heard[ERRORS..].copy_from_slice(fresh);
     }
 
     /// What the network says of its joints.

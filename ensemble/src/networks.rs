@@ -64,8 +64,8 @@ pub fn networks(ensemble: &Ensemble, instructions: Instructions) -> Box<dyn Netw
     }
 }
 
-/// Runs a block of a pattern; the last argument is room for its states.
-type Run<W> = fn(&Kernel<W>, &mut Block<W>, usize, Work, &mut [Pair<W>]);
+/// Runs a block of a pattern; the last argument is room for its gates.
+type Run<W> = fn(&Kernel<W>, &mut Block<W>, usize, Work, &mut [[Pair<W>; 4]]);
 type Agree<W> = fn(&mut [[W; 2]], f32) -> W;
 
 /// What is to be done with a block.
@@ -100,7 +100,7 @@ impl<W: Wide> Members<W> {
     /// Runs the blocks for which there is work.
     fn work(&mut self, work: impl Fn(&Block<W>) -> Option<Work>) {
         let Self { hidden, members, run, .. } = self;
-        let run = |room: &mut Vec<Pair<W>>,
+        let run = |room: &mut Vec<[Pair<W>; 4]>,
                    (kernel, pattern, block, work): (&Kernel<W>, usize, &mut Block<W>, Work)| {
             run(kernel, block, pattern, work, room);
         };
@@ -111,7 +111,7 @@ impl<W: Wide> Members<W> {
                 move |(index, block)| work(block).map(|work| (kernel, index % PATTERNS, block, work))
             })
         });
-        let room = || vec![[W::splat(0.0); 2]; *hidden];
+        let room = || vec![[[W::splat(0.0); 2]; 4]; *hidden];
         if rayon::current_thread_index().is_some() && rayon::current_num_threads() > 1 {
             let blocks: Vec<_> = blocks.collect();
             blocks.into_par_iter().with_min_len(BLOCKS_A_THREAD).for_each_init(room, run);
@@ -216,7 +216,7 @@ impl<W: Wide> Networks for Members<W> {
 }
 
 #[inline(always)]
-fn run<W: Wide>(kernel: &Kernel<W>, block: &mut Block<W>, pattern: usize, work: Work, room: &mut [Pair<W>]) {
+fn run<W: Wide>(kernel: &Kernel<W>, block: &mut Block<W>, pattern: usize, work: Work, room: &mut [[Pair<W>; 4]]) {
     if work.advance {
         kernel.advance(block, pattern, room);
     }
@@ -234,7 +234,7 @@ macro_rules! entries {
             block: &mut Block<$wide>,
             pattern: usize,
             work: Work,
-            room: &mut [Pair<$wide>],
+            room: &mut [[Pair<$wide>; 4]],
         ) {
             // SAFETY: `networks` has made sure that the processor has them.
             #[allow(unsafe_code)]
@@ -250,7 +250,7 @@ macro_rules! entries {
             block: &mut Block<$wide>,
             pattern: usize,
             work: Work,
-            room: &mut [Pair<$wide>],
+            room: &mut [[Pair<$wide>; 4]],
         ) {
             run(kernel, block, pattern, work, room);
         }

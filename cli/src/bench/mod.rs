@@ -58,7 +58,7 @@ fn window(text: &str) -> Result<f64, String> {
 }
 
 /// One measured number.
-#[derive(Serialize)]
+#[derive(Clone, Serialize)]
 pub struct Row {
     /// What was measured.
     pub case: String,
