@@ -55,7 +55,7 @@ struct Unwritable {
 
 /// Diagnoses, writes and prints.
 pub fn run(args: &Args) -> Outcome {
-    let model = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load).map_err(input)?;
+    let model = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load_analytic).map_err(input)?;
     let logs = args.logs.iter().map(|path| Log::open(path).map_err(input)).collect::<Result<Vec<_>, _>>()?;
     // Before the search, not after it: what it finds must not be lost.
     std::fs::create_dir_all(&args.out).map_err(|source| input(Unwritable { path: args.out.clone(), source }))?;

@@ -122,7 +122,7 @@ fn resumed(path: &Path) -> Result<Search, NotResumable> {
 
 /// Identifies, prints and writes.
 pub fn run(args: &Args) -> Outcome {
-    let model = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load).map_err(input)?;
+    let model = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load_analytic).map_err(input)?;
     let robot = model.robot_model().map_err(input)?;
     let (mut experiments, mut logs) = (Vec::new(), Vec::new());
     for path in &args.logs {

@@ -3,13 +3,13 @@
 use std::path::PathBuf;
 
 use indicatif::ProgressBar;
+use twinstep_ensemble::LearnedRobot;
 use twinstep_logs::{Base as LoggedBase, Log};
-use twinstep_model::RobotModel;
+use twinstep_model::{Actuator, ModelFile, RobotModel};
 use twinstep_sim::{Base, BatchBackend, Engine, RapierBackend, SimConfig};
 use twinstep_sysid::{RecordError, record};
 
 use crate::exit::{Failure, Outcome, Signals, input, other};
-use crate::robot_file::robot_model;
 use crate::serve::engine;
 
 /// Play a motion file through a robot model, and write what the robot did as a measured log.
@@ -62,13 +62,19 @@ pub fn run(args: &Args) -> Outcome {
     if args.motion.canonicalize().is_ok_and(|motion| args.out.canonicalize().is_ok_and(|out| out == motion)) {
         return Err(input(SameFile(args.out.clone())));
     }
-    let robot = robot_model(args.model.as_deref())?;
+    let file = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load).map_err(input)?;
+    let learned = LearnedRobot::load(&file).map_err(input)?;
+    let robot = match &learned {
+        Some(learned) => learned.robot.clone(),
+        None => file.robot_model().map_err(input)?,
+    };
+    let drives = || learned.as_ref().map(|learned| Box::new(learned.drives(1, false)) as Box<dyn Actuator>);
     let config = args.config();
     config.check(&robot.control).map_err(input)?;
     let motion = Log::open_motion(&args.motion).map_err(input)?;
     let signals = Signals::listen()?;
     let bar = ProgressBar::new(motion.rows() as u64);
-    let played = play(&motion, &robot, config, args.base, &mut |row| {
+    let played = play(&motion, &robot, &drives, config, args.base, &mut |row| {
         bar.set_position(row as u64);
         !signals.check().unwrap_or(true)
     });
@@ -101,12 +107,14 @@ fn base(text: &str) -> Result<LoggedBase, String> {
     }
 }
 
-/// What the robot does when it is commanded as `motion` has it; `base` goes before that of the segments.
+/// What the robot does when it is commanded as `motion` has it; `base` goes before that of the segments. `drives` makes
+/// the drives of one robot, if they are not its own.
 ///
 /// `progress` receives the number of rows done, and may end it.
 pub fn play(
     motion: &Log,
     robot: &RobotModel,
+    drives: &dyn Fn() -> Option<Box<dyn Actuator>>,
     config: SimConfig,
     base: Option<LoggedBase>,
     progress: &mut dyn FnMut(usize) -> bool,
@@ -119,7 +127,10 @@ pub fn play(
             motion,
             robot,
             base,
-            |base| RapierBackend::new(robot.clone(), based(base), 1).map_err(failed),
+            |base| {
+                let backend = RapierBackend::new(robot.clone(), based(base), 1).map_err(failed)?;
+                Ok(if let Some(drives) = drives() { backend.with_drive(drives) } else { backend })
+            },
             source,
             progress,
         ),
@@ -127,7 +138,10 @@ pub fn play(
             motion,
             robot,
             base,
-            |base| BatchBackend::new(robot.clone(), based(base), 1).map_err(failed),
+            |base| {
+                let backend = BatchBackend::new(robot.clone(), based(base), 1).map_err(failed)?;
+                Ok(if let Some(drives) = drives() { backend.with_drive(drives) } else { backend })
+            },
             source,
             progress,
         ),

@@ -5,6 +5,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 
+use crate::activation::{sigmoid, tanh};
 use crate::windows::Batch;
 
 /// The encoder's numbers, as [`crate::weights::Shape::layout`] has them.
@@ -173,25 +174,6 @@ fn retreat(
         by_cell[unit] = by * input[unit] * (1.0 - cell[unit] * cell[unit]);
         by_cells[unit] = by * forget[unit];
     }
-}
-
-/// tanh within 3e-7: the rational function of Eigen's `generic_fast_tanh_float`, which compilers vectorise.
-fn tanh(x: f32) -> f32 {
-    let x = x.clamp(-7.905_311, 7.905_311);
-    let s = x * x;
-    let mut above = -2.760_768_5e-16;
-    for factor in [2.000_188e-13, -8.604_672e-11, 5.122_297e-8, 1.485_722_4e-5, 6.372_619_3e-4, 4.893_524_6e-3] {
-        above = above * s + factor;
-    }
-    let mut below = 1.198_258_4e-6;
-    for factor in [1.185_347_1e-4, 2.268_434_6e-3, 4.893_525e-3] {
-        below = below * s + factor;
-    }
-    x * above / below
-}
-
-fn sigmoid(x: f32) -> f32 {
-    0.5 + 0.5 * tanh(0.5 * x)
 }
 
 fn matrix(content: &[f32], dimensions: [usize; 2], device: &Device) -> Tensor<2> {

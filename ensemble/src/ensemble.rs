@@ -3,7 +3,7 @@
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 use twinstep_logs::TauSensor;
-use twinstep_model::{Joint, JointKind};
+use twinstep_model::{JOINT_NAMES, Joint, JointKind};
 
 use crate::EnsembleError;
 use crate::data::Run;
@@ -88,6 +88,16 @@ impl Description {
             JointInput::Pooled => None,
             JointInput::Kind => kind(&self.joints[joint]),
             JointInput::Identity => Some(joint),
+        }
+    }
+
+    /// The same for a joint of [`Joint::ALL`]; none where it is not an input, or not known.
+    pub(crate) fn input_of(&self, joint: usize) -> Option<usize> {
+        let name = JOINT_NAMES[joint];
+        match self.joint_input {
+            JointInput::Pooled => None,
+            JointInput::Kind => kind(name),
+            JointInput::Identity => self.joints.iter().position(|known| known == name),
         }
     }
 

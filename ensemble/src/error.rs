@@ -62,6 +62,43 @@ pub enum EnsembleError {
         /// The row of the log.
         row: usize,
     },
+    /// The robot has other gains than those that the networks know by heart.
+    #[error(
+        "the ensemble learnt {joint} with kp {} and kd {}, the robot has kp {} and kd {}; a network sees only errors and \
+         knows its gains by heart: fit one to logs with the robot's gains",
+        learnt[0], learnt[1], wanted[0], wanted[1]
+    )]
+    OtherGains {
+        /// A joint that the ensemble knows.
+        joint: String,
+        /// Its kp [N·m/rad] and kd [N·m·s/rad].
+        learnt: [f64; 2],
+        /// The robot's.
+        wanted: [f64; 2],
+    },
+    /// What the networks have learnt already.
+    #[error(
+        "effect `{effect}` on {scope} does not go beside this ensemble: it learnt the torque at `{tap}` and stands for \
+         steps 1 to {last} of the chain, `{effect}` ({place}) among them; leave out the effect, or `[actuator]`"
+    )]
+    StandsFor {
+        /// The effect.
+        effect: &'static str,
+        /// Its scope.
+        scope: String,
+        /// Where the torque was measured.
+        tap: &'static str,
+        /// The last step that the ensemble stands for.
+        last: u32,
+        /// The effect's place in the chain.
+        place: &'static str,
+    },
+    /// A network is told which joint it is, and has never seen this one.
+    #[error("the ensemble is told which joint it drives and has learnt none called {joint}; fit one to all twelve")]
+    UnknownJoint {
+        /// The joint.
+        joint: &'static str,
+    },
     /// Too few rows to leave blocks out.
     #[error(
         "{rows} complete rows in {blocks} blocks are too few to learn from some, stop by others and judge by the rest"

@@ -2,7 +2,7 @@
 
 use burn::module::{Module, Param, ParamId};
 use burn::optim::GradientsParams;
-use burn::tensor::activation::relu;
+use burn::tensor::activation::{relu, sigmoid, tanh};
 use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::encoder::Encoder;
@@ -100,8 +100,20 @@ impl Network {
         Tensor::from_data(self.encoder().forward(batch).states(), &self.hidden_weight.val().device())
     }
 
+    /// Cells and states after one more row, in burn's operations; inputs `[batch, inputs]`, memory two of `[batch, hidden]`.
+    pub fn row(&self, inputs: Tensor<2>, [cell, state]: [Tensor<2>; 2]) -> [Tensor<2>; 2] {
+        let [_, units] = cell.dims();
+        let gates = inputs.matmul(self.input_weight.val())
+            + state.matmul(self.hidden_weight.val())
+            + self.gate_bias.val().unsqueeze();
+        let gate = |index: usize| gates.clone().narrow(1, index * units, units);
+        let cell = sigmoid(gate(1)) * cell + sigmoid(gate(0)) * tanh(gate(2));
+        let state = sigmoid(gate(3)) * tanh(cell.clone());
+        [cell, state]
+    }
+
     /// Mean and variance, two of `[time · batch, 1]`.
-    fn heads(&self, states: Tensor<2>) -> [Tensor<2>; 2] {
+    pub fn heads(&self, states: Tensor<2>) -> [Tensor<2>; 2] {
         [self.mean.forward(states.clone()), softplus(self.variance.forward(states)) + VARIANCE_FLOOR]
     }
 }
@@ -151,7 +163,6 @@ fn softplus(x: Tensor<2>) -> Tensor<2> {
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::activation::{sigmoid, tanh};
     use twinstep_model::stream;
 
     use super::*;
@@ -177,16 +188,11 @@ mod tests {
     fn by_burn(network: &Network, batch: &Batch) -> Tensor<1> {
         let device = network.hidden_weight.val().device();
         let inputs = Tensor::<2>::from_data(batch.inputs(), &device);
-        let mut cell = Tensor::<2>::zeros([batch.size, SHAPE.hidden], &device);
-        let (mut state, mut states) = (cell.clone(), Vec::new());
+        let nothing = Tensor::<2>::zeros([batch.size, SHAPE.hidden], &device);
+        let (mut memory, mut states) = ([nothing.clone(), nothing], Vec::new());
         for time in 0..batch.time {
-            let gates = inputs.clone().narrow(0, time * batch.size, batch.size).matmul(network.input_weight.val())
-                + state.matmul(network.hidden_weight.val())
-                + network.gate_bias.val().unsqueeze();
-            let gate = |index: usize| gates.clone().narrow(1, index * SHAPE.hidden, SHAPE.hidden);
-            cell = sigmoid(gate(1)) * cell + sigmoid(gate(0)) * tanh(gate(2));
-            state = sigmoid(gate(3)) * tanh(cell.clone());
-            states.push(state.clone());
+            memory = network.row(inputs.clone().narrow(0, time * batch.size, batch.size), memory);
+            states.push(memory[1].clone());
         }
         nll(network.heads(Tensor::cat(states, 0)), batch)
     }

@@ -1,8 +1,9 @@
 //! Who builds the environments that a client asked for.
 
+use twinstep_ensemble::{EnsembleError, LearnedRobot};
 use twinstep_envs::{CounterEnv, TaskEnv, TaskName, TaskSettings};
 use twinstep_model::effects::{DrawError, RobotDraws};
-use twinstep_model::{AutoresetMode, ModelFile, ModelFileError, RobotModel, VecEnv};
+use twinstep_model::{Actuator, AutoresetMode, ModelFile, ModelFileError, RobotModel, VecEnv};
 use twinstep_sim::{BatchBackend, BuildError, Engine, RapierBackend};
 
 use crate::Config;
@@ -24,6 +25,17 @@ pub enum HostError {
     /// The model file was refused.
     #[error(transparent)]
     Model(#[from] ModelFileError),
+    /// The ensemble of the model file was refused.
+    #[error("`actuator.ensemble`: {0}")]
+    Ensemble(#[from] EnsembleError),
+    /// A setting does not go with the model file's drives.
+    #[error("`{field}` does not go with this model file: {reason}")]
+    Drives {
+        /// The key.
+        field: &'static str,
+        /// Why not.
+        reason: &'static str,
+    },
     /// The intervals of the model file are of hardly any robot.
     #[error("`randomise.effects`: {0}")]
     Draws(#[from] DrawError),
@@ -39,24 +51,59 @@ pub enum HostError {
 pub struct SimHost {
     config: Config,
     robot: RobotModel,
+    /// If an ensemble drives the robot.
+    learned: Option<LearnedRobot>,
     /// If effects are to be drawn anew in each episode.
     robots: Option<RobotDraws>,
     seed: u64,
 }
 
 impl SimHost {
-    /// Reads the model file and checks the simulation's settings.
+    /// Reads the model file, and the ensemble that it names, and checks the simulation's settings.
     pub fn new(config: Config) -> Result<Self, HostError> {
         let file = match &config.server.model {
             Some(path) => ModelFile::load(path)?,
             None => ModelFile::default(),
         };
-        let robot = file.robot_model().expect("a file that was read is of a robot");
+        let learned = LearnedRobot::load(&file)?;
+        check_drives(&config, learned.as_ref())?;
+        let robot = match &learned {
+            Some(learned) => learned.robot.clone(),
+            None => file.robot_model().expect("a file that was read is of a robot"),
+        };
         config.sim.check(&robot.control).map_err(BuildError::Config)?;
         let seed = config.server.seed.unwrap_or_else(crate::server::random_u64);
         let robots = if config.randomise.effects { Some(RobotDraws::new(file)?) } else { None };
-        Ok(Self { config, robot, robots, seed })
+        Ok(Self { config, robot, learned, robots, seed })
     }
+
+    /// The learned drives of `num_envs` robots, if there are any.
+    fn drives(&self, num_envs: usize) -> Option<Box<dyn Actuator>> {
+        let uncertain = self.config.task.reward.uncertainty != 0.0;
+        self.learned.as_ref().map(|learned| Box::new(learned.drives(num_envs, uncertain)) as Box<dyn Actuator>)
+    }
+}
+
+/// Fails if a setting asks of the drives what they cannot do.
+fn check_drives(config: &Config, learned: Option<&LearnedRobot>) -> Result<(), HostError> {
+    let refuse = |field, reason| Err(HostError::Drives { field, reason });
+    let Some(learned) = learned else {
+        return match config.task.reward.uncertainty {
+            0.0 => Ok(()),
+            _ => refuse("task.reward.uncertainty", "without an `[actuator]` nothing is unknown about its drives"),
+        };
+    };
+    let by_heart = "an ensemble knows its gains by heart; leave them at [1, 1]";
+    if config.randomise.kp_scale != [1.0, 1.0] {
+        return refuse("randomise.kp_scale", by_heart);
+    }
+    if config.randomise.kd_scale != [1.0, 1.0] {
+        return refuse("randomise.kd_scale", by_heart);
+    }
+    if config.randomise.effects && learned.stands_for_rotor() {
+        return refuse("randomise.effects", "its ensemble learnt behind the rotor, and drawn robots have one");
+    }
+    Ok(())
 }
 
 impl Host for SimHost {
@@ -66,22 +113,28 @@ impl Host for SimHost {
         autoreset: AutoresetMode,
         max_episode_steps: Option<u32>,
     ) -> Result<Box<dyn VecEnv>, HostError> {
-        match self.config.task.name {
-            TaskName::Counter => Ok(Box::new(CounterEnv::new(&self.robot, num_envs, autoreset))),
-            TaskName::Walk => {
-                let settings = TaskSettings {
-                    task: self.config.task.clone(),
-                    randomise: self.config.randomise,
-                    robots: self.robots.clone(),
-                    autoreset,
-                    max_episode_steps,
-                    seed: self.seed,
-                };
-                let (robot, sim) = (self.robot.clone(), self.config.sim);
-                match sim.engine {
-                    Engine::Rapier => Ok(Box::new(TaskEnv::new(RapierBackend::new(robot, sim, num_envs)?, settings)?)),
-                    Engine::Batch => Ok(Box::new(TaskEnv::new(BatchBackend::new(robot, sim, num_envs)?, settings)?)),
-                }
+        if self.config.task.name == TaskName::Counter {
+            return Ok(Box::new(CounterEnv::new(&self.robot, num_envs, autoreset)));
+        }
+        let settings = TaskSettings {
+            task: self.config.task.clone(),
+            randomise: self.config.randomise,
+            robots: self.robots.clone(),
+            autoreset,
+            max_episode_steps,
+            seed: self.seed,
+        };
+        let (robot, sim, drives) = (self.robot.clone(), self.config.sim, self.drives(num_envs));
+        match sim.engine {
+            Engine::Rapier => {
+                let backend = RapierBackend::new(robot, sim, num_envs)?;
+                let backend = if let Some(drives) = drives { backend.with_drive(drives) } else { backend };
+                Ok(Box::new(TaskEnv::new(backend, settings)?))
+            }
+            Engine::Batch => {
+                let backend = BatchBackend::new(robot, sim, num_envs)?;
+                let backend = if let Some(drives) = drives { backend.with_drive(drives) } else { backend };
+                Ok(Box::new(TaskEnv::new(backend, settings)?))
             }
         }
     }

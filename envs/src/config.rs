@@ -132,6 +132,8 @@ reward_weights! {
     body_contact = -1.0,
     /// Moving joints while commanded to stand.
     stand_still = -0.1,
+    /// Motions that the learned drives of the model file know little about; only with such drives.
+    uncertainty = 0.0,
 }
 
 /// How bodies and drives differ from episode to episode; each value is drawn from its range at every reset.
@@ -241,7 +243,7 @@ mod tests {
               |
             2 | torques = -1.0
               | ^^^^^^^
-            unknown field `torques`, expected one of `track_linear_velocity`, `track_angular_velocity`, `linear_velocity_z`, `angular_velocity_xy`, `orientation`, `torque`, `joint_acceleration`, `action_rate`, `joint_position_limits`, `feet_air_time`, `body_contact`, `stand_still`
+            unknown field `torques`, expected one of `track_linear_velocity`, `track_angular_velocity`, `linear_velocity_z`, `angular_velocity_xy`, `orientation`, `torque`, `joint_acceleration`, `action_rate`, `joint_position_limits`, `feet_air_time`, `body_contact`, `stand_still`, `uncertainty`
         "#]].assert_eq(&error);
     }
 

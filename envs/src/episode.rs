@@ -1,7 +1,7 @@
 //! One robot's episode: how it starts, and what a policy step makes of it.
 
 use glam::Vec3;
-use rand::RngExt;
+use rand::{Rng, RngExt};
 use twinstep_model::{
     Control, EnvSpec, Ground, NUM_JOINTS, PerJoint, PerLeg, RobotModel, RobotStates, Stream, Variation, frames, stream,
 };
@@ -63,6 +63,8 @@ pub struct Start {
     pub variation: Variation,
     /// Where the effects of the model file are drawn from.
     pub effects: Stream,
+    /// Seed of what is random in the drives.
+    pub drive_seed: u64,
     /// Joint position [rad].
     pub q: PerJoint,
     /// Position gain [N·m/rad].
@@ -142,8 +144,9 @@ impl Episode {
     pub fn start(&mut self, rules: &Rules) -> Start {
         let Rules { randomise, control, .. } = rules;
         let noise = rules.task.start_position_noise_rad;
-        // A stream of its own, so that poses and commands are the same with and without.
+        // Streams of their own, so that poses and commands are the same with and without.
         let effects = stream(self.seed, "effects", self.started);
+        let drive_seed = stream(self.seed, "drives", self.started).next_u64();
         let stream = &mut self.stream;
         let variation = Variation {
             mass_scale: draw(stream, randomise.mass_scale),
@@ -162,7 +165,7 @@ impl Episode {
         self.term_sums = [0.0; TERMS];
         self.action = [0.0; NUM_JOINTS];
         self.air_time = [0.0; 4];
-        Start { variation, effects, q, kp, kd }
+        Start { variation, effects, drive_seed, q, kp, kd }
     }
 
     /// Takes the action in, before the step, and returns the joint positions that it wants [rad].
@@ -197,6 +200,7 @@ impl Episode {
             soft_upper: &rules.soft_upper,
             landed_air_time,
             body_contact: states.body_contact[robot],
+            uncertainty: states.uncertainty[robot],
         });
         let reward = terms.iter().sum();
         self.length += 1;

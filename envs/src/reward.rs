@@ -39,6 +39,8 @@ pub struct Moment<'a> {
     pub landed_air_time: PerLeg,
     /// True if the trunk or a thigh touches the ground.
     pub body_contact: bool,
+    /// What is unknown about the drives, mean over the joints [nat].
+    pub uncertainty: f32,
 }
 
 #[inline]
@@ -127,6 +129,12 @@ pub fn stand_still(moment: &Moment<'_>) -> f32 {
     moment.q.iter().zip(moment.default_pose).map(|(q, rest)| (q - rest).abs()).sum()
 }
 
+/// What is unknown about the drives, mean over the joints [nat]: U2E's epistemic-uncertainty function (equations 11 and 13).
+#[inline]
+pub fn uncertainty(moment: &Moment<'_>) -> f32 {
+    moment.uncertainty
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -152,6 +160,7 @@ mod tests {
             soft_upper: &[1.0; NUM_JOINTS],
             landed_air_time: [0.0; 4],
             body_contact: false,
+            uncertainty: 0.0,
         }
     }
 

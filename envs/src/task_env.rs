@@ -106,7 +106,7 @@ impl<B: Backend> TaskEnv<B> {
         self.commands[env] = Command::hold(start.q, start.kp, start.kd);
         let placement = Placement::above(self.rules.ground(), self.backend.robot(), start.q, START_CLEARANCE);
         let robot = self.robots.as_ref().map(|robots| robots.draw(&mut start.effects));
-        (Placement { variation: start.variation, ..placement }, robot)
+        (Placement { variation: start.variation, drive_seed: start.drive_seed, ..placement }, robot)
     }
 
     /// Sets the commands of all running environments, and restarts those that wait for it (NextStep).

@@ -1,5 +1,8 @@
 //! The seams below an environment: who steps the robots, and who turns commands into torque.
 
+use std::any::Any;
+use std::sync::Arc;
+
 use crate::{Command, Ground, PerJoint, Placement, RobotModel, RobotStates};
 
 /// Many robots that are commanded and observed together: a simulator, a replayed log or the real robot.
@@ -46,10 +49,51 @@ pub trait Backend: Send {
 /// Batch first, so that a learned drive serves all robots with one forward pass.
 pub trait Actuator: Send {
     /// Writes the torque of each joint [N·m] into `tau`, for every robot that is `active`.
-    fn torques(&mut self, commands: &[Command], active: &[bool], states: &RobotStates, tau: &mut [PerJoint]);
+    ///
+    /// Nothing is changed where it fails. Called on a backend's own threads, if it has any to share.
+    fn torques(
+        &mut self,
+        commands: &[Command],
+        active: &[bool],
+        states: &RobotStates,
+        tau: &mut [PerJoint],
+    ) -> Result<(), BackendError>;
 
-    /// Forgets what the drive remembers of `robot`.
-    fn reset(&mut self, robot: usize);
+    /// Forgets what the drive remembers of `robot`; what is random in it begins anew from `seed`.
+    fn reset(&mut self, robot: usize, seed: u64);
+
+    /// Everything that the drive remembers of `robot`.
+    fn snapshot(&self, robot: usize) -> ActuatorSnapshot;
+
+    /// Puts `robot` back into the state of `snapshot`, which a drive of the same kind made.
+    fn restore(&mut self, robot: usize, snapshot: &ActuatorSnapshot);
+
+    /// What this drive does not know about itself, if it can tell.
+    fn uncertainty(&mut self) -> Option<&mut dyn Uncertainty> {
+        None
+    }
+}
+
+/// How little is known about what robots do; to be rewarded while data are collected (U2E equation 13).
+pub trait Uncertainty: Send {
+    /// Writes what is unknown about each `active` robot [nat], as it is after its last drive period; the others stay.
+    fn evaluate(&mut self, active: &[bool], uncertainty: &mut [f32]);
+}
+
+/// What a drive remembers of one robot; only the drive knows what it is.
+#[derive(Clone)]
+pub struct ActuatorSnapshot(Arc<dyn Any + Send + Sync>);
+
+impl ActuatorSnapshot {
+    /// Holds `memory`.
+    pub fn new(memory: impl Any + Send + Sync) -> Self {
+        Self(Arc::new(memory))
+    }
+
+    /// What it holds, if that is of this type.
+    pub fn get<T: Any>(&self) -> Option<&T> {
+        self.0.downcast_ref()
+    }
 }
 
 /// Why a backend could not do what it was asked.
@@ -72,6 +116,14 @@ pub enum BackendError {
         robot: usize,
         /// The number of robots.
         num_robots: usize,
+    },
+    /// The drive cannot follow a command; nothing was stepped.
+    #[error("the drive of robot {robot} cannot follow its command: {reason}; nothing was stepped")]
+    Command {
+        /// The robot.
+        robot: usize,
+        /// Why not.
+        reason: String,
     },
     /// The simulation of some robots gave numbers that are not finite; the others were stepped.
     #[error("the simulation of robot {robot} diverged: `{quantity}` is not finite ({more} more); place it anew")]

@@ -40,7 +40,7 @@ mod state;
 mod stream;
 mod vec_env;
 
-pub use backend::{Actuator, Backend, BackendError};
+pub use backend::{Actuator, ActuatorSnapshot, Backend, BackendError, Uncertainty};
 pub use body::RigidBody;
 pub use go2::go2;
 pub use ground::Ground;
@@ -48,7 +48,7 @@ pub use height_field::{HeightField, HeightFieldError};
 pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};
 pub use kinematics::{HELD_HEIGHT, NUM_BODIES, Pose, body_poses};
 pub use mjcf::{MjcfBase, MjcfDrive, MjcfOptions, mjcf};
-pub use model_file::{EffectProblem, ModelFile, ModelFileError};
+pub use model_file::{EffectProblem, LearnedDrive, MemberDraw, ModelFile, ModelFileError};
 pub use robot::{
     Contact, Control, Derating, JointDrive, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes, Stribeck,
 };

@@ -52,6 +52,15 @@ pub enum ModelFileError {
         /// What is wrong with it, and what is allowed.
         problem: EffectProblem,
     },
+    /// The robot's drives are learned, and who asked needs their laws.
+    #[error(
+        "{name}: `[actuator]` is for `twinstep serve` and `twinstep play`: nothing else runs learned drives; leave it out, \
+         and the robot has the drives of its effects"
+    )]
+    LearnedDrive {
+        /// The file, or where else the text came from.
+        name: String,
+    },
     /// Entries do not go together.
     #[error("{name}: {cause}")]
     Conflict {
@@ -107,6 +116,33 @@ pub struct ModelFile {
     pub robot: String,
     /// In the order of the file.
     pub effects: Vec<Entry>,
+    /// What drives the robot in place of the chain's first steps, if anything does.
+    pub actuator: Option<LearnedDrive>,
+}
+
+/// The table `[actuator]`: an ensemble of networks in place of the first steps from command to torque.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LearnedDrive {
+    /// The ensemble's file; where the model file has it relative to itself, from the root.
+    pub ensemble: PathBuf,
+    /// When a robot gets another member.
+    #[serde(default)]
+    pub draw: MemberDraw,
+    /// Whether torque is drawn from the member's Gaussian in every drive period; its mean otherwise.
+    #[serde(default)]
+    pub sample: bool,
+}
+
+/// When the member of an ensemble that drives a robot is drawn.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MemberDraw {
+    /// When the robot is placed.
+    #[default]
+    Episode,
+    /// In every drive period (U2E §III-C).
+    Step,
 }
 
 #[derive(Deserialize)]
@@ -115,12 +151,13 @@ struct ModelText {
     robot: String,
     #[serde(default)]
     effect: Vec<Table>,
+    actuator: Option<LearnedDrive>,
 }
 
 impl Default for ModelFile {
     /// The ideal Go2.
     fn default() -> Self {
-        Self { robot: "go2".to_owned(), effects: Vec::new() }
+        Self { robot: "go2".to_owned(), effects: Vec::new(), actuator: None }
     }
 }
 
@@ -130,12 +167,24 @@ impl ModelFile {
         let path = path.as_ref();
         let text = std::fs::read_to_string(path)
             .map_err(|source| ModelFileError::Unreadable { path: path.to_owned(), source })?;
-        Self::parse(&text, &path.display().to_string())
+        let unreadable = |source| ModelFileError::Unreadable { path: path.to_owned(), source };
+        let mut file = Self::parse(&text, &path.display().to_string())?;
+        if let (Some(actuator), Some(folder)) = (&mut file.actuator, path.parent()) {
+            // From the root, so that the same model means the same in any folder that a tool writes it to.
+            actuator.ensemble = std::path::absolute(folder.join(&actuator.ensemble)).map_err(unreadable)?;
+        }
+        Ok(file)
+    }
+
+    /// Reads a model file for who needs the laws of its drives, and so refuses learned ones.
+    pub fn load_analytic(path: impl AsRef<Path>) -> Result<Self, ModelFileError> {
+        let path = path.as_ref();
+        analytic(Self::load(path)?, &path.display().to_string())
     }
 
     /// Reads the text of a model file; errors call it `name`.
     pub fn parse(text: &str, name: &str) -> Result<Self, ModelFileError> {
-        let ModelText { robot, effect } = toml::from_str(text)
+        let ModelText { robot, effect, actuator } = toml::from_str(text)
             .map_err(|error| ModelFileError::Malformed { name: name.to_owned(), message: error.to_string() })?;
         if !BUILT_IN.contains(&robot.as_str()) {
             return Err(ModelFileError::UnknownRobot { name: name.to_owned(), robot });
@@ -147,7 +196,7 @@ impl ModelFile {
                 problem,
             })
         });
-        let file = Self { robot, effects: effects.collect::<Result<_, _>>()? };
+        let file = Self { robot, effects: effects.collect::<Result<_, _>>()?, actuator };
         match file.robot_model() {
             Ok(_) => Ok(file),
             Err(cause) => Err(ModelFileError::Conflict { name: name.to_owned(), cause }),
@@ -180,6 +229,15 @@ impl ModelFile {
             if !intervals.is_empty() {
                 writeln!(text, "interval = {{ {} }}", intervals.join(", ")).expect("a String takes every text");
             }
+        }
+        if let Some(LearnedDrive { ensemble, draw, sample }) = &self.actuator {
+            let draw = match draw {
+                MemberDraw::Episode => "episode",
+                MemberDraw::Step => "step",
+            };
+            let ensemble = Value::from(ensemble.display().to_string());
+            writeln!(text, "\n[actuator]\nensemble = {ensemble}\ndraw = \"{draw}\"\nsample = {sample}")
+                .expect("a String takes every text");
         }
         text
     }
@@ -291,13 +349,20 @@ impl RobotModel {
     /// The robot of a model file.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, ModelFileError> {
         let path = path.as_ref();
-        composed(&ModelFile::load(path)?, &path.display().to_string())
+        composed(&ModelFile::load_analytic(path)?, &path.display().to_string())
     }
 
     /// The robot of the text of a model file; errors call it `name`.
     pub fn parse(text: &str, name: &str) -> Result<Self, ModelFileError> {
-        composed(&ModelFile::parse(text, name)?, name)
+        composed(&analytic(ModelFile::parse(text, name)?, name)?, name)
     }
+}
+
+fn analytic(file: ModelFile, name: &str) -> Result<ModelFile, ModelFileError> {
+    if file.actuator.is_some() {
+        return Err(ModelFileError::LearnedDrive { name: name.to_owned() });
+    }
+    Ok(file)
 }
 
 fn composed(file: &ModelFile, name: &str) -> Result<RobotModel, ModelFileError> {
@@ -331,7 +396,7 @@ mod tests {
               |
             2 | robto = "go2"
               | ^^^^^
-            unknown field `robto`, expected `robot` or `effect`
+            unknown field `robto`, expected one of `robot`, `effect`, `actuator`
         "#]],
         );
     }
@@ -339,6 +404,36 @@ mod tests {
     #[test]
     fn unknown_robot_is_answered_with_the_known_ones() {
         check_refusal("robot = \"spot\"", &expect![[r#"robot.toml: `robot` = "spot" is unknown; possible: "go2""#]]);
+    }
+
+    #[test]
+    fn learned_drive_is_read_beside_its_file_and_written_from_the_root() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("robot.toml");
+        std::fs::write(&path, "robot = \"go2\"\n[actuator]\nensemble = \"e.safetensors\"\ndraw = \"step\"")
+            .expect("written");
+        let file = ModelFile::load(&path).expect("valid");
+        let ensemble = folder.path().join("e.safetensors");
+        assert_eq!(file.actuator, Some(LearnedDrive { ensemble, draw: MemberDraw::Step, sample: false }));
+        assert_eq!(ModelFile::parse(&file.to_toml(), "again").expect("valid"), file);
+        for refusal in [RobotModel::load(&path).map(drop), ModelFile::load_analytic(&path).map(drop)] {
+            let error = refusal.expect_err("refused").to_string();
+            assert!(error.contains("robot.toml: `[actuator]` is for `twinstep serve`"), "{error}");
+        }
+    }
+
+    #[test]
+    fn misspelt_key_and_draw_of_a_learned_drive_are_answered_with_the_possible_ones() {
+        for (key, wanted) in [
+            ("ensembles = \"e\"", "unknown field `ensembles`, expected one of `ensemble`, `draw`, `sample`"),
+            ("ensemble = \"e\"\ndraw = \"row\"", "unknown variant `row`, expected `episode` or `step`"),
+            ("ensemble = \"e\"\nsample = 1", "invalid type: integer `1`, expected a boolean"),
+            ("draw = \"step\"", "missing field `ensemble`"),
+        ] {
+            let text = format!("robot = \"go2\"\n[actuator]\n{key}\n");
+            let error = ModelFile::parse(&text, "robot.toml").expect_err("refused").to_string();
+            assert!(error.contains(wanted), "{error}");
+        }
     }
 
     #[test]
@@ -445,7 +540,7 @@ mod tests {
     proptest! {
         #[test]
         fn file_that_was_written_reads_as_the_same(entries in prop::collection::vec(some_entry(), 0..6)) {
-            let file = ModelFile { robot: "go2".to_owned(), effects: entries };
+            let file = ModelFile { robot: "go2".to_owned(), effects: entries, actuator: None };
             // Two ripples of one joint may be a conflict; then there is no such file.
             if file.robot_model().is_ok() {
                 prop_assert_eq!(ModelFile::parse(&file.to_toml(), "written").expect("valid"), file);

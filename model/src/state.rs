@@ -58,6 +58,8 @@ pub struct RobotStates {
     pub foot_force: Vec<PerLeg>,
     /// True where the trunk or a thigh touches the ground.
     pub body_contact: Vec<bool>,
+    /// What is unknown about the robot's drives, mean over its joints [nat]; 0 where they do not tell.
+    pub uncertainty: Vec<f32>,
 }
 
 impl RobotStates {
@@ -73,6 +75,7 @@ impl RobotStates {
             base_angular_velocity: vec![[0.0; 3]; num_robots],
             foot_force: vec![[0.0; 4]; num_robots],
             body_contact: vec![false; num_robots],
+            uncertainty: vec![0.0; num_robots],
         }
     }
 
@@ -124,6 +127,7 @@ impl RobotStates {
         self.base_angular_velocity[robot] = other.base_angular_velocity[from];
         self.foot_force[robot] = other.foot_force[from];
         self.body_contact[robot] = other.body_contact[from];
+        self.uncertainty[robot] = other.uncertainty[from];
     }
 
     /// The name of the first quantity of `robot` that is not a finite number, if any.
@@ -141,7 +145,7 @@ impl RobotStates {
     }
 }
 
-/// Some of the robots of a [`RobotStates`], with its fields.
+/// Some of the robots of a [`RobotStates`], with the fields that a step of the physics writes.
 #[allow(missing_docs, reason = "those of `RobotStates`")]
 pub struct RobotStatesMut<'a> {
     pub q: &'a mut [PerJoint],
@@ -172,6 +176,8 @@ pub struct Placement {
     pub dq: PerJoint,
     /// How this robot's body and ground differ from the model's.
     pub variation: Variation,
+    /// Seed of what is random in the robot's drives.
+    pub drive_seed: u64,
 }
 
 impl Placement {
@@ -185,6 +191,7 @@ impl Placement {
             q,
             dq: [0.0; NUM_JOINTS],
             variation: Variation::default(),
+            drive_seed: 0,
         }
     }
 

@@ -1,7 +1,9 @@
 //! The rapier engine: one world a robot, stepped on all cores.
 
 use rayon::prelude::*;
-use twinstep_model::{Actuator, Backend, BackendError, Command, Ground, PerJoint, Placement, RobotModel, RobotStates};
+use twinstep_model::{
+    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, PerJoint, Placement, RobotModel, RobotStates,
+};
 
 use crate::ground_shapes::GroundShapes;
 use crate::robot_world::{Input, RobotWorld, WorldSnapshot};
@@ -63,6 +65,7 @@ pub(crate) fn check_lengths(commands: &[Command], active: &[bool], robots: usize
 pub struct RobotSnapshot {
     world: WorldSnapshot,
     state: RobotStates,
+    drive: Option<ActuatorSnapshot>,
 }
 
 impl RapierBackend {
@@ -82,7 +85,7 @@ impl RapierBackend {
         Ok(this)
     }
 
-    /// The same robots with another drive than their own.
+    /// The same robots with another drive than their own; each is to be placed anew.
     #[must_use]
     pub fn with_drive(self, drive: Box<dyn Actuator>) -> Self {
         Self { drive: Some(drive), ..self }
@@ -93,13 +96,14 @@ impl RapierBackend {
         if robot < num_robots { Ok(()) } else { Err(BackendError::NoSuchRobot { robot, num_robots }) }
     }
 
-    fn replace_world(&mut self, robot: usize, world: RobotWorld) {
-        self.worlds[robot] = world;
+    fn place(&mut self, robot: usize, model: &RobotModel, placement: &Placement) {
+        self.worlds[robot] = RobotWorld::new(model, &self.config, &self.ground_shapes, placement);
         if let Some(drive) = &mut self.drive {
-            drive.reset(robot);
+            drive.reset(robot, placement.drive_seed);
         }
         self.read_state(robot);
         self.states.tau[robot] = PerJoint::default();
+        self.states.uncertainty[robot] = 0.0;
     }
 
     fn read_state(&mut self, robot: usize) {
@@ -115,12 +119,15 @@ impl RapierBackend {
     }
 
     /// One drive period of all active robots: torque from the sampled state, held over the physics steps.
-    fn drive_period(&mut self, commands: &[Command], active: &[bool], steps: usize) {
-        let given = self.drive.as_mut().map(|drive| {
-            let mut tau = self.states.tau.clone();
-            drive.torques(commands, active, &self.states, &mut tau);
-            tau
-        });
+    fn drive_period(&mut self, commands: &[Command], active: &[bool], steps: usize) -> Result<(), BackendError> {
+        let given = match &mut self.drive {
+            Some(drive) => {
+                let mut tau = self.states.tau.clone();
+                self.pool.install(|| drive.torques(commands, active, &self.states, &mut tau))?;
+                Some(tau)
+            }
+            None => None,
+        };
         let input = |robot: usize| match &given {
             Some(tau) => Input::Torques(&tau[robot]),
             None => Input::Command(&commands[robot]),
@@ -134,6 +141,7 @@ impl RapierBackend {
                 world.read_joints(q, dq);
             });
         });
+        Ok(())
     }
 
     fn first_diverged(&self, active: &[bool]) -> Option<BackendError> {
@@ -165,17 +173,16 @@ impl Backend for RapierBackend {
         for (robot, _) in placements {
             self.check_index(*robot)?;
         }
+        let model = self.robot.clone();
         for (robot, placement) in placements {
-            let world = RobotWorld::new(&self.robot, &self.config, &self.ground_shapes, placement);
-            self.replace_world(*robot, world);
+            self.place(*robot, &model, placement);
         }
         Ok(())
     }
 
     fn reset_as(&mut self, robot: usize, model: &RobotModel, placement: &Placement) -> Result<(), BackendError> {
         self.check_index(robot)?;
-        let world = RobotWorld::new(model, &self.config, &self.ground_shapes, placement);
-        self.replace_world(robot, world);
+        self.place(robot, model, placement);
         Ok(())
     }
 
@@ -184,7 +191,10 @@ impl Backend for RapierBackend {
         check_lengths(commands, active, robots)?;
         let steps = self.config.steps_per_drive_period(&self.robot.control);
         for _ in 0..drive_periods {
-            self.drive_period(commands, active, steps);
+            self.drive_period(commands, active, steps)?;
+        }
+        if let Some(doubt) = self.drive.as_mut().and_then(|drive| drive.uncertainty()) {
+            self.pool.install(|| doubt.evaluate(active, &mut self.states.uncertainty));
         }
         for robot in (0..robots).filter(|robot| active[*robot]) {
             self.read_state(robot);
@@ -195,11 +205,15 @@ impl Backend for RapierBackend {
     fn snapshot(&self, robot: usize) -> RobotSnapshot {
         let mut state = RobotStates::new(1);
         state.copy_robot(0, &self.states, robot);
-        RobotSnapshot { world: self.worlds[robot].snapshot(), state }
+        let drive = self.drive.as_ref().map(|drive| drive.snapshot(robot));
+        RobotSnapshot { world: self.worlds[robot].snapshot(), state, drive }
     }
 
     fn restore(&mut self, robot: usize, snapshot: &RobotSnapshot) {
         self.worlds[robot].restore(&snapshot.world);
         self.states.copy_robot(robot, &snapshot.state, 0);
+        if let (Some(drive), Some(memory)) = (&mut self.drive, &snapshot.drive) {
+            drive.restore(robot, memory);
+        }
     }
 }

@@ -13,7 +13,7 @@ const MAY_USE: [(&str, &[&str]); 12] = [
     ("envs", &["model"]),
     ("sysid", &["model", "logs"]),
     ("ensemble", &["model", "logs"]),
-    ("env-server", &["model", "protocol", "sim", "envs"]),
+    ("env-server", &["model", "protocol", "sim", "envs", "ensemble"]),
     ("clients/rust", &["model", "protocol"]),
     ("cli", &["model", "logs", "protocol", "sim", "envs", "sysid", "ensemble", "env-server", "client"]),
     ("examples", &["model", "logs", "protocol", "sim", "envs", "env-server", "client"]),

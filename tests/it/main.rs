@@ -15,6 +15,7 @@ mod fit;
 mod hunt;
 mod identify;
 mod layering;
+mod learned;
 mod leases;
 mod log;
 mod next_experiment;

@@ -1,5 +1,6 @@
 //! `twinstep bench`: our numbers beside their references, in one run.
 
+mod ensemble;
 mod identify;
 mod pace;
 mod peers;
@@ -28,8 +29,8 @@ pub struct Args {
     /// Length of one measuring window [s]; each case takes the median of several.
     #[arg(long, default_value_t = 1.0, value_name = "S", value_parser = window)]
     window_s: f64,
-    /// Python for the other simulators beside which `sim` and `identify` measure, with MuJoCo and EnvPool: `pip install
-    /// "./clients/python[bench]"`. What it lacks is left out.
+    /// Python for what `sim` and `identify` measure beside, MuJoCo and EnvPool: `pip install "./clients/python[bench]"`;
+    /// and `ensemble`, PyTorch: `pip install torch`. What it lacks is left out.
     #[arg(long, default_value = "python3", value_name = "PATH")]
     python: PathBuf,
 }
@@ -44,6 +45,8 @@ enum What {
     Remote,
     /// Identification: closed-loop rollouts of the built-in recording beside MuJoCo, and the time of a whole search.
     Identify,
+    /// Learned drives: networks beside PyTorch's and burn's, and robots that they drive.
+    Ensemble,
     /// The other end of the TCP ping-pong.
     #[value(hide = true)]
     TcpEcho,
@@ -55,7 +58,7 @@ fn window(text: &str) -> Result<f64, String> {
 }
 
 /// One measured number.
-#[derive(Serialize)]
+#[derive(Clone, Serialize)]
 pub struct Row {
     /// What was measured.
     pub case: String,
@@ -102,6 +105,9 @@ pub fn run(args: &Args) -> Outcome {
     }
     if wanted(What::Identify) {
         rows.extend(identify::measure(&args.python, args.window_s, &signals)?);
+    }
+    if wanted(What::Ensemble) {
+        rows.extend(ensemble::measure(&args.python, args.window_s, &signals)?);
     }
     let results = Results { rows, machine: machine() };
     if args.json {

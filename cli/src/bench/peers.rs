@@ -1,4 +1,4 @@
-//! Other simulators, in Python: a child process that measures one window at a time.
+//! What ours is measured beside, in Python: a child process that measures one window at a time.
 
 use std::io::{BufRead, BufReader, Lines, Write};
 use std::path::Path;
@@ -30,10 +30,23 @@ pub struct Setup {
     pub window_s: f64,
 }
 
+/// A program of the interpreter. It reads a line of setup, answers with the names of its peers as JSON, and then to each
+/// name with a number.
+#[derive(Clone, Copy)]
+pub struct Program<'a> {
+    /// What the interpreter runs.
+    pub arguments: &'a [&'a str],
+    /// What it measures.
+    pub name: &'a str,
+    /// How to get what it lacks.
+    pub install: &'a str,
+}
+
 /// The peers that are installed; none without Python.
 pub struct Peers {
     process: Option<Process>,
     names: Vec<String>,
+    program: String,
 }
 
 struct Process {
@@ -44,22 +57,34 @@ struct Process {
 
 /// The child ended, or answered nonsense.
 #[derive(Debug, thiserror::Error)]
-#[error("`{MODULE}` failed at `{peer}`; its reason is above")]
+#[error("{program} failed at `{peer}`; the reason is above")]
 struct PeerError {
+    program: String,
     peer: String,
 }
 
 impl Peers {
-    /// Asks the interpreter `python` what it has; what it lacks is said on stderr, and left out.
+    /// Asks the interpreter `python` which simulators it has; what it lacks is said on stderr, and left out.
     pub fn start(python: &Path, setup: &Setup) -> Self {
-        Process::start(python, setup).unwrap_or_else(|reason| {
-            eprintln!(
-                "left out: MuJoCo and EnvPool, because `{} -m {MODULE}` {reason}\n  \
-                 pip install \"./clients/python[bench]\", and name its interpreter with `--python`",
-                python.display()
-            );
-            Self { process: None, names: Vec::new() }
-        })
+        let install = "pip install \"./clients/python[bench]\"";
+        Self::start_program(python, Program { arguments: &["-m", MODULE], name: "MuJoCo and EnvPool", install }, setup)
+    }
+
+    /// The same of another program.
+    pub fn start_program(python: &Path, program: Program, setup: &impl Serialize) -> Self {
+        let Program { arguments, name, install } = program;
+        let (process, names) = match Process::start(python, arguments, setup) {
+            Ok((process, names)) => (Some(process), names),
+            Err(reason) => {
+                eprintln!(
+                    "left out: {name}, because its program in `{}` {reason}\n  {install}, and name its interpreter with \
+                     `--python`",
+                    python.display()
+                );
+                (None, Vec::new())
+            }
+        };
+        Self { process, names, program: name.to_owned() }
     }
 
     /// True if there is a peer of that name.
@@ -67,17 +92,17 @@ impl Peers {
         self.names.iter().any(|name| name == peer)
     }
 
-    /// Env-steps a second of a peer in one window.
+    /// What a peer measures in one window: env-steps a second of a simulator.
     pub fn window(&mut self, peer: &str) -> Result<f64, Failure> {
         let answer = self.process.as_mut().and_then(|process| process.ask(peer));
-        answer.ok_or_else(|| other(PeerError { peer: peer.to_owned() }))
+        answer.ok_or_else(|| other(PeerError { program: self.program.clone(), peer: peer.to_owned() }))
     }
 }
 
 impl Process {
-    fn start(python: &Path, setup: &Setup) -> Result<Peers, String> {
+    fn start(python: &Path, arguments: &[&str], setup: &impl Serialize) -> Result<(Self, Vec<String>), String> {
         let mut child = Command::new(python)
-            .args(["-m", MODULE])
+            .args(arguments)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
@@ -88,7 +113,7 @@ impl Process {
         let setup = serde_json::to_string(setup).map_err(|error| error.to_string())?;
         let names = process.answer(&setup).ok_or("ended at once")?;
         let names = serde_json::from_str(&names).map_err(|error| format!("answered `{names}`: {error}"))?;
-        Ok(Peers { process: Some(process), names })
+        Ok((process, names))
     }
 
     fn ask(&mut self, peer: &str) -> Option<f64> {

@@ -57,7 +57,7 @@ impl RobotDraws {
 
     fn attempt(&self, random: &mut Stream) -> Result<RobotModel, EntryError> {
         let effects = self.0.effects.iter().map(|entry| entry.drawn(random)).collect();
-        ModelFile { robot: self.0.robot.clone(), effects }.robot_model()
+        ModelFile { robot: self.0.robot.clone(), effects, actuator: None }.robot_model()
     }
 }
 

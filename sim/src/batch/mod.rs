@@ -18,7 +18,9 @@ mod lanes;
 mod rows;
 
 use twinstep_model::lanes::Instructions;
-use twinstep_model::{Actuator, Backend, BackendError, Command, Ground, Placement, RobotModel, RobotStates};
+use twinstep_model::{
+    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, Placement, RobotModel, RobotStates,
+};
 
 pub use lanes::Lanes;
 
@@ -46,6 +48,7 @@ pub struct BatchBackend {
 pub struct BatchSnapshot {
     lane: LaneSnapshot,
     state: RobotStates,
+    drive: Option<ActuatorSnapshot>,
 }
 
 impl BatchBackend {
@@ -77,7 +80,7 @@ impl BatchBackend {
         Ok(Self { robot, config, ground, robots, states, drive: None, pool })
     }
 
-    /// The same robots with another drive than their own.
+    /// The same robots with another drive than their own; each is to be placed anew.
     #[must_use]
     pub fn with_drive(self, drive: Box<dyn Actuator>) -> Self {
         Self { drive: Some(drive), ..self }
@@ -88,10 +91,11 @@ impl BatchBackend {
         if robot < num_robots { Ok(()) } else { Err(BackendError::NoSuchRobot { robot, num_robots }) }
     }
 
-    fn after_place(&mut self, robot: usize) {
+    fn after_place(&mut self, robot: usize, placement: &Placement) {
         self.robots.read(robot, &mut self.states);
+        self.states.uncertainty[robot] = 0.0;
         if let Some(drive) = &mut self.drive {
-            drive.reset(robot);
+            drive.reset(robot, placement.drive_seed);
         }
     }
 
@@ -100,6 +104,14 @@ impl BatchBackend {
         let mut diverged = active.filter_map(|robot| Some((robot, self.states.first_not_finite(robot)?)));
         let (robot, quantity) = diverged.next()?;
         Some(BackendError::Diverged { robot, quantity, more: diverged.count() })
+    }
+}
+
+/// Runs `work` on the threads of `pool`, or on this one.
+fn on<R: Send>(pool: Option<&rayon::ThreadPool>, work: impl FnOnce() -> R + Send) -> R {
+    match pool {
+        Some(pool) => pool.install(work),
+        None => work(),
     }
 }
 
@@ -137,7 +149,7 @@ impl Backend for BatchBackend {
         }
         for (robot, placement) in placements {
             self.robots.place(*robot, &self.robot, placement);
-            self.after_place(*robot);
+            self.after_place(*robot, placement);
         }
         Ok(())
     }
@@ -145,7 +157,7 @@ impl Backend for BatchBackend {
     fn reset_as(&mut self, robot: usize, model: &RobotModel, placement: &Placement) -> Result<(), BackendError> {
         self.check_index(robot)?;
         self.robots.place(robot, model, placement);
-        self.after_place(robot);
+        self.after_place(robot, placement);
         Ok(())
     }
 
@@ -158,9 +170,12 @@ impl Backend for BatchBackend {
         if let Some(drive) = drive {
             let mut tau = states.tau.clone();
             for _ in 0..drive_periods {
-                drive.torques(commands, active, states, &mut tau);
+                on(pool, || drive.torques(commands, active, states, &mut tau))?;
                 let period = Time { drive_periods: 1, steps };
                 finite &= robots.advance(pool, Inputs::Torques(&tau), active, period, states);
+            }
+            if let Some(doubt) = drive.uncertainty() {
+                on(pool, || doubt.evaluate(active, &mut states.uncertainty));
             }
         } else {
             finite = robots.advance(pool, Inputs::Commands(commands), active, Time { drive_periods, steps }, states);
@@ -172,11 +187,15 @@ impl Backend for BatchBackend {
     fn snapshot(&self, robot: usize) -> BatchSnapshot {
         let mut state = RobotStates::new(1);
         state.copy_robot(0, &self.states, robot);
-        BatchSnapshot { lane: self.robots.snapshot(robot), state }
+        let drive = self.drive.as_ref().map(|drive| drive.snapshot(robot));
+        BatchSnapshot { lane: self.robots.snapshot(robot), state, drive }
     }
 
     fn restore(&mut self, robot: usize, snapshot: &BatchSnapshot) {
         self.robots.restore(robot, &snapshot.lane);
         self.states.copy_robot(robot, &snapshot.state, 0);
+        if let (Some(drive), Some(memory)) = (&mut self.drive, &snapshot.drive) {
+            drive.restore(robot, memory);
+        }
     }
 }

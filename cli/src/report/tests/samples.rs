@@ -126,8 +126,15 @@ pub fn chirp(robot: &ModelFile, base: Base) -> Log {
     let command = |joint: usize| t.iter().map(|t| pose[joint] + 0.2 * (2.0 + t).powi(2).sin()).collect();
     let commands = JOINT_NAMES.iter().enumerate().map(|(joint, name)| (format!("q_cmd_{name}"), command(joint)));
     let motion = Log::new_motion(meta, [("t".to_owned(), t.clone())].into_iter().chain(commands)).unwrap();
-    play(&motion, &robot.robot_model().unwrap(), SimConfig { threads: 1, ..SimConfig::default() }, None, &mut |_| true)
-        .unwrap()
+    play(
+        &motion,
+        &robot.robot_model().unwrap(),
+        &|| None,
+        SimConfig { threads: 1, ..SimConfig::default() },
+        None,
+        &mut |_| true,
+    )
+    .unwrap()
 }
 
 /// A simulated log with torques, what is said of it, and the model that made it.

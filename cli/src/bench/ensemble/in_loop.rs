@@ -1,0 +1,91 @@
+//! Robots that walk on the batch engine, driven by an ensemble, on one core.
+
+use twinstep_ensemble::LearnedRobot;
+use twinstep_envs::{Randomisation, TaskConfig, TaskEnv, TaskSettings};
+use twinstep_model::{AutoresetMode, LearnedDrive, MemberDraw, ModelFile, ResetRequest, VecEnv, go2};
+use twinstep_sim::{BatchBackend, SimConfig};
+
+use super::{MEMBERS, ensemble};
+use crate::bench::Row;
+use crate::bench::pace::{WINDOWS, measure as pace, median_of};
+use crate::exit::{Failure, Outcome, Signals, other};
+use crate::trot;
+
+/// Robots that are stepped together: what six networks remember of 64 fits into a core's own cache.
+const ROBOTS: [usize; 2] = [64, 1024];
+
+/// Who drives the robots.
+#[derive(Clone, Copy)]
+enum Drives {
+    /// Their own.
+    Own,
+    /// One member a robot, drawn when it is placed.
+    Episode,
+    /// One member a robot and drive period: all hear of every robot, and their disagreement is evaluated once a step.
+    StepAndUncertainty,
+}
+
+/// Env-steps a second of each kind of drive.
+pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+    let rows: Result<Vec<_>, _> = ROBOTS.into_iter().map(|robots| side_by_side(robots, window_s, signals)).collect();
+    Ok(rows?.concat())
+}
+
+/// Windows of all drives in turn.
+fn side_by_side(robots: usize, window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+    let cases = [
+        (Drives::Own, "own drives"),
+        (Drives::Episode, "one member an episode"),
+        (Drives::StepAndUncertainty, "six members and EUF"),
+    ];
+    let mut walks = cases.iter().map(|(drives, _)| walking(*drives, robots)).collect::<Result<Vec<_>, _>>()?;
+    let mut rates = vec![Vec::new(); cases.len()];
+    for _ in 0..WINDOWS {
+        for (walk, rates) in walks.iter_mut().zip(&mut rates) {
+            signals.check()?;
+            rates.push(pace(window_s, walk)?.per_second * robots as f64);
+        }
+    }
+    let rates: Vec<f64> = rates.into_iter().map(median_of).collect();
+    let row = |((_, name), rate): (&(Drives, &str), &f64)| Row {
+        case: format!("walk, {robots} robots, one core, {name}"),
+        value: *rate,
+        unit: "env-steps/s",
+        reference: Some("own drives".to_owned()),
+        ratio: Some(rate / rates[0]),
+    };
+    Ok(cases.iter().zip(&rates).map(row).collect())
+}
+
+/// A policy period of robots that are told to trot, again and again.
+fn walking(drives: Drives, robots: usize) -> Result<impl FnMut() -> Outcome, Failure> {
+    let sim = SimConfig { threads: 1, physics_hz: Some(1000), ..SimConfig::default() };
+    let backend = BatchBackend::new(go2(), sim, robots).map_err(other)?;
+    let draw = match drives {
+        Drives::Own | Drives::Episode => MemberDraw::Episode,
+        Drives::StepAndUncertainty => MemberDraw::Step,
+    };
+    let settings = LearnedDrive { ensemble: "measured".into(), draw, sample: false };
+    let learned = LearnedRobot::new(&ModelFile::default(), ensemble(MEMBERS), settings).map_err(other)?;
+    let backend = match drives {
+        Drives::Own => backend,
+        Drives::Episode => backend.with_drive(Box::new(learned.drives(robots, false))),
+        Drives::StepAndUncertainty => backend.with_drive(Box::new(learned.drives(robots, true))),
+    };
+    let settings = TaskSettings {
+        task: TaskConfig::default(),
+        randomise: Randomisation::default(),
+        robots: None,
+        autoreset: AutoresetMode::NextStep,
+        max_episode_steps: None,
+        seed: 1,
+    };
+    let mut envs = TaskEnv::new(backend, settings).map_err(other)?;
+    envs.reset(&ResetRequest::seeded(1, robots)).map_err(other)?;
+    let mut step = 0;
+    Ok(move || {
+        let action = trot::action(step as f32 * envs.spec().policy_dt as f32);
+        step += 1;
+        envs.step(&action.repeat(robots)).map(drop).map_err(other)
+    })
+}
