@@ -34,7 +34,7 @@ pub fn run(logs: &[(String, Log)], args: &Args) -> Outcome {
     let [svg, csv] = ["cross.svg", "cross.csv"].map(|name| args.out.join(name));
     chart::check_writable(&svg).map_err(input)?;
     let names: Vec<&str> = logs.iter().map(|(name, _)| name.as_str()).collect();
-    let stages = logs.iter().map(|log| DataSet::new(std::slice::from_ref(log)).map_err(input));
+    let stages = logs.iter().map(|log| DataSet::smoothed(std::slice::from_ref(log), args.smooth).map_err(input));
     let stages: Vec<DataSet> = stages.collect::<Result<_, _>>()?;
     if let Some(place) = stages.iter().position(|stage| stage.joints != stages[0].joints) {
         return Err(input(EnsembleError::OtherJoints { log: names[place].to_owned() }));

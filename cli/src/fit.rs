@@ -60,6 +60,10 @@ pub struct Args {
     /// Seed of the networks' first weights and of the order of the data.
     #[arg(long, default_value_t = Options::default().seed)]
     seed: u64,
+    /// Smooth what is learnt from by a cubic spline, as U2E does: waves of so many Hz have half their amplitude. What stops the
+    /// training and what judges it stay as measured.
+    #[arg(long, value_name = "HZ")]
+    pub smooth: Option<f64>,
     /// Go on with the training that ended, from OUT.training.
     #[arg(long)]
     resume: bool,
@@ -88,7 +92,7 @@ pub fn run(args: &Args) -> Outcome {
     for path in &args.logs {
         logs.push((path.display().to_string(), Log::open(path).map_err(input)?));
     }
-    let data = DataSet::new(&logs).map_err(input)?;
+    let data = DataSet::smoothed(&logs, args.smooth).map_err(input)?;
     if args.cross {
         return cross::run(&logs, args);
     }

@@ -6,6 +6,7 @@ use sha2::{Digest, Sha256};
 use twinstep_logs::{Log, TauSensor};
 
 use crate::EnsembleError;
+use crate::smooth::smoothed;
 
 /// Longest block [s]: long beside a drive's memory, short beside a motion.
 const LONGEST_BLOCK_S: f64 = 2.0;
@@ -43,9 +44,9 @@ pub struct Run {
 
 /// Runs of rows with what they have in common.
 ///
-/// Channels are taken as measured: U2E §IV-B smooths them by a cubic spline first, which no drive in a simulator could do
-/// with what is yet to come. Where a log has no velocity, it is the central difference of position over two rows, which
-/// looks one row ahead too.
+/// Channels are taken as measured. U2E §IV-B smooths them by a cubic spline first, which no drive in a simulator could do
+/// with what is yet to come: that is an option, for what is learnt from alone. Where a log has no velocity, it is the central
+/// difference of position over two rows, which looks one row ahead too.
 #[derive(Clone, Debug)]
 pub struct DataSet {
     /// Time from a row to the next [s].
@@ -62,12 +63,21 @@ pub struct DataSet {
 impl DataSet {
     /// The runs of `logs`, each with the name that errors give it.
     pub fn new(logs: &[(String, Log)]) -> Result<Self, EnsembleError> {
+        Self::smoothed(logs, None)
+    }
+
+    /// As [`DataSet::new`], with position, velocity and torque of what is learnt from smoothed, stretch by stretch: waves of
+    /// this frequency \[Hz] have half their amplitude.
+    pub fn smoothed(logs: &[(String, Log)], hz: Option<f64>) -> Result<Self, EnsembleError> {
         let (first, first_log) = logs.first().ok_or(EnsembleError::TooShort { rows: 0, blocks: 0 })?;
         let tau_sensor = first_log.meta().tau_sensor;
         if tau_sensor == TauSensor::None {
             return Err(EnsembleError::NoTorque { log: first.clone() });
         }
         let dt = 1.0 / first_log.meta().rate_hz;
+        if let Some(given) = hz.filter(|hz| !(*hz > 0.0 && *hz < 0.5 / dt)) {
+            return Err(EnsembleError::Smoothing { given, most: 0.5 / dt });
+        }
         let mut set = Self { dt, joints: Vec::new(), tau_sensor, gains: Vec::new(), runs: Vec::new() };
         let rows: usize = logs.iter().map(|(_, log)| log.rows()).sum();
         let longest = ((LONGEST_BLOCK_S / dt) as usize).max(SHORTEST_BLOCK);
@@ -79,7 +89,7 @@ impl DataSet {
             for (_, part) in log.segments() {
                 for start in part.clone().step_by(block_rows) {
                     let block = start..part.end.min(start + block_rows);
-                    set.add(log, &columns, &block, start == part.start, blocks);
+                    set.add(log, &columns, &block, Place { starts_part: start == part.start, number: blocks, hz });
                     blocks += 1;
                 }
             }
@@ -148,9 +158,9 @@ impl DataSet {
         if all.is_empty() { Err(EnsembleError::NoTorque { log: name.to_owned() }) } else { Ok(all) }
     }
 
-    /// Adds the runs of the `number`th block of all.
-    fn add(&mut self, log: &Log, columns: &[Columns], block: &Range<usize>, starts_part: bool, number: usize) {
-        let role = match number % CYCLE {
+    /// Adds the runs of a block.
+    fn add(&mut self, log: &Log, columns: &[Columns], block: &Range<usize>, place: Place) {
+        let role = match place.number % CYCLE {
             4 => Block::Validation,
             9 => Block::Test,
             _ => Block::Training,
@@ -160,16 +170,31 @@ impl DataSet {
             let error = |row| column.error(row, block, self.dt);
             let usable = |row| error(row).iter().chain([&column.torque[row]]).all(|cell| cell.is_finite());
             for rows in stretches(block.clone().filter(|row| usable(*row)), follows) {
-                let run = Run {
+                let starts_part = place.starts_part && rows.start == block.start;
+                let mut run = Run {
                     joint: column.joint,
-                    starts_part: starts_part && rows.start == block.start,
+                    starts_part,
                     errors: rows.clone().map(error).collect(),
-                    torques: column.torque[rows].to_vec(),
+                    torques: column.torque[rows.clone()].to_vec(),
                 };
+                if let Some(hz) = place.hz.filter(|_| role == Block::Training) {
+                    column.smooth(&mut run, rows, hz, self.dt);
+                }
                 self.runs.push((role, run));
             }
         }
     }
+}
+
+/// Where a block stands.
+#[derive(Clone, Copy)]
+struct Place {
+    /// Whether it begins a part of a log.
+    starts_part: bool,
+    /// Among the blocks of all logs.
+    number: usize,
+    /// To what it is smoothed, if it is learnt from [Hz].
+    hz: Option<f64>,
 }
 
 /// The channels of a joint.
@@ -193,6 +218,21 @@ impl Columns<'_> {
             |dq| dq[row],
         );
         [self.q_cmd[row] - self.q[row], self.dq_cmd.map_or(0.0, |dq_cmd| dq_cmd[row]) - dq]
+    }
+}
+
+impl Columns<'_> {
+    /// Smooths what was measured of a run; commands stay as sharp as they were.
+    fn smooth(&self, run: &mut Run, rows: Range<usize>, hz: f64, dt: f64) {
+        for channel in 0..2 {
+            let command = |row: usize| [Some(self.q_cmd), self.dq_cmd][channel].map_or(0.0, |cells| cells[row]);
+            let state = |(error, row): (&[f64; 2], usize)| command(row) - error[channel];
+            let states: Vec<f64> = run.errors.iter().zip(rows.clone()).map(state).collect();
+            for ((error, state), row) in run.errors.iter_mut().zip(smoothed(&states, hz, dt)).zip(rows.clone()) {
+                error[channel] = command(row) - state;
+            }
+        }
+        run.torques = smoothed(&run.torques, hz, dt);
     }
 }
 
@@ -296,6 +336,33 @@ pub mod tests {
         for row in 1..99 {
             assert!((one.errors[row][1] - other.errors[row][1]).abs() < 2e-4, "row {row}");
         }
+    }
+
+    #[test]
+    fn only_what_is_learnt_from_is_smoothed_and_commands_are_not() {
+        let stepping = || {
+            log(4000, |_, columns| {
+                columns[3].1 = (0..4000).map(|row| if row < 10 { 0.0 } else { 0.3 }).collect();
+            })
+        };
+        let raw = set(stepping()).expect("a set");
+        let smooth = DataSet::smoothed(&[("here".to_owned(), stepping())], Some(20.0)).expect("a set");
+        for block in [Block::Validation, Block::Test] {
+            assert!(raw.runs(block).eq(smooth.runs(block)));
+        }
+        let noise = |set: &DataSet| {
+            let run = set.runs(Block::Training).nth(1).expect("a run").clone();
+            let second = run.torques.windows(3).map(|rows| (rows[0] - 2.0 * rows[1] + rows[2]).powi(2));
+            second.sum::<f64>().sqrt()
+        };
+        assert!(noise(&smooth) < 0.2 * noise(&raw), "{} of {}", noise(&smooth), noise(&raw));
+        let step = |set: &DataSet| {
+            let run = set.runs(Block::Training).next().expect("a run").clone();
+            run.errors[10][0] - run.errors[9][0]
+        };
+        assert!((step(&smooth) - step(&raw)).abs() < 0.01, "{} of {}", step(&smooth), step(&raw));
+        let refused = DataSet::smoothed(&[("here".to_owned(), stepping())], Some(120.0)).expect_err("too fast");
+        assert!(refused.to_string().contains("120"), "{refused}");
     }
 
     #[test]

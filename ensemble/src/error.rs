@@ -109,6 +109,14 @@ pub enum EnsembleError {
         /// Blocks they are cut into.
         blocks: usize,
     },
+    /// A log has no waves as fast as that.
+    #[error("smoothing at {given} Hz: the frequency must be above 0 and below half the log's rate, {most} Hz")]
+    Smoothing {
+        /// What was given [Hz].
+        given: f64,
+        /// Half the log's rate [Hz].
+        most: f64,
+    },
     /// Hip, thigh and calf are the Go2's.
     #[error("joint `{joint}` is no hip, thigh or calf of a Go2; give each joint its own input, or pool them")]
     NoKind {

@@ -41,6 +41,7 @@ mod network;
 mod networks;
 mod reference;
 mod scales;
+mod smooth;
 mod train;
 mod weights;
 mod wide;
