@@ -5,8 +5,9 @@
 //! speed. The client compares every observation with a counter of its own ([`ledger::Ledger`]), which also survives the
 //! client's death. [`campaign`] runs many lanes at once and adds up.
 //!
-//! [`hidden_robot`] has the robots that identification is tried on, [`hidden_drive`] the drives that ensembles learn, [`rivals`] those that are taken for each other, [`security`] what the tests of TLS, users and access control need, [`python`] what those of the Python client do.
+//! [`hidden_robot`] has the robots that identification is tried on, [`hidden_drive`] the drives that ensembles learn, [`browser`] looks at pages, [`rivals`] has those that are taken for each other, [`security`] what the tests of TLS, users and access control need, [`python`] what those of the Python client do.
 
+pub mod browser;
 pub mod campaign;
 pub mod fault;
 pub mod hidden_drive;
