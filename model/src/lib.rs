@@ -52,7 +52,7 @@ pub use model_file::{EffectProblem, LearnedDrive, MemberDraw, ModelFile, ModelFi
 pub use robot::{
     Contact, Control, Derating, JointDrive, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes, Stribeck,
 };
-pub use rollout::{Job, Precision, Rollout};
+pub use rollout::{Job, Past, Precision, Rollout};
 pub use scene::{Scene, SceneShape, ShapeKind};
 pub use spec::{EnvSpec, Field};
 pub use state::{Command, Placement, RobotStates, RobotStatesMut, Variation};

@@ -1,6 +1,6 @@
 //! The seam between identification and simulators: commands in, motion out, for many candidate robots at once.
 
-use crate::{Command, Placement, RobotModel, RobotStates};
+use crate::{Command, PerJoint, Placement, RobotModel, RobotStates};
 
 /// What one candidate robot does.
 #[derive(Clone, Copy, Debug)]
@@ -11,8 +11,21 @@ pub struct Job<'a> {
     pub held: bool,
     /// Where it starts.
     pub start: Placement,
+    /// What it did just before, the oldest first: what its drives remember. Before that it held still.
+    pub past: &'a [Past],
     /// One command a drive period.
     pub commands: &'a [Command],
+}
+
+/// A drive period that is over.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Past {
+    /// What was commanded.
+    pub command: Command,
+    /// Joint positions at its start, as the encoders show them [rad].
+    pub q: PerJoint,
+    /// Joint velocities [rad/s].
+    pub dq: PerJoint,
 }
 
 /// The numbers that candidates are simulated in.

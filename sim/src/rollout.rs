@@ -48,8 +48,9 @@ impl BatchRollout {
             robots.read(robot, &mut start);
             record.copy_robot(0, &start, robot);
         }
-        let commands: Vec<_> = jobs.iter().map(|job| job.commands).collect();
-        robots.play(&commands, self.config.steps_per_drive_period(&self.robot.control), &mut records);
+        let steps = self.config.steps_per_drive_period(&self.robot.control);
+        robots.remember(&jobs.iter().map(|job| job.past).collect::<Vec<_>>(), steps);
+        robots.play(&jobs.iter().map(|job| job.commands).collect::<Vec<_>>(), steps, &mut records);
         records
     }
 }

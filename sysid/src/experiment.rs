@@ -277,7 +277,7 @@ impl Experiment {
                     *rate -= bias as f32;
                 }
                 let commands = weakened.get(index).unwrap_or(&window.commands);
-                jobs.push(Job { robot, held: window.held, start, commands });
+                jobs.push(Job { robot, held: window.held, start, past: &window.past, commands });
             }
         }
         simulator.play(&jobs, precision)

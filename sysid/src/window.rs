@@ -5,7 +5,7 @@ use std::ops::Range;
 use glam::{DQuat, DVec3};
 use nalgebra::{DMatrix, DVector};
 use twinstep_logs::{Base, Log};
-use twinstep_model::{Command, Ground, Placement, RobotModel};
+use twinstep_model::{Command, Ground, Past, Placement, RobotModel};
 
 use crate::experiment::ExperimentError;
 use crate::motion::{DriveClock, JointCommands, command, joint_commands};
@@ -17,22 +17,27 @@ pub struct Horizon {
     pub length_s: f64,
     /// Length of one with a held trunk [s]; infinite for a whole part of the log.
     pub held_s: f64,
-    /// Its beginning that is not compared [s].
+    /// Beginning of a window with a free trunk that is not compared [s].
     pub settling_s: f64,
+    /// And of one with a held trunk [s].
+    pub held_settling_s: f64,
 }
 
 impl Horizon {
     /// Every row but a window's first counts.
-    pub const EVALUATION: Self = Self { length_s: 0.5, held_s: f64::INFINITY, settling_s: 0.0 };
+    pub const EVALUATION: Self = Self { length_s: 0.5, held_s: f64::INFINITY, settling_s: 0.0, held_settling_s: 0.0 };
     /// The error of a measured start, a millimetre that the feet are in the ground or above it, dies away before anything is
     /// compared: it would pass for a harder ground and a lighter robot.
-    pub const IDENTIFICATION: Self = Self { length_s: 1.0, held_s: f64::INFINITY, settling_s: 0.2 };
+    pub const IDENTIFICATION: Self =
+        Self { length_s: 1.0, held_s: f64::INFINITY, settling_s: 0.2, held_settling_s: 0.2 };
     /// With windows for a held trunk too: a loop that rings is out of step after a second or two, whatever the model.
     pub const DIAGNOSIS: Self = Self { held_s: 2.0, ..Self::IDENTIFICATION };
     /// And where the model's does not ring at all, only what is nearly right would stay in step for as long.
-    pub const LOST: Self = Self { held_s: 0.6, ..Self::IDENTIFICATION };
+    pub const LOST: Self = Self { held_s: 0.25, held_settling_s: 0.0, ..Self::IDENTIFICATION };
 }
 
+/// Rows before a window's start that its drives remember.
+const PAST_ROWS: usize = 8;
 /// Height at which a held trunk hangs [m].
 const HELD_HEIGHT: f32 = twinstep_model::HELD_HEIGHT as f32;
 
@@ -45,6 +50,8 @@ pub struct Window {
     pub held: bool,
     /// The first row's measured state.
     pub start: Placement,
+    /// What was measured in the drive periods before it, the oldest first: a drive that acts late knows it still.
+    pub past: Vec<Past>,
     /// One a drive period.
     pub commands: Vec<Command>,
     /// Rows at its beginning that are not compared.
@@ -84,7 +91,8 @@ pub fn windows(log: &Log, robot: &RobotModel, horizon: Horizon) -> Result<Vec<Wi
         let in_rows = |time_s: f64| (time_s * log.meta().rate_hz).round() as usize;
         let whole = held && horizon.held_s.is_infinite();
         let length = if whole { rows.len() } else { in_rows(if held { horizon.held_s } else { horizon.length_s }) };
-        let settling = if whole { 1 } else { in_rows(horizon.settling_s).max(1) };
+        let settling =
+            if whole { 1 } else { in_rows(if held { horizon.held_settling_s } else { horizon.settling_s }).max(1) };
         let mut first = rows.start;
         while first + 1 < rows.end {
             let end = (first + length + 1).min(rows.end);
@@ -127,7 +135,20 @@ impl Player<'_> {
                 commands.extend(std::iter::repeat_n(command, self.clock.periods_between(t, index)));
             }
         }
-        Window { held, settling: 1, start: self.start(part, rows.start, held), rows, commands, period }
+        let (start, past) = (self.start(part, rows.start, held), self.past(part, rows.start, held));
+        Window { held, settling: 1, start, past, rows, commands, period }
+    }
+
+    /// The drive periods before `first`, as far as the part goes back.
+    fn past(&self, part: &Range<usize>, first: usize, held: bool) -> Vec<Past> {
+        let from = first.saturating_sub(PAST_ROWS).max(part.start);
+        let t = &self.log.t()[from..=first];
+        let of_row = |row: usize| {
+            let Placement { q, dq, .. } = self.start(part, row, held);
+            let past = Past { command: command(self.robot, &self.commands, row), q, dq };
+            std::iter::repeat_n(past, self.clock.periods_between(t, row - from))
+        };
+        (from..first).flat_map(of_row).collect()
     }
 
     /// The state in `row` of a part.

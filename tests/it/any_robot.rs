@@ -43,8 +43,10 @@ fn play(robots: &[RobotModel], base: Base) -> Vec<RobotStates> {
     let pose = go2().control.default_pose_f32();
     let commands = vec![Command::hold(pose.map(|q| q + 0.2), 30.0, 0.75); PERIODS];
     let start = Placement::at_rest(0.33, pose);
-    let jobs: Vec<_> =
-        robots.iter().map(|robot| Job { robot, held: base == Base::Fixed, start, commands: &commands }).collect();
+    let jobs: Vec<_> = robots
+        .iter()
+        .map(|robot| Job { robot, held: base == Base::Fixed, start, past: &[], commands: &commands })
+        .collect();
     let config = SimConfig { threads: 1, ..SimConfig::default() };
     BatchRollout::new(&go2(), &config).unwrap().play(&jobs, Precision::Double)
 }

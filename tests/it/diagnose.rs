@@ -5,6 +5,7 @@ use std::path::Path;
 use twinstep_model::effects::{Effect, Entry, compose};
 use twinstep_model::{ModelFile, RobotModel, go2};
 use twinstep_sysid::{Diagnosis, Value};
+use twinstep_tests::browser::{browser, layout};
 
 use crate::identify::{log_of, twinstep};
 
@@ -41,6 +42,32 @@ fn hidden_friction_is_named_with_its_scope_and_size_and_the_model_mended() {
     assert!(cause.score_nats > cause.threshold_nats);
     let [before, after] = [diagnosis.baseline, diagnosis.extended].map(|errors| errors.q_rmse_rad.unwrap());
     assert!(after < 0.4 * before, "{before} -> {after} rad on held-out seconds");
+    stands_in_a_browser(&folder.path().join("diagnosis/report.html"));
+}
+
+/// Every picture is there, the page fits the window, and nothing is fetched.
+fn stands_in_a_browser(page: &Path) {
+    let Some(browser) = browser() else {
+        println!("there is no Chromium here: the report was not looked at");
+        return;
+    };
+    let found = layout(&browser, page);
+    assert!(found.pictures >= 4 && found.flat_pictures == 0, "{found:?}");
+    assert!(found.overhang_px <= 0.0 && found.height_px > 1500.0, "{found:?}");
+    assert_eq!(found.requests, 0, "{found:?}");
+    assert!(found.heading.contains("friction"), "{found:?}");
+}
+
+#[test]
+fn delay_with_which_a_loop_rings_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let delay = Effect::named("torque_delay").unwrap();
+    let robot = compose(&go2(), &[Entry::new(delay, "RL_calf".parse().unwrap(), vec![0.0085]).unwrap()]).unwrap();
+    let diagnosis = diagnosed(&robot, folder.path());
+    let names: Vec<_> = diagnosis.findings.iter().map(|cause| (&cause.effect[..], &cause.scope[..])).collect();
+    assert_eq!(names[0], ("torque_delay", "RL_calf"), "{diagnosis:#?}");
+    let Value::Number(delay) = diagnosis.findings[0].parameters["delay_s"].value else { panic!("{diagnosis:#?}") };
+    assert!((delay / 0.0085 - 1.0).abs() < 0.05, "{delay} s");
 }
 
 #[test]

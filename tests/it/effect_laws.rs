@@ -235,8 +235,10 @@ fn effects_of_joints_follow_their_laws_in_both_engines() {
     };
     let commands = commands();
     let robots: Vec<_> = std::iter::once(lone_calf()).chain(CASES.iter().map(|(entries, _)| robot(entries))).collect();
-    let jobs: Vec<_> =
-        robots.iter().map(|robot| Job { robot, held: true, start: placement(), commands: &commands }).collect();
+    let jobs: Vec<_> = robots
+        .iter()
+        .map(|robot| Job { robot, held: true, start: placement(), past: &[], commands: &commands })
+        .collect();
     let played = BatchRollout::new(&lone_calf(), &config(Engine::Batch)).unwrap().play(&jobs, Precision::Double);
     let in_batch = |index: usize| -> Vec<_> { (1..=PERIODS).map(|entry| shown(&played[index], entry)).collect() };
 

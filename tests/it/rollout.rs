@@ -1,7 +1,7 @@
-//! Rollouts in the batch engine: a job is the same alone and among others.
+//! Rollouts in the batch engine: a job is the same alone and among others, and goes on from a past.
 
 use twinstep_model::effects::{Entry, compose};
-use twinstep_model::{Command, Job, Placement, Precision, RobotModel, RobotStates, Rollout, go2};
+use twinstep_model::{Command, Job, Past, Placement, Precision, RobotModel, RobotStates, Rollout, go2};
 use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_tests::hidden_robot::effect;
 
@@ -40,6 +40,7 @@ fn a_job_is_the_same_alone_and_among_others_of_other_lengths() {
             robot: &robots[index],
             held: index % 3 == 0,
             start: start(index),
+            past: &[],
             commands: &commands[index],
         })
         .collect();
@@ -59,4 +60,35 @@ fn a_job_is_the_same_alone_and_among_others_of_other_lengths() {
             assert!(diverged.iter().all(|diverged| !diverged));
         }
     }
+}
+
+#[test]
+fn a_job_with_a_past_goes_on_as_if_it_had_never_ended() {
+    let entries = [("torque_delay", 0.008), ("command_delay", 0.006), ("drive_lag", 0.005), ("encoder_offset", 0.02)]
+        .map(|(name, value)| {
+            let (effect, scope) = effect(name, "all");
+            Entry::new(effect, scope, vec![value]).unwrap()
+        });
+    let robot = compose(&go2(), &entries).unwrap();
+    let pose = go2().control.default_pose_f32();
+    let command = |period: usize| Command::hold(pose.map(|q| q + 0.2 * (0.2 * period as f32).sin()), 30.0, 0.75);
+    let commands: Vec<_> = (0..90).map(command).collect();
+    let mut simulator = BatchRollout::new(&go2(), &SimConfig { threads: 1, ..SimConfig::default() }).unwrap();
+    let mut play = |start: Placement, past: &[Past], commands: &[Command]| {
+        let job = Job { robot: &robot, held: true, start, past, commands };
+        simulator.play(&[job], Precision::Double).remove(0)
+    };
+    let whole = play(Placement::at_rest(1.0, pose), &[], &commands);
+    let now = 50;
+    let start = Placement { q: whole.q[now], dq: whole.dq[now], ..Placement::at_rest(1.0, pose) };
+    let past: Vec<_> = (now - 8..now)
+        .map(|period| Past { command: commands[period], q: whole.q[period], dq: whole.dq[period] })
+        .collect();
+    let mut error = |past: &[Past]| {
+        let states = play(start, past, &commands[now..]);
+        let pairs = states.q.iter().flatten().zip(whole.q[now..].iter().flatten());
+        pairs.map(|(one, other)| (one - other).abs()).fold(0.0, f32::max)
+    };
+    let [with, without] = [error(&past), error(&[])];
+    assert!(with < 0.02 * without, "{with} rad with its past, {without} rad without");
 }

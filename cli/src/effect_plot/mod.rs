@@ -87,7 +87,10 @@ fn play<'a>(motion: &Motion, robots: impl Iterator<Item = &'a RobotModel>) -> Re
             Base::Floating => Placement::above(&Ground::FLAT, robot, pose, motion.clearance),
         };
         let states = simulator
-            .play(&[Job { robot, held: motion.base == Base::Fixed, start, commands: &commands }], Precision::Double)
+            .play(
+                &[Job { robot, held: motion.base == Base::Fixed, start, past: &[], commands: &commands }],
+                Precision::Double,
+            )
             .remove(0);
         let joint = Joint { leg: Leg::FL, kind: motion.joint }.index();
         let settle = (motion.settle / robot.control.drive_dt()).round() as usize;

@@ -217,6 +217,26 @@ impl<T: Lane> Drive<T> {
         on_link
     }
 
+    /// Whether what happened before a start matters to any drive of the lanes.
+    pub fn remembers(&self) -> bool {
+        let is_late = |n: &Numbers<T>| n.lag.any_less(T::splat(1.0));
+        self.uses.command_delay || self.uses.torque_delay || self.numbers.iter().any(is_late)
+    }
+
+    /// A drive period of `steps` physics steps that is over, with what the encoders showed at its start: it leaves what the
+    /// drives remember of it, and nothing moves.
+    pub fn remember(&mut self, commands: &Commands<T>, q: &[T; 12], dq: &[T; 12], steps: usize) {
+        let rotors = self.memory.rotor;
+        let link: [T; 12] = std::array::from_fn(|joint| q[joint] - self.numbers[joint].encoder_offset);
+        self.memory.rotor = [link, *dq];
+        self.tick(commands, &link, dq);
+        for index in 0..steps {
+            self.push(index, &link, dq);
+            self.memory.rotor = [link, *dq];
+        }
+        self.memory.rotor = rotors;
+    }
+
     fn find_uses(&mut self) {
         let (zero, mut uses) = (T::splat(0.0), Uses::default());
         for n in &self.numbers {

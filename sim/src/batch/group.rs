@@ -2,7 +2,7 @@
 
 use glam::{DVec3, dvec3};
 use twinstep_model::lanes::{Commands, Drive, Factored, JointLoad, Lane, State, Tree, Vec3};
-use twinstep_model::{Ground, PerJoint, Placement, RigidBody, RobotModel, Variation};
+use twinstep_model::{Ground, Past, PerJoint, Placement, RigidBody, RobotModel, Variation};
 
 use super::contact::{Constraints, Impulses, LEG_POINTS, POINTS, Surface};
 use super::ground::Terrain;
@@ -145,6 +145,29 @@ impl<T: Lane> Group<T> {
         let Impulses { points, limits, frictions } = &mut self.impulses;
         let impulses = points.iter_mut().flatten().chain(limits.iter_mut().flatten()).chain(frictions);
         impulses.for_each(|impulse| impulse.set(lane, 0.0));
+    }
+
+    /// Lets the drives remember what each lane's robot did before it was placed, in periods of `steps` physics steps; one
+    /// that did nothing held still.
+    pub fn remember(&mut self, past: &[&[Past]], steps: usize) {
+        if !self.drive.remembers() {
+            return;
+        }
+        let (zero, one) = (T::splat(0.0), T::splat(1.0));
+        let q = self.sampled_q();
+        let still = std::array::from_fn(|joint| self.drive.seen(joint, q[joint], zero).0);
+        for age in (0..past.iter().map(|past| past.len()).max().unwrap_or(0)).rev() {
+            let (mut q, mut dq) = (still, [zero; 12]);
+            let mut commands =
+                Commands { q, dq, tau_ff: [zero; 12], kp: [zero; 12], kd: [zero; 12], strength: [one; 12] };
+            for (lane, past) in past.iter().enumerate() {
+                let Some(past) = past.len().checked_sub(age + 1).map(|index| &past[index]) else { continue };
+                commands.set(lane, &past.command);
+                set(&mut q, lane, past.q.map(f64::from));
+                set(&mut dq, lane, past.dq.map(f64::from));
+            }
+            self.drive.remember(&commands, &q, &dq, steps);
+        }
     }
 
     /// Advances all robots; what their sensors show then.

@@ -7,7 +7,7 @@ use twinstep_model::lanes::F32x4 as Baseline;
 #[cfg(target_arch = "x86_64")]
 use twinstep_model::lanes::{Avx2F32, Avx2F64, Avx512F32, Sse2F32 as Baseline};
 use twinstep_model::lanes::{Commands, Instructions, Lane};
-use twinstep_model::{Command, Ground, PerJoint, Placement, RobotModel, RobotStates, RobotStatesMut};
+use twinstep_model::{Command, Ground, Past, PerJoint, Placement, RobotModel, RobotStates, RobotStatesMut};
 
 use super::group::{Group, Input, LaneSnapshot, Sample, Scratch, Time};
 use crate::SimConfig;
@@ -46,6 +46,8 @@ pub trait Robots: Send + Sync {
         time: Time,
         states: &mut RobotStates,
     ) -> bool;
+    /// Lets the drives remember what robots did in drive periods of `steps` physics steps before they were placed.
+    fn remember(&mut self, past: &[&[Past]], steps: usize);
     /// Plays commands, one a drive period of `steps` physics steps, through every robot on this thread. What a robot
     /// does is written to entries 1 and up of its record.
     fn play(&mut self, commands: &[&[Command]], steps: usize, records: &mut [RobotStates]);
@@ -141,6 +143,12 @@ impl<T: Lane> Robots for Groups<T> {
                 // Every group is to be stepped, also after one that is not finite.
                 groups.map(|group| one(&mut scratch, group)).filter(|finite| !finite).count() == 0
             }
+        }
+    }
+
+    fn remember(&mut self, past: &[&[Past]], steps: usize) {
+        for (group, past) in self.groups.iter_mut().zip(past.chunks(T::LANES)) {
+            group.remember(past, steps);
         }
     }
 

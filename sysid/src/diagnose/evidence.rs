@@ -14,7 +14,7 @@ use crate::window::Horizon;
 /// Errors of a torque of this size, beside the noise, are any simulator's [N·m].
 const MISFIT_NM: f64 = 0.02;
 /// Share of a joint's motion that a model may miss before it is lost.
-const LOST: f64 = 0.5;
+const LOST: f64 = 0.1;
 /// Rows this long apart [s] are independent: positions, torques, the trunk, and its gyroscope, which has more noise than error.
 const INDEPENDENT_S: [f64; 4] = [0.2, 0.1, 0.5, 0.05];
 
@@ -62,7 +62,7 @@ impl Evidence {
         }
     }
 
-    /// Whether some joint is not followed at all by what leaves so much: as if it hung still, or worse.
+    /// Whether some joint is not followed at all by what leaves so much: by a third of its motion or more.
     pub fn is_lost(&self, left: &Leftover) -> bool {
         let log = &self.logs[0];
         (0..NUM_JOINTS).any(|joint| {
@@ -71,11 +71,6 @@ impl Evidence {
             let error = left.sums[joint].iter().sum::<f64>() / rows.max(1.0) * sigma * sigma;
             log.q(JOINT_NAMES[joint]).is_some_and(|q| error > LOST * variance(q))
         })
-    }
-
-    /// The logs.
-    pub fn into_logs(self) -> Vec<Log> {
-        self.logs
     }
 
     /// The logs.

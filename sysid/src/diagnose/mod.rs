@@ -103,22 +103,22 @@ pub fn diagnose(
     progress: &mut Progress,
 ) -> Result<Diagnosed, DiagnoseError> {
     let robot = model.robot_model()?;
-    let mut evidence = Evidence::new(logs, &robot, Horizon::DIAGNOSIS)?;
+    let mut say = |text: &str| if progress(text) { Ok(()) } else { Err(DiagnoseError::Ended) };
+    say("the ground, and errors of any robot")?;
+    let mut evidence = Evidence::new(logs.clone(), &robot, Horizon::DIAGNOSIS)?;
     let left = evidence.leftover(simulator, &robot);
     if left.diverged() {
         return Err(DiagnoseError::Diverges);
     }
-    if evidence.is_lost(&left) {
-        evidence = Evidence::new(evidence.into_logs(), &robot, Horizon::LOST)?;
-    }
-    let mut say = |text: &str| if progress(text) { Ok(()) } else { Err(DiagnoseError::Ended) };
-    say("the ground, and errors of any robot")?;
     let judged = on_fitted_ground(&evidence, model, simulator);
-    evidence.tolerate(&judged.robot_model()?, simulator);
-    let given = evidence.leftover(simulator, &robot);
+    let mut views = vec![View::new(evidence, &judged, &robot, simulator)?];
+    if views[0].evidence.is_lost(&left) {
+        evidence = Evidence::new(logs, &robot, Horizon::LOST)?;
+        views.push(View::new(evidence, &judged, &robot, simulator)?);
+    }
     let mut search = Search {
-        evidence: &evidence,
-        given: &given,
+        view: views.len() - 1,
+        views: &views,
         judged: judged.clone(),
         accepted: Accepted::new(),
         model: judged.clone(),
@@ -126,21 +126,22 @@ pub fn diagnose(
         say: &mut say,
     };
     search.run()?;
-    let Search { mut accepted, model: named, .. } = search;
+    let Search { view, mut accepted, model: named, .. } = search;
+    let View { evidence, given } = &views[view];
     let left = evidence.leftover(simulator, &named.robot_model()?);
     say("intervals")?;
-    let (extended, confusable) = intervals(model, &judged, &mut accepted, &evidence, simulator);
+    let (extended, confusable) = intervals(model, &judged, &mut accepted, evidence, simulator);
     say("choosing the next experiment")?;
     let rivalries = next::rivalries(&extended, &accepted, &confusable);
-    let next = next::next_motion(&rivalries, &evidence, &robot, simulator);
+    let next = next::next_motion(&rivalries, evidence, &robot, simulator);
     let causes = accepted.iter().map(|(best, others)| cause(best, others, &extended)).collect();
     let diagnosis = Diagnosis {
-        baseline: errors(&evidence, &robot, simulator)?,
-        extended: errors(&evidence, &extended.robot_model()?, simulator)?,
-        noise_floor: words::noise_floor(&evidence),
+        baseline: errors(evidence, &robot, simulator)?,
+        extended: errors(evidence, &extended.robot_model()?, simulator)?,
+        noise_floor: words::noise_floor(evidence),
         findings: causes,
         confusable,
-        unexplained: unexplained::unexplained(&evidence, &extended.robot_model()?, &given, &left, simulator),
+        unexplained: unexplained::unexplained(evidence, &extended.robot_model()?, given, &left, simulator),
         next_experiment: next.as_ref().map(|next| next.said.clone()),
         extended_model: String::new(),
     };
@@ -150,11 +151,32 @@ pub fn diagnose(
 /// Causes that are accepted, each with the others that were tried in its place.
 type Accepted = Vec<(Trial, Vec<Trial>)>;
 
+/// Logs in windows of one length.
+struct View {
+    evidence: Evidence,
+    /// What the given model leaves.
+    given: Leftover,
+}
+
+impl View {
+    fn new(
+        mut evidence: Evidence,
+        judged: &ModelFile,
+        robot: &RobotModel,
+        simulator: &mut dyn Rollout,
+    ) -> Result<Self, DiagnoseError> {
+        evidence.tolerate(&judged.robot_model()?, simulator);
+        let given = evidence.leftover(simulator, robot);
+        Ok(Self { evidence, given })
+    }
+}
+
 /// The search for causes.
 struct Search<'a> {
-    evidence: &'a Evidence,
-    /// What the given model leaves.
-    given: &'a Leftover,
+    /// In long windows; and in short ones, if the given model is lost in those.
+    views: &'a [View],
+    /// The one that is looked at.
+    view: usize,
     /// The given model on ground that suits the log.
     judged: ModelFile,
     accepted: Accepted,
@@ -164,7 +186,7 @@ struct Search<'a> {
     say: &'a mut dyn FnMut(&str) -> Result<(), DiagnoseError>,
 }
 
-impl Search<'_> {
+impl<'a> Search<'a> {
     /// One cause after the other, until none earns a name. What is left too small, or is more than any robot has, or does not
     /// explain its own joints when all are fitted together was another in disguise: it goes, and the search goes on without it.
     fn run(&mut self) -> Result<(), DiagnoseError> {
@@ -188,27 +210,27 @@ impl Search<'_> {
 
     /// A cause that does not stand when all are fitted together.
     fn untenable(&mut self) -> Option<usize> {
+        let View { evidence, given } = self.looked_at();
         let robot = self.model.robot_model().expect("fitted within its bounds");
-        let left = self.evidence.leftover(self.simulator, &robot);
+        let left = evidence.leftover(self.simulator, &robot);
         let stands = |hypothesis: &Hypothesis| {
-            hypothesis.is_large_enough()
-                && hypothesis.is_plausible()
-                && explains_its_joints(hypothesis, self.given, &left)
+            hypothesis.is_large_enough() && hypothesis.is_plausible() && explains_its_joints(hypothesis, given, &left)
         };
         self.accepted.iter().position(|(best, _)| !stands(&best.hypothesis))
     }
 
     /// The best cause on top of those that are accepted, if one earns a name.
     fn next(&mut self, excluded: &[String]) -> Result<Option<(Trial, Vec<Trial>)>, DiagnoseError> {
-        let left = self.evidence.leftover(self.simulator, &self.model.robot_model()?);
+        let evidence = &self.looked_at().evidence;
+        let left = evidence.leftover(self.simulator, &self.model.robot_model()?);
         let named = self.accepted.len();
         (self.say)(&format!("scanning, {named} named"))?;
-        let candidates = candidates(self.evidence, &self.model, self.simulator);
+        let candidates = candidates(evidence, &self.model, self.simulator);
         let mut trials = self.tried(candidates, excluded, &left)?;
         if let Some(best) = trials.first().filter(|best| best.score >= THRESHOLD) {
             // What the best is taken for, which one simulation of all joints may have missed.
             let names: Vec<String> = trials.iter().map(|trial| trial.hypothesis.name()).collect();
-            let alike = scan::alike(self.evidence, &self.model, &best.hypothesis, &names, &left, self.simulator);
+            let alike = scan::alike(evidence, &self.model, &best.hypothesis, &names, &left, self.simulator);
             trials.extend(self.tried(alike, excluded, &left)?);
             trials.sort_by(best_first);
         }
@@ -226,15 +248,21 @@ impl Search<'_> {
         excluded: &[String],
         left: &Leftover,
     ) -> Result<Vec<Trial>, DiagnoseError> {
+        let evidence = &self.looked_at().evidence;
         let mut trials = Vec::new();
         for hypothesis in hypotheses {
             if !self.is_out(&hypothesis, excluded) {
                 (self.say)(&format!("trying {}, {} named", hypothesis.name(), self.accepted.len()))?;
-                trials.extend(trial(self.evidence, &self.model, left, &hypothesis, self.simulator));
+                let hypothesis = scan::in_step(evidence, &self.model, hypothesis, left, self.simulator);
+                trials.extend(trial(evidence, &self.model, left, &hypothesis, self.simulator));
             }
         }
         trials.sort_by(best_first);
         Ok(trials)
+    }
+
+    fn looked_at(&self) -> &'a View {
+        &self.views[self.view]
     }
 
     /// Whether a hypothesis did not stand, or is named.
@@ -248,9 +276,19 @@ impl Search<'_> {
         let hypotheses: Vec<_> = self.accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
         self.model = self.judged.clone();
         let Some(fit) = Fit::new(&self.judged, &hypotheses).filter(|_| !hypotheses.is_empty()) else { return };
-        let point = fit.to(&self.evidence.whole, self.simulator);
+        let point = fit.to(&self.looked_at().evidence.whole, self.simulator);
         self.model = fit.model(&point);
         take_values(&mut self.accepted, &fit, &point);
+        self.look();
+    }
+
+    /// Long windows tell more, where the model follows them.
+    fn look(&mut self) {
+        if self.views.len() > 1 {
+            let robot = self.model.robot_model().expect("fitted within its bounds");
+            let evidence = &self.views[0].evidence;
+            self.view = usize::from(evidence.is_lost(&evidence.leftover(self.simulator, &robot)));
+        }
     }
 }
 

@@ -120,7 +120,8 @@ fn simulated(motion: &SafeMotion, robot: &RobotModel, like: &Log, simulator: &mu
     } else {
         Placement::above(&Ground::FLAT, robot, pose, 0.0)
     };
-    let states = simulator.play(&[Job { robot, held, start, commands: &commands }], Precision::Double).remove(0);
+    let states =
+        simulator.play(&[Job { robot, held, start, past: &[], commands: &commands }], Precision::Double).remove(0);
     let mut meta = Meta { noise: like.meta().noise.clone(), ..commanded.meta().clone() };
     let mut columns: Vec<_> = commanded.channels().map(|(name, cells)| (name.to_owned(), cells.to_vec())).collect();
     columns.push(("t".to_owned(), commanded.t().to_vec()));

@@ -89,19 +89,60 @@ pub fn alike(
         let alike = confused(effect, best.effect) || confused(best.effect, effect);
         alike && effect.target == best.effect.target && is_new(effect)
     });
-    let scope = best.scope;
-    let of = |effect: &'static Effect| {
-        let built = |values: Vec<f64>| {
-            let mut file = model.clone();
-            file.effects.push(Entry::new(effect, scope, values.clone()).ok()?);
-            Some((values, file.robot_model().ok()?))
-        };
-        let (values, robots): (Vec<_>, Vec<_>) = sizes_on_one_scope(effect).into_iter().filter_map(built).unzip();
-        let scores = evidence.leftovers(simulator, &robots, false).into_iter().map(|now| nats(evidence, &now, before));
-        let best = scores.zip(values).max_by(|one, other| one.0.total_cmp(&other.0));
-        best.map(|(_, values)| Hypothesis { effect, scope, values })
+    let first = |effect: &'static Effect| {
+        let at = sizes_on_one_scope(effect);
+        Some(Hypothesis {
+            effect,
+            scope: best.scope,
+            values: best_of(evidence, model, effect, best.scope, at, before, simulator)?,
+        })
     };
-    effects.filter_map(of).collect()
+    effects.filter_map(first).collect()
+}
+
+/// Delays and lags with which a loop rings are in step only where they are nearly right, and no slope leads there from afar:
+/// of those the best of many values, and of ever closer ones around it.
+pub fn in_step(
+    evidence: &Evidence,
+    model: &ModelFile,
+    hypothesis: Hypothesis,
+    before: &Leftover,
+    simulator: &mut dyn Rollout,
+) -> Hypothesis {
+    let Hypothesis { effect, scope, mut values } = hypothesis;
+    if !["command_delay", "torque_delay", "drive_lag"].contains(&effect.name) {
+        return Hypothesis { effect, scope, values };
+    }
+    let [least, most] = effect.parameters[0].bounds;
+    let mut tried = sizes_on_one_scope(effect);
+    tried.push(values.clone());
+    for around in [[0.88, 0.94, 1.06, 1.12], [0.97, 0.985, 1.015, 1.03]] {
+        let Some(best) = best_of(evidence, model, effect, scope, tried, before, simulator) else { break };
+        values = best;
+        let near = around.map(|factor| vec![(factor * values[0]).clamp(least, most)]);
+        tried = near.into_iter().chain([values.clone()]).collect();
+    }
+    Hypothesis { effect, scope, values }
+}
+
+/// The values that leave least of the whole logs.
+fn best_of(
+    evidence: &Evidence,
+    model: &ModelFile,
+    effect: &'static Effect,
+    scope: Scope,
+    values: Vec<Vec<f64>>,
+    before: &Leftover,
+    simulator: &mut dyn Rollout,
+) -> Option<Vec<f64>> {
+    let built = |values: Vec<f64>| {
+        let mut file = model.clone();
+        file.effects.push(Entry::new(effect, scope, values.clone()).ok()?);
+        Some((values, file.robot_model().ok()?))
+    };
+    let (values, robots): (Vec<_>, Vec<_>) = values.into_iter().filter_map(built).unzip();
+    let scores = evidence.leftovers(simulator, &robots, false).into_iter().map(|now| nats(evidence, &now, before));
+    scores.zip(values).max_by(|one, other| one.0.total_cmp(&other.0)).map(|(_, values)| values)
 }
 
 /// Evidence of everything [nats].
