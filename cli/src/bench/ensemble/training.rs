@@ -14,7 +14,7 @@ use crate::bench::Row;
 use crate::bench::pace::{WINDOWS, median_of};
 use crate::exit::{Failure, Signals, other};
 
-/// Rows of the log at 200 Hz: ten minutes, so that batches are full and no window reaches the end of an epoch.
+/// Rows of the log at 200 Hz: ten minutes, so that batches are full and a window of seconds ends within an epoch.
 const ROWS: usize = 120_000;
 /// Sequences of a batch and rows of a sequence, as [`Training`] has them.
 const LEARNING: (usize, usize) = (256, 64);
