@@ -101,6 +101,16 @@ impl Description {
         }
     }
 
+    /// kp [N·m/rad] and kd [N·m·s/rad] of all joints; fails if they are not the same.
+    pub fn shared_gains(&self) -> Result<[f64; 2], EnsembleError> {
+        let first = self.gains[0];
+        let other = (0..self.joints.len()).find(|joint| self.gains[*joint] != first);
+        other.map_or(Ok(first), |other| {
+            let joints = [0, other].map(|joint| self.joints[joint].clone());
+            Err(EnsembleError::GainsDiffer { joints, gains: [first, self.gains[other]] })
+        })
+    }
+
     /// Fails if a joint is of no kind, where kinds are an input.
     pub(crate) fn check(&self) -> Result<(), EnsembleError> {
         let unknown = self.joints.iter().find(|joint| self.joint_input == JointInput::Kind && kind(joint).is_none());

@@ -62,19 +62,17 @@ pub enum EnsembleError {
         /// The row of the log.
         row: usize,
     },
-    /// The robot has other gains than those that the networks know by heart.
+    /// A robot has one kp and one kd, and networks know several by heart.
     #[error(
-        "the ensemble learnt {joint} with kp {} and kd {}, the robot has kp {} and kd {}; a network sees only errors and \
-         knows its gains by heart: fit one to logs with the robot's gains",
-        learnt[0], learnt[1], wanted[0], wanted[1]
+        "the ensemble learnt {} with kp {} and kd {}, {} with kp {} and kd {}; a robot is commanded with one kp and one kd \
+         for all joints: fit one to logs with equal gains",
+        joints[0], gains[0][0], gains[0][1], joints[1], gains[1][0], gains[1][1]
     )]
-    OtherGains {
-        /// A joint that the ensemble knows.
-        joint: String,
-        /// Its kp [N·m/rad] and kd [N·m·s/rad].
-        learnt: [f64; 2],
-        /// The robot's.
-        wanted: [f64; 2],
+    GainsDiffer {
+        /// Two joints that the ensemble knows.
+        joints: [String; 2],
+        /// kp [N·m/rad] and kd [N·m·s/rad] of each.
+        gains: [[f64; 2]; 2],
     },
     /// What the networks have learnt already.
     #[error(

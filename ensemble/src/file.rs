@@ -140,11 +140,28 @@ impl Ensemble {
     pub fn read(path: impl AsRef<Path>) -> Result<Self, EnsembleError> {
         let arrays = Arrays::read(path.as_ref())?;
         let description: Description = arrays.header("ensemble")?;
+        if let Some(problem) = bad_gains(&description) {
+            return Err(arrays.problem(problem));
+        }
         description.check()?;
         let shape = description.shape();
         let members = (0..description.members).map(|index| arrays.weights(shape, &index.to_string()));
         Ok(Self { members: members.collect::<Result<_, _>>()?, description })
     }
+}
+
+/// What is wrong with the gains that a robot would be given, if anything.
+fn bad_gains(Description { joints, gains, .. }: &Description) -> Option<String> {
+    if joints.is_empty() || joints.len() != gains.len() {
+        return Some(format!(
+            "has `gains` of {} joints, and {} joints; one pair each is wanted",
+            gains.len(),
+            joints.len()
+        ));
+    }
+    let bad =
+        gains.iter().zip(joints).find(|(pair, _)| pair.iter().any(|gain| !(0.0..=f64::from(f32::MAX)).contains(gain)));
+    bad.map(|([kp, kd], joint)| format!("has `gains` of {joint} with kp {kp} and kd {kd}; both are 0 or more"))
 }
 
 #[cfg(test)]
@@ -209,6 +226,21 @@ mod tests {
         assert!(other.contains("`0.lstm.hidden_weight` as F32 [12, 3] instead of F32 [3, 12]"), "{other}");
         let broken = refusal(|arrays| arrays[6].1 = Bytes::floats(vec![1], &[f32::NAN]));
         assert!(broken.contains("`0.mean.bias` that is not finite"), "{broken}");
+    }
+
+    #[test]
+    fn gains_that_no_robot_can_have_are_refused() {
+        let refused = |gains: &[[f64; 2]]| {
+            let (folder, mut ensemble) = (tempfile::tempdir().expect("a folder"), ensemble());
+            let path = folder.path().join("ensemble.safetensors");
+            ensemble.description.gains = gains.to_vec();
+            ensemble.write(&path).expect("written");
+            Ensemble::read(&path).expect_err("refused").to_string()
+        };
+        let missing = refused(&[[20.0, 0.5]]);
+        assert!(missing.ends_with("has `gains` of 1 joints, and 2 joints; one pair each is wanted"), "{missing}");
+        let negative = refused(&[[20.0, 0.5], [20.0, -0.5]]);
+        assert!(negative.ends_with("of FL_calf with kp 20 and kd -0.5; both are 0 or more"), "{negative}");
     }
 
     #[test]

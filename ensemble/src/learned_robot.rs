@@ -15,7 +15,7 @@ const LAST_STEPS: [u32; 2] = [9, 14];
 /// A robot whose drives are learned.
 #[derive(Clone, Debug)]
 pub struct LearnedRobot {
-    /// The robot without what the ensemble stands for.
+    /// The robot without what the ensemble stands for; its gains are those that the ensemble learnt with.
     pub robot: RobotModel,
     ensemble: Ensemble,
     settings: LearnedDrive,
@@ -36,10 +36,7 @@ impl LearnedRobot {
         let mut robot = file.robot_model().expect("a file that was read is of a robot");
         let model = &ensemble.description;
         ensemble.check_step("the robot's drive", robot.control.drive_dt())?;
-        let wanted = [robot.control.kp, robot.control.kd];
-        if let Some((joint, learnt)) = model.joints.iter().zip(&model.gains).find(|(_, learnt)| **learnt != wanted) {
-            return Err(EnsembleError::OtherGains { joint: joint.clone(), learnt: *learnt, wanted });
-        }
+        [robot.control.kp, robot.control.kd] = model.shared_gains()?;
         let unknown = (0..JOINT_NAMES.len()).find(|joint| model.input_of(*joint).is_none());
         if let Some(joint) = unknown.filter(|_| model.joint_input == JointInput::Identity) {
             return Err(EnsembleError::UnknownJoint { joint: JOINT_NAMES[joint] });

@@ -8,7 +8,7 @@ use tempfile::TempDir;
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_ensemble::{Description, Ensemble, JointInput, LearnedRobot, Scale, Scales};
 use twinstep_env_server::{Config, Host, HostError, SimHost};
-use twinstep_envs::TaskName;
+use twinstep_envs::{TaskName, walk_spec};
 use twinstep_logs::{Base as LoggedBase, Log, Meta, Segment, TauSensor};
 use twinstep_model::{
     AutoresetMode, Backend, BackendError, Command as RobotCommand, JOINT_NAMES, LearnedDrive, MemberDraw, ModelFile,
@@ -258,17 +258,49 @@ fn serve_drives_robots_by_the_ensemble_of_its_model() {
 }
 
 #[test]
+fn served_robot_has_the_gains_that_its_ensemble_learnt_with_and_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let model = folder.path().join("robot.toml");
+    let soft = Description { gains: vec![[25.0, 0.6]; 12], ..description() };
+    Ensemble::of_gains(soft).write(folder.path().join("drives.safetensors")).unwrap();
+    std::fs::write(&model, "robot = \"go2\"\n[actuator]\nensemble = \"drives.safetensors\"").unwrap();
+    let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
+    let arguments = ["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "2", "--model", model.to_str().unwrap()];
+    let (_server, endpoint) = Process::listening(&programs.0.join("twinstep"), &arguments.map(str::to_owned)).unwrap();
+    let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
+    let nominal = walk_spec(&go2(), &Config::default().task);
+    let spec = remote.spec().clone();
+    assert_eq!([spec.kp, spec.kd], [25.0, 0.6]);
+    assert_ne!(spec.hash(), nominal.hash());
+    remote.reset(&ResetRequest::seeded(3, 2)).unwrap();
+    for step in 0..50 {
+        let batch = remote.step(&[0.0; 24]).unwrap();
+        assert!(batch.terminated.iter().all(|fell| !fell), "step {step}");
+    }
+}
+
+#[test]
 fn ensembles_that_do_not_go_with_the_robot_are_refused_with_the_reason() {
     let serve = ["serve", "--listen", "tcp/127.0.0.1:0"];
     let lag = "[[effect]]\nname = \"drive_lag\"\nscope = \"all\"\ntime_constant_s = 0.01";
     let ripple = "[[effect]]\nname = \"coulomb_friction\"\nscope = \"calf\"\ntorque_nm = 0.2";
     let slow = Description { dt: 0.02, ..description() };
-    let soft = Description { gains: vec![[20.0, 0.5]; 12], ..description() };
+    let mut uneven = description();
+    uneven.gains[4] = [20.0, 0.5];
     let behind = Description { tau_sensor: TauSensor::Output, ..description() };
-    let hip = Description { joints: vec!["FL_hip".to_owned()], joint_input: JointInput::Identity, ..description() };
+    let hip = Description {
+        joints: vec!["FL_hip".to_owned()],
+        gains: vec![[30.0, 0.75]],
+        joint_input: JointInput::Identity,
+        ..description()
+    };
     for (description, effects, reason) in [
         (slow, "", "`actuator.ensemble`: the robot's drive has a step of 0.005 s, the model one of 0.02 s"),
-        (soft, "", "learnt FL_hip with kp 20 and kd 0.5, the robot has kp 30 and kd 0.75"),
+        (
+            uneven,
+            "",
+            "learnt FL_hip with kp 30 and kd 0.75, FR_thigh with kp 20 and kd 0.5; a robot is commanded with one",
+        ),
         (
             description(),
             lag,

@@ -12,6 +12,7 @@ mod effects;
 mod exactly_once;
 mod faults;
 mod fit;
+mod golden_ensemble;
 mod hunt;
 mod identify;
 mod layering;

@@ -19,7 +19,8 @@ def test_the_package_imports_no_optional_library() -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "library", "extra"), [("sb3", "stable_baselines3", "sb3"), ("rsl_rl", "rsl_rl", "rsl-rl")]
+    ("module", "library", "extra"),
+    [("sb3", "stable_baselines3", "sb3"), ("rsl_rl", "rsl_rl", "rsl-rl"), ("onnx", "onnx", "onnx")],
 )
 def test_a_missing_library_is_named_with_its_extra(module: str, library: str, extra: str) -> None:
     done = run(f"import sys; sys.modules[{library!r}] = None; import twinstep.{module}")

@@ -73,7 +73,7 @@ fn write_stages(args: &Args, folder: &Path) {
     let drive = &DRIVES[DRIVES.len() - 1];
     for (name, amplitude, most_hz) in [("init", 0.12, 2.0), ("exp-1", 0.25, 3.5), ("exp-2", 0.45, 6.0)] {
         let motion = Motion { seconds: args.seconds, amplitude, hz: [0.3, most_hz], seed: args.seed };
-        drive.logs(motion).measured.write(&folder.join(format!("{name}.parquet"))).expect("written");
+        drive.logs(motion).measured.write(folder.join(format!("{name}.parquet"))).expect("written");
     }
 }
 

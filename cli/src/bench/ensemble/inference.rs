@@ -5,7 +5,7 @@ use std::path::Path;
 use twinstep_ensemble::{BurnInference, Inference};
 use twinstep_model::NUM_JOINTS;
 
-use super::torch::{Torch, name};
+use super::torch::{Learning, Setup, Torch, name};
 use super::{HIDDEN, MEMBERS, ensemble};
 use crate::bench::Row;
 use crate::bench::pace::{WINDOWS, measure as pace, median_of};
@@ -16,7 +16,8 @@ const ROBOTS: [usize; 4] = [1, 64, 1024, 4096];
 
 /// Microseconds a query: one member, and six with their disagreement; ours, PyTorch's and burn's in turn.
 pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
-    let mut torch = Torch::start(python, HIDDEN, &[1, MEMBERS], &ROBOTS, window_s);
+    let (members, robots, learning) = (&[1, MEMBERS], &ROBOTS, Learning::default());
+    let mut torch = Torch::start(python, &Setup { hidden: HIDDEN, members, robots, learning, window_s });
     let mut rows = Vec::new();
     for members in [1, MEMBERS] {
         for robots in ROBOTS {

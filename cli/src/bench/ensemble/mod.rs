@@ -1,8 +1,9 @@
-//! Learned drives: how fast networks answer beside PyTorch and burn, and robots that they drive.
+//! Learned drives: how fast networks answer and learn beside others, and robots that they drive.
 
 mod in_loop;
 mod inference;
 mod torch;
+mod training;
 
 use std::path::Path;
 
@@ -20,6 +21,7 @@ const HIDDEN: usize = 32;
 /// Every number of the ensemble.
 pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
     let mut rows = inference::measure(python, window_s, signals)?;
+    rows.extend(training::measure(python, window_s, signals)?);
     rows.extend(in_loop::measure(window_s, signals)?);
     Ok(rows)
 }

@@ -10,12 +10,30 @@ use crate::exit::Failure;
 /// What the child runs; it needs nothing but PyTorch.
 const SCRIPT: &str = include_str!("torch_peer.py");
 
+/// What is measured.
 #[derive(Serialize)]
-struct Setup<'a> {
-    hidden: usize,
-    members: &'a [usize],
-    robots: &'a [usize],
-    window_s: f64,
+pub struct Setup<'a> {
+    /// Units of an encoder.
+    pub hidden: usize,
+    /// Networks of a query.
+    pub members: &'a [usize],
+    /// Robots of a query.
+    pub robots: &'a [usize],
+    /// Trainings.
+    pub learning: Learning<'a>,
+    /// Length of a window [s].
+    pub window_s: f64,
+}
+
+/// Trainings of one network, one for each number of threads.
+#[derive(Default, Serialize)]
+pub struct Learning<'a> {
+    /// Sequences of a batch.
+    pub batch: usize,
+    /// Rows of a sequence.
+    pub rows: usize,
+    /// Threads.
+    pub threads: &'a [usize],
 }
 
 /// PyTorch, if the interpreter has it.
@@ -26,20 +44,25 @@ pub fn name(members: usize, robots: usize) -> String {
     format!("{members} {robots}")
 }
 
+/// What the child calls a training.
+pub fn training(threads: usize) -> String {
+    format!("training {threads}")
+}
+
 impl Torch {
     /// Asks the interpreter `python`; what it lacks is said on stderr, and left out.
-    pub fn start(python: &Path, hidden: usize, members: &[usize], robots: &[usize], window_s: f64) -> Self {
+    pub fn start(python: &Path, setup: &Setup) -> Self {
         let program =
             Program { arguments: &["-c", SCRIPT], name: "the networks in PyTorch", install: "pip install torch" };
-        Self(Peers::start_program(python, program, &Setup { hidden, members, robots, window_s }))
+        Self(Peers::start_program(python, program, setup))
     }
 
-    /// True if it can answer a query of that name.
+    /// True if it has a query or a training of that name.
     pub fn has(&self, query: &str) -> bool {
         self.0.has(query)
     }
 
-    /// Median time of a query in one window [µs].
+    /// Median time of a query, or of a training's step, in one window [µs].
     pub fn window(&mut self, query: &str) -> Result<f64, Failure> {
         self.0.window(query)
     }

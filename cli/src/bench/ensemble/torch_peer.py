@@ -1,7 +1,8 @@
-"""The networks of `twinstep bench ensemble` in PyTorch, on one thread.
+"""The networks of `twinstep bench ensemble` in PyTorch.
 
-Reads a line of JSON (hidden, members, robots, window_s), answers with the queries that it has, and then to each query,
-"members robots", with the median time in microseconds of one row of every joint, over one window.
+Reads a line of JSON (hidden, members, robots, learning, window_s), answers with the names of what it has, and then to each
+name with a median time in microseconds over one window: to a query, "members robots", that of one row of every joint, on
+one thread; to "training threads" that of one step of Adam of one network, on so many.
 """
 
 import json
@@ -10,11 +11,10 @@ import time
 
 try:
     import torch
-    from torch.nn.functional import softplus
+    from torch.nn.functional import gaussian_nll_loss, softplus
 except ImportError as error:
     sys.exit(f"lacks PyTorch: {error}")
 
-torch.set_num_threads(1)
 torch.manual_seed(1)
 
 
@@ -60,8 +60,29 @@ class Stack:
         return -alike.mean((0, 1)).log()
 
 
+class Training:
+    """One network on sequences, by PyTorch's own LSTM, loss and optimiser; the heads see the rows of all sequences at once."""
+
+    def __init__(self, hidden, batch, rows):
+        self.lstm = torch.nn.LSTM(2, hidden)
+        head = lambda: torch.nn.Sequential(torch.nn.Linear(hidden, hidden), torch.nn.ReLU(), torch.nn.Linear(hidden, 1))
+        self.mean, self.variance = head(), head()
+        modules = torch.nn.ModuleList([self.lstm, self.mean, self.variance])
+        self.optimiser = torch.optim.Adam(modules.parameters(), lr=5e-3)
+        self.torques = torch.randn(rows, batch, 1)
+
+    def hear(self, errors):
+        states, _ = self.lstm(errors)
+        variance = softplus(self.variance(states)) + 1e-6
+        loss = gaussian_nll_loss(self.mean(states), self.torques, variance)
+        self.optimiser.zero_grad()
+        loss.backward()
+        self.optimiser.step()
+
+
 def window(network, errors, seconds):
     times = []
+    network.hear(errors)
     since = last = time.perf_counter()
     while last - since < seconds or not times:
         network.hear(errors)
@@ -79,10 +100,18 @@ def main():
             rows = 12 * robots
             network = Member(setup["hidden"], rows) if members == 1 else Stack(members, setup["hidden"], rows)
             networks[f"{members} {robots}"] = (network, torch.randn(rows, 2))
+    batch, rows = setup["learning"]["batch"], setup["learning"]["rows"]
+    for threads in setup["learning"]["threads"]:
+        network = Training(setup["hidden"], batch, rows)
+        networks[f"training {threads}"] = (network, torch.randn(rows, batch, 2))
     print(json.dumps(list(networks)), flush=True)
-    with torch.inference_mode():
-        for line in sys.stdin:
-            print(window(*networks[line.strip()], setup["window_s"]), flush=True)
+    for line in sys.stdin:
+        name, threads = line.strip(), 1
+        if name.startswith("training"):
+            threads = int(name.split()[1])
+        torch.set_num_threads(threads)
+        with torch.inference_mode(not name.startswith("training")):
+            print(window(*networks[name], setup["window_s"]), flush=True)
 
 
 main()

@@ -1,0 +1,76 @@
+//! A small trained ensemble and what it says, kept in `ensemble/golden/` for other readers of its file.
+//!
+//! `UPDATE_GOLDEN=1 cargo test --release --workspace --test it golden_ensemble` trains it anew and writes both files.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use twinstep_ensemble::{DataSet, Ensemble, Inference, JointInput, Options, Outcome, Training};
+use twinstep_model::{JOINT_NAMES, NUM_JOINTS};
+use twinstep_tests::hidden_drive::{DRIVES, Motion};
+
+const ROWS: usize = 60;
+
+/// What every joint of a robot shows, row by row from an unseen past, and what every member makes of it.
+#[derive(Serialize, Deserialize)]
+struct Golden {
+    joints: Vec<String>,
+    /// ξ [rad, rad/s], `[row][joint]`.
+    errors: Vec<[[f64; 2]; NUM_JOINTS]>,
+    /// [N·m], `[row][member][joint]`.
+    mean: Vec<Vec<[f64; NUM_JOINTS]>>,
+    /// [N²·m²], `[row][member][joint]`.
+    variance: Vec<Vec<[f64; NUM_JOINTS]>>,
+}
+
+fn path(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../ensemble/golden").join(name)
+}
+
+fn trained() -> Ensemble {
+    let motion = Motion { seconds: 12.0, amplitude: 0.3, hz: [0.3, 6.0], seed: 5 };
+    let data = DataSet::new(&[("a drive that saturates".to_owned(), DRIVES[1].logs(motion).measured)]).unwrap();
+    let options = Options { members: 3, hidden: 8, joint_input: JointInput::Kind, epochs: 20, seed: 5 };
+    match Training::new(&data, options).unwrap().run(2, None, &mut |_| true).unwrap() {
+        Outcome::Trained(ensemble, _) => *ensemble,
+        Outcome::Ended(_) => panic!("it had no reason to end"),
+    }
+}
+
+/// What the ensemble says of joints that swing and now and then jump.
+fn said(ensemble: &Ensemble) -> Golden {
+    let mut inference = Inference::new(ensemble, 1);
+    let joints = JOINT_NAMES.map(str::to_owned).to_vec();
+    let mut golden = Golden { joints, errors: Vec::new(), mean: Vec::new(), variance: Vec::new() };
+    for row in 0..ROWS {
+        let errors = std::array::from_fn(|joint| {
+            let phase = 0.2 * row as f64 + joint as f64;
+            let jump = if (row + 7 * joint) % 31 < 4 { 0.25 } else { 0.0 };
+            [0.15 * phase.sin() + jump, 3.0 * phase.cos()]
+        });
+        inference.hear(&[errors]);
+        let members = || (0..ensemble.description.members).map(|member| inference.gaussians(0, member));
+        golden.mean.push(members().map(|gaussians| gaussians.map(|gaussian| gaussian.mean)).collect());
+        golden.variance.push(members().map(|gaussians| gaussians.map(|gaussian| gaussian.variance)).collect());
+        golden.errors.push(errors);
+    }
+    golden
+}
+
+#[test]
+fn golden_ensemble_says_what_is_written_beside_it() {
+    if std::env::var_os("UPDATE_GOLDEN").is_some() {
+        let ensemble = trained();
+        std::fs::create_dir_all(path("")).unwrap();
+        ensemble.write(path("drives.safetensors")).unwrap();
+        std::fs::write(path("said.json"), serde_json::to_string(&said(&ensemble)).unwrap()).unwrap();
+    }
+    let written: Golden = serde_json::from_slice(&std::fs::read(path("said.json")).unwrap()).unwrap();
+    let found = said(&Ensemble::read(path("drives.safetensors")).unwrap());
+    for (written, found) in [(written.mean, found.mean), (written.variance, found.variance)] {
+        let [written, found] = [written, found].map(|rows| rows.concat().concat());
+        assert_eq!(written.len(), ROWS * 3 * NUM_JOINTS);
+        // Digits of the text: the kernel has the same bits everywhere.
+        assert!(written.iter().zip(&found).all(|(one, other)| (one - other).abs() < 1e-9));
+    }
+}
