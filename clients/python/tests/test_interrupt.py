@@ -37,6 +37,6 @@ def test_interrupted_training_leaves_no_process_behind() -> None:
     # Into the middle of `learn`.
     time.sleep(1.0)
     os.killpg(agent.pid, signal.SIGINT)
-    _, printed = agent.communicate(timeout=60)
+    _, printed = agent.communicate(timeout=10)
     assert printed.rstrip().endswith("KeyboardInterrupt")
     assert_ends(server)
