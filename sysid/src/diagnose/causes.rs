@@ -6,7 +6,8 @@ use twinstep_model::{Joint, ModelFile, RobotModel, Rollout};
 use super::DiagnoseError;
 use super::evidence::Evidence;
 use super::hypothesis::Hypothesis;
-use super::leftover::{Leftover, TORQUE};
+use super::landscape::settled;
+use super::leftover::{CHANNELS, GYRO, Leftover, TORQUE, TRUNK};
 use super::scan::{self, Scored, scan};
 use super::trial::{Fit, Trial, trial};
 
@@ -96,7 +97,7 @@ impl<'a> Search<'a> {
         let robot = self.model.robot_model().expect("fitted within its bounds");
         let left = evidence.leftover(self.simulator, &robot);
         let stands = |hypothesis: &Hypothesis| {
-            hypothesis.is_large_enough() && hypothesis.is_plausible() && explains_its_joints(hypothesis, given, &left)
+            hypothesis.is_large_enough() && hypothesis.is_plausible() && explains_its_own(hypothesis, given, &left)
         };
         self.accepted.iter().position(|(best, _)| !stands(&best.hypothesis))
     }
@@ -158,7 +159,7 @@ impl<'a> Search<'a> {
         let hypotheses: Vec<_> = self.accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
         self.model = self.judged.clone();
         let Some(fit) = Fit::new(&self.judged, &hypotheses).filter(|_| !hypotheses.is_empty()) else { return };
-        let point = fit.to(&self.looked_at().evidence.whole, self.simulator);
+        let point = settled(&fit, &self.looked_at().evidence, self.simulator);
         self.model = fit.model(&point);
         take_values(&mut self.accepted, &fit, &point);
         self.look();
@@ -178,17 +179,27 @@ fn best_first(one: &Trial, other: &Trial) -> std::cmp::Ordering {
     other.score.total_cmp(&one.score)
 }
 
-/// Whether most of what was wrong at the joints of a cause is explained, in their positions and in their torques.
-fn explains_its_joints(hypothesis: &Hypothesis, given: &Leftover, left: &Leftover) -> bool {
-    if hypothesis.effect.target != Target::Joints {
-        return true;
-    }
-    let joints = || Joint::ALL.iter().filter(|joint| hypothesis.scope.contains(**joint)).map(|joint| joint.index());
-    [0, TORQUE].into_iter().all(|first| {
-        let excess = |left: &Leftover| joints().map(|joint| left.channel_excess(first + joint)).sum::<f64>();
-        let rows: f64 = joints().flat_map(|joint| left.counts[first + joint]).sum();
+/// Whether most of what was wrong where a cause acts is explained.
+fn explains_its_own(hypothesis: &Hypothesis, given: &Leftover, left: &Leftover) -> bool {
+    where_it_acts(hypothesis).into_iter().all(|channels| {
+        let excess = |left: &Leftover| channels.iter().map(|channel| left.channel_excess(*channel)).sum::<f64>();
+        let rows: f64 = channels.iter().flat_map(|channel| left.counts[*channel]).sum();
         excess(left) <= TOO_LITTLE * rows || excess(left) <= MOST_LEFT * excess(given)
     })
+}
+
+/// Channels of which each group has to be explained: of joints their positions, and their torques; of the trunk and the ground
+/// the motion of everything.
+fn where_it_acts(hypothesis: &Hypothesis) -> Vec<Vec<usize>> {
+    match hypothesis.effect.target {
+        Target::Joints => {
+            let joints = || Joint::ALL.into_iter().filter(|joint| hypothesis.scope.contains(*joint));
+            [0, TORQUE].map(|first| joints().map(|joint| first + joint.index()).collect()).to_vec()
+        }
+        Target::Base if hypothesis.effect.name == "gyro_bias" => vec![(GYRO..CHANNELS).collect()],
+        Target::Base | Target::Bodies | Target::Ground => vec![(0..TORQUE).chain(TRUNK..GYRO).collect()],
+        Target::Supply => Vec::new(),
+    }
 }
 
 /// Writes the values of a fit of all causes into them.
@@ -212,4 +223,42 @@ fn candidates(evidence: &Evidence, model: &ModelFile, simulator: &mut dyn Rollou
         scored.into_iter().filter(move |scored| scored.score >= least).take(most).map(|scored| scored.hypothesis)
     };
     tried(joints, TRIED).chain(tried(whole, TRIED_OF_WHOLE)).chain(tried(offsets, TRIED_OF_WHOLE)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use twinstep_model::effects::{Effect, Scope};
+
+    use super::*;
+
+    fn hypothesis(effect: &str, scope: Scope) -> Hypothesis {
+        Hypothesis { effect: Effect::named(effect).expect("an effect of the catalogue"), scope, values: Vec::new() }
+    }
+
+    /// A hundred rows of every channel, of this power, in units of noise.
+    fn leftover(power: impl Fn(usize) -> f64) -> Leftover {
+        let mut left = Leftover::empty();
+        for channel in 0..CHANNELS {
+            left.sums[channel][0] = 100.0 * power(channel);
+            left.counts[channel][0] = 100.0;
+        }
+        left
+    }
+
+    #[test]
+    fn cause_has_to_explain_half_of_what_was_wrong_where_it_acts() {
+        let (hip, calf) = (Joint::ALL[0], Joint::ALL[2]);
+        let given = leftover(|channel| if channel == hip.index() { 20.0 } else { 10.0 });
+        let only_hip = leftover(|channel| if channel == hip.index() { 1.0 } else { 9.9 });
+        let explains = |effect, scope| explains_its_own(&hypothesis(effect, scope), &given, &only_hip);
+        assert!(!explains("backlash", Scope::Joint(hip)), "the hip's torque is as wrong as before");
+        assert!(!explains("backlash", Scope::Joint(calf)));
+        assert!(!explains("com_shift", Scope::Base), "a trunk moves all joints");
+        assert!(!explains("gyro_bias", Scope::Base));
+        let noise = leftover(|_| 1.0);
+        for (effect, scope) in [("backlash", Scope::Joint(hip)), ("com_shift", Scope::Base), ("gyro_bias", Scope::Base)]
+        {
+            assert!(explains_its_own(&hypothesis(effect, scope), &given, &noise));
+        }
+    }
 }

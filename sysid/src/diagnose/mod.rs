@@ -15,6 +15,7 @@
 mod causes;
 mod evidence;
 mod hypothesis;
+mod landscape;
 mod leftover;
 mod line;
 mod next;
@@ -158,7 +159,7 @@ fn intervals(
     let hypotheses: Vec<_> = accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
     let fits = [judged, model].map(|model| Fit::new(model, &hypotheses).filter(|_| !hypotheses.is_empty()));
     let [Some(on_ground), Some(mut fit)] = fits else { return (model.clone(), Vec::new()) };
-    fit.begin = on_ground.to(&evidence.whole, simulator);
+    fit.begin = landscape::settled(&on_ground, evidence, simulator);
     take_values(accepted, &fit, &fit.begin);
     let experiments = &evidence.whole.experiments;
     let tolerances =
@@ -167,7 +168,8 @@ fn intervals(
         let errors = tolerances.map_or(Vec::new(), |all| all.robot_errors(task.spread, task.tolerances));
         covariance(&task.linear(simulator, &fit.begin)?, &blocks(experiments), &errors)
     });
-    words::with_intervals(&fit, covariance.as_ref(), SIMULATORS)
+    let near = landscape::near(&fit, evidence, simulator);
+    words::with_intervals(&fit, covariance.as_ref(), SIMULATORS, &near)
 }
 
 /// On the seconds that are set aside.

@@ -146,7 +146,7 @@ fn best_of(
 }
 
 /// Evidence of everything [nats].
-fn nats(evidence: &Evidence, now: &Leftover, before: &Leftover) -> f64 {
+pub fn nats(evidence: &Evidence, now: &Leftover, before: &Leftover) -> f64 {
     let of = |channel: usize| {
         [0, 1].map(|fold| now.gain(before, channel, fold, evidence.rows_in_one(channel))).iter().sum::<f64>()
     };

@@ -30,6 +30,7 @@ pub struct Trial {
 }
 
 /// Model and unknowns of effects on top of `model`, and where a descent begins: at `hypothesis` for the last of them.
+#[derive(Clone)]
 pub struct Fit {
     /// The model with an entry for each effect.
     pub file: ModelFile,

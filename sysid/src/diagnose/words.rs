@@ -17,8 +17,14 @@ const CORRELATED: f64 = 0.9;
 /// The normal distribution's two-sided 95 %.
 const TWO_SIDED_95: f64 = 1.96;
 
-/// The model of a fit with intervals, and what cannot be told apart; `least` is the deviation that no number is better than.
-pub fn with_intervals(fit: &Fit, covariance: Option<&DMatrix<f64>>, least: f64) -> (ModelFile, Vec<Confusable>) {
+/// The model of a fit with intervals, and what cannot be told apart; `least` is the deviation that no number is better than,
+/// and `near` are the ends of what is about as good, by unknown.
+pub fn with_intervals(
+    fit: &Fit,
+    covariance: Option<&DMatrix<f64>>,
+    least: f64,
+    near: &[[f64; 2]],
+) -> (ModelFile, Vec<Confusable>) {
     let mut model = fit.model(&fit.begin);
     let deviation = |index: usize| covariance.map_or(1.0, |covariance| covariance[(index, index)].sqrt().max(least));
     let intervals: Vec<Option<[f64; 2]>> = fit
@@ -27,7 +33,9 @@ pub fn with_intervals(fit: &Fit, covariance: Option<&DMatrix<f64>>, least: f64) 
         .enumerate()
         .map(|(index, unknown)| {
             let half = TWO_SIDED_95 * deviation(index) * unknown.prior[1];
-            let ends = [-half, half].map(|step| unknown.value(fit.begin[index] + step));
+            let [low, high] = near[index];
+            let ends =
+                [low.min(fit.begin[index] - half), high.max(fit.begin[index] + half)].map(|end| unknown.value(end));
             Some([ends[0].min(ends[1]), ends[0].max(ends[1])])
         })
         .collect();

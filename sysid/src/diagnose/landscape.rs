@@ -1,0 +1,168 @@
+//! Evidence along each number of a fit. A loop that rings, or a gear with play, has many small valleys: slopes tell neither
+//! which of them is the deepest nor how far its neighbours are as good.
+
+use twinstep_model::{RobotModel, Rollout};
+
+use super::evidence::Evidence;
+use super::scan::nats;
+use super::trial::Fit;
+
+/// Steps from a number, either way [prior deviations].
+const STEPS: [f64; 9] = [0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8];
+/// What a number loses at the ends of its 95 % interval [nats]: half of the quantile of χ² with one degree of freedom.
+const AT_ENDS: f64 = 1.92;
+/// A place that is better by so much [nats] is worth a descent from there.
+const BETTER: f64 = 3.0;
+/// Most descents.
+const DESCENTS: usize = 4;
+
+/// A place along one of the unknowns.
+struct Place {
+    unknown: usize,
+    coordinate: f64,
+    /// Evidence that is gained there.
+    gain: f64,
+}
+
+/// The numbers that follow the logs best, and no place along one of them is better.
+pub fn settled(fit: &Fit, evidence: &Evidence, simulator: &mut dyn Rollout) -> Vec<f64> {
+    let mut fit = fit.clone();
+    let mut best = fit.to(&evidence.whole, simulator);
+    for _ in 0..DESCENTS {
+        fit.begin.clone_from(&best);
+        let places = places(&fit, evidence, simulator);
+        let Some(better) = places.iter().max_by(|one, other| one.gain.total_cmp(&other.gain)) else { break };
+        if better.gain < BETTER {
+            break;
+        }
+        best[better.unknown] = better.coordinate;
+        fit.begin.clone_from(&best);
+        let descended = fit.to(&evidence.whole, simulator);
+        if gains(&fit, &[descended.clone()], evidence, simulator)[0] > 0.0 {
+            best = descended;
+        }
+    }
+    best
+}
+
+/// Coordinates between which each unknown of `fit` loses less than it does at the ends of its interval.
+pub fn near(fit: &Fit, evidence: &Evidence, simulator: &mut dyn Rollout) -> Vec<[f64; 2]> {
+    let mut ends: Vec<[f64; 2]> = fit.begin.iter().map(|coordinate| [*coordinate; 2]).collect();
+    for Place { unknown, coordinate, gain } in places(fit, evidence, simulator) {
+        if gain > -AT_ENDS {
+            let [low, high] = &mut ends[unknown];
+            (*low, *high) = (low.min(coordinate), high.max(coordinate));
+        }
+    }
+    ends
+}
+
+/// Places along each unknown, either way from where `fit` begins.
+fn places(fit: &Fit, evidence: &Evidence, simulator: &mut dyn Rollout) -> Vec<Place> {
+    let mut places = Vec::new();
+    for (index, unknown) in fit.unknowns.iter().enumerate() {
+        let [low, high] = unknown.coordinate_bounds();
+        for step in STEPS.into_iter().flat_map(|step| [-step, step]) {
+            let coordinate = (fit.begin[index] + step * unknown.prior[1]).clamp(low, high);
+            places.push(Place { unknown: index, coordinate, gain: 0.0 });
+        }
+    }
+    let point = |place: &Place| {
+        let mut point = fit.begin.clone();
+        point[place.unknown] = place.coordinate;
+        point
+    };
+    let points: Vec<Vec<f64>> = places.iter().map(point).collect();
+    for (place, gain) in places.iter_mut().zip(gains(fit, &points, evidence, simulator)) {
+        place.gain = gain;
+    }
+    places
+}
+
+/// Evidence that is gained at `points` [nats] against where `fit` begins; none where there is no robot.
+fn gains(fit: &Fit, points: &[Vec<f64>], evidence: &Evidence, simulator: &mut dyn Rollout) -> Vec<f64> {
+    let robot = |point: &[f64]| fit.model(point).robot_model().ok();
+    let all: Vec<Option<RobotModel>> = std::iter::once(&fit.begin).chain(points).map(|point| robot(point)).collect();
+    let robots: Vec<RobotModel> = all.iter().flatten().cloned().collect();
+    let mut left = evidence.leftovers(simulator, &robots, false).into_iter();
+    let mut left = all.iter().map(|robot| robot.as_ref().and_then(|_| left.next()));
+    let Some(here) = left.next().flatten() else { return vec![f64::NEG_INFINITY; points.len()] };
+    left.map(|left| left.map_or(f64::NEG_INFINITY, |left| nats(evidence, &left, &here))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use twinstep_logs::{Base, Log, Meta, Segment, TauSensor};
+    use twinstep_model::effects::{Effect, Scope};
+    use twinstep_model::{Job, Joint, ModelFile, Precision, RobotStates, go2};
+
+    use super::super::hypothesis::Hypothesis;
+    use super::*;
+    use crate::window::Horizon;
+
+    const RATE_HZ: f64 = 200.0;
+    /// Rows of a window of [`Horizon::DIAGNOSIS`].
+    const WINDOW: usize = 400;
+    const TRUTH: f64 = 0.3;
+    /// What friction changes by from one valley to the next [N·m·s].
+    const VALLEY: f64 = 0.06;
+
+    /// Rings, out of step with the truth by as much as its friction at the first joint is: next to the truth there is a
+    /// valley every [`VALLEY`], each less deep than the one before.
+    fn position(friction: f64, row: usize) -> f64 {
+        let phase = std::f64::consts::TAU * (friction - TRUTH) / VALLEY;
+        0.02 * (0.7 * row as f64 + phase).sin() + 0.1 * (friction - TRUTH)
+    }
+
+    struct Ringing;
+
+    impl Rollout for Ringing {
+        fn play(&mut self, jobs: &[Job], _: Precision) -> Vec<RobotStates> {
+            let play = |job: &Job| {
+                let mut states = RobotStates::new(job.commands.len() + 1);
+                for (row, q) in states.q.iter_mut().enumerate() {
+                    q[0] = position(job.robot.joints[0].viscous_friction, row) as f32;
+                }
+                states
+            };
+            jobs.iter().map(play).collect()
+        }
+    }
+
+    fn evidence() -> Evidence {
+        let rows = 5 * WINDOW;
+        let column = |name: &str, of: &dyn Fn(usize) -> f64| (name.to_owned(), (0..rows).map(of).collect());
+        let columns = [
+            column("t", &|row| row as f64 / RATE_HZ),
+            // A window begins with the row that the one before it ends with.
+            column("q_FL_hip", &|row| position(TRUTH, if row == 0 { 0 } else { (row - 1) % WINDOW + 1 })),
+            column("q_cmd_FL_hip", &|_| 0.0),
+            column("kp", &|_| 25.0),
+            column("kd", &|_| 0.6),
+        ];
+        let segments = vec![Segment { name: "air".to_owned(), base: Base::Fixed }];
+        let log = Log::new(Meta::new(RATE_HZ, TauSensor::None, segments), columns).expect("a log");
+        Evidence::new(vec![log], &go2(), Horizon::DIAGNOSIS).expect("an experiment")
+    }
+
+    fn fit(from: f64) -> Fit {
+        let effect = Effect::named("viscous_friction").expect("an effect of the catalogue");
+        let hypothesis = Hypothesis { effect, scope: Scope::Joint(Joint::ALL[0]), values: vec![from] };
+        Fit::new(&ModelFile::default(), &[hypothesis]).expect("a fit")
+    }
+
+    #[test]
+    fn descent_that_ends_in_the_next_valley_finds_the_deepest() {
+        let (evidence, fit) = (evidence(), fit(TRUTH + VALLEY));
+        let stuck = fit.to(&evidence.whole, &mut Ringing)[0];
+        assert!((stuck - TRUTH - VALLEY).abs() < 0.2 * VALLEY, "slopes lead to {stuck}");
+        let found = settled(&fit, &evidence, &mut Ringing)[0];
+        assert!((found - TRUTH).abs() < 0.05 * VALLEY, "{found}");
+    }
+
+    #[test]
+    fn what_is_near_loses_less_than_two_nats_and_the_next_valley_loses_more() {
+        let [low, high] = near(&fit(TRUTH), &evidence(), &mut Ringing)[0];
+        assert!((low..=high).contains(&TRUTH) && high - low < VALLEY, "{low} to {high}");
+    }
+}
