@@ -1,6 +1,7 @@
 //! A log as an experiment: windows that are simulated from measured states, and what is compared.
 
 use glam::DQuat;
+use rayon::prelude::*;
 use twinstep_logs::{Base, Log, TauSensor};
 use twinstep_model::{Command, Job, Joint, NUM_JOINTS, Precision, RobotModel, RobotStates, Rollout};
 
@@ -145,8 +146,8 @@ impl Experiment {
     ) -> Vec<Vec<f64>> {
         let trajectories = self.play(simulator, candidates, precision);
         candidates
-            .iter()
-            .zip(trajectories.chunks(self.windows.len().max(1)))
+            .par_iter()
+            .zip(trajectories.par_chunks(self.windows.len().max(1)))
             .map(|(robot, windows)| {
                 let mut residuals = Vec::new();
                 for (channel, window, states) in self.compared(windows) {

@@ -20,6 +20,8 @@ pub struct Unknown {
     pub unit: &'static str,
     /// What is allowed.
     pub bounds: [f64; 2],
+    /// What changes nothing.
+    pub neutral: f64,
     /// Prior mean and standard deviation, in the coordinate of [`Unknown::coordinate`].
     pub prior: [f64; 2],
     /// Sought as its inverse, because none of it is infinity.
@@ -101,6 +103,7 @@ pub fn unknowns(
                     },
                     unit: parameter.unit,
                     bounds: parameter.bounds,
+                    neutral: parameter.neutral,
                     prior: [middle, deviation],
                     inverse,
                     place: (index, place),

@@ -1,6 +1,7 @@
 //! Logs as evidence: what a candidate model leaves of each channel, in two folds of alternating seconds. Every fifth second is
 //! set aside.
 
+use rayon::prelude::*;
 use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout};
 
@@ -88,20 +89,21 @@ impl Evidence {
         let rows = if quick { &self.quick } else { &self.whole };
         let mut leftovers = rows.leftovers(simulator, robots);
         for (log, torques) in self.logs.iter().zip(&self.torques) {
-            for index in 0..robots.len() {
-                // Most effects are behind the torque's sensor: what it shows is as before.
-                let alike = index > 0 && torques.are_alike(&robots[index], &robots[index - 1]);
-                if alike {
-                    let (done, rest) = leftovers.split_at_mut(index);
-                    rest[0].sums[TORQUE..TRUNK].copy_from_slice(&done[index - 1].sums[TORQUE..TRUNK]);
-                    rest[0].counts[TORQUE..TRUNK].copy_from_slice(&done[index - 1].counts[TORQUE..TRUNK]);
-                    continue;
-                }
-                let sigma = torque_sigma(log, &robots[index]);
-                torques.differences(&robots[index], |joint, row, difference| {
-                    leftovers[index].add(TORQUE + joint, fold_of(log, row), difference / sigma[joint]);
-                });
-            }
+            // Most effects are behind the torque's sensor: what it shows of robots that follow one another is the same.
+            let alike: Vec<&[RobotModel]> = robots.chunk_by(|one, other| torques.are_alike(one, other)).collect();
+            let shown: Vec<Leftover> = alike
+                .par_iter()
+                .map(|robots| {
+                    let mut left = Leftover::empty();
+                    let sigma = torque_sigma(log, &robots[0]);
+                    torques.differences(&robots[0], |joint, row, difference| {
+                        left.add(TORQUE + joint, fold_of(log, row), difference / sigma[joint]);
+                    });
+                    left
+                })
+                .collect();
+            let each = shown.iter().zip(&alike).flat_map(|(left, robots)| std::iter::repeat_n(left, robots.len()));
+            leftovers.iter_mut().zip(each).for_each(|(left, shown)| left.add_all(shown));
         }
         leftovers
     }

@@ -49,6 +49,13 @@ impl Leftover {
         self.counts[channel][fold] += 1.0;
     }
 
+    /// Adds what is left of other rows.
+    pub fn add_all(&mut self, other: &Self) {
+        let mine = self.sums.as_flattened_mut().iter_mut().chain(self.counts.as_flattened_mut());
+        mine.zip(other.sums.as_flattened().iter().chain(other.counts.as_flattened()))
+            .for_each(|(sum, more)| *sum += more);
+    }
+
     /// True if the candidate diverged.
     pub fn diverged(&self) -> bool {
         self.sums.iter().flatten().any(|sum| !sum.is_finite())

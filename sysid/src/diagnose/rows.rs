@@ -1,5 +1,6 @@
 //! Rows of logs as residuals, and to which channel and fold each belongs. Every fifth second is in none.
 
+use rayon::prelude::*;
 use twinstep_logs::Log;
 use twinstep_model::{Precision, RobotModel, Rollout};
 
@@ -64,7 +65,7 @@ impl Rows {
                 whole.iter_mut().zip(residuals).for_each(|(whole, residuals)| whole.extend(residuals));
             }
         }
-        whole.into_iter().map(|residuals| self.leftover(residuals)).collect()
+        whole.into_par_iter().map(|residuals| self.leftover(residuals)).collect()
     }
 
     /// Residuals of a candidate less what tolerated errors explain.
