@@ -5,8 +5,8 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_logs::Log;
-use twinstep_model::ModelFile;
-use twinstep_sysid::{DiagnoseError, Diagnosed, Diagnosis, Errors, Value, diagnose};
+use twinstep_model::{Joint, ModelFile};
+use twinstep_sysid::{DiagnoseError, Diagnosed, Diagnosis, Errors, Value, diagnose, diagnose_torques};
 
 use crate::evaluate::simulator;
 use crate::exit::{Failure, Outcome, Signals, input, other};
@@ -24,6 +24,9 @@ use crate::report::write;
 /// DIR gets report.html to read, findings.json for programs, and extended.toml, which `twinstep serve --model` loads. Where
 /// causes are left that the log cannot tell apart, it also gets next_experiment, the safe motion that parts them best: play it
 /// and diagnose both logs.
+///
+/// Logs of another robot, with joints of other names, are looked at by the torques of their drives alone, beside ideal drives
+/// with the log's gains: they need `q_*`, `dq_*`, `q_cmd_*` and `tau_measured_*`, and DIR gets findings.json.
 ///
 /// Example: `twinstep diagnose data/go2_air_chirp --out diagnosis`
 #[derive(clap::Args)]
@@ -53,27 +56,35 @@ struct Unwritable {
     source: std::io::Error,
 }
 
+/// A model is of a Go2.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "--model {}: a model file is of a Go2, and the log's joint `{joint}` is none of its joints\n  without --model its drives \
+     are compared with ideal ones", model.display()
+)]
+struct OtherRobot {
+    model: PathBuf,
+    joint: String,
+}
+
 /// Diagnoses, writes and prints.
 pub fn run(args: &Args) -> Outcome {
     let model = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load_analytic).map_err(input)?;
     let logs = args.logs.iter().map(|path| Log::open(path).map_err(input)).collect::<Result<Vec<_>, _>>()?;
     // Before the search, not after it: what it finds must not be lost.
     std::fs::create_dir_all(&args.out).map_err(|source| input(Unwritable { path: args.out.clone(), source }))?;
-    let signals = Signals::listen()?;
+    let other_joint = logs[0].joints().iter().find(|name| name.parse::<Joint>().is_err());
+    if let Some(joint) = other_joint {
+        let model = args.model.clone();
+        let refused = model.map_or(Ok(()), |model| Err(OtherRobot { model, joint: joint.clone() }));
+        refused.map_err(input)?;
+        let diagnosis = with_progress(|progress| diagnose_torques(&logs, progress))?;
+        return tell(&diagnosis, args);
+    }
     let robot = model.robot_model().map_err(input)?;
     let mut simulator = simulator(&robot)?;
-    let bar = ProgressBar::new_spinner();
-    bar.set_style(ProgressStyle::with_template("{spinner} {elapsed} {msg}").expect("a template"));
-    let diagnosed = diagnose(logs.clone(), &model, &mut simulator, &mut |text| {
-        bar.set_message(text.to_owned());
-        bar.tick();
-        !signals.check().unwrap_or(true)
-    });
-    bar.finish_and_clear();
-    let Diagnosed { mut diagnosis, extended, next } = diagnosed.map_err(|error| match error {
-        DiagnoseError::Ended => Failure::Interrupted,
-        error => input(error),
-    })?;
+    let Diagnosed { mut diagnosis, extended, next } =
+        with_progress(|progress| diagnose(logs.clone(), &model, &mut simulator, progress))?;
     diagnosis.extended_model = "extended.toml".to_owned();
     let motion = args.out.join(NEXT_EXPERIMENT);
     // One of an earlier diagnosis would be taken for this one's.
@@ -84,13 +95,7 @@ pub fn run(args: &Args) -> Outcome {
         next.motion.write(&motion).map_err(input)?;
         NEXT_EXPERIMENT.clone_into(&mut said.motion);
     }
-    let json = serde_json::to_string_pretty(&diagnosis).map_err(other)?;
-    let written = |name: &str, text: &str| {
-        let path = args.out.join(name);
-        std::fs::write(&path, text).map_err(|source| input(Unwritable { path, source }))
-    };
-    written("extended.toml", &extended.to_toml())?;
-    written("findings.json", &json)?;
+    written(args, "extended.toml", &extended.to_toml())?;
     let provenance = Provenance {
         command: std::env::args().collect::<Vec<_>>().join(" "),
         date: today(),
@@ -98,13 +103,50 @@ pub fn run(args: &Args) -> Outcome {
         logs: args.logs.iter().zip(&logs).map(|(path, log)| LogFacts::of(&path.display().to_string(), log)).collect(),
     };
     let evidence = Evidence::gather(&logs[0], &model, &extended, &mut simulator, provenance).map_err(other)?;
-    write(&diagnosis, &evidence, &args.out.join("report.html")).map_err(input)?;
+    let report = args.out.join("report.html");
+    write(&diagnosis, &evidence, &report).map_err(input)?;
+    tell(&diagnosis, args)?;
+    if !args.json {
+        println!("report: {}", report.display());
+    }
+    Ok(())
+}
+
+/// What a diagnosis gives that says what it is doing, and ends with Ctrl-C.
+fn with_progress<T>(
+    diagnose: impl FnOnce(&mut dyn FnMut(&str) -> bool) -> Result<T, DiagnoseError>,
+) -> Result<T, Failure> {
+    let signals = Signals::listen()?;
+    let bar = ProgressBar::new_spinner();
+    bar.set_style(ProgressStyle::with_template("{spinner} {elapsed} {msg}").expect("a template"));
+    let found = diagnose(&mut |text| {
+        bar.set_message(text.to_owned());
+        bar.tick();
+        !signals.check().unwrap_or(true)
+    });
+    bar.finish_and_clear();
+    found.map_err(|error| match error {
+        DiagnoseError::Ended => Failure::Interrupted,
+        error => input(error),
+    })
+}
+
+/// Writes findings.json, and prints it or what a terminal shows.
+fn tell(diagnosis: &Diagnosis, args: &Args) -> Outcome {
+    let json = serde_json::to_string_pretty(diagnosis).map_err(other)?;
+    written(args, "findings.json", &json)?;
     if args.json {
         println!("{json}");
     } else {
-        print!("{}", text(&diagnosis, &args.out));
+        print!("{}", text(diagnosis, &args.out));
     }
     Ok(())
+}
+
+/// Writes a file of the folder.
+fn written(args: &Args, name: &str, text: &str) -> Outcome {
+    let path = args.out.join(name);
+    std::fs::write(&path, text).map_err(|source| input(Unwritable { path, source }))
 }
 
 /// What a terminal shows.
@@ -131,8 +173,7 @@ fn text(diagnosis: &Diagnosis, out: &Path) -> String {
     }
     lines.push(error_line("closed-loop joint RMSE [rad]", diagnosis, |errors| errors.q_rmse_rad));
     lines.push(error_line("torque RMSE [N·m]", diagnosis, |errors| errors.torque_rmse_nm));
-    lines.push(format!("report: {}\n", out.join("report.html").display()));
-    lines.join("\n")
+    lines.join("\n") + "\n"
 }
 
 fn error_line(name: &str, diagnosis: &Diagnosis, of: fn(&Errors) -> Option<f64>) -> String {

@@ -36,7 +36,7 @@ mod unknown;
 mod window;
 
 pub use balance::{Balance, Kinematics, PerRow};
-pub use diagnose::{DiagnoseError, Diagnosed, NextMotion, Rivalry, diagnose};
+pub use diagnose::{DiagnoseError, Diagnosed, NextMotion, Rivalry, diagnose, diagnose_torques};
 pub use diagnosis::{
     Cause, Confusable, Diagnosis, Errors, Estimate, NextExperiment, Parted, Rival, Unexplained, Value,
 };

@@ -2,10 +2,12 @@
 
 use std::path::Path;
 
+use twinstep_logs::{Log, Meta};
 use twinstep_model::effects::{Effect, Entry, compose};
 use twinstep_model::{ModelFile, RobotModel, go2};
 use twinstep_sysid::{Diagnosis, Value};
 use twinstep_tests::browser::{browser, layout};
+use twinstep_tests::hidden_drive::{DRIVES, Motion, NOISE_NM};
 
 use crate::identify::{log_of, twinstep};
 
@@ -91,4 +93,38 @@ fn bad_input_is_refused_before_any_work() {
     assert!(String::from_utf8_lossy(&output.stderr).contains("cannot write /proc/nowhere"));
     let output = twinstep(&["diagnose", "no/such/log", "--out", "/tmp"]);
     assert_eq!(output.status.code(), Some(2));
+}
+
+/// Legs of a robot with other names, whose motors saturate: no body of it is known.
+#[test]
+fn drives_of_another_robot_are_looked_at_by_their_torques() {
+    let folder = tempfile::tempdir().unwrap();
+    let motion = Motion { seconds: 10.0, amplitude: 0.3, hz: [0.5, 5.0], seed: 4 };
+    let go2 = DRIVES[1].logs(motion).measured;
+    let columns = go2.channels().map(|(name, cells)| (name.replace("calf", "shank"), cells.to_vec()));
+    let time = [("t".to_owned(), go2.t().to_vec())];
+    let meta = Meta { joints: Vec::new(), ..go2.meta().clone() };
+    let noise = meta.noise.into_iter().map(|(channel, sigma)| (channel.replace("calf", "shank"), sigma)).collect();
+    let log = Log::new(Meta { noise, ..meta }, columns.chain(time)).unwrap();
+    let path = folder.path().join("log.parquet");
+    log.write(&path).unwrap();
+    let out = folder.path().join("diagnosis");
+    let command = ["diagnose", path.to_str().unwrap(), "--out", out.to_str().unwrap()];
+    let output = twinstep(&command);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let findings = std::fs::read_to_string(out.join("findings.json")).unwrap();
+    let diagnosis: Diagnosis = serde_json::from_str(&findings).unwrap();
+    let cause = &diagnosis.findings[0];
+    assert_eq!((cause.effect.as_str(), cause.scope.as_str()), ("torque_saturation", "all"), "{findings}");
+    let kappa = &cause.parameters["kappa_nm"];
+    let Value::Number(value) = kappa.value else { panic!("{kappa:?}") };
+    assert!((value - 8.0).abs() < 0.4, "{kappa:?}");
+    assert!(diagnosis.extended.torque_rmse_nm < Some(1.2 * NOISE_NM), "{findings}");
+    assert!(!out.join("report.html").exists() && !out.join("extended.toml").exists());
+
+    let model = folder.path().join("model.toml");
+    std::fs::write(&model, ModelFile::default().to_toml()).unwrap();
+    let refused = twinstep(&[&command[..], &["--model", model.to_str().unwrap()]].concat());
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&refused.stderr).contains("FL_shank"), "{refused:?}");
 }

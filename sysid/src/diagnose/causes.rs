@@ -23,11 +23,11 @@ const TRIED: usize = 5;
 /// And about the trunk, the ground and the gyroscope, and about encoders.
 const TRIED_OF_WHOLE: usize = 2;
 /// Share of the power above noise that a cause has to explain.
-const LEAST_SHARE: f64 = 0.3;
+pub const LEAST_SHARE: f64 = 0.3;
 /// Share of the power above noise at a cause's own joints that may stay when all is named, and power in units of noise that
 /// is too little to tell. A gain that grows with the error is followed a part of the way by one that is higher.
-const MOST_LEFT: f64 = 0.5;
-const TOO_LITTLE: f64 = 1.0;
+pub const MOST_LEFT: f64 = 0.5;
+pub const TOO_LITTLE: f64 = 1.0;
 
 /// Causes that are accepted, each with the others that were tried in its place.
 pub type Accepted = Vec<(Trial, Vec<Trial>)>;

@@ -133,7 +133,7 @@ fn variance(values: &[f64]) -> f64 {
 }
 
 /// Noise of the torques that measured states make, beside the sensor's own and any simulator's misfit [N·m].
-fn torque_sigma(log: &Log, robot: &RobotModel) -> [f64; NUM_JOINTS] {
+pub fn torque_sigma(log: &Log, robot: &RobotModel) -> [f64; NUM_JOINTS] {
     JOINT_NAMES.map(|name| {
         let noise = |channel: &str, assumed: f64| {
             log.noise(&format!("{channel}_{name}")).filter(|sigma| *sigma > 0.0).unwrap_or(assumed)

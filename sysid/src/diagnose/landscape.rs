@@ -10,7 +10,7 @@ use super::trial::Fit;
 /// Steps from a number, either way [prior deviations].
 const STEPS: [f64; 9] = [0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8];
 /// What a number loses at the ends of its 95 % interval [nats]: half of the quantile of χ² with one degree of freedom.
-const AT_ENDS: f64 = 1.92;
+pub const AT_ENDS: f64 = 1.92;
 /// A place that is better by so much [nats] is worth a descent from there.
 const BETTER: f64 = 3.0;
 /// Most descents.

@@ -6,12 +6,16 @@
 //! - [`causes`]: the search, which uses these in turn:
 //! - [`scan`]: every effect on every joint at once; the best go on.
 //! - [`trial`]: one hypothesis fitted to one fold and judged on the other, in full simulation.
+//! - [`landscape`]: what slopes do not show of a fit: other valleys, and how far their floor goes.
 //! - [`rivalry`], [`next`]: which motion would part causes that the logs cannot tell apart.
 //! - [`unexplained`]: what is left, and what it depends on; [`line`]: or at which frequency it shakes.
+//!
+//! Joints that are not a Go2's are looked at by their torques alone: [`any_joints`], with [`seats`] and [`torque_fit`].
 //!
 //! The best trial is accepted if its evidence exceeds the threshold and it explains a good part of what is above the noise;
 //! all that is accepted is fitted anew together, and the search goes on from there.
 
+mod any_joints;
 mod causes;
 mod evidence;
 mod hypothesis;
@@ -22,6 +26,8 @@ mod next;
 mod rivalry;
 mod rows;
 mod scan;
+mod seats;
+mod torque_fit;
 mod trial;
 mod unexplained;
 mod words;
@@ -37,6 +43,7 @@ use crate::identify::blocks;
 use crate::refine::{SIMULATORS, covariance};
 use crate::tolerance::Tolerances;
 use crate::window::Horizon;
+pub use any_joints::diagnose_torques;
 use causes::{Accepted, Search, THRESHOLD, View, take_values};
 use evidence::Evidence;
 use hypothesis::Hypothesis;

@@ -16,7 +16,7 @@ const BINS: usize = 12;
 /// Share of a residual's power that a variable has to explain on held-out seconds.
 const TELLING: f64 = 0.3;
 /// Power above the noise, in units of it, that is worth a word.
-const LEAST_EXCESS: f64 = 0.3;
+pub const LEAST_EXCESS: f64 = 0.3;
 
 /// What `robot` leaves of what was `given`.
 pub fn unexplained(
@@ -36,26 +36,49 @@ pub fn unexplained(
             of(*one).total_cmp(&of(*other))
         })
         .filter(|channel| left.channel_excess(*channel) > LEAST_EXCESS * count(*channel));
-    let Some(channel) = worst else {
-        return Unexplained { fraction: 0.0, depends_on: Vec::new(), text: "What is left is noise.".to_owned() };
-    };
+    let Some(channel) = worst else { return noise() };
     let log = &evidence.logs()[0];
     let residual = residual(evidence, robot, channel, simulator);
-    let mut found: Vec<(f64, String)> = variables(log, robot)
+    let kind = if channel < TORQUE { "position" } else { "torque" };
+    let whose = format!("The {kind} of {}", JOINT_NAMES[channel % 12]);
+    told(log, &residual, variables(log, robot), fraction, &whose)
+}
+
+/// What a residual of a log depends on; `whose` it is begins the sentence.
+pub fn told(
+    log: &Log,
+    residual: &[f64],
+    variables: Vec<(String, Vec<f64>)>,
+    fraction: f64,
+    whose: &str,
+) -> Unexplained {
+    let mut found: Vec<(f64, String)> = variables
         .into_iter()
-        .map(|(name, cells)| (explained(log, &residual, &cells), name))
-        .chain(line_of(log, &residual).map(|(frequency, share)| (share, format!("a line at {frequency:.2} Hz"))))
+        .map(|(name, cells)| (explained(log, residual, &cells), name))
+        .chain(line_of(log, residual).map(|(frequency, share)| (share, format!("a line at {frequency:.2} Hz"))))
         .filter(|(share, _)| *share > TELLING)
         .collect();
     found.sort_by(|one, other| other.0.total_cmp(&one.0));
     found.truncate(3);
-    let kind = if channel < TORQUE { "position" } else { "torque" };
-    let name = JOINT_NAMES[channel % 12];
     let told = found.first().map_or("it depends on none of the channels".to_owned(), |(share, variable)| {
         format!("{:.0} % of it follows {variable}", 100.0 * share)
     });
-    let text = format!("The {kind} of {name} is off by more than noise and all that is named explain: {told}.");
+    let text = format!("{whose} is off by more than noise and all that is named explain: {told}.");
     Unexplained { fraction, depends_on: found.into_iter().map(|(_, name)| name).collect(), text }
+}
+
+/// Nothing is left.
+pub fn noise() -> Unexplained {
+    Unexplained { fraction: 0.0, depends_on: Vec::new(), text: "What is left is noise.".to_owned() }
+}
+
+/// What a log measured, and time.
+pub fn measured(log: &Log) -> Vec<(String, Vec<f64>)> {
+    let starts = ["q_", "dq_", "tau_measured_", "battery_V", "temp_"];
+    let measured = log.channels().filter(|(name, _)| starts.iter().any(|start| name.starts_with(start)));
+    let mut all: Vec<(String, Vec<f64>)> = measured.map(|(name, cells)| (name.to_owned(), cells.to_vec())).collect();
+    all.push(("t".to_owned(), log.t().to_vec()));
+    all
 }
 
 /// The strongest line of a residual, and the share that it explains.
@@ -92,15 +115,8 @@ fn residual(evidence: &Evidence, robot: &RobotModel, channel: usize, simulator: 
 
 /// What a residual might depend on: positions, velocities, commands and torques of all joints, and time.
 fn variables(log: &Log, robot: &RobotModel) -> Vec<(String, Vec<f64>)> {
-    let mut all: Vec<(String, Vec<f64>)> = log
-        .channels()
-        .filter(|(name, _)| {
-            ["q_", "dq_", "tau_measured_", "battery_V", "temp_"].iter().any(|start| name.starts_with(start))
-        })
-        .map(|(name, cells)| (name.to_owned(), cells.to_vec()))
-        .collect();
+    let mut all = measured(log);
     all.extend(wanted_torques(log, robot));
-    all.push(("t".to_owned(), log.t().to_vec()));
     all
 }
 

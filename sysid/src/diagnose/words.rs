@@ -16,9 +16,9 @@ use crate::unknown::set_intervals;
 const CORRELATED: f64 = 0.9;
 /// How far two simulators of one law are apart in its size, relative: a standard deviation. Measured on hunts of development,
 /// where errors of one or two percent in limits of speed, delays and gains were outside of narrower intervals.
-const SIZE_OF_SIMULATORS: f64 = 0.015;
+pub const SIZE_OF_SIMULATORS: f64 = 0.015;
 /// The normal distribution's two-sided 95 %.
-const TWO_SIDED_95: f64 = 1.96;
+pub const TWO_SIDED_95: f64 = 1.96;
 
 /// The model of a fit with intervals, and what cannot be told apart; `least` is the deviation that no number is better than,
 /// and `near` are the ends of what is about as good, by unknown.
