@@ -64,6 +64,9 @@ pub struct Args {
     /// training and what judges it stay as measured.
     #[arg(long, value_name = "HZ")]
     pub smooth: Option<f64>,
+    /// Train on the best GPU there is (builds with `--features gpu`); the numbers differ from the CPU's by rounding.
+    #[arg(long)]
+    gpu: bool,
     /// Go on with the training that ended, from OUT.training.
     #[arg(long)]
     resume: bool,
@@ -116,7 +119,10 @@ pub fn learn(
     out: &Path,
     resume: Option<Checkpoint>,
 ) -> Result<(Ensemble, Vec<Vec<Epoch>>), Failure> {
-    let training = Training::new(data, args.options()).map_err(input)?;
+    let mut training = Training::new(data, args.options()).map_err(input)?;
+    if args.gpu {
+        println!("training on {}", training.on_gpu().map_err(input)?);
+    }
     // Before the training, not after it: what was learnt must not be lost.
     check_writable(out).map_err(input)?;
     let saved = training_file(out);

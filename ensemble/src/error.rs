@@ -141,6 +141,12 @@ pub enum EnsembleError {
         /// The learning rate then.
         rate: f64,
     },
+    /// No GPU, or none in this build.
+    #[error("cannot train on a GPU: {cause}")]
+    NoGpu {
+        /// What is missing.
+        cause: String,
+    },
     /// A saved training of other data or settings.
     #[error("the saved training is of other {what}; go on with the same command, or start anew without it")]
     OtherTraining {

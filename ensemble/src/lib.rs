@@ -7,7 +7,7 @@
 //! - [`DataSet`] is measured logs as runs of rows without a gap, in three roles by blocks of time: to learn from, to stop
 //!   by, to judge by.
 //! - [`Training`] trains the members of an ensemble, tells its progress, ends when asked to, and goes on from a
-//!   [`Checkpoint`] as if it had never ended.
+//!   [`Checkpoint`] as if it had never ended. It does so on the CPU, or with the feature `gpu` on a GPU.
 //! - [`Ensemble`] is the trained members with all that their numbers depend on ([`Description`]): time step, scales, joints,
 //!   sensor, gains. It predicts, and it is read from and written to a safetensors file.
 //! - [`Calibration`] says how often the truth lies where an ensemble says it does.
@@ -23,6 +23,7 @@
 //! leaves the crate. The step of time is part of a model: one of another step is refused.
 
 mod activation;
+mod adam;
 mod by_hand;
 mod calibration;
 mod checkpoint;
@@ -33,6 +34,7 @@ mod ensemble;
 mod error;
 mod euf;
 mod file;
+mod gpu;
 mod inference;
 mod kernel;
 mod learned_robot;

@@ -1,13 +1,13 @@
 //! The training of one member.
 
-use burn::grad_clipping::GradientClippingConfig;
 use burn::module::Module;
-use burn::optim::{AdamConfig, ModuleOptimizer};
+use burn::optim::ModuleOptimizer;
 use burn::tensor::{Bytes, Device};
 use rand::seq::SliceRandom;
 use twinstep_model::stream;
 
 use crate::EnsembleError;
+use crate::adam::adam;
 use crate::checkpoint::MemberState;
 use crate::network::Network;
 use crate::train::{Epoch, Options};
@@ -53,17 +53,21 @@ pub struct Member<'a> {
 }
 
 impl<'a> Member<'a> {
-    /// From where `state` left off.
-    pub fn new(index: usize, options: &'a Options, shape: Shape, state: MemberState) -> Result<Self, EnsembleError> {
-        let device = Device::flex().autodiff();
-        let new = AdamConfig::new().with_grad_clipping(Some(GradientClippingConfig::Norm(GRADIENT_NORM))).init();
+    /// From where `state` left off, on any device.
+    pub fn new(
+        index: usize,
+        options: &'a Options,
+        shape: Shape,
+        state: MemberState,
+        device: &Device,
+    ) -> Result<Self, EnsembleError> {
         let optimizer = match state.optimizer {
-            saved if saved.is_empty() => new,
-            saved => new
+            saved if saved.is_empty() => adam(GRADIENT_NORM),
+            saved => adam(GRADIENT_NORM)
                 .from_bytes(Bytes::from_bytes_vec(saved))
                 .map_err(|_| EnsembleError::OtherTraining { what: VERSION })?,
         };
-        let network = Network::new(shape, &state.weights, &device);
+        let network = Network::new(shape, &state.weights, &device.clone().autodiff());
         Ok(Self { index, options, shape, network, optimizer, best: state.best, curve: state.curve })
     }
 

@@ -68,9 +68,12 @@ impl Network {
     }
 
     /// That and its gradients, of a network on an autodiff device.
-    ///
-    /// The heads are burn's to differentiate, as far back as the encoder's states; from there it is the encoder's own way.
     pub fn learn(&self, batch: &Batch) -> (f32, GradientsParams) {
+        if self.on_cpu() { self.learn_by_hand(batch) } else { self.learn_by_burn(batch) }
+    }
+
+    /// The heads are burn's to differentiate, as far back as the encoder's states; from there it is the encoder's own way.
+    fn learn_by_hand(&self, batch: &Batch) -> (f32, GradientsParams) {
         let encoder = self.encoder();
         let tape = encoder.forward(batch);
         let states = Tensor::<2>::from_data(tape.states(), &self.hidden_weight.val().device()).require_grad();
@@ -87,6 +90,17 @@ impl Network {
         (loss.into_scalar(), gradients)
     }
 
+    fn learn_by_burn(&self, batch: &Batch) -> (f32, GradientsParams) {
+        let loss = nll(self.heads(self.states_by_burn(batch)), batch);
+        let gradients = GradientsParams::from_grads(loss.backward(), self);
+        (loss.into_scalar(), gradients)
+    }
+
+    /// Whether it is where the encoder by hand is.
+    fn on_cpu(&self) -> bool {
+        self.hidden_weight.val().device() == Device::flex()
+    }
+
     fn encoder(&self) -> Encoder {
         Encoder {
             input_weight: self.input_weight.val().inner(),
@@ -95,9 +109,26 @@ impl Network {
         }
     }
 
-    /// The encoder's states, outside of autodiff, `[time · batch, hidden]`.
+    /// The encoder's states, `[time · batch, hidden]`.
     fn states(&self, batch: &Batch) -> Tensor<2> {
-        Tensor::from_data(self.encoder().forward(batch).states(), &self.hidden_weight.val().device())
+        if self.on_cpu() {
+            Tensor::from_data(self.encoder().forward(batch).states(), &self.hidden_weight.val().device())
+        } else {
+            self.states_by_burn(batch)
+        }
+    }
+
+    /// As [`Network::states`] on any device, for autodiff too.
+    fn states_by_burn(&self, batch: &Batch) -> Tensor<2> {
+        let (device, [units, _]) = (self.hidden_weight.val().device(), self.hidden_weight.val().dims());
+        let inputs = Tensor::<2>::from_data(batch.inputs(), &device);
+        let nothing = Tensor::<2>::zeros([batch.size, units], &device);
+        let (mut memory, mut states) = ([nothing.clone(), nothing], Vec::new());
+        for time in 0..batch.time {
+            memory = self.row(inputs.clone().narrow(0, time * batch.size, batch.size), memory);
+            states.push(memory[1].clone());
+        }
+        Tensor::cat(states, 0)
     }
 
     /// Cells and states after one more row, in burn's operations; inputs `[batch, inputs]`, memory two of `[batch, hidden]`.
@@ -184,33 +215,39 @@ mod tests {
         Windows::sequences(data.runs(Block::Training), &training.description).batch(&[0, 3])
     }
 
-    /// The whole network in burn's operations.
-    fn by_burn(network: &Network, batch: &Batch) -> Tensor<1> {
-        let device = network.hidden_weight.val().device();
-        let inputs = Tensor::<2>::from_data(batch.inputs(), &device);
-        let nothing = Tensor::<2>::zeros([batch.size, SHAPE.hidden], &device);
-        let (mut memory, mut states) = ([nothing.clone(), nothing], Vec::new());
-        for time in 0..batch.time {
-            memory = network.row(inputs.clone().narrow(0, time * batch.size, batch.size), memory);
-            states.push(memory[1].clone());
+    /// Holds loss and gradients to those of the encoder by hand, within 10⁻⁵ of the largest of an array or of 1.
+    fn check_by_burn(device: &Device) {
+        let (by_hand, by_burn, batch) =
+            (network(&Device::flex().autodiff()), network(&device.clone().autodiff()), batch());
+        let ((wanted_loss, wanted), (loss, found)) = (by_hand.learn_by_hand(&batch), by_burn.learn_by_burn(&batch));
+        assert!((loss - wanted_loss).abs() < 1e-5, "{loss} for {wanted_loss}");
+        for (index, (name, dimensions)) in SHAPE.layout().into_iter().enumerate() {
+            let id = ParamId::from(index as u64 + 1);
+            let numbers = |all: &GradientsParams| -> Vec<f32> {
+                let data = match dimensions.len() {
+                    1 => all.get::<1>(id).map(Tensor::into_data),
+                    _ => all.get::<2>(id).map(Tensor::into_data),
+                };
+                data.and_then(|data| data.try_into_vec().ok()).expect("a gradient")
+            };
+            let (wanted, found) = (numbers(&wanted), numbers(&found));
+            let largest = wanted.iter().fold(1.0_f32, |largest, one| largest.max(one.abs()));
+            let worst = wanted.iter().zip(&found).map(|(one, other)| (one - other).abs()).fold(0.0, f32::max);
+            assert!(found.len() == wanted.len() && worst < 1e-5 * largest, "{name}: {worst} of {largest}");
         }
-        nll(network.heads(Tensor::cat(states, 0)), batch)
     }
 
     #[test]
     fn encoder_by_hand_has_the_loss_and_the_gradients_that_burn_finds() {
-        let (network, batch) = (network(&Device::flex().autodiff()), batch());
-        let (loss, found) = network.learn(&batch);
-        let reference = by_burn(&network, &batch);
-        let wanted = GradientsParams::from_grads(reference.backward(), &network);
-        assert!((loss - reference.into_scalar::<f32>()).abs() < 1e-5);
-        let largest = |one: &Tensor<2>| one.clone().abs().max().into_scalar::<f32>();
-        for id in [network.input_weight.id, network.hidden_weight.id, network.mean.hidden_weight.id] {
-            let [one, other]: [Tensor<2>; 2] = [&found, &wanted].map(|all| all.get(id).expect("a gradient"));
-            assert!(largest(&(one - other.clone())) < 1e-5 * largest(&other).max(1.0));
+        check_by_burn(&Device::flex());
+    }
+
+    #[cfg(feature = "gpu")]
+    #[test]
+    fn gpu_has_the_loss_and_the_gradients_of_the_encoder_by_hand() {
+        if let Some(device) = crate::gpu::tests::device() {
+            check_by_burn(&device);
         }
-        let [one, other]: [Tensor<1>; 2] = [&found, &wanted].map(|all| all.get(network.gate_bias.id).expect("one"));
-        assert!(largest(&(one - other).unsqueeze()) < 1e-5);
     }
 
     #[test]

@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 
+use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 
 use crate::EnsembleError;
@@ -13,6 +14,7 @@ use crate::calibration::variance_scale;
 use crate::checkpoint::{Checkpoint, MemberState};
 use crate::data::{Block, DataSet};
 use crate::ensemble::{Description, Ensemble, JointInput};
+use crate::gpu;
 use crate::member::{EpochEnd, Member, finished};
 use crate::scales::Scales;
 use crate::windows::Windows;
@@ -101,6 +103,7 @@ pub struct Training<'a> {
     pub(crate) description: Description,
     sequences: Windows,
     validation: Windows,
+    device: Device,
 }
 
 /// News from a thread.
@@ -130,7 +133,16 @@ impl<'a> Training<'a> {
         description.check()?;
         let sequences = Windows::sequences(data.runs(Block::Training), &description);
         let validation = Windows::sequences(data.runs(Block::Validation), &description);
-        Ok(Self { data, options, description, sequences, validation })
+        Ok(Self { data, options, description, sequences, validation, device: Device::flex() })
+    }
+
+    /// Trains on the best GPU there is, whose name it gives, in place of the CPU.
+    ///
+    /// Numbers differ by rounding; a checkpoint goes on on either. Needs the feature `gpu`.
+    pub fn on_gpu(&mut self) -> Result<&'static str, EnsembleError> {
+        let (device, name) = gpu::best()?;
+        self.device = device;
+        Ok(name)
     }
 
     /// Sequences that a member learns from in an epoch.
@@ -138,7 +150,7 @@ impl<'a> Training<'a> {
         self.sequences.len()
     }
 
-    /// Trains all members on `threads` threads, from `resume` on where there is one.
+    /// Trains all members on `threads` threads (on a GPU one after another), from `resume` on where there is one.
     ///
     /// `progress` is called ten times a second and more, in the caller's thread, and ends the training when it answers `false`.
     pub fn run(
@@ -155,9 +167,10 @@ impl<'a> Training<'a> {
         let all = checkpoint.members.iter().cloned().enumerate();
         let waiting: VecDeque<_> = all.filter(|(_, member)| !done(member)).collect();
         let (waiting, stop) = (Mutex::new(waiting), AtomicBool::new(false));
+        let most = if self.device == Device::flex() { self.options.members } else { 1 };
         std::thread::scope(|scope| {
             let (sender, news) = channel();
-            for _ in 0..threads.clamp(1, self.options.members) {
+            for _ in 0..threads.clamp(1, most) {
                 let sender = sender.clone();
                 let (waiting, stop) = (&waiting, &stop);
                 scope.spawn(move || self.work(waiting, stop, sender));
@@ -217,7 +230,7 @@ impl<'a> Training<'a> {
         stop: &AtomicBool,
         tell: &dyn Fn(News) -> bool,
     ) -> Result<(), EnsembleError> {
-        let mut member = Member::new(index, &self.options, self.description.shape(), state)?;
+        let mut member = Member::new(index, &self.options, self.description.shape(), state, &self.device)?;
         let mut each = |sequences| tell(News::Sequences(sequences)) && !stop.load(Ordering::Relaxed);
         while let EpochEnd::Done = member.epoch(&self.sequences, &self.validation, &mut each)? {
             let state = member.state()?;
@@ -285,6 +298,33 @@ mod tests {
             training.run(1, Some(read()), &mut |_| true).expect_err("refused").to_string()
         };
         assert!(other(Options { seed: 2, ..options(4) }).contains("other settings"));
+    }
+
+    #[cfg(feature = "gpu")]
+    #[test]
+    fn gpu_learns_what_the_cpu_learns_and_each_goes_on_where_the_other_ended() {
+        if gpu::tests::device().is_none() {
+            return;
+        }
+        let data = data();
+        let training = || Training::new(&data, options(2)).expect("options");
+        let (on_cpu, mut on_gpu) = (training(), training());
+        on_gpu.on_gpu().expect("a GPU");
+        let curves = |training: &Training, resume| trained(training.run(2, resume, &mut |_| true).expect("trains")).1;
+        let wanted = curves(&on_cpu, None);
+        let close = |found: Vec<Vec<Epoch>>| {
+            for (found, wanted) in found.iter().flatten().zip(wanted.iter().flatten()) {
+                let apart = (found.validation_nll - wanted.validation_nll).abs();
+                assert!(apart < 1e-3, "{found:?} for {wanted:?}");
+                println!("{apart:e} nat");
+            }
+        };
+        close(curves(&on_gpu, None));
+        for [first, second] in [[&on_cpu, &on_gpu], [&on_gpu, &on_cpu]] {
+            let ended = first.run(1, None, &mut |progress| !matches!(progress, Progress::Epoch { .. }));
+            let Ok(Outcome::Ended(checkpoint)) = ended else { panic!("it was told to end") };
+            close(curves(second, Some(checkpoint)));
+        }
     }
 
     #[test]
