@@ -38,7 +38,7 @@ pub fn settled(fit: &Fit, evidence: &Evidence, simulator: &mut dyn Rollout) -> V
         best[better.unknown] = better.coordinate;
         fit.begin.clone_from(&best);
         let descended = fit.to(&evidence.whole, simulator);
-        if gains(&fit, &[descended.clone()], evidence, simulator)[0] > 0.0 {
+        if gains(&fit, std::slice::from_ref(&descended), evidence, simulator)[0] > 0.0 {
             best = descended;
         }
     }
