@@ -333,6 +333,13 @@ mod tests {
     }
 
     #[test]
+    fn cause_of_some_of_many_joints_says_which() {
+        let found = diagnosis(log(|joint, wanted, row| if joint >= 12 { 0.8 * wanted[row] } else { wanted[row] }));
+        let names: Vec<_> = found.findings.iter().map(|cause| format!("{}@{}", cause.effect, cause.scope)).collect();
+        assert_eq!(names, ["torque_gain@axis_12+axis_13"], "{:#?}", found.findings);
+    }
+
+    #[test]
     fn what_a_joint_lacks_is_named() {
         let whole = log(|_, wanted, row| wanted[row]);
         let columns: Vec<(String, Vec<f64>)> = std::iter::once(("t".to_owned(), whole.t().to_vec()))

@@ -25,6 +25,8 @@ const INDEPENDENT_S: f64 = 0.1;
 pub struct Seats {
     /// Their own names.
     names: Vec<String>,
+    /// Whether these are all joints of the robot.
+    whole: bool,
     /// The logs with the joints in their seats, and nothing else.
     logs: Vec<Log>,
     torques: Vec<MeasuredTorque>,
@@ -37,6 +39,7 @@ pub struct Seats {
 impl Seats {
     /// The joints `names` of `logs`, which have one rate.
     pub fn new(logs: &[Log], names: &[String]) -> Result<Self, MotionError> {
+        let whole = names.len() == logs[0].joints().len();
         let mut ideal = go2();
         ideal.control.drive_hz = logs[0].meta().rate_hz;
         for joint in &mut ideal.joints {
@@ -47,7 +50,7 @@ impl Seats {
         let unit = if largest > 0.0 { largest / LARGEST_NM } else { 1.0 };
         let logs: Vec<Log> = logs.iter().map(|log| seated(log, names, unit)).collect::<Result<_, _>>()?;
         let torques = logs.iter().map(|log| MeasuredTorque::new(log, &ideal)).collect::<Result<_, _>>()?;
-        Ok(Self { names: names.to_vec(), logs, torques, ideal, unit })
+        Ok(Self { names: names.to_vec(), whole, logs, torques, ideal, unit })
     }
 
     /// What a cause may be about: all joints, or one.
@@ -65,6 +68,8 @@ impl Seats {
     pub fn told(&self, scope: Scope) -> String {
         match scope {
             Scope::Joint(joint) => self.names[joint.index()].clone(),
+            // Others of the robot were looked at apart.
+            _ if !self.whole => self.names.join("+"),
             scope => scope.to_string(),
         }
     }
