@@ -22,8 +22,8 @@ def ask(session: zenoh.Session, key: str, **request: object) -> dict[str, Any]:
                 return msgpack.unpackb(reply.ok.payload.to_bytes())
             error = cast(zenoh.ReplyError, reply.err).payload.to_bytes()
             # Zenoh's own error is a text, "Timeout"; Twinstep's is a map.
-            if error[0] >= 0x80 and not (told := msgpack.unpackb(error))["retry"]:
-                raise RuntimeError(f"{told['code']}: {told['message']}\n  {told['hint']}")
+            if error[0] >= 0x80 and not (reply := msgpack.unpackb(error))["retryable"]:
+                raise RuntimeError(f"{reply['code']}: {reply['message']}\n  {reply['hint']}")
         time.sleep(0.05)
     raise TimeoutError(f"no answer at {key}")
 
@@ -37,13 +37,13 @@ def main() -> None:
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config) as session:
         servers = session.liveliness().get("twinstep/live/server/*/*")
-        (sid,) = {str(reply.ok.key_expr).split("/")[3] for reply in servers if reply.ok}
-        low, high = ask(session, f"twinstep/{sid}/hello", client="minimal_client.py")["protocols"]
+        (server_id,) = {str(reply.ok.key_expr).split("/")[3] for reply in servers if reply.ok}
+        low, high = ask(session, f"twinstep/{server_id}/hello", client="minimal_client.py")["protocols"]
         assert low <= 1 <= high, f"the server speaks protocol {low} to {high}, this client 1"
         client = uuid.uuid4().hex
-        token = session.liveliness().declare_token(f"twinstep/live/client/{sid}/{client}")
-        lease = ask(session, f"twinstep/{sid}/lease", client=client, num_envs=ENVS, autoreset="NextStep")
-        env, epoch, seq = f"twinstep/{sid}/env/{lease['lease']}", lease["epoch"], lease["last_seq"] + 1
+        token = session.liveliness().declare_token(f"twinstep/live/client/{server_id}/{client}")
+        lease = ask(session, f"twinstep/{server_id}/lease", client=client, num_envs=ENVS, autoreset="NextStep")
+        env, epoch, seq = f"twinstep/{server_id}/env/{lease['lease']}", lease["epoch"], lease["last_seq"] + 1
         ask(session, f"{env}/reset", epoch=epoch, seq=seq, seeds=struct.pack(f"<{ENVS}Q", *range(ENVS)))
         entries = ENVS * sum(part["size"] for part in lease["spec"]["action"])
         for _ in range(STEPS):

@@ -48,7 +48,7 @@ def step_until_lost(envs: twinstep.Go2VectorEnv, random: np.random.Generator) ->
             try:
                 obs = envs.recv()[0]
                 break
-            except twinstep.NoAnswerError as error:
+            except twinstep.RequestTimeoutError as error:
                 say("waiting", error)
         for counter, action in zip(counters, actions, strict=True):
             counter.step(action)

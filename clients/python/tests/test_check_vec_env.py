@@ -160,7 +160,7 @@ BROKEN: dict[str, tuple[Any, str]] = {
     "float64 obs": (lambda: changed_step(lambda o, *r: (o.astype(float), *r)), r"obs is float64 \(3, 2\)"),
     "list obs": (lambda: changed_step(lambda o, *r: (o.tolist(), *r)), "obs is list of 3"),
     "batched obs shape": (lambda: changed(reset=lambda self: Good.reset(self)[:2]), r"obs is float32 \(2, 2\)"),
-    "obs outside": (lambda: changed_step(outside), r"environment 2: obs\[1\] is 1.5\n  wanted: within \[-1.0, 1.0\]"),
+    "obs outside": (lambda: changed_step(outside), r"environment 2: obs\[1\] is 1.5\n  expected: within \[-1.0, 1.0\]"),
     "reset gives a tuple": (lambda: changed(reset=lambda self: (Good.reset(self), {})), "obs is tuple of 2"),
     "five results": (lambda: changed_step(lambda o, r, d, i: (o, r, d, d, i)), "`step_wait` gave tuple of 5"),
     "integer reward": (lambda: changed_step(lambda o, r, d, i: (o, r.astype(int), d, i)), "reward is int64"),
@@ -235,4 +235,4 @@ def test_a_broken_vec_env_is_named(name: str) -> None:
     make, message = BROKEN[name]
     with pytest.raises(VecEnvError, match=message) as caught:
         check_vec_env(make(), steps=20)
-    assert "\n  wanted: " in str(caught.value)
+    assert "\n  expected: " in str(caught.value)

@@ -46,7 +46,7 @@ def test_any_bytes_give_a_map_or_a_typed_error(payload: bytes) -> None:
 
 
 def test_wrong_length_is_named() -> None:
-    with pytest.raises(codec.MalformedError, match=r"`obs` has 7 bytes; <f4 \(2,\) is wanted"):
+    with pytest.raises(codec.MalformedError, match=r"`obs` has 7 bytes; <f4 \(2,\) is expected"):
         codec.tensor({"obs": bytes(7)}, "obs", "<f4", 2)
     with pytest.raises(codec.MalformedError, match="`obs` is NoneType, not bytes"):
         codec.tensor({}, "obs", "<f4", 2)

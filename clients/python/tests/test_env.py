@@ -53,7 +53,7 @@ def test_seeds_may_be_given_one_by_one() -> None:
     envs = Go2VectorEnv(2)
     obs, _ = envs.reset(seed=[3, 9])
     np.testing.assert_array_equal(obs[1], first)
-    with pytest.raises(twinstep.InvalidOptionError, match="`seed` has 1 entries; 2 are wanted"):
+    with pytest.raises(twinstep.InvalidOptionError, match="`seed` has 1 entries; 2 are expected"):
         envs.reset(seed=[3])
     envs.close()
 
@@ -86,8 +86,8 @@ def test_reset_mask_resets_where_it_is_true(counters: Go2VectorEnv) -> None:
     obs, _ = counters.reset(options={"reset_mask": np.array([False, True, False])})
     assert obs[:, 1].tolist() == [1, 2, 1]
     for mask, words in (
-        (np.array([True]), r"bool \(1,\); bool \(3,\) is wanted"),
-        (np.array([1, 0, 0]), r"int64 \(3,\); bool \(3,\) is wanted"),
+        (np.array([True]), r"bool \(1,\); bool \(3,\) is expected"),
+        (np.array([1, 0, 0]), r"int64 \(3,\); bool \(3,\) is expected"),
         (np.zeros(3, np.bool_), "nowhere true"),
     ):
         with pytest.raises(twinstep.InvalidOptionError, match=words):
@@ -127,8 +127,8 @@ def test_round_trip_is_told_only_when_asked_for(counters: Go2VectorEnv) -> None:
 @pytest.mark.parametrize(
     ("actions", "words"),
     [
-        (np.zeros((3, 11), np.float32), r"`actions` has shape \(3, 11\); \(3, 12\) is wanted"),
-        (np.zeros((3, 12), np.complex64), "`actions` has dtype complex64; float32 is wanted"),
+        (np.zeros((3, 11), np.float32), r"`actions` has shape \(3, 11\); \(3, 12\) is expected"),
+        (np.zeros((3, 12), np.complex64), "`actions` has dtype complex64; float32 is expected"),
         (np.full((3, 12), np.nan), r"environment 0, joint_position_offset\[FL_hip\], is nan"),
         (np.where(np.eye(3, 12, 4), np.inf, 0), r"environment 0, joint_position_offset\[FR_thigh\], is inf"),
     ],

@@ -25,7 +25,7 @@ def freeze(pid: int) -> None:
 
 
 def test_nobody_at_the_endpoint_is_said_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twinstep.link.CONNECT_TIMEOUT_S", 0.3)
+    monkeypatch.setattr("twinstep.connection.CONNECT_TIMEOUT_S", 0.3)
     with pytest.raises(twinstep.NoServerError) as error:
         Go2Env(endpoint="tcp/127.0.0.1:9")
     assert str(error.value).startswith("no server answers at tcp/127.0.0.1:9 after")
@@ -49,7 +49,7 @@ def test_bad_arguments_are_named(arguments: dict[str, object], words: str) -> No
 
 
 def test_bad_vector_arguments_are_named() -> None:
-    with pytest.raises(twinstep.InvalidOptionError, match="`num_envs` = 0; at least 1 is wanted"):
+    with pytest.raises(twinstep.InvalidOptionError, match="`num_envs` = 0; at least 1 is expected"):
         Go2VectorEnv(0)
     with pytest.raises(twinstep.InvalidOptionError, match="'NextStep', 'SameStep', 'Disabled' are known"):
         Go2VectorEnv(1, autoreset_mode="Sometimes")
@@ -73,8 +73,8 @@ def test_other_task_and_other_robot_are_refused() -> None:
     with pytest.raises(twinstep.SpecMismatchError, match="`spec_hash` = 00 is not this server's"):
         Go2Env(endpoint=server.endpoint, task="counter", spec_hash="00")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("twinstep.link.CONNECT_TIMEOUT_S", 0.2)
-        with pytest.raises(twinstep.NoUniqueRobotError, match="0 robots are named `rex`; visible: fido"):
+        patch.setattr("twinstep.connection.CONNECT_TIMEOUT_S", 0.2)
+        with pytest.raises(twinstep.AmbiguousRobotError, match="0 robots are named `rex`; visible: fido"):
             Go2Env(endpoint=server.endpoint, task="counter", robot="rex")
     with Go2Env(endpoint=server.endpoint, task="counter", robot="fido") as env:
         env.reset()
@@ -83,7 +83,7 @@ def test_other_task_and_other_robot_are_refused() -> None:
 
 def test_too_many_environments_are_refused_with_the_servers_number() -> None:
     server = EmbeddedServer(("--task", "counter", "--envs", "8"))
-    with pytest.raises(twinstep.RefusedError, match="`num_envs` = 9 are too many: 8 of 8 are free") as error:
+    with pytest.raises(twinstep.RequestRejectedError, match="`num_envs` = 9 are too many: 8 of 8 are free") as error:
         Go2VectorEnv(9, task="counter", endpoint=server.endpoint)
     assert (error.value.code, error.value.field) == ("too_many_envs", "num_envs")
     server.release()
@@ -100,7 +100,7 @@ def test_server_that_died_is_told_at_once_and_a_new_environment_gets_a_new_one()
     server = envs._remote._link._server
     os.kill(server.pid, signal.SIGKILL)
     since = time.monotonic()
-    with pytest.raises(twinstep.ServerDiedError, match=r"ended by signal 9; its last log lines:(.|\n)*robot `go2`"):
+    with pytest.raises(twinstep.ServerExitedError, match=r"ended by signal 9; its last log lines:(.|\n)*robot `go2`"):
         envs.step(STILL)
     assert time.monotonic() - since < 5
     envs.close()
@@ -115,7 +115,7 @@ def test_frozen_server_is_told_after_the_timeout_and_its_step_is_executed_once()
     envs.reset()
     server = envs._remote._link._server
     freeze(server.pid)
-    with pytest.raises(twinstep.NoAnswerError, match=r"no answer from tcp/127\.0\.0\.1"):
+    with pytest.raises(twinstep.RequestTimeoutError, match=r"no answer from tcp/127\.0\.0\.1"):
         envs.step(STILL)
     with pytest.raises(twinstep.Error, match="not answered yet"):
         envs.send(STILL)
@@ -151,4 +151,4 @@ def test_every_refusal_is_a_twinstep_error_with_its_hint() -> None:
         error = from_reply(code, "", "what", "how")
         assert type(error) is kind
         assert str(error) == "what\n  how"
-    assert isinstance(from_reply("brand_new", "field", "what", ""), twinstep.RefusedError)
+    assert isinstance(from_reply("brand_new", "field", "what", ""), twinstep.RequestRejectedError)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from twinstep.render import Viewer, _HeightField, _meet_field  # pyright: ignore[reportPrivateUsage]
+from twinstep.render import Viewer, _HeightField, _intersect_field  # pyright: ignore[reportPrivateUsage]
 
 GOLDEN = Path(__file__).parents[3] / "protocol" / "golden"
 
@@ -26,17 +26,17 @@ def scene(**changes: Any) -> dict[str, Any]:
     return {**golden("render_reply"), **changes}
 
 
-def field(heights: NDArray[np.float32], cell: float) -> dict[str, Any]:
+def field(heights: NDArray[np.float32], cell_size: float) -> dict[str, Any]:
     """A square of heights around the origin, as a server sends it."""
     rows, columns = heights.shape
-    corner = [-0.5 * cell * (rows - 1), -0.5 * cell * (columns - 1)]
+    origin = [-0.5 * cell_size * (rows - 1), -0.5 * cell_size * (columns - 1)]
     sent = heights.astype("<f4").tobytes()
-    return {"corner": corner, "cell": cell, "rows": rows, "columns": columns, "heights": sent}
+    return {"origin": origin, "cell_size": cell_size, "rows": rows, "columns": columns, "heights": sent}
 
 
-def on_field(heights: NDArray[np.float32], cell: float, **changes: Any) -> dict[str, Any]:
+def on_field(heights: NDArray[np.float32], cell_size: float, **changes: Any) -> dict[str, Any]:
     flat = scene()["ground"]
-    return scene(ground={**flat, "height_field": field(heights, cell)}, **changes)
+    return scene(ground={**flat, "height_field": field(heights, cell_size)}, **changes)
 
 
 def moved(by: tuple[float, float, float]) -> dict[str, Any]:
@@ -107,7 +107,7 @@ def test_field_that_rises_evenly_looks_like_the_slope() -> None:
     start = np.array([0.5, -0.5, 1.0], dtype=np.float32)
     normal = np.array([-np.sin(angle), 0.0, np.cos(angle)], dtype=np.float32)
     expected = -(start @ normal) / (rays @ normal)
-    assert np.allclose(_meet_field(rising, start, rays), expected, atol=1e-3)
+    assert np.allclose(_intersect_field(rising, start, rays), expected, atol=1e-3)
 
 
 def test_hills_and_the_golden_heights_are_drawn() -> None:

@@ -11,23 +11,23 @@ process.
 import gymnasium
 
 from .checker import VecEnvError, check_vec_env
-from .codec import MalformedError, Part, Spec
+from .codec import MalformedError, SpecField, Spec
 from .env import Go2Env
 from .errors import (
     Error,
     InvalidActionError,
     InvalidOptionError,
     LeaseLostError,
-    NoAnswerError,
+    RequestTimeoutError,
     NoServerError,
-    NoUniqueRobotError,
-    RefusedError,
+    AmbiguousRobotError,
+    RequestRejectedError,
     ResetNeededError,
-    ServerDiedError,
+    ServerExitedError,
     SpecMismatchError,
     VersionError,
 )
-from .remote import Options
+from .remote import ConnectOptions
 from .server import EmbeddedServer, ServerNotFoundError, ServerStartError
 from .vector_env import Go2VectorEnv
 
@@ -40,14 +40,14 @@ __all__ = [
     "InvalidOptionError",
     "LeaseLostError",
     "MalformedError",
-    "NoAnswerError",
+    "RequestTimeoutError",
     "NoServerError",
-    "NoUniqueRobotError",
-    "Options",
-    "Part",
-    "RefusedError",
+    "AmbiguousRobotError",
+    "ConnectOptions",
+    "SpecField",
+    "RequestRejectedError",
     "ResetNeededError",
-    "ServerDiedError",
+    "ServerExitedError",
     "ServerNotFoundError",
     "ServerStartError",
     "Spec",

@@ -28,7 +28,7 @@ ANT_ENVS = 64
 Row = dict[str, Any]
 
 
-def pace(once: Callable[[], object], window_s: float) -> tuple[float, float]:
+def measure_rate(once: Callable[[], object], window_s: float) -> tuple[float, float]:
     """Repeats a second and median time of one [µs], each the median of five windows."""
     once()
     rates, medians = list[float](), list[float]()
@@ -62,7 +62,7 @@ def transport(window_s: float) -> Iterator[Row]:
     reference = dm_env_rpc_rate(window_s)
     for num_envs in NUM_ENVS:
         with stepping(num_envs, "counter") as step:
-            rate, median_us = pace(step, window_s)
+            rate, median_us = measure_rate(step, window_s)
         yield row(f"physics off, {num_envs} envs", rate, "round trips/s")
         yield row(f"physics off, {num_envs} envs, p50", median_us, "us")
         yield row(f"physics off, {num_envs} envs", rate * num_envs, "env-steps/s", "dm_env_rpc", reference)
@@ -76,7 +76,7 @@ def physics(window_s: float) -> Iterator[Row]:
     in_process = {each["case"]: each["value"] for each in json.loads(program.stdout)["rows"]}
     for num_envs in NUM_ENVS:
         with stepping(num_envs, "walk") as step:
-            rate = pace(step, window_s)[0] * num_envs
+            rate = measure_rate(step, window_s)[0] * num_envs
         local = in_process.get(f"walk in process, {num_envs} envs")
         yield row(f"walk, {num_envs} envs", rate, "env-steps/s", "the same in process, in Rust", local)
         if num_envs == ANT_ENVS:
@@ -103,13 +103,13 @@ def ant_rates(window_s: float) -> Iterator[tuple[str, float]]:
         for mode in ("sync", "async"):
             envs = gymnasium.make_vec("Ant-v5", num_envs=ANT_ENVS, vectorization_mode=mode)
             envs.reset(seed=1)
-            yield f"Gymnasium {mode}", pace(lambda envs=envs: envs.step(actions), window_s)[0] * ANT_ENVS
+            yield f"Gymnasium {mode}", measure_rate(lambda envs=envs: envs.step(actions), window_s)[0] * ANT_ENVS
             envs.close()
     if installed("envpool"):
         envpool: Any = importlib.import_module("envpool")
         pool = envpool.make_gymnasium("Ant-v5", num_envs=ANT_ENVS)
         pool.reset()
-        yield "EnvPool", pace(lambda: pool.step(actions.astype(np.float64)), window_s)[0] * ANT_ENVS
+        yield "EnvPool", measure_rate(lambda: pool.step(actions.astype(np.float64)), window_s)[0] * ANT_ENVS
         pool.close()
 
 
@@ -117,10 +117,10 @@ def dm_env_rpc_rate(window_s: float) -> float | None:
     """Env-steps a second of one dm_env_rpc environment with our shapes, server and client on loopback."""
     if not installed("dm_env_rpc"):
         return None
-    from .peer_dm_env_rpc import remote_step
+    from .baseline_dm_env_rpc import remote_step
 
     with remote_step() as step:
-        return pace(step, window_s)[0]
+        return measure_rate(step, window_s)[0]
 
 
 def installed(module: str) -> bool:

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from .checker_results import Array, Result, VecEnvError, check_list, check_reset, check_step
+from .checker_results import Array, ReturnedArray, VecEnvError, check_list, check_reset, check_step
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -37,7 +37,7 @@ def check_vec_env(env: "VecEnv", *, steps: int = 200) -> None:
     Raises
     ------
     VecEnvError
-        Something is wrong: the message says what, in which environment, and what is wanted.
+        Something is wrong: the message says what, in which environment, and what is expected.
     """
     _check_itself(env)
     _check_attributes(env)
@@ -56,15 +56,15 @@ def _check_itself(env: object) -> None:
 
     if not isinstance(env, VecEnv):
         kind = f"{type(env).__module__}.{type(env).__qualname__}"
-        raise VecEnvError(f"{kind} is no `VecEnv`", wanted="a subclass of `stable_baselines3.common.vec_env.VecEnv`")
+        raise VecEnvError(f"{kind} is no `VecEnv`", expected="a subclass of `stable_baselines3.common.vec_env.VecEnv`")
     num_envs = cast(object, env.num_envs)
     if not isinstance(num_envs, int) or num_envs < 1:
-        raise VecEnvError(f"`num_envs` = {num_envs!r}", wanted="an int, at least 1")
+        raise VecEnvError(f"`num_envs` = {num_envs!r}", expected="an int, at least 1")
     for name in ("observation_space", "action_space"):
         space: object = getattr(env, name, None)
         if not isinstance(space, spaces.Space):
             found = f"`{name}` is {type(space).__name__}"
-            raise VecEnvError(found, wanted="a `gymnasium.Space`: that of one environment, not of all")
+            raise VecEnvError(found, expected="a `gymnasium.Space`: that of one environment, not of all")
 
 
 def _check_attributes(env: "VecEnv") -> None:
@@ -90,7 +90,7 @@ def _check_set_attr(env: "VecEnv", indices: int | list[int] | None, meant: list[
         expected = "after" if index in meant else "before"
         if value != expected:
             found = f"`set_attr` with indices={indices} left the attribute at {value!r}"
-            raise VecEnvError(found, wanted=f"{expected!r}: set where `indices` says, nowhere else", env=index)
+            raise VecEnvError(found, expected=f"{expected!r}: set where `indices` says, nowhere else", env=index)
 
 
 def _check_answers(env: "VecEnv", indices: int | list[int] | None, meant: list[int]) -> None:
@@ -101,16 +101,16 @@ def _check_answers(env: "VecEnv", indices: int | list[int] | None, meant: list[i
     check_list(values, f"`get_attr` {asked}", len(meant))
     if list(values) != meant:
         found = f"`get_attr` {asked} gave the attributes of the environments {list(values)}"
-        raise VecEnvError(found, wanted=f"those of {meant}, in this order")
+        raise VecEnvError(found, expected=f"those of {meant}, in this order")
     _ask("set_attr", env.set_attr, _METHOD, _method)
     answers = _ask("env_method", cast(Any, env).env_method, _METHOD, 1, indices=indices, keyword=2)
     check_list(answers, f"`env_method` {asked}", len(meant))
     if any(answer != (1, 2) for answer in answers):
-        raise VecEnvError(f"`env_method` {asked} gave {answers!r}", wanted="what the method returned: (1, 2)")
+        raise VecEnvError(f"`env_method` {asked} gave {answers!r}", expected="what the method returned: (1, 2)")
     wrapped = _ask("env_is_wrapped", env.env_is_wrapped, gymnasium.Wrapper, indices=indices)
     check_list(wrapped, f"`env_is_wrapped` {asked}", len(meant))
     if any(not isinstance(one, bool | np.bool_) for one in wrapped):
-        raise VecEnvError(f"`env_is_wrapped` {asked} gave {wrapped!r}", wanted="a bool for each environment")
+        raise VecEnvError(f"`env_is_wrapped` {asked} gave {wrapped!r}", expected="a bool for each environment")
 
 
 def _method(positional: int, *, keyword: int) -> tuple[int, int]:
@@ -125,7 +125,7 @@ def _ask(name: str, method: Callable[..., Any], *args: Any, **kwargs: Any) -> An
     except Exception as error:
         given = ", ".join([*map(repr, args), *(f"{key}={value!r}" for key, value in kwargs.items())])
         found = f"`{name}({given})` raised {type(error).__name__}: {error}"
-        raise VecEnvError(found, wanted="it works: algorithms, wrappers and callbacks call it") from error
+        raise VecEnvError(found, expected="it works: algorithms, wrappers and callbacks call it") from error
 
 
 def _step_at_once(env: "VecEnv", actions: Array) -> object:
@@ -137,7 +137,7 @@ def _step_in_two(env: "VecEnv", actions: Array) -> object:
     return cast(object, env.step_wait())
 
 
-def _rollout(env: "VecEnv", steps: int, step: Callable[["VecEnv", Array], object]) -> list[list[Result]]:
+def _rollout(env: "VecEnv", steps: int, step: Callable[["VecEnv", Array], object]) -> list[list[ReturnedArray]]:
     """Reset from the seed and step, checking all that comes back; the first entry is the reset's."""
     space: spaces.Space[Any] = copy.deepcopy(cast(Any, env.action_space))
     space.seed(_SEED)
@@ -148,31 +148,31 @@ def _rollout(env: "VecEnv", steps: int, step: Callable[["VecEnv", Array], object
         given = actions.copy()
         rollout.append(check_step(env, step(env, given)))
         if not np.array_equal(given, actions):
-            raise VecEnvError("a step wrote into the actions that it was given", wanted="they are left as they are")
+            raise VecEnvError("a step wrote into the actions that it was given", expected="they are left as they are")
     _check_fresh(rollout)
     return rollout
 
 
-def _check_fresh(rollout: list[list[Result]]) -> None:
-    wanted = "fresh arrays from each step: agents keep them until they learn"
+def _check_fresh(rollout: list[list[ReturnedArray]]) -> None:
+    expected = "fresh arrays from each step: agents keep them until they learn"
     for number, (results, after) in enumerate(pairwise(rollout)):
         for old in results:
-            if not np.array_equal(old.array, old.then):
-                raise VecEnvError(f"a later step overwrote {old.name} of step {number}", wanted=wanted, env=old.env)
+            if not np.array_equal(old.array, old.snapshot):
+                raise VecEnvError(f"a later step overwrote {old.name} of step {number}", expected=expected, env=old.env)
             if any(np.shares_memory(old.array, new.array) for new in after):
                 found = f"{old.name} of step {number} shares memory with what the next step gave"
-                raise VecEnvError(found, wanted=wanted, env=old.env)
+                raise VecEnvError(found, expected=expected, env=old.env)
 
 
-def _check_equal(one: list[list[Result]], other: list[list[Result]], which: str) -> None:
+def _check_equal(one: list[list[ReturnedArray]], other: list[list[ReturnedArray]], which: str) -> None:
     for number, (results, others) in enumerate(zip(one, other, strict=True)):
         # Their numbers differ only where `done` does, which comes before the ends.
         for a, b in zip(results, others, strict=False):
-            if np.array_equal(a.then, b.then):
+            if np.array_equal(a.snapshot, b.snapshot):
                 continue
-            env = a.env if a.env is not None else int(np.argwhere(a.then != b.then)[0, 0])
+            env = a.env if a.env is not None else int(np.argwhere(a.snapshot != b.snapshot)[0, 0])
             found = f"{which} differ in {a.name} of step {number}"
-            raise VecEnvError(found, wanted="equal seeds and actions give equal results", env=env)
+            raise VecEnvError(found, expected="equal seeds and actions give equal results", env=env)
 
 
 def _check_seed_is_used_once(env: "VecEnv") -> None:
@@ -183,8 +183,8 @@ def _check_seed_is_used_once(env: "VecEnv") -> None:
     # Where every seed gives the same start, nothing can be told.
     if _same(seeded, next_one) and not _same(seeded, other):
         found = "the second `reset` after `seed` gave the same observations again"
-        raise VecEnvError(found, wanted="a seed is used by one reset (`_reset_seeds`); then the random streams go on")
+        raise VecEnvError(found, expected="a seed is used by one reset (`_reset_seeds`); then the random streams go on")
 
 
-def _same(one: list[Result], other: list[Result]) -> bool:
-    return all(np.array_equal(a.then, b.then) for a, b in zip(one, other, strict=True))
+def _same(one: list[ReturnedArray], other: list[ReturnedArray]) -> bool:
+    return all(np.array_equal(a.snapshot, b.snapshot) for a, b in zip(one, other, strict=True))

@@ -24,19 +24,19 @@ class VecEnvError(Error, AssertionError):
     ----------
     env : int or None
         The environment where it showed; ``None`` if it is no single one.
-    wanted : str
+    expected : str
         What Stable-Baselines3 relies on.
     """
 
-    def __init__(self, found: str, *, wanted: str, env: int | None = None) -> None:
+    def __init__(self, found: str, *, expected: str, env: int | None = None) -> None:
         where = "" if env is None else f"environment {env}: "
-        super().__init__(f"{where}{found}\n  wanted: {wanted}")
+        super().__init__(f"{where}{found}\n  expected: {expected}")
         self.env = env
-        self.wanted = wanted
+        self.expected = expected
 
 
 @dataclass(frozen=True)
-class Result:
+class ReturnedArray:
     """An array that a ``VecEnv`` returned.
 
     Attributes
@@ -47,26 +47,26 @@ class Result:
         Whose it is; ``None`` if it has a row for each environment.
     array
         Itself, which the ``VecEnv`` may write into later.
-    then
+    snapshot
         A copy, made when it was returned.
     """
 
     name: str
     env: int | None
     array: Array
-    then: Array
+    snapshot: Array
 
 
-def check_reset(env: "VecEnv", obs: object) -> list[Result]:
+def check_reset(env: "VecEnv", obs: object) -> list[ReturnedArray]:
     """Check what ``reset`` gave, and keep it."""
     check_infos(env.reset_infos, "`reset_infos`", env.num_envs)
     return _check_obs(env, obs)
 
 
-def check_step(env: "VecEnv", returned: object) -> list[Result]:
+def check_step(env: "VecEnv", returned: object) -> list[ReturnedArray]:
     """Check what ``step_wait`` gave, and keep it: observations, reward, done, then the ends of episodes."""
     if not isinstance(returned, tuple) or len(cast(tuple[Any, ...], returned)) != 4:
-        raise VecEnvError(f"`step_wait` gave {_shown(returned)}", wanted="a tuple of 4: obs, reward, done, infos")
+        raise VecEnvError(f"`step_wait` gave {_shown(returned)}", expected="a tuple of 4: obs, reward, done, infos")
     obs, reward, done, infos = cast(tuple[Any, ...], returned)
     results = _check_obs(env, obs)
     # DummyVecEnv gives float32, SubprocVecEnv float64.
@@ -74,13 +74,13 @@ def check_step(env: "VecEnv", returned: object) -> list[Result]:
     reward = _check_array(reward, "reward", (env.num_envs,), "float64" if wide else "float32")
     done = _check_array(done, "done", (env.num_envs,), "bool")
     for index in np.flatnonzero(~np.isfinite(reward)):
-        raise VecEnvError(f"reward is {reward[index]}", wanted="a finite number", env=int(index))
+        raise VecEnvError(f"reward is {reward[index]}", expected="a finite number", env=int(index))
     check_infos(infos, "infos", env.num_envs)
     ends = [_check_end(env, infos[index], int(index), results) for index in np.flatnonzero(done)]
     return [
         *results,
-        Result("reward", None, reward, reward.copy()),
-        Result("done", None, done, done.copy()),
+        ReturnedArray("reward", None, reward, reward.copy()),
+        ReturnedArray("done", None, done, done.copy()),
         *(result for end in ends for result in end),
     ]
 
@@ -88,10 +88,10 @@ def check_step(env: "VecEnv", returned: object) -> list[Result]:
 def check_list(values: object, name: str, length: int) -> None:
     """Check that there is one entry for each environment that is meant. ``SubprocVecEnv`` gives tuples."""
     if not isinstance(values, list | tuple):
-        raise VecEnvError(f"{name} gave {_shown(values)}", wanted=f"a list of {length}")
+        raise VecEnvError(f"{name} gave {_shown(values)}", expected=f"a list of {length}")
     found = len(cast(Sequence[Any], values))
     if found != length:
-        raise VecEnvError(f"{name} gave {found} entries", wanted=f"{length}, one for each environment that is meant")
+        raise VecEnvError(f"{name} gave {found} entries", expected=f"{length}, one for each environment that is meant")
 
 
 def check_infos(infos: Any, name: str, length: int) -> None:
@@ -99,22 +99,22 @@ def check_infos(infos: Any, name: str, length: int) -> None:
     check_list(infos, name, length)
     for index, info in enumerate(infos):
         if not isinstance(info, dict):
-            raise VecEnvError(f"{name}[{index}] is {_shown(info)}", wanted="a dict", env=index)
+            raise VecEnvError(f"{name}[{index}] is {_shown(info)}", expected="a dict", env=index)
         if any(info is other for other in infos[:index]):
-            wanted = "a dict for each environment: wrappers write into it"
-            raise VecEnvError(f"{name}[{index}] is the same object as another's", wanted=wanted, env=index)
+            expected = "a dict for each environment: wrappers write into it"
+            raise VecEnvError(f"{name}[{index}] is the same object as another's", expected=expected, env=index)
 
 
-def _check_end(env: "VecEnv", info: dict[str, Any], index: int, obs: list[Result]) -> list[Result]:
+def _check_end(env: "VecEnv", info: dict[str, Any], index: int, obs: list[ReturnedArray]) -> list[ReturnedArray]:
     """Check what is due where an episode ended, and keep its last observation."""
     if "terminal_observation" not in info:
-        wanted = "the last observation of the episode that ended; obs has the first of the next"
-        raise VecEnvError("done, but infos has no `terminal_observation`", wanted=wanted, env=index)
+        expected = "the last observation of the episode that ended; obs has the first of the next"
+        raise VecEnvError("done, but infos has no `terminal_observation`", expected=expected, env=index)
     truncated = info.get("TimeLimit.truncated")
     if not isinstance(truncated, bool | np.bool_):
         found = f"done, but infos' `TimeLimit.truncated` is {truncated!r}"
-        raise VecEnvError(found, wanted="a bool: true if the time limit ended it and the task did not", env=index)
-    results: list[Result] = []
+        raise VecEnvError(found, expected="a bool: true if the time limit ended it and the task did not", env=index)
+    results: list[ReturnedArray] = []
     whole = cast(AnySpace, env.observation_space)
     for name, space, value in _leaves(whole, info["terminal_observation"], "terminal_observation", index):
         # An environment's Discrete observation is often an int, which Stable-Baselines3 reads as well.
@@ -123,17 +123,17 @@ def _check_end(env: "VecEnv", info: dict[str, Any], index: int, obs: list[Result
         _check_in_space(space, array[np.newaxis], name, [index])
         if any(np.shares_memory(array, current.array) for current in obs):
             found = f"{name} shares memory with obs, which has the first observation of the next episode"
-            raise VecEnvError(found, wanted="an array of its own", env=index)
-        results.append(Result(name, index, array, array.copy()))
+            raise VecEnvError(found, expected="an array of its own", env=index)
+        results.append(ReturnedArray(name, index, array, array.copy()))
     return results
 
 
-def _check_obs(env: "VecEnv", obs: object) -> list[Result]:
-    results: list[Result] = []
+def _check_obs(env: "VecEnv", obs: object) -> list[ReturnedArray]:
+    results: list[ReturnedArray] = []
     for name, space, value in _leaves(cast(AnySpace, env.observation_space), obs, "obs", None):
         array = _check_array(value, name, (env.num_envs, *(space.shape or ())), space.dtype)
         _check_in_space(space, array, name, range(env.num_envs))
-        results.append(Result(name, None, array, array.copy()))
+        results.append(ReturnedArray(name, None, array, array.copy()))
     return results
 
 
@@ -142,13 +142,13 @@ def _leaves(space: AnySpace, value: Any, name: str, env: int | None) -> Iterator
     if isinstance(space, spaces.Dict):
         parts = cast(dict[str, AnySpace], space.spaces)
         if not isinstance(value, dict) or set(cast(dict[str, Any], value)) != set(parts):
-            raise VecEnvError(f"{name} is {_shown(value)}", wanted=f"a dict with the keys {sorted(parts)}", env=env)
+            raise VecEnvError(f"{name} is {_shown(value)}", expected=f"a dict with the keys {sorted(parts)}", env=env)
         for key, part in parts.items():
             yield from _leaves(part, value[key], f"{name}[{key!r}]", env)
     elif isinstance(space, spaces.Tuple):
         entries = cast(tuple[AnySpace, ...], space.spaces)
         if not isinstance(value, tuple) or len(cast(tuple[Any, ...], value)) != len(entries):
-            raise VecEnvError(f"{name} is {_shown(value)}", wanted=f"a tuple of {len(entries)}", env=env)
+            raise VecEnvError(f"{name} is {_shown(value)}", expected=f"a tuple of {len(entries)}", env=env)
         for index, part in enumerate(entries):
             yield from _leaves(part, value[index], f"{name}[{index}]", env)
     else:
@@ -159,7 +159,7 @@ def _check_array(array: Any, name: str, shape: tuple[int, ...], dtype: Any, env:
     # The last observation of a Discrete space is a NumPy number; it has a shape and a dtype too.
     given = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray | np.generic) else _shown(array)
     if given != f"{np.dtype(dtype)} {shape}":
-        raise VecEnvError(f"{name} is {given}", wanted=f"a NumPy array, {np.dtype(dtype)} {shape}", env=env)
+        raise VecEnvError(f"{name} is {given}", expected=f"a NumPy array, {np.dtype(dtype)} {shape}", env=env)
     return np.asarray(cast(Any, array))
 
 
@@ -170,12 +170,12 @@ def _check_in_space(space: AnySpace, rows: Array, name: str, envs: Sequence[int]
         outside = ~((rows >= space.low) & (rows <= space.high))
         for row, *entry in cast(list[list[int]], np.argwhere(outside)[:1].tolist()):
             at, value = tuple(entry), rows[row, *entry]
-            wanted = f"within [{space.low[at]}, {space.high[at]}], as `observation_space` says"
-            raise VecEnvError(f"{name}[{', '.join(map(str, entry))}] is {value}", wanted=wanted, env=envs[row])
+            expected = f"within [{space.low[at]}, {space.high[at]}], as `observation_space` says"
+            raise VecEnvError(f"{name}[{', '.join(map(str, entry))}] is {value}", expected=expected, env=envs[row])
         return
     for row, index in enumerate(envs):
         if not space.contains(rows[row]):
-            raise VecEnvError(f"{name} is {rows[row]!r}", wanted=f"an element of {space}", env=index)
+            raise VecEnvError(f"{name} is {rows[row]!r}", expected=f"an element of {space}", env=index)
 
 
 def _shown(value: Any) -> str:

@@ -60,11 +60,11 @@ def tensor(message: Mapping[str, Any], field: str, dtype: str, *shape: int) -> N
     try:
         return np.frombuffer(payload, dtype).reshape(shape).copy()
     except ValueError as error:
-        raise MalformedError(f"`{field}` has {len(payload)} bytes; {dtype} {shape} is wanted") from error
+        raise MalformedError(f"`{field}` has {len(payload)} bytes; {dtype} {shape} is expected") from error
 
 
 @dataclass(frozen=True)
-class Part:
+class SpecField:
     """One part of an observation or action: ``size`` entries with a common name, unit and bounds."""
 
     name: str
@@ -72,7 +72,7 @@ class Part:
     unit: str
     low: float
     high: float
-    text: str
+    description: str
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,11 @@ class Spec:
 
     task: str
     robot: str
-    observation: tuple[Part, ...]
-    action: tuple[Part, ...]
+    observation: tuple[SpecField, ...]
+    action: tuple[SpecField, ...]
     joint_order: tuple[str, ...]
     policy_dt: float
-    drive_dt: float
+    actuator_dt: float
     kp: float
     kd: float
     action_scale: float
@@ -120,7 +120,7 @@ def read_spec(message: Mapping[str, Any], spec_hash: str) -> Spec:
         fields = dict(cast(Mapping[str, Any], message["spec"]))
         for name in ("observation", "action"):
             fields[name] = tuple(
-                Part(**{key: part[key] for key in ("name", "size", "unit", "low", "high", "text")})
+                SpecField(**{key: part[key] for key in ("name", "size", "unit", "low", "high", "description")})
                 for part in fields[name]
             )
         for name in ("joint_order", "default_pose", "reward_terms"):

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InvalidActionError, InvalidOptionError
-from .remote import UNLIMITED, Batch, Options, RemoteEnvs
+from .remote import UNLIMITED, StepBatch, ConnectOptions, RemoteVecEnv
 from .render import Viewer
 from .spaces import action_space, observation_space
 
@@ -15,7 +15,7 @@ RenderMode = Literal["rgb_array", "human"]
 
 
 class OptionArguments(TypedDict, total=False):
-    """Keyword arguments that :class:`Go2Env` and :class:`Go2VectorEnv` pass on to :class:`twinstep.Options`."""
+    """Keyword arguments that :class:`Go2Env` and :class:`Go2VectorEnv` pass on to :class:`twinstep.ConnectOptions`."""
 
     endpoint: str | None
     robot: str | None
@@ -41,7 +41,7 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     info_timing
         Adds ``round_trip_s`` [s] to every info of a step. Off, infos depend on seed and actions alone.
     **options
-        See :class:`twinstep.Options`.
+        See :class:`twinstep.ConnectOptions`.
 
     Notes
     -----
@@ -62,8 +62,8 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.render_mode = mode_of_pictures
         self._viewer = Viewer(mode_of_pictures) if mode_of_pictures else None
         self._info_timing = info_timing
-        self._remote = RemoteEnvs(
-            Options(**options),
+        self._remote = RemoteVecEnv(
+            ConnectOptions(**options),
             num_envs=1,
             autoreset="Disabled",
             max_episode_steps=UNLIMITED if max_episode_steps is None else max_episode_steps,
@@ -121,11 +121,11 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Send an action without waiting; :meth:`recv` is next."""
         given = np.asarray(action)
         if given.shape != self.action_space.shape:
-            raise InvalidActionError(f"`action` has shape {given.shape}; {self.action_space.shape} is wanted")
+            raise InvalidActionError(f"`action` has shape {given.shape}; {self.action_space.shape} is expected")
         self._remote.send(given[None])
 
     def recv(self) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Wait for what the sent action gave; may be called again after a ``NoAnswerError``."""
+        """Wait for what the sent action gave; may be called again after a ``RequestTimeoutError``."""
         batch = self._remote.recv()
         info: dict[str, Any] = {}
         if len(batch.ended):
@@ -165,6 +165,6 @@ def checked_render_mode(mode: str | None) -> RenderMode | None:
     raise InvalidOptionError(f"`render_mode` = {mode!r}; 'rgb_array', 'human' and None are known")
 
 
-def reward_terms(batch: Batch, index: int, names: tuple[str, ...]) -> dict[str, float]:
+def reward_terms(batch: StepBatch, index: int, names: tuple[str, ...]) -> dict[str, float]:
     """Sums of the weighted reward terms of the ``index``-th episode that ended."""
     return {name: float(value) for name, value in zip(names, batch.ended_terms[index], strict=True)}

@@ -11,7 +11,7 @@ class NoServerError(Error):
     """Nobody answers at the endpoint, or nobody that this client may see."""
 
 
-class NoUniqueRobotError(Error):
+class AmbiguousRobotError(Error):
     """No robot has the name that was asked for, or several robots are there and none was named."""
 
 
@@ -23,7 +23,7 @@ class SpecMismatchError(Error):
     """The server's task, observation, action, rates, gains or pose are not those that were asked for."""
 
 
-class NoAnswerError(Error, TimeoutError):
+class RequestTimeoutError(Error, TimeoutError):
     """The server did not answer in time; nobody knows yet whether the request was executed.
 
     ``recv`` waits for it again; ``reset`` settles it and starts anew. No step is ever executed twice.
@@ -34,7 +34,7 @@ class LeaseLostError(Error):
     """The environments are gone: the server was restarted, somebody took them over, or their time ran out."""
 
 
-class ServerDiedError(LeaseLostError):
+class ServerExitedError(LeaseLostError):
     """The server that this process started has ended; its last log lines are in the message."""
 
 
@@ -50,7 +50,7 @@ class ResetNeededError(Error, gymnasium.error.ResetNeeded):
     """An environment has no episode: call ``reset`` first."""
 
 
-class RefusedError(Error):
+class RequestRejectedError(Error):
     """The server refused a request.
 
     Attributes
@@ -82,4 +82,4 @@ def from_reply(code: str, field: str, message: str, hint: str) -> Error:
     """Make the exception for an error reply of the server."""
     text = f"{message}\n  {hint}" if hint else message
     kind = _BY_CODE.get(code)
-    return kind(text) if kind else RefusedError(code, field, text)
+    return kind(text) if kind else RequestRejectedError(code, field, text)

@@ -136,10 +136,10 @@ def normalised(graph: Graph, ensemble: EnsembleFile) -> str:
     return graph.add("Div", [centred, graph.constant(deviations)], "xi_normalised")
 
 
-def encode(graph: Graph, ensemble: EnsembleFile, heard: str) -> None:
+def encode(graph: Graph, ensemble: EnsembleFile, inputs: str) -> None:
     """One row of the LSTM: ``next_h`` and ``next_c``, (members, batch, hidden)."""
     hidden = ensemble.description["hidden"]
-    by_input = graph.affine(heard, ensemble.stacked("lstm.input_weight"), ensemble.stacked("lstm.bias"), "by_input")
+    by_input = graph.affine(inputs, ensemble.stacked("lstm.input_weight"), ensemble.stacked("lstm.bias"), "by_input")
     weight = graph.constant(ensemble.stacked("lstm.hidden_weight"))
     gates = graph.add("Add", [by_input, graph.add("MatMul", ["h", weight], "by_state")], "gates")
     names = ["input", "forget", "cell", "output"]

@@ -9,19 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import codec
-from .errors import Error, InvalidActionError, InvalidOptionError, NoAnswerError, RefusedError, SpecMismatchError
-from .link import Link, Pending
+from .errors import Error, InvalidActionError, InvalidOptionError, RequestTimeoutError, RequestRejectedError, SpecMismatchError
+from .connection import Connection, Pending
 from .server import EmbeddedServer
 
 UNLIMITED = 2**32 - 1
 """``max_episode_steps`` that never truncates."""
 
 _CAPACITY = "1000000"
-_USED_UP = ("diverged", "internal")
+_CONSUMES_SEQ = ("diverged", "internal")
 
 
 @dataclass(frozen=True)
-class Options:
+class ConnectOptions:
     """Where environments come from; the same for every kind of environment.
 
     Attributes
@@ -63,7 +63,7 @@ class Options:
 
 
 @dataclass
-class Batch:
+class StepBatch:
     """What one step gave. Arrays are fresh: nobody else writes into them.
 
     Attributes
@@ -94,7 +94,7 @@ class Batch:
     round_trip_s: float = field(compare=False)
 
 
-class RemoteEnvs:
+class RemoteVecEnv:
     """Environments on a server, for this client alone.
 
     Parameters
@@ -109,9 +109,9 @@ class RemoteEnvs:
         Policy steps after which an episode is truncated; the task's own number if ``None``.
     """
 
-    def __init__(self, options: Options, *, num_envs: int, autoreset: str, max_episode_steps: int | None) -> None:
+    def __init__(self, options: ConnectOptions, *, num_envs: int, autoreset: str, max_episode_steps: int | None) -> None:
         if num_envs < 1:
-            raise InvalidOptionError(f"`num_envs` = {num_envs}; at least 1 is wanted")
+            raise InvalidOptionError(f"`num_envs` = {num_envs}; at least 1 is expected")
         if max_episode_steps is not None and not 1 <= max_episode_steps <= UNLIMITED:
             raise InvalidOptionError(f"`max_episode_steps` = {max_episode_steps} is outside 1..={UNLIMITED}")
         self.num_envs = num_envs
@@ -120,42 +120,42 @@ class RemoteEnvs:
         try:
             endpoint = options.endpoint if server is None else server.endpoint
             assert endpoint is not None
-            link = Link(endpoint, robot=options.robot, zenoh_config=options.zenoh_config, server=server)
+            connection = Connection(endpoint, robot=options.robot, zenoh_config=options.zenoh_config, server=server)
         except BaseException:
             if server is not None:
                 server.release()
             raise
         # Runs at garbage collection and at the end of the interpreter, if `close` did not.
-        self._let_go = weakref.finalize(self, _let_go, link, server)
-        self._link = link
+        self._release = weakref.finalize(self, _release, connection, server)
+        self._connection = connection
         try:
             self._lease(autoreset, max_episode_steps)
         except BaseException:
-            self._let_go()
+            self._release()
             raise
 
     def _lease(self, autoreset: str, max_episode_steps: int | None) -> None:
-        link, options = self._link, self._options
-        found: str = link.hello["spec"]["task"]
+        connection, options = self._connection, self._options
+        found: str = connection.hello["spec"]["task"]
         if found != options.task:
             raise SpecMismatchError(
-                f"the server at {link.endpoint} has the task `{found}`, not `{options.task}`\n"
+                f"the server at {connection.endpoint} has the task `{found}`, not `{options.task}`\n"
                 f"  start it with `--task {options.task}`, or make the environment of `{found}`"
             )
         request: dict[str, object] = {
-            "client": link.client,
+            "client": connection.client,
             "num_envs": self.num_envs,
             "autoreset": autoreset,
             "max_episode_steps": max_episode_steps,
             "spec_hash": options.spec_hash,
         }
-        lease = link.ask(link.querier("lease"), request, options.reset_timeout_s)
-        self.spec = codec.read_spec(lease, link.hello["spec_hash"])
+        lease = connection.request(connection.querier("lease"), request, options.reset_timeout_s)
+        self.spec = codec.read_spec(lease, connection.hello["spec_hash"])
         self.lease: str = lease["lease"]
         self._epoch: int = lease["epoch"]
         self._last_seq: int = lease["last_seq"]
-        self._verbs = {
-            verb: link.querier(f"env/{lease['lease']}/{verb}") for verb in ("reset", "step", "render", "close")
+        self._methods = {
+            method: connection.querier(f"env/{lease['lease']}/{method}") for method in ("reset", "step", "render", "close")
         }
         self._pending: tuple[str, Pending, float] | None = None
 
@@ -174,14 +174,14 @@ class RemoteEnvs:
         obs : (num_envs, obs_len) float32
             Observations of all environments, reset or not.
         """
-        self._settle_what_was_given_up()
+        self._resolve_abandoned_request()
         request: dict[str, object] = {}
         if seeds is not None:
             request["seeds"] = seeds.astype("<u8").tobytes()
         if mask is not None:
             request["mask"] = mask.astype(np.uint8).tobytes()
         self._send("reset", request)
-        reply = self._settle(self._options.reset_timeout_s)
+        reply = self._await_pending(self._options.reset_timeout_s)
         return codec.tensor(reply, "obs", "<f4", self.num_envs, self.spec.obs_len)
 
     def send(self, actions: NDArray[Any]) -> None:
@@ -193,17 +193,17 @@ class RemoteEnvs:
             )
         self._send("step", {"actions": self._checked(actions).tobytes()})
 
-    def recv(self) -> Batch:
-        """Wait for what the sent actions gave. May be called again after a :class:`NoAnswerError`."""
+    def recv(self) -> StepBatch:
+        """Wait for what the sent actions gave. May be called again after a :class:`RequestTimeoutError`."""
         if self._pending is None:
             raise Error("nothing was sent: call `send` before `recv`")
         if self._pending[0] != "step":
             raise Error(f"the last `{self._pending[0]}` is not answered yet\n  `reset` settles it and starts anew")
         since = self._pending[2]
-        reply = self._settle(self._options.timeout_s)
+        reply = self._await_pending(self._options.timeout_s)
         n, k, obs_len = self.num_envs, len(reply.get("ended_env", b"")) // 4, self.spec.obs_len
         terms = len(self.spec.reward_terms)
-        return Batch(
+        return StepBatch(
             obs=codec.tensor(reply, "obs", "<f4", n, obs_len),
             reward=codec.tensor(reply, "reward", "<f4", n),
             terminated=codec.tensor(reply, "terminated", "?", n),
@@ -217,29 +217,29 @@ class RemoteEnvs:
 
     def scene(self, env: int) -> dict[str, Any]:
         """Shapes and poses of one robot and its ground, for drawing."""
-        return self._link.ask(self._verbs["render"], {"epoch": self._epoch, "env": env}, self._options.timeout_s)
+        return self._connection.request(self._methods["render"], {"epoch": self._epoch, "env": env}, self._options.timeout_s)
 
     def close(self) -> None:
         """Give the environments back; does nothing the second time."""
-        if not self._let_go.alive:
+        if not self._release.alive:
             return
         try:
-            self._settle_what_was_given_up()
+            self._resolve_abandoned_request()
             request: dict[str, object] = {"epoch": self._epoch, "seq": self._last_seq + 1}
-            self._link.ask(self._verbs["close"], request, self._options.timeout_s)
+            self._connection.request(self._methods["close"], request, self._options.timeout_s)
         except Error:
             # Whatever is wrong with the server, this client is done with it; a lease that is left is freed in time.
             pass
         finally:
-            self._let_go()
+            self._release()
 
-    def _send(self, verb: str, request: dict[str, object]) -> None:
-        if not self._let_go.alive:
+    def _send(self, method: str, request: dict[str, object]) -> None:
+        if not self._release.alive:
             raise Error("the environment is closed")
         payload = codec.encode({**request, "epoch": self._epoch, "seq": self._last_seq + 1})
-        self._pending = (verb, Pending(self._verbs[verb], payload), time.monotonic())
+        self._pending = (method, Pending(self._methods[method], payload), time.monotonic())
 
-    def _settle(self, timeout_s: float) -> dict[str, Any]:
+    def _await_pending(self, timeout_s: float) -> dict[str, Any]:
         """Wait for the answer to the pending request.
 
         Without an answer it stays pending, because it may have been executed. Its number is used up by an answer, or
@@ -247,22 +247,22 @@ class RemoteEnvs:
         """
         assert self._pending is not None
         try:
-            reply = self._link.wait(self._pending[1], timeout_s)
-        except (NoAnswerError, KeyboardInterrupt):
+            reply = self._connection.wait_reply(self._pending[1], timeout_s)
+        except (RequestTimeoutError, KeyboardInterrupt):
             raise
         except Error as error:
             self._pending = None
-            self._last_seq += isinstance(error, RefusedError) and error.code in _USED_UP
+            self._last_seq += isinstance(error, RequestRejectedError) and error.code in _CONSUMES_SEQ
             raise
         self._pending = None
         self._last_seq += 1
         return reply
 
-    def _settle_what_was_given_up(self) -> None:
+    def _resolve_abandoned_request(self) -> None:
         if self._pending is not None:
             try:
-                self._settle(self._options.reset_timeout_s)
-            except NoAnswerError:
+                self._await_pending(self._options.reset_timeout_s)
+            except RequestTimeoutError:
                 raise
             except Error:
                 # Why it was refused no longer matters, only that its number is settled.
@@ -270,11 +270,11 @@ class RemoteEnvs:
 
     def _checked(self, actions: NDArray[Any]) -> NDArray[np.float32]:
         given = np.asarray(actions)
-        wanted = (self.num_envs, self.spec.action_len)
-        if given.shape != wanted:
-            raise InvalidActionError(f"`actions` has shape {given.shape}; {wanted} is wanted")
+        expected = (self.num_envs, self.spec.action_len)
+        if given.shape != expected:
+            raise InvalidActionError(f"`actions` has shape {given.shape}; {expected} is expected")
         if given.dtype.kind not in "fiu":
-            raise InvalidActionError(f"`actions` has dtype {given.dtype}; float32 is wanted")
+            raise InvalidActionError(f"`actions` has dtype {given.dtype}; float32 is expected")
         checked = np.ascontiguousarray(given, dtype="<f4")
         if not np.isfinite(checked).all():
             env, entry = (int(index) for index in np.argwhere(~np.isfinite(checked))[0])
@@ -285,7 +285,7 @@ class RemoteEnvs:
         return checked
 
 
-def _flags(options: Options) -> tuple[str, ...]:
+def _flags(options: ConnectOptions) -> tuple[str, ...]:
     flags = ["--task", options.task, "--envs", _CAPACITY]
     if options.config is not None:
         flags += ["--config", options.config]
@@ -294,7 +294,7 @@ def _flags(options: Options) -> tuple[str, ...]:
     return tuple(flags)
 
 
-def _let_go(link: Link, server: EmbeddedServer | None) -> None:
-    link.close()
+def _release(connection: Connection, server: EmbeddedServer | None) -> None:
+    connection.close()
     if server is not None:
         server.release()

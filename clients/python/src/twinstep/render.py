@@ -34,9 +34,9 @@ _CAMERA_OFFSET_M = np.array([0.62, -1.25, 0.55], dtype=np.float32)
 """From the point looked at to the camera: from the front right and above."""
 _FOCAL = 2.3
 """Focal length in units of half the picture's height."""
-_FOLLOW = 0.2
+_CAMERA_SMOOTHING = 0.2
 """Share of the way to the robot that the camera goes with each picture: steps of a trot do not shake it."""
-_CUT_M = 1.0
+_NEAR_CLIP_M = 1.0
 """The camera jumps when the robot is farther from where it looks, as after a reset."""
 
 
@@ -63,7 +63,7 @@ class _Shape:
         half = self.size if self.kind == "box" else self.size[0] + np.array([0, 0, self.size[1]], dtype=np.float32)
         return self.centre + (signs * half) @ self.axes.T
 
-    def meet(self, origins: Array, rays: Array) -> Array:
+    def intersect(self, origins: Array, rays: Array) -> Array:
         """Distance along each ray to the shape.
 
         Parameters
@@ -80,7 +80,7 @@ class _Shape:
         """
         start, ray = (origins - self.centre) @ self.axes, rays @ self.axes
         if self.kind == "box":
-            return _meet_box(start, ray, self.size)
+            return _intersect_box(start, ray, self.size)
         return _meet_capsule(start, ray, float(self.size[0]), float(self.size[1]))
 
     def normal(self, points: Array) -> Array:
@@ -183,9 +183,9 @@ class Viewer:
         if self._backdrop is None or not self._backdrop.fits(camera, height, normal):
             self._backdrop = _Backdrop(camera, height, normal)
         if field is None:
-            picture = _Picture(camera, self._backdrop.rays, self._backdrop.distance, self._backdrop.paint(offset))
+            picture = _FrameBuffer(camera, self._backdrop.rays, self._backdrop.distance, self._backdrop.paint(offset))
         else:
-            picture = _Picture(camera, self._backdrop.rays, *_paint_field(camera, self._backdrop.rays, field))
+            picture = _FrameBuffer(camera, self._backdrop.rays, *_paint_field(camera, self._backdrop.rays, field))
         levels = [point] if field is None else [np.append(point[:2], level) for level in field.levels()]
         for shape in shapes:
             picture.draw_shadow(shape, levels, normal)
@@ -205,9 +205,9 @@ class Viewer:
         # Looks at the ground under the robot, not at the robot: its own ups and downs stay visible.
         under = base - normal * np.dot(base - point, normal)
         last = self._target
-        if last is None or np.linalg.norm(under - last) > _CUT_M:
+        if last is None or np.linalg.norm(under - last) > _NEAR_CLIP_M:
             last = under
-        followed = last + np.float32(_FOLLOW) * (under - last)
+        followed = last + np.float32(_CAMERA_SMOOTHING) * (under - last)
         self._target = followed
         target = followed + np.float32(0.17) * normal
         backward = _CAMERA_OFFSET_M / np.float32(np.linalg.norm(_CAMERA_OFFSET_M))
@@ -271,9 +271,9 @@ class _Backdrop:
 class _HeightField:
     """Heights at the corners of square cells, each cut in two triangles, as ``height_field`` has them."""
 
-    corner: Array
+    origin: Array
     """(2,) x and y of the first vertex [m]."""
-    cell: float
+    cell_size: float
     """[m]"""
     heights: Array
     """(rows, columns): along x, along y [m]."""
@@ -281,7 +281,7 @@ class _HeightField:
     @classmethod
     def read(cls, sent: Mapping[str, Any]) -> _HeightField:
         heights = np.frombuffer(sent["heights"], dtype="<f4").reshape(sent["rows"], sent["columns"])
-        return cls(np.asarray(sent["corner"], dtype=np.float32), float(sent["cell"]), heights.astype(np.float32))
+        return cls(np.asarray(sent["origin"], dtype=np.float32), float(sent["cell_size"]), heights.astype(np.float32))
 
     def levels(self) -> tuple[float, float]:
         """Lowest and highest height [m]."""
@@ -294,8 +294,8 @@ class _HeightField:
     def height_and_slope(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Heights [m] and their derivatives by x and y at ``x``, ``y`` [m]."""
         rows, columns = self.heights.shape
-        along: Array = np.clip((x - self.corner[0]) / np.float32(self.cell), 0, np.float32(rows - 1))
-        across: Array = np.clip((y - self.corner[1]) / np.float32(self.cell), 0, np.float32(columns - 1))
+        along: Array = np.clip((x - self.origin[0]) / np.float32(self.cell_size), 0, np.float32(rows - 1))
+        across: Array = np.clip((y - self.origin[1]) / np.float32(self.cell_size), 0, np.float32(columns - 1))
         row = np.minimum(along.astype(np.int32), rows - 2)
         column = np.minimum(across.astype(np.int32), columns - 2)
         u, v = (along - row).astype(np.float32), (across - column).astype(np.float32)
@@ -309,15 +309,15 @@ class _HeightField:
         rise_x, rise_y = np.where(near, rise_x, rise_y), np.where(near, rise_y, rise_x)
         sign = np.where(near, np.float32(1), np.float32(-1))
         height = third + np.abs(u + sign * 0.5 - 0.5) * rise_x + np.abs(v + sign * 0.5 - 0.5) * rise_y
-        scale = sign / np.float32(self.cell)
+        scale = sign / np.float32(self.cell_size)
         return height, rise_x * scale, rise_y * scale
 
 
-_MARCH = 20
+_RAY_MARCH_STEPS = 20
 """Samples of a ray between a field's highest and lowest height: finds the first hill in the way."""
 
 
-def _meet_field(field: _HeightField, start: Array, rays: Array) -> Array:
+def _intersect_field(field: _HeightField, start: Array, rays: Array) -> Array:
     """Distances (height, width) [m] of ``rays`` (height, width, 3) from ``start`` to a field, infinite in the sky."""
     lowest, highest = field.levels()
     # Half the rows and columns find the triangle; then each ray meets the triangle's plane.
@@ -325,10 +325,10 @@ def _meet_field(field: _HeightField, start: Array, rays: Array) -> Array:
     down = np.maximum(-z, np.float32(1e-3))
     enter = np.maximum((start[2] - highest) / down, np.float32(0))
     leave = np.minimum((start[2] - lowest) / down, np.float32(4 * _FOG_M))
-    step = (leave - enter) / np.float32(_MARCH)
+    step = (leave - enter) / np.float32(_RAY_MARCH_STEPS)
     found: Array = leave
     above = np.ones(found.shape, dtype=np.bool_)
-    for index in range(1, _MARCH + 1):
+    for index in range(1, _RAY_MARCH_STEPS + 1):
         sample = enter + np.float32(index) * step
         under = start[2] + sample * z < field.height(start[0] + sample * x, start[1] + sample * y)
         found = np.where(above & under, sample - np.float32(0.5) * step, found)
@@ -355,7 +355,7 @@ def _paint_field(camera: _Camera, rays: Array, field: _HeightField) -> tuple[Arr
         return all_distance, colour
     # Whole rows, because a slice is faster than a mask.
     rays = rays[int(rows[0]) :]
-    distance = _meet_field(field, camera.position, rays)
+    distance = _intersect_field(field, camera.position, rays)
     seen = np.isfinite(distance)
     near = np.where(seen, distance, np.float32(0))
     ray_x, ray_y, ray_z = np.ascontiguousarray(rays.transpose(2, 0, 1))
@@ -378,7 +378,7 @@ def _paint_field(camera: _Camera, rays: Array, field: _HeightField) -> tuple[Arr
     return all_distance, colour
 
 
-class _Picture:
+class _FrameBuffer:
     """Colour and distance of every pixel, while shapes are drawn one by one."""
 
     def __init__(self, camera: _Camera, rays: Array, distance: Array, colour: Array) -> None:
@@ -407,7 +407,7 @@ class _Picture:
             return
         rays = self._rays[top:bottom, left:right][candidates]
         ground = self._camera.position + rays * distance[candidates][:, None]
-        hit = np.isfinite(shape.meet(ground, _SUN[None]))
+        hit = np.isfinite(shape.intersect(ground, _SUN[None]))
         rows, columns = (index[hit] for index in np.nonzero(candidates))
         self._shadowed[top + rows, left + columns] = True
         self._colour[:, top + rows, left + columns] *= _SHADOW
@@ -418,7 +418,7 @@ class _Picture:
         if left >= right or top >= bottom:
             return
         rays = self._rays[top:bottom, left:right]
-        distance = shape.meet(self._camera.position[None], rays.reshape(-1, 3)).reshape(rays.shape[:2])
+        distance = shape.intersect(self._camera.position[None], rays.reshape(-1, 3)).reshape(rays.shape[:2])
         nearest = self._distance[top:bottom, left:right]
         seen = distance < nearest
         nearest[seen] = distance[seen]
@@ -487,7 +487,7 @@ def _rotation(quaternion: Array) -> Array:
     )
 
 
-def _meet_box(start: Array, ray: Array, half: Array) -> Array:
+def _intersect_box(start: Array, ray: Array, half: Array) -> Array:
     """Distances (n,) of rays to a box around the origin, in its frame; ``start`` or ``ray`` may be (1, 3)."""
     enter, leave = np.float32(-np.inf), np.float32(np.inf)
     for axis in range(3):
@@ -499,7 +499,7 @@ def _meet_box(start: Array, ray: Array, half: Array) -> Array:
 
 
 def _meet_capsule(start: Array, ray: Array, radius: float, half_length: float) -> Array:
-    """Distances (n,) of rays to a capsule along z around the origin, as in :func:`_meet_box`; a ball has no length."""
+    """Distances (n,) of rays to a capsule along z around the origin, as in :func:`_intersect_box`; a ball has no length."""
     (x, y, z), (u, v, w) = start.T, ray.T
     infinite = np.float32(np.inf)
     across = x * u + y * v

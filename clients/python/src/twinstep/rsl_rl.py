@@ -44,7 +44,7 @@ def make_vec_env(
     device
         Where the tensors are that the agent gets.
     **options
-        See :class:`twinstep.Options`.
+        See :class:`twinstep.ConnectOptions`.
     """
     arguments: dict[str, Any] = dict(options)
     if max_episode_steps is not None:

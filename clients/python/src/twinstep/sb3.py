@@ -45,7 +45,7 @@ def make_vec_env(
     render_mode
         ``"rgb_array"``, ``"human"`` (shows the first robot), or ``None``.
     **options
-        See :class:`twinstep.Options`.
+        See :class:`twinstep.ConnectOptions`.
 
     Notes
     -----
@@ -76,7 +76,7 @@ class Go2VecEnv(VecEnv):
         self.envs = envs
         self.twinstep_spec = envs.twinstep_spec
         # Before the base class, which asks each row for its `render_mode`.
-        self._rows = [Row(envs, index) for index in range(envs.num_envs)]
+        self._rows = [SubEnvView(envs, index) for index in range(envs.num_envs)]
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
         # VecVideoRecorder reads the frame rate here.
         self.metadata = {**envs.metadata, **self.metadata}
@@ -139,34 +139,34 @@ class Go2VecEnv(VecEnv):
         return self.envs.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Read an attribute of :class:`Row` from each of the environments ``indices``."""
-        return [getattr(row, attr_name) for row in self._rows_at(indices)]
+        """Read an attribute of :class:`SubEnvView` from each of the environments ``indices``."""
+        return [getattr(row, attr_name) for row in self._sub_envs(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         """Keep an attribute of your own with each of the environments ``indices``; it does not reach the server."""
-        for row in self._rows_at(indices):
+        for row in self._sub_envs(indices):
             setattr(row, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of :class:`Row`, or ``render``, on each of the environments ``indices``."""
+        """Call a method of :class:`SubEnvView`, or ``render``, on each of the environments ``indices``."""
         if method_name == "render":
             drawn = self.envs.render_mode == "rgb_array"
-            return [self.envs.draw(row.index) if drawn else None for row in self._rows_at(indices)]
-        return [getattr(row, method_name)(*method_args, **method_kwargs) for row in self._rows_at(indices)]
+            return [self.envs.draw(row.index) if drawn else None for row in self._sub_envs(indices)]
+        return [getattr(row, method_name)(*method_args, **method_kwargs) for row in self._sub_envs(indices)]
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Indices = None
     ) -> list[bool]:
         """Say for each of the environments ``indices`` that it has no such wrapper."""
-        return [False for _ in self._rows_at(indices)]
+        return [False for _ in self._sub_envs(indices)]
 
-    def _rows_at(self, indices: Indices) -> "list[Row]":
+    def _sub_envs(self, indices: Indices) -> "list[SubEnvView]":
         return [self._rows[index] for index in self._get_indices(indices)]
 
 
-class Row:
+class SubEnvView:
     """One robot of many, as ``get_attr``, ``set_attr`` and ``env_method`` see it.
 
     Attributes

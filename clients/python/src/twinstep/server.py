@@ -12,8 +12,8 @@ from typing import IO
 from .errors import Error
 
 _STARTUP_S = 20.0
-_GOODBYE_S = 5.0
-_LAST_LINES = 15
+_SHUTDOWN_TIMEOUT_S = 5.0
+_LOG_TAIL_LINES = 15
 
 
 class ServerNotFoundError(Error):
@@ -63,7 +63,7 @@ class EmbeddedServer:
     def __init__(self, arguments: tuple[str, ...]) -> None:
         self._arguments = arguments
         self._owner = os.getpid()
-        self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)
+        self._last_lines: deque[str] = deque(maxlen=_LOG_TAIL_LINES)
         command = [find_program(), "serve", "--until-stdin-closes", "--listen", "tcp/127.0.0.1:0", *arguments]
         # A group of its own: Ctrl-C in a terminal is for the agent, which then closes the environment.
         self._process = subprocess.Popen(
@@ -117,7 +117,7 @@ class EmbeddedServer:
         """Process id."""
         return self._process.pid
 
-    def obituary(self) -> str:
+    def exit_report(self) -> str:
         """How the server ended, and its last log lines."""
         code = self._process.poll()
         self._reader.join(timeout=1.0)
@@ -132,7 +132,7 @@ class EmbeddedServer:
         watchdog.cancel()
         if not line.startswith("listening "):
             self._stop()
-            raise ServerStartError(self.obituary())
+            raise ServerStartError(self.exit_report())
         return line.split()[1]
 
     def _keep_lines(self, stderr: IO[str]) -> None:
@@ -146,7 +146,7 @@ class EmbeddedServer:
         assert self._process.stdout is not None
         self._process.stdin.close()
         try:
-            self._process.wait(_GOODBYE_S)
+            self._process.wait(_SHUTDOWN_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
-from .codec import Part, Spec
+from .codec import SpecField, Spec
 
 
 def observation_space(spec: Spec) -> Space[NDArray[np.float32]]:
@@ -19,7 +19,7 @@ def action_space(spec: Spec) -> Space[NDArray[np.float32]]:
     return _box(spec.action)
 
 
-def _box(parts: tuple[Part, ...]) -> Space[NDArray[np.float32]]:
+def _box(parts: tuple[SpecField, ...]) -> Space[NDArray[np.float32]]:
     low = np.concatenate([np.full(part.size, part.low, np.float32) for part in parts])
     high = np.concatenate([np.full(part.size, part.high, np.float32) for part in parts])
     # Gymnasium types a Box by any number; its dtype says which.

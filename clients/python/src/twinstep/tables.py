@@ -1,6 +1,6 @@
 """Observation and action tables from a server's spec: ``python -m twinstep.tables > docs/go2-walk.md``."""
 
-from .codec import Part, Spec
+from .codec import SpecField, Spec
 from .vector_env import Go2VectorEnv
 
 
@@ -10,7 +10,7 @@ def tables(spec: Spec) -> str:
 
 Made by `python -m twinstep.tables` from the server's spec; a test keeps it true.
 
-One step is one policy period of {spec.policy_dt:g} s; the drive runs at {1 / spec.drive_dt:g} Hz with
+One step is one policy period of {spec.policy_dt:g} s; the actuator runs at {1 / spec.actuator_dt:g} Hz with
 kp = {spec.kp:g} N·m/rad and kd = {spec.kd:g} N·m·s/rad. An action of 1 offsets a joint by {spec.action_scale:g} rad
 from the default pose.
 Episodes are truncated after {spec.max_episode_steps} steps.
@@ -26,11 +26,11 @@ Episodes are truncated after {spec.max_episode_steps} steps.
     return "\n".join([head, *sections, order, rewards])
 
 
-def _table(parts: tuple[Part, ...]) -> str:
+def _table(parts: tuple[SpecField, ...]) -> str:
     rows, start = list[str](), 0
     for part in parts:
         index = f"{start}" if part.size == 1 else f"{start}–{start + part.size - 1}"
-        rows.append(f"| {index} | `{part.name}` | {part.unit or '–'} | {part.low:g} | {part.high:g} | {part.text} |")
+        rows.append(f"| {index} | `{part.name}` | {part.unit or '–'} | {part.low:g} | {part.high:g} | {part.description} |")
         start += part.size
     return "| index | name | unit | low | high | meaning |\n|---|---|---|---|---|---|\n" + "\n".join(rows) + "\n"
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .env import OptionArguments, RenderMode, checked_render_mode, reward_terms
 from .errors import InvalidOptionError
-from .remote import Batch, Options, RemoteEnvs
+from .remote import StepBatch, ConnectOptions, RemoteVecEnv
 from .render import Viewer
 from .spaces import action_space, observation_space
 
@@ -34,7 +34,7 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
     info_timing
         Adds ``round_trip_s`` [s] to every info of a step. Off, infos depend on seeds and actions alone.
     **options
-        See :class:`twinstep.Options`.
+        See :class:`twinstep.ConnectOptions`.
     """
 
     def __init__(
@@ -54,8 +54,8 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         self._viewer = Viewer(mode_of_pictures) if mode_of_pictures else None
         self._mode = mode
         self._info_timing = info_timing
-        self._remote = RemoteEnvs(
-            Options(**options), num_envs=num_envs, autoreset=mode.value, max_episode_steps=max_episode_steps
+        self._remote = RemoteVecEnv(
+            ConnectOptions(**options), num_envs=num_envs, autoreset=mode.value, max_episode_steps=max_episode_steps
         )
         self.num_envs = num_envs
         self.twinstep_spec = self._remote.spec
@@ -121,7 +121,7 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         self._remote.send(actions)
 
     def recv(self) -> StepResult:
-        """Wait for what the sent actions gave; may be called again after a ``NoAnswerError``."""
+        """Wait for what the sent actions gave; may be called again after a ``RequestTimeoutError``."""
         batch = self._remote.recv()
         infos = self._infos(batch)
         self._show()
@@ -151,9 +151,9 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         if isinstance(seed, int | np.integer):
             return (np.arange(self.num_envs, dtype=np.uint64) + np.uint64(seed)).astype(np.uint64)
         if len(seed) != self.num_envs:
-            raise InvalidOptionError(f"`seed` has {len(seed)} entries; {self.num_envs} are wanted")
+            raise InvalidOptionError(f"`seed` has {len(seed)} entries; {self.num_envs} are expected")
         if any(one < 0 for one in seed):
-            raise InvalidOptionError(f"`seed` has {min(seed)}; 0 or more is wanted")
+            raise InvalidOptionError(f"`seed` has {min(seed)}; 0 or more is expected")
         return np.array(seed, dtype=np.uint64)
 
     def _mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_] | None:
@@ -166,13 +166,13 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         mask = np.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
             raise InvalidOptionError(
-                f"`options['reset_mask']` is {mask.dtype} {mask.shape}; bool ({self.num_envs},) is wanted"
+                f"`options['reset_mask']` is {mask.dtype} {mask.shape}; bool ({self.num_envs},) is expected"
             )
         if not mask.any():
             raise InvalidOptionError("`options['reset_mask']` is nowhere true: nothing would be reset")
         return mask
 
-    def _infos(self, batch: Batch) -> dict[str, Any]:
+    def _infos(self, batch: StepBatch) -> dict[str, Any]:
         infos: dict[str, Any] = {}
         names = self.twinstep_spec.reward_terms
         for index, env in enumerate(batch.ended):

@@ -1,6 +1,6 @@
 """The simulators that ``twinstep bench`` measures beside its own: MuJoCo C, and EnvPool's Go1.
 
-``python -m twinstep.peer_simulators`` is a child of the bench. It reads one line of JSON with models and motion, prints
+``python -m twinstep.baseline_simulators`` is a child of the bench. It reads one line of JSON with models and motion, prints
 the list of the peers that are installed, and then answers each name with the env-steps a second of one window, so that
 the bench can take its own windows in between. It ends with its stdin.
 """

@@ -21,7 +21,7 @@ def test_child_names_the_peers_that_are_there_and_measures_them() -> None:
         "window_s": 0.01,
     }
     child = subprocess.run(
-        [sys.executable, "-m", "twinstep.peer_simulators"],
+        [sys.executable, "-m", "twinstep.baseline_simulators"],
         input=f"{json.dumps(setup)}\nmujoco 200\n",
         capture_output=True,
         text=True,

@@ -15,10 +15,10 @@ from .errors import (
     Error,
     InvalidOptionError,
     LeaseLostError,
-    NoAnswerError,
+    RequestTimeoutError,
     NoServerError,
-    NoUniqueRobotError,
-    ServerDiedError,
+    AmbiguousRobotError,
+    ServerExitedError,
     VersionError,
     from_reply,
 )
@@ -30,8 +30,8 @@ QUERY_TIMEOUT_S = 1.0
 CONNECT_TIMEOUT_S = 5.0
 """How long to look for a server."""
 
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.002, 0.2
-_REPLACED_FOR_S = 2.0
+_FIRST_BACKOFF_S, _MAX_BACKOFF_S = 0.002, 0.2
+_RESTART_CONFIRMATION_S = 2.0
 _LIVE_SERVERS = "twinstep/live/server/*/*"
 
 
@@ -54,7 +54,7 @@ class Pending:
             raise NoServerError(f"the Zenoh session is closed: {error}") from error
 
 
-class Link:
+class Connection:
     """A connection to one server.
 
     Parameters
@@ -77,10 +77,10 @@ class Link:
         self._pid = os.getpid()
         self._session = _open_session(endpoint, zenoh_config, server)
         try:
-            self.sid, self.name = self._find_server(robot)
+            self.server_id, self.name = self._find_server(robot)
             self.client = uuid.uuid4().hex
-            self.hello = self._greet()
-            self._token = self._session.liveliness().declare_token(f"twinstep/live/client/{self.sid}/{self.client}")
+            self.hello = self._handshake()
+            self._token = self._session.liveliness().declare_token(f"twinstep/live/client/{self.server_id}/{self.client}")
         except BaseException:
             self._session.close()
             raise
@@ -92,9 +92,9 @@ class Link:
             self._session.close()
 
     def querier(self, key: str) -> zenoh.Querier:
-        """Declare a querier for ``twinstep/<sid>/<key>``."""
+        """Declare a querier for ``twinstep/<server_id>/<key>``."""
         return self._session.declare_querier(
-            f"twinstep/{self.sid}/{key}",
+            f"twinstep/{self.server_id}/{key}",
             target=zenoh.QueryTarget.BEST_MATCHING,
             consolidation=zenoh.ConsolidationMode.NONE,
             congestion_control=zenoh.CongestionControl.BLOCK,
@@ -102,43 +102,43 @@ class Link:
             timeout=QUERY_TIMEOUT_S,
         )
 
-    def ask(self, querier: zenoh.Querier, request: dict[str, object], timeout_s: float) -> dict[str, Any]:
+    def request(self, querier: zenoh.Querier, message: dict[str, object], timeout_s: float) -> dict[str, Any]:
         """Send a request and wait for its answer."""
-        return self.wait(Pending(querier, codec.encode(request)), timeout_s)
+        return self.wait_reply(Pending(querier, codec.encode(message)), timeout_s)
 
-    def wait(self, pending: Pending, timeout_s: float) -> dict[str, Any]:
-        """Wait for the answer to a request, repeating it. May be called again after a :class:`NoAnswerError`."""
-        since, pause, replaced_since = time.monotonic(), _FIRST_PAUSE_S, None
+    def wait_reply(self, pending: Pending, timeout_s: float) -> dict[str, Any]:
+        """Wait for the answer to a request, repeating it. May be called again after a :class:`RequestTimeoutError`."""
+        since, pause, replaced_since = time.monotonic(), _FIRST_BACKOFF_S, None
         while True:
             answer = _outcome(pending)
             if isinstance(answer, dict):
                 return answer
             if self._server is not None and not self._server.alive:
-                raise ServerDiedError(self._server.obituary())
+                raise ServerExitedError(self._server.exit_report())
             now = time.monotonic()
             # Only silence tells of a restart: a query that times out had somebody at its end.
-            replaced = answer is _Silence.NOBODY and self._replaced()
+            replaced = answer is _NoReply.NONE and self._server_restarted()
             replaced_since = (replaced_since or now) if replaced else None
-            if replaced_since is not None and now - replaced_since >= _REPLACED_FOR_S:
+            if replaced_since is not None and now - replaced_since >= _RESTART_CONFIRMATION_S:
                 raise LeaseLostError(
                     f"the server at {self.endpoint} was restarted: its environments are gone\n  make a new environment"
                 )
             if now - since >= timeout_s:
-                raise NoAnswerError(
+                raise RequestTimeoutError(
                     f"no answer from {self.endpoint} to `{pending.querier.key_expr}` after {now - since:.1f} s: "
-                    f"{self._diagnose()}"
+                    f"{self._timeout_reason()}"
                 )
             time.sleep(pause)
-            pause = min(2 * pause, _LONGEST_PAUSE_S)
+            pause = min(2 * pause, _MAX_BACKOFF_S)
             pending.repeat()
 
-    def _greet(self) -> dict[str, Any]:
+    def _handshake(self) -> dict[str, Any]:
         request: dict[str, object] = {"client": "twinstep-python"}
-        hello = self.ask(self.querier("hello"), request, CONNECT_TIMEOUT_S)
+        hello = self.request(self.querier("hello"), request, CONNECT_TIMEOUT_S)
         low, high = hello["protocols"]
         if not low <= codec.PROTOCOL <= high:
             raise VersionError(
-                f"the server at {self.endpoint} ({hello['build']}) speaks protocol {low} to {high}, this client "
+                f"the server at {self.endpoint} ({hello['server_version']}) speaks protocol {low} to {high}, this client "
                 f"{codec.PROTOCOL}\n  install the same Twinstep at both ends"
             )
         return hello
@@ -166,19 +166,19 @@ class Link:
                     f"connected to {self.endpoint}, but no server is visible there after {waited_s:.1f} s\n"
                     "  either none runs behind it, or access control hides it from this user: the server's log tells"
                 )
-            wanted = f"{len(fitting)} robots are named `{robot}`" if robot else f"{len(fitting)} robots are there"
-            names = ", ".join(f"{name} ({sid})" for sid, name in visible)
-            raise NoUniqueRobotError(f"{wanted}; visible: {names}\n  choose one by its name: `robot=`")
+            found = f"{len(fitting)} robots are named `{robot}`" if robot else f"{len(fitting)} robots are there"
+            names = ", ".join(f"{name} ({server_id})" for server_id, name in visible)
+            raise AmbiguousRobotError(f"{found}; visible: {names}\n  choose one by its name: `robot=`")
 
-    def _replaced(self) -> bool:
+    def _server_restarted(self) -> bool:
         visible = self._visible_servers()
-        return all(sid != self.sid for sid, _ in visible) and any(name == self.name for _, name in visible)
+        return all(server_id != self.server_id for server_id, _ in visible) and any(name == self.name for _, name in visible)
 
-    def _diagnose(self) -> str:
+    def _timeout_reason(self) -> str:
         info = self._session.info
         if not info.routers_zid() and not info.peers_zid():
             return "the connection is down and could not be opened again; does the server or the router still run?"
-        if all(sid != self.sid for sid, _ in self._visible_servers()):
+        if all(server_id != self.server_id for server_id, _ in self._visible_servers()):
             return "the connection stands, but the server is gone from it: it ended, or its own link did"
         hello = _outcome(Pending(self.querier("hello"), codec.encode({"client": "twinstep-python"})))
         if isinstance(hello, dict):
@@ -186,23 +186,23 @@ class Link:
                 "the server answers `hello`, but not this: it is still executing the request (raise `timeout_s`), or "
                 "access control or a size limit on the way refuses it"
             )
-        if hello is _Silence.TIMEOUT:
+        if hello is _NoReply.TIMEOUT:
             return "the server is visible but frozen: it accepts requests and answers none"
         return "the server is visible but nothing comes back: access control may deny queries to this user"
 
 
-class _Silence:
+class _NoReply:
     """What came in place of an answer."""
 
-    NOBODY: "_Silence"
-    TIMEOUT: "_Silence"
-    BUSY: "_Silence"
+    NONE: "_NoReply"
+    TIMEOUT: "_NoReply"
+    BUSY: "_NoReply"
 
 
-_Silence.NOBODY, _Silence.TIMEOUT, _Silence.BUSY = _Silence(), _Silence(), _Silence()
+_NoReply.NONE, _NoReply.TIMEOUT, _NoReply.BUSY = _NoReply(), _NoReply(), _NoReply()
 
 
-def _outcome(pending: Pending) -> dict[str, Any] | _Silence:
+def _outcome(pending: Pending) -> dict[str, Any] | _NoReply:
     """The answer to one query, or why there is none; the server's refusals are raised."""
     for reply in pending.replies:
         if reply.ok is not None:
@@ -210,12 +210,12 @@ def _outcome(pending: Pending) -> dict[str, Any] | _Silence:
         payload = cast(bytes, reply.err.payload.to_bytes())
         # Zenoh's own errors, such as its timeout, are plain text; a map starts with 0x80 to 0x8f, 0xde or 0xdf.
         if not payload or not (0x80 <= payload[0] <= 0x8F or payload[0] in (0xDE, 0xDF)):
-            return _Silence.TIMEOUT
+            return _NoReply.TIMEOUT
         error = codec.decode(payload)
-        if error.get("retry"):
-            return _Silence.BUSY
+        if error.get("retryable"):
+            return _NoReply.BUSY
         raise from_reply(error["code"], error["field"], error["message"], error["hint"])
-    return _Silence.NOBODY
+    return _NoReply.NONE
 
 
 def _open_session(endpoint: str, path: str | None, server: EmbeddedServer | None) -> zenoh.Session:
@@ -226,16 +226,16 @@ def _open_session(endpoint: str, path: str | None, server: EmbeddedServer | None
             return zenoh.open(config)
         except zenoh.ZError as error:
             if server is not None and not server.alive:
-                raise ServerDiedError(server.obituary()) from error
+                raise ServerExitedError(server.exit_report()) from error
             waited_s = time.monotonic() - since
             if waited_s < CONNECT_TIMEOUT_S:
                 time.sleep(0.2)
                 continue
-            raise _nobody(endpoint, waited_s) from error
+            raise _connect_error(endpoint, waited_s) from error
 
 
-def _nobody(endpoint: str, waited_s: float) -> Error:
-    if _accepts(endpoint):
+def _connect_error(endpoint: str, waited_s: float) -> Error:
+    if _port_open(endpoint):
         reason = (
             "something accepts connections there: either it is no Twinstep server, or it refuses this client's user, "
             "password or certificate; the server's log tells which"
@@ -245,7 +245,7 @@ def _nobody(endpoint: str, waited_s: float) -> Error:
     return NoServerError(f"no server answers at {endpoint} after {waited_s:.1f} s: {reason}")
 
 
-def _accepts(endpoint: str) -> bool:
+def _port_open(endpoint: str) -> bool:
     address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
     host, _, port = address.rpartition(":")
     try:

@@ -1,7 +1,7 @@
 # pyright: basic, reportMissingImports=false
 """The reference of the bench: dm_env_rpc serving one environment with our shapes and no physics.
 
-``python -m twinstep.peer_dm_env_rpc`` is the server; it prints its port and ends with its stdin.
+``python -m twinstep.baseline_dm_env_rpc`` is the server; it prints its port and ends with its stdin.
 """
 
 import subprocess
