@@ -6,14 +6,14 @@ use std::sync::Arc;
 
 use miette::IntoDiagnostic;
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
-use twinstep_env_server::{Config, Server, SimHost};
+use twinstep_env_server::{Config, Server, SimEnvFactory};
 use twinstep_model::{ResetRequest, VecEnv};
 
 fn main() -> miette::Result<()> {
     let mut config = Config::default();
     config.server.listen = "tcp/127.0.0.1:7449".to_owned();
     config.randomise.payload_kg = [0.0, 2.0];
-    let host = SimHost::new(config.clone()).into_diagnostic()?;
+    let host = SimEnvFactory::new(config.clone()).into_diagnostic()?;
     let server = Server::start(&config.server, Arc::new(host)).into_diagnostic()?;
 
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&config.server.listen, 4)).into_diagnostic()?;
@@ -24,6 +24,6 @@ fn main() -> miette::Result<()> {
     println!("{} environment steps served", server.env_steps());
 
     env.close().into_diagnostic()?;
-    server.stop();
+    server.shutdown();
     Ok(())
 }

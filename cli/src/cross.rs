@@ -4,12 +4,12 @@
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use twinstep_ensemble::{Block, Checkpoint, DataSet, Ensemble, EnsembleError, Gaussian, Run, disagreement};
+use twinstep_ensemble::{Split, Checkpoint, DataSet, Ensemble, EnsembleError, Gaussian, Sequence, epistemic_uncertainty};
 use twinstep_logs::Log;
 
 use crate::chart::{self, GREY, INK, Line, ORANGE, Panel, PlotError};
-use crate::exit::{Failure, Outcome, input, other};
-use crate::fit::{Args, learn, training_file};
+use crate::exit::{Failure, CommandResult, input, other};
+use crate::fit::{Args, train_and_save, training_file};
 
 /// Width and height of a cell of the grid [px].
 const CELL: (u32, u32) = (460, 340);
@@ -21,15 +21,15 @@ struct Cell {
     /// Of the members' mean [N·m].
     rmse: f64,
     /// Mean of the disagreement [nat].
-    euf: f64,
+    mean_uncertainty: f64,
     /// The disagreement that one row in twenty exceeds [nat].
-    high_euf: f64,
+    uncertainty_p95: f64,
     /// Of the stretch that is drawn, row by row: time [s], measured torque, mean [N·m], disagreement [nat].
     drawn: Vec<[f64; 4]>,
 }
 
 /// Learns from each stage, judges by all, and writes the grid.
-pub fn run(logs: &[(String, Log)], args: &Args) -> Outcome {
+pub fn run(logs: &[(String, Log)], args: &Args) -> CommandResult {
     std::fs::create_dir_all(&args.out).map_err(input)?;
     let [svg, csv] = ["cross.svg", "cross.csv"].map(|name| args.out.join(name));
     chart::check_writable(&svg).map_err(input)?;
@@ -37,12 +37,12 @@ pub fn run(logs: &[(String, Log)], args: &Args) -> Outcome {
     let stages = logs.iter().map(|log| DataSet::smoothed(std::slice::from_ref(log), args.smooth).map_err(input));
     let stages: Vec<DataSet> = stages.collect::<Result<_, _>>()?;
     if let Some(place) = stages.iter().position(|stage| stage.joints != stages[0].joints) {
-        return Err(input(EnsembleError::OtherJoints { log: names[place].to_owned() }));
+        return Err(input(EnsembleError::JointsMismatch { log: names[place].to_owned() }));
     }
     let mut ensembles = Vec::new();
     for (number, (stage, name)) in stages.iter().zip(&names).enumerate() {
         println!("learning from {name}");
-        ensembles.push(learnt(stage, args, &args.out.join(format!("{}.safetensors", number + 1)))?);
+        ensembles.push(train_or_load(stage, args, &args.out.join(format!("{}.safetensors", number + 1)))?);
     }
     let cells: Vec<Vec<Cell>> =
         ensembles.iter().map(|ensemble| stages.iter().map(|stage| cell(ensemble, stage)).collect()).collect();
@@ -55,7 +55,7 @@ pub fn run(logs: &[(String, Log)], args: &Args) -> Outcome {
 }
 
 /// The ensemble of a stage; with --resume one that is done is read, and one that is not goes on.
-fn learnt(stage: &DataSet, args: &Args, out: &Path) -> Result<Ensemble, Failure> {
+fn train_or_load(stage: &DataSet, args: &Args, out: &Path) -> Result<Ensemble, Failure> {
     let saved: PathBuf = training_file(out);
     if args.resumes() && out.exists() && !saved.exists() {
         let ensemble = Ensemble::read(out).map_err(input)?;
@@ -64,14 +64,14 @@ fn learnt(stage: &DataSet, args: &Args, out: &Path) -> Result<Ensemble, Failure>
         }
     }
     let resume = (args.resumes() && saved.exists()).then(|| Checkpoint::read(&saved)).transpose().map_err(input)?;
-    Ok(learn(stage, args, out, resume)?.0)
+    Ok(train_and_save(stage, args, out, resume)?.0)
 }
 
 fn cell(ensemble: &Ensemble, stage: &DataSet) -> Cell {
-    let predicted = ensemble.predict(stage.runs(Block::Test));
+    let predicted = ensemble.predict(stage.runs(Split::Test));
     let (mut squares, mut eufs) = (0.0, Vec::new());
     let mut drawn = (0.0, Vec::new());
-    for (run, rows) in stage.runs(Block::Test).zip(&predicted) {
+    for (run, rows) in stage.runs(Split::Test).zip(&predicted) {
         let judged = judged(run, rows, stage.dt);
         squares += judged.iter().map(|[_, torque, mean, _]| (torque - mean).powi(2)).sum::<f64>();
         eufs.extend(judged.iter().map(|row| row[3]));
@@ -85,20 +85,20 @@ fn cell(ensemble: &Ensemble, stage: &DataSet) -> Cell {
     let rows = eufs.len().max(1) as f64;
     Cell {
         rmse: (squares / rows).sqrt(),
-        euf: eufs.iter().sum::<f64>() / rows,
-        high_euf: eufs.get(eufs.len() * 19 / 20).copied().unwrap_or(0.0),
+        mean_uncertainty: eufs.iter().sum::<f64>() / rows,
+        uncertainty_p95: eufs.get(eufs.len() * 19 / 20).copied().unwrap_or(0.0),
         drawn: drawn.1,
     }
 }
 
 /// Time, measured torque, mean and disagreement of each row that has a prediction.
-fn judged(run: &Run, rows: &[Vec<Gaussian>], dt: f64) -> Vec<[f64; 4]> {
+fn judged(run: &Sequence, rows: &[Vec<Gaussian>], dt: f64) -> Vec<[f64; 4]> {
     let first = run.torques.len() - rows.len();
     let row = |(index, members): (usize, &Vec<Gaussian>)| {
         let (means, variances): (Vec<f64>, Vec<f64>) =
             members.iter().map(|member| (member.mean, member.variance)).unzip();
         let mean = means.iter().sum::<f64>() / means.len() as f64;
-        [index as f64 * dt, run.torques[first + index], mean, disagreement(&means, &variances)]
+        [index as f64 * dt, run.torques[first + index], mean, epistemic_uncertainty(&means, &variances)]
     };
     rows.iter().enumerate().map(row).collect()
 }
@@ -107,7 +107,7 @@ fn judged(run: &Run, rows: &[Vec<Gaussian>], dt: f64) -> Vec<[f64; 4]> {
 fn numbers(cells: &[Vec<Cell>], names: &[&str]) -> String {
     let mut text = "learnt_from,judged_by,torque_rmse_nm,euf_nat,euf_95_percent_nat\n".to_owned();
     for (row, name) in cells.iter().zip(names) {
-        for (Cell { rmse, euf, high_euf, .. }, judge) in row.iter().zip(names) {
+        for (Cell { rmse, mean_uncertainty: euf, uncertainty_p95: high_euf, .. }, judge) in row.iter().zip(names) {
             let _ = writeln!(text, "{name},{judge},{rmse:.4},{euf:.4},{high_euf:.4}");
         }
     }
@@ -149,7 +149,7 @@ fn picture(cells: &[Vec<Cell>], names: &[&str]) -> Result<String, PlotError> {
             }
             .draw(&above)?;
             Panel {
-                caption: format!("mean disagreement {:.3} nat", cell.euf),
+                caption: format!("mean disagreement {:.3} nat", cell.mean_uncertainty),
                 x_label: "",
                 y_label: "[nat]",
                 x: 0.0..end,

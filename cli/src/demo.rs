@@ -8,7 +8,7 @@ use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_model::{ResetRequest, VecEnv, go2};
 use twinstep_sim::SimConfig;
 
-use crate::exit::{Outcome, Signals, other};
+use crate::exit::{CommandResult, Signals, other};
 use crate::replay::replay;
 use crate::server_process::ServerProcess;
 use crate::{joint_plot, recording, trot};
@@ -32,13 +32,13 @@ pub struct Args {
 }
 
 /// Both halves of the story.
-pub fn run(args: &Args) -> Outcome {
+pub fn run(args: &Args) -> CommandResult {
     let signals = Signals::listen()?;
     walk(args, &signals)?;
     compare(&args.out, &signals)
 }
 
-fn walk(args: &Args, signals: &Signals) -> Outcome {
+fn walk(args: &Args, signals: &Signals) -> CommandResult {
     let num_envs = args.envs as usize;
     eprintln!("1. A server in another process, {num_envs} simulated Go2, an agent that talks to it over Zenoh.");
     let server = ServerProcess::start(&["--envs", &num_envs.to_string()])?;
@@ -70,7 +70,7 @@ fn walk(args: &Args, signals: &Signals) -> Outcome {
     env.close().map_err(other)
 }
 
-fn compare(out: &Path, signals: &Signals) -> Outcome {
+fn compare(out: &Path, signals: &Signals) -> CommandResult {
     eprintln!("\n2. A recording of a real Go2, held in the air, beside the ideal simulated one.");
     let folder = out.join("go2_air_chirp");
     let log = recording::unpack(&folder)?;

@@ -6,11 +6,11 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_logs::Log;
 use twinstep_model::{Joint, ModelFile};
-use twinstep_sysid::{DiagnoseError, Diagnosed, Diagnosis, Errors, Value, diagnose, diagnose_torques};
+use twinstep_sysid::{DiagnoseError, DiagnosisOutput, Diagnosis, RmsErrors, ParameterValue, diagnose, diagnose_torques};
 
 use crate::evaluate::simulator;
-use crate::exit::{Failure, Outcome, Signals, input, other};
-use crate::report::evidence::{Evidence, LogFacts, Provenance};
+use crate::exit::{Failure, CommandResult, Signals, input, other};
+use crate::report::evidence::{ReportData, LogFacts, Provenance};
 use crate::report::write;
 
 /// Show what the simulation gets wrong, name the cause, extend the model, and measure the gain.
@@ -62,28 +62,28 @@ struct Unwritable {
     "--model {}: a model file is of a Go2, and the log's joint `{joint}` is none of its joints\n  without --model its drives \
      are compared with ideal ones", model.display()
 )]
-struct OtherRobot {
+struct UnsupportedRobot {
     model: PathBuf,
     joint: String,
 }
 
 /// Diagnoses, writes and prints.
-pub fn run(args: &Args) -> Outcome {
-    let model = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load_analytic).map_err(input)?;
+pub fn run(args: &Args) -> CommandResult {
+    let model = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load_without_actuator_network).map_err(input)?;
     let logs = args.logs.iter().map(|path| Log::open(path).map_err(input)).collect::<Result<Vec<_>, _>>()?;
     // Before the search, not after it: what it finds must not be lost.
     std::fs::create_dir_all(&args.out).map_err(|source| input(Unwritable { path: args.out.clone(), source }))?;
     let other_joint = logs[0].joints().iter().find(|name| name.parse::<Joint>().is_err());
     if let Some(joint) = other_joint {
         let model = args.model.clone();
-        let refused = model.map_or(Ok(()), |model| Err(OtherRobot { model, joint: joint.clone() }));
+        let refused = model.map_or(Ok(()), |model| Err(UnsupportedRobot { model, joint: joint.clone() }));
         refused.map_err(input)?;
         let diagnosis = with_progress(|progress| diagnose_torques(&logs, progress))?;
-        return tell(&diagnosis, args);
+        return print_findings(&diagnosis, args);
     }
     let robot = model.robot_model().map_err(input)?;
     let mut simulator = simulator(&robot)?;
-    let Diagnosed { mut diagnosis, extended, next } =
+    let DiagnosisOutput { mut diagnosis, extended, next } =
         with_progress(|progress| diagnose(logs.clone(), &model, &mut simulator, progress))?;
     diagnosis.extended_model = "extended.toml".to_owned();
     let motion = args.out.join(NEXT_EXPERIMENT);
@@ -102,10 +102,10 @@ pub fn run(args: &Args) -> Outcome {
         model: args.model.as_ref().map_or("the ideal go2".to_owned(), |path| path.display().to_string()),
         logs: args.logs.iter().zip(&logs).map(|(path, log)| LogFacts::of(&path.display().to_string(), log)).collect(),
     };
-    let evidence = Evidence::gather(&logs[0], &model, &extended, &mut simulator, provenance).map_err(other)?;
+    let evidence = ReportData::gather(&logs[0], &model, &extended, &mut simulator, provenance).map_err(other)?;
     let report = args.out.join("report.html");
     write(&diagnosis, &evidence, &report).map_err(input)?;
-    tell(&diagnosis, args)?;
+    print_findings(&diagnosis, args)?;
     if !args.json {
         println!("report: {}", report.display());
     }
@@ -126,13 +126,13 @@ fn with_progress<T>(
     });
     bar.finish_and_clear();
     found.map_err(|error| match error {
-        DiagnoseError::Ended => Failure::Interrupted,
+        DiagnoseError::Interrupted => Failure::Interrupted,
         error => input(error),
     })
 }
 
 /// Writes findings.json, and prints it or what a terminal shows.
-fn tell(diagnosis: &Diagnosis, args: &Args) -> Outcome {
+fn print_findings(diagnosis: &Diagnosis, args: &Args) -> CommandResult {
     let json = serde_json::to_string_pretty(diagnosis).map_err(other)?;
     written(args, "findings.json", &json)?;
     if args.json {
@@ -144,7 +144,7 @@ fn tell(diagnosis: &Diagnosis, args: &Args) -> Outcome {
 }
 
 /// Writes a file of the folder.
-fn written(args: &Args, name: &str, text: &str) -> Outcome {
+fn written(args: &Args, name: &str, text: &str) -> CommandResult {
     let path = args.out.join(name);
     std::fs::write(&path, text).map_err(|source| input(Unwritable { path, source }))
 }
@@ -176,16 +176,16 @@ fn text(diagnosis: &Diagnosis, out: &Path) -> String {
     lines.join("\n") + "\n"
 }
 
-fn error_line(name: &str, diagnosis: &Diagnosis, of: fn(&Errors) -> Option<f64>) -> String {
+fn error_line(name: &str, diagnosis: &Diagnosis, of: fn(&RmsErrors) -> Option<f64>) -> String {
     let errors = [&diagnosis.baseline, &diagnosis.extended, &diagnosis.noise_floor];
     let [before, after, floor] = errors.map(|errors| of(errors).map_or("-".to_owned(), |value| format!("{value:.4}")));
     format!("{name}, held-out seconds: {before} -> {after} (noise {floor})")
 }
 
-fn number(value: &Value) -> String {
+fn number(value: &ParameterValue) -> String {
     match value {
-        Value::Number(value) => format!("{value:.4}"),
-        Value::Vector(values) => {
+        ParameterValue::Number(value) => format!("{value:.4}"),
+        ParameterValue::Vector(values) => {
             format!("[{}]", values.iter().map(|value| format!("{value:.4}")).collect::<Vec<_>>().join(", "))
         }
     }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use twinstep_model::effects::{CATALOGUE, Composition, Effect, Target};
 
 use crate::effect_plot;
-use crate::exit::{Outcome, input};
+use crate::exit::{CommandResult, input};
 
 /// Explain what real robots do and ideal ones do not.
 ///
@@ -37,11 +37,11 @@ pub fn named(name: &str) -> Result<&'static Effect, UnknownEffect> {
 }
 
 /// Prints.
-pub fn run(args: &Args) -> Outcome {
+pub fn run(args: &Args) -> CommandResult {
     match &args.name {
         None => {
             for effect in CATALOGUE {
-                println!("{:<20}  {:<18}  {}", effect.name, effect.place, effect.what);
+                println!("{:<20}  {:<18}  {}", effect.name, effect.chain_stage, effect.summary);
             }
             println!("\n`twinstep effects NAME` explains one.");
         }
@@ -58,9 +58,9 @@ pub fn run(args: &Args) -> Outcome {
 
 /// The page of an effect.
 fn text(effect: &Effect) -> String {
-    let mut lines = vec![format!("{}: {}", effect.name, effect.what), String::new()];
+    let mut lines = vec![format!("{}: {}", effect.name, effect.summary), String::new()];
     lines.push(format!("  law        {}", effect.equation));
-    lines.push(format!("  acts at    {}", effect.place));
+    lines.push(format!("  acts at    {}", effect.chain_stage));
     let scopes = match effect.target {
         Target::Joints => "all, hip, thigh, calf, FL, FR, RL, RR, left, right, or a joint such as FL_hip",
         Target::Supply => "all",
@@ -79,18 +79,18 @@ fn text(effect: &Effect) -> String {
     lines.push("\nparameters".to_owned());
     for parameter in effect.parameters {
         let vector = if parameter.count > 1 { format!("[{}]", parameter.count) } else { String::new() };
-        let [low, high] = parameter.plausible;
+        let [low, high] = parameter.prior_range;
         let [least, most] = parameter.bounds;
         lines.push(format!(
             "  {}{vector}  plausible {low} to {high} {}, allowed {least} to {most}; {} changes nothing",
-            parameter.name, parameter.unit, parameter.neutral
+            parameter.name, parameter.unit, parameter.no_effect_value
         ));
         lines.push(format!("      source: {}", parameter.source));
     }
-    if !effect.confusions.is_empty() {
+    if !effect.confounders.is_empty() {
         lines.push("\ntaken for".to_owned());
-        for confusion in effect.confusions {
-            lines.push(format!("  {:<20}  {}", confusion.with, confusion.experiment));
+        for confusion in effect.confounders {
+            lines.push(format!("  {:<20}  {}", confusion.effect, confusion.discriminating_experiment));
         }
     }
     lines.push(format!("\n`twinstep effects {} --plot FILE.svg` draws it.\n", effect.name));

@@ -7,7 +7,7 @@ use twinstep_model::RobotModel;
 use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_sysid::{Evaluation, evaluate, position_errors};
 
-use crate::exit::{Failure, Outcome, input, other};
+use crate::exit::{Failure, CommandResult, input, other};
 use crate::robot_file::robot_model;
 use crate::{chart, evaluation_plot};
 
@@ -73,7 +73,7 @@ pub fn simulator(robot: &RobotModel) -> Result<BatchRollout, Failure> {
 }
 
 /// Evaluates and prints.
-pub fn run(args: &Args) -> Outcome {
+pub fn run(args: &Args) -> CommandResult {
     let robot = robot_model(args.model.as_deref())?;
     let log = Log::open(&args.log).map_err(input)?;
     let rows = args.rows.of(&log)?;

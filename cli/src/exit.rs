@@ -18,7 +18,7 @@ pub enum Failure {
 }
 
 /// What a command returns.
-pub type Outcome = Result<(), Failure>;
+pub type CommandResult = Result<(), Failure>;
 
 /// An error of the user's input.
 pub fn input(error: impl std::error::Error + Send + Sync + 'static) -> Failure {
@@ -31,16 +31,16 @@ pub fn other(error: impl std::error::Error + Send + Sync + 'static) -> Failure {
 }
 
 /// Tells the user, and the shell.
-pub fn code(outcome: Outcome) -> ExitCode {
+pub fn code(outcome: CommandResult) -> ExitCode {
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
-        Err(Failure::Input(report)) => complain(&report, 2),
-        Err(Failure::Other(report)) => complain(&report, 1),
+        Err(Failure::Input(report)) => print_error(&report, 2),
+        Err(Failure::Other(report)) => print_error(&report, 1),
         Err(Failure::Interrupted) => ExitCode::from(130),
     }
 }
 
-fn complain(report: &miette::Report, code: u8) -> ExitCode {
+fn print_error(report: &miette::Report, code: u8) -> ExitCode {
     eprintln!("error: {report}");
     ExitCode::from(code)
 }

@@ -7,14 +7,14 @@ use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use plotters::style::text_anchor::HPos;
 use twinstep_ensemble::{
-    Calibration, Checkpoint, Coverage, DataSet, Ensemble, EnsembleError, Epoch, JointInput, Options, Outcome as Ended,
-    Progress, Training,
+    Calibration, Checkpoint, Coverage, DataSet, Ensemble, EnsembleError, Epoch, JointEncoding, TrainingOptions, TrainingResult as Ended,
+    TrainingEvent, Training,
 };
 use twinstep_logs::Log;
 
 use crate::chart::{self, GREY, Line, ORANGE, Panel, PlotError};
 use crate::cross;
-use crate::exit::{Failure, Outcome, Signals, input, other};
+use crate::exit::{Failure, CommandResult, Signals, input, other};
 
 /// How often a running training is saved.
 const SAVE_EVERY: Duration = Duration::from_secs(30);
@@ -46,19 +46,19 @@ pub struct Args {
     #[arg(required = true)]
     logs: Vec<PathBuf>,
     /// Number of networks.
-    #[arg(long, value_name = "N", default_value_t = Options::default().members)]
+    #[arg(long, value_name = "N", default_value_t = TrainingOptions::default().members)]
     members: usize,
     /// Units of each network's LSTM.
-    #[arg(long, value_name = "N", default_value_t = Options::default().hidden)]
+    #[arg(long, value_name = "N", default_value_t = TrainingOptions::default().hidden)]
     hidden: usize,
     /// What a network is told of the joint: nothing, as in U2E; hip, thigh or calf; or which one it is.
-    #[arg(long, value_name = "WHAT", value_enum, default_value_t = Told::Pooled)]
-    joint_input: Told,
+    #[arg(long, value_name = "WHAT", value_enum, default_value_t = JointEncodingArg::Pooled)]
+    joint_input: JointEncodingArg,
     /// Most passes over the data; most trainings end before, when the left-out stretches are predicted no better.
-    #[arg(long, value_name = "N", default_value_t = Options::default().epochs)]
+    #[arg(long, value_name = "N", default_value_t = TrainingOptions::default().epochs)]
     epochs: usize,
     /// Seed of the networks' first weights and of the order of the data.
-    #[arg(long, default_value_t = Options::default().seed)]
+    #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
     /// Smooth what is learnt from by a cubic spline, as U2E does: waves of so many Hz have half their amplitude. What stops the
     /// training and what judges it stay as measured.
@@ -83,14 +83,14 @@ pub struct Args {
 
 /// [`JointInput`] by its name.
 #[derive(Clone, Copy, ValueEnum)]
-enum Told {
+enum JointEncodingArg {
     Pooled,
     Kind,
     Identity,
 }
 
 /// Trains, judges, prints and writes.
-pub fn run(args: &Args) -> Outcome {
+pub fn run(args: &Args) -> CommandResult {
     let mut logs = Vec::new();
     for path in &args.logs {
         logs.push((path.display().to_string(), Log::open(path).map_err(input)?));
@@ -101,7 +101,7 @@ pub fn run(args: &Args) -> Outcome {
     }
     args.plot.as_deref().map_or(Ok(()), chart::check_writable).map_err(input)?;
     let resume = if args.resume { Some(Checkpoint::read(&training_file(&args.out)).map_err(input)?) } else { None };
-    let (ensemble, curves) = learn(&data, args, &args.out, resume)?;
+    let (ensemble, curves) = train_and_save(&data, args, &args.out, resume)?;
     if let Some(path) = &args.plot {
         chart::write(&curves_svg(&curves).map_err(other)?, path).map_err(other)?;
     }
@@ -113,7 +113,7 @@ pub fn run(args: &Args) -> Outcome {
 }
 
 /// Trains an ensemble and writes it to `out`; what is interrupted is kept beside it.
-pub fn learn(
+pub fn train_and_save(
     data: &DataSet,
     args: &Args,
     out: &Path,
@@ -134,7 +134,7 @@ pub fn learn(
             }
             Ok((*ensemble, curves))
         }
-        Ended::Ended(checkpoint) => {
+        Ended::Interrupted(checkpoint) => {
             checkpoint.write(&saved).map_err(other)?;
             println!("ended before it was done; the same command with --resume goes on");
             Err(Failure::Interrupted)
@@ -148,13 +148,13 @@ impl Args {
         self.resume
     }
 
-    fn options(&self) -> Options {
+    fn options(&self) -> TrainingOptions {
         let joint_input = match self.joint_input {
-            Told::Pooled => JointInput::Pooled,
-            Told::Kind => JointInput::Kind,
-            Told::Identity => JointInput::Identity,
+            JointEncodingArg::Pooled => JointEncoding::Pooled,
+            JointEncodingArg::Kind => JointEncoding::Kind,
+            JointEncodingArg::Identity => JointEncoding::Identity,
         };
-        Options { members: self.members, hidden: self.hidden, joint_input, epochs: self.epochs, seed: self.seed }
+        TrainingOptions { members: self.members, hidden: self.hidden, joint_input, epochs: self.epochs, seed: self.seed }
     }
 }
 
@@ -185,8 +185,8 @@ fn train(training: &Training, args: &Args, saved: &Path, resume: Option<Checkpoi
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let ended = training.run(threads, resume, &mut |progress| {
         match progress {
-            Progress::Sequences(count) => bar.inc(count as u64),
-            Progress::Epoch { member, done, curve, checkpoint } => {
+            TrainingEvent::Sequences(count) => bar.inc(count as u64),
+            TrainingEvent::Epoch { member, done, curve, checkpoint } => {
                 let (number, epoch) = (curve.len(), curve[curve.len() - 1]);
                 let Epoch { training_nll, validation_nll } = epoch;
                 bar.set_message(format!(
@@ -201,7 +201,7 @@ fn train(training: &Training, args: &Args, saved: &Path, resume: Option<Checkpoi
                     last_save = Some(Instant::now());
                 }
             }
-            Progress::Nothing => {}
+            TrainingEvent::Tick => {}
         }
         unwritable.is_none() && !signals.check().unwrap_or(true)
     });
@@ -223,7 +223,7 @@ fn text(found: &Calibration, variance_scale: f64) -> String {
     let mut lines = vec![
         format!("judged by {} rows that nothing was learnt from or fitted to", found.rows),
         format!("torque error of the members' mean: {:.4} N·m (RMSE)", found.rmse),
-        format!("mean standard deviation: {:.4} N·m, all variances scaled by {variance_scale:.3}", found.deviation),
+        format!("mean standard deviation: {:.4} N·m, all variances scaled by {variance_scale:.3}", found.sharpness),
         format!(
             "{:<22}{:>7}{:>7}{:>7}  {:>12}  {:>8}",
             "intervals cover", "50 %", "90 %", "95 %", "PIT distance", "NLL"
@@ -238,8 +238,8 @@ fn text(found: &Calibration, variance_scale: f64) -> String {
 }
 
 fn line(name: &str, coverage: &Coverage) -> String {
-    let [half, ninety, more] = coverage.shares.map(|share| 100.0 * share);
-    let Coverage { pit_distance, nll, .. } = coverage;
+    let [half, ninety, more] = coverage.empirical.map(|share| 100.0 * share);
+    let Coverage { pit_ks_statistic: pit_distance, nll, .. } = coverage;
     format!("{name:<22}{half:>7.1}{ninety:>7.1}{more:>7.1}  {pit_distance:>12.3}  {nll:>8.3}")
 }
 

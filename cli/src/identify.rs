@@ -8,12 +8,12 @@ use twinstep_logs::Log;
 use twinstep_model::ModelFile;
 use twinstep_model::effects::{Effect, Scope, UnknownScope};
 use twinstep_sysid::{
-    Experiment, Finding, Horizon, Identification, Options, Search, Stage, Verdict, evaluate, identify,
+    Experiment, ParameterEstimate, WindowConfig, Identification, IdentifyOptions, GlobalSearch, Stage, EstimateStatus, evaluate, identify,
 };
 
 use crate::effects::{UnknownEffect, named};
 use crate::evaluate::{Rows, simulator};
-use crate::exit::{Failure, Outcome, Signals, input, other};
+use crate::exit::{Failure, CommandResult, Signals, input, other};
 
 /// What is sought without `--effects`: what a real Go2 in the air has shown most of.
 const DEFAULT_EFFECTS: &str = "armature@hip,armature@thigh,armature@calf,coulomb_friction@hip,coulomb_friction@thigh,\
@@ -41,17 +41,17 @@ pub struct Args {
     model: Option<PathBuf>,
     /// What to seek: effects with scopes, as in `coulomb_friction@calf,payload@base`; `twinstep effects` lists them.
     #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = DEFAULT_EFFECTS, hide_default_value = true)]
-    effects: Vec<Sought>,
+    effects: Vec<EffectAtScope>,
     #[command(flatten)]
     rows: Rows,
     /// Seek also what the log cannot tell.
     #[arg(long)]
     force: bool,
     /// Most generations of the search.
-    #[arg(long, value_name = "N", default_value_t = Options::default().generations)]
+    #[arg(long, value_name = "N", default_value_t = IdentifyOptions::default().generations)]
     generations: usize,
     /// Seed of the search.
-    #[arg(long, default_value_t = Options::default().seed)]
+    #[arg(long, default_value_t = IdentifyOptions::default().seed)]
     seed: u64,
     /// Go on with the search that Ctrl-C ended, from OUT.search.json.
     #[arg(long)]
@@ -63,7 +63,7 @@ pub struct Args {
 
 /// An effect with its scope, as in `coulomb_friction@calf`.
 #[derive(Clone, Debug)]
-struct Sought(&'static Effect, Scope);
+struct EffectAtScope(&'static Effect, Scope);
 
 /// Not an effect with its scope.
 #[derive(Debug, thiserror::Error)]
@@ -76,18 +76,18 @@ enum SoughtError {
     Scope(#[from] UnknownScope),
 }
 
-impl FromStr for Sought {
+impl FromStr for EffectAtScope {
     type Err = SoughtError;
 
     fn from_str(text: &str) -> Result<Self, SoughtError> {
         let (name, scope) = text.trim().split_once('@').ok_or_else(|| SoughtError::NoScope(text.to_owned()))?;
-        Ok(Sought(named(name)?, scope.parse::<Scope>()?))
+        Ok(EffectAtScope(named(name)?, scope.parse::<Scope>()?))
     }
 }
 
 /// What is sought without `--effects`.
 pub fn default_effects() -> Vec<(&'static Effect, Scope)> {
-    let parsed = |text: &str| text.parse().map(|Sought(effect, scope)| (effect, scope));
+    let parsed = |text: &str| text.parse().map(|EffectAtScope(effect, scope)| (effect, scope));
     DEFAULT_EFFECTS.split(',').map(|text| parsed(text).expect("the defaults are in the catalogue")).collect()
 }
 
@@ -114,21 +114,21 @@ fn search_file(out: &Path) -> PathBuf {
     name.into()
 }
 
-fn resumed(path: &Path) -> Result<Search, NotResumable> {
+fn resumed(path: &Path) -> Result<GlobalSearch, NotResumable> {
     let failed = |cause: String| NotResumable { path: path.to_owned(), cause };
     let text = std::fs::read_to_string(path).map_err(|error| failed(error.to_string()))?;
     serde_json::from_str(&text).map_err(|error| failed(error.to_string()))
 }
 
 /// Identifies, prints and writes.
-pub fn run(args: &Args) -> Outcome {
-    let model = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load_analytic).map_err(input)?;
+pub fn run(args: &Args) -> CommandResult {
+    let model = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load_without_actuator_network).map_err(input)?;
     let robot = model.robot_model().map_err(input)?;
     let (mut experiments, mut logs) = (Vec::new(), Vec::new());
     for path in &args.logs {
         let log = Log::open(path).map_err(input)?;
         let rows = args.rows.of(&log)?;
-        experiments.push(Experiment::new(&log, &robot, Horizon::IDENTIFICATION).map_err(input)?.only(|row| rows[row]));
+        experiments.push(Experiment::new(&log, &robot, WindowConfig::IDENTIFICATION).map_err(input)?.filter_rows(|row| rows[row]));
         logs.push((path, log, rows));
     }
     // Before the search, not after it: what it finds must not be lost.
@@ -136,18 +136,18 @@ pub fn run(args: &Args) -> Outcome {
     std::fs::OpenOptions::new().append(true).create(true).open(&args.out).map_err(unwritable)?;
     let signals = Signals::listen()?;
     let mut simulator = simulator(&robot)?;
-    let effects: Vec<_> = args.effects.iter().map(|Sought(effect, scope)| (*effect, *scope)).collect();
+    let effects: Vec<_> = args.effects.iter().map(|EffectAtScope(effect, scope)| (*effect, *scope)).collect();
     let search = search_file(&args.out);
     let resume = if args.resume { Some(resumed(&search).map_err(input)?) } else { None };
-    let options = Options { generations: args.generations, seed: args.seed, force: args.force, resume };
+    let options = IdentifyOptions { generations: args.generations, seed: args.seed, force: args.force, resume };
     let bar = progress_bar(args.generations);
     let found = identify(&model, &effects, &experiments, &mut simulator, &options, &mut |stage, step, cost| {
         bar.set_message(match stage {
-            Stage::Check => "what the log can tell".to_owned(),
-            Stage::Search => format!("search, cost {cost:.4e}"),
-            Stage::Refine => format!("refine {step}, cost {cost:.4e}"),
+            Stage::Identifiability => "what the log can tell".to_owned(),
+            Stage::GlobalSearch => format!("search, cost {cost:.4e}"),
+            Stage::Refinement => format!("refine {step}, cost {cost:.4e}"),
         });
-        if stage == Stage::Search {
+        if stage == Stage::GlobalSearch {
             bar.set_position(step as u64);
         }
         !signals.check().unwrap_or(true)
@@ -155,7 +155,7 @@ pub fn run(args: &Args) -> Outcome {
     bar.finish_and_clear();
     let found = found.map_err(input)?;
     std::fs::write(&args.out, found.model.to_toml()).map_err(unwritable)?;
-    match &found.interrupted {
+    match &found.checkpoint {
         Some(ended) => std::fs::write(&search, serde_json::to_string(ended).map_err(other)?).map_err(unwritable)?,
         None if search.exists() => std::fs::remove_file(&search).map_err(unwritable)?,
         None => {}
@@ -172,7 +172,7 @@ pub fn run(args: &Args) -> Outcome {
         }
     }
     println!("written to {}; judge it on rows it has not seen: twinstep evaluate --model", args.out.display());
-    if found.interrupted.is_some() {
+    if found.checkpoint.is_some() {
         println!("ended before it was done; the same command with --resume goes on");
         return Err(Failure::Interrupted);
     }
@@ -190,16 +190,16 @@ fn text(found: &Identification) -> String {
     for finding in &found.findings {
         let interval = finding.interval.map_or(String::new(), |[low, high]| format!("{low:.4} to {high:.4}"));
         let remark = match finding.verdict {
-            Verdict::Found => "",
-            Verdict::AtBound => "at its bound: the truth may lie beyond",
-            Verdict::CannotTell => "this log cannot tell: left as it was",
+            EstimateStatus::Identified => "",
+            EstimateStatus::AtBound => "at its bound: the truth may lie beyond",
+            EstimateStatus::NotIdentifiable => "this log cannot tell: left as it was",
         };
-        let (name, value) = (finding.unknown.name(), finding.value);
-        let line = format!("{name:<44}  {value:>10.4}  {interval:<22} {} {remark}", finding.unknown.unit);
+        let (name, value) = (finding.parameter.name(), finding.value);
+        let line = format!("{name:<44}  {value:>10.4}  {interval:<22} {} {remark}", finding.parameter.unit);
         lines.push(line.trim_end().to_owned());
     }
     lines.extend(found.findings.iter().filter_map(reading));
-    for (one, other, correlation, experiment) in &found.confusable {
+    for (one, other, correlation, experiment) in &found.correlated {
         lines.push(format!("cannot be told apart: {one} and {other} (correlation {correlation:.2})"));
         lines.extend(experiment.map(|experiment| format!("    what would: {experiment}")));
     }
@@ -208,9 +208,9 @@ fn text(found: &Identification) -> String {
 }
 
 /// What people call a log-Cholesky coordinate, where they have a name for it.
-fn reading(finding: &Finding) -> Option<String> {
-    let unknown = &finding.unknown;
-    let (name, unit, convert): (_, _, fn(f64) -> f64) = match unknown.parameter.as_str() {
+fn reading(finding: &ParameterEstimate) -> Option<String> {
+    let unknown = &finding.parameter;
+    let (name, unit, convert): (_, _, fn(f64) -> f64) = match unknown.parameter_name.as_str() {
         "theta.0" => ("mass", "kg", |alpha| (2.0 * alpha).exp()),
         "theta.7" => ("centre of mass, x", "m", |t| t),
         "theta.8" => ("centre of mass, y", "m", |t| t),

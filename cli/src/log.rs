@@ -4,9 +4,9 @@ use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
-use twinstep_logs::{Description, Log, LogError, would_replace};
+use twinstep_logs::{LogSummary, Log, LogError, overwritten_file};
 
-use crate::exit::{Failure, Outcome, input, other};
+use crate::exit::{Failure, CommandResult, input, other};
 
 /// Describe a measured log, or convert it.
 ///
@@ -47,7 +47,7 @@ struct SameFile {
 struct Report<'a> {
     log: &'a Path,
     #[serde(flatten)]
-    description: Description,
+    description: LogSummary,
     #[serde(skip_serializing_if = "Option::is_none")]
     converted: Option<Converted<'a>>,
 }
@@ -62,7 +62,7 @@ struct Converted<'a> {
 }
 
 /// Describes or converts.
-pub fn run(args: &Args) -> Outcome {
+pub fn run(args: &Args) -> CommandResult {
     let log = open(&args.log).map_err(input)?;
     let converted = args.convert.as_deref().map(|to| convert(&log, &args.log, to)).transpose()?;
     if args.json {
@@ -76,7 +76,7 @@ pub fn run(args: &Args) -> Outcome {
 }
 
 /// Writes to stdout, and minds no reader that has seen enough, as `head` has.
-fn print(text: &str) -> Outcome {
+fn print(text: &str) -> CommandResult {
     match std::io::stdout().write_all(text.as_bytes()) {
         Err(cause) if cause.kind() != ErrorKind::BrokenPipe => Err(other(cause)),
         _ => Ok(()),
@@ -92,20 +92,20 @@ fn told(converted: &Converted<'_>, log: &Log) -> String {
     if !log.ignored().is_empty() {
         lines.push(format!("left out, as it is no column of a log: {}", log.ignored().join(", ")));
     }
-    lines.extend(log.reading_notes().iter().map(|note| format!("note: {note}")));
+    lines.extend(log.read_warnings().iter().map(|note| format!("note: {note}")));
     lines.join("\n") + "\n"
 }
 
 /// Reads a measured log, or a motion, in which nothing was measured.
 fn open(path: &Path) -> Result<Log, LogError> {
     let nothing_measured = |motion: &Log| motion.joints().iter().all(|joint| motion.q(joint).is_none());
-    Log::open(path).or_else(|error| Log::open_motion(path).ok().filter(nothing_measured).ok_or(error))
+    Log::open(path).or_else(|error| Log::open_commands(path).ok().filter(nothing_measured).ok_or(error))
 }
 
 fn convert<'a>(log: &Log, from: &Path, to: &'a Path) -> Result<Converted<'a>, Failure> {
-    if let Some(of_log) = would_replace(from, to).map_err(input)? {
+    if let Some(of_log) = overwritten_file(from, to).map_err(input)? {
         return Err(input(SameFile { to: to.to_owned(), of_log }));
     }
     log.write(to).map_err(input)?;
-    Ok(Converted { to, rows: log.rows(), left_out: log.left_out_of(to) })
+    Ok(Converted { to, rows: log.rows(), left_out: log.unsupported_columns(to) })
 }

@@ -33,11 +33,11 @@ use clap::{Parser, Subcommand};
 #[command(version, propagate_version = true)]
 struct Cli {
     #[command(subcommand)]
-    command: Verb,
+    command: CliCommand,
 }
 
 #[derive(Subcommand)]
-enum Verb {
+enum CliCommand {
     Bench(bench::Args),
     Demo(demo::Args),
     Diagnose(diagnose::Args),
@@ -61,18 +61,18 @@ fn main() -> std::process::ExitCode {
         .with_writer(std::io::stderr)
         .init();
     let result = match Cli::parse().command {
-        Verb::Bench(args) => bench::run(&args),
-        Verb::Demo(args) => demo::run(&args),
-        Verb::Diagnose(args) => diagnose::run(&args),
-        Verb::Effects(args) => effects::run(&args),
-        Verb::Evaluate(args) => evaluate::run(&args),
-        Verb::Fit(args) => fit::run(&args),
-        Verb::Hunt(args) => hunt::run(&args),
-        Verb::Identify(args) => identify::run(&args),
-        Verb::Log(args) => log::run(&args),
-        Verb::Mjcf(args) => mjcf::run(&args),
-        Verb::Play(args) => play::run(&args),
-        Verb::Serve(args) => serve::run(&args),
+        CliCommand::Bench(args) => bench::run(&args),
+        CliCommand::Demo(args) => demo::run(&args),
+        CliCommand::Diagnose(args) => diagnose::run(&args),
+        CliCommand::Effects(args) => effects::run(&args),
+        CliCommand::Evaluate(args) => evaluate::run(&args),
+        CliCommand::Fit(args) => fit::run(&args),
+        CliCommand::Hunt(args) => hunt::run(&args),
+        CliCommand::Identify(args) => identify::run(&args),
+        CliCommand::Log(args) => log::run(&args),
+        CliCommand::Mjcf(args) => mjcf::run(&args),
+        CliCommand::Play(args) => play::run(&args),
+        CliCommand::Serve(args) => serve::run(&args),
     };
     exit::code(result)
 }

@@ -3,9 +3,9 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use twinstep_model::{MjcfBase, MjcfDrive, MjcfOptions, mjcf};
+use twinstep_model::{BaseMount, MjcfActuator, MjcfOptions, mjcf};
 
-use crate::exit::{Outcome, input, other};
+use crate::exit::{CommandResult, input, other};
 use crate::robot_file::robot_model;
 
 /// Shortest and longest step [s].
@@ -25,7 +25,7 @@ pub struct Args {
     model: Option<PathBuf>,
     /// Whether the trunk moves: floating, or fixed 1 m above the ground.
     #[arg(long, default_value = "floating", value_parser = base)]
-    base: MjcfBase,
+    base: BaseMount,
     /// One step of the physics [s], 0.00001 to 0.02.
     #[arg(long, default_value_t = 0.001, value_name = "S")]
     timestep: f64,
@@ -48,12 +48,12 @@ struct WriteError {
 }
 
 /// Writes the model.
-pub fn run(args: &Args) -> Outcome {
+pub fn run(args: &Args) -> CommandResult {
     if !TIMESTEPS.contains(&args.timestep) {
         return Err(input(TimestepError(args.timestep)));
     }
     let robot = robot_model(args.model.as_deref())?;
-    let options = MjcfOptions { base: args.base, timestep: args.timestep, drive: MjcfDrive::Torque };
+    let options = MjcfOptions { base: args.base, timestep: args.timestep, actuator: MjcfActuator::Torque };
     let text = mjcf(&robot, &options);
     match &args.out {
         Some(path) => std::fs::write(path, text).map_err(|cause| input(WriteError { path: path.clone(), cause })),
@@ -61,10 +61,10 @@ pub fn run(args: &Args) -> Outcome {
     }
 }
 
-fn base(text: &str) -> Result<MjcfBase, String> {
+fn base(text: &str) -> Result<BaseMount, String> {
     match text {
-        "floating" => Ok(MjcfBase::Floating),
-        "fixed" => Ok(MjcfBase::Fixed),
+        "floating" => Ok(BaseMount::Floating),
+        "fixed" => Ok(BaseMount::Fixed),
         _ => Err("the base is floating or fixed".to_owned()),
     }
 }

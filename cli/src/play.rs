@@ -3,13 +3,13 @@
 use std::path::PathBuf;
 
 use indicatif::ProgressBar;
-use twinstep_ensemble::LearnedRobot;
-use twinstep_logs::{Base as LoggedBase, Log};
+use twinstep_ensemble::ActuatorNetworkRobot;
+use twinstep_logs::{BaseMount as LoggedBase, Log};
 use twinstep_model::{Actuator, ModelFile, RobotModel};
-use twinstep_sim::{Base, BatchBackend, Engine, RapierBackend, SimConfig};
+use twinstep_sim::{BaseMount, BatchBackend, Engine, RapierBackend, SimConfig};
 use twinstep_sysid::{RecordError, record};
 
-use crate::exit::{Failure, Outcome, Signals, input, other};
+use crate::exit::{Failure, CommandResult, Signals, input, other};
 use crate::serve::engine;
 
 /// Play a motion file through a robot model, and write what the robot did as a measured log.
@@ -58,20 +58,20 @@ pub struct Args {
 struct SameFile(PathBuf);
 
 /// Plays and writes.
-pub fn run(args: &Args) -> Outcome {
+pub fn run(args: &Args) -> CommandResult {
     if args.motion.canonicalize().is_ok_and(|motion| args.out.canonicalize().is_ok_and(|out| out == motion)) {
         return Err(input(SameFile(args.out.clone())));
     }
     let file = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load).map_err(input)?;
-    let learned = LearnedRobot::load(&file).map_err(input)?;
+    let learned = ActuatorNetworkRobot::load(&file).map_err(input)?;
     let robot = match &learned {
         Some(learned) => learned.robot.clone(),
         None => file.robot_model().map_err(input)?,
     };
-    let drives = || learned.as_ref().map(|learned| Box::new(learned.drives(1, false)) as Box<dyn Actuator>);
+    let drives = || learned.as_ref().map(|learned| Box::new(learned.actuators(1, false)) as Box<dyn Actuator>);
     let config = args.config();
     config.check(&robot.control).map_err(input)?;
-    let motion = Log::open_motion(&args.motion).map_err(input)?;
+    let motion = Log::open_commands(&args.motion).map_err(input)?;
     let signals = Signals::listen()?;
     let bar = ProgressBar::new(motion.rows() as u64);
     let played = play(&motion, &robot, &drives, config, args.base, &mut |row| {
@@ -80,7 +80,7 @@ pub fn run(args: &Args) -> Outcome {
     });
     bar.finish_and_clear();
     let log = played.map_err(|error| match error {
-        RecordError::Ended => Failure::Interrupted,
+        RecordError::Interrupted => Failure::Interrupted,
         RecordError::Failed(_) | RecordError::Log(_) => other(error),
         RecordError::Motion(_) | RecordError::Backend(_) => input(error),
     })?;
@@ -121,7 +121,7 @@ pub fn play(
 ) -> Result<Log, RecordError> {
     let based = |base| SimConfig { base: simulated(base), ..config };
     let source = source(robot, config);
-    let failed = |error: twinstep_sim::BuildError| RecordError::Backend(Box::new(error));
+    let failed = |error: twinstep_sim::BackendBuildError| RecordError::Backend(Box::new(error));
     match config.engine {
         Engine::Rapier => record(
             motion,
@@ -129,7 +129,7 @@ pub fn play(
             base,
             |base| {
                 let backend = RapierBackend::new(robot.clone(), based(base), 1).map_err(failed)?;
-                Ok(if let Some(drives) = drives() { backend.with_drive(drives) } else { backend })
+                Ok(if let Some(drives) = drives() { backend.with_actuator(drives) } else { backend })
             },
             source,
             progress,
@@ -140,7 +140,7 @@ pub fn play(
             base,
             |base| {
                 let backend = BatchBackend::new(robot.clone(), based(base), 1).map_err(failed)?;
-                Ok(if let Some(drives) = drives() { backend.with_drive(drives) } else { backend })
+                Ok(if let Some(drives) = drives() { backend.with_actuator(drives) } else { backend })
             },
             source,
             progress,
@@ -148,10 +148,10 @@ pub fn play(
     }
 }
 
-fn simulated(base: LoggedBase) -> Base {
+fn simulated(base: LoggedBase) -> BaseMount {
     match base {
-        LoggedBase::Fixed => Base::Fixed,
-        LoggedBase::Floating => Base::Floating,
+        LoggedBase::Fixed => BaseMount::Fixed,
+        LoggedBase::Floating => BaseMount::Floating,
     }
 }
 

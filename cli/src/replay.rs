@@ -3,11 +3,11 @@
 use std::fmt::Write as _;
 use std::ops::Range;
 
-use twinstep_logs::{Base as MeasuredBase, Log};
-use twinstep_model::{Backend, HELD_HEIGHT, Placement, RobotModel};
-use twinstep_sim::{Base, BatchBackend, BuildError, SimConfig};
+use twinstep_logs::{BaseMount as MeasuredBase, Log};
+use twinstep_model::{Backend, FIXED_BASE_HEIGHT, InitialState, RobotModel};
+use twinstep_sim::{BaseMount, BatchBackend, BackendBuildError, SimConfig};
 
-use twinstep_sysid::motion::{DriveClock, FailedAt, JointCommands, MotionError, cell_or_zero, command, joint_commands};
+use twinstep_sysid::motion::{DriveClock, SimulationFailure, JointCommands, MotionError, cell_or_zero, command, joint_commands};
 
 /// Columns of the longest bar of [`Replay::table`].
 const BAR_WIDTH: f64 = 24.0;
@@ -67,10 +67,10 @@ pub enum ReplayError {
     Motion(#[from] MotionError),
     /// The simulation could not be built.
     #[error(transparent)]
-    Build(#[from] BuildError),
+    Build(#[from] BackendBuildError),
     /// The simulation failed.
     #[error(transparent)]
-    Simulation(#[from] FailedAt),
+    Simulation(#[from] SimulationFailure),
 }
 
 /// Puts `robot` down at the first measured state of each part of `log` and commands it as logged to the part's end.
@@ -91,12 +91,12 @@ pub fn replay(
     let commands = joint_commands(log)?;
     let joints = commands.iter().map(|commands| MeasuredJoint::of(log, commands)).collect::<Result<Vec<_>, _>>()?;
     let clock = DriveClock::of(log, robot)?;
-    let mut backend = BatchBackend::new(robot.clone(), SimConfig { base: Base::Fixed, ..config }, 1)?;
+    let mut backend = BatchBackend::new(robot.clone(), SimConfig { base: BaseMount::Fixed, ..config }, 1)?;
     let mut simulated = vec![Vec::with_capacity(log.rows()); joints.len()];
     for (segment, rows) in log.segments() {
         let failed = |row: usize| {
             let (segment, t) = (segment.name.clone(), log.t()[row]);
-            move |cause| FailedAt { segment, row: row + 1, t, cause }
+            move |cause| SimulationFailure { segment, row: row + 1, t, cause }
         };
         backend.reset(&[(0, placement(robot, &joints, rows.start))]).map_err(failed(rows.start))?;
         for row in rows.clone() {
@@ -160,8 +160,8 @@ impl<'a> MeasuredJoint<'a> {
     }
 }
 
-fn placement(robot: &RobotModel, joints: &[MeasuredJoint], row: usize) -> Placement {
-    let mut placement = Placement::at_rest(HELD_HEIGHT as f32, robot.control.default_pose_f32());
+fn placement(robot: &RobotModel, joints: &[MeasuredJoint], row: usize) -> InitialState {
+    let mut placement = InitialState::at_rest(FIXED_BASE_HEIGHT as f32, robot.control.default_pose_f32());
     for joint in joints {
         let index = joint.commands.joint.index();
         placement.q[index] = joint.q[row] as f32;
@@ -185,7 +185,7 @@ fn bar(share: f64) -> String {
 #[cfg(test)]
 mod tests {
     use expect_test::expect;
-    use twinstep_logs::{Gain, LogError, Meta, Segment, TauSensor};
+    use twinstep_logs::{Gain, LogError, Meta, Segment, TorqueSensor};
     use twinstep_model::{Command, Joint, go2};
 
     use super::*;
@@ -200,17 +200,17 @@ mod tests {
 
     fn meta(base: MeasuredBase) -> Meta {
         let segments = vec![Segment { name: "hang".to_owned(), base }];
-        let gain = |gain: f32| Some(Gain::Same(f64::from(gain)));
-        Meta { kp: gain(KP), kd: gain(KD), ..Meta::new(200.0, TauSensor::None, segments) }
+        let gain = |gain: f32| Some(Gain::Uniform(f64::from(gain)));
+        Meta { kp: gain(KP), kd: gain(KD), ..Meta::new(200.0, TorqueSensor::None, segments) }
     }
 
     /// Columns of the model's own motion: every joint but the rear right leg's swings, each with another phase.
     fn simulated_columns() -> Vec<(String, Vec<f64>)> {
         let robot = go2();
         let pose = robot.control.default_pose_f32();
-        let fixed = SimConfig { base: Base::Fixed, ..config() };
+        let fixed = SimConfig { base: BaseMount::Fixed, ..config() };
         let mut backend = BatchBackend::new(robot.clone(), fixed, 1).expect("a simulation");
-        backend.reset(&[(0, Placement::at_rest(HELD_HEIGHT as f32, pose))]).expect("placed");
+        backend.reset(&[(0, InitialState::at_rest(FIXED_BASE_HEIGHT as f32, pose))]).expect("placed");
         let t = (0..ROWS).map(|row| row as f64 * 0.005).collect();
         let [mut q, mut q_cmd] = [0, 1].map(|_| vec![Vec::new(); Joint::ALL.len()]);
         for row in 0..ROWS {
@@ -257,7 +257,7 @@ mod tests {
 
     #[test]
     fn wrong_gain_shows_as_error_in_every_joint_that_moves() {
-        let stiffer = Meta { kp: Some(Gain::Same(1.5 * f64::from(KP))), ..meta(MeasuredBase::Fixed) };
+        let stiffer = Meta { kp: Some(Gain::Uniform(1.5 * f64::from(KP))), ..meta(MeasuredBase::Fixed) };
         let replay = replayed(Log::new(stiffer, simulated_columns())).expect("a replay");
         for joint in &replay.joints {
             assert_eq!(joint.simulated[0], joint.measured[0], "{} starts as measured", joint.name);

@@ -7,11 +7,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use twinstep_env_server::{Config, Server, ServerError, SimHost};
+use twinstep_env_server::{Config, Server, ServerError, SimEnvFactory};
 use twinstep_envs::TaskName;
 use twinstep_sim::Engine;
 
-use crate::exit::{Outcome, Signals, input, other};
+use crate::exit::{CommandResult, Signals, input, other};
 
 /// How often the server looks for signals and tells its rate.
 const TICK: Duration = Duration::from_millis(50);
@@ -76,10 +76,10 @@ pub struct Args {
 }
 
 /// Serves until a signal or, if asked, the end of stdin.
-pub fn run(args: &Args) -> Outcome {
+pub fn run(args: &Args) -> CommandResult {
     let config = args.config()?;
     let signals = Signals::listen()?;
-    let host = SimHost::new(config.clone()).map_err(input)?;
+    let host = SimEnvFactory::new(config.clone()).map_err(input)?;
     let server = Server::start(&config.server, Arc::new(host)).map_err(|error| match error {
         ServerError::ZenohConfig { .. } | ServerError::Setting { .. } | ServerError::Host(_) => input(error),
         _ => other(error),
@@ -96,7 +96,7 @@ pub fn run(args: &Args) -> Outcome {
     );
     let stdin_closed = if args.until_stdin_closes { watch_stdin() } else { Arc::default() };
     let outcome = watch(&server, &signals, &stdin_closed);
-    server.stop();
+    server.shutdown();
     outcome
 }
 
@@ -171,7 +171,7 @@ fn watch_stdin() -> Arc<AtomicBool> {
 }
 
 /// Shows the rate until it is time to stop.
-fn watch(server: &Server, signals: &Signals, stdin_closed: &AtomicBool) -> Outcome {
+fn watch(server: &Server, signals: &Signals, stdin_closed: &AtomicBool) -> CommandResult {
     let style = ProgressStyle::with_template("{spinner} {msg}").expect("the template is valid");
     let line = ProgressBar::new_spinner().with_style(style);
     let mut mark = (Instant::now(), 0);

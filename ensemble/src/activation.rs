@@ -7,19 +7,19 @@ use crate::wide::Wide;
 /// Beyond it tanh is one in single precision.
 const TANH_LIMIT: f32 = 7.905_311;
 /// Odd and even part of tanh from the highest power of x² down: Eigen's `generic_fast_tanh_float`, within 3e-7.
-const TANH_ABOVE: [f32; 7] =
+const TANH_NUMERATOR: [f32; 7] =
     [-2.760_768_5e-16, 2.000_188e-13, -8.604_672e-11, 5.122_297e-8, 1.485_722_4e-5, 6.372_619_3e-4, 4.893_524_6e-3];
-const TANH_BELOW: [f32; 4] = [1.198_258_4e-6, 1.185_347_1e-4, 2.268_434_6e-3, 4.893_525e-3];
+const TANH_DENOMINATOR: [f32; 4] = [1.198_258_4e-6, 1.185_347_1e-4, 2.268_434_6e-3, 4.893_525e-3];
 
 /// tanh of one number, not fused: training runs it on processors whose fused instructions the compiler may not use.
 pub fn tanh(x: f32) -> f32 {
     let x = x.clamp(-TANH_LIMIT, TANH_LIMIT);
     let s = x * x;
-    let (mut above, mut below) = (TANH_ABOVE[0], TANH_BELOW[0]);
-    for factor in &TANH_ABOVE[1..] {
+    let (mut above, mut below) = (TANH_NUMERATOR[0], TANH_DENOMINATOR[0]);
+    for factor in &TANH_NUMERATOR[1..] {
         above = above * s + factor;
     }
-    for factor in &TANH_BELOW[1..] {
+    for factor in &TANH_DENOMINATOR[1..] {
         below = below * s + factor;
     }
     x * above / below
@@ -45,7 +45,7 @@ fn polynomial<W: Wide, const N: usize>(x: W, coefficients: [f32; N]) -> W {
 pub fn wide_tanh<W: Wide>(x: W) -> W {
     let x = W::splat(-TANH_LIMIT).max(W::splat(TANH_LIMIT).min(x));
     let s = x.times(x);
-    x.times(polynomial(s, TANH_ABOVE)).over(polynomial(s, TANH_BELOW))
+    x.times(polynomial(s, TANH_NUMERATOR)).over(polynomial(s, TANH_DENOMINATOR))
 }
 
 /// eˣ for x ≤ 0 within 2e-7 of itself; 1e-38 below −87.

@@ -1,10 +1,10 @@
 //! How often the truth lies where an ensemble says it does.
 
-use crate::data::{Block, DataSet, Run};
+use crate::data::{Split, DataSet, Sequence};
 use crate::ensemble::{Ensemble, Gaussian};
 
 /// Shares that central intervals claim to cover.
-const CLAIMED: [f64; 3] = [0.5, 0.9, 0.95];
+const NOMINAL_LEVELS: [f64; 3] = [0.5, 0.9, 0.95];
 /// Steps of the search for the best variance scale, each of which narrows it to 0.62 of what it was.
 const SEARCH_STEPS: usize = 30;
 /// Logarithms of the least and the largest of these scales.
@@ -14,9 +14,9 @@ const LOG_SCALES: (f64, f64) = (-4.0, 8.0);
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Coverage {
     /// Shares of the truth inside the central 50, 90 and 95 % intervals.
-    pub shares: [f64; 3],
+    pub empirical: [f64; 3],
     /// Largest distance of the distribution of the truth's quantiles (PIT) from the even one it should have (Kolmogorov).
-    pub pit_distance: f64,
+    pub pit_ks_statistic: f64,
     /// Mean negative log-likelihood [nat, of torque in N·m].
     pub nll: f64,
 }
@@ -29,7 +29,7 @@ pub struct Calibration {
     /// Of the mean prediction [N·m].
     pub rmse: f64,
     /// Sharpness: mean standard deviation of the mixture [N·m].
-    pub deviation: f64,
+    pub sharpness: f64,
     /// Each member as its network gives it, and after its variances were scaled.
     pub members: Vec<[Coverage; 2]>,
     /// The mixture of all, before and after.
@@ -39,7 +39,7 @@ pub struct Calibration {
 impl Calibration {
     /// Of `ensemble` on the blocks of `data` that are neither learnt from nor stopped or scaled by.
     pub fn of(ensemble: &Ensemble, data: &DataSet) -> Self {
-        let after = Predictions::of(ensemble, data, Block::Test);
+        let after = Predictions::of(ensemble, data, Split::Test);
         let before = after.scaled(1.0 / ensemble.description.variance_scale);
         let both = |members: std::ops::Range<usize>| [&before, &after].map(|all| all.coverage(members.clone()));
         let count = ensemble.description.members;
@@ -49,7 +49,7 @@ impl Calibration {
         Self {
             rows,
             rmse: (errors.sum::<f64>() / rows as f64).sqrt(),
-            deviation: deviations.sum::<f64>() / rows as f64,
+            sharpness: deviations.sum::<f64>() / rows as f64,
             members: (0..count).map(|member| both(member..member + 1)).collect(),
             mixture: both(0..count),
         }
@@ -58,7 +58,7 @@ impl Calibration {
 
 /// The factor on all variances that gives the validation rows the highest likelihood under the mixture.
 pub fn variance_scale(ensemble: &Ensemble, data: &DataSet) -> f64 {
-    Predictions::of(ensemble, data, Block::Validation).best_scale(ensemble.description.members)
+    Predictions::of(ensemble, data, Split::Validation).best_scale(ensemble.description.members)
 }
 
 /// Truth, and what each member expected, row by row.
@@ -67,9 +67,9 @@ struct Predictions {
 }
 
 impl Predictions {
-    fn of(ensemble: &Ensemble, data: &DataSet, block: Block) -> Self {
+    fn of(ensemble: &Ensemble, data: &DataSet, block: Split) -> Self {
         let expected = ensemble.predict(data.runs(block));
-        let row = |(run, rows): (&Run, Vec<Vec<Gaussian>>)| {
+        let row = |(run, rows): (&Sequence, Vec<Vec<Gaussian>>)| {
             let unseen = run.torques.len() - rows.len();
             run.torques[unseen..].iter().copied().zip(rows).collect::<Vec<_>>()
         };
@@ -113,8 +113,8 @@ impl Predictions {
             (quantile - index as f64 / count).abs().max((quantile - (index + 1) as f64 / count).abs())
         };
         Coverage {
-            shares: CLAIMED.map(inside),
-            pit_distance: quantiles.iter().enumerate().map(distance).fold(0.0, f64::max),
+            empirical: NOMINAL_LEVELS.map(inside),
+            pit_ks_statistic: quantiles.iter().enumerate().map(distance).fold(0.0, f64::max),
             nll: self.nll(members),
         }
     }
@@ -163,15 +163,15 @@ mod tests {
     #[test]
     fn true_beliefs_cover_what_they_claim_and_narrow_ones_less() {
         let right = predictions(2.0).coverage(0..3);
-        for (share, claimed) in right.shares.into_iter().zip(CLAIMED) {
+        for (share, claimed) in right.empirical.into_iter().zip(NOMINAL_LEVELS) {
             // Three deviations of a share of 20,000.
             assert!((share - claimed).abs() < 0.011, "{share} of {claimed}");
         }
-        assert!(right.pit_distance < 0.012);
+        assert!(right.pit_ks_statistic < 0.012);
         let narrow = predictions(1.0).coverage(0..3);
         // Within 1.645 · 1 of a truth that is spread by 2.
-        assert!((narrow.shares[1] - 0.589).abs() < 0.011, "{:?}", narrow.shares);
-        assert!(narrow.pit_distance > 0.1 && narrow.nll > right.nll);
+        assert!((narrow.empirical[1] - 0.589).abs() < 0.011, "{:?}", narrow.empirical);
+        assert!(narrow.pit_ks_statistic > 0.1 && narrow.nll > right.nll);
         assert!((right.nll - (0.5 + (2.0 * std::f64::consts::TAU.sqrt()).ln())).abs() < 0.02);
     }
 

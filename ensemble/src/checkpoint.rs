@@ -6,15 +6,15 @@ use serde::{Deserialize, Serialize};
 use twinstep_model::stream;
 
 use crate::EnsembleError;
-use crate::ensemble::Description;
+use crate::ensemble::EnsembleMetadata;
 use crate::file::{Arrays, Bytes, write};
-use crate::train::{Epoch, Options};
+use crate::train::{Epoch, TrainingOptions};
 use crate::weights::{Shape, Weights};
 
 /// Where every member stands at the end of its last epoch; the training goes on from there bit for bit.
 #[derive(Clone, Debug)]
 pub struct Checkpoint {
-    options: Options,
+    options: TrainingOptions,
     data_hash: String,
     shape: Shape,
     pub(crate) members: Vec<MemberState>,
@@ -37,7 +37,7 @@ pub struct MemberState {
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Header {
-    options: Options,
+    options: TrainingOptions,
     data_hash: String,
     inputs: usize,
     curves: Vec<Vec<Epoch>>,
@@ -45,7 +45,7 @@ struct Header {
 
 impl Checkpoint {
     /// The start of a training.
-    pub(crate) fn new(options: Options, description: &Description) -> Self {
+    pub(crate) fn new(options: TrainingOptions, description: &EnsembleMetadata) -> Self {
         let shape = description.shape();
         let member = |index: usize| {
             let weights = shape.random(&mut stream(options.seed, "first weights", index as u64));
@@ -56,7 +56,7 @@ impl Checkpoint {
     }
 
     /// Itself, if it is of these options and data; only the number of epochs may differ.
-    pub(crate) fn of(mut self, options: &Options, data_hash: &str) -> Result<Self, EnsembleError> {
+    pub(crate) fn of(mut self, options: &TrainingOptions, data_hash: &str) -> Result<Self, EnsembleError> {
         let mut saved = self.options;
         saved.epochs = options.epochs;
         if saved != *options {

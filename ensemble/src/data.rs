@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use sha2::{Digest, Sha256};
-use twinstep_logs::{Log, TauSensor};
+use twinstep_logs::{Log, TorqueSensor};
 
 use crate::EnsembleError;
 use crate::smooth::smoothed;
@@ -20,7 +20,7 @@ const JITTER: f64 = 0.25;
 /// What the rows of a block are for. Blocks are whole stretches of time, the same for all joints, because neighbouring rows
 /// know each other's noise and each other's motion.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Block {
+pub enum Split {
     /// To learn from: eight of ten.
     Training,
     /// To stop by, and to scale variances by: one of ten.
@@ -31,11 +31,11 @@ pub enum Block {
 
 /// Rows of one joint that follow one another without a gap, within one block.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Run {
+pub struct Sequence {
     /// Index into [`DataSet::joints`].
     pub joint: usize,
     /// Whether the drive was put down anew just before: no row of it has an unseen past.
-    pub starts_part: bool,
+    pub after_reset: bool,
     /// ξ = [q_cmd − q, dq_cmd − dq] of each row [rad, rad/s].
     pub errors: Vec<[f64; 2]>,
     /// Measured torque of each row, its mean to the next row [N·m].
@@ -54,10 +54,10 @@ pub struct DataSet {
     /// Joints with measured torque.
     pub joints: Vec<String>,
     /// Where torque was measured.
-    pub tau_sensor: TauSensor,
+    pub tau_sensor: TorqueSensor,
     /// kp [N·m/rad] and kd [N·m·s/rad] of each joint.
     pub gains: Vec<[f64; 2]>,
-    runs: Vec<(Block, Run)>,
+    runs: Vec<(Split, Sequence)>,
 }
 
 impl DataSet {
@@ -71,7 +71,7 @@ impl DataSet {
     pub fn smoothed(logs: &[(String, Log)], hz: Option<f64>) -> Result<Self, EnsembleError> {
         let (first, first_log) = logs.first().ok_or(EnsembleError::TooShort { rows: 0, blocks: 0 })?;
         let tau_sensor = first_log.meta().tau_sensor;
-        if tau_sensor == TauSensor::None {
+        if tau_sensor == TorqueSensor::None {
             return Err(EnsembleError::NoTorque { log: first.clone() });
         }
         let dt = 1.0 / first_log.meta().rate_hz;
@@ -89,20 +89,20 @@ impl DataSet {
             for (_, part) in log.segments() {
                 for start in part.clone().step_by(block_rows) {
                     let block = start..part.end.min(start + block_rows);
-                    set.add(log, &columns, &block, Place { starts_part: start == part.start, number: blocks, hz });
+                    set.add(log, &columns, &block, BlockContext { starts_part: start == part.start, number: blocks, hz });
                     blocks += 1;
                 }
             }
         }
         let has = |wanted| set.runs.iter().any(|(block, _)| *block == wanted);
-        if [Block::Training, Block::Validation, Block::Test].into_iter().all(has) {
+        if [Split::Training, Split::Validation, Split::Test].into_iter().all(has) {
             return Ok(set);
         }
         Err(EnsembleError::TooShort { rows: set.runs.iter().map(|(_, run)| run.torques.len()).sum(), blocks })
     }
 
     /// The runs of one role, in the order of logs, time and joints.
-    pub fn runs(&self, wanted: Block) -> impl Iterator<Item = &Run> + Clone {
+    pub fn runs(&self, wanted: Split) -> impl Iterator<Item = &Sequence> + Clone {
         self.runs.iter().filter(move |(block, _)| *block == wanted).map(|(_, run)| run)
     }
 
@@ -112,7 +112,7 @@ impl DataSet {
         hash.update(self.dt.to_le_bytes());
         hash.update(self.joints.join("\n"));
         for (block, run) in &self.runs {
-            hash.update([*block as u8, run.starts_part as u8, run.joint as u8]);
+            hash.update([*block as u8, run.after_reset as u8, run.joint as u8]);
             for number in run.errors.iter().flatten().chain(&run.torques) {
                 hash.update(number.to_le_bytes());
             }
@@ -125,10 +125,10 @@ impl DataSet {
     fn check(&self, name: &str, log: &Log) -> Result<(), EnsembleError> {
         let given = 1.0 / log.meta().rate_hz;
         if (given / self.dt - 1.0).abs() > 1e-6 {
-            return Err(EnsembleError::OtherStep { what: name.to_owned(), given, wanted: self.dt });
+            return Err(EnsembleError::TimeStepMismatch { what: name.to_owned(), given, wanted: self.dt });
         }
         if log.meta().tau_sensor != self.tau_sensor {
-            return Err(EnsembleError::OtherSensor { log: name.to_owned() });
+            return Err(EnsembleError::SensorMismatch { log: name.to_owned() });
         }
         Ok(())
     }
@@ -159,25 +159,25 @@ impl DataSet {
     }
 
     /// Adds the runs of a block.
-    fn add(&mut self, log: &Log, columns: &[Columns], block: &Range<usize>, place: Place) {
+    fn add(&mut self, log: &Log, columns: &[Columns], block: &Range<usize>, place: BlockContext) {
         let role = match place.number % CYCLE {
-            4 => Block::Validation,
-            9 => Block::Test,
-            _ => Block::Training,
+            4 => Split::Validation,
+            9 => Split::Test,
+            _ => Split::Training,
         };
         let follows = |row: usize| ((log.t()[row] - log.t()[row - 1]) / self.dt - 1.0).abs() <= JITTER;
         for column in columns {
             let error = |row| column.error(row, block, self.dt);
             let usable = |row| error(row).iter().chain([&column.torque[row]]).all(|cell| cell.is_finite());
-            for rows in stretches(block.clone().filter(|row| usable(*row)), follows) {
+            for rows in contiguous_ranges(block.clone().filter(|row| usable(*row)), follows) {
                 let starts_part = place.starts_part && rows.start == block.start;
-                let mut run = Run {
+                let mut run = Sequence {
                     joint: column.joint,
-                    starts_part,
+                    after_reset: starts_part,
                     errors: rows.clone().map(error).collect(),
                     torques: column.torque[rows.clone()].to_vec(),
                 };
-                if let Some(hz) = place.hz.filter(|_| role == Block::Training) {
+                if let Some(hz) = place.hz.filter(|_| role == Split::Training) {
                     column.smooth(&mut run, rows, hz, self.dt);
                 }
                 self.runs.push((role, run));
@@ -188,7 +188,7 @@ impl DataSet {
 
 /// Where a block stands.
 #[derive(Clone, Copy)]
-struct Place {
+struct BlockContext {
     /// Whether it begins a part of a log.
     starts_part: bool,
     /// Among the blocks of all logs.
@@ -223,7 +223,7 @@ impl Columns<'_> {
 
 impl Columns<'_> {
     /// Smooths what was measured of a run; commands stay as sharp as they were.
-    fn smooth(&self, run: &mut Run, rows: Range<usize>, hz: f64, dt: f64) {
+    fn smooth(&self, run: &mut Sequence, rows: Range<usize>, hz: f64, dt: f64) {
         for channel in 0..2 {
             let command = |row: usize| [Some(self.q_cmd), self.dq_cmd][channel].map_or(0.0, |cells| cells[row]);
             let state = |(error, row): (&[f64; 2], usize)| command(row) - error[channel];
@@ -237,7 +237,7 @@ impl Columns<'_> {
 }
 
 /// Ranges of `rows` that come one after another, each of which `follows` the one before it.
-fn stretches(rows: impl Iterator<Item = usize>, follows: impl Fn(usize) -> bool) -> Vec<Range<usize>> {
+fn contiguous_ranges(rows: impl Iterator<Item = usize>, follows: impl Fn(usize) -> bool) -> Vec<Range<usize>> {
     let mut found: Vec<Range<usize>> = Vec::new();
     for row in rows {
         match found.last_mut() {
@@ -250,7 +250,7 @@ fn stretches(rows: impl Iterator<Item = usize>, follows: impl Fn(usize) -> bool)
 
 #[cfg(test)]
 pub mod tests {
-    use twinstep_logs::{Base, Gain, Meta, Segment};
+    use twinstep_logs::{BaseMount, Gain, Meta, Segment};
     use twinstep_model::{standard_normal, stream};
 
     use super::*;
@@ -279,9 +279,9 @@ pub mod tests {
                 (0..rows).map(|row| torque(row) + NOISE * standard_normal(&mut random)).collect(),
             ),
         ];
-        let segments = vec![Segment { name: "air".to_owned(), base: Base::Fixed }];
-        let mut meta = Meta::new(200.0, TauSensor::Current, segments);
-        (meta.kp, meta.kd) = (Some(Gain::Same(20.0)), Some(Gain::Same(0.5)));
+        let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
+        let mut meta = Meta::new(200.0, TorqueSensor::MotorCurrent, segments);
+        (meta.kp, meta.kd) = (Some(Gain::Uniform(20.0)), Some(Gain::Uniform(0.5)));
         change(&mut meta, &mut columns);
         Log::new(meta, columns).expect("a log")
     }
@@ -297,15 +297,15 @@ pub mod tests {
         DataSet::new(&[("here".to_owned(), log)])
     }
 
-    fn rows(set: &DataSet, block: Block) -> usize {
+    fn rows(set: &DataSet, block: Split) -> usize {
         set.runs(block).map(|run| run.torques.len()).sum()
     }
 
     #[test]
     fn every_row_is_in_one_block_and_a_tenth_each_stops_and_judges() {
         let set = set(log(4000, |_, _| {})).expect("a set");
-        assert_eq!([Block::Training, Block::Validation, Block::Test].map(|block| rows(&set, block)), [3200, 400, 400]);
-        assert_eq!(set.runs(Block::Training).filter(|run| run.starts_part).count(), 1);
+        assert_eq!([Split::Training, Split::Validation, Split::Test].map(|block| rows(&set, block)), [3200, 400, 400]);
+        assert_eq!(set.runs(Split::Training).filter(|run| run.after_reset).count(), 1);
     }
 
     #[test]
@@ -317,7 +317,7 @@ pub mod tests {
         }))
         .expect("a set");
         let lengths =
-            |set: &DataSet| set.runs(Block::Training).map(|run| run.torques.len()).take(3).collect::<Vec<_>>();
+            |set: &DataSet| set.runs(Split::Training).map(|run| run.torques.len()).take(3).collect::<Vec<_>>();
         assert_eq!(lengths(&whole)[0], 100);
         assert_eq!(lengths(&holed), [10, 19, 70]);
         assert_ne!(whole.hash(), holed.hash());
@@ -332,7 +332,7 @@ pub mod tests {
             columns[1].1 = (0..2000).map(|row| -0.3 / 11.0 * (11.0 * row as f64 * 0.005).sin()).collect();
         }))
         .expect("a set");
-        let [one, other] = [&with, &without].map(|set| set.runs(Block::Training).next().expect("a run").clone());
+        let [one, other] = [&with, &without].map(|set| set.runs(Split::Training).next().expect("a run").clone());
         for row in 1..99 {
             assert!((one.errors[row][1] - other.errors[row][1]).abs() < 2e-4, "row {row}");
         }
@@ -347,17 +347,17 @@ pub mod tests {
         };
         let raw = set(stepping()).expect("a set");
         let smooth = DataSet::smoothed(&[("here".to_owned(), stepping())], Some(20.0)).expect("a set");
-        for block in [Block::Validation, Block::Test] {
+        for block in [Split::Validation, Split::Test] {
             assert!(raw.runs(block).eq(smooth.runs(block)));
         }
         let noise = |set: &DataSet| {
-            let run = set.runs(Block::Training).nth(1).expect("a run").clone();
+            let run = set.runs(Split::Training).nth(1).expect("a run").clone();
             let second = run.torques.windows(3).map(|rows| (rows[0] - 2.0 * rows[1] + rows[2]).powi(2));
             second.sum::<f64>().sqrt()
         };
         assert!(noise(&smooth) < 0.2 * noise(&raw), "{} of {}", noise(&smooth), noise(&raw));
         let step = |set: &DataSet| {
-            let run = set.runs(Block::Training).next().expect("a run").clone();
+            let run = set.runs(Split::Training).next().expect("a run").clone();
             run.errors[10][0] - run.errors[9][0]
         };
         assert!((step(&smooth) - step(&raw)).abs() < 0.01, "{} of {}", step(&smooth), step(&raw));
@@ -370,7 +370,7 @@ pub mod tests {
         let refused = |change: &Change| set(log(2000, change)).expect_err("refused").to_string();
         assert!(refused(&|_, columns| columns.push(column("tau_ff_knee", 2.0))).contains("`tau_ff_knee` at row 7"));
         assert!(refused(&|_, columns| columns.push(column("kp", 5.0))).contains("kp 5, kd 0.5 at row 7"));
-        assert!(refused(&|meta, _| meta.tau_sensor = TauSensor::None).contains("no measured torque"));
+        assert!(refused(&|meta, _| meta.tau_sensor = TorqueSensor::None).contains("no measured torque"));
         assert!(
             refused(&|_, columns| columns.iter_mut().for_each(|(_, cells)| cells.truncate(400))).contains("too few")
         );

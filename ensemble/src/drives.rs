@@ -1,29 +1,29 @@
 //! Robots that are driven by an ensemble.
 
 use rand::RngExt;
-use twinstep_model::lanes::Instructions;
+use twinstep_model::lanes::InstructionSet;
 use twinstep_model::{
-    Actuator, ActuatorSnapshot, BackendError, Command, JOINT_NAMES, LearnedDrive, MemberDraw, NUM_JOINTS, PerJoint,
-    RobotStates, Stream, Uncertainty, standard_normal, stream,
+    Actuator, ActuatorSnapshot, BackendError, Command, JOINT_NAMES, ActuatorNetworkConfig, MemberSampling, NUM_JOINTS, PerJoint,
+    RobotStates, Stream, EpistemicUncertainty, standard_normal, stream,
 };
 
 use crate::ensemble::Ensemble;
 use crate::kernel::Heads;
-use crate::networks::{Networks, Place, networks};
-use crate::scales::Scales;
+use crate::networks::{MemberBatch, MemberSlot, networks};
+use crate::scales::Normalisers;
 
 /// The drives of many robots: from ξ as the encoders show it to torque, by a member of an ensemble a robot.
 ///
 /// A robot's numbers depend on its own past and seed only: robot i of many has the bits of a single one, on any processor
 /// and any number of threads.
-pub struct LearnedDrives {
-    networks: Box<dyn Networks>,
+pub struct ActuatorNetwork {
+    networks: Box<dyn MemberBatch>,
     members: usize,
-    draw: MemberDraw,
+    draw: MemberSampling,
     sample: bool,
     /// Whether every member hears of every robot. A robot's slot is its index then.
-    all: bool,
-    scales: Scales,
+    feed_all_members: bool,
+    scales: Normalisers,
     /// Of normalised variances, as calibrated.
     variance_scale: f64,
     /// kp [N·m/rad] and kd [N·m·s/rad].
@@ -32,7 +32,7 @@ pub struct LearnedDrives {
     limits: PerJoint,
     robots: Vec<Robot>,
     /// The robots that each member drives, slot by slot, where not every member hears of all.
-    crews: Vec<Vec<usize>>,
+    robots_by_member: Vec<Vec<usize>>,
 }
 
 #[derive(Clone)]
@@ -43,43 +43,43 @@ struct Robot {
 }
 
 /// What the drives remember of a robot.
-struct Memory {
+struct NetworkSnapshot {
     random: Stream,
     member: usize,
     /// Of the member that drives it, or of all.
     states: Vec<Vec<f32>>,
 }
 
-impl LearnedDrives {
+impl ActuatorNetwork {
     /// Of `num_robots` robots, each with the seed 0. `uncertain` lets all members run, so that [`Uncertainty`] is known.
     pub(crate) fn new(
         ensemble: &Ensemble,
-        settings: &LearnedDrive,
+        settings: &ActuatorNetworkConfig,
         uncertain: bool,
         limits: PerJoint,
         num_robots: usize,
-        instructions: Instructions,
+        instructions: InstructionSet,
     ) -> Self {
         let model = &ensemble.description;
-        let all = uncertain || settings.draw == MemberDraw::Step;
+        let all = uncertain || settings.draw == MemberSampling::PerStep;
         let idle = Robot { random: stream(0, "drives", 0), member: 0, slot: 0 };
         let mut this = Self {
             networks: networks(ensemble, instructions),
             members: model.members,
             draw: settings.draw,
             sample: settings.sample,
-            all,
+            feed_all_members: all,
             scales: model.scales,
             variance_scale: model.variance_scale,
             gains: model.gains[0].map(|gain| gain as f32),
             limits,
             robots: vec![idle; num_robots],
-            crews: vec![Vec::new(); model.members],
+            robots_by_member: vec![Vec::new(); model.members],
         };
         for robot in 0..num_robots {
             this.robots[robot].slot = robot;
             if !all {
-                this.enlist(robot, 0);
+                this.assign(robot, 0);
             }
         }
         for member in 0..if all { this.members } else { 0 } {
@@ -92,36 +92,36 @@ impl LearnedDrives {
     }
 
     /// The members that hear of a robot.
-    fn hearing(&self, robot: usize) -> impl Iterator<Item = Place> + use<> {
+    fn fed_slots(&self, robot: usize) -> impl Iterator<Item = MemberSlot> + use<> {
         let Robot { member, slot, .. } = self.robots[robot];
-        let members = if self.all { 0..self.members } else { member..member + 1 };
-        members.map(move |member| Place { member, slot })
+        let members = if self.feed_all_members { 0..self.members } else { member..member + 1 };
+        members.map(move |member| MemberSlot { member, slot })
     }
 
     /// Lets `member` drive a robot; where only it hears of it, what others remember is lost.
-    fn hand_over(&mut self, robot: usize, member: usize) {
-        if self.all {
+    fn reassign(&mut self, robot: usize, member: usize) {
+        if self.feed_all_members {
             self.robots[robot].member = member;
         } else if self.robots[robot].member != member {
-            self.dismiss(robot);
-            self.enlist(robot, member);
+            self.unassign(robot);
+            self.assign(robot, member);
         }
     }
 
     /// Takes a robot from its member; the last of the crew moves up, so that there are no holes.
-    fn dismiss(&mut self, robot: usize) {
+    fn unassign(&mut self, robot: usize) {
         let Robot { member, slot, .. } = self.robots[robot];
-        self.crews[member].swap_remove(slot);
-        if let Some(last) = self.crews[member].get(slot) {
-            let from = Place { member, slot: self.crews[member].len() };
-            let memory = self.networks.memory(from);
-            self.networks.set_memory(Place { member, slot }, &memory);
+        self.robots_by_member[member].swap_remove(slot);
+        if let Some(last) = self.robots_by_member[member].get(slot) {
+            let from = MemberSlot { member, slot: self.robots_by_member[member].len() };
+            let memory = self.networks.state(from);
+            self.networks.set_state(MemberSlot { member, slot }, &memory);
             self.robots[*last].slot = slot;
         }
     }
 
-    fn enlist(&mut self, robot: usize, member: usize) {
-        let crew = &mut self.crews[member];
+    fn assign(&mut self, robot: usize, member: usize) {
+        let crew = &mut self.robots_by_member[member];
         (self.robots[robot].member, self.robots[robot].slot) = (member, crew.len());
         crew.push(robot);
         self.networks.grow(member, crew.len());
@@ -141,7 +141,7 @@ impl LearnedDrives {
             let known =
                 |joint: &usize| command.kp[*joint] == kp && command.kd[*joint] == kd && command.tau_ff[*joint] == 0.0;
             if let Some(joint) = (0..NUM_JOINTS).find(|joint| !known(joint)) {
-                return Err(BackendError::Command { robot, reason: reason(joint) });
+                return Err(BackendError::UnsupportedCommand { robot, reason: reason(joint) });
             }
         }
         Ok(())
@@ -161,7 +161,7 @@ impl LearnedDrives {
     /// The torque that a robot's member has answered [N·m].
     fn torque(&mut self, robot: usize) -> PerJoint {
         let Robot { member, slot, random } = &mut self.robots[robot];
-        let [means, variances] = self.networks.answer(Place { member: *member, slot: *slot });
+        let [means, variances] = self.networks.output(MemberSlot { member: *member, slot: *slot });
         let scale = self.scales.torque;
         std::array::from_fn(|joint| {
             let mut normalised = f64::from(means[joint]);
@@ -169,12 +169,12 @@ impl LearnedDrives {
                 normalised += (self.variance_scale * f64::from(variances[joint])).sqrt() * standard_normal(random);
             }
             let limit = self.limits[joint];
-            ((scale.mean + scale.deviation * normalised) as f32).clamp(-limit, limit)
+            ((scale.mean + scale.std * normalised) as f32).clamp(-limit, limit)
         })
     }
 }
 
-impl Actuator for LearnedDrives {
+impl Actuator for ActuatorNetwork {
     fn torques(
         &mut self,
         commands: &[Command],
@@ -185,12 +185,12 @@ impl Actuator for LearnedDrives {
         self.check(commands, active)?;
         let robots = || (0..active.len()).filter(|robot| active[*robot]);
         for robot in robots() {
-            if self.draw == MemberDraw::Step {
+            if self.draw == MemberSampling::PerStep {
                 self.robots[robot].member = self.robots[robot].random.random_range(0..self.members);
             }
             let errors = self.errors(&commands[robot], &states.q[robot], &states.dq[robot]);
-            for place in self.hearing(robot) {
-                self.networks.hear(place, &errors, place.member == self.robots[robot].member);
+            for place in self.fed_slots(robot) {
+                self.networks.push_input(place, &errors, place.member == self.robots[robot].member);
             }
         }
         self.networks.advance(if self.sample { Heads::Both } else { Heads::Mean });
@@ -202,39 +202,39 @@ impl Actuator for LearnedDrives {
 
     fn reset(&mut self, robot: usize, seed: u64) {
         self.robots[robot].random = stream(seed, "drives", 0);
-        if self.draw == MemberDraw::Episode {
+        if self.draw == MemberSampling::PerEpisode {
             let member = self.robots[robot].random.random_range(0..self.members);
-            self.hand_over(robot, member);
+            self.reassign(robot, member);
         }
-        for place in self.hearing(robot) {
-            self.networks.forget(place);
+        for place in self.fed_slots(robot) {
+            self.networks.reset_state(place);
         }
     }
 
     fn snapshot(&self, robot: usize) -> ActuatorSnapshot {
         let Robot { random, member, .. } = self.robots[robot].clone();
-        let states = self.hearing(robot).map(|place| self.networks.memory(place)).collect();
-        ActuatorSnapshot::new(Memory { random, member, states })
+        let states = self.fed_slots(robot).map(|place| self.networks.state(place)).collect();
+        ActuatorSnapshot::new(NetworkSnapshot { random, member, states })
     }
 
     fn restore(&mut self, robot: usize, snapshot: &ActuatorSnapshot) {
-        let Memory { random, member, states } = snapshot.get().expect("a snapshot of drives of the same ensemble");
+        let NetworkSnapshot { random, member, states } = snapshot.get().expect("a snapshot of drives of the same ensemble");
         self.robots[robot].random = random.clone();
-        self.hand_over(robot, *member);
-        for (place, memory) in self.hearing(robot).zip(states) {
-            self.networks.set_memory(place, memory);
+        self.reassign(robot, *member);
+        for (place, memory) in self.fed_slots(robot).zip(states) {
+            self.networks.set_state(place, memory);
         }
     }
 
-    fn uncertainty(&mut self) -> Option<&mut dyn Uncertainty> {
-        if self.all { Some(self) } else { None }
+    fn uncertainty(&mut self) -> Option<&mut dyn EpistemicUncertainty> {
+        if self.feed_all_members { Some(self) } else { None }
     }
 }
 
 /// [`crate::disagreement`] of the members about the torque of the last drive period, mean over the joints (U2E equation 11).
-impl Uncertainty for LearnedDrives {
+impl EpistemicUncertainty for ActuatorNetwork {
     fn evaluate(&mut self, active: &[bool], uncertainty: &mut [f32]) {
-        self.networks.answer_all();
+        self.networks.evaluate_all();
         let mut found = vec![0.0; active.len()];
         self.networks.disagreement(self.variance_scale as f32, &mut found);
         for robot in (0..active.len()).filter(|robot| active[*robot]) {
@@ -245,23 +245,23 @@ impl Uncertainty for LearnedDrives {
 
 #[cfg(test)]
 mod tests {
-    use twinstep_logs::TauSensor;
+    use twinstep_logs::TorqueSensor;
 
     use super::*;
-    use crate::ensemble::{Description, JointInput};
+    use crate::ensemble::{EnsembleMetadata, JointEncoding};
     use crate::inference::Inference;
-    use crate::scales::Scale;
+    use crate::scales::Normaliser;
 
     fn ensemble(members: usize) -> Ensemble {
-        let scale = |mean, deviation| Scale { mean, deviation };
-        Ensemble::untrained(Description {
+        let scale = |mean, deviation| Normaliser { mean, std: deviation };
+        Ensemble::untrained(EnsembleMetadata {
             members,
             hidden: 5,
             dt: 0.005,
             joints: JOINT_NAMES.map(str::to_owned).to_vec(),
-            joint_input: JointInput::Identity,
-            scales: Scales { errors: [scale(0.01, 0.1), scale(0.2, 2.0)], torque: scale(1.5, 10.0) },
-            tau_sensor: TauSensor::Current,
+            joint_input: JointEncoding::Identity,
+            scales: Normalisers { errors: [scale(0.01, 0.1), scale(0.2, 2.0)], torque: scale(1.5, 10.0) },
+            tau_sensor: TorqueSensor::MotorCurrent,
             gains: vec![[30.0, 0.75]; 12],
             variance_scale: 0.2,
             data_hash: String::new(),
@@ -269,16 +269,16 @@ mod tests {
         })
     }
 
-    fn drives(members: usize, draw: MemberDraw, sample: bool, robots: usize) -> LearnedDrives {
-        let settings = LearnedDrive { ensemble: "".into(), draw, sample };
+    fn drives(members: usize, draw: MemberSampling, sample: bool, robots: usize) -> ActuatorNetwork {
+        let settings = ActuatorNetworkConfig { ensemble: "".into(), draw, sample };
         let mut drives =
-            LearnedDrives::new(&ensemble(members), &settings, false, [9.0; 12], robots, Instructions::best());
+            ActuatorNetwork::new(&ensemble(members), &settings, false, [9.0; 12], robots, InstructionSet::best());
         (0..robots).for_each(|robot| drives.reset(robot, robot as u64));
         drives
     }
 
     /// Torques of robots that are all told and seen the same, row after row.
-    fn torques(drives: &mut LearnedDrives, row: usize) -> Vec<PerJoint> {
+    fn torques(drives: &mut ActuatorNetwork, row: usize) -> Vec<PerJoint> {
         let robots = drives.robots.len();
         let mut tau = vec![[0.0; 12]; robots];
         let command = Command::hold([0.02 * row as f32; 12], 30.0, 0.75);
@@ -292,9 +292,9 @@ mod tests {
     fn wanted(members: usize, row: usize) -> Vec<[crate::Gaussian; 12]> {
         let mut inference = Inference::new(&ensemble(members), 1);
         for row in 0..=row {
-            inference.hear(&[[[f64::from(0.02 * row as f32), 0.0]; 12]]);
+            inference.step(&[[[f64::from(0.02 * row as f32), 0.0]; 12]]);
         }
-        (0..members).map(|member| inference.gaussians(0, member)).collect()
+        (0..members).map(|member| inference.predictions(0, member)).collect()
     }
 
     /// Which member's means these are.
@@ -307,7 +307,7 @@ mod tests {
 
     #[test]
     fn one_member_drives_a_robot_until_it_is_placed_anew() {
-        let mut drives = drives(3, MemberDraw::Episode, false, 40);
+        let mut drives = drives(3, MemberSampling::PerEpisode, false, 40);
         let first: Vec<_> = torques(&mut drives, 0).iter().map(|tau| member_of(tau, &wanted(3, 0))).collect();
         for row in 1..4 {
             let tau = torques(&mut drives, row);
@@ -323,7 +323,7 @@ mod tests {
 
     #[test]
     fn drawn_step_by_step_every_member_remembers_what_the_others_drove() {
-        let mut drives = drives(3, MemberDraw::Step, false, 40);
+        let mut drives = drives(3, MemberSampling::PerStep, false, 40);
         let mut seen = Vec::new();
         for row in 0..4 {
             let tau = torques(&mut drives, row);
@@ -335,7 +335,7 @@ mod tests {
     #[test]
     fn samples_have_the_members_mean_and_deviation() {
         const ROBOTS: usize = 4000;
-        let mut drives = drives(1, MemberDraw::Episode, true, ROBOTS);
+        let mut drives = drives(1, MemberSampling::PerEpisode, true, ROBOTS);
         drives.limits = [f32::INFINITY; 12];
         let (tau, wanted) = (torques(&mut drives, 0), wanted(1, 0));
         for (joint, wanted) in wanted[0].iter().enumerate() {
@@ -350,7 +350,7 @@ mod tests {
 
     #[test]
     fn torque_stays_within_the_motors_limit() {
-        let mut drives = drives(1, MemberDraw::Episode, true, 400);
+        let mut drives = drives(1, MemberSampling::PerEpisode, true, 400);
         let tau = torques(&mut drives, 0);
         assert!(tau.iter().flatten().all(|tau| tau.abs() <= 9.0));
         assert!(tau.iter().flatten().any(|tau| tau.abs() == 9.0));

@@ -27,7 +27,7 @@ pub struct Tape {
     /// Cells, before the first row and after each, `[1 + time, batch, hidden]`.
     cells: Vec<f32>,
     /// tanh of the cells after each row, `[time, batch, hidden]`.
-    squashed: Vec<f32>,
+    tanh_cells: Vec<f32>,
     /// States, before the first row and after each, `[1 + time, batch, hidden]`.
     states: Vec<f32>,
 }
@@ -42,14 +42,14 @@ pub struct Gradients {
 impl Encoder {
     /// Runs over a batch from states of zero.
     pub fn forward(&self, batch: &Batch) -> Tape {
-        let (size, time, [units, width]) = (batch.size, batch.time, self.hidden_weight.dims());
+        let (size, time, [units, width]) = (batch.size, batch.steps, self.hidden_weight.dims());
         let device = self.hidden_weight.device();
         let mut tape = Tape {
             size,
             units,
             gates: numbers(Tensor::from_data(batch.inputs(), &device).matmul(self.input_weight.clone())),
             cells: vec![0.0; (1 + time) * size * units],
-            squashed: vec![0.0; time * size * units],
+            tanh_cells: vec![0.0; time * size * units],
             states: vec![0.0; (1 + time) * size * units],
         };
         for row in 0..time {
@@ -57,7 +57,7 @@ impl Encoder {
             let heard = numbers(matrix(before, [size, units], &device).matmul(self.hidden_weight.clone()));
             let (cells_before, cells) = tape.cells[row * size * units..].split_at_mut(size * units);
             let states = &mut tape.states[(row + 1) * size * units..];
-            let squashed = &mut tape.squashed[row * size * units..];
+            let squashed = &mut tape.tanh_cells[row * size * units..];
             let gates = &mut tape.gates[row * size * width..];
             for place in 0..size {
                 let (wide, narrow) = (place * width, place * units);
@@ -65,7 +65,7 @@ impl Encoder {
                 for ((gate, heard), bias) in gates.iter_mut().zip(&heard[wide..wide + width]).zip(&self.bias) {
                     *gate += heard + bias;
                 }
-                advance(
+                forward_step(
                     gates,
                     &cells_before[narrow..narrow + units],
                     &mut cells[narrow..narrow + units],
@@ -79,7 +79,7 @@ impl Encoder {
 
     /// Gradients of a loss from its gradients with respect to the states after each row, `[time · batch, hidden]`.
     pub fn backward(&self, batch: &Batch, tape: &Tape, by_states: &[f32]) -> Gradients {
-        let (size, time, [units, width]) = (batch.size, batch.time, self.hidden_weight.dims());
+        let (size, time, [units, width]) = (batch.size, batch.steps, self.hidden_weight.dims());
         let device = self.hidden_weight.device();
         let back = self.hidden_weight.clone().transpose();
         let mut by_gates = vec![0.0; time * size * width];
@@ -90,9 +90,9 @@ impl Encoder {
             for place in 0..size {
                 let (wide, narrow) = (place * width, place * units);
                 let at = row * size * units + narrow;
-                retreat(
+                backward_step(
                     &tape.gates[row * size * width + wide..][..width],
-                    [&tape.cells[at..at + units], &tape.squashed[at..at + units]],
+                    [&tape.cells[at..at + units], &tape.tanh_cells[at..at + units]],
                     [&by_states[at..at + units], &later[narrow..narrow + units]],
                     &mut by_cells[narrow..narrow + units],
                     &mut by_row[wide..wide + width],
@@ -127,7 +127,7 @@ impl Tape {
 }
 
 /// One row of one sequence: from what the gates hear to what they let through, and to the next cell and state.
-fn advance(gates: &mut [f32], before: &[f32], cells: &mut [f32], squashed: &mut [f32], states: &mut [f32]) {
+fn forward_step(gates: &mut [f32], before: &[f32], cells: &mut [f32], squashed: &mut [f32], states: &mut [f32]) {
     let units = before.len();
     let (input, rest) = gates.split_at_mut(units);
     let (forget, rest) = rest.split_at_mut(units);
@@ -151,7 +151,7 @@ fn advance(gates: &mut [f32], before: &[f32], cells: &mut [f32], squashed: &mut 
 
 /// The way back over [`advance`]. `by_states` are gradients with respect to the row's states from the heads and from the
 /// next row; `by_cells` goes from the gradients with respect to the row's cells to those of the row before.
-fn retreat(
+fn backward_step(
     gates: &[f32],
     [before, squashed]: [&[f32]; 2],
     [heads, later]: [&[f32]; 2],

@@ -15,19 +15,19 @@ pub enum EnsembleError {
     },
     /// Two logs measured torque at different places.
     #[error("{log} measured torque at another place (`tau_sensor`) than the first log; fit them apart")]
-    OtherSensor {
+    SensorMismatch {
         /// The log.
         log: String,
     },
     /// Stages that are compared have the same joints.
     #[error("{log} has measured torque of other joints than the first log; compare stages of the same joints")]
-    OtherJoints {
+    JointsMismatch {
         /// The log.
         log: String,
     },
     /// The time step is part of a model.
     #[error("{what} has a step of {given} s, the model one of {wanted} s; a network knows its own step only")]
-    OtherStep {
+    TimeStepMismatch {
         /// The log, or whatever asked.
         what: String,
         /// Its step [s].

@@ -26,7 +26,7 @@ pub fn jensen_renyi(means: &[f64], variances: &[f64]) -> f64 {
 ///
 /// # Panics
 /// Without a member, or when the two slices differ in length.
-pub fn disagreement(means: &[f64], variances: &[f64]) -> f64 {
+pub fn epistemic_uncertainty(means: &[f64], variances: &[f64]) -> f64 {
     let own = |member: usize| log_overlap(0.0, 2.0 * variances[member]);
     // Equal members give the logarithm of one, give or take a rounding.
     (-log_mean_over_pairs(means, variances, |one, other| 0.5 * (own(one) + own(other)))).max(0.0)
@@ -63,9 +63,9 @@ mod tests {
     #[test]
     fn equal_members_disagree_by_nothing_and_six_far_ones_by_log_six() {
         check(jensen_renyi(&[0.3; 6], &[0.7; 6]), 0.0);
-        assert!(disagreement(&[0.3; 6], &[0.7; 6]) < 1e-12);
+        assert!(epistemic_uncertainty(&[0.3; 6], &[0.7; 6]) < 1e-12);
         let far = [0.0, 1e3, 2e3, 3e3, 4e3, 5e3];
-        for euf in [jensen_renyi, disagreement] {
+        for euf in [jensen_renyi, epistemic_uncertainty] {
             check(euf(&far, &[1.0; 6]), 6f64.ln());
             // Nothing underflows: exp(-1e12) is zero in any float.
             check(euf(&far, &[1e-6; 6]), 6f64.ln());
@@ -77,7 +77,7 @@ mod tests {
         for (apart, wanted) in [(0.5, 0.03076), (1.0, 0.11721), (2.0, 0.37989), (5.0, 0.69122)] {
             let means = [0.0, 0.0, 0.0, apart, apart, apart];
             check(jensen_renyi(&means, &[1.0; 6]), wanted);
-            check(disagreement(&means, &[1.0; 6]), wanted);
+            check(epistemic_uncertainty(&means, &[1.0; 6]), wanted);
         }
     }
 
@@ -85,7 +85,7 @@ mod tests {
     fn value_of_the_paper_goes_negative_with_unequal_variances_and_the_corrected_one_does_not() {
         for (ratio, paper) in [(4.0, 0.02271), (100.0, -0.08812), (1e4, -0.95386), (1e6, -2.0714)] {
             check(jensen_renyi(&[0.0; 2], &[1.0, ratio]), paper);
-            assert!(disagreement(&[0.0; 2], &[1.0, ratio]) > 0.05);
+            assert!(epistemic_uncertainty(&[0.0; 2], &[1.0, ratio]) > 0.05);
         }
         let one_of_six = |deviation: f64| jensen_renyi(&[0.0; 6], &[1.0, 1.0, 1.0, 1.0, 1.0, deviation * deviation]);
         assert!(one_of_six(3.6) > 0.0 && one_of_six(3.7) < 0.0);
@@ -116,7 +116,7 @@ mod tests {
         fn disagreement_stays_within_its_bounds(members in ensemble()) {
             let (means, variances): (Vec<_>, Vec<_>) = members.into_iter().unzip();
             let most = (means.len() as f64).ln() + 1e-12;
-            prop_assert!((0.0..=most).contains(&disagreement(&means, &variances)));
+            prop_assert!((0.0..=most).contains(&epistemic_uncertainty(&means, &variances)));
             prop_assert!(jensen_renyi(&means, &variances) <= most);
         }
 
@@ -124,7 +124,7 @@ mod tests {
         fn both_agree_where_variances_are_equal(members in ensemble()) {
             let means: Vec<f64> = members.iter().map(|(mean, _)| *mean).collect();
             let variances = vec![members[0].1; means.len()];
-            prop_assert!((disagreement(&means, &variances) - jensen_renyi(&means, &variances)).abs() < 1e-9);
+            prop_assert!((epistemic_uncertainty(&means, &variances) - jensen_renyi(&means, &variances)).abs() < 1e-9);
         }
 
         #[test]
@@ -132,7 +132,7 @@ mod tests {
             let (means, variances): (Vec<_>, Vec<_>) = members.iter().copied().unzip();
             let turned = members.iter().rev().map(|(mean, variance)| (scale * mean + shift, scale * scale * variance));
             let (other_means, other_variances): (Vec<_>, Vec<_>) = turned.unzip();
-            for euf in [jensen_renyi, disagreement] {
+            for euf in [jensen_renyi, epistemic_uncertainty] {
                 let (one, other) = (euf(&means, &variances), euf(&other_means, &other_variances));
                 // Means in the tens that differ by less than a thousandth of themselves lose digits when they are shifted.
                 prop_assert!((one - other).abs() < 1e-6, "{one} {other}");

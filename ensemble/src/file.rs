@@ -8,7 +8,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::EnsembleError;
-use crate::ensemble::{Description, Ensemble};
+use crate::ensemble::{EnsembleMetadata, Ensemble};
 use crate::weights::{Shape, Weights};
 
 /// An array as it stands in a file.
@@ -139,7 +139,7 @@ impl Ensemble {
     /// Reads what [`Ensemble::write`] wrote; whatever is missing or of another size is named.
     pub fn read(path: impl AsRef<Path>) -> Result<Self, EnsembleError> {
         let arrays = Arrays::read(path.as_ref())?;
-        let description: Description = arrays.header("ensemble")?;
+        let description: EnsembleMetadata = arrays.header("ensemble")?;
         if let Some(problem) = bad_gains(&description) {
             return Err(arrays.problem(problem));
         }
@@ -151,7 +151,7 @@ impl Ensemble {
 }
 
 /// What is wrong with the gains that a robot would be given, if anything.
-fn bad_gains(Description { joints, gains, .. }: &Description) -> Option<String> {
+fn bad_gains(EnsembleMetadata { joints, gains, .. }: &EnsembleMetadata) -> Option<String> {
     if joints.is_empty() || joints.len() != gains.len() {
         return Some(format!(
             "has `gains` of {} joints, and {} joints; one pair each is wanted",
@@ -166,23 +166,23 @@ fn bad_gains(Description { joints, gains, .. }: &Description) -> Option<String> 
 
 #[cfg(test)]
 mod tests {
-    use twinstep_logs::TauSensor;
+    use twinstep_logs::TorqueSensor;
     use twinstep_model::stream;
 
     use super::*;
-    use crate::ensemble::JointInput;
-    use crate::scales::{Scale, Scales};
+    use crate::ensemble::JointEncoding;
+    use crate::scales::{Normaliser, Normalisers};
 
     fn ensemble() -> Ensemble {
-        let scale = Scale { mean: 0.1, deviation: 2.5 };
-        let description = Description {
+        let scale = Normaliser { mean: 0.1, std: 2.5 };
+        let description = EnsembleMetadata {
             members: 2,
             hidden: 3,
             dt: 0.005,
             joints: vec!["FL_hip".to_owned(), "FL_calf".to_owned()],
-            joint_input: JointInput::Kind,
-            scales: Scales { errors: [scale, scale], torque: scale },
-            tau_sensor: TauSensor::Output,
+            joint_input: JointEncoding::Kind,
+            scales: Normalisers { errors: [scale, scale], torque: scale },
+            tau_sensor: TorqueSensor::JointOutput,
             gains: vec![[20.0, 0.5], [25.0, 0.6]],
             variance_scale: 1.25,
             data_hash: "0123456789abcdef".to_owned(),

@@ -9,7 +9,7 @@
 use twinstep_model::NUM_JOINTS;
 
 use crate::activation::{wide_exp, wide_softplus, wide_tanh};
-use crate::ensemble::Description;
+use crate::ensemble::EnsembleMetadata;
 use crate::network::VARIANCE_FLOOR;
 use crate::weights::Weights;
 use crate::wide::Wide;
@@ -30,7 +30,7 @@ pub struct Kernel<W> {
     /// `[unit][entry of ξ, then state][gate]`.
     encoder: Vec<[f32; 4]>,
     /// What the gates hear of the joint itself: bias and the input that is 1 for it, `[pattern][unit][gate]`.
-    starts: [Vec<[Pair<W>; 4]>; PATTERNS],
+    gate_bias: [Vec<[Pair<W>; 4]>; PATTERNS],
     mean: Head,
     variance: Head,
 }
@@ -46,18 +46,18 @@ struct Head {
 
 /// What one member remembers and says of the joints of two registers.
 #[derive(Clone)]
-pub struct Block<W> {
+pub struct KernelState<W> {
     /// ξ, normalised, and the encoder's states after the last row: what the gates hear.
-    pub heard: Vec<Pair<W>>,
+    pub input: Vec<Pair<W>>,
     pub cells: Vec<Pair<W>>,
     /// Greater than 0 where a row is to be heard; the other joints stay as they are.
     pub active: Pair<W>,
     /// Mean and variance, normalised.
-    pub answer: [Pair<W>; 2],
+    pub output: [Pair<W>; 2],
     /// Whether any joint is active.
-    pub awake: bool,
+    pub has_input: bool,
     /// Whether an answer is wanted of any joint.
-    pub asked: bool,
+    pub output_needed: bool,
 }
 
 /// What is wanted of a network.
@@ -69,24 +69,24 @@ pub enum Heads {
     Both,
 }
 
-impl<W: Wide> Block<W> {
+impl<W: Wide> KernelState<W> {
     /// From states of zero.
     pub fn new(hidden: usize) -> Self {
         let zero = [W::splat(0.0); 2];
         Self {
-            heard: vec![zero; ERRORS + hidden],
+            input: vec![zero; ERRORS + hidden],
             cells: vec![zero; hidden],
             active: zero,
-            answer: [zero; 2],
-            awake: false,
-            asked: false,
+            output: [zero; 2],
+            has_input: false,
+            output_needed: false,
         }
     }
 }
 
 impl<W: Wide> Kernel<W> {
     /// Of a member of an ensemble that is described by `model`.
-    pub fn new(model: &Description, weights: &Weights) -> Self {
+    pub fn new(model: &EnsembleMetadata, weights: &Weights) -> Self {
         let (hidden, width) = (model.hidden, 4 * model.hidden);
         let [input, recurrent, bias] =
             ["lstm.input_weight", "lstm.hidden_weight", "lstm.bias"].map(|name| &weights[name]);
@@ -98,11 +98,11 @@ impl<W: Wide> Kernel<W> {
             errors.chain((0..hidden).map(move |row| gates(recurrent, row, unit)))
         });
         let start = |joint: usize, unit: usize| {
-            let own = model.input_of(joint).map_or([0.0; 4], |row| gates(input, ERRORS + row, unit));
+            let own = model.one_hot_index(joint).map_or([0.0; 4], |row| gates(input, ERRORS + row, unit));
             let bias = gates(bias, 0, unit);
             std::array::from_fn::<f32, 4, _>(|gate| bias[gate] + own[gate])
         };
-        let starts = std::array::from_fn(|pattern| {
+        let gate_bias = std::array::from_fn(|pattern| {
             let of_unit = |unit| {
                 let mut pairs = [[W::splat(0.0); 2]; 4];
                 for lane in 0..2 * W::LANES {
@@ -118,7 +118,7 @@ impl<W: Wide> Kernel<W> {
         Self {
             hidden,
             encoder: encoder.collect(),
-            starts,
+            gate_bias,
             mean: Head::new(hidden, ["mean.hidden.weight", "mean.hidden.bias", "mean.weight", "mean.bias"], weights),
             variance: Head::new(
                 hidden,
@@ -130,9 +130,9 @@ impl<W: Wide> Kernel<W> {
 
     /// The active joints hear ξ. `room` is for the gates of a unit each.
     #[inline(always)]
-    pub fn advance(&self, block: &mut Block<W>, pattern: usize, room: &mut [[Pair<W>; 4]]) {
-        let Block { heard, cells, active, .. } = block;
-        let units = self.encoder.chunks_exact(ERRORS + self.hidden).zip(&self.starts[pattern]);
+    pub fn advance(&self, block: &mut KernelState<W>, pattern: usize, room: &mut [[Pair<W>; 4]]) {
+        let KernelState { input: heard, cells, active, .. } = block;
+        let units = self.encoder.chunks_exact(ERRORS + self.hidden).zip(&self.gate_bias[pattern]);
         for ((weights, start), sums) in units.zip(room.iter_mut()) {
             let mut gates = *start;
             for (weights, heard) in weights.iter().zip(heard.iter()) {
@@ -162,13 +162,13 @@ impl<W: Wide> Kernel<W> {
 
     /// What the network says of its joints.
     #[inline(always)]
-    pub fn answer(&self, block: &mut Block<W>, heads: Heads) {
-        let states = &block.heard[ERRORS..];
-        block.answer[0] = self.mean.output(states);
+    pub fn answer(&self, block: &mut KernelState<W>, heads: Heads) {
+        let states = &block.input[ERRORS..];
+        block.output[0] = self.mean.output(states);
         if heads == Heads::Both {
             let raw = self.variance.output(states);
             let floor = W::splat(VARIANCE_FLOOR as f32);
-            block.answer[1] = [wide_softplus(raw[0]).plus(floor), wide_softplus(raw[1]).plus(floor)];
+            block.output[1] = [wide_softplus(raw[0]).plus(floor), wide_softplus(raw[1]).plus(floor)];
         }
     }
 }

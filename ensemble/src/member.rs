@@ -10,9 +10,9 @@ use crate::EnsembleError;
 use crate::adam::adam;
 use crate::checkpoint::MemberState;
 use crate::network::Network;
-use crate::train::{Epoch, Options};
+use crate::train::{Epoch, TrainingOptions};
 use crate::weights::{Shape, Weights};
-use crate::windows::Windows;
+use crate::windows::SequenceDataset;
 
 /// Most sequences of a batch, and of a part of the validation.
 const LARGEST_BATCH: usize = 256;
@@ -20,16 +20,16 @@ const LARGEST_BATCH: usize = 256;
 const SMALLEST_BATCH: usize = 16;
 const STEPS: usize = 20;
 /// Adam's first learning rate.
-const RATE: f64 = 5e-3;
+const LEARNING_RATE: f64 = 5e-3;
 /// What the rate is multiplied by after [`PATIENCE`] epochs without a better validation.
-const CUT: f64 = 0.3;
+const LR_DECAY: f64 = 0.3;
 const PATIENCE: usize = 4;
 /// The cut that ends the training instead.
-const LAST_CUT: i32 = 4;
+const MAX_LR_DECAYS: i32 = 4;
 /// A better validation is better by this [nat].
-const BETTER: f64 = 1e-3;
+const MIN_DELTA: f64 = 1e-3;
 /// Gradients of an array are no longer than this.
-const GRADIENT_NORM: f32 = 1.0;
+const MAX_GRAD_NORM: f32 = 1.0;
 /// What a saved optimiser is of that burn cannot read.
 const VERSION: &str = "versions of this program";
 
@@ -42,9 +42,9 @@ pub enum EpochEnd {
 }
 
 /// A member in training.
-pub struct Member<'a> {
+pub struct MemberTrainer<'a> {
     index: usize,
-    options: &'a Options,
+    options: &'a TrainingOptions,
     shape: Shape,
     network: Network,
     optimizer: ModuleOptimizer,
@@ -52,18 +52,18 @@ pub struct Member<'a> {
     curve: Vec<Epoch>,
 }
 
-impl<'a> Member<'a> {
+impl<'a> MemberTrainer<'a> {
     /// From where `state` left off, on any device.
     pub fn new(
         index: usize,
-        options: &'a Options,
+        options: &'a TrainingOptions,
         shape: Shape,
         state: MemberState,
         device: &Device,
     ) -> Result<Self, EnsembleError> {
         let optimizer = match state.optimizer {
-            saved if saved.is_empty() => adam(GRADIENT_NORM),
-            saved => adam(GRADIENT_NORM)
+            saved if saved.is_empty() => adam(MAX_GRAD_NORM),
+            saved => adam(MAX_GRAD_NORM)
                 .from_bytes(Bytes::from_bytes_vec(saved))
                 .map_err(|_| EnsembleError::OtherTraining { what: VERSION })?,
         };
@@ -75,11 +75,11 @@ impl<'a> Member<'a> {
     /// stops the epoch when it answers `false`.
     pub fn epoch(
         &mut self,
-        sequences: &Windows,
-        validation: &Windows,
+        sequences: &SequenceDataset,
+        validation: &SequenceDataset,
         each: &mut dyn FnMut(usize) -> bool,
     ) -> Result<EpochEnd, EnsembleError> {
-        let rate = schedule(&self.curve).unwrap_or(RATE);
+        let rate = schedule(&self.curve).unwrap_or(LEARNING_RATE);
         let mut order: Vec<usize> = (0..sequences.len()).collect();
         let name = format!("order of member {}", self.index);
         order.shuffle(&mut stream(self.options.seed, &name, self.curve.len() as u64));
@@ -87,7 +87,7 @@ impl<'a> Member<'a> {
         let (mut sum, mut count) = (0.0, 0.0);
         for chosen in order.chunks(size) {
             let batch = sequences.batch(chosen);
-            let (nll, gradients) = self.network.learn(&batch);
+            let (nll, gradients) = self.network.loss_and_gradients(&batch);
             self.network = self.optimizer.step(rate, self.network.clone(), gradients);
             sum += f64::from(nll) * batch.counted();
             count += batch.counted();
@@ -119,7 +119,7 @@ impl<'a> Member<'a> {
     }
 
     /// Mean negative log-likelihood over `windows`.
-    fn nll(&self, windows: &Windows) -> f64 {
+    fn nll(&self, windows: &SequenceDataset) -> f64 {
         let network = self.network.valid();
         let order: Vec<usize> = (0..windows.len()).collect();
         let (mut sum, mut count) = (0.0, 0.0);
@@ -133,7 +133,7 @@ impl<'a> Member<'a> {
 }
 
 /// Whether the training of a member with this `curve` is over.
-pub fn finished(curve: &[Epoch], options: &Options) -> bool {
+pub fn finished(curve: &[Epoch], options: &TrainingOptions) -> bool {
     curve.len() >= options.epochs || schedule(curve).is_none()
 }
 
@@ -141,13 +141,13 @@ pub fn finished(curve: &[Epoch], options: &Options) -> bool {
 fn schedule(curve: &[Epoch]) -> Option<f64> {
     let (mut best, mut stale, mut cuts) = (f64::INFINITY, 0, 0);
     for epoch in curve {
-        stale = if epoch.validation_nll < best - BETTER { 0 } else { stale + 1 };
+        stale = if epoch.validation_nll < best - MIN_DELTA { 0 } else { stale + 1 };
         best = best.min(epoch.validation_nll);
         if stale == PATIENCE {
             (stale, cuts) = (0, cuts + 1);
         }
     }
-    (cuts < LAST_CUT).then(|| RATE * CUT.powi(cuts))
+    (cuts < MAX_LR_DECAYS).then(|| LEARNING_RATE * LR_DECAY.powi(cuts))
 }
 
 #[cfg(test)]
@@ -160,9 +160,9 @@ mod tests {
 
     #[test]
     fn rate_falls_when_validation_stays_and_the_fourth_time_training_ends() {
-        assert_eq!(rate(&[3.0, 2.0, 1.0, 0.0, -1.0]), Some(RATE));
-        assert_eq!(rate(&[1.0, 2.0, 2.0, 2.0, 2.0]), Some(RATE * CUT));
-        assert_eq!(rate(&[1.0, 2.0, 2.0, 2.0, 0.0, 2.0]), Some(RATE));
+        assert_eq!(rate(&[3.0, 2.0, 1.0, 0.0, -1.0]), Some(LEARNING_RATE));
+        assert_eq!(rate(&[1.0, 2.0, 2.0, 2.0, 2.0]), Some(LEARNING_RATE * LR_DECAY));
+        assert_eq!(rate(&[1.0, 2.0, 2.0, 2.0, 0.0, 2.0]), Some(LEARNING_RATE));
         assert_eq!(rate(&[1.0; 17]), None);
     }
 }

@@ -68,12 +68,12 @@ impl Network {
     }
 
     /// That and its gradients, of a network on an autodiff device.
-    pub fn learn(&self, batch: &Batch) -> (f32, GradientsParams) {
-        if self.on_cpu() { self.learn_by_hand(batch) } else { self.learn_by_burn(batch) }
+    pub fn loss_and_gradients(&self, batch: &Batch) -> (f32, GradientsParams) {
+        if self.on_cpu() { self.manual_backward(batch) } else { self.autodiff_backward(batch) }
     }
 
     /// The heads are burn's to differentiate, as far back as the encoder's states; from there it is the encoder's own way.
-    fn learn_by_hand(&self, batch: &Batch) -> (f32, GradientsParams) {
+    fn manual_backward(&self, batch: &Batch) -> (f32, GradientsParams) {
         let encoder = self.encoder();
         let tape = encoder.forward(batch);
         let states = Tensor::<2>::from_data(tape.states(), &self.hidden_weight.val().device()).require_grad();
@@ -90,7 +90,7 @@ impl Network {
         (loss.into_scalar(), gradients)
     }
 
-    fn learn_by_burn(&self, batch: &Batch) -> (f32, GradientsParams) {
+    fn autodiff_backward(&self, batch: &Batch) -> (f32, GradientsParams) {
         let loss = nll(self.heads(self.states_by_burn(batch)), batch);
         let gradients = GradientsParams::from_grads(loss.backward(), self);
         (loss.into_scalar(), gradients)
@@ -124,15 +124,15 @@ impl Network {
         let inputs = Tensor::<2>::from_data(batch.inputs(), &device);
         let nothing = Tensor::<2>::zeros([batch.size, units], &device);
         let (mut memory, mut states) = ([nothing.clone(), nothing], Vec::new());
-        for time in 0..batch.time {
-            memory = self.row(inputs.clone().narrow(0, time * batch.size, batch.size), memory);
+        for time in 0..batch.steps {
+            memory = self.lstm_step(inputs.clone().narrow(0, time * batch.size, batch.size), memory);
             states.push(memory[1].clone());
         }
         Tensor::cat(states, 0)
     }
 
     /// Cells and states after one more row, in burn's operations; inputs `[batch, inputs]`, memory two of `[batch, hidden]`.
-    pub fn row(&self, inputs: Tensor<2>, [cell, state]: [Tensor<2>; 2]) -> [Tensor<2>; 2] {
+    pub fn lstm_step(&self, inputs: Tensor<2>, [cell, state]: [Tensor<2>; 2]) -> [Tensor<2>; 2] {
         let [_, units] = cell.dims();
         let gates = inputs.matmul(self.input_weight.val())
             + state.matmul(self.hidden_weight.val())
@@ -154,7 +154,7 @@ fn nll([mean, variance]: [Tensor<2>; 2], batch: &Batch) -> Tensor<1> {
     let column = |data: &[f32]| Tensor::<2>::from_data(TensorData::new(data.to_vec(), [data.len(), 1]), &device);
     let error = column(&batch.torques) - mean;
     let nll = variance.clone().log() * 0.5 + error.powi_scalar(2) / (variance * 2.0);
-    (nll * column(&batch.counts)).sum() / batch.counted() + 0.5 * std::f32::consts::TAU.ln()
+    (nll * column(&batch.mask)).sum() / batch.counted() + 0.5 * std::f32::consts::TAU.ln()
 }
 
 impl Head {
@@ -198,9 +198,9 @@ mod tests {
 
     use super::*;
     use crate::data::tests::log;
-    use crate::data::{Block, DataSet};
-    use crate::train::{Options, Training};
-    use crate::windows::Windows;
+    use crate::data::{Split, DataSet};
+    use crate::train::{TrainingOptions, Training};
+    use crate::windows::SequenceDataset;
 
     const SHAPE: Shape = Shape { inputs: 2, hidden: 8 };
 
@@ -211,15 +211,15 @@ mod tests {
     /// Two sequences, one of them with rows that do not count.
     fn batch() -> Batch {
         let data = DataSet::new(&[("here".to_owned(), log(2000, |_, _| {}))]).expect("a set");
-        let training = Training::new(&data, Options { hidden: 8, ..Options::default() }).expect("options");
-        Windows::sequences(data.runs(Block::Training), &training.description).batch(&[0, 3])
+        let training = Training::new(&data, TrainingOptions { hidden: 8, ..TrainingOptions::default() }).expect("options");
+        SequenceDataset::sequences(data.runs(Split::Training), &training.description).batch(&[0, 3])
     }
 
     /// Holds loss and gradients to those of the encoder by hand, within 10⁻⁵ of the largest of an array or of 1.
     fn check_by_burn(device: &Device) {
         let (by_hand, by_burn, batch) =
             (network(&Device::flex().autodiff()), network(&device.clone().autodiff()), batch());
-        let ((wanted_loss, wanted), (loss, found)) = (by_hand.learn_by_hand(&batch), by_burn.learn_by_burn(&batch));
+        let ((wanted_loss, wanted), (loss, found)) = (by_hand.manual_backward(&batch), by_burn.autodiff_backward(&batch));
         assert!((loss - wanted_loss).abs() < 1e-5, "{loss} for {wanted_loss}");
         for (index, (name, dimensions)) in SHAPE.layout().into_iter().enumerate() {
             let id = ParamId::from(index as u64 + 1);
@@ -254,7 +254,7 @@ mod tests {
     fn gradients_are_the_slopes_of_the_loss() {
         let (device, batch) = (Device::flex().autodiff(), batch());
         let weights = network(&device).weights(SHAPE);
-        let (_, gradients) = network(&device).learn(&batch);
+        let (_, gradients) = network(&device).loss_and_gradients(&batch);
         let network = network(&device);
         let by_hidden: Vec<f32> = gradients
             .get::<2>(network.hidden_weight.id)

@@ -4,10 +4,10 @@
 
 use rayon::prelude::*;
 use twinstep_model::NUM_JOINTS;
-use twinstep_model::lanes::Instructions;
+use twinstep_model::lanes::InstructionSet;
 
 use crate::ensemble::Ensemble;
-use crate::kernel::{Block, Heads, Kernel, PATTERNS, Pair, agreement};
+use crate::kernel::{KernelState, Heads, Kernel, PATTERNS, Pair, agreement};
 #[cfg(target_arch = "x86_64")]
 use crate::wide::{Avx2, Avx512};
 use crate::wide::{Portable, Wide};
@@ -17,47 +17,47 @@ const BLOCKS_A_THREAD: usize = 8;
 
 /// Where a member keeps a robot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Place {
+pub struct MemberSlot {
     pub member: usize,
     pub slot: usize,
 }
 
 /// Members below one seam: which registers run is chosen when they are made.
-pub trait Networks: Send {
+pub trait MemberBatch: Send {
     /// Gives a member room for so many robots, from states of zero; what it has stays.
     fn grow(&mut self, member: usize, slots: usize);
     /// The next row of a robot's joints, ξ normalised; `asked` if an answer is wanted.
-    fn hear(&mut self, place: Place, errors: &[[f32; 2]; NUM_JOINTS], asked: bool);
+    fn push_input(&mut self, place: MemberSlot, errors: &[[f32; 2]; NUM_JOINTS], asked: bool);
     /// Advances every robot that was heard of, and answers for those that are asked, on the threads of the pool that this
     /// is called in; outside of one on this thread.
     fn advance(&mut self, heads: Heads);
     /// Lets every member answer for all its robots, as they are.
-    fn answer_all(&mut self);
+    fn evaluate_all(&mut self);
     /// The last answer for a robot: means, variances, normalised.
-    fn answer(&self, place: Place) -> [[f32; NUM_JOINTS]; 2];
+    fn output(&self, place: MemberSlot) -> [[f32; NUM_JOINTS]; 2];
     /// The mean over the first robots' joints of how much all members' last answers disagree; every member has every robot
     /// in the same slot. Variances are multiplied by `variance_scale`.
     fn disagreement(&self, variance_scale: f32, found: &mut [f32]);
     /// Everything that a member remembers of a robot.
-    fn memory(&self, place: Place) -> Vec<f32>;
+    fn state(&self, place: MemberSlot) -> Vec<f32>;
     /// Puts that back.
-    fn set_memory(&mut self, place: Place, memory: &[f32]);
+    fn set_state(&mut self, place: MemberSlot, memory: &[f32]);
     /// A robot whose past is unseen.
-    fn forget(&mut self, place: Place);
+    fn reset_state(&mut self, place: MemberSlot);
 }
 
 /// The members of `ensemble` without a robot.
 ///
 /// # Panics
 /// If the processor lacks `instructions`.
-pub fn networks(ensemble: &Ensemble, instructions: Instructions) -> Box<dyn Networks> {
-    assert!(Instructions::available().contains(&instructions), "this processor has no {instructions:?}");
+pub fn networks(ensemble: &Ensemble, instructions: InstructionSet) -> Box<dyn MemberBatch> {
+    assert!(InstructionSet::available().contains(&instructions), "this processor has no {instructions:?}");
     match instructions {
         #[cfg(target_arch = "x86_64")]
-        Instructions::Avx512 => Box::new(Members::<Avx512>::new(ensemble, run_avx512, agree_avx512)),
+        InstructionSet::Avx512 => Box::new(Members::<Avx512>::new(ensemble, run_avx512, agree_avx512)),
         // AVX2 without fused operations is too rare for a path of its own.
         #[cfg(target_arch = "x86_64")]
-        Instructions::Avx2 if is_x86_feature_detected!("fma") => {
+        InstructionSet::Avx2 if is_x86_feature_detected!("fma") => {
             Box::new(Members::<Avx2>::new(ensemble, run_avx2, agree_avx2))
         }
         _ => Box::new(Members::<Portable>::new(ensemble, run, agreement)),
@@ -65,7 +65,7 @@ pub fn networks(ensemble: &Ensemble, instructions: Instructions) -> Box<dyn Netw
 }
 
 /// Runs a block of a pattern; the last argument is room for its gates.
-type Run<W> = fn(&Kernel<W>, &mut Block<W>, usize, Work, &mut [[Pair<W>; 4]]);
+type RunBlockFn<W> = fn(&Kernel<W>, &mut KernelState<W>, usize, Work, &mut [[Pair<W>; 4]]);
 type Agree<W> = fn(&mut [[W; 2]], f32) -> W;
 
 /// What is to be done with a block.
@@ -77,15 +77,15 @@ struct Work {
 
 struct Members<W> {
     hidden: usize,
-    members: Vec<(Kernel<W>, Vec<Block<W>>)>,
-    run: Run<W>,
+    members: Vec<(Kernel<W>, Vec<KernelState<W>>)>,
+    run: RunBlockFn<W>,
     agree: Agree<W>,
 }
 
 impl<W: Wide> Members<W> {
     const LANES: usize = 2 * W::LANES;
 
-    fn new(ensemble: &Ensemble, run: Run<W>, agree: Agree<W>) -> Self {
+    fn new(ensemble: &Ensemble, run: RunBlockFn<W>, agree: Agree<W>) -> Self {
         let model = &ensemble.description;
         let members = ensemble.members.iter().map(|weights| (Kernel::new(model, weights), Vec::new()));
         Self { hidden: model.hidden, members: members.collect(), run, agree }
@@ -98,10 +98,10 @@ impl<W: Wide> Members<W> {
     }
 
     /// Runs the blocks for which there is work.
-    fn work(&mut self, work: impl Fn(&Block<W>) -> Option<Work>) {
+    fn work(&mut self, work: impl Fn(&KernelState<W>) -> Option<Work>) {
         let Self { hidden, members, run, .. } = self;
         let run = |room: &mut Vec<[Pair<W>; 4]>,
-                   (kernel, pattern, block, work): (&Kernel<W>, usize, &mut Block<W>, Work)| {
+                   (kernel, pattern, block, work): (&Kernel<W>, usize, &mut KernelState<W>, Work)| {
             run(kernel, block, pattern, work, room);
         };
         let blocks = members.iter_mut().flat_map(|(kernel, blocks)| {
@@ -122,44 +122,44 @@ impl<W: Wide> Members<W> {
     }
 }
 
-impl<W: Wide> Networks for Members<W> {
+impl<W: Wide> MemberBatch for Members<W> {
     fn grow(&mut self, member: usize, slots: usize) {
         let (_, blocks) = &mut self.members[member];
         let wanted = (slots * NUM_JOINTS).div_ceil(Self::LANES).max(blocks.len());
-        blocks.resize(wanted, Block::new(self.hidden));
+        blocks.resize(wanted, KernelState::new(self.hidden));
     }
 
-    fn hear(&mut self, place: Place, errors: &[[f32; 2]; NUM_JOINTS], asked: bool) {
+    fn push_input(&mut self, place: MemberSlot, errors: &[[f32; 2]; NUM_JOINTS], asked: bool) {
         let (_, blocks) = &mut self.members[place.member];
         for ([block, half, lane], errors) in Self::lanes(place.slot).zip(errors) {
             let block = &mut blocks[block];
             for (entry, error) in errors.iter().enumerate() {
-                block.heard[entry][half].set(lane, *error);
+                block.input[entry][half].set(lane, *error);
             }
             block.active[half].set(lane, 1.0);
-            block.awake = true;
-            block.asked |= asked;
+            block.has_input = true;
+            block.output_needed |= asked;
         }
     }
 
     fn advance(&mut self, heads: Heads) {
         self.work(|block| {
-            block.awake.then_some(Work { advance: true, heads: if block.asked { Some(heads) } else { None } })
+            block.has_input.then_some(Work { advance: true, heads: if block.output_needed { Some(heads) } else { None } })
         });
-        for block in self.members.iter_mut().flat_map(|(_, blocks)| blocks).filter(|block| block.awake) {
-            (block.awake, block.asked, block.active) = (false, false, [W::splat(0.0); 2]);
+        for block in self.members.iter_mut().flat_map(|(_, blocks)| blocks).filter(|block| block.has_input) {
+            (block.has_input, block.output_needed, block.active) = (false, false, [W::splat(0.0); 2]);
         }
     }
 
-    fn answer_all(&mut self) {
+    fn evaluate_all(&mut self) {
         self.work(|_| Some(Work { advance: false, heads: Some(Heads::Both) }));
     }
 
-    fn answer(&self, place: Place) -> [[f32; NUM_JOINTS]; 2] {
+    fn output(&self, place: MemberSlot) -> [[f32; NUM_JOINTS]; 2] {
         let (_, blocks) = &self.members[place.member];
         let mut answer = [[0.0; NUM_JOINTS]; 2];
         for (joint, [block, half, lane]) in Self::lanes(place.slot).enumerate() {
-            for (given, answer) in blocks[block].answer.iter().zip(&mut answer) {
+            for (given, answer) in blocks[block].output.iter().zip(&mut answer) {
                 answer[joint] = given[half].get(lane);
             }
         }
@@ -173,7 +173,7 @@ impl<W: Wide> Networks for Members<W> {
         for block in 0..(found.len() * NUM_JOINTS).div_ceil(Self::LANES) {
             for half in 0..2 {
                 answers.clear();
-                answers.extend(self.members.iter().map(|(_, blocks)| blocks[block].answer.map(|answer| answer[half])));
+                answers.extend(self.members.iter().map(|(_, blocks)| blocks[block].output.map(|answer| answer[half])));
                 let agreement = (self.agree)(&mut answers, variance_scale);
                 let first = block * Self::LANES + half * W::LANES;
                 for lane in 0..W::LANES {
@@ -188,35 +188,35 @@ impl<W: Wide> Networks for Members<W> {
         }
     }
 
-    fn memory(&self, place: Place) -> Vec<f32> {
+    fn state(&self, place: MemberSlot) -> Vec<f32> {
         let (_, blocks) = &self.members[place.member];
         let mut memory = Vec::with_capacity(2 * (1 + self.hidden) * NUM_JOINTS);
         for [block, half, lane] in Self::lanes(place.slot) {
-            let Block { heard, cells, .. } = &blocks[block];
+            let KernelState { input: heard, cells, .. } = &blocks[block];
             memory.extend(heard.iter().chain(cells).map(|pair| pair[half].get(lane)));
         }
         memory
     }
 
-    fn set_memory(&mut self, place: Place, memory: &[f32]) {
+    fn set_state(&mut self, place: MemberSlot, memory: &[f32]) {
         let (_, blocks) = &mut self.members[place.member];
         let mut memory = memory.iter();
         for [block, half, lane] in Self::lanes(place.slot) {
-            let Block { heard, cells, .. } = &mut blocks[block];
+            let KernelState { input: heard, cells, .. } = &mut blocks[block];
             for (pair, value) in heard.iter_mut().chain(cells).zip(&mut memory) {
                 pair[half].set(lane, *value);
             }
         }
     }
 
-    fn forget(&mut self, place: Place) {
+    fn reset_state(&mut self, place: MemberSlot) {
         let nothing = vec![0.0; 2 * (1 + self.hidden) * NUM_JOINTS];
-        self.set_memory(place, &nothing);
+        self.set_state(place, &nothing);
     }
 }
 
 #[inline(always)]
-fn run<W: Wide>(kernel: &Kernel<W>, block: &mut Block<W>, pattern: usize, work: Work, room: &mut [[Pair<W>; 4]]) {
+fn run<W: Wide>(kernel: &Kernel<W>, block: &mut KernelState<W>, pattern: usize, work: Work, room: &mut [[Pair<W>; 4]]) {
     if work.advance {
         kernel.advance(block, pattern, room);
     }

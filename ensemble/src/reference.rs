@@ -11,7 +11,7 @@ pub struct BurnInference {
     members: Vec<(Network, [Tensor<2>; 2])>,
     one_hot: Vec<Option<usize>>,
     inputs: usize,
-    scales: crate::Scales,
+    scales: crate::Normalisers,
 }
 
 impl BurnInference {
@@ -25,7 +25,7 @@ impl BurnInference {
         };
         Self {
             members: ensemble.members.iter().map(member).collect(),
-            one_hot: (0..NUM_JOINTS).map(|joint| model.input_of(joint)).collect(),
+            one_hot: (0..NUM_JOINTS).map(|joint| model.one_hot_index(joint)).collect(),
             inputs: shape.inputs,
             scales: model.scales,
         }
@@ -45,7 +45,7 @@ impl BurnInference {
         }
         let inputs = Tensor::<2>::from_data(TensorData::new(inputs, [rows, self.inputs]), &Device::flex());
         let answer = |(network, memory): &mut (Network, [Tensor<2>; 2])| {
-            *memory = network.row(inputs.clone(), memory.clone());
+            *memory = network.lstm_step(inputs.clone(), memory.clone());
             network.heads(memory[1].clone()).map(|tensor| tensor.into_data().try_into_vec().expect("outputs are f32"))
         };
         self.members.iter_mut().map(answer).collect()

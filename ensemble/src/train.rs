@@ -12,40 +12,40 @@ use serde::{Deserialize, Serialize};
 use crate::EnsembleError;
 use crate::calibration::variance_scale;
 use crate::checkpoint::{Checkpoint, MemberState};
-use crate::data::{Block, DataSet};
-use crate::ensemble::{Description, Ensemble, JointInput};
+use crate::data::{Split, DataSet};
+use crate::ensemble::{EnsembleMetadata, Ensemble, JointEncoding};
 use crate::gpu;
-use crate::member::{EpochEnd, Member, finished};
-use crate::scales::Scales;
-use crate::windows::Windows;
+use crate::member::{EpochEnd, MemberTrainer, finished};
+use crate::scales::Normalisers;
+use crate::windows::SequenceDataset;
 
 /// How often the caller is asked whether to go on.
-const PULSE: Duration = Duration::from_millis(100);
+const TICK: Duration = Duration::from_millis(100);
 
 /// How an ensemble is trained.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Options {
+pub struct TrainingOptions {
     /// Number of networks.
     pub members: usize,
     /// Units of each encoder.
     pub hidden: usize,
     /// What a network is told of the joint.
-    pub joint_input: JointInput,
+    pub joint_input: JointEncoding,
     /// Most passes over the data.
     pub epochs: usize,
     /// Seed of first weights and order of data: equal seeds give equal ensembles, whatever the number of threads.
     pub seed: u64,
 }
 
-impl Default for Options {
+impl Default for TrainingOptions {
     /// Six members as in U2E.
     fn default() -> Self {
-        Self { members: 6, hidden: 32, joint_input: JointInput::Pooled, epochs: 100, seed: 0 }
+        Self { members: 6, hidden: 32, joint_input: JointEncoding::Pooled, epochs: 100, seed: 0 }
     }
 }
 
-impl Options {
+impl TrainingOptions {
     fn check(&self) -> Result<(), EnsembleError> {
         for (option, given, most) in
             [("members", self.members, 100), ("hidden", self.hidden, 512), ("epochs", self.epochs, 100_000)]
@@ -68,7 +68,7 @@ pub struct Epoch {
 }
 
 /// How far a training is.
-pub enum Progress<'a> {
+pub enum TrainingEvent<'a> {
     /// Sequences that members have learnt from since the last time.
     Sequences(usize),
     /// A member has ended an epoch, which is the last of its `curve`.
@@ -83,31 +83,31 @@ pub enum Progress<'a> {
         checkpoint: &'a Checkpoint,
     },
     /// A tenth of a second has passed without news.
-    Nothing,
+    Tick,
 }
 
 /// How a training ended.
 #[derive(Debug)]
-pub enum Outcome {
+pub enum TrainingResult {
     /// All members are trained; the epochs of each.
     Trained(Box<Ensemble>, Vec<Vec<Epoch>>),
     /// The caller ended it; from here it can go on.
-    Ended(Checkpoint),
+    Interrupted(Checkpoint),
 }
 
 /// Data and settings of a training.
 pub struct Training<'a> {
     data: &'a DataSet,
-    options: Options,
+    options: TrainingOptions,
     /// Of the ensemble, before variances are scaled.
-    pub(crate) description: Description,
-    sequences: Windows,
-    validation: Windows,
+    pub(crate) description: EnsembleMetadata,
+    sequences: SequenceDataset,
+    validation: SequenceDataset,
     device: Device,
 }
 
 /// News from a thread.
-enum News {
+enum WorkerMessage {
     Sequences(usize),
     Epoch(usize, Box<MemberState>),
     Failed(EnsembleError),
@@ -115,15 +115,15 @@ enum News {
 
 impl<'a> Training<'a> {
     /// Fails if a setting is out of range.
-    pub fn new(data: &'a DataSet, options: Options) -> Result<Self, EnsembleError> {
+    pub fn new(data: &'a DataSet, options: TrainingOptions) -> Result<Self, EnsembleError> {
         options.check()?;
-        let description = Description {
+        let description = EnsembleMetadata {
             members: options.members,
             hidden: options.hidden,
             dt: data.dt,
             joints: data.joints.clone(),
             joint_input: options.joint_input,
-            scales: Scales::of(data),
+            scales: Normalisers::of(data),
             tau_sensor: data.tau_sensor,
             gains: data.gains.clone(),
             variance_scale: 1.0,
@@ -131,8 +131,8 @@ impl<'a> Training<'a> {
             seed: options.seed,
         };
         description.check()?;
-        let sequences = Windows::sequences(data.runs(Block::Training), &description);
-        let validation = Windows::sequences(data.runs(Block::Validation), &description);
+        let sequences = SequenceDataset::sequences(data.runs(Split::Training), &description);
+        let validation = SequenceDataset::sequences(data.runs(Split::Validation), &description);
         Ok(Self { data, options, description, sequences, validation, device: Device::flex() })
     }
 
@@ -157,8 +157,8 @@ impl<'a> Training<'a> {
         &self,
         threads: usize,
         resume: Option<Checkpoint>,
-        progress: &mut dyn FnMut(Progress) -> bool,
-    ) -> Result<Outcome, EnsembleError> {
+        progress: &mut dyn FnMut(TrainingEvent) -> bool,
+    ) -> Result<TrainingResult, EnsembleError> {
         let mut checkpoint = match resume {
             Some(saved) => saved.of(&self.options, &self.description.data_hash)?,
             None => Checkpoint::new(self.options.clone(), &self.description),
@@ -178,19 +178,19 @@ impl<'a> Training<'a> {
             drop(sender);
             let mut failure = None;
             loop {
-                let go_on = match news.recv_timeout(PULSE) {
-                    Ok(News::Sequences(count)) => progress(Progress::Sequences(count)),
-                    Ok(News::Epoch(member, state)) => {
+                let go_on = match news.recv_timeout(TICK) {
+                    Ok(WorkerMessage::Sequences(count)) => progress(TrainingEvent::Sequences(count)),
+                    Ok(WorkerMessage::Epoch(member, state)) => {
                         checkpoint.members[member] = *state;
                         let state = &checkpoint.members[member];
                         let (done, curve) = (done(state), &state.curve);
-                        progress(Progress::Epoch { member, done, curve, checkpoint: &checkpoint })
+                        progress(TrainingEvent::Epoch { member, done, curve, checkpoint: &checkpoint })
                     }
-                    Ok(News::Failed(error)) => {
+                    Ok(WorkerMessage::Failed(error)) => {
                         failure.get_or_insert(error);
                         false
                     }
-                    Err(RecvTimeoutError::Timeout) => progress(Progress::Nothing),
+                    Err(RecvTimeoutError::Timeout) => progress(TrainingEvent::Tick),
                     Err(RecvTimeoutError::Disconnected) => break,
                 };
                 if !go_on {
@@ -200,23 +200,23 @@ impl<'a> Training<'a> {
             failure.map_or(Ok(()), Err)
         })?;
         if !checkpoint.members.iter().all(done) {
-            return Ok(Outcome::Ended(checkpoint));
+            return Ok(TrainingResult::Interrupted(checkpoint));
         }
         let (weights, curves) = checkpoint.members.into_iter().map(|member| (member.best, member.curve)).unzip();
         let mut ensemble = Ensemble { description: self.description.clone(), members: weights };
         ensemble.description.variance_scale = variance_scale(&ensemble, self.data);
-        Ok(Outcome::Trained(Box::new(ensemble), curves))
+        Ok(TrainingResult::Trained(Box::new(ensemble), curves))
     }
 
     /// Trains one waiting member after another.
-    fn work(&self, waiting: &Mutex<VecDeque<(usize, MemberState)>>, stop: &AtomicBool, sender: Sender<News>) {
+    fn work(&self, waiting: &Mutex<VecDeque<(usize, MemberState)>>, stop: &AtomicBool, sender: Sender<WorkerMessage>) {
         let next = || waiting.lock().ok()?.pop_front().filter(|_| !stop.load(Ordering::Relaxed));
         // Nobody listens once the caller's thread has panicked.
         let tell = |news| sender.send(news).is_ok();
         while let Some((index, state)) = next() {
             let trained = self.member(index, state, stop, &tell);
             if let Err(error) = trained {
-                tell(News::Failed(error));
+                tell(WorkerMessage::Failed(error));
                 return;
             }
         }
@@ -228,14 +228,14 @@ impl<'a> Training<'a> {
         index: usize,
         state: MemberState,
         stop: &AtomicBool,
-        tell: &dyn Fn(News) -> bool,
+        tell: &dyn Fn(WorkerMessage) -> bool,
     ) -> Result<(), EnsembleError> {
-        let mut member = Member::new(index, &self.options, self.description.shape(), state, &self.device)?;
-        let mut each = |sequences| tell(News::Sequences(sequences)) && !stop.load(Ordering::Relaxed);
+        let mut member = MemberTrainer::new(index, &self.options, self.description.shape(), state, &self.device)?;
+        let mut each = |sequences| tell(WorkerMessage::Sequences(sequences)) && !stop.load(Ordering::Relaxed);
         while let EpochEnd::Done = member.epoch(&self.sequences, &self.validation, &mut each)? {
             let state = member.state()?;
             let done = finished(&state.curve, &self.options);
-            if !tell(News::Epoch(index, Box::new(state))) || done {
+            if !tell(WorkerMessage::Epoch(index, Box::new(state))) || done {
                 break;
             }
         }
@@ -253,14 +253,14 @@ mod tests {
         DataSet::new(&[("here".to_owned(), log(4000, |_, _| {}))]).expect("a set")
     }
 
-    fn options(epochs: usize) -> Options {
-        Options { members: 2, hidden: 8, epochs, seed: 1, ..Options::default() }
+    fn options(epochs: usize) -> TrainingOptions {
+        TrainingOptions { members: 2, hidden: 8, epochs, seed: 1, ..TrainingOptions::default() }
     }
 
-    fn trained(outcome: Outcome) -> (Ensemble, Vec<Vec<Epoch>>) {
+    fn trained(outcome: TrainingResult) -> (Ensemble, Vec<Vec<Epoch>>) {
         match outcome {
-            Outcome::Trained(ensemble, curves) => (*ensemble, curves),
-            Outcome::Ended(_) => panic!("it had no reason to end"),
+            TrainingResult::Trained(ensemble, curves) => (*ensemble, curves),
+            TrainingResult::Interrupted(_) => panic!("it had no reason to end"),
         }
     }
 
@@ -271,9 +271,9 @@ mod tests {
             trained(Training::new(&data, options(60)).and_then(|t| t.run(2, None, &mut |_| true)).expect("trains"));
         let found = Calibration::of(&ensemble, &data);
         assert!(found.rmse < 1.3 * NOISE, "{} N·m", found.rmse);
-        let [_, ninety, _] = found.mixture[1].shares;
+        let [_, ninety, _] = found.mixture[1].empirical;
         assert!((0.85..=0.95).contains(&ninety), "{ninety} of the truth in the 90 % interval");
-        assert!((0.8..1.3).contains(&(found.deviation / NOISE)), "{} N·m", found.deviation);
+        assert!((0.8..1.3).contains(&(found.sharpness / NOISE)), "{} N·m", found.sharpness);
         assert!(curves.iter().all(|curve| curve[curve.len() - 1].validation_nll < curve[0].validation_nll));
     }
 
@@ -284,10 +284,10 @@ mod tests {
         let whole = trained(training.run(1, None, &mut |_| true).expect("trains"));
         let mut epochs = 0;
         let ended = training.run(2, None, &mut |progress| {
-            epochs += usize::from(matches!(progress, Progress::Epoch { .. }));
+            epochs += usize::from(matches!(progress, TrainingEvent::Epoch { .. }));
             epochs < 3
         });
-        let Ok(Outcome::Ended(checkpoint)) = ended else { panic!("it was told to end") };
+        let Ok(TrainingResult::Interrupted(checkpoint)) = ended else { panic!("it was told to end") };
         let path = folder.path().join("training");
         checkpoint.write(&path).expect("written");
         let read = || Checkpoint::read(&path).expect("read");
@@ -297,7 +297,7 @@ mod tests {
             let training = Training::new(&data, options).expect("options");
             training.run(1, Some(read()), &mut |_| true).expect_err("refused").to_string()
         };
-        assert!(other(Options { seed: 2, ..options(4) }).contains("other settings"));
+        assert!(other(TrainingOptions { seed: 2, ..options(4) }).contains("other settings"));
     }
 
     #[cfg(feature = "gpu")]
@@ -322,7 +322,7 @@ mod tests {
         close(curves(&on_gpu, None));
         for [first, second] in [[&on_cpu, &on_gpu], [&on_gpu, &on_cpu]] {
             let ended = first.run(1, None, &mut |progress| !matches!(progress, Progress::Epoch { .. }));
-            let Ok(Outcome::Ended(checkpoint)) = ended else { panic!("it was told to end") };
+            let Ok(TrainingResult::Interrupted(checkpoint)) = ended else { panic!("it was told to end") };
             close(curves(second, Some(checkpoint)));
         }
     }
@@ -340,19 +340,19 @@ mod tests {
         });
         let data = DataSet::new(&[("here".to_owned(), strong)]).expect("a set");
         let rmse = |joint_input| {
-            let training = Training::new(&data, Options { joint_input, ..options(15) }).expect("options");
+            let training = Training::new(&data, TrainingOptions { joint_input, ..options(15) }).expect("options");
             Calibration::of(&trained(training.run(2, None, &mut |_| true).expect("trains")).0, &data).rmse
         };
-        let [pooled, told] = [JointInput::Pooled, JointInput::Identity].map(rmse);
+        let [pooled, told] = [JointEncoding::Pooled, JointEncoding::Identity].map(rmse);
         assert!(told < 0.5 * pooled, "{told} N·m, pooled {pooled} N·m");
-        let of_a_kind = Training::new(&data, Options { joint_input: JointInput::Kind, ..options(15) });
+        let of_a_kind = Training::new(&data, TrainingOptions { joint_input: JointEncoding::Kind, ..options(15) });
         let error = of_a_kind.map(|_| ()).expect_err("refused").to_string();
         assert!(error.starts_with("joint `knee` is no hip, thigh or calf of a Go2"), "{error}");
     }
 
     #[test]
     fn setting_out_of_range_is_named() {
-        let error = Training::new(&data(), Options { members: 0, ..options(4) }).map(|_| ()).expect_err("refused");
+        let error = Training::new(&data(), TrainingOptions { members: 0, ..options(4) }).map(|_| ()).expect_err("refused");
         assert_eq!(error.to_string(), "`members` = 0 is outside 1..=100");
     }
 }

@@ -2,21 +2,21 @@
 
 use burn::tensor::TensorData;
 
-use crate::data::Run;
-use crate::ensemble::Description;
+use crate::data::Sequence;
+use crate::ensemble::EnsembleMetadata;
 
 /// Rows of a sequence in training: a third of a second at 200 Hz, ten times a drive's memory.
 pub const SEQUENCE_ROWS: usize = 64;
 /// Rows after an unseen past: the encoder hears them, but they do not count.
-pub const WARM_UP_ROWS: usize = 14;
+pub const BURN_IN_ROWS: usize = 14;
 
 /// Sequences of normalised rows.
-pub struct Windows {
+pub struct SequenceDataset {
     inputs: usize,
     /// Rows of a sequence.
     time: usize,
     runs: Vec<NormalisedRun>,
-    windows: Vec<Window>,
+    windows: Vec<SequenceSlice>,
 }
 
 struct NormalisedRun {
@@ -28,10 +28,10 @@ struct NormalisedRun {
 }
 
 /// A sequence: rows of a run from `start`, of which those from `counted` on count.
-struct Window {
+struct SequenceSlice {
     run: usize,
     start: usize,
-    counted: usize,
+    first_counted: usize,
 }
 
 /// Sequences side by side, time by time; rows beyond a run's end are zero, and do not count.
@@ -39,7 +39,7 @@ pub struct Batch {
     /// Sequences.
     pub size: usize,
     /// Rows of a sequence.
-    pub time: usize,
+    pub steps: usize,
     /// Entries of an input.
     inputs: usize,
     /// `[time, batch, inputs]`.
@@ -47,22 +47,22 @@ pub struct Batch {
     /// `[time, batch]`.
     pub torques: Vec<f32>,
     /// One where a row counts, `[time, batch]`.
-    pub counts: Vec<f32>,
+    pub mask: Vec<f32>,
 }
 
-impl Windows {
+impl SequenceDataset {
     /// Training sequences of `runs`, in which every row counts once unless its past is unseen.
-    pub fn sequences<'a>(runs: impl Iterator<Item = &'a Run>, model: &Description) -> Self {
+    pub fn sequences<'a>(runs: impl Iterator<Item = &'a Sequence>, model: &EnsembleMetadata) -> Self {
         Self::new(runs, model, SEQUENCE_ROWS)
     }
 
     /// `runs` as they are, each one sequence.
-    pub fn whole<'a>(runs: impl Iterator<Item = &'a Run> + Clone, model: &Description) -> Self {
+    pub fn whole<'a>(runs: impl Iterator<Item = &'a Sequence> + Clone, model: &EnsembleMetadata) -> Self {
         let longest = runs.clone().map(|run| run.torques.len()).max().unwrap_or(1);
         Self::new(runs, model, longest)
     }
 
-    fn new<'a>(runs: impl Iterator<Item = &'a Run>, model: &Description, time: usize) -> Self {
+    fn new<'a>(runs: impl Iterator<Item = &'a Sequence>, model: &EnsembleMetadata, time: usize) -> Self {
         let scales = &model.scales;
         let mut all = Self { inputs: model.shape().inputs, time, runs: Vec::new(), windows: Vec::new() };
         for (index, run) in runs.enumerate() {
@@ -73,10 +73,10 @@ impl Windows {
                 one_hot: model.one_hot(run.joint),
             });
             let rows = run.torques.len();
-            let mut counted = if run.starts_part { 0 } else { WARM_UP_ROWS };
+            let mut counted = if run.after_reset { 0 } else { BURN_IN_ROWS };
             while counted < rows {
-                let start = counted.saturating_sub(WARM_UP_ROWS);
-                all.windows.push(Window { run: index, start, counted });
+                let start = counted.saturating_sub(BURN_IN_ROWS);
+                all.windows.push(SequenceSlice { run: index, start, first_counted: counted });
                 counted = start + time;
             }
         }
@@ -93,11 +93,11 @@ impl Windows {
         let (size, time, inputs) = (chosen.len(), self.time, self.inputs);
         let mut batch = Batch {
             size,
-            time,
+            steps: time,
             inputs,
             data: vec![0.0; time * size * inputs],
             torques: vec![0.0; time * size],
-            counts: vec![0.0; time * size],
+            mask: vec![0.0; time * size],
         };
         for (column, window) in chosen.iter().map(|index| &self.windows[*index]).enumerate() {
             let run = &self.runs[window.run];
@@ -109,7 +109,7 @@ impl Windows {
                     input[2 + joint] = 1.0;
                 }
                 batch.torques[place] = run.torques[row];
-                batch.counts[place] = f32::from(u8::from(row >= window.counted));
+                batch.mask[place] = f32::from(u8::from(row >= window.first_counted));
             }
         }
         batch
@@ -117,7 +117,7 @@ impl Windows {
 
     /// The run of a sequence, and the row of that run which `time` in the sequence is, if it counts.
     pub fn place(&self, window: usize, time: usize) -> Option<(usize, usize)> {
-        let Window { run, start, counted } = self.windows[window];
+        let SequenceSlice { run, start, first_counted: counted } = self.windows[window];
         let row = start + time;
         (row >= counted && row < self.runs[run].torques.len()).then_some((run, row))
     }
@@ -126,11 +126,11 @@ impl Windows {
 impl Batch {
     /// How many rows count.
     pub fn counted(&self) -> f64 {
-        self.counts.iter().map(|count| f64::from(*count)).sum()
+        self.mask.iter().map(|count| f64::from(*count)).sum()
     }
 
     /// Inputs of every row, `[time · batch, inputs]`.
     pub fn inputs(&self) -> TensorData {
-        TensorData::new(self.data.clone(), [self.time * self.size, self.inputs])
+        TensorData::new(self.data.clone(), [self.steps * self.size, self.inputs])
     }
 }

@@ -16,5 +16,5 @@ mod server;
 mod worker;
 
 pub use config::{Config, ConfigFileError, ServerConfig};
-pub use host::{Host, HostError, SimHost};
+pub use host::{EnvFactory, EnvFactoryError, SimEnvFactory};
 pub use server::{Server, ServerError};

@@ -17,14 +17,14 @@ use zenoh::query::Queryable;
 use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait};
 
-use crate::desk::{Desk, DeskJob, Facts, accept};
-use crate::worker::Shared;
-use crate::{Host, HostError, ServerConfig};
+use crate::desk::{LeaseManager, LeaseManagerMessage, ServerInfo, dispatch};
+use crate::worker::ServerState;
+use crate::{EnvFactory, EnvFactoryError, ServerConfig};
 
 /// Requests that may wait at the desk.
-const DESK_QUEUE: usize = 1024;
+const LEASE_QUEUE: usize = 1024;
 /// How long clients that ask on are told of the shutdown before the session closes.
-pub const FAREWELL: Duration = Duration::from_millis(200);
+pub const SHUTDOWN_GRACE: Duration = Duration::from_millis(200);
 
 /// A running server.
 pub struct Server {
@@ -32,9 +32,9 @@ pub struct Server {
     session: Session,
     queryable: Queryable<()>,
     token: LivelinessToken,
-    desk: SyncSender<DeskJob>,
+    desk: SyncSender<LeaseManagerMessage>,
     desk_thread: JoinHandle<()>,
-    shared: Arc<Shared>,
+    shared: Arc<ServerState>,
 }
 
 /// Why a server could not start.
@@ -79,7 +79,7 @@ pub enum ServerError {
     },
     /// The environments cannot be built.
     #[error(transparent)]
-    Host(#[from] HostError),
+    Host(#[from] EnvFactoryError),
     /// The system gave no thread.
     #[error("cannot start the desk's thread: {0}")]
     Thread(std::io::Error),
@@ -87,24 +87,24 @@ pub enum ServerError {
 
 impl Server {
     /// Opens Zenoh as `config` says and answers with the environments of `host`.
-    pub fn start(config: &ServerConfig, host: Arc<dyn Host>) -> Result<Self, ServerError> {
+    pub fn start(config: &ServerConfig, host: Arc<dyn EnvFactory>) -> Result<Self, ServerError> {
         // One environment tells the spec, and that the host can build any.
         let spec = host.build(1, AutoresetMode::NextStep, None)?.spec().clone();
         let sid = random_id();
         let session = zenoh::open(zenoh_config(config)?)
             .wait()
             .map_err(|error| ServerError::Open { listen: config.listen.clone(), reason: error.to_string() })?;
-        let (desk, jobs) = sync_channel(DESK_QUEUE);
+        let (desk, jobs) = sync_channel(LEASE_QUEUE);
         let routes = Arc::new(RwLock::new(HashMap::new()));
-        let shared = Arc::new(Shared { shutting_down: AtomicBool::new(false), env_steps: AtomicU64::new(0) });
-        let facts = Facts {
+        let shared = Arc::new(ServerState { shutting_down: AtomicBool::new(false), env_steps: AtomicU64::new(0) });
+        let facts = ServerInfo {
             name: config.name.clone(),
             sid: sid.clone(),
             spec,
             max_envs: config.envs,
             lease_grace: config.lease_grace(),
         };
-        let own = Desk::new(facts, host, Arc::clone(&shared), Arc::clone(&routes), desk.clone());
+        let own = LeaseManager::new(facts, host, Arc::clone(&shared), Arc::clone(&routes), desk.clone());
         let desk_thread = std::thread::Builder::new()
             .name("desk".to_owned())
             .spawn(move || own.run(&jobs))
@@ -115,7 +115,7 @@ impl Server {
             session
                 .declare_queryable(&key)
                 .complete(true)
-                .callback(move |query| accept(query, &sid, &routes, &desk))
+                .callback(move |query| dispatch(query, &sid, &routes, &desk))
                 .wait()
                 .map_err(|error| ServerError::Declare { key, reason: error.to_string() })?
         };
@@ -145,19 +145,19 @@ impl Server {
     }
 
     /// Finishes the steps in progress, tells the clients, and closes the session.
-    pub fn stop(self) {
+    pub fn shutdown(self) {
         self.shared.shutting_down.store(true, Ordering::Release);
         // Clients that watch see the token go; those that ask get `shutting_down`.
         let _ = self.token.undeclare().wait();
-        let _ = self.desk.send(DeskJob::Stop);
-        std::thread::sleep(FAREWELL);
+        let _ = self.desk.send(LeaseManagerMessage::Stop);
+        std::thread::sleep(SHUTDOWN_GRACE);
         let _ = self.queryable.undeclare().wait();
         let _ = self.desk_thread.join();
         let _ = self.session.close().wait();
     }
 }
 
-fn watch_clients(session: &Session, sid: &str, desk: SyncSender<DeskJob>) -> Result<(), ServerError> {
+fn watch_clients(session: &Session, sid: &str, desk: SyncSender<LeaseManagerMessage>) -> Result<(), ServerError> {
     let key = keys::live_clients(sid);
     let own_sid = sid.to_owned();
     session
@@ -167,7 +167,7 @@ fn watch_clients(session: &Session, sid: &str, desk: SyncSender<DeskJob>) -> Res
         .callback(move |sample| {
             if let Some(client) = keys::parse_live_client(sample.key_expr().as_str(), &own_sid) {
                 // Blocks only while a thousand requests wait; losing the news would keep a dead client's environments.
-                let _ = desk.send(DeskJob::Client(client.to_owned(), sample.kind() == SampleKind::Put));
+                let _ = desk.send(LeaseManagerMessage::Client(client.to_owned(), sample.kind() == SampleKind::Put));
             }
         })
         .background()

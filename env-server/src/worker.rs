@@ -10,19 +10,19 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender};
 
 use twinstep_model::{AutoresetMode, EnvError, VecEnv};
-use twinstep_protocol::keys::Verb;
-use twinstep_protocol::{Code, PROTOCOL, WireError, convert, decode, encode, message, tensor};
+use twinstep_protocol::keys::EnvMethod;
+use twinstep_protocol::{ErrorCode, PROTOCOL, ErrorReply, convert, decode, encode, message, tensor};
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
-use crate::Host;
-use crate::desk::DeskJob;
+use crate::EnvFactory;
+use crate::desk::LeaseManagerMessage;
 
 /// What a worker is asked.
-pub enum Job {
+pub enum WorkerRequest {
     /// A query at one of the lease's keys.
-    Env(Verb, Query),
+    Env(EnvMethod, Query),
     /// A request for the lease itself.
     Lease {
         /// The query to answer.
@@ -33,7 +33,7 @@ pub enum Job {
 }
 
 /// What a worker shares with the desk.
-pub struct Shared {
+pub struct ServerState {
     /// Set when the server shuts down: nothing new is executed.
     pub shutting_down: AtomicBool,
     /// Environment steps executed by all workers.
@@ -41,7 +41,7 @@ pub struct Shared {
 }
 
 /// What was granted.
-pub struct Grant {
+pub struct LeaseParams {
     /// The lease's id.
     pub lease: String,
     /// Number of environments.
@@ -54,35 +54,35 @@ pub struct Grant {
 
 /// Owns the environments of one lease.
 pub struct Worker {
-    grant: Grant,
+    grant: LeaseParams,
     env: Box<dyn VecEnv>,
-    shared: Arc<Shared>,
-    desk: SyncSender<DeskJob>,
+    shared: Arc<ServerState>,
+    desk: SyncSender<LeaseManagerMessage>,
     epoch: u64,
     last_seq: u64,
     /// Verb and reply of `last_seq`.
-    last_reply: Option<(Verb, Answer)>,
+    last_reply: Option<(EnvMethod, CachedReply)>,
     actions: Vec<f32>,
     /// Why the environments can no longer be used, once they cannot.
-    broken: Option<String>,
+    failure: Option<String>,
 }
 
 /// An encoded reply, kept for repeats. Cloning shares the bytes.
 #[derive(Clone)]
-enum Answer {
+enum CachedReply {
     Ok(ZBytes),
-    Err(WireError),
+    Err(ErrorReply),
 }
 
 impl Worker {
     /// Builds the environments and answers until the lease is freed. Runs on the worker's own thread.
-    pub fn run(grant: Grant, host: &dyn Host, shared: Arc<Shared>, desk: SyncSender<DeskJob>, jobs: &Receiver<Job>) {
+    pub fn run(grant: LeaseParams, host: &dyn EnvFactory, shared: Arc<ServerState>, desk: SyncSender<LeaseManagerMessage>, jobs: &Receiver<WorkerRequest>) {
         let built = catch_unwind(AssertUnwindSafe(|| {
             host.build(grant.num_envs, grant.autoreset, grant.max_episode_steps).map_err(|error| error.to_string())
         }));
         let env = match built.unwrap_or_else(|panic| Err(panic_text(&panic))) {
             Ok(env) => env,
-            Err(reason) => return refuse_all(jobs, &desk, &grant.lease, &reason),
+            Err(reason) => return reject_all(jobs, &desk, &grant.lease, &reason),
         };
         let mut worker = Self {
             env,
@@ -92,32 +92,32 @@ impl Worker {
             last_seq: 0,
             last_reply: None,
             actions: Vec::new(),
-            broken: None,
+            failure: None,
             grant,
         };
         // Ends when the desk drops the lease, and with it the sender.
         while let Ok(job) = jobs.recv() {
             match job {
-                Job::Env(verb, query) => {
+                WorkerRequest::Env(verb, query) => {
                     let answer = worker.answer(verb, &query);
                     send(&query, answer);
                 }
-                Job::Lease { query, epoch } => {
-                    let answer = worker.hand_over(epoch);
+                WorkerRequest::Lease { query, epoch } => {
+                    let answer = worker.transfer(epoch);
                     send(&query, answer);
                 }
             }
         }
     }
 
-    fn hand_over(&mut self, epoch: u64) -> Answer {
+    fn transfer(&mut self, epoch: u64) -> CachedReply {
         self.epoch = epoch;
-        if let Some(reason) = &self.broken {
+        if let Some(reason) = &self.failure {
             // Nothing can be done with this lease: make room for the next.
-            self.give_back();
-            return Answer::Err(broken(reason));
+            self.request_release();
+            return CachedReply::Err(broken(reason));
         }
-        Answer::Ok(ZBytes::from(encode(&message::LeaseReply {
+        CachedReply::Ok(ZBytes::from(encode(&message::LeaseReply {
             protocol: PROTOCOL,
             lease: self.grant.lease.clone(),
             epoch: self.epoch,
@@ -129,45 +129,45 @@ impl Worker {
     }
 
     /// Asks the desk to free the lease. A full desk only delays it: to the next request, or until the client is gone.
-    fn give_back(&self) {
-        let _ = self.desk.try_send(DeskJob::Closed(self.grant.lease.clone()));
+    fn request_release(&self) {
+        let _ = self.desk.try_send(LeaseManagerMessage::Closed(self.grant.lease.clone()));
     }
 
-    fn answer(&mut self, verb: Verb, query: &Query) -> Answer {
+    fn answer(&mut self, verb: EnvMethod, query: &Query) -> CachedReply {
         let payload = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
-        if verb == Verb::Render {
-            return self.render(&payload).map_or_else(Answer::Err, |bytes| Answer::Ok(ZBytes::from(bytes)));
+        if verb == EnvMethod::Render {
+            return self.render(&payload).map_or_else(CachedReply::Err, |bytes| CachedReply::Ok(ZBytes::from(bytes)));
         }
-        let header = match decode::<message::EnvHeader>(&payload) {
+        let header = match decode::<message::RequestHeader>(&payload) {
             Ok(header) => header,
-            Err(error) => return Answer::Err(error),
+            Err(error) => return CachedReply::Err(error),
         };
         if let Err(error) = self.check_header(&header) {
-            return Answer::Err(error);
+            return CachedReply::Err(error);
         }
         if header.seq == self.last_seq {
             return match &self.last_reply {
                 Some((answered, answer)) if *answered == verb => answer.clone(),
-                _ => Answer::Err(stale_sequence(header.seq, self.last_seq)),
+                _ => CachedReply::Err(stale_sequence(header.seq, self.last_seq)),
             };
         }
         if self.shared.shutting_down.load(Ordering::Acquire) {
-            return Answer::Err(shutting_down());
+            return CachedReply::Err(shutting_down());
         }
-        if let Some(reason) = self.broken.as_ref().filter(|_| verb != Verb::Close) {
-            return Answer::Err(broken(reason));
+        if let Some(reason) = self.failure.as_ref().filter(|_| verb != EnvMethod::Close) {
+            return CachedReply::Err(broken(reason));
         }
         let outcome = catch_unwind(AssertUnwindSafe(|| self.execute(verb, &payload)));
         let answer = match outcome {
-            Ok(Ok(bytes)) => Answer::Ok(ZBytes::from(bytes)),
+            Ok(Ok(bytes)) => CachedReply::Ok(ZBytes::from(bytes)),
             // Refused without effect: the number stays free.
-            Ok(Err(error)) if !error.code.counts_as_executed() => return Answer::Err(error),
-            Ok(Err(error)) => Answer::Err(error),
+            Ok(Err(error)) if !error.code.consumes_seq() => return CachedReply::Err(error),
+            Ok(Err(error)) => CachedReply::Err(error),
             Err(panic) => {
                 let reason = panic_text(&panic);
                 tracing::error!(lease = self.grant.lease, reason, "environments panicked");
-                self.broken = Some(reason.clone());
-                Answer::Err(broken(&reason))
+                self.failure = Some(reason.clone());
+                CachedReply::Err(broken(&reason))
             }
         };
         self.last_seq = header.seq;
@@ -175,22 +175,22 @@ impl Worker {
         answer
     }
 
-    fn check_header(&self, header: &message::EnvHeader) -> Result<(), WireError> {
+    fn check_header(&self, header: &message::RequestHeader) -> Result<(), ErrorReply> {
         self.check_owner(header.protocol, header.epoch)?;
         if header.seq < self.last_seq {
             return Err(stale_sequence(header.seq, self.last_seq));
         }
         if header.seq > self.last_seq + 1 {
             let message = format!("`seq` = {} skips: the last executed is {}", header.seq, self.last_seq);
-            return Err(WireError::new(Code::SequenceGap, "seq", message)
+            return Err(ErrorReply::new(ErrorCode::SequenceGap, "seq", message)
                 .with_hint("send every number once, and repeat it until it is answered"));
         }
         Ok(())
     }
 
-    fn check_owner(&self, protocol: u16, epoch: u64) -> Result<(), WireError> {
+    fn check_owner(&self, protocol: u16, epoch: u64) -> Result<(), ErrorReply> {
         if protocol != PROTOCOL {
-            return Err(WireError::version(protocol));
+            return Err(ErrorReply::version(protocol));
         }
         if epoch != self.epoch {
             return Err(stale_epoch("epoch", epoch, self.epoch));
@@ -198,32 +198,32 @@ impl Worker {
         Ok(())
     }
 
-    fn render(&self, payload: &[u8]) -> Result<Vec<u8>, WireError> {
+    fn render(&self, payload: &[u8]) -> Result<Vec<u8>, ErrorReply> {
         let request: message::RenderRequest = decode(payload)?;
         self.check_owner(request.protocol, request.epoch)?;
         if self.shared.shutting_down.load(Ordering::Acquire) {
             return Err(shutting_down());
         }
-        if let Some(reason) = &self.broken {
+        if let Some(reason) = &self.failure {
             return Err(broken(reason));
         }
         let env = usize::try_from(request.env).unwrap_or(usize::MAX);
         // Nothing was changed, so that the environments are as good after a panic as before.
         let scene = catch_unwind(AssertUnwindSafe(|| self.env.scene(env)))
-            .map_err(|panic| WireError::new(Code::Internal, "", panic_text(&panic)))?;
+            .map_err(|panic| ErrorReply::new(ErrorCode::Internal, "", panic_text(&panic)))?;
         scene.map(convert::encode_scene).map_err(|error| convert::wire_error(&error))
     }
 
-    fn execute(&mut self, verb: Verb, payload: &[u8]) -> Result<Vec<u8>, WireError> {
+    fn execute(&mut self, verb: EnvMethod, payload: &[u8]) -> Result<Vec<u8>, ErrorReply> {
         match verb {
-            Verb::Reset => {
+            EnvMethod::Reset => {
                 let request: message::ResetRequest<'_> = decode(payload)?;
                 let wanted = convert::read_reset(&request)?;
                 let obs = self.env.reset(&wanted).map_err(|error| convert::wire_error(&error))?;
                 let obs = tensor::as_bytes(obs);
                 Ok(encode(&message::ResetReply { protocol: PROTOCOL, seq: request.seq, obs }))
             }
-            Verb::Step => {
+            EnvMethod::Step => {
                 let request: message::StepRequest<'_> = decode(payload)?;
                 let wanted = self.env.num_envs() * self.env.spec().action_len();
                 read_actions(request.actions, wanted, &mut self.actions)?;
@@ -231,24 +231,24 @@ impl Worker {
                 self.shared.env_steps.fetch_add(batch.reward.len() as u64, Ordering::Relaxed);
                 Ok(convert::encode_step(batch, request.seq))
             }
-            Verb::Close => {
+            EnvMethod::Close => {
                 let request: message::CloseRequest = decode(payload)?;
-                self.broken = Some("the client closed it".to_owned());
-                self.give_back();
+                self.failure = Some("the client closed it".to_owned());
+                self.request_release();
                 Ok(encode(&message::CloseReply { protocol: PROTOCOL, seq: request.seq }))
             }
-            Verb::Render => self.render(payload),
+            EnvMethod::Render => self.render(payload),
         }
     }
 }
 
 /// Reads `wanted` actions into `actions`, which a wrong number of them leaves untouched: it keeps the size of the largest.
-fn read_actions(bytes: &[u8], wanted: usize, actions: &mut Vec<f32>) -> Result<(), WireError> {
+fn read_actions(bytes: &[u8], wanted: usize, actions: &mut Vec<f32>) -> Result<(), ErrorReply> {
     convert::check_length("actions", bytes.len() / size_of::<f32>(), wanted)?;
     tensor::read_into(bytes, actions, "actions")
 }
 
-fn logged(error: &EnvError) -> WireError {
+fn logged(error: &EnvError) -> ErrorReply {
     if matches!(error, EnvError::Diverged { .. } | EnvError::Backend(_)) {
         tracing::warn!(%error, "step failed");
     }
@@ -256,20 +256,20 @@ fn logged(error: &EnvError) -> WireError {
 }
 
 /// Answers everything with the reason why the environments could not be built, until the lease is freed.
-fn refuse_all(jobs: &Receiver<Job>, desk: &SyncSender<DeskJob>, lease: &str, reason: &str) {
+fn reject_all(jobs: &Receiver<WorkerRequest>, desk: &SyncSender<LeaseManagerMessage>, lease: &str, reason: &str) {
     tracing::error!(lease, reason, "environments could not be built");
-    let _ = desk.try_send(DeskJob::Closed(lease.to_owned()));
+    let _ = desk.try_send(LeaseManagerMessage::Closed(lease.to_owned()));
     while let Ok(job) = jobs.recv() {
-        let (Job::Env(_, query) | Job::Lease { query, .. }) = job;
+        let (WorkerRequest::Env(_, query) | WorkerRequest::Lease { query, .. }) = job;
         let message = format!("the environments could not be built: {reason}");
-        send(&query, Answer::Err(WireError::new(Code::Internal, "", message)));
+        send(&query, CachedReply::Err(ErrorReply::new(ErrorCode::Internal, "", message)));
     }
 }
 
-fn send(query: &Query, answer: Answer) {
+fn send(query: &Query, answer: CachedReply) {
     match answer {
-        Answer::Ok(bytes) => reply(query, bytes),
-        Answer::Err(error) => reply_error(query, &error),
+        CachedReply::Ok(bytes) => reply(query, bytes),
+        CachedReply::Err(error) => reply_error(query, &error),
     }
 }
 
@@ -281,7 +281,7 @@ pub fn reply(query: &Query, bytes: ZBytes) {
 }
 
 /// Sends an error reply; a client that is gone by now is told nothing.
-pub fn reply_error(query: &Query, error: &WireError) {
+pub fn reply_error(query: &Query, error: &ErrorReply) {
     if let Err(failure) = query.reply_err(encode(error)).wait() {
         tracing::debug!(%failure, key = %query.key_expr(), "error reply not sent");
     }
@@ -292,25 +292,25 @@ fn panic_text(panic: &Box<dyn std::any::Any + Send>) -> String {
     text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "panicked".to_owned())
 }
 
-fn broken(reason: &str) -> WireError {
-    WireError::new(Code::LeaseLost, "lease", format!("the environments of this lease are gone: {reason}"))
+fn broken(reason: &str) -> ErrorReply {
+    ErrorReply::new(ErrorCode::LeaseLost, "lease", format!("the environments of this lease are gone: {reason}"))
         .with_hint("ask for a new lease")
 }
 
 /// The answer to everything while the server shuts down.
-pub fn shutting_down() -> WireError {
-    WireError::new(Code::ShuttingDown, "", "the server is shutting down; nothing was executed")
+pub fn shutting_down() -> ErrorReply {
+    ErrorReply::new(ErrorCode::ShuttingDown, "", "the server is shutting down; nothing was executed")
 }
 
 /// The answer to a request under another epoch than the lease's.
-pub fn stale_epoch(field: &'static str, given: u64, current: u64) -> WireError {
+pub fn stale_epoch(field: &'static str, given: u64, current: u64) -> ErrorReply {
     let message = format!("`{field}` = {given} is not the lease's: it is {current}");
-    WireError::new(Code::StaleEpoch, field, message).with_hint("another client took the lease over, or never had it")
+    ErrorReply::new(ErrorCode::StaleEpoch, field, message).with_hint("another client took the lease over, or never had it")
 }
 
-fn stale_sequence(given: u64, last: u64) -> WireError {
+fn stale_sequence(given: u64, last: u64) -> ErrorReply {
     let message = format!("`seq` = {given} was answered before: the last executed is {last}");
-    WireError::new(Code::StaleSequence, "seq", message)
+    ErrorReply::new(ErrorCode::StaleSequence, "seq", message)
 }
 
 #[cfg(test)]
@@ -321,7 +321,7 @@ mod tests {
     fn oversized_actions_are_refused_and_take_no_memory() {
         let mut actions = Vec::new();
         let error = read_actions(&vec![0; 1 << 20], 12, &mut actions).expect_err("too many");
-        assert_eq!(error.code, Code::BadShape);
+        assert_eq!(error.code, ErrorCode::BadShape);
         assert_eq!(actions.capacity(), 0);
         read_actions(&[0; 48], 12, &mut actions).expect("twelve");
         assert_eq!(actions, [0.0; 12]);

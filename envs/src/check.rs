@@ -18,7 +18,7 @@ pub enum CheckError {
     },
     /// It does something that no vector environment may.
     #[error("{0}")]
-    Broken(String),
+    ContractViolation(String),
 }
 
 /// Uses `env` for `steps` steps, twice with the same seed, and checks what it promises: shapes, finite numbers within
@@ -26,11 +26,11 @@ pub enum CheckError {
 /// refusals of bad input that change nothing.
 ///
 /// The environment must be deterministic; it is left in the middle of an episode.
-pub fn check(env: &mut dyn VecEnv, steps: usize) -> Result<(), CheckError> {
+pub fn check_vec_env(env: &mut dyn VecEnv, steps: usize) -> Result<(), CheckError> {
     let first = rollout(env, steps)?;
     let second = rollout(env, steps)?;
     if let Some(step) = first.iter().zip(&second).position(|(one, two)| one != two) {
-        return Err(CheckError::Broken(format!("equal seeds and actions gave other numbers in step {step}")));
+        return Err(CheckError::ContractViolation(format!("equal seeds and actions gave other numbers in step {step}")));
     }
     check_refusals(env)
 }
@@ -55,7 +55,7 @@ fn rollout(env: &mut dyn VecEnv, steps: usize) -> Result<Vec<StepBatch>, CheckEr
         for env in 0..num_envs {
             if restarts && waiting[env] && (batch.reward[env] != 0.0 || batch.done(env)) {
                 let what = "NextStep: the step that restarts an episode must have reward 0 and no end";
-                return Err(CheckError::Broken(format!("{what}; environment {env}, step {step}")));
+                return Err(CheckError::ContractViolation(format!("{what}; environment {env}, step {step}")));
             }
             lengths[env] = if restarts && waiting[env] { 0 } else { lengths[env] + 1 };
         }
@@ -73,7 +73,7 @@ fn test_action(step: usize, index: usize) -> f32 {
 fn check_numbers(obs: &[f32], spec: &twinstep_model::EnvSpec, num_envs: usize) -> Result<(), CheckError> {
     let obs_len = spec.obs_len();
     if obs.len() != num_envs * obs_len {
-        return Err(CheckError::Broken(format!("{} observation values; {} wanted", obs.len(), num_envs * obs_len)));
+        return Err(CheckError::ContractViolation(format!("{} observation values; {} wanted", obs.len(), num_envs * obs_len)));
     }
     let bounds: Vec<(f32, f32)> =
         spec.observation.iter().flat_map(|field| std::iter::repeat_n((field.low, field.high), field.size)).collect();
@@ -82,7 +82,7 @@ fn check_numbers(obs: &[f32], spec: &twinstep_model::EnvSpec, num_envs: usize) -
         if !(low..=high).contains(value) {
             let entry = spec.observation_entry(index % obs_len);
             let env = index / obs_len;
-            return Err(CheckError::Broken(format!("{entry} of environment {env} is {value}, outside {low}..{high}")));
+            return Err(CheckError::ContractViolation(format!("{entry} of environment {env} is {value}, outside {low}..{high}")));
         }
     }
     Ok(())
@@ -90,7 +90,7 @@ fn check_numbers(obs: &[f32], spec: &twinstep_model::EnvSpec, num_envs: usize) -
 
 fn check_ended(batch: &StepBatch, lengths: &mut [u32], env: &dyn VecEnv, step: usize) -> Result<(), CheckError> {
     let spec = env.spec();
-    let broken = |text: String| Err(CheckError::Broken(format!("{text}, in step {step}")));
+    let broken = |text: String| Err(CheckError::ContractViolation(format!("{text}, in step {step}")));
     let done = (0..lengths.len()).filter(|env| batch.done(*env)).count();
     if batch.ended.len() != done {
         return broken(format!("{done} environments are done, but {} ended episodes are listed", batch.ended.len()));
@@ -121,12 +121,12 @@ fn check_refusals(env: &mut dyn VecEnv) -> Result<(), CheckError> {
     poisoned[wanted - 1] = f32::NAN;
     for (actions, what) in [(vec![0.0; wanted + 1], "a wrong number of actions"), (poisoned, "an action that is NaN")] {
         if env.step(&actions).is_ok() {
-            return Err(CheckError::Broken(format!("{what} was accepted")));
+            return Err(CheckError::ContractViolation(format!("{what} was accepted")));
         }
     }
     let short = ResetRequest { seeds: Some(vec![0; env.num_envs() + 1]), mask: None };
     if env.reset(&short).is_ok() {
-        return Err(CheckError::Broken("a wrong number of seeds was accepted".to_owned()));
+        return Err(CheckError::ContractViolation("a wrong number of seeds was accepted".to_owned()));
     }
     env.reset(&ResetRequest::seeded(SEED, env.num_envs()))
         .map_err(|source| CheckError::Failed { doing: "reset after refusals", source })?;

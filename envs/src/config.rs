@@ -20,13 +20,13 @@ pub struct TaskConfig {
     /// Weight of each reward term; 0 leaves it out of the sum.
     pub reward: RewardWeights,
     /// Width of the tracking rewards' bell, `exp(−error² / width)` [m²/s², rad²/s²].
-    pub tracking_width: f32,
+    pub tracking_sigma: f32,
     /// The episode ends when the base tilts by more than this [rad].
     pub max_tilt_rad: f32,
     /// The episode ends when the base sinks below this height above the ground under it [m].
     pub min_base_height_m: f32,
     /// Joints start within this distance of the default pose [rad].
-    pub start_position_noise_rad: f32,
+    pub reset_joint_noise_rad: f32,
 }
 
 impl Default for TaskConfig {
@@ -37,10 +37,10 @@ impl Default for TaskConfig {
             command_resample_s: 10.0,
             command: CommandRanges::default(),
             reward: RewardWeights::default(),
-            tracking_width: 0.25,
+            tracking_sigma: 0.25,
             max_tilt_rad: 1.0,
             min_base_height_m: 0.15,
-            start_position_noise_rad: 0.1,
+            reset_joint_noise_rad: 0.1,
         }
     }
 }
@@ -61,21 +61,21 @@ pub enum TaskName {
 #[serde(deny_unknown_fields, default)]
 pub struct CommandRanges {
     /// Forward velocity [m/s].
-    pub forward: Range,
+    pub linear_velocity_x: Range,
     /// Velocity to the left [m/s].
-    pub left: Range,
+    pub linear_velocity_y: Range,
     /// Turning rate to the left [rad/s].
-    pub yaw: Range,
+    pub angular_velocity_z: Range,
 }
 
 impl Default for CommandRanges {
     fn default() -> Self {
-        Self { forward: [-1.0, 1.0], left: [-0.5, 0.5], yaw: [-1.0, 1.0] }
+        Self { linear_velocity_x: [-1.0, 1.0], linear_velocity_y: [-0.5, 0.5], angular_velocity_z: [-1.0, 1.0] }
     }
 }
 
 /// Number of reward terms.
-pub const TERMS: usize = RewardWeights::NAMES.len();
+pub const NUM_REWARD_TERMS: usize = RewardWeights::NAMES.len();
 
 macro_rules! reward_weights {
     ($($(#[$doc:meta])* $name:ident = $weight:expr),+ $(,)?) => {
@@ -187,15 +187,15 @@ impl TaskConfig {
     /// Fails if a value is outside its range.
     pub fn check(&self) -> Result<(), ConfigError> {
         let command = &self.command;
-        check_range("task.command.forward", command.forward, -5.0, 5.0)?;
-        check_range("task.command.left", command.left, -5.0, 5.0)?;
-        check_range("task.command.yaw", command.yaw, -5.0, 5.0)?;
+        check_range("task.command.forward", command.linear_velocity_x, -5.0, 5.0)?;
+        check_range("task.command.left", command.linear_velocity_y, -5.0, 5.0)?;
+        check_range("task.command.yaw", command.angular_velocity_z, -5.0, 5.0)?;
         check_value("task.max_episode_s", self.max_episode_s, 0.02, 1e6)?;
         check_value("task.command_resample_s", self.command_resample_s, 0.02, 1e6)?;
-        check_value("task.tracking_width", self.tracking_width, 1e-6, 1e6)?;
+        check_value("task.tracking_width", self.tracking_sigma, 1e-6, 1e6)?;
         check_value("task.max_tilt_rad", self.max_tilt_rad, 0.0, 3.2)?;
         check_value("task.min_base_height_m", self.min_base_height_m, -1e6, 1.0)?;
-        check_value("task.start_position_noise_rad", self.start_position_noise_rad, 0.0, 1.0)?;
+        check_value("task.start_position_noise_rad", self.reset_joint_noise_rad, 0.0, 1.0)?;
         self.reward
             .values()
             .try_for_each(|(name, weight)| check_value(&format!("task.reward.{name}"), weight, -1e6, 1e6))

@@ -25,7 +25,7 @@ pub struct Counter {
     /// Resets executed since the environment was made.
     pub resets: u32,
     /// Mix of all actions in their order.
-    pub mix: u32,
+    pub action_hash: u32,
 }
 
 impl Counter {
@@ -33,7 +33,7 @@ impl Counter {
     pub fn step(&mut self, action: &[f32]) {
         self.steps += 1;
         for value in action {
-            self.mix = (self.mix ^ value.to_bits()).wrapping_mul(0x0100_0193).rotate_left(5);
+            self.action_hash = (self.action_hash ^ value.to_bits()).wrapping_mul(0x0100_0193).rotate_left(5);
         }
     }
 
@@ -44,7 +44,7 @@ impl Counter {
 
     /// The first entries of the observation: numbers below 2²⁴, which a float holds exactly.
     pub fn observation(&self) -> [f32; 4] {
-        [(self.steps & 0xff_ffff) as f32, self.resets as f32, (self.mix >> 16) as f32, (self.mix & 0xffff) as f32]
+        [(self.steps & 0xff_ffff) as f32, self.resets as f32, (self.action_hash >> 16) as f32, (self.action_hash & 0xffff) as f32]
     }
 }
 
@@ -81,7 +81,7 @@ impl VecEnv for CounterEnv {
 
     fn reset(&mut self, request: &ResetRequest) -> Result<&[f32], EnvError> {
         request.check(self.num_envs())?;
-        for env in (0..self.num_envs()).filter(|env| request.wants(*env)) {
+        for env in (0..self.num_envs()).filter(|env| request.selects(*env)) {
             self.counters[env].reset();
             self.observe(env);
         }
@@ -123,6 +123,6 @@ mod tests {
         back.step(&[0.3, 0.4]);
         back.step(&[0.1, 0.2]);
         assert_eq!(forth.steps, back.steps);
-        assert_ne!(forth.mix, back.mix);
+        assert_ne!(forth.action_hash, back.action_hash);
     }
 }

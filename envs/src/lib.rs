@@ -15,8 +15,8 @@ mod observation;
 pub mod reward;
 mod task_env;
 
-pub use check::{CheckError, check};
+pub use check::{CheckError, check_vec_env};
 pub use config::{CommandRanges, ConfigError, Randomisation, RewardWeights, TaskConfig, TaskName};
 pub use counter::{Counter, CounterEnv};
 pub use observation::{OBS_LEN, observe, walk_spec};
-pub use task_env::{TaskEnv, TaskSettings};
+pub use task_env::{TaskEnv, TaskEnvConfig};

@@ -1,6 +1,6 @@
 //! The observation of U2E, equation (14), and the action: layout and computation, one place for simulator, log and robot.
 
-use twinstep_model::{EnvSpec, Field, JOINT_NAMES, NUM_JOINTS, PerJoint, RobotModel, RobotStates, frames};
+use twinstep_model::{EnvSpec, SpecField, JOINT_NAMES, NUM_JOINTS, PerJoint, RobotModel, RobotStates, frames};
 
 use crate::{RewardWeights, TaskConfig};
 
@@ -30,7 +30,7 @@ pub fn walk_spec(robot: &RobotModel, task: &TaskConfig) -> EnvSpec {
         )],
         joint_order: JOINT_NAMES.map(str::to_owned).to_vec(),
         policy_dt: control.policy_dt(),
-        drive_dt: control.drive_dt(),
+        actuator_dt: control.actuator_dt(),
         kp: control.kp,
         kd: control.kd,
         action_scale: control.action_scale,
@@ -40,8 +40,8 @@ pub fn walk_spec(robot: &RobotModel, task: &TaskConfig) -> EnvSpec {
     }
 }
 
-fn field(name: &str, size: usize, unit: &str, bound: f32, text: &str) -> Field {
-    Field { name: name.to_owned(), size, unit: unit.to_owned(), low: -bound, high: bound, text: text.to_owned() }
+fn field(name: &str, size: usize, unit: &str, bound: f32, text: &str) -> SpecField {
+    SpecField { name: name.to_owned(), size, unit: unit.to_owned(), low: -bound, high: bound, description: text.to_owned() }
 }
 
 /// Writes the observation of `robot` into `obs` (45 values), clipped to the bounds of [`walk_spec`].
@@ -53,7 +53,7 @@ pub fn observe(
     previous_action: &PerJoint,
     obs: &mut [f32],
 ) {
-    let gravity = frames::gravity_in_base(states.base_orientation[robot]);
+    let gravity = frames::projected_gravity(states.base_orientation[robot]);
     write_clipped(&mut obs[0..3], states.base_angular_velocity[robot], 50.0);
     write_clipped(&mut obs[3..6], gravity.to_array(), 1.0);
     write_clipped(&mut obs[6..9], command, 5.0);
@@ -81,7 +81,7 @@ mod tests {
         assert_eq!((spec.obs_len(), spec.action_len()), (OBS_LEN, 12));
         assert_eq!(spec.observation_entry(9), "joint_position[FL_hip]");
         assert_eq!(spec.observation_entry(44), "previous_action[RR_calf]");
-        assert_eq!((spec.policy_dt, spec.drive_dt, spec.max_episode_steps), (0.02, 0.005, 1000));
+        assert_eq!((spec.policy_dt, spec.actuator_dt, spec.max_episode_steps), (0.02, 0.005, 1000));
     }
 
     #[test]

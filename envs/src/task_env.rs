@@ -1,12 +1,12 @@
 //! The task `walk` on any backend: many robots that follow velocity commands.
 
-use twinstep_model::effects::RobotDraws;
+use twinstep_model::effects::RobotSampler;
 use twinstep_model::{
-    AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, Placement, ResetRequest,
+    AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, InitialState, ResetRequest,
     RobotModel, Scene, StepBatch, VecEnv,
 };
 
-use crate::episode::{Episode, Rules, Verdict};
+use crate::episode::{Episode, EpisodeConfig, StepOutcome};
 use crate::observation::{OBS_LEN, walk_spec};
 use crate::{ConfigError, Randomisation, TaskConfig};
 
@@ -15,13 +15,13 @@ const START_CLEARANCE: f32 = 0.01;
 
 /// Settings of a [`TaskEnv`] besides its backend.
 #[derive(Clone, Debug)]
-pub struct TaskSettings {
+pub struct TaskEnvConfig {
     /// The task.
     pub task: TaskConfig,
     /// What varies from episode to episode.
     pub randomise: Randomisation,
     /// Where each episode's robot is drawn from; the backend's own without.
-    pub robots: Option<RobotDraws>,
+    pub robot_sampler: Option<RobotSampler>,
     /// When an ended episode starts anew.
     pub autoreset: AutoresetMode,
     /// Policy steps after which an episode is truncated, in place of the task's own time.
@@ -34,8 +34,8 @@ pub struct TaskSettings {
 pub struct TaskEnv<B: Backend> {
     backend: B,
     spec: EnvSpec,
-    rules: Rules,
-    robots: Option<RobotDraws>,
+    rules: EpisodeConfig,
+    robots: Option<RobotSampler>,
     autoreset: AutoresetMode,
     episodes: Vec<Episode>,
     commands: Vec<Command>,
@@ -45,8 +45,8 @@ pub struct TaskEnv<B: Backend> {
 
 impl<B: Backend> TaskEnv<B> {
     /// The task on every robot of `backend`.
-    pub fn new(backend: B, settings: TaskSettings) -> Result<Self, ConfigError> {
-        let TaskSettings { task, randomise, robots, autoreset, max_episode_steps, seed } = settings;
+    pub fn new(backend: B, settings: TaskEnvConfig) -> Result<Self, ConfigError> {
+        let TaskEnvConfig { task, randomise, robot_sampler: robots, autoreset, max_episode_steps, seed } = settings;
         task.check()?;
         randomise.check()?;
         let robot = backend.robot();
@@ -54,11 +54,11 @@ impl<B: Backend> TaskEnv<B> {
         spec.max_episode_steps = max_episode_steps.unwrap_or(spec.max_episode_steps);
         let num_envs = backend.num_robots();
         Ok(Self {
-            rules: Rules::new(task, randomise, robot, backend.ground(), &spec),
+            rules: EpisodeConfig::new(task, randomise, robot, backend.ground(), &spec),
             spec,
             robots,
             autoreset,
-            episodes: (0..num_envs as u64).map(|env| Episode::idle(seed.wrapping_add(env))).collect(),
+            episodes: (0..num_envs as u64).map(|env| Episode::not_started(seed.wrapping_add(env))).collect(),
             commands: vec![Command::hold(robot.control.default_pose_f32(), 0.0, 0.0); num_envs],
             active: vec![true; num_envs],
             batch: StepBatch::new(num_envs, OBS_LEN),
@@ -92,7 +92,7 @@ impl<B: Backend> TaskEnv<B> {
         for env in envs {
             let (placement, robot) = self.start(*env);
             match robot {
-                Some(robot) => self.backend.reset_as(*env, &robot, &placement)?,
+                Some(robot) => self.backend.reset_with_model(*env, &robot, &placement)?,
                 None => self.backend.reset(&[(*env, placement)])?,
             }
             let row = &mut self.batch.obs[env * OBS_LEN..(env + 1) * OBS_LEN];
@@ -101,12 +101,12 @@ impl<B: Backend> TaskEnv<B> {
         Ok(())
     }
 
-    fn start(&mut self, env: usize) -> (Placement, Option<RobotModel>) {
+    fn start(&mut self, env: usize) -> (InitialState, Option<RobotModel>) {
         let mut start = self.episodes[env].start(&self.rules);
         self.commands[env] = Command::hold(start.q, start.kp, start.kd);
-        let placement = Placement::above(self.rules.ground(), self.backend.robot(), start.q, START_CLEARANCE);
-        let robot = self.robots.as_ref().map(|robots| robots.draw(&mut start.effects));
-        (Placement { variation: start.variation, drive_seed: start.drive_seed, ..placement }, robot)
+        let placement = InitialState::standing_on(self.rules.ground(), self.backend.robot(), start.q, START_CLEARANCE);
+        let robot = self.robots.as_ref().map(|robots| robots.sample(&mut start.effects));
+        (InitialState { randomisation: start.variation, actuator_seed: start.drive_seed, ..placement }, robot)
     }
 
     /// Sets the commands of all running environments, and restarts those that wait for it (NextStep).
@@ -118,7 +118,7 @@ impl<B: Backend> TaskEnv<B> {
             self.active[env] = episode.running;
             if episode.running {
                 // Gains stay those of the episode.
-                self.commands[env].q = episode.act(&self.rules, action, &dq[env]);
+                self.commands[env].q = episode.joint_targets(&self.rules, action, &dq[env]);
             } else {
                 waiting.push(env);
             }
@@ -131,8 +131,8 @@ impl<B: Backend> TaskEnv<B> {
         let Self { episodes, active, batch, rules, backend, .. } = self;
         let rows = batch.obs.chunks_exact_mut(OBS_LEN);
         for (env, (episode, obs)) in episodes.iter_mut().zip(rows).enumerate() {
-            let idle = Verdict { reward: 0.0, terminated: false, truncated: false };
-            let verdict = if active[env] { episode.judge(rules, backend.states(), env, obs) } else { idle };
+            let idle = StepOutcome { reward: 0.0, terminated: false, truncated: false };
+            let verdict = if active[env] { episode.evaluate_step(rules, backend.states(), env, obs) } else { idle };
             batch.reward[env] = verdict.reward;
             batch.terminated[env] = verdict.terminated;
             batch.truncated[env] = verdict.truncated;
@@ -176,7 +176,7 @@ impl<B: Backend> VecEnv for TaskEnv<B> {
 
     fn reset(&mut self, request: &ResetRequest) -> Result<&[f32], EnvError> {
         request.check(self.num_envs())?;
-        let envs: Vec<usize> = (0..self.num_envs()).filter(|env| request.wants(*env)).collect();
+        let envs: Vec<usize> = (0..self.num_envs()).filter(|env| request.selects(*env)).collect();
         if let Some(seeds) = &request.seeds {
             for env in &envs {
                 self.episodes[*env].seed(seeds[*env]);
@@ -209,7 +209,7 @@ impl<B: Backend> VecEnv for TaskEnv<B> {
 
     fn scene(&self, env: usize) -> Result<Scene, EnvError> {
         let num_envs = self.num_envs();
-        let episode = self.episodes.get(env).ok_or(EnvError::NoSuchEnv { env, num_envs })?;
+        let episode = self.episodes.get(env).ok_or(EnvError::EnvOutOfRange { env, num_envs })?;
         if !episode.running && !episode.was_started() {
             return Err(EnvError::NeedsReset { env });
         }

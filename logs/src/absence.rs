@@ -1,7 +1,7 @@
 //! What a log that lacks a quantity cannot tell.
 
 use crate::columns::Column;
-use crate::{Base, Log, TauSensor};
+use crate::{BaseMount, Log, TorqueSensor};
 
 /// Where a quantity is missed.
 #[derive(PartialEq, Eq)]
@@ -35,9 +35,9 @@ const COSTS: [(&str, Missed, &str); 14] = [
 
 /// The quantities that a log lacks and what each costs.
 pub(crate) fn absent(log: &Log) -> Vec<(&'static str, &'static str)> {
-    let floating = log.segments().any(|(segment, _)| segment.base == Base::Floating);
+    let floating = log.segments().any(|(segment, _)| segment.base == BaseMount::Floating);
     let held = |quantity: &str| match quantity {
-        "tau_measured" if log.meta().tau_sensor == TauSensor::None => false,
+        "tau_measured" if log.meta().tau_sensor == TorqueSensor::None => false,
         _ => log.channels().any(|(name, _)| Column::parse(name).is_some_and(|column| column.quantity.name == quantity)),
     };
     COSTS

@@ -55,7 +55,7 @@ macro_rules! primitives {
 primitives!(u8, u16, i16, u32, i32, f32);
 
 /// One walk over a message's fields, in their order, serves reading and writing.
-pub(crate) trait Walk {
+pub(crate) trait FieldVisitor {
     /// A number.
     fn value<T: Primitive>(&mut self, value: &mut T);
 
@@ -79,7 +79,7 @@ pub(crate) trait Message: Default {
     /// Size of the body [bytes].
     const SIZE: usize;
     /// Visits every field in its order.
-    fn walk(&mut self, fields: &mut impl Walk);
+    fn visit_fields(&mut self, fields: &mut impl FieldVisitor);
 }
 
 /// The message that a payload holds.
@@ -98,7 +98,7 @@ pub(crate) fn decode<M: Message>(payload: &[u8]) -> Result<M, CdrError> {
         return Err(CdrError::TooLong { bytes, expected });
     }
     let mut message = M::default();
-    message.walk(&mut Reader { body: &payload[HEADER..], at: 0, little_endian: payload[1] == 1 });
+    message.visit_fields(&mut Reader { body: &payload[HEADER..], at: 0, little_endian: payload[1] == 1 });
     Ok(message)
 }
 
@@ -106,7 +106,7 @@ pub(crate) fn decode<M: Message>(payload: &[u8]) -> Result<M, CdrError> {
 pub(crate) fn encode<M: Message>(message: &mut M) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(HEADER + M::SIZE);
     bytes.extend([0, 1, 0, 0]);
-    message.walk(&mut Writer { bytes: &mut bytes });
+    message.visit_fields(&mut Writer { bytes: &mut bytes });
     bytes
 }
 
@@ -117,7 +117,7 @@ struct Reader<'a> {
     little_endian: bool,
 }
 
-impl Walk for Reader<'_> {
+impl FieldVisitor for Reader<'_> {
     fn value<T: Primitive>(&mut self, value: &mut T) {
         let start = self.at.next_multiple_of(T::SIZE);
         self.at = start + T::SIZE;
@@ -129,7 +129,7 @@ struct Writer<'a> {
     bytes: &'a mut Vec<u8>,
 }
 
-impl Walk for Writer<'_> {
+impl FieldVisitor for Writer<'_> {
     fn value<T: Primitive>(&mut self, value: &mut T) {
         let start = HEADER + (self.bytes.len() - HEADER).next_multiple_of(T::SIZE);
         self.bytes.resize(start, 0);
@@ -146,7 +146,7 @@ mod tests {
 
     impl Message for Small {
         const SIZE: usize = 10;
-        fn walk(&mut self, fields: &mut impl Walk) {
+        fn visit_fields(&mut self, fields: &mut impl FieldVisitor) {
             fields.value(&mut self.0);
             fields.value(&mut self.1);
             fields.value(&mut self.2);

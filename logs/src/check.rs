@@ -6,22 +6,22 @@ use std::path::Path;
 use twinstep_model::JOINT_NAMES;
 
 use crate::LogError;
-use crate::columns::{Cells, Column};
-use crate::log::{Log, parts};
+use crate::columns::{MissingCells, Column};
+use crate::log::{Log, contiguous_ranges};
 use crate::meta::{Gain, Meta};
 use crate::table::Table;
 
 /// What a log is needed for, which decides the columns it must have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Need {
+pub(crate) enum LogKind {
     /// To compare: positions, commands and gains.
     Measurement,
     /// To play: commands.
-    Motion,
+    Commands,
 }
 
 /// Checks a table against its description and makes the log of both.
-pub(crate) fn assemble(mut table: Table, meta: Meta, meta_file: &Path, need: Need) -> Result<Log, LogError> {
+pub(crate) fn assemble(mut table: Table, meta: Meta, meta_file: &Path, need: LogKind) -> Result<Log, LogError> {
     check_joint_names(&table)?;
     let joints = joints_of(&table, &meta, need)?;
     leave_out_other_joints(&mut table, &joints);
@@ -42,11 +42,11 @@ pub(crate) fn assemble(mut table: Table, meta: Meta, meta_file: &Path, need: Nee
 }
 
 /// The joints that the description lists, or all that have a position (in a motion: a command).
-fn joints_of(table: &Table, meta: &Meta, need: Need) -> Result<Vec<String>, LogError> {
+fn joints_of(table: &Table, meta: &Meta, need: LogKind) -> Result<Vec<String>, LogError> {
     if !meta.joints.is_empty() {
         return Ok(meta.joints.clone());
     }
-    let quantity = if need == Need::Motion { "q_cmd" } else { "q" };
+    let quantity = if need == LogKind::Commands { "q_cmd" } else { "q" };
     let joints: Vec<String> = (table.columns.iter())
         .filter_map(|(name, _)| Column::parse(name))
         .filter(|column| column.quantity.name == quantity)
@@ -64,11 +64,11 @@ fn leave_out_other_joints(table: &mut Table, joints: &[String]) {
     table.ignored.extend(left_out.into_iter().map(|(name, _)| name));
 }
 
-fn require_columns(table: &Table, joints: &[String], need: Need) -> Result<(), LogError> {
+fn require_columns(table: &Table, joints: &[String], need: LogKind) -> Result<(), LogError> {
     if table.column("t").is_none() {
         return Err(missing(table, "t"));
     }
-    let quantities: &[&str] = if need == Need::Motion { &["q_cmd"] } else { &["q", "q_cmd"] };
+    let quantities: &[&str] = if need == LogKind::Commands { &["q_cmd"] } else { &["q", "q_cmd"] };
     for joint in joints {
         for column in quantities.iter().map(|quantity| format!("{quantity}_{joint}")) {
             if table.column(&column).is_none() {
@@ -139,7 +139,7 @@ fn check_lengths(table: &Table) -> Result<(), LogError> {
 fn check_cells(table: &Table) -> Result<(), LogError> {
     for (name, cells) in &table.columns {
         let quantity = Column::parse(name).map(|column| column.quantity);
-        let required = quantity.is_some_and(|quantity| quantity.cells == Cells::Required);
+        let required = quantity.is_some_and(|quantity| quantity.cells == MissingCells::Forbidden);
         let gain = quantity.is_some_and(|quantity| matches!(quantity.name, "kp" | "kd"));
         for (row, &value) in cells.iter().enumerate() {
             if value.is_nan() && required {
@@ -178,7 +178,7 @@ fn check_segments(table: &Table, segment: &[u32], meta: &Meta) -> Result<(), Log
 
 fn check_time(table: &Table, segment: &[u32], episode: &[u32]) -> Result<(), LogError> {
     let t = table.column("t").unwrap_or_default();
-    for rows in parts(segment, episode) {
+    for rows in contiguous_ranges(segment, episode) {
         for row in rows.skip(1) {
             if t[row] <= t[row - 1] {
                 return Err(LogError::TimeNotIncreasing {
@@ -208,7 +208,7 @@ fn check_quaternion(table: &Table) -> Result<(), LogError> {
 }
 
 /// Every joint has gains: its own column, the column for all joints, or the description's.
-fn check_gains(table: &Table, meta: &Meta, meta_file: &Path, joints: &[String], need: Need) -> Result<(), LogError> {
+fn check_gains(table: &Table, meta: &Meta, meta_file: &Path, joints: &[String], need: LogKind) -> Result<(), LogError> {
     for (gain, constant) in [("kp", &meta.kp), ("kd", &meta.kd)] {
         if let Some(Gain::PerJoint(gains)) = constant
             && gains.len() != joints.len()
@@ -217,7 +217,7 @@ fn check_gains(table: &Table, meta: &Meta, meta_file: &Path, joints: &[String], 
             let expected = "one number, or one for each joint";
             return Err(LogError::MetaValue { file: meta_file.into(), key: gain.to_owned(), value, expected });
         }
-        if need == Need::Motion || constant.is_some() || table.column(gain).is_some() {
+        if need == LogKind::Commands || constant.is_some() || table.column(gain).is_some() {
             continue;
         }
         if let Some(joint) = joints.iter().find(|joint| table.column(&format!("{gain}_{joint}")).is_none()) {

@@ -2,7 +2,7 @@
 
 /// What a quantity belongs to, which decides how its columns are named.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Of {
+pub(crate) enum ColumnOwner {
     /// One column with the quantity's own name.
     Robot,
     /// `<quantity>_<joint>`.
@@ -17,11 +17,11 @@ pub(crate) enum Of {
 
 /// Whether a cell of a column may be missing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Cells {
+pub(crate) enum MissingCells {
     /// Every row needs a number.
-    Required,
+    Forbidden,
     /// A row may have none.
-    Optional,
+    Allowed,
 }
 
 /// One measured or commanded quantity.
@@ -29,8 +29,8 @@ pub(crate) enum Cells {
 pub(crate) struct Quantity {
     pub name: &'static str,
     pub unit: &'static str,
-    pub of: Of,
-    pub cells: Cells,
+    pub of: ColumnOwner,
+    pub cells: MissingCells,
 }
 
 /// A column's name, read.
@@ -41,39 +41,39 @@ pub(crate) struct Column<'a> {
     pub part: Option<&'a str>,
 }
 
-const XYZ: Of = Of::Axis(&["x", "y", "z"]);
-const WXYZ: Of = Of::Axis(&["w", "x", "y", "z"]);
+const XYZ: ColumnOwner = ColumnOwner::Axis(&["x", "y", "z"]);
+const WXYZ: ColumnOwner = ColumnOwner::Axis(&["w", "x", "y", "z"]);
 
-const fn required(name: &'static str, unit: &'static str, of: Of) -> Quantity {
-    Quantity { name, unit, of, cells: Cells::Required }
+const fn required(name: &'static str, unit: &'static str, of: ColumnOwner) -> Quantity {
+    Quantity { name, unit, of, cells: MissingCells::Forbidden }
 }
 
-const fn optional(name: &'static str, unit: &'static str, of: Of) -> Quantity {
-    Quantity { name, unit, of, cells: Cells::Optional }
+const fn optional(name: &'static str, unit: &'static str, of: ColumnOwner) -> Quantity {
+    Quantity { name, unit, of, cells: MissingCells::Allowed }
 }
 
 /// Every quantity, in the order in which columns are written.
 pub(crate) static QUANTITIES: [Quantity; 20] = [
-    required("t", "s", Of::Robot),
-    required("segment", "", Of::Robot),
-    required("episode", "", Of::Robot),
-    required("kp", "N·m/rad", Of::RobotOrJoint),
-    required("kd", "N·m·s/rad", Of::RobotOrJoint),
-    required("q_cmd", "rad", Of::Joint),
-    optional("dq_cmd", "rad/s", Of::Joint),
-    optional("tau_ff", "N·m", Of::Joint),
-    required("q", "rad", Of::Joint),
-    optional("dq", "rad/s", Of::Joint),
-    optional("tau_measured", "N·m", Of::Joint),
-    optional("temp", "°C", Of::Joint),
+    required("t", "s", ColumnOwner::Robot),
+    required("segment", "", ColumnOwner::Robot),
+    required("episode", "", ColumnOwner::Robot),
+    required("kp", "N·m/rad", ColumnOwner::RobotOrJoint),
+    required("kd", "N·m·s/rad", ColumnOwner::RobotOrJoint),
+    required("q_cmd", "rad", ColumnOwner::Joint),
+    optional("dq_cmd", "rad/s", ColumnOwner::Joint),
+    optional("tau_ff", "N·m", ColumnOwner::Joint),
+    required("q", "rad", ColumnOwner::Joint),
+    optional("dq", "rad/s", ColumnOwner::Joint),
+    optional("tau_measured", "N·m", ColumnOwner::Joint),
+    optional("temp", "°C", ColumnOwner::Joint),
     optional("gyro", "rad/s", XYZ),
     optional("acc", "m/s²", XYZ),
     optional("quat", "", WXYZ),
     optional("pos", "m", XYZ),
     optional("vel", "m/s", XYZ),
-    optional("contact", "", Of::Leg),
-    optional("foot_force", "N", Of::Leg),
-    optional("battery_V", "V", Of::Robot),
+    optional("contact", "", ColumnOwner::Leg),
+    optional("foot_force", "N", ColumnOwner::Leg),
+    optional("battery_V", "V", ColumnOwner::Robot),
 ];
 
 /// The quantity with exactly this name.
@@ -85,7 +85,7 @@ impl<'a> Column<'a> {
     /// Reads a column's name; none for a name outside the grammar.
     pub fn parse(name: &'a str) -> Option<Column<'a>> {
         if let Some(quantity) = quantity(name) {
-            let whole = matches!(quantity.of, Of::Robot | Of::RobotOrJoint);
+            let whole = matches!(quantity.of, ColumnOwner::Robot | ColumnOwner::RobotOrJoint);
             return whole.then_some(Column { quantity, part: None });
         }
         // The longest quantity wins: `q_cmd_FL_hip` is the command of `FL_hip`, not the position of `cmd_FL_hip`.
@@ -94,16 +94,16 @@ impl<'a> Column<'a> {
             .filter_map(|quantity| Some((quantity, name.strip_prefix(quantity.name)?.strip_prefix('_')?)))
             .max_by_key(|(quantity, _)| quantity.name.len())?;
         let known = match quantity.of {
-            Of::Robot => false,
-            Of::Joint | Of::RobotOrJoint | Of::Leg => !part.is_empty(),
-            Of::Axis(axes) => axes.contains(&part),
+            ColumnOwner::Robot => false,
+            ColumnOwner::Joint | ColumnOwner::RobotOrJoint | ColumnOwner::Leg => !part.is_empty(),
+            ColumnOwner::Axis(axes) => axes.contains(&part),
         };
         known.then_some(Column { quantity, part: Some(part) })
     }
 
     /// The joint that the column belongs to.
     pub fn joint(&self) -> Option<&'a str> {
-        matches!(self.quantity.of, Of::Joint | Of::RobotOrJoint).then_some(self.part).flatten()
+        matches!(self.quantity.of, ColumnOwner::Joint | ColumnOwner::RobotOrJoint).then_some(self.part).flatten()
     }
 
     /// The place of the column's quantity in [`QUANTITIES`].

@@ -2,42 +2,42 @@
 
 use serde::Serialize;
 
-use crate::describe::{Description, largest};
+use crate::describe::{LogSummary, largest};
 use crate::excitation::{Excitation, velocity};
-use crate::{Base, Log, TauSensor};
+use crate::{BaseMount, Log, TorqueSensor};
 
 /// What a log can tell about one effect.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Conclusion {
+pub struct Identifiability {
     /// The effect's name in the catalogue.
     pub effect: &'static str,
     /// Whether the log can tell.
-    pub verdict: Verdict,
+    pub verdict: IdentifiabilityLevel,
     /// Why, in a sentence.
-    pub because: String,
+    pub reason: String,
 }
 
 /// Whether a log can tell about an effect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Verdict {
+pub enum IdentifiabilityLevel {
     /// It holds all that is needed.
-    Can,
+    Identifiable,
     /// It holds what is needed, but not what would make it sharp.
-    Weakly,
+    Weak,
     /// It lacks something that is needed.
-    Cannot,
+    NotIdentifiable,
 }
 
 /// Something that a log must have for a conclusion.
 #[derive(Clone, Copy, Debug)]
-enum Need {
+enum DataRequirement {
     /// A joint that turns at least four times.
-    Turns,
+    Reversals,
     /// A joint whose motion reaches a frequency [Hz].
-    Fast(f64),
+    Bandwidth(f64),
     /// A joint that moves slower than [`CREEP`] for a tenth of the time.
-    Creep,
+    LowSpeed,
     /// A joint that reaches a fraction of its highest speed.
     Speed(f64),
     /// A joint that reaches a fraction of its highest torque.
@@ -59,187 +59,187 @@ enum Need {
     /// A trunk that is free to move.
     Floating,
     /// The trunk's turning, up to a rate [rad/s].
-    Spin(f64),
+    BaseRotation(f64),
     /// The trunk's orientation.
     Orientation,
     /// The trunk's position or velocity.
-    Path,
+    BasePose,
     /// Forces or contacts of the feet.
-    Feet,
+    FootContact,
 }
 
 /// Speeds between which friction at low speed shows [rad/s].
-const CREEP: [f64; 2] = [0.02, 0.3];
+const LOW_SPEED: [f64; 2] = [0.02, 0.3];
 
 /// What one effect needs.
 struct Rule {
     effect: &'static str,
-    needs: &'static [Need],
+    needs: &'static [DataRequirement],
     /// What makes the answer sharp.
-    sharper: &'static [Need],
+    recommended: &'static [DataRequirement],
     /// What else looks like it, and how they are told apart.
-    caution: &'static str,
+    caveat: &'static str,
 }
 
 /// Every effect of the catalogue, in the order of the chain from command to motion.
 const RULES: [Rule; 25] = {
-    use Need::{
-        Creep, Fast, Feet, Floating, KdVaries, KpVaries, Orientation, Path, Range, Rate, Speed, Spin, Temperature,
-        Torque, TorqueMeasured, Turns, Voltage,
+    use DataRequirement::{
+        LowSpeed, Bandwidth, FootContact, Floating, KdVaries, KpVaries, Orientation, BasePose, Range, Rate, Speed, BaseRotation, Temperature,
+        Torque, TorqueMeasured, Reversals, Voltage,
     };
     const fn rule(
         effect: &'static str,
-        needs: &'static [Need],
-        sharper: &'static [Need],
+        needs: &'static [DataRequirement],
+        sharper: &'static [DataRequirement],
         caution: &'static str,
     ) -> Rule {
-        Rule { effect, needs, sharper, caution }
+        Rule { effect, needs, recommended: sharper, caveat: caution }
     }
     [
-        rule("command_delay", &[Turns, Rate(100.0)], &[Fast(2.0)], "armature looks alike in slow motion"),
-        rule("encoder_offset", &[Turns], &[KpVaries], "a constant load looks alike at one kp"),
+        rule("command_delay", &[Reversals, Rate(100.0)], &[Bandwidth(2.0)], "armature looks alike in slow motion"),
+        rule("encoder_offset", &[Reversals], &[KpVaries], "a constant load looks alike at one kp"),
         rule("torque_saturation", &[Torque(0.6)], &[TorqueMeasured], ""),
         rule("supply_sag", &[Torque(0.4), Voltage(0.5)], &[TorqueMeasured], ""),
         rule("thermal_derating", &[Torque(0.1), Temperature(10.0)], &[TorqueMeasured], ""),
         rule(
             "torque_delay",
-            &[Turns, Rate(200.0)],
-            &[Fast(2.0), TorqueMeasured],
+            &[Reversals, Rate(200.0)],
+            &[Bandwidth(2.0), TorqueMeasured],
             "command_delay differs only where the joint is pushed",
         ),
         rule("torque_speed_limit", &[Speed(0.5)], &[Torque(0.5)], ""),
         rule(
             "drive_lag",
-            &[Turns, Rate(200.0), Fast(2.0)],
+            &[Reversals, Rate(200.0), Bandwidth(2.0)],
             &[TorqueMeasured],
             "its gain falls with frequency, a delay's does not",
         ),
-        rule("torque_sensor_delay", &[TorqueMeasured, Turns, Rate(200.0)], &[Fast(2.0)], ""),
-        rule("torque_gain", &[Turns], &[TorqueMeasured, Torque(0.1)], "a wrong kp or mass looks alike"),
-        rule("torque_ripple", &[Range(0.5), Rate(100.0)], &[Creep, TorqueMeasured], ""),
-        rule("backlash", &[Turns, Rate(200.0)], &[Creep, TorqueMeasured], "it shows where the load changes its sign"),
-        rule("joint_elasticity", &[Rate(500.0), Fast(5.0)], &[TorqueMeasured], ""),
-        rule("coulomb_friction", &[Turns], &[TorqueMeasured], ""),
-        rule("viscous_friction", &[Turns, Speed(0.03)], &[KdVaries], "at one kd it is the same as a wrong kd"),
-        rule("stribeck_friction", &[Turns, Creep], &[TorqueMeasured], ""),
+        rule("torque_sensor_delay", &[TorqueMeasured, Reversals, Rate(200.0)], &[Bandwidth(2.0)], ""),
+        rule("torque_gain", &[Reversals], &[TorqueMeasured, Torque(0.1)], "a wrong kp or mass looks alike"),
+        rule("torque_ripple", &[Range(0.5), Rate(100.0)], &[LowSpeed, TorqueMeasured], ""),
+        rule("backlash", &[Reversals, Rate(200.0)], &[LowSpeed, TorqueMeasured], "it shows where the load changes its sign"),
+        rule("joint_elasticity", &[Rate(500.0), Bandwidth(5.0)], &[TorqueMeasured], ""),
+        rule("coulomb_friction", &[Reversals], &[TorqueMeasured], ""),
+        rule("viscous_friction", &[Reversals, Speed(0.03)], &[KdVaries], "at one kd it is the same as a wrong kd"),
+        rule("stribeck_friction", &[Reversals, LowSpeed], &[TorqueMeasured], ""),
         rule(
             "load_friction",
-            &[Turns, Torque(0.15)],
+            &[Reversals, Torque(0.15)],
             &[TorqueMeasured],
             "only loads that differ tell it from coulomb_friction",
         ),
         rule(
             "armature",
-            &[Turns, Rate(100.0), Fast(1.0)],
-            &[Fast(3.0)],
+            &[Reversals, Rate(100.0), Bandwidth(1.0)],
+            &[Bandwidth(3.0)],
             "a delay looks alike: two spectra, or the first 10 ms of a step, tell them apart",
         ),
         rule("joint_spring", &[Range(0.5)], &[TorqueMeasured], ""),
         rule("payload", &[Floating], &[TorqueMeasured], "a load on a leg shows with the trunk held too"),
         rule("com_shift", &[Floating], &[Orientation, TorqueMeasured], ""),
-        rule("inertia", &[Floating, Spin(1.0)], &[Orientation], ""),
-        rule("ground_friction", &[Floating], &[Path], "only feet that slip tell its size"),
-        rule("ground_stiffness", &[Floating, Rate(200.0)], &[Feet], ""),
-        rule("gyro_bias", &[Spin(0.0)], &[Orientation], ""),
+        rule("inertia", &[Floating, BaseRotation(1.0)], &[Orientation], ""),
+        rule("ground_friction", &[Floating], &[BasePose], "only feet that slip tell its size"),
+        rule("ground_stiffness", &[Floating, Rate(200.0)], &[FootContact], ""),
+        rule("gyro_bias", &[BaseRotation(0.0)], &[Orientation], ""),
     ]
 };
 
 /// What the log can tell about each effect; empty for a motion, in which nothing was measured.
-pub(crate) fn conclusions(log: &Log, description: &Description) -> Vec<Conclusion> {
+pub(crate) fn conclusions(log: &Log, description: &LogSummary) -> Vec<Identifiability> {
     if log.joints().iter().all(|joint| log.q(joint).is_none()) {
         return Vec::new();
     }
-    let evidence = Evidence { log, description };
+    let evidence = LogFeatures { log, description };
     RULES.iter().map(|rule| rule.judge(&evidence)).collect()
 }
 
 impl Rule {
-    fn judge(&self, evidence: &Evidence<'_>) -> Conclusion {
+    fn judge(&self, evidence: &LogFeatures<'_>) -> Identifiability {
         let mut met = Vec::new();
         for need in self.needs {
-            match evidence.look_for(*need) {
+            match evidence.check(*need) {
                 Ok(found) => met.push(found),
-                Err(because) => return Conclusion { effect: self.effect, verdict: Verdict::Cannot, because },
+                Err(because) => return Identifiability { effect: self.effect, verdict: IdentifiabilityLevel::NotIdentifiable, reason: because },
             }
         }
-        let blunt = self.sharper.iter().find_map(|need| evidence.look_for(*need).err());
-        let verdict = if blunt.is_some() { Verdict::Weakly } else { Verdict::Can };
-        let caution = Some(self.caution.to_owned()).filter(|caution| !caution.is_empty());
+        let blunt = self.recommended.iter().find_map(|need| evidence.check(*need).err());
+        let verdict = if blunt.is_some() { IdentifiabilityLevel::Weak } else { IdentifiabilityLevel::Identifiable };
+        let caution = Some(self.caveat.to_owned()).filter(|caution| !caution.is_empty());
         // What is lacking matters more than what is there.
         let reasons = if blunt.is_some() { vec![blunt, caution] } else { vec![Some(met.join(", ")), caution] };
         let because = reasons.into_iter().flatten().collect::<Vec<_>>().join("; ");
-        Conclusion { effect: self.effect, verdict, because }
+        Identifiability { effect: self.effect, verdict, reason: because }
     }
 }
 
 /// What is known of a log.
-struct Evidence<'a> {
+struct LogFeatures<'a> {
     log: &'a Log,
-    description: &'a Description,
+    description: &'a LogSummary,
 }
 
-impl Evidence<'_> {
+impl LogFeatures<'_> {
     /// What meets a need, or else what is missing and how to get it.
-    fn look_for(&self, need: Need) -> Result<String, String> {
+    fn check(&self, need: DataRequirement) -> Result<String, String> {
         let joints = &self.description.joints;
         let share = |of: fn(&Excitation) -> Option<(f64, f64)>| {
             let ratio = |joint: &Excitation| of(joint).map(|(reached, limit)| (reached / limit, joint.joint.clone()));
             joints.iter().filter_map(ratio).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, String::new()))
         };
         match need {
-            Need::Turns => {
+            DataRequirement::Reversals => {
                 let turning: Vec<_> =
-                    joints.iter().filter(|joint| joint.turns >= 4).map(|joint| joint.joint.as_str()).collect();
+                    joints.iter().filter(|joint| joint.reversals >= 4).map(|joint| joint.joint.as_str()).collect();
                 let found = self.some_of(&turning, ["moves both ways", "move both ways"]);
                 found.ok_or_else(|| "no joint turns four times: move it back and forth".to_owned())
             }
-            Need::Fast(hz) => {
+            DataRequirement::Bandwidth(hz) => {
                 let reached = joints.iter().filter_map(|joint| joint.band_hz).map(|band| band[1]).fold(0.0, f64::max);
                 let few = || format!("motion reaches {reached:.1} Hz only: move at {hz} Hz or more");
                 if reached >= hz { Ok(format!("motion reaches {reached:.1} Hz")) } else { Err(few()) }
             }
-            Need::Creep => {
+            DataRequirement::LowSpeed => {
                 let slow: Vec<_> =
                     joints.iter().map(|joint| joint.joint.as_str()).filter(|joint| self.creeps(joint)).collect();
                 let found = self.some_of(&slow, ["creeps below 0.3 rad/s", "creep below 0.3 rad/s"]);
                 found.ok_or_else(|| "no joint moves slowly: add motion of 0.02 to 0.3 rad/s".to_owned())
             }
-            Need::Speed(least) => {
+            DataRequirement::Speed(least) => {
                 let (reached, joint) = share(|joint| joint.speed_max.zip(joint.speed_limit));
                 reaches(reached, least, &joint, "speed")
             }
-            Need::Torque(least) => {
+            DataRequirement::Torque(least) => {
                 let (reached, joint) = share(|joint| joint.torque_max.zip(joint.torque_limit));
                 reaches(reached, least, &joint, "torque")
             }
-            Need::Range(radians) => {
+            DataRequirement::Range(radians) => {
                 let reached = joints.iter().map(|joint| joint.q_max - joint.q_min).fold(0.0, f64::max);
                 let few = || format!("positions span {reached:.2} rad only: span {radians} rad or more");
                 if reached >= radians { Ok(format!("positions span up to {reached:.2} rad")) } else { Err(few()) }
             }
-            Need::TorqueMeasured => {
-                let measured = self.log.meta().tau_sensor != TauSensor::None && self.holds("tau_measured");
+            DataRequirement::TorqueMeasured => {
+                let measured = self.log.meta().tau_sensor != TorqueSensor::None && self.holds("tau_measured");
                 need_channel(measured, "torque was measured", "no torque was measured: motion alone must show it")
             }
-            Need::Rate(hz) => {
+            DataRequirement::Rate(hz) => {
                 let rate = self.description.timing.rate_hz.unwrap_or(0.0);
                 let few = || format!("{rate:.0} Hz is too slow: record at {hz} Hz or more");
                 if rate >= 0.98 * hz { Ok(format!("recorded at {rate:.0} Hz")) } else { Err(few()) }
             }
-            Need::KdVaries => need_channel(
+            DataRequirement::KdVaries => need_channel(
                 self.varies(Log::kd),
                 "kd takes several values",
                 "kd never changes: repeat the motion at another kd",
             ),
-            Need::KpVaries => need_channel(
+            DataRequirement::KpVaries => need_channel(
                 self.varies(Log::kp),
                 "kp takes several values",
                 "kp never changes: repeat the motion at another kp",
             ),
-            Need::Temperature(kelvin) => self.span("temp", kelvin, "K", "motor temperature"),
-            Need::Voltage(volts) => self.span("battery_V", volts, "V", "the supply"),
-            Need::Floating => {
-                let free = self.description.segments.iter().filter(|segment| segment.base == Base::Floating);
+            DataRequirement::Temperature(kelvin) => self.span("temp", kelvin, "K", "motor temperature"),
+            DataRequirement::Voltage(volts) => self.span("battery_V", volts, "V", "the supply"),
+            DataRequirement::Floating => {
+                let free = self.description.segments.iter().filter(|segment| segment.base == BaseMount::Floating);
                 let seconds = free.map(|segment| segment.duration_s).sum::<f64>();
                 need_channel(
                     seconds > 0.0,
@@ -247,7 +247,7 @@ impl Evidence<'_> {
                     "the trunk is held: record a floating base",
                 )
             }
-            Need::Spin(rate) => {
+            DataRequirement::BaseRotation(rate) => {
                 let axes = ["gyro_x", "gyro_y", "gyro_z"].map(|axis| self.log.channel(axis));
                 let reached = largest(axes.into_iter().flatten().flatten().map(|rate| rate.abs()));
                 match reached {
@@ -258,17 +258,17 @@ impl Evidence<'_> {
                     Some(reached) => Ok(format!("the gyro reaches {reached:.2} rad/s")),
                 }
             }
-            Need::Orientation => need_channel(
+            DataRequirement::Orientation => need_channel(
                 self.holds("quat"),
                 "the trunk's orientation is known",
                 "no orientation (quat) was recorded",
             ),
-            Need::Path => need_channel(
+            DataRequirement::BasePose => need_channel(
                 self.holds("pos") || self.holds("vel"),
                 "the trunk's path is known",
                 "no path (pos, vel) was recorded",
             ),
-            Need::Feet => need_channel(
+            DataRequirement::FootContact => need_channel(
                 self.holds("foot_force") || self.holds("contact"),
                 "the feet's load is known",
                 "no foot_force or contact was recorded",
@@ -295,7 +295,7 @@ impl Evidence<'_> {
         let Some(q) = self.log.q(joint) else { return false };
         let (velocity, _) = velocity(self.log, joint, q);
         let rows = velocity.iter().map(Vec::len).sum::<usize>();
-        let slow = velocity.iter().flatten().filter(|(_, dq)| (CREEP[0]..CREEP[1]).contains(&dq.abs())).count();
+        let slow = velocity.iter().flatten().filter(|(_, dq)| (LOW_SPEED[0]..LOW_SPEED[1]).contains(&dq.abs())).count();
         slow * 10 > rows
     }
 
@@ -351,7 +351,7 @@ mod tests {
     #[test]
     fn names_in_cautions_are_in_the_catalogue() {
         for rule in RULES {
-            let words = rule.caution.split(|letter: char| !letter.is_ascii_alphanumeric() && letter != '_');
+            let words = rule.caveat.split(|letter: char| !letter.is_ascii_alphanumeric() && letter != '_');
             for word in words.filter(|word| word.contains('_')) {
                 assert!(Effect::named(word).is_some(), "the caution of `{}` names `{word}`", rule.effect);
             }

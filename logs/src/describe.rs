@@ -5,14 +5,14 @@ use twinstep_model::Joint;
 
 use crate::absence::absent;
 use crate::columns::{Column, QUANTITIES, Quantity};
-use crate::conclusions::{Conclusion, conclusions};
+use crate::conclusions::{Identifiability, conclusions};
 use crate::excitation::{Excitation, excitation};
 use crate::falls::{Fall, falls};
-use crate::{Base, Log, TauSensor};
+use crate::{BaseMount, Log, TorqueSensor};
 
 /// What a log holds, for a person (`Display`) or a program (`Serialize`).
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Description {
+pub struct LogSummary {
     /// Number of rows.
     pub rows: usize,
     /// Recorded time, without the pauses between the parts of a log [s].
@@ -24,17 +24,17 @@ pub struct Description {
     /// What was recorded.
     pub channels: Vec<ChannelDescription>,
     /// What was not recorded, and what that costs.
-    pub absent: Vec<Absence>,
+    pub absent: Vec<MissingChannel>,
     /// How much each joint moved.
     pub joints: Vec<Excitation>,
     /// Where a robot with a floating base fell over; none where the log cannot tell.
     pub falls: Option<Vec<Fall>>,
     /// What the log can tell about each effect of the catalogue; empty for a motion.
-    pub conclusions: Vec<Conclusion>,
+    pub conclusions: Vec<Identifiability>,
     /// Columns of the file that were left out.
     pub ignored: Vec<String>,
     /// What is odd about the log and yet no error.
-    pub notes: Vec<String>,
+    pub warnings: Vec<String>,
 }
 
 /// When the rows of a log were taken; none where no segment has two rows.
@@ -64,7 +64,7 @@ pub struct SegmentDescription {
     /// Its name.
     pub name: String,
     /// What the trunk could do.
-    pub base: Base,
+    pub base: BaseMount,
     /// How often it was recorded: its parts without a break.
     pub parts: usize,
     /// Its rows.
@@ -88,28 +88,28 @@ pub struct ChannelDescription {
 
 /// One quantity that a log lacks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Absence {
+pub struct MissingChannel {
     /// The quantity, such as `tau_measured`.
     pub quantity: &'static str,
     /// The conclusion that cannot be drawn.
-    pub cost: &'static str,
+    pub consequence: &'static str,
 }
 
 impl Log {
     /// Describes the log.
-    pub fn describe(&self) -> Description {
+    pub fn describe(&self) -> LogSummary {
         let timing = self.timing();
-        let mut description = Description {
+        let mut description = LogSummary {
             rows: self.rows(),
             duration_s: self.duration_s(),
             segments: self.described_segments(),
             channels: self.described_channels(),
-            absent: absent(self).into_iter().map(|(quantity, cost)| Absence { quantity, cost }).collect(),
+            absent: absent(self).into_iter().map(|(quantity, cost)| MissingChannel { quantity, consequence: cost }).collect(),
             joints: self.joints().iter().filter_map(|joint| excitation(self, joint)).collect(),
             falls: falls(self),
             conclusions: Vec::new(),
             ignored: self.ignored().to_vec(),
-            notes: self.notes(&timing),
+            warnings: self.notes(&timing),
             timing,
         };
         description.conclusions = conclusions(self, &description);
@@ -174,20 +174,20 @@ impl Log {
         const TOLERANCE: f64 = 0.05;
         // No joint of a Go2 turns that far; degrees do.
         const MOST: f64 = 7.0;
-        let mut notes = self.reading_notes().to_vec();
+        let mut notes = self.read_warnings().to_vec();
         if let Some(rate) = timing.rate_hz
             && (rate / timing.stated_rate_hz - 1.0).abs() > TOLERANCE
         {
             notes.push(format!("rows come at {rate:.1} Hz, but the meta file says {} Hz", timing.stated_rate_hz));
         }
         let torque = self.joints().iter().any(|joint| self.tau_measured(joint).is_some());
-        if torque && self.meta().tau_sensor == TauSensor::None {
+        if torque && self.meta().tau_sensor == TorqueSensor::None {
             notes.push(
                 "there is tau_measured, but by the meta file's `tau_sensor` no torque was measured: it is not compared"
                     .to_owned(),
             );
         }
-        if !torque && self.meta().tau_sensor != TauSensor::None {
+        if !torque && self.meta().tau_sensor != TorqueSensor::None {
             notes.push("the meta file names a `tau_sensor`, but there is no tau_measured".to_owned());
         }
         for quantity in ["q", "q_cmd"] {

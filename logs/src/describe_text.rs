@@ -2,26 +2,26 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use crate::conclusions::Verdict;
-use crate::describe::{ChannelDescription, Description, Timing};
+use crate::conclusions::IdentifiabilityLevel;
+use crate::describe::{ChannelDescription, LogSummary, Timing};
 use crate::excitation::{Excitation, SpeedSource, TorqueSource};
 use crate::falls::Fall;
-use crate::{Base, Conclusion};
+use crate::{BaseMount, Identifiability};
 
-impl Display for Description {
+impl Display for LogSummary {
     fn fmt(&self, out: &mut Formatter<'_>) -> fmt::Result {
         writeln!(out, "{} rows, {:.2} s", self.rows, self.duration_s)?;
         self.timing.fmt(out)?;
         section(out, "segments", &self.segments, |segment| {
             let base = match segment.base {
-                Base::Fixed => "fixed",
-                Base::Floating => "floating",
+                BaseMount::Fixed => "fixed",
+                BaseMount::Floating => "floating",
             };
             let parts = if segment.parts == 1 { String::new() } else { format!(" in {} parts", segment.parts) };
             format!("{:<14} base {base}, {} rows, {:.2} s{parts}", segment.name, segment.rows, segment.duration_s)
         })?;
         section(out, "channels", &self.channels, channel)?;
-        section(out, "absent", &self.absent, |absence| format!("{:<14} {}", absence.quantity, absence.cost))?;
+        section(out, "absent", &self.absent, |absence| format!("{:<14} {}", absence.quantity, absence.consequence))?;
         joints(out, &self.joints)?;
         if let Some(falls) = &self.falls {
             match falls.as_slice() {
@@ -31,7 +31,7 @@ impl Display for Description {
         }
         section(out, "what this log can tell", &self.conclusions, conclusion)?;
         section(out, "ignored columns", &self.ignored, String::clone)?;
-        section(out, "notes", &self.notes, String::clone)
+        section(out, "notes", &self.warnings, String::clone)
     }
 }
 
@@ -105,7 +105,7 @@ fn joints(out: &mut Formatter<'_>, joints: &[Excitation]) -> fmt::Result {
             percent(joint.torque_max, joint.torque_limit)
         )?;
         let band = joint.band_hz.map_or_else(|| "–".to_owned(), |[low, high]| format!("{low:.2}–{high:.2}"));
-        writeln!(out, "  {:6}  {band:>10}", joint.turns)?;
+        writeln!(out, "  {:6}  {band:>10}", joint.reversals)?;
     }
     if derived {
         writeln!(out, "  speed is derived from position by differences")?;
@@ -133,11 +133,11 @@ fn fall(fall: &Fall) -> String {
     format!("{:<14} at {:.2} s (row {}){tilt}{height}", fall.segment, fall.t, fall.row)
 }
 
-fn conclusion(conclusion: &Conclusion) -> String {
+fn conclusion(conclusion: &Identifiability) -> String {
     let verdict = match conclusion.verdict {
-        Verdict::Can => "can",
-        Verdict::Weakly => "weakly",
-        Verdict::Cannot => "cannot",
+        IdentifiabilityLevel::Identifiable => "can",
+        IdentifiabilityLevel::Weak => "weakly",
+        IdentifiabilityLevel::NotIdentifiable => "cannot",
     };
-    format!("{:<20} {verdict:<7} {}", conclusion.effect, conclusion.because)
+    format!("{:<20} {verdict:<7} {}", conclusion.effect, conclusion.reason)
 }

@@ -7,7 +7,7 @@ use crate::CdrError;
 
 /// One cell of a data file.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Place {
+pub struct CellLocation {
     /// The data file.
     pub file: PathBuf,
     /// The column's name.
@@ -18,7 +18,7 @@ pub struct Place {
     pub line: Option<u64>,
 }
 
-impl fmt::Display for Place {
+impl fmt::Display for CellLocation {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(formatter, "`{}`, column `{}`, row {}", self.file.display(), self.column, self.row)?;
         self.line.map_or(Ok(()), |line| write!(formatter, " (line {line})"))
@@ -129,7 +129,7 @@ pub enum LogError {
     #[error("{place}: `{text}` is not a number\n  leave a cell of an optional column empty where nothing is known")]
     NotANumber {
         /// Where.
-        place: Place,
+        place: CellLocation,
         /// The cell.
         text: String,
     },
@@ -139,7 +139,7 @@ pub enum LogError {
     )]
     MissingCell {
         /// Where.
-        place: Place,
+        place: CellLocation,
     },
     /// A cell is infinite.
     #[error(
@@ -147,7 +147,7 @@ pub enum LogError {
     )]
     NotFinite {
         /// Where.
-        place: Place,
+        place: CellLocation,
         /// The cell.
         value: f64,
     },
@@ -155,7 +155,7 @@ pub enum LogError {
     #[error("{place} is {value}, but it must be a whole number from 0\n  leave the column out where it never changes")]
     NotAnIndex {
         /// Where.
-        place: Place,
+        place: CellLocation,
         /// The cell.
         value: f64,
     },
@@ -166,7 +166,7 @@ pub enum LogError {
     )]
     TimeNotIncreasing {
         /// Where.
-        place: Place,
+        place: CellLocation,
         /// The cell [s].
         t: f64,
         /// The cell before it [s].
@@ -178,7 +178,7 @@ pub enum LogError {
     )]
     UnknownSegment {
         /// Where.
-        place: Place,
+        place: CellLocation,
         /// The cell.
         segment: u32,
         /// Number of described segments.
@@ -190,7 +190,7 @@ pub enum LogError {
     )]
     NegativeGain {
         /// Where.
-        place: Place,
+        place: CellLocation,
         /// The cell.
         gain: f64,
     },
@@ -200,7 +200,7 @@ pub enum LogError {
     )]
     QuaternionNorm {
         /// Where; the column is `quat_w`.
-        place: Place,
+        place: CellLocation,
         /// The norm.
         norm: f64,
     },
@@ -290,7 +290,7 @@ pub enum LogError {
     )]
     NotInMcap {
         /// Where, in the log to write.
-        place: Place,
+        place: CellLocation,
         /// The cell.
         value: f64,
         /// What fits.

@@ -4,7 +4,7 @@ use serde::Serialize;
 use twinstep_model::{Joint, JointModel, go2};
 
 use crate::describe::{largest, quantile};
-use crate::{Log, TauSensor};
+use crate::{Log, TorqueSensor};
 
 /// How much a joint moved; of a motion, how much it is told to.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -34,7 +34,7 @@ pub struct Excitation {
     /// Whether the torque was measured, or is what the PD law asks for.
     pub torque_from: TorqueSource,
     /// How often the velocity changed its sign; speeds below a twentieth of the highest do not count.
-    pub turns: usize,
+    pub reversals: usize,
     /// Frequencies of the motion [Hz]: what half of a time between two turns stands for, between its 10 % and 90 % quantiles.
     pub band_hz: Option<[f64; 2]>,
 }
@@ -71,7 +71,7 @@ pub(crate) fn excitation(log: &Log, joint: &str) -> Option<Excitation> {
     let speeds = || velocity.iter().flatten().map(|(_, dq)| dq.abs());
     let speed_max = largest(speeds());
     let (torque, torque_from) = torque(log, joint);
-    let turns = turns(&velocity, 0.05 * speed_max.unwrap_or(0.0));
+    let turns = reversal_times(&velocity, 0.05 * speed_max.unwrap_or(0.0));
     Some(Excitation {
         joint: joint.to_owned(),
         q_min,
@@ -85,7 +85,7 @@ pub(crate) fn excitation(log: &Log, joint: &str) -> Option<Excitation> {
         torque_rms: root_mean_square(torque.iter().copied()),
         torque_limit: known.map(|model| model.torque_limit),
         torque_from,
-        turns: turns.iter().map(Vec::len).sum(),
+        reversals: turns.iter().map(Vec::len).sum(),
         band_hz: band(&turns),
     })
 }
@@ -113,7 +113,7 @@ pub(crate) fn velocity(log: &Log, joint: &str, q: &[f64]) -> (Velocity, SpeedSou
 
 /// The measured torque, or that of the PD law; empty where neither is known.
 fn torque(log: &Log, joint: &str) -> (Vec<f64>, TorqueSource) {
-    if let Some(measured) = log.tau_measured(joint).filter(|_| log.meta().tau_sensor != TauSensor::None) {
+    if let Some(measured) = log.tau_measured(joint).filter(|_| log.meta().tau_sensor != TorqueSensor::None) {
         return (measured.to_vec(), TorqueSource::Measured);
     }
     let (Some(q), Some(q_cmd)) = (log.q(joint), log.q_cmd(joint)) else { return (Vec::new(), TorqueSource::Commanded) };
@@ -129,7 +129,7 @@ fn torque(log: &Log, joint: &str) -> (Vec<f64>, TorqueSource) {
 }
 
 /// The times at which the velocity has changed its sign and exceeds `threshold`, part by part [s].
-fn turns(velocity: &Velocity, threshold: f64) -> Vec<Vec<f64>> {
+fn reversal_times(velocity: &Velocity, threshold: f64) -> Vec<Vec<f64>> {
     let of_part = |part: &Vec<(f64, f64)>| {
         let mut sign = 0.0;
         let mut turns = Vec::new();

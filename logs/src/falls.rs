@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use crate::{Base, Log};
+use crate::{BaseMount, Log};
 
 /// Cosine of the tilt beyond which the robot has fallen: 60°.
 const FALLEN_COSINE: f64 = 0.5;
@@ -27,14 +27,14 @@ pub struct Fall {
 /// The falls in the parts with a floating base; none at all where neither orientation nor height is known.
 pub(crate) fn falls(log: &Log) -> Option<Vec<Fall>> {
     let (x, y, height) = (log.channel("quat_x"), log.channel("quat_y"), log.channel("pos_z"));
-    let floating = log.segments().any(|(segment, _)| segment.base == Base::Floating);
+    let floating = log.segments().any(|(segment, _)| segment.base == BaseMount::Floating);
     if !floating || ((x.is_none() || y.is_none()) && height.is_none()) {
         return None;
     }
     let cosine = |row: usize| Some(1.0 - 2.0 * (x?[row].powi(2) + y?[row].powi(2))).filter(|cosine| !cosine.is_nan());
     let metres = |row: usize| Some(height?[row]).filter(|metres| !metres.is_nan());
     let mut falls = Vec::new();
-    for (segment, rows) in log.segments().filter(|(segment, _)| segment.base == Base::Floating) {
+    for (segment, rows) in log.segments().filter(|(segment, _)| segment.base == BaseMount::Floating) {
         let mut heights: Vec<f64> = rows.clone().filter_map(metres).collect();
         heights.sort_by(f64::total_cmp);
         let low = crate::describe::quantile(&heights, 0.5).map(|median| FALLEN_HEIGHT * median);

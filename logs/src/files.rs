@@ -89,7 +89,7 @@ fn meta_names(stem: &str) -> [String; 2] {
 }
 
 /// The file of the log at `input` that writing a log to `output` would replace.
-pub fn would_replace(input: &Path, output: &Path) -> Result<Option<PathBuf>, LogError> {
+pub fn overwritten_file(input: &Path, output: &Path) -> Result<Option<PathBuf>, LogError> {
     let (input, output) = (Files::find(input)?, Files::choose(output)?);
     let of = |files: Files| [Some(files.data), files.meta].into_iter().flatten();
     let written: Vec<_> = of(output).filter_map(|file| file.canonicalize().ok()).collect();

@@ -4,7 +4,7 @@
 
 use twinstep_model::{Joint, Leg, NUM_JOINTS};
 
-use crate::cdr::{Message, Walk};
+use crate::cdr::{Message, FieldVisitor};
 
 /// Motors in a message after the robot's own.
 const MOTORS_WITHOUT_JOINT: usize = 20 - NUM_JOINTS;
@@ -83,7 +83,7 @@ pub(crate) struct MotorCmd {
 impl Message for LowState {
     const SIZE: usize = 1176;
 
-    fn walk(&mut self, fields: &mut impl Walk) {
+    fn visit_fields(&mut self, fields: &mut impl FieldVisitor) {
         head(fields);
         fields.array(&mut self.quaternion);
         fields.array(&mut self.gyroscope);
@@ -122,7 +122,7 @@ impl Message for LowState {
 impl Message for LowCmd {
     const SIZE: usize = 808;
 
-    fn walk(&mut self, fields: &mut impl Walk) {
+    fn visit_fields(&mut self, fields: &mut impl FieldVisitor) {
         head(fields);
         for motor in self.motors.iter_mut().chain(&mut [MotorCmd::default(); MOTORS_WITHOUT_JOINT]) {
             fields.value(&mut motor.mode);
@@ -141,7 +141,7 @@ impl Message for LowCmd {
 }
 
 /// What both messages begin with: head, level_flag, frame_reserve, serial number, version, bandwidth.
-fn head(fields: &mut impl Walk) {
+fn head(fields: &mut impl FieldVisitor) {
     fields.array(&mut [0xfe_u8, 0xef, 0xff, 0]);
     fields.unused::<u32>(4);
     fields.unused::<u16>(1);

@@ -49,11 +49,11 @@ mod table;
 mod write;
 
 pub use cdr::CdrError;
-pub use conclusions::{Conclusion, Verdict};
-pub use describe::{Absence, ChannelDescription, Description, SegmentDescription, Timing};
-pub use error::{LogError, Place};
+pub use conclusions::{Identifiability, IdentifiabilityLevel};
+pub use describe::{MissingChannel, ChannelDescription, LogSummary, SegmentDescription, Timing};
+pub use error::{LogError, CellLocation};
 pub use excitation::{Excitation, SpeedSource, TorqueSource};
 pub use falls::Fall;
-pub use files::would_replace;
+pub use files::overwritten_file;
 pub use log::Log;
-pub use meta::{Base, Gain, Meta, Segment, TauSensor};
+pub use meta::{BaseMount, Gain, Meta, Segment, TorqueSensor};

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use twinstep_model::Joint;
 
-use crate::check::{self, Need};
+use crate::check::{self, LogKind};
 use crate::columns::Column;
 use crate::files::{Files, Format};
 use crate::meta::{Gain, Meta, Segment};
@@ -37,24 +37,24 @@ impl Log {
     /// file `walk.csv` is `walk.json`, or `meta.json`. MCAP needs no description: a log that [`Log::write`] wrote
     /// carries its own, and of any other recording one is made of what it holds.
     pub fn open(path: impl AsRef<Path>) -> Result<Log, LogError> {
-        read(path.as_ref(), Need::Measurement)
+        read(path.as_ref(), LogKind::Measurement)
     }
 
     /// Reads a motion: a log that needs command columns only, and no gains.
     ///
     /// A measured log is also a motion.
-    pub fn open_motion(path: impl AsRef<Path>) -> Result<Log, LogError> {
-        read(path.as_ref(), Need::Motion)
+    pub fn open_commands(path: impl AsRef<Path>) -> Result<Log, LogError> {
+        read(path.as_ref(), LogKind::Commands)
     }
 
     /// Makes a log of columns in memory, checked like a file; a missing cell is NaN.
     pub fn new(meta: Meta, columns: impl IntoIterator<Item = (String, Vec<f64>)>) -> Result<Log, LogError> {
-        from_columns(meta, columns, Need::Measurement)
+        from_columns(meta, columns, LogKind::Measurement)
     }
 
     /// Makes a motion of command columns in memory.
-    pub fn new_motion(meta: Meta, columns: impl IntoIterator<Item = (String, Vec<f64>)>) -> Result<Log, LogError> {
-        from_columns(meta, columns, Need::Motion)
+    pub fn new_commands(meta: Meta, columns: impl IntoIterator<Item = (String, Vec<f64>)>) -> Result<Log, LogError> {
+        from_columns(meta, columns, LogKind::Commands)
     }
 
     /// What the log says of itself.
@@ -93,7 +93,7 @@ impl Log {
     }
 
     /// What was odd about the file and yet no error, in sentences.
-    pub fn reading_notes(&self) -> &[String] {
+    pub fn read_warnings(&self) -> &[String] {
         &self.notes
     }
 
@@ -109,7 +109,7 @@ impl Log {
 
     /// The log's parts: rows that follow one another in one segment of one episode.
     pub fn segments(&self) -> impl Iterator<Item = (&Segment, Range<usize>)> {
-        parts(&self.segment, &self.episode).map(|rows| (&self.meta.segments[self.segment[rows.start] as usize], rows))
+        contiguous_ranges(&self.segment, &self.episode).map(|rows| (&self.meta.segments[self.segment[rows.start] as usize], rows))
     }
 
     /// A channel by its column name, such as `gyro_x`; a missing cell is NaN.
@@ -238,7 +238,7 @@ impl ColumnCells<'_> {
 }
 
 /// The ranges of rows within which neither segment nor episode changes.
-pub(crate) fn parts<'a>(segment: &'a [u32], episode: &'a [u32]) -> impl Iterator<Item = Range<usize>> + use<'a> {
+pub(crate) fn contiguous_ranges<'a>(segment: &'a [u32], episode: &'a [u32]) -> impl Iterator<Item = Range<usize>> + use<'a> {
     let rows = segment.len();
     let mut start = 0;
     std::iter::from_fn(move || {
@@ -253,7 +253,7 @@ pub(crate) fn parts<'a>(segment: &'a [u32], episode: &'a [u32]) -> impl Iterator
     })
 }
 
-fn read(path: &Path, need: Need) -> Result<Log, LogError> {
+fn read(path: &Path, need: LogKind) -> Result<Log, LogError> {
     let files = Files::find(path)?;
     let meta = files.meta.as_deref().map(Meta::read).transpose()?;
     let meta_file = files.meta.as_ref().unwrap_or(&files.data);
@@ -273,7 +273,7 @@ fn read(path: &Path, need: Need) -> Result<Log, LogError> {
 fn from_columns(
     meta: Meta,
     columns: impl IntoIterator<Item = (String, Vec<f64>)>,
-    need: Need,
+    need: LogKind,
 ) -> Result<Log, LogError> {
     // What errors call a log that is in no file.
     let here = Path::new("columns in memory");

@@ -14,7 +14,7 @@ use twinstep_model::{Joint, Leg};
 use crate::cdr;
 use crate::go2_message::{LowCmd, LowState, MotorCmd, MotorState, NO_POSITION, NO_VELOCITY, SERVO, foot, motor};
 use crate::table::Table;
-use crate::{Base, Log, LogError, Meta, Place, Segment, TauSensor};
+use crate::{BaseMount, Log, LogError, Meta, CellLocation, Segment, TorqueSensor};
 
 /// The topic where each segment of each episode begins, in logs that we write.
 const PART_TOPIC: &str = "/twinstep/part";
@@ -32,7 +32,7 @@ const NANOSECONDS: f64 = 1e9;
 
 /// Where a segment of an episode begins.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-struct Part {
+struct SegmentStart {
     segment: u32,
     episode: u32,
     /// The log's time of its first row [s].
@@ -44,13 +44,13 @@ struct Part {
 struct Recording {
     states: Vec<(u64, LowState)>,
     commands: Vec<(u64, LowCmd)>,
-    parts: Vec<(u64, Part)>,
+    parts: Vec<(u64, SegmentStart)>,
     /// In a log that we wrote, its description and columns.
     about: Option<(Meta, Vec<String>)>,
     schemas: BTreeMap<u16, String>,
     channels: BTreeMap<u16, Channel>,
     /// Whether the file ends too early.
-    cut: bool,
+    truncated: bool,
 }
 
 /// A channel of the file, and how many messages it has.
@@ -81,18 +81,18 @@ pub(crate) fn read(file: &Path, beside: Option<Meta>) -> Result<(Table, Meta), L
     let (table, rate_hz) = recording.table(file, columns)?;
     let meta = match (about, beside) {
         (Some((meta, _)), _) | (None, Some(meta)) => meta,
-        (None, None) => guessed(&table, rate_hz),
+        (None, None) => default_meta(&table, rate_hz),
     };
     Ok((table, meta))
 }
 
 /// The description of a recording that has none.
-fn guessed(table: &Table, rate_hz: f64) -> Meta {
+fn default_meta(table: &Table, rate_hz: f64) -> Meta {
     let whole = rate_hz.round();
     let rate_hz = if (rate_hz / whole - 1.0).abs() < 0.02 { whole } else { rate_hz };
     let torque = table.columns.iter().any(|(name, _)| name.starts_with("tau_measured_"));
-    let tau_sensor = if torque { TauSensor::Current } else { TauSensor::None };
-    let segment = Segment { name: "recording".to_owned(), base: Base::Floating };
+    let tau_sensor = if torque { TorqueSensor::MotorCurrent } else { TorqueSensor::None };
+    let segment = Segment { name: "recording".to_owned(), base: BaseMount::Floating };
     Meta {
         source: Some("unitree_go LowState and LowCmd in MCAP".to_owned()),
         ..Meta::new(rate_hz, tau_sensor, vec![segment])
@@ -118,7 +118,7 @@ impl Recording {
                 }
                 // A recorder that lost its power has whole chunks up to there, which are worth reading.
                 Err(McapError::UnexpectedEof) if !recording.states.is_empty() => {
-                    recording.cut = true;
+                    recording.truncated = true;
                     break;
                 }
                 Err(cause) => return Err(damaged(cause)),
@@ -135,7 +135,7 @@ impl Recording {
                 self.channels.insert(channel.id, Channel { topic: channel.topic, content, messages: 0 });
             }
             Record::Message { header, data } => self.message(file, &header, &data)?,
-            Record::Metadata(metadata) if metadata.name == METADATA => self.about = Some(about(file, &metadata)?),
+            Record::Metadata(metadata) if metadata.name == METADATA => self.about = Some(read_metadata(file, &metadata)?),
             _ => {}
         }
         Ok(())
@@ -200,7 +200,7 @@ impl Recording {
     /// The columns of all rows, and the rate of the states [Hz].
     fn table(mut self, file: &Path, written: Option<&[String]>) -> Result<(Table, f64), LogError> {
         let mut notes = Vec::new();
-        if self.cut {
+        if self.truncated {
             let rows = self.states.len();
             notes.push(format!("the MCAP file is cut off: these are the {rows} states of its whole chunks"));
         }
@@ -225,16 +225,16 @@ impl Recording {
             });
         }
         note_count(&mut notes, start, "before the first command left out");
-        let mut rows: Vec<Row> = (start..self.states.len())
+        let mut rows: Vec<StateWithCommand> = (start..self.states.len())
             .filter_map(|row| {
-                Some(Row {
+                Some(StateWithCommand {
                     time: self.states[row].0,
                     state: &self.states[row].1,
                     command: self.commands[in_force[row]?].1.clone(),
                 })
             })
             .collect();
-        let stopped = rows.iter_mut().map(Row::take_stops).sum::<usize>();
+        let stopped = rows.iter_mut().map(StateWithCommand::normalise_stop_commands).sum::<usize>();
         if stopped > 0 {
             notes.push(format!(
                 "{stopped} motor commands without a position or with a stopped motor are read as gains of 0"
@@ -288,15 +288,15 @@ fn median_step(states: &[(u64, LowState)]) -> u64 {
 }
 
 /// A state with the command in force from it to the next.
-struct Row<'a> {
+struct StateWithCommand<'a> {
     time: u64,
     state: &'a LowState,
     command: LowCmd,
 }
 
-impl Row<'_> {
+impl StateWithCommand<'_> {
     /// Says with gains what the robot says with marks: no position, no velocity, a stopped motor. Counts them.
-    fn take_stops(&mut self) -> usize {
+    fn normalise_stop_commands(&mut self) -> usize {
         let mut stops = 0;
         for (command, state) in self.command.motors.iter_mut().zip(&self.state.motors) {
             if command.mode == 0 {
@@ -319,9 +319,9 @@ impl Row<'_> {
 type OfMotor = fn(&MotorState, &MotorCmd) -> f32;
 
 /// All columns; of a log that we wrote those it had, else those that are not zero throughout.
-fn columns(rows: &[Row<'_>], parts: &[(u64, Part)], written: Option<&[String]>) -> Vec<(String, Vec<f64>)> {
+fn columns(rows: &[StateWithCommand<'_>], parts: &[(u64, SegmentStart)], written: Option<&[String]>) -> Vec<(String, Vec<f64>)> {
     let had = |name: &str| written.is_none_or(|written| written.iter().any(|column| column == name));
-    let column = |of: &dyn Fn(&Row<'_>) -> f32| rows.iter().map(|row| f64::from(of(row))).collect::<Vec<_>>();
+    let column = |of: &dyn Fn(&StateWithCommand<'_>) -> f32| rows.iter().map(|row| f64::from(of(row))).collect::<Vec<_>>();
     let joints: Vec<Joint> = Joint::ALL.into_iter().filter(|joint| had(&format!("q_cmd_{joint}"))).collect();
     let mut columns = time_columns(rows, parts);
 
@@ -382,9 +382,9 @@ fn columns(rows: &[Row<'_>], parts: &[(u64, Part)], written: Option<&[String]>) 
 }
 
 /// `t`, and where the file has parts, `segment` and `episode`.
-fn time_columns(rows: &[Row<'_>], parts: &[(u64, Part)]) -> Vec<(String, Vec<f64>)> {
+fn time_columns(rows: &[StateWithCommand<'_>], parts: &[(u64, SegmentStart)]) -> Vec<(String, Vec<f64>)> {
     let first = rows.first().map_or(0, |row| row.time);
-    let whole = (first, Part { segment: 0, episode: 0, t: 0.0 });
+    let whole = (first, SegmentStart { segment: 0, episode: 0, t: 0.0 });
     let mut at = 0;
     let (mut t, mut segment, mut episode) = (Vec::new(), Vec::new(), Vec::new());
     for row in rows {
@@ -403,7 +403,7 @@ fn time_columns(rows: &[Row<'_>], parts: &[(u64, Part)]) -> Vec<(String, Vec<f64
     columns
 }
 
-fn about(file: &Path, metadata: &Metadata) -> Result<(Meta, Vec<String>), LogError> {
+fn read_metadata(file: &Path, metadata: &Metadata) -> Result<(Meta, Vec<String>), LogError> {
     let wrong = |cause| LogError::MetaSyntax { file: file.into(), cause };
     let text = |key: &str| metadata.metadata.get(key).map_or("", String::as_str);
     let meta: Meta = serde_json::from_str(text("meta")).map_err(wrong)?;
@@ -466,7 +466,7 @@ fn write_messages(
                 writer.write_to_known_channel(&header, data)
             };
             if row == rows.start {
-                let part = Part { segment: log.segment()[row], episode: log.episode()[row], t: log.t()[row] };
+                let part = SegmentStart { segment: log.segment()[row], episode: log.episode()[row], t: log.t()[row] };
                 send(parts, serde_json::to_string(&part).unwrap_or_default().as_bytes())?;
             }
             send(states, &cdr::encode(&mut state(log, joints, row)))?;
@@ -537,7 +537,7 @@ fn check_range(log: &Log, file: &Path) -> Result<(), LogError> {
             _ => (-SINGLE, SINGLE, "numbers up to 3.4e38"),
         };
         if let Some(row) = cells.iter().position(|cell| *cell < low || *cell > high) {
-            let place = Place { file: file.into(), column: column.to_owned(), row: row + 1, line: None };
+            let place = CellLocation { file: file.into(), column: column.to_owned(), row: row + 1, line: None };
             return Err(LogError::NotInMcap { place, value: cells[row], range });
         }
     }

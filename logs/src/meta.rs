@@ -21,7 +21,7 @@ pub struct Meta {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub joints: Vec<String>,
     /// Where `tau_measured` was measured.
-    pub tau_sensor: TauSensor,
+    pub tau_sensor: TorqueSensor,
     /// What the column `segment` is an index into.
     pub segments: Vec<Segment>,
     /// How commands were held and clipped, in words.
@@ -47,11 +47,11 @@ pub struct Meta {
 /// Where the torque of a log was measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum TauSensor {
+pub enum TorqueSensor {
     /// Motor current × torque constant.
-    Current,
+    MotorCurrent,
     /// At the joint's output.
-    Output,
+    JointOutput,
     /// Nowhere.
     None,
 }
@@ -59,7 +59,7 @@ pub enum TauSensor {
 /// What the trunk could do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Base {
+pub enum BaseMount {
     /// Held by a stand.
     Fixed,
     /// Free to move.
@@ -73,7 +73,7 @@ pub struct Segment {
     /// What was done, such as `air_chirp`.
     pub name: String,
     /// What the trunk could do.
-    pub base: Base,
+    pub base: BaseMount,
 }
 
 /// A gain that is constant over the log.
@@ -81,14 +81,14 @@ pub struct Segment {
 #[serde(untagged, expecting = "a gain must be a number, or a list with one number for each joint")]
 pub enum Gain {
     /// The same for all joints.
-    Same(f64),
+    Uniform(f64),
     /// One for each joint, in the order of [`Meta::joints`].
     PerJoint(Vec<f64>),
 }
 
 impl Meta {
     /// A description that says only what it must.
-    pub fn new(rate_hz: f64, tau_sensor: TauSensor, segments: Vec<Segment>) -> Meta {
+    pub fn new(rate_hz: f64, tau_sensor: TorqueSensor, segments: Vec<Segment>) -> Meta {
         Meta {
             rate_hz,
             policy_hz: None,
@@ -161,14 +161,14 @@ impl Gain {
     /// The gain of the joint at `index`.
     pub fn of(&self, index: usize) -> Option<f64> {
         match self {
-            Gain::Same(gain) => Some(*gain),
+            Gain::Uniform(gain) => Some(*gain),
             Gain::PerJoint(gains) => gains.get(index).copied(),
         }
     }
 
     fn values(&self) -> &[f64] {
         match self {
-            Gain::Same(gain) => std::slice::from_ref(gain),
+            Gain::Uniform(gain) => std::slice::from_ref(gain),
             Gain::PerJoint(gains) => gains,
         }
     }

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use crate::columns::Column;
-use crate::{LogError, Place};
+use crate::{LogError, CellLocation};
 
 /// Known columns with a cell for each row, in the file's order.
 #[derive(Debug)]
@@ -45,9 +45,9 @@ impl Table {
     }
 
     /// Names the cell in `column` at `row`, which counts from 0 here.
-    pub fn place(&self, column: &str, row: usize) -> Place {
+    pub fn place(&self, column: &str, row: usize) -> CellLocation {
         let line = self.lines.get(row).copied();
-        Place { file: self.file.clone(), column: column.to_owned(), row: row + 1, line }
+        CellLocation { file: self.file.clone(), column: column.to_owned(), row: row + 1, line }
     }
 
     /// The cells of a column.

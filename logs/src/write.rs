@@ -29,7 +29,7 @@ impl Log {
     }
 
     /// The columns that the format of the data file `path` cannot hold.
-    pub fn left_out_of(&self, path: impl AsRef<Path>) -> Vec<String> {
+    pub fn unsupported_columns(&self, path: impl AsRef<Path>) -> Vec<String> {
         match Files::choose(path.as_ref()) {
             Ok(Files { format: Format::Mcap, .. }) => mcap_file::left_out(self),
             _ => Vec::new(),

@@ -3,7 +3,7 @@
 use std::any::Any;
 use std::sync::Arc;
 
-use crate::{Command, Ground, PerJoint, Placement, RobotModel, RobotStates};
+use crate::{Command, Ground, PerJoint, InitialState, RobotModel, RobotStates};
 
 /// Many robots that are commanded and observed together: a simulator, a replayed log or the real robot.
 pub trait Backend: Send {
@@ -27,10 +27,10 @@ pub trait Backend: Send {
     }
 
     /// Puts nominal robots down anew; each pair is a robot's index and its place.
-    fn reset(&mut self, placements: &[(usize, Placement)]) -> Result<(), BackendError>;
+    fn reset(&mut self, placements: &[(usize, InitialState)]) -> Result<(), BackendError>;
 
     /// Puts one robot down anew as `model`: the nominal robot with other numbers. It is that until its next reset.
-    fn reset_as(&mut self, robot: usize, model: &RobotModel, placement: &Placement) -> Result<(), BackendError>;
+    fn reset_with_model(&mut self, robot: usize, model: &RobotModel, placement: &InitialState) -> Result<(), BackendError>;
 
     /// Advances every robot that is `active` by `drive_periods` periods of the drive under its command.
     ///
@@ -69,13 +69,13 @@ pub trait Actuator: Send {
     fn restore(&mut self, robot: usize, snapshot: &ActuatorSnapshot);
 
     /// What this drive does not know about itself, if it can tell.
-    fn uncertainty(&mut self) -> Option<&mut dyn Uncertainty> {
+    fn uncertainty(&mut self) -> Option<&mut dyn EpistemicUncertainty> {
         None
     }
 }
 
 /// How little is known about what robots do; to be rewarded while data are collected (U2E equation 13).
-pub trait Uncertainty: Send {
+pub trait EpistemicUncertainty: Send {
     /// Writes what is unknown about each `active` robot [nat], as it is after its last drive period; the others stay.
     fn evaluate(&mut self, active: &[bool], uncertainty: &mut [f32]);
 }
@@ -111,7 +111,7 @@ pub enum BackendError {
     },
     /// A robot index is too large.
     #[error("robot {robot} does not exist; there are {num_robots}")]
-    NoSuchRobot {
+    RobotOutOfRange {
         /// The index that was asked for.
         robot: usize,
         /// The number of robots.
@@ -119,7 +119,7 @@ pub enum BackendError {
     },
     /// The drive cannot follow a command; nothing was stepped.
     #[error("the drive of robot {robot} cannot follow its command: {reason}; nothing was stepped")]
-    Command {
+    UnsupportedCommand {
         /// The robot.
         robot: usize,
         /// Why not.

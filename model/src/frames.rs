@@ -15,7 +15,7 @@ pub fn to_wxyz(rotation: Quat) -> [f32; 4] {
 
 /// Unit vector of gravity in the base frame; (0, 0, −1) for an upright robot (U2E eq. 14, `g_t`).
 #[inline]
-pub fn gravity_in_base(orientation_wxyz: [f32; 4]) -> Vec3 {
+pub fn projected_gravity(orientation_wxyz: [f32; 4]) -> Vec3 {
     world_from_base(orientation_wxyz).inverse() * Vec3::NEG_Z
 }
 
@@ -28,15 +28,15 @@ mod tests {
     #[test]
     fn nose_down_robot_feels_gravity_forward() {
         let nose_down = Quat::from_rotation_y(0.3);
-        let gravity = gravity_in_base(to_wxyz(nose_down));
+        let gravity = projected_gravity(to_wxyz(nose_down));
         assert!(gravity.x > 0.29 && gravity.y.abs() < 1e-6 && gravity.z < -0.95, "{gravity}");
     }
 
     proptest! {
         #[test]
         fn heading_does_not_change_gravity_in_the_base(yaw in -3.0f32..3.0, pitch in -1.0f32..1.0) {
-            let tilted = gravity_in_base(to_wxyz(Quat::from_rotation_y(pitch)));
-            let turned = gravity_in_base(to_wxyz(Quat::from_rotation_z(yaw) * Quat::from_rotation_y(pitch)));
+            let tilted = projected_gravity(to_wxyz(Quat::from_rotation_y(pitch)));
+            let turned = projected_gravity(to_wxyz(Quat::from_rotation_z(yaw) * Quat::from_rotation_y(pitch)));
             prop_assert!((tilted - turned).length() < 1e-5);
         }
     }

@@ -8,7 +8,7 @@
 use glam::{DQuat, DVec3, dvec3};
 
 use crate::{
-    Contact, Control, Derating, Joint, JointDrive, JointKind, JointModel, JointSpring, Leg, LegModel, RigidBody,
+    Contact, ControlConfig, Derating, Joint, ActuatorParams, JointKind, JointModel, JointSpring, Leg, LegModel, RigidBody,
     RobotModel, Shapes, Stribeck,
 };
 
@@ -87,10 +87,10 @@ fn joint(joint: Joint) -> JointModel {
         armature: 0.01,
         viscous_friction: 0.0,
         coulomb_friction: 0.0,
-        stribeck_friction: Stribeck { breakaway: 0.0, speed: 0.1 },
+        stribeck_friction: Stribeck { breakaway_torque: 0.0, stribeck_velocity: 0.1 },
         load_friction: 0.0,
-        spring: JointSpring { stiffness: 0.0, torque_at_zero: 0.0 },
-        drive: JointDrive::IDEAL,
+        spring: JointSpring { stiffness: 0.0, torque_offset: 0.0 },
+        actuator: ActuatorParams::IDEAL,
     }
 }
 
@@ -116,14 +116,14 @@ fn contact() -> Contact {
 
 /// Rates: U2E §IV-A (policy at 50 Hz, decimation 4). Gains and pose: those in use for 50 Hz policies of the Go2
 /// (kp 20–40, kd 0.5–1).
-fn control() -> Control {
+fn control() -> ControlConfig {
     let default_pose = Joint::ALL.map(|joint| match joint.kind {
         JointKind::Hip => 0.1 * joint.leg.left_sign(),
         JointKind::Thigh if joint.leg.front_sign() > 0.0 => 0.8,
         JointKind::Thigh => 1.0,
         JointKind::Calf => -1.5,
     });
-    Control { kp: 30.0, kd: 0.75, action_scale: 0.5, default_pose, drive_hz: 200.0, decimation: 4 }
+    ControlConfig { kp: 30.0, kd: 0.75, action_scale: 0.5, default_pose, actuator_hz: 200.0, decimation: 4 }
 }
 
 fn quat_wxyz([w, x, y, z]: [f64; 4]) -> DQuat {

@@ -7,7 +7,7 @@ use glam::Vec3;
 use crate::HeightField;
 
 /// The farthest that a picture shows a height field [m], and the most cells that it takes for that: 104 kB.
-const PICTURE_REACH: (f32, usize) = (8.0, 80);
+const RENDER_EXTENT: (f32, usize) = (8.0, 80);
 
 /// The ground under the robots: a plane, with a height field in place of a part of it.
 #[derive(Clone, Debug, PartialEq)]
@@ -43,18 +43,18 @@ impl Ground {
     /// Height [m] at which the centre of a ball of `radius` [m] above (`x`, `y`) touches nothing yet.
     ///
     /// Exact on a plane; on a height field it takes the steepest triangle near for all of them, and is never too low.
-    pub fn clear_height(&self, x: f32, y: f32, radius: f32) -> f32 {
+    pub fn clearance_height(&self, x: f32, y: f32, radius: f32) -> f32 {
         let (height, normal) = self.sample(x, y);
         match &self.height_field {
             None => height + radius / normal[2],
-            Some(field) => height + radius * field.steepest(x, y, radius).hypot(1.0),
+            Some(field) => height + radius * field.max_slope(x, y, radius).hypot(1.0),
         }
     }
 
     /// The ground for a picture of a robot at (`x`, `y`) [m]: of a height field only what is near.
-    pub fn around(&self, x: f32, y: f32) -> Ground {
+    pub fn crop(&self, x: f32, y: f32) -> Ground {
         let part = |field: &Arc<HeightField>| {
-            let (reach, most) = PICTURE_REACH;
+            let (reach, most) = RENDER_EXTENT;
             Arc::new(field.around(x, y, ((reach / field.cell()).ceil() as usize).min(most)))
         };
         Ground { height_field: self.height_field.as_ref().map(part), ..*self }
@@ -75,10 +75,10 @@ mod tests {
     proptest! {
         #[test]
         fn ball_at_its_clear_height_touches_no_vertex_and_no_triangle(seed: u64, x in -1.0f32..1.0, y in -1.0f32..1.0) {
-            let field = HeightField::rough(0.1, 0.05, 40, seed).expect("a field");
+            let field = HeightField::random_uniform(0.1, 0.05, 40, seed).expect("a field");
             let ground = Ground { height_field: Some(Arc::new(field)), ..Ground::FLAT };
             let radius = 0.05;
-            let centre = ground.clear_height(x, y, radius);
+            let centre = ground.clearance_height(x, y, radius);
             for index in 0..400 {
                 let (dx, dy) = ((index / 20) as f32 / 200.0 - 0.05, (index % 20) as f32 / 200.0 - 0.05);
                 let distance = Vec3::new(dx, dy, ground.height(x + dx, y + dy) - centre).length();
@@ -90,7 +90,7 @@ mod tests {
         fn plane_is_as_high_as_its_equation_says(angle in -1.0f32..1.0, x in -5.0f32..5.0, y in -5.0f32..5.0) {
             let ground = Ground { normal: [-angle.sin(), 0.0, angle.cos()], ..Ground::FLAT };
             prop_assert!((ground.height(x, y) - x * angle.tan()).abs() < 1e-4);
-            let centre = Vec3::new(x, y, ground.clear_height(x, y, 0.1));
+            let centre = Vec3::new(x, y, ground.clearance_height(x, y, 0.1));
             prop_assert!((ground.up().dot(centre) - 0.1).abs() < 1e-5);
         }
     }

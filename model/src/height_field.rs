@@ -13,7 +13,7 @@ pub struct HeightField {
     corner: [f32; 2],
     cell: f32,
     /// 1 / `cell`.
-    cells_a_metre: f32,
+    inv_cell_size: f32,
     rows: usize,
     columns: usize,
     heights: Vec<f32>,
@@ -72,7 +72,7 @@ impl HeightField {
                 return Err(HeightFieldError::NotFinite(name));
             }
         }
-        Ok(Self { corner, cell, cells_a_metre: 1.0 / cell, rows, columns, heights })
+        Ok(Self { corner, cell, inv_cell_size: 1.0 / cell, rows, columns, heights })
     }
 
     /// As [`HeightField::new`], with the grid's centre at the origin.
@@ -83,7 +83,7 @@ impl HeightField {
     /// A square of `cells` × `cells` around the origin, with heights drawn evenly from 0 to `height` [m].
     ///
     /// The rim is at height 0, so that the field ends level with a plane around it.
-    pub fn rough(height: f32, cell: f32, cells: usize, seed: u64) -> Result<Self, HeightFieldError> {
+    pub fn random_uniform(height: f32, cell: f32, cells: usize, seed: u64) -> Result<Self, HeightFieldError> {
         let mut stream = stream(seed, "rough", 0);
         let mut heights = Vec::with_capacity((cells + 1) * (cells + 1));
         for row in 0..=cells {
@@ -139,15 +139,15 @@ impl HeightField {
     /// Height [m] and its derivatives by x and y at (`x`, `y`) [m].
     #[inline]
     pub fn height_and_slope(&self, x: f32, y: f32) -> (f32, [f32; 2]) {
-        let (row, u, inside_x) = locate((x - self.corner[0]) * self.cells_a_metre, self.rows);
-        let (column, v, inside_y) = locate((y - self.corner[1]) * self.cells_a_metre, self.columns);
+        let (row, u, inside_x) = locate((x - self.corner[0]) * self.inv_cell_size, self.rows);
+        let (column, v, inside_y) = locate((y - self.corner[1]) * self.inv_cell_size, self.columns);
         let [near, far_x, far_y, far] = self.cell_heights(row, column);
         // Both triangles have the vertices `far_x` and `far_y`; the third one is `near` or `far`.
         let nearer = u + v <= 1.0;
         let (base, a, b) = if nearer { (near, u, v) } else { (far, u - 1.0, v - 1.0) };
         let rise_x = if nearer { far_x - near } else { far - far_y };
         let rise_y = if nearer { far_y - near } else { far - far_x };
-        let slope = [rise_x * self.cells_a_metre * inside_x, rise_y * self.cells_a_metre * inside_y];
+        let slope = [rise_x * self.inv_cell_size * inside_x, rise_y * self.inv_cell_size * inside_y];
         (base + a * rise_x + b * rise_y, slope)
     }
 
@@ -160,9 +160,9 @@ impl HeightField {
     }
 
     /// The greatest slope (rise over run) of the cells that come within `radius` [m] of (`x`, `y`) along either axis.
-    pub fn steepest(&self, x: f32, y: f32, radius: f32) -> f32 {
+    pub fn max_slope(&self, x: f32, y: f32, radius: f32) -> f32 {
         let range = |value: f32, corner: f32, count: usize| {
-            let cell = |value: f32| locate((value - corner) * self.cells_a_metre, count).0;
+            let cell = |value: f32| locate((value - corner) * self.inv_cell_size, count).0;
             cell(value - radius)..=cell(value + radius)
         };
         let mut steepest = 0.0f32;
@@ -174,13 +174,13 @@ impl HeightField {
                 steepest = steepest.max(lower).max(upper);
             }
         }
-        steepest * self.cells_a_metre
+        steepest * self.inv_cell_size
     }
 
     /// The part within `cells` cells of (`x`, `y`) [m] along either axis, with at least one cell.
     pub fn around(&self, x: f32, y: f32, cells: usize) -> HeightField {
         let range = |value: f32, corner: f32, count: usize| {
-            let (middle, ..) = locate((value - corner) * self.cells_a_metre, count);
+            let (middle, ..) = locate((value - corner) * self.inv_cell_size, count);
             (middle.saturating_sub(cells), (middle + 1 + cells).min(count - 1))
         };
         let (first_row, last_row) = range(x, self.corner[0], self.rows);
@@ -290,7 +290,7 @@ mod tests {
         fn nothing_near_is_steeper_than_the_steepest(field in any_field(), x in -1.0f32..1.0, y in -0.75f32..0.75,
             dx in -0.1f32..0.1, dy in -0.1f32..0.1) {
             let (_, [slope_x, slope_y]) = field.height_and_slope(x + dx, y + dy);
-            prop_assert!(slope_x.hypot(slope_y) <= field.steepest(x, y, 0.1) + 1e-5);
+            prop_assert!(slope_x.hypot(slope_y) <= field.max_slope(x, y, 0.1) + 1e-5);
         }
     }
 
@@ -303,9 +303,9 @@ mod tests {
 
     #[test]
     fn equal_seeds_give_equal_ground_within_the_height_and_level_at_the_rim() {
-        let field = HeightField::rough(0.05, 0.25, 80, 1).expect("a field");
-        assert_eq!(field, HeightField::rough(0.05, 0.25, 80, 1).expect("a field"));
-        assert_ne!(field, HeightField::rough(0.05, 0.25, 80, 2).expect("a field"));
+        let field = HeightField::random_uniform(0.05, 0.25, 80, 1).expect("a field");
+        assert_eq!(field, HeightField::random_uniform(0.05, 0.25, 80, 1).expect("a field"));
+        assert_ne!(field, HeightField::random_uniform(0.05, 0.25, 80, 2).expect("a field"));
         assert!(field.heights().iter().all(|height| (0.0..=0.05).contains(height)));
         let mean = field.heights().iter().sum::<f32>() / field.heights().len() as f32;
         assert!((mean - 0.025).abs() < 0.002, "{mean}");

@@ -7,7 +7,7 @@ use crate::{Joint, NUM_JOINTS, PerJoint, RobotModel};
 /// Number of bodies of the robot: the trunk and one behind each joint.
 pub const NUM_BODIES: usize = 1 + NUM_JOINTS;
 /// Height of the base [m] at which a held robot hangs: no foot reaches the ground.
-pub const HELD_HEIGHT: f64 = 1.0;
+pub const FIXED_BASE_HEIGHT: f64 = 1.0;
 
 /// Pose of a frame in another one.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -40,21 +40,21 @@ mod state;
 mod stream;
 mod vec_env;
 
-pub use backend::{Actuator, ActuatorSnapshot, Backend, BackendError, Uncertainty};
+pub use backend::{Actuator, ActuatorSnapshot, Backend, BackendError, EpistemicUncertainty};
 pub use body::RigidBody;
 pub use go2::go2;
 pub use ground::Ground;
 pub use height_field::{HeightField, HeightFieldError};
 pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};
-pub use kinematics::{HELD_HEIGHT, NUM_BODIES, Pose, body_poses};
-pub use mjcf::{MjcfBase, MjcfDrive, MjcfOptions, mjcf};
-pub use model_file::{EffectProblem, LearnedDrive, MemberDraw, ModelFile, ModelFileError};
+pub use kinematics::{FIXED_BASE_HEIGHT, NUM_BODIES, Pose, body_poses};
+pub use mjcf::{BaseMount, MjcfActuator, MjcfOptions, mjcf};
+pub use model_file::{EffectEntryError, ActuatorNetworkConfig, MemberSampling, ModelFile, ModelFileError};
 pub use robot::{
-    Contact, Control, Derating, JointDrive, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes, Stribeck,
+    Contact, ControlConfig, Derating, ActuatorParams, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes, Stribeck,
 };
-pub use rollout::{Job, Past, Precision, Rollout};
+pub use rollout::{RolloutRequest, HistoryStep, Precision, Rollout};
 pub use scene::{Scene, SceneShape, ShapeKind};
-pub use spec::{EnvSpec, Field};
-pub use state::{Command, Placement, RobotStates, RobotStatesMut, Variation};
+pub use spec::{EnvSpec, SpecField};
+pub use state::{Command, InitialState, RobotStates, RobotStatesMut, RandomisationSample};
 pub use stream::{Stream, standard_normal, stream};
 pub use vec_env::{AutoresetMode, EndedEpisode, EnvError, ResetRequest, StepBatch, VecEnv};

@@ -4,8 +4,8 @@ use std::fmt::Write as _;
 
 use glam::{DMat3, DVec3};
 
-use crate::kinematics::HELD_HEIGHT;
-use crate::{Ground, Joint, JointKind, Leg, Placement, RigidBody, RobotModel};
+use crate::kinematics::FIXED_BASE_HEIGHT;
+use crate::{Ground, Joint, JointKind, Leg, InitialState, RigidBody, RobotModel};
 
 /// Gravity of the model [m/s²].
 const GRAVITY: f64 = 9.81;
@@ -14,23 +14,23 @@ const GRAVITY: f64 = 9.81;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MjcfOptions {
     /// Whether the trunk moves.
-    pub base: MjcfBase,
+    pub base: BaseMount,
     /// One step of the physics [s].
     pub timestep: f64,
     /// What `ctrl` of the twelve actuators means.
-    pub drive: MjcfDrive,
+    pub actuator: MjcfActuator,
 }
 
 impl Default for MjcfOptions {
     /// A robot that moves freely, driven by torque at 1 kHz.
     fn default() -> Self {
-        Self { base: MjcfBase::Floating, timestep: 0.001, drive: MjcfDrive::Torque }
+        Self { base: BaseMount::Floating, timestep: 0.001, actuator: MjcfActuator::Torque }
     }
 }
 
 /// Whether the trunk of a MuJoCo model moves.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum MjcfBase {
+pub enum BaseMount {
     /// It has a free joint, and starts where the feet of the default pose touch the ground.
     Floating,
     /// It hangs 1 m above the ground.
@@ -39,7 +39,7 @@ pub enum MjcfBase {
 
 /// What drives the joints of a MuJoCo model; the actuators have the order of [`Joint::ALL`].
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum MjcfDrive {
+pub enum MjcfActuator {
     /// `ctrl` is torque [N·m], clipped to the joint's limit.
     Torque,
     /// `ctrl` is the wanted position [rad]; PD at every step of the physics, clipped to the joint's torque limit.
@@ -88,19 +88,19 @@ pub fn mjcf(robot: &RobotModel, options: &MjcfOptions) -> String {
     );
     trunk(&mut xml, robot, options.base, height);
     xml.close("worldbody");
-    actuators(&mut xml, robot, options.drive);
+    actuators(&mut xml, robot, options.actuator);
     keyframe(&mut xml, robot, options.base, height);
     xml.close("mujoco");
     xml.text
 }
 
-fn base_height(robot: &RobotModel, base: MjcfBase) -> f64 {
+fn base_height(robot: &RobotModel, base: BaseMount) -> f64 {
     match base {
-        MjcfBase::Floating => {
-            let standing = Placement::above(&Ground::FLAT, robot, robot.control.default_pose_f32(), 0.0);
+        BaseMount::Floating => {
+            let standing = InitialState::standing_on(&Ground::FLAT, robot, robot.control.default_pose_f32(), 0.0);
             f64::from(standing.base_position[2])
         }
-        MjcfBase::Fixed => HELD_HEIGHT,
+        BaseMount::Fixed => FIXED_BASE_HEIGHT,
     }
 }
 
@@ -124,9 +124,9 @@ fn defaults(xml: &mut Xml, robot: &RobotModel, timestep: f64) {
     xml.close("default");
 }
 
-fn trunk(xml: &mut Xml, robot: &RobotModel, base: MjcfBase, height: f64) {
+fn trunk(xml: &mut Xml, robot: &RobotModel, base: BaseMount, height: f64) {
     xml.open("body", &[("name", "trunk".to_owned()), ("pos", numbers([0.0, 0.0, height]))]);
-    if base == MjcfBase::Floating {
+    if base == BaseMount::Floating {
         xml.leaf("freejoint", &[("name", "base".to_owned())]);
     }
     inertial(xml, &robot.trunk);
@@ -186,15 +186,15 @@ fn inertial(xml: &mut Xml, body: &RigidBody) {
     xml.leaf("inertial", &[("pos", place), ("mass", mass), ("fullinertia", numbers(full))]);
 }
 
-fn actuators(xml: &mut Xml, robot: &RobotModel, drive: MjcfDrive) {
+fn actuators(xml: &mut Xml, robot: &RobotModel, drive: MjcfActuator) {
     xml.open("actuator", &[]);
     for joint in Joint::ALL {
         let limit = robot.joints[joint.index()].torque_limit;
         let name = joint.name().to_owned();
         let (named, range) = ([("name", name.clone()), ("joint", name)], numbers([-limit, limit]));
         match drive {
-            MjcfDrive::Torque => xml.leaf("motor", &[&named[..], &[("ctrlrange", range)]].concat()),
-            MjcfDrive::Position { kp, kd } => {
+            MjcfActuator::Torque => xml.leaf("motor", &[&named[..], &[("ctrlrange", range)]].concat()),
+            MjcfActuator::Position { kp, kd } => {
                 let gains = [("kp", kp.to_string()), ("kv", kd.to_string()), ("forcerange", range)];
                 xml.leaf("position", &[&named[..], &gains].concat());
             }
@@ -203,9 +203,9 @@ fn actuators(xml: &mut Xml, robot: &RobotModel, drive: MjcfDrive) {
     xml.close("actuator");
 }
 
-fn keyframe(xml: &mut Xml, robot: &RobotModel, base: MjcfBase, height: f64) {
+fn keyframe(xml: &mut Xml, robot: &RobotModel, base: BaseMount, height: f64) {
     let free = [0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0];
-    let free = if base == MjcfBase::Floating { &free[..] } else { &[] };
+    let free = if base == BaseMount::Floating { &free[..] } else { &[] };
     let qpos = numbers(free.iter().copied().chain(robot.control.default_pose));
     xml.open("keyframe", &[]);
     xml.leaf("key", &[("name", "default_pose".to_owned()), ("qpos", qpos)]);
@@ -311,7 +311,7 @@ mod tests {
     #[test]
     fn held_trunk_has_no_free_joint() {
         let [floating, fixed] =
-            [MjcfBase::Floating, MjcfBase::Fixed].map(|base| model(MjcfOptions { base, ..MjcfOptions::default() }));
+            [BaseMount::Floating, BaseMount::Fixed].map(|base| model(MjcfOptions { base, ..MjcfOptions::default() }));
         assert_eq!(floating.matches("<freejoint").count(), 1);
         assert_eq!(fixed.matches("<freejoint").count(), 0);
         let positions = |xml: &str| values(xml, "key", "qpos")[0].split(' ').count();
@@ -320,8 +320,8 @@ mod tests {
 
     #[test]
     fn position_drive_has_the_gains_and_the_torque_limit() {
-        let drive = MjcfDrive::Position { kp: 40.0, kd: 1.0 };
-        let xml = model(MjcfOptions { drive, ..MjcfOptions::default() });
+        let drive = MjcfActuator::Position { kp: 40.0, kd: 1.0 };
+        let xml = model(MjcfOptions { actuator: drive, ..MjcfOptions::default() });
         assert_eq!(values(&xml, "position", "kp"), ["40"; NUM_JOINTS]);
         assert_eq!(values(&xml, "position", "kv"), ["1"; NUM_JOINTS]);
         assert_eq!(values(&xml, "position", "forcerange")[2], "-45.43 45.43");

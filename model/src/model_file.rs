@@ -6,14 +6,14 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use toml::{Table, Value};
 
-use crate::effects::{CATALOGUE, Effect, Entry, EntryError, Parameter, Scope, compose};
+use crate::effects::{CATALOGUE, Effect, EffectEntry, EntryError, Parameter, Scope, apply_effects};
 use crate::{RobotModel, go2};
 
 /// The names that `robot` may have.
 const BUILT_IN: [&str; 1] = ["go2"];
 
 /// The interval of a component that nobody measured, where others of its vector were: it may be anything.
-const UNKNOWN: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
+const UNBOUNDED: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
 
 /// Why a model file was refused.
 #[derive(Debug, thiserror::Error)]
@@ -50,7 +50,7 @@ pub enum ModelFileError {
         /// Which, from 1.
         number: usize,
         /// What is wrong with it, and what is allowed.
-        problem: EffectProblem,
+        problem: EffectEntryError,
     },
     /// The robot's drives are learned, and who asked needs their laws.
     #[error(
@@ -73,7 +73,7 @@ pub enum ModelFileError {
 
 /// What is wrong with an entry of a model file.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum EffectProblem {
+pub enum EffectEntryError {
     /// The catalogue has no such effect.
     #[error("`name` = \"{given}\" is not in the catalogue; possible: {}", CATALOGUE.map(|effect| effect.name).join(", "))]
     Unknown {
@@ -115,20 +115,20 @@ pub struct ModelFile {
     /// The built-in robot's name.
     pub robot: String,
     /// In the order of the file.
-    pub effects: Vec<Entry>,
+    pub effects: Vec<EffectEntry>,
     /// What drives the robot in place of the chain's first steps, if anything does.
-    pub actuator: Option<LearnedDrive>,
+    pub actuator: Option<ActuatorNetworkConfig>,
 }
 
 /// The table `[actuator]`: an ensemble of networks in place of the first steps from command to torque.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct LearnedDrive {
+pub struct ActuatorNetworkConfig {
     /// The ensemble's file; where the model file has it relative to itself, from the root.
     pub ensemble: PathBuf,
     /// When a robot gets another member.
     #[serde(default)]
-    pub draw: MemberDraw,
+    pub draw: MemberSampling,
     /// Whether torque is drawn from the member's Gaussian in every drive period; its mean otherwise.
     #[serde(default)]
     pub sample: bool,
@@ -137,12 +137,12 @@ pub struct LearnedDrive {
 /// When the member of an ensemble that drives a robot is drawn.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum MemberDraw {
+pub enum MemberSampling {
     /// When the robot is placed.
     #[default]
-    Episode,
+    PerEpisode,
     /// In every drive period (U2E §III-C).
-    Step,
+    PerStep,
 }
 
 #[derive(Deserialize)]
@@ -151,7 +151,7 @@ struct ModelText {
     robot: String,
     #[serde(default)]
     effect: Vec<Table>,
-    actuator: Option<LearnedDrive>,
+    actuator: Option<ActuatorNetworkConfig>,
 }
 
 impl Default for ModelFile {
@@ -177,7 +177,7 @@ impl ModelFile {
     }
 
     /// Reads a model file for who needs the laws of its drives, and so refuses learned ones.
-    pub fn load_analytic(path: impl AsRef<Path>) -> Result<Self, ModelFileError> {
+    pub fn load_without_actuator_network(path: impl AsRef<Path>) -> Result<Self, ModelFileError> {
         let path = path.as_ref();
         analytic(Self::load(path)?, &path.display().to_string())
     }
@@ -205,7 +205,7 @@ impl ModelFile {
 
     /// The robot with its effects.
     pub fn robot_model(&self) -> Result<RobotModel, EntryError> {
-        compose(&go2(), &self.effects)
+        apply_effects(&go2(), &self.effects)
     }
 
     /// The text of the file; reading it gives the same again, to the last bit.
@@ -220,7 +220,7 @@ impl ModelFile {
             }
             for (parameter, values) in of_parameters(entry.effect, &entry.intervals) {
                 if values.iter().any(Option::is_some) {
-                    let ends = values.iter().map(|interval| interval.unwrap_or(UNKNOWN));
+                    let ends = values.iter().map(|interval| interval.unwrap_or(UNBOUNDED));
                     let [low, high] =
                         [0, 1].map(|end| written(&ends.clone().map(|ends| ends[end]).collect::<Vec<_>>()));
                     intervals.push(format!("{} = [{low}, {high}]", parameter.name));
@@ -230,10 +230,10 @@ impl ModelFile {
                 writeln!(text, "interval = {{ {} }}", intervals.join(", ")).expect("a String takes every text");
             }
         }
-        if let Some(LearnedDrive { ensemble, draw, sample }) = &self.actuator {
+        if let Some(ActuatorNetworkConfig { ensemble, draw, sample }) = &self.actuator {
             let draw = match draw {
-                MemberDraw::Episode => "episode",
-                MemberDraw::Step => "step",
+                MemberSampling::PerEpisode => "episode",
+                MemberSampling::PerStep => "step",
             };
             let ensemble = Value::from(ensemble.display().to_string());
             writeln!(text, "\n[actuator]\nensemble = {ensemble}\ndraw = \"{draw}\"\nsample = {sample}")
@@ -262,16 +262,16 @@ fn written(values: &[f64]) -> Value {
     }
 }
 
-fn read_entry(table: &Table) -> Result<Entry, EffectProblem> {
+fn read_entry(table: &Table) -> Result<EffectEntry, EffectEntryError> {
     let text = |key: &str| match table.get(key) {
         Some(Value::String(text)) => Ok(text.clone()),
         other => Err(wrong(key, other, "a text")),
     };
     let given = text("name")?;
-    let effect = Effect::named(&given).ok_or(EffectProblem::Unknown { given })?;
+    let effect = Effect::named(&given).ok_or(EffectEntryError::Unknown { given })?;
     let known = |key: &str| effect.parameters.iter().any(|parameter| parameter.name == key);
     if let Some(key) = table.keys().find(|key| !["name", "scope", "interval"].contains(&key.as_str()) && !known(key)) {
-        return Err(EffectProblem::UnknownKey { effect: effect.name, key: key.clone() });
+        return Err(EffectEntryError::UnknownKey { effect: effect.name, key: key.clone() });
     }
     let scope: Scope = text("scope")?
         .parse()
@@ -280,19 +280,19 @@ fn read_entry(table: &Table) -> Result<Entry, EffectProblem> {
     for parameter in effect.parameters {
         values.extend(read_numbers(parameter.name, table.get(parameter.name), parameter.count)?);
     }
-    let mut entry = Entry::new(effect, scope, values)?;
+    let mut entry = EffectEntry::new(effect, scope, values)?;
     entry.intervals = read_intervals(effect, table.get("interval"))?;
     Ok(entry)
 }
 
-fn read_intervals(effect: &'static Effect, given: Option<&Value>) -> Result<Vec<Option<[f64; 2]>>, EffectProblem> {
+fn read_intervals(effect: &'static Effect, given: Option<&Value>) -> Result<Vec<Option<[f64; 2]>>, EffectEntryError> {
     let table = match given {
-        None => return Ok(vec![None; effect.count()]),
+        None => return Ok(vec![None; effect.num_values()]),
         Some(Value::Table(table)) => table,
         other => return Err(wrong("interval", other, "a table such as { torque_nm = [0.3, 0.5] }")),
     };
     if let Some(key) = table.keys().find(|key| effect.parameters.iter().all(|parameter| parameter.name != *key)) {
-        return Err(EffectProblem::UnknownKey { effect: effect.name, key: format!("interval.{key}") });
+        return Err(EffectEntryError::UnknownKey { effect: effect.name, key: format!("interval.{key}") });
     }
     let mut intervals = Vec::new();
     for Parameter { name, count, .. } in effect.parameters {
@@ -306,7 +306,7 @@ fn read_intervals(effect: &'static Effect, given: Option<&Value>) -> Result<Vec<
                     if let Some(wanted) = missing_of_interval(ends) {
                         return Err(wrong(&key, table.get(*name), wanted));
                     }
-                    intervals.push(Some(ends).filter(|ends| *ends != UNKNOWN));
+                    intervals.push(Some(ends).filter(|ends| *ends != UNBOUNDED));
                 }
             }
             other => return Err(wrong(&key, other, "[low, high]")),
@@ -318,14 +318,14 @@ fn read_intervals(effect: &'static Effect, given: Option<&Value>) -> Result<Vec<
 /// What an interval should be and is not.
 fn missing_of_interval(ends: [f64; 2]) -> Option<&'static str> {
     let [low, high] = ends;
-    if !ends.into_iter().all(f64::is_finite) && ends != UNKNOWN {
+    if !ends.into_iter().all(f64::is_finite) && ends != UNBOUNDED {
         return Some("a pair of numbers, or -inf and inf where nobody measured,");
     }
     (low > high).then_some("the low end before the high one")
 }
 
 /// A number, or a list of `count`.
-fn read_numbers(key: &str, given: Option<&Value>, count: usize) -> Result<Vec<f64>, EffectProblem> {
+fn read_numbers(key: &str, given: Option<&Value>, count: usize) -> Result<Vec<f64>, EffectEntryError> {
     let number = |value: &Value| match value {
         Value::Float(value) => Some(*value),
         Value::Integer(value) => Some(*value as f64),
@@ -340,16 +340,16 @@ fn read_numbers(key: &str, given: Option<&Value>, count: usize) -> Result<Vec<f6
     numbers.ok_or_else(|| wrong(key, given, &wanted))
 }
 
-fn wrong(key: &str, found: Option<&Value>, wanted: &str) -> EffectProblem {
+fn wrong(key: &str, found: Option<&Value>, wanted: &str) -> EffectEntryError {
     let found = found.map_or("missing".to_owned(), ToString::to_string);
-    EffectProblem::Key { key: key.to_owned(), found, wanted: wanted.to_owned() }
+    EffectEntryError::Key { key: key.to_owned(), found, wanted: wanted.to_owned() }
 }
 
 impl RobotModel {
     /// The robot of a model file.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, ModelFileError> {
         let path = path.as_ref();
-        composed(&ModelFile::load_analytic(path)?, &path.display().to_string())
+        composed(&ModelFile::load_without_actuator_network(path)?, &path.display().to_string())
     }
 
     /// The robot of the text of a model file; errors call it `name`.
@@ -414,9 +414,9 @@ mod tests {
             .expect("written");
         let file = ModelFile::load(&path).expect("valid");
         let ensemble = folder.path().join("e.safetensors");
-        assert_eq!(file.actuator, Some(LearnedDrive { ensemble, draw: MemberDraw::Step, sample: false }));
+        assert_eq!(file.actuator, Some(ActuatorNetworkConfig { ensemble, draw: MemberSampling::PerStep, sample: false }));
         assert_eq!(ModelFile::parse(&file.to_toml(), "again").expect("valid"), file);
-        for refusal in [RobotModel::load(&path).map(drop), ModelFile::load_analytic(&path).map(drop)] {
+        for refusal in [RobotModel::load(&path).map(drop), ModelFile::load_without_actuator_network(&path).map(drop)] {
             let error = refusal.expect_err("refused").to_string();
             assert!(error.contains("robot.toml: `[actuator]` is for `twinstep serve`"), "{error}");
         }
@@ -510,7 +510,7 @@ mod tests {
         );
     }
 
-    fn some_entry() -> impl Strategy<Value = Entry> {
+    fn some_entry() -> impl Strategy<Value = EffectEntry> {
         let scopes = Scope::of_joints().len();
         (0..CATALOGUE.len(), 0..scopes, prop::array::uniform10(0.0..1.0f64), any::<u16>()).prop_map(
             |(index, scope, shares, measured)| {
@@ -524,10 +524,10 @@ mod tests {
                 let parameters =
                     effect.parameters.iter().flat_map(|parameter| std::iter::repeat_n(parameter, parameter.count));
                 let values = parameters.zip(shares).map(|(parameter, share)| {
-                    let [low, high] = parameter.plausible;
+                    let [low, high] = parameter.prior_range;
                     low + share * (high - low)
                 });
-                let mut entry = Entry::new(effect, scope, values.collect()).expect("plausible values are allowed");
+                let mut entry = EffectEntry::new(effect, scope, values.collect()).expect("plausible values are allowed");
                 // Any of its components may have been measured.
                 let interval =
                     |(bit, value): (usize, &f64)| (measured >> bit & 1 == 1).then_some([value - 0.1, value + 0.1]);

@@ -20,7 +20,7 @@ pub struct RobotModel {
     /// Contact between the robot and the ground.
     pub contact: Contact,
     /// Drive gains, rates and the pose that actions are offsets from.
-    pub control: Control,
+    pub control: ControlConfig,
     /// What the gyroscope shows of a robot at rest [rad/s].
     pub gyro_bias: DVec3,
     /// How supply and heat weaken the motors.
@@ -35,18 +35,18 @@ pub struct Derating {
     /// Torque lost a kelvin above [`Derating::above_c`], by joint [1/K].
     pub per_kelvin: [f64; NUM_JOINTS],
     /// Temperature from which heat counts, by joint [°C].
-    pub above_c: [f64; NUM_JOINTS],
+    pub reference_temperature_c: [f64; NUM_JOINTS],
 }
 
 impl Derating {
     /// Full torque at any voltage and temperature.
     pub const NONE: Derating =
-        Derating { voltage_exponent: 0.0, per_kelvin: [0.0; NUM_JOINTS], above_c: [35.0; NUM_JOINTS] };
+        Derating { voltage_exponent: 0.0, per_kelvin: [0.0; NUM_JOINTS], reference_temperature_c: [35.0; NUM_JOINTS] };
 
     /// What is left of a joint's torque at a share of the reference voltage and a motor temperature [°C]; a temperature
     /// that nobody knows is NaN.
-    pub fn strength(&self, joint: usize, voltage_share: f64, temperature_c: f64) -> f64 {
-        let hot = (temperature_c - self.above_c[joint]).max(0.0);
+    pub fn derating_factor(&self, joint: usize, voltage_share: f64, temperature_c: f64) -> f64 {
+        let hot = (temperature_c - self.reference_temperature_c[joint]).max(0.0);
         voltage_share.max(0.0).powf(self.voltage_exponent) * (1.0 - self.per_kelvin[joint] * hot).max(0.0)
     }
 }
@@ -112,16 +112,16 @@ pub struct JointModel {
     /// A spring between the links, such as a cable.
     pub spring: JointSpring,
     /// From command to torque.
-    pub drive: JointDrive,
+    pub actuator: ActuatorParams,
 }
 
 /// Friction `breakaway · e^(−(dq/speed)²)` on top of the Coulomb friction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Stribeck {
     /// At rest [N·m]; 0 for none.
-    pub breakaway: f64,
+    pub breakaway_torque: f64,
     /// Speed at which it has fallen to 1/e [rad/s].
-    pub speed: f64,
+    pub stribeck_velocity: f64,
 }
 
 /// Torque `−stiffness · q + torque_at_zero` on the joint.
@@ -130,14 +130,14 @@ pub struct JointSpring {
     /// [N·m/rad]
     pub stiffness: f64,
     /// At q = 0 [N·m]: stiffness times rest position.
-    pub torque_at_zero: f64,
+    pub torque_offset: f64,
 }
 
 /// What stands between a joint's command and the torque at its gear; [`JointDrive::IDEAL`] has none of it.
 ///
 /// In the order in which it acts. Delays are at most [`JointDrive::LONGEST_DELAY`].
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct JointDrive {
+pub struct ActuatorParams {
     /// Commands reach the drive so late [s].
     pub command_delay: f64,
     /// Drive and log see q plus this [rad].
@@ -149,15 +149,15 @@ pub struct JointDrive {
     /// Speed at which back-EMF leaves no torque [rad/s]; infinite for none.
     pub no_load_speed: f64,
     /// Time constant of the torque [s]; 0 for none.
-    pub lag: f64,
+    pub torque_time_constant: f64,
     /// Factor on the torque between the current's sensor and the gear.
     pub gain: f64,
     /// Torque that the position ripples by.
     pub ripple: Ripple,
     /// Play of the gear [rad].
-    pub gap: f64,
+    pub backlash: f64,
     /// Stiffness of the gear [N·m/rad]; infinite for a rigid one.
-    pub stiffness: f64,
+    pub gear_stiffness: f64,
     /// What a log shows of the torque is so old [s].
     pub sensor_delay: f64,
 }
@@ -173,22 +173,22 @@ pub struct Ripple {
     pub phase: f64,
 }
 
-impl JointDrive {
+impl ActuatorParams {
     /// The longest delay [s]: eight periods of the drive.
-    pub const LONGEST_DELAY: f64 = 0.04;
+    pub const MAX_DELAY: f64 = 0.04;
 
     /// Commands become torque at once and exactly.
-    pub const IDEAL: JointDrive = JointDrive {
+    pub const IDEAL: ActuatorParams = ActuatorParams {
         command_delay: 0.0,
         encoder_offset: 0.0,
         saturation: f64::INFINITY,
         torque_delay: 0.0,
         no_load_speed: f64::INFINITY,
-        lag: 0.0,
+        torque_time_constant: 0.0,
         gain: 1.0,
         ripple: Ripple { amplitude: 0.0, cycles: 0.0, phase: 0.0 },
-        gap: 0.0,
-        stiffness: f64::INFINITY,
+        backlash: 0.0,
+        gear_stiffness: f64::INFINITY,
         sensor_delay: 0.0,
     };
 }
@@ -225,7 +225,7 @@ pub struct Contact {
 
 /// How a policy's action becomes a command, and how the drive follows it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Control {
+pub struct ControlConfig {
     /// Position gain [N·m/rad].
     pub kp: f64,
     /// Velocity gain [N·m·s/rad].
@@ -235,20 +235,20 @@ pub struct Control {
     /// The pose that actions are offsets from [rad].
     pub default_pose: [f64; NUM_JOINTS],
     /// Rate of the drive [Hz].
-    pub drive_hz: f64,
+    pub actuator_hz: f64,
     /// Drive periods in one policy period.
     pub decimation: usize,
 }
 
-impl Control {
+impl ControlConfig {
     /// One period of the drive [s].
-    pub fn drive_dt(&self) -> f64 {
-        1.0 / self.drive_hz
+    pub fn actuator_dt(&self) -> f64 {
+        1.0 / self.actuator_hz
     }
 
     /// One period of the policy [s].
     pub fn policy_dt(&self) -> f64 {
-        self.decimation as f64 / self.drive_hz
+        self.decimation as f64 / self.actuator_hz
     }
 
     /// The default pose in single precision [rad].

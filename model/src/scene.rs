@@ -58,7 +58,7 @@ impl Scene {
             bodies: ["trunk"].iter().chain(&JOINT_NAMES).map(ToString::to_string).collect(),
             pose: poses.map(Pose::to_array).to_vec(),
             shapes: shapes(robot),
-            ground: ground.around(world_from_base.position.x, world_from_base.position.y),
+            ground: ground.crop(world_from_base.position.x, world_from_base.position.y),
             command: None,
         }
     }

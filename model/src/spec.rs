@@ -5,7 +5,7 @@ use sha2::{Digest, Sha256};
 
 /// One named part of an observation or action vector.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Field {
+pub struct SpecField {
     /// The quantity, such as `joint_velocity`.
     pub name: String,
     /// Number of entries.
@@ -17,7 +17,7 @@ pub struct Field {
     /// Highest value; observations are clipped to it.
     pub high: f32,
     /// One line for a reader.
-    pub text: String,
+    pub description: String,
 }
 
 /// Everything that a client must know of an environment before it uses it.
@@ -28,15 +28,15 @@ pub struct EnvSpec {
     /// The nominal robot, such as `go2`.
     pub robot: String,
     /// Parts of the observation, in order.
-    pub observation: Vec<Field>,
+    pub observation: Vec<SpecField>,
     /// Parts of the action, in order.
-    pub action: Vec<Field>,
+    pub action: Vec<SpecField>,
     /// Joint names in the order of every per-joint array.
     pub joint_order: Vec<String>,
     /// One period of the policy [s].
     pub policy_dt: f64,
     /// One period of the drive [s].
-    pub drive_dt: f64,
+    pub actuator_dt: f64,
     /// Position gain [N·m/rad].
     pub kp: f64,
     /// Velocity gain [N·m·s/rad].
@@ -75,14 +75,14 @@ impl EnvSpec {
     /// Hash of everything that must agree between an agent and a robot: layouts, joint order, periods, gains,
     /// action scale and default pose. 32 hexadecimal digits; the text that is hashed is [`EnvSpec::agreement`].
     pub fn hash(&self) -> String {
-        let digest: [u8; 32] = Sha256::digest(self.agreement()).into();
+        let digest: [u8; 32] = Sha256::digest(self.hash_input()).into();
         let half: [u8; 16] = std::array::from_fn(|index| digest[index]);
         format!("{:032x}", u128::from_be_bytes(half))
     }
 
     /// The text that [`EnvSpec::hash`] hashes: one line for each thing that must agree.
-    pub fn agreement(&self) -> String {
-        let layout = |fields: &[Field]| {
+    pub fn hash_input(&self) -> String {
+        let layout = |fields: &[SpecField]| {
             fields.iter().map(|field| format!("{}:{}", field.name, field.size)).collect::<Vec<_>>().join(" ")
         };
         let pose = self.default_pose.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
@@ -93,7 +93,7 @@ impl EnvSpec {
             layout(&self.action),
             self.joint_order.join(" "),
             self.policy_dt,
-            self.drive_dt,
+            self.actuator_dt,
             self.kp,
             self.kd,
             self.action_scale,
@@ -101,7 +101,7 @@ impl EnvSpec {
     }
 }
 
-fn entry_name(fields: &[Field], joint_order: &[String], index: usize) -> String {
+fn entry_name(fields: &[SpecField], joint_order: &[String], index: usize) -> String {
     let mut start = 0;
     for field in fields {
         if index < start + field.size {

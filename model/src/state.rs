@@ -20,7 +20,7 @@ pub struct Command {
     /// Velocity gain [N·m·s/rad].
     pub kd: PerJoint,
     /// Share of the torque that supply and heat leave: 1 unless a log tells voltage and temperature.
-    pub strength: PerJoint,
+    pub derating_factor: PerJoint,
 }
 
 impl Command {
@@ -32,7 +32,7 @@ impl Command {
             tau_ff: [0.0; NUM_JOINTS],
             kp: [kp; NUM_JOINTS],
             kd: [kd; NUM_JOINTS],
-            strength: [1.0; NUM_JOINTS],
+            derating_factor: [1.0; NUM_JOINTS],
         }
     }
 }
@@ -59,7 +59,7 @@ pub struct RobotStates {
     /// True where the trunk or a thigh touches the ground.
     pub body_contact: Vec<bool>,
     /// What is unknown about the robot's drives, mean over its joints [nat]; 0 where they do not tell.
-    pub uncertainty: Vec<f32>,
+    pub epistemic_uncertainty: Vec<f32>,
 }
 
 impl RobotStates {
@@ -75,7 +75,7 @@ impl RobotStates {
             base_angular_velocity: vec![[0.0; 3]; num_robots],
             foot_force: vec![[0.0; 4]; num_robots],
             body_contact: vec![false; num_robots],
-            uncertainty: vec![0.0; num_robots],
+            epistemic_uncertainty: vec![0.0; num_robots],
         }
     }
 
@@ -127,7 +127,7 @@ impl RobotStates {
         self.base_angular_velocity[robot] = other.base_angular_velocity[from];
         self.foot_force[robot] = other.foot_force[from];
         self.body_contact[robot] = other.body_contact[from];
-        self.uncertainty[robot] = other.uncertainty[from];
+        self.epistemic_uncertainty[robot] = other.epistemic_uncertainty[from];
     }
 
     /// The name of the first quantity of `robot` that is not a finite number, if any.
@@ -161,7 +161,7 @@ pub struct RobotStatesMut<'a> {
 
 /// Where and how a robot is put down.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Placement {
+pub struct InitialState {
     /// Origin of the trunk's frame in the world [m].
     pub base_position: [f32; 3],
     /// Rotation world-from-base, `[w, x, y, z]`.
@@ -175,12 +175,12 @@ pub struct Placement {
     /// Joint velocity [rad/s].
     pub dq: PerJoint,
     /// How this robot's body and ground differ from the model's.
-    pub variation: Variation,
+    pub randomisation: RandomisationSample,
     /// Seed of what is random in the robot's drives.
-    pub drive_seed: u64,
+    pub actuator_seed: u64,
 }
 
-impl Placement {
+impl InitialState {
     /// At rest and upright at height `base_height` [m], with joints at `q` [rad].
     pub fn at_rest(base_height: f32, q: PerJoint) -> Self {
         Self {
@@ -190,8 +190,8 @@ impl Placement {
             base_angular_velocity: [0.0; 3],
             q,
             dq: [0.0; NUM_JOINTS],
-            variation: Variation::default(),
-            drive_seed: 0,
+            randomisation: RandomisationSample::default(),
+            actuator_seed: 0,
         }
     }
 
@@ -199,7 +199,7 @@ impl Placement {
     ///
     /// The lowest foot is `clearance` [m] above what is under it; a knee or a corner of the trunk that meets the ground
     /// before the feet do raises the robot further.
-    pub fn above(ground: &Ground, robot: &RobotModel, q: PerJoint, clearance: f32) -> Self {
+    pub fn standing_on(ground: &Ground, robot: &RobotModel, q: PerJoint, clearance: f32) -> Self {
         let rotation = Quat::from_rotation_arc(Vec3::Z, ground.up());
         let poses = body_poses(robot, Pose { position: Vec3::ZERO, rotation }, &q);
         let shapes = &robot.shapes;
@@ -215,7 +215,7 @@ impl Placement {
         let lift = trunk
             .into_iter()
             .chain(legs)
-            .map(|(point, radius)| ground.clear_height(point.x, point.y, radius) - point.z)
+            .map(|(point, radius)| ground.clearance_height(point.x, point.y, radius) - point.z)
             .fold(f32::NEG_INFINITY, f32::max);
         Self { base_orientation: frames::to_wxyz(rotation), ..Self::at_rest(lift + clearance, q) }
     }
@@ -223,7 +223,7 @@ impl Placement {
 
 /// How one robot's body and ground differ from the model's.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Variation {
+pub struct RandomisationSample {
     /// Factor on the mass and inertia of every body.
     pub mass_scale: f32,
     /// Point mass at the trunk's centre of mass [kg].
@@ -234,7 +234,7 @@ pub struct Variation {
     pub friction_scale: f32,
 }
 
-impl Default for Variation {
+impl Default for RandomisationSample {
     /// The robot exactly as its model has it.
     fn default() -> Self {
         Self { mass_scale: 1.0, payload: 0.0, com_shift: [0.0; 3], friction_scale: 1.0 }
@@ -251,7 +251,7 @@ mod tests {
     use crate::{HeightField, go2};
 
     /// Distance of each foot's ball from the ground, along the vertical [m].
-    fn gaps(placement: &Placement, ground: &Ground) -> [f32; 4] {
+    fn gaps(placement: &InitialState, ground: &Ground) -> [f32; 4] {
         let robot = go2();
         let world_from_base = Pose {
             position: Vec3::from(placement.base_position),
@@ -260,7 +260,7 @@ mod tests {
         let poses = body_poses(&robot, world_from_base, &placement.q);
         std::array::from_fn(|leg| {
             let centre = poses[3 + 3 * leg].transform(robot.shapes.foot_centre.as_vec3());
-            centre.z - ground.clear_height(centre.x, centre.y, robot.shapes.foot_radius as f32)
+            centre.z - ground.clearance_height(centre.x, centre.y, robot.shapes.foot_radius as f32)
         })
     }
 
@@ -270,7 +270,7 @@ mod tests {
     #[test]
     fn front_feet_of_the_default_pose_touch_flat_ground_from_0_32_m() {
         let robot = go2();
-        let placement = Placement::above(&Ground::FLAT, &robot, robot.control.default_pose_f32(), 0.0);
+        let placement = InitialState::standing_on(&Ground::FLAT, &robot, robot.control.default_pose_f32(), 0.0);
         assert!((placement.base_position[2] - 0.3235).abs() < 1e-4, "{:?}", placement.base_position);
         let [front_left, front_right, rear_left, rear_right] = gaps(&placement, &Ground::FLAT);
         assert!(front_left.abs().max(front_right.abs()) < 1e-6, "{front_left} {front_right}");
@@ -282,7 +282,7 @@ mod tests {
         let robot = go2();
         let ground = Ground { normal: [-0.3f32.sin(), 0.0, 0.3f32.cos()], ..Ground::FLAT };
         let [level, sloping] = [&Ground::FLAT, &ground]
-            .map(|ground| gaps(&Placement::above(ground, &robot, robot.control.default_pose_f32(), 0.0), ground));
+            .map(|ground| gaps(&InitialState::standing_on(ground, &robot, robot.control.default_pose_f32(), 0.0), ground));
         for (level, sloping) in level.iter().zip(sloping) {
             assert!((level - sloping * 0.3f32.cos()).abs() < 1e-5, "{level} {sloping}");
         }
@@ -292,10 +292,10 @@ mod tests {
         #[test]
         fn no_foot_starts_in_rough_ground_and_one_is_as_near_as_asked(seed: u64, bend in -0.2f32..0.2) {
             let robot = go2();
-            let field = HeightField::rough(0.1, 0.1, 40, seed).expect("a field");
+            let field = HeightField::random_uniform(0.1, 0.1, 40, seed).expect("a field");
             let ground = Ground { height_field: Some(Arc::new(field)), ..Ground::FLAT };
             let q = robot.control.default_pose_f32().map(|q| q + bend);
-            let gaps = gaps(&Placement::above(&ground, &robot, q, 0.01), &ground);
+            let gaps = gaps(&InitialState::standing_on(&ground, &robot, q, 0.01), &ground);
             let nearest = gaps.into_iter().fold(f32::INFINITY, f32::min);
             prop_assert!((nearest - 0.01).abs() < 1e-5, "{gaps:?}");
         }

@@ -27,7 +27,7 @@ pub trait VecEnv: Send {
 
     /// What it takes to draw environment `env` as it is now. Changes nothing.
     fn scene(&self, _env: usize) -> Result<Scene, EnvError> {
-        Err(EnvError::NothingToDraw { task: self.spec().task.clone() })
+        Err(EnvError::RenderUnsupported { task: self.spec().task.clone() })
     }
 }
 
@@ -74,7 +74,7 @@ impl ResetRequest {
     }
 
     /// True if environment `env` is to be reset.
-    pub fn wants(&self, env: usize) -> bool {
+    pub fn selects(&self, env: usize) -> bool {
         self.mask.as_ref().is_none_or(|mask| mask[env])
     }
 }
@@ -158,7 +158,7 @@ pub enum EnvError {
     },
     /// There is no such environment.
     #[error("`env` = {env} does not exist; there are {num_envs}")]
-    NoSuchEnv {
+    EnvOutOfRange {
         /// The environment that was asked for.
         env: usize,
         /// The number of environments.
@@ -166,7 +166,7 @@ pub enum EnvError {
     },
     /// The task has no robot that could be seen.
     #[error("the task `{task}` has nothing to draw")]
-    NothingToDraw {
+    RenderUnsupported {
         /// The task.
         task: String,
     },

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Code, WireError};
+use crate::{ErrorCode, ErrorReply};
 
 /// The version of the protocol that this crate speaks.
 pub const PROTOCOL: u16 = 1;
@@ -27,17 +27,17 @@ pub fn encode_with_capacity(message: &impl Serialize, capacity: usize) -> Vec<u8
 }
 
 /// Reads a message; the error says whether the version is foreign or the bytes are not the message.
-pub fn decode<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, WireError> {
+pub fn decode<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, ErrorReply> {
     // Serde would also take fields by position, in an order that no document promises.
     if !matches!(bytes.first(), Some(0x80..=0x8f | 0xde | 0xdf)) {
         return Err(malformed("the bytes are no MessagePack map"));
     }
     rmp_serde::from_slice(bytes).map_err(|error| match rmp_serde::from_slice::<Version>(bytes) {
-        Ok(Version { protocol }) if protocol != PROTOCOL => WireError::version(protocol),
+        Ok(Version { protocol }) if protocol != PROTOCOL => ErrorReply::version(protocol),
         _ => malformed(&error.to_string()),
     })
 }
 
-fn malformed(reason: &str) -> WireError {
-    WireError::new(Code::Malformed, "", reason).with_hint("a message is one MessagePack map with the fields of SPEC.md")
+fn malformed(reason: &str) -> ErrorReply {
+    ErrorReply::new(ErrorCode::Malformed, "", reason).with_hint("a message is one MessagePack map with the fields of SPEC.md")
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use twinstep_model::{EndedEpisode, EnvError, EnvSpec, Ground, HeightField, ResetRequest, Scene, StepBatch};
 
 use crate::codec::encode_with_capacity;
-use crate::{Code, PROTOCOL, WireError, encode, message, tensor};
+use crate::{ErrorCode, PROTOCOL, ErrorReply, encode, message, tensor};
 
 /// More bytes than the field names, lengths and numbers of a message take besides its tensors.
 const MAP_OVERHEAD: usize = 256;
@@ -22,7 +22,7 @@ pub fn encode_reset(request: &ResetRequest, epoch: u64, seq: u64) -> Vec<u8> {
 }
 
 /// A reset as received.
-pub fn read_reset(request: &message::ResetRequest<'_>) -> Result<ResetRequest, WireError> {
+pub fn read_reset(request: &message::ResetRequest<'_>) -> Result<ResetRequest, ErrorReply> {
     let seeds = request.seeds.map(|bytes| tensor::read(bytes, "seeds")).transpose()?;
     Ok(ResetRequest { seeds, mask: request.mask.map(tensor::flags_from_bytes) })
 }
@@ -61,12 +61,12 @@ pub fn encode_actions(actions: &[f32], epoch: u64, seq: u64) -> Vec<u8> {
 }
 
 /// A step's result as received, into `batch`. Every length must fit `num_envs` environments of `spec`.
-pub fn read_step(
+pub fn decode_step(
     reply: &message::StepReply<'_>,
     spec: &EnvSpec,
     num_envs: usize,
     batch: &mut StepBatch,
-) -> Result<(), WireError> {
+) -> Result<(), ErrorReply> {
     tensor::read_into(reply.obs, &mut batch.obs, "obs")?;
     tensor::read_into(reply.reward, &mut batch.reward, "reward")?;
     tensor::read_flags_into(reply.terminated, &mut batch.terminated);
@@ -91,7 +91,7 @@ pub fn read_step(
     }
     if let Some(env) = env.iter().find(|env| **env as usize >= num_envs) {
         let message = format!("`ended_env` has environment {env}; there are {num_envs}");
-        return Err(WireError::new(Code::OutOfRange, "ended_env", message));
+        return Err(ErrorReply::new(ErrorCode::OutOfRange, "ended_env", message));
     }
     batch.ended = (0..ended)
         .map(|k| EndedEpisode {
@@ -109,11 +109,11 @@ pub fn read_step(
 pub fn encode_scene(scene: Scene) -> Vec<u8> {
     let Scene { bodies, pose, shapes, ground, command } = scene;
     let pose = tensor::as_bytes(&pose);
-    encode(&message::RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground: send_ground(&ground), command })
+    encode(&message::RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground: encode_ground(&ground), command })
 }
 
 /// The ground of a scene, for a message.
-pub fn send_ground(ground: &Ground) -> message::Ground<'_> {
+pub fn encode_ground(ground: &Ground) -> message::Ground<'_> {
     let height_field = ground.height_field.as_deref().map(|field| {
         let [rows, columns] = field.shape().map(|count| count as u32);
         let heights = tensor::as_bytes(field.heights());
@@ -123,49 +123,49 @@ pub fn send_ground(ground: &Ground) -> message::Ground<'_> {
 }
 
 /// A scene as received. Every body must have a pose, every shape a body, and every vertex of the ground a height.
-pub fn read_scene(reply: message::RenderReply<'_>) -> Result<Scene, WireError> {
+pub fn decode_scene(reply: message::RenderReply<'_>) -> Result<Scene, ErrorReply> {
     let message::RenderReply { bodies, pose, shapes, ground, command, .. } = reply;
     let pose: Vec<[f32; 7]> = tensor::read(pose, "pose")?;
     check_length("pose", pose.len(), bodies.len())?;
     if let Some(shape) = shapes.iter().find(|shape| shape.body as usize >= bodies.len()) {
         let message = format!("`shapes` has body {}; there are {}", shape.body, bodies.len());
-        return Err(WireError::new(Code::OutOfRange, "shapes", message));
+        return Err(ErrorReply::new(ErrorCode::OutOfRange, "shapes", message));
     }
-    Ok(Scene { bodies, pose, shapes, ground: read_ground(ground)?, command })
+    Ok(Scene { bodies, pose, shapes, ground: decode_ground(ground)?, command })
 }
 
-fn read_ground(ground: message::Ground<'_>) -> Result<Ground, WireError> {
+fn decode_ground(ground: message::Ground<'_>) -> Result<Ground, ErrorReply> {
     let message::Ground { point, normal, height_field } = ground;
     let height_field = height_field.map(read_height_field).transpose()?.map(Arc::new);
     Ok(Ground { point, normal, height_field })
 }
 
-fn read_height_field(field: message::HeightField<'_>) -> Result<HeightField, WireError> {
+fn read_height_field(field: message::HeightField<'_>) -> Result<HeightField, ErrorReply> {
     let message::HeightField { corner, cell, rows, columns, heights } = field;
     let heights: Vec<f32> = tensor::read(heights, "heights")?;
     HeightField::new(corner, cell, [rows, columns].map(|count| count as usize), heights)
-        .map_err(|error| WireError::new(Code::BadShape, "height_field", error.to_string()))
+        .map_err(|error| ErrorReply::new(ErrorCode::BadShape, "height_field", error.to_string()))
 }
 
 /// Fails if `given` is not `wanted`.
-pub fn check_length(field: &'static str, given: usize, wanted: usize) -> Result<(), WireError> {
+pub fn check_length(field: &'static str, given: usize, wanted: usize) -> Result<(), ErrorReply> {
     if given == wanted {
         return Ok(());
     }
     let message = format!("`{field}` has {given} entries; {wanted} are wanted");
-    Err(WireError::new(Code::BadShape, field, message))
+    Err(ErrorReply::new(ErrorCode::BadShape, field, message))
 }
 
 /// An environment's error as sent.
-pub fn wire_error(error: &EnvError) -> WireError {
+pub fn wire_error(error: &EnvError) -> ErrorReply {
     let (code, field, hint) = match error {
-        EnvError::WrongLength { field, .. } => (Code::BadShape, *field, "shapes are num_envs × the spec's lengths"),
-        EnvError::ActionNotFinite { .. } => (Code::NotFinite, "actions", "look at what computed the action"),
-        EnvError::NeedsReset { .. } => (Code::NeedsReset, "", "send `reset`, with `mask` to reset only some"),
-        EnvError::NoSuchEnv { .. } => (Code::OutOfRange, "env", "environments are counted from 0"),
-        EnvError::NothingToDraw { .. } => (Code::UnknownKey, "", "pictures are of tasks with a robot, such as `walk`"),
-        EnvError::Diverged { .. } => (Code::Diverged, "", "send `reset` with `mask`"),
-        EnvError::Backend(_) | EnvError::Remote(_) => (Code::Internal, "", "the server's log says more"),
+        EnvError::WrongLength { field, .. } => (ErrorCode::BadShape, *field, "shapes are num_envs × the spec's lengths"),
+        EnvError::ActionNotFinite { .. } => (ErrorCode::NotFinite, "actions", "look at what computed the action"),
+        EnvError::NeedsReset { .. } => (ErrorCode::NeedsReset, "", "send `reset`, with `mask` to reset only some"),
+        EnvError::EnvOutOfRange { .. } => (ErrorCode::OutOfRange, "env", "environments are counted from 0"),
+        EnvError::RenderUnsupported { .. } => (ErrorCode::UnknownKey, "", "pictures are of tasks with a robot, such as `walk`"),
+        EnvError::Diverged { .. } => (ErrorCode::Diverged, "", "send `reset` with `mask`"),
+        EnvError::Backend(_) | EnvError::Remote(_) => (ErrorCode::Internal, "", "the server's log says more"),
     };
-    WireError::new(code, field, error.to_string()).with_hint(hint)
+    ErrorReply::new(code, field, error.to_string()).with_hint(hint)
 }

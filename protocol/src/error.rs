@@ -9,7 +9,7 @@ use crate::PROTOCOL;
 /// What kind of error it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Code {
+pub enum ErrorCode {
     /// The request's protocol version is not spoken here.
     Version,
     /// The bytes are not the message that the key asks for.
@@ -46,41 +46,41 @@ pub enum Code {
     Internal,
 }
 
-impl Code {
+impl ErrorCode {
     /// Every code.
-    pub const ALL: [Code; 17] = [
-        Code::Version,
-        Code::Malformed,
-        Code::UnknownKey,
-        Code::BadShape,
-        Code::NotFinite,
-        Code::OutOfRange,
-        Code::TooManyEnvs,
-        Code::LeaseLost,
-        Code::StaleEpoch,
-        Code::StaleSequence,
-        Code::SequenceGap,
-        Code::NeedsReset,
-        Code::Diverged,
-        Code::SpecMismatch,
-        Code::Busy,
-        Code::ShuttingDown,
-        Code::Internal,
+    pub const ALL: [ErrorCode; 17] = [
+        ErrorCode::Version,
+        ErrorCode::Malformed,
+        ErrorCode::UnknownKey,
+        ErrorCode::BadShape,
+        ErrorCode::NotFinite,
+        ErrorCode::OutOfRange,
+        ErrorCode::TooManyEnvs,
+        ErrorCode::LeaseLost,
+        ErrorCode::StaleEpoch,
+        ErrorCode::StaleSequence,
+        ErrorCode::SequenceGap,
+        ErrorCode::NeedsReset,
+        ErrorCode::Diverged,
+        ErrorCode::SpecMismatch,
+        ErrorCode::Busy,
+        ErrorCode::ShuttingDown,
+        ErrorCode::Internal,
     ];
 
     /// True if the request had effects, so that its sequence number is used up; false if the number is still free.
-    pub fn counts_as_executed(self) -> bool {
-        matches!(self, Code::Diverged | Code::Internal)
+    pub fn consumes_seq(self) -> bool {
+        matches!(self, ErrorCode::Diverged | ErrorCode::Internal)
     }
 }
 
 /// An error reply.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, thiserror::Error)]
-pub struct WireError {
+pub struct ErrorReply {
     /// Protocol version of the sender.
     pub protocol: u16,
     /// What kind of error it is.
-    pub code: Code,
+    pub code: ErrorCode,
     /// The field or key at fault; empty if it is none.
     pub field: String,
     /// What was wrong: value and what is allowed.
@@ -88,19 +88,19 @@ pub struct WireError {
     /// How to mend it; may be empty.
     pub hint: String,
     /// True if the same request may succeed later.
-    pub retry: bool,
+    pub retryable: bool,
 }
 
-impl WireError {
+impl ErrorReply {
     /// An error that repeating does not mend.
-    pub fn new(code: Code, field: impl Into<String>, message: impl Into<String>) -> Self {
+    pub fn new(code: ErrorCode, field: impl Into<String>, message: impl Into<String>) -> Self {
         Self {
             protocol: PROTOCOL,
             code,
             field: field.into(),
             message: message.into(),
             hint: String::new(),
-            retry: matches!(code, Code::Busy),
+            retryable: matches!(code, ErrorCode::Busy),
         }
     }
 
@@ -112,12 +112,12 @@ impl WireError {
 
     /// The answer to a request of the protocol version `theirs`.
     pub fn version(theirs: u16) -> Self {
-        Self::new(Code::Version, "protocol", format!("`protocol` = {theirs} is not spoken here; {PROTOCOL} is"))
+        Self::new(ErrorCode::Version, "protocol", format!("`protocol` = {theirs} is not spoken here; {PROTOCOL} is"))
             .with_hint("install the same Twinstep on both ends; `hello` tells what the server speaks")
     }
 }
 
-impl fmt::Display for WireError {
+impl fmt::Display for ErrorReply {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter.write_str(&self.message)?;
         if !self.hint.is_empty() {

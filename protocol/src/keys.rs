@@ -21,7 +21,7 @@ pub fn lease(sid: &str) -> String {
 }
 
 /// Asks the environments of `lease` to do something.
-pub fn env(sid: &str, lease: &str, verb: Verb) -> String {
+pub fn env(sid: &str, lease: &str, verb: EnvMethod) -> String {
     format!("{ROOT}/{sid}/env/{lease}/{}", verb.name())
 }
 
@@ -45,7 +45,7 @@ pub fn live_clients(sid: &str) -> String {
 
 /// What the environments of a lease can be asked.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verb {
+pub enum EnvMethod {
     /// Start episodes anew.
     Reset,
     /// Advance one policy period.
@@ -56,17 +56,17 @@ pub enum Verb {
     Render,
 }
 
-impl Verb {
+impl EnvMethod {
     /// Every verb.
-    pub const ALL: [Verb; 4] = [Verb::Reset, Verb::Step, Verb::Close, Verb::Render];
+    pub const ALL: [EnvMethod; 4] = [EnvMethod::Reset, EnvMethod::Step, EnvMethod::Close, EnvMethod::Render];
 
     /// The verb's last part of the key.
     pub const fn name(self) -> &'static str {
         match self {
-            Verb::Reset => "reset",
-            Verb::Step => "step",
-            Verb::Close => "close",
-            Verb::Render => "render",
+            EnvMethod::Reset => "reset",
+            EnvMethod::Step => "step",
+            EnvMethod::Close => "close",
+            EnvMethod::Render => "render",
         }
     }
 }
@@ -83,7 +83,7 @@ pub enum Request<'a> {
         /// The lease.
         lease: &'a str,
         /// What its environments are asked.
-        verb: Verb,
+        verb: EnvMethod,
     },
 }
 
@@ -94,7 +94,7 @@ pub fn parse<'a>(key: &'a str, sid: &str) -> Option<Request<'a>> {
         ["hello"] => Some(Request::Hello),
         ["lease"] => Some(Request::Lease),
         ["env", lease, verb] => {
-            let verb = Verb::ALL.into_iter().find(|known| known.name() == verb)?;
+            let verb = EnvMethod::ALL.into_iter().find(|known| known.name() == verb)?;
             Some(Request::Env { lease, verb })
         }
         _ => None,
@@ -119,7 +119,7 @@ mod tests {
     fn keys_are_read_as_they_are_written() {
         assert_eq!(parse(&hello("a1"), "a1"), Some(Request::Hello));
         assert_eq!(parse(&lease("a1"), "a1"), Some(Request::Lease));
-        for verb in Verb::ALL {
+        for verb in EnvMethod::ALL {
             assert_eq!(parse(&env("a1", "77", verb), "a1"), Some(Request::Env { lease: "77", verb }));
         }
         assert_eq!(parse_live_server(&live_server("a1", "go2")), Some(("a1", "go2")));

@@ -15,4 +15,4 @@ pub mod message;
 pub mod tensor;
 
 pub use codec::{PROTOCOL, decode, encode};
-pub use error::{Code, WireError};
+pub use error::{ErrorCode, ErrorReply};

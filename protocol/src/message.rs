@@ -24,11 +24,11 @@ pub struct HelloReply {
     /// Lowest and highest protocol version that the server speaks.
     pub protocols: [u16; 2],
     /// Program and version.
-    pub build: String,
+    pub server_version: String,
     /// The robot's name.
     pub name: String,
     /// The server's id.
-    pub sid: String,
+    pub server_id: String,
     /// Layouts, periods, gains and limits.
     pub spec: EnvSpec,
     /// [`EnvSpec::hash`] of `spec`.
@@ -253,7 +253,7 @@ pub struct HeightField<'a> {
 
 /// What [`ResetRequest`], [`StepRequest`] and [`CloseRequest`] have in common: enough to tell whether to execute one.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
-pub struct EnvHeader {
+pub struct RequestHeader {
     /// Protocol version of the client.
     pub protocol: u16,
     /// Epoch of the lease.

@@ -1,6 +1,6 @@
 //! Tensors as bytes: little-endian, C order.
 
-use crate::{Code, WireError};
+use crate::{ErrorCode, ErrorReply};
 
 const _: () = assert!(cfg!(target_endian = "little"), "tensors are sent as they lie in memory");
 
@@ -32,11 +32,11 @@ pub fn read_into<T: bytemuck::AnyBitPattern>(
     bytes: &[u8],
     values: &mut Vec<T>,
     field: &'static str,
-) -> Result<(), WireError> {
+) -> Result<(), ErrorReply> {
     let size = size_of::<T>();
     if !bytes.len().is_multiple_of(size) {
         let message = format!("`{field}` has {} bytes, which is no multiple of {size}", bytes.len());
-        return Err(WireError::new(Code::BadShape, field, message));
+        return Err(ErrorReply::new(ErrorCode::BadShape, field, message));
     }
     values.clear();
     // A `bin` starts anywhere in a message, so its numbers may be unaligned.
@@ -45,7 +45,7 @@ pub fn read_into<T: bytemuck::AnyBitPattern>(
 }
 
 /// Reads numbers. `field` is named if the bytes are not whole numbers.
-pub fn read<T: bytemuck::AnyBitPattern>(bytes: &[u8], field: &'static str) -> Result<Vec<T>, WireError> {
+pub fn read<T: bytemuck::AnyBitPattern>(bytes: &[u8], field: &'static str) -> Result<Vec<T>, ErrorReply> {
     let mut values = Vec::new();
     read_into(bytes, &mut values, field)?;
     Ok(values)

@@ -1,7 +1,7 @@
 //! How robots are simulated: the `[sim]` table of the server's config file.
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::{Control, Ground, HeightField};
+use twinstep_model::{ControlConfig, Ground, HeightField};
 
 /// Cells along a side of rough ground at most: a field of 4 MB.
 const MAX_CELLS: f32 = 1024.0;
@@ -22,7 +22,7 @@ pub struct SimConfig {
     /// The ground.
     pub terrain: Terrain,
     /// Whether the trunk moves or is held.
-    pub base: Base,
+    pub base: BaseMount,
     /// Threads that step robots; 0 takes all cores.
     pub threads: usize,
 }
@@ -34,7 +34,7 @@ impl Default for SimConfig {
             physics_hz: None,
             solver_iterations: None,
             terrain: Terrain::Flat,
-            base: Base::Floating,
+            base: BaseMount::Floating,
             threads: 0,
         }
     }
@@ -70,7 +70,7 @@ pub enum Terrain {
     /// A plane through the origin that rises along x by this angle [rad].
     SlopeRad(f32),
     /// Random heights on a grid around the origin.
-    Rough(Rough),
+    Rough(RoughTerrain),
 }
 
 /// Rough ground: heights at the corners of square cells, drawn evenly from 0 to `height_m`, with two triangles a cell.
@@ -78,7 +78,7 @@ pub enum Terrain {
 /// Its rim and all around it is the plane z = 0.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Rough {
+pub struct RoughTerrain {
     /// Greatest height [m].
     pub height_m: f32,
     /// Side of a cell [m].
@@ -90,7 +90,7 @@ pub struct Rough {
     pub seed: u64,
 }
 
-impl Rough {
+impl RoughTerrain {
     fn default_size_m() -> f32 {
         40.0
     }
@@ -125,7 +125,7 @@ impl Terrain {
             Terrain::SlopeRad(angle) => Ground { normal: [-angle.sin(), 0.0, angle.cos()], ..Ground::FLAT },
             Terrain::Rough(rough) => {
                 let cells = (rough.cells() as usize).clamp(2, MAX_CELLS as usize);
-                let field = HeightField::rough(rough.height_m, rough.cell_m, cells, rough.seed);
+                let field = HeightField::random_uniform(rough.height_m, rough.cell_m, cells, rough.seed);
                 Ground { height_field: Some(field.expect("the config was checked").into()), ..Ground::FLAT }
             }
         }
@@ -135,7 +135,7 @@ impl Terrain {
 /// Whether the trunk moves.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Base {
+pub enum BaseMount {
     /// The trunk moves freely.
     Floating,
     /// The trunk is held where it was placed, as on a stand.
@@ -166,8 +166,8 @@ impl SimConfig {
     }
 
     /// Fails if a value is outside its range for a robot with `control`.
-    pub fn check(&self, control: &Control) -> Result<(), SimConfigError> {
-        let drive_hz = control.drive_hz as u32;
+    pub fn check(&self, control: &ControlConfig) -> Result<(), SimConfigError> {
+        let drive_hz = control.actuator_hz as u32;
         let refuse = |field, value: String, allowed: String| Err(SimConfigError { field, value, allowed });
         if !(drive_hz..=20_000).contains(&self.physics_hz()) || !self.physics_hz().is_multiple_of(drive_hz) {
             let allowed = format!("a multiple of the drive's {drive_hz} Hz up to 20000");
@@ -189,8 +189,8 @@ impl SimConfig {
     }
 
     /// Physics steps in one period of the drive.
-    pub fn steps_per_drive_period(&self, control: &Control) -> usize {
-        self.physics_hz() as usize / control.drive_hz as usize
+    pub fn steps_per_drive_period(&self, control: &ControlConfig) -> usize {
+        self.physics_hz() as usize / control.actuator_hz as usize
     }
 }
 
@@ -213,7 +213,7 @@ mod tests {
         assert!(config.check(&go2().control).is_err());
     }
 
-    const ROUGH: Rough = Rough { height_m: 0.05, cell_m: 0.25, size_m: 40.0, seed: 1 };
+    const ROUGH: RoughTerrain = RoughTerrain { height_m: 0.05, cell_m: 0.25, size_m: 40.0, seed: 1 };
 
     fn read(text: &str) -> SimConfig {
         toml::from_str(text).expect("a `[sim]` table")
@@ -226,7 +226,7 @@ mod tests {
         let rough = "terrain = { rough = { height_m = 0.05, cell_m = 0.25, seed = 1 } }";
         assert_eq!(read(rough).terrain, Terrain::Rough(ROUGH));
         let sized = "terrain = { rough = { height_m = 0.05, cell_m = 0.25, size_m = 10.0, seed = 1 } }";
-        assert_eq!(read(sized).terrain, Terrain::Rough(Rough { size_m: 10.0, ..ROUGH }));
+        assert_eq!(read(sized).terrain, Terrain::Rough(RoughTerrain { size_m: 10.0, ..ROUGH }));
     }
 
     #[test]
@@ -242,11 +242,11 @@ mod tests {
             let config = SimConfig { terrain: Terrain::Rough(rough), ..SimConfig::default() };
             config.check(&go2().control).expect_err("refused").to_string()
         };
-        let height = refused(Rough { height_m: 0.5, ..ROUGH });
+        let height = refused(RoughTerrain { height_m: 0.5, ..ROUGH });
         assert_eq!(height, "`sim.terrain.rough.height_m` = 0.5 is not allowed: 0 to 0.3 m");
-        let cell = refused(Rough { cell_m: f32::NAN, ..ROUGH });
+        let cell = refused(RoughTerrain { cell_m: f32::NAN, ..ROUGH });
         assert_eq!(cell, "`sim.terrain.rough.cell_m` = NaN is not allowed: 0.02 to 10 m");
-        let size = refused(Rough { cell_m: 0.02, ..ROUGH });
+        let size = refused(RoughTerrain { cell_m: 0.02, ..ROUGH });
         assert_eq!(size, "`sim.terrain.rough.size_m` = 40 is not allowed: 2 to 1024 cells of 0.02 m");
     }
 

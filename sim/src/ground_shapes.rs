@@ -80,7 +80,7 @@ mod tests {
 
     #[test]
     fn rays_from_above_meet_the_surface_where_the_field_has_it() {
-        let field = HeightField::rough(0.3, 0.25, 40, 3).expect("a field");
+        let field = HeightField::random_uniform(0.3, 0.25, 40, 3).expect("a field");
         let shapes = GroundShapes::new(&Ground { height_field: Some(field.clone().into()), ..Ground::FLAT });
         for index in 0..2000 {
             // Irrational steps go everywhere: over the field (±5 m) and 2 m around it.

@@ -15,7 +15,7 @@ mod rapier;
 mod robot_world;
 mod rollout;
 
-pub use batch::{BatchBackend, BatchSnapshot, Lanes};
-pub use config::{Base, Engine, Rough, SimConfig, SimConfigError, Terrain};
-pub use rapier::{BuildError, RapierBackend, RobotSnapshot};
+pub use batch::{BatchBackend, BatchSnapshot, SimdPrecision};
+pub use config::{BaseMount, Engine, RoughTerrain, SimConfig, SimConfigError, Terrain};
+pub use rapier::{BackendBuildError, RapierBackend, RobotSnapshot};
 pub use rollout::BatchRollout;

@@ -2,11 +2,11 @@
 
 use rayon::prelude::*;
 use twinstep_model::{
-    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, PerJoint, Placement, RobotModel, RobotStates,
+    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, PerJoint, InitialState, RobotModel, RobotStates,
 };
 
 use crate::ground_shapes::GroundShapes;
-use crate::robot_world::{Input, RobotWorld, WorldSnapshot};
+use crate::robot_world::{ActuatorInputRef, RobotWorld, WorldSnapshot};
 use crate::{SimConfig, SimConfigError};
 
 /// Many Go2 in rapier3d.
@@ -24,7 +24,7 @@ pub struct RapierBackend {
 
 /// Why a backend could not be built.
 #[derive(Debug, thiserror::Error)]
-pub enum BuildError {
+pub enum BackendBuildError {
     /// A setting is not allowed.
     #[error(transparent)]
     Config(#[from] SimConfigError),
@@ -39,7 +39,7 @@ pub enum BuildError {
 }
 
 /// Threads that step robots; 0 takes all cores.
-pub(crate) fn thread_pool(threads: usize) -> Result<rayon::ThreadPool, BuildError> {
+pub(crate) fn thread_pool(threads: usize) -> Result<rayon::ThreadPool, BackendBuildError> {
     let threads = match threads {
         0 => std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
         threads => threads,
@@ -47,7 +47,7 @@ pub(crate) fn thread_pool(threads: usize) -> Result<rayon::ThreadPool, BuildErro
     rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
         .build()
-        .map_err(|source| BuildError::Threads { threads, source })
+        .map_err(|source| BackendBuildError::Threads { threads, source })
 }
 
 /// Fails unless a step has one command and one flag a robot.
@@ -70,12 +70,12 @@ pub struct RobotSnapshot {
 
 impl RapierBackend {
     /// `num_robots` robots that stand in their default pose.
-    pub fn new(robot: RobotModel, config: SimConfig, num_robots: usize) -> Result<Self, BuildError> {
+    pub fn new(robot: RobotModel, config: SimConfig, num_robots: usize) -> Result<Self, BackendBuildError> {
         config.check(&robot.control)?;
         let pool = thread_pool(config.threads)?;
         let ground = config.terrain.ground();
         let ground_shapes = GroundShapes::new(&ground);
-        let placement = Placement::above(&ground, &robot, robot.control.default_pose_f32(), 0.0);
+        let placement = InitialState::standing_on(&ground, &robot, robot.control.default_pose_f32(), 0.0);
         let worlds = (0..num_robots).map(|_| RobotWorld::new(&robot, &config, &ground_shapes, &placement)).collect();
         let states = RobotStates::new(num_robots);
         let mut this = Self { robot, config, ground, ground_shapes, worlds, states, drive: None, pool };
@@ -87,23 +87,23 @@ impl RapierBackend {
 
     /// The same robots with another drive than their own; each is to be placed anew.
     #[must_use]
-    pub fn with_drive(self, drive: Box<dyn Actuator>) -> Self {
+    pub fn with_actuator(self, drive: Box<dyn Actuator>) -> Self {
         Self { drive: Some(drive), ..self }
     }
 
     fn check_index(&self, robot: usize) -> Result<(), BackendError> {
         let num_robots = self.worlds.len();
-        if robot < num_robots { Ok(()) } else { Err(BackendError::NoSuchRobot { robot, num_robots }) }
+        if robot < num_robots { Ok(()) } else { Err(BackendError::RobotOutOfRange { robot, num_robots }) }
     }
 
-    fn place(&mut self, robot: usize, model: &RobotModel, placement: &Placement) {
+    fn reset_robot(&mut self, robot: usize, model: &RobotModel, placement: &InitialState) {
         self.worlds[robot] = RobotWorld::new(model, &self.config, &self.ground_shapes, placement);
         if let Some(drive) = &mut self.drive {
-            drive.reset(robot, placement.drive_seed);
+            drive.reset(robot, placement.actuator_seed);
         }
         self.read_state(robot);
         self.states.tau[robot] = PerJoint::default();
-        self.states.uncertainty[robot] = 0.0;
+        self.states.epistemic_uncertainty[robot] = 0.0;
     }
 
     fn read_state(&mut self, robot: usize) {
@@ -119,7 +119,7 @@ impl RapierBackend {
     }
 
     /// One drive period of all active robots: torque from the sampled state, held over the physics steps.
-    fn drive_period(&mut self, commands: &[Command], active: &[bool], steps: usize) -> Result<(), BackendError> {
+    fn actuator_period(&mut self, commands: &[Command], active: &[bool], steps: usize) -> Result<(), BackendError> {
         let given = match &mut self.drive {
             Some(drive) => {
                 let mut tau = self.states.tau.clone();
@@ -129,8 +129,8 @@ impl RapierBackend {
             None => None,
         };
         let input = |robot: usize| match &given {
-            Some(tau) => Input::Torques(&tau[robot]),
-            None => Input::Command(&commands[robot]),
+            Some(tau) => ActuatorInputRef::Torques(&tau[robot]),
+            None => ActuatorInputRef::Command(&commands[robot]),
         };
         let states = &mut self.states;
         let robots = (&mut self.worlds, &mut states.tau, &mut states.q, &mut states.dq, active);
@@ -169,20 +169,20 @@ impl Backend for RapierBackend {
         self.ground.clone()
     }
 
-    fn reset(&mut self, placements: &[(usize, Placement)]) -> Result<(), BackendError> {
+    fn reset(&mut self, placements: &[(usize, InitialState)]) -> Result<(), BackendError> {
         for (robot, _) in placements {
             self.check_index(*robot)?;
         }
         let model = self.robot.clone();
         for (robot, placement) in placements {
-            self.place(*robot, &model, placement);
+            self.reset_robot(*robot, &model, placement);
         }
         Ok(())
     }
 
-    fn reset_as(&mut self, robot: usize, model: &RobotModel, placement: &Placement) -> Result<(), BackendError> {
+    fn reset_with_model(&mut self, robot: usize, model: &RobotModel, placement: &InitialState) -> Result<(), BackendError> {
         self.check_index(robot)?;
-        self.place(robot, model, placement);
+        self.reset_robot(robot, model, placement);
         Ok(())
     }
 
@@ -191,10 +191,10 @@ impl Backend for RapierBackend {
         check_lengths(commands, active, robots)?;
         let steps = self.config.steps_per_drive_period(&self.robot.control);
         for _ in 0..drive_periods {
-            self.drive_period(commands, active, steps)?;
+            self.actuator_period(commands, active, steps)?;
         }
         if let Some(doubt) = self.drive.as_mut().and_then(|drive| drive.uncertainty()) {
-            self.pool.install(|| doubt.evaluate(active, &mut self.states.uncertainty));
+            self.pool.install(|| doubt.evaluate(active, &mut self.states.epistemic_uncertainty));
         }
         for robot in (0..robots).filter(|robot| active[*robot]) {
             self.read_state(robot);

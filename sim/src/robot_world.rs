@@ -14,13 +14,13 @@ use std::f64::consts::TAU;
 
 use glam::{DVec3, Quat, Vec3};
 use rapier3d::prelude::*;
-use twinstep_model::lanes::{Commands, Drive, JointForces};
+use twinstep_model::lanes::{SimdCommands, SimdActuators, JointForces};
 use twinstep_model::{
-    Command, Contact, Joint, JointKind, Leg, NUM_JOINTS, PerJoint, PerLeg, Placement, RigidBody, RobotModel, frames,
+    Command, Contact, Joint, JointKind, Leg, NUM_JOINTS, PerJoint, PerLeg, InitialState, RigidBody, RobotModel, frames,
 };
 
 use crate::ground_shapes::GroundShapes;
-use crate::{Base, SimConfig};
+use crate::{BaseMount, SimConfig};
 
 /// MuJoCo's default impedance of a contact, deep inside.
 const IMPEDANCE: f64 = 0.95;
@@ -44,14 +44,14 @@ pub struct RobotWorld {
     root_dofs: usize,
     feet: [ColliderHandle; 4],
     upper_body: Vec<ColliderHandle>,
-    drive: Drive<f64>,
+    drive: SimdActuators<f64>,
     /// What the gyroscopes show at rest [rad/s].
     gyro_bias: Vec3,
 }
 
 /// What turns into torque, for one robot.
 #[derive(Clone, Copy)]
-pub enum Input<'a> {
+pub enum ActuatorInputRef<'a> {
     /// A command, which the robot's own drives follow.
     Command(&'a Command),
     /// Torques from outside [N·m].
@@ -78,7 +78,7 @@ struct RootFrame {
     trunk_com: Vec3,
     feet: [ColliderHandle; 4],
     upper_body: Vec<ColliderHandle>,
-    drive: Drive<f64>,
+    drive: SimdActuators<f64>,
     gyro_bias: Vec3,
     /// With the contacts' softness, which another robot may have otherwise.
     integration_parameters: IntegrationParameters,
@@ -86,10 +86,10 @@ struct RootFrame {
 
 impl RobotWorld {
     /// Builds the robot where `placement` has it.
-    pub fn new(robot: &RobotModel, config: &SimConfig, ground: &GroundShapes, placement: &Placement) -> Self {
+    pub fn new(robot: &RobotModel, config: &SimConfig, ground: &GroundShapes, placement: &InitialState) -> Self {
         let mut world = PhysicsWorld { gravity: Vec3::new(0.0, 0.0, -9.81), ..PhysicsWorld::default() };
         world.integration_parameters = integration_parameters(robot, config);
-        let friction = robot.contact.friction as f32 * placement.variation.friction_scale;
+        let friction = robot.contact.friction as f32 * placement.randomisation.friction_scale;
         insert_ground(&mut world, ground, friction);
 
         let (trunk_body, leg_scale) = varied_bodies(robot, placement);
@@ -118,13 +118,13 @@ impl RobotWorld {
             }
         }
         let mut this = Self {
-            drive: Drive::new(robot, 1.0 / f64::from(config.physics_hz())),
+            drive: SimdActuators::new(robot, 1.0 / f64::from(config.physics_hz())),
             gyro_bias: robot.gyro_bias.as_vec3(),
             world,
             trunk,
             multibody: multibody.expect("a leg's joints close no loop"),
             trunk_com,
-            root_dofs: if config.base == Base::Floating { 6 } else { 0 },
+            root_dofs: if config.base == BaseMount::Floating { 6 } else { 0 },
             feet: feet.try_into().expect("one foot a leg"),
             upper_body,
         };
@@ -132,11 +132,11 @@ impl RobotWorld {
         this
     }
 
-    fn place_joints(&mut self, robot: &RobotModel, placement: &Placement) {
+    fn place_joints(&mut self, robot: &RobotModel, placement: &InitialState) {
         let root_dofs = self.root_dofs;
         // What a placement gives is what the encoders show.
         let q: PerJoint =
-            std::array::from_fn(|joint| placement.q[joint] - robot.joints[joint].drive.encoder_offset as f32);
+            std::array::from_fn(|joint| placement.q[joint] - robot.joints[joint].actuator.encoder_offset as f32);
         let rotors = self.drive.set(0, robot, &q, &placement.dq);
         let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
         // Takes over the trunk's pose, and drops the root's six axes when the trunk is fixed.
@@ -166,15 +166,15 @@ impl RobotWorld {
     }
 
     /// One drive period of `steps` physics steps; what the current's sensors showed in it [N·m].
-    pub fn drive_period(&mut self, input: Input, steps: usize) -> PerJoint {
+    pub fn drive_period(&mut self, input: ActuatorInputRef, steps: usize) -> PerJoint {
         let (mut q, mut dq) = self.joints();
         match input {
-            Input::Command(command) => self.drive.tick(&Commands::new(std::slice::from_ref(command)), &q, &dq),
-            Input::Torques(tau) => self.drive.ask(tau.map(f64::from)),
+            ActuatorInputRef::Command(command) => self.drive.update_command(&SimdCommands::new(std::slice::from_ref(command)), &q, &dq),
+            ActuatorInputRef::Torques(tau) => self.drive.set_torque(tau.map(f64::from)),
         }
         let mut shown = [0.0; NUM_JOINTS];
         for index in 0..steps {
-            let JointForces { tau, dry, .. } = self.drive.push(index, &q, &dq);
+            let JointForces { tau, dry_friction: dry, .. } = self.drive.step(index, &q, &dq);
             let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
             for (joint, link) in multibody.links_mut().skip(1).enumerate() {
                 let position = link.joint().coords()[REVOLUTE_AXIS];
@@ -185,7 +185,7 @@ impl RobotWorld {
             }
             self.world.step();
             (q, dq) = self.joints();
-            for (shown, current) in shown.iter_mut().zip(self.drive.current()) {
+            for (shown, current) in shown.iter_mut().zip(self.drive.estimated_torque()) {
                 *shown += current / steps as f64;
             }
         }
@@ -213,7 +213,7 @@ impl RobotWorld {
     pub fn read_joints(&self, q: &mut PerJoint, dq: &mut PerJoint) {
         let (positions, velocities) = self.joints();
         for joint in 0..NUM_JOINTS {
-            let (seen_q, seen_dq) = self.drive.seen(joint, positions[joint], velocities[joint]);
+            let (seen_q, seen_dq) = self.drive.encoder_reading(joint, positions[joint], velocities[joint]);
             (q[joint], dq[joint]) = (seen_q as f32, seen_dq as f32);
         }
     }
@@ -340,20 +340,20 @@ fn insert_ground(world: &mut PhysicsWorld, ground: &GroundShapes, friction: f32)
 }
 
 /// The trunk with this placement's payload and shift, and the factor on the legs' bodies.
-fn varied_bodies(robot: &RobotModel, placement: &Placement) -> (RigidBody, f64) {
-    let variation = &placement.variation;
+fn varied_bodies(robot: &RobotModel, placement: &InitialState) -> (RigidBody, f64) {
+    let variation = &placement.randomisation;
     let scale = f64::from(variation.mass_scale);
     let trunk = robot.trunk.scaled(scale).with_point_mass(f64::from(variation.payload), robot.trunk.com);
     let shift = DVec3::from(variation.com_shift.map(f64::from));
     (RigidBody { com: trunk.com + shift, ..trunk }, scale)
 }
 
-fn insert_trunk(world: &mut PhysicsWorld, base: Base, trunk: &RigidBody, placement: &Placement) -> RigidBodyHandle {
+fn insert_trunk(world: &mut PhysicsWorld, base: BaseMount, trunk: &RigidBody, placement: &InitialState) -> RigidBodyHandle {
     let world_from_base = frames::world_from_base(placement.base_orientation);
     let centre = Vec3::from(placement.base_position) + world_from_base * trunk.com.as_vec3();
     let builder = match base {
-        Base::Floating => RigidBodyBuilder::dynamic(),
-        Base::Fixed => RigidBodyBuilder::fixed(),
+        BaseMount::Floating => RigidBodyBuilder::dynamic(),
+        BaseMount::Fixed => RigidBodyBuilder::fixed(),
     };
     let pose = Pose::from_parts(centre, world_from_base);
     world.insert_body(moving_body(builder, trunk, DVec3::ZERO).pose(pose))
@@ -419,10 +419,10 @@ mod tests {
         let robot = go2();
         let q = std::array::from_fn(|j| robot.control.default_pose[j] as f32 + 0.2 * (j as f32).sin());
         let tilted = Quat::from_euler(glam::EulerRot::ZYX, 0.1 * TAU, 0.05 * TAU, -0.03 * TAU);
-        let placement = Placement { base_orientation: frames::to_wxyz(tilted), ..Placement::at_rest(0.6, q) };
+        let placement = InitialState { base_orientation: frames::to_wxyz(tilted), ..InitialState::at_rest(0.6, q) };
         let mut world = RobotWorld::new(&robot, &SimConfig::default(), &GroundShapes::new(&Ground::FLAT), &placement);
         for steps in [0, 40] {
-            world.drive_period(Input::Torques(&std::array::from_fn(|j| (j as f32).cos())), steps);
+            world.drive_period(ActuatorInputRef::Torques(&std::array::from_fn(|j| (j as f32).cos())), steps);
             let (mut q, mut dq) = (PerJoint::default(), PerJoint::default());
             world.read_joints(&mut q, &mut dq);
             let base = world.read_base();

@@ -3,11 +3,11 @@
 use std::cmp::Reverse;
 
 use rayon::prelude::*;
-use twinstep_model::lanes::Instructions;
-use twinstep_model::{Ground, Job, Precision, RobotModel, RobotStates, Rollout};
+use twinstep_model::lanes::InstructionSet;
+use twinstep_model::{Ground, RolloutRequest, Precision, RobotModel, RobotStates, Rollout};
 
-use crate::batch::{Lanes, lane_robots};
-use crate::{Base, BuildError, SimConfig};
+use crate::batch::{SimdPrecision, lane_robots};
+use crate::{BaseMount, BackendBuildError, SimConfig};
 
 /// Candidates that are stepped together: the widest register of all processors.
 fn together(precision: Precision) -> usize {
@@ -26,19 +26,19 @@ pub struct BatchRollout {
 
 impl BatchRollout {
     /// At the rate and on the threads of `config`, for candidates with the drive's rate of `robot`.
-    pub fn new(robot: &RobotModel, config: &SimConfig) -> Result<Self, BuildError> {
+    pub fn new(robot: &RobotModel, config: &SimConfig) -> Result<Self, BackendBuildError> {
         config.check(&robot.control)?;
         let pool = crate::rapier::thread_pool(config.threads)?;
         Ok(Self { robot: robot.clone(), config: *config, pool })
     }
 
     /// Plays jobs whose trunks are all held, or all free.
-    fn play_together(&self, jobs: &[&Job], precision: Precision) -> Vec<RobotStates> {
+    fn play_together(&self, jobs: &[&RolloutRequest], precision: Precision) -> Vec<RobotStates> {
         let lanes = match precision {
-            Precision::Single => Lanes::Single(Instructions::best()),
-            Precision::Double => Lanes::Double,
+            Precision::Single => SimdPrecision::Single(InstructionSet::best()),
+            Precision::Double => SimdPrecision::Double,
         };
-        let base = if jobs[0].held { Base::Fixed } else { Base::Floating };
+        let base = if jobs[0].held { BaseMount::Fixed } else { BaseMount::Floating };
         let config = SimConfig { base, ..self.config };
         let mut robots = lane_robots(lanes, &self.robot, &config, &Ground::FLAT, &jobs[0].start, jobs.len());
         let mut start = RobotStates::new(jobs.len());
@@ -49,14 +49,14 @@ impl BatchRollout {
             record.copy_robot(0, &start, robot);
         }
         let steps = self.config.steps_per_drive_period(&self.robot.control);
-        robots.remember(&jobs.iter().map(|job| job.past).collect::<Vec<_>>(), steps);
+        robots.remember(&jobs.iter().map(|job| job.history).collect::<Vec<_>>(), steps);
         robots.play(&jobs.iter().map(|job| job.commands).collect::<Vec<_>>(), steps, &mut records);
         records
     }
 }
 
 impl Rollout for BatchRollout {
-    fn play(&mut self, jobs: &[Job], precision: Precision) -> Vec<RobotStates> {
+    fn run(&mut self, jobs: &[RolloutRequest], precision: Precision) -> Vec<RobotStates> {
         let (this, size) = (&*self, together(precision));
         // By length, so that the lanes of a register end together.
         let mut order: Vec<usize> = (0..jobs.len()).collect();

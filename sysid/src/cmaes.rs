@@ -93,7 +93,7 @@ impl CmaEs {
     }
 
     /// Standard deviation along the widest axis.
-    pub fn width(&self) -> f64 {
+    pub fn max_std(&self) -> f64 {
         self.sigma * self.covariance.diagonal().iter().copied().fold(0.0, f64::max).sqrt()
     }
 
@@ -129,6 +129,6 @@ mod tests {
         }
         let cost = rosenbrock(search.mean.as_slice());
         assert!(cost < 1e-8, "{cost} at {:?}", search.mean);
-        assert!(search.width() < 1e-3);
+        assert!(search.max_std() < 1e-3);
     }
 }

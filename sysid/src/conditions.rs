@@ -5,7 +5,7 @@ use twinstep_model::{Derating, JOINT_NAMES, NUM_JOINTS};
 
 /// Supply voltage and motor temperatures of a log, by row; empty where it tells neither.
 #[derive(Clone, Debug)]
-pub struct Conditions(Vec<Condition>);
+pub struct OperatingConditions(Vec<Condition>);
 
 #[derive(Clone, Copy, Debug)]
 struct Condition {
@@ -15,7 +15,7 @@ struct Condition {
     temperature: [f64; NUM_JOINTS],
 }
 
-impl Conditions {
+impl OperatingConditions {
     /// Those of `log`.
     pub fn of(log: &Log) -> Self {
         let voltages = log.channel("battery_V");
@@ -38,21 +38,21 @@ impl Conditions {
     }
 
     /// Share of each joint's torque that is left in `row`.
-    pub fn strength(&self, derating: &Derating, row: usize) -> [f32; NUM_JOINTS] {
+    pub fn derating_factors(&self, derating: &Derating, row: usize) -> [f32; NUM_JOINTS] {
         let Some(condition) = self.0.get(row) else { return [1.0; NUM_JOINTS] };
-        std::array::from_fn(|joint| derating.strength(joint, condition.voltage, condition.temperature[joint]) as f32)
+        std::array::from_fn(|joint| derating.derating_factor(joint, condition.voltage, condition.temperature[joint]) as f32)
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use twinstep_logs::{Meta, TauSensor};
+    use twinstep_logs::{Meta, TorqueSensor};
 
     use super::*;
 
     #[test]
     fn motors_weaken_with_the_voltage_and_above_their_temperature() {
-        let segments = vec![twinstep_logs::Segment { name: "air".to_owned(), base: twinstep_logs::Base::Fixed }];
+        let segments = vec![twinstep_logs::Segment { name: "air".to_owned(), base: twinstep_logs::BaseMount::Fixed }];
         let column = |name: &str, cells: [f64; 3]| (name.to_owned(), cells.to_vec());
         let columns = [
             column("t", [0.0, 0.005, 0.01]),
@@ -63,11 +63,11 @@ mod tests {
             column("battery_V", [25.0, 20.0, f64::NAN]),
             column("temp_FL_hip", [30.0, f64::NAN, 55.0]),
         ];
-        let log = Log::new(Meta::new(200.0, TauSensor::None, segments), columns).expect("a log");
-        let conditions = Conditions::of(&log);
+        let log = Log::new(Meta::new(200.0, TorqueSensor::None, segments), columns).expect("a log");
+        let conditions = OperatingConditions::of(&log);
         let mut derating = Derating { voltage_exponent: 2.0, ..Derating::NONE };
         derating.per_kelvin[0] = 0.01;
-        let shares = [0, 1, 2].map(|row| conditions.strength(&derating, row)[..2].to_vec());
+        let shares = [0, 1, 2].map(|row| conditions.derating_factors(&derating, row)[..2].to_vec());
         assert_eq!(shares, [[1.0, 1.0], [0.64, 0.64], [0.8, 1.0]]);
     }
 }

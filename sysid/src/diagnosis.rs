@@ -8,15 +8,15 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Diagnosis {
     /// Errors of the model that was given.
-    pub baseline: Errors,
+    pub baseline: RmsErrors,
     /// Errors with the findings added to it.
-    pub extended: Errors,
+    pub extended: RmsErrors,
     /// Errors that the sensors alone would leave.
-    pub noise_floor: Errors,
+    pub noise_floor: RmsErrors,
     /// Named causes, the largest gain first; empty when nothing is wrong, or when no name is earned.
     pub findings: Vec<Cause>,
     /// What this log cannot tell apart.
-    pub confusable: Vec<Confusable>,
+    pub confusable: Vec<CorrelatedPair>,
     /// What is left.
     pub unexplained: Unexplained,
     /// The motion that would tell apart what this log cannot; none when there is nothing to tell, or none of ours does.
@@ -28,7 +28,7 @@ pub struct Diagnosis {
 
 /// Root mean square errors; null where the log cannot tell.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Errors {
+pub struct RmsErrors {
     /// Torque at the log's tap, driven by the measured states and commands [N·m].
     pub torque_rmse_nm: Option<f64>,
     /// Joint positions in closed loop [rad].
@@ -53,7 +53,7 @@ pub struct Cause {
     /// Effects with scope, as in `armature@calf`, that explain as much: this log cannot tell.
     pub ambiguous_with: Vec<String>,
     /// The best of the others.
-    pub rivals: Vec<Rival>,
+    pub rivals: Vec<AlternativeCause>,
     /// What a robot engineer would say.
     pub evidence: String,
 }
@@ -62,17 +62,17 @@ pub struct Cause {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Estimate {
     /// The value.
-    pub value: Value,
+    pub value: ParameterValue,
     /// Lower end.
-    pub low: Value,
+    pub low: ParameterValue,
     /// Upper end.
-    pub high: Value,
+    pub high: ParameterValue,
 }
 
 /// A number or a vector.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
-pub enum Value {
+pub enum ParameterValue {
     /// A number.
     Number(f64),
     /// A vector.
@@ -81,7 +81,7 @@ pub enum Value {
 
 /// Another cause that was tried.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Rival {
+pub struct AlternativeCause {
     /// The effect.
     pub effect: String,
     /// What it is about.
@@ -92,7 +92,7 @@ pub struct Rival {
 
 /// Effects that this log cannot tell apart.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Confusable {
+pub struct CorrelatedPair {
     /// Their names.
     pub effects: [String; 2],
     /// Correlation of their sizes.
@@ -107,14 +107,14 @@ pub struct NextExperiment {
     /// Its motion, a folder beside this file that `twinstep play` reads.
     pub motion: String,
     /// What it parts.
-    pub parts: Vec<Parted>,
+    pub parts: Vec<DiscriminatedPair>,
     /// In a sentence.
     pub text: String,
 }
 
 /// Two causes that a motion parts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Parted {
+pub struct DiscriminatedPair {
     /// As in `["backlash@RR_calf", "joint_elasticity@RR_calf"]`.
     pub effects: [String; 2],
     /// Evidence for the true one that is expected of the motion [nats].

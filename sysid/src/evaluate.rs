@@ -7,7 +7,7 @@ use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout};
 
 use crate::experiment::{Experiment, ExperimentError};
 use crate::torque::torque_errors;
-use crate::window::Horizon;
+use crate::window::WindowConfig;
 
 /// How far a model is from a log; null where the log cannot tell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -36,7 +36,7 @@ pub fn evaluate(
     simulator: &mut dyn Rollout,
     keep: impl Fn(usize) -> bool,
 ) -> Result<Evaluation, ExperimentError> {
-    let experiment = Experiment::new(log, robot, Horizon::EVALUATION)?.only(&keep);
+    let experiment = Experiment::new(log, robot, WindowConfig::EVALUATION)?.filter_rows(&keep);
     let positions = experiment
         .position_errors(simulator, robot)
         .map(|errors| (errors.iter().map(|(_, error)| error * error).sum(), errors.len()));
@@ -69,5 +69,5 @@ pub fn position_errors(
     simulator: &mut dyn Rollout,
     keep: impl Fn(usize) -> bool,
 ) -> Result<[Vec<(usize, f64)>; NUM_JOINTS], ExperimentError> {
-    Ok(Experiment::new(log, robot, Horizon::EVALUATION)?.only(keep).position_errors(simulator, robot))
+    Ok(Experiment::new(log, robot, WindowConfig::EVALUATION)?.filter_rows(keep).position_errors(simulator, robot))
 }

@@ -2,12 +2,12 @@
 
 use glam::DQuat;
 use rayon::prelude::*;
-use twinstep_logs::{Base, Log, TauSensor};
-use twinstep_model::{Command, Job, Joint, NUM_JOINTS, Precision, RobotModel, RobotStates, Rollout};
+use twinstep_logs::{BaseMount, Log, TorqueSensor};
+use twinstep_model::{Command, RolloutRequest, Joint, NUM_JOINTS, Precision, RobotModel, RobotStates, Rollout};
 
-use crate::conditions::Conditions;
+use crate::conditions::OperatingConditions;
 use crate::motion::{MotionError, joint_commands};
-use crate::window::{Horizon, Window, orientation, windows};
+use crate::window::{WindowConfig, Window, orientation, windows};
 
 /// Rows this long apart [s] count as independent.
 const BLOCK_S: f64 = 0.5;
@@ -23,7 +23,7 @@ pub enum ExperimentError {
     Motion(#[from] MotionError),
     /// A free trunk's motion was not measured.
     #[error("segment `{segment}` has base \"floating\", but the log has no `{missing}`: a window cannot start there")]
-    NoBase {
+    MissingBaseState {
         /// The segment's name.
         segment: String,
         /// The channels that are missing.
@@ -34,7 +34,7 @@ pub enum ExperimentError {
 /// What is compared in every row.
 #[derive(Clone, Debug)]
 struct Channel {
-    quantity: Quantity,
+    quantity: ResidualChannel,
     /// Standard deviation of its noise, in its unit.
     sigma: f64,
     /// Measured, by row; a missing cell is NaN.
@@ -43,7 +43,7 @@ struct Channel {
 
 /// What is compared, with the joint or axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Quantity {
+pub enum ResidualChannel {
     /// Of a joint.
     Position(usize),
     /// Of a joint.
@@ -65,13 +65,13 @@ impl Channel {
     fn rows<'a>(&'a self, window: &'a Window) -> impl Iterator<Item = (usize, usize)> + 'a {
         let of_trunk = matches!(
             self.quantity,
-            Quantity::BasePosition(_)
-                | Quantity::BaseOrientation(_)
-                | Quantity::BaseVelocity(_)
-                | Quantity::BaseRate(_)
+            ResidualChannel::BasePosition(_)
+                | ResidualChannel::BaseOrientation(_)
+                | ResidualChannel::BaseVelocity(_)
+                | ResidualChannel::BaseRate(_)
         );
         // A torque is the mean to the next row, and the last has none.
-        let end = window.rows.len() - usize::from(matches!(self.quantity, Quantity::Torque(_)));
+        let end = window.rows.len() - usize::from(matches!(self.quantity, ResidualChannel::Torque(_)));
         let first = if of_trunk && window.held { end } else { window.settling };
         (first..end).map(|index| (index, window.rows.start + index)).filter(|(_, row)| self.measured[*row].is_finite())
     }
@@ -87,13 +87,13 @@ pub struct Experiment {
     /// The log's own joints.
     joints: Vec<Joint>,
     /// Rows in half a second.
-    rows_a_block: usize,
-    conditions: Conditions,
+    rows_per_block: usize,
+    conditions: OperatingConditions,
 }
 
 impl Experiment {
     /// `log` as an experiment on robots with the gains and rates of `robot`.
-    pub fn new(log: &Log, robot: &RobotModel, horizon: Horizon) -> Result<Self, ExperimentError> {
+    pub fn new(log: &Log, robot: &RobotModel, horizon: WindowConfig) -> Result<Self, ExperimentError> {
         let joints: Vec<_> = joint_commands(log)?.iter().map(|joint| joint.joint).collect();
         let windows = windows(log, robot, horizon)?;
         let floating = windows.iter().any(|window| !window.held);
@@ -104,8 +104,8 @@ impl Experiment {
             channels: channels(log, &joints),
             orientations,
             joints,
-            rows_a_block: ((BLOCK_S * log.meta().rate_hz).round() as usize).max(1),
-            conditions: Conditions::of(log),
+            rows_per_block: ((BLOCK_S * log.meta().rate_hz).round() as usize).max(1),
+            conditions: OperatingConditions::of(log),
         })
     }
 
@@ -116,7 +116,7 @@ impl Experiment {
 
     /// The experiment with the rows `keep` says yes to alone.
     #[must_use]
-    pub fn only(mut self, keep: impl Fn(usize) -> bool) -> Self {
+    pub fn filter_rows(mut self, keep: impl Fn(usize) -> bool) -> Self {
         for channel in &mut self.channels {
             for (row, cell) in channel.measured.iter_mut().enumerate() {
                 if !keep(row) {
@@ -162,7 +162,7 @@ impl Experiment {
 
     /// The experiment with the parts whose trunk was held alone, if there are any.
     #[must_use]
-    pub fn held_first(mut self) -> Self {
+    pub fn prefer_fixed_base(mut self) -> Self {
         if self.windows.iter().any(|window| window.held) {
             self.windows.retain(|window| window.held);
         }
@@ -170,30 +170,30 @@ impl Experiment {
     }
 
     /// Whether there are parts whose trunk was free.
-    pub fn has_free_parts(&self) -> bool {
+    pub fn has_floating_base(&self) -> bool {
         self.windows.iter().any(|window| !window.held)
     }
 
     /// For every residual, its quantity and row.
-    pub fn cells(&self) -> impl Iterator<Item = (Quantity, usize)> {
+    pub fn residual_index(&self) -> impl Iterator<Item = (ResidualChannel, usize)> {
         let windows = self.channels.iter().flat_map(|channel| self.windows.iter().map(move |window| (channel, window)));
         windows.flat_map(|(channel, window)| channel.rows(window).map(move |(_, row)| (channel.quantity, row)))
     }
 
     /// Numbers of a free trunk's start: position, orientation, velocity, rate.
-    pub const STARTS: usize = 12;
+    pub const INITIAL_STATE_DIM: usize = 12;
 
     /// The experiment with one number of every start off by `size` deviations of what smoothing leaves of its noise.
-    pub fn started_off(&self, number: usize, size: f64) -> Self {
+    pub fn with_perturbed_start(&self, number: usize, size: f64) -> Self {
         let (of_axis, axis) = (number / 3, number % 3);
         let quantity =
-            [Quantity::BasePosition, Quantity::BaseOrientation, Quantity::BaseVelocity, Quantity::BaseRate][of_axis];
+            [ResidualChannel::BasePosition, ResidualChannel::BaseOrientation, ResidualChannel::BaseVelocity, ResidualChannel::BaseRate][of_axis];
         // A parabola through the cells within 20 ms leaves 9 / 4n of their variance at its middle.
-        let cells = 1.0 + 0.04 * self.rows_a_block as f64 / BLOCK_S;
+        let cells = 1.0 + 0.04 * self.rows_per_block as f64 / BLOCK_S;
         let error = size * (2.25 / cells).sqrt().min(1.0) * self.sigma(quantity(axis));
         let mut off = self.clone();
         for window in off.windows.iter_mut().filter(|window| !window.held) {
-            window.start_off(of_axis, axis, error);
+            window.perturb_start(of_axis, axis, error);
         }
         off
     }
@@ -214,7 +214,7 @@ impl Experiment {
     }
 
     /// Noise of a quantity, in its unit; 1 if it is not compared.
-    pub fn sigma(&self, quantity: Quantity) -> f64 {
+    pub fn sigma(&self, quantity: ResidualChannel) -> f64 {
         self.channels.iter().find(|channel| channel.quantity == quantity).map_or(1.0, |channel| channel.sigma)
     }
 
@@ -230,13 +230,13 @@ impl Experiment {
     pub fn groups(&self) -> Vec<usize> {
         let group = |channel: &Channel, window: &Window| {
             let quantity = match channel.quantity {
-                Quantity::Position(_) => 0,
-                Quantity::Velocity(_) => 1,
-                Quantity::Torque(_) => 2,
-                Quantity::BasePosition(_) => 3,
-                Quantity::BaseOrientation(_) => 4,
-                Quantity::BaseVelocity(_) => 5,
-                Quantity::BaseRate(_) => 6,
+                ResidualChannel::Position(_) => 0,
+                ResidualChannel::Velocity(_) => 1,
+                ResidualChannel::Torque(_) => 2,
+                ResidualChannel::BasePosition(_) => 3,
+                ResidualChannel::BaseOrientation(_) => 4,
+                ResidualChannel::BaseVelocity(_) => 5,
+                ResidualChannel::BaseRate(_) => 6,
             };
             2 * quantity + usize::from(window.held)
         };
@@ -250,7 +250,7 @@ impl Experiment {
         let windows = self.channels.iter().flat_map(|channel| self.windows.iter().map(move |window| (channel, window)));
         let block = |window: &Window, row: usize| {
             // What a window with a free trunk starts with is carried through all of it.
-            (if window.held { row } else { window.rows.start }) / self.rows_a_block
+            (if window.held { row } else { window.rows.start }) / self.rows_per_block
         };
         windows.flat_map(|(channel, window)| channel.rows(window).map(move |(_, row)| block(window, row))).collect()
     }
@@ -260,7 +260,7 @@ impl Experiment {
         let windows = self.play(simulator, std::slice::from_ref(robot), Precision::Double);
         let mut errors = [const { Vec::new() }; NUM_JOINTS];
         for (channel, window, states) in self.compared(&windows) {
-            if let Quantity::Position(joint) = channel.quantity {
+            if let ResidualChannel::Position(joint) = channel.quantity {
                 self.compare(channel, window, states, robot, |row, difference| errors[joint].push((row, difference)));
             }
         }
@@ -268,7 +268,7 @@ impl Experiment {
     }
 
     fn play(&self, simulator: &mut dyn Rollout, candidates: &[RobotModel], precision: Precision) -> Vec<RobotStates> {
-        let weakened: Vec<_> = candidates.iter().map(|robot| self.weakened(robot)).collect();
+        let weakened: Vec<_> = candidates.iter().map(|robot| self.derated_commands(robot)).collect();
         let mut jobs = Vec::new();
         for (robot, weakened) in candidates.iter().zip(&weakened) {
             for (index, window) in self.windows.iter().enumerate() {
@@ -278,22 +278,22 @@ impl Experiment {
                     *rate -= bias as f32;
                 }
                 let commands = weakened.get(index).unwrap_or(&window.commands);
-                jobs.push(Job { robot, held: window.held, start, past: &window.past, commands });
+                jobs.push(RolloutRequest { robot, held: window.held, start, history: &window.history, commands });
             }
         }
-        simulator.play(&jobs, precision)
+        simulator.run(&jobs, precision)
     }
 
     /// The windows' commands to motors as supply and heat leave them; empty where the log tells neither.
-    fn weakened(&self, robot: &RobotModel) -> Vec<Vec<Command>> {
+    fn derated_commands(&self, robot: &RobotModel) -> Vec<Vec<Command>> {
         if self.conditions.is_empty() {
             return Vec::new();
         }
         let of = |window: &Window| {
             let mut commands = window.commands.clone();
             for (pair, row) in window.period.windows(2).zip(window.rows.clone()) {
-                let strength = self.conditions.strength(&robot.derating, row);
-                commands[pair[0]..pair[1]].iter_mut().for_each(|command| command.strength = strength);
+                let strength = self.conditions.derating_factors(&robot.derating, row);
+                commands[pair[0]..pair[1]].iter_mut().for_each(|command| command.derating_factor = strength);
             }
             commands
         };
@@ -321,21 +321,21 @@ impl Experiment {
         for (index, row) in channel.rows(window) {
             let period = window.period[index];
             let simulated = match channel.quantity {
-                Quantity::Position(joint) => f64::from(states.q[period][joint]),
-                Quantity::Velocity(joint) => f64::from(states.dq[period][joint]),
-                Quantity::Torque(joint) => {
+                ResidualChannel::Position(joint) => f64::from(states.q[period][joint]),
+                ResidualChannel::Velocity(joint) => f64::from(states.dq[period][joint]),
+                ResidualChannel::Torque(joint) => {
                     let until = window.period.get(index + 1).copied().unwrap_or(period + 1);
-                    shown_torque(states, robot, joint, period, until)
+                    estimated_torque(states, robot, joint, period, until)
                 }
-                Quantity::BasePosition(axis) => f64::from(states.base_position[period][axis]),
-                Quantity::BaseOrientation(axis) => {
+                ResidualChannel::BasePosition(axis) => f64::from(states.base_position[period][axis]),
+                ResidualChannel::BaseOrientation(axis) => {
                     let [w, x, y, z] = states.base_orientation[period].map(f64::from);
                     let turn = self.orientations[row].inverse() * DQuat::from_xyzw(x, y, z, w);
                     let turn = if turn.w < 0.0 { -turn } else { turn };
                     turn.to_scaled_axis()[axis]
                 }
-                Quantity::BaseVelocity(axis) => f64::from(states.base_linear_velocity[period][axis]),
-                Quantity::BaseRate(axis) => f64::from(states.base_angular_velocity[period][axis]),
+                ResidualChannel::BaseVelocity(axis) => f64::from(states.base_linear_velocity[period][axis]),
+                ResidualChannel::BaseRate(axis) => f64::from(states.base_angular_velocity[period][axis]),
             };
             each(row, simulated - channel.measured[row]);
         }
@@ -343,8 +343,8 @@ impl Experiment {
 }
 
 /// Mean torque over drive periods `from..until`, as a late sensor shows it [N·m].
-pub fn shown_torque(states: &RobotStates, robot: &RobotModel, joint: usize, from: usize, until: usize) -> f64 {
-    let late = robot.joints[joint].drive.sensor_delay / robot.control.drive_dt();
+pub fn estimated_torque(states: &RobotStates, robot: &RobotModel, joint: usize, from: usize, until: usize) -> f64 {
+    let late = robot.joints[joint].actuator.sensor_delay / robot.control.actuator_dt();
     // Entry p + 1 holds the torque of period p.
     let at = |period: f64| {
         let entry = (period + 1.0).clamp(1.0, (states.tau.len() - 1) as f64);
@@ -358,7 +358,7 @@ pub fn shown_torque(states: &RobotStates, robot: &RobotModel, joint: usize, from
 
 fn channels(log: &Log, joints: &[Joint]) -> Vec<Channel> {
     let mut channels = Vec::new();
-    let mut add = |quantity: Quantity, name: String, kind: &str, measured: Option<&[f64]>| {
+    let mut add = |quantity: ResidualChannel, name: String, kind: &str, measured: Option<&[f64]>| {
         let assumed = ASSUMED_NOISE.iter().find(|(quantity, _)| *quantity == kind).expect("a known kind").1;
         if let Some(measured) = measured {
             let sigma = log.noise(&name).filter(|sigma| *sigma > 0.0).unwrap_or(assumed);
@@ -367,13 +367,13 @@ fn channels(log: &Log, joints: &[Joint]) -> Vec<Channel> {
     };
     for joint in joints {
         let (index, name) = (joint.index(), joint.name());
-        add(Quantity::Position(index), format!("q_{name}"), "q", log.q(name));
-        add(Quantity::Velocity(index), format!("dq_{name}"), "dq", log.dq(name));
-        if log.meta().tau_sensor == TauSensor::Current {
-            add(Quantity::Torque(index), format!("tau_measured_{name}"), "tau_measured", log.tau_measured(name));
+        add(ResidualChannel::Position(index), format!("q_{name}"), "q", log.q(name));
+        add(ResidualChannel::Velocity(index), format!("dq_{name}"), "dq", log.dq(name));
+        if log.meta().tau_sensor == TorqueSensor::MotorCurrent {
+            add(ResidualChannel::Torque(index), format!("tau_measured_{name}"), "tau_measured", log.tau_measured(name));
         }
     }
-    if log.segments().any(|(segment, _)| segment.base == Base::Floating) {
+    if log.segments().any(|(segment, _)| segment.base == BaseMount::Floating) {
         let known = |row: usize| {
             ["w", "x", "y", "z"]
                 .iter()
@@ -382,10 +382,10 @@ fn channels(log: &Log, joints: &[Joint]) -> Vec<Channel> {
         let zeros: Vec<f64> = (0..log.rows()).map(|row| if known(row) { 0.0 } else { f64::NAN }).collect();
         for (axis, letter) in ["x", "y", "z"].into_iter().enumerate() {
             let of = |kind: &str| format!("{kind}_{letter}");
-            add(Quantity::BasePosition(axis), of("pos"), "pos", log.channel(&of("pos")));
-            add(Quantity::BaseOrientation(axis), "quat_w".to_owned(), "quat", Some(&zeros));
-            add(Quantity::BaseVelocity(axis), of("vel"), "vel", log.channel(&of("vel")));
-            add(Quantity::BaseRate(axis), of("gyro"), "gyro", log.channel(&of("gyro")));
+            add(ResidualChannel::BasePosition(axis), of("pos"), "pos", log.channel(&of("pos")));
+            add(ResidualChannel::BaseOrientation(axis), "quat_w".to_owned(), "quat", Some(&zeros));
+            add(ResidualChannel::BaseVelocity(axis), of("vel"), "vel", log.channel(&of("vel")));
+            add(ResidualChannel::BaseRate(axis), of("gyro"), "gyro", log.channel(&of("gyro")));
         }
     }
     channels

@@ -35,17 +35,17 @@ mod torque;
 mod unknown;
 mod window;
 
-pub use balance::{Balance, Kinematics, PerRow};
-pub use diagnose::{DiagnoseError, Diagnosed, NextMotion, Rivalry, diagnose, diagnose_torques};
+pub use balance::{InverseDynamicsResidual, JointTrajectory, JointSeries};
+pub use diagnose::{DiagnoseError, DiagnosisOutput, ProposedExperiment, HypothesisPair, diagnose, diagnose_torques};
 pub use diagnosis::{
-    Cause, Confusable, Diagnosis, Errors, Estimate, NextExperiment, Parted, Rival, Unexplained, Value,
+    Cause, CorrelatedPair, Diagnosis, RmsErrors, Estimate, NextExperiment, DiscriminatedPair, AlternativeCause, Unexplained, ParameterValue,
 };
 pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};
 pub use experiment::{Experiment, ExperimentError};
-pub use identify::{Finding, Identification, IdentifyError, Options, Progress, Stage, Verdict, identify};
+pub use identify::{ParameterEstimate, Identification, IdentifyError, IdentifyOptions, IdentifyProgress, Stage, EstimateStatus, identify};
 pub use record::{RecordError, record};
-pub use safe_motions::{SAFE_MOTIONS, SafeMotion};
-pub use search::Search;
-pub use sensors::{Sensor, measured};
-pub use unknown::{Unknown, candidate, start, unknowns, with_values};
-pub use window::Horizon;
+pub use safe_motions::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
+pub use search::GlobalSearch;
+pub use sensors::{Sensor, apply_sensors};
+pub use unknown::{FreeParameter, candidate, initial_coordinate, free_parameters, with_values};
+pub use window::WindowConfig;

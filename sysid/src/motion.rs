@@ -45,7 +45,7 @@ pub enum MotionError {
 /// A simulation that failed, and where in the log.
 #[derive(Debug, thiserror::Error)]
 #[error("segment `{segment}`, row {row} (t = {t} s): {cause}")]
-pub struct FailedAt {
+pub struct SimulationFailure {
     /// The segment's name.
     pub segment: String,
     /// The data row from which was stepped, from 1.
@@ -133,7 +133,7 @@ impl DriveClock {
             log.segments().flat_map(|(_, rows)| log.t()[rows].windows(2).map(|pair| pair[1] - pair[0])).collect();
         steps.sort_by(f64::total_cmp);
         let median = *steps.get(steps.len() / 2).ok_or(MotionError::NoSteps)?;
-        let drive_dt = robot.control.drive_dt();
+        let drive_dt = robot.control.actuator_dt();
         let periods = (median / drive_dt).round();
         if periods < 1.0 || (median / (periods * drive_dt) - 1.0).abs() > PERIOD_TOLERANCE {
             return Err(MotionError::Period { period_ms: median * 1e3, drive_ms: drive_dt * 1e3 });

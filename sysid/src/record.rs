@@ -2,11 +2,11 @@
 
 use std::ops::Range;
 
-use twinstep_logs::{Base, Gain, Log, LogError, Meta, Segment, TauSensor};
-use twinstep_model::{Backend, Ground, HELD_HEIGHT, JOINT_NAMES, Joint, Leg, Placement, RobotModel, RobotStates};
+use twinstep_logs::{BaseMount, Gain, Log, LogError, Meta, Segment, TorqueSensor};
+use twinstep_model::{Backend, Ground, FIXED_BASE_HEIGHT, JOINT_NAMES, Joint, Leg, InitialState, RobotModel, RobotStates};
 
-use crate::conditions::Conditions;
-use crate::motion::{DriveClock, FailedAt, JointCommands, MotionError, command, joint_commands};
+use crate::conditions::OperatingConditions;
+use crate::motion::{DriveClock, SimulationFailure, JointCommands, MotionError, command, joint_commands};
 
 /// Why a motion gave no log.
 #[derive(Debug, thiserror::Error)]
@@ -19,13 +19,13 @@ pub enum RecordError {
     Backend(Box<dyn std::error::Error + Send + Sync>),
     /// The simulation failed.
     #[error(transparent)]
-    Failed(FailedAt),
+    Failed(SimulationFailure),
     /// What was recorded is no log.
     #[error(transparent)]
     Log(#[from] LogError),
     /// `progress` ended it.
     #[error("ended before the motion's last row")]
-    Ended,
+    Interrupted,
 }
 
 /// What `robot` does when it is commanded as `motion` has it, in backends of one robot each that `backend` makes for a held
@@ -35,17 +35,17 @@ pub enum RecordError {
 pub fn record<B: Backend>(
     motion: &Log,
     robot: &RobotModel,
-    base: Option<Base>,
-    mut backend: impl FnMut(Base) -> Result<B, RecordError>,
+    base: Option<BaseMount>,
+    mut backend: impl FnMut(BaseMount) -> Result<B, RecordError>,
     source: String,
     progress: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Log, RecordError> {
-    let player = Player {
+    let player = CommandPlayer {
         motion,
         robot,
         joints: joint_commands(motion)?,
         clock: DriveClock::of(motion, robot)?,
-        conditions: Conditions::of(motion),
+        conditions: OperatingConditions::of(motion),
     };
     let base_of = |segment: &Segment| base.unwrap_or(segment.base);
     let mut record = Record::default();
@@ -103,21 +103,21 @@ fn sensors(states: &RobotStates, stepped: bool) -> Vec<f64> {
 }
 
 /// A motion and the robot that it is for.
-struct Player<'a> {
+struct CommandPlayer<'a> {
     motion: &'a Log,
     robot: &'a RobotModel,
     joints: Vec<JointCommands<'a>>,
     clock: DriveClock,
-    conditions: Conditions,
+    conditions: OperatingConditions,
 }
 
-impl Player<'_> {
+impl CommandPlayer<'_> {
     /// Plays rows that follow one another.
     fn part<B: Backend>(
         &self,
         mut backend: B,
         segment: &str,
-        base: Base,
+        base: BaseMount,
         rows: Range<usize>,
         record: &mut Record,
         progress: &mut dyn FnMut(usize) -> bool,
@@ -125,7 +125,7 @@ impl Player<'_> {
         let t = &self.motion.t()[rows.clone()];
         let failed = |row: usize| {
             let (segment, t) = (segment.to_owned(), t[row - rows.start]);
-            move |cause| RecordError::Failed(FailedAt { segment, row: row + 1, t, cause })
+            move |cause| RecordError::Failed(SimulationFailure { segment, row: row + 1, t, cause })
         };
         backend.reset(&[(0, self.placement(&backend.ground(), base, rows.start))]).map_err(failed(rows.start))?;
         for row in rows.clone() {
@@ -133,7 +133,7 @@ impl Player<'_> {
             let mut sums = [0.0; JOINT_NAMES.len()];
             let periods = if row + 1 < rows.end { self.clock.periods_between(t, row - rows.start) } else { 0 };
             let mut command = command(self.robot, &self.joints, row);
-            command.strength = self.conditions.strength(&self.robot.derating, row);
+            command.derating_factor = self.conditions.derating_factors(&self.robot.derating, row);
             for _ in 0..periods {
                 backend.step(&[command], &[true], 1).map_err(failed(row))?;
                 for (sum, torque) in sums.iter_mut().zip(backend.states().tau[0]) {
@@ -143,14 +143,14 @@ impl Player<'_> {
             // Of no period the mean is not a number: the part's last row has no torque.
             record.tau_measured.push(sums.map(|sum| sum / periods as f64).to_vec());
             if !progress(row + 1) {
-                return Err(RecordError::Ended);
+                return Err(RecordError::Interrupted);
             }
         }
         Ok(())
     }
 
     /// Where the robot starts: the default pose, but for what the motion measured in `row`.
-    fn placement(&self, ground: &Ground, base: Base, row: usize) -> Placement {
+    fn placement(&self, ground: &Ground, base: BaseMount, row: usize) -> InitialState {
         let cell =
             |name: &str| self.motion.channel(name).map(|cells| cells[row] as f32).filter(|cell| cell.is_finite());
         let mut q = self.robot.control.default_pose_f32();
@@ -160,8 +160,8 @@ impl Player<'_> {
             dq[index] = cell(&format!("dq_{name}")).unwrap_or(0.0);
         }
         let start = match base {
-            Base::Floating => Placement::above(ground, self.robot, q, 0.0),
-            Base::Fixed => Placement::at_rest(HELD_HEIGHT as f32, q),
+            BaseMount::Floating => InitialState::standing_on(ground, self.robot, q, 0.0),
+            BaseMount::Fixed => InitialState::at_rest(FIXED_BASE_HEIGHT as f32, q),
         };
         let vector = |quantity: &str| {
             let [x, y, z] = ["x", "y", "z"].map(|axis| cell(&format!("{quantity}_{axis}")));
@@ -171,7 +171,7 @@ impl Player<'_> {
             let [w, x, y, z] = ["w", "x", "y", "z"].map(|part| cell(&format!("quat_{part}")));
             Some([w?, x?, y?, z?])
         };
-        Placement {
+        InitialState {
             base_position: vector("pos").unwrap_or(start.base_position),
             base_orientation: orientation().unwrap_or(start.base_orientation),
             base_linear_velocity: vector("vel").unwrap_or(start.base_linear_velocity),
@@ -183,7 +183,7 @@ impl Player<'_> {
 
     fn log(&self, record: Record, segments: Vec<Segment>, source: String) -> Result<Log, LogError> {
         let motion = self.motion;
-        let floating = segments.iter().any(|segment| segment.base == Base::Floating);
+        let floating = segments.iter().any(|segment| segment.base == BaseMount::Floating);
         let index = |cells: &[u32]| cells.iter().map(|cell| f64::from(*cell)).collect();
         let mut columns = vec![
             ("t".to_owned(), motion.t().to_vec()),
@@ -202,10 +202,10 @@ impl Player<'_> {
         let mut meta = Meta {
             policy_hz: motion.meta().policy_hz,
             joints: JOINT_NAMES.map(str::to_owned).to_vec(),
-            pd: Some(format!("PD at {} Hz, held, clipped to the torque limit", self.robot.control.drive_hz)),
+            pd: Some(format!("PD at {} Hz, held, clipped to the torque limit", self.robot.control.actuator_hz)),
             source: Some(source),
             // The ideal drive's torque, before rotor and friction.
-            ..Meta::new(motion.meta().rate_hz, TauSensor::Current, segments)
+            ..Meta::new(motion.meta().rate_hz, TorqueSensor::MotorCurrent, segments)
         };
         self.commands(&mut meta, &mut columns);
         // Voltage and temperature are given, not simulated.
@@ -237,7 +237,7 @@ impl Player<'_> {
             if gains.iter().all(|cells| cells.iter().all(|cell| *cell == cells[0])) {
                 let first: Vec<_> = gains.iter().map(|cells| cells[0]).collect();
                 let same = first.iter().all(|gain| *gain == first[0]);
-                *constant = Some(if same { Gain::Same(first[0]) } else { Gain::PerJoint(first) });
+                *constant = Some(if same { Gain::Uniform(first[0]) } else { Gain::PerJoint(first) });
             } else {
                 let names = JOINT_NAMES.iter().map(|name| format!("{quantity}_{name}"));
                 columns.extend(names.zip(gains));

@@ -2,7 +2,7 @@
 
 use std::f64::consts::TAU;
 
-use twinstep_logs::{Base, Log, Meta, Segment, TauSensor};
+use twinstep_logs::{BaseMount, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{Joint, JointKind, RobotModel};
 
 /// Length of every motion [s]: of equal length, they are told apart by what they show.
@@ -12,13 +12,13 @@ const EASE_S: f64 = 0.5;
 
 /// A motion that any healthy or slightly wrong Go2 gets through.
 #[derive(Clone, Copy, Debug)]
-pub struct SafeMotion {
+pub struct ExcitationTrajectory {
     /// Its name, as in `chirp_calf`.
     pub name: &'static str,
     /// What is done, and where.
     pub what: &'static str,
     /// Whether the trunk hangs in a stand.
-    pub base: Base,
+    pub base: BaseMount,
     /// Offset of a joint from the default pose [rad] at a time [s].
     offset: fn(Joint, f64) -> f64,
     /// Position and velocity gain at a time [s].
@@ -27,48 +27,48 @@ pub struct SafeMotion {
 
 /// All of them. Chirps show inertia and delays, steps delays, creeping friction and play, holds gravity, springs and gains,
 /// and standing what is loaded.
-pub const SAFE_MOTIONS: [SafeMotion; 14] = [
-    held("chirp_hip", "a chirp of the hips in the air", |joint, t| only(JointKind::Hip, joint, 0.15 * chirp(t)), usual),
-    held(
+pub const EXCITATION_TRAJECTORIES: [ExcitationTrajectory; 14] = [
+    fixed_base("chirp_hip", "a chirp of the hips in the air", |joint, t| only(JointKind::Hip, joint, 0.15 * chirp(t)), default_gains),
+    fixed_base(
         "chirp_thigh",
         "a chirp of the thighs in the air",
         |joint, t| only(JointKind::Thigh, joint, 0.15 * chirp(t)),
-        usual,
+        default_gains,
     ),
-    held(
+    fixed_base(
         "chirp_calf",
         "a chirp of the calves in the air",
         |joint, t| only(JointKind::Calf, joint, 0.2 * chirp(t)),
-        usual,
+        default_gains,
     ),
-    held(
+    fixed_base(
         "chirp_firm",
         "a chirp of all joints in the air with firm gains",
         |joint, t| 0.1 * chirp(t) * if joint.index() % 2 == 0 { 1.0 } else { -1.0 },
-        firm,
+        stiff_gains,
     ),
-    held("steps", "small steps of all joints in the air", |joint, t| 0.1 * wave(joint, 0.9, t).signum(), firm),
-    held("creep", "slow reversals of all joints in the air", |joint, t| 0.1 * triangle(joint, 0.3, t), usual),
-    held(
+    fixed_base("steps", "small steps of all joints in the air", |joint, t| 0.1 * wave(joint, 0.9, t).signum(), stiff_gains),
+    fixed_base("creep", "slow reversals of all joints in the air", |joint, t| 0.1 * triangle(joint, 0.3, t), default_gains),
+    fixed_base(
         "creep_soft",
         "slow reversals of all joints in the air with soft gains",
         |joint, t| 0.15 * triangle(joint, 0.25, t),
         soft,
     ),
-    held(
+    fixed_base(
         "two_speeds",
         "reversals in the air, first slow, then fast",
         |joint, t| if t < 5.0 { 0.1 * triangle(joint, 0.3, t) } else { 0.3 * triangle(joint, 1.2, t) },
-        usual,
+        default_gains,
     ),
-    held("holds", "slow changes between postures in the air", |joint, t| pose(joint, t, 1.25), usual),
-    held(
+    fixed_base("holds", "slow changes between postures in the air", |joint, t| pose(joint, t, 1.25), default_gains),
+    fixed_base(
         "holds_two_gains",
         "postures in the air, each held with soft and with firm gains",
         |joint, t| pose(joint, t, 2.5),
-        |t| if t % 2.5 < 1.25 { soft(t) } else { firm(t) },
+        |t| if t % 2.5 < 1.25 { soft(t) } else { stiff_gains(t) },
     ),
-    held("multisine", "five sines of all joints at once in the air", |joint, t| 0.3 * multisine(joint, t), usual),
+    fixed_base("multisine", "five sines of all joints at once in the air", |joint, t| 0.3 * multisine(joint, t), default_gains),
     standing("sway", "swaying of the trunk over standing feet", |joint, t| {
         let fore = 0.08 * (TAU * 0.37 * t).sin();
         stance(joint, 0.06 * (TAU * 0.23 * t).sin(), 0.05 * (TAU * 0.61 * t).sin(), fore)
@@ -80,28 +80,28 @@ pub const SAFE_MOTIONS: [SafeMotion; 14] = [
     }),
 ];
 
-const fn held(
+const fn fixed_base(
     name: &'static str,
     what: &'static str,
     offset: fn(Joint, f64) -> f64,
     gains: fn(f64) -> [f64; 2],
-) -> SafeMotion {
-    SafeMotion { name, what, base: Base::Fixed, offset, gains }
+) -> ExcitationTrajectory {
+    ExcitationTrajectory { name, what, base: BaseMount::Fixed, offset, gains }
 }
 
-const fn standing(name: &'static str, what: &'static str, offset: fn(Joint, f64) -> f64) -> SafeMotion {
-    SafeMotion { name, what, base: Base::Floating, offset, gains: |_| [60.0, 1.5] }
+const fn standing(name: &'static str, what: &'static str, offset: fn(Joint, f64) -> f64) -> ExcitationTrajectory {
+    ExcitationTrajectory { name, what, base: BaseMount::Floating, offset, gains: |_| [60.0, 1.5] }
 }
 
 fn soft(_: f64) -> [f64; 2] {
     [20.0, 0.6]
 }
 
-fn usual(_: f64) -> [f64; 2] {
+fn default_gains(_: f64) -> [f64; 2] {
     [30.0, 0.8]
 }
 
-fn firm(_: f64) -> [f64; 2] {
+fn stiff_gains(_: f64) -> [f64; 2] {
     [60.0, 1.5]
 }
 
@@ -151,10 +151,10 @@ fn stance(joint: Joint, lift: f64, pitch: f64, fore: f64) -> f64 {
     }
 }
 
-impl SafeMotion {
+impl ExcitationTrajectory {
     /// Its commands to `robot`, one row a period of the drive.
     pub fn motion(&self, robot: &RobotModel) -> Log {
-        let rate_hz = robot.control.drive_hz;
+        let rate_hz = robot.control.actuator_hz;
         let t: Vec<f64> = (0..(LENGTH_S * rate_hz) as usize).map(|row| row as f64 / rate_hz).collect();
         let of_time = |of: &dyn Fn(f64) -> f64| t.iter().map(|t| of(*t)).collect::<Vec<_>>();
         let ease = |t: f64| (t.min(LENGTH_S - t) / EASE_S).clamp(0.0, 1.0);
@@ -170,9 +170,9 @@ impl SafeMotion {
         }
         columns.push(("t".to_owned(), t));
         let segments = vec![Segment { name: self.name.to_owned(), base: self.base }];
-        let mut meta = Meta::new(rate_hz, TauSensor::None, segments);
+        let mut meta = Meta::new(rate_hz, TorqueSensor::None, segments);
         meta.joints = Joint::ALL.map(|joint| joint.name().to_owned()).to_vec();
         meta.source = Some(format!("twinstep: {}", self.what));
-        Log::new_motion(meta, columns).expect("commands of all joints at even times are a motion")
+        Log::new_commands(meta, columns).expect("commands of all joints at even times are a motion")
     }
 }

@@ -13,19 +13,19 @@ pub struct Sensor {
     /// Standard deviation of white noise, in the channel's unit; of `quat` the angle about each axis [rad].
     pub sigma: f64,
     /// Smallest step that is told apart, in the channel's unit; 0 for none.
-    pub step: f64,
+    pub resolution: f64,
 }
 
 impl Sensor {
     /// What is shown of `value`.
     fn shows(&self, value: f64, random: &mut impl Rng) -> f64 {
         let noisy = value + self.sigma * standard_normal(random);
-        if self.step > 0.0 { (noisy / self.step).round() * self.step } else { noisy }
+        if self.resolution > 0.0 { (noisy / self.resolution).round() * self.resolution } else { noisy }
     }
 }
 
 /// `log` as `sensors` show it, noise stated; quantities without a sensor are shown exactly.
-pub fn measured(log: &Log, sensors: &[Sensor], seed: u64) -> Result<Log, LogError> {
+pub fn apply_sensors(log: &Log, sensors: &[Sensor], seed: u64) -> Result<Log, LogError> {
     let mut random = stream(seed, "sensors", 0);
     let mut meta = log.meta().clone();
     let index = |cells: &[u32]| cells.iter().map(|cell| f64::from(*cell)).collect();
@@ -47,17 +47,17 @@ pub fn measured(log: &Log, sensors: &[Sensor], seed: u64) -> Result<Log, LogErro
         columns.push((name.to_owned(), cells));
     }
     if let Some(sensor) = sensors.iter().find(|sensor| sensor.quantity == "quat") {
-        turn(&mut columns, sensor.sigma, &mut random);
+        add_orientation_noise(&mut columns, sensor.sigma, &mut random);
     }
     meta.noise.extend(sensors.iter().filter(|sensor| sensor.sigma > 0.0).map(|sensor| {
         // Rounding adds the variance of an even distribution.
-        (sensor.quantity.to_owned(), sensor.sigma.hypot(sensor.step / 12f64.sqrt()))
+        (sensor.quantity.to_owned(), sensor.sigma.hypot(sensor.resolution / 12f64.sqrt()))
     }));
     Log::new(meta, columns)
 }
 
 /// Turns measured orientations by a small random angle about each axis.
-fn turn(columns: &mut [(String, Vec<f64>)], sigma: f64, random: &mut impl Rng) {
+fn add_orientation_noise(columns: &mut [(String, Vec<f64>)], sigma: f64, random: &mut impl Rng) {
     let Some(places) = ["quat_w", "quat_x", "quat_y", "quat_z"]
         .map(|name| columns.iter().position(|(column, _)| column == name))
         .into_iter()

@@ -4,38 +4,38 @@ use nalgebra::{DMatrix, DVector};
 use twinstep_model::{ModelFile, Precision, Rollout};
 
 use crate::experiment::Experiment;
-use crate::tolerance::Tolerances;
-use crate::unknown::{Unknown, candidate};
+use crate::tolerance::NuisanceModel;
+use crate::unknown::{FreeParameter, candidate};
 
 /// Half a difference, in prior standard deviations.
 const STEP: f64 = 0.02;
 
 /// What is asked. A point is the unknowns' coordinates.
 #[derive(Clone, Copy)]
-pub struct Task<'a> {
+pub struct LeastSquaresProblem<'a> {
     /// The model with an entry for each unknown.
     pub file: &'a ModelFile,
     /// What is sought.
-    pub unknowns: &'a [Unknown],
+    pub unknowns: &'a [FreeParameter],
     /// What is to be followed.
     pub experiments: &'a [Experiment],
     /// What residuals are divided by, one by one, besides their noise; empty for nothing. See [`Task::spread`].
-    pub spread: &'a [f64],
+    pub residual_scale: &'a [f64],
     /// Errors that explain residuals at a price, for residuals that are divided by `spread`.
-    pub tolerances: Option<&'a Tolerances>,
+    pub tolerances: Option<&'a NuisanceModel>,
     /// What candidates are simulated in.
     pub precision: Precision,
 }
 
 /// Residuals at a point, and their derivatives by the coordinates in units of their prior deviations.
-pub struct Linear {
+pub struct Linearisation {
     /// Residuals.
     pub residuals: DVector<f64>,
     /// One row a residual, one column an unknown.
-    pub slopes: DMatrix<f64>,
+    pub jacobian: DMatrix<f64>,
 }
 
-impl Task<'_> {
+impl LeastSquaresProblem<'_> {
     /// Residuals at points, one after the other, then what tolerated errors cost; none of a point that is no robot or
     /// diverged.
     pub fn residuals(&self, simulator: &mut dyn Rollout, points: &[Vec<f64>]) -> Vec<Option<Vec<f64>>> {
@@ -51,12 +51,12 @@ impl Task<'_> {
             .map(|robot| {
                 robot.as_ref()?;
                 let mut whole: Vec<f64> = parts.iter_mut().flat_map(|part| part.next().unwrap_or_default()).collect();
-                whole.iter_mut().zip(self.spread).for_each(|(residual, spread)| *residual /= spread);
+                whole.iter_mut().zip(self.residual_scale).for_each(|(residual, spread)| *residual /= spread);
                 if whole.iter().any(|residual| !residual.is_finite()) {
                     return None;
                 }
                 if let Some(tolerances) = self.tolerances {
-                    tolerances.take(&mut whole);
+                    tolerances.project_out(&mut whole);
                 }
                 Some(whole)
             })
@@ -64,7 +64,7 @@ impl Task<'_> {
     }
 
     /// Residuals and slopes at `point`: central differences in one batch; none where a neighbour diverges.
-    pub fn linear(&self, simulator: &mut dyn Rollout, point: &[f64]) -> Option<Linear> {
+    pub fn linearise(&self, simulator: &mut dyn Rollout, point: &[f64]) -> Option<Linearisation> {
         let mut points = vec![point.to_vec()];
         let mut widths = Vec::new();
         for (index, unknown) in self.unknowns.iter().enumerate() {
@@ -85,13 +85,13 @@ impl Task<'_> {
             let slope = above.iter().zip(&below).map(|(above, below)| (above - below) / width);
             slopes.set_column(index, &DVector::from_iterator(here.len(), slope));
         }
-        Some(Linear { residuals: here, slopes })
+        Some(Linearisation { residuals: here, jacobian: slopes })
     }
 
     /// How much larger than their noise the residuals of `point` are, by quantity and by whether the trunk was held; at least
     /// 1. A model errs in some of them more than in others, and those say less.
-    pub fn spread(&self, simulator: &mut dyn Rollout, point: &[f64]) -> Vec<f64> {
-        let unspread = Task { spread: &[], ..*self };
+    pub fn estimate_residual_scale(&self, simulator: &mut dyn Rollout, point: &[f64]) -> Vec<f64> {
+        let unspread = LeastSquaresProblem { residual_scale: &[], ..*self };
         let groups: Vec<usize> = self.experiments.iter().flat_map(Experiment::groups).collect();
         let Some(residuals) = unspread.residuals(simulator, &[point.to_vec()]).remove(0) else {
             return vec![1.0; groups.len()];
@@ -107,16 +107,16 @@ impl Task<'_> {
     /// Cost of residuals, and of the distance to the prior.
     pub fn cost(&self, residuals: &[f64], point: &[f64]) -> f64 {
         residuals.iter().map(|residual| residual * residual).sum::<f64>()
-            + self.scaled(point).map(|distance| distance * distance).sum::<f64>()
+            + self.to_prior_units(point).map(|distance| distance * distance).sum::<f64>()
     }
 
     /// A point's distance from the prior means, in prior deviations.
-    pub fn scaled(&self, point: &[f64]) -> impl Iterator<Item = f64> {
+    pub fn to_prior_units(&self, point: &[f64]) -> impl Iterator<Item = f64> {
         self.unknowns.iter().zip(point).map(|(unknown, value)| (value - unknown.prior[0]) / unknown.prior[1])
     }
 
     /// Back from [`Task::scaled`], to the nearest point that is allowed.
-    pub fn within_bounds(&self, scaled: &[f64]) -> Vec<f64> {
+    pub fn from_prior_units(&self, scaled: &[f64]) -> Vec<f64> {
         let pairs = self.unknowns.iter().zip(scaled);
         let back = pairs.map(|(unknown, value)| {
             let [low, high] = unknown.coordinate_bounds();

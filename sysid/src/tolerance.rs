@@ -12,26 +12,26 @@ use twinstep_model::{Precision, RobotModel, Rollout};
 use crate::experiment::Experiment;
 
 /// Standard deviations: of masses, relative; of where legs are mounted [m]; of the ground, relative.
-const MASS: f64 = 0.006;
-const LENGTH_M: f64 = 0.0012;
-const GROUND: [f64; 2] = [0.03, 0.15];
+const MASS_STD: f64 = 0.006;
+const MOUNT_OFFSET_STD_M: f64 = 0.0012;
+const GROUND_STD: [f64; 2] = [0.03, 0.15];
 /// Where each of four legs is mounted, along three axes; masses of the trunk, and of hips, thighs and calves; the ground.
-const ERRORS: usize = 12 + 4 + 2;
+const NUM_NUISANCE: usize = 12 + 4 + 2;
 /// Residuals that count as one: they depend on each other over this many rows.
-const ROWS_IN_ONE: f64 = 40.0;
+const CORRELATION_ROWS: f64 = 40.0;
 
 /// What tolerated errors do to residuals.
 #[derive(Clone)]
-pub struct Tolerances {
-    starts: Vec<Errors>,
-    robot: Errors,
+pub struct NuisanceModel {
+    starts: Vec<NuisanceBlock>,
+    robot: NuisanceBlock,
     /// Slopes by the robot's errors as they are simulated, with no start corrected.
     slopes: DMatrix<f64>,
 }
 
 /// Errors that act on some of the residuals.
 #[derive(Clone)]
-struct Errors {
+struct NuisanceBlock {
     /// Which.
     rows: Vec<usize>,
     /// A row a residual, a column an error of one standard deviation.
@@ -39,9 +39,9 @@ struct Errors {
     factor: Cholesky<f64, Dyn>,
 }
 
-impl Errors {
+impl NuisanceBlock {
     fn new(rows: Vec<usize>, slopes: DMatrix<f64>) -> Option<Self> {
-        let prior = DMatrix::identity(slopes.ncols(), slopes.ncols()) * ROWS_IN_ONE;
+        let prior = DMatrix::identity(slopes.ncols(), slopes.ncols()) * CORRELATION_ROWS;
         let factor = (slopes.tr_mul(&slopes) + prior).cholesky()?;
         Some(Self { rows, slopes, factor })
     }
@@ -54,7 +54,7 @@ impl Errors {
         for (row, value) in self.rows.iter().zip(&own) {
             residuals[*row] = *value;
         }
-        residuals.extend(sizes.iter().map(|size| size * ROWS_IN_ONE.sqrt()));
+        residuals.extend(sizes.iter().map(|size| size * CORRELATION_ROWS.sqrt()));
     }
 
     fn divided(&self, spread: &[f64]) -> Option<Self> {
@@ -66,24 +66,24 @@ impl Errors {
     }
 }
 
-impl Tolerances {
+impl NuisanceModel {
     /// Around `robot`; none where it diverges.
     pub fn new(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Rollout) -> Option<Self> {
         let starts = starts(experiments, robot, simulator)?;
-        let sides = |error: usize| [-1.0, 1.0].map(|side| off(robot, error, side));
-        let robots: Vec<RobotModel> = (0..ERRORS).flat_map(sides).collect();
-        let mut columns = vec![Vec::new(); ERRORS];
+        let sides = |error: usize| [-1.0, 1.0].map(|side| perturbed_robot(robot, error, side));
+        let robots: Vec<RobotModel> = (0..NUM_NUISANCE).flat_map(sides).collect();
+        let mut columns = vec![Vec::new(); NUM_NUISANCE];
         for experiment in experiments {
             let residuals = experiment.residuals(simulator, &robots, Precision::Single);
             for (column, ends) in columns.iter_mut().zip(residuals.chunks(2)) {
                 column.extend(half_difference(&ends[0], &ends[1]));
             }
         }
-        let slopes = DMatrix::from_iterator(columns[0].len(), ERRORS, columns.into_iter().flatten());
+        let slopes = DMatrix::from_iterator(columns[0].len(), NUM_NUISANCE, columns.into_iter().flatten());
         slopes.iter().all(|slope| slope.is_finite()).then(|| Self::of(starts, slopes)).flatten()
     }
 
-    fn of(starts: Vec<Errors>, slopes: DMatrix<f64>) -> Option<Self> {
+    fn of(starts: Vec<NuisanceBlock>, slopes: DMatrix<f64>) -> Option<Self> {
         let corrected = slopes.column_iter().map(|column| {
             let mut column = column.iter().copied().collect();
             for start in &starts {
@@ -92,12 +92,12 @@ impl Tolerances {
             DVector::from_vec(column)
         });
         let corrected = DMatrix::from_columns(&corrected.collect::<Vec<_>>());
-        let robot = Errors::new((0..corrected.nrows()).collect(), corrected)?;
+        let robot = NuisanceBlock::new((0..corrected.nrows()).collect(), corrected)?;
         Some(Self { starts, robot, slopes })
     }
 
     /// For residuals that are divided by `spread`, one by one.
-    pub fn divided(&self, spread: &[f64]) -> Option<Self> {
+    pub fn rescaled(&self, spread: &[f64]) -> Option<Self> {
         let mut slopes = self.slopes.clone();
         for (mut slope, spread) in slopes.row_iter_mut().zip(spread) {
             slope /= *spread;
@@ -111,7 +111,7 @@ impl Tolerances {
         let error = |slopes: nalgebra::DVectorView<f64>| {
             let mut residuals: Vec<f64> = slopes.iter().zip(spread).map(|(slope, spread)| slope / spread).collect();
             if let Some(taken) = taken {
-                taken.take(&mut residuals);
+                taken.project_out(&mut residuals);
             }
             residuals
         };
@@ -119,7 +119,7 @@ impl Tolerances {
     }
 
     /// Takes out of residuals what the errors explain; what that costs is added at their end, to be squared like the others.
-    pub fn take(&self, residuals: &mut Vec<f64>) {
+    pub fn project_out(&self, residuals: &mut Vec<f64>) {
         for errors in self.starts.iter().chain([&self.robot]) {
             errors.take(residuals);
         }
@@ -127,25 +127,25 @@ impl Tolerances {
 
     /// Evidence that is lost by the `costs` that [`Tolerances::take`] adds: of starts, and of the robot [nats].
     pub fn nats(costs: &[f64]) -> [f64; 2] {
-        let (starts, robot) = costs.split_at(costs.len().saturating_sub(ERRORS));
-        [starts, robot].map(|costs| 0.5 * costs.iter().map(|cost| cost * cost).sum::<f64>() / ROWS_IN_ONE)
+        let (starts, robot) = costs.split_at(costs.len().saturating_sub(NUM_NUISANCE));
+        [starts, robot].map(|costs| 0.5 * costs.iter().map(|cost| cost * cost).sum::<f64>() / CORRELATION_ROWS)
     }
 }
 
 /// Power that the robot's errors have above what any robot's have, if they cost so much [nats], in units of a row's noise.
 pub fn excess(nats: f64) -> f64 {
-    (2.0 * nats - ERRORS as f64).max(0.0) * ROWS_IN_ONE
+    (2.0 * nats - NUM_NUISANCE as f64).max(0.0) * CORRELATION_ROWS
 }
 
 /// The errors of every window's start.
-fn starts(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Rollout) -> Option<Vec<Errors>> {
+fn starts(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Rollout) -> Option<Vec<NuisanceBlock>> {
     let (mut starts, mut first) = (Vec::new(), 0);
     for experiment in experiments {
         let mut residuals = |part: usize, side: f64| {
             let one = std::slice::from_ref(robot);
-            experiment.started_off(part, side).residuals(simulator, one, Precision::Single).remove(0)
+            experiment.with_perturbed_start(part, side).residuals(simulator, one, Precision::Single).remove(0)
         };
-        let columns: Vec<Vec<f64>> = (0..Experiment::STARTS)
+        let columns: Vec<Vec<f64>> = (0..Experiment::INITIAL_STATE_DIM)
             .map(|part| half_difference(&residuals(part, -1.0), &residuals(part, 1.0)).collect())
             .collect();
         if columns.iter().flatten().any(|slope| !slope.is_finite()) {
@@ -153,7 +153,7 @@ fn starts(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Ro
         }
         for rows in experiment.free_windows() {
             let slopes = DMatrix::from_fn(rows.len(), columns.len(), |row, column| columns[column][rows[row]]);
-            starts.push(Errors::new(rows.into_iter().map(|row| first + row).collect(), slopes)?);
+            starts.push(NuisanceBlock::new(rows.into_iter().map(|row| first + row).collect(), slopes)?);
         }
         first += columns[0].len();
     }
@@ -165,18 +165,18 @@ fn half_difference<'a>(below: &'a [f64], above: &'a [f64]) -> impl Iterator<Item
 }
 
 /// `robot` with one of the errors, of `size` standard deviations.
-fn off(robot: &RobotModel, error: usize, size: f64) -> RobotModel {
+fn perturbed_robot(robot: &RobotModel, error: usize, size: f64) -> RobotModel {
     let mut robot = robot.clone();
     match error {
-        0..12 => robot.legs[error / 3].origins[0][error % 3] += size * LENGTH_M,
-        12 => robot.trunk = robot.trunk.scaled(1.0 + size * MASS),
+        0..12 => robot.legs[error / 3].origins[0][error % 3] += size * MOUNT_OFFSET_STD_M,
+        12 => robot.trunk = robot.trunk.scaled(1.0 + size * MASS_STD),
         13..16 => {
             for leg in &mut robot.legs {
-                leg.bodies[error - 13] = leg.bodies[error - 13].scaled(1.0 + size * MASS);
+                leg.bodies[error - 13] = leg.bodies[error - 13].scaled(1.0 + size * MASS_STD);
             }
         }
-        16 => robot.contact.friction *= 1.0 + size * GROUND[0],
-        _ => robot.contact.time_constant *= 1.0 + size * GROUND[1],
+        16 => robot.contact.friction *= 1.0 + size * GROUND_STD[0],
+        _ => robot.contact.time_constant *= 1.0 + size * GROUND_STD[1],
     }
     robot
 }
@@ -188,20 +188,20 @@ mod tests {
     const ROWS: usize = 9_000;
 
     fn slope(row: usize, error: usize) -> f64 {
-        if row % ERRORS == error { 1.0 } else { 0.0 }
+        if row % NUM_NUISANCE == error { 1.0 } else { 0.0 }
     }
 
     #[test]
     fn what_an_error_of_its_size_explains_is_taken_and_what_it_cannot_stays() {
-        let slopes = DMatrix::from_fn(ROWS, ERRORS, slope);
-        let tolerances = Tolerances::of(Vec::new(), slopes).expect("a positive definite information");
+        let slopes = DMatrix::from_fn(ROWS, NUM_NUISANCE, slope);
+        let tolerances = NuisanceModel::of(Vec::new(), slopes).expect("a positive definite information");
         let mut residuals: Vec<f64> = (0..ROWS).map(|row| 2.0 * slope(row, 0)).collect();
-        tolerances.take(&mut residuals);
+        tolerances.project_out(&mut residuals);
         assert!(residuals[..ROWS].iter().all(|residual| residual.abs() < 0.2), "two deviations are no news");
-        assert!((Tolerances::nats(&residuals[ROWS..])[1] - 2.0).abs() < 0.4, "and cost half their square");
+        assert!((NuisanceModel::nats(&residuals[ROWS..])[1] - 2.0).abs() < 0.4, "and cost half their square");
         let mut others = vec![0.0; ROWS];
         others[1] = 5.0;
-        tolerances.take(&mut others);
+        tolerances.project_out(&mut others);
         assert!(others[1] > 4.9, "one row alone is no error of the robot");
     }
 
@@ -209,13 +209,13 @@ mod tests {
     fn start_explains_its_own_window_alone() {
         let window = |rows: std::ops::Range<usize>| {
             let slopes = DMatrix::from_element(rows.len(), 1, 1.0);
-            Errors::new(rows.collect(), slopes).expect("positive definite")
+            NuisanceBlock::new(rows.collect(), slopes).expect("positive definite")
         };
         let starts = vec![window(0..ROWS / 2), window(ROWS / 2..ROWS)];
-        let tolerances = Tolerances::of(starts, DMatrix::from_fn(ROWS, ERRORS, slope)).expect("positive definite");
+        let tolerances = NuisanceModel::of(starts, DMatrix::from_fn(ROWS, NUM_NUISANCE, slope)).expect("positive definite");
         let mut residuals: Vec<f64> = (0..ROWS).map(|row| if row < ROWS / 2 { 1.0 } else { -1.0 }).collect();
-        tolerances.take(&mut residuals);
+        tolerances.project_out(&mut residuals);
         assert!(residuals[..ROWS].iter().all(|residual| residual.abs() < 0.02));
-        assert_eq!(residuals.len(), ROWS + 2 + ERRORS);
+        assert_eq!(residuals.len(), ROWS + 2 + NUM_NUISANCE);
     }
 }

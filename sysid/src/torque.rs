@@ -1,10 +1,10 @@
 //! The torque that a model's drives make of measured states: no simulation, and so no error that adds up.
 
-use twinstep_logs::{Log, TauSensor};
-use twinstep_model::lanes::{Commands, Drive};
+use twinstep_logs::{Log, TorqueSensor};
+use twinstep_model::lanes::{SimdCommands, SimdActuators};
 use twinstep_model::{Command, JointModel, NUM_JOINTS, RobotModel, go2};
 
-use crate::conditions::Conditions;
+use crate::conditions::OperatingConditions;
 use crate::motion::{DriveClock, MotionError, command, joint_commands};
 
 /// Sums of squares and counts of the torque errors of each joint [N²·m²], at the log's tap; none without a sensor, or
@@ -29,16 +29,16 @@ const SUBSTEPS: usize = 5;
 
 /// Measured torques, and what drives make them of.
 pub struct MeasuredTorque {
-    sensor: TauSensor,
-    conditions: Conditions,
-    rows: Vec<Row>,
+    sensor: TorqueSensor,
+    conditions: OperatingConditions,
+    rows: Vec<TorqueSample>,
 }
 
 /// A row of a log, to the next.
-struct Row {
+struct TorqueSample {
     row: usize,
     /// The first of its part: a drive starts there without a memory.
-    first: bool,
+    after_reset: bool,
     q: [f64; NUM_JOINTS],
     dq: [f64; NUM_JOINTS],
     ddq: [f64; NUM_JOINTS],
@@ -61,7 +61,7 @@ impl MeasuredTorque {
             })
             .collect();
         let mut all = Vec::new();
-        let parts = if log.meta().tau_sensor == TauSensor::None { Vec::new() } else { log.segments().collect() };
+        let parts = if log.meta().tau_sensor == TorqueSensor::None { Vec::new() } else { log.segments().collect() };
         for (_, rows) in parts {
             let t = &log.t()[rows.clone()];
             for (index, row) in rows.clone().enumerate().take(rows.len() - 1) {
@@ -69,7 +69,7 @@ impl MeasuredTorque {
                 let (q, none) = (robot.control.default_pose, [0.0; NUM_JOINTS]);
                 let command = command(robot, &joints, row);
                 let torque = [f64::NAN; NUM_JOINTS];
-                let mut now = Row { row, first: index == 0, q, dq: none, ddq: none, command, periods, torque };
+                let mut now = TorqueSample { row, after_reset: index == 0, q, dq: none, ddq: none, command, periods, torque };
                 for (joint, q, dq, tau) in &columns {
                     now.q[*joint] = q.map_or(now.q[*joint], |q| q[row]);
                     let speeds = dq.map_or([f64::NAN; 2], |dq| [dq[row], dq[row + 1]]);
@@ -82,23 +82,23 @@ impl MeasuredTorque {
                 all.push(now);
             }
         }
-        Ok(Self { sensor: log.meta().tau_sensor, conditions: Conditions::of(log), rows: all })
+        Ok(Self { sensor: log.meta().tau_sensor, conditions: OperatingConditions::of(log), rows: all })
     }
 
     /// Whether two robots make the same torque of the same states.
-    pub fn are_alike(&self, one: &RobotModel, other: &RobotModel) -> bool {
-        let [one, other] = [one, other].map(|robot| before_the_tap(robot, self.sensor));
+    pub fn predict_same_torque(&self, one: &RobotModel, other: &RobotModel) -> bool {
+        let [one, other] = [one, other].map(|robot| upstream_of_sensor(robot, self.sensor));
         one.joints == other.joints && one.derating == other.derating
     }
 
     /// Hands on joint, row and the torque that the drives of `robot` make, less the measured one [N·m].
     pub fn differences(&self, robot: &RobotModel, mut each: impl FnMut(usize, usize, f64)) {
-        let robot = &before_the_tap(robot, self.sensor);
-        let dt = robot.control.drive_dt() / SUBSTEPS as f64;
-        let mut drive = Drive::<f64>::new(robot, dt);
+        let robot = &upstream_of_sensor(robot, self.sensor);
+        let dt = robot.control.actuator_dt() / SUBSTEPS as f64;
+        let mut drive = SimdActuators::<f64>::new(robot, dt);
         // The drive adds its offset to what it is given; a log has it already.
-        let offsets = robot.joints.map(|joint| joint.drive.encoder_offset);
-        let late = robot.joints.map(|joint| joint.drive.sensor_delay / dt);
+        let offsets = robot.joints.map(|joint| joint.actuator.encoder_offset);
+        let late = robot.joints.map(|joint| joint.actuator.sensor_delay / dt);
         // Torques of this part, a substep an entry.
         let mut made: Vec<[f64; NUM_JOINTS]> = Vec::new();
         for row in &self.rows {
@@ -107,37 +107,37 @@ impl MeasuredTorque {
                 let mean = |joint: usize| 0.5 * (row.dq[joint] + dq[joint]);
                 [std::array::from_fn(|joint| row.q[joint] - offsets[joint] + time * mean(joint)), dq]
             };
-            if row.first {
-                drive = Drive::new(robot, dt);
+            if row.after_reset {
+                drive = SimdActuators::new(robot, dt);
                 drive.set(0, robot, &at(0.0)[0].map(|q| q as f32), &[0.0; NUM_JOINTS]);
                 made.clear();
             }
-            let strength = self.conditions.strength(&robot.derating, row.row);
-            let commands = Commands::new(&[Command { strength, ..row.command }]);
+            let strength = self.conditions.derating_factors(&robot.derating, row.row);
+            let commands = SimdCommands::new(&[Command { derating_factor: strength, ..row.command }]);
             for step in 0..row.periods * SUBSTEPS {
                 let [q, dq] = at(step as f64 * dt);
                 if step % SUBSTEPS == 0 {
-                    drive.tick(&commands, &q, &dq);
+                    drive.update_command(&commands, &q, &dq);
                 }
-                let forces = drive.push(step % SUBSTEPS, &q, &dq);
+                let forces = drive.step(step % SUBSTEPS, &q, &dq);
                 made.push(std::array::from_fn(|joint| match self.sensor {
-                    TauSensor::Output => {
-                        let dry = forces.dry[joint] * smooth_sign(dq[joint]);
+                    TorqueSensor::JointOutput => {
+                        let dry = forces.dry_friction[joint] * smooth_sign(dq[joint]);
                         let rotor = robot.joints[joint].armature * row.ddq[joint];
-                        forces.tau[joint] - forces.viscous[joint] * dq[joint] - dry - rotor
+                        forces.tau[joint] - forces.damping[joint] * dq[joint] - dry - rotor
                     }
-                    _ => drive.current()[joint],
+                    _ => drive.estimated_torque()[joint],
                 }));
             }
             for (joint, measured) in row.torque.into_iter().enumerate().filter(|(_, torque)| torque.is_finite()) {
-                each(joint, row.row, shown(&made, joint, row.periods * SUBSTEPS, late[joint]) - measured);
+                each(joint, row.row, delayed_mean(&made, joint, row.periods * SUBSTEPS, late[joint]) - measured);
             }
         }
     }
 }
 
 /// Mean over the last `steps` of what a sensor that is `late` steps late shows of a joint's torques.
-fn shown(made: &[[f64; NUM_JOINTS]], joint: usize, steps: usize, late: f64) -> f64 {
+fn delayed_mean(made: &[[f64; NUM_JOINTS]], joint: usize, steps: usize, late: f64) -> f64 {
     let at = |step: usize| {
         let place = (step as f64 - late).max(0.0);
         let (before, part) = (place as usize, place.fract());
@@ -149,15 +149,15 @@ fn shown(made: &[[f64; NUM_JOINTS]], joint: usize, steps: usize, late: f64) -> f
 
 /// The robot without what lies behind the torque's sensor, or is in the measured position already: springs at the link,
 /// play and springs in the gear, whose rotor the encoder follows.
-fn before_the_tap(robot: &RobotModel, sensor: TauSensor) -> RobotModel {
+fn upstream_of_sensor(robot: &RobotModel, sensor: TorqueSensor) -> RobotModel {
     let mut robot = robot.clone();
     let ideal = go2().joints;
     for (joint, ideal) in robot.joints.iter_mut().zip(ideal) {
         joint.spring = ideal.spring;
-        (joint.drive.gap, joint.drive.stiffness) = (ideal.drive.gap, ideal.drive.stiffness);
-        if sensor == TauSensor::Current {
-            (joint.drive.gain, joint.drive.ripple) = (ideal.drive.gain, ideal.drive.ripple);
-            *joint = JointModel { torque_limit: joint.torque_limit, drive: joint.drive, ..ideal };
+        (joint.actuator.backlash, joint.actuator.gear_stiffness) = (ideal.actuator.backlash, ideal.actuator.gear_stiffness);
+        if sensor == TorqueSensor::MotorCurrent {
+            (joint.actuator.gain, joint.actuator.ripple) = (ideal.actuator.gain, ideal.actuator.ripple);
+            *joint = JointModel { torque_limit: joint.torque_limit, actuator: joint.actuator, ..ideal };
         }
     }
     robot
@@ -175,8 +175,8 @@ mod tests {
     #[test]
     fn late_sensor_shows_the_torque_of_a_while_ago() {
         let made: Vec<[f64; NUM_JOINTS]> = (0..10).map(|step| [f64::from(step); NUM_JOINTS]).collect();
-        assert_eq!(shown(&made, 3, 2, 0.0), 8.5);
-        assert_eq!(shown(&made, 3, 2, 2.25), 6.25);
-        assert_eq!(shown(&made[..2], 3, 2, 5.0), 0.0, "nothing is before the first");
+        assert_eq!(delayed_mean(&made, 3, 2, 0.0), 8.5);
+        assert_eq!(delayed_mean(&made, 3, 2, 2.25), 6.25);
+        assert_eq!(delayed_mean(&made[..2], 3, 2, 5.0), 0.0, "nothing is before the first");
     }
 }

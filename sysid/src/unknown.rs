@@ -1,6 +1,6 @@
 //! The numbers that are sought: of entries of a model file, with bounds and prior.
 
-use twinstep_model::effects::{Composition, Effect, Entry, EntryError, Scope};
+use twinstep_model::effects::{Composition, Effect, EffectEntry, EntryError, Scope};
 use twinstep_model::{ModelFile, RobotModel};
 
 /// Prior deviations of log-Cholesky coordinates `[α, d1, d2, d3, s12, s23, s13, t1, t2, t3]` around the given body: mass
@@ -9,13 +9,13 @@ const INERTIA_PRIOR: [f64; 10] = [0.15, 0.3, 0.3, 0.3, 0.05, 0.05, 0.05, 0.05, 0
 
 /// A number of an entry of a model file.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Unknown {
+pub struct FreeParameter {
     /// The effect.
     pub effect: &'static Effect,
     /// What it is about.
     pub scope: Scope,
     /// The parameter; of a vector its index after a dot, as in `shift_m.0`.
-    pub parameter: String,
+    pub parameter_name: String,
     /// Its unit.
     pub unit: &'static str,
     /// What is allowed.
@@ -30,7 +30,7 @@ pub struct Unknown {
     place: (usize, usize),
 }
 
-impl Unknown {
+impl FreeParameter {
     /// The number as the search sees it: itself, or its inverse.
     pub fn coordinate(&self, value: f64) -> f64 {
         if self.inverse { 1.0 / value } else { value }
@@ -51,17 +51,17 @@ impl Unknown {
 
     /// Its name for people, as in `coulomb_friction@calf torque_nm`.
     pub fn name(&self) -> String {
-        format!("{}@{} {}", self.effect.name, self.scope, self.parameter)
+        format!("{}@{} {}", self.effect.name, self.scope, self.parameter_name)
     }
 }
 
 /// The numbers of `effects`, to be sought on top of `model`; and the model with an entry for each.
 ///
 /// An effect that replaces takes the place of the model's entry of the same scope; others are added to what is there.
-pub fn unknowns(
+pub fn free_parameters(
     model: &ModelFile,
     effects: &[(&'static Effect, Scope)],
-) -> Result<(ModelFile, Vec<Unknown>), EntryError> {
+) -> Result<(ModelFile, Vec<FreeParameter>), EntryError> {
     let (mut file, mut unknowns) = (model.clone(), Vec::new());
     for (effect, scope) in effects {
         let start: Vec<f64> = effect
@@ -69,7 +69,7 @@ pub fn unknowns(
             .iter()
             .flat_map(|parameter| {
                 // Where there is none of it, or next to none.
-                let value = if parameter.neutral.is_finite() { parameter.neutral } else { parameter.bounds[1] };
+                let value = if parameter.no_effect_value.is_finite() { parameter.no_effect_value } else { parameter.bounds[1] };
                 std::iter::repeat_n(value, parameter.count)
             })
             .collect();
@@ -82,28 +82,28 @@ pub fn unknowns(
         if effect.composition == Composition::Replace {
             file.effects.retain(|entry| entry.effect != *effect || entry.scope != *scope);
         }
-        file.effects.push(Entry::new(effect, *scope, start.clone())?);
+        file.effects.push(EffectEntry::new(effect, *scope, start.clone())?);
         let index = file.effects.len() - 1;
         let mut place = 0;
         for parameter in effect.parameters {
             for component in 0..parameter.count {
-                let inverse = parameter.neutral.is_infinite();
-                let [low, high] = parameter.plausible.map(|value| if inverse { 1.0 / value } else { value });
+                let inverse = parameter.no_effect_value.is_infinite();
+                let [low, high] = parameter.prior_range.map(|value| if inverse { 1.0 / value } else { value });
                 let (low, high) = if inverse { (0.0, low) } else { (low, high) };
                 let inertia = effect.name == "inertia";
                 let middle = if inertia { start[place] } else { 0.5 * (low + high) };
                 let deviation = if inertia { INERTIA_PRIOR[place] } else { (high - low).abs() / 3.92 };
-                unknowns.push(Unknown {
+                unknowns.push(FreeParameter {
                     effect,
                     scope: *scope,
-                    parameter: if parameter.count == 1 {
+                    parameter_name: if parameter.count == 1 {
                         parameter.name.to_owned()
                     } else {
                         format!("{}.{component}", parameter.name)
                     },
                     unit: parameter.unit,
                     bounds: parameter.bounds,
-                    neutral: parameter.neutral,
+                    neutral: parameter.no_effect_value,
                     prior: [middle, deviation],
                     inverse,
                     place: (index, place),
@@ -126,7 +126,7 @@ fn nominal_inertia(model: &ModelFile, scope: Scope) -> Result<Vec<f64>, EntryErr
 }
 
 /// The candidate's file with these coordinates, each brought within its bounds.
-pub fn with_values(file: &ModelFile, unknowns: &[Unknown], coordinates: &[f64]) -> ModelFile {
+pub fn with_values(file: &ModelFile, unknowns: &[FreeParameter], coordinates: &[f64]) -> ModelFile {
     let mut file = file.clone();
     for (unknown, coordinate) in unknowns.iter().zip(coordinates) {
         let (entry, value) = unknown.place;
@@ -136,19 +136,19 @@ pub fn with_values(file: &ModelFile, unknowns: &[Unknown], coordinates: &[f64]) 
 }
 
 /// The candidate robot; none where entries do not go together or a body could not be.
-pub fn candidate(file: &ModelFile, unknowns: &[Unknown], coordinates: &[f64]) -> Option<RobotModel> {
+pub fn candidate(file: &ModelFile, unknowns: &[FreeParameter], coordinates: &[f64]) -> Option<RobotModel> {
     with_values(file, unknowns, coordinates).robot_model().ok()
 }
 
 /// Where an unknown starts [coordinate].
-pub fn start(file: &ModelFile, unknown: &Unknown) -> f64 {
+pub fn initial_coordinate(file: &ModelFile, unknown: &FreeParameter) -> f64 {
     let (entry, value) = unknown.place;
     unknown.coordinate(file.effects[entry].values[value])
 }
 
 /// Takes entries out of the file that were added to `model` and of which nothing was found; `told` says of each unknown
 /// whether it was.
-pub fn without_untold(file: &mut ModelFile, model: &ModelFile, unknowns: &[Unknown], told: &[bool]) {
+pub fn drop_unidentifiable(file: &mut ModelFile, model: &ModelFile, unknowns: &[FreeParameter], told: &[bool]) {
     let about = |index: usize| unknowns.iter().zip(told).filter(move |(unknown, _)| unknown.place.0 == index);
     let mut index = 0;
     file.effects.retain(|entry| {
@@ -161,7 +161,7 @@ pub fn without_untold(file: &mut ModelFile, model: &ModelFile, unknowns: &[Unkno
 }
 
 /// Writes intervals, low and high, beside the values of the unknowns.
-pub fn set_intervals(file: &mut ModelFile, unknowns: &[Unknown], intervals: &[Option<[f64; 2]>]) {
+pub fn set_intervals(file: &mut ModelFile, unknowns: &[FreeParameter], intervals: &[Option<[f64; 2]>]) {
     for (unknown, interval) in unknowns.iter().zip(intervals) {
         let (entry, value) = unknown.place;
         file.effects[entry].intervals[value] = *interval;

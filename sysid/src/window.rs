@@ -4,42 +4,42 @@ use std::ops::Range;
 
 use glam::{DQuat, DVec3};
 use nalgebra::{DMatrix, DVector};
-use twinstep_logs::{Base, Log};
-use twinstep_model::{Command, Ground, Past, Placement, RobotModel};
+use twinstep_logs::{BaseMount, Log};
+use twinstep_model::{Command, Ground, HistoryStep, InitialState, RobotModel};
 
 use crate::experiment::ExperimentError;
 use crate::motion::{DriveClock, JointCommands, command, joint_commands};
 
 /// The windows that a log is cut into.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Horizon {
+pub struct WindowConfig {
     /// Length of a window with a free trunk [s].
-    pub length_s: f64,
+    pub floating_length_s: f64,
     /// Length of one with a held trunk [s]; infinite for a whole part of the log.
-    pub held_s: f64,
+    pub fixed_length_s: f64,
     /// Beginning of a window with a free trunk that is not compared [s].
-    pub settling_s: f64,
+    pub floating_burn_in_s: f64,
     /// And of one with a held trunk [s].
-    pub held_settling_s: f64,
+    pub fixed_burn_in_s: f64,
 }
 
-impl Horizon {
+impl WindowConfig {
     /// Every row but a window's first counts.
-    pub const EVALUATION: Self = Self { length_s: 0.5, held_s: f64::INFINITY, settling_s: 0.0, held_settling_s: 0.0 };
+    pub const EVALUATION: Self = Self { floating_length_s: 0.5, fixed_length_s: f64::INFINITY, floating_burn_in_s: 0.0, fixed_burn_in_s: 0.0 };
     /// The error of a measured start, a millimetre that the feet are in the ground or above it, dies away before anything is
     /// compared: it would pass for a harder ground and a lighter robot.
     pub const IDENTIFICATION: Self =
-        Self { length_s: 1.0, held_s: f64::INFINITY, settling_s: 0.2, held_settling_s: 0.2 };
+        Self { floating_length_s: 1.0, fixed_length_s: f64::INFINITY, floating_burn_in_s: 0.2, fixed_burn_in_s: 0.2 };
     /// With windows for a held trunk too: a loop that rings is out of step after a second or two, whatever the model.
-    pub const DIAGNOSIS: Self = Self { held_s: 2.0, ..Self::IDENTIFICATION };
+    pub const DIAGNOSIS: Self = Self { fixed_length_s: 2.0, ..Self::IDENTIFICATION };
     /// And where the model's does not ring at all, only what is nearly right would stay in step for as long.
-    pub const LOST: Self = Self { held_s: 0.25, held_settling_s: 0.0, ..Self::IDENTIFICATION };
+    pub const SHORT: Self = Self { fixed_length_s: 0.25, fixed_burn_in_s: 0.0, ..Self::IDENTIFICATION };
 }
 
 /// Rows before a window's start that its drives remember.
-const PAST_ROWS: usize = 8;
+const HISTORY_ROWS: usize = 8;
 /// Height at which a held trunk hangs [m].
-const HELD_HEIGHT: f32 = twinstep_model::HELD_HEIGHT as f32;
+const HELD_HEIGHT: f32 = twinstep_model::FIXED_BASE_HEIGHT as f32;
 
 /// Rows that are simulated from the first of them.
 #[derive(Clone, Debug)]
@@ -49,9 +49,9 @@ pub struct Window {
     /// Whether the trunk was held.
     pub held: bool,
     /// The first row's measured state.
-    pub start: Placement,
+    pub start: InitialState,
     /// What was measured in the drive periods before it, the oldest first: a drive that acts late knows it still.
-    pub past: Vec<Past>,
+    pub history: Vec<HistoryStep>,
     /// One a drive period.
     pub commands: Vec<Command>,
     /// Rows at its beginning that are not compared.
@@ -62,7 +62,7 @@ pub struct Window {
 
 impl Window {
     /// Moves the start by `error`: of position, orientation, velocity or rate, in this order, along or about an axis.
-    pub fn start_off(&mut self, quantity: usize, axis: usize, error: f64) {
+    pub fn perturb_start(&mut self, quantity: usize, axis: usize, error: f64) {
         match quantity {
             0 => self.start.base_position[axis] += error as f32,
             1 => {
@@ -78,21 +78,21 @@ impl Window {
 }
 
 /// Cuts `log`: a held trunk from each part's start to its end, a free one in windows of a horizon.
-pub fn windows(log: &Log, robot: &RobotModel, horizon: Horizon) -> Result<Vec<Window>, ExperimentError> {
-    let player = Player { log, robot, commands: joint_commands(log)?, clock: DriveClock::of(log, robot)? };
+pub fn windows(log: &Log, robot: &RobotModel, horizon: WindowConfig) -> Result<Vec<Window>, ExperimentError> {
+    let player = WindowBuilder { log, robot, commands: joint_commands(log)?, clock: DriveClock::of(log, robot)? };
     let mut windows = Vec::new();
     for (segment, rows) in log.segments() {
-        let held = segment.base == Base::Fixed;
+        let held = segment.base == BaseMount::Fixed;
         if !held
             && let Some(missing) = ["pos_z", "quat_w", "vel_x"].into_iter().find(|name| log.channel(name).is_none())
         {
-            return Err(ExperimentError::NoBase { segment: segment.name.clone(), missing });
+            return Err(ExperimentError::MissingBaseState { segment: segment.name.clone(), missing });
         }
         let in_rows = |time_s: f64| (time_s * log.meta().rate_hz).round() as usize;
-        let whole = held && horizon.held_s.is_infinite();
-        let length = if whole { rows.len() } else { in_rows(if held { horizon.held_s } else { horizon.length_s }) };
+        let whole = held && horizon.fixed_length_s.is_infinite();
+        let length = if whole { rows.len() } else { in_rows(if held { horizon.fixed_length_s } else { horizon.floating_length_s }) };
         let settling =
-            if whole { 1 } else { in_rows(if held { horizon.held_settling_s } else { horizon.settling_s }).max(1) };
+            if whole { 1 } else { in_rows(if held { horizon.fixed_burn_in_s } else { horizon.floating_burn_in_s }).max(1) };
         let mut first = rows.start;
         while first + 1 < rows.end {
             let end = (first + length + 1).min(rows.end);
@@ -117,14 +117,14 @@ fn normalized([w, x, y, z]: [f64; 4]) -> DQuat {
 }
 
 /// A log whose parts become windows.
-struct Player<'a> {
+struct WindowBuilder<'a> {
     log: &'a Log,
     robot: &'a RobotModel,
     commands: Vec<JointCommands<'a>>,
     clock: DriveClock,
 }
 
-impl Player<'_> {
+impl WindowBuilder<'_> {
     fn window(&self, part: &Range<usize>, rows: Range<usize>, held: bool) -> Window {
         let t = &self.log.t()[rows.clone()];
         let (mut commands, mut period) = (Vec::new(), Vec::new());
@@ -136,26 +136,26 @@ impl Player<'_> {
             }
         }
         let (start, past) = (self.start(part, rows.start, held), self.past(part, rows.start, held));
-        Window { held, settling: 1, start, past, rows, commands, period }
+        Window { held, settling: 1, start, history: past, rows, commands, period }
     }
 
     /// The drive periods before `first`, as far as the part goes back.
-    fn past(&self, part: &Range<usize>, first: usize, held: bool) -> Vec<Past> {
-        let from = first.saturating_sub(PAST_ROWS).max(part.start);
+    fn past(&self, part: &Range<usize>, first: usize, held: bool) -> Vec<HistoryStep> {
+        let from = first.saturating_sub(HISTORY_ROWS).max(part.start);
         let t = &self.log.t()[from..=first];
         let of_row = |row: usize| {
-            let Placement { q, dq, .. } = self.start(part, row, held);
-            let past = Past { command: command(self.robot, &self.commands, row), q, dq };
+            let InitialState { q, dq, .. } = self.start(part, row, held);
+            let past = HistoryStep { command: command(self.robot, &self.commands, row), q, dq };
             std::iter::repeat_n(past, self.clock.periods_between(t, row - from))
         };
         (from..first).flat_map(of_row).collect()
     }
 
     /// The state in `row` of a part.
-    fn start(&self, part: &Range<usize>, row: usize, held: bool) -> Placement {
-        let mut start = Placement::above(&Ground::FLAT, self.robot, self.robot.control.default_pose_f32(), 0.0);
+    fn start(&self, part: &Range<usize>, row: usize, held: bool) -> InitialState {
+        let mut start = InitialState::standing_on(&Ground::FLAT, self.robot, self.robot.control.default_pose_f32(), 0.0);
         if held {
-            start = Placement::at_rest(HELD_HEIGHT, self.robot.control.default_pose_f32());
+            start = InitialState::at_rest(HELD_HEIGHT, self.robot.control.default_pose_f32());
         }
         let smoothed = |cells: &[f64]| smoothed(&self.log.t()[part.clone()], &cells[part.clone()], row - part.start);
         for joint in &self.commands {

@@ -2,15 +2,15 @@
 
 use glam::DMat3;
 use proptest::prelude::*;
-use twinstep_model::effects::{CATALOGUE, Entry, Scope, Target, compose};
-use twinstep_model::{Command, Job, Joint, Placement, Precision, RobotModel, RobotStates, Rollout, go2};
-use twinstep_sim::{Base, BatchRollout, SimConfig};
+use twinstep_model::effects::{CATALOGUE, EffectEntry, Scope, Target, apply_effects};
+use twinstep_model::{Command, RolloutRequest, Joint, InitialState, Precision, RobotModel, RobotStates, Rollout, go2};
+use twinstep_sim::{BaseMount, BatchRollout, SimConfig};
 
 /// Drive periods of a rollout.
 const PERIODS: usize = 40;
 
 /// An effect with any scope that it can have and any values that it may have.
-fn any_entry() -> impl Strategy<Value = Entry> {
+fn any_entry() -> impl Strategy<Value = EffectEntry> {
     (0..CATALOGUE.len(), any::<prop::sample::Index>(), prop::array::uniform10(0.0..=1.0f64)).prop_map(
         |(effect, scope, shares)| {
             let effect = CATALOGUE[effect];
@@ -27,7 +27,7 @@ fn any_entry() -> impl Strategy<Value = Entry> {
                 let [low, high] = parameter.bounds;
                 low + share * (high - low)
             });
-            Entry::new(effect, *scope.get(&scopes), values.collect()).unwrap()
+            EffectEntry::new(effect, *scope.get(&scopes), values.collect()).unwrap()
         },
     )
 }
@@ -39,16 +39,16 @@ fn is_positive_definite(matrix: &DMat3) -> bool {
 }
 
 /// A step of all joints of `robots`, from just above the ground.
-fn play(robots: &[RobotModel], base: Base) -> Vec<RobotStates> {
+fn play(robots: &[RobotModel], base: BaseMount) -> Vec<RobotStates> {
     let pose = go2().control.default_pose_f32();
     let commands = vec![Command::hold(pose.map(|q| q + 0.2), 30.0, 0.75); PERIODS];
-    let start = Placement::at_rest(0.33, pose);
+    let start = InitialState::at_rest(0.33, pose);
     let jobs: Vec<_> = robots
         .iter()
-        .map(|robot| Job { robot, held: base == Base::Fixed, start, past: &[], commands: &commands })
+        .map(|robot| RolloutRequest { robot, held: base == BaseMount::Fixed, start, history: &[], commands: &commands })
         .collect();
     let config = SimConfig { threads: 1, ..SimConfig::default() };
-    BatchRollout::new(&go2(), &config).unwrap().play(&jobs, Precision::Double)
+    BatchRollout::new(&go2(), &config).unwrap().run(&jobs, Precision::Double)
 }
 
 proptest! {
@@ -59,8 +59,8 @@ proptest! {
         proposals in prop::collection::vec(prop::collection::vec(any_entry(), 1..6), 3),
         held: bool,
     ) {
-        let base = if held { Base::Fixed } else { Base::Floating };
-        let composed = proposals.iter().filter_map(|entries| compose(&go2(), entries).ok());
+        let base = if held { BaseMount::Fixed } else { BaseMount::Floating };
+        let composed = proposals.iter().filter_map(|entries| apply_effects(&go2(), entries).ok());
         let robots: Vec<_> = std::iter::once(go2()).chain(composed).collect();
         for robot in &robots {
             for body in robot.legs.iter().flat_map(|leg| &leg.bodies).chain([&robot.trunk]) {

@@ -1,9 +1,9 @@
 //! The batch engine against rapier and against physics.
 
 use rand::RngExt;
-use twinstep_model::lanes::Instructions;
-use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, Variation, go2, stream};
-use twinstep_sim::{Base, BatchBackend, BatchBackend as Simulator, Engine, Lanes, RapierBackend, SimConfig};
+use twinstep_model::lanes::InstructionSet;
+use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, InitialState, RandomisationSample, go2, stream};
+use twinstep_sim::{BaseMount, BatchBackend, BatchBackend as Simulator, Engine, SimdPrecision, RapierBackend, SimConfig};
 
 const ENGINE: Engine = Engine::Batch;
 
@@ -18,7 +18,7 @@ fn pose() -> PerJoint {
     go2().control.default_pose_f32()
 }
 
-fn at(physics_hz: u32, solver_iterations: u32, base: Base) -> SimConfig {
+fn at(physics_hz: u32, solver_iterations: u32, base: BaseMount) -> SimConfig {
     SimConfig {
         physics_hz: Some(physics_hz),
         solver_iterations: Some(solver_iterations),
@@ -28,7 +28,7 @@ fn at(physics_hz: u32, solver_iterations: u32, base: Base) -> SimConfig {
     }
 }
 
-fn finest_rapier(base: Base) -> RapierBackend {
+fn finest_rapier(base: BaseMount) -> RapierBackend {
     RapierBackend::new(go2(), at(4000, 4, base), 1).unwrap()
 }
 
@@ -53,7 +53,7 @@ fn trot_target(period: usize) -> PerJoint {
 
 /// Joint positions over one second of `target`, after half a second to settle.
 fn motion(backend: &mut impl Backend, height: f32, target: fn(usize) -> PerJoint) -> Vec<PerJoint> {
-    let placement = Placement::at_rest(height, pose());
+    let placement = InitialState::at_rest(height, pose());
     backend.reset(&[(0, placement)]).unwrap();
     let robots = backend.num_robots();
     let mut play = |target: PerJoint, periods: usize| {
@@ -67,7 +67,7 @@ fn motion(backend: &mut impl Backend, height: f32, target: fn(usize) -> PerJoint
 
 /// Of the trunk of a robot that stands [m].
 fn standing_height(backend: &mut impl Backend) -> f32 {
-    backend.reset(&[(0, Placement::at_rest(0.335, pose()))]).unwrap();
+    backend.reset(&[(0, InitialState::at_rest(0.335, pose()))]).unwrap();
     backend.step(&[Command::hold(pose(), 40.0, 1.0)], &[true], 3 * SECOND).unwrap();
     backend.states().base_position[0][2]
 }
@@ -77,7 +77,7 @@ fn rms_difference(one: &[PerJoint], other: &[PerJoint]) -> f32 {
     (pairs.map(|(one, other)| (one - other).powi(2)).sum::<f32>() / (one.len() * NUM_JOINTS) as f32).sqrt()
 }
 
-fn check(base: Base, height: f32, target: fn(usize) -> PerJoint, limit: f32) {
+fn check(base: BaseMount, height: f32, target: fn(usize) -> PerJoint, limit: f32) {
     let reference = motion(&mut finest_rapier(base), height, target);
     let ours = motion(&mut batch(at(1000, 4, base), 1), height, target);
     let difference = rms_difference(&ours, &reference);
@@ -87,25 +87,25 @@ fn check(base: Base, height: f32, target: fn(usize) -> PerJoint, limit: f32) {
 
 #[test]
 fn robot_on_a_stand_moves_as_in_rapier() {
-    check(Base::Fixed, 1.0, step_target, 0.001);
-    check(Base::Fixed, 1.0, trot_target, 0.001);
+    check(BaseMount::Fixed, 1.0, step_target, 0.001);
+    check(BaseMount::Fixed, 1.0, trot_target, 0.001);
 }
 
 #[test]
 fn stance_step_is_as_in_rapier() {
-    check(Base::Floating, 0.335, step_target, 0.006);
+    check(BaseMount::Floating, 0.335, step_target, 0.006);
 }
 
 #[test]
 fn trot_is_as_in_rapier() {
-    check(Base::Floating, 0.335, trot_target, 0.02);
+    check(BaseMount::Floating, 0.335, trot_target, 0.02);
 }
 
 #[test]
 fn robot_sinks_as_deep_into_soft_ground_as_in_rapier() {
     let mut robot = go2();
     robot.contact.time_constant = 0.05;
-    let config = || at(1000, 4, Base::Floating);
+    let config = || at(1000, 4, BaseMount::Floating);
     let hard = standing_height(&mut batch(config(), 1));
     let [ours, rapier] = [
         hard - standing_height(&mut BatchBackend::new(robot.clone(), config(), 1).unwrap()),
@@ -117,7 +117,7 @@ fn robot_sinks_as_deep_into_soft_ground_as_in_rapier() {
 
 #[test]
 fn feet_carry_the_weight() {
-    let mut backend = batch(at(1000, 4, Base::Floating), 1);
+    let mut backend = batch(at(1000, 4, BaseMount::Floating), 1);
     backend.step(&[Command::hold(pose(), 40.0, 1.0)], &[true], 10 * SECOND).unwrap();
     let force: f32 = backend.states().foot_force[0].iter().sum();
     let weight = go2().total_mass() as f32 * 9.81;
@@ -128,13 +128,13 @@ fn feet_carry_the_weight() {
 #[test]
 fn robot_gives_the_same_bits_in_any_lane_batch_and_number_of_threads() {
     let run = |robots: usize, at_index: usize, threads: usize| {
-        let config = SimConfig { threads, ..at(400, 4, Base::Floating) };
+        let config = SimConfig { threads, ..at(400, 4, BaseMount::Floating) };
         let mut backend = batch(config, robots);
         let placement = |robot: usize| {
-            let variation = Variation { mass_scale: 0.8 + 0.05 * robot as f32, ..Variation::default() };
-            Placement { variation, ..Placement::at_rest(0.3 + 0.01 * robot as f32, pose()) }
+            let variation = RandomisationSample { mass_scale: 0.8 + 0.05 * robot as f32, ..RandomisationSample::default() };
+            InitialState { randomisation: variation, ..InitialState::at_rest(0.3 + 0.01 * robot as f32, pose()) }
         };
-        let chosen = Placement { base_linear_velocity: [0.5, 0.2, 0.0], ..placement(3) };
+        let chosen = InitialState { base_linear_velocity: [0.5, 0.2, 0.0], ..placement(3) };
         let placements: Vec<_> =
             (0..robots).map(|robot| (robot, if robot == at_index { chosen } else { placement(robot) })).collect();
         backend.reset(&placements).unwrap();
@@ -152,21 +152,21 @@ fn robot_gives_the_same_bits_in_any_lane_batch_and_number_of_threads() {
 }
 
 /// A robot that trots for a second, in the numbers that `lanes` names: joints after each drive period.
-fn trot_in(lanes: Lanes) -> Vec<PerJoint> {
-    motion(&mut BatchBackend::with_lanes(go2(), at(1000, 4, Base::Floating), 1, lanes).unwrap(), 0.335, trot_target)
+fn trot_in(lanes: SimdPrecision) -> Vec<PerJoint> {
+    motion(&mut BatchBackend::with_precision(go2(), at(1000, 4, BaseMount::Floating), 1, lanes).unwrap(), 0.335, trot_target)
 }
 
 #[test]
 fn every_instruction_set_gives_the_same_bits() {
-    let baseline = trot_in(Lanes::Single(Instructions::Baseline));
-    for instructions in Instructions::available() {
-        assert_eq!(trot_in(Lanes::Single(instructions)), baseline, "{instructions}");
+    let baseline = trot_in(SimdPrecision::Single(InstructionSet::Baseline));
+    for instructions in InstructionSet::available() {
+        assert_eq!(trot_in(SimdPrecision::Single(instructions)), baseline, "{instructions}");
     }
 }
 
 #[test]
 fn single_precision_is_enough() {
-    let (single, double) = (trot_in(Lanes::Single(Instructions::best())), trot_in(Lanes::Double));
+    let (single, double) = (trot_in(SimdPrecision::Single(InstructionSet::best())), trot_in(SimdPrecision::Double));
     let difference = rms_difference(&single, &double);
     assert!(difference > 0.0 && difference < 1e-4, "{difference} rad");
 }
@@ -176,7 +176,7 @@ fn joint_limits_hold_against_targets_beyond_them() {
     let robot = go2();
     let (lower, upper) = (robot.lower_limits(), robot.upper_limits());
     let mut random = stream(1, "targets", 0);
-    let mut backend = batch(SimConfig { base: Base::Fixed, threads: 1, ..SimConfig::default() }, 64);
+    let mut backend = batch(SimConfig { base: BaseMount::Fixed, threads: 1, ..SimConfig::default() }, 64);
     let mut beyond = 0.0f32;
     for _ in 0..200 {
         let commands: Vec<_> = (0..64)
@@ -200,13 +200,13 @@ fn a_million_random_steps_of_random_robots_stay_finite() {
     let mut backend = batch(SimConfig::default(), ROBOTS);
     let mut placements = Vec::new();
     for robot in 0..ROBOTS {
-        let variation = Variation {
+        let variation = RandomisationSample {
             mass_scale: random.random_range(0.7..1.3),
             payload: random.random_range(-1.0..5.0),
             com_shift: std::array::from_fn(|_| random.random_range(-0.05..0.05)),
             friction_scale: random.random_range(0.2..1.7),
         };
-        placements.push((robot, Placement { variation, ..Placement::at_rest(0.4, pose()) }));
+        placements.push((robot, InitialState { randomisation: variation, ..InitialState::at_rest(0.4, pose()) }));
     }
     backend.reset(&placements).unwrap();
     for _ in 0..1_000_000 / ROBOTS {
@@ -225,7 +225,7 @@ fn a_million_random_steps_of_random_robots_stay_finite() {
 #[test]
 fn robot_that_diverges_is_named_and_its_neighbours_do_not_notice() {
     let run = |broken: bool| {
-        let mut backend = batch(at(400, 4, Base::Floating), 8);
+        let mut backend = batch(at(400, 4, BaseMount::Floating), 8);
         let mut commands = vec![Command::hold(pose(), 30.0, 0.75); 8];
         if broken {
             commands[2].tau_ff[4] = f32::NAN;
@@ -243,7 +243,7 @@ fn robot_that_diverges_is_named_and_its_neighbours_do_not_notice() {
 
 #[test]
 fn snapshot_continues_bit_for_bit_in_the_same_place() {
-    let mut backend = batch(at(400, 4, Base::Floating), 3);
+    let mut backend = batch(at(400, 4, BaseMount::Floating), 3);
     let go_on = |backend: &mut BatchBackend| {
         for period in 0..50 {
             backend.step(&[Command::hold(trot_target(period), 30.0, 0.75); 3], &[true; 3], 1).unwrap();
@@ -259,7 +259,7 @@ fn snapshot_continues_bit_for_bit_in_the_same_place() {
 
 #[test]
 fn inactive_robots_stay_as_they_are() {
-    let mut backend = batch(at(400, 4, Base::Floating), 3);
+    let mut backend = batch(at(400, 4, BaseMount::Floating), 3);
     let before = backend.states().clone();
     backend.step(&[Command::hold(pose(), 30.0, 0.75); 3], &[true, false, true], 10).unwrap();
     assert_eq!(backend.states().q[1], before.q[1]);

@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use twinstep_logs::{Log, Meta};
-use twinstep_model::effects::{Effect, Entry, compose};
+use twinstep_model::effects::{Effect, EffectEntry, apply_effects};
 use twinstep_model::{ModelFile, RobotModel, go2};
-use twinstep_sysid::{Diagnosis, Value};
+use twinstep_sysid::{Diagnosis, ParameterValue};
 use twinstep_tests::browser::{browser, layout};
 use twinstep_tests::hidden_drive::{DRIVES, Motion, NOISE_NM};
 
@@ -32,14 +32,14 @@ fn diagnosed(robot: &RobotModel, folder: &Path) -> Diagnosis {
 fn hidden_friction_is_named_with_its_scope_and_size_and_the_model_mended() {
     let folder = tempfile::tempdir().unwrap();
     let entry = |name, scope: &str, value| {
-        Entry::new(Effect::named(name).unwrap(), scope.parse().unwrap(), vec![value]).unwrap()
+        EffectEntry::new(Effect::named(name).unwrap(), scope.parse().unwrap(), vec![value]).unwrap()
     };
-    let robot = compose(&go2(), &[entry("coulomb_friction", "RR", 0.6)]).unwrap();
+    let robot = apply_effects(&go2(), &[entry("coulomb_friction", "RR", 0.6)]).unwrap();
     let diagnosis = diagnosed(&robot, folder.path());
     let cause = &diagnosis.findings[0];
     assert_eq!((cause.effect.as_str(), cause.scope.as_str()), ("coulomb_friction", "RR"), "{diagnosis:#?}");
     let size = &cause.parameters["torque_nm"];
-    let Value::Number(value) = size.value else { panic!("{size:?}") };
+    let ParameterValue::Number(value) = size.value else { panic!("{size:?}") };
     assert!((value - 0.6).abs() < 0.06, "{size:?}");
     assert!(cause.score_nats > cause.threshold_nats);
     let [before, after] = [diagnosis.baseline, diagnosis.extended].map(|errors| errors.q_rmse_rad.unwrap());
@@ -64,11 +64,11 @@ fn stands_in_a_browser(page: &Path) {
 fn delay_with_which_a_loop_rings_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let delay = Effect::named("torque_delay").unwrap();
-    let robot = compose(&go2(), &[Entry::new(delay, "RL_calf".parse().unwrap(), vec![0.0085]).unwrap()]).unwrap();
+    let robot = apply_effects(&go2(), &[EffectEntry::new(delay, "RL_calf".parse().unwrap(), vec![0.0085]).unwrap()]).unwrap();
     let diagnosis = diagnosed(&robot, folder.path());
     let names: Vec<_> = diagnosis.findings.iter().map(|cause| (&cause.effect[..], &cause.scope[..])).collect();
     assert_eq!(names[0], ("torque_delay", "RL_calf"), "{diagnosis:#?}");
-    let Value::Number(delay) = diagnosis.findings[0].parameters["delay_s"].value else { panic!("{diagnosis:#?}") };
+    let ParameterValue::Number(delay) = diagnosis.findings[0].parameters["delay_s"].value else { panic!("{diagnosis:#?}") };
     assert!((delay / 0.0085 - 1.0).abs() < 0.05, "{delay} s");
 }
 
@@ -117,7 +117,7 @@ fn drives_of_another_robot_are_looked_at_by_their_torques() {
     let cause = &diagnosis.findings[0];
     assert_eq!((cause.effect.as_str(), cause.scope.as_str()), ("torque_saturation", "all"), "{findings}");
     let kappa = &cause.parameters["kappa_nm"];
-    let Value::Number(value) = kappa.value else { panic!("{kappa:?}") };
+    let ParameterValue::Number(value) = kappa.value else { panic!("{kappa:?}") };
     assert!((value - 8.0).abs() < 0.4, "{kappa:?}");
     assert!(diagnosis.extended.torque_rmse_nm < Some(1.2 * NOISE_NM), "{findings}");
     assert!(!out.join("report.html").exists() && !out.join("extended.toml").exists());

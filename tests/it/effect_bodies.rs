@@ -3,11 +3,11 @@
 use std::f64::consts::TAU;
 
 use glam::{DVec3, Vec3};
-use twinstep_model::effects::{Effect, Entry, compose};
+use twinstep_model::effects::{Effect, EffectEntry, apply_effects};
 use twinstep_model::{
-    Backend, Command, Joint, PerJoint, Placement, Pose, RigidBody, RobotModel, RobotStates, body_poses, frames, go2,
+    Backend, Command, Joint, PerJoint, InitialState, Pose, RigidBody, RobotModel, RobotStates, body_poses, frames, go2,
 };
-use twinstep_sim::{Base, BatchBackend, Engine, RapierBackend, SimConfig};
+use twinstep_sim::{BaseMount, BatchBackend, Engine, RapierBackend, SimConfig};
 
 const GRAVITY: f64 = 9.81;
 const CALF: usize = 2;
@@ -19,22 +19,22 @@ const D3: f64 = -2.4;
 
 pub fn with(robot: &RobotModel, effects: &[(&str, &str, &[f64])]) -> RobotModel {
     let entry = |(name, scope, values): &(&str, &str, &[f64])| {
-        Entry::new(Effect::named(name).unwrap(), scope.parse().unwrap(), values.to_vec()).unwrap()
+        EffectEntry::new(Effect::named(name).unwrap(), scope.parse().unwrap(), values.to_vec()).unwrap()
     };
-    compose(robot, &effects.iter().map(entry).collect::<Vec<_>>()).unwrap()
+    apply_effects(robot, &effects.iter().map(entry).collect::<Vec<_>>()).unwrap()
 }
 
-pub fn config(base: Base, physics_hz: u32) -> SimConfig {
+pub fn config(base: BaseMount, physics_hz: u32) -> SimConfig {
     SimConfig { base, physics_hz: Some(physics_hz), threads: 1, ..SimConfig::default() }
 }
 
-pub fn batch(robot: &RobotModel, config: SimConfig, placement: Placement) -> BatchBackend {
+pub fn batch(robot: &RobotModel, config: SimConfig, placement: InitialState) -> BatchBackend {
     let mut backend = BatchBackend::new(robot.clone(), config, 1).unwrap();
     backend.reset(&[(0, placement)]).unwrap();
     backend
 }
 
-pub fn rapier(robot: &RobotModel, config: SimConfig, placement: Placement) -> RapierBackend {
+pub fn rapier(robot: &RobotModel, config: SimConfig, placement: InitialState) -> RapierBackend {
     let config = SimConfig { engine: Engine::Rapier, ..config };
     let mut backend = RapierBackend::new(robot.clone(), config, 1).unwrap();
     backend.reset(&[(0, placement)]).unwrap();
@@ -85,7 +85,7 @@ const LINK_CASES: [BodyCase; 3] = [
 fn held_leg_carries_the_weight_of_its_links() {
     for ((name, values), change) in LINK_CASES {
         let robot = with(&go2(), &[(name, "FL_calf", values)]);
-        let mut backend = batch(&robot, config(Base::Fixed, 1000), Placement::at_rest(1.0, pose()));
+        let mut backend = batch(&robot, config(BaseMount::Fixed, 1000), InitialState::at_rest(1.0, pose()));
         run(&mut backend, &Command::hold(pose(), 60.0, 2.0), 3.0);
         let (states, frames) = (backend.states(), frames_of(backend.states()));
         for joint in 0..3 {
@@ -129,9 +129,9 @@ fn limp_calf_swings_with_the_period_of_its_pendulum() {
         let expected = TAU * (inertia / (GRAVITY * lever.x.hypot(lever.z))).sqrt();
 
         let rest = lever.x.atan2(-lever.z);
-        let mut placement = Placement::at_rest(2.0, [0.0; 12]);
+        let mut placement = InitialState::at_rest(2.0, [0.0; 12]);
         placement.q[CALF] = rest as f32 + 0.1;
-        let mut backend = batch(&robot, config(Base::Fixed, 1000), placement);
+        let mut backend = batch(&robot, config(BaseMount::Fixed, 1000), placement);
         let mut crossings = Vec::new();
         let mut before = 1.0;
         for period in 1..=1000 {
@@ -159,7 +159,7 @@ fn feet_of_a_standing_robot_carry_its_trunk_where_its_mass_is() {
     ];
     for ((name, values), change) in cases {
         let robot = with(&go2(), &[(name, "base", values)]);
-        let mut backend = batch(&robot, config(Base::Floating, 1000), Placement::at_rest(0.33, pose()));
+        let mut backend = batch(&robot, config(BaseMount::Floating, 1000), InitialState::at_rest(0.33, pose()));
         run(&mut backend, &Command::hold(pose(), 100.0, 3.0), 4.0);
         let (states, frames) = (backend.states(), frames_of(backend.states()));
         let (mut weight, mut moment) = (0.0, DVec3::ZERO);
@@ -189,12 +189,12 @@ fn sliding_robot_is_slowed_by_friction_times_gravity() {
     }
     // Crouched and stiff, so that it does not tip over.
     let crouch = Joint::map_kinds(0.0, 1.3, -2.6);
-    let ground = Placement::above(&twinstep_model::Ground::FLAT, &go2(), crouch, 0.0);
-    let placement = Placement { base_linear_velocity: [2.0, 0.0, 0.0], ..ground };
+    let ground = InitialState::standing_on(&twinstep_model::Ground::FLAT, &go2(), crouch, 0.0);
+    let placement = InitialState { base_linear_velocity: [2.0, 0.0, 0.0], ..ground };
     let hold = Command::hold(crouch, 200.0, 5.0);
     for coefficient in [0.1, 0.3] {
         let robot = with(&go2(), &[("ground_friction", "ground", &[coefficient])]);
-        let stand = config(Base::Floating, 1000);
+        let stand = config(BaseMount::Floating, 1000);
         let engines = [slowed(batch(&robot, stand, placement), &hold), slowed(rapier(&robot, stand, placement), &hold)];
         for slowed in engines {
             let expected = coefficient * GRAVITY;
@@ -234,9 +234,9 @@ fn pressed_foot_sinks_in_and_settles_with_the_grounds_time_constant() {
         for leg in 1..4 {
             (q[3 * leg + 1], q[3 * leg + 2]) = (1.5, -2.7);
         }
-        let far = batch(&robot, config(Base::Fixed, 2000), Placement::at_rest(1.0, q));
+        let far = batch(&robot, config(BaseMount::Fixed, 2000), InitialState::at_rest(1.0, q));
         let touching = 1.0 - height(far.states());
-        let mut backend = batch(&robot, config(Base::Fixed, 2000), Placement::at_rest(touching as f32, q));
+        let mut backend = batch(&robot, config(BaseMount::Fixed, 2000), InitialState::at_rest(touching as f32, q));
 
         let body = &robot.legs[0].bodies[2];
         let inertia =

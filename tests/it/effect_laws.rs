@@ -4,9 +4,9 @@
 //! chirp under PD. [`Law`] is written from `twinstep effects`, not from the engines.
 
 use glam::DVec3;
-use twinstep_model::effects::{Effect, Entry, compose};
-use twinstep_model::{Backend, Command, Job, Placement, Precision, RobotModel, RobotStates, Rollout, go2};
-use twinstep_sim::{Base, BatchRollout, Engine, RapierBackend, SimConfig};
+use twinstep_model::effects::{Effect, EffectEntry, apply_effects};
+use twinstep_model::{Backend, Command, RolloutRequest, InitialState, Precision, RobotModel, RobotStates, Rollout, go2};
+use twinstep_sim::{BaseMount, BatchRollout, Engine, RapierBackend, SimConfig};
 
 const CALF: usize = 2;
 const PERIODS: usize = 200;
@@ -185,8 +185,8 @@ fn integrate(law: &Law) -> Vec<[f64; 2]> {
     rows
 }
 
-fn placement() -> Placement {
-    Placement::at_rest(2.0, go2().control.default_pose_f32())
+fn placement() -> InitialState {
+    InitialState::at_rest(2.0, go2().control.default_pose_f32())
 }
 
 fn commands() -> Vec<Command> {
@@ -201,7 +201,7 @@ fn commands() -> Vec<Command> {
 
 fn config(engine: Engine) -> SimConfig {
     let physics_hz = Some((STEPS as f64 / PERIOD) as u32);
-    SimConfig { engine, base: Base::Fixed, physics_hz, threads: 1, ..SimConfig::default() }
+    SimConfig { engine, base: BaseMount::Fixed, physics_hz, threads: 1, ..SimConfig::default() }
 }
 
 fn shown(states: &RobotStates, entry: usize) -> [f64; 2] {
@@ -229,17 +229,17 @@ fn rms(one: &[[f64; 2]], other: &[[f64; 2]]) -> f64 {
 fn effects_of_joints_follow_their_laws_in_both_engines() {
     let robot = |entries: &[(&str, &[f64])]| {
         let entry = |(name, values): &(&str, &[f64])| {
-            Entry::new(Effect::named(name).unwrap(), "FL_calf".parse().unwrap(), values.to_vec()).unwrap()
+            EffectEntry::new(Effect::named(name).unwrap(), "FL_calf".parse().unwrap(), values.to_vec()).unwrap()
         };
-        compose(&lone_calf(), &entries.iter().map(entry).collect::<Vec<_>>()).unwrap()
+        apply_effects(&lone_calf(), &entries.iter().map(entry).collect::<Vec<_>>()).unwrap()
     };
     let commands = commands();
     let robots: Vec<_> = std::iter::once(lone_calf()).chain(CASES.iter().map(|(entries, _)| robot(entries))).collect();
     let jobs: Vec<_> = robots
         .iter()
-        .map(|robot| Job { robot, held: true, start: placement(), past: &[], commands: &commands })
+        .map(|robot| RolloutRequest { robot, held: true, start: placement(), history: &[], commands: &commands })
         .collect();
-    let played = BatchRollout::new(&lone_calf(), &config(Engine::Batch)).unwrap().play(&jobs, Precision::Double);
+    let played = BatchRollout::new(&lone_calf(), &config(Engine::Batch)).unwrap().run(&jobs, Precision::Double);
     let in_batch = |index: usize| -> Vec<_> { (1..=PERIODS).map(|entry| shown(&played[index], entry)).collect() };
 
     let ideal = integrate(&Law::default());

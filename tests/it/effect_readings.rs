@@ -1,20 +1,20 @@
 //! What sensors show and a log tells, against the definitions of the effects.
 
 use glam::Vec3;
-use twinstep_logs::{Base as LoggedBase, Log, Meta, Segment, TauSensor};
-use twinstep_model::{Backend, Command, Job, Placement, Precision, RobotModel, RobotStates, Rollout, go2};
-use twinstep_sim::{Base, SimConfig};
-use twinstep_sysid::{Experiment, Horizon};
+use twinstep_logs::{BaseMount as LoggedBase, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{Backend, Command, RolloutRequest, InitialState, Precision, RobotModel, RobotStates, Rollout, go2};
+use twinstep_sim::{BaseMount, SimConfig};
+use twinstep_sysid::{Experiment, WindowConfig};
 
 use crate::effect_bodies::{batch, config, pose, rapier, run, with};
 
 const CALF: usize = 2;
 
-fn check_gyroscope<B: Backend>(of: impl Fn(&RobotModel, SimConfig, Placement) -> B) {
+fn check_gyroscope<B: Backend>(of: impl Fn(&RobotModel, SimConfig, InitialState) -> B) {
     let biased = [("gyro_bias", "base", &[0.3, -0.2, 0.1][..]), ("gyro_bias", "base", &[0.1, 0.0, 0.0])];
-    let thrown = Placement { base_angular_velocity: [1.0, 0.5, -0.8], ..Placement::at_rest(3.0, pose()) };
+    let thrown = InitialState { base_angular_velocity: [1.0, 0.5, -0.8], ..InitialState::at_rest(3.0, pose()) };
     let [mut biased, mut ideal] =
-        [with(&go2(), &biased), go2()].map(|robot| of(&robot, config(Base::Floating, 1000), thrown));
+        [with(&go2(), &biased), go2()].map(|robot| of(&robot, config(BaseMount::Floating, 1000), thrown));
     for _ in 0..20 {
         run(&mut biased, &Command::hold(pose(), 30.0, 0.75), 0.02);
         run(&mut ideal, &Command::hold(pose(), 30.0, 0.75), 0.02);
@@ -32,10 +32,10 @@ fn gyroscope_shows_its_bias_and_the_motion_is_the_same() {
 
 /// Keeps what it is told, and answers with a torque that grows by 0.1 N·m a drive period.
 #[derive(Default)]
-struct Told(Vec<Command>);
+struct CommandRecorder(Vec<Command>);
 
-impl Rollout for Told {
-    fn play(&mut self, jobs: &[Job], _: Precision) -> Vec<RobotStates> {
+impl Rollout for CommandRecorder {
+    fn run(&mut self, jobs: &[RolloutRequest], _: Precision) -> Vec<RobotStates> {
         self.0 = jobs[0].commands.to_vec();
         let mut states = RobotStates::new(self.0.len() + 1);
         for (entry, tau) in states.tau.iter_mut().enumerate().skip(1) {
@@ -61,9 +61,9 @@ fn told(robot: &RobotModel, late: f64) -> (Vec<f64>, Vec<Command>) {
         ("temp_FL_calf", column(&|row| 30.0 + row)),
     ];
     let log =
-        Log::new(Meta::new(200.0, TauSensor::Current, segments), columns.map(|(name, cells)| (name.to_owned(), cells)));
-    let mut simulator = Told::default();
-    let experiment = Experiment::new(&log.unwrap(), robot, Horizon::EVALUATION).unwrap().only(|row| row >= 10);
+        Log::new(Meta::new(200.0, TorqueSensor::MotorCurrent, segments), columns.map(|(name, cells)| (name.to_owned(), cells)));
+    let mut simulator = CommandRecorder::default();
+    let experiment = Experiment::new(&log.unwrap(), robot, WindowConfig::EVALUATION).unwrap().filter_rows(|row| row >= 10);
     let residuals = experiment.residuals(&mut simulator, std::slice::from_ref(robot), Precision::Double);
     (residuals.into_iter().next().unwrap(), simulator.0)
 }
@@ -86,7 +86,7 @@ fn supply_and_heat_leave_the_share_of_torque_that_their_laws_say() {
         let row = row as f64;
         let cold = ((30.0 - 0.1 * row) / 30.0).powf(1.7);
         let hot = cold * (1.0 - 0.004 * (row - 10.0).max(0.0));
-        let [of_calf, of_thigh] = [CALF, CALF - 1].map(|joint| f64::from(command.strength[joint]));
+        let [of_calf, of_thigh] = [CALF, CALF - 1].map(|joint| f64::from(command.derating_factor[joint]));
         assert!((of_calf - hot).abs() < 1e-6 && (of_thigh - cold).abs() < 1e-6, "row {row}: {of_calf} {of_thigh}");
     }
 }

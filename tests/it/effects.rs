@@ -2,9 +2,9 @@
 
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_envs::TaskName;
-use twinstep_model::effects::{CATALOGUE, Effect, Entry, Scope, Target, compose};
-use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, Placement, ResetRequest, RobotModel, VecEnv, go2};
-use twinstep_sim::{Base, BatchBackend, Engine, RapierBackend, SimConfig};
+use twinstep_model::effects::{CATALOGUE, Effect, EffectEntry, Scope, Target, apply_effects};
+use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, InitialState, ResetRequest, RobotModel, VecEnv, go2};
+use twinstep_sim::{BaseMount, BatchBackend, Engine, RapierBackend, SimConfig};
 
 use crate::remote;
 
@@ -17,20 +17,20 @@ const DISAGREES: &str = "ground_stiffness";
 /// Drive periods of the motion.
 const PERIODS: usize = 200;
 
-fn config(engine: Engine, base: Base) -> SimConfig {
+fn config(engine: Engine, base: BaseMount) -> SimConfig {
     SimConfig { engine, base, physics_hz: Some(2000), threads: 1, ..SimConfig::default() }
 }
 
 /// Joint positions and torques in each drive period of a chirp in the air, or of a sway on the feet.
-fn motion(backend: &mut impl Backend, base: Base) -> Vec<PerJoint> {
+fn motion(backend: &mut impl Backend, base: BaseMount) -> Vec<PerJoint> {
     let pose = go2().control.default_pose_f32();
-    let height = if base == Base::Fixed { 1.0 } else { 0.3236 };
-    backend.reset(&[(0, Placement::at_rest(height, pose))]).unwrap();
+    let height = if base == BaseMount::Fixed { 1.0 } else { 0.3236 };
+    backend.reset(&[(0, InitialState::at_rest(height, pose))]).unwrap();
     let mut rows = Vec::new();
     for period in 0..PERIODS {
         let t = period as f32 * 0.005;
         let swing = (std::f32::consts::TAU * (1.0 + 1.5 * t) * t).sin();
-        let target = std::array::from_fn(|j| pose[j] + if base == Base::Fixed { 0.3 * swing } else { 0.08 * swing });
+        let target = std::array::from_fn(|j| pose[j] + if base == BaseMount::Fixed { 0.3 * swing } else { 0.08 * swing });
         backend.step(&[Command::hold(target, 30.0, 0.75)], &[true], 1).unwrap();
         rows.push(backend.states().q[0]);
         rows.push(backend.states().tau[0].map(|tau| 0.02 * tau));
@@ -40,7 +40,7 @@ fn motion(backend: &mut impl Backend, base: Base) -> Vec<PerJoint> {
     rows
 }
 
-fn in_both(robot: &RobotModel, base: Base) -> [Vec<PerJoint>; 2] {
+fn in_both(robot: &RobotModel, base: BaseMount) -> [Vec<PerJoint>; 2] {
     let mut rapier = RapierBackend::new(robot.clone(), config(Engine::Rapier, base), 1).unwrap();
     let mut batch = BatchBackend::new(robot.clone(), config(Engine::Batch, base), 1).unwrap();
     [motion(&mut rapier, base), motion(&mut batch, base)]
@@ -51,14 +51,14 @@ fn rms(one: &[PerJoint], other: &[PerJoint]) -> f32 {
     (squares.sum::<f32>() / (one.len() * NUM_JOINTS) as f32).sqrt()
 }
 
-fn entry(effect: &'static Effect) -> Entry {
+fn entry(effect: &'static Effect) -> EffectEntry {
     let scope = match effect.target {
         Target::Joints | Target::Supply => Scope::All,
         Target::Bodies | Target::Base => Scope::Base,
         Target::Ground => Scope::Ground,
     };
     let values = effect.parameters.iter().flat_map(|parameter| {
-        let [low, high] = parameter.plausible;
+        let [low, high] = parameter.prior_range;
         std::iter::repeat_n(low + 0.7 * (high - low), parameter.count)
     });
     let values = match effect.name {
@@ -74,7 +74,7 @@ fn entry(effect: &'static Effect) -> Entry {
         "gyro_bias" => vec![0.3, -0.2, 0.1],
         _ => values.collect(),
     };
-    Entry::new(effect, scope, values).unwrap()
+    EffectEntry::new(effect, scope, values).unwrap()
 }
 
 #[test]
@@ -82,9 +82,9 @@ fn effects_do_the_same_in_both_engines() {
     // These need a log's voltage, temperature or torque channel, and leave the motion alone.
     let elsewhere = ["supply_sag", "thermal_derating", "torque_sensor_delay"];
     for effect in CATALOGUE.into_iter().filter(|effect| !elsewhere.contains(&effect.name)) {
-        let base = if effect.target == Target::Joints { Base::Fixed } else { Base::Floating };
+        let base = if effect.target == Target::Joints { BaseMount::Fixed } else { BaseMount::Floating };
         let ideal = in_both(&go2(), base);
-        let [rapier, batch] = in_both(&compose(&go2(), &[entry(effect)]).unwrap(), base);
+        let [rapier, batch] = in_both(&apply_effects(&go2(), &[entry(effect)]).unwrap(), base);
         let (apart, changed) = (rms(&rapier, &batch), rms(&batch, &ideal[1]));
         println!(
             "{:<20} changes {changed:.5}, engines {apart:.5} apart, ideal {:.5}",
@@ -130,7 +130,7 @@ fn server_simulates_the_effects_of_its_model_file() {
         for _ in 0..5 {
             after = env.step(&[0.3; 12]).unwrap().obs[9..21].to_vec();
         }
-        server.stop();
+        server.shutdown();
         before.iter().zip(&after).map(|(before, after)| (before - after).abs()).fold(0.0, f32::max)
     };
     let (ideal, held) = (moved(None), moved(Some(path)));

@@ -3,13 +3,13 @@
 use std::sync::Arc;
 
 use twinstep_envs::TaskName;
-use twinstep_protocol::keys::Verb;
+use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::message::{CloseRequest, LeaseReply, ResetRequest};
 use twinstep_protocol::tensor::as_bytes;
-use twinstep_protocol::{Code, PROTOCOL, encode, keys};
+use twinstep_protocol::{ErrorCode, PROTOCOL, encode, keys};
 
 use crate::raw_client::{RawClient, only_reply, reset_bytes, resets_in, step_bytes, step_with, steps_in};
-use crate::remote::{Fragile, config, start, start_with};
+use crate::remote::{FailingEnvFactory, config, start, start_with};
 
 /// Runs `test` with a client whose lease of two counters was reset under number 1.
 fn with_counters(test: impl FnOnce(&RawClient, &LeaseReply)) {
@@ -18,7 +18,7 @@ fn with_counters(test: impl FnOnce(&RawClient, &LeaseReply)) {
     let lease = client.lease(2);
     client.reset(&lease, 1).unwrap();
     test(&client, &lease);
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -38,7 +38,7 @@ fn request_sent_three_times_is_executed_once_with_equal_bytes() {
 #[test]
 fn request_sent_again_while_it_is_in_progress_is_executed_once() {
     with_counters(|client, lease| {
-        let key = keys::env(&client.sid, &lease.lease, Verb::Step);
+        let key = keys::env(&client.sid, &lease.lease, EnvMethod::Step);
         for seq in 2..50 {
             let sent: Vec<_> = (0..3).map(|_| client.send(&key, &step_bytes(lease, seq))).collect();
             let answers: Vec<_> = sent.iter().map(|replies| only_reply(replies, &key).unwrap()).collect();
@@ -54,7 +54,7 @@ fn repeated_close_gives_its_answer_or_finds_no_lease() {
         let closed = client.close(lease, 2).unwrap();
         match client.close(lease, 2) {
             Ok(again) => assert_eq!(again, closed),
-            Err(error) => assert_eq!(error.code, Code::LeaseLost),
+            Err(error) => assert_eq!(error.code, ErrorCode::LeaseLost),
         }
         assert_eq!(client.hello().free_envs, 64);
     });
@@ -66,18 +66,18 @@ fn numbers_and_epochs_out_of_order_are_refused_without_effect() {
         client.step(lease, 2).unwrap();
         let other_epoch = |epoch| LeaseReply { epoch, ..lease.clone() };
         for (epoch, seq, expected) in [
-            (1, 4, Code::SequenceGap),
-            (1, u64::MAX, Code::SequenceGap),
-            (1, 1, Code::StaleSequence),
-            (1, 0, Code::StaleSequence),
-            (0, 3, Code::StaleEpoch),
-            (2, 3, Code::StaleEpoch),
-            (u64::MAX, 3, Code::StaleEpoch),
+            (1, 4, ErrorCode::SequenceGap),
+            (1, u64::MAX, ErrorCode::SequenceGap),
+            (1, 1, ErrorCode::StaleSequence),
+            (1, 0, ErrorCode::StaleSequence),
+            (0, 3, ErrorCode::StaleEpoch),
+            (2, 3, ErrorCode::StaleEpoch),
+            (u64::MAX, 3, ErrorCode::StaleEpoch),
         ] {
             let error = client.step(&other_epoch(epoch), seq).unwrap_err();
             assert_eq!(error.code, expected, "epoch {epoch}, seq {seq}");
         }
-        assert_eq!(client.reset(lease, 2).unwrap_err().code, Code::StaleSequence, "number 2 was a step");
+        assert_eq!(client.reset(lease, 2).unwrap_err().code, ErrorCode::StaleSequence, "number 2 was a step");
         assert_eq!(steps_in(&client.step(lease, 3).unwrap()), 2.0);
     });
 }
@@ -85,16 +85,16 @@ fn numbers_and_epochs_out_of_order_are_refused_without_effect() {
 #[test]
 fn wrong_arrays_are_refused_by_name_without_effect() {
     with_counters(|client, lease| {
-        let step = |actions: &[f32]| client.ask_env(lease, Verb::Step, &step_with(lease, 2, actions)).unwrap_err();
+        let step = |actions: &[f32]| client.ask_env(lease, EnvMethod::Step, &step_with(lease, 2, actions)).unwrap_err();
         // The last is a payload of 16 MiB.
         for length in [0, 12, 23, 25, 48, 4 << 20] {
             let error = step(&vec![0.0; length]);
-            assert_eq!((error.code, error.field.as_str()), (Code::BadShape, "actions"), "{length} actions");
+            assert_eq!((error.code, error.field.as_str()), (ErrorCode::BadShape, "actions"), "{length} actions");
         }
         for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
             let mut actions = [0.0; 24];
             actions[23] = value;
-            assert_eq!(step(&actions).code, Code::NotFinite, "{value}");
+            assert_eq!(step(&actions).code, ErrorCode::NotFinite, "{value}");
         }
         let (seeds, mask) = ([0u64; 3], [1u8; 3]);
         let reset = ResetRequest { protocol: PROTOCOL, epoch: 1, seq: 2, seeds: None, mask: None };
@@ -104,8 +104,8 @@ fn wrong_arrays_are_refused_by_name_without_effect() {
             ("mask", ResetRequest { mask: Some(&mask), ..reset.clone() }),
             ("mask", ResetRequest { mask: Some(&[]), ..reset }),
         ] {
-            let error = client.ask_env(lease, Verb::Reset, &encode(&request)).unwrap_err();
-            assert_eq!((error.code, error.field.as_str()), (Code::BadShape, field));
+            let error = client.ask_env(lease, EnvMethod::Reset, &encode(&request)).unwrap_err();
+            assert_eq!((error.code, error.field.as_str()), (ErrorCode::BadShape, field));
         }
         assert_eq!(steps_in(&client.step(lease, 2).unwrap()), 1.0, "the number was free");
     });
@@ -116,15 +116,15 @@ fn foreign_version_is_refused_at_every_key_but_hello() {
     with_counters(|client, lease| {
         for key in [
             keys::lease(&client.sid),
-            keys::env(&client.sid, &lease.lease, Verb::Reset),
-            keys::env(&client.sid, &lease.lease, Verb::Step),
-            keys::env(&client.sid, &lease.lease, Verb::Close),
-            keys::env(&client.sid, &lease.lease, Verb::Render),
+            keys::env(&client.sid, &lease.lease, EnvMethod::Reset),
+            keys::env(&client.sid, &lease.lease, EnvMethod::Step),
+            keys::env(&client.sid, &lease.lease, EnvMethod::Close),
+            keys::env(&client.sid, &lease.lease, EnvMethod::Render),
         ] {
             // Once with all fields of the message, once with none that version 1 knows.
             let close = encode(&CloseRequest { protocol: 2, epoch: 1, seq: 2 });
             for payload in [close.as_slice(), b"\x82\xa8protocol\x02\xa3new\xc0"] {
-                assert_eq!(client.ask(&key, payload).unwrap_err().code, Code::Version, "{key}");
+                assert_eq!(client.ask(&key, payload).unwrap_err().code, ErrorCode::Version, "{key}");
             }
         }
         assert!(client.ask(&keys::hello(&client.sid), b"\x81\xa8protocol\x02").is_ok());
@@ -136,33 +136,33 @@ fn foreign_version_is_refused_at_every_key_but_hello() {
 fn lease_that_never_was_is_told_apart_from_unknown_keys() {
     with_counters(|client, lease| {
         let foreign = LeaseReply { lease: "0123456789abcdef".to_owned(), ..lease.clone() };
-        assert_eq!(client.step(&foreign, 2).unwrap_err().code, Code::LeaseLost);
+        assert_eq!(client.step(&foreign, 2).unwrap_err().code, ErrorCode::LeaseLost);
         for rest in ["", "/env", "/lease/x", "/*", "/**"] {
             let key = format!("twinstep/{}{rest}", client.sid);
-            assert_eq!(client.ask(&key, b"").unwrap_err().code, Code::UnknownKey, "{key}");
+            assert_eq!(client.ask(&key, b"").unwrap_err().code, ErrorCode::UnknownKey, "{key}");
         }
         let key = format!("twinstep/{}/env/{}/jump", client.sid, lease.lease);
-        assert_eq!(client.ask(&key, &step_bytes(lease, 2)).unwrap_err().code, Code::UnknownKey);
+        assert_eq!(client.ask(&key, &step_bytes(lease, 2)).unwrap_err().code, ErrorCode::UnknownKey);
         assert_eq!(steps_in(&client.step(lease, 2).unwrap()), 1.0);
     });
 }
 
 #[test]
 fn lease_whose_environments_panicked_can_be_closed_or_asked_anew() {
-    let (server, endpoint) = start_with(&config(TaskName::Counter), Arc::new(Fragile));
+    let (server, endpoint) = start_with(&config(TaskName::Counter), Arc::new(FailingEnvFactory));
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
     let panicked = || {
         let lease = client.lease(64);
         client.reset(&lease, 1).unwrap();
         (2..4).for_each(|seq| drop(client.step(&lease, seq).unwrap()));
-        assert_eq!(client.step(&lease, 4).unwrap_err().code, Code::LeaseLost);
+        assert_eq!(client.step(&lease, 4).unwrap_err().code, ErrorCode::LeaseLost);
         lease
     };
     let first = panicked();
     client.close(&first, 5).unwrap();
     panicked();
-    assert_eq!(client.ask_lease(&client.lease_request(64)).unwrap_err().code, Code::LeaseLost);
+    assert_eq!(client.ask_lease(&client.lease_request(64)).unwrap_err().code, ErrorCode::LeaseLost);
     let third = client.lease(64);
-    client.ask_env(&third, Verb::Reset, &reset_bytes(&third, 1)).unwrap();
-    server.stop();
+    client.ask_env(&third, EnvMethod::Reset, &reset_bytes(&third, 1)).unwrap();
+    server.shutdown();
 }

@@ -2,12 +2,12 @@
 
 use std::sync::atomic::AtomicBool;
 
-use twinstep_tests::campaign::{self, Plan, Tally};
-use twinstep_tests::lane::Commands;
+use twinstep_tests::campaign::{self, FaultPlan, FaultReport};
+use twinstep_tests::lane::TestBedConfig;
 
-fn inject(faults: usize, lanes: usize, server_arguments: &[&str]) -> Tally {
-    let plan = Plan {
-        commands: Commands {
+fn inject(faults: usize, lanes: usize, server_arguments: &[&str]) -> FaultReport {
+    let plan = FaultPlan {
+        commands: TestBedConfig {
             program: env!("CARGO_BIN_EXE_faults").into(),
             server: server_arguments.iter().map(|argument| (*argument).to_owned()).collect(),
             client: None,

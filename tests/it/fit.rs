@@ -5,12 +5,12 @@ use std::f64::consts::TAU;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use twinstep_ensemble::{Block, DataSet, Ensemble, disagreement};
-use twinstep_logs::{Base as LoggedBase, Gain, Log, Meta, Segment, TauSensor};
-use twinstep_model::effects::{Entry, compose};
+use twinstep_ensemble::{Split, DataSet, Ensemble, epistemic_uncertainty};
+use twinstep_logs::{BaseMount as LoggedBase, Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::effects::{EffectEntry, apply_effects};
 use twinstep_model::{JOINT_NAMES, RobotModel, go2};
-use twinstep_sim::{Base, BatchBackend, Engine, SimConfig};
-use twinstep_sysid::{RecordError, Sensor, measured, record};
+use twinstep_sim::{BaseMount, BatchBackend, Engine, SimConfig};
+use twinstep_sysid::{RecordError, Sensor, apply_sensors, record};
 use twinstep_tests::hidden_robot::effect;
 use twinstep_tests::python::Programs;
 
@@ -27,9 +27,9 @@ fn twinstep(arguments: &[&str]) -> Output {
 fn robot() -> RobotModel {
     let entries = [("torque_delay", 0.008), ("torque_saturation", 5.0)].map(|(name, value)| {
         let (effect, scope) = effect(name, "all");
-        Entry::new(effect, scope, vec![value]).unwrap()
+        EffectEntry::new(effect, scope, vec![value]).unwrap()
     });
-    compose(&go2(), &entries).unwrap()
+    apply_effects(&go2(), &entries).unwrap()
 }
 
 /// Twelve seconds of steps in the air, each joint's about `amplitude` to both sides [rad].
@@ -47,19 +47,19 @@ fn log(amplitude: f64) -> Log {
         }
     }
     let segments = vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }];
-    let mut meta = Meta::new(RATE_HZ, TauSensor::Current, segments);
+    let mut meta = Meta::new(RATE_HZ, TorqueSensor::MotorCurrent, segments);
     meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
-    (meta.kp, meta.kd) = (Some(Gain::Same(25.0)), Some(Gain::Same(0.6)));
-    let motion = Log::new_motion(meta, columns).unwrap();
+    (meta.kp, meta.kd) = (Some(Gain::Uniform(25.0)), Some(Gain::Uniform(0.6)));
+    let motion = Log::new_commands(meta, columns).unwrap();
     let robot = robot();
     let backend = |_| {
-        let config = SimConfig { engine: Engine::Batch, base: Base::Fixed, threads: 1, ..SimConfig::default() };
+        let config = SimConfig { engine: Engine::Batch, base: BaseMount::Fixed, threads: 1, ..SimConfig::default() };
         BatchBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)))
     };
     let exact =
         record(&motion, &robot, None, backend, "a robot that acts late and saturates".to_owned(), &mut |_| true)
             .unwrap();
-    measured(&exact, &[Sensor { quantity: "tau_measured", sigma: NOISE, step: 0.0 }], 1).unwrap()
+    apply_sensors(&exact, &[Sensor { quantity: "tau_measured", sigma: NOISE, resolution: 0.0 }], 1).unwrap()
 }
 
 fn fit(log: &Path, out: &Path, more: &[&str]) -> Output {
@@ -88,14 +88,14 @@ fn ensemble_predicts_late_and_saturating_drives_and_disagrees_where_it_has_not_b
     let ensemble = Ensemble::read(&out).unwrap();
     let euf = |data: &DataSet| {
         let (mut error, mut ideal, mut sum, mut count) = (0.0, 0.0, 0.0, 0.0);
-        for (run, rows) in data.runs(Block::Test).zip(ensemble.predict(data.runs(Block::Test))) {
+        for (run, rows) in data.runs(Split::Test).zip(ensemble.predict(data.runs(Split::Test))) {
             let unseen = run.torques.len() - rows.len();
             for ((members, torque), [dq, ddq]) in rows.iter().zip(&run.torques[unseen..]).zip(&run.errors[unseen..]) {
                 let (means, variances): (Vec<_>, Vec<_>) =
                     members.iter().map(|member| (member.mean, member.variance)).unzip();
                 error += (means.iter().sum::<f64>() / means.len() as f64 - torque).powi(2);
                 ideal += (25.0 * dq + 0.6 * ddq - torque).powi(2);
-                sum += disagreement(&means, &variances);
+                sum += epistemic_uncertainty(&means, &variances);
                 count += 1.0;
             }
         }

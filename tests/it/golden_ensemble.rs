@@ -5,7 +5,7 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use twinstep_ensemble::{DataSet, Ensemble, Inference, JointInput, Options, Outcome, Training};
+use twinstep_ensemble::{DataSet, Ensemble, Inference, JointEncoding, TrainingOptions, TrainingResult, Training};
 use twinstep_model::{JOINT_NAMES, NUM_JOINTS};
 use twinstep_tests::hidden_drive::{DRIVES, Motion};
 
@@ -30,10 +30,10 @@ fn path(name: &str) -> PathBuf {
 fn trained() -> Ensemble {
     let motion = Motion { seconds: 12.0, amplitude: 0.3, hz: [0.3, 6.0], seed: 5 };
     let data = DataSet::new(&[("a drive that saturates".to_owned(), DRIVES[1].logs(motion).measured)]).unwrap();
-    let options = Options { members: 3, hidden: 8, joint_input: JointInput::Kind, epochs: 20, seed: 5 };
+    let options = TrainingOptions { members: 3, hidden: 8, joint_input: JointEncoding::Kind, epochs: 20, seed: 5 };
     match Training::new(&data, options).unwrap().run(2, None, &mut |_| true).unwrap() {
-        Outcome::Trained(ensemble, _) => *ensemble,
-        Outcome::Ended(_) => panic!("it had no reason to end"),
+        TrainingResult::Trained(ensemble, _) => *ensemble,
+        TrainingResult::Interrupted(_) => panic!("it had no reason to end"),
     }
 }
 
@@ -48,8 +48,8 @@ fn said(ensemble: &Ensemble) -> Golden {
             let jump = if (row + 7 * joint) % 31 < 4 { 0.25 } else { 0.0 };
             [0.15 * phase.sin() + jump, 3.0 * phase.cos()]
         });
-        inference.hear(&[errors]);
-        let members = || (0..ensemble.description.members).map(|member| inference.gaussians(0, member));
+        inference.step(&[errors]);
+        let members = || (0..ensemble.description.members).map(|member| inference.predictions(0, member));
         golden.mean.push(members().map(|gaussians| gaussians.map(|gaussian| gaussian.mean)).collect());
         golden.variance.push(members().map(|gaussians| gaussians.map(|gaussian| gaussian.variance)).collect());
         golden.errors.push(errors);

@@ -4,12 +4,12 @@ use std::collections::BTreeMap;
 use std::process::Command as Process;
 
 use rand::RngExt;
-use twinstep_logs::{Base as LoggedBase, Gain, Log, Meta, Segment, TauSensor};
-use twinstep_model::effects::{Effect, Entry, Scope, compose};
-use twinstep_model::{Backend, Command, HELD_HEIGHT, JOINT_NAMES, ModelFile, Placement, RobotModel, go2, stream};
-use twinstep_sim::{Base, BatchBackend, BatchRollout, Engine, RapierBackend, SimConfig};
+use twinstep_logs::{BaseMount as LoggedBase, Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::effects::{Effect, EffectEntry, Scope, apply_effects};
+use twinstep_model::{Backend, Command, FIXED_BASE_HEIGHT, JOINT_NAMES, ModelFile, InitialState, RobotModel, go2, stream};
+use twinstep_sim::{BaseMount, BatchBackend, BatchRollout, Engine, RapierBackend, SimConfig};
 use twinstep_sysid::{
-    Experiment, Horizon, Identification, IdentifyError, Options, RecordError, Search, Stage, Verdict, evaluate,
+    Experiment, WindowConfig, Identification, IdentifyError, IdentifyOptions, RecordError, GlobalSearch, Stage, EstimateStatus, evaluate,
     identify, record,
 };
 use twinstep_tests::python::{Programs, root};
@@ -31,26 +31,26 @@ fn scope(text: &str) -> Scope {
     text.parse().unwrap()
 }
 
-fn plant() -> RobotModel {
+fn ground_truth() -> RobotModel {
     let entries: Vec<_> = HIDDEN
         .iter()
-        .map(|(name, place, value)| Entry::new(named(name), scope(place), vec![*value]).unwrap())
+        .map(|(name, place, value)| EffectEntry::new(named(name), scope(place), vec![*value]).unwrap())
         .collect();
-    compose(&go2(), &entries).unwrap()
+    apply_effects(&go2(), &entries).unwrap()
 }
 
 /// Eight seconds of chirps in the air, measured by encoders with noise, from the other engine at a finer step.
 pub fn log_of(robot: &RobotModel) -> Log {
     let config = SimConfig {
         engine: Engine::Rapier,
-        base: Base::Fixed,
+        base: BaseMount::Fixed,
         physics_hz: Some(2000),
         threads: 1,
         ..SimConfig::default()
     };
     let mut backend = RapierBackend::new(robot.clone(), config, 1).unwrap();
     let pose = go2().control.default_pose_f32();
-    backend.reset(&[(0, Placement::at_rest(HELD_HEIGHT as f32, pose))]).unwrap();
+    backend.reset(&[(0, InitialState::at_rest(FIXED_BASE_HEIGHT as f32, pose))]).unwrap();
     let mut columns = BTreeMap::<String, Vec<f64>>::new();
     let mut random = stream(5, "noise", 0);
     for row in 0..1600 {
@@ -70,8 +70,8 @@ pub fn log_of(robot: &RobotModel) -> Log {
         backend.step(&[command], &[true], 1).unwrap();
     }
     let segments = vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }];
-    let mut meta = Meta::new(200.0, TauSensor::None, segments);
-    (meta.kp, meta.kd) = (Some(Gain::Same(25.0)), Some(Gain::Same(0.6)));
+    let mut meta = Meta::new(200.0, TorqueSensor::None, segments);
+    (meta.kp, meta.kd) = (Some(Gain::Uniform(25.0)), Some(Gain::Uniform(0.6)));
     meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
     Log::new(meta, columns).unwrap()
 }
@@ -86,26 +86,26 @@ fn seek(log: &Log, effects: &[(&str, &str)], progress: fn(usize) -> bool) -> Ide
 }
 
 fn resume(
-    search: Option<Search>,
+    search: Option<GlobalSearch>,
     log: &Log,
     effects: &[(&str, &str)],
     progress: fn(usize) -> bool,
 ) -> Result<Identification, IdentifyError> {
-    let experiment = Experiment::new(log, &go2(), Horizon::IDENTIFICATION).unwrap();
+    let experiment = Experiment::new(log, &go2(), WindowConfig::IDENTIFICATION).unwrap();
     let effects: Vec<_> = effects.iter().map(|(name, place)| (named(name), scope(place))).collect();
     let model = ModelFile::default();
     let mut progress = |_: Stage, step: usize, _: f64| progress(step);
-    let options = Options { resume: search, ..Options::default() };
+    let options = IdentifyOptions { resume: search, ..IdentifyOptions::default() };
     identify(&model, &effects, &[experiment], &mut simulator(), &options, &mut progress)
 }
 
 #[test]
 fn hidden_effects_are_found_with_intervals_that_hold_them() {
-    let log = log_of(&plant());
+    let log = log_of(&ground_truth());
     let found = seek(&log, &HIDDEN.map(|(name, place, _)| (name, place)), |_| true);
     for (finding, (name, _, truth)) in found.findings.iter().zip(HIDDEN) {
         println!("{name}: {} {:?}, truth {truth}", finding.value, finding.interval);
-        assert_eq!(finding.verdict, Verdict::Found);
+        assert_eq!(finding.verdict, EstimateStatus::Identified);
         let tolerance = if name == "command_delay" { 0.0005 } else { 0.1 * truth };
         assert!((finding.value - truth).abs() < tolerance, "{name}: {} instead of {truth}", finding.value);
         let [low, high] = finding.interval.unwrap();
@@ -123,22 +123,22 @@ fn what_a_log_cannot_tell_is_left_and_said() {
     // A held trunk: neither a payload on it nor the ground show.
     let log = log_of(&go2());
     let found = seek(&log, &[("payload", "base"), ("ground_friction", "ground")], |_| true);
-    assert!(found.findings.iter().all(|finding| finding.verdict == Verdict::CannotTell));
+    assert!(found.findings.iter().all(|finding| finding.verdict == EstimateStatus::NotIdentifiable));
     assert_eq!(found.model, ModelFile::default());
 }
 
 #[test]
 fn search_that_is_ended_keeps_the_best_so_far_and_can_be_taken_up_again() {
-    let log = log_of(&plant());
+    let log = log_of(&ground_truth());
     let effects = [("coulomb_friction", "calf")];
     let found = seek(&log, &effects, |step| step < 2);
     assert!(found.rms[1] < found.rms[0], "{:?}", found.rms);
-    let search = found.interrupted.expect("it was ended");
+    let search = found.checkpoint.expect("it was ended");
     let stored = serde_json::to_string(&search).unwrap();
     let resumed = resume(Some(serde_json::from_str(&stored).unwrap()), &log, &effects, |_| true).unwrap();
     assert_eq!(resumed.model, seek(&log, &effects, |_| true).model, "as if it had never been ended");
     let other = resume(Some(search), &log, &[("coulomb_friction", "hip")], |_| true);
-    assert!(matches!(other, Err(IdentifyError::AnotherSearch { .. })));
+    assert!(matches!(other, Err(IdentifyError::ResumeMismatch { .. })));
 }
 
 #[test]
@@ -152,7 +152,7 @@ fn supply_and_heat_are_identified_from_logs_that_tell_them() {
     let columns = motion.channels().map(|(name, cells)| (name.to_owned(), cells.to_vec()));
     let columns = columns.chain([("t".to_owned(), motion.t().to_vec()), ("battery_V".to_owned(), voltage)]);
     let motion = Log::new(motion.meta().clone(), columns).unwrap();
-    let config = SimConfig { base: Base::Fixed, threads: 1, ..SimConfig::default() };
+    let config = SimConfig { base: BaseMount::Fixed, threads: 1, ..SimConfig::default() };
     let backend =
         |_| BatchBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)));
     let log = record(&motion, &robot, None, backend, "sagging".to_owned(), &mut |_| true).unwrap();

@@ -6,13 +6,13 @@ use std::process::{Command, Output};
 
 use tempfile::TempDir;
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
-use twinstep_ensemble::{Description, Ensemble, JointInput, LearnedRobot, Scale, Scales};
-use twinstep_env_server::{Config, Host, HostError, SimHost};
+use twinstep_ensemble::{EnsembleMetadata, Ensemble, JointEncoding, ActuatorNetworkRobot, Normaliser, Normalisers};
+use twinstep_env_server::{Config, EnvFactory, EnvFactoryError, SimEnvFactory};
 use twinstep_envs::{TaskName, walk_spec};
-use twinstep_logs::{Base as LoggedBase, Log, Meta, Segment, TauSensor};
+use twinstep_logs::{BaseMount as LoggedBase, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{
-    AutoresetMode, Backend, BackendError, Command as RobotCommand, JOINT_NAMES, LearnedDrive, MemberDraw, ModelFile,
-    Placement, ResetRequest, StepBatch, VecEnv, go2,
+    AutoresetMode, Backend, BackendError, Command as RobotCommand, JOINT_NAMES, ActuatorNetworkConfig, MemberSampling, ModelFile,
+    InitialState, ResetRequest, StepBatch, VecEnv, go2,
 };
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 use twinstep_tests::process::Process;
@@ -23,16 +23,16 @@ use crate::remote;
 const ENVS: usize = 5;
 
 /// What a small ensemble for the Go2 depends on.
-fn description() -> Description {
-    let scale = |deviation| Scale { mean: 0.0, deviation };
-    Description {
+fn description() -> EnsembleMetadata {
+    let scale = |deviation| Normaliser { mean: 0.0, std: deviation };
+    EnsembleMetadata {
         members: 3,
         hidden: 6,
         dt: 0.005,
         joints: JOINT_NAMES.map(str::to_owned).to_vec(),
-        joint_input: JointInput::Kind,
-        scales: Scales { errors: [scale(0.1), scale(2.0)], torque: scale(15.0) },
-        tau_sensor: TauSensor::Current,
+        joint_input: JointEncoding::Kind,
+        scales: Normalisers { errors: [scale(0.1), scale(2.0)], torque: scale(15.0) },
+        tau_sensor: TorqueSensor::MotorCurrent,
         gains: vec![[30.0, 0.75]; 12],
         variance_scale: 0.05,
         data_hash: String::new(),
@@ -41,7 +41,7 @@ fn description() -> Description {
 }
 
 /// A folder with an ensemble and a model file that names it, with more lines under `[actuator]` and before it.
-fn model_with(description: Description, effects: &str, keys: &str) -> (TempDir, PathBuf) {
+fn model_with(description: EnsembleMetadata, effects: &str, keys: &str) -> (TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("robot.toml");
     Ensemble::untrained(description).write(folder.path().join("drives.safetensors")).unwrap();
@@ -60,7 +60,7 @@ fn config(engine: Engine, model: &Path, threads: usize) -> Config {
 }
 
 fn envs(config: &Config, num_envs: usize) -> Box<dyn VecEnv> {
-    SimHost::new(config.clone()).unwrap().build(num_envs, AutoresetMode::NextStep, Some(6)).unwrap()
+    SimEnvFactory::new(config.clone()).unwrap().build(num_envs, AutoresetMode::NextStep, Some(6)).unwrap()
 }
 
 /// Steps of environments that are seeded from `seed`; environment by environment the same actions.
@@ -109,16 +109,16 @@ fn uncertainty_is_a_reward_and_changes_no_motion() {
 }
 
 /// Largest difference of a standing robot's joints [rad], and of its torques [N·m], from those of its own drives.
-fn away_from_own_drives(tau_sensor: TauSensor) -> [f32; 2] {
-    let description = Description { tau_sensor, ..description() };
-    let settings = LearnedDrive { ensemble: PathBuf::new(), draw: MemberDraw::Step, sample: false };
-    let learned = LearnedRobot::new(&ModelFile::default(), Ensemble::of_gains(description), settings).unwrap();
+fn away_from_own_drives(tau_sensor: TorqueSensor) -> [f32; 2] {
+    let description = EnsembleMetadata { tau_sensor, ..description() };
+    let settings = ActuatorNetworkConfig { ensemble: PathBuf::new(), draw: MemberSampling::PerStep, sample: false };
+    let learned = ActuatorNetworkRobot::new(&ModelFile::default(), Ensemble::linear_pd(description), settings).unwrap();
     let sim = SimConfig { engine: Engine::Batch, threads: 1, ..SimConfig::default() };
     let own = BatchBackend::new(go2(), sim, 1).unwrap();
     let backend = BatchBackend::new(learned.robot.clone(), sim, 1).unwrap();
     let pose = go2().control.default_pose_f32();
-    let [own, other] = [own, backend.with_drive(Box::new(learned.drives(1, false)))].map(|mut backend| {
-        backend.reset(&[(0, Placement::at_rest(0.34, pose))]).unwrap();
+    let [own, other] = [own, backend.with_actuator(Box::new(learned.actuators(1, false)))].map(|mut backend| {
+        backend.reset(&[(0, InitialState::at_rest(0.34, pose))]).unwrap();
         let command = RobotCommand::hold(pose.map(|q| q + 0.05), 30.0, 0.75);
         backend.step(&[command], &[true], 200).unwrap();
         let states = backend.states();
@@ -132,23 +132,23 @@ fn away_from_own_drives(tau_sensor: TauSensor) -> [f32; 2] {
 
 #[test]
 fn robot_stands_on_networks_that_know_its_gains() {
-    let [q, tau] = away_from_own_drives(TauSensor::Current);
+    let [q, tau] = away_from_own_drives(TorqueSensor::MotorCurrent);
     // The networks bend by some percent of the torque, and differ by one.
     assert!(q < 0.02 && tau < 0.7, "{q} rad, {tau} N·m");
     // Without the rotor, which its own drives have, it stands alike.
-    let [q, tau] = away_from_own_drives(TauSensor::Output);
+    let [q, tau] = away_from_own_drives(TorqueSensor::JointOutput);
     assert!(q < 0.02 && tau < 0.7, "{q} rad, {tau} N·m");
 }
 
 #[test]
 fn rotor_is_in_what_was_learnt_behind_it() {
-    for (tau_sensor, rotor) in [(TauSensor::Current, go2().joints[0].armature), (TauSensor::Output, 0.0)] {
-        let (_folder, model) = model_with(Description { tau_sensor, ..description() }, "", "");
-        let learned = LearnedRobot::load(&ModelFile::load(&model).unwrap()).unwrap().unwrap();
+    for (tau_sensor, rotor) in [(TorqueSensor::MotorCurrent, go2().joints[0].armature), (TorqueSensor::JointOutput, 0.0)] {
+        let (_folder, model) = model_with(EnsembleMetadata { tau_sensor, ..description() }, "", "");
+        let learned = ActuatorNetworkRobot::load(&ModelFile::load(&model).unwrap()).unwrap().unwrap();
         assert!(learned.robot.joints.iter().all(|joint| joint.armature == rotor));
         let mut config = config(Engine::Batch, &model, 1);
         config.randomise.effects = true;
-        assert_eq!(SimHost::new(config).is_ok(), rotor > 0.0);
+        assert_eq!(SimEnvFactory::new(config).is_ok(), rotor > 0.0);
     }
 }
 
@@ -161,14 +161,14 @@ fn steps<B: Backend>(backend: &mut B, active: [bool; 2]) -> Vec<Vec<f32>> {
         backend.step(&[hold; 2], &active, 3).unwrap();
         let states = backend.states();
         seen.extend(
-            (0..2).map(|robot| [&states.q[robot][..], &states.tau[robot], &states.uncertainty[robot..][..1]].concat()),
+            (0..2).map(|robot| [&states.q[robot][..], &states.tau[robot], &states.epistemic_uncertainty[robot..][..1]].concat()),
         );
     }
     seen
 }
 
 fn check_snapshots<B: Backend>(mut backend: B) {
-    let placement = |seed| Placement { drive_seed: seed, ..Placement::at_rest(0.34, go2().control.default_pose_f32()) };
+    let placement = |seed| InitialState { actuator_seed: seed, ..InitialState::at_rest(0.34, go2().control.default_pose_f32()) };
     backend.reset(&[(0, placement(7)), (1, placement(8))]).unwrap();
     steps(&mut backend, [true, true]);
     let kept = [0, 1].map(|robot| backend.snapshot(robot));
@@ -198,21 +198,21 @@ fn check_snapshots<B: Backend>(mut backend: B) {
 fn drives_go_back_with_the_robots_snapshot() {
     for (keys, uncertain) in [("sample = true", false), ("", true), ("draw = \"step\"", false)] {
         let (_folder, model) = model_with(description(), "", keys);
-        let learned = LearnedRobot::load(&ModelFile::load(&model).unwrap()).unwrap().unwrap();
+        let learned = ActuatorNetworkRobot::load(&ModelFile::load(&model).unwrap()).unwrap().unwrap();
         let sim = |engine| SimConfig { engine, threads: 1, ..SimConfig::default() };
-        let drives = || Box::new(learned.drives(2, uncertain));
+        let drives = || Box::new(learned.actuators(2, uncertain));
         let robot = || learned.robot.clone();
-        check_snapshots(BatchBackend::new(robot(), sim(Engine::Batch), 2).unwrap().with_drive(drives()));
-        check_snapshots(RapierBackend::new(robot(), sim(Engine::Rapier), 2).unwrap().with_drive(drives()));
+        check_snapshots(BatchBackend::new(robot(), sim(Engine::Batch), 2).unwrap().with_actuator(drives()));
+        check_snapshots(RapierBackend::new(robot(), sim(Engine::Rapier), 2).unwrap().with_actuator(drives()));
     }
 }
 
 #[test]
 fn commands_that_no_network_has_heard_of_are_refused_and_nothing_is_stepped() {
     let (_folder, model) = model_with(description(), "", "");
-    let learned = LearnedRobot::load(&ModelFile::load(&model).unwrap()).unwrap().unwrap();
+    let learned = ActuatorNetworkRobot::load(&ModelFile::load(&model).unwrap()).unwrap().unwrap();
     let sim = SimConfig { engine: Engine::Batch, threads: 1, ..SimConfig::default() };
-    let mut backend = BatchBackend::new(go2(), sim, 2).unwrap().with_drive(Box::new(learned.drives(2, false)));
+    let mut backend = BatchBackend::new(go2(), sim, 2).unwrap().with_actuator(Box::new(learned.actuators(2, false)));
     let known = RobotCommand::hold(go2().control.default_pose_f32(), 30.0, 0.75);
     let before = backend.states().clone();
     let pushed = RobotCommand { tau_ff: std::array::from_fn(|joint| if joint == 4 { 1.5 } else { 0.0 }), ..known };
@@ -220,7 +220,7 @@ fn commands_that_no_network_has_heard_of_are_refused_and_nothing_is_stepped() {
     for (command, reason) in [(pushed, "FR_thigh has 1.5"), (soft, "FL_hip is commanded [20.0, 0.75]")] {
         let error = backend.step(&[known, command], &[true, true], 4).unwrap_err();
         assert!(
-            matches!(error, BackendError::Command { robot: 1, .. }) && error.to_string().contains(reason),
+            matches!(error, BackendError::UnsupportedCommand { robot: 1, .. }) && error.to_string().contains(reason),
             "{error}"
         );
         assert_eq!(*backend.states(), before);
@@ -261,8 +261,8 @@ fn serve_drives_robots_by_the_ensemble_of_its_model() {
 fn served_robot_has_the_gains_that_its_ensemble_learnt_with_and_says_so() {
     let folder = tempfile::tempdir().unwrap();
     let model = folder.path().join("robot.toml");
-    let soft = Description { gains: vec![[25.0, 0.6]; 12], ..description() };
-    Ensemble::of_gains(soft).write(folder.path().join("drives.safetensors")).unwrap();
+    let soft = EnsembleMetadata { gains: vec![[25.0, 0.6]; 12], ..description() };
+    Ensemble::linear_pd(soft).write(folder.path().join("drives.safetensors")).unwrap();
     std::fs::write(&model, "robot = \"go2\"\n[actuator]\nensemble = \"drives.safetensors\"").unwrap();
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
     let arguments = ["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "2", "--model", model.to_str().unwrap()];
@@ -284,14 +284,14 @@ fn ensembles_that_do_not_go_with_the_robot_are_refused_with_the_reason() {
     let serve = ["serve", "--listen", "tcp/127.0.0.1:0"];
     let lag = "[[effect]]\nname = \"drive_lag\"\nscope = \"all\"\ntime_constant_s = 0.01";
     let ripple = "[[effect]]\nname = \"coulomb_friction\"\nscope = \"calf\"\ntorque_nm = 0.2";
-    let slow = Description { dt: 0.02, ..description() };
+    let slow = EnsembleMetadata { dt: 0.02, ..description() };
     let mut uneven = description();
     uneven.gains[4] = [20.0, 0.5];
-    let behind = Description { tau_sensor: TauSensor::Output, ..description() };
-    let hip = Description {
+    let behind = EnsembleMetadata { tau_sensor: TorqueSensor::JointOutput, ..description() };
+    let hip = EnsembleMetadata {
         joints: vec!["FL_hip".to_owned()],
         gains: vec![[30.0, 0.75]],
-        joint_input: JointInput::Identity,
+        joint_input: JointEncoding::Identity,
         ..description()
     };
     for (description, effects, reason) in [
@@ -315,7 +315,7 @@ fn ensembles_that_do_not_go_with_the_robot_are_refused_with_the_reason() {
     }
     // Behind the current there is friction.
     let (_folder, model) = model_with(description(), ripple, "");
-    assert!(SimHost::new(config(Engine::Batch, &model, 1)).is_ok());
+    assert!(SimEnvFactory::new(config(Engine::Batch, &model, 1)).is_ok());
 }
 
 #[test]
@@ -324,8 +324,8 @@ fn settings_that_learned_drives_cannot_follow_are_refused_by_name() {
     let refused = |change: fn(&mut Config), wanted: &str| {
         let mut config = config(Engine::Batch, &model, 1);
         change(&mut config);
-        let error = SimHost::new(config).err().unwrap();
-        assert!(matches!(error, HostError::Drives { field, .. } if field == wanted), "{error}");
+        let error = SimEnvFactory::new(config).err().unwrap();
+        assert!(matches!(error, EnvFactoryError::ActuatorNetwork { field, .. } if field == wanted), "{error}");
     };
     refused(|config| config.randomise.kp_scale = [0.9, 1.1], "randomise.kp_scale");
     refused(|config| config.randomise.kd_scale = [0.9, 0.9], "randomise.kd_scale");
@@ -342,10 +342,10 @@ fn settings_that_learned_drives_cannot_follow_are_refused_by_name() {
 fn play_runs_learned_drives_and_who_needs_their_laws_refuses_them() {
     let (folder, model) = model_with(description(), "", "draw = \"step\"");
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
-    let meta = Meta::new(50.0, TauSensor::None, vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }]);
+    let meta = Meta::new(50.0, TorqueSensor::None, vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }]);
     let mut columns = BTreeMap::from([("t".to_owned(), (0..20).map(|row| 0.02 * f64::from(row)).collect())]);
     columns.insert("q_cmd_FL_calf".to_owned(), vec![-1.3; 20]);
-    Log::new_motion(meta, columns).unwrap().write(path("sway.csv")).unwrap();
+    Log::new_commands(meta, columns).unwrap().write(path("sway.csv")).unwrap();
     let play = |out: &str, more: &[&str]| {
         let output = twinstep(&[&["play", &path("sway.csv"), "--out", out], more].concat());
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

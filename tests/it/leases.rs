@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use twinstep_env_server::Server;
 use twinstep_envs::TaskName;
-use twinstep_protocol::Code;
+use twinstep_protocol::ErrorCode;
 use twinstep_protocol::message::LeaseRequest;
 
 use crate::raw_client::{RawClient, steps_in};
@@ -32,16 +32,16 @@ fn numbers_of_environments_that_cannot_be_are_refused() {
     let (server, endpoint) = start_counters(10.0);
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
     for (num_envs, expected) in [
-        (0, Code::OutOfRange),
-        (65, Code::TooManyEnvs),
-        (1_000_000_000, Code::TooManyEnvs),
-        (u64::MAX, Code::TooManyEnvs),
+        (0, ErrorCode::OutOfRange),
+        (65, ErrorCode::TooManyEnvs),
+        (1_000_000_000, ErrorCode::TooManyEnvs),
+        (u64::MAX, ErrorCode::TooManyEnvs),
     ] {
         let error = client.ask_lease(&client.lease_request(num_envs)).unwrap_err();
         assert_eq!((error.code, error.field.as_str()), (expected, "num_envs"), "{num_envs}");
     }
     assert_eq!(client.hello().free_envs, 64);
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -50,9 +50,9 @@ fn clients_without_a_proper_id_are_refused() {
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
     for id in [String::new(), "a/b".to_owned(), "*".to_owned(), "é".to_owned(), "c".repeat(65)] {
         let error = client.ask_lease(&LeaseRequest { client: id, ..client.lease_request(1) }).unwrap_err();
-        assert_eq!((error.code, error.field.as_str()), (Code::OutOfRange, "client"));
+        assert_eq!((error.code, error.field.as_str()), (ErrorCode::OutOfRange, "client"));
     }
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -61,9 +61,9 @@ fn lease_asked_again_is_the_same_lease() {
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
     let lease = client.lease(3);
     assert_eq!(client.lease(3), lease);
-    assert_eq!(client.ask_lease(&client.lease_request(4)).unwrap_err().code, Code::OutOfRange);
+    assert_eq!(client.ask_lease(&client.lease_request(4)).unwrap_err().code, ErrorCode::OutOfRange);
     assert_eq!(client.hello().free_envs, 61);
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -88,9 +88,9 @@ fn lost_client_is_followed_within_the_grace_and_forgotten_after_it() {
     second.vanish();
     wait_until("the lease is freed", || third.hello().free_envs == 64);
     assert!(since.elapsed().as_secs_f64() >= grace_s, "freed before the grace had passed");
-    assert_eq!(third.reclaim(&lease.lease, 2).unwrap_err().code, Code::LeaseLost);
-    assert_eq!(third.step(&taken, 4).unwrap_err().code, Code::LeaseLost);
-    server.stop();
+    assert_eq!(third.reclaim(&lease.lease, 2).unwrap_err().code, ErrorCode::LeaseLost);
+    assert_eq!(third.step(&taken, 4).unwrap_err().code, ErrorCode::LeaseLost);
+    server.shutdown();
 }
 
 #[test]
@@ -101,10 +101,10 @@ fn reclaim_sent_again_gets_its_answer_again() {
     let second = RawClient::connect(&endpoint, server.sid(), "second");
     let taken = second.reclaim(&lease.lease, 1).unwrap();
     assert_eq!(second.reclaim(&lease.lease, 1).unwrap(), taken);
-    assert_eq!(first.reclaim(&lease.lease, 1).unwrap_err().code, Code::StaleEpoch, "only its new owner repeats it");
-    assert_eq!(first.reset(&lease, 1).unwrap_err().code, Code::StaleEpoch);
+    assert_eq!(first.reclaim(&lease.lease, 1).unwrap_err().code, ErrorCode::StaleEpoch, "only its new owner repeats it");
+    assert_eq!(first.reset(&lease, 1).unwrap_err().code, ErrorCode::StaleEpoch);
     second.reset(&taken, 1).unwrap();
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -115,7 +115,7 @@ fn reclaim_under_a_wrong_epoch_takes_nothing() {
     let lease = owner.lease(1);
     let intruder = RawClient::without_token(&endpoint, server.sid(), "intruder");
     for epoch in [0, 2, u64::MAX] {
-        assert_eq!(intruder.reclaim(&lease.lease, epoch).unwrap_err().code, Code::StaleEpoch, "epoch {epoch}");
+        assert_eq!(intruder.reclaim(&lease.lease, epoch).unwrap_err().code, ErrorCode::StaleEpoch, "epoch {epoch}");
     }
     // The owner is silent, as one that learns between two rollouts is: its token alone keeps the lease.
     let since = Instant::now();
@@ -123,7 +123,7 @@ fn reclaim_under_a_wrong_epoch_takes_nothing() {
         assert_eq!(intruder.hello().free_envs, 63, "the owner's lease was freed");
     }
     owner.reset(&lease, 1).unwrap();
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -133,6 +133,6 @@ fn client_that_never_shows_a_token_loses_its_lease_to_silence() {
     let lease = client.lease(1);
     client.reset(&lease, 1).unwrap();
     wait_until("the lease is freed", || client.hello().free_envs == 64);
-    assert_eq!(client.step(&lease, 2).unwrap_err().code, Code::LeaseLost);
-    server.stop();
+    assert_eq!(client.step(&lease, 2).unwrap_err().code, ErrorCode::LeaseLost);
+    server.shutdown();
 }

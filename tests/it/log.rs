@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use expect_test::{Expect, expect};
-use twinstep_logs::{Base, Gain, Log, Meta, Segment, TauSensor};
+use twinstep_logs::{BaseMount, Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_tests::python::Programs;
 
 /// The real robot in the air, 16 s at 200 Hz.
@@ -51,11 +51,11 @@ fn tumble() -> Log {
         ("gyro_x", column(&|seconds| if tilt(seconds) > 0.0 { 2.0 } else { 0.0 })),
         ("pos_z", column(&|seconds| 0.3 - 0.07 * tilt(seconds))),
     ];
-    let segments = vec![Segment { name: "tumble".to_owned(), base: Base::Floating }];
+    let segments = vec![Segment { name: "tumble".to_owned(), base: BaseMount::Floating }];
     let meta = Meta {
-        kp: Some(Gain::Same(30.0)),
-        kd: Some(Gain::Same(0.75)),
-        ..Meta::new(200.0, TauSensor::Current, segments)
+        kp: Some(Gain::Uniform(30.0)),
+        kd: Some(Gain::Uniform(0.75)),
+        ..Meta::new(200.0, TorqueSensor::MotorCurrent, segments)
     };
     Log::new(meta, columns.map(|(name, cells)| (name.to_owned(), cells))).unwrap()
 }
@@ -200,8 +200,8 @@ fn bad_input_is_named_and_stdout_stays_empty() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("walk.csv");
     std::fs::write(&path, "t,q_FL_hip_deg,q_cmd_FL_hip,kp,kd\n0,0,0,20,0.5\n").unwrap();
-    let segments = vec![Segment { name: "walk".to_owned(), base: Base::Floating }];
-    let meta = serde_json::to_string(&Meta::new(200.0, TauSensor::None, segments)).unwrap();
+    let segments = vec![Segment { name: "walk".to_owned(), base: BaseMount::Floating }];
+    let meta = serde_json::to_string(&Meta::new(200.0, TorqueSensor::None, segments)).unwrap();
     std::fs::write(folder.path().join("walk.json"), meta).unwrap();
     check_refusal(
         &log(&[path.to_str().unwrap(), "--json"]),
@@ -233,10 +233,10 @@ fn bad_input_is_named_and_stdout_stays_empty() {
 fn motion_is_described_without_conclusions() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("sway.csv");
-    let segments = vec![Segment { name: "sway".to_owned(), base: Base::Fixed }];
+    let segments = vec![Segment { name: "sway".to_owned(), base: BaseMount::Fixed }];
     let columns = [("t", vec![0.0, 0.02, 0.04]), ("q_cmd_FL_hip", vec![0.0, 0.1, 0.2])];
-    let meta = Meta::new(50.0, TauSensor::None, segments);
-    Log::new_motion(meta, columns.map(|(name, cells)| (name.to_owned(), cells))).unwrap().write(&path).unwrap();
+    let meta = Meta::new(50.0, TorqueSensor::None, segments);
+    Log::new_commands(meta, columns.map(|(name, cells)| (name.to_owned(), cells))).unwrap().write(&path).unwrap();
     let text = stdout(&[path.to_str().unwrap()]);
     assert!(text.contains("nothing was measured: this is a motion to play"), "{text}");
     assert!(!text.contains("what this log can tell"));

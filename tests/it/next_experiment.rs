@@ -2,11 +2,11 @@
 
 use std::f64::consts::TAU;
 
-use twinstep_logs::{Base as LoggedBase, Gain, Log, Meta, Segment, TauSensor};
-use twinstep_model::effects::Entry;
+use twinstep_logs::{BaseMount as LoggedBase, Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::effects::EffectEntry;
 use twinstep_model::{JOINT_NAMES, Joint, ModelFile, RobotModel, go2};
-use twinstep_sim::{Base, BatchBackend, BatchRollout, SimConfig};
-use twinstep_sysid::{Diagnosis, SAFE_MOTIONS, Sensor, measured, record};
+use twinstep_sim::{BaseMount, BatchBackend, BatchRollout, SimConfig};
+use twinstep_sysid::{Diagnosis, EXCITATION_TRAJECTORIES, Sensor, apply_sensors, record};
 use twinstep_tests::hidden_robot::effect;
 use twinstep_tests::rivals::PAIRS;
 
@@ -20,7 +20,7 @@ const FASTEST: f64 = 10.0;
 /// What `robot` does in a motion, simulated at a finer step than models are.
 fn played(motion: &Log, robot: &RobotModel) -> Log {
     let backend = |base: LoggedBase| {
-        let base = if base == LoggedBase::Fixed { Base::Fixed } else { Base::Floating };
+        let base = if base == LoggedBase::Fixed { BaseMount::Fixed } else { BaseMount::Floating };
         let config = SimConfig { base, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
         Ok(BatchBackend::new(robot.clone(), config, 1).unwrap())
     };
@@ -32,13 +32,13 @@ fn encoders(log: &Log) -> Log {
     let kept = |name: &str| name.starts_with("q_") || name.starts_with('k');
     let columns = log.channels().filter(|(name, _)| kept(name)).map(|(name, cells)| (name.to_owned(), cells.to_vec()));
     let columns = columns.chain([("t".to_owned(), log.t().to_vec())]);
-    let log = Log::new(Meta { tau_sensor: TauSensor::None, ..log.meta().clone() }, columns).unwrap();
-    measured(&log, &[Sensor { quantity: "q", sigma: 0.002, step: 0.0 }], 1).unwrap()
+    let log = Log::new(Meta { tau_sensor: TorqueSensor::None, ..log.meta().clone() }, columns).unwrap();
+    apply_sensors(&log, &[Sensor { quantity: "q", sigma: 0.002, resolution: 0.0 }], 1).unwrap()
 }
 
 #[test]
 fn nominal_robot_gets_through_every_safe_motion() {
-    for motion in SAFE_MOTIONS {
+    for motion in EXCITATION_TRAJECTORIES {
         let (name, log) = (motion.name, played(&motion.motion(&go2()), &go2()));
         let most = |cells: &[f64]| {
             cells.iter().filter(|cell| cell.is_finite()).fold(0.0, |most: f64, cell| most.max(cell.abs()))
@@ -69,8 +69,8 @@ fn nominal_robot_gets_through_every_safe_motion() {
 
 #[test]
 fn safe_motions_have_names_of_their_own_and_begin_and_end_in_the_default_pose() {
-    for (index, motion) in SAFE_MOTIONS.iter().enumerate() {
-        assert!(SAFE_MOTIONS[..index].iter().all(|other| other.name != motion.name));
+    for (index, motion) in EXCITATION_TRAJECTORIES.iter().enumerate() {
+        assert!(EXCITATION_TRAJECTORIES[..index].iter().all(|other| other.name != motion.name));
         let log = motion.motion(&go2());
         for (joint, name) in JOINT_NAMES.into_iter().enumerate() {
             let (commands, pose) = (log.q_cmd(name).unwrap(), go2().control.default_pose[joint]);
@@ -86,10 +86,10 @@ fn chosen_motion_beats_the_median_one() {
     let (rivalry, robot) = (pair.rivalry(), pair.robot().robot_model().unwrap());
     let mut simulator = BatchRollout::new(&go2(), &SimConfig::default()).unwrap();
     let mut told: Vec<[f64; 2]> = Vec::new();
-    for motion in SAFE_MOTIONS.iter().filter(|motion| motion.base == LoggedBase::Fixed) {
+    for motion in EXCITATION_TRAJECTORIES.iter().filter(|motion| motion.base == LoggedBase::Fixed) {
         let log = encoders(&played(&motion.motion(&go2()), &robot));
-        let predicted = rivalry.predicted(motion, &log, &mut simulator).unwrap();
-        told.push([predicted, rivalry.achieved(log, &mut simulator).unwrap()]);
+        let predicted = rivalry.expected_log_likelihood_ratio(motion, &log, &mut simulator).unwrap();
+        told.push([predicted, rivalry.log_likelihood_ratio(log, &mut simulator).unwrap()]);
     }
     let chosen = told.iter().max_by(|one, other| one[0].total_cmp(&other[0])).unwrap()[1];
     told.sort_by(|one, other| one[1].total_cmp(&other[1]));
@@ -100,14 +100,14 @@ fn chosen_motion_beats_the_median_one() {
 fn slow_sines() -> Log {
     let segments = vec![Segment { name: "sines".to_owned(), base: LoggedBase::Fixed }];
     let meta =
-        Meta { kp: Some(Gain::Same(30.0)), kd: Some(Gain::Same(0.8)), ..Meta::new(200.0, TauSensor::None, segments) };
+        Meta { kp: Some(Gain::Uniform(30.0)), kd: Some(Gain::Uniform(0.8)), ..Meta::new(200.0, TorqueSensor::None, segments) };
     let t: Vec<f64> = (0..1200).map(|row| f64::from(row) * 0.005).collect();
     let commands = Joint::ALL.map(|joint| {
         let (index, pose) = (joint.index(), go2().control.default_pose[joint.index()]);
         let command = t.iter().map(|t| pose + 0.15 * t.min(1.0) * (TAU * t + index as f64).sin()).collect();
         (format!("q_cmd_{}", joint.name()), command)
     });
-    Log::new_motion(meta, commands.into_iter().chain([("t".to_owned(), t.clone())])).unwrap()
+    Log::new_commands(meta, commands.into_iter().chain([("t".to_owned(), t.clone())])).unwrap()
 }
 
 #[test]
@@ -115,7 +115,7 @@ fn diagnosis_with_a_rival_writes_a_motion_that_play_takes() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
     let (viscous, thighs) = effect("viscous_friction", "thigh");
-    let entry = Entry::new(viscous, thighs, vec![0.15]).unwrap();
+    let entry = EffectEntry::new(viscous, thighs, vec![0.15]).unwrap();
     let robot = ModelFile { effects: vec![entry], ..ModelFile::default() };
     std::fs::write(path("robot.toml"), robot.to_toml()).unwrap();
     let run = |arguments: &[&str]| {

@@ -4,9 +4,9 @@ use std::f32::consts::PI;
 
 use glam::{DMat3, DVec3, Vec3};
 use proptest::prelude::*;
-use twinstep_model::lanes::{Acceleration, State, Tree, Vec3 as LaneVec3, forward_dynamics};
-use twinstep_model::{Backend, Command, Joint, NUM_JOINTS, PerJoint, Placement, RobotModel, frames, go2};
-use twinstep_sim::{Base, Engine, SimConfig, Terrain};
+use twinstep_model::lanes::{Acceleration, State, KinematicTree, Vec3 as LaneVec3, forward_dynamics};
+use twinstep_model::{Backend, Command, Joint, NUM_JOINTS, PerJoint, InitialState, RobotModel, frames, go2};
+use twinstep_sim::{BaseMount, Engine, SimConfig, Terrain};
 
 use super::{ENGINE, Simulator};
 
@@ -16,7 +16,7 @@ const DT: f64 = 1e-5;
 /// The joint `FL_calf`.
 const CALF: usize = 2;
 
-fn backend(config: SimConfig, placement: Placement) -> Simulator {
+fn backend(config: SimConfig, placement: InitialState) -> Simulator {
     let mut backend = Simulator::new(go2(), SimConfig { engine: ENGINE, threads: 1, ..config }, 1).unwrap();
     backend.reset(&[(0, placement)]).unwrap();
     backend
@@ -36,7 +36,7 @@ fn hold_default_pose() -> Command {
 }
 
 fn run(backend: &mut Simulator, command: &Command, seconds: f32) {
-    let periods = (seconds * go2().control.drive_hz as f32).round() as usize;
+    let periods = (seconds * go2().control.actuator_hz as f32).round() as usize;
     backend.step(&[*command], &[true], periods).unwrap();
 }
 
@@ -93,7 +93,7 @@ proptest! {
         dq in prop::array::uniform12(-2.0f32..2.0),
     ) {
         let robot = go2();
-        let placement = Placement { base_angular_velocity: spin, dq, ..Placement::at_rest(20.0, default_pose()) };
+        let placement = InitialState { base_angular_velocity: spin, dq, ..InitialState::at_rest(20.0, default_pose()) };
         let mut backend = backend(SimConfig { physics_hz: Some(4000), ..SimConfig::default() }, placement);
         let (linear, angular, com, energy) = motion(&robot, &backend);
         run(&mut backend, &limp(), 0.1);
@@ -111,7 +111,7 @@ proptest! {
 fn dropped_robot_falls_as_galilei_says() {
     let mut backend = backend(
         SimConfig { physics_hz: Some(400), solver_iterations: Some(1), ..SimConfig::default() },
-        Placement::at_rest(10.0, default_pose()),
+        InitialState::at_rest(10.0, default_pose()),
     );
     run(&mut backend, &hold_default_pose(), 1.0);
     let fallen = 10.0 - backend.states().base_position[0][2];
@@ -125,10 +125,10 @@ fn dropped_robot_falls_as_galilei_says() {
 #[test]
 fn momentum_is_kept_in_flight_while_the_legs_swing() {
     let robot = go2();
-    let placement = Placement {
+    let placement = InitialState {
         base_linear_velocity: [0.3, -0.2, 5.0],
         base_angular_velocity: [1.0, 1.5, -0.8],
-        ..Placement::at_rest(20.0, default_pose())
+        ..InitialState::at_rest(20.0, default_pose())
     };
     let mut backend = backend(SimConfig { physics_hz: Some(1000), ..SimConfig::default() }, placement);
     let (linear, _, com) = momentum(&robot, &backend);
@@ -177,10 +177,10 @@ fn lone_calf(viscous: f64, coulomb: f64) -> RobotModel {
 /// to the opposite of both, so that gravity drops out.
 fn calf_velocity(robot: &RobotModel, dq: f32, tau: f32) -> f64 {
     let stand =
-        SimConfig { engine: ENGINE, base: Base::Fixed, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
+        SimConfig { engine: ENGINE, base: BaseMount::Fixed, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
     let [forth, back] = [1.0, -1.0].map(|sign| {
         let mut backend = Simulator::new(robot.clone(), stand, 1).unwrap();
-        let mut placement = Placement::at_rest(2.0, default_pose());
+        let mut placement = InitialState::at_rest(2.0, default_pose());
         placement.dq[CALF] = sign * dq;
         backend.reset(&[(0, placement)]).unwrap();
         let mut command = limp();
@@ -215,10 +215,10 @@ fn coulomb_friction_takes_its_torque_from_a_moving_calf() {
 
 #[test]
 fn coulomb_friction_holds_what_is_weaker() {
-    let stand = SimConfig { engine: ENGINE, base: Base::Fixed, threads: 1, ..SimConfig::default() };
+    let stand = SimConfig { engine: ENGINE, base: BaseMount::Fixed, threads: 1, ..SimConfig::default() };
     let angle_after = |tau: f32| {
         let mut backend = Simulator::new(lone_calf(0.0, 0.8), stand, 1).unwrap();
-        backend.reset(&[(0, Placement::at_rest(2.0, default_pose()))]).unwrap();
+        backend.reset(&[(0, InitialState::at_rest(2.0, default_pose()))]).unwrap();
         let mut command = limp();
         command.tau_ff[CALF] = tau;
         run(&mut backend, &command, 1.0);
@@ -233,12 +233,12 @@ fn coulomb_friction_holds_what_is_weaker() {
 /// 10 µs.
 #[test]
 fn engine_accelerates_as_the_equations_of_motion_say() {
-    let tree = Tree::<f64>::splat(&go2());
-    let placement = Placement {
+    let tree = KinematicTree::<f64>::splat(&go2());
+    let placement = InitialState {
         base_linear_velocity: [0.3, -0.2, 1.0],
         base_angular_velocity: [1.0, 1.5, -0.8],
         dq: std::array::from_fn(|joint| (joint as f32 - 5.0) * 0.5),
-        ..Placement::at_rest(20.0, default_pose())
+        ..InitialState::at_rest(20.0, default_pose())
     };
     let mut command = limp();
     command.tau_ff = std::array::from_fn(|joint| ((joint * 7 % 12) as f32 - 5.5) * 0.8);
@@ -283,7 +283,7 @@ fn engine_accelerates_as_the_equations_of_motion_say() {
 #[test]
 fn standing_robot_weighs_its_mass_and_stays_where_it_is() {
     let robot = go2();
-    let mut backend = backend(SimConfig::default(), Placement::at_rest(0.33, default_pose()));
+    let mut backend = backend(SimConfig::default(), InitialState::at_rest(0.33, default_pose()));
     let stiff = Command::hold(default_pose(), 60.0, 2.0);
     run(&mut backend, &stiff, 5.0);
     let (start, weight) = (backend.states().base_position[0], robot.total_mass() as f32 * GRAVITY);
@@ -294,7 +294,7 @@ fn standing_robot_weighs_its_mass_and_stays_where_it_is() {
     let drift = (Vec3::from(states.base_position[0]) - Vec3::from(start)).length();
     assert!(drift < 0.01, "drifted {drift} m in a minute");
     assert!(!states.body_contact[0]);
-    assert!(frames::gravity_in_base(states.base_orientation[0]).z < -0.99);
+    assert!(frames::projected_gravity(states.base_orientation[0]).z < -0.99);
 }
 
 #[test]
@@ -304,9 +304,9 @@ fn robot_on_a_slope_slides_only_beyond_the_friction_angle() {
         let config = SimConfig { physics_hz: Some(1000), terrain: Terrain::SlopeRad(angle), ..SimConfig::default() };
         // Crouched and stiff, so that it slides before it tips over.
         let crouch: PerJoint = Joint::map_kinds(0.0, 1.3, -2.6);
-        let placement = Placement {
+        let placement = InitialState {
             base_orientation: frames::to_wxyz(glam::Quat::from_rotation_y(-angle)),
-            ..Placement::at_rest(0.16 / angle.cos(), crouch)
+            ..InitialState::at_rest(0.16 / angle.cos(), crouch)
         };
         let mut backend = backend(config, placement);
         let hold = Command::hold(crouch, 200.0, 5.0);
@@ -343,7 +343,7 @@ fn one_thread_and_two_give_the_same_bits() {
 
 #[test]
 fn restored_robot_continues_bit_for_bit() {
-    let mut backend = backend(SimConfig::default(), Placement::at_rest(0.33, default_pose()));
+    let mut backend = backend(SimConfig::default(), InitialState::at_rest(0.33, default_pose()));
     run(&mut backend, &hold_default_pose(), 0.3);
     let snapshot = backend.snapshot(0);
     let command = Command::hold(default_pose().map(|q| q + 0.2), 30.0, 0.75);
@@ -365,9 +365,9 @@ fn inactive_robot_does_not_move() {
 
 #[test]
 fn payload_and_scale_show_on_the_feet() {
-    let mut placement = Placement::at_rest(0.33, default_pose());
-    placement.variation.payload = 3.0;
-    placement.variation.mass_scale = 1.1;
+    let mut placement = InitialState::at_rest(0.33, default_pose());
+    placement.randomisation.payload = 3.0;
+    placement.randomisation.mass_scale = 1.1;
     let mut backend = backend(SimConfig::default(), placement);
     run(&mut backend, &Command::hold(default_pose(), 80.0, 3.0), 4.0);
     let force: f32 = backend.states().foot_force[0].iter().sum();

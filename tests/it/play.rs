@@ -4,8 +4,8 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use expect_test::{Expect, expect};
-use twinstep_logs::{Base as LoggedBase, Gain, Log, Meta, Segment, TauSensor};
-use twinstep_model::{Backend, Command as RobotCommand, Ground, JOINT_NAMES, NUM_JOINTS, PerJoint, Placement, go2};
+use twinstep_logs::{BaseMount as LoggedBase, Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{Backend, Command as RobotCommand, Ground, JOINT_NAMES, NUM_JOINTS, PerJoint, InitialState, go2};
 use twinstep_sim::{BatchBackend, Engine, SimConfig};
 use twinstep_tests::python::Programs;
 
@@ -32,7 +32,7 @@ fn target(row: usize) -> PerJoint {
 
 fn motion(base: LoggedBase, seconds_a_row: f64) -> Log {
     let segments = vec![Segment { name: "sway".to_owned(), base }];
-    let meta = Meta { kp: Some(Gain::Same(KP)), ..Meta::new(50.0, TauSensor::None, segments) };
+    let meta = Meta { kp: Some(Gain::Uniform(KP)), ..Meta::new(50.0, TorqueSensor::None, segments) };
     let episode = |row| f64::from(u8::from(row >= ANEW));
     let mut columns = vec![
         ("t".to_owned(), (0..ROWS).map(|row| row as f64 * seconds_a_row).collect()),
@@ -42,7 +42,7 @@ fn motion(base: LoggedBase, seconds_a_row: f64) -> Log {
     for (joint, name) in JOINT_NAMES.iter().enumerate().take(NUM_JOINTS - 1) {
         columns.push((format!("q_cmd_{name}"), (0..ROWS).map(|row| f64::from(target(row)[joint])).collect()));
     }
-    Log::new_motion(meta, columns).unwrap()
+    Log::new_commands(meta, columns).unwrap()
 }
 
 #[test]
@@ -60,7 +60,7 @@ fn played_motion_is_a_log_of_what_the_model_does() {
     let config = SimConfig { engine: Engine::Batch, physics_hz: Some(400), threads: 1, ..SimConfig::default() };
     let mut backend = BatchBackend::new(robot.clone(), config, 1).unwrap();
     let pose = robot.control.default_pose_f32();
-    let start = Placement::above(&Ground::FLAT, &robot, pose, 0.0);
+    let start = InitialState::standing_on(&Ground::FLAT, &robot, pose, 0.0);
     assert_eq!(log.rows(), ROWS);
     for row in 0..ROWS {
         if row == 0 || row == ANEW {
@@ -133,7 +133,7 @@ fn motion_is_not_overwritten() {
     let output = play(&source, &source, &[]);
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).contains("is the motion itself"));
-    assert!(Log::open_motion(&source).unwrap().q("FL_hip").is_none());
+    assert!(Log::open_commands(&source).unwrap().q("FL_hip").is_none());
 }
 
 #[test]

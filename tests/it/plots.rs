@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
-use twinstep_logs::{Base as LoggedBase, Gain, Log, Meta, Segment, TauSensor};
+use twinstep_logs::{BaseMount as LoggedBase, Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::JOINT_NAMES;
 use twinstep_model::effects::CATALOGUE;
 use twinstep_tests::python::{Programs, root};
@@ -66,9 +66,9 @@ fn evaluation_is_drawn_with_every_joint_and_the_worst_one_over_time() {
 fn torque_has_bars_of_its_own_where_it_was_measured() {
     let segments = vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }];
     let meta = Meta {
-        kp: Some(Gain::Same(30.0)),
-        kd: Some(Gain::Same(0.7)),
-        ..Meta::new(200.0, TauSensor::Current, segments)
+        kp: Some(Gain::Uniform(30.0)),
+        kd: Some(Gain::Uniform(0.7)),
+        ..Meta::new(200.0, TorqueSensor::MotorCurrent, segments)
     };
     let column =
         |name: &str, of: fn(f64) -> f64| (name.to_owned(), (0..50).map(|row| of(f64::from(row) * 0.005)).collect());

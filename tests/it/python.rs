@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
-use twinstep_tests::campaign::{self, Plan};
-use twinstep_tests::lane::Commands;
+use twinstep_tests::campaign::{self, FaultPlan};
+use twinstep_tests::lane::TestBedConfig;
 use twinstep_tests::python::{Programs, outside_cargo, python, root, run};
 
 const FAULTS: &str = env!("CARGO_BIN_EXE_faults");
@@ -56,8 +56,8 @@ fn python_client_survives_faults() {
     // The lanes' processes inherit it.
     let program = vec!["env".to_owned(), format!("PYTHONPATH={}", client().join("src").display())];
     let client = [program, vec![python.display().to_string(), script.display().to_string()]].concat();
-    let plan = Plan {
-        commands: Commands { program: FAULTS.into(), server: Vec::new(), client: Some(client) },
+    let plan = FaultPlan {
+        commands: TestBedConfig { program: FAULTS.into(), server: Vec::new(), client: Some(client) },
         faults: 30,
         lanes: 6,
         seed: 2,

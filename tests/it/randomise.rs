@@ -5,10 +5,10 @@ use std::process::Command;
 
 use tempfile::TempDir;
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
-use twinstep_env_server::{Config, Host, SimHost};
+use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
 use twinstep_envs::{OBS_LEN, TaskName};
 use twinstep_model::{
-    AutoresetMode, Backend, Command as RobotCommand, Placement, ResetRequest, RobotModel, VecEnv, go2,
+    AutoresetMode, Backend, Command as RobotCommand, InitialState, ResetRequest, RobotModel, VecEnv, go2,
 };
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 use twinstep_tests::process::Process;
@@ -60,10 +60,10 @@ fn config(engine: Engine, model: &std::path::Path, effects: bool) -> Config {
     config.sim.engine = engine;
     config.sim.threads = 1;
     config.server.model = Some(model.to_owned());
-    config.task.start_position_noise_rad = 0.0;
-    config.task.command.forward = [0.3, 0.3];
-    config.task.command.left = [0.0, 0.0];
-    config.task.command.yaw = [0.0, 0.0];
+    config.task.reset_joint_noise_rad = 0.0;
+    config.task.command.linear_velocity_x = [0.3, 0.3];
+    config.task.command.linear_velocity_y = [0.0, 0.0];
+    config.task.command.angular_velocity_z = [0.0, 0.0];
     config.randomise.effects = effects;
     config
 }
@@ -79,7 +79,7 @@ fn episode(env: &mut dyn VecEnv, request: &ResetRequest) -> Vec<Vec<f32>> {
 }
 
 fn local(config: &Config, envs: usize) -> Box<dyn VecEnv> {
-    SimHost::new(config.clone()).unwrap().build(envs, AutoresetMode::NextStep, None).unwrap()
+    SimEnvFactory::new(config.clone()).unwrap().build(envs, AutoresetMode::NextStep, None).unwrap()
 }
 
 fn robot(rows: &[Vec<f32>], env: usize) -> Vec<&[f32]> {
@@ -113,7 +113,7 @@ fn model_without_intervals_is_the_same_to_the_last_bit() {
         let [without, with] = [false, true].map(|effects| {
             let mut config = config(engine, &path, effects);
             // What else is drawn is not shifted.
-            config.task.start_position_noise_rad = 0.1;
+            config.task.reset_joint_noise_rad = 0.1;
             config.randomise.mass_scale = [0.9, 1.1];
             episode(&mut *local(&config, 2), &ResetRequest::seeded(3, 2))
         });
@@ -173,20 +173,20 @@ fn sway(backend: &mut impl Backend) -> (Vec<[f32; 12]>, [f32; 3], [f32; 3]) {
 
 fn check_robot_of_its_own<B: Backend>(of: impl Fn(RobotModel) -> B) {
     let drawn = RobotModel::parse(&format!("robot = \"go2\"\n{MEASURED}"), "drawn").unwrap();
-    let placement = Placement::at_rest(0.34, go2().control.default_pose_f32());
+    let placement = InitialState::at_rest(0.34, go2().control.default_pose_f32());
     let mut all = of(drawn.clone());
     all.reset(&[(0, placement)]).unwrap();
     let expected = sway(&mut all);
 
     let mut backend = of(go2());
-    backend.reset_as(0, &drawn, &placement).unwrap();
+    backend.reset_with_model(0, &drawn, &placement).unwrap();
     let start = backend.snapshot(0);
     assert!(sway(&mut backend) == expected, "it moves as if all robots were so");
     backend.reset(&[(0, placement)]).unwrap();
     assert!(sway(&mut backend) != expected, "the nominal robot is back");
     backend.restore(0, &start);
     assert!(sway(&mut backend) == expected, "a snapshot holds the robot too");
-    assert!(backend.reset_as(1, &drawn, &placement).is_err(), "there is one robot");
+    assert!(backend.reset_with_model(1, &drawn, &placement).is_err(), "there is one robot");
 }
 
 #[test]

@@ -3,20 +3,20 @@
 use std::time::Duration;
 
 use twinstep_model::AutoresetMode;
-use twinstep_protocol::keys::Verb;
+use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::message::{
     CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, ResetReply, ResetRequest, StepReply,
     StepRequest,
 };
 use twinstep_protocol::tensor::{self, as_bytes};
-use twinstep_protocol::{PROTOCOL, WireError, decode, encode, keys};
+use twinstep_protocol::{PROTOCOL, ErrorReply, decode, encode, keys};
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 use zenoh::{Session, Wait};
 
 /// The bytes of a good reply, or the error that was replied.
-pub type Answer = Result<Vec<u8>, WireError>;
+pub type Answer = Result<Vec<u8>, ErrorReply>;
 
 /// A session at one server.
 pub struct RawClient {
@@ -99,7 +99,7 @@ impl RawClient {
         }
     }
 
-    pub fn ask_lease(&self, request: &LeaseRequest) -> Result<LeaseReply, WireError> {
+    pub fn ask_lease(&self, request: &LeaseRequest) -> Result<LeaseReply, ErrorReply> {
         self.ask(&keys::lease(&self.sid), &encode(request)).map(|bytes| decode(&bytes).unwrap())
     }
 
@@ -107,25 +107,25 @@ impl RawClient {
         self.ask_lease(&self.lease_request(num_envs)).unwrap()
     }
 
-    pub fn reclaim(&self, lease: &str, epoch: u64) -> Result<LeaseReply, WireError> {
+    pub fn reclaim(&self, lease: &str, epoch: u64) -> Result<LeaseReply, ErrorReply> {
         let reclaim = Some(Reclaim { lease: lease.to_owned(), epoch });
         self.ask_lease(&LeaseRequest { reclaim, ..self.lease_request(1) })
     }
 
-    pub fn ask_env(&self, lease: &LeaseReply, verb: Verb, payload: &[u8]) -> Answer {
+    pub fn ask_env(&self, lease: &LeaseReply, verb: EnvMethod, payload: &[u8]) -> Answer {
         self.ask(&keys::env(&self.sid, &lease.lease, verb), payload)
     }
 
     pub fn reset(&self, lease: &LeaseReply, seq: u64) -> Answer {
-        self.ask_env(lease, Verb::Reset, &reset_bytes(lease, seq))
+        self.ask_env(lease, EnvMethod::Reset, &reset_bytes(lease, seq))
     }
 
     pub fn step(&self, lease: &LeaseReply, seq: u64) -> Answer {
-        self.ask_env(lease, Verb::Step, &step_bytes(lease, seq))
+        self.ask_env(lease, EnvMethod::Step, &step_bytes(lease, seq))
     }
 
     pub fn close(&self, lease: &LeaseReply, seq: u64) -> Answer {
-        self.ask_env(lease, Verb::Close, &encode(&CloseRequest { protocol: PROTOCOL, epoch: lease.epoch, seq }))
+        self.ask_env(lease, EnvMethod::Close, &encode(&CloseRequest { protocol: PROTOCOL, epoch: lease.epoch, seq }))
     }
 }
 

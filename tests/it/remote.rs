@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv};
-use twinstep_env_server::{Config, Host, HostError, Server, SimHost};
+use twinstep_env_server::{Config, EnvFactory, EnvFactoryError, Server, SimEnvFactory};
 use twinstep_envs::{Counter, OBS_LEN, TaskName, check};
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv, go2};
-use twinstep_protocol::Code;
+use twinstep_protocol::ErrorCode;
 use twinstep_sim::Engine;
 
 pub fn config(task: TaskName) -> Config {
@@ -19,19 +19,19 @@ pub fn config(task: TaskName) -> Config {
 }
 
 pub fn start(config: &Config) -> (Server, String) {
-    start_with(config, Arc::new(SimHost::new(config.clone()).unwrap()))
+    start_with(config, Arc::new(SimEnvFactory::new(config.clone()).unwrap()))
 }
 
-pub fn start_with(config: &Config, host: Arc<dyn Host>) -> (Server, String) {
+pub fn start_with(config: &Config, host: Arc<dyn EnvFactory>) -> (Server, String) {
     let server = Server::start(&config.server, host).unwrap();
     let endpoint = server.endpoints().into_iter().find(|endpoint| endpoint.starts_with("tcp/127.0.0.1")).unwrap();
     (server, endpoint)
 }
 
-fn refusal(error: &EnvError) -> Code {
+fn refusal(error: &EnvError) -> ErrorCode {
     let EnvError::Remote(error) = error else { panic!("{error}") };
     match error.downcast_ref::<ClientError>() {
-        Some(ClientError::Refused(refusal)) => refusal.code,
+        Some(ClientError::Rejected(refusal)) => refusal.code,
         other => panic!("{other:?}"),
     }
 }
@@ -42,10 +42,10 @@ fn remote_walk_passes_the_checker_in_every_autoreset_mode() {
     for autoreset in [AutoresetMode::NextStep, AutoresetMode::SameStep, AutoresetMode::Disabled] {
         let options = ConnectOptions { autoreset, max_episode_steps: Some(7), ..ConnectOptions::new(&endpoint, 3) };
         let mut env = RemoteVecEnv::connect(&options).unwrap();
-        check(&mut env, 30).unwrap();
+        check_vec_env(&mut env, 30).unwrap();
         env.close().unwrap();
     }
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -55,8 +55,8 @@ fn walk_on_the_batch_engine_passes_the_checker() {
     config.randomise.mass_scale = [0.9, 1.1];
     let (server, endpoint) = start(&config);
     let options = ConnectOptions { max_episode_steps: Some(7), ..ConnectOptions::new(&endpoint, 11) };
-    check(&mut RemoteVecEnv::connect(&options).unwrap(), 30).unwrap();
-    server.stop();
+    check_vec_env(&mut RemoteVecEnv::connect(&options).unwrap(), 30).unwrap();
+    server.shutdown();
 }
 
 #[test]
@@ -64,14 +64,14 @@ fn remote_and_local_walk_give_the_same_bits() {
     let config = config(TaskName::Walk);
     let (server, endpoint) = start(&config);
     let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
-    let mut local = SimHost::new(config).unwrap().build(2, AutoresetMode::NextStep, None).unwrap();
+    let mut local = SimEnvFactory::new(config).unwrap().build(2, AutoresetMode::NextStep, None).unwrap();
     let request = ResetRequest::seeded(5, 2);
     assert_eq!(remote.reset(&request).unwrap(), local.reset(&request).unwrap());
     for step in 0..50 {
         let actions: Vec<f32> = (0..24).map(|index| ((step * 7 + index) as f32).sin()).collect();
         assert_eq!(remote.step(&actions).unwrap(), local.step(&actions).unwrap(), "step {step}");
     }
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -98,7 +98,7 @@ fn several_clients_have_their_own_environments() {
     for client in clients {
         client.join().unwrap();
     }
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -112,22 +112,22 @@ fn overlapped_steps_are_executed_once_each() {
         assert_eq!(env.recv().unwrap().obs[0], step as f32);
     }
     assert!(env.recv().is_err(), "nothing was sent");
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
 fn bad_input_is_refused_by_name_and_the_next_good_step_works() {
     let (server, endpoint) = start(&config(TaskName::Walk));
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
-    assert_eq!(refusal(&env.step(&[0.0; 24]).unwrap_err()), Code::NeedsReset);
+    assert_eq!(refusal(&env.step(&[0.0; 24]).unwrap_err()), ErrorCode::NeedsReset);
     env.reset(&ResetRequest::seeded(1, 2)).unwrap();
     let mut actions = [0.0; 24];
     actions[13] = f32::NAN;
     let error = env.step(&actions).unwrap_err();
-    assert_eq!(refusal(&error), Code::NotFinite);
+    assert_eq!(refusal(&error), ErrorCode::NotFinite);
     assert!(error.to_string().contains("environment 1, joint_position_offset[FL_thigh], is NaN"), "{error}");
     assert!(env.step(&[0.0; 24]).is_ok());
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -138,16 +138,16 @@ fn more_environments_than_there_are_are_refused_with_both_numbers() {
         assert!(error.contains(&format!("{num_envs} are too many: 64 of 64 are free")), "{error}");
     }
     assert!(RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 64)).is_ok());
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
 fn policy_made_for_another_robot_is_refused() {
     let (server, endpoint) = start(&config(TaskName::Walk));
     let options = ConnectOptions { spec_hash: Some("0".repeat(32)), ..ConnectOptions::new(&endpoint, 1) };
-    let Some(ClientError::Refused(error)) = RemoteVecEnv::connect(&options).err() else { panic!("accepted") };
-    assert_eq!(error.code, Code::SpecMismatch);
-    server.stop();
+    let Some(ClientError::Rejected(error)) = RemoteVecEnv::connect(&options).err() else { panic!("accepted") };
+    assert_eq!(error.code, ErrorCode::SpecMismatch);
+    server.shutdown();
 }
 
 #[test]
@@ -159,9 +159,9 @@ fn lease_is_reclaimed_with_its_number_and_the_old_client_is_told() {
     first.step(&[1.0; 12]).unwrap();
     let mut second = RemoteVecEnv::reclaim(&options, first.ticket()).unwrap();
     assert_eq!(second.step(&[2.0; 12]).unwrap().obs[0], 2.0, "it continues where the first was");
-    assert_eq!(refusal(&first.step(&[3.0; 12]).unwrap_err()), Code::StaleEpoch);
+    assert_eq!(refusal(&first.step(&[3.0; 12]).unwrap_err()), ErrorCode::StaleEpoch);
     assert_eq!(second.step(&[4.0; 12]).unwrap().obs[0], 3.0, "the old client executed nothing");
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -174,12 +174,12 @@ fn nobody_at_the_endpoint_is_said_with_the_command_to_start_one() {
 }
 
 /// A host whose environments panic at their third step.
-pub struct Fragile;
+pub struct FailingEnvFactory;
 
 struct FragileEnv(Box<dyn VecEnv>, u32);
 
-impl Host for Fragile {
-    fn build(&self, num_envs: usize, autoreset: AutoresetMode, _: Option<u32>) -> Result<Box<dyn VecEnv>, HostError> {
+impl EnvFactory for FailingEnvFactory {
+    fn build(&self, num_envs: usize, autoreset: AutoresetMode, _: Option<u32>) -> Result<Box<dyn VecEnv>, EnvFactoryError> {
         let inner = Box::new(twinstep_envs::CounterEnv::new(&go2(), num_envs, autoreset));
         Ok(Box::new(FragileEnv(inner, 0)))
     }
@@ -207,7 +207,7 @@ impl VecEnv for FragileEnv {
 
 #[test]
 fn panic_in_an_environment_is_answered_and_the_server_lives_on() {
-    let (server, endpoint) = start_with(&config(TaskName::Counter), Arc::new(Fragile));
+    let (server, endpoint) = start_with(&config(TaskName::Counter), Arc::new(FailingEnvFactory));
     let options = ConnectOptions::new(&endpoint, 1);
     let mut env = RemoteVecEnv::connect(&options).unwrap();
     env.reset(&ResetRequest::default()).unwrap();
@@ -215,12 +215,12 @@ fn panic_in_an_environment_is_answered_and_the_server_lives_on() {
     env.step(&[0.0; 12]).unwrap();
     for _ in 0..2 {
         let error = env.step(&[0.0; 12]).unwrap_err();
-        assert_eq!(refusal(&error), Code::LeaseLost);
+        assert_eq!(refusal(&error), ErrorCode::LeaseLost);
         assert!(error.to_string().contains("planted in the third step"), "{error}");
     }
     let mut other = RemoteVecEnv::connect(&options).unwrap();
     assert!(other.reset(&ResetRequest::default()).is_ok());
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -228,7 +228,7 @@ fn stopping_server_tells_its_client() {
     let (server, endpoint) = start(&config(TaskName::Counter));
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 1)).unwrap();
     env.reset(&ResetRequest::default()).unwrap();
-    let stopper = std::thread::spawn(move || server.stop());
+    let stopper = std::thread::spawn(move || server.shutdown());
     let error = loop {
         if let Err(error) = env.step(&[0.0; 12]) {
             break error.to_string();

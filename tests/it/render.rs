@@ -1,26 +1,26 @@
 //! What is sent for a picture is what the simulation has, and asking for it changes nothing.
 
 use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv};
-use twinstep_env_server::{Host, SimHost};
+use twinstep_env_server::{EnvFactory, SimEnvFactory};
 use twinstep_envs::TaskName;
 use twinstep_model::{AutoresetMode, EnvError, Ground, ResetRequest, VecEnv};
-use twinstep_protocol::keys::Verb;
+use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::message::{LeaseReply, RenderRequest};
-use twinstep_protocol::{Code, PROTOCOL, encode};
+use twinstep_protocol::{ErrorCode, PROTOCOL, encode};
 use twinstep_sim::Terrain;
 
 use crate::raw_client::{Answer, RawClient};
 use crate::remote::{config, start};
 
 fn render(client: &RawClient, lease: &LeaseReply, env: u64) -> Answer {
-    client.ask_env(lease, Verb::Render, &encode(&RenderRequest { protocol: PROTOCOL, epoch: lease.epoch, env }))
+    client.ask_env(lease, EnvMethod::Render, &encode(&RenderRequest { protocol: PROTOCOL, epoch: lease.epoch, env }))
 }
 
 #[test]
 fn remote_and_local_scenes_are_equal_and_drawing_changes_no_bit_of_the_episode() {
     let config = config(TaskName::Walk);
     let (server, endpoint) = start(&config);
-    let host = SimHost::new(config).unwrap();
+    let host = SimEnvFactory::new(config).unwrap();
     let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
     let mut local = host.build(2, AutoresetMode::NextStep, None).unwrap();
     let mut unseen = host.build(2, AutoresetMode::NextStep, None).unwrap();
@@ -40,14 +40,14 @@ fn remote_and_local_scenes_are_equal_and_drawing_changes_no_bit_of_the_episode()
     remote.scene(0).unwrap();
     remote.recv().unwrap();
     remote.close().unwrap();
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
 fn scene_has_the_ground_that_is_simulated() {
     let mut config = config(TaskName::Walk);
     config.sim.terrain = Terrain::SlopeRad(0.2);
-    let mut env = SimHost::new(config).unwrap().build(1, AutoresetMode::NextStep, None).unwrap();
+    let mut env = SimEnvFactory::new(config).unwrap().build(1, AutoresetMode::NextStep, None).unwrap();
     env.reset(&ResetRequest::default()).unwrap();
     let ground = env.scene(0).unwrap().ground;
     assert_eq!(ground, Ground { normal: [-0.2f32.sin(), 0.0, 0.2f32.cos()], ..Ground::FLAT });
@@ -58,20 +58,20 @@ fn render_is_refused_by_name_and_uses_no_number_up() {
     let (server, endpoint) = start(&config(TaskName::Walk));
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
     let lease = client.lease(2);
-    assert_eq!(render(&client, &lease, 0).unwrap_err().code, Code::NeedsReset);
+    assert_eq!(render(&client, &lease, 0).unwrap_err().code, ErrorCode::NeedsReset);
     client.reset(&lease, 1).unwrap();
     let first = render(&client, &lease, 1).unwrap();
     assert_eq!(render(&client, &lease, 1).unwrap(), first);
     for env in [2, u64::MAX] {
         let error = render(&client, &lease, env).unwrap_err();
-        assert_eq!((error.code, error.field.as_str()), (Code::OutOfRange, "env"), "{env}");
+        assert_eq!((error.code, error.field.as_str()), (ErrorCode::OutOfRange, "env"), "{env}");
     }
     let stale = LeaseReply { epoch: 2, ..lease.clone() };
-    assert_eq!(render(&client, &stale, 0).unwrap_err().code, Code::StaleEpoch);
+    assert_eq!(render(&client, &stale, 0).unwrap_err().code, ErrorCode::StaleEpoch);
     client.step(&lease, 2).unwrap();
     assert_ne!(render(&client, &lease, 1).unwrap(), first);
     client.close(&lease, 3).unwrap();
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -80,8 +80,8 @@ fn counter_has_nothing_to_draw() {
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 1)).unwrap();
     env.reset(&ResetRequest::default()).unwrap();
     let EnvError::Remote(error) = env.scene(0).unwrap_err() else { panic!("the server refused it") };
-    let Some(ClientError::Refused(refusal)) = error.downcast_ref() else { panic!("{error}") };
-    assert_eq!((refusal.code, refusal.message.as_str()), (Code::UnknownKey, "the task `counter` has nothing to draw"));
+    let Some(ClientError::Rejected(refusal)) = error.downcast_ref() else { panic!("{error}") };
+    assert_eq!((refusal.code, refusal.message.as_str()), (ErrorCode::UnknownKey, "the task `counter` has nothing to draw"));
     env.step(&[0.0; 12]).unwrap();
-    server.stop();
+    server.shutdown();
 }

@@ -1,7 +1,7 @@
 //! Rollouts in the batch engine: a job is the same alone and among others, and goes on from a past.
 
-use twinstep_model::effects::{Entry, compose};
-use twinstep_model::{Command, Job, Past, Placement, Precision, RobotModel, RobotStates, Rollout, go2};
+use twinstep_model::effects::{EffectEntry, apply_effects};
+use twinstep_model::{Command, RolloutRequest, HistoryStep, InitialState, Precision, RobotModel, RobotStates, Rollout, go2};
 use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_tests::hidden_robot::effect;
 
@@ -14,7 +14,7 @@ const BROKEN: usize = 5;
 fn robot(index: usize) -> RobotModel {
     let (effect, scope) = effect("command_delay", "all");
     let delay = 0.002 * (index % 2) as f64;
-    compose(&go2(), &[Entry::new(effect, scope, vec![delay]).unwrap()]).unwrap()
+    apply_effects(&go2(), &[EffectEntry::new(effect, scope, vec![delay]).unwrap()]).unwrap()
 }
 
 /// 3 to 60 drive periods, no neighbours alike.
@@ -34,19 +34,19 @@ fn commands(index: usize) -> Vec<Command> {
 fn a_job_is_the_same_alone_and_among_others_of_other_lengths() {
     let robots: Vec<_> = (0..JOBS).map(robot).collect();
     let commands: Vec<_> = (0..JOBS).map(commands).collect();
-    let start = |index: usize| Placement::at_rest(0.3 + 0.005 * index as f32, go2().control.default_pose_f32());
+    let start = |index: usize| InitialState::at_rest(0.3 + 0.005 * index as f32, go2().control.default_pose_f32());
     let jobs: Vec<_> = (0..JOBS)
-        .map(|index| Job {
+        .map(|index| RolloutRequest {
             robot: &robots[index],
             held: index % 3 == 0,
             start: start(index),
-            past: &[],
+            history: &[],
             commands: &commands[index],
         })
         .collect();
     let mut simulator = BatchRollout::new(&go2(), &SimConfig { threads: 2, ..SimConfig::default() }).unwrap();
     for precision in [Precision::Single, Precision::Double] {
-        let together = simulator.play(&jobs, precision);
+        let together = simulator.run(&jobs, precision);
         for (index, states) in together.iter().enumerate() {
             let periods = commands[index].len();
             assert_eq!(states.q.len(), periods + 1);
@@ -55,7 +55,7 @@ fn a_job_is_the_same_alone_and_among_others_of_other_lengths() {
                 assert!(!diverged[2] && diverged[3..].iter().all(|diverged| *diverged), "{diverged:?}");
                 continue;
             }
-            let alone: RobotStates = simulator.play(&jobs[index..=index], precision).remove(0);
+            let alone: RobotStates = simulator.run(&jobs[index..=index], precision).remove(0);
             assert_eq!(*states, alone, "job {index} in {precision:?}");
             assert!(diverged.iter().all(|diverged| !diverged));
         }
@@ -67,24 +67,24 @@ fn a_job_with_a_past_goes_on_as_if_it_had_never_ended() {
     let entries = [("torque_delay", 0.008), ("command_delay", 0.006), ("drive_lag", 0.005), ("encoder_offset", 0.02)]
         .map(|(name, value)| {
             let (effect, scope) = effect(name, "all");
-            Entry::new(effect, scope, vec![value]).unwrap()
+            EffectEntry::new(effect, scope, vec![value]).unwrap()
         });
-    let robot = compose(&go2(), &entries).unwrap();
+    let robot = apply_effects(&go2(), &entries).unwrap();
     let pose = go2().control.default_pose_f32();
     let command = |period: usize| Command::hold(pose.map(|q| q + 0.2 * (0.2 * period as f32).sin()), 30.0, 0.75);
     let commands: Vec<_> = (0..90).map(command).collect();
     let mut simulator = BatchRollout::new(&go2(), &SimConfig { threads: 1, ..SimConfig::default() }).unwrap();
-    let mut play = |start: Placement, past: &[Past], commands: &[Command]| {
-        let job = Job { robot: &robot, held: true, start, past, commands };
-        simulator.play(&[job], Precision::Double).remove(0)
+    let mut play = |start: InitialState, past: &[HistoryStep], commands: &[Command]| {
+        let job = RolloutRequest { robot: &robot, held: true, start, history: past, commands };
+        simulator.run(&[job], Precision::Double).remove(0)
     };
-    let whole = play(Placement::at_rest(1.0, pose), &[], &commands);
+    let whole = play(InitialState::at_rest(1.0, pose), &[], &commands);
     let now = 50;
-    let start = Placement { q: whole.q[now], dq: whole.dq[now], ..Placement::at_rest(1.0, pose) };
+    let start = InitialState { q: whole.q[now], dq: whole.dq[now], ..InitialState::at_rest(1.0, pose) };
     let past: Vec<_> = (now - 8..now)
-        .map(|period| Past { command: commands[period], q: whole.q[period], dq: whole.dq[period] })
+        .map(|period| HistoryStep { command: commands[period], q: whole.q[period], dq: whole.dq[period] })
         .collect();
-    let mut error = |past: &[Past]| {
+    let mut error = |past: &[HistoryStep]| {
         let states = play(start, past, &commands[now..]);
         let pairs = states.q.iter().flatten().zip(whole.q[now..].iter().flatten());
         pairs.map(|(one, other)| (one - other).abs()).fold(0.0, f32::max)

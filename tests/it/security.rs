@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv};
-use twinstep_env_server::{Config, Server, ServerError, SimHost};
+use twinstep_env_server::{Config, Server, ServerError, SimEnvFactory};
 use twinstep_envs::TaskName;
 use twinstep_model::{ResetRequest, VecEnv};
 use twinstep_tests::security::SecurityFolder;
@@ -17,7 +17,7 @@ fn serve(protocol: &str, zenoh: &Path) -> (Server, String) {
     config.server.listen = format!("{protocol}/127.0.0.1:0");
     config.server.zenoh = Some(zenoh.to_owned());
     config.server.lease_grace_s = 0.0;
-    let server = Server::start(&config.server, Arc::new(SimHost::new(config.clone()).unwrap())).unwrap();
+    let server = Server::start(&config.server, Arc::new(SimEnvFactory::new(config.clone()).unwrap())).unwrap();
     let endpoint = server.endpoints().into_iter().find(|endpoint| endpoint.contains("127.0.0.1")).unwrap();
     (server, endpoint)
 }
@@ -51,7 +51,7 @@ fn user_with_the_password_steps() {
     let folder = SecurityFolder::new().unwrap();
     let (server, endpoint) = serve("tcp", &folder.path("server-users.json5"));
     steps(&endpoint, Some(folder.path("client-user.json5")));
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -71,7 +71,7 @@ fn wrong_password_unknown_user_and_no_password_are_refused() {
     assert!(!text.contains(".rs:"), "{text}");
     refused(&endpoint, Some(folder.edited("client-user.json5", "alice", "mallory").unwrap()));
     refused(&endpoint, None);
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -81,7 +81,7 @@ fn user_file_without_users_does_not_open_the_server() {
     let mut config = Config::default();
     config.server.listen = "tcp/127.0.0.1:0".to_owned();
     config.server.zenoh = Some(folder.path("server-users.json5"));
-    let error = Server::start(&config.server, Arc::new(SimHost::new(config.clone()).unwrap())).err().unwrap();
+    let error = Server::start(&config.server, Arc::new(SimEnvFactory::new(config.clone()).unwrap())).err().unwrap();
     assert!(matches!(error, ServerError::ZenohConfig { .. }), "{error:?}");
     assert!(error.to_string().contains("names no user"), "{error}");
 }
@@ -93,7 +93,7 @@ fn refusals_with_a_reason_pass_access_control() {
     let mut env = connect(&endpoint, Some(folder.path("client-user.json5"))).unwrap();
     let error = env.step(&[0.0; 48]).unwrap_err().to_string();
     assert!(error.contains("reset"), "{error}");
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -101,7 +101,7 @@ fn allowed_user_steps_and_is_seen_by_the_server() {
     let folder = SecurityFolder::new().unwrap();
     let (server, endpoint) = serve("tcp", &folder.path("server-acl.json5"));
     steps(&endpoint, Some(folder.path("client-user.json5")));
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -111,12 +111,12 @@ fn user_without_a_policy_sees_no_server_and_is_told_both_reasons() {
     folder.edited("client-user.json5", "alice", "bob").unwrap();
     let bob = folder.edited("edited-client-user.json5", "change-me-1", "change-me-2").unwrap();
     let error = connect(&endpoint, Some(bob)).err().expect("refused");
-    assert!(matches!(error, ClientError::Invisible { .. }), "{error:?}");
+    assert!(matches!(error, ClientError::NoServerVisible { .. }), "{error:?}");
     let text = error.to_string();
     for said in ["no server is visible", "none runs", "access control", "TWINSTEP_LOG"] {
         assert!(text.contains(said), "{text}");
     }
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -125,7 +125,7 @@ fn steps_go_through_tls() {
     let (server, endpoint) = serve("tls", &folder.path("server-tls.json5"));
     assert!(endpoint.starts_with("tls/"));
     steps(&endpoint, Some(folder.path("client-tls.json5")));
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -135,7 +135,7 @@ fn client_that_trusts_another_authority_refuses_the_server() {
     let text = refused(&endpoint, Some(other.path("client-tls.json5")));
     assert!(text.contains("certificate"), "{text}");
     refused(&endpoint, None);
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -149,7 +149,7 @@ fn mutual_tls_lets_in_whoever_has_a_certificate_of_the_authority() {
     let foreign = other.uncommented("client-tls.json5").unwrap();
     assert!(connect(&endpoint, Some(foreign)).is_err(), "a foreign certificate");
     steps(&endpoint, Some(folder.uncommented("client-tls.json5").unwrap()));
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -158,7 +158,7 @@ fn password_goes_through_tls() {
     let (server, endpoint) = serve("tls", &folder.uncommented("server-users.json5").unwrap());
     steps(&endpoint, Some(folder.uncommented("client-user.json5").unwrap()));
     refused(&endpoint, Some(folder.path("client-tls.json5")));
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -176,5 +176,5 @@ fn access_control_by_certificate_name_lets_its_owner_step() {
     );
     let (server, endpoint) = serve("tls", &zenoh.unwrap());
     steps(&endpoint, Some(folder.uncommented("client-tls.json5").unwrap()));
-    server.stop();
+    server.shutdown();
 }

@@ -2,18 +2,18 @@
 
 use glam::{Quat, Vec3};
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
-use twinstep_env_server::{Config, Host, SimHost};
+use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
 use twinstep_envs::TaskName;
 use twinstep_model::{
-    AutoresetMode, Backend, Command, Ground, NUM_LEGS, Placement, Pose, ResetRequest, ShapeKind, VecEnv, body_poses,
+    AutoresetMode, Backend, Command, Ground, NUM_LEGS, InitialState, Pose, ResetRequest, ShapeKind, VecEnv, body_poses,
     frames, go2,
 };
-use twinstep_sim::{BatchBackend, Engine, RapierBackend, Rough, SimConfig, Terrain};
+use twinstep_sim::{BatchBackend, Engine, RapierBackend, RoughTerrain, SimConfig, Terrain};
 
 use crate::remote::{config, start};
 
 fn rough(height_m: f32, cell_m: f32, seed: u64) -> Terrain {
-    Terrain::Rough(Rough { height_m, cell_m, size_m: 20.0, seed })
+    Terrain::Rough(RoughTerrain { height_m, cell_m, size_m: 20.0, seed })
 }
 
 /// Makes a robot of one engine.
@@ -30,7 +30,7 @@ fn batch(config: SimConfig) -> BatchBackend {
 fn backend<B: Backend>(make: Make<B>, terrain: Terrain, clearance: f32) -> B {
     let q = go2().control.default_pose_f32();
     let mut backend = make(SimConfig { terrain, threads: 1, ..SimConfig::default() });
-    let placement = Placement::above(&backend.ground(), backend.robot(), q, clearance);
+    let placement = InitialState::standing_on(&backend.ground(), backend.robot(), q, clearance);
     backend.reset(&[(0, placement)]).unwrap();
     backend
 }
@@ -80,7 +80,7 @@ fn stands_on_its_feet<B: Backend>(make: Make<B>) {
             assert!((force > 0.0) == (*gap < 0.001), "seed {seed}: {gap} m from the ground with {force} N");
         }
         assert!(!states.body_contact[0], "seed {seed}");
-        assert!(frames::gravity_in_base(states.base_orientation[0]).z < -0.98, "seed {seed}");
+        assert!(frames::projected_gravity(states.base_orientation[0]).z < -0.98, "seed {seed}");
     }
 }
 
@@ -135,7 +135,7 @@ fn robot_beside_the_field_stands_on_level_ground() {
 fn stands_beside_the_field<B: Backend>(make: Make<B>) {
     let mut backend = backend(make, rough(0.05, 0.25, 1), 0.0);
     let q = go2().control.default_pose_f32();
-    let placement = Placement { base_position: [10.5, -3.0, 0.34], ..Placement::at_rest(0.34, q) };
+    let placement = InitialState { base_position: [10.5, -3.0, 0.34], ..InitialState::at_rest(0.34, q) };
     backend.reset(&[(0, placement)]).unwrap();
     backend.step(&[Command::hold(q, 60.0, 2.0)], &[true], 400).unwrap();
     assert!((0.27..0.33).contains(&backend.states().base_position[0][2]), "{:?}", backend.states().base_position[0]);
@@ -170,7 +170,7 @@ fn server_with_rough_ground_in_its_file_sends_the_heights_around_the_robot() {
         z - whole.height(x, y)
     );
     assert!(sent.heights().iter().any(|height| *height > 0.07));
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -183,7 +183,7 @@ fn server_refuses_rough_ground_that_cannot_be_before_it_starts() {
         ("[sim]\nterrain = { rough = { height_m = 0.1, cell_m = 0.0, seed = 7 } }", "`sim.terrain.rough.cell_m` = 0"),
     ] {
         let config = Config::parse(text, "server.toml").unwrap();
-        let error = SimHost::new(config).err().unwrap().to_string();
+        let error = SimEnvFactory::new(config).err().unwrap().to_string();
         assert!(error.contains(wanted), "{error}");
     }
 }
@@ -192,8 +192,8 @@ fn server_refuses_rough_ground_that_cannot_be_before_it_starts() {
 fn walk_on_a_steep_slope_starts_with_the_feet_on_it() {
     let mut config = config(TaskName::Walk);
     config.sim.terrain = Terrain::SlopeRad(0.3);
-    config.task.start_position_noise_rad = 0.0;
-    let mut env = SimHost::new(config).unwrap().build(1, AutoresetMode::NextStep, None).unwrap();
+    config.task.reset_joint_noise_rad = 0.0;
+    let mut env = SimEnvFactory::new(config).unwrap().build(1, AutoresetMode::NextStep, None).unwrap();
     env.reset(&ResetRequest::default()).unwrap();
     let up = Ground { normal: [-0.3f32.sin(), 0.0, 0.3f32.cos()], ..Ground::FLAT }.up();
     let scene = env.scene(0).unwrap();

@@ -9,9 +9,9 @@ use proptest::strategy::ValueTree;
 use proptest::test_runner::TestRunner;
 use serde::de::IgnoredAny;
 use twinstep_envs::TaskName;
-use twinstep_protocol::keys::Verb;
+use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::message::{CloseRequest, HelloRequest, LeaseReply, RenderRequest};
-use twinstep_protocol::{Code, PROTOCOL, decode, encode, keys};
+use twinstep_protocol::{ErrorCode, PROTOCOL, decode, encode, keys};
 
 use crate::raw_client::{RawClient, reset_bytes, step_bytes, step_with, steps_in};
 use crate::remote::{config, start};
@@ -22,7 +22,7 @@ const MEASURED_IN_A_PROCESS: &str = "wire::twenty_thousand_bad_requests";
 fn all_keys(sid: &str, lease: &str) -> Vec<String> {
     let mut all = vec![keys::hello(sid), keys::lease(sid)];
     for lease in [lease, "0123456789abcdef"] {
-        all.extend(Verb::ALL.map(|verb| keys::env(sid, lease, verb)));
+        all.extend(EnvMethod::ALL.map(|verb| keys::env(sid, lease, verb)));
     }
     all.extend(["", "/*", "/hello/x", "/env/x", "/env/x/jump"].map(|rest| format!("twinstep/{sid}{rest}")));
     all
@@ -109,7 +109,7 @@ fn any_bytes_at_any_key_get_one_answer_and_others_go_on() {
         let step = bystander.step(&own, 1 + u64::from(steps)).unwrap();
         assert_eq!(steps_in(&step), steps as f32, "after {} at {key}", payload.escape_ascii());
     }
-    server.stop();
+    server.shutdown();
 }
 
 #[test]
@@ -148,7 +148,7 @@ fn twenty_thousand_bad_requests() {
         let mut payload = if index.is_multiple_of(100) { large.clone() } else { good[index % good.len()].clone() };
         payload[0] = 0xc1;
         if let Err(error) = client.ask(key, &payload) {
-            assert!(matches!(error.code, Code::Malformed | Code::LeaseLost | Code::UnknownKey), "{error}");
+            assert!(matches!(error.code, ErrorCode::Malformed | ErrorCode::LeaseLost | ErrorCode::UnknownKey), "{error}");
         }
     };
     (0..10_000).for_each(bad);
@@ -161,7 +161,7 @@ fn twenty_thousand_bad_requests() {
 
     let giant = step_with(&lease, 2, &vec![0.0; GIANT / 4]);
     for _ in 0..8 {
-        assert_eq!(client.ask_env(&lease, Verb::Step, &giant).unwrap_err().code, Code::BadShape);
+        assert_eq!(client.ask_env(&lease, EnvMethod::Step, &giant).unwrap_err().code, ErrorCode::BadShape);
     }
     drop(giant);
     // Until Zenoh has forgotten the queries, and the allocator what it lent them.
@@ -172,5 +172,5 @@ fn twenty_thousand_bad_requests() {
     assert!(kept < GIANT * 4, "{kept} bytes more after giant requests: they are kept");
     println!("{grown} bytes more after 20000 bad requests, {kept} after giant ones");
     assert_eq!(steps_in(&client.step(&lease, 2).unwrap()), 1.0);
-    server.stop();
+    server.shutdown();
 }

@@ -9,12 +9,12 @@ use std::time::Duration;
 use twinstep_model::stream;
 
 use crate::fault::Fault;
-use crate::lane::{Commands, Lane};
+use crate::lane::{TestBedConfig, TestBed};
 
 /// What to inject.
-pub struct Plan {
+pub struct FaultPlan {
     /// What the processes run.
-    pub commands: Commands,
+    pub commands: TestBedConfig,
     /// Number of faults.
     pub faults: usize,
     /// Lanes at once; every second one has a router.
@@ -25,7 +25,7 @@ pub struct Plan {
 
 /// What came of it.
 #[derive(Debug, Default)]
-pub struct Tally {
+pub struct FaultReport {
     /// How often each fault was injected.
     pub injected: BTreeMap<Fault, usize>,
     /// The fault and the evidence of everything that went wrong.
@@ -36,14 +36,14 @@ pub struct Tally {
     pub slowest: Duration,
 }
 
-impl Tally {
+impl FaultReport {
     /// Faults injected in all.
     pub fn total(&self) -> usize {
         self.injected.values().sum()
     }
 }
 
-impl std::fmt::Display for Tally {
+impl std::fmt::Display for FaultReport {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let mut table = format!("{:<42}{:>9}{:>8}\n", "fault", "injected", "failed");
         for (fault, count) in &self.injected {
@@ -62,7 +62,7 @@ impl std::fmt::Display for Tally {
 }
 
 /// Injects the faults of `plan`. `progress` is told of each; `stop` ends early.
-pub fn run(plan: &Plan, stop: &AtomicBool, progress: impl Fn(Fault)) -> Result<Tally, String> {
+pub fn run(plan: &FaultPlan, stop: &AtomicBool, progress: impl Fn(Fault)) -> Result<FaultReport, String> {
     let (sender, outcomes) = channel();
     std::thread::scope(|scope| {
         let threads: Vec<_> = (0..plan.lanes)
@@ -78,7 +78,7 @@ pub fn run(plan: &Plan, stop: &AtomicBool, progress: impl Fn(Fault)) -> Result<T
             })
             .collect();
         drop(sender);
-        let mut tally = Tally::default();
+        let mut tally = FaultReport::default();
         for (fault, failure) in outcomes {
             *tally.injected.entry(fault).or_default() += 1;
             tally.failures.extend(failure.map(|evidence| (fault, evidence)));
@@ -96,7 +96,7 @@ pub fn run(plan: &Plan, stop: &AtomicBool, progress: impl Fn(Fault)) -> Result<T
 /// Injects `share` faults; a lane that does not go on is started anew. Returns the acknowledged steps, and the
 /// longest time to go on.
 fn run_lane(
-    plan: &Plan,
+    plan: &FaultPlan,
     index: usize,
     share: usize,
     stop: &AtomicBool,
@@ -104,7 +104,7 @@ fn run_lane(
 ) -> Result<(u64, Duration), String> {
     let with_router = index % 2 == 1;
     let mut random = stream(plan.seed, "faults", index as u64);
-    let start = || Lane::start(&plan.commands, with_router);
+    let start = || TestBed::start(&plan.commands, with_router);
     let mut lane = start()?;
     let (mut steps, mut slowest) = (0, Duration::ZERO);
     for _ in 0..share {

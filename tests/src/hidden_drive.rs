@@ -6,11 +6,11 @@ use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 
 use rand::RngExt;
-use twinstep_logs::{Base as LoggedBase, Log, Meta, Segment, TauSensor};
-use twinstep_model::effects::{Effect, Entry, Scope, compose};
+use twinstep_logs::{BaseMount as LoggedBase, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::effects::{Effect, EffectEntry, Scope, apply_effects};
 use twinstep_model::{Joint, JointKind, RobotModel, go2, stream};
-use twinstep_sim::{Base, BatchBackend, SimConfig};
-use twinstep_sysid::{RecordError, Sensor, measured, record};
+use twinstep_sim::{BaseMount, BatchBackend, SimConfig};
+use twinstep_sysid::{RecordError, Sensor, apply_sensors, record};
 
 /// Rate of the logs [Hz].
 pub const RATE_HZ: f64 = 200.0;
@@ -18,9 +18,9 @@ pub const RATE_HZ: f64 = 200.0;
 pub const NOISE_NM: f64 = 0.2;
 /// Noise and steps of the sensors. Drives close their loop on the same encoder that is logged, so that it has little.
 const SENSORS: [Sensor; 3] = [
-    Sensor { quantity: "q", sigma: 0.0003, step: 0.0 },
-    Sensor { quantity: "dq", sigma: 0.01, step: 0.0 },
-    Sensor { quantity: "tau_measured", sigma: NOISE_NM, step: 0.0 },
+    Sensor { quantity: "q", sigma: 0.0003, resolution: 0.0 },
+    Sensor { quantity: "dq", sigma: 0.01, resolution: 0.0 },
+    Sensor { quantity: "tau_measured", sigma: NOISE_NM, resolution: 0.0 },
 ];
 /// Waves of a joint.
 const WAVES: usize = 6;
@@ -32,7 +32,7 @@ pub struct HiddenDrive {
     /// Effects and their values.
     effects: &'static [(&'static str, &'static [f64])],
     /// Where its torque is measured.
-    pub sensor: TauSensor,
+    pub sensor: TorqueSensor,
 }
 
 /// The drives that ensembles are tried on.
@@ -43,7 +43,7 @@ pub const DRIVES: [HiddenDrive; 5] = [
     HiddenDrive {
         name: "Coulomb and viscous friction before an output sensor",
         effects: &[("coulomb_friction", &[1.2]), ("viscous_friction", &[0.15])],
-        sensor: TauSensor::Output,
+        sensor: TorqueSensor::JointOutput,
     },
     HiddenDrive {
         name: "all of them at an output sensor",
@@ -55,12 +55,12 @@ pub const DRIVES: [HiddenDrive; 5] = [
             ("coulomb_friction", &[0.8]),
             ("viscous_friction", &[0.1]),
         ],
-        sensor: TauSensor::Output,
+        sensor: TorqueSensor::JointOutput,
     },
 ];
 
 const fn current(name: &'static str, effects: &'static [(&'static str, &'static [f64])]) -> HiddenDrive {
-    HiddenDrive { name, effects, sensor: TauSensor::Current }
+    HiddenDrive { name, effects, sensor: TorqueSensor::MotorCurrent }
 }
 
 /// How a robot is moved.
@@ -92,16 +92,16 @@ impl HiddenDrive {
     pub fn logs(&self, motion: Motion) -> Logs {
         let entries = self.effects.iter().map(|(name, values)| {
             let effect = Effect::named(name).expect("an effect of the catalogue");
-            Entry::new(effect, Scope::All, values.to_vec()).expect("plausible values")
+            EffectEntry::new(effect, Scope::All, values.to_vec()).expect("plausible values")
         });
-        let robot = compose(&go2(), &entries.collect::<Vec<_>>()).expect("a robot");
+        let robot = apply_effects(&go2(), &entries.collect::<Vec<_>>()).expect("a robot");
         let backend = |_| {
-            let config = SimConfig { base: Base::Fixed, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
+            let config = SimConfig { base: BaseMount::Fixed, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
             BatchBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(error.into()))
         };
         let exact = record(&waves(motion), &robot, None, backend, self.name.to_owned(), &mut |_| true).expect("a log");
-        let exact = if self.sensor == TauSensor::Output { at_output(&exact, &robot) } else { exact };
-        let measured = measured(&exact, &SENSORS, motion.seed).expect("a log");
+        let exact = if self.sensor == TorqueSensor::JointOutput { at_output(&exact, &robot) } else { exact };
+        let measured = apply_sensors(&exact, &SENSORS, motion.seed).expect("a log");
         Logs { measured, exact }
     }
 }
@@ -129,12 +129,12 @@ fn waves(motion: Motion) -> Log {
         columns.insert(format!("q_cmd_{}", joint.name()), (0..rows).map(at).collect());
     }
     let segments = vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }];
-    Log::new_motion(Meta::new(RATE_HZ, TauSensor::Current, segments), columns).expect("a motion")
+    Log::new_commands(Meta::new(RATE_HZ, TorqueSensor::MotorCurrent, segments), columns).expect("a motion")
 }
 
 /// The torque behind friction: of the mean speed from a row to the next.
 fn at_output(log: &Log, robot: &RobotModel) -> Log {
-    let meta = Meta { tau_sensor: TauSensor::Output, ..log.meta().clone() };
+    let meta = Meta { tau_sensor: TorqueSensor::JointOutput, ..log.meta().clone() };
     let index = |cells: &[u32]| cells.iter().map(|cell| f64::from(*cell)).collect();
     let mut columns = vec![
         ("t".to_owned(), log.t().to_vec()),

@@ -7,11 +7,11 @@ use std::f64::consts::TAU;
 
 use glam::DVec3;
 use rand::RngExt;
-use twinstep_logs::{Base as LoggedBase, Log, Meta, Segment, TauSensor};
-use twinstep_model::effects::{Effect, Entry, Scope};
+use twinstep_logs::{BaseMount as LoggedBase, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::effects::{Effect, EffectEntry, Scope};
 use twinstep_model::{JOINT_NAMES, Joint, JointKind, Leg, ModelFile, go2, stream};
-use twinstep_sim::{Base, Engine, RapierBackend, SimConfig};
-use twinstep_sysid::{RecordError, Sensor, measured, record};
+use twinstep_sim::{BaseMount, Engine, RapierBackend, SimConfig};
+use twinstep_sysid::{RecordError, Sensor, apply_sensors, record};
 
 /// Rate of the log [Hz].
 const RATE_HZ: f64 = 200.0;
@@ -22,13 +22,13 @@ const STANCE_ROWS: usize = 2400;
 
 /// Noise and steps of the sensors.
 const SENSORS: [Sensor; 7] = [
-    Sensor { quantity: "q", sigma: 0.002, step: 0.0002 },
-    Sensor { quantity: "dq", sigma: 0.05, step: 0.01 },
-    Sensor { quantity: "tau_measured", sigma: 0.2, step: 0.05 },
-    Sensor { quantity: "pos", sigma: 0.002, step: 0.0 },
-    Sensor { quantity: "quat", sigma: 0.004, step: 0.0 },
-    Sensor { quantity: "vel", sigma: 0.03, step: 0.0 },
-    Sensor { quantity: "gyro", sigma: 0.02, step: 0.001 },
+    Sensor { quantity: "q", sigma: 0.002, resolution: 0.0002 },
+    Sensor { quantity: "dq", sigma: 0.05, resolution: 0.01 },
+    Sensor { quantity: "tau_measured", sigma: 0.2, resolution: 0.05 },
+    Sensor { quantity: "pos", sigma: 0.002, resolution: 0.0 },
+    Sensor { quantity: "quat", sigma: 0.004, resolution: 0.0 },
+    Sensor { quantity: "vel", sigma: 0.03, resolution: 0.0 },
+    Sensor { quantity: "gyro", sigma: 0.02, resolution: 0.001 },
 ];
 
 /// An effect with its scope, as in `coulomb_friction@calf`.
@@ -41,7 +41,7 @@ pub fn effect(name: &str, scope: &str) -> (&'static Effect, Scope) {
 
 /// Robot number `case`: mass of the trunk ±20 %, centre of mass ±4 cm along each axis, inertia ±20 % besides, and by joint
 /// type κ 18 to 30 N·m, Coulomb friction, rotor inertia; a delay of 1 to 10 ms.
-pub fn hidden_robot(case: u64) -> ModelFile {
+pub fn ground_truth_robot(case: u64) -> ModelFile {
     let mut random = stream(case, "hidden robot", 0);
     let mut draw = |low: f64, high: f64| random.random_range(low..high);
     let mut trunk = go2().trunk;
@@ -59,14 +59,14 @@ pub fn hidden_robot(case: u64) -> ModelFile {
     entries.push(("command_delay", "all", vec![draw(0.001, 0.01)]));
     let entry = |(name, scope, values): (&str, &str, Vec<f64>)| {
         let (effect, scope) = effect(name, scope);
-        Entry::new(effect, scope, values).expect("drawn within the bounds")
+        EffectEntry::new(effect, scope, values).expect("drawn within the bounds")
     };
     ModelFile { effects: entries.into_iter().map(entry).collect(), ..ModelFile::default() }
 }
 
 /// What is sought: what is hidden, and the ground, whose softness the engines see differently.
-pub fn sought() -> Vec<(&'static Effect, Scope)> {
-    let hidden = hidden_robot(0).effects;
+pub fn estimated_effects() -> Vec<(&'static Effect, Scope)> {
+    let hidden = ground_truth_robot(0).effects;
     let ground = [effect("ground_stiffness", "ground"), effect("ground_friction", "ground")];
     hidden.iter().map(|entry| (entry.effect, entry.scope)).chain(ground).collect()
 }
@@ -101,9 +101,9 @@ pub fn motion(variant: u64) -> Log {
     }
     let segment = |name: &str, base| Segment { name: name.to_owned(), base };
     let segments = vec![segment("air", LoggedBase::Fixed), segment("stance", LoggedBase::Floating)];
-    let mut meta = Meta::new(RATE_HZ, TauSensor::Current, segments);
+    let mut meta = Meta::new(RATE_HZ, TorqueSensor::MotorCurrent, segments);
     meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
-    Log::new_motion(meta, columns).expect("a motion")
+    Log::new_commands(meta, columns).expect("a motion")
 }
 
 /// Slow waves that lift, pitch, roll and shift the trunk while the feet stay.
@@ -131,11 +131,11 @@ fn sway(joint: Joint, time: f64, shift: f64) -> f64 {
 pub fn log_of(robot: &ModelFile, motion: &Log, seed: u64) -> Log {
     let robot = robot.robot_model().expect("a robot");
     let backend = |base: LoggedBase| {
-        let base = if base == LoggedBase::Fixed { Base::Fixed } else { Base::Floating };
+        let base = if base == LoggedBase::Fixed { BaseMount::Fixed } else { BaseMount::Floating };
         let config =
             SimConfig { engine: Engine::Rapier, base, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
         RapierBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)))
     };
     let exact = record(motion, &robot, None, backend, "a robot of `hidden_robot`".to_owned(), &mut |_| true);
-    measured(&exact.expect("the robot gets through"), &SENSORS, seed).expect("a log")
+    apply_sensors(&exact.expect("the robot gets through"), &SENSORS, seed).expect("a log")
 }

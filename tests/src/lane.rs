@@ -12,14 +12,14 @@ use crate::proxy::Proxy;
 use crate::repeats;
 
 /// How long a lane may take to go on after a fault.
-const PATIENCE: Duration = Duration::from_secs(30);
+const RECOVERY_TIMEOUT: Duration = Duration::from_secs(30);
 /// How long the news of a server may take through the router.
-const NEWS: Duration = Duration::from_secs(3);
+const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(3);
 /// Steps after which a lane counts as going on.
 const PROGRESS: usize = 3;
 
 /// The processes of one lane.
-pub struct Lane {
+pub struct TestBed {
     router: Option<Process>,
     server: Process,
     client: Process,
@@ -29,7 +29,7 @@ pub struct Lane {
     endpoint: String,
     /// Where the client connects, on its way to `endpoint`.
     proxy: Proxy,
-    plan: Commands,
+    plan: TestBedConfig,
     /// The client's lease and epoch.
     lease: [String; 2],
     /// Counters after the last acknowledged step, as the client printed them.
@@ -42,7 +42,7 @@ pub struct Lane {
 
 /// What the processes of a lane run.
 #[derive(Clone, Debug)]
-pub struct Commands {
+pub struct TestBedConfig {
     /// The program with the roles of [`crate::roles`].
     pub program: PathBuf,
     /// Further arguments of the server.
@@ -51,12 +51,12 @@ pub struct Commands {
     pub client: Option<Vec<String>>,
 }
 
-impl Commands {
-    fn start_client(&self, endpoint: &str, heritage: &[String]) -> Result<Process, String> {
+impl TestBedConfig {
+    fn start_client(&self, endpoint: &str, reclaimed_state: &[String]) -> Result<Process, String> {
         let own = vec![self.program.display().to_string(), "client".to_owned()];
         let mut words = self.client.clone().unwrap_or(own);
         words.push(endpoint.to_owned());
-        words.extend_from_slice(heritage);
+        words.extend_from_slice(reclaimed_state);
         Process::start(Path::new(&words[0]), &words[1..])
     }
 }
@@ -68,9 +68,9 @@ enum Lease {
     IsNew,
 }
 
-impl Lane {
+impl TestBed {
     /// Starts the processes and waits until the client steps.
-    pub fn start(plan: &Commands, with_router: bool) -> Result<Self, String> {
+    pub fn start(plan: &TestBedConfig, with_router: bool) -> Result<Self, String> {
         let program = &plan.program;
         let listen = free_endpoint()?;
         let endpoint = if with_router { free_endpoint()? } else { listen.clone() };
@@ -91,7 +91,7 @@ impl Lane {
             steps: 0,
             slowest: Duration::ZERO,
         };
-        lane.goes_on(Lease::IsNew)?;
+        lane.wait_for_progress(Lease::IsNew)?;
         // Starting is no fault.
         lane.slowest = Duration::ZERO;
         Ok(lane)
@@ -111,19 +111,19 @@ impl Lane {
             Fault::RouterKilled => self.kill_router(moment(random, 0..800)),
             Fault::ClientFrozen => {
                 freeze(&self.client, moment(random, 50..3000))?;
-                self.goes_on(Lease::GoesOn)
+                self.wait_for_progress(Lease::GoesOn)
             }
             Fault::ServerFrozen => {
                 freeze(&self.server, moment(random, 2500..4000))?;
-                self.goes_on(Lease::GoesOn)
+                self.wait_for_progress(Lease::GoesOn)
             }
             Fault::MessagesDelayed => {
                 self.proxy.hold(moment(random, 50..3000));
-                self.goes_on(Lease::GoesOn)
+                self.wait_for_progress(Lease::GoesOn)
             }
             Fault::RequestRepeated => {
                 repeats::three_times(&self.endpoint)?;
-                self.goes_on(Lease::GoesOn)
+                self.wait_for_progress(Lease::GoesOn)
             }
             Fault::SecondServer => self.start_second_server(),
         }
@@ -136,7 +136,7 @@ impl Lane {
     fn kill_server(&mut self) -> Result<(), String> {
         self.server.kill();
         self.server = start_server(&self.plan.program, &self.listen, self.router_endpoint(), &self.plan.server)?;
-        self.goes_on(Lease::IsNew)
+        self.wait_for_progress(Lease::IsNew)
     }
 
     fn kill_client(&mut self) -> Result<(), String> {
@@ -145,13 +145,13 @@ impl Lane {
         }
         if self.plan.client.is_some() {
             self.client = self.plan.start_client(&self.proxy.endpoint, &[])?;
-            return self.goes_on(Lease::IsNew);
+            return self.wait_for_progress(Lease::IsNew);
         }
         let [lease, epoch] = self.lease.clone();
         let mut heritage = vec!["--inherit".to_owned(), lease, epoch];
         heritage.extend(self.acknowledged.iter().cloned());
         self.client = self.plan.start_client(&self.proxy.endpoint, &heritage)?;
-        self.goes_on(Lease::GoesOn)
+        self.wait_for_progress(Lease::GoesOn)
     }
 
     fn kill_router(&mut self, pause: Duration) -> Result<(), String> {
@@ -159,7 +159,7 @@ impl Lane {
         router.kill();
         std::thread::sleep(pause);
         self.router = Some(start_router(&self.plan.program, &self.endpoint)?);
-        self.goes_on(Lease::GoesOn)
+        self.wait_for_progress(Lease::GoesOn)
     }
 
     /// Behind a router both servers are visible, and a new client must not choose blindly. At one endpoint the second
@@ -174,24 +174,24 @@ impl Lane {
             let since = Instant::now();
             loop {
                 match RemoteVecEnv::connect(&options) {
-                    Err(ClientError::NoUniqueRobot { .. }) => return self.goes_on(Lease::GoesOn),
+                    Err(ClientError::AmbiguousRobot { .. }) => return self.wait_for_progress(Lease::GoesOn),
                     Err(error) => return Err(format!("two servers: {error}")),
                     // The router may not have heard of the second server yet.
-                    Ok(_) if since.elapsed() < NEWS => {}
+                    Ok(_) if since.elapsed() < DISCOVERY_TIMEOUT => {}
                     Ok(_) => return Err("a client chose one of two servers".to_owned()),
                 }
             }
         } else {
             let mut second = Process::start(&self.plan.program, &["server".to_owned(), self.listen.clone()])?;
-            match second.exit_code(PATIENCE) {
+            match second.exit_code(RECOVERY_TIMEOUT) {
                 Some(0) | None => Err("a second server started at the same endpoint".to_owned()),
-                Some(_) => self.goes_on(Lease::GoesOn),
+                Some(_) => self.wait_for_progress(Lease::GoesOn),
             }
         }
     }
 
     /// Waits until the client steps again, under the same lease or a new one.
-    fn goes_on(&mut self, lease: Lease) -> Result<(), String> {
+    fn wait_for_progress(&mut self, lease: Lease) -> Result<(), String> {
         // What was printed before the fault's end says nothing about after it.
         let (before, since) = (self.lease[0].clone(), Instant::now());
         for line in self.client.lines_so_far() {
@@ -199,7 +199,7 @@ impl Lane {
         }
         let mut progress = 0;
         while progress < PROGRESS {
-            let left = PATIENCE.saturating_sub(since.elapsed());
+            let left = RECOVERY_TIMEOUT.saturating_sub(since.elapsed());
             let Some(line) = self.client.line(left) else {
                 return Err(format!("the client does not go on after {:.1} s", since.elapsed().as_secs_f64()));
             };
@@ -256,9 +256,9 @@ fn start_server(program: &Path, listen: &str, router: Option<&str>, extra: &[Str
 /// Starts a process that says when it listens. A port may stay taken for a moment after its owner's death.
 fn start(program: &Path, arguments: &[String]) -> Result<Process, String> {
     let since = Instant::now();
-    while since.elapsed() < PATIENCE {
+    while since.elapsed() < RECOVERY_TIMEOUT {
         let process = Process::start(program, arguments)?;
-        if process.line(PATIENCE).is_some_and(|line| line.starts_with("listening")) {
+        if process.line(RECOVERY_TIMEOUT).is_some_and(|line| line.starts_with("listening")) {
             return Ok(process);
         }
         std::thread::sleep(Duration::from_millis(50));

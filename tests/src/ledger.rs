@@ -9,18 +9,18 @@ pub const NUM_ENVS: usize = 2;
 ///
 /// Usually one. After a client's death two: its last request was executed, or was not.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Ledger {
+pub struct StepOracle {
     possible: Vec<[Counter; NUM_ENVS]>,
 }
 
-impl Ledger {
+impl StepOracle {
     /// Freshly built environments that were reset once.
     pub fn after_first_reset() -> Self {
         Self { possible: vec![[Counter { resets: 1, ..Counter::default() }; NUM_ENVS]] }
     }
 
     /// The last acknowledged state of a client that died with a request under way.
-    pub fn inherited(acknowledged: [Counter; NUM_ENVS]) -> Self {
+    pub fn after_client_crash(acknowledged: [Counter; NUM_ENVS]) -> Self {
         let mut executed = acknowledged;
         step(&mut executed, &actions(&acknowledged));
         Self { possible: vec![acknowledged, executed] }
@@ -54,7 +54,7 @@ impl Ledger {
 /// Sixteen-bit numbers that the state determines.
 fn actions(counters: &[Counter; NUM_ENVS]) -> Vec<f32> {
     let value = |counter: &Counter, env: usize, joint: usize| {
-        let seed = counter.mix ^ (counter.steps * 97 + env as u32 * 31 + joint as u32);
+        let seed = counter.action_hash ^ (counter.steps * 97 + env as u32 * 31 + joint as u32);
         (seed.wrapping_mul(0x9e37_79b9) >> 16) as f32
     };
     let entries =
@@ -79,7 +79,7 @@ mod tests {
     #[test]
     fn step_executed_twice_or_skipped_is_noticed() {
         for executed in [0, 2] {
-            let mut ledger = Ledger::after_first_reset();
+            let mut ledger = StepOracle::after_first_reset();
             let mut counters = ledger.possible[0];
             let actions = ledger.actions();
             for _ in 0..executed {
@@ -91,14 +91,14 @@ mod tests {
 
     #[test]
     fn heir_accepts_the_last_request_executed_once_or_not_at_all() {
-        let acknowledged = [Counter { steps: 5, resets: 1, mix: 77 }; NUM_ENVS];
+        let acknowledged = [Counter { steps: 5, resets: 1, action_hash: 77 }; NUM_ENVS];
         let sent = actions(&acknowledged);
         for executed in 0..3 {
             let mut counters = acknowledged;
             for _ in 0..executed {
                 step(&mut counters, &sent);
             }
-            let mut ledger = Ledger::inherited(acknowledged);
+            let mut ledger = StepOracle::after_client_crash(acknowledged);
             let next = ledger.actions();
             step(&mut counters, &next);
             assert_eq!(ledger.observe(&next, &observation(&counters)).is_ok(), executed < 2, "{executed} times");

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use twinstep_envs::{Counter, OBS_LEN};
 use twinstep_model::AutoresetMode;
-use twinstep_protocol::keys::{self, Verb};
+use twinstep_protocol::keys::{self, EnvMethod};
 use twinstep_protocol::{PROTOCOL, decode, encode, message, tensor};
 use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::{Session, Wait};
@@ -35,13 +35,13 @@ pub fn three_times(endpoint: &str) -> Result<(), String> {
     let key = |verb| keys::env(&sid, &lease.lease, verb);
     let (protocol, epoch) = (PROTOCOL, lease.epoch);
     let reset = message::ResetRequest { protocol, epoch, seq: 1, seeds: None, mask: None };
-    ask_three_times(&session, &key(Verb::Reset), encode(&reset))?;
+    ask_three_times(&session, &key(EnvMethod::Reset), encode(&reset))?;
     let mut counter = Counter { resets: 1, ..Counter::default() };
     for step in 1..=STEPS {
         let action = [step as f32; 12];
         let actions = tensor::as_bytes(&action);
         let request = message::StepRequest { protocol, epoch, seq: step + 1, actions };
-        let answer = ask_three_times(&session, &key(Verb::Step), encode(&request))?;
+        let answer = ask_three_times(&session, &key(EnvMethod::Step), encode(&request))?;
         let reply: message::StepReply<'_> = decode(&answer).map_err(text)?;
         let obs: Vec<f32> = tensor::read(reply.obs, "obs").map_err(text)?;
         counter.step(&action);
@@ -50,7 +50,7 @@ pub fn three_times(endpoint: &str) -> Result<(), String> {
         }
     }
     let close = message::CloseRequest { protocol, epoch, seq: STEPS + 2 };
-    ask_three_times(&session, &key(Verb::Close), encode(&close))?;
+    ask_three_times(&session, &key(EnvMethod::Close), encode(&close))?;
     session.close().wait().map_err(text)
 }
 

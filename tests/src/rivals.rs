@@ -1,8 +1,8 @@
 //! Pairs of effects that are taken for each other: a robot that has the first, and the question whether it is the second.
 
 use twinstep_model::ModelFile;
-use twinstep_model::effects::Entry;
-use twinstep_sysid::Rivalry;
+use twinstep_model::effects::EffectEntry;
+use twinstep_sysid::HypothesisPair;
 
 use crate::hidden_robot::effect;
 
@@ -14,13 +14,13 @@ pub struct Pair {
     /// What the robot has.
     pub hidden: Side,
     /// What it might have.
-    pub rival: Side,
+    pub alternative: Side,
     /// Whether the trunk's motion is measured, so that motions on the ground tell something.
     pub on_ground: bool,
 }
 
 const fn pair(hidden: Side, rival: Side, on_ground: bool) -> Pair {
-    Pair { hidden, rival, on_ground }
+    Pair { hidden, alternative: rival, on_ground }
 }
 
 /// Pairs that the catalogue says are taken for each other.
@@ -40,16 +40,16 @@ impl Pair {
     pub fn robot(&self) -> ModelFile {
         let (name, scope, values) = self.hidden;
         let (effect, scope) = effect(name, scope);
-        let entry = Entry::new(effect, scope, values.to_vec()).expect("plausible values are allowed");
+        let entry = EffectEntry::new(effect, scope, values.to_vec()).expect("plausible values are allowed");
         ModelFile { effects: vec![entry], ..ModelFile::default() }
     }
 
     /// The question.
-    pub fn rivalry(&self) -> Rivalry {
-        let sides = [self.hidden, self.rival].map(|(name, scope, values)| {
+    pub fn rivalry(&self) -> HypothesisPair {
+        let sides = [self.hidden, self.alternative].map(|(name, scope, values)| {
             let (effect, scope) = effect(name, scope);
             (effect, scope, values.to_vec())
         });
-        Rivalry::new(ModelFile::default(), sides)
+        HypothesisPair::new(ModelFile::default(), sides)
     }
 }

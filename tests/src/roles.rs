@@ -4,13 +4,13 @@ use std::io::Read;
 use std::sync::Arc;
 use std::time::Duration;
 
-use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv, Ticket};
-use twinstep_env_server::{Host, HostError, Server, ServerConfig};
+use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv, LeaseHandle};
+use twinstep_env_server::{EnvFactory, EnvFactoryError, Server, ServerConfig};
 use twinstep_envs::{Counter, CounterEnv};
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv, go2};
 use zenoh::Wait;
 
-use crate::ledger::{Ledger, NUM_ENVS};
+use crate::ledger::{StepOracle, NUM_ENVS};
 
 /// One process of a lane.
 #[derive(clap::Subcommand, Clone, Debug)]
@@ -39,7 +39,7 @@ pub struct ServerArgs {
     pub step_ms: u64,
     /// Plants the error that all this is here to find: every so many steps, one is executed twice.
     #[arg(long)]
-    pub double_every: Option<u32>,
+    pub duplicate_step_every: Option<u32>,
 }
 
 /// Of [`Role::Client`].
@@ -49,7 +49,7 @@ pub struct ClientArgs {
     pub endpoint: String,
     /// The dead client's lease to take over, its epoch, and steps, resets and mixes it had acknowledged.
     #[arg(long, num_args = 2 + 3 * NUM_ENVS)]
-    pub inherit: Option<Vec<String>>,
+    pub reclaim: Option<Vec<String>>,
 }
 
 impl Role {
@@ -109,11 +109,11 @@ struct SlowEnv {
     steps: u32,
 }
 
-impl Host for SlowHost {
-    fn build(&self, num_envs: usize, autoreset: AutoresetMode, _: Option<u32>) -> Result<Box<dyn VecEnv>, HostError> {
+impl EnvFactory for SlowHost {
+    fn build(&self, num_envs: usize, autoreset: AutoresetMode, _: Option<u32>) -> Result<Box<dyn VecEnv>, EnvFactoryError> {
         let inner = CounterEnv::new(&go2(), num_envs, autoreset);
         let step = Duration::from_millis(self.0.step_ms);
-        Ok(Box::new(SlowEnv { inner, step, double_every: self.0.double_every, steps: 0 }))
+        Ok(Box::new(SlowEnv { inner, step, double_every: self.0.duplicate_step_every, steps: 0 }))
     }
 }
 
@@ -156,10 +156,10 @@ fn client(arguments: &ClientArgs) -> Result<(), ClientError> {
         connect_timeout: Duration::from_secs(20),
         ..ConnectOptions::new(&arguments.endpoint, NUM_ENVS)
     };
-    let mut heritage = arguments.inherit.as_deref().map(read_heritage);
+    let mut heritage = arguments.reclaim.as_deref().map(read_heritage);
     loop {
         let (env, ledger) = match heritage.take() {
-            Some((ticket, counters)) => (RemoteVecEnv::reclaim(&options, &ticket)?, Ledger::inherited(counters)),
+            Some((ticket, counters)) => (RemoteVecEnv::reclaim(&options, &ticket)?, StepOracle::after_client_crash(counters)),
             None => match fresh(&options) {
                 Ok(started) => started,
                 Err(reason) => {
@@ -168,7 +168,7 @@ fn client(arguments: &ClientArgs) -> Result<(), ClientError> {
                 }
             },
         };
-        let Ticket { lease, epoch } = env.ticket();
+        let LeaseHandle { lease, epoch } = env.ticket();
         println!("lease {lease} {epoch}");
         match step_until_lost(env, ledger) {
             Ended::Lost(reason) => println!("lost {}", reason.replace('\n', " ")),
@@ -177,9 +177,9 @@ fn client(arguments: &ClientArgs) -> Result<(), ClientError> {
     }
 }
 
-fn fresh(options: &ConnectOptions) -> Result<(RemoteVecEnv, Ledger), String> {
+fn fresh(options: &ConnectOptions) -> Result<(RemoteVecEnv, StepOracle), String> {
     let mut env = RemoteVecEnv::connect(options).map_err(|error| error.to_string())?;
-    let mut ledger = Ledger::after_first_reset();
+    let mut ledger = StepOracle::after_first_reset();
     let obs = env.reset(&ResetRequest::default()).map_err(|error| error.to_string())?;
     ledger.settle(obs)?;
     Ok((env, ledger))
@@ -190,7 +190,7 @@ enum Ended {
     Violation(String),
 }
 
-fn step_until_lost(mut env: RemoteVecEnv, mut ledger: Ledger) -> Ended {
+fn step_until_lost(mut env: RemoteVecEnv, mut ledger: StepOracle) -> Ended {
     loop {
         let actions = ledger.actions();
         if let Err(error) = env.send(&actions) {
@@ -199,7 +199,7 @@ fn step_until_lost(mut env: RemoteVecEnv, mut ledger: Ledger) -> Ended {
         let batch = loop {
             match env.recv().cloned() {
                 Ok(batch) => break batch,
-                Err(error) if gave_up(&error) => println!("waiting {}", error.to_string().replace('\n', " ")),
+                Err(error) if is_timeout(&error) => println!("waiting {}", error.to_string().replace('\n', " ")),
                 Err(error) => return Ended::Lost(error.to_string()),
             }
         };
@@ -211,22 +211,22 @@ fn step_until_lost(mut env: RemoteVecEnv, mut ledger: Ledger) -> Ended {
 }
 
 /// True if nobody knows whether the request was executed: it is asked for again.
-fn gave_up(error: &EnvError) -> bool {
+fn is_timeout(error: &EnvError) -> bool {
     let EnvError::Remote(error) = error else { return false };
-    matches!(error.downcast_ref(), Some(ClientError::NoAnswer { .. }))
+    matches!(error.downcast_ref(), Some(ClientError::RequestTimeout { .. }))
 }
 
 fn write_counters(counters: &[Counter; NUM_ENVS]) -> String {
-    let numbers = counters.iter().flat_map(|counter| [counter.steps, counter.resets, counter.mix]);
+    let numbers = counters.iter().flat_map(|counter| [counter.steps, counter.resets, counter.action_hash]);
     numbers.map(|number| number.to_string()).collect::<Vec<_>>().join(" ")
 }
 
-fn read_heritage(words: &[String]) -> (Ticket, [Counter; NUM_ENVS]) {
+fn read_heritage(words: &[String]) -> (LeaseHandle, [Counter; NUM_ENVS]) {
     let number = |index: usize| words[index].parse::<u64>().expect("the lane passes what a client printed");
     let counter = |env: usize| Counter {
         steps: number(2 + 3 * env) as u32,
         resets: number(3 + 3 * env) as u32,
-        mix: number(4 + 3 * env) as u32,
+        action_hash: number(4 + 3 * env) as u32,
     };
-    (Ticket { lease: words[0].clone(), epoch: number(1) }, std::array::from_fn(counter))
+    (LeaseHandle { lease: words[0].clone(), epoch: number(1) }, std::array::from_fn(counter))
 }

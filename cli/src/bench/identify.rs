@@ -5,16 +5,16 @@ use std::time::Instant;
 
 use rand::RngExt;
 use twinstep_logs::Log;
-use twinstep_model::effects::{Entry, compose};
+use twinstep_model::effects::{EffectEntry, apply_effects};
 use twinstep_model::{
-    JOINT_NAMES, MjcfBase, MjcfDrive, MjcfOptions, ModelFile, Precision, RobotModel, go2, mjcf, stream,
+    JOINT_NAMES, BaseMount, MjcfActuator, MjcfOptions, ModelFile, Precision, RobotModel, go2, mjcf, stream,
 };
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_sysid::{Experiment, Horizon, Options, identify};
+use twinstep_sysid::{Experiment, WindowConfig, IdentifyOptions, identify};
 
-use super::Row;
+use super::Measurement;
 use super::pace::{WINDOWS, measure as pace, median_of};
-use super::peers::{Peers, Setup};
+use super::peers::{Baselines, Setup};
 use crate::exit::{Failure, Signals, other};
 use crate::identify::default_effects;
 use crate::recording;
@@ -23,7 +23,7 @@ use crate::recording;
 const ROLLOUTS: usize = 1000;
 const ROLLOUT_S: f64 = 10.0;
 /// Candidates that are judged at a time: their trajectories fit into memory, and there is work for many cores.
-const TOGETHER: usize = 100;
+const BATCH_SIZE: usize = 100;
 /// Candidates that are judged at a time on one core: half a generation of the search, which fills every register.
 const ON_ONE_CORE: usize = 16;
 /// Robots in MuJoCo: it steps them one after the other.
@@ -33,16 +33,16 @@ const ROLLOUTS_AIM_S: f64 = 10.0;
 const IDENTIFICATION_AIM_S: f64 = 20.0;
 
 /// Robot-seconds a second, seconds for a thousand rollouts, and seconds for an identification.
-pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Measurement>, Failure> {
     let folder = std::env::temp_dir().join(format!("twinstep-bench-{}", std::process::id()));
     let log = recording::unpack(&folder);
     std::fs::remove_dir_all(&folder).map_err(other)?;
     let log = log?;
     let first = log.t()[0];
-    let experiment = Experiment::new(&log, &go2(), Horizon::IDENTIFICATION).map_err(other)?;
-    let rollouts = experiment.clone().only(|row| log.t()[row] - first <= ROLLOUT_S);
+    let experiment = Experiment::new(&log, &go2(), WindowConfig::IDENTIFICATION).map_err(other)?;
+    let rollouts = experiment.clone().filter_rows(|row| log.t()[row] - first <= ROLLOUT_S);
     let candidates = candidates()?;
-    let mut peers = Peers::start(python, &setup(&log, window_s));
+    let mut peers = Baselines::start(python, &setup(&log, window_s));
     let mut rows =
         on_one_core(&rollouts, &candidates[..ON_ONE_CORE], &mut peers, window_s)?.into_iter().collect::<Vec<_>>();
     rows.extend(on_all_cores(&rollouts, &candidates, signals)?);
@@ -56,12 +56,12 @@ fn candidates() -> Result<Vec<RobotModel>, Failure> {
     let mut candidate = || {
         let entries = default_effects().into_iter().map(|(effect, scope)| {
             let values = effect.parameters.iter().map(|parameter| {
-                let [low, high] = parameter.plausible;
+                let [low, high] = parameter.prior_range;
                 random.random_range(low..high)
             });
-            Entry::new(effect, scope, values.collect()).map_err(other)
+            EffectEntry::new(effect, scope, values.collect()).map_err(other)
         });
-        compose(&go2(), &entries.collect::<Result<Vec<_>, _>>()?).map_err(other)
+        apply_effects(&go2(), &entries.collect::<Result<Vec<_>, _>>()?).map_err(other)
     };
     (0..ROLLOUTS).map(|_| candidate()).collect()
 }
@@ -74,9 +74,9 @@ fn simulator(threads: usize) -> Result<BatchRollout, Failure> {
 fn on_one_core(
     rollouts: &Experiment,
     candidates: &[RobotModel],
-    peers: &mut Peers,
+    peers: &mut Baselines,
     window_s: f64,
-) -> Result<[Row; 2], Failure> {
+) -> Result<[Measurement; 2], Failure> {
     let hz = SimConfig::default().physics_hz();
     let (mut simulator, peer) = (simulator(1)?, format!("mujoco {hz}"));
     let (mut single, mut double, mut theirs) = (Vec::new(), Vec::new(), Vec::new());
@@ -90,12 +90,12 @@ fn on_one_core(
         }
         if peers.has(&peer) {
             // It counts drive periods.
-            theirs.push(peers.window(&peer)? * go2().control.drive_dt());
+            theirs.push(peers.window(&peer)? * go2().control.actuator_dt());
         }
     }
     let (single, double) = (median_of(single), median_of(double));
     let theirs = (!theirs.is_empty()).then(|| median_of(theirs));
-    let row = |numbers: &str, value: f64, reference: Option<(String, f64)>| Row {
+    let row = |numbers: &str, value: f64, reference: Option<(String, f64)>| Measurement {
         case: format!("closed-loop rollouts, batch {numbers} {hz} Hz, one core"),
         value,
         unit: "robot-s/s",
@@ -108,15 +108,15 @@ fn on_one_core(
     ])
 }
 
-fn on_all_cores(rollouts: &Experiment, candidates: &[RobotModel], signals: &Signals) -> Result<[Row; 2], Failure> {
+fn on_all_cores(rollouts: &Experiment, candidates: &[RobotModel], signals: &Signals) -> Result<[Measurement; 2], Failure> {
     let mut simulator = simulator(0)?;
     let since = Instant::now();
-    for candidates in candidates.chunks(TOGETHER) {
+    for candidates in candidates.chunks(BATCH_SIZE) {
         signals.check()?;
         rollouts.residuals(&mut simulator, candidates, Precision::Single);
     }
     let seconds = since.elapsed().as_secs_f64();
-    let row = |case: &str, value: f64, unit: &'static str| Row {
+    let row = |case: &str, value: f64, unit: &'static str| Measurement {
         case: format!("{ROLLOUTS} closed-loop rollouts of {ROLLOUT_S} s, {case}"),
         value,
         unit,
@@ -126,7 +126,7 @@ fn on_all_cores(rollouts: &Experiment, candidates: &[RobotModel], signals: &Sign
     Ok([row("all cores", ROLLOUTS as f64 * ROLLOUT_S / seconds, "robot-s/s"), row("time", seconds, "s")])
 }
 
-fn whole_search(experiment: &Experiment, signals: &Signals) -> Result<Row, Failure> {
+fn whole_search(experiment: &Experiment, signals: &Signals) -> Result<Measurement, Failure> {
     let (model, effects, mut simulator) = (ModelFile::default(), default_effects(), simulator(0)?);
     let since = Instant::now();
     let found = identify(
@@ -134,14 +134,14 @@ fn whole_search(experiment: &Experiment, signals: &Signals) -> Result<Row, Failu
         &effects,
         std::slice::from_ref(experiment),
         &mut simulator,
-        &Options::default(),
+        &IdentifyOptions::default(),
         &mut |_, _, _| !signals.check().unwrap_or(true),
     );
     let seconds = since.elapsed().as_secs_f64();
-    if found.map_err(other)?.interrupted.is_some() {
+    if found.map_err(other)?.checkpoint.is_some() {
         return Err(Failure::Interrupted);
     }
-    Ok(Row {
+    Ok(Measurement {
         case: format!("identify {} numbers from 16 s of twelve joints", effects.len()),
         value: seconds,
         unit: "s",
@@ -153,12 +153,12 @@ fn whole_search(experiment: &Experiment, signals: &Signals) -> Result<Row, Failu
 /// What MuJoCo needs to follow the same commands, its drive in the model.
 fn setup(log: &Log, window_s: f64) -> Setup {
     let (control, hz) = (go2().control, SimConfig::default().physics_hz());
-    let drive = MjcfDrive::Position {
+    let drive = MjcfActuator::Position {
         kp: log.kp(JOINT_NAMES[0], 0).unwrap_or(control.kp),
         kd: log.kd(JOINT_NAMES[0], 0).unwrap_or(control.kd),
     };
-    let model = mjcf(&go2(), &MjcfOptions { base: MjcfBase::Fixed, timestep: 1.0 / f64::from(hz), drive });
-    let periods = (ROLLOUT_S / control.drive_dt()).round() as usize;
+    let model = mjcf(&go2(), &MjcfOptions { base: BaseMount::Fixed, timestep: 1.0 / f64::from(hz), actuator: drive });
+    let periods = (ROLLOUT_S / control.actuator_dt()).round() as usize;
     let target = |row: usize| {
         let command = |(name, pose): (&&str, f64)| log.q_cmd(name).map_or(pose, |cells| cells[row]) as f32;
         JOINT_NAMES.iter().zip(control.default_pose).map(command).collect()
@@ -168,7 +168,7 @@ fn setup(log: &Log, window_s: f64) -> Setup {
         threads: Vec::new(),
         targets: (0..periods).map(target).collect(),
         actions: Vec::new(),
-        policy_dt: control.drive_dt(),
+        policy_dt: control.actuator_dt(),
         num_envs: MUJOCO_ROBOTS,
         window_s,
     }

@@ -13,7 +13,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use crate::exit::{Outcome, Signals};
+use crate::exit::{CommandResult, Signals};
 
 /// Measure Twinstep on this machine, side by side with the references, in one run.
 ///
@@ -59,7 +59,7 @@ fn window(text: &str) -> Result<f64, String> {
 
 /// One measured number.
 #[derive(Clone, Serialize)]
-pub struct Row {
+pub struct Measurement {
     /// What was measured.
     pub case: String,
     /// The number.
@@ -74,7 +74,7 @@ pub struct Row {
 
 #[derive(Serialize)]
 struct Results {
-    rows: Vec<Row>,
+    rows: Vec<Measurement>,
     machine: Machine,
 }
 
@@ -87,7 +87,7 @@ struct Machine {
 }
 
 /// Measures and prints.
-pub fn run(args: &Args) -> Outcome {
+pub fn run(args: &Args) -> CommandResult {
     if args.what == Some(What::TcpEcho) {
         return tcp::echo();
     }

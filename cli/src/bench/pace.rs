@@ -9,7 +9,7 @@ pub const WINDOWS: usize = 5;
 
 /// What one window gave.
 #[derive(Clone, Copy)]
-pub struct Pace {
+pub struct Throughput {
     /// Repeats in a second.
     pub per_second: f64,
     /// Median time of one repeat [µs].
@@ -17,7 +17,7 @@ pub struct Pace {
 }
 
 /// Repeats `once` for `window_s` seconds.
-pub fn measure(window_s: f64, mut once: impl FnMut() -> Result<(), Failure>) -> Result<Pace, Failure> {
+pub fn measure(window_s: f64, mut once: impl FnMut() -> Result<(), Failure>) -> Result<Throughput, Failure> {
     let (window, since) = (Duration::from_secs_f64(window_s), Instant::now());
     let mut times = Vec::new();
     let mut last = since;
@@ -29,13 +29,13 @@ pub fn measure(window_s: f64, mut once: impl FnMut() -> Result<(), Failure>) -> 
     }
     let per_second = times.len() as f64 / last.duration_since(since).as_secs_f64();
     times.sort_unstable();
-    Ok(Pace { per_second, median_us: times[times.len() / 2].as_secs_f64() * 1e6 })
+    Ok(Throughput { per_second, median_us: times[times.len() / 2].as_secs_f64() * 1e6 })
 }
 
 /// The median of several windows, number by number.
-pub fn median(paces: &[Pace]) -> Pace {
-    let middle = |pick: fn(&Pace) -> f64| median_of(paces.iter().map(pick).collect());
-    Pace { per_second: middle(|pace| pace.per_second), median_us: middle(|pace| pace.median_us) }
+pub fn median(paces: &[Throughput]) -> Throughput {
+    let middle = |pick: fn(&Throughput) -> f64| median_of(paces.iter().map(pick).collect());
+    Throughput { per_second: middle(|pace| pace.per_second), median_us: middle(|pace| pace.median_us) }
 }
 
 /// The median of a few numbers.

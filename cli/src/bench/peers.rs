@@ -43,7 +43,7 @@ pub struct Program<'a> {
 }
 
 /// The peers that are installed; none without Python.
-pub struct Peers {
+pub struct Baselines {
     process: Option<Process>,
     names: Vec<String>,
     program: String,
@@ -63,7 +63,7 @@ struct PeerError {
     peer: String,
 }
 
-impl Peers {
+impl Baselines {
     /// Asks the interpreter `python` which simulators it has; what it lacks is said on stderr, and left out.
     pub fn start(python: &Path, setup: &Setup) -> Self {
         let install = "pip install \"./clients/python[bench]\"";

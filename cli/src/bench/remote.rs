@@ -1,29 +1,29 @@
 //! Environments with physics: the same walk over Zenoh and in process, in turn.
 
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
-use twinstep_env_server::{Config, Host, SimHost};
+use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
 
-use super::Row;
-use super::pace::{Pace, WINDOWS, measure as pace, median};
+use super::Measurement;
+use super::pace::{Throughput, WINDOWS, measure as pace, median};
 use crate::exit::{Failure, Signals, other};
 use crate::server_process::ServerProcess;
 use crate::trot;
 
 /// Environment steps a second, remote beside in process.
-pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Measurement>, Failure> {
     let mut rows = Vec::new();
     for num_envs in [64, 1024, 4096] {
         let (remote, local) = side_by_side(num_envs, window_s, signals)?;
         let env_steps = num_envs as f64;
-        rows.push(Row {
+        rows.push(Measurement {
             case: format!("walk in process, {num_envs} envs"),
             value: local.per_second * env_steps,
             unit: "env-steps/s",
             reference: None,
             ratio: None,
         });
-        rows.push(Row {
+        rows.push(Measurement {
             case: format!("walk over Zenoh, {num_envs} envs"),
             value: remote.per_second * env_steps,
             unit: "env-steps/s",
@@ -34,10 +34,10 @@ pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
     Ok(rows)
 }
 
-fn side_by_side(num_envs: usize, window_s: f64, signals: &Signals) -> Result<(Pace, Pace), Failure> {
+fn side_by_side(num_envs: usize, window_s: f64, signals: &Signals) -> Result<(Throughput, Throughput), Failure> {
     let server = ServerProcess::start(&[])?;
     let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&server.endpoint, num_envs)).map_err(other)?;
-    let mut local = SimHost::new(Config::default())
+    let mut local = SimEnvFactory::new(Config::default())
         .and_then(|host| host.build(num_envs, AutoresetMode::NextStep, None))
         .map_err(other)?;
     let request = ResetRequest::seeded(1, num_envs);

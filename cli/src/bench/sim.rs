@@ -3,18 +3,18 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use twinstep_env_server::{Config, Host, SimHost};
-use twinstep_model::lanes::Instructions;
+use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
+use twinstep_model::lanes::InstructionSet;
 use twinstep_model::{
-    AutoresetMode, Backend, Command, MjcfBase, MjcfDrive, MjcfOptions, NUM_JOINTS, PerJoint, Placement, ResetRequest,
+    AutoresetMode, Backend, Command, BaseMount, MjcfActuator, MjcfOptions, NUM_JOINTS, PerJoint, InitialState, ResetRequest,
     go2, mjcf,
 };
-use twinstep_sim::{BatchBackend, Engine, Lanes, RapierBackend, SimConfig};
+use twinstep_sim::{BatchBackend, Engine, SimdPrecision, RapierBackend, SimConfig};
 
-use super::Row;
+use super::Measurement;
 use super::pace::{WINDOWS, measure as pace, median_of};
-use super::peers::{Peers, Setup};
-use crate::exit::{Failure, Outcome, Signals, other};
+use super::peers::{Baselines, Setup};
+use crate::exit::{Failure, CommandResult, Signals, other};
 use crate::trot;
 
 /// One way to simulate a robot.
@@ -28,7 +28,7 @@ struct Setting {
 #[derive(Clone, Copy)]
 enum Simulator {
     Rapier,
-    Batch(Lanes),
+    Batch(SimdPrecision),
 }
 
 /// Wanted joint positions [rad] in a drive period of a motion.
@@ -38,22 +38,22 @@ const fn rapier(physics_hz: u32, solver_iterations: u32) -> Setting {
     Setting { simulator: Simulator::Rapier, physics_hz, solver_iterations }
 }
 
-fn batch(lanes: Lanes, physics_hz: u32) -> Setting {
+fn batch(lanes: SimdPrecision, physics_hz: u32) -> Setting {
     Setting { simulator: Simulator::Batch(lanes), physics_hz, solver_iterations: 4 }
 }
 
 fn fastest(physics_hz: u32) -> Setting {
-    batch(Lanes::Single(Instructions::best()), physics_hz)
+    batch(SimdPrecision::Single(InstructionSet::best()), physics_hz)
 }
 
 /// Everything that is measured: rapier, and the batch engine with each instruction set that this processor has.
 fn settings() -> Vec<Setting> {
     let mut settings =
         vec![rapier(200, 1), rapier(200, 2), rapier(200, 4), rapier(400, 1), rapier(1000, 1), rapier(1000, 4)];
-    for instructions in Instructions::available() {
-        settings.extend([200, 400, 1000].map(|physics_hz| batch(Lanes::Single(instructions), physics_hz)));
+    for instructions in InstructionSet::available() {
+        settings.extend([200, 400, 1000].map(|physics_hz| batch(SimdPrecision::Single(instructions), physics_hz)));
     }
-    settings.extend([fastest(4000), batch(Lanes::Double, 1000)]);
+    settings.extend([fastest(4000), batch(SimdPrecision::Double, 1000)]);
     settings
 }
 
@@ -80,23 +80,23 @@ const KP: f32 = 40.0;
 const KD: f32 = 1.0;
 
 /// Environment steps a second and joint error of every setting, beside the simulators that `python` has.
-pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Measurement>, Failure> {
     let motions: [(&str, Target); 2] = [("stance step", stance_step), ("trot", trot_target)];
     let finest = motions.iter().map(|(_, target)| joint_positions(FINEST, *target)).collect::<Result<Vec<_>, _>>()?;
     let finest_name = name(FINEST);
-    let mut peers = Peers::start(python, &setup(window_s));
+    let mut peers = Baselines::start(python, &setup(window_s));
     let (mut rows, mut mujoco) = (Vec::new(), BTreeMap::<u32, Vec<f64>>::new());
     for setting in settings() {
         signals.check()?;
         let name = name(setting);
         let case = format!("{name}, one core");
-        let (ours, theirs) = beside_mujoco(setting, &mut peers, window_s)?;
+        let (ours, theirs) = compare_with_mujoco(setting, &mut peers, window_s)?;
         let reference = mujoco_name(setting.physics_hz);
         rows.extend(speed_rows(&case, setting.physics_hz, ours, theirs.map(|rate| (&*reference, rate))));
         mujoco.entry(setting.physics_hz).or_default().extend(theirs);
         for ((motion, target), finest) in motions.iter().zip(&finest) {
             let positions = joint_positions(setting, *target)?;
-            rows.push(Row {
+            rows.push(Measurement {
                 case: format!("{name}, joint error, 1 s of {motion}"),
                 value: rms_difference(&positions, finest),
                 unit: "rad",
@@ -117,9 +117,9 @@ pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Ro
 }
 
 /// Env-steps a second, and the time that one robot's physics step takes of it, beside a reference.
-fn speed_rows(case: &str, physics_hz: u32, rate: f64, reference: Option<(&str, f64)>) -> [Row; 2] {
+fn speed_rows(case: &str, physics_hz: u32, rate: f64, reference: Option<(&str, f64)>) -> [Measurement; 2] {
     let steps = go2().control.policy_dt() * f64::from(physics_hz);
-    let row = |case: String, value: f64, unit: &'static str| Row {
+    let row = |case: String, value: f64, unit: &'static str| Measurement {
         case,
         value,
         unit,
@@ -134,7 +134,7 @@ fn speed_rows(case: &str, physics_hz: u32, rate: f64, reference: Option<(&str, f
 }
 
 /// Env-steps a second of ours, and of MuJoCo at the same rate if it is there, in turn.
-fn beside_mujoco(setting: Setting, peers: &mut Peers, window_s: f64) -> Result<(f64, Option<f64>), Failure> {
+fn compare_with_mujoco(setting: Setting, peers: &mut Baselines, window_s: f64) -> Result<(f64, Option<f64>), Failure> {
     let peer = format!("mujoco {}", setting.physics_hz);
     match setting.simulator {
         Simulator::Rapier => {
@@ -142,14 +142,14 @@ fn beside_mujoco(setting: Setting, peers: &mut Peers, window_s: f64) -> Result<(
             beside_peer(trotting(backend)?, peers, &peer, window_s)
         }
         Simulator::Batch(lanes) => {
-            let backend = BatchBackend::with_lanes(go2(), config(setting), ROBOTS, lanes).map_err(other)?;
+            let backend = BatchBackend::with_precision(go2(), config(setting), ROBOTS, lanes).map_err(other)?;
             beside_peer(trotting(backend)?, peers, &peer, window_s)
         }
     }
 }
 
 /// Our environments beside EnvPool's, with observations, rewards and resets on both sides.
-fn beside_envpool(threads: usize, peers: &mut Peers, window_s: f64) -> Result<Vec<Row>, Failure> {
+fn beside_envpool(threads: usize, peers: &mut Baselines, window_s: f64) -> Result<Vec<Measurement>, Failure> {
     let peer = format!("EnvPool Go1 (flat), {ROBOTS} envs, {threads} thread(s)");
     let (ours, theirs) = beside_peer(walking(ROBOTS, threads)?, peers, &format!("envpool {threads}"), window_s)?;
     let case = format!("walk, {}, {ROBOTS} envs, {threads} thread(s)", name(fastest(ENVS_HZ)));
@@ -159,7 +159,7 @@ fn beside_envpool(threads: usize, peers: &mut Peers, window_s: f64) -> Result<Ve
 }
 
 /// What the task costs on top of the bare engine, and what the second core brings.
-fn whole_and_parts(window_s: f64) -> Result<[Row; 3], Failure> {
+fn whole_and_parts(window_s: f64) -> Result<[Measurement; 3], Failure> {
     let bare = |threads| {
         let config = SimConfig { threads, ..config(fastest(ENVS_HZ)) };
         trotting(BatchBackend::new(go2(), config, MANY).map_err(other)?)
@@ -178,10 +178,10 @@ fn whole_and_parts(window_s: f64) -> Result<[Row; 3], Failure> {
 }
 
 /// A policy period of `num_envs` environments of the task `walk`, again and again.
-fn walking(num_envs: usize, threads: usize) -> Result<impl FnMut() -> Outcome, Failure> {
+fn walking(num_envs: usize, threads: usize) -> Result<impl FnMut() -> CommandResult, Failure> {
     let config = Config { sim: SimConfig { threads, ..config(fastest(ENVS_HZ)) }, ..Config::default() };
     let mut envs =
-        SimHost::new(config).and_then(|host| host.build(num_envs, AutoresetMode::NextStep, None)).map_err(other)?;
+        SimEnvFactory::new(config).and_then(|host| host.build(num_envs, AutoresetMode::NextStep, None)).map_err(other)?;
     envs.reset(&ResetRequest::seeded(1, num_envs)).map_err(other)?;
     let mut step = 0;
     Ok(move || {
@@ -191,8 +191,8 @@ fn walking(num_envs: usize, threads: usize) -> Result<impl FnMut() -> Outcome, F
     })
 }
 
-fn row(case: String, value: f64, reference: Option<(&str, f64)>) -> Row {
-    Row {
+fn row(case: String, value: f64, reference: Option<(&str, f64)>) -> Measurement {
+    Measurement {
         case,
         value,
         unit: "env-steps/s",
@@ -203,8 +203,8 @@ fn row(case: String, value: f64, reference: Option<(&str, f64)>) -> Row {
 
 /// Env-steps a second of two of ours with [`MANY`] robots; windows of both in turn.
 fn in_turn(
-    mut one: impl FnMut() -> Outcome,
-    mut other: impl FnMut() -> Outcome,
+    mut one: impl FnMut() -> CommandResult,
+    mut other: impl FnMut() -> CommandResult,
     window_s: f64,
 ) -> Result<(f64, f64), Failure> {
     let (mut first, mut second) = (Vec::new(), Vec::new());
@@ -217,8 +217,8 @@ fn in_turn(
 
 /// Env-steps a second of `once`, which steps [`ROBOTS`] robots, and of a peer; windows of both in turn.
 fn beside_peer(
-    mut once: impl FnMut() -> Outcome,
-    peers: &mut Peers,
+    mut once: impl FnMut() -> CommandResult,
+    peers: &mut Baselines,
     peer: &str,
     window_s: f64,
 ) -> Result<(f64, Option<f64>), Failure> {
@@ -236,9 +236,9 @@ fn beside_peer(
 fn setup(window_s: f64) -> Setup {
     let control = go2().control;
     let model = |physics_hz: u32| {
-        let drive = MjcfDrive::Position { kp: f64::from(KP), kd: f64::from(KD) };
+        let drive = MjcfActuator::Position { kp: f64::from(KP), kd: f64::from(KD) };
         let timestep = 1.0 / f64::from(physics_hz);
-        (physics_hz, mjcf(&go2(), &MjcfOptions { base: MjcfBase::Floating, timestep, drive }))
+        (physics_hz, mjcf(&go2(), &MjcfOptions { base: BaseMount::Floating, timestep, actuator: drive }))
     };
     Setup {
         models: MUJOCO_HZ.into_iter().map(model).collect(),
@@ -254,8 +254,8 @@ fn setup(window_s: f64) -> Setup {
 fn name(Setting { simulator, physics_hz, solver_iterations }: Setting) -> String {
     let simulator = match simulator {
         Simulator::Rapier => "rapier".to_owned(),
-        Simulator::Batch(Lanes::Single(instructions)) => format!("batch {instructions}"),
-        Simulator::Batch(Lanes::Double) => "batch f64".to_owned(),
+        Simulator::Batch(SimdPrecision::Single(instructions)) => format!("batch {instructions}"),
+        Simulator::Batch(SimdPrecision::Double) => "batch f64".to_owned(),
     };
     format!("{simulator} {physics_hz} Hz x {solver_iterations}")
 }
@@ -273,8 +273,8 @@ fn config(Setting { simulator, physics_hz, solver_iterations }: Setting) -> SimC
     SimConfig { engine, physics_hz, solver_iterations, threads: 1, ..SimConfig::default() }
 }
 
-fn place(backend: &mut impl Backend) -> Outcome {
-    let placement = Placement::at_rest(START_HEIGHT, go2().control.default_pose_f32());
+fn place(backend: &mut impl Backend) -> CommandResult {
+    let placement = InitialState::at_rest(START_HEIGHT, go2().control.default_pose_f32());
     let placements: Vec<_> = (0..backend.num_robots()).map(|robot| (robot, placement)).collect();
     backend.reset(&placements).map_err(other)
 }
@@ -284,7 +284,7 @@ fn command(target: PerJoint) -> Command {
 }
 
 /// A policy period of all robots of `backend`, again and again.
-fn trotting(mut backend: impl Backend) -> Result<impl FnMut() -> Outcome, Failure> {
+fn trotting(mut backend: impl Backend) -> Result<impl FnMut() -> CommandResult, Failure> {
     place(&mut backend)?;
     let (decimation, active) = (go2().control.decimation, vec![true; backend.num_robots()]);
     let mut period = 0;
@@ -300,7 +300,7 @@ fn joint_positions(setting: Setting, target: Target) -> Result<Vec<PerJoint>, Fa
     match setting.simulator {
         Simulator::Rapier => play(RapierBackend::new(go2(), config(setting), 1).map_err(other)?, target),
         Simulator::Batch(lanes) => {
-            play(BatchBackend::with_lanes(go2(), config(setting), 1, lanes).map_err(other)?, target)
+            play(BatchBackend::with_precision(go2(), config(setting), 1, lanes).map_err(other)?, target)
         }
     }
 }
@@ -325,7 +325,7 @@ fn stance_step(_: usize) -> PerJoint {
 
 fn trot_target(period: usize) -> PerJoint {
     let control = go2().control;
-    let (pose, action) = (control.default_pose_f32(), trot::action(period as f32 * control.drive_dt() as f32));
+    let (pose, action) = (control.default_pose_f32(), trot::action(period as f32 * control.actuator_dt() as f32));
     std::array::from_fn(|j| pose[j] + control.action_scale as f32 * action[j])
 }
 

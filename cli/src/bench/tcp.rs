@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::process::{Child, Command, Stdio};
 
-use crate::exit::{Failure, Outcome, other};
+use crate::exit::{Failure, CommandResult, other};
 
 /// A connection to an echo process: it reads `request` bytes and writes `reply` bytes, again and again.
 pub struct PingPong {
@@ -35,7 +35,7 @@ impl PingPong {
     }
 
     /// One round trip.
-    pub fn once(&mut self) -> Outcome {
+    pub fn once(&mut self) -> CommandResult {
         self.stream.write_all(&self.request).map_err(other)?;
         self.stream.read_exact(&mut self.reply).map_err(other)
     }
@@ -50,7 +50,7 @@ impl Drop for PingPong {
 }
 
 /// The other end: prints its address, answers one connection, ends with it.
-pub fn echo() -> Outcome {
+pub fn echo() -> CommandResult {
     let listener = TcpListener::bind("127.0.0.1:0").map_err(other)?;
     println!("{}", listener.local_addr().map_err(other)?);
     std::io::stdout().flush().map_err(other)?;

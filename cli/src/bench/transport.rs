@@ -4,8 +4,8 @@ use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_model::{ResetRequest, StepBatch, VecEnv};
 use twinstep_protocol::convert;
 
-use super::Row;
-use super::pace::{Pace, WINDOWS, measure as pace, median};
+use super::Measurement;
+use super::pace::{Throughput, WINDOWS, measure as pace, median};
 use super::tcp::PingPong;
 use crate::exit::{Failure, Signals, other};
 use crate::server_process::ServerProcess;
@@ -14,20 +14,20 @@ use crate::server_process::ServerProcess;
 const CASES: [(usize, bool); 6] = [(1, false), (64, false), (1024, false), (1024, true), (4096, false), (4096, true)];
 
 /// Round trips a second and median latency of each case.
-pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Measurement>, Failure> {
     let mut rows = Vec::new();
     for (num_envs, shared_memory) in CASES {
         let (ours, tcp) = side_by_side(num_envs, shared_memory, window_s, signals)?;
         let profile = if shared_memory { ", shared memory" } else { "" };
         let reference = Some("raw TCP ping-pong with the same payloads".to_owned());
-        rows.push(Row {
+        rows.push(Measurement {
             case: format!("transport, {num_envs} envs{profile}"),
             value: ours.per_second,
             unit: "round trips/s",
             reference: reference.clone(),
             ratio: Some(ours.per_second / tcp.per_second),
         });
-        rows.push(Row {
+        rows.push(Measurement {
             case: format!("transport, {num_envs} envs{profile}, p50"),
             value: ours.median_us,
             unit: "us",
@@ -44,7 +44,7 @@ fn side_by_side(
     shared_memory: bool,
     window_s: f64,
     signals: &Signals,
-) -> Result<(Pace, Pace), Failure> {
+) -> Result<(Throughput, Throughput), Failure> {
     let mut flags = vec!["--task", "counter"];
     if shared_memory {
         flags.push("--shared-memory");

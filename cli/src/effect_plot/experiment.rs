@@ -4,26 +4,26 @@ use std::f64::consts::TAU;
 
 use twinstep_model::JointKind;
 use twinstep_model::effects::Effect;
-use twinstep_sim::Base;
+use twinstep_sim::BaseMount;
 
-use super::quantity::Quantity;
+use super::quantity::PlotQuantity;
 
 /// A motion that shows an effect, and the quantities in which it does.
-pub struct Experiment {
+pub struct EffectDemo {
     /// What the robot is told.
-    pub motion: &'static Motion,
+    pub motion: &'static DemoMotion,
     /// What is shown over time.
-    pub over_time: Quantity,
+    pub over_time: PlotQuantity,
     /// What the law is about: x and y.
-    pub law: [Quantity; 2],
+    pub law: [PlotQuantity; 2],
 }
 
 /// What all legs are told, as offsets from the default pose.
-pub struct Motion {
+pub struct DemoMotion {
     /// In words.
     pub what: &'static str,
     /// Whether the trunk is held.
-    pub base: Base,
+    pub base: BaseMount,
     /// Height of the lowest foot above the ground at the start [m], where the trunk is free.
     pub clearance: f32,
     /// The pose of time 0 is held for so long before it [s].
@@ -45,9 +45,9 @@ pub struct Motion {
 }
 
 /// In the air, with the model's own gains, fully charged and cold.
-const HELD: Motion = Motion {
+const HELD: DemoMotion = DemoMotion {
     what: "",
-    base: Base::Fixed,
+    base: BaseMount::Fixed,
     clearance: 0.0,
     settle: 0.3,
     duration: 3.0,
@@ -59,25 +59,25 @@ const HELD: Motion = Motion {
     temperature: [30.0; 2],
 };
 /// On its feet.
-const STANDING: Motion = Motion { base: Base::Floating, settle: 1.0, kp: 40.0, kd: 1.0, ..HELD };
+const STANDING: DemoMotion = DemoMotion { base: BaseMount::Floating, settle: 1.0, kp: 40.0, kd: 1.0, ..HELD };
 
-const SWING: Motion = Motion {
+const SWING: DemoMotion = DemoMotion {
     what: "held in the air, the thighs swing at 0.8 Hz",
     target: |t| [0.0, 0.4 * (TAU * 0.8 * t).sin(), 0.0],
     ..HELD
 };
-const CHIRP: Motion = Motion {
+const CHIRP: DemoMotion = DemoMotion {
     what: "held in the air, a chirp of the thighs from 0.5 to 3.5 Hz",
     target: |t| [0.0, 0.3 * (TAU * (0.5 + 0.5 * t) * t).sin(), 0.0],
     ..HELD
 };
-const STEP: Motion = Motion {
+const STEP: DemoMotion = DemoMotion {
     what: "held in the air, a step of the thighs",
     duration: 0.5,
     target: |t| [0.0, if t < 0.05 { 0.2 } else { -0.2 }, 0.0],
     ..HELD
 };
-const THROWS: Motion = Motion {
+const THROWS: DemoMotion = DemoMotion {
     what: "held in the air, large steps of the calves with stiff gains",
     duration: 1.0,
     kp: 60.0,
@@ -86,26 +86,26 @@ const THROWS: Motion = Motion {
     target: |t| [0.0, 0.0, 0.6 * (TAU * 2.0 * t).sin().signum()],
     ..HELD
 };
-const SQUATS: Motion =
-    Motion { what: "standing, squats at 1 Hz", target: |t| squat(0.2 * (TAU * t).sin()), ..STANDING };
-const SLOW_SQUATS: Motion =
-    Motion { what: "standing, squats at 0.4 Hz", target: |t| squat(0.2 * (TAU * 0.4 * t).sin()), ..STANDING };
-const BATTERY: Motion =
-    Motion { what: "standing, squats at 0.4 Hz while the battery empties", voltage: [33.6, 26.0], ..SLOW_SQUATS };
-const HEAT: Motion =
-    Motion { what: "standing, squats at 0.4 Hz while the motors heat up", temperature: [25.0, 85.0], ..SLOW_SQUATS };
-const SWAY: Motion = Motion {
+const SQUATS: DemoMotion =
+    DemoMotion { what: "standing, squats at 1 Hz", target: |t| squat(0.2 * (TAU * t).sin()), ..STANDING };
+const SLOW_SQUATS: DemoMotion =
+    DemoMotion { what: "standing, squats at 0.4 Hz", target: |t| squat(0.2 * (TAU * 0.4 * t).sin()), ..STANDING };
+const BATTERY: DemoMotion =
+    DemoMotion { what: "standing, squats at 0.4 Hz while the battery empties", voltage: [33.6, 26.0], ..SLOW_SQUATS };
+const HEAT: DemoMotion =
+    DemoMotion { what: "standing, squats at 0.4 Hz while the motors heat up", temperature: [25.0, 85.0], ..SLOW_SQUATS };
+const SWAY: DemoMotion = DemoMotion {
     what: "standing, the hips sway at 2 Hz",
     target: |t| [0.25 * (TAU * 2.0 * t).sin(), 0.0, 0.0],
     ..STANDING
 };
-const LEAN: Motion = Motion {
+const LEAN: DemoMotion = DemoMotion {
     what: "standing, the hips lean slowly to both sides",
     target: |t| [0.03 * (TAU * 0.7 * t).sin(), 0.0, 0.0],
     ..STANDING
 };
-const DROP: Motion =
-    Motion { what: "dropped onto its feet from 3 cm", clearance: 0.03, settle: 0.0, duration: 0.5, ..STANDING };
+const DROP: DemoMotion =
+    DemoMotion { what: "dropped onto its feet from 3 cm", clearance: 0.03, settle: 0.0, duration: 0.5, ..STANDING };
 
 /// Thigh and calf that bend together, so that the foot stays below the hip.
 fn squat(bend: f64) -> [f64; 3] {
@@ -113,32 +113,32 @@ fn squat(bend: f64) -> [f64; 3] {
 }
 
 /// The motion and the quantities for an effect of the catalogue.
-pub fn of(effect: &Effect) -> Experiment {
-    use Quantity::{
-        Acceleration, Force, FrontShare, Given, Gyro, Height, Lift, Pitch, Position, Push, Sideways, Strength,
-        Temperature, Time, Turn, Unexplained, Velocity, Voltage, Wanted,
+pub fn of(effect: &Effect) -> EffectDemo {
+    use PlotQuantity::{
+        Acceleration, Force, FrontShare, EstimatedTorque, Gyro, Height, VerticalAcceleration, Pitch, Position, LateralAcceleration, Sideways, DeratingFactor,
+        Temperature, Time, RollRate, InverseDynamicsResidual, Velocity, Voltage, CommandedTorque,
     };
     let (motion, over_time, law) = match effect.name {
         "encoder_offset" => (&SLOW_SQUATS, Height, [Position, Height]),
-        "torque_saturation" => (&THROWS, Given, [Wanted, Given]),
-        "supply_sag" => (&BATTERY, Height, [Voltage, Strength]),
-        "thermal_derating" => (&HEAT, Height, [Temperature, Strength]),
-        "torque_speed_limit" => (&THROWS, Given, [Velocity, Given]),
-        "torque_sensor_delay" => (&CHIRP, Given, [Wanted, Given]),
-        "torque_gain" | "load_friction" => (&CHIRP, Position, [Given, Unexplained]),
-        "torque_ripple" | "joint_spring" => (&SWING, Position, [Position, Unexplained]),
-        "backlash" => (&CHIRP, Position, [Time, Unexplained]),
-        "joint_elasticity" => (&STEP, Position, [Time, Unexplained]),
-        "coulomb_friction" | "stribeck_friction" => (&SWING, Position, [Velocity, Unexplained]),
-        "viscous_friction" => (&CHIRP, Position, [Velocity, Unexplained]),
-        "armature" => (&CHIRP, Position, [Acceleration, Unexplained]),
-        "payload" | "inertia" => (&SQUATS, Height, [Lift, Force]),
+        "torque_saturation" => (&THROWS, EstimatedTorque, [CommandedTorque, EstimatedTorque]),
+        "supply_sag" => (&BATTERY, Height, [Voltage, DeratingFactor]),
+        "thermal_derating" => (&HEAT, Height, [Temperature, DeratingFactor]),
+        "torque_speed_limit" => (&THROWS, EstimatedTorque, [Velocity, EstimatedTorque]),
+        "torque_sensor_delay" => (&CHIRP, EstimatedTorque, [CommandedTorque, EstimatedTorque]),
+        "torque_gain" | "load_friction" => (&CHIRP, Position, [EstimatedTorque, InverseDynamicsResidual]),
+        "torque_ripple" | "joint_spring" => (&SWING, Position, [Position, InverseDynamicsResidual]),
+        "backlash" => (&CHIRP, Position, [Time, InverseDynamicsResidual]),
+        "joint_elasticity" => (&STEP, Position, [Time, InverseDynamicsResidual]),
+        "coulomb_friction" | "stribeck_friction" => (&SWING, Position, [Velocity, InverseDynamicsResidual]),
+        "viscous_friction" => (&CHIRP, Position, [Velocity, InverseDynamicsResidual]),
+        "armature" => (&CHIRP, Position, [Acceleration, InverseDynamicsResidual]),
+        "payload" | "inertia" => (&SQUATS, Height, [VerticalAcceleration, Force]),
         "com_shift" => (&SLOW_SQUATS, Pitch, [Time, FrontShare]),
-        "ground_friction" => (&SWAY, Sideways, [Time, Push]),
+        "ground_friction" => (&SWAY, Sideways, [Time, LateralAcceleration]),
         "ground_stiffness" => (&DROP, Height, [Time, Force]),
-        "gyro_bias" => (&LEAN, Gyro, [Turn, Gyro]),
+        "gyro_bias" => (&LEAN, Gyro, [RollRate, Gyro]),
         // What comes late (command_delay, torque_delay, drive_lag); and what has no motion of its own yet.
-        _ => (&CHIRP, Position, [Wanted, Given]),
+        _ => (&CHIRP, Position, [CommandedTorque, EstimatedTorque]),
     };
-    Experiment { motion, over_time, law }
+    EffectDemo { motion, over_time, law }
 }

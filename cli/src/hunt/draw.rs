@@ -2,48 +2,48 @@
 
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
-use twinstep_model::effects::{Effect, Entry, Scope, Target};
+use twinstep_model::effects::{Effect, EffectEntry, Scope, Target};
 use twinstep_model::{Joint, JointKind, Leg, ModelFile, Stream, standard_normal, stream};
 
-use super::outside::Outside;
+use super::outside::UnmodelledEffect;
 
 /// What a case hides.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Kind {
+pub enum CaseKind {
     /// One effect, from half of its plausible range on.
-    Half,
+    LargeEffect,
     /// One effect, at a fifth of its plausible range.
-    Fifth,
+    SmallEffect,
     /// Nothing.
-    Nothing,
+    Healthy,
     /// Something that the catalogue does not have.
-    Outside,
+    UnmodelledEffect,
     /// Two effects, each from half of its plausible range on.
-    Two,
+    TwoEffects,
 }
 
 /// How often each kind comes in a shuffled deck, so that any 28 cases in a row from a multiple of 28 have the same mix.
-const DECK: [(Kind, usize); 5] =
-    [(Kind::Half, 6), (Kind::Fifth, 6), (Kind::Nothing, 8), (Kind::Outside, 4), (Kind::Two, 4)];
+const CASE_MIX: [(CaseKind, usize); 5] =
+    [(CaseKind::LargeEffect, 6), (CaseKind::SmallEffect, 6), (CaseKind::Healthy, 8), (CaseKind::UnmodelledEffect, 4), (CaseKind::TwoEffects, 4)];
 
 /// Where the robot moves.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Place {
+pub enum BaseSchedule {
     /// The trunk is held.
-    Air,
+    Fixed,
     /// The robot stands.
-    Stance,
+    Floating,
     /// First one, then the other.
-    Both,
+    FixedThenFloating,
 }
 
 /// What the log will have, whatever is hidden.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Setting {
+pub struct LogSetup {
     /// Where the robot moves.
-    pub place: Place,
+    pub place: BaseSchedule,
     /// Whether the motors' current was measured.
     pub torque: bool,
     /// Whether the supply's voltage was measured.
@@ -54,7 +54,7 @@ pub struct Setting {
 
 /// What an effect needs to show.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Need {
+enum Requirement {
     /// Legs that are free to move fast, creep and step.
     Air,
     /// Feet on the ground.
@@ -66,30 +66,30 @@ enum Need {
 
 /// What each effect needs to show. Not drawn are `inertia`, ten numbers that are another way to say payload and shift,
 /// and `ground_friction`: no foot slips in these motions.
-const NEEDS: [(&str, &[Need]); 23] = [
-    ("command_delay", &[Need::Air]),
-    ("encoder_offset", &[Need::Ground]),
-    ("torque_saturation", &[Need::Air]),
-    ("supply_sag", &[Need::Battery]),
-    ("thermal_derating", &[Need::Temperature, Need::Air]),
-    ("torque_delay", &[Need::Air]),
-    ("torque_speed_limit", &[Need::Air]),
-    ("drive_lag", &[Need::Air]),
-    ("torque_sensor_delay", &[Need::Torque, Need::Air]),
-    ("torque_gain", &[Need::Air]),
-    ("torque_ripple", &[Need::Air]),
-    ("backlash", &[Need::Air]),
-    ("joint_elasticity", &[Need::Air]),
-    ("coulomb_friction", &[Need::Air]),
-    ("viscous_friction", &[Need::Air]),
-    ("stribeck_friction", &[Need::Air]),
-    ("load_friction", &[Need::Ground]),
-    ("armature", &[Need::Air]),
-    ("joint_spring", &[Need::Air]),
-    ("payload", &[Need::Ground]),
-    ("com_shift", &[Need::Ground]),
-    ("ground_stiffness", &[Need::Ground]),
-    ("gyro_bias", &[Need::Ground]),
+const NEEDS: [(&str, &[Requirement]); 23] = [
+    ("command_delay", &[Requirement::Air]),
+    ("encoder_offset", &[Requirement::Ground]),
+    ("torque_saturation", &[Requirement::Air]),
+    ("supply_sag", &[Requirement::Battery]),
+    ("thermal_derating", &[Requirement::Temperature, Requirement::Air]),
+    ("torque_delay", &[Requirement::Air]),
+    ("torque_speed_limit", &[Requirement::Air]),
+    ("drive_lag", &[Requirement::Air]),
+    ("torque_sensor_delay", &[Requirement::Torque, Requirement::Air]),
+    ("torque_gain", &[Requirement::Air]),
+    ("torque_ripple", &[Requirement::Air]),
+    ("backlash", &[Requirement::Air]),
+    ("joint_elasticity", &[Requirement::Air]),
+    ("coulomb_friction", &[Requirement::Air]),
+    ("viscous_friction", &[Requirement::Air]),
+    ("stribeck_friction", &[Requirement::Air]),
+    ("load_friction", &[Requirement::Ground]),
+    ("armature", &[Requirement::Air]),
+    ("joint_spring", &[Requirement::Air]),
+    ("payload", &[Requirement::Ground]),
+    ("com_shift", &[Requirement::Ground]),
+    ("ground_stiffness", &[Requirement::Ground]),
+    ("gyro_bias", &[Requirement::Ground]),
 ];
 
 /// One round of the game.
@@ -100,13 +100,13 @@ pub struct Case {
     /// Of the case, from 0.
     pub number: u64,
     /// What it hides.
-    pub kind: Kind,
+    pub kind: CaseKind,
     /// What the log will have.
-    pub setting: Setting,
+    pub setting: LogSetup,
     /// Hidden effects of the catalogue.
-    pub hidden: Vec<Entry>,
+    pub hidden: Vec<EffectEntry>,
     /// What else is hidden.
-    pub outside: Option<Outside>,
+    pub outside: Option<UnmodelledEffect>,
 }
 
 impl Case {
@@ -116,12 +116,12 @@ impl Case {
         let setting = setting(&mut stream(seed, "hunt setting", number));
         let random = &mut stream(seed, "hunt hidden", number);
         let hidden = match kind {
-            Kind::Half => vec![from_half(setting, random)],
-            Kind::Fifth => vec![entry(setting, 0.2, random)],
-            Kind::Two => two(setting, random),
-            Kind::Nothing | Kind::Outside => Vec::new(),
+            CaseKind::LargeEffect => vec![from_half(setting, random)],
+            CaseKind::SmallEffect => vec![entry(setting, 0.2, random)],
+            CaseKind::TwoEffects => two(setting, random),
+            CaseKind::Healthy | CaseKind::UnmodelledEffect => Vec::new(),
         };
-        let outside = (kind == Kind::Outside).then(|| Outside::draw(setting.place, random));
+        let outside = (kind == CaseKind::UnmodelledEffect).then(|| UnmodelledEffect::draw(setting.place, random));
         Self { seed, number, kind, setting, hidden, outside }
     }
 
@@ -136,8 +136,8 @@ impl Case {
     }
 }
 
-fn kind(seed: u64, number: u64) -> Kind {
-    let mut deck: Vec<_> = DECK.iter().flat_map(|(kind, count)| std::iter::repeat_n(*kind, *count)).collect();
+fn kind(seed: u64, number: u64) -> CaseKind {
+    let mut deck: Vec<_> = CASE_MIX.iter().flat_map(|(kind, count)| std::iter::repeat_n(*kind, *count)).collect();
     let size = deck.len() as u64;
     let random = &mut stream(seed, "hunt deck", number / size);
     // Fisher and Yates.
@@ -147,13 +147,13 @@ fn kind(seed: u64, number: u64) -> Kind {
     deck[(number % size) as usize]
 }
 
-fn setting(random: &mut impl Rng) -> Setting {
+fn setting(random: &mut impl Rng) -> LogSetup {
     let place = match random.random_range(0.0..1.0) {
-        share if share < 0.35 => Place::Air,
-        share if share < 0.45 => Place::Stance,
-        _ => Place::Both,
+        share if share < 0.35 => BaseSchedule::Fixed,
+        share if share < 0.45 => BaseSchedule::Floating,
+        _ => BaseSchedule::FixedThenFloating,
     };
-    Setting {
+    LogSetup {
         place,
         torque: random.random_bool(0.7),
         battery: random.random_bool(0.5),
@@ -161,14 +161,14 @@ fn setting(random: &mut impl Rng) -> Setting {
     }
 }
 
-impl Setting {
-    fn has(self, need: Need) -> bool {
+impl LogSetup {
+    fn has(self, need: Requirement) -> bool {
         match need {
-            Need::Air => self.place != Place::Stance,
-            Need::Ground => self.place != Place::Air,
-            Need::Torque => self.torque,
-            Need::Battery => self.battery,
-            Need::Temperature => self.temperature,
+            Requirement::Air => self.place != BaseSchedule::Floating,
+            Requirement::Ground => self.place != BaseSchedule::Fixed,
+            Requirement::Torque => self.torque,
+            Requirement::Battery => self.battery,
+            Requirement::Temperature => self.temperature,
         }
     }
 
@@ -180,26 +180,26 @@ impl Setting {
 }
 
 /// An effect with a size of half of its plausible range to all of it.
-fn from_half(setting: Setting, random: &mut impl Rng) -> Entry {
+fn from_half(setting: LogSetup, random: &mut impl Rng) -> EffectEntry {
     let share = random.random_range(0.5..1.0);
     entry(setting, share, random)
 }
 
 /// An effect at `share` of the way from nothing to the end of what is plausible.
-fn entry(setting: Setting, share: f64, random: &mut impl Rng) -> Entry {
+fn entry(setting: LogSetup, share: f64, random: &mut impl Rng) -> EffectEntry {
     let shown = setting.shown();
     let effect = shown[random.random_range(0..shown.len())];
     let scope = scope(effect.target, random);
-    Entry::new(effect, scope, values(effect, share, random)).expect("plausible values are allowed")
+    EffectEntry::new(effect, scope, values(effect, share, random)).expect("plausible values are allowed")
 }
 
 /// Two effects that are not taken for each other and meet at no joint.
-fn two(setting: Setting, random: &mut impl Rng) -> Vec<Entry> {
+fn two(setting: LogSetup, random: &mut impl Rng) -> Vec<EffectEntry> {
     loop {
         let pair = [from_half(setting, random), from_half(setting, random)];
         let [one, other] = &pair;
         let meet = Joint::ALL.into_iter().any(|joint| one.scope.contains(joint) && other.scope.contains(joint));
-        let confused = |one: &Effect, other: &Effect| one.confusions.iter().any(|like| like.with == other.name);
+        let confused = |one: &Effect, other: &Effect| one.confounders.iter().any(|like| like.effect == other.name);
         let alike =
             one.effect == other.effect || confused(one.effect, other.effect) || confused(other.effect, one.effect);
         if !meet && !alike {
@@ -228,19 +228,19 @@ fn scope(target: Target, random: &mut impl Rng) -> Scope {
 fn values(effect: &Effect, share: f64, random: &mut impl Rng) -> Vec<f64> {
     let mut values = Vec::new();
     for (index, parameter) in effect.parameters.iter().enumerate() {
-        let [low, high] = parameter.plausible;
+        let [low, high] = parameter.prior_range;
         if index > 0 {
             values.extend((0..parameter.count).map(|_| random.random_range(low..high)));
         } else if parameter.count > 1 {
             let way: Vec<_> = (0..parameter.count).map(|_| standard_normal(random)).collect();
             let length = way.iter().map(|part| part * part).sum::<f64>().sqrt();
             values.extend(way.iter().map(|part| part / length * share * high));
-        } else if parameter.neutral.is_infinite() {
+        } else if parameter.no_effect_value.is_infinite() {
             // A limit or a stiffness: what counts is its inverse, 0 for none.
             values.push(low / share);
         } else {
             values.push(
-                parameter.neutral + share * (far_end(parameter.neutral, [low, high], random) - parameter.neutral),
+                parameter.no_effect_value + share * (far_end(parameter.no_effect_value, [low, high], random) - parameter.no_effect_value),
             );
         }
     }
@@ -257,7 +257,7 @@ fn far_end(neutral: f64, [low, high]: [f64; 2], random: &mut impl Rng) -> f64 {
 #[cfg(test)]
 mod tests {
     use twinstep_model::effects::CATALOGUE;
-    use twinstep_model::effects::compose;
+    use twinstep_model::effects::apply_effects;
     use twinstep_model::go2;
 
     use super::*;
@@ -273,9 +273,9 @@ mod tests {
     #[test]
     fn two_hundred_cases_have_the_mix_that_is_promised() {
         let count = |kind| (0..200).filter(|number| super::kind(3, *number) == kind).count();
-        assert!(count(Kind::Nothing) >= 50, "a quarter");
-        assert!(count(Kind::Two) >= 28 && count(Kind::Outside) >= 28, "a seventh");
-        assert!(count(Kind::Half) >= 40 && count(Kind::Fifth) >= 40);
+        assert!(count(CaseKind::Healthy) >= 50, "a quarter");
+        assert!(count(CaseKind::TwoEffects) >= 28 && count(CaseKind::UnmodelledEffect) >= 28, "a seventh");
+        assert!(count(CaseKind::LargeEffect) >= 40 && count(CaseKind::SmallEffect) >= 40);
     }
 
     #[test]
@@ -289,15 +289,15 @@ mod tests {
     fn every_case_is_a_robot_and_shows_what_it_hides() {
         for number in 0..300 {
             let case = Case::draw(1, number);
-            compose(&go2(), &case.hidden).expect("a robot");
+            apply_effects(&go2(), &case.hidden).expect("a robot");
             let shown = case.setting.shown();
             assert!(case.hidden.iter().all(|entry| shown.contains(&entry.effect)), "{case:?}");
             let hidden = match case.kind {
-                Kind::Half | Kind::Fifth => 1,
-                Kind::Two => 2,
-                Kind::Nothing | Kind::Outside => 0,
+                CaseKind::LargeEffect | CaseKind::SmallEffect => 1,
+                CaseKind::TwoEffects => 2,
+                CaseKind::Healthy | CaseKind::UnmodelledEffect => 0,
             };
-            assert_eq!((case.hidden.len(), case.outside.is_some()), (hidden, case.kind == Kind::Outside));
+            assert_eq!((case.hidden.len(), case.outside.is_some()), (hidden, case.kind == CaseKind::UnmodelledEffect));
         }
     }
 

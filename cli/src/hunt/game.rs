@@ -7,11 +7,11 @@ use std::time::{Duration, Instant};
 
 use twinstep_model::{ModelFile, RobotModel, go2};
 use twinstep_sim::BatchRollout;
-use twinstep_sysid::{Diagnosis, Errors, RecordError, evaluate};
+use twinstep_sysid::{Diagnosis, RmsErrors, RecordError, evaluate};
 
 use super::draw::Case;
 use super::judge::judge;
-use super::{Diagnose, HuntError, Round, at, plant};
+use super::{Diagnose, HuntError, CaseResult, at, plant};
 use crate::exit::{Failure, Signals, input, other};
 
 /// How often a running diagnosis is looked after.
@@ -20,7 +20,7 @@ const LOOK: Duration = Duration::from_millis(20);
 const BAD_INPUT: i32 = 2;
 
 /// A game that is played.
-pub struct Game<'a> {
+pub struct BlindTest<'a> {
     /// Where it is kept.
     pub out: &'a Path,
     /// What diagnoses.
@@ -32,34 +32,34 @@ pub struct Game<'a> {
 }
 
 /// What a diagnosis said, or complained of.
-struct Answer {
+struct DiagnosisRun {
     said: Result<Diagnosis, String>,
     seconds: f64,
 }
 
-impl Game<'_> {
+impl BlindTest<'_> {
     /// Hides, diagnoses and judges.
-    pub fn round(&mut self, case: &Case) -> Result<Round, Failure> {
+    pub fn run_case(&mut self, case: &Case) -> Result<CaseResult, Failure> {
         let folder = self.out.join(format!("{:04}", case.number));
         let model = self.out.join("nominal.toml");
         std::fs::write(&model, ModelFile::default().to_toml()).map_err(at(&model))?;
         let log = plant::log_of(case, &mut |_| !self.signals.check().unwrap_or(true)).map_err(|error| match error {
-            RecordError::Ended => Failure::Interrupted,
+            RecordError::Interrupted => Failure::Interrupted,
             error => other(error),
         })?;
         let path = folder.join("log");
         log.write(&path).map_err(input)?;
-        let Answer { said, seconds } = self.answer(&path, &model, &folder)?;
+        let DiagnosisRun { said, seconds } = self.answer(&path, &model, &folder)?;
         // Only now: nobody can have read it before.
         let truth = folder.join("truth.toml");
         std::fs::write(&truth, case.truth().to_toml()).map_err(at(&truth))?;
         let mut errors = |robot: &RobotModel| {
             let found = evaluate(&log, robot, &mut self.simulator, |_| true).map_err(other)?;
-            Ok(Errors { torque_rmse_nm: found.torque_rmse_nm, q_rmse_rad: found.q_rmse_rad })
+            Ok(RmsErrors { torque_rmse_nm: found.torque_rmse_nm, q_rmse_rad: found.q_rmse_rad })
         };
         let nominal = errors(&go2())?;
         let truth = errors(&case.truth().robot_model().map_err(other)?)?;
-        Ok(Round {
+        Ok(CaseResult {
             seed: case.seed,
             case: case.number,
             kind: case.kind,
@@ -68,13 +68,13 @@ impl Game<'_> {
             nominal,
             truth,
             verdict: judge(case, said.as_ref().ok(), [nominal, truth]),
-            died: said.err(),
+            error: said.err(),
             seconds,
         })
     }
 
     /// Lets the diagnosis run; its words are kept beside the log.
-    fn answer(&self, log: &Path, model: &Path, folder: &Path) -> Result<Answer, Failure> {
+    fn answer(&self, log: &Path, model: &Path, folder: &Path) -> Result<DiagnosisRun, Failure> {
         let [stdout, stderr] = ["diagnosis.json", "diagnosis.txt"].map(|name| folder.join(name));
         let start = Instant::now();
         let mut command = (self.diagnose)(log, model, &folder.join("report"));
@@ -91,7 +91,7 @@ impl Game<'_> {
         } else {
             Err(format!("{status}: {complaint}"))
         };
-        Ok(Answer { said, seconds })
+        Ok(DiagnosisRun { said, seconds })
     }
 
     fn wait(&self, mut child: Child) -> Result<ExitStatus, Failure> {

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 use twinstep_model::Joint;
-use twinstep_model::effects::{Entry, Scope};
-use twinstep_sysid::{Cause, Diagnosis, Errors, Estimate, Value};
+use twinstep_model::effects::{EffectEntry, Scope};
+use twinstep_sysid::{Cause, Diagnosis, RmsErrors, Estimate, ParameterValue};
 
 use super::draw::Case;
 
@@ -15,23 +15,23 @@ const STRONGEST: usize = 3;
 
 /// What a diagnosis was worth.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Verdict {
+pub struct Score {
     /// What it named, as `effect@scope`, in its order.
     pub named: Vec<String>,
     /// For each hidden effect, how it was found.
-    pub hits: Vec<Hit>,
+    pub hits: Vec<EffectScore>,
     /// Names that were not hidden.
     pub wrong_names: usize,
     /// Of what is outside the catalogue: whether what it depends on was said.
     pub depends_on: Option<bool>,
     /// Shares of the error that it removed on rows held out, of what the truth in our own model removes.
-    pub removed: Removed,
+    pub removed: ErrorReduction,
 }
 
 /// How a hidden effect was found.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[allow(clippy::struct_excessive_bools, reason = "each is a line of the table")]
-pub struct Hit {
+pub struct EffectScore {
     /// Its name.
     pub effect: String,
     /// What it was about.
@@ -41,9 +41,9 @@ pub struct Hit {
     /// Named first.
     pub first: bool,
     /// Not named first, but said to be as likely as what was.
-    pub either: bool,
+    pub ambiguous: bool,
     /// Among the first three names, those of rivals after those of causes.
-    pub first_three: bool,
+    pub in_top_3: bool,
     /// Named, on the joints where it was hidden and no others.
     pub scope_right: bool,
     /// Of the first parameter, where name and scope are right.
@@ -54,14 +54,14 @@ pub struct Hit {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Size {
     /// Whether it lies in its 95 % interval.
-    pub within: bool,
+    pub covered: bool,
     /// Of what the effect adds to nothing, relative.
     pub error: f64,
 }
 
 /// Shares of an error, by where it is seen.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Removed {
+pub struct ErrorReduction {
     /// Of the torque's.
     pub torque: Option<f64>,
     /// Of the motion's, in closed loop.
@@ -72,7 +72,7 @@ pub struct Removed {
 /// true one on the same log.
 ///
 /// A diagnosis that gave no answer named nothing.
-pub fn judge(case: &Case, diagnosis: Option<&Diagnosis>, [nominal, truth]: [Errors; 2]) -> Verdict {
+pub fn judge(case: &Case, diagnosis: Option<&Diagnosis>, [nominal, truth]: [RmsErrors; 2]) -> Score {
     let findings = diagnosis.map_or(&[][..], |diagnosis| &diagnosis.findings);
     let hidden = |name: &str| case.hidden.iter().any(|entry| entry.effect.name == name);
     let depends_on = case.outside.map(|outside| {
@@ -81,7 +81,7 @@ pub fn judge(case: &Case, diagnosis: Option<&Diagnosis>, [nominal, truth]: [Erro
             told.any(|told| outside.depends_on(told))
         })
     });
-    Verdict {
+    Score {
         named: findings.iter().map(|cause| format!("{}@{}", cause.effect, cause.scope)).collect(),
         hits: case.hidden.iter().map(|entry| hit(entry, findings)).collect(),
         wrong_names: findings.iter().filter(|cause| !hidden(&cause.effect)).count(),
@@ -90,7 +90,7 @@ pub fn judge(case: &Case, diagnosis: Option<&Diagnosis>, [nominal, truth]: [Erro
     }
 }
 
-fn hit(entry: &Entry, findings: &[Cause]) -> Hit {
+fn hit(entry: &EffectEntry, findings: &[Cause]) -> EffectScore {
     let name = entry.effect.name;
     let of_name: Vec<_> = findings.iter().filter(|cause| cause.effect == name).collect();
     let first = findings.first().is_some_and(|cause| cause.effect == name);
@@ -99,13 +99,13 @@ fn hit(entry: &Entry, findings: &[Cause]) -> Hit {
     let together: Vec<_> = of_name.iter().flat_map(|cause| places(&cause.scope)).collect();
     let scope_right = !of_name.is_empty() && same(together, places(&entry.scope.to_string()));
     let alone = of_name.iter().find(|cause| same(places(&cause.scope), places(&entry.scope.to_string())));
-    Hit {
+    EffectScore {
         effect: name.to_owned(),
         scope: entry.scope.to_string(),
         named: !of_name.is_empty(),
         first,
-        either: !first && findings.first().is_some_and(ambiguous),
-        first_three: ranking(findings).iter().take(3).any(|told| *told == name),
+        ambiguous: !first && findings.first().is_some_and(ambiguous),
+        in_top_3: ranking(findings).iter().take(3).any(|told| *told == name),
         scope_right,
         size: alone.and_then(|cause| size(entry, cause.parameters.get(entry.effect.parameters[0].name)?)),
     }
@@ -150,12 +150,12 @@ fn same(mut one: Vec<String>, mut other: Vec<String>) -> bool {
 }
 
 /// The first parameter of a finding against the hidden one's.
-fn size(entry: &Entry, found: &Estimate) -> Option<Size> {
+fn size(entry: &EffectEntry, found: &Estimate) -> Option<Size> {
     let parameter = &entry.effect.parameters[0];
     let truth = &entry.values[..parameter.count];
-    let numbers = |value: &Value| match value {
-        Value::Number(number) => vec![*number],
-        Value::Vector(numbers) => numbers.clone(),
+    let numbers = |value: &ParameterValue| match value {
+        ParameterValue::Number(number) => vec![*number],
+        ParameterValue::Vector(numbers) => numbers.clone(),
     };
     let [value, low, high] = [&found.value, &found.low, &found.high].map(numbers);
     if [&value, &low, &high].iter().any(|numbers| numbers.len() != truth.len()) {
@@ -163,19 +163,19 @@ fn size(entry: &Entry, found: &Estimate) -> Option<Size> {
     }
     let within = truth.iter().zip(&low).zip(&high).all(|((truth, low), high)| (low..=high).contains(&truth));
     let norm = |numbers: &mut dyn Iterator<Item = f64>| numbers.map(|number| number * number).sum::<f64>().sqrt();
-    let nothing = if parameter.neutral.is_finite() { parameter.neutral } else { 0.0 };
+    let nothing = if parameter.no_effect_value.is_finite() { parameter.no_effect_value } else { 0.0 };
     let missed = norm(&mut truth.iter().zip(&value).map(|(truth, value)| value - truth));
-    Some(Size { within, error: missed / norm(&mut truth.iter().map(|truth| truth - nothing)) })
+    Some(Size { covered: within, error: missed / norm(&mut truth.iter().map(|truth| truth - nothing)) })
 }
 
-fn removed(diagnosis: &Diagnosis, [nominal, truth]: [Errors; 2]) -> Removed {
+fn removed(diagnosis: &Diagnosis, [nominal, truth]: [RmsErrors; 2]) -> ErrorReduction {
     let (before, after) = (diagnosis.baseline, diagnosis.extended);
-    let share = |of: fn(&Errors) -> Option<f64>| {
-        let share_gone = |before: &Errors, after: &Errors| Some(1.0 - of(after)? / of(before)?);
+    let share = |of: fn(&RmsErrors) -> Option<f64>| {
+        let share_gone = |before: &RmsErrors, after: &RmsErrors| Some(1.0 - of(after)? / of(before)?);
         let possible = share_gone(&nominal, &truth).filter(|gone| *gone >= LEAST_REMOVED)?;
         Some(share_gone(&before, &after)? / possible)
     };
-    Removed { torque: share(|errors| errors.torque_rmse_nm), motion: share(|errors| errors.q_rmse_rad) }
+    ErrorReduction { torque: share(|errors| errors.torque_rmse_nm), motion: share(|errors| errors.q_rmse_rad) }
 }
 
 #[cfg(test)]
@@ -183,25 +183,25 @@ mod tests {
     use std::collections::BTreeMap;
 
     use twinstep_model::effects::Effect;
-    use twinstep_sysid::{Rival, Unexplained};
+    use twinstep_sysid::{AlternativeCause, Unexplained};
 
     use super::*;
-    use crate::hunt::draw::{Kind, Place, Setting};
-    use crate::hunt::outside::Outside;
+    use crate::hunt::draw::{CaseKind, BaseSchedule, LogSetup};
+    use crate::hunt::outside::UnmodelledEffect;
 
     fn case(hidden: &[(&str, &str, f64)]) -> Case {
         let entry = |(name, scope, value): &(&str, &str, f64)| {
             let effect = Effect::named(name).expect("known");
-            Entry::new(effect, scope.parse().expect("a scope"), vec![*value]).expect("allowed")
+            EffectEntry::new(effect, scope.parse().expect("a scope"), vec![*value]).expect("allowed")
         };
-        let setting = Setting { place: Place::Air, torque: true, battery: false, temperature: false };
+        let setting = LogSetup { place: BaseSchedule::Fixed, torque: true, battery: false, temperature: false };
         let hidden = hidden.iter().map(entry).collect();
-        Case { seed: 0, number: 0, kind: Kind::Half, setting, hidden, outside: None }
+        Case { seed: 0, number: 0, kind: CaseKind::LargeEffect, setting, hidden, outside: None }
     }
 
     fn cause(effect: &str, scope: &str, [low, value, high]: [f64; 3]) -> Cause {
         let name = Effect::named(effect).expect("known").parameters[0].name.to_owned();
-        let [low, value, high] = [low, value, high].map(Value::Number);
+        let [low, value, high] = [low, value, high].map(ParameterValue::Number);
         Cause {
             effect: effect.to_owned(),
             scope: scope.to_owned(),
@@ -217,9 +217,9 @@ mod tests {
 
     fn said(findings: Vec<Cause>) -> Diagnosis {
         Diagnosis {
-            baseline: Errors { torque_rmse_nm: Some(1.0), q_rmse_rad: Some(0.020) },
-            extended: Errors { torque_rmse_nm: Some(0.6), q_rmse_rad: Some(0.008) },
-            noise_floor: Errors::default(),
+            baseline: RmsErrors { torque_rmse_nm: Some(1.0), q_rmse_rad: Some(0.020) },
+            extended: RmsErrors { torque_rmse_nm: Some(0.6), q_rmse_rad: Some(0.008) },
+            noise_floor: RmsErrors::default(),
             findings,
             confusable: Vec::new(),
             unexplained: Unexplained::default(),
@@ -228,11 +228,11 @@ mod tests {
         }
     }
 
-    fn errors(torque: f64, q: f64) -> Errors {
-        Errors { torque_rmse_nm: Some(torque), q_rmse_rad: Some(q) }
+    fn errors(torque: f64, q: f64) -> RmsErrors {
+        RmsErrors { torque_rmse_nm: Some(torque), q_rmse_rad: Some(q) }
     }
 
-    fn judged(case: &Case, findings: Vec<Cause>) -> Verdict {
+    fn judged(case: &Case, findings: Vec<Cause>) -> Score {
         judge(case, Some(&said(findings)), [errors(1.0, 0.04), errors(0.95, 0.01)])
     }
 
@@ -241,9 +241,9 @@ mod tests {
         let case = case(&[("torque_gain", "RR_calf", 1.2)]);
         let verdict = judged(&case, vec![cause("torque_gain", "RR_calf", [1.15, 1.18, 1.21])]);
         let hit = &verdict.hits[0];
-        assert!(hit.first && hit.first_three && hit.scope_right && hit.named && !hit.either);
+        assert!(hit.first && hit.in_top_3 && hit.scope_right && hit.named && !hit.ambiguous);
         let size = hit.size.expect("compared");
-        assert!(size.within && (size.error - 0.1).abs() < 1e-9, "a gain's size is what it adds to one");
+        assert!(size.covered && (size.error - 0.1).abs() < 1e-9, "a gain's size is what it adds to one");
         assert_eq!((verdict.named[0].as_str(), verdict.wrong_names), ("torque_gain@RR_calf", 0));
     }
 
@@ -263,18 +263,18 @@ mod tests {
         wrong.ambiguous_with = vec!["torque_delay@all".to_owned()];
         let verdict = judged(&case, vec![wrong.clone()]);
         let hit = &verdict.hits[0];
-        assert!(!hit.first && !hit.named && hit.either && hit.first_three && verdict.wrong_names == 1);
+        assert!(!hit.first && !hit.named && hit.ambiguous && hit.in_top_3 && verdict.wrong_names == 1);
         wrong.ambiguous_with.clear();
-        wrong.rivals = vec![Rival { effect: "torque_delay".to_owned(), scope: "all".to_owned(), held_out_gain: 0.1 }];
+        wrong.rivals = vec![AlternativeCause { effect: "torque_delay".to_owned(), scope: "all".to_owned(), held_out_gain: 0.1 }];
         let hit = &judged(&case, vec![wrong]).hits[0];
-        assert!(!hit.either && hit.first_three);
+        assert!(!hit.ambiguous && hit.in_top_3);
     }
 
     #[test]
     fn any_name_is_wrong_where_nothing_or_something_else_is_hidden() {
         let mut other = case(&[]);
         assert_eq!(judged(&other, vec![cause("armature", "all", [0.0; 3])]).wrong_names, 1);
-        other.outside = Some(Outside::DeadBand { joint: 0, width: 1.0 });
+        other.outside = Some(UnmodelledEffect::DeadBand { joint: 0, width: 1.0 });
         let mut diagnosis = said(Vec::new());
         let judged = |diagnosis: &Diagnosis| judge(&other, Some(diagnosis), [errors(1.0, 0.04); 2]);
         assert_eq!(judged(&diagnosis).depends_on, Some(false));

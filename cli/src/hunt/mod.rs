@@ -16,14 +16,14 @@ use std::process::Command;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::{Deserialize, Serialize};
 use twinstep_model::go2;
-use twinstep_sysid::Errors;
+use twinstep_sysid::RmsErrors;
 
 use crate::evaluate::simulator;
-use crate::exit::{Failure, Outcome, Signals, input, other};
-use draw::{Case, Kind, Setting};
-use game::Game;
-use judge::Verdict;
-use outside::Outside;
+use crate::exit::{Failure, CommandResult, Signals, input, other};
+use draw::{Case, CaseKind, LogSetup};
+use game::BlindTest;
+use judge::Score;
+use outside::UnmodelledEffect;
 
 /// Hide effects in simulated robots, let `twinstep diagnose` look for them, and judge what it says.
 ///
@@ -57,21 +57,21 @@ pub struct Args {
 
 /// A line of `cases.jsonl`: a case and what came of it.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Round {
+pub struct CaseResult {
     /// Of the game.
     seed: u64,
     /// Of the case.
     case: u64,
-    kind: Kind,
-    setting: Setting,
-    outside: Option<Outside>,
+    kind: CaseKind,
+    setting: LogSetup,
+    outside: Option<UnmodelledEffect>,
     /// Errors on the log of the model that the diagnosis was given.
-    nominal: Errors,
+    nominal: RmsErrors,
     /// Errors on the log of the true effects in our own model.
-    truth: Errors,
-    verdict: Verdict,
+    truth: RmsErrors,
+    verdict: Score,
     /// What the diagnosis complained of, if it gave no answer.
-    died: Option<String>,
+    error: Option<String>,
     /// Time of the diagnosis [s].
     seconds: f64,
 }
@@ -98,7 +98,7 @@ fn at(path: &Path) -> impl FnOnce(std::io::Error) -> Failure {
 }
 
 /// Plays all cases and prints the table.
-pub fn run(args: &Args) -> Outcome {
+pub fn run(args: &Args) -> CommandResult {
     let program = std::env::current_exe().map_err(other)?;
     let diagnose = move |log: &Path, model: &Path, out: &Path| {
         let mut command = Command::new(&program);
@@ -121,11 +121,11 @@ fn play(args: &Args, diagnose: &Diagnose) -> Result<String, Failure> {
     }
     std::fs::create_dir_all(&args.out).map_err(at(&args.out))?;
     let mut lines = OpenOptions::new().append(true).create(true).open(&ledger).map_err(at(&ledger))?;
-    let mut game = Game { out: &args.out, diagnose, signals: Signals::listen()?, simulator: simulator(&go2())? };
+    let mut game = BlindTest { out: &args.out, diagnose, signals: Signals::listen()?, simulator: simulator(&go2())? };
     let bar = progress_bar(args.cases);
     for number in 0..args.cases {
         if !rounds.iter().any(|round| round.case == number) {
-            let round = game.round(&Case::draw(args.seed, number))?;
+            let round = game.run_case(&Case::draw(args.seed, number))?;
             let line = serde_json::to_string(&round).map_err(other)?;
             writeln!(lines, "{line}").map_err(at(&ledger))?;
             rounds.push(round);
@@ -146,11 +146,11 @@ fn progress_bar(cases: u64) -> ProgressBar {
 }
 
 /// The cases that were judged before.
-fn played(ledger: &Path, seed: u64) -> Result<Vec<Round>, HuntError> {
+fn played(ledger: &Path, seed: u64) -> Result<Vec<CaseResult>, HuntError> {
     let path = || ledger.to_owned();
     let text = std::fs::read_to_string(ledger).map_err(|cause| HuntError::File { path: path(), cause })?;
     let round = |(index, line): (usize, &str)| {
-        let round: Round =
+        let round: CaseResult =
             serde_json::from_str(line).map_err(|cause| HuntError::Line { path: path(), line: index + 1, cause })?;
         if round.seed == seed {
             Ok(round)
@@ -163,7 +163,7 @@ fn played(ledger: &Path, seed: u64) -> Result<Vec<Round>, HuntError> {
 
 #[cfg(test)]
 mod tests {
-    use super::draw::Place;
+    use super::draw::BaseSchedule;
     use super::*;
 
     /// Finds nothing, and notes what it was given.
@@ -208,7 +208,7 @@ mod tests {
         assert!(text.contains("| the diagnosis died | none | 1 of 2: 50 % |"), "{text}");
         let rounds = played(&out.join("cases.jsonl"), 4).expect("lines");
         assert_eq!(rounds.iter().map(|round| round.case).collect::<Vec<_>>(), [0, 1]);
-        assert!(rounds[1].died.as_ref().is_some_and(|died| died.contains("it broke")));
+        assert!(rounds[1].error.as_ref().is_some_and(|died| died.contains("it broke")));
         assert!(out.join("hunt.md").exists() && out.join("0000/truth.toml").exists());
     }
 
@@ -219,19 +219,19 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         play(&args(28, 100, folder.path(), false), &nothing).expect("played");
         let rounds = played(&folder.path().join("cases.jsonl"), 100).expect("lines");
-        for Round { case, kind, setting, outside, nominal, truth, verdict, .. } in &rounds {
+        for CaseResult { case, kind, setting, outside, nominal, truth, verdict, .. } in &rounds {
             let hidden: Vec<_> = verdict.hits.iter().map(|hit| format!("{}@{}", hit.effect, hit.scope)).collect();
             println!("{case} {kind:?} {:?} {hidden:?} {outside:?} {nominal:?} {truth:?}", setting.place);
         }
-        for Round { case, kind, setting, nominal, truth, verdict, .. } in rounds {
+        for CaseResult { case, kind, setting, nominal, truth, verdict, .. } in rounds {
             let [before, after] = [nominal, truth].map(|errors| errors.q_rmse_rad.expect("q is in every log"));
             // What no error of motion can show.
             let unseen = verdict.hits.iter().any(|hit| ["gyro_bias", "torque_sensor_delay"].contains(&&*hit.effect));
             match kind {
-                Kind::Nothing if setting.place == Place::Air => assert!(before < 0.003, "case {case}: {before} rad"),
-                Kind::Nothing => assert!(before < 0.012, "case {case}: {before} rad"),
-                Kind::Half | Kind::Two => assert!(unseen || after < before, "case {case}: {before} -> {after} rad"),
-                Kind::Fifth | Kind::Outside => {}
+                CaseKind::Healthy if setting.place == BaseSchedule::Fixed => assert!(before < 0.003, "case {case}: {before} rad"),
+                CaseKind::Healthy => assert!(before < 0.012, "case {case}: {before} rad"),
+                CaseKind::LargeEffect | CaseKind::TwoEffects => assert!(unseen || after < before, "case {case}: {before} -> {after} rad"),
+                CaseKind::SmallEffect | CaseKind::UnmodelledEffect => {}
             }
         }
     }

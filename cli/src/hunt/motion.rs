@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 
 use rand::{Rng, RngExt};
-use twinstep_logs::{Base, Log, Meta, Segment, TauSensor};
+use twinstep_logs::{BaseMount, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{JOINT_NAMES, Joint, JointKind, NUM_JOINTS, go2};
 
-use super::draw::{Place, Setting};
+use super::draw::{BaseSchedule, LogSetup};
 
 /// Rate of the log [Hz].
 pub const RATE_HZ: f64 = 200.0;
@@ -122,18 +122,18 @@ fn triangle(turns: f64) -> f64 {
 }
 
 /// Phases with their lengths [s]; the trunk is held in all but the swaying.
-fn phases(place: Place) -> &'static [(Phase, f64)] {
+fn phases(place: BaseSchedule) -> &'static [(Phase, f64)] {
     match place {
-        Place::Air => &[(Phase::Chirp, 8.0), (Phase::Creep, 5.0), (Phase::Steps, 4.0), (Phase::Holds, 6.0)],
-        Place::Stance => &[(Phase::Sway, 22.0)],
-        Place::Both => {
+        BaseSchedule::Fixed => &[(Phase::Chirp, 8.0), (Phase::Creep, 5.0), (Phase::Steps, 4.0), (Phase::Holds, 6.0)],
+        BaseSchedule::Floating => &[(Phase::Sway, 22.0)],
+        BaseSchedule::FixedThenFloating => {
             &[(Phase::Chirp, 5.0), (Phase::Creep, 4.0), (Phase::Steps, 2.5), (Phase::Holds, 4.0), (Phase::Sway, 9.0)]
         }
     }
 }
 
 /// The commands of a case, with voltage and temperatures where they are measured.
-pub fn motion(setting: Setting, random: &mut impl Rng) -> Log {
+pub fn motion(setting: LogSetup, random: &mut impl Rng) -> Log {
     let style = Style::draw(random);
     let mut columns = BTreeMap::<String, Vec<f64>>::new();
     for (phase, length) in phases(setting.place) {
@@ -142,7 +142,7 @@ pub fn motion(setting: Setting, random: &mut impl Rng) -> Log {
             let t = columns.get("t").map_or(0, Vec::len) as f64 / RATE_HZ;
             let mut cell = |name: String, value: f64| columns.entry(name).or_default().push(value);
             cell("t".to_owned(), t);
-            let second = setting.place == Place::Both && *phase == Phase::Sway;
+            let second = setting.place == BaseSchedule::FixedThenFloating && *phase == Phase::Sway;
             cell("segment".to_owned(), f64::from(u8::from(second)));
             cell("kp".to_owned(), style.kp(*phase));
             cell("kd".to_owned(), style.kd);
@@ -161,15 +161,15 @@ pub fn motion(setting: Setting, random: &mut impl Rng) -> Log {
         }
     }
     let segment = |name: &str, base| Segment { name: name.to_owned(), base };
-    let (air, stance) = (segment("air", Base::Fixed), segment("stance", Base::Floating));
+    let (air, stance) = (segment("air", BaseMount::Fixed), segment("stance", BaseMount::Floating));
     let segments = match setting.place {
-        Place::Air => vec![air],
-        Place::Stance => vec![stance],
-        Place::Both => vec![air, stance],
+        BaseSchedule::Fixed => vec![air],
+        BaseSchedule::Floating => vec![stance],
+        BaseSchedule::FixedThenFloating => vec![air, stance],
     };
-    let mut meta = Meta::new(RATE_HZ, TauSensor::Current, segments);
+    let mut meta = Meta::new(RATE_HZ, TorqueSensor::MotorCurrent, segments);
     meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
-    Log::new_motion(meta, columns).expect("a motion")
+    Log::new_commands(meta, columns).expect("a motion")
 }
 
 /// A battery that empties and sags under loads that come and go [V].
@@ -191,8 +191,8 @@ mod tests {
 
     #[test]
     fn commands_stay_inside_the_joints_ranges() {
-        for (place, seed) in [Place::Air, Place::Stance, Place::Both].into_iter().zip(0..) {
-            let setting = Setting { place, torque: true, battery: true, temperature: true };
+        for (place, seed) in [BaseSchedule::Fixed, BaseSchedule::Floating, BaseSchedule::FixedThenFloating].into_iter().zip(0..) {
+            let setting = LogSetup { place, torque: true, battery: true, temperature: true };
             let motion = motion(setting, &mut stream(seed, "test", 0));
             assert!((20.0..25.0).contains(&(motion.rows() as f64 / RATE_HZ)), "20 to 25 s");
             for joint in Joint::ALL {

@@ -1,15 +1,15 @@
 //! The sealed robot and its log: another engine, a finer step, slightly other masses, lengths and contact.
 
 use rand::{Rng, RngExt};
-use twinstep_logs::{Base as LoggedBase, Log, LogError, TauSensor};
-use twinstep_model::effects::compose;
+use twinstep_logs::{BaseMount as LoggedBase, Log, LogError, TorqueSensor};
+use twinstep_model::effects::apply_effects;
 use twinstep_model::{Joint, RobotModel, go2};
-use twinstep_sim::{Base, Engine, RapierBackend, SimConfig};
-use twinstep_sysid::{RecordError, Sensor, measured, record};
+use twinstep_sim::{BaseMount, Engine, RapierBackend, SimConfig};
+use twinstep_sysid::{RecordError, Sensor, apply_sensors, record};
 
 use super::draw::Case;
 use super::motion::{RATE_HZ, motion};
-use super::outside::Tampered;
+use super::outside::PerturbedBackend;
 
 /// Rate of the plant's physics [Hz]; the model's is 1000.
 const PHYSICS_HZ: u32 = 4000;
@@ -20,13 +20,13 @@ const LENGTH_ERROR: f64 = 0.002;
 /// The log of a case; `progress` may end it.
 pub fn log_of(case: &Case, progress: &mut dyn FnMut(usize) -> bool) -> Result<Log, RecordError> {
     let robot = perturbed(&mut case.stream("hunt body"));
-    let robot = compose(&robot, &case.hidden).expect("drawn so that it is a robot");
+    let robot = apply_effects(&robot, &case.hidden).expect("drawn so that it is a robot");
     let backend = |base: LoggedBase| {
-        let base = if base == LoggedBase::Fixed { Base::Fixed } else { Base::Floating };
+        let base = if base == LoggedBase::Fixed { BaseMount::Fixed } else { BaseMount::Floating };
         let physics_hz = Some(PHYSICS_HZ);
         let config = SimConfig { engine: Engine::Rapier, base, physics_hz, threads: 1, ..SimConfig::default() };
         let backend = RapierBackend::new(robot.clone(), config, 1);
-        backend.map(|backend| Tampered::new(backend, case.outside)).map_err(|error| RecordError::Backend(error.into()))
+        backend.map(|backend| PerturbedBackend::new(backend, case.outside)).map_err(|error| RecordError::Backend(error.into()))
     };
     let motion = motion(case.setting, &mut case.stream("hunt motion"));
     // Says nothing of what is hidden.
@@ -34,7 +34,7 @@ pub fn log_of(case: &Case, progress: &mut dyn FnMut(usize) -> bool) -> Result<Lo
     let random = &mut case.stream("hunt sensors");
     let sensors = sensors(random);
     let shown = torque_sensor(&exact, &robot, case.setting.torque)?;
-    Ok(measured(&shown, &sensors, random.random())?)
+    Ok(apply_sensors(&shown, &sensors, random.random())?)
 }
 
 /// The built-in robot, not quite.
@@ -62,7 +62,7 @@ fn perturbed(random: &mut impl Rng) -> RobotModel {
 fn sensors(random: &mut impl Rng) -> Vec<Sensor> {
     let mut sensor = |quantity, [low, high]: [f64; 2], step| {
         let sigma = random.random_range(low..high);
-        Sensor { quantity, sigma, step }
+        Sensor { quantity, sigma, resolution: step }
     };
     vec![
         sensor("q", [0.0005, 0.002], 0.0002),
@@ -80,7 +80,7 @@ fn sensors(random: &mut impl Rng) -> Vec<Sensor> {
 fn torque_sensor(log: &Log, robot: &RobotModel, measured: bool) -> Result<Log, LogError> {
     let mut meta = log.meta().clone();
     if !measured {
-        meta.tau_sensor = TauSensor::None;
+        meta.tau_sensor = TorqueSensor::None;
     }
     let index = |cells: &[u32]| cells.iter().map(|cell| f64::from(*cell)).collect();
     let mut columns = vec![
@@ -95,7 +95,7 @@ fn torque_sensor(log: &Log, robot: &RobotModel, measured: bool) -> Result<Log, L
         };
         if measured {
             let joint: Joint = joint.parse().expect("one of the twelve");
-            let late = robot.joints[joint.index()].drive.sensor_delay * RATE_HZ;
+            let late = robot.joints[joint.index()].actuator.sensor_delay * RATE_HZ;
             let parts = log.segments().flat_map(|(_, rows)| delayed(&cells[rows], late));
             columns.push((name.to_owned(), parts.collect()));
         }
@@ -117,21 +117,21 @@ fn delayed(cells: &[f64], late: f64) -> Vec<f64> {
 
 #[cfg(test)]
 mod tests {
-    use twinstep_model::effects::{Effect, Entry, Scope};
+    use twinstep_model::effects::{Effect, EffectEntry, Scope};
     use twinstep_sim::BatchRollout;
     use twinstep_sysid::evaluate;
 
     use super::*;
-    use crate::hunt::draw::{Kind, Place, Setting};
+    use crate::hunt::draw::{CaseKind, BaseSchedule, LogSetup};
 
-    fn case(place: Place, seed: u64, hidden: Vec<Entry>) -> Case {
-        let setting = Setting { place, torque: true, battery: true, temperature: false };
-        Case { seed, number: 0, kind: Kind::Nothing, setting, hidden, outside: None }
+    fn case(place: BaseSchedule, seed: u64, hidden: Vec<EffectEntry>) -> Case {
+        let setting = LogSetup { place, torque: true, battery: true, temperature: false };
+        Case { seed, number: 0, kind: CaseKind::Healthy, setting, hidden, outside: None }
     }
 
     #[test]
     fn log_of_a_healthy_robot_is_near_the_nominal_model() {
-        for (place, seed) in [(Place::Air, 1), (Place::Stance, 2), (Place::Both, 3)] {
+        for (place, seed) in [(BaseSchedule::Fixed, 1), (BaseSchedule::Floating, 2), (BaseSchedule::FixedThenFloating, 3)] {
             let folder = tempfile::tempdir().expect("a folder");
             let log = log_of(&case(place, seed, Vec::new()), &mut |_| true).expect("the robot gets through");
             log.write(folder.path()).expect("written");
@@ -144,7 +144,7 @@ mod tests {
             }
             assert!(log.channel("temp_FL_hip").is_none());
             assert!(log.noise("q_FL_hip").is_some_and(|sigma| (0.0005..0.0021).contains(&sigma)));
-            assert_eq!(log.channel("gyro_x").is_some(), place != Place::Air);
+            assert_eq!(log.channel("gyro_x").is_some(), place != BaseSchedule::Fixed);
             let mut simulator = BatchRollout::new(&go2(), &SimConfig::default()).expect("a simulator");
             let error = evaluate(&log, &go2(), &mut simulator, |_| true).expect("evaluated");
             let worst =
@@ -157,9 +157,9 @@ mod tests {
     #[test]
     fn late_torque_sensor_shows_in_the_torque_alone() {
         let effect = Effect::named("torque_sensor_delay").expect("known");
-        let late = Entry::new(effect, Scope::All, vec![0.0125]).expect("allowed");
+        let late = EffectEntry::new(effect, Scope::All, vec![0.0125]).expect("allowed");
         let [healthy, late] = [vec![], vec![late]].map(|hidden| {
-            let case = case(Place::Air, 1, hidden);
+            let case = case(BaseSchedule::Fixed, 1, hidden);
             log_of(&case, &mut |_| true).expect("the robot gets through")
         });
         assert_eq!(healthy.q("FL_calf"), late.q("FL_calf"));

@@ -3,15 +3,15 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 
-use super::Round;
-use super::draw::Kind;
-use super::judge::{Hit, Removed};
+use super::CaseResult;
+use super::draw::CaseKind;
+use super::judge::{EffectScore, ErrorReduction};
 
 /// What stands in the matrix for no name.
 const NONE: &str = "(none)";
 
 /// All that a game says.
-pub fn text(rounds: &[Round]) -> String {
+pub fn text(rounds: &[CaseResult]) -> String {
     let mut text = format!("{} cases\n\n", rounds.len());
     text += &rates(rounds);
     text += &numbers(rounds);
@@ -41,36 +41,36 @@ fn wilson(hits: usize, count: usize) -> [f64; 2] {
     [middle - reach, middle + reach].map(|end| (end / (1.0 + Z * Z / n)).clamp(0.0, 1.0))
 }
 
-fn rates(rounds: &[Round]) -> String {
-    let of = |kind: Kind| rounds.iter().filter(move |round| round.kind == kind);
-    let hits = |kind: Kind| of(kind).flat_map(|round| &round.verdict.hits);
+fn rates(rounds: &[CaseResult]) -> String {
+    let of = |kind: CaseKind| rounds.iter().filter(move |round| round.kind == kind);
+    let hits = |kind: CaseKind| of(kind).flat_map(|round| &round.verdict.hits);
     let mut text = "| | goal | rate | 95 % interval |\n|---|---|---|---|\n".to_owned();
     for (kind, size, first, three, scope) in [
-        (Kind::Half, "half the range or more", ">= 90 %", ">= 97 %", ">= 92 %"),
-        (Kind::Fifth, "a fifth of the range", ">= 70 %", "", ""),
+        (CaseKind::LargeEffect, "half the range or more", ">= 90 %", ">= 97 %", ">= 92 %"),
+        (CaseKind::SmallEffect, "a fifth of the range", ">= 70 %", "", ""),
     ] {
         text += &rate(&format!("{size}: right name first"), first, hits(kind).map(|hit| hit.first));
-        text += &rate(&format!("{size}: said it could be the right one"), "", hits(kind).map(|hit| hit.either));
-        text += &rate(&format!("{size}: in first three"), three, hits(kind).map(|hit| hit.first_three));
+        text += &rate(&format!("{size}: said it could be the right one"), "", hits(kind).map(|hit| hit.ambiguous));
+        text += &rate(&format!("{size}: in first three"), three, hits(kind).map(|hit| hit.in_top_3));
         text += &rate(&format!("{size}: right scope"), scope, hits(kind).map(|hit| hit.scope_right));
         text += &rate(&format!("{size}: a wrong name, also"), "", of(kind).map(|round| round.verdict.wrong_names > 0));
     }
-    let named = |kind: Kind| of(kind).map(|round| !round.verdict.named.is_empty());
-    text += &rate("nothing hidden: a name is given", "<= 3 %", named(Kind::Nothing));
-    text += &rate("outside the catalogue: a wrong name", "<= 10 %", named(Kind::Outside));
-    let depends_on = of(Kind::Outside).filter_map(|round| round.verdict.depends_on);
+    let named = |kind: CaseKind| of(kind).map(|round| !round.verdict.named.is_empty());
+    text += &rate("nothing hidden: a name is given", "<= 3 %", named(CaseKind::Healthy));
+    text += &rate("outside the catalogue: a wrong name", "<= 10 %", named(CaseKind::UnmodelledEffect));
+    let depends_on = of(CaseKind::UnmodelledEffect).filter_map(|round| round.verdict.depends_on);
     text += &rate("outside the catalogue: what it depends on is right", ">= 50 %", depends_on);
-    let both = |good: fn(&Hit) -> bool| of(Kind::Two).map(move |round| round.verdict.hits.iter().all(good));
+    let both = |good: fn(&EffectScore) -> bool| of(CaseKind::TwoEffects).map(move |round| round.verdict.hits.iter().all(good));
     text += &rate("two effects: both named", ">= 65 %", both(|hit| hit.named));
     text += &rate("two effects: both named, with their scopes", "", both(|hit| hit.named && hit.scope_right));
     let sizes = rounds.iter().flat_map(|round| &round.verdict.hits).filter_map(|hit| hit.size);
-    text += &rate("size within its 95 % interval", "88 to 99 %", sizes.map(|size| size.within));
-    text + &rate("the diagnosis died", "none", rounds.iter().map(|round| round.died.is_some()))
+    text += &rate("size within its 95 % interval", "88 to 99 %", sizes.map(|size| size.covered));
+    text + &rate("the diagnosis died", "none", rounds.iter().map(|round| round.error.is_some()))
 }
 
-fn numbers(rounds: &[Round]) -> String {
+fn numbers(rounds: &[CaseResult]) -> String {
     let sizes = rounds.iter().flat_map(|round| &round.verdict.hits).filter_map(|hit| hit.size);
-    let removed = |of: fn(&Removed) -> Option<f64>| rounds.iter().filter_map(move |round| of(&round.verdict.removed));
+    let removed = |of: fn(&ErrorReduction) -> Option<f64>| rounds.iter().filter_map(move |round| of(&round.verdict.removed));
     let seconds = rounds.iter().map(|round| round.seconds);
     let line = |label: &str, goal: &str, value: Option<f64>, unit: &str, scale: f64| {
         let value = value.map_or("no case".to_owned(), |value| format!("{:.1} {unit}", scale * value));
@@ -90,7 +90,7 @@ fn numbers(rounds: &[Round]) -> String {
     text + &line("penalty a case: 1 for each effect not named, 2 for each wrong name", "", Some(penalty), "", 1.0)
 }
 
-fn penalty(round: &Round) -> usize {
+fn penalty(round: &CaseResult) -> usize {
     round.verdict.hits.iter().filter(|hit| !hit.named).count() + 2 * round.verdict.wrong_names
 }
 
@@ -103,13 +103,13 @@ fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
 }
 
 /// What was hidden in cases of at most one thing, and how often each name was given first.
-fn matrix(rounds: &[Round]) -> String {
+fn matrix(rounds: &[CaseResult]) -> String {
     let mut counts = BTreeMap::<(&str, &str), usize>::new();
-    for round in rounds.iter().filter(|round| round.kind != Kind::Two) {
+    for round in rounds.iter().filter(|round| round.kind != CaseKind::TwoEffects) {
         let hidden = match round.kind {
-            Kind::Nothing => NONE,
-            Kind::Outside => "(outside)",
-            Kind::Half | Kind::Fifth | Kind::Two => round.verdict.hits.first().map_or(NONE, |hit| &hit.effect),
+            CaseKind::Healthy => NONE,
+            CaseKind::UnmodelledEffect => "(outside)",
+            CaseKind::LargeEffect | CaseKind::SmallEffect | CaseKind::TwoEffects => round.verdict.hits.first().map_or(NONE, |hit| &hit.effect),
         };
         let named = round.verdict.named.first().and_then(|named| named.split('@').next()).unwrap_or(NONE);
         *counts.entry((hidden, named)).or_default() += 1;
@@ -135,33 +135,33 @@ fn matrix(rounds: &[Round]) -> String {
 #[cfg(test)]
 mod tests {
     use expect_test::expect;
-    use twinstep_sysid::Errors;
+    use twinstep_sysid::RmsErrors;
 
     use super::*;
-    use crate::hunt::draw::{Place, Setting};
-    use crate::hunt::judge::{Size, Verdict};
+    use crate::hunt::draw::{BaseSchedule, LogSetup};
+    use crate::hunt::judge::{Size, Score};
 
-    fn round(kind: Kind, hidden: &[&str], named: &[&str]) -> Round {
-        let hit = |name: &&str| Hit {
+    fn round(kind: CaseKind, hidden: &[&str], named: &[&str]) -> CaseResult {
+        let hit = |name: &&str| EffectScore {
             effect: (*name).to_owned(),
             scope: "all".to_owned(),
             named: named.contains(name),
             first: named.first() == Some(name),
-            either: false,
-            first_three: named.contains(name),
+            ambiguous: false,
+            in_top_3: named.contains(name),
             scope_right: named.contains(name),
-            size: named.contains(name).then_some(Size { within: true, error: 0.04 }),
+            size: named.contains(name).then_some(Size { covered: true, error: 0.04 }),
         };
-        let verdict = Verdict {
+        let verdict = Score {
             named: named.iter().map(|name| format!("{name}@all")).collect(),
             hits: hidden.iter().map(hit).collect(),
             wrong_names: named.iter().filter(|name| !hidden.contains(name)).count(),
-            depends_on: (kind == Kind::Outside).then_some(true),
-            removed: Removed { torque: None, motion: Some(0.9) },
+            depends_on: (kind == CaseKind::UnmodelledEffect).then_some(true),
+            removed: ErrorReduction { torque: None, motion: Some(0.9) },
         };
-        let setting = Setting { place: Place::Air, torque: true, battery: false, temperature: false };
-        let (nominal, truth) = (Errors::default(), Errors::default());
-        Round { seed: 0, case: 0, kind, setting, outside: None, nominal, truth, verdict, died: None, seconds: 12.0 }
+        let setting = LogSetup { place: BaseSchedule::Fixed, torque: true, battery: false, temperature: false };
+        let (nominal, truth) = (RmsErrors::default(), RmsErrors::default());
+        CaseResult { seed: 0, case: 0, kind, setting, outside: None, nominal, truth, verdict, error: None, seconds: 12.0 }
     }
 
     #[test]
@@ -174,11 +174,11 @@ mod tests {
     #[test]
     fn game_of_five_cases_reads_so() {
         let rounds = [
-            round(Kind::Half, &["armature"], &["armature"]),
-            round(Kind::Half, &["drive_lag"], &["torque_delay"]),
-            round(Kind::Nothing, &[], &[]),
-            round(Kind::Outside, &[], &[]),
-            round(Kind::Two, &["armature", "payload"], &["payload"]),
+            round(CaseKind::LargeEffect, &["armature"], &["armature"]),
+            round(CaseKind::LargeEffect, &["drive_lag"], &["torque_delay"]),
+            round(CaseKind::Healthy, &[], &[]),
+            round(CaseKind::UnmodelledEffect, &[], &[]),
+            round(CaseKind::TwoEffects, &["armature", "payload"], &["payload"]),
         ];
         expect![[r#"
             5 cases

@@ -1,13 +1,13 @@
 //! What a log shows of two models: the one that was given, and the one that the findings extend.
 
-use twinstep_logs::{Log, TauSensor};
-use twinstep_model::effects::{CATALOGUE, Entry, EntryError, Target, compose};
+use twinstep_logs::{Log, TorqueSensor};
+use twinstep_model::effects::{CATALOGUE, EffectEntry, EntryError, Target, apply_effects};
 use twinstep_model::{Joint, ModelFile, NUM_JOINTS, RobotModel, Rollout, go2};
 use twinstep_sysid::motion::{JointCommands, MotionError, joint_commands};
-use twinstep_sysid::{Balance, Evaluation, ExperimentError, Kinematics, PerRow, evaluate, position_errors};
+use twinstep_sysid::{InverseDynamicsResidual, Evaluation, ExperimentError, JointTrajectory, JointSeries, evaluate, position_errors};
 
-use super::law::{Law, Residuals};
-use super::strip::Strip;
+use super::law::{ResidualPlot, Residuals};
+use super::strip::TimeSeries;
 
 /// Why there is no evidence.
 #[derive(Debug, thiserror::Error)]
@@ -66,20 +66,20 @@ impl LogFacts {
 
 /// What the pictures of a report show; of all rows of a log.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Evidence {
+pub struct ReportData {
     /// Errors of the model that was given.
     pub before: Evaluation,
     /// Errors of the extended model.
     pub after: Evaluation,
     /// The worst joint over time: position, and torque where it was measured.
-    pub strips: Vec<Strip>,
+    pub strips: Vec<TimeSeries>,
     /// One for each entry that the extended model has more, where the log shows it.
-    pub laws: Vec<Law>,
+    pub laws: Vec<ResidualPlot>,
     /// Where it all comes from.
     pub provenance: Provenance,
 }
 
-impl Evidence {
+impl ReportData {
     /// Simulates `log` under both models, and under the extended one without each of its findings where the log's
     /// torques do not show them.
     pub fn gather(
@@ -90,7 +90,7 @@ impl Evidence {
         provenance: Provenance,
     ) -> Result<Self, EvidenceError> {
         let [before, after] = [given.robot_model()?, extended.robot_model()?];
-        let mut bench = Bench { log, joints: joint_commands(log)?, kinematics: Kinematics::of(log)?, simulator };
+        let mut bench = LogEvaluator { log, joints: joint_commands(log)?, kinematics: JointTrajectory::of(log)?, simulator };
         let [first, second] = [bench.trial(&before)?, bench.trial(&after)?];
         let laws = (0..extended.effects.len())
             .filter(|index| !given.effects.contains(&extended.effects[*index]))
@@ -98,7 +98,7 @@ impl Evidence {
             .filter_map(Result::transpose)
             .collect::<Result<_, _>>()?;
         Ok(Self {
-            strips: Strip::of(log, [&first, &second]),
+            strips: TimeSeries::of(log, [&first, &second]),
             before: first.evaluation,
             after: second.evaluation,
             laws,
@@ -110,44 +110,44 @@ impl Evidence {
 /// The extended model without one of its entries: what was given stands in its place again.
 fn without(given: &ModelFile, extended: &ModelFile, index: usize) -> Result<RobotModel, EntryError> {
     let left_out = &extended.effects[index];
-    let same = |entry: &&Entry| entry.effect == left_out.effect && entry.scope == left_out.scope;
+    let same = |entry: &&EffectEntry| entry.effect == left_out.effect && entry.scope == left_out.scope;
     let mut entries = extended.effects.clone();
     match given.effects.iter().find(same) {
         Some(entry) if entries.iter().filter(same).count() == 1 => entries[index] = entry.clone(),
         _ => drop(entries.remove(index)),
     }
-    compose(&go2(), &entries)
+    apply_effects(&go2(), &entries)
 }
 
 /// A model on a log.
-pub struct Trial {
+pub struct ModelEvaluation {
     /// By joint.
     pub evaluation: Evaluation,
     /// Simulated less measured position [rad], by row.
-    pub position: PerRow,
+    pub position: JointSeries,
     /// Torques of the measured motion.
-    pub balance: Balance,
+    pub balance: InverseDynamicsResidual,
 }
 
 /// A log, and what simulates it.
-struct Bench<'a> {
+struct LogEvaluator<'a> {
     log: &'a Log,
     joints: Vec<JointCommands<'a>>,
-    kinematics: Kinematics,
+    kinematics: JointTrajectory,
     simulator: &'a mut dyn Rollout,
 }
 
-impl Bench<'_> {
-    fn trial(&mut self, robot: &RobotModel) -> Result<Trial, EvidenceError> {
-        Ok(Trial {
+impl LogEvaluator<'_> {
+    fn trial(&mut self, robot: &RobotModel) -> Result<ModelEvaluation, EvidenceError> {
+        Ok(ModelEvaluation {
             evaluation: evaluate(self.log, robot, self.simulator, |_| true)?,
             position: self.position(robot)?,
-            balance: Balance::of(self.log, robot)?,
+            balance: InverseDynamicsResidual::of(self.log, robot)?,
         })
     }
 
     /// Simulated less measured position [rad].
-    fn position(&mut self, robot: &RobotModel) -> Result<PerRow, EvidenceError> {
+    fn position(&mut self, robot: &RobotModel) -> Result<JointSeries, EvidenceError> {
         let mut cells = [const { Vec::new() }; NUM_JOINTS];
         let errors = position_errors(self.log, robot, self.simulator, |_| true)?;
         for (cells, errors) in cells.iter_mut().zip(&errors).filter(|(_, errors)| !errors.is_empty()) {
@@ -162,19 +162,19 @@ impl Bench<'_> {
     /// The law of `entry` in the residual that shows it best.
     fn law(
         &mut self,
-        entry: &Entry,
+        entry: &EffectEntry,
         without: &RobotModel,
         robot: &RobotModel,
-        with: &Trial,
-    ) -> Result<Option<Law>, EvidenceError> {
+        with: &ModelEvaluation,
+    ) -> Result<Option<ResidualPlot>, EvidenceError> {
         let (y_label, residuals) = match best_residual(self.log, entry) {
             Residual::Torque => {
-                let of = |balance: &Balance| less(&self.measured_torque(), &balance.shown);
-                ("measured − model's torque [N·m]", [of(&Balance::of(self.log, without)?), of(&with.balance)])
+                let of = |balance: &InverseDynamicsResidual| less(&self.measured_torque(), &balance.estimated_torque);
+                ("measured − model's torque [N·m]", [of(&InverseDynamicsResidual::of(self.log, without)?), of(&with.balance)])
             }
             Residual::Unexplained => {
-                let balance = Balance::of(self.log, without)?;
-                ("unexplained torque [N·m]", [balance.unexplained, with.balance.unexplained.clone()])
+                let balance = InverseDynamicsResidual::of(self.log, without)?;
+                ("unexplained torque [N·m]", [balance.torque, with.balance.torque.clone()])
             }
             Residual::Position => ("position error [rad]", [self.position(without)?, with.position.clone()]),
         };
@@ -183,7 +183,7 @@ impl Bench<'_> {
         Ok(Residuals { log, robot, joints, kinematics, y_label, without, with }.law(entry))
     }
 
-    fn measured_torque(&self) -> PerRow {
+    fn measured_torque(&self) -> JointSeries {
         std::array::from_fn(|joint| self.log.tau_measured(Joint::ALL[joint].name()).map_or(Vec::new(), <[f64]>::to_vec))
     }
 }
@@ -198,10 +198,10 @@ enum Residual {
 }
 
 /// Where `entry` shows best: before the torque's sensor in the torque, behind it in the motion.
-fn best_residual(log: &Log, entry: &Entry) -> Residual {
+fn best_residual(log: &Log, entry: &EffectEntry) -> Residual {
     let chain = |name: &str| CATALOGUE.iter().position(|effect| effect.name == name);
     let at_motor = chain(entry.effect.name) <= chain("torque_sensor_delay");
-    let held = log.segments().all(|(segment, _)| segment.base == twinstep_logs::Base::Fixed);
+    let held = log.segments().all(|(segment, _)| segment.base == twinstep_logs::BaseMount::Fixed);
     let of_joints = matches!(entry.effect.target, Target::Joints | Target::Supply);
     if !of_joints || matches!(entry.effect.name, "backlash" | "joint_elasticity") {
         return Residual::Position;
@@ -209,14 +209,14 @@ fn best_residual(log: &Log, entry: &Entry) -> Residual {
     let sensor = log.meta().tau_sensor;
     let measured = log.joints().iter().any(|joint| log.tau_measured(joint).is_some());
     match (measured, sensor) {
-        (true, TauSensor::Output) if entry.effect.name != "joint_spring" => Residual::Torque,
-        (true, TauSensor::Current) if at_motor => Residual::Torque,
+        (true, TorqueSensor::JointOutput) if entry.effect.name != "joint_spring" => Residual::Torque,
+        (true, TorqueSensor::MotorCurrent) if at_motor => Residual::Torque,
         _ if held => Residual::Unexplained,
         _ => Residual::Position,
     }
 }
 
 /// Differences, where there are both.
-fn less(one: &PerRow, other: &PerRow) -> PerRow {
+fn less(one: &JointSeries, other: &JointSeries) -> JointSeries {
     std::array::from_fn(|joint| one[joint].iter().zip(&other[joint]).map(|(one, other)| one - other).collect())
 }

@@ -1,15 +1,15 @@
 //! The findings: the law of each in the data, its size, and the rivals that it beat.
 
 use twinstep_model::effects::{Effect, Parameter};
-use twinstep_sysid::{Cause, Diagnosis, Estimate, Rival, Value};
+use twinstep_sysid::{Cause, Diagnosis, Estimate, AlternativeCause, ParameterValue};
 
-use super::evidence::Evidence;
+use super::evidence::ReportData;
 use super::html::{alike, bar, escape, number, percent};
 use super::overview::key;
 use super::{plot, words};
 
 /// One card a finding.
-pub fn cards(diagnosis: &Diagnosis, evidence: &Evidence) -> String {
+pub fn cards(diagnosis: &Diagnosis, evidence: &ReportData) -> String {
     if diagnosis.findings.is_empty() {
         return String::new();
     }
@@ -23,7 +23,7 @@ pub fn cards(diagnosis: &Diagnosis, evidence: &Evidence) -> String {
     )
 }
 
-fn card(rank: usize, finding: &Cause, evidence: &Evidence) -> String {
+fn card(rank: usize, finding: &Cause, evidence: &ReportData) -> String {
     let name = words::sentence(&words::cause(&finding.effect, &finding.scope));
     let effect = Effect::named(&finding.effect);
     format!(
@@ -39,14 +39,14 @@ fn card(rank: usize, finding: &Cause, evidence: &Evidence) -> String {
 
 /// What the catalogue says of an effect.
 fn catalogue(effect: &Effect) -> String {
-    let [what, equation, signature] = [effect.what, effect.equation, effect.signature].map(escape);
+    let [what, equation, signature] = [effect.summary, effect.equation, effect.signature].map(escape);
     format!(
         "<dl>\n<dt>Effect</dt><dd>{what}</dd>\n<dt>Law</dt><dd><code>{equation}</code></dd>\n\
          <dt>In data</dt><dd>{signature}</dd>\n</dl>\n"
     )
 }
 
-fn law(finding: &Cause, evidence: &Evidence) -> String {
+fn law(finding: &Cause, evidence: &ReportData) -> String {
     let cause = (finding.effect.clone(), finding.scope.clone());
     let Some(law) = evidence.laws.iter().find(|law| law.cause == cause) else {
         return "<p class=\"note\">The log in the pictures does not show this effect on its own.</p>\n".to_owned();
@@ -62,7 +62,7 @@ fn parameters(finding: &Cause, effect: Option<&'static Effect>) -> String {
     for (name, estimate) in &finding.parameters {
         let known = effect.and_then(|effect| effect.parameters.iter().find(|parameter| parameter.name == name));
         for (index, numbers) in components(estimate).into_iter().enumerate() {
-            let vector = matches!(estimate.value, Value::Vector(_));
+            let vector = matches!(estimate.value, ParameterValue::Vector(_));
             let label = if vector { format!("{}[{index}]", escape(name)) } else { escape(name) };
             items += &parameter(&label, numbers, known);
         }
@@ -73,7 +73,7 @@ fn parameters(finding: &Cause, effect: Option<&'static Effect>) -> String {
 fn parameter(label: &str, numbers: [f64; 3], known: Option<&Parameter>) -> String {
     let [value, low, high] = numbers;
     let unit = known.map_or("", |known| known.unit);
-    let plausible = known.map_or([value, value], |known| known.plausible);
+    let plausible = known.map_or([value, value], |known| known.prior_range);
     let picture = plot::whisker(value, [low, high], plausible);
     let [value, low, high] = alike(numbers);
     let size = format!("{value} {unit}");
@@ -89,11 +89,11 @@ fn parameter(label: &str, numbers: [f64; 3], known: Option<&Parameter>) -> Strin
 
 /// Value, low and high of each number.
 fn components(estimate: &Estimate) -> Vec<[f64; 3]> {
-    let of = |value: &Value, index: usize| match value {
-        Value::Number(number) => *number,
-        Value::Vector(numbers) => numbers.get(index).copied().unwrap_or(f64::NAN),
+    let of = |value: &ParameterValue, index: usize| match value {
+        ParameterValue::Number(number) => *number,
+        ParameterValue::Vector(numbers) => numbers.get(index).copied().unwrap_or(f64::NAN),
     };
-    let count = if let Value::Vector(numbers) = &estimate.value { numbers.len() } else { 1 };
+    let count = if let ParameterValue::Vector(numbers) = &estimate.value { numbers.len() } else { 1 };
     (0..count).map(|index| [&estimate.value, &estimate.low, &estimate.high].map(|end| of(end, index))).collect()
 }
 
@@ -104,8 +104,8 @@ pub fn ranking(diagnosis: &Diagnosis) -> String {
     }
     let mut rows = String::new();
     for (index, finding) in diagnosis.findings.iter().enumerate() {
-        rows += &winner(index + 1, finding);
-        rows.extend(finding.rivals.iter().map(|rival| beaten(rival, finding.held_out_gain)));
+        rows += &finding_row(index + 1, finding);
+        rows.extend(finding.rivals.iter().map(|rival| alternative_row(rival, finding.held_out_gain)));
     }
     format!(
         "<section>\n<h2>What else it could have been</h2>\n<div class=\"wide\"><table class=\"ranking\">\n\
@@ -117,7 +117,7 @@ pub fn ranking(diagnosis: &Diagnosis) -> String {
     )
 }
 
-fn winner(rank: usize, finding: &Cause) -> String {
+fn finding_row(rank: usize, finding: &Cause) -> String {
     format!(
         "<tr class=\"winner\"><th scope=\"row\">{rank}. {}</th><td>{}</td><td>{}</td><td>{} \
          <span class=\"small\">nats, needs {}</span></td></tr>\n",
@@ -129,7 +129,7 @@ fn winner(rank: usize, finding: &Cause) -> String {
     )
 }
 
-fn beaten(rival: &Rival, gain: f64) -> String {
+fn alternative_row(rival: &AlternativeCause, gain: f64) -> String {
     let lost = 100.0 * (gain - rival.held_out_gain);
     let verdict = if lost >= 0.5 { format!("{lost:.0} points less") } else { "as good".to_owned() };
     format!(

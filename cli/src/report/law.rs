@@ -1,10 +1,10 @@
 //! The residual of a log beside the variable that explains it, and what a finding makes of it.
 
 use twinstep_logs::Log;
-use twinstep_model::effects::{Entry, Target};
+use twinstep_model::effects::{EffectEntry, Target};
 use twinstep_model::{Joint, RobotModel};
 use twinstep_sysid::motion::{JointCommands, cell_or_zero};
-use twinstep_sysid::{Kinematics, PerRow};
+use twinstep_sysid::{JointTrajectory, JointSeries};
 
 /// Bins of a picture.
 const BINS: usize = 40;
@@ -13,7 +13,7 @@ const LEAST_ROWS: usize = 8;
 
 /// A residual over the variable that explains it.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Law {
+pub struct ResidualPlot {
     /// Effect and scope, as in the model file.
     pub cause: (String, String),
     /// The variable, with its unit.
@@ -44,8 +44,8 @@ pub enum Variable {
     Velocity,
     Acceleration,
     /// Torque of a drive without effects.
-    Wanted,
-    WantedRate,
+    CommandedTorque,
+    CommandedTorqueRate,
     CommandRate,
     /// Size of that torque with the sign of the velocity.
     Load,
@@ -56,12 +56,12 @@ pub enum Variable {
 
 impl Variable {
     /// The one that explains an entry.
-    pub fn of(entry: &Entry) -> Self {
+    pub fn of(entry: &EffectEntry) -> Self {
         match entry.effect.name {
             "coulomb_friction" | "viscous_friction" | "stribeck_friction" | "torque_speed_limit" => Self::Velocity,
             "joint_spring" | "torque_ripple" | "encoder_offset" => Self::Position,
-            "torque_gain" | "torque_saturation" | "backlash" | "joint_elasticity" => Self::Wanted,
-            "torque_delay" | "drive_lag" | "torque_sensor_delay" => Self::WantedRate,
+            "torque_gain" | "torque_saturation" | "backlash" | "joint_elasticity" => Self::CommandedTorque,
+            "torque_delay" | "drive_lag" | "torque_sensor_delay" => Self::CommandedTorqueRate,
             "command_delay" => Self::CommandRate,
             "armature" => Self::Acceleration,
             "load_friction" => Self::Load,
@@ -76,8 +76,8 @@ impl Variable {
             Self::Position => "joint position [rad]",
             Self::Velocity => "joint velocity [rad/s]",
             Self::Acceleration => "joint acceleration [rad/s²]",
-            Self::Wanted => "torque of the ideal drive [N·m]",
-            Self::WantedRate => "change of the ideal drive's torque [N·m/s]",
+            Self::CommandedTorque => "torque of the ideal drive [N·m]",
+            Self::CommandedTorqueRate => "change of the ideal drive's torque [N·m/s]",
             Self::CommandRate => "change of the command [rad/s]",
             Self::Load => "size of the torque, signed as the velocity [N·m]",
             Self::Voltage => "battery voltage [V]",
@@ -87,7 +87,7 @@ impl Variable {
     }
 
     /// Its value in every row.
-    fn values(self, log: &Log, robot: &RobotModel, joint: &JointCommands, kinematics: &Kinematics) -> Vec<f64> {
+    fn values(self, log: &Log, robot: &RobotModel, joint: &JointCommands, kinematics: &JointTrajectory) -> Vec<f64> {
         let index = joint.joint.index();
         let wanted = || wanted(log, robot, joint, kinematics);
         let channel = |name: &str| log.channel(name).map_or(Vec::new(), <[f64]>::to_vec);
@@ -95,8 +95,8 @@ impl Variable {
             Self::Position => kinematics.q[index].clone(),
             Self::Velocity => kinematics.dq[index].clone(),
             Self::Acceleration => kinematics.ddq[index].clone(),
-            Self::Wanted => wanted(),
-            Self::WantedRate => rates(log, &wanted()),
+            Self::CommandedTorque => wanted(),
+            Self::CommandedTorqueRate => rates(log, &wanted()),
             Self::CommandRate => rates(log, joint.q_cmd),
             Self::Load => wanted().iter().zip(&kinematics.dq[index]).map(|(tau, dq)| tau.abs() * dq.signum()).collect(),
             Self::Voltage => channel("battery_V"),
@@ -111,17 +111,17 @@ pub struct Residuals<'a> {
     pub log: &'a Log,
     pub robot: &'a RobotModel,
     pub joints: &'a [JointCommands<'a>],
-    pub kinematics: &'a Kinematics,
+    pub kinematics: &'a JointTrajectory,
     /// What is on the y axis.
     pub y_label: &'static str,
     /// Of the model without the finding, and of the one with it.
-    pub without: &'a PerRow,
-    pub with: &'a PerRow,
+    pub without: &'a JointSeries,
+    pub with: &'a JointSeries,
 }
 
 impl Residuals<'_> {
     /// The law of `entry` in them; none where no row has both residual and variable.
-    pub fn law(&self, entry: &Entry) -> Option<Law> {
+    pub fn law(&self, entry: &EffectEntry) -> Option<ResidualPlot> {
         let variable = Variable::of(entry);
         let of_bodies = !matches!(entry.effect.target, Target::Joints | Target::Supply);
         let shown = |joint: Joint| of_bodies || entry.scope.contains(joint);
@@ -139,7 +139,7 @@ impl Residuals<'_> {
         }
         let bins = bins(points);
         let cause = (entry.effect.name.to_owned(), entry.scope.to_string());
-        (bins.len() > 1).then_some(Law { cause, x_label: variable.label(), y_label: self.y_label, bins })
+        (bins.len() > 1).then_some(ResidualPlot { cause, x_label: variable.label(), y_label: self.y_label, bins })
     }
 }
 
@@ -170,7 +170,7 @@ fn bins(mut points: Vec<[f64; 3]>) -> Vec<Bin> {
 }
 
 /// Torque of a drive without effects on the measured state [N·m].
-fn wanted(log: &Log, robot: &RobotModel, joint: &JointCommands, kinematics: &Kinematics) -> Vec<f64> {
+fn wanted(log: &Log, robot: &RobotModel, joint: &JointCommands, kinematics: &JointTrajectory) -> Vec<f64> {
     let index = joint.joint.index();
     let q = log.q(joint.joint.name()).unwrap_or_default();
     let gain = |gains: &Option<Vec<f64>>, row: usize, model: f64| gains.as_ref().map_or(model, |gains| gains[row]);

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 
 use twinstep_sysid::Diagnosis;
 
-use evidence::Evidence;
+use evidence::ReportData;
 
 const STYLE: &str = include_str!("style.css");
 
@@ -29,16 +29,16 @@ pub struct ReportError {
 }
 
 /// Writes the report of a diagnosis.
-pub fn write(diagnosis: &Diagnosis, evidence: &Evidence, path: &Path) -> Result<(), ReportError> {
+pub fn write(diagnosis: &Diagnosis, evidence: &ReportData, path: &Path) -> Result<(), ReportError> {
     std::fs::write(path, page(diagnosis, evidence)).map_err(|cause| ReportError { path: path.to_owned(), cause })
 }
 
 /// The page. Everything in it that comes from a file went through [`html::escape`]; the policy in its head keeps a
 /// browser from running or fetching anything all the same.
-fn page(diagnosis: &Diagnosis, evidence: &Evidence) -> String {
+fn page(diagnosis: &Diagnosis, evidence: &ReportData) -> String {
     let log = evidence.provenance.logs.first().map_or("", |log| log.name.as_str());
     let sections = [
-        overview::verdict(diagnosis, evidence),
+        overview::headline(diagnosis, evidence),
         overview::numbers(diagnosis),
         overview::heat_maps(evidence),
         overview::strips(evidence),

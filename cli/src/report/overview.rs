@@ -1,9 +1,9 @@
 //! The upper part of the page: verdict, numbers, where and when simulation and measurement part.
 
 use twinstep_model::{Joint, JointKind, Leg};
-use twinstep_sysid::{Diagnosis, Errors, Evaluation, JointEvaluation};
+use twinstep_sysid::{Diagnosis, RmsErrors, Evaluation, JointEvaluation};
 
-use super::evidence::Evidence;
+use super::evidence::ReportData;
 use super::html::{alike, escape, percent};
 use super::strip::Curve;
 use super::{plot, words};
@@ -12,10 +12,10 @@ use super::{plot, words};
 const LEAST_SCALE: f64 = 1e-3;
 
 /// A joint's error, where it is known.
-type Part = fn(&JointEvaluation) -> Option<f64>;
+type JointErrorFn = fn(&JointEvaluation) -> Option<f64>;
 
 /// The first thing on the page.
-pub fn verdict(diagnosis: &Diagnosis, evidence: &Evidence) -> String {
+pub fn headline(diagnosis: &Diagnosis, evidence: &ReportData) -> String {
     let (log, verdict) = (shown_log(evidence), words::verdict(diagnosis));
     format!("<header>\n<p class=\"kicker\">Diagnosis of {log}</p>\n<h1>{verdict}</h1>\n</header>\n")
 }
@@ -23,7 +23,7 @@ pub fn verdict(diagnosis: &Diagnosis, evidence: &Evidence) -> String {
 /// Errors of both models beside what the sensors leave.
 pub fn numbers(diagnosis: &Diagnosis) -> String {
     let Diagnosis { baseline, extended, noise_floor, .. } = diagnosis;
-    let row = |name: &str, of: fn(&Errors) -> Option<f64>| {
+    let row = |name: &str, of: fn(&RmsErrors) -> Option<f64>| {
         let [before, after, floor] = [baseline, extended, noise_floor].map(of);
         let gain = before.zip(after).and_then(|(before, after)| words::gain(before, after));
         let cells = alike([before, after, floor].map(|value| value.unwrap_or(f64::NAN)));
@@ -43,8 +43,8 @@ pub fn numbers(diagnosis: &Diagnosis) -> String {
 }
 
 /// The errors of twelve joints under both models.
-pub fn heat_maps(evidence: &Evidence) -> String {
-    let quantities: [(&str, Part); 2] =
+pub fn heat_maps(evidence: &ReportData) -> String {
+    let quantities: [(&str, JointErrorFn); 2] =
         [("joint position [rad]", |joint| joint.q_rmse_rad), ("torque [N·m]", |joint| joint.torque_rmse_nm)];
     let mut maps = String::new();
     for (name, of) in quantities {
@@ -69,7 +69,7 @@ pub fn heat_maps(evidence: &Evidence) -> String {
     )
 }
 
-fn heat_map(name: &str, evaluation: &Evaluation, of: Part, worst: f64) -> String {
+fn heat_map(name: &str, evaluation: &Evaluation, of: JointErrorFn, worst: f64) -> String {
     let cell = |leg: Leg, kind: JointKind| {
         let error = evaluation.per_joint.get(Joint { leg, kind }.name()).and_then(of);
         match error {
@@ -93,7 +93,7 @@ fn heat_map(name: &str, evaluation: &Evaluation, of: Part, worst: f64) -> String
 }
 
 /// The worst joint over time.
-pub fn strips(evidence: &Evidence) -> String {
+pub fn strips(evidence: &ReportData) -> String {
     let mut figures = String::new();
     for strip in &evidence.strips {
         let joint = strip.joint;
@@ -119,7 +119,7 @@ pub fn key(class: &str, name: &str) -> String {
 }
 
 /// The log in the pictures.
-fn shown_log(evidence: &Evidence) -> String {
+fn shown_log(evidence: &ReportData) -> String {
     let first = evidence.provenance.logs.first();
     first.map_or("the log".to_owned(), |log| format!("<code>{}</code>", escape(&log.name)))
 }

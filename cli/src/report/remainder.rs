@@ -1,7 +1,7 @@
 //! The lower part of the page: what cannot be told apart, what is left, and where it all comes from.
 
 use twinstep_model::effects::Effect;
-use twinstep_sysid::{Cause, Confusable, Diagnosis, NextExperiment};
+use twinstep_sysid::{Cause, CorrelatedPair, Diagnosis, NextExperiment};
 
 use super::evidence::{LogFacts, Provenance};
 use super::html::{escape, number, percent};
@@ -30,7 +30,7 @@ fn experiment(next: &NextExperiment) -> String {
     )
 }
 
-fn pair(pair: &Confusable) -> String {
+fn pair(pair: &CorrelatedPair) -> String {
     let [one, other] = pair.effects.each_ref().map(|effect| words::cause_at(effect));
     let (one, correlation, next) = (words::sentence(&one), number(pair.correlation), escape(&pair.experiment));
     format!("<li><strong>{one} or {other}</strong> (correlation {correlation}). Next: {next}</li>\n")
@@ -47,9 +47,9 @@ fn ambiguous(finding: &Cause) -> String {
 /// What the catalogue proposes to tell an effect from others.
 fn experiments(effect: &str, others: &[String]) -> String {
     let among = |name: &str| others.iter().any(|other| other.split('@').next() == Some(name));
-    let confusions = Effect::named(effect).map_or(&[][..], |effect| effect.confusions);
-    let known = confusions.iter().filter(|confusion| among(confusion.with));
-    known.map(|confusion| escape(confusion.experiment)).collect::<Vec<_>>().join(" ")
+    let confusions = Effect::named(effect).map_or(&[][..], |effect| effect.confounders);
+    let known = confusions.iter().filter(|confusion| among(confusion.effect));
+    known.map(|confusion| escape(confusion.discriminating_experiment)).collect::<Vec<_>>().join(" ")
 }
 
 /// What no finding explains.

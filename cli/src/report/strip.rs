@@ -2,11 +2,11 @@
 
 use std::ops::Range;
 
-use twinstep_logs::{Log, TauSensor};
+use twinstep_logs::{Log, TorqueSensor};
 use twinstep_model::Joint;
 use twinstep_sysid::{Evaluation, JointEvaluation};
 
-use super::evidence::Trial;
+use super::evidence::ModelEvaluation;
 use crate::timeline::Timeline;
 
 /// Length of the cut that is shown from near [s].
@@ -14,7 +14,7 @@ const CLOSE_S: f64 = 3.0;
 
 /// A joint over time.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Strip {
+pub struct TimeSeries {
     /// The joint.
     pub joint: &'static str,
     /// What is shown, with its unit.
@@ -36,24 +36,24 @@ pub struct Curve {
     pub pieces: Vec<Vec<(f64, f64)>>,
 }
 
-impl Strip {
+impl TimeSeries {
     /// Of position, and of torque where it was measured.
-    pub fn of(log: &Log, trials: [&Trial; 2]) -> Vec<Strip> {
+    pub fn of(log: &Log, trials: [&ModelEvaluation; 2]) -> Vec<TimeSeries> {
         let before = &trials[0].evaluation;
         let mut strips = Vec::new();
         if let Some(joint) = worst(before, |joint| joint.q_rmse_rad)
             && let Some(measured) = log.q(joint.name())
         {
-            let of = |trial: &Trial| {
+            let of = |trial: &ModelEvaluation| {
                 trial.position[joint.index()].iter().zip(measured).map(|(error, q)| error + q).collect()
             };
             strips.push(strip(log, joint, "joint position [rad]", measured, trials.map(of)));
         }
-        if log.meta().tau_sensor != TauSensor::None
+        if log.meta().tau_sensor != TorqueSensor::None
             && let Some(joint) = worst(before, |joint| joint.torque_rmse_nm)
             && let Some(measured) = log.tau_measured(joint.name())
         {
-            let of = |trial: &Trial| trial.balance.shown[joint.index()].clone();
+            let of = |trial: &ModelEvaluation| trial.balance.estimated_torque[joint.index()].clone();
             strips.push(strip(log, joint, "torque [N·m]", measured, trials.map(of)));
         }
         strips
@@ -67,12 +67,12 @@ fn worst(evaluation: &Evaluation, of: fn(&JointEvaluation) -> Option<f64>) -> Op
     name.parse().ok()
 }
 
-fn strip(log: &Log, joint: Joint, label: &'static str, measured: &[f64], models: [Vec<f64>; 2]) -> Strip {
+fn strip(log: &Log, joint: Joint, label: &'static str, measured: &[f64], models: [Vec<f64>; 2]) -> TimeSeries {
     let [before, after] = &models;
     let differences = |model: &[f64]| model.iter().zip(measured).map(|(model, cell)| model - cell).collect::<Vec<_>>();
     let errors = [differences(before), differences(after)];
     let close = worst_rows(log, &errors[0]);
-    Strip {
+    TimeSeries {
         joint: joint.name(),
         label,
         close: [

@@ -1,7 +1,7 @@
 //! Effects, scopes and the verdict in a robot engineer's words. What comes from files is escaped here.
 
 use twinstep_model::effects::{Effect, Target};
-use twinstep_sysid::{Cause, Diagnosis, Errors, Value};
+use twinstep_sysid::{Cause, Diagnosis, RmsErrors, ParameterValue};
 
 use super::html::{alike, escape, percent};
 
@@ -71,7 +71,7 @@ pub fn verdict(diagnosis: &Diagnosis) -> String {
     let together = if findings.len() > 1 { "; together they remove " } else { ": it removes " };
     let removed = removed(baseline, extended);
     let gain = if removed.is_empty() { String::new() } else { format!("{together}{removed}") };
-    format!("{causes}{gain}.{}", findings.iter().map(doubt).collect::<String>())
+    format!("{causes}{gain}.{}", findings.iter().map(ambiguity).collect::<String>())
 }
 
 /// The first parameter, in brackets, where it is one number.
@@ -80,7 +80,7 @@ fn size(finding: &Cause) -> String {
     let first = parameters.first().and_then(|first| finding.parameters.get(first.name).map(|value| (first, value)));
     let Some((parameter, estimate)) = first else { return String::new() };
     match (&estimate.value, &estimate.low, &estimate.high) {
-        (Value::Number(value), Value::Number(low), Value::Number(high)) => {
+        (ParameterValue::Number(value), ParameterValue::Number(low), ParameterValue::Number(high)) => {
             let [value, low, high] = alike([*value, *low, *high]);
             format!(" ({}, 95 %: {low} to {high})", format!("{value} {}", parameter.unit).trim_end())
         }
@@ -89,7 +89,7 @@ fn size(finding: &Cause) -> String {
 }
 
 /// What a finding cannot be told from.
-fn doubt(finding: &Cause) -> String {
+fn ambiguity(finding: &Cause) -> String {
     if finding.ambiguous_with.is_empty() {
         return String::new();
     }
@@ -97,7 +97,7 @@ fn doubt(finding: &Cause) -> String {
     format!(" This log cannot tell {} from {others}.", cause(&finding.effect, &finding.scope))
 }
 
-fn removed(baseline: &Errors, extended: &Errors) -> String {
+fn removed(baseline: &RmsErrors, extended: &RmsErrors) -> String {
     let pairs = [
         ("joint position error", "rad", baseline.q_rmse_rad, extended.q_rmse_rad),
         ("torque error", "N·m", baseline.torque_rmse_nm, extended.torque_rmse_nm),

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use twinstep_protocol::WireError;
+use twinstep_protocol::ErrorReply;
 
 /// Why a client did not get what it asked for.
 #[derive(Debug, thiserror::Error)]
@@ -34,7 +34,7 @@ pub enum ClientError {
          server says: `TWINSTEP_LOG={SERVER_LOG} twinstep serve --zenoh FILE`; its `access_control` must allow this \
          user what `examples/security/server-acl.json5` allows `alice`"
     )]
-    Invisible {
+    NoServerVisible {
         /// Where the client is connected.
         endpoint: String,
         /// For how long it looked [s].
@@ -42,7 +42,7 @@ pub enum ClientError {
     },
     /// Servers are visible, but none or several fit.
     #[error("{wanted}; visible: {}\n  choose one by its name (`robot`)", visible.join(", "))]
-    NoUniqueRobot {
+    AmbiguousRobot {
         /// What was looked for and how many there are.
         wanted: String,
         /// `name (sid)` of every server.
@@ -58,7 +58,7 @@ pub enum ClientError {
     },
     /// The server refused.
     #[error(transparent)]
-    Refused(#[from] WireError),
+    Rejected(#[from] ErrorReply),
     /// The server was stopped.
     #[error("the server at {endpoint} is shutting down; the request was not executed")]
     ShuttingDown {
@@ -75,7 +75,7 @@ pub enum ClientError {
     },
     /// No answer came, for a stated reason.
     #[error("no answer from {endpoint} to `{request}` after {waited_s:.1} s: {reason}")]
-    NoAnswer {
+    RequestTimeout {
         /// Where the server is or was.
         endpoint: String,
         /// What was asked.
@@ -87,7 +87,7 @@ pub enum ClientError {
     },
     /// The last request may or may not have been executed: nothing else can be asked before it is settled.
     #[error("the last `{0}` is not answered yet\n  `recv` waits for it again; `reset` settles it and starts anew")]
-    Unanswered(&'static str),
+    RequestPending(&'static str),
     /// Nothing was sent.
     #[error("nothing was sent: call `send` before `recv`")]
     NothingSent,

@@ -22,5 +22,5 @@ mod link;
 mod remote_env;
 
 pub use error::ClientError;
-pub use link::{ConnectOptions, Link};
-pub use remote_env::{RemoteVecEnv, Ticket};
+pub use link::{ConnectOptions, Connection};
+pub use remote_env::{RemoteVecEnv, LeaseHandle};

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use twinstep_model::AutoresetMode;
-use twinstep_protocol::{Code, PROTOCOL, WireError, decode, encode, keys, message};
+use twinstep_protocol::{ErrorCode, PROTOCOL, ErrorReply, decode, encode, keys, message};
 use zenoh::bytes::ZBytes;
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::liveliness::LivelinessToken;
@@ -19,10 +19,10 @@ use crate::ClientError;
 /// take longer; Zenoh keeps state for every query this long, so that it must stay short.
 const QUERY_TIMEOUT: Duration = Duration::from_secs(2);
 /// Pause before a repeat, doubled each time up to the second.
-const PAUSES: [Duration; 2] = [Duration::from_millis(2), Duration::from_millis(200)];
+const RETRY_BACKOFF: [Duration; 2] = [Duration::from_millis(2), Duration::from_millis(200)];
 /// How long another server must stand in the place of ours before ours counts as restarted. A server that lost its
 /// router is back within a second.
-const REPLACED_FOR: Duration = Duration::from_secs(2);
+const RESTART_CONFIRMATION: Duration = Duration::from_secs(2);
 /// How long a port may take to accept a connection.
 const PROBE_TIMEOUT: Duration = Duration::from_secs(1);
 
@@ -70,7 +70,7 @@ impl ConnectOptions {
 }
 
 /// A connection to one server, with the client's liveliness token declared.
-pub struct Link {
+pub struct Connection {
     endpoint: String,
     timeout: Duration,
     session: Session,
@@ -87,16 +87,16 @@ pub struct Pending {
 }
 
 /// What became of one query.
-enum Outcome {
+enum QueryOutcome {
     Answer(ZBytes),
-    Error(WireError),
+    Error(ErrorReply),
     /// The query timed out: the server is frozen, or still executing.
     Timeout,
     /// Zero replies: nobody is there, or somebody on the way refused.
-    Nobody,
+    NoReply,
 }
 
-impl Link {
+impl Connection {
     /// Connects, finds the server, and declares the client's token there.
     pub fn open(options: &ConnectOptions) -> Result<Self, ClientError> {
         let session = open_session(options)?;
@@ -135,7 +135,7 @@ impl Link {
     pub fn hello(&self) -> Result<message::HelloReply, ClientError> {
         let querier = self.querier(keys::hello(&self.sid))?;
         let client = concat!("twinstep-client ", env!("CARGO_PKG_VERSION")).to_owned();
-        let answer = self.ask(&querier, encode(&message::HelloRequest { protocol: PROTOCOL, client }))?;
+        let answer = self.request(&querier, encode(&message::HelloRequest { protocol: PROTOCOL, client }))?;
         let hello: message::HelloReply = read_answer(&answer, "hello")?;
         if !(hello.protocols[0]..=hello.protocols[1]).contains(&PROTOCOL) {
             return Err(ClientError::Version { theirs: hello.protocols, ours: PROTOCOL });
@@ -144,52 +144,52 @@ impl Link {
     }
 
     /// Sends a request and waits for its answer.
-    pub fn ask(&self, querier: &Querier<'static>, request: Vec<u8>) -> Result<ZBytes, ClientError> {
-        self.wait(querier, &mut send(querier, request)?)
+    pub fn request(&self, querier: &Querier<'static>, request: Vec<u8>) -> Result<ZBytes, ClientError> {
+        self.wait_reply(querier, &mut send(querier, request)?)
     }
 
     /// Waits for the answer to a request, repeating it until the timeout. May be called again after a timeout.
-    pub fn wait(&self, querier: &Querier<'static>, pending: &mut Pending) -> Result<ZBytes, ClientError> {
+    pub fn wait_reply(&self, querier: &Querier<'static>, pending: &mut Pending) -> Result<ZBytes, ClientError> {
         let since = Instant::now();
-        let mut pause = PAUSES[0];
+        let mut pause = RETRY_BACKOFF[0];
         let mut replaced_since: Option<Instant> = None;
         loop {
             match outcome(&pending.replies) {
-                Outcome::Answer(bytes) => return Ok(bytes),
-                Outcome::Error(error) if error.code == Code::ShuttingDown => {
+                QueryOutcome::Answer(bytes) => return Ok(bytes),
+                QueryOutcome::Error(error) if error.code == ErrorCode::ShuttingDown => {
                     return Err(ClientError::ShuttingDown { endpoint: self.endpoint.clone() });
                 }
-                Outcome::Error(error) if !error.retry => return Err(error.into()),
-                Outcome::Error(_) | Outcome::Timeout => {}
-                Outcome::Nobody => {
-                    replaced_since = self.is_replaced().then(|| replaced_since.unwrap_or_else(Instant::now));
-                    if replaced_since.is_some_and(|since| since.elapsed() >= REPLACED_FOR) {
+                QueryOutcome::Error(error) if !error.retryable => return Err(error.into()),
+                QueryOutcome::Error(_) | QueryOutcome::Timeout => {}
+                QueryOutcome::NoReply => {
+                    replaced_since = self.server_restarted().then(|| replaced_since.unwrap_or_else(Instant::now));
+                    if replaced_since.is_some_and(|since| since.elapsed() >= RESTART_CONFIRMATION) {
                         return Err(ClientError::Restarted { endpoint: self.endpoint.clone() });
                     }
                 }
             }
             if since.elapsed() >= self.timeout {
-                return Err(ClientError::NoAnswer {
+                return Err(ClientError::RequestTimeout {
                     endpoint: self.endpoint.clone(),
                     request: querier.key_expr().to_string(),
                     waited_s: since.elapsed().as_secs_f64(),
-                    reason: self.diagnose(),
+                    reason: self.timeout_reason(),
                 });
             }
             std::thread::sleep(pause);
-            pause = (pause * 2).min(PAUSES[1]);
+            pause = (pause * 2).min(RETRY_BACKOFF[1]);
             pending.replies = get(querier, &pending.payload)?;
         }
     }
 
     /// True if another start of a server with this robot's name is visible and this one is not.
-    fn is_replaced(&self) -> bool {
+    fn server_restarted(&self) -> bool {
         let visible = visible_servers(&self.session);
         !visible.iter().any(|(sid, _)| *sid == self.sid) && visible.iter().any(|(_, name)| *name == self.name)
     }
 
     /// Which of the reasons for silence it is.
-    fn diagnose(&self) -> String {
+    fn timeout_reason(&self) -> String {
         let info = self.session.info();
         let linked = info.routers_zid().wait().next().is_some() || info.peers_zid().wait().next().is_some();
         if !linked {
@@ -205,11 +205,11 @@ impl Link {
             Ok(outcome(&send(&querier, encode(&request))?.replies))
         });
         match hello {
-            Ok(Outcome::Answer(_)) => {
+            Ok(QueryOutcome::Answer(_)) => {
                 "the server answers `hello`, but not this: it is still executing the request (raise `timeout`), or \
                  access control or a message size limit on the way refuses it"
             }
-            Ok(Outcome::Timeout) => "the server is visible but frozen: it accepts requests and answers none",
+            Ok(QueryOutcome::Timeout) => "the server is visible but frozen: it accepts requests and answers none",
             _ => "the server is visible but nothing comes back: access control may deny queries to this user",
         }
         .to_owned()
@@ -227,12 +227,12 @@ fn get(querier: &Querier<'static>, payload: &ZBytes) -> Result<FifoChannelHandle
     querier.get().payload(payload.clone()).wait().map_err(|error| refused_by_zenoh(&error))
 }
 
-fn outcome(replies: &FifoChannelHandler<Reply>) -> Outcome {
-    let Ok(reply) = replies.recv() else { return Outcome::Nobody };
+fn outcome(replies: &FifoChannelHandler<Reply>) -> QueryOutcome {
+    let Ok(reply) = replies.recv() else { return QueryOutcome::NoReply };
     match reply.into_result() {
-        Ok(sample) => Outcome::Answer(sample.payload().clone()),
+        Ok(sample) => QueryOutcome::Answer(sample.payload().clone()),
         // Zenoh's own errors, such as its timeout, are not ours to decode.
-        Err(error) => decode(&error.payload().to_bytes()).map_or(Outcome::Timeout, Outcome::Error),
+        Err(error) => decode(&error.payload().to_bytes()).map_or(QueryOutcome::Timeout, QueryOutcome::Error),
     }
 }
 
@@ -256,7 +256,7 @@ fn open_session(options: &ConnectOptions) -> Result<Session, ClientError> {
                     port_open: port_open(&options.endpoint),
                 });
             }
-            Err(_) => std::thread::sleep(PAUSES[1]),
+            Err(_) => std::thread::sleep(RETRY_BACKOFF[1]),
         }
     }
 }
@@ -325,10 +325,10 @@ fn find_server(session: &Session, options: &ConnectOptions) -> Result<(String, S
         match (fitting.pop(), fitting.is_empty()) {
             (Some(server), true) => return Ok(server),
             // A restarted server's old token may still be there for a moment.
-            _ if since.elapsed() < options.connect_timeout => std::thread::sleep(PAUSES[1] / 4),
+            _ if since.elapsed() < options.connect_timeout => std::thread::sleep(RETRY_BACKOFF[1] / 4),
             (None, _) if visible.is_empty() => {
                 let waited_s = since.elapsed().as_secs_f64();
-                return Err(ClientError::Invisible { endpoint: options.endpoint.clone(), waited_s });
+                return Err(ClientError::NoServerVisible { endpoint: options.endpoint.clone(), waited_s });
             }
             (found, _) => {
                 let count = fitting.len() + usize::from(found.is_some());
@@ -337,7 +337,7 @@ fn find_server(session: &Session, options: &ConnectOptions) -> Result<(String, S
                     None => format!("{count} robots are there and none was named"),
                 };
                 let visible = visible.iter().map(|(sid, name)| format!("{name} ({sid})")).collect();
-                return Err(ClientError::NoUniqueRobot { wanted, visible });
+                return Err(ClientError::AmbiguousRobot { wanted, visible });
             }
         }
     }

@@ -292,7 +292,7 @@ fn a_joint_s_name_with_something_behind_it_is_answered_with_the_column_that_is_m
 fn positions_in_degrees_are_noted() {
     let log = Log::open(folder(&CSV.replace("0.3,", "85,"), META).path()).expect("a log");
     expect!["q_FL_hip goes beyond 7 rad: is it in degrees? Positions are in radians"]
-        .assert_eq(&log.describe().notes.join("; "));
+        .assert_eq(&log.describe().warnings.join("; "));
 }
 
 #[test]

@@ -14,7 +14,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use tempfile::TempDir;
-use twinstep_logs::{Base, Gain, Meta, Segment, TauSensor};
+use twinstep_logs::{BaseMount, Gain, Meta, Segment, TorqueSensor};
 
 /// The real robot in the air, 16 s at 200 Hz.
 const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../data/go2_air_chirp");
@@ -47,8 +47,8 @@ fn write(folder: &Path, name: &str, content: &str) -> PathBuf {
 /// A description of `stand` (fixed) and `walk` (floating), with gains.
 fn meta() -> Meta {
     let segment = |name: &str, base| Segment { name: name.to_owned(), base };
-    let segments = vec![segment("stand", Base::Fixed), segment("walk", Base::Floating)];
-    Meta { kp: Some(Gain::Same(20.0)), kd: Some(Gain::Same(0.5)), ..Meta::new(200.0, TauSensor::Current, segments) }
+    let segments = vec![segment("stand", BaseMount::Fixed), segment("walk", BaseMount::Floating)];
+    Meta { kp: Some(Gain::Uniform(20.0)), kd: Some(Gain::Uniform(0.5)), ..Meta::new(200.0, TorqueSensor::MotorCurrent, segments) }
 }
 
 /// Columns by name, as `Log::new` takes them.

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use expect_test::{Expect, expect};
 use proptest::prelude::*;
-use twinstep_logs::{Base, Gain, Log, LogError, Meta, Segment, TauSensor};
+use twinstep_logs::{BaseMount, Gain, Log, LogError, Meta, Segment, TorqueSensor};
 
 use crate::{RECORDING, columns, meta};
 
@@ -133,8 +133,8 @@ fn small() -> Log {
 
 #[test]
 fn what_mcap_has_no_place_for_is_named() {
-    assert_eq!(small().left_out_of("walk.mcap"), ["pos_z"]);
-    assert!(small().left_out_of("walk.csv").is_empty());
+    assert_eq!(small().unsupported_columns("walk.mcap"), ["pos_z"]);
+    assert!(small().unsupported_columns("walk.csv").is_empty());
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("walk.mcap");
     small().write(&path).expect("written");
@@ -269,7 +269,7 @@ fn recording_of_the_robot_is_read_in_our_order() {
         (Some(3), Some(20.0), Some(0.5))
     );
     assert!(log.dq("FL_hip").is_none(), "zero throughout is no measurement");
-    assert_eq!((log.meta().tau_sensor, log.meta().rate_hz), (TauSensor::Current, 500.0));
+    assert_eq!((log.meta().tau_sensor, log.meta().rate_hz), (TorqueSensor::MotorCurrent, 500.0));
     assert_eq!(log.ignored(), ["topic /camera/image (4 messages)"]);
     expect![[r#"
         [
@@ -277,7 +277,7 @@ fn recording_of_the_robot_is_read_in_our_order() {
             "foot_force is the robot's raw count, not newtons: it tells loaded from unloaded only",
         ]
     "#]]
-    .assert_debug_eq(&log.reading_notes());
+    .assert_debug_eq(&log.read_warnings());
 }
 
 #[test]
@@ -303,8 +303,8 @@ fn description_beside_a_recording_says_what_the_robot_cannot() {
     recorder.state("/lowstate", 0, &state_bytes());
     recorder.command("/lowcmd", 0, &command_bytes(FIRST));
     recorder.finish();
-    let segments = vec![Segment { name: "held".to_owned(), base: Base::Fixed }];
-    let said = Meta { joints: vec!["RR_hip".to_owned()], ..Meta::new(500.0, TauSensor::Current, segments) };
+    let segments = vec![Segment { name: "held".to_owned(), base: BaseMount::Fixed }];
+    let said = Meta { joints: vec!["RR_hip".to_owned()], ..Meta::new(500.0, TorqueSensor::MotorCurrent, segments) };
     fs::write(folder.path().join("robot.json"), serde_json::to_string(&said).expect("JSON")).expect("a file");
     let log = Log::open(&path).expect("a log");
     assert_eq!((log.meta(), log.joints()), (&said, &["RR_hip".to_owned()][..]));
@@ -332,7 +332,7 @@ fn a_file_that_was_cut_off_gives_its_whole_chunks_and_says_so() {
     fs::write(&path, &whole[..whole.len() * 3 / 4]).expect("a file");
     let log = Log::open(&path).expect("a log");
     assert!(log.rows() > 1000 && log.rows() < 3200, "{}", log.rows());
-    assert!(log.reading_notes()[0].starts_with("the MCAP file is cut off: these are the"), "{:?}", log.reading_notes());
+    assert!(log.read_warnings()[0].starts_with("the MCAP file is cut off: these are the"), "{:?}", log.read_warnings());
 }
 
 fn check(record: impl FnOnce(&mut Recorder), expected: &Expect) {
@@ -419,7 +419,7 @@ fn what_does_not_fit_into_the_messages_is_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("walk.mcap");
     let error = |rows| {
-        let meta = Meta { kp: Some(Gain::Same(1.0)), ..meta() };
+        let meta = Meta { kp: Some(Gain::Uniform(1.0)), ..meta() };
         let error = Log::new(meta, rows).expect("a log").write(&path).expect_err("refused").to_string();
         error.replace(&folder.path().display().to_string(), "log")
     };

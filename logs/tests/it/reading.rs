@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use twinstep_logs::{Base, Gain, Log, Meta};
+use twinstep_logs::{BaseMount, Gain, Log, Meta};
 use twinstep_model::Joint;
 
 use crate::{CSV, META, RECORDING, columns, folder, meta, write};
@@ -16,7 +16,7 @@ fn the_real_recording_opens() {
     assert_eq!((log.kp("RR_calf", 0), log.kd("RR_calf", 0)), (Some(20.0), Some(1.5)));
     assert_eq!(log.q("FL_hip").map(|q| q[0]), Some(-0.047_134_7));
     let parts: Vec<_> = log.segments().map(|(segment, rows)| (segment.name.as_str(), segment.base, rows)).collect();
-    assert_eq!(parts, [("air_chirp", Base::Fixed, 0..log.rows())]);
+    assert_eq!(parts, [("air_chirp", BaseMount::Fixed, 0..log.rows())]);
 }
 
 #[test]
@@ -102,10 +102,10 @@ fn parts_end_where_segment_or_episode_changes() {
 fn a_motion_needs_commands_only() {
     let csv = "t,q_cmd_a\n0,0.1\n0.02,0.2\n";
     let folder = folder(csv, META);
-    let motion = Log::open_motion(folder.path()).expect("a motion");
+    let motion = Log::open_commands(folder.path()).expect("a motion");
     assert_eq!((motion.joints(), motion.q("a"), motion.kp("a", 0)), (&["a".to_owned()][..], None, None));
     assert!(Log::open(folder.path()).is_err());
-    assert!(Log::open_motion(RECORDING).is_ok(), "a measured log is also a motion");
+    assert!(Log::open_commands(RECORDING).is_ok(), "a measured log is also a motion");
 }
 
 #[test]

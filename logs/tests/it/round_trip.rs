@@ -52,7 +52,7 @@ fn build((index, joints, [gyro, volts], kp, (rate_hz, kd)): Parts) -> Log {
     all.extend(gyro.map(|gyro| ("gyro_x".to_owned(), gyro)));
     all.extend(volts.map(|volts| ("battery_V".to_owned(), volts)));
     all.extend(kp.map(|kp| ("kp".to_owned(), kp)));
-    Log::new(Meta { rate_hz, kd: Some(kd.map_or(Gain::Same(0.5), Gain::PerJoint)), ..meta() }, all).expect("a log")
+    Log::new(Meta { rate_hz, kd: Some(kd.map_or(Gain::Uniform(0.5), Gain::PerJoint)), ..meta() }, all).expect("a log")
 }
 
 fn bits(log: &Log) -> Vec<(&str, Vec<u64>)> {
@@ -99,10 +99,10 @@ fn the_real_recording_survives_every_format() {
 
 #[test]
 fn a_motion_survives() {
-    let motion = Log::new_motion(meta(), columns([("t", vec![0.0, 0.1]), ("q_cmd_a", vec![1.0, 2.0])])).expect("one");
+    let motion = Log::new_commands(meta(), columns([("t", vec![0.0, 0.1]), ("q_cmd_a", vec![1.0, 2.0])])).expect("one");
     let folder = tempfile::tempdir().expect("a folder");
     motion.write(folder.path()).expect("written");
-    assert_eq!(Log::open_motion(folder.path()).expect("read"), motion);
+    assert_eq!(Log::open_commands(folder.path()).expect("read"), motion);
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Domain randomisation: robots drawn from the intervals of a model file.
 
-use super::{Entry, EntryError};
+use super::{EffectEntry, EntryError};
 use crate::{ModelFile, RobotModel, Stream, standard_normal, stream};
 
 /// Draws that are tried to see whether the intervals are of any robots.
@@ -14,7 +14,7 @@ const CENTRAL: f64 = 1.96;
 /// others are as the file has them. Values are independent of each other. What is no robot, because delays add up to
 /// more than a drive remembers or a mass is not positive, is drawn again.
 #[derive(Clone, Debug, PartialEq)]
-pub struct RobotDraws(ModelFile);
+pub struct RobotSampler(ModelFile);
 
 /// Most of what the intervals allow is no robot.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -22,7 +22,7 @@ pub struct RobotDraws(ModelFile);
     "of {tried} robots drawn from the intervals of the model file only {possible} can be, at least half must: {cause}; \
      make the intervals narrower"
 )]
-pub struct DrawError {
+pub struct SamplingError {
     /// Robots drawn.
     pub tried: usize,
     /// Those that can be.
@@ -31,22 +31,22 @@ pub struct DrawError {
     pub cause: EntryError,
 }
 
-impl RobotDraws {
+impl RobotSampler {
     /// The robots of `file`; fails if more than half of all draws are none.
-    pub fn new(file: ModelFile) -> Result<Self, DrawError> {
+    pub fn new(file: ModelFile) -> Result<Self, SamplingError> {
         let this = Self(file);
         let mut trials = stream(0, "trial draws", 0);
         let causes: Vec<_> = (0..TRIALS).filter_map(|_| this.attempt(&mut trials).err()).collect();
         match causes.first() {
             Some(cause) if 2 * causes.len() > TRIALS => {
-                Err(DrawError { tried: TRIALS, possible: TRIALS - causes.len(), cause: cause.clone() })
+                Err(SamplingError { tried: TRIALS, possible: TRIALS - causes.len(), cause: cause.clone() })
             }
             _ => Ok(this),
         }
     }
 
     /// One of the robots.
-    pub fn draw(&self, random: &mut Stream) -> RobotModel {
+    pub fn sample(&self, random: &mut Stream) -> RobotModel {
         // Ends soon: `new` has seen that about every second draw is a robot.
         loop {
             if let Ok(robot) = self.attempt(random) {
@@ -61,8 +61,8 @@ impl RobotDraws {
     }
 }
 
-impl Entry {
-    fn drawn(&self, random: &mut Stream) -> Entry {
+impl EffectEntry {
+    fn drawn(&self, random: &mut Stream) -> EffectEntry {
         let mut drawn = self.clone();
         let parameters = self.effect.parameters.iter().flat_map(|one| std::iter::repeat_n(one, one.count));
         for ((value, interval), parameter) in drawn.values.iter_mut().zip(&self.intervals).zip(parameters) {
@@ -81,10 +81,10 @@ mod tests {
     use expect_test::expect;
 
     use super::*;
-    use crate::{JointDrive, go2};
+    use crate::{ActuatorParams, go2};
 
-    fn draws(effects: &str) -> Result<RobotDraws, DrawError> {
-        RobotDraws::new(ModelFile::parse(&format!("robot = \"go2\"\n{effects}"), "robot.toml").expect("valid"))
+    fn draws(effects: &str) -> Result<RobotSampler, SamplingError> {
+        RobotSampler::new(ModelFile::parse(&format!("robot = \"go2\"\n{effects}"), "robot.toml").expect("valid"))
     }
 
     fn effect(text: &str) -> String {
@@ -96,7 +96,7 @@ mod tests {
         let friction =
             "name = \"coulomb_friction\"; scope = \"calf\"; torque_nm = 0.5; interval = { torque_nm = [0.4, 0.8] }";
         let (draws, mut random) = (draws(&effect(friction)).expect("robots"), stream(1, "draws", 0));
-        let robots: Vec<_> = (0..4000).map(|_| draws.draw(&mut random)).collect();
+        let robots: Vec<_> = (0..4000).map(|_| draws.sample(&mut random)).collect();
         let drawn: Vec<f64> = robots.iter().map(|robot| robot.joints[2].coulomb_friction).collect();
         let inside = drawn.iter().filter(|torque| (0.4..0.8).contains(*torque)).count();
         // Four deviations of 4000 draws: 55 of 3800.
@@ -115,7 +115,7 @@ mod tests {
                      interval = { shift_m = [[0.2, -inf, 0.01], [0.4, inf, 0.03]] }";
         let (draws, mut random) = (draws(&(effect(load) + &effect(shift))).expect("robots"), stream(1, "draws", 0));
         let nominal = go2().trunk.com;
-        let shifts: Vec<_> = (0..200).map(|_| draws.draw(&mut random).trunk.com - nominal).collect();
+        let shifts: Vec<_> = (0..200).map(|_| draws.sample(&mut random).trunk.com - nominal).collect();
         assert!(shifts.iter().all(|shift| shift.x <= 0.3 + 1e-12 && shift.y == 0.0), "{shifts:?}");
         assert!(shifts.iter().any(|shift| (shift.x - 0.3).abs() < 1e-12) && shifts.iter().any(|shift| shift.x < 0.25));
     }
@@ -124,7 +124,7 @@ mod tests {
     fn model_without_intervals_gives_its_own_robot_and_takes_no_random_numbers() {
         let friction = "name = \"coulomb_friction\"; scope = \"all\"; torque_nm = 0.5";
         let (draws, mut random) = (draws(&effect(friction)).expect("robots"), stream(1, "draws", 0));
-        assert_eq!(draws.draw(&mut random), draws.0.robot_model().expect("no conflict"));
+        assert_eq!(draws.sample(&mut random), draws.0.robot_model().expect("no conflict"));
         assert_eq!(random, stream(1, "draws", 0));
     }
 
@@ -141,7 +141,7 @@ mod tests {
         let (draws, mut random) = (draws(&delays(0.03)).expect("robots"), stream(1, "draws", 0));
         assert!((0..200).any(|_| draws.attempt(&mut random).is_err()));
         for _ in 0..200 {
-            assert!(draws.draw(&mut random).joints[0].drive.command_delay <= JointDrive::LONGEST_DELAY);
+            assert!(draws.sample(&mut random).joints[0].actuator.command_delay <= ActuatorParams::MAX_DELAY);
         }
     }
 

@@ -1,35 +1,35 @@
 //! The drive's current follows its wish with a time constant.
 
-use super::{Composition, Confusion, Effect, Parameter, Target};
+use super::{Composition, Confounder, Effect, Parameter, Target};
 
 /// The drive's current follows its wish with a time constant.
 pub const EFFECT: Effect = Effect {
     name: "drive_lag",
-    what: "The drive's current follows its wish with a time constant.",
+    summary: "The drive's current follows its wish with a time constant.",
     equation: "d tau / dt = (tau_in - tau) / T",
-    place: "9, bandwidth",
+    chain_stage: "9, bandwidth",
     parameters: &[Parameter {
         name: "time_constant_s",
         unit: "s",
         count: 1,
         bounds: [0.0, 0.1],
-        plausible: [0.0, 0.015],
-        neutral: 0.0,
+        prior_range: [0.0, 0.015],
+        no_effect_value: 0.0,
         source: "current loops and filters of such drives take 2 to 15 ms",
     }],
     composition: Composition::Replace,
     target: Target::Joints,
     signature: "The torque is late and rounded: its phase lags and its amplitude falls with frequency.",
-    confusions: &[
-        Confusion { with: "torque_delay", experiment: "A chirp to high frequency: a delay keeps the amplitude." },
-        Confusion { with: "command_delay", experiment: "A chirp to high frequency: a delay keeps the amplitude." },
-        Confusion {
-            with: "armature",
-            experiment: "Compare the torque with the motion: a lag is before the torque's sensor, inertia behind it.",
+    confounders: &[
+        Confounder { effect: "torque_delay", discriminating_experiment: "A chirp to high frequency: a delay keeps the amplitude." },
+        Confounder { effect: "command_delay", discriminating_experiment: "A chirp to high frequency: a delay keeps the amplitude." },
+        Confounder {
+            effect: "armature",
+            discriminating_experiment: "Compare the torque with the motion: a lag is before the torque's sensor, inertia behind it.",
         },
     ],
     apply: |robot, place, values| {
-        super::joint(robot, place).drive.lag = values[0];
+        super::joint(robot, place).actuator.torque_time_constant = values[0];
         Ok(())
     },
 };

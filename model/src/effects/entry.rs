@@ -1,11 +1,11 @@
 //! Entries of a model file, and the robot that they make.
 
-use super::{Composition, Effect, Place, Scope, Target};
+use super::{Composition, Effect, EffectSite, Scope, Target};
 use crate::{Joint, RobotModel};
 
 /// An effect with its scope and values.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Entry {
+pub struct EffectEntry {
     /// The effect.
     pub effect: &'static Effect,
     /// What it is about.
@@ -57,13 +57,13 @@ pub enum EntryError {
     },
 }
 
-impl Entry {
+impl EffectEntry {
     /// An entry without intervals; `values` are the effect's, parameter after parameter.
     ///
     /// # Panics
     /// If the number of values is wrong.
     pub fn new(effect: &'static Effect, scope: Scope, values: Vec<f64>) -> Result<Self, EntryError> {
-        assert_eq!(values.len(), effect.count(), "values of `{}`", effect.name);
+        assert_eq!(values.len(), effect.num_values(), "values of `{}`", effect.name);
         let intervals = vec![None; values.len()];
         let entry = Self { effect, scope, values, intervals };
         entry.check()?;
@@ -98,38 +98,38 @@ impl Entry {
     }
 
     /// Where it is applied.
-    fn places(&self) -> Vec<Place> {
+    fn sites(&self) -> Vec<EffectSite> {
         match (self.effect.target, self.scope) {
             (Target::Joints, scope) => Joint::ALL
                 .into_iter()
                 .filter(|joint| scope.contains(*joint))
-                .map(|joint| Place::Joint(joint.index()))
+                .map(|joint| EffectSite::Joint(joint.index()))
                 .collect(),
-            (Target::Bodies, Scope::Joint(joint)) => vec![Place::Joint(joint.index())],
-            _ => vec![Place::Whole],
+            (Target::Bodies, Scope::Joint(joint)) => vec![EffectSite::Joint(joint.index())],
+            _ => vec![EffectSite::Global],
         }
     }
 
     /// True if another entry of the same name replaces this one at `place`.
-    fn is_replaced(&self, own: usize, place: Place, entries: &[Entry]) -> bool {
+    fn is_replaced(&self, own: usize, place: EffectSite, entries: &[EffectEntry]) -> bool {
         if self.effect.composition != Composition::Replace {
             return false;
         }
         let rank = |index: usize| (std::cmp::Reverse(entries[index].scope.joints()), index);
         let others = entries.iter().enumerate().filter(|(_, other)| other.effect == self.effect);
-        others.filter(|(_, other)| other.places().contains(&place)).any(|(index, _)| rank(index) > rank(own))
+        others.filter(|(_, other)| other.sites().contains(&place)).any(|(index, _)| rank(index) > rank(own))
     }
 }
 
 /// `robot` with the effects of `entries`: each adds, multiplies or replaces as its [`Composition`] says.
-pub fn compose(robot: &RobotModel, entries: &[Entry]) -> Result<RobotModel, EntryError> {
+pub fn apply_effects(robot: &RobotModel, entries: &[EffectEntry]) -> Result<RobotModel, EntryError> {
     let mut composed = robot.clone();
     // A body that is replaced altogether is there before anything is added to it.
     let (whole, others): (Vec<_>, Vec<_>) =
         entries.iter().enumerate().partition(|(_, entry)| entry.effect.name == "inertia");
     for (index, entry) in whole.into_iter().chain(others) {
         entry.check()?;
-        for place in entry.places() {
+        for place in entry.sites() {
             if !entry.is_replaced(index, place, entries) {
                 let (effect, scope) = (entry.effect.name, entry.scope);
                 (entry.effect.apply)(&mut composed, place, &entry.values).map_err(|reason| EntryError::Conflict {
@@ -140,19 +140,19 @@ pub fn compose(robot: &RobotModel, entries: &[Entry]) -> Result<RobotModel, Entr
             }
         }
     }
-    match entries.last().zip(impossible(&composed)) {
+    match entries.last().zip(check_robot(&composed)) {
         Some((entry, reason)) => Err(EntryError::Conflict { effect: entry.effect.name, scope: entry.scope, reason }),
         None => Ok(composed),
     }
 }
 
 /// Why no such robot can be, if so.
-fn impossible(robot: &RobotModel) -> Option<&'static str> {
+fn check_robot(robot: &RobotModel) -> Option<&'static str> {
     for joint in &robot.joints {
         if joint.armature < 0.0 {
             return Some("the armature of a joint adds up to less than zero");
         }
-        if joint.armature <= 0.0 && (joint.drive.gap > 0.0 || joint.drive.stiffness.is_finite()) {
+        if joint.armature <= 0.0 && (joint.actuator.backlash > 0.0 || joint.actuator.gear_stiffness.is_finite()) {
             return Some("a rotor behind a gear with play or a spring needs an armature above zero");
         }
     }

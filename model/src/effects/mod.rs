@@ -38,8 +38,8 @@ mod torque_sensor_delay;
 mod torque_speed_limit;
 mod viscous_friction;
 
-pub use draw::{DrawError, RobotDraws};
-pub use entry::{Entry, EntryError, compose};
+pub use draw::{SamplingError, RobotSampler};
+pub use entry::{EffectEntry, EntryError, apply_effects};
 pub use scope::{Scope, UnknownScope};
 
 use crate::RobotModel;
@@ -79,11 +79,11 @@ pub struct Effect {
     /// Its name in model files and findings.
     pub name: &'static str,
     /// What it is, in a sentence.
-    pub what: &'static str,
+    pub summary: &'static str,
     /// Its law.
     pub equation: &'static str,
     /// Its place in the chain from command to motion: the step's number where it has one, and a word.
-    pub place: &'static str,
+    pub chain_stage: &'static str,
     /// What it has.
     pub parameters: &'static [Parameter],
     /// How entries of this name that meet at one joint compose.
@@ -93,9 +93,9 @@ pub struct Effect {
     /// What it looks like in data.
     pub signature: &'static str,
     /// What it is taken for.
-    pub confusions: &'static [Confusion],
+    pub confounders: &'static [Confounder],
     /// Puts the values, parameter after parameter, into the robot, at one place.
-    pub apply: fn(&mut RobotModel, Place, &[f64]) -> Result<(), &'static str>,
+    pub apply: fn(&mut RobotModel, EffectSite, &[f64]) -> Result<(), &'static str>,
 }
 
 /// A parameter of an effect.
@@ -110,9 +110,9 @@ pub struct Parameter {
     /// What is allowed.
     pub bounds: [f64; 2],
     /// What a Go2 may plausibly have: the prior, as a 95 % range.
-    pub plausible: [f64; 2],
+    pub prior_range: [f64; 2],
     /// The value that changes nothing.
-    pub neutral: f64,
+    pub no_effect_value: f64,
     /// Where the plausible range comes from.
     pub source: &'static str,
 }
@@ -145,20 +145,20 @@ pub enum Target {
 
 /// Where an effect is applied.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Place {
+pub enum EffectSite {
     /// A joint, or the link behind it, by its index.
     Joint(usize),
     /// The trunk, the supply or the ground.
-    Whole,
+    Global,
 }
 
 /// Another effect that looks alike, and what tells the two apart.
 #[derive(Debug)]
-pub struct Confusion {
+pub struct Confounder {
     /// The other one's name.
-    pub with: &'static str,
+    pub effect: &'static str,
     /// What to run.
-    pub experiment: &'static str,
+    pub discriminating_experiment: &'static str,
 }
 
 impl Effect {
@@ -168,7 +168,7 @@ impl Effect {
     }
 
     /// Numbers in all parameters.
-    pub fn count(&self) -> usize {
+    pub fn num_values(&self) -> usize {
         self.parameters.iter().map(|parameter| parameter.count).sum()
     }
 }
@@ -180,27 +180,27 @@ impl PartialEq for Effect {
 }
 
 /// Puts a number into every joint that an effect is about; effects of joints are applied to nothing else.
-fn joint(robot: &mut RobotModel, place: Place) -> &mut crate::JointModel {
+fn joint(robot: &mut RobotModel, place: EffectSite) -> &mut crate::JointModel {
     match place {
-        Place::Joint(index) => &mut robot.joints[index],
-        Place::Whole => unreachable!("an effect of joints is applied joint by joint"),
+        EffectSite::Joint(index) => &mut robot.joints[index],
+        EffectSite::Global => unreachable!("an effect of joints is applied joint by joint"),
     }
 }
 
 /// Adds to a delay [s].
 fn delayed(delay: &mut f64, more: f64) -> Result<(), &'static str> {
     *delay += more;
-    if *delay > crate::JointDrive::LONGEST_DELAY + 1e-9 {
+    if *delay > crate::ActuatorParams::MAX_DELAY + 1e-9 {
         return Err("the delays of a joint add up to more than 0.04 s");
     }
     Ok(())
 }
 
 /// The body that an effect is about.
-fn body(robot: &mut RobotModel, place: Place) -> &mut crate::RigidBody {
+fn body(robot: &mut RobotModel, place: EffectSite) -> &mut crate::RigidBody {
     match place {
-        Place::Joint(index) => &mut robot.legs[index / 3].bodies[index % 3],
-        Place::Whole => &mut robot.trunk,
+        EffectSite::Joint(index) => &mut robot.legs[index / 3].bodies[index % 3],
+        EffectSite::Global => &mut robot.trunk,
     }
 }
 

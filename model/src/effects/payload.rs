@@ -2,22 +2,22 @@
 
 use glam::DVec3;
 
-use super::{Composition, Confusion, Effect, Parameter, Target};
+use super::{Composition, Confounder, Effect, Parameter, Target};
 
 /// A mass that the model does not know.
 pub const EFFECT: Effect = Effect {
     name: "payload",
-    what: "A mass that the model does not know.",
+    summary: "A mass that the model does not know.",
     equation: "a point mass m at r, fixed to the trunk or to a link",
-    place: "body",
+    chain_stage: "body",
     parameters: &[
         Parameter {
             name: "mass_kg",
             unit: "kg",
             count: 1,
             bounds: [-3.0, 20.0],
-            plausible: [-1.0, 4.0],
-            neutral: 0.0,
+            prior_range: [-1.0, 4.0],
+            no_effect_value: 0.0,
             source: "batteries, computers and sensors that people mount",
         },
         Parameter {
@@ -25,17 +25,17 @@ pub const EFFECT: Effect = Effect {
             unit: "m",
             count: 3,
             bounds: [-0.5, 0.5],
-            plausible: [-0.2, 0.2],
-            neutral: 0.0,
+            prior_range: [-0.2, 0.2],
+            no_effect_value: 0.0,
             source: "on the robot",
         },
     ],
     composition: Composition::Add,
     target: Target::Bodies,
     signature: "All feet carry more in stance, more of it where the mass is; in the air nothing changes.",
-    confusions: &[
-        Confusion { with: "com_shift", experiment: "Weigh the robot: a shift has no mass." },
-        Confusion { with: "torque_gain", experiment: "Move a leg in the air: a gain is still there." },
+    confounders: &[
+        Confounder { effect: "com_shift", discriminating_experiment: "Weigh the robot: a shift has no mass." },
+        Confounder { effect: "torque_gain", discriminating_experiment: "Move a leg in the air: a gain is still there." },
     ],
     apply: |robot, place, values| {
         let body = super::body(robot, place);

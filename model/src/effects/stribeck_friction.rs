@@ -1,21 +1,21 @@
 //! Breakaway friction that fades as the joint moves.
 
-use super::{Composition, Confusion, Effect, Parameter, Target};
+use super::{Composition, Confounder, Effect, Parameter, Target};
 
 /// Breakaway friction that fades as the joint moves.
 pub const EFFECT: Effect = Effect {
     name: "stribeck_friction",
-    what: "Breakaway friction that fades as the joint moves.",
+    summary: "Breakaway friction that fades as the joint moves.",
     equation: "-F_s exp(-(dq / v_s)^2) sign(dq)",
-    place: "13, friction",
+    chain_stage: "13, friction",
     parameters: &[
         Parameter {
             name: "breakaway_nm",
             unit: "N·m",
             count: 1,
             bounds: [0.0, 20.0],
-            plausible: [0.0, 1.0],
-            neutral: 0.0,
+            prior_range: [0.0, 1.0],
+            no_effect_value: 0.0,
             source: "published servos and gears have 0.05 to 1 N·m",
         },
         Parameter {
@@ -23,22 +23,22 @@ pub const EFFECT: Effect = Effect {
             unit: "rad/s",
             count: 1,
             bounds: [0.01, 10.0],
-            plausible: [0.1, 3.0],
-            neutral: 0.1,
+            prior_range: [0.1, 3.0],
+            no_effect_value: 0.1,
             source: "published servos and gears",
         },
     ],
     composition: Composition::Add,
     target: Target::Joints,
     signature: "Friction is largest near standstill; slow motion sticks and slips.",
-    confusions: &[Confusion { with: "coulomb_friction", experiment: "Creep, then move fast: Coulomb friction stays." }],
+    confounders: &[Confounder { effect: "coulomb_friction", discriminating_experiment: "Creep, then move fast: Coulomb friction stays." }],
     apply: |robot, place, values| {
         let friction = &mut super::joint(robot, place).stribeck_friction;
-        if friction.breakaway > 0.0 && (friction.speed - values[1]).abs() > 1e-9 {
+        if friction.breakaway_torque > 0.0 && (friction.stribeck_velocity - values[1]).abs() > 1e-9 {
             return Err("two Stribeck frictions of different `speed_rad_s` on one joint");
         }
-        friction.breakaway += values[0];
-        friction.speed = values[1];
+        friction.breakaway_torque += values[0];
+        friction.stribeck_velocity = values[1];
         Ok(())
     },
 };

@@ -9,8 +9,8 @@ fn named(name: &str) -> &'static Effect {
     Effect::named(name).expect("in the catalogue")
 }
 
-fn entry(name: &str, scope: &str, values: &[f64]) -> Entry {
-    Entry::new(named(name), scope.parse().expect("a scope"), values.to_vec()).expect("allowed")
+fn entry(name: &str, scope: &str, values: &[f64]) -> EffectEntry {
+    EffectEntry::new(named(name), scope.parse().expect("a scope"), values.to_vec()).expect("allowed")
 }
 
 /// A scope that the effect can have.
@@ -26,12 +26,12 @@ fn some_scope(effect: &Effect) -> Scope {
 fn names_are_unique_and_confusions_are_in_the_catalogue() {
     for (index, effect) in CATALOGUE.iter().enumerate() {
         assert!(CATALOGUE[..index].iter().all(|other| other.name != effect.name), "{}", effect.name);
-        for confusion in effect.confusions {
-            assert!(Effect::named(confusion.with).is_some(), "{} is taken for {}", effect.name, confusion.with);
+        for confusion in effect.confounders {
+            assert!(Effect::named(confusion.effect).is_some(), "{} is taken for {}", effect.name, confusion.effect);
         }
         for parameter in effect.parameters {
             let [low, high] = parameter.bounds;
-            let [from, to] = parameter.plausible;
+            let [from, to] = parameter.prior_range;
             assert!(low <= from && from < to && to <= high, "{}.{}", effect.name, parameter.name);
         }
     }
@@ -46,22 +46,22 @@ fn plausible_values_change_the_robot_and_neutral_ones_do_not() {
         let apply = |values: Vec<f64>| {
             let intervals = vec![None; values.len()];
             // An infinite neutral value stands outside the bounds of a file.
-            let entry = Entry { effect, scope: some_scope(effect), values, intervals };
+            let entry = EffectEntry { effect, scope: some_scope(effect), values, intervals };
             let mut robot = go2();
             for joint in 0..12 {
-                let place = if effect.target == Target::Joints { Place::Joint(joint) } else { Place::Whole };
+                let place = if effect.target == Target::Joints { EffectSite::Joint(joint) } else { EffectSite::Global };
                 (effect.apply)(&mut robot, place, &entry.values).expect("no conflict");
-                if place == Place::Whole {
+                if place == EffectSite::Global {
                     break;
                 }
             }
             robot
         };
-        assert_ne!(apply(of(|parameter| parameter.plausible[1])), go2(), "{}", effect.name);
+        assert_ne!(apply(of(|parameter| parameter.prior_range[1])), go2(), "{}", effect.name);
         if effect.name == "inertia" {
             continue;
         }
-        let neutral = apply(of(|parameter| parameter.neutral));
+        let neutral = apply(of(|parameter| parameter.no_effect_value));
         // Cycles of no ripple, a rest of no spring and the like may be written.
         assert_eq!(
             neutral.joints.map(|joint| joint.coulomb_friction),
@@ -75,7 +75,7 @@ fn plausible_values_change_the_robot_and_neutral_ones_do_not() {
 #[test]
 fn friction_adds_up_where_scopes_overlap() {
     let entries = [entry("coulomb_friction", "all", &[0.1]), entry("coulomb_friction", "RR_thigh", &[0.4])];
-    let robot = compose(&go2(), &entries).expect("no conflict");
+    let robot = apply_effects(&go2(), &entries).expect("no conflict");
     for (joint, model) in crate::Joint::ALL.iter().zip(&robot.joints) {
         let expected = if joint.name() == "RR_thigh" { 0.5 } else { 0.1 };
         assert!((model.coulomb_friction - expected).abs() < 1e-12, "{}", joint.name());
@@ -85,9 +85,9 @@ fn friction_adds_up_where_scopes_overlap() {
 #[test]
 fn gains_multiply() {
     let entries = [entry("torque_gain", "all", &[0.9]), entry("torque_gain", "calf", &[0.5])];
-    let robot = compose(&go2(), &entries).expect("no conflict");
-    assert!((robot.joints[0].drive.gain - 0.9).abs() < 1e-12);
-    assert!((robot.joints[2].drive.gain - 0.45).abs() < 1e-12);
+    let robot = apply_effects(&go2(), &entries).expect("no conflict");
+    assert!((robot.joints[0].actuator.gain - 0.9).abs() < 1e-12);
+    assert!((robot.joints[2].actuator.gain - 0.45).abs() < 1e-12);
 }
 
 #[test]
@@ -98,17 +98,17 @@ fn narrowest_scope_replaces_and_of_equal_ones_the_last() {
         entry("drive_lag", "calf", &[0.003]),
         entry("drive_lag", "calf", &[0.004]),
     ];
-    let robot = compose(&go2(), &entries).expect("no conflict");
-    assert_eq!(robot.joints[2].drive.lag, 0.001);
-    assert_eq!(robot.joints[5].drive.lag, 0.004);
-    assert_eq!(robot.joints[0].drive.lag, 0.002);
+    let robot = apply_effects(&go2(), &entries).expect("no conflict");
+    assert_eq!(robot.joints[2].actuator.torque_time_constant, 0.001);
+    assert_eq!(robot.joints[5].actuator.torque_time_constant, 0.004);
+    assert_eq!(robot.joints[0].actuator.torque_time_constant, 0.002);
 }
 
 #[test]
 fn ripples_of_one_frequency_add_as_waves() {
     let entries =
         [entry("torque_ripple", "FL_hip", &[0.3, 10.0, 0.2]), entry("torque_ripple", "FL_hip", &[0.1, 10.0, 1.5])];
-    let ripple = compose(&go2(), &entries).expect("no conflict").joints[0].drive.ripple;
+    let ripple = apply_effects(&go2(), &entries).expect("no conflict").joints[0].actuator.ripple;
     for q in [0.0, 0.1, 0.7] {
         let sum = 0.3 * f64::sin(10.0 * q + 0.2) + 0.1 * f64::sin(10.0 * q + 1.5);
         assert!((ripple.amplitude * (ripple.cycles * q + ripple.phase).sin() - sum).abs() < 1e-12);
@@ -119,14 +119,14 @@ fn ripples_of_one_frequency_add_as_waves() {
 fn ripples_of_two_frequencies_are_refused() {
     let entries =
         [entry("torque_ripple", "all", &[0.3, 10.0, 0.2]), entry("torque_ripple", "FL_hip", &[0.1, 12.0, 0.0])];
-    let error = compose(&go2(), &entries).expect_err("refused").to_string();
+    let error = apply_effects(&go2(), &entries).expect_err("refused").to_string();
     assert!(error.contains("`cycles_per_turn`"), "{error}");
 }
 
 #[test]
 fn what_adds_up_to_no_robot_is_refused() {
-    let refused = |entries: &[Entry], part: &str| {
-        let error = compose(&go2(), entries).expect_err("refused").to_string();
+    let refused = |entries: &[EffectEntry], part: &str| {
+        let error = apply_effects(&go2(), entries).expect_err("refused").to_string();
         assert!(error.contains(part), "{error}");
     };
     // More than the drives remember.
@@ -140,20 +140,20 @@ fn what_adds_up_to_no_robot_is_refused() {
 fn payload_stays_on_a_body_that_is_replaced_whatever_the_order() {
     let theta = go2().trunk.scaled(1.2).log_cholesky();
     let (body, load) = (entry("inertia", "base", &theta), entry("payload", "base", &[2.0, 0.1, 0.0, 0.0]));
-    let one = compose(&go2(), &[body.clone(), load.clone()]).expect("no conflict").trunk;
-    assert_eq!(compose(&go2(), &[load, body]).expect("no conflict").trunk, one);
+    let one = apply_effects(&go2(), &[body.clone(), load.clone()]).expect("no conflict").trunk;
+    assert_eq!(apply_effects(&go2(), &[load, body]).expect("no conflict").trunk, one);
     assert!((one.mass - 1.2 * go2().trunk.mass - 2.0).abs() < 1e-9);
 }
 
 #[test]
 fn scope_that_an_effect_cannot_have_is_refused_with_what_it_can() {
-    let error = Entry::new(named("payload"), Scope::All, vec![1.0, 0.0, 0.0, 0.0]).expect_err("refused").to_string();
+    let error = EffectEntry::new(named("payload"), Scope::All, vec![1.0, 0.0, 0.0, 0.0]).expect_err("refused").to_string();
     assert_eq!(error, "`payload` cannot have scope \"all\"; possible: base, or a joint for the link behind it");
 }
 
 #[test]
 fn value_outside_its_bounds_is_refused() {
-    let error = Entry::new(named("command_delay"), Scope::All, vec![0.5]).expect_err("refused").to_string();
+    let error = EffectEntry::new(named("command_delay"), Scope::All, vec![0.5]).expect_err("refused").to_string();
     assert_eq!(error, "`command_delay` on all: `delay_s` = 0.5 is not allowed: 0 to 0.04");
 }
 

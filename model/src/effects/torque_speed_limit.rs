@@ -1,37 +1,37 @@
 //! Back-EMF leaves less torque the faster the motor turns.
 
-use super::{Composition, Confusion, Effect, Parameter, Target};
+use super::{Composition, Confounder, Effect, Parameter, Target};
 
 /// Back-EMF leaves less torque the faster the motor turns.
 pub const EFFECT: Effect = Effect {
     name: "torque_speed_limit",
-    what: "Back-EMF leaves less torque the faster the motor turns.",
+    summary: "Back-EMF leaves less torque the faster the motor turns.",
     equation: "|tau| <= tau_max clip(1 - dq sign(tau) / v0, 0, 1)",
-    place: "8, back-EMF",
+    chain_stage: "8, back-EMF",
     parameters: &[Parameter {
         name: "no_load_rad_s",
         unit: "rad/s",
         count: 1,
         bounds: [2.0, 200.0],
-        plausible: [12.0, 60.0],
-        neutral: f64::INFINITY,
+        prior_range: [12.0, 60.0],
+        no_effect_value: f64::INFINITY,
         source: "Unitree's data sheet: 30.1 rad/s for hip and thigh, 15.7 for the calf",
     }],
     composition: Composition::Replace,
     target: Target::Joints,
     signature: "At high speed the torque is clipped while it drives, and not while it brakes.",
-    confusions: &[
-        Confusion {
-            with: "torque_saturation",
-            experiment: "Large torque against a held joint: only saturation is left.",
+    confounders: &[
+        Confounder {
+            effect: "torque_saturation",
+            discriminating_experiment: "Large torque against a held joint: only saturation is left.",
         },
-        Confusion {
-            with: "viscous_friction",
-            experiment: "Fast motion with small torque: friction is there, the limit is not.",
+        Confounder {
+            effect: "viscous_friction",
+            discriminating_experiment: "Fast motion with small torque: friction is there, the limit is not.",
         },
     ],
     apply: |robot, place, values| {
-        super::joint(robot, place).drive.no_load_speed = values[0];
+        super::joint(robot, place).actuator.no_load_speed = values[0];
         Ok(())
     },
 };

@@ -1,10 +1,10 @@
 //! Equations of motion `M a + bias = τ` of the tree, leg by leg: recursive Newton-Euler for forces, composite bodies for
 //! the mass matrix (Featherstone, "Rigid Body Dynamics Algorithms", chapters 5 and 6).
 
-use super::factored::{Factored, JointLoad};
-use super::lane::Lane;
+use super::factored::{FactoredDynamics, JointLoad};
+use super::lane::SimdFloat;
 use super::spatial::{Inertia, Vec3};
-use super::tree::{LegFrames, State, Tree};
+use super::tree::{LegFrames, State, KinematicTree};
 
 /// Accelerations.
 #[derive(Clone, Copy, Debug)]
@@ -29,8 +29,8 @@ pub struct Wrench<T> {
 /// The wrench on the base and the joint torques [N·m] that accelerate the robot so, under gravity `gravity` [m/s²] along
 /// −z of the world: inverse dynamics by recursive Newton-Euler. Linear in every body's ten numbers.
 #[inline(always)]
-pub fn inverse_dynamics<T: Lane>(
-    tree: &Tree<T>,
+pub fn inverse_dynamics<T: SimdFloat>(
+    tree: &KinematicTree<T>,
     state: &State<T>,
     acceleration: &Acceleration<T>,
     gravity: T,
@@ -54,10 +54,10 @@ pub fn inverse_dynamics<T: Lane>(
 
 /// Accelerations under joint torques `tau` [N·m] with nothing touching the robot.
 #[inline(always)]
-pub fn forward_dynamics<T: Lane>(tree: &Tree<T>, state: &State<T>, tau: &[T; 12], gravity: T) -> Acceleration<T> {
+pub fn forward_dynamics<T: SimdFloat>(tree: &KinematicTree<T>, state: &State<T>, tau: &[T; 12], gravity: T) -> Acceleration<T> {
     let (one, zero) = (T::splat(1.0), T::splat(0.0));
     let load = JointLoad { tau: *tau, damping: [zero; 12] };
-    let mut factored = Factored::empty();
+    let mut factored = FactoredDynamics::empty();
     factored.set_up(tree, state, &load, one, gravity, one);
     let ([ax, ay, az, lx, ly, lz], ddq) = factored.solution();
     Acceleration { angular: Vec3([ax, ay, az]), linear: Vec3([lx, ly, lz]), ddq }
@@ -66,13 +66,13 @@ pub fn forward_dynamics<T: Lane>(tree: &Tree<T>, state: &State<T>, tau: &[T; 12]
 /// The mass matrix, symmetric: rows and columns are the base's angular and linear velocity in base axes and the joints'
 /// velocities.
 #[inline(always)]
-pub fn mass_matrix<T: Lane>(tree: &Tree<T>, q: &[T; 12]) -> [[T; 18]; 18] {
+pub fn mass_matrix<T: SimdFloat>(tree: &KinematicTree<T>, q: &[T; 12]) -> [[T; 18]; 18] {
     let mut matrix = [[T::splat(0.0); 18]; 18];
     let mut whole = tree.trunk;
     for leg in 0..4 {
         let frames = LegFrames::new(tree, q, leg);
         let inertia = LegInertia::new(tree, &frames, &frames.bodies(&tree.bodies[leg]), leg);
-        whole = whole.joined(&inertia.composite);
+        whole = whole.combined(&inertia.composite);
         for i in 0..3 {
             let row = 6 + 3 * leg + i;
             for j in 0..=i {
@@ -104,12 +104,12 @@ pub(super) struct LegForces<T> {
     pub moment: Vec3<T>,
 }
 
-impl<T: Lane> LegForces<T> {
+impl<T: SimdFloat> LegForces<T> {
     /// `rising` is the acceleration of the base's origin plus that of a fall that gravity does not allow. Without
     /// `acceleration` base and joints keep their velocities, and what comes out is the bias.
     #[inline(always)]
     pub fn new(
-        tree: &Tree<T>,
+        tree: &KinematicTree<T>,
         state: &State<T>,
         frames: &LegFrames<T>,
         bodies: &[Inertia<T>; 3],
@@ -122,7 +122,7 @@ impl<T: Lane> LegForces<T> {
         let LegFrames { hip_angle, shank, .. } = *frames;
         let (hip, thigh) = (tree.hip[leg], tree.thigh[leg]);
         let omega = state.angular_velocity;
-        let turning = omega.turned_back_x(hip_angle);
+        let turning = omega.rotate_x_inverse(hip_angle);
         let spin = Vec3([state.dq[joint], zero, zero]);
         let pitch1 = Vec3([zero, state.dq[joint + 1], zero]);
         let pitch2 = Vec3([zero, state.dq[joint + 2], zero]);
@@ -131,9 +131,9 @@ impl<T: Lane> LegForces<T> {
         let mut rising1 = rising + omega.cross(omega.cross(hip));
         if let Some(Acceleration { angular, ddq, .. }) = acceleration {
             rising1 = rising1 + angular.cross(hip);
-            alpha1 = alpha1 + angular.turned_back_x(hip_angle) + Vec3([ddq[joint], zero, zero]);
+            alpha1 = alpha1 + angular.rotate_x_inverse(hip_angle) + Vec3([ddq[joint], zero, zero]);
         }
-        let acceleration1 = rising1.turned_back_x(hip_angle);
+        let acceleration1 = rising1.rotate_x_inverse(hip_angle);
         let (omega2, mut alpha2) = (omega1 + pitch1, alpha1 + omega1.cross(pitch1));
         if let Some(Acceleration { ddq, .. }) = acceleration {
             alpha2 = alpha2 + Vec3([zero, ddq[joint + 1], zero]);
@@ -168,15 +168,15 @@ pub(super) struct LegInertia<T> {
     pub composite: Inertia<T>,
 }
 
-impl<T: Lane> LegInertia<T> {
+impl<T: SimdFloat> LegInertia<T> {
     #[inline(always)]
-    pub fn new(tree: &Tree<T>, frames: &LegFrames<T>, bodies: &[Inertia<T>; 3], leg: usize) -> Self {
+    pub fn new(tree: &KinematicTree<T>, frames: &LegFrames<T>, bodies: &[Inertia<T>; 3], leg: usize) -> Self {
         let (zero, one) = (T::splat(0.0), T::splat(1.0));
         let LegFrames { hip_angle, shank, .. } = *frames;
         let (hip, thigh) = (tree.hip[leg], tree.thigh[leg]);
         let [body1, body2, body3] = bodies;
-        let composite2 = body2.joined(&body3.shifted(shank));
-        let composite1 = body1.joined(&composite2.shifted(thigh));
+        let composite2 = body2.combined(&body3.shifted(shank));
+        let composite1 = body1.combined(&composite2.shifted(thigh));
         let (ex, ey) = (Vec3([one, zero, zero]), Vec3([zero, one, zero]));
         let (push2, twist2) = (ey.cross(body3.moment), body3.times(ey));
         let twist2_thigh = twist2 + shank.cross(push2);
@@ -203,14 +203,14 @@ impl<T: Lane> LegInertia<T> {
 
 /// Force and moment at the hip's origin in hip axes, as force and moment at the base's origin in base axes.
 #[inline(always)]
-fn to_base<T: Lane>(force: Vec3<T>, moment: Vec3<T>, hip: Vec3<T>, hip_angle: (T, T)) -> (Vec3<T>, Vec3<T>) {
-    let force = force.turned_x(hip_angle);
-    (force, moment.turned_x(hip_angle) + hip.cross(force))
+fn to_base<T: SimdFloat>(force: Vec3<T>, moment: Vec3<T>, hip: Vec3<T>, hip_angle: (T, T)) -> (Vec3<T>, Vec3<T>) {
+    let force = force.rotate_x(hip_angle);
+    (force, moment.rotate_x(hip_angle) + hip.cross(force))
 }
 
 /// Lower triangle of a body's 6 × 6 matrix: angular, then linear.
 #[inline(always)]
-pub(super) fn spatial_matrix<T: Lane>(body: &Inertia<T>) -> [[T; 6]; 6] {
+pub(super) fn spatial_matrix<T: SimdFloat>(body: &Inertia<T>) -> [[T; 6]; 6] {
     let zero = T::splat(0.0);
     let [xx, yy, zz, xy, xz, yz] = body.about_origin;
     let ([hx, hy, hz], m) = (body.moment.0, body.mass);

@@ -7,9 +7,9 @@
 //! `J Δ = y·u + z·g`, and rows meet through y·y' and, on the same leg, z·z'.
 
 use super::dynamics::{LegForces, LegInertia, spatial_matrix};
-use super::lane::Lane;
+use super::lane::SimdFloat;
 use super::spatial::{Cholesky, Inertia, Vec3};
-use super::tree::{LegFrames, State, Tree};
+use super::tree::{LegFrames, State, KinematicTree};
 
 /// What acts at the joints.
 #[derive(Clone, Copy, Debug)]
@@ -32,7 +32,7 @@ pub struct FactoredLeg<T> {
 }
 
 /// The factored equations of one step.
-pub struct Factored<T> {
+pub struct FactoredDynamics<T> {
     /// Factor B of the trunk's block.
     pub trunk: Cholesky<T, 6>,
     /// The legs.
@@ -43,7 +43,7 @@ pub struct Factored<T> {
     pub g: [[T; 3]; 4],
 }
 
-impl<T: Lane> Factored<T> {
+impl<T: SimdFloat> FactoredDynamics<T> {
     /// Of nothing; [`Factored::set_up`] fills it. Kept from step to step, because it is large.
     pub fn empty() -> Self {
         let zero = T::splat(0.0);
@@ -53,7 +53,7 @@ impl<T: Lane> Factored<T> {
 
     /// Sets up the step `dt` [s] under gravity `gravity` [m/s²]. `moving` is 1 where the trunk moves, 0 where it is held.
     #[inline(always)]
-    pub fn set_up(&mut self, tree: &Tree<T>, state: &State<T>, load: &JointLoad<T>, dt: T, gravity: T, moving: T) {
+    pub fn set_up(&mut self, tree: &KinematicTree<T>, state: &State<T>, load: &JointLoad<T>, dt: T, gravity: T, is_floating: T) {
         let rising = state.world_axes()[2].scaled(gravity);
         let (mut force, mut moment) = tree.trunk.wrench(state.angular_velocity, Vec3::zero(), rising);
         let mut whole = tree.trunk;
@@ -61,7 +61,7 @@ impl<T: Lane> Factored<T> {
         let (mut less, mut rhs) = ([[T::splat(0.0); 6]; 6], [T::splat(0.0); 6]);
         for leg in 0..4 {
             let (composite, forces) = self.set_up_leg(tree, state, load, leg, dt, rising);
-            whole = whole.joined(&composite);
+            whole = whole.combined(&composite);
             force = force + forces.force;
             moment = moment + forces.moment;
             for (row, g) in self.legs[leg].coupling.iter().zip(self.g[leg]) {
@@ -87,7 +87,7 @@ impl<T: Lane> Factored<T> {
         self.u = self.trunk.forward(rhs);
         // A held trunk takes no part: nothing that acts on it changes its velocity.
         for value in &mut self.u {
-            *value = *value * moving;
+            *value = *value * is_floating;
         }
     }
 
@@ -95,16 +95,16 @@ impl<T: Lane> Factored<T> {
     #[inline(always)]
     fn set_up_leg(
         &mut self,
-        tree: &Tree<T>,
+        tree: &KinematicTree<T>,
         state: &State<T>,
         load: &JointLoad<T>,
         leg: usize,
         dt: T,
-        rising: Vec3<T>,
+        proper_acceleration: Vec3<T>,
     ) -> (Inertia<T>, LegForces<T>) {
         let frames = LegFrames::new(tree, &state.q, leg);
         let bodies = frames.bodies(&tree.bodies[leg]);
-        let bias = LegForces::new(tree, state, &frames, &bodies, leg, rising, None);
+        let bias = LegForces::new(tree, state, &frames, &bodies, leg, proper_acceleration, None);
         let LegInertia { mut block, columns, composite } = LegInertia::new(tree, &frames, &bodies, leg);
         let mut wanted = [T::splat(0.0); 3];
         for i in 0..3 {

@@ -2,7 +2,7 @@
 
 /// Instruction sets that there are lanes for, from the slowest to the fastest.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Instructions {
+pub enum InstructionSet {
     /// What every processor of the architecture has.
     Baseline,
     /// 256-bit registers of x86-64.
@@ -11,7 +11,7 @@ pub enum Instructions {
     Avx512,
 }
 
-impl Instructions {
+impl InstructionSet {
     /// Those of this processor, from the slowest to the fastest.
     pub fn available() -> Vec<Self> {
         #[cfg_attr(not(target_arch = "x86_64"), expect(unused_mut, reason = "only x86-64 has a choice"))]
@@ -34,7 +34,7 @@ impl Instructions {
     }
 }
 
-impl std::fmt::Display for Instructions {
+impl std::fmt::Display for InstructionSet {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
             Self::Baseline if cfg!(target_arch = "x86_64") => "SSE2",

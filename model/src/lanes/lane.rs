@@ -10,7 +10,7 @@
 use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
 
 /// One number for each of [`Lane::LANES`] robots.
-pub trait Lane:
+pub trait SimdFloat:
     Copy
     + Add<Output = Self>
     + Sub<Output = Self>
@@ -45,9 +45,9 @@ pub trait Lane:
         self.max(-self)
     }
     /// `then` where `self < limit`, else `otherwise`.
-    fn select_less(self, limit: Self, then: Self, otherwise: Self) -> Self;
+    fn select_lt(self, limit: Self, then: Self, otherwise: Self) -> Self;
     /// True if `self < limit` for any robot.
-    fn any_less(self, limit: Self) -> bool;
+    fn any_lt(self, limit: Self) -> bool;
     /// Sine and cosine; within a few units in the last place for |x| < 100.
     fn sin_cos(self) -> (Self, Self);
 }
@@ -128,7 +128,7 @@ impl F32x4 {
     }
 }
 
-impl Lane for F32x4 {
+impl SimdFloat for F32x4 {
     const LANES: usize = 4;
 
     #[inline(always)]
@@ -156,16 +156,16 @@ impl Lane for F32x4 {
 
     #[inline(always)]
     fn max(self, other: Self) -> Self {
-        self.select_less(other, other, self)
+        self.select_lt(other, other, self)
     }
 
     #[inline(always)]
     fn min(self, other: Self) -> Self {
-        self.select_less(other, self, other)
+        self.select_lt(other, self, other)
     }
 
     #[inline(always)]
-    fn select_less(self, limit: Self, then: Self, otherwise: Self) -> Self {
+    fn select_lt(self, limit: Self, then: Self, otherwise: Self) -> Self {
         let mut result = otherwise;
         for lane in 0..4 {
             result.0[lane] = if self.0[lane] < limit.0[lane] { then.0[lane] } else { otherwise.0[lane] };
@@ -174,7 +174,7 @@ impl Lane for F32x4 {
     }
 
     #[inline(always)]
-    fn any_less(self, limit: Self) -> bool {
+    fn any_lt(self, limit: Self) -> bool {
         let mut any = false;
         for lane in 0..4 {
             any |= self.0[lane] < limit.0[lane];
@@ -189,7 +189,7 @@ impl Lane for F32x4 {
 }
 
 /// One robot in double precision: for references and for identification.
-impl Lane for f64 {
+impl SimdFloat for f64 {
     const LANES: usize = 1;
 
     #[inline(always)]
@@ -214,21 +214,21 @@ impl Lane for f64 {
 
     #[inline(always)]
     fn max(self, other: Self) -> Self {
-        self.select_less(other, other, self)
+        self.select_lt(other, other, self)
     }
 
     #[inline(always)]
     fn min(self, other: Self) -> Self {
-        self.select_less(other, self, other)
+        self.select_lt(other, self, other)
     }
 
     #[inline(always)]
-    fn select_less(self, limit: Self, then: Self, otherwise: Self) -> Self {
+    fn select_lt(self, limit: Self, then: Self, otherwise: Self) -> Self {
         if self < limit { then } else { otherwise }
     }
 
     #[inline(always)]
-    fn any_less(self, limit: Self) -> bool {
+    fn any_lt(self, limit: Self) -> bool {
         self < limit
     }
 
@@ -241,14 +241,14 @@ impl Lane for f64 {
 /// Sine and cosine in single precision without a branch or an integer: Cody-Waite reduction to ±π/2, then Taylor
 /// polynomials.
 #[inline(always)]
-pub(super) fn sin_cos_single<T: Lane>(x: T) -> (T, T) {
+pub(super) fn sin_cos_single<T: SimdFloat>(x: T) -> (T, T) {
     let (r, sign) = reduced(x, 12_582_912.0, [3.140_625, 9.670_257_568_359_375e-4, 6.277_114_152_908_325e-7]);
     (sign * sine::<T, 6>(r), sign * cosine::<T, 7>(r))
 }
 
 /// As [`sin_cos_single`], in double precision.
 #[inline(always)]
-pub(super) fn sin_cos_double<T: Lane>(x: T) -> (T, T) {
+pub(super) fn sin_cos_double<T: SimdFloat>(x: T) -> (T, T) {
     let parts = [3.141_592_621_803_283_7, 3.178_650_942_459_171_3e-8, 1.224_646_786_410_718_9e-16];
     let (r, sign) = reduced(x, 6_755_399_441_055_744.0, parts);
     (sign * sine::<T, 11>(r), sign * cosine::<T, 12>(r))
@@ -259,7 +259,7 @@ pub(super) fn sin_cos_double<T: Lane>(x: T) -> (T, T) {
 /// Adding and taking away `round`, 1.5 · 2^(digits of the significand), rounds to a whole number. π is given in parts
 /// whose products with a small whole number are exact.
 #[inline(always)]
-fn reduced<T: Lane>(x: T, round: f64, pi: [f64; 3]) -> (T, T) {
+fn reduced<T: SimdFloat>(x: T, round: f64, pi: [f64; 3]) -> (T, T) {
     let round = T::splat(round);
     let turns = (x * T::splat(std::f64::consts::FRAC_1_PI) + round) - round;
     let r = ((x - turns * T::splat(pi[0])) - turns * T::splat(pi[1])) - turns * T::splat(pi[2]);
@@ -271,19 +271,19 @@ fn reduced<T: Lane>(x: T, round: f64, pi: [f64; 3]) -> (T, T) {
 
 /// The first `TERMS` terms of the sine's series.
 #[inline(always)]
-fn sine<T: Lane, const TERMS: usize>(r: T) -> T {
+fn sine<T: SimdFloat, const TERMS: usize>(r: T) -> T {
     r * series::<T, TERMS>(r * r, 1)
 }
 
 /// The first `TERMS` terms of the cosine's series.
 #[inline(always)]
-fn cosine<T: Lane, const TERMS: usize>(r: T) -> T {
+fn cosine<T: SimdFloat, const TERMS: usize>(r: T) -> T {
     series::<T, TERMS>(r * r, 0)
 }
 
 /// `Σ (−s)^k / (2k + first)!` by Horner's rule.
 #[inline(always)]
-fn series<T: Lane, const TERMS: usize>(s: T, first: usize) -> T {
+fn series<T: SimdFloat, const TERMS: usize>(s: T, first: usize) -> T {
     let mut factorial = 1.0;
     let mut coefficients = [1.0; 16];
     for k in 1..TERMS {
@@ -302,7 +302,7 @@ fn series<T: Lane, const TERMS: usize>(s: T, first: usize) -> T {
 ///
 /// The 64th root by its series, squared six times: no integers, so that lanes stay together.
 #[inline(always)]
-pub(super) fn exponential<T: Lane>(x: T) -> T {
+pub(super) fn exponential<T: SimdFloat>(x: T) -> T {
     const TERMS: usize = 18;
     let root = x.max(T::splat(-40.0)) * T::splat(1.0 / 64.0);
     let mut sum = T::splat(1.0);
@@ -329,7 +329,7 @@ mod tests {
             prop_assert!((sin.get(0) - exact.sin()).abs() < 4e-7, "sin {x} = {sin:?}");
             prop_assert!((cos.get(3) - exact.cos()).abs() < 4e-7, "cos {x} = {cos:?}");
             let (sin, cos) = x.sin_cos();
-            let (ours_sin, ours_cos) = Lane::sin_cos(x);
+            let (ours_sin, ours_cos) = SimdFloat::sin_cos(x);
             prop_assert!((sin - ours_sin).abs() < 2e-15 && (cos - ours_cos).abs() < 2e-15, "{x}");
         }
     }

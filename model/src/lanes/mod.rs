@@ -26,12 +26,12 @@ mod tree;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
-pub use drive::{Commands, Drive, JointForces};
+pub use drive::{SimdCommands, SimdActuators, JointForces};
 pub use dynamics::{Acceleration, Wrench, forward_dynamics, inverse_dynamics, mass_matrix};
-pub use factored::{Factored, FactoredLeg, JointLoad};
-pub use instructions::Instructions;
-pub use lane::{F32x4, Lane};
+pub use factored::{FactoredDynamics, FactoredLeg, JointLoad};
+pub use instructions::InstructionSet;
+pub use lane::{F32x4, SimdFloat};
 pub use spatial::{Cholesky, Inertia, Vec3};
-pub use tree::{Frames, LegFrames, State, Tree};
+pub use tree::{Frames, LegFrames, State, KinematicTree};
 #[cfg(target_arch = "x86_64")]
 pub use x86::{Avx2F32, Avx2F64, Avx512F32, Sse2F32};

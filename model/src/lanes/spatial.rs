@@ -4,14 +4,14 @@ use std::ops::{Add, Neg, Sub};
 
 use glam::{DMat3, DVec3};
 
-use super::lane::Lane;
+use super::lane::SimdFloat;
 use crate::RigidBody;
 
 /// A vector.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Vec3<T>(pub [T; 3]);
 
-impl<T: Lane> Vec3<T> {
+impl<T: SimdFloat> Vec3<T> {
     /// The same for every robot.
     #[inline(always)]
     pub fn splat(value: DVec3) -> Self {
@@ -52,26 +52,26 @@ impl<T: Lane> Vec3<T> {
 
     /// Turned about x by the angle with this sine and cosine.
     #[inline(always)]
-    pub fn turned_x(self, (s, c): (T, T)) -> Self {
+    pub fn rotate_x(self, (s, c): (T, T)) -> Self {
         let [x, y, z] = self.0;
         Self([x, c * y - s * z, s * y + c * z])
     }
 
     /// Turned back about x.
     #[inline(always)]
-    pub fn turned_back_x(self, (s, c): (T, T)) -> Self {
-        self.turned_x((-s, c))
+    pub fn rotate_x_inverse(self, (s, c): (T, T)) -> Self {
+        self.rotate_x((-s, c))
     }
 
     /// Turned about y by the angle with this sine and cosine.
     #[inline(always)]
-    pub fn turned_y(self, (s, c): (T, T)) -> Self {
+    pub fn rotate_y(self, (s, c): (T, T)) -> Self {
         let [x, y, z] = self.0;
         Self([c * x + s * z, y, c * z - s * x])
     }
 }
 
-impl<T: Lane> Add for Vec3<T> {
+impl<T: SimdFloat> Add for Vec3<T> {
     type Output = Self;
     #[inline(always)]
     fn add(self, other: Self) -> Self {
@@ -79,7 +79,7 @@ impl<T: Lane> Add for Vec3<T> {
     }
 }
 
-impl<T: Lane> Sub for Vec3<T> {
+impl<T: SimdFloat> Sub for Vec3<T> {
     type Output = Self;
     #[inline(always)]
     fn sub(self, other: Self) -> Self {
@@ -87,7 +87,7 @@ impl<T: Lane> Sub for Vec3<T> {
     }
 }
 
-impl<T: Lane> Neg for Vec3<T> {
+impl<T: SimdFloat> Neg for Vec3<T> {
     type Output = Self;
     #[inline(always)]
     fn neg(self) -> Self {
@@ -106,7 +106,7 @@ pub struct Inertia<T> {
     pub about_origin: [T; 6],
 }
 
-impl<T: Lane> Inertia<T> {
+impl<T: SimdFloat> Inertia<T> {
     /// Of a body, the same for every robot.
     pub fn splat(body: &RigidBody) -> Self {
         let mut inertia = Self { mass: T::splat(0.0), moment: Vec3::zero(), about_origin: [T::splat(0.0); 6] };
@@ -162,7 +162,7 @@ impl<T: Lane> Inertia<T> {
             s * xy + c * xz,
             cs * (yy - zz) + (cc - ss) * yz,
         ];
-        Self { mass: self.mass, moment: self.moment.turned_x((s, c)), about_origin }
+        Self { mass: self.mass, moment: self.moment.rotate_x((s, c)), about_origin }
     }
 
     /// The same body seen from axes turned about y.
@@ -179,7 +179,7 @@ impl<T: Lane> Inertia<T> {
             cs * (zz - xx) + (cc - ss) * xz,
             c * yz - s * xy,
         ];
-        Self { mass: self.mass, moment: self.moment.turned_y((s, c)), about_origin }
+        Self { mass: self.mass, moment: self.moment.rotate_y((s, c)), about_origin }
     }
 
     /// The same body seen from an origin that lies `offset` back: its own origin is at `offset`.
@@ -202,7 +202,7 @@ impl<T: Lane> Inertia<T> {
 
     /// Two bodies that move as one.
     #[inline(always)]
-    pub fn joined(&self, other: &Self) -> Self {
+    pub fn combined(&self, other: &Self) -> Self {
         let mut about_origin = self.about_origin;
         for (entry, more) in about_origin.iter_mut().zip(other.about_origin) {
             *entry += more;
@@ -219,7 +219,7 @@ pub struct Cholesky<T, const N: usize> {
     inverse: [T; N],
 }
 
-impl<T: Lane, const N: usize> Cholesky<T, N> {
+impl<T: SimdFloat, const N: usize> Cholesky<T, N> {
     /// Of nothing, to be replaced.
     pub(super) fn empty() -> Self {
         Self { factor: [[T::splat(0.0); N]; N], inverse: [T::splat(0.0); N] }

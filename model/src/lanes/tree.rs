@@ -1,6 +1,6 @@
 //! The Go2's tree: the numbers of its bodies, its state, and where everything is.
 
-use super::lane::Lane;
+use super::lane::SimdFloat;
 use super::spatial::{Inertia, Vec3};
 use crate::{LegModel, RobotModel};
 
@@ -8,7 +8,7 @@ use crate::{LegModel, RobotModel};
 ///
 /// Hips turn about x; thighs and calves about y. A thigh's origin lies on its hip's y axis.
 #[derive(Clone, Debug)]
-pub struct Tree<T> {
+pub struct KinematicTree<T> {
     /// About the base frame's origin.
     pub trunk: Inertia<T>,
     /// By leg and joint, each about its joint's origin.
@@ -23,7 +23,7 @@ pub struct Tree<T> {
     pub armature: [T; 12],
 }
 
-impl<T: Lane> Tree<T> {
+impl<T: SimdFloat> KinematicTree<T> {
     /// Of a robot, the same in every lane.
     pub fn splat(robot: &RobotModel) -> Self {
         let legs = &robot.legs;
@@ -71,7 +71,7 @@ pub struct State<T> {
     pub dq: [T; 12],
 }
 
-impl<T: Lane> State<T> {
+impl<T: SimdFloat> State<T> {
     /// At the world's origin, upright and at rest, with all joints at 0.
     pub fn origin() -> Self {
         let (zero, one) = (T::splat(0.0), T::splat(1.0));
@@ -113,7 +113,7 @@ pub struct LegFrames<T> {
     calf_angle: (T, T),
 }
 
-impl<T: Lane> LegFrames<T> {
+impl<T: SimdFloat> LegFrames<T> {
     /// Of nothing, to be replaced.
     pub(super) fn empty() -> Self {
         let (zero, origin) = (T::splat(0.0), Vec3::zero());
@@ -130,17 +130,17 @@ impl<T: Lane> LegFrames<T> {
 
     /// Of leg `leg` with all the robot's joints at `q` [rad].
     #[inline(always)]
-    pub fn new(tree: &Tree<T>, q: &[T; 12], leg: usize) -> Self {
+    pub fn new(tree: &KinematicTree<T>, q: &[T; 12], leg: usize) -> Self {
         let (zero, one) = (T::splat(0.0), T::splat(1.0));
         let hip_angle = q[3 * leg].sin_cos();
         let thigh_angle = q[3 * leg + 1].sin_cos();
         let calf_angle = (q[3 * leg + 1] + q[3 * leg + 2]).sin_cos();
-        let shank = tree.calf[leg].turned_y(thigh_angle);
+        let shank = tree.calf[leg].rotate_y(thigh_angle);
         let pitch = Vec3([zero, hip_angle.1, hip_angle.0]);
-        let thigh = tree.hip[leg] + tree.thigh[leg].turned_x(hip_angle);
+        let thigh = tree.hip[leg] + tree.thigh[leg].rotate_x(hip_angle);
         Self {
             axes: [Vec3([one, zero, zero]), pitch, pitch],
-            origins: [tree.hip[leg], thigh, thigh + shank.turned_x(hip_angle)],
+            origins: [tree.hip[leg], thigh, thigh + shank.rotate_x(hip_angle)],
             shank,
             hip_angle,
             thigh_angle,
@@ -157,7 +157,7 @@ impl<T: Lane> LegFrames<T> {
     /// A point of the calf, such as the foot, given in its frame, in the base frame [m].
     #[inline(always)]
     pub fn calf_point(&self, point: Vec3<T>) -> Vec3<T> {
-        self.origins[2] + point.turned_y(self.calf_angle).turned_x(self.hip_angle)
+        self.origins[2] + point.rotate_y(self.calf_angle).rotate_x(self.hip_angle)
     }
 
     /// Velocity in base axes that each joint's unit speed gives the point at `place` (base frame) of the calf: the
@@ -179,10 +179,10 @@ pub struct Frames<T> {
     pub legs: [LegFrames<T>; 4],
 }
 
-impl<T: Lane> Frames<T> {
+impl<T: SimdFloat> Frames<T> {
     /// With the joints at `q` [rad].
     #[inline(always)]
-    pub fn new(tree: &Tree<T>, q: &[T; 12]) -> Self {
+    pub fn new(tree: &KinematicTree<T>, q: &[T; 12]) -> Self {
         Self {
             legs: [
                 LegFrames::new(tree, q, 0),

@@ -8,7 +8,7 @@
 #[allow(clippy::wildcard_imports, reason = "the names say where they are from")]
 use std::arch::x86_64::*;
 
-use super::lane::{Lane, operators, sin_cos_double, sin_cos_single};
+use super::lane::{SimdFloat, operators, sin_cos_double, sin_cos_single};
 
 /// Defines a lane type over one register.
 macro_rules! register {
@@ -167,11 +167,11 @@ mod tests {
 
     /// Every operation on numbers that include zeros of both signs, infinities and no number at all.
     #[inline(always)]
-    fn every_operation<T: Lane>(a: f64, b: f64) -> [u64; 11] {
+    fn every_operation<T: SimdFloat>(a: f64, b: f64) -> [u64; 11] {
         let (x, y) = (T::splat(a), T::splat(b));
         let (sin, cos) = x.sin_cos();
         let results =
-            [x + y, x - y, x * y, x / y, -x, x.sqrt(), x.max(y), x.min(y), x.select_less(y, x * x, y), sin, cos];
+            [x + y, x - y, x * y, x / y, -x, x.sqrt(), x.max(y), x.min(y), x.select_lt(y, x * x, y), sin, cos];
         // Not-a-numbers differ in their payload between processors.
         results.map(|result| {
             let value = result.get(T::LANES - 1);

@@ -6,10 +6,10 @@ use proptest::prelude::*;
 use serde::{Deserialize, Serialize};
 use twinstep_model::{AutoresetMode, EndedEpisode, Scene, StepBatch};
 use twinstep_protocol::message::{
-    CloseReply, CloseRequest, EnvHeader, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply,
+    CloseReply, CloseRequest, RequestHeader, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply,
     RenderRequest, ResetReply, ResetRequest, StepReply, StepRequest,
 };
-use twinstep_protocol::{Code, PROTOCOL, WireError, convert, decode, encode, tensor};
+use twinstep_protocol::{ErrorCode, PROTOCOL, ErrorReply, convert, decode, encode, tensor};
 
 use crate::golden;
 
@@ -17,8 +17,8 @@ use crate::golden;
 const KINDS: usize = 14;
 
 /// Decodes `bytes` as every kind of message; the codes of those that were refused.
-fn refusals(bytes: &[u8]) -> Vec<Code> {
-    fn refusal<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Option<Code> {
+fn refusals(bytes: &[u8]) -> Vec<ErrorCode> {
+    fn refusal<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Option<ErrorCode> {
         decode::<T>(bytes).err().map(|error| error.code)
     }
     [
@@ -34,8 +34,8 @@ fn refusals(bytes: &[u8]) -> Vec<Code> {
         refusal::<CloseReply>(bytes),
         refusal::<RenderRequest>(bytes),
         refusal::<RenderReply<'_>>(bytes),
-        refusal::<EnvHeader>(bytes),
-        refusal::<WireError>(bytes),
+        refusal::<RequestHeader>(bytes),
+        refusal::<ErrorReply>(bytes),
     ]
     .into_iter()
     .flatten()
@@ -82,7 +82,7 @@ proptest! {
         let [max_envs, free_envs, env_steps] = counts;
         let spec = golden::small_spec();
         let hello = HelloReply {
-            protocol: PROTOCOL, protocols, build: name.clone(), sid: name.clone(), spec_hash: spec.hash(),
+            protocol: PROTOCOL, protocols, server_version: name.clone(), server_id: name.clone(), spec_hash: spec.hash(),
             spec: spec.clone(), max_envs, free_envs, lease_grace_s, env_steps, name: name.clone(),
         };
         round_trips(&hello, &mut Vec::new());
@@ -106,9 +106,9 @@ proptest! {
     }
 
     #[test]
-    fn errors_round_trip(code in prop::sample::select(Code::ALL.to_vec()), words: [String; 3]) {
+    fn errors_round_trip(code in prop::sample::select(ErrorCode::ALL.to_vec()), words: [String; 3]) {
         let [field, message, hint] = words;
-        round_trips(&WireError::new(code, field, message).with_hint(hint), &mut Vec::new());
+        round_trips(&ErrorReply::new(code, field, message).with_hint(hint), &mut Vec::new());
     }
 
     #[test]
@@ -131,7 +131,7 @@ proptest! {
         let bytes = convert::encode_step(&batch, seq);
         let reply: StepReply<'_> = decode(&bytes).expect("what was encoded decodes");
         let mut read = StepBatch::default();
-        convert::read_step(&reply, &spec, rows.len(), &mut read).expect("the lengths fit");
+        convert::decode_step(&reply, &spec, rows.len(), &mut read).expect("the lengths fit");
         prop_assert_eq!(read, batch);
     }
 
@@ -150,7 +150,7 @@ proptest! {
     ) {
         let message = golden::read(name);
         let codes = refusals(&message[..cut.index(message.len())]);
-        prop_assert_eq!(codes, vec![Code::Malformed; KINDS]);
+        prop_assert_eq!(codes, vec![ErrorCode::Malformed; KINDS]);
     }
 
     #[test]
@@ -163,14 +163,14 @@ proptest! {
             let at = at.index(message.len());
             message[at] = byte;
         }
-        prop_assert!(refusals(&message).iter().all(|code| matches!(code, Code::Malformed | Code::Version)));
+        prop_assert!(refusals(&message).iter().all(|code| matches!(code, ErrorCode::Malformed | ErrorCode::Version)));
     }
 
     #[test]
     fn random_bytes_are_refused(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
         let codes = refusals(&bytes);
         prop_assert_eq!(codes.len(), KINDS);
-        prop_assert!(codes.iter().all(|code| matches!(code, Code::Malformed | Code::Version)));
+        prop_assert!(codes.iter().all(|code| matches!(code, ErrorCode::Malformed | ErrorCode::Version)));
     }
 }
 
@@ -203,33 +203,33 @@ fn integers_may_have_any_width() {
 fn missing_required_fields_are_named() {
     let close = encode(&CloseRequest { protocol: PROTOCOL, epoch: 1, seq: 1 });
     let error = decode::<StepRequest<'_>>(&close).expect_err("it has no actions");
-    assert_eq!((error.code, error.message.as_str()), (Code::Malformed, "missing field `actions`"));
+    assert_eq!((error.code, error.message.as_str()), (ErrorCode::Malformed, "missing field `actions`"));
 }
 
 #[test]
 fn fields_by_position_are_malformed() {
     // [1, 1, 1] would be a close request if fields could go without names.
-    assert_eq!(refusals(&[0x93, 1, 1, 1]), vec![Code::Malformed; KINDS]);
+    assert_eq!(refusals(&[0x93, 1, 1, 1]), vec![ErrorCode::Malformed; KINDS]);
 }
 
 #[test]
 fn foreign_version_is_told_apart_even_if_the_fields_changed() {
     let error = decode::<StepRequest<'_>>(b"\x82\xa8protocol\x02\xa3new\x01").expect_err("version 2");
-    assert_eq!(error.code, Code::Version);
+    assert_eq!(error.code, ErrorCode::Version);
 }
 
 #[test]
 fn deep_nesting_is_malformed() {
     // {"protocol": [[[…]]]} with a hundred thousand brackets.
     let bytes = [b"\x81\xa8protocol".to_vec(), vec![0x91; 100_000]].concat();
-    assert_eq!(refusals(&bytes), vec![Code::Malformed; KINDS]);
+    assert_eq!(refusals(&bytes), vec![ErrorCode::Malformed; KINDS]);
 }
 
 #[test]
 fn tensors_are_read_from_golden_bytes() {
     let reply: StepReply<'_> = decode(golden::read("step_reply_ended")).expect("golden");
     let mut batch = StepBatch::default();
-    convert::read_step(&reply, &golden::small_spec(), 2, &mut batch).expect("the lengths fit");
+    convert::decode_step(&reply, &golden::small_spec(), 2, &mut batch).expect("the lengths fit");
     assert_eq!(batch.reward, [0.75, -1.25]);
     assert_eq!((batch.ended[0].env, batch.ended[0].length), (1, 300));
     assert_eq!(batch.ended[0].final_obs, [0.5, 0.5, -0.5, 1.5, -2.5]);
@@ -242,13 +242,13 @@ fn scene_survives_the_wire_and_a_shape_without_a_body_is_refused() {
     let scene = golden::small_scene();
     let bytes = convert::encode_scene(scene.clone());
     let reply: RenderReply<'_> = decode(&bytes).expect("what was encoded decodes");
-    assert_eq!(convert::read_scene(reply.clone()).expect("it fits"), scene);
+    assert_eq!(convert::decode_scene(reply.clone()).expect("it fits"), scene);
     let mut stray = reply.clone();
     stray.shapes[0].body = 2;
-    let error = convert::read_scene(stray).expect_err("there are two bodies");
-    assert_eq!((error.code, error.message.as_str()), (Code::OutOfRange, "`shapes` has body 2; there are 2"));
-    let error = convert::read_scene(RenderReply { pose: &reply.pose[..28], ..reply }).expect_err("one pose of two");
-    assert_eq!((error.code, error.field.as_str()), (Code::BadShape, "pose"));
+    let error = convert::decode_scene(stray).expect_err("there are two bodies");
+    assert_eq!((error.code, error.message.as_str()), (ErrorCode::OutOfRange, "`shapes` has body 2; there are 2"));
+    let error = convert::decode_scene(RenderReply { pose: &reply.pose[..28], ..reply }).expect_err("one pose of two");
+    assert_eq!((error.code, error.field.as_str()), (ErrorCode::BadShape, "pose"));
 }
 
 #[test]
@@ -256,11 +256,11 @@ fn rough_ground_survives_the_wire_and_a_grid_with_too_few_heights_is_refused() {
     let scene = Scene { ground: golden::rough_ground(), ..golden::small_scene() };
     let bytes = convert::encode_scene(scene.clone());
     let mut reply: RenderReply<'_> = decode(&bytes).expect("what was encoded decodes");
-    assert_eq!(convert::read_scene(reply.clone()).expect("it fits"), scene);
+    assert_eq!(convert::decode_scene(reply.clone()).expect("it fits"), scene);
     for (rows, columns) in [(3, 2), (0, 0), (u32::MAX, u32::MAX)] {
         let field = reply.ground.height_field.as_mut().expect("it was sent");
         (field.rows, field.columns) = (rows, columns);
-        let error = convert::read_scene(reply.clone()).expect_err("nine heights are no such grid");
-        assert_eq!((error.code, error.field.as_str()), (Code::BadShape, "height_field"), "{rows} × {columns}");
+        let error = convert::decode_scene(reply.clone()).expect_err("nine heights are no such grid");
+        assert_eq!((error.code, error.field.as_str()), (ErrorCode::BadShape, "height_field"), "{rows} × {columns}");
     }
 }

@@ -7,14 +7,14 @@ use std::fmt::Debug;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::{AutoresetMode, EnvSpec, Field, Ground, HeightField, Scene, SceneShape, ShapeKind};
-use twinstep_protocol::convert::send_ground;
+use twinstep_model::{AutoresetMode, EnvSpec, SpecField, Ground, HeightField, Scene, SceneShape, ShapeKind};
+use twinstep_protocol::convert::encode_ground;
 use twinstep_protocol::message::{
     CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply, RenderRequest,
     ResetReply, ResetRequest, StepReply, StepRequest,
 };
 use twinstep_protocol::tensor::as_bytes;
-use twinstep_protocol::{Code, PROTOCOL, WireError, decode, encode};
+use twinstep_protocol::{ErrorCode, PROTOCOL, ErrorReply, decode, encode};
 
 /// Name of every golden file, without `.msgpack`.
 pub const NAMES: [&str; 18] = [
@@ -77,13 +77,13 @@ fn check<T: Serialize + Deserialize<'static> + PartialEq + Debug>(name: &str, me
 
 /// A robot with two joints: observations of 5, actions of 2 entries.
 pub fn small_spec() -> EnvSpec {
-    let field = |name: &str, size, unit: &str, bound: f32, text: &str| Field {
+    let field = |name: &str, size, unit: &str, bound: f32, text: &str| SpecField {
         name: name.to_owned(),
         size,
         unit: unit.to_owned(),
         low: -bound,
         high: bound,
-        text: text.to_owned(),
+        description: text.to_owned(),
     };
     EnvSpec {
         task: "walk".to_owned(),
@@ -95,7 +95,7 @@ pub fn small_spec() -> EnvSpec {
         action: vec![field("joint_position_offset", 2, "action_scale", 1.0, "offset from q_default")],
         joint_order: vec!["FL_hip".to_owned(), "FL_thigh".to_owned()],
         policy_dt: 0.02,
-        drive_dt: 0.005,
+        actuator_dt: 0.005,
         kp: 20.0,
         kd: 0.5,
         action_scale: 0.25,
@@ -111,9 +111,9 @@ fn hello_has_its_golden_bytes() {
     let reply = HelloReply {
         protocol: PROTOCOL,
         protocols: [1, 1],
-        build: "twinstep 0.1.0".to_owned(),
+        server_version: "twinstep 0.1.0".to_owned(),
         name: "go2".to_owned(),
-        sid: "0123456789abcdef".to_owned(),
+        server_id: "0123456789abcdef".to_owned(),
         spec_hash: small_spec().hash(),
         spec: small_spec(),
         max_envs: 4096,
@@ -233,15 +233,15 @@ fn render_has_its_golden_bytes() {
     check("render_request", &RenderRequest { protocol: PROTOCOL, epoch: 1, env: 1 });
     let Scene { bodies, pose, shapes, ground, command } = small_scene();
     let pose = as_bytes(&pose);
-    let flat = RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground: send_ground(&ground), command };
+    let flat = RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground: encode_ground(&ground), command };
     check("render_reply", &flat);
     let rough = rough_ground();
-    check("render_reply_rough", &RenderReply { ground: send_ground(&rough), ..flat });
+    check("render_reply_rough", &RenderReply { ground: encode_ground(&rough), ..flat });
 }
 
 #[test]
 fn error_has_its_golden_bytes() {
-    let error = WireError::new(Code::BadShape, "actions", "`actions` has 3 entries; 4 are wanted")
+    let error = ErrorReply::new(ErrorCode::BadShape, "actions", "`actions` has 3 entries; 4 are wanted")
         .with_hint("shapes are num_envs × the spec's lengths");
     check("error", &error);
 }

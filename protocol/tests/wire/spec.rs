@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 use twinstep_model::AutoresetMode;
-use twinstep_protocol::keys::{self, Verb};
-use twinstep_protocol::{Code, PROTOCOL};
+use twinstep_protocol::keys::{self, EnvMethod};
+use twinstep_protocol::{ErrorCode, PROTOCOL};
 
 use crate::golden;
 
@@ -101,7 +101,7 @@ fn every_field_at_any_depth_is_named() {
 
 #[test]
 fn table_of_errors_has_exactly_the_codes() {
-    let codes = Code::ALL.map(|code| {
+    let codes = ErrorCode::ALL.map(|code| {
         let quoted = rmp_serde::to_vec_named(&code).expect("a code is a string");
         rmp_serde::from_slice::<String>(&quoted).expect("a code is a string")
     });
@@ -110,7 +110,7 @@ fn table_of_errors_has_exactly_the_codes() {
 
 #[test]
 fn every_verb_key_and_mode_is_named() {
-    let verbs = Verb::ALL.map(|verb| keys::env("<sid>", "<lease>", verb));
+    let verbs = EnvMethod::ALL.map(|verb| keys::env("<sid>", "<lease>", verb));
     let places = [keys::hello("<sid>"), keys::lease("<sid>"), keys::LIVE_SERVERS.to_owned()];
     let tokens = [keys::live_server("<sid>", "<name>"), keys::live_client("<sid>", "<client>")];
     for key in verbs.iter().chain(&places).chain(&tokens) {

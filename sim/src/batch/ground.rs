@@ -3,19 +3,19 @@
 use std::sync::Arc;
 
 use glam::DVec3;
-use twinstep_model::lanes::{Lane, State, Vec3};
+use twinstep_model::lanes::{SimdFloat, State, Vec3};
 use twinstep_model::{Ground, HeightField};
 
 /// What the robots stand on.
 #[derive(Clone, Debug)]
-pub enum Terrain<T> {
+pub enum SimdTerrain<T> {
     /// A plane through the origin: its normal, and two directions along it, in the world.
     Plane([Vec3<T>; 3]),
     /// A height field, and its greatest height [m].
     Field(Arc<HeightField>, T),
 }
 
-impl<T: Lane> Terrain<T> {
+impl<T: SimdFloat> SimdTerrain<T> {
     /// The same ground for robots in lanes.
     pub fn new(ground: &Ground) -> Self {
         if let Some(field) = &ground.height_field {
@@ -29,7 +29,7 @@ impl<T: Lane> Terrain<T> {
 
     /// The ground as seen from trunks in this state.
     #[inline(always)]
-    pub fn near(&self, state: &State<T>) -> Near<'_, T> {
+    pub fn near(&self, state: &State<T>) -> LocalTerrain<'_, T> {
         let axes = state.world_axes();
         let (plane, height) = match self {
             Self::Plane(plane) => (*plane, plane[0].dot(state.position)),
@@ -41,13 +41,13 @@ impl<T: Lane> Terrain<T> {
         };
         let directions = [to_base(plane[0], &axes), to_base(plane[1], &axes), to_base(plane[2], &axes)];
         let velocity = to_base(state.linear_velocity, &axes);
-        Near { terrain: self, position: state.position, axes, velocity, directions, height }
+        LocalTerrain { terrain: self, position: state.position, axes, velocity, directions, height }
     }
 }
 
 /// The ground as seen from the trunk.
-pub struct Near<'a, T> {
-    terrain: &'a Terrain<T>,
+pub struct LocalTerrain<'a, T> {
+    terrain: &'a SimdTerrain<T>,
     position: Vec3<T>,
     /// The world's axes in base axes.
     axes: [Vec3<T>; 3],
@@ -60,14 +60,14 @@ pub struct Near<'a, T> {
 }
 
 /// The ground below a point, as a plane.
-pub struct Patch<T> {
+pub struct TangentPlane<T> {
     /// Of the point above it, along its normal [m].
     pub height: T,
     /// Its normal, and two directions along it, in base axes.
     pub directions: [Vec3<T>; 3],
 }
 
-impl<T: Lane> Near<'_, T> {
+impl<T: SimdFloat> LocalTerrain<'_, T> {
     /// A bound below the heights of all corners of a box around the base's origin with half size `half` [m].
     #[inline(always)]
     pub fn lowest_corner(&self, half: Vec3<T>) -> T {
@@ -77,17 +77,17 @@ impl<T: Lane> Near<'_, T> {
 
     /// The ground below a point of the base frame.
     #[inline(always)]
-    pub fn below(&self, point: Vec3<T>) -> Patch<T> {
+    pub fn plane_below(&self, point: Vec3<T>) -> TangentPlane<T> {
         match self.terrain {
-            Terrain::Plane(_) => {
-                Patch { height: self.height + self.directions[0].dot(point), directions: self.directions }
+            SimdTerrain::Plane(_) => {
+                TangentPlane { height: self.height + self.directions[0].dot(point), directions: self.directions }
             }
-            Terrain::Field(field, _) => self.below_on_field(field, point),
+            SimdTerrain::Field(field, _) => self.below_on_field(field, point),
         }
     }
 
     #[inline(always)]
-    fn below_on_field(&self, field: &HeightField, point: Vec3<T>) -> Patch<T> {
+    fn below_on_field(&self, field: &HeightField, point: Vec3<T>) -> TangentPlane<T> {
         let zero = T::splat(0.0);
         let [x, y, z] = (self.position + in_world(point, &self.axes)).0;
         let (mut ground, mut normal): (T, Vec3<T>) = (zero, Vec3::zero());
@@ -102,18 +102,18 @@ impl<T: Lane> Near<'_, T> {
         let across = Vec3([zero, nz / size, -(ny / size)]);
         let directions =
             [to_base(normal, &self.axes), to_base(across.cross(normal), &self.axes), to_base(across, &self.axes)];
-        Patch { height: (z - ground) * nz, directions }
+        TangentPlane { height: (z - ground) * nz, directions }
     }
 }
 
 /// A vector of the world in base axes.
 #[inline(always)]
-fn to_base<T: Lane>(world: Vec3<T>, axes: &[Vec3<T>; 3]) -> Vec3<T> {
+fn to_base<T: SimdFloat>(world: Vec3<T>, axes: &[Vec3<T>; 3]) -> Vec3<T> {
     axes[0].scaled(world.0[0]) + axes[1].scaled(world.0[1]) + axes[2].scaled(world.0[2])
 }
 
 /// A vector in base axes in the world.
 #[inline(always)]
-fn in_world<T: Lane>(base: Vec3<T>, axes: &[Vec3<T>; 3]) -> Vec3<T> {
+fn in_world<T: SimdFloat>(base: Vec3<T>, axes: &[Vec3<T>; 3]) -> Vec3<T> {
     Vec3([axes[0].dot(base), axes[1].dot(base), axes[2].dot(base)])
 }

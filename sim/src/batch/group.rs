@@ -1,22 +1,22 @@
 //! As many robots as there are lanes: their numbers, and one physics step of them all.
 
 use glam::{DVec3, dvec3};
-use twinstep_model::lanes::{Commands, Drive, Factored, JointLoad, Lane, State, Tree, Vec3};
-use twinstep_model::{Ground, Past, PerJoint, Placement, RigidBody, RobotModel, Variation};
+use twinstep_model::lanes::{SimdCommands, SimdActuators, FactoredDynamics, JointLoad, SimdFloat, State, KinematicTree, Vec3};
+use twinstep_model::{Ground, HistoryStep, PerJoint, InitialState, RigidBody, RobotModel, RandomisationSample};
 
-use super::contact::{Constraints, Impulses, LEG_POINTS, POINTS, Surface};
-use super::ground::Terrain;
-use crate::{Base, SimConfig};
+use super::contact::{Constraints, Impulses, LEG_POINTS, POINTS, ContactParams};
+use super::ground::SimdTerrain;
+use crate::{BaseMount, SimConfig};
 
 /// Gravity [m/s²].
 const GRAVITY: f64 = 9.81;
 
 /// Robots in lanes, with everything that their next step depends on.
 #[derive(Clone)]
-pub struct Group<T> {
-    tree: Tree<T>,
-    drive: Drive<T>,
-    surface: Surface<T>,
+pub struct RobotBatch<T> {
+    tree: KinematicTree<T>,
+    drive: SimdActuators<T>,
+    surface: ContactParams<T>,
     state: State<T>,
     /// What the current's sensor showed, mean over the last drive period [N·m].
     tau: [T; 12],
@@ -29,7 +29,7 @@ pub struct Group<T> {
 
 /// How long robots are advanced.
 #[derive(Clone, Copy)]
-pub struct Time {
+pub struct StepCount {
     /// Periods of the drive.
     pub drive_periods: usize,
     /// Physics steps in each, under one torque.
@@ -38,14 +38,14 @@ pub struct Time {
 
 /// Where the torque of a drive period comes from.
 #[allow(clippy::large_enum_variant, reason = "made once a step, and never moved")]
-pub enum Input<T> {
+pub enum ActuatorInput<T> {
     /// Commands, which the robot's own drives follow.
-    Commands(Commands<T>),
+    Commands(SimdCommands<T>),
     /// Torques from outside [N·m].
     Torques([T; 12]),
 }
 
-impl<T: Lane> Input<T> {
+impl<T: SimdFloat> ActuatorInput<T> {
     /// Torques from outside, one entry a robot.
     pub fn torques(tau: &[PerJoint]) -> Self {
         let mut given = [T::splat(0.0); 12];
@@ -57,20 +57,20 @@ impl<T: Lane> Input<T> {
 }
 
 /// Room for the equations of one step: large, so that one serves many groups and steps.
-pub struct Scratch<T> {
-    factored: Factored<T>,
+pub struct Workspace<T> {
+    factored: FactoredDynamics<T>,
     constraints: Constraints<T>,
 }
 
-impl<T: Lane> Scratch<T> {
+impl<T: SimdFloat> Workspace<T> {
     /// Room, with nothing in it.
     pub fn empty() -> Self {
-        Self { factored: Factored::empty(), constraints: Constraints::empty() }
+        Self { factored: FactoredDynamics::empty(), constraints: Constraints::empty() }
     }
 }
 
 /// What the sensors show of all robots.
-pub struct Sample<T> {
+pub struct SensorReadings<T> {
     /// Of the trunk [m].
     pub position: Vec3<T>,
     /// Of the trunk, world-from-base.
@@ -85,13 +85,13 @@ pub struct Sample<T> {
 #[derive(Clone, Debug, PartialEq)]
 pub struct LaneSnapshot(Vec<f64>);
 
-impl<T: Lane> Group<T> {
+impl<T: SimdFloat> RobotBatch<T> {
     /// Robots that stand as `placement` says.
-    pub fn new(robot: &RobotModel, config: &SimConfig, ground: &Ground, placement: &Placement) -> Self {
+    pub fn new(robot: &RobotModel, config: &SimConfig, ground: &Ground, placement: &InitialState) -> Self {
         let dt = 1.0 / f64::from(config.physics_hz());
         let mut group = Self {
-            tree: Tree::splat(robot),
-            drive: Drive::new(robot, dt),
+            tree: KinematicTree::splat(robot),
+            drive: SimdActuators::new(robot, dt),
             surface: surface(robot, config, ground, dt),
             state: State::origin(),
             tau: [T::splat(0.0); 12],
@@ -107,8 +107,8 @@ impl<T: Lane> Group<T> {
     }
 
     /// Places one robot anew.
-    pub fn place(&mut self, lane: usize, robot: &RobotModel, placement: &Placement) {
-        let variation = &placement.variation;
+    pub fn place(&mut self, lane: usize, robot: &RobotModel, placement: &InitialState) {
+        let variation = &placement.randomisation;
         let mut varied = robot.clone();
         varied.trunk = varied_trunk(robot, variation);
         for body in varied.legs.iter_mut().flat_map(|leg| &mut leg.bodies) {
@@ -116,7 +116,7 @@ impl<T: Lane> Group<T> {
         }
         self.tree.set(lane, &varied);
         // What a placement gives is what the encoders show.
-        let offsets = robot.joints.map(|joint| joint.drive.encoder_offset as f32);
+        let offsets = robot.joints.map(|joint| joint.actuator.encoder_offset as f32);
         let q: PerJoint = std::array::from_fn(|joint| placement.q[joint] - offsets[joint]);
         let rotors = self.drive.set(lane, robot, &q, &placement.dq);
         for (armature, rotor) in self.tree.armature.iter_mut().zip(rotors) {
@@ -129,13 +129,13 @@ impl<T: Lane> Group<T> {
 
         // As `sampled_q` reads: half a step further on.
         let half = 0.5 * self.dt.get(lane);
-        let moving = self.surface.moving.get(lane);
+        let moving = self.surface.is_floating.get(lane);
         let [linear, angular] = [placement.base_linear_velocity, placement.base_angular_velocity]
             .map(|given| Vec3(given.map(|value| moving * f64::from(value))));
         let position = Vec3(placement.base_position.map(f64::from)) + linear.scaled(half);
         let state = &mut self.state;
         set(&mut state.position.0, lane, position.0);
-        set(&mut state.orientation, lane, turned(placement.base_orientation.map(f64::from), angular.scaled(half)));
+        set(&mut state.orientation, lane, integrate_orientation(placement.base_orientation.map(f64::from), angular.scaled(half)));
         set(&mut state.linear_velocity.0, lane, linear.0);
         set(&mut state.angular_velocity.0, lane, angular.0);
         let dq = placement.dq.map(f64::from);
@@ -149,24 +149,24 @@ impl<T: Lane> Group<T> {
 
     /// Lets the drives remember what each lane's robot did before it was placed, in periods of `steps` physics steps; one
     /// that did nothing held still.
-    pub fn remember(&mut self, past: &[&[Past]], steps: usize) {
-        if !self.drive.remembers() {
+    pub fn replay_history(&mut self, past: &[&[HistoryStep]], steps: usize) {
+        if !self.drive.has_memory() {
             return;
         }
         let (zero, one) = (T::splat(0.0), T::splat(1.0));
         let q = self.sampled_q();
-        let still = std::array::from_fn(|joint| self.drive.seen(joint, q[joint], zero).0);
+        let still = std::array::from_fn(|joint| self.drive.encoder_reading(joint, q[joint], zero).0);
         for age in (0..past.iter().map(|past| past.len()).max().unwrap_or(0)).rev() {
             let (mut q, mut dq) = (still, [zero; 12]);
             let mut commands =
-                Commands { q, dq, tau_ff: [zero; 12], kp: [zero; 12], kd: [zero; 12], strength: [one; 12] };
+                SimdCommands { q, dq, tau_ff: [zero; 12], kp: [zero; 12], kd: [zero; 12], strength: [one; 12] };
             for (lane, past) in past.iter().enumerate() {
                 let Some(past) = past.len().checked_sub(age + 1).map(|index| &past[index]) else { continue };
                 commands.set(lane, &past.command);
                 set(&mut q, lane, past.q.map(f64::from));
                 set(&mut dq, lane, past.dq.map(f64::from));
             }
-            self.drive.remember(&commands, &q, &dq, steps);
+            self.drive.replay_history(&commands, &q, &dq, steps);
         }
     }
 
@@ -174,21 +174,21 @@ impl<T: Lane> Group<T> {
     #[inline(always)]
     pub fn advance(
         &mut self,
-        input: &Input<T>,
-        Time { drive_periods, steps }: Time,
-        scratch: &mut Scratch<T>,
-    ) -> Sample<T> {
+        input: &ActuatorInput<T>,
+        StepCount { drive_periods, steps }: StepCount,
+        scratch: &mut Workspace<T>,
+    ) -> SensorReadings<T> {
         let share = T::splat(1.0 / steps as f64);
         for _ in 0..drive_periods {
             match input {
-                Input::Commands(commands) => self.drive.tick(commands, &self.sampled_q(), &self.state.dq),
-                Input::Torques(tau) => self.drive.ask(*tau),
+                ActuatorInput::Commands(commands) => self.drive.update_command(commands, &self.sampled_q(), &self.state.dq),
+                ActuatorInput::Torques(tau) => self.drive.set_torque(*tau),
             }
             self.tau = [T::splat(0.0); 12];
             for index in 0..steps {
                 self.step(index, scratch);
                 for joint in 0..12 {
-                    self.tau[joint] += self.drive.current()[joint] * share;
+                    self.tau[joint] += self.drive.estimated_torque()[joint] * share;
                 }
             }
         }
@@ -197,13 +197,13 @@ impl<T: Lane> Group<T> {
 
     /// One physics step of the drive period.
     #[inline(always)]
-    fn step(&mut self, index: usize, Scratch { factored, constraints }: &mut Scratch<T>) {
+    fn step(&mut self, index: usize, Workspace { factored, constraints }: &mut Workspace<T>) {
         let Self { tree, drive, state, surface, impulses, dt, .. } = self;
-        let forces = drive.push(index, &state.q, &state.dq);
-        let load = JointLoad { tau: forces.tau, damping: forces.viscous };
-        factored.set_up(tree, state, &load, *dt, T::splat(GRAVITY), surface.moving);
-        constraints.find(factored, state, surface, &forces.dry, impulses, *dt);
-        constraints.solve(factored, impulses, surface, &forces.dry, *dt, self.iterations);
+        let forces = drive.step(index, &state.q, &state.dq);
+        let load = JointLoad { tau: forces.tau, damping: forces.damping };
+        factored.set_up(tree, state, &load, *dt, T::splat(GRAVITY), surface.is_floating);
+        constraints.detect(factored, state, surface, &forces.dry_friction, impulses, *dt);
+        constraints.solve(factored, impulses, surface, &forces.dry_friction, *dt, self.iterations);
         let (trunk, joints) = factored.solution();
         self.integrate(trunk, joints);
     }
@@ -211,7 +211,7 @@ impl<T: Lane> Group<T> {
     /// Semi-implicit Euler: velocities first, then positions with the new ones.
     #[inline(always)]
     fn integrate(&mut self, trunk: [T; 6], joints: [T; 12]) {
-        let (dt, moving, state) = (self.dt, self.surface.moving, &mut self.state);
+        let (dt, moving, state) = (self.dt, self.surface.is_floating, &mut self.state);
         for joint in 0..12 {
             state.dq[joint] += joints[joint];
             state.q[joint] += dt * state.dq[joint];
@@ -223,7 +223,7 @@ impl<T: Lane> Group<T> {
         state.linear_velocity =
             state.linear_velocity + Vec3([axes[0].dot(change), axes[1].dot(change), axes[2].dot(change)]);
         state.position = state.position + state.linear_velocity.scaled(dt);
-        state.orientation = turned(state.orientation, state.angular_velocity.scaled(dt));
+        state.orientation = integrate_orientation(state.orientation, state.angular_velocity.scaled(dt));
     }
 
     /// What moves.
@@ -233,18 +233,18 @@ impl<T: Lane> Group<T> {
 
     /// What the sensors show now.
     #[inline(always)]
-    pub fn sample(&self) -> Sample<T> {
+    pub fn sample(&self) -> SensorReadings<T> {
         let State { position, orientation, linear_velocity, angular_velocity, dq, .. } = &self.state;
         // The trunk as `sampled_q` has the joints.
         let back = T::splat(-0.5) * self.dt;
-        let mut sample = Sample {
+        let mut sample = SensorReadings {
             position: *position + linear_velocity.scaled(back),
-            orientation: turned(*orientation, angular_velocity.scaled(back)),
+            orientation: integrate_orientation(*orientation, angular_velocity.scaled(back)),
             q: self.sampled_q(),
             dq: *dq,
         };
         for joint in 0..12 {
-            (sample.q[joint], sample.dq[joint]) = self.drive.seen(joint, sample.q[joint], sample.dq[joint]);
+            (sample.q[joint], sample.dq[joint]) = self.drive.encoder_reading(joint, sample.q[joint], sample.dq[joint]);
         }
         sample
     }
@@ -300,7 +300,7 @@ impl<T: Lane> Group<T> {
     /// Visits every number that differs between robots, always in the same order.
     fn visit(&mut self, mut visit: impl FnMut(&mut T)) {
         let Self { tree, drive, surface, state, tau, gyro_bias, impulses, .. } = self;
-        let Tree { trunk, bodies, hip, thigh, calf, armature } = tree;
+        let KinematicTree { trunk, bodies, hip, thigh, calf, armature } = tree;
         for body in std::iter::once(trunk).chain(bodies.iter_mut().flatten()) {
             visit(&mut body.mass);
             body.moment.0.iter_mut().chain(&mut body.about_origin).for_each(&mut visit);
@@ -319,20 +319,20 @@ impl<T: Lane> Group<T> {
     }
 }
 
-fn set<T: Lane, const N: usize>(values: &mut [T; N], lane: usize, given: [f64; N]) {
+fn set<T: SimdFloat, const N: usize>(values: &mut [T; N], lane: usize, given: [f64; N]) {
     for (value, given) in values.iter_mut().zip(given) {
         value.set(lane, given);
     }
 }
 
 /// The trunk with the variation's payload and shift.
-fn varied_trunk(robot: &RobotModel, variation: &Variation) -> RigidBody {
+fn varied_trunk(robot: &RobotModel, variation: &RandomisationSample) -> RigidBody {
     let trunk = robot.trunk.scaled(f64::from(variation.mass_scale));
     let trunk = trunk.with_point_mass(f64::from(variation.payload), robot.trunk.com);
     RigidBody { com: trunk.com + DVec3::from(variation.com_shift.map(f64::from)), ..trunk }
 }
 
-fn surface<T: Lane>(robot: &RobotModel, config: &SimConfig, ground: &Ground, dt: f64) -> Surface<T> {
+fn surface<T: SimdFloat>(robot: &RobotModel, config: &SimConfig, ground: &Ground, dt: f64) -> ContactParams<T> {
     let shapes = &robot.shapes;
     let points = [shapes.foot_centre, shapes.calf_ends[1], shapes.calf_ends[0]].map(Vec3::splat);
     let half = shapes.trunk_half_size;
@@ -341,23 +341,23 @@ fn surface<T: Lane>(robot: &RobotModel, config: &SimConfig, ground: &Ground, dt:
         Vec3::splat(half * dvec3(sign(0), sign(1), sign(2)))
     };
     let zero = T::splat(0.0);
-    Surface {
+    ContactParams {
         leg_points: [points; 4],
         radii: [shapes.foot_radius, shapes.calf_radius, shapes.calf_radius].map(T::splat),
         corners: std::array::from_fn(corner),
-        ground: Terrain::new(ground),
+        ground: SimdTerrain::new(ground),
         friction: zero,
         time_constant: zero,
         limits: robot.joints.map(|joint| joint.range.map(T::splat)),
         limit_time_constant: T::splat(2.0 * dt),
-        moving: T::splat(if config.base == Base::Floating { 1.0 } else { 0.0 }),
+        is_floating: T::splat(if config.base == BaseMount::Floating { 1.0 } else { 0.0 }),
     }
 }
 
 /// `orientation` turned by the rotation vector `turn` [rad] in its own axes; a Taylor series of the exponential to the
 /// third order, then normalised.
 #[inline(always)]
-fn turned<T: Lane>(orientation: [T; 4], turn: Vec3<T>) -> [T; 4] {
+fn integrate_orientation<T: SimdFloat>(orientation: [T; 4], turn: Vec3<T>) -> [T; 4] {
     let half = turn.scaled(T::splat(0.5));
     let square = half.dot(half);
     let [a, b, c] = half.scaled(T::splat(1.0) - square * T::splat(1.0 / 6.0)).0;

@@ -6,24 +6,24 @@ use rayon::prelude::*;
 use twinstep_model::lanes::F32x4 as Baseline;
 #[cfg(target_arch = "x86_64")]
 use twinstep_model::lanes::{Avx2F32, Avx2F64, Avx512F32, Sse2F32 as Baseline};
-use twinstep_model::lanes::{Commands, Instructions, Lane};
-use twinstep_model::{Command, Ground, Past, PerJoint, Placement, RobotModel, RobotStates, RobotStatesMut};
+use twinstep_model::lanes::{SimdCommands, InstructionSet, SimdFloat};
+use twinstep_model::{Command, Ground, HistoryStep, PerJoint, InitialState, RobotModel, RobotStates, RobotStatesMut};
 
-use super::group::{Group, Input, LaneSnapshot, Sample, Scratch, Time};
+use super::group::{RobotBatch, ActuatorInput, LaneSnapshot, SensorReadings, Workspace, StepCount};
 use crate::SimConfig;
 
 /// Which numbers robots are simulated in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Lanes {
+pub enum SimdPrecision {
     /// Single precision in the registers of these instructions: for learning.
-    Single(Instructions),
+    Single(InstructionSet),
     /// Double precision in the widest registers of this processor: for identification.
     Double,
 }
 
 /// What turns into torque, for all robots.
 #[derive(Clone, Copy)]
-pub enum Inputs<'a> {
+pub enum ActuatorInputs<'a> {
     /// Commands that the robots' own drives follow, one a robot.
     Commands(&'a [Command]),
     /// Torques [N·m], one entry a robot, held.
@@ -31,9 +31,9 @@ pub enum Inputs<'a> {
 }
 
 /// Robots in groups of any lane type.
-pub trait Robots: Send + Sync {
+pub trait BatchSimulator: Send + Sync {
     /// Places `robot` anew.
-    fn place(&mut self, robot: usize, model: &RobotModel, placement: &Placement);
+    fn place(&mut self, robot: usize, model: &RobotModel, placement: &InitialState);
     /// Copies the state of `robot` out.
     fn read(&self, robot: usize, states: &mut RobotStates);
     /// Advances the active robots on the threads of `pool`, or on this one, and copies their states out. True if all
@@ -41,13 +41,13 @@ pub trait Robots: Send + Sync {
     fn advance(
         &mut self,
         pool: Option<&ThreadPool>,
-        inputs: Inputs,
+        inputs: ActuatorInputs,
         active: &[bool],
-        time: Time,
+        time: StepCount,
         states: &mut RobotStates,
     ) -> bool;
     /// Lets the drives remember what robots did in drive periods of `steps` physics steps before they were placed.
-    fn remember(&mut self, past: &[&[Past]], steps: usize);
+    fn remember(&mut self, past: &[&[HistoryStep]], steps: usize);
     /// Plays commands, one a drive period of `steps` physics steps, through every robot on this thread. What a robot
     /// does is written to entries 1 and up of its record.
     fn play(&mut self, commands: &[&[Command]], steps: usize, records: &mut [RobotStates]);
@@ -62,18 +62,18 @@ pub trait Robots: Send + Sync {
 /// # Panics
 /// If the processor lacks the instructions that `lanes` names.
 pub fn robots(
-    lanes: Lanes,
+    lanes: SimdPrecision,
     model: &RobotModel,
     config: &SimConfig,
     ground: &Ground,
-    placement: &Placement,
+    placement: &InitialState,
     num_robots: usize,
-) -> Box<dyn Robots> {
+) -> Box<dyn BatchSimulator> {
     let instructions = match lanes {
-        Lanes::Single(instructions) => instructions,
-        Lanes::Double => Instructions::best(),
+        SimdPrecision::Single(instructions) => instructions,
+        SimdPrecision::Double => InstructionSet::best(),
     };
-    assert!(Instructions::available().contains(&instructions), "this processor has no {instructions:?}");
+    assert!(InstructionSet::available().contains(&instructions), "this processor has no {instructions:?}");
     macro_rules! of {
         ($lane:ty, $advance:ident) => {
             Box::new(Groups::<$lane> {
@@ -84,26 +84,26 @@ pub fn robots(
     }
     match lanes {
         #[cfg(target_arch = "x86_64")]
-        Lanes::Single(Instructions::Avx512) => of!(Avx512F32, advance_avx512),
+        SimdPrecision::Single(InstructionSet::Avx512) => of!(Avx512F32, advance_avx512),
         #[cfg(target_arch = "x86_64")]
-        Lanes::Single(Instructions::Avx2) => of!(Avx2F32, advance_avx2),
+        SimdPrecision::Single(InstructionSet::Avx2) => of!(Avx2F32, advance_avx2),
         #[cfg(target_arch = "x86_64")]
-        Lanes::Double if instructions >= Instructions::Avx2 => of!(Avx2F64, advance_avx2_double),
-        Lanes::Single(_) => of!(Baseline, advance_baseline),
-        Lanes::Double => of!(f64, advance_baseline),
+        SimdPrecision::Double if instructions >= InstructionSet::Avx2 => of!(Avx2F64, advance_avx2_double),
+        SimdPrecision::Single(_) => of!(Baseline, advance_baseline),
+        SimdPrecision::Double => of!(f64, advance_baseline),
     }
 }
 
 /// Advances one group.
-type Advance<T> = fn(&mut Group<T>, &Input<T>, Time, &mut Scratch<T>) -> Sample<T>;
+type Advance<T> = fn(&mut RobotBatch<T>, &ActuatorInput<T>, StepCount, &mut Workspace<T>) -> SensorReadings<T>;
 
-struct Groups<T> {
-    groups: Vec<Group<T>>,
+struct RobotBatches<T> {
+    groups: Vec<RobotBatch<T>>,
     advance: Advance<T>,
 }
 
-impl<T: Lane> Robots for Groups<T> {
-    fn place(&mut self, robot: usize, model: &RobotModel, placement: &Placement) {
+impl<T: SimdFloat> BatchSimulator for RobotBatches<T> {
+    fn place(&mut self, robot: usize, model: &RobotModel, placement: &InitialState) {
         self.groups[robot / T::LANES].place(robot % T::LANES, model, placement);
     }
 
@@ -116,29 +116,29 @@ impl<T: Lane> Robots for Groups<T> {
     fn advance(
         &mut self,
         pool: Option<&ThreadPool>,
-        inputs: Inputs,
+        inputs: ActuatorInputs,
         active: &[bool],
-        time: Time,
+        time: StepCount,
         states: &mut RobotStates,
     ) -> bool {
         let (lanes, advance) = (T::LANES, self.advance);
         let mut chunks: Vec<_> = states.chunks_mut(lanes).collect();
-        let one = |scratch: &mut Scratch<T>,
-                   (index, (group, states)): (usize, (&mut Group<T>, &mut RobotStatesMut))| {
+        let one = |scratch: &mut Workspace<T>,
+                   (index, (group, states)): (usize, (&mut RobotBatch<T>, &mut RobotStatesMut))| {
             let robots = index * lanes..(index * lanes + lanes).min(active.len());
             let input = match inputs {
-                Inputs::Commands(commands) => Input::Commands(Commands::new(&commands[robots.clone()])),
-                Inputs::Torques(tau) => Input::torques(&tau[robots.clone()]),
+                ActuatorInputs::Commands(commands) => ActuatorInput::Commands(SimdCommands::new(&commands[robots.clone()])),
+                ActuatorInputs::Torques(tau) => ActuatorInput::torques(&tau[robots.clone()]),
             };
             advance_active(group, advance, &input, &active[robots], time, scratch, states)
         };
         match pool {
             Some(pool) if self.groups.len() > 1 => pool.install(|| {
                 let groups = self.groups.par_iter_mut().zip(&mut chunks).enumerate();
-                groups.map_init(Scratch::empty, one).reduce(|| true, |finite, other| finite && other)
+                groups.map_init(Workspace::empty, one).reduce(|| true, |finite, other| finite && other)
             }),
             _ => {
-                let mut scratch = Scratch::empty();
+                let mut scratch = Workspace::empty();
                 let groups = self.groups.iter_mut().zip(&mut chunks).enumerate();
                 // Every group is to be stepped, also after one that is not finite.
                 groups.map(|group| one(&mut scratch, group)).filter(|finite| !finite).count() == 0
@@ -146,19 +146,19 @@ impl<T: Lane> Robots for Groups<T> {
         }
     }
 
-    fn remember(&mut self, past: &[&[Past]], steps: usize) {
+    fn remember(&mut self, past: &[&[HistoryStep]], steps: usize) {
         for (group, past) in self.groups.iter_mut().zip(past.chunks(T::LANES)) {
-            group.remember(past, steps);
+            group.replay_history(past, steps);
         }
     }
 
     fn play(&mut self, commands: &[&[Command]], steps: usize, records: &mut [RobotStates]) {
-        let mut scratch = Scratch::empty();
+        let mut scratch = Workspace::empty();
         let robots = commands.chunks(T::LANES).zip(records.chunks_mut(T::LANES));
         for (group, (commands, records)) in self.groups.iter_mut().zip(robots) {
             let mut records: Vec<_> = records.iter_mut().map(RobotStates::all_mut).collect();
-            let mut now = Commands::new(&[]);
-            let time = Time { drive_periods: 1, steps };
+            let mut now = SimdCommands::new(&[]);
+            let time = StepCount { drive_periods: 1, steps };
             for period in 0..commands.iter().map(|commands| commands.len()).max().unwrap_or(0) {
                 for lane in 0..T::LANES {
                     // A robot without commands does as the last: left to fall, it would touch what no other touches.
@@ -167,7 +167,7 @@ impl<T: Lane> Robots for Groups<T> {
                     }
                 }
                 // Who is done runs on unrecorded, which costs nothing: lanes do not touch each other.
-                let sample = (self.advance)(group, &Input::Commands(now), time, &mut scratch);
+                let sample = (self.advance)(group, &ActuatorInput::Commands(now), time, &mut scratch);
                 for (lane, record) in records.iter_mut().enumerate().filter(|(lane, _)| period < commands[*lane].len())
                 {
                     read(group, &sample, lane, record, period + 1);
@@ -187,13 +187,13 @@ impl<T: Lane> Robots for Groups<T> {
 
 /// Advances the active robots of a group and copies them out; the others stay as they are. True if all numbers are
 /// finite.
-fn advance_active<T: Lane>(
-    group: &mut Group<T>,
+fn advance_active<T: SimdFloat>(
+    group: &mut RobotBatch<T>,
     advance: Advance<T>,
-    input: &Input<T>,
+    input: &ActuatorInput<T>,
     active: &[bool],
-    time: Time,
-    scratch: &mut Scratch<T>,
+    time: StepCount,
+    scratch: &mut Workspace<T>,
     states: &mut RobotStatesMut,
 ) -> bool {
     if active.iter().all(|active| !active) {
@@ -214,7 +214,7 @@ fn advance_active<T: Lane>(
 }
 
 /// Copies one robot of a group out to entry `at`.
-fn read<T: Lane>(group: &Group<T>, sample: &Sample<T>, lane: usize, states: &mut RobotStatesMut, at: usize) {
+fn read<T: SimdFloat>(group: &RobotBatch<T>, sample: &SensorReadings<T>, lane: usize, states: &mut RobotStatesMut, at: usize) {
     let state = group.state();
     states.base_position[at] = values(&sample.position.0, lane);
     states.base_orientation[at] = values(&sample.orientation, lane);
@@ -236,7 +236,7 @@ fn is_finite(states: &RobotStatesMut, robot: usize) -> bool {
     (trunk + velocity + sum(&states.q[robot]) + sum(&states.dq[robot]) + sum(&states.tau[robot])).is_finite()
 }
 
-fn values<T: Lane, const N: usize>(values: &[T; N], lane: usize) -> [f32; N] {
+fn values<T: SimdFloat, const N: usize>(values: &[T; N], lane: usize) -> [f32; N] {
     let mut read = [0.0; N];
     for (read, value) in read.iter_mut().zip(values) {
         *read = value.get(lane) as f32;
@@ -278,11 +278,11 @@ entry!(advance_avx512, enter_avx512, "avx512f", Avx512F32);
 entry!(advance_avx2, enter_avx2, "avx2", Avx2F32);
 entry!(advance_avx2_double, enter_avx2_double, "avx2", Avx2F64);
 
-fn advance_baseline<T: Lane>(
-    group: &mut Group<T>,
-    input: &Input<T>,
-    time: Time,
-    scratch: &mut Scratch<T>,
-) -> Sample<T> {
+fn advance_baseline<T: SimdFloat>(
+    group: &mut RobotBatch<T>,
+    input: &ActuatorInput<T>,
+    time: StepCount,
+    scratch: &mut Workspace<T>,
+) -> SensorReadings<T> {
     group.advance(input, time, scratch)
 }

@@ -17,25 +17,25 @@ mod group;
 mod lanes;
 mod rows;
 
-use twinstep_model::lanes::Instructions;
+use twinstep_model::lanes::InstructionSet;
 use twinstep_model::{
-    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, Placement, RobotModel, RobotStates,
+    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, InitialState, RobotModel, RobotStates,
 };
 
-pub use lanes::Lanes;
+pub use lanes::SimdPrecision;
 
-use crate::rapier::{BuildError, check_lengths};
+use crate::rapier::{BackendBuildError, check_lengths};
 use crate::{SimConfig, SimConfigError};
-use group::{LaneSnapshot, Time};
+use group::{LaneSnapshot, StepCount};
 pub(crate) use lanes::robots as lane_robots;
-use lanes::{Inputs, Robots};
+use lanes::{ActuatorInputs, BatchSimulator};
 
 /// Many Go2 in SIMD lanes.
 pub struct BatchBackend {
     robot: RobotModel,
     config: SimConfig,
     ground: Ground,
-    robots: Box<dyn Robots>,
+    robots: Box<dyn BatchSimulator>,
     states: RobotStates,
     /// In place of the robots' own drives, which are part of the lanes.
     drive: Option<Box<dyn Actuator>>,
@@ -53,25 +53,25 @@ pub struct BatchSnapshot {
 
 impl BatchBackend {
     /// `num_robots` robots that stand in their default pose, in single precision and the processor's widest registers.
-    pub fn new(robot: RobotModel, config: SimConfig, num_robots: usize) -> Result<Self, BuildError> {
-        Self::with_lanes(robot, config, num_robots, Lanes::Single(Instructions::best()))
+    pub fn new(robot: RobotModel, config: SimConfig, num_robots: usize) -> Result<Self, BackendBuildError> {
+        Self::with_precision(robot, config, num_robots, SimdPrecision::Single(InstructionSet::best()))
     }
 
     /// As [`BatchBackend::new`], with other numbers.
     ///
     /// # Panics
     /// If the processor lacks the instructions that `lanes` names.
-    pub fn with_lanes(
+    pub fn with_precision(
         robot: RobotModel,
         config: SimConfig,
         num_robots: usize,
-        lanes: Lanes,
-    ) -> Result<Self, BuildError> {
+        lanes: SimdPrecision,
+    ) -> Result<Self, BackendBuildError> {
         config.check(&robot.control)?;
         check_tree(&robot)?;
         let pool = if config.threads == 1 { None } else { Some(crate::rapier::thread_pool(config.threads)?) };
         let ground = config.terrain.ground();
-        let placement = Placement::above(&ground, &robot, robot.control.default_pose_f32(), 0.0);
+        let placement = InitialState::standing_on(&ground, &robot, robot.control.default_pose_f32(), 0.0);
         let robots = lanes::robots(lanes, &robot, &config, &ground, &placement, num_robots);
         let mut states = RobotStates::new(num_robots);
         for index in 0..num_robots {
@@ -82,20 +82,20 @@ impl BatchBackend {
 
     /// The same robots with another drive than their own; each is to be placed anew.
     #[must_use]
-    pub fn with_drive(self, drive: Box<dyn Actuator>) -> Self {
+    pub fn with_actuator(self, drive: Box<dyn Actuator>) -> Self {
         Self { drive: Some(drive), ..self }
     }
 
     fn check_index(&self, robot: usize) -> Result<(), BackendError> {
         let num_robots = self.num_robots();
-        if robot < num_robots { Ok(()) } else { Err(BackendError::NoSuchRobot { robot, num_robots }) }
+        if robot < num_robots { Ok(()) } else { Err(BackendError::RobotOutOfRange { robot, num_robots }) }
     }
 
-    fn after_place(&mut self, robot: usize, placement: &Placement) {
+    fn after_place(&mut self, robot: usize, placement: &InitialState) {
         self.robots.read(robot, &mut self.states);
-        self.states.uncertainty[robot] = 0.0;
+        self.states.epistemic_uncertainty[robot] = 0.0;
         if let Some(drive) = &mut self.drive {
-            drive.reset(robot, placement.drive_seed);
+            drive.reset(robot, placement.actuator_seed);
         }
     }
 
@@ -143,7 +143,7 @@ impl Backend for BatchBackend {
         self.ground.clone()
     }
 
-    fn reset(&mut self, placements: &[(usize, Placement)]) -> Result<(), BackendError> {
+    fn reset(&mut self, placements: &[(usize, InitialState)]) -> Result<(), BackendError> {
         for (robot, _) in placements {
             self.check_index(*robot)?;
         }
@@ -154,7 +154,7 @@ impl Backend for BatchBackend {
         Ok(())
     }
 
-    fn reset_as(&mut self, robot: usize, model: &RobotModel, placement: &Placement) -> Result<(), BackendError> {
+    fn reset_with_model(&mut self, robot: usize, model: &RobotModel, placement: &InitialState) -> Result<(), BackendError> {
         self.check_index(robot)?;
         self.robots.place(robot, model, placement);
         self.after_place(robot, placement);
@@ -171,14 +171,14 @@ impl Backend for BatchBackend {
             let mut tau = states.tau.clone();
             for _ in 0..drive_periods {
                 on(pool, || drive.torques(commands, active, states, &mut tau))?;
-                let period = Time { drive_periods: 1, steps };
-                finite &= robots.advance(pool, Inputs::Torques(&tau), active, period, states);
+                let period = StepCount { drive_periods: 1, steps };
+                finite &= robots.advance(pool, ActuatorInputs::Torques(&tau), active, period, states);
             }
             if let Some(doubt) = drive.uncertainty() {
-                on(pool, || doubt.evaluate(active, &mut states.uncertainty));
+                on(pool, || doubt.evaluate(active, &mut states.epistemic_uncertainty));
             }
         } else {
-            finite = robots.advance(pool, Inputs::Commands(commands), active, Time { drive_periods, steps }, states);
+            finite = robots.advance(pool, ActuatorInputs::Commands(commands), active, StepCount { drive_periods, steps }, states);
         }
         let diverged = if finite { None } else { self.first_diverged(active) };
         diverged.map_or(Ok(()), Err)

@@ -1,18 +1,18 @@
 //! Constraint rows in the whitened coordinates of [`Factored`]: nine numbers each.
 
-use twinstep_model::lanes::{Factored, Lane, State, Vec3};
+use twinstep_model::lanes::{FactoredDynamics, SimdFloat, State, Vec3};
 
 /// Impedance of a constraint at a distance of zero and, from [`IMPEDANCE_WIDTH`] on, deep inside: MuJoCo's defaults.
 const IMPEDANCE: [f64; 2] = [0.9, 0.95];
 /// How much harder friction is than the push along the normal: MuJoCo's `impratio`, which menagerie has at 100 for the Go2. Rubber
 /// feet do not creep; with 1 a robot that stands with its feet pushed apart walks sideways by millimetres a second.
-const FRICTION_HARDNESS: f64 = 30.0;
+const IMPRATIO: f64 = 30.0;
 /// Depth [m] or angle [rad] at which the impedance is the larger one.
 const IMPEDANCE_WIDTH: f64 = 0.001;
 
 /// One constraint row.
 #[derive(Clone, Copy)]
-pub struct Row<T> {
+pub struct ConstraintRow<T> {
     /// By the trunk's whitened velocity.
     pub y: [T; 6],
     /// By the leg's.
@@ -21,20 +21,20 @@ pub struct Row<T> {
     /// One over A + R where the row is active, 0 elsewhere: there its impulse stays 0.
     pub inverse: T,
     /// `dt a_ref`.
-    wanted: T,
+    target_velocity: T,
 }
 
-impl<T: Lane> Row<T> {
+impl<T: SimdFloat> ConstraintRow<T> {
     /// A row that does nothing.
     #[inline(always)]
     pub fn empty() -> Self {
         let zero = T::splat(0.0);
-        Self { y: [zero; 6], z: [zero; 3], regularisation: zero, inverse: zero, wanted: zero }
+        Self { y: [zero; 6], z: [zero; 3], regularisation: zero, inverse: zero, target_velocity: zero }
     }
 
     /// A row that is active nowhere: `trunk` and `joints` are its Jacobian, by the trunk's velocity and the leg's joints.
     #[inline(always)]
-    fn whitened(factored: &Factored<T>, moving: T, leg: usize, mut trunk: [T; 6], joints: [T; 3]) -> Self {
+    fn whitened(factored: &FactoredDynamics<T>, moving: T, leg: usize, mut trunk: [T; 6], joints: [T; 3]) -> Self {
         let zero = T::splat(0.0);
         let mut z = [zero; 3];
         if leg < 4 {
@@ -61,16 +61,16 @@ impl<T: Lane> Row<T> {
 
     /// How much the impulse is too large.
     #[inline(always)]
-    pub fn excess(&self, factored: &Factored<T>, leg: usize, impulse: T) -> T {
-        self.missed(factored, leg, impulse) * self.inverse
+    pub fn impulse_error(&self, factored: &FactoredDynamics<T>, leg: usize, impulse: T) -> T {
+        self.velocity_error(factored, leg, impulse) * self.inverse
     }
 
     /// How far the row is from what it wants [m/s].
     #[inline(always)]
-    pub fn missed(&self, factored: &Factored<T>, leg: usize, impulse: T) -> T {
+    pub fn velocity_error(&self, factored: &FactoredDynamics<T>, leg: usize, impulse: T) -> T {
         let zero = T::splat(0.0);
         let g = if leg < 4 { factored.g[leg] } else { [zero; 3] };
-        self.dot(&factored.u, &g) + (self.regularisation * impulse - self.wanted)
+        self.dot(&factored.u, &g) + (self.regularisation * impulse - self.target_velocity)
     }
 
     /// Summed in pairs: the sweep waits for each sum, and a chain of additions takes twice as long.
@@ -83,7 +83,7 @@ impl<T: Lane> Row<T> {
 
     /// Applies an impulse.
     #[inline(always)]
-    pub fn push(&self, factored: &mut Factored<T>, leg: usize, impulse: T) {
+    pub fn apply_impulse(&self, factored: &mut FactoredDynamics<T>, leg: usize, impulse: T) {
         for (u, y) in factored.u.iter_mut().zip(self.y) {
             *u += y * impulse;
         }
@@ -96,7 +96,7 @@ impl<T: Lane> Row<T> {
 }
 
 /// How soft a row is, and how far; it is active where the distance is below zero.
-pub struct Softness<T> {
+pub struct SoftConstraint<T> {
     /// [s]
     pub time_constant: T,
     /// [m] or [rad]
@@ -105,7 +105,7 @@ pub struct Softness<T> {
     pub dt: T,
 }
 
-impl<T: Lane> Softness<T> {
+impl<T: SimdFloat> SoftConstraint<T> {
     /// d of the distance.
     #[inline(always)]
     fn impedance(&self) -> T {
@@ -128,20 +128,20 @@ impl<T: Lane> Softness<T> {
 
     /// The row that pushes back out: a normal, or a joint limit.
     #[inline(always)]
-    fn pushing(&self, row: Row<T>, velocity: T) -> Row<T> {
+    fn unilateral(&self, row: ConstraintRow<T>, velocity: T) -> ConstraintRow<T> {
         let impedance = self.impedance();
         let (response, one) = (row.response(&row), T::splat(1.0));
         let regularisation = (one - impedance) / impedance * response;
         let wanted = -(self.damping() * velocity) - self.stiffness() * impedance * self.distance;
-        let inverse = self.distance.select_less(T::splat(0.0), one / (response + regularisation), T::splat(0.0));
-        Row { regularisation, inverse, wanted: wanted * self.dt, ..row }
+        let inverse = self.distance.select_lt(T::splat(0.0), one / (response + regularisation), T::splat(0.0));
+        ConstraintRow { regularisation, inverse, target_velocity: wanted * self.dt, ..row }
     }
 }
 
 /// The rows of a point of a leg's calf, or of the trunk (leg 4).
 pub struct PointRow<'a, T> {
     /// The equations.
-    pub factored: &'a Factored<T>,
+    pub factored: &'a FactoredDynamics<T>,
     /// What moves.
     pub state: &'a State<T>,
     /// Velocity of the base origin in base axes [m/s].
@@ -154,27 +154,27 @@ pub struct PointRow<'a, T> {
     pub moving: T,
 }
 
-impl<T: Lane> PointRow<'_, T> {
+impl<T: SimdFloat> PointRow<'_, T> {
     /// Along the ground's normal.
     #[inline(always)]
-    pub fn normal(&self, direction: Vec3<T>, softness: &Softness<T>) -> Row<T> {
+    pub fn normal(&self, direction: Vec3<T>, softness: &SoftConstraint<T>) -> ConstraintRow<T> {
         let (row, velocity) = self.row(direction);
-        softness.pushing(row, velocity)
+        softness.unilateral(row, velocity)
     }
 
     /// Along the ground: it has a small part of the normal row's regularisation, and only damps.
     #[inline(always)]
-    pub fn along(&self, direction: Vec3<T>, softness: &Softness<T>, normal: &Row<T>) -> Row<T> {
+    pub fn tangent(&self, direction: Vec3<T>, softness: &SoftConstraint<T>, normal: &ConstraintRow<T>) -> ConstraintRow<T> {
         let (row, velocity) = self.row(direction);
         let zero = T::splat(0.0);
-        let regularisation = normal.regularisation * T::splat(1.0 / FRICTION_HARDNESS);
-        let inverse = softness.distance.select_less(zero, T::splat(1.0) / (row.response(&row) + regularisation), zero);
-        Row { regularisation, inverse, wanted: -(softness.damping() * velocity) * softness.dt, ..row }
+        let regularisation = normal.regularisation * T::splat(1.0 / IMPRATIO);
+        let inverse = softness.distance.select_lt(zero, T::splat(1.0) / (row.response(&row) + regularisation), zero);
+        ConstraintRow { regularisation, inverse, target_velocity: -(softness.damping() * velocity) * softness.dt, ..row }
     }
 
     /// The row along `direction`, and the point's velocity along it.
     #[inline(always)]
-    fn row(&self, direction: Vec3<T>) -> (Row<T>, T) {
+    fn row(&self, direction: Vec3<T>) -> (ConstraintRow<T>, T) {
         let turning = self.place.cross(direction);
         let trunk = [turning.0[0], turning.0[1], turning.0[2], direction.0[0], direction.0[1], direction.0[2]];
         let mut velocity = turning.dot(self.state.angular_velocity) + direction.dot(self.velocity);
@@ -186,14 +186,14 @@ impl<T: Lane> PointRow<'_, T> {
                 velocity += joints[i] * self.state.dq[3 * self.leg + i];
             }
         }
-        (Row::whitened(self.factored, self.moving, self.leg, trunk, joints), velocity)
+        (ConstraintRow::whitened(self.factored, self.moving, self.leg, trunk, joints), velocity)
     }
 }
 
 /// The rows of a joint.
 pub struct JointRow<'a, T> {
     /// The equations.
-    pub factored: &'a Factored<T>,
+    pub factored: &'a FactoredDynamics<T>,
     /// The joint.
     pub joint: usize,
     /// +1 or −1: the direction of a positive impulse.
@@ -202,25 +202,25 @@ pub struct JointRow<'a, T> {
     pub moving: T,
 }
 
-impl<T: Lane> JointRow<'_, T> {
+impl<T: SimdFloat> JointRow<'_, T> {
     /// Back into the joint's range.
     #[inline(always)]
-    pub fn limit(&self, velocity: T, softness: &Softness<T>) -> Row<T> {
-        softness.pushing(self.row(), velocity)
+    pub fn limit(&self, velocity: T, softness: &SoftConstraint<T>) -> ConstraintRow<T> {
+        softness.unilateral(self.row(), velocity)
     }
 
     /// Against all motion.
     #[inline(always)]
-    pub fn stop(&self, velocity: T) -> Row<T> {
+    pub fn friction(&self, velocity: T) -> ConstraintRow<T> {
         let row = self.row();
-        Row { inverse: T::splat(1.0) / row.response(&row), wanted: -velocity, ..row }
+        ConstraintRow { inverse: T::splat(1.0) / row.response(&row), target_velocity: -velocity, ..row }
     }
 
     #[inline(always)]
-    fn row(&self) -> Row<T> {
+    fn row(&self) -> ConstraintRow<T> {
         let zero = T::splat(0.0);
         let mut along = [zero; 3];
         along[self.joint % 3] = self.sign;
-        Row::whitened(self.factored, self.moving, self.joint / 3, [zero; 6], along)
+        ConstraintRow::whitened(self.factored, self.moving, self.joint / 3, [zero; 6], along)
     }
 }

@@ -6,16 +6,16 @@
 
 use twinstep_logs::Log;
 use twinstep_model::RobotModel;
-use twinstep_model::effects::{CATALOGUE, Entry, Parameter, Scope, Target};
+use twinstep_model::effects::{CATALOGUE, EffectEntry, Parameter, Scope, Target};
 
-use super::causes::{LEAST_SHARE, MOST_LEFT, THRESHOLD, TOO_LITTLE};
-use super::hypothesis::{Hypothesis, choice, sizes};
-use super::leftover::{Leftover, TORQUE};
-use super::seats::Seats;
-use super::torque_fit::{Found, TorqueFit};
+use super::causes::{MIN_EXPLAINED_FRACTION, MAX_REMAINING_FRACTION, THRESHOLD, NEGLIGIBLE_EXCESS};
+use super::hypothesis::{Hypothesis, selection_penalty, grid};
+use super::leftover::{ResidualPower, TORQUE};
+use super::seats::JointSlots;
+use super::torque_fit::{TorqueCandidate, TorqueFit};
 use super::unexplained::{self, LEAST_EXCESS};
-use super::{CLOSE, CLOSE_SHARE, DiagnoseError, Progress};
-use crate::diagnosis::{Cause, Diagnosis, Errors, Estimate, Rival, Unexplained, Value};
+use super::{AMBIGUITY_NATS, AMBIGUITY_FRACTION, DiagnoseError, DiagnoseProgress};
+use crate::diagnosis::{Cause, Diagnosis, RmsErrors, Estimate, AlternativeCause, Unexplained, ParameterValue};
 use crate::experiment::ExperimentError;
 
 /// Joints that are looked at together, as many as the Go2 has seats.
@@ -26,18 +26,18 @@ const TRIED: usize = 4;
 const MOST_CAUSES: usize = 12;
 
 /// Names what ideal drives get wrong in the torques of `logs`, of one robot with joints of any names.
-pub fn diagnose_torques(logs: &[Log], progress: &mut Progress) -> Result<Diagnosis, DiagnoseError> {
+pub fn diagnose_torques(logs: &[Log], progress: &mut DiagnoseProgress) -> Result<Diagnosis, DiagnoseError> {
     let mut all = Vec::new();
     for names in logs[0].joints().chunks(TOGETHER) {
-        let seats = Seats::new(logs, names).map_err(ExperimentError::from)?;
-        let mut search = Search { seats: &seats, causes: Vec::new(), progress: &mut *progress };
+        let seats = JointSlots::new(logs, names).map_err(ExperimentError::from)?;
+        let mut search = TorqueForwardSelection { seats: &seats, causes: Vec::new(), progress: &mut *progress };
         search.run()?;
         let causes = std::mem::take(&mut search.causes);
-        all.push(Part::new(&seats, &causes, &logs[0]));
+        all.push(JointGroupResult::new(&seats, &causes, &logs[0]));
     }
-    let sums = |of: fn(&Part) -> [f64; 3]| {
+    let sums = |of: fn(&JointGroupResult) -> [f64; 3]| {
         let sum = |index: usize| all.iter().map(|part| of(part)[index]).sum::<f64>();
-        let rmse = |squares: f64| Errors { torque_rmse_nm: Some((squares / sum(2).max(1.0)).sqrt()), q_rmse_rad: None };
+        let rmse = |squares: f64| RmsErrors { torque_rmse_nm: Some((squares / sum(2).max(1.0)).sqrt()), q_rmse_rad: None };
         [rmse(sum(0)), rmse(sum(1))]
     };
     let ([baseline, noise_floor], [extended, _]) = (sums(|part| part.before), sums(|part| part.after));
@@ -55,39 +55,39 @@ pub fn diagnose_torques(logs: &[Log], progress: &mut Progress) -> Result<Diagnos
 }
 
 /// What is said of some joints.
-struct Part {
+struct JointGroupResult {
     causes: Vec<Cause>,
     before: [f64; 3],
     after: [f64; 3],
     unexplained: Unexplained,
 }
 
-impl Part {
-    fn new(seats: &Seats, causes: &[Found], log: &Log) -> Self {
-        let entries: Vec<Entry> = causes.iter().map(|cause| cause.entry.clone()).collect();
+impl JointGroupResult {
+    fn new(seats: &JointSlots, causes: &[TorqueCandidate], log: &Log) -> Self {
+        let entries: Vec<EffectEntry> = causes.iter().map(|cause| cause.entry.clone()).collect();
         let [given, named] = [&[][..], &entries].map(|entries| seats.robot(entries).expect("entries that were fitted"));
         let told = |index: usize| {
             let others = entries.iter().enumerate().filter(|(other, _)| *other != index);
-            let others: Vec<Entry> = others.map(|(_, entry)| entry.clone()).collect();
+            let others: Vec<EffectEntry> = others.map(|(_, entry)| entry.clone()).collect();
             cause(seats, &causes[index], &others)
         };
         Self {
             causes: (0..causes.len()).map(told).collect(),
-            before: seats.set_aside(&given),
-            after: seats.set_aside(&named),
+            before: seats.held_out_sums(&given),
+            after: seats.held_out_sums(&named),
             unexplained: left(seats, [&given, &named], log),
         }
     }
 }
 
 /// The search for causes at some joints.
-struct Search<'a, 'b> {
-    seats: &'a Seats,
-    causes: Vec<Found>,
-    progress: &'a mut Progress<'b>,
+struct TorqueForwardSelection<'a, 'b> {
+    seats: &'a JointSlots,
+    causes: Vec<TorqueCandidate>,
+    progress: &'a mut DiagnoseProgress<'b>,
 }
 
-impl Search<'_, '_> {
+impl TorqueForwardSelection<'_, '_> {
     fn run(&mut self) -> Result<(), DiagnoseError> {
         while self.causes.len() < MOST_CAUSES {
             self.say()?;
@@ -100,8 +100,8 @@ impl Search<'_, '_> {
             let cause = self.causes.remove(place);
             let others = self.entries();
             let again = TorqueFit::new(self.seats, &others, &cause.entry);
-            let entry = again.map_or(cause.entry.clone(), |fit| fit.entry_at(&fit.descended(&[0, 1])));
-            self.causes.insert(place, Found { entry, ..cause });
+            let entry = again.map_or(cause.entry.clone(), |fit| fit.entry_at(&fit.coordinate_descent(&[0, 1])));
+            self.causes.insert(place, TorqueCandidate { entry, ..cause });
         }
         while let Some(place) = self.untenable() {
             self.causes.remove(place);
@@ -111,42 +111,42 @@ impl Search<'_, '_> {
 
     fn say(&mut self) -> Result<(), DiagnoseError> {
         let text = format!("torques of {} and others, {} named", self.seats.name(0), self.causes.len());
-        if (self.progress)(&text) { Ok(()) } else { Err(DiagnoseError::Ended) }
+        if (self.progress)(&text) { Ok(()) } else { Err(DiagnoseError::Interrupted) }
     }
 
-    fn entries(&self) -> Vec<Entry> {
+    fn entries(&self) -> Vec<EffectEntry> {
         self.causes.iter().map(|cause| cause.entry.clone()).collect()
     }
 
     /// The best cause on top of those that are named, if one earns a name.
-    fn next(&self) -> Option<Found> {
+    fn next(&self) -> Option<TorqueCandidate> {
         let entries = self.entries();
         let named =
-            |entry: &Entry| entries.iter().any(|other| other.effect == entry.effect && other.scope == entry.scope);
+            |entry: &EffectEntry| entries.iter().any(|other| other.effect == entry.effect && other.scope == entry.scope);
         let tried = self.candidates(&entries)?.into_iter().filter(|entry| !named(entry)).take(TRIED);
-        let mut found: Vec<Found> =
-            tried.filter_map(|entry| TorqueFit::new(self.seats, &entries, &entry)?.judged()).collect();
+        let mut found: Vec<TorqueCandidate> =
+            tried.filter_map(|entry| TorqueFit::new(self.seats, &entries, &entry)?.cross_validated()).collect();
         found.sort_by(|one, other| other.score.total_cmp(&one.score));
-        let earns = |found: &Found| {
-            found.score >= THRESHOLD && found.explains >= LEAST_SHARE && hypothesis(&found.entry).is_large_enough()
+        let earns = |found: &TorqueCandidate| {
+            found.score >= THRESHOLD && found.explains >= MIN_EXPLAINED_FRACTION && hypothesis(&found.entry).exceeds_min_size()
         };
         let place = found.iter().position(earns)?;
         let best = found.remove(place);
-        Some(Found { others: found, ..best })
+        Some(TorqueCandidate { others: found, ..best })
     }
 
     /// Every effect that torques show, on all joints and on each, with the best of a few sizes; the best first.
-    fn candidates(&self, entries: &[Entry]) -> Option<Vec<Entry>> {
+    fn candidates(&self, entries: &[EffectEntry]) -> Option<Vec<EffectEntry>> {
         let now = self.seats.robot(entries)?;
         let before = self.seats.leftovers(std::slice::from_ref(&now)).remove(0);
         let mut scored = Vec::new();
         for effect in CATALOGUE.into_iter().filter(|effect| effect.target == Target::Joints) {
             let with = |values: Vec<f64>| {
-                let entry = Entry::new(effect, Scope::All, values.clone()).ok()?;
+                let entry = EffectEntry::new(effect, Scope::All, values.clone()).ok()?;
                 Some((values, self.seats.robot(&[entries, &[entry]].concat())?))
             };
-            let (values, robots): (Vec<_>, Vec<_>) = sizes(effect).into_iter().filter_map(with).unzip();
-            if !robots.iter().any(|robot| self.seats.show(robot, &now)) {
+            let (values, robots): (Vec<_>, Vec<_>) = grid(effect).into_iter().filter_map(with).unzip();
+            if !robots.iter().any(|robot| self.seats.affects_torque(robot, &now)) {
                 continue;
             }
             let left = self.seats.leftovers(&robots);
@@ -154,9 +154,9 @@ impl Search<'_, '_> {
                 let of = |size: usize, fold: usize| nats(self.seats, scope, &left[size], &before, &[fold]);
                 let best = |of: &dyn Fn(usize) -> f64| (0..values.len()).max_by(|a, b| of(*a).total_cmp(&of(*b)));
                 // Chosen on one fold, judged on the other.
-                let judged = of(best(&|size| of(size, 0))?, 1) + of(best(&|size| of(size, 1))?, 0) - choice(scope);
+                let judged = of(best(&|size| of(size, 0))?, 1) + of(best(&|size| of(size, 1))?, 0) - selection_penalty(scope);
                 let whole = best(&|size| of(size, 0) + of(size, 1))?;
-                scored.push((judged, Entry::new(effect, scope, values[whole].clone()).ok()?));
+                scored.push((judged, EffectEntry::new(effect, scope, values[whole].clone()).ok()?));
             }
         }
         scored.retain(|(score, _)| *score > 0.0);
@@ -168,49 +168,49 @@ impl Search<'_, '_> {
     fn untenable(&self) -> Option<usize> {
         let (given, named) = (self.seats.robot(&[])?, self.seats.robot(&self.entries())?);
         let left = self.seats.leftovers(&[given, named]);
-        let stands = |cause: &Found| {
-            let excess = |left: &Leftover| excess(self.seats, cause.entry.scope, left);
+        let stands = |cause: &TorqueCandidate| {
+            let excess = |left: &ResidualPower| excess(self.seats, cause.entry.scope, left);
             let rows: f64 = self.seats.of(cause.entry.scope).flat_map(|seat| left[1].counts[TORQUE + seat]).sum();
             let one = hypothesis(&cause.entry);
-            let explains = excess(&left[1]) <= TOO_LITTLE * rows || excess(&left[1]) <= MOST_LEFT * excess(&left[0]);
-            one.is_large_enough() && one.is_plausible() && explains
+            let explains = excess(&left[1]) <= NEGLIGIBLE_EXCESS * rows || excess(&left[1]) <= MAX_REMAINING_FRACTION * excess(&left[0]);
+            one.exceeds_min_size() && one.is_plausible() && explains
         };
         self.causes.iter().position(|cause| !stands(cause))
     }
 }
 
 /// Evidence for what leaves `now` against what leaves `before` on a scope [nats].
-pub fn nats(seats: &Seats, scope: Scope, now: &Leftover, before: &Leftover, folds: &[usize]) -> f64 {
+pub fn nats(seats: &JointSlots, scope: Scope, now: &ResidualPower, before: &ResidualPower, folds: &[usize]) -> f64 {
     let rows = seats.rows_in_one();
-    let of = |seat: usize| folds.iter().map(|fold| now.gain(before, TORQUE + seat, *fold, rows)).sum::<f64>();
+    let of = |seat: usize| folds.iter().map(|fold| now.log_likelihood_gain(before, TORQUE + seat, *fold, rows)).sum::<f64>();
     seats.of(scope).map(of).sum()
 }
 
 /// Power above the noise on a scope.
-pub fn excess(seats: &Seats, scope: Scope, left: &Leftover) -> f64 {
+pub fn excess(seats: &JointSlots, scope: Scope, left: &ResidualPower) -> f64 {
     seats.of(scope).map(|seat| left.channel_excess(TORQUE + seat)).sum()
 }
 
-fn hypothesis(entry: &Entry) -> Hypothesis {
+fn hypothesis(entry: &EffectEntry) -> Hypothesis {
     Hypothesis { effect: entry.effect, scope: entry.scope, values: entry.values.clone() }
 }
 
 /// As people read it, in the joints' own names and units.
-fn cause(seats: &Seats, found: &Found, others: &[Entry]) -> Cause {
-    let (effect, scope) = (found.entry.effect, seats.told(found.entry.scope));
+fn cause(seats: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) -> Cause {
+    let (effect, scope) = (found.entry.effect, seats.scope_name(found.entry.scope));
     let fit = TorqueFit::new(seats, others, &found.entry).expect("it was fitted before");
     let numbers = effect.parameters.iter().zip(&found.entry.values).zip(fit.intervals());
     let told = |((parameter, value), [low, high]): ((&Parameter, &f64), [f64; 2])| {
         // Torques in the seats are in units of their own.
-        let unit = if parameter.unit.contains("N·m") || parameter.unit == "kg·m²" { seats.unit } else { 1.0 };
-        let [value, low, high] = [*value, low, high].map(|number| Value::Number(unit * number));
+        let unit = if parameter.unit.contains("N·m") || parameter.unit == "kg·m²" { seats.torque_scale } else { 1.0 };
+        let [value, low, high] = [*value, low, high].map(|number| ParameterValue::Number(unit * number));
         (parameter.name.to_owned(), Estimate { value, low, high })
     };
-    let name = |entry: &Entry| format!("{}@{}", entry.effect.name, seats.told(entry.scope));
-    let close = |other: &&Found| other.score > found.score - CLOSE.max(CLOSE_SHARE * found.score);
-    let rival = |other: &Found| Rival {
+    let name = |entry: &EffectEntry| format!("{}@{}", entry.effect.name, seats.scope_name(entry.scope));
+    let close = |other: &&TorqueCandidate| other.score > found.score - AMBIGUITY_NATS.max(AMBIGUITY_FRACTION * found.score);
+    let rival = |other: &TorqueCandidate| AlternativeCause {
         effect: other.entry.effect.name.to_owned(),
-        scope: seats.told(other.entry.scope),
+        scope: seats.scope_name(other.entry.scope),
         held_out_gain: other.gain,
     };
     let mut evidence = format!(
@@ -236,7 +236,7 @@ fn cause(seats: &Seats, found: &Found, others: &[Entry]) -> Cause {
 }
 
 /// What is left where it is most, and what that depends on.
-fn left(seats: &Seats, [given, named]: [&RobotModel; 2], log: &Log) -> Unexplained {
+fn left(seats: &JointSlots, [given, named]: [&RobotModel; 2], log: &Log) -> Unexplained {
     let left = seats.leftovers(&[given.clone(), named.clone()]);
     let [before, after] = [&left[0], &left[1]].map(|left| excess(seats, Scope::All, left));
     let share = |seat: usize| {
@@ -244,16 +244,16 @@ fn left(seats: &Seats, [given, named]: [&RobotModel; 2], log: &Log) -> Unexplain
         left[1].channel_excess(TORQUE + seat) / rows.max(1.0)
     };
     let worst = seats.of(Scope::All).max_by(|one, other| share(*one).total_cmp(&share(*other)));
-    let Some(seat) = worst.filter(|seat| share(*seat) > LEAST_EXCESS) else { return unexplained::noise() };
+    let Some(seat) = worst.filter(|seat| share(*seat) > LEAST_EXCESS) else { return unexplained::only_noise() };
     let fraction = if before > 0.0 { (after / before).min(1.0) } else { 0.0 };
     let whose = format!("The torque of {}", seats.name(seat));
-    unexplained::told(log, &seats.residual(named, seat), unexplained::measured(log), fraction, &whose)
+    unexplained::describe_residual(log, &seats.residual(named, seat), unexplained::measured(log), fraction, &whose)
 }
 
 #[cfg(test)]
 mod tests {
     use rand::RngExt;
-    use twinstep_logs::{Base, Meta, Segment, TauSensor};
+    use twinstep_logs::{BaseMount, Meta, Segment, TorqueSensor};
     use twinstep_model::{standard_normal, stream};
 
     use super::*;
@@ -292,8 +292,8 @@ mod tests {
         }
         columns.push(("kp".to_owned(), vec![200.0; ROWS]));
         columns.push(("kd".to_owned(), vec![2.0; ROWS]));
-        let segments = vec![Segment { name: "bench".to_owned(), base: Base::Fixed }];
-        let mut meta = Meta::new(RATE_HZ, TauSensor::Output, segments);
+        let segments = vec![Segment { name: "bench".to_owned(), base: BaseMount::Fixed }];
+        let mut meta = Meta::new(RATE_HZ, TorqueSensor::JointOutput, segments);
         let noise = [("q", 1e-5), ("dq", 1e-3), ("tau_measured", NOISE_NM)];
         meta.noise = noise.map(|(quantity, sigma)| (quantity.to_owned(), sigma)).into();
         Log::new(meta, columns).expect("a log")
@@ -325,7 +325,7 @@ mod tests {
         assert_eq!(names[1..], ["torque_gain@axis_13"], "{:#?}", found.findings);
         let within = |place: usize, name: &str, truth: f64| {
             let told = &found.findings[place].parameters[name];
-            let [Value::Number(low), Value::Number(high)] = [&told.low, &told.high] else { return false };
+            let [ParameterValue::Number(low), ParameterValue::Number(high)] = [&told.low, &told.high] else { return false };
             (*low..=*high).contains(&truth)
         };
         assert!(within(0, "delay_s", 0.008) && within(1, "gain", 0.85), "{:#?}", found.findings);

@@ -5,72 +5,72 @@ use rayon::prelude::*;
 use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout};
 
-use super::leftover::{GYRO, Leftover, TORQUE, TRUNK};
-use super::rows::{Rows, fold_of};
+use super::leftover::{GYRO, ResidualPower, TORQUE, TRUNK};
+use super::rows::{ResidualRows, fold_of};
 use crate::experiment::{Experiment, ExperimentError};
-use crate::tolerance::Tolerances;
+use crate::tolerance::NuisanceModel;
 use crate::torque::MeasuredTorque;
-use crate::window::Horizon;
+use crate::window::WindowConfig;
 
 /// Errors of a torque of this size, beside the noise, are any simulator's [N·m].
 const MISFIT_NM: f64 = 0.02;
 /// Share of a joint's motion that a model may miss before it is lost.
-const LOST: f64 = 0.1;
+const MAX_UNTRACKED_VARIANCE: f64 = 0.1;
 /// Rows this long apart [s] are independent: positions, torques, the trunk, and its gyroscope, which has more noise than error.
 const INDEPENDENT_S: [f64; 4] = [0.2, 0.1, 0.5, 0.05];
 
 /// Logs of one robot.
-pub struct Evidence {
+pub struct ResidualData {
     logs: Vec<Log>,
     /// All rows but those that are set aside.
-    pub whole: Rows,
+    pub fit_rows: ResidualRows,
     /// One half of them and the other.
-    pub folds: [Rows; 2],
+    pub folds: [ResidualRows; 2],
     /// Of all of them those with the trunk held, if there are any: joints hardly disturb each other there.
-    quick: Rows,
+    fixed_base_rows: ResidualRows,
     torques: Vec<MeasuredTorque>,
 }
 
-impl Evidence {
+impl ResidualData {
     /// `logs` of a robot with the gains and rates of `robot`, in windows of `horizon`.
-    pub fn new(logs: Vec<Log>, robot: &RobotModel, horizon: Horizon) -> Result<Self, ExperimentError> {
+    pub fn new(logs: Vec<Log>, robot: &RobotModel, horizon: WindowConfig) -> Result<Self, ExperimentError> {
         let experiments: Vec<Experiment> =
             logs.iter().map(|log| Experiment::new(log, robot, horizon)).collect::<Result<_, _>>()?;
         let only = |keep: &dyn Fn(Option<usize>) -> bool| -> Vec<Experiment> {
             let pairs = logs.iter().zip(&experiments);
-            pairs.map(|(log, experiment)| experiment.clone().only(|row| keep(fold_of(log, row)))).collect()
+            pairs.map(|(log, experiment)| experiment.clone().filter_rows(|row| keep(fold_of(log, row)))).collect()
         };
         let whole = only(&|fold| fold.is_some());
-        let quick = whole.iter().cloned().map(Experiment::held_first).collect();
+        let quick = whole.iter().cloned().map(Experiment::prefer_fixed_base).collect();
         Ok(Self {
             torques: logs.iter().map(|log| MeasuredTorque::new(log, robot)).collect::<Result<_, _>>()?,
-            folds: [0, 1].map(|fold| Rows::new(&logs, only(&|of| of == Some(fold)))),
-            whole: Rows::new(&logs, whole),
-            quick: Rows::new(&logs, quick),
+            folds: [0, 1].map(|fold| ResidualRows::new(&logs, only(&|of| of == Some(fold)))),
+            fit_rows: ResidualRows::new(&logs, whole),
+            fixed_base_rows: ResidualRows::new(&logs, quick),
             logs,
         })
     }
 
     /// From here on, errors that any robot has are not evidence; `robot` is the model.
-    pub fn tolerate(&mut self, robot: &RobotModel, simulator: &mut dyn Rollout) {
+    pub fn set_nuisance_model(&mut self, robot: &RobotModel, simulator: &mut dyn Rollout) {
         if self.has_free_parts() {
-            for rows in [&mut self.whole].into_iter().chain(&mut self.folds) {
-                rows.tolerances = Tolerances::new(&rows.experiments, robot, simulator);
+            for rows in [&mut self.fit_rows].into_iter().chain(&mut self.folds) {
+                rows.tolerances = NuisanceModel::new(&rows.experiments, robot, simulator);
             }
-            if self.quick.experiments.iter().any(Experiment::has_free_parts) {
-                self.quick.tolerances.clone_from(&self.whole.tolerances);
+            if self.fixed_base_rows.experiments.iter().any(Experiment::has_floating_base) {
+                self.fixed_base_rows.tolerances.clone_from(&self.fit_rows.tolerances);
             }
         }
     }
 
     /// Whether some joint is not followed at all by what leaves so much: by a third of its motion or more.
-    pub fn is_lost(&self, left: &Leftover) -> bool {
+    pub fn fails_to_track(&self, left: &ResidualPower) -> bool {
         let log = &self.logs[0];
         (0..NUM_JOINTS).any(|joint| {
             let rows: f64 = left.counts[joint].iter().sum();
-            let sigma = self.whole.unit_of_position(joint);
+            let sigma = self.fit_rows.position_std(joint);
             let error = left.sums[joint].iter().sum::<f64>() / rows.max(1.0) * sigma * sigma;
-            log.q(JOINT_NAMES[joint]).is_some_and(|q| error > LOST * variance(q))
+            log.q(JOINT_NAMES[joint]).is_some_and(|q| error > MAX_UNTRACKED_VARIANCE * variance(q))
         })
     }
 
@@ -81,20 +81,20 @@ impl Evidence {
 
     /// Whether a trunk was free somewhere.
     pub fn has_free_parts(&self) -> bool {
-        self.whole.experiments.iter().any(Experiment::has_free_parts)
+        self.fit_rows.experiments.iter().any(Experiment::has_floating_base)
     }
 
     /// What candidates leave; with `quick` only where the trunk was held, if it was.
-    pub fn leftovers(&self, simulator: &mut dyn Rollout, robots: &[RobotModel], quick: bool) -> Vec<Leftover> {
-        let rows = if quick { &self.quick } else { &self.whole };
+    pub fn residual_powers(&self, simulator: &mut dyn Rollout, robots: &[RobotModel], quick: bool) -> Vec<ResidualPower> {
+        let rows = if quick { &self.fixed_base_rows } else { &self.fit_rows };
         let mut leftovers = rows.leftovers(simulator, robots);
         for (log, torques) in self.logs.iter().zip(&self.torques) {
             // Most effects are behind the torque's sensor: what it shows of robots that follow one another is the same.
-            let alike: Vec<&[RobotModel]> = robots.chunk_by(|one, other| torques.are_alike(one, other)).collect();
-            let shown: Vec<Leftover> = alike
+            let alike: Vec<&[RobotModel]> = robots.chunk_by(|one, other| torques.predict_same_torque(one, other)).collect();
+            let shown: Vec<ResidualPower> = alike
                 .par_iter()
                 .map(|robots| {
-                    let mut left = Leftover::empty();
+                    let mut left = ResidualPower::empty();
                     let sigma = torque_sigma(log, &robots[0]);
                     torques.differences(&robots[0], |joint, row, difference| {
                         left.add(TORQUE + joint, fold_of(log, row), difference / sigma[joint]);
@@ -109,12 +109,12 @@ impl Evidence {
     }
 
     /// What one candidate leaves of everything.
-    pub fn leftover(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> Leftover {
-        self.leftovers(simulator, std::slice::from_ref(robot), false).remove(0)
+    pub fn leftover(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> ResidualPower {
+        self.residual_powers(simulator, std::slice::from_ref(robot), false).remove(0)
     }
 
     /// Rows of a channel that count as one.
-    pub fn rows_in_one(&self, channel: usize) -> f64 {
+    pub fn correlation_rows(&self, channel: usize) -> f64 {
         let kind = [TORQUE, TRUNK, GYRO].into_iter().filter(|first| channel >= *first).count();
         (INDEPENDENT_S[kind] * self.logs[0].meta().rate_hz).max(1.0)
     }

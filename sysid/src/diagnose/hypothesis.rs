@@ -1,6 +1,6 @@
 //! What might be wrong: an effect on a scope, with values.
 
-use twinstep_model::effects::{Composition, Effect, Entry, EntryError, Scope, Target};
+use twinstep_model::effects::{Composition, Effect, EffectEntry, EntryError, Scope, Target};
 use twinstep_model::{Joint, ModelFile};
 
 /// Shares of the way from no effect to the end of its plausible range that are tried.
@@ -28,19 +28,19 @@ impl Hypothesis {
     }
 
     /// Whether it is large enough to be worth a name.
-    pub fn is_large_enough(&self) -> bool {
+    pub fn exceeds_min_size(&self) -> bool {
         let own = LEAST_SHARES.iter().find(|(name, _)| *name == self.effect.name);
-        share(self.effect, &self.values) >= own.map_or(LEAST_SHARE, |(_, least)| *least)
+        relative_size(self.effect, &self.values) >= own.map_or(LEAST_SHARE, |(_, least)| *least)
     }
 
     /// Whether a robot may have it: no value is half as far again from none of it as the plausible range goes.
     pub fn is_plausible(&self) -> bool {
         let parameters = self.effect.parameters.iter().flat_map(|one| std::iter::repeat_n(one, one.count));
         parameters.zip(&self.values).all(|(parameter, value)| {
-            let [low, high] = parameter.plausible;
-            let beyond = 0.5 * (high - parameter.neutral).max(parameter.neutral - low);
+            let [low, high] = parameter.prior_range;
+            let beyond = 0.5 * (high - parameter.no_effect_value).max(parameter.no_effect_value - low);
             // An infinite one is none of it.
-            if parameter.neutral.is_infinite() {
+            if parameter.no_effect_value.is_infinite() {
                 *value >= 0.5 * low
             } else {
                 (low - beyond..=high + beyond).contains(value)
@@ -50,18 +50,18 @@ impl Hypothesis {
 }
 
 /// How far along the way from no effect to the end of the plausible range the largest of an effect's main values is.
-fn share(effect: &Effect, values: &[f64]) -> f64 {
+fn relative_size(effect: &Effect, values: &[f64]) -> f64 {
     let parameter = &effect.parameters[0];
-    let [low, high] = parameter.plausible;
+    let [low, high] = parameter.prior_range;
     let of = |value: &f64| {
-        if parameter.neutral.is_infinite() {
+        if parameter.no_effect_value.is_infinite() {
             return low / value;
         }
-        let end = if *value > parameter.neutral { high } else { low };
-        if (end - parameter.neutral).abs() < 1e-12 {
+        let end = if *value > parameter.no_effect_value { high } else { low };
+        if (end - parameter.no_effect_value).abs() < 1e-12 {
             0.0
         } else {
-            (value - parameter.neutral) / (end - parameter.neutral)
+            (value - parameter.no_effect_value) / (end - parameter.no_effect_value)
         }
     };
     values[..parameter.count].iter().map(of).fold(0.0, f64::max)
@@ -81,24 +81,24 @@ pub fn with_effect(model: &ModelFile, effect: &'static Effect, values: &[f64]) -
         if effect.composition == Composition::Replace {
             file.effects.retain(|entry| entry.effect != effect || entry.scope != scope);
         }
-        file.effects.push(Entry::new(effect, scope, values.to_vec())?);
+        file.effects.push(EffectEntry::new(effect, scope, values.to_vec())?);
     }
     Ok(file)
 }
 
 /// Values to try, from small to large, of effects on joints and on the supply.
-pub fn sizes(effect: &Effect) -> Vec<Vec<f64>> {
+pub fn grid(effect: &Effect) -> Vec<Vec<f64>> {
     let main = &effect.parameters[0];
-    let [low, high] = main.plausible;
+    let [low, high] = main.prior_range;
     let mut firsts = Vec::new();
     for share in SHARES {
-        if main.neutral.is_infinite() {
+        if main.no_effect_value.is_infinite() {
             firsts.push(low / share);
             continue;
         }
         for end in [low, high] {
-            if (end - main.neutral).abs() > 1e-9 {
-                firsts.push(main.neutral + share * (end - main.neutral));
+            if (end - main.no_effect_value).abs() > 1e-9 {
+                firsts.push(main.no_effect_value + share * (end - main.no_effect_value));
             }
         }
     }
@@ -116,10 +116,10 @@ pub fn sizes(effect: &Effect) -> Vec<Vec<f64>> {
 
 /// Values to try of an effect on one scope, from small to large. Delays and lags with which a loop rings stay in step only
 /// where they are nearly right: of those there are more.
-pub fn sizes_on_one_scope(effect: &Effect) -> Vec<Vec<f64>> {
+pub fn fine_grid(effect: &Effect) -> Vec<Vec<f64>> {
     let coarse = match effect.target {
-        Target::Joints | Target::Supply if effect.name != "encoder_offset" => sizes(effect),
-        _ => return whole_sizes(effect),
+        Target::Joints | Target::Supply if effect.name != "encoder_offset" => grid(effect),
+        _ => return body_grid(effect),
     };
     if !["command_delay", "torque_delay", "drive_lag"].contains(&effect.name) {
         return coarse;
@@ -128,13 +128,13 @@ pub fn sizes_on_one_scope(effect: &Effect) -> Vec<Vec<f64>> {
 }
 
 /// Values to try of an effect that is judged by the whole log; each component of a vector alone.
-pub fn whole_sizes(effect: &Effect) -> Vec<Vec<f64>> {
+pub fn body_grid(effect: &Effect) -> Vec<Vec<f64>> {
     match effect.name {
         "payload" => [-0.5, 0.3, 0.8, 2.0].map(|mass| vec![mass, 0.0, 0.0, 0.0]).to_vec(),
         "com_shift" | "gyro_bias" => {
             let along = |axis: usize| {
                 [-0.5, -0.15, 0.15, 0.5].map(|share| {
-                    let size = share * effect.parameters[0].plausible[1];
+                    let size = share * effect.parameters[0].prior_range[1];
                     (0..3).map(|one| if one == axis { size } else { 0.0 }).collect()
                 })
             };
@@ -155,7 +155,7 @@ fn ripples() -> Vec<Vec<f64>> {
 }
 
 /// What having chosen among all scopes of its kind costs [nats].
-pub fn choice(scope: Scope) -> f64 {
+pub fn selection_penalty(scope: Scope) -> f64 {
     let kinds: f64 = match scope {
         Scope::Kind(_) => 3.0,
         Scope::Leg(_) => 4.0,

@@ -15,25 +15,25 @@ pub const GYRO: usize = TRUNK + 9;
 
 /// Sums of squares and counts by channel and fold, in units of noise and misfit.
 #[derive(Clone, Debug)]
-pub struct Leftover {
+pub struct ResidualPower {
     /// Sums of squares.
     pub sums: [[f64; 2]; CHANNELS],
     /// Numbers of rows.
     pub counts: [[f64; 2]; CHANNELS],
     /// What tolerated errors cost that explain a part of the rest, of starts and of the robot [nats].
-    pub tolerated: [f64; 2],
+    pub nuisance_cost: [f64; 2],
 }
 
-impl Leftover {
+impl ResidualPower {
     /// Nothing yet.
     pub fn empty() -> Self {
-        Self { sums: [[0.0; 2]; CHANNELS], counts: [[0.0; 2]; CHANNELS], tolerated: [0.0; 2] }
+        Self { sums: [[0.0; 2]; CHANNELS], counts: [[0.0; 2]; CHANNELS], nuisance_cost: [0.0; 2] }
     }
 
     /// How much less tolerated errors cost than `before` [nats]. Where more than noise is left, the errors that explain a part
     /// of it are as uncertain.
     pub fn tolerated_gain(&self, before: &Self) -> f64 {
-        let cost = |left: &Self| left.tolerated.iter().sum::<f64>() / left.power().max(1.0);
+        let cost = |left: &Self| left.nuisance_cost.iter().sum::<f64>() / left.power().max(1.0);
         cost(before) - cost(self)
     }
 
@@ -62,7 +62,7 @@ impl Leftover {
     }
 
     /// Evidence for this model against `before` in a channel and fold [nats], with `rows` counting as one.
-    pub fn gain(&self, before: &Self, channel: usize, fold: usize, rows: f64) -> f64 {
+    pub fn log_likelihood_gain(&self, before: &Self, channel: usize, fold: usize, rows: f64) -> f64 {
         let (now, then, count) = (self.sums[channel][fold], before.sums[channel][fold], before.counts[channel][fold]);
         if count == 0.0 {
             return 0.0;
@@ -74,13 +74,13 @@ impl Leftover {
     }
 
     /// Power above noise and misfit, everywhere.
-    pub fn excess(&self) -> f64 {
+    pub fn power_above_noise(&self) -> f64 {
         (0..CHANNELS).map(|channel| self.channel_excess(channel)).sum::<f64>() + self.tolerated_excess()
     }
 
     /// Power that errors of the robot would have to explain beyond what any robot has.
     pub fn tolerated_excess(&self) -> f64 {
-        tolerance::excess(self.tolerated[1])
+        tolerance::excess(self.nuisance_cost[1])
     }
 
     /// Power above noise and misfit of a channel.

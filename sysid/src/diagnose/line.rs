@@ -9,7 +9,7 @@ const FREQUENCIES_HZ: [f64; 2] = [0.5, 25.0];
 
 /// The frequency [Hz] whose wave explains most of `values` at times `t`, fitted to one fold and judged on the other, and the
 /// share of their power that it explains. Folds alternate.
-pub fn line(t: &[f64], values: &[f64], folds: &[usize]) -> Option<(f64, f64)> {
+pub fn spectral_line(t: &[f64], values: &[f64], folds: &[usize]) -> Option<(f64, f64)> {
     let [low, high] = FREQUENCIES_HZ;
     let length = t.last()? - t.first()?;
     // Four to the width of a line.
@@ -52,8 +52,8 @@ mod tests {
         let with: Vec<f64> =
             t.iter().enumerate().map(|(row, t)| 1.41 * (TAU * 3.3 * t + 1.0).sin() + noise(row)).collect();
         let without: Vec<f64> = (0..t.len()).map(noise).collect();
-        let (frequency, share) = line(&t, &with, &folds).expect("times");
+        let (frequency, share) = spectral_line(&t, &with, &folds).expect("times");
         assert!((frequency - 3.3).abs() < 0.02 && (share - 0.5).abs() < 0.05, "{frequency} {share}");
-        assert!(line(&t, &without, &folds).expect("times").1 < 0.05);
+        assert!(spectral_line(&t, &without, &folds).expect("times").1 < 0.05);
     }
 }

@@ -36,25 +36,25 @@ use twinstep_logs::Log;
 use twinstep_model::effects::{Effect, Scope};
 use twinstep_model::{ModelFile, Precision, RobotModel, Rollout};
 
-use crate::diagnosis::{Cause, Confusable, Diagnosis, Errors};
+use crate::diagnosis::{Cause, CorrelatedPair, Diagnosis, RmsErrors};
 use crate::evaluate::evaluate;
 use crate::experiment::ExperimentError;
 use crate::identify::blocks;
-use crate::refine::{SIMULATORS, covariance};
-use crate::tolerance::Tolerances;
-use crate::window::Horizon;
+use crate::refine::{SIMULATOR_MISMATCH_STD, covariance};
+use crate::tolerance::NuisanceModel;
+use crate::window::WindowConfig;
 pub use any_joints::diagnose_torques;
-use causes::{Accepted, Search, THRESHOLD, View, take_values};
-use evidence::Evidence;
+use causes::{Accepted, ForwardSelection, THRESHOLD, WindowedData, write_estimates};
+use evidence::ResidualData;
 use hypothesis::Hypothesis;
-pub use next::NextMotion;
-pub use rivalry::Rivalry;
-use trial::{Fit, Trial};
+pub use next::ProposedExperiment;
+pub use rivalry::HypothesisPair;
+use trial::{FitProblem, CandidateFit};
 
 /// A rival this close [nats], or within this share of the cause's own evidence, cannot be told from the cause: simulators of
 /// one law differ by as much.
-const CLOSE: f64 = 6.0;
-const CLOSE_SHARE: f64 = 0.05;
+const AMBIGUITY_NATS: f64 = 6.0;
+const AMBIGUITY_FRACTION: f64 = 0.05;
 
 /// Why there is no diagnosis.
 #[derive(Debug, thiserror::Error)]
@@ -70,21 +70,21 @@ pub enum DiagnoseError {
     Model(#[from] twinstep_model::effects::EntryError),
     /// Ended by `progress`.
     #[error("ended before it was done")]
-    Ended,
+    Interrupted,
 }
 
 /// What is being done, said now and then; ends the diagnosis when it returns false.
-pub type Progress<'a> = dyn FnMut(&str) -> bool + 'a;
+pub type DiagnoseProgress<'a> = dyn FnMut(&str) -> bool + 'a;
 
 /// A diagnosis and the model that it makes.
 #[derive(Clone, Debug)]
-pub struct Diagnosed {
+pub struct DiagnosisOutput {
     /// What is said; `extended_model` is left to who writes the files.
     pub diagnosis: Diagnosis,
     /// The given model with the causes, and intervals.
     pub extended: ModelFile,
     /// What to play next, where causes are left that the logs cannot tell apart.
-    pub next: Option<NextMotion>,
+    pub next: Option<ProposedExperiment>,
 }
 
 /// Names what `model` gets wrong in `logs` of one robot.
@@ -92,34 +92,34 @@ pub fn diagnose(
     logs: Vec<Log>,
     model: &ModelFile,
     simulator: &mut dyn Rollout,
-    progress: &mut Progress,
-) -> Result<Diagnosed, DiagnoseError> {
+    progress: &mut DiagnoseProgress,
+) -> Result<DiagnosisOutput, DiagnoseError> {
     let robot = model.robot_model()?;
-    let mut say = |text: &str| if progress(text) { Ok(()) } else { Err(DiagnoseError::Ended) };
+    let mut say = |text: &str| if progress(text) { Ok(()) } else { Err(DiagnoseError::Interrupted) };
     say("the ground, and errors of any robot")?;
-    let mut evidence = Evidence::new(logs.clone(), &robot, Horizon::DIAGNOSIS)?;
+    let mut evidence = ResidualData::new(logs.clone(), &robot, WindowConfig::DIAGNOSIS)?;
     let left = evidence.leftover(simulator, &robot);
     if left.diverged() {
         return Err(DiagnoseError::Diverges);
     }
-    let judged = on_fitted_ground(&evidence, model, simulator);
-    let mut views = vec![View::new(evidence, &judged, &robot, simulator)?];
-    if views[0].evidence.is_lost(&left) {
-        evidence = Evidence::new(logs, &robot, Horizon::LOST)?;
-        views.push(View::new(evidence, &judged, &robot, simulator)?);
+    let judged = with_fitted_ground(&evidence, model, simulator);
+    let mut views = vec![WindowedData::new(evidence, &judged, &robot, simulator)?];
+    if views[0].evidence.fails_to_track(&left) {
+        evidence = ResidualData::new(logs, &robot, WindowConfig::SHORT)?;
+        views.push(WindowedData::new(evidence, &judged, &robot, simulator)?);
     }
-    let mut search = Search {
+    let mut search = ForwardSelection {
         view: views.len() - 1,
         views: &views,
-        judged: judged.clone(),
+        baseline: judged.clone(),
         accepted: Accepted::new(),
         model: judged.clone(),
         simulator,
-        say: &mut say,
+        progress: &mut say,
     };
     search.run()?;
-    let Search { view, mut accepted, model: named, .. } = search;
-    let View { evidence, given } = &views[view];
+    let ForwardSelection { view, mut accepted, model: named, .. } = search;
+    let WindowedData { evidence, given } = &views[view];
     let left = evidence.leftover(simulator, &named.robot_model()?);
     say("intervals")?;
     let (extended, confusable) = intervals(model, &judged, &mut accepted, evidence, simulator);
@@ -134,25 +134,25 @@ pub fn diagnose(
         findings: causes,
         confusable,
         unexplained: unexplained::unexplained(evidence, &extended.robot_model()?, given, &left, simulator),
-        next_experiment: next.as_ref().map(|next| next.said.clone()),
+        next_experiment: next.as_ref().map(|next| next.summary.clone()),
         extended_model: String::new(),
     };
-    Ok(Diagnosed { diagnosis, extended, next })
+    Ok(DiagnosisOutput { diagnosis, extended, next })
 }
 
 /// The model on ground of a hardness that suits the log, as long as the difference is not worth a name: how a foot meets the
 /// ground differs between a simulator and anything else, and would pass for a shifted mass or a softer gear.
-fn on_fitted_ground(evidence: &Evidence, model: &ModelFile, simulator: &mut dyn Rollout) -> ModelFile {
+fn with_fitted_ground(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> ModelFile {
     let effect = Effect::named("ground_stiffness").expect("an effect of the catalogue");
     let own = model.effects.iter().rfind(|entry| entry.effect == effect);
-    let values = own.map_or(vec![effect.parameters[0].neutral], |entry| entry.values.clone());
+    let values = own.map_or(vec![effect.parameters[0].no_effect_value], |entry| entry.values.clone());
     let hypothesis = Hypothesis { effect, scope: Scope::Ground, values };
-    let Some(fit) = Fit::new(model, std::slice::from_ref(&hypothesis)).filter(|_| evidence.has_free_parts()) else {
+    let Some(fit) = FitProblem::new(model, std::slice::from_ref(&hypothesis)).filter(|_| evidence.has_free_parts()) else {
         return model.clone();
     };
-    let point = fit.to(&evidence.whole, simulator);
+    let point = fit.solve(&evidence.fit_rows, simulator);
     let fitted = Hypothesis { values: vec![fit.unknowns[0].value(point[0])], ..hypothesis };
-    if fitted.is_large_enough() { model.clone() } else { fit.model(&point) }
+    if fitted.exceeds_min_size() { model.clone() } else { fit.model(&point) }
 }
 
 /// The model with the causes and their 95 % intervals, and what cannot be told apart.
@@ -160,27 +160,27 @@ fn intervals(
     model: &ModelFile,
     judged: &ModelFile,
     accepted: &mut Accepted,
-    evidence: &Evidence,
+    evidence: &ResidualData,
     simulator: &mut dyn Rollout,
-) -> (ModelFile, Vec<Confusable>) {
+) -> (ModelFile, Vec<CorrelatedPair>) {
     let hypotheses: Vec<_> = accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
-    let fits = [judged, model].map(|model| Fit::new(model, &hypotheses).filter(|_| !hypotheses.is_empty()));
+    let fits = [judged, model].map(|model| FitProblem::new(model, &hypotheses).filter(|_| !hypotheses.is_empty()));
     let [Some(on_ground), Some(mut fit)] = fits else { return (model.clone(), Vec::new()) };
-    fit.begin = landscape::settled(&on_ground, evidence, simulator);
-    take_values(accepted, &fit, &fit.begin);
-    let experiments = &evidence.whole.experiments;
+    fit.initial_point = landscape::refine_with_restarts(&on_ground, evidence, simulator);
+    write_estimates(accepted, &fit, &fit.initial_point);
+    let experiments = &evidence.fit_rows.experiments;
     let tolerances =
-        fit.model(&fit.begin).robot_model().ok().and_then(|robot| Tolerances::new(experiments, &robot, simulator));
-    let covariance = fit.task(&evidence.whole, simulator, Precision::Double, |task, simulator| {
-        let errors = tolerances.map_or(Vec::new(), |all| all.robot_errors(task.spread, task.tolerances));
-        covariance(&task.linear(simulator, &fit.begin)?, &blocks(experiments), &errors)
+        fit.model(&fit.initial_point).robot_model().ok().and_then(|robot| NuisanceModel::new(experiments, &robot, simulator));
+    let covariance = fit.with_problem(&evidence.fit_rows, simulator, Precision::Double, |task, simulator| {
+        let errors = tolerances.map_or(Vec::new(), |all| all.robot_errors(task.residual_scale, task.tolerances));
+        covariance(&task.linearise(simulator, &fit.initial_point)?, &blocks(experiments), &errors)
     });
-    let near = landscape::near(&fit, evidence, simulator);
-    words::with_intervals(&fit, covariance.as_ref(), SIMULATORS, &near)
+    let near = landscape::profile_intervals(&fit, evidence, simulator);
+    words::with_intervals(&fit, covariance.as_ref(), SIMULATOR_MISMATCH_STD, &near)
 }
 
 /// On the seconds that are set aside.
-fn errors(evidence: &Evidence, robot: &RobotModel, simulator: &mut dyn Rollout) -> Result<Errors, DiagnoseError> {
+fn errors(evidence: &ResidualData, robot: &RobotModel, simulator: &mut dyn Rollout) -> Result<RmsErrors, DiagnoseError> {
     let (mut torque, mut q) = (Vec::new(), Vec::new());
     for log in evidence.logs() {
         let evaluation = evaluate(log, robot, simulator, |row| rows::fold_of(log, row).is_none())?;
@@ -191,16 +191,16 @@ fn errors(evidence: &Evidence, robot: &RobotModel, simulator: &mut dyn Rollout) 
         let squares: f64 = errors.iter().map(|error| error * error).sum();
         (!errors.is_empty()).then(|| (squares / errors.len() as f64).sqrt())
     };
-    Ok(Errors { torque_rmse_nm: whole(torque), q_rmse_rad: whole(q) })
+    Ok(RmsErrors { torque_rmse_nm: whole(torque), q_rmse_rad: whole(q) })
 }
 
 /// Of the others those that the logs cannot tell from the best.
-fn close<'a>(best: &Trial, others: &'a [Trial]) -> impl Iterator<Item = &'a Trial> {
-    let least = best.score - CLOSE.max(CLOSE_SHARE * best.score);
+fn ambiguous<'a>(best: &CandidateFit, others: &'a [CandidateFit]) -> impl Iterator<Item = &'a CandidateFit> {
+    let least = best.score - AMBIGUITY_NATS.max(AMBIGUITY_FRACTION * best.score);
     others.iter().filter(move |other| other.score > least)
 }
 
-fn cause(best: &Trial, others: &[Trial], extended: &ModelFile) -> Cause {
+fn cause(best: &CandidateFit, others: &[CandidateFit], extended: &ModelFile) -> Cause {
     let hypothesis = &best.hypothesis;
     Cause {
         effect: hypothesis.effect.name.to_owned(),
@@ -209,8 +209,8 @@ fn cause(best: &Trial, others: &[Trial], extended: &ModelFile) -> Cause {
         held_out_gain: best.gain,
         score_nats: best.score,
         threshold_nats: THRESHOLD,
-        ambiguous_with: close(best, others).map(|other| other.hypothesis.name()).collect(),
+        ambiguous_with: ambiguous(best, others).map(|other| other.hypothesis.name()).collect(),
         rivals: others.iter().take(5).map(words::rival).collect(),
-        evidence: words::evidence(best, others),
+        evidence: words::explanation(best, others),
     }
 }

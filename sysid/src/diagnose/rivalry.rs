@@ -1,31 +1,31 @@
 //! Two models that explain a log equally well: how far a motion would part them, and how far a log of it does.
 
-use twinstep_logs::{Base, Log, Meta, TauSensor};
+use twinstep_logs::{BaseMount, Log, Meta, TorqueSensor};
 use twinstep_model::effects::{Effect, Scope};
-use twinstep_model::{Ground, HELD_HEIGHT, JOINT_NAMES, Job, ModelFile, Placement, Precision, RobotModel, Rollout};
+use twinstep_model::{Ground, FIXED_BASE_HEIGHT, JOINT_NAMES, RolloutRequest, ModelFile, InitialState, Precision, RobotModel, Rollout};
 
-use super::evidence::Evidence;
+use super::evidence::ResidualData;
 use super::hypothesis::Hypothesis;
-use super::leftover::{CHANNELS, Leftover};
+use super::leftover::{CHANNELS, ResidualPower};
 use super::rows::PRECISION;
-use super::trial::Fit;
-use crate::experiment::{ExperimentError, shown_torque};
+use super::trial::FitProblem;
+use crate::experiment::{ExperimentError, estimated_torque};
 use crate::motion::{command, joint_commands};
-use crate::safe_motions::SafeMotion;
-use crate::task::Task;
-use crate::window::Horizon;
+use crate::safe_motions::ExcitationTrajectory;
+use crate::task::LeastSquaresProblem;
+use crate::window::WindowConfig;
 
 /// Parts of the step to a rival's refitted numbers that are tried: a line is only so straight.
 const STEPS: [f64; 4] = [0.0, 0.25, 0.5, 1.0];
 
 /// What is common to two models, and the effect that each has besides.
 #[derive(Clone, Debug)]
-pub struct Rivalry {
+pub struct HypothesisPair {
     model: ModelFile,
     sides: [Hypothesis; 2],
 }
 
-impl Rivalry {
+impl HypothesisPair {
     /// Of two effects on top of `model`, each with its scope and its values.
     pub fn new(model: ModelFile, sides: [(&'static Effect, Scope, Vec<f64>); 2]) -> Self {
         Self { model, sides: sides.map(|(effect, scope, values)| Hypothesis { effect, scope, values }) }
@@ -40,66 +40,66 @@ impl Rivalry {
     /// measured and how well. None where neither can be simulated.
     ///
     /// The other one may take any size that makes up for the difference: what is left is what counts.
-    pub fn predicted(&self, motion: &SafeMotion, like: &Log, simulator: &mut dyn Rollout) -> Option<f64> {
+    pub fn expected_log_likelihood_ratio(&self, motion: &ExcitationTrajectory, like: &Log, simulator: &mut dyn Rollout) -> Option<f64> {
         let [one, other] = &self.sides;
         let nats = [(one, other), (other, one)].map(|(truth, rival)| {
             let robot = self.robot(truth)?;
             let log = simulated(motion, &robot, like, simulator)?;
-            let evidence = Evidence::new(vec![log], &robot, Horizon::DIAGNOSIS).ok()?;
-            Some(expected(&evidence, &refitted(&self.fit(rival)?, &evidence, simulator)?))
+            let evidence = ResidualData::new(vec![log], &robot, WindowConfig::DIAGNOSIS).ok()?;
+            Some(expected_gain(&evidence, &gauss_newton_refit(&self.fit(rival)?, &evidence, simulator)?))
         });
         Some(0.5 * (nats[0]? + nats[1]?))
     }
 
     /// Evidence of `log` for the first of the two against the second [nats], both fitted to it.
-    pub fn achieved(&self, log: Log, simulator: &mut dyn Rollout) -> Result<f64, ExperimentError> {
+    pub fn log_likelihood_ratio(&self, log: Log, simulator: &mut dyn Rollout) -> Result<f64, ExperimentError> {
         let robot = self.model.robot_model().expect("a model that was given is a robot");
-        let evidence = Evidence::new(vec![log], &robot, Horizon::DIAGNOSIS)?;
+        let evidence = ResidualData::new(vec![log], &robot, WindowConfig::DIAGNOSIS)?;
         let [one, other] = self.sides.each_ref().map(|side| {
             let fit = self.fit(side).expect("an effect of the catalogue goes on top of any model");
-            let point = fit.to(&evidence.whole, simulator);
+            let point = fit.solve(&evidence.fit_rows, simulator);
             let robot = fit.model(&point).robot_model().expect("fitted within its bounds");
             evidence.leftover(simulator, &robot)
         });
-        let gain = |channel, fold| one.gain(&other, channel, fold, evidence.rows_in_one(channel));
+        let gain = |channel, fold| one.log_likelihood_gain(&other, channel, fold, evidence.correlation_rows(channel));
         Ok((0..CHANNELS).map(|channel| gain(channel, 0) + gain(channel, 1)).sum())
     }
 
     fn robot(&self, side: &Hypothesis) -> Option<RobotModel> {
         let fit = self.fit(side)?;
-        fit.model(&fit.begin).robot_model().ok()
+        fit.model(&fit.initial_point).robot_model().ok()
     }
 
-    fn fit(&self, side: &Hypothesis) -> Option<Fit> {
-        Fit::new(&self.model, std::slice::from_ref(side))
+    fn fit(&self, side: &Hypothesis) -> Option<FitProblem> {
+        FitProblem::new(&self.model, std::slice::from_ref(side))
     }
 }
 
 /// What is left with the numbers of a rival moved so that it mimics best: one step of Gauss and Newton.
-fn refitted(fit: &Fit, evidence: &Evidence, simulator: &mut dyn Rollout) -> Option<Leftover> {
-    let task = Task {
+fn gauss_newton_refit(fit: &FitProblem, evidence: &ResidualData, simulator: &mut dyn Rollout) -> Option<ResidualPower> {
+    let task = LeastSquaresProblem {
         file: &fit.file,
         unknowns: &fit.unknowns,
-        experiments: &evidence.whole.experiments,
-        spread: &[],
+        experiments: &evidence.fit_rows.experiments,
+        residual_scale: &[],
         tolerances: None,
         precision: PRECISION,
     };
-    let here = Task { precision: Precision::Double, ..task }.linear(simulator, &fit.begin)?;
-    let step = here.slopes.clone().svd(true, true).solve(&-here.residuals, 1e-9).ok()?;
+    let here = LeastSquaresProblem { precision: Precision::Double, ..task }.linearise(simulator, &fit.initial_point)?;
+    let step = here.jacobian.clone().svd(true, true).solve(&-here.residuals, 1e-9).ok()?;
     let moved = |part: f64| {
-        let moved: Vec<f64> = task.scaled(&fit.begin).zip(step.iter()).map(|(now, step)| now + part * step).collect();
-        fit.model(&task.within_bounds(&moved)).robot_model().ok()
+        let moved: Vec<f64> = task.to_prior_units(&fit.initial_point).zip(step.iter()).map(|(now, step)| now + part * step).collect();
+        fit.model(&task.from_prior_units(&moved)).robot_model().ok()
     };
     let robots: Vec<RobotModel> = STEPS.into_iter().filter_map(moved).collect();
-    let left = evidence.leftovers(simulator, &robots, false).into_iter().filter(|left| !left.diverged());
-    left.min_by(|one, other| expected(evidence, one).total_cmp(&expected(evidence, other)))
+    let left = evidence.residual_powers(simulator, &robots, false).into_iter().filter(|left| !left.diverged());
+    left.min_by(|one, other| expected_gain(evidence, one).total_cmp(&expected_gain(evidence, other)))
 }
 
 /// Evidence that noise on top of differences is expected to give against who predicts them [nats].
-fn expected(evidence: &Evidence, left: &Leftover) -> f64 {
+fn expected_gain(evidence: &ResidualData, left: &ResidualPower) -> f64 {
     let of = |channel: usize| -> f64 {
-        let rows = evidence.rows_in_one(channel);
+        let rows = evidence.correlation_rows(channel);
         let folds = left.sums[channel].into_iter().zip(left.counts[channel]).filter(|(_, count)| *count > 0.0);
         // Of power 1 is the noise, which either model leaves.
         folds.map(|(sum, count)| 0.5 * count / rows * (sum / count).ln_1p()).sum()
@@ -109,19 +109,19 @@ fn expected(evidence: &Evidence, left: &Leftover) -> f64 {
 
 /// The log that `robot` would make of a motion, without noise, with the channels and the stated noise of `like`; none if it
 /// diverges.
-fn simulated(motion: &SafeMotion, robot: &RobotModel, like: &Log, simulator: &mut dyn Rollout) -> Option<Log> {
+fn simulated(motion: &ExcitationTrajectory, robot: &RobotModel, like: &Log, simulator: &mut dyn Rollout) -> Option<Log> {
     let commanded = motion.motion(robot);
     let joints = joint_commands(&commanded).ok()?;
     let commands: Vec<_> = (0..commanded.rows()).map(|row| command(robot, &joints, row)).collect();
     let pose = robot.control.default_pose_f32();
-    let held = motion.base == Base::Fixed;
+    let held = motion.base == BaseMount::Fixed;
     let start = if held {
-        Placement::at_rest(HELD_HEIGHT as f32, pose)
+        InitialState::at_rest(FIXED_BASE_HEIGHT as f32, pose)
     } else {
-        Placement::above(&Ground::FLAT, robot, pose, 0.0)
+        InitialState::standing_on(&Ground::FLAT, robot, pose, 0.0)
     };
     let states =
-        simulator.play(&[Job { robot, held, start, past: &[], commands: &commands }], Precision::Double).remove(0);
+        simulator.run(&[RolloutRequest { robot, held, start, history: &[], commands: &commands }], Precision::Double).remove(0);
     let mut meta = Meta { noise: like.meta().noise.clone(), ..commanded.meta().clone() };
     let mut columns: Vec<_> = commanded.channels().map(|(name, cells)| (name.to_owned(), cells.to_vec())).collect();
     columns.push(("t".to_owned(), commanded.t().to_vec()));
@@ -135,8 +135,8 @@ fn simulated(motion: &SafeMotion, robot: &RobotModel, like: &Log, simulator: &mu
         }
         if like.tau_measured(name).is_some() {
             // A sensor at the output sees more than a motor's current; what it sees besides is not counted on.
-            meta.tau_sensor = TauSensor::Current;
-            channel(format!("tau_measured_{name}"), &|row| shown_torque(&states, robot, joint, row, row + 1) as f32);
+            meta.tau_sensor = TorqueSensor::MotorCurrent;
+            channel(format!("tau_measured_{name}"), &|row| estimated_torque(&states, robot, joint, row, row + 1) as f32);
         }
     }
     if !held {

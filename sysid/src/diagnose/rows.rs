@@ -4,46 +4,46 @@ use rayon::prelude::*;
 use twinstep_logs::Log;
 use twinstep_model::{Precision, RobotModel, Rollout};
 
-use super::leftover::{GYRO, Leftover, TRUNK};
-use crate::experiment::{Experiment, Quantity};
-use crate::tolerance::Tolerances;
+use super::leftover::{GYRO, ResidualPower, TRUNK};
+use crate::experiment::{Experiment, ResidualChannel};
+use crate::tolerance::NuisanceModel;
 
 /// What evidence is simulated in.
 pub const PRECISION: Precision = Precision::Single;
 /// Candidates that are simulated at once, which bounds memory.
-const TOGETHER: usize = 64;
+const BATCH_SIZE: usize = 64;
 /// Errors of this size, beside the noise, are any simulator's: of a joint's position [rad]; of the trunk's motion and of its
 /// gyroscope [noise].
-const MISFIT_RAD: f64 = 0.001;
-const MISFIT_OF_TRUNK: f64 = 1.0;
+const MODEL_ERROR_RAD: f64 = 0.001;
+const MODEL_ERROR_BASE: f64 = 1.0;
 const MISFIT_OF_GYRO: f64 = 1.0 / 3.0;
 /// Length of a block [s]; blocks go to the two folds in turn.
 const BLOCK_S: f64 = 1.0;
 
 /// Rows of all logs.
-pub struct Rows {
+pub struct ResidualRows {
     /// The logs, each with these rows alone.
     pub experiments: Vec<Experiment>,
     /// Errors of any robot, in these rows; none where every trunk was held.
-    pub tolerances: Option<Tolerances>,
+    pub tolerances: Option<NuisanceModel>,
     /// For every residual its channel, its fold, and what it is multiplied by.
     cells: Vec<(usize, Option<usize>, f64)>,
 }
 
-impl Rows {
+impl ResidualRows {
     /// `experiments` on `logs`, of which they may have a part of the rows.
     pub fn new(logs: &[Log], experiments: Vec<Experiment>) -> Self {
         let mut cells = Vec::new();
         for (log, experiment) in logs.iter().zip(&experiments) {
-            cells.extend(experiment.cells().map(|(quantity, row)| {
+            cells.extend(experiment.residual_index().map(|(quantity, row)| {
                 // A velocity says what the position does, with more noise; torques are judged without a simulation.
                 let (channel, misfit) = match quantity {
-                    Quantity::Position(joint) => (joint, MISFIT_RAD / experiment.sigma(quantity)),
-                    Quantity::Velocity(_) | Quantity::Torque(_) => return (0, None, 0.0),
-                    Quantity::BasePosition(axis) => (TRUNK + axis, MISFIT_OF_TRUNK),
-                    Quantity::BaseOrientation(axis) => (TRUNK + 3 + axis, MISFIT_OF_TRUNK),
-                    Quantity::BaseVelocity(axis) => (TRUNK + 6 + axis, MISFIT_OF_TRUNK),
-                    Quantity::BaseRate(axis) => (GYRO + axis, MISFIT_OF_GYRO),
+                    ResidualChannel::Position(joint) => (joint, MODEL_ERROR_RAD / experiment.sigma(quantity)),
+                    ResidualChannel::Velocity(_) | ResidualChannel::Torque(_) => return (0, None, 0.0),
+                    ResidualChannel::BasePosition(axis) => (TRUNK + axis, MODEL_ERROR_BASE),
+                    ResidualChannel::BaseOrientation(axis) => (TRUNK + 3 + axis, MODEL_ERROR_BASE),
+                    ResidualChannel::BaseVelocity(axis) => (TRUNK + 6 + axis, MODEL_ERROR_BASE),
+                    ResidualChannel::BaseRate(axis) => (GYRO + axis, MISFIT_OF_GYRO),
                 };
                 (channel, fold_of(log, row), 1.0 / misfit.hypot(1.0))
             }));
@@ -52,15 +52,15 @@ impl Rows {
     }
 
     /// What a joint's position is in units of [rad]: noise and misfit.
-    pub fn unit_of_position(&self, joint: usize) -> f64 {
-        MISFIT_RAD.hypot(self.experiments[0].sigma(Quantity::Position(joint)))
+    pub fn position_std(&self, joint: usize) -> f64 {
+        MODEL_ERROR_RAD.hypot(self.experiments[0].sigma(ResidualChannel::Position(joint)))
     }
 
     /// What candidates leave of the motion.
-    pub fn leftovers(&self, simulator: &mut dyn Rollout, robots: &[RobotModel]) -> Vec<Leftover> {
+    pub fn leftovers(&self, simulator: &mut dyn Rollout, robots: &[RobotModel]) -> Vec<ResidualPower> {
         let mut whole = vec![Vec::new(); robots.len()];
         for experiment in &self.experiments {
-            for (robots, whole) in robots.chunks(TOGETHER).zip(whole.chunks_mut(TOGETHER)) {
+            for (robots, whole) in robots.chunks(BATCH_SIZE).zip(whole.chunks_mut(BATCH_SIZE)) {
                 let residuals = experiment.residuals(simulator, robots, PRECISION);
                 whole.iter_mut().zip(residuals).for_each(|(whole, residuals)| whole.extend(residuals));
             }
@@ -69,22 +69,22 @@ impl Rows {
     }
 
     /// Residuals of a candidate less what tolerated errors explain.
-    pub fn corrected(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> Vec<f64> {
+    pub fn nuisance_corrected(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> Vec<f64> {
         let one = std::slice::from_ref(robot);
         let parts = self.experiments.iter().flat_map(|experiment| experiment.residuals(simulator, one, PRECISION));
         let mut residuals: Vec<f64> = parts.flatten().collect();
         if let Some(tolerances) = &self.tolerances {
-            tolerances.take(&mut residuals);
+            tolerances.project_out(&mut residuals);
         }
         residuals
     }
 
-    fn leftover(&self, mut residuals: Vec<f64>) -> Leftover {
+    fn leftover(&self, mut residuals: Vec<f64>) -> ResidualPower {
         if let Some(tolerances) = &self.tolerances {
-            tolerances.take(&mut residuals);
+            tolerances.project_out(&mut residuals);
         }
-        let tolerated = Tolerances::nats(&residuals[self.cells.len()..]);
-        let mut left = Leftover { tolerated, ..Leftover::empty() };
+        let tolerated = NuisanceModel::nats(&residuals[self.cells.len()..]);
+        let mut left = ResidualPower { nuisance_cost: tolerated, ..ResidualPower::empty() };
         for (residual, (channel, fold, weight)) in residuals.iter().zip(&self.cells) {
             left.add(*channel, *fold, residual * weight);
         }
@@ -100,13 +100,13 @@ pub fn fold_of(log: &Log, row: usize) -> Option<usize> {
 
 #[cfg(test)]
 mod tests {
-    use twinstep_logs::{Base, Meta, Segment, TauSensor};
+    use twinstep_logs::{BaseMount, Meta, Segment, TorqueSensor};
 
     use super::*;
 
     #[test]
     fn every_fifth_second_takes_no_part_in_choice_or_fit() {
-        let segments = vec![Segment { name: "air".to_owned(), base: Base::Fixed }];
+        let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
         let column = |name: &str, value: fn(usize) -> f64| (name.to_owned(), (0..100).map(value).collect());
         let columns = [
             column("t", |row| row as f64 / 10.0),
@@ -115,7 +115,7 @@ mod tests {
             column("kp", |_| 20.0),
             column("kd", |_| 0.5),
         ];
-        let log = Log::new(Meta::new(10.0, TauSensor::None, segments), columns).expect("a log");
+        let log = Log::new(Meta::new(10.0, TorqueSensor::None, segments), columns).expect("a log");
         let folds: Vec<_> = (0..100).step_by(10).map(|row| fold_of(&log, row)).collect();
         let five = [Some(0), Some(1), Some(0), Some(1), None];
         assert_eq!(folds, [five, five].concat());

@@ -4,12 +4,12 @@
 use std::collections::BTreeMap;
 
 use rayon::prelude::*;
-use twinstep_logs::{Base, Log, Meta, Segment};
-use twinstep_model::effects::{Entry, Scope, compose};
+use twinstep_logs::{BaseMount, Log, Meta, Segment};
+use twinstep_model::effects::{EffectEntry, Scope, apply_effects};
 use twinstep_model::{JOINT_NAMES, Joint, RobotModel, go2};
 
 use super::evidence::torque_sigma;
-use super::leftover::{Leftover, TORQUE};
+use super::leftover::{ResidualPower, TORQUE};
 use super::rows::fold_of;
 use crate::motion::MotionError;
 use crate::torque::MeasuredTorque;
@@ -22,7 +22,7 @@ const LARGEST_NM: f64 = 20.0;
 const INDEPENDENT_S: f64 = 0.1;
 
 /// Joints in seats.
-pub struct Seats {
+pub struct JointSlots {
     /// Their own names.
     names: Vec<String>,
     /// Whether these are all joints of the robot.
@@ -31,26 +31,26 @@ pub struct Seats {
     logs: Vec<Log>,
     torques: Vec<MeasuredTorque>,
     /// What a unit of torque in the seats is [N·m].
-    pub unit: f64,
+    pub torque_scale: f64,
     /// An ideal drive in every seat, without limits, that ticks with the rows of the logs.
     ideal: RobotModel,
 }
 
-impl Seats {
+impl JointSlots {
     /// The joints `names` of `logs`, which have one rate.
     pub fn new(logs: &[Log], names: &[String]) -> Result<Self, MotionError> {
         let whole = names.len() == logs[0].joints().len();
         let mut ideal = go2();
-        ideal.control.drive_hz = logs[0].meta().rate_hz;
+        ideal.control.actuator_hz = logs[0].meta().rate_hz;
         for joint in &mut ideal.joints {
             (joint.torque_limit, joint.armature) = (1e6, 0.0);
         }
         let torques = names.iter().flat_map(|name| logs.iter().filter_map(|log| log.tau_measured(name))).flatten();
         let largest = torques.filter(|torque| torque.is_finite()).fold(0.0_f64, |most, torque| most.max(torque.abs()));
         let unit = if largest > 0.0 { largest / LARGEST_NM } else { 1.0 };
-        let logs: Vec<Log> = logs.iter().map(|log| seated(log, names, unit)).collect::<Result<_, _>>()?;
+        let logs: Vec<Log> = logs.iter().map(|log| into_slots(log, names, unit)).collect::<Result<_, _>>()?;
         let torques = logs.iter().map(|log| MeasuredTorque::new(log, &ideal)).collect::<Result<_, _>>()?;
-        Ok(Self { names: names.to_vec(), whole, logs, torques, ideal, unit })
+        Ok(Self { names: names.to_vec(), whole, logs, torques, ideal, torque_scale: unit })
     }
 
     /// What a cause may be about: all joints, or one.
@@ -65,7 +65,7 @@ impl Seats {
     }
 
     /// A scope by the joints' own names.
-    pub fn told(&self, scope: Scope) -> String {
+    pub fn scope_name(&self, scope: Scope) -> String {
         match scope {
             Scope::Joint(joint) => self.names[joint.index()].clone(),
             // Others of the robot were looked at apart.
@@ -85,19 +85,19 @@ impl Seats {
     }
 
     /// Drives with these effects; none that are no drives.
-    pub fn robot(&self, entries: &[Entry]) -> Option<RobotModel> {
-        compose(&self.ideal, entries).ok()
+    pub fn robot(&self, entries: &[EffectEntry]) -> Option<RobotModel> {
+        apply_effects(&self.ideal, entries).ok()
     }
 
     /// Whether an effect shows in torques at all, where the sensor is.
-    pub fn show(&self, robot: &RobotModel, other: &RobotModel) -> bool {
-        self.torques.iter().any(|torques| !torques.are_alike(robot, other))
+    pub fn affects_torque(&self, robot: &RobotModel, other: &RobotModel) -> bool {
+        self.torques.iter().any(|torques| !torques.predict_same_torque(robot, other))
     }
 
     /// What candidates leave of the torques.
-    pub fn leftovers(&self, robots: &[RobotModel]) -> Vec<Leftover> {
+    pub fn leftovers(&self, robots: &[RobotModel]) -> Vec<ResidualPower> {
         let left = |robot: &RobotModel| {
-            let mut left = Leftover::empty();
+            let mut left = ResidualPower::empty();
             for (log, torques) in self.logs.iter().zip(&self.torques) {
                 let sigma = torque_sigma(log, &self.ideal);
                 torques.differences(robot, |seat, row, difference| {
@@ -110,7 +110,7 @@ impl Seats {
     }
 
     /// Sums of squares of what `robot` leaves on the seconds that are set aside, and of noise alone [N²·m²]; and rows.
-    pub fn set_aside(&self, robot: &RobotModel) -> [f64; 3] {
+    pub fn held_out_sums(&self, robot: &RobotModel) -> [f64; 3] {
         let (mut squares, mut noise, mut rows) = (0.0, 0.0, 0.0);
         for (log, torques) in self.logs.iter().zip(&self.torques) {
             let sigma = torque_sigma(log, &self.ideal);
@@ -122,7 +122,7 @@ impl Seats {
                 }
             });
         }
-        [self.unit * self.unit * squares, self.unit * self.unit * noise, rows]
+        [self.torque_scale * self.torque_scale * squares, self.torque_scale * self.torque_scale * noise, rows]
     }
 
     /// What `robot` leaves of the torque of a seat in the first log, by row; not a number where nothing was measured.
@@ -138,7 +138,7 @@ impl Seats {
 }
 
 /// `log` with `names` in their seats, torques in units of `unit` [N·m], and nothing else but the supply.
-fn seated(log: &Log, names: &[String], unit: f64) -> Result<Log, MotionError> {
+fn into_slots(log: &Log, names: &[String], unit: f64) -> Result<Log, MotionError> {
     let index = |cells: &[u32]| cells.iter().map(|cell| f64::from(*cell)).collect();
     let mut columns: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     columns.insert("t".to_owned(), log.t().to_vec());
@@ -165,7 +165,7 @@ fn seated(log: &Log, names: &[String], unit: f64) -> Result<Log, MotionError> {
         }
     }
     // No body moves here: whatever held it, its joints are measured.
-    let held = |segment: &Segment| Segment { base: Base::Fixed, ..segment.clone() };
+    let held = |segment: &Segment| Segment { base: BaseMount::Fixed, ..segment.clone() };
     let meta = Meta {
         joints: JOINT_NAMES[..names.len()].iter().map(ToString::to_string).collect(),
         segments: log.meta().segments.iter().map(held).collect(),

@@ -3,13 +3,13 @@
 use twinstep_model::effects::{Effect, Scope};
 use twinstep_model::{ModelFile, Precision, RobotModel, Rollout};
 
-use super::evidence::Evidence;
-use super::hypothesis::{Hypothesis, choice};
-use super::leftover::{CHANNELS, Leftover};
-use super::rows::{PRECISION, Rows};
+use super::evidence::ResidualData;
+use super::hypothesis::{Hypothesis, selection_penalty};
+use super::leftover::{CHANNELS, ResidualPower};
+use super::rows::{PRECISION, ResidualRows};
 use crate::refine::refine;
-use crate::task::Task;
-use crate::unknown::{Unknown, start, unknowns, with_values};
+use crate::task::LeastSquaresProblem;
+use crate::unknown::{FreeParameter, initial_coordinate, free_parameters, with_values};
 
 /// Most steps of a descent: the scan has found the valley.
 const STEPS: usize = 6;
@@ -18,7 +18,7 @@ const SETTLED: f64 = 1e-3;
 
 /// What came of a hypothesis.
 #[derive(Clone, Debug)]
-pub struct Trial {
+pub struct CandidateFit {
     /// With values fitted to everything.
     pub hypothesis: Hypothesis,
     /// Evidence on held-out blocks, less the price of choosing and of its parameters [nats].
@@ -26,39 +26,39 @@ pub struct Trial {
     /// 1 − RMSE after / RMSE before on the held-out residuals where it acts.
     pub gain: f64,
     /// Share of the power above noise that it explains, in the channels where it acts.
-    pub explains: f64,
+    pub explained_fraction: f64,
 }
 
 /// Model and unknowns of effects on top of `model`, and where a descent begins: at `hypothesis` for the last of them.
 #[derive(Clone)]
-pub struct Fit {
+pub struct FitProblem {
     /// The model with an entry for each effect.
     pub file: ModelFile,
     /// Their numbers.
-    pub unknowns: Vec<Unknown>,
+    pub unknowns: Vec<FreeParameter>,
     /// Where a descent begins [coordinates].
-    pub begin: Vec<f64>,
+    pub initial_point: Vec<f64>,
 }
 
-impl Fit {
+impl FitProblem {
     /// Of `hypotheses`, all at once.
     pub fn new(model: &ModelFile, hypotheses: &[Hypothesis]) -> Option<Self> {
         let effects: Vec<(&'static Effect, Scope)> = hypotheses.iter().map(|one| (one.effect, one.scope)).collect();
-        let (file, unknowns) = unknowns(model, &effects).ok()?;
+        let (file, unknowns) = free_parameters(model, &effects).ok()?;
         let values: Vec<f64> = hypotheses.iter().flat_map(|one| one.values.iter().copied()).collect();
         // Where nothing is known of a value it begins where there is none of it.
         let begin = unknowns
             .iter()
             .zip(&values)
-            .map(|(unknown, value)| if value.is_finite() { unknown.coordinate(*value) } else { start(&file, unknown) });
-        Some(Self { begin: begin.collect(), file, unknowns })
+            .map(|(unknown, value)| if value.is_finite() { unknown.coordinate(*value) } else { initial_coordinate(&file, unknown) });
+        Some(Self { initial_point: begin.collect(), file, unknowns })
     }
 
     /// The numbers that follow `rows` best.
-    pub fn to(&self, rows: &Rows, simulator: &mut dyn Rollout) -> Vec<f64> {
+    pub fn solve(&self, rows: &ResidualRows, simulator: &mut dyn Rollout) -> Vec<f64> {
         let (mut steps, mut last) = (0, f64::INFINITY);
-        self.task(rows, simulator, PRECISION, |task, simulator| {
-            refine(task, simulator, self.begin.clone(), |cost| {
+        self.with_problem(rows, simulator, PRECISION, |task, simulator| {
+            refine(task, simulator, self.initial_point.clone(), |cost| {
                 steps += 1;
                 let settled = last - cost < SETTLED * cost;
                 last = cost;
@@ -68,19 +68,19 @@ impl Fit {
     }
 
     /// Hands on what is asked of `rows`, weighted as the beginning lets expect.
-    pub fn task<R>(
+    pub fn with_problem<R>(
         &self,
-        rows: &Rows,
+        rows: &ResidualRows,
         simulator: &mut dyn Rollout,
         precision: Precision,
-        ask: impl FnOnce(&Task, &mut dyn Rollout) -> R,
+        ask: impl FnOnce(&LeastSquaresProblem, &mut dyn Rollout) -> R,
     ) -> R {
         let (file, unknowns, experiments) = (&self.file, &self.unknowns[..], &rows.experiments[..]);
         let tolerances = rows.tolerances.as_ref();
-        let task = Task { file, unknowns, experiments, spread: &[], tolerances, precision };
-        let spread = task.spread(simulator, &self.begin);
-        let tolerances = tolerances.and_then(|tolerances| tolerances.divided(&spread));
-        ask(&Task { spread: &spread, tolerances: tolerances.as_ref(), ..task }, simulator)
+        let task = LeastSquaresProblem { file, unknowns, experiments, residual_scale: &[], tolerances, precision };
+        let spread = task.estimate_residual_scale(simulator, &self.initial_point);
+        let tolerances = tolerances.and_then(|tolerances| tolerances.rescaled(&spread));
+        ask(&LeastSquaresProblem { residual_scale: &spread, tolerances: tolerances.as_ref(), ..task }, simulator)
     }
 
     /// The model with these numbers.
@@ -90,23 +90,23 @@ impl Fit {
 }
 
 /// Tries `hypothesis` on top of `model`, which leaves `before`.
-pub fn trial(
-    evidence: &Evidence,
+pub fn cross_validate(
+    evidence: &ResidualData,
     model: &ModelFile,
-    before: &Leftover,
+    before: &ResidualPower,
     hypothesis: &Hypothesis,
     simulator: &mut dyn Rollout,
-) -> Option<Trial> {
-    let fit = Fit::new(model, std::slice::from_ref(hypothesis))?;
-    let points = [0, 1].map(|fold| fit.to(&evidence.folds[fold], simulator));
+) -> Option<CandidateFit> {
+    let fit = FitProblem::new(model, std::slice::from_ref(hypothesis))?;
+    let points = [0, 1].map(|fold| fit.solve(&evidence.folds[fold], simulator));
     let whole: Vec<f64> = points[0].iter().zip(&points[1]).map(|(one, other)| 0.5 * (one + other)).collect();
     let models = [fit.model(&points[0]), fit.model(&points[1]), fit.model(&whole)];
     let robots: Vec<RobotModel> = models.iter().map(|model| model.robot_model().ok()).collect::<Option<_>>()?;
-    let left = evidence.leftovers(simulator, &robots, false);
+    let left = evidence.residual_powers(simulator, &robots, false);
     // Fitted to one fold, judged on the other.
     let judged = |channel: usize| {
-        let rows = evidence.rows_in_one(channel);
-        left[0].gain(before, channel, 1, rows) + left[1].gain(before, channel, 0, rows)
+        let rows = evidence.correlation_rows(channel);
+        left[0].log_likelihood_gain(before, channel, 1, rows) + left[1].log_likelihood_gain(before, channel, 0, rows)
     };
     let tolerated: f64 = left[..2].iter().map(|left| 0.5 * left.tolerated_gain(before)).sum();
     let evidence_nats: f64 = (0..CHANNELS).map(judged).sum::<f64>() + tolerated;
@@ -117,16 +117,16 @@ pub fn trial(
         acts.iter().map(|channel| before.sums[*channel].iter().sum::<f64>()).sum::<f64>(),
         acts.iter().map(|channel| held_out(*channel)).sum::<f64>(),
     ];
-    let above = |left: &Leftover| {
+    let above = |left: &ResidualPower| {
         let tolerated = if tolerated > 1.0 { left.tolerated_excess() } else { 0.0 };
         acts.iter().map(|channel| left.channel_excess(*channel)).sum::<f64>() + tolerated
     };
     let [above, left_above] = [above(before), above(&left[2])];
     let values = fit.unknowns.iter().zip(&whole).map(|(unknown, coordinate)| unknown.value(*coordinate)).collect();
-    Some(Trial {
+    Some(CandidateFit {
         hypothesis: Hypothesis { values, ..hypothesis.clone() },
-        score: evidence_nats - choice(hypothesis.scope) - parameters,
+        score: evidence_nats - selection_penalty(hypothesis.scope) - parameters,
         gain: if then > 0.0 { 1.0 - (now / then).sqrt() } else { 0.0 },
-        explains: if above > 0.0 { 1.0 - left_above / above } else { 0.0 },
+        explained_fraction: if above > 0.0 { 1.0 - left_above / above } else { 0.0 },
     })
 }

@@ -3,30 +3,30 @@
 use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, RobotModel, Rollout};
 
-use super::evidence::Evidence;
-use super::leftover::{Leftover, TORQUE, TRUNK};
-use super::line::line;
+use super::evidence::ResidualData;
+use super::leftover::{ResidualPower, TORQUE, TRUNK};
+use super::line::spectral_line;
 use super::rows::fold_of;
 use crate::diagnosis::Unexplained;
-use crate::experiment::Quantity;
+use crate::experiment::ResidualChannel;
 use crate::motion::{JointCommands, command, joint_commands};
 
 /// Bins of a variable that might explain a residual.
 const BINS: usize = 12;
 /// Share of a residual's power that a variable has to explain on held-out seconds.
-const TELLING: f64 = 0.3;
+const MIN_R_SQUARED: f64 = 0.3;
 /// Power above the noise, in units of it, that is worth a word.
 pub const LEAST_EXCESS: f64 = 0.3;
 
 /// What `robot` leaves of what was `given`.
 pub fn unexplained(
-    evidence: &Evidence,
+    evidence: &ResidualData,
     robot: &RobotModel,
-    given: &Leftover,
-    left: &Leftover,
+    given: &ResidualPower,
+    left: &ResidualPower,
     simulator: &mut dyn Rollout,
 ) -> Unexplained {
-    let (before, after) = (given.excess(), left.excess());
+    let (before, after) = (given.power_above_noise(), left.power_above_noise());
     let fraction = if before > 0.0 { (after / before).min(1.0) } else { 0.0 };
     let count = |channel: usize| left.counts[channel].iter().sum::<f64>();
     let worst = (0..TRUNK)
@@ -36,16 +36,16 @@ pub fn unexplained(
             of(*one).total_cmp(&of(*other))
         })
         .filter(|channel| left.channel_excess(*channel) > LEAST_EXCESS * count(*channel));
-    let Some(channel) = worst else { return noise() };
+    let Some(channel) = worst else { return only_noise() };
     let log = &evidence.logs()[0];
     let residual = residual(evidence, robot, channel, simulator);
     let kind = if channel < TORQUE { "position" } else { "torque" };
     let whose = format!("The {kind} of {}", JOINT_NAMES[channel % 12]);
-    told(log, &residual, variables(log, robot), fraction, &whose)
+    describe_residual(log, &residual, variables(log, robot), fraction, &whose)
 }
 
 /// What a residual of a log depends on; `whose` it is begins the sentence.
-pub fn told(
+pub fn describe_residual(
     log: &Log,
     residual: &[f64],
     variables: Vec<(String, Vec<f64>)>,
@@ -54,9 +54,9 @@ pub fn told(
 ) -> Unexplained {
     let mut found: Vec<(f64, String)> = variables
         .into_iter()
-        .map(|(name, cells)| (explained(log, residual, &cells), name))
+        .map(|(name, cells)| (binned_r_squared(log, residual, &cells), name))
         .chain(line_of(log, residual).map(|(frequency, share)| (share, format!("a line at {frequency:.2} Hz"))))
-        .filter(|(share, _)| *share > TELLING)
+        .filter(|(share, _)| *share > MIN_R_SQUARED)
         .collect();
     found.sort_by(|one, other| other.0.total_cmp(&one.0));
     found.truncate(3);
@@ -68,7 +68,7 @@ pub fn told(
 }
 
 /// Nothing is left.
-pub fn noise() -> Unexplained {
+pub fn only_noise() -> Unexplained {
     Unexplained { fraction: 0.0, depends_on: Vec::new(), text: "What is left is noise.".to_owned() }
 }
 
@@ -88,11 +88,11 @@ fn line_of(log: &Log, residual: &[f64]) -> Option<(f64, f64)> {
     let t: Vec<f64> = rows.iter().map(|(row, _)| log.t()[*row]).collect();
     let values: Vec<f64> = rows.iter().map(|(row, _)| residual[*row]).collect();
     let folds: Vec<usize> = rows.iter().map(|(_, fold)| *fold).collect();
-    line(&t, &values, &folds)
+    spectral_line(&t, &values, &folds)
 }
 
 /// The residual of a joint's position or torque, by row of the first log; not a number where there is none.
-fn residual(evidence: &Evidence, robot: &RobotModel, channel: usize, simulator: &mut dyn Rollout) -> Vec<f64> {
+fn residual(evidence: &ResidualData, robot: &RobotModel, channel: usize, simulator: &mut dyn Rollout) -> Vec<f64> {
     let log = &evidence.logs()[0];
     let mut residual = vec![f64::NAN; log.rows()];
     if channel >= TORQUE {
@@ -103,9 +103,9 @@ fn residual(evidence: &Evidence, robot: &RobotModel, channel: usize, simulator: 
         };
         evidence.torques().differences(robot, each);
     } else {
-        let corrected = evidence.whole.corrected(simulator, robot);
-        for (corrected, (quantity, row)) in corrected.into_iter().zip(evidence.whole.experiments[0].cells()) {
-            if quantity == Quantity::Position(channel) {
+        let corrected = evidence.fit_rows.nuisance_corrected(simulator, robot);
+        for (corrected, (quantity, row)) in corrected.into_iter().zip(evidence.fit_rows.experiments[0].residual_index()) {
+            if quantity == ResidualChannel::Position(channel) {
                 residual[row] = corrected;
             }
         }
@@ -138,7 +138,7 @@ fn wanted_torques(log: &Log, robot: &RobotModel) -> Vec<(String, Vec<f64>)> {
 }
 
 /// Share of the residual's variance on held-out seconds that its mean in bins of `cells`, from the other seconds, explains.
-fn explained(log: &Log, residual: &[f64], cells: &[f64]) -> f64 {
+fn binned_r_squared(log: &Log, residual: &[f64], cells: &[f64]) -> f64 {
     let rows: Vec<usize> =
         (0..residual.len()).filter(|row| residual[*row].is_finite() && cells[*row].is_finite()).collect();
     if rows.len() < 10 * BINS {

@@ -5,41 +5,41 @@ use std::collections::BTreeMap;
 use nalgebra::DMatrix;
 use twinstep_model::ModelFile;
 
-use super::evidence::Evidence;
+use super::evidence::ResidualData;
 use super::hypothesis::Hypothesis;
-use super::trial::{Fit, Trial};
-use crate::diagnosis::{Confusable, Errors, Estimate, Rival, Value};
-use crate::experiment::Quantity;
+use super::trial::{FitProblem, CandidateFit};
+use crate::diagnosis::{CorrelatedPair, RmsErrors, Estimate, AlternativeCause, ParameterValue};
+use crate::experiment::ResidualChannel;
 use crate::unknown::set_intervals;
 
 /// Correlations of this size and above are named.
 const CORRELATED: f64 = 0.9;
 /// How far two simulators of one law are apart in its size, relative: a standard deviation. Measured on hunts of development,
 /// where errors of one or two percent in limits of speed, delays and gains were outside of narrower intervals.
-pub const SIZE_OF_SIMULATORS: f64 = 0.015;
+pub const SIMULATOR_MISMATCH_REL_STD: f64 = 0.015;
 /// The normal distribution's two-sided 95 %.
 pub const TWO_SIDED_95: f64 = 1.96;
 
 /// The model of a fit with intervals, and what cannot be told apart; `least` is the deviation that no number is better than,
 /// and `near` are the ends of what is about as good, by unknown.
 pub fn with_intervals(
-    fit: &Fit,
+    fit: &FitProblem,
     covariance: Option<&DMatrix<f64>>,
-    least: f64,
+    min_std: f64,
     near: &[[f64; 2]],
-) -> (ModelFile, Vec<Confusable>) {
-    let mut model = fit.model(&fit.begin);
-    let deviation = |index: usize| covariance.map_or(1.0, |covariance| covariance[(index, index)].sqrt().max(least));
+) -> (ModelFile, Vec<CorrelatedPair>) {
+    let mut model = fit.model(&fit.initial_point);
+    let deviation = |index: usize| covariance.map_or(1.0, |covariance| covariance[(index, index)].sqrt().max(min_std));
     let intervals: Vec<Option<[f64; 2]>> = fit
         .unknowns
         .iter()
         .enumerate()
         .map(|(index, unknown)| {
-            let size = (fit.begin[index] - unknown.coordinate(unknown.neutral)).abs();
-            let half = TWO_SIDED_95 * (deviation(index) * unknown.prior[1]).max(SIZE_OF_SIMULATORS * size);
+            let size = (fit.initial_point[index] - unknown.coordinate(unknown.neutral)).abs();
+            let half = TWO_SIDED_95 * (deviation(index) * unknown.prior[1]).max(SIMULATOR_MISMATCH_REL_STD * size);
             let [low, high] = near[index];
             let ends =
-                [low.min(fit.begin[index] - half), high.max(fit.begin[index] + half)].map(|end| unknown.value(end));
+                [low.min(fit.initial_point[index] - half), high.max(fit.initial_point[index] + half)].map(|end| unknown.value(end));
             Some([ends[0].min(ends[1]), ends[0].max(ends[1])])
         })
         .collect();
@@ -50,10 +50,10 @@ pub fn with_intervals(
             let correlation = covariance.map_or(0.0, |covariance| covariance[(i, j)] / (deviation(i) * deviation(j)));
             if correlation.abs() >= CORRELATED && one.effect != other.effect {
                 let told = |from: &'static twinstep_model::effects::Effect, to: &str| {
-                    from.confusions.iter().find(|confusion| confusion.with == to).map(|confusion| confusion.experiment)
+                    from.confounders.iter().find(|confusion| confusion.effect == to).map(|confusion| confusion.discriminating_experiment)
                 };
                 let experiment = told(one.effect, other.effect.name).or(told(other.effect, one.effect.name));
-                confusable.push(Confusable {
+                confusable.push(CorrelatedPair {
                     effects: [other.effect.name.to_owned(), one.effect.name.to_owned()],
                     correlation,
                     experiment: experiment.unwrap_or("Another motion, with other speeds and loads.").to_owned(),
@@ -83,7 +83,7 @@ pub fn estimates(hypothesis: &Hypothesis, extended: &ModelFile) -> BTreeMap<Stri
                 .collect()
         };
         let value =
-            |values: Vec<f64>| if parameter.count == 1 { Value::Number(values[0]) } else { Value::Vector(values) };
+            |values: Vec<f64>| if parameter.count == 1 { ParameterValue::Number(values[0]) } else { ParameterValue::Vector(values) };
         let estimate = Estimate {
             value: value(hypothesis.values[range.clone()].to_vec()),
             low: value(end(0)),
@@ -95,8 +95,8 @@ pub fn estimates(hypothesis: &Hypothesis, extended: &ModelFile) -> BTreeMap<Stri
 }
 
 /// A trial as a rival.
-pub fn rival(trial: &Trial) -> Rival {
-    Rival {
+pub fn rival(trial: &CandidateFit) -> AlternativeCause {
+    AlternativeCause {
         effect: trial.hypothesis.effect.name.to_owned(),
         scope: trial.hypothesis.scope.to_string(),
         held_out_gain: trial.gain,
@@ -104,7 +104,7 @@ pub fn rival(trial: &Trial) -> Rival {
 }
 
 /// Why, in a sentence.
-pub fn evidence(best: &Trial, others: &[Trial]) -> String {
+pub fn explanation(best: &CandidateFit, others: &[CandidateFit]) -> String {
     let hypothesis = &best.hypothesis;
     let size = hypothesis.effect.parameters.iter().zip(&hypothesis.values).next();
     let size = size.map_or(String::new(), |(parameter, value)| format!(" of {value:.4} {}", parameter.unit));
@@ -123,10 +123,10 @@ pub fn evidence(best: &Trial, others: &[Trial]) -> String {
 }
 
 /// What the sensors alone would leave.
-pub fn noise_floor(evidence: &Evidence) -> Errors {
-    let experiments = &evidence.whole.experiments;
+pub fn noise_floor(evidence: &ResidualData) -> RmsErrors {
+    let experiments = &evidence.fit_rows.experiments;
     let sigmas = experiments.iter().flat_map(|experiment| {
-        experiment.joints().iter().map(|joint| experiment.sigma(Quantity::Position(joint.index())))
+        experiment.joints().iter().map(|joint| experiment.sigma(ResidualChannel::Position(joint.index())))
     });
     let squares: Vec<f64> = sigmas.map(|sigma| sigma * sigma).collect();
     let has_torque =
@@ -139,7 +139,7 @@ pub fn noise_floor(evidence: &Evidence) -> Errors {
         })
         .collect();
     let mean = |squares: &[f64]| (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt();
-    Errors { torque_rmse_nm: has_torque.then(|| mean(&torques)), q_rmse_rad: Some(mean(&squares)) }
+    RmsErrors { torque_rmse_nm: has_torque.then(|| mean(&torques)), q_rmse_rad: Some(mean(&squares)) }
 }
 
 #[cfg(test)]
@@ -152,7 +152,7 @@ mod tests {
     fn interval_holds_what_is_as_good_and_what_another_simulator_would_say() {
         let effect = Effect::named("torque_gain").expect("an effect of the catalogue");
         let hypothesis = Hypothesis { effect, scope: Scope::All, values: vec![0.8] };
-        let fit = Fit::new(&ModelFile::default(), &[hypothesis]).expect("a fit");
+        let fit = FitProblem::new(&ModelFile::default(), &[hypothesis]).expect("a fit");
         let known = DMatrix::from_element(1, 1, 1e-12);
         let interval = |near: [f64; 2]| {
             let (model, _) = with_intervals(&fit, Some(&known), 0.0, &[near]);

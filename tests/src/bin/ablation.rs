@@ -8,10 +8,10 @@ use indicatif::ProgressBar;
 use rayon::prelude::*;
 use twinstep_logs::Log;
 use twinstep_model::effects::{Effect, Scope};
-use twinstep_model::{JOINT_NAMES, Job, ModelFile, Precision, RobotStates, Rollout, go2};
+use twinstep_model::{JOINT_NAMES, RolloutRequest, ModelFile, Precision, RobotStates, Rollout, go2};
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_sysid::{Experiment, Horizon, Options, candidate, evaluate, identify, start, unknowns, with_values};
-use twinstep_tests::hidden_robot::{effect, hidden_robot, log_of, motion, sought};
+use twinstep_sysid::{Experiment, WindowConfig, IdentifyOptions, candidate, evaluate, identify, initial_coordinate, free_parameters, with_values};
+use twinstep_tests::hidden_robot::{effect, ground_truth_robot, log_of, motion, estimated_effects};
 
 /// Identify hidden robots with different models and searches, and judge them on other motion.
 #[derive(Parser)]
@@ -55,7 +55,7 @@ fn main() {
     let cases: Vec<Vec<Outcome>> = (args.first..args.first + args.cases)
         .into_par_iter()
         .map(|case| {
-            let hidden = hidden_robot(case);
+            let hidden = ground_truth_robot(case);
             outcomes(&log_of(&hidden, &seen, case), &log_of(&hidden, &unseen, case + 1), &bar)
         })
         .collect();
@@ -102,15 +102,15 @@ struct Counting {
 }
 
 impl Rollout for Counting {
-    fn play(&mut self, jobs: &[Job], precision: Precision) -> Vec<RobotStates> {
+    fn run(&mut self, jobs: &[RolloutRequest], precision: Precision) -> Vec<RobotStates> {
         self.played += jobs.iter().map(|job| job.commands.len()).sum::<usize>();
-        self.simulator.play(jobs, precision)
+        self.simulator.run(jobs, precision)
     }
 }
 
 /// What becomes of fits to `seen` on `unseen`, in the order of [`NAMES`].
 fn outcomes(seen: &Log, unseen: &Log, bar: &ProgressBar) -> Vec<Outcome> {
-    let experiment = Experiment::new(seen, &go2(), Horizon::IDENTIFICATION).expect("an experiment");
+    let experiment = Experiment::new(seen, &go2(), WindowConfig::IDENTIFICATION).expect("an experiment");
     let simulator = BatchRollout::new(&go2(), &SimConfig { threads: 1, ..SimConfig::default() }).expect("a simulator");
     let mut simulator = Counting { simulator, played: 0 };
     experiment.residuals(&mut simulator, &[go2()], Precision::Single);
@@ -138,15 +138,15 @@ fn outcomes(seen: &Log, unseen: &Log, bar: &ProgressBar) -> Vec<Outcome> {
         let effects: Vec<_> = std::iter::once(effect("inertia", "base")).chain(motor).collect();
         judge(&|simulator| fitted(&effects, &experiment, simulator));
     }
-    let budget = judge(&|simulator| fitted(&sought(), &experiment, simulator));
+    let budget = judge(&|simulator| fitted(&estimated_effects(), &experiment, simulator));
     for times in [1, 4] {
-        judge(&|simulator| descended(&sought(), &experiment, simulator, times * budget));
+        judge(&|simulator| descended(&estimated_effects(), &experiment, simulator, times * budget));
     }
     outcomes
 }
 
 fn fitted(effects: &[(&'static Effect, Scope)], experiment: &Experiment, simulator: &mut dyn Rollout) -> ModelFile {
-    let options = Options { force: true, ..Options::default() };
+    let options = IdentifyOptions { force: true, ..IdentifyOptions::default() };
     let experiments = std::slice::from_ref(experiment);
     let found = identify(&ModelFile::default(), effects, experiments, simulator, &options, &mut |_, _, _| true);
     found.expect("the ideal robot can be simulated").model
@@ -159,8 +159,8 @@ fn descended(
     simulator: &mut Counting,
     budget: usize,
 ) -> ModelFile {
-    let (file, unknowns) = unknowns(&ModelFile::default(), effects).expect("known effects");
-    let mut point: Vec<f64> = unknowns.iter().map(|unknown| start(&file, unknown)).collect();
+    let (file, unknowns) = free_parameters(&ModelFile::default(), effects).expect("known effects");
+    let mut point: Vec<f64> = unknowns.iter().map(|unknown| initial_coordinate(&file, unknown)).collect();
     let (mut mean, mut square) = (vec![0.0; point.len()], vec![0.0; point.len()]);
     let mut best = (f64::INFINITY, point.clone());
     let mut step = 0;

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use clap::Parser;
 use indicatif::ProgressBar;
 use twinstep_ensemble::{
-    Block, Calibration, DataSet, Ensemble, Gaussian, Options, Outcome, Progress, Run, Training, disagreement,
+    Split, Calibration, DataSet, Ensemble, Gaussian, TrainingOptions, TrainingResult, TrainingEvent, Sequence, Training, epistemic_uncertainty,
     jensen_renyi,
 };
 use twinstep_logs::Log;
@@ -96,19 +96,19 @@ fn data(log: Log) -> DataSet {
 }
 
 fn trained(data: &DataSet, args: &Args, bar: &ProgressBar) -> Ensemble {
-    let options = Options { epochs: args.epochs, seed: args.seed, ..Options::default() };
+    let options = TrainingOptions { epochs: args.epochs, seed: args.seed, ..TrainingOptions::default() };
     let training = Training::new(data, options).expect("settings in range");
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let ended = training.run(threads, None, &mut |progress| {
-        if let Progress::Epoch { member, curve, .. } = progress {
+        if let TrainingEvent::Epoch { member, curve, .. } = progress {
             bar.set_message(format!("member {}, epoch {}", member + 1, curve.len()));
             bar.tick();
         }
         true
     });
     match ended.expect("trained") {
-        Outcome::Trained(ensemble, _) => *ensemble,
-        Outcome::Ended(_) => unreachable!("nobody ended it"),
+        TrainingResult::Trained(ensemble, _) => *ensemble,
+        TrainingResult::Interrupted(_) => unreachable!("nobody ended it"),
     }
 }
 
@@ -117,10 +117,10 @@ fn fit(drive: &HiddenDrive, args: &Args, bar: &ProgressBar) -> String {
     let data = data(drive.logs(rich(args, args.seed)).measured);
     let ensemble = trained(&data, args, bar);
     let filter = Filter::fitted(&data);
-    let predicted = ensemble.predict(data.runs(Block::Test));
+    let predicted = ensemble.predict(data.runs(Split::Test));
     let mut squares = [0.0; 4];
     let mut rows = 0.0;
-    for (run, predicted) in data.runs(Block::Test).zip(&predicted) {
+    for (run, predicted) in data.runs(Split::Test).zip(&predicted) {
         let skipped = run.torques.len() - predicted.len();
         let [kp, kd] = data.gains[run.joint];
         for row in HISTORY..run.torques.len() {
@@ -135,7 +135,7 @@ fn fit(drive: &HiddenDrive, args: &Args, bar: &ProgressBar) -> String {
     }
     let errors = squares.map(|sum: f64| format!("{:.2}", (sum / rows).sqrt() / NOISE_NM)).join(" | ");
     let calibration = Calibration::of(&ensemble, &data);
-    format!("| {} | {errors} | {:.1} % |", drive.name, 100.0 * calibration.mixture[1].shares[1])
+    format!("| {} | {errors} | {:.1} % |", drive.name, 100.0 * calibration.mixture[1].empirical[1])
 }
 
 fn mean(members: &[Gaussian]) -> f64 {
@@ -150,7 +150,7 @@ struct Filter {
 impl Filter {
     const INPUTS: usize = 2 * HISTORY + 1;
 
-    fn inputs(run: &Run, row: usize) -> Vec<f64> {
+    fn inputs(run: &Sequence, row: usize) -> Vec<f64> {
         let past = run.errors[row + 1 - HISTORY..=row].iter().flatten().copied();
         past.chain([1.0]).collect()
     }
@@ -158,7 +158,7 @@ impl Filter {
     fn fitted(data: &DataSet) -> Self {
         let mut matrix = vec![vec![0.0; Self::INPUTS]; Self::INPUTS];
         let mut right = vec![0.0; Self::INPUTS];
-        for run in data.runs(Block::Training) {
+        for run in data.runs(Split::Training) {
             for row in HISTORY..run.torques.len() {
                 let inputs = Self::inputs(run, row);
                 for (one, line) in inputs.iter().zip(&mut matrix) {
@@ -173,7 +173,7 @@ impl Filter {
         Self { weights: solved(matrix, right) }
     }
 
-    fn torque(&self, run: &Run, row: usize) -> f64 {
+    fn torque(&self, run: &Sequence, row: usize) -> f64 {
         Self::inputs(run, row).iter().zip(&self.weights).map(|(input, weight)| input * weight).sum()
     }
 }
@@ -208,19 +208,19 @@ fn uncertainty(drive: &HiddenDrive, args: &Args, bar: &ProgressBar) {
     let seen = data(drive.logs(gentle(args, args.seed)).measured);
     let ensemble = trained(&seen, args, bar);
     let motions = [(gentle(args, args.seed + 100), false), (violent(args, args.seed + 200), true)];
-    let runs: Vec<(Run, Vec<Vec<Gaussian>>, bool)> = motions
+    let runs: Vec<(Sequence, Vec<Vec<Gaussian>>, bool)> = motions
         .into_iter()
         .flat_map(|(motion, unseen)| {
             let logs = drive.logs(motion);
             let (measured, exact) = (data(logs.measured), data(logs.exact));
-            let all = [Block::Training, Block::Validation, Block::Test];
+            let all = [Split::Training, Split::Validation, Split::Test];
             let of = |set: &DataSet| all.iter().flat_map(|block| set.runs(*block)).cloned().collect::<Vec<_>>();
             let (noisy, exact) = (of(&measured), of(&exact));
             let predicted = ensemble.predict(noisy.iter());
             exact.into_iter().zip(predicted).map(move |(run, predicted)| (run, predicted, unseen))
         })
         .collect();
-    for (name, euf) in [("as in U2E", jensen_renyi as fn(&[f64], &[f64]) -> f64), ("corrected", disagreement)] {
+    for (name, euf) in [("as in U2E", jensen_renyi as fn(&[f64], &[f64]) -> f64), ("corrected", epistemic_uncertainty)] {
         let rows: Vec<Judged> =
             runs.iter().flat_map(|(run, predicted, unseen)| judged(run, predicted, *unseen, euf)).collect();
         let steps = control_steps(&runs, euf);
@@ -237,7 +237,7 @@ fn uncertainty(drive: &HiddenDrive, args: &Args, bar: &ProgressBar) {
     }
 }
 
-fn judged(run: &Run, predicted: &[Vec<Gaussian>], unseen: bool, euf: fn(&[f64], &[f64]) -> f64) -> Vec<Judged> {
+fn judged(run: &Sequence, predicted: &[Vec<Gaussian>], unseen: bool, euf: fn(&[f64], &[f64]) -> f64) -> Vec<Judged> {
     let truth = &run.torques[run.torques.len() - predicted.len()..];
     let row = |(members, truth): (&Vec<Gaussian>, &f64)| {
         let (means, variances): (Vec<f64>, Vec<f64>) =
@@ -249,7 +249,7 @@ fn judged(run: &Run, predicted: &[Vec<Gaussian>], unseen: bool, euf: fn(&[f64], 
 
 /// Means over the rows of a control step and the twelve joints, as a reward has them (U2E §III-C). Runs of the joints follow
 /// one another block by block.
-fn control_steps(runs: &[(Run, Vec<Vec<Gaussian>>, bool)], euf: fn(&[f64], &[f64]) -> f64) -> Vec<Judged> {
+fn control_steps(runs: &[(Sequence, Vec<Vec<Gaussian>>, bool)], euf: fn(&[f64], &[f64]) -> f64) -> Vec<Judged> {
     let mut steps = Vec::new();
     for joints in runs.chunks(12) {
         let all: Vec<Vec<Judged>> =

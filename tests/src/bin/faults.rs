@@ -8,8 +8,8 @@ use std::time::Instant;
 
 use clap::Parser;
 use indicatif::{ProgressBar, ProgressStyle};
-use twinstep_tests::campaign::{self, Plan};
-use twinstep_tests::lane::Commands;
+use twinstep_tests::campaign::{self, FaultPlan};
+use twinstep_tests::lane::TestBedConfig;
 use twinstep_tests::roles::Role;
 
 /// Kill, freeze and confuse servers, clients and routers, and count what goes wrong.
@@ -54,8 +54,8 @@ fn main() -> ExitCode {
 
 fn inject(arguments: &Arguments) -> Result<bool, Box<dyn std::error::Error>> {
     let program = std::env::current_exe()?;
-    let plan = Plan {
-        commands: Commands { program, server: Vec::new(), client: arguments.client.clone() },
+    let plan = FaultPlan {
+        commands: TestBedConfig { program, server: Vec::new(), client: arguments.client.clone() },
         faults: arguments.faults,
         lanes: usize::from(arguments.lanes),
         seed: arguments.seed,

@@ -5,10 +5,10 @@
 
 use clap::Parser;
 use rayon::prelude::*;
-use twinstep_logs::{Base, Log};
+use twinstep_logs::{BaseMount, Log};
 use twinstep_model::go2;
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_sysid::{SAFE_MOTIONS, SafeMotion};
+use twinstep_sysid::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
 use twinstep_tests::hidden_robot::log_of;
 use twinstep_tests::rivals::{PAIRS, Pair};
 
@@ -29,7 +29,7 @@ fn main() {
         "A robot in rapier at 4 kHz has the first effect and plays each of {} safe motions (10 s, noisy sensors); the \
          models are simulated by the batch engine. Predicted: the evidence expected for the true one of the two, the \
          other's size refitted. Achieved: the evidence of the log for the first, both fitted to it.\n",
-        SAFE_MOTIONS.len()
+        EXCITATION_TRAJECTORIES.len()
     );
     println!(
         "| first | second | chosen | predicted [nats] | achieved [nats] | median motion achieved | best motion | best achieved | rank |"
@@ -58,8 +58,8 @@ struct Row {
 
 fn row(pair: &Pair, seed: u64) -> Row {
     let rivalry = pair.rivalry();
-    let motions: Vec<&SafeMotion> =
-        SAFE_MOTIONS.iter().filter(|motion| pair.on_ground || motion.base == Base::Fixed).collect();
+    let motions: Vec<&ExcitationTrajectory> =
+        EXCITATION_TRAJECTORIES.iter().filter(|motion| pair.on_ground || motion.base == BaseMount::Fixed).collect();
     let robot = pair.robot();
     let logs: Vec<Log> = motions.par_iter().map(|motion| log_of(&robot, &motion.motion(&go2()), seed)).collect();
     // What is measured, and how well: the same in every log.
@@ -70,8 +70,8 @@ fn row(pair: &Pair, seed: u64) -> Row {
         .map(|(motion, log)| {
             let config = SimConfig { threads: 1, ..SimConfig::default() };
             let mut simulator = BatchRollout::new(&go2(), &config).expect("a simulator");
-            let predicted = rivalry.predicted(motion, like, &mut simulator).unwrap_or(0.0);
-            [predicted, rivalry.achieved(log.clone(), &mut simulator).expect("an experiment")]
+            let predicted = rivalry.expected_log_likelihood_ratio(motion, like, &mut simulator).unwrap_or(0.0);
+            [predicted, rivalry.log_likelihood_ratio(log.clone(), &mut simulator).expect("an experiment")]
         })
         .collect();
     let most =

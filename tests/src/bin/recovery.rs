@@ -8,8 +8,8 @@ use indicatif::ProgressBar;
 use rayon::prelude::*;
 use twinstep_model::{ModelFile, go2};
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_sysid::{Experiment, Finding, Horizon, Options, identify};
-use twinstep_tests::hidden_robot::{hidden_robot, log_of, motion, sought};
+use twinstep_sysid::{Experiment, ParameterEstimate, WindowConfig, IdentifyOptions, identify};
+use twinstep_tests::hidden_robot::{ground_truth_robot, log_of, motion, estimated_effects};
 
 /// Find hidden bodies and motors again, and print the table.
 #[derive(Parser)]
@@ -93,17 +93,17 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
 }
 
 fn recovered(case: u64, motion: &twinstep_logs::Log) -> Vec<Answer> {
-    let hidden = hidden_robot(case);
+    let hidden = ground_truth_robot(case);
     let log = log_of(&hidden, motion, case);
-    let experiment = Experiment::new(&log, &go2(), Horizon::IDENTIFICATION).expect("an experiment");
+    let experiment = Experiment::new(&log, &go2(), WindowConfig::IDENTIFICATION).expect("an experiment");
     let mut simulator =
         BatchRollout::new(&go2(), &SimConfig { threads: 1, ..SimConfig::default() }).expect("a simulator");
     let found = identify(
         &ModelFile::default(),
-        &sought(),
+        &estimated_effects(),
         &[experiment],
         &mut simulator,
-        &Options::default(),
+        &IdentifyOptions::default(),
         &mut |_, _, _| true,
     )
     .expect("the ideal robot can be simulated");
@@ -111,11 +111,11 @@ fn recovered(case: u64, motion: &twinstep_logs::Log) -> Vec<Answer> {
     found.findings.iter().zip(truths).filter_map(|(finding, truth)| answer(finding, truth)).collect()
 }
 
-fn answer(finding: &Finding, truth: f64) -> Option<Answer> {
-    let of = |row: &&(_, &str, &str, _, _)| row.1 == finding.unknown.effect.name && row.2 == finding.unknown.parameter;
+fn answer(finding: &ParameterEstimate, truth: f64) -> Option<Answer> {
+    let of = |row: &&(_, &str, &str, _, _)| row.1 == finding.parameter.effect.name && row.2 == finding.parameter.parameter_name;
     let (quantity, _, _, unit, goal) = *ROWS.iter().find(of)?;
-    let half = 0.5 * (finding.predicted[1] - finding.predicted[0]);
-    let middle = 0.5 * (finding.predicted[0] + finding.predicted[1]);
+    let half = 0.5 * (finding.predicted_interval[1] - finding.predicted_interval[0]);
+    let middle = 0.5 * (finding.predicted_interval[0] + finding.predicted_interval[1]);
     // Per unit of the unknown, at `value`.
     let scale = |value: f64| match (quantity, unit) {
         // mass = exp(2 α)

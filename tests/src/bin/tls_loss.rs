@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 
 use clap::{Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
-use twinstep_client::{ConnectOptions, Link};
+use twinstep_client::{ConnectOptions, Connection};
 use twinstep_envs::OBS_LEN;
 use twinstep_model::{AutoresetMode, StepBatch};
-use twinstep_protocol::keys::{self, Verb};
+use twinstep_protocol::keys::{self, EnvMethod};
 use twinstep_protocol::{PROTOCOL, convert, decode, encode, message, tensor};
 use twinstep_tests::process::Process;
 use twinstep_tests::security::{Failure, SecurityFolder};
@@ -176,7 +176,7 @@ fn ask_echo(
 fn ask_twinstep(round_trips: usize, folder: &SecurityFolder, endpoint: &str, envs: usize) -> Result<Tally, Failure> {
     let options =
         ConnectOptions { zenoh: Some(folder.path("client-tls.json5")), ..ConnectOptions::new(endpoint, envs) };
-    let link = Link::open(&options)?;
+    let link = Connection::open(&options)?;
     let lease = message::LeaseRequest {
         protocol: PROTOCOL,
         client: link.client().to_owned(),
@@ -186,15 +186,15 @@ fn ask_twinstep(round_trips: usize, folder: &SecurityFolder, endpoint: &str, env
         spec_hash: None,
         reclaim: None,
     };
-    let granted = link.ask(&link.querier(keys::lease(link.sid()))?, encode(&lease))?;
+    let granted = link.request(&link.querier(keys::lease(link.sid()))?, encode(&lease))?;
     let granted: message::LeaseReply = decode(&granted.to_bytes())?;
     let querier = |verb| link.querier(keys::env(link.sid(), &granted.lease, verb));
     let epoch = granted.epoch;
     let reset = message::ResetRequest { protocol: PROTOCOL, epoch, seq: 1, seeds: None, mask: None };
-    link.ask(&querier(Verb::Reset)?, encode(&reset))?;
+    link.request(&querier(EnvMethod::Reset)?, encode(&reset))?;
     let actions = vec![0.1f32; envs * ACTION_LEN];
     let actions = tensor::as_bytes(&actions);
-    ask(&querier(Verb::Step)?, round_trips, Way::Twinstep, envs, |answered| {
+    ask(&querier(EnvMethod::Step)?, round_trips, Way::Twinstep, envs, |answered| {
         encode(&message::StepRequest { protocol: PROTOCOL, epoch, seq: 2 + answered as u64, actions })
     })
 }

@@ -1,14 +1,14 @@
 //! Robots that walk on the batch engine, driven by an ensemble, on one core.
 
-use twinstep_ensemble::LearnedRobot;
-use twinstep_envs::{Randomisation, TaskConfig, TaskEnv, TaskSettings};
-use twinstep_model::{AutoresetMode, LearnedDrive, MemberDraw, ModelFile, ResetRequest, VecEnv, go2};
+use twinstep_ensemble::ActuatorNetworkRobot;
+use twinstep_envs::{Randomisation, TaskConfig, TaskEnv, TaskEnvConfig};
+use twinstep_model::{AutoresetMode, ActuatorNetworkConfig, MemberSampling, ModelFile, ResetRequest, VecEnv, go2};
 use twinstep_sim::{BatchBackend, SimConfig};
 
 use super::{MEMBERS, ensemble};
-use crate::bench::Row;
+use crate::bench::Measurement;
 use crate::bench::pace::{WINDOWS, measure as pace, median_of};
-use crate::exit::{Failure, Outcome, Signals, other};
+use crate::exit::{Failure, CommandResult, Signals, other};
 use crate::trot;
 
 /// Robots that are stepped together: what six networks remember of 64 fits into a core's own cache.
@@ -16,27 +16,27 @@ const ROBOTS: [usize; 2] = [64, 1024];
 
 /// Who drives the robots.
 #[derive(Clone, Copy)]
-enum Drives {
+enum ActuatorKind {
     /// Their own.
-    Own,
+    Analytic,
     /// One member a robot, drawn when it is placed.
-    Episode,
+    NetworkPerEpisode,
     /// One member a robot and drive period: all hear of every robot, and their disagreement is evaluated once a step.
-    StepAndUncertainty,
+    NetworkPerStep,
 }
 
 /// Env-steps a second of each kind of drive.
-pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+pub fn measure(window_s: f64, signals: &Signals) -> Result<Vec<Measurement>, Failure> {
     let rows: Result<Vec<_>, _> = ROBOTS.into_iter().map(|robots| side_by_side(robots, window_s, signals)).collect();
     Ok(rows?.concat())
 }
 
 /// Windows of all drives in turn.
-fn side_by_side(robots: usize, window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+fn side_by_side(robots: usize, window_s: f64, signals: &Signals) -> Result<Vec<Measurement>, Failure> {
     let cases = [
-        (Drives::Own, "own drives"),
-        (Drives::Episode, "one member an episode"),
-        (Drives::StepAndUncertainty, "six members and EUF"),
+        (ActuatorKind::Analytic, "own drives"),
+        (ActuatorKind::NetworkPerEpisode, "one member an episode"),
+        (ActuatorKind::NetworkPerStep, "six members and EUF"),
     ];
     let mut walks = cases.iter().map(|(drives, _)| walking(*drives, robots)).collect::<Result<Vec<_>, _>>()?;
     let mut rates = vec![Vec::new(); cases.len()];
@@ -47,7 +47,7 @@ fn side_by_side(robots: usize, window_s: f64, signals: &Signals) -> Result<Vec<R
         }
     }
     let rates: Vec<f64> = rates.into_iter().map(median_of).collect();
-    let row = |((_, name), rate): (&(Drives, &str), &f64)| Row {
+    let row = |((_, name), rate): (&(ActuatorKind, &str), &f64)| Measurement {
         case: format!("walk, {robots} robots, one core, {name}"),
         value: *rate,
         unit: "env-steps/s",
@@ -58,24 +58,24 @@ fn side_by_side(robots: usize, window_s: f64, signals: &Signals) -> Result<Vec<R
 }
 
 /// A policy period of robots that are told to trot, again and again.
-fn walking(drives: Drives, robots: usize) -> Result<impl FnMut() -> Outcome, Failure> {
+fn walking(drives: ActuatorKind, robots: usize) -> Result<impl FnMut() -> CommandResult, Failure> {
     let sim = SimConfig { threads: 1, physics_hz: Some(1000), ..SimConfig::default() };
     let backend = BatchBackend::new(go2(), sim, robots).map_err(other)?;
     let draw = match drives {
-        Drives::Own | Drives::Episode => MemberDraw::Episode,
-        Drives::StepAndUncertainty => MemberDraw::Step,
+        ActuatorKind::Analytic | ActuatorKind::NetworkPerEpisode => MemberSampling::PerEpisode,
+        ActuatorKind::NetworkPerStep => MemberSampling::PerStep,
     };
-    let settings = LearnedDrive { ensemble: "measured".into(), draw, sample: false };
-    let learned = LearnedRobot::new(&ModelFile::default(), ensemble(MEMBERS), settings).map_err(other)?;
+    let settings = ActuatorNetworkConfig { ensemble: "measured".into(), draw, sample: false };
+    let learned = ActuatorNetworkRobot::new(&ModelFile::default(), ensemble(MEMBERS), settings).map_err(other)?;
     let backend = match drives {
-        Drives::Own => backend,
-        Drives::Episode => backend.with_drive(Box::new(learned.drives(robots, false))),
-        Drives::StepAndUncertainty => backend.with_drive(Box::new(learned.drives(robots, true))),
+        ActuatorKind::Analytic => backend,
+        ActuatorKind::NetworkPerEpisode => backend.with_actuator(Box::new(learned.actuators(robots, false))),
+        ActuatorKind::NetworkPerStep => backend.with_actuator(Box::new(learned.actuators(robots, true))),
     };
-    let settings = TaskSettings {
+    let settings = TaskEnvConfig {
         task: TaskConfig::default(),
         randomise: Randomisation::default(),
-        robots: None,
+        robot_sampler: None,
         autoreset: AutoresetMode::NextStep,
         max_episode_steps: None,
         seed: 1,

@@ -7,7 +7,7 @@ use twinstep_model::NUM_JOINTS;
 
 use super::torch::{Learning, Setup, Torch, name};
 use super::{HIDDEN, MEMBERS, ensemble};
-use crate::bench::Row;
+use crate::bench::Measurement;
 use crate::bench::pace::{WINDOWS, measure as pace, median_of};
 use crate::exit::{Failure, Signals};
 
@@ -15,7 +15,7 @@ use crate::exit::{Failure, Signals};
 const ROBOTS: [usize; 4] = [1, 64, 1024, 4096];
 
 /// Microseconds a query: one member, and six with their disagreement; ours, PyTorch's and burn's in turn.
-pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Measurement>, Failure> {
     let (members, robots, learning) = (&[1, MEMBERS], &ROBOTS, Learning::default());
     let mut torch = Torch::start(python, &Setup { hidden: HIDDEN, members, robots, learning, window_s });
     let mut rows = Vec::new();
@@ -28,7 +28,7 @@ pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Ro
     Ok(rows)
 }
 
-fn query(members: usize, robots: usize, torch: &mut Torch, window_s: f64) -> Result<Vec<Row>, Failure> {
+fn query(members: usize, robots: usize, torch: &mut Torch, window_s: f64) -> Result<Vec<Measurement>, Failure> {
     let ensemble = ensemble(members);
     let (mut ours, mut burns) = (Inference::new(&ensemble, robots), BurnInference::new(&ensemble, robots));
     let mut time = 0;
@@ -40,9 +40,9 @@ fn query(members: usize, robots: usize, torch: &mut Torch, window_s: f64) -> Res
     let [mut own, mut torches, mut by_burn] = [(); 3].map(|()| Vec::new());
     for _ in 0..WINDOWS {
         own.push(median_us(window_s, || {
-            ours.hear(&errors());
+            ours.step(&errors());
             if members > 1 {
-                std::hint::black_box(ours.disagreement());
+                std::hint::black_box(ours.epistemic_uncertainty());
             }
         })?);
         by_burn.push(median_us(window_s, || drop(std::hint::black_box(burns.hear(&errors()))))?);
@@ -53,7 +53,7 @@ fn query(members: usize, robots: usize, torch: &mut Torch, window_s: f64) -> Res
     let (own, by_burn) = (median_of(own), median_of(by_burn));
     let what = if members == 1 { "one member".to_owned() } else { format!("{members} members and EUF") };
     let case = format!("query of {what}, {robots} robots");
-    let row = |case: String, value: f64, reference: Option<(&str, f64)>| Row {
+    let row = |case: String, value: f64, reference: Option<(&str, f64)>| Measurement {
         case,
         value,
         unit: "us",

@@ -7,11 +7,11 @@ mod training;
 
 use std::path::Path;
 
-use twinstep_ensemble::{Description, Ensemble, JointInput, Scale, Scales};
-use twinstep_logs::TauSensor;
+use twinstep_ensemble::{EnsembleMetadata, Ensemble, JointEncoding, Normaliser, Normalisers};
+use twinstep_logs::TorqueSensor;
 use twinstep_model::{JOINT_NAMES, go2};
 
-use super::Row;
+use super::Measurement;
 use crate::exit::{Failure, Signals};
 
 /// U2E's sizes.
@@ -19,7 +19,7 @@ const MEMBERS: usize = 6;
 const HIDDEN: usize = 32;
 
 /// Every number of the ensemble.
-pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Measurement>, Failure> {
     let mut rows = inference::measure(python, window_s, signals)?;
     rows.extend(training::measure(python, window_s, signals)?);
     rows.extend(in_loop::measure(window_s, signals)?);
@@ -28,15 +28,15 @@ pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Ro
 
 /// An ensemble that drives a Go2 by its gains: as fast as any other of its size, and robots stay on their feet.
 fn ensemble(members: usize) -> Ensemble {
-    let (control, scale) = (go2().control, |deviation| Scale { mean: 0.0, deviation });
-    Ensemble::of_gains(Description {
+    let (control, scale) = (go2().control, |deviation| Normaliser { mean: 0.0, std: deviation });
+    Ensemble::linear_pd(EnsembleMetadata {
         members,
         hidden: HIDDEN,
-        dt: control.drive_dt(),
+        dt: control.actuator_dt(),
         joints: JOINT_NAMES.map(str::to_owned).to_vec(),
-        joint_input: JointInput::Pooled,
-        scales: Scales { errors: [scale(0.2), scale(4.0)], torque: scale(8.0) },
-        tau_sensor: TauSensor::Current,
+        joint_input: JointEncoding::Pooled,
+        scales: Normalisers { errors: [scale(0.2), scale(4.0)], torque: scale(8.0) },
+        tau_sensor: TorqueSensor::MotorCurrent,
         gains: vec![[control.kp, control.kd]; JOINT_NAMES.len()],
         variance_scale: 1.0,
         data_hash: String::new(),

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use crate::bench::peers::{Peers, Program};
+use crate::bench::peers::{Baselines, Program};
 use crate::exit::Failure;
 
 /// What the child runs; it needs nothing but PyTorch.
@@ -37,7 +37,7 @@ pub struct Learning<'a> {
 }
 
 /// PyTorch, if the interpreter has it.
-pub struct Torch(Peers);
+pub struct Torch(Baselines);
 
 /// What the child calls a query.
 pub fn name(members: usize, robots: usize) -> String {
@@ -54,7 +54,7 @@ impl Torch {
     pub fn start(python: &Path, setup: &Setup) -> Self {
         let program =
             Program { arguments: &["-c", SCRIPT], name: "the networks in PyTorch", install: "pip install torch" };
-        Self(Peers::start_program(python, program, setup))
+        Self(Baselines::start_program(python, program, setup))
     }
 
     /// True if it has a query or a training of that name.

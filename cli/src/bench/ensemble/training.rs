@@ -4,13 +4,13 @@ use std::f64::consts::TAU;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use twinstep_ensemble::{DataSet, Options, Progress, Training};
-use twinstep_logs::{Base, Gain, Log, Meta, Segment, TauSensor};
+use twinstep_ensemble::{DataSet, TrainingOptions, TrainingEvent, Training};
+use twinstep_logs::{BaseMount, Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::JOINT_NAMES;
 
 use super::torch::{Learning, Setup, Torch, training};
 use super::{HIDDEN, MEMBERS};
-use crate::bench::Row;
+use crate::bench::Measurement;
 use crate::bench::pace::{WINDOWS, median_of};
 use crate::exit::{Failure, Signals, other};
 
@@ -20,9 +20,9 @@ const ROWS: usize = 120_000;
 const LEARNING: (usize, usize) = (256, 64);
 
 /// Member-sequences a second on one thread and on all, ours and PyTorch's in turn.
-pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Row>, Failure> {
+pub fn measure(python: &Path, window_s: f64, signals: &Signals) -> Result<Vec<Measurement>, Failure> {
     let data = DataSet::new(&[("joints that swing".to_owned(), log()?)]).map_err(other)?;
-    let options = Options { members: MEMBERS, hidden: HIDDEN, ..Options::default() };
+    let options = TrainingOptions { members: MEMBERS, hidden: HIDDEN, ..TrainingOptions::default() };
     let ours = Training::new(&data, options).map_err(other)?;
     let mut threads = vec![1, std::thread::available_parallelism().map_or(1, usize::from)];
     threads.dedup();
@@ -47,7 +47,7 @@ fn window(training: &Training, threads: usize, window_s: f64) -> Result<f64, Fai
     let window = Duration::from_secs_f64(window_s);
     let (mut since, mut sequences, mut rate) = (None::<Instant>, 0, 0.0);
     let ended = training.run(threads, None, &mut |progress| {
-        let Progress::Sequences(count) = progress else { return true };
+        let TrainingEvent::Sequences(count) = progress else { return true };
         let Some(since) = since else {
             // Until now the networks were made.
             since = Some(Instant::now());
@@ -62,10 +62,10 @@ fn window(training: &Training, threads: usize, window_s: f64) -> Result<f64, Fai
     Ok(rate)
 }
 
-fn rows_of(threads: usize, [own, torches]: [Vec<f64>; 2]) -> Vec<Row> {
+fn rows_of(threads: usize, [own, torches]: [Vec<f64>; 2]) -> Vec<Measurement> {
     let case = format!("training, {MEMBERS} members, threads: {threads}");
     let own = median_of(own);
-    let row = |case: String, value: f64, theirs: Option<f64>| Row {
+    let row = |case: String, value: f64, theirs: Option<f64>| Measurement {
         case,
         value,
         unit: "member-sequences/s",
@@ -91,8 +91,8 @@ fn log() -> Result<Log, Failure> {
         columns.push((format!("q_cmd_{name}"), vec![0.0; ROWS]));
         columns.push((format!("tau_measured_{name}"), (0..ROWS).map(torque).collect()));
     }
-    let segments = vec![Segment { name: "air".to_owned(), base: Base::Fixed }];
-    let mut meta = Meta::new(200.0, TauSensor::Current, segments);
-    (meta.kp, meta.kd) = (Some(Gain::Same(20.0)), Some(Gain::Same(0.5)));
+    let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
+    let mut meta = Meta::new(200.0, TorqueSensor::MotorCurrent, segments);
+    (meta.kp, meta.kd) = (Some(Gain::Uniform(20.0)), Some(Gain::Uniform(0.5)));
     Log::new(meta, columns).map_err(other)
 }

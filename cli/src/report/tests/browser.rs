@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use twinstep_logs::Base;
+use twinstep_logs::BaseMount;
 use twinstep_model::ModelFile;
 
 use super::samples::{chirp, evidence, findings, recording, simulated, three_joints};
@@ -91,7 +91,7 @@ fn pages_to_look_at() {
     write("torque.html", page(&said, &evidence(&log, &own)));
     write(
         "nothing.html",
-        page(&nothing(), &evidence(&chirp(&ModelFile::default(), Base::Fixed), &ModelFile::default())),
+        page(&nothing(), &evidence(&chirp(&ModelFile::default(), BaseMount::Fixed), &ModelFile::default())),
     );
     write("one_leg.html", page(&nothing(), &evidence(&three_joints(), &extended)));
 }

@@ -5,9 +5,9 @@
 mod browser;
 mod samples;
 
-use twinstep_logs::{Base, Log};
+use twinstep_logs::{BaseMount, Log};
 use twinstep_model::ModelFile;
-use twinstep_sysid::{Diagnosis, Errors, Unexplained};
+use twinstep_sysid::{Diagnosis, RmsErrors, Unexplained};
 
 use super::page;
 use samples::{chirp, evidence, findings, loaded, recording, simulated, three_joints};
@@ -43,7 +43,7 @@ fn check(page: &str) {
 }
 
 fn nothing() -> Diagnosis {
-    let errors = Errors { torque_rmse_nm: None, q_rmse_rad: Some(0.002) };
+    let errors = RmsErrors { torque_rmse_nm: None, q_rmse_rad: Some(0.002) };
     Diagnosis {
         baseline: errors,
         extended: errors,
@@ -107,7 +107,7 @@ fn load_on_a_robot_on_its_feet_shows_over_time_in_its_motion() {
 
 #[test]
 fn nothing_wrong_is_said_so() {
-    let page = page(&nothing(), &evidence(&chirp(&ModelFile::default(), Base::Fixed), &ModelFile::default()));
+    let page = page(&nothing(), &evidence(&chirp(&ModelFile::default(), BaseMount::Fixed), &ModelFile::default()));
     check(&page);
     assert!(page.contains("<h1>Nothing is wrong above the noise.</h1>"));
     assert!(!page.contains("What causes it") && page.contains("no two causes"));
@@ -122,7 +122,7 @@ fn unexplained_names_what_it_depends_on() {
     };
     let page = page(
         &Diagnosis { unexplained, ..nothing() },
-        &evidence(&chirp(&ModelFile::default(), Base::Fixed), &ModelFile::default()),
+        &evidence(&chirp(&ModelFile::default(), BaseMount::Fixed), &ModelFile::default()),
     );
     check(&page);
     assert!(page.contains("it depends on <code>q_FR_hip</code> and <code>dq_FR_hip</code>.</h1>"));
@@ -167,7 +167,7 @@ fn text_from_files_is_never_markup() {
 
 #[test]
 fn place_that_cannot_be_written_is_named() {
-    let evidence = evidence(&chirp(&ModelFile::default(), Base::Fixed), &ModelFile::default());
+    let evidence = evidence(&chirp(&ModelFile::default(), BaseMount::Fixed), &ModelFile::default());
     let error =
         super::write(&nothing(), &evidence, std::path::Path::new("/no/such/report.html")).unwrap_err().to_string();
     assert!(error.starts_with("cannot write the report `/no/such/report.html`: "), "{error}");

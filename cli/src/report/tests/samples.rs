@@ -2,15 +2,15 @@
 
 use std::path::Path;
 
-use twinstep_logs::{Base, Gain, Log, Meta, Segment, TauSensor};
+use twinstep_logs::{BaseMount, Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{JOINT_NAMES, ModelFile, go2};
 use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_sysid::{
-    Cause, Confusable, Diagnosis, Errors, Estimate, NextExperiment, Parted, Rival, Unexplained, Value,
+    Cause, CorrelatedPair, Diagnosis, RmsErrors, Estimate, NextExperiment, DiscriminatedPair, AlternativeCause, Unexplained, ParameterValue,
 };
 
 use crate::play::play;
-use crate::report::evidence::{Evidence, LogFacts, Provenance};
+use crate::report::evidence::{ReportData, LogFacts, Provenance};
 
 const RECORDING: &str = "data/go2_air_chirp";
 
@@ -20,7 +20,7 @@ pub fn recording() -> Log {
 }
 
 /// `log` under the ideal Go2 and under `extended`.
-pub fn evidence(log: &Log, extended: &ModelFile) -> Evidence {
+pub fn evidence(log: &Log, extended: &ModelFile) -> ReportData {
     let mut simulator = BatchRollout::new(&go2(), &SimConfig::default()).unwrap();
     let provenance = Provenance {
         command: format!("twinstep diagnose {RECORDING} --out out"),
@@ -28,7 +28,7 @@ pub fn evidence(log: &Log, extended: &ModelFile) -> Evidence {
         model: "the ideal go2".to_owned(),
         logs: vec![LogFacts::of(RECORDING, log)],
     };
-    Evidence::gather(log, &ModelFile::default(), extended, &mut simulator, provenance).unwrap()
+    ReportData::gather(log, &ModelFile::default(), extended, &mut simulator, provenance).unwrap()
 }
 
 /// A model file with entries of name, scope, parameter and value.
@@ -66,7 +66,7 @@ pub fn findings() -> (Diagnosis, ModelFile) {
         extended: errors(0.014),
         noise_floor: errors(0.002),
         findings: vec![friction, armature, viscous],
-        confusable: vec![Confusable {
+        confusable: vec![CorrelatedPair {
             effects: ["command_delay".to_owned(), "armature".to_owned()],
             correlation: -0.97,
             experiment: "a chirp of the calves to 10 Hz at twice the gain".to_owned(),
@@ -78,7 +78,7 @@ pub fn findings() -> (Diagnosis, ModelFile) {
         },
         next_experiment: Some(NextExperiment {
             motion: "next_experiment".to_owned(),
-            parts: vec![Parted {
+            parts: vec![DiscriminatedPair {
                 effects: ["armature@calf".to_owned(), "command_delay@calf".to_owned()],
                 predicted_nats: 80.0,
                 median_nats: 20.0,
@@ -90,12 +90,12 @@ pub fn findings() -> (Diagnosis, ModelFile) {
     (diagnosis, extended)
 }
 
-fn errors(q: f64) -> Errors {
-    Errors { torque_rmse_nm: None, q_rmse_rad: Some(q) }
+fn errors(q: f64) -> RmsErrors {
+    RmsErrors { torque_rmse_nm: None, q_rmse_rad: Some(q) }
 }
 
 fn cause(effect: &str, scope: &str, parameter: &str, [value, low, high]: [f64; 3]) -> Cause {
-    let [value, low, high] = [value, low, high].map(Value::Number);
+    let [value, low, high] = [value, low, high].map(ParameterValue::Number);
     Cause {
         effect: effect.to_owned(),
         scope: scope.to_owned(),
@@ -109,23 +109,23 @@ fn cause(effect: &str, scope: &str, parameter: &str, [value, low, high]: [f64; 3
     }
 }
 
-fn rival(effect: &str, scope: &str, held_out_gain: f64) -> Rival {
-    Rival { effect: effect.to_owned(), scope: scope.to_owned(), held_out_gain }
+fn rival(effect: &str, scope: &str, held_out_gain: f64) -> AlternativeCause {
+    AlternativeCause { effect: effect.to_owned(), scope: scope.to_owned(), held_out_gain }
 }
 
 /// What a robot does under a chirp of all joints; with torques.
-pub fn chirp(robot: &ModelFile, base: Base) -> Log {
+pub fn chirp(robot: &ModelFile, base: BaseMount) -> Log {
     let segments = vec![Segment { name: "chirp".to_owned(), base }];
     let meta = Meta {
-        kp: Some(Gain::Same(30.0)),
-        kd: Some(Gain::Same(1.0)),
-        ..Meta::new(200.0, TauSensor::Current, segments)
+        kp: Some(Gain::Uniform(30.0)),
+        kd: Some(Gain::Uniform(1.0)),
+        ..Meta::new(200.0, TorqueSensor::MotorCurrent, segments)
     };
     let t: Vec<f64> = (0..1200).map(|row| f64::from(row) * 0.005).collect();
     let pose = go2().control.default_pose;
     let command = |joint: usize| t.iter().map(|t| pose[joint] + 0.2 * (2.0 + t).powi(2).sin()).collect();
     let commands = JOINT_NAMES.iter().enumerate().map(|(joint, name)| (format!("q_cmd_{name}"), command(joint)));
-    let motion = Log::new_motion(meta, [("t".to_owned(), t.clone())].into_iter().chain(commands)).unwrap();
+    let motion = Log::new_commands(meta, [("t".to_owned(), t.clone())].into_iter().chain(commands)).unwrap();
     play(
         &motion,
         &robot.robot_model().unwrap(),
@@ -148,13 +148,13 @@ pub fn simulated() -> (Log, Diagnosis, ModelFile) {
             cause("viscous_friction", "FL_thigh", "coefficient_nms", [0.3, 0.28, 0.31]),
             cause("command_delay", "all", "delay_s", [0.008, 0.0075, 0.0081]),
         ],
-        baseline: Errors { torque_rmse_nm: Some(0.84), q_rmse_rad: Some(0.03) },
-        extended: Errors { torque_rmse_nm: Some(0.07), q_rmse_rad: Some(0.003) },
+        baseline: RmsErrors { torque_rmse_nm: Some(0.84), q_rmse_rad: Some(0.03) },
+        extended: RmsErrors { torque_rmse_nm: Some(0.07), q_rmse_rad: Some(0.003) },
         confusable: Vec::new(),
         unexplained: Unexplained::default(),
         ..findings().0
     };
-    (chirp(&extended, Base::Fixed), diagnosis, extended)
+    (chirp(&extended, BaseMount::Fixed), diagnosis, extended)
 }
 
 /// A robot on its feet with a load on its trunk, and the model that made it.
@@ -165,7 +165,7 @@ pub fn loaded() -> (Log, ModelFile) {
         "test",
     );
     let extended = extended.unwrap();
-    (chirp(&extended, Base::Floating), extended)
+    (chirp(&extended, BaseMount::Floating), extended)
 }
 
 /// A log of one leg.

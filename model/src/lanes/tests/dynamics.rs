@@ -39,8 +39,8 @@ fn acceleration() -> impl Strategy<Value = Acceleration<f64>> {
     })
 }
 
-fn tree() -> Tree<f64> {
-    Tree::splat(&go2())
+fn tree() -> KinematicTree<f64> {
+    KinematicTree::splat(&go2())
 }
 
 fn world_from_base(state: &State<f64>) -> DQuat {
@@ -197,7 +197,7 @@ proptest! {
         let torques = |scale: f64| {
             let mut robot = go2();
             robot.legs[1].bodies[2] = robot.legs[1].bodies[2].scaled(scale);
-            forces(&inverse_dynamics(&Tree::splat(&robot), &state, &acceleration, GRAVITY))
+            forces(&inverse_dynamics(&KinematicTree::splat(&robot), &state, &acceleration, GRAVITY))
         };
         let (without, one, many) = (torques(0.0), torques(1.0), torques(factor));
         for i in 0..18 {
