@@ -1,1 +1,1 @@
-//! Examples: one idea each. They are the files beside this one.
+//! Examples of the Rust API, one topic per file in this folder.

@@ -1,4 +1,4 @@
-//! An agent in this process, robots in another: start `twinstep serve` first.
+//! Steps robots of a server with a proportional policy. Start `twinstep serve` first.
 //!
 //! `cargo run --release -p twinstep-examples --example remote_agent [ENDPOINT]`
 
@@ -15,7 +15,7 @@ fn main() -> miette::Result<()> {
     let mut obs = env.reset(&ResetRequest::seeded(1, NUM_ENVS)).into_diagnostic()?.to_vec();
     let mut total = 0.0;
     for _ in 0..250 {
-        // The policy: pull every joint back to the default pose, in proportion to how far it is away (obs 9..21).
+        // The policy moves every joint back towards the default pose, in proportion to its offset (obs 9..21).
         let actions: Vec<f32> = obs
             .chunks_exact(obs_len)
             .flat_map(|row| row[9..9 + action_len].iter().map(|offset| -0.3 * offset))

@@ -1,4 +1,4 @@
-//! A server inside your own program, with your own settings.
+//! Runs a server inside the program, with custom settings.
 //!
 //! `cargo run --release -p twinstep-examples --example server_in_process`
 
@@ -13,8 +13,8 @@ fn main() -> miette::Result<()> {
     let mut config = Config::default();
     config.server.listen = "tcp/127.0.0.1:7449".to_owned();
     config.randomise.payload_kg = [0.0, 2.0];
-    let host = SimEnvFactory::new(config.clone()).into_diagnostic()?;
-    let server = Server::start(&config.server, Arc::new(host)).into_diagnostic()?;
+    let factory = SimEnvFactory::new(config.clone()).into_diagnostic()?;
+    let server = Server::start(&config.server, Arc::new(factory)).into_diagnostic()?;
 
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&config.server.listen, 4)).into_diagnostic()?;
     env.reset(&ResetRequest::seeded(1, 4)).into_diagnostic()?;

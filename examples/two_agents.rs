@@ -1,4 +1,4 @@
-//! Two agents on one server, each with robots of its own: start `twinstep serve` first.
+//! Runs two agents on one server, each with its own robots. Start `twinstep serve` first.
 //!
 //! `cargo run --release -p twinstep-examples --example two_agents [ENDPOINT]`
 
@@ -20,7 +20,7 @@ fn main() -> miette::Result<()> {
     Ok(())
 }
 
-/// Bends every knee by `bend` for two seconds and tells where they ended.
+/// Bends every knee by `bend` for two seconds and prints the final position of one knee.
 fn agent(name: &str, endpoint: &str, bend: f32, num_envs: usize) -> miette::Result<()> {
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(endpoint, num_envs)).into_diagnostic()?;
     env.reset(&ResetRequest::seeded(1, num_envs)).into_diagnostic()?;

@@ -1,7 +1,7 @@
-//! burn's Adam, whose saved moments are read on the CPU.
+//! burn's Adam optimiser, which loads its saved moments on the CPU.
 //!
-//! burn reads them on its default device. With the feature `gpu` that is a GPU, there or not, even where the training is to go
-//! on on the CPU. The next step moves them to where the network is.
+//! burn loads them on its default device. With the feature `gpu` this is a GPU, even if there is none or the training
+//! resumes on the CPU. The next step moves the moments to the device of the network.
 
 use burn::grad_clipping::GradientClippingConfig;
 use burn::module::ParamGroup;
@@ -9,7 +9,7 @@ use burn::optim::{Adam, AdamConfig, DynOptimizer, DynState, ModuleOptimizer, Sta
 use burn::tensor::Device;
 use burn::tensor::kind::BridgeTensor;
 
-/// Adam with burn's defaults, for gradients cut to a norm of `gradient_norm` for each array.
+/// Returns Adam with burn's defaults and gradients clipped to the norm `gradient_norm` per array.
 pub fn adam(gradient_norm: f32) -> ModuleOptimizer {
     let config = AdamConfig::new();
     let clipping = GradientClippingConfig::Norm(gradient_norm).init();

@@ -1,43 +1,43 @@
-//! How often the truth lies where an ensemble says it does.
+//! Calibration of an ensemble's predictive uncertainty.
 
 use crate::data::{Split, DataSet, Sequence};
 use crate::ensemble::{Ensemble, Gaussian};
 
-/// Shares that central intervals claim to cover.
+/// Nominal levels of the central prediction intervals.
 const NOMINAL_LEVELS: [f64; 3] = [0.5, 0.9, 0.95];
-/// Steps of the search for the best variance scale, each of which narrows it to 0.62 of what it was.
+/// Steps of the golden-section search for the variance scale; each reduces the interval to 62 %.
 const SEARCH_STEPS: usize = 30;
-/// Logarithms of the least and the largest of these scales.
+/// Logarithms of the minimum and maximum variance scale.
 const LOG_SCALES: (f64, f64) = (-4.0, 8.0);
 
-/// How far the truth is from where it was expected.
+/// Calibration of a predictive distribution.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Coverage {
-    /// Shares of the truth inside the central 50, 90 and 95 % intervals.
+    /// Fractions of the measurements inside the central 50, 90 and 95 % intervals.
     pub empirical: [f64; 3],
-    /// Largest distance of the distribution of the truth's quantiles (PIT) from the even one it should have (Kolmogorov).
+    /// Kolmogorov–Smirnov distance of the quantiles (PIT) from the uniform distribution.
     pub pit_ks_statistic: f64,
-    /// Mean negative log-likelihood [nat, of torque in N·m].
+    /// Mean negative log-likelihood of the torque in N·m [nat].
     pub nll: f64,
 }
 
-/// How well the uncertainty of an ensemble is calibrated on rows it has not learnt from.
+/// Accuracy and calibration of an ensemble on the test split.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibration {
-    /// Rows that were judged by.
+    /// Number of test rows.
     pub rows: usize,
-    /// Of the mean prediction [N·m].
+    /// RMS error of the mean prediction [N·m].
     pub rmse: f64,
-    /// Sharpness: mean standard deviation of the mixture [N·m].
+    /// Mean standard deviation of the mixture distribution [N·m].
     pub sharpness: f64,
-    /// Each member as its network gives it, and after its variances were scaled.
+    /// Calibration of each member, before and after its variances are scaled.
     pub members: Vec<[Coverage; 2]>,
-    /// The mixture of all, before and after.
+    /// Calibration of the mixture distribution, before and after the variances are scaled.
     pub mixture: [Coverage; 2],
 }
 
 impl Calibration {
-    /// Of `ensemble` on the blocks of `data` that are neither learnt from nor stopped or scaled by.
+    /// Evaluates `ensemble` on the test split of `data`.
     pub fn of(ensemble: &Ensemble, data: &DataSet) -> Self {
         let after = Predictions::of(ensemble, data, Split::Test);
         let before = after.scaled(1.0 / ensemble.description.variance_scale);
@@ -56,12 +56,12 @@ impl Calibration {
     }
 }
 
-/// The factor on all variances that gives the validation rows the highest likelihood under the mixture.
+/// Returns the variance factor with the highest likelihood of the validation split under the mixture.
 pub fn variance_scale(ensemble: &Ensemble, data: &DataSet) -> f64 {
     Predictions::of(ensemble, data, Split::Validation).best_scale(ensemble.description.members)
 }
 
-/// Truth, and what each member expected, row by row.
+/// Measured torque and the members' predictions, row by row.
 struct Predictions {
     rows: Vec<(f64, Vec<Gaussian>)>,
 }
@@ -70,13 +70,13 @@ impl Predictions {
     fn of(ensemble: &Ensemble, data: &DataSet, block: Split) -> Self {
         let expected = ensemble.predict(data.runs(block));
         let row = |(run, rows): (&Sequence, Vec<Vec<Gaussian>>)| {
-            let unseen = run.torques.len() - rows.len();
-            run.torques[unseen..].iter().copied().zip(rows).collect::<Vec<_>>()
+            let burn_in = run.torques.len() - rows.len();
+            run.torques[burn_in..].iter().copied().zip(rows).collect::<Vec<_>>()
         };
         Self { rows: data.runs(block).zip(expected).flat_map(row).collect() }
     }
 
-    /// By golden sections: the likelihood has one peak, or peaks so close that either will do.
+    /// Finds the best scale by golden-section search. The likelihood has one maximum, or several close together.
     fn best_scale(&self, members: usize) -> f64 {
         let nll = |log_scale: f64| self.scaled(log_scale.exp()).nll(0..members);
         let (mut low, mut high) = LOG_SCALES;
@@ -100,14 +100,14 @@ impl Predictions {
         sum / self.rows.len() as f64
     }
 
-    /// Of the mixture of some members.
+    /// Returns the calibration of the mixture of some members.
     fn coverage(&self, members: std::ops::Range<usize>) -> Coverage {
         let quantile = |(torque, all): &(f64, Vec<Gaussian>)| mixture_cdf(&all[members.clone()], *torque);
         let mut quantiles: Vec<f64> = self.rows.iter().map(quantile).collect();
         quantiles.sort_by(f64::total_cmp);
         let count = quantiles.len() as f64;
-        let inside = |claimed: f64| {
-            quantiles.iter().filter(|quantile| (*quantile - 0.5).abs() <= 0.5 * claimed).count() as f64 / count
+        let inside = |level: f64| {
+            quantiles.iter().filter(|quantile| (*quantile - 0.5).abs() <= 0.5 * level).count() as f64 / count
         };
         let distance = |(index, quantile): (usize, &f64)| {
             (quantile - index as f64 / count).abs().max((quantile - (index + 1) as f64 / count).abs())
@@ -130,7 +130,7 @@ fn mixture_variance(members: &[Gaussian]) -> f64 {
     members.iter().map(second).sum::<f64>() / members.len() as f64
 }
 
-/// Probability of less than `torque`.
+/// Returns the probability of a torque below `torque`.
 fn mixture_cdf(members: &[Gaussian], torque: f64) -> f64 {
     let below = |member: &Gaussian| 0.5 * libm::erfc((member.mean - torque) / (2.0 * member.variance).sqrt());
     members.iter().map(below).sum::<f64>() / members.len() as f64
@@ -151,38 +151,38 @@ mod tests {
 
     use super::*;
 
-    /// Truth with a deviation of 2 that members of one mean believe to be `believed`.
-    fn predictions(believed: f64) -> Predictions {
+    /// Measurements with standard deviation 2, for which the members predict `predicted_std`.
+    fn predictions(predicted_std: f64) -> Predictions {
         let mut random = stream(4, "truth", 0);
         let row = |_| {
-            (1.0 + 2.0 * standard_normal(&mut random), vec![Gaussian { mean: 1.0, variance: believed * believed }; 3])
+            (1.0 + 2.0 * standard_normal(&mut random), vec![Gaussian { mean: 1.0, variance: predicted_std * predicted_std }; 3])
         };
         Predictions { rows: (0..20_000).map(row).collect() }
     }
 
     #[test]
-    fn true_beliefs_cover_what_they_claim_and_narrow_ones_less() {
-        let right = predictions(2.0).coverage(0..3);
-        for (share, claimed) in right.empirical.into_iter().zip(NOMINAL_LEVELS) {
-            // Three deviations of a share of 20,000.
-            assert!((share - claimed).abs() < 0.011, "{share} of {claimed}");
+    fn correct_variances_have_nominal_coverage_and_small_ones_less() {
+        let correct = predictions(2.0).coverage(0..3);
+        for (fraction, level) in correct.empirical.into_iter().zip(NOMINAL_LEVELS) {
+            // Tolerance: three standard deviations of a fraction of 20,000 rows.
+            assert!((fraction - level).abs() < 0.011, "{fraction} of {level}");
         }
-        assert!(right.pit_ks_statistic < 0.012);
+        assert!(correct.pit_ks_statistic < 0.012);
         let narrow = predictions(1.0).coverage(0..3);
-        // Within 1.645 · 1 of a truth that is spread by 2.
+        // Probability of |x| < 1.645 for a standard deviation of 2.
         assert!((narrow.empirical[1] - 0.589).abs() < 0.011, "{:?}", narrow.empirical);
-        assert!(narrow.pit_ks_statistic > 0.1 && narrow.nll > right.nll);
-        assert!((right.nll - (0.5 + (2.0 * std::f64::consts::TAU.sqrt()).ln())).abs() < 0.02);
+        assert!(narrow.pit_ks_statistic > 0.1 && narrow.nll > correct.nll);
+        assert!((correct.nll - (0.5 + (2.0 * std::f64::consts::TAU.sqrt()).ln())).abs() < 0.02);
     }
 
     #[test]
-    fn best_scale_makes_narrow_beliefs_true() {
+    fn best_scale_corrects_small_variances() {
         let scale = predictions(1.0).best_scale(3);
         assert!((scale - 4.0).abs() < 0.15, "{scale}");
     }
 
     #[test]
-    fn mixture_of_two_has_the_moments_and_quantiles_of_their_mean() {
+    fn mixture_of_two_has_the_known_moments_and_quantiles() {
         let two = [Gaussian { mean: -1.0, variance: 0.25 }, Gaussian { mean: 3.0, variance: 1.0 }];
         assert_eq!(mixture_mean(&two), 1.0);
         assert_eq!(mixture_variance(&two), 0.625 + 4.0);

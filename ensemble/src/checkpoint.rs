@@ -1,4 +1,4 @@
-//! A training that has not ended yet, in memory and as a file.
+//! State of an interrupted training, in memory and as a file.
 
 use std::path::Path;
 
@@ -11,7 +11,7 @@ use crate::file::{Arrays, Bytes, write};
 use crate::train::{Epoch, TrainingOptions};
 use crate::weights::{Shape, Weights};
 
-/// Where every member stands at the end of its last epoch; the training goes on from there bit for bit.
+/// State of every member at the end of its last epoch. A resumed training gives bitwise equal results.
 #[derive(Clone, Debug)]
 pub struct Checkpoint {
     options: TrainingOptions,
@@ -20,20 +20,20 @@ pub struct Checkpoint {
     pub(crate) members: Vec<MemberState>,
 }
 
-/// Where a member stands.
+/// State of one member.
 #[derive(Clone, Debug)]
 pub struct MemberState {
-    /// Its weights.
+    /// Weights after the last epoch.
     pub weights: Weights,
-    /// Its weights at the best validation so far.
+    /// Weights with the lowest validation loss so far.
     pub best: Weights,
-    /// Its optimiser as burn saves it; empty before the first epoch.
+    /// State of the optimiser in burn's format; empty before the first epoch.
     pub optimizer: Vec<u8>,
-    /// Its epochs.
+    /// Epochs so far.
     pub curve: Vec<Epoch>,
 }
 
-/// What stands in the file beside the arrays.
+/// Metadata of the file.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Header {
@@ -44,7 +44,7 @@ struct Header {
 }
 
 impl Checkpoint {
-    /// The start of a training.
+    /// Creates the initial state of a training.
     pub(crate) fn new(options: TrainingOptions, description: &EnsembleMetadata) -> Self {
         let shape = description.shape();
         let member = |index: usize| {
@@ -55,7 +55,7 @@ impl Checkpoint {
         Self { data_hash: description.data_hash.clone(), shape, members, options }
     }
 
-    /// Itself, if it is of these options and data; only the number of epochs may differ.
+    /// Checks that the checkpoint is of a training with these options and data. The number of epochs may differ.
     pub(crate) fn of(mut self, options: &TrainingOptions, data_hash: &str) -> Result<Self, EnsembleError> {
         let mut saved = self.options;
         saved.epochs = options.epochs;
@@ -69,12 +69,12 @@ impl Checkpoint {
         Ok(self)
     }
 
-    /// All epochs of each member.
+    /// Returns the epochs of each member.
     pub fn curves(&self) -> impl Iterator<Item = &[Epoch]> {
         self.members.iter().map(|member| member.curve.as_slice())
     }
 
-    /// Writes it as a safetensors file, in one piece or not at all.
+    /// Writes a safetensors file atomically.
     pub fn write(&self, path: &Path) -> Result<(), EnsembleError> {
         let mut arrays = Vec::new();
         for (index, member) in self.members.iter().enumerate() {
@@ -94,7 +94,7 @@ impl Checkpoint {
         write(path, "training", &header, arrays)
     }
 
-    /// Reads what [`Checkpoint::write`] wrote.
+    /// Reads a file of [`Checkpoint::write`].
     pub fn read(path: &Path) -> Result<Self, EnsembleError> {
         let arrays = Arrays::read(path)?;
         let Header { options, data_hash, inputs, curves } = arrays.header("training")?;

@@ -1,4 +1,4 @@
-//! Measured logs as what networks learn from.
+//! Data sets for training and evaluation, from measured logs.
 
 use std::ops::Range;
 
@@ -8,52 +8,51 @@ use twinstep_logs::{Log, TorqueSensor};
 use crate::EnsembleError;
 use crate::smooth::smoothed;
 
-/// Longest block [s]: long beside a drive's memory, short beside a motion.
+/// Maximum length of a block [s]: long compared with an actuator's time constants, short compared with a motion.
 const LONGEST_BLOCK_S: f64 = 2.0;
-/// Shortest block [rows].
+/// Minimum length of a block [rows].
 const SHORTEST_BLOCK: usize = 60;
-/// Of this many blocks that follow one another, one is to stop by and one to judge by.
+/// Of this many consecutive blocks, one is for validation and one for test.
 const CYCLE: usize = 10;
-/// A step that differs from the log's rate by more than this share is a gap.
+/// Relative deviation of a time step from the log's rate above which it is a gap.
 const JITTER: f64 = 0.25;
 
-/// What the rows of a block are for. Blocks are whole stretches of time, the same for all joints, because neighbouring rows
-/// know each other's noise and each other's motion.
+/// Data split. The split is by blocks of time, the same for all joints, because neighbouring rows are correlated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Split {
-    /// To learn from: eight of ten.
+    /// Training: eight of ten blocks.
     Training,
-    /// To stop by, and to scale variances by: one of ten.
+    /// Early stopping and variance scale: one of ten blocks.
     Validation,
-    /// To judge by: one of ten.
+    /// Evaluation: one of ten blocks.
     Test,
 }
 
-/// Rows of one joint that follow one another without a gap, within one block.
+/// Contiguous rows of one joint within one block.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sequence {
     /// Index into [`DataSet::joints`].
     pub joint: usize,
-    /// Whether the drive was put down anew just before: no row of it has an unseen past.
+    /// True if the actuator was reset just before, so that no burn-in is needed.
     pub after_reset: bool,
     /// ξ = [q_cmd − q, dq_cmd − dq] of each row [rad, rad/s].
     pub errors: Vec<[f64; 2]>,
-    /// Measured torque of each row, its mean to the next row [N·m].
+    /// Measured torque of each row, the mean until the next row [N·m].
     pub torques: Vec<f64>,
 }
 
-/// Runs of rows with what they have in common.
+/// Sequences of measured logs with their common properties.
 ///
-/// Channels are taken as measured. U2E §IV-B smooths them by a cubic spline first, which no drive in a simulator could do
-/// with what is yet to come: that is an option, for what is learnt from alone. Where a log has no velocity, it is the central
-/// difference of position over two rows, which looks one row ahead too.
+/// By default channels are used as measured. U2E §IV-B smooths them by a cubic spline, which uses future samples that
+/// an actuator in a simulator does not have. Smoothing is therefore optional and only for the training split. A
+/// missing velocity is the central difference of the position over two rows, which also uses one future sample.
 #[derive(Clone, Debug)]
 pub struct DataSet {
-    /// Time from a row to the next [s].
+    /// Time step [s].
     pub dt: f64,
-    /// Joints with measured torque.
+    /// Names of the joints with measured torque.
     pub joints: Vec<String>,
-    /// Where torque was measured.
+    /// Location of the torque sensor.
     pub tau_sensor: TorqueSensor,
     /// kp [N·m/rad] and kd [N·m·s/rad] of each joint.
     pub gains: Vec<[f64; 2]>,
@@ -61,13 +60,14 @@ pub struct DataSet {
 }
 
 impl DataSet {
-    /// The runs of `logs`, each with the name that errors give it.
+    /// Creates the data set of `logs`, each with its name in errors.
     pub fn new(logs: &[(String, Log)]) -> Result<Self, EnsembleError> {
         Self::smoothed(logs, None)
     }
 
-    /// As [`DataSet::new`], with position, velocity and torque of what is learnt from smoothed, stretch by stretch: waves of
-    /// this frequency \[Hz] have half their amplitude.
+    /// Creates a data set like [`DataSet::new`], with smoothed position, velocity and torque in the training split.
+    ///
+    /// Each sequence is smoothed separately. The amplitude at the frequency `hz` \[Hz] is halved.
     pub fn smoothed(logs: &[(String, Log)], hz: Option<f64>) -> Result<Self, EnsembleError> {
         let (first, first_log) = logs.first().ok_or(EnsembleError::TooShort { rows: 0, blocks: 0 })?;
         let tau_sensor = first_log.meta().tau_sensor;
@@ -101,12 +101,12 @@ impl DataSet {
         Err(EnsembleError::TooShort { rows: set.runs.iter().map(|(_, run)| run.torques.len()).sum(), blocks })
     }
 
-    /// The runs of one role, in the order of logs, time and joints.
+    /// Returns the sequences of one split, in the order of logs, time and joints.
     pub fn runs(&self, wanted: Split) -> impl Iterator<Item = &Sequence> + Clone {
         self.runs.iter().filter(move |(block, _)| *block == wanted).map(|(_, run)| run)
     }
 
-    /// A fingerprint of all of it, in hexadecimal.
+    /// Returns a hash of the data in hexadecimal.
     pub fn hash(&self) -> String {
         let mut hash = Sha256::new();
         hash.update(self.dt.to_le_bytes());
@@ -133,7 +133,7 @@ impl DataSet {
         Ok(())
     }
 
-    /// The channels of each joint with torque, which becomes a joint of the set if it is none yet.
+    /// Returns the channels of each joint with measured torque. Adds new joints to the data set.
     fn columns<'a>(&mut self, name: &str, log: &'a Log) -> Result<Vec<Columns<'a>>, EnsembleError> {
         let mut all = Vec::new();
         for joint in log.joints() {
@@ -158,7 +158,7 @@ impl DataSet {
         if all.is_empty() { Err(EnsembleError::NoTorque { log: name.to_owned() }) } else { Ok(all) }
     }
 
-    /// Adds the runs of a block.
+    /// Adds the sequences of a block.
     fn add(&mut self, log: &Log, columns: &[Columns], block: &Range<usize>, place: BlockContext) {
         let role = match place.number % CYCLE {
             4 => Split::Validation,
@@ -186,18 +186,18 @@ impl DataSet {
     }
 }
 
-/// Where a block stands.
+/// Context of a block.
 #[derive(Clone, Copy)]
 struct BlockContext {
-    /// Whether it begins a part of a log.
+    /// True if the block is the first of a log segment.
     starts_part: bool,
-    /// Among the blocks of all logs.
+    /// Index among the blocks of all logs.
     number: usize,
-    /// To what it is smoothed, if it is learnt from [Hz].
+    /// Frequency of smoothing in the training split [Hz]; `None` without smoothing.
     hz: Option<f64>,
 }
 
-/// The channels of a joint.
+/// Channels of a joint.
 struct Columns<'a> {
     joint: usize,
     q: &'a [f64],
@@ -208,7 +208,7 @@ struct Columns<'a> {
 }
 
 impl Columns<'_> {
-    /// ξ at `row`; a velocity that was not measured is a difference of positions within `block`.
+    /// Returns ξ at `row`. A missing velocity is the difference of positions within `block`.
     fn error(&self, row: usize, block: &Range<usize>, dt: f64) -> [f64; 2] {
         let dq = self.dq.map_or_else(
             || {
@@ -222,7 +222,7 @@ impl Columns<'_> {
 }
 
 impl Columns<'_> {
-    /// Smooths what was measured of a run; commands stay as sharp as they were.
+    /// Smooths the measured channels of a sequence. Commands do not change.
     fn smooth(&self, run: &mut Sequence, rows: Range<usize>, hz: f64, dt: f64) {
         for channel in 0..2 {
             let command = |row: usize| [Some(self.q_cmd), self.dq_cmd][channel].map_or(0.0, |cells| cells[row]);
@@ -236,7 +236,7 @@ impl Columns<'_> {
     }
 }
 
-/// Ranges of `rows` that come one after another, each of which `follows` the one before it.
+/// Returns the ranges of consecutive `rows`, in each of which every row `follows` the previous one.
 fn contiguous_ranges(rows: impl Iterator<Item = usize>, follows: impl Fn(usize) -> bool) -> Vec<Range<usize>> {
     let mut found: Vec<Range<usize>> = Vec::new();
     for row in rows {
@@ -250,15 +250,16 @@ fn contiguous_ranges(rows: impl Iterator<Item = usize>, follows: impl Fn(usize) 
 
 #[cfg(test)]
 pub mod tests {
-    use twinstep_logs::{BaseMount, Gain, Meta, Segment};
+    use twinstep_model::BaseMount;
+    use twinstep_logs::{Gain, Meta, Segment};
     use twinstep_model::{standard_normal, stream};
 
     use super::*;
 
-    /// Torque's noise in [`log`] [N·m].
+    /// Standard deviation of the torque noise in [`log`] [N·m].
     pub const NOISE: f64 = 0.1;
 
-    /// One joint in waves, whose drive acts one row late.
+    /// Returns the log of one joint in sinusoidal motion, whose actuator has a delay of one row.
     pub fn log(rows: usize, change: impl Fn(&mut Meta, &mut Vec<(String, Vec<f64>)>)) -> Log {
         let mut random = stream(3, "noise", 0);
         let error = |row: usize| {
@@ -288,7 +289,7 @@ pub mod tests {
 
     type Change = dyn Fn(&mut Meta, &mut Vec<(String, Vec<f64>)>);
 
-    /// A channel that is `at` in row 7, and zero else.
+    /// Returns a channel that is `at` in row 7 and zero elsewhere.
     fn column(name: &str, at: f64) -> (String, Vec<f64>) {
         (name.to_owned(), (0..2000).map(|row| if row == 7 { at } else { 0.0 }).collect())
     }
@@ -302,14 +303,14 @@ pub mod tests {
     }
 
     #[test]
-    fn every_row_is_in_one_block_and_a_tenth_each_stops_and_judges() {
+    fn a_tenth_of_the_rows_is_for_validation_and_a_tenth_for_test() {
         let set = set(log(4000, |_, _| {})).expect("a set");
         assert_eq!([Split::Training, Split::Validation, Split::Test].map(|block| rows(&set, block)), [3200, 400, 400]);
         assert_eq!(set.runs(Split::Training).filter(|run| run.after_reset).count(), 1);
     }
 
     #[test]
-    fn gaps_and_missing_cells_part_runs() {
+    fn gaps_and_missing_cells_separate_sequences() {
         let whole = set(log(2000, |_, _| {})).expect("a set");
         let holed = set(log(2000, |_, columns| {
             columns[4].1[10] = f64::NAN;
@@ -324,11 +325,11 @@ pub mod tests {
     }
 
     #[test]
-    fn velocity_that_was_not_measured_is_the_slope_of_position() {
+    fn missing_velocity_is_the_derivative_of_position() {
         let with = set(log(2000, |_, _| {})).expect("a set");
         let without = set(log(2000, |_, columns| {
             columns.remove(2);
-            // The position whose slope the velocity was.
+            // The integral of the removed velocity.
             columns[1].1 = (0..2000).map(|row| -0.3 / 11.0 * (11.0 * row as f64 * 0.005).sin()).collect();
         }))
         .expect("a set");
@@ -339,7 +340,7 @@ pub mod tests {
     }
 
     #[test]
-    fn only_what_is_learnt_from_is_smoothed_and_commands_are_not() {
+    fn only_measured_channels_of_the_training_split_are_smoothed() {
         let stepping = || {
             log(4000, |_, columns| {
                 columns[3].1 = (0..4000).map(|row| if row < 10 { 0.0 } else { 0.3 }).collect();
@@ -361,22 +362,22 @@ pub mod tests {
             run.errors[10][0] - run.errors[9][0]
         };
         assert!((step(&smooth) - step(&raw)).abs() < 0.01, "{} of {}", step(&smooth), step(&raw));
-        let refused = DataSet::smoothed(&[("here".to_owned(), stepping())], Some(120.0)).expect_err("too fast");
-        assert!(refused.to_string().contains("120"), "{refused}");
+        let error = DataSet::smoothed(&[("here".to_owned(), stepping())], Some(120.0)).expect_err("too high");
+        assert!(error.to_string().contains("120"), "{error}");
     }
 
     #[test]
-    fn what_a_network_could_not_know_is_refused() {
-        let refused = |change: &Change| set(log(2000, change)).expect_err("refused").to_string();
-        assert!(refused(&|_, columns| columns.push(column("tau_ff_knee", 2.0))).contains("`tau_ff_knee` at row 7"));
-        assert!(refused(&|_, columns| columns.push(column("kp", 5.0))).contains("kp 5, kd 0.5 at row 7"));
-        assert!(refused(&|meta, _| meta.tau_sensor = TorqueSensor::None).contains("no measured torque"));
+    fn logs_without_the_required_channels_are_rejected() {
+        let error = |change: &Change| set(log(2000, change)).expect_err("rejected").to_string();
+        assert!(error(&|_, columns| columns.push(column("tau_ff_knee", 2.0))).contains("`tau_ff_knee` at row 7"));
+        assert!(error(&|_, columns| columns.push(column("kp", 5.0))).contains("kp 5, kd 0.5 at row 7"));
+        assert!(error(&|meta, _| meta.tau_sensor = TorqueSensor::None).contains("no measured torque"));
         assert!(
-            refused(&|_, columns| columns.iter_mut().for_each(|(_, cells)| cells.truncate(400))).contains("too few")
+            error(&|_, columns| columns.iter_mut().for_each(|(_, cells)| cells.truncate(400))).contains("too few")
         );
         let slow = log(2000, |meta, _| meta.rate_hz = 100.0);
         let logs = [("one".to_owned(), log(2000, |_, _| {})), ("two".to_owned(), slow)];
-        let error = DataSet::new(&logs).expect_err("refused").to_string();
-        assert!(error.starts_with("two has a step of 0.01 s, the model one of 0.005 s"), "{error}");
+        let error = DataSet::new(&logs).expect_err("rejected").to_string();
+        assert!(error.starts_with("two has a time step of 0.01 s, the model one of 0.005 s"), "{error}");
     }
 }

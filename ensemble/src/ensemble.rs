@@ -1,4 +1,4 @@
-//! Trained members, and what their numbers depend on.
+//! An ensemble of trained networks and its metadata.
 
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
@@ -8,54 +8,54 @@ use twinstep_model::{JOINT_NAMES, Joint, JointKind};
 use crate::EnsembleError;
 use crate::data::Sequence;
 use crate::network::Network;
-use crate::scales::Normalisers;
+use crate::normaliser::Normalisers;
 use crate::weights::{Shape, Weights};
-use crate::windows::SequenceDataset;
+use crate::sequences::SequenceDataset;
 
-/// Runs that are predicted side by side.
+/// Number of sequences per batch in a prediction.
 const PREDICTION_BATCH: usize = 256;
 
-/// What a network is told of the joint, beside ξ.
+/// Encoding of the joint in the input of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum JointEncoding {
-    /// Nothing: all joints are one actuator, as in U2E.
+    /// The joint is not an input: all joints have the same actuator, as in U2E.
     Pooled,
-    /// Whether it is a hip, a thigh or a calf.
+    /// One-hot encoding of the joint type: hip, thigh or calf.
     Kind,
-    /// Which one it is.
+    /// One-hot encoding of the joint.
     Identity,
 }
 
-/// What the numbers of an ensemble depend on; kept with them in the file.
+/// Properties of the training data and the networks, stored in the file of an ensemble.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EnsembleMetadata {
     /// Number of networks.
     pub members: usize,
-    /// Units of a network's encoder.
+    /// Number of LSTM units.
     pub hidden: usize,
-    /// Time from a row to the next [s].
+    /// Time step [s].
     pub dt: f64,
-    /// The joints it learnt from.
+    /// Joints of the training data.
     pub joints: Vec<String>,
-    /// What a network is told of the joint.
+    /// Encoding of the joint in the input.
     pub joint_input: JointEncoding,
-    /// What is 0 and what is 1 to a network.
+    /// Normalisers of inputs and output.
     pub scales: Normalisers,
-    /// Where the torque was measured that it gives.
+    /// Location of the torque sensor in the training data.
     pub tau_sensor: TorqueSensor,
-    /// kp [N·m/rad] and kd [N·m·s/rad] of each joint, which it knows by heart.
+    /// kp [N·m/rad] and kd [N·m·s/rad] of each joint in the training data.
     pub gains: Vec<[f64; 2]>,
-    /// What the variances that the networks give are multiplied by, so that intervals cover what they should.
+    /// Calibrated factor of the predicted variances.
     pub variance_scale: f64,
-    /// Fingerprint of the data it learnt from.
+    /// Hash of the training data.
     pub data_hash: String,
-    /// Seed of first weights and order of data.
+    /// Seed of initial weights and order of the training data.
     pub seed: u64,
 }
 
-/// A torque as a network sees it.
+/// Predictive distribution of a torque.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gaussian {
     /// Mean [N·m].
@@ -64,10 +64,10 @@ pub struct Gaussian {
     pub variance: f64,
 }
 
-/// Networks that learnt the same drives from the same data, each in its own way.
+/// Networks trained on the same data, with different initial weights and orders of the data.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ensemble {
-    /// What their numbers depend on.
+    /// Properties of the training data and the networks.
     pub description: EnsembleMetadata,
     pub(crate) members: Vec<Weights>,
 }
@@ -82,7 +82,7 @@ impl EnsembleMetadata {
         Shape { inputs: 2 + more, hidden: self.hidden }
     }
 
-    /// Which of the inputs behind ξ is 1 for the joint at an index of [`Description::joints`].
+    /// Returns the index of the one-hot input for a joint, given as an index into [`EnsembleMetadata::joints`].
     pub(crate) fn one_hot(&self, joint: usize) -> Option<usize> {
         match self.joint_input {
             JointEncoding::Pooled => None,
@@ -91,7 +91,9 @@ impl EnsembleMetadata {
         }
     }
 
-    /// The same for a joint of [`Joint::ALL`]; none where it is not an input, or not known.
+    /// Returns the index of the one-hot input for a joint of [`Joint::ALL`].
+    ///
+    /// `None` if the joint is not an input or not in the training data.
     pub(crate) fn one_hot_index(&self, joint: usize) -> Option<usize> {
         let name = JOINT_NAMES[joint];
         match self.joint_input {
@@ -101,7 +103,7 @@ impl EnsembleMetadata {
         }
     }
 
-    /// kp [N·m/rad] and kd [N·m·s/rad] of all joints; fails if they are not the same.
+    /// Returns kp [N·m/rad] and kd [N·m·s/rad] of all joints. Fails if they differ.
     pub fn uniform_gains(&self) -> Result<[f64; 2], EnsembleError> {
         let first = self.gains[0];
         let other = (0..self.joints.len()).find(|joint| self.gains[*joint] != first);
@@ -111,7 +113,7 @@ impl EnsembleMetadata {
         })
     }
 
-    /// Fails if a joint is of no kind, where kinds are an input.
+    /// Checks that every joint has a type if the joint type is an input.
     pub(crate) fn check(&self) -> Result<(), EnsembleError> {
         let unknown = self.joints.iter().find(|joint| self.joint_input == JointEncoding::Kind && kind(joint).is_none());
         unknown.map_or(Ok(()), |joint| Err(EnsembleError::NoKind { joint: joint.clone() }))
@@ -124,19 +126,19 @@ fn kind(joint: &str) -> Option<usize> {
 }
 
 impl Ensemble {
-    /// Fails unless rows come every `dt` [s]; `what` is named in the error.
+    /// Checks that the time step of the ensemble is `dt` [s]. `what` describes the caller in the error.
     pub fn check_step(&self, what: &str, dt: f64) -> Result<(), EnsembleError> {
-        let wanted = self.description.dt;
-        if (dt / wanted - 1.0).abs() <= 1e-6 {
+        let expected = self.description.dt;
+        if (dt / expected - 1.0).abs() <= 1e-6 {
             return Ok(());
         }
-        Err(EnsembleError::TimeStepMismatch { what: what.to_owned(), given: dt, wanted })
+        Err(EnsembleError::TimeStepMismatch { what: what.to_owned(), given: dt, wanted: expected })
     }
 
-    /// What each member expects at each row of each run, which starts from a state of zero: `[run][row][member]`.
+    /// Predicts the torque of each row with each member, `[sequence][row][member]`, from states of zero.
     ///
-    /// Rows whose unseen past still matters are left out at the start of a run, as in training: where a run does not start
-    /// a part, the first prediction is of row [`Ensemble::WARM_UP`].
+    /// As in training, the burn-in rows have no prediction: the first is of row [`Ensemble::WARM_UP`], unless the
+    /// sequence begins after a reset.
     pub fn predict<'a>(&self, runs: impl Iterator<Item = &'a Sequence> + Clone) -> Vec<Vec<Vec<Gaussian>>> {
         let windows = SequenceDataset::whole(runs.clone(), &self.description);
         let mut found: Vec<Vec<Vec<Gaussian>>> = runs.map(|_| Vec::new()).collect();
@@ -145,15 +147,15 @@ impl Ensemble {
         let networks: Vec<_> =
             self.members.iter().map(|weights| Network::new(self.description.shape(), weights, &device)).collect();
         let order: Vec<usize> = (0..windows.len()).collect();
-        for chosen in order.chunks(PREDICTION_BATCH) {
-            let batch = windows.batch(chosen);
+        for indices in order.chunks(PREDICTION_BATCH) {
+            let batch = windows.batch(indices);
             let outputs: Vec<[Vec<f32>; 2]> = networks.iter().map(|network| network.outputs(&batch)).collect();
-            for (column, window) in chosen.iter().enumerate() {
+            for (column, window) in indices.iter().enumerate() {
                 for (time, run) in (0..batch.steps).filter_map(|time| Some((time, windows.place(*window, time)?.0))) {
-                    let place = time * batch.size + column;
+                    let index = time * batch.size + column;
                     let gaussian = |[mean, variance]: &[Vec<f32>; 2]| Gaussian {
-                        mean: scale.mean + scale.std * f64::from(mean[place]),
-                        variance: variance_scale * f64::from(variance[place]),
+                        mean: scale.mean + scale.std * f64::from(mean[index]),
+                        variance: variance_scale * f64::from(variance[index]),
                     };
                     found[run].push(outputs.iter().map(gaussian).collect());
                 }
@@ -162,6 +164,6 @@ impl Ensemble {
         found
     }
 
-    /// Rows that a network hears before its first prediction, unless they are a part's first.
-    pub const WARM_UP: usize = crate::windows::BURN_IN_ROWS;
+    /// Number of burn-in rows before the first prediction of a sequence that does not begin after a reset.
+    pub const WARM_UP: usize = crate::sequences::BURN_IN_ROWS;
 }

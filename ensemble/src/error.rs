@@ -1,44 +1,44 @@
-//! What can be wrong with a log that is to be learnt from, or with a file of an ensemble.
+//! Errors of logs, options and files.
 
 use std::path::PathBuf;
 
-/// Why there is no ensemble.
+/// Reasons why an ensemble cannot be trained, loaded or used.
 #[derive(Debug, thiserror::Error)]
 pub enum EnsembleError {
-    /// No torque was measured.
+    /// The log has no measured torque.
     #[error(
-        "{log} has no measured torque: columns `tau_measured_<joint>`, and `tau_sensor` in meta.json that says where"
+        "{log} has no measured torque; columns `tau_measured_<joint>`, and `tau_sensor` in meta.json, are required"
     )]
     NoTorque {
         /// The log.
         log: String,
     },
-    /// Two logs measured torque at different places.
-    #[error("{log} measured torque at another place (`tau_sensor`) than the first log; fit them apart")]
+    /// Two logs have different locations of the torque sensor.
+    #[error("{log} has a different `tau_sensor` than the first log; train one ensemble per sensor location")]
     SensorMismatch {
         /// The log.
         log: String,
     },
-    /// Stages that are compared have the same joints.
-    #[error("{log} has measured torque of other joints than the first log; compare stages of the same joints")]
+    /// The logs of two stages have torque of different joints.
+    #[error("{log} has measured torque of different joints than the first log; stages must have the same joints")]
     JointsMismatch {
         /// The log.
         log: String,
     },
-    /// The time step is part of a model.
-    #[error("{what} has a step of {given} s, the model one of {wanted} s; a network knows its own step only")]
+    /// The time step differs from that of the model.
+    #[error("{what} has a time step of {given} s, the model one of {wanted} s; a network is valid for one time step")]
     TimeStepMismatch {
-        /// The log, or whatever asked.
+        /// Log or simulation with the other time step.
         what: String,
-        /// Its step [s].
+        /// Its time step [s].
         given: f64,
-        /// The model's step [s].
+        /// Time step of the model [s].
         wanted: f64,
     },
-    /// A network sees position and velocity errors, and so must know the gains by heart.
+    /// The gains change. A network is valid for one value of the gains, because they are not an input.
     #[error(
-        "{log}: the gains of {joint} change (kp {kp}, kd {kd} at row {row}); a network sees only errors, so every row of \
-         every log must have the gains that the first has"
+        "{log}: the gains of {joint} change (kp {kp}, kd {kd} at row {row}); gains are not an input of a network, so \
+         every row of every log must have the gains of the first row"
     )]
     GainsChange {
         /// The log.
@@ -47,13 +47,13 @@ pub enum EnsembleError {
         joint: String,
         /// The row of the log.
         row: usize,
-        /// Its position gain [N·m/rad].
+        /// Position gain in that row [N·m/rad].
         kp: f64,
-        /// Its velocity gain [N·m·s/rad].
+        /// Velocity gain in that row [N·m·s/rad].
         kd: f64,
     },
-    /// Torque was commanded beside the gains.
-    #[error("{log} commands `tau_ff_{joint}` at row {row}; a network sees only position and velocity errors")]
+    /// The log contains feed-forward torque.
+    #[error("{log} has `tau_ff_{joint}` at row {row}; it must be 0, because it is not an input of a network")]
     FeedForward {
         /// The log.
         log: String,
@@ -62,113 +62,113 @@ pub enum EnsembleError {
         /// The row of the log.
         row: usize,
     },
-    /// A robot has one kp and one kd, and networks know several by heart.
+    /// The ensemble is trained with different gains per joint, but a robot has one kp and one kd.
     #[error(
-        "the ensemble learnt {} with kp {} and kd {}, {} with kp {} and kd {}; a robot is commanded with one kp and one kd \
-         for all joints: fit one to logs with equal gains",
+        "the ensemble is trained for {} with kp {} and kd {}, for {} with kp {} and kd {}; a robot has one kp and one \
+         kd for all joints: train an ensemble on logs with equal gains",
         joints[0], gains[0][0], gains[0][1], joints[1], gains[1][0], gains[1][1]
     )]
     GainsDiffer {
-        /// Two joints that the ensemble knows.
+        /// Two joints of the ensemble.
         joints: [String; 2],
         /// kp [N·m/rad] and kd [N·m·s/rad] of each.
         gains: [[f64; 2]; 2],
     },
-    /// What the networks have learnt already.
+    /// An effect belongs to a stage that the ensemble replaces.
     #[error(
-        "effect `{effect}` on {scope} does not go beside this ensemble: it learnt the torque at `{tap}` and stands for \
-         steps 1 to {last} of the chain, `{effect}` ({place}) among them; leave out the effect, or `[actuator]`"
+        "effect `{effect}` on {scope} is part of this ensemble, which is trained on the torque at `{tap}`: it replaces \
+         stages 1 to {last} of the chain, including `{effect}` ({place}); remove the effect or `[actuator]`"
     )]
     StandsFor {
         /// The effect.
         effect: &'static str,
-        /// Its scope.
+        /// Scope of the effect.
         scope: String,
-        /// Where the torque was measured.
+        /// Location of the torque sensor.
         tap: &'static str,
-        /// The last step that the ensemble stands for.
+        /// Last stage that the ensemble replaces.
         last: u32,
-        /// The effect's place in the chain.
+        /// Stage of the effect.
         place: &'static str,
     },
-    /// A network is told which joint it is, and has never seen this one.
-    #[error("the ensemble is told which joint it drives and has learnt none called {joint}; fit one to all twelve")]
+    /// The joint is an input of the networks, and there were no training data of this joint.
+    #[error("the joint is an input of the ensemble, which is not trained for {joint}; train one on all twelve joints")]
     UnknownJoint {
         /// The joint.
         joint: &'static str,
     },
-    /// Too few rows to leave blocks out.
+    /// Too few rows for a split into training, validation and test data.
     #[error(
-        "{rows} complete rows in {blocks} blocks are too few to learn from some, stop by others and judge by the rest"
+        "{rows} complete rows in {blocks} blocks are too few for training, validation and test data; use longer logs"
     )]
     TooShort {
-        /// Rows with all that is needed, for any joint.
+        /// Number of rows with all channels, for any joint.
         rows: usize,
-        /// Blocks they are cut into.
+        /// Number of blocks.
         blocks: usize,
     },
-    /// A log has no waves as fast as that.
-    #[error("smoothing at {given} Hz: the frequency must be above 0 and below half the log's rate, {most} Hz")]
+    /// The smoothing frequency is out of range.
+    #[error("smoothing at {given} Hz: the frequency must be above 0 and below half the rate of the log, {most} Hz")]
     Smoothing {
-        /// What was given [Hz].
+        /// The frequency [Hz].
         given: f64,
-        /// Half the log's rate [Hz].
+        /// Half the rate of the log [Hz].
         most: f64,
     },
-    /// Hip, thigh and calf are the Go2's.
-    #[error("joint `{joint}` is no hip, thigh or calf of a Go2; give each joint its own input, or pool them")]
+    /// The joint has no type (hip, thigh or calf of the Go2).
+    #[error("joint `{joint}` is not a hip, thigh or calf of a Go2; use the joint input `identity` or `pooled`")]
     NoKind {
         /// The joint.
         joint: String,
     },
-    /// A setting is out of range.
-    #[error("`{option}` = {given} is outside 1..={most}")]
+    /// An option is out of range.
+    #[error("`{option}` = {given} is not allowed: 1 to {most}")]
     Option {
-        /// Its name.
+        /// Name of the option.
         option: &'static str,
-        /// What was given.
+        /// Its value.
         given: usize,
-        /// The most there may be.
+        /// Maximum value.
         most: usize,
     },
-    /// Training gave numbers that are none.
-    #[error("the loss of member {member} is no number in epoch {epoch}; smaller steps may help (learning rate {rate})")]
+    /// The loss became NaN or infinite.
+    #[error("the loss of member {member} is not finite in epoch {epoch} (learning rate {rate}); try another seed")]
     Diverged {
         /// The member.
         member: usize,
-        /// The epoch, from one.
+        /// The epoch, counted from 1.
         epoch: usize,
-        /// The learning rate then.
+        /// Learning rate of the epoch.
         rate: f64,
     },
-    /// No GPU, or none in this build.
+    /// There is no GPU, or the program was built without GPU support.
     #[error("cannot train on a GPU: {cause}")]
     NoGpu {
         /// What is missing.
         cause: String,
     },
-    /// A saved training of other data or settings.
-    #[error("the saved training is of other {what}; go on with the same command, or start anew without it")]
+    /// The checkpoint belongs to a training with different data or settings.
+    #[error("the checkpoint has different {what}; resume with the same command, or start without the checkpoint")]
     OtherTraining {
         /// What differs.
         what: &'static str,
     },
-    /// The system refused to read or write.
+    /// The file cannot be read or written.
     #[error("cannot {verb} `{path}`: {cause}")]
     File {
         /// `read` or `write`.
         verb: &'static str,
         /// The file.
         path: PathBuf,
-        /// The system's answer.
+        /// Error of the operating system.
         cause: std::io::Error,
     },
-    /// The file is not what it should be.
+    /// The content of the file is invalid.
     #[error("`{path}` {problem}")]
     Content {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it, as the end of a sentence.
+        /// What is wrong; continues a sentence that begins with the path.
         problem: String,
     },
 }

@@ -1,4 +1,4 @@
-//! Files in the safetensors format: arrays by name, and a description as JSON in the metadata.
+//! Files in the safetensors format: named arrays, and a header as JSON in the metadata.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use crate::EnsembleError;
 use crate::ensemble::{EnsembleMetadata, Ensemble};
 use crate::weights::{Shape, Weights};
 
-/// An array as it stands in a file.
+/// An array of a file.
 pub struct Bytes {
     kind: Dtype,
     dimensions: Vec<usize>,
@@ -19,19 +19,19 @@ pub struct Bytes {
 }
 
 impl Bytes {
-    /// Floats, row-major.
+    /// Creates an array of 32-bit floats, row-major.
     pub fn floats(dimensions: Vec<usize>, numbers: &[f32]) -> Self {
         let content = numbers.iter().flat_map(|number| number.to_le_bytes()).collect();
         Self { kind: Dtype::F32, dimensions, content }
     }
 
-    /// Bytes as they are.
+    /// Creates an array of bytes.
     pub fn plain(content: Vec<u8>) -> Self {
         Self { kind: Dtype::U8, dimensions: vec![content.len()], content }
     }
 }
 
-/// Writes arrays with their description under `key`, in one piece or not at all.
+/// Writes arrays, and a header under the metadata key `key`. The write is atomic.
 pub fn write(
     path: &Path,
     key: &str,
@@ -40,20 +40,20 @@ pub fn write(
 ) -> Result<(), EnsembleError> {
     let views = arrays.iter().map(|(name, array)| {
         let view = TensorView::new(array.kind, array.dimensions.clone(), &array.content);
-        (name, view.expect("an array has as many numbers as its dimensions say"))
+        (name, view.expect("the length of an array is the product of its dimensions"))
     });
-    let header = serde_json::to_string(header).expect("a description is plain data");
-    // One key only: several would come in another order each time, and equal ensembles would not be equal files.
+    let header = serde_json::to_string(header).expect("a header is plain data");
+    // Only one key: the order of several would be random, and equal ensembles would have different files.
     let metadata = HashMap::from([(key.to_owned(), header)]);
-    let content = serialize(views, Some(metadata)).expect("the names differ");
-    let mut beside = path.as_os_str().to_owned();
-    beside.push(".part");
-    std::fs::write(&beside, content)
-        .and_then(|()| std::fs::rename(&beside, path))
+    let content = serialize(views, Some(metadata)).expect("the names are unique");
+    let mut temporary = path.as_os_str().to_owned();
+    temporary.push(".part");
+    std::fs::write(&temporary, content)
+        .and_then(|()| std::fs::rename(&temporary, path))
         .map_err(|cause| EnsembleError::File { verb: "write", path: path.to_owned(), cause })
 }
 
-/// A file in memory.
+/// The content of a file.
 pub struct Arrays {
     path: PathBuf,
     content: Vec<u8>,
@@ -69,27 +69,27 @@ impl Arrays {
         Ok(arrays)
     }
 
-    /// The description under `key`.
+    /// Returns the header under the metadata key `key`.
     pub fn header<T: DeserializeOwned>(&self, key: &str) -> Result<T, EnsembleError> {
         let (_, metadata) = SafeTensors::read_metadata(&self.content).map_err(|cause| self.broken(&cause))?;
         let metadata = metadata.metadata().clone().unwrap_or_default();
         let text = metadata.get(key).ok_or_else(|| self.problem(format!("has no key `{key}` in its metadata")))?;
-        serde_json::from_str(text).map_err(|cause| self.problem(format!("has an unreadable `{key}`: {cause}")))
+        serde_json::from_str(text).map_err(|cause| self.problem(format!("has an invalid `{key}`: {cause}")))
     }
 
-    /// The weights whose names begin with `prefix`.
+    /// Returns the weights whose names begin with `prefix`.
     pub fn weights(&self, shape: Shape, prefix: &str) -> Result<Weights, EnsembleError> {
         shape
             .layout()
             .into_iter()
-            .map(|(name, wanted)| {
+            .map(|(name, expected)| {
                 let full = format!("{prefix}.{name}");
                 let tensors = self.tensors()?;
                 let found = tensors.tensor(&full).map_err(|_| self.problem(format!("has no array `{full}`")))?;
-                if found.dtype() != Dtype::F32 || found.shape() != wanted {
+                if found.dtype() != Dtype::F32 || found.shape() != expected {
                     let (kind, dimensions) = (found.dtype(), found.shape());
                     return Err(
-                        self.problem(format!("has `{full}` as {kind:?} {dimensions:?} instead of F32 {wanted:?}"))
+                        self.problem(format!("has `{full}` as {kind:?} {dimensions:?} instead of F32 {expected:?}"))
                     );
                 }
                 let number = |bytes: &[u8]| f32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
@@ -102,14 +102,14 @@ impl Arrays {
             .collect()
     }
 
-    /// An array of bytes.
+    /// Returns an array of bytes.
     pub fn bytes(&self, name: &str) -> Result<Vec<u8>, EnsembleError> {
         let tensors = self.tensors()?;
         let found = tensors.tensor(name).map_err(|_| self.problem(format!("has no array `{name}`")))?;
         Ok(found.data().to_vec())
     }
 
-    /// What is wrong with the file, as the end of a sentence.
+    /// Creates an error. `problem` continues a sentence that begins with the path.
     pub fn problem(&self, problem: String) -> EnsembleError {
         EnsembleError::Content { path: self.path.clone(), problem }
     }
@@ -119,13 +119,15 @@ impl Arrays {
     }
 
     fn broken(&self, cause: &impl std::fmt::Display) -> EnsembleError {
-        self.problem(format!("is no safetensors file: {cause}"))
+        self.problem(format!("is not a safetensors file: {cause}"))
     }
 }
 
 impl Ensemble {
-    /// Writes it as a safetensors file: arrays `<member>.<name>` of 32-bit floats, and [`Description`] as JSON under the
-    /// metadata's key `ensemble`.
+    /// Writes a safetensors file.
+    ///
+    /// It contains the arrays `<member>.<name>` of 32-bit floats, and the [`EnsembleMetadata`] as JSON under the
+    /// metadata key `ensemble`.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<(), EnsembleError> {
         let shape = self.description.shape();
         let arrays = self.members.iter().enumerate().flat_map(|(index, weights)| {
@@ -136,7 +138,7 @@ impl Ensemble {
         write(path.as_ref(), "ensemble", &self.description, arrays.collect())
     }
 
-    /// Reads what [`Ensemble::write`] wrote; whatever is missing or of another size is named.
+    /// Reads a file of [`Ensemble::write`]. Errors name the array that is missing or has the wrong shape.
     pub fn read(path: impl AsRef<Path>) -> Result<Self, EnsembleError> {
         let arrays = Arrays::read(path.as_ref())?;
         let description: EnsembleMetadata = arrays.header("ensemble")?;
@@ -150,18 +152,18 @@ impl Ensemble {
     }
 }
 
-/// What is wrong with the gains that a robot would be given, if anything.
+/// Returns what is wrong with the gains, or `None` if they are valid.
 fn bad_gains(EnsembleMetadata { joints, gains, .. }: &EnsembleMetadata) -> Option<String> {
     if joints.is_empty() || joints.len() != gains.len() {
         return Some(format!(
-            "has `gains` of {} joints, and {} joints; one pair each is wanted",
+            "has `gains` of {} joints, but {} joints; one pair per joint is expected",
             gains.len(),
             joints.len()
         ));
     }
     let bad =
         gains.iter().zip(joints).find(|(pair, _)| pair.iter().any(|gain| !(0.0..=f64::from(f32::MAX)).contains(gain)));
-    bad.map(|([kp, kd], joint)| format!("has `gains` of {joint} with kp {kp} and kd {kd}; both are 0 or more"))
+    bad.map(|([kp, kd], joint)| format!("has `gains` of {joint} with kp {kp} and kd {kd}; both must be 0 or more"))
 }
 
 #[cfg(test)]
@@ -171,7 +173,7 @@ mod tests {
 
     use super::*;
     use crate::ensemble::JointEncoding;
-    use crate::scales::{Normaliser, Normalisers};
+    use crate::normaliser::{Normaliser, Normalisers};
 
     fn ensemble() -> Ensemble {
         let scale = Normaliser { mean: 0.1, std: 2.5 };
@@ -192,8 +194,8 @@ mod tests {
         Ensemble { description, members }
     }
 
-    /// What reading says after `change` to the arrays.
-    fn refusal(change: impl Fn(&mut Vec<(String, Bytes)>)) -> String {
+    /// Returns the error of reading a file after `change` to its arrays.
+    fn read_error(change: impl Fn(&mut Vec<(String, Bytes)>)) -> String {
         let (ensemble, folder) = (ensemble(), tempfile::tempdir().expect("a folder"));
         let path = folder.path().join("ensemble.safetensors");
         let mut arrays = Vec::new();
@@ -203,55 +205,55 @@ mod tests {
         }
         change(&mut arrays);
         write(&path, "ensemble", &ensemble.description, arrays).expect("written");
-        Ensemble::read(&path).expect_err("refused").to_string()
+        Ensemble::read(&path).expect_err("error").to_string()
     }
 
     #[test]
-    fn file_gives_back_every_bit_and_the_description() {
+    fn reading_inverts_writing() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("ensemble.safetensors");
         ensemble().write(&path).expect("written");
         let read = Ensemble::read(&path).expect("read");
         assert_eq!(read, ensemble());
         assert!(read.check_step("the simulation", 0.005).is_ok());
-        let error = read.check_step("the simulation", 0.001).expect_err("refused").to_string();
-        assert!(error.starts_with("the simulation has a step of 0.001 s, the model one of 0.005 s"), "{error}");
+        let error = read.check_step("the simulation", 0.001).expect_err("rejected").to_string();
+        assert!(error.starts_with("the simulation has a time step of 0.001 s, the model one of 0.005 s"), "{error}");
     }
 
     #[test]
-    fn what_is_missing_or_of_another_size_is_named() {
-        let missing = refusal(|arrays| arrays.retain(|(name, _)| name != "1.mean.bias"));
+    fn errors_name_the_array_that_is_missing_or_has_the_wrong_shape() {
+        let missing = read_error(|arrays| arrays.retain(|(name, _)| name != "1.mean.bias"));
         assert!(missing.ends_with("has no array `1.mean.bias`"), "{missing}");
-        let other = refusal(|arrays| arrays[1].1 = Bytes::floats(vec![12, 3], &[0.0; 36]));
+        let other = read_error(|arrays| arrays[1].1 = Bytes::floats(vec![12, 3], &[0.0; 36]));
         assert!(other.contains("`0.lstm.hidden_weight` as F32 [12, 3] instead of F32 [3, 12]"), "{other}");
-        let broken = refusal(|arrays| arrays[6].1 = Bytes::floats(vec![1], &[f32::NAN]));
-        assert!(broken.contains("`0.mean.bias` that is not finite"), "{broken}");
+        let nan = read_error(|arrays| arrays[6].1 = Bytes::floats(vec![1], &[f32::NAN]));
+        assert!(nan.contains("`0.mean.bias` that is not finite"), "{nan}");
     }
 
     #[test]
-    fn gains_that_no_robot_can_have_are_refused() {
-        let refused = |gains: &[[f64; 2]]| {
+    fn invalid_gains_are_rejected() {
+        let error = |gains: &[[f64; 2]]| {
             let (folder, mut ensemble) = (tempfile::tempdir().expect("a folder"), ensemble());
             let path = folder.path().join("ensemble.safetensors");
             ensemble.description.gains = gains.to_vec();
             ensemble.write(&path).expect("written");
-            Ensemble::read(&path).expect_err("refused").to_string()
+            Ensemble::read(&path).expect_err("error").to_string()
         };
-        let missing = refused(&[[20.0, 0.5]]);
-        assert!(missing.ends_with("has `gains` of 1 joints, and 2 joints; one pair each is wanted"), "{missing}");
-        let negative = refused(&[[20.0, 0.5], [20.0, -0.5]]);
-        assert!(negative.ends_with("of FL_calf with kp 20 and kd -0.5; both are 0 or more"), "{negative}");
+        let missing = error(&[[20.0, 0.5]]);
+        assert!(missing.ends_with("has `gains` of 1 joints, but 2 joints; one pair per joint is expected"), "{missing}");
+        let negative = error(&[[20.0, 0.5], [20.0, -0.5]]);
+        assert!(negative.ends_with("of FL_calf with kp 20 and kd -0.5; both must be 0 or more"), "{negative}");
     }
 
     #[test]
-    fn other_files_are_refused_by_name() {
+    fn other_files_are_rejected_with_their_path() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("other");
-        let refused = || Ensemble::read(&path).expect_err("refused").to_string();
-        assert!(refused().starts_with("cannot read `"));
+        let error = || Ensemble::read(&path).expect_err("error").to_string();
+        assert!(error().starts_with("cannot read `"));
         std::fs::write(&path, "not at all").expect("written");
-        assert!(refused().contains("is no safetensors file"));
+        assert!(error().contains("is not a safetensors file"));
         write(&path, "training", &1, Vec::new()).expect("written");
-        assert!(refused().ends_with("has no key `ensemble` in its metadata"));
+        assert!(error().ends_with("has no key `ensemble` in its metadata"));
     }
 }

@@ -1,10 +1,10 @@
-//! The GPU that a training can run on.
+//! GPU device for training.
 
 use burn::tensor::Device;
 
 use crate::EnsembleError;
 
-/// The best GPU there is as burn's device, and its name. Graphics drivers in software are the last choice.
+/// Returns the best GPU as a burn device, and its name. Software drivers are used only if there is no other.
 #[cfg(feature = "gpu")]
 pub fn best() -> Result<(Device, &'static str), EnsembleError> {
     match found() {
@@ -13,13 +13,13 @@ pub fn best() -> Result<(Device, &'static str), EnsembleError> {
     }
 }
 
-/// Without the feature there is none.
+/// Returns an error, because the feature `gpu` is off.
 #[cfg(not(feature = "gpu"))]
 pub fn best() -> Result<(Device, &'static str), EnsembleError> {
-    Err(EnsembleError::NoGpu { cause: "built without it: cargo build --release --features gpu".to_owned() })
+    Err(EnsembleError::NoGpu { cause: "built without GPU support; use `cargo build --release --features gpu`".to_owned() })
 }
 
-/// burn takes a GPU once in a process.
+/// Returns the GPU, which burn can initialise only once per process.
 #[cfg(feature = "gpu")]
 fn found() -> &'static Result<(Device, String), burn::tensor::wgpu::WgpuInitError> {
     static FOUND: std::sync::OnceLock<Result<(Device, String), burn::tensor::wgpu::WgpuInitError>> =
@@ -36,7 +36,7 @@ pub mod tests {
 
     use super::*;
 
-    /// The GPU to test on, where there is one.
+    /// Returns the GPU to test on, or `None` if there is none.
     pub fn device() -> Option<Device> {
         match found() {
             Ok((device, name)) => {
@@ -44,10 +44,10 @@ pub mod tests {
                 Some(device.clone())
             }
             Err(WgpuInitError::AdapterUnavailable { .. }) => {
-                println!("skipped: no adapter");
+                println!("skipped: no GPU");
                 None
             }
-            Err(error) => panic!("there is a GPU, but {error}"),
+            Err(error) => panic!("cannot use the GPU: {error}"),
         }
     }
 }
@@ -57,8 +57,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn build_without_it_says_how_to_get_one_with_it() {
+    fn error_without_the_feature_contains_the_build_command() {
         let error = best().map(|_| ()).expect_err("none").to_string();
-        assert_eq!(error, "cannot train on a GPU: built without it: cargo build --release --features gpu");
+        assert_eq!(error, "cannot train on a GPU: built without GPU support; use `cargo build --release --features gpu`");
     }
 }

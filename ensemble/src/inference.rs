@@ -1,17 +1,17 @@
-//! All members row by row, for many robots at once.
+//! Row-by-row inference with all members, for many robots.
 
 use twinstep_model::NUM_JOINTS;
-use twinstep_model::lanes::InstructionSet;
+use twinstep_simd::InstructionSet;
 
 use crate::ensemble::{Ensemble, Gaussian};
 use crate::kernel::Heads;
-use crate::networks::{MemberBatch, MemberSlot, networks};
-use crate::scales::Normalisers;
+use crate::member_batch::{MemberBatch, MemberSlot, member_batch};
+use crate::normaliser::Normalisers;
 
-/// An ensemble that hears robots row after row: for who has commands and encoders, but no simulator.
+/// Evaluates an ensemble row by row, for applications without a simulator.
 ///
-/// It computes in the processor's widest registers, all joints side by side. A joint's numbers depend on its own past only,
-/// and have the same bits on every processor.
+/// All joints are computed in parallel in the widest registers of the processor. The outputs of a joint depend only on
+/// its own history, and are bitwise equal on every processor.
 pub struct Inference {
     networks: Box<dyn MemberBatch>,
     members: usize,
@@ -21,30 +21,32 @@ pub struct Inference {
 }
 
 impl Inference {
-    /// `num_robots` robots whose past is unseen.
+    /// Creates the inference for `num_robots` robots, with network states of zero.
     pub fn new(ensemble: &Ensemble, num_robots: usize) -> Self {
         Self::with(ensemble, num_robots, InstructionSet::best())
     }
 
-    /// As [`Inference::new`], with these instructions.
+    /// Creates the inference like [`Inference::new`] on a given instruction set.
     ///
     /// # Panics
-    /// If the processor lacks them.
+    /// If the processor does not support the instruction set.
     pub fn with(ensemble: &Ensemble, num_robots: usize, instructions: InstructionSet) -> Self {
         let model = &ensemble.description;
-        let mut networks = networks(ensemble, instructions);
+        let mut networks = member_batch(ensemble, instructions);
         (0..model.members).for_each(|member| networks.grow(member, num_robots));
         let (scales, variance_scale) = (model.scales, model.variance_scale);
         Self { networks, members: model.members, num_robots, scales, variance_scale }
     }
 
-    /// The next row of every robot: ξ = [q_cmd − q, dq_cmd − dq] [rad, rad/s] of each joint in the order of
+    /// Advances every robot by one row.
+    ///
+    /// `errors` contains ξ = [q_cmd − q, dq_cmd − dq] [rad, rad/s] of each joint, in the order of
     /// [`twinstep_model::Joint::ALL`].
     ///
     /// # Panics
-    /// Unless there is one entry a robot.
+    /// If the number of entries is not the number of robots.
     pub fn step(&mut self, errors: &[[[f64; 2]; NUM_JOINTS]]) {
-        assert_eq!(errors.len(), self.num_robots, "one entry a robot");
+        assert_eq!(errors.len(), self.num_robots, "one entry per robot");
         let [position, velocity] = self.scales.errors;
         for (slot, errors) in errors.iter().enumerate() {
             let errors = errors.map(|[q, dq]| [position.normalise(q), velocity.normalise(dq)]);
@@ -55,7 +57,7 @@ impl Inference {
         self.networks.advance(Heads::Both);
     }
 
-    /// What a member says of a robot's torques now.
+    /// Returns the last prediction of a member for the torques of a robot.
     pub fn predictions(&self, robot: usize, member: usize) -> [Gaussian; NUM_JOINTS] {
         let [means, variances] = self.networks.output(MemberSlot { member, slot: robot });
         let scale = self.scales.torque;
@@ -66,7 +68,7 @@ impl Inference {
         })
     }
 
-    /// [`crate::disagreement`] of the members, mean over the joints, one entry a robot [nat].
+    /// Returns [`crate::epistemic_uncertainty`] of the last predictions, mean over the joints, per robot [nat].
     pub fn epistemic_uncertainty(&self) -> Vec<f32> {
         let mut found = vec![0.0; self.num_robots];
         self.networks.disagreement(self.variance_scale as f32, &mut found);
@@ -84,13 +86,13 @@ mod tests {
     use super::*;
     use crate::data::Sequence;
     use crate::ensemble::{EnsembleMetadata, JointEncoding};
-    use crate::euf::epistemic_uncertainty;
+    use crate::epistemic_uncertainty::epistemic_uncertainty;
     use crate::network::Network;
-    use crate::scales::Normaliser;
-    use crate::windows::SequenceDataset;
+    use crate::normaliser::Normaliser;
+    use crate::sequences::SequenceDataset;
 
     fn ensemble(members: usize, hidden: usize, joint_input: JointEncoding) -> Ensemble {
-        let scale = |mean, deviation| Normaliser { mean, std: deviation };
+        let scale = |mean, std| Normaliser { mean, std };
         Ensemble::untrained(EnsembleMetadata {
             members,
             hidden,
@@ -106,7 +108,7 @@ mod tests {
         })
     }
 
-    /// Motion of a joint that swings and now and then jumps.
+    /// Returns ξ of a joint in a sinusoidal motion with occasional steps.
     fn error(robot: usize, joint: usize, row: usize) -> [f64; 2] {
         let phase = (row as f64).mul_add(0.07 + 0.003 * joint as f64, robot as f64);
         let jump = if (row + 13 * joint) % 97 < 9 { 0.4 } else { 0.0 };
@@ -130,17 +132,17 @@ mod tests {
         let model = &ensemble.description;
         let batch = SequenceDataset::whole(runs.iter(), model).batch(&(0..NUM_JOINTS).collect::<Vec<_>>());
         let of_member = |weights| Network::new(model.shape(), weights, &Device::flex()).outputs(&batch);
-        let wanted: Vec<_> = ensemble.members.iter().map(of_member).collect();
-        // Not the first robot, so that its joints lie across two blocks.
+        let expected: Vec<_> = ensemble.members.iter().map(of_member).collect();
+        // The second robot, whose joints are in two blocks.
         let mut inference = Inference::with(&ensemble, 3, InstructionSet::best());
         for time in 0..ROWS {
             inference.step(&row(0..3, time));
-            for (member, wanted) in wanted.iter().enumerate() {
+            for (member, expected) in expected.iter().enumerate() {
                 let answer = inference.networks.output(MemberSlot { member, slot: 1 });
-                for (found, wanted) in answer.iter().zip(wanted) {
+                for (found, expected) in answer.iter().zip(expected) {
                     for (joint, found) in found.iter().enumerate() {
-                        let wanted = wanted[time * NUM_JOINTS + joint];
-                        assert!((found - wanted).abs() < 1e-5, "row {time}, joint {joint}: {found} {wanted}");
+                        let expected = expected[time * NUM_JOINTS + joint];
+                        assert!((found - expected).abs() < 1e-5, "row {time}, joint {joint}: {found} {expected}");
                     }
                 }
             }
@@ -148,14 +150,14 @@ mod tests {
     }
 
     #[test]
-    fn a_thousand_rows_are_burns() {
+    fn a_thousand_rows_agree_with_burn() {
         check_against_burn(JointEncoding::Pooled, 32);
         check_against_burn(JointEncoding::Kind, 7);
         check_against_burn(JointEncoding::Identity, 8);
     }
 
     #[test]
-    fn disagreement_is_the_exact_functions() {
+    fn epistemic_uncertainty_agrees_with_the_scalar_function() {
         let ensemble = ensemble(6, 16, JointEncoding::Kind);
         let mut inference = Inference::new(&ensemble, 5);
         for time in 0..40 {
@@ -168,14 +170,14 @@ mod tests {
                     members.iter().map(|member| (member[joint].mean, member[joint].variance)).unzip();
                 epistemic_uncertainty(&means, &variances)
             };
-            let wanted = (0..NUM_JOINTS).map(of_joint).sum::<f64>() / NUM_JOINTS as f64;
-            assert!((f64::from(found) - wanted).abs() < 1e-6, "{found} {wanted}");
-            assert!(wanted > 1e-3, "{wanted}");
+            let expected = (0..NUM_JOINTS).map(of_joint).sum::<f64>() / NUM_JOINTS as f64;
+            assert!((f64::from(found) - expected).abs() < 1e-6, "{found} {expected}");
+            assert!(expected > 1e-3, "{expected}");
         }
     }
 
     #[test]
-    fn one_member_agrees_with_itself() {
+    fn single_member_has_no_epistemic_uncertainty() {
         let mut inference = Inference::new(&ensemble(1, 4, JointEncoding::Pooled), 2);
         inference.step(&row(0..2, 0));
         assert_eq!(inference.epistemic_uncertainty(), [0.0, 0.0]);
@@ -184,7 +186,7 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(12))]
         #[test]
-        fn a_robots_bits_are_the_same_in_any_register_and_any_company(
+        fn outputs_are_bitwise_equal_for_any_register_and_batch(
             robots in 1usize..9, hidden in 1usize..20, rows in 1usize..30, kind: bool
         ) {
             let ensemble = ensemble(2, hidden, if kind { JointEncoding::Kind } else { JointEncoding::Identity });
@@ -196,7 +198,7 @@ mod tests {
                 (answers.map(|answer| answer.map(|numbers| numbers.map(f32::to_bits))),
                     inference.epistemic_uncertainty()[last].to_bits())
             };
-            let alone = bits(robots - 1..robots, InstructionSet::Baseline);
+            let alone = bits(robots - 1..robots, InstructionSet::BASELINE);
             for instructions in InstructionSet::available() {
                 prop_assert_eq!(bits(0..robots, instructions), alone);
             }

@@ -1,10 +1,10 @@
-//! One row of one network, for as many joints as two registers hold: the two hide each other's waiting.
+//! One row of one network, for the joints of two SIMD registers. Two registers hide the latency of the instructions.
 //!
-//! Every joint's sums are taken in one order, inputs before states, whatever the register. Nothing here may stay out of
-//! line: it is compiled for the processor's instructions below [`crate::networks`] only.
+//! The order of the sums does not depend on the register: inputs before states. All functions must be inlined, because
+//! only their callers in [`crate::member_batch`] are compiled for the instruction set of the processor.
 
-#![allow(clippy::inline_always, reason = "what stays out of line is compiled for the oldest processor")]
-#![allow(clippy::needless_range_loop, reason = "closures may be left out of line")]
+#![allow(clippy::inline_always, reason = "a function that is not inlined is compiled for the baseline instruction set")]
+#![allow(clippy::needless_range_loop, reason = "closures may not be inlined")]
 
 use twinstep_model::NUM_JOINTS;
 
@@ -12,67 +12,67 @@ use crate::activation::{wide_exp, wide_softplus, wide_tanh};
 use crate::ensemble::EnsembleMetadata;
 use crate::network::VARIANCE_FLOOR;
 use crate::weights::Weights;
-use crate::wide::Wide;
+use twinstep_simd::SimdFloat;
 
-/// Entries of ξ.
+/// Number of entries of ξ.
 const ERRORS: usize = 2;
-/// What weights of the input, forget, cell and output gate are multiplied by: σ(x) = ½ + ½ tanh(x/2), and halves are exact.
+/// Factors on the weights of the input, forget, cell and output gate: σ(x) = ½ + ½ tanh(x/2). Halving is exact.
 const HALVED: [f32; 4] = [0.5, 0.5, 1.0, 0.5];
-/// After so many blocks the joints of a block are the same again: 24, 48 and 96 lanes are whole robots.
+/// Number of blocks after which the assignment of joints to lanes repeats: 24, 48 or 96 lanes are whole robots.
 pub const PATTERNS: usize = 3;
 
-/// One number of each joint of a block.
-pub type Pair<W> = [W; 2];
+/// One number per joint of a block.
+pub type Pair<T> = [T; 2];
 
-/// A member's numbers, in the order in which they are read.
-pub struct Kernel<W> {
+/// Parameters of a member, in the order in which they are read.
+pub struct Kernel<T> {
     hidden: usize,
-    /// `[unit][entry of ξ, then state][gate]`.
+    /// Weights of the encoder, `[unit][entry of ξ, then state][gate]`.
     encoder: Vec<[f32; 4]>,
-    /// What the gates hear of the joint itself: bias and the input that is 1 for it, `[pattern][unit][gate]`.
-    gate_bias: [Vec<[Pair<W>; 4]>; PATTERNS],
+    /// Bias of the gates and weight of the joint's one-hot input, `[pattern][unit][gate]`.
+    gate_bias: [Vec<[Pair<T>; 4]>; PATTERNS],
     mean: Head,
     variance: Head,
 }
 
-/// A hidden layer and an output. Units beyond the last have weights of zero.
+/// A hidden layer and an output. The units are padded to a multiple of four with weights of zero.
 struct Head {
-    /// `[four units][state][unit]`.
+    /// Weights of the hidden layer, `[four units][state][unit]`.
     hidden: Vec<[f32; 4]>,
-    /// Bias of the hidden units, and what they weigh in the output: `[four units][unit]`.
+    /// Bias of the hidden units and their weights in the output, `[four units][unit]`.
     units: Vec<[[f32; 4]; 2]>,
     bias: f32,
 }
 
-/// What one member remembers and says of the joints of two registers.
+/// Input, state and output of one member for the joints of two registers.
 #[derive(Clone)]
-pub struct KernelState<W> {
-    /// ξ, normalised, and the encoder's states after the last row: what the gates hear.
-    pub input: Vec<Pair<W>>,
-    pub cells: Vec<Pair<W>>,
-    /// Greater than 0 where a row is to be heard; the other joints stay as they are.
-    pub active: Pair<W>,
-    /// Mean and variance, normalised.
-    pub output: [Pair<W>; 2],
-    /// Whether any joint is active.
+pub struct KernelState<T> {
+    /// Inputs of the gates: normalised ξ, and the encoder's states after the last row.
+    pub input: Vec<Pair<T>>,
+    pub cells: Vec<Pair<T>>,
+    /// Greater than 0 for joints that have an input. The states of the others do not change.
+    pub active: Pair<T>,
+    /// Normalised mean and variance.
+    pub output: [Pair<T>; 2],
+    /// True if any joint is active.
     pub has_input: bool,
-    /// Whether an answer is wanted of any joint.
+    /// True if the output of any joint is needed.
     pub output_needed: bool,
 }
 
-/// What is wanted of a network.
+/// Heads of a network to evaluate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Heads {
-    /// The means.
+    /// Means only.
     Mean,
     /// Means and variances.
     Both,
 }
 
-impl<W: Wide> KernelState<W> {
-    /// From states of zero.
+impl<T: SimdFloat> KernelState<T> {
+    /// Creates states of zero.
     pub fn new(hidden: usize) -> Self {
-        let zero = [W::splat(0.0); 2];
+        let zero = [T::splat(0.0); 2];
         Self {
             input: vec![zero; ERRORS + hidden],
             cells: vec![zero; hidden],
@@ -84,8 +84,8 @@ impl<W: Wide> KernelState<W> {
     }
 }
 
-impl<W: Wide> Kernel<W> {
-    /// Of a member of an ensemble that is described by `model`.
+impl<T: SimdFloat> Kernel<T> {
+    /// Arranges the weights of a member of the ensemble `model`.
     pub fn new(model: &EnsembleMetadata, weights: &Weights) -> Self {
         let (hidden, width) = (model.hidden, 4 * model.hidden);
         let [input, recurrent, bias] =
@@ -104,11 +104,11 @@ impl<W: Wide> Kernel<W> {
         };
         let gate_bias = std::array::from_fn(|pattern| {
             let of_unit = |unit| {
-                let mut pairs = [[W::splat(0.0); 2]; 4];
-                for lane in 0..2 * W::LANES {
-                    let start = start((pattern * 2 * W::LANES + lane) % NUM_JOINTS, unit);
+                let mut pairs = [[T::splat(0.0); 2]; 4];
+                for lane in 0..2 * T::LANES {
+                    let start = start((pattern * 2 * T::LANES + lane) % NUM_JOINTS, unit);
                     for gate in 0..4 {
-                        pairs[gate][lane / W::LANES].set(lane % W::LANES, start[gate]);
+                        pairs[gate][lane / T::LANES].set(lane % T::LANES, f64::from(start[gate]));
                     }
                 }
                 pairs
@@ -128,47 +128,47 @@ impl<W: Wide> Kernel<W> {
         }
     }
 
-    /// The active joints hear ξ. `room` is for the gates of a unit each.
+    /// Advances the active joints by one row. `room` is a workspace for the gates of each unit.
     #[inline(always)]
-    pub fn advance(&self, block: &mut KernelState<W>, pattern: usize, room: &mut [[Pair<W>; 4]]) {
-        let KernelState { input: heard, cells, active, .. } = block;
+    pub fn advance(&self, block: &mut KernelState<T>, pattern: usize, room: &mut [[Pair<T>; 4]]) {
+        let KernelState { input: inputs, cells, active, .. } = block;
         let units = self.encoder.chunks_exact(ERRORS + self.hidden).zip(&self.gate_bias[pattern]);
         for ((weights, start), sums) in units.zip(room.iter_mut()) {
             let mut gates = *start;
-            for (weights, heard) in weights.iter().zip(heard.iter()) {
+            for (weights, inputs) in weights.iter().zip(inputs.iter()) {
                 for gate in 0..4 {
-                    let weight = W::splat(weights[gate]);
+                    let weight = T::splat(f64::from(weights[gate]));
                     for half in 0..2 {
-                        gates[gate][half] = heard[half].fused(weight, gates[gate][half]);
+                        gates[gate][half] = inputs[half].mul_add(weight, gates[gate][half]);
                     }
                 }
             }
             *sums = gates;
         }
-        let (one, share) = (W::splat(1.0), W::splat(0.5));
-        // Apart from the sums, so that one unit's divisions do not hold up the next one's.
-        for ((gates, cell), state) in room.iter().zip(cells.iter_mut()).zip(&mut heard[ERRORS..]) {
+        let (zero, one, share) = (T::splat(0.0), T::splat(1.0), T::splat(0.5));
+        // A separate loop, so that the divisions of the units overlap.
+        for ((gates, cell), state) in room.iter().zip(cells.iter_mut()).zip(&mut inputs[ERRORS..]) {
             for half in 0..2 {
-                // Twice the logistic function of what the gate heard, whose half it is given.
-                let [input, forget] = [wide_tanh(gates[0][half]).plus(one), wide_tanh(gates[1][half]).plus(one)];
+                // Twice the logistic function, because the weights of these gates are halved.
+                let [input, forget] = [wide_tanh(gates[0][half]) + one, wide_tanh(gates[1][half]) + one];
                 let before = cell[half];
-                let after = share.times(forget.fused(before, input.times(wide_tanh(gates[2][half]))));
-                let output = wide_tanh(gates[3][half]).fused(share, share);
-                cell[half] = active[half].select_positive(after, before);
-                state[half] = active[half].select_positive(output.times(wide_tanh(after)), state[half]);
+                let after = share * forget.mul_add(before, input * wide_tanh(gates[2][half]));
+                let output = wide_tanh(gates[3][half]).mul_add(share, share);
+                cell[half] = zero.select_lt(active[half], after, before);
+                state[half] = zero.select_lt(active[half], output * wide_tanh(after), state[half]);
             }
         }
     }
 
-    /// What the network says of its joints.
+    /// Evaluates the heads.
     #[inline(always)]
-    pub fn answer(&self, block: &mut KernelState<W>, heads: Heads) {
+    pub fn answer(&self, block: &mut KernelState<T>, heads: Heads) {
         let states = &block.input[ERRORS..];
         block.output[0] = self.mean.output(states);
         if heads == Heads::Both {
             let raw = self.variance.output(states);
-            let floor = W::splat(VARIANCE_FLOOR as f32);
-            block.output[1] = [wide_softplus(raw[0]).plus(floor), wide_softplus(raw[1]).plus(floor)];
+            let floor = T::splat(VARIANCE_FLOOR);
+            block.output[1] = [wide_softplus(raw[0]) + floor, wide_softplus(raw[1]) + floor];
         }
     }
 }
@@ -186,26 +186,26 @@ impl Head {
     }
 
     #[inline(always)]
-    fn output<W: Wide>(&self, states: &[Pair<W>]) -> Pair<W> {
-        let zero = W::splat(0.0);
-        let mut output = [W::splat(self.bias); 2];
+    fn output<T: SimdFloat>(&self, states: &[Pair<T>]) -> Pair<T> {
+        let zero = T::splat(0.0);
+        let mut output = [T::splat(f64::from(self.bias)); 2];
         for (weights, [bias, share]) in self.hidden.chunks_exact(states.len()).zip(&self.units) {
             let mut units = [[zero; 2]; 4];
             for unit in 0..4 {
-                units[unit] = [W::splat(bias[unit]); 2];
+                units[unit] = [T::splat(f64::from(bias[unit])); 2];
             }
             for (weights, state) in weights.iter().zip(states) {
                 for unit in 0..4 {
-                    let weight = W::splat(weights[unit]);
+                    let weight = T::splat(f64::from(weights[unit]));
                     for half in 0..2 {
-                        units[unit][half] = state[half].fused(weight, units[unit][half]);
+                        units[unit][half] = state[half].mul_add(weight, units[unit][half]);
                     }
                 }
             }
             for unit in 0..4 {
                 for half in 0..2 {
-                    // What is no number is to be seen.
-                    output[half] = zero.max(units[unit][half]).fused(W::splat(share[unit]), output[half]);
+                    // `max` returns its first operand if it is NaN, so that NaN propagates.
+                    output[half] = units[unit][half].max(zero).mul_add(T::splat(f64::from(share[unit])), output[half]);
                 }
             }
         }
@@ -213,28 +213,28 @@ impl Head {
     }
 }
 
-/// How much the members agree: the mean over all pairs of Zᵢⱼ/√(ZᵢᵢZⱼⱼ), whose −log is [`crate::disagreement`].
+/// Returns the mean over all pairs of Zᵢⱼ/√(ZᵢᵢZⱼⱼ), whose −log is [`crate::epistemic_uncertainty`].
 ///
-/// `answers` has the mean and the variance of each member, in any unit; each variance is multiplied by `variance_scale`
-/// first, and the deviations are left in its place.
+/// `outputs` contains the mean and the variance of each member, in any unit. Each variance is first multiplied by
+/// `variance_scale`, and replaced by the standard deviation.
 #[inline(always)]
-pub fn agreement<W: Wide>(answers: &mut [[W; 2]], variance_scale: f32) -> W {
-    let (members, minus_half) = (answers.len() as f32, W::splat(-0.5));
-    for [_, spread] in answers.iter_mut() {
-        *spread = spread.times(W::splat(variance_scale)).sqrt();
+pub fn agreement<T: SimdFloat>(outputs: &mut [[T; 2]], variance_scale: f32) -> T {
+    let (members, minus_half) = (outputs.len() as f32, T::splat(-0.5));
+    for [_, variance] in outputs.iter_mut() {
+        *variance = (*variance * T::splat(f64::from(variance_scale))).sqrt();
     }
-    let mut pairs = W::splat(0.0);
-    for (index, [mean, deviation]) in answers.iter().enumerate() {
-        for [other_mean, other_deviation] in &answers[..index] {
-            let variance = deviation.fused(*deviation, other_deviation.times(*other_deviation));
-            let share = W::splat(1.0).over(variance);
-            let apart = mean.minus(*other_mean);
-            let product = deviation.times(*other_deviation);
-            let alike = product.plus(product).times(share).sqrt();
-            pairs = alike.fused(wide_exp(apart.times(apart).times(share).times(minus_half)), pairs);
+    let mut pairs = T::splat(0.0);
+    for (index, [mean, std]) in outputs.iter().enumerate() {
+        for [other_mean, other_std] in &outputs[..index] {
+            let variance = std.mul_add(*std, *other_std * *other_std);
+            let share = T::splat(1.0) / variance;
+            let difference = *mean - *other_mean;
+            let product = *std * *other_std;
+            let normaliser = ((product + product) * share).sqrt();
+            pairs = normaliser.mul_add(wide_exp(difference * difference * share * minus_half), pairs);
         }
     }
-    // Each pair counts twice, and each member is its own.
-    let sum = pairs.fused(W::splat(2.0), W::splat(members));
-    W::splat(1.0).min(sum.times(W::splat(1.0 / (members * members))))
+    // Each pair counts twice, and each member forms a pair with itself.
+    let sum = pairs.mul_add(T::splat(2.0), T::splat(f64::from(members)));
+    T::splat(1.0).min(sum * T::splat(f64::from(1.0 / (members * members))))
 }

@@ -1,63 +1,62 @@
-//! Learned drives that know what they do not know: a deep ensemble of recurrent networks (U2E §II-B, III-A, III-B).
+//! Actuator networks with epistemic uncertainty: a deep ensemble of LSTMs (U2E §II-B, III-A, III-B).
 //!
-//! A network sees what a joint's controller sees, ξ = [Δq, Δq̇] (command less measurement), row after row, and gives the
-//! joint's torque as a Gaussian. Several of them, which differ in their first weights and in the order of what they learnt
-//! from, agree where they have seen data and disagree where they have not. These types carry the crate:
+//! The input of a network is ξ = [Δq, Δq̇] of one joint (command minus measurement), row after row. The output is the
+//! joint torque as a Gaussian. The members differ in their initial weights and in the order of the training data.
+//! Their predictions agree where there are training data and differ elsewhere. The main types:
 //!
-//! - [`DataSet`] is measured logs as runs of rows without a gap, in three roles by blocks of time: to learn from, to stop
-//!   by, to judge by.
-//! - [`Training`] trains the members of an ensemble, tells its progress, ends when asked to, and goes on from a
-//!   [`Checkpoint`] as if it had never ended. It does so on the CPU, or with the feature `gpu` on a GPU.
-//! - [`Ensemble`] is the trained members with all that their numbers depend on ([`Description`]): time step, scales, joints,
-//!   sensor, gains. It predicts, and it is read from and written to a safetensors file.
-//! - [`Calibration`] says how often the truth lies where an ensemble says it does.
-//! - [`disagreement`] and [`jensen_renyi`] turn the members' Gaussians into epistemic uncertainty, the latter as the
-//!   paper has it.
-//! - [`LearnedRobot`] is a model file's robot with an ensemble in place of its drives, and what is left of it to simulate;
-//!   [`LearnedDrives`], which it makes, drives many robots in either engine and tells what it does not know about them.
-//! - [`Inference`] hears robots row by row without a simulator; [`BurnInference`] is the same in burn's operations, to be
-//!   measured beside it.
-//! - [`EnsembleError`] says what is wrong with a log or a file, and how to mend it.
+//! - [`DataSet`]: measured logs as sequences of contiguous rows. Blocks of time are split into training, validation
+//!   and test data.
+//! - [`Training`]: trains the members of an ensemble on the CPU, or with the feature `gpu` on a GPU. It reports
+//!   progress, can be interrupted, and resumes from a [`Checkpoint`] with the same result.
+//! - [`Ensemble`]: the trained members with their [`EnsembleMetadata`] (time step, normalisers, joints, sensor, gains).
+//!   It predicts torques and is stored in a safetensors file.
+//! - [`Calibration`]: empirical coverage of the prediction intervals on the test split.
+//! - [`epistemic_uncertainty`] and [`jensen_renyi`]: epistemic uncertainty from the members' Gaussians, the latter as
+//!   in U2E.
+//! - [`ActuatorNetworkRobot`]: the robot of a model file whose actuators are replaced by an ensemble. It creates the
+//!   [`ActuatorNetwork`], which computes the torques of many robots in either engine, and their epistemic uncertainty.
+//! - [`Inference`]: evaluates an ensemble row by row without a simulator. [`BurnInference`] is the baseline in burn's
+//!   operations.
+//! - [`EnsembleError`]: describes what is wrong with a log or a file, and how to fix it.
 //!
-//! SI units: torques in \[N·m], errors in \[rad] and \[rad/s]. What a network computes is normalised; nothing normalised
-//! leaves the crate. The step of time is part of a model: one of another step is refused.
+//! Public quantities are in SI units: torques in \[N·m], errors in \[rad] and \[rad/s]. The networks compute with
+//! normalised quantities. The time step is part of a model: other time steps are rejected.
 
 mod activation;
 mod adam;
-mod by_hand;
+mod synthetic;
 mod calibration;
 mod checkpoint;
 mod data;
-mod drives;
+mod actuator_network;
 mod encoder;
 mod ensemble;
 mod error;
-mod euf;
+mod epistemic_uncertainty;
 mod file;
 mod gpu;
 mod inference;
 mod kernel;
-mod learned_robot;
+mod actuator_network_robot;
 mod member;
 mod network;
-mod networks;
-mod reference;
-mod scales;
+mod member_batch;
+mod burn_inference;
+mod normaliser;
 mod smooth;
 mod train;
 mod weights;
-mod wide;
-mod windows;
+mod sequences;
 
 pub use calibration::{Calibration, Coverage};
 pub use checkpoint::Checkpoint;
 pub use data::{Split, DataSet, Sequence};
-pub use drives::ActuatorNetwork;
+pub use actuator_network::ActuatorNetwork;
 pub use ensemble::{EnsembleMetadata, Ensemble, Gaussian, JointEncoding};
 pub use error::EnsembleError;
-pub use euf::{epistemic_uncertainty, jensen_renyi};
+pub use epistemic_uncertainty::{epistemic_uncertainty, jensen_renyi};
 pub use inference::Inference;
-pub use learned_robot::ActuatorNetworkRobot;
-pub use reference::BurnInference;
-pub use scales::{Normaliser, Normalisers};
+pub use actuator_network_robot::ActuatorNetworkRobot;
+pub use burn_inference::BurnInference;
+pub use normaliser::{Normaliser, Normalisers};
 pub use train::{Epoch, TrainingOptions, TrainingResult, TrainingEvent, Training};

@@ -1,4 +1,4 @@
-//! The training of one member.
+//! Training of one member.
 
 use burn::module::Module;
 use burn::optim::ModuleOptimizer;
@@ -12,36 +12,38 @@ use crate::checkpoint::MemberState;
 use crate::network::Network;
 use crate::train::{Epoch, TrainingOptions};
 use crate::weights::{Shape, Weights};
-use crate::windows::SequenceDataset;
+use crate::sequences::SequenceDataset;
 
-/// Most sequences of a batch, and of a part of the validation.
+/// Maximum number of sequences in a batch.
 const LARGEST_BATCH: usize = 256;
-/// Least sequences of a batch; small data sets have at least [`STEPS`] batches an epoch down to this.
+/// Minimum number of sequences in a batch.
 const SMALLEST_BATCH: usize = 16;
+/// Number of batches per epoch, as far as the limits of the batch size allow.
 const STEPS: usize = 20;
-/// Adam's first learning rate.
+/// Initial learning rate of Adam.
 const LEARNING_RATE: f64 = 5e-3;
-/// What the rate is multiplied by after [`PATIENCE`] epochs without a better validation.
+/// Factor by which the learning rate decays after [`PATIENCE`] epochs without a better validation loss.
 const LR_DECAY: f64 = 0.3;
+/// Number of epochs without a better validation loss before a decay.
 const PATIENCE: usize = 4;
-/// The cut that ends the training instead.
+/// Number of decays at which the training ends.
 const MAX_LR_DECAYS: i32 = 4;
-/// A better validation is better by this [nat].
+/// Minimum decrease of the validation loss that counts as better [nat].
 const MIN_DELTA: f64 = 1e-3;
-/// Gradients of an array are no longer than this.
+/// Maximum norm of the gradient of each array.
 const MAX_GRAD_NORM: f32 = 1.0;
-/// What a saved optimiser is of that burn cannot read.
-const VERSION: &str = "versions of this program";
+/// What differs if burn cannot load a saved optimiser.
+const VERSION: &str = "program versions";
 
-/// How a pass over the data ended.
+/// How an epoch ended.
 pub enum EpochEnd {
-    /// At its end.
+    /// All sequences were used.
     Done,
-    /// The caller stopped it; what was learnt since the last end is to be forgotten.
+    /// The caller stopped it. The updates of this epoch must be discarded.
     Stopped,
 }
 
-/// A member in training.
+/// Trains one member.
 pub struct MemberTrainer<'a> {
     index: usize,
     options: &'a TrainingOptions,
@@ -53,7 +55,7 @@ pub struct MemberTrainer<'a> {
 }
 
 impl<'a> MemberTrainer<'a> {
-    /// From where `state` left off, on any device.
+    /// Resumes a training from `state` on any device.
     pub fn new(
         index: usize,
         options: &'a TrainingOptions,
@@ -71,8 +73,9 @@ impl<'a> MemberTrainer<'a> {
         Ok(Self { index, options, shape, network, optimizer, best: state.best, curve: state.curve })
     }
 
-    /// Learns from every sequence once, in an order of its own. `each` hears of every batch how many sequences it had, and
-    /// stops the epoch when it answers `false`.
+    /// Trains for one epoch: every sequence once, in an order that depends on the member.
+    ///
+    /// `each` is called after every batch with its number of sequences, and stops the epoch by returning `false`.
     pub fn epoch(
         &mut self,
         sequences: &SequenceDataset,
@@ -107,7 +110,7 @@ impl<'a> MemberTrainer<'a> {
         Ok(EpochEnd::Done)
     }
 
-    /// Where it stands at an epoch's end.
+    /// Returns the state at the end of an epoch.
     pub fn state(&self) -> Result<MemberState, EnsembleError> {
         let optimizer = self.optimizer.into_bytes().map_err(|_| EnsembleError::OtherTraining { what: VERSION })?;
         Ok(MemberState {
@@ -118,7 +121,7 @@ impl<'a> MemberTrainer<'a> {
         })
     }
 
-    /// Mean negative log-likelihood over `windows`.
+    /// Returns the mean negative log-likelihood of `windows` [nat].
     fn nll(&self, windows: &SequenceDataset) -> f64 {
         let network = self.network.valid();
         let order: Vec<usize> = (0..windows.len()).collect();
@@ -132,22 +135,22 @@ impl<'a> MemberTrainer<'a> {
     }
 }
 
-/// Whether the training of a member with this `curve` is over.
+/// Returns true if the training of a member with this `curve` is finished.
 pub fn finished(curve: &[Epoch], options: &TrainingOptions) -> bool {
     curve.len() >= options.epochs || schedule(curve).is_none()
 }
 
-/// The learning rate after the epochs of `curve`; none when it is time to end.
+/// Returns the learning rate after the epochs of `curve`, or `None` if the training ends.
 fn schedule(curve: &[Epoch]) -> Option<f64> {
-    let (mut best, mut stale, mut cuts) = (f64::INFINITY, 0, 0);
+    let (mut best, mut stale, mut decays) = (f64::INFINITY, 0, 0);
     for epoch in curve {
         stale = if epoch.validation_nll < best - MIN_DELTA { 0 } else { stale + 1 };
         best = best.min(epoch.validation_nll);
         if stale == PATIENCE {
-            (stale, cuts) = (0, cuts + 1);
+            (stale, decays) = (0, decays + 1);
         }
     }
-    (cuts < MAX_LR_DECAYS).then(|| LEARNING_RATE * LR_DECAY.powi(cuts))
+    (decays < MAX_LR_DECAYS).then(|| LEARNING_RATE * LR_DECAY.powi(decays))
 }
 
 #[cfg(test)]
@@ -159,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn rate_falls_when_validation_stays_and_the_fourth_time_training_ends() {
+    fn rate_decays_without_a_better_validation_loss_and_the_fourth_time_training_ends() {
         assert_eq!(rate(&[3.0, 2.0, 1.0, 0.0, -1.0]), Some(LEARNING_RATE));
         assert_eq!(rate(&[1.0, 2.0, 2.0, 2.0, 2.0]), Some(LEARNING_RATE * LR_DECAY));
         assert_eq!(rate(&[1.0, 2.0, 2.0, 2.0, 0.0, 2.0]), Some(LEARNING_RATE));

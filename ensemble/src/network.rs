@@ -1,4 +1,4 @@
-//! One member: an LSTM encoder, and a head each for the mean and the variance of the torque.
+//! One member: an LSTM encoder with one head for the mean and one for the variance of the torque.
 
 use burn::module::{Module, Param, ParamId};
 use burn::optim::GradientsParams;
@@ -7,12 +7,12 @@ use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::encoder::Encoder;
 use crate::weights::{Shape, Weights};
-use crate::windows::Batch;
+use crate::sequences::Batch;
 
-/// Least variance, normalised (U2E §IV-B).
+/// Minimum normalised variance (U2E §IV-B).
 pub const VARIANCE_FLOOR: f64 = 1e-6;
 
-/// A network of U2E §IV-B; its arrays are those of [`Shape::layout`], in that order.
+/// A network of U2E §IV-B. Its arrays are in the order of [`Shape::layout`].
 #[derive(Module, Debug)]
 pub struct Network {
     input_weight: Param<Tensor<2>>,
@@ -32,10 +32,10 @@ struct Head {
 }
 
 impl Network {
-    /// The network with `weights`, whose arrays have the lengths of `shape`.
+    /// Creates a network of the given `shape` with `weights`.
     pub fn new(shape: Shape, weights: &Weights, device: &Device) -> Self {
         let mut arrays = shape.layout().into_iter().enumerate().map(|(index, (name, dimensions))| {
-            // Fixed names, so that a saved optimiser finds its parameters again.
+            // Fixed ids, so that the state of a saved optimiser is assigned to the same parameters.
             (ParamId::from(index as u64 + 1), TensorData::new(weights[name].clone(), dimensions))
         });
         let mut next = || arrays.next().expect("the layout lists every array");
@@ -48,7 +48,7 @@ impl Network {
         }
     }
 
-    /// Its numbers.
+    /// Returns the weights.
     pub fn weights(&self, shape: Shape) -> Weights {
         let [mean, variance] = [&self.mean, &self.variance].map(Head::values);
         let encoder = [values(&self.input_weight), values(&self.hidden_weight), values(&self.gate_bias)];
@@ -56,23 +56,24 @@ impl Network {
         shape.layout().into_iter().map(|(name, _)| name).zip(arrays).collect()
     }
 
-    /// Mean and variance of the torque of every row, normalised: two of `[time · batch]`, from states of zero.
+    /// Returns the normalised mean and variance of the torque of every row, each `[time · batch]`, from states of zero.
     pub fn outputs(&self, batch: &Batch) -> [Vec<f32>; 2] {
         self.heads(self.states(batch)).map(|tensor| tensor.into_data().try_into_vec().expect("the outputs are f32"))
     }
 
-    /// Mean over the rows that count of the Gaussian negative log-likelihood [nat], normalised (U2E equation 5, with the
-    /// constant ½ log 2π that makes it one).
+    /// Returns the Gaussian negative log-likelihood of normalised torque, mean over the rows of the mask [nat].
+    ///
+    /// U2E, eq. 5, with the constant ½ log 2π that U2E omits.
     pub fn nll(&self, batch: &Batch) -> f32 {
         nll(self.heads(self.states(batch)), batch).into_scalar()
     }
 
-    /// That and its gradients, of a network on an autodiff device.
+    /// Returns the loss [`Network::nll`] and its gradients. The network must be on an autodiff device.
     pub fn loss_and_gradients(&self, batch: &Batch) -> (f32, GradientsParams) {
         if self.on_cpu() { self.manual_backward(batch) } else { self.autodiff_backward(batch) }
     }
 
-    /// The heads are burn's to differentiate, as far back as the encoder's states; from there it is the encoder's own way.
+    /// Differentiates the heads with burn, and the encoder with its hand-written backward pass.
     fn manual_backward(&self, batch: &Batch) -> (f32, GradientsParams) {
         let encoder = self.encoder();
         let tape = encoder.forward(batch);
@@ -96,7 +97,7 @@ impl Network {
         (loss.into_scalar(), gradients)
     }
 
-    /// Whether it is where the encoder by hand is.
+    /// Returns true if the hand-written encoder can be used.
     fn on_cpu(&self) -> bool {
         self.hidden_weight.val().device() == Device::flex()
     }
@@ -109,7 +110,7 @@ impl Network {
         }
     }
 
-    /// The encoder's states, `[time · batch, hidden]`.
+    /// Returns the encoder's states, `[time · batch, hidden]`.
     fn states(&self, batch: &Batch) -> Tensor<2> {
         if self.on_cpu() {
             Tensor::from_data(self.encoder().forward(batch).states(), &self.hidden_weight.val().device())
@@ -118,20 +119,22 @@ impl Network {
         }
     }
 
-    /// As [`Network::states`] on any device, for autodiff too.
+    /// Returns the encoder's states like [`Network::states`], on any device and with automatic differentiation.
     fn states_by_burn(&self, batch: &Batch) -> Tensor<2> {
         let (device, [units, _]) = (self.hidden_weight.val().device(), self.hidden_weight.val().dims());
         let inputs = Tensor::<2>::from_data(batch.inputs(), &device);
-        let nothing = Tensor::<2>::zeros([batch.size, units], &device);
-        let (mut memory, mut states) = ([nothing.clone(), nothing], Vec::new());
+        let zeros = Tensor::<2>::zeros([batch.size, units], &device);
+        let (mut state, mut states) = ([zeros.clone(), zeros], Vec::new());
         for time in 0..batch.steps {
-            memory = self.lstm_step(inputs.clone().narrow(0, time * batch.size, batch.size), memory);
-            states.push(memory[1].clone());
+            state = self.lstm_step(inputs.clone().narrow(0, time * batch.size, batch.size), state);
+            states.push(state[1].clone());
         }
         Tensor::cat(states, 0)
     }
 
-    /// Cells and states after one more row, in burn's operations; inputs `[batch, inputs]`, memory two of `[batch, hidden]`.
+    /// Advances the LSTM by one row in burn's operations and returns cells and states.
+    ///
+    /// Inputs are `[batch, inputs]`, cells and states `[batch, hidden]`.
     pub fn lstm_step(&self, inputs: Tensor<2>, [cell, state]: [Tensor<2>; 2]) -> [Tensor<2>; 2] {
         let [_, units] = cell.dims();
         let gates = inputs.matmul(self.input_weight.val())
@@ -143,7 +146,7 @@ impl Network {
         [cell, state]
     }
 
-    /// Mean and variance, two of `[time · batch, 1]`.
+    /// Returns the normalised mean and variance, each `[time · batch, 1]`.
     pub fn heads(&self, states: Tensor<2>) -> [Tensor<2>; 2] {
         [self.mean.forward(states.clone()), softplus(self.variance.forward(states)) + VARIANCE_FLOOR]
     }
@@ -167,7 +170,7 @@ impl Head {
         }
     }
 
-    /// `[rows, hidden]` to `[rows, 1]`.
+    /// Maps `[rows, hidden]` to `[rows, 1]`.
     fn forward(&self, rows: Tensor<2>) -> Tensor<2> {
         let hidden = relu(rows.matmul(self.hidden_weight.val()) + self.hidden_bias.val().unsqueeze());
         hidden.matmul(self.weight.val()) + self.bias.val().unsqueeze()
@@ -187,7 +190,7 @@ fn values<const D: usize>(parameter: &Param<Tensor<D>>) -> Vec<f32> {
     parameter.val().into_data().try_into_vec().expect("the parameters are f32")
 }
 
-/// log(1 + exp(x)), without overflow. burn's own passes over the tensor eight times.
+/// Returns log(1 + exp(x)) without overflow. burn's own implementation takes eight passes over the tensor.
 fn softplus(x: Tensor<2>) -> Tensor<2> {
     relu(x.clone()) + (-x.abs()).exp().log1p()
 }
@@ -200,7 +203,7 @@ mod tests {
     use crate::data::tests::log;
     use crate::data::{Split, DataSet};
     use crate::train::{TrainingOptions, Training};
-    use crate::windows::SequenceDataset;
+    use crate::sequences::SequenceDataset;
 
     const SHAPE: Shape = Shape { inputs: 2, hidden: 8 };
 
@@ -208,19 +211,21 @@ mod tests {
         Network::new(SHAPE, &SHAPE.random(&mut stream(1, "weights", 0)), device)
     }
 
-    /// Two sequences, one of them with rows that do not count.
+    /// Returns two sequences, one of which has burn-in rows.
     fn batch() -> Batch {
         let data = DataSet::new(&[("here".to_owned(), log(2000, |_, _| {}))]).expect("a set");
         let training = Training::new(&data, TrainingOptions { hidden: 8, ..TrainingOptions::default() }).expect("options");
         SequenceDataset::sequences(data.runs(Split::Training), &training.description).batch(&[0, 3])
     }
 
-    /// Holds loss and gradients to those of the encoder by hand, within 10⁻⁵ of the largest of an array or of 1.
-    fn check_by_burn(device: &Device) {
+    /// Compares loss and gradients with those of the hand-written encoder.
+    ///
+    /// The tolerance is 10⁻⁵ times the largest element of an array, or times 1 if that is larger.
+    fn check_against_burn(device: &Device) {
         let (by_hand, by_burn, batch) =
             (network(&Device::flex().autodiff()), network(&device.clone().autodiff()), batch());
-        let ((wanted_loss, wanted), (loss, found)) = (by_hand.manual_backward(&batch), by_burn.autodiff_backward(&batch));
-        assert!((loss - wanted_loss).abs() < 1e-5, "{loss} for {wanted_loss}");
+        let ((expected_loss, expected), (loss, found)) = (by_hand.manual_backward(&batch), by_burn.autodiff_backward(&batch));
+        assert!((loss - expected_loss).abs() < 1e-5, "{loss} for {expected_loss}");
         for (index, (name, dimensions)) in SHAPE.layout().into_iter().enumerate() {
             let id = ParamId::from(index as u64 + 1);
             let numbers = |all: &GradientsParams| -> Vec<f32> {
@@ -230,28 +235,28 @@ mod tests {
                 };
                 data.and_then(|data| data.try_into_vec().ok()).expect("a gradient")
             };
-            let (wanted, found) = (numbers(&wanted), numbers(&found));
-            let largest = wanted.iter().fold(1.0_f32, |largest, one| largest.max(one.abs()));
-            let worst = wanted.iter().zip(&found).map(|(one, other)| (one - other).abs()).fold(0.0, f32::max);
-            assert!(found.len() == wanted.len() && worst < 1e-5 * largest, "{name}: {worst} of {largest}");
+            let (expected, found) = (numbers(&expected), numbers(&found));
+            let largest = expected.iter().fold(1.0_f32, |largest, one| largest.max(one.abs()));
+            let worst = expected.iter().zip(&found).map(|(one, other)| (one - other).abs()).fold(0.0, f32::max);
+            assert!(found.len() == expected.len() && worst < 1e-5 * largest, "{name}: {worst} of {largest}");
         }
     }
 
     #[test]
-    fn encoder_by_hand_has_the_loss_and_the_gradients_that_burn_finds() {
-        check_by_burn(&Device::flex());
+    fn loss_and_gradients_of_the_hand_written_encoder_agree_with_burn() {
+        check_against_burn(&Device::flex());
     }
 
     #[cfg(feature = "gpu")]
     #[test]
-    fn gpu_has_the_loss_and_the_gradients_of_the_encoder_by_hand() {
+    fn loss_and_gradients_on_a_gpu_agree_with_the_hand_written_encoder() {
         if let Some(device) = crate::gpu::tests::device() {
-            check_by_burn(&device);
+            check_against_burn(&device);
         }
     }
 
     #[test]
-    fn gradients_are_the_slopes_of_the_loss() {
+    fn gradients_agree_with_finite_differences() {
         let (device, batch) = (Device::flex().autodiff(), batch());
         let weights = network(&device).weights(SHAPE);
         let (_, gradients) = network(&device).loss_and_gradients(&batch);
@@ -260,24 +265,24 @@ mod tests {
             .get::<2>(network.hidden_weight.id)
             .and_then(|gradient| gradient.into_data().try_into_vec().ok())
             .expect("a gradient");
-        let loss = |place: usize, change: f32| {
+        let loss = |index: usize, change: f32| {
             let mut weights = weights.clone();
-            weights.get_mut("lstm.hidden_weight").expect("there")[place] += change;
+            weights.get_mut("lstm.hidden_weight").expect("there")[index] += change;
             Network::new(SHAPE, &weights, &Device::flex()).nll(&batch)
         };
         let step = 1e-2;
-        for place in (0..by_hidden.len()).step_by(17) {
-            let slope = (loss(place, step) - loss(place, -step)) / (2.0 * step);
+        for index in (0..by_hidden.len()).step_by(17) {
+            let derivative = (loss(index, step) - loss(index, -step)) / (2.0 * step);
             assert!(
-                (slope - by_hidden[place]).abs() < 1e-4 + 0.02 * slope.abs(),
-                "{place}: {slope} {}",
-                by_hidden[place]
+                (derivative - by_hidden[index]).abs() < 1e-4 + 0.02 * derivative.abs(),
+                "{index}: {derivative} {}",
+                by_hidden[index]
             );
         }
     }
 
     #[test]
-    fn variance_is_never_below_its_floor() {
+    fn variance_is_at_least_its_floor() {
         let mut weights = SHAPE.random(&mut stream(1, "weights", 0));
         weights.insert("variance.bias", vec![-1e4]);
         let [_, variances] = Network::new(SHAPE, &weights, &Device::flex()).outputs(&batch());

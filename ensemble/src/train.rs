@@ -1,4 +1,4 @@
-//! Training: every member on its own, as many at once as there are threads.
+//! Training: the members are independent, and one thread trains one member at a time.
 
 use std::collections::VecDeque;
 use std::sync::Mutex;
@@ -16,25 +16,25 @@ use crate::data::{Split, DataSet};
 use crate::ensemble::{EnsembleMetadata, Ensemble, JointEncoding};
 use crate::gpu;
 use crate::member::{EpochEnd, MemberTrainer, finished};
-use crate::scales::Normalisers;
-use crate::windows::SequenceDataset;
+use crate::normaliser::Normalisers;
+use crate::sequences::SequenceDataset;
 
-/// How often the caller is asked whether to go on.
+/// Maximum time between two calls of `progress`.
 const TICK: Duration = Duration::from_millis(100);
 
-/// How an ensemble is trained.
+/// Options of a training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainingOptions {
     /// Number of networks.
     pub members: usize,
-    /// Units of each encoder.
+    /// Number of LSTM units.
     pub hidden: usize,
-    /// What a network is told of the joint.
+    /// Encoding of the joint in the input.
     pub joint_input: JointEncoding,
-    /// Most passes over the data.
+    /// Maximum number of epochs.
     pub epochs: usize,
-    /// Seed of first weights and order of data: equal seeds give equal ensembles, whatever the number of threads.
+    /// Seed of initial weights and order of the data. Equal seeds give equal ensembles for any number of threads.
     pub seed: u64,
 }
 
@@ -47,66 +47,66 @@ impl Default for TrainingOptions {
 
 impl TrainingOptions {
     fn check(&self) -> Result<(), EnsembleError> {
-        for (option, given, most) in
+        for (option, given, max) in
             [("members", self.members, 100), ("hidden", self.hidden, 512), ("epochs", self.epochs, 100_000)]
         {
-            if !(1..=most).contains(&given) {
-                return Err(EnsembleError::Option { option, given, most });
+            if !(1..=max).contains(&given) {
+                return Err(EnsembleError::Option { option, given, most: max });
             }
         }
         Ok(())
     }
 }
 
-/// A pass over the data.
+/// Losses of one epoch.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Epoch {
-    /// Mean negative log-likelihood of the training rows while they were learnt from [nat, of torque in N·m].
+    /// Mean negative log-likelihood of the training rows during the epoch, of torque in N·m [nat].
     pub training_nll: f64,
-    /// That of the validation rows after it.
+    /// Mean negative log-likelihood of the validation rows after the epoch [nat].
     pub validation_nll: f64,
 }
 
-/// How far a training is.
+/// Progress of a training.
 pub enum TrainingEvent<'a> {
-    /// Sequences that members have learnt from since the last time.
+    /// Number of sequences that were processed since the last event.
     Sequences(usize),
-    /// A member has ended an epoch, which is the last of its `curve`.
+    /// A member has completed an epoch, the last of its `curve`.
     Epoch {
         /// Index of the member.
         member: usize,
-        /// Whether it was the member's last.
+        /// True if the training of the member is finished.
         done: bool,
-        /// All its epochs so far.
+        /// All epochs of the member so far.
         curve: &'a [Epoch],
-        /// From here the training can go on later.
+        /// State from which the training can be resumed.
         checkpoint: &'a Checkpoint,
     },
-    /// A tenth of a second has passed without news.
+    /// 0.1 s have passed without another event.
     Tick,
 }
 
-/// How a training ended.
+/// Result of a training.
 #[derive(Debug)]
 pub enum TrainingResult {
-    /// All members are trained; the epochs of each.
+    /// The trained ensemble, and the epochs of each member.
     Trained(Box<Ensemble>, Vec<Vec<Epoch>>),
-    /// The caller ended it; from here it can go on.
+    /// The caller interrupted the training, which can be resumed from this state.
     Interrupted(Checkpoint),
 }
 
-/// Data and settings of a training.
+/// Data and options of a training.
 pub struct Training<'a> {
     data: &'a DataSet,
     options: TrainingOptions,
-    /// Of the ensemble, before variances are scaled.
+    /// Metadata of the ensemble before the calibration of the variances.
     pub(crate) description: EnsembleMetadata,
     sequences: SequenceDataset,
     validation: SequenceDataset,
     device: Device,
 }
 
-/// News from a thread.
+/// Message from a worker thread.
 enum WorkerMessage {
     Sequences(usize),
     Epoch(usize, Box<MemberState>),
@@ -114,7 +114,7 @@ enum WorkerMessage {
 }
 
 impl<'a> Training<'a> {
-    /// Fails if a setting is out of range.
+    /// Prepares a training. Fails if an option is out of range.
     pub fn new(data: &'a DataSet, options: TrainingOptions) -> Result<Self, EnsembleError> {
         options.check()?;
         let description = EnsembleMetadata {
@@ -136,23 +136,24 @@ impl<'a> Training<'a> {
         Ok(Self { data, options, description, sequences, validation, device: Device::flex() })
     }
 
-    /// Trains on the best GPU there is, whose name it gives, in place of the CPU.
+    /// Selects the best GPU for training instead of the CPU, and returns its name.
     ///
-    /// Numbers differ by rounding; a checkpoint goes on on either. Needs the feature `gpu`.
+    /// Results differ by rounding. A checkpoint can be resumed on either. Requires the feature `gpu`.
     pub fn on_gpu(&mut self) -> Result<&'static str, EnsembleError> {
         let (device, name) = gpu::best()?;
         self.device = device;
         Ok(name)
     }
 
-    /// Sequences that a member learns from in an epoch.
+    /// Returns the number of sequences per epoch of a member.
     pub fn sequences_an_epoch(&self) -> usize {
         self.sequences.len()
     }
 
-    /// Trains all members on `threads` threads (on a GPU one after another), from `resume` on where there is one.
+    /// Trains all members on `threads` threads, or resumes from a checkpoint. On a GPU they are trained in turn.
     ///
-    /// `progress` is called ten times a second and more, in the caller's thread, and ends the training when it answers `false`.
+    /// `progress` is called at least ten times per second on the caller's thread. It interrupts the training by
+    /// returning `false`.
     pub fn run(
         &self,
         threads: usize,
@@ -165,20 +166,20 @@ impl<'a> Training<'a> {
         };
         let done = |member: &MemberState| finished(&member.curve, &self.options);
         let all = checkpoint.members.iter().cloned().enumerate();
-        let waiting: VecDeque<_> = all.filter(|(_, member)| !done(member)).collect();
-        let (waiting, stop) = (Mutex::new(waiting), AtomicBool::new(false));
-        let most = if self.device == Device::flex() { self.options.members } else { 1 };
+        let queue: VecDeque<_> = all.filter(|(_, member)| !done(member)).collect();
+        let (queue, stop) = (Mutex::new(queue), AtomicBool::new(false));
+        let max = if self.device == Device::flex() { self.options.members } else { 1 };
         std::thread::scope(|scope| {
-            let (sender, news) = channel();
-            for _ in 0..threads.clamp(1, most) {
+            let (sender, messages) = channel();
+            for _ in 0..threads.clamp(1, max) {
                 let sender = sender.clone();
-                let (waiting, stop) = (&waiting, &stop);
-                scope.spawn(move || self.work(waiting, stop, sender));
+                let (queue, stop) = (&queue, &stop);
+                scope.spawn(move || self.work(queue, stop, sender));
             }
             drop(sender);
             let mut failure = None;
             loop {
-                let go_on = match news.recv_timeout(TICK) {
+                let proceed = match messages.recv_timeout(TICK) {
                     Ok(WorkerMessage::Sequences(count)) => progress(TrainingEvent::Sequences(count)),
                     Ok(WorkerMessage::Epoch(member, state)) => {
                         checkpoint.members[member] = *state;
@@ -193,7 +194,7 @@ impl<'a> Training<'a> {
                     Err(RecvTimeoutError::Timeout) => progress(TrainingEvent::Tick),
                     Err(RecvTimeoutError::Disconnected) => break,
                 };
-                if !go_on {
+                if !proceed {
                     stop.store(true, Ordering::Relaxed);
                 }
             }
@@ -208,34 +209,34 @@ impl<'a> Training<'a> {
         Ok(TrainingResult::Trained(Box::new(ensemble), curves))
     }
 
-    /// Trains one waiting member after another.
-    fn work(&self, waiting: &Mutex<VecDeque<(usize, MemberState)>>, stop: &AtomicBool, sender: Sender<WorkerMessage>) {
-        let next = || waiting.lock().ok()?.pop_front().filter(|_| !stop.load(Ordering::Relaxed));
-        // Nobody listens once the caller's thread has panicked.
-        let tell = |news| sender.send(news).is_ok();
+    /// Trains the members of the queue one after another.
+    fn work(&self, queue: &Mutex<VecDeque<(usize, MemberState)>>, stop: &AtomicBool, sender: Sender<WorkerMessage>) {
+        let next = || queue.lock().ok()?.pop_front().filter(|_| !stop.load(Ordering::Relaxed));
+        // Sending fails if the caller's thread has panicked.
+        let send = |message| sender.send(message).is_ok();
         while let Some((index, state)) = next() {
-            let trained = self.member(index, state, stop, &tell);
+            let trained = self.member(index, state, stop, &send);
             if let Err(error) = trained {
-                tell(WorkerMessage::Failed(error));
+                send(WorkerMessage::Failed(error));
                 return;
             }
         }
     }
 
-    /// Trains a member to its end, or until `stop`.
+    /// Trains a member until it is finished, or until `stop`.
     fn member(
         &self,
         index: usize,
         state: MemberState,
         stop: &AtomicBool,
-        tell: &dyn Fn(WorkerMessage) -> bool,
+        send: &dyn Fn(WorkerMessage) -> bool,
     ) -> Result<(), EnsembleError> {
         let mut member = MemberTrainer::new(index, &self.options, self.description.shape(), state, &self.device)?;
-        let mut each = |sequences| tell(WorkerMessage::Sequences(sequences)) && !stop.load(Ordering::Relaxed);
+        let mut each = |sequences| send(WorkerMessage::Sequences(sequences)) && !stop.load(Ordering::Relaxed);
         while let EpochEnd::Done = member.epoch(&self.sequences, &self.validation, &mut each)? {
             let state = member.state()?;
             let done = finished(&state.curve, &self.options);
-            if !tell(WorkerMessage::Epoch(index, Box::new(state))) || done {
+            if !send(WorkerMessage::Epoch(index, Box::new(state))) || done {
                 break;
             }
         }
@@ -260,25 +261,25 @@ mod tests {
     fn trained(outcome: TrainingResult) -> (Ensemble, Vec<Vec<Epoch>>) {
         match outcome {
             TrainingResult::Trained(ensemble, curves) => (*ensemble, curves),
-            TrainingResult::Interrupted(_) => panic!("it had no reason to end"),
+            TrainingResult::Interrupted(_) => panic!("the training was interrupted"),
         }
     }
 
     #[test]
-    fn ensemble_learns_a_late_drive_to_its_noise_and_knows_how_large_that_is() {
+    fn error_and_sharpness_of_a_delayed_actuator_are_close_to_the_noise() {
         let data = data();
         let (ensemble, curves) =
             trained(Training::new(&data, options(60)).and_then(|t| t.run(2, None, &mut |_| true)).expect("trains"));
         let found = Calibration::of(&ensemble, &data);
         assert!(found.rmse < 1.3 * NOISE, "{} N·m", found.rmse);
         let [_, ninety, _] = found.mixture[1].empirical;
-        assert!((0.85..=0.95).contains(&ninety), "{ninety} of the truth in the 90 % interval");
+        assert!((0.85..=0.95).contains(&ninety), "{ninety} of the rows are in the 90 % interval");
         assert!((0.8..1.3).contains(&(found.sharpness / NOISE)), "{} N·m", found.sharpness);
         assert!(curves.iter().all(|curve| curve[curve.len() - 1].validation_nll < curve[0].validation_nll));
     }
 
     #[test]
-    fn training_goes_on_from_a_file_to_the_same_bits_on_any_number_of_threads() {
+    fn resumed_training_is_bitwise_equal_on_any_number_of_threads() {
         let (data, folder) = (data(), tempfile::tempdir().expect("a folder"));
         let training = Training::new(&data, options(4)).expect("options");
         let whole = trained(training.run(1, None, &mut |_| true).expect("trains"));
@@ -287,7 +288,7 @@ mod tests {
             epochs += usize::from(matches!(progress, TrainingEvent::Epoch { .. }));
             epochs < 3
         });
-        let Ok(TrainingResult::Interrupted(checkpoint)) = ended else { panic!("it was told to end") };
+        let Ok(TrainingResult::Interrupted(checkpoint)) = ended else { panic!("the training was not interrupted") };
         let path = folder.path().join("training");
         checkpoint.write(&path).expect("written");
         let read = || Checkpoint::read(&path).expect("read");
@@ -295,14 +296,14 @@ mod tests {
 
         let other = |options| {
             let training = Training::new(&data, options).expect("options");
-            training.run(1, Some(read()), &mut |_| true).expect_err("refused").to_string()
+            training.run(1, Some(read()), &mut |_| true).expect_err("rejected").to_string()
         };
-        assert!(other(TrainingOptions { seed: 2, ..options(4) }).contains("other settings"));
+        assert!(other(TrainingOptions { seed: 2, ..options(4) }).contains("different settings"));
     }
 
     #[cfg(feature = "gpu")]
     #[test]
-    fn gpu_learns_what_the_cpu_learns_and_each_goes_on_where_the_other_ended() {
+    fn training_on_a_gpu_agrees_with_the_cpu_and_each_resumes_the_other() {
         if gpu::tests::device().is_none() {
             return;
         }
@@ -311,24 +312,24 @@ mod tests {
         let (on_cpu, mut on_gpu) = (training(), training());
         on_gpu.on_gpu().expect("a GPU");
         let curves = |training: &Training, resume| trained(training.run(2, resume, &mut |_| true).expect("trains")).1;
-        let wanted = curves(&on_cpu, None);
-        let close = |found: Vec<Vec<Epoch>>| {
-            for (found, wanted) in found.iter().flatten().zip(wanted.iter().flatten()) {
-                let apart = (found.validation_nll - wanted.validation_nll).abs();
-                assert!(apart < 1e-3, "{found:?} for {wanted:?}");
-                println!("{apart:e} nat");
+        let expected = curves(&on_cpu, None);
+        let assert_close = |found: Vec<Vec<Epoch>>| {
+            for (found, expected) in found.iter().flatten().zip(expected.iter().flatten()) {
+                let difference = (found.validation_nll - expected.validation_nll).abs();
+                assert!(difference < 1e-3, "{found:?} for {expected:?}");
+                println!("{difference:e} nat");
             }
         };
-        close(curves(&on_gpu, None));
+        assert_close(curves(&on_gpu, None));
         for [first, second] in [[&on_cpu, &on_gpu], [&on_gpu, &on_cpu]] {
             let ended = first.run(1, None, &mut |progress| !matches!(progress, Progress::Epoch { .. }));
-            let Ok(TrainingResult::Interrupted(checkpoint)) = ended else { panic!("it was told to end") };
-            close(curves(second, Some(checkpoint)));
+            let Ok(TrainingResult::Interrupted(checkpoint)) = ended else { panic!("the training was not interrupted") };
+            assert_close(curves(second, Some(checkpoint)));
         }
     }
 
     #[test]
-    fn network_that_is_told_the_joint_learns_drives_that_differ() {
+    fn joint_encoding_distinguishes_different_actuators() {
         let strong = log(4000, |_, columns| {
             let weak = |name: &str| {
                 let (_, cells) = columns.iter().find(|(column, _)| column == name).expect("a column");
@@ -343,16 +344,16 @@ mod tests {
             let training = Training::new(&data, TrainingOptions { joint_input, ..options(15) }).expect("options");
             Calibration::of(&trained(training.run(2, None, &mut |_| true).expect("trains")).0, &data).rmse
         };
-        let [pooled, told] = [JointEncoding::Pooled, JointEncoding::Identity].map(rmse);
-        assert!(told < 0.5 * pooled, "{told} N·m, pooled {pooled} N·m");
-        let of_a_kind = Training::new(&data, TrainingOptions { joint_input: JointEncoding::Kind, ..options(15) });
-        let error = of_a_kind.map(|_| ()).expect_err("refused").to_string();
-        assert!(error.starts_with("joint `knee` is no hip, thigh or calf of a Go2"), "{error}");
+        let [pooled, encoded] = [JointEncoding::Pooled, JointEncoding::Identity].map(rmse);
+        assert!(encoded < 0.5 * pooled, "{encoded} N·m, pooled {pooled} N·m");
+        let with_joint_type = Training::new(&data, TrainingOptions { joint_input: JointEncoding::Kind, ..options(15) });
+        let error = with_joint_type.map(|_| ()).expect_err("rejected").to_string();
+        assert!(error.starts_with("joint `knee` is not a hip, thigh or calf of a Go2"), "{error}");
     }
 
     #[test]
-    fn setting_out_of_range_is_named() {
-        let error = Training::new(&data(), TrainingOptions { members: 0, ..options(4) }).map(|_| ()).expect_err("refused");
-        assert_eq!(error.to_string(), "`members` = 0 is outside 1..=100");
+    fn error_names_the_option_out_of_range() {
+        let error = Training::new(&data(), TrainingOptions { members: 0, ..options(4) }).map(|_| ()).expect_err("rejected");
+        assert_eq!(error.to_string(), "`members` = 0 is not allowed: 1 to 100");
     }
 }

@@ -1,24 +1,24 @@
-//! The numbers of one network, by name.
+//! Weights of one network, by name.
 
 use std::collections::BTreeMap;
 
 use rand::RngExt;
 use twinstep_model::Stream;
 
-/// Weights of one member, row-major, by the names that the file gives them.
+/// Weights of one member, row-major, by their names in the file.
 pub type Weights = BTreeMap<&'static str, Vec<f32>>;
 
 /// Sizes of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shape {
-    /// Entries of an input row.
+    /// Number of inputs.
     pub inputs: usize,
-    /// Units of the encoder and of each head's hidden layer.
+    /// Number of units of the encoder and of each head's hidden layer.
     pub hidden: usize,
 }
 
 impl Shape {
-    /// Name and dimensions of each array, `[from, to]`; gates in the order input, forget, cell, output.
+    /// Returns name and dimensions `[from, to]` of each array. The order of gates is input, forget, cell, output.
     pub fn layout(self) -> [(&'static str, Vec<usize>); 11] {
         let Shape { inputs, hidden } = self;
         [
@@ -36,8 +36,10 @@ impl Shape {
         ]
     }
 
-    /// Weights to start from: uniform within ±1/√hidden, as in PyTorch's LSTM, but forget gates one higher, so that what
-    /// happened ten rows ago is heard of from the first step of training on.
+    /// Samples initial weights.
+    ///
+    /// Uniform within ±1/√hidden, as in PyTorch's LSTM. The bias of the forget gates is one higher, so that gradients
+    /// propagate over ten rows from the first step of training.
     pub fn random(self, random: &mut Stream) -> Weights {
         let bound = 1.0 / (self.hidden as f32).sqrt();
         let mut weights: Weights = (self.layout().into_iter())

@@ -1,4 +1,4 @@
-//! The server's config file (TOML). Every command-line flag has its key here.
+//! The server's config file (TOML). Every command-line flag of the server has a key here.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -7,17 +7,17 @@ use serde::{Deserialize, Serialize};
 use twinstep_envs::{Randomisation, TaskConfig};
 use twinstep_sim::SimConfig;
 
-/// A config file: four tables, all keys optional.
+/// The config file of a server: four tables, in which every key is optional.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Where and for whom the server answers.
+    /// Network settings, limits and robot of the server.
     pub server: ServerConfig,
-    /// What the robots are asked to do.
+    /// The task and its rewards.
     pub task: TaskConfig,
-    /// How they are simulated.
+    /// Simulation settings.
     pub sim: SimConfig,
-    /// How they differ from each other.
+    /// Domain randomisation.
     pub randomise: Randomisation,
 }
 
@@ -25,23 +25,23 @@ pub struct Config {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ServerConfig {
-    /// The robot's name; clients find the server by it.
+    /// Name of the robot; clients select the server by it.
     pub name: String,
-    /// Where the server listens: a Zenoh endpoint such as `tcp/127.0.0.1:7447`; port 0 takes a free one.
+    /// Zenoh endpoint to listen at, such as `tcp/127.0.0.1:7447`. Port 0 selects a free port.
     pub listen: String,
-    /// Routers to connect to, in place of listening only.
+    /// Zenoh endpoints of routers to connect to, in addition to listening.
     pub connect: Vec<String>,
-    /// Zenoh configuration (JSON5) for TLS, users and access control; `listen` and `connect` are put into it.
+    /// Zenoh configuration file (JSON5) for TLS, users and access control; `listen` and `connect` override its values.
     pub zenoh: Option<PathBuf>,
-    /// Move large messages through shared memory when both ends are on one machine.
+    /// Sends large messages through shared memory if client and server run on one machine.
     pub shared_memory: bool,
-    /// The most environments hosted in all.
+    /// Maximum total number of environments.
     pub envs: usize,
-    /// Model file of the robot; the ideal Go2 without.
+    /// Model file of the robot. Default: the ideal Go2.
     pub model: Option<PathBuf>,
-    /// Time that a lost client's environments wait for it [s].
+    /// Time for which the environments of a disconnected client are kept [s].
     pub lease_grace_s: f64,
-    /// Seed of environments that no client seeds; drawn anew at each start without.
+    /// Seed of environments that the client does not seed. Default: a random seed at each start.
     pub seed: Option<u64>,
 }
 
@@ -62,13 +62,13 @@ impl Default for ServerConfig {
 }
 
 impl ServerConfig {
-    /// Time that a lost client's environments wait for it.
+    /// Returns the time for which the environments of a disconnected client are kept.
     pub fn lease_grace(&self) -> Duration {
         Duration::from_secs_f64(self.lease_grace_s)
     }
 }
 
-/// Why a config was refused.
+/// Reasons why a config file is rejected.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigFileError {
     /// The file could not be read.
@@ -76,7 +76,7 @@ pub enum ConfigFileError {
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The text is not TOML, a key is unknown, or a value has the wrong type.
@@ -84,7 +84,7 @@ pub enum ConfigFileError {
     Malformed {
         /// The file.
         name: String,
-        /// What is wrong and where.
+        /// Description of the error and its location.
         message: String,
     },
     /// A value is outside its range.
@@ -94,10 +94,10 @@ pub enum ConfigFileError {
         field: &'static str,
         /// Its value.
         value: String,
-        /// What is allowed.
+        /// The allowed values.
         allowed: &'static str,
     },
-    /// A setting of the task or its randomisation is not allowed.
+    /// A setting of the task or of its randomisation is not allowed.
     #[error(transparent)]
     Task(#[from] twinstep_envs::ConfigError),
 }
@@ -111,7 +111,7 @@ impl Config {
         Self::parse(&text, &path.display().to_string())
     }
 
-    /// Reads the text of a config file; errors call it `name`.
+    /// Parses the text of a config file. Errors refer to the file as `name`.
     pub fn parse(text: &str, name: &str) -> Result<Self, ConfigFileError> {
         let config: Self = toml::from_str(text)
             .map_err(|error| ConfigFileError::Malformed { name: name.to_owned(), message: error.to_string() })?;
@@ -119,7 +119,9 @@ impl Config {
         Ok(config)
     }
 
-    /// Fails if a value is outside its range. `sim` is checked against the robot's drive when environments are built.
+    /// Checks that every value is within its range.
+    ///
+    /// [`SimEnvFactory::new`](crate::SimEnvFactory::new) checks `sim`, because its limits depend on the robot.
     pub fn check(&self) -> Result<(), ConfigFileError> {
         let server = &self.server;
         let out_of_range = |field, value: String, allowed| Err(ConfigFileError::OutOfRange { field, value, allowed });

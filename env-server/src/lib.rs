@@ -1,20 +1,20 @@
-//! Vectorised Go2 environments behind Zenoh: sessions and leases, exactly-once stepping, shutdown.
+//! Serves vectorised Go2 environments over Zenoh: leases, exactly-once execution, shutdown.
 //!
-//! - [`Server`]: one process start. [`Server::start`] opens Zenoh and answers; [`Server::stop`] finishes the steps in
-//!   progress and tells the clients.
-//! - [`Host`]: who builds the environments that a client asked for; [`SimHost`] builds them from a [`Config`].
-//! - [`Config`]: the config file with `[server]`, `[task]`, `[sim]` and `[randomise]`.
+//! - [`Server`]: one run of a server. [`Server::start`] opens Zenoh and answers requests. [`Server::shutdown`] finishes
+//!   the steps in progress and notifies the clients.
+//! - [`EnvFactory`]: builds the environments of a lease. [`SimEnvFactory`] builds simulated ones from a [`Config`].
+//! - [`Config`]: the config file with the tables `[server]`, `[task]`, `[sim]` and `[randomise]`.
 //!
-//! Three kinds of thread: Zenoh's own only enqueue; the *desk* grants leases and watches who lives; one *worker* a lease
-//! owns its environments and does what it is asked in order, so that a repeated request waits for the one in progress
-//! and then gets its reply again.
+//! There are three kinds of thread. Zenoh's threads only enqueue requests. The *lease manager* grants leases and
+//! monitors the liveliness of clients. One *worker* per lease owns its environments and executes its requests in order.
+//! A repeated request therefore waits for the one in progress and gets its reply.
 
 mod config;
-mod desk;
-mod host;
+mod lease_manager;
+mod env_factory;
 mod server;
 mod worker;
 
 pub use config::{Config, ConfigFileError, ServerConfig};
-pub use host::{EnvFactory, EnvFactoryError, SimEnvFactory};
+pub use env_factory::{EnvFactory, EnvFactoryError, SimEnvFactory};
 pub use server::{Server, ServerError};

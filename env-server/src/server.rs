@@ -1,4 +1,4 @@
-//! One start of the server: its Zenoh session, its desk, its end.
+//! One run of a server: its Zenoh session, its lease manager and its shutdown.
 
 use std::collections::HashMap;
 use std::collections::hash_map::RandomState;
@@ -17,13 +17,13 @@ use zenoh::query::Queryable;
 use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait};
 
-use crate::desk::{LeaseManager, LeaseManagerMessage, ServerInfo, dispatch};
+use crate::lease_manager::{LeaseManager, LeaseManagerMessage, ServerInfo, dispatch};
 use crate::worker::ServerState;
 use crate::{EnvFactory, EnvFactoryError, ServerConfig};
 
-/// Requests that may wait at the desk.
+/// Capacity of the lease manager's queue.
 const LEASE_QUEUE: usize = 1024;
-/// How long clients that ask on are told of the shutdown before the session closes.
+/// Time between the start of a shutdown and the end of the session, in which requests get `shutting_down`.
 pub const SHUTDOWN_GRACE: Duration = Duration::from_millis(200);
 
 /// A running server.
@@ -32,132 +32,132 @@ pub struct Server {
     session: Session,
     queryable: Queryable<()>,
     token: LivelinessToken,
-    desk: SyncSender<LeaseManagerMessage>,
-    desk_thread: JoinHandle<()>,
+    lease_queue: SyncSender<LeaseManagerMessage>,
+    lease_thread: JoinHandle<()>,
     shared: Arc<ServerState>,
 }
 
-/// Why a server could not start.
+/// Reasons why a server cannot start.
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
-    /// The Zenoh configuration file was refused.
-    #[error("the Zenoh configuration {}: {reason}", path.display())]
+    /// The Zenoh configuration file is invalid.
+    #[error("Zenoh configuration {}: {reason}", path.display())]
     ZenohConfig {
         /// The file.
         path: PathBuf,
-        /// What Zenoh said.
+        /// Error of Zenoh.
         reason: String,
     },
-    /// A value was refused by Zenoh.
-    #[error("`server.{field}` = {value} is refused by Zenoh: {reason}")]
+    /// Zenoh rejected a value.
+    #[error("Zenoh rejects `server.{field}` = {value}: {reason}")]
     Setting {
         /// The key.
         field: &'static str,
         /// Its value.
         value: String,
-        /// What Zenoh said.
+        /// Error of Zenoh.
         reason: String,
     },
     /// The session could not be opened.
     #[error(
-        "cannot listen at {listen}: {reason}\n  if another server runs there, give this one another endpoint: \
-         `--listen tcp/127.0.0.1:0` takes a free port"
+        "cannot listen at {listen}: {reason}\n  if another server uses this endpoint, choose a different one: \
+         `--listen tcp/127.0.0.1:0` selects a free port"
     )]
     Open {
         /// The endpoint.
         listen: String,
-        /// What Zenoh said.
+        /// Error of Zenoh.
         reason: String,
     },
-    /// The session refused a declaration.
-    #[error("cannot answer at {key}: {reason}")]
+    /// The session rejected a declaration.
+    #[error("cannot declare the key {key}: {reason}")]
     Declare {
         /// The key.
         key: String,
-        /// What Zenoh said.
+        /// Error of Zenoh.
         reason: String,
     },
     /// The environments cannot be built.
     #[error(transparent)]
     Host(#[from] EnvFactoryError),
-    /// The system gave no thread.
-    #[error("cannot start the desk's thread: {0}")]
+    /// The operating system could not start a thread.
+    #[error("cannot start the lease manager's thread: {0}")]
     Thread(std::io::Error),
 }
 
 impl Server {
-    /// Opens Zenoh as `config` says and answers with the environments of `host`.
-    pub fn start(config: &ServerConfig, host: Arc<dyn EnvFactory>) -> Result<Self, ServerError> {
-        // One environment tells the spec, and that the host can build any.
-        let spec = host.build(1, AutoresetMode::NextStep, None)?.spec().clone();
+    /// Opens a Zenoh session as in `config` and serves the environments that `factory` builds.
+    pub fn start(config: &ServerConfig, factory: Arc<dyn EnvFactory>) -> Result<Self, ServerError> {
+        // One environment provides the spec, and shows before the first lease that the factory works.
+        let spec = factory.build(1, AutoresetMode::NextStep, None)?.spec().clone();
         let sid = random_id();
         let session = zenoh::open(zenoh_config(config)?)
             .wait()
             .map_err(|error| ServerError::Open { listen: config.listen.clone(), reason: error.to_string() })?;
-        let (desk, jobs) = sync_channel(LEASE_QUEUE);
+        let (lease_queue, jobs) = sync_channel(LEASE_QUEUE);
         let routes = Arc::new(RwLock::new(HashMap::new()));
         let shared = Arc::new(ServerState { shutting_down: AtomicBool::new(false), env_steps: AtomicU64::new(0) });
-        let facts = ServerInfo {
+        let info = ServerInfo {
             name: config.name.clone(),
             sid: sid.clone(),
             spec,
             max_envs: config.envs,
             lease_grace: config.lease_grace(),
         };
-        let own = LeaseManager::new(facts, host, Arc::clone(&shared), Arc::clone(&routes), desk.clone());
-        let desk_thread = std::thread::Builder::new()
-            .name("desk".to_owned())
-            .spawn(move || own.run(&jobs))
+        let lease_manager = LeaseManager::new(info, factory, Arc::clone(&shared), Arc::clone(&routes), lease_queue.clone());
+        let lease_thread = std::thread::Builder::new()
+            .name("lease-manager".to_owned())
+            .spawn(move || lease_manager.run(&jobs))
             .map_err(ServerError::Thread)?;
-        watch_clients(&session, &sid, desk.clone())?;
+        watch_clients(&session, &sid, lease_queue.clone())?;
         let queryable = {
-            let (sid, desk, key) = (sid.clone(), desk.clone(), keys::server(&sid));
+            let (sid, lease_queue, key) = (sid.clone(), lease_queue.clone(), keys::server(&sid));
             session
                 .declare_queryable(&key)
                 .complete(true)
-                .callback(move |query| dispatch(query, &sid, &routes, &desk))
+                .callback(move |query| dispatch(query, &sid, &routes, &lease_queue))
                 .wait()
                 .map_err(|error| ServerError::Declare { key, reason: error.to_string() })?
         };
-        // Last, so that whoever sees the token is answered.
+        // The token is declared last: a client that sees it can send requests.
         let key = keys::live_server(&sid, &config.name);
         let token = session
             .liveliness()
             .declare_token(&key)
             .wait()
             .map_err(|error| ServerError::Declare { key, reason: error.to_string() })?;
-        Ok(Self { sid, session, queryable, token, desk, desk_thread, shared })
+        Ok(Self { sid, session, queryable, token, lease_queue, lease_thread, shared })
     }
 
-    /// The server's id, new with each start.
+    /// Returns the id of the server, which is new at each start.
     pub fn sid(&self) -> &str {
         &self.sid
     }
 
-    /// Where the server listens, with the port that the system gave.
+    /// Returns the endpoints at which the server listens, with the actual port instead of port 0.
     pub fn endpoints(&self) -> Vec<String> {
         self.session.info().locators().wait().iter().map(ToString::to_string).collect()
     }
 
-    /// Environment steps executed so far.
+    /// Returns the number of environment steps executed so far.
     pub fn env_steps(&self) -> u64 {
         self.shared.env_steps.load(Ordering::Relaxed)
     }
 
-    /// Finishes the steps in progress, tells the clients, and closes the session.
+    /// Finishes the steps in progress, notifies the clients, and closes the session.
     pub fn shutdown(self) {
         self.shared.shutting_down.store(true, Ordering::Release);
-        // Clients that watch see the token go; those that ask get `shutting_down`.
+        // Clients detect that the token disappears; new requests get `shutting_down`.
         let _ = self.token.undeclare().wait();
-        let _ = self.desk.send(LeaseManagerMessage::Stop);
+        let _ = self.lease_queue.send(LeaseManagerMessage::Stop);
         std::thread::sleep(SHUTDOWN_GRACE);
         let _ = self.queryable.undeclare().wait();
-        let _ = self.desk_thread.join();
+        let _ = self.lease_thread.join();
         let _ = self.session.close().wait();
     }
 }
 
-fn watch_clients(session: &Session, sid: &str, desk: SyncSender<LeaseManagerMessage>) -> Result<(), ServerError> {
+fn watch_clients(session: &Session, sid: &str, lease_queue: SyncSender<LeaseManagerMessage>) -> Result<(), ServerError> {
     let key = keys::live_clients(sid);
     let own_sid = sid.to_owned();
     session
@@ -166,8 +166,8 @@ fn watch_clients(session: &Session, sid: &str, desk: SyncSender<LeaseManagerMess
         .history(true)
         .callback(move |sample| {
             if let Some(client) = keys::parse_live_client(sample.key_expr().as_str(), &own_sid) {
-                // Blocks only while a thousand requests wait; losing the news would keep a dead client's environments.
-                let _ = desk.send(LeaseManagerMessage::Client(client.to_owned(), sample.kind() == SampleKind::Put));
+                // Blocks only while the queue is full. A dropped message would keep the lease of a disconnected client.
+                let _ = lease_queue.send(LeaseManagerMessage::Client(client.to_owned(), sample.kind() == SampleKind::Put));
             }
         })
         .background()
@@ -175,7 +175,7 @@ fn watch_clients(session: &Session, sid: &str, desk: SyncSender<LeaseManagerMess
         .map_err(|error| ServerError::Declare { key, reason: error.to_string() })
 }
 
-/// The Zenoh configuration: the user's file, then what Twinstep relies on.
+/// Returns the Zenoh configuration: the user's file, overridden by the settings that Twinstep requires.
 fn zenoh_config(config: &ServerConfig) -> Result<zenoh::Config, ServerError> {
     let mut zenoh = match &config.zenoh {
         Some(path) => zenoh::Config::from_file(path)
@@ -190,13 +190,14 @@ fn zenoh_config(config: &ServerConfig) -> Result<zenoh::Config, ServerError> {
         ("connect", "connect/endpoints", &connect),
         ("zenoh", "mode", "\"peer\""),
         ("zenoh", "scouting/multicast/enabled", "false"),
-        // A frozen peer is noticed after 2 s in place of Zenoh's 10.
+        // An unresponsive peer is detected after 2 s instead of Zenoh's 10 s.
         ("zenoh", "transport/link/tx/lease", "2000"),
-        // Room for a step of 4096 robots, which Zenoh sends in twelve parts: with its own two, whoever writes waits for
-        // whoever sends after every second part, and whoever receives takes new memory for each.
+        // A step of 4096 robots is sent in twelve fragments. With Zenoh's default queue of two, the writing thread
+        // waits for the sending thread after every second fragment. With its default buffer, the receiver allocates
+        // each one.
         ("zenoh", "transport/link/tx/queue/size/data", "16"),
         ("zenoh", "transport/link/rx/buffer_size", "2097152"),
-        // A router that comes back is found within a second in place of Zenoh's four.
+        // The connection to a restarted router is restored within 1 s instead of Zenoh's 4 s.
         ("zenoh", "connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
         ("shared_memory", "transport/shared_memory/enabled", if config.shared_memory { "true" } else { "false" }),
     ];
@@ -210,28 +211,28 @@ fn zenoh_config(config: &ServerConfig) -> Result<zenoh::Config, ServerError> {
     Ok(zenoh)
 }
 
-/// Fails if the configuration asks for users and their file names none: Zenoh would then let everyone in.
+/// Checks that a dictionary file of users, if configured, is not empty. Zenoh would accept every client.
 fn check_users(config: &ServerConfig, zenoh: &zenoh::Config) -> Result<(), ServerError> {
     let Some(path) = &config.zenoh else { return Ok(()) };
     let setting = zenoh.get_json("transport/auth/usrpwd/dictionary_file").unwrap_or_default();
     let Ok(Some(users)) = serde_json::from_str::<Option<PathBuf>>(&setting) else { return Ok(()) };
-    let refuse = |reason: String| Err(ServerError::ZenohConfig { path: path.clone(), reason });
+    let reject = |reason: String| Err(ServerError::ZenohConfig { path: path.clone(), reason });
     match std::fs::read_to_string(&users) {
-        Ok(text) if text.trim().is_empty() => refuse(format!(
-            "its `dictionary_file` {} names no user, and Zenoh would let everyone in\n  write one `user:password` a line",
+        Ok(text) if text.trim().is_empty() => reject(format!(
+            "its `dictionary_file` {} is empty, so Zenoh would accept every client\n  write one `user:password` per line",
             users.display()
         )),
         Ok(_) => Ok(()),
-        Err(error) => refuse(format!("its `dictionary_file` {}: {error}", users.display())),
+        Err(error) => reject(format!("its `dictionary_file` {}: {error}", users.display())),
     }
 }
 
-/// A random number from the system's entropy.
+/// Returns a random number from the entropy of the operating system.
 pub fn random_u64() -> u64 {
     RandomState::new().build_hasher().finish()
 }
 
-/// A random id of 16 hexadecimal digits.
+/// Returns a random id of 16 hexadecimal digits.
 pub fn random_id() -> String {
     format!("{:016x}", random_u64())
 }

@@ -1,8 +1,8 @@
-//! The worker of one lease: owns its environments and executes every request exactly once, in order.
+//! Worker of one lease: owns its environments and executes every request exactly once, in order.
 //!
-//! Requests carry the lease's epoch and a sequence number. The next number is executed and its reply kept; the same
-//! number again gets that reply again; anything else is a typed error. A request that is refused without effect leaves
-//! its number free. `render` has no number: it reads, and is answered between two requests.
+//! Requests carry the lease's epoch and a sequence number. The worker executes the next number and caches the reply.
+//! A repeated number gets the cached reply. Any other number is an error. A request that is rejected without effect
+//! does not consume its number. `render` only reads: it has no number and is answered between two requests.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -17,9 +17,9 @@ use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
 use crate::EnvFactory;
-use crate::desk::LeaseManagerMessage;
+use crate::lease_manager::LeaseManagerMessage;
 
-/// What a worker is asked.
+/// Request to a worker.
 pub enum WorkerRequest {
     /// A query at one of the lease's keys.
     Env(EnvMethod, Query),
@@ -27,28 +27,28 @@ pub enum WorkerRequest {
     Lease {
         /// The query to answer.
         query: Query,
-        /// The lease's epoch from here on; a new one if it is handed over.
+        /// Epoch of the lease from this request on; increased if the lease is reclaimed.
         epoch: u64,
     },
 }
 
-/// What a worker shares with the desk.
+/// State that the workers share with the server.
 pub struct ServerState {
-    /// Set when the server shuts down: nothing new is executed.
+    /// True once the server shuts down; no new request is executed.
     pub shutting_down: AtomicBool,
     /// Environment steps executed by all workers.
     pub env_steps: AtomicU64,
 }
 
-/// What was granted.
+/// Parameters of a granted lease.
 pub struct LeaseParams {
-    /// The lease's id.
+    /// Id of the lease.
     pub lease: String,
     /// Number of environments.
     pub num_envs: usize,
-    /// When an ended episode starts anew.
+    /// When a new episode starts after one has ended.
     pub autoreset: AutoresetMode,
-    /// Policy steps after which an episode is truncated, in place of the task's own.
+    /// Number of policy steps after which an episode is truncated. Default: that of the task.
     pub max_episode_steps: Option<u32>,
 }
 
@@ -57,17 +57,17 @@ pub struct Worker {
     grant: LeaseParams,
     env: Box<dyn VecEnv>,
     shared: Arc<ServerState>,
-    desk: SyncSender<LeaseManagerMessage>,
+    lease_queue: SyncSender<LeaseManagerMessage>,
     epoch: u64,
     last_seq: u64,
-    /// Verb and reply of `last_seq`.
+    /// Method and reply of `last_seq`.
     last_reply: Option<(EnvMethod, CachedReply)>,
     actions: Vec<f32>,
-    /// Why the environments can no longer be used, once they cannot.
+    /// Reason why the environments cannot be used any more; `None` while they can.
     failure: Option<String>,
 }
 
-/// An encoded reply, kept for repeats. Cloning shares the bytes.
+/// An encoded reply, cached for repeated requests. Cloning shares the bytes.
 #[derive(Clone)]
 enum CachedReply {
     Ok(ZBytes),
@@ -75,19 +75,19 @@ enum CachedReply {
 }
 
 impl Worker {
-    /// Builds the environments and answers until the lease is freed. Runs on the worker's own thread.
-    pub fn run(grant: LeaseParams, host: &dyn EnvFactory, shared: Arc<ServerState>, desk: SyncSender<LeaseManagerMessage>, jobs: &Receiver<WorkerRequest>) {
+    /// Builds the environments and handles requests until the lease is released. Runs on a thread of its own.
+    pub fn run(grant: LeaseParams, factory: &dyn EnvFactory, shared: Arc<ServerState>, lease_queue: SyncSender<LeaseManagerMessage>, jobs: &Receiver<WorkerRequest>) {
         let built = catch_unwind(AssertUnwindSafe(|| {
-            host.build(grant.num_envs, grant.autoreset, grant.max_episode_steps).map_err(|error| error.to_string())
+            factory.build(grant.num_envs, grant.autoreset, grant.max_episode_steps).map_err(|error| error.to_string())
         }));
         let env = match built.unwrap_or_else(|panic| Err(panic_text(&panic))) {
             Ok(env) => env,
-            Err(reason) => return reject_all(jobs, &desk, &grant.lease, &reason),
+            Err(reason) => return reject_all(jobs, &lease_queue, &grant.lease, &reason),
         };
         let mut worker = Self {
             env,
             shared,
-            desk,
+            lease_queue,
             epoch: 1,
             last_seq: 0,
             last_reply: None,
@@ -95,7 +95,7 @@ impl Worker {
             failure: None,
             grant,
         };
-        // Ends when the desk drops the lease, and with it the sender.
+        // The loop ends when the lease manager removes the lease and so drops the sender.
         while let Ok(job) = jobs.recv() {
             match job {
                 WorkerRequest::Env(verb, query) => {
@@ -113,9 +113,9 @@ impl Worker {
     fn transfer(&mut self, epoch: u64) -> CachedReply {
         self.epoch = epoch;
         if let Some(reason) = &self.failure {
-            // Nothing can be done with this lease: make room for the next.
+            // The lease is unusable: release its environments for another lease.
             self.request_release();
-            return CachedReply::Err(broken(reason));
+            return CachedReply::Err(lost_environments(reason));
         }
         CachedReply::Ok(ZBytes::from(encode(&message::LeaseReply {
             protocol: PROTOCOL,
@@ -128,9 +128,10 @@ impl Worker {
         })))
     }
 
-    /// Asks the desk to free the lease. A full desk only delays it: to the next request, or until the client is gone.
+    /// Requests the release of the lease. If the queue is full, the lease is released later: at the next lease request
+    /// or when it expires.
     fn request_release(&self) {
-        let _ = self.desk.try_send(LeaseManagerMessage::Closed(self.grant.lease.clone()));
+        let _ = self.lease_queue.try_send(LeaseManagerMessage::Closed(self.grant.lease.clone()));
     }
 
     fn answer(&mut self, verb: EnvMethod, query: &Query) -> CachedReply {
@@ -155,19 +156,19 @@ impl Worker {
             return CachedReply::Err(shutting_down());
         }
         if let Some(reason) = self.failure.as_ref().filter(|_| verb != EnvMethod::Close) {
-            return CachedReply::Err(broken(reason));
+            return CachedReply::Err(lost_environments(reason));
         }
         let outcome = catch_unwind(AssertUnwindSafe(|| self.execute(verb, &payload)));
         let answer = match outcome {
             Ok(Ok(bytes)) => CachedReply::Ok(ZBytes::from(bytes)),
-            // Refused without effect: the number stays free.
+            // Rejected without effect: the number is not consumed.
             Ok(Err(error)) if !error.code.consumes_seq() => return CachedReply::Err(error),
             Ok(Err(error)) => CachedReply::Err(error),
             Err(panic) => {
                 let reason = panic_text(&panic);
                 tracing::error!(lease = self.grant.lease, reason, "environments panicked");
                 self.failure = Some(reason.clone());
-                CachedReply::Err(broken(&reason))
+                CachedReply::Err(lost_environments(&reason))
             }
         };
         self.last_seq = header.seq;
@@ -181,9 +182,9 @@ impl Worker {
             return Err(stale_sequence(header.seq, self.last_seq));
         }
         if header.seq > self.last_seq + 1 {
-            let message = format!("`seq` = {} skips: the last executed is {}", header.seq, self.last_seq);
+            let message = format!("`seq` = {} skips a number: the last consumed is {}", header.seq, self.last_seq);
             return Err(ErrorReply::new(ErrorCode::SequenceGap, "seq", message)
-                .with_hint("send every number once, and repeat it until it is answered"));
+                .with_hint("increase `seq` by one per request, and repeat a request until a reply arrives"));
         }
         Ok(())
     }
@@ -205,10 +206,10 @@ impl Worker {
             return Err(shutting_down());
         }
         if let Some(reason) = &self.failure {
-            return Err(broken(reason));
+            return Err(lost_environments(reason));
         }
         let env = usize::try_from(request.env).unwrap_or(usize::MAX);
-        // Nothing was changed, so that the environments are as good after a panic as before.
+        // `scene` does not change the environments, so they stay usable after a panic.
         let scene = catch_unwind(AssertUnwindSafe(|| self.env.scene(env)))
             .map_err(|panic| ErrorReply::new(ErrorCode::Internal, "", panic_text(&panic)))?;
         scene.map(convert::encode_scene).map_err(|error| convert::wire_error(&error))
@@ -218,22 +219,22 @@ impl Worker {
         match verb {
             EnvMethod::Reset => {
                 let request: message::ResetRequest<'_> = decode(payload)?;
-                let wanted = convert::read_reset(&request)?;
-                let obs = self.env.reset(&wanted).map_err(|error| convert::wire_error(&error))?;
+                let reset = convert::read_reset(&request)?;
+                let obs = self.env.reset(&reset).map_err(|error| convert::wire_error(&error))?;
                 let obs = tensor::as_bytes(obs);
                 Ok(encode(&message::ResetReply { protocol: PROTOCOL, seq: request.seq, obs }))
             }
             EnvMethod::Step => {
                 let request: message::StepRequest<'_> = decode(payload)?;
-                let wanted = self.env.num_envs() * self.env.spec().action_len();
-                read_actions(request.actions, wanted, &mut self.actions)?;
+                let expected = self.env.num_envs() * self.env.spec().action_len();
+                read_actions(request.actions, expected, &mut self.actions)?;
                 let batch = self.env.step(&self.actions).map_err(|error| logged(&error))?;
                 self.shared.env_steps.fetch_add(batch.reward.len() as u64, Ordering::Relaxed);
                 Ok(convert::encode_step(batch, request.seq))
             }
             EnvMethod::Close => {
                 let request: message::CloseRequest = decode(payload)?;
-                self.failure = Some("the client closed it".to_owned());
+                self.failure = Some("the client closed the lease".to_owned());
                 self.request_release();
                 Ok(encode(&message::CloseReply { protocol: PROTOCOL, seq: request.seq }))
             }
@@ -242,9 +243,11 @@ impl Worker {
     }
 }
 
-/// Reads `wanted` actions into `actions`, which a wrong number of them leaves untouched: it keeps the size of the largest.
-fn read_actions(bytes: &[u8], wanted: usize, actions: &mut Vec<f32>) -> Result<(), ErrorReply> {
-    convert::check_length("actions", bytes.len() / size_of::<f32>(), wanted)?;
+/// Decodes `expected` actions into `actions`.
+///
+/// The length is checked first, because `actions` would keep the capacity of an oversized message.
+fn read_actions(bytes: &[u8], expected: usize, actions: &mut Vec<f32>) -> Result<(), ErrorReply> {
+    convert::check_length("actions", bytes.len() / size_of::<f32>(), expected)?;
     tensor::read_into(bytes, actions, "actions")
 }
 
@@ -255,10 +258,10 @@ fn logged(error: &EnvError) -> ErrorReply {
     convert::wire_error(error)
 }
 
-/// Answers everything with the reason why the environments could not be built, until the lease is freed.
-fn reject_all(jobs: &Receiver<WorkerRequest>, desk: &SyncSender<LeaseManagerMessage>, lease: &str, reason: &str) {
+/// Answers every request with the reason why the environments could not be built, until the lease is released.
+fn reject_all(jobs: &Receiver<WorkerRequest>, lease_queue: &SyncSender<LeaseManagerMessage>, lease: &str, reason: &str) {
     tracing::error!(lease, reason, "environments could not be built");
-    let _ = desk.try_send(LeaseManagerMessage::Closed(lease.to_owned()));
+    let _ = lease_queue.try_send(LeaseManagerMessage::Closed(lease.to_owned()));
     while let Ok(job) = jobs.recv() {
         let (WorkerRequest::Env(_, query) | WorkerRequest::Lease { query, .. }) = job;
         let message = format!("the environments could not be built: {reason}");
@@ -273,14 +276,14 @@ fn send(query: &Query, answer: CachedReply) {
     }
 }
 
-/// Sends a reply; a client that is gone by now is told nothing.
+/// Sends a reply. Failures are only logged, because the client may have disconnected.
 pub fn reply(query: &Query, bytes: ZBytes) {
     if let Err(error) = query.reply(query.key_expr(), bytes).express(true).wait() {
         tracing::debug!(%error, key = %query.key_expr(), "reply not sent");
     }
 }
 
-/// Sends an error reply; a client that is gone by now is told nothing.
+/// Sends an error reply. Failures are only logged, because the client may have disconnected.
 pub fn reply_error(query: &Query, error: &ErrorReply) {
     if let Err(failure) = query.reply_err(encode(error)).wait() {
         tracing::debug!(%failure, key = %query.key_expr(), "error reply not sent");
@@ -292,24 +295,25 @@ fn panic_text(panic: &Box<dyn std::any::Any + Send>) -> String {
     text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "panicked".to_owned())
 }
 
-fn broken(reason: &str) -> ErrorReply {
-    ErrorReply::new(ErrorCode::LeaseLost, "lease", format!("the environments of this lease are gone: {reason}"))
-        .with_hint("ask for a new lease")
+fn lost_environments(reason: &str) -> ErrorReply {
+    ErrorReply::new(ErrorCode::LeaseLost, "lease", format!("the environments of this lease are lost: {reason}"))
+        .with_hint("request a new lease")
 }
 
-/// The answer to everything while the server shuts down.
+/// Returns the error reply to every new request while the server shuts down.
 pub fn shutting_down() -> ErrorReply {
     ErrorReply::new(ErrorCode::ShuttingDown, "", "the server is shutting down; nothing was executed")
 }
 
-/// The answer to a request under another epoch than the lease's.
+/// Returns the error reply to a request whose epoch differs from that of the lease.
 pub fn stale_epoch(field: &'static str, given: u64, current: u64) -> ErrorReply {
-    let message = format!("`{field}` = {given} is not the lease's: it is {current}");
-    ErrorReply::new(ErrorCode::StaleEpoch, field, message).with_hint("another client took the lease over, or never had it")
+    let message = format!("`{field}` = {given} is not the epoch of this lease, {current}");
+    ErrorReply::new(ErrorCode::StaleEpoch, field, message)
+        .with_hint("another client has reclaimed the lease; request a new lease")
 }
 
 fn stale_sequence(given: u64, last: u64) -> ErrorReply {
-    let message = format!("`seq` = {given} was answered before: the last executed is {last}");
+    let message = format!("`seq` = {given} was answered before: the last consumed is {last}");
     ErrorReply::new(ErrorCode::StaleSequence, "seq", message)
 }
 
@@ -318,7 +322,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn oversized_actions_are_refused_and_take_no_memory() {
+    fn oversized_actions_are_rejected_without_allocating() {
         let mut actions = Vec::new();
         let error = read_actions(&vec![0; 1 << 20], 12, &mut actions).expect_err("too many");
         assert_eq!(error.code, ErrorCode::BadShape);

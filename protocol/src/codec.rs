@@ -1,10 +1,10 @@
-//! Messages to bytes and back.
+//! Encodes messages to MessagePack and decodes them.
 
 use serde::{Deserialize, Serialize};
 
 use crate::{ErrorCode, ErrorReply};
 
-/// The version of the protocol that this crate speaks.
+/// Protocol version of this crate.
 pub const PROTOCOL: u16 = 1;
 
 #[derive(Deserialize)]
@@ -12,12 +12,14 @@ struct Version {
     protocol: u16,
 }
 
-/// A message as MessagePack, a map with field names.
+/// Encodes a message as a MessagePack map with field names.
 pub fn encode(message: &impl Serialize) -> Vec<u8> {
     encode_with_capacity(message, 256)
 }
 
-/// As [`encode`], into `capacity` bytes taken at once: a large message that grows is copied each time.
+/// Encodes a message like [`encode`], into a buffer of `capacity` bytes.
+///
+/// A sufficient capacity avoids reallocations, each of which copies a large message.
 pub fn encode_with_capacity(message: &impl Serialize, capacity: usize) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(capacity);
     message
@@ -26,11 +28,13 @@ pub fn encode_with_capacity(message: &impl Serialize, capacity: usize) -> Vec<u8
     bytes
 }
 
-/// Reads a message; the error says whether the version is foreign or the bytes are not the message.
+/// Decodes a message.
+///
+/// The error code is [`ErrorCode::Version`] for another protocol version, else [`ErrorCode::Malformed`].
 pub fn decode<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, ErrorReply> {
-    // Serde would also take fields by position, in an order that no document promises.
+    // Serde would also accept fields by position, whose order is not specified.
     if !matches!(bytes.first(), Some(0x80..=0x8f | 0xde | 0xdf)) {
-        return Err(malformed("the bytes are no MessagePack map"));
+        return Err(malformed("the message is not a MessagePack map"));
     }
     rmp_serde::from_slice(bytes).map_err(|error| match rmp_serde::from_slice::<Version>(bytes) {
         Ok(Version { protocol }) if protocol != PROTOCOL => ErrorReply::version(protocol),
@@ -39,5 +43,5 @@ pub fn decode<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, ErrorReply> 
 }
 
 fn malformed(reason: &str) -> ErrorReply {
-    ErrorReply::new(ErrorCode::Malformed, "", reason).with_hint("a message is one MessagePack map with the fields of SPEC.md")
+    ErrorReply::new(ErrorCode::Malformed, "", reason).with_hint("encode one MessagePack map with the fields in SPEC.md")
 }

@@ -1,4 +1,4 @@
-//! Between messages and the types of `twinstep-model`.
+//! Conversions between messages and the types of `twinstep-model`.
 
 use std::sync::Arc;
 
@@ -7,10 +7,10 @@ use twinstep_model::{EndedEpisode, EnvError, EnvSpec, Ground, HeightField, Reset
 use crate::codec::encode_with_capacity;
 use crate::{ErrorCode, PROTOCOL, ErrorReply, encode, message, tensor};
 
-/// More bytes than the field names, lengths and numbers of a message take besides its tensors.
+/// Upper bound on the size of a message without its tensors [bytes].
 const MAP_OVERHEAD: usize = 256;
 
-/// A reset as sent.
+/// Encodes a reset request.
 pub fn encode_reset(request: &ResetRequest, epoch: u64, seq: u64) -> Vec<u8> {
     encode(&message::ResetRequest {
         protocol: PROTOCOL,
@@ -21,13 +21,13 @@ pub fn encode_reset(request: &ResetRequest, epoch: u64, seq: u64) -> Vec<u8> {
     })
 }
 
-/// A reset as received.
+/// Decodes a reset request.
 pub fn read_reset(request: &message::ResetRequest<'_>) -> Result<ResetRequest, ErrorReply> {
     let seeds = request.seeds.map(|bytes| tensor::read(bytes, "seeds")).transpose()?;
     Ok(ResetRequest { seeds, mask: request.mask.map(tensor::flags_from_bytes) })
 }
 
-/// A step's result as sent.
+/// Encodes the reply to a step.
 pub fn encode_step(batch: &StepBatch, seq: u64) -> Vec<u8> {
     let ended = &batch.ended;
     let env: Vec<u32> = ended.iter().map(|episode| episode.env as u32).collect();
@@ -53,14 +53,14 @@ pub fn encode_step(batch: &StepBatch, seq: u64) -> Vec<u8> {
     encode_with_capacity(&reply, MAP_OVERHEAD + numbers * size_of::<f32>() + flags)
 }
 
-/// A step request as sent.
+/// Encodes a step request.
 pub fn encode_actions(actions: &[f32], epoch: u64, seq: u64) -> Vec<u8> {
     let actions = tensor::as_bytes(actions);
     let request = message::StepRequest { protocol: PROTOCOL, epoch, seq, actions };
     encode_with_capacity(&request, MAP_OVERHEAD + actions.len())
 }
 
-/// A step's result as received, into `batch`. Every length must fit `num_envs` environments of `spec`.
+/// Decodes the reply to a step into `batch`. Fails if a length does not match `num_envs` environments of `spec`.
 pub fn decode_step(
     reply: &message::StepReply<'_>,
     spec: &EnvSpec,
@@ -77,7 +77,7 @@ pub fn decode_step(
     let terms: Vec<f32> = tensor::read(reply.ended_terms, "ended_terms")?;
     let final_obs: Vec<f32> = tensor::read(reply.final_obs, "final_obs")?;
     let (ended, obs_len, num_terms) = (env.len(), spec.obs_len(), spec.reward_terms.len());
-    for (field, given, wanted) in [
+    for (field, given, expected) in [
         ("obs", batch.obs.len(), num_envs * obs_len),
         ("reward", batch.reward.len(), num_envs),
         ("terminated", batch.terminated.len(), num_envs),
@@ -87,7 +87,7 @@ pub fn decode_step(
         ("ended_terms", terms.len(), ended * num_terms),
         ("final_obs", final_obs.len(), if final_obs.is_empty() { 0 } else { ended * obs_len }),
     ] {
-        check_length(field, given, wanted)?;
+        check_length(field, given, expected)?;
     }
     if let Some(env) = env.iter().find(|env| **env as usize >= num_envs) {
         let message = format!("`ended_env` has environment {env}; there are {num_envs}");
@@ -105,24 +105,26 @@ pub fn decode_step(
     Ok(())
 }
 
-/// A scene as sent.
+/// Encodes the reply to a render request.
 pub fn encode_scene(scene: Scene) -> Vec<u8> {
     let Scene { bodies, pose, shapes, ground, command } = scene;
     let pose = tensor::as_bytes(&pose);
     encode(&message::RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground: encode_ground(&ground), command })
 }
 
-/// The ground of a scene, for a message.
+/// Returns the ground of a scene as part of a message, without copying the heights.
 pub fn encode_ground(ground: &Ground) -> message::Ground<'_> {
     let height_field = ground.height_field.as_deref().map(|field| {
         let [rows, columns] = field.shape().map(|count| count as u32);
         let heights = tensor::as_bytes(field.heights());
-        message::HeightField { corner: field.corner(), cell: field.cell(), rows, columns, heights }
+        message::HeightField { origin: field.origin(), cell_size: field.cell_size(), rows, columns, heights }
     });
     message::Ground { point: ground.point, normal: ground.normal, height_field }
 }
 
-/// A scene as received. Every body must have a pose, every shape a body, and every vertex of the ground a height.
+/// Decodes the reply to a render request.
+///
+/// Fails if a body has no pose, a shape refers to a missing body, or a vertex of the ground has no height.
 pub fn decode_scene(reply: message::RenderReply<'_>) -> Result<Scene, ErrorReply> {
     let message::RenderReply { bodies, pose, shapes, ground, command, .. } = reply;
     let pose: Vec<[f32; 7]> = tensor::read(pose, "pose")?;
@@ -141,31 +143,31 @@ fn decode_ground(ground: message::Ground<'_>) -> Result<Ground, ErrorReply> {
 }
 
 fn read_height_field(field: message::HeightField<'_>) -> Result<HeightField, ErrorReply> {
-    let message::HeightField { corner, cell, rows, columns, heights } = field;
+    let message::HeightField { origin, cell_size, rows, columns, heights } = field;
     let heights: Vec<f32> = tensor::read(heights, "heights")?;
-    HeightField::new(corner, cell, [rows, columns].map(|count| count as usize), heights)
+    HeightField::new(origin, cell_size, [rows, columns].map(|count| count as usize), heights)
         .map_err(|error| ErrorReply::new(ErrorCode::BadShape, "height_field", error.to_string()))
 }
 
-/// Fails if `given` is not `wanted`.
-pub fn check_length(field: &'static str, given: usize, wanted: usize) -> Result<(), ErrorReply> {
-    if given == wanted {
+/// Checks that the length `given` of a field equals `expected`.
+pub fn check_length(field: &'static str, given: usize, expected: usize) -> Result<(), ErrorReply> {
+    if given == expected {
         return Ok(());
     }
-    let message = format!("`{field}` has {given} entries; {wanted} are wanted");
+    let message = format!("`{field}` has {given} entries; {expected} are expected");
     Err(ErrorReply::new(ErrorCode::BadShape, field, message))
 }
 
-/// An environment's error as sent.
+/// Converts an error of an environment to an error reply.
 pub fn wire_error(error: &EnvError) -> ErrorReply {
     let (code, field, hint) = match error {
-        EnvError::WrongLength { field, .. } => (ErrorCode::BadShape, *field, "shapes are num_envs × the spec's lengths"),
-        EnvError::ActionNotFinite { .. } => (ErrorCode::NotFinite, "actions", "look at what computed the action"),
-        EnvError::NeedsReset { .. } => (ErrorCode::NeedsReset, "", "send `reset`, with `mask` to reset only some"),
-        EnvError::EnvOutOfRange { .. } => (ErrorCode::OutOfRange, "env", "environments are counted from 0"),
-        EnvError::RenderUnsupported { .. } => (ErrorCode::UnknownKey, "", "pictures are of tasks with a robot, such as `walk`"),
+        EnvError::WrongLength { field, .. } => (ErrorCode::BadShape, *field, "expected are `num_envs` × the size in the spec"),
+        EnvError::ActionNotFinite { .. } => (ErrorCode::NotFinite, "actions", "check the policy that computed the action"),
+        EnvError::NeedsReset { .. } => (ErrorCode::NeedsReset, "", "send `reset`, with `mask` for some environments"),
+        EnvError::EnvOutOfRange { .. } => (ErrorCode::OutOfRange, "env", "environments are numbered from 0"),
+        EnvError::RenderUnsupported { .. } => (ErrorCode::UnknownKey, "", "use a task with a robot, such as `walk`"),
         EnvError::Diverged { .. } => (ErrorCode::Diverged, "", "send `reset` with `mask`"),
-        EnvError::Backend(_) | EnvError::Remote(_) => (ErrorCode::Internal, "", "the server's log says more"),
+        EnvError::Backend(_) | EnvError::Remote(_) => (ErrorCode::Internal, "", "read the log of the server"),
     };
     ErrorReply::new(code, field, error.to_string()).with_hint(hint)
 }

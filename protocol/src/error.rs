@@ -1,4 +1,4 @@
-//! Errors as they travel: a code for programs, words for people.
+//! Error replies: a code for programs, and text for people.
 
 use std::fmt;
 
@@ -6,48 +6,48 @@ use serde::{Deserialize, Serialize};
 
 use crate::PROTOCOL;
 
-/// What kind of error it is.
+/// Kind of an error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ErrorCode {
-    /// The request's protocol version is not spoken here.
+    /// The server does not support the request's protocol version.
     Version,
-    /// The bytes are not the message that the key asks for.
+    /// The bytes are not the message of this key.
     Malformed,
-    /// Nothing is answered at this key.
+    /// The key does not exist, or the task has nothing to render.
     UnknownKey,
     /// An array has the wrong number of entries.
     BadShape,
     /// A number is NaN or infinite.
     NotFinite,
-    /// A value is outside what is allowed.
+    /// A value is outside its range.
     OutOfRange,
-    /// The server does not host that many more environments.
+    /// Fewer environments are free than requested.
     TooManyEnvs,
-    /// The lease never existed, was closed, or its grace has passed.
+    /// The lease was closed or expired, never existed, or its environments failed.
     LeaseLost,
-    /// Somebody reclaimed the lease: this epoch is over.
+    /// Another client has reclaimed the lease.
     StaleEpoch,
-    /// The sequence number is older than the last one executed.
+    /// The sequence number was consumed before.
     StaleSequence,
-    /// The sequence number skips at least one.
+    /// At least one sequence number was skipped.
     SequenceGap,
-    /// The environment must be reset first.
+    /// An environment has no episode and must be reset first.
     NeedsReset,
-    /// The simulation of an environment gave numbers that are not finite.
+    /// The simulation of an environment became NaN or infinite.
     Diverged,
-    /// The client's spec hash is not this server's.
+    /// The client's spec hash differs from the server's.
     SpecMismatch,
-    /// Too many requests wait; ask again.
+    /// Too many requests are queued; repeat the request later.
     Busy,
     /// The server is shutting down.
     ShuttingDown,
-    /// The server failed; its log says more.
+    /// The server failed; its log contains the reason.
     Internal,
 }
 
 impl ErrorCode {
-    /// Every code.
+    /// All error codes.
     pub const ALL: [ErrorCode; 17] = [
         ErrorCode::Version,
         ErrorCode::Malformed,
@@ -68,7 +68,7 @@ impl ErrorCode {
         ErrorCode::Internal,
     ];
 
-    /// True if the request had effects, so that its sequence number is used up; false if the number is still free.
+    /// Returns true if a request with this error had effects and so consumed its sequence number.
     pub fn consumes_seq(self) -> bool {
         matches!(self, ErrorCode::Diverged | ErrorCode::Internal)
     }
@@ -79,20 +79,20 @@ impl ErrorCode {
 pub struct ErrorReply {
     /// Protocol version of the sender.
     pub protocol: u16,
-    /// What kind of error it is.
+    /// Kind of the error.
     pub code: ErrorCode,
-    /// The field or key at fault; empty if it is none.
+    /// Name of the invalid field; empty if there is none.
     pub field: String,
-    /// What was wrong: value and what is allowed.
+    /// What is wrong: the value, and what is allowed.
     pub message: String,
-    /// How to mend it; may be empty.
+    /// How to fix the error; may be empty.
     pub hint: String,
     /// True if the same request may succeed later.
     pub retryable: bool,
 }
 
 impl ErrorReply {
-    /// An error that repeating does not mend.
+    /// Creates an error reply without a hint.
     pub fn new(code: ErrorCode, field: impl Into<String>, message: impl Into<String>) -> Self {
         Self {
             protocol: PROTOCOL,
@@ -104,16 +104,16 @@ impl ErrorReply {
         }
     }
 
-    /// The same error with advice.
+    /// Sets the hint.
     pub fn with_hint(mut self, hint: impl Into<String>) -> Self {
         self.hint = hint.into();
         self
     }
 
-    /// The answer to a request of the protocol version `theirs`.
+    /// Creates the error reply to a request of the unsupported protocol version `theirs`.
     pub fn version(theirs: u16) -> Self {
-        Self::new(ErrorCode::Version, "protocol", format!("`protocol` = {theirs} is not spoken here; {PROTOCOL} is"))
-            .with_hint("install the same Twinstep on both ends; `hello` tells what the server speaks")
+        Self::new(ErrorCode::Version, "protocol", format!("`protocol` = {theirs} is not supported; {PROTOCOL} is"))
+            .with_hint("install the same Twinstep at both ends; `hello` contains the supported versions")
     }
 }
 

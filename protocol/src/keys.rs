@@ -1,66 +1,66 @@
-//! Key expressions.
+//! Key expressions of requests and liveliness tokens.
 //!
-//! `<sid>` names one start of one server, so that no two queryables ever share a key.
+//! The server id `<sid>` is new at each start of a server, so no two queryables share a key.
 
-/// First part of every key.
+/// First segment of every key.
 pub const ROOT: &str = "twinstep";
 
-/// Everything that the server `sid` answers.
+/// Returns the key expression of all requests to the server `sid`.
 pub fn server(sid: &str) -> String {
     format!("{ROOT}/{sid}/**")
 }
 
-/// Who the server is and what it hosts.
+/// Returns the key of `hello`: identity of the server and what it hosts.
 pub fn hello(sid: &str) -> String {
     format!("{ROOT}/{sid}/hello")
 }
 
-/// Asks for environments.
+/// Returns the key that leases environments.
 pub fn lease(sid: &str) -> String {
     format!("{ROOT}/{sid}/lease")
 }
 
-/// Asks the environments of `lease` to do something.
+/// Returns the key of a method of the environments of `lease`.
 pub fn env(sid: &str, lease: &str, verb: EnvMethod) -> String {
     format!("{ROOT}/{sid}/env/{lease}/{}", verb.name())
 }
 
-/// Liveliness token of the server `sid` with the robot name `name`.
+/// Returns the key of the liveliness token of the server `sid` with the robot name `name`.
 pub fn live_server(sid: &str, name: &str) -> String {
     format!("{ROOT}/live/server/{sid}/{name}")
 }
 
-/// Selects the liveliness tokens of all servers.
+/// Key expression of the liveliness tokens of all servers.
 pub const LIVE_SERVERS: &str = "twinstep/live/server/*/*";
 
-/// Liveliness token of the client `client` at the server `sid`.
+/// Returns the key of the liveliness token of the client `client` at the server `sid`.
 pub fn live_client(sid: &str, client: &str) -> String {
     format!("{ROOT}/live/client/{sid}/{client}")
 }
 
-/// Selects the liveliness tokens of all clients of the server `sid`.
+/// Returns the key expression of the liveliness tokens of all clients of the server `sid`.
 pub fn live_clients(sid: &str) -> String {
     format!("{ROOT}/live/client/{sid}/*")
 }
 
-/// What the environments of a lease can be asked.
+/// Method of the environments of a lease.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EnvMethod {
-    /// Start episodes anew.
+    /// Starts new episodes.
     Reset,
-    /// Advance one policy period.
+    /// Advances all environments by one policy period.
     Step,
-    /// Give the environments back.
+    /// Ends the lease.
     Close,
-    /// Tell what it takes to draw one environment. Carries no sequence number.
+    /// Returns the scene of one environment. Only reads, so it has no sequence number.
     Render,
 }
 
 impl EnvMethod {
-    /// Every verb.
+    /// All methods.
     pub const ALL: [EnvMethod; 4] = [EnvMethod::Reset, EnvMethod::Step, EnvMethod::Close, EnvMethod::Render];
 
-    /// The verb's last part of the key.
+    /// Returns the last segment of the method's key.
     pub const fn name(self) -> &'static str {
         match self {
             EnvMethod::Reset => "reset",
@@ -71,7 +71,7 @@ impl EnvMethod {
     }
 }
 
-/// What a query's key asks of the server `sid`.
+/// Request that a key of a server stands for.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Request<'a> {
     /// [`hello`].
@@ -80,14 +80,14 @@ pub enum Request<'a> {
     Lease,
     /// [`env`].
     Env {
-        /// The lease.
+        /// Id of the lease.
         lease: &'a str,
-        /// What its environments are asked.
+        /// Method of its environments.
         verb: EnvMethod,
     },
 }
 
-/// What `key` asks of the server `sid`, or `None` if nothing is answered there.
+/// Returns the request that `key` stands for at the server `sid`, or `None` if the key does not exist.
 pub fn parse<'a>(key: &'a str, sid: &str) -> Option<Request<'a>> {
     let rest = key.strip_prefix(ROOT)?.strip_prefix('/')?.strip_prefix(sid)?.strip_prefix('/')?;
     match rest.split('/').collect::<Vec<_>>()[..] {
@@ -101,12 +101,12 @@ pub fn parse<'a>(key: &'a str, sid: &str) -> Option<Request<'a>> {
     }
 }
 
-/// Server id and robot name of a server's liveliness token.
+/// Returns the server id and the robot name in the key of a server's liveliness token.
 pub fn parse_live_server(key: &str) -> Option<(&str, &str)> {
     key.strip_prefix("twinstep/live/server/")?.split_once('/')
 }
 
-/// Client id of a client's liveliness token at the server `sid`.
+/// Returns the client id in the key of a client's liveliness token at the server `sid`.
 pub fn parse_live_client<'a>(key: &'a str, sid: &str) -> Option<&'a str> {
     key.strip_prefix("twinstep/live/client/")?.strip_prefix(sid)?.strip_prefix('/')
 }
@@ -116,7 +116,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn keys_are_read_as_they_are_written() {
+    fn parsing_inverts_formatting() {
         assert_eq!(parse(&hello("a1"), "a1"), Some(Request::Hello));
         assert_eq!(parse(&lease("a1"), "a1"), Some(Request::Lease));
         for verb in EnvMethod::ALL {
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn foreign_keys_are_none() {
+    fn unknown_keys_are_none() {
         for key in ["twinstep/a1", "twinstep/a1/", "twinstep/b2/hello", "twinstep/a1/env/7", "twinstep/a1/env/7/jump"] {
             assert_eq!(parse(key, "a1"), None, "{key}");
         }

@@ -1,11 +1,11 @@
-//! The wire `twinstep.v1`: messages, key expressions, version check, golden bytes. `SPEC.md` beside this crate's
-//! manifest says it all for a client in another language.
+//! The wire protocol `twinstep.v1`: messages, key expressions, errors. `SPEC.md` next to this crate's manifest is the
+//! specification for clients in other languages.
 //!
-//! - [`keys`]: where things are asked for.
-//! - [`message`]: one struct a message, MessagePack as named maps, tensors as `bin` (little-endian, C order).
-//! - [`WireError`] and [`Code`]: errors are replies.
-//! - [`encode`] and [`decode`]: bytes; a foreign protocol version is told apart from malformed bytes.
-//! - [`convert`]: between messages and the types of `twinstep-model`.
+//! - [`keys`]: key expressions of requests and liveliness tokens.
+//! - [`message`]: one struct per message, encoded as a MessagePack map; tensors are `bin` (little-endian, C order).
+//! - [`ErrorReply`] and [`ErrorCode`]: error replies.
+//! - [`encode`] and [`decode`]: messages to and from bytes. An unsupported protocol version is an error of its own.
+//! - [`convert`]: conversions between messages and the types of `twinstep-model`.
 
 mod codec;
 pub mod convert;

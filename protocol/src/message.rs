@@ -1,123 +1,122 @@
-//! One struct a message. Requests and replies of each key stand together.
+//! One struct per message. The request and the reply of each key are next to each other.
 //!
-//! Every message is a map and carries `protocol`. Readers ignore fields they do not know; fields marked `default` may be
-//! left out.
+//! Every message is a map and contains `protocol`. Readers ignore unknown fields. Fields marked `default` are optional.
 
 use serde::{Deserialize, Serialize};
 use twinstep_model::{AutoresetMode, EnvSpec, SceneShape};
 
-/// Asks a server who it is.
+/// Requests the identity of a server.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HelloRequest {
     /// Protocol version of the client.
     pub protocol: u16,
-    /// Program and version, for the server's log.
+    /// Program and version of the client, for the server's log.
     #[serde(default)]
     pub client: String,
 }
 
-/// Who a server is and what it hosts.
+/// Identity of a server and what it hosts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HelloReply {
     /// Protocol version of the server.
     pub protocol: u16,
-    /// Lowest and highest protocol version that the server speaks.
+    /// Lowest and highest protocol version that the server supports.
     pub protocols: [u16; 2],
-    /// Program and version.
+    /// Program and version of the server.
     pub server_version: String,
-    /// The robot's name.
+    /// Name of the robot.
     pub name: String,
-    /// The server's id.
+    /// Id of the server.
     pub server_id: String,
-    /// Layouts, periods, gains and limits.
+    /// Spec of the environments: layouts, periods, gains and limits.
     pub spec: EnvSpec,
     /// [`EnvSpec::hash`] of `spec`.
     pub spec_hash: String,
-    /// Environments that the server hosts at most.
+    /// Maximum number of environments.
     pub max_envs: u64,
-    /// Environments that are free.
+    /// Number of environments that are not leased.
     pub free_envs: u64,
-    /// Time that a lost client's environments wait for it [s].
+    /// Time for which the environments of a disconnected client are kept [s].
     pub lease_grace_s: f64,
-    /// Environment steps that the server has executed.
+    /// Number of environment steps executed since the start of the server.
     pub env_steps: u64,
 }
 
-/// Asks for environments.
+/// Requests a lease of environments.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LeaseRequest {
     /// Protocol version of the client.
     pub protocol: u16,
-    /// The client's id, as in its liveliness token. A client declares the token before it asks.
+    /// Id of the client, as in its liveliness token. A client declares the token before it requests a lease.
     pub client: String,
     /// Number of environments.
     pub num_envs: u64,
-    /// When an ended episode starts anew.
+    /// When a new episode starts after one has ended.
     pub autoreset: AutoresetMode,
-    /// Policy steps after which an episode is truncated; the server's own number without.
+    /// Number of policy steps after which an episode is truncated. Default: the server's.
     #[serde(default)]
     pub max_episode_steps: Option<u32>,
-    /// The spec hash that the client was made for; refused if it is not the server's.
+    /// Spec hash for which the client's policy was trained. A server with a different one rejects the request.
     #[serde(default)]
     pub spec_hash: Option<String>,
-    /// Takes over a lease instead of asking for a new one.
+    /// Takes over an existing lease instead of requesting a new one.
     #[serde(default)]
     pub reclaim: Option<Reclaim>,
 }
 
-/// A lease that a client had and wants to go on with.
+/// A lease to take over.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Reclaim {
-    /// The lease's id.
+    /// Id of the lease.
     pub lease: String,
-    /// Its last known epoch.
+    /// Last known epoch of the lease.
     pub epoch: u64,
 }
 
-/// Environments that were granted.
+/// A granted lease.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LeaseReply {
     /// Protocol version of the server.
     pub protocol: u16,
-    /// The lease's id, part of the keys to its environments.
+    /// Id of the lease, part of the keys of its environments.
     pub lease: String,
-    /// Goes up with every reclaim; requests carry it.
+    /// Fencing token, increased by one at each reclaim. Requests contain it.
     pub epoch: u64,
     /// Number of environments.
     pub num_envs: u64,
-    /// When an ended episode starts anew.
+    /// When a new episode starts after one has ended.
     pub autoreset: AutoresetMode,
-    /// Sequence number of the last request that was executed; 0 for none. The next has one more.
+    /// Last sequence number that was consumed; 0 for none. The next request has this number plus one.
     pub last_seq: u64,
-    /// Layouts, periods, gains and limits; `max_episode_steps` as granted.
+    /// Spec of the environments, with `max_episode_steps` as granted.
     pub spec: EnvSpec,
 }
 
-/// Starts episodes anew.
+/// Starts new episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ResetRequest<'a> {
     /// Protocol version of the client.
     pub protocol: u16,
     /// Epoch of the lease.
     pub epoch: u64,
-    /// Sequence number: one more than the last.
+    /// Sequence number: the last one plus one.
     pub seq: u64,
-    /// `num_envs` × u64; without, each environment continues its random stream.
+    /// Seed of each environment, `num_envs` × u64. Default: each continues its random stream.
     #[serde(default, borrow, with = "serde_bytes")]
     pub seeds: Option<&'a [u8]>,
-    /// `num_envs` × u8, 1 where to reset; without, all are.
+    /// 1 for environments to reset, `num_envs` × u8. Default: all.
     #[serde(default, borrow, with = "serde_bytes")]
     pub mask: Option<&'a [u8]>,
 }
 
-/// First observations.
+/// Observations after a reset.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ResetReply<'a> {
     /// Protocol version of the server.
     pub protocol: u16,
     /// Sequence number of the request.
     pub seq: u64,
-    /// `num_envs × obs_len` × f32.
+    /// Observations, `num_envs × obs_len` × f32.
     #[serde(borrow, with = "serde_bytes")]
     pub obs: &'a [u8],
 }
@@ -129,30 +128,30 @@ pub struct StepRequest<'a> {
     pub protocol: u16,
     /// Epoch of the lease.
     pub epoch: u64,
-    /// Sequence number: one more than the last.
+    /// Sequence number: the last one plus one.
     pub seq: u64,
-    /// `num_envs × action_len` × f32.
+    /// Actions, `num_envs × action_len` × f32.
     #[serde(borrow, with = "serde_bytes")]
     pub actions: &'a [u8],
 }
 
-/// What the step gave.
+/// Result of a step.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct StepReply<'a> {
     /// Protocol version of the server.
     pub protocol: u16,
     /// Sequence number of the request.
     pub seq: u64,
-    /// `num_envs × obs_len` × f32.
+    /// Observations, `num_envs × obs_len` × f32.
     #[serde(borrow, with = "serde_bytes")]
     pub obs: &'a [u8],
-    /// `num_envs` × f32.
+    /// Rewards, `num_envs` × f32.
     #[serde(borrow, with = "serde_bytes")]
     pub reward: &'a [u8],
-    /// `num_envs` × u8.
+    /// 1 if the task ended the episode, `num_envs` × u8.
     #[serde(borrow, with = "serde_bytes")]
     pub terminated: &'a [u8],
-    /// `num_envs` × u8.
+    /// 1 if the time limit ended the episode, `num_envs` × u8.
     #[serde(borrow, with = "serde_bytes")]
     pub truncated: &'a [u8],
     /// Environments whose episode ended, k × u32.
@@ -172,18 +171,18 @@ pub struct StepReply<'a> {
     pub final_obs: &'a [u8],
 }
 
-/// Gives the environments back.
+/// Ends the lease.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CloseRequest {
     /// Protocol version of the client.
     pub protocol: u16,
     /// Epoch of the lease.
     pub epoch: u64,
-    /// Sequence number: one more than the last.
+    /// Sequence number: the last one plus one.
     pub seq: u64,
 }
 
-/// The environments are free.
+/// Confirms that the lease has ended.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CloseReply {
     /// Protocol version of the server.
@@ -192,66 +191,66 @@ pub struct CloseReply {
     pub seq: u64,
 }
 
-/// Asks what it takes to draw one environment. It reads only: no sequence number.
+/// Requests the scene of one environment. Only reads, so it has no sequence number.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RenderRequest {
     /// Protocol version of the client.
     pub protocol: u16,
     /// Epoch of the lease.
     pub epoch: u64,
-    /// The environment.
+    /// Index of the environment.
     pub env: u64,
 }
 
-/// What it takes to draw one robot without knowing it, as [`twinstep_model::Scene`] has it.
+/// Everything needed to draw one robot without a robot model, as in [`twinstep_model::Scene`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RenderReply<'a> {
     /// Protocol version of the server.
     pub protocol: u16,
     /// Names of the bodies; the first is the trunk.
     pub bodies: Vec<String>,
-    /// World-from-body, `bodies` × 7 × f32: position [m], then quaternion `[w, x, y, z]`.
+    /// World-from-body pose of each body, `bodies` × 7 × f32: position [m], then quaternion `[w, x, y, z]`.
     #[serde(borrow, with = "serde_bytes")]
     pub pose: &'a [u8],
-    /// What the bodies look like.
+    /// Geometry of the bodies.
     pub shapes: Vec<SceneShape>,
-    /// What the robot stands on.
+    /// Ground under the robot.
     #[serde(borrow)]
     pub ground: Ground<'a>,
-    /// Wanted velocity in the base frame: forward [m/s], left [m/s], yaw [rad/s].
+    /// Commanded velocity in the base frame: forward [m/s], left [m/s], yaw rate [rad/s].
     #[serde(default)]
     pub command: Option<[f32; 3]>,
 }
 
-/// The ground: a plane, with a height field in it where it is rough.
+/// The ground: a plane, and a height field if it is rough.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Ground<'a> {
-    /// A point of the plane in the world [m].
+    /// A point of the plane, in the world frame [m].
     pub point: [f32; 3],
-    /// Its unit normal in the world.
+    /// Unit normal of the plane, in the world frame.
     pub normal: [f32; 3],
-    /// The heights around the robot. Left out where the ground is the plane.
+    /// Heights that replace the plane around the robot; absent if the ground is the plane.
     #[serde(default, borrow, skip_serializing_if = "Option::is_none")]
     pub height_field: Option<HeightField<'a>>,
 }
 
-/// Heights on a grid, as [`twinstep_model::HeightField`] has them.
+/// Heights on a grid, as in [`twinstep_model::HeightField`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HeightField<'a> {
-    /// x and y of the first vertex in the world [m].
-    pub corner: [f32; 2],
+    /// x and y of the first vertex, in the world frame [m].
+    pub origin: [f32; 2],
     /// Distance between neighbouring vertices [m].
-    pub cell: f32,
+    pub cell_size: f32,
     /// Number of vertices along x.
     pub rows: u32,
     /// Number of vertices along y.
     pub columns: u32,
-    /// Height of every vertex in the world [m], `rows × columns` × f32.
+    /// z of each vertex in the world frame, `rows × columns` × f32 [m].
     #[serde(borrow, with = "serde_bytes")]
     pub heights: &'a [u8],
 }
 
-/// What [`ResetRequest`], [`StepRequest`] and [`CloseRequest`] have in common: enough to tell whether to execute one.
+/// Common fields of [`ResetRequest`], [`StepRequest`] and [`CloseRequest`], which decide whether to execute one.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 pub struct RequestHeader {
     /// Protocol version of the client.

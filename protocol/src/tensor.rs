@@ -1,33 +1,33 @@
-//! Tensors as bytes: little-endian, C order.
+//! Conversions between tensors and bytes: little-endian, C order.
 
 use crate::{ErrorCode, ErrorReply};
 
-const _: () = assert!(cfg!(target_endian = "little"), "tensors are sent as they lie in memory");
+const _: () = assert!(cfg!(target_endian = "little"), "tensors are sent in the byte order of memory");
 
-/// Bytes of `values`, without copying.
+/// Returns the bytes of `values` without copying.
 pub fn as_bytes<T: bytemuck::NoUninit>(values: &[T]) -> &[u8] {
     bytemuck::cast_slice(values)
 }
 
-/// Bytes of flags, without copying: 0 or 1 each.
+/// Returns the bytes of flags, each 0 or 1, without copying.
 pub fn flags_as_bytes(flags: &[bool]) -> &[u8] {
     bytemuck::cast_slice(flags)
 }
 
-/// Reads flags; anything but 0 is true.
+/// Decodes flags; every byte except 0 is true.
 pub fn flags_from_bytes(bytes: &[u8]) -> Vec<bool> {
     let mut flags = Vec::new();
     read_flags_into(bytes, &mut flags);
     flags
 }
 
-/// As [`flags_from_bytes`], into `flags`, whatever its length was.
+/// Decodes flags into `flags`, which is resized; every byte except 0 is true.
 pub fn read_flags_into(bytes: &[u8], flags: &mut Vec<bool>) {
     flags.clear();
     flags.extend(bytes.iter().map(|byte| *byte != 0));
 }
 
-/// Reads numbers into `values`, whatever its length was. `field` is named if the bytes are not whole numbers.
+/// Decodes numbers into `values`, which is resized. Fails if the number of bytes is not a multiple of the number size.
 pub fn read_into<T: bytemuck::AnyBitPattern>(
     bytes: &[u8],
     values: &mut Vec<T>,
@@ -35,16 +35,16 @@ pub fn read_into<T: bytemuck::AnyBitPattern>(
 ) -> Result<(), ErrorReply> {
     let size = size_of::<T>();
     if !bytes.len().is_multiple_of(size) {
-        let message = format!("`{field}` has {} bytes, which is no multiple of {size}", bytes.len());
+        let message = format!("`{field}` has {} bytes, which is not a multiple of {size}", bytes.len());
         return Err(ErrorReply::new(ErrorCode::BadShape, field, message));
     }
     values.clear();
-    // A `bin` starts anywhere in a message, so its numbers may be unaligned.
+    // A `bin` can start at any offset in a message, so its numbers may be unaligned.
     values.extend(bytes.chunks_exact(size).map(bytemuck::pod_read_unaligned::<T>));
     Ok(())
 }
 
-/// Reads numbers. `field` is named if the bytes are not whole numbers.
+/// Decodes numbers. Fails if the number of bytes is not a multiple of the number size.
 pub fn read<T: bytemuck::AnyBitPattern>(bytes: &[u8], field: &'static str) -> Result<Vec<T>, ErrorReply> {
     let mut values = Vec::new();
     read_into(bytes, &mut values, field)?;
@@ -59,7 +59,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn numbers_survive_at_any_alignment(values: Vec<f32>, offset in 0usize..4) {
+        fn decoding_inverts_encoding_at_any_alignment(values: Vec<f32>, offset in 0usize..4) {
             let mut buffer = vec![0; offset];
             buffer.extend_from_slice(as_bytes(&values));
             let read: Vec<f32> = read(&buffer[offset..], "values").expect("whole numbers");
@@ -69,8 +69,8 @@ mod tests {
     }
 
     #[test]
-    fn half_a_number_is_refused_by_name() {
+    fn incomplete_number_is_rejected_with_its_field() {
         let error = read::<f32>(&[0; 7], "actions").expect_err("7 bytes");
-        assert_eq!(error.message, "`actions` has 7 bytes, which is no multiple of 4");
+        assert_eq!(error.message, "`actions` has 7 bytes, which is not a multiple of 4");
     }
 }

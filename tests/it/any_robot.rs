@@ -2,11 +2,11 @@
 
 use glam::DMat3;
 use proptest::prelude::*;
-use twinstep_model::effects::{CATALOGUE, EffectEntry, Scope, Target, apply_effects};
-use twinstep_model::{Command, RolloutRequest, Joint, InitialState, Precision, RobotModel, RobotStates, Rollout, go2};
-use twinstep_sim::{BaseMount, BatchRollout, SimConfig};
+use twinstep_effects::{CATALOGUE, EffectEntry, Scope, Target, apply_effects};
+use twinstep_model::{Command, RolloutRequest, Joint, InitialState, Precision, RobotModel, RobotStates, Rollout, go2, BaseMount};
+use twinstep_sim::{BatchRollout, SimConfig};
 
-/// Drive periods of a rollout.
+/// Actuator periods of a rollout.
 const PERIODS: usize = 40;
 
 /// An effect with any scope that it can have and any values that it may have.

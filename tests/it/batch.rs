@@ -1,9 +1,9 @@
 //! The batch engine against rapier and against physics.
 
 use rand::RngExt;
-use twinstep_model::lanes::InstructionSet;
-use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, InitialState, RandomisationSample, go2, stream};
-use twinstep_sim::{BaseMount, BatchBackend, BatchBackend as Simulator, Engine, SimdPrecision, RapierBackend, SimConfig};
+use twinstep_simd::InstructionSet;
+use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, InitialState, RandomisationSample, go2, stream, BaseMount};
+use twinstep_sim::{BatchBackend, BatchBackend as Simulator, Engine, SimdPrecision, RapierBackend, SimConfig};
 
 const ENGINE: Engine = Engine::Batch;
 
@@ -11,7 +11,7 @@ const ENGINE: Engine = Engine::Batch;
 #[allow(clippy::duplicate_mod, reason = "the same tests for each engine")]
 mod physics;
 
-/// Drive periods in a second.
+/// Actuator periods in a second.
 const SECOND: usize = 200;
 
 fn pose() -> PerJoint {
@@ -151,14 +151,14 @@ fn robot_gives_the_same_bits_in_any_lane_batch_and_number_of_threads() {
     }
 }
 
-/// A robot that trots for a second, in the numbers that `lanes` names: joints after each drive period.
+/// A robot that trots for a second, in the numbers that `lanes` names: joints after each actuator period.
 fn trot_in(lanes: SimdPrecision) -> Vec<PerJoint> {
     motion(&mut BatchBackend::with_precision(go2(), at(1000, 4, BaseMount::Floating), 1, lanes).unwrap(), 0.335, trot_target)
 }
 
 #[test]
 fn every_instruction_set_gives_the_same_bits() {
-    let baseline = trot_in(SimdPrecision::Single(InstructionSet::Baseline));
+    let baseline = trot_in(SimdPrecision::Single(InstructionSet::BASELINE));
     for instructions in InstructionSet::available() {
         assert_eq!(trot_in(SimdPrecision::Single(instructions)), baseline, "{instructions}");
     }

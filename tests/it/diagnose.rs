@@ -3,11 +3,12 @@
 use std::path::Path;
 
 use twinstep_logs::{Log, Meta};
-use twinstep_model::effects::{Effect, EffectEntry, apply_effects};
-use twinstep_model::{ModelFile, RobotModel, go2};
-use twinstep_sysid::{Diagnosis, ParameterValue};
+use twinstep_effects::{Effect, EffectEntry, apply_effects};
+use twinstep_effects::ModelFile;
+use twinstep_model::{RobotModel, go2};
+use twinstep_diagnose::{Diagnosis, ParameterValue};
 use twinstep_tests::browser::{browser, layout};
-use twinstep_tests::hidden_drive::{DRIVES, Motion, NOISE_NM};
+use twinstep_tests::ground_truth_actuator::{DRIVES, Motion, NOISE_NM};
 
 use crate::identify::{log_of, twinstep};
 

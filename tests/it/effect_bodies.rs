@@ -3,11 +3,9 @@
 use std::f64::consts::TAU;
 
 use glam::{DVec3, Vec3};
-use twinstep_model::effects::{Effect, EffectEntry, apply_effects};
-use twinstep_model::{
-    Backend, Command, Joint, PerJoint, InitialState, Pose, RigidBody, RobotModel, RobotStates, body_poses, frames, go2,
-};
-use twinstep_sim::{BaseMount, BatchBackend, Engine, RapierBackend, SimConfig};
+use twinstep_effects::{Effect, EffectEntry, apply_effects};
+use twinstep_model::{Backend, Command, Joint, PerJoint, InitialState, Pose, RigidBody, RobotModel, RobotStates, body_poses, frames, go2, BaseMount};
+use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 
 const GRAVITY: f64 = 9.81;
 const CALF: usize = 2;

@@ -1,18 +1,18 @@
 //! Effects of the joints against their laws, integrated here anew: one joint, plain numbers, steps ten times finer.
 //!
 //! A calf turns alone, its centre of mass on its axis, so that neither gravity nor other joints act on it; it follows a
-//! chirp under PD. [`Law`] is written from `twinstep effects`, not from the engines.
+//! chirp under PD. [`ResidualPlot`] is written from `twinstep effects`, not from the engines.
 
 use glam::DVec3;
-use twinstep_model::effects::{Effect, EffectEntry, apply_effects};
-use twinstep_model::{Backend, Command, RolloutRequest, InitialState, Precision, RobotModel, RobotStates, Rollout, go2};
-use twinstep_sim::{BaseMount, BatchRollout, Engine, RapierBackend, SimConfig};
+use twinstep_effects::{Effect, EffectEntry, apply_effects};
+use twinstep_model::{Backend, Command, RolloutRequest, InitialState, Precision, RobotModel, RobotStates, Rollout, go2, BaseMount};
+use twinstep_sim::{BatchRollout, Engine, RapierBackend, SimConfig};
 
 const CALF: usize = 2;
 const PERIODS: usize = 200;
-/// One drive period [s].
+/// One actuator period [s].
 const PERIOD: f64 = 0.005;
-/// Physics steps in a drive period, of the engines and of the integration here.
+/// Physics steps in an actuator period, of the engines and of the integration here.
 const STEPS: usize = 20;
 const FINE_STEPS: usize = 10 * STEPS;
 const KP: f64 = 30.0;
@@ -133,7 +133,7 @@ fn chirp(t: f64) -> [f64; 2] {
     [start() + 0.4 * (1.0 - phase.cos()), 0.4 * rate * phase.sin()]
 }
 
-/// What encoder [rad] and current sensor [N·m, mean over the period before] show after each drive period.
+/// What encoder [rad] and current sensor [N·m, mean over the period before] show after each actuator period.
 fn integrate(law: &Law) -> Vec<[f64; 2]> {
     let robot = lone_calf();
     let (limit, rotor_inertia) = (robot.joints[CALF].torque_limit, robot.joints[CALF].armature + law.armature);

@@ -1,10 +1,10 @@
 //! What sensors show and a log tells, against the definitions of the effects.
 
 use glam::Vec3;
-use twinstep_logs::{BaseMount as LoggedBase, Log, Meta, Segment, TorqueSensor};
-use twinstep_model::{Backend, Command, RolloutRequest, InitialState, Precision, RobotModel, RobotStates, Rollout, go2};
-use twinstep_sim::{BaseMount, SimConfig};
-use twinstep_sysid::{Experiment, WindowConfig};
+use twinstep_model::{BaseMount, Backend, Command, RolloutRequest, InitialState, Precision, RobotModel, RobotStates, Rollout, go2};
+use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+use twinstep_sim::SimConfig;
+use twinstep_identify::{Experiment, WindowConfig};
 
 use crate::effect_bodies::{batch, config, pose, rapier, run, with};
 
@@ -30,7 +30,7 @@ fn gyroscope_shows_its_bias_and_the_motion_is_the_same() {
     check_gyroscope(rapier);
 }
 
-/// Keeps what it is told, and answers with a torque that grows by 0.1 N·m a drive period.
+/// Keeps what it is told, and answers with a torque that grows by 0.1 N·m an actuator period.
 #[derive(Default)]
 struct CommandRecorder(Vec<Command>);
 
@@ -49,7 +49,7 @@ impl Rollout for CommandRecorder {
 fn told(robot: &RobotModel, late: f64) -> (Vec<f64>, Vec<Command>) {
     let rows = 60;
     let column = |of: &dyn Fn(f64) -> f64| (0..rows).map(|row| of(f64::from(row))).collect::<Vec<_>>();
-    let segments = vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }];
+    let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
     let columns = [
         ("t", column(&|row| 0.005 * row)),
         ("kp", column(&|_| 30.0)),

@@ -2,9 +2,9 @@
 
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_envs::TaskName;
-use twinstep_model::effects::{CATALOGUE, Effect, EffectEntry, Scope, Target, apply_effects};
-use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, InitialState, ResetRequest, RobotModel, VecEnv, go2};
-use twinstep_sim::{BaseMount, BatchBackend, Engine, RapierBackend, SimConfig};
+use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Scope, Target, apply_effects};
+use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, InitialState, ResetRequest, RobotModel, VecEnv, go2, BaseMount};
+use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 
 use crate::remote;
 
@@ -14,14 +14,14 @@ const RATTLES: &str = "backlash";
 /// (docs/physics.md has the numbers).
 const DISAGREES: &str = "ground_stiffness";
 
-/// Drive periods of the motion.
+/// Actuator periods of the motion.
 const PERIODS: usize = 200;
 
 fn config(engine: Engine, base: BaseMount) -> SimConfig {
     SimConfig { engine, base, physics_hz: Some(2000), threads: 1, ..SimConfig::default() }
 }
 
-/// Joint positions and torques in each drive period of a chirp in the air, or of a sway on the feet.
+/// Joint positions and torques in each actuator period of a chirp in the air, or of a sway on the feet.
 fn motion(backend: &mut impl Backend, base: BaseMount) -> Vec<PerJoint> {
     let pose = go2().control.default_pose_f32();
     let height = if base == BaseMount::Fixed { 1.0 } else { 0.3236 };
@@ -113,7 +113,7 @@ fn effects_do_the_same_in_both_engines() {
     }
 }
 
-/// Joints that are held by more friction than their drives have torque stay where they are, over the wire too.
+/// Joints that are held by more friction than their actuators have torque stay where they are, over the wire too.
 #[test]
 fn server_simulates_the_effects_of_its_model_file() {
     let folder = tempfile::tempdir().unwrap();

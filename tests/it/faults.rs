@@ -2,8 +2,8 @@
 
 use std::sync::atomic::AtomicBool;
 
-use twinstep_tests::campaign::{self, FaultPlan, FaultReport};
-use twinstep_tests::lane::TestBedConfig;
+use twinstep_tests::fault_injection::{self, FaultPlan, FaultReport};
+use twinstep_tests::test_bed::TestBedConfig;
 
 fn inject(faults: usize, lanes: usize, server_arguments: &[&str]) -> FaultReport {
     let plan = FaultPlan {
@@ -16,7 +16,7 @@ fn inject(faults: usize, lanes: usize, server_arguments: &[&str]) -> FaultReport
         lanes,
         seed: 1,
     };
-    campaign::run(&plan, &AtomicBool::new(false), |_| ()).unwrap()
+    fault_injection::run(&plan, &AtomicBool::new(false), |_| ()).unwrap()
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! `twinstep fit` through the real program, on a robot whose drives act late and saturate.
+//! `twinstep fit` through the real program, on a robot whose actuators act late and saturate.
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
@@ -6,12 +6,12 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use twinstep_ensemble::{Split, DataSet, Ensemble, epistemic_uncertainty};
-use twinstep_logs::{BaseMount as LoggedBase, Gain, Log, Meta, Segment, TorqueSensor};
-use twinstep_model::effects::{EffectEntry, apply_effects};
-use twinstep_model::{JOINT_NAMES, RobotModel, go2};
-use twinstep_sim::{BaseMount, BatchBackend, Engine, SimConfig};
-use twinstep_sysid::{RecordError, Sensor, apply_sensors, record};
-use twinstep_tests::hidden_robot::effect;
+use twinstep_model::{BaseMount, JOINT_NAMES, RobotModel, go2};
+use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_effects::{EffectEntry, apply_effects};
+use twinstep_sim::{BatchBackend, Engine, SimConfig};
+use twinstep_identify::{RecordError, Sensor, apply_sensors, record};
+use twinstep_tests::ground_truth_robot::effect;
 use twinstep_tests::python::Programs;
 
 const RATE_HZ: f64 = 200.0;
@@ -46,7 +46,7 @@ fn log(amplitude: f64) -> Log {
             columns.entry(format!("q_cmd_{name}")).or_default().push(cell);
         }
     }
-    let segments = vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }];
+    let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
     let mut meta = Meta::new(RATE_HZ, TorqueSensor::MotorCurrent, segments);
     meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
     (meta.kp, meta.kd) = (Some(Gain::Uniform(25.0)), Some(Gain::Uniform(0.6)));

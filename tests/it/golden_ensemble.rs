@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use twinstep_ensemble::{DataSet, Ensemble, Inference, JointEncoding, TrainingOptions, TrainingResult, Training};
 use twinstep_model::{JOINT_NAMES, NUM_JOINTS};
-use twinstep_tests::hidden_drive::{DRIVES, Motion};
+use twinstep_tests::ground_truth_actuator::{DRIVES, Motion};
 
 const ROWS: usize = 60;
 
@@ -29,7 +29,7 @@ fn path(name: &str) -> PathBuf {
 
 fn trained() -> Ensemble {
     let motion = Motion { seconds: 12.0, amplitude: 0.3, hz: [0.3, 6.0], seed: 5 };
-    let data = DataSet::new(&[("a drive that saturates".to_owned(), DRIVES[1].logs(motion).measured)]).unwrap();
+    let data = DataSet::new(&[("an actuator that saturates".to_owned(), DRIVES[1].logs(motion).measured)]).unwrap();
     let options = TrainingOptions { members: 3, hidden: 8, joint_input: JointEncoding::Kind, epochs: 20, seed: 5 };
     match Training::new(&data, options).unwrap().run(2, None, &mut |_| true).unwrap() {
         TrainingResult::Trained(ensemble, _) => *ensemble,
@@ -62,11 +62,11 @@ fn golden_ensemble_says_what_is_written_beside_it() {
     if std::env::var_os("UPDATE_GOLDEN").is_some() {
         let ensemble = trained();
         std::fs::create_dir_all(path("")).unwrap();
-        ensemble.write(path("drives.safetensors")).unwrap();
+        ensemble.write(path("actuators.safetensors")).unwrap();
         std::fs::write(path("said.json"), serde_json::to_string(&said(&ensemble)).unwrap()).unwrap();
     }
     let written: Golden = serde_json::from_slice(&std::fs::read(path("said.json")).unwrap()).unwrap();
-    let found = said(&Ensemble::read(path("drives.safetensors")).unwrap());
+    let found = said(&Ensemble::read(path("actuators.safetensors")).unwrap());
     for (written, found) in [(written.mean, found.mean), (written.variance, found.variance)] {
         let [written, found] = [written, found].map(|rows| rows.concat().concat());
         assert_eq!(written.len(), ROWS * 3 * NUM_JOINTS);

@@ -4,14 +4,12 @@ use std::collections::BTreeMap;
 use std::process::Command as Process;
 
 use rand::RngExt;
-use twinstep_logs::{BaseMount as LoggedBase, Gain, Log, Meta, Segment, TorqueSensor};
-use twinstep_model::effects::{Effect, EffectEntry, Scope, apply_effects};
-use twinstep_model::{Backend, Command, FIXED_BASE_HEIGHT, JOINT_NAMES, ModelFile, InitialState, RobotModel, go2, stream};
-use twinstep_sim::{BaseMount, BatchBackend, BatchRollout, Engine, RapierBackend, SimConfig};
-use twinstep_sysid::{
-    Experiment, WindowConfig, Identification, IdentifyError, IdentifyOptions, RecordError, GlobalSearch, Stage, EstimateStatus, evaluate,
-    identify, record,
-};
+use twinstep_model::{BaseMount, Backend, Command, FIXED_BASE_HEIGHT, JOINT_NAMES, InitialState, RobotModel, go2, stream};
+use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_effects::{Effect, EffectEntry, Scope, apply_effects};
+use twinstep_effects::ModelFile;
+use twinstep_sim::{BatchBackend, BatchRollout, Engine, RapierBackend, SimConfig};
+use twinstep_identify::{Experiment, WindowConfig, Identification, IdentifyError, IdentifyOptions, RecordError, GlobalSearch, Stage, EstimateStatus, evaluate, identify, record};
 use twinstep_tests::python::{Programs, root};
 
 /// What is sought, and the truth.
@@ -69,7 +67,7 @@ pub fn log_of(robot: &RobotModel) -> Log {
         }
         backend.step(&[command], &[true], 1).unwrap();
     }
-    let segments = vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }];
+    let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
     let mut meta = Meta::new(200.0, TorqueSensor::None, segments);
     (meta.kp, meta.kd) = (Some(Gain::Uniform(25.0)), Some(Gain::Uniform(0.6)));
     meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
@@ -120,7 +118,7 @@ fn hidden_effects_are_found_with_intervals_that_hold_them() {
 
 #[test]
 fn what_a_log_cannot_tell_is_left_and_said() {
-    // A held trunk: neither a payload on it nor the ground show.
+    // A fixed base: neither a payload on it nor the ground show.
     let log = log_of(&go2());
     let found = seek(&log, &[("payload", "base"), ("ground_friction", "ground")], |_| true);
     assert!(found.findings.iter().all(|finding| finding.verdict == EstimateStatus::NotIdentifiable));
@@ -220,7 +218,7 @@ fn mistakes_on_the_command_line_are_named() {
 #[test]
 fn catalogue_explains_every_effect() {
     let list = String::from_utf8(twinstep(&["effects"]).stdout).unwrap();
-    for effect in twinstep_model::effects::CATALOGUE {
+    for effect in twinstep_effects::CATALOGUE {
         assert!(list.contains(effect.name));
         let page = String::from_utf8(twinstep(&["effects", effect.name]).stdout).unwrap();
         assert!(page.contains(effect.equation) && page.contains(effect.parameters[0].name), "{page}");

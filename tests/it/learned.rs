@@ -1,4 +1,4 @@
-//! Robots that an ensemble drives: in both engines, through the server, and through the other programs that take a model.
+//! Robots that an ensemble actuators: in both engines, through the server, and through the other programs that take a model.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -9,11 +9,9 @@ use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_ensemble::{EnsembleMetadata, Ensemble, JointEncoding, ActuatorNetworkRobot, Normaliser, Normalisers};
 use twinstep_env_server::{Config, EnvFactory, EnvFactoryError, SimEnvFactory};
 use twinstep_envs::{TaskName, walk_spec};
-use twinstep_logs::{BaseMount as LoggedBase, Log, Meta, Segment, TorqueSensor};
-use twinstep_model::{
-    AutoresetMode, Backend, BackendError, Command as RobotCommand, JOINT_NAMES, ActuatorNetworkConfig, MemberSampling, ModelFile,
-    InitialState, ResetRequest, StepBatch, VecEnv, go2,
-};
+use twinstep_model::{BaseMount, AutoresetMode, Backend, BackendError, Command as RobotCommand, JOINT_NAMES, InitialState, ResetRequest, StepBatch, VecEnv, go2};
+use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+use twinstep_effects::{ActuatorNetworkConfig, MemberSampling, ModelFile};
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 use twinstep_tests::process::Process;
 use twinstep_tests::python::Programs;
@@ -44,8 +42,8 @@ fn description() -> EnsembleMetadata {
 fn model_with(description: EnsembleMetadata, effects: &str, keys: &str) -> (TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("robot.toml");
-    Ensemble::untrained(description).write(folder.path().join("drives.safetensors")).unwrap();
-    let actuator = format!("[actuator]\nensemble = \"drives.safetensors\"\n{keys}\n");
+    Ensemble::untrained(description).write(folder.path().join("actuators.safetensors")).unwrap();
+    let actuator = format!("[actuator]\nensemble = \"actuators.safetensors\"\n{keys}\n");
     std::fs::write(&path, format!("robot = \"go2\"\n{effects}\n{actuator}")).unwrap();
     (folder, path)
 }
@@ -96,7 +94,7 @@ fn uncertainty_is_a_reward_and_changes_no_motion() {
     let (_folder, model) = model_with(description(), "", "");
     let plain = config(Engine::Batch, &model, 1);
     let mut curious = plain.clone();
-    curious.task.reward.uncertainty = 2.0;
+    curious.task.reward.epistemic_uncertainty = 2.0;
     let [plain, curious] = [plain, curious].map(|config| episode(envs(&config, ENVS).as_mut(), 3));
     for (plain, curious) in plain.iter().zip(&curious) {
         assert_eq!(plain.obs, curious.obs);
@@ -108,7 +106,7 @@ fn uncertainty_is_a_reward_and_changes_no_motion() {
     assert!(curious[3].reward.iter().zip(&plain[3].reward).all(|(with, without)| with > without));
 }
 
-/// Largest difference of a standing robot's joints [rad], and of its torques [N·m], from those of its own drives.
+/// Largest difference of a standing robot's joints [rad], and of its torques [N·m], from those of its own actuators.
 fn away_from_own_drives(tau_sensor: TorqueSensor) -> [f32; 2] {
     let description = EnsembleMetadata { tau_sensor, ..description() };
     let settings = ActuatorNetworkConfig { ensemble: PathBuf::new(), draw: MemberSampling::PerStep, sample: false };
@@ -135,7 +133,7 @@ fn robot_stands_on_networks_that_know_its_gains() {
     let [q, tau] = away_from_own_drives(TorqueSensor::MotorCurrent);
     // The networks bend by some percent of the torque, and differ by one.
     assert!(q < 0.02 && tau < 0.7, "{q} rad, {tau} N·m");
-    // Without the rotor, which its own drives have, it stands alike.
+    // Without the rotor, which its own actuators have, it stands alike.
     let [q, tau] = away_from_own_drives(TorqueSensor::JointOutput);
     assert!(q < 0.02 && tau < 0.7, "{q} rad, {tau} N·m");
 }
@@ -173,7 +171,7 @@ fn check_snapshots<B: Backend>(mut backend: B) {
     steps(&mut backend, [true, true]);
     let kept = [0, 1].map(|robot| backend.snapshot(robot));
     let first = steps(&mut backend, [true, true]);
-    // Another member may drive robot 0 by now; what stands still stays as it is, in its drives too.
+    // Another member may actuator robot 0 by now; what stands still stays as it is, in its actuators too.
     backend.reset(&[(0, placement(9))]).unwrap();
     steps(&mut backend, [true, false]);
     (0..2).for_each(|robot| backend.restore(robot, &kept[robot]));
@@ -200,10 +198,10 @@ fn drives_go_back_with_the_robots_snapshot() {
         let (_folder, model) = model_with(description(), "", keys);
         let learned = ActuatorNetworkRobot::load(&ModelFile::load(&model).unwrap()).unwrap().unwrap();
         let sim = |engine| SimConfig { engine, threads: 1, ..SimConfig::default() };
-        let drives = || Box::new(learned.actuators(2, uncertain));
+        let actuators = || Box::new(learned.actuators(2, uncertain));
         let robot = || learned.robot.clone();
-        check_snapshots(BatchBackend::new(robot(), sim(Engine::Batch), 2).unwrap().with_actuator(drives()));
-        check_snapshots(RapierBackend::new(robot(), sim(Engine::Rapier), 2).unwrap().with_actuator(drives()));
+        check_snapshots(BatchBackend::new(robot(), sim(Engine::Batch), 2).unwrap().with_actuator(actuators()));
+        check_snapshots(RapierBackend::new(robot(), sim(Engine::Rapier), 2).unwrap().with_actuator(actuators()));
     }
 }
 
@@ -217,7 +215,7 @@ fn commands_that_no_network_has_heard_of_are_refused_and_nothing_is_stepped() {
     let before = backend.states().clone();
     let pushed = RobotCommand { tau_ff: std::array::from_fn(|joint| if joint == 4 { 1.5 } else { 0.0 }), ..known };
     let soft = RobotCommand::hold(known.q, 20.0, 0.75);
-    for (command, reason) in [(pushed, "FR_thigh has 1.5"), (soft, "FL_hip is commanded [20.0, 0.75]")] {
+    for (command, reason) in [(pushed, "FR_thigh has 1.5"), (soft, "FL_hip has [20.0, 0.75]")] {
         let error = backend.step(&[known, command], &[true, true], 4).unwrap_err();
         assert!(
             matches!(error, BackendError::UnsupportedCommand { robot: 1, .. }) && error.to_string().contains(reason),
@@ -262,8 +260,8 @@ fn served_robot_has_the_gains_that_its_ensemble_learnt_with_and_says_so() {
     let folder = tempfile::tempdir().unwrap();
     let model = folder.path().join("robot.toml");
     let soft = EnsembleMetadata { gains: vec![[25.0, 0.6]; 12], ..description() };
-    Ensemble::linear_pd(soft).write(folder.path().join("drives.safetensors")).unwrap();
-    std::fs::write(&model, "robot = \"go2\"\n[actuator]\nensemble = \"drives.safetensors\"").unwrap();
+    Ensemble::linear_pd(soft).write(folder.path().join("actuators.safetensors")).unwrap();
+    std::fs::write(&model, "robot = \"go2\"\n[actuator]\nensemble = \"actuators.safetensors\"").unwrap();
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
     let arguments = ["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "2", "--model", model.to_str().unwrap()];
     let (_server, endpoint) = Process::listening(&programs.0.join("twinstep"), &arguments.map(str::to_owned)).unwrap();
@@ -295,19 +293,19 @@ fn ensembles_that_do_not_go_with_the_robot_are_refused_with_the_reason() {
         ..description()
     };
     for (description, effects, reason) in [
-        (slow, "", "`actuator.ensemble`: the robot's drive has a step of 0.005 s, the model one of 0.02 s"),
+        (slow, "", "`actuator.ensemble`: the robot's actuator has a time step of 0.005 s, the model one of 0.02 s"),
         (
             uneven,
             "",
-            "learnt FL_hip with kp 30 and kd 0.75, FR_thigh with kp 20 and kd 0.5; a robot is commanded with one",
+            "trained for FL_hip with kp 30 and kd 0.75, for FR_thigh with kp 20 and kd 0.5; a robot has one",
         ),
         (
             description(),
             lag,
-            "`drive_lag` on all does not go beside this ensemble: it learnt the torque at `current` and",
+            "`drive_lag` on all is part of this ensemble, which is trained on the torque at `current`",
         ),
-        (behind, ripple, "stands for steps 1 to 14 of the chain, `coulomb_friction` (13, friction) among them"),
-        (hip, "", "has learnt none called FL_thigh"),
+        (behind, ripple, "replaces stages 1 to 14 of the chain, including `coulomb_friction` (13, friction)"),
+        (hip, "", "is not trained for FL_thigh"),
     ] {
         let (_folder, model) = model_with(description, effects, "");
         let error = refusal(&serve, &model);
@@ -332,9 +330,9 @@ fn settings_that_learned_drives_cannot_follow_are_refused_by_name() {
     refused(
         |config| {
             config.server.model = None;
-            config.task.reward.uncertainty = 1.0;
+            config.task.reward.epistemic_uncertainty = 1.0;
         },
-        "task.reward.uncertainty",
+        "task.reward.epistemic_uncertainty",
     );
 }
 
@@ -342,7 +340,7 @@ fn settings_that_learned_drives_cannot_follow_are_refused_by_name() {
 fn play_runs_learned_drives_and_who_needs_their_laws_refuses_them() {
     let (folder, model) = model_with(description(), "", "draw = \"step\"");
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
-    let meta = Meta::new(50.0, TorqueSensor::None, vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }]);
+    let meta = Meta::new(50.0, TorqueSensor::None, vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }]);
     let mut columns = BTreeMap::from([("t".to_owned(), (0..20).map(|row| 0.02 * f64::from(row)).collect())]);
     columns.insert("q_cmd_FL_calf".to_owned(), vec![-1.3; 20]);
     Log::new_commands(meta, columns).unwrap().write(path("sway.csv")).unwrap();

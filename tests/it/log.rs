@@ -4,7 +4,8 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use expect_test::{Expect, expect};
-use twinstep_logs::{BaseMount, Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::BaseMount;
+use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_tests::python::Programs;
 
 /// The real robot in the air, 16 s at 200 Hz.
@@ -31,7 +32,7 @@ fn check_refusal(output: &Output, folder: &Path, message: &Expect) {
     message.assert_eq(&String::from_utf8_lossy(&output.stderr).replace(&folder.display().to_string(), "log"));
 }
 
-/// A robot with a free trunk that turns over after a second.
+/// A robot with a floating base that turns over after a second.
 fn tumble() -> Log {
     const ROWS: usize = 400;
     let t = |row: usize| row as f64 * 0.005;
@@ -67,7 +68,7 @@ fn log_of_the_real_robot_is_described() {
         "3200 rows, 16.00 s\n",
         "no gap\n",
         "  air_chirp      base fixed, 3200 rows, 16.00 s\n",
-        "  payload              cannot  the trunk is held: record a floating base\n",
+        "  payload              cannot  the base is fixed: record a floating base\n",
         "  coulomb_friction     weakly  no torque was measured: motion alone must show it\n",
     ] {
         assert!(text.contains(line), "{line} is not in\n{text}");
@@ -107,10 +108,10 @@ fn description_of_a_tumble_has_the_fall_and_what_it_can_tell() {
           load_friction        can     FL_hip moves both ways, FL_hip reaches 76 % of its highest torque; only loads that differ tell it from coulomb_friction
           armature             can     FL_hip moves both ways, recorded at 200 Hz, motion reaches 3.2 Hz; a delay looks alike: two spectra, or the first 10 ms of a step, tell them apart
           joint_spring         can     positions span up to 0.60 rad
-          payload              can     the trunk is free for 2.0 s; a load on a leg shows with the trunk held too
-          com_shift            can     the trunk is free for 2.0 s
-          inertia              can     the trunk is free for 2.0 s, the gyro reaches 2.00 rad/s
-          ground_friction      can     the trunk is free for 2.0 s; only feet that slip tell its size
+          payload              can     the base is floating for 2.0 s; a load on a leg shows with the trunk held too
+          com_shift            can     the base is floating for 2.0 s
+          inertia              can     the base is floating for 2.0 s, the gyro reaches 2.00 rad/s
+          ground_friction      can     the base is floating for 2.0 s; only feet that slip tell its size
           ground_stiffness     weakly  no foot_force or contact was recorded
           gyro_bias            can     the gyro reaches 2.00 rad/s
     "#]].assert_eq(told);
@@ -208,15 +209,15 @@ fn bad_input_is_named_and_stdout_stays_empty() {
         folder.path(),
         &expect![[r#"
         error: `log/walk.csv`, column `q_FL_hip_deg`: the Go2 has no joint `FL_hip_deg`
-          call the column `q_FL_hip`, in rad; columns carry no unit in their names
+          rename the column to `q_FL_hip`, in rad; column names do not contain units
     "#]],
     );
     check_refusal(
         &log(&["nowhere"]),
         folder.path(),
         &expect![[r#"
-        error: no log is at `nowhere`
-          give a folder with meta.json and one of data.parquet, data.csv, data.csv.gz and data.mcap, or the data file itself
+        error: there is no log at `nowhere`
+          pass a folder with meta.json and one of data.parquet, data.csv, data.csv.gz and data.mcap, or a data file
     "#]],
     );
     check_refusal(

@@ -2,25 +2,27 @@
 
 use std::f64::consts::TAU;
 
-use twinstep_logs::{BaseMount as LoggedBase, Gain, Log, Meta, Segment, TorqueSensor};
-use twinstep_model::effects::EffectEntry;
-use twinstep_model::{JOINT_NAMES, Joint, ModelFile, RobotModel, go2};
-use twinstep_sim::{BaseMount, BatchBackend, BatchRollout, SimConfig};
-use twinstep_sysid::{Diagnosis, EXCITATION_TRAJECTORIES, Sensor, apply_sensors, record};
-use twinstep_tests::hidden_robot::effect;
-use twinstep_tests::rivals::PAIRS;
+use twinstep_model::{BaseMount, JOINT_NAMES, Joint, RobotModel, go2};
+use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_effects::EffectEntry;
+use twinstep_effects::ModelFile;
+use twinstep_sim::{BatchBackend, BatchRollout, SimConfig};
+use twinstep_diagnose::{Diagnosis, EXCITATION_TRAJECTORIES};
+use twinstep_identify::{Sensor, apply_sensors, record};
+use twinstep_tests::ground_truth_robot::effect;
+use twinstep_tests::confounded_pairs::PAIRS;
 
 use crate::identify::twinstep;
 
 /// Distance that joints keep from the ends of their range [rad].
 const MARGIN: f64 = 0.1;
-/// Highest speed of a joint [rad/s]; the calf's drive ends at 15.7.
+/// Highest speed of a joint [rad/s]; the calf's actuator ends at 15.7.
 const FASTEST: f64 = 10.0;
 
 /// What `robot` does in a motion, simulated at a finer step than models are.
 fn played(motion: &Log, robot: &RobotModel) -> Log {
-    let backend = |base: LoggedBase| {
-        let base = if base == LoggedBase::Fixed { BaseMount::Fixed } else { BaseMount::Floating };
+    let backend = |base: BaseMount| {
+        let base = if base == BaseMount::Fixed { BaseMount::Fixed } else { BaseMount::Floating };
         let config = SimConfig { base, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
         Ok(BatchBackend::new(robot.clone(), config, 1).unwrap())
     };
@@ -57,7 +59,7 @@ fn nominal_robot_gets_through_every_safe_motion() {
             assert!(speed < FASTEST, "{name}: {joint} at {speed} rad/s");
             assert!(torque < 0.9 * limits.torque_limit, "{name}: {joint} with {torque} N·m");
         }
-        if motion.base == LoggedBase::Floating {
+        if motion.base == BaseMount::Floating {
             let cells = |name: &str| log.channel(name).unwrap().iter();
             assert!(cells("pos_z").all(|height| (0.2..0.4).contains(height)), "{name}: falls or jumps");
             // 1 − 2 (x² + y²) is the cosine of the tilt.
@@ -81,12 +83,12 @@ fn safe_motions_have_names_of_their_own_and_begin_and_end_in_the_default_pose() 
 
 #[test]
 fn chosen_motion_beats_the_median_one() {
-    // Drive lag or torque delay; `results/next_experiment.md` has more pairs.
+    // Actuator lag or torque delay; `results/next_experiment.md` has more pairs.
     let pair = &PAIRS[2];
     let (rivalry, robot) = (pair.rivalry(), pair.robot().robot_model().unwrap());
     let mut simulator = BatchRollout::new(&go2(), &SimConfig::default()).unwrap();
     let mut told: Vec<[f64; 2]> = Vec::new();
-    for motion in EXCITATION_TRAJECTORIES.iter().filter(|motion| motion.base == LoggedBase::Fixed) {
+    for motion in EXCITATION_TRAJECTORIES.iter().filter(|motion| motion.base == BaseMount::Fixed) {
         let log = encoders(&played(&motion.motion(&go2()), &robot));
         let predicted = rivalry.expected_log_likelihood_ratio(motion, &log, &mut simulator).unwrap();
         told.push([predicted, rivalry.log_likelihood_ratio(log, &mut simulator).unwrap()]);
@@ -98,7 +100,7 @@ fn chosen_motion_beats_the_median_one() {
 
 /// Six seconds of one slow sine a joint, at which a delay and viscous friction are the same.
 fn slow_sines() -> Log {
-    let segments = vec![Segment { name: "sines".to_owned(), base: LoggedBase::Fixed }];
+    let segments = vec![Segment { name: "sines".to_owned(), base: BaseMount::Fixed }];
     let meta =
         Meta { kp: Some(Gain::Uniform(30.0)), kd: Some(Gain::Uniform(0.8)), ..Meta::new(200.0, TorqueSensor::None, segments) };
     let t: Vec<f64> = (0..1200).map(|row| f64::from(row) * 0.005).collect();

@@ -4,9 +4,8 @@ use std::f32::consts::PI;
 
 use glam::{DMat3, DVec3, Vec3};
 use proptest::prelude::*;
-use twinstep_model::lanes::{Acceleration, State, KinematicTree, Vec3 as LaneVec3, forward_dynamics};
-use twinstep_model::{Backend, Command, Joint, NUM_JOINTS, PerJoint, InitialState, RobotModel, frames, go2};
-use twinstep_sim::{BaseMount, Engine, SimConfig, Terrain};
+use twinstep_model::{dynamics::{Acceleration, State, KinematicTree, Vec3 as LaneVec3, forward_dynamics}, Backend, Command, Joint, NUM_JOINTS, PerJoint, InitialState, RobotModel, frames, go2, BaseMount};
+use twinstep_sim::{Engine, SimConfig, Terrain};
 
 use super::{ENGINE, Simulator};
 

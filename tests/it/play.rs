@@ -4,12 +4,12 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use expect_test::{Expect, expect};
-use twinstep_logs::{BaseMount as LoggedBase, Gain, Log, Meta, Segment, TorqueSensor};
-use twinstep_model::{Backend, Command as RobotCommand, Ground, JOINT_NAMES, NUM_JOINTS, PerJoint, InitialState, go2};
+use twinstep_model::{BaseMount, Backend, Command as RobotCommand, Ground, JOINT_NAMES, NUM_JOINTS, PerJoint, InitialState, go2};
+use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_sim::{BatchBackend, Engine, SimConfig};
 use twinstep_tests::python::Programs;
 
-/// Rows of the motion at 50 Hz, four drive periods each.
+/// Rows of the motion at 50 Hz, four actuator periods each.
 const ROWS: usize = 40;
 /// The row at which the robot is placed anew.
 const ANEW: usize = 25;
@@ -30,7 +30,7 @@ fn target(row: usize) -> PerJoint {
     std::array::from_fn(|joint| pose[joint] + 0.1 * (0.3 * row as f32 + joint as f32).sin())
 }
 
-fn motion(base: LoggedBase, seconds_a_row: f64) -> Log {
+fn motion(base: BaseMount, seconds_a_row: f64) -> Log {
     let segments = vec![Segment { name: "sway".to_owned(), base }];
     let meta = Meta { kp: Some(Gain::Uniform(KP)), ..Meta::new(50.0, TorqueSensor::None, segments) };
     let episode = |row| f64::from(u8::from(row >= ANEW));
@@ -49,7 +49,7 @@ fn motion(base: LoggedBase, seconds_a_row: f64) -> Log {
 fn played_motion_is_a_log_of_what_the_model_does() {
     let folder = tempfile::tempdir().unwrap();
     let (source, out) = (folder.path().join("sway.csv"), folder.path().join("played"));
-    motion(LoggedBase::Floating, 0.02).write(&source).unwrap();
+    motion(BaseMount::Floating, 0.02).write(&source).unwrap();
     let settings = ["--engine", "batch", "--physics-hz", "400"];
     let output = play(&source, &out, &settings);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -97,10 +97,10 @@ fn played_motion_is_a_log_of_what_the_model_does() {
 fn flag_goes_before_the_base_of_the_motion() {
     let folder = tempfile::tempdir().unwrap();
     let (source, out) = (folder.path().join("sway.parquet"), folder.path().join("held.parquet"));
-    motion(LoggedBase::Floating, 0.02).write(&source).unwrap();
+    motion(BaseMount::Floating, 0.02).write(&source).unwrap();
     assert!(play(&source, &out, &["--base", "fixed"]).status.success());
     let log = Log::open(&out).unwrap();
-    assert_eq!(log.meta().segments[0].base, LoggedBase::Fixed);
+    assert_eq!(log.meta().segments[0].base, BaseMount::Fixed);
     assert!(log.channel("pos_z").is_none() && log.tau_measured("RR_calf").is_some());
 }
 
@@ -114,12 +114,12 @@ fn check_refusal(output: &Output, message: &Expect) {
 fn motion_between_the_periods_of_the_drive_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let (source, out) = (folder.path().join("sway.csv"), folder.path().join("played.csv"));
-    motion(LoggedBase::Fixed, 0.013).write(&source).unwrap();
+    motion(BaseMount::Fixed, 0.013).write(&source).unwrap();
     check_refusal(
         &play(&source, &out, &[]),
         &expect![[r"
-            error: the log's median sample period is 13.000 ms, not a whole number of the drive's 5.000 ms within 2 %
-              resample the log, or give the robot model a `drive_hz` that the log's rate divides
+            error: the log's median sample period is 13.000 ms, not a whole number of the actuator's 5.000 ms within 2 %
+              resample the log, or give the robot model a `actuator_hz` that the log's rate divides
         "]],
     );
     assert!(!out.exists());
@@ -129,7 +129,7 @@ fn motion_between_the_periods_of_the_drive_is_refused() {
 fn motion_is_not_overwritten() {
     let folder = tempfile::tempdir().unwrap();
     let source = folder.path().join("sway.csv");
-    motion(LoggedBase::Fixed, 0.02).write(&source).unwrap();
+    motion(BaseMount::Fixed, 0.02).write(&source).unwrap();
     let output = play(&source, &source, &[]);
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).contains("is the motion itself"));
@@ -141,7 +141,7 @@ fn rate_that_the_drive_does_not_divide_is_refused_by_name() {
     check_refusal(
         &play(Path::new("none.csv"), Path::new("out.csv"), &["--physics-hz", "500"]),
         &expect![[r"
-            error: `sim.physics_hz` = 500 is not allowed: a multiple of the drive's 200 Hz up to 20000
+            error: `sim.physics_hz` = 500 is not allowed: a multiple of the actuator rate, 200 Hz, up to 20000
         "]],
     );
 }

@@ -3,9 +3,9 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
-use twinstep_logs::{BaseMount as LoggedBase, Gain, Log, Meta, Segment, TorqueSensor};
-use twinstep_model::JOINT_NAMES;
-use twinstep_model::effects::CATALOGUE;
+use twinstep_model::{BaseMount, JOINT_NAMES};
+use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_effects::CATALOGUE;
 use twinstep_tests::python::{Programs, root};
 
 const LOG: &str = "data/go2_air_chirp";
@@ -64,7 +64,7 @@ fn evaluation_is_drawn_with_every_joint_and_the_worst_one_over_time() {
 
 #[test]
 fn torque_has_bars_of_its_own_where_it_was_measured() {
-    let segments = vec![Segment { name: "air".to_owned(), base: LoggedBase::Fixed }];
+    let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
     let meta = Meta {
         kp: Some(Gain::Uniform(30.0)),
         kd: Some(Gain::Uniform(0.7)),

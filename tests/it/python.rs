@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
-use twinstep_tests::campaign::{self, FaultPlan};
-use twinstep_tests::lane::TestBedConfig;
+use twinstep_tests::fault_injection::{self, FaultPlan};
+use twinstep_tests::test_bed::TestBedConfig;
 use twinstep_tests::python::{Programs, outside_cargo, python, root, run};
 
 const FAULTS: &str = env!("CARGO_BIN_EXE_faults");
@@ -62,7 +62,7 @@ fn python_client_survives_faults() {
         lanes: 6,
         seed: 2,
     };
-    let tally = campaign::run(&plan, &AtomicBool::new(false), |_| ()).unwrap();
+    let tally = fault_injection::run(&plan, &AtomicBool::new(false), |_| ()).unwrap();
     assert!(tally.failures.is_empty(), "{:#?}", tally.failures);
 }
 

@@ -16,7 +16,7 @@ use twinstep_tests::python::Programs;
 
 use crate::remote;
 
-/// Effects of drive, joint, body, ground and sensor.
+/// Effects of actuator, joint, body, ground and sensor.
 const MEASURED: &str = "
 [[effect]]
 name = \"command_delay\"
@@ -172,7 +172,7 @@ fn sway(backend: &mut impl Backend) -> (Vec<[f32; 12]>, [f32; 3], [f32; 3]) {
 }
 
 fn check_robot_of_its_own<B: Backend>(of: impl Fn(RobotModel) -> B) {
-    let drawn = RobotModel::parse(&format!("robot = \"go2\"\n{MEASURED}"), "drawn").unwrap();
+    let drawn = twinstep_effects::parse_robot(&format!("robot = \"go2\"\n{MEASURED}"), "drawn").unwrap();
     let placement = InitialState::at_rest(0.34, go2().control.default_pose_f32());
     let mut all = of(drawn.clone());
     all.reset(&[(0, placement)]).unwrap();

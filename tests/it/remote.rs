@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{Config, EnvFactory, EnvFactoryError, Server, SimEnvFactory};
-use twinstep_envs::{Counter, OBS_LEN, TaskName, check};
+use twinstep_envs::{Counter, OBS_LEN, TaskName, check_vec_env};
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv, go2};
 use twinstep_protocol::ErrorCode;
 use twinstep_sim::Engine;
@@ -135,7 +135,7 @@ fn more_environments_than_there_are_are_refused_with_both_numbers() {
     let (server, endpoint) = start(&config(TaskName::Walk));
     for num_envs in [65, 1_000_000_000] {
         let error = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, num_envs)).err().unwrap().to_string();
-        assert!(error.contains(&format!("{num_envs} are too many: 64 of 64 are free")), "{error}");
+        assert!(error.contains(&format!("{num_envs} is too large: 64 of 64 are free")), "{error}");
     }
     assert!(RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 64)).is_ok());
     server.shutdown();

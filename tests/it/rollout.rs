@@ -1,13 +1,13 @@
 //! Rollouts in the batch engine: a job is the same alone and among others, and goes on from a past.
 
-use twinstep_model::effects::{EffectEntry, apply_effects};
+use twinstep_effects::{EffectEntry, apply_effects};
 use twinstep_model::{Command, RolloutRequest, HistoryStep, InitialState, Precision, RobotModel, RobotStates, Rollout, go2};
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_tests::hidden_robot::effect;
+use twinstep_tests::ground_truth_robot::effect;
 
 /// More than one register of either precision, and no whole number of them.
 const JOBS: usize = 21;
-/// The job whose command is no number, from the third drive period on.
+/// The job whose command is no number, from the third actuator period on.
 const BROKEN: usize = 5;
 
 /// Every other robot has a delay, so that it remembers commands.
@@ -17,7 +17,7 @@ fn robot(index: usize) -> RobotModel {
     apply_effects(&go2(), &[EffectEntry::new(effect, scope, vec![delay]).unwrap()]).unwrap()
 }
 
-/// 3 to 60 drive periods, no neighbours alike.
+/// 3 to 60 actuator periods, no neighbours alike.
 fn commands(index: usize) -> Vec<Command> {
     let pose = go2().control.default_pose_f32();
     let command = |period: usize| {

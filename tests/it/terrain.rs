@@ -158,7 +158,7 @@ fn server_with_rough_ground_in_its_file_sends_the_heights_around_the_robot() {
     }
     let scene = env.scene(1).unwrap();
     let (sent, whole) = (scene.ground.height_field.unwrap(), terrain.ground());
-    assert_eq!(sent.cell(), 0.25);
+    assert_eq!(sent.cell_size(), 0.25);
     assert!(sent.shape().iter().all(|count| (64..=68).contains(count)), "8 m to each side: {:?}", sent.shape());
     let [x, y, z, ..] = scene.pose[0];
     for (dx, dy) in [(0.0, 0.0), (1.3, -0.7), (-3.1, 2.2)] {

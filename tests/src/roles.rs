@@ -10,7 +10,7 @@ use twinstep_envs::{Counter, CounterEnv};
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv, go2};
 use zenoh::Wait;
 
-use crate::ledger::{StepOracle, NUM_ENVS};
+use crate::step_oracle::{StepOracle, NUM_ENVS};
 
 /// One process of a lane.
 #[derive(clap::Subcommand, Clone, Debug)]

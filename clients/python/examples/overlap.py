@@ -1,6 +1,6 @@
-"""Compute while the server steps: ``send`` actions, do something else, ``recv`` what they gave.
+"""Overlap policy and simulation with ``send`` and ``recv``.
 
-Two groups of robots take turns: while the server steps one, the policy computes the other's actions.
+Two groups of robots alternate: while the server steps one, the policy computes the actions of the other.
 """
 
 import argparse
@@ -46,12 +46,12 @@ def main() -> None:
     args = parser.parse_args()
 
     groups = [twinstep.Go2VectorEnv(args.envs) for _ in range(2)]
-    for way in (wait, overlap):
+    for run in (wait, overlap):
         obs = [envs.reset(seed=1)[0] for envs in groups]
-        began = time.perf_counter()
-        way(groups, obs, args.steps)
-        rate = 2 * args.envs * args.steps / (time.perf_counter() - began)
-        print(f"{way.__name__:8} {rate:8.0f} environment steps a second")
+        start = time.perf_counter()
+        run(groups, obs, args.steps)
+        rate = 2 * args.envs * args.steps / (time.perf_counter() - start)
+        print(f"{run.__name__:8} {rate:8.0f} environment steps per second")
     for envs in groups:
         envs.close()
 

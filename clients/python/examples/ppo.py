@@ -1,6 +1,7 @@
-"""Train a walk with PPO of Stable-Baselines3 and keep it with the hash of the robot it was trained for.
+"""Train a walking policy with PPO of Stable-Baselines3, and store it with the spec hash of the robot.
 
-Needs ``pip install "twinstep[sb3]"``. Every episode's reward and length go to ``<out>/episodes.monitor.csv``.
+Needs ``pip install "twinstep[sb3]"``. Reward and length of each episode are written to
+``<out>/episodes.monitor.csv``.
 """
 
 import argparse
@@ -20,13 +21,13 @@ from twinstep.sb3 import make_vec_env
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--envs", type=int, default=64)
-    parser.add_argument("--steps", type=int, default=1_000_000, help="environment steps in all")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="total number of environment steps")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("walk"))
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
 
-    # The network is too small to share among threads, and their waiting takes cores from the server's simulation.
+    # The network is too small for several threads, which would take cores from the server's simulation.
     torch.set_num_threads(1)
 
     robots = make_vec_env(n_envs=args.envs, seed=args.seed)
@@ -37,7 +38,7 @@ def main() -> None:
         n_steps=64,
         batch_size=16 * args.envs,
         n_epochs=5,
-        # Shaking costs more than walking pays: begin with a standard deviation of 0.37, not 1.
+        # Initial standard deviation 0.37 instead of 1: the penalties of noisy actions exceed the reward of walking.
         policy_kwargs={"net_arch": [128, 128], "log_std_init": -1.0},
         seed=args.seed,
         device="cpu",

@@ -1,4 +1,4 @@
-"""Step robots with random actions: the shortest whole program."""
+"""Step robots with random actions: the shortest complete program."""
 
 import argparse
 from typing import Any
@@ -19,7 +19,7 @@ def main() -> None:
 
     envs: Any = gym.make_vec("twinstep/Go2-Walk-v0", num_envs=args.envs)
     for part in envs.twinstep_spec.observation:
-        print(f"{part.name:22} {part.size:3}  {part.unit:18} {part.text}")
+        print(f"{part.name:22} {part.size:3}  {part.unit:18} {part.description}")
 
     envs.action_space.seed(1)
     envs.reset(seed=1)

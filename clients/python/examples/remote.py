@@ -1,4 +1,4 @@
-"""Run the agent that ``ppo.py`` trained on another server, or on a robot: only ``--endpoint`` changes."""
+"""Run the agent of ``ppo.py`` on another server or on a robot: only ``--endpoint`` changes."""
 
 import argparse
 from pathlib import Path
@@ -12,13 +12,13 @@ from twinstep.sb3 import make_vec_env
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--endpoint", help="such as tcp/192.168.1.7:7447; without, a server starts on this machine")
-    parser.add_argument("--policy", type=Path, default=Path("walk"), help="what `ppo.py --out` wrote")
+    parser.add_argument("--endpoint", help="such as tcp/192.168.1.7:7447. Default: a server on this machine")
+    parser.add_argument("--policy", type=Path, default=Path("walk"), help="output folder of `ppo.py`")
     parser.add_argument("--envs", type=int, default=1)
     parser.add_argument("--steps", type=int, default=1000)
     args = parser.parse_args()
 
-    # The server refuses if joints, gains, rates or observation are not those that the agent learned with.
+    # The server rejects the hash if joints, gains, periods or observation differ from those in training.
     spec_hash = (args.policy / "spec_hash").read_text()
     robots = make_vec_env(n_envs=args.envs, endpoint=args.endpoint, spec_hash=spec_hash, seed=1)
     envs = VecNormalize.load(str(args.policy / "normalization.pkl"), VecMonitor(robots))

@@ -1,4 +1,4 @@
-"""The child of ``twinstep bench sim`` that measures other simulators."""
+"""The child process of ``twinstep bench sim`` that measures baseline simulators."""
 
 import importlib.util
 import json
@@ -8,7 +8,7 @@ import sys
 from twinstep.server import find_program
 
 
-def test_child_names_the_peers_that_are_there_and_measures_them() -> None:
+def test_child_lists_and_measures_the_installed_baselines() -> None:
     command = [find_program(), "mjcf", "--timestep", "0.005"]
     model = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     setup = {
@@ -31,4 +31,4 @@ def test_child_names_the_peers_that_are_there_and_measures_them() -> None:
     assert "mujoco 200" in json.loads(names)
     assert float(rate) > 0
     if importlib.util.find_spec("envpool") is None:
-        assert "left out: envpool is not installed" in child.stderr
+        assert "skipped: envpool is not installed" in child.stderr

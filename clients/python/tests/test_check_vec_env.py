@@ -1,4 +1,4 @@
-"""The checker passes what is right and names what is wrong."""
+"""The checker accepts correct environments and names the violation of incorrect ones."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ N, LENGTH = 3, 5
 
 
 class Good(VecEnv):
-    """Random walks of five steps in a square; right in every respect."""
+    """A correct ``VecEnv``: random walks of five steps in a square."""
 
     render_mode = None
 
@@ -72,17 +72,17 @@ class Good(VecEnv):
 
 
 def changed(**methods: Any) -> VecEnv:
-    """Make a VecEnv that is right but for ``methods``."""
+    """Create a VecEnv that is correct except for ``methods``."""
     return type("Bad", (Good,), methods)()
 
 
 def changed_step(change: Any) -> VecEnv:
-    """Make a VecEnv whose results of a step go through ``change``."""
+    """Create a VecEnv that applies ``change`` to the results of a step."""
     return changed(step_wait=lambda self: change(*Good.step_wait(self)))
 
 
 def with_infos(change: Any) -> VecEnv:
-    """Make a VecEnv where ``change`` goes over the infos of ended episodes."""
+    """Create a VecEnv that applies ``change`` to the infos of ended episodes."""
 
     def step(obs: Any, reward: Any, done: Any, infos: Any) -> Any:
         for env in np.flatnonzero(done):
@@ -151,25 +151,25 @@ def set_everywhere(self: Any, attr_name: str, value: Any, indices: Any = None) -
     Good.set_attr(self, attr_name, value)
 
 
-def refuses(self: Any, *args: Any, **kwargs: Any) -> None:
+def raises(self: Any, *args: Any, **kwargs: Any) -> None:
     raise NotImplementedError("not for this simulator")
 
 
-BROKEN: dict[str, tuple[Any, str]] = {
-    "gymnasium vector env": (lambda: gym.make_vec("CartPole-v1", 2), "is no `VecEnv`"),
+INCORRECT: dict[str, tuple[Any, str]] = {
+    "gymnasium vector env": (lambda: gym.make_vec("CartPole-v1", 2), "is not a `VecEnv`"),
     "float64 obs": (lambda: changed_step(lambda o, *r: (o.astype(float), *r)), r"obs is float64 \(3, 2\)"),
     "list obs": (lambda: changed_step(lambda o, *r: (o.tolist(), *r)), "obs is list of 3"),
     "batched obs shape": (lambda: changed(reset=lambda self: Good.reset(self)[:2]), r"obs is float32 \(2, 2\)"),
     "obs outside": (lambda: changed_step(outside), r"environment 2: obs\[1\] is 1.5\n  expected: within \[-1.0, 1.0\]"),
     "reset gives a tuple": (lambda: changed(reset=lambda self: (Good.reset(self), {})), "obs is tuple of 2"),
-    "five results": (lambda: changed_step(lambda o, r, d, i: (o, r, d, d, i)), "`step_wait` gave tuple of 5"),
+    "five results": (lambda: changed_step(lambda o, r, d, i: (o, r, d, d, i)), "`step_wait` returned tuple of 5"),
     "integer reward": (lambda: changed_step(lambda o, r, d, i: (o, r.astype(int), d, i)), "reward is int64"),
     "list reward": (lambda: changed_step(lambda o, r, d, i: (o, r.tolist(), d, i)), "reward is list of 3"),
     "column reward": (lambda: changed_step(lambda o, r, d, i: (o, r[:, None], d, i)), r"reward is float32 \(3, 1\)"),
     "nan reward": (lambda: changed_step(late_nan), "environment 1: reward is nan"),
     "integer done": (lambda: changed_step(lambda o, r, d, i: (o, r, d.astype(int), i)), "done is int64"),
-    "infos dict": (lambda: changed_step(lambda o, r, d, i: (o, r, d, {})), "infos gave dict of 0"),
-    "short infos": (lambda: changed_step(lambda o, r, d, i: (o, r, d, i[:2])), "infos gave 2 entries"),
+    "infos dict": (lambda: changed_step(lambda o, r, d, i: (o, r, d, {})), "infos returned dict of 0"),
+    "short infos": (lambda: changed_step(lambda o, r, d, i: (o, r, d, i[:2])), "infos returned 2 entries"),
     "shared infos": (lambda: changed_step(lambda o, r, d, i: (o, r, d, [{}] * N)), r"infos\[1\] is the same object"),
     "no terminal_observation": (
         lambda: with_infos(lambda info: info.pop("terminal_observation")),
@@ -190,18 +190,18 @@ BROKEN: dict[str, tuple[Any, str]] = {
     ),
     "reused obs": (lambda: changed(step_wait=reused_obs), "a later step overwrote obs of step 1"),
     "unseeded": (lambda: changed(reset=unseeded_reset), "two rollouts .* differ in obs of step 0"),
-    "seed kept": (lambda: changed(reset=reset_that_keeps_seeds), "the second `reset` after `seed` gave the same"),
-    "actions changed": (lambda: changed(step_async=step_async_that_scales), "wrote into the actions"),
+    "seed kept": (lambda: changed(reset=reset_that_keeps_seeds), "the second `reset` after `seed` returned the same"),
+    "actions changed": (lambda: changed(step_async=step_async_that_scales), "wrote into its argument `actions`"),
     "step differs": (lambda: changed(step=step_that_differs), "`step`, and `step_async` .* differ in obs of step 1"),
     "close once": (lambda: changed(close=close_once), r"`close\(\)` raised AttributeError"),
-    "get_attr of one": (lambda: changed(get_attr=first_only(Good.get_attr)), "`get_attr` gave 1 entries"),
-    "set_attr everywhere": (lambda: changed(set_attr=set_everywhere), "environment 0: `set_attr` with indices=2 left"),
-    "no env_method": (lambda: changed(env_method=refuses), "raised NotImplementedError: not for this simulator"),
-    "env_is_wrapped of none": (lambda: changed(env_is_wrapped=lambda *a, **k: False), "`env_is_wrapped` .* gave bool"),
+    "get_attr of one": (lambda: changed(get_attr=first_only(Good.get_attr)), "`get_attr` returned 1 entries"),
+    "set_attr everywhere": (lambda: changed(set_attr=set_everywhere), "environment 0: the attribute is 'after' after `set_attr` with indices=2"),
+    "no env_method": (lambda: changed(env_method=raises), "raised NotImplementedError: not for this simulator"),
+    "env_is_wrapped of none": (lambda: changed(env_is_wrapped=lambda *a, **k: False), "`env_is_wrapped` .* returned bool"),
 }
 
 
-def test_a_right_vec_env_passes() -> None:
+def test_a_correct_vec_env_passes() -> None:
     check_vec_env(Good(), steps=20)
 
 
@@ -225,14 +225,14 @@ def test_robots_in_a_monitor_pass() -> None:
     check_vec_env(VecMonitor(make_vec_env(n_envs=1, max_episode_steps=20)), steps=30)
 
 
-def test_a_rollout_without_an_end_is_warned_of() -> None:
+def test_a_rollout_without_an_end_of_an_episode_warns() -> None:
     with pytest.warns(UserWarning, match="no episode ended within 4 steps"):
         check_vec_env(Good(), steps=4)
 
 
-@pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_vec_env_is_named(name: str) -> None:
-    make, message = BROKEN[name]
+@pytest.mark.parametrize("name", INCORRECT)
+def test_the_error_of_an_incorrect_vec_env_names_the_violation(name: str) -> None:
+    make, message = INCORRECT[name]
     with pytest.raises(VecEnvError, match=message) as caught:
         check_vec_env(make(), steps=20)
     assert "\n  expected: " in str(caught.value)

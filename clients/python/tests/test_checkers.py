@@ -1,4 +1,4 @@
-"""The environments pass Gymnasium's own checkers and wrappers."""
+"""The environments pass Gymnasium's checkers and work with its wrappers."""
 
 import pickle
 from collections.abc import Iterator
@@ -26,23 +26,23 @@ def endpoint() -> Iterator[str]:
 
 
 def random_actions(steps: int, num_envs: int) -> np.ndarray[Any, np.dtype[np.float32]]:
-    """Actions (steps, num_envs, 12)."""
+    """Return actions (steps, num_envs, 12)."""
     return np.random.default_rng(3).uniform(-1, 1, (steps, num_envs, 12)).astype(np.float32)
 
 
-def test_gymnasium_checks_the_environment() -> None:
+def test_the_environment_passes_gymnasiums_checker() -> None:
     env = gym.make(WALK)
     check_env(env.unwrapped, skip_render_check=True)
     env.close()
 
 
-def test_gymnasium_checks_the_rendered_environment() -> None:
+def test_the_rendered_environment_passes_gymnasiums_checker() -> None:
     env = gym.make(WALK, render_mode="rgb_array")
     check_env(env.unwrapped)
     env.close()
 
 
-def test_gymnasium_checks_a_remote_environment(endpoint: str) -> None:
+def test_a_remote_environment_passes_gymnasiums_checker(endpoint: str) -> None:
     env = gym.make(WALK, endpoint=endpoint)
     check_env(env.unwrapped, skip_render_check=True)
     env.close()

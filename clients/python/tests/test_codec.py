@@ -1,4 +1,4 @@
-"""The wire's bytes: the golden files that the server's own tests hold, and properties."""
+"""Encoding of messages: the golden files that the server's tests share, and properties."""
 
 import contextlib
 from pathlib import Path
@@ -17,7 +17,7 @@ def golden(name: str) -> dict[str, object]:
     return codec.decode((GOLDEN / f"{name}.msgpack").read_bytes())
 
 
-def test_golden_requests_are_what_this_client_sends() -> None:
+def test_golden_requests_are_encoded_like_those_of_this_client() -> None:
     for path in sorted(GOLDEN.glob("*_request*.msgpack")):
         message = codec.decode(path.read_bytes())
         assert message.pop("protocol") == codec.PROTOCOL, path.name
@@ -32,7 +32,7 @@ def test_golden_hello_has_a_spec() -> None:
 
 
 @given(st.lists(st.floats(width=32, allow_nan=False), min_size=1))
-def test_tensors_survive(values: list[float]) -> None:
+def test_decoding_a_tensor_inverts_encoding(values: list[float]) -> None:
     array = np.array(values, "<f4")
     read = codec.tensor(codec.decode(codec.encode({"x": array.tobytes()})), "x", "<f4", len(values))
     np.testing.assert_array_equal(read, array)
@@ -40,12 +40,12 @@ def test_tensors_survive(values: list[float]) -> None:
 
 
 @given(st.binary())
-def test_any_bytes_give_a_map_or_a_typed_error(payload: bytes) -> None:
+def test_any_bytes_decode_to_a_map_or_raise_a_typed_error(payload: bytes) -> None:
     with contextlib.suppress(codec.MalformedError):
         assert isinstance(codec.decode(payload), dict)
 
 
-def test_wrong_length_is_named() -> None:
+def test_error_contains_the_wrong_length() -> None:
     with pytest.raises(codec.MalformedError, match=r"`obs` has 7 bytes; <f4 \(2,\) is expected"):
         codec.tensor({"obs": bytes(7)}, "obs", "<f4", 2)
     with pytest.raises(codec.MalformedError, match="`obs` is NoneType, not bytes"):

@@ -47,7 +47,7 @@ def test_row_of_a_vector_is_the_single_environment_with_its_seed() -> None:
     np.testing.assert_array_equal(np.array(rows)[:, 1], single)
 
 
-def test_seeds_may_be_given_one_by_one() -> None:
+def test_a_sequence_of_seeds_sets_each_environment() -> None:
     with Go2Env() as env:
         first = env.reset(seed=9)[0]
     envs = Go2VectorEnv(2)
@@ -59,7 +59,7 @@ def test_seeds_may_be_given_one_by_one() -> None:
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-def test_end_of_an_episode_tells_its_reward_terms(mode: str) -> None:
+def test_info_at_the_end_of_an_episode_has_its_reward_terms(mode: str) -> None:
     envs = Go2VectorEnv(2, autoreset_mode=mode, max_episode_steps=4)
     envs.reset(seed=1)
     total = np.zeros(2)
@@ -88,15 +88,15 @@ def test_reset_mask_resets_where_it_is_true(counters: Go2VectorEnv) -> None:
     for mask, words in (
         (np.array([True]), r"bool \(1,\); bool \(3,\) is expected"),
         (np.array([1, 0, 0]), r"int64 \(3,\); bool \(3,\) is expected"),
-        (np.zeros(3, np.bool_), "nowhere true"),
+        (np.zeros(3, np.bool_), "has no true entry"),
     ):
         with pytest.raises(twinstep.InvalidOptionError, match=words):
             counters.reset(options={"reset_mask": mask})
-    with pytest.raises(twinstep.InvalidOptionError, match=r"'speed'.*only 'reset_mask' is known"):
+    with pytest.raises(twinstep.InvalidOptionError, match=r"'speed'.*only 'reset_mask' is supported"):
         counters.reset(options={"speed": 1})
 
 
-def test_returned_arrays_are_fresh_and_writable(counters: Go2VectorEnv) -> None:
+def test_returned_arrays_are_new_and_writable(counters: Go2VectorEnv) -> None:
     first = counters.step(np.zeros((3, 12), np.float32))
     kept = [array.copy() for array in first[:4]]
     counters.step(np.ones((3, 12), np.float32))
@@ -108,14 +108,14 @@ def test_returned_arrays_are_fresh_and_writable(counters: Go2VectorEnv) -> None:
 def test_sent_actions_overlap_with_the_policy(counters: Go2VectorEnv) -> None:
     for step in range(1, 20):
         counters.send(np.zeros((3, 12), np.float32))
-        with pytest.raises(twinstep.Error, match="last `step` is not answered yet"):
+        with pytest.raises(twinstep.Error, match="last `step` has no reply yet"):
             counters.send(np.zeros((3, 12), np.float32))
         assert (counters.recv()[0][:, 0] == step).all()
     with pytest.raises(twinstep.Error, match="call `send` before `recv`"):
         counters.recv()
 
 
-def test_round_trip_is_told_only_when_asked_for(counters: Go2VectorEnv) -> None:
+def test_round_trip_is_in_the_info_only_with_info_timing(counters: Go2VectorEnv) -> None:
     assert counters.step(np.zeros((3, 12), np.float32))[4] == {}
     envs = Go2VectorEnv(2, task="counter", info_timing=True)
     envs.reset()
@@ -133,13 +133,13 @@ def test_round_trip_is_told_only_when_asked_for(counters: Go2VectorEnv) -> None:
         (np.where(np.eye(3, 12, 4), np.inf, 0), r"environment 0, joint_position_offset\[FR_thigh\], is inf"),
     ],
 )
-def test_bad_actions_are_named_and_nothing_is_stepped(counters: Go2VectorEnv, actions: np.ndarray, words: str) -> None:
+def test_errors_name_the_invalid_action_and_nothing_is_stepped(counters: Go2VectorEnv, actions: np.ndarray, words: str) -> None:
     with pytest.raises(twinstep.InvalidActionError, match=words):
         counters.step(actions)
     assert counters.step(np.zeros((3, 12), np.float32))[0][0, 0] == 1
 
 
-def test_environments_of_one_process_share_a_server_that_ends_with_the_last() -> None:
+def test_environments_of_one_process_share_a_server_until_the_last_is_closed() -> None:
     first, second = Go2VectorEnv(1, task="counter"), Go2VectorEnv(1, task="counter")
     server = first._remote._link._server
     assert server is second._remote._link._server
@@ -149,8 +149,8 @@ def test_environments_of_one_process_share_a_server_that_ends_with_the_last() ->
     assert not server.alive
 
 
-@pytest.mark.parametrize("death", ["exit", "SIGKILL"])
-def test_server_ends_with_its_parent_however_that_ends(death: str) -> None:
+@pytest.mark.parametrize("cause", ["exit", "SIGKILL"])
+def test_server_terminates_with_its_parent(cause: str) -> None:
     program = textwrap.dedent("""
         import sys, twinstep
         envs = twinstep.Go2VectorEnv(1, task="counter")
@@ -159,7 +159,7 @@ def test_server_ends_with_its_parent_however_that_ends(death: str) -> None:
     """)
     parent = subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     server = int(parent.stdout.readline())
-    if death == "SIGKILL":
+    if cause == "SIGKILL":
         parent.kill()
     parent.communicate()
     assert_ends(server)
@@ -171,7 +171,7 @@ def assert_ends(server: int) -> None:
             return
         time.sleep(0.05)
     os.kill(server, signal.SIGKILL)
-    raise AssertionError("the server outlived its parent by 5 s")
+    raise AssertionError("the server still runs 5 s after its parent has terminated")
 
 
 def is_running(pid: int) -> bool:

@@ -1,4 +1,4 @@
-"""What a user reads when something is wrong."""
+"""Exceptions and their messages."""
 
 import os
 import signal
@@ -16,91 +16,91 @@ from twinstep.errors import from_reply
 STILL = np.zeros((2, 12), np.float32)
 
 
-def freeze(pid: int) -> None:
-    """Returns when every thread has stopped: on a busy machine one goes on for a while after the signal."""
+def suspend(pid: int) -> None:
+    """Suspend a process and return when all its threads have stopped, which takes a while on a busy machine."""
     os.kill(pid, signal.SIGSTOP)
     threads = [Path(f"/proc/{pid}/task/{thread}/stat") for thread in os.listdir(f"/proc/{pid}/task")]
     while any(stat.read_text().rsplit(") ")[1][0] != "T" for stat in threads):
         time.sleep(0.001)
 
 
-def test_nobody_at_the_endpoint_is_said_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_without_a_server_says_how_to_start_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("twinstep.connection.CONNECT_TIMEOUT_S", 0.3)
     with pytest.raises(twinstep.NoServerError) as error:
         Go2Env(endpoint="tcp/127.0.0.1:9")
     assert str(error.value).startswith("no server answers at tcp/127.0.0.1:9 after")
-    assert "nothing accepts connections there\n  start a server: `twinstep serve`" in str(error.value)
+    assert "no program accepts connections there\n  start a server with `twinstep serve`" in str(error.value)
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"endpoint": "nonsense"}, "`endpoint` = nonsense is refused by Zenoh"),
-        ({"zenoh_config": "/no/such/file"}, "`zenoh_config` = /no/such/file: there is no such file"),
-        ({"endpoint": "tcp/127.0.0.1:9", "model": "robot.toml"}, "`config` and `model` are the bundled server's"),
-        ({"timeout_s": 0.0}, "`timeout_s` = 0.0 is not more than 0 s"),
-        ({"render_mode": "ansi"}, "`render_mode` = 'ansi'; 'rgb_array', 'human' and None are known"),
-        ({"max_episode_steps": 0}, r"`max_episode_steps` = 0 is outside 1\.\.="),
+        ({"endpoint": "nonsense"}, "Zenoh rejects `endpoint` = nonsense"),
+        ({"zenoh_config": "/no/such/file"}, "`zenoh_config` = /no/such/file: the file does not exist"),
+        ({"endpoint": "tcp/127.0.0.1:9", "model": "robot.toml"}, "`config` and `model` are options of the bundled server"),
+        ({"timeout_s": 0.0}, "`timeout_s` = 0.0 s; must be greater than 0"),
+        ({"render_mode": "ansi"}, "`render_mode` = 'ansi'; expected is 'rgb_array', 'human' or None"),
+        ({"max_episode_steps": 0}, "`max_episode_steps` = 0 is not allowed: 1 to"),
     ],
 )
-def test_bad_arguments_are_named(arguments: dict[str, object], words: str) -> None:
+def test_errors_name_the_invalid_argument(arguments: dict[str, object], words: str) -> None:
     with pytest.raises(twinstep.InvalidOptionError, match=words):
         Go2Env(**arguments)
 
 
-def test_bad_vector_arguments_are_named() -> None:
-    with pytest.raises(twinstep.InvalidOptionError, match="`num_envs` = 0; at least 1 is expected"):
+def test_errors_name_the_invalid_vector_argument() -> None:
+    with pytest.raises(twinstep.InvalidOptionError, match="`num_envs` = 0; must be at least 1"):
         Go2VectorEnv(0)
-    with pytest.raises(twinstep.InvalidOptionError, match="'NextStep', 'SameStep', 'Disabled' are known"):
+    with pytest.raises(twinstep.InvalidOptionError, match="expected is one of 'NextStep', 'SameStep', 'Disabled'"):
         Go2VectorEnv(1, autoreset_mode="Sometimes")
 
 
-def test_server_that_cannot_start_shows_its_own_words() -> None:
+def test_error_of_a_server_that_cannot_start_contains_its_log() -> None:
     with pytest.raises(twinstep.ServerStartError, match=r"exit code 2(.|\n)*robot\.toml"):
         Go2Env(model="/no/such/robot.toml")
 
 
-def test_program_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_names_the_missing_program(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TWINSTEP_SERVER", "/no/such/program")
-    with pytest.raises(twinstep.ServerNotFoundError, match="`TWINSTEP_SERVER` = /no/such/program is no program"):
+    with pytest.raises(twinstep.ServerNotFoundError, match="`TWINSTEP_SERVER` = /no/such/program is not an executable program"):
         Go2Env(task="counter", timeout_s=1.0)
 
 
-def test_other_task_and_other_robot_are_refused() -> None:
+def test_wrong_task_hash_and_robot_are_rejected() -> None:
     server = EmbeddedServer(("--task", "counter", "--name", "fido"))
     with pytest.raises(twinstep.SpecMismatchError, match="has the task `counter`, not `walk`"):
         Go2Env(endpoint=server.endpoint)
-    with pytest.raises(twinstep.SpecMismatchError, match="`spec_hash` = 00 is not this server's"):
+    with pytest.raises(twinstep.SpecMismatchError, match="`spec_hash` = 00 differs from this server's"):
         Go2Env(endpoint=server.endpoint, task="counter", spec_hash="00")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("twinstep.connection.CONNECT_TIMEOUT_S", 0.2)
-        with pytest.raises(twinstep.AmbiguousRobotError, match="0 robots are named `rex`; visible: fido"):
+        with pytest.raises(twinstep.AmbiguousRobotError, match="0 robots have the name `rex`; visible: fido"):
             Go2Env(endpoint=server.endpoint, task="counter", robot="rex")
     with Go2Env(endpoint=server.endpoint, task="counter", robot="fido") as env:
         env.reset()
     server.release()
 
 
-def test_too_many_environments_are_refused_with_the_servers_number() -> None:
+def test_too_many_environments_are_rejected_with_the_number_of_free_ones() -> None:
     server = EmbeddedServer(("--task", "counter", "--envs", "8"))
-    with pytest.raises(twinstep.RequestRejectedError, match="`num_envs` = 9 are too many: 8 of 8 are free") as error:
+    with pytest.raises(twinstep.RequestRejectedError, match="`num_envs` = 9 is too large: 8 of 8 are free") as error:
         Go2VectorEnv(9, task="counter", endpoint=server.endpoint)
     assert (error.value.code, error.value.field) == ("too_many_envs", "num_envs")
     server.release()
 
 
-def test_step_before_reset_is_refused() -> None:
+def test_step_before_reset_is_rejected() -> None:
     with Go2Env(task="counter") as env, pytest.raises(twinstep.ResetNeededError):
         env.step(np.zeros(12, np.float32))
 
 
-def test_server_that_died_is_told_at_once_and_a_new_environment_gets_a_new_one() -> None:
+def test_exit_of_the_server_raises_at_once_and_a_new_environment_starts_a_new_server() -> None:
     envs = Go2VectorEnv(2, task="counter")
     envs.reset()
     server = envs._remote._link._server
     os.kill(server.pid, signal.SIGKILL)
     since = time.monotonic()
-    with pytest.raises(twinstep.ServerExitedError, match=r"ended by signal 9; its last log lines:(.|\n)*robot `go2`"):
+    with pytest.raises(twinstep.ServerExitedError, match=r"terminated by signal 9; its last log lines:(.|\n)*robot `go2`"):
         envs.step(STILL)
     assert time.monotonic() - since < 5
     envs.close()
@@ -110,14 +110,14 @@ def test_server_that_died_is_told_at_once_and_a_new_environment_gets_a_new_one()
     envs.close()
 
 
-def test_frozen_server_is_told_after_the_timeout_and_its_step_is_executed_once() -> None:
+def test_suspended_server_causes_a_timeout_and_its_step_is_executed_once() -> None:
     envs = Go2VectorEnv(2, task="counter", timeout_s=1.5)
     envs.reset()
     server = envs._remote._link._server
-    freeze(server.pid)
-    with pytest.raises(twinstep.RequestTimeoutError, match=r"no answer from tcp/127\.0\.0\.1"):
+    suspend(server.pid)
+    with pytest.raises(twinstep.RequestTimeoutError, match=r"no reply from tcp/127\.0\.0\.1"):
         envs.step(STILL)
-    with pytest.raises(twinstep.Error, match="not answered yet"):
+    with pytest.raises(twinstep.Error, match="has no reply yet"):
         envs.send(STILL)
     os.kill(server.pid, signal.SIGCONT)
     assert envs.recv()[0][0, 0] == 1
@@ -125,11 +125,11 @@ def test_frozen_server_is_told_after_the_timeout_and_its_step_is_executed_once()
     envs.close()
 
 
-def test_reset_settles_a_step_that_was_given_up() -> None:
+def test_reset_waits_for_an_abandoned_step() -> None:
     envs = Go2VectorEnv(2, task="counter", timeout_s=0.5)
     envs.reset()
     server = envs._remote._link._server
-    freeze(server.pid)
+    suspend(server.pid)
     with pytest.raises(TimeoutError):
         envs.step(STILL)
     threading.Timer(0.3, os.kill, (server.pid, signal.SIGCONT)).start()
@@ -138,7 +138,7 @@ def test_reset_settles_a_step_that_was_given_up() -> None:
     envs.close()
 
 
-def test_closed_environment_says_so() -> None:
+def test_closed_environment_raises() -> None:
     env = Go2Env(task="counter")
     env.close()
     env.close()
@@ -146,7 +146,7 @@ def test_closed_environment_says_so() -> None:
         env.reset()
 
 
-def test_every_refusal_is_a_twinstep_error_with_its_hint() -> None:
+def test_every_error_reply_is_a_twinstep_error_with_its_hint() -> None:
     for code, kind in (("version", twinstep.VersionError), ("stale_epoch", twinstep.LeaseLostError)):
         error = from_reply(code, "", "what", "how")
         assert type(error) is kind

@@ -1,4 +1,4 @@
-"""Optional libraries are imported only where they are needed, and their absence says how to mend it."""
+"""Optional libraries are imported only if needed, and the error without them says how to install them."""
 
 import subprocess
 import sys
@@ -7,7 +7,7 @@ import pytest
 
 
 def run(code: str) -> subprocess.CompletedProcess[str]:
-    """Run Python code in a process of its own."""
+    """Run Python code in a separate process."""
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
@@ -22,7 +22,7 @@ def test_the_package_imports_no_optional_library() -> None:
     ("module", "library", "extra"),
     [("sb3", "stable_baselines3", "sb3"), ("rsl_rl", "rsl_rl", "rsl-rl"), ("onnx", "onnx", "onnx")],
 )
-def test_a_missing_library_is_named_with_its_extra(module: str, library: str, extra: str) -> None:
+def test_error_names_the_extra_of_a_missing_library(module: str, library: str, extra: str) -> None:
     done = run(f"import sys; sys.modules[{library!r}] = None; import twinstep.{module}")
     assert done.returncode == 1
     assert f'is not installed here\n  pip install "twinstep[{extra}]"' in done.stderr

@@ -1,4 +1,4 @@
-"""Ctrl-C in the middle of training."""
+"""Ctrl-C during training."""
 
 import os
 import signal
@@ -34,7 +34,7 @@ def test_interrupted_training_leaves_no_process_behind() -> None:
     )
     assert agent.stdout is not None
     server = int(agent.stdout.readline())
-    # Into the middle of `learn`.
+    # Until `learn` runs.
     time.sleep(1.0)
     os.killpg(agent.pid, signal.SIGINT)
     _, printed = agent.communicate(timeout=10)

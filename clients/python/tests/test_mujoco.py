@@ -1,6 +1,6 @@
 """The physics against MuJoCo: the same motions through ``twinstep play`` and through the model of ``twinstep mjcf``.
 
-Both start from the same state, and hold the same PD torque over each 5 ms of the drive.
+Both start from the same state, and hold the same PD torque over each 5 ms of the actuator.
 """
 
 import json

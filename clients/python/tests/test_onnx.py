@@ -12,7 +12,7 @@ import pytest
 from twinstep.onnx import EnsembleFile, EnsembleFileError
 
 GOLDEN = Path(__file__).parents[3] / "ensemble" / "golden"
-ENSEMBLE = GOLDEN / "drives.safetensors"
+ENSEMBLE = GOLDEN / "actuators.safetensors"
 
 
 def export(ensemble: Path, out: Path) -> subprocess.CompletedProcess[str]:

@@ -1,4 +1,4 @@
-"""Robots as a VecEnv of rsl_rl."""
+"""The ``VecEnv`` for rsl_rl."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ MODEL = {"class_name": "MLPModel", "hidden_dims": [32], "activation": "elu"}
 
 
 def config() -> dict[str, Any]:
-    """A small PPO."""
+    """Return the configuration of a small PPO."""
     gaussian = {"class_name": "GaussianDistribution", "init_std": 0.4}
     return {
         "num_steps_per_env": 12,
@@ -28,7 +28,7 @@ def config() -> dict[str, Any]:
     }
 
 
-def test_the_runner_learns_two_iterations(tmp_path: Path) -> None:
+def test_the_runner_trains_for_two_iterations(tmp_path: Path) -> None:
     torch.set_num_threads(1)
     envs = make_vec_env(num_envs=8, seed=1, max_episode_steps=10)
     runner = OnPolicyRunner(envs, config(), log_dir=str(tmp_path), device="cpu")
@@ -37,7 +37,7 @@ def test_the_runner_learns_two_iterations(tmp_path: Path) -> None:
     assert (tmp_path / "model_1.pt").exists()
 
 
-def test_time_outs_are_told_from_failures() -> None:
+def test_time_outs_are_distinguished_from_failures() -> None:
     envs = make_vec_env(num_envs=3, seed=1, max_episode_steps=4)
     ends = [envs.step(torch.zeros(3, 12)) for _ in range(4)]
     envs.close()
@@ -49,7 +49,7 @@ def test_time_outs_are_told_from_failures() -> None:
     assert envs.episode_length_buf.tolist() == [0] * 3
 
 
-def test_a_length_that_the_runner_wrote_ends_the_episode_early() -> None:
+def test_an_episode_length_written_by_the_runner_ends_the_episode_early() -> None:
     envs = make_vec_env(num_envs=3, seed=1, max_episode_steps=4)
     envs.episode_length_buf = torch.tensor([0, 3, 0])
     _, _, done, extras = envs.step(torch.zeros(3, 12))

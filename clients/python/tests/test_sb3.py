@@ -1,4 +1,4 @@
-"""Robots as a VecEnv of Stable-Baselines3."""
+"""The ``VecEnv`` for Stable-Baselines3."""
 
 from typing import Any
 
@@ -24,13 +24,13 @@ def _one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def test_stable_baselines3_checks_the_environment() -> None:
+def test_the_environment_passes_the_checker_of_stable_baselines3() -> None:
     env = gym.make("twinstep/Go2-Walk-v0")
     check_env(env)
     env.close()
 
 
-def test_rows_are_those_of_the_gymnasium_environment() -> None:
+def test_rows_equal_those_of_the_gymnasium_environment() -> None:
     ours = make_vec_env(n_envs=3, seed=5, max_episode_steps=4)
     envs = gym.make_vec("twinstep/Go2-Walk-v0", num_envs=3, autoreset_mode="SameStep", max_episode_steps=4)
     np.testing.assert_array_equal(ours.reset(), envs.reset(seed=5)[0])
@@ -60,7 +60,7 @@ def test_a_seed_is_used_by_one_reset() -> None:
     envs.close()
 
 
-def test_a_row_resets_alone() -> None:
+def test_resetting_a_row_does_not_change_the_others() -> None:
     envs = make_vec_env(n_envs=3, seed=1)
     start = envs.reset()
     for _ in range(5):
@@ -72,7 +72,7 @@ def test_a_row_resets_alone() -> None:
     envs.close()
 
 
-def test_rows_keep_attributes_of_their_own() -> None:
+def test_rows_have_separate_attributes() -> None:
     envs = make_vec_env(n_envs=3)
     envs.set_attr("level", 1)
     envs.set_attr("level", 2, indices=[2])
@@ -85,7 +85,7 @@ def test_rows_keep_attributes_of_their_own() -> None:
     envs.close()
 
 
-def test_options_are_refused_where_they_are_given() -> None:
+def test_options_are_rejected() -> None:
     envs = make_vec_env(n_envs=3)
     envs.set_options({})
     with pytest.raises(twinstep.InvalidOptionError, match=r"`options` has \['slope'\]"):
@@ -105,14 +105,14 @@ def test_images_are_tiled() -> None:
     envs.close()
 
 
-def test_another_autoreset_is_refused() -> None:
+def test_other_autoreset_modes_are_rejected() -> None:
     envs: Any = gym.make_vec("twinstep/Go2-Walk-v0", num_envs=1)
     with pytest.raises(twinstep.InvalidOptionError, match="Stable-Baselines3 needs 'SameStep'"):
         Go2VecEnv(envs)
     envs.close()
 
 
-def test_ppo_learns_a_few_hundred_steps() -> None:
+def test_ppo_trains_for_a_few_hundred_steps() -> None:
     envs = VecNormalize(VecMonitor(make_vec_env(n_envs=8, max_episode_steps=25)))
     agent = PPO("MlpPolicy", envs, n_steps=32, batch_size=64, n_epochs=1, seed=1, device="cpu")
     agent.learn(512)
@@ -121,12 +121,12 @@ def test_ppo_learns_a_few_hundred_steps() -> None:
     envs.close()
 
 
-def test_sac_learns_a_few_hundred_steps() -> None:
+def test_sac_trains_for_a_few_hundred_steps() -> None:
     envs = VecNormalize(VecMonitor(make_vec_env(n_envs=8, max_episode_steps=25)))
     agent = SAC("MlpPolicy", envs, learning_starts=100, batch_size=64, buffer_size=1000, seed=1, device="cpu")
     agent.learn(400)
     assert agent.num_timesteps == 400
-    # A time limit is no failure: the critic goes on from the last observation.
+    # A time limit is not a failure: the critic bootstraps from the last observation.
     assert agent.replay_buffer is not None
     assert agent.replay_buffer.timeouts.sum() == 16  # type: ignore[attr-defined]
     envs.close()

@@ -1,4 +1,4 @@
-"""TorchRL's checker passes."""
+"""The environment passes TorchRL's checker."""
 
 import gymnasium as gym
 import pytest
@@ -13,7 +13,7 @@ from torchrl.envs.utils import check_env_specs
 gym.register_envs(twinstep)
 
 
-def test_torchrl_checks_the_environment() -> None:
+def test_the_environment_passes_torchrls_checker() -> None:
     env = GymWrapper(gym.make("twinstep/Go2-Walk-v0"))
     check_env_specs(env)
     env.close()

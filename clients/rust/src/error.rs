@@ -1,118 +1,127 @@
-//! Why a client did not get what it asked for.
+//! Errors of the client.
 
 use std::path::PathBuf;
 
 use twinstep_protocol::ErrorReply;
 
-/// Why a client did not get what it asked for.
+/// Reasons why a request fails.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
-    /// The Zenoh configuration was refused.
-    #[error("the Zenoh configuration{}: {reason}", path.as_ref().map(|path| format!(" {}", path.display())).unwrap_or_default())]
+    /// The server process could not be started.
+    #[error("the server process did not start: {0}")]
+    ServerStart(String),
+    /// Zenoh rejects the configuration.
+    #[error(
+        "Zenoh configuration{}: {reason}",
+        path.as_ref().map(|path| format!(" {}", path.display())).unwrap_or_default()
+    )]
     Config {
         /// The file, if there is one.
         path: Option<PathBuf>,
-        /// What Zenoh said.
+        /// Error of Zenoh.
         reason: String,
     },
     /// No connection could be opened.
-    #[error("no server answers at {endpoint} after {waited_s:.1} s ({reason})\n  {}", refused_or_absent(*port_open))]
+    #[error("no server answers at {endpoint} after {waited_s:.1} s ({reason})\n  {}", connect_reason(*port_open))]
     NoServer {
-        /// Where the client tried.
+        /// Endpoint of the server or router.
         endpoint: String,
-        /// For how long [s].
+        /// Time until the request failed [s].
         waited_s: f64,
-        /// What Zenoh said.
+        /// Error of Zenoh.
         reason: String,
         /// True if a program accepts connections there.
         port_open: bool,
     },
-    /// The connection stands, but no server is visible.
+    /// The connection works, but no server is visible.
     #[error(
-        "connected to {endpoint}, but no server is visible there after {waited_s:.1} s\n  either none runs behind it, or \
-         access control hides it from this user: Zenoh tells the client nothing of either\n  to find out, look at what the \
-         server says: `TWINSTEP_LOG={SERVER_LOG} twinstep serve --zenoh FILE`; its `access_control` must allow this \
-         user what `examples/security/server-acl.json5` allows `alice`"
+        "connected to {endpoint}, but no server is visible there after {waited_s:.1} s\n  either no server is running, \
+         or access control hides it from this user: Zenoh does not report which\n  read the log of the server: \
+         `TWINSTEP_LOG={SERVER_LOG} twinstep serve --zenoh FILE`\n  its `access_control` must allow this user what \
+         `examples/security/server-acl.json5` allows `alice`"
     )]
     NoServerVisible {
-        /// Where the client is connected.
+        /// Endpoint of the connection.
         endpoint: String,
-        /// For how long it looked [s].
+        /// Duration of the discovery [s].
         waited_s: f64,
     },
-    /// Servers are visible, but none or several fit.
-    #[error("{wanted}; visible: {}\n  choose one by its name (`robot`)", visible.join(", "))]
+    /// Servers are visible, but none or several match.
+    #[error("{wanted}; visible: {}\n  set `robot` to the name of one of them", visible.join(", "))]
     AmbiguousRobot {
-        /// What was looked for and how many there are.
+        /// The requested robot, and the number of matches.
         wanted: String,
-        /// `name (sid)` of every server.
+        /// `name (sid)` of every visible server.
         visible: Vec<String>,
     },
-    /// The server speaks other protocol versions.
-    #[error("the server speaks protocol {}..={}, this client {ours}\n  install the same Twinstep on both ends", theirs[0], theirs[1])]
+    /// The server does not support the client's protocol version.
+    #[error(
+        "the server supports protocol {} to {}, this client {ours}\n  install the same Twinstep at both ends",
+        theirs[0], theirs[1]
+    )]
     Version {
-        /// Lowest and highest version of the server.
+        /// Lowest and highest version that the server supports.
         theirs: [u16; 2],
-        /// The client's.
+        /// Version of the client.
         ours: u16,
     },
-    /// The server refused.
+    /// The server rejected the request.
     #[error(transparent)]
     Rejected(#[from] ErrorReply),
-    /// The server was stopped.
+    /// The server is shutting down.
     #[error("the server at {endpoint} is shutting down; the request was not executed")]
     ShuttingDown {
-        /// Where it was.
+        /// Endpoint of the server.
         endpoint: String,
     },
-    /// Another start of the server answers in the old one's place: its environments are gone.
+    /// The server was restarted: the environments of its leases are lost.
     #[error(
-        "the server at {endpoint} was restarted: the environments of this lease are gone\n  connect anew and reset"
+        "the server at {endpoint} was restarted: the environments of this lease are lost\n  connect again and reset"
     )]
     Restarted {
-        /// Where it is.
+        /// Endpoint of the server.
         endpoint: String,
     },
-    /// No answer came, for a stated reason.
-    #[error("no answer from {endpoint} to `{request}` after {waited_s:.1} s: {reason}")]
+    /// No reply arrived in time.
+    #[error("no reply from {endpoint} to `{request}` after {waited_s:.1} s: {reason}")]
     RequestTimeout {
-        /// Where the server is or was.
+        /// Endpoint of the server.
         endpoint: String,
-        /// What was asked.
+        /// The request.
         request: String,
-        /// For how long [s].
+        /// Time until the request failed [s].
         waited_s: f64,
-        /// Which of the possible reasons it is, and what to do.
+        /// The reason, and what to do.
         reason: String,
     },
-    /// The last request may or may not have been executed: nothing else can be asked before it is settled.
-    #[error("the last `{0}` is not answered yet\n  `recv` waits for it again; `reset` settles it and starts anew")]
+    /// The last request is in progress and may have been executed. No other request can be sent before its reply.
+    #[error("the last `{0}` has no reply yet\n  call `recv` to wait for it, or `reset` to wait and start new episodes")]
     RequestPending(&'static str),
-    /// Nothing was sent.
-    #[error("nothing was sent: call `send` before `recv`")]
+    /// `recv` was called without `send`.
+    #[error("no request is in progress: call `send` before `recv`")]
     NothingSent,
-    /// The server's answer is not what the protocol says.
-    #[error("the server's answer to `{request}` is malformed: {reason}")]
+    /// The reply does not conform to the protocol.
+    #[error("the server's reply to `{request}` is malformed: {reason}")]
     Malformed {
-        /// What was asked.
+        /// The request.
         request: String,
-        /// What is wrong with the answer.
+        /// What is wrong with the reply.
         reason: String,
     },
 }
 
-/// What makes a server log whom it refuses, and why.
+/// Value of `TWINSTEP_LOG` with which a server logs each rejected client and the reason.
 const SERVER_LOG: &str = "warn,twinstep=info,zenoh_transport=debug,zenoh::net::routing=info";
 
-fn refused_or_absent(port_open: bool) -> String {
+fn connect_reason(port_open: bool) -> String {
     if !port_open {
-        return "no program accepts connections there: start a server with `twinstep serve --listen ENDPOINT`, or look \
-                for its address, port or firewall"
+        return "no program accepts connections there: start a server with `twinstep serve --listen ENDPOINT`, or check \
+                the address, the port and the firewall"
             .to_owned();
     }
     format!(
-        "a program accepts connections there: either it is no Zenoh server, or this client is refused: its user, \
-         password or certificate, or tcp in place of tls; Zenoh does not tell the client which\n  to find out, look at \
-         what the server says: `TWINSTEP_LOG={SERVER_LOG} twinstep serve --zenoh FILE`"
+        "a program accepts connections there: either it is not a Zenoh server, or it rejects this client: its user, \
+         password or certificate, or tcp instead of tls; Zenoh does not report which\n  read the log of the server: \
+         `TWINSTEP_LOG={SERVER_LOG} twinstep serve --zenoh FILE`"
     )
 }

@@ -1,4 +1,4 @@
-//! [`RemoteVecEnv`]: a [`twinstep_model::VecEnv`] at the other end of Zenoh, a simulator's or the real robot's.
+//! [`RemoteVecEnv`]: a [`twinstep_model::VecEnv`] whose environments run on a server reached over Zenoh.
 //!
 //! ```no_run
 //! use twinstep_client::{ConnectOptions, RemoteVecEnv};
@@ -13,14 +13,16 @@
 //! # }
 //! ```
 //!
-//! A request is repeated under its number until it is answered, and the server executes each number once: a lost reply,
-//! a frozen server or a restarted router costs time, never a step. When nobody answers, [`ClientError`] says which of
-//! the possible reasons it is.
+//! The client repeats a request with the same sequence number until a reply arrives. The server executes each number
+//! once. A lost reply, an unresponsive server or a restarted router costs time, but no step is lost or executed twice.
+//! If no reply arrives, [`ClientError`] contains the reason.
 
 mod error;
-mod link;
+mod connection;
 mod remote_env;
+mod server_process;
 
 pub use error::ClientError;
-pub use link::{ConnectOptions, Connection};
+pub use connection::{ConnectOptions, Connection};
+pub use server_process::ServerProcess;
 pub use remote_env::{RemoteVecEnv, LeaseHandle};

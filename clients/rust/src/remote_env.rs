@@ -1,4 +1,4 @@
-//! A vector environment at the other end of Zenoh.
+//! Vectorised environments on a server.
 
 use std::sync::OnceLock;
 
@@ -8,21 +8,21 @@ use twinstep_protocol::{ErrorCode, PROTOCOL, ErrorReply, convert, decode, encode
 use zenoh::bytes::ZBytes;
 use zenoh::query::Querier;
 
-use crate::link::{Pending, read_answer, send};
+use crate::connection::{Pending, read_answer, send};
 use crate::{ClientError, ConnectOptions, Connection};
 
-/// What it takes to take a lease over from another process: keep it where a crash does not lose it.
+/// Id and epoch of a lease, with which another process can reclaim it. Store it where a crash does not lose it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LeaseHandle {
-    /// The lease's id.
+    /// Id of the lease.
     pub lease: String,
-    /// Its epoch.
+    /// Epoch of the lease.
     pub epoch: u64,
 }
 
-/// Environments on a server, for this client alone.
+/// Environments on a server, leased by this client.
 pub struct RemoteVecEnv {
-    link: Connection,
+    connection: Connection,
     ticket: LeaseHandle,
     spec: EnvSpec,
     num_envs: usize,
@@ -30,9 +30,9 @@ pub struct RemoteVecEnv {
     last_seq: u64,
     step: Querier<'static>,
     reset: Querier<'static>,
-    /// Declared with the first picture: an agent that draws none pays nothing.
+    /// Declared at the first `scene`, which most agents never request.
     render: OnceLock<Querier<'static>>,
-    /// The request under way, with its verb.
+    /// The request in progress, with its method.
     pending: Option<(EnvMethod, Pending)>,
     batch: StepBatch,
 }
@@ -43,28 +43,28 @@ impl RemoteVecEnv {
         Self::open(options, None)
     }
 
-    /// Takes over a lease whose client is lost, within the server's grace. The environments are as they were left.
+    /// Reclaims the lease of another process within the server's grace period. The environments are unchanged.
     pub fn reclaim(options: &ConnectOptions, ticket: &LeaseHandle) -> Result<Self, ClientError> {
         Self::open(options, Some(ticket))
     }
 
     fn open(options: &ConnectOptions, ticket: Option<&LeaseHandle>) -> Result<Self, ClientError> {
-        let link = Connection::open(options)?;
-        link.hello()?;
+        let connection = Connection::open(options)?;
+        connection.hello()?;
         let request = message::LeaseRequest {
             protocol: PROTOCOL,
-            client: link.client().to_owned(),
+            client: connection.client().to_owned(),
             num_envs: options.num_envs as u64,
             autoreset: options.autoreset,
             max_episode_steps: options.max_episode_steps,
             spec_hash: options.spec_hash.clone(),
             reclaim: ticket.map(|ticket| message::Reclaim { lease: ticket.lease.clone(), epoch: ticket.epoch }),
         };
-        let querier = link.querier(keys::lease(link.sid()))?;
-        let answer = link.request(&querier, encode(&request))?;
+        let querier = connection.querier(keys::lease(connection.sid()))?;
+        let answer = connection.request(&querier, encode(&request))?;
         let granted: message::LeaseReply = read_answer(&answer, "lease")?;
-        let key = |verb| keys::env(link.sid(), &granted.lease, verb);
-        let (step, reset) = (link.querier(key(EnvMethod::Step))?, link.querier(key(EnvMethod::Reset))?);
+        let key = |verb| keys::env(connection.sid(), &granted.lease, verb);
+        let (step, reset) = (connection.querier(key(EnvMethod::Step))?, connection.querier(key(EnvMethod::Reset))?);
         let num_envs = granted.num_envs as usize;
         Ok(Self {
             batch: StepBatch::new(num_envs, granted.spec.obs_len()),
@@ -77,16 +77,16 @@ impl RemoteVecEnv {
             reset,
             render: OnceLock::new(),
             pending: None,
-            link,
+            connection,
         })
     }
 
-    /// What it takes to take this lease over from another process.
+    /// Returns the handle with which another process can reclaim this lease.
     pub fn ticket(&self) -> &LeaseHandle {
         &self.ticket
     }
 
-    /// Sends actions without waiting: the policy may compute while the server steps. [`RemoteVecEnv::recv`] is next.
+    /// Sends actions without waiting, so that the caller can compute during the step. Call [`RemoteVecEnv::recv`] next.
     pub fn send(&mut self, actions: &[f32]) -> Result<(), EnvError> {
         if let Some((verb, _)) = &self.pending {
             return Err(remote(ClientError::RequestPending(verb.name())));
@@ -101,8 +101,10 @@ impl RemoteVecEnv {
         Ok(())
     }
 
-    /// Waits for what the sent actions gave. After a [`ClientError::NoAnswer`] it may be called again: the step is then
-    /// repeated under its number, and still executed once.
+    /// Waits for the result of the actions that were sent.
+    ///
+    /// It may be called again after a [`ClientError::RequestTimeout`]. The step is then repeated with the same sequence
+    /// number, and executed once.
     pub fn recv(&mut self) -> Result<&StepBatch, EnvError> {
         match &self.pending {
             Some((EnvMethod::Step, _)) => {}
@@ -117,16 +119,16 @@ impl RemoteVecEnv {
         Ok(&self.batch)
     }
 
-    /// Gives the environments back at once, in place of leaving them to the server's grace.
+    /// Ends the lease at once. Without it, the server keeps the environments for the grace period.
     pub fn close(mut self) -> Result<(), ClientError> {
         if self.pending.is_some() {
-            // What it gave no longer matters, but its number must be settled.
+            // Its result is not needed, but whether its number was consumed is.
             let _ = self.await_pending();
         }
-        let querier = self.link.querier(keys::env(self.link.sid(), &self.ticket.lease, EnvMethod::Close))?;
+        let querier = self.connection.querier(keys::env(self.connection.sid(), &self.ticket.lease, EnvMethod::Close))?;
         let (epoch, seq) = (self.ticket.epoch, self.last_seq + 1);
-        match self.link.request(&querier, encode(&message::CloseRequest { protocol: PROTOCOL, epoch, seq })) {
-            // The first answer was lost, or the grace has passed: they are free either way.
+        match self.connection.request(&querier, encode(&message::CloseRequest { protocol: PROTOCOL, epoch, seq })) {
+            // The first reply was lost, or the grace period has passed: the lease has ended either way.
             Err(ClientError::Rejected(refusal)) if refusal.code == ErrorCode::LeaseLost => Ok(()),
             answer => answer.map(drop),
         }
@@ -136,16 +138,18 @@ impl RemoteVecEnv {
         if let Some(querier) = self.render.get() {
             return Ok(querier);
         }
-        let querier = self.link.querier(keys::env(self.link.sid(), &self.ticket.lease, EnvMethod::Render))?;
+        let querier = self.connection.querier(keys::env(self.connection.sid(), &self.ticket.lease, EnvMethod::Render))?;
         Ok(self.render.get_or_init(|| querier))
     }
 
-    /// Waits for the answer to the pending request. Without an answer it stays pending, because it may have been
-    /// executed; its number is used up by an answer, or by an error that had effects.
+    /// Waits for the reply to the pending request.
+    ///
+    /// After a timeout the request stays pending, because it may have been executed. A reply or an error with effects
+    /// consumes its number.
     fn await_pending(&mut self) -> Result<ZBytes, EnvError> {
         let Some((verb, pending)) = &mut self.pending else { return Err(remote(ClientError::NothingSent)) };
         let querier = if *verb == EnvMethod::Reset { &self.reset } else { &self.step };
-        let answer = self.link.wait_reply(querier, pending);
+        let answer = self.connection.wait_reply(querier, pending);
         let executed = match &answer {
             Ok(_) => true,
             Err(ClientError::RequestTimeout { .. }) => return answer.map_err(remote),
@@ -173,10 +177,10 @@ impl VecEnv for RemoteVecEnv {
 
     fn reset(&mut self, request: &ResetRequest) -> Result<&[f32], EnvError> {
         if self.pending.is_some() {
-            // A step that was given up: what it gave or why it was refused no longer matters, whether it was executed does.
-            let settled = self.await_pending().map(drop);
+            // An abandoned step: its result or error is not needed, but whether its number was consumed is.
+            let awaited = self.await_pending().map(drop);
             if self.pending.is_some() {
-                return settled.map(|()| self.batch.obs.as_slice());
+                return awaited.map(|()| self.batch.obs.as_slice());
             }
         }
         request.check(self.num_envs)?;
@@ -196,11 +200,11 @@ impl VecEnv for RemoteVecEnv {
         self.recv()
     }
 
-    /// While a step is under way, it is drawn after the step.
+    /// If a step is in progress, the scene is that after the step.
     fn scene(&self, env: usize) -> Result<Scene, EnvError> {
         let querier = self.render_querier().map_err(remote)?;
         let request = message::RenderRequest { protocol: PROTOCOL, epoch: self.ticket.epoch, env: env as u64 };
-        let answer = self.link.request(querier, encode(&request)).map_err(remote)?;
+        let answer = self.connection.request(querier, encode(&request)).map_err(remote)?;
         let bytes = answer.to_bytes();
         decode(&bytes).and_then(convert::decode_scene).map_err(|error| malformed("render", error))
     }

@@ -7,11 +7,12 @@ use clap::Parser;
 use indicatif::ProgressBar;
 use rayon::prelude::*;
 use twinstep_logs::Log;
-use twinstep_model::effects::{Effect, Scope};
-use twinstep_model::{JOINT_NAMES, RolloutRequest, ModelFile, Precision, RobotStates, Rollout, go2};
+use twinstep_effects::{Effect, Scope};
+use twinstep_model::{JOINT_NAMES, RolloutRequest, Precision, RobotStates, Rollout, go2};
+use twinstep_effects::ModelFile;
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_sysid::{Experiment, WindowConfig, IdentifyOptions, candidate, evaluate, identify, initial_coordinate, free_parameters, with_values};
-use twinstep_tests::hidden_robot::{effect, ground_truth_robot, log_of, motion, estimated_effects};
+use twinstep_identify::{Experiment, WindowConfig, IdentifyOptions, candidate, evaluate, identify, initial_coordinate, free_parameters, with_values};
+use twinstep_tests::ground_truth_robot::{effect, ground_truth_robot, log_of, motion, estimated_effects};
 
 /// Identify hidden robots with different models and searches, and judge them on other motion.
 #[derive(Parser)]
@@ -97,7 +98,7 @@ fn median(sorted: &[f64]) -> f64 {
 /// A simulator that counts what it plays.
 struct Counting {
     simulator: BatchRollout,
-    /// Drive periods.
+    /// Actuator periods.
     played: usize,
 }
 

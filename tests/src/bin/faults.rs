@@ -8,8 +8,8 @@ use std::time::Instant;
 
 use clap::Parser;
 use indicatif::{ProgressBar, ProgressStyle};
-use twinstep_tests::campaign::{self, FaultPlan};
-use twinstep_tests::lane::TestBedConfig;
+use twinstep_tests::fault_injection::{self, FaultPlan};
+use twinstep_tests::test_bed::TestBedConfig;
 use twinstep_tests::roles::Role;
 
 /// Kill, freeze and confuse servers, clients and routers, and count what goes wrong.
@@ -63,7 +63,7 @@ fn inject(arguments: &Arguments) -> Result<bool, Box<dyn std::error::Error>> {
     let style = ProgressStyle::with_template("{bar:40} {pos}/{len} faults, {per_sec}, {eta} left: {msg}")?;
     let bar = ProgressBar::new(arguments.faults as u64).with_style(style);
     let since = Instant::now();
-    let tally = campaign::run(&plan, &AtomicBool::new(false), |fault| {
+    let tally = fault_injection::run(&plan, &AtomicBool::new(false), |fault| {
         bar.set_message(fault.name());
         bar.inc(1);
     })?;

@@ -5,12 +5,12 @@
 
 use clap::Parser;
 use rayon::prelude::*;
-use twinstep_logs::{BaseMount, Log};
-use twinstep_model::go2;
+use twinstep_model::{BaseMount, go2};
+use twinstep_logs::Log;
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_sysid::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
-use twinstep_tests::hidden_robot::log_of;
-use twinstep_tests::rivals::{PAIRS, Pair};
+use twinstep_diagnose::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
+use twinstep_tests::ground_truth_robot::log_of;
+use twinstep_tests::confounded_pairs::{PAIRS, Pair};
 
 /// Predict what safe motions tell of pairs of effects, and measure it.
 #[derive(Parser)]

@@ -4,8 +4,8 @@
 >>> import twinstep
 >>> envs = gym.make_vec("twinstep/Go2-Walk-v0", num_envs=64)  # doctest: +SKIP
 
-``endpoint=`` names a remote server or the robot; without, the bundled server starts on this machine and ends with this
-process.
+``endpoint=`` selects a remote server or the robot. By default the bundled server starts on this machine and terminates
+with this process.
 """
 
 import gymnasium
@@ -61,7 +61,7 @@ gymnasium.register(
     id="twinstep/Go2-Walk-v0",
     entry_point="twinstep.env:Go2Env",
     vector_entry_point="twinstep.vector_env:Go2VectorEnv",
-    # Twenty seconds, the task's own limit.
+    # 20 s, the time limit of the task.
     max_episode_steps=1000,
     kwargs={"task": "walk"},
 )

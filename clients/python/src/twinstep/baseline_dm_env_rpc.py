@@ -1,7 +1,7 @@
 # pyright: basic, reportMissingImports=false
-"""The reference of the bench: dm_env_rpc serving one environment with our shapes and no physics.
+"""Baseline of the bench: dm_env_rpc with one environment of the same shapes and without physics.
 
-``python -m twinstep.baseline_dm_env_rpc`` is the server; it prints its port and ends with its stdin.
+``python -m twinstep.baseline_dm_env_rpc`` is the server. It prints its port and terminates when its stdin closes.
 """
 
 import subprocess
@@ -18,10 +18,10 @@ OBSERVATION, ACTION = 1, 1
 
 
 class Servicer(dm_env_rpc_pb2_grpc.EnvironmentServicer):
-    """Answers every step with the same 45 floats."""
+    """Replies to every step with the same 45 floats."""
 
     def Process(self, request_iterator, context):  # noqa: N802
-        """One stream of requests and replies."""
+        """Handle one stream of requests and replies."""
         obs = np.zeros(45, np.float32)
         for request in request_iterator:
             tensor_utils.unpack_tensor(request.step.actions[ACTION])
@@ -43,7 +43,7 @@ def serve() -> None:
 
 @contextmanager
 def remote_step() -> Generator[Callable[[], object], None, None]:
-    """A function that steps an environment in another process once."""
+    """Yield a function that executes one step of an environment in another process."""
     server = subprocess.Popen(
         [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
@@ -54,10 +54,10 @@ def remote_step() -> Generator[Callable[[], object], None, None]:
     def step() -> object:
         request = dm_env_rpc_pb2.StepRequest(requested_observations=[OBSERVATION])
         request.actions[ACTION].CopyFrom(tensor_utils.pack_tensor(action))
-        return tensor_utils.unpack_tensor(link.send(request).observations[OBSERVATION])
+        return tensor_utils.unpack_tensor(client.send(request).observations[OBSERVATION])
 
     address = f"127.0.0.1:{int(server.stdout.readline())}"
-    with grpc.insecure_channel(address) as channel, connection.Connection(channel) as link:
+    with grpc.insecure_channel(address) as channel, connection.Connection(channel) as client:
         yield step
     server.stdin.close()
     server.wait()

@@ -1,8 +1,8 @@
-"""The simulators that ``twinstep bench`` measures beside its own: MuJoCo C, and EnvPool's Go1.
+"""Baseline simulators of ``twinstep bench``: MuJoCo C, and EnvPool's Go1.
 
-``python -m twinstep.baseline_simulators`` is a child of the bench. It reads one line of JSON with models and motion, prints
-the list of the peers that are installed, and then answers each name with the env-steps a second of one window, so that
-the bench can take its own windows in between. It ends with its stdin.
+``python -m twinstep.baseline_simulators`` is a child process of the bench. It reads one line of JSON with models and
+motion and prints the list of installed baselines. It then reads names of baselines, and prints for each the env-steps
+per second of one window. The bench measures its own windows in between. The process terminates when its stdin closes.
 """
 
 import importlib
@@ -17,13 +17,13 @@ import numpy as np
 from .bench import installed
 
 Advance = Callable[[], int]
-"""Advances all robots and returns how many env-steps that were."""
+"""Function that advances all robots and returns the number of env-steps."""
 
 GO1 = "Go1JoystickFlatTerrain-v1"
 
 
-def peers(setup: dict[str, Any]) -> dict[str, Callable[[], Advance]]:
-    """What can be measured here: a function that prepares each peer, by name."""
+def baselines(setup: dict[str, Any]) -> dict[str, Callable[[], Advance]]:
+    """Return a function that prepares each installed baseline, by name."""
     found = dict[str, Callable[[], Advance]]()
     if installed("mujoco"):
         for physics_hz, model in setup["models"].items():
@@ -35,10 +35,10 @@ def peers(setup: dict[str, Any]) -> dict[str, Callable[[], Advance]]:
 
 
 def mujoco_trot(xml: str, setup: dict[str, Any]) -> Advance:
-    """``mujoco.rollout`` of all robots on one thread.
+    """Prepare ``mujoco.rollout`` of all robots on one thread.
 
-    A rollout is open loop, so the drive is in the model: position actuators, whose PD acts at every step of the
-    physics and not at 200 Hz as in ours.
+    A rollout is open loop, so the model contains position actuators. Their PD loop runs at every physics step, in our
+    engines at 200 Hz.
     """
     mujoco: Any = importlib.import_module("mujoco")
     rollout: Any = importlib.import_module("mujoco.rollout")
@@ -55,22 +55,22 @@ def mujoco_trot(xml: str, setup: dict[str, Any]) -> Advance:
 
     def advance() -> int:
         nonlocal states
-        # One MjData: no pool of threads.
-        passed, _ = rollout.rollout(model, data, states, control)
-        states = np.array(passed[:, -1])
+        # With one MjData, rollout uses one thread.
+        trajectory, _ = rollout.rollout(model, data, states, control)
+        states = np.array(trajectory[:, -1])
         return len(states) * len(targets)
 
     return advance
 
 
 def envpool_trot(threads: int, setup: dict[str, Any]) -> Advance:
-    """MuJoCo Playground's Go1 in EnvPool, with its own observations, rewards and resets."""
+    """Prepare MuJoCo Playground's Go1 in EnvPool, with its own observations, rewards and resets."""
     envpool: Any = importlib.import_module("envpool")
     envs = envpool.make_gymnasium(GO1, num_envs=setup["num_envs"], num_threads=threads)
     envs.reset()
-    # Its legs are FR, FL, RR, RL; the scale of an action is ours.
-    own_order = np.array(setup["actions"]).reshape(-1, 4, 3)[:, [1, 0, 3, 2]].reshape(-1, 12)
-    actions = np.repeat(own_order[:, None], setup["num_envs"], axis=1)
+    # The order of its legs is FR, FL, RR, RL. The action scale is the same as ours.
+    actions_in_order = np.array(setup["actions"]).reshape(-1, 4, 3)[:, [1, 0, 3, 2]].reshape(-1, 12)
+    actions = np.repeat(actions_in_order[:, None], setup["num_envs"], axis=1)
 
     def advance() -> int:
         for action in actions:
@@ -81,21 +81,21 @@ def envpool_trot(threads: int, setup: dict[str, Any]) -> Advance:
 
 
 def main() -> None:
-    """Answer the bench."""
+    """Handle the requests of the bench."""
     setup = json.loads(sys.stdin.readline())
-    known = peers(setup)
-    print(json.dumps(list(known)), flush=True)
+    prepare = baselines(setup)
+    print(json.dumps(list(prepare)), flush=True)
     ready = dict[str, Advance]()
     for line in sys.stdin:
         name = line.strip()
         if name not in ready:
-            ready[name] = known[name]()
-            # The first steps are falls and allocations.
+            ready[name] = prepare[name]()
+            # Warm-up: the first steps contain falls and memory allocation.
             ready[name]()
         count, since = 0, time.perf_counter()
-        while (passed := time.perf_counter() - since) < setup["window_s"]:
+        while (elapsed := time.perf_counter() - since) < setup["window_s"]:
             count += ready[name]()
-        print(count / passed, flush=True)
+        print(count / elapsed, flush=True)
 
 
 if __name__ == "__main__":

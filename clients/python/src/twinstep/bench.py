@@ -1,6 +1,6 @@
-"""How fast environments step from Python, side by side with the peers: ``python -m twinstep.bench [--json]``.
+"""Measure the stepping rate from Python, compared with baselines: ``python -m twinstep.bench [--json]``.
 
-Peers that are not installed are left out and named on stderr: ``pip install "twinstep[bench]"``.
+Baselines that are not installed are skipped with a message on stderr: ``pip install "twinstep[bench]"``.
 """
 
 import argparse
@@ -29,7 +29,7 @@ Row = dict[str, Any]
 
 
 def measure_rate(once: Callable[[], object], window_s: float) -> tuple[float, float]:
-    """Repeats a second and median time of one [µs], each the median of five windows."""
+    """Return the calls per second and the median time of a call [µs], each the median of five windows."""
     once()
     rates, medians = list[float](), list[float]()
     for _ in range(WINDOWS):
@@ -47,7 +47,7 @@ def measure_rate(once: Callable[[], object], window_s: float) -> tuple[float, fl
 
 @contextmanager
 def stepping(num_envs: int, task: str) -> Generator[Callable[[], object], None, None]:
-    """A function that steps ``num_envs`` robots of the bundled server once."""
+    """Yield a function that executes one step of ``num_envs`` robots of the bundled server."""
     envs = Go2VectorEnv(num_envs, task=task)
     envs.reset(seed=1)
     actions = np.zeros((num_envs, 12), np.float32)
@@ -58,7 +58,7 @@ def stepping(num_envs: int, task: str) -> Generator[Callable[[], object], None, 
 
 
 def transport(window_s: float) -> Iterator[Row]:
-    """Physics off, beside dm_env_rpc serving the same observation."""
+    """Measure the transport without physics, compared with dm_env_rpc with the same observation."""
     reference = dm_env_rpc_rate(window_s)
     for num_envs in NUM_ENVS:
         with stepping(num_envs, "counter") as step:
@@ -69,7 +69,7 @@ def transport(window_s: float) -> Iterator[Row]:
 
 
 def physics(window_s: float) -> Iterator[Row]:
-    """Physics on, beside the same environments in process and beside Ant-v5 of the peers."""
+    """Measure steps with physics, compared with the same environments in process and Ant-v5 of the baselines."""
     program = subprocess.run(
         [find_program(), "bench", "remote", "--json", "--window-s", str(window_s)], capture_output=True, check=True
     )
@@ -80,24 +80,24 @@ def physics(window_s: float) -> Iterator[Row]:
         local = in_process.get(f"walk in process, {num_envs} envs")
         yield row(f"walk, {num_envs} envs", rate, "env-steps/s", "the same in process, in Rust", local)
         if num_envs == ANT_ENVS:
-            for peer, peers_rate in ant_rates(window_s):
-                yield row(f"walk, {num_envs} envs", rate, "env-steps/s", f"{peer}, Ant-v5", peers_rate)
+            for baseline, baseline_rate in ant_rates(window_s):
+                yield row(f"walk, {num_envs} envs", rate, "env-steps/s", f"{baseline}, Ant-v5", baseline_rate)
 
 
-def row(case: str, value: float, unit: str, reference: str | None = None, theirs: float | None = None) -> Row:
-    """One number; ``ratio`` is ours to the reference's."""
-    known = theirs is not None
+def row(case: str, value: float, unit: str, reference: str | None = None, reference_value: float | None = None) -> Row:
+    """Return one measurement; ``ratio`` is our value divided by that of the reference."""
+    known = reference_value is not None
     return {
         "case": case,
         "value": value,
         "unit": unit,
-        "reference": f"{reference}: {theirs:.0f}" if known else None,
-        "ratio": value / theirs if known else None,
+        "reference": f"{reference}: {reference_value:.0f}" if known else None,
+        "ratio": value / reference_value if known else None,
     }
 
 
 def ant_rates(window_s: float) -> Iterator[tuple[str, float]]:
-    """Env-steps a second of 64 Ant-v5 in each peer that is installed."""
+    """Measure the env-steps per second of 64 Ant-v5 in each installed baseline."""
     actions = np.zeros((ANT_ENVS, 8), np.float32)
     if installed("mujoco"):
         for mode in ("sync", "async"):
@@ -114,7 +114,7 @@ def ant_rates(window_s: float) -> Iterator[tuple[str, float]]:
 
 
 def dm_env_rpc_rate(window_s: float) -> float | None:
-    """Env-steps a second of one dm_env_rpc environment with our shapes, server and client on loopback."""
+    """Measure the env-steps per second of one dm_env_rpc environment of the same shapes, over loopback."""
     if not installed("dm_env_rpc"):
         return None
     from .baseline_dm_env_rpc import remote_step
@@ -124,17 +124,17 @@ def dm_env_rpc_rate(window_s: float) -> float | None:
 
 
 def installed(module: str) -> bool:
-    """Whether a peer is there; its absence is said."""
+    """Return true if a baseline is installed; print a message if not."""
     if importlib.util.find_spec(module) is not None:
         return True
-    print(f'left out: {module} is not installed (pip install "twinstep[bench]")', file=sys.stderr)
+    print(f'skipped: {module} is not installed (pip install "twinstep[bench]")', file=sys.stderr)
     return False
 
 
 def main() -> None:
-    """Measure and print."""
+    """Run the measurements and print the results."""
     parser = argparse.ArgumentParser(prog="python -m twinstep.bench", description=__doc__)
-    parser.add_argument("what", nargs="?", choices=["transport", "physics"], help="both without")
+    parser.add_argument("what", nargs="?", choices=["transport", "physics"], help="default: both")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--window-s", type=float, default=1.0, help="length of one of the five windows of each case")
     arguments = parser.parse_args()
@@ -145,8 +145,8 @@ def main() -> None:
         for each in part(arguments.window_s):
             rows.append(each)
             if not arguments.json:
-                beside = f"   {each['ratio']:.2f} of {each['reference']}" if each["ratio"] is not None else ""
-                print(f"{each['case']:<32}{each['value']:>12.0f} {each['unit']:<14}{beside}", flush=True)
+                comparison = f"   {each['ratio']:.2f} of {each['reference']}" if each["ratio"] is not None else ""
+                print(f"{each['case']:<32}{each['value']:>12.0f} {each['unit']:<14}{comparison}", flush=True)
     if arguments.json:
         machine = f"{platform.processor() or platform.machine()}, Python {platform.python_version()}"
         print(json.dumps({"rows": rows, "machine": machine}))

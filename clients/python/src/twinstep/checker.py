@@ -1,4 +1,4 @@
-"""The checker for ``VecEnv`` that Stable-Baselines3 does not have: its own checks single environments."""
+"""Checker for a ``VecEnv``. The checker of Stable-Baselines3 is only for single environments."""
 
 import copy
 import warnings
@@ -22,22 +22,22 @@ _ATTRIBUTE, _METHOD = "twinstep_check_attribute", "twinstep_check_method"
 
 
 def check_vec_env(env: "VecEnv", *, steps: int = 200) -> None:
-    """Check anybody's ``VecEnv`` of Stable-Baselines3, and close it.
+    """Check the contract of any Stable-Baselines3 ``VecEnv``, and close it.
 
-    It is stepped with random actions, three times from the same seed. Check it without ``VecNormalize``, whose
-    statistics go on from rollout to rollout.
+    It is stepped with random actions in three rollouts from the same seed. Check it without ``VecNormalize``, whose
+    statistics persist between rollouts.
 
     Parameters
     ----------
     env
-        What is checked.
+        The environment to check.
     steps
-        Steps of a rollout. Warns if no episode ends within them: then what is due at an end was not checked.
+        Number of steps of a rollout. Warns if no episode ends within them, because ends are then not checked.
 
     Raises
     ------
     VecEnvError
-        Something is wrong: the message says what, in which environment, and what is expected.
+        The contract is violated. The message contains what is wrong, in which environment, and what is expected.
     """
     _check_itself(env)
     _check_attributes(env)
@@ -46,9 +46,9 @@ def check_vec_env(env: "VecEnv", *, steps: int = 200) -> None:
     _check_equal(first, _rollout(env, steps, _step_in_two), "`step`, and `step_async` followed by `step_wait`,")
     _check_seed_is_used_once(env)
     for _ in range(2):
-        _ask("close", env.close)
+        _call("close", env.close)
     if not any(result.name.startswith("terminal_observation") for results in first for result in results):
-        warnings.warn(f"no episode ended within {steps} steps, so no end was checked; raise `steps`", stacklevel=2)
+        warnings.warn(f"no episode ended within {steps} steps, so no end was checked; increase `steps`", stacklevel=2)
 
 
 def _check_itself(env: object) -> None:
@@ -56,76 +56,78 @@ def _check_itself(env: object) -> None:
 
     if not isinstance(env, VecEnv):
         kind = f"{type(env).__module__}.{type(env).__qualname__}"
-        raise VecEnvError(f"{kind} is no `VecEnv`", expected="a subclass of `stable_baselines3.common.vec_env.VecEnv`")
+        expected = "a subclass of `stable_baselines3.common.vec_env.VecEnv`"
+        raise VecEnvError(f"{kind} is not a `VecEnv`", expected=expected)
     num_envs = cast(object, env.num_envs)
     if not isinstance(num_envs, int) or num_envs < 1:
-        raise VecEnvError(f"`num_envs` = {num_envs!r}", expected="an int, at least 1")
+        raise VecEnvError(f"`num_envs` = {num_envs!r}", expected="an int of at least 1")
     for name in ("observation_space", "action_space"):
         space: object = getattr(env, name, None)
         if not isinstance(space, spaces.Space):
             found = f"`{name}` is {type(space).__name__}"
-            raise VecEnvError(found, expected="a `gymnasium.Space`: that of one environment, not of all")
+            raise VecEnvError(found, expected="the `gymnasium.Space` of one environment, not of all")
 
 
 def _check_attributes(env: "VecEnv") -> None:
     everywhere, last = list(range(env.num_envs)), env.num_envs - 1
-    # As callers ask: for all, for one, for several out of order.
-    asked: list[tuple[int | list[int] | None, list[int]]] = [
+    # All indices, a single index, several in another order.
+    requests: list[tuple[int | list[int] | None, list[int]]] = [
         (None, everywhere),
         (last, [last]),
         (everywhere[::-1], everywhere[::-1]),
     ]
-    for indices, meant in asked:
-        _check_set_attr(env, indices, meant)
-    for indices, meant in asked:
-        _check_answers(env, indices, meant)
+    for indices, expected_indices in requests:
+        _check_set_attr(env, indices, expected_indices)
+    for indices, expected_indices in requests:
+        _check_getters(env, indices, expected_indices)
 
 
-def _check_set_attr(env: "VecEnv", indices: int | list[int] | None, meant: list[int]) -> None:
-    _ask("set_attr", env.set_attr, _ATTRIBUTE, "before")
-    _ask("set_attr", env.set_attr, _ATTRIBUTE, "after", indices=indices)
-    values = _ask("get_attr", env.get_attr, _ATTRIBUTE)
+def _check_set_attr(env: "VecEnv", indices: int | list[int] | None, expected_indices: list[int]) -> None:
+    _call("set_attr", env.set_attr, _ATTRIBUTE, "before")
+    _call("set_attr", env.set_attr, _ATTRIBUTE, "after", indices=indices)
+    values = _call("get_attr", env.get_attr, _ATTRIBUTE)
     check_list(values, "`get_attr`", env.num_envs)
     for index, value in enumerate(values):
-        expected = "after" if index in meant else "before"
+        expected = "after" if index in expected_indices else "before"
         if value != expected:
-            found = f"`set_attr` with indices={indices} left the attribute at {value!r}"
-            raise VecEnvError(found, expected=f"{expected!r}: set where `indices` says, nowhere else", env=index)
+            found = f"the attribute is {value!r} after `set_attr` with indices={indices}"
+            raise VecEnvError(found, expected=f"{expected!r}: set only for the environments in `indices`", env=index)
 
 
-def _check_answers(env: "VecEnv", indices: int | list[int] | None, meant: list[int]) -> None:
-    asked = f"with indices={indices}"
+def _check_getters(env: "VecEnv", indices: int | list[int] | None, expected_indices: list[int]) -> None:
+    arguments = f"with indices={indices}"
     for index in range(env.num_envs):
-        _ask("set_attr", env.set_attr, _ATTRIBUTE, index, indices=index)
-    values = _ask("get_attr", env.get_attr, _ATTRIBUTE, indices=indices)
-    check_list(values, f"`get_attr` {asked}", len(meant))
-    if list(values) != meant:
-        found = f"`get_attr` {asked} gave the attributes of the environments {list(values)}"
-        raise VecEnvError(found, expected=f"those of {meant}, in this order")
-    _ask("set_attr", env.set_attr, _METHOD, _method)
-    answers = _ask("env_method", cast(Any, env).env_method, _METHOD, 1, indices=indices, keyword=2)
-    check_list(answers, f"`env_method` {asked}", len(meant))
-    if any(answer != (1, 2) for answer in answers):
-        raise VecEnvError(f"`env_method` {asked} gave {answers!r}", expected="what the method returned: (1, 2)")
-    wrapped = _ask("env_is_wrapped", env.env_is_wrapped, gymnasium.Wrapper, indices=indices)
-    check_list(wrapped, f"`env_is_wrapped` {asked}", len(meant))
+        _call("set_attr", env.set_attr, _ATTRIBUTE, index, indices=index)
+    values = _call("get_attr", env.get_attr, _ATTRIBUTE, indices=indices)
+    check_list(values, f"`get_attr` {arguments}", len(expected_indices))
+    if list(values) != expected_indices:
+        found = f"`get_attr` {arguments} returned the attributes of the environments {list(values)}"
+        raise VecEnvError(found, expected=f"those of {expected_indices}, in this order")
+    _call("set_attr", env.set_attr, _METHOD, _method)
+    returned = _call("env_method", cast(Any, env).env_method, _METHOD, 1, indices=indices, keyword=2)
+    check_list(returned, f"`env_method` {arguments}", len(expected_indices))
+    if any(answer != (1, 2) for answer in returned):
+        found = f"`env_method` {arguments} returned {returned!r}"
+        raise VecEnvError(found, expected="the return value of the method: (1, 2)")
+    wrapped = _call("env_is_wrapped", env.env_is_wrapped, gymnasium.Wrapper, indices=indices)
+    check_list(wrapped, f"`env_is_wrapped` {arguments}", len(expected_indices))
     if any(not isinstance(one, bool | np.bool_) for one in wrapped):
-        raise VecEnvError(f"`env_is_wrapped` {asked} gave {wrapped!r}", expected="a bool for each environment")
+        raise VecEnvError(f"`env_is_wrapped` {arguments} returned {wrapped!r}", expected="one bool per environment")
 
 
 def _method(positional: int, *, keyword: int) -> tuple[int, int]:
-    """What ``env_method`` is made to call; at the top of the module, so that ``SubprocVecEnv`` can pickle it."""
+    """Return the arguments. Called by ``env_method``; at module level, so that ``SubprocVecEnv`` can pickle it."""
     return positional, keyword
 
 
-def _ask(name: str, method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+def _call(name: str, method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     """Call a method of the ``VecEnv`` that must not raise."""
     try:
         return method(*args, **kwargs)
     except Exception as error:
         given = ", ".join([*map(repr, args), *(f"{key}={value!r}" for key, value in kwargs.items())])
         found = f"`{name}({given})` raised {type(error).__name__}: {error}"
-        raise VecEnvError(found, expected="it works: algorithms, wrappers and callbacks call it") from error
+        raise VecEnvError(found, expected="no exception: algorithms and wrappers call this method") from error
 
 
 def _step_at_once(env: "VecEnv", actions: Array) -> object:
@@ -138,41 +140,41 @@ def _step_in_two(env: "VecEnv", actions: Array) -> object:
 
 
 def _rollout(env: "VecEnv", steps: int, step: Callable[["VecEnv", Array], object]) -> list[list[ReturnedArray]]:
-    """Reset from the seed and step, checking all that comes back; the first entry is the reset's."""
+    """Reset with the seed, step, and check all results; the first entry is that of the reset."""
     space: spaces.Space[Any] = copy.deepcopy(cast(Any, env.action_space))
     space.seed(_SEED)
-    check_list(_ask("seed", env.seed, _SEED), "`seed`", env.num_envs)
+    check_list(_call("seed", env.seed, _SEED), "`seed`", env.num_envs)
     rollout = [check_reset(env, env.reset())]
     for _ in range(steps):
         actions: Array = np.array([space.sample() for _ in range(env.num_envs)])
         given = actions.copy()
         rollout.append(check_step(env, step(env, given)))
         if not np.array_equal(given, actions):
-            raise VecEnvError("a step wrote into the actions that it was given", expected="they are left as they are")
+            raise VecEnvError("a step wrote into its argument `actions`", expected="unchanged actions")
     _check_fresh(rollout)
     return rollout
 
 
 def _check_fresh(rollout: list[list[ReturnedArray]]) -> None:
-    expected = "fresh arrays from each step: agents keep them until they learn"
+    expected = "new arrays from each step, because agents store them"
     for number, (results, after) in enumerate(pairwise(rollout)):
         for old in results:
             if not np.array_equal(old.array, old.snapshot):
                 raise VecEnvError(f"a later step overwrote {old.name} of step {number}", expected=expected, env=old.env)
             if any(np.shares_memory(old.array, new.array) for new in after):
-                found = f"{old.name} of step {number} shares memory with what the next step gave"
+                found = f"{old.name} of step {number} shares memory with the result of the next step"
                 raise VecEnvError(found, expected=expected, env=old.env)
 
 
 def _check_equal(one: list[list[ReturnedArray]], other: list[list[ReturnedArray]], which: str) -> None:
     for number, (results, others) in enumerate(zip(one, other, strict=True)):
-        # Their numbers differ only where `done` does, which comes before the ends.
+        # The numbers of entries differ only if `done` differs, which is compared before the entries at ends.
         for a, b in zip(results, others, strict=False):
             if np.array_equal(a.snapshot, b.snapshot):
                 continue
             env = a.env if a.env is not None else int(np.argwhere(a.snapshot != b.snapshot)[0, 0])
             found = f"{which} differ in {a.name} of step {number}"
-            raise VecEnvError(found, expected="equal seeds and actions give equal results", env=env)
+            raise VecEnvError(found, expected="equal results for equal seeds and actions", env=env)
 
 
 def _check_seed_is_used_once(env: "VecEnv") -> None:
@@ -180,10 +182,10 @@ def _check_seed_is_used_once(env: "VecEnv") -> None:
     seeded, next_one = check_reset(env, env.reset()), check_reset(env, env.reset())
     env.seed(_OTHER_SEED)
     other = check_reset(env, env.reset())
-    # Where every seed gives the same start, nothing can be told.
+    # Not checked if every seed gives the same initial state.
     if _same(seeded, next_one) and not _same(seeded, other):
-        found = "the second `reset` after `seed` gave the same observations again"
-        raise VecEnvError(found, expected="a seed is used by one reset (`_reset_seeds`); then the random streams go on")
+        found = "the second `reset` after `seed` returned the same observations"
+        raise VecEnvError(found, expected="one reset uses the seed (`_reset_seeds`); later the random streams continue")
 
 
 def _same(one: list[ReturnedArray], other: list[ReturnedArray]) -> bool:

@@ -1,4 +1,4 @@
-"""Messages of the wire (``protocol/SPEC.md``) to bytes and back, and the server's spec."""
+"""Encode and decode messages of the wire protocol (``protocol/SPEC.md``), and read the spec of a server."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from .errors import Error
 
 PROTOCOL = 1
-"""Version of the protocol that this client speaks."""
+"""Protocol version of this client."""
 
 
 class MalformedError(Error):
-    """The server's answer is not what the protocol says."""
+    """A reply does not conform to the protocol."""
 
 
 def encode(message: Mapping[str, object]) -> bytes:
-    """Encode a request; the protocol's version is added."""
+    """Encode a request; adds the protocol version."""
     return cast(bytes, msgpack.packb({"protocol": PROTOCOL, **message}))
 
 
@@ -33,15 +33,15 @@ def decode(payload: bytes) -> dict[str, Any]:
     """
     try:
         message = cast(object, msgpack.unpackb(payload))
-    except Exception as error:  # msgpack raises many kinds
-        raise MalformedError(f"the answer is not MessagePack: {error}") from error
+    except Exception as error:  # msgpack raises many types
+        raise MalformedError(f"the reply is not MessagePack: {error}") from error
     if not isinstance(message, dict):
-        raise MalformedError(f"the answer is {type(message).__name__}, not a map")
+        raise MalformedError(f"the reply is {type(message).__name__}, not a map")
     return cast(dict[str, Any], message)
 
 
 def tensor(message: Mapping[str, Any], field: str, dtype: str, *shape: int) -> NDArray[Any]:
-    """Read a tensor of ``message`` into a fresh, writable array.
+    """Return a tensor of ``message`` as a new, writable array.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def tensor(message: Mapping[str, Any], field: str, dtype: str, *shape: int) -> N
     dtype
         Little-endian NumPy type, such as ``"<f4"``.
     shape
-        What is expected; the first entry may be -1.
+        Expected shape; the first entry may be -1.
     """
     payload = message.get(field)
     if not isinstance(payload, bytes):
@@ -65,7 +65,7 @@ def tensor(message: Mapping[str, Any], field: str, dtype: str, *shape: int) -> N
 
 @dataclass(frozen=True)
 class SpecField:
-    """One part of an observation or action: ``size`` entries with a common name, unit and bounds."""
+    """One quantity of an observation or action: ``size`` entries with a common name, unit and bounds."""
 
     name: str
     size: int
@@ -77,7 +77,7 @@ class SpecField:
 
 @dataclass(frozen=True)
 class Spec:
-    """What a server says about its task: layouts, rates, gains. ``hash`` is equal where an agent may run on both."""
+    """Spec of a server's task: layouts, periods, gains. An agent can run on every server with the same ``hash``."""
 
     task: str
     robot: str
@@ -96,16 +96,16 @@ class Spec:
 
     @property
     def obs_len(self) -> int:
-        """Entries of an observation."""
+        """Length of an observation."""
         return sum(part.size for part in self.observation)
 
     @property
     def action_len(self) -> int:
-        """Entries of an action."""
+        """Length of an action."""
         return sum(part.size for part in self.action)
 
     def action_entry(self, index: int) -> str:
-        """Name entry ``index`` of an action, such as ``joint_position_offset[FL_thigh]``."""
+        """Return the name of entry ``index`` of an action, such as ``joint_position_offset[FL_thigh]``."""
         for part in self.action:
             if index < part.size:
                 per_joint = part.size == len(self.joint_order)
@@ -128,4 +128,4 @@ def read_spec(message: Mapping[str, Any], spec_hash: str) -> Spec:
         known = set(Spec.__dataclass_fields__) - {"hash"}
         return Spec(**{name: fields[name] for name in known}, hash=spec_hash)
     except (KeyError, TypeError) as error:
-        raise MalformedError(f"the server's spec lacks or garbles {error}") from error
+        raise MalformedError(f"the server's spec is invalid: {error}") from error

@@ -1,4 +1,4 @@
-"""The connection to one server: opening, finding, asking until answered, and saying why not."""
+"""Connection to one server: session, discovery, requests with retries, reasons of timeouts."""
 
 import json
 import os
@@ -25,10 +25,14 @@ from .errors import (
 from .server import EmbeddedServer
 
 QUERY_TIMEOUT_S = 1.0
-"""A query is repeated after this time; Zenoh keeps state for each as long. A longer step is waited for by repeating."""
+"""Timeout of one query, after which it is repeated.
+
+A step may take longer, because a repeat waits for the request in progress. The timeout is short, because Zenoh keeps
+state for each query this long.
+"""
 
 CONNECT_TIMEOUT_S = 5.0
-"""How long to look for a server."""
+"""Time after which the discovery of a server fails."""
 
 _FIRST_BACKOFF_S, _MAX_BACKOFF_S = 0.002, 0.2
 _RESTART_CONFIRMATION_S = 2.0
@@ -36,7 +40,7 @@ _LIVE_SERVERS = "twinstep/live/server/*/*"
 
 
 class Pending:
-    """A request that was sent and not yet answered."""
+    """A request in progress."""
 
     def __init__(self, querier: zenoh.Querier, payload: bytes) -> None:
         self.querier = querier
@@ -44,7 +48,7 @@ class Pending:
         self.replies = self._get()
 
     def repeat(self) -> None:
-        """Send it again under the same number, so that it is executed once."""
+        """Send the request again with the same number, so that it is executed once."""
         self.replies = self._get()
 
     def _get(self) -> Any:
@@ -62,11 +66,11 @@ class Connection:
     endpoint
         Zenoh endpoint of the server or of a router, such as ``tcp/127.0.0.1:7447``.
     robot
-        The robot's name; needed where several are visible.
+        Name of the robot. Required if several are visible.
     zenoh_config
         Zenoh configuration file (JSON5) for TLS, user and password.
     server
-        The server at ``endpoint``, if this process started it.
+        The server at ``endpoint`` if this process started it.
     """
 
     def __init__(
@@ -87,7 +91,7 @@ class Connection:
 
     def close(self) -> None:
         """Close the session."""
-        # A child made by fork has the object, but not the session's threads.
+        # A forked child has the object, but not the threads of the session.
         if self._pid == os.getpid():
             self._session.close()
 
@@ -103,11 +107,11 @@ class Connection:
         )
 
     def request(self, querier: zenoh.Querier, message: dict[str, object], timeout_s: float) -> dict[str, Any]:
-        """Send a request and wait for its answer."""
+        """Send a request and wait for the reply."""
         return self.wait_reply(Pending(querier, codec.encode(message)), timeout_s)
 
     def wait_reply(self, pending: Pending, timeout_s: float) -> dict[str, Any]:
-        """Wait for the answer to a request, repeating it. May be called again after a :class:`RequestTimeoutError`."""
+        """Wait for the reply to a request, and repeat the request. May be called again after a timeout."""
         since, pause, replaced_since = time.monotonic(), _FIRST_BACKOFF_S, None
         while True:
             answer = _outcome(pending)
@@ -116,16 +120,17 @@ class Connection:
             if self._server is not None and not self._server.alive:
                 raise ServerExitedError(self._server.exit_report())
             now = time.monotonic()
-            # Only silence tells of a restart: a query that times out had somebody at its end.
+            # Only zero replies can be due to a restart. A query that times out has reached the server.
             replaced = answer is _NoReply.NONE and self._server_restarted()
             replaced_since = (replaced_since or now) if replaced else None
             if replaced_since is not None and now - replaced_since >= _RESTART_CONFIRMATION_S:
                 raise LeaseLostError(
-                    f"the server at {self.endpoint} was restarted: its environments are gone\n  make a new environment"
+                    f"the server at {self.endpoint} was restarted: the environments of this lease are lost\n"
+                    "  create a new environment"
                 )
             if now - since >= timeout_s:
                 raise RequestTimeoutError(
-                    f"no answer from {self.endpoint} to `{pending.querier.key_expr}` after {now - since:.1f} s: "
+                    f"no reply from {self.endpoint} to `{pending.querier.key_expr}` after {now - since:.1f} s: "
                     f"{self._timeout_reason()}"
                 )
             time.sleep(pause)
@@ -138,13 +143,13 @@ class Connection:
         low, high = hello["protocols"]
         if not low <= codec.PROTOCOL <= high:
             raise VersionError(
-                f"the server at {self.endpoint} ({hello['server_version']}) speaks protocol {low} to {high}, this client "
-                f"{codec.PROTOCOL}\n  install the same Twinstep at both ends"
+                f"the server at {self.endpoint} ({hello['server_version']}) supports protocol {low} to {high}, this "
+                f"client {codec.PROTOCOL}\n  install the same Twinstep at both ends"
             )
         return hello
 
     def _visible_servers(self) -> list[tuple[str, str]]:
-        """Server id and robot name of every visible server."""
+        """Return the server id and the robot name of every visible server."""
         replies = self._session.liveliness().get(_LIVE_SERVERS, timeout=QUERY_TIMEOUT_S)
         keys = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
         return sorted((key.split("/")[3], key.split("/")[4]) for key in keys)
@@ -153,22 +158,23 @@ class Connection:
         since = time.monotonic()
         while True:
             visible = self._visible_servers()
-            fitting = [server for server in visible if robot in (None, server[1])]
-            if len(fitting) == 1:
-                return fitting[0]
+            matching = [server for server in visible if robot in (None, server[1])]
+            if len(matching) == 1:
+                return matching[0]
             waited_s = time.monotonic() - since
             if waited_s < CONNECT_TIMEOUT_S:
-                # A restarted server's old token may still be there for a moment.
+                # The old token of a restarted server may be visible for a moment.
                 time.sleep(0.05)
                 continue
             if not visible:
                 raise NoServerError(
                     f"connected to {self.endpoint}, but no server is visible there after {waited_s:.1f} s\n"
-                    "  either none runs behind it, or access control hides it from this user: the server's log tells"
+                    "  either no server is running, or access control hides it from this user: read the server's log"
                 )
-            found = f"{len(fitting)} robots are named `{robot}`" if robot else f"{len(fitting)} robots are there"
+            count = len(matching)
+            found = f"{count} robots have the name `{robot}`" if robot else f"{count} robots are visible"
             names = ", ".join(f"{name} ({server_id})" for server_id, name in visible)
-            raise AmbiguousRobotError(f"{found}; visible: {names}\n  choose one by its name: `robot=`")
+            raise AmbiguousRobotError(f"{found}; visible: {names}\n  set `robot` to the name of one of them")
 
     def _server_restarted(self) -> bool:
         visible = self._visible_servers()
@@ -177,22 +183,22 @@ class Connection:
     def _timeout_reason(self) -> str:
         info = self._session.info
         if not info.routers_zid() and not info.peers_zid():
-            return "the connection is down and could not be opened again; does the server or the router still run?"
+            return "the connection is lost and cannot be restored; check that the server or the router is running"
         if all(server_id != self.server_id for server_id, _ in self._visible_servers()):
-            return "the connection stands, but the server is gone from it: it ended, or its own link did"
+            return "the connection works, but the server is no longer visible: it has terminated or lost its router"
         hello = _outcome(Pending(self.querier("hello"), codec.encode({"client": "twinstep-python"})))
         if isinstance(hello, dict):
             return (
-                "the server answers `hello`, but not this: it is still executing the request (raise `timeout_s`), or "
-                "access control or a size limit on the way refuses it"
+                "the server answers `hello`, but not this request: it is still in progress (increase `timeout_s`), or "
+                "access control or a message size limit rejects it"
             )
         if hello is _NoReply.TIMEOUT:
-            return "the server is visible but frozen: it accepts requests and answers none"
-        return "the server is visible but nothing comes back: access control may deny queries to this user"
+            return "the server is visible but unresponsive: it does not reply to requests"
+            return "the server is visible, but queries get no reply: access control may deny queries to this user"
 
 
 class _NoReply:
-    """What came in place of an answer."""
+    """Why a query got no reply."""
 
     NONE: "_NoReply"
     TIMEOUT: "_NoReply"
@@ -203,12 +209,12 @@ _NoReply.NONE, _NoReply.TIMEOUT, _NoReply.BUSY = _NoReply(), _NoReply(), _NoRepl
 
 
 def _outcome(pending: Pending) -> dict[str, Any] | _NoReply:
-    """The answer to one query, or why there is none; the server's refusals are raised."""
+    """Return the reply to one query, or why there is none. Raises error replies of the server."""
     for reply in pending.replies:
         if reply.ok is not None:
             return codec.decode(reply.ok.payload.to_bytes())
         payload = cast(bytes, reply.err.payload.to_bytes())
-        # Zenoh's own errors, such as its timeout, are plain text; a map starts with 0x80 to 0x8f, 0xde or 0xdf.
+        # Errors of Zenoh, such as its timeout, are plain text; a map starts with 0x80 to 0x8f, 0xde or 0xdf.
         if not payload or not (0x80 <= payload[0] <= 0x8F or payload[0] in (0xDE, 0xDF)):
             return _NoReply.TIMEOUT
         error = codec.decode(payload)
@@ -237,11 +243,11 @@ def _open_session(endpoint: str, path: str | None, server: EmbeddedServer | None
 def _connect_error(endpoint: str, waited_s: float) -> Error:
     if _port_open(endpoint):
         reason = (
-            "something accepts connections there: either it is no Twinstep server, or it refuses this client's user, "
-            "password or certificate; the server's log tells which"
+            "a program accepts connections there: either it is not a Twinstep server, or it rejects this client's "
+            "user, password or certificate; read the server's log"
         )
     else:
-        reason = "nothing accepts connections there\n  start a server: `twinstep serve`, or leave `endpoint` out"
+        reason = "no program accepts connections there\n  start a server with `twinstep serve`, or omit `endpoint`"
     return NoServerError(f"no server answers at {endpoint} after {waited_s:.1f} s: {reason}")
 
 
@@ -257,7 +263,7 @@ def _port_open(endpoint: str) -> bool:
 
 def _zenoh_config(endpoint: str, path: str | None) -> zenoh.Config:
     if path is not None and not Path(path).is_file():
-        raise InvalidOptionError(f"`zenoh_config` = {path}: there is no such file")
+        raise InvalidOptionError(f"`zenoh_config` = {path}: the file does not exist")
     try:
         config = zenoh.Config() if path is None else zenoh.Config.from_file(path)
         for key, value in (
@@ -266,13 +272,13 @@ def _zenoh_config(endpoint: str, path: str | None) -> zenoh.Config:
             ("connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
             ("scouting/multicast/enabled", "false"),
             ("transport/link/tx/lease", "2000"),
-            # Room for a step of 4096 robots, which Zenoh sends in twelve parts.
+            # A step of 4096 robots is sent in twelve fragments; Zenoh's default queue of two delays them.
             ("transport/link/tx/queue/size/data", "16"),
             ("transport/link/rx/buffer_size", "2097152"),
             ("transport/shared_memory/enabled", "false"),
         ):
             config.insert_json5(key, value)
     except zenoh.ZError as error:
-        wrong = f"`zenoh_config` = {path}" if path else f"`endpoint` = {endpoint}"
-        raise InvalidOptionError(f"{wrong} is refused by Zenoh: {error}") from error
+        option = f"`zenoh_config` = {path}" if path else f"`endpoint` = {endpoint}"
+        raise InvalidOptionError(f"Zenoh rejects {option}: {error}") from error
     return config

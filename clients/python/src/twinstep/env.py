@@ -15,7 +15,7 @@ RenderMode = Literal["rgb_array", "human"]
 
 
 class OptionArguments(TypedDict, total=False):
-    """Keyword arguments that :class:`Go2Env` and :class:`Go2VectorEnv` pass on to :class:`twinstep.ConnectOptions`."""
+    """Keyword arguments that :class:`Go2Env` and :class:`Go2VectorEnv` pass to :class:`twinstep.ConnectOptions`."""
 
     endpoint: str | None
     robot: str | None
@@ -36,10 +36,10 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     render_mode
         ``"rgb_array"``, ``"human"`` (needs the extra ``[render]``), or ``None``.
     max_episode_steps
-        Policy steps after which the server truncates an episode. ``None`` leaves the time limit to
-        ``gymnasium.make``, which adds one.
+        Policy steps after which the server truncates an episode. With ``None`` the time limit is that of
+        ``gymnasium.make``.
     info_timing
-        Adds ``round_trip_s`` [s] to every info of a step. Off, infos depend on seed and actions alone.
+        Adds ``round_trip_s`` [s] to the info of every step. Without it, infos depend only on seed and actions.
     **options
         See :class:`twinstep.ConnectOptions`.
 
@@ -58,9 +58,9 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         info_timing: bool = False,
         **options: Unpack[OptionArguments],
     ) -> None:
-        mode_of_pictures = checked_render_mode(render_mode)
-        self.render_mode = mode_of_pictures
-        self._viewer = Viewer(mode_of_pictures) if mode_of_pictures else None
+        checked_mode = checked_render_mode(render_mode)
+        self.render_mode = checked_mode
+        self._viewer = Viewer(checked_mode) if checked_mode else None
         self._info_timing = info_timing
         self._remote = RemoteVecEnv(
             ConnectOptions(**options),
@@ -82,7 +82,7 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         seed
             Equal seeds give equal episodes. ``None`` continues the random stream.
         options
-            None are known.
+            Not supported.
 
         Returns
         -------
@@ -92,7 +92,7 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         super().reset(seed=seed)
         if options:
-            raise InvalidOptionError(f"`options` has {sorted(options)}; a single environment knows none")
+            raise InvalidOptionError(f"`options` has {sorted(options)}; a single environment has no options")
         seeds = None if seed is None else np.array([seed], dtype=np.uint64)
         obs = self._remote.reset(seeds, None)[0]
         self._show()
@@ -118,14 +118,14 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self.recv()
 
     def send(self, action: NDArray[np.float32]) -> None:
-        """Send an action without waiting; :meth:`recv` is next."""
+        """Send an action without waiting. Call :meth:`recv` next."""
         given = np.asarray(action)
         if given.shape != self.action_space.shape:
             raise InvalidActionError(f"`action` has shape {given.shape}; {self.action_space.shape} is expected")
         self._remote.send(given[None])
 
     def recv(self) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Wait for what the sent action gave; may be called again after a ``RequestTimeoutError``."""
+        """Wait for the result of the action; may be called again after a ``RequestTimeoutError``."""
         batch = self._remote.recv()
         info: dict[str, Any] = {}
         if len(batch.ended):
@@ -136,15 +136,15 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return batch.obs[0], float(batch.reward[0]), bool(batch.terminated[0]), bool(batch.truncated[0]), info
 
     def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Draw the robot: (480, 640, 3) uint8 with ``render_mode="rgb_array"``, else ``None``."""
+        """Render the robot: (480, 640, 3) uint8 with ``render_mode="rgb_array"``, else ``None``."""
         if self.render_mode is None:
             gymnasium.logger.warn("render was called, but `render_mode` is not set: make(..., render_mode='rgb_array')")
             return None
-        picture = self._draw()
-        return picture if self.render_mode == "rgb_array" else None
+        image = self._draw()
+        return image if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Give the environment back and close the window."""
+        """End the lease and close the window."""
         if self._viewer is not None:
             self._viewer.close()
         self._remote.close()
@@ -159,12 +159,12 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def checked_render_mode(mode: str | None) -> RenderMode | None:
-    """Return ``mode`` if it is one."""
+    """Return ``mode`` if it is a valid render mode."""
     if mode is None or mode == "rgb_array" or mode == "human":
         return mode
-    raise InvalidOptionError(f"`render_mode` = {mode!r}; 'rgb_array', 'human' and None are known")
+    raise InvalidOptionError(f"`render_mode` = {mode!r}; expected is 'rgb_array', 'human' or None")
 
 
 def reward_terms(batch: StepBatch, index: int, names: tuple[str, ...]) -> dict[str, float]:
-    """Sums of the weighted reward terms of the ``index``-th episode that ended."""
+    """Return the sum of each weighted reward term of the ``index``-th episode that ended."""
     return {name: float(value) for name, value in zip(names, batch.ended_terms[index], strict=True)}

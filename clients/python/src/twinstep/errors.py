@@ -1,49 +1,49 @@
-"""Everything that can go wrong, as exceptions under :class:`Error`."""
+"""Exceptions of Twinstep, all derived from :class:`Error`."""
 
 import gymnasium
 
 
 class Error(Exception):
-    """Base of every exception of Twinstep."""
+    """Base class of all exceptions of Twinstep."""
 
 
 class NoServerError(Error):
-    """Nobody answers at the endpoint, or nobody that this client may see."""
+    """No server answers at the endpoint, or access control hides it from this client."""
 
 
 class AmbiguousRobotError(Error):
-    """No robot has the name that was asked for, or several robots are there and none was named."""
+    """No robot has the requested name, or several robots are visible and ``robot`` is not set."""
 
 
 class VersionError(Error):
-    """Server and client speak different versions of the protocol."""
+    """The server does not support the client's protocol version."""
 
 
 class SpecMismatchError(Error):
-    """The server's task, observation, action, rates, gains or pose are not those that were asked for."""
+    """The server's task, observation, action, periods, gains or default pose differ from the requested ones."""
 
 
 class RequestTimeoutError(Error, TimeoutError):
-    """The server did not answer in time; nobody knows yet whether the request was executed.
+    """No reply arrived in time; the request may or may not have been executed.
 
-    ``recv`` waits for it again; ``reset`` settles it and starts anew. No step is ever executed twice.
+    ``recv`` waits for the reply again. ``reset`` waits for it and then starts new episodes. No step is executed twice.
     """
 
 
 class LeaseLostError(Error):
-    """The environments are gone: the server was restarted, somebody took them over, or their time ran out."""
+    """The lease has ended: the server was restarted, another client took it over, or its grace period passed."""
 
 
 class ServerExitedError(LeaseLostError):
-    """The server that this process started has ended; its last log lines are in the message."""
+    """The server that this process started has terminated; the message contains its last log lines."""
 
 
 class InvalidActionError(Error, ValueError):
-    """An action has the wrong shape or type, or a number in it is NaN or infinite."""
+    """An action has the wrong shape or type, or contains NaN or an infinite number."""
 
 
 class InvalidOptionError(Error, ValueError):
-    """An argument is not allowed; the message says which, what was given, and what is allowed."""
+    """An argument is not allowed; the message contains its name, its value and the allowed values."""
 
 
 class ResetNeededError(Error, gymnasium.error.ResetNeeded):
@@ -51,14 +51,14 @@ class ResetNeededError(Error, gymnasium.error.ResetNeeded):
 
 
 class RequestRejectedError(Error):
-    """The server refused a request.
+    """The server rejected a request.
 
     Attributes
     ----------
     code : str
-        What kind of error it is, as ``protocol/SPEC.md`` lists them.
+        Error code, as in ``protocol/SPEC.md``.
     field : str
-        The field at fault; empty if it is none.
+        Name of the invalid field; empty if there is none.
     """
 
     def __init__(self, code: str, field: str, message: str) -> None:
@@ -79,7 +79,7 @@ _BY_CODE: dict[str, type[Error]] = {
 
 
 def from_reply(code: str, field: str, message: str, hint: str) -> Error:
-    """Make the exception for an error reply of the server."""
+    """Return the exception for an error reply of the server."""
     text = f"{message}\n  {hint}" if hint else message
     kind = _BY_CODE.get(code)
     return kind(text) if kind else RequestRejectedError(code, field, text)

@@ -1,4 +1,4 @@
-"""A lease of environments on a server: the one place where requests get their numbers."""
+"""Lease of environments on a server. Assigns the sequence numbers of requests."""
 
 import time
 import weakref
@@ -22,24 +22,24 @@ _CONSUMES_SEQ = ("diverged", "internal")
 
 @dataclass(frozen=True)
 class ConnectOptions:
-    """Where environments come from; the same for every kind of environment.
+    """Options of a connection, common to all environments.
 
     Attributes
     ----------
     endpoint
-        Zenoh endpoint of a server, a robot, or a router before them. ``None`` starts the bundled server.
+        Zenoh endpoint of a server, a robot or a router. ``None`` starts the bundled server.
     robot
-        The robot's name; needed where several are visible at ``endpoint``.
+        Name of the robot. Required if several are visible at ``endpoint``.
     task
-        What the robots are asked to do; a server at ``endpoint`` must have this task.
+        Name of the task. A server at ``endpoint`` must have this task.
     config, model
-        Config file and model file of the bundled server (``twinstep serve --help``); not with ``endpoint``.
+        Config file and model file of the bundled server (``twinstep serve --help``). Not allowed with ``endpoint``.
     zenoh_config
         Zenoh configuration file (JSON5) for TLS, user and password.
     spec_hash
-        Refuse a server on which an agent trained for this hash would not work.
+        Spec hash for which the agent was trained. A server with a different hash is rejected.
     timeout_s, reset_timeout_s
-        How long to wait for a step and for a reset [s].
+        Timeout of a step and of a reset [s].
     """
 
     endpoint: str | None = None
@@ -53,18 +53,18 @@ class ConnectOptions:
     reset_timeout_s: float = 10.0
 
     def __post_init__(self) -> None:
-        """Check what can be checked without a server."""
+        """Check the options that do not depend on a server."""
         if self.endpoint is not None and (self.config is not None or self.model is not None):
-            raise InvalidOptionError("`config` and `model` are the bundled server's: leave them out, or `endpoint`")
+            raise InvalidOptionError("`config` and `model` are options of the bundled server: omit them or `endpoint`")
         for name in ("timeout_s", "reset_timeout_s"):
             value = getattr(self, name)
             if not value > 0:
-                raise InvalidOptionError(f"`{name}` = {value} is not more than 0 s")
+                raise InvalidOptionError(f"`{name}` = {value} s; must be greater than 0")
 
 
 @dataclass
 class StepBatch:
-    """What one step gave. Arrays are fresh: nobody else writes into them.
+    """Result of one step. The arrays are new and not written to later.
 
     Attributes
     ----------
@@ -78,9 +78,9 @@ class StepBatch:
     ended_terms : (k, reward_terms) float32
         Sums of their weighted reward terms.
     final_obs : (k, obs_len) float32, or empty
-        Their last observations, where autoreset is SameStep.
+        Their last observations; empty unless autoreset is SameStep.
     round_trip_s
-        From sending the actions to having the answer [s].
+        Time from sending the actions to the reply [s].
     """
 
     obs: NDArray[np.float32]
@@ -95,25 +95,25 @@ class StepBatch:
 
 
 class RemoteVecEnv:
-    """Environments on a server, for this client alone.
+    """Environments on a server, leased by this client.
 
     Parameters
     ----------
     options
-        Where they come from.
+        Server and task.
     num_envs
-        How many.
+        Number of environments.
     autoreset
-        ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``; done in the server.
+        ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``; executed by the server.
     max_episode_steps
-        Policy steps after which an episode is truncated; the task's own number if ``None``.
+        Policy steps after which an episode is truncated. ``None``: the number of the task.
     """
 
     def __init__(self, options: ConnectOptions, *, num_envs: int, autoreset: str, max_episode_steps: int | None) -> None:
         if num_envs < 1:
-            raise InvalidOptionError(f"`num_envs` = {num_envs}; at least 1 is expected")
+            raise InvalidOptionError(f"`num_envs` = {num_envs}; must be at least 1")
         if max_episode_steps is not None and not 1 <= max_episode_steps <= UNLIMITED:
-            raise InvalidOptionError(f"`max_episode_steps` = {max_episode_steps} is outside 1..={UNLIMITED}")
+            raise InvalidOptionError(f"`max_episode_steps` = {max_episode_steps} is not allowed: 1 to {UNLIMITED}")
         self.num_envs = num_envs
         self._options = options
         server = EmbeddedServer.shared(_flags(options)) if options.endpoint is None else None
@@ -125,7 +125,7 @@ class RemoteVecEnv:
             if server is not None:
                 server.release()
             raise
-        # Runs at garbage collection and at the end of the interpreter, if `close` did not.
+        # Runs at garbage collection or at the end of the interpreter if `close` was not called.
         self._release = weakref.finalize(self, _release, connection, server)
         self._connection = connection
         try:
@@ -140,7 +140,7 @@ class RemoteVecEnv:
         if found != options.task:
             raise SpecMismatchError(
                 f"the server at {connection.endpoint} has the task `{found}`, not `{options.task}`\n"
-                f"  start it with `--task {options.task}`, or make the environment of `{found}`"
+                f"  start it with `--task {options.task}`, or create the environment with task `{found}`"
             )
         request: dict[str, object] = {
             "client": connection.client,
@@ -160,14 +160,14 @@ class RemoteVecEnv:
         self._pending: tuple[str, Pending, float] | None = None
 
     def reset(self, seeds: NDArray[np.uint64] | None, mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
-        """Start episodes anew.
+        """Start new episodes.
 
         Parameters
         ----------
         seeds : (num_envs,) uint64, optional
-            Without, each environment continues its random stream.
+            Seed of each environment. ``None``: each continues its random stream.
         mask : (num_envs,) bool, optional
-            Where to reset; everywhere without.
+            True for environments to reset. ``None``: all.
 
         Returns
         -------
@@ -185,20 +185,20 @@ class RemoteVecEnv:
         return codec.tensor(reply, "obs", "<f4", self.num_envs, self.spec.obs_len)
 
     def send(self, actions: NDArray[Any]) -> None:
-        """Send actions without waiting: the policy may compute while the server steps. :meth:`recv` is next."""
+        """Send actions without waiting, so that the caller can compute during the step. Call :meth:`recv` next."""
         if self._pending is not None:
             raise Error(
-                f"the last `{self._pending[0]}` is not answered yet\n"
-                "  `recv` waits for it again; `reset` settles it and starts anew"
+                f"the last `{self._pending[0]}` has no reply yet\n"
+                "  call `recv` to wait for it, or `reset` to wait and start new episodes"
             )
         self._send("step", {"actions": self._checked(actions).tobytes()})
 
     def recv(self) -> StepBatch:
-        """Wait for what the sent actions gave. May be called again after a :class:`RequestTimeoutError`."""
+        """Wait for the result of the actions. May be called again after a :class:`RequestTimeoutError`."""
         if self._pending is None:
-            raise Error("nothing was sent: call `send` before `recv`")
+            raise Error("no request is in progress: call `send` before `recv`")
         if self._pending[0] != "step":
-            raise Error(f"the last `{self._pending[0]}` is not answered yet\n  `reset` settles it and starts anew")
+            raise Error(f"the last `{self._pending[0]}` has no reply yet\n  call `reset` to wait for it")
         since = self._pending[2]
         reply = self._await_pending(self._options.timeout_s)
         n, k, obs_len = self.num_envs, len(reply.get("ended_env", b"")) // 4, self.spec.obs_len
@@ -216,11 +216,11 @@ class RemoteVecEnv:
         )
 
     def scene(self, env: int) -> dict[str, Any]:
-        """Shapes and poses of one robot and its ground, for drawing."""
+        """Return shapes and poses of one robot, and its ground, for rendering."""
         return self._connection.request(self._methods["render"], {"epoch": self._epoch, "env": env}, self._options.timeout_s)
 
     def close(self) -> None:
-        """Give the environments back; does nothing the second time."""
+        """End the lease. Further calls have no effect."""
         if not self._release.alive:
             return
         try:
@@ -228,7 +228,7 @@ class RemoteVecEnv:
             request: dict[str, object] = {"epoch": self._epoch, "seq": self._last_seq + 1}
             self._connection.request(self._methods["close"], request, self._options.timeout_s)
         except Error:
-            # Whatever is wrong with the server, this client is done with it; a lease that is left is freed in time.
+            # The error does not matter to a closed client. The server releases the lease after the grace period.
             pass
         finally:
             self._release()
@@ -240,10 +240,10 @@ class RemoteVecEnv:
         self._pending = (method, Pending(self._methods[method], payload), time.monotonic())
 
     def _await_pending(self, timeout_s: float) -> dict[str, Any]:
-        """Wait for the answer to the pending request.
+        """Wait for the reply to the pending request.
 
-        Without an answer it stays pending, because it may have been executed. Its number is used up by an answer, or
-        by an error that had effects.
+        After a timeout the request stays pending, because it may have been executed. A reply or an error with effects
+        consumes its number.
         """
         assert self._pending is not None
         try:
@@ -265,7 +265,7 @@ class RemoteVecEnv:
             except RequestTimeoutError:
                 raise
             except Error:
-                # Why it was refused no longer matters, only that its number is settled.
+                # Its error is not needed, but whether its number was consumed is.
                 pass
 
     def _checked(self, actions: NDArray[Any]) -> NDArray[np.float32]:
@@ -280,7 +280,7 @@ class RemoteVecEnv:
             env, entry = (int(index) for index in np.argwhere(~np.isfinite(checked))[0])
             raise InvalidActionError(
                 f"the action of environment {env}, {self.spec.action_entry(entry)}, is {checked[env, entry]}\n"
-                "  nothing was stepped; look at what computed the action"
+                "  nothing was stepped; check the policy that computed the action"
             )
         return checked
 

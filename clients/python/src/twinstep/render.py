@@ -1,6 +1,6 @@
-"""Pictures of one robot on the ground, drawn from the server's answer to ``render``.
+"""Ray-cast images of one robot on the ground, from the server's reply to ``render``.
 
-Every shape is met by one ray a pixel inside its silhouette's rectangle: numpy is enough, and a picture takes
+One ray per pixel is intersected with each shape, inside the rectangle around its silhouette. With numpy an image takes
 milliseconds. World frame: z up; SI units.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
-"""32 bits throughout: a picture is limited by memory."""
+"""32-bit floats, because rendering is limited by memory bandwidth."""
 
 _SKY_TOP, _SKY_LOW = np.array([[92, 138, 190], [214, 226, 236]], dtype=np.float32)
 _TILES = np.array([[150, 158, 164], [178, 186, 190]], dtype=np.float32)
@@ -27,64 +27,64 @@ _COLOURS: dict[str, tuple[float, float, float]] = {
 }
 _TILE_M = 0.25
 _FOG_M = 9.0
-"""Distance over which the ground fades into the horizon."""
+"""Length scale over which the ground fades into the horizon."""
 _SUN = np.array([0.3, -0.6, 0.74], dtype=np.float32) / np.float32(np.linalg.norm([0.3, -0.6, 0.74]))
 _AMBIENT, _DIFFUSE, _SHADOW = 0.5, 0.55, 0.55
 _CAMERA_OFFSET_M = np.array([0.62, -1.25, 0.55], dtype=np.float32)
-"""From the point looked at to the camera: from the front right and above."""
+"""Offset of the camera from its target: to the front right and above."""
 _FOCAL = 2.3
-"""Focal length in units of half the picture's height."""
+"""Focal length in units of half the image height."""
 _CAMERA_SMOOTHING = 0.2
-"""Share of the way to the robot that the camera goes with each picture: steps of a trot do not shake it."""
+"""Fraction of the distance to the robot by which the camera moves per image, so that a trot does not shake it."""
 _NEAR_CLIP_M = 1.0
-"""The camera jumps when the robot is farther from where it looks, as after a reset."""
+"""Distance from the camera's target to the robot above which the camera jumps, as after a reset."""
 
 
 @dataclass(frozen=True)
 class _Shape:
-    """One shape in the world: a box, a capsule or a sphere (a capsule of length 0)."""
+    """A shape in the world frame: a box, a capsule or a sphere (a capsule of length 0)."""
 
     kind: str
     size: Array
-    """(3,) as sent [m]."""
+    """(3,), as in the message [m]."""
     centre: Array
-    """(3,) [m]."""
+    """(3,), position of the centre [m]."""
     axes: Array
-    """(3, 3) world-from-shape rotation."""
+    """(3, 3), world-from-shape rotation."""
 
     @property
     def radius(self) -> float:
-        """Radius of the ball around the shape [m]."""
+        """Radius of the bounding sphere [m]."""
         return float(np.linalg.norm(self.size)) if self.kind == "box" else float(self.size[0] + self.size[1])
 
     def corners(self) -> Array:
-        """Points [m] whose convex hull holds the shape: (8, 3)."""
+        """Return points whose convex hull contains the shape, (8, 3) [m]."""
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float32)
         half = self.size if self.kind == "box" else self.size[0] + np.array([0, 0, self.size[1]], dtype=np.float32)
         return self.centre + (signs * half) @ self.axes.T
 
     def intersect(self, origins: Array, rays: Array) -> Array:
-        """Distance along each ray to the shape.
+        """Return the distance along each ray to the shape.
 
         Parameters
         ----------
         origins : (1, 3) or (n, 3) float32
-            Where the rays start [m].
+            Start points of the rays [m].
         rays : (n, 3) or (1, 3) float32
             Unit directions.
 
         Returns
         -------
         (n,) float32
-            [m], infinite without a hit.
+            Distance [m]; infinite without an intersection.
         """
         start, ray = (origins - self.centre) @ self.axes, rays @ self.axes
         if self.kind == "box":
             return _intersect_box(start, ray, self.size)
-        return _meet_capsule(start, ray, float(self.size[0]), float(self.size[1]))
+        return _intersect_capsule(start, ray, float(self.size[0]), float(self.size[1]))
 
     def normal(self, points: Array) -> Array:
-        """Unit normals (n, 3) in the world at ``points`` (n, 3) [m] of the surface."""
+        """Return the unit normals (n, 3), in the world frame, at ``points`` (n, 3) [m] of the surface."""
         own = (points - self.centre) @ self.axes
         if self.kind == "box":
             face = np.abs(own / self.size).argmax(axis=1)
@@ -99,16 +99,16 @@ class _Shape:
 
 @dataclass(frozen=True)
 class _Camera:
-    """A pinhole camera that looks at a point."""
+    """A pinhole camera."""
 
     position: Array
     axes: Array
-    """(3, 3) columns: right, up, backward."""
+    """(3, 3), columns right, up, backward in the world frame."""
     width: int
     height: int
 
     def rays(self, left: int, right: int, top: int, bottom: int) -> Array:
-        """Unit directions in the world of a rectangle of pixels: (bottom - top, right - left, 3)."""
+        """Return the directions of a rectangle of pixels in the world frame: (bottom - top, right - left, 3)."""
         half = 0.5 * self.height
         x = ((np.arange(left, right, dtype=np.float32) + 0.5) - 0.5 * self.width) / half
         y = (half - (np.arange(top, bottom, dtype=np.float32) + 0.5)) / half
@@ -116,7 +116,7 @@ class _Camera:
         return rays / np.sqrt(x[None, :, None] ** 2 + y[:, None, None] ** 2 + _FOCAL**2)
 
     def rectangle(self, points: Array) -> tuple[int, int, int, int]:
-        """Pixels (left, right, top, bottom) that hold the hull of ``points`` [m]; none if it is behind the camera."""
+        """Return pixels (left, right, top, bottom) around the hull of ``points`` [m]; empty behind the camera."""
         seen = (points - self.position) @ self.axes
         depth = -seen[:, 2]
         if depth.max() < 0.05:
@@ -131,21 +131,21 @@ class _Camera:
 
 
 class Viewer:
-    """Draws one robot, as an array or in a window.
+    """Renders one robot, as an array or in a window.
 
     Parameters
     ----------
     mode : {"rgb_array", "human"}
-        "human" also shows every picture in a window, which needs pygame.
+        "human" also shows every image in a window, which requires pygame.
     width, height : int
-        Size of a picture [pixels].
+        Size of an image [pixels].
     fps : int
-        Pictures a second that the window shows at most. [Hz]
+        Maximum frame rate of the window [Hz].
 
     Raises
     ------
     ImportError
-        ``mode`` is "human" and pygame is missing.
+        ``mode`` is "human" and pygame is not installed.
     """
 
     def __init__(self, mode: Literal["rgb_array", "human"], width: int = 640, height: int = 480, fps: int = 50) -> None:
@@ -157,7 +157,7 @@ class Viewer:
         self._window = _Window(width, height, fps) if mode == "human" else None
 
     def draw(self, scene: Mapping[str, object]) -> NDArray[np.uint8]:
-        """Draw what the server answered to ``render``.
+        """Render the server's reply to ``render``.
 
         Parameters
         ----------
@@ -175,7 +175,7 @@ class Viewer:
         base = np.frombuffer(cast(bytes, scene["pose"]), dtype="<f4", count=3).astype(np.float32)
         field = None if ground.get("height_field") is None else _HeightField.read(ground["height_field"])
         if field is not None:
-            # The plane through the ground under the robot: what the camera follows.
+            # The camera follows the point of the ground under the robot.
             point = np.append(base[:2], field.height(*base[:2, None])).astype(np.float32)
         camera = self._camera(base, point, normal)
         offset = camera.position - point
@@ -183,15 +183,15 @@ class Viewer:
         if self._backdrop is None or not self._backdrop.fits(camera, height, normal):
             self._backdrop = _Backdrop(camera, height, normal)
         if field is None:
-            picture = _FrameBuffer(camera, self._backdrop.rays, self._backdrop.distance, self._backdrop.paint(offset))
+            frame = _FrameBuffer(camera, self._backdrop.rays, self._backdrop.distance, self._backdrop.paint(offset))
         else:
-            picture = _FrameBuffer(camera, self._backdrop.rays, *_paint_field(camera, self._backdrop.rays, field))
+            frame = _FrameBuffer(camera, self._backdrop.rays, *_paint_field(camera, self._backdrop.rays, field))
         levels = [point] if field is None else [np.append(point[:2], level) for level in field.levels()]
         for shape in shapes:
-            picture.draw_shadow(shape, levels, normal)
+            frame.draw_shadow(shape, levels, normal)
         for shape in shapes:
-            picture.draw_shape(shape)
-        image = picture.image()
+            frame.draw_shape(shape)
+        image = frame.image()
         if self._window is not None:
             self._window.show(image)
         return image
@@ -202,14 +202,14 @@ class Viewer:
             self._window.close()
 
     def _camera(self, base: Array, point: Array, normal: Array) -> _Camera:
-        # Looks at the ground under the robot, not at the robot: its own ups and downs stay visible.
+        # The target is the ground under the robot, so that vertical motion of the robot is visible.
         under = base - normal * np.dot(base - point, normal)
         last = self._target
         if last is None or np.linalg.norm(under - last) > _NEAR_CLIP_M:
             last = under
-        followed = last + np.float32(_CAMERA_SMOOTHING) * (under - last)
-        self._target = followed
-        target = followed + np.float32(0.17) * normal
+        smoothed = last + np.float32(_CAMERA_SMOOTHING) * (under - last)
+        self._target = smoothed
+        target = smoothed + np.float32(0.17) * normal
         backward = _CAMERA_OFFSET_M / np.float32(np.linalg.norm(_CAMERA_OFFSET_M))
         right = np.cross(np.array([0, 0, 1], dtype=np.float32), backward)
         right /= np.linalg.norm(right)
@@ -218,19 +218,19 @@ class Viewer:
 
 
 class _Backdrop:
-    """Sky, and chequered ground as seen from one height and direction: all that does not depend on where."""
+    """Sky and chequered ground for one camera height and direction, without the horizontal position."""
 
     def __init__(self, camera: _Camera, height: float, normal: Array) -> None:
         self.rays = camera.rays(0, camera.width, 0, camera.height)
         self.axes, self.height, self.normal = camera.axes, height, normal
         rise = np.clip(self.rays[..., 2] * 3, 0, 1)
-        # By planes, (3, height, width): numpy is slow where the last axis is short.
+        # Colour planes first, (3, height, width): numpy is slow if the last axis is short.
         self._far = _SKY_LOW[:, None, None] + (_SKY_TOP - _SKY_LOW)[:, None, None] * rise
         downward = self.rays @ normal
         self.distance = np.full(downward.shape, np.inf, dtype=np.float32)
         np.divide(-height, downward, out=self.distance, where=downward < -1e-3)
         seen = np.isfinite(self.distance)
-        # Whole rows, because a slice is faster than a mask.
+        # Whole rows, because slices are faster than masks.
         rows = np.flatnonzero(seen.any(axis=1))
         self._first_row = int(rows[0]) if len(rows) else camera.height
         seen = seen[self._first_row :]
@@ -240,11 +240,11 @@ class _Backdrop:
         self._tiles_from_world = np.stack([first, np.cross(normal, first)]) / np.float32(_TILE_M)
         rays = self.rays[self._first_row :]
         self._tile = [np.ascontiguousarray((rays @ axis) * distance) for axis in self._tiles_from_world]
-        # A pixel far away covers many tiles: average over its footprint, or they flicker.
+        # A distant pixel covers many tiles. Averaging over its footprint avoids flicker.
         footprint = distance / (0.5 * camera.height * _FOCAL * _TILE_M)
         slant = np.sqrt(np.clip(-downward[self._first_row :], 0.02, 1))
         self._width = np.maximum(footprint / slant, 1e-3).astype(np.float32)
-        # Sky among the rows is ground in the thickest fog.
+        # Sky pixels in these rows are drawn as ground in complete fog.
         clear = np.where(seen, np.exp(-np.square(distance / _FOG_M)), 0)
         mean = _SKY_LOW + 0.5 * (_TILES[0] + _TILES[1] - 2 * _SKY_LOW)
         far = self._far[:, self._first_row :]
@@ -252,12 +252,12 @@ class _Backdrop:
         self._contrast = 0.5 * (_TILES[0] - _TILES[1])[:, None, None] * clear
 
     def fits(self, camera: _Camera, height: float, normal: Array) -> bool:
-        """True if another picture can use it."""
+        """Return true if the backdrop is valid for this camera."""
         same = np.array_equal(camera.axes, self.axes) and np.array_equal(normal, self.normal)
         return same and abs(height - self.height) < 1e-3
 
     def paint(self, offset: Array) -> Array:
-        """Picture without a robot, (3, height, width); ``offset`` [m] leads from the ground's point to the camera."""
+        """Return the image without a robot, (3, height, width); ``offset`` [m] is from the ground to the camera."""
         colour = self._far.copy()
         across = [
             _blurred_stripes(tile + np.float32(np.mod(axis @ offset, 2)), self._width)
@@ -269,14 +269,14 @@ class _Backdrop:
 
 @dataclass(frozen=True)
 class _HeightField:
-    """Heights at the corners of square cells, each cut in two triangles, as ``height_field`` has them."""
+    """Heights at the corners of square cells of two triangles each, as in the message ``height_field``."""
 
     origin: Array
-    """(2,) x and y of the first vertex [m]."""
+    """(2,), x and y of the first vertex [m]."""
     cell_size: float
-    """[m]"""
+    """Side length of a cell [m]."""
     heights: Array
-    """(rows, columns): along x, along y [m]."""
+    """(rows, columns), along x and along y [m]."""
 
     @classmethod
     def read(cls, sent: Mapping[str, Any]) -> _HeightField:
@@ -284,15 +284,15 @@ class _HeightField:
         return cls(np.asarray(sent["origin"], dtype=np.float32), float(sent["cell_size"]), heights.astype(np.float32))
 
     def levels(self) -> tuple[float, float]:
-        """Lowest and highest height [m]."""
+        """Return the minimum and maximum height [m]."""
         return float(self.heights.min()), float(self.heights.max())
 
     def height(self, x: Array, y: Array) -> Array:
-        """Heights [m] at ``x``, ``y`` [m]; outside, the edge goes on."""
+        """Return the heights [m] at ``x``, ``y`` [m]; outside, that of the nearest border point."""
         return self.height_and_slope(x, y)[0]
 
     def height_and_slope(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Heights [m] and their derivatives by x and y at ``x``, ``y`` [m]."""
+        """Return the heights [m] and their derivatives with respect to x and y, at ``x``, ``y`` [m]."""
         rows, columns = self.heights.shape
         along: Array = np.clip((x - self.origin[0]) / np.float32(self.cell_size), 0, np.float32(rows - 1))
         across: Array = np.clip((y - self.origin[1]) / np.float32(self.cell_size), 0, np.float32(columns - 1))
@@ -302,7 +302,7 @@ class _HeightField:
         flat = self.heights.ravel()
         first = row * columns + column
         far_x, far_y = flat[first + columns], flat[first + 1]
-        # The triangles have two vertices in common; the third is the first one or the one across.
+        # The triangles of a cell share two vertices. The third is the first vertex of the cell or the opposite one.
         near = u + v <= 1
         third = flat[first + np.where(near, 0, columns + 1)]
         rise_x, rise_y = far_x - third, far_y - third
@@ -314,13 +314,13 @@ class _HeightField:
 
 
 _RAY_MARCH_STEPS = 20
-"""Samples of a ray between a field's highest and lowest height: finds the first hill in the way."""
+"""Number of samples of a ray between the maximum and minimum height, to find the first intersection."""
 
 
 def _intersect_field(field: _HeightField, start: Array, rays: Array) -> Array:
-    """Distances (height, width) [m] of ``rays`` (height, width, 3) from ``start`` to a field, infinite in the sky."""
+    """Return the distances (height, width) [m] along ``rays`` (height, width, 3) to a field, infinite in the sky."""
     lowest, highest = field.levels()
-    # Half the rows and columns find the triangle; then each ray meets the triangle's plane.
+    # The triangles are found at half resolution. Then each ray is intersected with the plane of its triangle.
     x, y, z = np.ascontiguousarray(rays[::2, ::2].transpose(2, 0, 1))
     down = np.maximum(-z, np.float32(1e-3))
     enter = np.maximum((start[2] - highest) / down, np.float32(0))
@@ -337,7 +337,7 @@ def _intersect_field(field: _HeightField, start: Array, rays: Array) -> Array:
     x, y, z = np.ascontiguousarray(rays.transpose(2, 0, 1))
     for _ in range(2):
         height, slope_x, slope_y = field.height_and_slope(start[0] + distance * x, start[1] + distance * y)
-        # Newton's step along the ray is exact on a triangle; where the ray grazes, the sample stays.
+        # A Newton step along the ray is exact on a triangle. It is omitted for grazing rays.
         gap: Array = start[2] + distance * z - height
         fall: Array = slope_x * x + slope_y * y - z
         newton = np.where(fall > 0.02, gap / np.maximum(fall, np.float32(0.02)), 0)
@@ -346,14 +346,14 @@ def _intersect_field(field: _HeightField, start: Array, rays: Array) -> Array:
 
 
 def _paint_field(camera: _Camera, rays: Array, field: _HeightField) -> tuple[Array, Array]:
-    """Distance (height, width) [m] of the ground, and a picture (3, height, width) of it without a robot."""
+    """Return the distance of the ground (height, width) [m] and its image (3, height, width)."""
     rise = np.clip(rays[..., 2] * 3, 0, 1)
     colour: Array = _SKY_LOW[:, None, None] + (_SKY_TOP - _SKY_LOW)[:, None, None] * rise
     all_distance = np.full(rise.shape, np.inf, dtype=np.float32)
     rows = np.flatnonzero((rays[..., 2] < -1e-3).any(axis=1))
     if len(rows) == 0:
         return all_distance, colour
-    # Whole rows, because a slice is faster than a mask.
+    # Whole rows, because slices are faster than masks.
     rays = rays[int(rows[0]) :]
     distance = _intersect_field(field, camera.position, rays)
     seen = np.isfinite(distance)
@@ -363,10 +363,10 @@ def _paint_field(camera: _Camera, rays: Array, field: _HeightField) -> tuple[Arr
     _, slope_x, slope_y = field.height_and_slope(x, y)
     up = 1 / np.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
     facing = np.clip((_SUN[2] - _SUN[0] * slope_x - _SUN[1] * slope_y) * up, 0, 1)
-    # As bright as a plane's tiles where it is level; slopes are exaggerated, or they do not show.
+    # Level ground is as bright as the plane. The effect of slopes is exaggerated to make them visible.
     light = np.clip(1 + 1.2 * (facing - _SUN[2]), 0.4, 1.25)
     towards = (ray_x * slope_x + ray_y * slope_y - ray_z) * up
-    # A pixel far away covers many tiles: average over its footprint, or they flicker.
+    # A distant pixel covers many tiles. Averaging over its footprint avoids flicker.
     footprint = near / np.float32(0.5 * camera.height * _FOCAL * _TILE_M)
     width = np.maximum(footprint / np.sqrt(np.clip(towards, 0.02, 1)), np.float32(1e-3))
     tiles = _blurred_stripes(x / np.float32(_TILE_M), width) * _blurred_stripes(y / np.float32(_TILE_M), width)
@@ -379,7 +379,7 @@ def _paint_field(camera: _Camera, rays: Array, field: _HeightField) -> tuple[Arr
 
 
 class _FrameBuffer:
-    """Colour and distance of every pixel, while shapes are drawn one by one."""
+    """Colour and distance of every pixel."""
 
     def __init__(self, camera: _Camera, rays: Array, distance: Array, colour: Array) -> None:
         self._camera = camera
@@ -389,11 +389,11 @@ class _FrameBuffer:
         self._shadowed = np.zeros(self._distance.shape, dtype=np.bool_)
 
     def image(self) -> NDArray[np.uint8]:
-        """The picture so far: (height, width, 3) uint8."""
+        """Return the image, (height, width, 3) uint8."""
         return np.ascontiguousarray(self._colour.astype(np.uint8).transpose(1, 2, 0))
 
     def draw_shadow(self, shape: _Shape, levels: Sequence[Array], normal: Array) -> None:
-        """Darkens the ground that the shape hides from the sun; it lies between planes through ``levels`` [m]."""
+        """Darken the ground in the shadow of the shape. The ground lies between planes through ``levels`` [m]."""
         corners = shape.corners()
         corners = np.concatenate(
             [corners - ((corners - point) @ normal / np.dot(_SUN, normal))[:, None] * _SUN for point in levels]
@@ -413,7 +413,7 @@ class _FrameBuffer:
         self._colour[:, top + rows, left + columns] *= _SHADOW
 
     def draw_shape(self, shape: _Shape) -> None:
-        """Draws the shape where nothing nearer was drawn."""
+        """Draw the shape at pixels without a nearer object."""
         left, right, top, bottom = self._camera.rectangle(shape.corners())
         if left >= right or top >= bottom:
             return
@@ -424,7 +424,7 @@ class _FrameBuffer:
         nearest[seen] = distance[seen]
         light = shape.normal(self._camera.position + rays[seen] * distance[seen][:, None])
         facing = np.clip(light @ _SUN, 0, 1)
-        # The half towards the sky gets more of the scattered light.
+        # Surfaces that face the sky get more ambient light.
         brightness = _AMBIENT * (0.75 + 0.25 * light[:, 2]) + _DIFFUSE * facing
         shine = facing**24
         colour = np.array(_COLOURS[shape.kind], dtype=np.float32)
@@ -433,11 +433,11 @@ class _FrameBuffer:
 
 
 class _Window:
-    """A pygame window that shows pictures no faster than ``fps``."""
+    """A pygame window with a maximum frame rate of ``fps``."""
 
     def __init__(self, width: int, height: int, fps: int) -> None:
         try:
-            # By name, because it is an optional dependency.
+            # Imported by name, because it is an optional dependency.
             self._pygame: Any = importlib.import_module("pygame")
         except ImportError as error:
             message = 'render mode "human" needs pygame\n  pip install "twinstep[render]"'
@@ -449,10 +449,10 @@ class _Window:
         self._next_s = time.monotonic()
 
     def show(self, image: NDArray[np.uint8]) -> None:
-        """Show ``image``, (height, width, 3), when it is its turn."""
+        """Show ``image``, (height, width, 3), at the next frame time."""
         time.sleep(max(0.0, self._next_s - time.monotonic()))
         self._next_s = max(self._next_s, time.monotonic() - self._period_s) + self._period_s
-        # Without reading its events a window counts as hanging.
+        # A window that does not read its events is reported as unresponsive.
         self._pygame.event.pump()
         self._pygame.surfarray.blit_array(self._surface, image.swapaxes(0, 1))
         self._pygame.display.flip()
@@ -475,7 +475,7 @@ def _shapes_of(scene: Mapping[str, object]) -> list[_Shape]:
 
 
 def _rotation(quaternion: Array) -> Array:
-    """Rotation matrix (3, 3) of a quaternion [w, x, y, z]."""
+    """Return the rotation matrix (3, 3) of a quaternion [w, x, y, z]."""
     w, x, y, z = (quaternion / np.linalg.norm(quaternion)).tolist()
     return np.array(
         [
@@ -488,7 +488,7 @@ def _rotation(quaternion: Array) -> Array:
 
 
 def _intersect_box(start: Array, ray: Array, half: Array) -> Array:
-    """Distances (n,) of rays to a box around the origin, in its frame; ``start`` or ``ray`` may be (1, 3)."""
+    """Return the distances (n,) along rays to a box around the origin; ``start`` or ``ray`` may be (1, 3)."""
     enter, leave = np.float32(-np.inf), np.float32(np.inf)
     for axis in range(3):
         direction = ray[:, axis]
@@ -498,8 +498,8 @@ def _intersect_box(start: Array, ray: Array, half: Array) -> Array:
     return np.where((enter < leave) & (enter > 0), enter, np.float32(np.inf)).astype(np.float32)
 
 
-def _meet_capsule(start: Array, ray: Array, radius: float, half_length: float) -> Array:
-    """Distances (n,) of rays to a capsule along z around the origin, as in :func:`_intersect_box`; a ball has no length."""
+def _intersect_capsule(start: Array, ray: Array, radius: float, half_length: float) -> Array:
+    """Return the distances (n,) along rays to a capsule along z around the origin, as in :func:`_intersect_box`."""
     (x, y, z), (u, v, w) = start.T, ray.T
     infinite = np.float32(np.inf)
     across = x * u + y * v
@@ -514,13 +514,13 @@ def _meet_capsule(start: Array, ray: Array, radius: float, half_length: float) -
         across_ball = across + height * w
         under = across_ball * across_ball - outside - height * height
         along = -across_ball - np.sqrt(np.maximum(under, 0))
-        # The ball's inner half lies in the cylinder, which is met first.
+        # The inner half of the sphere is inside the cylinder, which the ray hits first.
         distance = np.where((under > 0) & (along > 0) & (along < distance), along, distance)
     return distance
 
 
 def _blurred_stripes(where: Array, width: Array) -> Array:
-    """Stripes of ±1 that change at every integer, averaged over ``width``: the triangle wave is their integral."""
+    """Return stripes of ±1 that change at every integer, averaged over ``width``; their integral is a triangle wave."""
 
     def integral(x: Array) -> Array:
         return np.abs(x - 2 * np.floor(0.5 * x) - 1)

@@ -1,4 +1,4 @@
-"""Many robots as an ``rsl_rl`` 5 ``VecEnv``. Needs the extra ``[rsl-rl]``."""
+"""``VecEnv`` of ``rsl_rl`` 5 with many robots. Requires the extra ``[rsl-rl]``."""
 
 from dataclasses import asdict
 from typing import Any, Unpack, cast
@@ -29,7 +29,7 @@ def make_vec_env(
     device: str = "cpu",
     **options: Unpack[OptionArguments],
 ) -> "Go2VecEnv":
-    """Make robots for an ``OnPolicyRunner``.
+    """Create robots for an ``OnPolicyRunner``.
 
     Parameters
     ----------
@@ -38,11 +38,11 @@ def make_vec_env(
     num_envs
         Number of robots.
     seed
-        Environment i starts with ``seed + i``.
+        Environment i has the seed ``seed + i``.
     max_episode_steps
-        Policy steps after which an episode is truncated; the task's own number if ``None``.
+        Policy steps after which an episode is truncated. ``None``: the number of the task.
     device
-        Where the tensors are that the agent gets.
+        Device of the returned tensors.
     **options
         See :class:`twinstep.ConnectOptions`.
     """
@@ -54,21 +54,21 @@ def make_vec_env(
 
 
 class Go2VecEnv(VecEnv):
-    """Robots on one server as a ``VecEnv``; their observation group is ``"policy"``.
+    """Robots on one server as a ``VecEnv`` with the observation group ``"policy"``.
 
     Parameters
     ----------
     envs
-        Robots with ``autoreset_mode="SameStep"``, as rsl_rl wants it.
+        Robots with ``autoreset_mode="SameStep"``, which rsl_rl requires.
     seed
-        Environment i starts with ``seed + i``.
+        Environment i has the seed ``seed + i``.
     device
-        Where the tensors are that the agent gets.
+        Device of the returned tensors.
 
     Attributes
     ----------
     episode_length_buf : (num_envs,) int64
-        Policy steps since each episode began. The runner writes here so that episodes end at different times.
+        Policy steps since the start of each episode. The runner writes to it so that episodes end at different times.
     """
 
     def __init__(self, envs: Go2VectorEnv, *, seed: int | None = None, device: str = "cpu") -> None:
@@ -86,7 +86,7 @@ class Go2VecEnv(VecEnv):
         self._obs, _ = envs.reset(seed=seed)
 
     def get_observations(self) -> TensorDict:
-        """The last observations: ``policy``, (num_envs, 45) float32."""
+        """Return the last observations: ``policy``, (num_envs, 45) float32."""
         return TensorDict({"policy": self._tensor(self._obs)}, batch_size=[self.num_envs])
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
@@ -100,18 +100,18 @@ class Go2VecEnv(VecEnv):
         Returns
         -------
         obs : TensorDict
-            ``policy``, (num_envs, 45) float32; where an episode ended, the first of the next.
+            ``policy``, (num_envs, 45) float32. Where an episode ended, the first observation of the next.
         reward : (num_envs,) float32
         done : (num_envs,) bool
         extras : dict
-            ``time_outs``, (num_envs,) float32, 1 where the time limit ended the episode; in a step that ended episodes
-            also ``log`` with the mean of each of their weighted reward terms.
+            ``time_outs``, (num_envs,) float32, 1 where the time limit ended the episode. In a step that ended episodes
+            also ``log``, the mean of each of their weighted reward terms.
         """
         self._obs, reward, terminated, truncated, vector_info = self.envs.step(actions.detach().cpu().numpy())
         self.episode_length_buf += 1
-        # Only after the runner wrote into the buffer does it run ahead of the server's own count.
-        used_up = self.episode_length_buf.cpu().numpy() >= self.max_episode_length
-        early = used_up & ~terminated & ~truncated
+        # The buffer exceeds the server's count only if the runner has written to it.
+        at_limit = self.episode_length_buf.cpu().numpy() >= self.max_episode_length
+        early = at_limit & ~terminated & ~truncated
         if early.any():
             self._obs, _ = self.envs.reset(options={"reset_mask": early})
             truncated = truncated | early
@@ -123,7 +123,7 @@ class Go2VecEnv(VecEnv):
         return self.get_observations(), self._tensor(reward.astype(np.float32)), done, extras
 
     def close(self) -> None:
-        """Give the robots back; does nothing the second time."""
+        """End the lease. Further calls have no effect."""
         self.envs.close()
 
     def _tensor(self, array: NDArray[Any]) -> torch.Tensor:
@@ -131,7 +131,7 @@ class Go2VecEnv(VecEnv):
 
 
 def _mean_terms(terms: dict[str, NDArray[Any]]) -> dict[str, float]:
-    """Mean of each reward term over the environments whose episode ended: those in the mask ``_<term>``."""
+    """Return the mean of each reward term over the environments in the mask ``_<term>``, whose episode ended."""
     return {
         f"/reward/{name}": float(values[terms[f"_{name}"]].mean())
         for name, values in terms.items()

@@ -1,4 +1,4 @@
-"""Many robots as a Stable-Baselines3 ``VecEnv``. Needs the extra ``[sb3]``."""
+"""Stable-Baselines3 ``VecEnv`` of many robots. Requires the extra ``[sb3]``."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, Unpack, cast
@@ -18,7 +18,7 @@ except ImportError as error:
     raise ImportError('Stable-Baselines3 is not installed here\n  pip install "twinstep[sb3]"') from error
 
 Indices = int | Iterable[int] | None
-"""Which environments are meant; ``None`` means all."""
+"""Indices of environments; ``None``: all."""
 
 
 def make_vec_env(
@@ -30,7 +30,7 @@ def make_vec_env(
     render_mode: RenderMode | None = None,
     **options: Unpack[OptionArguments],
 ) -> "Go2VecEnv":
-    """Make robots for an agent of Stable-Baselines3, as its own ``make_vec_env`` does.
+    """Create robots for an agent of Stable-Baselines3, like its function ``make_vec_env``.
 
     Parameters
     ----------
@@ -39,9 +39,9 @@ def make_vec_env(
     n_envs
         Number of robots.
     seed
-        Environment i starts with ``seed + i``. ``None`` draws a seed from NumPy's global generator.
+        Environment i has the seed ``seed + i``. ``None``: a random seed from NumPy's global generator.
     max_episode_steps
-        Policy steps after which an episode is truncated; the task's own number if ``None``.
+        Policy steps after which an episode is truncated. ``None``: the number of the task.
     render_mode
         ``"rgb_array"``, ``"human"`` (shows the first robot), or ``None``.
     **options
@@ -49,7 +49,7 @@ def make_vec_env(
 
     Notes
     -----
-    Episodes' rewards and lengths come from ``VecMonitor(make_vec_env(...))``.
+    Use ``VecMonitor(make_vec_env(...))`` to record rewards and lengths of episodes.
     """
     arguments: dict[str, Any] = {**options, "render_mode": render_mode}
     if max_episode_steps is not None:
@@ -66,7 +66,7 @@ class Go2VecEnv(VecEnv):
     Parameters
     ----------
     envs
-        Robots with ``autoreset_mode="SameStep"``, as Stable-Baselines3 wants it.
+        Robots with ``autoreset_mode="SameStep"``, which Stable-Baselines3 requires.
     """
 
     def __init__(self, envs: Go2VectorEnv) -> None:
@@ -75,14 +75,14 @@ class Go2VecEnv(VecEnv):
             raise InvalidOptionError(f"`autoreset_mode` = {mode.value!r}; Stable-Baselines3 needs 'SameStep'")
         self.envs = envs
         self.twinstep_spec = envs.twinstep_spec
-        # Before the base class, which asks each row for its `render_mode`.
+        # Before the base class, which reads the `render_mode` of each row.
         self._rows = [SubEnvView(envs, index) for index in range(envs.num_envs)]
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
         # VecVideoRecorder reads the frame rate here.
         self.metadata = {**envs.metadata, **self.metadata}
 
     def reset(self) -> NDArray[np.float32]:
-        """Start all episodes, with the seeds that :meth:`seed` left, once; then each random stream goes on.
+        """Start all episodes, with the seeds of :meth:`seed` the first time; later the random streams continue.
 
         Returns
         -------
@@ -95,21 +95,21 @@ class Go2VecEnv(VecEnv):
         return obs
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
-        """Send actions, (n_envs, 12) float32, without waiting: the server steps while the caller goes on."""
+        """Send actions, (n_envs, 12) float32, without waiting."""
         self.envs.send(actions)
 
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Wait for what the sent actions gave.
+        """Wait for the result of the actions.
 
         Returns
         -------
         obs : (n_envs, 45) float32
-            Where an episode ended, the first of the next.
+            Where an episode ended, the first observation of the next.
         reward : (n_envs,) float32
         done : (n_envs,) bool
         infos : list of dict
-            ``TimeLimit.truncated``; where an episode ended also ``terminal_observation`` and ``reward_terms``, the
-            episode's sum of each weighted reward term.
+            ``TimeLimit.truncated``. Where an episode ended also ``terminal_observation`` and ``reward_terms``, the sum
+            of each weighted reward term over the episode.
         """
         obs, reward, terminated, truncated, vector_info = self.envs.recv()
         done = terminated | truncated
@@ -124,26 +124,26 @@ class Go2VecEnv(VecEnv):
         return obs, reward.astype(np.float32), done, infos
 
     def close(self) -> None:
-        """Give the robots back; does nothing the second time."""
+        """End the lease. Further calls have no effect."""
         self.envs.close()
 
     def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
-        """Refuse options: a robot's reset knows none."""
+        """Reject options, because the reset of a robot has none."""
         given = options if isinstance(options, list) else [options or {}]
         names = sorted({name for of_env in given for name in of_env})
         if names:
-            raise InvalidOptionError(f"`options` has {names}; a robot's reset knows none")
+            raise InvalidOptionError(f"`options` has {names}; the reset of a robot has no options")
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Draw every robot, (480, 640, 3) uint8 each; ``None`` each unless ``render_mode="rgb_array"``."""
+        """Render every robot, (480, 640, 3) uint8 each; ``None`` each unless ``render_mode="rgb_array"``."""
         return self.envs.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Read an attribute of :class:`SubEnvView` from each of the environments ``indices``."""
+        """Return an attribute of :class:`SubEnvView` of each of the environments ``indices``."""
         return [getattr(row, attr_name) for row in self._sub_envs(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Keep an attribute of your own with each of the environments ``indices``; it does not reach the server."""
+        """Set an attribute on the client side for each of the environments ``indices``."""
         for row in self._sub_envs(indices):
             setattr(row, attr_name, value)
 
@@ -159,7 +159,7 @@ class Go2VecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Indices = None
     ) -> list[bool]:
-        """Say for each of the environments ``indices`` that it has no such wrapper."""
+        """Return ``False`` for each of the environments ``indices``: they have no wrappers."""
         return [False for _ in self._sub_envs(indices)]
 
     def _sub_envs(self, indices: Indices) -> "list[SubEnvView]":
@@ -167,14 +167,14 @@ class Go2VecEnv(VecEnv):
 
 
 class SubEnvView:
-    """One robot of many, as ``get_attr``, ``set_attr`` and ``env_method`` see it.
+    """View of one robot, for ``get_attr``, ``set_attr`` and ``env_method``.
 
     Attributes
     ----------
     index
-        Its row in every array.
+        Row of the robot in every array.
     spec, twinstep_spec, render_mode, metadata, observation_space, action_space
-        As of a single environment.
+        Same as in a single environment.
     """
 
     def __init__(self, envs: Go2VectorEnv, index: int) -> None:
@@ -194,14 +194,14 @@ class SubEnvView:
     def __setattr__(self, name: str, value: object) -> None:
         if name in self.__dict__.get("_fixed", ()):
             raise AttributeError(
-                f"`{name}` is the same for all robots and cannot be set: make new environments with it"
+                f"`{name}` is the same for all robots and cannot be set; create new environments with it"
             )
         super().__setattr__(name, value)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode of this robot alone; the others go on.
+        """Start an episode of this robot. The episodes of the others continue.
 
         Returns
         -------
@@ -216,7 +216,7 @@ class SubEnvView:
 
 
 def _info_of(vector_info: dict[str, Any], env: int) -> dict[str, Any]:
-    """The info of one environment, taken from those of all: each ``key`` has a mask ``_key``."""
+    """Return the info of one environment from those of all: each ``key`` has a mask ``_key``."""
     info: dict[str, Any] = {}
     for key, values in vector_info.items():
         if not key.startswith("_") and vector_info[f"_{key}"][env]:

@@ -1,4 +1,4 @@
-"""The bundled server: found, started, shared within the process, and gone with it."""
+"""The bundled server, a child process that all environments of this process share."""
 
 import os
 import shutil
@@ -21,15 +21,15 @@ class ServerNotFoundError(Error):
 
 
 class ServerStartError(Error):
-    """The bundled server ended before it answered."""
+    """The bundled server terminated before it was ready."""
 
 
 def find_program() -> str:
-    """Path of the program ``twinstep``: the variable ``TWINSTEP_SERVER``, this installation's scripts, or ``PATH``."""
+    """Return the path of the program ``twinstep``: ``TWINSTEP_SERVER``, the scripts of this Python, or ``PATH``."""
     override = os.environ.get("TWINSTEP_SERVER")
     if override:
         if not os.access(override, os.X_OK):
-            raise ServerNotFoundError(f"`TWINSTEP_SERVER` = {override} is no program")
+            raise ServerNotFoundError(f"`TWINSTEP_SERVER` = {override} is not an executable program")
         return override
     for scheme in (None, f"{os.name}_user"):
         scripts = sysconfig.get_path("scripts", scheme) if scheme else sysconfig.get_path("scripts")
@@ -40,7 +40,7 @@ def find_program() -> str:
     if program is None:
         raise ServerNotFoundError(
             "the program `twinstep` is not installed here\n"
-            "  install the package with pip, put `twinstep` on the PATH, or name it in TWINSTEP_SERVER"
+            "  install the package with pip, add `twinstep` to the PATH, or set TWINSTEP_SERVER"
         )
     return program
 
@@ -48,8 +48,8 @@ def find_program() -> str:
 class EmbeddedServer:
     """A server on a free port of this machine, as a child process.
 
-    It ends when its stdin closes, which happens however this process ends. Environments with the same ``arguments``
-    share one: :meth:`shared` and :meth:`release` count its users.
+    It terminates when its stdin closes, which happens even if this process crashes. Environments with the same
+    ``arguments`` share one server; :meth:`shared` and :meth:`release` count its users.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class EmbeddedServer:
         self._owner = os.getpid()
         self._last_lines: deque[str] = deque(maxlen=_LOG_TAIL_LINES)
         command = [find_program(), "serve", "--until-stdin-closes", "--listen", "tcp/127.0.0.1:0", *arguments]
-        # A group of its own: Ctrl-C in a terminal is for the agent, which then closes the environment.
+        # A separate process group, so that Ctrl-C in a terminal reaches only the agent, which closes the environment.
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
@@ -82,8 +82,8 @@ class EmbeddedServer:
 
     @classmethod
     def shared(cls, arguments: tuple[str, ...]) -> "EmbeddedServer":
-        """The server of this process with these arguments; started if there is none, or if it has died."""
-        # A child made by fork shares its parent's memory, not its server.
+        """Return the server with these arguments. Starts one if there is none, or if it has terminated."""
+        # A forked child has a copy of its parent's memory, but not its server.
         key = (os.getpid(), arguments)
         with cls._lock:
             known = cls._shared.get(key)
@@ -94,7 +94,7 @@ class EmbeddedServer:
             return server
 
     def release(self) -> None:
-        """Give the server up; the last user stops it."""
+        """Release the server; the last user stops it."""
         key = (self._owner, self._arguments)
         if os.getpid() != self._owner:
             return
@@ -109,7 +109,7 @@ class EmbeddedServer:
 
     @property
     def alive(self) -> bool:
-        """Whether the process runs."""
+        """True while the process runs."""
         return self._process.poll() is None
 
     @property
@@ -118,12 +118,12 @@ class EmbeddedServer:
         return self._process.pid
 
     def exit_report(self) -> str:
-        """How the server ended, and its last log lines."""
+        """Return how the server terminated, and its last log lines."""
         code = self._process.poll()
         self._reader.join(timeout=1.0)
-        lines = "\n  ".join(self._last_lines) or "it logged nothing"
-        ended = f"by signal {-code}" if code is not None and code < 0 else f"with exit code {code}"
-        return f"the server that this process started (pid {self.pid}) ended {ended}; its last log lines:\n  {lines}"
+        lines = "\n  ".join(self._last_lines) or "(none)"
+        cause = f"by signal {-code}" if code is not None and code < 0 else f"with exit code {code}"
+        return f"the server started by this process (pid {self.pid}) terminated {cause}; its last log lines:\n  {lines}"
 
     def _await_endpoint(self, stdout: IO[str]) -> str:
         watchdog = threading.Timer(_STARTUP_S, self._process.kill)
@@ -141,7 +141,7 @@ class EmbeddedServer:
         stderr.close()
 
     def _stop(self) -> None:
-        """End the process; does nothing the second time."""
+        """Stop the process. Further calls have no effect."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.close()

@@ -1,4 +1,4 @@
-"""Gymnasium spaces from a server's spec."""
+"""Gymnasium spaces from the spec of a server."""
 
 from typing import cast
 
@@ -10,17 +10,17 @@ from .codec import SpecField, Spec
 
 
 def observation_space(spec: Spec) -> Space[NDArray[np.float32]]:
-    """Bounds of one observation, ``(obs_len,)`` float32."""
+    """Return the space of one observation, ``(obs_len,)`` float32."""
     return _box(spec.observation)
 
 
 def action_space(spec: Spec) -> Space[NDArray[np.float32]]:
-    """Bounds of one action, ``(action_len,)`` float32."""
+    """Return the space of one action, ``(action_len,)`` float32."""
     return _box(spec.action)
 
 
 def _box(parts: tuple[SpecField, ...]) -> Space[NDArray[np.float32]]:
     low = np.concatenate([np.full(part.size, part.low, np.float32) for part in parts])
     high = np.concatenate([np.full(part.size, part.high, np.float32) for part in parts])
-    # Gymnasium types a Box by any number; its dtype says which.
+    # Gymnasium's type of a Box does not contain its dtype.
     return cast(Space[NDArray[np.float32]], Box(low, high, dtype=np.float32))

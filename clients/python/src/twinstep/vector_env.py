@@ -1,4 +1,4 @@
-"""Many robots as a Gymnasium vector environment; one message steps them all."""
+"""Gymnasium vector environment of many robots, which one message steps."""
 
 from collections.abc import Sequence
 from typing import Any, Unpack
@@ -19,20 +19,20 @@ StepResult = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], 
 
 
 class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
-    """``num_envs`` robots on one server. Row i with seed s is the single environment with seed s + i.
+    """``num_envs`` robots on one server. Row i with seed s equals the single environment with seed s + i.
 
     Parameters
     ----------
     num_envs
         Number of robots.
     autoreset_mode
-        ``AutoresetMode`` or its value, ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``; done in the server.
+        ``AutoresetMode`` or its value, ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``; executed by the server.
     max_episode_steps
-        Policy steps after which an episode is truncated; the task's own number if ``None``.
+        Policy steps after which an episode is truncated. ``None``: the number of the task.
     render_mode
         As for :class:`Go2Env`; ``"human"`` shows the first robot.
     info_timing
-        Adds ``round_trip_s`` [s] to every info of a step. Off, infos depend on seeds and actions alone.
+        Adds ``round_trip_s`` [s] to the info of every step. Without it, infos depend only on seeds and actions.
     **options
         See :class:`twinstep.ConnectOptions`.
     """
@@ -49,9 +49,9 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
     ) -> None:
         mode = _autoreset_mode(autoreset_mode)
         self.metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 50, "autoreset_mode": mode}
-        mode_of_pictures = checked_render_mode(render_mode)
-        self.render_mode = mode_of_pictures
-        self._viewer = Viewer(mode_of_pictures) if mode_of_pictures else None
+        checked_mode = checked_render_mode(render_mode)
+        self.render_mode = checked_mode
+        self._viewer = Viewer(checked_mode) if checked_mode else None
         self._mode = mode
         self._info_timing = info_timing
         self._remote = RemoteVecEnv(
@@ -75,14 +75,14 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         Parameters
         ----------
         seed
-            Environment i gets ``seed + i``, or entry i of a sequence. ``None`` continues the random streams.
+            Environment i has the seed ``seed + i``, or entry i of a sequence. ``None`` continues the random streams.
         options
-            ``{"reset_mask": mask}``, mask (num_envs,) bool, resets only where it is true.
+            ``{"reset_mask": mask}``, mask (num_envs,) bool, resets only the environments where it is true.
 
         Returns
         -------
         obs : (num_envs, 45) float32
-            Of all environments, reset or not.
+            Observations of all environments, reset or not.
         info : dict
             Empty.
         """
@@ -111,24 +111,24 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         reward : (num_envs,) float64
         terminated, truncated : (num_envs,) bool
         info : dict
-            ``reward_terms`` of the episodes that ended; with ``"SameStep"`` in ``final_info``, beside ``final_obs``.
+            ``reward_terms`` of the episodes that ended; with ``"SameStep"`` in ``final_info``, next to ``final_obs``.
         """
         self.send(actions)
         return self.recv()
 
     def send(self, actions: NDArray[np.float32]) -> None:
-        """Send actions without waiting: the policy may compute while the server steps. :meth:`recv` is next."""
+        """Send actions without waiting, so that the caller can compute during the step. Call :meth:`recv` next."""
         self._remote.send(actions)
 
     def recv(self) -> StepResult:
-        """Wait for what the sent actions gave; may be called again after a ``RequestTimeoutError``."""
+        """Wait for the result of the actions; may be called again after a ``RequestTimeoutError``."""
         batch = self._remote.recv()
         infos = self._infos(batch)
         self._show()
         return batch.obs, batch.reward.astype(np.float64), batch.terminated, batch.truncated, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Draw every robot: a tuple of (480, 640, 3) uint8 with ``render_mode="rgb_array"``, else ``None``."""
+        """Render every robot: a tuple of (480, 640, 3) uint8 with ``render_mode="rgb_array"``, else ``None``."""
         if self.render_mode is None:
             gymnasium.logger.warn("render was called, but `render_mode` is not set: make(..., render_mode='rgb_array')")
             return None
@@ -138,7 +138,7 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         return tuple(self.draw(env) for env in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Give the environments back and close the window."""
+        """End the lease and close the window."""
         viewer: Viewer | None = getattr(self, "_viewer", None)
         if viewer is not None:
             viewer.close()
@@ -153,13 +153,13 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         if len(seed) != self.num_envs:
             raise InvalidOptionError(f"`seed` has {len(seed)} entries; {self.num_envs} are expected")
         if any(one < 0 for one in seed):
-            raise InvalidOptionError(f"`seed` has {min(seed)}; 0 or more is expected")
+            raise InvalidOptionError(f"`seed` has {min(seed)}; must be 0 or more")
         return np.array(seed, dtype=np.uint64)
 
     def _mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_] | None:
         unknown = sorted(set(options or ()) - {"reset_mask"})
         if unknown:
-            raise InvalidOptionError(f"`options` has {unknown}; only 'reset_mask' is known")
+            raise InvalidOptionError(f"`options` has {unknown}; only 'reset_mask' is supported")
         mask = (options or {}).get("reset_mask")
         if mask is None:
             return None
@@ -169,7 +169,7 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
                 f"`options['reset_mask']` is {mask.dtype} {mask.shape}; bool ({self.num_envs},) is expected"
             )
         if not mask.any():
-            raise InvalidOptionError("`options['reset_mask']` is nowhere true: nothing would be reset")
+            raise InvalidOptionError("`options['reset_mask']` has no true entry; at least one is expected")
         return mask
 
     def _infos(self, batch: StepBatch) -> dict[str, Any]:
@@ -190,7 +190,7 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
             self.draw(0)
 
     def draw(self, env: int) -> NDArray[np.uint8]:
-        """Draw one robot: (480, 640, 3) uint8; needs a ``render_mode``."""
+        """Render one robot: (480, 640, 3) uint8; requires a ``render_mode``."""
         assert self._viewer is not None
         return self._viewer.draw(self._remote.scene(env))
 
@@ -200,4 +200,4 @@ def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
         return AutoresetMode(mode)
     except ValueError as error:
         known = ", ".join(repr(known.value) for known in AutoresetMode)
-        raise InvalidOptionError(f"`autoreset_mode` = {mode!r}; {known} are known") from error
+        raise InvalidOptionError(f"`autoreset_mode` = {mode!r}; expected is one of {known}") from error

@@ -1,0 +1,360 @@
+//! Connection to one server: session, discovery, requests with retries, reasons of timeouts.
+
+use std::net::{TcpStream, ToSocketAddrs};
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use twinstep_model::AutoresetMode;
+use twinstep_protocol::{ErrorCode, PROTOCOL, ErrorReply, decode, encode, keys, message};
+use zenoh::bytes::ZBytes;
+use zenoh::handlers::FifoChannelHandler;
+use zenoh::liveliness::LivelinessToken;
+use zenoh::qos::CongestionControl;
+use zenoh::query::{ConsolidationMode, Querier, QueryTarget, Reply};
+use zenoh::{Session, Wait};
+
+use crate::ClientError;
+
+/// Timeout of one query, after which it is repeated.
+///
+/// A step may take longer, because a repeat waits for the request in progress. The timeout is short, because Zenoh
+/// keeps state for each query this long.
+const QUERY_TIMEOUT: Duration = Duration::from_secs(2);
+/// Pause before the first repeat, doubled each time, and its maximum.
+const RETRY_BACKOFF: [Duration; 2] = [Duration::from_millis(2), Duration::from_millis(200)];
+/// Time for which another server id must be visible under the robot's name before the server counts as restarted.
+///
+/// A server that lost its router is visible again within 1 s.
+const RESTART_CONFIRMATION: Duration = Duration::from_secs(2);
+/// Timeout of the test whether a port accepts connections.
+const PROBE_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Server to connect to, and the environments to request.
+#[derive(Clone, Debug)]
+pub struct ConnectOptions {
+    /// Zenoh endpoint of the server or of a router, such as `tcp/127.0.0.1:7447`.
+    pub endpoint: String,
+    /// Name of the robot. Required if several are visible.
+    pub robot: Option<String>,
+    /// Number of environments.
+    pub num_envs: usize,
+    /// When a new episode starts after one has ended.
+    pub autoreset: AutoresetMode,
+    /// Number of policy steps after which an episode is truncated. Default: the server's.
+    pub max_episode_steps: Option<u32>,
+    /// Spec hash that was stored with a policy; a server with a different one is rejected. Default: accept any.
+    pub spec_hash: Option<String>,
+    /// Zenoh configuration file (JSON5) for TLS, user and password.
+    pub zenoh: Option<PathBuf>,
+    /// Sends large messages through shared memory if client and server run on one machine.
+    pub shared_memory: bool,
+    /// Time after which connecting fails.
+    pub connect_timeout: Duration,
+    /// Time after which an unanswered request fails.
+    pub timeout: Duration,
+}
+
+impl ConnectOptions {
+    /// Creates options for `num_envs` environments of the only server at `endpoint`, with default timeouts.
+    pub fn new(endpoint: impl Into<String>, num_envs: usize) -> Self {
+        Self {
+            endpoint: endpoint.into(),
+            robot: None,
+            num_envs,
+            autoreset: AutoresetMode::NextStep,
+            max_episode_steps: None,
+            spec_hash: None,
+            zenoh: None,
+            shared_memory: false,
+            connect_timeout: Duration::from_secs(5),
+            timeout: Duration::from_secs(20),
+        }
+    }
+}
+
+/// A connection to one server, at which the client has declared its liveliness token.
+pub struct Connection {
+    endpoint: String,
+    timeout: Duration,
+    session: Session,
+    sid: String,
+    name: String,
+    client: String,
+    _token: LivelinessToken,
+}
+
+/// A request in progress.
+pub struct Pending {
+    payload: ZBytes,
+    replies: FifoChannelHandler<Reply>,
+}
+
+/// Result of one query.
+enum QueryOutcome {
+    Answer(ZBytes),
+    Error(ErrorReply),
+    /// The query timed out: the server is unresponsive or still executes the request.
+    Timeout,
+    /// Zero replies: no server answers at the key, or access control denies the query.
+    NoReply,
+}
+
+impl Connection {
+    /// Opens a session, finds the server, and declares the client's liveliness token.
+    pub fn open(options: &ConnectOptions) -> Result<Self, ClientError> {
+        let session = open_session(options)?;
+        let (sid, name) = find_server(&session, options)?;
+        let client = random_id(&session);
+        let key = keys::live_client(&sid, &client);
+        let token = session.liveliness().declare_token(&key).wait().map_err(|error| zenoh_error(&error))?;
+        let endpoint = options.endpoint.clone();
+        Ok(Self { endpoint, timeout: options.timeout, session, sid, name, client, _token: token })
+    }
+
+    /// Returns the id of the client, as in its liveliness token.
+    pub fn client(&self) -> &str {
+        &self.client
+    }
+
+    /// Returns the id of the server.
+    pub fn sid(&self) -> &str {
+        &self.sid
+    }
+
+    /// Declares a querier for one key of the server.
+    pub fn querier(&self, key: String) -> Result<Querier<'static>, ClientError> {
+        self.session
+            .declare_querier(key)
+            .target(QueryTarget::BestMatching)
+            .consolidation(ConsolidationMode::None)
+            .congestion_control(CongestionControl::Block)
+            .express(true)
+            .timeout(QUERY_TIMEOUT)
+            .wait()
+            .map_err(|error| zenoh_error(&error))
+    }
+
+    /// Requests `hello`. Fails if the server does not support this protocol version.
+    pub fn hello(&self) -> Result<message::HelloReply, ClientError> {
+        let querier = self.querier(keys::hello(&self.sid))?;
+        let client = concat!("twinstep-client ", env!("CARGO_PKG_VERSION")).to_owned();
+        let answer = self.request(&querier, encode(&message::HelloRequest { protocol: PROTOCOL, client }))?;
+        let hello: message::HelloReply = read_answer(&answer, "hello")?;
+        if !(hello.protocols[0]..=hello.protocols[1]).contains(&PROTOCOL) {
+            return Err(ClientError::Version { theirs: hello.protocols, ours: PROTOCOL });
+        }
+        Ok(hello)
+    }
+
+    /// Sends a request and waits for the reply.
+    pub fn request(&self, querier: &Querier<'static>, request: Vec<u8>) -> Result<ZBytes, ClientError> {
+        self.wait_reply(querier, &mut send(querier, request)?)
+    }
+
+    /// Waits for the reply to a request and repeats the request until the timeout. May be called again after a timeout.
+    pub fn wait_reply(&self, querier: &Querier<'static>, pending: &mut Pending) -> Result<ZBytes, ClientError> {
+        let since = Instant::now();
+        let mut pause = RETRY_BACKOFF[0];
+        let mut replaced_since: Option<Instant> = None;
+        loop {
+            match outcome(&pending.replies) {
+                QueryOutcome::Answer(bytes) => return Ok(bytes),
+                QueryOutcome::Error(error) if error.code == ErrorCode::ShuttingDown => {
+                    return Err(ClientError::ShuttingDown { endpoint: self.endpoint.clone() });
+                }
+                QueryOutcome::Error(error) if !error.retryable => return Err(error.into()),
+                QueryOutcome::Error(_) | QueryOutcome::Timeout => {}
+                QueryOutcome::NoReply => {
+                    replaced_since = self.server_restarted().then(|| replaced_since.unwrap_or_else(Instant::now));
+                    if replaced_since.is_some_and(|since| since.elapsed() >= RESTART_CONFIRMATION) {
+                        return Err(ClientError::Restarted { endpoint: self.endpoint.clone() });
+                    }
+                }
+            }
+            if since.elapsed() >= self.timeout {
+                return Err(ClientError::RequestTimeout {
+                    endpoint: self.endpoint.clone(),
+                    request: querier.key_expr().to_string(),
+                    waited_s: since.elapsed().as_secs_f64(),
+                    reason: self.timeout_reason(),
+                });
+            }
+            std::thread::sleep(pause);
+            pause = (pause * 2).min(RETRY_BACKOFF[1]);
+            pending.replies = get(querier, &pending.payload)?;
+        }
+    }
+
+    /// Returns true if a server of this robot's name is visible under another id, and this server is not visible.
+    fn server_restarted(&self) -> bool {
+        let visible = visible_servers(&self.session);
+        !visible.iter().any(|(sid, _)| *sid == self.sid) && visible.iter().any(|(_, name)| *name == self.name)
+    }
+
+    /// Returns the reason for a timeout, from the state of the session, the liveliness tokens and a `hello` request.
+    fn timeout_reason(&self) -> String {
+        let info = self.session.info();
+        let linked = info.routers_zid().wait().next().is_some() || info.peers_zid().wait().next().is_some();
+        if !linked {
+            return "the connection is lost and cannot be restored; check that the server or the router is running"
+                .to_owned();
+        }
+        if !visible_servers(&self.session).iter().any(|(sid, _)| *sid == self.sid) {
+            return "the connection works, but the server is no longer visible: it has terminated or lost its router"
+                .to_owned();
+        }
+        let hello = self.querier(keys::hello(&self.sid)).and_then(|querier| {
+            let request = message::HelloRequest { protocol: PROTOCOL, client: self.client.clone() };
+            Ok(outcome(&send(&querier, encode(&request))?.replies))
+        });
+        match hello {
+            Ok(QueryOutcome::Answer(_)) => {
+                "the server answers `hello`, but not this request: it is still in progress (increase `timeout`), or \
+                 access control or a message size limit rejects it"
+            }
+            Ok(QueryOutcome::Timeout) => "the server is visible but unresponsive: it does not reply to requests",
+            _ => "the server is visible, but queries get no reply: access control may deny queries to this user",
+        }
+        .to_owned()
+    }
+}
+
+/// Sends a request without waiting for the reply.
+pub fn send(querier: &Querier<'static>, request: Vec<u8>) -> Result<Pending, ClientError> {
+    let payload = ZBytes::from(request);
+    let replies = get(querier, &payload)?;
+    Ok(Pending { payload, replies })
+}
+
+fn get(querier: &Querier<'static>, payload: &ZBytes) -> Result<FifoChannelHandler<Reply>, ClientError> {
+    querier.get().payload(payload.clone()).wait().map_err(|error| zenoh_error(&error))
+}
+
+fn outcome(replies: &FifoChannelHandler<Reply>) -> QueryOutcome {
+    let Ok(reply) = replies.recv() else { return QueryOutcome::NoReply };
+    match reply.into_result() {
+        Ok(sample) => QueryOutcome::Answer(sample.payload().clone()),
+        // Zenoh's own errors, such as its timeout, are not MessagePack.
+        Err(error) => decode(&error.payload().to_bytes()).map_or(QueryOutcome::Timeout, QueryOutcome::Error),
+    }
+}
+
+/// Decodes the reply to `request`.
+pub fn read_answer<T: serde::de::DeserializeOwned>(answer: &ZBytes, request: &str) -> Result<T, ClientError> {
+    decode(&answer.to_bytes())
+        .map_err(|error| ClientError::Malformed { request: request.to_owned(), reason: error.message })
+}
+
+fn open_session(options: &ConnectOptions) -> Result<Session, ClientError> {
+    let since = Instant::now();
+    loop {
+        let config = zenoh_config(options)?;
+        match zenoh::open(config).wait() {
+            Ok(session) => return Ok(session),
+            Err(error) if since.elapsed() >= options.connect_timeout => {
+                return Err(ClientError::NoServer {
+                    endpoint: options.endpoint.clone(),
+                    waited_s: since.elapsed().as_secs_f64(),
+                    reason: without_source_line(&error.to_string()),
+                    port_open: port_open(&options.endpoint),
+                });
+            }
+            Err(_) => std::thread::sleep(RETRY_BACKOFF[1]),
+        }
+    }
+}
+
+/// Returns an error text of Zenoh without the source location at its end.
+fn without_source_line(error: &str) -> String {
+    error.split(" at /").next().unwrap_or(error).trim_end().to_owned()
+}
+
+/// Returns true if a program accepts connections at the endpoint.
+///
+/// Distinguishes a server that rejects this client from an absent server.
+fn port_open(endpoint: &str) -> bool {
+    let address = endpoint.split_once('/').map_or(endpoint, |(_, rest)| rest);
+    let address = address.split(['?', '#']).next().unwrap_or_default();
+    let mut addresses = address.to_socket_addrs().into_iter().flatten();
+    addresses.any(|address| TcpStream::connect_timeout(&address, PROBE_TIMEOUT).is_ok())
+}
+
+fn zenoh_config(options: &ConnectOptions) -> Result<zenoh::Config, ClientError> {
+    let invalid = |reason: String| ClientError::Config { path: options.zenoh.clone(), reason };
+    let mut config = match &options.zenoh {
+        Some(path) => zenoh::Config::from_file(path).map_err(|error| invalid(error.to_string()))?,
+        None => zenoh::Config::default(),
+    };
+    let endpoints = serde_json::json!([options.endpoint]).to_string();
+    for (key, value) in [
+        ("mode", "\"client\""),
+        ("connect/endpoints", endpoints.as_str()),
+        ("scouting/multicast/enabled", "false"),
+        ("transport/link/tx/lease", "2000"),
+        // A step of 4096 robots is sent in twelve fragments. With Zenoh's default queue of two, the writing thread
+        // waits for the sending thread after every second fragment. With its default buffer, the receiver allocates
+        // each one.
+        ("transport/link/tx/queue/size/data", "16"),
+        ("transport/link/rx/buffer_size", "2097152"),
+        // The connection to a restarted server or router is restored within 1 s instead of Zenoh's 4 s.
+        ("connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
+        ("transport/shared_memory/enabled", if options.shared_memory { "true" } else { "false" }),
+    ] {
+        config.insert_json5(key, value).map_err(|error| invalid(format!("`{key}` = {value}: {error}")))?;
+    }
+    Ok(config)
+}
+
+/// Returns the server id and the robot name of every visible server.
+fn visible_servers(session: &Session) -> Vec<(String, String)> {
+    let Ok(replies) = session.liveliness().get(keys::LIVE_SERVERS).timeout(QUERY_TIMEOUT).wait() else {
+        return Vec::new();
+    };
+    let mut servers: Vec<(String, String)> = std::iter::from_fn(|| replies.recv().ok())
+        .filter_map(|reply| reply.into_result().ok())
+        .filter_map(|sample| {
+            let (sid, name) = keys::parse_live_server(sample.key_expr().as_str())?;
+            Some((sid.to_owned(), name.to_owned()))
+        })
+        .collect();
+    servers.sort();
+    servers.dedup();
+    servers
+}
+
+fn find_server(session: &Session, options: &ConnectOptions) -> Result<(String, String), ClientError> {
+    let since = Instant::now();
+    loop {
+        let visible = visible_servers(session);
+        let matches = |name: &str| options.robot.as_ref().is_none_or(|robot| robot == name);
+        let mut matching: Vec<_> = visible.iter().filter(|(_, name)| matches(name)).cloned().collect();
+        match (matching.pop(), matching.is_empty()) {
+            (Some(server), true) => return Ok(server),
+            // The old token of a restarted server may be visible for a moment.
+            _ if since.elapsed() < options.connect_timeout => std::thread::sleep(RETRY_BACKOFF[1] / 4),
+            (None, _) if visible.is_empty() => {
+                let waited_s = since.elapsed().as_secs_f64();
+                return Err(ClientError::NoServerVisible { endpoint: options.endpoint.clone(), waited_s });
+            }
+            (found, _) => {
+                let count = matching.len() + usize::from(found.is_some());
+                let expected = match &options.robot {
+                    Some(robot) => format!("{count} robots have the name `{robot}`"),
+                    None => format!("{count} robots are visible, and `robot` is not set"),
+                };
+                let visible = visible.iter().map(|(sid, name)| format!("{name} ({sid})")).collect();
+                return Err(ClientError::AmbiguousRobot { wanted: expected, visible });
+            }
+        }
+    }
+}
+
+fn random_id(session: &Session) -> String {
+    use std::hash::{BuildHasher, Hasher};
+    let number = std::hash::RandomState::new().build_hasher().finish();
+    format!("{}-{number:016x}", session.zid())
+}
+
+fn zenoh_error(error: &zenoh::Error) -> ClientError {
+    ClientError::Config { path: None, reason: error.to_string() }
+}

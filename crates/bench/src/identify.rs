@@ -1,0 +1,174 @@
+//! Identification: closed-loop rollouts of the built-in recording's commands, and a whole search.
+
+use std::path::Path;
+use std::time::Instant;
+
+use rand::RngExt;
+use twinstep_logs::Log;
+use twinstep_effects::{EffectEntry, apply_effects};
+use twinstep_model::{JOINT_NAMES, BaseMount, MjcfActuator, MjcfOptions, Precision, RobotModel, go2, mjcf, stream};
+use twinstep_effects::ModelFile;
+use twinstep_sim::{BatchRollout, SimConfig};
+use twinstep_identify::{Experiment, WindowConfig, IdentifyOptions, identify};
+
+use crate::Measurement;
+use crate::throughput::{WINDOWS, measure as pace, median_of};
+use crate::baselines::{Baselines, Setup};
+use crate::error::{BenchError, Interrupted, check, failed};
+use twinstep_identify::default_effects;
+use twinstep_logs::recording;
+
+/// Rollouts that are timed on all cores, and the length of each [s].
+const ROLLOUTS: usize = 1000;
+const ROLLOUT_S: f64 = 10.0;
+/// Candidates that are judged at a time: their trajectories fit into memory, and there is work for many cores.
+const BATCH_SIZE: usize = 100;
+/// Candidates that are judged at a time on one core: half a generation of the search, which fills every register.
+const ON_ONE_CORE: usize = 16;
+/// Robots in MuJoCo: it steps them one after the other.
+const MUJOCO_ROBOTS: usize = 2;
+/// What the rollouts, and a whole identification, may take on two cores [s].
+const ROLLOUTS_AIM_S: f64 = 10.0;
+const IDENTIFICATION_AIM_S: f64 = 20.0;
+
+/// Robot-seconds a second, seconds for a thousand rollouts, and seconds for an identification.
+pub fn measure(python: &Path, window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
+    let folder = std::env::temp_dir().join(format!("twinstep-bench-{}", std::process::id()));
+    let log = recording::unpack(&folder);
+    std::fs::remove_dir_all(&folder).map_err(failed)?;
+    let log = log.map_err(failed)?;
+    let first = log.t()[0];
+    let experiment = Experiment::new(&log, &go2(), WindowConfig::IDENTIFICATION).map_err(failed)?;
+    let rollouts = experiment.clone().filter_rows(|row| log.t()[row] - first <= ROLLOUT_S);
+    let candidates = candidates()?;
+    let mut peers = Baselines::start(python, &setup(&log, window_s));
+    let mut rows =
+        on_one_core(&rollouts, &candidates[..ON_ONE_CORE], &mut peers, window_s)?.into_iter().collect::<Vec<_>>();
+    rows.extend(on_all_cores(&rollouts, &candidates, interrupted)?);
+    rows.push(whole_search(&experiment, interrupted)?);
+    Ok(rows)
+}
+
+/// Robots with a random value of every effect that `twinstep identify` seeks by itself, within what is plausible.
+fn candidates() -> Result<Vec<RobotModel>, BenchError> {
+    let mut random = stream(1, "bench identify", 0);
+    let mut candidate = || {
+        let entries = default_effects().into_iter().map(|(effect, scope)| {
+            let values = effect.parameters.iter().map(|parameter| {
+                let [low, high] = parameter.prior_range;
+                random.random_range(low..high)
+            });
+            EffectEntry::new(effect, scope, values.collect()).map_err(failed)
+        });
+        apply_effects(&go2(), &entries.collect::<Result<Vec<_>, _>>()?).map_err(failed)
+    };
+    (0..ROLLOUTS).map(|_| candidate()).collect()
+}
+
+fn simulator(threads: usize) -> Result<BatchRollout, BenchError> {
+    BatchRollout::new(&go2(), &SimConfig { threads, ..SimConfig::default() }).map_err(failed)
+}
+
+/// Windows of ours in single and in double precision and of MuJoCo in turn.
+fn on_one_core(
+    rollouts: &Experiment,
+    candidates: &[RobotModel],
+    peers: &mut Baselines,
+    window_s: f64,
+) -> Result<[Measurement; 2], BenchError> {
+    let hz = SimConfig::default().physics_hz();
+    let (mut simulator, peer) = (simulator(1)?, format!("mujoco {hz}"));
+    let (mut single, mut double, mut theirs) = (Vec::new(), Vec::new(), Vec::new());
+    for _ in 0..WINDOWS {
+        for (precision, paces) in [(Precision::Single, &mut single), (Precision::Double, &mut double)] {
+            let judged = pace(window_s, || {
+                rollouts.residuals(&mut simulator, candidates, precision);
+                Ok(())
+            })?;
+            paces.push(judged.per_second * candidates.len() as f64 * ROLLOUT_S);
+        }
+        if peers.has(&peer) {
+            // It counts actuator periods.
+            theirs.push(peers.window(&peer)? * go2().control.actuator_dt());
+        }
+    }
+    let (single, double) = (median_of(single), median_of(double));
+    let theirs = (!theirs.is_empty()).then(|| median_of(theirs));
+    let row = |numbers: &str, value: f64, reference: Option<(String, f64)>| Measurement {
+        case: format!("closed-loop rollouts, batch {numbers} {hz} Hz, one core"),
+        value,
+        unit: "robot-s/s",
+        ratio: reference.as_ref().map(|(_, reference)| value / reference),
+        reference: reference.map(|(reference, pace)| format!("{reference}, {pace:.0} robot-s/s")),
+    };
+    Ok([
+        row("f32", single, theirs.map(|theirs| (format!("MuJoCo C {hz} Hz, one thread"), theirs))),
+        row("f64", double, Some(("f32".to_owned(), single))),
+    ])
+}
+
+fn on_all_cores(rollouts: &Experiment, candidates: &[RobotModel], interrupted: Interrupted) -> Result<[Measurement; 2], BenchError> {
+    let mut simulator = simulator(0)?;
+    let since = Instant::now();
+    for candidates in candidates.chunks(BATCH_SIZE) {
+        check(interrupted)?;
+        rollouts.residuals(&mut simulator, candidates, Precision::Single);
+    }
+    let seconds = since.elapsed().as_secs_f64();
+    let row = |case: &str, value: f64, unit: &'static str| Measurement {
+        case: format!("{ROLLOUTS} closed-loop rollouts of {ROLLOUT_S} s, {case}"),
+        value,
+        unit,
+        reference: Some(format!("the aim of {ROLLOUTS_AIM_S} s for all")),
+        ratio: Some(ROLLOUTS_AIM_S / seconds),
+    };
+    Ok([row("all cores", ROLLOUTS as f64 * ROLLOUT_S / seconds, "robot-s/s"), row("time", seconds, "s")])
+}
+
+fn whole_search(experiment: &Experiment, interrupted: Interrupted) -> Result<Measurement, BenchError> {
+    let (model, effects, mut simulator) = (ModelFile::default(), default_effects(), simulator(0)?);
+    let since = Instant::now();
+    let found = identify(
+        &model,
+        &effects,
+        std::slice::from_ref(experiment),
+        &mut simulator,
+        &IdentifyOptions::default(),
+        &mut |_, _, _| !interrupted(),
+    );
+    let seconds = since.elapsed().as_secs_f64();
+    if found.map_err(failed)?.checkpoint.is_some() {
+        return Err(BenchError::Interrupted);
+    }
+    Ok(Measurement {
+        case: format!("identify {} numbers from 16 s of twelve joints", effects.len()),
+        value: seconds,
+        unit: "s",
+        reference: Some(format!("the aim of {IDENTIFICATION_AIM_S} s")),
+        ratio: Some(IDENTIFICATION_AIM_S / seconds),
+    })
+}
+
+/// What MuJoCo needs to follow the same commands, its actuator in the model.
+fn setup(log: &Log, window_s: f64) -> Setup {
+    let (control, hz) = (go2().control, SimConfig::default().physics_hz());
+    let actuator = MjcfActuator::Position {
+        kp: log.kp(JOINT_NAMES[0], 0).unwrap_or(control.kp),
+        kd: log.kd(JOINT_NAMES[0], 0).unwrap_or(control.kd),
+    };
+    let model = mjcf(&go2(), &MjcfOptions { base: BaseMount::Fixed, timestep: 1.0 / f64::from(hz), actuator: actuator });
+    let periods = (ROLLOUT_S / control.actuator_dt()).round() as usize;
+    let target = |row: usize| {
+        let command = |(name, pose): (&&str, f64)| log.q_cmd(name).map_or(pose, |cells| cells[row]) as f32;
+        JOINT_NAMES.iter().zip(control.default_pose).map(command).collect()
+    };
+    Setup {
+        models: [(hz, model)].into(),
+        threads: Vec::new(),
+        targets: (0..periods).map(target).collect(),
+        actions: Vec::new(),
+        policy_dt: control.actuator_dt(),
+        num_envs: MUJOCO_ROBOTS,
+        window_s,
+    }
+}

@@ -1,0 +1,61 @@
+//! Environments with physics: the same walk over Zenoh and in process, in turn.
+
+use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
+use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
+
+use crate::Measurement;
+use crate::throughput::{Throughput, WINDOWS, measure as pace, median};
+use crate::error::{BenchError, Interrupted, check, failed};
+use twinstep_client::ServerProcess;
+use twinstep_envs::trot;
+
+/// Environment steps a second, remote beside in process.
+pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
+    let mut rows = Vec::new();
+    for num_envs in [64, 1024, 4096] {
+        let (remote, local) = side_by_side(num_envs, window_s, interrupted)?;
+        let env_steps = num_envs as f64;
+        rows.push(Measurement {
+            case: format!("walk in process, {num_envs} envs"),
+            value: local.per_second * env_steps,
+            unit: "env-steps/s",
+            reference: None,
+            ratio: None,
+        });
+        rows.push(Measurement {
+            case: format!("walk over Zenoh, {num_envs} envs"),
+            value: remote.per_second * env_steps,
+            unit: "env-steps/s",
+            reference: Some("the same envs in process".to_owned()),
+            ratio: Some(remote.per_second / local.per_second),
+        });
+    }
+    Ok(rows)
+}
+
+fn side_by_side(num_envs: usize, window_s: f64, interrupted: Interrupted) -> Result<(Throughput, Throughput), BenchError> {
+    let server = ServerProcess::start(&[]).map_err(failed)?;
+    let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&server.endpoint, num_envs)).map_err(failed)?;
+    let mut local = SimEnvFactory::new(Config::default())
+        .and_then(|host| host.build(num_envs, AutoresetMode::NextStep, None))
+        .map_err(failed)?;
+    let request = ResetRequest::seeded(1, num_envs);
+    remote.reset(&request).map_err(failed)?;
+    local.reset(&request).map_err(failed)?;
+    // The same trot in both, so that both meet the same contacts.
+    let (mut remote_steps, mut local_steps) = (0, 0);
+    let (mut ours, mut reference) = (Vec::new(), Vec::new());
+    for _ in 0..WINDOWS {
+        check(interrupted)?;
+        ours.push(pace(window_s, || step(&mut remote, &mut remote_steps))?);
+        reference.push(pace(window_s, || step(&mut *local, &mut local_steps))?);
+    }
+    Ok((median(&ours), median(&reference)))
+}
+
+fn step(env: &mut dyn VecEnv, steps: &mut u32) -> Result<(), BenchError> {
+    let action = trot::action(*steps as f32 * env.spec().policy_dt as f32);
+    *steps += 1;
+    env.step(&action.repeat(env.num_envs())).map(drop).map_err(failed)
+}

@@ -1,0 +1,45 @@
+//! How fast something repeats: rate and latency over windows.
+
+use std::time::{Duration, Instant};
+
+use crate::error::BenchError;
+
+/// Windows whose median counts.
+pub const WINDOWS: usize = 5;
+
+/// What one window gave.
+#[derive(Clone, Copy)]
+pub struct Throughput {
+    /// Repeats in a second.
+    pub per_second: f64,
+    /// Median time of one repeat [µs].
+    pub median_us: f64,
+}
+
+/// Repeats `once` for `window_s` seconds.
+pub fn measure(window_s: f64, mut once: impl FnMut() -> Result<(), BenchError>) -> Result<Throughput, BenchError> {
+    let (window, since) = (Duration::from_secs_f64(window_s), Instant::now());
+    let mut times = Vec::new();
+    let mut last = since;
+    while last.duration_since(since) < window {
+        once()?;
+        let now = Instant::now();
+        times.push(now.duration_since(last));
+        last = now;
+    }
+    let per_second = times.len() as f64 / last.duration_since(since).as_secs_f64();
+    times.sort_unstable();
+    Ok(Throughput { per_second, median_us: times[times.len() / 2].as_secs_f64() * 1e6 })
+}
+
+/// The median of several windows, number by number.
+pub fn median(paces: &[Throughput]) -> Throughput {
+    let middle = |pick: fn(&Throughput) -> f64| median_of(paces.iter().map(pick).collect());
+    Throughput { per_second: middle(|pace| pace.per_second), median_us: middle(|pace| pace.median_us) }
+}
+
+/// The median of a few numbers.
+pub fn median_of(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}

@@ -1,0 +1,110 @@
+//! `twinstep evaluate`: the error of a model on a log.
+
+use std::path::PathBuf;
+
+use twinstep_logs::Log;
+use twinstep_model::RobotModel;
+use twinstep_sim::{BatchRollout, SimConfig};
+use twinstep_identify::{Evaluation, evaluate, position_errors};
+
+use crate::exit::{Failure, CommandResult, input, other};
+use crate::robot_file::robot_model;
+use twinstep_report::{chart, evaluation_plot};
+
+/// How far a model is from a measured log: the number that says whether a model got better.
+///
+/// Torque: what the model's actuators make of the measured positions, velocities and commands, at the log's sensor. Position:
+/// in closed loop, under the log's commands; with the base held from each part's first measured state to its end, with a
+/// free base in windows of 0.5 s from measured states. Root mean squares over all rows and joints.
+///
+/// Example: `twinstep evaluate --model extended.toml data/go2_air_chirp --plot errors.svg`
+#[derive(clap::Args)]
+pub struct Args {
+    /// The log: a data file, or a folder that holds one.
+    log: PathBuf,
+    /// Model file of the robot; the ideal Go2 without.
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    #[command(flatten)]
+    rows: Rows,
+    /// Print one JSON object and nothing else on stdout.
+    #[arg(long)]
+    json: bool,
+    /// Write a picture: the errors joint by joint, and the worst joint over time.
+    #[arg(long, value_name = "FILE.svg")]
+    plot: Option<PathBuf>,
+}
+
+/// Which rows count.
+#[derive(clap::Args)]
+pub struct Rows {
+    /// Count only rows from this time on [s].
+    #[arg(long, value_name = "S")]
+    from: Option<f64>,
+    /// Count only rows before this time [s].
+    #[arg(long, value_name = "S")]
+    until: Option<f64>,
+}
+
+/// No row is left.
+#[derive(Debug, thiserror::Error)]
+#[error("`--from` and `--until` leave no row: the log's `t` goes from {first} to {last} s")]
+struct NoRows {
+    first: f64,
+    last: f64,
+}
+
+impl Rows {
+    /// For each row of the log, whether it counts.
+    pub fn of(&self, log: &Log) -> Result<Vec<bool>, Failure> {
+        let (from, until) = (self.from.unwrap_or(f64::NEG_INFINITY), self.until.unwrap_or(f64::INFINITY));
+        let rows: Vec<bool> = log.t().iter().map(|t| (from..until).contains(t)).collect();
+        if rows.contains(&true) {
+            return Ok(rows);
+        }
+        let (first, last) = (log.t()[0], log.t()[log.rows() - 1]);
+        Err(input(NoRows { first, last }))
+    }
+}
+
+/// The simulator that candidates are judged in.
+pub fn simulator(robot: &RobotModel) -> Result<BatchRollout, Failure> {
+    BatchRollout::new(robot, &SimConfig::default()).map_err(input)
+}
+
+/// Evaluates and prints.
+pub fn run(args: &Args) -> CommandResult {
+    let robot = robot_model(args.model.as_deref())?;
+    let log = Log::open(&args.log).map_err(input)?;
+    let rows = args.rows.of(&log)?;
+    if let Some(path) = &args.plot {
+        chart::check_writable(path).map_err(input)?;
+    }
+    let mut simulator = simulator(&robot)?;
+    let evaluation = evaluate(&log, &robot, &mut simulator, |row| rows[row]).map_err(input)?;
+    if let Some(path) = &args.plot {
+        let errors = position_errors(&log, &robot, &mut simulator, |row| rows[row]).map_err(input)?;
+        let model = args.model.as_ref().map_or("the ideal go2".to_owned(), |model| model.display().to_string());
+        let title = format!("{model} on {}", args.log.display());
+        evaluation_plot::write_svg(&log, &evaluation, &errors, &title, path).map_err(input)?;
+    }
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&evaluation).map_err(other)?);
+    } else {
+        print!("{}", table(&evaluation));
+    }
+    Ok(())
+}
+
+/// A line a joint, and one over all.
+pub fn table(evaluation: &Evaluation) -> String {
+    let cell = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
+    let line = |name: &str, q: Option<f64>, torque: Option<f64>| {
+        format!("{name:<10}  {:>10}  {:>12}\n", cell(q), cell(torque))
+    };
+    let mut text = "joint        q [rad]    torque [N·m]   (RMSE)\n".to_owned();
+    for (name, joint) in &evaluation.per_joint {
+        text += &line(name, joint.q_rmse_rad, joint.torque_rmse_nm);
+    }
+    text + &line("all joints", evaluation.q_rmse_rad, evaluation.torque_rmse_nm)
+}

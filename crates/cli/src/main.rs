@@ -1,0 +1,68 @@
+//! The command line `twinstep`: one subcommand a file.
+
+mod bench;
+mod cross_evaluation;
+mod demo;
+mod diagnose;
+mod effects;
+mod evaluate;
+mod exit;
+mod fit;
+mod hunt;
+mod identify;
+mod log;
+mod mjcf;
+mod play;
+mod robot_file;
+mod serve;
+
+use clap::{Parser, Subcommand};
+
+/// Thousands of simulated Unitree Go2 for reinforcement learning, and an honest look at the gap to the real one.
+#[derive(Parser)]
+#[command(version, propagate_version = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: CliCommand,
+}
+
+#[derive(Subcommand)]
+enum CliCommand {
+    Bench(bench::Args),
+    Demo(demo::Args),
+    Diagnose(diagnose::Args),
+    Effects(effects::Args),
+    Evaluate(evaluate::Args),
+    Fit(fit::Args),
+    Hunt(hunt::Args),
+    Identify(identify::Args),
+    Log(log::Args),
+    Mjcf(mjcf::Args),
+    Play(play::Args),
+    Serve(serve::Args),
+}
+
+fn main() -> std::process::ExitCode {
+    tracing_subscriber::fmt()
+        .with_env_filter(
+            tracing_subscriber::EnvFilter::try_from_env("TWINSTEP_LOG")
+                .unwrap_or_else(|_| "warn,zenoh::api::session=error,twinstep=info".into()),
+        )
+        .with_writer(std::io::stderr)
+        .init();
+    let result = match Cli::parse().command {
+        CliCommand::Bench(args) => bench::run(&args),
+        CliCommand::Demo(args) => demo::run(&args),
+        CliCommand::Diagnose(args) => diagnose::run(&args),
+        CliCommand::Effects(args) => effects::run(&args),
+        CliCommand::Evaluate(args) => evaluate::run(&args),
+        CliCommand::Fit(args) => fit::run(&args),
+        CliCommand::Hunt(args) => hunt::run(&args),
+        CliCommand::Identify(args) => identify::run(&args),
+        CliCommand::Log(args) => log::run(&args),
+        CliCommand::Mjcf(args) => mjcf::run(&args),
+        CliCommand::Play(args) => play::run(&args),
+        CliCommand::Serve(args) => serve::run(&args),
+    };
+    exit::code(result)
+}

@@ -1,0 +1,168 @@
+//! What might be wrong: an effect on a scope, with values.
+
+use twinstep_effects::{Composition, Effect, EffectEntry, EntryError, Scope, Target};
+use twinstep_model::Joint;
+use twinstep_effects::ModelFile;
+
+/// Shares of the way from no effect to the end of its plausible range that are tried.
+const SHARES: [f64; 5] = [0.1, 0.2, 0.4, 0.75, 1.3];
+/// A finding smaller than this share of its plausible range is not worth a name.
+const LEAST_SHARE: f64 = 0.1;
+/// The same of effects that errors of a millimetre in geometry, or another law of contact, look like.
+const LEAST_SHARES: [(&str, f64); 3] = [("encoder_offset", 0.3), ("com_shift", 0.12), ("ground_stiffness", 0.3)];
+
+/// An effect on a scope, with values.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Hypothesis {
+    /// The effect.
+    pub effect: &'static Effect,
+    /// What it is about.
+    pub scope: Scope,
+    /// Its values, parameter after parameter.
+    pub values: Vec<f64>,
+}
+
+impl Hypothesis {
+    /// As people write it, `armature@calf`.
+    pub fn name(&self) -> String {
+        format!("{}@{}", self.effect.name, self.scope)
+    }
+
+    /// Whether it is large enough to be worth a name.
+    pub fn exceeds_min_size(&self) -> bool {
+        let own = LEAST_SHARES.iter().find(|(name, _)| *name == self.effect.name);
+        relative_size(self.effect, &self.values) >= own.map_or(LEAST_SHARE, |(_, least)| *least)
+    }
+
+    /// Whether a robot may have it: no value is half as far again from none of it as the plausible range goes.
+    pub fn is_plausible(&self) -> bool {
+        let parameters = self.effect.parameters.iter().flat_map(|one| std::iter::repeat_n(one, one.count));
+        parameters.zip(&self.values).all(|(parameter, value)| {
+            let [low, high] = parameter.prior_range;
+            let beyond = 0.5 * (high - parameter.no_effect_value).max(parameter.no_effect_value - low);
+            // An infinite one is none of it.
+            if parameter.no_effect_value.is_infinite() {
+                *value >= 0.5 * low
+            } else {
+                (low - beyond..=high + beyond).contains(value)
+            }
+        })
+    }
+}
+
+/// How far along the way from no effect to the end of the plausible range the largest of an effect's main values is.
+fn relative_size(effect: &Effect, values: &[f64]) -> f64 {
+    let parameter = &effect.parameters[0];
+    let [low, high] = parameter.prior_range;
+    let of = |value: &f64| {
+        if parameter.no_effect_value.is_infinite() {
+            return low / value;
+        }
+        let end = if *value > parameter.no_effect_value { high } else { low };
+        if (end - parameter.no_effect_value).abs() < 1e-12 {
+            0.0
+        } else {
+            (value - parameter.no_effect_value) / (end - parameter.no_effect_value)
+        }
+    };
+    values[..parameter.count].iter().map(of).fold(0.0, f64::max)
+}
+
+/// The model with an effect of these values on every one of `joints`, or of the whole.
+pub fn with_effect(model: &ModelFile, effect: &'static Effect, values: &[f64]) -> Result<ModelFile, EntryError> {
+    let mut file = model.clone();
+    // One entry a joint: where an effect replaces, the narrowest counts.
+    let scopes: Vec<Scope> = match effect.target {
+        Target::Joints => Joint::ALL.map(Scope::Joint).to_vec(),
+        Target::Supply => vec![Scope::All],
+        Target::Bodies | Target::Base => vec![Scope::Base],
+        Target::Ground => vec![Scope::Ground],
+    };
+    for scope in scopes {
+        if effect.composition == Composition::Replace {
+            file.effects.retain(|entry| entry.effect != effect || entry.scope != scope);
+        }
+        file.effects.push(EffectEntry::new(effect, scope, values.to_vec())?);
+    }
+    Ok(file)
+}
+
+/// Values to try, from small to large, of effects on joints and on the supply.
+pub fn grid(effect: &Effect) -> Vec<Vec<f64>> {
+    let main = &effect.parameters[0];
+    let [low, high] = main.prior_range;
+    let mut firsts = Vec::new();
+    for share in SHARES {
+        if main.no_effect_value.is_infinite() {
+            firsts.push(low / share);
+            continue;
+        }
+        for end in [low, high] {
+            if (end - main.no_effect_value).abs() > 1e-9 {
+                firsts.push(main.no_effect_value + share * (end - main.no_effect_value));
+            }
+        }
+    }
+    let seconds: &[&[f64]] = match effect.name {
+        "stribeck_friction" => &[&[0.15], &[0.6], &[2.0]],
+        "joint_spring" => &[&[-1.2], &[0.0], &[1.2]],
+        "thermal_derating" => &[&[35.0]],
+        "torque_ripple" => return ripples(),
+        _ => &[&[]],
+    };
+    let [least, most] = main.bounds;
+    let firsts = firsts.into_iter().map(|first| first.clamp(least, most));
+    firsts.flat_map(|first| seconds.iter().map(move |second| [&[first][..], second].concat())).collect()
+}
+
+/// Values to try of an effect on one scope, from small to large. Delays and lags with which a loop rings stay in step only
+/// where they are nearly right: of those there are more.
+pub fn fine_grid(effect: &Effect) -> Vec<Vec<f64>> {
+    let coarse = match effect.target {
+        Target::Joints | Target::Supply if effect.name != "encoder_offset" => grid(effect),
+        _ => return body_grid(effect),
+    };
+    if !["command_delay", "torque_delay", "drive_lag"].contains(&effect.name) {
+        return coarse;
+    }
+    coarse.iter().flat_map(|values| [0.8, 1.0, 1.25].map(|factor| vec![factor * values[0]])).collect()
+}
+
+/// Values to try of an effect that is judged by the whole log; each component of a vector alone.
+pub fn body_grid(effect: &Effect) -> Vec<Vec<f64>> {
+    match effect.name {
+        "payload" => [-0.5, 0.3, 0.8, 2.0].map(|mass| vec![mass, 0.0, 0.0, 0.0]).to_vec(),
+        "com_shift" | "gyro_bias" => {
+            let along = |axis: usize| {
+                [-0.5, -0.15, 0.15, 0.5].map(|share| {
+                    let size = share * effect.parameters[0].prior_range[1];
+                    (0..3).map(|one| if one == axis { size } else { 0.0 }).collect()
+                })
+            };
+            (0..3).flat_map(along).collect()
+        }
+        "encoder_offset" => [-0.02, 0.02].map(|offset| vec![offset]).to_vec(),
+        "ground_friction" => [0.3, 0.5, 0.65, 1.1].map(|friction| vec![friction]).to_vec(),
+        "ground_stiffness" => [0.005, 0.01, 0.02, 0.04].map(|time| vec![time]).to_vec(),
+        _ => Vec::new(),
+    }
+}
+
+/// Ripples of one size, every third number of cycles and four phases. Joints move within half a radian of their middle, where
+/// two numbers next but one to each other are half a radian out of step at most, which a descent mends.
+fn ripples() -> Vec<Vec<f64>> {
+    let phases = [0.0, 0.5, 1.0, -0.5].map(|turn| turn * std::f64::consts::PI);
+    (7..=150).step_by(3).flat_map(|cycles| phases.map(|phase| vec![0.12, f64::from(cycles), phase])).collect()
+}
+
+/// What having chosen among all scopes of its kind costs [nats].
+pub fn selection_penalty(scope: Scope) -> f64 {
+    let kinds: f64 = match scope {
+        Scope::Kind(_) => 3.0,
+        Scope::Leg(_) => 4.0,
+        Scope::Left | Scope::Right => 2.0,
+        Scope::Joint(_) => 12.0,
+        Scope::All | Scope::Base | Scope::Ground => 1.0,
+    };
+    kinds.ln()
+}

@@ -1,0 +1,167 @@
+//! What is found, as people read it.
+
+use std::collections::BTreeMap;
+
+use nalgebra::DMatrix;
+use twinstep_effects::ModelFile;
+
+use super::residual_data::ResidualData;
+use super::hypothesis::Hypothesis;
+use super::cross_validation::{FitProblem, CandidateFit};
+use crate::findings::{CorrelatedPair, RmsErrors, Estimate, AlternativeCause, ParameterValue};
+use twinstep_identify::experiment::ResidualChannel;
+use twinstep_identify::parameter::set_intervals;
+
+/// Correlations of this size and above are named.
+const CORRELATED: f64 = 0.9;
+/// How far two simulators of one law are apart in its size, relative: a standard deviation. Measured on hunts of development,
+/// where errors of one or two percent in limits of speed, delays and gains were outside of narrower intervals.
+pub const SIMULATOR_MISMATCH_REL_STD: f64 = 0.015;
+/// The normal distribution's two-sided 95 %.
+pub const TWO_SIDED_95: f64 = 1.96;
+
+/// The model of a fit with intervals, and what cannot be told apart; `least` is the deviation that no number is better than,
+/// and `near` are the ends of what is about as good, by unknown.
+pub fn with_intervals(
+    fit: &FitProblem,
+    covariance: Option<&DMatrix<f64>>,
+    min_std: f64,
+    near: &[[f64; 2]],
+) -> (ModelFile, Vec<CorrelatedPair>) {
+    let mut model = fit.model(&fit.initial_point);
+    let deviation = |index: usize| covariance.map_or(1.0, |covariance| covariance[(index, index)].sqrt().max(min_std));
+    let intervals: Vec<Option<[f64; 2]>> = fit
+        .unknowns
+        .iter()
+        .enumerate()
+        .map(|(index, unknown)| {
+            let size = (fit.initial_point[index] - unknown.coordinate(unknown.neutral)).abs();
+            let half = TWO_SIDED_95 * (deviation(index) * unknown.prior[1]).max(SIMULATOR_MISMATCH_REL_STD * size);
+            let [low, high] = near[index];
+            let ends =
+                [low.min(fit.initial_point[index] - half), high.max(fit.initial_point[index] + half)].map(|end| unknown.value(end));
+            Some([ends[0].min(ends[1]), ends[0].max(ends[1])])
+        })
+        .collect();
+    set_intervals(&mut model, &fit.unknowns, &intervals);
+    let mut confusable = Vec::new();
+    for (i, one) in fit.unknowns.iter().enumerate() {
+        for (j, other) in fit.unknowns.iter().enumerate().take(i) {
+            let correlation = covariance.map_or(0.0, |covariance| covariance[(i, j)] / (deviation(i) * deviation(j)));
+            if correlation.abs() >= CORRELATED && one.effect != other.effect {
+                let told = |from: &'static twinstep_effects::Effect, to: &str| {
+                    from.confounders.iter().find(|confusion| confusion.effect == to).map(|confusion| confusion.discriminating_experiment)
+                };
+                let experiment = told(one.effect, other.effect.name).or(told(other.effect, one.effect.name));
+                confusable.push(CorrelatedPair {
+                    effects: [other.effect.name.to_owned(), one.effect.name.to_owned()],
+                    correlation,
+                    experiment: experiment.unwrap_or("Another motion, with other speeds and loads.").to_owned(),
+                });
+            }
+        }
+    }
+    (model, confusable)
+}
+
+/// The values of a cause with the intervals of its entry in the extended model.
+pub fn estimates(hypothesis: &Hypothesis, extended: &ModelFile) -> BTreeMap<String, Estimate> {
+    let mut entries = extended.effects.iter().rev();
+    let entry = entries.find(|entry| entry.effect == hypothesis.effect && entry.scope == hypothesis.scope);
+    let mut estimates = BTreeMap::new();
+    let mut place = 0;
+    for parameter in hypothesis.effect.parameters {
+        let range = place..place + parameter.count;
+        place += parameter.count;
+        let end = |side: usize| -> Vec<f64> {
+            range
+                .clone()
+                .map(|index| {
+                    let interval = entry.and_then(|entry| entry.intervals[index]);
+                    interval.map_or(hypothesis.values[index], |interval| interval[side])
+                })
+                .collect()
+        };
+        let value =
+            |values: Vec<f64>| if parameter.count == 1 { ParameterValue::Number(values[0]) } else { ParameterValue::Vector(values) };
+        let estimate = Estimate {
+            value: value(hypothesis.values[range.clone()].to_vec()),
+            low: value(end(0)),
+            high: value(end(1)),
+        };
+        estimates.insert(parameter.name.to_owned(), estimate);
+    }
+    estimates
+}
+
+/// A trial as a rival.
+pub fn rival(trial: &CandidateFit) -> AlternativeCause {
+    AlternativeCause {
+        effect: trial.hypothesis.effect.name.to_owned(),
+        scope: trial.hypothesis.scope.to_string(),
+        held_out_gain: trial.gain,
+    }
+}
+
+/// Why, in a sentence.
+pub fn explanation(best: &CandidateFit, others: &[CandidateFit]) -> String {
+    let hypothesis = &best.hypothesis;
+    let size = hypothesis.effect.parameters.iter().zip(&hypothesis.values).next();
+    let size = size.map_or(String::new(), |(parameter, value)| format!(" of {value:.4} {}", parameter.unit));
+    let mut text = format!(
+        "{} at {}{}: on seconds that it was not fitted to it takes {:.0} % off the error where it acts.",
+        hypothesis.effect.name.replace('_', " "),
+        hypothesis.scope,
+        size.trim_end(),
+        100.0 * best.gain
+    );
+    if let Some(other) = others.first() {
+        let behind = best.score - other.score;
+        text = format!("{text} Next best is {}, {behind:.0} nats behind.", other.hypothesis.name());
+    }
+    text + " " + hypothesis.effect.signature
+}
+
+/// What the sensors alone would leave.
+pub fn noise_floor(evidence: &ResidualData) -> RmsErrors {
+    let experiments = &evidence.fit_rows.experiments;
+    let sigmas = experiments.iter().flat_map(|experiment| {
+        experiment.joints().iter().map(|joint| experiment.sigma(ResidualChannel::Position(joint.index())))
+    });
+    let squares: Vec<f64> = sigmas.map(|sigma| sigma * sigma).collect();
+    let has_torque =
+        evidence.logs().iter().any(|log| log.joints().iter().any(|joint| log.tau_measured(joint).is_some()));
+    let torques: Vec<f64> = evidence
+        .logs()
+        .iter()
+        .flat_map(|log| {
+            log.joints().iter().map(|joint| log.noise(&format!("tau_measured_{joint}")).unwrap_or(0.2).powi(2))
+        })
+        .collect();
+    let mean = |squares: &[f64]| (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt();
+    RmsErrors { torque_rmse_nm: has_torque.then(|| mean(&torques)), q_rmse_rad: Some(mean(&squares)) }
+}
+
+#[cfg(test)]
+mod tests {
+    use twinstep_effects::{Effect, Scope};
+
+    use super::*;
+
+    #[test]
+    fn interval_holds_what_is_as_good_and_what_another_simulator_would_say() {
+        let effect = Effect::named("torque_gain").expect("an effect of the catalogue");
+        let hypothesis = Hypothesis { effect, scope: Scope::All, values: vec![0.8] };
+        let fit = FitProblem::new(&ModelFile::default(), &[hypothesis]).expect("a fit");
+        let known = DMatrix::from_element(1, 1, 1e-12);
+        let interval = |near: [f64; 2]| {
+            let (model, _) = with_intervals(&fit, Some(&known), 0.0, &[near]);
+            model.effects[0].intervals[0].expect("an interval")
+        };
+        let [low, high] = interval([0.8, 0.8]);
+        // 1.96 times 1.5 % of the way from 1, which changes nothing.
+        assert!((low - 0.79412).abs() < 1e-6 && (high - 0.80588).abs() < 1e-6, "{low} to {high}");
+        let [low, high] = interval([0.7, 0.8]);
+        assert!(low == 0.7 && (high - 0.80588).abs() < 1e-6, "{low} to {high}");
+    }
+}

@@ -1,0 +1,196 @@
+//! The scan: every effect on every joint at once, a few simulations an effect. With the trunk held joints hardly disturb
+//! each other, so that one simulation judges all twelve, and any scope is a sum over its joints. Effects on the trunk, the
+//! ground and the gyroscope are judged by the whole log.
+
+use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Scope, Target};
+use twinstep_model::{Joint, RobotModel, Rollout};
+use twinstep_effects::ModelFile;
+
+use super::residual_data::ResidualData;
+use super::hypothesis::{Hypothesis, selection_penalty, grid, fine_grid, body_grid, with_effect};
+use super::residual_power::{CHANNELS, ResidualPower, TORQUE};
+
+/// Scopes of one effect that go on.
+const OF_ONE_EFFECT: usize = 2;
+
+/// A hypothesis with its evidence on held-out blocks [nats].
+#[derive(Clone, Debug)]
+pub struct ScoredHypothesis {
+    /// The hypothesis, with the best of the values that were tried.
+    pub hypothesis: Hypothesis,
+    /// Evidence, less the price of choosing.
+    pub score: f64,
+}
+
+/// Effects that one simulation of all joints can judge, the best first.
+pub fn scan(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<ScoredHypothesis> {
+    let Ok(robot) = model.robot_model() else { return Vec::new() };
+    let before = evidence.residual_powers(simulator, std::slice::from_ref(&robot), true).remove(0);
+    let effects = CATALOGUE.into_iter().filter(|effect| matches!(effect.target, Target::Joints | Target::Supply));
+    let mut scored: Vec<ScoredHypothesis> =
+        effects.flat_map(|effect| scan_effect(evidence, model, effect, &before, simulator)).collect();
+    if evidence.has_free_parts() {
+        scored.extend(scan_whole(evidence, model, &robot, simulator));
+    }
+    scored.sort_by(|one, other| other.score.total_cmp(&one.score));
+    scored
+}
+
+fn scan_effect(
+    evidence: &ResidualData,
+    model: &ModelFile,
+    effect: &'static Effect,
+    before: &ResidualPower,
+    simulator: &mut dyn Rollout,
+) -> Vec<ScoredHypothesis> {
+    let built = |values: Vec<f64>| -> Option<(Vec<f64>, RobotModel)> {
+        let robot = with_effect(model, effect, &values).ok()?.robot_model().ok()?;
+        Some((values, robot))
+    };
+    let (values, robots): (Vec<_>, Vec<_>) = grid(effect).into_iter().filter_map(built).unzip();
+    let gains: Vec<_> =
+        evidence.residual_powers(simulator, &robots, true).iter().map(|now| joint_gains(evidence, now, before)).collect();
+    let scopes = if effect.target == Target::Supply { vec![Scope::All] } else { Scope::of_joints() };
+    let mut scored: Vec<ScoredHypothesis> = scopes
+        .into_iter()
+        .filter_map(|scope| {
+            let of = |size: usize, fold: usize| -> f64 {
+                Joint::ALL
+                    .iter()
+                    .filter(|joint| scope.contains(**joint))
+                    .map(|joint| gains[size][joint.index()][fold])
+                    .sum()
+            };
+            let best =
+                |of: &dyn Fn(usize) -> f64| (0..values.len()).max_by(|one, other| of(*one).total_cmp(&of(*other)));
+            // Chosen on one fold, judged on the other.
+            let judged = of(best(&|size| of(size, 0))?, 1) + of(best(&|size| of(size, 1))?, 0);
+            let whole = best(&|size| of(size, 0) + of(size, 1))?;
+            let hypothesis = Hypothesis { effect, scope, values: values[whole].clone() };
+            Some(ScoredHypothesis { hypothesis, score: judged - selection_penalty(scope) })
+        })
+        .collect();
+    scored.sort_by(|one, other| other.score.total_cmp(&one.score));
+    scored.truncate(OF_ONE_EFFECT);
+    scored
+}
+
+/// What `best` is taken for, and what is taken for it, on its scope, each with the best of its values; none of `tried`.
+pub fn confounders_of(
+    evidence: &ResidualData,
+    model: &ModelFile,
+    best: &Hypothesis,
+    tried: &[String],
+    before: &ResidualPower,
+    simulator: &mut dyn Rollout,
+) -> Vec<Hypothesis> {
+    let confused = |one: &Effect, other: &Effect| one.confounders.iter().any(|confusion| confusion.effect == other.name);
+    let is_new = |effect: &Effect| !tried.contains(&format!("{}@{}", effect.name, best.scope));
+    let effects = CATALOGUE.into_iter().filter(|effect| {
+        let alike = confused(effect, best.effect) || confused(best.effect, effect);
+        alike && effect.target == best.effect.target && is_new(effect)
+    });
+    let first = |effect: &'static Effect| {
+        let at = fine_grid(effect);
+        Some(Hypothesis {
+            effect,
+            scope: best.scope,
+            values: best_values(evidence, model, effect, best.scope, at, before, simulator)?,
+        })
+    };
+    effects.filter_map(first).collect()
+}
+
+/// Delays and lags with which a loop rings are in step only where they are nearly right, and no slope leads there from afar:
+/// of those the best of many values, and of ever closer ones around it.
+pub fn refine_delay_grid(
+    evidence: &ResidualData,
+    model: &ModelFile,
+    hypothesis: Hypothesis,
+    before: &ResidualPower,
+    simulator: &mut dyn Rollout,
+) -> Hypothesis {
+    let Hypothesis { effect, scope, mut values } = hypothesis;
+    if !["command_delay", "torque_delay", "drive_lag"].contains(&effect.name) {
+        return Hypothesis { effect, scope, values };
+    }
+    let [least, most] = effect.parameters[0].bounds;
+    let mut tried = fine_grid(effect);
+    tried.push(values.clone());
+    for around in [[0.88, 0.94, 1.06, 1.12], [0.97, 0.985, 1.015, 1.03]] {
+        let Some(best) = best_values(evidence, model, effect, scope, tried, before, simulator) else { break };
+        values = best;
+        let near = around.map(|factor| vec![(factor * values[0]).clamp(least, most)]);
+        tried = near.into_iter().chain([values.clone()]).collect();
+    }
+    Hypothesis { effect, scope, values }
+}
+
+/// The values that leave least of the whole logs.
+fn best_values(
+    evidence: &ResidualData,
+    model: &ModelFile,
+    effect: &'static Effect,
+    scope: Scope,
+    values: Vec<Vec<f64>>,
+    before: &ResidualPower,
+    simulator: &mut dyn Rollout,
+) -> Option<Vec<f64>> {
+    let built = |values: Vec<f64>| {
+        let mut file = model.clone();
+        file.effects.push(EffectEntry::new(effect, scope, values.clone()).ok()?);
+        Some((values, file.robot_model().ok()?))
+    };
+    let (values, robots): (Vec<_>, Vec<_>) = values.into_iter().filter_map(built).unzip();
+    let scores = evidence.residual_powers(simulator, &robots, false).into_iter().map(|now| log_likelihood_gain(evidence, &now, before));
+    scores.zip(values).max_by(|one, other| one.0.total_cmp(&other.0)).map(|(_, values)| values)
+}
+
+/// Evidence of everything [nats].
+pub fn log_likelihood_gain(evidence: &ResidualData, now: &ResidualPower, before: &ResidualPower) -> f64 {
+    let of = |channel: usize| {
+        [0, 1].map(|fold| now.log_likelihood_gain(before, channel, fold, evidence.correlation_rows(channel))).iter().sum::<f64>()
+    };
+    (0..CHANNELS).map(of).sum::<f64>() + now.tolerated_gain(before)
+}
+
+/// Effects that are not of joints, and offsets of encoders: with the trunk held nothing shows of those but gravity.
+fn body_effects() -> Vec<(&'static Effect, Scope)> {
+    let named = |name: &str| Effect::named(name).expect("an effect of the catalogue");
+    let whole = ["payload", "com_shift", "gyro_bias"].map(|name| (named(name), Scope::Base));
+    let ground = ["ground_friction", "ground_stiffness"].map(|name| (named(name), Scope::Ground));
+    let offsets = Scope::of_joints().into_iter().map(|scope| (named("encoder_offset"), scope));
+    whole.into_iter().chain(ground).chain(offsets).collect()
+}
+
+/// Judges [`of_the_whole`].
+fn scan_whole(evidence: &ResidualData, model: &ModelFile, robot: &RobotModel, simulator: &mut dyn Rollout) -> Vec<ScoredHypothesis> {
+    let before = evidence.leftover(simulator, robot);
+    let mut scored = Vec::new();
+    for (effect, scope) in body_effects() {
+        let built = |values: Vec<f64>| {
+            let mut file = model.clone();
+            file.effects.push(EffectEntry::new(effect, scope, values.clone()).ok()?);
+            Some((values, file.robot_model().ok()?))
+        };
+        let (values, robots): (Vec<_>, Vec<_>) = body_grid(effect).into_iter().filter_map(built).unzip();
+        let gains = evidence.residual_powers(simulator, &robots, false).into_iter().map(|now| log_likelihood_gain(evidence, &now, &before));
+        let best = gains.zip(values).max_by(|one, other| one.0.total_cmp(&other.0));
+        scored.extend(best.map(|(score, values)| ScoredHypothesis {
+            hypothesis: Hypothesis { effect, scope, values },
+            score: score - selection_penalty(scope),
+        }));
+    }
+    scored
+}
+
+/// Evidence by joint and fold, from its position and its torque [nats].
+fn joint_gains(evidence: &ResidualData, now: &ResidualPower, before: &ResidualPower) -> Vec<[f64; 2]> {
+    let of = |joint: usize, fold: usize| {
+        [joint, TORQUE + joint]
+            .map(|channel| now.log_likelihood_gain(before, channel, fold, evidence.correlation_rows(channel)))
+            .iter()
+            .sum::<f64>()
+    };
+    (0..twinstep_model::NUM_JOINTS).map(|joint| [of(joint, 0), of(joint, 1)]).collect()
+}

@@ -1,0 +1,354 @@
+//! Diagnosis of the actuators of any joints, whatever their names and number: by their torques alone, from `q`, `q_cmd`, gains
+//! and measured torque. No body is simulated, and none has to be known.
+//!
+//! The rules are those of the whole diagnosis: a cause is fitted to one fold of seconds and judged on the other, and is named
+//! if its evidence is above the threshold, it explains a good part of what is above the noise, and it is large enough.
+
+use twinstep_logs::Log;
+use twinstep_model::RobotModel;
+use twinstep_effects::{CATALOGUE, EffectEntry, Parameter, Scope, Target};
+
+use super::forward_selection::{MIN_EXPLAINED_FRACTION, MAX_REMAINING_FRACTION, THRESHOLD, NEGLIGIBLE_EXCESS};
+use super::hypothesis::{Hypothesis, selection_penalty, grid};
+use super::residual_power::{ResidualPower, TORQUE};
+use super::joint_slots::JointSlots;
+use super::torque_fit::{TorqueCandidate, TorqueFit};
+use super::unexplained::{self, LEAST_EXCESS};
+use super::{AMBIGUITY_NATS, AMBIGUITY_FRACTION, DiagnoseError, DiagnoseProgress};
+use crate::findings::{Cause, Diagnosis, RmsErrors, Estimate, AlternativeCause, Unexplained, ParameterValue};
+use twinstep_identify::experiment::ExperimentError;
+
+/// Joints that are looked at together, as many as the Go2 has seats.
+const TOGETHER: usize = twinstep_model::NUM_JOINTS;
+/// Hypotheses that are fitted, of those that a first look at a few sizes found.
+const TRIED: usize = 4;
+/// Most causes, of as many joints.
+const MOST_CAUSES: usize = 12;
+
+/// Names what ideal actuators get wrong in the torques of `logs`, of one robot with joints of any names.
+pub fn diagnose_torques(logs: &[Log], progress: &mut DiagnoseProgress) -> Result<Diagnosis, DiagnoseError> {
+    let mut all = Vec::new();
+    for names in logs[0].joints().chunks(TOGETHER) {
+        let seats = JointSlots::new(logs, names).map_err(ExperimentError::from)?;
+        let mut search = TorqueForwardSelection { seats: &seats, causes: Vec::new(), progress: &mut *progress };
+        search.run()?;
+        let causes = std::mem::take(&mut search.causes);
+        all.push(JointGroupResult::new(&seats, &causes, &logs[0]));
+    }
+    let sums = |of: fn(&JointGroupResult) -> [f64; 3]| {
+        let sum = |index: usize| all.iter().map(|part| of(part)[index]).sum::<f64>();
+        let rmse = |squares: f64| RmsErrors { torque_rmse_nm: Some((squares / sum(2).max(1.0)).sqrt()), q_rmse_rad: None };
+        [rmse(sum(0)), rmse(sum(1))]
+    };
+    let ([baseline, noise_floor], [extended, _]) = (sums(|part| part.before), sums(|part| part.after));
+    let unexplained = all.iter().map(|part| part.unexplained.clone());
+    Ok(Diagnosis {
+        baseline,
+        extended,
+        noise_floor,
+        unexplained: unexplained.max_by(|one, other| one.fraction.total_cmp(&other.fraction)).unwrap_or_default(),
+        findings: all.into_iter().flat_map(|part| part.causes).collect(),
+        confusable: Vec::new(),
+        next_experiment: None,
+        extended_model: String::new(),
+    })
+}
+
+/// What is said of some joints.
+struct JointGroupResult {
+    causes: Vec<Cause>,
+    before: [f64; 3],
+    after: [f64; 3],
+    unexplained: Unexplained,
+}
+
+impl JointGroupResult {
+    fn new(seats: &JointSlots, causes: &[TorqueCandidate], log: &Log) -> Self {
+        let entries: Vec<EffectEntry> = causes.iter().map(|cause| cause.entry.clone()).collect();
+        let [given, named] = [&[][..], &entries].map(|entries| seats.robot(entries).expect("entries that were fitted"));
+        let told = |index: usize| {
+            let others = entries.iter().enumerate().filter(|(other, _)| *other != index);
+            let others: Vec<EffectEntry> = others.map(|(_, entry)| entry.clone()).collect();
+            cause(seats, &causes[index], &others)
+        };
+        Self {
+            causes: (0..causes.len()).map(told).collect(),
+            before: seats.held_out_sums(&given),
+            after: seats.held_out_sums(&named),
+            unexplained: left(seats, [&given, &named], log),
+        }
+    }
+}
+
+/// The search for causes at some joints.
+struct TorqueForwardSelection<'a, 'b> {
+    seats: &'a JointSlots,
+    causes: Vec<TorqueCandidate>,
+    progress: &'a mut DiagnoseProgress<'b>,
+}
+
+impl TorqueForwardSelection<'_, '_> {
+    fn run(&mut self) -> Result<(), DiagnoseError> {
+        while self.causes.len() < MOST_CAUSES {
+            self.say()?;
+            let Some(next) = self.next() else { break };
+            self.causes.push(next);
+        }
+        // Each anew, beside those that were found after it.
+        for place in 0..self.causes.len() {
+            self.say()?;
+            let cause = self.causes.remove(place);
+            let others = self.entries();
+            let again = TorqueFit::new(self.seats, &others, &cause.entry);
+            let entry = again.map_or(cause.entry.clone(), |fit| fit.entry_at(&fit.coordinate_descent(&[0, 1])));
+            self.causes.insert(place, TorqueCandidate { entry, ..cause });
+        }
+        while let Some(place) = self.untenable() {
+            self.causes.remove(place);
+        }
+        Ok(())
+    }
+
+    fn say(&mut self) -> Result<(), DiagnoseError> {
+        let text = format!("torques of {} and others, {} named", self.seats.name(0), self.causes.len());
+        if (self.progress)(&text) { Ok(()) } else { Err(DiagnoseError::Interrupted) }
+    }
+
+    fn entries(&self) -> Vec<EffectEntry> {
+        self.causes.iter().map(|cause| cause.entry.clone()).collect()
+    }
+
+    /// The best cause on top of those that are named, if one earns a name.
+    fn next(&self) -> Option<TorqueCandidate> {
+        let entries = self.entries();
+        let named =
+            |entry: &EffectEntry| entries.iter().any(|other| other.effect == entry.effect && other.scope == entry.scope);
+        let tried = self.candidates(&entries)?.into_iter().filter(|entry| !named(entry)).take(TRIED);
+        let mut found: Vec<TorqueCandidate> =
+            tried.filter_map(|entry| TorqueFit::new(self.seats, &entries, &entry)?.cross_validated()).collect();
+        found.sort_by(|one, other| other.score.total_cmp(&one.score));
+        let earns = |found: &TorqueCandidate| {
+            found.score >= THRESHOLD && found.explains >= MIN_EXPLAINED_FRACTION && hypothesis(&found.entry).exceeds_min_size()
+        };
+        let place = found.iter().position(earns)?;
+        let best = found.remove(place);
+        Some(TorqueCandidate { others: found, ..best })
+    }
+
+    /// Every effect that torques show, on all joints and on each, with the best of a few sizes; the best first.
+    fn candidates(&self, entries: &[EffectEntry]) -> Option<Vec<EffectEntry>> {
+        let now = self.seats.robot(entries)?;
+        let before = self.seats.leftovers(std::slice::from_ref(&now)).remove(0);
+        let mut scored = Vec::new();
+        for effect in CATALOGUE.into_iter().filter(|effect| effect.target == Target::Joints) {
+            let with = |values: Vec<f64>| {
+                let entry = EffectEntry::new(effect, Scope::All, values.clone()).ok()?;
+                Some((values, self.seats.robot(&[entries, &[entry]].concat())?))
+            };
+            let (values, robots): (Vec<_>, Vec<_>) = grid(effect).into_iter().filter_map(with).unzip();
+            if !robots.iter().any(|robot| self.seats.affects_torque(robot, &now)) {
+                continue;
+            }
+            let left = self.seats.leftovers(&robots);
+            for scope in self.seats.scopes() {
+                let of = |size: usize, fold: usize| nats(self.seats, scope, &left[size], &before, &[fold]);
+                let best = |of: &dyn Fn(usize) -> f64| (0..values.len()).max_by(|a, b| of(*a).total_cmp(&of(*b)));
+                // Chosen on one fold, judged on the other.
+                let judged = of(best(&|size| of(size, 0))?, 1) + of(best(&|size| of(size, 1))?, 0) - selection_penalty(scope);
+                let whole = best(&|size| of(size, 0) + of(size, 1))?;
+                scored.push((judged, EffectEntry::new(effect, scope, values[whole].clone()).ok()?));
+            }
+        }
+        scored.retain(|(score, _)| *score > 0.0);
+        scored.sort_by(|(one, _), (other, _)| other.total_cmp(one));
+        Some(scored.into_iter().map(|(_, entry)| entry).collect())
+    }
+
+    /// A cause that is too small, more than any actuator has, or leaves half of what was wrong at its own joints.
+    fn untenable(&self) -> Option<usize> {
+        let (given, named) = (self.seats.robot(&[])?, self.seats.robot(&self.entries())?);
+        let left = self.seats.leftovers(&[given, named]);
+        let stands = |cause: &TorqueCandidate| {
+            let excess = |left: &ResidualPower| excess(self.seats, cause.entry.scope, left);
+            let rows: f64 = self.seats.of(cause.entry.scope).flat_map(|seat| left[1].counts[TORQUE + seat]).sum();
+            let one = hypothesis(&cause.entry);
+            let explains = excess(&left[1]) <= NEGLIGIBLE_EXCESS * rows || excess(&left[1]) <= MAX_REMAINING_FRACTION * excess(&left[0]);
+            one.exceeds_min_size() && one.is_plausible() && explains
+        };
+        self.causes.iter().position(|cause| !stands(cause))
+    }
+}
+
+/// Evidence for what leaves `now` against what leaves `before` on a scope [nats].
+pub fn nats(seats: &JointSlots, scope: Scope, now: &ResidualPower, before: &ResidualPower, folds: &[usize]) -> f64 {
+    let rows = seats.rows_in_one();
+    let of = |seat: usize| folds.iter().map(|fold| now.log_likelihood_gain(before, TORQUE + seat, *fold, rows)).sum::<f64>();
+    seats.of(scope).map(of).sum()
+}
+
+/// Power above the noise on a scope.
+pub fn excess(seats: &JointSlots, scope: Scope, left: &ResidualPower) -> f64 {
+    seats.of(scope).map(|seat| left.channel_excess(TORQUE + seat)).sum()
+}
+
+fn hypothesis(entry: &EffectEntry) -> Hypothesis {
+    Hypothesis { effect: entry.effect, scope: entry.scope, values: entry.values.clone() }
+}
+
+/// As people read it, in the joints' own names and units.
+fn cause(seats: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) -> Cause {
+    let (effect, scope) = (found.entry.effect, seats.scope_name(found.entry.scope));
+    let fit = TorqueFit::new(seats, others, &found.entry).expect("it was fitted before");
+    let numbers = effect.parameters.iter().zip(&found.entry.values).zip(fit.intervals());
+    let told = |((parameter, value), [low, high]): ((&Parameter, &f64), [f64; 2])| {
+        // Torques in the seats are in units of their own.
+        let unit = if parameter.unit.contains("N·m") || parameter.unit == "kg·m²" { seats.torque_scale } else { 1.0 };
+        let [value, low, high] = [*value, low, high].map(|number| ParameterValue::Number(unit * number));
+        (parameter.name.to_owned(), Estimate { value, low, high })
+    };
+    let name = |entry: &EffectEntry| format!("{}@{}", entry.effect.name, seats.scope_name(entry.scope));
+    let close = |other: &&TorqueCandidate| other.score > found.score - AMBIGUITY_NATS.max(AMBIGUITY_FRACTION * found.score);
+    let rival = |other: &TorqueCandidate| AlternativeCause {
+        effect: other.entry.effect.name.to_owned(),
+        scope: seats.scope_name(other.entry.scope),
+        held_out_gain: other.gain,
+    };
+    let mut evidence = format!(
+        "{} at {scope}: on seconds that it was not fitted to it takes {:.0} % off the error of the torque.",
+        effect.name.replace('_', " "),
+        100.0 * found.gain
+    );
+    if let Some(other) = found.others.first() {
+        let behind = found.score - other.score;
+        evidence = format!("{evidence} Next best is {}, {behind:.0} nats behind.", name(&other.entry));
+    }
+    Cause {
+        effect: effect.name.to_owned(),
+        parameters: numbers.map(told).collect(),
+        held_out_gain: found.gain,
+        score_nats: found.score,
+        threshold_nats: THRESHOLD,
+        ambiguous_with: found.others.iter().filter(close).map(|other| name(&other.entry)).collect(),
+        rivals: found.others.iter().map(rival).collect(),
+        evidence: format!("{evidence} {}", effect.signature),
+        scope,
+    }
+}
+
+/// What is left where it is most, and what that depends on.
+fn left(seats: &JointSlots, [given, named]: [&RobotModel; 2], log: &Log) -> Unexplained {
+    let left = seats.leftovers(&[given.clone(), named.clone()]);
+    let [before, after] = [&left[0], &left[1]].map(|left| excess(seats, Scope::All, left));
+    let share = |seat: usize| {
+        let rows: f64 = left[1].counts[TORQUE + seat].iter().sum();
+        left[1].channel_excess(TORQUE + seat) / rows.max(1.0)
+    };
+    let worst = seats.of(Scope::All).max_by(|one, other| share(*one).total_cmp(&share(*other)));
+    let Some(seat) = worst.filter(|seat| share(*seat) > LEAST_EXCESS) else { return unexplained::only_noise() };
+    let fraction = if before > 0.0 { (after / before).min(1.0) } else { 0.0 };
+    let whose = format!("The torque of {}", seats.name(seat));
+    unexplained::describe_residual(log, &seats.residual(named, seat), unexplained::measured(log), fraction, &whose)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::RngExt;
+    use twinstep_model::BaseMount;
+    use twinstep_logs::{Meta, Segment, TorqueSensor};
+    use twinstep_model::{standard_normal, stream};
+
+    use super::*;
+
+    const RATE_HZ: f64 = 500.0;
+    const ROWS: usize = 5_000;
+    const NOISE_NM: f64 = 0.5;
+
+    /// Fourteen joints of an arm, 60 N·m strong, in waves, whose actuators do as they are told but for a torque of `row` by
+    /// `made`, from the torque that is wanted in each row.
+    fn log(made: impl Fn(usize, &[f64], usize) -> f64) -> Log {
+        let mut columns = vec![("t".to_owned(), (0..ROWS).map(|row| row as f64 / RATE_HZ).collect::<Vec<f64>>())];
+        for joint in 0..14 {
+            let mut random = stream(3, "arm", joint as u64);
+            let waves: Vec<[f64; 2]> =
+                (0..5).map(|_| [random.random_range(1.0..25.0), random.random_range(0.0..6.0)]).collect();
+            // From rest, within a second.
+            let at = |row: usize| row as f64 / RATE_HZ;
+            let grown = |t: f64| if t < 1.0 { [t * t * (3.0 - 2.0 * t), 6.0 * t * (1.0 - t)] } else { [1.0, 0.0] };
+            let sum =
+                |of: &dyn Fn(f64, f64) -> f64| 0.1 * waves.iter().map(|[rate, phase]| of(*rate, *phase)).sum::<f64>();
+            let motion = |row: usize| {
+                let (t, [size, growth]) = (at(row), grown(at(row)));
+                let wave = sum(&|rate, phase| (rate * t + phase).sin());
+                let slope = sum(&|rate, phase| rate * (rate * t + phase).cos());
+                [size * wave, growth * wave + size * slope]
+            };
+            let [q, dq] = [0, 1].map(|part| (0..ROWS).map(|row| motion(row)[part]).collect::<Vec<f64>>());
+            let q_cmd: Vec<f64> = (0..ROWS).map(|row| 1.3 * q[row] + 0.02 * dq[row]).collect();
+            let wanted: Vec<f64> = (0..ROWS).map(|row| 200.0 * (q_cmd[row] - q[row]) - 2.0 * dq[row]).collect();
+            let tau = (0..ROWS).map(|row| made(joint, &wanted, row) + NOISE_NM * standard_normal(&mut random));
+            let tau = tau.collect();
+            for (quantity, cells) in [("q", q), ("dq", dq), ("q_cmd", q_cmd), ("tau_measured", tau)] {
+                columns.push((format!("{quantity}_axis_{joint}"), cells));
+            }
+        }
+        columns.push(("kp".to_owned(), vec![200.0; ROWS]));
+        columns.push(("kd".to_owned(), vec![2.0; ROWS]));
+        let segments = vec![Segment { name: "bench".to_owned(), base: BaseMount::Fixed }];
+        let mut meta = Meta::new(RATE_HZ, TorqueSensor::JointOutput, segments);
+        let noise = [("q", 1e-5), ("dq", 1e-3), ("tau_measured", NOISE_NM)];
+        meta.noise = noise.map(|(quantity, sigma)| (quantity.to_owned(), sigma)).into();
+        Log::new(meta, columns).expect("a log")
+    }
+
+    fn diagnosis(log: Log) -> Diagnosis {
+        diagnose_torques(&[log], &mut |_| true).expect("a diagnosis")
+    }
+
+    #[test]
+    fn drives_that_do_as_they_are_told_get_no_name() {
+        let found = diagnosis(log(|_, wanted, row| wanted[row]));
+        assert!(found.findings.is_empty(), "{:#?}", found.findings);
+        assert_eq!(found.unexplained.fraction, 0.0);
+    }
+
+    #[test]
+    fn late_drive_and_weak_one_of_a_robot_of_fourteen_joints_are_named() {
+        let found = diagnosis(log(|joint, wanted, row| match joint {
+            3 => wanted[row.saturating_sub(4)],
+            13 => 0.85 * wanted[row],
+            _ => wanted[row],
+        }));
+        let names: Vec<_> = found.findings.iter().map(|cause| format!("{}@{}", cause.effect, cause.scope)).collect();
+        // A torque that comes late and one that is shown late are the same torque, until a body moves by it.
+        let late = ["torque_delay@axis_3", "torque_sensor_delay@axis_3"];
+        assert!(late.contains(&names[0].as_str()), "{names:?}");
+        assert!(late.contains(&found.findings[0].ambiguous_with[0].as_str()), "{:#?}", found.findings[0]);
+        assert_eq!(names[1..], ["torque_gain@axis_13"], "{:#?}", found.findings);
+        let within = |place: usize, name: &str, truth: f64| {
+            let told = &found.findings[place].parameters[name];
+            let [ParameterValue::Number(low), ParameterValue::Number(high)] = [&told.low, &told.high] else { return false };
+            (*low..=*high).contains(&truth)
+        };
+        assert!(within(0, "delay_s", 0.008) && within(1, "gain", 0.85), "{:#?}", found.findings);
+        assert!(found.extended.torque_rmse_nm < Some(1.1 * NOISE_NM), "{:?}", found.extended);
+    }
+
+    #[test]
+    fn cause_of_some_of_many_joints_says_which() {
+        let found = diagnosis(log(|joint, wanted, row| if joint >= 12 { 0.8 * wanted[row] } else { wanted[row] }));
+        let names: Vec<_> = found.findings.iter().map(|cause| format!("{}@{}", cause.effect, cause.scope)).collect();
+        assert_eq!(names, ["torque_gain@axis_12+axis_13"], "{:#?}", found.findings);
+    }
+
+    #[test]
+    fn what_a_joint_lacks_is_named() {
+        let whole = log(|_, wanted, row| wanted[row]);
+        let columns: Vec<(String, Vec<f64>)> = std::iter::once(("t".to_owned(), whole.t().to_vec()))
+            .chain(whole.channels().map(|(name, cells)| (name.to_owned(), cells.to_vec())))
+            .filter(|(name, _)| name != "tau_measured_axis_5")
+            .collect();
+        let log = Log::new(whole.meta().clone(), columns).expect("a log");
+        let error = diagnose_torques(&[log], &mut |_| true).expect_err("refused").to_string();
+        assert_eq!(error, "joint `axis_5` of the log has no `tau_measured`");
+    }
+}

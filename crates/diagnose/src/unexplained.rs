@@ -1,0 +1,170 @@
+//! What is left when all that is named is explained, and what it depends on.
+
+use twinstep_logs::Log;
+use twinstep_model::{JOINT_NAMES, RobotModel, Rollout};
+
+use super::residual_data::ResidualData;
+use super::residual_power::{ResidualPower, TORQUE, TRUNK};
+use super::spectral_line::spectral_line;
+use super::residual_rows::fold_of;
+use crate::findings::Unexplained;
+use twinstep_identify::experiment::ResidualChannel;
+use twinstep_identify::motion::{JointCommands, command, joint_commands};
+
+/// Bins of a variable that might explain a residual.
+const BINS: usize = 12;
+/// Share of a residual's power that a variable has to explain on held-out seconds.
+const MIN_R_SQUARED: f64 = 0.3;
+/// Power above the noise, in units of it, that is worth a word.
+pub const LEAST_EXCESS: f64 = 0.3;
+
+/// What `robot` leaves of what was `given`.
+pub fn unexplained(
+    evidence: &ResidualData,
+    robot: &RobotModel,
+    given: &ResidualPower,
+    left: &ResidualPower,
+    simulator: &mut dyn Rollout,
+) -> Unexplained {
+    let (before, after) = (given.power_above_noise(), left.power_above_noise());
+    let fraction = if before > 0.0 { (after / before).min(1.0) } else { 0.0 };
+    let count = |channel: usize| left.counts[channel].iter().sum::<f64>();
+    let worst = (0..TRUNK)
+        .filter(|channel| count(*channel) > 0.0)
+        .max_by(|one, other| {
+            let of = |channel: usize| left.channel_excess(channel) / count(channel);
+            of(*one).total_cmp(&of(*other))
+        })
+        .filter(|channel| left.channel_excess(*channel) > LEAST_EXCESS * count(*channel));
+    let Some(channel) = worst else { return only_noise() };
+    let log = &evidence.logs()[0];
+    let residual = residual(evidence, robot, channel, simulator);
+    let kind = if channel < TORQUE { "position" } else { "torque" };
+    let whose = format!("The {kind} of {}", JOINT_NAMES[channel % 12]);
+    describe_residual(log, &residual, variables(log, robot), fraction, &whose)
+}
+
+/// What a residual of a log depends on; `whose` it is begins the sentence.
+pub fn describe_residual(
+    log: &Log,
+    residual: &[f64],
+    variables: Vec<(String, Vec<f64>)>,
+    fraction: f64,
+    whose: &str,
+) -> Unexplained {
+    let mut found: Vec<(f64, String)> = variables
+        .into_iter()
+        .map(|(name, cells)| (binned_r_squared(log, residual, &cells), name))
+        .chain(line_of(log, residual).map(|(frequency, share)| (share, format!("a line at {frequency:.2} Hz"))))
+        .filter(|(share, _)| *share > MIN_R_SQUARED)
+        .collect();
+    found.sort_by(|one, other| other.0.total_cmp(&one.0));
+    found.truncate(3);
+    let told = found.first().map_or("it depends on none of the channels".to_owned(), |(share, variable)| {
+        format!("{:.0} % of it follows {variable}", 100.0 * share)
+    });
+    let text = format!("{whose} is off by more than noise and all that is named explain: {told}.");
+    Unexplained { fraction, depends_on: found.into_iter().map(|(_, name)| name).collect(), text }
+}
+
+/// Nothing is left.
+pub fn only_noise() -> Unexplained {
+    Unexplained { fraction: 0.0, depends_on: Vec::new(), text: "What is left is noise.".to_owned() }
+}
+
+/// What a log measured, and time.
+pub fn measured(log: &Log) -> Vec<(String, Vec<f64>)> {
+    let starts = ["q_", "dq_", "tau_measured_", "battery_V", "temp_"];
+    let measured = log.channels().filter(|(name, _)| starts.iter().any(|start| name.starts_with(start)));
+    let mut all: Vec<(String, Vec<f64>)> = measured.map(|(name, cells)| (name.to_owned(), cells.to_vec())).collect();
+    all.push(("t".to_owned(), log.t().to_vec()));
+    all
+}
+
+/// The strongest line of a residual, and the share that it explains.
+fn line_of(log: &Log, residual: &[f64]) -> Option<(f64, f64)> {
+    let rows = (0..residual.len()).filter(|row| residual[*row].is_finite());
+    let rows: Vec<(usize, usize)> = rows.filter_map(|row| Some((row, fold_of(log, row)?))).collect();
+    let t: Vec<f64> = rows.iter().map(|(row, _)| log.t()[*row]).collect();
+    let values: Vec<f64> = rows.iter().map(|(row, _)| residual[*row]).collect();
+    let folds: Vec<usize> = rows.iter().map(|(_, fold)| *fold).collect();
+    spectral_line(&t, &values, &folds)
+}
+
+/// The residual of a joint's position or torque, by row of the first log; not a number where there is none.
+fn residual(evidence: &ResidualData, robot: &RobotModel, channel: usize, simulator: &mut dyn Rollout) -> Vec<f64> {
+    let log = &evidence.logs()[0];
+    let mut residual = vec![f64::NAN; log.rows()];
+    if channel >= TORQUE {
+        let each = |joint: usize, row: usize, difference: f64| {
+            if TORQUE + joint == channel {
+                residual[row] = difference;
+            }
+        };
+        evidence.torques().differences(robot, each);
+    } else {
+        let corrected = evidence.fit_rows.nuisance_corrected(simulator, robot);
+        for (corrected, (quantity, row)) in corrected.into_iter().zip(evidence.fit_rows.experiments[0].residual_index()) {
+            if quantity == ResidualChannel::Position(channel) {
+                residual[row] = corrected;
+            }
+        }
+    }
+    residual
+}
+
+/// What a residual might depend on: positions, velocities, commands and torques of all joints, and time.
+fn variables(log: &Log, robot: &RobotModel) -> Vec<(String, Vec<f64>)> {
+    let mut all = measured(log);
+    all.extend(wanted_torques(log, robot));
+    all
+}
+
+/// The torques that actuators are asked for, `tau_cmd_<joint>` [N·m].
+fn wanted_torques(log: &Log, robot: &RobotModel) -> Vec<(String, Vec<f64>)> {
+    let joints = joint_commands(log).unwrap_or_default();
+    let of = |joint: &JointCommands| -> Option<(String, Vec<f64>)> {
+        let (name, index) = (joint.joint.name(), joint.joint.index());
+        let (q, dq) = (log.q(name)?, log.dq(name));
+        let wanted = |row: usize| {
+            let command = command(robot, &joints, row);
+            let [kp, kd, to, at] =
+                [command.kp, command.kd, command.q, command.dq].map(|values| f64::from(values[index]));
+            kp * (to - q[row]) + kd * (at - dq.map_or(at, |dq| dq[row]))
+        };
+        Some((format!("tau_cmd_{name}"), (0..log.rows()).map(wanted).collect()))
+    };
+    joints.iter().filter_map(of).collect()
+}
+
+/// Share of the residual's variance on held-out seconds that its mean in bins of `cells`, from the other seconds, explains.
+fn binned_r_squared(log: &Log, residual: &[f64], cells: &[f64]) -> f64 {
+    let rows: Vec<usize> =
+        (0..residual.len()).filter(|row| residual[*row].is_finite() && cells[*row].is_finite()).collect();
+    if rows.len() < 10 * BINS {
+        return 0.0;
+    }
+    let mut sorted: Vec<f64> = rows.iter().map(|row| cells[*row]).collect();
+    sorted.sort_by(f64::total_cmp);
+    let bin = |value: f64| {
+        let below = sorted.partition_point(|other| *other < value);
+        (below * BINS / sorted.len()).min(BINS - 1)
+    };
+    let (mut rest, mut total) = (0.0, 0.0);
+    for fold in [0, 1] {
+        let (mut sums, mut counts) = ([0.0; BINS], [0.0; BINS]);
+        let of_fold = |fold: usize| rows.iter().copied().filter(move |row| fold_of(log, *row) == Some(fold));
+        for row in of_fold(fold) {
+            sums[bin(cells[row])] += residual[row];
+            counts[bin(cells[row])] += 1.0;
+        }
+        let mean = sums.iter().sum::<f64>() / counts.iter().sum::<f64>().max(1.0);
+        for row in of_fold(1 - fold) {
+            let bin = bin(cells[row]);
+            let expected = if counts[bin] > 0.0 { sums[bin] / counts[bin] } else { mean };
+            rest += (residual[row] - expected).powi(2);
+            total += (residual[row] - mean).powi(2);
+        }
+    }
+    if total > 0.0 { 1.0 - rest / total } else { 0.0 }
+}

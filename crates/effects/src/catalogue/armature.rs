@@ -1,0 +1,41 @@
+//! Rotor inertia reflected through the gear to the joint.
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "armature",
+    summary: "Rotor inertia reflected through the gear to the joint.",
+    equation: "J_a ddq",
+    chain_stage: "14, rotor",
+    parameters: &[Parameter {
+        name: "inertia_kgm2",
+        unit: "kg·m²",
+        count: 1,
+        bounds: [-0.01, 0.5],
+        prior_range: [0.0, 0.05],
+        no_effect_value: 0.0,
+        source: "identified on a real Go2: 0.001 to 0.018 on hips and thighs, 0.017 to 0.032 on calves; nominal value \
+                 0.01",
+    }],
+    composition: Composition::Add,
+    target: Target::Joints,
+    signature: "The residual is proportional to the joint acceleration. Its amplitude grows with the square of the \
+                frequency.",
+    confounders: &[
+        Confounder {
+            effect: "command_delay",
+            discriminating_experiment: "Command steps, and chirps with two different spectra.",
+        },
+        Confounder {
+            effect: "inertia",
+            discriminating_experiment: "Load the leg or lock other joints: the rotor inertia does not change.",
+        },
+    ],
+    needs: &[DataRequirement::Reversals, DataRequirement::Rate(100.0), DataRequirement::Bandwidth(1.0)],
+    recommended: &[DataRequirement::Bandwidth(3.0)],
+    caveat: "confounded with a delay: two spectra, or the first 10 ms of a step, discriminate",
+    apply: |robot, site, values| {
+        crate::joint(robot, site).armature += values[0];
+        Ok(())
+    },
+};

@@ -1,0 +1,49 @@
+//! Dry friction, independent of speed, which also holds the joint at rest.
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "coulomb_friction",
+    summary: "Dry friction, independent of speed, which also holds the joint at rest.",
+    equation: "-c sign(dq); at dq = 0 the torque that holds the joint, up to c in magnitude",
+    chain_stage: "13, friction",
+    parameters: &[Parameter {
+        name: "torque_nm",
+        unit: "N·m",
+        count: 1,
+        bounds: [0.0, 20.0],
+        prior_range: [0.0, 1.5],
+        no_effect_value: 0.0,
+        source: "identified on a real Go2 with its feet in the air: 0.03 to 0.39 N·m on hips and thighs, 0.5 to 1.3 \
+                 on calves",
+    }],
+    composition: Composition::Add,
+    target: Target::Joints,
+    signature: "The residual has a constant magnitude and the sign of the velocity. The joint sticks at reversals.",
+    confounders: &[
+        Confounder {
+            effect: "viscous_friction",
+            discriminating_experiment: "Motion at two speeds: Coulomb friction is the same at both.",
+        },
+        Confounder {
+            effect: "stribeck_friction",
+            discriminating_experiment: "Slow motion at 0.05 to 0.3 rad/s: Stribeck friction acts only at low speed.",
+        },
+        Confounder {
+            effect: "load_friction",
+            discriminating_experiment: "The same motion in the air and under load: Coulomb friction is the same.",
+        },
+        Confounder {
+            effect: "backlash",
+            discriminating_experiment: "Slow reversals without load: with backlash the link moves freely, with \
+                                        friction it sticks.",
+        },
+    ],
+    needs: &[DataRequirement::Reversals],
+    recommended: &[DataRequirement::TorqueMeasured],
+    caveat: "",
+    apply: |robot, site, values| {
+        crate::joint(robot, site).coulomb_friction += values[0];
+        Ok(())
+    },
+};

@@ -1,0 +1,33 @@
+//! Friction coefficient of the ground.
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "ground_friction",
+    summary: "Friction coefficient of the ground.",
+    equation: "|f_t| <= mu f_n",
+    chain_stage: "ground",
+    parameters: &[Parameter {
+        name: "coefficient",
+        unit: "",
+        count: 1,
+        bounds: [0.01, 3.0],
+        prior_range: [0.3, 1.2],
+        no_effect_value: 0.8,
+        source: "randomisation ranges of legged robots",
+    }],
+    composition: Composition::Replace,
+    target: Target::Ground,
+    signature: "The feet slip where those of the model stick, or the reverse.",
+    confounders: &[Confounder {
+        effect: "payload",
+        discriminating_experiment: "Push the standing robot, whose weight is known, sideways until it slips.",
+    }],
+    needs: &[DataRequirement::Floating],
+    recommended: &[DataRequirement::BasePose],
+    caveat: "only slipping feet determine its value",
+    apply: |robot, _, values| {
+        robot.contact.friction = values[0];
+        Ok(())
+    },
+};

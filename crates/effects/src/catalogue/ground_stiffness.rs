@@ -1,0 +1,35 @@
+//! Compliance of the ground or of the feet.
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "ground_stiffness",
+    summary: "Compliance of the ground or of the feet.",
+    equation: "contact is a critically damped spring with time constant T for the effective mass of the contact \
+               (MuJoCo's solref)",
+    chain_stage: "ground",
+    parameters: &[Parameter {
+        name: "time_constant_s",
+        unit: "s",
+        count: 1,
+        bounds: [0.001, 0.2],
+        prior_range: [0.002, 0.04],
+        no_effect_value: 0.002,
+        source: "rubber feet on floors from steel to carpet",
+    }],
+    composition: Composition::Replace,
+    target: Target::Ground,
+    signature: "Impacts last longer and the feet penetrate deeper.",
+    confounders: &[Confounder {
+        effect: "joint_elasticity",
+        discriminating_experiment: "Push a foot of the robot with its base fixed above the ground: only elasticity \
+                                    remains.",
+    }],
+    needs: &[DataRequirement::Floating, DataRequirement::Rate(200.0)],
+    recommended: &[DataRequirement::FootContact],
+    caveat: "",
+    apply: |robot, _, values| {
+        robot.contact.time_constant = values[0];
+        Ok(())
+    },
+};

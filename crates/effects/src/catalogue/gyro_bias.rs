@@ -1,0 +1,32 @@
+//! Constant offset of the gyroscope.
+
+use glam::DVec3;
+
+use crate::{Composition, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "gyro_bias",
+    summary: "Constant offset of the gyroscope.",
+    equation: "gyro = omega + b",
+    chain_stage: "IMU",
+    parameters: &[Parameter {
+        name: "bias_rad_s",
+        unit: "rad/s",
+        count: 3,
+        bounds: [-0.5, 0.5],
+        prior_range: [-0.02, 0.02],
+        no_effect_value: 0.0,
+        source: "MEMS gyroscopes",
+    }],
+    composition: Composition::Add,
+    target: Target::Base,
+    signature: "The measured angular velocity has a constant error, also at rest.",
+    confounders: &[],
+    needs: &[DataRequirement::BaseRotation(0.0)],
+    recommended: &[DataRequirement::Orientation],
+    caveat: "",
+    apply: |robot, _, values| {
+        robot.gyro_bias += DVec3::new(values[0], values[1], values[2]);
+        Ok(())
+    },
+};

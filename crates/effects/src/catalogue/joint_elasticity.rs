@@ -1,0 +1,40 @@
+//! Elastic gear between rotor and link.
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "joint_elasticity",
+    summary: "Elastic gear between rotor and link.",
+    equation: "rotor and link are two inertias, coupled by the torque k (rotor - link). The encoder is at the rotor",
+    chain_stage: "12, gear",
+    parameters: &[Parameter {
+        name: "stiffness_nm_rad",
+        unit: "N·m/rad",
+        count: 1,
+        bounds: [5.0, 20000.0],
+        prior_range: [200.0, 2000.0],
+        no_effect_value: f64::INFINITY,
+        source: "harmonic and planetary gears of this size",
+    }],
+    composition: Composition::Replace,
+    target: Target::Joints,
+    signature: "A resonance, and a deflection of the link proportional to the torque.",
+    confounders: &[
+        Confounder {
+            effect: "backlash",
+            discriminating_experiment: "Loads of both signs: the deflection of backlash is constant, that of a spring \
+                                        is proportional to the load.",
+        },
+        Confounder {
+            effect: "armature",
+            discriminating_experiment: "A chirp through the resonance: inertia alone has no resonance.",
+        },
+    ],
+    needs: &[DataRequirement::Rate(500.0), DataRequirement::Bandwidth(5.0)],
+    recommended: &[DataRequirement::TorqueMeasured],
+    caveat: "",
+    apply: |robot, site, values| {
+        crate::joint(robot, site).actuator.gear_stiffness = values[0];
+        Ok(())
+    },
+};

@@ -1,0 +1,54 @@
+//! A cable or a spring pulls the joint towards a rest position.
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "joint_spring",
+    summary: "A cable or a spring pulls the joint towards a rest position.",
+    equation: "-k (q - q0)",
+    chain_stage: "15, link",
+    parameters: &[
+        Parameter {
+            name: "stiffness_nm_rad",
+            unit: "N·m/rad",
+            count: 1,
+            bounds: [0.0, 50.0],
+            prior_range: [0.0, 3.0],
+            no_effect_value: 0.0,
+            source: "cables and hoses over a joint",
+        },
+        Parameter {
+            name: "rest_rad",
+            unit: "rad",
+            count: 1,
+            bounds: [-6.3, 6.3],
+            prior_range: [-1.5, 1.5],
+            no_effect_value: 0.0,
+            source: "position at which the cable is slack",
+        },
+    ],
+    composition: Composition::Add,
+    target: Target::Joints,
+    signature: "The residual is proportional to the joint position.",
+    confounders: &[
+        Confounder {
+            effect: "encoder_offset",
+            discriminating_experiment: "Static poses at several joint angles: a spring torque grows with the angle, \
+                                        an offset is the same at each.",
+        },
+        Confounder {
+            effect: "payload",
+            discriminating_experiment: "Static poses at several trunk orientations: the torque of a payload depends \
+                                        on orientation, that of a spring does not.",
+        },
+    ],
+    needs: &[DataRequirement::Range(0.5)],
+    recommended: &[DataRequirement::TorqueMeasured],
+    caveat: "",
+    apply: |robot, site, values| {
+        let spring = &mut crate::joint(robot, site).spring;
+        spring.stiffness += values[0];
+        spring.torque_offset += values[0] * values[1];
+        Ok(())
+    },
+};

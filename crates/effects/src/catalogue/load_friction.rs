@@ -1,0 +1,41 @@
+//! Friction proportional to the magnitude of the motor torque.
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "load_friction",
+    summary: "Friction proportional to the magnitude of the motor torque.",
+    equation: "-mu |tau_m| sign(dq)",
+    chain_stage: "13, friction",
+    parameters: &[Parameter {
+        name: "coefficient",
+        unit: "",
+        count: 1,
+        bounds: [0.0, 0.8],
+        prior_range: [0.0, 0.25],
+        no_effect_value: 0.0,
+        source: "BAM's servos: 0.05 to 0.25",
+    }],
+    composition: Composition::Add,
+    target: Target::Joints,
+    signature: "Friction grows with the load and vanishes without load.",
+    confounders: &[
+        Confounder {
+            effect: "coulomb_friction",
+            discriminating_experiment: "The same motion in the air and under load: Coulomb friction is the same in \
+                                        both.",
+        },
+        Confounder {
+            effect: "torque_gain",
+            discriminating_experiment: "Lift and lower a load: friction changes sign, the error due to a gain does \
+                                        not.",
+        },
+    ],
+    needs: &[DataRequirement::Reversals, DataRequirement::Torque(0.15)],
+    recommended: &[DataRequirement::TorqueMeasured],
+    caveat: "differs from coulomb_friction only under different loads",
+    apply: |robot, site, values| {
+        crate::joint(robot, site).load_friction += values[0];
+        Ok(())
+    },
+};

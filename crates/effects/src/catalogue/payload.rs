@@ -1,0 +1,57 @@
+//! Additional point mass on the trunk or a link.
+
+use glam::DVec3;
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "payload",
+    summary: "Additional point mass on the trunk or a link.",
+    equation: "a point mass m at r, fixed to the trunk or to a link",
+    chain_stage: "body",
+    parameters: &[
+        Parameter {
+            name: "mass_kg",
+            unit: "kg",
+            count: 1,
+            bounds: [-3.0, 20.0],
+            prior_range: [-1.0, 4.0],
+            no_effect_value: 0.0,
+            source: "typical mounted batteries, computers and sensors",
+        },
+        Parameter {
+            name: "position_m",
+            unit: "m",
+            count: 3,
+            bounds: [-0.5, 0.5],
+            prior_range: [-0.2, 0.2],
+            no_effect_value: 0.0,
+            source: "extent of the robot",
+        },
+    ],
+    composition: Composition::Add,
+    target: Target::Bodies,
+    signature: "In stance all feet carry more weight, most of it near the mass. With the feet in the air nothing \
+                changes.",
+    confounders: &[
+        Confounder {
+            effect: "com_shift",
+            discriminating_experiment: "Weigh the robot: a shift does not change its weight.",
+        },
+        Confounder {
+            effect: "torque_gain",
+            discriminating_experiment: "Move a leg in the air: a gain still acts, a payload on the trunk does not.",
+        },
+    ],
+    needs: &[DataRequirement::Floating],
+    recommended: &[DataRequirement::TorqueMeasured],
+    caveat: "a load on a leg is also identifiable with a fixed base",
+    apply: |robot, site, values| {
+        let body = crate::body(robot, site);
+        if body.mass + values[0] <= 0.0 {
+            return Err("the body's mass would be zero or less");
+        }
+        *body = body.with_point_mass(values[0], DVec3::new(values[1], values[2], values[3]));
+        Ok(())
+    },
+};

@@ -1,0 +1,49 @@
+//! Additional friction near standstill that decays with speed.
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "stribeck_friction",
+    summary: "Additional friction near standstill that decays with speed.",
+    equation: "-F_s exp(-(dq / v_s)^2) sign(dq)",
+    chain_stage: "13, friction",
+    parameters: &[
+        Parameter {
+            name: "breakaway_nm",
+            unit: "N·m",
+            count: 1,
+            bounds: [0.0, 20.0],
+            prior_range: [0.0, 1.0],
+            no_effect_value: 0.0,
+            source: "published servos and gears have 0.05 to 1 N·m",
+        },
+        Parameter {
+            name: "speed_rad_s",
+            unit: "rad/s",
+            count: 1,
+            bounds: [0.01, 10.0],
+            prior_range: [0.1, 3.0],
+            no_effect_value: 0.1,
+            source: "published servos and gears",
+        },
+    ],
+    composition: Composition::Add,
+    target: Target::Joints,
+    signature: "Friction is largest near standstill. Slow motion shows stick-slip.",
+    confounders: &[Confounder {
+        effect: "coulomb_friction",
+        discriminating_experiment: "Slow motion, then fast motion: Coulomb friction is the same in both.",
+    }],
+    needs: &[DataRequirement::Reversals, DataRequirement::LowSpeed],
+    recommended: &[DataRequirement::TorqueMeasured],
+    caveat: "",
+    apply: |robot, site, values| {
+        let friction = &mut crate::joint(robot, site).stribeck_friction;
+        if friction.breakaway_torque > 0.0 && (friction.stribeck_velocity - values[1]).abs() > 1e-9 {
+            return Err("two Stribeck frictions of different `speed_rad_s` on one joint");
+        }
+        friction.breakaway_torque += values[0];
+        friction.stribeck_velocity = values[1];
+        Ok(())
+    },
+};

@@ -1,0 +1,41 @@
+//! Motor torque decreases with the battery voltage.
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "supply_sag",
+    summary: "Motor torque decreases with the battery voltage.",
+    equation: "tau <- tau (V / V_ref)^n, where V_ref is the highest battery_V of the log",
+    chain_stage: "4, supply",
+    parameters: &[Parameter {
+        name: "exponent",
+        unit: "",
+        count: 1,
+        bounds: [0.0, 4.0],
+        prior_range: [0.0, 2.0],
+        no_effect_value: 0.0,
+        source: "BAM's servo logs: supply sag explains them better than any friction model",
+    }],
+    composition: Composition::Replace,
+    target: Target::Supply,
+    signature: "All joints lose torque at the same time, when the battery voltage falls.",
+    confounders: &[
+        Confounder {
+            effect: "torque_saturation",
+            discriminating_experiment: "Move one joint alone, then all together: saturation of a joint is the same in \
+                                        both, sag is not.",
+        },
+        Confounder {
+            effect: "thermal_derating",
+            discriminating_experiment: "A short burst of torque with a cold motor: sag acts at once, heating takes \
+                                        minutes.",
+        },
+    ],
+    needs: &[DataRequirement::Torque(0.4), DataRequirement::Voltage(0.5)],
+    recommended: &[DataRequirement::TorqueMeasured],
+    caveat: "",
+    apply: |robot, _, values| {
+        robot.derating.voltage_exponent = values[0];
+        Ok(())
+    },
+};

@@ -1,0 +1,44 @@
+//! Smooth saturation of the motor torque.
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "torque_saturation",
+    summary: "Smooth saturation of the motor torque.",
+    equation: "tau <- kappa tanh(tau / kappa)",
+    chain_stage: "3, saturation",
+    parameters: &[Parameter {
+        name: "kappa_nm",
+        unit: "N·m",
+        count: 1,
+        bounds: [2.0, 200.0],
+        prior_range: [15.0, 40.0],
+        no_effect_value: f64::INFINITY,
+        source: "SPI-Active's motor model; its identified values on the Go2 are 17 to 29 N·m",
+    }],
+    composition: Composition::Replace,
+    target: Target::Joints,
+    signature: "Measured torque plotted over commanded torque saturates at both signs, at every speed.",
+    confounders: &[
+        Confounder {
+            effect: "torque_gain",
+            discriminating_experiment: "The same motion at two amplitudes: a gain is the same at both, saturation \
+                                        reduces only the large one.",
+        },
+        Confounder {
+            effect: "torque_speed_limit",
+            discriminating_experiment: "Large torque on a blocked joint: at zero speed only saturation acts.",
+        },
+        Confounder {
+            effect: "supply_sag",
+            discriminating_experiment: "Move one joint alone, then all together: sag affects all joints.",
+        },
+    ],
+    needs: &[DataRequirement::Torque(0.6)],
+    recommended: &[DataRequirement::TorqueMeasured],
+    caveat: "",
+    apply: |robot, site, values| {
+        crate::joint(robot, site).actuator.saturation = values[0];
+        Ok(())
+    },
+};

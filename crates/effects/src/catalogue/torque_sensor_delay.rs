@@ -1,0 +1,30 @@
+//! Delay of the logged torque; the motion is not delayed.
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "torque_sensor_delay",
+    summary: "Delay of the logged torque; the motion is not delayed.",
+    equation: "tau_measured(t) = tau(t - T)",
+    chain_stage: "tap `current`",
+    parameters: &[Parameter {
+        name: "delay_s",
+        unit: "s",
+        count: 1,
+        bounds: [0.0, 0.04],
+        prior_range: [0.0, 0.02],
+        no_effect_value: 0.0,
+        source: "published logs hold each torque sample for 2 to 23 ms",
+    }],
+    composition: Composition::Add,
+    target: Target::Joints,
+    signature: "A time shift of the torque channel removes the error. The simulated motion agrees without it.",
+    confounders: &[Confounder {
+        effect: "torque_delay",
+        discriminating_experiment: "Compare the motion: a torque delay changes it.",
+    }],
+    needs: &[DataRequirement::TorqueMeasured, DataRequirement::Reversals, DataRequirement::Rate(200.0)],
+    recommended: &[DataRequirement::Bandwidth(2.0)],
+    caveat: "",
+    apply: |robot, site, values| crate::delayed(&mut crate::joint(robot, site).actuator.sensor_delay, values[0]),
+};

@@ -1,0 +1,39 @@
+//! Back-EMF reduces the available torque with speed.
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+pub const EFFECT: Effect = Effect {
+    name: "torque_speed_limit",
+    summary: "Back-EMF reduces the available torque with speed.",
+    equation: "|tau| <= tau_max clip(1 - dq sign(tau) / v0, 0, 1)",
+    chain_stage: "8, back-EMF",
+    parameters: &[Parameter {
+        name: "no_load_rad_s",
+        unit: "rad/s",
+        count: 1,
+        bounds: [2.0, 200.0],
+        prior_range: [12.0, 60.0],
+        no_effect_value: f64::INFINITY,
+        source: "Unitree's data sheet: 30.1 rad/s for hip and thigh, 15.7 for the calf",
+    }],
+    composition: Composition::Replace,
+    target: Target::Joints,
+    signature: "At high speed the torque is clipped while it accelerates the joint, but not while it brakes.",
+    confounders: &[
+        Confounder {
+            effect: "torque_saturation",
+            discriminating_experiment: "Large torque on a blocked joint: at zero speed only saturation acts.",
+        },
+        Confounder {
+            effect: "viscous_friction",
+            discriminating_experiment: "Fast motion with small torque: friction acts, the limit does not.",
+        },
+    ],
+    needs: &[DataRequirement::Speed(0.5)],
+    recommended: &[DataRequirement::Torque(0.5)],
+    caveat: "",
+    apply: |robot, site, values| {
+        crate::joint(robot, site).actuator.no_load_speed = values[0];
+        Ok(())
+    },
+};

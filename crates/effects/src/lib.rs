@@ -1,0 +1,167 @@
+//! Catalogue of effects: differences between real robots and the ideal one.
+//!
+//! - [`Effect`]: an effect of the catalogue: equation, parameters, signature in data, confounders, and the change of a
+//!   [`RobotModel`]. One file per effect.
+//! - [`CATALOGUE`]: all effects, in the order of the chain from command to motion.
+//! - [`Scope`]: the joints or the part of the robot to which an entry of a model file applies.
+//! - [`EffectEntry`]: an effect with a scope and values; [`apply_effects`] applies several to a robot.
+//! - [`ModelFile`]: a nominal robot and a list of entries, in TOML.
+//! - [`RobotSampler`]: domain randomisation within the intervals of a model file.
+//!
+//! An effect only changes parameters. [`twinstep_model::dynamics::SimdActuators`] and the engines implement the laws.
+
+mod catalogue;
+mod data_requirement;
+mod entry;
+mod model_file;
+mod sampler;
+mod scope;
+
+pub use catalogue::CATALOGUE;
+pub use data_requirement::{DataRequirement, LOW_SPEED};
+pub use sampler::{SamplingError, RobotSampler};
+pub use entry::{EffectEntry, EntryError, apply_effects};
+pub use model_file::{ActuatorNetworkConfig, EffectEntryError, MemberSampling, ModelFile, ModelFileError, load_robot, parse_robot};
+pub use scope::{Scope, UnknownScope};
+
+use twinstep_model::RobotModel;
+
+/// Effect of the catalogue.
+#[derive(Debug)]
+pub struct Effect {
+    /// Name in model files and findings.
+    pub name: &'static str,
+    /// Description in one sentence.
+    pub summary: &'static str,
+    /// Equation of the effect.
+    pub equation: &'static str,
+    /// Stage in the chain from command to motion: number of the step, if it has one, and a word.
+    pub chain_stage: &'static str,
+    /// Parameters, in the order of their values.
+    pub parameters: &'static [Parameter],
+    /// Composition of entries of this effect that apply to the same joint.
+    pub composition: Composition,
+    /// Scopes that the effect can have.
+    pub target: Target,
+    /// Signature in measured data.
+    pub signature: &'static str,
+    /// Effects that it is often confused with.
+    pub confounders: &'static [Confounder],
+    /// What a log must contain so that the effect is identifiable from it.
+    pub needs: &'static [DataRequirement],
+    /// What a log should also contain; without it the effect is weakly identifiable.
+    pub recommended: &'static [DataRequirement],
+    /// Caveat to any conclusion about the effect; empty for none.
+    pub caveat: &'static str,
+    /// Applies the values to the robot at one site. The values of a parameter are contiguous.
+    pub apply: fn(&mut RobotModel, EffectSite, &[f64]) -> Result<(), &'static str>,
+}
+
+/// Parameter of an effect.
+#[derive(Debug)]
+pub struct Parameter {
+    /// Name, with the unit as suffix.
+    pub name: &'static str,
+    /// Unit for display; empty if dimensionless.
+    pub unit: &'static str,
+    /// Number of components: 1, or more for a vector.
+    pub count: usize,
+    /// Lowest and highest allowed value.
+    pub bounds: [f64; 2],
+    /// Central 95 % interval of the prior for a Go2.
+    pub prior_range: [f64; 2],
+    /// Value without any effect.
+    pub no_effect_value: f64,
+    /// Source of the prior.
+    pub source: &'static str,
+}
+
+/// Composition of entries of one effect that apply to the same joint.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Composition {
+    /// Values add up.
+    Add,
+    /// Values multiply.
+    Multiply,
+    /// The entry with the narrowest scope applies; among equal scopes, the last.
+    Replace,
+}
+
+/// Scopes that an effect can have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Target {
+    /// Any scope over joints.
+    Joints,
+    /// Only all joints together: the common power supply.
+    Supply,
+    /// The trunk, or the child link of a joint.
+    Bodies,
+    /// The trunk.
+    Base,
+    /// The ground.
+    Ground,
+}
+
+/// Site at which an effect is applied.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum EffectSite {
+    /// A joint, or its child link, by the index of the joint.
+    Joint(usize),
+    /// The trunk, the supply or the ground.
+    Global,
+}
+
+/// Effect with a similar signature, and an experiment that discriminates between the two.
+#[derive(Debug)]
+pub struct Confounder {
+    /// Name of the other effect.
+    pub effect: &'static str,
+    /// Experiment, and what distinguishes the two effects in it.
+    pub discriminating_experiment: &'static str,
+}
+
+impl Effect {
+    /// Returns the effect of this name. Returns `None` if the catalogue has no such effect.
+    pub fn named(name: &str) -> Option<&'static Effect> {
+        CATALOGUE.into_iter().find(|effect| effect.name == name)
+    }
+
+    /// Returns the number of components of all parameters.
+    pub fn num_values(&self) -> usize {
+        self.parameters.iter().map(|parameter| parameter.count).sum()
+    }
+}
+
+impl PartialEq for Effect {
+    fn eq(&self, other: &Self) -> bool {
+        self.name == other.name
+    }
+}
+
+/// Returns the joint of a site, for effects with [`Target::Joints`].
+fn joint(robot: &mut RobotModel, site: EffectSite) -> &mut twinstep_model::JointModel {
+    match site {
+        EffectSite::Joint(index) => &mut robot.joints[index],
+        EffectSite::Global => unreachable!("an effect of joints is applied joint by joint"),
+    }
+}
+
+/// Adds `more` to a delay [s]. Fails if the sum exceeds the longest delay that the actuators simulate.
+fn delayed(delay: &mut f64, more: f64) -> Result<(), &'static str> {
+    *delay += more;
+    if *delay > twinstep_model::ActuatorParams::MAX_DELAY + 1e-9 {
+        return Err("the delays of a joint add up to more than 0.04 s");
+    }
+    Ok(())
+}
+
+/// Returns the body of a site: the child link of the joint, or the trunk.
+fn body(robot: &mut RobotModel, site: EffectSite) -> &mut twinstep_model::RigidBody {
+    match site {
+        EffectSite::Joint(index) => &mut robot.legs[index / 3].bodies[index % 3],
+        EffectSite::Global => &mut robot.trunk,
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,158 @@
+//! Domain randomisation: robots sampled from the intervals of a model file.
+
+use super::{EffectEntry, EntryError};
+use crate::ModelFile;
+use twinstep_model::{RobotModel, Stream, standard_normal, stream};
+
+/// Number of samples that estimate the fraction of valid robots.
+const TRIALS: usize = 100;
+/// Half width of the central 95 % interval of a normal distribution [standard deviations].
+const CENTRAL: f64 = 1.96;
+
+/// Samples robots from the intervals of a model file.
+///
+/// A value with an interval is normally distributed with that interval as its central 95 %, clipped to the parameter's
+/// bounds. Values without an interval are constant. All values are independent. Samples that are not valid robots are
+/// rejected, for example if delays add up to more than [`twinstep_model::ActuatorParams::MAX_DELAY`] or a mass is not
+/// positive.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RobotSampler(ModelFile);
+
+/// Less than half of the samples are valid robots.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error(
+    "only {possible} of {tried} samples from the intervals of the model file are valid robots; at least half must be \
+     valid. One is not: {cause}. Make the intervals narrower"
+)]
+pub struct SamplingError {
+    /// Number of samples.
+    pub tried: usize,
+    /// Number of samples that are valid robots.
+    pub possible: usize,
+    /// Reason why the first of the others is not valid.
+    pub cause: EntryError,
+}
+
+impl RobotSampler {
+    /// Creates the sampler of a model file. Fails if more than half of 100 samples are not valid robots.
+    pub fn new(file: ModelFile) -> Result<Self, SamplingError> {
+        let this = Self(file);
+        let mut trials = stream(0, "trial draws", 0);
+        let causes: Vec<_> = (0..TRIALS).filter_map(|_| this.attempt(&mut trials).err()).collect();
+        match causes.first() {
+            Some(cause) if 2 * causes.len() > TRIALS => {
+                Err(SamplingError { tried: TRIALS, possible: TRIALS - causes.len(), cause: cause.clone() })
+            }
+            _ => Ok(this),
+        }
+    }
+
+    /// Samples a robot.
+    pub fn sample(&self, random: &mut Stream) -> RobotModel {
+        // Terminates quickly: `new` checked that about half of all samples are valid.
+        loop {
+            if let Ok(robot) = self.attempt(random) {
+                return robot;
+            }
+        }
+    }
+
+    fn attempt(&self, random: &mut Stream) -> Result<RobotModel, EntryError> {
+        let effects = self.0.effects.iter().map(|entry| entry.sampled(random)).collect();
+        ModelFile { robot: self.0.robot.clone(), effects, actuator: None }.robot_model()
+    }
+}
+
+impl EffectEntry {
+    fn sampled(&self, random: &mut Stream) -> EffectEntry {
+        let mut sampled = self.clone();
+        let parameters = self.effect.parameters.iter().flat_map(|one| std::iter::repeat_n(one, one.count));
+        for ((value, interval), parameter) in sampled.values.iter_mut().zip(&self.intervals).zip(parameters) {
+            if let Some([low, high]) = interval {
+                let [least, most] = parameter.bounds;
+                let std = (high - low) / (2.0 * CENTRAL);
+                *value = (0.5 * (low + high) + std * standard_normal(random)).clamp(least, most);
+            }
+        }
+        sampled
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use expect_test::expect;
+
+    use super::*;
+    use twinstep_model::{ActuatorParams, go2};
+
+    fn draws(effects: &str) -> Result<RobotSampler, SamplingError> {
+        RobotSampler::new(ModelFile::parse(&format!("robot = \"go2\"\n{effects}"), "robot.toml").expect("valid"))
+    }
+
+    fn effect(text: &str) -> String {
+        format!("[[effect]]\n{}\n", text.replace("; ", "\n"))
+    }
+
+    #[test]
+    fn interval_contains_95_percent_of_the_samples_and_is_centred_on_their_mean() {
+        let friction =
+            "name = \"coulomb_friction\"; scope = \"calf\"; torque_nm = 0.5; interval = { torque_nm = [0.4, 0.8] }";
+        let (draws, mut random) = (draws(&effect(friction)).expect("robots"), stream(1, "draws", 0));
+        let robots: Vec<_> = (0..4000).map(|_| draws.sample(&mut random)).collect();
+        let drawn: Vec<f64> = robots.iter().map(|robot| robot.joints[2].coulomb_friction).collect();
+        let inside = drawn.iter().filter(|torque| (0.4..0.8).contains(*torque)).count();
+        // Four standard deviations of the count: 4 sqrt(4000 · 0.95 · 0.05) = 55.
+        assert!(inside.abs_diff(3800) < 55, "{inside} of 4000");
+        let mean = drawn.iter().sum::<f64>() / 4000.0;
+        assert!((mean - 0.6).abs() < 0.007, "{mean} N·m");
+        // One value per entry, and no friction at other joints.
+        assert!(robots.iter().all(|robot| robot.joints[2].coulomb_friction == robot.joints[11].coulomb_friction));
+        assert!(robots.iter().all(|robot| robot.joints[0] == go2().joints[0]));
+    }
+
+    #[test]
+    fn component_without_an_interval_is_constant_and_samples_respect_the_bounds() {
+        let load = "name = \"payload\"; scope = \"base\"; mass_kg = 0.0; position_m = [0.1, 0.0, 0.2]";
+        let shift = "name = \"com_shift\"; scope = \"base\"; shift_m = [0.3, 0.0, 0.02]; \
+                     interval = { shift_m = [[0.2, -inf, 0.01], [0.4, inf, 0.03]] }";
+        let (draws, mut random) = (draws(&(effect(load) + &effect(shift))).expect("robots"), stream(1, "draws", 0));
+        let nominal = go2().trunk.com;
+        let shifts: Vec<_> = (0..200).map(|_| draws.sample(&mut random).trunk.com - nominal).collect();
+        assert!(shifts.iter().all(|shift| shift.x <= 0.3 + 1e-12 && shift.y == 0.0), "{shifts:?}");
+        assert!(shifts.iter().any(|shift| (shift.x - 0.3).abs() < 1e-12) && shifts.iter().any(|shift| shift.x < 0.25));
+    }
+
+    #[test]
+    fn model_without_intervals_returns_its_robot_and_draws_no_random_numbers() {
+        let friction = "name = \"coulomb_friction\"; scope = \"all\"; torque_nm = 0.5";
+        let (draws, mut random) = (draws(&effect(friction)).expect("robots"), stream(1, "draws", 0));
+        assert_eq!(draws.sample(&mut random), draws.0.robot_model().expect("no conflict"));
+        assert_eq!(random, stream(1, "draws", 0));
+    }
+
+    /// Entries of two delays that add up at the hips.
+    fn delays(high: f64) -> String {
+        let of = |scope: &str| format!("name = \"command_delay\"; scope = \"{scope}\"; delay_s = 0.01");
+        let interval = format!("; interval = {{ delay_s = [0.0, {high}] }}");
+        effect(&(of("all") + &interval)) + &effect(&(of("hip") + &interval))
+    }
+
+    #[test]
+    fn invalid_robots_are_rejected() {
+        // The mean of each delay is 0.015 s: their sum sometimes exceeds 0.04 s.
+        let (draws, mut random) = (draws(&delays(0.03)).expect("robots"), stream(1, "draws", 0));
+        assert!((0..200).any(|_| draws.attempt(&mut random).is_err()));
+        for _ in 0..200 {
+            assert!(draws.sample(&mut random).joints[0].actuator.command_delay <= ActuatorParams::MAX_DELAY);
+        }
+    }
+
+    #[test]
+    fn intervals_with_few_valid_robots_are_rejected_with_the_reason() {
+        let error = draws(&delays(0.06)).expect_err("refused");
+        expect![["only 19 of 100 samples from the intervals of the model file are valid robots; at least half must be \
+                  valid. One is not: `command_delay` on hip conflicts with another entry: the delays of a joint add \
+                  up to more than 0.04 s. Make the intervals narrower"]]
+        .assert_eq(&error.to_string());
+    }
+}

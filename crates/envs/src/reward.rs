@@ -1,0 +1,196 @@
+//! Reward terms of the task `walk`, one function each. Weights and signs are in [`crate::RewardWeights`].
+
+use twinstep_model::{NUM_JOINTS, PerJoint, PerLeg};
+
+/// State of one robot after one policy step, from which the reward terms are computed.
+#[derive(Clone, Copy, Debug)]
+pub struct RewardInput<'a> {
+    /// One period of the policy [s].
+    pub policy_dt: f32,
+    /// Width σ of the tracking rewards [m²/s², rad²/s²].
+    pub tracking_sigma: f32,
+    /// Commanded velocity: forward [m/s], left [m/s], yaw rate [rad/s].
+    pub command: [f32; 3],
+    /// Velocity of the base in the base frame [m/s].
+    pub linear_velocity: [f32; 3],
+    /// Angular velocity of the base in the base frame [rad/s].
+    pub angular_velocity: [f32; 3],
+    /// Unit vector of gravity in the base frame.
+    pub gravity: [f32; 3],
+    /// Joint position [rad].
+    pub q: &'a PerJoint,
+    /// Joint velocity [rad/s].
+    pub dq: &'a PerJoint,
+    /// Joint velocity of the previous policy step [rad/s].
+    pub previous_dq: &'a PerJoint,
+    /// Joint torque [N·m].
+    pub tau: &'a PerJoint,
+    /// Action of this step, clipped.
+    pub action: &'a PerJoint,
+    /// Action of the previous step, clipped.
+    pub previous_action: &'a PerJoint,
+    /// The default pose [rad].
+    pub default_pose: &'a PerJoint,
+    /// Lower soft limit of the joint positions [rad].
+    pub soft_lower: &'a PerJoint,
+    /// Upper soft limit of the joint positions [rad].
+    pub soft_upper: &'a PerJoint,
+    /// Air time of each foot that touched down in this step, 0 for the others [s].
+    pub touchdown_air_time: PerLeg,
+    /// True if the trunk or a thigh touches the ground.
+    pub body_contact: bool,
+    /// Epistemic uncertainty of the actuators, mean over the joints [nat].
+    pub uncertainty: f32,
+}
+
+#[inline]
+fn has_motion_command(input: &RewardInput<'_>) -> bool {
+    input.command.iter().map(|value| value * value).sum::<f32>().sqrt() > 0.1
+}
+
+/// Returns `exp(−|v_xy − command_xy|² / σ)`, 1 without an error.
+#[inline]
+pub fn track_linear_velocity(input: &RewardInput<'_>) -> f32 {
+    let error = (0..2).map(|axis| (input.command[axis] - input.linear_velocity[axis]).powi(2)).sum::<f32>();
+    (-error / input.tracking_sigma).exp()
+}
+
+/// Returns `exp(−(ω_z − command_yaw)² / σ)`, 1 without an error.
+#[inline]
+pub fn track_angular_velocity(input: &RewardInput<'_>) -> f32 {
+    (-(input.command[2] - input.angular_velocity[2]).powi(2) / input.tracking_sigma).exp()
+}
+
+/// Returns `v_z²` [m²/s²].
+#[inline]
+pub fn linear_velocity_z(input: &RewardInput<'_>) -> f32 {
+    input.linear_velocity[2].powi(2)
+}
+
+/// Returns `ω_x² + ω_y²` [rad²/s²].
+#[inline]
+pub fn angular_velocity_xy(input: &RewardInput<'_>) -> f32 {
+    input.angular_velocity[0].powi(2) + input.angular_velocity[1].powi(2)
+}
+
+/// Returns `g_x² + g_y²` of the gravity vector in the base frame, the squared sine of the tilt.
+#[inline]
+pub fn flat_orientation(input: &RewardInput<'_>) -> f32 {
+    input.gravity[0].powi(2) + input.gravity[1].powi(2)
+}
+
+/// Returns Σ τ² over the joints [N²·m²].
+#[inline]
+pub fn joint_torque(input: &RewardInput<'_>) -> f32 {
+    input.tau.iter().map(|tau| tau * tau).sum()
+}
+
+/// Returns Σ (Δdq / dt)² over the joints [rad²/s⁴].
+#[inline]
+pub fn joint_acceleration(input: &RewardInput<'_>) -> f32 {
+    input.dq.iter().zip(input.previous_dq).map(|(now, previous)| ((now - previous) / input.policy_dt).powi(2)).sum()
+}
+
+/// Returns Σ (Δaction)².
+#[inline]
+pub fn action_rate(input: &RewardInput<'_>) -> f32 {
+    input.action.iter().zip(input.previous_action).map(|(now, previous)| (now - previous).powi(2)).sum()
+}
+
+/// Returns Σ of the distance of each joint beyond its soft limits, the central 90 % of its range [rad].
+#[inline]
+pub fn joint_position_limits(input: &RewardInput<'_>) -> f32 {
+    let outside =
+        |j: usize| (input.soft_lower[j] - input.q[j]).max(0.0) + (input.q[j] - input.soft_upper[j]).max(0.0);
+    (0..NUM_JOINTS).map(outside).sum()
+}
+
+/// Returns Σ (air time − 0.5 s) over the feet that touched down, or 0 if the velocity command is below 0.1 [s].
+#[inline]
+pub fn feet_air_time(input: &RewardInput<'_>) -> f32 {
+    if !has_motion_command(input) {
+        return 0.0;
+    }
+    input.touchdown_air_time.iter().filter(|time| **time > 0.0).map(|time| time - 0.5).sum()
+}
+
+/// Returns 1 if the trunk or a thigh touches the ground, else 0.
+#[inline]
+pub fn undesired_contact(input: &RewardInput<'_>) -> f32 {
+    f32::from(u8::from(input.body_contact))
+}
+
+/// Returns Σ |q − q_default| if the velocity command is below 0.1, else 0 [rad].
+#[inline]
+pub fn stand_still(input: &RewardInput<'_>) -> f32 {
+    if has_motion_command(input) {
+        return 0.0;
+    }
+    input.q.iter().zip(input.default_pose).map(|(q, default)| (q - default).abs()).sum()
+}
+
+/// Returns the epistemic uncertainty of the actuators, mean over the joints [nat].
+///
+/// U2E's epistemic-uncertainty function, eqs. 11 and 13.
+#[inline]
+pub fn epistemic_uncertainty(input: &RewardInput<'_>) -> f32 {
+    input.uncertainty
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ZERO: PerJoint = [0.0; NUM_JOINTS];
+
+    fn at_rest() -> RewardInput<'static> {
+        RewardInput {
+            policy_dt: 0.02,
+            tracking_sigma: 0.25,
+            command: [0.0; 3],
+            linear_velocity: [0.0; 3],
+            angular_velocity: [0.0; 3],
+            gravity: [0.0, 0.0, -1.0],
+            q: &ZERO,
+            dq: &ZERO,
+            previous_dq: &ZERO,
+            tau: &ZERO,
+            action: &ZERO,
+            previous_action: &ZERO,
+            default_pose: &ZERO,
+            soft_lower: &[-1.0; NUM_JOINTS],
+            soft_upper: &[1.0; NUM_JOINTS],
+            touchdown_air_time: [0.0; 4],
+            body_contact: false,
+            uncertainty: 0.0,
+        }
+    }
+
+    #[test]
+    fn perfect_tracking_has_reward_one() {
+        let input = RewardInput { command: [0.5, 0.1, 0.3], linear_velocity: [0.5, 0.1, 9.0], ..at_rest() };
+        assert_eq!(track_linear_velocity(&input), 1.0);
+        assert!((track_angular_velocity(&input) - (-0.09f32 / 0.25).exp()).abs() < 1e-6);
+    }
+
+    #[test]
+    fn standing_in_the_default_pose_has_no_penalty() {
+        let terms = crate::RewardWeights::default().evaluate(&at_rest());
+        let expected = 0.02 * (1.0 + 0.5);
+        assert!((terms.iter().sum::<f32>() - expected).abs() < 1e-6, "{terms:?}");
+    }
+
+    #[test]
+    fn long_swing_phase_is_rewarded_only_with_a_velocity_command() {
+        let landed = RewardInput { touchdown_air_time: [0.7, 0.0, 0.0, 0.0], ..at_rest() };
+        assert_eq!(feet_air_time(&landed), 0.0);
+        assert!((feet_air_time(&RewardInput { command: [1.0, 0.0, 0.0], ..landed }) - 0.2).abs() < 1e-6);
+    }
+
+    #[test]
+    fn penalty_of_a_joint_beyond_its_soft_limit_is_the_distance() {
+        let mut q = ZERO;
+        (q[3], q[7]) = (1.25, -1.5);
+        assert!((joint_position_limits(&RewardInput { q: &q, ..at_rest() }) - 0.75).abs() < 1e-6);
+    }
+}

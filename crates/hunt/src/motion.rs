@@ -1,0 +1,205 @@
+//! The motions of a case: on a stand, on the feet, or one after the other, 20 to 25 s.
+
+use std::collections::BTreeMap;
+use std::f64::consts::TAU;
+
+use rand::{Rng, RngExt};
+use twinstep_model::{BaseMount, JOINT_NAMES, Joint, JointKind, NUM_JOINTS, go2};
+use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+
+use crate::draw::{BaseSchedule, LogSetup};
+
+/// Rate of the log [Hz].
+pub const RATE_HZ: f64 = 200.0;
+/// Poses of [`Phase::Holds`], and how long each takes with the way to it [s].
+const POSES: usize = 12;
+const POSE_S: f64 = 1.0;
+const WAY_S: f64 = 0.35;
+/// A period of [`Phase::Sway`], and the part of it in which the robot moves [s].
+const SWAY_S: f64 = 3.0;
+const SWAYING_S: f64 = 2.2;
+
+/// What is done for a while.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Phase {
+    /// Every joint waves ever faster: inertia, viscous friction, delays.
+    Chirp,
+    /// Ramps of about 0.15 rad/s with reversals: friction at low speed, gear play.
+    Creep,
+    /// Squares with firmer gains: torque and speed limits, delays.
+    Steps,
+    /// Poses, one after the other: gravity, springs, gains.
+    Holds,
+    /// Slow waves of the trunk over standing feet, with holds: payload, offsets, ground.
+    Sway,
+}
+
+/// What a motion is drawn of.
+struct Style {
+    /// Of each joint [rad].
+    shift: [f64; NUM_JOINTS],
+    /// Factor on each joint's rate.
+    pace: [f64; NUM_JOINTS],
+    /// Of [`Phase::Holds`] [rad].
+    poses: [[f64; NUM_JOINTS]; POSES],
+    /// Highest frequency of the chirp [Hz].
+    chirp_hz: f64,
+    /// Position gains: soft, firm, standing [N·m/rad].
+    kp: [f64; 3],
+    /// [N·m·s/rad]
+    kd: f64,
+}
+
+impl Style {
+    fn draw(random: &mut impl Rng) -> Self {
+        let mut joints = |low: f64, high: f64| std::array::from_fn(|_| random.random_range(low..high));
+        let (shift, pace) = (joints(0.0, TAU), joints(0.8, 1.25));
+        let poses = std::array::from_fn(|_| joints(-0.35, 0.35));
+        let kp = [random.random_range(20.0..35.0), random.random_range(55.0..75.0), random.random_range(40.0..60.0)];
+        Self { shift, pace, poses, chirp_hz: random.random_range(4.0..6.0), kp, kd: random.random_range(0.6..1.0) }
+    }
+
+    /// Position gain in a phase.
+    fn kp(&self, phase: Phase) -> f64 {
+        match phase {
+            Phase::Steps => self.kp[1],
+            Phase::Sway => self.kp[2],
+            Phase::Chirp | Phase::Creep | Phase::Holds => self.kp[0],
+        }
+    }
+
+    /// Commanded offset from the default pose [rad], `time` [s] into a phase of `length` [s].
+    fn offset(&self, phase: Phase, joint: Joint, time: f64, length: f64) -> f64 {
+        let index = joint.index();
+        let (shift, pace) = (self.shift[index], self.pace[index]);
+        let reach = if joint.kind == JointKind::Hip { 0.75 } else { 1.0 };
+        let ease = (time / 0.3).min(1.0);
+        reach
+            * match phase {
+                Phase::Chirp => {
+                    let turns = (0.3 + 0.5 * (self.chirp_hz - 0.3) * time / length) * time;
+                    ease * 0.35 * (TAU * pace * turns + shift).sin()
+                }
+                Phase::Creep => ease * triangle(0.15 * pace * time / 0.8 + shift / TAU) * 0.2,
+                Phase::Steps => {
+                    // Away from the end of the calf's range: steps overshoot.
+                    let middle = if joint.kind == JointKind::Calf { -0.2 } else { 0.0 };
+                    middle + 0.34 * (TAU * 1.4 * pace * time + shift).sin().signum()
+                }
+                Phase::Holds => {
+                    let pose = ((time / POSE_S) as usize).min(POSES - 1);
+                    let before = if pose == 0 { 0.0 } else { self.poses[pose - 1][index] };
+                    let way = ((time - pose as f64 * POSE_S) / WAY_S).min(1.0);
+                    before + (self.poses[pose][index] - before) * way * way * (3.0 - 2.0 * way)
+                }
+                Phase::Sway => self.sway(joint, time) / reach,
+            }
+    }
+
+    /// Waves that lift, pitch, roll and shift the trunk while the feet stay; they stop now and then.
+    fn sway(&self, joint: Joint, time: f64) -> f64 {
+        let swaying = (time / SWAY_S).floor() * SWAYING_S + (time % SWAY_S).min(SWAYING_S);
+        let wave = |way: usize| {
+            let rates = [(0.31, 0.5), (0.57, 0.3), (0.97, 0.2)];
+            let waves = rates.iter().enumerate().map(|(index, (rate, part))| {
+                part * (TAU * rate * self.pace[way] * swaying + self.shift[(way + 5 * index) % 12]).sin()
+            });
+            time.min(1.0) * waves.sum::<f64>()
+        };
+        let (front, left) = (joint.leg.front_sign(), joint.leg.left_sign());
+        let length = 0.14 * wave(0) + 0.07 * front * wave(1) + 0.03 * left * wave(2);
+        match joint.kind {
+            JointKind::Hip => 0.05 * wave(3),
+            JointKind::Thigh => length + 0.06 * wave(4),
+            JointKind::Calf => -2.0 * length,
+        }
+    }
+}
+
+/// A triangle wave of period 1, from −1 to 1.
+fn triangle(turns: f64) -> f64 {
+    4.0 * ((turns - turns.floor()) - 0.5).abs() - 1.0
+}
+
+/// Phases with their lengths [s]; the base is fixed in all but the swaying.
+fn phases(place: BaseSchedule) -> &'static [(Phase, f64)] {
+    match place {
+        BaseSchedule::Fixed => &[(Phase::Chirp, 8.0), (Phase::Creep, 5.0), (Phase::Steps, 4.0), (Phase::Holds, 6.0)],
+        BaseSchedule::Floating => &[(Phase::Sway, 22.0)],
+        BaseSchedule::FixedThenFloating => {
+            &[(Phase::Chirp, 5.0), (Phase::Creep, 4.0), (Phase::Steps, 2.5), (Phase::Holds, 4.0), (Phase::Sway, 9.0)]
+        }
+    }
+}
+
+/// The commands of a case, with voltage and temperatures where they are measured.
+pub fn motion(setting: LogSetup, random: &mut impl Rng) -> Log {
+    let style = Style::draw(random);
+    let mut columns = BTreeMap::<String, Vec<f64>>::new();
+    for (phase, length) in phases(setting.place) {
+        for row in 0..(length * RATE_HZ) as usize {
+            let time = row as f64 / RATE_HZ;
+            let t = columns.get("t").map_or(0, Vec::len) as f64 / RATE_HZ;
+            let mut cell = |name: String, value: f64| columns.entry(name).or_default().push(value);
+            cell("t".to_owned(), t);
+            let second = setting.place == BaseSchedule::FixedThenFloating && *phase == Phase::Sway;
+            cell("segment".to_owned(), f64::from(u8::from(second)));
+            cell("kp".to_owned(), style.kp(*phase));
+            cell("kd".to_owned(), style.kd);
+            for joint in Joint::ALL {
+                let pose = go2().control.default_pose[joint.index()];
+                cell(format!("q_cmd_{}", joint.name()), pose + style.offset(*phase, joint, time, *length));
+            }
+            if setting.battery {
+                cell("battery_V".to_owned(), voltage(t, style.shift[0]));
+            }
+            if setting.temperature {
+                for (index, name) in JOINT_NAMES.iter().enumerate() {
+                    cell(format!("temp_{name}"), temperature(t, style.pace[index]));
+                }
+            }
+        }
+    }
+    let segment = |name: &str, base| Segment { name: name.to_owned(), base };
+    let (air, stance) = (segment("air", BaseMount::Fixed), segment("stance", BaseMount::Floating));
+    let segments = match setting.place {
+        BaseSchedule::Fixed => vec![air],
+        BaseSchedule::Floating => vec![stance],
+        BaseSchedule::FixedThenFloating => vec![air, stance],
+    };
+    let mut meta = Meta::new(RATE_HZ, TorqueSensor::MotorCurrent, segments);
+    meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
+    Log::new_commands(meta, columns).expect("a motion")
+}
+
+/// A battery that empties and sags under loads that come and go [V].
+fn voltage(t: f64, shift: f64) -> f64 {
+    let load = 0.5 + 0.3 * (TAU * t / 3.7 + shift).sin() + 0.2 * (TAU * t / 1.3).sin();
+    29.4 - 0.05 * t - 3.5 * load
+}
+
+/// A motor that heats up [°C]; faster than real ones, so that half a minute tells.
+fn temperature(t: f64, pace: f64) -> f64 {
+    30.0 + 50.0 * (1.0 - (-t * pace / 12.0).exp())
+}
+
+#[cfg(test)]
+mod tests {
+    use twinstep_model::stream;
+
+    use super::*;
+
+    #[test]
+    fn commands_stay_inside_the_joints_ranges() {
+        for (place, seed) in [BaseSchedule::Fixed, BaseSchedule::Floating, BaseSchedule::FixedThenFloating].into_iter().zip(0..) {
+            let setting = LogSetup { place, torque: true, battery: true, temperature: true };
+            let motion = motion(setting, &mut stream(seed, "test", 0));
+            assert!((20.0..25.0).contains(&(motion.rows() as f64 / RATE_HZ)), "20 to 25 s");
+            for joint in Joint::ALL {
+                let [low, high] = go2().joints[joint.index()].range;
+                let cells = motion.q_cmd(joint.name()).expect("commanded");
+                assert!(cells.iter().all(|cell| (low + 0.1..high - 0.1).contains(cell)), "{place:?} {joint}");
+            }
+        }
+    }
+}

@@ -1,0 +1,223 @@
+//! The table and the confusion matrix of a game, in markdown.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write as _;
+
+use crate::CaseResult;
+use crate::draw::CaseKind;
+use crate::score::{EffectScore, ErrorReduction};
+
+/// What stands in the matrix for no name.
+const NONE: &str = "(none)";
+
+/// All that a game says.
+pub fn text(rounds: &[CaseResult]) -> String {
+    let mut text = format!("{} cases\n\n", rounds.len());
+    text += &rates(rounds);
+    text += &numbers(rounds);
+    text += "\nFirst name given (columns) for what was hidden (rows):\n\n";
+    text + &matrix(rounds)
+}
+
+/// k of n with its 95 % interval: `12 of 13: 92 % (67 to 99)`.
+fn rate(label: &str, aim: &str, outcomes: impl Iterator<Item = bool>) -> String {
+    let outcomes: Vec<_> = outcomes.collect();
+    let (count, hits) = (outcomes.len(), outcomes.iter().filter(|hit| **hit).count());
+    if count == 0 {
+        return format!("| {label} | {aim} | no case | |\n");
+    }
+    let [low, high] = wilson(hits, count);
+    let percent = |share: f64| format!("{:.0}", 100.0 * share);
+    let share = percent(hits as f64 / count as f64);
+    format!("| {label} | {aim} | {hits} of {count}: {share} % | {} to {} % |\n", percent(low), percent(high))
+}
+
+/// Wilson's 95 % interval of a binomial rate.
+fn wilson(hits: usize, count: usize) -> [f64; 2] {
+    const Z: f64 = 1.959_964;
+    let (n, rate) = (count as f64, hits as f64 / count as f64);
+    let middle = rate + Z * Z / (2.0 * n);
+    let reach = Z * (rate * (1.0 - rate) / n + Z * Z / (4.0 * n * n)).sqrt();
+    [middle - reach, middle + reach].map(|end| (end / (1.0 + Z * Z / n)).clamp(0.0, 1.0))
+}
+
+fn rates(rounds: &[CaseResult]) -> String {
+    let of = |kind: CaseKind| rounds.iter().filter(move |round| round.kind == kind);
+    let hits = |kind: CaseKind| of(kind).flat_map(|round| &round.verdict.hits);
+    let mut text = "| | goal | rate | 95 % interval |\n|---|---|---|---|\n".to_owned();
+    for (kind, size, first, three, scope) in [
+        (CaseKind::LargeEffect, "half the range or more", ">= 90 %", ">= 97 %", ">= 92 %"),
+        (CaseKind::SmallEffect, "a fifth of the range", ">= 70 %", "", ""),
+    ] {
+        text += &rate(&format!("{size}: right name first"), first, hits(kind).map(|hit| hit.first));
+        text += &rate(&format!("{size}: said it could be the right one"), "", hits(kind).map(|hit| hit.ambiguous));
+        text += &rate(&format!("{size}: in first three"), three, hits(kind).map(|hit| hit.in_top_3));
+        text += &rate(&format!("{size}: right scope"), scope, hits(kind).map(|hit| hit.scope_right));
+        text += &rate(&format!("{size}: a wrong name, also"), "", of(kind).map(|round| round.verdict.wrong_names > 0));
+    }
+    let named = |kind: CaseKind| of(kind).map(|round| !round.verdict.named.is_empty());
+    text += &rate("nothing hidden: a name is given", "<= 3 %", named(CaseKind::Healthy));
+    text += &rate("outside the catalogue: a wrong name", "<= 10 %", named(CaseKind::UnmodelledEffect));
+    let depends_on = of(CaseKind::UnmodelledEffect).filter_map(|round| round.verdict.depends_on);
+    text += &rate("outside the catalogue: what it depends on is right", ">= 50 %", depends_on);
+    let both = |good: fn(&EffectScore) -> bool| of(CaseKind::TwoEffects).map(move |round| round.verdict.hits.iter().all(good));
+    text += &rate("two effects: both named", ">= 65 %", both(|hit| hit.named));
+    text += &rate("two effects: both named, with their scopes", "", both(|hit| hit.named && hit.scope_right));
+    let sizes = rounds.iter().flat_map(|round| &round.verdict.hits).filter_map(|hit| hit.size);
+    text += &rate("size within its 95 % interval", "88 to 99 %", sizes.map(|size| size.covered));
+    text + &rate("the diagnosis died", "none", rounds.iter().map(|round| round.error.is_some()))
+}
+
+fn numbers(rounds: &[CaseResult]) -> String {
+    let sizes = rounds.iter().flat_map(|round| &round.verdict.hits).filter_map(|hit| hit.size);
+    let removed = |of: fn(&ErrorReduction) -> Option<f64>| rounds.iter().filter_map(move |round| of(&round.verdict.removed));
+    let seconds = rounds.iter().map(|round| round.seconds);
+    let line = |label: &str, goal: &str, value: Option<f64>, unit: &str, scale: f64| {
+        let value = value.map_or("no case".to_owned(), |value| format!("{:.1} {unit}", scale * value));
+        format!("| {label} | {goal} | {value} | |\n")
+    };
+    let share = "% of what the truth removes";
+    let mut text = line("median error of size", "<= 10 %", median(sizes.map(|size| size.error)), "%", 100.0);
+    for (label, shares) in [
+        ("held-out torque error removed, median", median(removed(|removed| removed.torque))),
+        ("held-out motion error removed, median", median(removed(|removed| removed.motion))),
+    ] {
+        text += &line(label, ">= 85 %", shares, share, 100.0);
+    }
+    text += &line("time of a diagnosis, median", "", median(seconds.clone()), "s", 1.0);
+    text += &line("time of a diagnosis, longest", "", seconds.reduce(f64::max), "s", 1.0);
+    let penalty = rounds.iter().map(penalty).sum::<usize>() as f64 / rounds.len().max(1) as f64;
+    text + &line("penalty a case: 1 for each effect not named, 2 for each wrong name", "", Some(penalty), "", 1.0)
+}
+
+fn penalty(round: &CaseResult) -> usize {
+    round.verdict.hits.iter().filter(|hit| !hit.named).count() + 2 * round.verdict.wrong_names
+}
+
+fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let mut values: Vec<_> = values.collect();
+    values.sort_by(f64::total_cmp);
+    let (half, odd) = (values.len() / 2, values.len() % 2 == 1);
+    let upper = *values.get(half)?;
+    Some(if odd { upper } else { 0.5 * (values[half - 1] + upper) })
+}
+
+/// What was hidden in cases of at most one thing, and how often each name was given first.
+fn matrix(rounds: &[CaseResult]) -> String {
+    let mut counts = BTreeMap::<(&str, &str), usize>::new();
+    for round in rounds.iter().filter(|round| round.kind != CaseKind::TwoEffects) {
+        let hidden = match round.kind {
+            CaseKind::Healthy => NONE,
+            CaseKind::UnmodelledEffect => "(outside)",
+            CaseKind::LargeEffect | CaseKind::SmallEffect | CaseKind::TwoEffects => round.verdict.hits.first().map_or(NONE, |hit| &hit.effect),
+        };
+        let named = round.verdict.named.first().and_then(|named| named.split('@').next()).unwrap_or(NONE);
+        *counts.entry((hidden, named)).or_default() += 1;
+    }
+    let rows: BTreeSet<_> = counts.keys().map(|(hidden, _)| *hidden).collect();
+    let columns: BTreeSet<_> = counts.keys().map(|(_, named)| *named).collect();
+    let mut text = "| hidden".to_owned();
+    for named in &columns {
+        let _ = write!(text, " | {named}");
+    }
+    let _ = writeln!(text, " |\n|---{}|", "|---".repeat(columns.len()));
+    for hidden in rows {
+        let _ = write!(text, "| {hidden}");
+        for named in &columns {
+            let count = counts.get(&(hidden, *named)).map_or(String::new(), ToString::to_string);
+            let _ = write!(text, " | {count}");
+        }
+        text += " |\n";
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use expect_test::expect;
+    use twinstep_diagnose::RmsErrors;
+
+    use super::*;
+    use crate::draw::{BaseSchedule, LogSetup};
+    use crate::score::{Size, Score};
+
+    fn round(kind: CaseKind, hidden: &[&str], named: &[&str]) -> CaseResult {
+        let hit = |name: &&str| EffectScore {
+            effect: (*name).to_owned(),
+            scope: "all".to_owned(),
+            named: named.contains(name),
+            first: named.first() == Some(name),
+            ambiguous: false,
+            in_top_3: named.contains(name),
+            scope_right: named.contains(name),
+            size: named.contains(name).then_some(Size { covered: true, error: 0.04 }),
+        };
+        let verdict = Score {
+            named: named.iter().map(|name| format!("{name}@all")).collect(),
+            hits: hidden.iter().map(hit).collect(),
+            wrong_names: named.iter().filter(|name| !hidden.contains(name)).count(),
+            depends_on: (kind == CaseKind::UnmodelledEffect).then_some(true),
+            removed: ErrorReduction { torque: None, motion: Some(0.9) },
+        };
+        let setting = LogSetup { place: BaseSchedule::Fixed, torque: true, battery: false, temperature: false };
+        let (nominal, truth) = (RmsErrors::default(), RmsErrors::default());
+        CaseResult { seed: 0, case: 0, kind, setting, outside: None, nominal, truth, verdict, error: None, seconds: 12.0 }
+    }
+
+    #[test]
+    fn interval_is_wilsons() {
+        let [low, high] = wilson(9, 10);
+        assert!((low - 0.5958).abs() < 1e-4 && (high - 0.9821).abs() < 1e-4, "{low} {high}");
+        assert_eq!(wilson(0, 20)[0], 0.0);
+    }
+
+    #[test]
+    fn game_of_five_cases_reads_so() {
+        let rounds = [
+            round(CaseKind::LargeEffect, &["armature"], &["armature"]),
+            round(CaseKind::LargeEffect, &["drive_lag"], &["torque_delay"]),
+            round(CaseKind::Healthy, &[], &[]),
+            round(CaseKind::UnmodelledEffect, &[], &[]),
+            round(CaseKind::TwoEffects, &["armature", "payload"], &["payload"]),
+        ];
+        expect![[r#"
+            5 cases
+
+            | | goal | rate | 95 % interval |
+            |---|---|---|---|
+            | half the range or more: right name first | >= 90 % | 1 of 2: 50 % | 9 to 91 % |
+            | half the range or more: said it could be the right one |  | 0 of 2: 0 % | 0 to 66 % |
+            | half the range or more: in first three | >= 97 % | 1 of 2: 50 % | 9 to 91 % |
+            | half the range or more: right scope | >= 92 % | 1 of 2: 50 % | 9 to 91 % |
+            | half the range or more: a wrong name, also |  | 1 of 2: 50 % | 9 to 91 % |
+            | a fifth of the range: right name first | >= 70 % | no case | |
+            | a fifth of the range: said it could be the right one |  | no case | |
+            | a fifth of the range: in first three |  | no case | |
+            | a fifth of the range: right scope |  | no case | |
+            | a fifth of the range: a wrong name, also |  | no case | |
+            | nothing hidden: a name is given | <= 3 % | 0 of 1: 0 % | 0 to 79 % |
+            | outside the catalogue: a wrong name | <= 10 % | 0 of 1: 0 % | 0 to 79 % |
+            | outside the catalogue: what it depends on is right | >= 50 % | 1 of 1: 100 % | 21 to 100 % |
+            | two effects: both named | >= 65 % | 0 of 1: 0 % | 0 to 79 % |
+            | two effects: both named, with their scopes |  | 0 of 1: 0 % | 0 to 79 % |
+            | size within its 95 % interval | 88 to 99 % | 2 of 2: 100 % | 34 to 100 % |
+            | the diagnosis died | none | 0 of 5: 0 % | 0 to 43 % |
+            | median error of size | <= 10 % | 4.0 % | |
+            | held-out torque error removed, median | >= 85 % | no case | |
+            | held-out motion error removed, median | >= 85 % | 90.0 % of what the truth removes | |
+            | time of a diagnosis, median |  | 12.0 s | |
+            | time of a diagnosis, longest |  | 12.0 s | |
+            | penalty a case: 1 for each effect not named, 2 for each wrong name |  | 0.8  | |
+
+            First name given (columns) for what was hidden (rows):
+
+            | hidden | (none) | armature | torque_delay |
+            |---|---|---|---|
+            | (none) | 1 |  |  |
+            | (outside) | 1 |  |  |
+            | armature |  | 1 |  |
+            | drive_lag |  |  | 1 |
+        "#]]
+        .assert_eq(&text(&rounds));
+    }
+}

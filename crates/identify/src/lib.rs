@@ -1,0 +1,49 @@
+//! System identification: measured logs compared with simulations, and parameters estimated from them.
+//!
+//! - [`motion`]: the commands of a log, row by row, in actuator periods.
+//! - [`record()`]: runs a motion on a robot in a backend and returns the log.
+//! - [`apply_sensors()`]: sensor noise and resolution on an exact log.
+//! - [`Experiment`]: a log cut into windows that are simulated from measured states, with residuals in units of noise.
+//! - [`EffectAtScope`]: an effect to estimate, as in `coulomb_friction@calf`.
+//! - [`replay`]: measured and simulated positions joint by joint.
+//! - [`evaluate()`]: the errors of a model on a log; [`position_errors`]: the same over time.
+//! - [`InverseDynamicsResidual`]: torque of the model's actuators minus the inverse dynamics, row by row.
+//! - [`FreeParameter`]: a parameter of a model file that is estimated, with bounds and prior.
+//! - [`GlobalSearch`]: CMA-ES, which can be interrupted and resumed.
+//! - [`NuisanceModel`]: nuisance parameters, eliminated by generalised least squares.
+//! - [`identify()`]: CMA-ES, then Levenberg-Marquardt, then intervals and identifiability.
+//!
+//! The simulator is a [`twinstep_model::Rollout`]; this crate depends on no engine.
+
+mod cmaes;
+mod effect_list;
+pub mod evaluate;
+pub mod experiment;
+mod global_search;
+pub mod identify;
+mod inverse_dynamics;
+pub mod least_squares;
+pub mod motion;
+pub mod nuisance;
+mod operating_conditions;
+pub mod parameter;
+mod record;
+pub mod replay;
+pub mod refine;
+mod sensors;
+pub mod torque;
+pub mod window;
+
+pub use effect_list::{DEFAULT_EFFECTS, EffectAtScope, EffectAtScopeError, UnknownEffect, default_effects, named};
+pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};
+pub use experiment::{Experiment, ExperimentError};
+pub use global_search::GlobalSearch;
+pub use identify::{
+    EstimateStatus, Identification, IdentifyError, IdentifyOptions, IdentifyProgress, ParameterEstimate, Stage, identify,
+};
+pub use inverse_dynamics::{InverseDynamicsResidual, JointSeries, JointTrajectory};
+pub use nuisance::NuisanceModel;
+pub use parameter::{FreeParameter, candidate, free_parameters, initial_coordinate, with_values};
+pub use record::{RecordError, record};
+pub use sensors::{Sensor, apply_sensors};
+pub use window::WindowConfig;

@@ -1,0 +1,73 @@
+//! What supply and heat leave of the motors' torque.
+
+use twinstep_logs::Log;
+use twinstep_model::{Derating, JOINT_NAMES, NUM_JOINTS};
+
+/// Supply voltage and motor temperatures of a log, by row; empty where it tells neither.
+#[derive(Clone, Debug)]
+pub struct OperatingConditions(Vec<Condition>);
+
+#[derive(Clone, Copy, Debug)]
+struct Condition {
+    /// Voltage over the highest of the log; 1 where it is not known.
+    voltage: f64,
+    /// Of each motor [°C]; NaN where it is not known.
+    temperature: [f64; NUM_JOINTS],
+}
+
+impl OperatingConditions {
+    /// Those of `log`.
+    pub fn of(log: &Log) -> Self {
+        let voltages = log.channel("battery_V");
+        let temperatures = JOINT_NAMES.map(|name| log.channel(&format!("temp_{name}")));
+        if voltages.is_none() && temperatures.iter().all(Option::is_none) {
+            return Self(Vec::new());
+        }
+        let finite = voltages.into_iter().flatten().copied().filter(|cell| cell.is_finite());
+        let highest = finite.fold(f64::MIN_POSITIVE, f64::max);
+        let row = |row: usize| Condition {
+            voltage: voltages.map(|cells| cells[row] / highest).filter(|ratio| ratio.is_finite()).unwrap_or(1.0),
+            temperature: temperatures.map(|cells| cells.map_or(f64::NAN, |cells| cells[row])),
+        };
+        Self((0..log.rows()).map(row).collect())
+    }
+
+    /// True if supply and heat cannot show: the log tells neither.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Share of each joint's torque that is left in `row`.
+    pub fn derating_factors(&self, derating: &Derating, row: usize) -> [f32; NUM_JOINTS] {
+        let Some(condition) = self.0.get(row) else { return [1.0; NUM_JOINTS] };
+        std::array::from_fn(|joint| derating.derating_factor(joint, condition.voltage, condition.temperature[joint]) as f32)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use twinstep_logs::{Meta, TorqueSensor};
+
+    use super::*;
+
+    #[test]
+    fn motors_weaken_with_the_voltage_and_above_their_temperature() {
+        let segments = vec![twinstep_logs::Segment { name: "air".to_owned(), base: twinstep_model::BaseMount::Fixed }];
+        let column = |name: &str, cells: [f64; 3]| (name.to_owned(), cells.to_vec());
+        let columns = [
+            column("t", [0.0, 0.005, 0.01]),
+            column("q_FL_hip", [0.0; 3]),
+            column("q_cmd_FL_hip", [0.0; 3]),
+            column("kp", [20.0; 3]),
+            column("kd", [0.5; 3]),
+            column("battery_V", [25.0, 20.0, f64::NAN]),
+            column("temp_FL_hip", [30.0, f64::NAN, 55.0]),
+        ];
+        let log = Log::new(Meta::new(200.0, TorqueSensor::None, segments), columns).expect("a log");
+        let conditions = OperatingConditions::of(&log);
+        let mut derating = Derating { voltage_exponent: 2.0, ..Derating::NONE };
+        derating.per_kelvin[0] = 0.01;
+        let shares = [0, 1, 2].map(|row| conditions.derating_factors(&derating, row)[..2].to_vec());
+        assert_eq!(shares, [[1.0, 1.0], [0.64, 0.64], [0.8, 1.0]]);
+    }
+}

@@ -1,0 +1,247 @@
+//! A motion through a robot in a backend, as a measured log.
+
+use std::ops::Range;
+
+use twinstep_model::{BaseMount, Backend, Ground, FIXED_BASE_HEIGHT, JOINT_NAMES, Joint, Leg, InitialState, RobotModel, RobotStates};
+use twinstep_logs::{Gain, Log, LogError, Meta, Segment, TorqueSensor};
+
+use crate::operating_conditions::OperatingConditions;
+use crate::motion::{ActuatorClock, SimulationFailure, JointCommands, MotionError, command, joint_commands};
+
+/// Why a motion gave no log.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordError {
+    /// Its commands cannot be given to the robot.
+    #[error(transparent)]
+    Motion(#[from] MotionError),
+    /// There is no such simulation.
+    #[error(transparent)]
+    Backend(Box<dyn std::error::Error + Send + Sync>),
+    /// The simulation failed.
+    #[error(transparent)]
+    Failed(SimulationFailure),
+    /// What was recorded is no log.
+    #[error(transparent)]
+    Log(#[from] LogError),
+    /// `progress` ended it.
+    #[error("ended before the motion's last row")]
+    Interrupted,
+}
+
+/// What `robot` does when it is commanded as `motion` has it, in backends of one robot each that `backend` makes for a held
+/// or a floating base; `base` goes before that of the segments.
+///
+/// `progress` receives the number of rows done, and may end it.
+pub fn record<B: Backend>(
+    motion: &Log,
+    robot: &RobotModel,
+    base: Option<BaseMount>,
+    mut backend: impl FnMut(BaseMount) -> Result<B, RecordError>,
+    source: String,
+    progress: &mut dyn FnMut(usize) -> bool,
+) -> Result<Log, RecordError> {
+    let player = CommandPlayer {
+        motion,
+        robot,
+        joints: joint_commands(motion)?,
+        clock: ActuatorClock::of(motion, robot)?,
+        conditions: OperatingConditions::of(motion),
+    };
+    let base_of = |segment: &Segment| base.unwrap_or(segment.base);
+    let mut record = Record::default();
+    for (segment, rows) in motion.segments() {
+        let base = base_of(segment);
+        player.part(backend(base)?, &segment.name, base, rows, &mut record, progress)?;
+    }
+    let segments = &motion.meta().segments;
+    let segments = segments.iter().map(|segment| Segment { base: base_of(segment), ..segment.clone() }).collect();
+    Ok(player.log(record, segments, source)?)
+}
+
+/// What the robot did, with one entry a row.
+#[derive(Default)]
+struct Record {
+    /// As [`sensor_names`].
+    sensors: Vec<Vec<f64>>,
+    /// Mean torque of each joint from the row to the next [N·m].
+    tau_measured: Vec<Vec<f64>>,
+}
+
+/// Channels of [`sensors`] that every log has; the rest is of the moving trunk.
+const JOINT_CHANNELS: usize = 2 * JOINT_NAMES.len();
+
+fn sensor_names() -> Vec<String> {
+    let of = |quantity: &'static str, parts: &[&str]| {
+        parts.iter().map(|part| format!("{quantity}_{part}")).collect::<Vec<_>>()
+    };
+    let xyz = ["x", "y", "z"];
+    [
+        of("q", &JOINT_NAMES),
+        of("dq", &JOINT_NAMES),
+        of("pos", &xyz),
+        of("quat", &["w", "x", "y", "z"]),
+        of("vel", &xyz),
+        of("gyro", &xyz),
+        of("foot_force", &Leg::ALL.map(Leg::name)),
+    ]
+    .concat()
+}
+
+/// The sensors of one row; no force is known before the first step.
+fn sensors(states: &RobotStates, stepped: bool) -> Vec<f64> {
+    let foot_force = if stepped { states.foot_force[0] } else { [f32::NAN; 4] };
+    let channels: [&[f32]; 7] = [
+        &states.q[0],
+        &states.dq[0],
+        &states.base_position[0],
+        &states.base_orientation[0],
+        &states.base_linear_velocity[0],
+        &states.base_angular_velocity[0],
+        &foot_force,
+    ];
+    channels.into_iter().flatten().copied().map(f64::from).collect()
+}
+
+/// A motion and the robot that it is for.
+struct CommandPlayer<'a> {
+    motion: &'a Log,
+    robot: &'a RobotModel,
+    joints: Vec<JointCommands<'a>>,
+    clock: ActuatorClock,
+    conditions: OperatingConditions,
+}
+
+impl CommandPlayer<'_> {
+    /// Plays rows that follow one another.
+    fn part<B: Backend>(
+        &self,
+        mut backend: B,
+        segment: &str,
+        base: BaseMount,
+        rows: Range<usize>,
+        record: &mut Record,
+        progress: &mut dyn FnMut(usize) -> bool,
+    ) -> Result<(), RecordError> {
+        let t = &self.motion.t()[rows.clone()];
+        let failed = |row: usize| {
+            let (segment, t) = (segment.to_owned(), t[row - rows.start]);
+            move |cause| RecordError::Failed(SimulationFailure { segment, row: row + 1, t, cause })
+        };
+        backend.reset(&[(0, self.placement(&backend.ground(), base, rows.start))]).map_err(failed(rows.start))?;
+        for row in rows.clone() {
+            record.sensors.push(sensors(backend.states(), row > rows.start));
+            let mut sums = [0.0; JOINT_NAMES.len()];
+            let periods = if row + 1 < rows.end { self.clock.periods_between(t, row - rows.start) } else { 0 };
+            let mut command = command(self.robot, &self.joints, row);
+            command.derating_factor = self.conditions.derating_factors(&self.robot.derating, row);
+            for _ in 0..periods {
+                backend.step(&[command], &[true], 1).map_err(failed(row))?;
+                for (sum, torque) in sums.iter_mut().zip(backend.states().tau[0]) {
+                    *sum += f64::from(torque);
+                }
+            }
+            // Of no period the mean is not a number: the part's last row has no torque.
+            record.tau_measured.push(sums.map(|sum| sum / periods as f64).to_vec());
+            if !progress(row + 1) {
+                return Err(RecordError::Interrupted);
+            }
+        }
+        Ok(())
+    }
+
+    /// Where the robot starts: the default pose, but for what the motion measured in `row`.
+    fn placement(&self, ground: &Ground, base: BaseMount, row: usize) -> InitialState {
+        let cell =
+            |name: &str| self.motion.channel(name).map(|cells| cells[row] as f32).filter(|cell| cell.is_finite());
+        let mut q = self.robot.control.default_pose_f32();
+        let mut dq = [0.0; JOINT_NAMES.len()];
+        for (index, name) in JOINT_NAMES.iter().enumerate() {
+            q[index] = cell(&format!("q_{name}")).unwrap_or(q[index]);
+            dq[index] = cell(&format!("dq_{name}")).unwrap_or(0.0);
+        }
+        let start = match base {
+            BaseMount::Floating => InitialState::standing_on(ground, self.robot, q, 0.0),
+            BaseMount::Fixed => InitialState::at_rest(FIXED_BASE_HEIGHT as f32, q),
+        };
+        let vector = |quantity: &str| {
+            let [x, y, z] = ["x", "y", "z"].map(|axis| cell(&format!("{quantity}_{axis}")));
+            Some([x?, y?, z?])
+        };
+        let orientation = || {
+            let [w, x, y, z] = ["w", "x", "y", "z"].map(|part| cell(&format!("quat_{part}")));
+            Some([w?, x?, y?, z?])
+        };
+        InitialState {
+            base_position: vector("pos").unwrap_or(start.base_position),
+            base_orientation: orientation().unwrap_or(start.base_orientation),
+            base_linear_velocity: vector("vel").unwrap_or(start.base_linear_velocity),
+            base_angular_velocity: vector("gyro").unwrap_or(start.base_angular_velocity),
+            dq,
+            ..start
+        }
+    }
+
+    fn log(&self, record: Record, segments: Vec<Segment>, source: String) -> Result<Log, LogError> {
+        let motion = self.motion;
+        let floating = segments.iter().any(|segment| segment.base == BaseMount::Floating);
+        let index = |cells: &[u32]| cells.iter().map(|cell| f64::from(*cell)).collect();
+        let mut columns = vec![
+            ("t".to_owned(), motion.t().to_vec()),
+            ("segment".to_owned(), index(motion.segment())),
+            ("episode".to_owned(), index(motion.episode())),
+        ];
+        let channel = |rows: &[Vec<f64>], channel: usize| rows.iter().map(|row| row[channel]).collect();
+        let names = sensor_names();
+        let kept = if floating { names.len() } else { JOINT_CHANNELS };
+        for (place, name) in names.into_iter().take(kept).enumerate() {
+            columns.push((name, channel(&record.sensors, place)));
+        }
+        for (joint, name) in JOINT_NAMES.iter().enumerate() {
+            columns.push((format!("tau_measured_{name}"), channel(&record.tau_measured, joint)));
+        }
+        let mut meta = Meta {
+            policy_hz: motion.meta().policy_hz,
+            joints: JOINT_NAMES.map(str::to_owned).to_vec(),
+            pd: Some(format!("PD at {} Hz, held, clipped to the torque limit", self.robot.control.actuator_hz)),
+            source: Some(source),
+            // The ideal actuator's torque, before rotor and friction.
+            ..Meta::new(motion.meta().rate_hz, TorqueSensor::MotorCurrent, segments)
+        };
+        self.commands(&mut meta, &mut columns);
+        // Voltage and temperature are given, not simulated.
+        let given = motion.channels().filter(|(name, _)| *name == "battery_V" || name.starts_with("temp_"));
+        columns.extend(given.map(|(name, cells)| (name.to_owned(), cells.to_vec())));
+        Log::new(meta, columns)
+    }
+
+    /// The commands as they were given, of all twelve joints; gains that never change go to the description.
+    fn commands(&self, meta: &mut Meta, columns: &mut Vec<(String, Vec<f64>)>) {
+        let (rows, control) = (self.motion.rows(), &self.robot.control);
+        let [mut kp, mut kd] = [Vec::new(), Vec::new()];
+        for joint in Joint::ALL {
+            let name = joint.name();
+            let given = self.joints.iter().find(|commands| commands.joint == joint);
+            let held = || vec![control.default_pose[joint.index()]; rows];
+            columns.push((format!("q_cmd_{name}"), given.map_or_else(held, |given| given.q_cmd.to_vec())));
+            let optional =
+                [("dq_cmd", given.and_then(|given| given.dq_cmd)), ("tau_ff", given.and_then(|given| given.tau_ff))];
+            for (quantity, cells) in optional {
+                if let Some(cells) = cells {
+                    columns.push((format!("{quantity}_{name}"), cells.to_vec()));
+                }
+            }
+            kp.push(given.and_then(|given| given.kp.clone()).unwrap_or_else(|| vec![control.kp; rows]));
+            kd.push(given.and_then(|given| given.kd.clone()).unwrap_or_else(|| vec![control.kd; rows]));
+        }
+        for (quantity, gains, constant) in [("kp", kp, &mut meta.kp), ("kd", kd, &mut meta.kd)] {
+            if gains.iter().all(|cells| cells.iter().all(|cell| *cell == cells[0])) {
+                let first: Vec<_> = gains.iter().map(|cells| cells[0]).collect();
+                let same = first.iter().all(|gain| *gain == first[0]);
+                *constant = Some(if same { Gain::Uniform(first[0]) } else { Gain::PerJoint(first) });
+            } else {
+                let names = JOINT_NAMES.iter().map(|name| format!("{quantity}_{name}"));
+                columns.extend(names.zip(gains));
+            }
+        }
+    }
+}

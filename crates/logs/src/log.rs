@@ -1,0 +1,289 @@
+//! Measured log in memory.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::path::Path;
+
+use twinstep_model::Joint;
+
+use crate::check::{self, LogKind};
+use crate::columns::Column;
+use crate::files::{Files, Format};
+use crate::meta::{Gain, Meta, Segment};
+use crate::table::Table;
+use crate::{LogError, csv_table, mcap_file, parquet_table};
+
+/// Commands and measurements of a robot, row by row. The contents are validated.
+///
+/// The sensors of a row are sampled at its `t`. Its commands are in force from `t` to the next row, and `tau_measured`
+/// is the mean over that interval. Two logs are equal if their metadata and columns are equal. Ignored columns do not
+/// count, and missing cells are equal to each other.
+#[derive(Clone, Debug)]
+pub struct Log {
+    pub(crate) meta: Meta,
+    pub(crate) t: Vec<f64>,
+    pub(crate) segment: Vec<u32>,
+    pub(crate) episode: Vec<u32>,
+    pub(crate) joints: Vec<String>,
+    pub(crate) channels: BTreeMap<String, Vec<f64>>,
+    pub(crate) ignored: Vec<String>,
+    pub(crate) notes: Vec<String>,
+}
+
+impl Log {
+    /// Reads a log from its folder or its data file.
+    ///
+    /// A folder contains `meta.json` and one of `data.parquet`, `data.csv`, `data.csv.gz` and `data.mcap`. The metadata
+    /// of a data file `walk.csv` is `walk.json` or `meta.json` in the same folder. MCAP needs no metadata file: a file
+    /// that [`Log::write`] wrote contains its metadata, and for other recordings default metadata are used.
+    pub fn open(path: impl AsRef<Path>) -> Result<Log, LogError> {
+        read(path.as_ref(), LogKind::Measurement)
+    }
+
+    /// Reads a motion file: a log that needs only command columns, and no gains.
+    ///
+    /// A measured log is also a valid motion file.
+    pub fn open_commands(path: impl AsRef<Path>) -> Result<Log, LogError> {
+        read(path.as_ref(), LogKind::Commands)
+    }
+
+    /// Creates a log from columns in memory, validated like a file. A missing cell is NaN.
+    pub fn new(meta: Meta, columns: impl IntoIterator<Item = (String, Vec<f64>)>) -> Result<Log, LogError> {
+        from_columns(meta, columns, LogKind::Measurement)
+    }
+
+    /// Creates a log from command columns in memory, as [`Log::open_commands`] reads them.
+    pub fn new_commands(meta: Meta, columns: impl IntoIterator<Item = (String, Vec<f64>)>) -> Result<Log, LogError> {
+        from_columns(meta, columns, LogKind::Commands)
+    }
+
+    /// Returns the metadata.
+    pub fn meta(&self) -> &Meta {
+        &self.meta
+    }
+
+    /// Returns the time of each row [s], which increases within a segment of an episode.
+    pub fn t(&self) -> &[f64] {
+        &self.t
+    }
+
+    /// Returns the index of each row's segment in the metadata; zeros if the file has no such column.
+    pub fn segment(&self) -> &[u32] {
+        &self.segment
+    }
+
+    /// Returns the episode of each row, which changes when the robot is reset; zeros if the file has no such column.
+    pub fn episode(&self) -> &[u32] {
+        &self.episode
+    }
+
+    /// Returns the names of the joints, in the order of the metadata, or else of their columns.
+    pub fn joints(&self) -> &[String] {
+        &self.joints
+    }
+
+    /// Returns the joints, in the order of [`Log::joints`]. Returns `None` if one is not a joint of the Go2.
+    pub fn go2_joints(&self) -> Option<Vec<Joint>> {
+        self.joints.iter().map(|joint| joint.parse().ok()).collect()
+    }
+
+    /// Returns the ignored columns of the file: unknown names, and joints that the metadata do not list.
+    pub fn ignored(&self) -> &[String] {
+        &self.ignored
+    }
+
+    /// Returns the warnings from reading the file, as sentences.
+    pub fn read_warnings(&self) -> &[String] {
+        &self.notes
+    }
+
+    /// Returns the number of rows, at least one.
+    pub fn rows(&self) -> usize {
+        self.t.len()
+    }
+
+    /// Returns the recorded time [s], without the pauses between the ranges of [`Log::segments`].
+    pub fn duration_s(&self) -> f64 {
+        self.segments().map(|(_, rows)| self.t[rows.end - 1] - self.t[rows.start]).sum()
+    }
+
+    /// Returns the contiguous ranges of rows in one segment of one episode, each with its segment.
+    pub fn segments(&self) -> impl Iterator<Item = (&Segment, Range<usize>)> {
+        contiguous_ranges(&self.segment, &self.episode).map(|rows| (&self.meta.segments[self.segment[rows.start] as usize], rows))
+    }
+
+    /// Returns a channel by its column name, such as `gyro_x`. A missing cell is NaN.
+    pub fn channel(&self, name: &str) -> Option<&[f64]> {
+        self.channels.get(name).map(Vec::as_slice)
+    }
+
+    /// Returns all channels by column name, without `t`, `segment` and `episode`.
+    pub fn channels(&self) -> impl Iterator<Item = (&str, &[f64])> {
+        self.channels.iter().map(|(name, cells)| (name.as_str(), cells.as_slice()))
+    }
+
+    /// Returns the measured position [rad]. Only a motion file may lack it.
+    pub fn q(&self, joint: &str) -> Option<&[f64]> {
+        self.of_joint("q", joint)
+    }
+
+    /// Returns the measured velocity [rad/s].
+    pub fn dq(&self, joint: &str) -> Option<&[f64]> {
+        self.of_joint("dq", joint)
+    }
+
+    /// Returns the commanded position [rad].
+    pub fn q_cmd(&self, joint: &str) -> Option<&[f64]> {
+        self.of_joint("q_cmd", joint)
+    }
+
+    /// Returns the commanded velocity [rad/s]. `None` means zero.
+    pub fn dq_cmd(&self, joint: &str) -> Option<&[f64]> {
+        self.of_joint("dq_cmd", joint)
+    }
+
+    /// Returns the commanded feed-forward torque [N·m]. `None` means zero.
+    pub fn tau_ff(&self, joint: &str) -> Option<&[f64]> {
+        self.of_joint("tau_ff", joint)
+    }
+
+    /// Returns the measured torque [N·m], at the sensor location `tau_sensor` of [`Log::meta`].
+    pub fn tau_measured(&self, joint: &str) -> Option<&[f64]> {
+        self.of_joint("tau_measured", joint)
+    }
+
+    /// Returns the position gain in force from a row to the next [N·m/rad]. Only a motion file may lack it.
+    pub fn kp(&self, joint: &str, row: usize) -> Option<f64> {
+        self.gain("kp", self.meta.kp.as_ref(), joint, row)
+    }
+
+    /// Returns the velocity gain in force from a row to the next [N·m·s/rad]. Only a motion file may lack it.
+    pub fn kd(&self, joint: &str, row: usize) -> Option<f64> {
+        self.gain("kd", self.meta.kd.as_ref(), joint, row)
+    }
+
+    /// Returns the standard deviation of a channel's noise in the channel's unit, if the metadata state it.
+    pub fn noise(&self, channel: &str) -> Option<f64> {
+        let quantity = Column::parse(channel)?.quantity.name;
+        self.meta.noise.get(channel).or_else(|| self.meta.noise.get(quantity)).copied()
+    }
+
+    fn of_joint(&self, quantity: &str, joint: &str) -> Option<&[f64]> {
+        self.channel(&format!("{quantity}_{joint}"))
+    }
+
+    fn gain(&self, quantity: &str, constant: Option<&Gain>, joint: &str, row: usize) -> Option<f64> {
+        let index = self.joints.iter().position(|name| name == joint)?;
+        match self.of_joint(quantity, joint).or_else(|| self.channel(quantity)) {
+            Some(column) => column.get(row).copied(),
+            None => constant.filter(|_| row < self.rows())?.of(index),
+        }
+    }
+
+    /// Returns all columns, in the order in which they are written.
+    pub(crate) fn columns(&self) -> Vec<NamedColumn<'_>> {
+        let mut columns = vec![
+            NamedColumn { name: "t".to_owned(), cells: ColumnCells::Number(&self.t) },
+            NamedColumn { name: "segment".to_owned(), cells: ColumnCells::Index(&self.segment) },
+            NamedColumn { name: "episode".to_owned(), cells: ColumnCells::Index(&self.episode) },
+        ];
+        let sort_key = |name: &str| {
+            let column = Column::parse(name)?;
+            Some((column.rank(), self.joints.iter().position(|joint| Some(joint.as_str()) == column.joint())))
+        };
+        let mut names: Vec<_> = self.channels.keys().collect();
+        names.sort_by_key(|name| sort_key(name));
+        columns.extend(
+            names
+                .into_iter()
+                .map(|name| NamedColumn { name: name.clone(), cells: ColumnCells::Number(&self.channels[name]) }),
+        );
+        columns
+    }
+}
+
+impl PartialEq for Log {
+    fn eq(&self, other: &Log) -> bool {
+        let same = |mine: &f64, its: &f64| mine == its || (mine.is_nan() && its.is_nan());
+        self.meta == other.meta
+            && self.joints == other.joints
+            && self.t == other.t
+            && self.segment == other.segment
+            && self.episode == other.episode
+            && self.channels.keys().eq(other.channels.keys())
+            && self.channels.values().flatten().zip(other.channels.values().flatten()).all(|(a, b)| same(a, b))
+    }
+}
+
+/// Column to write.
+pub(crate) struct NamedColumn<'a> {
+    pub name: String,
+    pub cells: ColumnCells<'a>,
+}
+
+/// Cells of a column to write.
+#[derive(Clone, Copy)]
+pub(crate) enum ColumnCells<'a> {
+    Index(&'a [u32]),
+    Number(&'a [f64]),
+}
+
+impl ColumnCells<'_> {
+    pub fn len(&self) -> usize {
+        match self {
+            ColumnCells::Index(cells) => cells.len(),
+            ColumnCells::Number(cells) => cells.len(),
+        }
+    }
+}
+
+/// Returns the ranges of rows within which neither segment nor episode changes.
+pub(crate) fn contiguous_ranges<'a>(segment: &'a [u32], episode: &'a [u32]) -> impl Iterator<Item = Range<usize>> + use<'a> {
+    let rows = segment.len();
+    let mut start = 0;
+    std::iter::from_fn(move || {
+        if start == rows {
+            return None;
+        }
+        let changed = |&row: &usize| segment[row] != segment[start] || episode[row] != episode[start];
+        let end = (start + 1..rows).find(changed).unwrap_or(rows);
+        let range = start..end;
+        start = end;
+        Some(range)
+    })
+}
+
+fn read(path: &Path, need: LogKind) -> Result<Log, LogError> {
+    let files = Files::find(path)?;
+    let meta = files.meta.as_deref().map(Meta::read).transpose()?;
+    let meta_file = files.meta.as_ref().unwrap_or(&files.data);
+    let needed = |meta: Option<Meta>| {
+        meta.ok_or_else(|| LogError::NoMeta { wanted: files.expected_meta(), data: files.data.clone() })
+    };
+    let open = || std::fs::File::open(&files.data).map_err(|cause| LogError::Read { file: files.data.clone(), cause });
+    let (table, meta) = match files.format {
+        Format::Csv => (csv_table::read(&files.data, open()?)?, needed(meta)?),
+        Format::CsvGz => (csv_table::read(&files.data, flate2::read::MultiGzDecoder::new(open()?))?, needed(meta)?),
+        Format::Parquet => (parquet_table::read(&files.data)?, needed(meta)?),
+        Format::Mcap => mcap_file::read(&files.data, meta)?,
+    };
+    check::assemble(table, meta, meta_file, need)
+}
+
+fn from_columns(
+    meta: Meta,
+    columns: impl IntoIterator<Item = (String, Vec<f64>)>,
+    need: LogKind,
+) -> Result<Log, LogError> {
+    // Errors show this instead of a path.
+    let here = Path::new("columns in memory");
+    meta.check(here)?;
+    let (names, cells): (Vec<_>, Vec<_>) = columns.into_iter().unzip();
+    let (mut table, indices) = Table::from_header(here, &names)?;
+    for (cells, index) in cells.into_iter().zip(indices) {
+        if let Some(index) = index {
+            table.columns[index].1 = cells;
+        }
+    }
+    check::assemble(table, meta, here, need)
+}

@@ -1,0 +1,144 @@
+//! Interfaces below an environment: [`Backend`] steps robots, [`Actuator`] computes their torques.
+
+use std::any::Any;
+use std::sync::Arc;
+
+use crate::{Command, Ground, PerJoint, InitialState, RobotModel, RobotStates};
+
+/// Batch of robots that are commanded and observed together: a simulator, a replayed log or the real robot.
+pub trait Backend: Send {
+    /// Full state of one robot. After [`Backend::restore`] the robot continues bit for bit as from the snapshot.
+    type Snapshot: Clone + Send;
+
+    /// Returns the number of robots.
+    fn num_robots(&self) -> usize {
+        self.states().q.len()
+    }
+
+    /// Returns the nominal robot.
+    fn robot(&self) -> &RobotModel;
+
+    /// Returns the states after the last [`Backend::reset`] or [`Backend::step`].
+    fn states(&self) -> &RobotStates;
+
+    /// Returns the ground under the robots.
+    fn ground(&self) -> Ground {
+        Ground::FLAT
+    }
+
+    /// Resets robots to initial states, with the nominal model. Each pair is a robot's index and its initial state.
+    fn reset(&mut self, initial_states: &[(usize, InitialState)]) -> Result<(), BackendError>;
+
+    /// Resets one robot to an initial state, with the parameters of `model` until its next reset.
+    fn reset_with_model(
+        &mut self,
+        robot: usize,
+        model: &RobotModel,
+        initial_state: &InitialState,
+    ) -> Result<(), BackendError>;
+
+    /// Advances every `active` robot by `actuator_periods` actuator periods under its command.
+    ///
+    /// `commands` and `active` have one entry per robot. Inactive robots do not change.
+    fn step(&mut self, commands: &[Command], active: &[bool], actuator_periods: usize) -> Result<(), BackendError>;
+
+    /// Returns the full state of `robot`.
+    fn snapshot(&self, robot: usize) -> Self::Snapshot;
+
+    /// Restores the state of `robot` from `snapshot`.
+    fn restore(&mut self, robot: usize, snapshot: &Self::Snapshot);
+}
+
+/// Actuators of a batch of robots: computes joint torques from commands and measured states, once per actuator period.
+///
+/// The interface is batched, so that an actuator network evaluates all robots in one forward pass.
+pub trait Actuator: Send {
+    /// Writes the torque of each joint [N·m] into `tau`, for every `active` robot.
+    ///
+    /// If it fails, nothing changes. A backend with a thread pool calls it on that pool.
+    fn torques(
+        &mut self,
+        commands: &[Command],
+        active: &[bool],
+        states: &RobotStates,
+        tau: &mut [PerJoint],
+    ) -> Result<(), BackendError>;
+
+    /// Resets the state of the actuators of `robot` and seeds their random numbers with `seed`.
+    fn reset(&mut self, robot: usize, seed: u64);
+
+    /// Returns the full state of the actuators of `robot`.
+    fn snapshot(&self, robot: usize) -> ActuatorSnapshot;
+
+    /// Restores the state of the actuators of `robot` from `snapshot`, which the same type of actuator must have made.
+    fn restore(&mut self, robot: usize, snapshot: &ActuatorSnapshot);
+
+    /// Returns the estimator of the epistemic uncertainty. Returns `None` if the actuator has none.
+    fn uncertainty(&mut self) -> Option<&mut dyn EpistemicUncertainty> {
+        None
+    }
+}
+
+/// Estimates epistemic uncertainty, a reward term for data collection (U2E, eq. 13).
+pub trait EpistemicUncertainty: Send {
+    /// Writes the epistemic uncertainty [nat] of each `active` robot after its last actuator period. Entries of other
+    /// robots do not change.
+    fn evaluate(&mut self, active: &[bool], uncertainty: &mut [f32]);
+}
+
+/// Opaque state of the actuators of one robot.
+#[derive(Clone)]
+pub struct ActuatorSnapshot(Arc<dyn Any + Send + Sync>);
+
+impl ActuatorSnapshot {
+    /// Creates a snapshot that contains `memory`.
+    pub fn new(memory: impl Any + Send + Sync) -> Self {
+        Self(Arc::new(memory))
+    }
+
+    /// Returns the contents if they have type `T`, else `None`.
+    pub fn get<T: Any>(&self) -> Option<&T> {
+        self.0.downcast_ref()
+    }
+}
+
+/// Error of a backend.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum BackendError {
+    /// An argument has the wrong number of entries.
+    #[error("`{field}` has {given} entries; {wanted} are expected, one per robot")]
+    WrongLength {
+        /// The argument.
+        field: &'static str,
+        /// Number of entries of the argument.
+        given: usize,
+        /// Expected number of entries.
+        wanted: usize,
+    },
+    /// A robot index is too large.
+    #[error("robot {robot} does not exist; the number of robots is {num_robots}")]
+    RobotOutOfRange {
+        /// Requested index.
+        robot: usize,
+        /// Number of robots.
+        num_robots: usize,
+    },
+    /// The actuator does not support a command. No robot was stepped.
+    #[error("the actuator of robot {robot} does not support its command: {reason}; no robot was stepped")]
+    UnsupportedCommand {
+        /// The robot.
+        robot: usize,
+        /// What is not supported.
+        reason: String,
+    },
+    /// The simulation of some robots diverged to values that are not finite. The other robots were stepped.
+    #[error("the simulation of robot {robot} diverged: `{quantity}` is not finite ({more} more robots); reset it")]
+    Diverged {
+        /// The first robot that diverged.
+        robot: usize,
+        /// Its first quantity that is not finite.
+        quantity: &'static str,
+        /// Number of other robots that diverged in the same step.
+        more: usize,
+    },
+}

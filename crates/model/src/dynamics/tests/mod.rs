@@ -1,0 +1,4 @@
+//! Tests of the SIMD dynamics in double precision.
+
+mod actuators;
+mod equations;

@@ -1,0 +1,56 @@
+//! Types and robot model that all Twinstep crates share.
+//!
+//! - [`Joint`] and the joint order; [`RobotModel`] and [`go2`], the nominal robot with the source of each parameter.
+//! - [`Command`], [`RobotStates`] and [`InitialState`]: commands, measured and simulated states, and reset states.
+//! - [`Backend`]: a batch of robots that are commanded and observed together (simulator, replayed log, real robot).
+//! - [`Actuator`]: computes torques from commands and states. Actuator networks implement it.
+//! - [`VecEnv`]: a batch of environments that are reset and stepped together, in process or over a network;
+//!   [`EnvSpec`]: layouts, periods, gains and limits of an environment.
+//! - [`Scene`]: shapes and poses for rendering; [`body_poses`]: forward kinematics.
+//! - [`Ground`]: a plane, or a [`HeightField`] for uneven terrain.
+//! - [`mjcf()`]: the robot as a MuJoCo model.
+//! - [`dynamics`]: kinematics, dynamics and actuator laws, with one robot per SIMD lane.
+//! - [`Rollout`]: simulates command sequences with many candidate robots at once.
+//! - [`stream`]: reproducible random streams, one per consumer, from one seed.
+//!
+//! SI units, radians, seconds. The docs of each vector give its frame, world or base. The base frame is fixed to the
+//! trunk: x forward, y left, z up. Quaternions in arrays are `[w, x, y, z]` and rotate from base to world.
+
+mod backend;
+mod base_mount;
+mod body;
+pub mod dynamics;
+pub mod frames;
+mod go2;
+mod ground;
+mod height_field;
+mod joint;
+mod kinematics;
+mod log_cholesky;
+mod mjcf;
+mod robot;
+mod rollout;
+mod scene;
+mod spec;
+mod state;
+mod stream;
+mod vec_env;
+
+pub use backend::{Actuator, ActuatorSnapshot, Backend, BackendError, EpistemicUncertainty};
+pub use base_mount::BaseMount;
+pub use body::RigidBody;
+pub use go2::go2;
+pub use ground::Ground;
+pub use height_field::{HeightField, HeightFieldError};
+pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};
+pub use kinematics::{FIXED_BASE_HEIGHT, NUM_BODIES, Pose, body_poses};
+pub use mjcf::{MjcfActuator, MjcfOptions, mjcf};
+pub use robot::{
+    Contact, ControlConfig, Derating, ActuatorParams, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes, Stribeck,
+};
+pub use rollout::{RolloutRequest, HistoryStep, Precision, Rollout};
+pub use scene::{Scene, SceneShape, ShapeKind};
+pub use spec::{EnvSpec, SpecField};
+pub use state::{Command, InitialState, RobotStates, RobotStatesMut, RandomisationSample};
+pub use stream::{Stream, standard_normal, stream};
+pub use vec_env::{AutoresetMode, EndedEpisode, EnvError, ResetRequest, StepBatch, VecEnv};

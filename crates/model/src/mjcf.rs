@@ -1,0 +1,321 @@
+//! Export of the robot as a MuJoCo model with the same tree, parameters and contacts, for comparison of the physics.
+
+use std::fmt::Write as _;
+
+use glam::{DMat3, DVec3};
+
+use crate::kinematics::FIXED_BASE_HEIGHT;
+use crate::{BaseMount, Ground, Joint, JointKind, Leg, InitialState, RigidBody, RobotModel};
+
+/// Gravity of the model [m/s²].
+const GRAVITY: f64 = 9.81;
+
+/// Options of a MuJoCo model.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MjcfOptions {
+    /// Mount of the base.
+    pub base: BaseMount,
+    /// Physics step [s].
+    pub timestep: f64,
+    /// Type of the twelve actuators, which determines the meaning of `ctrl`.
+    pub actuator: MjcfActuator,
+}
+
+impl Default for MjcfOptions {
+    /// Floating base, torque control, 1 kHz.
+    fn default() -> Self {
+        Self { base: BaseMount::Floating, timestep: 0.001, actuator: MjcfActuator::Torque }
+    }
+}
+
+/// Type of the actuators of a MuJoCo model, which are in the order of [`Joint::ALL`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum MjcfActuator {
+    /// `ctrl` is torque [N·m], clipped to the joint's limit.
+    Torque,
+    /// `ctrl` is the commanded position [rad]. PD control at every physics step, clipped to the joint's torque limit.
+    Position {
+        /// Position gain [N·m/rad].
+        kp: f64,
+        /// Velocity gain [N·m·s/rad].
+        kd: f64,
+    },
+}
+
+/// Returns the MuJoCo model (MJCF, XML) of `robot` on the plane z = 0.
+///
+/// The trunk is named `trunk`, and each link has the name of its joint. The contact points are those of the batch
+/// engine: a sphere at the foot, a sphere at each end of the calf's capsule, and the corners of the trunk's box. There
+/// is no self-collision. Contacts have MuJoCo's default impedance and the time constant of [`RobotModel::contact`].
+/// Joint limits are as stiff as the time step allows. The keyframe `default_pose` has the robot standing in the default
+/// pose, or at [`FIXED_BASE_HEIGHT`] if its base is fixed.
+pub fn mjcf(robot: &RobotModel, options: &MjcfOptions) -> String {
+    let mut xml = Xml::default();
+    xml.open("mujoco", &[("model", robot.name.clone())]);
+    xml.leaf("compiler", &[("angle", "radian".to_owned()), ("autolimits", "true".to_owned())]);
+    let gravity = numbers([0.0, 0.0, -GRAVITY]);
+    xml.leaf(
+        "option",
+        &[
+            ("timestep", options.timestep.to_string()),
+            ("gravity", gravity),
+            ("integrator", "Euler".to_owned()),
+            ("cone", "elliptic".to_owned()),
+            ("impratio", "30".to_owned()),
+        ],
+    );
+    defaults(&mut xml, robot, options.timestep);
+    let height = base_height(robot, options.base);
+    xml.open("worldbody", &[]);
+    xml.leaf("light", &[("pos", numbers([0.0, 0.0, 3.0])), ("directional", "true".to_owned())]);
+    xml.leaf(
+        "geom",
+        &[
+            ("name", "ground".to_owned()),
+            ("type", "plane".to_owned()),
+            ("size", numbers([0.0, 0.0, 0.05])),
+            ("contype", "1".to_owned()),
+            ("conaffinity", "0".to_owned()),
+        ],
+    );
+    trunk(&mut xml, robot, options.base, height);
+    xml.close("worldbody");
+    actuators(&mut xml, robot, options.actuator);
+    keyframe(&mut xml, robot, options.base, height);
+    xml.close("mujoco");
+    xml.text
+}
+
+fn base_height(robot: &RobotModel, base: BaseMount) -> f64 {
+    match base {
+        BaseMount::Floating => {
+            let standing = InitialState::standing_on(&Ground::FLAT, robot, robot.control.default_pose_f32(), 0.0);
+            f64::from(standing.base_position[2])
+        }
+        BaseMount::Fixed => FIXED_BASE_HEIGHT,
+    }
+}
+
+fn defaults(xml: &mut Xml, robot: &RobotModel, timestep: f64) {
+    let contact = &robot.contact;
+    xml.open("default", &[]);
+    // MuJoCo's default solimp, as in the batch engine. `refsafe` requires a time constant of at least two steps.
+    xml.leaf("joint", &[("limited", "true".to_owned()), ("solreflimit", numbers([2.0 * timestep, 1.0]))]);
+    xml.leaf(
+        "geom",
+        &[
+            // Only robot and ground collide.
+            ("contype", "0".to_owned()),
+            ("conaffinity", "1".to_owned()),
+            ("condim", "3".to_owned()),
+            ("friction", numbers([contact.friction, 0.0, 0.0])),
+            ("solref", numbers([contact.time_constant, contact.damping_ratio])),
+            ("solimp", numbers([0.9, 0.95, 0.001])),
+        ],
+    );
+    xml.close("default");
+}
+
+fn trunk(xml: &mut Xml, robot: &RobotModel, base: BaseMount, height: f64) {
+    xml.open("body", &[("name", "trunk".to_owned()), ("pos", numbers([0.0, 0.0, height]))]);
+    if base == BaseMount::Floating {
+        xml.leaf("freejoint", &[("name", "base".to_owned())]);
+    }
+    inertial(xml, &robot.trunk);
+    let size = numbers(robot.shapes.trunk_half_size.to_array());
+    xml.leaf("geom", &[("name", "trunk".to_owned()), ("type", "box".to_owned()), ("size", size)]);
+    for leg in Leg::ALL {
+        for kind in JointKind::ALL {
+            link(xml, robot, Joint { leg, kind });
+        }
+        calf_geoms(xml, robot, leg);
+        for _ in JointKind::ALL {
+            xml.close("body");
+        }
+    }
+    xml.close("body");
+}
+
+/// Opens the child link of `joint`.
+fn link(xml: &mut Xml, robot: &RobotModel, joint: Joint) {
+    let (leg, numbers_of) = (&robot.legs[joint.leg as usize], &robot.joints[joint.index()]);
+    let origin = leg.origins[joint.kind as usize];
+    xml.open("body", &[("name", joint.name().to_owned()), ("pos", numbers(origin.to_array()))]);
+    inertial(xml, &leg.bodies[joint.kind as usize]);
+    xml.leaf(
+        "joint",
+        &[
+            ("name", joint.name().to_owned()),
+            ("axis", numbers(RobotModel::axis(joint).to_array())),
+            ("range", numbers(numbers_of.range)),
+            ("armature", numbers_of.armature.to_string()),
+        ],
+    );
+}
+
+fn calf_geoms(xml: &mut Xml, robot: &RobotModel, leg: Leg) {
+    let shapes = &robot.shapes;
+    let spheres = [
+        ("foot", shapes.foot_centre, shapes.foot_radius),
+        ("shin", shapes.calf_ends[1], shapes.calf_radius),
+        ("knee", shapes.calf_ends[0], shapes.calf_radius),
+    ];
+    for (part, centre, radius) in spheres {
+        let name = format!("{}_{part}", leg.name());
+        let place = numbers(centre.to_array());
+        xml.leaf(
+            "geom",
+            &[("name", name), ("type", "sphere".to_owned()), ("pos", place), ("size", radius.to_string())],
+        );
+    }
+}
+
+fn inertial(xml: &mut Xml, body: &RigidBody) {
+    let RigidBody { mass, com, inertia } = *body;
+    let DMat3 { x_axis, y_axis, z_axis } = inertia;
+    let full = [x_axis.x, y_axis.y, z_axis.z, y_axis.x, z_axis.x, z_axis.y];
+    let (place, mass) = (numbers(DVec3::to_array(&com)), mass.to_string());
+    xml.leaf("inertial", &[("pos", place), ("mass", mass), ("fullinertia", numbers(full))]);
+}
+
+fn actuators(xml: &mut Xml, robot: &RobotModel, actuator: MjcfActuator) {
+    xml.open("actuator", &[]);
+    for joint in Joint::ALL {
+        let limit = robot.joints[joint.index()].torque_limit;
+        let name = joint.name().to_owned();
+        let (named, range) = ([("name", name.clone()), ("joint", name)], numbers([-limit, limit]));
+        match actuator {
+            MjcfActuator::Torque => xml.leaf("motor", &[&named[..], &[("ctrlrange", range)]].concat()),
+            MjcfActuator::Position { kp, kd } => {
+                let gains = [("kp", kp.to_string()), ("kv", kd.to_string()), ("forcerange", range)];
+                xml.leaf("position", &[&named[..], &gains].concat());
+            }
+        }
+    }
+    xml.close("actuator");
+}
+
+fn keyframe(xml: &mut Xml, robot: &RobotModel, base: BaseMount, height: f64) {
+    let free = [0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0];
+    let free = if base == BaseMount::Floating { &free[..] } else { &[] };
+    let qpos = numbers(free.iter().copied().chain(robot.control.default_pose));
+    xml.open("keyframe", &[]);
+    xml.leaf("key", &[("name", "default_pose".to_owned()), ("qpos", qpos)]);
+    xml.close("keyframe");
+}
+
+fn numbers(values: impl IntoIterator<Item = f64>) -> String {
+    // `to_string` writes the shortest decimals that parse to the same numbers.
+    values.into_iter().map(|value| value.to_string()).collect::<Vec<_>>().join(" ")
+}
+
+/// XML writer, one element per line, indented by depth.
+#[derive(Default)]
+struct Xml {
+    text: String,
+    depth: usize,
+}
+
+impl Xml {
+    fn open(&mut self, name: &str, attributes: &[(&str, String)]) {
+        self.element(name, attributes, ">");
+        self.depth += 1;
+    }
+
+    fn leaf(&mut self, name: &str, attributes: &[(&str, String)]) {
+        self.element(name, attributes, "/>");
+    }
+
+    fn close(&mut self, name: &str) {
+        self.depth -= 1;
+        writeln!(self.text, "{:width$}</{name}>", "", width = 2 * self.depth).expect("a String takes every text");
+    }
+
+    fn element(&mut self, name: &str, attributes: &[(&str, String)], end: &str) {
+        write!(self.text, "{:width$}<{name}", "", width = 2 * self.depth).expect("a String takes every text");
+        for (key, value) in attributes {
+            write!(self.text, " {key}=\"{}\"", escaped(value)).expect("a String takes every text");
+        }
+        self.text.push_str(end);
+        self.text.push('\n');
+    }
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('"', "&quot;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{NUM_JOINTS, go2};
+
+    /// Returns the values of `attribute` in all elements named `element`.
+    fn values<'a>(xml: &'a str, element: &str, attribute: &str) -> Vec<&'a str> {
+        let key = format!(" {attribute}=\"");
+        xml.lines()
+            .filter(|line| line.trim_start().starts_with(&format!("<{element} ")))
+            .filter_map(|line| line.split_once(&key)?.1.split('"').next())
+            .collect()
+    }
+
+    fn model(options: MjcfOptions) -> String {
+        mjcf(&go2(), &options)
+    }
+
+    #[test]
+    fn elements_are_closed_in_reverse_order() {
+        let mut robot = go2();
+        robot.name = "a \"b\" <c> & d".to_owned();
+        let xml = mjcf(&robot, &MjcfOptions::default());
+        let mut open = Vec::new();
+        for line in xml.lines().map(str::trim) {
+            assert!(line.starts_with('<') && line.ends_with('>') && line.matches('<').count() == 1, "{line}");
+            let name = line.trim_start_matches(['<', '/']).split([' ', '>', '/']).next().expect("a name");
+            match line {
+                _ if line.starts_with("</") => assert_eq!(open.pop(), Some(name)),
+                _ if line.ends_with("/>") => {}
+                _ => open.push(name),
+            }
+        }
+        assert!(open.is_empty());
+        assert!(xml.starts_with("<mujoco model=\"a &quot;b&quot; &lt;c> &amp; d\">"));
+    }
+
+    #[test]
+    fn numbers_of_bodies_joints_and_geoms_agree_with_the_robot() {
+        let xml = model(MjcfOptions::default());
+        assert_eq!(values(&xml, "body", "name").len(), 1 + NUM_JOINTS);
+        assert_eq!(values(&xml, "joint", "name"), crate::JOINT_NAMES);
+        assert_eq!(values(&xml, "motor", "joint"), crate::JOINT_NAMES);
+        // Ground, trunk, three spheres per leg.
+        assert_eq!(values(&xml, "geom", "name").len(), 2 + 12);
+    }
+
+    #[test]
+    fn total_mass_agrees_with_the_robot() {
+        let xml = model(MjcfOptions::default());
+        let mass: f64 =
+            values(&xml, "inertial", "mass").into_iter().map(|mass| mass.parse::<f64>().expect("a number")).sum();
+        assert!((mass - go2().total_mass()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn fixed_base_has_no_free_joint() {
+        let [floating, fixed] =
+            [BaseMount::Floating, BaseMount::Fixed].map(|base| model(MjcfOptions { base, ..MjcfOptions::default() }));
+        assert_eq!(floating.matches("<freejoint").count(), 1);
+        assert_eq!(fixed.matches("<freejoint").count(), 0);
+        let positions = |xml: &str| values(xml, "key", "qpos")[0].split(' ').count();
+        assert_eq!((positions(&floating), positions(&fixed)), (7 + NUM_JOINTS, NUM_JOINTS));
+    }
+
+    #[test]
+    fn position_actuator_has_the_gains_and_the_torque_limit() {
+        let actuator = MjcfActuator::Position { kp: 40.0, kd: 1.0 };
+        let xml = model(MjcfOptions { actuator: actuator, ..MjcfOptions::default() });
+        assert_eq!(values(&xml, "position", "kp"), ["40"; NUM_JOINTS]);
+        assert_eq!(values(&xml, "position", "kv"), ["1"; NUM_JOINTS]);
+        assert_eq!(values(&xml, "position", "forcerange")[2], "-45.43 45.43");
+    }
+}

@@ -1,0 +1,48 @@
+//! Interface between identification and simulators: simulates command sequences with many candidate robots at once.
+
+use crate::{Command, PerJoint, InitialState, RobotModel, RobotStates};
+
+/// Simulation of one candidate robot.
+#[derive(Clone, Copy, Debug)]
+pub struct RolloutRequest<'a> {
+    /// The candidate robot.
+    pub robot: &'a RobotModel,
+    /// Whether its base is fixed.
+    pub held: bool,
+    /// Initial state.
+    pub start: InitialState,
+    /// Actuator periods before the start, oldest first; they initialise the actuator state. Before them the robot was
+    /// at rest.
+    pub history: &'a [HistoryStep],
+    /// Commands, one per actuator period.
+    pub commands: &'a [Command],
+}
+
+/// Command and measured state of one past actuator period.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct HistoryStep {
+    /// Command of the period.
+    pub command: Command,
+    /// Encoder readings of the joint positions at its start [rad].
+    pub q: PerJoint,
+    /// Joint velocities at its start [rad/s].
+    pub dq: PerJoint,
+}
+
+/// Floating-point precision of a simulation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Precision {
+    /// Single precision: several times as fast, for a global search.
+    Single,
+    /// Double precision: for derivatives by finite differences.
+    Double,
+}
+
+/// Simulates candidate robots.
+pub trait Rollout {
+    /// Simulates every request and returns its states.
+    ///
+    /// Each array has one entry for the initial state and one after each actuator period. If a simulation diverges, its
+    /// values are not finite from then on.
+    fn run(&mut self, jobs: &[RolloutRequest], precision: Precision) -> Vec<RobotStates>;
+}

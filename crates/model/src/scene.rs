@@ -1,0 +1,144 @@
+//! Scene for rendering one robot: bodies, their shapes and poses, and the ground.
+
+use glam::{DVec3, Quat, Vec3};
+use serde::{Deserialize, Serialize};
+
+use crate::kinematics::{Pose, body_poses};
+use crate::{Ground, JOINT_NAMES, Leg, RobotModel, RobotStates, frames};
+
+/// Scene for rendering. Poses are `[x, y, z, w, x, y, z]`: position [m], then quaternion.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scene {
+    /// Names of the bodies; the first is the trunk.
+    pub bodies: Vec<String>,
+    /// Pose world-from-body of each body.
+    pub pose: Vec<[f32; 7]>,
+    /// Shapes of the bodies; the same in every scene of a robot.
+    pub shapes: Vec<SceneShape>,
+    /// The ground; a height field is cropped around the robot.
+    pub ground: Ground,
+    /// Commanded base velocity in the base frame: forward [m/s], left [m/s], yaw [rad/s]. `None` if the task has none.
+    pub command: Option<[f32; 3]>,
+}
+
+/// Shape of a body.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SceneShape {
+    /// Index of the body in [`Scene::bodies`].
+    pub body: u32,
+    /// Kind of the shape, which determines the meaning of `size`.
+    pub kind: ShapeKind,
+    /// Size [m]. Box: half sizes along x, y, z. Capsule: radius, half length along z without the caps, 0. Sphere:
+    /// radius, 0, 0.
+    pub size: [f32; 3],
+    /// Pose body-from-shape.
+    pub offset: [f32; 7],
+}
+
+/// Kind of a shape.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ShapeKind {
+    /// Box.
+    Box,
+    /// Cylinder with half spheres at its ends.
+    Capsule,
+    /// Sphere.
+    Sphere,
+}
+
+impl Scene {
+    /// Returns the scene of robot `index` of `states` on `ground`.
+    pub fn new(robot: &RobotModel, states: &RobotStates, index: usize, ground: &Ground) -> Self {
+        let world_from_base = Pose {
+            position: Vec3::from(states.base_position[index]),
+            rotation: frames::world_from_base(states.base_orientation[index]),
+        };
+        let poses = body_poses(robot, world_from_base, &states.q[index]);
+        Self {
+            bodies: ["trunk"].iter().chain(&JOINT_NAMES).map(ToString::to_string).collect(),
+            pose: poses.map(Pose::to_array).to_vec(),
+            shapes: shapes(robot),
+            ground: ground.crop(world_from_base.position.x, world_from_base.position.y),
+            command: None,
+        }
+    }
+}
+
+/// Returns the collision shapes, and shapes only for rendering: head, hip actuators, and thigh and calf capsules.
+fn shapes(robot: &RobotModel) -> Vec<SceneShape> {
+    let collision = &robot.shapes;
+    let foot_radius = collision.foot_radius;
+    // Head and hip actuators are menagerie's collision geoms, which the simulators do not have.
+    let mut shapes = vec![
+        cuboid(0, collision.trunk_half_size, DVec3::ZERO),
+        capsule(0, 0.05, [DVec3::new(0.16, 0.0, 0.005), DVec3::new(0.285, 0.0, 0.01)]),
+        sphere(0, 0.047, DVec3::new(0.293, 0.0, -0.06)),
+    ];
+    for leg in Leg::ALL {
+        let hip = 1 + 3 * leg as u32;
+        let (thigh, calf) = (hip + 1, hip + 2);
+        let left = leg.left_sign();
+        let knee = robot.legs[leg as usize].origins[2];
+        shapes.extend([
+            capsule(hip, 0.04, [DVec3::ZERO, DVec3::new(0.0, 0.085 * left, 0.0)]),
+            cuboid(thigh, collision.thigh_half_size, collision.thigh_centre),
+            capsule(thigh, 1.2 * foot_radius, [DVec3::ZERO, knee]),
+            capsule(calf, collision.calf_radius, collision.calf_ends),
+            capsule(calf, 0.9 * collision.calf_radius, [collision.calf_ends[1], collision.foot_centre]),
+            sphere(calf, foot_radius, collision.foot_centre),
+        ]);
+    }
+    shapes
+}
+
+fn cuboid(body: u32, half_size: DVec3, centre: DVec3) -> SceneShape {
+    let offset = Pose { position: centre.as_vec3(), rotation: Quat::IDENTITY }.to_array();
+    SceneShape { body, kind: ShapeKind::Box, size: half_size.as_vec3().to_array(), offset }
+}
+
+fn sphere(body: u32, radius: f64, centre: DVec3) -> SceneShape {
+    let offset = Pose { position: centre.as_vec3(), rotation: Quat::IDENTITY }.to_array();
+    SceneShape { body, kind: ShapeKind::Sphere, size: [radius as f32, 0.0, 0.0], offset }
+}
+
+/// Returns the capsule around the line segment between `ends`.
+fn capsule(body: u32, radius: f64, ends: [DVec3; 2]) -> SceneShape {
+    let [from, to] = ends.map(DVec3::as_vec3);
+    let rotation = Quat::from_rotation_arc(Vec3::Z, (to - from).normalize_or(Vec3::Z));
+    let offset = Pose { position: from.midpoint(to), rotation }.to_array();
+    let size = [radius as f32, 0.5 * from.distance(to), 0.0];
+    SceneShape { body, kind: ShapeKind::Capsule, size, offset }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{NUM_BODIES, go2};
+
+    fn standing() -> Scene {
+        let robot = go2();
+        let mut states = RobotStates::new(1);
+        states.q[0] = robot.control.default_pose_f32();
+        states.base_position[0] = [0.0, 0.0, 0.32];
+        Scene::new(&robot, &states, 0, &Ground::FLAT)
+    }
+
+    #[test]
+    fn every_body_has_a_name_a_pose_and_a_shape() {
+        let scene = standing();
+        assert_eq!((scene.bodies.len(), scene.pose.len()), (NUM_BODIES, NUM_BODIES));
+        for body in 0..NUM_BODIES as u32 {
+            assert!(scene.shapes.iter().any(|shape| shape.body == body), "{}", scene.bodies[body as usize]);
+        }
+    }
+
+    #[test]
+    fn capsule_has_the_given_ends() {
+        let ends = [DVec3::new(0.1, -0.2, 0.3), DVec3::new(0.4, 0.5, -0.6)];
+        let shape = capsule(0, 0.01, ends);
+        let [x, y, z, qw, qx, qy, qz] = shape.offset;
+        let tip = Vec3::new(x, y, z) + Quat::from_xyzw(qx, qy, qz, qw) * Vec3::new(0.0, 0.0, shape.size[1]);
+        assert!((tip - ends[1].as_vec3()).length() < 1e-6);
+    }
+}

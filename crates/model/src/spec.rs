@@ -1,0 +1,115 @@
+//! Specification of an environment, and the hash of what agent and robot must agree on.
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+/// Named part of an observation or action vector.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SpecField {
+    /// Name of the quantity, such as `joint_velocity`.
+    pub name: String,
+    /// Number of entries.
+    pub size: usize,
+    /// Unit, such as `rad/s`; empty if dimensionless.
+    pub unit: String,
+    /// Lowest value; observations are clipped to it.
+    pub low: f32,
+    /// Highest value; observations are clipped to it.
+    pub high: f32,
+    /// Description in one line.
+    pub description: String,
+}
+
+/// Specification of an environment: layouts, periods, gains and limits.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EnvSpec {
+    /// Name of the task, such as `walk`.
+    pub task: String,
+    /// Name of the nominal robot, such as `go2`.
+    pub robot: String,
+    /// Parts of the observation, in order.
+    pub observation: Vec<SpecField>,
+    /// Parts of the action, in order.
+    pub action: Vec<SpecField>,
+    /// Joint names in the order of every per-joint array.
+    pub joint_order: Vec<String>,
+    /// Policy period [s].
+    pub policy_dt: f64,
+    /// Actuator period [s].
+    pub actuator_dt: f64,
+    /// Position gain [N·m/rad].
+    pub kp: f64,
+    /// Velocity gain [N·m·s/rad].
+    pub kd: f64,
+    /// Joint offset of an action of 1 [rad].
+    pub action_scale: f64,
+    /// Joint positions to which actions are relative [rad].
+    pub default_pose: Vec<f64>,
+    /// Names of the reward terms, in the order of every per-term array.
+    pub reward_terms: Vec<String>,
+    /// Policy steps after which an episode is truncated.
+    pub max_episode_steps: u32,
+}
+
+impl EnvSpec {
+    /// Returns the length of one observation.
+    pub fn obs_len(&self) -> usize {
+        self.observation.iter().map(|field| field.size).sum()
+    }
+
+    /// Returns the length of one action.
+    pub fn action_len(&self) -> usize {
+        self.action.iter().map(|field| field.size).sum()
+    }
+
+    /// Returns the name of entry `index` of the observation, such as `joint_position[FL_hip]`.
+    pub fn observation_entry(&self, index: usize) -> String {
+        entry_name(&self.observation, &self.joint_order, index)
+    }
+
+    /// Returns the name of entry `index` of the action, such as `joint_position_offset[FL_hip]`.
+    pub fn action_entry(&self, index: usize) -> String {
+        entry_name(&self.action, &self.joint_order, index)
+    }
+
+    /// Returns the hash of all that an agent and a robot must agree on, as 32 hexadecimal digits.
+    ///
+    /// It covers layouts, joint order, policy period, gains, action scale and default pose: [`EnvSpec::hash_input`].
+    pub fn hash(&self) -> String {
+        let digest: [u8; 32] = Sha256::digest(self.hash_input()).into();
+        let half: [u8; 16] = std::array::from_fn(|index| digest[index]);
+        format!("{:032x}", u128::from_be_bytes(half))
+    }
+
+    /// Returns the text that [`EnvSpec::hash`] hashes, one line per quantity.
+    pub fn hash_input(&self) -> String {
+        let layout = |fields: &[SpecField]| {
+            fields.iter().map(|field| format!("{}:{}", field.name, field.size)).collect::<Vec<_>>().join(" ")
+        };
+        let pose = self.default_pose.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
+        format!(
+            "observation {}\naction {}\njoint_order {}\npolicy_dt {}\nkp {}\nkd {}\naction_scale {}\n\
+             default_pose {pose}\n",
+            layout(&self.observation),
+            layout(&self.action),
+            self.joint_order.join(" "),
+            self.policy_dt,
+            self.kp,
+            self.kd,
+            self.action_scale,
+        )
+    }
+}
+
+fn entry_name(fields: &[SpecField], joint_order: &[String], index: usize) -> String {
+    let mut start = 0;
+    for field in fields {
+        if index < start + field.size {
+            let within = index - start;
+            let label = if field.size == joint_order.len() { joint_order[within].clone() } else { within.to_string() };
+            return format!("{}[{label}]", field.name);
+        }
+        start += field.size;
+    }
+    format!("entry {index}")
+}

@@ -1,0 +1,168 @@
+//! A picture of an effect: a motion without it and with it, the difference, and its law in what was measured.
+
+mod experiment;
+mod quantity;
+
+use std::path::Path;
+
+use plotters::prelude::RGBColor;
+use plotters::style::text_anchor::HPos;
+use twinstep_effects::{Effect, EffectEntry, Scope, Target, apply_effects};
+use twinstep_model::{Command, Ground, FIXED_BASE_HEIGHT, RolloutRequest, Joint, Leg, InitialState, Precision, RobotModel, Rollout, go2, BaseMount};
+use twinstep_sim::{BatchRollout, SimConfig};
+
+use crate::chart::{self, GREY, INK, Panel, PlotError};
+use experiment::{EffectDemo, DemoMotion};
+use quantity::{PlotQuantity, SimulatedRun};
+
+/// Width and height of the picture [px].
+const SIZE: (u32, u32) = (1500, 1000);
+/// Heights of the text above the panels and of the upper panel [half px].
+const HEADER_HEIGHT: u32 = 270;
+const UPPER_HEIGHT: u32 = 860;
+/// From the least of the effect to the most.
+const COLOURS: [RGBColor; 3] = [RGBColor(0xf2, 0xa7, 0x1b), RGBColor(0xe0, 0x40, 0x1f), RGBColor(0x7a, 0x1f, 0xa2)];
+/// The voltage at which the motors have all their torque [V]: that of a full battery.
+const FULL_V: f64 = 33.6;
+
+/// Simulates and draws.
+pub fn write_svg(effect: &'static Effect, path: &Path) -> Result<(), PlotError> {
+    chart::check_writable(path)?;
+    let experiment = experiment::of(effect);
+    let mut robots = vec![("without".to_owned(), go2())];
+    robots.extend(variants(effect)?);
+    let runs = play(experiment.motion, robots.iter().map(|(_, robot)| robot))?;
+    let names: Vec<_> = robots.into_iter().map(|(name, _)| name).collect();
+    chart::write(&draw(effect, &experiment, &names, &runs).map_err(simulate)?, path)
+}
+
+/// Robots with the low, the middle and the high of what is plausible, without one that changes nothing.
+///
+/// Only the first number of the first parameter varies, on all that the effect can be about.
+fn variants(effect: &'static Effect) -> Result<Vec<(String, RobotModel)>, PlotError> {
+    let scope = match effect.target {
+        Target::Joints | Target::Supply => Scope::All,
+        Target::Bodies | Target::Base => Scope::Base,
+        Target::Ground => Scope::Ground,
+    };
+    let robot = |values| apply_effects(&go2(), &[EffectEntry::new(effect, scope, values).map_err(simulate)?]).map_err(simulate);
+    if effect.name == "inertia" {
+        // Ten coordinates without a plausible range of their own: a lighter and a heavier trunk of the same shape.
+        let scaled = |factor: f64| {
+            let values = go2().trunk.scaled(factor).log_cholesky().to_vec();
+            Ok((format!("trunk times {factor}"), robot(values)?))
+        };
+        return [0.7, 1.4].map(scaled).into_iter().collect();
+    }
+    let (first, rest) = effect.parameters.split_first().expect("every effect has a parameter");
+    let [low, high] = first.prior_range;
+    let mut sizes = [low, f64::midpoint(low, high), high];
+    if first.no_effect_value.is_infinite() {
+        sizes.reverse();
+    }
+    let shown = sizes.into_iter().filter(|size| (size - first.no_effect_value).abs() > 1e-9);
+    shown
+        .map(|size| {
+            let mut values = vec![size];
+            values.resize(first.count, first.no_effect_value);
+            values.extend(rest.iter().flat_map(|parameter| {
+                std::iter::repeat_n(f64::midpoint(parameter.prior_range[0], parameter.prior_range[1]), parameter.count)
+            }));
+            let size = format!("{size:.4}").trim_end_matches('0').trim_end_matches('.').to_owned();
+            Ok((format!("{} {size}", first.name), robot(values)?))
+        })
+        .collect()
+}
+
+/// What the robots do in a motion.
+fn play<'a>(motion: &DemoMotion, robots: impl Iterator<Item = &'a RobotModel>) -> Result<Vec<SimulatedRun>, PlotError> {
+    let config = SimConfig { threads: 1, ..SimConfig::default() };
+    let mut simulator = BatchRollout::new(&go2(), &config).map_err(simulate)?;
+    let runs = robots.map(|robot| {
+        let (commands, supply) = commands(motion, robot);
+        let pose = commands[0].q;
+        let start = match motion.base {
+            BaseMount::Fixed => InitialState::at_rest(FIXED_BASE_HEIGHT as f32, pose),
+            BaseMount::Floating => InitialState::standing_on(&Ground::FLAT, robot, pose, motion.clearance),
+        };
+        let states = simulator
+            .run(
+                &[RolloutRequest { robot, held: motion.base == BaseMount::Fixed, start, history: &[], commands: &commands }],
+                Precision::Double,
+            )
+            .remove(0);
+        let joint = Joint { leg: Leg::FL, kind: motion.joint }.index();
+        let settle = (motion.settle / robot.control.actuator_dt()).round() as usize;
+        SimulatedRun { robot: robot.clone(), commands, supply, joint, settle, states }
+    });
+    Ok(runs.collect())
+}
+
+/// What the robot is told, and battery voltage and motor temperature, in each actuator period.
+fn commands(motion: &DemoMotion, robot: &RobotModel) -> (Vec<Command>, Vec<[f64; 2]>) {
+    let (dt, pose) = (robot.control.actuator_dt(), robot.control.default_pose);
+    let period = |period: usize| {
+        let t = (period as f64 * dt - motion.settle).max(0.0);
+        let share = t / motion.duration;
+        let [volts, celsius] = [motion.voltage, motion.temperature].map(|[from, to]| from + share * (to - from));
+        let offset = (motion.target)(t);
+        let q = std::array::from_fn(|joint| (pose[joint] + offset[Joint::ALL[joint].kind as usize]) as f32);
+        let strength = |joint| robot.derating.derating_factor(joint, volts / FULL_V, celsius) as f32;
+        let command = Command { derating_factor: std::array::from_fn(strength), ..Command::hold(q, motion.kp, motion.kd) };
+        (command, [volts, celsius])
+    };
+    (0..((motion.settle + motion.duration) / dt).round() as usize).map(period).unzip()
+}
+
+fn draw(effect: &Effect, experiment: &EffectDemo, names: &[String], runs: &[SimulatedRun]) -> Result<String, PlotError> {
+    chart::picture(SIZE, |root| {
+        let (header, panels) = root.split_vertically(HEADER_HEIGHT);
+        chart::text(&header, &format!("{}: {}", effect.name, effect.summary), 52, HPos::Center, (SIZE.0 as i32, 56))?;
+        chart::text(&header, effect.equation, 36, HPos::Center, (SIZE.0 as i32, 124))?;
+        let mut legend: Vec<_> = names.iter().map(String::as_str).zip([INK].into_iter().chain(COLOURS)).collect();
+        if experiment.over_time == PlotQuantity::Position {
+            legend.push(("command", GREY));
+        }
+        chart::legend(&header, &legend, 590, (60, 210))?;
+        let (upper, lower) = panels.split_vertically(UPPER_HEIGHT);
+        let (left, right) = lower.split_horizontally(SIZE.0);
+        let EffectDemo { motion, over_time, law: [x, y] } = *experiment;
+        let mut shown =
+            panel(motion.what.to_owned(), PlotQuantity::Time, over_time, runs, &|run, period| over_time.of(run, period));
+        if over_time == PlotQuantity::Position {
+            let command =
+                lines(&runs[..1], PlotQuantity::Time, &|run, period| f64::from(run.commands[period].q[run.joint]));
+            shown.lines.extend(command.into_iter().map(|line| chart::Line { colour: GREY, width: 2, ..line }));
+            shown.y = extent(&shown.lines, |(_, y)| y);
+        }
+        shown.draw(&upper)?;
+        panel("difference that it makes".to_owned(), PlotQuantity::Time, over_time, runs, &|run, period| {
+            over_time.of(run, period) - over_time.of(&runs[0], period)
+        })
+        .draw(&left)?;
+        panel("its law in the data".to_owned(), x, y, runs, &|run, period| y.of(run, period)).draw(&right)
+    })
+}
+
+fn panel(caption: String, x: PlotQuantity, y: PlotQuantity, runs: &[SimulatedRun], of: &dyn Fn(&SimulatedRun, usize) -> f64) -> Panel {
+    let lines = lines(runs, x, of);
+    let (x_range, y_range) = (extent(&lines, |(x, _)| x), extent(&lines, |(_, y)| y));
+    Panel { caption, x_label: x.label(), y_label: y.label(), x: x_range, y: y_range, lines }
+}
+
+fn lines(runs: &[SimulatedRun], x: PlotQuantity, of: &dyn Fn(&SimulatedRun, usize) -> f64) -> Vec<chart::Line> {
+    let line = |(run, colour): (&SimulatedRun, RGBColor)| {
+        let periods = run.settle..run.commands.len();
+        let piece = periods.map(|period| (x.of(run, period), of(run, period))).collect();
+        chart::Line { colour, width: 4, pieces: vec![piece] }
+    };
+    runs.iter().zip([INK].into_iter().chain(COLOURS)).map(line).collect()
+}
+
+fn extent(lines: &[chart::Line], of: fn((f64, f64)) -> f64) -> std::ops::Range<f64> {
+    chart::range(lines.iter().flat_map(|line| line.pieces.iter().flatten()).map(|point| of(*point)))
+}
+
+fn simulate(error: impl std::error::Error) -> PlotError {
+    PlotError::Simulate(error.to_string())
+}

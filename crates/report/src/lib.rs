@@ -1,0 +1,29 @@
+//! What people look at: the report of a diagnosis, and every plot, as SVG.
+//!
+//! - [`write_report`]: the page of a diagnosis, from [`ReportData`].
+//! - [`chart`]: panels with axes and lines, in one style.
+//! - [`joint_plot`], [`evaluation_plot`], [`effect_plot`]: the plots of `demo`, `evaluate` and `effects`.
+//! - [`joint_table()`]: the position error of each joint as text.
+
+pub mod chart;
+pub mod effect_plot;
+pub mod evaluation_plot;
+mod findings;
+mod html;
+pub mod joint_plot;
+mod joint_table;
+mod limitations;
+mod overview;
+mod page;
+mod plot;
+pub mod report_data;
+mod residual_plot;
+#[cfg(test)]
+mod tests;
+mod text;
+mod time_series;
+mod timeline;
+
+pub use joint_table::joint_table;
+pub use page::{ReportError, write as write_report};
+pub use report_data::ReportData;

@@ -1,0 +1,126 @@
+//! The upper part of the page: verdict, numbers, where and when simulation and measurement part.
+
+use twinstep_model::{Joint, JointKind, Leg};
+use twinstep_diagnose::{Diagnosis, RmsErrors};
+use twinstep_identify::{Evaluation, JointEvaluation};
+
+use crate::report_data::ReportData;
+use crate::html::{alike, escape, percent};
+use crate::time_series::Curve;
+use crate::{plot, text};
+
+/// The darkest colour stands for at least this error [rad, N·m], so that rounding errors have none.
+const LEAST_SCALE: f64 = 1e-3;
+
+/// A joint's error, where it is known.
+type JointErrorFn = fn(&JointEvaluation) -> Option<f64>;
+
+/// The first thing on the page.
+pub fn headline(diagnosis: &Diagnosis, evidence: &ReportData) -> String {
+    let (log, verdict) = (shown_log(evidence), text::verdict(diagnosis));
+    format!("<header>\n<p class=\"kicker\">Diagnosis of {log}</p>\n<h1>{verdict}</h1>\n</header>\n")
+}
+
+/// Errors of both models beside what the sensors leave.
+pub fn numbers(diagnosis: &Diagnosis) -> String {
+    let Diagnosis { baseline, extended, noise_floor, .. } = diagnosis;
+    let row = |name: &str, of: fn(&RmsErrors) -> Option<f64>| {
+        let [before, after, floor] = [baseline, extended, noise_floor].map(of);
+        let gain = before.zip(after).and_then(|(before, after)| text::gain(before, after));
+        let cells = alike([before, after, floor].map(|value| value.unwrap_or(f64::NAN)));
+        let cells = cells.map(|cell| format!("<td>{cell}</td>")).concat();
+        let gain = gain.map_or("–".to_owned(), percent);
+        format!("<tr><th scope=\"row\">{name}</th>{cells}<td><strong>{gain}</strong></td></tr>\n")
+    };
+    format!(
+        "<section>\n<h2>How large the error is</h2>\n<div class=\"wide\"><table class=\"numbers\">\n\
+         <thead><tr><th></th><th>given model</th><th>extended model</th><th>noise floor</th><th>removed</th></tr>\
+         </thead>\n<tbody>\n{}{}</tbody></table></div>\n\
+         <p class=\"note\">Root mean squares on blocks of the log that took no part in any choice or fit. A dash: this \
+         log cannot tell. The noise floor is what the sensors alone would leave.</p>\n</section>\n",
+        row("joint position, closed loop [rad]", |errors| errors.q_rmse_rad),
+        row("torque at the sensor [N·m]", |errors| errors.torque_rmse_nm)
+    )
+}
+
+/// The errors of twelve joints under both models.
+pub fn heat_maps(evidence: &ReportData) -> String {
+    let quantities: [(&str, JointErrorFn); 2] =
+        [("joint position [rad]", |joint| joint.q_rmse_rad), ("torque [N·m]", |joint| joint.torque_rmse_nm)];
+    let mut maps = String::new();
+    for (name, of) in quantities {
+        let both = [&evidence.before, &evidence.after];
+        let errors = both.iter().flat_map(|evaluation| evaluation.per_joint.values()).filter_map(of);
+        let Some(worst) = errors.filter(|error| error.is_finite()).reduce(f64::max) else { continue };
+        let worst = worst.max(LEAST_SCALE);
+        // Nothing found, nothing extended: the second map would be the first.
+        let shown = if evidence.before == evidence.after { 1 } else { 2 };
+        for (model, evaluation) in ["given model", "extended model"].into_iter().zip(both).take(shown) {
+            maps += &heat_map(&format!("{name}, {model}"), evaluation, of, worst);
+        }
+    }
+    if maps.is_empty() {
+        return String::new();
+    }
+    format!(
+        "<section>\n<h2>Where it is</h2>\n<div class=\"pair\">\n{maps}</div>\n\
+         <p class=\"note\">Root mean square error of each joint over the whole of {}; before and after on one scale. \
+         Grey: not in the log.</p>\n</section>\n",
+        shown_log(evidence)
+    )
+}
+
+fn heat_map(name: &str, evaluation: &Evaluation, of: JointErrorFn, worst: f64) -> String {
+    let cell = |leg: Leg, kind: JointKind| {
+        let error = evaluation.per_joint.get(Joint { leg, kind }.name()).and_then(of);
+        match error {
+            None => "<td class=\"cell absent\">–</td>".to_owned(),
+            Some(error) => {
+                let share = if error.is_finite() { error / worst } else { 1.0 };
+                let [error, _] = alike([error, worst]);
+                format!("<td class=\"cell\" style=\"--share:{:.0}%\">{error}</td>", 100.0 * share)
+            }
+        }
+    };
+    let rows = Leg::ALL.map(|leg| {
+        let cells = JointKind::ALL.map(|kind| cell(leg, kind)).concat();
+        format!("<tr><th scope=\"row\">{}</th>{cells}</tr>\n", leg.name())
+    });
+    format!(
+        "<table class=\"heat\"><caption>{name}</caption>\n\
+         <thead><tr><th></th><th>hip</th><th>thigh</th><th>calf</th></tr></thead>\n<tbody>\n{}</tbody></table>\n",
+        rows.concat()
+    )
+}
+
+/// The worst joint over time.
+pub fn strips(evidence: &ReportData) -> String {
+    let mut figures = String::new();
+    for strip in &evidence.strips {
+        let joint = strip.joint;
+        figures += &figure(&format!("{joint}, where it is worst"), &strip.close, strip.label);
+        figures +=
+            &figure(&format!("{joint}, error over the whole log"), &strip.errors, &format!("error of {}", strip.label));
+    }
+    if figures.is_empty() {
+        return String::new();
+    }
+    format!("<section>\n<h2>When it is: the worst joint</h2>\n<div class=\"pair\">\n{figures}</div>\n</section>\n")
+}
+
+fn figure(caption: &str, curves: &[Curve], y_label: &str) -> String {
+    let keys = curves.iter().map(|curve| key(curve.class, curve.name)).collect::<String>();
+    let picture = plot::curves(curves, y_label);
+    format!("<figure><figcaption><strong>{caption}</strong>{keys}</figcaption>{picture}</figure>\n")
+}
+
+/// A name in a legend.
+pub fn key(class: &str, name: &str) -> String {
+    format!("<span class=\"key\"><span class=\"sample {class}\"></span>{name}</span>")
+}
+
+/// The log in the pictures.
+fn shown_log(evidence: &ReportData) -> String {
+    let first = evidence.provenance.logs.first();
+    first.map_or("the log".to_owned(), |log| format!("<code>{}</code>", escape(&log.name)))
+}

@@ -1,0 +1,268 @@
+//! Batches of robots behind one trait, so that the register type can be chosen at run time.
+
+use rayon::ThreadPool;
+use rayon::prelude::*;
+use twinstep_model::dynamics::SimdCommands;
+use twinstep_model::{
+    Command, Ground, HistoryStep, InitialState, PerJoint, RobotModel, RobotStates, RobotStatesMut,
+};
+use twinstep_simd::{InstructionSet, SimdFloat, SimdKernel, SimdTask, with_f32, with_f64};
+
+use super::group::{RobotBatch, ActuatorInput, LaneSnapshot, SensorReadings, Workspace, StepCount};
+use crate::SimConfig;
+
+/// Precision of the simulation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SimdPrecision {
+    /// Single precision with this instruction set, for reinforcement learning.
+    Single(InstructionSet),
+    /// Double precision in the widest registers of the processor, for system identification.
+    Double,
+}
+
+/// Input of the actuators of all robots.
+#[derive(Clone, Copy)]
+pub enum ActuatorInputs<'a> {
+    /// Commands to the actuators of the robot model, one per robot.
+    Commands(&'a [Command]),
+    /// Joint torques of an external actuator, one entry per robot [N·m].
+    Torques(&'a [PerJoint]),
+}
+
+/// Robots in batches of any register type.
+pub trait BatchSimulator: Send + Sync {
+    /// Resets `robot` to an initial state.
+    fn place(&mut self, robot: usize, model: &RobotModel, initial_state: &InitialState);
+    /// Copies the state of `robot` to `states`.
+    fn read(&self, robot: usize, states: &mut RobotStates);
+    /// Advances the active robots on the threads of `pool`, or on the current one, and copies their states to `states`.
+    ///
+    /// Returns true if all numbers are finite.
+    fn advance(
+        &mut self,
+        pool: Option<&ThreadPool>,
+        inputs: ActuatorInputs,
+        active: &[bool],
+        time: StepCount,
+        states: &mut RobotStates,
+    ) -> bool;
+    /// Replays the actuator periods before the initial state into the state of the actuators.
+    ///
+    /// `past` has one entry per robot; a period has `steps` physics steps.
+    fn remember(&mut self, past: &[&[HistoryStep]], steps: usize);
+    /// Simulates every robot with its commands on the current thread, one command per actuator period.
+    ///
+    /// A period has `steps` physics steps. The state after period `i` is entry `i + 1` of a robot's record.
+    fn play(&mut self, commands: &[&[Command]], steps: usize, records: &mut [RobotStates]);
+    /// Returns the full state of `robot`.
+    fn snapshot(&self, robot: usize) -> LaneSnapshot;
+    /// Restores the state of `robot`.
+    fn restore(&mut self, robot: usize, snapshot: &LaneSnapshot);
+}
+
+/// Creates `num_robots` robots in the state `initial`.
+pub fn batch_simulator(
+    precision: SimdPrecision,
+    model: &RobotModel,
+    config: &SimConfig,
+    ground: &Ground,
+    initial: &InitialState,
+    num_robots: usize,
+) -> Box<dyn BatchSimulator> {
+    let task = MakeBatches { model, config, ground, initial, num_robots };
+    match precision {
+        SimdPrecision::Single(instructions) => with_f32(instructions, task),
+        SimdPrecision::Double => with_f64(InstructionSet::best(), task),
+    }
+}
+
+struct MakeBatches<'a> {
+    model: &'a RobotModel,
+    config: &'a SimConfig,
+    ground: &'a Ground,
+    initial: &'a InitialState,
+    num_robots: usize,
+}
+
+impl SimdTask for MakeBatches<'_> {
+    type Output = Box<dyn BatchSimulator>;
+
+    fn run<T: SimdFloat>(self) -> Self::Output {
+        let batch = RobotBatch::<T>::new(self.model, self.config, self.ground, self.initial);
+        Box::new(RobotBatches { batches: vec![batch; self.num_robots.div_ceil(T::LANES)] })
+    }
+}
+
+/// One call of [`RobotBatch::advance`].
+struct Advance<'a, T> {
+    batch: &'a mut RobotBatch<T>,
+    input: &'a ActuatorInput<T>,
+    count: StepCount,
+    workspace: &'a mut Workspace<T>,
+}
+
+impl<T: SimdFloat> SimdKernel for Advance<'_, T> {
+    type Output = SensorReadings<T>;
+
+    #[inline(always)]
+    fn run(self) -> SensorReadings<T> {
+        self.batch.advance(self.input, self.count, self.workspace)
+    }
+}
+
+/// Advances one batch, compiled for the instruction set of its registers.
+fn advance<T: SimdFloat>(
+    batch: &mut RobotBatch<T>,
+    input: &ActuatorInput<T>,
+    count: StepCount,
+    workspace: &mut Workspace<T>,
+) -> SensorReadings<T> {
+    T::vectorise(Advance { batch, input, count, workspace })
+}
+
+struct RobotBatches<T> {
+    batches: Vec<RobotBatch<T>>,
+}
+
+impl<T: SimdFloat> BatchSimulator for RobotBatches<T> {
+    fn place(&mut self, robot: usize, model: &RobotModel, initial_state: &InitialState) {
+        self.batches[robot / T::LANES].place(robot % T::LANES, model, initial_state);
+    }
+
+    fn read(&self, robot: usize, states: &mut RobotStates) {
+        let mut all = states.all_mut();
+        let group = &self.batches[robot / T::LANES];
+        read(group, &group.sample(), robot % T::LANES, &mut all, robot);
+    }
+
+    fn advance(
+        &mut self,
+        pool: Option<&ThreadPool>,
+        inputs: ActuatorInputs,
+        active: &[bool],
+        time: StepCount,
+        states: &mut RobotStates,
+    ) -> bool {
+        let lanes = T::LANES;
+        let mut chunks: Vec<_> = states.chunks_mut(lanes).collect();
+        let one = |scratch: &mut Workspace<T>,
+                   (index, (group, states)): (usize, (&mut RobotBatch<T>, &mut RobotStatesMut))| {
+            let robots = index * lanes..(index * lanes + lanes).min(active.len());
+            let input = match inputs {
+                ActuatorInputs::Commands(commands) => ActuatorInput::Commands(SimdCommands::new(&commands[robots.clone()])),
+                ActuatorInputs::Torques(tau) => ActuatorInput::torques(&tau[robots.clone()]),
+            };
+            advance_active(group, &input, &active[robots], time, scratch, states)
+        };
+        match pool {
+            Some(pool) if self.batches.len() > 1 => pool.install(|| {
+                let groups = self.batches.par_iter_mut().zip(&mut chunks).enumerate();
+                groups.map_init(Workspace::empty, one).reduce(|| true, |finite, other| finite && other)
+            }),
+            _ => {
+                let mut scratch = Workspace::empty();
+                let groups = self.batches.iter_mut().zip(&mut chunks).enumerate();
+                // `count` steps every batch, also after one that diverged.
+                groups.map(|group| one(&mut scratch, group)).filter(|finite| !finite).count() == 0
+            }
+        }
+    }
+
+    fn remember(&mut self, past: &[&[HistoryStep]], steps: usize) {
+        for (group, past) in self.batches.iter_mut().zip(past.chunks(T::LANES)) {
+            group.replay_history(past, steps);
+        }
+    }
+
+    fn play(&mut self, commands: &[&[Command]], steps: usize, records: &mut [RobotStates]) {
+        let mut scratch = Workspace::empty();
+        let robots = commands.chunks(T::LANES).zip(records.chunks_mut(T::LANES));
+        for (group, (commands, records)) in self.batches.iter_mut().zip(robots) {
+            let mut records: Vec<_> = records.iter_mut().map(RobotStates::all_mut).collect();
+            let mut now = SimdCommands::new(&[]);
+            let time = StepCount { actuator_periods: 1, steps };
+            for period in 0..commands.iter().map(|commands| commands.len()).max().unwrap_or(0) {
+                for lane in 0..T::LANES {
+                    // An unused lane copies the last robot. A falling robot would add contacts that cost time.
+                    if let Some(command) = commands[lane.min(commands.len() - 1)].get(period) {
+                        now.set(lane, command);
+                    }
+                }
+                // A robot whose commands have ended is stepped without being recorded. Lanes are independent, so this
+                // has no effect on the others.
+                let sample = advance(group, &ActuatorInput::Commands(now), time, &mut scratch);
+                for (lane, record) in records.iter_mut().enumerate().filter(|(lane, _)| period < commands[*lane].len())
+                {
+                    read(group, &sample, lane, record, period + 1);
+                }
+            }
+        }
+    }
+
+    fn snapshot(&self, robot: usize) -> LaneSnapshot {
+        self.batches[robot / T::LANES].clone().snapshot(robot % T::LANES)
+    }
+
+    fn restore(&mut self, robot: usize, snapshot: &LaneSnapshot) {
+        self.batches[robot / T::LANES].restore(robot % T::LANES, snapshot);
+    }
+}
+
+/// Advances the active robots of a batch and copies their states to `states`. The others do not change.
+///
+/// Returns true if all numbers are finite.
+fn advance_active<T: SimdFloat>(
+    group: &mut RobotBatch<T>,
+    input: &ActuatorInput<T>,
+    active: &[bool],
+    time: StepCount,
+    scratch: &mut Workspace<T>,
+    states: &mut RobotStatesMut,
+) -> bool {
+    if active.iter().all(|active| !active) {
+        return true;
+    }
+    let inactive = (0..active.len()).filter(|lane| !active[*lane]);
+    let inactive: Vec<_> = inactive.map(|lane| (lane, group.snapshot(lane))).collect();
+    let sample = advance(group, input, time, scratch);
+    for (lane, snapshot) in inactive {
+        group.restore(lane, &snapshot);
+    }
+    let mut finite = true;
+    for lane in (0..active.len()).filter(|lane| active[*lane]) {
+        read(group, &sample, lane, states, lane);
+        finite &= is_finite(states, lane);
+    }
+    finite
+}
+
+/// Copies the state of one robot of a batch to entry `at` of `states`.
+fn read<T: SimdFloat>(group: &RobotBatch<T>, sample: &SensorReadings<T>, lane: usize, states: &mut RobotStatesMut, at: usize) {
+    let state = group.state();
+    states.base_position[at] = values(&sample.position.0, lane);
+    states.base_orientation[at] = values(&sample.orientation, lane);
+    states.base_linear_velocity[at] = values(&state.linear_velocity.0, lane);
+    states.base_angular_velocity[at] = std::array::from_fn(|axis| group.gyro(lane, axis) as f32);
+    states.q[at] = values(&sample.q, lane);
+    states.dq[at] = values(&sample.dq, lane);
+    states.tau[at] = values(group.tau(), lane);
+    states.foot_force[at] = std::array::from_fn(|leg| group.foot_force(lane, leg) as f32);
+    states.body_contact[at] = group.body_contact(lane);
+}
+
+/// Returns true if all numbers of a robot are finite.
+fn is_finite(states: &RobotStatesMut, robot: usize) -> bool {
+    // A sum with a term that is not finite is not finite. The finite terms are too small to overflow.
+    let sum = |values: &[f32]| values.iter().sum::<f32>();
+    let trunk = sum(&states.base_position[robot]) + sum(&states.base_orientation[robot]);
+    let velocity = sum(&states.base_linear_velocity[robot]) + sum(&states.base_angular_velocity[robot]);
+    (trunk + velocity + sum(&states.q[robot]) + sum(&states.dq[robot]) + sum(&states.tau[robot])).is_finite()
+}
+
+fn values<T: SimdFloat, const N: usize>(values: &[T; N], lane: usize) -> [f32; N] {
+    let mut read = [0.0; N];
+    for (read, value) in read.iter_mut().zip(values) {
+        *read = value.get(lane) as f32;
+    }
+    read
+}

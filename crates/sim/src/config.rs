@@ -1,0 +1,253 @@
+//! Settings of the simulation: the `[sim]` table of the server's config file.
+
+use serde::{Deserialize, Serialize};
+use twinstep_model::{BaseMount, ControlConfig, Ground, HeightField};
+
+/// Maximum number of cells along a side of rough terrain: a height field of 4 MB.
+const MAX_CELLS: f32 = 1024.0;
+
+/// Settings of the simulation.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimConfig {
+    /// The engine that integrates the equations of motion.
+    pub engine: Engine,
+    /// Rate of the physics [Hz], a multiple of the actuator rate. Default: recommended for the engine.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub physics_hz: Option<u32>,
+    /// Solver iterations per physics step. Default: recommended for the engine.
+    ///
+    /// rapier integrates the joints in each iteration, so two iterations have about the cost and the accuracy of twice
+    /// the rate. In the batch engine the iterations refine only the contact forces.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub solver_iterations: Option<u32>,
+    /// The ground.
+    pub terrain: Terrain,
+    /// Fixed or floating base.
+    pub base: BaseMount,
+    /// Number of threads that step robots. 0: one per core.
+    pub threads: usize,
+}
+
+impl Default for SimConfig {
+    fn default() -> Self {
+        Self {
+            engine: Engine::Batch,
+            physics_hz: None,
+            solver_iterations: None,
+            terrain: Terrain::Flat,
+            base: BaseMount::Floating,
+            threads: 0,
+        }
+    }
+}
+
+/// Physics engine.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Engine {
+    /// rapier3d: reduced-coordinate multibodies, one world per robot. The reference.
+    Rapier,
+    /// One robot per SIMD lane, with MuJoCo's soft constraints. The default, and the faster one.
+    Batch,
+}
+
+impl Engine {
+    /// Returns the recommended rate of the physics [Hz] and number of solver iterations.
+    ///
+    /// Measured with `twinstep bench sim`; `docs/physics.md` contains the table and the reason.
+    fn recommended(self) -> (u32, u32) {
+        match self {
+            Engine::Rapier => (200, 2),
+            Engine::Batch => (1000, 4),
+        }
+    }
+}
+
+/// The ground under the robots.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Terrain {
+    /// The plane z = 0.
+    Flat,
+    /// A plane through the origin that rises along x by this angle [rad].
+    SlopeRad(f32),
+    /// A height field with random heights around the origin.
+    Rough(RoughTerrain),
+}
+
+/// Rough terrain: heights at the corners of square cells, sampled uniformly from 0 to `height_m`.
+///
+/// Each cell is two triangles. The border of the height field and everything outside are the plane z = 0.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RoughTerrain {
+    /// Maximum height [m].
+    pub height_m: f32,
+    /// Side length of a cell [m].
+    pub cell_m: f32,
+    /// Side length of the height field [m], rounded to whole cells. Default: 40.
+    #[serde(default = "RoughTerrain::default_size_m")]
+    pub size_m: f32,
+    /// Seed of the heights. Equal seeds give equal terrain, which all robots share.
+    pub seed: u64,
+}
+
+impl RoughTerrain {
+    fn default_size_m() -> f32 {
+        40.0
+    }
+
+    /// Returns the number of cells along a side.
+    fn cells(self) -> f32 {
+        (self.size_m / self.cell_m).round()
+    }
+
+    fn check(self) -> Result<(), SimConfigError> {
+        let reject =
+            |field, value: f32, allowed: String| Err(SimConfigError { field, value: value.to_string(), allowed });
+        if !(0.0..=0.3).contains(&self.height_m) {
+            return reject("terrain.rough.height_m", self.height_m, "0 to 0.3 m".to_owned());
+        }
+        if !(0.02..=10.0).contains(&self.cell_m) {
+            return reject("terrain.rough.cell_m", self.cell_m, "0.02 to 10 m".to_owned());
+        }
+        if !(2.0..=MAX_CELLS).contains(&self.cells()) {
+            let allowed = format!("2 to {MAX_CELLS} cells of {} m", self.cell_m);
+            return reject("terrain.rough.size_m", self.size_m, allowed);
+        }
+        Ok(())
+    }
+}
+
+impl Terrain {
+    /// Builds the ground. Rough terrain is sampled in each call, so build it once and share it.
+    pub fn ground(self) -> Ground {
+        match self {
+            Terrain::Flat => Ground::FLAT,
+            Terrain::SlopeRad(angle) => Ground { normal: [-angle.sin(), 0.0, angle.cos()], ..Ground::FLAT },
+            Terrain::Rough(rough) => {
+                let cells = (rough.cells() as usize).clamp(2, MAX_CELLS as usize);
+                let field = HeightField::random_uniform(rough.height_m, rough.cell_m, cells, rough.seed);
+                Ground { height_field: Some(field.expect("the config was checked").into()), ..Ground::FLAT }
+            }
+        }
+    }
+}
+
+/// A setting is outside its range.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("`sim.{field}` = {value} is not allowed: {allowed}")]
+pub struct SimConfigError {
+    /// The key.
+    pub field: &'static str,
+    /// Its value.
+    pub value: String,
+    /// The allowed values.
+    pub allowed: String,
+}
+
+impl SimConfig {
+    /// Returns the rate of the physics [Hz].
+    pub fn physics_hz(&self) -> u32 {
+        self.physics_hz.unwrap_or(self.engine.recommended().0)
+    }
+
+    /// Returns the number of solver iterations per physics step.
+    pub fn solver_iterations(&self) -> u32 {
+        self.solver_iterations.unwrap_or(self.engine.recommended().1)
+    }
+
+    /// Checks that every value is within its range for a robot with `control`.
+    pub fn check(&self, control: &ControlConfig) -> Result<(), SimConfigError> {
+        let actuator_hz = control.actuator_hz as u32;
+        let reject = |field, value: String, allowed: String| Err(SimConfigError { field, value, allowed });
+        if !(actuator_hz..=20_000).contains(&self.physics_hz()) || !self.physics_hz().is_multiple_of(actuator_hz) {
+            let allowed = format!("a multiple of the actuator rate, {actuator_hz} Hz, up to 20000");
+            return reject("physics_hz", self.physics_hz().to_string(), allowed);
+        }
+        if !(1..=64).contains(&self.solver_iterations()) {
+            return reject("solver_iterations", self.solver_iterations().to_string(), "1 to 64".to_owned());
+        }
+        if self.threads > 1024 {
+            return reject("threads", self.threads.to_string(), "0 (one per core) to 1024".to_owned());
+        }
+        match self.terrain {
+            Terrain::SlopeRad(angle) if !(-1.0..=1.0).contains(&angle) => {
+                reject("terrain.slope_rad", angle.to_string(), "-1 to 1 rad".to_owned())
+            }
+            Terrain::Rough(rough) => rough.check(),
+            Terrain::Flat | Terrain::SlopeRad(_) => Ok(()),
+        }
+    }
+
+    /// Returns the number of physics steps per actuator period.
+    pub fn steps_per_actuator_period(&self, control: &ControlConfig) -> usize {
+        self.physics_hz() as usize / control.actuator_hz as usize
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use twinstep_model::go2;
+
+    use super::*;
+
+    #[test]
+    fn error_of_a_rate_that_is_not_a_multiple_lists_the_allowed_rates() {
+        let config = SimConfig { physics_hz: Some(500), ..SimConfig::default() };
+        let error = config.check(&go2().control).expect_err("error").to_string();
+        assert_eq!(error, "`sim.physics_hz` = 500 is not allowed: a multiple of the actuator rate, 200 Hz, up to 20000");
+    }
+
+    #[test]
+    fn nan_slope_is_rejected() {
+        let config = SimConfig { terrain: Terrain::SlopeRad(f32::NAN), ..SimConfig::default() };
+        assert!(config.check(&go2().control).is_err());
+    }
+
+    const ROUGH: RoughTerrain = RoughTerrain { height_m: 0.05, cell_m: 0.25, size_m: 40.0, seed: 1 };
+
+    fn read(text: &str) -> SimConfig {
+        toml::from_str(text).expect("a `[sim]` table")
+    }
+
+    #[test]
+    fn each_terrain_is_parsed() {
+        assert_eq!(read("terrain = \"flat\"").terrain, Terrain::Flat);
+        assert_eq!(read("terrain = { slope_rad = 0.1 }").terrain, Terrain::SlopeRad(0.1));
+        let rough = "terrain = { rough = { height_m = 0.05, cell_m = 0.25, seed = 1 } }";
+        assert_eq!(read(rough).terrain, Terrain::Rough(ROUGH));
+        let sized = "terrain = { rough = { height_m = 0.05, cell_m = 0.25, size_m = 10.0, seed = 1 } }";
+        assert_eq!(read(sized).terrain, Terrain::Rough(RoughTerrain { size_m: 10.0, ..ROUGH }));
+    }
+
+    #[test]
+    fn error_of_an_unknown_key_of_rough_terrain_has_its_line_and_the_keys() {
+        let error = toml::from_str::<SimConfig>("[terrain.rough]\nheight = 0.05\n").expect_err("error").to_string();
+        assert!(error.contains("line 2") && error.contains("unknown field `height`"), "{error}");
+        assert!(error.contains("`height_m`, `cell_m`, `size_m`, `seed`"), "{error}");
+    }
+
+    #[test]
+    fn error_of_rough_terrain_outside_its_range_has_the_allowed_range() {
+        let error = |rough| {
+            let config = SimConfig { terrain: Terrain::Rough(rough), ..SimConfig::default() };
+            config.check(&go2().control).expect_err("error").to_string()
+        };
+        let height = error(RoughTerrain { height_m: 0.5, ..ROUGH });
+        assert_eq!(height, "`sim.terrain.rough.height_m` = 0.5 is not allowed: 0 to 0.3 m");
+        let cell = error(RoughTerrain { cell_m: f32::NAN, ..ROUGH });
+        assert_eq!(cell, "`sim.terrain.rough.cell_m` = NaN is not allowed: 0.02 to 10 m");
+        let size = error(RoughTerrain { cell_m: 0.02, ..ROUGH });
+        assert_eq!(size, "`sim.terrain.rough.size_m` = 40 is not allowed: 2 to 1024 cells of 0.02 m");
+    }
+
+    #[test]
+    fn each_engine_has_a_default_rate() {
+        assert_eq!((read("").physics_hz(), read("").solver_iterations()), (1000, 4));
+        let rapier = read("engine = \"rapier\"");
+        assert_eq!((rapier.physics_hz(), rapier.solver_iterations()), (200, 2));
+        assert_eq!(read("engine = \"rapier\"\nphysics_hz = 400").physics_hz(), 400);
+    }
+}

@@ -1,0 +1,21 @@
+//! Simulation of many Go2 robots behind the trait [`twinstep_model::Backend`], with two engines.
+//!
+//! - [`SimConfig`]: engine, rates, terrain, base, threads; the `[sim]` table of a config file.
+//! - [`RapierBackend`]: one rapier3d world per robot, stepped on all cores. The results are bitwise equal for any
+//!   number of threads.
+//! - [`BatchBackend`]: one robot per SIMD lane. The results are bitwise equal for any lane, batch size and number of
+//!   threads.
+//!
+//! In one actuator period the PD loop samples the state once, and `physics_hz / actuator_hz` physics steps follow.
+
+mod batch;
+mod config;
+mod ground_shapes;
+mod rapier;
+mod robot_world;
+mod rollout;
+
+pub use batch::{BatchBackend, BatchSnapshot, SimdPrecision};
+pub use config::{Engine, RoughTerrain, SimConfig, SimConfigError, Terrain};
+pub use rapier::{BackendBuildError, RapierBackend, RobotSnapshot};
+pub use rollout::BatchRollout;

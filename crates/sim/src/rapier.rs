@@ -1,0 +1,219 @@
+//! The rapier engine: one world per robot, stepped on all cores.
+
+use rayon::prelude::*;
+use twinstep_model::{
+    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, PerJoint, InitialState, RobotModel, RobotStates,
+};
+
+use crate::ground_shapes::GroundShapes;
+use crate::robot_world::{ActuatorInputRef, RobotWorld, WorldSnapshot};
+use crate::{SimConfig, SimConfigError};
+
+/// Backend that simulates each robot in a rapier3d world.
+pub struct RapierBackend {
+    robot: RobotModel,
+    config: SimConfig,
+    ground: Ground,
+    ground_shapes: GroundShapes,
+    worlds: Vec<RobotWorld>,
+    states: RobotStates,
+    /// Replaces the actuators of the robot model. `None`: analytic actuators.
+    actuator: Option<Box<dyn Actuator>>,
+    pool: rayon::ThreadPool,
+}
+
+/// Reasons why a backend cannot be built.
+#[derive(Debug, thiserror::Error)]
+pub enum BackendBuildError {
+    /// A setting is not allowed.
+    #[error(transparent)]
+    Config(#[from] SimConfigError),
+    /// The operating system could not start the threads.
+    #[error("cannot start {threads} simulation threads: {source}")]
+    Threads {
+        /// Requested number of threads.
+        threads: usize,
+        /// Error of the thread pool.
+        source: rayon::ThreadPoolBuildError,
+    },
+}
+
+/// Creates the pool of threads that step robots; 0 means one per core.
+pub(crate) fn thread_pool(threads: usize) -> Result<rayon::ThreadPool, BackendBuildError> {
+    let threads = match threads {
+        0 => std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
+        threads => threads,
+    };
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()
+        .map_err(|source| BackendBuildError::Threads { threads, source })
+}
+
+/// Checks that there are one command and one flag per robot.
+pub(crate) fn check_lengths(commands: &[Command], active: &[bool], robots: usize) -> Result<(), BackendError> {
+    for (field, given) in [("commands", commands.len()), ("active", active.len())] {
+        if given != robots {
+            return Err(BackendError::WrongLength { field, given, wanted: robots });
+        }
+    }
+    Ok(())
+}
+
+/// State of one robot. After a restore the simulation continues bit for bit.
+#[derive(Clone)]
+pub struct RobotSnapshot {
+    world: WorldSnapshot,
+    state: RobotStates,
+    actuator: Option<ActuatorSnapshot>,
+}
+
+impl RapierBackend {
+    /// Creates `num_robots` robots that stand in their default pose.
+    pub fn new(robot: RobotModel, config: SimConfig, num_robots: usize) -> Result<Self, BackendBuildError> {
+        config.check(&robot.control)?;
+        let pool = thread_pool(config.threads)?;
+        let ground = config.terrain.ground();
+        let ground_shapes = GroundShapes::new(&ground);
+        let initial_state = InitialState::standing_on(&ground, &robot, robot.control.default_pose_f32(), 0.0);
+        let worlds = (0..num_robots).map(|_| RobotWorld::new(&robot, &config, &ground_shapes, &initial_state)).collect();
+        let states = RobotStates::new(num_robots);
+        let mut this = Self { robot, config, ground, ground_shapes, worlds, states, actuator: None, pool };
+        for index in 0..num_robots {
+            this.read_state(index);
+        }
+        Ok(this)
+    }
+
+    /// Replaces the actuators of all robots. Reset every robot afterwards.
+    #[must_use]
+    pub fn with_actuator(self, actuator: Box<dyn Actuator>) -> Self {
+        Self { actuator: Some(actuator), ..self }
+    }
+
+    fn check_index(&self, robot: usize) -> Result<(), BackendError> {
+        let num_robots = self.worlds.len();
+        if robot < num_robots { Ok(()) } else { Err(BackendError::RobotOutOfRange { robot, num_robots }) }
+    }
+
+    fn reset_robot(&mut self, robot: usize, model: &RobotModel, initial_state: &InitialState) {
+        self.worlds[robot] = RobotWorld::new(model, &self.config, &self.ground_shapes, initial_state);
+        if let Some(actuator) = &mut self.actuator {
+            actuator.reset(robot, initial_state.actuator_seed);
+        }
+        self.read_state(robot);
+        self.states.tau[robot] = PerJoint::default();
+        self.states.epistemic_uncertainty[robot] = 0.0;
+    }
+
+    fn read_state(&mut self, robot: usize) {
+        let (world, states) = (&self.worlds[robot], &mut self.states);
+        world.read_joints(&mut states.q[robot], &mut states.dq[robot]);
+        let base = world.read_base();
+        states.base_position[robot] = base.position;
+        states.base_orientation[robot] = base.orientation;
+        states.base_linear_velocity[robot] = base.linear_velocity;
+        states.base_angular_velocity[robot] = base.angular_velocity;
+        states.foot_force[robot] = world.foot_forces();
+        states.body_contact[robot] = world.body_contact();
+    }
+
+    /// Advances all active robots by one actuator period.
+    fn actuator_period(&mut self, commands: &[Command], active: &[bool], steps: usize) -> Result<(), BackendError> {
+        let external = match &mut self.actuator {
+            Some(actuator) => {
+                let mut tau = self.states.tau.clone();
+                self.pool.install(|| actuator.torques(commands, active, &self.states, &mut tau))?;
+                Some(tau)
+            }
+            None => None,
+        };
+        let input = |robot: usize| match &external {
+            Some(tau) => ActuatorInputRef::Torques(&tau[robot]),
+            None => ActuatorInputRef::Command(&commands[robot]),
+        };
+        let states = &mut self.states;
+        let robots = (&mut self.worlds, &mut states.tau, &mut states.q, &mut states.dq, active);
+        self.pool.install(|| {
+            let robots = robots.into_par_iter().enumerate().filter(|(_, (.., active))| **active);
+            robots.for_each(|(robot, (world, tau, q, dq, _))| {
+                *tau = world.actuator_period(input(robot), steps);
+                world.read_joints(q, dq);
+            });
+        });
+        Ok(())
+    }
+
+    fn first_diverged(&self, active: &[bool]) -> Option<BackendError> {
+        let mut diverged = (0..self.worlds.len()).filter(|robot| active[*robot]).filter_map(|robot| {
+            let quantity = self.states.first_not_finite(robot);
+            quantity.or_else(|| self.worlds[robot].diverged().then_some("dq")).map(|quantity| (robot, quantity))
+        });
+        let (robot, quantity) = diverged.next()?;
+        Some(BackendError::Diverged { robot, quantity, more: diverged.count() })
+    }
+}
+
+impl Backend for RapierBackend {
+    type Snapshot = RobotSnapshot;
+
+    fn robot(&self) -> &RobotModel {
+        &self.robot
+    }
+
+    fn states(&self) -> &RobotStates {
+        &self.states
+    }
+
+    fn ground(&self) -> Ground {
+        self.ground.clone()
+    }
+
+    fn reset(&mut self, initial_states: &[(usize, InitialState)]) -> Result<(), BackendError> {
+        for (robot, _) in initial_states {
+            self.check_index(*robot)?;
+        }
+        let model = self.robot.clone();
+        for (robot, initial_state) in initial_states {
+            self.reset_robot(*robot, &model, initial_state);
+        }
+        Ok(())
+    }
+
+    fn reset_with_model(&mut self, robot: usize, model: &RobotModel, initial_state: &InitialState) -> Result<(), BackendError> {
+        self.check_index(robot)?;
+        self.reset_robot(robot, model, initial_state);
+        Ok(())
+    }
+
+    fn step(&mut self, commands: &[Command], active: &[bool], actuator_periods: usize) -> Result<(), BackendError> {
+        let robots = self.num_robots();
+        check_lengths(commands, active, robots)?;
+        let steps = self.config.steps_per_actuator_period(&self.robot.control);
+        for _ in 0..actuator_periods {
+            self.actuator_period(commands, active, steps)?;
+        }
+        if let Some(evaluator) = self.actuator.as_mut().and_then(|actuator| actuator.uncertainty()) {
+            self.pool.install(|| evaluator.evaluate(active, &mut self.states.epistemic_uncertainty));
+        }
+        for robot in (0..robots).filter(|robot| active[*robot]) {
+            self.read_state(robot);
+        }
+        self.first_diverged(active).map_or(Ok(()), Err)
+    }
+
+    fn snapshot(&self, robot: usize) -> RobotSnapshot {
+        let mut state = RobotStates::new(1);
+        state.copy_robot(0, &self.states, robot);
+        let actuator = self.actuator.as_ref().map(|actuator| actuator.snapshot(robot));
+        RobotSnapshot { world: self.worlds[robot].snapshot(), state, actuator }
+    }
+
+    fn restore(&mut self, robot: usize, snapshot: &RobotSnapshot) {
+        self.worlds[robot].restore(&snapshot.world);
+        self.states.copy_robot(robot, &snapshot.state, 0);
+        if let (Some(actuator), Some(state)) = (&mut self.actuator, &snapshot.actuator) {
+            actuator.restore(robot, state);
+        }
+    }
+}

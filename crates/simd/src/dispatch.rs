@@ -1,0 +1,39 @@
+//! From an instruction set to the code that runs on its registers.
+
+use crate::float::SimdFloat;
+use crate::instruction_set::{InstructionSet, Level};
+#[cfg(target_arch = "x86_64")]
+use crate::x86::{Avx2F32, Avx2F64, Avx512F32, Sse2F32 as BaselineF32};
+#[cfg(not(target_arch = "x86_64"))]
+use crate::float::F32x4 as BaselineF32;
+
+/// Code that is generic over the register type.
+pub trait SimdTask {
+    /// The result.
+    type Output;
+
+    /// Runs on registers of type `T`.
+    fn run<T: SimdFloat>(self) -> Self::Output;
+}
+
+/// Runs `task` on single-precision registers of an instruction set.
+pub fn with_f32<K: SimdTask>(instructions: InstructionSet, task: K) -> K::Output {
+    match instructions.0 {
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 => task.run::<Avx512F32>(),
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx2 => task.run::<Avx2F32>(),
+        Level::Baseline => task.run::<BaselineF32>(),
+    }
+}
+
+/// Runs `task` on double-precision registers of an instruction set: four lanes from AVX2 on, one lane otherwise.
+pub fn with_f64<K: SimdTask>(instructions: InstructionSet, task: K) -> K::Output {
+    match instructions.0 {
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 if !InstructionSet::available().contains(&InstructionSet(Level::Avx2)) => task.run::<f64>(),
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 | Level::Avx2 => task.run::<Avx2F64>(),
+        Level::Baseline => task.run::<f64>(),
+    }
+}

@@ -1,0 +1,286 @@
+//! One number in each lane of a register.
+//!
+//! Nothing on lanes takes a closure: one that the compiler does not inline is compiled for the oldest processor, and
+//! costs more than all the rest.
+
+use crate::functions;
+use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
+
+/// Code that is compiled for the instruction set of its registers; see [`SimdFloat::vectorise`].
+///
+/// `run` and everything that it calls must be `#[inline(always)]`: a function that is not inlined is compiled for the
+/// oldest processor.
+pub trait SimdKernel {
+    /// The result.
+    type Output;
+
+    /// Runs the code.
+    fn run(self) -> Self::Output;
+}
+
+/// One number in each of [`SimdFloat::LANES`] lanes.
+///
+/// Conversions from and to `f64` round to the precision of the lanes.
+pub trait SimdFloat:
+    Copy
+    + Add<Output = Self>
+    + Sub<Output = Self>
+    + Mul<Output = Self>
+    + Div<Output = Self>
+    + Neg<Output = Self>
+    + AddAssign
+    + SubAssign
+    + Send
+    + Sync
+    + 'static
+{
+    /// Number of lanes.
+    const LANES: usize;
+
+    /// Returns the same value in every lane.
+    fn splat(value: f64) -> Self;
+    /// Returns the value of one lane.
+    fn get(&self, lane: usize) -> f64;
+    /// Sets the value of one lane.
+    fn set(&mut self, lane: usize, value: f64);
+    /// Returns the square root.
+    fn sqrt(self) -> Self;
+    /// Returns `self · factor + summand`, rounded once. Slow where the processor has no such instruction.
+    fn mul_add(self, factor: Self, summand: Self) -> Self;
+    /// Returns two to the power of `self`, which must be a whole number from −126 to 127.
+    fn exp2_integer(self) -> Self;
+    /// Returns the larger value; `self` where either is NaN.
+    fn max(self, other: Self) -> Self;
+    /// Returns the smaller value; `other` where either is NaN.
+    fn min(self, other: Self) -> Self;
+    /// Returns the absolute value.
+    #[inline(always)]
+    #[must_use]
+    fn abs(self) -> Self {
+        self.max(-self)
+    }
+    /// Returns `then` where `self < limit`, else `otherwise`.
+    fn select_lt(self, limit: Self, then: Self, otherwise: Self) -> Self;
+    /// Returns true if `self < limit` in any lane.
+    fn any_lt(self, limit: Self) -> bool;
+    /// Returns sine and cosine; within a few units in the last place for |x| < 100.
+    fn sin_cos(self) -> (Self, Self);
+    /// Runs a kernel that is compiled for the instruction set of this register type.
+    #[inline(always)]
+    fn vectorise<K: SimdKernel>(kernel: K) -> K::Output {
+        kernel.run()
+    }
+}
+
+/// Implements the operators of a register type by its inherent functions `plus`, `minus`, `times`, `over` and `negated`.
+macro_rules! operators {
+    ($lanes:ty) => {
+        operators!($lanes, Add, add, plus);
+        operators!($lanes, Sub, sub, minus);
+        operators!($lanes, Mul, mul, times);
+        operators!($lanes, Div, div, over);
+
+        impl std::ops::Neg for $lanes {
+            type Output = Self;
+            #[inline(always)]
+            fn neg(self) -> Self {
+                self.negated()
+            }
+        }
+
+        impl std::ops::AddAssign for $lanes {
+            #[inline(always)]
+            fn add_assign(&mut self, other: Self) {
+                *self = self.plus(other);
+            }
+        }
+
+        impl std::ops::SubAssign for $lanes {
+            #[inline(always)]
+            fn sub_assign(&mut self, other: Self) {
+                *self = self.minus(other);
+            }
+        }
+    };
+    ($lanes:ty, $trait:ident, $operator:ident, $function:ident) => {
+        impl std::ops::$trait for $lanes {
+            type Output = Self;
+            #[inline(always)]
+            fn $operator(self, other: Self) -> Self {
+                self.$function(other)
+            }
+        }
+    };
+}
+pub(crate) use operators;
+
+/// Four lanes of single precision on any processor; the compiler makes a register of NEON of it on aarch64.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[repr(align(16))]
+pub struct F32x4([f32; 4]);
+
+operators!(F32x4);
+
+macro_rules! lanewise {
+    ($function:ident, $operator:tt) => {
+        #[inline(always)]
+        fn $function(mut self, other: Self) -> Self {
+            for lane in 0..4 {
+                self.0[lane] $operator other.0[lane];
+            }
+            self
+        }
+    };
+}
+
+impl F32x4 {
+    lanewise!(plus, +=);
+    lanewise!(minus, -=);
+    lanewise!(times, *=);
+    lanewise!(over, /=);
+
+    #[inline(always)]
+    fn negated(mut self) -> Self {
+        for lane in 0..4 {
+            self.0[lane] = -self.0[lane];
+        }
+        self
+    }
+}
+
+impl SimdFloat for F32x4 {
+    const LANES: usize = 4;
+
+    #[inline(always)]
+    fn splat(value: f64) -> Self {
+        Self([value as f32; 4])
+    }
+
+    #[inline(always)]
+    fn get(&self, lane: usize) -> f64 {
+        f64::from(self.0[lane])
+    }
+
+    #[inline(always)]
+    fn set(&mut self, lane: usize, value: f64) {
+        self.0[lane] = value as f32;
+    }
+
+    #[inline(always)]
+    fn sqrt(mut self) -> Self {
+        for lane in 0..4 {
+            self.0[lane] = self.0[lane].sqrt();
+        }
+        self
+    }
+
+    #[inline(always)]
+    fn mul_add(mut self, factor: Self, summand: Self) -> Self {
+        for lane in 0..4 {
+            self.0[lane] = self.0[lane].mul_add(factor.0[lane], summand.0[lane]);
+        }
+        self
+    }
+
+    #[inline(always)]
+    fn exp2_integer(mut self) -> Self {
+        for lane in 0..4 {
+            self.0[lane] = f32::from_bits(((self.0[lane] as i32 + 127) as u32) << 23);
+        }
+        self
+    }
+
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        self.select_lt(other, other, self)
+    }
+
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        self.select_lt(other, self, other)
+    }
+
+    #[inline(always)]
+    fn select_lt(self, limit: Self, then: Self, otherwise: Self) -> Self {
+        let mut result = otherwise;
+        for lane in 0..4 {
+            result.0[lane] = if self.0[lane] < limit.0[lane] { then.0[lane] } else { otherwise.0[lane] };
+        }
+        result
+    }
+
+    #[inline(always)]
+    fn any_lt(self, limit: Self) -> bool {
+        let mut any = false;
+        for lane in 0..4 {
+            any |= self.0[lane] < limit.0[lane];
+        }
+        any
+    }
+
+    #[inline(always)]
+    fn sin_cos(self) -> (Self, Self) {
+        functions::sin_cos_single(self)
+    }
+}
+
+/// One lane of double precision on any processor.
+impl SimdFloat for f64 {
+    const LANES: usize = 1;
+
+    #[inline(always)]
+    fn splat(value: f64) -> Self {
+        value
+    }
+
+    #[inline(always)]
+    fn get(&self, _: usize) -> f64 {
+        *self
+    }
+
+    #[inline(always)]
+    fn set(&mut self, _: usize, value: f64) {
+        *self = value;
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        f64::sqrt(self)
+    }
+
+    #[inline(always)]
+    fn mul_add(self, factor: Self, summand: Self) -> Self {
+        f64::mul_add(self, factor, summand)
+    }
+
+    #[inline(always)]
+    fn exp2_integer(self) -> Self {
+        f64::from_bits(((self as i64 + 1023) as u64) << 52)
+    }
+
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        self.select_lt(other, other, self)
+    }
+
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        self.select_lt(other, self, other)
+    }
+
+    #[inline(always)]
+    fn select_lt(self, limit: Self, then: Self, otherwise: Self) -> Self {
+        if self < limit { then } else { otherwise }
+    }
+
+    #[inline(always)]
+    fn any_lt(self, limit: Self) -> bool {
+        self < limit
+    }
+
+    #[inline(always)]
+    fn sin_cos(self) -> (Self, Self) {
+        functions::sin_cos_double(self)
+    }
+}
+

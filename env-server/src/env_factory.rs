@@ -1,0 +1,148 @@
+//! Factories of the environments of a lease.
+
+use twinstep_ensemble::{EnsembleError, ActuatorNetworkRobot};
+use twinstep_envs::{CounterEnv, TaskEnv, TaskName, TaskEnvConfig};
+use twinstep_effects::{SamplingError, RobotSampler};
+use twinstep_model::{Actuator, AutoresetMode, RobotModel, VecEnv};
+use twinstep_effects::{ModelFile, ModelFileError};
+use twinstep_sim::{BatchBackend, BackendBuildError, Engine, RapierBackend};
+
+use crate::Config;
+
+/// Builds the environments of a lease.
+pub trait EnvFactory: Send + Sync + 'static {
+    /// Builds `num_envs` environments. `max_episode_steps` overrides the value of the task.
+    fn build(
+        &self,
+        num_envs: usize,
+        autoreset: AutoresetMode,
+        max_episode_steps: Option<u32>,
+    ) -> Result<Box<dyn VecEnv>, EnvFactoryError>;
+}
+
+/// Reasons why environments cannot be built.
+#[derive(Debug, thiserror::Error)]
+pub enum EnvFactoryError {
+    /// The model file is invalid.
+    #[error(transparent)]
+    Model(#[from] ModelFileError),
+    /// The actuator network that the model file names is invalid.
+    #[error("`actuator.ensemble`: {0}")]
+    Ensemble(#[from] EnsembleError),
+    /// A setting is not compatible with the actuators of the model file.
+    #[error("`{field}` is not compatible with this model file: {reason}")]
+    ActuatorNetwork {
+        /// The key.
+        field: &'static str,
+        /// Why the setting is not compatible, and which value is allowed.
+        reason: &'static str,
+    },
+    /// Too few samples from the intervals of the model file are valid robots.
+    #[error("`randomise.effects`: {0}")]
+    Draws(#[from] SamplingError),
+    /// The simulation settings are invalid.
+    #[error(transparent)]
+    Sim(#[from] BackendBuildError),
+    /// The task settings are invalid.
+    #[error(transparent)]
+    Task(#[from] twinstep_envs::ConfigError),
+}
+
+/// Builds simulated environments from a [`Config`].
+pub struct SimEnvFactory {
+    config: Config,
+    robot: RobotModel,
+    /// `None` if the robot is simulated with the analytic actuator model.
+    learned: Option<ActuatorNetworkRobot>,
+    /// `None` unless the effects are sampled in each episode.
+    robots: Option<RobotSampler>,
+    seed: u64,
+}
+
+impl SimEnvFactory {
+    /// Reads the model file and the actuator network that it names, and checks the simulation settings.
+    pub fn new(config: Config) -> Result<Self, EnvFactoryError> {
+        let file = match &config.server.model {
+            Some(path) => ModelFile::load(path)?,
+            None => ModelFile::default(),
+        };
+        let learned = ActuatorNetworkRobot::load(&file)?;
+        check_actuators(&config, learned.as_ref())?;
+        let robot = match &learned {
+            Some(learned) => learned.robot.clone(),
+            None => file.robot_model().expect("the model file was checked when it was read"),
+        };
+        config.sim.check(&robot.control).map_err(BackendBuildError::Config)?;
+        let seed = config.server.seed.unwrap_or_else(crate::server::random_u64);
+        let robots = if config.randomise.effects { Some(RobotSampler::new(file)?) } else { None };
+        Ok(Self { config, robot, learned, robots, seed })
+    }
+
+    /// Returns the actuator networks of `num_envs` robots, or `None` if the actuators are analytic.
+    fn actuators(&self, num_envs: usize) -> Option<Box<dyn Actuator>> {
+        let uncertain = self.config.task.reward.epistemic_uncertainty != 0.0;
+        self.learned.as_ref().map(|learned| Box::new(learned.actuators(num_envs, uncertain)) as Box<dyn Actuator>)
+    }
+}
+
+/// Checks that the settings are compatible with the actuators of the robot.
+fn check_actuators(config: &Config, learned: Option<&ActuatorNetworkRobot>) -> Result<(), EnvFactoryError> {
+    let reject = |field, reason| Err(EnvFactoryError::ActuatorNetwork { field, reason });
+    let Some(learned) = learned else {
+        return match config.task.reward.epistemic_uncertainty {
+            0.0 => Ok(()),
+            _ => reject(
+                "task.reward.epistemic_uncertainty",
+                "it has no `[actuator]`, so there is no epistemic uncertainty; use 0",
+            ),
+        };
+    };
+    let fixed_gains = "its actuator network is trained for one pair of gains; use [1, 1]";
+    if config.randomise.kp_scale != [1.0, 1.0] {
+        return reject("randomise.kp_scale", fixed_gains);
+    }
+    if config.randomise.kd_scale != [1.0, 1.0] {
+        return reject("randomise.kd_scale", fixed_gains);
+    }
+    if config.randomise.effects && learned.includes_rotor() {
+        return reject(
+            "randomise.effects",
+            "its actuator network includes the rotor inertia, which sampled robots have as well; use false",
+        );
+    }
+    Ok(())
+}
+
+impl EnvFactory for SimEnvFactory {
+    fn build(
+        &self,
+        num_envs: usize,
+        autoreset: AutoresetMode,
+        max_episode_steps: Option<u32>,
+    ) -> Result<Box<dyn VecEnv>, EnvFactoryError> {
+        if self.config.task.name == TaskName::Counter {
+            return Ok(Box::new(CounterEnv::new(&self.robot, num_envs, autoreset)));
+        }
+        let settings = TaskEnvConfig {
+            task: self.config.task.clone(),
+            randomise: self.config.randomise,
+            robot_sampler: self.robots.clone(),
+            autoreset,
+            max_episode_steps,
+            seed: self.seed,
+        };
+        let (robot, sim, actuators) = (self.robot.clone(), self.config.sim, self.actuators(num_envs));
+        match sim.engine {
+            Engine::Rapier => {
+                let backend = RapierBackend::new(robot, sim, num_envs)?;
+                let backend = if let Some(actuators) = actuators { backend.with_actuator(actuators) } else { backend };
+                Ok(Box::new(TaskEnv::new(backend, settings)?))
+            }
+            Engine::Batch => {
+                let backend = BatchBackend::new(robot, sim, num_envs)?;
+                let backend = if let Some(actuators) = actuators { backend.with_actuator(actuators) } else { backend };
+                Ok(Box::new(TaskEnv::new(backend, settings)?))
+            }
+        }
+    }
+}

@@ -1,4 +1,0 @@
-//! What the lanes compute, in double precision.
-
-mod drive;
-mod dynamics;

@@ -1,0 +1,142 @@
+//! Robots that nobody knows, and the logs that they leave: what identification is tried on.
+//!
+//! The robot runs in rapier at 4 kHz, the model in the batch engine at 1 kHz; its sensors have noise and steps.
+
+use std::collections::BTreeMap;
+use std::f64::consts::TAU;
+
+use glam::DVec3;
+use rand::RngExt;
+use twinstep_model::{BaseMount, JOINT_NAMES, Joint, JointKind, Leg, go2, stream};
+use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+use twinstep_effects::{Effect, EffectEntry, Scope};
+use twinstep_effects::ModelFile;
+use twinstep_sim::{Engine, RapierBackend, SimConfig};
+use twinstep_identify::{RecordError, Sensor, apply_sensors, record};
+
+/// Rate of the log [Hz].
+const RATE_HZ: f64 = 200.0;
+/// Rows with the trunk held.
+const AIR_ROWS: usize = 1300;
+/// Rows on the feet.
+const STANCE_ROWS: usize = 2400;
+
+/// Noise and steps of the sensors.
+const SENSORS: [Sensor; 7] = [
+    Sensor { quantity: "q", sigma: 0.002, resolution: 0.0002 },
+    Sensor { quantity: "dq", sigma: 0.05, resolution: 0.01 },
+    Sensor { quantity: "tau_measured", sigma: 0.2, resolution: 0.05 },
+    Sensor { quantity: "pos", sigma: 0.002, resolution: 0.0 },
+    Sensor { quantity: "quat", sigma: 0.004, resolution: 0.0 },
+    Sensor { quantity: "vel", sigma: 0.03, resolution: 0.0 },
+    Sensor { quantity: "gyro", sigma: 0.02, resolution: 0.001 },
+];
+
+/// An effect with its scope, as in `coulomb_friction@calf`.
+///
+/// # Panics
+/// If there is none.
+pub fn effect(name: &str, scope: &str) -> (&'static Effect, Scope) {
+    (Effect::named(name).expect("an effect of the catalogue"), scope.parse().expect("a scope"))
+}
+
+/// Robot number `case`: mass of the trunk ±20 %, centre of mass ±4 cm along each axis, inertia ±20 % besides, and by joint
+/// type κ 18 to 30 N·m, Coulomb friction, rotor inertia; a delay of 1 to 10 ms.
+pub fn ground_truth_robot(case: u64) -> ModelFile {
+    let mut random = stream(case, "hidden robot", 0);
+    let mut draw = |low: f64, high: f64| random.random_range(low..high);
+    let mut trunk = go2().trunk;
+    let heavier = draw(0.8, 1.2);
+    trunk.mass *= heavier;
+    trunk.com += DVec3::new(draw(-0.04, 0.04), draw(-0.04, 0.04), draw(-0.04, 0.04));
+    trunk.inertia *= heavier * draw(0.8, 1.2);
+    let mut entries = vec![("inertia", "base", trunk.log_cholesky().to_vec())];
+    for kind in ["hip", "thigh", "calf"] {
+        let [low, high] = if kind == "calf" { [0.3, 1.2] } else { [0.1, 0.5] };
+        entries.push(("torque_saturation", kind, vec![draw(18.0, 30.0)]));
+        entries.push(("coulomb_friction", kind, vec![draw(low, high)]));
+        entries.push(("armature", kind, vec![draw(-0.005, 0.02)]));
+    }
+    entries.push(("command_delay", "all", vec![draw(0.001, 0.01)]));
+    let entry = |(name, scope, values): (&str, &str, Vec<f64>)| {
+        let (effect, scope) = effect(name, scope);
+        EffectEntry::new(effect, scope, values).expect("drawn within the bounds")
+    };
+    ModelFile { effects: entries.into_iter().map(entry).collect(), ..ModelFile::default() }
+}
+
+/// What is sought: what is hidden, and the ground, whose softness the engines see differently.
+pub fn estimated_effects() -> Vec<(&'static Effect, Scope)> {
+    let hidden = ground_truth_robot(0).effects;
+    let ground = [effect("ground_stiffness", "ground"), effect("ground_friction", "ground")];
+    hidden.iter().map(|entry| (entry.effect, entry.scope)).chain(ground).collect()
+}
+
+/// 6.5 s in the air, a chirp and then square waves with firm gains, and 12 s of swaying on the feet; another `variant` is
+/// another motion of the same kind.
+pub fn motion(variant: u64) -> Log {
+    let mut random = stream(variant, "motion", 0);
+    let pace = if variant == 0 { 1.0 } else { random.random_range(0.8..1.25) };
+    let shift = if variant == 0 { 0.0 } else { random.random_range(0.0..TAU) };
+    let mut columns = BTreeMap::<String, Vec<f64>>::new();
+    for row in 0..AIR_ROWS + STANCE_ROWS {
+        let air = row < AIR_ROWS;
+        let time = (if air { row } else { row - AIR_ROWS }) as f64 / RATE_HZ;
+        let firm = air && time > 4.0;
+        let mut cell = |name: String, value: f64| columns.entry(name).or_default().push(value);
+        cell("t".to_owned(), row as f64 / RATE_HZ);
+        cell("segment".to_owned(), f64::from(u8::from(!air)));
+        cell("kp".to_owned(), if firm { 60.0 } else { 25.0 + 15.0 * f64::from(u8::from(!air)) });
+        cell("kd".to_owned(), if air { 0.8 } else { 1.0 });
+        for joint in Joint::ALL {
+            let offset = match (air, firm) {
+                (true, false) => 0.3 * (TAU * pace * (0.5 + 0.4 * time) * time + joint.index() as f64 + shift).sin(),
+                (true, true) => {
+                    let rate = pace * (1.5 + joint.index() as f64 / 60.0);
+                    0.25 * (TAU * rate * time + joint.index() as f64 + shift).sin().signum()
+                }
+                _ => sway(joint, pace * time, shift),
+            };
+            cell(format!("q_cmd_{}", joint.name()), go2().control.default_pose[joint.index()] + offset);
+        }
+    }
+    let segment = |name: &str, base| Segment { name: name.to_owned(), base };
+    let segments = vec![segment("air", BaseMount::Fixed), segment("stance", BaseMount::Floating)];
+    let mut meta = Meta::new(RATE_HZ, TorqueSensor::MotorCurrent, segments);
+    meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
+    Log::new_commands(meta, columns).expect("a motion")
+}
+
+/// Slow waves that lift, pitch, roll and shift the trunk while the feet stay.
+fn sway(joint: Joint, time: f64, shift: f64) -> f64 {
+    let wave = |way: f64| {
+        let waves = [(0.31, 0.5), (0.57, 0.3), (0.97, 0.2)].into_iter().enumerate();
+        let sum: f64 = waves
+            .map(|(index, (rate, part))| {
+                part * (TAU * (rate + 0.05 * way) * time + 1.7 * way + index as f64 + shift).sin()
+            })
+            .sum();
+        time.min(1.0) * sum
+    };
+    let front = if matches!(joint.leg, Leg::FL | Leg::FR) { 1.0 } else { -1.0 };
+    let left = if matches!(joint.leg, Leg::FL | Leg::RL) { 1.0 } else { -1.0 };
+    let length = 0.12 * wave(0.0) + 0.07 * front * wave(1.0) + 0.03 * left * wave(2.0);
+    match joint.kind {
+        JointKind::Hip => 0.04 * wave(3.0),
+        JointKind::Thigh => length + 0.06 * wave(4.0),
+        JointKind::Calf => -2.0 * length,
+    }
+}
+
+/// What `robot` does in `motion`, as its sensors show it.
+pub fn log_of(robot: &ModelFile, motion: &Log, seed: u64) -> Log {
+    let robot = robot.robot_model().expect("a robot");
+    let backend = |base: BaseMount| {
+        let base = if base == BaseMount::Fixed { BaseMount::Fixed } else { BaseMount::Floating };
+        let config =
+            SimConfig { engine: Engine::Rapier, base, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
+        RapierBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)))
+    };
+    let exact = record(motion, &robot, None, backend, "a robot of `hidden_robot`".to_owned(), &mut |_| true);
+    apply_sensors(&exact.expect("the robot gets through"), &SENSORS, seed).expect("a log")
+}
