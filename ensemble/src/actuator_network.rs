@@ -1,9 +1,12 @@
 //! Actuators simulated with an ensemble.
 
 use rand::RngExt;
-use twinstep_simd::InstructionSet;
-use twinstep_model::{Actuator, ActuatorSnapshot, BackendError, Command, JOINT_NAMES, NUM_JOINTS, PerJoint, RobotStates, Stream, EpistemicUncertainty, standard_normal, stream};
 use twinstep_effects::{ActuatorNetworkConfig, MemberSampling};
+use twinstep_model::{
+    Actuator, ActuatorSnapshot, BackendError, Command, EpistemicUncertainty, JOINT_NAMES, NUM_JOINTS, PerJoint,
+    RobotStates, Stream, standard_normal, stream,
+};
+use twinstep_simd::InstructionSet;
 
 use crate::ensemble::Ensemble;
 use crate::kernel::Heads;
@@ -339,7 +342,8 @@ mod tests {
         actuators.limits = [f32::INFINITY; 12];
         let (tau, expected) = (torques(&mut actuators, 0), expected(1, 0));
         for (joint, expected) in expected[0].iter().enumerate() {
-            let of = |power: i32| tau.iter().map(|tau| (f64::from(tau[joint]) - expected.mean).powi(power)).sum::<f64>();
+            let of =
+                |power: i32| tau.iter().map(|tau| (f64::from(tau[joint]) - expected.mean).powi(power)).sum::<f64>();
             let (mean, variance) = (of(1) / ROBOTS as f64, of(2) / ROBOTS as f64);
             // Tolerance: five standard errors.
             assert!(mean.abs() < 5.0 * (expected.variance / ROBOTS as f64).sqrt(), "{joint}: {mean}");

@@ -1,10 +1,10 @@
 //! The robot of a model file whose actuators are replaced by an ensemble, with a check of the remaining effects.
 
-use twinstep_logs::TorqueSensor;
 use twinstep_effects::EffectEntry;
-use twinstep_simd::InstructionSet;
-use twinstep_model::{JOINT_NAMES, RobotModel};
 use twinstep_effects::{ActuatorNetworkConfig, ModelFile};
+use twinstep_logs::TorqueSensor;
+use twinstep_model::{JOINT_NAMES, RobotModel};
+use twinstep_simd::InstructionSet;
 
 use crate::EnsembleError;
 use crate::actuator_network::ActuatorNetwork;
@@ -61,7 +61,12 @@ impl ActuatorNetworkRobot {
     ///
     /// # Panics
     /// If the processor does not support the instruction set.
-    pub fn actuators_with(&self, num_robots: usize, run_all_members: bool, instructions: InstructionSet) -> ActuatorNetwork {
+    pub fn actuators_with(
+        &self,
+        num_robots: usize,
+        run_all_members: bool,
+        instructions: InstructionSet,
+    ) -> ActuatorNetwork {
         // The torque at the joint output can exceed that of the motor because of the rotor inertia.
         let limits = match self.ensemble.description.tau_sensor {
             TorqueSensor::JointOutput => [f32::INFINITY; 12],
@@ -83,7 +88,8 @@ fn check_compatible(entry: &EffectEntry, sensor: TorqueSensor) -> Result<(), Ens
         TorqueSensor::MotorCurrent | TorqueSensor::None => ("current", LAST_REPLACED_STAGE[0]),
     };
     let (effect, place) = (entry.effect.name, entry.effect.chain_stage);
-    let step: Option<u32> = place.split(',').next().and_then(|step| step.parse().ok());
+    let step: Option<u32> =
+        place.split(',').next().and_then(|step| step.trim_end_matches(char::is_alphabetic).parse().ok());
     // The training data contain the delay of the torque sensor as well.
     if step.map_or(place.starts_with("tap"), |step| step <= last) {
         return Err(EnsembleError::StandsFor { effect, scope: entry.scope.to_string(), tap, last, place });

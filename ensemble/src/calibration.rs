@@ -1,6 +1,6 @@
 //! Calibration of an ensemble's predictive uncertainty.
 
-use crate::data::{Split, DataSet, Sequence};
+use crate::data::{DataSet, Sequence, Split};
 use crate::ensemble::{Ensemble, Gaussian};
 
 /// Nominal levels of the central prediction intervals.
@@ -155,7 +155,10 @@ mod tests {
     fn predictions(predicted_std: f64) -> Predictions {
         let mut random = stream(4, "truth", 0);
         let row = |_| {
-            (1.0 + 2.0 * standard_normal(&mut random), vec![Gaussian { mean: 1.0, variance: predicted_std * predicted_std }; 3])
+            (
+                1.0 + 2.0 * standard_normal(&mut random),
+                vec![Gaussian { mean: 1.0, variance: predicted_std * predicted_std }; 3],
+            )
         };
         Predictions { rows: (0..20_000).map(row).collect() }
     }

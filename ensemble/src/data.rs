@@ -89,7 +89,12 @@ impl DataSet {
             for (_, part) in log.segments() {
                 for start in part.clone().step_by(block_rows) {
                     let block = start..part.end.min(start + block_rows);
-                    set.add(log, &columns, &block, BlockContext { starts_part: start == part.start, number: blocks, hz });
+                    set.add(
+                        log,
+                        &columns,
+                        &block,
+                        BlockContext { starts_part: start == part.start, number: blocks, hz },
+                    );
                     blocks += 1;
                 }
             }
@@ -250,8 +255,8 @@ fn contiguous_ranges(rows: impl Iterator<Item = usize>, follows: impl Fn(usize) 
 
 #[cfg(test)]
 pub mod tests {
-    use twinstep_model::BaseMount;
     use twinstep_logs::{Gain, Meta, Segment};
+    use twinstep_model::BaseMount;
     use twinstep_model::{standard_normal, stream};
 
     use super::*;
@@ -372,9 +377,7 @@ pub mod tests {
         assert!(error(&|_, columns| columns.push(column("tau_ff_knee", 2.0))).contains("`tau_ff_knee` at row 7"));
         assert!(error(&|_, columns| columns.push(column("kp", 5.0))).contains("kp 5, kd 0.5 at row 7"));
         assert!(error(&|meta, _| meta.tau_sensor = TorqueSensor::None).contains("no measured torque"));
-        assert!(
-            error(&|_, columns| columns.iter_mut().for_each(|(_, cells)| cells.truncate(400))).contains("too few")
-        );
+        assert!(error(&|_, columns| columns.iter_mut().for_each(|(_, cells)| cells.truncate(400))).contains("too few"));
         let slow = log(2000, |meta, _| meta.rate_hz = 100.0);
         let logs = [("one".to_owned(), log(2000, |_, _| {})), ("two".to_owned(), slow)];
         let error = DataSet::new(&logs).expect_err("rejected").to_string();

@@ -9,8 +9,8 @@ use crate::EnsembleError;
 use crate::data::Sequence;
 use crate::network::Network;
 use crate::normaliser::Normalisers;
-use crate::weights::{Shape, Weights};
 use crate::sequences::SequenceDataset;
+use crate::weights::{Shape, Weights};
 
 /// Number of sequences per batch in a prediction.
 const PREDICTION_BATCH: usize = 256;

@@ -8,7 +8,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::EnsembleError;
-use crate::ensemble::{EnsembleMetadata, Ensemble};
+use crate::ensemble::{Ensemble, EnsembleMetadata};
 use crate::weights::{Shape, Weights};
 
 /// An array of a file.
@@ -240,7 +240,10 @@ mod tests {
             Ensemble::read(&path).expect_err("error").to_string()
         };
         let missing = error(&[[20.0, 0.5]]);
-        assert!(missing.ends_with("has `gains` of 1 joints, but 2 joints; one pair per joint is expected"), "{missing}");
+        assert!(
+            missing.ends_with("has `gains` of 1 joints, but 2 joints; one pair per joint is expected"),
+            "{missing}"
+        );
         let negative = error(&[[20.0, 0.5], [20.0, -0.5]]);
         assert!(negative.ends_with("of FL_calf with kp 20 and kd -0.5; both must be 0 or more"), "{negative}");
     }

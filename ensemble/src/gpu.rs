@@ -16,7 +16,9 @@ pub fn best() -> Result<(Device, &'static str), EnsembleError> {
 /// Returns an error, because the feature `gpu` is off.
 #[cfg(not(feature = "gpu"))]
 pub fn best() -> Result<(Device, &'static str), EnsembleError> {
-    Err(EnsembleError::NoGpu { cause: "built without GPU support; use `cargo build --release --features gpu`".to_owned() })
+    Err(EnsembleError::NoGpu {
+        cause: "built without GPU support; use `cargo build --release --features gpu`".to_owned(),
+    })
 }
 
 /// Returns the GPU, which burn can initialise only once per process.
@@ -59,6 +61,9 @@ mod tests {
     #[test]
     fn error_without_the_feature_contains_the_build_command() {
         let error = best().map(|_| ()).expect_err("none").to_string();
-        assert_eq!(error, "cannot train on a GPU: built without GPU support; use `cargo build --release --features gpu`");
+        assert_eq!(
+            error,
+            "cannot train on a GPU: built without GPU support; use `cargo build --release --features gpu`"
+        );
     }
 }

@@ -10,9 +10,9 @@ use crate::EnsembleError;
 use crate::adam::adam;
 use crate::checkpoint::MemberState;
 use crate::network::Network;
+use crate::sequences::SequenceDataset;
 use crate::train::{Epoch, TrainingOptions};
 use crate::weights::{Shape, Weights};
-use crate::sequences::SequenceDataset;
 
 /// Maximum number of sequences in a batch.
 const LARGEST_BATCH: usize = 256;

@@ -134,7 +134,9 @@ impl<T: SimdFloat> MemberBatch for Members<T> {
 
     fn advance(&mut self, heads: Heads) {
         self.work(|block| {
-            block.has_input.then_some(Work { advance: true, heads: if block.output_needed { Some(heads) } else { None } })
+            block
+                .has_input
+                .then_some(Work { advance: true, heads: if block.output_needed { Some(heads) } else { None } })
         });
         for block in self.members.iter_mut().flat_map(|(_, blocks)| blocks).filter(|block| block.has_input) {
             (block.has_input, block.output_needed, block.active) = (false, false, [T::splat(0.0); 2]);

@@ -6,8 +6,8 @@ use burn::tensor::activation::{relu, sigmoid, tanh};
 use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::encoder::Encoder;
-use crate::weights::{Shape, Weights};
 use crate::sequences::Batch;
+use crate::weights::{Shape, Weights};
 
 /// Minimum normalised variance (U2E §IV-B).
 pub const VARIANCE_FLOOR: f64 = 1e-6;
@@ -201,9 +201,9 @@ mod tests {
 
     use super::*;
     use crate::data::tests::log;
-    use crate::data::{Split, DataSet};
-    use crate::train::{TrainingOptions, Training};
+    use crate::data::{DataSet, Split};
     use crate::sequences::SequenceDataset;
+    use crate::train::{Training, TrainingOptions};
 
     const SHAPE: Shape = Shape { inputs: 2, hidden: 8 };
 
@@ -214,7 +214,8 @@ mod tests {
     /// Returns two sequences, one of which has burn-in rows.
     fn batch() -> Batch {
         let data = DataSet::new(&[("here".to_owned(), log(2000, |_, _| {}))]).expect("a set");
-        let training = Training::new(&data, TrainingOptions { hidden: 8, ..TrainingOptions::default() }).expect("options");
+        let training =
+            Training::new(&data, TrainingOptions { hidden: 8, ..TrainingOptions::default() }).expect("options");
         SequenceDataset::sequences(data.runs(Split::Training), &training.description).batch(&[0, 3])
     }
 
@@ -224,7 +225,8 @@ mod tests {
     fn check_against_burn(device: &Device) {
         let (by_hand, by_burn, batch) =
             (network(&Device::flex().autodiff()), network(&device.clone().autodiff()), batch());
-        let ((expected_loss, expected), (loss, found)) = (by_hand.manual_backward(&batch), by_burn.autodiff_backward(&batch));
+        let ((expected_loss, expected), (loss, found)) =
+            (by_hand.manual_backward(&batch), by_burn.autodiff_backward(&batch));
         assert!((loss - expected_loss).abs() < 1e-5, "{loss} for {expected_loss}");
         for (index, (name, dimensions)) in SHAPE.layout().into_iter().enumerate() {
             let id = ParamId::from(index as u64 + 1);

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::data::{Split, DataSet};
+use crate::data::{DataSet, Split};
 
 /// Mean and standard deviation of a quantity.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -11,6 +11,7 @@ pub struct Normaliser {
     /// Mean.
     pub mean: f64,
     /// Standard deviation, greater than 0.
+    #[serde(rename = "deviation")]
     pub std: f64,
 }
 
@@ -43,7 +44,9 @@ impl Normalisers {
     /// Computes the normalisers of the training split.
     pub(crate) fn of(data: &DataSet) -> Self {
         let error = |index: usize| {
-            Normaliser::of(data.runs(Split::Training).flat_map(move |run| run.errors.iter().map(move |error| error[index])))
+            Normaliser::of(
+                data.runs(Split::Training).flat_map(move |run| run.errors.iter().map(move |error| error[index])),
+            )
         };
         let torque = Normaliser::of(data.runs(Split::Training).flat_map(|run| run.torques.iter().copied()));
         Self { errors: [error(0), error(1)], torque }

@@ -2,7 +2,7 @@
 
 use twinstep_model::stream;
 
-use crate::ensemble::{EnsembleMetadata, Ensemble};
+use crate::ensemble::{Ensemble, EnsembleMetadata};
 use crate::weights::Weights;
 
 /// Argument of the encoder's tanh in [`Ensemble::linear_pd`] per standard deviation of torque.

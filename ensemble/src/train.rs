@@ -12,8 +12,8 @@ use serde::{Deserialize, Serialize};
 use crate::EnsembleError;
 use crate::calibration::variance_scale;
 use crate::checkpoint::{Checkpoint, MemberState};
-use crate::data::{Split, DataSet};
-use crate::ensemble::{EnsembleMetadata, Ensemble, JointEncoding};
+use crate::data::{DataSet, Split};
+use crate::ensemble::{Ensemble, EnsembleMetadata, JointEncoding};
 use crate::gpu;
 use crate::member::{EpochEnd, MemberTrainer, finished};
 use crate::normaliser::Normalisers;
@@ -322,7 +322,7 @@ mod tests {
         };
         assert_close(curves(&on_gpu, None));
         for [first, second] in [[&on_cpu, &on_gpu], [&on_gpu, &on_cpu]] {
-            let ended = first.run(1, None, &mut |progress| !matches!(progress, Progress::Epoch { .. }));
+            let ended = first.run(1, None, &mut |progress| !matches!(progress, TrainingEvent::Epoch { .. }));
             let Ok(TrainingResult::Interrupted(checkpoint)) = ended else { panic!("the training was not interrupted") };
             assert_close(curves(second, Some(checkpoint)));
         }
@@ -353,7 +353,8 @@ mod tests {
 
     #[test]
     fn error_names_the_option_out_of_range() {
-        let error = Training::new(&data(), TrainingOptions { members: 0, ..options(4) }).map(|_| ()).expect_err("rejected");
+        let error =
+            Training::new(&data(), TrainingOptions { members: 0, ..options(4) }).map(|_| ()).expect_err("rejected");
         assert_eq!(error.to_string(), "`members` = 0 is not allowed: 1 to 100");
     }
 }

@@ -1,11 +1,11 @@
 //! Factories of the environments of a lease.
 
-use twinstep_ensemble::{EnsembleError, ActuatorNetworkRobot};
-use twinstep_envs::{CounterEnv, TaskEnv, TaskName, TaskEnvConfig};
-use twinstep_effects::{SamplingError, RobotSampler};
-use twinstep_model::{Actuator, AutoresetMode, RobotModel, VecEnv};
 use twinstep_effects::{ModelFile, ModelFileError};
-use twinstep_sim::{BatchBackend, BackendBuildError, Engine, RapierBackend};
+use twinstep_effects::{RobotSampler, SamplingError};
+use twinstep_ensemble::{ActuatorNetworkRobot, EnsembleError};
+use twinstep_envs::{CounterEnv, TaskEnv, TaskEnvConfig, TaskName};
+use twinstep_model::{Actuator, AutoresetMode, RobotModel, VecEnv};
+use twinstep_sim::{BackendBuildError, BatchBackend, Engine, RapierBackend};
 
 use crate::Config;
 

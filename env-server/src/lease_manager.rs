@@ -9,13 +9,13 @@ use std::time::{Duration, Instant};
 
 use twinstep_model::EnvSpec;
 use twinstep_protocol::keys::{self, Request};
-use twinstep_protocol::{ErrorCode, PROTOCOL, ErrorReply, decode, encode, message};
+use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, decode, encode, message};
 use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
 use crate::EnvFactory;
 use crate::server::{SHUTDOWN_GRACE, random_id};
-use crate::worker::{LeaseParams, WorkerRequest, ServerState, Worker, reply, reply_error, shutting_down, stale_epoch};
+use crate::worker::{LeaseParams, ServerState, Worker, WorkerRequest, reply, reply_error, shutting_down, stale_epoch};
 
 /// Capacity of a worker's request queue. A client has one request in progress; the rest is for its repeats.
 const WORKER_QUEUE: usize = 32;
@@ -92,7 +92,9 @@ pub fn dispatch(query: Query, sid: &str, routes: &WorkerTable, lease_queue: &Syn
         None => drop(lease_queue.try_send(LeaseManagerMessage::Query(query.clone()))),
         Some(route) => {
             *route.last_request.write().unwrap_or_else(std::sync::PoisonError::into_inner) = Instant::now();
-            if let Err(TrySendError::Full(WorkerRequest::Env(_, query))) = route.jobs.try_send(WorkerRequest::Env(verb, query.clone())) {
+            if let Err(TrySendError::Full(WorkerRequest::Env(_, query))) =
+                route.jobs.try_send(WorkerRequest::Env(verb, query.clone()))
+            {
                 let message = format!("{WORKER_QUEUE} requests of this lease are already queued");
                 let error = ErrorReply::new(ErrorCode::Busy, "", message).with_hint("send one request at a time");
                 reply_error(&query, &error);
@@ -207,7 +209,11 @@ impl LeaseManager {
         }
         let is_id = |character: char| character.is_ascii_alphanumeric() || matches!(character, '-' | '_');
         if request.client.is_empty() || request.client.len() > 64 || !request.client.chars().all(is_id) {
-            return reject(ErrorCode::OutOfRange, "client", "`client` must be 1 to 64 letters, digits, - and _".to_owned());
+            return reject(
+                ErrorCode::OutOfRange,
+                "client",
+                "`client` must be 1 to 64 letters, digits, - and _".to_owned(),
+            );
         }
         if request.num_envs == 0 {
             return reject(ErrorCode::OutOfRange, "num_envs", "`num_envs` = 0; must be at least 1".to_owned());
@@ -257,16 +263,19 @@ impl LeaseManager {
             max_episode_steps: request.max_episode_steps,
         };
         let (sender, receiver) = sync_channel(WORKER_QUEUE);
-        let (factory, shared, lease_queue) = (Arc::clone(&self.factory), Arc::clone(&self.shared), self.own_queue.clone());
+        let (factory, shared, lease_queue) =
+            (Arc::clone(&self.factory), Arc::clone(&self.shared), self.own_queue.clone());
         let thread = std::thread::Builder::new()
             .name(format!("lease-{id}"))
             .spawn(move || Worker::run(grant, &*factory, shared, lease_queue, &receiver))
-            .map_err(|error| ErrorReply::new(ErrorCode::Internal, "", format!("cannot start a thread for the lease: {error}")))?;
+            .map_err(|error| {
+                ErrorReply::new(ErrorCode::Internal, "", format!("cannot start a thread for the lease: {error}"))
+            })?;
         tracing::info!(lease = id, client = request.client, num_envs, "lease granted");
         let route = WorkerHandle { jobs: sender, last_request: RwLock::new(Instant::now()) };
         self.routes.write().unwrap_or_else(std::sync::PoisonError::into_inner).insert(id.to_owned(), route);
         let disconnected_since = (!self.live_clients.contains(&request.client)).then(Instant::now);
-        let lease = Lease { client: request.client.clone(), num_envs, epoch: 1, disconnected_since: disconnected_since, thread };
+        let lease = Lease { client: request.client.clone(), num_envs, epoch: 1, disconnected_since, thread };
         self.leases.insert(id.to_owned(), lease);
         Ok(())
     }
@@ -274,7 +283,9 @@ impl LeaseManager {
     fn reclaim(&mut self, client: &str, reclaim: &message::Reclaim, query: &Query) -> Result<(), ErrorReply> {
         let Some(lease) = self.leases.get(&reclaim.lease) else {
             let message = format!("lease `{}` does not exist: it was closed or expired", reclaim.lease);
-            return Err(ErrorReply::new(ErrorCode::LeaseLost, "reclaim.lease", message).with_hint("request a new lease"));
+            return Err(
+                ErrorReply::new(ErrorCode::LeaseLost, "reclaim.lease", message).with_hint("request a new lease")
+            );
         };
         let epoch = lease.epoch;
         // The reply to the new owner was lost: repeat it with the same epoch.
@@ -319,7 +330,11 @@ impl LeaseManager {
                 })
             };
             let is_disconnected = |lease: &Lease| lease.disconnected_since.is_some_and(|since| since.elapsed() > grace);
-            self.leases.iter().filter(|(id, lease)| is_disconnected(lease) && is_idle(id)).map(|(id, _)| id.clone()).collect()
+            self.leases
+                .iter()
+                .filter(|(id, lease)| is_disconnected(lease) && is_idle(id))
+                .map(|(id, _)| id.clone())
+                .collect()
         };
         for id in expired {
             self.release(&id, "its client is disconnected and the grace period has passed");

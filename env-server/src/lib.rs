@@ -10,8 +10,8 @@
 //! A repeated request therefore waits for the one in progress and gets its reply.
 
 mod config;
-mod lease_manager;
 mod env_factory;
+mod lease_manager;
 mod server;
 mod worker;
 

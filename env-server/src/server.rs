@@ -91,8 +91,7 @@ impl Server {
         // One environment provides the spec, and shows before the first lease that the factory works.
         let spec = factory.build(1, AutoresetMode::NextStep, None)?.spec().clone();
         let sid = random_id();
-        let session = zenoh::open(zenoh_config(config)?)
-            .wait()
+        let session = twinstep_session::open(zenoh_config(config)?)
             .map_err(|error| ServerError::Open { listen: config.listen.clone(), reason: error.to_string() })?;
         let (lease_queue, jobs) = sync_channel(LEASE_QUEUE);
         let routes = Arc::new(RwLock::new(HashMap::new()));
@@ -104,7 +103,8 @@ impl Server {
             max_envs: config.envs,
             lease_grace: config.lease_grace(),
         };
-        let lease_manager = LeaseManager::new(info, factory, Arc::clone(&shared), Arc::clone(&routes), lease_queue.clone());
+        let lease_manager =
+            LeaseManager::new(info, factory, Arc::clone(&shared), Arc::clone(&routes), lease_queue.clone());
         let lease_thread = std::thread::Builder::new()
             .name("lease-manager".to_owned())
             .spawn(move || lease_manager.run(&jobs))
@@ -157,7 +157,11 @@ impl Server {
     }
 }
 
-fn watch_clients(session: &Session, sid: &str, lease_queue: SyncSender<LeaseManagerMessage>) -> Result<(), ServerError> {
+fn watch_clients(
+    session: &Session,
+    sid: &str,
+    lease_queue: SyncSender<LeaseManagerMessage>,
+) -> Result<(), ServerError> {
     let key = keys::live_clients(sid);
     let own_sid = sid.to_owned();
     session
@@ -167,7 +171,8 @@ fn watch_clients(session: &Session, sid: &str, lease_queue: SyncSender<LeaseMana
         .callback(move |sample| {
             if let Some(client) = keys::parse_live_client(sample.key_expr().as_str(), &own_sid) {
                 // Blocks only while the queue is full. A dropped message would keep the lease of a disconnected client.
-                let _ = lease_queue.send(LeaseManagerMessage::Client(client.to_owned(), sample.kind() == SampleKind::Put));
+                let _ =
+                    lease_queue.send(LeaseManagerMessage::Client(client.to_owned(), sample.kind() == SampleKind::Put));
             }
         })
         .background()

@@ -11,7 +11,7 @@ use std::sync::mpsc::{Receiver, SyncSender};
 
 use twinstep_model::{AutoresetMode, EnvError, VecEnv};
 use twinstep_protocol::keys::EnvMethod;
-use twinstep_protocol::{ErrorCode, PROTOCOL, ErrorReply, convert, decode, encode, message, tensor};
+use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, message, tensor};
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
@@ -76,7 +76,13 @@ enum CachedReply {
 
 impl Worker {
     /// Builds the environments and handles requests until the lease is released. Runs on a thread of its own.
-    pub fn run(grant: LeaseParams, factory: &dyn EnvFactory, shared: Arc<ServerState>, lease_queue: SyncSender<LeaseManagerMessage>, jobs: &Receiver<WorkerRequest>) {
+    pub fn run(
+        grant: LeaseParams,
+        factory: &dyn EnvFactory,
+        shared: Arc<ServerState>,
+        lease_queue: SyncSender<LeaseManagerMessage>,
+        jobs: &Receiver<WorkerRequest>,
+    ) {
         let built = catch_unwind(AssertUnwindSafe(|| {
             factory.build(grant.num_envs, grant.autoreset, grant.max_episode_steps).map_err(|error| error.to_string())
         }));
@@ -259,7 +265,12 @@ fn logged(error: &EnvError) -> ErrorReply {
 }
 
 /// Answers every request with the reason why the environments could not be built, until the lease is released.
-fn reject_all(jobs: &Receiver<WorkerRequest>, lease_queue: &SyncSender<LeaseManagerMessage>, lease: &str, reason: &str) {
+fn reject_all(
+    jobs: &Receiver<WorkerRequest>,
+    lease_queue: &SyncSender<LeaseManagerMessage>,
+    lease: &str,
+    reason: &str,
+) {
     tracing::error!(lease, reason, "environments could not be built");
     let _ = lease_queue.try_send(LeaseManagerMessage::Closed(lease.to_owned()));
     while let Ok(job) = jobs.recv() {

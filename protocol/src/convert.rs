@@ -5,7 +5,7 @@ use std::sync::Arc;
 use twinstep_model::{EndedEpisode, EnvError, EnvSpec, Ground, HeightField, ResetRequest, Scene, StepBatch};
 
 use crate::codec::encode_with_capacity;
-use crate::{ErrorCode, PROTOCOL, ErrorReply, encode, message, tensor};
+use crate::{ErrorCode, ErrorReply, PROTOCOL, encode, message, tensor};
 
 /// Upper bound on the size of a message without its tensors [bytes].
 const MAP_OVERHEAD: usize = 256;
@@ -161,8 +161,12 @@ pub fn check_length(field: &'static str, given: usize, expected: usize) -> Resul
 /// Converts an error of an environment to an error reply.
 pub fn wire_error(error: &EnvError) -> ErrorReply {
     let (code, field, hint) = match error {
-        EnvError::WrongLength { field, .. } => (ErrorCode::BadShape, *field, "expected are `num_envs` × the size in the spec"),
-        EnvError::ActionNotFinite { .. } => (ErrorCode::NotFinite, "actions", "check the policy that computed the action"),
+        EnvError::WrongLength { field, .. } => {
+            (ErrorCode::BadShape, *field, "expected are `num_envs` × the size in the spec")
+        }
+        EnvError::ActionNotFinite { .. } => {
+            (ErrorCode::NotFinite, "actions", "check the policy that computed the action")
+        }
         EnvError::NeedsReset { .. } => (ErrorCode::NeedsReset, "", "send `reset`, with `mask` for some environments"),
         EnvError::EnvOutOfRange { .. } => (ErrorCode::OutOfRange, "env", "environments are numbered from 0"),
         EnvError::RenderUnsupported { .. } => (ErrorCode::UnknownKey, "", "use a task with a robot, such as `walk`"),

@@ -3,7 +3,9 @@
 use glam::DMat3;
 use proptest::prelude::*;
 use twinstep_effects::{CATALOGUE, EffectEntry, Scope, Target, apply_effects};
-use twinstep_model::{Command, RolloutRequest, Joint, InitialState, Precision, RobotModel, RobotStates, Rollout, go2, BaseMount};
+use twinstep_model::{
+    BaseMount, Command, InitialState, Joint, Precision, RobotModel, RobotStates, Rollout, RolloutRequest, go2,
+};
 use twinstep_sim::{BatchRollout, SimConfig};
 
 /// Actuator periods of a rollout.
@@ -43,10 +45,8 @@ fn play(robots: &[RobotModel], base: BaseMount) -> Vec<RobotStates> {
     let pose = go2().control.default_pose_f32();
     let commands = vec![Command::hold(pose.map(|q| q + 0.2), 30.0, 0.75); PERIODS];
     let start = InitialState::at_rest(0.33, pose);
-    let jobs: Vec<_> = robots
-        .iter()
-        .map(|robot| RolloutRequest { robot, held: base == BaseMount::Fixed, start, history: &[], commands: &commands })
-        .collect();
+    let jobs: Vec<_> =
+        robots.iter().map(|robot| RolloutRequest { robot, base, start, history: &[], commands: &commands }).collect();
     let config = SimConfig { threads: 1, ..SimConfig::default() };
     BatchRollout::new(&go2(), &config).unwrap().run(&jobs, Precision::Double)
 }

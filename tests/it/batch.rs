@@ -1,9 +1,11 @@
 //! The batch engine against rapier and against physics.
 
 use rand::RngExt;
+use twinstep_model::{
+    Backend, BaseMount, Command, InitialState, NUM_JOINTS, PerJoint, RandomisationSample, go2, stream,
+};
+use twinstep_sim::{BatchBackend, BatchBackend as Simulator, Engine, RapierBackend, SimConfig, SimdPrecision};
 use twinstep_simd::InstructionSet;
-use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, InitialState, RandomisationSample, go2, stream, BaseMount};
-use twinstep_sim::{BatchBackend, BatchBackend as Simulator, Engine, SimdPrecision, RapierBackend, SimConfig};
 
 const ENGINE: Engine = Engine::Batch;
 
@@ -131,7 +133,8 @@ fn robot_gives_the_same_bits_in_any_lane_batch_and_number_of_threads() {
         let config = SimConfig { threads, ..at(400, 4, BaseMount::Floating) };
         let mut backend = batch(config, robots);
         let placement = |robot: usize| {
-            let variation = RandomisationSample { mass_scale: 0.8 + 0.05 * robot as f32, ..RandomisationSample::default() };
+            let variation =
+                RandomisationSample { mass_scale: 0.8 + 0.05 * robot as f32, ..RandomisationSample::default() };
             InitialState { randomisation: variation, ..InitialState::at_rest(0.3 + 0.01 * robot as f32, pose()) }
         };
         let chosen = InitialState { base_linear_velocity: [0.5, 0.2, 0.0], ..placement(3) };
@@ -153,7 +156,11 @@ fn robot_gives_the_same_bits_in_any_lane_batch_and_number_of_threads() {
 
 /// A robot that trots for a second, in the numbers that `lanes` names: joints after each actuator period.
 fn trot_in(lanes: SimdPrecision) -> Vec<PerJoint> {
-    motion(&mut BatchBackend::with_precision(go2(), at(1000, 4, BaseMount::Floating), 1, lanes).unwrap(), 0.335, trot_target)
+    motion(
+        &mut BatchBackend::with_precision(go2(), at(1000, 4, BaseMount::Floating), 1, lanes).unwrap(),
+        0.335,
+        trot_target,
+    )
 }
 
 #[test]

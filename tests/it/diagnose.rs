@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
-use twinstep_logs::{Log, Meta};
-use twinstep_effects::{Effect, EffectEntry, apply_effects};
-use twinstep_effects::ModelFile;
-use twinstep_model::{RobotModel, go2};
 use twinstep_diagnose::{Diagnosis, ParameterValue};
+use twinstep_effects::ModelFile;
+use twinstep_effects::{Effect, EffectEntry, apply_effects};
+use twinstep_logs::{Log, Meta};
+use twinstep_model::{RobotModel, go2};
 use twinstep_tests::browser::{browser, layout};
 use twinstep_tests::ground_truth_actuator::{DRIVES, Motion, NOISE_NM};
 
@@ -65,11 +65,14 @@ fn stands_in_a_browser(page: &Path) {
 fn delay_with_which_a_loop_rings_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let delay = Effect::named("torque_delay").unwrap();
-    let robot = apply_effects(&go2(), &[EffectEntry::new(delay, "RL_calf".parse().unwrap(), vec![0.0085]).unwrap()]).unwrap();
+    let robot =
+        apply_effects(&go2(), &[EffectEntry::new(delay, "RL_calf".parse().unwrap(), vec![0.0085]).unwrap()]).unwrap();
     let diagnosis = diagnosed(&robot, folder.path());
     let names: Vec<_> = diagnosis.findings.iter().map(|cause| (&cause.effect[..], &cause.scope[..])).collect();
     assert_eq!(names[0], ("torque_delay", "RL_calf"), "{diagnosis:#?}");
-    let ParameterValue::Number(delay) = diagnosis.findings[0].parameters["delay_s"].value else { panic!("{diagnosis:#?}") };
+    let ParameterValue::Number(delay) = diagnosis.findings[0].parameters["delay_s"].value else {
+        panic!("{diagnosis:#?}")
+    };
     assert!((delay / 0.0085 - 1.0).abs() < 0.05, "{delay} s");
 }
 

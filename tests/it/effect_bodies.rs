@@ -4,7 +4,10 @@ use std::f64::consts::TAU;
 
 use glam::{DVec3, Vec3};
 use twinstep_effects::{Effect, EffectEntry, apply_effects};
-use twinstep_model::{Backend, Command, Joint, PerJoint, InitialState, Pose, RigidBody, RobotModel, RobotStates, body_poses, frames, go2, BaseMount};
+use twinstep_model::{
+    Backend, BaseMount, Command, InitialState, Joint, PerJoint, Pose, RigidBody, RobotModel, RobotStates, body_poses,
+    frames, go2,
+};
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 
 const GRAVITY: f64 = 9.81;

@@ -5,7 +5,9 @@
 
 use glam::DVec3;
 use twinstep_effects::{Effect, EffectEntry, apply_effects};
-use twinstep_model::{Backend, Command, RolloutRequest, InitialState, Precision, RobotModel, RobotStates, Rollout, go2, BaseMount};
+use twinstep_model::{
+    Backend, BaseMount, Command, InitialState, Precision, RobotModel, RobotStates, Rollout, RolloutRequest, go2,
+};
 use twinstep_sim::{BatchRollout, Engine, RapierBackend, SimConfig};
 
 const CALF: usize = 2;
@@ -237,7 +239,13 @@ fn effects_of_joints_follow_their_laws_in_both_engines() {
     let robots: Vec<_> = std::iter::once(lone_calf()).chain(CASES.iter().map(|(entries, _)| robot(entries))).collect();
     let jobs: Vec<_> = robots
         .iter()
-        .map(|robot| RolloutRequest { robot, held: true, start: placement(), history: &[], commands: &commands })
+        .map(|robot| RolloutRequest {
+            robot,
+            base: BaseMount::Fixed,
+            start: placement(),
+            history: &[],
+            commands: &commands,
+        })
         .collect();
     let played = BatchRollout::new(&lone_calf(), &config(Engine::Batch)).unwrap().run(&jobs, Precision::Double);
     let in_batch = |index: usize| -> Vec<_> { (1..=PERIODS).map(|entry| shown(&played[index], entry)).collect() };

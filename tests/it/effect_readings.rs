@@ -1,10 +1,12 @@
 //! What sensors show and a log tells, against the definitions of the effects.
 
 use glam::Vec3;
-use twinstep_model::{BaseMount, Backend, Command, RolloutRequest, InitialState, Precision, RobotModel, RobotStates, Rollout, go2};
-use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
-use twinstep_sim::SimConfig;
 use twinstep_identify::{Experiment, WindowConfig};
+use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{
+    Backend, BaseMount, Command, InitialState, Precision, RobotModel, RobotStates, Rollout, RolloutRequest, go2,
+};
+use twinstep_sim::SimConfig;
 
 use crate::effect_bodies::{batch, config, pose, rapier, run, with};
 
@@ -60,10 +62,13 @@ fn told(robot: &RobotModel, late: f64) -> (Vec<f64>, Vec<Command>) {
         ("battery_V", column(&|row| 30.0 - 0.1 * row)),
         ("temp_FL_calf", column(&|row| 30.0 + row)),
     ];
-    let log =
-        Log::new(Meta::new(200.0, TorqueSensor::MotorCurrent, segments), columns.map(|(name, cells)| (name.to_owned(), cells)));
+    let log = Log::new(
+        Meta::new(200.0, TorqueSensor::MotorCurrent, segments),
+        columns.map(|(name, cells)| (name.to_owned(), cells)),
+    );
     let mut simulator = CommandRecorder::default();
-    let experiment = Experiment::new(&log.unwrap(), robot, WindowConfig::EVALUATION).unwrap().filter_rows(|row| row >= 10);
+    let experiment =
+        Experiment::new(&log.unwrap(), robot, WindowConfig::EVALUATION).unwrap().filter_rows(|row| row >= 10);
     let residuals = experiment.residuals(&mut simulator, std::slice::from_ref(robot), Precision::Double);
     (residuals.into_iter().next().unwrap(), simulator.0)
 }

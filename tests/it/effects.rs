@@ -1,9 +1,11 @@
 //! Effects of the catalogue do the same in both engines.
 
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
-use twinstep_envs::TaskName;
 use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Scope, Target, apply_effects};
-use twinstep_model::{Backend, Command, NUM_JOINTS, PerJoint, InitialState, ResetRequest, RobotModel, VecEnv, go2, BaseMount};
+use twinstep_envs::TaskName;
+use twinstep_model::{
+    Backend, BaseMount, Command, InitialState, NUM_JOINTS, PerJoint, ResetRequest, RobotModel, VecEnv, go2,
+};
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 
 use crate::remote;
@@ -30,7 +32,8 @@ fn motion(backend: &mut impl Backend, base: BaseMount) -> Vec<PerJoint> {
     for period in 0..PERIODS {
         let t = period as f32 * 0.005;
         let swing = (std::f32::consts::TAU * (1.0 + 1.5 * t) * t).sin();
-        let target = std::array::from_fn(|j| pose[j] + if base == BaseMount::Fixed { 0.3 * swing } else { 0.08 * swing });
+        let target =
+            std::array::from_fn(|j| pose[j] + if base == BaseMount::Fixed { 0.3 * swing } else { 0.08 * swing });
         backend.step(&[Command::hold(target, 30.0, 0.75)], &[true], 1).unwrap();
         rows.push(backend.states().q[0]);
         rows.push(backend.states().tau[0].map(|tau| 0.02 * tau));

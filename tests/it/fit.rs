@@ -5,12 +5,12 @@ use std::f64::consts::TAU;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use twinstep_ensemble::{Split, DataSet, Ensemble, epistemic_uncertainty};
-use twinstep_model::{BaseMount, JOINT_NAMES, RobotModel, go2};
-use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_effects::{EffectEntry, apply_effects};
-use twinstep_sim::{BatchBackend, Engine, SimConfig};
+use twinstep_ensemble::{DataSet, Ensemble, Split, epistemic_uncertainty};
 use twinstep_identify::{RecordError, Sensor, apply_sensors, record};
+use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{BaseMount, JOINT_NAMES, RobotModel, go2};
+use twinstep_sim::{BatchBackend, Engine, SimConfig};
 use twinstep_tests::ground_truth_robot::effect;
 use twinstep_tests::python::Programs;
 
@@ -52,7 +52,7 @@ fn log(amplitude: f64) -> Log {
     (meta.kp, meta.kd) = (Some(Gain::Uniform(25.0)), Some(Gain::Uniform(0.6)));
     let motion = Log::new_commands(meta, columns).unwrap();
     let robot = robot();
-    let backend = |_| {
+    let backend = |_, robot: &RobotModel| {
         let config = SimConfig { engine: Engine::Batch, base: BaseMount::Fixed, threads: 1, ..SimConfig::default() };
         BatchBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)))
     };
@@ -83,7 +83,7 @@ fn ensemble_predicts_late_and_saturating_drives_and_disagrees_where_it_has_not_b
     assert!(output.status.success(), "{}", stderr(&output));
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     assert!(text.contains("mixture, scaled") && text.contains("epochs of each member: "), "{text}");
-    assert!(std::fs::read_to_string(&plot).unwrap().contains("networks learn"));
+    assert!(std::fs::read_to_string(&plot).unwrap().contains("Training of 2 networks"));
 
     let ensemble = Ensemble::read(&out).unwrap();
     let euf = |data: &DataSet| {

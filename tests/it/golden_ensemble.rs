@@ -5,7 +5,7 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use twinstep_ensemble::{DataSet, Ensemble, Inference, JointEncoding, TrainingOptions, TrainingResult, Training};
+use twinstep_ensemble::{DataSet, Ensemble, Inference, JointEncoding, Training, TrainingOptions, TrainingResult};
 use twinstep_model::{JOINT_NAMES, NUM_JOINTS};
 use twinstep_tests::ground_truth_actuator::{DRIVES, Motion};
 

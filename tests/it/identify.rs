@@ -4,12 +4,17 @@ use std::collections::BTreeMap;
 use std::process::Command as Process;
 
 use rand::RngExt;
-use twinstep_model::{BaseMount, Backend, Command, FIXED_BASE_HEIGHT, JOINT_NAMES, InitialState, RobotModel, go2, stream};
-use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
-use twinstep_effects::{Effect, EffectEntry, Scope, apply_effects};
 use twinstep_effects::ModelFile;
+use twinstep_effects::{Effect, EffectEntry, Scope, apply_effects};
+use twinstep_identify::{
+    EstimateStatus, Experiment, GlobalSearch, Identification, IdentifyError, IdentifyOptions, RecordError, Stage,
+    WindowConfig, evaluate, identify, record,
+};
+use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{
+    Backend, BaseMount, Command, FIXED_BASE_HEIGHT, InitialState, JOINT_NAMES, RobotModel, go2, stream,
+};
 use twinstep_sim::{BatchBackend, BatchRollout, Engine, RapierBackend, SimConfig};
-use twinstep_identify::{Experiment, WindowConfig, Identification, IdentifyError, IdentifyOptions, RecordError, GlobalSearch, Stage, EstimateStatus, evaluate, identify, record};
 use twinstep_tests::python::{Programs, root};
 
 /// What is sought, and the truth.
@@ -151,8 +156,9 @@ fn supply_and_heat_are_identified_from_logs_that_tell_them() {
     let columns = columns.chain([("t".to_owned(), motion.t().to_vec()), ("battery_V".to_owned(), voltage)]);
     let motion = Log::new(motion.meta().clone(), columns).unwrap();
     let config = SimConfig { base: BaseMount::Fixed, threads: 1, ..SimConfig::default() };
-    let backend =
-        |_| BatchBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)));
+    let backend = |_, robot: &RobotModel| {
+        BatchBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)))
+    };
     let log = record(&motion, &robot, None, backend, "sagging".to_owned(), &mut |_| true).unwrap();
     let found = seek(&log, &[("supply_sag", "all")], |_| true);
     let [low, high] = found.findings[0].interval.unwrap();
@@ -210,7 +216,7 @@ fn mistakes_on_the_command_line_are_named() {
     assert!(String::from_utf8_lossy(&output.stderr).starts_with("error: cannot write /nowhere/fitted.toml"));
     let output = twinstep(&["evaluate", "data/go2_air_chirp", "--from", "100"]);
     assert_eq!(output.status.code(), Some(2));
-    assert!(String::from_utf8_lossy(&output.stderr).contains("leave no row"));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("select no row"));
     let output = twinstep(&["effects", "friction"]);
     assert_eq!(output.status.code(), Some(2));
 }

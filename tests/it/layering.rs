@@ -4,32 +4,92 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Crate folder and the workspace crates it may depend on. Leaves import only the core; the edge composes them.
-const MAY_USE: [(&str, &[&str]); 12] = [
-    ("model", &[]),
-    ("logs", &["model"]),
+/// Crate folder and the workspace crates that it may use. Leaves use only the core; the edge composes them.
+const MAY_USE: [(&str, &[&str]); 19] = [
+    // Core.
+    ("crates/simd", &[]),
+    ("crates/model", &["simd"]),
+    ("crates/effects", &["model"]),
+    ("crates/logs", &["model", "effects"]),
     ("protocol", &["model"]),
-    ("sim", &["model"]),
-    ("envs", &["model"]),
-    ("sysid", &["model", "logs"]),
-    ("ensemble", &["model", "logs"]),
-    ("env-server", &["model", "protocol", "sim", "envs", "ensemble"]),
-    ("clients/rust", &["model", "protocol"]),
-    ("cli", &["model", "logs", "protocol", "sim", "envs", "sysid", "ensemble", "env-server", "client"]),
-    ("examples", &["model", "logs", "protocol", "sim", "envs", "env-server", "client"]),
-    ("tests", &["model", "logs", "protocol", "sim", "envs", "sysid", "ensemble", "env-server", "client"]),
+    // Leaves.
+    ("crates/sim", &["simd", "model"]),
+    ("crates/envs", &["model", "effects"]),
+    ("crates/identify", &["model", "effects", "logs"]),
+    ("crates/diagnose", &["model", "effects", "logs", "identify"]),
+    ("crates/session", &[]),
+    ("ensemble", &["simd", "model", "effects", "logs"]),
+    // Edge.
+    ("env-server", &["model", "effects", "protocol", "session", "sim", "envs", "ensemble"]),
+    ("clients/rust", &["model", "protocol", "session"]),
+    ("crates/report", &["model", "effects", "logs", "sim", "identify", "diagnose"]),
+    ("crates/hunt", &["model", "effects", "logs", "sim", "identify", "diagnose"]),
+    (
+        "crates/bench",
+        &[
+            "simd",
+            "model",
+            "effects",
+            "logs",
+            "protocol",
+            "sim",
+            "envs",
+            "identify",
+            "ensemble",
+            "env-server",
+            "client",
+        ],
+    ),
+    (
+        "crates/cli",
+        &[
+            "model",
+            "effects",
+            "logs",
+            "protocol",
+            "sim",
+            "envs",
+            "identify",
+            "diagnose",
+            "ensemble",
+            "env-server",
+            "client",
+            "report",
+            "hunt",
+            "bench",
+        ],
+    ),
+    ("examples", &["model", "env-server", "client"]),
+    (
+        "tests",
+        &[
+            "simd",
+            "model",
+            "effects",
+            "logs",
+            "protocol",
+            "session",
+            "sim",
+            "envs",
+            "identify",
+            "diagnose",
+            "ensemble",
+            "env-server",
+            "client",
+        ],
+    ),
 ];
 
-/// A library that stands behind one wall, and the crates inside it.
+/// A library that only some crates may use.
 const WALLS: [(&str, &[&str]); 8] = [
-    ("rapier3d", &["sim"]),
+    ("rapier3d", &["crates/sim"]),
     ("burn", &["ensemble"]),
-    ("zenoh", &["env-server", "clients/rust", "tests"]),
-    ("clap", &["cli", "tests"]),
-    ("plotters", &["cli"]),
-    ("parquet", &["logs"]),
-    ("mcap", &["logs"]),
-    ("nalgebra", &["sysid"]),
+    ("zenoh", &["crates/session", "env-server", "clients/rust", "tests"]),
+    ("clap", &["crates/cli", "tests"]),
+    ("plotters", &["crates/report"]),
+    ("parquet", &["crates/logs"]),
+    ("mcap", &["crates/logs"]),
+    ("nalgebra", &["crates/identify", "crates/diagnose"]),
 ];
 
 fn root() -> PathBuf {

@@ -6,12 +6,15 @@ use std::process::{Command, Output};
 
 use tempfile::TempDir;
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
-use twinstep_ensemble::{EnsembleMetadata, Ensemble, JointEncoding, ActuatorNetworkRobot, Normaliser, Normalisers};
+use twinstep_effects::{ActuatorNetworkConfig, MemberSampling, ModelFile};
+use twinstep_ensemble::{ActuatorNetworkRobot, Ensemble, EnsembleMetadata, JointEncoding, Normaliser, Normalisers};
 use twinstep_env_server::{Config, EnvFactory, EnvFactoryError, SimEnvFactory};
 use twinstep_envs::{TaskName, walk_spec};
-use twinstep_model::{BaseMount, AutoresetMode, Backend, BackendError, Command as RobotCommand, JOINT_NAMES, InitialState, ResetRequest, StepBatch, VecEnv, go2};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
-use twinstep_effects::{ActuatorNetworkConfig, MemberSampling, ModelFile};
+use twinstep_model::{
+    AutoresetMode, Backend, BackendError, BaseMount, Command as RobotCommand, InitialState, JOINT_NAMES, ResetRequest,
+    StepBatch, VecEnv, go2,
+};
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 use twinstep_tests::process::Process;
 use twinstep_tests::python::Programs;
@@ -140,7 +143,9 @@ fn robot_stands_on_networks_that_know_its_gains() {
 
 #[test]
 fn rotor_is_in_what_was_learnt_behind_it() {
-    for (tau_sensor, rotor) in [(TorqueSensor::MotorCurrent, go2().joints[0].armature), (TorqueSensor::JointOutput, 0.0)] {
+    for (tau_sensor, rotor) in
+        [(TorqueSensor::MotorCurrent, go2().joints[0].armature), (TorqueSensor::JointOutput, 0.0)]
+    {
         let (_folder, model) = model_with(EnsembleMetadata { tau_sensor, ..description() }, "", "");
         let learned = ActuatorNetworkRobot::load(&ModelFile::load(&model).unwrap()).unwrap().unwrap();
         assert!(learned.robot.joints.iter().all(|joint| joint.armature == rotor));
@@ -158,15 +163,16 @@ fn steps<B: Backend>(backend: &mut B, active: [bool; 2]) -> Vec<Vec<f32>> {
     for _ in 0..6 {
         backend.step(&[hold; 2], &active, 3).unwrap();
         let states = backend.states();
-        seen.extend(
-            (0..2).map(|robot| [&states.q[robot][..], &states.tau[robot], &states.epistemic_uncertainty[robot..][..1]].concat()),
-        );
+        seen.extend((0..2).map(|robot| {
+            [&states.q[robot][..], &states.tau[robot], &states.epistemic_uncertainty[robot..][..1]].concat()
+        }));
     }
     seen
 }
 
 fn check_snapshots<B: Backend>(mut backend: B) {
-    let placement = |seed| InitialState { actuator_seed: seed, ..InitialState::at_rest(0.34, go2().control.default_pose_f32()) };
+    let placement =
+        |seed| InitialState { actuator_seed: seed, ..InitialState::at_rest(0.34, go2().control.default_pose_f32()) };
     backend.reset(&[(0, placement(7)), (1, placement(8))]).unwrap();
     steps(&mut backend, [true, true]);
     let kept = [0, 1].map(|robot| backend.snapshot(robot));
@@ -294,11 +300,7 @@ fn ensembles_that_do_not_go_with_the_robot_are_refused_with_the_reason() {
     };
     for (description, effects, reason) in [
         (slow, "", "`actuator.ensemble`: the robot's actuator has a time step of 0.005 s, the model one of 0.02 s"),
-        (
-            uneven,
-            "",
-            "trained for FL_hip with kp 30 and kd 0.75, for FR_thigh with kp 20 and kd 0.5; a robot has one",
-        ),
+        (uneven, "", "trained for FL_hip with kp 30 and kd 0.75, for FR_thigh with kp 20 and kd 0.5; a robot has one"),
         (
             description(),
             lag,

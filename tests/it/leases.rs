@@ -101,7 +101,11 @@ fn reclaim_sent_again_gets_its_answer_again() {
     let second = RawClient::connect(&endpoint, server.sid(), "second");
     let taken = second.reclaim(&lease.lease, 1).unwrap();
     assert_eq!(second.reclaim(&lease.lease, 1).unwrap(), taken);
-    assert_eq!(first.reclaim(&lease.lease, 1).unwrap_err().code, ErrorCode::StaleEpoch, "only its new owner repeats it");
+    assert_eq!(
+        first.reclaim(&lease.lease, 1).unwrap_err().code,
+        ErrorCode::StaleEpoch,
+        "only its new owner repeats it"
+    );
     assert_eq!(first.reset(&lease, 1).unwrap_err().code, ErrorCode::StaleEpoch);
     second.reset(&taken, 1).unwrap();
     server.shutdown();

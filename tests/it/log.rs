@@ -4,8 +4,8 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use expect_test::{Expect, expect};
-use twinstep_model::BaseMount;
 use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::BaseMount;
 use twinstep_tests::python::Programs;
 
 /// The real robot in the air, 16 s at 200 Hz.
@@ -68,8 +68,8 @@ fn log_of_the_real_robot_is_described() {
         "3200 rows, 16.00 s\n",
         "no gap\n",
         "  air_chirp      base fixed, 3200 rows, 16.00 s\n",
-        "  payload              cannot  the base is fixed: record a floating base\n",
-        "  coulomb_friction     weakly  no torque was measured: motion alone must show it\n",
+        "  payload              no    the base is fixed: record a floating base\n",
+        "  coulomb_friction     weak  torque was not measured: only motion is available\n",
     ] {
         assert!(text.contains(line), "{line} is not in\n{text}");
     }
@@ -83,37 +83,37 @@ fn description_of_a_tumble_has_the_fall_and_what_it_can_tell() {
     let text = stdout(&[path.to_str().unwrap()]);
     let told = text.split_once("joints  ").unwrap().1;
     expect![[r#"
-                   position [rad]          speed [rad/s]        torque [N·m]         turns    moves at
+                   position [rad]          speed [rad/s]        torque [N·m]     reversals   frequency
                          low    high  to limit    RMS   peak  limit    RMS   peak  limit              [Hz]
           FL_hip       -0.300   0.300     0.747    4.22   6.00   20 %  12.66  18.00   76 %      13   3.12–3.23
         falls
-          tumble         at 1.53 s (row 306), tilted by 60°, trunk at 0.23 m
-        what this log can tell
-          command_delay        can     FL_hip moves both ways, recorded at 200 Hz; armature looks alike in slow motion
-          encoder_offset       weakly  kp never changes: repeat the motion at another kp; a constant load looks alike at one kp
-          torque_saturation    can     FL_hip reaches 76 % of its highest torque
-          supply_sag           cannot  no battery_V was recorded
-          thermal_derating     cannot  no temp was recorded
-          torque_delay         can     FL_hip moves both ways, recorded at 200 Hz; command_delay differs only where the joint is pushed
-          torque_speed_limit   cannot  no joint passes 20 % of its highest speed: reach 50 % or more
-          drive_lag            can     FL_hip moves both ways, recorded at 200 Hz, motion reaches 3.2 Hz; its gain falls with frequency, a delay's does not
-          torque_sensor_delay  can     torque was measured, FL_hip moves both ways, recorded at 200 Hz
-          torque_gain          can     FL_hip moves both ways; a wrong kp or mass looks alike
-          torque_ripple        weakly  no joint moves slowly: add motion of 0.02 to 0.3 rad/s
-          backlash             weakly  no joint moves slowly: add motion of 0.02 to 0.3 rad/s; it shows where the load changes its sign
-          joint_elasticity     cannot  200 Hz is too slow: record at 500 Hz or more
-          coulomb_friction     can     FL_hip moves both ways
-          viscous_friction     weakly  kd never changes: repeat the motion at another kd; at one kd it is the same as a wrong kd
-          stribeck_friction    cannot  no joint moves slowly: add motion of 0.02 to 0.3 rad/s
-          load_friction        can     FL_hip moves both ways, FL_hip reaches 76 % of its highest torque; only loads that differ tell it from coulomb_friction
-          armature             can     FL_hip moves both ways, recorded at 200 Hz, motion reaches 3.2 Hz; a delay looks alike: two spectra, or the first 10 ms of a step, tell them apart
-          joint_spring         can     positions span up to 0.60 rad
-          payload              can     the base is floating for 2.0 s; a load on a leg shows with the trunk held too
-          com_shift            can     the base is floating for 2.0 s
-          inertia              can     the base is floating for 2.0 s, the gyro reaches 2.00 rad/s
-          ground_friction      can     the base is floating for 2.0 s; only feet that slip tell its size
-          ground_stiffness     weakly  no foot_force or contact was recorded
-          gyro_bias            can     the gyro reaches 2.00 rad/s
+          tumble         at 1.53 s (row 306), tilted by 60°, base at 0.23 m
+        identifiability
+          command_delay        yes   FL_hip moves in both directions, recorded at 200 Hz; confounded with armature in slow motion
+          encoder_offset       weak  kp is constant: repeat the motion with another kp; confounded with a constant load at a single kp
+          torque_saturation    yes   FL_hip reaches 76 % of its torque limit
+          supply_sag           no    no battery_V was recorded
+          thermal_derating     no    no temp was recorded
+          torque_delay         yes   FL_hip moves in both directions, recorded at 200 Hz; differs from command_delay only if the joint is pushed
+          torque_speed_limit   no    no joint exceeds 20 % of its speed limit: reach 50 % or more
+          drive_lag            yes   FL_hip moves in both directions, recorded at 200 Hz, motion reaches 3.2 Hz; its gain falls with frequency, that of a delay does not
+          torque_sensor_delay  yes   torque was measured, FL_hip moves in both directions, recorded at 200 Hz
+          torque_gain          yes   FL_hip moves in both directions; confounded with a wrong kp or mass
+          torque_ripple        weak  no joint moves slowly: add motion of 0.02 to 0.3 rad/s
+          backlash             weak  no joint moves slowly: add motion of 0.02 to 0.3 rad/s; visible where the load changes sign
+          joint_elasticity     no    a rate of 200 Hz is too low: record at 500 Hz or more
+          coulomb_friction     yes   FL_hip moves in both directions
+          viscous_friction     weak  kd is constant: repeat the motion with another kd; confounded with a wrong kd at a single kd
+          stribeck_friction    no    no joint moves slowly: add motion of 0.02 to 0.3 rad/s
+          load_friction        yes   FL_hip moves in both directions, FL_hip reaches 76 % of its torque limit; differs from coulomb_friction only under different loads
+          armature             yes   FL_hip moves in both directions, recorded at 200 Hz, motion reaches 3.2 Hz; confounded with a delay: two spectra, or the first 10 ms of a step, discriminate
+          joint_spring         yes   positions span up to 0.60 rad
+          payload              yes   the base is floating for 2.0 s; a load on a leg is also identifiable with a fixed base
+          com_shift            yes   the base is floating for 2.0 s
+          inertia              yes   the base is floating for 2.0 s, the gyro reaches 2.00 rad/s
+          ground_friction      yes   the base is floating for 2.0 s; only slipping feet determine its value
+          ground_stiffness     weak  no foot_force or contact was recorded
+          gyro_bias            yes   the gyro reaches 2.00 rad/s
     "#]].assert_eq(told);
 }
 
@@ -164,7 +164,7 @@ fn conversion_says_what_it_leaves_out() {
     let folder = tempfile::tempdir().unwrap();
     let (csv, mcap) = (folder.path().join("tumble.csv"), folder.path().join("tumble.mcap"));
     tumble().write(&csv).unwrap();
-    assert!(convert(&csv, &mcap).contains("left out, as the format has no place for it: pos_z\n"));
+    assert!(convert(&csv, &mcap).contains("omitted, not supported by the format: pos_z\n"));
     let json = stdout(&[csv.to_str().unwrap(), "--json", "--convert", mcap.to_str().unwrap()]);
     let json: serde_json::Value = serde_json::from_str(&json).unwrap();
     assert_eq!(json["converted"]["left_out"][0], "pos_z");
@@ -239,6 +239,6 @@ fn motion_is_described_without_conclusions() {
     let meta = Meta::new(50.0, TorqueSensor::None, segments);
     Log::new_commands(meta, columns.map(|(name, cells)| (name.to_owned(), cells))).unwrap().write(&path).unwrap();
     let text = stdout(&[path.to_str().unwrap()]);
-    assert!(text.contains("nothing was measured: this is a motion to play"), "{text}");
-    assert!(!text.contains("what this log can tell"));
+    assert!(text.contains("nothing was measured: this is a motion file"), "{text}");
+    assert!(!text.contains("identifiability"));
 }

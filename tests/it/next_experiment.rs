@@ -2,15 +2,15 @@
 
 use std::f64::consts::TAU;
 
-use twinstep_model::{BaseMount, JOINT_NAMES, Joint, RobotModel, go2};
-use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_diagnose::{Diagnosis, EXCITATION_TRAJECTORIES};
 use twinstep_effects::EffectEntry;
 use twinstep_effects::ModelFile;
-use twinstep_sim::{BatchBackend, BatchRollout, SimConfig};
-use twinstep_diagnose::{Diagnosis, EXCITATION_TRAJECTORIES};
 use twinstep_identify::{Sensor, apply_sensors, record};
-use twinstep_tests::ground_truth_robot::effect;
+use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{BaseMount, JOINT_NAMES, Joint, RobotModel, go2};
+use twinstep_sim::{BatchBackend, BatchRollout, SimConfig};
 use twinstep_tests::confounded_pairs::PAIRS;
+use twinstep_tests::ground_truth_robot::effect;
 
 use crate::identify::twinstep;
 
@@ -21,8 +21,7 @@ const FASTEST: f64 = 10.0;
 
 /// What `robot` does in a motion, simulated at a finer step than models are.
 fn played(motion: &Log, robot: &RobotModel) -> Log {
-    let backend = |base: BaseMount| {
-        let base = if base == BaseMount::Fixed { BaseMount::Fixed } else { BaseMount::Floating };
+    let backend = |base: BaseMount, robot: &RobotModel| {
         let config = SimConfig { base, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
         Ok(BatchBackend::new(robot.clone(), config, 1).unwrap())
     };
@@ -85,13 +84,13 @@ fn safe_motions_have_names_of_their_own_and_begin_and_end_in_the_default_pose() 
 fn chosen_motion_beats_the_median_one() {
     // Actuator lag or torque delay; `results/next_experiment.md` has more pairs.
     let pair = &PAIRS[2];
-    let (rivalry, robot) = (pair.rivalry(), pair.robot().robot_model().unwrap());
+    let (pair, robot) = (pair.pair(), pair.robot().robot_model().unwrap());
     let mut simulator = BatchRollout::new(&go2(), &SimConfig::default()).unwrap();
     let mut told: Vec<[f64; 2]> = Vec::new();
     for motion in EXCITATION_TRAJECTORIES.iter().filter(|motion| motion.base == BaseMount::Fixed) {
         let log = encoders(&played(&motion.motion(&go2()), &robot));
-        let predicted = rivalry.expected_log_likelihood_ratio(motion, &log, &mut simulator).unwrap();
-        told.push([predicted, rivalry.log_likelihood_ratio(log, &mut simulator).unwrap()]);
+        let predicted = pair.expected_log_likelihood_ratio(motion, &log, &mut simulator).unwrap();
+        told.push([predicted, pair.log_likelihood_ratio(log, &mut simulator).unwrap()]);
     }
     let chosen = told.iter().max_by(|one, other| one[0].total_cmp(&other[0])).unwrap()[1];
     told.sort_by(|one, other| one[1].total_cmp(&other[1]));
@@ -101,8 +100,11 @@ fn chosen_motion_beats_the_median_one() {
 /// Six seconds of one slow sine a joint, at which a delay and viscous friction are the same.
 fn slow_sines() -> Log {
     let segments = vec![Segment { name: "sines".to_owned(), base: BaseMount::Fixed }];
-    let meta =
-        Meta { kp: Some(Gain::Uniform(30.0)), kd: Some(Gain::Uniform(0.8)), ..Meta::new(200.0, TorqueSensor::None, segments) };
+    let meta = Meta {
+        kp: Some(Gain::Uniform(30.0)),
+        kd: Some(Gain::Uniform(0.8)),
+        ..Meta::new(200.0, TorqueSensor::None, segments)
+    };
     let t: Vec<f64> = (0..1200).map(|row| f64::from(row) * 0.005).collect();
     let commands = Joint::ALL.map(|joint| {
         let (index, pose) = (joint.index(), go2().control.default_pose[joint.index()]);

@@ -4,7 +4,11 @@ use std::f32::consts::PI;
 
 use glam::{DMat3, DVec3, Vec3};
 use proptest::prelude::*;
-use twinstep_model::{dynamics::{Acceleration, State, KinematicTree, Vec3 as LaneVec3, forward_dynamics}, Backend, Command, Joint, NUM_JOINTS, PerJoint, InitialState, RobotModel, frames, go2, BaseMount};
+use twinstep_model::{
+    Backend, BaseMount, Command, InitialState, Joint, NUM_JOINTS, PerJoint, RobotModel,
+    dynamics::{Acceleration, KinematicTree, State, Vec3 as LaneVec3, forward_dynamics},
+    frames, go2,
+};
 use twinstep_sim::{Engine, SimConfig, Terrain};
 
 use super::{ENGINE, Simulator};
@@ -175,8 +179,13 @@ fn lone_calf(viscous: f64, coulomb: f64) -> RobotModel {
 /// Velocity of the lone calf [rad/s] after 20 ms, from a velocity [rad/s] and under a torque [N·m]; half the difference
 /// to the opposite of both, so that gravity drops out.
 fn calf_velocity(robot: &RobotModel, dq: f32, tau: f32) -> f64 {
-    let stand =
-        SimConfig { engine: ENGINE, base: BaseMount::Fixed, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
+    let stand = SimConfig {
+        engine: ENGINE,
+        base: BaseMount::Fixed,
+        physics_hz: Some(4000),
+        threads: 1,
+        ..SimConfig::default()
+    };
     let [forth, back] = [1.0, -1.0].map(|sign| {
         let mut backend = Simulator::new(robot.clone(), stand, 1).unwrap();
         let mut placement = InitialState::at_rest(2.0, default_pose());

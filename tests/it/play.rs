@@ -4,8 +4,10 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use expect_test::{Expect, expect};
-use twinstep_model::{BaseMount, Backend, Command as RobotCommand, Ground, JOINT_NAMES, NUM_JOINTS, PerJoint, InitialState, go2};
 use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{
+    Backend, BaseMount, Command as RobotCommand, Ground, InitialState, JOINT_NAMES, NUM_JOINTS, PerJoint, go2,
+};
 use twinstep_sim::{BatchBackend, Engine, SimConfig};
 use twinstep_tests::python::Programs;
 
@@ -119,7 +121,7 @@ fn motion_between_the_periods_of_the_drive_is_refused() {
         &play(&source, &out, &[]),
         &expect![[r"
             error: the log's median sample period is 13.000 ms, not a whole number of the actuator's 5.000 ms within 2 %
-              resample the log, or give the robot model a `actuator_hz` that the log's rate divides
+              resample the log, or use a robot model whose `actuator_hz` is a multiple of the log's rate
         "]],
     );
     assert!(!out.exists());
@@ -132,7 +134,7 @@ fn motion_is_not_overwritten() {
     motion(BaseMount::Fixed, 0.02).write(&source).unwrap();
     let output = play(&source, &source, &[]);
     assert_eq!(output.status.code(), Some(2));
-    assert!(String::from_utf8_lossy(&output.stderr).contains("is the motion itself"));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("is the motion file itself"));
     assert!(Log::open_commands(&source).unwrap().q("FL_hip").is_none());
 }
 

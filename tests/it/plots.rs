@@ -3,9 +3,9 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
-use twinstep_model::{BaseMount, JOINT_NAMES};
-use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_effects::CATALOGUE;
+use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{BaseMount, JOINT_NAMES};
 use twinstep_tests::python::{Programs, root};
 
 const LOG: &str = "data/go2_air_chirp";

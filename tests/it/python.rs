@@ -5,8 +5,8 @@ use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
 use twinstep_tests::fault_injection::{self, FaultPlan};
-use twinstep_tests::test_bed::TestBedConfig;
 use twinstep_tests::python::{Programs, outside_cargo, python, root, run};
+use twinstep_tests::test_bed::TestBedConfig;
 
 const FAULTS: &str = env!("CARGO_BIN_EXE_faults");
 

@@ -9,7 +9,7 @@ use twinstep_protocol::message::{
     StepRequest,
 };
 use twinstep_protocol::tensor::{self, as_bytes};
-use twinstep_protocol::{PROTOCOL, ErrorReply, decode, encode, keys};
+use twinstep_protocol::{ErrorReply, PROTOCOL, decode, encode, keys};
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
@@ -48,7 +48,7 @@ impl RawClient {
         ] {
             config.insert_json5(key, value).unwrap();
         }
-        let session = zenoh::open(config).wait().unwrap();
+        let session = twinstep_session::open(config).unwrap();
         let (sid, client) = (sid.to_owned(), client.to_owned());
         Self { session, sid, client, token: None, query_timeout: Duration::from_secs(5) }
     }

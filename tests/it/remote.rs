@@ -179,7 +179,12 @@ pub struct FailingEnvFactory;
 struct FragileEnv(Box<dyn VecEnv>, u32);
 
 impl EnvFactory for FailingEnvFactory {
-    fn build(&self, num_envs: usize, autoreset: AutoresetMode, _: Option<u32>) -> Result<Box<dyn VecEnv>, EnvFactoryError> {
+    fn build(
+        &self,
+        num_envs: usize,
+        autoreset: AutoresetMode,
+        _: Option<u32>,
+    ) -> Result<Box<dyn VecEnv>, EnvFactoryError> {
         let inner = Box::new(twinstep_envs::CounterEnv::new(&go2(), num_envs, autoreset));
         Ok(Box::new(FragileEnv(inner, 0)))
     }

@@ -81,7 +81,10 @@ fn counter_has_nothing_to_draw() {
     env.reset(&ResetRequest::default()).unwrap();
     let EnvError::Remote(error) = env.scene(0).unwrap_err() else { panic!("the server refused it") };
     let Some(ClientError::Rejected(refusal)) = error.downcast_ref() else { panic!("{error}") };
-    assert_eq!((refusal.code, refusal.message.as_str()), (ErrorCode::UnknownKey, "the task `counter` cannot be rendered"));
+    assert_eq!(
+        (refusal.code, refusal.message.as_str()),
+        (ErrorCode::UnknownKey, "the task `counter` cannot be rendered")
+    );
     env.step(&[0.0; 12]).unwrap();
     server.shutdown();
 }

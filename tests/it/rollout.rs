@@ -1,7 +1,9 @@
 //! Rollouts in the batch engine: a job is the same alone and among others, and goes on from a past.
 
 use twinstep_effects::{EffectEntry, apply_effects};
-use twinstep_model::{Command, RolloutRequest, HistoryStep, InitialState, Precision, RobotModel, RobotStates, Rollout, go2};
+use twinstep_model::{
+    BaseMount, Command, HistoryStep, InitialState, Precision, RobotModel, RobotStates, Rollout, RolloutRequest, go2,
+};
 use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_tests::ground_truth_robot::effect;
 
@@ -38,7 +40,7 @@ fn a_job_is_the_same_alone_and_among_others_of_other_lengths() {
     let jobs: Vec<_> = (0..JOBS)
         .map(|index| RolloutRequest {
             robot: &robots[index],
-            held: index % 3 == 0,
+            base: if index % 3 == 0 { BaseMount::Fixed } else { BaseMount::Floating },
             start: start(index),
             history: &[],
             commands: &commands[index],
@@ -75,7 +77,7 @@ fn a_job_with_a_past_goes_on_as_if_it_had_never_ended() {
     let commands: Vec<_> = (0..90).map(command).collect();
     let mut simulator = BatchRollout::new(&go2(), &SimConfig { threads: 1, ..SimConfig::default() }).unwrap();
     let mut play = |start: InitialState, past: &[HistoryStep], commands: &[Command]| {
-        let job = RolloutRequest { robot: &robot, held: true, start, history: past, commands };
+        let job = RolloutRequest { robot: &robot, base: BaseMount::Fixed, start, history: past, commands };
         simulator.run(&[job], Precision::Double).remove(0)
     };
     let whole = play(InitialState::at_rest(1.0, pose), &[], &commands);

@@ -5,7 +5,7 @@ use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
 use twinstep_envs::TaskName;
 use twinstep_model::{
-    AutoresetMode, Backend, Command, Ground, NUM_LEGS, InitialState, Pose, ResetRequest, ShapeKind, VecEnv, body_poses,
+    AutoresetMode, Backend, Command, Ground, InitialState, NUM_LEGS, Pose, ResetRequest, ShapeKind, VecEnv, body_poses,
     frames, go2,
 };
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, RoughTerrain, SimConfig, Terrain};

@@ -148,7 +148,10 @@ fn twenty_thousand_bad_requests() {
         let mut payload = if index.is_multiple_of(100) { large.clone() } else { good[index % good.len()].clone() };
         payload[0] = 0xc1;
         if let Err(error) = client.ask(key, &payload) {
-            assert!(matches!(error.code, ErrorCode::Malformed | ErrorCode::LeaseLost | ErrorCode::UnknownKey), "{error}");
+            assert!(
+                matches!(error.code, ErrorCode::Malformed | ErrorCode::LeaseLost | ErrorCode::UnknownKey),
+                "{error}"
+            );
         }
     };
     (0..10_000).for_each(bad);

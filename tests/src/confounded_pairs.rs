@@ -1,8 +1,8 @@
 //! Pairs of effects that are taken for each other: a robot that has the first, and the question whether it is the second.
 
-use twinstep_effects::ModelFile;
-use twinstep_effects::EffectEntry;
 use twinstep_diagnose::HypothesisPair;
+use twinstep_effects::EffectEntry;
+use twinstep_effects::ModelFile;
 
 use crate::ground_truth_robot::effect;
 
@@ -45,7 +45,7 @@ impl Pair {
     }
 
     /// The question.
-    pub fn rivalry(&self) -> HypothesisPair {
+    pub fn pair(&self) -> HypothesisPair {
         let sides = [self.hidden, self.alternative].map(|(name, scope, values)| {
             let (effect, scope) = effect(name, scope);
             (effect, scope, values.to_vec())

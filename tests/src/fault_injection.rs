@@ -9,7 +9,7 @@ use std::time::Duration;
 use twinstep_model::stream;
 
 use crate::fault::Fault;
-use crate::test_bed::{TestBedConfig, TestBed};
+use crate::test_bed::{TestBed, TestBedConfig};
 
 /// What to inject.
 pub struct FaultPlan {

@@ -6,11 +6,11 @@ use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 
 use rand::RngExt;
-use twinstep_model::{BaseMount, Joint, JointKind, RobotModel, go2, stream};
-use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
 use twinstep_effects::{Effect, EffectEntry, Scope, apply_effects};
-use twinstep_sim::{BatchBackend, SimConfig};
 use twinstep_identify::{RecordError, Sensor, apply_sensors, record};
+use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{BaseMount, Joint, JointKind, RobotModel, go2, stream};
+use twinstep_sim::{BatchBackend, SimConfig};
 
 /// Rate of the logs [Hz].
 pub const RATE_HZ: f64 = 200.0;
@@ -95,8 +95,9 @@ impl HiddenDrive {
             EffectEntry::new(effect, Scope::All, values.to_vec()).expect("plausible values")
         });
         let robot = apply_effects(&go2(), &entries.collect::<Vec<_>>()).expect("a robot");
-        let backend = |_| {
-            let config = SimConfig { base: BaseMount::Fixed, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
+        let backend = |_, robot: &RobotModel| {
+            let config =
+                SimConfig { base: BaseMount::Fixed, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
             BatchBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(error.into()))
         };
         let exact = record(&waves(motion), &robot, None, backend, self.name.to_owned(), &mut |_| true).expect("a log");

@@ -7,12 +7,12 @@ use std::f64::consts::TAU;
 
 use glam::DVec3;
 use rand::RngExt;
-use twinstep_model::{BaseMount, JOINT_NAMES, Joint, JointKind, Leg, go2, stream};
-use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
-use twinstep_effects::{Effect, EffectEntry, Scope};
 use twinstep_effects::ModelFile;
-use twinstep_sim::{Engine, RapierBackend, SimConfig};
+use twinstep_effects::{Effect, EffectEntry, Scope};
 use twinstep_identify::{RecordError, Sensor, apply_sensors, record};
+use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{BaseMount, JOINT_NAMES, Joint, JointKind, Leg, RobotModel, go2, stream};
+use twinstep_sim::{Engine, RapierBackend, SimConfig};
 
 /// Rate of the log [Hz].
 const RATE_HZ: f64 = 200.0;
@@ -131,8 +131,7 @@ fn sway(joint: Joint, time: f64, shift: f64) -> f64 {
 /// What `robot` does in `motion`, as its sensors show it.
 pub fn log_of(robot: &ModelFile, motion: &Log, seed: u64) -> Log {
     let robot = robot.robot_model().expect("a robot");
-    let backend = |base: BaseMount| {
-        let base = if base == BaseMount::Fixed { BaseMount::Fixed } else { BaseMount::Floating };
+    let backend = |base: BaseMount, robot: &RobotModel| {
         let config =
             SimConfig { engine: Engine::Rapier, base, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
         RapierBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)))

@@ -8,16 +8,16 @@
 //! [`ground_truth_robot`] has the robots that identification is tried on, [`ground_truth_actuator`] the actuators that ensembles learn, [`browser`] looks at pages, [`confounded_pairs`] has those that are taken for each other, [`security`] what the tests of TLS, users and access control need, [`python`] what those of the Python client do.
 
 pub mod browser;
-pub mod fault_injection;
+pub mod confounded_pairs;
 pub mod fault;
+pub mod fault_injection;
 pub mod ground_truth_actuator;
 pub mod ground_truth_robot;
-pub mod test_bed;
-pub mod step_oracle;
 pub mod process;
 pub mod proxy;
 pub mod python;
 pub mod repeats;
-pub mod confounded_pairs;
 pub mod roles;
 pub mod security;
+pub mod step_oracle;
+pub mod test_bed;

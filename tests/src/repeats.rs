@@ -66,7 +66,7 @@ fn open(endpoint: &str) -> Result<Session, String> {
     {
         config.insert_json5(key, value).map_err(text)?;
     }
-    zenoh::open(config).wait().map_err(text)
+    twinstep_session::open(config).map_err(text)
 }
 
 fn first_server(session: &Session) -> Result<String, String> {

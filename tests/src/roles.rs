@@ -4,13 +4,13 @@ use std::io::Read;
 use std::sync::Arc;
 use std::time::Duration;
 
-use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv, LeaseHandle};
+use twinstep_client::{ClientError, ConnectOptions, LeaseHandle, RemoteVecEnv};
 use twinstep_env_server::{EnvFactory, EnvFactoryError, Server, ServerConfig};
 use twinstep_envs::{Counter, CounterEnv};
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv, go2};
 use zenoh::Wait;
 
-use crate::step_oracle::{StepOracle, NUM_ENVS};
+use crate::step_oracle::{NUM_ENVS, StepOracle};
 
 /// One process of a lane.
 #[derive(clap::Subcommand, Clone, Debug)]
@@ -77,7 +77,7 @@ fn route(listen: &str) -> Result<(), Box<dyn std::error::Error>> {
     ] {
         config.insert_json5(key, &value).map_err(|error| error.to_string())?;
     }
-    let _session = zenoh::open(config).wait().map_err(|error| error.to_string())?;
+    let _session = twinstep_session::open(config).map_err(|error| error.to_string())?;
     println!("listening {listen}");
     wait_for_a_signal()
 }
@@ -110,7 +110,12 @@ struct SlowEnv {
 }
 
 impl EnvFactory for SlowHost {
-    fn build(&self, num_envs: usize, autoreset: AutoresetMode, _: Option<u32>) -> Result<Box<dyn VecEnv>, EnvFactoryError> {
+    fn build(
+        &self,
+        num_envs: usize,
+        autoreset: AutoresetMode,
+        _: Option<u32>,
+    ) -> Result<Box<dyn VecEnv>, EnvFactoryError> {
         let inner = CounterEnv::new(&go2(), num_envs, autoreset);
         let step = Duration::from_millis(self.0.step_ms);
         Ok(Box::new(SlowEnv { inner, step, double_every: self.0.duplicate_step_every, steps: 0 }))
@@ -159,7 +164,9 @@ fn client(arguments: &ClientArgs) -> Result<(), ClientError> {
     let mut heritage = arguments.reclaim.as_deref().map(read_heritage);
     loop {
         let (env, ledger) = match heritage.take() {
-            Some((ticket, counters)) => (RemoteVecEnv::reclaim(&options, &ticket)?, StepOracle::after_client_crash(counters)),
+            Some((ticket, counters)) => {
+                (RemoteVecEnv::reclaim(&options, &ticket)?, StepOracle::after_client_crash(counters))
+            }
             None => match fresh(&options) {
                 Ok(started) => started,
                 Err(reason) => {

@@ -1,9 +1,9 @@
-"""Steps counters and checks every observation, while somebody kills, freezes and delays what is around it.
+"""Step counters and check every observation, while other processes are killed, suspended and delayed.
 
 ``target/release/faults --faults 1000 --client target/python/bin/python clients/python/tests/fault_client.py``
 
 Prints ``lease ID EPOCH`` for each lease, ``acked`` with the counters of each step, ``waiting`` and ``lost`` with the
-typed exception, and ``violation`` with the evidence.
+exception, and ``violation`` with the observed and the expected values.
 """
 
 import os
@@ -19,7 +19,7 @@ NUM_ENVS = 2
 
 
 class Counter:
-    """What the task ``counter`` has seen, kept a second time."""
+    """Expected state of the task ``counter``."""
 
     def __init__(self) -> None:
         self.steps, self.resets, self.mix = 0, 1, 0
@@ -35,7 +35,7 @@ class Counter:
         return [self.steps & 0xFFFFFF, self.resets, self.mix >> 16, self.mix & 0xFFFF]
 
 
-def say(*words: object) -> None:
+def report(*words: object) -> None:
     print(*(str(word).replace("\n", " ") for word in words), flush=True)
 
 
@@ -49,14 +49,14 @@ def step_until_lost(envs: twinstep.Go2VectorEnv, random: np.random.Generator) ->
                 obs = envs.recv()[0]
                 break
             except twinstep.RequestTimeoutError as error:
-                say("waiting", error)
+                report("waiting", error)
         for counter, action in zip(counters, actions, strict=True):
             counter.step(action)
         expected = [counter.observation for counter in counters]
         if obs[:, :4].tolist() != expected:
-            say("violation", obs[:, :4].tolist(), "is not", expected)
+            report("violation", obs[:, :4].tolist(), "is not", expected)
             return
-        say("acked", *(number for each in counters for number in (each.steps, each.resets, each.mix)))
+        report("acked", *(number for each in counters for number in (each.steps, each.resets, each.mix)))
 
 
 def main(endpoint: str) -> None:
@@ -65,14 +65,14 @@ def main(endpoint: str) -> None:
         try:
             envs = twinstep.Go2VectorEnv(NUM_ENVS, task="counter", endpoint=endpoint, timeout_s=2.0)
         except twinstep.Error as error:
-            say("lost", type(error).__name__, error)
+            report("lost", type(error).__name__, error)
             continue
         try:
             envs.reset()
-            say("lease", envs.lease, 1)
+            report("lease", envs.lease, 1)
             step_until_lost(envs, random)
         except twinstep.Error as error:
-            say("lost", type(error).__name__, error)
+            report("lost", type(error).__name__, error)
         envs.close()
 
 

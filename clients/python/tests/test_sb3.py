@@ -44,7 +44,7 @@ def test_rows_equal_those_of_the_gymnasium_environment() -> None:
     for row, one in enumerate(infos):
         np.testing.assert_array_equal(one["terminal_observation"], info["final_obs"][row])
         assert one["TimeLimit.truncated"] is True
-        assert one["reward_terms"]["torque"] == info["final_info"]["reward_terms"]["torque"][row]
+        assert one["reward_terms"]["joint_torque"] == info["final_info"]["reward_terms"]["joint_torque"][row]
     ours.close()
     envs.close()
 

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use twinstep_model::AutoresetMode;
-use twinstep_protocol::{ErrorCode, PROTOCOL, ErrorReply, decode, encode, keys, message};
+use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, decode, encode, keys, message};
 use zenoh::bytes::ZBytes;
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::liveliness::LivelinessToken;
@@ -249,7 +249,7 @@ fn open_session(options: &ConnectOptions) -> Result<Session, ClientError> {
     let since = Instant::now();
     loop {
         let config = zenoh_config(options)?;
-        match zenoh::open(config).wait() {
+        match twinstep_session::open(config) {
             Ok(session) => return Ok(session),
             Err(error) if since.elapsed() >= options.connect_timeout => {
                 return Err(ClientError::NoServer {

@@ -17,12 +17,12 @@
 //! once. A lost reply, an unresponsive server or a restarted router costs time, but no step is lost or executed twice.
 //! If no reply arrives, [`ClientError`] contains the reason.
 
-mod error;
 mod connection;
+mod error;
 mod remote_env;
 mod server_process;
 
-pub use error::ClientError;
 pub use connection::{ConnectOptions, Connection};
+pub use error::ClientError;
+pub use remote_env::{LeaseHandle, RemoteVecEnv};
 pub use server_process::ServerProcess;
-pub use remote_env::{RemoteVecEnv, LeaseHandle};

@@ -4,7 +4,7 @@ use std::sync::OnceLock;
 
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, Scene, StepBatch, VecEnv};
 use twinstep_protocol::keys::EnvMethod;
-use twinstep_protocol::{ErrorCode, PROTOCOL, ErrorReply, convert, decode, encode, keys, message, tensor};
+use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, keys, message, tensor};
 use zenoh::bytes::ZBytes;
 use zenoh::query::Querier;
 
@@ -125,7 +125,8 @@ impl RemoteVecEnv {
             // Its result is not needed, but whether its number was consumed is.
             let _ = self.await_pending();
         }
-        let querier = self.connection.querier(keys::env(self.connection.sid(), &self.ticket.lease, EnvMethod::Close))?;
+        let querier =
+            self.connection.querier(keys::env(self.connection.sid(), &self.ticket.lease, EnvMethod::Close))?;
         let (epoch, seq) = (self.ticket.epoch, self.last_seq + 1);
         match self.connection.request(&querier, encode(&message::CloseRequest { protocol: PROTOCOL, epoch, seq })) {
             // The first reply was lost, or the grace period has passed: the lease has ended either way.
@@ -138,7 +139,8 @@ impl RemoteVecEnv {
         if let Some(querier) = self.render.get() {
             return Ok(querier);
         }
-        let querier = self.connection.querier(keys::env(self.connection.sid(), &self.ticket.lease, EnvMethod::Render))?;
+        let querier =
+            self.connection.querier(keys::env(self.connection.sid(), &self.ticket.lease, EnvMethod::Render))?;
         Ok(self.render.get_or_init(|| querier))
     }
 

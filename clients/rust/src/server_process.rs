@@ -30,7 +30,9 @@ impl ServerProcess {
         }
         match line.trim().strip_prefix("listening ") {
             Some(endpoint) => Ok(Self { endpoint: endpoint.to_owned(), child }),
-            None => Err(ClientError::ServerStart("it did not print its endpoint; `twinstep serve` prints the reason".to_owned())),
+            None => Err(ClientError::ServerStart(
+                "it did not print its endpoint; `twinstep serve` prints the reason".to_owned(),
+            )),
         }
     }
 }

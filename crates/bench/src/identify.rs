@@ -4,17 +4,17 @@ use std::path::Path;
 use std::time::Instant;
 
 use rand::RngExt;
-use twinstep_logs::Log;
-use twinstep_effects::{EffectEntry, apply_effects};
-use twinstep_model::{JOINT_NAMES, BaseMount, MjcfActuator, MjcfOptions, Precision, RobotModel, go2, mjcf, stream};
 use twinstep_effects::ModelFile;
+use twinstep_effects::{EffectEntry, apply_effects};
+use twinstep_identify::{Experiment, IdentifyOptions, WindowConfig, identify};
+use twinstep_logs::Log;
+use twinstep_model::{BaseMount, JOINT_NAMES, MjcfActuator, MjcfOptions, Precision, RobotModel, go2, mjcf, stream};
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_identify::{Experiment, WindowConfig, IdentifyOptions, identify};
 
 use crate::Measurement;
-use crate::throughput::{WINDOWS, measure as pace, median_of};
 use crate::baselines::{Baselines, Setup};
 use crate::error::{BenchError, Interrupted, check, failed};
+use crate::throughput::{WINDOWS, measure as pace, median_of};
 use twinstep_identify::default_effects;
 use twinstep_logs::recording;
 
@@ -107,7 +107,11 @@ fn on_one_core(
     ])
 }
 
-fn on_all_cores(rollouts: &Experiment, candidates: &[RobotModel], interrupted: Interrupted) -> Result<[Measurement; 2], BenchError> {
+fn on_all_cores(
+    rollouts: &Experiment,
+    candidates: &[RobotModel],
+    interrupted: Interrupted,
+) -> Result<[Measurement; 2], BenchError> {
     let mut simulator = simulator(0)?;
     let since = Instant::now();
     for candidates in candidates.chunks(BATCH_SIZE) {
@@ -156,7 +160,8 @@ fn setup(log: &Log, window_s: f64) -> Setup {
         kp: log.kp(JOINT_NAMES[0], 0).unwrap_or(control.kp),
         kd: log.kd(JOINT_NAMES[0], 0).unwrap_or(control.kd),
     };
-    let model = mjcf(&go2(), &MjcfOptions { base: BaseMount::Fixed, timestep: 1.0 / f64::from(hz), actuator: actuator });
+    let model =
+        mjcf(&go2(), &MjcfOptions { base: BaseMount::Fixed, timestep: 1.0 / f64::from(hz), actuator: actuator });
     let periods = (ROLLOUT_S / control.actuator_dt()).round() as usize;
     let target = |row: usize| {
         let command = |(name, pose): (&&str, f64)| log.q_cmd(name).map_or(pose, |cells| cells[row]) as f32;

@@ -5,8 +5,8 @@ use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
 
 use crate::Measurement;
-use crate::throughput::{Throughput, WINDOWS, measure as pace, median};
 use crate::error::{BenchError, Interrupted, check, failed};
+use crate::throughput::{Throughput, WINDOWS, measure as pace, median};
 use twinstep_client::ServerProcess;
 use twinstep_envs::trot;
 
@@ -34,7 +34,11 @@ pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measuremen
     Ok(rows)
 }
 
-fn side_by_side(num_envs: usize, window_s: f64, interrupted: Interrupted) -> Result<(Throughput, Throughput), BenchError> {
+fn side_by_side(
+    num_envs: usize,
+    window_s: f64,
+    interrupted: Interrupted,
+) -> Result<(Throughput, Throughput), BenchError> {
     let server = ServerProcess::start(&[]).map_err(failed)?;
     let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&server.endpoint, num_envs)).map_err(failed)?;
     let mut local = SimEnvFactory::new(Config::default())

@@ -4,17 +4,17 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
-use twinstep_simd::InstructionSet;
 use twinstep_model::{
-    AutoresetMode, Backend, Command, BaseMount, MjcfActuator, MjcfOptions, NUM_JOINTS, PerJoint, InitialState, ResetRequest,
-    go2, mjcf,
+    AutoresetMode, Backend, BaseMount, Command, InitialState, MjcfActuator, MjcfOptions, NUM_JOINTS, PerJoint,
+    ResetRequest, go2, mjcf,
 };
-use twinstep_sim::{BatchBackend, Engine, SimdPrecision, RapierBackend, SimConfig};
+use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig, SimdPrecision};
+use twinstep_simd::InstructionSet;
 
 use crate::Measurement;
-use crate::throughput::{WINDOWS, measure as pace, median_of};
 use crate::baselines::{Baselines, Setup};
 use crate::error::{BenchError, Interrupted, check, failed};
+use crate::throughput::{WINDOWS, measure as pace, median_of};
 use twinstep_envs::trot;
 
 /// One way to simulate a robot.
@@ -134,7 +134,11 @@ fn speed_rows(case: &str, physics_hz: u32, rate: f64, reference: Option<(&str, f
 }
 
 /// Env-steps a second of ours, and of MuJoCo at the same rate if it is there, in turn.
-fn compare_with_mujoco(setting: Setting, peers: &mut Baselines, window_s: f64) -> Result<(f64, Option<f64>), BenchError> {
+fn compare_with_mujoco(
+    setting: Setting,
+    peers: &mut Baselines,
+    window_s: f64,
+) -> Result<(f64, Option<f64>), BenchError> {
     let peer = format!("mujoco {}", setting.physics_hz);
     match setting.simulator {
         Simulator::Rapier => {
@@ -180,8 +184,9 @@ fn whole_and_parts(window_s: f64) -> Result<[Measurement; 3], BenchError> {
 /// A policy period of `num_envs` environments of the task `walk`, again and again.
 fn walking(num_envs: usize, threads: usize) -> Result<impl FnMut() -> Result<(), BenchError>, BenchError> {
     let config = Config { sim: SimConfig { threads, ..config(fastest(ENVS_HZ)) }, ..Config::default() };
-    let mut envs =
-        SimEnvFactory::new(config).and_then(|host| host.build(num_envs, AutoresetMode::NextStep, None)).map_err(failed)?;
+    let mut envs = SimEnvFactory::new(config)
+        .and_then(|host| host.build(num_envs, AutoresetMode::NextStep, None))
+        .map_err(failed)?;
     envs.reset(&ResetRequest::seeded(1, num_envs)).map_err(failed)?;
     let mut step = 0;
     Ok(move || {

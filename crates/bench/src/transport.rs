@@ -5,9 +5,9 @@ use twinstep_model::{ResetRequest, StepBatch, VecEnv};
 use twinstep_protocol::convert;
 
 use crate::Measurement;
-use crate::throughput::{Throughput, WINDOWS, measure as pace, median};
-use crate::tcp::PingPong;
 use crate::error::{BenchError, Interrupted, check, failed};
+use crate::tcp::PingPong;
+use crate::throughput::{Throughput, WINDOWS, measure as pace, median};
 use twinstep_client::ServerProcess;
 
 /// Environments in a message, and whether through shared memory.

@@ -1,4 +1,4 @@
-//! `twinstep bench`: our numbers side by side with their references, in one run.
+//! `twinstep bench`: measures Twinstep and its baselines in one run.
 
 use std::path::PathBuf;
 
@@ -6,9 +6,11 @@ use twinstep_bench::{BenchError, Machine, Results, ensemble, identify, remote, s
 
 use crate::exit::{CommandResult, Failure, Signals, other};
 
-/// Measure Twinstep on this machine, side by side with the references, in one run.
+/// Measure the speed and accuracy of Twinstep and of its baselines on this machine.
 ///
-/// Absolute numbers depend on the load of the machine. Compare ratios, and medians over repeats.
+/// Absolute numbers depend on the load of the machine. Compare ratios, and medians over several runs.
+///
+/// Example: `twinstep bench sim --window-s 0.5 --python .venv/bin/python`
 #[derive(clap::Args)]
 pub struct Args {
     /// Benchmark to run. Default: all.
@@ -20,8 +22,8 @@ pub struct Args {
     /// Length of one measuring window [s]. Each case is the median of several windows.
     #[arg(long, default_value_t = 1.0, value_name = "S", value_parser = window)]
     window_s: f64,
-    /// Python interpreter for the baselines: MuJoCo and EnvPool for `sim` and `identify` (`pip install
-    /// "./clients/python[bench]"`), PyTorch for `ensemble` (`pip install torch`). Missing baselines are left out.
+    /// Python interpreter for the baselines. `sim` and `identify` use MuJoCo and EnvPool (`pip install
+    /// "./clients/python[bench]"`), `ensemble` uses PyTorch (`pip install torch`). Missing baselines are skipped.
     #[arg(long, default_value = "python3", value_name = "PATH")]
     python: PathBuf,
 }
@@ -34,21 +36,21 @@ enum What {
     Sim,
     /// Environments with physics over Zenoh, compared with the same environments in process.
     Remote,
-    /// Identification: closed-loop rollouts of the built-in recording compared with MuJoCo, and one whole search.
+    /// Identification: closed-loop rollouts of the built-in recording compared with MuJoCo, and one whole run.
     Identify,
-    /// Actuator networks compared with PyTorch and burn, and robots simulated with them.
+    /// Actuator networks: speed compared with PyTorch and burn, and robots simulated with them.
     Ensemble,
-    /// The echo server of the TCP ping-pong.
+    /// Echo server of the TCP ping-pong.
     #[value(hide = true)]
     TcpEcho,
 }
 
 fn window(text: &str) -> Result<f64, String> {
-    let seconds: f64 = text.parse().map_err(|_| "a number of seconds is expected".to_owned())?;
-    if (0.01..=60.0).contains(&seconds) { Ok(seconds) } else { Err("0.01 to 60 s".to_owned()) }
+    let seconds: f64 = text.parse().map_err(|_| "must be a number of seconds".to_owned())?;
+    if (0.01..=60.0).contains(&seconds) { Ok(seconds) } else { Err("must be 0.01 to 60 s".to_owned()) }
 }
 
-/// Measures and prints.
+/// Runs the selected benchmarks and prints the results.
 pub fn run(args: &Args) -> CommandResult {
     if args.what == Some(What::TcpEcho) {
         return tcp::echo().map_err(failure);
@@ -98,7 +100,7 @@ fn print(results: &Results) {
         let value = format!("{:.decimals$}", row.value);
         let comparison = match (&row.reference, row.ratio) {
             (Some(reference), Some(ratio)) => format!("  {ratio:.3} of {reference}"),
-            (Some(reference), None) => format!("  against {reference}"),
+            (Some(reference), None) => format!("  compared with {reference}"),
             _ => String::new(),
         };
         println!("{:<52} {value:>10} {:<14}{comparison}", row.case, row.unit);

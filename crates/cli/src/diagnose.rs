@@ -1,62 +1,65 @@
-//! `twinstep diagnose`: what a model gets wrong, by name.
+//! `twinstep diagnose`: reports which effects a robot model lacks.
 
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use indicatif::{ProgressBar, ProgressStyle};
+use twinstep_diagnose::{
+    DiagnoseError, Diagnosis, DiagnosisOutput, ParameterValue, RmsErrors, diagnose, diagnose_torques,
+};
+use twinstep_effects::ModelFile;
 use twinstep_logs::Log;
 use twinstep_model::Joint;
-use twinstep_effects::ModelFile;
-use twinstep_diagnose::{DiagnoseError, DiagnosisOutput, Diagnosis, RmsErrors, ParameterValue, diagnose, diagnose_torques};
 
 use crate::evaluate::simulator;
-use crate::exit::{Failure, CommandResult, Signals, input, other};
-use twinstep_report::report_data::{ReportData, LogFacts, Provenance};
+use crate::exit::{CommandResult, Failure, Signals, input, other};
+use twinstep_report::report_data::{LogFacts, Provenance, ReportData};
 use twinstep_report::write_report;
 
-/// Show what the simulation gets wrong, name the cause, extend the model, and measure the gain.
+/// Find the effects that a robot model lacks, estimate their parameters and write the corrected model.
 ///
-/// Simulations of the log's commands are compared with what was measured. Every effect of the catalogue is tried on every
-/// joint, leg, side and type of joint; what explains most is fitted on one half of the log's seconds and judged on the other,
-/// and is named only if its evidence is above a threshold and it explains a good part of the error. Then the search goes on
-/// from there. A name is not given when nothing is wrong, or when the cause is not in the catalogue: then the report says what
-/// the error depends on.
+/// The log's commands are simulated, and the result is compared with the measurements. Every effect of the catalogue is
+/// tested on every joint, leg, side and joint type. The best candidates are fitted to one fold of the log and evaluated
+/// on the other. A candidate is reported as a cause if its log-likelihood gain exceeds a threshold and it explains at
+/// least 30 % of the residual power that it affects. The search then continues with the cause added to the model. If no
+/// effect of the catalogue is the cause, the report states what the residual depends on.
 ///
-/// DIR gets report.html to read, findings.json for programs, and extended.toml, which `twinstep serve --model` loads. Where
-/// causes are left that the log cannot tell apart, it also gets next_experiment, the safe motion that parts them best: play it
-/// and diagnose both logs.
+/// DIR gets report.html for a browser, findings.json for programs and extended.toml, the corrected model, which
+/// `twinstep serve --model` loads. If some causes are not distinguishable with this log, DIR also gets next_experiment,
+/// the safe motion that discriminates between them best. Execute it with `twinstep play` or on the robot, then diagnose
+/// both logs together.
 ///
-/// Logs of another robot, with joints of other names, are looked at by the torques of their actuators alone, beside ideal actuators
-/// with the log's gains: they need `q_*`, `dq_*`, `q_cmd_*` and `tau_measured_*`, and DIR gets findings.json.
+/// For a robot with other joint names, only the actuator torques are analysed. The baseline is an ideal actuator with
+/// the log's gains. Such a log needs `q_*`, `dq_*`, `q_cmd_*` and `tau_measured_*`, and DIR gets findings.json only.
 ///
 /// Example: `twinstep diagnose data/go2_air_chirp --out diagnosis`
 #[derive(clap::Args)]
 pub struct Args {
-    /// Logs of one robot: data files, or folders that hold one.
+    /// Logs of one robot: data files, or folders that contain one.
     #[arg(required = true)]
     logs: Vec<PathBuf>,
-    /// The model that is to be corrected; the ideal Go2 without.
+    /// Model file to correct. Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
-    /// The folder to write.
+    /// Folder to write.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Print findings.json on stdout too, and nothing else there.
+    /// Print findings.json to stdout too, and nothing else.
     #[arg(long)]
     json: bool,
 }
 
 impl Args {
-    /// Diagnoses `log` with the ideal Go2 and writes to `out`.
+    /// Returns the arguments that diagnose `log` against the ideal Go2 and write to `out`.
     pub fn new(log: PathBuf, out: PathBuf) -> Self {
         Self { logs: vec![log], model: None, out, json: false }
     }
 }
 
-/// The folder of the motion that is to be played next, in the folder that is written.
+/// Folder of the proposed experiment, in the output folder.
 const NEXT_EXPERIMENT: &str = "next_experiment";
 
-/// The folder cannot be written.
+/// The output folder cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write {}: {source}", path.display())]
 struct Unwritable {
@@ -64,22 +67,26 @@ struct Unwritable {
     source: std::io::Error,
 }
 
-/// A model is of a Go2.
+/// A model file was given for a robot that is not a Go2.
 #[derive(Debug, thiserror::Error)]
 #[error(
-    "--model {}: a model file is of a Go2, and the log's joint `{joint}` is none of its joints\n  without --model its actuators \
-     are compared with ideal ones", model.display()
+    "--model {}: a model file describes a Go2, and a Go2 has no joint `{joint}`\n  omit --model to compare the log's \
+     actuators with ideal ones", model.display()
 )]
 struct UnsupportedRobot {
     model: PathBuf,
     joint: String,
 }
 
-/// Diagnoses, writes and prints.
+/// Diagnoses the logs, writes the output folder and prints a summary.
 pub fn run(args: &Args) -> CommandResult {
-    let model = args.model.as_ref().map_or(Ok(ModelFile::default()), ModelFile::load_without_actuator_network).map_err(input)?;
+    let model = args
+        .model
+        .as_ref()
+        .map_or(Ok(ModelFile::default()), ModelFile::load_without_actuator_network)
+        .map_err(input)?;
     let logs = args.logs.iter().map(|path| Log::open(path).map_err(input)).collect::<Result<Vec<_>, _>>()?;
-    // Before the search, not after it: what it finds must not be lost.
+    // Checked before the search, so that its result cannot be lost.
     std::fs::create_dir_all(&args.out).map_err(|source| input(Unwritable { path: args.out.clone(), source }))?;
     let other_joint = logs[0].joints().iter().find(|name| name.parse::<Joint>().is_err());
     if let Some(joint) = other_joint {
@@ -95,24 +102,24 @@ pub fn run(args: &Args) -> CommandResult {
         with_progress(|progress| diagnose(logs.clone(), &model, &mut simulator, progress))?;
     diagnosis.extended_model = "extended.toml".to_owned();
     let motion = args.out.join(NEXT_EXPERIMENT);
-    // One of an earlier diagnosis would be taken for this one's.
+    // The folder of an earlier diagnosis must not be mistaken for the result of this one.
     if motion.exists() {
         std::fs::remove_dir_all(&motion).map_err(|source| input(Unwritable { path: motion.clone(), source }))?;
     }
-    if let Some((said, next)) = diagnosis.next_experiment.as_mut().zip(next) {
+    if let Some((entry, next)) = diagnosis.next_experiment.as_mut().zip(next) {
         next.motion.write(&motion).map_err(input)?;
-        NEXT_EXPERIMENT.clone_into(&mut said.motion);
+        NEXT_EXPERIMENT.clone_into(&mut entry.motion);
     }
-    written(args, "extended.toml", &extended.to_toml())?;
+    write_file(args, "extended.toml", &extended.to_toml())?;
     let provenance = Provenance {
         command: std::env::args().collect::<Vec<_>>().join(" "),
         date: today(),
         model: args.model.as_ref().map_or("the ideal go2".to_owned(), |path| path.display().to_string()),
         logs: args.logs.iter().zip(&logs).map(|(path, log)| LogFacts::of(&path.display().to_string(), log)).collect(),
     };
-    let evidence = ReportData::gather(&logs[0], &model, &extended, &mut simulator, provenance).map_err(other)?;
+    let data = ReportData::gather(&logs[0], &model, &extended, &mut simulator, provenance).map_err(other)?;
     let report = args.out.join("report.html");
-    write_report(&diagnosis, &evidence, &report).map_err(input)?;
+    write_report(&diagnosis, &data, &report).map_err(input)?;
     print_findings(&diagnosis, args)?;
     if !args.json {
         println!("report: {}", report.display());
@@ -120,7 +127,7 @@ pub fn run(args: &Args) -> CommandResult {
     Ok(())
 }
 
-/// What a diagnosis gives that says what it is doing, and ends with Ctrl-C.
+/// Runs `diagnose` with a progress spinner. Ctrl-C interrupts it.
 fn with_progress<T>(
     diagnose: impl FnOnce(&mut dyn FnMut(&str) -> bool) -> Result<T, DiagnoseError>,
 ) -> Result<T, Failure> {
@@ -139,10 +146,10 @@ fn with_progress<T>(
     })
 }
 
-/// Writes findings.json, and prints it or what a terminal shows.
+/// Writes findings.json and prints it or, by default, a summary.
 fn print_findings(diagnosis: &Diagnosis, args: &Args) -> CommandResult {
     let json = serde_json::to_string_pretty(diagnosis).map_err(other)?;
-    written(args, "findings.json", &json)?;
+    write_file(args, "findings.json", &json)?;
     if args.json {
         println!("{json}");
     } else {
@@ -151,13 +158,13 @@ fn print_findings(diagnosis: &Diagnosis, args: &Args) -> CommandResult {
     Ok(())
 }
 
-/// Writes a file of the folder.
-fn written(args: &Args, name: &str, text: &str) -> CommandResult {
+/// Writes a file into the output folder.
+fn write_file(args: &Args, name: &str, text: &str) -> CommandResult {
     let path = args.out.join(name);
     std::fs::write(&path, text).map_err(|source| input(Unwritable { path, source }))
 }
 
-/// What a terminal shows.
+/// Returns the summary for a terminal.
 fn text(diagnosis: &Diagnosis, out: &Path) -> String {
     let mut lines = Vec::new();
     for cause in &diagnosis.findings {
@@ -168,11 +175,11 @@ fn text(diagnosis: &Diagnosis, out: &Path) -> String {
         lines.push(format!("{}@{}  {}", cause.effect, cause.scope, sizes.collect::<Vec<_>>().join(", ")));
         lines.push(format!("    {}", cause.evidence));
         if !cause.ambiguous_with.is_empty() {
-            lines.push(format!("    or {}: this log cannot tell", cause.ambiguous_with.join(", or ")));
+            lines.push(format!("    not distinguishable from {} with this log", cause.ambiguous_with.join(" or ")));
         }
     }
     if diagnosis.findings.is_empty() {
-        lines.push("no cause is named".to_owned());
+        lines.push("no cause identified".to_owned());
     }
     lines.push(diagnosis.unexplained.text.clone());
     if let Some(next) = &diagnosis.next_experiment {
@@ -187,7 +194,7 @@ fn text(diagnosis: &Diagnosis, out: &Path) -> String {
 fn error_line(name: &str, diagnosis: &Diagnosis, of: fn(&RmsErrors) -> Option<f64>) -> String {
     let errors = [&diagnosis.baseline, &diagnosis.extended, &diagnosis.noise_floor];
     let [before, after, floor] = errors.map(|errors| of(errors).map_or("-".to_owned(), |value| format!("{value:.4}")));
-    format!("{name}, held-out seconds: {before} -> {after} (noise {floor})")
+    format!("{name}, held-out blocks: {before} -> {after} (noise floor {floor})")
 }
 
 fn number(value: &ParameterValue) -> String {
@@ -199,7 +206,7 @@ fn number(value: &ParameterValue) -> String {
     }
 }
 
-/// The date in UTC, as in 2026-11-21 (days to a civil date, Howard Hinnant's algorithm).
+/// Returns the date in UTC, as in 2026-11-21 (Howard Hinnant's algorithm `civil_from_days`).
 fn today() -> String {
     let seconds = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
     civil_date(seconds / 86_400)
@@ -220,7 +227,7 @@ fn civil_date(days: u64) -> String {
 #[cfg(test)]
 mod tests {
     #[test]
-    fn days_are_dates() {
+    fn days_since_1970_are_converted_to_dates() {
         let dates = [0, 11_016, 20_778].map(super::civil_date);
         assert_eq!(dates, ["1970-01-01", "2000-02-29", "2026-11-21"]);
     }

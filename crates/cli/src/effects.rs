@@ -1,4 +1,4 @@
-//! `twinstep effects`: what the catalogue knows.
+//! `twinstep effects`: lists and explains the effects of the catalogue.
 
 use std::path::PathBuf;
 
@@ -9,31 +9,31 @@ use twinstep_report::effect_plot;
 
 use crate::exit::{CommandResult, input};
 
-/// Explain what real robots do and ideal ones do not.
+/// List the effects in which real robots differ from the ideal model, or explain one of them.
 ///
-/// Without a name: the catalogue, in the order in which effects act from command to motion. With a name: the effect's law,
-/// its parameters with what is plausible for a Go2, what it looks like in a log, what it is taken for, and the experiment
-/// that tells them apart.
+/// Without NAME it prints the catalogue in the order of the chain from command to motion. With NAME it prints the
+/// effect's law, its parameters with their prior ranges for a Go2, and its signature in a log. It also prints the
+/// effects that it is often confused with, each with the experiment that discriminates between them.
 ///
 /// Example: `twinstep effects coulomb_friction --plot friction.svg`
 #[derive(clap::Args)]
 pub struct Args {
-    /// The effect.
+    /// Name of the effect.
     name: Option<String>,
-    /// Write a picture of the effect: a simulated motion without it and with its low, middle and high plausible size,
-    /// the difference, and its law in what a log shows.
+    /// Write a plot of the effect. It has a simulated motion without the effect and with a low, middle and high value
+    /// of its prior range, the difference, and the law in quantities that a log contains.
     #[arg(long, value_name = "FILE.svg", requires = "name")]
     plot: Option<PathBuf>,
 }
 
-/// Prints.
+/// Prints the catalogue, or the page of one effect.
 pub fn run(args: &Args) -> CommandResult {
     match &args.name {
         None => {
             for effect in CATALOGUE {
                 println!("{:<20}  {:<18}  {}", effect.name, effect.chain_stage, effect.summary);
             }
-            println!("\n`twinstep effects NAME` explains one.");
+            println!("\n`twinstep effects NAME` explains one effect.");
         }
         Some(name) => {
             let effect = named(name).map_err(input)?;
@@ -46,7 +46,7 @@ pub fn run(args: &Args) -> CommandResult {
     Ok(())
 }
 
-/// The page of an effect.
+/// Returns the page of an effect.
 fn text(effect: &Effect) -> String {
     let mut lines = vec![format!("{}: {}", effect.name, effect.summary), String::new()];
     lines.push(format!("  law        {}", effect.equation));
@@ -60,29 +60,29 @@ fn text(effect: &Effect) -> String {
     };
     lines.push(format!("  scopes     {scopes}"));
     let composition = match effect.composition {
-        Composition::Add => "entries that overlap add up",
-        Composition::Multiply => "entries that overlap multiply",
-        Composition::Replace => "the entry with the narrowest scope counts, of equal ones the last",
+        Composition::Add => "values of overlapping entries add up",
+        Composition::Multiply => "values of overlapping entries multiply",
+        Composition::Replace => "the entry with the narrowest scope applies; among equal scopes, the last",
     };
     lines.push(format!("  compose    {composition}"));
-    lines.push(format!("  in data    {}", effect.signature));
+    lines.push(format!("  signature  {}", effect.signature));
     lines.push("\nparameters".to_owned());
     for parameter in effect.parameters {
         let vector = if parameter.count > 1 { format!("[{}]", parameter.count) } else { String::new() };
         let [low, high] = parameter.prior_range;
-        let [least, most] = parameter.bounds;
+        let [min, max] = parameter.bounds;
         lines.push(format!(
-            "  {}{vector}  plausible {low} to {high} {}, allowed {least} to {most}; {} changes nothing",
+            "  {}{vector}  prior range {low} to {high} {}, allowed {min} to {max}; {} has no effect",
             parameter.name, parameter.unit, parameter.no_effect_value
         ));
         lines.push(format!("      source: {}", parameter.source));
     }
     if !effect.confounders.is_empty() {
-        lines.push("\ntaken for".to_owned());
-        for confusion in effect.confounders {
-            lines.push(format!("  {:<20}  {}", confusion.effect, confusion.discriminating_experiment));
+        lines.push("\noften confused with".to_owned());
+        for confounder in effect.confounders {
+            lines.push(format!("  {:<20}  {}", confounder.effect, confounder.discriminating_experiment));
         }
     }
-    lines.push(format!("\n`twinstep effects {} --plot FILE.svg` draws it.\n", effect.name));
+    lines.push(format!("\n`twinstep effects {} --plot FILE.svg` plots it.\n", effect.name));
     lines.join("\n")
 }

@@ -1,28 +1,29 @@
-//! `twinstep evaluate`: the error of a model on a log.
+//! `twinstep evaluate`: measures the error of a robot model on a log.
 
 use std::path::PathBuf;
 
+use twinstep_identify::{Evaluation, evaluate, position_errors};
 use twinstep_logs::Log;
 use twinstep_model::RobotModel;
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_identify::{Evaluation, evaluate, position_errors};
 
-use crate::exit::{Failure, CommandResult, input, other};
+use crate::exit::{CommandResult, Failure, input, other};
 use crate::robot_file::robot_model;
 use twinstep_report::{chart, evaluation_plot};
 
-/// How far a model is from a measured log: the number that says whether a model got better.
+/// Measure the error of a robot model on a measured log.
 ///
-/// Torque: what the model's actuators make of the measured positions, velocities and commands, at the log's sensor. Position:
-/// in closed loop, under the log's commands; with the base held from each part's first measured state to its end, with a
-/// free base in windows of 0.5 s from measured states. Root mean squares over all rows and joints.
+/// Torque: the model's actuators receive the measured positions and velocities and the log's commands. Their torque is
+/// compared at the location of the log's torque sensor. Position: the log's commands are simulated in closed loop. With
+/// a fixed base, each segment is simulated from its first measured state to its end. With a floating base, windows of
+/// 0.5 s are simulated from measured states. Errors are root mean squares over all selected rows and joints.
 ///
 /// Example: `twinstep evaluate --model extended.toml data/go2_air_chirp --plot errors.svg`
 #[derive(clap::Args)]
 pub struct Args {
-    /// The log: a data file, or a folder that holds one.
+    /// Measured log: a data file, or a folder that contains one.
     log: PathBuf,
-    /// Model file of the robot; the ideal Go2 without.
+    /// Model file of the robot. Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
     #[command(flatten)]
@@ -30,32 +31,32 @@ pub struct Args {
     /// Print one JSON object and nothing else on stdout.
     #[arg(long)]
     json: bool,
-    /// Write a picture: the errors joint by joint, and the worst joint over time.
+    /// Write a plot: the error of each joint, and the joint with the largest position error over time.
     #[arg(long, value_name = "FILE.svg")]
     plot: Option<PathBuf>,
 }
 
-/// Which rows count.
+/// Selection of rows by time.
 #[derive(clap::Args)]
 pub struct Rows {
-    /// Count only rows from this time on [s].
+    /// Evaluate only rows from this time on [s].
     #[arg(long, value_name = "S")]
     from: Option<f64>,
-    /// Count only rows before this time [s].
+    /// Evaluate only rows before this time [s].
     #[arg(long, value_name = "S")]
     until: Option<f64>,
 }
 
-/// No row is left.
+/// `--from` and `--until` select no row.
 #[derive(Debug, thiserror::Error)]
-#[error("`--from` and `--until` leave no row: the log's `t` goes from {first} to {last} s")]
+#[error("`--from` and `--until` select no row: `t` of the log is {first} to {last} s")]
 struct NoRows {
     first: f64,
     last: f64,
 }
 
 impl Rows {
-    /// For each row of the log, whether it counts.
+    /// Returns, for each row of the log, whether it is selected.
     pub fn of(&self, log: &Log) -> Result<Vec<bool>, Failure> {
         let (from, until) = (self.from.unwrap_or(f64::NEG_INFINITY), self.until.unwrap_or(f64::INFINITY));
         let rows: Vec<bool> = log.t().iter().map(|t| (from..until).contains(t)).collect();
@@ -67,12 +68,12 @@ impl Rows {
     }
 }
 
-/// The simulator that candidates are judged in.
+/// Returns the simulator in which models are evaluated.
 pub fn simulator(robot: &RobotModel) -> Result<BatchRollout, Failure> {
     BatchRollout::new(robot, &SimConfig::default()).map_err(input)
 }
 
-/// Evaluates and prints.
+/// Evaluates the model and prints its errors.
 pub fn run(args: &Args) -> CommandResult {
     let robot = robot_model(args.model.as_deref())?;
     let log = Log::open(&args.log).map_err(input)?;
@@ -96,7 +97,7 @@ pub fn run(args: &Args) -> CommandResult {
     Ok(())
 }
 
-/// A line a joint, and one over all.
+/// Returns a table of the errors with one line per joint and one over all joints.
 pub fn table(evaluation: &Evaluation) -> String {
     let cell = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
     let line = |name: &str, q: Option<f64>, torque: Option<f64>| {

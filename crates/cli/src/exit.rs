@@ -1,4 +1,4 @@
-//! How a command ends: 0 done, 2 bad input, 130 interrupted, 1 anything else.
+//! Exit codes: 0 success, 2 invalid input, 130 interrupted, 1 any other error.
 
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -6,31 +6,31 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use signal_hook::consts::{SIGINT, SIGTERM};
 
-/// Why a command did not end well.
+/// Reason why a command failed.
 #[derive(Debug)]
 pub enum Failure {
-    /// The user's input is at fault.
+    /// The user's input is invalid.
     Input(miette::Report),
-    /// Something else is.
+    /// Any other error.
     Other(miette::Report),
-    /// Ctrl-C.
+    /// The user pressed Ctrl-C.
     Interrupted,
 }
 
-/// What a command returns.
+/// Result of a command.
 pub type CommandResult = Result<(), Failure>;
 
-/// An error of the user's input.
+/// Wraps an error in the user's input.
 pub fn input(error: impl std::error::Error + Send + Sync + 'static) -> Failure {
     Failure::Input(miette::Report::msg(error.to_string()))
 }
 
-/// Any other error.
+/// Wraps any other error.
 pub fn other(error: impl std::error::Error + Send + Sync + 'static) -> Failure {
     Failure::Other(miette::Report::msg(error.to_string()))
 }
 
-/// Tells the user, and the shell.
+/// Prints the error, if any, and returns the exit code.
 pub fn code(outcome: CommandResult) -> ExitCode {
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
@@ -45,11 +45,11 @@ fn print_error(report: &miette::Report, code: u8) -> ExitCode {
     ExitCode::from(code)
 }
 
-/// The signals that ask to end. The first is left to the program; a second one ends it at once.
+/// SIGINT and SIGTERM. The program handles the first one; a second one terminates it at once.
 pub struct Signals(Arc<AtomicUsize>);
 
 impl Signals {
-    /// Starts to listen for SIGINT and SIGTERM.
+    /// Registers the handlers of SIGINT and SIGTERM.
     pub fn listen() -> Result<Self, Failure> {
         let last = Arc::new(AtomicUsize::new(0));
         for signal in [SIGINT, SIGTERM] {
@@ -61,7 +61,7 @@ impl Signals {
         Ok(Self(last))
     }
 
-    /// `Err(Interrupted)` after a SIGINT, `Ok(true)` after a SIGTERM, `Ok(false)` before any.
+    /// Returns `Err(Interrupted)` after a SIGINT, `Ok(true)` after a SIGTERM, and `Ok(false)` before either.
     pub fn check(&self) -> Result<bool, Failure> {
         match self.0.load(Ordering::Acquire) as i32 {
             SIGINT => Err(Failure::Interrupted),

@@ -1,4 +1,4 @@
-//! `twinstep fit`: an ensemble of actuator networks from measured logs.
+//! `twinstep fit`: trains an ensemble of actuator networks on measured logs.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -6,81 +6,82 @@ use std::time::{Duration, Instant};
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_ensemble::{
-    Calibration, Checkpoint, Coverage, DataSet, Ensemble, EnsembleError, Epoch, JointEncoding, TrainingOptions, TrainingResult as Ended,
-    TrainingEvent, Training,
+    Calibration, Checkpoint, Coverage, DataSet, Ensemble, EnsembleError, Epoch, JointEncoding, Training, TrainingEvent,
+    TrainingOptions, TrainingResult as Ended,
 };
 use twinstep_logs::Log;
 
-use twinstep_report::chart::{self, HPos, RGBColor, GREY, Line, ORANGE, Panel, PlotError};
 use crate::cross_evaluation;
-use crate::exit::{Failure, CommandResult, Signals, input, other};
+use crate::exit::{CommandResult, Failure, Signals, input, other};
+use twinstep_report::chart::{self, GREY, HPos, Line, ORANGE, Panel, PlotError, RGBColor};
 
-/// How often a running training is saved.
+/// Interval at which a running training is saved.
 const SAVE_EVERY: Duration = Duration::from_secs(30);
-/// Width and height of the learning curves [px].
+/// Width and height of the plot of the learning curves [px].
 const SIZE: (u32, u32) = (900, 600);
 
-/// Learn a robot's actuators from measured logs: an ensemble of networks that knows what it does not know (U2E).
+/// Train an ensemble of actuator networks on measured logs (U2E).
 ///
-/// Each network sees a joint's position and velocity error, row after row, and gives its torque as a mean and a variance.
-/// Networks that began differently agree on what they have seen and disagree elsewhere. The logs need `tau_measured_*`, one
-/// rate and constant gains; torque beside the gains (`tau_ff_*`) is refused. Velocity that was not measured is the central
-/// difference of position.
+/// Each network receives the position and velocity error of one joint, row after row, and predicts the mean and
+/// variance of its torque. The members start from different initial weights. They agree on motion like the training
+/// data and disagree elsewhere; this gives the epistemic uncertainty of each prediction. The logs need
+/// `tau_measured_*`, one rate and constant gains. A log with feed-forward torque (`tau_ff_*`) is refused. A velocity
+/// that was not measured is replaced by the central difference of the position.
 ///
-/// Of every ten stretches of time eight are learnt from, one says when to stop and how wide intervals have to be, and the last
-/// one judges: its torque error, and how often the truth lies inside the intervals, are printed, before and after the
-/// variances were scaled.
+/// Each log is cut into blocks. Of every ten blocks, eight are the training split, one is the validation split and one
+/// is the test split. The validation split is used for early stopping and for one factor that scales all variances. The
+/// command prints the torque error and the coverage of the intervals on the test split, before and after scaling.
 ///
-/// Ctrl-C ends the training and keeps it in OUT.training, from which the same command with --resume goes on; it is saved there
-/// after the first epoch and every 30 s too.
+/// Ctrl-C interrupts the training and saves it in OUT.training. The same command with --resume continues from there.
+/// The training is also saved there after the first epoch and every 30 s.
 ///
-/// With --cross each log is a stage of a collection of data: an ensemble learns from each alone and is judged by the left-out
-/// stretches of every stage, as in Fig. 2 of U2E. OUT is a folder then, with `1.safetensors` and so on, the grid as
-/// `cross.svg`, and its numbers as `cross.csv`.
+/// With --cross each log is one stage of a data collection. One ensemble is trained per stage and evaluated on the test
+/// split of every stage (U2E, Fig. 2). OUT is then a folder with `1.safetensors` and so on, the grid of plots
+/// `cross.svg` and the table `cross.csv`.
 ///
 /// Example: `twinstep fit walk.parquet jump.parquet --out ensemble.safetensors --plot curves.svg`
 #[derive(clap::Args)]
 pub struct Args {
-    /// The logs: data files, or folders that hold one.
+    /// Measured logs: data files, or folders that contain one.
     #[arg(required = true)]
     logs: Vec<PathBuf>,
-    /// Number of networks.
+    /// Number of members of the ensemble.
     #[arg(long, value_name = "N", default_value_t = TrainingOptions::default().members)]
     members: usize,
-    /// Units of each network's LSTM.
+    /// Number of hidden units of each member's LSTM.
     #[arg(long, value_name = "N", default_value_t = TrainingOptions::default().hidden)]
     hidden: usize,
-    /// What a network is told of the joint: nothing, as in U2E; hip, thigh or calf; or which one it is.
+    /// Encoding of the joint in the input: none, as in U2E (pooled), the joint type (kind), or the joint (identity).
     #[arg(long, value_name = "WHAT", value_enum, default_value_t = JointEncodingArg::Pooled)]
     joint_input: JointEncodingArg,
-    /// Most passes over the data; most trainings end before, when the left-out stretches are predicted no better.
+    /// Maximum number of epochs. Most trainings end earlier, by early stopping on the validation split.
     #[arg(long, value_name = "N", default_value_t = TrainingOptions::default().epochs)]
     epochs: usize,
-    /// Seed of the networks' first weights and of the order of the data.
+    /// Seed of the initial weights and of the order of the data.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
-    /// Smooth what is learnt from by a cubic spline, as U2E does: waves of so many Hz have half their amplitude. What stops the
-    /// training and what judges it stay as measured.
+    /// Smooth the training split with a cubic spline, as U2E does. The spline halves the amplitude at this frequency
+    /// [Hz]. The validation and test splits stay as measured.
     #[arg(long, value_name = "HZ")]
     pub smooth: Option<f64>,
-    /// Train on the best GPU there is (builds with `--features gpu`); the numbers differ from the CPU's by rounding.
+    /// Train on the best available GPU (builds with `--features gpu`). Results differ from the CPU's by rounding.
     #[arg(long)]
     gpu: bool,
-    /// Go on with the training that ended, from OUT.training.
+    /// Continue the interrupted training in OUT.training.
     #[arg(long)]
     resume: bool,
-    /// Draw the learning curves.
+    /// Write a plot of the learning curves.
     #[arg(long, value_name = "FILE.svg", conflicts_with = "cross")]
     plot: Option<PathBuf>,
-    /// Learn from each log alone, and judge each ensemble by every log.
+    /// Train one ensemble per log, and evaluate each of them on every log.
     #[arg(long)]
     cross: bool,
-    /// The file to write (safetensors); with --cross the folder.
+    /// File to write (safetensors); with --cross, folder to write.
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
 }
 
-/// [`JointEncoding`] by its name.
+/// [`JointEncoding`] as a value of the command line.
 #[derive(Clone, Copy, ValueEnum)]
 enum JointEncodingArg {
     Pooled,
@@ -88,7 +89,7 @@ enum JointEncodingArg {
     Identity,
 }
 
-/// Trains, judges, prints and writes.
+/// Trains, evaluates and writes the ensemble.
 pub fn run(args: &Args) -> CommandResult {
     let mut logs = Vec::new();
     for path in &args.logs {
@@ -111,7 +112,7 @@ pub fn run(args: &Args) -> CommandResult {
     Ok(())
 }
 
-/// Trains an ensemble and writes it to `out`; what is interrupted is kept beside it.
+/// Trains an ensemble and writes it to `out`. Saves an interrupted training in [`training_file`].
 pub fn train_and_save(
     data: &DataSet,
     args: &Args,
@@ -122,7 +123,7 @@ pub fn train_and_save(
     if args.gpu {
         println!("training on {}", training.on_gpu().map_err(input)?);
     }
-    // Before the training, not after it: what was learnt must not be lost.
+    // Checked before the training, so that its result cannot be lost.
     check_writable(out).map_err(input)?;
     let saved = training_file(out);
     match train(&training, args, &saved, resume)? {
@@ -135,14 +136,14 @@ pub fn train_and_save(
         }
         Ended::Interrupted(checkpoint) => {
             checkpoint.write(&saved).map_err(other)?;
-            println!("ended before it was done; the same command with --resume goes on");
+            println!("interrupted; the same command with --resume continues");
             Err(Failure::Interrupted)
         }
     }
 }
 
 impl Args {
-    /// Whether a training that ended is to go on.
+    /// True if an interrupted training is to be continued.
     pub fn resumes(&self) -> bool {
         self.resume
     }
@@ -153,24 +154,30 @@ impl Args {
             JointEncodingArg::Kind => JointEncoding::Kind,
             JointEncodingArg::Identity => JointEncoding::Identity,
         };
-        TrainingOptions { members: self.members, hidden: self.hidden, joint_input, epochs: self.epochs, seed: self.seed }
+        TrainingOptions {
+            members: self.members,
+            hidden: self.hidden,
+            joint_input,
+            epochs: self.epochs,
+            seed: self.seed,
+        }
     }
 }
 
-/// Where a training that has not ended is kept.
+/// Returns the file in which an unfinished training is saved.
 pub fn training_file(out: &Path) -> PathBuf {
     let mut name = out.as_os_str().to_owned();
     name.push(".training");
     name.into()
 }
 
-/// Fails if no file can be made beside `out`.
+/// Returns an error if no file can be created next to `out`.
 fn check_writable(out: &Path) -> Result<(), EnsembleError> {
-    let beside = training_file(out);
-    let made = std::fs::OpenOptions::new().append(true).create(true).open(&beside);
-    let empty = made.and_then(|file| Ok(file.metadata()?.len() == 0));
-    let cleaned = empty.and_then(|empty| if empty { std::fs::remove_file(&beside) } else { Ok(()) });
-    cleaned.map_err(|cause| EnsembleError::File { verb: "write", path: out.to_owned(), cause })
+    let path = training_file(out);
+    let created = std::fs::OpenOptions::new().append(true).create(true).open(&path);
+    let empty = created.and_then(|file| Ok(file.metadata()?.len() == 0));
+    let removed = empty.and_then(|empty| if empty { std::fs::remove_file(&path) } else { Ok(()) });
+    removed.map_err(|cause| EnsembleError::File { verb: "write", path: out.to_owned(), cause })
 }
 
 fn train(training: &Training, args: &Args, saved: &Path, resume: Option<Checkpoint>) -> Result<Ended, Failure> {
@@ -182,14 +189,14 @@ fn train(training: &Training, args: &Args, saved: &Path, resume: Option<Checkpoi
     bar.reset_eta();
     let (mut unwritable, mut last_save) = (None, None::<Instant>);
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
-    let ended = training.run(threads, resume, &mut |progress| {
+    let result = training.run(threads, resume, &mut |progress| {
         match progress {
             TrainingEvent::Sequences(count) => bar.inc(count as u64),
             TrainingEvent::Epoch { member, done, curve, checkpoint } => {
                 let (number, epoch) = (curve.len(), curve[curve.len() - 1]);
                 let Epoch { training_nll, validation_nll } = epoch;
                 bar.set_message(format!(
-                    "member {}, epoch {number}: NLL {training_nll:.3}, left out {validation_nll:.3}",
+                    "member {}, epoch {number}: training NLL {training_nll:.3}, validation NLL {validation_nll:.3}",
                     member + 1
                 ));
                 if done {
@@ -206,7 +213,7 @@ fn train(training: &Training, args: &Args, saved: &Path, resume: Option<Checkpoi
     });
     bar.finish_and_clear();
     unwritable.map_or(Ok(()), |error| Err(other(error)))?;
-    ended.map_err(|error| match error {
+    result.map_err(|error| match error {
         EnsembleError::Diverged { .. } => other(error),
         _ => input(error),
     })
@@ -217,11 +224,11 @@ fn progress_bar(sequences: usize) -> ProgressBar {
     ProgressBar::new(sequences as u64).with_style(style.expect("a template"))
 }
 
-/// A line a member and one of their mixture, before and after its variances were scaled.
+/// Returns a table with two lines per member and for their mixture: before and after scaling the variances.
 fn text(found: &Calibration, variance_scale: f64) -> String {
     let mut lines = vec![
-        format!("judged by {} rows that nothing was learnt from or fitted to", found.rows),
-        format!("torque error of the members' mean: {:.4} N·m (RMSE)", found.rmse),
+        format!("evaluated on {} held-out rows", found.rows),
+        format!("torque RMSE of the members' mean: {:.4} N·m", found.rmse),
         format!("mean standard deviation: {:.4} N·m, all variances scaled by {variance_scale:.3}", found.sharpness),
         format!(
             "{:<22}{:>7}{:>7}{:>7}  {:>12}  {:>8}",
@@ -242,7 +249,7 @@ fn line(name: &str, coverage: &Coverage) -> String {
     format!("{name:<22}{half:>7.1}{ninety:>7.1}{more:>7.1}  {pit_distance:>12.3}  {nll:>8.3}")
 }
 
-/// Negative log-likelihood of every member over its epochs.
+/// Plots the negative log-likelihood of every member over its epochs.
 fn curves_svg(curves: &[Vec<Epoch>]) -> Result<String, PlotError> {
     let of = |value: fn(&Epoch) -> f64| {
         let points = move |curve: &Vec<Epoch>| {
@@ -254,8 +261,8 @@ fn curves_svg(curves: &[Vec<Epoch>]) -> Result<String, PlotError> {
     let longest = curves.iter().map(Vec::len).max().unwrap_or(1).max(2);
     let values = training.iter().chain(&validation).flatten().map(|(_, nll)| *nll);
     let panel = Panel {
-        caption: format!("{} networks learn", curves.len()),
-        x_label: "passes over the data",
+        caption: format!("Training of {} networks", curves.len()),
+        x_label: "epoch",
         y_label: "negative log-likelihood [nat]",
         x: 1.0..longest as f64,
         y: chart::range(values),
@@ -266,7 +273,7 @@ fn curves_svg(curves: &[Vec<Epoch>]) -> Result<String, PlotError> {
     };
     chart::picture(SIZE, |root| {
         panel.draw(root)?;
-        let names = [("learnt from", GREY), ("left out", ORANGE)];
+        let names = [("training", GREY), ("validation", ORANGE)];
         chart::legend(root, &names, 420, (900, 120))?;
         chart::text(root, "each line is one network", 34, HPos::Left, (900, 180))
     })

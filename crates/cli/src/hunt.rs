@@ -8,32 +8,33 @@ use twinstep_hunt::{HuntConfig, HuntError, hunt};
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 
-/// Hide effects in simulated robots, let `twinstep diagnose` look for them, and judge what it says.
+/// Run a blind test of `twinstep diagnose` on simulated robots with hidden effects.
 ///
-/// Every case is drawn from the seed and its number: two sevenths hide nothing, a seventh hides two effects, a seventh
-/// something that the catalogue does not have, the rest one effect, half of them at a fifth of its plausible range and
-/// half from one half to all of it. The robot runs in rapier at 4 kHz with masses off by up to 1 % and lengths by up to
-/// 2 mm; sensors have noise. The diagnosis is another process: it sees the log and the model of the ideal Go2.
+/// Each case is sampled from the seed and its number. Two sevenths of the cases hide no effect, one seventh two effects
+/// and one seventh an effect outside the catalogue. The other cases hide one effect: half of them at a fifth of its
+/// prior range, half from one half to all of the range. The robot runs in rapier at 4 kHz. Its masses have errors of up
+/// to 1 %, its leg mounts of up to 2 mm, and its sensors have noise. The diagnosis runs in another process, which
+/// receives only the log and the model of the ideal Go2.
 ///
-/// Prints a table of rates with their 95 % intervals (Wilson) and which name was given for which effect, and writes it to
-/// OUT/hunt.md. OUT/cases.jsonl has a line a case as soon as it is judged; the same command with --resume goes on from
-/// there, also with more cases. OUT/<case> keeps the case's log, what the diagnosis said of it, and truth.toml.
+/// Prints a table of rates with 95 % intervals (Wilson) and the confusion matrix, and writes both to OUT/hunt.md. Each
+/// case is scored and appended to OUT/cases.jsonl as soon as it is complete. The same command with --resume continues
+/// from there, also with more cases. OUT/<case> has the log, the diagnosis, and the ground truth in truth.toml.
 ///
-/// Keep the seeds that you develop with and those that you report apart.
+/// Use different seeds for development and for reported results.
 ///
 /// Example: `twinstep hunt --cases 28 --seed 1 --out hunt-1`
 #[derive(clap::Args)]
 pub struct Args {
-    /// Number of cases; multiples of 28 have the mix of kinds exactly.
+    /// Number of cases. Multiples of 28 have exactly the mix above.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     cases: u64,
-    /// Seed of the game.
+    /// Seed of the cases.
     #[arg(long, value_name = "S")]
     seed: u64,
-    /// Folder of the results.
+    /// Folder to write.
     #[arg(long, value_name = "DIR", default_value = "twinstep-hunt")]
     out: PathBuf,
-    /// Go on with the game in OUT.
+    /// Continue the blind test in OUT.
     #[arg(long)]
     resume: bool,
 }

@@ -1,32 +1,34 @@
-//! `twinstep log`: a measured log described, or converted.
+//! `twinstep log`: describes or converts a measured log.
 
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
-use twinstep_logs::{LogSummary, Log, LogError, overwritten_file};
+use twinstep_logs::{Log, LogError, LogSummary, overwritten_file};
 
-use crate::exit::{Failure, CommandResult, input, other};
+use crate::exit::{CommandResult, Failure, input, other};
 
 /// Describe a measured log, or convert it.
 ///
-/// A log is a folder with a data file and meta.json, or the data file itself: data.csv, data.csv.gz or data.parquet with
-/// meta.json beside it (walk.csv may have walk.json), or an MCAP recording of the robot's own /lowstate and /lowcmd
-/// (also rt/lowstate and rt/lowcmd; CDR), which needs no meta.json; one beside it says whether the base was held.
+/// A log is a folder with a data file and meta.json, or the data file itself: data.csv, data.csv.gz or data.parquet
+/// with meta.json in the same folder (walk.json for walk.csv). It may also be an MCAP recording of the robot's topics
+/// /lowstate and /lowcmd (also rt/lowstate and rt/lowcmd; CDR). MCAP needs no meta.json; an optional one contains the
+/// mounting of the base.
 ///
-/// The description has channels with units and empty cells; rate, jitter and gaps; segments; for each joint how far, how
-/// fast and how hard it moved and how near its limits; falls; and for each effect that a real robot may have whether this
-/// log can tell of it (can, weakly, cannot) and why. Columns and meta.json are explained in docs/logs.md.
+/// The description has channels with units and empty cells; rate, jitter and gaps; segments; for each joint the range
+/// of position, speed and torque and the distance to its limits; falls; and for each effect of the catalogue whether it
+/// is identifiable from the log (yes, weak, no) and why. docs/logs.md explains the columns and meta.json.
 ///
-/// With --convert it writes the log anew instead: the format is that of the file's name. CSV and Parquet keep everything;
-/// MCAP keeps what the robot's messages have (no `pos_*`, `vel_*`, `contact_*`), in single precision.
+/// With --convert it writes the log in the format of the given file name instead. CSV and Parquet keep everything. MCAP
+/// keeps the fields of the robot's messages (no `pos_*`, `vel_*`, `contact_*`), in single precision.
 ///
 /// Examples: `twinstep log data/go2_air_chirp` and `twinstep log robot.mcap --convert walk.parquet`
 #[derive(clap::Args)]
 pub struct Args {
-    /// The log: a data file, or a folder that holds one.
+    /// Measured log: a data file, or a folder that contains one.
     log: PathBuf,
-    /// Write the log to this file: *.parquet, *.csv, *.csv.gz or *.mcap, or a folder, which gets data.parquet and meta.json.
+    /// Write the log to this file: *.parquet, *.csv, *.csv.gz or *.mcap, or a folder, which gets data.parquet and
+    /// meta.json.
     #[arg(long, value_name = "FILE")]
     convert: Option<PathBuf>,
     /// Print the description as one JSON object.
@@ -34,7 +36,7 @@ pub struct Args {
     json: bool,
 }
 
-/// The new log would replace the old one.
+/// The output would overwrite a file of the input log.
 #[derive(Debug, thiserror::Error)]
 #[error("`--convert {}` would replace `{}`, which belongs to the log itself\n  name another file or folder", .to.display(), .of_log.display())]
 struct SameFile {
@@ -42,7 +44,7 @@ struct SameFile {
     of_log: PathBuf,
 }
 
-/// What `--json` prints.
+/// Output of `--json`.
 #[derive(Serialize)]
 struct Report<'a> {
     log: &'a Path,
@@ -52,16 +54,16 @@ struct Report<'a> {
     converted: Option<Converted<'a>>,
 }
 
-/// What was written.
+/// Result of a conversion.
 #[derive(Serialize)]
 struct Converted<'a> {
     to: &'a Path,
     rows: usize,
-    /// Columns that the format cannot hold.
+    /// Columns that the format does not support.
     left_out: Vec<String>,
 }
 
-/// Describes or converts.
+/// Describes or converts the log.
 pub fn run(args: &Args) -> CommandResult {
     let log = open(&args.log).map_err(input)?;
     let converted = args.convert.as_deref().map(|to| convert(&log, &args.log, to)).transpose()?;
@@ -70,12 +72,12 @@ pub fn run(args: &Args) -> CommandResult {
         return print(&format!("{}\n", serde_json::to_string(&report).map_err(other)?));
     }
     match converted {
-        Some(converted) => print(&told(&converted, &log)),
+        Some(converted) => print(&conversion_summary(&converted, &log)),
         None => print(&format!("{}\n{}", args.log.display(), log.describe())),
     }
 }
 
-/// Writes to stdout, and minds no reader that has seen enough, as `head` has.
+/// Writes to stdout. A pipe that the reader closed, as `head` does, is not an error.
 fn print(text: &str) -> CommandResult {
     match std::io::stdout().write_all(text.as_bytes()) {
         Err(cause) if cause.kind() != ErrorKind::BrokenPipe => Err(other(cause)),
@@ -83,20 +85,20 @@ fn print(text: &str) -> CommandResult {
     }
 }
 
-/// What was converted, in words.
-fn told(converted: &Converted<'_>, log: &Log) -> String {
+/// Returns a summary of the conversion.
+fn conversion_summary(converted: &Converted<'_>, log: &Log) -> String {
     let mut lines = vec![format!("wrote {} ({} rows)", converted.to.display(), converted.rows)];
     if !converted.left_out.is_empty() {
-        lines.push(format!("left out, as the format has no place for it: {}", converted.left_out.join(", ")));
+        lines.push(format!("omitted, not supported by the format: {}", converted.left_out.join(", ")));
     }
     if !log.ignored().is_empty() {
-        lines.push(format!("left out, as it is no column of a log: {}", log.ignored().join(", ")));
+        lines.push(format!("omitted, not a column of a log: {}", log.ignored().join(", ")));
     }
     lines.extend(log.read_warnings().iter().map(|note| format!("note: {note}")));
     lines.join("\n") + "\n"
 }
 
-/// Reads a measured log, or a motion, in which nothing was measured.
+/// Opens a measured log, or a motion file, which has no measurements.
 fn open(path: &Path) -> Result<Log, LogError> {
     let nothing_measured = |motion: &Log| motion.joints().iter().all(|joint| motion.q(joint).is_none());
     Log::open(path).or_else(|error| Log::open_commands(path).ok().filter(nothing_measured).ok_or(error))

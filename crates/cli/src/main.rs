@@ -1,4 +1,4 @@
-//! The command line `twinstep`: one subcommand a file.
+//! Command line `twinstep`, with one file per subcommand.
 
 mod bench;
 mod cross_evaluation;
@@ -18,7 +18,7 @@ mod serve;
 
 use clap::{Parser, Subcommand};
 
-/// Thousands of simulated Unitree Go2 for reinforcement learning, and an honest look at the gap to the real one.
+/// Simulate thousands of Unitree Go2 robots for reinforcement learning, and measure the gap to the real robot.
 #[derive(Parser)]
 #[command(version, propagate_version = true)]
 struct Cli {

@@ -1,4 +1,4 @@
-//! `twinstep mjcf`: the robot as a MuJoCo model.
+//! `twinstep mjcf`: exports the robot as a MuJoCo model.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -8,38 +8,39 @@ use twinstep_model::{BaseMount, MjcfActuator, MjcfOptions, mjcf};
 use crate::exit::{CommandResult, input, other};
 use crate::robot_file::robot_model;
 
-/// Shortest and longest step [s].
+/// Allowed time steps [s].
 const TIMESTEPS: std::ops::RangeInclusive<f64> = 1e-5..=0.02;
 
-/// Write the robot as a MuJoCo model (MJCF, XML), for a second opinion on the physics.
+/// Export the robot as a MuJoCo model (MJCF, XML), to compare the physics with MuJoCo.
 ///
-/// The model has the tree, masses, inertias, armature, joint ranges and torque limits of the robot, and the contacts that
-/// `--engine batch` knows: feet, both ends of each calf, and the trunk's corners against the ground. `ctrl` is torque
-/// [N·m] in the joint order FL, FR, RL, RR; hip, thigh, calf. The keyframe `default_pose` is the start.
+/// The model contains the kinematic tree, masses, inertias, armature, joint ranges and torque limits of the robot. Its
+/// contacts are those of `--engine batch`: feet, both ends of each calf, and the corners of the base against the
+/// ground. `ctrl` is torque [N·m] in the joint order FL, FR, RL, RR; hip, thigh, calf. The keyframe `default_pose` is
+/// the initial state.
 ///
 /// Example: `twinstep mjcf --out go2.xml && python -m mujoco.viewer --mjcf go2.xml`
 #[derive(clap::Args)]
 pub struct Args {
-    /// Model file of the robot; the ideal Go2 without.
+    /// Model file of the robot. Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
-    /// Whether the trunk moves: floating, or fixed 1 m above the ground.
+    /// Mounting of the base: floating, or fixed 1 m above the ground.
     #[arg(long, default_value = "floating", value_parser = base)]
     base: BaseMount,
-    /// One step of the physics [s], 0.00001 to 0.02.
+    /// Time step of the physics [s], 0.00001 to 0.02.
     #[arg(long, default_value_t = 0.001, value_name = "S")]
     timestep: f64,
-    /// File to write; stdout without.
+    /// File to write. Default: stdout.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
 }
 
-/// A flag outside what is allowed.
+/// `--timestep` is outside its range.
 #[derive(Debug, thiserror::Error)]
 #[error("`--timestep` = {0} is not allowed: {low} to {high} s", low = TIMESTEPS.start(), high = TIMESTEPS.end())]
 struct TimestepError(f64);
 
-/// A file that cannot be written.
+/// The output file cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("`--out`: cannot write {}: {cause}", path.display())]
 struct WriteError {
@@ -47,7 +48,7 @@ struct WriteError {
     cause: std::io::Error,
 }
 
-/// Writes the model.
+/// Exports the model.
 pub fn run(args: &Args) -> CommandResult {
     if !TIMESTEPS.contains(&args.timestep) {
         return Err(input(TimestepError(args.timestep)));
@@ -65,6 +66,6 @@ fn base(text: &str) -> Result<BaseMount, String> {
     match text {
         "floating" => Ok(BaseMount::Floating),
         "fixed" => Ok(BaseMount::Fixed),
-        _ => Err("the base is floating or fixed".to_owned()),
+        _ => Err("must be `floating` or `fixed`".to_owned()),
     }
 }

@@ -1,64 +1,78 @@
-//! `twinstep play`: a motion file through a robot model, as a measured log.
+//! `twinstep play`: simulates a motion file with a robot model and writes a measured log.
 
 use std::path::PathBuf;
 
 use indicatif::ProgressBar;
-use twinstep_ensemble::ActuatorNetworkRobot;
-use twinstep_model::{BaseMount, Actuator, RobotModel};
-use twinstep_logs::Log;
 use twinstep_effects::ModelFile;
-use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
+use twinstep_ensemble::ActuatorNetworkRobot;
 use twinstep_identify::{RecordError, record};
+use twinstep_logs::Log;
+use twinstep_logs::replay::at_log_rate;
+use twinstep_model::{Actuator, BaseMount, RobotModel};
+use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 
-use crate::exit::{Failure, CommandResult, Signals, input, other};
+use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::serve::engine;
 
-/// Play a motion file through a robot model, and write what the robot did as a measured log.
+/// Simulate a motion file with a robot model and write the result as a measured log.
 ///
-/// A motion file is a log (data.csv, .csv.gz or .parquet, and meta.json beside it) with command columns only: `t` and
-/// `q_cmd_<joint>`, and where wanted `dq_cmd_<joint>`, `tau_ff_<joint>`, `kp` and `kd`; gains may also stand in meta.json,
-/// and are the model's where neither has them. Joints without a column hold the default pose. The row's command is in
-/// force from its `t` to the next row's; rows come at the actuator's 200 Hz or a whole fraction of it.
+/// A motion file is a log (data.csv, .csv.gz or .parquet, with meta.json in the same folder) with command columns only.
+/// `t` and `q_cmd_<joint>` are required; `dq_cmd_<joint>`, `tau_ff_<joint>`, `kp` and `kd` are optional. Gains may also
+/// be in meta.json. Default: the gains of the model. Joints without a column hold the default pose. A row's command is
+/// in force from its `t` to the next row's. The rate of the rows is 20 to 2000 Hz. A motion of 200 Hz or more is
+/// simulated with actuators at its own rate, a slower one at the smallest multiple of its rate that is at least 200 Hz.
 ///
-/// Every segment, and every episode in it, starts with the robot at rest in its default pose: on its feet, or held 1 m
-/// above the ground. Columns `q_*`, `dq_*`, `pos_*`, `quat_*`, `vel_*` and `gyro_*`, where the motion has them, say
-/// otherwise by their first row.
+/// Every segment, and every episode in it, starts with the robot at rest in its default pose: standing, or fixed 1 m
+/// above the ground. If the motion has columns `q_*`, `dq_*`, `pos_*`, `quat_*`, `vel_*` or `gyro_*`, their first row
+/// is the initial state instead.
 ///
-/// The log has `q_*` and `dq_*` sampled at `t`, `tau_measured_*` as the mean from `t` to the next row (none in a part's
-/// last), the commands, and with a floating base `pos_*`, `quat_*`, `vel_*`, `gyro_*` and `foot_force_*`.
+/// The log has `q_*` and `dq_*` sampled at `t`, the commands, and `tau_measured_*` as the mean from `t` to the next
+/// row. The last row of each segment and episode has no torque. With a floating base the log also has `pos_*`,
+/// `quat_*`, `vel_*`, `gyro_*` and `foot_force_*`.
 ///
 /// Example: `twinstep play stance.csv --engine batch --physics-hz 1000 --out stance_played.parquet`
 #[derive(clap::Args)]
 pub struct Args {
-    /// The motion: a data file, or a folder that holds one.
+    /// Motion file, or a folder that contains one.
     motion: PathBuf,
-    /// Model file of the robot; the ideal Go2 without.
+    /// Model file of the robot. Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
-    /// Whether the trunk moves: floating or fixed; as meta.json says of each segment without.
-    #[arg(long, value_parser = base)]
+    /// Mounting of the base: floating or fixed. Default: that of each segment in meta.json.
+    #[arg(long)]
     base: Option<BaseMount>,
-    /// Who integrates the equations of motion: rapier (the reference) or batch (the fast one); the server's default
-    /// without.
+    /// Physics engine: rapier (the reference) or batch (SIMD, faster). Default: batch.
     #[arg(long, value_parser = engine)]
     engine: Option<Engine>,
-    /// Rate of the physics [Hz]; a multiple of the actuator's 200. Without: rapier 200, batch 1000.
+    /// Rate of the physics [Hz], a multiple of the actuator rate. Default: 200 with rapier, 1000 with batch, rounded up
+    /// to a multiple.
     #[arg(long, value_name = "HZ")]
     physics_hz: Option<u32>,
-    /// Solver iterations a physics step. Without: rapier 2, batch 4.
+    /// Solver iterations per physics step. Default: 2 with rapier, 4 with batch.
     #[arg(long, value_name = "N")]
     solver_iterations: Option<u32>,
-    /// The log to write: *.parquet, *.csv or *.csv.gz, or a folder, which gets data.parquet and meta.json.
+    /// Log to write: *.parquet, *.csv or *.csv.gz, or a folder, which gets data.parquet and meta.json.
     #[arg(long, value_name = "LOG")]
     out: PathBuf,
 }
 
-/// The log would replace the motion.
+/// The log would overwrite the motion file.
 #[derive(Debug, thiserror::Error)]
-#[error("`--out` = {} is the motion itself\n  name another file or folder", .0.display())]
+#[error("`--out` = {} is the motion file itself\n  name another file or folder", .0.display())]
 struct SameFile(PathBuf);
 
-/// Plays and writes.
+/// The ensemble was trained for another actuator rate.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "the motion is simulated with actuators at {motion_hz} Hz, but the ensemble of the model file was trained for \
+     {ensemble_hz} Hz\n  resample the motion to {ensemble_hz} Hz or a fraction of it"
+)]
+struct EnsembleRate {
+    motion_hz: f64,
+    ensemble_hz: f64,
+}
+
+/// Simulates the motion and writes the log.
 pub fn run(args: &Args) -> CommandResult {
     if args.motion.canonicalize().is_ok_and(|motion| args.out.canonicalize().is_ok_and(|out| out == motion)) {
         return Err(input(SameFile(args.out.clone())));
@@ -71,16 +85,21 @@ pub fn run(args: &Args) -> CommandResult {
     };
     let actuators = || learned.as_ref().map(|learned| Box::new(learned.actuators(1, false)) as Box<dyn Actuator>);
     let config = args.config();
-    config.check(&robot.control).map_err(input)?;
     let motion = Log::open_commands(&args.motion).map_err(input)?;
+    let replayed = at_log_rate(&motion, &robot).map_err(input)?;
+    config.check(&replayed.control).map_err(input)?;
+    if learned.is_some() && replayed.control.actuator_hz != robot.control.actuator_hz {
+        let (motion_hz, ensemble_hz) = (replayed.control.actuator_hz, robot.control.actuator_hz);
+        return Err(input(EnsembleRate { motion_hz, ensemble_hz }));
+    }
     let signals = Signals::listen()?;
     let bar = ProgressBar::new(motion.rows() as u64);
-    let played = play(&motion, &robot, &actuators, config, args.base, &mut |row| {
+    let result = play(&motion, &robot, &actuators, config, args.base, &mut |row| {
         bar.set_position(row as u64);
         !signals.check().unwrap_or(true)
     });
     bar.finish_and_clear();
-    let log = played.map_err(|error| match error {
+    let log = result.map_err(|error| match error {
         RecordError::Interrupted => Failure::Interrupted,
         RecordError::Failed(_) | RecordError::Log(_) => other(error),
         RecordError::Motion(_) | RecordError::Backend(_) => input(error),
@@ -100,18 +119,10 @@ impl Args {
     }
 }
 
-fn base(text: &str) -> Result<BaseMount, String> {
-    match text {
-        "floating" => Ok(BaseMount::Floating),
-        "fixed" => Ok(BaseMount::Fixed),
-        _ => Err("the base is floating or fixed".to_owned()),
-    }
-}
-
-/// What the robot does when it is commanded as `motion` has it; `base` goes before that of the segments. `actuators` makes
-/// the actuators of one robot, if they are not its own.
+/// Simulates `robot` with the commands of `motion` and returns the log.
 ///
-/// `progress` receives the number of rows done, and may end it.
+/// `base` replaces the mounting of all segments. `actuators` creates the actuators of one robot, or returns `None` for
+/// the robot's own. `progress` receives the number of completed rows and returns false to interrupt the simulation.
 pub fn play(
     motion: &Log,
     robot: &RobotModel,
@@ -120,15 +131,15 @@ pub fn play(
     base: Option<BaseMount>,
     progress: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Log, RecordError> {
-    let based = |base| SimConfig { base: simulated(base), ..config };
-    let source = source(robot, config);
+    let based = |base| SimConfig { base, ..config };
+    let source = source(&at_log_rate(motion, robot)?, config);
     let failed = |error: twinstep_sim::BackendBuildError| RecordError::Backend(Box::new(error));
     match config.engine {
         Engine::Rapier => record(
             motion,
             robot,
             base,
-            |base| {
+            |base, robot| {
                 let backend = RapierBackend::new(robot.clone(), based(base), 1).map_err(failed)?;
                 Ok(if let Some(actuators) = actuators() { backend.with_actuator(actuators) } else { backend })
             },
@@ -139,7 +150,7 @@ pub fn play(
             motion,
             robot,
             base,
-            |base| {
+            |base, robot| {
                 let backend = BatchBackend::new(robot.clone(), based(base), 1).map_err(failed)?;
                 Ok(if let Some(actuators) = actuators() { backend.with_actuator(actuators) } else { backend })
             },
@@ -149,14 +160,8 @@ pub fn play(
     }
 }
 
-fn simulated(base: BaseMount) -> BaseMount {
-    match base {
-        BaseMount::Fixed => BaseMount::Fixed,
-        BaseMount::Floating => BaseMount::Floating,
-    }
-}
-
 fn source(robot: &RobotModel, config: SimConfig) -> String {
+    let config = config.at_actuator_rate(&robot.control);
     let (physics_hz, solver_iterations) = (config.physics_hz(), config.solver_iterations());
     let engine = match config.engine {
         Engine::Rapier => "rapier",

@@ -1,4 +1,4 @@
-//! The robot that `--model` names.
+//! Robot model of the flag `--model`.
 
 use std::path::Path;
 
@@ -6,7 +6,7 @@ use twinstep_model::{RobotModel, go2};
 
 use crate::exit::{Failure, input};
 
-/// The robot of a model file; the ideal Go2 without.
+/// Returns the robot of a model file, or the ideal Go2 for `None`.
 pub fn robot_model(path: Option<&Path>) -> Result<RobotModel, Failure> {
     path.map_or_else(|| Ok(go2()), |path| twinstep_effects::load_robot(path).map_err(input))
 }

@@ -1,4 +1,4 @@
-//! `twinstep serve`: environments behind Zenoh until told to stop.
+//! `twinstep serve`: serves environments over Zenoh until it is stopped.
 
 use std::io::{Read, Write};
 use std::path::PathBuf;
@@ -13,69 +13,71 @@ use twinstep_sim::Engine;
 
 use crate::exit::{CommandResult, Signals, input, other};
 
-/// How often the server looks for signals and tells its rate.
+/// Interval at which the server checks for signals.
 const TICK: Duration = Duration::from_millis(50);
 
 /// Serve simulated Go2 environments over Zenoh.
 ///
-/// Agents lease environments and call `reset` and `step`: from Rust (`twinstep-client`) or, by `protocol/SPEC.md`, from
-/// any language with a Zenoh client. Listens on this machine only unless told otherwise. Ctrl-C finishes the step in
-/// progress and tells the clients.
+/// Agents lease environments and call `reset` and `step`: from Rust (`twinstep-client`), from Python (`twinstep`) or,
+/// as `protocol/SPEC.md` specifies, from any language with a Zenoh client. Default: it listens on this machine only.
+/// Ctrl-C completes the step in progress and notifies the clients.
 ///
-/// Prints one line to stdout once it answers: `listening ENDPOINT`.
+/// When the server is ready, it prints one line to stdout: `listening ENDPOINT`.
+///
+/// Examples: `twinstep serve --envs 1024` and `twinstep serve --config server.toml --model fitted.toml`
 #[derive(clap::Args)]
 pub struct Args {
-    /// Config file (TOML) with [server], [task], [sim] and [randomise]; flags go before its values.
+    /// Config file (TOML) with [server], [task], [sim] and [randomise]. Flags override its values.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// The robot's name; clients find the server by it.
+    /// Name of the robot, by which clients find the server.
     #[arg(long)]
     name: Option<String>,
-    /// What the robots are asked to do: walk, or counter (no physics; measures the transport).
+    /// Task: walk, or counter (no physics, to measure the transport).
     #[arg(long, value_parser = task_name)]
     task: Option<TaskName>,
-    /// The most robots hosted in all; each client's lease asks for its number.
+    /// Maximum number of environments of all clients together. Each client requests its number with its lease.
     #[arg(long, value_name = "N")]
     envs: Option<usize>,
-    /// Model file of the robot; the ideal Go2 without.
+    /// Model file of the robot. Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
-    /// Zenoh endpoint to listen at; port 0 takes a free one. [default: tcp/127.0.0.1:7447]
+    /// Zenoh endpoint to listen on; port 0 selects a free port. Default: tcp/127.0.0.1:7447.
     #[arg(long, value_name = "ENDPOINT")]
     listen: Option<String>,
-    /// Router to connect to; may be given several times.
+    /// Zenoh router to connect to. The flag may be repeated.
     #[arg(long, value_name = "ENDPOINT")]
     connect: Vec<String>,
-    /// Zenoh configuration (JSON5) for TLS, users and access control; see examples/security.
+    /// Zenoh configuration file (JSON5) for TLS, users and access control; see examples/security.
     #[arg(long, value_name = "FILE")]
     zenoh: Option<PathBuf>,
-    /// Move large messages through shared memory when both ends are on this machine.
+    /// Use shared memory for large messages to clients on the same machine.
     #[arg(long)]
     shared_memory: bool,
-    /// Who integrates the equations of motion: rapier (the reference) or batch (many robots in SIMD lanes, fast).
+    /// Physics engine: rapier (the reference) or batch (one robot per SIMD lane, faster). Default: batch.
     #[arg(long, value_parser = engine)]
     engine: Option<Engine>,
-    /// Rate of the physics [Hz]; a multiple of the actuator's 200. Without: rapier 200, batch 1000.
+    /// Rate of the physics [Hz], a multiple of the actuators' 200 Hz. Default: 200 with rapier, 1000 with batch.
     #[arg(long, value_name = "HZ")]
     physics_hz: Option<u32>,
-    /// Threads that step robots; 0 takes all cores.
+    /// Number of threads that step robots; 0 uses all cores.
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
-    /// Draw every value of the model file that has an interval from it, anew in each episode.
+    /// Sample every parameter of the model file that has an interval, for every robot in every episode.
     #[arg(long)]
     randomise_effects: bool,
-    /// Time that a lost client's environments wait for it [s].
+    /// Time for which the environments of a disconnected client are kept [s].
     #[arg(long, value_name = "S")]
     lease_grace_s: Option<f64>,
-    /// Seed of environments that no client seeds.
+    /// Seed of environments that a client does not seed.
     #[arg(long)]
     seed: Option<u64>,
-    /// Stop when stdin closes: for programs that start a server and must not leave it behind.
+    /// Stop when stdin closes, for programs that start a server and must not leave it running.
     #[arg(long)]
     until_stdin_closes: bool,
 }
 
-/// Serves until a signal or, if asked, the end of stdin.
+/// Serves until a signal or, with `--until-stdin-closes`, the end of stdin.
 pub fn run(args: &Args) -> CommandResult {
     let config = args.config()?;
     let signals = Signals::listen()?;
@@ -138,25 +140,25 @@ fn task_name(text: &str) -> Result<TaskName, String> {
     match text {
         "walk" => Ok(TaskName::Walk),
         "counter" => Ok(TaskName::Counter),
-        _ => Err("the tasks are walk and counter".to_owned()),
+        _ => Err("must be `walk` or `counter`".to_owned()),
     }
 }
 
-/// The engine of that name.
+/// Parses the name of an engine.
 pub fn engine(text: &str) -> Result<Engine, String> {
     match text {
         "rapier" => Ok(Engine::Rapier),
         "batch" => Ok(Engine::Batch),
-        _ => Err("the engines are rapier and batch".to_owned()),
+        _ => Err("must be `rapier` or `batch`".to_owned()),
     }
 }
 
-/// The endpoint with the port that the system gave, or the one that was asked for.
+/// Returns the endpoint with the port that the system assigned, or the requested endpoint.
 fn listening_endpoint(server: &Server, config: &Config) -> String {
-    let asked = &config.server.listen;
-    let address = asked.rsplit_once(':').map_or(asked.as_str(), |(address, _)| address);
+    let requested = &config.server.listen;
+    let address = requested.rsplit_once(':').map_or(requested.as_str(), |(address, _)| address);
     let endpoints = server.endpoints();
-    endpoints.iter().find(|endpoint| endpoint.starts_with(address)).unwrap_or(asked).clone()
+    endpoints.iter().find(|endpoint| endpoint.starts_with(address)).unwrap_or(requested).clone()
 }
 
 fn watch_stdin() -> Arc<AtomicBool> {
@@ -170,7 +172,7 @@ fn watch_stdin() -> Arc<AtomicBool> {
     closed
 }
 
-/// Shows the rate until it is time to stop.
+/// Shows the step rate until the server has to stop.
 fn watch(server: &Server, signals: &Signals, stdin_closed: &AtomicBool) -> CommandResult {
     let style = ProgressStyle::with_template("{spinner} {msg}").expect("the template is valid");
     let line = ProgressBar::new_spinner().with_style(style);
@@ -180,7 +182,7 @@ fn watch(server: &Server, signals: &Signals, stdin_closed: &AtomicBool) -> Comma
         if mark.0.elapsed() >= Duration::from_secs(1) {
             let steps = server.env_steps();
             let rate = (steps - mark.1) as f64 / mark.0.elapsed().as_secs_f64();
-            line.set_message(format!("{rate:.0} env-steps/s, {steps} in all"));
+            line.set_message(format!("{rate:.0} env-steps/s, {steps} in total"));
             line.tick();
             mark = (Instant::now(), steps);
         }

@@ -1,61 +1,60 @@
-//! A trial: one hypothesis fitted to one fold and judged on the other, in full simulation.
+//! Cross-validation: a hypothesis is fitted to one fold and evaluated on the other, in full simulation.
 
-use twinstep_effects::{Effect, Scope};
 use twinstep_effects::ModelFile;
+use twinstep_effects::{Effect, Scope};
 use twinstep_model::{Precision, RobotModel, Rollout};
 
-use super::residual_data::ResidualData;
 use super::hypothesis::{Hypothesis, selection_penalty};
+use super::residual_data::ResidualData;
 use super::residual_power::{CHANNELS, ResidualPower};
 use super::residual_rows::{PRECISION, ResidualRows};
-use twinstep_identify::refine::refine;
 use twinstep_identify::least_squares::LeastSquaresProblem;
-use twinstep_identify::parameter::{FreeParameter, initial_coordinate, free_parameters, with_values};
+use twinstep_identify::parameter::{FreeParameter, free_parameters, initial_coordinate, with_values};
+use twinstep_identify::refine::refine;
 
-/// Most steps of a descent: the scan has found the valley.
+/// Maximum number of refinement steps; the scan provides a start near the minimum.
 const STEPS: usize = 6;
-/// A step that lowers the cost by a smaller share ends it.
+/// Relative decrease of the cost below which the refinement has converged.
 const SETTLED: f64 = 1e-3;
 
-/// What came of a hypothesis.
+/// Cross-validated hypothesis.
 #[derive(Clone, Debug)]
 pub struct CandidateFit {
-    /// With values fitted to everything.
+    /// The hypothesis with the mean of the values fitted to either fold.
     pub hypothesis: Hypothesis,
-    /// Evidence on held-out blocks, less the price of choosing and of its parameters [nats].
+    /// Cross-validated log-likelihood gain, minus the penalties for its scope and its parameters [nat].
     pub score: f64,
-    /// 1 − RMSE after / RMSE before on the held-out residuals where it acts.
+    /// 1 − RMSE after / RMSE before, cross-validated in the affected channels.
     pub gain: f64,
-    /// Share of the power above noise that it explains, in the channels where it acts.
+    /// Fraction of the power above noise that it explains in the affected channels.
     pub explained_fraction: f64,
 }
 
-/// Model and unknowns of effects on top of `model`, and where a descent begins: at `hypothesis` for the last of them.
+/// Fit of effects on top of a model.
 #[derive(Clone)]
 pub struct FitProblem {
     /// The model with an entry for each effect.
     pub file: ModelFile,
-    /// Their numbers.
+    /// Free parameters of the effects.
     pub unknowns: Vec<FreeParameter>,
-    /// Where a descent begins [coordinates].
+    /// Initial point of the refinement [coordinates].
     pub initial_point: Vec<f64>,
 }
 
 impl FitProblem {
-    /// Of `hypotheses`, all at once.
+    /// Creates the fit of all `hypotheses`. Returns `None` if their entries conflict.
     pub fn new(model: &ModelFile, hypotheses: &[Hypothesis]) -> Option<Self> {
         let effects: Vec<(&'static Effect, Scope)> = hypotheses.iter().map(|one| (one.effect, one.scope)).collect();
         let (file, unknowns) = free_parameters(model, &effects).ok()?;
         let values: Vec<f64> = hypotheses.iter().flat_map(|one| one.values.iter().copied()).collect();
-        // Where nothing is known of a value it begins where there is none of it.
-        let begin = unknowns
-            .iter()
-            .zip(&values)
-            .map(|(unknown, value)| if value.is_finite() { unknown.coordinate(*value) } else { initial_coordinate(&file, unknown) });
+        // The initial value of an infinite value is that of the file.
+        let begin = unknowns.iter().zip(&values).map(|(unknown, value)| {
+            if value.is_finite() { unknown.coordinate(*value) } else { initial_coordinate(&file, unknown) }
+        });
         Some(Self { initial_point: begin.collect(), file, unknowns })
     }
 
-    /// The numbers that follow `rows` best.
+    /// Returns the point with the least cost on `rows` [coordinates].
     pub fn solve(&self, rows: &ResidualRows, simulator: &mut dyn Rollout) -> Vec<f64> {
         let (mut steps, mut last) = (0, f64::INFINITY);
         self.with_problem(rows, simulator, PRECISION, |task, simulator| {
@@ -68,7 +67,7 @@ impl FitProblem {
         })
     }
 
-    /// Hands on what is asked of `rows`, weighted as the beginning lets expect.
+    /// Calls `ask` with the least-squares problem on `rows`, with residual scales estimated at the initial point.
     pub fn with_problem<R>(
         &self,
         rows: &ResidualRows,
@@ -84,13 +83,15 @@ impl FitProblem {
         ask(&LeastSquaresProblem { residual_scale: &spread, tolerances: tolerances.as_ref(), ..task }, simulator)
     }
 
-    /// The model with these numbers.
+    /// Returns the model at a point.
     pub fn model(&self, point: &[f64]) -> ModelFile {
         with_values(&self.file, &self.unknowns, point)
     }
 }
 
-/// Tries `hypothesis` on top of `model`, which leaves `before`.
+/// Cross-validates `hypothesis` on top of `model`, whose residual power is `before`.
+///
+/// Returns `None` if a fitted model is not a valid robot.
 pub fn cross_validate(
     evidence: &ResidualData,
     model: &ModelFile,
@@ -104,7 +105,7 @@ pub fn cross_validate(
     let models = [fit.model(&points[0]), fit.model(&points[1]), fit.model(&whole)];
     let robots: Vec<RobotModel> = models.iter().map(|model| model.robot_model().ok()).collect::<Option<_>>()?;
     let left = evidence.residual_powers(simulator, &robots, false);
-    // Fitted to one fold, judged on the other.
+    // Fitted to one fold, evaluated on the other.
     let judged = |channel: usize| {
         let rows = evidence.correlation_rows(channel);
         left[0].log_likelihood_gain(before, channel, 1, rows) + left[1].log_likelihood_gain(before, channel, 0, rows)

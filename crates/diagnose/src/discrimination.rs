@@ -1,20 +1,22 @@
 //! Two models that explain a log equally well: how far a motion would part them, and how far a log of it does.
 
-use twinstep_model::{BaseMount, Ground, FIXED_BASE_HEIGHT, JOINT_NAMES, RolloutRequest, InitialState, Precision, RobotModel, Rollout};
-use twinstep_logs::{Log, Meta, TorqueSensor};
-use twinstep_effects::{Effect, Scope};
 use twinstep_effects::ModelFile;
+use twinstep_effects::{Effect, Scope};
+use twinstep_logs::{Log, Meta, TorqueSensor};
+use twinstep_model::{
+    BaseMount, FIXED_BASE_HEIGHT, Ground, InitialState, JOINT_NAMES, Precision, RobotModel, Rollout, RolloutRequest,
+};
 
-use super::residual_data::ResidualData;
+use super::cross_validation::FitProblem;
 use super::hypothesis::Hypothesis;
+use super::residual_data::ResidualData;
 use super::residual_power::{CHANNELS, ResidualPower};
 use super::residual_rows::PRECISION;
-use super::cross_validation::FitProblem;
-use twinstep_identify::experiment::{ExperimentError, estimated_torque};
-use twinstep_identify::motion::{command, joint_commands};
 use crate::excitation::ExcitationTrajectory;
+use twinstep_identify::experiment::{ExperimentError, estimated_torque};
 use twinstep_identify::least_squares::LeastSquaresProblem;
 use twinstep_identify::window::WindowConfig;
+use twinstep_logs::replay::{command, joint_commands};
 
 /// Parts of the step to a rival's refitted numbers that are tried: a line is only so straight.
 const STEPS: [f64; 4] = [0.0, 0.25, 0.5, 1.0];
@@ -41,7 +43,12 @@ impl HypothesisPair {
     /// measured and how well. None where neither can be simulated.
     ///
     /// The other one may take any size that makes up for the difference: what is left is what counts.
-    pub fn expected_log_likelihood_ratio(&self, motion: &ExcitationTrajectory, like: &Log, simulator: &mut dyn Rollout) -> Option<f64> {
+    pub fn expected_log_likelihood_ratio(
+        &self,
+        motion: &ExcitationTrajectory,
+        like: &Log,
+        simulator: &mut dyn Rollout,
+    ) -> Option<f64> {
         let [one, other] = &self.sides;
         let nats = [(one, other), (other, one)].map(|(truth, rival)| {
             let robot = self.robot(truth)?;
@@ -60,7 +67,7 @@ impl HypothesisPair {
             let fit = self.fit(side).expect("an effect of the catalogue goes on top of any model");
             let point = fit.solve(&evidence.fit_rows, simulator);
             let robot = fit.model(&point).robot_model().expect("fitted within its bounds");
-            evidence.leftover(simulator, &robot)
+            evidence.residual_power(simulator, &robot)
         });
         let gain = |channel, fold| one.log_likelihood_gain(&other, channel, fold, evidence.correlation_rows(channel));
         Ok((0..CHANNELS).map(|channel| gain(channel, 0) + gain(channel, 1)).sum())
@@ -89,7 +96,8 @@ fn gauss_newton_refit(fit: &FitProblem, evidence: &ResidualData, simulator: &mut
     let here = LeastSquaresProblem { precision: Precision::Double, ..task }.linearise(simulator, &fit.initial_point)?;
     let step = here.jacobian.clone().svd(true, true).solve(&-here.residuals, 1e-9).ok()?;
     let moved = |part: f64| {
-        let moved: Vec<f64> = task.to_prior_units(&fit.initial_point).zip(step.iter()).map(|(now, step)| now + part * step).collect();
+        let moved: Vec<f64> =
+            task.to_prior_units(&fit.initial_point).zip(step.iter()).map(|(now, step)| now + part * step).collect();
         fit.model(&task.from_prior_units(&moved)).robot_model().ok()
     };
     let robots: Vec<RobotModel> = STEPS.into_iter().filter_map(moved).collect();
@@ -110,7 +118,12 @@ fn expected_gain(evidence: &ResidualData, left: &ResidualPower) -> f64 {
 
 /// The log that `robot` would make of a motion, without noise, with the channels and the stated noise of `like`; none if it
 /// diverges.
-fn simulated(motion: &ExcitationTrajectory, robot: &RobotModel, like: &Log, simulator: &mut dyn Rollout) -> Option<Log> {
+fn simulated(
+    motion: &ExcitationTrajectory,
+    robot: &RobotModel,
+    like: &Log,
+    simulator: &mut dyn Rollout,
+) -> Option<Log> {
     let commanded = motion.motion(robot);
     let joints = joint_commands(&commanded).ok()?;
     let commands: Vec<_> = (0..commanded.rows()).map(|row| command(robot, &joints, row)).collect();
@@ -121,8 +134,12 @@ fn simulated(motion: &ExcitationTrajectory, robot: &RobotModel, like: &Log, simu
     } else {
         InitialState::standing_on(&Ground::FLAT, robot, pose, 0.0)
     };
-    let states =
-        simulator.run(&[RolloutRequest { robot, held, start, history: &[], commands: &commands }], Precision::Double).remove(0);
+    let states = simulator
+        .run(
+            &[RolloutRequest { robot, base: motion.base, start, history: &[], commands: &commands }],
+            Precision::Double,
+        )
+        .remove(0);
     let mut meta = Meta { noise: like.meta().noise.clone(), ..commanded.meta().clone() };
     let mut columns: Vec<_> = commanded.channels().map(|(name, cells)| (name.to_owned(), cells.to_vec())).collect();
     columns.push(("t".to_owned(), commanded.t().to_vec()));
@@ -137,7 +154,9 @@ fn simulated(motion: &ExcitationTrajectory, robot: &RobotModel, like: &Log, simu
         if like.tau_measured(name).is_some() {
             // A sensor at the output sees more than a motor's current; what it sees besides is not counted on.
             meta.tau_sensor = TorqueSensor::MotorCurrent;
-            channel(format!("tau_measured_{name}"), &|row| estimated_torque(&states, robot, joint, row, row + 1) as f32);
+            channel(format!("tau_measured_{name}"), &|row| {
+                estimated_torque(&states, robot, joint, row, row + 1) as f32
+            });
         }
     }
     if !held {

@@ -2,8 +2,8 @@
 
 use std::f64::consts::TAU;
 
-use twinstep_model::{BaseMount, Joint, JointKind, RobotModel};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{BaseMount, Joint, JointKind, RobotModel};
 
 /// Length of every motion [s]: of equal length, they are told apart by what they show.
 const LENGTH_S: f64 = 10.0;
@@ -28,7 +28,12 @@ pub struct ExcitationTrajectory {
 /// All of them. Chirps show inertia and delays, steps delays, creeping friction and play, holds gravity, springs and gains,
 /// and standing what is loaded.
 pub const EXCITATION_TRAJECTORIES: [ExcitationTrajectory; 14] = [
-    fixed_base("chirp_hip", "a chirp of the hips in the air", |joint, t| only(JointKind::Hip, joint, 0.15 * chirp(t)), default_gains),
+    fixed_base(
+        "chirp_hip",
+        "a chirp of the hips in the air",
+        |joint, t| only(JointKind::Hip, joint, 0.15 * chirp(t)),
+        default_gains,
+    ),
     fixed_base(
         "chirp_thigh",
         "a chirp of the thighs in the air",
@@ -47,8 +52,18 @@ pub const EXCITATION_TRAJECTORIES: [ExcitationTrajectory; 14] = [
         |joint, t| 0.1 * chirp(t) * if joint.index() % 2 == 0 { 1.0 } else { -1.0 },
         stiff_gains,
     ),
-    fixed_base("steps", "small steps of all joints in the air", |joint, t| 0.1 * wave(joint, 0.9, t).signum(), stiff_gains),
-    fixed_base("creep", "slow reversals of all joints in the air", |joint, t| 0.1 * triangle(joint, 0.3, t), default_gains),
+    fixed_base(
+        "steps",
+        "small steps of all joints in the air",
+        |joint, t| 0.1 * wave(joint, 0.9, t).signum(),
+        stiff_gains,
+    ),
+    fixed_base(
+        "creep",
+        "slow reversals of all joints in the air",
+        |joint, t| 0.1 * triangle(joint, 0.3, t),
+        default_gains,
+    ),
     fixed_base(
         "creep_soft",
         "slow reversals of all joints in the air with soft gains",
@@ -68,7 +83,12 @@ pub const EXCITATION_TRAJECTORIES: [ExcitationTrajectory; 14] = [
         |joint, t| pose(joint, t, 2.5),
         |t| if t % 2.5 < 1.25 { soft(t) } else { stiff_gains(t) },
     ),
-    fixed_base("multisine", "five sines of all joints at once in the air", |joint, t| 0.3 * multisine(joint, t), default_gains),
+    fixed_base(
+        "multisine",
+        "five sines of all joints at once in the air",
+        |joint, t| 0.3 * multisine(joint, t),
+        default_gains,
+    ),
     standing("sway", "swaying of the trunk over standing feet", |joint, t| {
         let fore = 0.08 * (TAU * 0.37 * t).sin();
         stance(joint, 0.06 * (TAU * 0.23 * t).sin(), 0.05 * (TAU * 0.61 * t).sin(), fore)

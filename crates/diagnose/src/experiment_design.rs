@@ -1,16 +1,16 @@
 //! The next experiment: of our safe motions, the one that best parts what the log could not.
 
-use twinstep_model::{BaseMount, RobotModel, Rollout};
-use twinstep_logs::Log;
-use twinstep_effects::{Effect, EffectEntry};
 use twinstep_effects::ModelFile;
+use twinstep_effects::{Effect, EffectEntry};
+use twinstep_logs::Log;
+use twinstep_model::{BaseMount, RobotModel, Rollout};
 
-use super::residual_data::ResidualData;
-use super::hypothesis::Hypothesis;
 use super::discrimination::HypothesisPair;
-use super::{Accepted, AMBIGUITY_NATS, ambiguous};
-use crate::findings::{CorrelatedPair, NextExperiment, DiscriminatedPair};
+use super::hypothesis::Hypothesis;
+use super::residual_data::ResidualData;
+use super::{AMBIGUITY_NATS, Accepted, ambiguous};
 use crate::excitation::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
+use crate::findings::{CorrelatedPair, DiscriminatedPair, NextExperiment};
 
 /// Most pairs of causes that are asked about: each is simulated in every motion.
 const MAX_PAIRS: usize = 4;
@@ -28,12 +28,12 @@ pub struct ProposedExperiment {
 
 /// The motion that parts the rivals best; none without rivals, or where none of ours parts two of them.
 pub fn next_motion(
-    rivalries: &[HypothesisPair],
+    pairs: &[HypothesisPair],
     evidence: &ResidualData,
     robot: &RobotModel,
     simulator: &mut dyn Rollout,
 ) -> Option<ProposedExperiment> {
-    if rivalries.is_empty() {
+    if pairs.is_empty() {
         return None;
     }
     // A trunk whose motion nobody measured tells nothing on the ground.
@@ -42,16 +42,20 @@ pub fn next_motion(
         EXCITATION_TRAJECTORIES.into_iter().filter(|motion| on_ground || motion.base == BaseMount::Fixed).collect();
     let like = &evidence.logs()[0];
     let mut nats = |motion: &ExcitationTrajectory| -> Vec<f64> {
-        rivalries.iter().map(|rivalry| rivalry.expected_log_likelihood_ratio(motion, like, simulator).unwrap_or(0.0)).collect()
+        pairs.iter().map(|pair| pair.expected_log_likelihood_ratio(motion, like, simulator).unwrap_or(0.0)).collect()
     };
     let predicted: Vec<Vec<f64>> = motions.iter().map(&mut nats).collect();
     // Of two rivals that are parted well already, more evidence is worth less than of two that are not.
     let worth = |motion: usize| predicted[motion].iter().map(|nats| nats.ln_1p()).sum::<f64>();
     let best = (0..motions.len()).max_by(|one, other| worth(*one).total_cmp(&worth(*other)))?;
-    let parts = rivalries.iter().enumerate().map(|(index, rivalry)| {
+    let parts = pairs.iter().enumerate().map(|(index, pair)| {
         let mut all: Vec<f64> = predicted.iter().map(|nats| nats[index]).collect();
         all.sort_by(f64::total_cmp);
-        DiscriminatedPair { effects: rivalry.names(), predicted_nats: predicted[best][index], median_nats: all[all.len() / 2] }
+        DiscriminatedPair {
+            effects: pair.names(),
+            predicted_nats: predicted[best][index],
+            median_nats: all[all.len() / 2],
+        }
     });
     let parts: Vec<_> = parts.filter(|part| part.predicted_nats >= AMBIGUITY_NATS).collect();
     let text = words(&motions[best], &parts)?;
@@ -60,29 +64,29 @@ pub fn next_motion(
 }
 
 /// Causes with rivals that explain as much, and causes whose sizes this log cannot tell apart.
-pub fn rivalries(extended: &ModelFile, accepted: &Accepted, confusable: &[CorrelatedPair]) -> Vec<HypothesisPair> {
-    let mut rivalries = Vec::new();
+pub fn pairs(extended: &ModelFile, accepted: &Accepted, confusable: &[CorrelatedPair]) -> Vec<HypothesisPair> {
+    let mut pairs = Vec::new();
     for (best, others) in accepted {
         let close = ambiguous(best, others);
-        rivalries.extend(close.map(|other| rivalry(extended, &best.hypothesis, &other.hypothesis)));
+        pairs.extend(close.map(|other| hypothesis_pair(extended, &best.hypothesis, &other.hypothesis)));
     }
     for pair in confusable {
         let [one, other] = pair.effects.each_ref().map(|name| {
             let mut named = accepted.iter().map(|(best, _)| &best.hypothesis);
             named.find(|hypothesis| hypothesis.effect.name == name)
         });
-        rivalries.extend(one.zip(other).map(|(one, other)| rivalry(extended, one, other)));
+        pairs.extend(one.zip(other).map(|(one, other)| hypothesis_pair(extended, one, other)));
     }
-    rivalries.retain(|rivalry| {
+    pairs.retain(|pair| {
         let known = |name: String| NOT_PREDICTED.iter().all(|other| !name.starts_with(other));
-        rivalry.names().into_iter().all(known)
+        pair.names().into_iter().all(known)
     });
-    rivalries.truncate(MAX_PAIRS);
-    rivalries
+    pairs.truncate(MAX_PAIRS);
+    pairs
 }
 
 /// One or the other, on top of all other causes.
-fn rivalry(extended: &ModelFile, one: &Hypothesis, other: &Hypothesis) -> HypothesisPair {
+fn hypothesis_pair(extended: &ModelFile, one: &Hypothesis, other: &Hypothesis) -> HypothesisPair {
     let is = |entry: &EffectEntry, hypothesis: &Hypothesis| {
         entry.effect.name == hypothesis.effect.name
             && entry.scope == hypothesis.scope

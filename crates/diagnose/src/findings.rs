@@ -1,75 +1,75 @@
-//! What a diagnosis says: `findings.json`.
+//! Result of a diagnosis: `findings.json`.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-/// What is wrong with a model, by what was held out of every choice and fit.
+/// Result of a diagnosis. The errors are on held-out blocks, which take no part in any selection or fit.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Diagnosis {
-    /// Errors of the model that was given.
+    /// Errors of the given model.
     pub baseline: RmsErrors,
-    /// Errors with the findings added to it.
+    /// Errors of the given model with the causes.
     pub extended: RmsErrors,
-    /// Errors that the sensors alone would leave.
+    /// Errors due to sensor noise alone.
     pub noise_floor: RmsErrors,
-    /// Named causes, the largest gain first; empty when nothing is wrong, or when no name is earned.
+    /// Causes, in the order in which they were found; empty if no candidate reaches the threshold.
     pub findings: Vec<Cause>,
-    /// What this log cannot tell apart.
+    /// Pairs of causes with highly correlated estimates.
     pub confusable: Vec<CorrelatedPair>,
-    /// What is left.
+    /// Unexplained residual.
     pub unexplained: Unexplained,
-    /// The motion that would tell apart what this log cannot; none when there is nothing to tell, or none of ours does.
+    /// Experiment that discriminates between ambiguous causes; `None` if there are none, or no trajectory discriminates.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next_experiment: Option<NextExperiment>,
-    /// The corrected model, beside this file.
+    /// File name of the corrected model, in the same folder.
     pub extended_model: String,
 }
 
-/// Root mean square errors; null where the log cannot tell.
+/// Root mean square errors; null if they were not measured.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct RmsErrors {
-    /// Torque at the log's tap, driven by the measured states and commands [N·m].
+    /// Torque error at the log's torque sensor, computed from measured states and commands [N·m].
     pub torque_rmse_nm: Option<f64>,
-    /// Joint positions in closed loop [rad].
+    /// Position error of the joints in closed loop [rad].
     pub q_rmse_rad: Option<f64>,
 }
 
-/// A named cause: what is to be added to the model, multiplied into it or set in it.
+/// Effect with scope and values that the model lacks.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Cause {
-    /// The effect of the catalogue.
+    /// Name of the effect in the catalogue.
     pub effect: String,
-    /// What it is about.
+    /// Scope of the effect.
     pub scope: String,
-    /// Its parameters by name; vectors are lists.
+    /// Estimates of the parameters, by name.
     pub parameters: BTreeMap<String, Estimate>,
-    /// 1 − RMSE after / RMSE before, on the held-out residuals where the effect acts, on top of the causes before it.
+    /// 1 − RMSE after / RMSE before, cross-validated in the affected channels, on top of the causes before it.
     pub held_out_gain: f64,
-    /// Evidence for it on held-out blocks [nats].
+    /// Cross-validated log-likelihood gain after penalties [nat].
     pub score_nats: f64,
-    /// It had to be more: a constant.
+    /// Threshold of the log-likelihood gain, a constant [nat].
     pub threshold_nats: f64,
-    /// Effects with scope, as in `armature@calf`, that explain as much: this log cannot tell.
+    /// Ambiguous alternatives, which explain the log equally well, as in `armature@calf`.
     pub ambiguous_with: Vec<String>,
-    /// The best of the others.
+    /// Best alternative hypotheses.
     pub rivals: Vec<AlternativeCause>,
-    /// What a robot engineer would say.
+    /// Explanation of the cause, as text.
     pub evidence: String,
 }
 
-/// A value with its 95 % interval.
+/// Estimate of a parameter with its 95 % interval.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Estimate {
-    /// The value.
+    /// Estimated value.
     pub value: ParameterValue,
-    /// Lower end.
+    /// Lower end of the interval.
     pub low: ParameterValue,
-    /// Upper end.
+    /// Upper end of the interval.
     pub high: ParameterValue,
 }
 
-/// A number or a vector.
+/// Value of a parameter: a number or a vector.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum ParameterValue {
@@ -79,57 +79,57 @@ pub enum ParameterValue {
     Vector(Vec<f64>),
 }
 
-/// Another cause that was tried.
+/// Alternative hypothesis in place of a cause.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AlternativeCause {
-    /// The effect.
+    /// Name of the effect.
     pub effect: String,
-    /// What it is about.
+    /// Scope of the effect.
     pub scope: String,
-    /// Its gain in place of the cause.
+    /// 1 − RMSE after / RMSE before in place of the cause, cross-validated in the affected channels.
     pub held_out_gain: f64,
 }
 
-/// Effects that this log cannot tell apart.
+/// Pair of causes with highly correlated estimates.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CorrelatedPair {
-    /// Their names.
+    /// Names of the effects.
     pub effects: [String; 2],
-    /// Correlation of their sizes.
+    /// Correlation of the estimates.
     pub correlation: f64,
-    /// What to run next.
+    /// Experiment that discriminates between the effects.
     pub experiment: String,
 }
 
-/// What to play next.
+/// Proposed experiment.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct NextExperiment {
-    /// Its motion, a folder beside this file that `twinstep play` reads.
+    /// Motion file for `twinstep play`: name of a folder in the same folder.
     pub motion: String,
-    /// What it parts.
+    /// Pairs of causes between which it discriminates.
     pub parts: Vec<DiscriminatedPair>,
-    /// In a sentence.
+    /// Description, as text.
     pub text: String,
 }
 
-/// Two causes that a motion parts.
+/// Two causes between which an experiment discriminates.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DiscriminatedPair {
-    /// As in `["backlash@RR_calf", "joint_elasticity@RR_calf"]`.
+    /// Names with scopes, as in `["backlash@RR_calf", "joint_elasticity@RR_calf"]`.
     pub effects: [String; 2],
-    /// Evidence for the true one that is expected of the motion [nats].
+    /// Expected log-likelihood ratio of the true cause to the other [nat].
     pub predicted_nats: f64,
-    /// The same of the median motion that was looked at.
+    /// Expected log-likelihood ratio for the median trajectory [nat].
     pub median_nats: f64,
 }
 
-/// What is left when all that is named is explained.
+/// Residual that the causes do not explain.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Unexplained {
-    /// Share of the residual power above the noise floor.
+    /// Residual power above noise, divided by that of the given model.
     pub fraction: f64,
-    /// Channels that what is left depends on, such as `q_FR_hip`, the strongest first.
+    /// Channels on which the residual depends, such as `q_FR_hip`, the strongest first.
     pub depends_on: Vec<String>,
-    /// In a sentence.
+    /// Description, as text.
     pub text: String,
 }

@@ -1,48 +1,51 @@
-//! The search for causes: one after the other, until none earns a name; and what does not stand in the end is taken back.
+//! Forward selection of causes with backward elimination.
 
+use twinstep_effects::ModelFile;
 use twinstep_effects::Target;
 use twinstep_model::{Joint, RobotModel, Rollout};
-use twinstep_effects::ModelFile;
 
 use super::DiagnoseError;
-use super::residual_data::ResidualData;
+use super::cross_validation::{CandidateFit, FitProblem, cross_validate};
 use super::hypothesis::Hypothesis;
 use super::profile_likelihood::refine_with_restarts;
+use super::residual_data::ResidualData;
 use super::residual_power::{CHANNELS, GYRO, ResidualPower, TORQUE, TRUNK};
 use super::scan::{self, ScoredHypothesis, scan};
-use super::cross_validation::{FitProblem, CandidateFit, cross_validate};
 
-/// Evidence that a cause has to exceed [nats]: set by hand, after a wrong name with 22 on a robot of `twinstep hunt` that is in no
-/// published table.
+/// Log-likelihood gain that a cause must reach [nat].
+///
+/// Set by hand after a false positive with 22 nat in a case of `twinstep hunt` that is not in a published table.
 pub const THRESHOLD: f64 = 30.0;
-/// Most causes that are named.
+/// Maximum number of causes.
 const MOST_CAUSES: usize = 5;
-/// Most rounds of the search, and of taking back.
+/// Maximum number of rounds of selection and elimination.
 const MOST_SEARCHES: usize = 10;
-/// Hypotheses about joints that are tried in full.
+/// Maximum number of hypotheses about joints that are fitted in full simulation.
 const MAX_JOINT_CANDIDATES: usize = 5;
-/// And about the trunk, the ground and the gyroscope, and about encoders.
+/// Maximum number of hypotheses about base, ground and gyroscope, and about encoders.
 const MAX_BODY_CANDIDATES: usize = 2;
-/// Share of the power above noise that a cause has to explain.
+/// Fraction of the power above noise that a cause must explain.
 pub const MIN_EXPLAINED_FRACTION: f64 = 0.3;
-/// Share of the power above noise at a cause's own joints that may stay when all is named, and power in units of noise that
-/// is too little to tell. A gain that grows with the error is followed a part of the way by one that is higher.
+/// Fraction of the power above noise that may remain in the channels that a cause affects, after the joint refit.
+///
+/// A constant gain, for example, partly imitates a gain that grows with the error.
 pub const MAX_REMAINING_FRACTION: f64 = 0.5;
+/// Power above noise per row that is negligible [noise variance].
 pub const NEGLIGIBLE_EXCESS: f64 = 1.0;
 
-/// Causes that are accepted, each with the others that were tried in its place.
+/// Accepted causes, each with its alternative hypotheses.
 pub type Accepted = Vec<(CandidateFit, Vec<CandidateFit>)>;
 
-/// Logs in windows of one length.
+/// Residuals of logs in windows of one length.
 pub struct WindowedData {
-    /// The logs.
+    /// Residuals of the logs.
     pub evidence: ResidualData,
-    /// What the given model leaves.
+    /// Residual power of the given model.
     pub given: ResidualPower,
 }
 
 impl WindowedData {
-    /// Of logs that nothing is tolerated in yet.
+    /// Adds the nuisance parameters of `judged` to the data, and computes the residual power of `robot`.
     pub fn new(
         mut evidence: ResidualData,
         judged: &ModelFile,
@@ -50,29 +53,31 @@ impl WindowedData {
         simulator: &mut dyn Rollout,
     ) -> Result<Self, DiagnoseError> {
         evidence.set_nuisance_model(&judged.robot_model()?, simulator);
-        let given = evidence.leftover(simulator, robot);
+        let given = evidence.residual_power(simulator, robot);
         Ok(Self { evidence, given })
     }
 }
 
-/// The search for causes.
+/// State of the forward selection.
 pub struct ForwardSelection<'a> {
-    /// In long windows; and in short ones, if the given model is lost in those.
+    /// Data in long windows, and in short ones if the given model fails to track the joints in the long ones.
     pub views: &'a [WindowedData],
-    /// The one that is looked at.
+    /// Index of the data in use.
     pub view: usize,
-    /// The given model on ground that suits the log.
+    /// The given model with fitted ground.
     pub baseline: ModelFile,
     pub accepted: Accepted,
-    /// [`Search::judged`] with all that is accepted, fitted together to everything.
+    /// [`ForwardSelection::baseline`] with all accepted causes, fitted jointly to both folds.
     pub model: ModelFile,
     pub simulator: &'a mut dyn Rollout,
     pub progress: &'a mut dyn FnMut(&str) -> Result<(), DiagnoseError>,
 }
 
 impl<'a> ForwardSelection<'a> {
-    /// One cause after the other, until none earns a name. What is left too small, or is more than any robot has, or does not
-    /// explain its own joints when all are fitted together was another in disguise: it goes, and the search goes on without it.
+    /// Runs forward selection with backward elimination.
+    ///
+    /// Each round adds the best candidate and refits all causes. If none reaches the threshold, a cause that is too small,
+    /// implausible, or leaves more than half of its own channels' error is removed and excluded.
     pub fn run(&mut self) -> Result<(), DiagnoseError> {
         let mut excluded = Vec::new();
         for _ in 0..MOST_SEARCHES {
@@ -92,40 +97,47 @@ impl<'a> ForwardSelection<'a> {
         Ok(())
     }
 
-    /// A cause that does not stand when all are fitted together.
+    /// Returns the index of a cause to eliminate after the joint refit, if any.
     fn to_eliminate(&mut self) -> Option<usize> {
         let WindowedData { evidence, given } = self.looked_at();
         let robot = self.model.robot_model().expect("fitted within its bounds");
-        let left = evidence.leftover(self.simulator, &robot);
+        let left = evidence.residual_power(self.simulator, &robot);
         let stands = |hypothesis: &Hypothesis| {
-            hypothesis.exceeds_min_size() && hypothesis.is_plausible() && explains_affected_channels(hypothesis, given, &left)
+            hypothesis.exceeds_min_size()
+                && hypothesis.is_plausible()
+                && explains_affected_channels(hypothesis, given, &left)
         };
         self.accepted.iter().position(|(best, _)| !stands(&best.hypothesis))
     }
 
-    /// The best cause on top of those that are accepted, if one earns a name.
-    fn best_addition(&mut self, excluded: &[String]) -> Result<Option<(CandidateFit, Vec<CandidateFit>)>, DiagnoseError> {
+    /// Returns the best candidate on top of the accepted causes with its alternatives, if one reaches the threshold.
+    fn best_addition(
+        &mut self,
+        excluded: &[String],
+    ) -> Result<Option<(CandidateFit, Vec<CandidateFit>)>, DiagnoseError> {
         let evidence = &self.looked_at().evidence;
-        let left = evidence.leftover(self.simulator, &self.model.robot_model()?);
+        let left = evidence.residual_power(self.simulator, &self.model.robot_model()?);
         let named = self.accepted.len();
-        (self.progress)(&format!("scanning, {named} named"))?;
+        (self.progress)(&format!("scanning the catalogue; causes: {named}"))?;
         let candidates = candidates(evidence, &self.model, self.simulator);
         let mut trials = self.evaluate(candidates, excluded, &left)?;
         if let Some(best) = trials.first().filter(|best| best.score >= THRESHOLD) {
-            // What the best is taken for, which one simulation of all joints may have missed.
+            // Confounders of the best candidate, which the scan of all joints at once may have missed.
             let names: Vec<String> = trials.iter().map(|trial| trial.hypothesis.name()).collect();
             let alike = scan::confounders_of(evidence, &self.model, &best.hypothesis, &names, &left, self.simulator);
             trials.extend(self.evaluate(alike, excluded, &left)?);
             trials.sort_by(best_first);
         }
         let earns_name = |trial: &CandidateFit| {
-            trial.score >= THRESHOLD && trial.explained_fraction >= MIN_EXPLAINED_FRACTION && trial.hypothesis.exceeds_min_size()
+            trial.score >= THRESHOLD
+                && trial.explained_fraction >= MIN_EXPLAINED_FRACTION
+                && trial.hypothesis.exceeds_min_size()
         };
         let place = trials.iter().position(earns_name);
         Ok(place.map(|place| (trials.remove(place), trials)))
     }
 
-    /// Trials of hypotheses, the best first, of what leaves `left`.
+    /// Cross-validates hypotheses on top of the model with residual power `left`. Returns them with the best first.
     fn evaluate(
         &mut self,
         hypotheses: Vec<Hypothesis>,
@@ -136,7 +148,7 @@ impl<'a> ForwardSelection<'a> {
         let mut trials = Vec::new();
         for hypothesis in hypotheses {
             if !self.is_excluded(&hypothesis, excluded) {
-                (self.progress)(&format!("trying {}, {} named", hypothesis.name(), self.accepted.len()))?;
+                (self.progress)(&format!("fitting {}; causes: {}", hypothesis.name(), self.accepted.len()))?;
                 let hypothesis = scan::refine_delay_grid(evidence, &self.model, hypothesis, left, self.simulator);
                 trials.extend(cross_validate(evidence, &self.model, left, &hypothesis, self.simulator));
             }
@@ -149,13 +161,13 @@ impl<'a> ForwardSelection<'a> {
         &self.views[self.view]
     }
 
-    /// Whether a hypothesis did not stand, or is named.
+    /// Returns true if a hypothesis was eliminated or is accepted.
     fn is_excluded(&self, hypothesis: &Hypothesis, excluded: &[String]) -> bool {
         let named = |accepted: &CandidateFit| accepted.hypothesis.name() == hypothesis.name();
         excluded.contains(&hypothesis.name()) || self.accepted.iter().any(|(accepted, _)| named(accepted))
     }
 
-    /// Fits all that is accepted together.
+    /// Refits all accepted causes jointly.
     fn refit(&mut self) {
         let hypotheses: Vec<_> = self.accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
         self.model = self.baseline.clone();
@@ -166,12 +178,12 @@ impl<'a> ForwardSelection<'a> {
         self.choose_windows();
     }
 
-    /// Long windows tell more, where the model follows them.
+    /// Selects long windows if the model tracks the joints in them, because they are more informative.
     fn choose_windows(&mut self) {
         if self.views.len() > 1 {
             let robot = self.model.robot_model().expect("fitted within its bounds");
             let evidence = &self.views[0].evidence;
-            self.view = usize::from(evidence.fails_to_track(&evidence.leftover(self.simulator, &robot)));
+            self.view = usize::from(evidence.fails_to_track(&evidence.residual_power(self.simulator, &robot)));
         }
     }
 }
@@ -180,7 +192,7 @@ fn best_first(one: &CandidateFit, other: &CandidateFit) -> std::cmp::Ordering {
     other.score.total_cmp(&one.score)
 }
 
-/// Whether most of what was wrong where a cause acts is explained.
+/// Returns true if most of the excess power in the channels that a cause affects is explained.
 fn explains_affected_channels(hypothesis: &Hypothesis, given: &ResidualPower, left: &ResidualPower) -> bool {
     affected_channels(hypothesis).into_iter().all(|channels| {
         let excess = |left: &ResidualPower| channels.iter().map(|channel| left.channel_excess(*channel)).sum::<f64>();
@@ -189,8 +201,9 @@ fn explains_affected_channels(hypothesis: &Hypothesis, given: &ResidualPower, le
     })
 }
 
-/// Channels of which each group has to be explained: of joints their positions, and their torques; of the trunk and the ground
-/// the motion of everything.
+/// Returns the groups of channels that a cause must explain, each separately.
+///
+/// For joints, positions and torques are separate groups. For base and ground, the group is all motion channels.
 fn affected_channels(hypothesis: &Hypothesis) -> Vec<Vec<usize>> {
     match hypothesis.effect.target {
         Target::Joints => {
@@ -203,7 +216,7 @@ fn affected_channels(hypothesis: &Hypothesis) -> Vec<Vec<usize>> {
     }
 }
 
-/// Writes the values of a fit of all causes into them.
+/// Writes the values of a joint fit to the accepted causes.
 pub fn write_estimates(accepted: &mut Accepted, fit: &FitProblem, point: &[f64]) {
     let mut values = fit.unknowns.iter().zip(point).map(|(unknown, coordinate)| unknown.value(*coordinate));
     for (best, _) in accepted {
@@ -211,7 +224,9 @@ pub fn write_estimates(accepted: &mut Accepted, fit: &FitProblem, point: &[f64])
     }
 }
 
-/// What is tried in full: the best of the scan, of the joints and of the rest, which have seen different parts of the logs.
+/// Returns the hypotheses of the scan to fit in full simulation.
+///
+/// Joints, bodies and encoder offsets are ranked separately, because the scan evaluates them on different rows.
 fn candidates(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<Hypothesis> {
     let scored = scan(evidence, model, simulator).into_iter().filter(|scored| scored.score > 0.0);
     let (offsets, others): (Vec<_>, Vec<_>) =
@@ -223,7 +238,10 @@ fn candidates(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Ro
         let least = 0.3 * scored.first().map_or(0.0, |best| best.score);
         scored.into_iter().filter(move |scored| scored.score >= least).take(most).map(|scored| scored.hypothesis)
     };
-    tried(joints, MAX_JOINT_CANDIDATES).chain(tried(whole, MAX_BODY_CANDIDATES)).chain(tried(offsets, MAX_BODY_CANDIDATES)).collect()
+    tried(joints, MAX_JOINT_CANDIDATES)
+        .chain(tried(whole, MAX_BODY_CANDIDATES))
+        .chain(tried(offsets, MAX_BODY_CANDIDATES))
+        .collect()
 }
 
 #[cfg(test)]
@@ -236,8 +254,8 @@ mod tests {
         Hypothesis { effect: Effect::named(effect).expect("an effect of the catalogue"), scope, values: Vec::new() }
     }
 
-    /// A hundred rows of every channel, of this power, in units of noise.
-    fn leftover(power: impl Fn(usize) -> f64) -> ResidualPower {
+    /// Returns 100 rows of every channel with this residual power [noise variance].
+    fn residual_power(power: impl Fn(usize) -> f64) -> ResidualPower {
         let mut left = ResidualPower::empty();
         for channel in 0..CHANNELS {
             left.sums[channel][0] = 100.0 * power(channel);
@@ -247,16 +265,16 @@ mod tests {
     }
 
     #[test]
-    fn cause_has_to_explain_half_of_what_was_wrong_where_it_acts() {
+    fn cause_must_explain_half_of_the_excess_in_its_channels() {
         let (hip, calf) = (Joint::ALL[0], Joint::ALL[2]);
-        let given = leftover(|channel| if channel == hip.index() { 20.0 } else { 10.0 });
-        let only_hip = leftover(|channel| if channel == hip.index() { 1.0 } else { 9.9 });
+        let given = residual_power(|channel| if channel == hip.index() { 20.0 } else { 10.0 });
+        let only_hip = residual_power(|channel| if channel == hip.index() { 1.0 } else { 9.9 });
         let explains = |effect, scope| explains_affected_channels(&hypothesis(effect, scope), &given, &only_hip);
-        assert!(!explains("backlash", Scope::Joint(hip)), "the hip's torque is as wrong as before");
+        assert!(!explains("backlash", Scope::Joint(hip)), "the torque of the hip is not explained");
         assert!(!explains("backlash", Scope::Joint(calf)));
-        assert!(!explains("com_shift", Scope::Base), "a trunk moves all joints");
+        assert!(!explains("com_shift", Scope::Base), "an effect on the base affects all joints");
         assert!(!explains("gyro_bias", Scope::Base));
-        let noise = leftover(|_| 1.0);
+        let noise = residual_power(|_| 1.0);
         for (effect, scope) in [("backlash", Scope::Joint(hip)), ("com_shift", Scope::Base), ("gyro_bias", Scope::Base)]
         {
             assert!(explains_affected_channels(&hypothesis(effect, scope), &given, &noise));

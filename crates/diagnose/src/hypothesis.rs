@@ -1,8 +1,8 @@
 //! What might be wrong: an effect on a scope, with values.
 
+use twinstep_effects::ModelFile;
 use twinstep_effects::{Composition, Effect, EffectEntry, EntryError, Scope, Target};
 use twinstep_model::Joint;
-use twinstep_effects::ModelFile;
 
 /// Shares of the way from no effect to the end of its plausible range that are tried.
 const SHARES: [f64; 5] = [0.1, 0.2, 0.4, 0.75, 1.3];
@@ -108,6 +108,7 @@ pub fn grid(effect: &Effect) -> Vec<Vec<f64>> {
         "joint_spring" => &[&[-1.2], &[0.0], &[1.2]],
         "thermal_derating" => &[&[35.0]],
         "torque_ripple" => return ripples(),
+        "pd_gain" => return pd_gains(effect),
         _ => &[&[]],
     };
     let [least, most] = main.bounds;
@@ -146,6 +147,15 @@ pub fn body_grid(effect: &Effect) -> Vec<Vec<f64>> {
         "ground_stiffness" => [0.005, 0.01, 0.02, 0.04].map(|time| vec![time]).to_vec(),
         _ => Vec::new(),
     }
+}
+
+/// Returns scales of one gain at a time, from small to large changes.
+fn pd_gains(effect: &Effect) -> Vec<Vec<f64>> {
+    let scales = |index: usize| {
+        let [low, high] = effect.parameters[index].prior_range;
+        SHARES.into_iter().flat_map(move |share| [low, high].map(|end| 1.0 + share * (end - 1.0)))
+    };
+    scales(0).map(|kp| vec![kp, 1.0]).chain(scales(1).map(|kd| vec![1.0, kd])).collect()
 }
 
 /// Ripples of one size, every third number of cycles and four phases. Joints move within half a radian of their middle, where

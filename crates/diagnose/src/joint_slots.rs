@@ -1,47 +1,48 @@
-//! Joints of any robot, at most twelve, in the seats of the Go2's: what their actuators make of measured states and commands,
+//! Joints of any robot, at most twelve, in the slots of the Go2's: what their actuators make of measured states and commands,
 //! which no simulation of a body is needed for.
 
 use std::collections::BTreeMap;
 
 use rayon::prelude::*;
-use twinstep_model::{BaseMount, JOINT_NAMES, Joint, RobotModel, go2};
-use twinstep_logs::{Log, Meta, Segment};
 use twinstep_effects::{EffectEntry, Scope, apply_effects};
+use twinstep_logs::{Log, Meta, Segment};
+use twinstep_model::{BaseMount, JOINT_NAMES, Joint, RobotModel, go2};
 
 use super::residual_data::torque_sigma;
 use super::residual_power::{ResidualPower, TORQUE};
 use super::residual_rows::fold_of;
-use twinstep_identify::motion::MotionError;
 use twinstep_identify::torque::MeasuredTorque;
+use twinstep_logs::replay::ReplayError;
 
 /// Quantities of a joint that its actuator's torque is made of.
 const QUANTITIES: [&str; 7] = ["q", "dq", "q_cmd", "dq_cmd", "tau_ff", "tau_measured", "temp"];
-/// The largest torque in the seats, which a Go2's actuator has too: what is plausible of its friction then is of any.
+/// The largest torque in the slots, which a Go2's actuator has too: what is plausible of its friction then is of any.
 const LARGEST_NM: f64 = 20.0;
 /// Torques this long apart [s] are independent.
 const INDEPENDENT_S: f64 = 0.1;
 
-/// Joints in seats.
+/// Joints in slots.
 pub struct JointSlots {
     /// Their own names.
     names: Vec<String>,
     /// Whether these are all joints of the robot.
     whole: bool,
-    /// The logs with the joints in their seats, and nothing else.
+    /// The logs with the joints in their slots, and nothing else.
     logs: Vec<Log>,
     torques: Vec<MeasuredTorque>,
-    /// What a unit of torque in the seats is [N·m].
+    /// What a unit of torque in the slots is [N·m].
     pub torque_scale: f64,
     /// An ideal actuator in every seat, without limits, that ticks with the rows of the logs.
     ideal: RobotModel,
 }
 
 impl JointSlots {
-    /// The joints `names` of `logs`, which have one rate.
-    pub fn new(logs: &[Log], names: &[String]) -> Result<Self, MotionError> {
+    /// The joints `names` of `logs`.
+    pub fn new(logs: &[Log], names: &[String]) -> Result<Self, ReplayError> {
         let whole = names.len() == logs[0].joints().len();
         let mut ideal = go2();
-        ideal.control.actuator_hz = logs[0].meta().rate_hz;
+        // Below the rate of any log: each log is replayed at its own rate, one actuator period per row.
+        ideal.control.actuator_hz = 1.0;
         for joint in &mut ideal.joints {
             (joint.torque_limit, joint.armature) = (1e6, 0.0);
         }
@@ -79,9 +80,14 @@ impl JointSlots {
         &self.names[seat]
     }
 
+    /// Returns the highest rate of the logs [Hz].
+    fn max_rate_hz(&self) -> f64 {
+        self.logs.iter().map(|log| log.meta().rate_hz).fold(0.0, f64::max)
+    }
+
     /// Rows that count as one.
     pub fn rows_in_one(&self) -> f64 {
-        (INDEPENDENT_S * self.logs[0].meta().rate_hz).max(1.0)
+        (INDEPENDENT_S * self.max_rate_hz()).max(1.0)
     }
 
     /// Actuators with these effects; none that are no actuators.
@@ -95,7 +101,7 @@ impl JointSlots {
     }
 
     /// What candidates leave of the torques.
-    pub fn leftovers(&self, robots: &[RobotModel]) -> Vec<ResidualPower> {
+    pub fn residual_powers(&self, robots: &[RobotModel]) -> Vec<ResidualPower> {
         let left = |robot: &RobotModel| {
             let mut left = ResidualPower::empty();
             for (log, torques) in self.logs.iter().zip(&self.torques) {
@@ -137,8 +143,8 @@ impl JointSlots {
     }
 }
 
-/// `log` with `names` in their seats, torques in units of `unit` [N·m], and nothing else but the supply.
-fn into_slots(log: &Log, names: &[String], unit: f64) -> Result<Log, MotionError> {
+/// `log` with `names` in their slots, torques in units of `unit` [N·m], and nothing else but the supply.
+fn into_slots(log: &Log, names: &[String], unit: f64) -> Result<Log, ReplayError> {
     let index = |cells: &[u32]| cells.iter().map(|cell| f64::from(*cell)).collect();
     let mut columns: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     columns.insert("t".to_owned(), log.t().to_vec());
@@ -149,7 +155,7 @@ fn into_slots(log: &Log, names: &[String], unit: f64) -> Result<Log, MotionError
     for (name, seat) in names.iter().zip(JOINT_NAMES) {
         for quantity in ["q", "dq", "q_cmd", "tau_measured"] {
             if log.channel(&format!("{quantity}_{name}")).is_none() {
-                return Err(MotionError::Missing { joint: name.clone(), quantity });
+                return Err(ReplayError::Missing { joint: name.clone(), quantity });
             }
         }
         for quantity in QUANTITIES {

@@ -1,19 +1,21 @@
-//! Diagnosis: what a model gets wrong, by name, and the gain on seconds that took no part in the choice.
+//! Diagnosis: identifies the effects of the catalogue that a model lacks, by comparison with logs.
 //!
-//! - [`residual_rows`]: logs as residuals, in two folds of alternating seconds; [`residual_power`]: what a candidate leaves of them;
-//!   [`residual_data`]: of motion and torque together.
+//! - [`residual_rows`]: residuals of logs in two folds of alternating seconds, with every fifth second held out;
+//!   [`residual_power`]: their sums of squares; [`residual_data`]: residuals of motion and torque together.
 //! - [`hypothesis`]: an effect on a scope, with values.
-//! - [`forward_selection`]: the search, which uses these in turn:
-//! - [`scan`]: every effect on every joint at once; the best go on.
-//! - [`cross_validation`]: one hypothesis fitted to one fold and judged on the other, in full simulation.
-//! - [`profile_likelihood`]: what slopes do not show of a fit: other valleys, and how far their floor goes.
-//! - [`discrimination`], [`experiment_design`]: which motion would part causes that the logs cannot tell apart.
-//! - [`unexplained`]: what is left, and what it depends on; [`spectral_line`]: or at which frequency it shakes.
+//! - [`forward_selection`]: forward selection with backward elimination, which uses the following modules in turn.
+//! - [`scan`]: evaluates every effect on all joints at once, and returns the best candidates.
+//! - [`cross_validation`]: fits a hypothesis to one fold and evaluates it on the other, in full simulation.
+//! - [`profile_likelihood`]: restarts from other local minima, and profile-likelihood intervals.
+//! - [`discrimination`], [`experiment_design`]: choose an experiment that discriminates between ambiguous causes.
+//! - [`unexplained`]: describes the unexplained residual; [`spectral_line`]: its strongest frequency.
 //!
-//! Joints that are not a Go2's are looked at by their torques alone: [`torque_only`], with [`joint_slots`] and [`torque_fit`].
+//! Joints that are not a Go2's are diagnosed by their torques only: [`torque_only`], with [`joint_slots`] and
+//! [`torque_fit`].
 //!
-//! The best trial is accepted if its evidence exceeds the threshold and it explains a good part of what is above the noise;
-//! all that is accepted is fitted anew together, and the search goes on from there.
+//! A candidate is accepted as a cause if its log-likelihood gain exceeds [`forward_selection::THRESHOLD`], it explains at
+//! least [`forward_selection::MIN_EXPLAINED_FRACTION`] of the residual power above noise, and it exceeds a minimum size. All
+//! accepted causes are then refitted together, and the search continues.
 
 mod cross_validation;
 mod discrimination;
@@ -34,66 +36,67 @@ mod torque_fit;
 mod torque_only;
 mod unexplained;
 
-use twinstep_logs::Log;
-use twinstep_effects::{Effect, Scope};
 use twinstep_effects::ModelFile;
+use twinstep_effects::{Effect, Scope};
+use twinstep_logs::Log;
 use twinstep_model::{Precision, RobotModel, Rollout};
 
+use cross_validation::{CandidateFit, FitProblem};
+pub use discrimination::HypothesisPair;
+pub use excitation::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
+pub use experiment_design::ProposedExperiment;
+pub use findings::{
+    AlternativeCause, Cause, CorrelatedPair, Diagnosis, DiscriminatedPair, Estimate, NextExperiment, ParameterValue,
+    RmsErrors, Unexplained,
+};
+use forward_selection::{Accepted, ForwardSelection, THRESHOLD, WindowedData, write_estimates};
+use hypothesis::Hypothesis;
+use residual_data::ResidualData;
+pub use torque_only::diagnose_torques;
 use twinstep_identify::evaluate::evaluate;
 use twinstep_identify::experiment::ExperimentError;
 use twinstep_identify::identify::blocks;
-use twinstep_identify::refine::{SIMULATOR_MISMATCH_STD, covariance};
 use twinstep_identify::nuisance::NuisanceModel;
+use twinstep_identify::refine::{SIMULATOR_MISMATCH_STD, covariance};
 use twinstep_identify::window::WindowConfig;
-pub use excitation::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
-pub use findings::{
-    AlternativeCause, Cause, CorrelatedPair, Diagnosis, DiscriminatedPair, Estimate, NextExperiment, ParameterValue, RmsErrors, Unexplained,
-};
-pub use torque_only::diagnose_torques;
-use forward_selection::{Accepted, ForwardSelection, THRESHOLD, WindowedData, write_estimates};
-use residual_data::ResidualData;
-use hypothesis::Hypothesis;
-pub use experiment_design::ProposedExperiment;
-pub use discrimination::HypothesisPair;
-use cross_validation::{FitProblem, CandidateFit};
 
-/// A rival this close [nats], or within this share of the cause's own evidence, cannot be told from the cause: simulators of
-/// one law differ by as much.
+/// Difference of the log-likelihood gain [nat], or its fraction of the cause's gain, within which an alternative is
+/// ambiguous. Simulators of the same law differ by as much.
 const AMBIGUITY_NATS: f64 = 6.0;
 const AMBIGUITY_FRACTION: f64 = 0.05;
 
-/// Why there is no diagnosis.
+/// Reason why a diagnosis is impossible.
 #[derive(Debug, thiserror::Error)]
 pub enum DiagnoseError {
-    /// A log is no experiment.
+    /// A log cannot be used as an experiment.
     #[error(transparent)]
     Experiment(#[from] ExperimentError),
     /// The given model cannot be simulated.
-    #[error("the simulation of the given model diverges on this log: start from a model that does not")]
+    #[error("the simulation of the given model diverges on this log: start from a model that does not diverge")]
     Diverges,
-    /// The given model is none.
+    /// The given model is not a valid robot.
     #[error(transparent)]
     Model(#[from] twinstep_effects::EntryError),
-    /// Ended by `progress`.
-    #[error("ended before it was done")]
+    /// `progress` returned false.
+    #[error("interrupted before completion")]
     Interrupted,
 }
 
-/// What is being done, said now and then; ends the diagnosis when it returns false.
+/// Progress callback with a description of the current step. The diagnosis is interrupted if it returns false.
 pub type DiagnoseProgress<'a> = dyn FnMut(&str) -> bool + 'a;
 
-/// A diagnosis and the model that it makes.
+/// Result of a diagnosis, with the corrected model.
 #[derive(Clone, Debug)]
 pub struct DiagnosisOutput {
-    /// What is said; `extended_model` is left to who writes the files.
+    /// The findings. The caller that writes the files sets `extended_model`.
     pub diagnosis: Diagnosis,
-    /// The given model with the causes, and intervals.
+    /// The given model with the causes and their intervals.
     pub extended: ModelFile,
-    /// What to play next, where causes are left that the logs cannot tell apart.
+    /// Proposed experiment, if there are ambiguous causes.
     pub next: Option<ProposedExperiment>,
 }
 
-/// Names what `model` gets wrong in `logs` of one robot.
+/// Identifies the effects that `model` lacks, from `logs` of one robot.
 pub fn diagnose(
     logs: Vec<Log>,
     model: &ModelFile,
@@ -102,9 +105,9 @@ pub fn diagnose(
 ) -> Result<DiagnosisOutput, DiagnoseError> {
     let robot = model.robot_model()?;
     let mut say = |text: &str| if progress(text) { Ok(()) } else { Err(DiagnoseError::Interrupted) };
-    say("the ground, and errors of any robot")?;
+    say("fitting the ground and the nuisance parameters")?;
     let mut evidence = ResidualData::new(logs.clone(), &robot, WindowConfig::DIAGNOSIS)?;
-    let left = evidence.leftover(simulator, &robot);
+    let left = evidence.residual_power(simulator, &robot);
     if left.diverged() {
         return Err(DiagnoseError::Diverges);
     }
@@ -126,12 +129,12 @@ pub fn diagnose(
     search.run()?;
     let ForwardSelection { view, mut accepted, model: named, .. } = search;
     let WindowedData { evidence, given } = &views[view];
-    let left = evidence.leftover(simulator, &named.robot_model()?);
-    say("intervals")?;
+    let left = evidence.residual_power(simulator, &named.robot_model()?);
+    say("computing intervals")?;
     let (extended, confusable) = intervals(model, &judged, &mut accepted, evidence, simulator);
     say("choosing the next experiment")?;
-    let rivalries = experiment_design::rivalries(&extended, &accepted, &confusable);
-    let next = experiment_design::next_motion(&rivalries, evidence, &robot, simulator);
+    let pairs = experiment_design::pairs(&extended, &accepted, &confusable);
+    let next = experiment_design::next_motion(&pairs, evidence, &robot, simulator);
     let causes = accepted.iter().map(|(best, others)| cause(best, others, &extended)).collect();
     let diagnosis = Diagnosis {
         baseline: errors(evidence, &robot, simulator)?,
@@ -146,14 +149,17 @@ pub fn diagnose(
     Ok(DiagnosisOutput { diagnosis, extended, next })
 }
 
-/// The model on ground of a hardness that suits the log, as long as the difference is not worth a name: how a foot meets the
-/// ground differs between a simulator and anything else, and would pass for a shifted mass or a softer gear.
+/// Returns the model with the ground's time constant fitted to the log, if the change is too small for a cause.
+///
+/// Contact laws differ between any two simulators. Without this step the difference is attributed to a shifted mass or an
+/// elastic gear.
 fn with_fitted_ground(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> ModelFile {
     let effect = Effect::named("ground_stiffness").expect("an effect of the catalogue");
     let own = model.effects.iter().rfind(|entry| entry.effect == effect);
     let values = own.map_or(vec![effect.parameters[0].no_effect_value], |entry| entry.values.clone());
     let hypothesis = Hypothesis { effect, scope: Scope::Ground, values };
-    let Some(fit) = FitProblem::new(model, std::slice::from_ref(&hypothesis)).filter(|_| evidence.has_free_parts()) else {
+    let Some(fit) = FitProblem::new(model, std::slice::from_ref(&hypothesis)).filter(|_| evidence.has_free_parts())
+    else {
         return model.clone();
     };
     let point = fit.solve(&evidence.fit_rows, simulator);
@@ -161,7 +167,7 @@ fn with_fitted_ground(evidence: &ResidualData, model: &ModelFile, simulator: &mu
     if fitted.exceeds_min_size() { model.clone() } else { fit.model(&point) }
 }
 
-/// The model with the causes and their 95 % intervals, and what cannot be told apart.
+/// Returns the model with the causes and their 95 % intervals, and the pairs of highly correlated causes.
 fn intervals(
     model: &ModelFile,
     judged: &ModelFile,
@@ -175,8 +181,11 @@ fn intervals(
     fit.initial_point = profile_likelihood::refine_with_restarts(&on_ground, evidence, simulator);
     write_estimates(accepted, &fit, &fit.initial_point);
     let experiments = &evidence.fit_rows.experiments;
-    let tolerances =
-        fit.model(&fit.initial_point).robot_model().ok().and_then(|robot| NuisanceModel::new(experiments, &robot, simulator));
+    let tolerances = fit
+        .model(&fit.initial_point)
+        .robot_model()
+        .ok()
+        .and_then(|robot| NuisanceModel::new(experiments, &robot, simulator));
     let covariance = fit.with_problem(&evidence.fit_rows, simulator, Precision::Double, |task, simulator| {
         let errors = tolerances.map_or(Vec::new(), |all| all.robot_errors(task.residual_scale, task.tolerances));
         covariance(&task.linearise(simulator, &fit.initial_point)?, &blocks(experiments), &errors)
@@ -185,8 +194,12 @@ fn intervals(
     reporting::with_intervals(&fit, covariance.as_ref(), SIMULATOR_MISMATCH_STD, &near)
 }
 
-/// On the seconds that are set aside.
-fn errors(evidence: &ResidualData, robot: &RobotModel, simulator: &mut dyn Rollout) -> Result<RmsErrors, DiagnoseError> {
+/// Returns the RMS errors on held-out blocks.
+fn errors(
+    evidence: &ResidualData,
+    robot: &RobotModel,
+    simulator: &mut dyn Rollout,
+) -> Result<RmsErrors, DiagnoseError> {
     let (mut torque, mut q) = (Vec::new(), Vec::new());
     for log in evidence.logs() {
         let evaluation = evaluate(log, robot, simulator, |row| residual_rows::fold_of(log, row).is_none())?;
@@ -200,7 +213,7 @@ fn errors(evidence: &ResidualData, robot: &RobotModel, simulator: &mut dyn Rollo
     Ok(RmsErrors { torque_rmse_nm: whole(torque), q_rmse_rad: whole(q) })
 }
 
-/// Of the others those that the logs cannot tell from the best.
+/// Returns the alternatives that are ambiguous with the best candidate.
 fn ambiguous<'a>(best: &CandidateFit, others: &'a [CandidateFit]) -> impl Iterator<Item = &'a CandidateFit> {
     let least = best.score - AMBIGUITY_NATS.max(AMBIGUITY_FRACTION * best.score);
     others.iter().filter(move |other| other.score > least)

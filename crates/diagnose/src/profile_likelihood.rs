@@ -3,9 +3,9 @@
 
 use twinstep_model::{RobotModel, Rollout};
 
+use super::cross_validation::FitProblem;
 use super::residual_data::ResidualData;
 use super::scan::log_likelihood_gain;
-use super::cross_validation::FitProblem;
 
 /// Steps from a number, either way [prior deviations].
 const STEPS: [f64; 9] = [0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8];
@@ -82,7 +82,8 @@ fn places(fit: &FitProblem, evidence: &ResidualData, simulator: &mut dyn Rollout
 /// Evidence that is gained at `points` [nats] against where `fit` begins; none where there is no robot.
 fn gains(fit: &FitProblem, points: &[Vec<f64>], evidence: &ResidualData, simulator: &mut dyn Rollout) -> Vec<f64> {
     let robot = |point: &[f64]| fit.model(point).robot_model().ok();
-    let all: Vec<Option<RobotModel>> = std::iter::once(&fit.initial_point).chain(points).map(|point| robot(point)).collect();
+    let all: Vec<Option<RobotModel>> =
+        std::iter::once(&fit.initial_point).chain(points).map(|point| robot(point)).collect();
     let robots: Vec<RobotModel> = all.iter().flatten().cloned().collect();
     let mut left = evidence.residual_powers(simulator, &robots, false).into_iter();
     let mut left = all.iter().map(|robot| robot.as_ref().and_then(|_| left.next()));
@@ -92,11 +93,11 @@ fn gains(fit: &FitProblem, points: &[Vec<f64>], evidence: &ResidualData, simulat
 
 #[cfg(test)]
 mod tests {
-    use twinstep_model::BaseMount;
-    use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
-    use twinstep_effects::{Effect, Scope};
-    use twinstep_model::{RolloutRequest, Joint, Precision, RobotStates, go2};
     use twinstep_effects::ModelFile;
+    use twinstep_effects::{Effect, Scope};
+    use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+    use twinstep_model::BaseMount;
+    use twinstep_model::{Joint, Precision, RobotStates, RolloutRequest, go2};
 
     use super::super::hypothesis::Hypothesis;
     use super::*;

@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use nalgebra::DMatrix;
 use twinstep_effects::ModelFile;
 
-use super::residual_data::ResidualData;
+use super::cross_validation::{CandidateFit, FitProblem};
 use super::hypothesis::Hypothesis;
-use super::cross_validation::{FitProblem, CandidateFit};
-use crate::findings::{CorrelatedPair, RmsErrors, Estimate, AlternativeCause, ParameterValue};
+use super::residual_data::ResidualData;
+use crate::findings::{AlternativeCause, CorrelatedPair, Estimate, ParameterValue, RmsErrors};
 use twinstep_identify::experiment::ResidualChannel;
 use twinstep_identify::parameter::set_intervals;
 
@@ -38,8 +38,8 @@ pub fn with_intervals(
             let size = (fit.initial_point[index] - unknown.coordinate(unknown.neutral)).abs();
             let half = TWO_SIDED_95 * (deviation(index) * unknown.prior[1]).max(SIMULATOR_MISMATCH_REL_STD * size);
             let [low, high] = near[index];
-            let ends =
-                [low.min(fit.initial_point[index] - half), high.max(fit.initial_point[index] + half)].map(|end| unknown.value(end));
+            let ends = [low.min(fit.initial_point[index] - half), high.max(fit.initial_point[index] + half)]
+                .map(|end| unknown.value(end));
             Some([ends[0].min(ends[1]), ends[0].max(ends[1])])
         })
         .collect();
@@ -50,7 +50,10 @@ pub fn with_intervals(
             let correlation = covariance.map_or(0.0, |covariance| covariance[(i, j)] / (deviation(i) * deviation(j)));
             if correlation.abs() >= CORRELATED && one.effect != other.effect {
                 let told = |from: &'static twinstep_effects::Effect, to: &str| {
-                    from.confounders.iter().find(|confusion| confusion.effect == to).map(|confusion| confusion.discriminating_experiment)
+                    from.confounders
+                        .iter()
+                        .find(|confusion| confusion.effect == to)
+                        .map(|confusion| confusion.discriminating_experiment)
                 };
                 let experiment = told(one.effect, other.effect.name).or(told(other.effect, one.effect.name));
                 confusable.push(CorrelatedPair {
@@ -82,8 +85,9 @@ pub fn estimates(hypothesis: &Hypothesis, extended: &ModelFile) -> BTreeMap<Stri
                 })
                 .collect()
         };
-        let value =
-            |values: Vec<f64>| if parameter.count == 1 { ParameterValue::Number(values[0]) } else { ParameterValue::Vector(values) };
+        let value = |values: Vec<f64>| {
+            if parameter.count == 1 { ParameterValue::Number(values[0]) } else { ParameterValue::Vector(values) }
+        };
         let estimate = Estimate {
             value: value(hypothesis.values[range.clone()].to_vec()),
             low: value(end(0)),

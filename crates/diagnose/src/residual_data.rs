@@ -85,12 +85,18 @@ impl ResidualData {
     }
 
     /// What candidates leave; with `quick` only where the base was fixed, if it was.
-    pub fn residual_powers(&self, simulator: &mut dyn Rollout, robots: &[RobotModel], quick: bool) -> Vec<ResidualPower> {
+    pub fn residual_powers(
+        &self,
+        simulator: &mut dyn Rollout,
+        robots: &[RobotModel],
+        quick: bool,
+    ) -> Vec<ResidualPower> {
         let rows = if quick { &self.fixed_base_rows } else { &self.fit_rows };
-        let mut leftovers = rows.leftovers(simulator, robots);
+        let mut residual_powers = rows.residual_powers(simulator, robots);
         for (log, torques) in self.logs.iter().zip(&self.torques) {
             // Most effects are behind the torque's sensor: what it shows of robots that follow one another is the same.
-            let alike: Vec<&[RobotModel]> = robots.chunk_by(|one, other| torques.predict_same_torque(one, other)).collect();
+            let alike: Vec<&[RobotModel]> =
+                robots.chunk_by(|one, other| torques.predict_same_torque(one, other)).collect();
             let shown: Vec<ResidualPower> = alike
                 .par_iter()
                 .map(|robots| {
@@ -103,20 +109,25 @@ impl ResidualData {
                 })
                 .collect();
             let each = shown.iter().zip(&alike).flat_map(|(left, robots)| std::iter::repeat_n(left, robots.len()));
-            leftovers.iter_mut().zip(each).for_each(|(left, shown)| left.add_all(shown));
+            residual_powers.iter_mut().zip(each).for_each(|(left, shown)| left.add_all(shown));
         }
-        leftovers
+        residual_powers
     }
 
     /// What one candidate leaves of everything.
-    pub fn leftover(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> ResidualPower {
+    pub fn residual_power(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> ResidualPower {
         self.residual_powers(simulator, std::slice::from_ref(robot), false).remove(0)
+    }
+
+    /// Returns the highest rate of the logs [Hz].
+    fn max_rate_hz(&self) -> f64 {
+        self.logs.iter().map(|log| log.meta().rate_hz).fold(0.0, f64::max)
     }
 
     /// Rows of a channel that count as one.
     pub fn correlation_rows(&self, channel: usize) -> f64 {
         let kind = [TORQUE, TRUNK, GYRO].into_iter().filter(|first| channel >= *first).count();
-        (INDEPENDENT_S[kind] * self.logs[0].meta().rate_hz).max(1.0)
+        (INDEPENDENT_S[kind] * self.max_rate_hz()).max(1.0)
     }
 
     /// Measured torques of the first log.

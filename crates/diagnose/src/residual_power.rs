@@ -1,67 +1,71 @@
-//! What a candidate leaves of each channel, in units of noise and of the misfit of any simulator.
+//! Residual power of each channel, in units of the variance of noise and model error.
 
 use twinstep_model::NUM_JOINTS;
 
 use twinstep_identify::nuisance;
 
-/// Channels: positions, torques, and of the trunk position, orientation, velocity and rate.
+/// Number of channels: joint positions, torques, and base position, orientation, velocity and angular velocity.
 pub const CHANNELS: usize = 2 * NUM_JOINTS + 12;
 /// First channel of the torques.
 pub const TORQUE: usize = NUM_JOINTS;
-/// First channel of the trunk.
+/// First channel of the base.
 pub const TRUNK: usize = 2 * NUM_JOINTS;
-/// First channel of its gyroscope.
+/// First channel of the gyroscope.
 pub const GYRO: usize = TRUNK + 9;
 
-/// Sums of squares and counts by channel and fold, in units of noise and misfit.
+/// Sums of squared residuals and numbers of rows by channel and fold, in units of the variance of noise and model error.
 #[derive(Clone, Debug)]
 pub struct ResidualPower {
-    /// Sums of squares.
+    /// Sums of squared residuals.
     pub sums: [[f64; 2]; CHANNELS],
     /// Numbers of rows.
     pub counts: [[f64; 2]; CHANNELS],
-    /// What tolerated errors cost that explain a part of the rest, of starts and of the robot [nats].
+    /// Penalties of the nuisance parameters of initial states and of the robot [nat].
     pub nuisance_cost: [f64; 2],
 }
 
 impl ResidualPower {
-    /// Nothing yet.
+    /// Returns zero sums and counts.
     pub fn empty() -> Self {
         Self { sums: [[0.0; 2]; CHANNELS], counts: [[0.0; 2]; CHANNELS], nuisance_cost: [0.0; 2] }
     }
 
-    /// How much less tolerated errors cost than `before` [nats]. Where more than noise is left, the errors that explain a part
-    /// of it are as uncertain.
+    /// Returns the decrease of the penalties of nuisance parameters from `before` [nat].
+    ///
+    /// Penalties are divided by the residual power if that exceeds noise, because the nuisance parameters are then less
+    /// certain.
     pub fn tolerated_gain(&self, before: &Self) -> f64 {
         let cost = |left: &Self| left.nuisance_cost.iter().sum::<f64>() / left.power().max(1.0);
         cost(before) - cost(self)
     }
 
-    /// Mean power of all rows, in units of noise and misfit.
+    /// Returns the mean power of all rows, in units of the variance of noise and model error.
     fn power(&self) -> f64 {
         self.sums.iter().flatten().sum::<f64>() / self.counts.iter().flatten().sum::<f64>().max(1.0)
     }
 
-    /// Adds a difference, in units of noise and misfit, of a row in a fold; none is set aside.
+    /// Adds the normalised residual of a row in a fold. `None` is a held-out block, which is not added.
     pub fn add(&mut self, channel: usize, fold: Option<usize>, difference: f64) {
         let Some(fold) = fold else { return };
         self.sums[channel][fold] += difference * difference;
         self.counts[channel][fold] += 1.0;
     }
 
-    /// Adds what is left of other rows.
+    /// Adds the sums and counts of `other`.
     pub fn add_all(&mut self, other: &Self) {
         let mine = self.sums.as_flattened_mut().iter_mut().chain(self.counts.as_flattened_mut());
         mine.zip(other.sums.as_flattened().iter().chain(other.counts.as_flattened()))
             .for_each(|(sum, more)| *sum += more);
     }
 
-    /// True if the candidate diverged.
+    /// Returns true if the simulation diverged.
     pub fn diverged(&self) -> bool {
         self.sums.iter().flatten().any(|sum| !sum.is_finite())
     }
 
-    /// Evidence for this model against `before` in a channel and fold [nats], with `rows` counting as one.
+    /// Returns the log-likelihood gain over `before` for one channel and fold [nat].
+    ///
+    /// ½ n ln(SSR_before / SSR), with n = row count / `rows`, where `rows` is the correlation length.
     pub fn log_likelihood_gain(&self, before: &Self, channel: usize, fold: usize, rows: f64) -> f64 {
         let (now, then, count) = (self.sums[channel][fold], before.sums[channel][fold], before.counts[channel][fold]);
         if count == 0.0 {
@@ -73,17 +77,17 @@ impl ResidualPower {
         0.5 * count / rows * ((then + 1e-9) / (now + 1e-9)).ln()
     }
 
-    /// Power above noise and misfit, everywhere.
+    /// Returns the power above noise and model error of all channels, and of the robot's nuisance parameters.
     pub fn power_above_noise(&self) -> f64 {
         (0..CHANNELS).map(|channel| self.channel_excess(channel)).sum::<f64>() + self.tolerated_excess()
     }
 
-    /// Power that errors of the robot would have to explain beyond what any robot has.
+    /// Returns the power by which the robot's nuisance parameters exceed their expectation.
     pub fn tolerated_excess(&self) -> f64 {
         nuisance::excess(self.nuisance_cost[1])
     }
 
-    /// Power above noise and misfit of a channel.
+    /// Returns the power above noise and model error of a channel.
     pub fn channel_excess(&self, channel: usize) -> f64 {
         let sum: f64 = self.sums[channel].iter().sum();
         (sum - self.counts[channel].iter().sum::<f64>()).max(0.0)

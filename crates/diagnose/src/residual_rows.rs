@@ -57,7 +57,7 @@ impl ResidualRows {
     }
 
     /// What candidates leave of the motion.
-    pub fn leftovers(&self, simulator: &mut dyn Rollout, robots: &[RobotModel]) -> Vec<ResidualPower> {
+    pub fn residual_powers(&self, simulator: &mut dyn Rollout, robots: &[RobotModel]) -> Vec<ResidualPower> {
         let mut whole = vec![Vec::new(); robots.len()];
         for experiment in &self.experiments {
             for (robots, whole) in robots.chunks(BATCH_SIZE).zip(whole.chunks_mut(BATCH_SIZE)) {
@@ -65,7 +65,7 @@ impl ResidualRows {
                 whole.iter_mut().zip(residuals).for_each(|(whole, residuals)| whole.extend(residuals));
             }
         }
-        whole.into_par_iter().map(|residuals| self.leftover(residuals)).collect()
+        whole.into_par_iter().map(|residuals| self.residual_power(residuals)).collect()
     }
 
     /// Residuals of a candidate less what tolerated errors explain.
@@ -79,7 +79,7 @@ impl ResidualRows {
         residuals
     }
 
-    fn leftover(&self, mut residuals: Vec<f64>) -> ResidualPower {
+    fn residual_power(&self, mut residuals: Vec<f64>) -> ResidualPower {
         if let Some(tolerances) = &self.tolerances {
             tolerances.project_out(&mut residuals);
         }
@@ -100,8 +100,8 @@ pub fn fold_of(log: &Log, row: usize) -> Option<usize> {
 
 #[cfg(test)]
 mod tests {
-    use twinstep_model::BaseMount;
     use twinstep_logs::{Meta, Segment, TorqueSensor};
+    use twinstep_model::BaseMount;
 
     use super::*;
 

@@ -2,12 +2,12 @@
 //! each other, so that one simulation judges all twelve, and any scope is a sum over its joints. Effects on the trunk, the
 //! ground and the gyroscope are judged by the whole log.
 
+use twinstep_effects::ModelFile;
 use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Scope, Target};
 use twinstep_model::{Joint, RobotModel, Rollout};
-use twinstep_effects::ModelFile;
 
+use super::hypothesis::{Hypothesis, body_grid, fine_grid, grid, selection_penalty, with_effect};
 use super::residual_data::ResidualData;
-use super::hypothesis::{Hypothesis, selection_penalty, grid, fine_grid, body_grid, with_effect};
 use super::residual_power::{CHANNELS, ResidualPower, TORQUE};
 
 /// Scopes of one effect that go on.
@@ -48,8 +48,11 @@ fn scan_effect(
         Some((values, robot))
     };
     let (values, robots): (Vec<_>, Vec<_>) = grid(effect).into_iter().filter_map(built).unzip();
-    let gains: Vec<_> =
-        evidence.residual_powers(simulator, &robots, true).iter().map(|now| joint_gains(evidence, now, before)).collect();
+    let gains: Vec<_> = evidence
+        .residual_powers(simulator, &robots, true)
+        .iter()
+        .map(|now| joint_gains(evidence, now, before))
+        .collect();
     let scopes = if effect.target == Target::Supply { vec![Scope::All] } else { Scope::of_joints() };
     let mut scored: Vec<ScoredHypothesis> = scopes
         .into_iter()
@@ -84,7 +87,8 @@ pub fn confounders_of(
     before: &ResidualPower,
     simulator: &mut dyn Rollout,
 ) -> Vec<Hypothesis> {
-    let confused = |one: &Effect, other: &Effect| one.confounders.iter().any(|confusion| confusion.effect == other.name);
+    let confused =
+        |one: &Effect, other: &Effect| one.confounders.iter().any(|confusion| confusion.effect == other.name);
     let is_new = |effect: &Effect| !tried.contains(&format!("{}@{}", effect.name, best.scope));
     let effects = CATALOGUE.into_iter().filter(|effect| {
         let alike = confused(effect, best.effect) || confused(best.effect, effect);
@@ -142,14 +146,20 @@ fn best_values(
         Some((values, file.robot_model().ok()?))
     };
     let (values, robots): (Vec<_>, Vec<_>) = values.into_iter().filter_map(built).unzip();
-    let scores = evidence.residual_powers(simulator, &robots, false).into_iter().map(|now| log_likelihood_gain(evidence, &now, before));
+    let scores = evidence
+        .residual_powers(simulator, &robots, false)
+        .into_iter()
+        .map(|now| log_likelihood_gain(evidence, &now, before));
     scores.zip(values).max_by(|one, other| one.0.total_cmp(&other.0)).map(|(_, values)| values)
 }
 
 /// Evidence of everything [nats].
 pub fn log_likelihood_gain(evidence: &ResidualData, now: &ResidualPower, before: &ResidualPower) -> f64 {
     let of = |channel: usize| {
-        [0, 1].map(|fold| now.log_likelihood_gain(before, channel, fold, evidence.correlation_rows(channel))).iter().sum::<f64>()
+        [0, 1]
+            .map(|fold| now.log_likelihood_gain(before, channel, fold, evidence.correlation_rows(channel)))
+            .iter()
+            .sum::<f64>()
     };
     (0..CHANNELS).map(of).sum::<f64>() + now.tolerated_gain(before)
 }
@@ -164,8 +174,13 @@ fn body_effects() -> Vec<(&'static Effect, Scope)> {
 }
 
 /// Judges [`of_the_whole`].
-fn scan_whole(evidence: &ResidualData, model: &ModelFile, robot: &RobotModel, simulator: &mut dyn Rollout) -> Vec<ScoredHypothesis> {
-    let before = evidence.leftover(simulator, robot);
+fn scan_whole(
+    evidence: &ResidualData,
+    model: &ModelFile,
+    robot: &RobotModel,
+    simulator: &mut dyn Rollout,
+) -> Vec<ScoredHypothesis> {
+    let before = evidence.residual_power(simulator, robot);
     let mut scored = Vec::new();
     for (effect, scope) in body_effects() {
         let built = |values: Vec<f64>| {
@@ -174,7 +189,10 @@ fn scan_whole(evidence: &ResidualData, model: &ModelFile, robot: &RobotModel, si
             Some((values, file.robot_model().ok()?))
         };
         let (values, robots): (Vec<_>, Vec<_>) = body_grid(effect).into_iter().filter_map(built).unzip();
-        let gains = evidence.residual_powers(simulator, &robots, false).into_iter().map(|now| log_likelihood_gain(evidence, &now, &before));
+        let gains = evidence
+            .residual_powers(simulator, &robots, false)
+            .into_iter()
+            .map(|now| log_likelihood_gain(evidence, &now, &before));
         let best = gains.zip(values).max_by(|one, other| one.0.total_cmp(&other.0));
         scored.extend(best.map(|(score, values)| ScoredHypothesis {
             hypothesis: Hypothesis { effect, scope, values },

@@ -4,12 +4,12 @@ use twinstep_effects::EffectEntry;
 use twinstep_effects::ModelFile;
 use twinstep_model::RobotModel;
 
-use super::torque_only::{excess, nats};
 use super::hypothesis::selection_penalty;
-use super::profile_likelihood::LOG_LIKELIHOOD_DROP_95;
-use super::residual_power::{ResidualPower, TORQUE};
 use super::joint_slots::JointSlots;
+use super::profile_likelihood::LOG_LIKELIHOOD_DROP_95;
 use super::reporting::{SIMULATOR_MISMATCH_REL_STD, TWO_SIDED_95};
+use super::residual_power::{ResidualPower, TORQUE};
+use super::torque_only::{excess, nats};
 use twinstep_identify::parameter::{FreeParameter, free_parameters};
 
 /// First and last step of a descent [prior deviations].
@@ -34,7 +34,7 @@ pub struct TorqueCandidate {
 
 /// A cause on top of others.
 pub struct TorqueFit<'a> {
-    seats: &'a JointSlots,
+    slots: &'a JointSlots,
     others: &'a [EffectEntry],
     cause: &'a EffectEntry,
     unknowns: Vec<FreeParameter>,
@@ -44,11 +44,11 @@ pub struct TorqueFit<'a> {
 
 impl<'a> TorqueFit<'a> {
     /// From the values that `cause` has, on top of `others`.
-    pub fn new(seats: &'a JointSlots, others: &'a [EffectEntry], cause: &'a EffectEntry) -> Option<Self> {
+    pub fn new(slots: &'a JointSlots, others: &'a [EffectEntry], cause: &'a EffectEntry) -> Option<Self> {
         let (_, unknowns) = free_parameters(&ModelFile::default(), &[(cause.effect, cause.scope)]).ok()?;
         let begin = unknowns.iter().zip(&cause.values).map(|(unknown, value)| unknown.coordinate(*value)).collect();
-        let before = seats.leftovers(&[seats.robot(others)?]).remove(0);
-        Some(Self { seats, others, cause, unknowns, begin, before })
+        let before = slots.residual_powers(&[slots.robot(others)?]).remove(0);
+        Some(Self { slots, others, cause, unknowns, begin, before })
     }
 
     /// The cause with the values of `point`.
@@ -83,15 +83,15 @@ impl<'a> TorqueFit<'a> {
         let middle = one.iter().zip(&other).map(|(one, other)| 0.5 * (one + other)).collect();
         let points = [one, other, middle];
         let robots: Vec<RobotModel> = points.iter().map(|point| self.robot(point)).collect::<Option<_>>()?;
-        let left = self.seats.leftovers(&robots);
+        let left = self.slots.residual_powers(&robots);
         let scope = self.cause.scope;
         let evidence: f64 =
-            [(0, 1), (1, 0)].map(|(of, on)| nats(self.seats, scope, &left[of], &self.before, &[on])).iter().sum();
+            [(0, 1), (1, 0)].map(|(of, on)| nats(self.slots, scope, &left[of], &self.before, &[on])).iter().sum();
         let sums = |left: [&ResidualPower; 2]| -> f64 {
-            self.seats.of(scope).map(|seat| left[0].sums[TORQUE + seat][1] + left[1].sums[TORQUE + seat][0]).sum()
+            self.slots.of(scope).map(|seat| left[0].sums[TORQUE + seat][1] + left[1].sums[TORQUE + seat][0]).sum()
         };
         let [then, now] = [sums([&self.before; 2]), sums([&left[0], &left[1]])];
-        let [above, still] = [&self.before, &left[2]].map(|left| excess(self.seats, scope, left));
+        let [above, still] = [&self.before, &left[2]].map(|left| excess(self.slots, scope, left));
         Some(TorqueCandidate {
             entry: self.entry_at(&points[2]),
             score: evidence - selection_penalty(scope) - 0.5 * self.unknowns.len() as f64 * 200f64.ln(),
@@ -129,18 +129,18 @@ impl<'a> TorqueFit<'a> {
     }
 
     fn robot(&self, point: &[f64]) -> Option<RobotModel> {
-        self.seats.robot(&[self.others, &[self.entry_at(point)]].concat())
+        self.slots.robot(&[self.others, &[self.entry_at(point)]].concat())
     }
 
     /// Evidence at points against none of the cause [nats].
     fn nats(&self, points: &[Vec<f64>], folds: &[usize]) -> Vec<f64> {
         let robots: Vec<Option<RobotModel>> = points.iter().map(|point| self.robot(point)).collect();
         let built: Vec<RobotModel> = robots.iter().flatten().cloned().collect();
-        let mut left = self.seats.leftovers(&built).into_iter();
+        let mut left = self.slots.residual_powers(&built).into_iter();
         let scope = self.cause.scope;
         let found = |robot: &Option<RobotModel>| {
             let left = robot.as_ref().and_then(|_| left.next());
-            left.map_or(f64::NEG_INFINITY, |left| nats(self.seats, scope, &left, &self.before, folds))
+            left.map_or(f64::NEG_INFINITY, |left| nats(self.slots, scope, &left, &self.before, folds))
         };
         robots.iter().map(found).collect()
     }

@@ -4,21 +4,21 @@
 //! The rules are those of the whole diagnosis: a cause is fitted to one fold of seconds and judged on the other, and is named
 //! if its evidence is above the threshold, it explains a good part of what is above the noise, and it is large enough.
 
+use twinstep_effects::{CATALOGUE, EffectEntry, Parameter, Scope, Target};
 use twinstep_logs::Log;
 use twinstep_model::RobotModel;
-use twinstep_effects::{CATALOGUE, EffectEntry, Parameter, Scope, Target};
 
-use super::forward_selection::{MIN_EXPLAINED_FRACTION, MAX_REMAINING_FRACTION, THRESHOLD, NEGLIGIBLE_EXCESS};
-use super::hypothesis::{Hypothesis, selection_penalty, grid};
-use super::residual_power::{ResidualPower, TORQUE};
+use super::forward_selection::{MAX_REMAINING_FRACTION, MIN_EXPLAINED_FRACTION, NEGLIGIBLE_EXCESS, THRESHOLD};
+use super::hypothesis::{Hypothesis, grid, selection_penalty};
 use super::joint_slots::JointSlots;
+use super::residual_power::{ResidualPower, TORQUE};
 use super::torque_fit::{TorqueCandidate, TorqueFit};
 use super::unexplained::{self, LEAST_EXCESS};
-use super::{AMBIGUITY_NATS, AMBIGUITY_FRACTION, DiagnoseError, DiagnoseProgress};
-use crate::findings::{Cause, Diagnosis, RmsErrors, Estimate, AlternativeCause, Unexplained, ParameterValue};
+use super::{AMBIGUITY_FRACTION, AMBIGUITY_NATS, DiagnoseError, DiagnoseProgress};
+use crate::findings::{AlternativeCause, Cause, Diagnosis, Estimate, ParameterValue, RmsErrors, Unexplained};
 use twinstep_identify::experiment::ExperimentError;
 
-/// Joints that are looked at together, as many as the Go2 has seats.
+/// Joints that are looked at together, as many as the Go2 has slots.
 const TOGETHER: usize = twinstep_model::NUM_JOINTS;
 /// Hypotheses that are fitted, of those that a first look at a few sizes found.
 const TRIED: usize = 4;
@@ -29,15 +29,16 @@ const MOST_CAUSES: usize = 12;
 pub fn diagnose_torques(logs: &[Log], progress: &mut DiagnoseProgress) -> Result<Diagnosis, DiagnoseError> {
     let mut all = Vec::new();
     for names in logs[0].joints().chunks(TOGETHER) {
-        let seats = JointSlots::new(logs, names).map_err(ExperimentError::from)?;
-        let mut search = TorqueForwardSelection { seats: &seats, causes: Vec::new(), progress: &mut *progress };
+        let slots = JointSlots::new(logs, names).map_err(ExperimentError::from)?;
+        let mut search = TorqueForwardSelection { slots: &slots, causes: Vec::new(), progress: &mut *progress };
         search.run()?;
         let causes = std::mem::take(&mut search.causes);
-        all.push(JointGroupResult::new(&seats, &causes, &logs[0]));
+        all.push(JointGroupResult::new(&slots, &causes, &logs[0]));
     }
     let sums = |of: fn(&JointGroupResult) -> [f64; 3]| {
         let sum = |index: usize| all.iter().map(|part| of(part)[index]).sum::<f64>();
-        let rmse = |squares: f64| RmsErrors { torque_rmse_nm: Some((squares / sum(2).max(1.0)).sqrt()), q_rmse_rad: None };
+        let rmse =
+            |squares: f64| RmsErrors { torque_rmse_nm: Some((squares / sum(2).max(1.0)).sqrt()), q_rmse_rad: None };
         [rmse(sum(0)), rmse(sum(1))]
     };
     let ([baseline, noise_floor], [extended, _]) = (sums(|part| part.before), sums(|part| part.after));
@@ -63,26 +64,26 @@ struct JointGroupResult {
 }
 
 impl JointGroupResult {
-    fn new(seats: &JointSlots, causes: &[TorqueCandidate], log: &Log) -> Self {
+    fn new(slots: &JointSlots, causes: &[TorqueCandidate], log: &Log) -> Self {
         let entries: Vec<EffectEntry> = causes.iter().map(|cause| cause.entry.clone()).collect();
-        let [given, named] = [&[][..], &entries].map(|entries| seats.robot(entries).expect("entries that were fitted"));
+        let [given, named] = [&[][..], &entries].map(|entries| slots.robot(entries).expect("entries that were fitted"));
         let told = |index: usize| {
             let others = entries.iter().enumerate().filter(|(other, _)| *other != index);
             let others: Vec<EffectEntry> = others.map(|(_, entry)| entry.clone()).collect();
-            cause(seats, &causes[index], &others)
+            cause(slots, &causes[index], &others)
         };
         Self {
             causes: (0..causes.len()).map(told).collect(),
-            before: seats.held_out_sums(&given),
-            after: seats.held_out_sums(&named),
-            unexplained: left(seats, [&given, &named], log),
+            before: slots.held_out_sums(&given),
+            after: slots.held_out_sums(&named),
+            unexplained: left(slots, [&given, &named], log),
         }
     }
 }
 
 /// The search for causes at some joints.
 struct TorqueForwardSelection<'a, 'b> {
-    seats: &'a JointSlots,
+    slots: &'a JointSlots,
     causes: Vec<TorqueCandidate>,
     progress: &'a mut DiagnoseProgress<'b>,
 }
@@ -99,7 +100,7 @@ impl TorqueForwardSelection<'_, '_> {
             self.say()?;
             let cause = self.causes.remove(place);
             let others = self.entries();
-            let again = TorqueFit::new(self.seats, &others, &cause.entry);
+            let again = TorqueFit::new(self.slots, &others, &cause.entry);
             let entry = again.map_or(cause.entry.clone(), |fit| fit.entry_at(&fit.coordinate_descent(&[0, 1])));
             self.causes.insert(place, TorqueCandidate { entry, ..cause });
         }
@@ -110,7 +111,7 @@ impl TorqueForwardSelection<'_, '_> {
     }
 
     fn say(&mut self) -> Result<(), DiagnoseError> {
-        let text = format!("torques of {} and others, {} named", self.seats.name(0), self.causes.len());
+        let text = format!("torques of {} and others, {} named", self.slots.name(0), self.causes.len());
         if (self.progress)(&text) { Ok(()) } else { Err(DiagnoseError::Interrupted) }
     }
 
@@ -121,14 +122,17 @@ impl TorqueForwardSelection<'_, '_> {
     /// The best cause on top of those that are named, if one earns a name.
     fn next(&self) -> Option<TorqueCandidate> {
         let entries = self.entries();
-        let named =
-            |entry: &EffectEntry| entries.iter().any(|other| other.effect == entry.effect && other.scope == entry.scope);
+        let named = |entry: &EffectEntry| {
+            entries.iter().any(|other| other.effect == entry.effect && other.scope == entry.scope)
+        };
         let tried = self.candidates(&entries)?.into_iter().filter(|entry| !named(entry)).take(TRIED);
         let mut found: Vec<TorqueCandidate> =
-            tried.filter_map(|entry| TorqueFit::new(self.seats, &entries, &entry)?.cross_validated()).collect();
+            tried.filter_map(|entry| TorqueFit::new(self.slots, &entries, &entry)?.cross_validated()).collect();
         found.sort_by(|one, other| other.score.total_cmp(&one.score));
         let earns = |found: &TorqueCandidate| {
-            found.score >= THRESHOLD && found.explains >= MIN_EXPLAINED_FRACTION && hypothesis(&found.entry).exceeds_min_size()
+            found.score >= THRESHOLD
+                && found.explains >= MIN_EXPLAINED_FRACTION
+                && hypothesis(&found.entry).exceeds_min_size()
         };
         let place = found.iter().position(earns)?;
         let best = found.remove(place);
@@ -137,24 +141,25 @@ impl TorqueForwardSelection<'_, '_> {
 
     /// Every effect that torques show, on all joints and on each, with the best of a few sizes; the best first.
     fn candidates(&self, entries: &[EffectEntry]) -> Option<Vec<EffectEntry>> {
-        let now = self.seats.robot(entries)?;
-        let before = self.seats.leftovers(std::slice::from_ref(&now)).remove(0);
+        let now = self.slots.robot(entries)?;
+        let before = self.slots.residual_powers(std::slice::from_ref(&now)).remove(0);
         let mut scored = Vec::new();
         for effect in CATALOGUE.into_iter().filter(|effect| effect.target == Target::Joints) {
             let with = |values: Vec<f64>| {
                 let entry = EffectEntry::new(effect, Scope::All, values.clone()).ok()?;
-                Some((values, self.seats.robot(&[entries, &[entry]].concat())?))
+                Some((values, self.slots.robot(&[entries, &[entry]].concat())?))
             };
             let (values, robots): (Vec<_>, Vec<_>) = grid(effect).into_iter().filter_map(with).unzip();
-            if !robots.iter().any(|robot| self.seats.affects_torque(robot, &now)) {
+            if !robots.iter().any(|robot| self.slots.affects_torque(robot, &now)) {
                 continue;
             }
-            let left = self.seats.leftovers(&robots);
-            for scope in self.seats.scopes() {
-                let of = |size: usize, fold: usize| nats(self.seats, scope, &left[size], &before, &[fold]);
+            let left = self.slots.residual_powers(&robots);
+            for scope in self.slots.scopes() {
+                let of = |size: usize, fold: usize| nats(self.slots, scope, &left[size], &before, &[fold]);
                 let best = |of: &dyn Fn(usize) -> f64| (0..values.len()).max_by(|a, b| of(*a).total_cmp(&of(*b)));
                 // Chosen on one fold, judged on the other.
-                let judged = of(best(&|size| of(size, 0))?, 1) + of(best(&|size| of(size, 1))?, 0) - selection_penalty(scope);
+                let judged =
+                    of(best(&|size| of(size, 0))?, 1) + of(best(&|size| of(size, 1))?, 0) - selection_penalty(scope);
                 let whole = best(&|size| of(size, 0) + of(size, 1))?;
                 scored.push((judged, EffectEntry::new(effect, scope, values[whole].clone()).ok()?));
             }
@@ -166,13 +171,14 @@ impl TorqueForwardSelection<'_, '_> {
 
     /// A cause that is too small, more than any actuator has, or leaves half of what was wrong at its own joints.
     fn untenable(&self) -> Option<usize> {
-        let (given, named) = (self.seats.robot(&[])?, self.seats.robot(&self.entries())?);
-        let left = self.seats.leftovers(&[given, named]);
+        let (given, named) = (self.slots.robot(&[])?, self.slots.robot(&self.entries())?);
+        let left = self.slots.residual_powers(&[given, named]);
         let stands = |cause: &TorqueCandidate| {
-            let excess = |left: &ResidualPower| excess(self.seats, cause.entry.scope, left);
-            let rows: f64 = self.seats.of(cause.entry.scope).flat_map(|seat| left[1].counts[TORQUE + seat]).sum();
+            let excess = |left: &ResidualPower| excess(self.slots, cause.entry.scope, left);
+            let rows: f64 = self.slots.of(cause.entry.scope).flat_map(|seat| left[1].counts[TORQUE + seat]).sum();
             let one = hypothesis(&cause.entry);
-            let explains = excess(&left[1]) <= NEGLIGIBLE_EXCESS * rows || excess(&left[1]) <= MAX_REMAINING_FRACTION * excess(&left[0]);
+            let explains = excess(&left[1]) <= NEGLIGIBLE_EXCESS * rows
+                || excess(&left[1]) <= MAX_REMAINING_FRACTION * excess(&left[0]);
             one.exceeds_min_size() && one.is_plausible() && explains
         };
         self.causes.iter().position(|cause| !stands(cause))
@@ -180,15 +186,16 @@ impl TorqueForwardSelection<'_, '_> {
 }
 
 /// Evidence for what leaves `now` against what leaves `before` on a scope [nats].
-pub fn nats(seats: &JointSlots, scope: Scope, now: &ResidualPower, before: &ResidualPower, folds: &[usize]) -> f64 {
-    let rows = seats.rows_in_one();
-    let of = |seat: usize| folds.iter().map(|fold| now.log_likelihood_gain(before, TORQUE + seat, *fold, rows)).sum::<f64>();
-    seats.of(scope).map(of).sum()
+pub fn nats(slots: &JointSlots, scope: Scope, now: &ResidualPower, before: &ResidualPower, folds: &[usize]) -> f64 {
+    let rows = slots.rows_in_one();
+    let of =
+        |seat: usize| folds.iter().map(|fold| now.log_likelihood_gain(before, TORQUE + seat, *fold, rows)).sum::<f64>();
+    slots.of(scope).map(of).sum()
 }
 
 /// Power above the noise on a scope.
-pub fn excess(seats: &JointSlots, scope: Scope, left: &ResidualPower) -> f64 {
-    seats.of(scope).map(|seat| left.channel_excess(TORQUE + seat)).sum()
+pub fn excess(slots: &JointSlots, scope: Scope, left: &ResidualPower) -> f64 {
+    slots.of(scope).map(|seat| left.channel_excess(TORQUE + seat)).sum()
 }
 
 fn hypothesis(entry: &EffectEntry) -> Hypothesis {
@@ -196,21 +203,23 @@ fn hypothesis(entry: &EffectEntry) -> Hypothesis {
 }
 
 /// As people read it, in the joints' own names and units.
-fn cause(seats: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) -> Cause {
-    let (effect, scope) = (found.entry.effect, seats.scope_name(found.entry.scope));
-    let fit = TorqueFit::new(seats, others, &found.entry).expect("it was fitted before");
+fn cause(slots: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) -> Cause {
+    let (effect, scope) = (found.entry.effect, slots.scope_name(found.entry.scope));
+    let fit = TorqueFit::new(slots, others, &found.entry).expect("it was fitted before");
     let numbers = effect.parameters.iter().zip(&found.entry.values).zip(fit.intervals());
     let told = |((parameter, value), [low, high]): ((&Parameter, &f64), [f64; 2])| {
-        // Torques in the seats are in units of their own.
-        let unit = if parameter.unit.contains("N·m") || parameter.unit == "kg·m²" { seats.torque_scale } else { 1.0 };
+        // Torques in the slots are in units of their own.
+        let unit =
+            if parameter.unit.contains("N·m") || parameter.unit == "kg·m²" { slots.torque_scale } else { 1.0 };
         let [value, low, high] = [*value, low, high].map(|number| ParameterValue::Number(unit * number));
         (parameter.name.to_owned(), Estimate { value, low, high })
     };
-    let name = |entry: &EffectEntry| format!("{}@{}", entry.effect.name, seats.scope_name(entry.scope));
-    let close = |other: &&TorqueCandidate| other.score > found.score - AMBIGUITY_NATS.max(AMBIGUITY_FRACTION * found.score);
+    let name = |entry: &EffectEntry| format!("{}@{}", entry.effect.name, slots.scope_name(entry.scope));
+    let close =
+        |other: &&TorqueCandidate| other.score > found.score - AMBIGUITY_NATS.max(AMBIGUITY_FRACTION * found.score);
     let rival = |other: &TorqueCandidate| AlternativeCause {
         effect: other.entry.effect.name.to_owned(),
-        scope: seats.scope_name(other.entry.scope),
+        scope: slots.scope_name(other.entry.scope),
         held_out_gain: other.gain,
     };
     let mut evidence = format!(
@@ -236,25 +245,25 @@ fn cause(seats: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) ->
 }
 
 /// What is left where it is most, and what that depends on.
-fn left(seats: &JointSlots, [given, named]: [&RobotModel; 2], log: &Log) -> Unexplained {
-    let left = seats.leftovers(&[given.clone(), named.clone()]);
-    let [before, after] = [&left[0], &left[1]].map(|left| excess(seats, Scope::All, left));
+fn left(slots: &JointSlots, [given, named]: [&RobotModel; 2], log: &Log) -> Unexplained {
+    let left = slots.residual_powers(&[given.clone(), named.clone()]);
+    let [before, after] = [&left[0], &left[1]].map(|left| excess(slots, Scope::All, left));
     let share = |seat: usize| {
         let rows: f64 = left[1].counts[TORQUE + seat].iter().sum();
         left[1].channel_excess(TORQUE + seat) / rows.max(1.0)
     };
-    let worst = seats.of(Scope::All).max_by(|one, other| share(*one).total_cmp(&share(*other)));
+    let worst = slots.of(Scope::All).max_by(|one, other| share(*one).total_cmp(&share(*other)));
     let Some(seat) = worst.filter(|seat| share(*seat) > LEAST_EXCESS) else { return unexplained::only_noise() };
     let fraction = if before > 0.0 { (after / before).min(1.0) } else { 0.0 };
-    let whose = format!("The torque of {}", seats.name(seat));
-    unexplained::describe_residual(log, &seats.residual(named, seat), unexplained::measured(log), fraction, &whose)
+    let whose = format!("The torque of {}", slots.name(seat));
+    unexplained::describe_residual(log, &slots.residual(named, seat), unexplained::measured(log), fraction, &whose)
 }
 
 #[cfg(test)]
 mod tests {
     use rand::RngExt;
-    use twinstep_model::BaseMount;
     use twinstep_logs::{Meta, Segment, TorqueSensor};
+    use twinstep_model::BaseMount;
     use twinstep_model::{standard_normal, stream};
 
     use super::*;
@@ -326,7 +335,9 @@ mod tests {
         assert_eq!(names[1..], ["torque_gain@axis_13"], "{:#?}", found.findings);
         let within = |place: usize, name: &str, truth: f64| {
             let told = &found.findings[place].parameters[name];
-            let [ParameterValue::Number(low), ParameterValue::Number(high)] = [&told.low, &told.high] else { return false };
+            let [ParameterValue::Number(low), ParameterValue::Number(high)] = [&told.low, &told.high] else {
+                return false;
+            };
             (*low..=*high).contains(&truth)
         };
         assert!(within(0, "delay_s", 0.008) && within(1, "gain", 0.85), "{:#?}", found.findings);

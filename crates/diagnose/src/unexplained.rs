@@ -5,11 +5,11 @@ use twinstep_model::{JOINT_NAMES, RobotModel, Rollout};
 
 use super::residual_data::ResidualData;
 use super::residual_power::{ResidualPower, TORQUE, TRUNK};
-use super::spectral_line::spectral_line;
 use super::residual_rows::fold_of;
+use super::spectral_line::spectral_line;
 use crate::findings::Unexplained;
 use twinstep_identify::experiment::ResidualChannel;
-use twinstep_identify::motion::{JointCommands, command, joint_commands};
+use twinstep_logs::replay::{JointCommands, command, joint_commands};
 
 /// Bins of a variable that might explain a residual.
 const BINS: usize = 12;
@@ -104,7 +104,8 @@ fn residual(evidence: &ResidualData, robot: &RobotModel, channel: usize, simulat
         evidence.torques().differences(robot, each);
     } else {
         let corrected = evidence.fit_rows.nuisance_corrected(simulator, robot);
-        for (corrected, (quantity, row)) in corrected.into_iter().zip(evidence.fit_rows.experiments[0].residual_index()) {
+        for (corrected, (quantity, row)) in corrected.into_iter().zip(evidence.fit_rows.experiments[0].residual_index())
+        {
             if quantity == ResidualChannel::Position(channel) {
                 residual[row] = corrected;
             }

@@ -77,9 +77,7 @@ impl EffectEntry {
                 (scope.joints() > 0, "all, hip, thigh, calf, FL, FR, RL, RR, left, right, or a joint such as FL_hip")
             }
             Target::Supply => (scope == Scope::All, "all"),
-            Target::Bodies => {
-                (matches!(scope, Scope::Base | Scope::Joint(_)), "base, or a joint for its child link")
-            }
+            Target::Bodies => (matches!(scope, Scope::Base | Scope::Joint(_)), "base, or a joint for its child link"),
             Target::Base => (scope == Scope::Base, "base"),
             Target::Ground => (scope == Scope::Ground, "ground"),
         };

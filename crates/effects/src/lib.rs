@@ -19,9 +19,11 @@ mod scope;
 
 pub use catalogue::CATALOGUE;
 pub use data_requirement::{DataRequirement, LOW_SPEED};
-pub use sampler::{SamplingError, RobotSampler};
 pub use entry::{EffectEntry, EntryError, apply_effects};
-pub use model_file::{ActuatorNetworkConfig, EffectEntryError, MemberSampling, ModelFile, ModelFileError, load_robot, parse_robot};
+pub use model_file::{
+    ActuatorNetworkConfig, EffectEntryError, MemberSampling, ModelFile, ModelFileError, load_robot, parse_robot,
+};
+pub use sampler::{RobotSampler, SamplingError};
 pub use scope::{Scope, UnknownScope};
 
 use twinstep_model::RobotModel;

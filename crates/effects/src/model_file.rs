@@ -57,7 +57,7 @@ pub enum ModelFileError {
         "{name}: `[actuator]` is for `twinstep serve` and `twinstep play`; no other command simulates actuator \
          networks. Remove the table to use the analytic actuators with the effects of the file"
     )]
-    LearnedDrive {
+    ActuatorNetwork {
         /// The file, or another source of the text.
         name: String,
     },
@@ -275,13 +275,11 @@ fn read_entry(table: &Table) -> Result<EffectEntry, EffectEntryError> {
     if let Some(key) = table.keys().find(|key| !["name", "scope", "interval"].contains(&key.as_str()) && !known(key)) {
         return Err(EffectEntryError::UnknownKey { effect: effect.name, key: key.clone() });
     }
-    let scope: Scope = text("scope")?
-        .parse()
-        .map_err(|_: crate::UnknownScope| {
-            let expected = "one of all, hip, thigh, calf, FL, FR, RL, RR, left, right, base, ground, or a joint such \
+    let scope: Scope = text("scope")?.parse().map_err(|_: crate::UnknownScope| {
+        let expected = "one of all, hip, thigh, calf, FL, FR, RL, RR, left, right, base, ground, or a joint such \
                             as FL_hip";
-            key_error("scope", table.get("scope"), expected)
-        })?;
+        key_error("scope", table.get("scope"), expected)
+    })?;
     let mut values = Vec::new();
     for parameter in effect.parameters {
         values.extend(read_numbers(parameter.name, table.get(parameter.name), parameter.count)?);
@@ -364,7 +362,7 @@ pub fn parse_robot(text: &str, name: &str) -> Result<RobotModel, ModelFileError>
 
 fn analytic(file: ModelFile, name: &str) -> Result<ModelFile, ModelFileError> {
     if file.actuator.is_some() {
-        return Err(ModelFileError::LearnedDrive { name: name.to_owned() });
+        return Err(ModelFileError::ActuatorNetwork { name: name.to_owned() });
     }
     Ok(file)
 }
@@ -418,7 +416,10 @@ mod tests {
             .expect("written");
         let file = ModelFile::load(&path).expect("valid");
         let ensemble = folder.path().join("e.safetensors");
-        assert_eq!(file.actuator, Some(ActuatorNetworkConfig { ensemble, draw: MemberSampling::PerStep, sample: false }));
+        assert_eq!(
+            file.actuator,
+            Some(ActuatorNetworkConfig { ensemble, draw: MemberSampling::PerStep, sample: false })
+        );
         assert_eq!(ModelFile::parse(&file.to_toml(), "again").expect("valid"), file);
         for refusal in [load_robot(&path).map(drop), ModelFile::load_without_actuator_network(&path).map(drop)] {
             let error = refusal.expect_err("refused").to_string();
@@ -485,9 +486,7 @@ mod tests {
         );
         check_refusal(
             &format!("{FRICTION}torque_nm = 1\ninterval = {{ torque_nm = [2, 1] }}"),
-            &expect![[
-                r#"robot.toml: effect 1: `interval.torque_nm` is [2, 1]; expected low <= high"#
-            ]],
+            &expect![[r#"robot.toml: effect 1: `interval.torque_nm` is [2, 1]; expected low <= high"#]],
         );
         check_refusal(
             &FRICTION.replace("RR_thigh", "RR_knee"),

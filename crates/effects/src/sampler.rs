@@ -150,9 +150,11 @@ mod tests {
     #[test]
     fn intervals_with_few_valid_robots_are_rejected_with_the_reason() {
         let error = draws(&delays(0.06)).expect_err("refused");
-        expect![["only 19 of 100 samples from the intervals of the model file are valid robots; at least half must be \
+        expect![[
+            "only 19 of 100 samples from the intervals of the model file are valid robots; at least half must be \
                   valid. One is not: `command_delay` on hip conflicts with another entry: the delays of a joint add \
-                  up to more than 0.04 s. Make the intervals narrower"]]
+                  up to more than 0.04 s. Make the intervals narrower"
+        ]]
         .assert_eq(&error.to_string());
     }
 }

@@ -31,7 +31,9 @@ pub fn check_vec_env(env: &mut dyn VecEnv, steps: usize) -> Result<(), CheckErro
     let first = rollout(env, steps)?;
     let second = rollout(env, steps)?;
     if let Some(step) = first.iter().zip(&second).position(|(one, two)| one != two) {
-        return Err(CheckError::ContractViolation(format!("equal seeds and actions gave different results in step {step}")));
+        return Err(CheckError::ContractViolation(format!(
+            "equal seeds and actions gave different results in step {step}"
+        )));
     }
     check_rejections(env)
 }
@@ -55,7 +57,8 @@ fn rollout(env: &mut dyn VecEnv, steps: usize) -> Result<Vec<StepBatch>, CheckEr
         check_numbers(&batch.obs, &spec, num_envs)?;
         for env in 0..num_envs {
             if restarts && waiting[env] && (batch.reward[env] != 0.0 || batch.done(env)) {
-                let what = "NextStep: the step that resets an environment must have reward 0 and must not end the episode";
+                let what =
+                    "NextStep: the step that resets an environment must have reward 0 and must not end the episode";
                 return Err(CheckError::ContractViolation(format!("{what}; environment {env}, step {step}")));
             }
             lengths[env] = if restarts && waiting[env] { 0 } else { lengths[env] + 1 };
@@ -74,7 +77,11 @@ fn test_action(step: usize, index: usize) -> f32 {
 fn check_numbers(obs: &[f32], spec: &twinstep_model::EnvSpec, num_envs: usize) -> Result<(), CheckError> {
     let obs_len = spec.obs_len();
     if obs.len() != num_envs * obs_len {
-        return Err(CheckError::ContractViolation(format!("`obs` has {} entries; {} are expected", obs.len(), num_envs * obs_len)));
+        return Err(CheckError::ContractViolation(format!(
+            "`obs` has {} entries; {} are expected",
+            obs.len(),
+            num_envs * obs_len
+        )));
     }
     let bounds: Vec<(f32, f32)> =
         spec.observation.iter().flat_map(|field| std::iter::repeat_n((field.low, field.high), field.size)).collect();
@@ -83,7 +90,9 @@ fn check_numbers(obs: &[f32], spec: &twinstep_model::EnvSpec, num_envs: usize) -
         if !(low..=high).contains(value) {
             let entry = spec.observation_entry(index % obs_len);
             let env = index / obs_len;
-            return Err(CheckError::ContractViolation(format!("{entry} of environment {env} is {value}, outside {low}..{high}")));
+            return Err(CheckError::ContractViolation(format!(
+                "{entry} of environment {env} is {value}, outside {low}..{high}"
+            )));
         }
     }
     Ok(())
@@ -109,7 +118,9 @@ fn check_ended(batch: &StepBatch, lengths: &mut [u32], env: &dyn VecEnv, step: u
             return violation(format!("environment {index} was truncated after {} steps", episode.length));
         }
         if episode.final_obs.len() != final_obs_len || episode.terms.len() != spec.reward_terms.len() {
-            return violation(format!("`terms` or `final_obs` of the ended episode of environment {index} has the wrong length"));
+            return violation(format!(
+                "`terms` or `final_obs` of the ended episode of environment {index} has the wrong length"
+            ));
         }
         lengths[index] = 0;
     }
@@ -120,7 +131,9 @@ fn check_rejections(env: &mut dyn VecEnv) -> Result<(), CheckError> {
     let num_actions = env.num_envs() * env.spec().action_len();
     let mut with_nan = vec![0.0; num_actions];
     with_nan[num_actions - 1] = f32::NAN;
-    for (actions, what) in [(vec![0.0; num_actions + 1], "a wrong number of actions"), (with_nan, "an action that is NaN")] {
+    for (actions, what) in
+        [(vec![0.0; num_actions + 1], "a wrong number of actions"), (with_nan, "an action that is NaN")]
+    {
         if env.step(&actions).is_ok() {
             return Err(CheckError::ContractViolation(format!("{what} was accepted")));
         }

@@ -94,9 +94,9 @@ macro_rules! reward_weights {
             /// Names of the terms, in the order of every per-term array.
             pub const NAMES: &'static [&'static str] = &[$(stringify!($name)),+];
 
-            /// Each weighted term of `moment`, in the order of [`RewardWeights::NAMES`].
-            pub fn evaluate(&self, moment: &crate::reward::RewardInput<'_>) -> [f32; NUM_REWARD_TERMS] {
-                [$(self.$name * crate::reward::$name(moment) * moment.policy_dt),+]
+            /// Returns the value of each weighted term, in the order of [`RewardWeights::NAMES`].
+            pub fn evaluate(&self, input: &crate::reward::RewardInput<'_>) -> [f32; NUM_REWARD_TERMS] {
+                [$(self.$name * crate::reward::$name(input) * input.policy_dt),+]
             }
 
             fn values(&self) -> impl Iterator<Item = (&'static str, f32)> {

@@ -44,7 +44,12 @@ impl Counter {
 
     /// Returns the first entries of the observation: integers below 2²⁴, which `f32` represents exactly.
     pub fn observation(&self) -> [f32; 4] {
-        [(self.steps & 0xff_ffff) as f32, self.resets as f32, (self.action_hash >> 16) as f32, (self.action_hash & 0xffff) as f32]
+        [
+            (self.steps & 0xff_ffff) as f32,
+            self.resets as f32,
+            (self.action_hash >> 16) as f32,
+            (self.action_hash & 0xffff) as f32,
+        ]
     }
 }
 

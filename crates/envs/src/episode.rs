@@ -3,10 +3,11 @@
 use glam::Vec3;
 use rand::{Rng, RngExt};
 use twinstep_model::{
-    ControlConfig, EnvSpec, Ground, NUM_JOINTS, PerJoint, PerLeg, RobotModel, RobotStates, Stream, RandomisationSample, frames, stream,
+    ControlConfig, EnvSpec, Ground, NUM_JOINTS, PerJoint, PerLeg, RandomisationSample, RobotModel, RobotStates, Stream,
+    frames, stream,
 };
 
-use crate::config::{Range, NUM_REWARD_TERMS};
+use crate::config::{NUM_REWARD_TERMS, Range};
 use crate::observation::observe;
 use crate::reward::RewardInput;
 use crate::{Randomisation, TaskConfig};
@@ -178,7 +179,13 @@ impl Episode {
     }
 
     /// Returns the reward and the end flags after a step, and writes the next observation into `obs`.
-    pub fn evaluate_step(&mut self, config: &EpisodeConfig, states: &RobotStates, robot: usize, obs: &mut [f32]) -> StepOutcome {
+    pub fn evaluate_step(
+        &mut self,
+        config: &EpisodeConfig,
+        states: &RobotStates,
+        robot: usize,
+        obs: &mut [f32],
+    ) -> StepOutcome {
         let touchdown_air_time = self.update_air_time(&states.foot_force[robot], config.policy_dt);
         let base_from_world = frames::world_from_base(states.base_orientation[robot]).inverse();
         let gravity = base_from_world * Vec3::NEG_Z;
@@ -225,7 +232,8 @@ impl Episode {
 
     fn draw_command(&mut self, config: &EpisodeConfig) {
         let ranges = &config.task.command;
-        self.command = [ranges.linear_velocity_x, ranges.linear_velocity_y, ranges.angular_velocity_z].map(|range| draw(&mut self.stream, range));
+        self.command = [ranges.linear_velocity_x, ranges.linear_velocity_y, ranges.angular_velocity_z]
+            .map(|range| draw(&mut self.stream, range));
     }
 
     /// Updates the air time of each foot, and returns that of the feet that touched down, 0 for the others [s].

@@ -1,6 +1,6 @@
 //! Layout of observation and action, and the observation of U2E, eq. 14, for simulator, log and robot.
 
-use twinstep_model::{EnvSpec, SpecField, JOINT_NAMES, NUM_JOINTS, PerJoint, RobotModel, RobotStates, frames};
+use twinstep_model::{EnvSpec, JOINT_NAMES, NUM_JOINTS, PerJoint, RobotModel, RobotStates, SpecField, frames};
 
 use crate::{RewardWeights, TaskConfig};
 
@@ -16,7 +16,13 @@ pub fn walk_spec(robot: &RobotModel, task: &TaskConfig) -> EnvSpec {
         observation: vec![
             field("base_angular_velocity", 3, "rad/s", 50.0, "angular velocity of the base in the base frame, omega_t"),
             field("projected_gravity", 3, "", 1.0, "unit vector of gravity in the base frame, g_t"),
-            field("velocity_command", 3, "m/s, m/s, rad/s", 5.0, "commanded velocity in the base frame: forward, left, yaw rate, c_t"),
+            field(
+                "velocity_command",
+                3,
+                "m/s, m/s, rad/s",
+                5.0,
+                "commanded velocity in the base frame: forward, left, yaw rate, c_t",
+            ),
             field("joint_position", NUM_JOINTS, "rad", 6.3, "position relative to the default pose, q - q_default"),
             field("joint_velocity", NUM_JOINTS, "rad/s", 100.0, "velocity, dq"),
             field("previous_action", NUM_JOINTS, "", 1.0, "action of the previous step, clipped, a_(t-1)"),
@@ -41,7 +47,14 @@ pub fn walk_spec(robot: &RobotModel, task: &TaskConfig) -> EnvSpec {
 }
 
 fn field(name: &str, size: usize, unit: &str, bound: f32, text: &str) -> SpecField {
-    SpecField { name: name.to_owned(), size, unit: unit.to_owned(), low: -bound, high: bound, description: text.to_owned() }
+    SpecField {
+        name: name.to_owned(),
+        size,
+        unit: unit.to_owned(),
+        low: -bound,
+        high: bound,
+        description: text.to_owned(),
+    }
 }
 
 /// Writes the observation of `robot` into `obs` (45 values), clipped to the bounds of [`walk_spec`].

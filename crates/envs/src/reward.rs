@@ -100,8 +100,7 @@ pub fn action_rate(input: &RewardInput<'_>) -> f32 {
 /// Returns Σ of the distance of each joint beyond its soft limits, the central 90 % of its range [rad].
 #[inline]
 pub fn joint_position_limits(input: &RewardInput<'_>) -> f32 {
-    let outside =
-        |j: usize| (input.soft_lower[j] - input.q[j]).max(0.0) + (input.q[j] - input.soft_upper[j]).max(0.0);
+    let outside = |j: usize| (input.soft_lower[j] - input.q[j]).max(0.0) + (input.q[j] - input.soft_upper[j]).max(0.0);
     (0..NUM_JOINTS).map(outside).sum()
 }
 

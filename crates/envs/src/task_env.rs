@@ -104,7 +104,8 @@ impl<B: Backend> TaskEnv<B> {
     fn start(&mut self, env: usize) -> (InitialState, Option<RobotModel>) {
         let mut start = self.episodes[env].start(&self.config);
         self.commands[env] = Command::hold(start.q, start.kp, start.kd);
-        let initial_state = InitialState::standing_on(self.config.ground(), self.backend.robot(), start.q, START_CLEARANCE);
+        let initial_state =
+            InitialState::standing_on(self.config.ground(), self.backend.robot(), start.q, START_CLEARANCE);
         let robot = self.robots.as_ref().map(|robots| robots.sample(&mut start.effects));
         (InitialState { randomisation: start.variation, actuator_seed: start.actuator_seed, ..initial_state }, robot)
     }
@@ -132,7 +133,8 @@ impl<B: Backend> TaskEnv<B> {
         let rows = batch.obs.chunks_exact_mut(OBS_LEN);
         for (env, (episode, obs)) in episodes.iter_mut().zip(rows).enumerate() {
             let not_stepped = StepOutcome { reward: 0.0, terminated: false, truncated: false };
-            let outcome = if active[env] { episode.evaluate_step(config, backend.states(), env, obs) } else { not_stepped };
+            let outcome =
+                if active[env] { episode.evaluate_step(config, backend.states(), env, obs) } else { not_stepped };
             batch.reward[env] = outcome.reward;
             batch.terminated[env] = outcome.terminated;
             batch.truncated[env] = outcome.truncated;

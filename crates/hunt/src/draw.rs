@@ -2,9 +2,9 @@
 
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
+use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, EffectEntry, Scope, Target};
 use twinstep_model::{Joint, JointKind, Leg, Stream, standard_normal, stream};
-use twinstep_effects::ModelFile;
 
 use crate::unmodelled::UnmodelledEffect;
 
@@ -25,8 +25,13 @@ pub enum CaseKind {
 }
 
 /// How often each kind comes in a shuffled deck, so that any 28 cases in a row from a multiple of 28 have the same mix.
-const CASE_MIX: [(CaseKind, usize); 5] =
-    [(CaseKind::LargeEffect, 6), (CaseKind::SmallEffect, 6), (CaseKind::Healthy, 8), (CaseKind::UnmodelledEffect, 4), (CaseKind::TwoEffects, 4)];
+const CASE_MIX: [(CaseKind, usize); 5] = [
+    (CaseKind::LargeEffect, 6),
+    (CaseKind::SmallEffect, 6),
+    (CaseKind::Healthy, 8),
+    (CaseKind::UnmodelledEffect, 4),
+    (CaseKind::TwoEffects, 4),
+];
 
 /// Where the robot moves.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -67,14 +72,16 @@ enum Requirement {
 
 /// What each effect needs to show. Not drawn are `inertia`, ten numbers that are another way to say payload and shift,
 /// and `ground_friction`: no foot slips in these motions.
-const NEEDS: [(&str, &[Requirement]); 23] = [
+const NEEDS: [(&str, &[Requirement]); 25] = [
     ("command_delay", &[Requirement::Air]),
     ("encoder_offset", &[Requirement::Ground]),
+    ("pd_gain", &[Requirement::Air]),
     ("torque_saturation", &[Requirement::Air]),
     ("supply_sag", &[Requirement::Battery]),
     ("thermal_derating", &[Requirement::Temperature, Requirement::Air]),
     ("torque_delay", &[Requirement::Air]),
     ("torque_speed_limit", &[Requirement::Air]),
+    ("torque_dead_zone", &[Requirement::Air]),
     ("drive_lag", &[Requirement::Air]),
     ("torque_sensor_delay", &[Requirement::Torque, Requirement::Air]),
     ("torque_gain", &[Requirement::Air]),
@@ -241,7 +248,8 @@ fn values(effect: &Effect, share: f64, random: &mut impl Rng) -> Vec<f64> {
             values.push(low / share);
         } else {
             values.push(
-                parameter.no_effect_value + share * (far_end(parameter.no_effect_value, [low, high], random) - parameter.no_effect_value),
+                parameter.no_effect_value
+                    + share * (far_end(parameter.no_effect_value, [low, high], random) - parameter.no_effect_value),
             );
         }
     }

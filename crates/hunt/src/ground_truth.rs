@@ -1,11 +1,11 @@
 //! The sealed robot and its log: another engine, a finer step, slightly other masses, lengths and contact.
 
 use rand::{Rng, RngExt};
-use twinstep_model::{BaseMount, Joint, RobotModel, go2};
-use twinstep_logs::{Log, LogError, TorqueSensor};
 use twinstep_effects::apply_effects;
-use twinstep_sim::{Engine, RapierBackend, SimConfig};
 use twinstep_identify::{RecordError, Sensor, apply_sensors, record};
+use twinstep_logs::{Log, LogError, TorqueSensor};
+use twinstep_model::{BaseMount, Joint, RobotModel, go2};
+use twinstep_sim::{Engine, RapierBackend, SimConfig};
 
 use crate::draw::Case;
 use crate::motion::{RATE_HZ, motion};
@@ -21,12 +21,13 @@ const LENGTH_ERROR: f64 = 0.002;
 pub fn log_of(case: &Case, progress: &mut dyn FnMut(usize) -> bool) -> Result<Log, RecordError> {
     let robot = perturbed(&mut case.stream("hunt body"));
     let robot = apply_effects(&robot, &case.hidden).expect("drawn so that it is a robot");
-    let backend = |base: BaseMount| {
-        let base = if base == BaseMount::Fixed { BaseMount::Fixed } else { BaseMount::Floating };
+    let backend = |base: BaseMount, robot: &RobotModel| {
         let physics_hz = Some(PHYSICS_HZ);
         let config = SimConfig { engine: Engine::Rapier, base, physics_hz, threads: 1, ..SimConfig::default() };
         let backend = RapierBackend::new(robot.clone(), config, 1);
-        backend.map(|backend| PerturbedBackend::new(backend, case.outside)).map_err(|error| RecordError::Backend(error.into()))
+        backend
+            .map(|backend| PerturbedBackend::new(backend, case.outside))
+            .map_err(|error| RecordError::Backend(error.into()))
     };
     let motion = motion(case.setting, &mut case.stream("hunt motion"));
     // Says nothing of what is hidden.
@@ -118,11 +119,11 @@ fn delayed(cells: &[f64], late: f64) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use twinstep_effects::{Effect, EffectEntry, Scope};
-    use twinstep_sim::BatchRollout;
     use twinstep_identify::evaluate;
+    use twinstep_sim::BatchRollout;
 
     use super::*;
-    use crate::draw::{CaseKind, BaseSchedule, LogSetup};
+    use crate::draw::{BaseSchedule, CaseKind, LogSetup};
 
     fn case(place: BaseSchedule, seed: u64, hidden: Vec<EffectEntry>) -> Case {
         let setting = LogSetup { place, torque: true, battery: true, temperature: false };
@@ -131,7 +132,9 @@ mod tests {
 
     #[test]
     fn log_of_a_healthy_robot_is_near_the_nominal_model() {
-        for (place, seed) in [(BaseSchedule::Fixed, 1), (BaseSchedule::Floating, 2), (BaseSchedule::FixedThenFloating, 3)] {
+        for (place, seed) in
+            [(BaseSchedule::Fixed, 1), (BaseSchedule::Floating, 2), (BaseSchedule::FixedThenFloating, 3)]
+        {
             let folder = tempfile::tempdir().expect("a folder");
             let log = log_of(&case(place, seed, Vec::new()), &mut |_| true).expect("the robot gets through");
             log.write(folder.path()).expect("written");

@@ -1,12 +1,12 @@
 //! `twinstep hunt`: hide effects, diagnose, judge.
 
 mod draw;
+mod ground_truth;
+mod motion;
 mod runner;
 mod score;
-mod motion;
-mod unmodelled;
-mod ground_truth;
 mod table;
+mod unmodelled;
 
 use std::fs::OpenOptions;
 use std::io::Write as _;
@@ -14,8 +14,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::go2;
 use twinstep_diagnose::RmsErrors;
+use twinstep_model::go2;
 
 use twinstep_sim::{BatchRollout, SimConfig};
 
@@ -178,8 +178,8 @@ fn read_results(ledger: &Path, seed: u64) -> Result<Vec<CaseResult>, HuntError> 
 
 #[cfg(test)]
 mod tests {
-    use crate::draw::BaseSchedule;
     use super::*;
+    use crate::draw::BaseSchedule;
 
     /// Finds nothing, and notes what it was given.
     fn nothing(log: &Path, model: &Path, out: &Path) -> Command {
@@ -244,9 +244,13 @@ mod tests {
             // What no error of motion can show.
             let unseen = verdict.hits.iter().any(|hit| ["gyro_bias", "torque_sensor_delay"].contains(&&*hit.effect));
             match kind {
-                CaseKind::Healthy if setting.place == BaseSchedule::Fixed => assert!(before < 0.003, "case {case}: {before} rad"),
+                CaseKind::Healthy if setting.place == BaseSchedule::Fixed => {
+                    assert!(before < 0.003, "case {case}: {before} rad")
+                }
                 CaseKind::Healthy => assert!(before < 0.012, "case {case}: {before} rad"),
-                CaseKind::LargeEffect | CaseKind::TwoEffects => assert!(unseen || after < before, "case {case}: {before} -> {after} rad"),
+                CaseKind::LargeEffect | CaseKind::TwoEffects => {
+                    assert!(unseen || after < before, "case {case}: {before} -> {after} rad")
+                }
                 CaseKind::SmallEffect | CaseKind::UnmodelledEffect => {}
             }
         }

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 
 use rand::{Rng, RngExt};
-use twinstep_model::{BaseMount, JOINT_NAMES, Joint, JointKind, NUM_JOINTS, go2};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{BaseMount, JOINT_NAMES, Joint, JointKind, NUM_JOINTS, go2};
 
 use crate::draw::{BaseSchedule, LogSetup};
 
@@ -191,7 +191,9 @@ mod tests {
 
     #[test]
     fn commands_stay_inside_the_joints_ranges() {
-        for (place, seed) in [BaseSchedule::Fixed, BaseSchedule::Floating, BaseSchedule::FixedThenFloating].into_iter().zip(0..) {
+        for (place, seed) in
+            [BaseSchedule::Fixed, BaseSchedule::Floating, BaseSchedule::FixedThenFloating].into_iter().zip(0..)
+        {
             let setting = LogSetup { place, torque: true, battery: true, temperature: true };
             let motion = motion(setting, &mut stream(seed, "test", 0));
             assert!((20.0..25.0).contains(&(motion.rows() as f64 / RATE_HZ)), "20 to 25 s");

@@ -5,11 +5,11 @@ use std::path::Path;
 use std::process::{Child, ExitStatus};
 use std::time::{Duration, Instant};
 
+use twinstep_diagnose::{Diagnosis, RmsErrors};
 use twinstep_effects::ModelFile;
+use twinstep_identify::{RecordError, evaluate};
 use twinstep_model::{RobotModel, go2};
 use twinstep_sim::BatchRollout;
-use twinstep_diagnose::{Diagnosis, RmsErrors};
-use twinstep_identify::{RecordError, evaluate};
 
 use crate::draw::Case;
 use crate::score::judge;

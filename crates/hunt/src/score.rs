@@ -1,9 +1,9 @@
 //! What a diagnosis said, against what was hidden.
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::Joint;
+use twinstep_diagnose::{Cause, Diagnosis, Estimate, ParameterValue, RmsErrors};
 use twinstep_effects::{EffectEntry, Scope};
-use twinstep_diagnose::{Cause, Diagnosis, RmsErrors, Estimate, ParameterValue};
+use twinstep_model::Joint;
 
 use crate::draw::Case;
 
@@ -182,11 +182,11 @@ fn removed(diagnosis: &Diagnosis, [nominal, truth]: [RmsErrors; 2]) -> ErrorRedu
 mod tests {
     use std::collections::BTreeMap;
 
-    use twinstep_effects::Effect;
     use twinstep_diagnose::{AlternativeCause, Unexplained};
+    use twinstep_effects::Effect;
 
     use super::*;
-    use crate::draw::{CaseKind, BaseSchedule, LogSetup};
+    use crate::draw::{BaseSchedule, CaseKind, LogSetup};
     use crate::unmodelled::UnmodelledEffect;
 
     fn case(hidden: &[(&str, &str, f64)]) -> Case {
@@ -265,7 +265,8 @@ mod tests {
         let hit = &verdict.hits[0];
         assert!(!hit.first && !hit.named && hit.ambiguous && hit.in_top_3 && verdict.wrong_names == 1);
         wrong.ambiguous_with.clear();
-        wrong.rivals = vec![AlternativeCause { effect: "torque_delay".to_owned(), scope: "all".to_owned(), held_out_gain: 0.1 }];
+        wrong.rivals =
+            vec![AlternativeCause { effect: "torque_delay".to_owned(), scope: "all".to_owned(), held_out_gain: 0.1 }];
         let hit = &judged(&case, vec![wrong]).hits[0];
         assert!(!hit.ambiguous && hit.in_top_3);
     }
@@ -274,7 +275,7 @@ mod tests {
     fn any_name_is_wrong_where_nothing_or_something_else_is_hidden() {
         let mut other = case(&[]);
         assert_eq!(judged(&other, vec![cause("armature", "all", [0.0; 3])]).wrong_names, 1);
-        other.outside = Some(UnmodelledEffect::DeadBand { joint: 0, width: 1.0 });
+        other.outside = Some(UnmodelledEffect::OneWayFriction { joint: 0, torque: 1.0 });
         let mut diagnosis = said(Vec::new());
         let judged = |diagnosis: &Diagnosis| judge(&other, Some(diagnosis), [errors(1.0, 0.04); 2]);
         assert_eq!(judged(&diagnosis).depends_on, Some(false));

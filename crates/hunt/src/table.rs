@@ -60,7 +60,8 @@ fn rates(rounds: &[CaseResult]) -> String {
     text += &rate("outside the catalogue: a wrong name", "<= 10 %", named(CaseKind::UnmodelledEffect));
     let depends_on = of(CaseKind::UnmodelledEffect).filter_map(|round| round.verdict.depends_on);
     text += &rate("outside the catalogue: what it depends on is right", ">= 50 %", depends_on);
-    let both = |good: fn(&EffectScore) -> bool| of(CaseKind::TwoEffects).map(move |round| round.verdict.hits.iter().all(good));
+    let both =
+        |good: fn(&EffectScore) -> bool| of(CaseKind::TwoEffects).map(move |round| round.verdict.hits.iter().all(good));
     text += &rate("two effects: both named", ">= 65 %", both(|hit| hit.named));
     text += &rate("two effects: both named, with their scopes", "", both(|hit| hit.named && hit.scope_right));
     let sizes = rounds.iter().flat_map(|round| &round.verdict.hits).filter_map(|hit| hit.size);
@@ -70,7 +71,8 @@ fn rates(rounds: &[CaseResult]) -> String {
 
 fn numbers(rounds: &[CaseResult]) -> String {
     let sizes = rounds.iter().flat_map(|round| &round.verdict.hits).filter_map(|hit| hit.size);
-    let removed = |of: fn(&ErrorReduction) -> Option<f64>| rounds.iter().filter_map(move |round| of(&round.verdict.removed));
+    let removed =
+        |of: fn(&ErrorReduction) -> Option<f64>| rounds.iter().filter_map(move |round| of(&round.verdict.removed));
     let seconds = rounds.iter().map(|round| round.seconds);
     let line = |label: &str, goal: &str, value: Option<f64>, unit: &str, scale: f64| {
         let value = value.map_or("no case".to_owned(), |value| format!("{:.1} {unit}", scale * value));
@@ -109,7 +111,9 @@ fn matrix(rounds: &[CaseResult]) -> String {
         let hidden = match round.kind {
             CaseKind::Healthy => NONE,
             CaseKind::UnmodelledEffect => "(outside)",
-            CaseKind::LargeEffect | CaseKind::SmallEffect | CaseKind::TwoEffects => round.verdict.hits.first().map_or(NONE, |hit| &hit.effect),
+            CaseKind::LargeEffect | CaseKind::SmallEffect | CaseKind::TwoEffects => {
+                round.verdict.hits.first().map_or(NONE, |hit| &hit.effect)
+            }
         };
         let named = round.verdict.named.first().and_then(|named| named.split('@').next()).unwrap_or(NONE);
         *counts.entry((hidden, named)).or_default() += 1;
@@ -139,7 +143,7 @@ mod tests {
 
     use super::*;
     use crate::draw::{BaseSchedule, LogSetup};
-    use crate::score::{Size, Score};
+    use crate::score::{Score, Size};
 
     fn round(kind: CaseKind, hidden: &[&str], named: &[&str]) -> CaseResult {
         let hit = |name: &&str| EffectScore {
@@ -161,7 +165,18 @@ mod tests {
         };
         let setting = LogSetup { place: BaseSchedule::Fixed, torque: true, battery: false, temperature: false };
         let (nominal, truth) = (RmsErrors::default(), RmsErrors::default());
-        CaseResult { seed: 0, case: 0, kind, setting, outside: None, nominal, truth, verdict, error: None, seconds: 12.0 }
+        CaseResult {
+            seed: 0,
+            case: 0,
+            kind,
+            setting,
+            outside: None,
+            nominal,
+            truth,
+            verdict,
+            error: None,
+            seconds: 12.0,
+        }
     }
 
     #[test]

@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
-use twinstep_model::{Backend, BackendError, Command, Ground, Joint, InitialState, RobotModel, RobotStates};
+use twinstep_model::{Backend, BackendError, Command, Ground, InitialState, Joint, RobotModel, RobotStates};
 
 use crate::draw::BaseSchedule;
 
@@ -14,8 +14,8 @@ use crate::draw::BaseSchedule;
 pub enum UnmodelledEffect {
     /// A share of one joint's torque acts on another one too, behind the current's sensor.
     CrossTalk { from: usize, into: usize, share: f64 },
-    /// Wanted torques below `width` [N·m] give none, larger ones so much less.
-    DeadBand { joint: usize, width: f64 },
+    /// Friction of this torque [N·m] while the joint moves in its positive direction, none in the other.
+    OneWayFriction { joint: usize, torque: f64 },
     /// A torque from outside, of this amplitude [N·m] and frequency [Hz].
     Disturbance { joint: usize, amplitude: f64, frequency: f64 },
     /// The position gain grows with the error e [rad] by the factor 1 + `cubic`·e².
@@ -39,10 +39,14 @@ impl UnmodelledEffect {
                 UnmodelledEffect::Disturbance { joint, amplitude, frequency }
             }
             // On the ground only steps in the air have errors that are large.
-            3 if place != BaseSchedule::Floating => UnmodelledEffect::HardeningGain { joint, cubic: random.random_range(8.0..25.0) },
+            3 if place != BaseSchedule::Floating => {
+                UnmodelledEffect::HardeningGain { joint, cubic: random.random_range(8.0..25.0) }
+            }
             // With the trunk held nothing but gravity, by so much as a cosine, shows where an encoder has drifted to.
-            4 if place != BaseSchedule::Fixed => UnmodelledEffect::EncoderDrift { joint, rate: random.random_range(0.0015..0.004) },
-            _ => UnmodelledEffect::DeadBand { joint, width: random.random_range(0.4..1.2) },
+            4 if place != BaseSchedule::Fixed => {
+                UnmodelledEffect::EncoderDrift { joint, rate: random.random_range(0.0015..0.004) }
+            }
+            _ => UnmodelledEffect::OneWayFriction { joint, torque: random.random_range(0.4..1.2) },
         }
     }
 
@@ -54,7 +58,9 @@ impl UnmodelledEffect {
         let all = ["q", "dq", "q_cmd", "dq_cmd", "tau", "tau_measured", "tau_cmd"];
         match self {
             UnmodelledEffect::CrossTalk { from, .. } => of(from, &all),
-            UnmodelledEffect::DeadBand { joint, .. } | UnmodelledEffect::HardeningGain { joint, .. } => of(joint, &all),
+            UnmodelledEffect::OneWayFriction { joint, .. } | UnmodelledEffect::HardeningGain { joint, .. } => {
+                of(joint, &all)
+            }
             UnmodelledEffect::Disturbance { frequency, .. } => {
                 frequencies(told).any(|found| (found / frequency - 1.0).abs() < 0.05)
             }
@@ -66,15 +72,11 @@ impl UnmodelledEffect {
     /// the actuators have measured of it, at `time` [s].
     fn apply(self, command: &mut Command, seen: &RobotStates, time: f64) -> [f32; 12] {
         let mut unseen = [0.0; 12];
-        let wanted = |joint: usize| {
-            let position = command.kp[joint] * (command.q[joint] - seen.q[0][joint]);
-            position + command.kd[joint] * (command.dq[joint] - seen.dq[0][joint]) + command.tau_ff[joint]
-        };
         match self {
             UnmodelledEffect::CrossTalk { from, into, share } => unseen[into] = share as f32 * seen.tau[0][from],
-            UnmodelledEffect::DeadBand { joint, width } => {
-                let width = width as f32;
-                command.tau_ff[joint] -= wanted(joint).clamp(-width, width);
+            UnmodelledEffect::OneWayFriction { joint, torque } => {
+                // Full friction from 0.1 rad/s on: a step at rest would chatter at the actuator rate.
+                unseen[joint] = -(torque as f32) * (seen.dq[0][joint] / 0.1).clamp(0.0, 1.0);
             }
             UnmodelledEffect::Disturbance { joint, amplitude, frequency } => {
                 unseen[joint] = (amplitude * (TAU * frequency * time).sin()) as f32;
@@ -149,7 +151,12 @@ impl<B: Backend> Backend for PerturbedBackend<B> {
         Ok(())
     }
 
-    fn reset_with_model(&mut self, robot: usize, model: &RobotModel, placement: &InitialState) -> Result<(), BackendError> {
+    fn reset_with_model(
+        &mut self,
+        robot: usize,
+        model: &RobotModel,
+        placement: &InitialState,
+    ) -> Result<(), BackendError> {
         self.inner.reset_with_model(robot, model, placement)?;
         self.see([0.0; 12]);
         Ok(())
@@ -158,7 +165,8 @@ impl<B: Backend> Backend for PerturbedBackend<B> {
     fn step(&mut self, commands: &[Command], active: &[bool], actuator_periods: usize) -> Result<(), BackendError> {
         for _ in 0..actuator_periods {
             let mut command = commands[0];
-            let unseen = self.outside.map_or([0.0; 12], |outside| outside.apply(&mut command, &self.measured, self.time));
+            let unseen =
+                self.outside.map_or([0.0; 12], |outside| outside.apply(&mut command, &self.measured, self.time));
             self.inner.step(&[command], active, 1)?;
             self.time += self.inner.robot().control.actuator_dt();
             self.see(unseen);
@@ -195,14 +203,14 @@ mod tests {
     }
 
     #[test]
-    fn dead_band_takes_what_it_is_wide() {
-        let mut seen = RobotStates::new(1);
-        let law = UnmodelledEffect::DeadBand { joint: 0, width: 1.0 };
-        for (error, left) in [(0.01, 0.0), (0.1, 2.0), (-0.1, -2.0)] {
-            seen.q[0][0] = -error;
+    fn one_way_friction_acts_in_the_positive_direction_only() {
+        let mut measured = RobotStates::new(1);
+        let law = UnmodelledEffect::OneWayFriction { joint: 0, torque: 1.0 };
+        for (speed, expected) in [(2.0, -1.0), (0.05, -0.5), (0.0, 0.0), (-2.0, 0.0)] {
+            measured.dq[0][0] = speed;
             let mut command = Command::hold([0.0; 12], 30.0, 0.0);
-            law.apply(&mut command, &seen, 0.0);
-            assert!((30.0 * error + command.tau_ff[0] - left).abs() < 1e-5);
+            assert_eq!(law.apply(&mut command, &measured, 0.0)[0], expected, "at {speed} rad/s");
+            assert_eq!(command.tau_ff[0], expected);
         }
     }
 }

@@ -1,11 +1,11 @@
-//! CMA-ES, ask and tell (Hansen, "The CMA Evolution Strategy: A Tutorial", 2016).
+//! CMA-ES with ask-and-tell interface (Hansen, "The CMA Evolution Strategy: A Tutorial", 2016).
 
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 use twinstep_model::standard_normal;
 
-/// A search distribution over coordinates whose scales are about one.
+/// Search distribution over coordinates with scales of about one.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CmaEs {
     mean: DVector<f64>,
@@ -13,7 +13,7 @@ pub struct CmaEs {
     covariance: DMatrix<f64>,
     /// Square root of the covariance.
     root: DMatrix<f64>,
-    /// One over it.
+    /// Inverse of `root`.
     inverse_root: DMatrix<f64>,
     path: DVector<f64>,
     sigma_path: DVector<f64>,
@@ -22,11 +22,11 @@ pub struct CmaEs {
 }
 
 impl CmaEs {
-    /// Around `mean`, with standard deviation `sigma` along each axis.
+    /// Creates a distribution around `mean` with standard deviation `sigma` along each axis.
     pub fn new(mean: &[f64], sigma: f64) -> Self {
         let n = mean.len();
         let population = 4 + (3.0 * (n as f64).ln()).floor() as usize;
-        // Both cores and all lanes want work: a larger population costs little here and finds narrow valleys.
+        // A larger population than the default uses all cores and SIMD lanes, and is more robust in narrow minima.
         let parents = population.max(16);
         let raw: Vec<f64> = (1..=parents).map(|rank| (parents as f64 + 0.5).ln() - (rank as f64).ln()).collect();
         let sum: f64 = raw.iter().sum();
@@ -43,7 +43,7 @@ impl CmaEs {
         }
     }
 
-    /// Points to be judged.
+    /// Samples the points of a generation.
     pub fn ask(&self, random: &mut impl Rng) -> Vec<Vec<f64>> {
         let n = self.mean.len();
         (0..2 * self.weights.len())
@@ -54,7 +54,7 @@ impl CmaEs {
             .collect()
     }
 
-    /// What the points cost; the distribution moves towards the cheap ones.
+    /// Updates the distribution with the costs of the points.
     pub fn tell(&mut self, points: &[Vec<f64>], costs: &[f64]) {
         let n = self.mean.len() as f64;
         let mut order: Vec<usize> = (0..points.len()).collect();
@@ -92,7 +92,7 @@ impl CmaEs {
         self.factor();
     }
 
-    /// Standard deviation along the widest axis.
+    /// Returns the largest standard deviation along a coordinate axis.
     pub fn max_std(&self) -> f64 {
         self.sigma * self.covariance.diagonal().iter().copied().fold(0.0, f64::max).sqrt()
     }
@@ -113,13 +113,13 @@ impl CmaEs {
 mod tests {
     use super::*;
 
-    /// A narrow curved valley; 0 at (1, …, 1).
+    /// Returns the Rosenbrock function, whose minimum is 0 at (1, …, 1).
     fn rosenbrock(x: &[f64]) -> f64 {
         x.windows(2).map(|pair| 100.0 * (pair[1] - pair[0] * pair[0]).powi(2) + (1.0 - pair[0]).powi(2)).sum()
     }
 
     #[test]
-    fn finds_the_bottom_of_a_curved_valley() {
+    fn rosenbrock_function_is_minimised() {
         let mut random = twinstep_model::stream(1, "cmaes", 0);
         let mut search = CmaEs::new(&[-1.0, 0.5, 0.0, 2.0, 1.0], 0.5);
         for _ in 0..300 {

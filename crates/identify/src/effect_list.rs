@@ -13,7 +13,7 @@ pub const DEFAULT_EFFECTS: &str = "armature@hip,armature@thigh,armature@calf,cou
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EffectAtScope(pub &'static Effect, pub Scope);
 
-/// Why a text is not an effect with its scope.
+/// Reason why a text is not an effect with its scope.
 #[derive(Debug, thiserror::Error)]
 pub enum EffectAtScopeError {
     /// The scope is missing.

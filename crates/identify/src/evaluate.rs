@@ -1,4 +1,4 @@
-//! The errors of a model on a log.
+//! Errors of a model on a log.
 
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -9,27 +9,27 @@ use crate::experiment::{Experiment, ExperimentError};
 use crate::torque::torque_errors;
 use crate::window::WindowConfig;
 
-/// How far a model is from a log; null where the log cannot tell.
+/// Errors of a model on a log. Values are `None` if the log lacks the measurements.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Evaluation {
-    /// Root mean square over joints and rows of the actuators' torque on measured states [N·m].
+    /// Root mean square over joints and rows of the error of the actuators' torque on measured states [N·m].
     pub torque_rmse_nm: Option<f64>,
     /// Root mean square over joints and rows of the position error in closed loop [rad].
     pub q_rmse_rad: Option<f64>,
-    /// The same, joint by joint.
+    /// Errors of each joint.
     pub per_joint: BTreeMap<&'static str, JointEvaluation>,
 }
 
-/// One joint's part of an [`Evaluation`].
+/// Errors of one joint in an [`Evaluation`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct JointEvaluation {
-    /// [N·m]
+    /// Root mean square of the torque error [N·m].
     pub torque_rmse_nm: Option<f64>,
-    /// [rad]
+    /// Root mean square of the position error [rad].
     pub q_rmse_rad: Option<f64>,
 }
 
-/// Evaluates `robot` on `log`; `keep` chooses the rows that count.
+/// Evaluates `robot` on the rows of `log` that `keep` selects.
 pub fn evaluate(
     log: &Log,
     robot: &RobotModel,
@@ -60,9 +60,10 @@ pub fn evaluate(
     })
 }
 
-/// Simulated less measured position [rad] in closed loop, by joint: each with its row, of the rows that `keep` chooses.
+/// Returns rows and closed-loop position errors of each joint, simulated minus measured [rad].
 ///
-/// A row where the robot is put down as it was measured has none.
+/// Only rows that `keep` selects are included. The first row of a window has no error, because the simulation starts
+/// from its measured state.
 pub fn position_errors(
     log: &Log,
     robot: &RobotModel,

@@ -1,105 +1,114 @@
-//! A log as an experiment: windows that are simulated from measured states, and what is compared.
+//! Experiment: windows of a log that are simulated from measured states, and the channels that are compared.
 
 use glam::DQuat;
 use rayon::prelude::*;
-use twinstep_model::{BaseMount, Command, RolloutRequest, Joint, NUM_JOINTS, Precision, RobotModel, RobotStates, Rollout};
 use twinstep_logs::{Log, TorqueSensor};
+use twinstep_model::{
+    BaseMount, Command, Joint, NUM_JOINTS, Precision, RobotModel, RobotStates, Rollout, RolloutRequest,
+};
 
-use crate::operating_conditions::OperatingConditions;
-use crate::motion::{MotionError, joint_commands};
-use crate::window::{WindowConfig, Window, orientation, windows};
+use crate::window::{Window, WindowConfig, orientation, windows};
+use twinstep_logs::operating_conditions::OperatingConditions;
+use twinstep_logs::replay::{ReplayError, at_log_rate, delayed_mean, joint_commands};
 
-/// Rows this long apart [s] count as independent.
+/// Length of a block [s]; residuals of different blocks are treated as independent.
 const BLOCK_S: f64 = 0.5;
-/// Noise that is assumed of a channel whose noise nobody stated: of a quantity, its σ.
+/// Standard deviation of the noise of each quantity, for channels whose metadata do not state it.
 const ASSUMED_NOISE: [(&str, f64); 7] =
     [("q", 0.002), ("dq", 0.05), ("tau_measured", 0.2), ("pos", 0.005), ("quat", 0.01), ("vel", 0.05), ("gyro", 0.02)];
 
-/// Why a log is no experiment.
+/// Reason why a log cannot be used as an experiment.
 #[derive(Debug, thiserror::Error)]
 pub enum ExperimentError {
-    /// Its commands cannot be given to the robot.
+    /// The commands of the log cannot be simulated.
     #[error(transparent)]
-    Motion(#[from] MotionError),
-    /// A floating base's motion was not measured.
-    #[error("segment `{segment}` has base \"floating\", but the log has no `{missing}`: a window cannot start there")]
+    Motion(#[from] ReplayError),
+    /// The motion of a floating base was not measured.
+    #[error(
+        "segment `{segment}` has base \"floating\", but the log has no `{missing}`, which is needed for the initial \
+         state of a window"
+    )]
     MissingBaseState {
-        /// The segment's name.
+        /// Name of the segment.
         segment: String,
-        /// The channels that are missing.
+        /// The missing channel.
         missing: &'static str,
     },
 }
 
-/// What is compared in every row.
+/// Channel that is compared in every row.
 #[derive(Clone, Debug)]
 struct Channel {
     quantity: ResidualChannel,
-    /// Standard deviation of its noise, in its unit.
+    /// Standard deviation of the noise, in the channel's unit.
     sigma: f64,
-    /// Measured, by row; a missing cell is NaN.
+    /// Measured values by row; NaN for a missing cell.
     measured: Vec<f64>,
 }
 
-/// What is compared, with the joint or axis.
+/// Quantity that is compared, with its joint or axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ResidualChannel {
-    /// Of a joint.
+    /// Position of a joint.
     Position(usize),
-    /// Of a joint.
+    /// Velocity of a joint.
     Velocity(usize),
-    /// Of a joint, at the current's sensor.
+    /// Torque of a joint at the current sensor.
     Torque(usize),
-    /// Along a world axis.
+    /// Base position along a world axis.
     BasePosition(usize),
-    /// A component of the rotation vector from the measured to the simulated orientation.
+    /// Component of the rotation vector from the measured to the simulated base orientation.
     BaseOrientation(usize),
-    /// Along a world axis.
+    /// Base velocity along a world axis.
     BaseVelocity(usize),
-    /// About an axis of the trunk.
+    /// Angular velocity about a base axis.
     BaseRate(usize),
 }
 
 impl Channel {
-    /// Rows of `window` that are compared, with their index in it: not the first at least, which was given.
+    /// Returns the compared rows of `window`, each with its index in the window. Rows of the burn-in are excluded.
     fn rows<'a>(&'a self, window: &'a Window) -> impl Iterator<Item = (usize, usize)> + 'a {
-        let of_trunk = matches!(
+        let of_base = matches!(
             self.quantity,
             ResidualChannel::BasePosition(_)
                 | ResidualChannel::BaseOrientation(_)
                 | ResidualChannel::BaseVelocity(_)
                 | ResidualChannel::BaseRate(_)
         );
-        // A torque is the mean to the next row, and the last has none.
+        // A torque is the mean to the next row, so the last row has none.
         let end = window.rows.len() - usize::from(matches!(self.quantity, ResidualChannel::Torque(_)));
-        let first = if of_trunk && window.held { end } else { window.settling };
+        let first = if of_base && window.base.is_fixed() { end } else { window.settling };
         (first..end).map(|index| (index, window.rows.start + index)).filter(|(_, row)| self.measured[*row].is_finite())
     }
 }
 
-/// A log cut into windows.
+/// Log split into windows.
 #[derive(Clone, Debug)]
 pub struct Experiment {
     windows: Vec<Window>,
     channels: Vec<Channel>,
-    /// Measured orientations, by row, where the base was floating.
+    /// Rate at which the actuators are replayed [Hz].
+    actuator_hz: f64,
+    /// Measured orientations by row; empty without a floating base.
     orientations: Vec<DQuat>,
-    /// The log's own joints.
+    /// Joints of the log.
     joints: Vec<Joint>,
-    /// Rows in half a second.
+    /// Number of rows in a block.
     rows_per_block: usize,
     conditions: OperatingConditions,
 }
 
 impl Experiment {
-    /// `log` as an experiment on robots with the gains and rates of `robot`.
+    /// Creates an experiment from `log`, for robots with the gains and rates of `robot`.
     pub fn new(log: &Log, robot: &RobotModel, horizon: WindowConfig) -> Result<Self, ExperimentError> {
         let joints: Vec<_> = joint_commands(log)?.iter().map(|joint| joint.joint).collect();
+        let robot = &at_log_rate(log, robot)?;
         let windows = windows(log, robot, horizon)?;
-        let floating = windows.iter().any(|window| !window.held);
+        let floating = windows.iter().any(|window| !window.base.is_fixed());
         let orientations =
             if floating { (0..log.rows()).map(|row| orientation(log, row)).collect() } else { Vec::new() };
         Ok(Self {
+            actuator_hz: robot.control.actuator_hz,
             windows,
             channels: channels(log, &joints),
             orientations,
@@ -109,12 +118,12 @@ impl Experiment {
         })
     }
 
-    /// The joints that the log has.
+    /// Returns the joints of the log.
     pub fn joints(&self) -> &[Joint] {
         &self.joints
     }
 
-    /// The experiment with the rows `keep` says yes to alone.
+    /// Returns the experiment restricted to the rows that `keep` selects.
     #[must_use]
     pub fn filter_rows(mut self, keep: impl Fn(usize) -> bool) -> Self {
         for channel in &mut self.channels {
@@ -125,7 +134,7 @@ impl Experiment {
             }
         }
         for window in &mut self.windows {
-            // What is not compared is not simulated: a window ends with its last row that counts.
+            // Rows after the last selected one are not simulated.
             let last = window.rows.clone().rev().find(|row| keep(*row)).unwrap_or(window.rows.start);
             let count = last + 1 - window.rows.start;
             window.rows.end = last + 1;
@@ -136,15 +145,18 @@ impl Experiment {
         self
     }
 
-    /// Differences of simulated and measured for each candidate, in units of their noise; one entry a cell that was
-    /// measured, in the same order for every candidate. Not finite from where a candidate diverges.
+    /// Returns the residuals of each candidate: simulated minus measured, divided by the noise.
+    ///
+    /// There is one residual per measured cell, in the same order for every candidate. If a candidate diverges, its
+    /// residuals are not finite from then on.
     pub fn residuals(
         &self,
         simulator: &mut dyn Rollout,
         candidates: &[RobotModel],
         precision: Precision,
     ) -> Vec<Vec<f64>> {
-        let trajectories = self.play(simulator, candidates, precision);
+        let candidates = &self.at_rate(candidates);
+        let trajectories = self.simulate(simulator, candidates, precision);
         candidates
             .par_iter()
             .zip(trajectories.par_chunks(self.windows.len().max(1)))
@@ -160,45 +172,51 @@ impl Experiment {
             .collect()
     }
 
-    /// The experiment with the parts whose base was fixed alone, if there are any.
+    /// Returns the experiment restricted to windows with a fixed base, if there are any.
     #[must_use]
     pub fn prefer_fixed_base(mut self) -> Self {
-        if self.windows.iter().any(|window| window.held) {
-            self.windows.retain(|window| window.held);
+        if self.windows.iter().any(|window| window.base.is_fixed()) {
+            self.windows.retain(|window| window.base.is_fixed());
         }
         self
     }
 
-    /// Whether there are parts whose base was floating.
+    /// Returns true if a window has a floating base.
     pub fn has_floating_base(&self) -> bool {
-        self.windows.iter().any(|window| !window.held)
+        self.windows.iter().any(|window| !window.base.is_fixed())
     }
 
-    /// For every residual, its quantity and row.
+    /// Returns the channel and row of every residual.
     pub fn residual_index(&self) -> impl Iterator<Item = (ResidualChannel, usize)> {
         let windows = self.channels.iter().flat_map(|channel| self.windows.iter().map(move |window| (channel, window)));
         windows.flat_map(|(channel, window)| channel.rows(window).map(move |(_, row)| (channel.quantity, row)))
     }
 
-    /// Numbers of a floating base's start: position, orientation, velocity, rate.
+    /// Dimension of a floating base's initial state: position, orientation, velocity, angular velocity.
     pub const INITIAL_STATE_DIM: usize = 12;
 
-    /// The experiment with one number of every start off by `size` deviations of what smoothing leaves of its noise.
+    /// Returns the experiment with one component of every initial base state perturbed.
+    ///
+    /// The perturbation is `size` standard deviations of the smoothed measurement.
     pub fn with_perturbed_start(&self, number: usize, size: f64) -> Self {
         let (of_axis, axis) = (number / 3, number % 3);
-        let quantity =
-            [ResidualChannel::BasePosition, ResidualChannel::BaseOrientation, ResidualChannel::BaseVelocity, ResidualChannel::BaseRate][of_axis];
-        // A parabola through the cells within 20 ms leaves 9 / 4n of their variance at its middle.
+        let quantity = [
+            ResidualChannel::BasePosition,
+            ResidualChannel::BaseOrientation,
+            ResidualChannel::BaseVelocity,
+            ResidualChannel::BaseRate,
+        ][of_axis];
+        // The variance of a parabola fit through n cells within 20 ms is 9 / 4n of a cell's variance at the midpoint.
         let cells = 1.0 + 0.04 * self.rows_per_block as f64 / BLOCK_S;
         let error = size * (2.25 / cells).sqrt().min(1.0) * self.sigma(quantity(axis));
-        let mut off = self.clone();
-        for window in off.windows.iter_mut().filter(|window| !window.held) {
+        let mut perturbed = self.clone();
+        for window in perturbed.windows.iter_mut().filter(|window| !window.base.is_fixed()) {
             window.perturb_start(of_axis, axis, error);
         }
-        off
+        perturbed
     }
 
-    /// For every window whose base was floating, its residuals.
+    /// Returns the indices of the residuals of every window with a floating base.
     pub fn free_windows(&self) -> Vec<Vec<usize>> {
         let mut of_window = vec![Vec::new(); self.windows.len()];
         let mut next = 0;
@@ -210,23 +228,23 @@ impl Experiment {
             }
         }
         let pairs = self.windows.iter().zip(of_window);
-        pairs.filter(|(window, own)| !window.held && !own.is_empty()).map(|(_, own)| own).collect()
+        pairs.filter(|(window, own)| !window.base.is_fixed() && !own.is_empty()).map(|(_, own)| own).collect()
     }
 
-    /// Noise of a quantity, in its unit; 1 if it is not compared.
+    /// Returns the standard deviation of a channel's noise, in the channel's unit; 1 if it is not compared.
     pub fn sigma(&self, quantity: ResidualChannel) -> f64 {
         self.channels.iter().find(|channel| channel.quantity == quantity).map_or(1.0, |channel| channel.sigma)
     }
 
-    /// As many groups as [`EffectDemo::groups`] has at most.
+    /// Upper bound of the values of [`Experiment::groups`].
     pub const GROUPS: usize = 14;
 
-    /// Whether a group is of a fixed base.
+    /// Returns true if a group has a fixed base.
     pub fn is_held(group: usize) -> bool {
         group % 2 == 1
     }
 
-    /// For every residual, a number for its quantity and for whether the base was fixed.
+    /// Returns the group of every residual: a number for its quantity and the mount of the base.
     pub fn groups(&self) -> Vec<usize> {
         let group = |channel: &Channel, window: &Window| {
             let quantity = match channel.quantity {
@@ -238,26 +256,27 @@ impl Experiment {
                 ResidualChannel::BaseVelocity(_) => 5,
                 ResidualChannel::BaseRate(_) => 6,
             };
-            2 * quantity + usize::from(window.held)
+            2 * quantity + usize::from(window.base.is_fixed())
         };
         let windows = self.channels.iter().flat_map(|channel| self.windows.iter().map(move |window| (channel, window)));
         let same = windows.flat_map(|(channel, window)| channel.rows(window).map(move |_| group(channel, window)));
         same.collect()
     }
 
-    /// For every residual, the block that it belongs to: half a second, or a window with a floating base.
+    /// Returns the block of every residual: half a second, or a window with a floating base.
     pub fn blocks(&self) -> Vec<usize> {
         let windows = self.channels.iter().flat_map(|channel| self.windows.iter().map(move |window| (channel, window)));
         let block = |window: &Window, row: usize| {
-            // What a window with a floating base starts with is carried through all of it.
-            (if window.held { row } else { window.rows.start }) / self.rows_per_block
+            // An error of the initial state persists through a whole window with a floating base.
+            (if window.base.is_fixed() { row } else { window.rows.start }) / self.rows_per_block
         };
         windows.flat_map(|(channel, window)| channel.rows(window).map(move |(_, row)| block(window, row))).collect()
     }
 
-    /// Simulated less measured position of each joint [rad] with its row, simulated from measured states.
+    /// Returns rows and position errors of each joint, simulated minus measured [rad].
     pub fn position_errors(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> [Vec<(usize, f64)>; NUM_JOINTS] {
-        let windows = self.play(simulator, std::slice::from_ref(robot), Precision::Double);
+        let robot = &self.at_rate(std::slice::from_ref(robot))[0];
+        let windows = self.simulate(simulator, std::slice::from_ref(robot), Precision::Double);
         let mut errors = [const { Vec::new() }; NUM_JOINTS];
         for (channel, window, states) in self.compared(&windows) {
             if let ResidualChannel::Position(joint) = channel.quantity {
@@ -267,24 +286,36 @@ impl Experiment {
         errors
     }
 
-    fn play(&self, simulator: &mut dyn Rollout, candidates: &[RobotModel], precision: Precision) -> Vec<RobotStates> {
-        let weakened: Vec<_> = candidates.iter().map(|robot| self.derated_commands(robot)).collect();
+    /// Returns the robots with the actuator rate of the log.
+    fn at_rate(&self, robots: &[RobotModel]) -> Vec<RobotModel> {
+        let mut robots = robots.to_vec();
+        robots.iter_mut().for_each(|robot| robot.control.actuator_hz = self.actuator_hz);
+        robots
+    }
+
+    fn simulate(
+        &self,
+        simulator: &mut dyn Rollout,
+        candidates: &[RobotModel],
+        precision: Precision,
+    ) -> Vec<RobotStates> {
+        let derated: Vec<_> = candidates.iter().map(|robot| self.derated_commands(robot)).collect();
         let mut jobs = Vec::new();
-        for (robot, weakened) in candidates.iter().zip(&weakened) {
+        for (robot, derated) in candidates.iter().zip(&derated) {
             for (index, window) in self.windows.iter().enumerate() {
-                // Where the gyroscope is off, so is the measured start.
+                // The measured initial state contains the gyroscope bias.
                 let mut start = window.start;
                 for (rate, bias) in start.base_angular_velocity.iter_mut().zip(robot.gyro_bias.to_array()) {
                     *rate -= bias as f32;
                 }
-                let commands = weakened.get(index).unwrap_or(&window.commands);
-                jobs.push(RolloutRequest { robot, held: window.held, start, history: &window.history, commands });
+                let commands = derated.get(index).unwrap_or(&window.commands);
+                jobs.push(RolloutRequest { robot, base: window.base, start, history: &window.history, commands });
             }
         }
         simulator.run(&jobs, precision)
     }
 
-    /// The windows' commands to motors as supply and heat leave them; empty where the log tells neither.
+    /// Returns the commands of the windows with derating factors; empty if the log has neither voltage nor temperature.
     fn derated_commands(&self, robot: &RobotModel) -> Vec<Vec<Command>> {
         if self.conditions.is_empty() {
             return Vec::new();
@@ -292,8 +323,8 @@ impl Experiment {
         let of = |window: &Window| {
             let mut commands = window.commands.clone();
             for (pair, row) in window.period.windows(2).zip(window.rows.clone()) {
-                let strength = self.conditions.derating_factors(&robot.derating, row);
-                commands[pair[0]..pair[1]].iter_mut().for_each(|command| command.derating_factor = strength);
+                let derating_factors = self.conditions.derating_factors(&robot.derating, row);
+                commands[pair[0]..pair[1]].iter_mut().for_each(|command| command.derating_factor = derating_factors);
             }
             commands
         };
@@ -309,7 +340,7 @@ impl Experiment {
         })
     }
 
-    /// Hands on the difference in each row that is compared.
+    /// Calls `each` with every compared row and its difference, simulated minus measured.
     fn compare(
         &self,
         channel: &Channel,
@@ -330,9 +361,9 @@ impl Experiment {
                 ResidualChannel::BasePosition(axis) => f64::from(states.base_position[period][axis]),
                 ResidualChannel::BaseOrientation(axis) => {
                     let [w, x, y, z] = states.base_orientation[period].map(f64::from);
-                    let turn = self.orientations[row].inverse() * DQuat::from_xyzw(x, y, z, w);
-                    let turn = if turn.w < 0.0 { -turn } else { turn };
-                    turn.to_scaled_axis()[axis]
+                    let rotation = self.orientations[row].inverse() * DQuat::from_xyzw(x, y, z, w);
+                    let rotation = if rotation.w < 0.0 { -rotation } else { rotation };
+                    rotation.to_scaled_axis()[axis]
                 }
                 ResidualChannel::BaseVelocity(axis) => f64::from(states.base_linear_velocity[period][axis]),
                 ResidualChannel::BaseRate(axis) => f64::from(states.base_angular_velocity[period][axis]),
@@ -342,18 +373,12 @@ impl Experiment {
     }
 }
 
-/// Mean torque over actuator periods `from..until`, as a late sensor shows it [N·m].
+/// Returns the mean torque over actuator periods `from..until`, with the delay of the torque sensor [N·m].
 pub fn estimated_torque(states: &RobotStates, robot: &RobotModel, joint: usize, from: usize, until: usize) -> f64 {
-    let late = robot.joints[joint].actuator.sensor_delay / robot.control.actuator_dt();
-    // Entry p + 1 holds the torque of period p.
-    let at = |period: f64| {
-        let entry = (period + 1.0).clamp(1.0, (states.tau.len() - 1) as f64);
-        let (whole, part) = (entry.floor() as usize, entry.fract());
-        let next = (whole + 1).min(states.tau.len() - 1);
-        f64::from(states.tau[whole][joint]) * (1.0 - part) + f64::from(states.tau[next][joint]) * part
-    };
-    let periods = until.max(from + 1) - from;
-    (0..periods).map(|index| at((from + index) as f64 - late)).sum::<f64>() / periods as f64
+    let delay = robot.joints[joint].actuator.sensor_delay / robot.control.actuator_dt();
+    // Entry p + 1 has the torque of period p.
+    let last = states.tau.len() - 1;
+    delayed_mean(|period| f64::from(states.tau[(period + 1).min(last)][joint]), from..until.max(from + 1), delay)
 }
 
 fn channels(log: &Log, joints: &[Joint]) -> Vec<Channel> {

@@ -1,32 +1,34 @@
-//! Identification: a global search, a local one, and what the data can and cannot tell.
+//! Identification: predicted identifiability, global search, refinement, and intervals.
 
-use twinstep_effects::{Effect, EntryError, Scope};
 use twinstep_effects::ModelFile;
+use twinstep_effects::{Effect, EntryError, Scope};
 use twinstep_model::{Precision, Rollout};
 
 use crate::experiment::Experiment;
-use crate::refine::{SIMULATOR_MISMATCH_STD, covariance, information, refine};
 use crate::global_search::GlobalSearch;
 use crate::least_squares::LeastSquaresProblem;
-use crate::parameter::{FreeParameter, set_intervals, initial_coordinate, free_parameters, with_values, drop_unidentifiable};
+use crate::parameter::{
+    FreeParameter, drop_unidentifiable, free_parameters, initial_coordinate, set_intervals, with_values,
+};
+use crate::refine::{SIMULATOR_MISMATCH_STD, covariance, information, refine};
 
-/// An unknown that keeps more than this share of its prior deviation is left at its prior: the log cannot tell.
+/// Ratio of posterior to prior standard deviation above which a parameter is not identifiable and keeps its prior.
 const MAX_POSTERIOR_TO_PRIOR: f64 = 0.7;
-/// Correlations of this size and above are named.
+/// Absolute correlation from which a pair of parameters is reported.
 const MIN_CORRELATION: f64 = 0.9;
-/// The normal distribution's two-sided 95 %.
+/// Half width of the central 95 % interval of a normal distribution [standard deviations].
 const Z_95: f64 = 1.96;
 
-/// How hard to look.
+/// Options of an identification.
 #[derive(Clone, Debug)]
 pub struct IdentifyOptions {
-    /// Most generations of the global search.
+    /// Maximum number of generations of the global search.
     pub generations: usize,
-    /// Seed of its random numbers.
+    /// Random seed of the global search.
     pub seed: u64,
-    /// Seek also what the log cannot tell.
+    /// Also estimate parameters that are not identifiable.
     pub force: bool,
-    /// A search that was ended, to be taken up again.
+    /// Checkpoint of an interrupted search to resume.
     pub resume: Option<GlobalSearch>,
 }
 
@@ -36,88 +38,90 @@ impl Default for IdentifyOptions {
     }
 }
 
-/// Where an identification is.
+/// Stage of an identification.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stage {
-    /// Predicting what the log can tell.
+    /// Prediction of identifiability.
     Identifiability,
     /// CMA-ES.
     GlobalSearch,
-    /// Gauss-Newton.
+    /// Levenberg–Marquardt.
     Refinement,
 }
 
-/// Said now and then; ends the identification with the best so far when it returns false.
+/// Progress callback with stage, step and value: the RMS residual in the first stage, then the cost.
+///
+/// If it returns false, the identification is interrupted and returns the best point so far.
 pub type IdentifyProgress<'a> = dyn FnMut(Stage, usize, f64) -> bool + 'a;
 
-/// What came out of an unknown.
+/// Estimate of a free parameter.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ParameterEstimate {
-    /// The unknown.
+    /// The free parameter.
     pub parameter: FreeParameter,
-    /// Its value.
+    /// Estimated value.
     pub value: f64,
-    /// 95 %; none where the log cannot tell.
+    /// 95 % interval; `None` if the parameter is not identifiable.
     pub interval: Option<[f64; 2]>,
-    /// The 95 % interval that was predicted before the search, around the prior's middle.
+    /// 95 % interval around the prior mean, predicted before the search.
     pub predicted_interval: [f64; 2],
-    /// What is to be said of it.
+    /// Status of the estimate.
     pub verdict: EstimateStatus,
 }
 
-/// What is to be said of a value.
+/// Status of an estimate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EstimateStatus {
-    /// It was found.
+    /// The parameter was estimated.
     Identified,
-    /// It lies at its bound: the truth may be beyond.
+    /// The estimate is at its bound; the true value may be outside.
     AtBound,
-    /// The log cannot tell: it was left at its prior.
+    /// The parameter is not identifiable from the log and keeps its initial value.
     NotIdentifiable,
 }
 
-/// What came out.
+/// Result of an identification.
 #[derive(Clone, Debug)]
 pub struct Identification {
-    /// The model with the values and their intervals.
+    /// The model with the estimates and their intervals.
     pub model: ModelFile,
-    /// Unknown by unknown.
+    /// Estimate of each parameter.
     pub findings: Vec<ParameterEstimate>,
-    /// Root mean square of the residuals, in units of their noise, at the start and at the end.
+    /// Root mean square of the residuals [noise std] of the given model and of the result.
     pub rms: [f64; 2],
-    /// Pairs of unknowns that the log cannot part, with their correlation and the experiment that would.
+    /// Pairs of highly correlated parameters: names, correlation, and an experiment that discriminates between them.
     pub correlated: Vec<(String, String, f64, Option<&'static str>)>,
-    /// Where it was ended before it was done, to be taken up again.
+    /// State of the search for resuming, if the identification was interrupted.
     pub checkpoint: Option<GlobalSearch>,
 }
 
-/// Why there is no identification.
+/// Reason why an identification is impossible.
 #[derive(Debug, thiserror::Error)]
 pub enum IdentifyError {
-    /// An effect cannot be sought there.
+    /// An effect cannot be estimated at its scope.
     #[error(transparent)]
     Entry(#[from] EntryError),
-    /// The given model, played through the log's commands, diverges.
-    #[error("the simulation of the given model diverges on this log: start from a model that does not")]
+    /// The simulation of the given model diverges.
+    #[error("the simulation of the given model diverges on this log: start from a model that does not diverge")]
     Diverges,
-    /// The search that is to be taken up again sought something else.
-    #[error("the search to be resumed is another one\n  it:   {resumed}\n  this: {asked}")]
+    /// The checkpoint belongs to another problem.
+    #[error("the checkpoint belongs to another problem\n  checkpoint: {resumed}\n  requested:  {asked}")]
     ResumeMismatch {
-        /// What it sought.
+        /// Problem of the checkpoint.
         resumed: String,
-        /// What is sought now.
+        /// Requested problem.
         asked: String,
     },
-    /// No cell of the logs is left.
-    #[error("nothing is left to compare: the rows that count hold no measurement after a window's first row")]
+    /// The selected rows contain no residual.
+    #[error("there is nothing to compare: the selected rows contain no measurement after the first row of a window")]
     NothingToCompare,
 }
 
-/// Seeks the numbers of `effects` on top of `model`, so that simulations follow the logs of `experiments`.
+/// Estimates the parameters of `effects` on top of `model` from the logs of `experiments`.
 ///
-/// The cost is the sum of squares of all residuals in units of their noise, plus the squared distance of each unknown from
-/// its prior in prior deviations: SPI-Active's cost (its eq. 4) with the noise as weights. Residuals larger than the
-/// stated noise widen it: they are scaled by what the best model leaves.
+/// The cost is the sum of squares of all residuals [noise std], plus the squared distance of each parameter from its
+/// prior mean [prior std]: the cost of SPI-Active (eq. 4) with the noise as weights. Residuals that exceed the noise
+/// are scaled by the root mean square residual of the best model.
 pub fn identify(
     model: &ModelFile,
     effects: &[(&'static Effect, Scope)],
@@ -127,29 +131,44 @@ pub fn identify(
     progress: &mut IdentifyProgress,
 ) -> Result<Identification, IdentifyError> {
     let (file, all) = free_parameters(model, effects)?;
-    let whole =
-        LeastSquaresProblem { file: &file, unknowns: &all, experiments, residual_scale: &[], tolerances: None, precision: Precision::Double };
-    let given =
-        LeastSquaresProblem { file: model, unknowns: &[], experiments, residual_scale: &[], tolerances: None, precision: Precision::Double };
+    let whole = LeastSquaresProblem {
+        file: &file,
+        unknowns: &all,
+        experiments,
+        residual_scale: &[],
+        tolerances: None,
+        precision: Precision::Double,
+    };
+    let given = LeastSquaresProblem {
+        file: model,
+        unknowns: &[],
+        experiments,
+        residual_scale: &[],
+        tolerances: None,
+        precision: Precision::Double,
+    };
     let first = given.residuals(simulator, &[Vec::new()]).remove(0).ok_or(IdentifyError::Diverges)?;
     if first.is_empty() {
         return Err(IdentifyError::NothingToCompare);
     }
     let begin: Vec<f64> = all.iter().map(|unknown| initial_coordinate(&file, unknown)).collect();
     let predicted = predicted(&whole, simulator);
-    let told: Vec<bool> = predicted.iter().map(|deviation| options.force || *deviation < MAX_POSTERIOR_TO_PRIOR).collect();
-    // What the log cannot tell stays where it starts: at its neutral value where it has one.
-    let free: Vec<FreeParameter> = kept(&all, &told);
+    let identifiable: Vec<bool> = predicted.iter().map(|std| options.force || *std < MAX_POSTERIOR_TO_PRIOR).collect();
+    // Parameters that are not identifiable keep their initial value.
+    let free: Vec<FreeParameter> = select(&all, &identifiable);
     let task = LeastSquaresProblem { unknowns: &free, ..whole };
     let mut search = match &options.resume {
         Some(resumed) => resumed.clone(),
-        None => {
-            GlobalSearch::new(question(&free, first.len(), rms(&first), options.seed), &task, kept(&begin, &told), simulator)
-        }
+        None => GlobalSearch::new(
+            problem_key(&free, first.len(), rms(&first), options.seed),
+            &task,
+            select(&begin, &identifiable),
+            simulator,
+        ),
     };
-    let asked = question(&free, first.len(), rms(&first), options.seed);
-    if search.problem_key != asked {
-        return Err(IdentifyError::ResumeMismatch { resumed: search.problem_key, asked });
+    let requested = problem_key(&free, first.len(), rms(&first), options.seed);
+    if search.problem_key != requested {
+        return Err(IdentifyError::ResumeMismatch { resumed: search.problem_key, asked: requested });
     }
     let mut interrupted = !progress(Stage::Identifiability, 1, rms(&first));
     if !free.is_empty() && !interrupted {
@@ -165,7 +184,7 @@ pub fn identify(
     let mut point = search.best.clone();
     let mut spread = task.estimate_residual_scale(simulator, &point);
     let mut steps = 0;
-    // What the model cannot follow shows better after the first descent.
+    // The residual scale is more accurate after the first refinement.
     for _ in 0..2 {
         if free.is_empty() || interrupted {
             break;
@@ -181,27 +200,27 @@ pub fn identify(
     let here = LeastSquaresProblem { residual_scale: &spread, ..task }.linearise(simulator, &point);
     let spread = here.and_then(|here| covariance(&here, &blocks(experiments), &[]));
     let mut found = with_values(&file, &free, &point);
-    let (findings, confusable) = estimates(&all, &predicted, &told, &free, &point, &begin, spread.as_ref());
+    let (findings, correlated) = estimates(&all, &predicted, &identifiable, &free, &point, &begin, spread.as_ref());
     let intervals: Vec<_> = findings.iter().map(|finding| finding.interval).collect();
     set_intervals(&mut found, &all, &intervals);
-    drop_unidentifiable(&mut found, model, &all, &told);
+    drop_unidentifiable(&mut found, model, &all, &identifiable);
     let interrupted = interrupted.then_some(search);
-    Ok(Identification { model: found, findings, rms: [rms(&first), rms(&last)], correlated: confusable, checkpoint: interrupted })
+    Ok(Identification { model: found, findings, rms: [rms(&first), rms(&last)], correlated, checkpoint: interrupted })
 }
 
-fn kept<T: Clone>(all: &[T], told: &[bool]) -> Vec<T> {
-    all.iter().zip(told).filter(|(_, told)| **told).map(|(one, _)| one.clone()).collect()
+fn select<T: Clone>(all: &[T], identifiable: &[bool]) -> Vec<T> {
+    all.iter().zip(identifiable).filter(|(_, identifiable)| **identifiable).map(|(one, _)| one.clone()).collect()
 }
 
-/// What a search is about, in words.
-fn question(free: &[FreeParameter], residuals: usize, rms: f64, seed: u64) -> String {
+/// Returns a description of the problem, which identifies a checkpoint.
+fn problem_key(free: &[FreeParameter], residuals: usize, rms: f64, seed: u64) -> String {
     let names: Vec<_> = free.iter().map(FreeParameter::name).collect();
-    format!("seed {seed}, {residuals} residuals of RMS {rms:.6e}, unknowns {}", names.join(", "))
+    format!("seed {seed}, {residuals} residuals of RMS {rms:.6e}, free parameters {}", names.join(", "))
 }
 
-/// The 95 % interval of a deviation [prior deviations] around a coordinate.
-fn around(unknown: &FreeParameter, coordinate: f64, deviation: f64) -> [f64; 2] {
-    let half = Z_95 * deviation * unknown.prior[1];
+/// Returns the 95 % interval around a coordinate for a standard deviation [prior std].
+fn interval_around(unknown: &FreeParameter, coordinate: f64, std: f64) -> [f64; 2] {
+    let half = Z_95 * std * unknown.prior[1];
     let ends = [unknown.value(coordinate - half), unknown.value(coordinate + half)];
     [ends[0].min(ends[1]), ends[0].max(ends[1])]
 }
@@ -210,7 +229,7 @@ fn rms(residuals: &[f64]) -> f64 {
     (residuals.iter().map(|residual| residual * residual).sum::<f64>() / residuals.len().max(1) as f64).sqrt()
 }
 
-/// Blocks of all experiments, each with numbers of its own.
+/// Returns the blocks of the residuals of all experiments, with distinct numbers for each experiment.
 pub fn blocks(experiments: &[Experiment]) -> Vec<usize> {
     let mut all = Vec::new();
     for experiment in experiments {
@@ -220,19 +239,23 @@ pub fn blocks(experiments: &[Experiment]) -> Vec<usize> {
     all
 }
 
-/// The deviation of each unknown [prior deviations] that the Fisher information of this motion, prior included, lets
-/// expect in the middle of the priors, where every effect is there.
+/// Predicts the standard deviation of each parameter [prior std] from the Fisher information of residuals and prior.
+///
+/// It is evaluated at the prior means, where every effect acts.
 fn predicted(task: &LeastSquaresProblem, simulator: &mut dyn Rollout) -> Vec<f64> {
-    let middle = task.from_prior_units(&vec![0.0; task.unknowns.len()]);
-    // Errors go on for long: count one row in thirty as independent, and with a floating base one in a window.
+    let prior_mean = task.from_prior_units(&vec![0.0; task.unknowns.len()]);
+    // Residuals are correlated: one row in thirty counts as independent, and one in 200, a window, with a floating
+    // base.
     let independent = |group: &usize| if Experiment::is_held(*group) { 30f64.sqrt() } else { 200f64.sqrt() };
     let groups: Vec<usize> = task.experiments.iter().flat_map(Experiment::groups).collect();
     let spread: Vec<f64> = groups.iter().map(independent).collect();
-    let here = LeastSquaresProblem { residual_scale: &spread, ..*task }.linearise(simulator, &middle);
+    let here = LeastSquaresProblem { residual_scale: &spread, ..*task }.linearise(simulator, &prior_mean);
     let factor = here.and_then(|here| information(&here).cholesky());
     factor.map_or_else(
         || vec![0.0; task.unknowns.len()],
-        |factor| factor.inverse().diagonal().iter().map(|variance| variance.sqrt().hypot(SIMULATOR_MISMATCH_STD)).collect(),
+        |factor| {
+            factor.inverse().diagonal().iter().map(|variance| variance.sqrt().hypot(SIMULATOR_MISMATCH_STD)).collect()
+        },
     )
 }
 
@@ -241,42 +264,57 @@ type CorrelatedPairs = Vec<(String, String, f64, Option<&'static str>)>;
 fn estimates(
     all: &[FreeParameter],
     predicted: &[f64],
-    told: &[bool],
+    identifiable: &[bool],
     free: &[FreeParameter],
     point: &[f64],
     begin: &[f64],
     spread: Option<&nalgebra::DMatrix<f64>>,
 ) -> (Vec<ParameterEstimate>, CorrelatedPairs) {
     let mut findings = Vec::new();
-    let mut place = 0;
+    let mut free_index = 0;
     for (index, unknown) in all.iter().enumerate() {
-        let predicted = around(unknown, unknown.prior[0], predicted[index]);
-        if !told[index] {
+        let predicted = interval_around(unknown, unknown.prior[0], predicted[index]);
+        if !identifiable[index] {
             let (unknown, value) = (unknown.clone(), unknown.value(begin[index]));
-            findings.push(ParameterEstimate { parameter: unknown, value, interval: None, predicted_interval: predicted, verdict: EstimateStatus::NotIdentifiable });
+            findings.push(ParameterEstimate {
+                parameter: unknown,
+                value,
+                interval: None,
+                predicted_interval: predicted,
+                verdict: EstimateStatus::NotIdentifiable,
+            });
             continue;
         }
         let [low, high] = unknown.coordinate_bounds();
-        let at_bound = |end: f64| (point[place] - end).abs() < 1e-6 * unknown.prior[1];
-        let verdict = if at_bound(low) || at_bound(high) { EstimateStatus::AtBound } else { EstimateStatus::Identified };
-        let interval = spread.map(|spread| around(unknown, point[place], spread[(place, place)].sqrt()));
-        let (unknown, value) = (unknown.clone(), unknown.value(point[place]));
-        findings.push(ParameterEstimate { parameter: unknown, value, interval, predicted_interval: predicted, verdict });
-        place += 1;
+        let at_bound = |end: f64| (point[free_index] - end).abs() < 1e-6 * unknown.prior[1];
+        let verdict =
+            if at_bound(low) || at_bound(high) { EstimateStatus::AtBound } else { EstimateStatus::Identified };
+        let interval =
+            spread.map(|spread| interval_around(unknown, point[free_index], spread[(free_index, free_index)].sqrt()));
+        let (unknown, value) = (unknown.clone(), unknown.value(point[free_index]));
+        findings.push(ParameterEstimate {
+            parameter: unknown,
+            value,
+            interval,
+            predicted_interval: predicted,
+            verdict,
+        });
+        free_index += 1;
     }
-    let mut confusable = Vec::new();
+    let mut correlated = Vec::new();
     if let Some(spread) = spread {
         for i in 0..free.len() {
             for j in 0..i {
                 let correlation = spread[(i, j)] / (spread[(i, i)] * spread[(j, j)]).sqrt();
                 if correlation.abs() >= MIN_CORRELATION {
-                    let experiment = free[i].effect.confounders.iter().find(|other| other.effect == free[j].effect.name);
+                    let experiment =
+                        free[i].effect.confounders.iter().find(|other| other.effect == free[j].effect.name);
                     let back = free[j].effect.confounders.iter().find(|other| other.effect == free[i].effect.name);
-                    let experiment = experiment.or(back).map(|confusion| confusion.discriminating_experiment);
-                    confusable.push((free[j].name(), free[i].name(), correlation, experiment));
+                    let experiment = experiment.or(back).map(|confounder| confounder.discriminating_experiment);
+                    correlated.push((free[j].name(), free[i].name(), correlation, experiment));
                 }
             }
         }
     }
-    (findings, confusable)
+    (findings, correlated)
 }

@@ -1,49 +1,56 @@
-//! The torques of a measured motion: what a model's actuators give for it, and what its bodies need.
+//! Inverse-dynamics residual: torque of a model's actuators on measured states minus the torque of the measured motion.
 //!
-//! No simulation, and so no error that adds up: what is left over stands beside the speed, position or acceleration
-//! that explains it.
+//! Nothing is simulated, so errors do not accumulate. The residual in a row depends on speed, position and acceleration
+//! in the same row.
 
 use std::ops::Range;
 
-use twinstep_model::{dynamics::{Acceleration, SimdCommands, SimdActuators, State, KinematicTree, Vec3, inverse_dynamics}, BaseMount, NUM_JOINTS, RobotModel};
 use twinstep_logs::{Log, TorqueSensor};
+use twinstep_model::{
+    BaseMount, NUM_JOINTS, RobotModel,
+    dynamics::{Acceleration, KinematicTree, SimdActuators, SimdCommands, State, Vec3, inverse_dynamics},
+};
 
-use crate::operating_conditions::OperatingConditions;
-use crate::motion::{ActuatorClock, JointCommands, MotionError, command, joint_commands};
+use twinstep_logs::operating_conditions::OperatingConditions;
+use twinstep_logs::replay::{
+    ActuatorClock, JointCommands, ReplayError, at_log_rate, command, delayed_mean, joint_commands,
+};
 
-/// [m/s²]
+/// Gravitational acceleration [m/s²].
 const GRAVITY: f64 = 9.81;
-/// Rows on either side that a slope is taken over.
+/// Number of rows on either side for a derivative.
 const HALF_WINDOW: usize = 3;
 
-/// One number a row for each joint, in the order of [`twinstep_model::Joint::ALL`]; NaN where the log cannot tell, and
-/// nothing at all for a joint that it lacks.
+/// One value per row for each joint, in the order of [`twinstep_model::Joint::ALL`].
+///
+/// Values are NaN if they are not known. The series of a joint that the log lacks is empty.
 pub type JointSeries = [Vec<f64>; NUM_JOINTS];
 
-/// Measured motion of the joints, each row at the middle between it and the next, where the mean torque belongs.
+/// Measured motion of the joints at the midpoint of each row and the next, the time of the mean torque.
 #[derive(Clone, Debug)]
 pub struct JointTrajectory {
-    /// [rad]
+    /// Position [rad].
     pub q: JointSeries,
-    /// Measured, or else the slope of the position [rad/s].
+    /// Velocity [rad/s]: measured, or else the derivative of the position.
     pub dq: JointSeries,
-    /// Slope of the velocity [rad/s²].
+    /// Acceleration [rad/s²]: the derivative of the velocity.
     pub ddq: JointSeries,
 }
 
-/// What measured motion leaves over under a model.
+/// Inverse-dynamics residual of a model on a log.
 #[derive(Clone, Debug)]
 pub struct InverseDynamicsResidual {
-    /// What motor, friction and spring of the model give, less what its bodies need for the measured motion [N·m]; of a
-    /// trunk that is held, because the ground's forces are not measured.
+    /// Torque of the model's motor, friction and spring, minus inverse dynamics of the measured motion [N·m].
+    ///
+    /// Only with a fixed base, because contact forces are not measured.
     pub torque: JointSeries,
-    /// Torque that the model's actuators would show at the log's sensor [N·m].
+    /// Torque that the model predicts at the log's torque sensor [N·m].
     pub estimated_torque: JointSeries,
 }
 
 impl JointTrajectory {
-    /// Those of `log`.
-    pub fn of(log: &Log) -> Result<Self, MotionError> {
+    /// Computes the trajectory of `log`.
+    pub fn of(log: &Log) -> Result<Self, ReplayError> {
         let mut this = Self { q: empty(), dq: empty(), ddq: empty() };
         for joint in joint_commands(log)? {
             let (index, name) = (joint.joint.index(), joint.joint.name());
@@ -58,29 +65,29 @@ impl JointTrajectory {
 }
 
 impl InverseDynamicsResidual {
-    /// That of `robot` on `log`.
-    pub fn of(log: &Log, robot: &RobotModel) -> Result<Self, MotionError> {
-        let (joints, clock) = (joint_commands(log)?, ActuatorClock::of(log, robot)?);
+    /// Computes the residual of `robot` on `log`.
+    pub fn of(log: &Log, robot: &RobotModel) -> Result<Self, ReplayError> {
+        let mut robot = at_log_rate(log, robot)?;
+        let (joints, clock) = (joint_commands(log)?, ActuatorClock::of(log, &robot)?);
         let kinematics = JointTrajectory::of(log)?;
-        let mut robot = robot.clone();
         for joint in &mut robot.joints {
-            // The encoder follows the rotor: play and springs in the gear are in the measured position already.
+            // The encoder is at the rotor: the measured position contains the effect of backlash and elasticity.
             (joint.actuator.backlash, joint.actuator.gear_stiffness) = (0.0, f64::INFINITY);
         }
-        let player = ActuatorReplay { log, robot: &robot, joints, clock, kinematics };
-        let mut balance = Self { torque: empty(), estimated_torque: empty() };
-        for joint in &player.joints {
-            balance.torque[joint.joint.index()] = vec![f64::NAN; log.rows()];
-            balance.estimated_torque[joint.joint.index()] = vec![f64::NAN; log.rows()];
+        let replay = ActuatorReplay { log, robot: &robot, joints, clock, kinematics };
+        let mut residual = Self { torque: empty(), estimated_torque: empty() };
+        for joint in &replay.joints {
+            residual.torque[joint.joint.index()] = vec![f64::NAN; log.rows()];
+            residual.estimated_torque[joint.joint.index()] = vec![f64::NAN; log.rows()];
         }
         for (segment, rows) in log.segments().filter(|(_, rows)| rows.len() > 1) {
-            player.play(rows, segment.base == BaseMount::Fixed, &mut balance);
+            replay.run(rows, segment.base == BaseMount::Fixed, &mut residual);
         }
-        Ok(balance)
+        Ok(residual)
     }
 }
 
-/// A log whose commands go through a model's actuators.
+/// Simulation of a model's actuators with the commands of a log.
 struct ActuatorReplay<'a> {
     log: &'a Log,
     robot: &'a RobotModel,
@@ -90,48 +97,56 @@ struct ActuatorReplay<'a> {
 }
 
 impl ActuatorReplay<'_> {
-    fn play(&self, rows: Range<usize>, held: bool, balance: &mut InverseDynamicsResidual) {
+    fn run(&self, rows: Range<usize>, is_fixed: bool, residual: &mut InverseDynamicsResidual) {
         let (robot, t) = (self.robot, &self.log.t()[rows.clone()]);
         let (conditions, tree) = (OperatingConditions::of(self.log), KinematicTree::splat(robot));
         let mut actuator = SimdActuators::<f64>::new(robot, robot.control.actuator_dt());
         actuator.set(0, robot, &self.sampled(rows.start).0.map(|q| q as f32), &[0.0; NUM_JOINTS]);
+        // Torque at the sensor in each actuator period since the start of the range [N·m].
+        let mut history: Vec<[f64; NUM_JOINTS]> = Vec::new();
         for row in rows.start..rows.end - 1 {
             let mut command = command(robot, &self.joints, row);
             command.derating_factor = conditions.derating_factors(&robot.derating, row);
             let commands = SimdCommands::new(&[command]);
             let (q, dq) = self.sampled(row);
             let middle = self.middle(row);
-            let needed = inverse_dynamics(&tree, &middle.0, &middle.1, GRAVITY).1;
+            let required = inverse_dynamics(&tree, &middle.0, &middle.1, GRAVITY).1;
             let periods = self.clock.periods_between(t, row - rows.start).max(1);
-            let (mut given, mut shown) = ([0.0; NUM_JOINTS], [0.0; NUM_JOINTS]);
+            let mut applied = [0.0; NUM_JOINTS];
             for _ in 0..periods {
                 actuator.update_command(&commands, &q, &dq);
                 let forces = actuator.step(0, &middle.0.q, &middle.0.dq);
+                let mut estimated = [0.0; NUM_JOINTS];
                 for joint in 0..NUM_JOINTS {
                     let speed = middle.0.dq[joint];
                     let friction = forces.damping[joint] * speed + forces.dry_friction[joint] * (speed / 0.02).tanh();
                     let spring = robot.joints[joint].spring;
                     let spring = spring.torque_offset - spring.stiffness * middle.0.q[joint];
-                    given[joint] += (forces.tau[joint] - friction) / periods as f64;
-                    shown[joint] += match self.log.meta().tau_sensor {
+                    applied[joint] += (forces.tau[joint] - friction) / periods as f64;
+                    estimated[joint] = match self.log.meta().tau_sensor {
                         TorqueSensor::JointOutput => {
                             let rotor = robot.joints[joint].armature * middle.1.ddq[joint];
                             forces.tau[joint] - spring - friction - rotor
                         }
                         _ => actuator.estimated_torque()[joint],
-                    } / periods as f64;
+                    };
                 }
+                history.push(estimated);
             }
             for joint in self.joints.iter().map(|joint| joint.joint.index()) {
-                balance.estimated_torque[joint][row] = shown[joint];
-                if held && self.kinematics.ddq[joint][row].is_finite() {
-                    balance.torque[joint][row] = given[joint] - needed[joint];
+                let delay = robot.joints[joint].actuator.sensor_delay / robot.control.actuator_dt();
+                let samples = history.len() - periods..history.len();
+                residual.estimated_torque[joint][row] = delayed_mean(|sample| history[sample][joint], samples, delay);
+                if is_fixed && self.kinematics.ddq[joint][row].is_finite() {
+                    residual.torque[joint][row] = applied[joint] - required[joint];
                 }
             }
         }
     }
 
-    /// What the actuator is given in `row`, which is not the last: it adds its offset, which a log has already.
+    /// Returns the joint positions [rad] and velocities [rad/s] in `row`, which is not the last one.
+    ///
+    /// Encoder offsets are subtracted, because the actuators add them.
     fn sampled(&self, row: usize) -> ([f64; NUM_JOINTS], [f64; NUM_JOINTS]) {
         let (mut q, mut dq) = (self.robot.control.default_pose, [0.0; NUM_JOINTS]);
         for joint in &self.joints {
@@ -145,7 +160,7 @@ impl ActuatorReplay<'_> {
         (q, dq)
     }
 
-    /// The measured motion between `row` and the next; a joint that nobody measured holds still.
+    /// Returns the measured motion at the midpoint of `row` and the next. Joints without measurement are at rest.
     fn middle(&self, row: usize) -> (State<f64>, Acceleration<f64>) {
         let mut state = State::<f64>::origin();
         let mut ddq = [0.0; NUM_JOINTS];
@@ -168,8 +183,10 @@ fn or_zero(value: f64) -> f64 {
     if value.is_finite() { value } else { 0.0 }
 }
 
-/// Change of `cells` with time, by row: that of the parabola through the row and three on either side. NaN near
-/// the ends of the log's parts.
+/// Returns the time derivative of `cells` by row: of the parabola fit through the row and [`HALF_WINDOW`] on either
+/// side.
+///
+/// It is NaN near the ends of contiguous ranges of rows.
 fn derivative(log: &Log, cells: &[f64]) -> Vec<f64> {
     let slope = |row: usize| {
         let near = || row - HALF_WINDOW..=row + HALF_WINDOW;
@@ -178,14 +195,14 @@ fn derivative(log: &Log, cells: &[f64]) -> Vec<f64> {
         let spread: f64 = near().map(|other| (dt(other) - middle).powi(2)).sum();
         near().map(|other| (dt(other) - middle) * cells[other]).sum::<f64>() / spread
     };
-    let mut slopes = vec![f64::NAN; cells.len()];
+    let mut derivatives = vec![f64::NAN; cells.len()];
     for (_, rows) in log.segments() {
-        (rows.start + HALF_WINDOW..rows.end.saturating_sub(HALF_WINDOW)).for_each(|row| slopes[row] = slope(row));
+        (rows.start + HALF_WINDOW..rows.end.saturating_sub(HALF_WINDOW)).for_each(|row| derivatives[row] = slope(row));
     }
-    slopes
+    derivatives
 }
 
-/// Means of neighbouring rows of a part; its last has none.
+/// Returns the mean of each row and the next; NaN for the last row of a contiguous range.
 fn midpoints(log: &Log, cells: &[f64]) -> Vec<f64> {
     let mut means = vec![f64::NAN; cells.len()];
     for (_, rows) in log.segments() {

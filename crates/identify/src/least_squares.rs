@@ -1,4 +1,4 @@
-//! What is asked of the data: numbers of a model, and the experiments that its simulations are to follow.
+//! Least-squares problem: free parameters of a model, and experiments whose residuals are minimised.
 
 use nalgebra::{DMatrix, DVector};
 use twinstep_effects::ModelFile;
@@ -8,37 +8,39 @@ use crate::experiment::Experiment;
 use crate::nuisance::NuisanceModel;
 use crate::parameter::{FreeParameter, candidate};
 
-/// Half a difference, in prior standard deviations.
+/// Step of the central differences, on either side [prior std].
 const STEP: f64 = 0.02;
 
-/// What is asked. A point is the unknowns' coordinates.
+/// Least-squares problem. A point consists of the coordinates of the free parameters.
 #[derive(Clone, Copy)]
 pub struct LeastSquaresProblem<'a> {
-    /// The model with an entry for each unknown.
+    /// The model, with entries for all free parameters.
     pub file: &'a ModelFile,
-    /// What is sought.
+    /// The free parameters.
     pub unknowns: &'a [FreeParameter],
-    /// What is to be followed.
+    /// The experiments.
     pub experiments: &'a [Experiment],
-    /// What residuals are divided by, one by one, besides their noise; empty for nothing. See [`LeastSquaresProblem::spread`].
+    /// Scale of each residual in addition to its noise; empty for 1. See
+    /// [`LeastSquaresProblem::estimate_residual_scale`].
     pub residual_scale: &'a [f64],
-    /// Errors that explain residuals at a price, for residuals that are divided by `spread`.
+    /// Nuisance parameters, for residuals that are divided by `residual_scale`.
     pub tolerances: Option<&'a NuisanceModel>,
-    /// What candidates are simulated in.
+    /// Precision of the simulations.
     pub precision: Precision,
 }
 
-/// Residuals at a point, and their derivatives by the coordinates in units of their prior deviations.
+/// Residuals at a point, and their derivatives with respect to the coordinates [1/prior std].
 pub struct Linearisation {
     /// Residuals.
     pub residuals: DVector<f64>,
-    /// One row a residual, one column an unknown.
+    /// Jacobian: one row per residual, one column per free parameter.
     pub jacobian: DMatrix<f64>,
 }
 
 impl LeastSquaresProblem<'_> {
-    /// Residuals at points, one after the other, then what tolerated errors cost; none of a point that is no robot or
-    /// diverged.
+    /// Returns the residuals of each point, followed by the penalties of the nuisance parameters.
+    ///
+    /// The entry of a point is `None` if it is not a valid robot or its simulation diverges.
     pub fn residuals(&self, simulator: &mut dyn Rollout, points: &[Vec<f64>]) -> Vec<Option<Vec<f64>>> {
         let robots: Vec<_> = points.iter().map(|point| candidate(self.file, self.unknowns, point)).collect();
         let built: Vec<_> = robots.iter().flatten().cloned().collect();
@@ -64,7 +66,9 @@ impl LeastSquaresProblem<'_> {
             .collect()
     }
 
-    /// Residuals and slopes at `point`: central differences in one batch; none where a neighbour diverges.
+    /// Computes residuals and Jacobian at `point`, by central differences in one batch.
+    ///
+    /// Returns `None` if a simulation diverges.
     pub fn linearise(&self, simulator: &mut dyn Rollout, point: &[f64]) -> Option<Linearisation> {
         let mut points = vec![point.to_vec()];
         let mut widths = Vec::new();
@@ -80,21 +84,22 @@ impl LeastSquaresProblem<'_> {
         }
         let mut all = self.residuals(simulator, &points).into_iter();
         let here = DVector::from_vec(all.next()??);
-        let mut slopes = DMatrix::zeros(here.len(), self.unknowns.len());
+        let mut jacobian = DMatrix::zeros(here.len(), self.unknowns.len());
         for (index, width) in widths.into_iter().enumerate() {
             let (below, above) = (all.next()??, all.next()??);
-            let slope = above.iter().zip(&below).map(|(above, below)| (above - below) / width);
-            slopes.set_column(index, &DVector::from_iterator(here.len(), slope));
+            let derivative = above.iter().zip(&below).map(|(above, below)| (above - below) / width);
+            jacobian.set_column(index, &DVector::from_iterator(here.len(), derivative));
         }
-        Some(Linearisation { residuals: here, jacobian: slopes })
+        Some(Linearisation { residuals: here, jacobian })
     }
 
-    /// How much larger than their noise the residuals of `point` are, by quantity and by whether the base was fixed; at least
-    /// 1. A model errs in some of them more than in others, and those say less.
+    /// Returns the scale of each residual at `point`: the root mean square of its group, at least 1.
+    ///
+    /// Groups are quantities with a fixed or a floating base. Groups with larger model errors get smaller weights.
     pub fn estimate_residual_scale(&self, simulator: &mut dyn Rollout, point: &[f64]) -> Vec<f64> {
-        let unspread = LeastSquaresProblem { residual_scale: &[], ..*self };
+        let unscaled = LeastSquaresProblem { residual_scale: &[], ..*self };
         let groups: Vec<usize> = self.experiments.iter().flat_map(Experiment::groups).collect();
-        let Some(residuals) = unspread.residuals(simulator, &[point.to_vec()]).remove(0) else {
+        let Some(residuals) = unscaled.residuals(simulator, &[point.to_vec()]).remove(0) else {
             return vec![1.0; groups.len()];
         };
         let mut sums = vec![(0.0, 0.0); Experiment::GROUPS];
@@ -105,18 +110,18 @@ impl LeastSquaresProblem<'_> {
         groups.iter().map(|group| (sums[*group].0 / sums[*group].1).sqrt().max(1.0)).collect()
     }
 
-    /// Cost of residuals, and of the distance to the prior.
+    /// Returns the cost: sum of squares of the residuals and of the distances from the prior means.
     pub fn cost(&self, residuals: &[f64], point: &[f64]) -> f64 {
         residuals.iter().map(|residual| residual * residual).sum::<f64>()
             + self.to_prior_units(point).map(|distance| distance * distance).sum::<f64>()
     }
 
-    /// A point's distance from the prior means, in prior deviations.
+    /// Returns the difference of each coordinate from its prior mean [prior std].
     pub fn to_prior_units(&self, point: &[f64]) -> impl Iterator<Item = f64> {
         self.unknowns.iter().zip(point).map(|(unknown, value)| (value - unknown.prior[0]) / unknown.prior[1])
     }
 
-    /// Back from [`LeastSquaresProblem::to_prior_units`], to the nearest point that is allowed.
+    /// Inverts [`LeastSquaresProblem::to_prior_units`], and clips the coordinates to their bounds.
     pub fn from_prior_units(&self, scaled: &[f64]) -> Vec<f64> {
         let pairs = self.unknowns.iter().zip(scaled);
         let back = pairs.map(|(unknown, value)| {

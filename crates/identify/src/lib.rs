@@ -1,9 +1,9 @@
-//! System identification: measured logs compared with simulations, and parameters estimated from them.
+//! System identification: comparison of measured logs with simulations, and estimation of parameters.
 //!
-//! - [`motion`]: the commands of a log, row by row, in actuator periods.
-//! - [`record()`]: runs a motion on a robot in a backend and returns the log.
-//! - [`apply_sensors()`]: sensor noise and resolution on an exact log.
-//! - [`Experiment`]: a log cut into windows that are simulated from measured states, with residuals in units of noise.
+//! - [`record()`]: simulates a motion file on a robot in a backend and returns the log.
+//! - [`apply_sensors()`]: adds sensor noise and resolution to a simulated log.
+//! - [`Experiment`]: a log split into windows that are simulated from measured states, with residuals in units of
+//!   noise.
 //! - [`EffectAtScope`]: an effect to estimate, as in `coulomb_friction@calf`.
 //! - [`replay`]: measured and simulated positions joint by joint.
 //! - [`evaluate()`]: the errors of a model on a log; [`position_errors`]: the same over time.
@@ -11,9 +11,9 @@
 //! - [`FreeParameter`]: a parameter of a model file that is estimated, with bounds and prior.
 //! - [`GlobalSearch`]: CMA-ES, which can be interrupted and resumed.
 //! - [`NuisanceModel`]: nuisance parameters, eliminated by generalised least squares.
-//! - [`identify()`]: CMA-ES, then Levenberg-Marquardt, then intervals and identifiability.
+//! - [`identify()`]: predicted identifiability, CMA-ES, Levenberg–Marquardt, then intervals and correlations.
 //!
-//! The simulator is a [`twinstep_model::Rollout`]; this crate depends on no engine.
+//! Simulators implement [`twinstep_model::Rollout`]; this crate does not depend on an engine.
 
 mod cmaes;
 mod effect_list;
@@ -23,13 +23,11 @@ mod global_search;
 pub mod identify;
 mod inverse_dynamics;
 pub mod least_squares;
-pub mod motion;
 pub mod nuisance;
-mod operating_conditions;
 pub mod parameter;
 mod record;
-pub mod replay;
 pub mod refine;
+pub mod replay;
 mod sensors;
 pub mod torque;
 pub mod window;
@@ -39,7 +37,8 @@ pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};
 pub use experiment::{Experiment, ExperimentError};
 pub use global_search::GlobalSearch;
 pub use identify::{
-    EstimateStatus, Identification, IdentifyError, IdentifyOptions, IdentifyProgress, ParameterEstimate, Stage, identify,
+    EstimateStatus, Identification, IdentifyError, IdentifyOptions, IdentifyProgress, ParameterEstimate, Stage,
+    identify,
 };
 pub use inverse_dynamics::{InverseDynamicsResidual, JointSeries, JointTrajectory};
 pub use nuisance::NuisanceModel;

@@ -1,73 +1,80 @@
-//! Errors that explain residuals and are no fault of the model: of mass, geometry and contact, which any robot has, and of the
-//! measured state in which a window starts. A standing robot whose leg is mounted 2 mm too low has joints that are off by
-//! 10 mrad, and a trunk that is put down 20 mm/s too fast swings for as long: both would be taken for loads and encoders.
+//! Nuisance parameters: errors of mass, leg mounting, ground contact and initial state that any robot has.
 //!
-//! Their slopes are taken once, by simulation, and what they can explain at the price of their own size is taken out of
-//! residuals: the cost of a corrected residual is that of generalised least squares, `rᵀ (1 + S P Sᵀ)⁻¹ r`. Starts go first,
-//! window by window; what the robot's errors explain is what is left of it then.
+//! Left in the residuals, they are attributed to a payload or an encoder offset. A leg that is mounted 2 mm too low
+//! changes the joint positions of a standing robot by 10 mrad. An initial velocity that is 20 mm/s too high lets the
+//! trunk swing through the whole window.
+//!
+//! Their Jacobian S is simulated once. Generalised least squares removes their effect; the cost is `rᵀ (I + S P Sᵀ)⁻¹
+//! r`, where P is their prior covariance. The initial states are eliminated first, window by window, then the errors of
+//! the robot.
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use twinstep_model::{Precision, RobotModel, Rollout};
 
 use crate::experiment::Experiment;
 
-/// Standard deviations: of masses, relative; of where legs are mounted [m]; of the ground, relative.
+/// Relative standard deviation of masses.
 const MASS_STD: f64 = 0.006;
+/// Standard deviation of the mounting position of a leg along each axis [m].
 const MOUNT_OFFSET_STD_M: f64 = 0.0012;
+/// Relative standard deviations of ground friction and of the contact's time constant.
 const GROUND_STD: [f64; 2] = [0.03, 0.15];
-/// Where each of four legs is mounted, along three axes; masses of the trunk, and of hips, thighs and calves; the ground.
+/// Number of nuisance parameters of the robot.
+///
+/// Mounting positions of four legs along three axes; masses of trunk, hips, thighs and calves; friction and time
+/// constant of the ground.
 const NUM_NUISANCE: usize = 12 + 4 + 2;
-/// Residuals that count as one: they depend on each other over this many rows.
+/// Correlation length of the residuals [rows].
 const CORRELATION_ROWS: f64 = 40.0;
 
-/// What tolerated errors do to residuals.
+/// Linear model of the effect of nuisance parameters on residuals.
 #[derive(Clone)]
 pub struct NuisanceModel {
     starts: Vec<NuisanceBlock>,
     robot: NuisanceBlock,
-    /// Slopes by the robot's errors as they are simulated, with no start corrected.
-    slopes: DMatrix<f64>,
+    /// Jacobian with respect to the errors of the robot, before elimination of the initial states.
+    jacobian: DMatrix<f64>,
 }
 
-/// Errors that act on some of the residuals.
+/// Nuisance parameters that affect a subset of the residuals.
 #[derive(Clone)]
 struct NuisanceBlock {
-    /// Which.
+    /// Indices of the residuals.
     rows: Vec<usize>,
-    /// A row a residual, a column an error of one standard deviation.
-    slopes: DMatrix<f64>,
+    /// Jacobian: one row per residual, one column per nuisance parameter [prior std].
+    jacobian: DMatrix<f64>,
     factor: Cholesky<f64, Dyn>,
 }
 
 impl NuisanceBlock {
-    fn new(rows: Vec<usize>, slopes: DMatrix<f64>) -> Option<Self> {
-        let prior = DMatrix::identity(slopes.ncols(), slopes.ncols()) * CORRELATION_ROWS;
-        let factor = (slopes.tr_mul(&slopes) + prior).cholesky()?;
-        Some(Self { rows, slopes, factor })
+    fn new(rows: Vec<usize>, jacobian: DMatrix<f64>) -> Option<Self> {
+        let prior = DMatrix::identity(jacobian.ncols(), jacobian.ncols()) * CORRELATION_ROWS;
+        let factor = (jacobian.tr_mul(&jacobian) + prior).cholesky()?;
+        Some(Self { rows, jacobian, factor })
     }
 
-    /// Takes out of residuals what the errors explain; what that costs is added at their end.
-    fn take(&self, residuals: &mut Vec<f64>) {
+    /// Subtracts the effect of the estimated nuisance parameters, and appends their penalties to the residuals.
+    fn eliminate(&self, residuals: &mut Vec<f64>) {
         let mut own = DVector::from_iterator(self.rows.len(), self.rows.iter().map(|row| residuals[*row]));
-        let sizes = self.factor.solve(&self.slopes.tr_mul(&own));
-        own.gemv(-1.0, &self.slopes, &sizes, 1.0);
+        let sizes = self.factor.solve(&self.jacobian.tr_mul(&own));
+        own.gemv(-1.0, &self.jacobian, &sizes, 1.0);
         for (row, value) in self.rows.iter().zip(&own) {
             residuals[*row] = *value;
         }
         residuals.extend(sizes.iter().map(|size| size * CORRELATION_ROWS.sqrt()));
     }
 
-    fn divided(&self, spread: &[f64]) -> Option<Self> {
-        let mut slopes = self.slopes.clone();
-        for (mut slope, row) in slopes.row_iter_mut().zip(&self.rows) {
-            slope /= spread[*row];
+    fn rescaled(&self, spread: &[f64]) -> Option<Self> {
+        let mut jacobian = self.jacobian.clone();
+        for (mut derivative, row) in jacobian.row_iter_mut().zip(&self.rows) {
+            derivative /= spread[*row];
         }
-        Self::new(self.rows.clone(), slopes)
+        Self::new(self.rows.clone(), jacobian)
     }
 }
 
 impl NuisanceModel {
-    /// Around `robot`; none where it diverges.
+    /// Linearises at `robot`. Returns `None` if a simulation diverges.
     pub fn new(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Rollout) -> Option<Self> {
         let starts = starts(experiments, robot, simulator)?;
         let sides = |error: usize| [-1.0, 1.0].map(|side| perturbed_robot(robot, error, side));
@@ -79,65 +86,73 @@ impl NuisanceModel {
                 column.extend(half_difference(&ends[0], &ends[1]));
             }
         }
-        let slopes = DMatrix::from_iterator(columns[0].len(), NUM_NUISANCE, columns.into_iter().flatten());
-        slopes.iter().all(|slope| slope.is_finite()).then(|| Self::of(starts, slopes)).flatten()
+        let jacobian = DMatrix::from_iterator(columns[0].len(), NUM_NUISANCE, columns.into_iter().flatten());
+        jacobian.iter().all(|derivative| derivative.is_finite()).then(|| Self::of(starts, jacobian)).flatten()
     }
 
-    fn of(starts: Vec<NuisanceBlock>, slopes: DMatrix<f64>) -> Option<Self> {
-        let corrected = slopes.column_iter().map(|column| {
+    fn of(starts: Vec<NuisanceBlock>, jacobian: DMatrix<f64>) -> Option<Self> {
+        let corrected = jacobian.column_iter().map(|column| {
             let mut column = column.iter().copied().collect();
             for start in &starts {
-                start.take(&mut column);
+                start.eliminate(&mut column);
             }
             DVector::from_vec(column)
         });
         let corrected = DMatrix::from_columns(&corrected.collect::<Vec<_>>());
         let robot = NuisanceBlock::new((0..corrected.nrows()).collect(), corrected)?;
-        Some(Self { starts, robot, slopes })
+        Some(Self { starts, robot, jacobian })
     }
 
-    /// For residuals that are divided by `spread`, one by one.
+    /// Returns the model for residuals that are divided by `spread`, with one entry per residual.
     pub fn rescaled(&self, spread: &[f64]) -> Option<Self> {
-        let mut slopes = self.slopes.clone();
-        for (mut slope, spread) in slopes.row_iter_mut().zip(spread) {
-            slope /= *spread;
+        let mut jacobian = self.jacobian.clone();
+        for (mut derivative, spread) in jacobian.row_iter_mut().zip(spread) {
+            derivative /= *spread;
         }
-        Self::of(self.starts.iter().map(|start| start.divided(spread)).collect::<Option<_>>()?, slopes)
+        Self::of(self.starts.iter().map(|start| start.rescaled(spread)).collect::<Option<_>>()?, jacobian)
     }
 
-    /// What each of the robot's errors, of one standard deviation, does to residuals that are divided by `spread` and have
-    /// what is `taken` out of them.
+    /// Returns the effect of each error of the robot, of one standard deviation, on residuals divided by `spread`.
+    ///
+    /// The nuisance parameters of `taken` are eliminated from the effects.
     pub fn robot_errors(&self, spread: &[f64], taken: Option<&Self>) -> Vec<Vec<f64>> {
-        let error = |slopes: nalgebra::DVectorView<f64>| {
-            let mut residuals: Vec<f64> = slopes.iter().zip(spread).map(|(slope, spread)| slope / spread).collect();
+        let error = |jacobian: nalgebra::DVectorView<f64>| {
+            let mut residuals: Vec<f64> =
+                jacobian.iter().zip(spread).map(|(derivative, spread)| derivative / spread).collect();
             if let Some(taken) = taken {
                 taken.project_out(&mut residuals);
             }
             residuals
         };
-        self.slopes.column_iter().map(|column| error(column.as_view())).collect()
+        self.jacobian.column_iter().map(|column| error(column.as_view())).collect()
     }
 
-    /// Takes out of residuals what the errors explain; what that costs is added at their end, to be squared like the others.
+    /// Eliminates all nuisance parameters from the residuals, and appends their penalties.
+    ///
+    /// The sum of squares of the result is the generalised least-squares cost.
     pub fn project_out(&self, residuals: &mut Vec<f64>) {
         for errors in self.starts.iter().chain([&self.robot]) {
-            errors.take(residuals);
+            errors.eliminate(residuals);
         }
     }
 
-    /// Evidence that is lost by the `costs` that [`NuisanceModel::project_out`] adds: of starts, and of the robot [nats].
+    /// Returns the decrease of the log-likelihood [nat] by the penalties `costs` of [`NuisanceModel::project_out`].
+    ///
+    /// The first value is for the initial states, the second for the errors of the robot.
     pub fn nats(costs: &[f64]) -> [f64; 2] {
         let (starts, robot) = costs.split_at(costs.len().saturating_sub(NUM_NUISANCE));
         [starts, robot].map(|costs| 0.5 * costs.iter().map(|cost| cost * cost).sum::<f64>() / CORRELATION_ROWS)
     }
 }
 
-/// Power that the robot's errors have above what any robot's have, if they cost so much [nats], in units of a row's noise.
+/// Returns the power [noise variance of a row] by which the robot's errors exceed their expectation.
+///
+/// `nats` is the decrease of the log-likelihood by their penalties [nat].
 pub fn excess(nats: f64) -> f64 {
     (2.0 * nats - NUM_NUISANCE as f64).max(0.0) * CORRELATION_ROWS
 }
 
-/// The errors of every window's start.
+/// Returns the nuisance parameters of the initial state of every window.
 fn starts(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Rollout) -> Option<Vec<NuisanceBlock>> {
     let (mut starts, mut first) = (Vec::new(), 0);
     for experiment in experiments {
@@ -148,12 +163,12 @@ fn starts(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Ro
         let columns: Vec<Vec<f64>> = (0..Experiment::INITIAL_STATE_DIM)
             .map(|part| half_difference(&residuals(part, -1.0), &residuals(part, 1.0)).collect())
             .collect();
-        if columns.iter().flatten().any(|slope| !slope.is_finite()) {
+        if columns.iter().flatten().any(|derivative| !derivative.is_finite()) {
             return None;
         }
         for rows in experiment.free_windows() {
-            let slopes = DMatrix::from_fn(rows.len(), columns.len(), |row, column| columns[column][rows[row]]);
-            starts.push(NuisanceBlock::new(rows.into_iter().map(|row| first + row).collect(), slopes)?);
+            let jacobian = DMatrix::from_fn(rows.len(), columns.len(), |row, column| columns[column][rows[row]]);
+            starts.push(NuisanceBlock::new(rows.into_iter().map(|row| first + row).collect(), jacobian)?);
         }
         first += columns[0].len();
     }
@@ -164,7 +179,7 @@ fn half_difference<'a>(below: &'a [f64], above: &'a [f64]) -> impl Iterator<Item
     above.iter().zip(below).map(|(above, below)| 0.5 * (above - below))
 }
 
-/// `robot` with one of the errors, of `size` standard deviations.
+/// Returns `robot` with one error of `size` standard deviations.
 fn perturbed_robot(robot: &RobotModel, error: usize, size: f64) -> RobotModel {
     let mut robot = robot.clone();
     match error {
@@ -187,34 +202,38 @@ mod tests {
 
     const ROWS: usize = 9_000;
 
-    fn slope(row: usize, error: usize) -> f64 {
+    fn derivative(row: usize, error: usize) -> f64 {
         if row % NUM_NUISANCE == error { 1.0 } else { 0.0 }
     }
 
     #[test]
-    fn what_an_error_of_its_size_explains_is_taken_and_what_it_cannot_stays() {
-        let slopes = DMatrix::from_fn(ROWS, NUM_NUISANCE, slope);
-        let tolerances = NuisanceModel::of(Vec::new(), slopes).expect("a positive definite information");
-        let mut residuals: Vec<f64> = (0..ROWS).map(|row| 2.0 * slope(row, 0)).collect();
-        tolerances.project_out(&mut residuals);
-        assert!(residuals[..ROWS].iter().all(|residual| residual.abs() < 0.2), "two deviations are no news");
-        assert!((NuisanceModel::nats(&residuals[ROWS..])[1] - 2.0).abs() < 0.4, "and cost half their square");
+    fn effects_of_nuisance_parameters_are_eliminated_and_others_remain() {
+        let jacobian = DMatrix::from_fn(ROWS, NUM_NUISANCE, derivative);
+        let nuisance = NuisanceModel::of(Vec::new(), jacobian).expect("a positive definite information");
+        let mut residuals: Vec<f64> = (0..ROWS).map(|row| 2.0 * derivative(row, 0)).collect();
+        nuisance.project_out(&mut residuals);
+        assert!(
+            residuals[..ROWS].iter().all(|residual| residual.abs() < 0.2),
+            "an error of two standard deviations is eliminated"
+        );
+        assert!((NuisanceModel::nats(&residuals[ROWS..])[1] - 2.0).abs() < 0.4, "its penalty is half its square");
         let mut others = vec![0.0; ROWS];
         others[1] = 5.0;
-        tolerances.project_out(&mut others);
-        assert!(others[1] > 4.9, "one row alone is no error of the robot");
+        nuisance.project_out(&mut others);
+        assert!(others[1] > 4.9, "an error in a single row is not due to the robot");
     }
 
     #[test]
-    fn start_explains_its_own_window_alone() {
+    fn initial_state_affects_only_its_own_window() {
         let window = |rows: std::ops::Range<usize>| {
-            let slopes = DMatrix::from_element(rows.len(), 1, 1.0);
-            NuisanceBlock::new(rows.collect(), slopes).expect("positive definite")
+            let jacobian = DMatrix::from_element(rows.len(), 1, 1.0);
+            NuisanceBlock::new(rows.collect(), jacobian).expect("positive definite")
         };
         let starts = vec![window(0..ROWS / 2), window(ROWS / 2..ROWS)];
-        let tolerances = NuisanceModel::of(starts, DMatrix::from_fn(ROWS, NUM_NUISANCE, slope)).expect("positive definite");
+        let nuisance =
+            NuisanceModel::of(starts, DMatrix::from_fn(ROWS, NUM_NUISANCE, derivative)).expect("positive definite");
         let mut residuals: Vec<f64> = (0..ROWS).map(|row| if row < ROWS / 2 { 1.0 } else { -1.0 }).collect();
-        tolerances.project_out(&mut residuals);
+        nuisance.project_out(&mut residuals);
         assert!(residuals[..ROWS].iter().all(|residual| residual.abs() < 0.02));
         assert_eq!(residuals.len(), ROWS + 2 + NUM_NUISANCE);
     }

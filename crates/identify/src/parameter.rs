@@ -1,64 +1,66 @@
-//! The numbers that are sought: of entries of a model file, with bounds and prior.
+//! Free parameters: values of entries of a model file that are estimated, with bounds and prior.
 
-use twinstep_effects::{Composition, Effect, EffectEntry, EntryError, Scope};
 use twinstep_effects::ModelFile;
+use twinstep_effects::{Composition, Effect, EffectEntry, EntryError, Scope};
 use twinstep_model::RobotModel;
 
-/// Prior deviations of log-Cholesky coordinates `[α, d1, d2, d3, s12, s23, s13, t1, t2, t3]` around the given body: mass
-/// to 30 %, extents to a third, centre of mass to 5 cm.
+/// Prior standard deviations of log-Cholesky coordinates `[α, d1, d2, d3, s12, s23, s13, t1, t2, t3]`.
+///
+/// They are relative to the nominal body: 30 % of the mass, a third of the extents, 5 cm of the centre of mass.
 const INERTIA_PRIOR: [f64; 10] = [0.15, 0.3, 0.3, 0.3, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05];
 
-/// A number of an entry of a model file.
+/// Value of an entry of a model file that is estimated.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FreeParameter {
     /// The effect.
     pub effect: &'static Effect,
-    /// What it is about.
+    /// The scope of the effect.
     pub scope: Scope,
-    /// The parameter; of a vector its index after a dot, as in `shift_m.0`.
+    /// Name of the parameter; for a vector with the component's index, as in `shift_m.0`.
     pub parameter_name: String,
-    /// Its unit.
+    /// Unit; empty if dimensionless.
     pub unit: &'static str,
-    /// What is allowed.
+    /// Lowest and highest allowed value.
     pub bounds: [f64; 2],
-    /// What changes nothing.
+    /// Value without any effect.
     pub neutral: f64,
     /// Prior mean and standard deviation, in the coordinate of [`FreeParameter::coordinate`].
     pub prior: [f64; 2],
-    /// Sought as its inverse, because none of it is infinity.
+    /// True if the coordinate is the inverse of the value, because the value without effect is infinite.
     inverse: bool,
-    /// Which entry of the candidate's file, and which of its values.
-    place: (usize, usize),
+    /// Index of the entry in the candidate's file, and of the value in the entry.
+    location: (usize, usize),
 }
 
 impl FreeParameter {
-    /// The number as the search sees it: itself, or its inverse.
+    /// Returns the coordinate of a value in the search space: the value, or its inverse.
     pub fn coordinate(&self, value: f64) -> f64 {
         if self.inverse { 1.0 / value } else { value }
     }
 
-    /// Back from [`FreeParameter::coordinate`], within the bounds.
+    /// Returns the value of a coordinate, clipped to the bounds.
     pub fn value(&self, coordinate: f64) -> f64 {
         let [low, high] = self.bounds;
         let value = if self.inverse { 1.0 / coordinate.max(1e-12) } else { coordinate };
         value.clamp(low, high)
     }
 
-    /// The bounds of the coordinate.
+    /// Returns the bounds of the coordinate.
     pub fn coordinate_bounds(&self) -> [f64; 2] {
         let [low, high] = self.bounds;
         if self.inverse { [1.0 / high, 1.0 / low] } else { [low, high] }
     }
 
-    /// Its name for people, as in `coulomb_friction@calf torque_nm`.
+    /// Returns the name for display, as in `coulomb_friction@calf torque_nm`.
     pub fn name(&self) -> String {
         format!("{}@{} {}", self.effect.name, self.scope, self.parameter_name)
     }
 }
 
-/// The numbers of `effects`, to be sought on top of `model`; and the model with an entry for each.
+/// Returns `model` with an entry for each of `effects`, and the free parameters of these entries.
 ///
-/// An effect that replaces takes the place of the model's entry of the same scope; others are added to what is there.
+/// An effect whose composition is to replace overrides the model's entry of the same scope. Other effects are added to
+/// the existing entries.
 pub fn free_parameters(
     model: &ModelFile,
     effects: &[(&'static Effect, Scope)],
@@ -69,8 +71,9 @@ pub fn free_parameters(
             .parameters
             .iter()
             .flat_map(|parameter| {
-                // Where there is none of it, or next to none.
-                let value = if parameter.no_effect_value.is_finite() { parameter.no_effect_value } else { parameter.bounds[1] };
+                // The value without effect, or, if that is infinite, the bound with the least effect.
+                let value =
+                    if parameter.no_effect_value.is_finite() { parameter.no_effect_value } else { parameter.bounds[1] };
                 std::iter::repeat_n(value, parameter.count)
             })
             .collect();
@@ -85,15 +88,15 @@ pub fn free_parameters(
         }
         file.effects.push(EffectEntry::new(effect, *scope, start.clone())?);
         let index = file.effects.len() - 1;
-        let mut place = 0;
+        let mut component_index = 0;
         for parameter in effect.parameters {
             for component in 0..parameter.count {
                 let inverse = parameter.no_effect_value.is_infinite();
                 let [low, high] = parameter.prior_range.map(|value| if inverse { 1.0 / value } else { value });
                 let (low, high) = if inverse { (0.0, low) } else { (low, high) };
                 let inertia = effect.name == "inertia";
-                let middle = if inertia { start[place] } else { 0.5 * (low + high) };
-                let deviation = if inertia { INERTIA_PRIOR[place] } else { (high - low).abs() / 3.92 };
+                let mean = if inertia { start[component_index] } else { 0.5 * (low + high) };
+                let std = if inertia { INERTIA_PRIOR[component_index] } else { (high - low).abs() / 3.92 };
                 unknowns.push(FreeParameter {
                     effect,
                     scope: *scope,
@@ -105,18 +108,18 @@ pub fn free_parameters(
                     unit: parameter.unit,
                     bounds: parameter.bounds,
                     neutral: parameter.no_effect_value,
-                    prior: [middle, deviation],
+                    prior: [mean, std],
                     inverse,
-                    place: (index, place),
+                    location: (index, component_index),
                 });
-                place += 1;
+                component_index += 1;
             }
         }
     }
     Ok((file, unknowns))
 }
 
-/// Log-Cholesky coordinates of the link that the model has.
+/// Returns the log-Cholesky coordinates of the model's body.
 fn nominal_inertia(model: &ModelFile, scope: Scope) -> Result<Vec<f64>, EntryError> {
     let robot = model.robot_model()?;
     let body = match scope {
@@ -126,45 +129,47 @@ fn nominal_inertia(model: &ModelFile, scope: Scope) -> Result<Vec<f64>, EntryErr
     Ok(body.log_cholesky().to_vec())
 }
 
-/// The candidate's file with these coordinates, each brought within its bounds.
+/// Returns the file with the values of these coordinates, clipped to their bounds.
 pub fn with_values(file: &ModelFile, unknowns: &[FreeParameter], coordinates: &[f64]) -> ModelFile {
     let mut file = file.clone();
     for (unknown, coordinate) in unknowns.iter().zip(coordinates) {
-        let (entry, value) = unknown.place;
+        let (entry, value) = unknown.location;
         file.effects[entry].values[value] = unknown.value(*coordinate);
     }
     file
 }
 
-/// The candidate robot; none where entries do not go together or a body could not be.
+/// Returns the candidate robot. Returns `None` if entries conflict or a body is not physically consistent.
 pub fn candidate(file: &ModelFile, unknowns: &[FreeParameter], coordinates: &[f64]) -> Option<RobotModel> {
     with_values(file, unknowns, coordinates).robot_model().ok()
 }
 
-/// Where an unknown starts [coordinate].
+/// Returns the initial coordinate of a free parameter: that of its value in the file.
 pub fn initial_coordinate(file: &ModelFile, unknown: &FreeParameter) -> f64 {
-    let (entry, value) = unknown.place;
+    let (entry, value) = unknown.location;
     unknown.coordinate(file.effects[entry].values[value])
 }
 
-/// Takes entries out of the file that were added to `model` and of which nothing was found; `told` says of each unknown
-/// whether it was.
-pub fn drop_unidentifiable(file: &mut ModelFile, model: &ModelFile, unknowns: &[FreeParameter], told: &[bool]) {
-    let about = |index: usize| unknowns.iter().zip(told).filter(move |(unknown, _)| unknown.place.0 == index);
+/// Removes entries from the file that were added to `model` and have no identifiable parameter.
+///
+/// `identifiable` has one entry per free parameter.
+pub fn drop_unidentifiable(file: &mut ModelFile, model: &ModelFile, unknowns: &[FreeParameter], identifiable: &[bool]) {
+    let of_entry =
+        |index: usize| unknowns.iter().zip(identifiable).filter(move |(unknown, _)| unknown.location.0 == index);
     let mut index = 0;
     file.effects.retain(|entry| {
-        let untold = about(index).count() > 0 && about(index).all(|(_, told)| !told);
+        let unidentifiable = of_entry(index).count() > 0 && of_entry(index).all(|(_, identifiable)| !identifiable);
         let replaced = entry.effect.composition == Composition::Replace;
         let own = replaced && model.effects.iter().any(|own| own.effect == entry.effect && own.scope == entry.scope);
         index += 1;
-        !untold || own
+        !unidentifiable || own
     });
 }
 
-/// Writes intervals, low and high, beside the values of the unknowns.
+/// Writes the intervals of the free parameters, low and high, to their entries.
 pub fn set_intervals(file: &mut ModelFile, unknowns: &[FreeParameter], intervals: &[Option<[f64; 2]>]) {
     for (unknown, interval) in unknowns.iter().zip(intervals) {
-        let (entry, value) = unknown.place;
+        let (entry, value) = unknown.location;
         file.effects[entry].intervals[value] = *interval;
     }
 }

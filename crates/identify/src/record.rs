@@ -1,45 +1,50 @@
-//! A motion through a robot in a backend, as a measured log.
+//! Simulation of a motion file on a robot in a backend, recorded as a log.
 
 use std::ops::Range;
 
-use twinstep_model::{BaseMount, Backend, Ground, FIXED_BASE_HEIGHT, JOINT_NAMES, Joint, Leg, InitialState, RobotModel, RobotStates};
 use twinstep_logs::{Gain, Log, LogError, Meta, Segment, TorqueSensor};
+use twinstep_model::{
+    Backend, BaseMount, FIXED_BASE_HEIGHT, Ground, InitialState, JOINT_NAMES, Joint, Leg, RobotModel, RobotStates,
+};
 
-use crate::operating_conditions::OperatingConditions;
-use crate::motion::{ActuatorClock, SimulationFailure, JointCommands, MotionError, command, joint_commands};
+use twinstep_logs::operating_conditions::OperatingConditions;
+use twinstep_logs::replay::{
+    ActuatorClock, JointCommands, ReplayError, SimulationFailure, at_log_rate, command, joint_commands,
+};
 
-/// Why a motion gave no log.
+/// Reason why a simulation was not recorded.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// Its commands cannot be given to the robot.
+    /// The commands cannot be simulated.
     #[error(transparent)]
-    Motion(#[from] MotionError),
-    /// There is no such simulation.
+    Motion(#[from] ReplayError),
+    /// The backend cannot be created.
     #[error(transparent)]
     Backend(Box<dyn std::error::Error + Send + Sync>),
     /// The simulation failed.
     #[error(transparent)]
     Failed(SimulationFailure),
-    /// What was recorded is no log.
+    /// The recording is not a valid log.
     #[error(transparent)]
     Log(#[from] LogError),
-    /// `progress` ended it.
-    #[error("ended before the motion's last row")]
+    /// `progress` returned false.
+    #[error("interrupted before the last row of the motion file")]
     Interrupted,
 }
 
-/// What `robot` does when it is commanded as `motion` has it, in backends of one robot each that `backend` makes for a held
-/// or a floating base; `base` goes before that of the segments.
+/// Runs the commands of `motion` on `robot` and returns the log.
 ///
-/// `progress` receives the number of rows done, and may end it.
+/// `backend` makes a backend of one robot for a base mount and the robot at the rate of the motion. `base` overrides
+/// the mount of the segments. `progress` receives the number of completed rows and returns false to interrupt.
 pub fn record<B: Backend>(
     motion: &Log,
     robot: &RobotModel,
     base: Option<BaseMount>,
-    mut backend: impl FnMut(BaseMount) -> Result<B, RecordError>,
+    mut backend: impl FnMut(BaseMount, &RobotModel) -> Result<B, RecordError>,
     source: String,
     progress: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Log, RecordError> {
+    let robot = &at_log_rate(motion, robot)?;
     let player = CommandPlayer {
         motion,
         robot,
@@ -51,23 +56,23 @@ pub fn record<B: Backend>(
     let mut record = Record::default();
     for (segment, rows) in motion.segments() {
         let base = base_of(segment);
-        player.part(backend(base)?, &segment.name, base, rows, &mut record, progress)?;
+        player.simulate(backend(base, robot)?, &segment.name, base, rows, &mut record, progress)?;
     }
     let segments = &motion.meta().segments;
     let segments = segments.iter().map(|segment| Segment { base: base_of(segment), ..segment.clone() }).collect();
     Ok(player.log(record, segments, source)?)
 }
 
-/// What the robot did, with one entry a row.
+/// Recorded channels, with one entry per row.
 #[derive(Default)]
 struct Record {
-    /// As [`sensor_names`].
+    /// Channels in the order of [`sensor_names`].
     sensors: Vec<Vec<f64>>,
     /// Mean torque of each joint from the row to the next [N·m].
     tau_measured: Vec<Vec<f64>>,
 }
 
-/// Channels of [`sensors`] that every log has; the rest is of the moving trunk.
+/// Number of channels of [`sensors`] for the joints; the others are for a floating base.
 const JOINT_CHANNELS: usize = 2 * JOINT_NAMES.len();
 
 fn sensor_names() -> Vec<String> {
@@ -87,7 +92,7 @@ fn sensor_names() -> Vec<String> {
     .concat()
 }
 
-/// The sensors of one row; no force is known before the first step.
+/// Returns the sensor values of one row. Foot forces are not known before the first step.
 fn sensors(states: &RobotStates, stepped: bool) -> Vec<f64> {
     let foot_force = if stepped { states.foot_force[0] } else { [f32::NAN; 4] };
     let channels: [&[f32]; 7] = [
@@ -102,7 +107,7 @@ fn sensors(states: &RobotStates, stepped: bool) -> Vec<f64> {
     channels.into_iter().flatten().copied().map(f64::from).collect()
 }
 
-/// A motion and the robot that it is for.
+/// Player of a motion file on a robot.
 struct CommandPlayer<'a> {
     motion: &'a Log,
     robot: &'a RobotModel,
@@ -112,8 +117,8 @@ struct CommandPlayer<'a> {
 }
 
 impl CommandPlayer<'_> {
-    /// Plays rows that follow one another.
-    fn part<B: Backend>(
+    /// Simulates a contiguous range of rows.
+    fn simulate<B: Backend>(
         &self,
         mut backend: B,
         segment: &str,
@@ -127,7 +132,7 @@ impl CommandPlayer<'_> {
             let (segment, t) = (segment.to_owned(), t[row - rows.start]);
             move |cause| RecordError::Failed(SimulationFailure { segment, row: row + 1, t, cause })
         };
-        backend.reset(&[(0, self.placement(&backend.ground(), base, rows.start))]).map_err(failed(rows.start))?;
+        backend.reset(&[(0, self.initial_state(&backend.ground(), base, rows.start))]).map_err(failed(rows.start))?;
         for row in rows.clone() {
             record.sensors.push(sensors(backend.states(), row > rows.start));
             let mut sums = [0.0; JOINT_NAMES.len()];
@@ -140,7 +145,7 @@ impl CommandPlayer<'_> {
                     *sum += f64::from(torque);
                 }
             }
-            // Of no period the mean is not a number: the part's last row has no torque.
+            // The last row of a range has no period, so its mean torque is 0/0 = NaN: missing.
             record.tau_measured.push(sums.map(|sum| sum / periods as f64).to_vec());
             if !progress(row + 1) {
                 return Err(RecordError::Interrupted);
@@ -149,8 +154,8 @@ impl CommandPlayer<'_> {
         Ok(())
     }
 
-    /// Where the robot starts: the default pose, but for what the motion measured in `row`.
-    fn placement(&self, ground: &Ground, base: BaseMount, row: usize) -> InitialState {
+    /// Returns the initial state: the measured values of the motion file in `row`, or else the default pose.
+    fn initial_state(&self, ground: &Ground, base: BaseMount, row: usize) -> InitialState {
         let cell =
             |name: &str| self.motion.channel(name).map(|cells| cells[row] as f32).filter(|cell| cell.is_finite());
         let mut q = self.robot.control.default_pose_f32();
@@ -192,9 +197,9 @@ impl CommandPlayer<'_> {
         ];
         let channel = |rows: &[Vec<f64>], channel: usize| rows.iter().map(|row| row[channel]).collect();
         let names = sensor_names();
-        let kept = if floating { names.len() } else { JOINT_CHANNELS };
-        for (place, name) in names.into_iter().take(kept).enumerate() {
-            columns.push((name, channel(&record.sensors, place)));
+        let num_channels = if floating { names.len() } else { JOINT_CHANNELS };
+        for (index, name) in names.into_iter().take(num_channels).enumerate() {
+            columns.push((name, channel(&record.sensors, index)));
         }
         for (joint, name) in JOINT_NAMES.iter().enumerate() {
             columns.push((format!("tau_measured_{name}"), channel(&record.tau_measured, joint)));
@@ -204,25 +209,25 @@ impl CommandPlayer<'_> {
             joints: JOINT_NAMES.map(str::to_owned).to_vec(),
             pd: Some(format!("PD at {} Hz, held, clipped to the torque limit", self.robot.control.actuator_hz)),
             source: Some(source),
-            // The ideal actuator's torque, before rotor and friction.
+            // The recorded torque is that of the actuator, before rotor inertia and friction.
             ..Meta::new(motion.meta().rate_hz, TorqueSensor::MotorCurrent, segments)
         };
         self.commands(&mut meta, &mut columns);
-        // Voltage and temperature are given, not simulated.
+        // Voltage and temperature are copied, because they are not simulated.
         let given = motion.channels().filter(|(name, _)| *name == "battery_V" || name.starts_with("temp_"));
         columns.extend(given.map(|(name, cells)| (name.to_owned(), cells.to_vec())));
         Log::new(meta, columns)
     }
 
-    /// The commands as they were given, of all twelve joints; gains that never change go to the description.
+    /// Adds the commands of all twelve joints. Constant gains are written to the metadata.
     fn commands(&self, meta: &mut Meta, columns: &mut Vec<(String, Vec<f64>)>) {
         let (rows, control) = (self.motion.rows(), &self.robot.control);
         let [mut kp, mut kd] = [Vec::new(), Vec::new()];
         for joint in Joint::ALL {
             let name = joint.name();
             let given = self.joints.iter().find(|commands| commands.joint == joint);
-            let held = || vec![control.default_pose[joint.index()]; rows];
-            columns.push((format!("q_cmd_{name}"), given.map_or_else(held, |given| given.q_cmd.to_vec())));
+            let default = || vec![control.default_pose[joint.index()]; rows];
+            columns.push((format!("q_cmd_{name}"), given.map_or_else(default, |given| given.q_cmd.to_vec())));
             let optional =
                 [("dq_cmd", given.and_then(|given| given.dq_cmd)), ("tau_ff", given.and_then(|given| given.tau_ff))];
             for (quantity, cells) in optional {

@@ -1,18 +1,18 @@
-//! Levenberg-Marquardt from where the search ended, and the covariance there.
+//! Levenberg–Marquardt refinement, and covariance of the estimate.
 
 use nalgebra::{DMatrix, DVector};
 use twinstep_model::Rollout;
 
-use crate::least_squares::{Linearisation, LeastSquaresProblem};
+use crate::least_squares::{LeastSquaresProblem, Linearisation};
 
-/// A step that lowers the cost by less ends the descent: a standard deviation is a cost of 1.
+/// Decrease of the cost below which the refinement has converged; one standard deviation is a cost of 1.
 const COST_TOLERANCE: f64 = 0.1;
-/// Most steps.
+/// Maximum number of iterations.
 const MAX_ITERATIONS: usize = 30;
-/// Factors of the diagonal that are tried side by side: a step costs one batch.
+/// Levenberg–Marquardt damping factors, all evaluated in one batch per iteration.
 const DAMPING_FACTORS: [f64; 8] = [0.0, 1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3];
 
-/// Goes downhill from `point`.
+/// Minimises the cost from `point`. `each` receives the cost after every step and returns false to interrupt.
 pub fn refine(
     task: &LeastSquaresProblem,
     simulator: &mut dyn Rollout,
@@ -22,18 +22,21 @@ pub fn refine(
     for _ in 0..MAX_ITERATIONS {
         let Some(here) = task.linearise(simulator, &point) else { break };
         let now = task.cost(here.residuals.as_slice(), &point);
-        let tries: Vec<_> = DAMPING_FACTORS.iter().filter_map(|damping| step(task, &here, &point, *damping)).collect();
+        let candidates: Vec<_> =
+            DAMPING_FACTORS.iter().filter_map(|damping| step(task, &here, &point, *damping)).collect();
         let costs: Vec<f64> = task
-            .residuals(simulator, &tries)
+            .residuals(simulator, &candidates)
             .iter()
-            .zip(&tries)
+            .zip(&candidates)
             .map(|(found, point)| found.as_ref().map_or(f64::INFINITY, |found| task.cost(found, point)))
             .collect();
-        let Some(best) = (0..tries.len()).min_by(|one, other| costs[*one].total_cmp(&costs[*other])) else { break };
+        let Some(best) = (0..candidates.len()).min_by(|one, other| costs[*one].total_cmp(&costs[*other])) else {
+            break;
+        };
         if costs[best] >= now {
             break;
         }
-        point.clone_from(&tries[best]);
+        point.clone_from(&candidates[best]);
         if !each(costs[best]) || now - costs[best] < COST_TOLERANCE {
             break;
         }
@@ -41,7 +44,7 @@ pub fn refine(
     point
 }
 
-/// A step within the bounds; none where the equations cannot be solved.
+/// Returns the point after a damped step, within the bounds. Returns `None` if the equations cannot be solved.
 fn step(task: &LeastSquaresProblem, here: &Linearisation, point: &[f64], damping: f64) -> Option<Vec<f64>> {
     let mut information = information(here);
     let prior = DVector::from_iterator(point.len(), task.to_prior_units(point));
@@ -53,21 +56,24 @@ fn step(task: &LeastSquaresProblem, here: &Linearisation, point: &[f64], damping
     Some(task.from_prior_units(moved.as_slice()))
 }
 
-/// How far two simulators of the same robot are apart, in prior deviations: no number is known better. Measured with rapier
-/// as the robot and the batch engine as the model (`recovery`): friction torques differ by 0.01 N·m, masses by 1 %.
+/// Lower bound on the standard deviation of an estimate [prior std]: the mismatch between simulators.
+///
+/// Measured with rapier as the robot and the batch engine as the model (`parameter_recovery`): friction torques differ
+/// by 0.01 N·m, masses by 1 %.
 pub const SIMULATOR_MISMATCH_STD: f64 = 0.02;
 
-/// Fisher information of the residuals and of the prior, in prior deviations.
+/// Returns the Fisher information of residuals and prior [1/prior std²].
 pub fn information(here: &Linearisation) -> DMatrix<f64> {
     let count = here.jacobian.ncols();
     here.jacobian.transpose() * &here.jacobian + DMatrix::identity(count, count)
 }
 
-/// Covariance of the estimate, in prior deviations. Residuals in a block may depend on each other; blocks do not.
+/// Returns the covariance of the estimate [prior std²].
 ///
-/// The sandwich `A⁻¹ B A⁻¹` with `B = Σ g gᵀ` over blocks, which holds when residuals are not white and the model is not
-/// quite right (White 1982); never less than `A⁻¹`. And what each of `errors` would move it: residuals that an error which any
-/// robot may have makes, of one standard deviation.
+/// Sandwich estimator `A⁻¹ B A⁻¹` with `B = Σ g gᵀ` over blocks (White 1982). It is valid for correlated residuals
+/// within blocks and for model errors; blocks must be independent. Variances are at least those of `A⁻¹` and
+/// [`SIMULATOR_MISMATCH_STD`]². Each of `errors` adds its effect on the estimate: residuals of a nuisance parameter of
+/// one standard deviation.
 pub fn covariance(here: &Linearisation, blocks: &[usize], errors: &[Vec<f64>]) -> Option<DMatrix<f64>> {
     let count = here.jacobian.ncols();
     let inverse = information(here).cholesky()?.inverse();
@@ -80,13 +86,14 @@ pub fn covariance(here: &Linearisation, blocks: &[usize], errors: &[Vec<f64>]) -
     let outer = gradients.values().map(|gradient| gradient * gradient.transpose()).sum::<DMatrix<f64>>()
         * (blocks / (blocks - count as f64).max(1.0))
         + DMatrix::identity(count, count);
-    let sandwich = &inverse * outer * &inverse + DMatrix::identity(count, count) * (SIMULATOR_MISMATCH_STD * SIMULATOR_MISMATCH_STD);
-    // The wider of the two, unknown by unknown; correlations are the sandwich's.
+    let sandwich = &inverse * outer * &inverse
+        + DMatrix::identity(count, count) * (SIMULATOR_MISMATCH_STD * SIMULATOR_MISMATCH_STD);
+    // The larger variance of the two for each parameter, with the correlations of the sandwich.
     let mut covariance = sandwich.clone();
     for i in 0..count {
         for j in 0..count {
-            let grown = |k: usize| (inverse[(k, k)] / sandwich[(k, k)]).max(1.0).sqrt();
-            covariance[(i, j)] *= grown(i) * grown(j);
+            let growth = |k: usize| (inverse[(k, k)] / sandwich[(k, k)]).max(1.0).sqrt();
+            covariance[(i, j)] *= growth(i) * growth(j);
         }
     }
     for error in errors {

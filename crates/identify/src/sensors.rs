@@ -1,30 +1,30 @@
-//! Sensors: what they make of the exact log of a simulated robot.
+//! Simulation of sensor noise and resolution on the exact log of a simulated robot.
 
 use glam::{DQuat, DVec3};
 use rand::Rng;
 use twinstep_logs::{Log, LogError};
 use twinstep_model::{standard_normal, stream};
 
-/// What one quantity's sensor does.
+/// Sensor of one quantity.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sensor {
-    /// The quantity, as in `q` or `tau_measured`; its channels are `q_FL_hip` and so on.
+    /// Name of the quantity, as in `q` or `tau_measured`; its channels are `q_FL_hip` and so on.
     pub quantity: &'static str,
-    /// Standard deviation of white noise, in the channel's unit; of `quat` the angle about each axis [rad].
+    /// Standard deviation of white noise, in the channel's unit; for `quat` of the angle about each axis [rad].
     pub sigma: f64,
-    /// Smallest step that is told apart, in the channel's unit; 0 for none.
+    /// Resolution, in the channel's unit; 0 for no rounding.
     pub resolution: f64,
 }
 
 impl Sensor {
-    /// What is shown of `value`.
-    fn shows(&self, value: f64, random: &mut impl Rng) -> f64 {
+    /// Returns a measurement of `value`.
+    fn measure(&self, value: f64, random: &mut impl Rng) -> f64 {
         let noisy = value + self.sigma * standard_normal(random);
         if self.resolution > 0.0 { (noisy / self.resolution).round() * self.resolution } else { noisy }
     }
 }
 
-/// `log` as `sensors` show it, noise stated; quantities without a sensor are shown exactly.
+/// Returns `log` with the noise of `sensors`, which its metadata state. Quantities without a sensor are exact.
 pub fn apply_sensors(log: &Log, sensors: &[Sensor], seed: u64) -> Result<Log, LogError> {
     let mut random = stream(seed, "sensors", 0);
     let mut meta = log.meta().clone();
@@ -41,7 +41,7 @@ pub fn apply_sensors(log: &Log, sensors: &[Sensor], seed: u64) -> Result<Log, Lo
             rest.is_some_and(|rest| !rest.starts_with("cmd_")) && sensor.quantity != "quat"
         });
         let cells = match sensor {
-            Some(sensor) => cells.iter().map(|value| sensor.shows(*value, &mut random)).collect(),
+            Some(sensor) => cells.iter().map(|value| sensor.measure(*value, &mut random)).collect(),
             None => cells.to_vec(),
         };
         columns.push((name.to_owned(), cells));
@@ -50,27 +50,27 @@ pub fn apply_sensors(log: &Log, sensors: &[Sensor], seed: u64) -> Result<Log, Lo
         add_orientation_noise(&mut columns, sensor.sigma, &mut random);
     }
     meta.noise.extend(sensors.iter().filter(|sensor| sensor.sigma > 0.0).map(|sensor| {
-        // Rounding adds the variance of an even distribution.
+        // Rounding adds the variance of a uniform distribution.
         (sensor.quantity.to_owned(), sensor.sigma.hypot(sensor.resolution / 12f64.sqrt()))
     }));
     Log::new(meta, columns)
 }
 
-/// Turns measured orientations by a small random angle about each axis.
+/// Rotates measured orientations by a small random angle about each axis.
 fn add_orientation_noise(columns: &mut [(String, Vec<f64>)], sigma: f64, random: &mut impl Rng) {
-    let Some(places) = ["quat_w", "quat_x", "quat_y", "quat_z"]
+    let Some(indices) = ["quat_w", "quat_x", "quat_y", "quat_z"]
         .map(|name| columns.iter().position(|(column, _)| column == name))
         .into_iter()
         .collect::<Option<Vec<_>>>()
     else {
         return;
     };
-    for row in 0..columns[places[0]].1.len() {
-        let [w, x, y, z] = [0, 1, 2, 3].map(|part: usize| columns[places[part]].1[row]);
+    for row in 0..columns[indices[0]].1.len() {
+        let [w, x, y, z] = [0, 1, 2, 3].map(|part: usize| columns[indices[part]].1[row]);
         let error = DVec3::from_array([(); 3].map(|()| sigma * standard_normal(random)));
-        let turned = DQuat::from_xyzw(x, y, z, w) * DQuat::from_scaled_axis(error);
-        for (place, value) in places.iter().zip([turned.w, turned.x, turned.y, turned.z]) {
-            columns[*place].1[row] = value;
+        let rotated = DQuat::from_xyzw(x, y, z, w) * DQuat::from_scaled_axis(error);
+        for (index, value) in indices.iter().zip([rotated.w, rotated.x, rotated.y, rotated.z]) {
+            columns[*index].1[row] = value;
         }
     }
 }

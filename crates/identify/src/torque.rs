@@ -1,18 +1,23 @@
-//! The torque that a model's actuators make of measured states: no simulation, and so no error that adds up.
+//! Torque of a model's actuators on measured states. Nothing is simulated, so errors do not accumulate.
 
 use twinstep_logs::{Log, TorqueSensor};
-use twinstep_model::{dynamics::{SimdCommands, SimdActuators}, Command, JointModel, NUM_JOINTS, RobotModel, go2};
+use twinstep_model::{
+    Command, JointModel, NUM_JOINTS, RobotModel,
+    dynamics::{SimdActuators, SimdCommands},
+    go2,
+};
 
-use crate::operating_conditions::OperatingConditions;
-use crate::motion::{ActuatorClock, MotionError, command, joint_commands};
+use twinstep_logs::operating_conditions::OperatingConditions;
+use twinstep_logs::replay::{ActuatorClock, ReplayError, at_log_rate, command, delayed_mean, joint_commands};
 
-/// Sums of squares and counts of the torque errors of each joint [N²·m²], at the log's tap; none without a sensor, or
-/// without velocities.
+/// Returns the sum of squares [N²·m²] and the number of torque errors of each joint, at the log's torque sensor.
+///
+/// Returns `None` if torque or velocity was not measured.
 pub fn torque_errors(
     log: &Log,
     robot: &RobotModel,
     keep: impl Fn(usize) -> bool,
-) -> Result<Option<[(f64, usize); NUM_JOINTS]>, MotionError> {
+) -> Result<Option<[(f64, usize); NUM_JOINTS]>, ReplayError> {
     let mut sums = [(0.0, 0); NUM_JOINTS];
     MeasuredTorque::new(log, robot)?.differences(robot, |joint, row, difference| {
         if keep(row) {
@@ -23,34 +28,39 @@ pub fn torque_errors(
     Ok(sums.iter().any(|(_, count)| *count > 0).then_some(sums))
 }
 
-/// Steps of an actuator in a period of it: lag and delay act within.
-const SUBSTEPS: usize = 5;
+/// Lowest rate at which lag and delay are evaluated within an actuator period [Hz].
+const MIN_SUBSTEP_HZ: f64 = 1000.0;
 
-/// Measured torques, and what actuators make them of.
+/// Measured torques, with the states and commands from which actuators compute them.
 pub struct MeasuredTorque {
+    /// Rate at which the actuators are replayed [Hz].
+    actuator_hz: f64,
+    /// Substeps per actuator period.
+    substeps: usize,
     sensor: TorqueSensor,
     conditions: OperatingConditions,
     rows: Vec<TorqueSample>,
 }
 
-/// A row of a log, to the next.
+/// One row of a log, until the next.
 struct TorqueSample {
     row: usize,
-    /// The first of its part: an actuator starts there without a memory.
+    /// True for the first row of a contiguous range, at which the actuator state is reset.
     after_reset: bool,
     q: [f64; NUM_JOINTS],
     dq: [f64; NUM_JOINTS],
     ddq: [f64; NUM_JOINTS],
     command: Command,
     periods: usize,
-    /// NaN where it was not measured, or the velocity was not.
+    /// Measured torque [N·m]; NaN if torque or velocity was not measured.
     torque: [f64; NUM_JOINTS],
 }
 
 impl MeasuredTorque {
-    /// Those of `log`, for robots with the gains and rates of `robot`.
-    pub fn new(log: &Log, robot: &RobotModel) -> Result<Self, MotionError> {
+    /// Collects the samples of `log`, for robots with the gains and rates of `robot`.
+    pub fn new(log: &Log, robot: &RobotModel) -> Result<Self, ReplayError> {
         let joints = joint_commands(log)?;
+        let robot = &at_log_rate(log, robot)?;
         let clock = ActuatorClock::of(log, robot)?;
         let columns: Vec<_> = joints
             .iter()
@@ -68,7 +78,8 @@ impl MeasuredTorque {
                 let (q, none) = (robot.control.default_pose, [0.0; NUM_JOINTS]);
                 let command = command(robot, &joints, row);
                 let torque = [f64::NAN; NUM_JOINTS];
-                let mut now = TorqueSample { row, after_reset: index == 0, q, dq: none, ddq: none, command, periods, torque };
+                let mut now =
+                    TorqueSample { row, after_reset: index == 0, q, dq: none, ddq: none, command, periods, torque };
                 for (joint, q, dq, tau) in &columns {
                     now.q[*joint] = q.map_or(now.q[*joint], |q| q[row]);
                     let speeds = dq.map_or([f64::NAN; 2], |dq| [dq[row], dq[row + 1]]);
@@ -81,25 +92,35 @@ impl MeasuredTorque {
                 all.push(now);
             }
         }
-        Ok(Self { sensor: log.meta().tau_sensor, conditions: OperatingConditions::of(log), rows: all })
+        let actuator_hz = robot.control.actuator_hz;
+        let substeps = (MIN_SUBSTEP_HZ / actuator_hz).ceil().max(1.0) as usize;
+        Ok(Self {
+            actuator_hz,
+            substeps,
+            sensor: log.meta().tau_sensor,
+            conditions: OperatingConditions::of(log),
+            rows: all,
+        })
     }
 
-    /// Whether two robots make the same torque of the same states.
+    /// Returns true if two robots predict the same torque for the same states.
     pub fn predict_same_torque(&self, one: &RobotModel, other: &RobotModel) -> bool {
         let [one, other] = [one, other].map(|robot| upstream_of_sensor(robot, self.sensor));
         one.joints == other.joints && one.derating == other.derating
     }
 
-    /// Hands on joint, row and the torque that the actuators of `robot` make, less the measured one [N·m].
+    /// Calls `each` with joint, row and torque error: torque of the actuators of `robot` minus measured torque [N·m].
     pub fn differences(&self, robot: &RobotModel, mut each: impl FnMut(usize, usize, f64)) {
-        let robot = &upstream_of_sensor(robot, self.sensor);
-        let dt = robot.control.actuator_dt() / SUBSTEPS as f64;
+        let mut robot = upstream_of_sensor(robot, self.sensor);
+        robot.control.actuator_hz = self.actuator_hz;
+        let robot = &robot;
+        let dt = robot.control.actuator_dt() / self.substeps as f64;
         let mut actuator = SimdActuators::<f64>::new(robot, dt);
-        // The actuator adds its offset to what it is given; a log has it already.
+        // The actuator adds its encoder offset, which the measured positions already contain.
         let offsets = robot.joints.map(|joint| joint.actuator.encoder_offset);
-        let late = robot.joints.map(|joint| joint.actuator.sensor_delay / dt);
-        // Torques of this part, a substep an entry.
-        let mut made: Vec<[f64; NUM_JOINTS]> = Vec::new();
+        let delay = robot.joints.map(|joint| joint.actuator.sensor_delay / dt);
+        // Torques since the last reset, one entry per substep.
+        let mut torques: Vec<[f64; NUM_JOINTS]> = Vec::new();
         for row in &self.rows {
             let at = |time: f64| -> [[f64; NUM_JOINTS]; 2] {
                 let dq: [f64; NUM_JOINTS] = std::array::from_fn(|joint| row.dq[joint] + time * row.ddq[joint]);
@@ -109,17 +130,18 @@ impl MeasuredTorque {
             if row.after_reset {
                 actuator = SimdActuators::new(robot, dt);
                 actuator.set(0, robot, &at(0.0)[0].map(|q| q as f32), &[0.0; NUM_JOINTS]);
-                made.clear();
+                torques.clear();
             }
-            let strength = self.conditions.derating_factors(&robot.derating, row.row);
-            let commands = SimdCommands::new(&[Command { derating_factor: strength, ..row.command }]);
-            for step in 0..row.periods * SUBSTEPS {
+            let derating_factor = self.conditions.derating_factors(&robot.derating, row.row);
+            let commands = SimdCommands::new(&[Command { derating_factor, ..row.command }]);
+            let steps = row.periods * self.substeps;
+            for step in 0..steps {
                 let [q, dq] = at(step as f64 * dt);
-                if step % SUBSTEPS == 0 {
+                if step % self.substeps == 0 {
                     actuator.update_command(&commands, &q, &dq);
                 }
-                let forces = actuator.step(step % SUBSTEPS, &q, &dq);
-                made.push(std::array::from_fn(|joint| match self.sensor {
+                let forces = actuator.step(step % self.substeps, &q, &dq);
+                torques.push(std::array::from_fn(|joint| match self.sensor {
                     TorqueSensor::JointOutput => {
                         let dry = forces.dry_friction[joint] * smooth_sign(dq[joint]);
                         let rotor = robot.joints[joint].armature * row.ddq[joint];
@@ -129,31 +151,27 @@ impl MeasuredTorque {
                 }));
             }
             for (joint, measured) in row.torque.into_iter().enumerate().filter(|(_, torque)| torque.is_finite()) {
-                each(joint, row.row, delayed_mean(&made, joint, row.periods * SUBSTEPS, late[joint]) - measured);
+                each(
+                    joint,
+                    row.row,
+                    delayed_mean(|step| torques[step][joint], torques.len() - steps..torques.len(), delay[joint])
+                        - measured,
+                );
             }
         }
     }
 }
 
-/// Mean over the last `steps` of what a sensor that is `late` steps late shows of a joint's torques.
-fn delayed_mean(made: &[[f64; NUM_JOINTS]], joint: usize, steps: usize, late: f64) -> f64 {
-    let at = |step: usize| {
-        let place = (step as f64 - late).max(0.0);
-        let (before, part) = (place as usize, place.fract());
-        let after = (before + 1).min(made.len() - 1);
-        made[before][joint] * (1.0 - part) + made[after][joint] * part
-    };
-    (made.len() - steps..made.len()).map(at).sum::<f64>() / steps as f64
-}
-
-/// The robot without what lies behind the torque's sensor, or is in the measured position already: springs at the link,
-/// play and springs in the gear, whose rotor the encoder follows.
+/// Returns the robot without the effects that act after the torque sensor, or that the measured position contains.
+///
+/// These are springs at the link, and backlash and elasticity of the gear, because the encoder is at the rotor.
 fn upstream_of_sensor(robot: &RobotModel, sensor: TorqueSensor) -> RobotModel {
     let mut robot = robot.clone();
     let ideal = go2().joints;
     for (joint, ideal) in robot.joints.iter_mut().zip(ideal) {
         joint.spring = ideal.spring;
-        (joint.actuator.backlash, joint.actuator.gear_stiffness) = (ideal.actuator.backlash, ideal.actuator.gear_stiffness);
+        (joint.actuator.backlash, joint.actuator.gear_stiffness) =
+            (ideal.actuator.backlash, ideal.actuator.gear_stiffness);
         if sensor == TorqueSensor::MotorCurrent {
             (joint.actuator.gain, joint.actuator.ripple) = (ideal.actuator.gain, ideal.actuator.ripple);
             *joint = JointModel { torque_limit: joint.torque_limit, actuator: joint.actuator, ..ideal };
@@ -162,20 +180,7 @@ fn upstream_of_sensor(robot: &RobotModel, sensor: TorqueSensor) -> RobotModel {
     robot
 }
 
-/// The sign of a measured velocity, which is never quite zero.
+/// Returns a smooth approximation of the sign of a velocity [rad/s], because measured velocities are noisy around zero.
 fn smooth_sign(dq: f64) -> f64 {
     (dq / 0.02).tanh()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn late_sensor_shows_the_torque_of_a_while_ago() {
-        let made: Vec<[f64; NUM_JOINTS]> = (0..10).map(|step| [f64::from(step); NUM_JOINTS]).collect();
-        assert_eq!(delayed_mean(&made, 3, 2, 0.0), 8.5);
-        assert_eq!(delayed_mean(&made, 3, 2, 2.25), 6.25);
-        assert_eq!(delayed_mean(&made[..2], 3, 2, 5.0), 0.0, "nothing is before the first");
-    }
 }

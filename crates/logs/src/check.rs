@@ -6,7 +6,7 @@ use std::path::Path;
 use twinstep_model::JOINT_NAMES;
 
 use crate::LogError;
-use crate::columns::{MissingCells, Column};
+use crate::columns::{Column, MissingCells};
 use crate::log::{Log, contiguous_ranges};
 use crate::meta::{Gain, Meta};
 use crate::table::Table;
@@ -83,7 +83,9 @@ fn missing(table: &Table, column: &str) -> LogError {
     // Names that other recorders use.
     let (what, others): (_, &[&str]) = match column {
         "t" => ("the time of each row [s]", &["time", "timestamp", "time_s", "t_s", "stamp", "sec", "seconds"]),
-        "q_cmd_<joint>" => ("a joint's commanded position, such as `q_cmd_FL_hip` [rad]", &["q_des_", "q_target_", "q_ref_"]),
+        "q_cmd_<joint>" => {
+            ("a joint's commanded position, such as `q_cmd_FL_hip` [rad]", &["q_des_", "q_target_", "q_ref_"])
+        }
         _ => ("a joint's measured position, such as `q_FL_hip` [rad]", &["pos_", "position_", "joint_pos_"]),
     };
     let names = table.columns.iter().map(|(name, _)| name).chain(&table.ignored);

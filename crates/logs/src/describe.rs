@@ -1,13 +1,13 @@
 //! Summary of a log: size, timing, contents and motion of the joints.
 
 use serde::Serialize;
-use twinstep_model::{Joint, BaseMount};
+use twinstep_model::{BaseMount, Joint};
 
-use crate::missing_channels::absent;
 use crate::columns::{Column, QUANTITIES, Quantity};
-use crate::identifiability::{Identifiability, conclusions};
 use crate::excitation::{Excitation, excitation};
 use crate::falls::{Fall, falls};
+use crate::identifiability::{Identifiability, conclusions};
+use crate::missing_channels::absent;
 use crate::{Log, TorqueSensor};
 
 /// Summary of a log, as text (`Display`) or data (`Serialize`).
@@ -106,7 +106,10 @@ impl Log {
             duration_s: self.duration_s(),
             segments: self.described_segments(),
             channels: self.described_channels(),
-            absent: absent(self).into_iter().map(|(quantity, cost)| MissingChannel { quantity, consequence: cost }).collect(),
+            absent: absent(self)
+                .into_iter()
+                .map(|(quantity, cost)| MissingChannel { quantity, consequence: cost })
+                .collect(),
             joints: self.joints().iter().filter_map(|joint| excitation(self, joint)).collect(),
             falls: falls(self),
             conclusions: Vec::new(),
@@ -187,9 +190,7 @@ impl Log {
         }
         let torque = self.joints().iter().any(|joint| self.tau_measured(joint).is_some());
         if torque && self.meta().tau_sensor == TorqueSensor::None {
-            notes.push(
-                "tau_measured is not compared, because `tau_sensor` of the meta file is \"none\"".to_owned(),
-            );
+            notes.push("tau_measured is not compared, because `tau_sensor` of the meta file is \"none\"".to_owned());
         }
         if !torque && self.meta().tau_sensor != TorqueSensor::None {
             notes.push("the meta file has a `tau_sensor`, but the log has no tau_measured".to_owned());

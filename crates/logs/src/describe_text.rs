@@ -2,12 +2,12 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use crate::identifiability::IdentifiabilityLevel;
+use crate::Identifiability;
 use crate::describe::{ChannelDescription, LogSummary, Timing};
 use crate::excitation::{Excitation, SpeedSource, TorqueSource};
 use crate::falls::Fall;
+use crate::identifiability::IdentifiabilityLevel;
 use twinstep_model::BaseMount;
-use crate::Identifiability;
 
 impl Display for LogSummary {
     fn fmt(&self, out: &mut Formatter<'_>) -> fmt::Result {

@@ -72,7 +72,7 @@ pub(crate) fn excitation(log: &Log, joint: &str) -> Option<Excitation> {
     let speeds = || velocity.iter().flatten().map(|(_, dq)| dq.abs());
     let speed_max = largest(speeds());
     let (torque, torque_from) = torque(log, joint);
-    let turns = reversal_times(&velocity, 0.05 * speed_max.unwrap_or(0.0));
+    let reversals = reversal_times(&velocity, 0.05 * speed_max.unwrap_or(0.0));
     Some(Excitation {
         joint: joint.to_owned(),
         q_min,
@@ -86,8 +86,8 @@ pub(crate) fn excitation(log: &Log, joint: &str) -> Option<Excitation> {
         torque_rms: root_mean_square(torque.iter().copied()),
         torque_limit: known.map(|model| model.torque_limit),
         torque_from,
-        reversals: turns.iter().map(Vec::len).sum(),
-        band_hz: band(&turns),
+        reversals: reversals.iter().map(Vec::len).sum(),
+        band_hz: band(&reversals),
     })
 }
 
@@ -99,17 +99,17 @@ fn model(joint: &str) -> Option<JointModel> {
 /// Returns the measured velocity, or finite differences of `q` at the midpoints of the rows.
 pub(crate) fn velocity(log: &Log, joint: &str, q: &[f64]) -> (Velocity, SpeedSource) {
     let t = log.t();
-    let parts = log.segments().map(|(_, rows)| rows);
+    let ranges = log.segments().map(|(_, rows)| rows);
     if let Some(dq) = log.dq(joint).filter(|dq| dq.iter().any(|dq| !dq.is_nan())) {
         let known =
             |rows: std::ops::Range<usize>| rows.map(|row| (t[row], dq[row])).filter(|(_, dq)| !dq.is_nan()).collect();
-        return (parts.map(known).collect(), SpeedSource::Measured);
+        return (ranges.map(known).collect(), SpeedSource::Measured);
     }
     let derived = |rows: std::ops::Range<usize>| {
         let pairs = rows.clone().zip(rows.skip(1));
         pairs.map(|(row, next)| (f64::midpoint(t[row], t[next]), (q[next] - q[row]) / (t[next] - t[row]))).collect()
     };
-    (parts.map(derived).collect(), SpeedSource::Derived)
+    (ranges.map(derived).collect(), SpeedSource::Derived)
 }
 
 /// Returns the measured torque, or that of the PD law; empty if neither is known.
@@ -131,22 +131,23 @@ fn torque(log: &Log, joint: &str) -> (Vec<f64>, TorqueSource) {
 
 /// Returns the times [s] of sign changes among velocities above `threshold`, for each contiguous range of rows.
 fn reversal_times(velocity: &Velocity, threshold: f64) -> Vec<Vec<f64>> {
-    let of_part = |part: &Vec<(f64, f64)>| {
+    let in_range = |range: &Vec<(f64, f64)>| {
         let mut sign = 0.0;
-        let mut turns = Vec::new();
-        for (t, dq) in part.iter().filter(|(_, dq)| dq.abs() > threshold) {
+        let mut reversals = Vec::new();
+        for (t, dq) in range.iter().filter(|(_, dq)| dq.abs() > threshold) {
             if sign * dq < 0.0 {
-                turns.push(*t);
+                reversals.push(*t);
             }
             sign = dq.signum();
         }
-        turns
+        reversals
     };
-    velocity.iter().map(of_part).collect()
+    velocity.iter().map(in_range).collect()
 }
 
-fn band(turns: &[Vec<f64>]) -> Option<[f64; 2]> {
-    let mut halves: Vec<f64> = turns.iter().flat_map(|turns| turns.windows(2).map(|pair| pair[1] - pair[0])).collect();
+fn band(reversals: &[Vec<f64>]) -> Option<[f64; 2]> {
+    let times = reversals.iter().flat_map(|times| times.windows(2).map(|pair| pair[1] - pair[0]));
+    let mut halves: Vec<f64> = times.collect();
     halves.sort_by(f64::total_cmp);
     Some([0.9, 0.1].map(|fraction| quantile(&halves, fraction)).map(|half| half.map(|half| 0.5 / half)))
         .and_then(|band| Some([band[0]?, band[1]?]))

@@ -2,8 +2,8 @@
 
 use serde::Serialize;
 
-use twinstep_model::BaseMount;
 use crate::Log;
+use twinstep_model::BaseMount;
 
 /// Cosine of the tilt beyond which the robot has fallen: 60°.
 const FALLEN_COSINE: f64 = 0.5;

@@ -5,7 +5,7 @@
 
 use twinstep_model::{Joint, Leg, NUM_JOINTS};
 
-use crate::cdr::{Message, FieldVisitor};
+use crate::cdr::{FieldVisitor, Message};
 
 /// Number of motor entries in a message beyond the joints of the Go2.
 const MOTORS_WITHOUT_JOINT: usize = 20 - NUM_JOINTS;

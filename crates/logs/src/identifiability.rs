@@ -5,8 +5,8 @@ use twinstep_effects::{CATALOGUE, DataRequirement, Effect, LOW_SPEED};
 
 use crate::describe::{LogSummary, largest};
 use crate::excitation::{Excitation, velocity};
-use twinstep_model::BaseMount;
 use crate::{Log, TorqueSensor};
+use twinstep_model::BaseMount;
 
 /// Identifiability of one effect from a log.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -34,10 +34,6 @@ pub enum IdentifiabilityLevel {
     #[serde(rename = "cannot")]
     NotIdentifiable,
 }
-
-
-
-
 
 /// Returns the identifiability of each effect; empty for a motion file, which has no measurements.
 pub(crate) fn conclusions(log: &Log, description: &LogSummary) -> Vec<Identifiability> {
@@ -114,7 +110,7 @@ impl LogFeatures<'_> {
             }
             DataRequirement::TorqueMeasured => {
                 let measured = self.log.meta().tau_sensor != TorqueSensor::None && self.has_channel("tau_measured");
-                need_channel(measured, "torque was measured", "torque was not measured: the motion must show it")
+                need_channel(measured, "torque was measured", "torque was not measured: only motion is available")
             }
             DataRequirement::Rate(hz) => {
                 let rate = self.description.timing.rate_hz.unwrap_or(0.0);

@@ -16,7 +16,7 @@
 //! ```
 //! use twinstep_logs::Log;
 //!
-//! let log = Log::open(concat!(env!("CARGO_MANIFEST_DIR"), "/../data/go2_air_chirp"))?;
+//! let log = Log::open(concat!(env!("CARGO_MANIFEST_DIR"), "/../../data/go2_air_chirp"))?;
 //! for (segment, rows) in log.segments() {
 //!     println!("{}: {} rows", segment.name, rows.len());
 //! }
@@ -31,11 +31,9 @@
 //! Reading passes through these modules: `files` finds the files; `csv_table`, `parquet_table` or `mcap_file` reads the
 //! cells; `columns` parses the column names; `check` validates the log.
 
-mod missing_channels;
 mod cdr;
 mod check;
 mod columns;
-mod identifiability;
 mod csv_table;
 mod describe;
 mod describe_text;
@@ -44,20 +42,24 @@ mod excitation;
 mod falls;
 mod files;
 mod go2_message;
+mod identifiability;
 mod log;
 mod mcap_file;
 mod meta;
+mod missing_channels;
+pub mod operating_conditions;
 mod parquet_table;
 pub mod recording;
+pub mod replay;
 mod table;
 mod write;
 
 pub use cdr::CdrError;
-pub use identifiability::{Identifiability, IdentifiabilityLevel};
-pub use describe::{MissingChannel, ChannelDescription, LogSummary, SegmentDescription, Timing};
-pub use error::{LogError, CellLocation};
+pub use describe::{ChannelDescription, LogSummary, MissingChannel, SegmentDescription, Timing};
+pub use error::{CellLocation, LogError};
 pub use excitation::{Excitation, SpeedSource, TorqueSource};
 pub use falls::Fall;
 pub use files::overwritten_file;
+pub use identifiability::{Identifiability, IdentifiabilityLevel};
 pub use log::Log;
 pub use meta::{Gain, Meta, Segment, TorqueSensor};

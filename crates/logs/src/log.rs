@@ -109,7 +109,8 @@ impl Log {
 
     /// Returns the contiguous ranges of rows in one segment of one episode, each with its segment.
     pub fn segments(&self) -> impl Iterator<Item = (&Segment, Range<usize>)> {
-        contiguous_ranges(&self.segment, &self.episode).map(|rows| (&self.meta.segments[self.segment[rows.start] as usize], rows))
+        contiguous_ranges(&self.segment, &self.episode)
+            .map(|rows| (&self.meta.segments[self.segment[rows.start] as usize], rows))
     }
 
     /// Returns a channel by its column name, such as `gyro_x`. A missing cell is NaN.
@@ -238,7 +239,10 @@ impl ColumnCells<'_> {
 }
 
 /// Returns the ranges of rows within which neither segment nor episode changes.
-pub(crate) fn contiguous_ranges<'a>(segment: &'a [u32], episode: &'a [u32]) -> impl Iterator<Item = Range<usize>> + use<'a> {
+pub(crate) fn contiguous_ranges<'a>(
+    segment: &'a [u32],
+    episode: &'a [u32],
+) -> impl Iterator<Item = Range<usize>> + use<'a> {
     let rows = segment.len();
     let mut start = 0;
     std::iter::from_fn(move || {

@@ -9,12 +9,12 @@ use mcap::McapError;
 use mcap::records::{MessageHeader, Metadata, Record};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use serde::{Deserialize, Serialize};
-use twinstep_model::{Joint, Leg, BaseMount};
+use twinstep_model::{BaseMount, Joint, Leg};
 
 use crate::cdr;
 use crate::go2_message::{LowCmd, LowState, MotorCmd, MotorState, NO_POSITION, NO_VELOCITY, SERVO, foot, motor};
 use crate::table::Table;
-use crate::{Log, LogError, Meta, CellLocation, Segment, TorqueSensor};
+use crate::{CellLocation, Log, LogError, Meta, Segment, TorqueSensor};
 
 /// Topic with the start of each segment of each episode, in files that `Log::write` wrote.
 const PART_TOPIC: &str = "/twinstep/part";
@@ -136,7 +136,9 @@ impl Recording {
                 self.channels.insert(channel.id, Channel { topic: channel.topic, content, messages: 0 });
             }
             Record::Message { header, data } => self.message(file, &header, &data)?,
-            Record::Metadata(metadata) if metadata.name == METADATA => self.own_meta = Some(read_metadata(file, &metadata)?),
+            Record::Metadata(metadata) if metadata.name == METADATA => {
+                self.own_meta = Some(read_metadata(file, &metadata)?)
+            }
             _ => {}
         }
         Ok(())
@@ -326,9 +328,14 @@ impl StateWithCommand<'_> {
 type OfMotor = fn(&MotorState, &MotorCmd) -> f32;
 
 /// Returns all columns: those in `written`, or else those that are not zero throughout.
-fn columns(rows: &[StateWithCommand<'_>], parts: &[(u64, SegmentStart)], written: Option<&[String]>) -> Vec<(String, Vec<f64>)> {
+fn columns(
+    rows: &[StateWithCommand<'_>],
+    parts: &[(u64, SegmentStart)],
+    written: Option<&[String]>,
+) -> Vec<(String, Vec<f64>)> {
     let had = |name: &str| written.is_none_or(|written| written.iter().any(|column| column == name));
-    let column = |of: &dyn Fn(&StateWithCommand<'_>) -> f32| rows.iter().map(|row| f64::from(of(row))).collect::<Vec<_>>();
+    let column =
+        |of: &dyn Fn(&StateWithCommand<'_>) -> f32| rows.iter().map(|row| f64::from(of(row))).collect::<Vec<_>>();
     let joints: Vec<Joint> = Joint::ALL.into_iter().filter(|joint| had(&format!("q_cmd_{joint}"))).collect();
     let mut columns = time_columns(rows, parts);
 

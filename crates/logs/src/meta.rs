@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use twinstep_model::BaseMount;
 use serde::{Deserialize, Serialize};
+use twinstep_model::BaseMount;
 
 use crate::LogError;
 use crate::columns::{Column, quantity};

@@ -1,8 +1,8 @@
 //! Consequences of quantities that a log does not contain.
 
 use crate::columns::Column;
-use twinstep_model::BaseMount;
 use crate::{Log, TorqueSensor};
+use twinstep_model::BaseMount;
 
 /// When the absence of a quantity has consequences.
 #[derive(PartialEq, Eq)]

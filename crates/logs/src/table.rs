@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use crate::columns::Column;
-use crate::{LogError, CellLocation};
+use crate::{CellLocation, LogError};
 
 /// Known columns with one cell per row, in the order of the file.
 #[derive(Debug)]

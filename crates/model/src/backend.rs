@@ -3,7 +3,7 @@
 use std::any::Any;
 use std::sync::Arc;
 
-use crate::{Command, Ground, PerJoint, InitialState, RobotModel, RobotStates};
+use crate::{Command, Ground, InitialState, PerJoint, RobotModel, RobotStates};
 
 /// Batch of robots that are commanded and observed together: a simulator, a replayed log or the real robot.
 pub trait Backend: Send {

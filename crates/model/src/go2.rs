@@ -8,8 +8,8 @@
 use glam::{DQuat, DVec3, dvec3};
 
 use crate::{
-    Contact, ControlConfig, Derating, Joint, ActuatorParams, JointKind, JointModel, JointSpring, Leg, LegModel, RigidBody,
-    RobotModel, Shapes, Stribeck,
+    ActuatorParams, Contact, ControlConfig, Derating, Joint, JointKind, JointModel, JointSpring, Leg, LegModel,
+    RigidBody, RobotModel, Shapes, Stribeck,
 };
 
 /// Returns the ideal Go2: without joint friction, damping or delay.

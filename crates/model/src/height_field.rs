@@ -317,8 +317,9 @@ mod tests {
 
     #[test]
     fn invalid_grids_are_rejected_with_the_reason() {
-        let refused =
-            |cell_size, shape, heights| HeightField::centred(cell_size, shape, heights).expect_err("refused").to_string();
+        let refused = |cell_size, shape, heights| {
+            HeightField::centred(cell_size, shape, heights).expect_err("refused").to_string()
+        };
         assert_eq!(refused(1.0, [2, 3], vec![0.0; 5]), "`heights` has 5 entries; 2 rows and 3 columns have 6");
         assert_eq!(
             refused(1.0, [1, 3], vec![0.0; 3]),

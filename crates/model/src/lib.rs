@@ -46,11 +46,12 @@ pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoi
 pub use kinematics::{FIXED_BASE_HEIGHT, NUM_BODIES, Pose, body_poses};
 pub use mjcf::{MjcfActuator, MjcfOptions, mjcf};
 pub use robot::{
-    Contact, ControlConfig, Derating, ActuatorParams, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes, Stribeck,
+    ActuatorParams, Contact, ControlConfig, Derating, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes,
+    Stribeck,
 };
-pub use rollout::{RolloutRequest, HistoryStep, Precision, Rollout};
+pub use rollout::{HistoryStep, Precision, Rollout, RolloutRequest};
 pub use scene::{Scene, SceneShape, ShapeKind};
 pub use spec::{EnvSpec, SpecField};
-pub use state::{Command, InitialState, RobotStates, RobotStatesMut, RandomisationSample};
+pub use state::{Command, InitialState, RandomisationSample, RobotStates, RobotStatesMut};
 pub use stream::{Stream, standard_normal, stream};
 pub use vec_env::{AutoresetMode, EndedEpisode, EnvError, ResetRequest, StepBatch, VecEnv};

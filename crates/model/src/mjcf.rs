@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use glam::{DMat3, DVec3};
 
 use crate::kinematics::FIXED_BASE_HEIGHT;
-use crate::{BaseMount, Ground, Joint, JointKind, Leg, InitialState, RigidBody, RobotModel};
+use crate::{BaseMount, Ground, InitialState, Joint, JointKind, Leg, RigidBody, RobotModel};
 
 /// Gravity of the model [m/s²].
 const GRAVITY: f64 = 9.81;

@@ -144,12 +144,18 @@ pub struct ActuatorParams {
     pub command_delay: f64,
     /// Encoder reading minus joint position [rad]. PD loop and log use the reading.
     pub encoder_offset: f64,
+    /// Position gain of the PD loop divided by the commanded gain.
+    pub kp_scale: f64,
+    /// Velocity gain of the PD loop divided by the commanded gain.
+    pub kd_scale: f64,
     /// Saturation torque κ of `κ · tanh(τ / κ)` [N·m]; infinite for none.
     pub saturation: f64,
     /// Delay of the PD loop's torque [s].
     pub torque_delay: f64,
     /// Speed at which back-EMF reduces the torque to zero [rad/s]; infinite for no reduction.
     pub no_load_speed: f64,
+    /// Half width of the torque dead zone [N·m]: smaller torques become zero, larger ones are reduced by it.
+    pub dead_zone: f64,
     /// Time constant of the first-order lag of the torque [s]; 0 for none.
     pub torque_time_constant: f64,
     /// Motor torque divided by the torque that the current sensor measures.
@@ -176,16 +182,19 @@ pub struct Ripple {
 }
 
 impl ActuatorParams {
-    /// Longest delay [s]: eight actuator periods at 200 Hz.
+    /// Longest delay [s].
     pub const MAX_DELAY: f64 = 0.04;
 
     /// Ideal actuator: the commanded torque without delay, lag, saturation or backlash.
     pub const IDEAL: ActuatorParams = ActuatorParams {
         command_delay: 0.0,
         encoder_offset: 0.0,
+        kp_scale: 1.0,
+        kd_scale: 1.0,
         saturation: f64::INFINITY,
         torque_delay: 0.0,
         no_load_speed: f64::INFINITY,
+        dead_zone: 0.0,
         torque_time_constant: 0.0,
         gain: 1.0,
         ripple: Ripple { amplitude: 0.0, cycles: 0.0, phase: 0.0 },

@@ -1,14 +1,14 @@
 //! Interface between identification and simulators: simulates command sequences with many candidate robots at once.
 
-use crate::{Command, PerJoint, InitialState, RobotModel, RobotStates};
+use crate::{BaseMount, Command, InitialState, PerJoint, RobotModel, RobotStates};
 
 /// Simulation of one candidate robot.
 #[derive(Clone, Copy, Debug)]
 pub struct RolloutRequest<'a> {
     /// The candidate robot.
     pub robot: &'a RobotModel,
-    /// Whether its base is fixed.
-    pub held: bool,
+    /// Base mount of the candidate.
+    pub base: BaseMount,
     /// Initial state.
     pub start: InitialState,
     /// Actuator periods before the start, oldest first; they initialise the actuator state. Before them the robot was

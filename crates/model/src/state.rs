@@ -281,8 +281,9 @@ mod tests {
     fn feet_have_the_same_distance_to_a_slope_as_to_flat_ground() {
         let robot = go2();
         let ground = Ground { normal: [-0.3f32.sin(), 0.0, 0.3f32.cos()], ..Ground::FLAT };
-        let [level, sloping] = [&Ground::FLAT, &ground]
-            .map(|ground| gaps(&InitialState::standing_on(ground, &robot, robot.control.default_pose_f32(), 0.0), ground));
+        let [level, sloping] = [&Ground::FLAT, &ground].map(|ground| {
+            gaps(&InitialState::standing_on(ground, &robot, robot.control.default_pose_f32(), 0.0), ground)
+        });
         for (level, sloping) in level.iter().zip(sloping) {
             assert!((level - sloping * 0.3f32.cos()).abs() < 1e-5, "{level} {sloping}");
         }

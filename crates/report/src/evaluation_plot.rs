@@ -5,9 +5,9 @@ use std::path::Path;
 
 use plotters::prelude::*;
 use plotters::style::text_anchor::HPos;
+use twinstep_identify::{Evaluation, JointEvaluation};
 use twinstep_logs::Log;
 use twinstep_model::{Joint, NUM_JOINTS};
-use twinstep_identify::{Evaluation, JointEvaluation};
 
 use crate::chart::{self, Area, GREY, INK, Line, ORANGE, Panel, PlotError};
 use crate::timeline::Timeline;

@@ -1,11 +1,11 @@
 //! The findings: the law of each in the data, its size, and the rivals that it beat.
 
+use twinstep_diagnose::{AlternativeCause, Cause, Diagnosis, Estimate, ParameterValue};
 use twinstep_effects::{Effect, Parameter};
-use twinstep_diagnose::{Cause, Diagnosis, Estimate, AlternativeCause, ParameterValue};
 
-use crate::report_data::ReportData;
 use crate::html::{alike, bar, escape, number, percent};
 use crate::overview::key;
+use crate::report_data::ReportData;
 use crate::{plot, text};
 
 /// One card a finding.

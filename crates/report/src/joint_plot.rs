@@ -8,8 +8,8 @@ use plotters::style::text_anchor::HPos;
 use twinstep_model::{Joint, JointKind, Leg};
 
 use crate::chart::{self, Area, GREY, INK, ORANGE, Panel, PlotError};
-use twinstep_identify::replay::{JointError, Replay};
 use crate::timeline::Timeline;
+use twinstep_identify::replay::{JointError, Replay};
 
 /// Width and height of the picture [px].
 const SIZE: (u32, u32) = (1500, 1320);

@@ -1,10 +1,10 @@
 //! The lower part of the page: what cannot be told apart, what is left, and where it all comes from.
 
-use twinstep_effects::Effect;
 use twinstep_diagnose::{Cause, CorrelatedPair, Diagnosis, NextExperiment};
+use twinstep_effects::Effect;
 
-use crate::report_data::{LogFacts, Provenance};
 use crate::html::{escape, number, percent};
+use crate::report_data::{LogFacts, Provenance};
 use crate::text;
 
 /// What this log cannot tell apart, and what to run next.

@@ -1,11 +1,11 @@
 //! The upper part of the page: verdict, numbers, where and when simulation and measurement part.
 
-use twinstep_model::{Joint, JointKind, Leg};
 use twinstep_diagnose::{Diagnosis, RmsErrors};
 use twinstep_identify::{Evaluation, JointEvaluation};
+use twinstep_model::{Joint, JointKind, Leg};
 
-use crate::report_data::ReportData;
 use crate::html::{alike, escape, percent};
+use crate::report_data::ReportData;
 use crate::time_series::Curve;
 use crate::{plot, text};
 

@@ -3,10 +3,10 @@
 use std::fmt::Write as _;
 use std::ops::Range;
 
+use crate::chart::{range, tick_label};
 use crate::html::escape;
 use crate::residual_plot::Bin;
 use crate::time_series::Curve;
-use crate::chart::{range, tick_label};
 
 /// Width and height [px]; a narrow screen shows it nearly as large, so that its text stays readable.
 const SIZE: (f64, f64) = (520.0, 290.0);

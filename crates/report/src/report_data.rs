@@ -1,11 +1,13 @@
 //! What a log shows of two models: the one that was given, and the one that the findings extend.
 
-use twinstep_logs::{Log, TorqueSensor};
-use twinstep_effects::{CATALOGUE, EffectEntry, EntryError, Target, apply_effects};
-use twinstep_model::{Joint, NUM_JOINTS, RobotModel, Rollout, go2};
 use twinstep_effects::ModelFile;
-use twinstep_identify::motion::{JointCommands, MotionError, joint_commands};
-use twinstep_identify::{InverseDynamicsResidual, Evaluation, ExperimentError, JointTrajectory, JointSeries, evaluate, position_errors};
+use twinstep_effects::{CATALOGUE, EffectEntry, EntryError, Target, apply_effects};
+use twinstep_identify::{
+    Evaluation, ExperimentError, InverseDynamicsResidual, JointSeries, JointTrajectory, evaluate, position_errors,
+};
+use twinstep_logs::replay::{JointCommands, ReplayError, joint_commands};
+use twinstep_logs::{Log, TorqueSensor};
+use twinstep_model::{Joint, NUM_JOINTS, RobotModel, Rollout, go2};
 
 use crate::residual_plot::{ResidualPlot, Residuals};
 use crate::time_series::TimeSeries;
@@ -21,7 +23,7 @@ pub enum EvidenceError {
     Experiment(#[from] ExperimentError),
     /// The log's commands cannot be given to the robot.
     #[error(transparent)]
-    Motion(#[from] MotionError),
+    Motion(#[from] ReplayError),
 }
 
 /// Where a report comes from.
@@ -91,7 +93,8 @@ impl ReportData {
         provenance: Provenance,
     ) -> Result<Self, EvidenceError> {
         let [before, after] = [given.robot_model()?, extended.robot_model()?];
-        let mut bench = LogEvaluator { log, joints: joint_commands(log)?, kinematics: JointTrajectory::of(log)?, simulator };
+        let mut bench =
+            LogEvaluator { log, joints: joint_commands(log)?, kinematics: JointTrajectory::of(log)?, simulator };
         let [first, second] = [bench.trial(&before)?, bench.trial(&after)?];
         let laws = (0..extended.effects.len())
             .filter(|index| !given.effects.contains(&extended.effects[*index]))
@@ -171,7 +174,10 @@ impl LogEvaluator<'_> {
         let (y_label, residuals) = match best_residual(self.log, entry) {
             Residual::Torque => {
                 let of = |balance: &InverseDynamicsResidual| less(&self.measured_torque(), &balance.estimated_torque);
-                ("measured − model's torque [N·m]", [of(&InverseDynamicsResidual::of(self.log, without)?), of(&with.balance)])
+                (
+                    "measured − model's torque [N·m]",
+                    [of(&InverseDynamicsResidual::of(self.log, without)?), of(&with.balance)],
+                )
             }
             Residual::Unexplained => {
                 let balance = InverseDynamicsResidual::of(self.log, without)?;

@@ -1,10 +1,10 @@
 //! The residual of a log beside the variable that explains it, and what a finding makes of it.
 
-use twinstep_logs::Log;
 use twinstep_effects::{EffectEntry, Target};
+use twinstep_identify::{JointSeries, JointTrajectory};
+use twinstep_logs::Log;
+use twinstep_logs::replay::{JointCommands, cell_or_zero};
 use twinstep_model::{Joint, RobotModel};
-use twinstep_identify::motion::{JointCommands, cell_or_zero};
-use twinstep_identify::{JointTrajectory, JointSeries};
 
 /// Bins of a picture.
 const BINS: usize = 40;

@@ -1,7 +1,7 @@
 //! Effects, scopes and the verdict in a robot engineer's words. What comes from files is escaped here.
 
+use twinstep_diagnose::{Cause, Diagnosis, ParameterValue, RmsErrors};
 use twinstep_effects::{Effect, Target};
-use twinstep_diagnose::{Cause, Diagnosis, RmsErrors, ParameterValue};
 
 use crate::html::{alike, escape, percent};
 

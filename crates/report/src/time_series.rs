@@ -2,9 +2,9 @@
 
 use std::ops::Range;
 
+use twinstep_identify::{Evaluation, JointEvaluation};
 use twinstep_logs::{Log, TorqueSensor};
 use twinstep_model::Joint;
-use twinstep_identify::{Evaluation, JointEvaluation};
 
 use crate::report_data::ModelEvaluation;
 use crate::timeline::Timeline;

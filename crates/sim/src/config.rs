@@ -148,9 +148,20 @@ pub struct SimConfigError {
 }
 
 impl SimConfig {
-    /// Returns the rate of the physics [Hz].
+    /// Returns the rate of the physics [Hz]; without a rate of its own, the engine's recommended rate.
     pub fn physics_hz(&self) -> u32 {
         self.physics_hz.unwrap_or(self.engine.recommended().0)
+    }
+
+    /// Returns the settings with a physics rate for actuators of this rate.
+    ///
+    /// Without a rate of its own the physics runs at the smallest multiple of the actuator rate that is not below the
+    /// engine's recommended rate.
+    #[must_use]
+    pub fn at_actuator_rate(self, control: &ControlConfig) -> Self {
+        let (actuator_hz, recommended) = (control.actuator_hz as u32, self.engine.recommended().0);
+        let multiple = recommended.div_ceil(actuator_hz.max(1)) * actuator_hz;
+        Self { physics_hz: Some(self.physics_hz.unwrap_or(multiple)), ..self }
     }
 
     /// Returns the number of solver iterations per physics step.
@@ -162,9 +173,10 @@ impl SimConfig {
     pub fn check(&self, control: &ControlConfig) -> Result<(), SimConfigError> {
         let actuator_hz = control.actuator_hz as u32;
         let reject = |field, value: String, allowed: String| Err(SimConfigError { field, value, allowed });
-        if !(actuator_hz..=20_000).contains(&self.physics_hz()) || !self.physics_hz().is_multiple_of(actuator_hz) {
+        let physics_hz = self.at_actuator_rate(control).physics_hz();
+        if !(actuator_hz..=20_000).contains(&physics_hz) || !physics_hz.is_multiple_of(actuator_hz) {
             let allowed = format!("a multiple of the actuator rate, {actuator_hz} Hz, up to 20000");
-            return reject("physics_hz", self.physics_hz().to_string(), allowed);
+            return reject("physics_hz", physics_hz.to_string(), allowed);
         }
         if !(1..=64).contains(&self.solver_iterations()) {
             return reject("solver_iterations", self.solver_iterations().to_string(), "1 to 64".to_owned());
@@ -197,7 +209,10 @@ mod tests {
     fn error_of_a_rate_that_is_not_a_multiple_lists_the_allowed_rates() {
         let config = SimConfig { physics_hz: Some(500), ..SimConfig::default() };
         let error = config.check(&go2().control).expect_err("error").to_string();
-        assert_eq!(error, "`sim.physics_hz` = 500 is not allowed: a multiple of the actuator rate, 200 Hz, up to 20000");
+        assert_eq!(
+            error,
+            "`sim.physics_hz` = 500 is not allowed: a multiple of the actuator rate, 200 Hz, up to 20000"
+        );
     }
 
     #[test]

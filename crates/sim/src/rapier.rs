@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 use twinstep_model::{
-    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, PerJoint, InitialState, RobotModel, RobotStates,
+    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, InitialState, PerJoint, RobotModel, RobotStates,
 };
 
 use crate::ground_shapes::GroundShapes;
@@ -72,11 +72,13 @@ impl RapierBackend {
     /// Creates `num_robots` robots that stand in their default pose.
     pub fn new(robot: RobotModel, config: SimConfig, num_robots: usize) -> Result<Self, BackendBuildError> {
         config.check(&robot.control)?;
+        let config = config.at_actuator_rate(&robot.control);
         let pool = thread_pool(config.threads)?;
         let ground = config.terrain.ground();
         let ground_shapes = GroundShapes::new(&ground);
         let initial_state = InitialState::standing_on(&ground, &robot, robot.control.default_pose_f32(), 0.0);
-        let worlds = (0..num_robots).map(|_| RobotWorld::new(&robot, &config, &ground_shapes, &initial_state)).collect();
+        let worlds =
+            (0..num_robots).map(|_| RobotWorld::new(&robot, &config, &ground_shapes, &initial_state)).collect();
         let states = RobotStates::new(num_robots);
         let mut this = Self { robot, config, ground, ground_shapes, worlds, states, actuator: None, pool };
         for index in 0..num_robots {
@@ -180,7 +182,12 @@ impl Backend for RapierBackend {
         Ok(())
     }
 
-    fn reset_with_model(&mut self, robot: usize, model: &RobotModel, initial_state: &InitialState) -> Result<(), BackendError> {
+    fn reset_with_model(
+        &mut self,
+        robot: usize,
+        model: &RobotModel,
+        initial_state: &InitialState,
+    ) -> Result<(), BackendError> {
         self.check_index(robot)?;
         self.reset_robot(robot, model, initial_state);
         Ok(())

@@ -16,10 +16,15 @@ use std::f64::consts::TAU;
 
 use glam::{DVec3, Quat, Vec3};
 use rapier3d::prelude::*;
-use twinstep_model::{dynamics::{SimdCommands, SimdActuators, JointForces}, Command, Contact, Joint, JointKind, Leg, NUM_JOINTS, PerJoint, PerLeg, InitialState, RigidBody, RobotModel, frames, BaseMount};
+use twinstep_model::{
+    BaseMount, Command, Contact, InitialState, Joint, JointKind, Leg, NUM_JOINTS, PerJoint, PerLeg, RigidBody,
+    RobotModel,
+    dynamics::{JointForces, SimdActuators, SimdCommands},
+    frames,
+};
 
-use crate::ground_shapes::GroundShapes;
 use crate::SimConfig;
+use crate::ground_shapes::GroundShapes;
 
 /// MuJoCo's default impedance of a deep contact.
 const IMPEDANCE: f64 = 0.95;
@@ -168,7 +173,9 @@ impl RobotWorld {
     pub fn actuator_period(&mut self, input: ActuatorInputRef, steps: usize) -> PerJoint {
         let (mut q, mut dq) = self.joints();
         match input {
-            ActuatorInputRef::Command(command) => self.actuator.update_command(&SimdCommands::new(std::slice::from_ref(command)), &q, &dq),
+            ActuatorInputRef::Command(command) => {
+                self.actuator.update_command(&SimdCommands::new(std::slice::from_ref(command)), &q, &dq)
+            }
             ActuatorInputRef::Torques(tau) => self.actuator.set_torque(tau.map(f64::from)),
         }
         let mut estimated = [0.0; NUM_JOINTS];
@@ -349,7 +356,12 @@ fn randomised_bodies(robot: &RobotModel, initial_state: &InitialState) -> (Rigid
     (RigidBody { com: trunk.com + shift, ..trunk }, scale)
 }
 
-fn insert_trunk(world: &mut PhysicsWorld, base: BaseMount, trunk: &RigidBody, initial_state: &InitialState) -> RigidBodyHandle {
+fn insert_trunk(
+    world: &mut PhysicsWorld,
+    base: BaseMount,
+    trunk: &RigidBody,
+    initial_state: &InitialState,
+) -> RigidBodyHandle {
     let world_from_base = frames::world_from_base(initial_state.base_orientation);
     let centre = Vec3::from(initial_state.base_position) + world_from_base * trunk.com.as_vec3();
     let builder = match base {
@@ -421,7 +433,8 @@ mod tests {
         let q = std::array::from_fn(|j| robot.control.default_pose[j] as f32 + 0.2 * (j as f32).sin());
         let tilted = Quat::from_euler(glam::EulerRot::ZYX, 0.1 * TAU, 0.05 * TAU, -0.03 * TAU);
         let initial_state = InitialState { base_orientation: frames::to_wxyz(tilted), ..InitialState::at_rest(0.6, q) };
-        let mut world = RobotWorld::new(&robot, &SimConfig::default(), &GroundShapes::new(&Ground::FLAT), &initial_state);
+        let mut world =
+            RobotWorld::new(&robot, &SimConfig::default(), &GroundShapes::new(&Ground::FLAT), &initial_state);
         for steps in [0, 40] {
             world.actuator_period(ActuatorInputRef::Torques(&std::array::from_fn(|j| (j as f32).cos())), steps);
             let (mut q, mut dq) = (PerJoint::default(), PerJoint::default());

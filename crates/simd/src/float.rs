@@ -283,4 +283,3 @@ impl SimdFloat for f64 {
         functions::sin_cos_double(self)
     }
 }
-

@@ -226,8 +226,21 @@ mod tests {
             let (sin, cos) = x.sin_cos();
             let selected = x.select_lt(y, x * x, y);
             let power = T::splat(-3.0).exp2_integer();
-            let results =
-                [x + y, x - y, x * y, x / y, -x, x.sqrt(), x.max(y), x.min(y), x.mul_add(y, x), power, selected, sin, cos];
+            let results = [
+                x + y,
+                x - y,
+                x * y,
+                x / y,
+                -x,
+                x.sqrt(),
+                x.max(y),
+                x.min(y),
+                x.mul_add(y, x),
+                power,
+                selected,
+                sin,
+                cos,
+            ];
             // The payload of a NaN differs between processors.
             results.map(|result| {
                 let value = result.get(T::LANES - 1);

@@ -6,10 +6,10 @@ use proptest::prelude::*;
 use serde::{Deserialize, Serialize};
 use twinstep_model::{AutoresetMode, EndedEpisode, Scene, StepBatch};
 use twinstep_protocol::message::{
-    CloseReply, CloseRequest, RequestHeader, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply,
-    RenderRequest, ResetReply, ResetRequest, StepReply, StepRequest,
+    CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply, RenderRequest,
+    RequestHeader, ResetReply, ResetRequest, StepReply, StepRequest,
 };
-use twinstep_protocol::{ErrorCode, PROTOCOL, ErrorReply, convert, decode, encode, tensor};
+use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, tensor};
 
 use crate::golden;
 

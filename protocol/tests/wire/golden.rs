@@ -7,14 +7,14 @@ use std::fmt::Debug;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::{AutoresetMode, EnvSpec, SpecField, Ground, HeightField, Scene, SceneShape, ShapeKind};
+use twinstep_model::{AutoresetMode, EnvSpec, Ground, HeightField, Scene, SceneShape, ShapeKind, SpecField};
 use twinstep_protocol::convert::encode_ground;
 use twinstep_protocol::message::{
     CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply, RenderRequest,
     ResetReply, ResetRequest, StepReply, StepRequest,
 };
 use twinstep_protocol::tensor::as_bytes;
-use twinstep_protocol::{ErrorCode, PROTOCOL, ErrorReply, decode, encode};
+use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, decode, encode};
 
 /// Name of every golden file, without `.msgpack`.
 pub const NAMES: [&str; 18] = [

@@ -6,13 +6,16 @@
 use clap::Parser;
 use indicatif::ProgressBar;
 use rayon::prelude::*;
-use twinstep_logs::Log;
-use twinstep_effects::{Effect, Scope};
-use twinstep_model::{JOINT_NAMES, RolloutRequest, Precision, RobotStates, Rollout, go2};
 use twinstep_effects::ModelFile;
+use twinstep_effects::{Effect, Scope};
+use twinstep_identify::{
+    Experiment, IdentifyOptions, WindowConfig, candidate, evaluate, free_parameters, identify, initial_coordinate,
+    with_values,
+};
+use twinstep_logs::Log;
+use twinstep_model::{JOINT_NAMES, Precision, RobotStates, Rollout, RolloutRequest, go2};
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_identify::{Experiment, WindowConfig, IdentifyOptions, candidate, evaluate, identify, initial_coordinate, free_parameters, with_values};
-use twinstep_tests::ground_truth_robot::{effect, ground_truth_robot, log_of, motion, estimated_effects};
+use twinstep_tests::ground_truth_robot::{effect, estimated_effects, ground_truth_robot, log_of, motion};
 
 /// Identify hidden robots with different models and searches, and judge them on other motion.
 #[derive(Parser)]

@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use clap::Parser;
 use indicatif::ProgressBar;
 use twinstep_ensemble::{
-    Split, Calibration, DataSet, Ensemble, Gaussian, TrainingOptions, TrainingResult, TrainingEvent, Sequence, Training, epistemic_uncertainty,
-    jensen_renyi,
+    Calibration, DataSet, Ensemble, Gaussian, Sequence, Split, Training, TrainingEvent, TrainingOptions,
+    TrainingResult, epistemic_uncertainty, jensen_renyi,
 };
 use twinstep_logs::Log;
 use twinstep_tests::ground_truth_actuator::{DRIVES, HiddenDrive, Motion, NOISE_NM};
@@ -220,7 +220,8 @@ fn uncertainty(actuator: &HiddenDrive, args: &Args, bar: &ProgressBar) {
             exact.into_iter().zip(predicted).map(move |(run, predicted)| (run, predicted, unseen))
         })
         .collect();
-    for (name, euf) in [("as in U2E", jensen_renyi as fn(&[f64], &[f64]) -> f64), ("corrected", epistemic_uncertainty)] {
+    for (name, euf) in [("as in U2E", jensen_renyi as fn(&[f64], &[f64]) -> f64), ("corrected", epistemic_uncertainty)]
+    {
         let rows: Vec<Judged> =
             runs.iter().flat_map(|(run, predicted, unseen)| judged(run, predicted, *unseen, euf)).collect();
         let steps = control_steps(&runs, euf);

@@ -9,8 +9,8 @@ use std::time::Instant;
 use clap::Parser;
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_tests::fault_injection::{self, FaultPlan};
-use twinstep_tests::test_bed::TestBedConfig;
 use twinstep_tests::roles::Role;
+use twinstep_tests::test_bed::TestBedConfig;
 
 /// Kill, freeze and confuse servers, clients and routers, and count what goes wrong.
 ///

@@ -5,12 +5,12 @@
 
 use clap::Parser;
 use rayon::prelude::*;
-use twinstep_model::{BaseMount, go2};
-use twinstep_logs::Log;
-use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_diagnose::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
-use twinstep_tests::ground_truth_robot::log_of;
+use twinstep_logs::Log;
+use twinstep_model::{BaseMount, go2};
+use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_tests::confounded_pairs::{PAIRS, Pair};
+use twinstep_tests::ground_truth_robot::log_of;
 
 /// Predict what safe motions tell of pairs of effects, and measure it.
 #[derive(Parser)]
@@ -57,7 +57,7 @@ struct Row {
 }
 
 fn row(pair: &Pair, seed: u64) -> Row {
-    let rivalry = pair.rivalry();
+    let pair = pair.pair();
     let motions: Vec<&ExcitationTrajectory> =
         EXCITATION_TRAJECTORIES.iter().filter(|motion| pair.on_ground || motion.base == BaseMount::Fixed).collect();
     let robot = pair.robot();
@@ -70,8 +70,8 @@ fn row(pair: &Pair, seed: u64) -> Row {
         .map(|(motion, log)| {
             let config = SimConfig { threads: 1, ..SimConfig::default() };
             let mut simulator = BatchRollout::new(&go2(), &config).expect("a simulator");
-            let predicted = rivalry.expected_log_likelihood_ratio(motion, like, &mut simulator).unwrap_or(0.0);
-            [predicted, rivalry.log_likelihood_ratio(log.clone(), &mut simulator).expect("an experiment")]
+            let predicted = pair.expected_log_likelihood_ratio(motion, like, &mut simulator).unwrap_or(0.0);
+            [predicted, pair.log_likelihood_ratio(log.clone(), &mut simulator).expect("an experiment")]
         })
         .collect();
     let most =
@@ -80,7 +80,7 @@ fn row(pair: &Pair, seed: u64) -> Row {
     let mut achieved: Vec<f64> = told.iter().map(|told| told[1]).collect();
     achieved.sort_by(f64::total_cmp);
     Row {
-        names: rivalry.names(),
+        names: pair.names(),
         chosen: motions[chosen].name,
         predicted: told[chosen][0],
         achieved: told[chosen][1],

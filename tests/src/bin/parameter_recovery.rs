@@ -7,10 +7,10 @@ use clap::Parser;
 use indicatif::ProgressBar;
 use rayon::prelude::*;
 use twinstep_effects::ModelFile;
+use twinstep_identify::{Experiment, IdentifyOptions, ParameterEstimate, WindowConfig, identify};
 use twinstep_model::go2;
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_identify::{Experiment, ParameterEstimate, WindowConfig, IdentifyOptions, identify};
-use twinstep_tests::ground_truth_robot::{ground_truth_robot, log_of, motion, estimated_effects};
+use twinstep_tests::ground_truth_robot::{estimated_effects, ground_truth_robot, log_of, motion};
 
 /// Find hidden bodies and motors again, and print the table.
 #[derive(Parser)]
@@ -113,7 +113,9 @@ fn recovered(case: u64, motion: &twinstep_logs::Log) -> Vec<Answer> {
 }
 
 fn answer(finding: &ParameterEstimate, truth: f64) -> Option<Answer> {
-    let of = |row: &&(_, &str, &str, _, _)| row.1 == finding.parameter.effect.name && row.2 == finding.parameter.parameter_name;
+    let of = |row: &&(_, &str, &str, _, _)| {
+        row.1 == finding.parameter.effect.name && row.2 == finding.parameter.parameter_name
+    };
     let (quantity, _, _, unit, goal) = *ROWS.iter().find(of)?;
     let half = 0.5 * (finding.predicted_interval[1] - finding.predicted_interval[0]);
     let middle = 0.5 * (finding.predicted_interval[0] + finding.predicted_interval[1]);

@@ -157,7 +157,7 @@ fn ask_echo(
     let mut config = zenoh::Config::from_file(folder.path("client-tls.json5"))?;
     config.insert_json5("mode", "\"client\"")?;
     config.insert_json5("connect/endpoints", &format!("[\"{endpoint}\"]"))?;
-    let session = zenoh::open(config).wait()?;
+    let session = twinstep_session::open(config)?;
     let querier = session
         .declare_querier(ECHO_KEY)
         .target(QueryTarget::BestMatching)
@@ -262,7 +262,7 @@ fn echo(config: &std::path::Path, listen: &str, envs: usize, express: bool) -> R
     zenoh.insert_json5("mode", "\"peer\"")?;
     zenoh.insert_json5("scouting/multicast/enabled", "false")?;
     zenoh.insert_json5("listen/endpoints", &format!("[\"{listen}\"]"))?;
-    let session: Session = zenoh::open(zenoh).wait()?;
+    let session: Session = twinstep_session::open(zenoh)?;
     let queries = session.declare_queryable(ECHO_KEY).complete(true).wait()?;
     let reply = ZBytes::from(convert::encode_step(&StepBatch::new(envs, OBS_LEN), 1));
     let endpoint = session.info().locators().wait().first().map(ToString::to_string).unwrap_or_default();

@@ -114,7 +114,8 @@ def _check_end(env: "VecEnv", info: dict[str, Any], index: int, obs: list[Return
     truncated = info.get("TimeLimit.truncated")
     if not isinstance(truncated, bool | np.bool_):
         found = f"done, but infos' `TimeLimit.truncated` is {truncated!r}"
-        raise VecEnvError(found, expected="a bool, true if the time limit ended the episode and the task did not", env=index)
+        expected = "a bool, true if the time limit ended the episode and the task did not"
+        raise VecEnvError(found, expected=expected, env=index)
     results: list[ReturnedArray] = []
     whole = cast(AnySpace, env.observation_space)
     for name, space, value in _leaves(whole, info["terminal_observation"], "terminal_observation", index):

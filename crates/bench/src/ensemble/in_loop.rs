@@ -1,15 +1,15 @@
 //! Robots that walk on the batch engine, driven by an ensemble, on one core.
 
+use twinstep_effects::{ActuatorNetworkConfig, MemberSampling, ModelFile};
 use twinstep_ensemble::ActuatorNetworkRobot;
 use twinstep_envs::{Randomisation, TaskConfig, TaskEnv, TaskEnvConfig};
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv, go2};
-use twinstep_effects::{ActuatorNetworkConfig, MemberSampling, ModelFile};
 use twinstep_sim::{BatchBackend, SimConfig};
 
 use super::{MEMBERS, ensemble};
 use crate::Measurement;
-use crate::throughput::{WINDOWS, measure as pace, median_of};
 use crate::error::{BenchError, Interrupted, check, failed};
+use crate::throughput::{WINDOWS, measure as pace, median_of};
 use twinstep_envs::trot;
 
 /// Robots that are stepped together: what six networks remember of 64 fits into a core's own cache.
@@ -28,7 +28,8 @@ enum ActuatorKind {
 
 /// Env-steps a second of each kind of actuator.
 pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
-    let rows: Result<Vec<_>, _> = ROBOTS.into_iter().map(|robots| side_by_side(robots, window_s, interrupted)).collect();
+    let rows: Result<Vec<_>, _> =
+        ROBOTS.into_iter().map(|robots| side_by_side(robots, window_s, interrupted)).collect();
     Ok(rows?.concat())
 }
 

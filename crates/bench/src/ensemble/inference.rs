@@ -8,8 +8,8 @@ use twinstep_model::NUM_JOINTS;
 use super::torch::{Learning, Setup, Torch, name};
 use super::{HIDDEN, MEMBERS, ensemble};
 use crate::Measurement;
-use crate::throughput::{WINDOWS, measure as pace, median_of};
 use crate::error::{BenchError, Interrupted, check};
+use crate::throughput::{WINDOWS, measure as pace, median_of};
 
 /// Robots of a query.
 const ROBOTS: [usize; 4] = [1, 64, 1024, 4096];

@@ -7,7 +7,7 @@ mod training;
 
 use std::path::Path;
 
-use twinstep_ensemble::{EnsembleMetadata, Ensemble, JointEncoding, Normaliser, Normalisers};
+use twinstep_ensemble::{Ensemble, EnsembleMetadata, JointEncoding, Normaliser, Normalisers};
 use twinstep_logs::TorqueSensor;
 use twinstep_model::{JOINT_NAMES, go2};
 

@@ -4,15 +4,15 @@ use std::f64::consts::TAU;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use twinstep_ensemble::{DataSet, TrainingOptions, TrainingEvent, Training};
-use twinstep_model::{BaseMount, JOINT_NAMES};
+use twinstep_ensemble::{DataSet, Training, TrainingEvent, TrainingOptions};
 use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{BaseMount, JOINT_NAMES};
 
 use super::torch::{Learning, Setup, Torch, training};
 use super::{HIDDEN, MEMBERS};
 use crate::Measurement;
-use crate::throughput::{WINDOWS, median_of};
 use crate::error::{BenchError, Interrupted, check, failed};
+use crate::throughput::{WINDOWS, median_of};
 
 /// Rows of the log at 200 Hz: ten minutes, so that batches are full and a window of seconds ends within an epoch.
 const ROWS: usize = 120_000;

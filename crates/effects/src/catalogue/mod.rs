@@ -15,9 +15,11 @@ mod joint_elasticity;
 mod joint_spring;
 mod load_friction;
 mod payload;
+mod pd_gain;
 mod stribeck_friction;
 mod supply_sag;
 mod thermal_derating;
+mod torque_dead_zone;
 mod torque_delay;
 mod torque_gain;
 mod torque_ripple;
@@ -29,14 +31,16 @@ mod viscous_friction;
 use crate::Effect;
 
 /// All effects, in the order of the chain from command to motion.
-pub const CATALOGUE: [&Effect; 25] = [
+pub const CATALOGUE: [&Effect; 27] = [
     &command_delay::EFFECT,
     &encoder_offset::EFFECT,
+    &pd_gain::EFFECT,
     &torque_saturation::EFFECT,
     &supply_sag::EFFECT,
     &thermal_derating::EFFECT,
     &torque_delay::EFFECT,
     &torque_speed_limit::EFFECT,
+    &torque_dead_zone::EFFECT,
     &drive_lag::EFFECT,
     &torque_sensor_delay::EFFECT,
     &torque_gain::EFFECT,

@@ -1,6 +1,6 @@
 //! Motor torque decreases with the motor temperature.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, EffectSite, Target};
+use crate::{Composition, Confounder, DataRequirement, Effect, EffectSite, Parameter, Target};
 
 pub const EFFECT: Effect = Effect {
     name: "thermal_derating",

@@ -99,10 +99,7 @@ fn joints_in_the_metadata_need_columns() {
 
 #[test]
 fn log_without_rows_is_rejected() {
-    check_csv(
-        "t,kp,kd,q_a,q_cmd_a\n",
-        &expect!["`log/data.csv` has no rows; a log needs at least one"],
-    );
+    check_csv("t,kp,kd,q_a,q_cmd_a\n", &expect!["`log/data.csv` has no rows; a log needs at least one"]);
 }
 
 #[test]
@@ -214,10 +211,7 @@ fn quaternion_must_have_unit_norm() {
 
 #[test]
 fn columns_of_unequal_length_are_rejected() {
-    check_columns(
-        [("dq_a", vec![0.0])],
-        &expect!["`columns in memory`, column `dq_a` has 1 rows, but `t` has 2"],
-    );
+    check_columns([("dq_a", vec![0.0])], &expect!["`columns in memory`, column `dq_a` has 1 rows, but `t` has 2"]);
 }
 
 #[test]

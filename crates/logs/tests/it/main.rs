@@ -14,8 +14,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use tempfile::TempDir;
-use twinstep_model::BaseMount;
 use twinstep_logs::{Gain, Meta, Segment, TorqueSensor};
+use twinstep_model::BaseMount;
 
 /// Recording of a real robot with its feet in the air, 16 s at 200 Hz.
 const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../data/go2_air_chirp");
@@ -49,7 +49,11 @@ fn write(folder: &Path, name: &str, content: &str) -> PathBuf {
 fn meta() -> Meta {
     let segment = |name: &str, base| Segment { name: name.to_owned(), base };
     let segments = vec![segment("stand", BaseMount::Fixed), segment("walk", BaseMount::Floating)];
-    Meta { kp: Some(Gain::Uniform(20.0)), kd: Some(Gain::Uniform(0.5)), ..Meta::new(200.0, TorqueSensor::MotorCurrent, segments) }
+    Meta {
+        kp: Some(Gain::Uniform(20.0)),
+        kd: Some(Gain::Uniform(0.5)),
+        ..Meta::new(200.0, TorqueSensor::MotorCurrent, segments)
+    }
 }
 
 /// Returns columns by name, as arguments of `Log::new`.

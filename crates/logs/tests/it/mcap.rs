@@ -1,4 +1,4 @@
-//! Logs as the robot's own messages in MCAP: written and read again, and recordings of others.
+//! Logs in MCAP: files that `Log::write` wrote, and recordings of other programs.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -6,17 +6,17 @@ use std::path::Path;
 
 use expect_test::{Expect, expect};
 use proptest::prelude::*;
-use twinstep_model::BaseMount;
 use twinstep_logs::{Gain, Log, LogError, Meta, Segment, TorqueSensor};
+use twinstep_model::BaseMount;
 
 use crate::{RECORDING, columns, meta};
 
-/// A number that both messages hold exactly.
+/// Returns a number that is exact in single precision.
 fn single() -> impl Strategy<Value = f64> {
     (-1e6..1e6f32).prop_map(f64::from)
 }
 
-/// Any log of the Go2 in the channels that MCAP has.
+/// Returns any log of the Go2 with channels that MCAP supports.
 fn log() -> impl Strategy<Value = Log> {
     let joints = prop::sample::subsequence(twinstep_model::JOINT_NAMES.to_vec(), 1..=12);
     (1..12usize, joints).prop_flat_map(|(rows, joints)| {
@@ -68,11 +68,11 @@ fn build(names: &[&str], (index, joints, [gyro, volts], force, kp): Parts) -> Lo
     Log::new(meta(), all).expect("a log")
 }
 
-/// Equal in everything; in time to what nanoseconds can say.
+/// Checks that the logs are equal, in time to 1 ns.
 fn check_equal(read: &Log, written: &Log) {
     assert_eq!(read.rows(), written.rows());
     for (read, written) in read.t().iter().zip(written.t()) {
-        // Half a nanosecond of rounding, and that of the time's own 64 bits.
+        // Rounding to nanoseconds, and of the time in double precision.
         assert!((read - written).abs() < 0.6e-9 + 1e-12 * written.abs(), "{read} {written}");
     }
     let with_time = |log: &Log| {
@@ -97,17 +97,17 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn a_log_survives_mcap_in_the_channels_it_has(log in log()) {
+    fn mcap_round_trips_in_supported_channels(log in log()) {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("walk.mcap");
         log.write(&path).expect("written");
         check_equal(&Log::open(&path).expect("read"), &log);
         let files = fs::read_dir(folder.path()).expect("a folder").count();
-        prop_assert_eq!(files, 1, "MCAP carries its description");
+        prop_assert_eq!(files, 1, "MCAP files contain their metadata");
     }
 
     #[test]
-    fn damaged_mcap_is_an_error_or_less_and_never_a_panic(at in 8..20_000usize, to in any::<u8>(), cut in any::<bool>()) {
+    fn damaged_mcap_gives_an_error_or_fewer_rows_but_no_panic(at in 8..20_000usize, to in any::<u8>(), cut in any::<bool>()) {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("walk.mcap");
         small().write(&path).expect("written");
@@ -121,7 +121,7 @@ proptest! {
     }
 }
 
-/// Four rows of one joint.
+/// Returns a log with four rows of one joint.
 fn small() -> Log {
     let rows = columns([
         ("t", vec![0.0, 0.005, 0.01, 0.015]),
@@ -133,7 +133,7 @@ fn small() -> Log {
 }
 
 #[test]
-fn what_mcap_has_no_place_for_is_named() {
+fn unsupported_columns_are_listed() {
     assert_eq!(small().unsupported_columns("walk.mcap"), ["pos_z"]);
     assert!(small().unsupported_columns("walk.csv").is_empty());
     let folder = tempfile::tempdir().expect("a folder");
@@ -144,7 +144,7 @@ fn what_mcap_has_no_place_for_is_named() {
 }
 
 #[test]
-fn the_real_recording_survives_to_single_precision() {
+fn real_recording_round_trips_in_single_precision() {
     let log = Log::open(RECORDING).expect("the recording");
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("air.mcap");
@@ -157,7 +157,7 @@ fn the_real_recording_survives_to_single_precision() {
     }
 }
 
-/// A recording as another recorder leaves it: topics, schemas and bytes by hand.
+/// Writer of a recording as of another program, with explicit topics, schemas and bytes.
 struct Recorder {
     writer: mcap::Writer<fs::File>,
 }
@@ -193,14 +193,14 @@ impl Recorder {
     }
 }
 
-/// Puts bytes at an offset of a message's body.
+/// Writes bytes at an offset of a message's body.
 fn put(message: &mut [u8], offset: usize, bytes: &[u8]) {
     message[4 + offset..4 + offset + bytes.len()].copy_from_slice(bytes);
 }
 
-// The offsets below follow from the IDL's fields, each laid at the next multiple of its size.
+// The offsets below follow from the IDL: each field is aligned to its size.
 
-/// A state with every motor at q = 1 + its index in the robot's order, feet 10, 20, 30, 40 in the robot's order.
+/// Returns a state with q = 1 + index for every motor, and feet 10, 20, 30, 40, in the robot's order.
 fn state_bytes() -> Vec<u8> {
     let mut bytes = vec![0; 4 + 1176];
     bytes[1] = 1;
@@ -208,7 +208,7 @@ fn state_bytes() -> Vec<u8> {
     put(&mut bytes, 44, &0.5f32.to_le_bytes()); // gyroscope y
     put(&mut bytes, 60, &9.81f32.to_le_bytes()); // accelerometer z
     for motor in 0..20 {
-        // Motors begin at 77 with a mode; each of the rest begins at a multiple of four.
+        // The mode of the first motor is at 77; the other motors start at multiples of four.
         let start = 76 + 48 * motor;
         put(&mut bytes, start + 4, &(1.0 + motor as f32).to_le_bytes());
         put(&mut bytes, start + 16, &(-1.0 - motor as f32).to_le_bytes()); // tau_est
@@ -221,7 +221,7 @@ fn state_bytes() -> Vec<u8> {
     bytes
 }
 
-/// A command with q = 100 + index, kp 20 and kd 0.5, or as `first` says of the first motor.
+/// Returns a command with q = 100 + index, kp 20 and kd 0.5; the values of the first motor are `first`.
 fn command_bytes(first: [f32; 5]) -> Vec<u8> {
     let mut bytes = vec![0; 4 + 808];
     bytes[1] = 1;
@@ -238,14 +238,14 @@ fn command_bytes(first: [f32; 5]) -> Vec<u8> {
 const FIRST: [f32; 5] = [100.0, 0.0, 0.0, 20.0, 0.5];
 
 #[test]
-fn recording_of_the_robot_is_read_in_our_order() {
+fn recording_of_the_robot_is_reordered_to_the_joint_order() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("robot.mcap");
     let mut recorder = Recorder::create(&path);
     for row in 0..4u64 {
         let now = 1_700_000_000_000_000_000 + row * 2_000_000;
         recorder.state("rt/lowstate", now, &state_bytes());
-        // 0.4 ms after the state that it was computed from, 1.6 ms before the next.
+        // 0.4 ms after the state that the command responds to, 1.6 ms before the next state.
         let first = [100.0 + row as f32 / 4.0, 0.0, 0.0, 20.0, 0.5];
         if row > 0 {
             recorder.command("rt/lowcmd", now + 400_000, &command_bytes(first));
@@ -264,18 +264,22 @@ fn recording_of_the_robot_is_read_in_our_order() {
     assert_eq!(["FL", "FR", "RL", "RR"].map(|leg| first("foot_force", leg)), [20.0, 10.0, 40.0, 30.0]);
     assert_eq!((first("quat", "w"), first("gyro", "y"), first("acc", "z")), (1.0, 0.5, f64::from(9.81f32)));
     assert_eq!(log.channel("battery_V").expect("volts")[0], 28.5);
-    assert_eq!(log.q_cmd("FR_hip"), Some(&[100.25, 100.5, 100.75][..]), "each state has the command that answers it");
+    assert_eq!(
+        log.q_cmd("FR_hip"),
+        Some(&[100.25, 100.5, 100.75][..]),
+        "each state has the command that responds to it"
+    );
     assert_eq!(
         (log.channel("kp").map(<[f64]>::len), log.kp("RR_calf", 0), log.kd("RR_calf", 0)),
         (Some(3), Some(20.0), Some(0.5))
     );
-    assert!(log.dq("FL_hip").is_none(), "zero throughout is no measurement");
+    assert!(log.dq("FL_hip").is_none(), "sensors that are zero throughout are absent");
     assert_eq!((log.meta().tau_sensor, log.meta().rate_hz), (TorqueSensor::MotorCurrent, 500.0));
     assert_eq!(log.ignored(), ["topic /camera/image (4 messages)"]);
     expect![[r#"
         [
-            "one state before the first command left out",
-            "foot_force is the robot's raw count, not newtons: it tells loaded from unloaded only",
+            "omitted one state before the first command",
+            "foot_force is the robot's raw count, not newtons: it only distinguishes loaded from unloaded feet",
         ]
     "#]]
     .assert_debug_eq(&log.read_warnings());
@@ -297,7 +301,7 @@ fn chunks_of_every_compression_are_read() {
 }
 
 #[test]
-fn description_beside_a_recording_says_what_the_robot_cannot() {
+fn metadata_file_of_a_recording_is_used() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("robot.mcap");
     let mut recorder = Recorder::create(&path);
@@ -305,14 +309,14 @@ fn description_beside_a_recording_says_what_the_robot_cannot() {
     recorder.command("/lowcmd", 0, &command_bytes(FIRST));
     recorder.finish();
     let segments = vec![Segment { name: "held".to_owned(), base: BaseMount::Fixed }];
-    let said = Meta { joints: vec!["RR_hip".to_owned()], ..Meta::new(500.0, TorqueSensor::MotorCurrent, segments) };
-    fs::write(folder.path().join("robot.json"), serde_json::to_string(&said).expect("JSON")).expect("a file");
+    let expected = Meta { joints: vec!["RR_hip".to_owned()], ..Meta::new(500.0, TorqueSensor::MotorCurrent, segments) };
+    fs::write(folder.path().join("robot.json"), serde_json::to_string(&expected).expect("JSON")).expect("a file");
     let log = Log::open(&path).expect("a log");
-    assert_eq!((log.meta(), log.joints()), (&said, &["RR_hip".to_owned()][..]));
+    assert_eq!((log.meta(), log.joints()), (&expected, &["RR_hip".to_owned()][..]));
 }
 
 #[test]
-fn idle_and_stopped_motors_have_no_gain() {
+fn commands_without_position_or_velocity_have_gains_of_zero() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("robot.mcap");
     let mut recorder = Recorder::create(&path);
@@ -325,7 +329,7 @@ fn idle_and_stopped_motors_have_no_gain() {
 }
 
 #[test]
-fn a_file_that_was_cut_off_gives_its_whole_chunks_and_says_so() {
+fn truncated_file_gives_its_complete_chunks_and_a_warning() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("air.mcap");
     Log::open(RECORDING).expect("the recording").write(&path).expect("written");
@@ -333,7 +337,7 @@ fn a_file_that_was_cut_off_gives_its_whole_chunks_and_says_so() {
     fs::write(&path, &whole[..whole.len() * 3 / 4]).expect("a file");
     let log = Log::open(&path).expect("a log");
     assert!(log.rows() > 1000 && log.rows() < 3200, "{}", log.rows());
-    assert!(log.read_warnings()[0].starts_with("the MCAP file is cut off: these are the"), "{:?}", log.read_warnings());
+    assert!(log.read_warnings()[0].starts_with("the MCAP file is truncated: read the"), "{:?}", log.read_warnings());
 }
 
 fn check(record: impl FnOnce(&mut Recorder), expected: &Expect) {
@@ -347,18 +351,18 @@ fn check(record: impl FnOnce(&mut Recorder), expected: &Expect) {
 }
 
 #[test]
-fn recordings_that_are_no_log_are_answered_with_what_they_lack() {
+fn errors_for_incomplete_recordings_say_what_is_missing() {
     check(
         |_| {},
         &expect![[r#"
         `log/robot.mcap` has no message on /lowstate; its topics are none
-          record both /lowstate and /lowcmd (or rt/lowstate and rt/lowcmd): a log needs what was told beside what was done"#]],
+          record both /lowstate and /lowcmd (or rt/lowstate and rt/lowcmd): a log needs measurements and commands"#]],
     );
     check(
         |recorder| recorder.state("/lowstate", 0, &state_bytes()),
         &expect![[r#"
         `log/robot.mcap` has no message on /lowcmd; its topics are `/lowstate` (1 messages)
-          record both /lowstate and /lowcmd (or rt/lowstate and rt/lowcmd): a log needs what was told beside what was done"#]],
+          record both /lowstate and /lowcmd (or rt/lowstate and rt/lowcmd): a log needs measurements and commands"#]],
     );
     check(
         |recorder| {
@@ -368,7 +372,7 @@ fn recordings_that_are_no_log_are_answered_with_what_they_lack() {
         },
         &expect![[r#"
             `log/robot.mcap` has no message on /lowcmd before the last /lowstate; its topics are `/lowstate` (1 messages), `/lowcmd` (2 messages)
-              record both /lowstate and /lowcmd (or rt/lowstate and rt/lowcmd): a log needs what was told beside what was done"#]],
+              record both /lowstate and /lowcmd (or rt/lowstate and rt/lowcmd): a log needs measurements and commands"#]],
     );
     check(
         |recorder| recorder.send("/lowstate", "unitree_hg/msg/LowState", "cdr", 0, &[0, 1, 0, 0]),
@@ -400,7 +404,7 @@ fn recordings_that_are_no_log_are_answered_with_what_they_lack() {
 }
 
 #[test]
-fn numbers_that_are_none_are_named_with_their_row() {
+fn error_for_nan_contains_its_row() {
     check(
         |recorder| {
             recorder.state("/lowstate", 0, &state_bytes());
@@ -411,12 +415,12 @@ fn numbers_that_are_none_are_named_with_their_row() {
         },
         &expect![[r#"
             `log/robot.mcap`, column `q_FR_hip`, row 2 is empty or NaN, but it must be a finite number
-              leave the row out, or fill the cell with what was in force"#]],
+              remove the row, or fill the cell with the value that was in force"#]],
     );
 }
 
 #[test]
-fn what_does_not_fit_into_the_messages_is_refused() {
+fn values_out_of_range_of_the_messages_are_rejected() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("walk.mcap");
     let error = |rows| {
@@ -427,18 +431,18 @@ fn what_does_not_fit_into_the_messages_is_refused() {
     let hot =
         columns([("t", vec![0.0]), ("q_FL_hip", vec![0.0]), ("q_cmd_FL_hip", vec![0.0]), ("temp_FL_hip", vec![300.0])]);
     expect![[r#"
-        `log/walk.mcap`, column `temp_FL_hip`, row 1: 300 does not fit into the robot's message, which holds 0 to 254 °C
+        `log/walk.mcap`, column `temp_FL_hip`, row 1: 300 is out of the range of the robot's message, 0 to 254 °C
           write Parquet or CSV instead"#]]
     .assert_eq(&error(hot));
     expect![[r#"
-        `log/walk.mcap`: joint `a` is none of the Go2's, so its messages have no place for it
+        `log/walk.mcap`: the messages of the Go2 have no joint `a`
           write Parquet or CSV instead"#]]
     .assert_eq(&error(columns([("t", vec![0.0]), ("q_a", vec![0.0]), ("q_cmd_a", vec![0.0])])));
     assert!(!path.exists());
 }
 
 #[test]
-fn a_file_that_is_no_mcap_is_an_error() {
+fn invalid_mcap_file_is_rejected() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("walk.mcap");
     fs::write(&path, "t,q_FL_hip\n").expect("a file");

@@ -2,8 +2,8 @@
 
 use std::fs;
 
-use twinstep_model::{BaseMount, Joint};
 use twinstep_logs::{Gain, Log, Meta};
+use twinstep_model::{BaseMount, Joint};
 
 use crate::{CSV, META, RECORDING, columns, folder, meta, write};
 

@@ -1,4 +1,4 @@
-//! What is written is read again, to the last bit.
+//! Logs are read back exactly as they were written.
 
 use std::fs;
 
@@ -8,13 +8,13 @@ use twinstep_logs::{Gain, Log, LogError, Meta};
 
 use crate::{CSV, META, RECORDING, columns, folder, meta};
 
-/// Every finite number, also the extreme ones.
+/// Returns any finite number, including extreme ones.
 fn number() -> impl Strategy<Value = f64> {
     use proptest::num::f64::{NEGATIVE, NORMAL, POSITIVE, SUBNORMAL, ZERO};
     POSITIVE | NEGATIVE | NORMAL | SUBNORMAL | ZERO
 }
 
-/// Any log with up to three joints, with optional channels that have missing cells.
+/// Returns any log with up to three joints, and optional channels with missing cells.
 fn log() -> impl Strategy<Value = Log> {
     (1..20usize, 1..4usize).prop_flat_map(|(rows, joints)| {
         let cells = move || prop::collection::vec(number(), rows);
@@ -56,7 +56,7 @@ fn build((index, joints, [gyro, volts], kp, (rate_hz, kd)): Parts) -> Log {
 }
 
 fn bits(log: &Log) -> Vec<(&str, Vec<u64>)> {
-    // All missing cells count as one; -0 and 0 count as two.
+    // All NaN are equal; -0 and 0 differ.
     let bits = |cell: &f64| if cell.is_nan() { f64::NAN.to_bits() } else { cell.to_bits() };
     log.channels().map(|(name, cells)| (name, cells.iter().map(bits).collect())).collect()
 }
@@ -74,23 +74,23 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn a_log_survives_csv(log in log()) {
+    fn csv_round_trips(log in log()) {
         check(&log, "data.csv");
     }
 
     #[test]
-    fn a_log_survives_compressed_csv(log in log()) {
+    fn compressed_csv_round_trips(log in log()) {
         check(&log, "walk.csv.gz");
     }
 
     #[test]
-    fn a_log_survives_parquet(log in log()) {
+    fn parquet_round_trips(log in log()) {
         check(&log, "data.parquet");
     }
 }
 
 #[test]
-fn the_real_recording_survives_every_format() {
+fn real_recording_round_trips_in_every_format() {
     let log = Log::open(RECORDING).expect("the recording");
     for name in ["data.csv", "walk.csv.gz", "walk.parquet", "a_new_folder"] {
         check(&log, name);
@@ -98,7 +98,7 @@ fn the_real_recording_survives_every_format() {
 }
 
 #[test]
-fn a_motion_survives() {
+fn motion_file_round_trips() {
     let motion = Log::new_commands(meta(), columns([("t", vec![0.0, 0.1]), ("q_cmd_a", vec![1.0, 2.0])])).expect("one");
     let folder = tempfile::tempdir().expect("a folder");
     motion.write(folder.path()).expect("written");
@@ -106,7 +106,7 @@ fn a_motion_survives() {
 }
 
 #[test]
-fn a_written_folder_holds_two_files_and_nothing_unfinished() {
+fn written_folder_contains_two_files_and_no_temporary_ones() {
     let parent = tempfile::tempdir().expect("a folder");
     let target = parent.path().join("new/log");
     Log::open(folder(CSV, META).path()).expect("a log").write(&target).expect("written");
@@ -117,10 +117,10 @@ fn a_written_folder_holds_two_files_and_nothing_unfinished() {
 }
 
 #[test]
-fn a_write_that_fails_leaves_what_was_there() {
+fn failed_write_leaves_no_temporary_files() {
     let folder = folder(CSV, META);
     let log = Log::open(folder.path()).expect("a log");
-    // A folder is in the way of the description, so that the last step fails.
+    // A folder has the name of the data file, so renaming fails.
     fs::create_dir_all(folder.path().join("walk.csv/in_the_way")).expect("a folder");
     assert!(matches!(log.write(folder.path().join("walk.csv")), Err(LogError::Write { .. })));
     let hidden = |name: &str| name.starts_with('.');
@@ -130,7 +130,7 @@ fn a_write_that_fails_leaves_what_was_there() {
 }
 
 #[test]
-fn a_folder_never_gets_a_second_data_file() {
+fn second_data_file_in_a_folder_is_rejected() {
     let folder = folder(CSV, META);
     let log = Log::open(folder.path()).expect("a log");
     assert!(matches!(log.write(folder.path()), Err(LogError::SeveralDataFiles { .. })));

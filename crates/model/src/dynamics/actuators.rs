@@ -4,11 +4,9 @@
 //! once per physics step. Both engines use this code. An effect that no robot in the batch has costs one branch per
 //! step.
 
+use crate::{ActuatorParams, Command, JointModel, PerJoint, RobotModel};
 use twinstep_simd::{SimdFloat, exponential};
-use crate::{Command, ActuatorParams, JointModel, PerJoint, RobotModel};
 
-/// Length of the command and torque history [actuator periods]: the longest delay at 200 Hz, and two for interpolation.
-const HISTORY_LEN: usize = 10;
 /// Stiffness of a gear with backlash for which the model gives no stiffness [N·m/rad].
 const DEFAULT_GEAR_STIFFNESS: f64 = 2000.0;
 
@@ -64,9 +62,11 @@ impl<T: SimdFloat> SimdCommands<T> {
 #[allow(clippy::struct_excessive_bools, reason = "the flags are independent")]
 struct ActiveEffects {
     command_delay: bool,
+    pd_gain: bool,
     saturation: bool,
     torque_delay: bool,
     back_emf: bool,
+    dead_zone: bool,
     ripple: bool,
     elastic: bool,
     speed_friction: bool,
@@ -103,12 +103,16 @@ coefficients! { |joint, dt, actuator_dt|
     encoder_offset = joint.actuator.encoder_offset;
     /// Command delay [actuator periods].
     command_delay = joint.actuator.command_delay / actuator_dt;
+    kp_scale = joint.actuator.kp_scale;
+    kd_scale = joint.actuator.kd_scale;
     /// 1 / κ [1/(N·m)]; 0 for no saturation.
     saturation = 1.0 / joint.actuator.saturation;
     /// Torque delay [actuator periods].
     torque_delay = joint.actuator.torque_delay / actuator_dt;
     /// 1 / no-load speed [s/rad]; 0 for no limit.
     back_emf = 1.0 / joint.actuator.no_load_speed;
+    /// Half width of the torque dead zone [N·m].
+    dead_zone = joint.actuator.dead_zone;
     /// Fraction of its distance to the input that the lagged torque covers in a physics step.
     lag = if joint.actuator.torque_time_constant > 0.0 { 1.0 - (-dt / joint.actuator.torque_time_constant).exp() } else { 1.0 };
     /// Mean over a physics step of the remaining distance, divided by the distance at the start of the step.
@@ -132,6 +136,12 @@ coefficients! { |joint, dt, actuator_dt|
     spring_offset = joint.spring.torque_offset;
 }
 
+/// Returns the length of the command and torque history [actuator periods]: the longest delay, and two for interpolation.
+fn history_len(actuator_dt: f64) -> usize {
+    // 0.04 s are eight periods of 5 ms, whatever the rounding of the quotient.
+    (ActuatorParams::MAX_DELAY / actuator_dt - 1e-6).ceil() as usize + 2
+}
+
 /// Returns the stiffness of the gear [N·m/rad]; 0 if rotor and link move together.
 fn gear_stiffness(actuator: &ActuatorParams) -> f64 {
     if actuator.gear_stiffness.is_finite() {
@@ -147,9 +157,9 @@ fn gear_stiffness(actuator: &ActuatorParams) -> f64 {
 #[derive(Clone, Debug)]
 struct ActuatorState<T> {
     /// Position [rad], velocity [rad/s] and feed-forward torque [N·m] of the last commands, newest first.
-    commands: [[[T; 12]; 3]; HISTORY_LEN],
+    commands: Vec<[[T; 12]; 3]>,
     /// Torque of the PD loop in the last actuator periods, newest first [N·m].
-    torque_history: [[T; 12]; HISTORY_LEN],
+    torque_history: Vec<[T; 12]>,
     /// Torque after the first-order lag, proportional to the motor current [N·m].
     current: [T; 12],
     /// Position [rad] and velocity [rad/s] of the rotor of an elastic gear.
@@ -187,9 +197,22 @@ impl<T: SimdFloat> SimdActuators<T> {
     pub fn new(robot: &RobotModel, dt: f64) -> Self {
         let (zero, actuator_dt) = ([T::splat(0.0); 12], robot.control.actuator_dt());
         let coefficients = robot.joints.map(|joint| Coefficients::splat(&joint, dt, actuator_dt));
-        let state =
-            ActuatorState { commands: [[zero; 3]; HISTORY_LEN], torque_history: [zero; HISTORY_LEN], current: zero, rotor: [zero; 2] };
-        Self { coefficients, state, estimated_torque: zero, active: ActiveEffects::default(), step_fraction: T::splat(dt / actuator_dt), dt, actuator_dt }
+        let length = history_len(actuator_dt);
+        let state = ActuatorState {
+            commands: vec![[zero; 3]; length],
+            torque_history: vec![zero; length],
+            current: zero,
+            rotor: [zero; 2],
+        };
+        Self {
+            coefficients,
+            state,
+            estimated_torque: zero,
+            active: ActiveEffects::default(),
+            step_fraction: T::splat(dt / actuator_dt),
+            dt,
+            actuator_dt,
+        }
     }
 
     /// Resets the actuators of one lane to those of `robot`, with joints at `q` [rad] and `dq` [rad/s] and zero torque.
@@ -240,12 +263,14 @@ impl<T: SimdFloat> SimdActuators<T> {
     }
 
     fn update_active_effects(&mut self) {
-        let (zero, mut active) = (T::splat(0.0), ActiveEffects::default());
+        let (zero, one, mut active) = (T::splat(0.0), T::splat(1.0), ActiveEffects::default());
         for n in &self.coefficients {
             active.command_delay |= zero.any_lt(n.command_delay);
+            active.pd_gain |= [n.kp_scale, n.kd_scale].iter().any(|scale| scale.any_lt(one) || one.any_lt(*scale));
             active.saturation |= zero.any_lt(n.saturation);
             active.torque_delay |= zero.any_lt(n.torque_delay);
             active.back_emf |= zero.any_lt(n.back_emf);
+            active.dead_zone |= zero.any_lt(n.dead_zone);
             active.ripple |= zero.any_lt(n.ripple_amplitude);
             active.elastic |= zero.any_lt(n.gear);
             active.speed_friction |= zero.any_lt(n.breakaway) || zero.any_lt(n.load);
@@ -277,7 +302,10 @@ impl<T: SimdFloat> SimdActuators<T> {
         let mut torque = [T::splat(0.0); 12];
         for joint in 0..12 {
             let n = &self.coefficients[joint];
-            let (kp, kd) = (commands.kp[joint], commands.kd[joint]);
+            let (mut kp, mut kd) = (commands.kp[joint], commands.kd[joint]);
+            if self.active.pd_gain {
+                (kp, kd) = (kp * n.kp_scale, kd * n.kd_scale);
+            }
             let (measured_q, measured_dq) = self.encoder_reading(joint, q[joint], dq[joint]);
             let mut tau = now[2][joint] + (kp * (now[0][joint] - measured_q) + kd * (now[1][joint] - measured_dq));
             if self.active.saturation {
@@ -294,7 +322,8 @@ impl<T: SimdFloat> SimdActuators<T> {
     #[inline(always)]
     pub fn set_torque(&mut self, torque: [T; 12]) {
         if self.active.torque_delay {
-            self.state.torque_history.copy_within(0..HISTORY_LEN - 1, 1);
+            let last = self.state.torque_history.len() - 1;
+            self.state.torque_history.copy_within(0..last, 1);
         }
         self.state.torque_history[0] = torque;
     }
@@ -303,7 +332,8 @@ impl<T: SimdFloat> SimdActuators<T> {
     #[inline(always)]
     fn delayed(&mut self, commands: &SimdCommands<T>) -> [[T; 12]; 3] {
         let (zero, one) = (T::splat(0.0), T::splat(1.0));
-        self.state.commands.copy_within(0..HISTORY_LEN - 1, 1);
+        let last = self.state.commands.len() - 1;
+        self.state.commands.copy_within(0..last, 1);
         self.state.commands[0] = [commands.q, commands.dq, commands.tau_ff];
         let mut arrived = [[zero; 12]; 3];
         for (age, command) in self.state.commands.iter().enumerate() {
@@ -339,6 +369,11 @@ impl<T: SimdFloat> SimdActuators<T> {
                 let forth = limit * (one - share).max(zero).min(one);
                 let back = limit * (one + share).max(zero).min(one);
                 tau = forth.min(tau.max(-back));
+            }
+            if active.dead_zone {
+                let size = (tau.abs() - n.dead_zone).max(zero);
+                // Robots without a dead zone keep the bits of their torque.
+                tau = zero.select_lt(n.dead_zone, tau.select_lt(zero, -size, size), tau);
             }
             let (current, input) = (&mut self.state.current[joint], tau);
             self.estimated_torque[joint] = input + n.lag_mean * (*current - input);
@@ -382,7 +417,11 @@ impl<T: SimdFloat> SimdActuators<T> {
                 delayed[joint] += shared / self.step_fraction * torque[joint];
             }
             // Without delay the exact value, so that the result does not depend on the other lanes.
-            delayed[joint] = zero.select_lt(self.coefficients[joint].torque_delay, delayed[joint], self.state.torque_history[0][joint]);
+            delayed[joint] = zero.select_lt(
+                self.coefficients[joint].torque_delay,
+                delayed[joint],
+                self.state.torque_history[0][joint],
+            );
         }
         delayed
     }

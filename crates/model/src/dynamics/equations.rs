@@ -4,9 +4,9 @@
 //! "Rigid Body Dynamics Algorithms", 2008, chapters 5 and 6).
 
 use super::factored::{FactoredDynamics, JointLoad};
-use twinstep_simd::SimdFloat;
 use super::spatial::{Inertia, Vec3};
-use super::tree::{LegFrames, State, KinematicTree};
+use super::tree::{KinematicTree, LegFrames, State};
+use twinstep_simd::SimdFloat;
 
 /// Accelerations of base and joints.
 #[derive(Clone, Copy, Debug)]
@@ -57,7 +57,12 @@ pub fn inverse_dynamics<T: SimdFloat>(
 
 /// Computes forward dynamics: accelerations for joint torques `tau` [N·m] without contact.
 #[inline(always)]
-pub fn forward_dynamics<T: SimdFloat>(tree: &KinematicTree<T>, state: &State<T>, tau: &[T; 12], gravity: T) -> Acceleration<T> {
+pub fn forward_dynamics<T: SimdFloat>(
+    tree: &KinematicTree<T>,
+    state: &State<T>,
+    tau: &[T; 12],
+    gravity: T,
+) -> Acceleration<T> {
     let (one, zero) = (T::splat(1.0), T::splat(0.0));
     let load = JointLoad { tau: *tau, damping: [zero; 12] };
     let mut factored = FactoredDynamics::empty();

@@ -7,9 +7,9 @@
 //! `J Δ = y·u + z·g`. Two rows are coupled through y·y' and, on the same leg, z·z'.
 
 use super::equations::{LegForces, LegInertia, spatial_matrix};
-use twinstep_simd::SimdFloat;
 use super::spatial::{Cholesky, Inertia, Vec3};
-use super::tree::{LegFrames, State, KinematicTree};
+use super::tree::{KinematicTree, LegFrames, State};
+use twinstep_simd::SimdFloat;
 
 /// Torque and viscous friction at the joints.
 #[derive(Clone, Copy, Debug)]
@@ -55,7 +55,15 @@ impl<T: SimdFloat> FactoredDynamics<T> {
     ///
     /// `is_floating` is 1 for a floating base and 0 for a fixed base.
     #[inline(always)]
-    pub fn set_up(&mut self, tree: &KinematicTree<T>, state: &State<T>, load: &JointLoad<T>, dt: T, gravity: T, is_floating: T) {
+    pub fn set_up(
+        &mut self,
+        tree: &KinematicTree<T>,
+        state: &State<T>,
+        load: &JointLoad<T>,
+        dt: T,
+        gravity: T,
+        is_floating: T,
+    ) {
         let proper_acceleration = state.world_axes()[2].scaled(gravity);
         let (mut force, mut moment) = tree.trunk.wrench(state.angular_velocity, Vec3::zero(), proper_acceleration);
         let mut whole = tree.trunk;

@@ -4,8 +4,8 @@ use std::ops::{Add, Neg, Sub};
 
 use glam::{DMat3, DVec3};
 
-use twinstep_simd::SimdFloat;
 use crate::RigidBody;
+use twinstep_simd::SimdFloat;
 
 /// Vector in three dimensions.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -1,8 +1,8 @@
 //! Kinematic tree of the Go2: inertial parameters, geometry, state and poses of its bodies.
 
-use twinstep_simd::SimdFloat;
 use super::spatial::{Inertia, Vec3};
 use crate::{LegModel, RobotModel};
+use twinstep_simd::SimdFloat;
 
 /// Inertial parameters and geometry of a batch of robots, one per lane.
 ///

@@ -2,8 +2,8 @@
 
 use std::f64::consts::TAU;
 
-use twinstep_model::{JointKind, BaseMount};
 use twinstep_effects::Effect;
+use twinstep_model::{BaseMount, JointKind};
 
 use super::quantity::PlotQuantity;
 
@@ -91,8 +91,11 @@ const SLOW_SQUATS: DemoMotion =
     DemoMotion { what: "standing, squats at 0.4 Hz", target: |t| squat(0.2 * (TAU * 0.4 * t).sin()), ..STANDING };
 const BATTERY: DemoMotion =
     DemoMotion { what: "standing, squats at 0.4 Hz while the battery empties", voltage: [33.6, 26.0], ..SLOW_SQUATS };
-const HEAT: DemoMotion =
-    DemoMotion { what: "standing, squats at 0.4 Hz while the motors heat up", temperature: [25.0, 85.0], ..SLOW_SQUATS };
+const HEAT: DemoMotion = DemoMotion {
+    what: "standing, squats at 0.4 Hz while the motors heat up",
+    temperature: [25.0, 85.0],
+    ..SLOW_SQUATS
+};
 const SWAY: DemoMotion = DemoMotion {
     what: "standing, the hips sway at 2 Hz",
     target: |t| [0.25 * (TAU * 2.0 * t).sin(), 0.0, 0.0],
@@ -114,8 +117,9 @@ fn squat(bend: f64) -> [f64; 3] {
 /// The motion and the quantities for an effect of the catalogue.
 pub fn of(effect: &Effect) -> EffectDemo {
     use PlotQuantity::{
-        Acceleration, Force, FrontShare, EstimatedTorque, Gyro, Height, VerticalAcceleration, Pitch, Position, LateralAcceleration, Sideways, DeratingFactor,
-        Temperature, Time, RollRate, InverseDynamicsResidual, Velocity, Voltage, CommandedTorque,
+        Acceleration, CommandedTorque, DeratingFactor, EstimatedTorque, Force, FrontShare, Gyro, Height,
+        InverseDynamicsResidual, LateralAcceleration, Pitch, Position, RollRate, Sideways, Temperature, Time, Velocity,
+        VerticalAcceleration, Voltage,
     };
     let (motion, over_time, law) = match effect.name {
         "encoder_offset" => (&SLOW_SQUATS, Height, [Position, Height]),

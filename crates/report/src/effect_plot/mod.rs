@@ -8,11 +8,14 @@ use std::path::Path;
 use plotters::prelude::RGBColor;
 use plotters::style::text_anchor::HPos;
 use twinstep_effects::{Effect, EffectEntry, Scope, Target, apply_effects};
-use twinstep_model::{Command, Ground, FIXED_BASE_HEIGHT, RolloutRequest, Joint, Leg, InitialState, Precision, RobotModel, Rollout, go2, BaseMount};
+use twinstep_model::{
+    BaseMount, Command, FIXED_BASE_HEIGHT, Ground, InitialState, Joint, Leg, Precision, RobotModel, Rollout,
+    RolloutRequest, go2,
+};
 use twinstep_sim::{BatchRollout, SimConfig};
 
 use crate::chart::{self, GREY, INK, Panel, PlotError};
-use experiment::{EffectDemo, DemoMotion};
+use experiment::{DemoMotion, EffectDemo};
 use quantity::{PlotQuantity, SimulatedRun};
 
 /// Width and height of the picture [px].
@@ -45,7 +48,8 @@ fn variants(effect: &'static Effect) -> Result<Vec<(String, RobotModel)>, PlotEr
         Target::Bodies | Target::Base => Scope::Base,
         Target::Ground => Scope::Ground,
     };
-    let robot = |values| apply_effects(&go2(), &[EffectEntry::new(effect, scope, values).map_err(simulate)?]).map_err(simulate);
+    let robot =
+        |values| apply_effects(&go2(), &[EffectEntry::new(effect, scope, values).map_err(simulate)?]).map_err(simulate);
     if effect.name == "inertia" {
         // Ten coordinates without a plausible range of their own: a lighter and a heavier trunk of the same shape.
         let scaled = |factor: f64| {
@@ -87,7 +91,7 @@ fn play<'a>(motion: &DemoMotion, robots: impl Iterator<Item = &'a RobotModel>) -
         };
         let states = simulator
             .run(
-                &[RolloutRequest { robot, held: motion.base == BaseMount::Fixed, start, history: &[], commands: &commands }],
+                &[RolloutRequest { robot, base: motion.base, start, history: &[], commands: &commands }],
                 Precision::Double,
             )
             .remove(0);
@@ -108,13 +112,19 @@ fn commands(motion: &DemoMotion, robot: &RobotModel) -> (Vec<Command>, Vec<[f64;
         let offset = (motion.target)(t);
         let q = std::array::from_fn(|joint| (pose[joint] + offset[Joint::ALL[joint].kind as usize]) as f32);
         let strength = |joint| robot.derating.derating_factor(joint, volts / FULL_V, celsius) as f32;
-        let command = Command { derating_factor: std::array::from_fn(strength), ..Command::hold(q, motion.kp, motion.kd) };
+        let command =
+            Command { derating_factor: std::array::from_fn(strength), ..Command::hold(q, motion.kp, motion.kd) };
         (command, [volts, celsius])
     };
     (0..((motion.settle + motion.duration) / dt).round() as usize).map(period).unzip()
 }
 
-fn draw(effect: &Effect, experiment: &EffectDemo, names: &[String], runs: &[SimulatedRun]) -> Result<String, PlotError> {
+fn draw(
+    effect: &Effect,
+    experiment: &EffectDemo,
+    names: &[String],
+    runs: &[SimulatedRun],
+) -> Result<String, PlotError> {
     chart::picture(SIZE, |root| {
         let (header, panels) = root.split_vertically(HEADER_HEIGHT);
         chart::text(&header, &format!("{}: {}", effect.name, effect.summary), 52, HPos::Center, (SIZE.0 as i32, 56))?;
@@ -127,8 +137,9 @@ fn draw(effect: &Effect, experiment: &EffectDemo, names: &[String], runs: &[Simu
         let (upper, lower) = panels.split_vertically(UPPER_HEIGHT);
         let (left, right) = lower.split_horizontally(SIZE.0);
         let EffectDemo { motion, over_time, law: [x, y] } = *experiment;
-        let mut shown =
-            panel(motion.what.to_owned(), PlotQuantity::Time, over_time, runs, &|run, period| over_time.of(run, period));
+        let mut shown = panel(motion.what.to_owned(), PlotQuantity::Time, over_time, runs, &|run, period| {
+            over_time.of(run, period)
+        });
         if over_time == PlotQuantity::Position {
             let command =
                 lines(&runs[..1], PlotQuantity::Time, &|run, period| f64::from(run.commands[period].q[run.joint]));
@@ -144,7 +155,13 @@ fn draw(effect: &Effect, experiment: &EffectDemo, names: &[String], runs: &[Simu
     })
 }
 
-fn panel(caption: String, x: PlotQuantity, y: PlotQuantity, runs: &[SimulatedRun], of: &dyn Fn(&SimulatedRun, usize) -> f64) -> Panel {
+fn panel(
+    caption: String,
+    x: PlotQuantity,
+    y: PlotQuantity,
+    runs: &[SimulatedRun],
+    of: &dyn Fn(&SimulatedRun, usize) -> f64,
+) -> Panel {
     let lines = lines(runs, x, of);
     let (x_range, y_range) = (extent(&lines, |(x, _)| x), extent(&lines, |(_, y)| y));
     Panel { caption, x_label: x.label(), y_label: y.label(), x: x_range, y: y_range, lines }

@@ -1,6 +1,11 @@
 //! What a picture of an effect shows of a simulated motion.
 
-use twinstep_model::{dynamics::{Acceleration, State, KinematicTree, Vec3, inverse_dynamics}, Command, NUM_JOINTS, RobotModel, RobotStates, go2};
+use twinstep_identify::experiment::estimated_torque;
+use twinstep_model::{
+    Command, NUM_JOINTS, RobotModel, RobotStates,
+    dynamics::{Acceleration, KinematicTree, State, Vec3, inverse_dynamics},
+    go2,
+};
 
 /// [m/s²]
 const GRAVITY: f64 = 9.81;
@@ -101,7 +106,7 @@ impl PlotQuantity {
             Self::Velocity => f64::from(states.dq[period][joint]),
             Self::Acceleration => change(&|row| states.dq[row][joint]),
             Self::CommandedTorque => run.wanted(period),
-            Self::EstimatedTorque => run.shown_torque(period),
+            Self::EstimatedTorque => run.measured_torque(period),
             Self::InverseDynamicsResidual => f64::from(states.tau[period + 1][joint]) - run.needed(period),
             Self::Height => f64::from(states.base_position[period][2]),
             Self::Sideways => f64::from(states.base_position[period][1]),
@@ -130,13 +135,9 @@ impl SimulatedRun {
         f64::from(command.kp[joint] * (command.q[joint] - q) - command.kd[joint] * dq)
     }
 
-    /// What the sensor of the motor's current shows at the end of a period, late as it is [N·m].
-    fn shown_torque(&self, period: usize) -> f64 {
-        let late = self.robot.joints[self.joint].actuator.sensor_delay / self.robot.control.actuator_dt();
-        let at = (period as f64 + 1.0 - late).max(0.0);
-        let of = |entry: usize| f64::from(self.states.tau[entry][self.joint]);
-        let whole = at as usize;
-        of(whole) + at.fract() * (of((whole + 1).min(self.states.tau.len() - 1)) - of(whole))
+    /// Returns the measured torque of a period, with the delay of the torque sensor [N·m].
+    fn measured_torque(&self, period: usize) -> f64 {
+        estimated_torque(&self.states, &self.robot, self.joint, period, period + 1)
     }
 
     /// What the ideal robot, held in the air, needs for the measured motion [N·m], by inverse dynamics.

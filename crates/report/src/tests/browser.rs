@@ -3,13 +3,13 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use twinstep_model::BaseMount;
 use twinstep_effects::ModelFile;
+use twinstep_model::BaseMount;
 
-use super::samples::{chirp, evidence, findings, recording, simulated, three_joints};
 use super::nothing;
-use crate::page::page;
+use super::samples::{chirp, evidence, findings, recording, simulated, three_joints};
 use crate::html::escape;
+use crate::page::page;
 
 /// Widths of a screen [px].
 const WIDTHS: [u32; 3] = [360, 760, 1200];

@@ -5,10 +5,10 @@
 mod browser;
 mod samples;
 
-use twinstep_model::BaseMount;
-use twinstep_logs::Log;
-use twinstep_effects::ModelFile;
 use twinstep_diagnose::{Diagnosis, RmsErrors, Unexplained};
+use twinstep_effects::ModelFile;
+use twinstep_logs::Log;
+use twinstep_model::BaseMount;
 
 use crate::page::page;
 use samples::{chirp, evidence, findings, loaded, recording, simulated, three_joints};
@@ -169,7 +169,8 @@ fn text_from_files_is_never_markup() {
 #[test]
 fn place_that_cannot_be_written_is_named() {
     let evidence = evidence(&chirp(&ModelFile::default(), BaseMount::Fixed), &ModelFile::default());
-    let error =
-        crate::write_report(&nothing(), &evidence, std::path::Path::new("/no/such/report.html")).unwrap_err().to_string();
+    let error = crate::write_report(&nothing(), &evidence, std::path::Path::new("/no/such/report.html"))
+        .unwrap_err()
+        .to_string();
     assert!(error.starts_with("cannot write the report `/no/such/report.html`: "), "{error}");
 }

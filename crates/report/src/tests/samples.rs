@@ -2,14 +2,17 @@
 
 use std::path::Path;
 
-use twinstep_model::{BaseMount, JOINT_NAMES, go2};
-use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_diagnose::{
+    AlternativeCause, Cause, CorrelatedPair, Diagnosis, DiscriminatedPair, Estimate, NextExperiment, ParameterValue,
+    RmsErrors, Unexplained,
+};
 use twinstep_effects::ModelFile;
+use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{BaseMount, JOINT_NAMES, go2};
 use twinstep_sim::{BatchBackend, BatchRollout, SimConfig};
-use twinstep_diagnose::{Cause, CorrelatedPair, Diagnosis, RmsErrors, Estimate, NextExperiment, DiscriminatedPair, AlternativeCause, Unexplained, ParameterValue};
 
+use crate::report_data::{LogFacts, Provenance, ReportData};
 use twinstep_identify::record;
-use crate::report_data::{ReportData, LogFacts, Provenance};
 
 const RECORDING: &str = "data/go2_air_chirp";
 
@@ -126,7 +129,7 @@ pub fn chirp(robot: &ModelFile, base: BaseMount) -> Log {
     let commands = JOINT_NAMES.iter().enumerate().map(|(joint, name)| (format!("q_cmd_{name}"), command(joint)));
     let motion = Log::new_commands(meta, [("t".to_owned(), t.clone())].into_iter().chain(commands)).unwrap();
     let robot = robot.robot_model().unwrap();
-    let backend = |base| {
+    let backend = |base, robot: &twinstep_model::RobotModel| {
         let config = SimConfig { threads: 1, base, ..SimConfig::default() };
         Ok(BatchBackend::new(robot.clone(), config, 1).expect("a backend"))
     };

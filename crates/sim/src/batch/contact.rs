@@ -8,8 +8,8 @@
 use twinstep_model::dynamics::{FactoredDynamics, State, Vec3};
 use twinstep_simd::SimdFloat;
 
-use super::ground::{TangentPlane, SimdTerrain};
-use super::rows::{JointRow, PointRow, ConstraintRow, SoftConstraint};
+use super::ground::{SimdTerrain, TangentPlane};
+use super::rows::{ConstraintRow, JointRow, PointRow, SoftConstraint};
 
 /// Number of contact points of a leg: the foot, the distal end of the calf, the knee.
 pub const LEG_POINTS: usize = 3;
@@ -175,7 +175,8 @@ impl<T: SimdFloat> Constraints<T> {
             }
             let softness = SoftConstraint { time_constant: surface.time_constant, distance, dt };
             let place = centre - directions[0].scaled(radius);
-            let row = PointRow { factored, state, velocity: local_ground.velocity, leg, place, moving: surface.is_floating };
+            let row =
+                PointRow { factored, state, velocity: local_ground.velocity, leg, place, moving: surface.is_floating };
             let block = self.points.next();
             (block.leg, block.point) = (leg, point);
             block.rows[0] = row.normal(directions[0], &softness);
@@ -213,7 +214,13 @@ impl<T: SimdFloat> Constraints<T> {
     }
 
     #[inline(always)]
-    fn find_friction(&mut self, factored: &FactoredDynamics<T>, state: &State<T>, surface: &ContactParams<T>, joint: usize) {
+    fn find_friction(
+        &mut self,
+        factored: &FactoredDynamics<T>,
+        state: &State<T>,
+        surface: &ContactParams<T>,
+        joint: usize,
+    ) {
         let row = JointRow { factored, joint, sign: T::splat(1.0), moving: surface.is_floating };
         *self.frictions.next() = JointBlock { row: row.friction(state.dq[joint]), leg: joint / 3, index: joint };
     }
@@ -255,7 +262,8 @@ impl<T: SimdFloat> Constraints<T> {
             for block in self.frictions.all() {
                 let (row, impulse) = (&block.row, &mut impulses.frictions[block.index]);
                 let max_impulse = dry[block.index] * dt;
-                let new = (*impulse - row.impulse_error(factored, block.leg, *impulse)).max(-max_impulse).min(max_impulse);
+                let new =
+                    (*impulse - row.impulse_error(factored, block.leg, *impulse)).max(-max_impulse).min(max_impulse);
                 row.apply_impulse(factored, block.leg, new - *impulse);
                 *impulse = new;
             }
@@ -268,7 +276,12 @@ impl<T: SimdFloat> Constraints<T> {
 /// `couplings` gives the effect of the normal impulse on the tangents. The velocities are therefore read and updated
 /// once per point, whose latency limits the sweep.
 #[inline(always)]
-fn solve_point<T: SimdFloat>(factored: &mut FactoredDynamics<T>, block: &PointBlock<T>, impulse: &mut [T; 3], friction: T) {
+fn solve_point<T: SimdFloat>(
+    factored: &mut FactoredDynamics<T>,
+    block: &PointBlock<T>,
+    impulse: &mut [T; 3],
+    friction: T,
+) {
     let [normal, first, second] = &block.rows;
     let (zero, leg) = (T::splat(0.0), block.leg);
     let errors = [

@@ -3,8 +3,11 @@
 use std::sync::Arc;
 
 use glam::DVec3;
+use twinstep_model::{
+    Ground, HeightField,
+    dynamics::{State, Vec3},
+};
 use twinstep_simd::SimdFloat;
-use twinstep_model::{dynamics::{State, Vec3}, Ground, HeightField};
 
 /// Ground under robots in SIMD lanes.
 #[derive(Clone, Debug)]

@@ -4,7 +4,7 @@
 //! and differ only in parameter values. One SIMD register therefore holds eight or sixteen robots.
 //!
 //! - [`contact`], [`rows`] and [`ground`]: contacts, joint limits and joint friction as MuJoCo's soft constraints.
-//! - [`group`]: a [`group::RobotBatch`] is the state of the robots in one register.
+//! - [`group`]: a [`robot_batch::RobotBatch`] is the state of the robots in one register.
 //! - [`simulator`]: steps batches on all cores, in the widest registers of the processor.
 //! - [`BatchBackend`]: the engine.
 //!
@@ -16,20 +16,20 @@
 
 mod contact;
 mod ground;
-mod group;
-mod simulator;
+mod robot_batch;
 mod rows;
+mod simulator;
 
-use twinstep_simd::InstructionSet;
 use twinstep_model::{
     Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, InitialState, RobotModel, RobotStates,
 };
+use twinstep_simd::InstructionSet;
 
 pub use simulator::SimdPrecision;
 
 use crate::rapier::{BackendBuildError, check_lengths};
 use crate::{SimConfig, SimConfigError};
-use group::{LaneSnapshot, StepCount};
+use robot_batch::{LaneSnapshot, StepCount};
 pub(crate) use simulator::batch_simulator;
 use simulator::{ActuatorInputs, BatchSimulator};
 
@@ -68,6 +68,7 @@ impl BatchBackend {
         precision: SimdPrecision,
     ) -> Result<Self, BackendBuildError> {
         config.check(&robot.control)?;
+        let config = config.at_actuator_rate(&robot.control);
         check_tree(&robot)?;
         let pool = if config.threads == 1 { None } else { Some(crate::rapier::thread_pool(config.threads)?) };
         let ground = config.terrain.ground();
@@ -154,7 +155,12 @@ impl Backend for BatchBackend {
         Ok(())
     }
 
-    fn reset_with_model(&mut self, robot: usize, model: &RobotModel, initial_state: &InitialState) -> Result<(), BackendError> {
+    fn reset_with_model(
+        &mut self,
+        robot: usize,
+        model: &RobotModel,
+        initial_state: &InitialState,
+    ) -> Result<(), BackendError> {
         self.check_index(robot)?;
         self.robots.place(robot, model, initial_state);
         self.after_reset(robot, initial_state);
@@ -178,7 +184,13 @@ impl Backend for BatchBackend {
                 on(pool, || evaluator.evaluate(active, &mut states.epistemic_uncertainty));
             }
         } else {
-            finite = robots.advance(pool, ActuatorInputs::Commands(commands), active, StepCount { actuator_periods, steps }, states);
+            finite = robots.advance(
+                pool,
+                ActuatorInputs::Commands(commands),
+                active,
+                StepCount { actuator_periods, steps },
+                states,
+            );
         }
         let diverged = if finite { None } else { self.first_diverged(active) };
         diverged.map_or(Ok(()), Err)

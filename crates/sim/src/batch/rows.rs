@@ -173,12 +173,22 @@ impl<T: SimdFloat> PointRow<'_, T> {
     ///
     /// It has the normal row's regularisation divided by [`IMPRATIO`], and damping only.
     #[inline(always)]
-    pub fn tangent(&self, direction: Vec3<T>, softness: &SoftConstraint<T>, normal: &ConstraintRow<T>) -> ConstraintRow<T> {
+    pub fn tangent(
+        &self,
+        direction: Vec3<T>,
+        softness: &SoftConstraint<T>,
+        normal: &ConstraintRow<T>,
+    ) -> ConstraintRow<T> {
         let (row, velocity) = self.row(direction);
         let zero = T::splat(0.0);
         let regularisation = normal.regularisation * T::splat(1.0 / IMPRATIO);
         let inverse = softness.distance.select_lt(zero, T::splat(1.0) / (row.response(&row) + regularisation), zero);
-        ConstraintRow { regularisation, inverse, target_velocity: -(softness.damping() * velocity) * softness.dt, ..row }
+        ConstraintRow {
+            regularisation,
+            inverse,
+            target_velocity: -(softness.damping() * velocity) * softness.dt,
+            ..row
+        }
     }
 
     /// Returns the row along `direction` and the velocity of the point along it [m/s].

@@ -3,12 +3,10 @@
 use rayon::ThreadPool;
 use rayon::prelude::*;
 use twinstep_model::dynamics::SimdCommands;
-use twinstep_model::{
-    Command, Ground, HistoryStep, InitialState, PerJoint, RobotModel, RobotStates, RobotStatesMut,
-};
+use twinstep_model::{Command, Ground, HistoryStep, InitialState, PerJoint, RobotModel, RobotStates, RobotStatesMut};
 use twinstep_simd::{InstructionSet, SimdFloat, SimdKernel, SimdTask, with_f32, with_f64};
 
-use super::group::{RobotBatch, ActuatorInput, LaneSnapshot, SensorReadings, Workspace, StepCount};
+use super::robot_batch::{ActuatorInput, LaneSnapshot, RobotBatch, SensorReadings, StepCount, Workspace};
 use crate::SimConfig;
 
 /// Precision of the simulation.
@@ -149,7 +147,9 @@ impl<T: SimdFloat> BatchSimulator for RobotBatches<T> {
                    (index, (group, states)): (usize, (&mut RobotBatch<T>, &mut RobotStatesMut))| {
             let robots = index * lanes..(index * lanes + lanes).min(active.len());
             let input = match inputs {
-                ActuatorInputs::Commands(commands) => ActuatorInput::Commands(SimdCommands::new(&commands[robots.clone()])),
+                ActuatorInputs::Commands(commands) => {
+                    ActuatorInput::Commands(SimdCommands::new(&commands[robots.clone()]))
+                }
                 ActuatorInputs::Torques(tau) => ActuatorInput::torques(&tau[robots.clone()]),
             };
             advance_active(group, &input, &active[robots], time, scratch, states)
@@ -237,7 +237,13 @@ fn advance_active<T: SimdFloat>(
 }
 
 /// Copies the state of one robot of a batch to entry `at` of `states`.
-fn read<T: SimdFloat>(group: &RobotBatch<T>, sample: &SensorReadings<T>, lane: usize, states: &mut RobotStatesMut, at: usize) {
+fn read<T: SimdFloat>(
+    group: &RobotBatch<T>,
+    sample: &SensorReadings<T>,
+    lane: usize,
+    states: &mut RobotStatesMut,
+    at: usize,
+) {
     let state = group.state();
     states.base_position[at] = values(&sample.position.0, lane);
     states.base_orientation[at] = values(&sample.orientation, lane);

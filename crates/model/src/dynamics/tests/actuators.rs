@@ -2,8 +2,8 @@
 
 use proptest::prelude::*;
 
-use super::super::{SimdCommands, SimdActuators};
-use crate::{Command, ActuatorParams, JointModel, NUM_JOINTS, Ripple, RobotModel, Stribeck, go2};
+use super::super::{SimdActuators, SimdCommands};
+use crate::{ActuatorParams, Command, JointModel, NUM_JOINTS, Ripple, RobotModel, Stribeck, go2};
 
 /// Number of physics steps per actuator period.
 const STEPS: usize = 5;
@@ -101,6 +101,24 @@ proptest! {
         let commands = (0..20).map(|period| Command::hold([ramp(period) as f32; NUM_JOINTS], 10.0, 0.0));
         let last = *simulate(&robot, commands, 0.0, 0.0).last().expect("torques");
         prop_assert!((last - 10.0 * (ramp(19) - 0.01 * delay / PERIOD)).abs() < 1e-6, "{last}");
+    }
+
+    #[test]
+    fn pd_gains_scale_position_and_velocity_error_but_not_the_feed_forward_torque(kp in 0.1..3.0f64, kd in 0.0..3.0f64) {
+        let robot = with_actuator(ActuatorParams { kp_scale: kp, kd_scale: kd, ..ActuatorParams::IDEAL });
+        let mut command = Command::hold([0.1; NUM_JOINTS], 20.0, 2.0);
+        (command.dq, command.tau_ff) = ([0.5; NUM_JOINTS], [0.3; NUM_JOINTS]);
+        let last = *simulate(&robot, [command], 0.0, 0.0).last().expect("torques");
+        let expected = kp * 20.0 * f64::from(0.1f32) + kd * 2.0 * 0.5 + f64::from(0.3f32);
+        prop_assert!((last - expected).abs() < 1e-9, "{last} instead of {expected}");
+    }
+
+    #[test]
+    fn dead_zone_removes_its_half_width(tau in -5.0..5.0f64, width in 0.01..3.0f64) {
+        let robot = with_actuator(ActuatorParams { dead_zone: width, ..ActuatorParams::IDEAL });
+        let last = *simulate(&robot, vec![torque(tau); 2], 0.0, 0.0).last().expect("torques");
+        let tau = f64::from(tau as f32);
+        prop_assert!((last - tau.signum() * (tau.abs() - width).max(0.0)).abs() < 1e-12, "{last} from {tau}");
     }
 
     #[test]

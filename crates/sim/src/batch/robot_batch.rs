@@ -1,10 +1,13 @@
 //! State of the robots in one SIMD register, and one physics step of them.
 
 use glam::{DVec3, dvec3};
-use twinstep_model::{dynamics::{SimdCommands, SimdActuators, FactoredDynamics, JointLoad, State, KinematicTree, Vec3}, Ground, HistoryStep, PerJoint, InitialState, RigidBody, RobotModel, RandomisationSample, BaseMount};
+use twinstep_model::{
+    BaseMount, Ground, HistoryStep, InitialState, PerJoint, RandomisationSample, RigidBody, RobotModel,
+    dynamics::{FactoredDynamics, JointLoad, KinematicTree, SimdActuators, SimdCommands, State, Vec3},
+};
 use twinstep_simd::SimdFloat;
 
-use super::contact::{Constraints, Impulses, LEG_POINTS, POINTS, ContactParams};
+use super::contact::{Constraints, ContactParams, Impulses, LEG_POINTS, POINTS};
 use super::ground::SimdTerrain;
 use crate::SimConfig;
 
@@ -135,7 +138,11 @@ impl<T: SimdFloat> RobotBatch<T> {
         let position = Vec3(initial_state.base_position.map(f64::from)) + linear.scaled(half);
         let state = &mut self.state;
         set(&mut state.position.0, lane, position.0);
-        set(&mut state.orientation, lane, integrate_orientation(initial_state.base_orientation.map(f64::from), angular.scaled(half)));
+        set(
+            &mut state.orientation,
+            lane,
+            integrate_orientation(initial_state.base_orientation.map(f64::from), angular.scaled(half)),
+        );
         set(&mut state.linear_velocity.0, lane, linear.0);
         set(&mut state.angular_velocity.0, lane, angular.0);
         let dq = initial_state.dq.map(f64::from);
@@ -182,7 +189,9 @@ impl<T: SimdFloat> RobotBatch<T> {
         let share = T::splat(1.0 / steps as f64);
         for _ in 0..actuator_periods {
             match input {
-                ActuatorInput::Commands(commands) => self.actuator.update_command(commands, &self.sampled_q(), &self.state.dq),
+                ActuatorInput::Commands(commands) => {
+                    self.actuator.update_command(commands, &self.sampled_q(), &self.state.dq)
+                }
                 ActuatorInput::Torques(tau) => self.actuator.set_torque(*tau),
             }
             self.tau = [T::splat(0.0); 12];
@@ -245,7 +254,8 @@ impl<T: SimdFloat> RobotBatch<T> {
             dq: *dq,
         };
         for joint in 0..12 {
-            (sample.q[joint], sample.dq[joint]) = self.actuator.encoder_reading(joint, sample.q[joint], sample.dq[joint]);
+            (sample.q[joint], sample.dq[joint]) =
+                self.actuator.encoder_reading(joint, sample.q[joint], sample.dq[joint]);
         }
         sample
     }

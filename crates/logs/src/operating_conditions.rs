@@ -1,22 +1,22 @@
-//! What supply and heat leave of the motors' torque.
+//! Operating conditions of a log: supply voltage and motor temperatures, and the derating of motor torque.
 
-use twinstep_logs::Log;
+use crate::Log;
 use twinstep_model::{Derating, JOINT_NAMES, NUM_JOINTS};
 
-/// Supply voltage and motor temperatures of a log, by row; empty where it tells neither.
+/// Supply voltage and motor temperatures of a log, by row; empty if the log has neither.
 #[derive(Clone, Debug)]
 pub struct OperatingConditions(Vec<Condition>);
 
 #[derive(Clone, Copy, Debug)]
 struct Condition {
-    /// Voltage over the highest of the log; 1 where it is not known.
+    /// Voltage divided by the highest voltage of the log; 1 if it is missing.
     voltage: f64,
-    /// Of each motor [°C]; NaN where it is not known.
+    /// Temperature of each motor [°C]; NaN if it is missing.
     temperature: [f64; NUM_JOINTS],
 }
 
 impl OperatingConditions {
-    /// Those of `log`.
+    /// Collects the conditions of `log`.
     pub fn of(log: &Log) -> Self {
         let voltages = log.channel("battery_V");
         let temperatures = JOINT_NAMES.map(|name| log.channel(&format!("temp_{name}")));
@@ -32,27 +32,29 @@ impl OperatingConditions {
         Self((0..log.rows()).map(row).collect())
     }
 
-    /// True if supply and heat cannot show: the log tells neither.
+    /// Returns true if the log has neither voltage nor temperature.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// Share of each joint's torque that is left in `row`.
+    /// Returns the derating factor of each joint's torque in `row`.
     pub fn derating_factors(&self, derating: &Derating, row: usize) -> [f32; NUM_JOINTS] {
         let Some(condition) = self.0.get(row) else { return [1.0; NUM_JOINTS] };
-        std::array::from_fn(|joint| derating.derating_factor(joint, condition.voltage, condition.temperature[joint]) as f32)
+        std::array::from_fn(|joint| {
+            derating.derating_factor(joint, condition.voltage, condition.temperature[joint]) as f32
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use twinstep_logs::{Meta, TorqueSensor};
+    use crate::{Meta, TorqueSensor};
 
     use super::*;
 
     #[test]
-    fn motors_weaken_with_the_voltage_and_above_their_temperature() {
-        let segments = vec![twinstep_logs::Segment { name: "air".to_owned(), base: twinstep_model::BaseMount::Fixed }];
+    fn derating_depends_on_voltage_and_temperature() {
+        let segments = vec![crate::Segment { name: "air".to_owned(), base: twinstep_model::BaseMount::Fixed }];
         let column = |name: &str, cells: [f64; 3]| (name.to_owned(), cells.to_vec());
         let columns = [
             column("t", [0.0, 0.005, 0.01]),
@@ -67,7 +69,7 @@ mod tests {
         let conditions = OperatingConditions::of(&log);
         let mut derating = Derating { voltage_exponent: 2.0, ..Derating::NONE };
         derating.per_kelvin[0] = 0.01;
-        let shares = [0, 1, 2].map(|row| conditions.derating_factors(&derating, row)[..2].to_vec());
-        assert_eq!(shares, [[1.0, 1.0], [0.64, 0.64], [0.8, 1.0]]);
+        let factors = [0, 1, 2].map(|row| conditions.derating_factors(&derating, row)[..2].to_vec());
+        assert_eq!(factors, [[1.0, 1.0], [0.64, 0.64], [0.8, 1.0]]);
     }
 }

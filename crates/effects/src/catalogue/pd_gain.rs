@@ -1,0 +1,57 @@
+//! The gains of the PD loop differ from the commanded gains.
+
+use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+
+/// The gains of the PD loop differ from the commanded gains.
+pub const EFFECT: Effect = Effect {
+    name: "pd_gain",
+    summary: "The gains of the PD loop differ from the commanded gains.",
+    equation: "tau = s_p kp (q_cmd - q) + s_d kd (dq_cmd - dq) + tau_ff",
+    chain_stage: "2a, PD",
+    parameters: &[
+        Parameter {
+            name: "kp_scale",
+            unit: "",
+            count: 1,
+            bounds: [0.1, 5.0],
+            prior_range: [0.7, 1.3],
+            no_effect_value: 1.0,
+            source: "legged_gym and Walk These Ways randomise the stiffness by 0.8 to 1.3",
+        },
+        Parameter {
+            name: "kd_scale",
+            unit: "",
+            count: 1,
+            bounds: [0.0, 10.0],
+            prior_range: [0.5, 1.5],
+            no_effect_value: 1.0,
+            source: "legged_gym and Walk These Ways randomise the damping by 0.5 to 1.5",
+        },
+    ],
+    composition: Composition::Multiply,
+    target: Target::Joints,
+    signature: "The measured torque is proportional to the position error, or to the speed, with another factor than the commanded gain. Feed-forward torque is not scaled.",
+    confounders: &[
+        Confounder {
+            effect: "torque_gain",
+            discriminating_experiment: "Measure the motor current: it follows the gains of the loop, not the torque constant.",
+        },
+        Confounder {
+            effect: "viscous_friction",
+            discriminating_experiment: "Repeat the motion at another commanded kd: friction does not change with it. A motor-current sensor does not measure friction.",
+        },
+        Confounder {
+            effect: "torque_saturation",
+            discriminating_experiment: "Two amplitudes of the same motion: a gain has the same ratio at both.",
+        },
+    ],
+    needs: &[DataRequirement::Reversals],
+    recommended: &[DataRequirement::TorqueMeasured, DataRequirement::KdVaries],
+    caveat: "without a motor-current sensor, kd_scale at one kd is the same as viscous_friction",
+    apply: |robot, site, values| {
+        let actuator = &mut crate::joint(robot, site).actuator;
+        actuator.kp_scale *= values[0];
+        actuator.kd_scale *= values[1];
+        Ok(())
+    },
+};
