@@ -99,7 +99,7 @@ impl DataSet {
                 }
             }
         }
-        let has = |wanted| set.runs.iter().any(|(block, _)| *block == wanted);
+        let has = |expected| set.runs.iter().any(|(block, _)| *block == expected);
         if [Split::Training, Split::Validation, Split::Test].into_iter().all(has) {
             return Ok(set);
         }
@@ -107,8 +107,8 @@ impl DataSet {
     }
 
     /// Returns the sequences of one split, in the order of logs, time and joints.
-    pub fn runs(&self, wanted: Split) -> impl Iterator<Item = &Sequence> + Clone {
-        self.runs.iter().filter(move |(block, _)| *block == wanted).map(|(_, run)| run)
+    pub fn runs(&self, expected: Split) -> impl Iterator<Item = &Sequence> + Clone {
+        self.runs.iter().filter(move |(block, _)| *block == expected).map(|(_, run)| run)
     }
 
     /// Returns a hash of the data in hexadecimal.
@@ -130,7 +130,7 @@ impl DataSet {
     fn check(&self, name: &str, log: &Log) -> Result<(), EnsembleError> {
         let given = 1.0 / log.meta().rate_hz;
         if (given / self.dt - 1.0).abs() > 1e-6 {
-            return Err(EnsembleError::TimeStepMismatch { what: name.to_owned(), given, wanted: self.dt });
+            return Err(EnsembleError::TimeStepMismatch { what: name.to_owned(), given, expected: self.dt });
         }
         if log.meta().tau_sensor != self.tau_sensor {
             return Err(EnsembleError::SensorMismatch { log: name.to_owned() });

@@ -132,7 +132,7 @@ impl Ensemble {
         if (dt / expected - 1.0).abs() <= 1e-6 {
             return Ok(());
         }
-        Err(EnsembleError::TimeStepMismatch { what: what.to_owned(), given: dt, wanted: expected })
+        Err(EnsembleError::TimeStepMismatch { what: what.to_owned(), given: dt, expected })
     }
 
     /// Predicts the torque of each row with each member, `[sequence][row][member]`, from states of zero.

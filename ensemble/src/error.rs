@@ -26,14 +26,14 @@ pub enum EnsembleError {
         log: String,
     },
     /// The time step differs from that of the model.
-    #[error("{what} has a time step of {given} s, the model one of {wanted} s; a network is valid for one time step")]
+    #[error("{what} has a time step of {given} s, the model one of {expected} s; a network is valid for one time step")]
     TimeStepMismatch {
         /// Log or simulation with the other time step.
         what: String,
         /// Its time step [s].
         given: f64,
         /// Time step of the model [s].
-        wanted: f64,
+        expected: f64,
     },
     /// The gains change. A network is valid for one value of the gains, because they are not an input.
     #[error(

@@ -84,7 +84,7 @@ fn healthy_robot_gets_no_name() {
     assert_eq!(diagnosis.baseline, diagnosis.extended);
     assert_eq!(diagnosis.unexplained.fraction, 0.0, "{:?}", diagnosis.unexplained);
     let page = std::fs::read_to_string(folder.path().join("diagnosis/report.html")).unwrap();
-    assert!(page.contains("Nothing is wrong above the noise"));
+    assert!(page.contains("No model error above the noise"));
     assert_eq!(diagnosis.next_experiment, None);
     assert!(!folder.path().join("diagnosis/next_experiment").exists());
 }

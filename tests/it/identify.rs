@@ -194,7 +194,7 @@ fn real_go2_is_followed_far_better_after_identification() {
 
 #[test]
 fn mistakes_on_the_command_line_are_named() {
-    for (effects, wanted) in [
+    for (effects, expected) in [
         ("coulomb_friction", "has no scope"),
         ("friction@calf", "not in the catalogue"),
         ("coulomb_friction@knee", "is no scope"),
@@ -204,7 +204,7 @@ fn mistakes_on_the_command_line_are_named() {
         assert_eq!(output.status.code(), Some(2));
         assert!(output.stdout.is_empty());
         let told = String::from_utf8_lossy(&output.stderr);
-        assert!(told.contains(wanted), "{told}");
+        assert!(told.contains(expected), "{told}");
     }
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("fitted.toml");

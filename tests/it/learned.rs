@@ -321,11 +321,11 @@ fn ensembles_that_do_not_go_with_the_robot_are_refused_with_the_reason() {
 #[test]
 fn settings_that_learned_drives_cannot_follow_are_refused_by_name() {
     let (_folder, model) = model_with(description(), "", "");
-    let refused = |change: fn(&mut Config), wanted: &str| {
+    let refused = |change: fn(&mut Config), expected: &str| {
         let mut config = config(Engine::Batch, &model, 1);
         change(&mut config);
         let error = SimEnvFactory::new(config).err().unwrap();
-        assert!(matches!(error, EnvFactoryError::ActuatorNetwork { field, .. } if field == wanted), "{error}");
+        assert!(matches!(error, EnvFactoryError::ActuatorNetwork { field, .. } if field == expected), "{error}");
     };
     refused(|config| config.randomise.kp_scale = [0.9, 1.1], "randomise.kp_scale");
     refused(|config| config.randomise.kd_scale = [0.9, 0.9], "randomise.kd_scale");

@@ -84,7 +84,7 @@ fn safe_motions_have_names_of_their_own_and_begin_and_end_in_the_default_pose() 
 fn chosen_motion_beats_the_median_one() {
     // Actuator lag or torque delay; `results/next_experiment.md` has more pairs.
     let pair = &PAIRS[2];
-    let (pair, robot) = (pair.pair(), pair.robot().robot_model().unwrap());
+    let (pair, robot) = (pair.hypothesis_pair(), pair.robot().robot_model().unwrap());
     let mut simulator = BatchRollout::new(&go2(), &SimConfig::default()).unwrap();
     let mut told: Vec<[f64; 2]> = Vec::new();
     for motion in EXCITATION_TRAJECTORIES.iter().filter(|motion| motion.base == BaseMount::Fixed) {

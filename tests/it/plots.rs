@@ -38,7 +38,7 @@ fn lines<'a>(svg: &'a str, colour: &str) -> Vec<&'a str> {
 fn every_effect_is_drawn_with_a_difference_that_can_be_seen() {
     for effect in CATALOGUE {
         let svg = picture(&["effects", effect.name]);
-        assert!(svg.contains(effect.name) && svg.contains("difference that it makes"), "{}", effect.name);
+        assert!(svg.contains(effect.name) && svg.contains("difference due to the effect"), "{}", effect.name);
         // The legend's sample first, then a line in each of the three panels.
         let (without, with) = (lines(&svg, "#262626"), lines(&svg, "#F2A71B"));
         assert_eq!([without.len(), with.len()], [4, 4], "{}", effect.name);

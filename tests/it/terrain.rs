@@ -175,7 +175,7 @@ fn server_with_rough_ground_in_its_file_sends_the_heights_around_the_robot() {
 
 #[test]
 fn server_refuses_rough_ground_that_cannot_be_before_it_starts() {
-    for (text, wanted) in [
+    for (text, expected) in [
         (
             "[sim]\nterrain = { rough = { height_m = 9.0, cell_m = 0.25, seed = 7 } }",
             "`sim.terrain.rough.height_m` = 9",
@@ -184,7 +184,7 @@ fn server_refuses_rough_ground_that_cannot_be_before_it_starts() {
     ] {
         let config = Config::parse(text, "server.toml").unwrap();
         let error = SimEnvFactory::new(config).err().unwrap().to_string();
-        assert!(error.contains(wanted), "{error}");
+        assert!(error.contains(expected), "{error}");
     }
 }
 

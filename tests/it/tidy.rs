@@ -56,6 +56,73 @@ fn readme_gives_the_two_commands_and_ci_runs_the_same_test_command() {
     assert!(readme.contains("cargo test --release --workspace") && ci.contains("cargo test --release --workspace"));
 }
 
+/// Words that this project does not use, with the term of the field that stands in their place.
+const REPLACED_WORDS: [(&str, &str); 32] = [
+    ("learned drive", "actuator network"),
+    ("learned drives", "actuator networks"),
+    ("drive period", "actuator period"),
+    ("drive periods", "actuator periods"),
+    ("drive_hz", "actuator_hz"),
+    ("drive_dt", "actuator_dt"),
+    ("JointDrive", "ActuatorParams"),
+    ("LearnedDrive", "ActuatorNetworkConfig"),
+    ("held trunk", "fixed base"),
+    ("free trunk", "floating base"),
+    ("put down anew", "reset"),
+    ("placed anew", "reset"),
+    ("farewell", "shutdown grace period"),
+    ("obituary", "exit report"),
+    ("crews", "robots_by_member"),
+    ("leftover", "residual power"),
+    ("leftovers", "residual powers"),
+    ("seats", "joint slots"),
+    ("rivalry", "hypothesis pair"),
+    ("untold", "not identifiable"),
+    ("by heart", "trained for one value"),
+    ("knows what it does not know", "estimates its epistemic uncertainty"),
+    ("earns its name", "reaches the threshold"),
+    ("gravity_in_base", "projected_gravity"),
+    ("tracking_width", "tracking_sigma"),
+    ("TauSensor", "TorqueSensor"),
+    ("MemberDraw", "MemberSampling"),
+    ("NoAnswerError", "RequestTimeoutError"),
+    ("NoUniqueRobotError", "AmbiguousRobotError"),
+    ("ServerDiedError", "ServerExitedError"),
+    ("RefusedError", "RequestRejectedError"),
+    ("sysid", "identify"),
+];
+
+/// True if `word` is in `text` and no part of a longer name.
+fn has_word(text: &str, word: &str) -> bool {
+    let is_name = |character: Option<char>| character.is_some_and(|c| c.is_alphanumeric() || c == '_');
+    text.match_indices(word).any(|(start, _)| {
+        !is_name(text[..start].chars().next_back()) && !is_name(text[start + word.len()..].chars().next())
+    })
+}
+
+#[test]
+fn every_file_of_the_catalogue_is_in_the_catalogue() {
+    let mut found = Vec::new();
+    files(&root().join("crates/effects/src/catalogue"), &["rs"], &mut found);
+    for path in found.iter().filter(|path| !path.ends_with("mod.rs")) {
+        let name = path.file_stem().unwrap().to_str().unwrap();
+        assert!(twinstep_effects::Effect::named(name).is_some(), "{} is not in `CATALOGUE`", path.display());
+    }
+}
+
+#[test]
+fn words_that_were_replaced_stay_away() {
+    for (path, text) in sources(&["rs", "py", "md"]) {
+        // The changelog names what was renamed, and this file has the list.
+        if path.ends_with("CHANGELOG.md") || path.ends_with("tests/it/tidy.rs") {
+            continue;
+        }
+        for (word, term) in REPLACED_WORDS {
+            assert!(!has_word(&text, word), "{}: \"{word}\" is not the field's term; write \"{term}\"", path.display());
+        }
+    }
+}
+
 #[test]
 fn links_in_the_documents_lead_somewhere() {
     for (path, text) in sources(&["md"]) {

@@ -1,16 +1,16 @@
-//! What a page looks like in a real browser, without a window.
+//! Layout of an HTML page in a real browser, without a visible window.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use serde::Deserialize;
 
-/// Names of the browser.
+/// Program names of supported browsers.
 const NAMES: [&str; 3] = ["chromium", "chromium-browser", "google-chrome"];
 /// Width and height of the window [px].
 const WINDOW: &str = "1200,900";
 
-/// Measures the page when it stands, and leaves the numbers in it.
+/// Script that measures the page after it has loaded and replaces its content by the numbers.
 const MEASURE: &str = r#"<script>addEventListener("load", () => {
     const boxes = [...document.querySelectorAll("svg")].map((svg) => svg.getBoundingClientRect());
     const numbers = {
@@ -24,30 +24,30 @@ const MEASURE: &str = r#"<script>addEventListener("load", () => {
     document.documentElement.innerHTML = "<pre>" + JSON.stringify(numbers) + "</pre>";
 });</script>"#;
 
-/// A page as it stands in a window.
+/// Measured layout of a page.
 #[derive(Debug, Deserialize)]
 pub struct Layout {
-    /// Number of its SVGs.
+    /// Number of SVG elements.
     pub pictures: usize,
-    /// Those that have no size to speak of.
+    /// Number of SVG elements narrower or lower than 20 px.
     pub flat_pictures: usize,
-    /// By how much it is wider than the window [px].
+    /// Width beyond that of the window [px].
     pub overhang_px: f64,
-    /// Its height [px].
+    /// Height of the page [px].
     pub height_px: f64,
-    /// What it asked the network, or the disk, for.
+    /// Number of resources loaded from the network or the disk.
     pub requests: usize,
-    /// What stands first.
+    /// Text of the first `h1`.
     pub heading: String,
 }
 
-/// The browser of this machine, if there is one.
+/// Returns the first browser on the `PATH`, or `None` if none is installed.
 pub fn browser() -> Option<PathBuf> {
     let folders: Vec<PathBuf> = std::env::split_paths(&std::env::var_os("PATH")?).collect();
     NAMES.iter().flat_map(|name| folders.iter().map(move |folder| folder.join(name))).find(|path| path.is_file())
 }
 
-/// How `page` stands in `browser`.
+/// Measures the layout of `page` in `browser`.
 ///
 /// # Panics
 /// If the browser does not run, or the page cannot be measured.
@@ -55,7 +55,7 @@ pub fn layout(browser: &Path, page: &Path) -> Layout {
     let folder = tempfile::tempdir().expect("a folder");
     let copy = folder.path().join("page.html");
     let html = std::fs::read_to_string(page).expect("a page");
-    // A report forbids scripts; the one that measures has to run.
+    // The report's content security policy forbids scripts, but the measuring script must run.
     let open = html.replace("http-equiv=\"Content-Security-Policy\"", "");
     std::fs::write(&copy, format!("{open}{MEASURE}")).expect("written");
     let output = Command::new(browser)

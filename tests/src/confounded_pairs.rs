@@ -1,4 +1,4 @@
-//! Pairs of effects that are taken for each other: a robot that has the first, and the question whether it is the second.
+//! Pairs of confounded effects: a robot with the first, and both as hypotheses.
 
 use twinstep_diagnose::HypothesisPair;
 use twinstep_effects::EffectEntry;
@@ -6,24 +6,24 @@ use twinstep_effects::ModelFile;
 
 use crate::ground_truth_robot::effect;
 
-/// An effect with its scope and its values, half of what is plausible or so.
+/// Effect, scope and values. The values are about half of the plausible maximum.
 type Side = (&'static str, &'static str, &'static [f64]);
 
-/// Two effects that are taken for each other.
+/// Two confounded effects.
 pub struct Pair {
-    /// What the robot has.
+    /// True effect of the robot.
     pub hidden: Side,
-    /// What it might have.
+    /// Alternative hypothesis.
     pub alternative: Side,
-    /// Whether the trunk's motion is measured, so that motions on the ground tell something.
+    /// True if trajectories with a floating base are included, because the base motion is measured.
     pub on_ground: bool,
 }
 
-const fn pair(hidden: Side, rival: Side, on_ground: bool) -> Pair {
-    Pair { hidden, alternative: rival, on_ground }
+const fn pair(hidden: Side, alternative: Side, on_ground: bool) -> Pair {
+    Pair { hidden, alternative, on_ground }
 }
 
-/// Pairs that the catalogue says are taken for each other.
+/// Pairs that the catalogue lists as confounders.
 pub const PAIRS: [Pair; 8] = [
     pair(("backlash", "RR_calf", &[0.012]), ("joint_elasticity", "RR_calf", &[300.0]), false),
     pair(("command_delay", "all", &[0.008]), ("armature", "all", &[0.01]), false),
@@ -36,7 +36,7 @@ pub const PAIRS: [Pair; 8] = [
 ];
 
 impl Pair {
-    /// The robot with the hidden effect.
+    /// Returns the model of the robot with the true effect.
     pub fn robot(&self) -> ModelFile {
         let (name, scope, values) = self.hidden;
         let (effect, scope) = effect(name, scope);
@@ -44,8 +44,8 @@ impl Pair {
         ModelFile { effects: vec![entry], ..ModelFile::default() }
     }
 
-    /// The question.
-    pub fn pair(&self) -> HypothesisPair {
+    /// Returns both effects as hypotheses on the ideal robot.
+    pub fn hypothesis_pair(&self) -> HypothesisPair {
         let sides = [self.hidden, self.alternative].map(|(name, scope, values)| {
             let (effect, scope) = effect(name, scope);
             (effect, scope, values.to_vec())

@@ -1,34 +1,35 @@
-//! The faults, and what each must leave true.
+//! Faults and the state that must hold after each.
 
 use std::time::Duration;
 
 use rand::RngExt;
 use twinstep_model::Stream;
 
-/// What is done to a lane.
+/// A fault injected into a test bed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Fault {
-    /// SIGKILL in the middle of a step, then a new start: the client is told, leases anew and goes on.
+    /// SIGKILL during a step, then a restart. The client receives an error, acquires a new lease and continues.
     ServerKilled,
-    /// SIGKILL, then another client that reclaims the lease: the counters go on where they were. A client that cannot
-    /// reclaim starts anew.
+    /// SIGKILL, then another client that reclaims the lease: the counters continue from their values. A client that
+    /// does not support reclaiming acquires a new lease.
     ClientKilled,
-    /// SIGKILL of the router, then a new one: the lease goes on.
+    /// SIGKILL of the router, then a new one: the lease remains valid.
     RouterKilled,
-    /// SIGSTOP and SIGCONT, sometimes past Zenoh's own patience: the lease goes on.
+    /// SIGSTOP and SIGCONT of the client, sometimes for longer than Zenoh's link timeout: the lease remains valid.
     ClientFrozen,
-    /// SIGSTOP and SIGCONT, past the client's timeout: the lease goes on.
+    /// SIGSTOP and SIGCONT of the server, for longer than the client's timeout: the lease remains valid.
     ServerFrozen,
-    /// Every message between client and server held back for a while: the lease goes on.
+    /// Every message between client and server is delayed for up to 3 s: the lease remains valid.
     MessagesDelayed,
-    /// Every request sent three times at once: executed once, answered three times alike.
+    /// Every request is sent three times at once: it is executed once, and the three replies are equal.
     RequestRepeated,
-    /// A second server of the same name or at the same endpoint: refused, and the client goes on.
+    /// A second server is started behind the same router or at the same endpoint: it is rejected, and the client
+    /// continues.
     SecondServer,
 }
 
 impl Fault {
-    /// Every fault.
+    /// All faults.
     pub const ALL: [Fault; 8] = [
         Fault::ServerKilled,
         Fault::ClientKilled,
@@ -40,21 +41,21 @@ impl Fault {
         Fault::SecondServer,
     ];
 
-    /// What it is called in tables.
+    /// Returns the name used in tables.
     pub const fn name(self) -> &'static str {
         match self {
-            Fault::ServerKilled => "server killed in mid-step, restarted",
+            Fault::ServerKilled => "server killed during a step, restarted",
             Fault::ClientKilled => "client killed, lease reclaimed",
             Fault::RouterKilled => "router killed, restarted",
-            Fault::ClientFrozen => "client frozen, thawed",
-            Fault::ServerFrozen => "server frozen past the timeout, thawed",
+            Fault::ClientFrozen => "client suspended, resumed",
+            Fault::ServerFrozen => "server suspended beyond the timeout, resumed",
             Fault::MessagesDelayed => "messages delayed",
             Fault::RequestRepeated => "requests sent three times at once",
             Fault::SecondServer => "second server started by mistake",
         }
     }
 
-    /// Any fault; [`Fault::RouterKilled`] only where there is a router.
+    /// Samples a fault uniformly. [`Fault::RouterKilled`] is sampled only if there is a router.
     pub fn draw(random: &mut Stream, has_router: bool) -> Self {
         loop {
             let fault = Self::ALL[random.random_range(0..Self::ALL.len())];
@@ -65,7 +66,7 @@ impl Fault {
     }
 }
 
-/// A random time in `range` [ms].
+/// Samples a duration uniformly from `range` [ms].
 pub fn moment(random: &mut Stream, range: std::ops::Range<u64>) -> Duration {
     Duration::from_millis(random.random_range(range))
 }

@@ -1,4 +1,4 @@
-//! Many faults on many lanes at once, added up.
+//! Injects many faults into many test beds in parallel and adds up the results.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -11,33 +11,33 @@ use twinstep_model::stream;
 use crate::fault::Fault;
 use crate::test_bed::{TestBed, TestBedConfig};
 
-/// What to inject.
+/// Settings of a run of fault injection.
 pub struct FaultPlan {
-    /// What the processes run.
+    /// Commands of the processes.
     pub commands: TestBedConfig,
     /// Number of faults.
     pub faults: usize,
-    /// Lanes at once; every second one has a router.
+    /// Number of test beds in parallel. Every second one has a router.
     pub lanes: usize,
-    /// Seed of the faults and their moments.
+    /// Seed of the faults and their times.
     pub seed: u64,
 }
 
-/// What came of it.
+/// Result of a run of fault injection.
 #[derive(Debug, Default)]
 pub struct FaultReport {
-    /// How often each fault was injected.
+    /// Number of injections of each fault.
     pub injected: BTreeMap<Fault, usize>,
-    /// The fault and the evidence of everything that went wrong.
+    /// Fault and evidence of every failure.
     pub failures: Vec<(Fault, String)>,
-    /// Steps that clients acknowledged, each checked.
+    /// Number of steps that clients acknowledged; each was checked.
     pub steps: u64,
-    /// The longest time from a fault's end to the third step after it.
+    /// Longest time from the end of a fault to the third step after it.
     pub slowest: Duration,
 }
 
 impl FaultReport {
-    /// Faults injected in all.
+    /// Returns the total number of injected faults.
     pub fn total(&self) -> usize {
         self.injected.values().sum()
     }
@@ -54,14 +54,14 @@ impl std::fmt::Display for FaultReport {
         writeln!(table, "{} acknowledged steps, each compared with the client's own counters", self.steps)?;
         write!(
             table,
-            "longest time from a fault's end to the third step after it: {:.1} s",
+            "longest time from the end of a fault to the third step after it: {:.1} s",
             self.slowest.as_secs_f64()
         )?;
         formatter.write_str(&table)
     }
 }
 
-/// Injects the faults of `plan`. `progress` is told of each; `stop` ends early.
+/// Injects the faults of `plan`. Calls `progress` for each; stops early once `stop` is true.
 pub fn run(plan: &FaultPlan, stop: &AtomicBool, progress: impl Fn(Fault)) -> Result<FaultReport, String> {
     let (sender, outcomes) = channel();
     std::thread::scope(|scope| {
@@ -70,8 +70,8 @@ pub fn run(plan: &FaultPlan, stop: &AtomicBool, progress: impl Fn(Fault)) -> Res
                 let sender = sender.clone();
                 let share = plan.faults / plan.lanes + usize::from(index < plan.faults % plan.lanes);
                 scope.spawn(move || {
-                    run_lane(plan, index, share, stop, |fault, failure| {
-                        // The receiver outlives every lane.
+                    run_test_bed(plan, index, share, stop, |fault, failure| {
+                        // The receiver outlives every test bed.
                         let _ = sender.send((fault, failure));
                     })
                 })
@@ -85,7 +85,7 @@ pub fn run(plan: &FaultPlan, stop: &AtomicBool, progress: impl Fn(Fault)) -> Res
             progress(fault);
         }
         for thread in threads {
-            let (steps, slowest) = thread.join().map_err(|_| "a lane panicked".to_owned())??;
+            let (steps, slowest) = thread.join().map_err(|_| "a test bed panicked".to_owned())??;
             tally.steps += steps;
             tally.slowest = tally.slowest.max(slowest);
         }
@@ -93,9 +93,9 @@ pub fn run(plan: &FaultPlan, stop: &AtomicBool, progress: impl Fn(Fault)) -> Res
     })
 }
 
-/// Injects `share` faults; a lane that does not go on is started anew. Returns the acknowledged steps, and the
-/// longest time to go on.
-fn run_lane(
+/// Injects `share` faults into one test bed and replaces it after a failure. Returns the number of acknowledged steps
+/// and the longest recovery time.
+fn run_test_bed(
     plan: &FaultPlan,
     index: usize,
     share: usize,
@@ -105,21 +105,21 @@ fn run_lane(
     let with_router = index % 2 == 1;
     let mut random = stream(plan.seed, "faults", index as u64);
     let start = || TestBed::start(&plan.commands, with_router);
-    let mut lane = start()?;
+    let mut test_bed = start()?;
     let (mut steps, mut slowest) = (0, Duration::ZERO);
     for _ in 0..share {
         if stop.load(Ordering::Acquire) {
             break;
         }
-        let fault = Fault::draw(&mut random, lane.has_router());
-        let outcome = lane.inject(fault, &mut random);
+        let fault = Fault::draw(&mut random, test_bed.has_router());
+        let outcome = test_bed.inject(fault, &mut random);
         let failed = outcome.is_err();
         report(fault, outcome.err());
         if failed {
-            steps += lane.steps;
-            slowest = slowest.max(lane.slowest);
-            lane = start()?;
+            steps += test_bed.steps;
+            slowest = slowest.max(test_bed.slowest);
+            test_bed = start()?;
         }
     }
-    Ok((steps + lane.steps, slowest.max(lane.slowest)))
+    Ok((steps + test_bed.steps, slowest.max(test_bed.slowest)))
 }

@@ -1,6 +1,6 @@
-//! Actuators that nobody knows, and the logs that they leave: what ensembles are tried on.
+//! Simulated actuators with known effects, and their logs: ground truth for actuator networks.
 //!
-//! The robot hangs in a stand, in the batch engine at 4 kHz, and every joint waves in many frequencies at once.
+//! The robot has a fixed base in the air and runs in the batch engine at 4 kHz. Every joint follows a sum of sines.
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
@@ -14,39 +14,39 @@ use twinstep_sim::{BatchBackend, SimConfig};
 
 /// Rate of the logs [Hz].
 pub const RATE_HZ: f64 = 200.0;
-/// Standard deviation of the torque's sensor [N·m].
+/// Standard deviation of the torque sensor [N·m].
 pub const NOISE_NM: f64 = 0.2;
-/// Noise and steps of the sensors. Actuators close their loop on the same encoder that is logged, so that it has little.
+/// Noise and resolution of the sensors. The encoder noise is small because the PD loops use the logged encoder.
 const SENSORS: [Sensor; 3] = [
     Sensor { quantity: "q", sigma: 0.0003, resolution: 0.0 },
     Sensor { quantity: "dq", sigma: 0.01, resolution: 0.0 },
     Sensor { quantity: "tau_measured", sigma: NOISE_NM, resolution: 0.0 },
 ];
-/// Waves of a joint.
+/// Number of sines per joint.
 const WAVES: usize = 6;
 
-/// An actuator with hidden effects at all joints.
+/// An actuator with known effects at all joints.
 pub struct HiddenDrive {
-    /// What people call it.
+    /// Name in tables.
     pub name: &'static str,
-    /// Effects and their values.
+    /// Effects with their values.
     effects: &'static [(&'static str, &'static [f64])],
-    /// Where its torque is measured.
+    /// Location of the torque measurement.
     pub sensor: TorqueSensor,
 }
 
-/// The actuators that ensembles are tried on.
+/// Actuators for the evaluation of actuator networks.
 pub const DRIVES: [HiddenDrive; 5] = [
     current("delay of 6 ms and lag of 5 ms (linear)", &[("torque_delay", &[0.006]), ("drive_lag", &[0.005])]),
     current("saturation, κ = 8 N·m", &[("torque_saturation", &[8.0])]),
-    current("torque-speed limit, no load at 9 rad/s", &[("torque_speed_limit", &[9.0])]),
+    current("torque–speed limit, no-load speed 9 rad/s", &[("torque_speed_limit", &[9.0])]),
     HiddenDrive {
-        name: "Coulomb and viscous friction before an output sensor",
+        name: "Coulomb and viscous friction, output sensor",
         effects: &[("coulomb_friction", &[1.2]), ("viscous_friction", &[0.15])],
         sensor: TorqueSensor::JointOutput,
     },
     HiddenDrive {
-        name: "all of them at an output sensor",
+        name: "all of the above, output sensor",
         effects: &[
             ("torque_delay", &[0.004]),
             ("drive_lag", &[0.004]),
@@ -63,29 +63,29 @@ const fn current(name: &'static str, effects: &'static [(&'static str, &'static 
     HiddenDrive { name, effects, sensor: TorqueSensor::MotorCurrent }
 }
 
-/// How a robot is moved.
+/// Settings of a motion.
 #[derive(Clone, Copy)]
 pub struct Motion {
     /// Length [s].
     pub seconds: f64,
-    /// Amplitude of all waves of a joint together [rad].
+    /// Amplitude of the sum of sines of a joint, as √2 times its RMS value [rad].
     pub amplitude: f64,
-    /// Their frequencies [Hz].
+    /// Range of the frequencies [Hz].
     pub hz: [f64; 2],
-    /// Of phases and frequencies, and of the sensors' noise.
+    /// Seed of the frequencies, the phases and the sensor noise.
     pub seed: u64,
 }
 
-/// A log twice: what sensors show, and what they would show without noise.
+/// A log with and without sensor noise.
 pub struct Logs {
-    /// With noise.
+    /// Log with sensor noise.
     pub measured: Log,
-    /// Without.
+    /// Log without sensor noise.
     pub exact: Log,
 }
 
 impl HiddenDrive {
-    /// What it does in `motion`.
+    /// Simulates `motion` with this actuator.
     ///
     /// # Panics
     /// If the robot cannot be simulated.
@@ -107,7 +107,9 @@ impl HiddenDrive {
     }
 }
 
-/// Commands of waves around the default pose, of equal amplitude each and of other frequencies and phases at every joint.
+/// Returns position commands: per joint a sum of sines around the default pose.
+///
+/// The sines of a joint have equal amplitudes. Frequencies and phases differ between joints.
 fn waves(motion: Motion) -> Log {
     let mut random = stream(motion.seed, "hidden drive motion", 0);
     let mut columns = BTreeMap::<String, Vec<f64>>::new();
@@ -117,15 +119,15 @@ fn waves(motion: Motion) -> Log {
     columns.insert("kd".to_owned(), vec![0.6; rows]);
     for joint in Joint::ALL {
         let [low, high] = motion.hz;
-        let waves: [(f64, f64); WAVES] = std::array::from_fn(|_| {
+        let sines: [(f64, f64); WAVES] = std::array::from_fn(|_| {
             (low * (high / low).powf(random.random_range(0.0..1.0)), random.random_range(0.0..TAU))
         });
-        let reach = motion.amplitude * if joint.kind == JointKind::Hip { 0.6 } else { 1.0 };
+        let amplitude = motion.amplitude * if joint.kind == JointKind::Hip { 0.6 } else { 1.0 };
         let pose = go2().control.default_pose[joint.index()];
         let at = |row: usize| {
             let t = row as f64 / RATE_HZ;
-            let sum: f64 = waves.iter().map(|(hz, phase)| (TAU * hz * t + phase).sin()).sum();
-            pose + t.min(1.0) * reach * sum / (WAVES as f64).sqrt()
+            let sum: f64 = sines.iter().map(|(hz, phase)| (TAU * hz * t + phase).sin()).sum();
+            pose + t.min(1.0) * amplitude * sum / (WAVES as f64).sqrt()
         };
         columns.insert(format!("q_cmd_{}", joint.name()), (0..rows).map(at).collect());
     }
@@ -133,7 +135,9 @@ fn waves(motion: Motion) -> Log {
     Log::new_commands(Meta::new(RATE_HZ, TorqueSensor::MotorCurrent, segments), columns).expect("a motion")
 }
 
-/// The torque behind friction: of the mean speed from a row to the next.
+/// Returns `log` with the torque at the joint output, which is the motor torque minus friction.
+///
+/// Friction is computed from the mean joint velocity of a row and the next.
 fn at_output(log: &Log, robot: &RobotModel) -> Log {
     let meta = Meta { tau_sensor: TorqueSensor::JointOutput, ..log.meta().clone() };
     let index = |cells: &[u32]| cells.iter().map(|cell| f64::from(*cell)).collect();
@@ -149,11 +153,11 @@ fn at_output(log: &Log, robot: &RobotModel) -> Log {
         };
         let joint: Joint = joint.parse().expect("one of the twelve");
         let (numbers, dq) = (&robot.joints[joint.index()], log.dq(joint.name()).expect("measured"));
-        let behind = |row: usize| {
+        let output_torque = |row: usize| {
             let speed = f64::midpoint(dq[row], dq[(row + 1).min(dq.len() - 1)]);
             cells[row] - numbers.coulomb_friction * (speed / 0.02).tanh() - numbers.viscous_friction * speed
         };
-        columns.push((name.to_owned(), (0..cells.len()).map(behind).collect()));
+        columns.push((name.to_owned(), (0..cells.len()).map(output_torque).collect()));
     }
     Log::new(meta, columns).expect("a log")
 }

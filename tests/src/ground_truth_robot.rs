@@ -1,6 +1,7 @@
-//! Robots that nobody knows, and the logs that they leave: what identification is tried on.
+//! Simulated robots with known parameters, and their logs: ground truth for system identification.
 //!
-//! The robot runs in rapier at 4 kHz, the model in the batch engine at 1 kHz; its sensors have noise and steps.
+//! The robot runs in rapier at 4 kHz, the model in the batch engine at 1 kHz. The robot's sensors have noise and a
+//! finite resolution.
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
@@ -16,12 +17,12 @@ use twinstep_sim::{Engine, RapierBackend, SimConfig};
 
 /// Rate of the log [Hz].
 const RATE_HZ: f64 = 200.0;
-/// Rows with the trunk held.
+/// Number of rows with a fixed base.
 const AIR_ROWS: usize = 1300;
-/// Rows on the feet.
+/// Number of rows with a floating base, standing.
 const STANCE_ROWS: usize = 2400;
 
-/// Noise and steps of the sensors.
+/// Noise and resolution of the sensors.
 const SENSORS: [Sensor; 7] = [
     Sensor { quantity: "q", sigma: 0.002, resolution: 0.0002 },
     Sensor { quantity: "dq", sigma: 0.05, resolution: 0.01 },
@@ -32,16 +33,18 @@ const SENSORS: [Sensor; 7] = [
     Sensor { quantity: "gyro", sigma: 0.02, resolution: 0.001 },
 ];
 
-/// An effect with its scope, as in `coulomb_friction@calf`.
+/// Returns an effect of the catalogue with its scope, as in `coulomb_friction@calf`.
 ///
 /// # Panics
-/// If there is none.
+/// If the effect or the scope does not exist.
 pub fn effect(name: &str, scope: &str) -> (&'static Effect, Scope) {
     (Effect::named(name).expect("an effect of the catalogue"), scope.parse().expect("a scope"))
 }
 
-/// Robot number `case`: mass of the trunk ±20 %, centre of mass ±4 cm along each axis, inertia ±20 % besides, and by joint
-/// type κ 18 to 30 N·m, Coulomb friction, rotor inertia; a delay of 1 to 10 ms.
+/// Returns the robot with number `case`.
+///
+/// Trunk mass varies by ±20 %, the centre of mass by ±4 cm along each axis, the inertia by a further ±20 %. Each joint
+/// type has its own κ (18 to 30 N·m), Coulomb friction and rotor inertia. The command delay is 1 to 10 ms.
 pub fn ground_truth_robot(case: u64) -> ModelFile {
     let mut random = stream(case, "hidden robot", 0);
     let mut draw = |low: f64, high: f64| random.random_range(low..high);
@@ -65,15 +68,17 @@ pub fn ground_truth_robot(case: u64) -> ModelFile {
     ModelFile { effects: entries.into_iter().map(entry).collect(), ..ModelFile::default() }
 }
 
-/// What is sought: what is hidden, and the ground, whose softness the engines see differently.
+/// Returns the effects to estimate: those of the ground truth, and the ground, whose contact models differ between the
+/// engines.
 pub fn estimated_effects() -> Vec<(&'static Effect, Scope)> {
-    let hidden = ground_truth_robot(0).effects;
+    let true_effects = ground_truth_robot(0).effects;
     let ground = [effect("ground_stiffness", "ground"), effect("ground_friction", "ground")];
-    hidden.iter().map(|entry| (entry.effect, entry.scope)).chain(ground).collect()
+    true_effects.iter().map(|entry| (entry.effect, entry.scope)).chain(ground).collect()
 }
 
-/// 6.5 s in the air, a chirp and then square waves with firm gains, and 12 s of swaying on the feet; another `variant` is
-/// another motion of the same kind.
+/// Returns commands for 6.5 s with a fixed base (a chirp, then square waves with higher gains) and 12 s of standing.
+///
+/// While standing, the base moves slowly. Each `variant` is another motion of the same kind.
 pub fn motion(variant: u64) -> Log {
     let mut random = stream(variant, "motion", 0);
     let pace = if variant == 0 { 1.0 } else { random.random_range(0.8..1.25) };
@@ -82,14 +87,14 @@ pub fn motion(variant: u64) -> Log {
     for row in 0..AIR_ROWS + STANCE_ROWS {
         let air = row < AIR_ROWS;
         let time = (if air { row } else { row - AIR_ROWS }) as f64 / RATE_HZ;
-        let firm = air && time > 4.0;
+        let square = air && time > 4.0;
         let mut cell = |name: String, value: f64| columns.entry(name).or_default().push(value);
         cell("t".to_owned(), row as f64 / RATE_HZ);
         cell("segment".to_owned(), f64::from(u8::from(!air)));
-        cell("kp".to_owned(), if firm { 60.0 } else { 25.0 + 15.0 * f64::from(u8::from(!air)) });
+        cell("kp".to_owned(), if square { 60.0 } else { 25.0 + 15.0 * f64::from(u8::from(!air)) });
         cell("kd".to_owned(), if air { 0.8 } else { 1.0 });
         for joint in Joint::ALL {
-            let offset = match (air, firm) {
+            let offset = match (air, square) {
                 (true, false) => 0.3 * (TAU * pace * (0.5 + 0.4 * time) * time + joint.index() as f64 + shift).sin(),
                 (true, true) => {
                     let rate = pace * (1.5 + joint.index() as f64 / 60.0);
@@ -107,7 +112,7 @@ pub fn motion(variant: u64) -> Log {
     Log::new_commands(meta, columns).expect("a motion")
 }
 
-/// Slow waves that lift, pitch, roll and shift the trunk while the feet stay.
+/// Returns the joint offset [rad] of slow sines that lift, pitch, roll and shift the trunk while the feet stay in place.
 fn sway(joint: Joint, time: f64, shift: f64) -> f64 {
     let wave = |way: f64| {
         let waves = [(0.31, 0.5), (0.57, 0.3), (0.97, 0.2)].into_iter().enumerate();
@@ -128,7 +133,7 @@ fn sway(joint: Joint, time: f64, shift: f64) -> f64 {
     }
 }
 
-/// What `robot` does in `motion`, as its sensors show it.
+/// Simulates `robot` with the commands of `motion` and returns the log with sensor noise.
 pub fn log_of(robot: &ModelFile, motion: &Log, seed: u64) -> Log {
     let robot = robot.robot_model().expect("a robot");
     let backend = |base: BaseMount, robot: &RobotModel| {
@@ -137,5 +142,5 @@ pub fn log_of(robot: &ModelFile, motion: &Log, seed: u64) -> Log {
         RapierBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)))
     };
     let exact = record(motion, &robot, None, backend, "a robot of `hidden_robot`".to_owned(), &mut |_| true);
-    apply_sensors(&exact.expect("the robot gets through"), &SENSORS, seed).expect("a log")
+    apply_sensors(&exact.expect("the simulation completes"), &SENSORS, seed).expect("a log")
 }

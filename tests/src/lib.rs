@@ -1,11 +1,19 @@
-//! Faults injected into real processes, and the proof that no step is executed twice, skipped or invented.
+//! Shared code of the tests that cross crates, and of the programs behind `results/`.
 //!
-//! A [`lane::TestBed`] is a server, a client and, on every second lane, a router between them, each a process of its own
-//! ([`roles`]), with a [`proxy`] before the client that can delay its messages. Faults ([`fault::Fault`]) hit it one after another while the client steps counters (task `counter`) at full
-//! speed. The client compares every observation with a counter of its own ([`ledger::StepOracle`]), which also survives the
-//! client's death. [`fault_injection`] runs many lanes at once and adds up.
+//! Fault injection checks with real processes that no step is executed twice, skipped or invented. A
+//! [`test_bed::TestBed`] has a server, a client and, in every second test bed, a router between them. Each is a process
+//! of its own ([`roles`]). A [`proxy`] in front of the client can delay its messages. Faults ([`fault::Fault`]) are
+//! injected one after another while the client steps counters (task `counter`) as fast as it can. The client compares
+//! every observation with its own counters ([`step_oracle::StepOracle`]), and this state survives the client's process.
+//! [`fault_injection`] runs many test beds in parallel and adds up their results.
 //!
-//! [`ground_truth_robot`] has the robots that identification is tried on, [`ground_truth_actuator`] the actuators that ensembles learn, [`browser`] looks at pages, [`confounded_pairs`] has those that are taken for each other, [`security`] what the tests of TLS, users and access control need, [`python`] what those of the Python client do.
+//! The other modules:
+//! - [`ground_truth_robot`]: robots with known parameters, for system identification
+//! - [`ground_truth_actuator`]: actuators with known effects, for actuator networks
+//! - [`confounded_pairs`]: pairs of confounded effects, for experiment design
+//! - [`browser`]: layout of an HTML report in a real browser
+//! - [`security`]: files and certificates for TLS, users and access control
+//! - [`python`]: environment for the tests of the Python client
 
 pub mod browser;
 pub mod confounded_pairs;

@@ -1,4 +1,4 @@
-//! A child process that can be killed, frozen and thawed, and whose lines can be awaited.
+//! A child process that can be killed, suspended and resumed, and whose output is read line by line.
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -6,21 +6,21 @@ use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
-/// How long a server may take to start.
+/// Maximum time for the start of a server.
 const STARTUP: Duration = Duration::from_secs(20);
 
-/// A child process; killed when dropped.
+/// A child process. It is killed when dropped.
 pub struct Process {
     child: Child,
     lines: Receiver<String>,
 }
 
 impl Process {
-    /// Starts `program` with `arguments`; its stdout is read line by line.
+    /// Starts `program` with `arguments` and reads its stdout line by line.
     pub fn start(program: &Path, arguments: &[String]) -> Result<Self, String> {
         let mut child = Command::new(program)
             .args(arguments)
-            // Closes when this process dies, which tells the child to end.
+            // The pipe closes when this process exits; the child then exits too.
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
@@ -38,7 +38,7 @@ impl Process {
         Ok(Self { child, lines })
     }
 
-    /// Starts a program that prints `listening ENDPOINT` once it answers, and waits for that.
+    /// Starts a program and waits for its line `listening ENDPOINT`. Returns the process and the endpoint.
     pub fn listening(program: &Path, arguments: &[String]) -> Result<(Self, String), String> {
         let process = Self::start(program, arguments)?;
         let line = process.line(STARTUP).unwrap_or_default();
@@ -48,30 +48,30 @@ impl Process {
         }
     }
 
-    /// The next line, or `None` after `timeout` or once the process has ended.
+    /// Returns the next line, or `None` after `timeout` or if the process has exited.
     pub fn line(&self, timeout: Duration) -> Option<String> {
         self.lines.recv_timeout(timeout).ok()
     }
 
-    /// Every line that is there already.
+    /// Returns all lines received so far.
     pub fn lines_so_far(&self) -> Vec<String> {
         self.lines.try_iter().collect()
     }
 
-    /// SIGKILL, and what it still printed.
+    /// Sends SIGKILL and returns the remaining lines.
     pub fn kill(&mut self) -> Vec<String> {
-        // Both fail only if it has ended already.
+        // Both fail only if the process has already exited.
         let _ = self.child.kill();
         let _ = self.child.wait();
         self.lines.iter().collect()
     }
 
-    /// SIGSTOP.
+    /// Suspends the process with SIGSTOP.
     pub fn freeze(&self) -> Result<(), String> {
         self.signal("STOP")
     }
 
-    /// SIGCONT.
+    /// Resumes the process with SIGCONT.
     pub fn thaw(&self) -> Result<(), String> {
         self.signal("CONT")
     }
@@ -84,7 +84,7 @@ impl Process {
         }
     }
 
-    /// The exit code, once the process has ended by itself.
+    /// Waits for the process to exit and returns its exit code, or `None` after `timeout`.
     pub fn exit_code(&mut self, timeout: Duration) -> Option<i32> {
         let since = Instant::now();
         while since.elapsed() < timeout {

@@ -1,4 +1,4 @@
-//! A TCP proxy between a client and what it connects to, which can hold every message back for a while.
+//! A TCP proxy between a client and its endpoint that can delay all messages.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -6,9 +6,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{sleep, spawn};
 use std::time::{Duration, Instant};
 
-/// Forwards every connection until the process ends.
+/// A proxy that forwards every connection until the process exits.
 pub struct Proxy {
-    /// Where it listens.
+    /// Endpoint on which it listens.
     pub endpoint: String,
     held_until: Arc<Mutex<Instant>>,
 }
@@ -24,7 +24,7 @@ impl Proxy {
         let held = Arc::clone(&held_until);
         spawn(move || {
             for client in listener.incoming().flatten() {
-                // Nobody there: closing the client's connection says so.
+                // If the target does not accept, the client's connection is closed.
                 let Ok(server) = TcpStream::connect(&target) else { continue };
                 for (from, to) in [(client.try_clone(), server.try_clone()), (Ok(server), Ok(client))] {
                     let (Ok(from), Ok(to)) = (from, to) else { continue };
@@ -36,7 +36,7 @@ impl Proxy {
         Ok(Self { endpoint, held_until })
     }
 
-    /// Holds every message back for `pause`, and returns when it is over.
+    /// Delays all messages for `pause` and returns after it.
     pub fn hold(&self, pause: Duration) {
         *self.held_until.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now() + pause;
         sleep(pause);
@@ -45,15 +45,15 @@ impl Proxy {
 
 fn forward(mut from: TcpStream, mut to: TcpStream, held_until: &Mutex<Instant>) {
     let mut buffer = vec![0; 65536];
-    // Small messages must not wait for each other.
+    // Nagle's algorithm would delay small messages.
     let _ = to.set_nodelay(true);
     while let Ok(length @ 1..) = from.read(&mut buffer) {
-        let left = held_until.lock().unwrap_or_else(PoisonError::into_inner).duration_since(Instant::now());
-        sleep(left);
+        let delay = held_until.lock().unwrap_or_else(PoisonError::into_inner).duration_since(Instant::now());
+        sleep(delay);
         if to.write_all(&buffer[..length]).is_err() {
             break;
         }
     }
-    // Either end's close closes both.
+    // If one end closes, both directions are closed.
     let _ = (from.shutdown(Shutdown::Both), to.shutdown(Shutdown::Both));
 }

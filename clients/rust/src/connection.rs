@@ -343,7 +343,7 @@ fn find_server(session: &Session, options: &ConnectOptions) -> Result<(String, S
                     None => format!("{count} robots are visible, and `robot` is not set"),
                 };
                 let visible = visible.iter().map(|(sid, name)| format!("{name} ({sid})")).collect();
-                return Err(ClientError::AmbiguousRobot { wanted: expected, visible });
+                return Err(ClientError::AmbiguousRobot { expected, visible });
             }
         }
     }

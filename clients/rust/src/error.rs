@@ -47,10 +47,10 @@ pub enum ClientError {
         waited_s: f64,
     },
     /// Servers are visible, but none or several match.
-    #[error("{wanted}; visible: {}\n  set `robot` to the name of one of them", visible.join(", "))]
+    #[error("{expected}; visible: {}\n  set `robot` to the name of one of them", visible.join(", "))]
     AmbiguousRobot {
         /// The requested robot, and the number of matches.
-        wanted: String,
+        expected: String,
         /// `name (sid)` of every visible server.
         visible: Vec<String>,
     },

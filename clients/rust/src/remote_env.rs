@@ -91,9 +91,9 @@ impl RemoteVecEnv {
         if let Some((verb, _)) = &self.pending {
             return Err(remote(ClientError::RequestPending(verb.name())));
         }
-        let wanted = self.num_envs * self.spec.action_len();
-        if actions.len() != wanted {
-            return Err(EnvError::WrongLength { field: "actions", given: actions.len(), wanted });
+        let expected = self.num_envs * self.spec.action_len();
+        if actions.len() != expected {
+            return Err(EnvError::WrongLength { field: "actions", given: actions.len(), expected });
         }
         let (epoch, seq) = (self.ticket.epoch, self.last_seq + 1);
         let request = convert::encode_actions(actions, epoch, seq);

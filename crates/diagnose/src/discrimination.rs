@@ -1,4 +1,4 @@
-//! Two models that explain a log equally well: how far a motion would part them, and how far a log of it does.
+//! Discrimination between two hypotheses: expected log-likelihood ratio of a motion, and log-likelihood ratio of a log.
 
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, Scope};
@@ -18,10 +18,10 @@ use twinstep_identify::least_squares::LeastSquaresProblem;
 use twinstep_identify::window::WindowConfig;
 use twinstep_logs::replay::{command, joint_commands};
 
-/// Parts of the step to a rival's refitted numbers that are tried: a line is only so straight.
+/// Fractions of the Gauss–Newton step that are tried, because the residuals are not linear.
 const STEPS: [f64; 4] = [0.0, 0.25, 0.5, 1.0];
 
-/// What is common to two models, and the effect that each has besides.
+/// Two hypotheses on top of a common model.
 #[derive(Clone, Debug)]
 pub struct HypothesisPair {
     model: ModelFile,
@@ -29,20 +29,20 @@ pub struct HypothesisPair {
 }
 
 impl HypothesisPair {
-    /// Of two effects on top of `model`, each with its scope and its values.
+    /// Creates a pair of two effects on top of `model`, each with its scope and values.
     pub fn new(model: ModelFile, sides: [(&'static Effect, Scope, Vec<f64>); 2]) -> Self {
         Self { model, sides: sides.map(|(effect, scope, values)| Hypothesis { effect, scope, values }) }
     }
 
-    /// The effects as people write them, `armature@calf`.
+    /// Returns the names of the hypotheses, as in `armature@calf`.
     pub fn names(&self) -> [String; 2] {
         self.sides.each_ref().map(Hypothesis::name)
     }
 
-    /// The expected evidence of `motion` for the true one of the two [nats], the mean of both cases; `like` says what is
-    /// measured and how well. None where neither can be simulated.
+    /// Returns the expected log-likelihood ratio of the true hypothesis to the other for `motion` [nat].
     ///
-    /// The other one may take any size that makes up for the difference: what is left is what counts.
+    /// It is the mean of both cases. The other hypothesis is refitted, so that only the difference that it cannot
+    /// imitate counts. `like` determines the measured channels and their noise. Returns `None` if a simulation fails.
     pub fn expected_log_likelihood_ratio(
         &self,
         motion: &ExcitationTrajectory,
@@ -59,7 +59,7 @@ impl HypothesisPair {
         Some(0.5 * (nats[0]? + nats[1]?))
     }
 
-    /// Evidence of `log` for the first of the two against the second [nats], both fitted to it.
+    /// Returns the log-likelihood ratio of the first hypothesis to the second on `log` [nat], both fitted to it.
     pub fn log_likelihood_ratio(&self, log: Log, simulator: &mut dyn Rollout) -> Result<f64, ExperimentError> {
         let robot = self.model.robot_model().expect("a model that was given is a robot");
         let evidence = ResidualData::new(vec![log], &robot, WindowConfig::DIAGNOSIS)?;
@@ -83,7 +83,7 @@ impl HypothesisPair {
     }
 }
 
-/// What is left with the numbers of a rival moved so that it mimics best: one step of Gauss and Newton.
+/// Returns the residual power of the alternative hypothesis after one Gauss–Newton step of its parameters.
 fn gauss_newton_refit(fit: &FitProblem, evidence: &ResidualData, simulator: &mut dyn Rollout) -> Option<ResidualPower> {
     let task = LeastSquaresProblem {
         file: &fit.file,
@@ -105,19 +105,21 @@ fn gauss_newton_refit(fit: &FitProblem, evidence: &ResidualData, simulator: &mut
     left.min_by(|one, other| expected_gain(evidence, one).total_cmp(&expected_gain(evidence, other)))
 }
 
-/// Evidence that noise on top of differences is expected to give against who predicts them [nats].
+/// Returns the expected log-likelihood ratio [nat] of the true model to the alternative, for noisy data with these
+/// residuals.
 fn expected_gain(evidence: &ResidualData, left: &ResidualPower) -> f64 {
     let of = |channel: usize| -> f64 {
         let rows = evidence.correlation_rows(channel);
         let folds = left.sums[channel].into_iter().zip(left.counts[channel]).filter(|(_, count)| *count > 0.0);
-        // Of power 1 is the noise, which either model leaves.
+        // Power 1 is that of the noise, which remains in both models.
         folds.map(|(sum, count)| 0.5 * count / rows * (sum / count).ln_1p()).sum()
     };
     (0..CHANNELS).map(of).sum()
 }
 
-/// The log that `robot` would make of a motion, without noise, with the channels and the stated noise of `like`; none if it
-/// diverges.
+/// Simulates a motion of `robot` without noise, and returns a log with the channels and the noise metadata of `like`.
+///
+/// Returns `None` if the simulation diverges.
 fn simulated(
     motion: &ExcitationTrajectory,
     robot: &RobotModel,
@@ -152,7 +154,7 @@ fn simulated(
             channel(format!("dq_{name}"), &|row| states.dq[row][joint]);
         }
         if like.tau_measured(name).is_some() {
-            // A sensor at the output sees more than a motor's current; what it sees besides is not counted on.
+            // Also for an output sensor: the additional information that it has is not assumed.
             meta.tau_sensor = TorqueSensor::MotorCurrent;
             channel(format!("tau_measured_{name}"), &|row| {
                 estimated_torque(&states, robot, joint, row, row + 1) as f32

@@ -1,32 +1,34 @@
-//! Safe motions to choose the next experiment from: ten seconds each, well inside the Go2's limits.
+//! Excitation trajectories for the next experiment: 10 s each, within the limits of the Go2.
 
 use std::f64::consts::TAU;
 
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{BaseMount, Joint, JointKind, RobotModel};
 
-/// Length of every motion [s]: of equal length, they are told apart by what they show.
+/// Length of every trajectory [s]; equal lengths make their information comparable.
 const LENGTH_S: f64 = 10.0;
-/// Time in which a motion comes and goes [s].
+/// Time over which a trajectory starts and ends smoothly [s].
 const EASE_S: f64 = 0.5;
 
-/// A motion that any healthy or slightly wrong Go2 gets through.
+/// Excitation trajectory that is safe for any Go2 that does not differ strongly from the ideal one.
 #[derive(Clone, Copy, Debug)]
 pub struct ExcitationTrajectory {
-    /// Its name, as in `chirp_calf`.
+    /// Name, as in `chirp_calf`.
     pub name: &'static str,
-    /// What is done, and where.
+    /// Description of the motion.
     pub what: &'static str,
-    /// Whether the trunk hangs in a stand.
+    /// Mount of the base.
     pub base: BaseMount,
     /// Offset of a joint from the default pose [rad] at a time [s].
     offset: fn(Joint, f64) -> f64,
-    /// Position and velocity gain at a time [s].
+    /// Position gain [N·m/rad] and velocity gain [N·m·s/rad] at a time [s].
     gains: fn(f64) -> [f64; 2],
 }
 
-/// All of them. Chirps show inertia and delays, steps delays, creeping friction and play, holds gravity, springs and gains,
-/// and standing what is loaded.
+/// All excitation trajectories.
+///
+/// Chirps excite inertia and delays, steps delays, slow reversals friction and backlash, and static poses gravity,
+/// springs and gains. Standing trajectories excite effects under load.
 pub const EXCITATION_TRAJECTORIES: [ExcitationTrajectory; 14] = [
     fixed_base(
         "chirp_hip",
@@ -48,7 +50,7 @@ pub const EXCITATION_TRAJECTORIES: [ExcitationTrajectory; 14] = [
     ),
     fixed_base(
         "chirp_firm",
-        "a chirp of all joints in the air with firm gains",
+        "a chirp of all joints in the air with high gains",
         |joint, t| 0.1 * chirp(t) * if joint.index() % 2 == 0 { 1.0 } else { -1.0 },
         stiff_gains,
     ),
@@ -66,7 +68,7 @@ pub const EXCITATION_TRAJECTORIES: [ExcitationTrajectory; 14] = [
     ),
     fixed_base(
         "creep_soft",
-        "slow reversals of all joints in the air with soft gains",
+        "slow reversals of all joints in the air with low gains",
         |joint, t| 0.15 * triangle(joint, 0.25, t),
         soft,
     ),
@@ -79,7 +81,7 @@ pub const EXCITATION_TRAJECTORIES: [ExcitationTrajectory; 14] = [
     fixed_base("holds", "slow changes between postures in the air", |joint, t| pose(joint, t, 1.25), default_gains),
     fixed_base(
         "holds_two_gains",
-        "postures in the air, each held with soft and with firm gains",
+        "postures in the air, each held with low and with high gains",
         |joint, t| pose(joint, t, 2.5),
         |t| if t % 2.5 < 1.25 { soft(t) } else { stiff_gains(t) },
     ),
@@ -129,12 +131,12 @@ fn only(kind: JointKind, joint: Joint, offset: f64) -> f64 {
     if joint.kind == kind { offset } else { 0.0 }
 }
 
-/// From 0.4 to 6 Hz.
+/// Chirp from 0.4 to 6 Hz.
 fn chirp(t: f64) -> f64 {
     (TAU * (0.4 + 0.5 * (6.0 - 0.4) * t / LENGTH_S) * t).sin()
 }
 
-/// A sine with a phase for each joint, so that no two do the same.
+/// Sine with a different phase and frequency for each joint, so that no two joints move alike.
 fn wave(joint: Joint, rate_hz: f64, t: f64) -> f64 {
     (TAU * rate_hz * (1.0 + 0.02 * joint.index() as f64) * t + 2.4 * joint.index() as f64).sin()
 }
@@ -147,13 +149,13 @@ fn multisine(joint: Joint, t: f64) -> f64 {
     [0.3, 0.7, 1.3, 2.3, 3.9].map(|rate| 0.2 * wave(joint, rate, t + rate)).iter().sum()
 }
 
-/// One posture after the other, each for `length` [s].
+/// Sequence of postures of `length` [s].
 fn pose(joint: Joint, t: f64, length: f64) -> f64 {
     let reach = if joint.kind == JointKind::Hip { 0.25 } else { 0.35 };
     hold_of(reach, length, 2.1 * joint.index() as f64, t)
 }
 
-/// Levels within `reach`, each for `length` [s] with the way to it.
+/// Sequence of levels within ±`reach`, each of `length` [s] including the transition to it.
 fn hold_of(reach: f64, length: f64, shift: f64, t: f64) -> f64 {
     let level = |number: f64| reach * (7.3 * number + shift).sin();
     let number = (t / length).floor();
@@ -161,7 +163,7 @@ fn hold_of(reach: f64, length: f64, shift: f64, t: f64) -> f64 {
     level(number) + (level(number + 1.0) - level(number)) * way * way * (3.0 - 2.0 * way)
 }
 
-/// Offsets that lift, pitch and shift the trunk while the feet stay.
+/// Joint offsets that lift, pitch and shift the trunk while the feet do not move.
 fn stance(joint: Joint, lift: f64, pitch: f64, fore: f64) -> f64 {
     let length = lift + pitch * joint.leg.front_sign();
     match joint.kind {
@@ -172,7 +174,7 @@ fn stance(joint: Joint, lift: f64, pitch: f64, fore: f64) -> f64 {
 }
 
 impl ExcitationTrajectory {
-    /// Its commands to `robot`, one row a period of the actuator.
+    /// Returns the commands of the trajectory for `robot`, with one row per actuator period.
     pub fn motion(&self, robot: &RobotModel) -> Log {
         let rate_hz = robot.control.actuator_hz;
         let t: Vec<f64> = (0..(LENGTH_S * rate_hz) as usize).map(|row| row as f64 / rate_hz).collect();
@@ -193,6 +195,6 @@ impl ExcitationTrajectory {
         let mut meta = Meta::new(rate_hz, TorqueSensor::None, segments);
         meta.joints = Joint::ALL.map(|joint| joint.name().to_owned()).to_vec();
         meta.source = Some(format!("twinstep: {}", self.what));
-        Log::new_commands(meta, columns).expect("commands of all joints at even times are a motion")
+        Log::new_commands(meta, columns).expect("commands of all joints at uniform times are a valid motion file")
     }
 }

@@ -1,4 +1,4 @@
-//! The next experiment: of our safe motions, the one that best parts what the log could not.
+//! Experiment design: selects the excitation trajectory that discriminates best between ambiguous causes.
 
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, EffectEntry};
@@ -12,21 +12,23 @@ use super::{AMBIGUITY_NATS, Accepted, ambiguous};
 use crate::excitation::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
 use crate::findings::{CorrelatedPair, DiscriminatedPair, NextExperiment};
 
-/// Most pairs of causes that are asked about: each is simulated in every motion.
+/// Maximum number of pairs of causes; each is simulated with every trajectory.
 const MAX_PAIRS: usize = 4;
-/// Nothing simulates voltage and heat, so what depends on them cannot be predicted.
+/// Effects that are not predicted, because voltage and temperature are not simulated.
 const NOT_PREDICTED: [&str; 2] = ["supply_sag", "thermal_derating"];
 
-/// What to play next, and its commands.
+/// Proposed experiment with its commands.
 #[derive(Clone, Debug)]
 pub struct ProposedExperiment {
-    /// What is said of it; the name of its motion is left to who writes the files.
+    /// Summary for the findings. The caller that writes the files sets the name of the motion file.
     pub summary: NextExperiment,
-    /// Its commands.
+    /// Commands of the experiment.
     pub motion: Log,
 }
 
-/// The motion that parts the rivals best; none without rivals, or where none of ours parts two of them.
+/// Returns the trajectory that discriminates best between the pairs.
+///
+/// Returns `None` without pairs, or if no trajectory discriminates between any of them.
 pub fn next_motion(
     pairs: &[HypothesisPair],
     evidence: &ResidualData,
@@ -36,7 +38,7 @@ pub fn next_motion(
     if pairs.is_empty() {
         return None;
     }
-    // A trunk whose motion nobody measured tells nothing on the ground.
+    // Trajectories on the ground need measured base motion.
     let on_ground = evidence.has_free_parts();
     let motions: Vec<ExcitationTrajectory> =
         EXCITATION_TRAJECTORIES.into_iter().filter(|motion| on_ground || motion.base == BaseMount::Fixed).collect();
@@ -45,7 +47,7 @@ pub fn next_motion(
         pairs.iter().map(|pair| pair.expected_log_likelihood_ratio(motion, like, simulator).unwrap_or(0.0)).collect()
     };
     let predicted: Vec<Vec<f64>> = motions.iter().map(&mut nats).collect();
-    // Of two rivals that are parted well already, more evidence is worth less than of two that are not.
+    // The logarithm favours pairs with a small ratio over those that are already well discriminated.
     let worth = |motion: usize| predicted[motion].iter().map(|nats| nats.ln_1p()).sum::<f64>();
     let best = (0..motions.len()).max_by(|one, other| worth(*one).total_cmp(&worth(*other)))?;
     let parts = pairs.iter().enumerate().map(|(index, pair)| {
@@ -63,7 +65,7 @@ pub fn next_motion(
     Some(ProposedExperiment { summary: said, motion: motions[best].motion(robot) })
 }
 
-/// Causes with rivals that explain as much, and causes whose sizes this log cannot tell apart.
+/// Returns pairs of causes with ambiguous alternatives, and pairs of causes with highly correlated estimates.
 pub fn pairs(extended: &ModelFile, accepted: &Accepted, confusable: &[CorrelatedPair]) -> Vec<HypothesisPair> {
     let mut pairs = Vec::new();
     for (best, others) in accepted {
@@ -85,7 +87,7 @@ pub fn pairs(extended: &ModelFile, accepted: &Accepted, confusable: &[Correlated
     pairs
 }
 
-/// One or the other, on top of all other causes.
+/// Returns a pair of two hypotheses on top of all other causes.
 fn hypothesis_pair(extended: &ModelFile, one: &Hypothesis, other: &Hypothesis) -> HypothesisPair {
     let is = |entry: &EffectEntry, hypothesis: &Hypothesis| {
         entry.effect.name == hypothesis.effect.name
@@ -100,11 +102,15 @@ fn hypothesis_pair(extended: &ModelFile, one: &Hypothesis, other: &Hypothesis) -
     HypothesisPair::new(model, [side(one), side(other)])
 }
 
-/// Which rivals it parts, and how far.
+/// Describes the experiment and the pairs between which it discriminates. Returns `None` without pairs.
 fn words(motion: &ExcitationTrajectory, parts: &[DiscriminatedPair]) -> Option<String> {
     let pairs = parts.iter().map(|DiscriminatedPair { effects: [one, other], predicted_nats, median_nats }| {
-        format!("{one} from {other} by a predicted {predicted_nats:.0} nats (the median motion by {median_nats:.0})")
+        format!(
+            "{one} and {other}, expected log-likelihood ratio {predicted_nats:.0} nat (median trajectory: \
+             {median_nats:.0} nat)"
+        )
     });
-    let pairs = pairs.collect::<Vec<_>>().join(", ");
-    (!pairs.is_empty()).then(|| format!("Play {}, 10 s of {}: it parts {pairs}.", motion.name, motion.what))
+    let pairs = pairs.collect::<Vec<_>>().join("; ");
+    (!pairs.is_empty())
+        .then(|| format!("Run {}, 10 s of {}. It discriminates between {pairs}.", motion.name, motion.what))
 }

@@ -19,7 +19,8 @@ pub struct Diagnosis {
     pub confusable: Vec<CorrelatedPair>,
     /// Unexplained residual.
     pub unexplained: Unexplained,
-    /// Experiment that discriminates between ambiguous causes; `None` if there are none, or no trajectory discriminates.
+    /// Experiment that discriminates between ambiguous causes; `None` if there are none, or no trajectory
+    /// discriminates.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next_experiment: Option<NextExperiment>,
     /// File name of the corrected model, in the same folder.

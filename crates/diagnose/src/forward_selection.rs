@@ -76,8 +76,8 @@ pub struct ForwardSelection<'a> {
 impl<'a> ForwardSelection<'a> {
     /// Runs forward selection with backward elimination.
     ///
-    /// Each round adds the best candidate and refits all causes. If none reaches the threshold, a cause that is too small,
-    /// implausible, or leaves more than half of its own channels' error is removed and excluded.
+    /// Each round adds the best candidate and refits all causes. If none reaches the threshold, a cause that is too
+    /// small, implausible, or leaves more than half of its own channels' error is removed and excluded.
     pub fn run(&mut self) -> Result<(), DiagnoseError> {
         let mut excluded = Vec::new();
         for _ in 0..MOST_SEARCHES {

@@ -1,46 +1,46 @@
-//! What might be wrong: an effect on a scope, with values.
+//! Hypothesis: an effect on a scope, with values.
 
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Composition, Effect, EffectEntry, EntryError, Scope, Target};
 use twinstep_model::Joint;
 
-/// Shares of the way from no effect to the end of its plausible range that are tried.
+/// Grid of sizes, relative to the distance from no effect to the end of the prior range.
 const SHARES: [f64; 5] = [0.1, 0.2, 0.4, 0.75, 1.3];
-/// A finding smaller than this share of its plausible range is not worth a name.
+/// Minimum size of a cause, relative to its prior range.
 const LEAST_SHARE: f64 = 0.1;
-/// The same of effects that errors of a millimetre in geometry, or another law of contact, look like.
+/// Minimum sizes of effects that geometry errors of 1 mm or another contact law imitate.
 const LEAST_SHARES: [(&str, f64); 3] = [("encoder_offset", 0.3), ("com_shift", 0.12), ("ground_stiffness", 0.3)];
 
-/// An effect on a scope, with values.
+/// Effect on a scope, with values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Hypothesis {
     /// The effect.
     pub effect: &'static Effect,
-    /// What it is about.
+    /// The scope of the effect.
     pub scope: Scope,
-    /// Its values, parameter after parameter.
+    /// Values of all parameters, in the order of the effect's parameters.
     pub values: Vec<f64>,
 }
 
 impl Hypothesis {
-    /// As people write it, `armature@calf`.
+    /// Returns the name with scope, as in `armature@calf`.
     pub fn name(&self) -> String {
         format!("{}@{}", self.effect.name, self.scope)
     }
 
-    /// Whether it is large enough to be worth a name.
+    /// Returns true if it is large enough to be reported as a cause.
     pub fn exceeds_min_size(&self) -> bool {
         let own = LEAST_SHARES.iter().find(|(name, _)| *name == self.effect.name);
         relative_size(self.effect, &self.values) >= own.map_or(LEAST_SHARE, |(_, least)| *least)
     }
 
-    /// Whether a robot may have it: no value is half as far again from none of it as the plausible range goes.
+    /// Returns true if all values are plausible: at most half the range outside the prior range.
     pub fn is_plausible(&self) -> bool {
         let parameters = self.effect.parameters.iter().flat_map(|one| std::iter::repeat_n(one, one.count));
         parameters.zip(&self.values).all(|(parameter, value)| {
             let [low, high] = parameter.prior_range;
             let beyond = 0.5 * (high - parameter.no_effect_value).max(parameter.no_effect_value - low);
-            // An infinite one is none of it.
+            // The value without effect is infinite: only values below the range are implausible.
             if parameter.no_effect_value.is_infinite() {
                 *value >= 0.5 * low
             } else {
@@ -50,7 +50,9 @@ impl Hypothesis {
     }
 }
 
-/// How far along the way from no effect to the end of the plausible range the largest of an effect's main values is.
+/// Returns the size of an effect, relative to the distance from no effect to the end of the prior range.
+///
+/// It is the largest of the components of the first parameter.
 fn relative_size(effect: &Effect, values: &[f64]) -> f64 {
     let parameter = &effect.parameters[0];
     let [low, high] = parameter.prior_range;
@@ -68,10 +70,10 @@ fn relative_size(effect: &Effect, values: &[f64]) -> f64 {
     values[..parameter.count].iter().map(of).fold(0.0, f64::max)
 }
 
-/// The model with an effect of these values on every one of `joints`, or of the whole.
+/// Returns the model with an effect of these values on every joint, or on supply, base or ground.
 pub fn with_effect(model: &ModelFile, effect: &'static Effect, values: &[f64]) -> Result<ModelFile, EntryError> {
     let mut file = model.clone();
-    // One entry a joint: where an effect replaces, the narrowest counts.
+    // One entry per joint: if the effect replaces, the entry with the narrowest scope applies.
     let scopes: Vec<Scope> = match effect.target {
         Target::Joints => Joint::ALL.map(Scope::Joint).to_vec(),
         Target::Supply => vec![Scope::All],
@@ -87,7 +89,7 @@ pub fn with_effect(model: &ModelFile, effect: &'static Effect, values: &[f64]) -
     Ok(file)
 }
 
-/// Values to try, from small to large, of effects on joints and on the supply.
+/// Returns the grid of values, from small to large, for effects on joints and on the supply.
 pub fn grid(effect: &Effect) -> Vec<Vec<f64>> {
     let main = &effect.parameters[0];
     let [low, high] = main.prior_range;
@@ -116,8 +118,9 @@ pub fn grid(effect: &Effect) -> Vec<Vec<f64>> {
     firsts.flat_map(|first| seconds.iter().map(move |second| [&[first][..], second].concat())).collect()
 }
 
-/// Values to try of an effect on one scope, from small to large. Delays and lags with which a loop rings stay in step only
-/// where they are nearly right: of those there are more.
+/// Returns the grid of values of an effect on one scope, from small to large.
+///
+/// The grid of delays and lags is finer: an oscillating loop stays in phase only if they are nearly correct.
 pub fn fine_grid(effect: &Effect) -> Vec<Vec<f64>> {
     let coarse = match effect.target {
         Target::Joints | Target::Supply if effect.name != "encoder_offset" => grid(effect),
@@ -129,7 +132,7 @@ pub fn fine_grid(effect: &Effect) -> Vec<Vec<f64>> {
     coarse.iter().flat_map(|values| [0.8, 1.0, 1.25].map(|factor| vec![factor * values[0]])).collect()
 }
 
-/// Values to try of an effect that is judged by the whole log; each component of a vector alone.
+/// Returns the grid of values of an effect that is evaluated on the whole log, for each component of a vector alone.
 pub fn body_grid(effect: &Effect) -> Vec<Vec<f64>> {
     match effect.name {
         "payload" => [-0.5, 0.3, 0.8, 2.0].map(|mass| vec![mass, 0.0, 0.0, 0.0]).to_vec(),
@@ -158,14 +161,16 @@ fn pd_gains(effect: &Effect) -> Vec<Vec<f64>> {
     scales(0).map(|kp| vec![kp, 1.0]).chain(scales(1).map(|kd| vec![1.0, kd])).collect()
 }
 
-/// Ripples of one size, every third number of cycles and four phases. Joints move within half a radian of their middle, where
-/// two numbers next but one to each other are half a radian out of step at most, which a descent mends.
+/// Returns ripples of one amplitude, with every third number of cycles and four phases.
+///
+/// Joints move within 0.5 rad of their mean position. There the phase error to the nearest grid value is at most 0.5
+/// rad, which the refinement corrects.
 fn ripples() -> Vec<Vec<f64>> {
     let phases = [0.0, 0.5, 1.0, -0.5].map(|turn| turn * std::f64::consts::PI);
     (7..=150).step_by(3).flat_map(|cycles| phases.map(|phase| vec![0.12, f64::from(cycles), phase])).collect()
 }
 
-/// What having chosen among all scopes of its kind costs [nats].
+/// Returns the penalty for the selection among all scopes of the same kind [nat].
 pub fn selection_penalty(scope: Scope) -> f64 {
     let kinds: f64 = match scope {
         Scope::Kind(_) => 3.0,

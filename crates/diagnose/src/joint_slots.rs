@@ -1,5 +1,6 @@
-//! Joints of any robot, at most twelve, in the slots of the Go2's: what their actuators make of measured states and commands,
-//! which no simulation of a body is needed for.
+//! Joints of any robot, at most twelve, mapped to the joint slots of the Go2.
+//!
+//! The actuator torques are computed from measured states and commands, without simulation of bodies.
 
 use std::collections::BTreeMap;
 
@@ -14,30 +15,32 @@ use super::residual_rows::fold_of;
 use twinstep_identify::torque::MeasuredTorque;
 use twinstep_logs::replay::ReplayError;
 
-/// Quantities of a joint that its actuator's torque is made of.
+/// Quantities that determine the torque of a joint's actuator, and the measured torque.
 const QUANTITIES: [&str; 7] = ["q", "dq", "q_cmd", "dq_cmd", "tau_ff", "tau_measured", "temp"];
-/// The largest torque in the slots, which a Go2's actuator has too: what is plausible of its friction then is of any.
+/// Torque in the slots to which the largest measured torque is scaled [N·m].
+///
+/// It is typical of the Go2, so that the Go2's prior ranges apply to any robot.
 const LARGEST_NM: f64 = 20.0;
-/// Torques this long apart [s] are independent.
+/// Correlation time of torque residuals [s].
 const INDEPENDENT_S: f64 = 0.1;
 
 /// Joints in slots.
 pub struct JointSlots {
-    /// Their own names.
+    /// Names of the joints in the logs.
     names: Vec<String>,
-    /// Whether these are all joints of the robot.
+    /// True if these are all joints of the robot.
     whole: bool,
-    /// The logs with the joints in their slots, and nothing else.
+    /// Logs with only these joints, renamed to their slots.
     logs: Vec<Log>,
     torques: Vec<MeasuredTorque>,
-    /// What a unit of torque in the slots is [N·m].
+    /// Unit of torque in the slots [N·m].
     pub torque_scale: f64,
-    /// An ideal actuator in every seat, without limits, that ticks with the rows of the logs.
+    /// Ideal actuator without limits in every slot, with one actuator period per row.
     ideal: RobotModel,
 }
 
 impl JointSlots {
-    /// The joints `names` of `logs`.
+    /// Creates the slots for the joints `names` of `logs`.
     pub fn new(logs: &[Log], names: &[String]) -> Result<Self, ReplayError> {
         let whole = names.len() == logs[0].joints().len();
         let mut ideal = go2();
@@ -54,28 +57,28 @@ impl JointSlots {
         Ok(Self { names: names.to_vec(), whole, logs, torques, ideal, torque_scale: unit })
     }
 
-    /// What a cause may be about: all joints, or one.
+    /// Returns the scopes that a cause can have: all joints, or one joint.
     pub fn scopes(&self) -> Vec<Scope> {
         let single = Joint::ALL.into_iter().take(self.names.len()).map(Scope::Joint);
         std::iter::once(Scope::All).filter(|_| self.names.len() > 1).chain(single).collect()
     }
 
-    /// Seats of a scope.
+    /// Returns the slots of a scope.
     pub fn of(&self, scope: Scope) -> impl Iterator<Item = usize> {
         (0..self.names.len()).filter(move |seat| scope.contains(Joint::ALL[*seat]))
     }
 
-    /// A scope by the joints' own names.
+    /// Returns the name of a scope, with the names of the joints in the logs.
     pub fn scope_name(&self, scope: Scope) -> String {
         match scope {
             Scope::Joint(joint) => self.names[joint.index()].clone(),
-            // Others of the robot were looked at apart.
+            // Other joints of the robot are in another group.
             _ if !self.whole => self.names.join("+"),
             scope => scope.to_string(),
         }
     }
 
-    /// A joint's own name.
+    /// Returns the name of a joint in the logs.
     pub fn name(&self, seat: usize) -> &str {
         &self.names[seat]
     }
@@ -85,22 +88,22 @@ impl JointSlots {
         self.logs.iter().map(|log| log.meta().rate_hz).fold(0.0, f64::max)
     }
 
-    /// Rows that count as one.
+    /// Returns the correlation length of torque residuals [rows].
     pub fn rows_in_one(&self) -> f64 {
         (INDEPENDENT_S * self.max_rate_hz()).max(1.0)
     }
 
-    /// Actuators with these effects; none that are no actuators.
+    /// Returns the actuators with these effects. Returns `None` if the entries conflict.
     pub fn robot(&self, entries: &[EffectEntry]) -> Option<RobotModel> {
         apply_effects(&self.ideal, entries).ok()
     }
 
-    /// Whether an effect shows in torques at all, where the sensor is.
+    /// Returns true if two robots predict different torques at the sensor.
     pub fn affects_torque(&self, robot: &RobotModel, other: &RobotModel) -> bool {
         self.torques.iter().any(|torques| !torques.predict_same_torque(robot, other))
     }
 
-    /// What candidates leave of the torques.
+    /// Returns the residual power of the torques of each candidate.
     pub fn residual_powers(&self, robots: &[RobotModel]) -> Vec<ResidualPower> {
         let left = |robot: &RobotModel| {
             let mut left = ResidualPower::empty();
@@ -115,7 +118,7 @@ impl JointSlots {
         robots.par_iter().map(left).collect()
     }
 
-    /// Sums of squares of what `robot` leaves on the seconds that are set aside, and of noise alone [N²·m²]; and rows.
+    /// Returns sums over held-out blocks: squared residuals of `robot` and noise variance [N²·m²], and number of rows.
     pub fn held_out_sums(&self, robot: &RobotModel) -> [f64; 3] {
         let (mut squares, mut noise, mut rows) = (0.0, 0.0, 0.0);
         for (log, torques) in self.logs.iter().zip(&self.torques) {
@@ -131,7 +134,7 @@ impl JointSlots {
         [self.torque_scale * self.torque_scale * squares, self.torque_scale * self.torque_scale * noise, rows]
     }
 
-    /// What `robot` leaves of the torque of a seat in the first log, by row; not a number where nothing was measured.
+    /// Returns the torque residual of a slot in the first log, by row; NaN if torque was not measured.
     pub fn residual(&self, robot: &RobotModel, seat: usize) -> Vec<f64> {
         let mut residual = vec![f64::NAN; self.logs[0].rows()];
         self.torques[0].differences(robot, |joint, row, difference| {
@@ -143,7 +146,9 @@ impl JointSlots {
     }
 }
 
-/// `log` with `names` in their slots, torques in units of `unit` [N·m], and nothing else but the supply.
+/// Returns `log` with only the supply voltage and the joints `names`, renamed to their slots.
+///
+/// Torques are in units of `unit` [N·m].
 fn into_slots(log: &Log, names: &[String], unit: f64) -> Result<Log, ReplayError> {
     let index = |cells: &[u32]| cells.iter().map(|cell| f64::from(*cell)).collect();
     let mut columns: BTreeMap<String, Vec<f64>> = BTreeMap::new();
@@ -170,7 +175,7 @@ fn into_slots(log: &Log, names: &[String], unit: f64) -> Result<Log, ReplayError
             columns.insert(format!("{gain}_{seat}"), cells);
         }
     }
-    // No body moves here: whatever held it, its joints are measured.
+    // The base is fixed in all segments, because bodies are not simulated.
     let held = |segment: &Segment| Segment { base: BaseMount::Fixed, ..segment.clone() };
     let meta = Meta {
         joints: JOINT_NAMES[..names.len()].iter().map(ToString::to_string).collect(),
@@ -180,5 +185,5 @@ fn into_slots(log: &Log, names: &[String], unit: f64) -> Result<Log, ReplayError
         noise,
         ..log.meta().clone()
     };
-    Ok(Log::new(meta, columns).expect("a log with other names is one"))
+    Ok(Log::new(meta, columns).expect("a log with renamed joints is valid"))
 }

@@ -13,9 +13,9 @@
 //! Joints that are not a Go2's are diagnosed by their torques only: [`torque_only`], with [`joint_slots`] and
 //! [`torque_fit`].
 //!
-//! A candidate is accepted as a cause if its log-likelihood gain exceeds [`forward_selection::THRESHOLD`], it explains at
-//! least [`forward_selection::MIN_EXPLAINED_FRACTION`] of the residual power above noise, and it exceeds a minimum size. All
-//! accepted causes are then refitted together, and the search continues.
+//! A candidate is accepted as a cause if its log-likelihood gain exceeds [`forward_selection::THRESHOLD`], it explains
+//! at least [`forward_selection::MIN_EXPLAINED_FRACTION`] of the residual power above noise, and it exceeds a minimum
+//! size. All accepted causes are then refitted together, and the search continues.
 
 mod cross_validation;
 mod discrimination;
@@ -60,9 +60,11 @@ use twinstep_identify::nuisance::NuisanceModel;
 use twinstep_identify::refine::{SIMULATOR_MISMATCH_STD, covariance};
 use twinstep_identify::window::WindowConfig;
 
-/// Difference of the log-likelihood gain [nat], or its fraction of the cause's gain, within which an alternative is
-/// ambiguous. Simulators of the same law differ by as much.
+/// Difference of the log-likelihood gain from that of a cause within which an alternative is ambiguous [nat].
+///
+/// Simulators of the same law differ by as much.
 const AMBIGUITY_NATS: f64 = 6.0;
+/// The same difference, divided by the gain of the cause; the larger of the two applies.
 const AMBIGUITY_FRACTION: f64 = 0.05;
 
 /// Reason why a diagnosis is impossible.
@@ -151,8 +153,8 @@ pub fn diagnose(
 
 /// Returns the model with the ground's time constant fitted to the log, if the change is too small for a cause.
 ///
-/// Contact laws differ between any two simulators. Without this step the difference is attributed to a shifted mass or an
-/// elastic gear.
+/// Contact laws differ between any two simulators. Without this step the difference is attributed to a shifted mass or
+/// an elastic gear.
 fn with_fitted_ground(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> ModelFile {
     let effect = Effect::named("ground_stiffness").expect("an effect of the catalogue");
     let own = model.effects.iter().rfind(|entry| entry.effect == effect);

@@ -1,5 +1,7 @@
-//! Evidence along each number of a fit. A loop that rings, or a gear with play, has many small valleys: slopes tell neither
-//! which of them is the deepest nor how far its neighbours are as good.
+//! Profile likelihood along each parameter of a fit.
+//!
+//! Oscillating loops and backlash create many local minima. Derivatives indicate neither the global minimum nor the
+//! range of neighbouring minima that are almost as good.
 
 use twinstep_model::{RobotModel, Rollout};
 
@@ -7,24 +9,25 @@ use super::cross_validation::FitProblem;
 use super::residual_data::ResidualData;
 use super::scan::log_likelihood_gain;
 
-/// Steps from a number, either way [prior deviations].
+/// Distances of the points from the estimate, in both directions [prior std].
 const STEPS: [f64; 9] = [0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8];
-/// What a number loses at the ends of its 95 % interval [nats]: half of the quantile of χ² with one degree of freedom.
+/// Decrease of the log-likelihood at the ends of a 95 % interval [nat]: half the 95 % quantile of χ² with one degree of
+/// freedom.
 pub const LOG_LIKELIHOOD_DROP_95: f64 = 1.92;
-/// A place that is better by so much [nats] is worth a descent from there.
+/// Log-likelihood gain of a point from which the refinement is restarted [nat].
 const MIN_RESTART_GAIN: f64 = 3.0;
-/// Most descents.
+/// Maximum number of restarts.
 const MAX_RESTARTS: usize = 4;
 
-/// A place along one of the unknowns.
+/// Point of the profile along one parameter.
 struct ProfilePoint {
     unknown: usize,
     coordinate: f64,
-    /// Evidence that is gained there.
+    /// Log-likelihood gain over the estimate [nat].
     gain: f64,
 }
 
-/// The numbers that follow the logs best, and no place along one of them is better.
+/// Refines a fit, and restarts from points of the profile with higher likelihood. Returns the best point [coordinates].
 pub fn refine_with_restarts(fit: &FitProblem, evidence: &ResidualData, simulator: &mut dyn Rollout) -> Vec<f64> {
     let mut fit = fit.clone();
     let mut best = fit.solve(&evidence.fit_rows, simulator);
@@ -45,7 +48,8 @@ pub fn refine_with_restarts(fit: &FitProblem, evidence: &ResidualData, simulator
     best
 }
 
-/// Coordinates between which each unknown of `fit` loses less than it does at the ends of its interval.
+/// Returns the profile-likelihood interval of each parameter: points with a drop of less than
+/// [`LOG_LIKELIHOOD_DROP_95`] [coordinates].
 pub fn profile_intervals(fit: &FitProblem, evidence: &ResidualData, simulator: &mut dyn Rollout) -> Vec<[f64; 2]> {
     let mut ends: Vec<[f64; 2]> = fit.initial_point.iter().map(|coordinate| [*coordinate; 2]).collect();
     for ProfilePoint { unknown, coordinate, gain } in places(fit, evidence, simulator) {
@@ -57,7 +61,7 @@ pub fn profile_intervals(fit: &FitProblem, evidence: &ResidualData, simulator: &
     ends
 }
 
-/// Places along each unknown, either way from where `fit` begins.
+/// Evaluates the profile along each parameter, in both directions from the initial point of `fit`.
 fn places(fit: &FitProblem, evidence: &ResidualData, simulator: &mut dyn Rollout) -> Vec<ProfilePoint> {
     let mut places = Vec::new();
     for (index, unknown) in fit.unknowns.iter().enumerate() {
@@ -79,7 +83,7 @@ fn places(fit: &FitProblem, evidence: &ResidualData, simulator: &mut dyn Rollout
     places
 }
 
-/// Evidence that is gained at `points` [nats] against where `fit` begins; none where there is no robot.
+/// Returns the log-likelihood gain of `points` over the initial point of `fit` [nat]; −∞ if a robot is not valid.
 fn gains(fit: &FitProblem, points: &[Vec<f64>], evidence: &ResidualData, simulator: &mut dyn Rollout) -> Vec<f64> {
     let robot = |point: &[f64]| fit.model(point).robot_model().ok();
     let all: Vec<Option<RobotModel>> =
@@ -107,11 +111,12 @@ mod tests {
     /// Rows of a window of [`WindowConfig::DIAGNOSIS`].
     const WINDOW: usize = 400;
     const TRUTH: f64 = 0.3;
-    /// What friction changes by from one valley to the next [N·m·s].
+    /// Distance between neighbouring local minima [N·m·s].
     const VALLEY: f64 = 0.06;
 
-    /// Rings, out of step with the truth by as much as its friction at the first joint is: next to the truth there is a
-    /// valley every [`VALLEY`], each less deep than the one before.
+    /// Returns an oscillation whose phase error is proportional to the error of the friction.
+    ///
+    /// The residual has a local minimum every [`VALLEY`], with a depth that decreases with the distance from the truth.
     fn position(friction: f64, row: usize) -> f64 {
         let phase = std::f64::consts::TAU * (friction - TRUTH) / VALLEY;
         0.02 * (0.7 * row as f64 + phase).sin() + 0.1 * (friction - TRUTH)
@@ -137,7 +142,7 @@ mod tests {
         let column = |name: &str, of: &dyn Fn(usize) -> f64| (name.to_owned(), (0..rows).map(of).collect());
         let columns = [
             column("t", &|row| row as f64 / RATE_HZ),
-            // A window begins with the row that the one before it ends with.
+            // The first row of a window is the last row of the previous one.
             column("q_FL_hip", &|row| position(TRUTH, if row == 0 { 0 } else { (row - 1) % WINDOW + 1 })),
             column("q_cmd_FL_hip", &|_| 0.0),
             column("kp", &|_| 25.0),
@@ -155,16 +160,16 @@ mod tests {
     }
 
     #[test]
-    fn descent_that_ends_in_the_next_valley_finds_the_deepest() {
+    fn restart_leaves_a_local_minimum() {
         let (evidence, fit) = (evidence(), fit(TRUTH + VALLEY));
         let stuck = fit.solve(&evidence.fit_rows, &mut Ringing)[0];
-        assert!((stuck - TRUTH - VALLEY).abs() < 0.2 * VALLEY, "slopes lead to {stuck}");
+        assert!((stuck - TRUTH - VALLEY).abs() < 0.2 * VALLEY, "the refinement converges to {stuck}");
         let found = refine_with_restarts(&fit, &evidence, &mut Ringing)[0];
         assert!((found - TRUTH).abs() < 0.05 * VALLEY, "{found}");
     }
 
     #[test]
-    fn what_is_near_loses_less_than_two_nats_and_the_next_valley_loses_more() {
+    fn profile_interval_excludes_the_neighbouring_minimum() {
         let [low, high] = profile_intervals(&fit(TRUTH), &evidence(), &mut Ringing)[0];
         assert!((low..=high).contains(&TRUTH) && high - low < VALLEY, "{low} to {high}");
     }

@@ -1,4 +1,4 @@
-//! What is found, as people read it.
+//! Conversion of fits to reported findings: intervals, estimates and explanations.
 
 use std::collections::BTreeMap;
 
@@ -12,16 +12,20 @@ use crate::findings::{AlternativeCause, CorrelatedPair, Estimate, ParameterValue
 use twinstep_identify::experiment::ResidualChannel;
 use twinstep_identify::parameter::set_intervals;
 
-/// Correlations of this size and above are named.
+/// Absolute correlation from which a pair of causes is reported.
 const CORRELATED: f64 = 0.9;
-/// How far two simulators of one law are apart in its size, relative: a standard deviation. Measured on hunts of development,
-/// where errors of one or two percent in limits of speed, delays and gains were outside of narrower intervals.
+/// Relative standard deviation of an effect's size between two simulators of the same law.
+///
+/// Measured in blind tests during development: errors of 1 to 2 % in speed limits, delays and gains were outside of
+/// narrower intervals.
 pub const SIMULATOR_MISMATCH_REL_STD: f64 = 0.015;
-/// The normal distribution's two-sided 95 %.
+/// Half width of the central 95 % interval of a normal distribution [standard deviations].
 pub const TWO_SIDED_95: f64 = 1.96;
 
-/// The model of a fit with intervals, and what cannot be told apart; `least` is the deviation that no number is better than,
-/// and `near` are the ends of what is about as good, by unknown.
+/// Returns the model of a fit with intervals, and pairs of highly correlated causes.
+///
+/// `min_std` is a lower bound on each standard deviation [prior std]. `near` is the profile-likelihood interval of each
+/// parameter [coordinates].
 pub fn with_intervals(
     fit: &FitProblem,
     covariance: Option<&DMatrix<f64>>,
@@ -59,7 +63,7 @@ pub fn with_intervals(
                 confusable.push(CorrelatedPair {
                     effects: [other.effect.name.to_owned(), one.effect.name.to_owned()],
                     correlation,
-                    experiment: experiment.unwrap_or("Another motion, with other speeds and loads.").to_owned(),
+                    experiment: experiment.unwrap_or("A different motion, with other speeds and loads.").to_owned(),
                 });
             }
         }
@@ -67,7 +71,7 @@ pub fn with_intervals(
     (model, confusable)
 }
 
-/// The values of a cause with the intervals of its entry in the extended model.
+/// Returns the values of a cause with the intervals of its entry in the extended model.
 pub fn estimates(hypothesis: &Hypothesis, extended: &ModelFile) -> BTreeMap<String, Estimate> {
     let mut entries = extended.effects.iter().rev();
     let entry = entries.find(|entry| entry.effect == hypothesis.effect && entry.scope == hypothesis.scope);
@@ -98,7 +102,7 @@ pub fn estimates(hypothesis: &Hypothesis, extended: &ModelFile) -> BTreeMap<Stri
     estimates
 }
 
-/// A trial as a rival.
+/// Returns a candidate as an alternative hypothesis.
 pub fn rival(trial: &CandidateFit) -> AlternativeCause {
     AlternativeCause {
         effect: trial.hypothesis.effect.name.to_owned(),
@@ -107,13 +111,13 @@ pub fn rival(trial: &CandidateFit) -> AlternativeCause {
     }
 }
 
-/// Why, in a sentence.
+/// Returns the explanation of a cause as text.
 pub fn explanation(best: &CandidateFit, others: &[CandidateFit]) -> String {
     let hypothesis = &best.hypothesis;
     let size = hypothesis.effect.parameters.iter().zip(&hypothesis.values).next();
     let size = size.map_or(String::new(), |(parameter, value)| format!(" of {value:.4} {}", parameter.unit));
     let mut text = format!(
-        "{} at {}{}: on seconds that it was not fitted to it takes {:.0} % off the error where it acts.",
+        "{} at {}{}: it reduces the cross-validated RMS error in the affected channels by {:.0} %.",
         hypothesis.effect.name.replace('_', " "),
         hypothesis.scope,
         size.trim_end(),
@@ -121,12 +125,12 @@ pub fn explanation(best: &CandidateFit, others: &[CandidateFit]) -> String {
     );
     if let Some(other) = others.first() {
         let behind = best.score - other.score;
-        text = format!("{text} Next best is {}, {behind:.0} nats behind.", other.hypothesis.name());
+        text = format!("{text} Best alternative: {}, {behind:.0} nat less.", other.hypothesis.name());
     }
     text + " " + hypothesis.effect.signature
 }
 
-/// What the sensors alone would leave.
+/// Returns the RMS errors due to sensor noise alone.
 pub fn noise_floor(evidence: &ResidualData) -> RmsErrors {
     let experiments = &evidence.fit_rows.experiments;
     let sigmas = experiments.iter().flat_map(|experiment| {
@@ -153,7 +157,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn interval_holds_what_is_as_good_and_what_another_simulator_would_say() {
+    fn interval_includes_the_profile_and_the_mismatch_between_simulators() {
         let effect = Effect::named("torque_gain").expect("an effect of the catalogue");
         let hypothesis = Hypothesis { effect, scope: Scope::All, values: vec![0.8] };
         let fit = FitProblem::new(&ModelFile::default(), &[hypothesis]).expect("a fit");
@@ -163,7 +167,7 @@ mod tests {
             model.effects[0].intervals[0].expect("an interval")
         };
         let [low, high] = interval([0.8, 0.8]);
-        // 1.96 times 1.5 % of the way from 1, which changes nothing.
+        // 1.96 times 1.5 % of the distance from 1, the gain without effect.
         assert!((low - 0.79412).abs() < 1e-6 && (high - 0.80588).abs() < 1e-6, "{low} to {high}");
         let [low, high] = interval([0.7, 0.8]);
         assert!(low == 0.7 && (high - 0.80588).abs() < 1e-6, "{low} to {high}");

@@ -1,7 +1,7 @@
-//! Logs as evidence: what a candidate model leaves of each channel, in two folds of alternating seconds. Every fifth second is
-//! set aside.
+//! Residuals of motion and torque of logs, in two folds of alternating seconds. Every fifth second is held out.
 
 use rayon::prelude::*;
+use twinstep_effects::{DataRequirement, Effect};
 use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout};
 
@@ -12,27 +12,28 @@ use twinstep_identify::nuisance::NuisanceModel;
 use twinstep_identify::torque::MeasuredTorque;
 use twinstep_identify::window::WindowConfig;
 
-/// Errors of a torque of this size, beside the noise, are any simulator's [N·m].
+/// Standard deviation of the model error of torques, in addition to noise [N·m].
 const MISFIT_NM: f64 = 0.02;
-/// Share of a joint's motion that a model may miss before it is lost.
+/// Mean squared position error, divided by the variance of the measured position, above which a joint is not tracked.
 const MAX_UNTRACKED_VARIANCE: f64 = 0.1;
-/// Rows this long apart [s] are independent: positions, torques, the trunk, and its gyroscope, which has more noise than error.
+/// Correlation time of residuals [s]: positions, torques, base motion, and gyroscope, whose noise exceeds its model
+/// error.
 const INDEPENDENT_S: [f64; 4] = [0.2, 0.1, 0.5, 0.05];
 
-/// Logs of one robot.
+/// Residual data of the logs of one robot.
 pub struct ResidualData {
     logs: Vec<Log>,
-    /// All rows but those that are set aside.
+    /// All rows except held-out blocks.
     pub fit_rows: ResidualRows,
-    /// One half of them and the other.
+    /// The two folds of `fit_rows`.
     pub folds: [ResidualRows; 2],
-    /// Of all of them those with the trunk held, if there are any: joints hardly disturb each other there.
+    /// Rows of `fit_rows` with a fixed base, in which the joints are nearly decoupled; all rows if there are none.
     fixed_base_rows: ResidualRows,
     torques: Vec<MeasuredTorque>,
 }
 
 impl ResidualData {
-    /// `logs` of a robot with the gains and rates of `robot`, in windows of `horizon`.
+    /// Creates the data from `logs` of a robot with the gains and rates of `robot`, in windows of `horizon`.
     pub fn new(logs: Vec<Log>, robot: &RobotModel, horizon: WindowConfig) -> Result<Self, ExperimentError> {
         let experiments: Vec<Experiment> =
             logs.iter().map(|log| Experiment::new(log, robot, horizon)).collect::<Result<_, _>>()?;
@@ -51,7 +52,7 @@ impl ResidualData {
         })
     }
 
-    /// From here on, errors that any robot has are not evidence; `robot` is the model.
+    /// Sets the nuisance parameters, linearised at `robot`, if a log has a floating base.
     pub fn set_nuisance_model(&mut self, robot: &RobotModel, simulator: &mut dyn Rollout) {
         if self.has_free_parts() {
             for rows in [&mut self.fit_rows].into_iter().chain(&mut self.folds) {
@@ -63,7 +64,8 @@ impl ResidualData {
         }
     }
 
-    /// Whether some joint is not followed at all by what leaves so much: by a third of its motion or more.
+    /// Returns true if the mean squared position error of any joint exceeds 10 % of the variance of its measured
+    /// position.
     pub fn fails_to_track(&self, left: &ResidualPower) -> bool {
         let log = &self.logs[0];
         (0..NUM_JOINTS).any(|joint| {
@@ -74,17 +76,17 @@ impl ResidualData {
         })
     }
 
-    /// The logs.
+    /// Returns the logs.
     pub fn logs(&self) -> &[Log] {
         &self.logs
     }
 
-    /// Whether a base was floating somewhere.
+    /// Returns true if a window has a floating base.
     pub fn has_free_parts(&self) -> bool {
         self.fit_rows.experiments.iter().any(Experiment::has_floating_base)
     }
 
-    /// What candidates leave; with `quick` only where the base was fixed, if it was.
+    /// Returns the residual power of candidates; with `quick` only of rows with a fixed base, if there are any.
     pub fn residual_powers(
         &self,
         simulator: &mut dyn Rollout,
@@ -94,7 +96,7 @@ impl ResidualData {
         let rows = if quick { &self.fixed_base_rows } else { &self.fit_rows };
         let mut residual_powers = rows.residual_powers(simulator, robots);
         for (log, torques) in self.logs.iter().zip(&self.torques) {
-            // Most effects are behind the torque's sensor: what it shows of robots that follow one another is the same.
+            // Most effects act after the torque sensor, so consecutive candidates often predict the same torque.
             let alike: Vec<&[RobotModel]> =
                 robots.chunk_by(|one, other| torques.predict_same_torque(one, other)).collect();
             let shown: Vec<ResidualPower> = alike
@@ -114,9 +116,17 @@ impl ResidualData {
         residual_powers
     }
 
-    /// What one candidate leaves of everything.
+    /// Returns the residual power of one candidate on all rows.
     pub fn residual_power(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> ResidualPower {
         self.residual_powers(simulator, std::slice::from_ref(robot), false).remove(0)
+    }
+
+    /// Returns false if the effect is not identifiable without a torque sensor and the logs have none.
+    ///
+    /// Such effects imitate others in the motion: at one kd, a wrong velocity gain is viscous friction.
+    pub fn has_required_torque(&self, effect: &Effect) -> bool {
+        let has_torque = |log: &Log| log.joints().iter().any(|joint| log.tau_measured(joint).is_some());
+        !effect.needs.contains(&DataRequirement::TorqueMeasured) || self.logs.iter().any(has_torque)
     }
 
     /// Returns the highest rate of the logs [Hz].
@@ -124,13 +134,13 @@ impl ResidualData {
         self.logs.iter().map(|log| log.meta().rate_hz).fold(0.0, f64::max)
     }
 
-    /// Rows of a channel that count as one.
+    /// Returns the correlation length of a channel [rows].
     pub fn correlation_rows(&self, channel: usize) -> f64 {
         let kind = [TORQUE, TRUNK, GYRO].into_iter().filter(|first| channel >= *first).count();
         (INDEPENDENT_S[kind] * self.max_rate_hz()).max(1.0)
     }
 
-    /// Measured torques of the first log.
+    /// Returns the measured torques of the first log.
     pub fn torques(&self) -> &MeasuredTorque {
         &self.torques[0]
     }
@@ -143,7 +153,9 @@ fn variance(values: &[f64]) -> f64 {
     finite().map(|value| (value - mean).powi(2)).sum::<f64>() / count
 }
 
-/// Noise of the torques that measured states make, beside the sensor's own and any simulator's misfit [N·m].
+/// Returns the standard deviation of torque residuals by joint [N·m].
+///
+/// It includes noise of the torque sensor, noise of positions and velocities in the PD loop, and model error.
 pub fn torque_sigma(log: &Log, robot: &RobotModel) -> [f64; NUM_JOINTS] {
     JOINT_NAMES.map(|name| {
         let noise = |channel: &str, assumed: f64| {

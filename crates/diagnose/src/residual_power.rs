@@ -13,7 +13,8 @@ pub const TRUNK: usize = 2 * NUM_JOINTS;
 /// First channel of the gyroscope.
 pub const GYRO: usize = TRUNK + 9;
 
-/// Sums of squared residuals and numbers of rows by channel and fold, in units of the variance of noise and model error.
+/// Sums of squared residuals and numbers of rows by channel and fold, in units of the variance of noise and model
+/// error.
 #[derive(Clone, Debug)]
 pub struct ResidualPower {
     /// Sums of squared residuals.

@@ -1,4 +1,4 @@
-//! Rows of logs as residuals, and to which channel and fold each belongs. Every fifth second is in none.
+//! Residuals of rows of logs, with the channel and fold of each. Every fifth second is a held-out block.
 
 use rayon::prelude::*;
 use twinstep_logs::Log;
@@ -8,35 +8,37 @@ use super::residual_power::{GYRO, ResidualPower, TRUNK};
 use twinstep_identify::experiment::{Experiment, ResidualChannel};
 use twinstep_identify::nuisance::NuisanceModel;
 
-/// What evidence is simulated in.
+/// Precision of the simulations.
 pub const PRECISION: Precision = Precision::Single;
-/// Candidates that are simulated at once, which bounds memory.
+/// Number of candidates that are simulated at once, which limits memory.
 const BATCH_SIZE: usize = 64;
-/// Errors of this size, beside the noise, are any simulator's: of a joint's position [rad]; of the trunk's motion and of its
-/// gyroscope [noise].
+/// Standard deviation of the model error of joint positions [rad].
 const MODEL_ERROR_RAD: f64 = 0.001;
+/// Standard deviation of the model error of base motion [noise std].
 const MODEL_ERROR_BASE: f64 = 1.0;
+/// Standard deviation of the model error of the gyroscope [noise std].
 const MISFIT_OF_GYRO: f64 = 1.0 / 3.0;
-/// Length of a block [s]; blocks go to the two folds in turn.
+/// Length of a block [s]; blocks are assigned to the two folds alternately.
 const BLOCK_S: f64 = 1.0;
 
-/// Rows of all logs.
+/// Residuals of rows of all logs.
 pub struct ResidualRows {
-    /// The logs, each with these rows alone.
+    /// The logs, each restricted to these rows.
     pub experiments: Vec<Experiment>,
-    /// Errors of any robot, in these rows; none where every base was fixed.
+    /// Nuisance parameters; `None` without a floating base.
     pub tolerances: Option<NuisanceModel>,
-    /// For every residual its channel, its fold, and what it is multiplied by.
+    /// Channel, fold and weight of every residual.
     cells: Vec<(usize, Option<usize>, f64)>,
 }
 
 impl ResidualRows {
-    /// `experiments` on `logs`, of which they may have a part of the rows.
+    /// Creates the residuals of `experiments`, which contain some or all rows of `logs`.
     pub fn new(logs: &[Log], experiments: Vec<Experiment>) -> Self {
         let mut cells = Vec::new();
         for (log, experiment) in logs.iter().zip(&experiments) {
             cells.extend(experiment.residual_index().map(|(quantity, row)| {
-                // A velocity says what the position does, with more noise; torques are judged without a simulation.
+                // Velocities repeat the information of positions with more noise. Torques are evaluated without
+                // simulation.
                 let (channel, misfit) = match quantity {
                     ResidualChannel::Position(joint) => (joint, MODEL_ERROR_RAD / experiment.sigma(quantity)),
                     ResidualChannel::Velocity(_) | ResidualChannel::Torque(_) => return (0, None, 0.0),
@@ -51,12 +53,12 @@ impl ResidualRows {
         Self { experiments, tolerances: None, cells }
     }
 
-    /// What a joint's position is in units of [rad]: noise and misfit.
+    /// Returns the standard deviation of noise and model error of a joint's position [rad].
     pub fn position_std(&self, joint: usize) -> f64 {
         MODEL_ERROR_RAD.hypot(self.experiments[0].sigma(ResidualChannel::Position(joint)))
     }
 
-    /// What candidates leave of the motion.
+    /// Returns the residual power of the motion of each candidate.
     pub fn residual_powers(&self, simulator: &mut dyn Rollout, robots: &[RobotModel]) -> Vec<ResidualPower> {
         let mut whole = vec![Vec::new(); robots.len()];
         for experiment in &self.experiments {
@@ -68,7 +70,7 @@ impl ResidualRows {
         whole.into_par_iter().map(|residuals| self.residual_power(residuals)).collect()
     }
 
-    /// Residuals of a candidate less what tolerated errors explain.
+    /// Returns the residuals of a candidate after elimination of the nuisance parameters.
     pub fn nuisance_corrected(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> Vec<f64> {
         let one = std::slice::from_ref(robot);
         let parts = self.experiments.iter().flat_map(|experiment| experiment.residuals(simulator, one, PRECISION));
@@ -92,7 +94,8 @@ impl ResidualRows {
     }
 }
 
-/// The fold of a row; none where it is set aside: every fifth block takes no part in any choice or fit, and tells the gain.
+/// Returns the fold of a row. Returns `None` for held-out blocks: every fifth block takes no part in any selection or
+/// fit.
 pub fn fold_of(log: &Log, row: usize) -> Option<usize> {
     let block = (row as f64 / (BLOCK_S * log.meta().rate_hz)) as usize % 5;
     (block < 4).then_some(block % 2)
@@ -106,7 +109,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_fifth_second_takes_no_part_in_choice_or_fit() {
+    fn every_fifth_second_is_held_out() {
         let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
         let column = |name: &str, value: fn(usize) -> f64| (name.to_owned(), (0..100).map(value).collect());
         let columns = [

@@ -1,6 +1,7 @@
-//! The scan: every effect on every joint at once, a few simulations an effect. With the trunk held joints hardly disturb
-//! each other, so that one simulation judges all twelve, and any scope is a sum over its joints. Effects on the trunk, the
-//! ground and the gyroscope are judged by the whole log.
+//! Scan: evaluates every effect on all joints at once, with a few simulations per effect.
+//!
+//! With a fixed base the joints are nearly decoupled. One simulation therefore evaluates all twelve joints, and the
+//! score of a scope is the sum over its joints. Effects on base, ground and gyroscope are evaluated on the whole log.
 
 use twinstep_effects::ModelFile;
 use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Scope, Target};
@@ -10,23 +11,25 @@ use super::hypothesis::{Hypothesis, body_grid, fine_grid, grid, selection_penalt
 use super::residual_data::ResidualData;
 use super::residual_power::{CHANNELS, ResidualPower, TORQUE};
 
-/// Scopes of one effect that go on.
+/// Maximum number of scopes per effect in the result.
 const OF_ONE_EFFECT: usize = 2;
 
-/// A hypothesis with its evidence on held-out blocks [nats].
+/// Hypothesis with its score.
 #[derive(Clone, Debug)]
 pub struct ScoredHypothesis {
-    /// The hypothesis, with the best of the values that were tried.
+    /// The hypothesis, with the best values of the grid.
     pub hypothesis: Hypothesis,
-    /// Evidence, less the price of choosing.
+    /// Log-likelihood gain minus the penalty of its scope [nat].
     pub score: f64,
 }
 
-/// Effects that one simulation of all joints can judge, the best first.
+/// Scans all effects of the catalogue. Returns the hypotheses with the best first.
 pub fn scan(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<ScoredHypothesis> {
     let Ok(robot) = model.robot_model() else { return Vec::new() };
     let before = evidence.residual_powers(simulator, std::slice::from_ref(&robot), true).remove(0);
-    let effects = CATALOGUE.into_iter().filter(|effect| matches!(effect.target, Target::Joints | Target::Supply));
+    let effects = CATALOGUE.into_iter().filter(|effect| {
+        matches!(effect.target, Target::Joints | Target::Supply) && evidence.has_required_torque(effect)
+    });
     let mut scored: Vec<ScoredHypothesis> =
         effects.flat_map(|effect| scan_effect(evidence, model, effect, &before, simulator)).collect();
     if evidence.has_free_parts() {
@@ -66,7 +69,7 @@ fn scan_effect(
             };
             let best =
                 |of: &dyn Fn(usize) -> f64| (0..values.len()).max_by(|one, other| of(*one).total_cmp(&of(*other)));
-            // Chosen on one fold, judged on the other.
+            // Selected on one fold, evaluated on the other.
             let judged = of(best(&|size| of(size, 0))?, 1) + of(best(&|size| of(size, 1))?, 0);
             let whole = best(&|size| of(size, 0) + of(size, 1))?;
             let hypothesis = Hypothesis { effect, scope, values: values[whole].clone() };
@@ -78,7 +81,9 @@ fn scan_effect(
     scored
 }
 
-/// What `best` is taken for, and what is taken for it, on its scope, each with the best of its values; none of `tried`.
+/// Returns the confounders of `best` on the same scope, in either direction of the catalogue's list.
+///
+/// Each has its best grid value. Skips those in `tried`.
 pub fn confounders_of(
     evidence: &ResidualData,
     model: &ModelFile,
@@ -92,7 +97,7 @@ pub fn confounders_of(
     let is_new = |effect: &Effect| !tried.contains(&format!("{}@{}", effect.name, best.scope));
     let effects = CATALOGUE.into_iter().filter(|effect| {
         let alike = confused(effect, best.effect) || confused(best.effect, effect);
-        alike && effect.target == best.effect.target && is_new(effect)
+        alike && effect.target == best.effect.target && is_new(effect) && evidence.has_required_torque(effect)
     });
     let first = |effect: &'static Effect| {
         let at = fine_grid(effect);
@@ -105,8 +110,9 @@ pub fn confounders_of(
     effects.filter_map(first).collect()
 }
 
-/// Delays and lags with which a loop rings are in step only where they are nearly right, and no slope leads there from afar:
-/// of those the best of many values, and of ever closer ones around it.
+/// Refines a delay or lag on successively finer grids; returns other hypotheses unchanged.
+///
+/// If the loop oscillates, the residual has a narrow minimum, which a gradient step cannot reach from far away.
 pub fn refine_delay_grid(
     evidence: &ResidualData,
     model: &ModelFile,
@@ -130,7 +136,7 @@ pub fn refine_delay_grid(
     Hypothesis { effect, scope, values }
 }
 
-/// The values that leave least of the whole logs.
+/// Returns the values with the largest log-likelihood gain on all rows.
 fn best_values(
     evidence: &ResidualData,
     model: &ModelFile,
@@ -153,7 +159,7 @@ fn best_values(
     scores.zip(values).max_by(|one, other| one.0.total_cmp(&other.0)).map(|(_, values)| values)
 }
 
-/// Evidence of everything [nats].
+/// Returns the log-likelihood gain of all channels, including the penalties of nuisance parameters [nat].
 pub fn log_likelihood_gain(evidence: &ResidualData, now: &ResidualPower, before: &ResidualPower) -> f64 {
     let of = |channel: usize| {
         [0, 1]
@@ -164,7 +170,9 @@ pub fn log_likelihood_gain(evidence: &ResidualData, now: &ResidualPower, before:
     (0..CHANNELS).map(of).sum::<f64>() + now.tolerated_gain(before)
 }
 
-/// Effects that are not of joints, and offsets of encoders: with the trunk held nothing shows of those but gravity.
+/// Returns effects on base and ground, and encoder offsets, with their scopes.
+///
+/// Encoder offsets are included because with a fixed base they are visible only through gravity.
 fn body_effects() -> Vec<(&'static Effect, Scope)> {
     let named = |name: &str| Effect::named(name).expect("an effect of the catalogue");
     let whole = ["payload", "com_shift", "gyro_bias"].map(|name| (named(name), Scope::Base));
@@ -173,7 +181,7 @@ fn body_effects() -> Vec<(&'static Effect, Scope)> {
     whole.into_iter().chain(ground).chain(offsets).collect()
 }
 
-/// Judges [`of_the_whole`].
+/// Scans the effects of [`body_effects`].
 fn scan_whole(
     evidence: &ResidualData,
     model: &ModelFile,
@@ -202,7 +210,7 @@ fn scan_whole(
     scored
 }
 
-/// Evidence by joint and fold, from its position and its torque [nats].
+/// Returns the log-likelihood gain by joint and fold, of its position and torque [nat].
 fn joint_gains(evidence: &ResidualData, now: &ResidualPower, before: &ResidualPower) -> Vec<[f64; 2]> {
     let of = |joint: usize, fold: usize| {
         [joint, TORQUE + joint]

@@ -1,18 +1,19 @@
-//! A line in the spectrum: what shakes at a frequency of its own depends on no channel.
+//! Spectral line: the strongest frequency of a residual that does not depend on any channel.
 
 use std::f64::consts::TAU;
 
 use nalgebra::{Matrix2, Vector2};
 
-/// Frequencies that are tried [Hz].
+/// Range of frequencies [Hz].
 const FREQUENCIES_HZ: [f64; 2] = [0.5, 25.0];
 
-/// The frequency [Hz] whose wave explains most of `values` at times `t`, fitted to one fold and judged on the other, and the
-/// share of their power that it explains. Folds alternate.
+/// Returns the frequency [Hz] of the sine that explains most of `values` at times `t` [s], and the explained fraction.
+///
+/// The sine is fitted to one fold and evaluated on the other. Returns `None` without values.
 pub fn spectral_line(t: &[f64], values: &[f64], folds: &[usize]) -> Option<(f64, f64)> {
     let [low, high] = FREQUENCIES_HZ;
     let length = t.last()? - t.first()?;
-    // Four to the width of a line.
+    // Four frequencies per line width.
     let step = 0.25 / length.max(1.0);
     let count = ((high - low) / step) as usize;
     let tried = (0..count).map(|index| low + step * index as f64);
@@ -45,7 +46,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn line_is_found_beneath_as_much_noise_and_none_where_there_is_none() {
+    fn line_is_found_in_noise_of_equal_power_and_not_in_noise_alone() {
         let t: Vec<f64> = (0..4000).map(|row| 0.005 * f64::from(row)).collect();
         let folds: Vec<usize> = t.iter().map(|t| *t as usize % 2).collect();
         let noise = |row: usize| ((row * 7919 % 1009) as f64 / 1009.0 - 0.5) * 3.46;

@@ -1,4 +1,4 @@
-//! One cause fitted to torques, beside others that stay as they are.
+//! Fit of one cause to torques, with other causes unchanged.
 
 use twinstep_effects::EffectEntry;
 use twinstep_effects::ModelFile;
@@ -12,27 +12,27 @@ use super::residual_power::{ResidualPower, TORQUE};
 use super::torque_only::{excess, nats};
 use twinstep_identify::parameter::{FreeParameter, free_parameters};
 
-/// First and last step of a descent [prior deviations].
+/// First and last step of the coordinate descent [prior std].
 const STEPS: [f64; 2] = [0.2, 0.01];
-/// Steps outwards in which the end of an interval is looked for [prior deviations].
+/// Distances from the estimate at which the end of an interval is searched [prior std].
 const PROFILE_STEPS: [f64; 14] = [0.002, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0];
 
-/// A cause that was fitted and judged.
+/// Cross-validated cause.
 #[derive(Clone)]
 pub struct TorqueCandidate {
-    /// With values fitted to everything.
+    /// The cause with the mean of the values fitted to either fold.
     pub entry: EffectEntry,
-    /// Evidence on held-out blocks, less the price of choosing and of its parameters [nats].
+    /// Cross-validated log-likelihood gain, minus the penalties for its scope and its parameters [nat].
     pub score: f64,
-    /// 1 − RMSE after / RMSE before on held-out seconds.
+    /// 1 − RMSE after / RMSE before, cross-validated.
     pub gain: f64,
-    /// Share of the power above noise that it explains.
+    /// Fraction of the power above noise that it explains.
     pub explains: f64,
-    /// The best of those that were tried in its place.
+    /// Alternative hypotheses.
     pub others: Vec<TorqueCandidate>,
 }
 
-/// A cause on top of others.
+/// Fit of a cause on top of others.
 pub struct TorqueFit<'a> {
     slots: &'a JointSlots,
     others: &'a [EffectEntry],
@@ -43,7 +43,7 @@ pub struct TorqueFit<'a> {
 }
 
 impl<'a> TorqueFit<'a> {
-    /// From the values that `cause` has, on top of `others`.
+    /// Creates the fit of `cause` on top of `others`, which starts at the values of `cause`.
     pub fn new(slots: &'a JointSlots, others: &'a [EffectEntry], cause: &'a EffectEntry) -> Option<Self> {
         let (_, unknowns) = free_parameters(&ModelFile::default(), &[(cause.effect, cause.scope)]).ok()?;
         let begin = unknowns.iter().zip(&cause.values).map(|(unknown, value)| unknown.coordinate(*value)).collect();
@@ -51,13 +51,15 @@ impl<'a> TorqueFit<'a> {
         Some(Self { slots, others, cause, unknowns, begin, before })
     }
 
-    /// The cause with the values of `point`.
+    /// Returns the cause with the values of `point`.
     pub fn entry_at(&self, point: &[f64]) -> EffectEntry {
         let values = self.unknowns.iter().zip(point).map(|(unknown, coordinate)| unknown.value(*coordinate)).collect();
         EffectEntry { values, ..self.cause.clone() }
     }
 
-    /// The point that leaves least on `folds`: steps along one unknown at a time, halved where none helps.
+    /// Returns the point with the largest log-likelihood gain on `folds`, by coordinate descent.
+    ///
+    /// The step is halved if no step along a single parameter improves the point.
     pub fn coordinate_descent(&self, folds: &[usize]) -> Vec<f64> {
         let [mut step, last] = STEPS;
         let mut point = self.begin.clone();
@@ -77,7 +79,7 @@ impl<'a> TorqueFit<'a> {
         point
     }
 
-    /// Fitted to one fold and judged on the other.
+    /// Fits the cause to one fold and evaluates it on the other. Returns `None` if the actuators are not valid.
     pub fn cross_validated(&self) -> Option<TorqueCandidate> {
         let [one, other] = [0, 1].map(|fold| self.coordinate_descent(&[fold]));
         let middle = one.iter().zip(&other).map(|(one, other)| 0.5 * (one + other)).collect();
@@ -101,7 +103,9 @@ impl<'a> TorqueFit<'a> {
         })
     }
 
-    /// 95 % intervals of the values: as far as less is lost than at their ends, and what any law misses.
+    /// Returns the 95 % intervals of the values.
+    ///
+    /// Each is the profile-likelihood interval, widened to at least the mismatch between simulators.
     pub fn intervals(&self) -> Vec<[f64; 2]> {
         let most = self.nats(std::slice::from_ref(&self.begin), &[0, 1])[0];
         let end = |index: usize, side: f64| {
@@ -132,7 +136,7 @@ impl<'a> TorqueFit<'a> {
         self.slots.robot(&[self.others, &[self.entry_at(point)]].concat())
     }
 
-    /// Evidence at points against none of the cause [nats].
+    /// Returns the log-likelihood gain of points over the model without the cause [nat].
     fn nats(&self, points: &[Vec<f64>], folds: &[usize]) -> Vec<f64> {
         let robots: Vec<Option<RobotModel>> = points.iter().map(|point| self.robot(point)).collect();
         let built: Vec<RobotModel> = robots.iter().flatten().cloned().collect();

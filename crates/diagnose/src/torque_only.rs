@@ -1,8 +1,10 @@
-//! Diagnosis of the actuators of any joints, whatever their names and number: by their torques alone, from `q`, `q_cmd`, gains
-//! and measured torque. No body is simulated, and none has to be known.
+//! Diagnosis of the actuators of any robot by their torques only, from `q`, `dq`, `q_cmd`, gains and measured torque.
 //!
-//! The rules are those of the whole diagnosis: a cause is fitted to one fold of seconds and judged on the other, and is named
-//! if its evidence is above the threshold, it explains a good part of what is above the noise, and it is large enough.
+//! Joints can have any names and number. Bodies are not simulated, so their parameters are not needed.
+//!
+//! The rules are those of the full diagnosis. A cause is fitted to one fold and evaluated on the other. It is reported
+//! if its log-likelihood gain exceeds the threshold, it explains enough of the power above noise, and it is large
+//! enough.
 
 use twinstep_effects::{CATALOGUE, EffectEntry, Parameter, Scope, Target};
 use twinstep_logs::Log;
@@ -18,14 +20,14 @@ use super::{AMBIGUITY_FRACTION, AMBIGUITY_NATS, DiagnoseError, DiagnoseProgress}
 use crate::findings::{AlternativeCause, Cause, Diagnosis, Estimate, ParameterValue, RmsErrors, Unexplained};
 use twinstep_identify::experiment::ExperimentError;
 
-/// Joints that are looked at together, as many as the Go2 has slots.
+/// Number of joints in a group: the number of slots of the Go2.
 const TOGETHER: usize = twinstep_model::NUM_JOINTS;
-/// Hypotheses that are fitted, of those that a first look at a few sizes found.
+/// Maximum number of hypotheses of the scan that are fitted.
 const TRIED: usize = 4;
-/// Most causes, of as many joints.
+/// Maximum number of causes per group of joints.
 const MOST_CAUSES: usize = 12;
 
-/// Names what ideal actuators get wrong in the torques of `logs`, of one robot with joints of any names.
+/// Identifies the effects that ideal actuators lack, from the torques in `logs` of one robot with joints of any names.
 pub fn diagnose_torques(logs: &[Log], progress: &mut DiagnoseProgress) -> Result<Diagnosis, DiagnoseError> {
     let mut all = Vec::new();
     for names in logs[0].joints().chunks(TOGETHER) {
@@ -55,7 +57,7 @@ pub fn diagnose_torques(logs: &[Log], progress: &mut DiagnoseProgress) -> Result
     })
 }
 
-/// What is said of some joints.
+/// Result for a group of joints.
 struct JointGroupResult {
     causes: Vec<Cause>,
     before: [f64; 3],
@@ -81,7 +83,7 @@ impl JointGroupResult {
     }
 }
 
-/// The search for causes at some joints.
+/// State of the forward selection for a group of joints.
 struct TorqueForwardSelection<'a, 'b> {
     slots: &'a JointSlots,
     causes: Vec<TorqueCandidate>,
@@ -95,7 +97,7 @@ impl TorqueForwardSelection<'_, '_> {
             let Some(next) = self.next() else { break };
             self.causes.push(next);
         }
-        // Each anew, beside those that were found after it.
+        // Refits each cause on top of all others, including those found after it.
         for place in 0..self.causes.len() {
             self.say()?;
             let cause = self.causes.remove(place);
@@ -111,7 +113,7 @@ impl TorqueForwardSelection<'_, '_> {
     }
 
     fn say(&mut self) -> Result<(), DiagnoseError> {
-        let text = format!("torques of {} and others, {} named", self.slots.name(0), self.causes.len());
+        let text = format!("fitting torques of the group of {}; causes: {}", self.slots.name(0), self.causes.len());
         if (self.progress)(&text) { Ok(()) } else { Err(DiagnoseError::Interrupted) }
     }
 
@@ -119,7 +121,7 @@ impl TorqueForwardSelection<'_, '_> {
         self.causes.iter().map(|cause| cause.entry.clone()).collect()
     }
 
-    /// The best cause on top of those that are named, if one earns a name.
+    /// Returns the best candidate on top of the accepted causes, if one reaches the threshold.
     fn next(&self) -> Option<TorqueCandidate> {
         let entries = self.entries();
         let named = |entry: &EffectEntry| {
@@ -139,7 +141,9 @@ impl TorqueForwardSelection<'_, '_> {
         Some(TorqueCandidate { others: found, ..best })
     }
 
-    /// Every effect that torques show, on all joints and on each, with the best of a few sizes; the best first.
+    /// Scans every effect that affects torques, on all joints and on each joint, on a grid of sizes.
+    ///
+    /// Returns the candidates with the best first.
     fn candidates(&self, entries: &[EffectEntry]) -> Option<Vec<EffectEntry>> {
         let now = self.slots.robot(entries)?;
         let before = self.slots.residual_powers(std::slice::from_ref(&now)).remove(0);
@@ -157,7 +161,7 @@ impl TorqueForwardSelection<'_, '_> {
             for scope in self.slots.scopes() {
                 let of = |size: usize, fold: usize| nats(self.slots, scope, &left[size], &before, &[fold]);
                 let best = |of: &dyn Fn(usize) -> f64| (0..values.len()).max_by(|a, b| of(*a).total_cmp(&of(*b)));
-                // Chosen on one fold, judged on the other.
+                // Selected on one fold, evaluated on the other.
                 let judged =
                     of(best(&|size| of(size, 0))?, 1) + of(best(&|size| of(size, 1))?, 0) - selection_penalty(scope);
                 let whole = best(&|size| of(size, 0) + of(size, 1))?;
@@ -169,7 +173,8 @@ impl TorqueForwardSelection<'_, '_> {
         Some(scored.into_iter().map(|(_, entry)| entry).collect())
     }
 
-    /// A cause that is too small, more than any actuator has, or leaves half of what was wrong at its own joints.
+    /// Returns the index of a cause that is too small, implausible, or leaves half of the excess power at its own
+    /// joints.
     fn untenable(&self) -> Option<usize> {
         let (given, named) = (self.slots.robot(&[])?, self.slots.robot(&self.entries())?);
         let left = self.slots.residual_powers(&[given, named]);
@@ -185,7 +190,7 @@ impl TorqueForwardSelection<'_, '_> {
     }
 }
 
-/// Evidence for what leaves `now` against what leaves `before` on a scope [nats].
+/// Returns the log-likelihood gain of `now` over `before` on a scope [nat].
 pub fn nats(slots: &JointSlots, scope: Scope, now: &ResidualPower, before: &ResidualPower, folds: &[usize]) -> f64 {
     let rows = slots.rows_in_one();
     let of =
@@ -193,7 +198,7 @@ pub fn nats(slots: &JointSlots, scope: Scope, now: &ResidualPower, before: &Resi
     slots.of(scope).map(of).sum()
 }
 
-/// Power above the noise on a scope.
+/// Returns the power above noise on a scope.
 pub fn excess(slots: &JointSlots, scope: Scope, left: &ResidualPower) -> f64 {
     slots.of(scope).map(|seat| left.channel_excess(TORQUE + seat)).sum()
 }
@@ -202,13 +207,13 @@ fn hypothesis(entry: &EffectEntry) -> Hypothesis {
     Hypothesis { effect: entry.effect, scope: entry.scope, values: entry.values.clone() }
 }
 
-/// As people read it, in the joints' own names and units.
+/// Returns the cause for the findings, with the names and units of the joints in the logs.
 fn cause(slots: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) -> Cause {
     let (effect, scope) = (found.entry.effect, slots.scope_name(found.entry.scope));
     let fit = TorqueFit::new(slots, others, &found.entry).expect("it was fitted before");
     let numbers = effect.parameters.iter().zip(&found.entry.values).zip(fit.intervals());
     let told = |((parameter, value), [low, high]): ((&Parameter, &f64), [f64; 2])| {
-        // Torques in the slots are in units of their own.
+        // Torques in the slots are scaled.
         let unit =
             if parameter.unit.contains("N·m") || parameter.unit == "kg·m²" { slots.torque_scale } else { 1.0 };
         let [value, low, high] = [*value, low, high].map(|number| ParameterValue::Number(unit * number));
@@ -223,13 +228,13 @@ fn cause(slots: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) ->
         held_out_gain: other.gain,
     };
     let mut evidence = format!(
-        "{} at {scope}: on seconds that it was not fitted to it takes {:.0} % off the error of the torque.",
+        "{} at {scope}: it reduces the cross-validated RMS error of the torque by {:.0} %.",
         effect.name.replace('_', " "),
         100.0 * found.gain
     );
     if let Some(other) = found.others.first() {
         let behind = found.score - other.score;
-        evidence = format!("{evidence} Next best is {}, {behind:.0} nats behind.", name(&other.entry));
+        evidence = format!("{evidence} Best alternative: {}, {behind:.0} nat less.", name(&other.entry));
     }
     Cause {
         effect: effect.name.to_owned(),
@@ -244,7 +249,7 @@ fn cause(slots: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) ->
     }
 }
 
-/// What is left where it is most, and what that depends on.
+/// Describes the unexplained residual of the joint with the largest power above noise.
 fn left(slots: &JointSlots, [given, named]: [&RobotModel; 2], log: &Log) -> Unexplained {
     let left = slots.residual_powers(&[given.clone(), named.clone()]);
     let [before, after] = [&left[0], &left[1]].map(|left| excess(slots, Scope::All, left));
@@ -272,15 +277,16 @@ mod tests {
     const ROWS: usize = 5_000;
     const NOISE_NM: f64 = 0.5;
 
-    /// Fourteen joints of an arm, 60 N·m strong, in waves, whose actuators do as they are told but for a torque of `row` by
-    /// `made`, from the torque that is wanted in each row.
+    /// Returns a log of fourteen joints of an arm with torques up to 60 N·m, which follow sums of sines.
+    ///
+    /// `made` returns the torque of a joint in a row [N·m] from the commanded torque in each row.
     fn log(made: impl Fn(usize, &[f64], usize) -> f64) -> Log {
         let mut columns = vec![("t".to_owned(), (0..ROWS).map(|row| row as f64 / RATE_HZ).collect::<Vec<f64>>())];
         for joint in 0..14 {
             let mut random = stream(3, "arm", joint as u64);
             let waves: Vec<[f64; 2]> =
                 (0..5).map(|_| [random.random_range(1.0..25.0), random.random_range(0.0..6.0)]).collect();
-            // From rest, within a second.
+            // Smooth start from rest within one second.
             let at = |row: usize| row as f64 / RATE_HZ;
             let grown = |t: f64| if t < 1.0 { [t * t * (3.0 - 2.0 * t), 6.0 * t * (1.0 - t)] } else { [1.0, 0.0] };
             let sum =
@@ -314,21 +320,21 @@ mod tests {
     }
 
     #[test]
-    fn drives_that_do_as_they_are_told_get_no_name() {
+    fn ideal_actuators_give_no_cause() {
         let found = diagnosis(log(|_, wanted, row| wanted[row]));
         assert!(found.findings.is_empty(), "{:#?}", found.findings);
         assert_eq!(found.unexplained.fraction, 0.0);
     }
 
     #[test]
-    fn late_drive_and_weak_one_of_a_robot_of_fourteen_joints_are_named() {
+    fn delayed_and_weak_actuators_of_a_robot_with_fourteen_joints_are_identified() {
         let found = diagnosis(log(|joint, wanted, row| match joint {
             3 => wanted[row.saturating_sub(4)],
             13 => 0.85 * wanted[row],
             _ => wanted[row],
         }));
         let names: Vec<_> = found.findings.iter().map(|cause| format!("{}@{}", cause.effect, cause.scope)).collect();
-        // A torque that comes late and one that is shown late are the same torque, until a body moves by it.
+        // Torque delay and sensor delay give the same measured torque; only the motion distinguishes them.
         let late = ["torque_delay@axis_3", "torque_sensor_delay@axis_3"];
         assert!(late.contains(&names[0].as_str()), "{names:?}");
         assert!(late.contains(&found.findings[0].ambiguous_with[0].as_str()), "{:#?}", found.findings[0]);
@@ -345,14 +351,14 @@ mod tests {
     }
 
     #[test]
-    fn cause_of_some_of_many_joints_says_which() {
+    fn cause_of_a_group_of_joints_lists_them() {
         let found = diagnosis(log(|joint, wanted, row| if joint >= 12 { 0.8 * wanted[row] } else { wanted[row] }));
         let names: Vec<_> = found.findings.iter().map(|cause| format!("{}@{}", cause.effect, cause.scope)).collect();
         assert_eq!(names, ["torque_gain@axis_12+axis_13"], "{:#?}", found.findings);
     }
 
     #[test]
-    fn what_a_joint_lacks_is_named() {
+    fn error_for_a_missing_column_contains_the_joint() {
         let whole = log(|_, wanted, row| wanted[row]);
         let columns: Vec<(String, Vec<f64>)> = std::iter::once(("t".to_owned(), whole.t().to_vec()))
             .chain(whole.channels().map(|(name, cells)| (name.to_owned(), cells.to_vec())))

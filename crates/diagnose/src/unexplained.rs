@@ -1,4 +1,4 @@
-//! What is left when all that is named is explained, and what it depends on.
+//! Unexplained residual: the worst channel, and what its residual depends on.
 
 use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, RobotModel, Rollout};
@@ -11,14 +11,14 @@ use crate::findings::Unexplained;
 use twinstep_identify::experiment::ResidualChannel;
 use twinstep_logs::replay::{JointCommands, command, joint_commands};
 
-/// Bins of a variable that might explain a residual.
+/// Number of bins of a variable that may explain a residual.
 const BINS: usize = 12;
-/// Share of a residual's power that a variable has to explain on held-out seconds.
+/// Cross-validated R² from which a variable is reported.
 const MIN_R_SQUARED: f64 = 0.3;
-/// Power above the noise, in units of it, that is worth a word.
+/// Power above noise from which an unexplained residual is reported [noise variance].
 pub const LEAST_EXCESS: f64 = 0.3;
 
-/// What `robot` leaves of what was `given`.
+/// Describes the unexplained residual of `robot`, relative to the residual power `given` of the given model.
 pub fn unexplained(
     evidence: &ResidualData,
     robot: &RobotModel,
@@ -44,7 +44,7 @@ pub fn unexplained(
     describe_residual(log, &residual, variables(log, robot), fraction, &whose)
 }
 
-/// What a residual of a log depends on; `whose` it is begins the sentence.
+/// Describes what a residual of a log depends on. The text starts with `whose`.
 pub fn describe_residual(
     log: &Log,
     residual: &[f64],
@@ -55,24 +55,26 @@ pub fn describe_residual(
     let mut found: Vec<(f64, String)> = variables
         .into_iter()
         .map(|(name, cells)| (binned_r_squared(log, residual, &cells), name))
-        .chain(line_of(log, residual).map(|(frequency, share)| (share, format!("a line at {frequency:.2} Hz"))))
+        .chain(
+            line_of(log, residual).map(|(frequency, share)| (share, format!("a spectral line at {frequency:.2} Hz"))),
+        )
         .filter(|(share, _)| *share > MIN_R_SQUARED)
         .collect();
     found.sort_by(|one, other| other.0.total_cmp(&one.0));
     found.truncate(3);
     let told = found.first().map_or("it depends on none of the channels".to_owned(), |(share, variable)| {
-        format!("{:.0} % of it follows {variable}", 100.0 * share)
+        format!("{:.0} % of its variance is explained by {variable}", 100.0 * share)
     });
-    let text = format!("{whose} is off by more than noise and all that is named explain: {told}.");
+    let text = format!("{whose} has a residual above noise that no cause explains: {told}.");
     Unexplained { fraction, depends_on: found.into_iter().map(|(_, name)| name).collect(), text }
 }
 
-/// Nothing is left.
+/// Returns the result for a residual that does not exceed noise.
 pub fn only_noise() -> Unexplained {
-    Unexplained { fraction: 0.0, depends_on: Vec::new(), text: "What is left is noise.".to_owned() }
+    Unexplained { fraction: 0.0, depends_on: Vec::new(), text: "The residual is noise.".to_owned() }
 }
 
-/// What a log measured, and time.
+/// Returns the measured channels of a log, and time.
 pub fn measured(log: &Log) -> Vec<(String, Vec<f64>)> {
     let starts = ["q_", "dq_", "tau_measured_", "battery_V", "temp_"];
     let measured = log.channels().filter(|(name, _)| starts.iter().any(|start| name.starts_with(start)));
@@ -81,7 +83,7 @@ pub fn measured(log: &Log) -> Vec<(String, Vec<f64>)> {
     all
 }
 
-/// The strongest line of a residual, and the share that it explains.
+/// Returns the frequency of the strongest spectral line of a residual [Hz], and the explained fraction.
 fn line_of(log: &Log, residual: &[f64]) -> Option<(f64, f64)> {
     let rows = (0..residual.len()).filter(|row| residual[*row].is_finite());
     let rows: Vec<(usize, usize)> = rows.filter_map(|row| Some((row, fold_of(log, row)?))).collect();
@@ -91,7 +93,7 @@ fn line_of(log: &Log, residual: &[f64]) -> Option<(f64, f64)> {
     spectral_line(&t, &values, &folds)
 }
 
-/// The residual of a joint's position or torque, by row of the first log; not a number where there is none.
+/// Returns the residual of a joint's position or torque, by row of the first log; NaN if it was not measured.
 fn residual(evidence: &ResidualData, robot: &RobotModel, channel: usize, simulator: &mut dyn Rollout) -> Vec<f64> {
     let log = &evidence.logs()[0];
     let mut residual = vec![f64::NAN; log.rows()];
@@ -114,14 +116,14 @@ fn residual(evidence: &ResidualData, robot: &RobotModel, channel: usize, simulat
     residual
 }
 
-/// What a residual might depend on: positions, velocities, commands and torques of all joints, and time.
+/// Returns the variables that may explain a residual: measured channels and commanded torques of all joints, and time.
 fn variables(log: &Log, robot: &RobotModel) -> Vec<(String, Vec<f64>)> {
     let mut all = measured(log);
     all.extend(wanted_torques(log, robot));
     all
 }
 
-/// The torques that actuators are asked for, `tau_cmd_<joint>` [N·m].
+/// Returns the commanded torques of the PD loop, `tau_cmd_<joint>` [N·m].
 fn wanted_torques(log: &Log, robot: &RobotModel) -> Vec<(String, Vec<f64>)> {
     let joints = joint_commands(log).unwrap_or_default();
     let of = |joint: &JointCommands| -> Option<(String, Vec<f64>)> {
@@ -138,7 +140,7 @@ fn wanted_torques(log: &Log, robot: &RobotModel) -> Vec<(String, Vec<f64>)> {
     joints.iter().filter_map(of).collect()
 }
 
-/// Share of the residual's variance on held-out seconds that its mean in bins of `cells`, from the other seconds, explains.
+/// Returns the R² of binned means: bins of `cells`, means from one fold, evaluated on the other.
 fn binned_r_squared(log: &Log, residual: &[f64], cells: &[f64]) -> f64 {
     let rows: Vec<usize> =
         (0..residual.len()).filter(|row| residual[*row].is_finite() && cells[*row].is_finite()).collect();

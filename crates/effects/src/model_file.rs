@@ -81,14 +81,14 @@ pub enum EffectEntryError {
         given: String,
     },
     /// A key is missing or of the wrong kind.
-    #[error("`{key}` is {found}; expected {wanted}")]
+    #[error("`{key}` is {found}; expected {expected}")]
     Key {
         /// The key.
         key: String,
         /// Value in the file.
         found: String,
         /// Expected value.
-        wanted: String,
+        expected: String,
     },
     /// The effect does not have this key.
     #[error("`{effect}` has no key `{key}`; possible: name, scope, interval, {}", names(effect))]
@@ -346,7 +346,7 @@ fn read_numbers(key: &str, given: Option<&Value>, count: usize) -> Result<Vec<f6
 
 fn key_error(key: &str, found: Option<&Value>, expected: &str) -> EffectEntryError {
     let found = found.map_or("missing".to_owned(), ToString::to_string);
-    EffectEntryError::Key { key: key.to_owned(), found, wanted: expected.to_owned() }
+    EffectEntryError::Key { key: key.to_owned(), found, expected: expected.to_owned() }
 }
 
 /// Reads a model file and returns its robot. Fails if the file has an actuator network.

@@ -97,7 +97,7 @@ impl VecEnv for CounterEnv {
         let action_len = self.spec.action_len();
         let expected = self.num_envs() * action_len;
         if actions.len() != expected {
-            return Err(EnvError::WrongLength { field: "actions", given: actions.len(), wanted: expected });
+            return Err(EnvError::WrongLength { field: "actions", given: actions.len(), expected });
         }
         if let Some(index) = actions.iter().position(|value| !value.is_finite()) {
             let entry = self.spec.action_entry(index % action_len);

@@ -75,7 +75,7 @@ impl<B: Backend> TaskEnv<B> {
         let action_len = self.spec.action_len();
         let expected = self.num_envs() * action_len;
         if actions.len() != expected {
-            return Err(EnvError::WrongLength { field: "actions", given: actions.len(), wanted: expected });
+            return Err(EnvError::WrongLength { field: "actions", given: actions.len(), expected });
         }
         // One branch-free pass over all actions, which the compiler vectorises. The index is searched only on failure.
         if !actions.iter().fold(true, |finite, value| finite & value.is_finite()) {

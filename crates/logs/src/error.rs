@@ -56,14 +56,14 @@ pub enum LogError {
     },
     /// The metadata file is missing.
     #[error(
-        "`{wanted}`, the metadata of `{data}`, is missing\n  its minimal content is {{\"rate_hz\": 200, \
+        "`{expected}`, the metadata of `{data}`, is missing\n  its minimal content is {{\"rate_hz\": 200, \
          \"tau_sensor\": \"none\", \"segments\": [{{\"name\": \"walk\", \"base\": \"floating\"}}]}}"
     )]
     NoMeta {
         /// The data file.
         data: PathBuf,
         /// Expected path of the metadata.
-        wanted: PathBuf,
+        expected: PathBuf,
     },
     /// A file cannot be read, or its compression is damaged.
     #[error("cannot read `{file}`: {cause}{}", hint_of_damage(.cause))]
@@ -251,14 +251,14 @@ pub enum LogError {
     },
     /// An MCAP file lacks a required topic.
     #[error(
-        "`{file}` has no message on {wanted}; its topics are {topics}\n  \
+        "`{file}` has no message on {expected}; its topics are {topics}\n  \
          record both /lowstate and /lowcmd (or rt/lowstate and rt/lowcmd): a log needs measurements and commands"
     )]
     McapTopic {
         /// The file.
         file: PathBuf,
         /// The missing topic.
-        wanted: &'static str,
+        expected: &'static str,
         /// Topics of the file.
         topics: String,
     },

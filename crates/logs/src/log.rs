@@ -262,7 +262,7 @@ fn read(path: &Path, need: LogKind) -> Result<Log, LogError> {
     let meta = files.meta.as_deref().map(Meta::read).transpose()?;
     let meta_file = files.meta.as_ref().unwrap_or(&files.data);
     let needed = |meta: Option<Meta>| {
-        meta.ok_or_else(|| LogError::NoMeta { wanted: files.expected_meta(), data: files.data.clone() })
+        meta.ok_or_else(|| LogError::NoMeta { expected: files.expected_meta(), data: files.data.clone() })
     };
     let open = || std::fs::File::open(&files.data).map_err(|cause| LogError::Read { file: files.data.clone(), cause });
     let (table, meta) = match files.format {

@@ -74,8 +74,8 @@ pub(crate) fn read(file: &Path, meta_file: Option<Meta>) -> Result<(Table, Meta)
     let mut recording = Recording::read(file)?;
     recording.order();
     if recording.states.is_empty() || recording.commands.is_empty() {
-        let wanted = if recording.states.is_empty() { "/lowstate" } else { "/lowcmd" };
-        return Err(LogError::McapTopic { file: file.into(), wanted, topics: recording.topics() });
+        let expected = if recording.states.is_empty() { "/lowstate" } else { "/lowcmd" };
+        return Err(LogError::McapTopic { file: file.into(), expected, topics: recording.topics() });
     }
     let own_meta = recording.own_meta.take();
     let columns = own_meta.as_ref().map(|(_, columns)| columns.as_slice());
@@ -225,7 +225,7 @@ impl Recording {
         if start == self.states.len() {
             return Err(LogError::McapTopic {
                 file: file.into(),
-                wanted: "/lowcmd before the last /lowstate",
+                expected: "/lowcmd before the last /lowstate",
                 topics: self.topics(),
             });
         }

@@ -106,14 +106,14 @@ impl ActuatorSnapshot {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum BackendError {
     /// An argument has the wrong number of entries.
-    #[error("`{field}` has {given} entries; {wanted} are expected, one per robot")]
+    #[error("`{field}` has {given} entries; {expected} are expected, one per robot")]
     WrongLength {
         /// The argument.
         field: &'static str,
         /// Number of entries of the argument.
         given: usize,
         /// Expected number of entries.
-        wanted: usize,
+        expected: usize,
     },
     /// A robot index is too large.
     #[error("robot {robot} does not exist; the number of robots is {num_robots}")]

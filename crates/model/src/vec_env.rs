@@ -68,7 +68,7 @@ impl ResetRequest {
         let lengths = [("seeds", self.seeds.as_ref().map(Vec::len)), ("mask", self.mask.as_ref().map(Vec::len))];
         for (field, length) in lengths {
             if let Some(given) = length.filter(|given| *given != num_envs) {
-                return Err(EnvError::WrongLength { field, given, wanted: num_envs });
+                return Err(EnvError::WrongLength { field, given, expected: num_envs });
             }
         }
         Ok(())
@@ -132,14 +132,14 @@ pub struct EndedEpisode {
 #[derive(Debug, thiserror::Error)]
 pub enum EnvError {
     /// An array has the wrong number of entries.
-    #[error("`{field}` has {given} entries; {wanted} are expected")]
+    #[error("`{field}` has {given} entries; {expected} are expected")]
     WrongLength {
         /// The array.
         field: &'static str,
         /// Number of entries of the array.
         given: usize,
         /// Expected number of entries.
-        wanted: usize,
+        expected: usize,
     },
     /// An action is NaN or infinite. No environment was stepped.
     #[error("`actions` of environment {env}: {entry} is {value}, but must be finite; no environment was stepped")]

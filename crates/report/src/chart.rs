@@ -1,4 +1,4 @@
-//! Pictures as SVG: panels with axes and lines, alike in every command that draws.
+//! Plots as SVG: panels with axes and lines, in one style for all commands.
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -9,32 +9,32 @@ pub use plotters::style::RGBColor;
 pub use plotters::style::text_anchor::HPos;
 use plotters::style::text_anchor::{Pos, VPos};
 
-/// Units of all lengths in a pixel: the library rounds to whole units, and lines in whole pixels look like stairs.
+/// Units of length per pixel. plotters rounds to whole units, and lines in whole pixels look like stairs.
 const UNITS: u32 = 2;
 const FONT: &str = "sans-serif";
-/// Text, and what was measured or is without an effect.
+/// Colour of text, of measurements, and of a simulation without an effect.
 pub const INK: RGBColor = RGBColor(0x26, 0x26, 0x26);
-/// What was commanded.
+/// Colour of commands.
 pub const GREY: RGBColor = RGBColor(0xa8, 0xa8, 0xa8);
-/// What was simulated.
+/// Colour of simulations.
 pub const ORANGE: RGBColor = RGBColor(0xff, 0x6a, 0x13);
 const RULE: RGBColor = RGBColor(0xe6, 0xe6, 0xe6);
 
-/// Why a picture could not be made.
+/// Reason why a plot could not be made.
 #[derive(Debug, thiserror::Error)]
 pub enum PlotError {
-    /// The motion of the picture could not be simulated.
-    #[error("cannot simulate the motion of the picture: {0}")]
+    /// The motion of the plot could not be simulated.
+    #[error("cannot simulate the motion of the plot: {0}")]
     Simulate(String),
     /// The drawing library failed.
-    #[error("cannot draw the picture: {0}")]
+    #[error("cannot draw the plot: {0}")]
     Draw(String),
-    /// The system refused to write the file.
+    /// The file could not be written.
     #[error("cannot write `{path}`: {cause}")]
     Write {
         /// The file.
         path: PathBuf,
-        /// The system's answer.
+        /// Error of the operating system.
         cause: std::io::Error,
     },
 }
@@ -45,21 +45,21 @@ impl<E: std::error::Error + Send + Sync> From<DrawingAreaErrorKind<E>> for PlotE
     }
 }
 
-/// A part of a picture.
+/// Part of a plot.
 pub type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
-/// Fails if `path` cannot be written: to be asked before the work, not after it.
+/// Returns an error if `path` cannot be written. Called before the work, so that its result cannot be lost.
 pub fn check_writable(path: &Path) -> Result<(), PlotError> {
     let opened = std::fs::OpenOptions::new().append(true).create(true).open(path);
     opened.map(drop).map_err(|cause| PlotError::Write { path: path.into(), cause })
 }
 
-/// Writes a picture.
+/// Writes a plot.
 pub fn write(svg: &str, path: &Path) -> Result<(), PlotError> {
     std::fs::write(path, svg).map_err(|cause| PlotError::Write { path: path.into(), cause })
 }
 
-/// An SVG of `size` [px]; `draw` works in half pixels.
+/// Returns an SVG of `size` [px]. `draw` works in half pixels.
 pub fn picture(size: (u32, u32), draw: impl FnOnce(&Area) -> Result<(), PlotError>) -> Result<String, PlotError> {
     let canvas = (UNITS * size.0, UNITS * size.1);
     let mut svg = String::new();
@@ -72,13 +72,13 @@ pub fn picture(size: (u32, u32), draw: impl FnOnce(&Area) -> Result<(), PlotErro
     Ok(svg.replacen(&tag(canvas), &tag(size), 1))
 }
 
-/// Text of a height that begins, or has its middle, at a place.
-pub fn text(area: &Area, text: &str, height: u32, at: HPos, place: (i32, i32)) -> Result<(), PlotError> {
+/// Draws text of `height` [half px]. `at` selects whether `position` is its start or its centre.
+pub fn text(area: &Area, text: &str, height: u32, at: HPos, position: (i32, i32)) -> Result<(), PlotError> {
     let style = (FONT, height).into_text_style(area).color(&INK).pos(Pos::new(at, VPos::Center));
-    Ok(area.draw_text(text, &style, place)?)
+    Ok(area.draw_text(text, &style, position)?)
 }
 
-/// Line samples with their names from `x` to the right, `spacing` apart.
+/// Draws line samples with their names from `x` to the right, at intervals of `spacing`.
 pub fn legend(area: &Area, lines: &[(&str, RGBColor)], spacing: i32, (mut x, y): (i32, i32)) -> Result<(), PlotError> {
     const SAMPLE: i32 = 88;
     for (name, colour) in lines {
@@ -89,34 +89,34 @@ pub fn legend(area: &Area, lines: &[(&str, RGBColor)], spacing: i32, (mut x, y):
     Ok(())
 }
 
-/// A line of a panel.
+/// Line of a panel.
 pub struct Line {
-    /// Its colour.
+    /// Colour of the line.
     pub colour: RGBColor,
-    /// Its width [half px].
+    /// Width of the line [half px].
     pub width: u32,
-    /// Its pieces.
+    /// Pieces of the line, each a list of points.
     pub pieces: Vec<Vec<(f64, f64)>>,
 }
 
-/// Axes with lines.
+/// Panel with axes and lines.
 pub struct Panel {
-    /// What stands above it.
+    /// Title above the panel.
     pub caption: String,
-    /// What stands below its x axis; may be empty.
+    /// Label of the x axis; may be empty.
     pub x_label: &'static str,
-    /// What stands beside its y axis; may be empty.
+    /// Label of the y axis; may be empty.
     pub y_label: &'static str,
-    /// What the x axis spans.
+    /// Range of the x axis.
     pub x: Range<f64>,
-    /// What the y axis spans.
+    /// Range of the y axis.
     pub y: Range<f64>,
-    /// In the order in which they are drawn.
+    /// Lines, in drawing order.
     pub lines: Vec<Line>,
 }
 
 impl Panel {
-    /// Draws it.
+    /// Draws the panel.
     pub fn draw(&self, area: &Area) -> Result<(), PlotError> {
         let label = |size: u32| (FONT, size).into_text_style(area).color(&INK);
         let mut chart = ChartBuilder::on(area)
@@ -155,7 +155,7 @@ impl Panel {
     }
 }
 
-/// The range of finite `values` with room around it; one around a value that is the only one.
+/// Returns the range of the finite `values` with a margin. The range of equal values is centred on them.
 pub fn range(values: impl Iterator<Item = f64>) -> Range<f64> {
     let finite = values.filter(|value| value.is_finite());
     let (low, high) = finite.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
@@ -164,7 +164,7 @@ pub fn range(values: impl Iterator<Item = f64>) -> Range<f64> {
     low - room..high + room
 }
 
-/// A number with the decimals that tell six ticks on `span` apart; never a negative zero.
+/// Formats a number with enough decimals to distinguish six ticks on `span`. Never returns a negative zero.
 pub fn tick_label(value: f64, span: f64) -> String {
     let decimals = (6.0 / span).log10().ceil().clamp(0.0, 6.0);
     let scale = 10f64.powf(decimals);
@@ -184,13 +184,13 @@ mod tests {
     }
 
     #[test]
-    fn range_has_room_and_passes_over_what_is_no_number() {
+    fn range_has_a_margin_and_ignores_nan() {
         assert_eq!(range([0.0, f64::NAN, 100.0].into_iter()), -6.0..106.0);
         assert!(!range(std::iter::empty()).is_empty());
     }
 
     #[test]
-    fn folder_that_does_not_exist_is_named() {
+    fn error_names_a_path_that_cannot_be_written() {
         let path = Path::new("/no/such/folder/joints.svg");
         for refused in [check_writable(path), write("", path)] {
             let error = refused.expect_err("refused").to_string();

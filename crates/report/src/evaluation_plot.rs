@@ -1,4 +1,4 @@
-//! A picture of an evaluation: the errors joint by joint, and the worst joint over time.
+//! Plot of an evaluation: the error of each joint, and the worst joint over time.
 
 use std::ops::Range;
 use std::path::Path;
@@ -12,16 +12,16 @@ use twinstep_model::{Joint, NUM_JOINTS};
 use crate::chart::{self, Area, GREY, INK, Line, ORANGE, Panel, PlotError};
 use crate::timeline::Timeline;
 
-/// Width and height of the picture [px].
+/// Width and height of the plot [px].
 const SIZE: (u32, u32) = (1500, 900);
 /// Heights of the title and of the bars [half px].
 const HEADER_HEIGHT: u32 = 110;
 const BARS_HEIGHT: u32 = 800;
 
-/// Simulated less measured position [rad] with its row, by joint.
+/// Simulated minus measured position [rad] with its row, by joint.
 pub type Errors = [Vec<(usize, f64)>; NUM_JOINTS];
 
-/// Writes bars of the joints' errors, and the joint with the largest of position over time.
+/// Plots the errors of the joints as bars, and the joint with the largest position error over time.
 pub fn write_svg(
     log: &Log,
     evaluation: &Evaluation,
@@ -42,20 +42,20 @@ pub fn write_svg(
         }
         match worst(evaluation) {
             Some(joint) => draw_joint(&lower, log, joint, &errors[joint.index()]),
-            None => chart::text(&lower, "the log has no position to compare", 40, HPos::Center, (SIZE.0 as i32, 400)),
+            None => chart::text(&lower, "the log has no measured position", 40, HPos::Center, (SIZE.0 as i32, 400)),
         }
     })?;
     chart::write(&svg, path)
 }
 
-/// The joint with the largest position error.
+/// Returns the joint with the largest position error.
 fn worst(evaluation: &Evaluation) -> Option<Joint> {
     let errors = evaluation.per_joint.iter().filter_map(|(name, joint)| Some((name, joint.q_rmse_rad?)));
     let (name, _) = errors.max_by(|one, other| one.1.total_cmp(&other.1))?;
     name.parse().ok()
 }
 
-/// An error of each joint in the order of [`Joint::ALL`], where it is known.
+/// Returns the known errors of the joints, in the order of [`Joint::ALL`].
 fn heights(evaluation: &Evaluation, of: fn(&JointEvaluation) -> Option<f64>) -> Vec<(Joint, f64)> {
     let known = |joint: Joint| Some((joint, of(evaluation.per_joint.get(joint.name())?)?));
     Joint::ALL.into_iter().filter_map(known).collect()
@@ -71,8 +71,8 @@ fn draw_bars(area: &Area, name: &str, heights: &[(Joint, f64)], overall: f64) ->
         .x_label_area_size(60)
         .y_label_area_size(160)
         .build_cartesian_2d(-0.5..heights.len() as f64 - 0.5, 0.0..1.1 * highest)?;
-    let joint_name = |place: &f64| {
-        let joint = heights.get(place.round() as usize).filter(|_| place.fract().abs() < 1e-6);
+    let joint_name = |position: &f64| {
+        let joint = heights.get(position.round() as usize).filter(|_| position.fract().abs() < 1e-6);
         joint.map_or(String::new(), |(joint, _)| joint.name().to_owned())
     };
     let tick = |value: &f64| chart::tick_label(*value, 1.1 * highest);
@@ -87,8 +87,8 @@ fn draw_bars(area: &Area, name: &str, heights: &[(Joint, f64)], overall: f64) ->
         .label_style(label(32))
         .axis_style(GREY.stroke_width(2));
     mesh.draw()?;
-    let bar = |(place, (_, height)): (usize, &(Joint, f64))| {
-        let middle = place as f64;
+    let bar = |(index, (_, height)): (usize, &(Joint, f64))| {
+        let middle = index as f64;
         Rectangle::new([(middle - 0.35, 0.0), (middle + 0.35, *height)], ORANGE.filled())
     };
     chart.draw_series(heights.iter().enumerate().map(bar))?;
@@ -119,7 +119,7 @@ fn draw_joint(area: &Area, log: &Log, joint: Joint, errors: &[(usize, f64)]) -> 
     chart::legend(area, &[("measured", INK), ("simulated", ORANGE)], 340, (160, 40))
 }
 
-/// Those of `rows` that belong to the same part of the log, part after part.
+/// Returns the ranges of `rows` that belong to the same contiguous range of the log.
 fn parts(log: &Log, rows: &[usize]) -> Vec<Range<usize>> {
     let of =
         |part: Range<usize>| rows.partition_point(|row| *row < part.start)..rows.partition_point(|row| *row < part.end);

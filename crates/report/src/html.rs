@@ -1,6 +1,6 @@
-//! Text for a page: escaped, and numbers as people write them.
+//! Text and numbers for an HTML page.
 
-/// `text` as it may stand anywhere in a page, in quotes too.
+/// Escapes `text` for any place in a page, including quoted attributes.
 pub fn escape(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for character in text.chars() {
@@ -10,7 +10,7 @@ pub fn escape(text: &str) -> String {
             '>' => escaped.push_str("&gt;"),
             '"' => escaped.push_str("&quot;"),
             '\'' => escaped.push_str("&#39;"),
-            // A browser reads them as nothing, or as an error.
+            // Browsers ignore control characters or report an error.
             control if control.is_control() && control != '\n' => escaped.push(' '),
             other => escaped.push(other),
         }
@@ -18,7 +18,7 @@ pub fn escape(text: &str) -> String {
     escaped
 }
 
-/// A number with three digits that count, and a minus sign that is one.
+/// Formats a number with three significant digits and a typographic minus sign.
 pub fn number(value: f64) -> String {
     if value.is_nan() {
         return "–".to_owned();
@@ -38,12 +38,12 @@ pub fn number(value: f64) -> String {
     text.replace('-', "−")
 }
 
-/// Numbers that are compared: with the decimals that the largest needs.
+/// Formats numbers for comparison: all with the decimals that the largest needs.
 pub fn alike<const N: usize>(values: [f64; N]) -> [String; N] {
     let largest =
         values.into_iter().filter(|value| value.is_finite()).fold(0.0, |most: f64, value| most.max(value.abs()));
     let decimals = 2.0 - largest.log10().floor();
-    // Very large and very small ones, and none at all, stand for themselves.
+    // Very large, very small and missing numbers are formatted one by one.
     if !(0.0..=7.0).contains(&decimals) {
         return values.map(number);
     }
@@ -51,12 +51,12 @@ pub fn alike<const N: usize>(values: [f64; N]) -> [String; N] {
     values.map(|value| if value.is_finite() { format!("{value:.decimals$}").replace('-', "−") } else { number(value) })
 }
 
-/// A share in percent.
+/// Formats a fraction in percent.
 pub fn percent(share: f64) -> String {
     if share.is_finite() { format!("{:.0} %", 100.0 * share).replace('-', "−") } else { "–".to_owned() }
 }
 
-/// A bar from 0 to a share of the full width.
+/// Returns a bar from 0 to a fraction of the full width.
 pub fn bar(share: f64, class: &str) -> String {
     let width = if share.is_finite() { 100.0 * share.clamp(0.0, 1.0) } else { 0.0 };
     format!("<span class=\"bar\"><span class=\"{class}\" style=\"width:{width:.1}%\"></span></span>")
@@ -67,26 +67,26 @@ mod tests {
     use super::*;
 
     #[test]
-    fn text_cannot_leave_its_place() {
+    fn escaped_text_is_never_markup() {
         assert_eq!(escape("<b a='\"&"), "&lt;b a=&#39;&quot;&amp;");
         assert_eq!(escape("a\u{0}b"), "a b");
     }
 
     #[test]
-    fn numbers_have_three_digits_that_count() {
-        let shown = [0.0, 1.0, -0.012_345, 412.3, 41_234.0, 1e-9, f64::INFINITY, f64::NAN].map(number);
-        assert_eq!(shown, ["0", "1.00", "−0.0123", "412", "41234", "1.00e−9", "∞", "–"]);
+    fn numbers_have_three_significant_digits() {
+        let formatted = [0.0, 1.0, -0.012_345, 412.3, 41_234.0, 1e-9, f64::INFINITY, f64::NAN].map(number);
+        assert_eq!(formatted, ["0", "1.00", "−0.0123", "412", "41234", "1.00e−9", "∞", "–"]);
     }
 
     #[test]
-    fn numbers_that_are_compared_have_the_same_decimals() {
+    fn compared_numbers_have_the_same_decimals() {
         assert_eq!(alike([1.0, 0.94, 1.06]), ["1.00", "0.94", "1.06"]);
         assert_eq!(alike([0.002, f64::NEG_INFINITY, f64::NAN]), ["0.00200", "−∞", "–"]);
         assert_eq!(alike([0.0, 41_234.0]), ["0", "41234"]);
     }
 
     #[test]
-    fn bars_stay_in_their_box() {
+    fn bars_are_at_most_as_wide_as_their_box() {
         assert!(bar(7.0, "gain").contains("width:100.0%"));
         assert!(bar(f64::NAN, "gain").contains("width:0.0%"));
     }

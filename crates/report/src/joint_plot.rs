@@ -1,4 +1,4 @@
-//! A picture of a replay: one small panel a joint, measured against simulated.
+//! Plot of a replay: one small panel per joint, with measured and simulated position.
 
 use std::ops::Range;
 use std::path::Path;
@@ -11,7 +11,7 @@ use crate::chart::{self, Area, GREY, INK, ORANGE, Panel, PlotError};
 use crate::timeline::Timeline;
 use twinstep_identify::replay::{JointError, Replay};
 
-/// Width and height of the picture [px].
+/// Width and height of the plot [px].
 const SIZE: (u32, u32) = (1500, 1320);
 /// Height of the title and the legend above the panels [half px].
 const HEADER_HEIGHT: u32 = 200;
@@ -23,9 +23,9 @@ const LINES: [Line; 3] = [
     Line { name: "simulated", colour: ORANGE, width: 3, of: |joint| &joint.simulated },
 ];
 
-/// Writes the replay's joints as an SVG: a row of panels a leg, a column each for hip, thigh and calf.
+/// Plots the replay's joints as an SVG, with one row of panels per leg and one column per joint type.
 ///
-/// The position axes of a column have the same scale. Parts of a log follow one another without pauses.
+/// The position axes of a column have the same scale. Segments of a log follow each other without pauses.
 pub fn write_svg(replay: &Replay, title: &str, path: &Path) -> Result<(), PlotError> {
     chart::write(&draw(replay, title)?, path)
 }
@@ -73,7 +73,7 @@ fn draw_empty_panel(area: &Area, joint: Joint) -> Result<(), PlotError> {
     chart::text(area, &format!("{joint} is not in the log"), 38, HPos::Center, centre)
 }
 
-/// One of a panel's lines.
+/// Line of a panel.
 struct Line {
     name: &'static str,
     colour: RGBColor,
@@ -81,13 +81,15 @@ struct Line {
     of: fn(&JointError) -> &Vec<f64>,
 }
 
-/// The middle of a joint's lines, with room for the widest lines of its kind: panels of a column compare by eye [rad].
+/// Returns the position range of a joint's panel [rad].
+///
+/// It is centred on the joint's lines. All joints of a type have the same span, so that their panels are comparable.
 fn position_range(replay: &Replay, error: &JointError) -> Range<f64> {
     let of_kind = |other: &&JointError| kind(other).is_some() && kind(other) == kind(error);
     let widest = replay.joints.iter().filter(of_kind).map(bounds).map(|[low, high]| high - low).fold(0.0, f64::max);
     let [low, high] = bounds(error);
     let middle = f64::midpoint(low, high);
-    // A joint at rest gets an axis too.
+    // A joint at rest needs an axis, too.
     let half = (0.54 * widest).max(0.005);
     middle - half..middle + half
 }
@@ -96,7 +98,7 @@ fn kind(error: &JointError) -> Option<JointKind> {
     error.name.parse().ok().map(|joint: Joint| joint.kind)
 }
 
-/// The lowest and highest value of a panel's lines [rad].
+/// Returns the lowest and highest value of a panel's lines [rad].
 fn bounds(error: &JointError) -> [f64; 2] {
     let values = || LINES.iter().flat_map(|line| (line.of)(error)).copied();
     [values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max)]
@@ -119,17 +121,17 @@ mod tests {
             command: sine(-0.1),
         };
         let joints = joints.iter().enumerate().map(joint).collect();
-        // The second part starts over, as a log's episodes may.
+        // Time starts again in the second range, as it may in the episodes of a log.
         let t = (0..rows).map(|row| (row % (rows / 2)) as f64 * 0.005).collect();
         Replay { joints, t, ranges: vec![0..rows / 2, rows / 2..rows], rmse_rad: 0.05 }
     }
 
     #[test]
-    fn picture_names_all_twelve_joints_and_stays_below_half_a_megabyte() {
+    fn plot_names_all_twelve_joints_and_stays_below_half_a_megabyte() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("joints.svg");
-        write_svg(&replay(&JOINT_NAMES, 20_000), "twenty thousand rows", &path).expect("a picture");
-        let svg = std::fs::read_to_string(path).expect("the picture");
+        write_svg(&replay(&JOINT_NAMES, 20_000), "twenty thousand rows", &path).expect("a plot");
+        let svg = std::fs::read_to_string(path).expect("the plot");
         for name in JOINT_NAMES {
             assert!(svg.contains(name), "{name}");
         }
@@ -139,8 +141,8 @@ mod tests {
     }
 
     #[test]
-    fn joint_that_the_log_lacks_has_a_panel_that_says_so() {
-        let svg = draw(&replay(&JOINT_NAMES[1..], 10), "eleven joints").expect("a picture");
+    fn joint_that_the_log_lacks_has_a_panel_with_a_note() {
+        let svg = draw(&replay(&JOINT_NAMES[1..], 10), "eleven joints").expect("a plot");
         assert!(svg.contains("FL_hip is not in the log"));
     }
 }

@@ -1,22 +1,22 @@
-//! A text table of the position error of each joint.
+//! Text table of the position error of each joint.
 
 use std::fmt::Write as _;
 
 use twinstep_identify::replay::Replay;
 
-/// Columns of the longest bar of [`Replay::table`].
+/// Width of the longest bar [columns].
 const BAR_WIDTH: f64 = 24.0;
-/// The longest bar stands for at least this RMSE [rad], so that rounding errors draw no bars.
-const LEAST_BAR_SCALE: f64 = 1e-3;
+/// Minimum RMSE of the longest bar [rad], so that rounding errors draw no bars.
+const MIN_BAR_SCALE: f64 = 1e-3;
 
 /// Returns one line per joint, with a bar in proportion to the RMSE, and a last line over all joints.
 pub fn joint_table(replay: &Replay) -> String {
-    let worst = replay.joints.iter().map(|joint| joint.rmse_rad).fold(LEAST_BAR_SCALE, f64::max);
+    let worst = replay.joints.iter().map(|joint| joint.rmse_rad).fold(MIN_BAR_SCALE, f64::max);
     let largest = replay.joints.iter().map(|joint| joint.max_rad).fold(0.0, f64::max);
     let mut table = "joint       RMSE [rad]  largest error [rad]\n".to_owned();
     let mut line = |name: &str, rmse_rad: f64, max_rad: f64, bar: &str| {
         let line = format!("{name:<10}  {rmse_rad:>10.4}  {max_rad:>19.4}  {bar}");
-        writeln!(table, "{}", line.trim_end()).expect("a String takes every text");
+        writeln!(table, "{}", line.trim_end()).expect("writing to a String cannot fail");
     };
     for joint in &replay.joints {
         line(&joint.name, joint.rmse_rad, joint.max_rad, &bar(joint.rmse_rad / worst));
@@ -25,7 +25,7 @@ pub fn joint_table(replay: &Replay) -> String {
     table
 }
 
-/// A bar of `share` times the full width, in eighths of a column.
+/// Returns a bar of `share` times the full width, in eighths of a column.
 fn bar(share: f64) -> String {
     const EIGHTHS: [&str; 8] = ["", "▏", "▎", "▍", "▌", "▋", "▊", "▉"];
     let eighths = (share * BAR_WIDTH * 8.0).round() as usize;

@@ -1,6 +1,6 @@
-//! What people look at: the report of a diagnosis, and every plot, as SVG.
+//! HTML report of a diagnosis, and all plots as SVG.
 //!
-//! - [`write_report`]: the page of a diagnosis, from [`ReportData`].
+//! - [`write_report`]: the HTML page of a diagnosis, from [`ReportData`].
 //! - [`chart`]: panels with axes and lines, in one style.
 //! - [`joint_plot`], [`evaluation_plot`], [`effect_plot`]: the plots of `demo`, `evaluate` and `effects`.
 //! - [`joint_table()`]: the position error of each joint as text.

@@ -1,4 +1,4 @@
-//! The upper part of the page: verdict, numbers, where and when simulation and measurement part.
+//! Upper part of the page: headline, errors, and the joints and times at which they are largest.
 
 use twinstep_diagnose::{Diagnosis, RmsErrors};
 use twinstep_identify::{Evaluation, JointEvaluation};
@@ -9,19 +9,19 @@ use crate::report_data::ReportData;
 use crate::time_series::Curve;
 use crate::{plot, text};
 
-/// The darkest colour stands for at least this error [rad, N·m], so that rounding errors have none.
-const LEAST_SCALE: f64 = 1e-3;
+/// Minimum error of the darkest colour [rad, N·m], so that rounding errors have no colour.
+const MIN_SCALE: f64 = 1e-3;
 
-/// A joint's error, where it is known.
+/// Function that returns an error of a joint, if it is known.
 type JointErrorFn = fn(&JointEvaluation) -> Option<f64>;
 
-/// The first thing on the page.
-pub fn headline(diagnosis: &Diagnosis, evidence: &ReportData) -> String {
-    let (log, verdict) = (shown_log(evidence), text::verdict(diagnosis));
+/// Returns the header with the headline.
+pub fn headline(diagnosis: &Diagnosis, data: &ReportData) -> String {
+    let (log, verdict) = (plotted_log(data), text::verdict(diagnosis));
     format!("<header>\n<p class=\"kicker\">Diagnosis of {log}</p>\n<h1>{verdict}</h1>\n</header>\n")
 }
 
-/// Errors of both models beside what the sensors leave.
+/// Returns the table of both models' errors and the noise floor.
 pub fn numbers(diagnosis: &Diagnosis) -> String {
     let Diagnosis { baseline, extended, noise_floor, .. } = diagnosis;
     let row = |name: &str, of: fn(&RmsErrors) -> Option<f64>| {
@@ -33,29 +33,29 @@ pub fn numbers(diagnosis: &Diagnosis) -> String {
         format!("<tr><th scope=\"row\">{name}</th>{cells}<td><strong>{gain}</strong></td></tr>\n")
     };
     format!(
-        "<section>\n<h2>How large the error is</h2>\n<div class=\"wide\"><table class=\"numbers\">\n\
-         <thead><tr><th></th><th>given model</th><th>extended model</th><th>noise floor</th><th>removed</th></tr>\
+        "<section>\n<h2>Error on held-out blocks</h2>\n<div class=\"wide\"><table class=\"numbers\">\n\
+         <thead><tr><th></th><th>given model</th><th>extended model</th><th>noise floor</th><th>reduction</th></tr>\
          </thead>\n<tbody>\n{}{}</tbody></table></div>\n\
-         <p class=\"note\">Root mean squares on blocks of the log that took no part in any choice or fit. A dash: this \
-         log cannot tell. The noise floor is what the sensors alone would leave.</p>\n</section>\n",
+         <p class=\"note\">Root mean squares on the held-out blocks, which take no part in any selection or fit. A \
+         dash: not measured in this log. The noise floor is the error due to sensor noise alone.</p>\n</section>\n",
         row("joint position, closed loop [rad]", |errors| errors.q_rmse_rad),
         row("torque at the sensor [N·m]", |errors| errors.torque_rmse_nm)
     )
 }
 
-/// The errors of twelve joints under both models.
-pub fn heat_maps(evidence: &ReportData) -> String {
+/// Returns heat maps of the joints' errors under both models.
+pub fn heat_maps(data: &ReportData) -> String {
     let quantities: [(&str, JointErrorFn); 2] =
         [("joint position [rad]", |joint| joint.q_rmse_rad), ("torque [N·m]", |joint| joint.torque_rmse_nm)];
     let mut maps = String::new();
     for (name, of) in quantities {
-        let both = [&evidence.before, &evidence.after];
+        let both = [&data.before, &data.after];
         let errors = both.iter().flat_map(|evaluation| evaluation.per_joint.values()).filter_map(of);
         let Some(worst) = errors.filter(|error| error.is_finite()).reduce(f64::max) else { continue };
-        let worst = worst.max(LEAST_SCALE);
-        // Nothing found, nothing extended: the second map would be the first.
-        let shown = if evidence.before == evidence.after { 1 } else { 2 };
-        for (model, evaluation) in ["given model", "extended model"].into_iter().zip(both).take(shown) {
+        let worst = worst.max(MIN_SCALE);
+        // Without causes both models are the same, and one map is enough.
+        let count = if data.before == data.after { 1 } else { 2 };
+        for (model, evaluation) in ["given model", "extended model"].into_iter().zip(both).take(count) {
             maps += &heat_map(&format!("{name}, {model}"), evaluation, of, worst);
         }
     }
@@ -63,10 +63,10 @@ pub fn heat_maps(evidence: &ReportData) -> String {
         return String::new();
     }
     format!(
-        "<section>\n<h2>Where it is</h2>\n<div class=\"pair\">\n{maps}</div>\n\
-         <p class=\"note\">Root mean square error of each joint over the whole of {}; before and after on one scale. \
-         Grey: not in the log.</p>\n</section>\n",
-        shown_log(evidence)
+        "<section>\n<h2>Error per joint</h2>\n<div class=\"pair\">\n{maps}</div>\n\
+         <p class=\"note\">Root mean square error of each joint over the whole of {}. All maps of a quantity have the \
+         same colour scale. Grey: not in the log.</p>\n</section>\n",
+        plotted_log(data)
     )
 }
 
@@ -93,19 +93,19 @@ fn heat_map(name: &str, evaluation: &Evaluation, of: JointErrorFn, worst: f64) -
     )
 }
 
-/// The worst joint over time.
-pub fn strips(evidence: &ReportData) -> String {
+/// Returns the plots of the worst joint over time.
+pub fn strips(data: &ReportData) -> String {
     let mut figures = String::new();
-    for strip in &evidence.strips {
+    for strip in &data.strips {
         let joint = strip.joint;
-        figures += &figure(&format!("{joint}, where it is worst"), &strip.close, strip.label);
+        figures += &figure(&format!("{joint}, where the error is largest"), &strip.close, strip.label);
         figures +=
             &figure(&format!("{joint}, error over the whole log"), &strip.errors, &format!("error of {}", strip.label));
     }
     if figures.is_empty() {
         return String::new();
     }
-    format!("<section>\n<h2>When it is: the worst joint</h2>\n<div class=\"pair\">\n{figures}</div>\n</section>\n")
+    format!("<section>\n<h2>Error over time (worst joint)</h2>\n<div class=\"pair\">\n{figures}</div>\n</section>\n")
 }
 
 fn figure(caption: &str, curves: &[Curve], y_label: &str) -> String {
@@ -114,13 +114,13 @@ fn figure(caption: &str, curves: &[Curve], y_label: &str) -> String {
     format!("<figure><figcaption><strong>{caption}</strong>{keys}</figcaption>{picture}</figure>\n")
 }
 
-/// A name in a legend.
+/// Returns an entry of a legend.
 pub fn key(class: &str, name: &str) -> String {
     format!("<span class=\"key\"><span class=\"sample {class}\"></span>{name}</span>")
 }
 
-/// The log in the pictures.
-fn shown_log(evidence: &ReportData) -> String {
-    let first = evidence.provenance.logs.first();
+/// Returns the name of the plotted log.
+fn plotted_log(data: &ReportData) -> String {
+    let first = data.provenance.logs.first();
     first.map_or("the log".to_owned(), |log| format!("<code>{}</code>", escape(&log.name)))
 }

@@ -1,4 +1,4 @@
-//! The report of a diagnosis: one HTML page without scripts that fetches nothing.
+//! HTML report of a diagnosis: one page without scripts and without external resources.
 
 use std::path::{Path, PathBuf};
 
@@ -9,7 +9,7 @@ use crate::{findings, html, limitations, overview};
 
 const STYLE: &str = include_str!("style.css");
 
-/// The page could not be written.
+/// The report could not be written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write the report `{path}`: {cause}", path = path.display())]
 pub struct ReportError {
@@ -18,24 +18,26 @@ pub struct ReportError {
 }
 
 /// Writes the report of a diagnosis.
-pub fn write(diagnosis: &Diagnosis, evidence: &ReportData, path: &Path) -> Result<(), ReportError> {
-    std::fs::write(path, page(diagnosis, evidence)).map_err(|cause| ReportError { path: path.to_owned(), cause })
+pub fn write(diagnosis: &Diagnosis, data: &ReportData, path: &Path) -> Result<(), ReportError> {
+    std::fs::write(path, page(diagnosis, data)).map_err(|cause| ReportError { path: path.to_owned(), cause })
 }
 
-/// The page. Everything in it that comes from a file went through [`html::escape`]; the policy in its head keeps a
-/// browser from running or fetching anything all the same.
-pub(crate) fn page(diagnosis: &Diagnosis, evidence: &ReportData) -> String {
-    let log = evidence.provenance.logs.first().map_or("", |log| log.name.as_str());
+/// Returns the page.
+///
+/// All text from files is escaped by [`html::escape`]. In addition, the policy in the page's head forbids the browser
+/// to run or fetch anything.
+pub(crate) fn page(diagnosis: &Diagnosis, data: &ReportData) -> String {
+    let log = data.provenance.logs.first().map_or("", |log| log.name.as_str());
     let sections = [
-        overview::headline(diagnosis, evidence),
+        overview::headline(diagnosis, data),
         overview::numbers(diagnosis),
-        overview::heat_maps(evidence),
-        overview::strips(evidence),
-        findings::cards(diagnosis, evidence),
+        overview::heat_maps(data),
+        overview::strips(data),
+        findings::cards(diagnosis, data),
         findings::ranking(diagnosis),
         limitations::confusions(diagnosis),
         limitations::unexplained(diagnosis),
-        limitations::provenance(diagnosis, &evidence.provenance),
+        limitations::provenance(diagnosis, &data.provenance),
     ];
     format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\

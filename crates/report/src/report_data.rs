@@ -1,4 +1,4 @@
-//! What a log shows of two models: the one that was given, and the one that the findings extend.
+//! Data of the report: errors of the given and the extended model on one log, and the law of each cause.
 
 use twinstep_effects::ModelFile;
 use twinstep_effects::{CATALOGUE, EffectEntry, EntryError, Target, apply_effects};
@@ -12,50 +12,50 @@ use twinstep_model::{Joint, NUM_JOINTS, RobotModel, Rollout, go2};
 use crate::residual_plot::{ResidualPlot, Residuals};
 use crate::time_series::TimeSeries;
 
-/// Why there is no evidence.
+/// Reason why the data of a report could not be computed.
 #[derive(Debug, thiserror::Error)]
 pub enum EvidenceError {
-    /// Entries of a model do not go together.
+    /// Effect entries of a model conflict.
     #[error(transparent)]
     Model(#[from] EntryError),
     /// The log cannot be simulated.
     #[error(transparent)]
     Experiment(#[from] ExperimentError),
-    /// The log's commands cannot be given to the robot.
+    /// The log's commands cannot be simulated.
     #[error(transparent)]
     Motion(#[from] ReplayError),
 }
 
-/// Where a report comes from.
+/// Provenance of a report.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Provenance {
-    /// As it was typed.
+    /// Command line.
     pub command: String,
-    /// When.
+    /// Date of the diagnosis.
     pub date: String,
-    /// The model that was given.
+    /// Name of the given model.
     pub model: String,
-    /// What was diagnosed; the first is in the pictures.
+    /// Diagnosed logs. The first one is plotted.
     pub logs: Vec<LogFacts>,
 }
 
-/// A log in a line.
+/// Summary of a log.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LogFacts {
-    /// Its path.
+    /// Path of the log.
     pub name: String,
-    /// Its rows.
+    /// Number of rows.
     pub rows: usize,
     /// Recorded time [s].
     pub duration_s: f64,
-    /// Rows a second [Hz].
+    /// Rate of the rows [Hz].
     pub rate_hz: f64,
-    /// Its parts, by name.
+    /// Names of the segments.
     pub segments: Vec<String>,
 }
 
 impl LogFacts {
-    /// Those of `log`.
+    /// Returns the summary of `log`.
     pub fn of(name: &str, log: &Log) -> Self {
         Self {
             name: name.to_owned(),
@@ -67,24 +67,24 @@ impl LogFacts {
     }
 }
 
-/// What the pictures of a report show; of all rows of a log.
+/// Data of a report's figures, from all rows of one log.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ReportData {
-    /// Errors of the model that was given.
+    /// Errors of the given model.
     pub before: Evaluation,
     /// Errors of the extended model.
     pub after: Evaluation,
-    /// The worst joint over time: position, and torque where it was measured.
+    /// Worst joint over time: position, and torque if it was measured.
     pub strips: Vec<TimeSeries>,
-    /// One for each entry that the extended model has more, where the log shows it.
+    /// Residual plot of each entry that only the extended model has, if the log has the quantities for it.
     pub laws: Vec<ResidualPlot>,
-    /// Where it all comes from.
+    /// Provenance of the report.
     pub provenance: Provenance,
 }
 
 impl ReportData {
-    /// Simulates `log` under both models, and under the extended one without each of its findings where the log's
-    /// torques do not show them.
+    /// Simulates `log` with both models, and with the extended model without single entries where a residual plot needs
+    /// it.
     pub fn gather(
         log: &Log,
         given: &ModelFile,
@@ -93,12 +93,12 @@ impl ReportData {
         provenance: Provenance,
     ) -> Result<Self, EvidenceError> {
         let [before, after] = [given.robot_model()?, extended.robot_model()?];
-        let mut bench =
+        let mut evaluator =
             LogEvaluator { log, joints: joint_commands(log)?, kinematics: JointTrajectory::of(log)?, simulator };
-        let [first, second] = [bench.trial(&before)?, bench.trial(&after)?];
+        let [first, second] = [evaluator.evaluate_model(&before)?, evaluator.evaluate_model(&after)?];
         let laws = (0..extended.effects.len())
             .filter(|index| !given.effects.contains(&extended.effects[*index]))
-            .map(|index| bench.law(&extended.effects[index], &without(given, extended, index)?, &after, &second))
+            .map(|index| evaluator.law(&extended.effects[index], &without(given, extended, index)?, &after, &second))
             .filter_map(Result::transpose)
             .collect::<Result<_, _>>()?;
         Ok(Self {
@@ -111,10 +111,10 @@ impl ReportData {
     }
 }
 
-/// The extended model without one of its entries: what was given stands in its place again.
+/// Returns the extended model without one of its entries. The entry of the given model, if any, replaces it.
 fn without(given: &ModelFile, extended: &ModelFile, index: usize) -> Result<RobotModel, EntryError> {
-    let left_out = &extended.effects[index];
-    let same = |entry: &&EffectEntry| entry.effect == left_out.effect && entry.scope == left_out.scope;
+    let removed = &extended.effects[index];
+    let same = |entry: &&EffectEntry| entry.effect == removed.effect && entry.scope == removed.scope;
     let mut entries = extended.effects.clone();
     match given.effects.iter().find(same) {
         Some(entry) if entries.iter().filter(same).count() == 1 => entries[index] = entry.clone(),
@@ -123,17 +123,17 @@ fn without(given: &ModelFile, extended: &ModelFile, index: usize) -> Result<Robo
     apply_effects(&go2(), &entries)
 }
 
-/// A model on a log.
+/// Evaluation of a model on a log.
 pub struct ModelEvaluation {
-    /// By joint.
+    /// Errors by joint.
     pub evaluation: Evaluation,
-    /// Simulated less measured position [rad], by row.
+    /// Simulated minus measured position [rad], by joint and row.
     pub position: JointSeries,
-    /// Torques of the measured motion.
+    /// Modelled torques of the measured motion.
     pub balance: InverseDynamicsResidual,
 }
 
-/// A log, and what simulates it.
+/// Evaluates models on one log.
 struct LogEvaluator<'a> {
     log: &'a Log,
     joints: Vec<JointCommands<'a>>,
@@ -142,7 +142,7 @@ struct LogEvaluator<'a> {
 }
 
 impl LogEvaluator<'_> {
-    fn trial(&mut self, robot: &RobotModel) -> Result<ModelEvaluation, EvidenceError> {
+    fn evaluate_model(&mut self, robot: &RobotModel) -> Result<ModelEvaluation, EvidenceError> {
         Ok(ModelEvaluation {
             evaluation: evaluate(self.log, robot, self.simulator, |_| true)?,
             position: self.position(robot)?,
@@ -150,7 +150,7 @@ impl LogEvaluator<'_> {
         })
     }
 
-    /// Simulated less measured position [rad].
+    /// Returns simulated minus measured position [rad], by joint and row.
     fn position(&mut self, robot: &RobotModel) -> Result<JointSeries, EvidenceError> {
         let mut cells = [const { Vec::new() }; NUM_JOINTS];
         let errors = position_errors(self.log, robot, self.simulator, |_| true)?;
@@ -163,7 +163,7 @@ impl LogEvaluator<'_> {
         Ok(cells)
     }
 
-    /// The law of `entry` in the residual that shows it best.
+    /// Returns the residual plot of `entry`, in the residual of [`best_residual`].
     fn law(
         &mut self,
         entry: &EffectEntry,
@@ -173,15 +173,16 @@ impl LogEvaluator<'_> {
     ) -> Result<Option<ResidualPlot>, EvidenceError> {
         let (y_label, residuals) = match best_residual(self.log, entry) {
             Residual::Torque => {
-                let of = |balance: &InverseDynamicsResidual| less(&self.measured_torque(), &balance.estimated_torque);
+                let of =
+                    |balance: &InverseDynamicsResidual| difference(&self.measured_torque(), &balance.estimated_torque);
                 (
-                    "measured − model's torque [N·m]",
+                    "measured − modelled torque [N·m]",
                     [of(&InverseDynamicsResidual::of(self.log, without)?), of(&with.balance)],
                 )
             }
             Residual::Unexplained => {
                 let balance = InverseDynamicsResidual::of(self.log, without)?;
-                ("unexplained torque [N·m]", [balance.torque, with.balance.torque.clone()])
+                ("inverse-dynamics residual [N·m]", [balance.torque, with.balance.torque.clone()])
             }
             Residual::Position => ("position error [rad]", [self.position(without)?, with.position.clone()]),
         };
@@ -196,19 +197,19 @@ impl LogEvaluator<'_> {
 }
 
 enum Residual {
-    /// Of the measured torque.
+    /// Measured minus modelled torque.
     Torque,
-    /// Of the torque that the measured motion needs.
+    /// Inverse-dynamics residual.
     Unexplained,
-    /// Of the simulated position.
+    /// Simulated minus measured position.
     Position,
 }
 
-/// Where `entry` shows best: before the torque's sensor in the torque, behind it in the motion.
+/// Returns the residual in which `entry` is most visible: torque for effects before the torque sensor, else motion.
 fn best_residual(log: &Log, entry: &EffectEntry) -> Residual {
     let chain = |name: &str| CATALOGUE.iter().position(|effect| effect.name == name);
     let at_motor = chain(entry.effect.name) <= chain("torque_sensor_delay");
-    let held = log.segments().all(|(segment, _)| segment.base == twinstep_model::BaseMount::Fixed);
+    let fixed_base = log.segments().all(|(segment, _)| segment.base == twinstep_model::BaseMount::Fixed);
     let of_joints = matches!(entry.effect.target, Target::Joints | Target::Supply);
     if !of_joints || matches!(entry.effect.name, "backlash" | "joint_elasticity") {
         return Residual::Position;
@@ -218,12 +219,12 @@ fn best_residual(log: &Log, entry: &EffectEntry) -> Residual {
     match (measured, sensor) {
         (true, TorqueSensor::JointOutput) if entry.effect.name != "joint_spring" => Residual::Torque,
         (true, TorqueSensor::MotorCurrent) if at_motor => Residual::Torque,
-        _ if held => Residual::Unexplained,
+        _ if fixed_base => Residual::Unexplained,
         _ => Residual::Position,
     }
 }
 
-/// Differences, where there are both.
-fn less(one: &JointSeries, other: &JointSeries) -> JointSeries {
+/// Returns the differences in rows that both series have.
+fn difference(one: &JointSeries, other: &JointSeries) -> JointSeries {
     std::array::from_fn(|joint| one[joint].iter().zip(&other[joint]).map(|(one, other)| one - other).collect())
 }

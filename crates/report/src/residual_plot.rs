@@ -1,4 +1,4 @@
-//! The residual of a log beside the variable that explains it, and what a finding makes of it.
+//! Residual of a log over the variable that explains it, with the part that a cause explains.
 
 use twinstep_effects::{EffectEntry, Target};
 use twinstep_identify::{JointSeries, JointTrajectory};
@@ -6,38 +6,38 @@ use twinstep_logs::Log;
 use twinstep_logs::replay::{JointCommands, cell_or_zero};
 use twinstep_model::{Joint, RobotModel};
 
-/// Bins of a picture.
+/// Number of bins of a plot.
 const BINS: usize = 40;
-/// Rows that a bin has at least.
-const LEAST_ROWS: usize = 8;
+/// Minimum number of rows of a bin.
+const MIN_ROWS: usize = 8;
 
-/// A residual over the variable that explains it.
+/// Residual over the variable that explains it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ResidualPlot {
     /// Effect and scope, as in the model file.
     pub cause: (String, String),
-    /// The variable, with its unit.
+    /// Name of the variable, with its unit.
     pub x_label: &'static str,
-    /// The residual, with its unit.
+    /// Name of the residual, with its unit.
     pub y_label: &'static str,
-    /// From left to right.
+    /// Bins in ascending order of the variable.
     pub bins: Vec<Bin>,
 }
 
-/// Rows whose variable is alike.
+/// Rows with similar values of the variable.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bin {
-    /// Middle of the bin.
+    /// Mean of the variable.
     pub x: f64,
-    /// Mean residual of the model without the finding.
+    /// Mean residual of the model without the cause.
     pub mean: f64,
-    /// The middle 68 % of it.
+    /// 16th and 84th percentile of that residual.
     pub spread: [f64; 2],
-    /// Mean of what the finding takes away.
+    /// Mean of the part that the cause explains.
     pub law: f64,
 }
 
-/// What an effect depends on.
+/// Variable on which an effect depends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Variable {
     Position,
@@ -47,7 +47,7 @@ pub enum Variable {
     CommandedTorque,
     CommandedTorqueRate,
     CommandRate,
-    /// Size of that torque with the sign of the velocity.
+    /// Magnitude of that torque with the sign of the velocity.
     Load,
     Voltage,
     Temperature,
@@ -55,7 +55,7 @@ pub enum Variable {
 }
 
 impl Variable {
-    /// The one that explains an entry.
+    /// Returns the variable that explains an entry.
     pub fn of(entry: &EffectEntry) -> Self {
         match entry.effect.name {
             "coulomb_friction" | "viscous_friction" | "stribeck_friction" | "torque_speed_limit" => Self::Velocity,
@@ -77,28 +77,28 @@ impl Variable {
             Self::Velocity => "joint velocity [rad/s]",
             Self::Acceleration => "joint acceleration [rad/s²]",
             Self::CommandedTorque => "torque of the ideal actuator [N·m]",
-            Self::CommandedTorqueRate => "change of the ideal actuator's torque [N·m/s]",
-            Self::CommandRate => "change of the command [rad/s]",
-            Self::Load => "size of the torque, signed as the velocity [N·m]",
+            Self::CommandedTorqueRate => "rate of the ideal actuator's torque [N·m/s]",
+            Self::CommandRate => "rate of the commanded position [rad/s]",
+            Self::Load => "torque magnitude, sign of the velocity [N·m]",
             Self::Voltage => "battery voltage [V]",
             Self::Temperature => "motor temperature [°C]",
             Self::Time => "time [s]",
         }
     }
 
-    /// Its value in every row.
+    /// Returns the value of the variable in every row.
     fn values(self, log: &Log, robot: &RobotModel, joint: &JointCommands, kinematics: &JointTrajectory) -> Vec<f64> {
         let index = joint.joint.index();
-        let wanted = || wanted(log, robot, joint, kinematics);
+        let torque = || commanded_torque(log, robot, joint, kinematics);
         let channel = |name: &str| log.channel(name).map_or(Vec::new(), <[f64]>::to_vec);
         match self {
             Self::Position => kinematics.q[index].clone(),
             Self::Velocity => kinematics.dq[index].clone(),
             Self::Acceleration => kinematics.ddq[index].clone(),
-            Self::CommandedTorque => wanted(),
-            Self::CommandedTorqueRate => rates(log, &wanted()),
+            Self::CommandedTorque => torque(),
+            Self::CommandedTorqueRate => rates(log, &torque()),
             Self::CommandRate => rates(log, joint.q_cmd),
-            Self::Load => wanted().iter().zip(&kinematics.dq[index]).map(|(tau, dq)| tau.abs() * dq.signum()).collect(),
+            Self::Load => torque().iter().zip(&kinematics.dq[index]).map(|(tau, dq)| tau.abs() * dq.signum()).collect(),
             Self::Voltage => channel("battery_V"),
             Self::Temperature => channel(&format!("temp_{}", joint.joint)),
             Self::Time => log.t().to_vec(),
@@ -106,34 +106,34 @@ impl Variable {
     }
 }
 
-/// What residuals there are, and where they come from.
+/// Residuals of a log with and without a cause.
 pub struct Residuals<'a> {
     pub log: &'a Log,
     pub robot: &'a RobotModel,
     pub joints: &'a [JointCommands<'a>],
     pub kinematics: &'a JointTrajectory,
-    /// What is on the y axis.
+    /// Label of the y axis.
     pub y_label: &'static str,
-    /// Of the model without the finding, and of the one with it.
+    /// Residuals of the model without the cause, and of the model with it.
     pub without: &'a JointSeries,
     pub with: &'a JointSeries,
 }
 
 impl Residuals<'_> {
-    /// The law of `entry` in them; none where no row has both residual and variable.
+    /// Returns the residual plot of `entry`. Returns `None` if fewer than two bins have enough rows.
     pub fn law(&self, entry: &EffectEntry) -> Option<ResidualPlot> {
         let variable = Variable::of(entry);
         let of_bodies = !matches!(entry.effect.target, Target::Joints | Target::Supply);
-        let shown = |joint: Joint| of_bodies || entry.scope.contains(joint);
+        let is_affected = |joint: Joint| of_bodies || entry.scope.contains(joint);
         let mut points = Vec::new();
-        for joint in self.joints.iter().filter(|joint| shown(joint.joint)) {
+        for joint in self.joints.iter().filter(|joint| is_affected(joint.joint)) {
             let index = joint.joint.index();
             let x = variable.values(self.log, self.robot, joint, self.kinematics);
             for (x, (without, with)) in x.iter().zip(self.without[index].iter().zip(&self.with[index])) {
                 if x.is_finite() && without.is_finite() && with.is_finite() {
-                    // Over time only the size counts: signs of different joints cancel.
-                    let size = |y: f64| if variable == Variable::Time { y.abs() } else { y };
-                    points.push([*x, size(*without), size(*without) - size(*with)]);
+                    // Over time the magnitude is plotted: residuals of different joints would cancel.
+                    let magnitude = |y: f64| if variable == Variable::Time { y.abs() } else { y };
+                    points.push([*x, magnitude(*without), magnitude(*without) - magnitude(*with)]);
                 }
             }
         }
@@ -143,7 +143,7 @@ impl Residuals<'_> {
     }
 }
 
-/// Of points of x, residual and law, between the half percents of x.
+/// Bins points of variable, residual and explained part. Omits the lowest and highest 0.5 % of the variable.
 fn bins(mut points: Vec<[f64; 3]>) -> Vec<Bin> {
     points.sort_by(|one, other| one[0].total_cmp(&other[0]));
     let edge = points.len() / 200;
@@ -165,12 +165,16 @@ fn bins(mut points: Vec<[f64; 3]>) -> Vec<Bin> {
             law: points.iter().map(|point| point[2]).sum::<f64>() / count,
         }
     };
-    let place = |point: &[f64; 3]| (((point[0] - first[0]) / width) as usize).min(BINS - 1);
-    points.chunk_by(|one, other| place(one) == place(other)).filter(|rows| rows.len() >= LEAST_ROWS).map(bin).collect()
+    let bin_index = |point: &[f64; 3]| (((point[0] - first[0]) / width) as usize).min(BINS - 1);
+    points
+        .chunk_by(|one, other| bin_index(one) == bin_index(other))
+        .filter(|rows| rows.len() >= MIN_ROWS)
+        .map(bin)
+        .collect()
 }
 
-/// Torque of an actuator without effects on the measured state [N·m].
-fn wanted(log: &Log, robot: &RobotModel, joint: &JointCommands, kinematics: &JointTrajectory) -> Vec<f64> {
+/// Returns the torque of an actuator without effects in the measured state [N·m].
+fn commanded_torque(log: &Log, robot: &RobotModel, joint: &JointCommands, kinematics: &JointTrajectory) -> Vec<f64> {
     let index = joint.joint.index();
     let q = log.q(joint.joint.name()).unwrap_or_default();
     let gain = |gains: &Option<Vec<f64>>, row: usize, model: f64| gains.as_ref().map_or(model, |gains| gains[row]);
@@ -182,7 +186,7 @@ fn wanted(log: &Log, robot: &RobotModel, joint: &JointCommands, kinematics: &Joi
     (0..q.len()).map(of).collect()
 }
 
-/// Change with time between neighbours; NaN at the ends of the log's parts.
+/// Returns central differences over time; NaN at the ends of contiguous ranges.
 fn rates(log: &Log, cells: &[f64]) -> Vec<f64> {
     let mut rates = vec![f64::NAN; cells.len()];
     for (_, rows) in log.segments() {

@@ -1,20 +1,20 @@
-//! Effects, scopes and the verdict in a robot engineer's words. What comes from files is escaped here.
+//! Names of effects and scopes, and the headline of the report. Text from files is escaped here.
 
 use twinstep_diagnose::{Cause, Diagnosis, ParameterValue, RmsErrors};
 use twinstep_effects::{Effect, Target};
 
 use crate::html::{alike, escape, percent};
 
-/// Below this share of the residual power above the noise, what is left is not worth a word.
-const NOTHING_LEFT: f64 = 0.1;
+/// Unexplained fraction of the residual power above noise that is reported as no error.
+const NEGLIGIBLE_FRACTION: f64 = 0.1;
 
-/// An effect's name as people write it.
+/// Returns the name of an effect in words.
 pub fn effect(name: &str) -> String {
     let words = escape(&name.replace('_', " "));
     words.replace("coulomb", "Coulomb").replace("stribeck", "Stribeck").replace("com shift", "centre-of-mass shift")
 }
 
-/// What an effect is about, after "of".
+/// Returns a scope in words, for use after "of".
 pub fn scope(scope: &str) -> String {
     match scope {
         "all" => "all joints".to_owned(),
@@ -22,44 +22,44 @@ pub fn scope(scope: &str) -> String {
         "calf" => "the calves".to_owned(),
         "FL" | "FR" | "RL" | "RR" => format!("leg {scope}"),
         "left" | "right" => format!("the {scope} legs"),
-        "base" => "the trunk".to_owned(),
+        "base" => "the base".to_owned(),
         "ground" => "the ground".to_owned(),
         other => escape(other),
     }
 }
 
-/// An effect with its scope.
+/// Returns an effect with its scope in words.
 pub fn cause(name: &str, about: &str) -> String {
     match Effect::named(name).map(|effect| effect.target) {
-        // "Ground friction of the ground" says nothing more.
+        // The scope of these effects adds no information: "ground friction of the ground".
         Some(Target::Ground | Target::Supply) => effect(name),
         _ => format!("{} of {}", effect(name), scope(about)),
     }
 }
 
-/// As `armature@calf` is written in findings.
+/// Returns a cause in words, from its form `armature@calf` in findings.
 pub fn cause_at(text: &str) -> String {
     text.split_once('@').map_or_else(|| effect(text), |(name, about)| cause(name, about))
 }
 
-/// With a capital letter.
+/// Capitalises the first letter.
 pub fn sentence(text: &str) -> String {
     let mut letters = text.chars();
     letters.next().map_or(String::new(), |first| first.to_uppercase().chain(letters).collect())
 }
 
-/// What the diagnosis comes to, in a sentence.
+/// Returns the headline: a summary of the diagnosis.
 pub fn verdict(diagnosis: &Diagnosis) -> String {
     let Diagnosis { findings, unexplained, baseline, extended, .. } = diagnosis;
     if findings.is_empty() {
         return match unexplained.depends_on.split_first() {
-            None if unexplained.fraction < NOTHING_LEFT => "Nothing is wrong above the noise.".to_owned(),
+            None if unexplained.fraction < NEGLIGIBLE_FRACTION => "No model error above the noise.".to_owned(),
             None => format!(
-                "Something is wrong, but no cause earns its name: {} of the error above the noise is unexplained.",
+                "The model has an error, but no cause reaches the threshold: {} of the residual power is unexplained.",
                 percent(unexplained.fraction)
             ),
             Some(_) => format!(
-                "Something is wrong that no effect of the catalogue explains; it depends on {}.",
+                "The model has an error that no effect of the catalogue explains; it depends on {}.",
                 listed(unexplained.depends_on.iter().map(|channel| format!("<code>{}</code>", escape(channel))))
             ),
         };
@@ -74,7 +74,7 @@ pub fn verdict(diagnosis: &Diagnosis) -> String {
     format!("{causes}{gain}.{}", findings.iter().map(ambiguity).collect::<String>())
 }
 
-/// The first parameter, in brackets, where it is one number.
+/// Returns the first parameter with its interval in brackets, if it is a single number.
 fn size(finding: &Cause) -> String {
     let parameters = Effect::named(&finding.effect).map_or(&[][..], |effect| effect.parameters);
     let first = parameters.first().and_then(|first| finding.parameters.get(first.name).map(|value| (first, value)));
@@ -88,13 +88,13 @@ fn size(finding: &Cause) -> String {
     }
 }
 
-/// What a finding cannot be told from.
+/// Returns a sentence with the ambiguous alternatives of a cause.
 fn ambiguity(finding: &Cause) -> String {
     if finding.ambiguous_with.is_empty() {
         return String::new();
     }
     let others = listed(finding.ambiguous_with.iter().map(|other| cause_at(other)));
-    format!(" This log cannot tell {} from {others}.", cause(&finding.effect, &finding.scope))
+    format!(" With this log, {} is not distinguishable from {others}.", cause(&finding.effect, &finding.scope))
 }
 
 fn removed(baseline: &RmsErrors, extended: &RmsErrors) -> String {
@@ -111,12 +111,12 @@ fn removed(baseline: &RmsErrors, extended: &RmsErrors) -> String {
     listed(known)
 }
 
-/// 1 − after / before.
+/// Returns the relative reduction, 1 − after / before. Returns `None` if it is not defined.
 pub fn gain(before: f64, after: f64) -> Option<f64> {
     (before > 0.0 && after.is_finite()).then(|| 1.0 - after / before)
 }
 
-/// "a, b and c".
+/// Joins items as in "a, b and c".
 pub fn listed(items: impl Iterator<Item = String>) -> String {
     let items: Vec<_> = items.collect();
     match items.split_last() {

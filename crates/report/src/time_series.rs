@@ -1,4 +1,4 @@
-//! The worst joint over time: measured, and simulated by both models.
+//! Worst joint over time: measured, and simulated with both models.
 
 use std::ops::Range;
 
@@ -9,35 +9,35 @@ use twinstep_model::Joint;
 use crate::report_data::ModelEvaluation;
 use crate::timeline::Timeline;
 
-/// Length of the cut that is shown from near [s].
+/// Maximum length of the detail plot [s].
 const CLOSE_S: f64 = 3.0;
 
-/// A joint over time.
+/// Time series of one joint.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TimeSeries {
-    /// The joint.
+    /// Name of the joint.
     pub joint: &'static str,
-    /// What is shown, with its unit.
+    /// Plotted quantity, with its unit.
     pub label: &'static str,
-    /// From near, where the given model is worst.
+    /// Detail of the interval in which the given model has the largest error.
     pub close: Vec<Curve>,
-    /// Model less measured over the whole log.
+    /// Model minus measurement over the whole log.
     pub errors: Vec<Curve>,
 }
 
-/// A line.
+/// Line of a plot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Curve {
-    /// Its name in the legend.
+    /// Name in the legend.
     pub name: &'static str,
-    /// Its look.
+    /// CSS class.
     pub class: &'static str,
-    /// Time [s] and value.
+    /// Pieces of the line, as points of time [s] and value.
     pub pieces: Vec<Vec<(f64, f64)>>,
 }
 
 impl TimeSeries {
-    /// Of position, and of torque where it was measured.
+    /// Returns the time series of position, and of torque if it was measured.
     pub fn of(log: &Log, trials: [&ModelEvaluation; 2]) -> Vec<TimeSeries> {
         let before = &trials[0].evaluation;
         let mut strips = Vec::new();
@@ -60,7 +60,7 @@ impl TimeSeries {
     }
 }
 
-/// The joint with the largest error.
+/// Returns the joint with the largest error.
 fn worst(evaluation: &Evaluation, of: fn(&JointEvaluation) -> Option<f64>) -> Option<Joint> {
     let errors = evaluation.per_joint.iter().filter_map(|(name, joint)| Some((name, of(joint)?)));
     let (name, _) = errors.max_by(|one, other| one.1.total_cmp(&other.1))?;
@@ -88,7 +88,7 @@ fn strip(log: &Log, joint: Joint, label: &'static str, measured: &[f64], models:
     }
 }
 
-/// The part of the log that is worst, not longer than [`CLOSE_S`].
+/// Returns the rows with the largest squared error, at most [`CLOSE_S`] long.
 fn worst_rows(log: &Log, errors: &[f64]) -> Range<usize> {
     let length = (CLOSE_S * log.meta().rate_hz).round() as usize;
     let power = |rows: &Range<usize>| -> f64 {
@@ -101,7 +101,7 @@ fn worst_rows(log: &Log, errors: &[f64]) -> Range<usize> {
     cuts.max_by(|one, other| power(one).total_cmp(&power(other))).unwrap_or(0..log.rows())
 }
 
-/// Lines through `rows`, without what is no number.
+/// Returns the lines through `rows`, without values that are not finite.
 fn pieces(log: &Log, rows: &Range<usize>, values: &[f64]) -> Vec<Vec<(f64, f64)>> {
     let kept: Vec<usize> = rows.clone().filter(|row| values[*row].is_finite()).collect();
     let at = |cells: &[f64]| kept.iter().map(|row| cells[*row]).collect::<Vec<f64>>();

@@ -1,21 +1,21 @@
-//! The time axis of a log: its parts one after another, without the pauses.
+//! Time axis of a log: its contiguous ranges one after another, without pauses.
 
 use std::ops::Range;
 
-/// Points a line, at most; a panel is a few hundred pixels wide.
+/// Maximum number of points per line. A panel is a few hundred pixels wide.
 const MAX_POINTS: usize = 800;
 
-/// Rows of a log in time.
+/// Time axis of the rows of a log.
 pub struct Timeline<'a> {
     parts: &'a [Range<usize>],
-    /// Time of each row: recorded in the first part, and counted on from there [s].
+    /// Time of each row [s]: as recorded in the first part, and continued without pauses in the others.
     time: Vec<f64>,
-    /// Rows that share two points of a line.
+    /// Number of rows that are reduced to two points of a line.
     rows_per_bucket: usize,
 }
 
 impl<'a> Timeline<'a> {
-    /// Rows at the times `t` [s], in `parts` that follow one another.
+    /// Creates the time axis of rows with times `t` [s], in consecutive ranges `parts`.
     pub fn new(t: &[f64], parts: &'a [Range<usize>]) -> Self {
         let mut time = Vec::with_capacity(t.len());
         let mut now = t.first().copied().unwrap_or(0.0);
@@ -28,13 +28,13 @@ impl<'a> Timeline<'a> {
         Self { parts, time, rows_per_bucket }
     }
 
-    /// From the first row to the last [s].
+    /// Returns the time from the first to the last row [s].
     pub fn range(&self) -> Range<f64> {
         let first = self.time.first().copied().unwrap_or(0.0);
         first..self.time.last().copied().unwrap_or(first)
     }
 
-    /// The points of each part's line, thinned to the lowest and the highest of each bucket, which keeps every peak.
+    /// Returns the points of each part's line, reduced to the minimum and maximum of each bucket. Peaks are kept.
     pub fn points(&self, values: &[f64]) -> Vec<Vec<(f64, f64)>> {
         let by_value = |a: &usize, b: &usize| values[*a].total_cmp(&values[*b]);
         let bucket_points = |bucket: Range<usize>| {
@@ -57,8 +57,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn thinned_line_keeps_its_peak_and_time_never_goes_back() {
-        // The second part starts over, as a log's episodes may.
+    fn thinned_line_keeps_its_peak_and_time_is_monotonic() {
+        // Time starts again in the second part, as it may in the episodes of a log.
         let t: Vec<f64> = (0..10_000).map(|row| f64::from(row % 5_000) * 0.005).collect();
         let parts = [0..5_000, 5_000..10_000];
         let mut values = vec![0.0; 10_000];

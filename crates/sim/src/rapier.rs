@@ -54,7 +54,7 @@ pub(crate) fn thread_pool(threads: usize) -> Result<rayon::ThreadPool, BackendBu
 pub(crate) fn check_lengths(commands: &[Command], active: &[bool], robots: usize) -> Result<(), BackendError> {
     for (field, given) in [("commands", commands.len()), ("active", active.len())] {
         if given != robots {
-            return Err(BackendError::WrongLength { field, given, wanted: robots });
+            return Err(BackendError::WrongLength { field, given, expected: robots });
         }
     }
     Ok(())

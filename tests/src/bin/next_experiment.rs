@@ -57,7 +57,7 @@ struct Row {
 }
 
 fn row(pair: &Pair, seed: u64) -> Row {
-    let pair = pair.pair();
+    let hypotheses = pair.hypothesis_pair();
     let motions: Vec<&ExcitationTrajectory> =
         EXCITATION_TRAJECTORIES.iter().filter(|motion| pair.on_ground || motion.base == BaseMount::Fixed).collect();
     let robot = pair.robot();
@@ -70,8 +70,8 @@ fn row(pair: &Pair, seed: u64) -> Row {
         .map(|(motion, log)| {
             let config = SimConfig { threads: 1, ..SimConfig::default() };
             let mut simulator = BatchRollout::new(&go2(), &config).expect("a simulator");
-            let predicted = pair.expected_log_likelihood_ratio(motion, like, &mut simulator).unwrap_or(0.0);
-            [predicted, pair.log_likelihood_ratio(log.clone(), &mut simulator).expect("an experiment")]
+            let predicted = hypotheses.expected_log_likelihood_ratio(motion, like, &mut simulator).unwrap_or(0.0);
+            [predicted, hypotheses.log_likelihood_ratio(log.clone(), &mut simulator).expect("an experiment")]
         })
         .collect();
     let most =
@@ -80,7 +80,7 @@ fn row(pair: &Pair, seed: u64) -> Row {
     let mut achieved: Vec<f64> = told.iter().map(|told| told[1]).collect();
     achieved.sort_by(f64::total_cmp);
     Row {
-        names: pair.names(),
+        names: hypotheses.names(),
         chosen: motions[chosen].name,
         predicted: told[chosen][0],
         achieved: told[chosen][1],

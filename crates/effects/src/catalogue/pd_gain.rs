@@ -45,9 +45,9 @@ pub const EFFECT: Effect = Effect {
             discriminating_experiment: "Two amplitudes of the same motion: a gain has the same ratio at both.",
         },
     ],
-    needs: &[DataRequirement::Reversals],
-    recommended: &[DataRequirement::TorqueMeasured, DataRequirement::KdVaries],
-    caveat: "without a motor-current sensor, kd_scale at one kd is the same as viscous_friction",
+    needs: &[DataRequirement::TorqueMeasured, DataRequirement::Reversals],
+    recommended: &[DataRequirement::KdVaries],
+    caveat: "",
     apply: |robot, site, values| {
         let actuator = &mut crate::joint(robot, site).actuator;
         actuator.kp_scale *= values[0];

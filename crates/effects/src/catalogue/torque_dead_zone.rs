@@ -34,8 +34,8 @@ pub const EFFECT: Effect = Effect {
             discriminating_experiment: "Reverse slowly under a constant load: backlash appears only where the load changes its sign.",
         },
     ],
-    needs: &[DataRequirement::Reversals],
-    recommended: &[DataRequirement::TorqueMeasured],
+    needs: &[DataRequirement::TorqueMeasured, DataRequirement::Reversals],
+    recommended: &[],
     caveat: "",
     apply: |robot, site, values| {
         crate::joint(robot, site).actuator.dead_zone = values[0];

@@ -1,4 +1,4 @@
-//! Which motion shows an effect, and in which quantities.
+//! Motion that excites an effect, and the quantities in which it is visible.
 
 use std::f64::consts::TAU;
 
@@ -7,44 +7,44 @@ use twinstep_model::{BaseMount, JointKind};
 
 use super::quantity::PlotQuantity;
 
-/// A motion that shows an effect, and the quantities in which it does.
+/// Motion that excites an effect, and the quantities in which it is plotted.
 pub struct EffectDemo {
-    /// What the robot is told.
+    /// Commanded motion.
     pub motion: &'static DemoMotion,
-    /// What is shown over time.
+    /// Quantity that is plotted over time.
     pub over_time: PlotQuantity,
-    /// What the law is about: x and y.
+    /// Quantities of the law: x and y.
     pub law: [PlotQuantity; 2],
 }
 
-/// What all legs are told, as offsets from the default pose.
+/// Commands of all legs, as offsets from the default pose.
 pub struct DemoMotion {
-    /// In words.
+    /// Description, for the title of the panel.
     pub what: &'static str,
-    /// Whether the base is fixed.
+    /// Mounting of the base.
     pub base: BaseMount,
-    /// Height of the lowest foot above the ground at the start [m], where the base is floating.
+    /// Height of the lowest foot above the ground at the start [m], for a floating base.
     pub clearance: f32,
-    /// The pose of time 0 is held for so long before it [s].
+    /// Duration for which the pose of time 0 is held before the motion [s].
     pub settle: f64,
-    /// Its length [s].
+    /// Duration of the motion [s].
     pub duration: f64,
-    /// [N·m/rad]
+    /// Position gain [N·m/rad].
     pub kp: f32,
-    /// [N·m·s/rad]
+    /// Velocity gain [N·m·s/rad].
     pub kd: f32,
-    /// The joint of the front left leg that is shown.
+    /// Joint of the front left leg that is plotted.
     pub joint: JointKind,
     /// Offsets of hip, thigh and calf at a time [rad].
     pub target: fn(f64) -> [f64; 3],
-    /// The battery's voltage at its start and end [V].
+    /// Battery voltage at the start and at the end [V].
     pub voltage: [f64; 2],
-    /// The motors' temperature at its start and end [°C].
+    /// Motor temperature at the start and at the end [°C].
     pub temperature: [f64; 2],
 }
 
-/// In the air, with the model's own gains, fully charged and cold.
-const HELD: DemoMotion = DemoMotion {
+/// Fixed base in the air, the model's own gains, full battery, cold motors.
+const FIXED_BASE: DemoMotion = DemoMotion {
     what: "",
     base: BaseMount::Fixed,
     clearance: 0.0,
@@ -57,33 +57,33 @@ const HELD: DemoMotion = DemoMotion {
     voltage: [33.6; 2],
     temperature: [30.0; 2],
 };
-/// On its feet.
-const STANDING: DemoMotion = DemoMotion { base: BaseMount::Floating, settle: 1.0, kp: 40.0, kd: 1.0, ..HELD };
+/// Standing robot.
+const STANDING: DemoMotion = DemoMotion { base: BaseMount::Floating, settle: 1.0, kp: 40.0, kd: 1.0, ..FIXED_BASE };
 
 const SWING: DemoMotion = DemoMotion {
-    what: "held in the air, the thighs swing at 0.8 Hz",
+    what: "fixed base, the thighs swing at 0.8 Hz",
     target: |t| [0.0, 0.4 * (TAU * 0.8 * t).sin(), 0.0],
-    ..HELD
+    ..FIXED_BASE
 };
 const CHIRP: DemoMotion = DemoMotion {
-    what: "held in the air, a chirp of the thighs from 0.5 to 3.5 Hz",
+    what: "fixed base, a chirp of the thighs from 0.5 to 3.5 Hz",
     target: |t| [0.0, 0.3 * (TAU * (0.5 + 0.5 * t) * t).sin(), 0.0],
-    ..HELD
+    ..FIXED_BASE
 };
 const STEP: DemoMotion = DemoMotion {
-    what: "held in the air, a step of the thighs",
+    what: "fixed base, a step of the thighs",
     duration: 0.5,
     target: |t| [0.0, if t < 0.05 { 0.2 } else { -0.2 }, 0.0],
-    ..HELD
+    ..FIXED_BASE
 };
 const THROWS: DemoMotion = DemoMotion {
-    what: "held in the air, large steps of the calves with stiff gains",
+    what: "fixed base, large steps of the calves with high gains",
     duration: 1.0,
     kp: 60.0,
     kd: 1.0,
     joint: JointKind::Calf,
     target: |t| [0.0, 0.0, 0.6 * (TAU * 2.0 * t).sin().signum()],
-    ..HELD
+    ..FIXED_BASE
 };
 const SQUATS: DemoMotion =
     DemoMotion { what: "standing, squats at 1 Hz", target: |t| squat(0.2 * (TAU * t).sin()), ..STANDING };
@@ -107,14 +107,14 @@ const LEAN: DemoMotion = DemoMotion {
     ..STANDING
 };
 const DROP: DemoMotion =
-    DemoMotion { what: "dropped onto its feet from 3 cm", clearance: 0.03, settle: 0.0, duration: 0.5, ..STANDING };
+    DemoMotion { what: "dropped from 3 cm onto the feet", clearance: 0.03, settle: 0.0, duration: 0.5, ..STANDING };
 
-/// Thigh and calf that bend together, so that the foot stays below the hip.
+/// Returns the offsets of a squat [rad]: thigh and calf bend together, so that the foot stays below the hip.
 fn squat(bend: f64) -> [f64; 3] {
     [0.0, bend, -2.0 * bend]
 }
 
-/// The motion and the quantities for an effect of the catalogue.
+/// Returns the motion and the quantities for an effect of the catalogue.
 pub fn of(effect: &Effect) -> EffectDemo {
     use PlotQuantity::{
         Acceleration, CommandedTorque, DeratingFactor, EstimatedTorque, Force, FrontShare, Gyro, Height,
@@ -140,7 +140,7 @@ pub fn of(effect: &Effect) -> EffectDemo {
         "ground_friction" => (&SWAY, Sideways, [Time, LateralAcceleration]),
         "ground_stiffness" => (&DROP, Height, [Time, Force]),
         "gyro_bias" => (&LEAN, Gyro, [RollRate, Gyro]),
-        // What comes late (command_delay, torque_delay, drive_lag); and what has no motion of its own yet.
+        // Delays and lags (command_delay, torque_delay, drive_lag), and effects without an entry above.
         _ => (&CHIRP, Position, [CommandedTorque, EstimatedTorque]),
     };
     EffectDemo { motion, over_time, law }

@@ -1,4 +1,4 @@
-//! A picture of an effect: a motion without it and with it, the difference, and its law in what was measured.
+//! Plot of an effect: a motion without and with it, the difference, and its law in measured quantities.
 
 mod experiment;
 mod quantity;
@@ -18,17 +18,17 @@ use crate::chart::{self, GREY, INK, Panel, PlotError};
 use experiment::{DemoMotion, EffectDemo};
 use quantity::{PlotQuantity, SimulatedRun};
 
-/// Width and height of the picture [px].
+/// Width and height of the plot [px].
 const SIZE: (u32, u32) = (1500, 1000);
 /// Heights of the text above the panels and of the upper panel [half px].
 const HEADER_HEIGHT: u32 = 270;
 const UPPER_HEIGHT: u32 = 860;
-/// From the least of the effect to the most.
+/// Colours, from the smallest to the largest value of the effect.
 const COLOURS: [RGBColor; 3] = [RGBColor(0xf2, 0xa7, 0x1b), RGBColor(0xe0, 0x40, 0x1f), RGBColor(0x7a, 0x1f, 0xa2)];
-/// The voltage at which the motors have all their torque [V]: that of a full battery.
+/// Voltage of a full battery, at which the motors have their full torque [V].
 const FULL_V: f64 = 33.6;
 
-/// Simulates and draws.
+/// Simulates the effect and writes the plot.
 pub fn write_svg(effect: &'static Effect, path: &Path) -> Result<(), PlotError> {
     chart::check_writable(path)?;
     let experiment = experiment::of(effect);
@@ -39,9 +39,9 @@ pub fn write_svg(effect: &'static Effect, path: &Path) -> Result<(), PlotError> 
     chart::write(&draw(effect, &experiment, &names, &runs).map_err(simulate)?, path)
 }
 
-/// Robots with the low, the middle and the high of what is plausible, without one that changes nothing.
+/// Returns robots with a low, middle and high value of the prior range, except a value that has no effect.
 ///
-/// Only the first number of the first parameter varies, on all that the effect can be about.
+/// Only the first component of the first parameter varies, on the largest scope of the effect.
 fn variants(effect: &'static Effect) -> Result<Vec<(String, RobotModel)>, PlotError> {
     let scope = match effect.target {
         Target::Joints | Target::Supply => Scope::All,
@@ -51,10 +51,10 @@ fn variants(effect: &'static Effect) -> Result<Vec<(String, RobotModel)>, PlotEr
     let robot =
         |values| apply_effects(&go2(), &[EffectEntry::new(effect, scope, values).map_err(simulate)?]).map_err(simulate);
     if effect.name == "inertia" {
-        // Ten coordinates without a plausible range of their own: a lighter and a heavier trunk of the same shape.
+        // Ten coordinates without a useful prior range each: a lighter and a heavier base of the same shape.
         let scaled = |factor: f64| {
             let values = go2().trunk.scaled(factor).log_cholesky().to_vec();
-            Ok((format!("trunk times {factor}"), robot(values)?))
+            Ok((format!("base mass × {factor}"), robot(values)?))
         };
         return [0.7, 1.4].map(scaled).into_iter().collect();
     }
@@ -64,8 +64,8 @@ fn variants(effect: &'static Effect) -> Result<Vec<(String, RobotModel)>, PlotEr
     if first.no_effect_value.is_infinite() {
         sizes.reverse();
     }
-    let shown = sizes.into_iter().filter(|size| (size - first.no_effect_value).abs() > 1e-9);
-    shown
+    let visible = sizes.into_iter().filter(|size| (size - first.no_effect_value).abs() > 1e-9);
+    visible
         .map(|size| {
             let mut values = vec![size];
             values.resize(first.count, first.no_effect_value);
@@ -78,7 +78,7 @@ fn variants(effect: &'static Effect) -> Result<Vec<(String, RobotModel)>, PlotEr
         .collect()
 }
 
-/// What the robots do in a motion.
+/// Simulates the robots in a motion.
 fn play<'a>(motion: &DemoMotion, robots: impl Iterator<Item = &'a RobotModel>) -> Result<Vec<SimulatedRun>, PlotError> {
     let config = SimConfig { threads: 1, ..SimConfig::default() };
     let mut simulator = BatchRollout::new(&go2(), &config).map_err(simulate)?;
@@ -102,7 +102,7 @@ fn play<'a>(motion: &DemoMotion, robots: impl Iterator<Item = &'a RobotModel>) -
     Ok(runs.collect())
 }
 
-/// What the robot is told, and battery voltage and motor temperature, in each actuator period.
+/// Returns command, battery voltage [V] and motor temperature [°C] of each actuator period.
 fn commands(motion: &DemoMotion, robot: &RobotModel) -> (Vec<Command>, Vec<[f64; 2]>) {
     let (dt, pose) = (robot.control.actuator_dt(), robot.control.default_pose);
     let period = |period: usize| {
@@ -111,9 +111,9 @@ fn commands(motion: &DemoMotion, robot: &RobotModel) -> (Vec<Command>, Vec<[f64;
         let [volts, celsius] = [motion.voltage, motion.temperature].map(|[from, to]| from + share * (to - from));
         let offset = (motion.target)(t);
         let q = std::array::from_fn(|joint| (pose[joint] + offset[Joint::ALL[joint].kind as usize]) as f32);
-        let strength = |joint| robot.derating.derating_factor(joint, volts / FULL_V, celsius) as f32;
+        let factor = |joint| robot.derating.derating_factor(joint, volts / FULL_V, celsius) as f32;
         let command =
-            Command { derating_factor: std::array::from_fn(strength), ..Command::hold(q, motion.kp, motion.kd) };
+            Command { derating_factor: std::array::from_fn(factor), ..Command::hold(q, motion.kp, motion.kd) };
         (command, [volts, celsius])
     };
     (0..((motion.settle + motion.duration) / dt).round() as usize).map(period).unzip()
@@ -137,21 +137,21 @@ fn draw(
         let (upper, lower) = panels.split_vertically(UPPER_HEIGHT);
         let (left, right) = lower.split_horizontally(SIZE.0);
         let EffectDemo { motion, over_time, law: [x, y] } = *experiment;
-        let mut shown = panel(motion.what.to_owned(), PlotQuantity::Time, over_time, runs, &|run, period| {
+        let mut upper_panel = panel(motion.what.to_owned(), PlotQuantity::Time, over_time, runs, &|run, period| {
             over_time.of(run, period)
         });
         if over_time == PlotQuantity::Position {
             let command =
                 lines(&runs[..1], PlotQuantity::Time, &|run, period| f64::from(run.commands[period].q[run.joint]));
-            shown.lines.extend(command.into_iter().map(|line| chart::Line { colour: GREY, width: 2, ..line }));
-            shown.y = extent(&shown.lines, |(_, y)| y);
+            upper_panel.lines.extend(command.into_iter().map(|line| chart::Line { colour: GREY, width: 2, ..line }));
+            upper_panel.y = extent(&upper_panel.lines, |(_, y)| y);
         }
-        shown.draw(&upper)?;
-        panel("difference that it makes".to_owned(), PlotQuantity::Time, over_time, runs, &|run, period| {
+        upper_panel.draw(&upper)?;
+        panel("difference due to the effect".to_owned(), PlotQuantity::Time, over_time, runs, &|run, period| {
             over_time.of(run, period) - over_time.of(&runs[0], period)
         })
         .draw(&left)?;
-        panel("its law in the data".to_owned(), x, y, runs, &|run, period| y.of(run, period)).draw(&right)
+        panel("law in measured quantities".to_owned(), x, y, runs, &|run, period| y.of(run, period)).draw(&right)
     })
 }
 

@@ -1,4 +1,4 @@
-//! What a picture of an effect shows of a simulated motion.
+//! Quantities of a simulated motion in the plot of an effect.
 
 use twinstep_identify::experiment::estimated_torque;
 use twinstep_model::{
@@ -7,70 +7,70 @@ use twinstep_model::{
     go2,
 };
 
-/// [m/s²]
+/// Gravitational acceleration [m/s²].
 const GRAVITY: f64 = 9.81;
 
-/// A number of each actuator period, of the trunk or of the joint that is shown.
+/// Quantity of an actuator period, of the base or of the plotted joint.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum PlotQuantity {
-    /// Since the motion began.
+    /// Time since the start of the motion [s].
     Time,
-    /// As the encoder shows it.
+    /// Encoder reading of the position [rad].
     Position,
-    /// As the encoder shows it.
+    /// Encoder reading of the velocity [rad/s].
     Velocity,
-    /// Mean over the period.
+    /// Mean acceleration over the period [rad/s²].
     Acceleration,
-    /// What the ideal actuator would give, from command and measurement.
+    /// Torque of the ideal actuator for the command and the measured state [N·m].
     CommandedTorque,
-    /// What the motor gives, as its sensor shows it.
+    /// Measured motor torque [N·m].
     EstimatedTorque,
-    /// What the motor gives less what the ideal robot needs for the same motion.
+    /// Motor torque minus the torque that the ideal robot needs for the same motion [N·m].
     InverseDynamicsResidual,
-    /// Of the trunk.
+    /// Height of the base [m].
     Height,
-    /// Of the trunk, to the left.
+    /// Position of the base, to the left [m].
     Sideways,
-    /// Of the trunk, nose down.
+    /// Pitch of the base, nose down [rad].
     Pitch,
-    /// Roll rate as the gyroscope shows it.
+    /// Roll rate measured by the gyroscope [rad/s].
     Gyro,
-    /// Roll rate of the trunk.
+    /// True roll rate of the base [rad/s].
     RollRate,
-    /// On all feet.
+    /// Contact force on all feet [N].
     Force,
-    /// Share of the force that is on the front feet.
+    /// Fraction of the contact force that is on the front feet.
     FrontShare,
-    /// Acceleration of the trunk upwards, and gravity.
+    /// Upward acceleration of the base plus gravity [m/s²].
     VerticalAcceleration,
-    /// Acceleration of the trunk to the left.
+    /// Acceleration of the base to the left [m/s²].
     LateralAcceleration,
-    /// Of the battery.
+    /// Battery voltage [V].
     Voltage,
-    /// Of the motors.
+    /// Motor temperature [°C].
     Temperature,
-    /// Share of the torque that supply and heat leave.
+    /// Factor on the torque for supply voltage and motor temperature.
     DeratingFactor,
 }
 
-/// A robot's motion under commands.
+/// Simulated motion of a robot.
 pub struct SimulatedRun {
     /// The robot.
     pub robot: RobotModel,
-    /// One an actuator period.
+    /// Command of each actuator period.
     pub commands: Vec<Command>,
     /// Battery voltage [V] and motor temperature [°C] of each actuator period.
     pub supply: Vec<[f64; 2]>,
-    /// The joint that is shown.
+    /// Index of the plotted joint.
     pub joint: usize,
-    /// Actuator periods before time 0.
+    /// Number of actuator periods before time 0.
     pub settle: usize,
-    /// One more than commands.
+    /// States at the start of each actuator period and after the last one.
     pub states: RobotStates,
 }
 
 impl PlotQuantity {
-    /// For an axis, with its unit.
+    /// Returns the label of an axis, with its unit.
     pub fn label(self) -> &'static str {
         match self {
             Self::Time => "time [s]",
@@ -79,23 +79,23 @@ impl PlotQuantity {
             Self::Acceleration => "joint acceleration [rad/s²]",
             Self::CommandedTorque => "torque of the ideal actuator [N·m]",
             Self::EstimatedTorque => "measured torque [N·m]",
-            Self::InverseDynamicsResidual => "unexplained torque [N·m]",
-            Self::Height => "trunk height [m]",
-            Self::Sideways => "trunk to the left [m]",
-            Self::Pitch => "trunk pitch [rad]",
+            Self::InverseDynamicsResidual => "inverse-dynamics residual [N·m]",
+            Self::Height => "base height [m]",
+            Self::Sideways => "base position to the left [m]",
+            Self::Pitch => "base pitch [rad]",
             Self::Gyro => "measured roll rate [rad/s]",
             Self::RollRate => "true roll rate [rad/s]",
             Self::Force => "force on all feet [N]",
-            Self::FrontShare => "share on the front feet",
+            Self::FrontShare => "fraction on the front feet",
             Self::VerticalAcceleration => "upward acceleration + g [m/s²]",
             Self::LateralAcceleration => "acceleration to the left [m/s²]",
             Self::Voltage => "battery voltage [V]",
             Self::Temperature => "motor temperature [°C]",
-            Self::DeratingFactor => "share of the torque",
+            Self::DeratingFactor => "derating factor",
         }
     }
 
-    /// In actuator period `period` of a run.
+    /// Returns the value in actuator period `period` of a run.
     pub fn of(self, run: &SimulatedRun, period: usize) -> f64 {
         let (states, joint, dt) = (&run.states, run.joint, run.robot.control.actuator_dt());
         let change = |of: &dyn Fn(usize) -> f32| f64::from(of(period + 1) - of(period)) / dt;
@@ -105,9 +105,9 @@ impl PlotQuantity {
             Self::Position => f64::from(states.q[period][joint]),
             Self::Velocity => f64::from(states.dq[period][joint]),
             Self::Acceleration => change(&|row| states.dq[row][joint]),
-            Self::CommandedTorque => run.wanted(period),
+            Self::CommandedTorque => run.commanded_torque(period),
             Self::EstimatedTorque => run.measured_torque(period),
-            Self::InverseDynamicsResidual => f64::from(states.tau[period + 1][joint]) - run.needed(period),
+            Self::InverseDynamicsResidual => f64::from(states.tau[period + 1][joint]) - run.required_torque(period),
             Self::Height => f64::from(states.base_position[period][2]),
             Self::Sideways => f64::from(states.base_position[period][1]),
             Self::Pitch => {
@@ -128,8 +128,8 @@ impl PlotQuantity {
 }
 
 impl SimulatedRun {
-    /// Torque of an actuator without effects on the measured state [N·m].
-    fn wanted(&self, period: usize) -> f64 {
+    /// Returns the torque of an actuator without effects in the measured state [N·m].
+    fn commanded_torque(&self, period: usize) -> f64 {
         let (command, joint) = (&self.commands[period], self.joint);
         let [q, dq] = [self.states.q[period][joint], self.states.dq[period][joint]];
         f64::from(command.kp[joint] * (command.q[joint] - q) - command.kd[joint] * dq)
@@ -140,8 +140,8 @@ impl SimulatedRun {
         estimated_torque(&self.states, &self.robot, self.joint, period, period + 1)
     }
 
-    /// What the ideal robot, held in the air, needs for the measured motion [N·m], by inverse dynamics.
-    fn needed(&self, period: usize) -> f64 {
+    /// Returns the torque that the ideal robot with a fixed base needs for the measured motion [N·m]: inverse dynamics.
+    fn required_torque(&self, period: usize) -> f64 {
         let dt = self.robot.control.actuator_dt();
         let mean =
             |of: &[[f32; NUM_JOINTS]], joint: usize| f64::from(f32::midpoint(of[period][joint], of[period + 1][joint]));

@@ -1,4 +1,4 @@
-//! The page in a real browser, where there is one.
+//! Layout of the page in a real browser, if one is installed.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -11,19 +11,19 @@ use super::samples::{chirp, evidence, findings, recording, simulated, three_join
 use crate::html::escape;
 use crate::page::page;
 
-/// Widths of a screen [px].
+/// Widths of the tested screens [px].
 const WIDTHS: [u32; 3] = [360, 760, 1200];
 
-/// Chromium, by one of its names.
+/// Returns the path of Chromium, under one of its names.
 fn browser() -> Option<PathBuf> {
     let folders: Vec<_> = std::env::split_paths(&std::env::var_os("PATH")?).collect();
     let names = ["chromium", "chromium-browser", "google-chrome"];
     folders.iter().flat_map(|folder| names.map(|name| folder.join(name))).find(|path| path.is_file())
 }
 
-/// The page in frames of several widths, each with a line that says how wide it is and how wide its content.
+/// Returns a page with frames of several widths that reports the width of each frame and of its content.
 fn frames(page: &str) -> String {
-    // The policy of the page would be the frame's, and its parent could not look in.
+    // With the policy of the page, its parent could not read the frame.
     let page = escape(page);
     let frames = WIDTHS.map(|width| format!("<iframe width={width} height=900 srcdoc=\"{page}\"></iframe>")).concat();
     format!(
@@ -63,16 +63,16 @@ fn assert_fits(browser: &Path, name: &str, page: &str) {
 }
 
 #[test]
-fn page_fits_narrow_and_wide_screens_and_a_browser_does_not_complain() {
+fn page_fits_narrow_and_wide_screens_without_browser_errors() {
     let Some(browser) = browser() else {
         println!("skipped: no Chromium on the PATH");
         return;
     };
     let (diagnosis, extended) = findings();
-    let (log, said, own) = simulated();
+    let (log, diagnosis_with_torque, own) = simulated();
     let pages = [
         ("findings", page(&diagnosis, &evidence(&recording(), &extended))),
-        ("torque", page(&said, &evidence(&log, &own))),
+        ("torque", page(&diagnosis_with_torque, &evidence(&log, &own))),
         ("one leg", page(&nothing(), &evidence(&three_joints(), &extended))),
     ];
     for (name, page) in pages {
@@ -81,15 +81,15 @@ fn page_fits_narrow_and_wide_screens_and_a_browser_does_not_complain() {
 }
 
 #[test]
-#[ignore = "writes pages into the temporary folder, to be looked at"]
-fn pages_to_look_at() {
+#[ignore = "writes pages into the temporary folder, for manual inspection"]
+fn pages_for_inspection() {
     let folder = std::env::temp_dir().join("twinstep-report");
     std::fs::create_dir_all(&folder).unwrap();
     let (diagnosis, extended) = findings();
-    let (log, said, own) = simulated();
+    let (log, diagnosis_with_torque, own) = simulated();
     let write = |name: &str, page: String| std::fs::write(folder.join(name), page).unwrap();
     write("findings.html", page(&diagnosis, &evidence(&recording(), &extended)));
-    write("torque.html", page(&said, &evidence(&log, &own)));
+    write("torque.html", page(&diagnosis_with_torque, &evidence(&log, &own)));
     write(
         "nothing.html",
         page(&nothing(), &evidence(&chirp(&ModelFile::default(), BaseMount::Fixed), &ModelFile::default())),

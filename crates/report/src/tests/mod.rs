@@ -1,4 +1,4 @@
-//! Reports of made-up diagnoses on a real and on a simulated log.
+//! Reports of constructed diagnoses on a real and on a simulated log.
 
 #![allow(clippy::unwrap_used)]
 
@@ -13,10 +13,10 @@ use twinstep_model::BaseMount;
 use crate::page::page;
 use samples::{chirp, evidence, findings, loaded, recording, simulated, three_joints};
 
-/// What HTML closes by itself.
+/// Tags without a closing tag.
 const VOID: [&str; 2] = ["meta", "!doctype"];
 
-/// Every tag that is opened is closed, in order.
+/// Asserts that every opened tag is closed, in order.
 fn assert_well_formed(page: &str) {
     let mut open = Vec::new();
     for tag in page.split('<').skip(1) {
@@ -32,14 +32,13 @@ fn assert_well_formed(page: &str) {
     assert!(open.is_empty(), "{open:?} stay open");
 }
 
-/// What holds of every page.
+/// Asserts what holds for every page.
 fn check(page: &str) {
-    // The style has no tags, but `>` may be in it one day.
     assert_well_formed(page);
     for fetched in ["http:", "https:", "<script", "javascript:", " src=", "@import", "url(", " href="] {
         assert!(!page.to_lowercase().contains(fetched), "{fetched}");
     }
-    assert!(!page.contains("NaN") && !page.contains("inf "), "a number is none");
+    assert!(!page.contains("NaN") && !page.contains("inf "), "a number is not finite");
     assert!(page.len() < 1_000_000, "{} bytes", page.len());
 }
 
@@ -58,20 +57,20 @@ fn nothing() -> Diagnosis {
 }
 
 #[test]
-fn page_has_verdict_twelve_joints_strips_laws_and_provenance() {
+fn page_has_headline_twelve_joints_time_series_laws_and_provenance() {
     let (diagnosis, extended) = findings();
     let page = page(&diagnosis, &evidence(&recording(), &extended));
     check(&page);
     assert!(page.contains("<h1><strong>Coulomb friction of the calves</strong> (1.00 N·m, 95 %: 0.94 to 1.06), "));
     assert!(page.contains("together they remove 61 % of the joint position error (0.0360 → 0.0140 rad)"));
-    assert_eq!(page.matches("class=\"cell\"").count(), 24, "twelve before and twelve after");
+    assert_eq!(page.matches("class=\"cell\"").count(), 24, "twelve of each model");
     assert_eq!(page.matches("class=\"line measured\"").count(), 1);
-    assert_eq!(page.matches("class=\"line law\"").count(), 3, "one a finding");
+    assert_eq!(page.matches("class=\"line law\"").count(), 3, "one per cause");
     assert!(page.contains("data/go2_air_chirp") && page.contains("3200 rows") && page.contains("twinstep diagnose"));
 }
 
 #[test]
-fn friction_shows_as_a_step_over_velocity_of_the_size_that_was_added() {
+fn friction_is_plotted_as_a_step_over_velocity_with_the_added_torque() {
     let (_, extended) = findings();
     let evidence = evidence(&recording(), &extended);
     let law = evidence.laws.iter().find(|law| law.cause.0 == "coulomb_friction").unwrap();
@@ -82,13 +81,13 @@ fn friction_shows_as_a_step_over_velocity_of_the_size_that_was_added() {
 }
 
 #[test]
-fn unexplained_torque_of_a_simulated_robot_is_the_friction_that_it_has() {
+fn inverse_dynamics_residual_of_a_simulated_robot_is_its_friction() {
     let (log, diagnosis, extended) = simulated();
     let evidence = evidence(&log, &extended);
     let law = &evidence.laws[0];
     assert_eq!(law.cause, ("viscous_friction".to_owned(), "FL_thigh".to_owned()));
     for bin in &law.bins {
-        // The slope of noiseless rows is off by what three rows smooth away.
+        // Smoothing over three rows changes the derivative of noiseless rows.
         assert!((bin.mean - bin.law).abs() < 0.1, "{bin:?}");
         assert!((bin.law - 0.3 * bin.x).abs() < 1e-6, "{bin:?}");
     }
@@ -97,25 +96,25 @@ fn unexplained_torque_of_a_simulated_robot_is_the_friction_that_it_has() {
 }
 
 #[test]
-fn load_on_a_robot_on_its_feet_shows_over_time_in_its_motion() {
+fn payload_of_a_standing_robot_is_plotted_over_time() {
     let (log, extended) = loaded();
     let evidence = evidence(&log, &extended);
     let law = &evidence.laws[0];
     assert_eq!([law.x_label, law.y_label], ["time [s]", "position error [rad]"]);
-    assert!(law.bins.iter().map(|bin| bin.law).sum::<f64>() > 0.0, "the load explains some of it");
+    assert!(law.bins.iter().map(|bin| bin.law).sum::<f64>() > 0.0, "the payload explains a part of the error");
     check(&page(&nothing(), &evidence));
 }
 
 #[test]
-fn nothing_wrong_is_said_so() {
+fn report_without_causes_states_no_model_error() {
     let page = page(&nothing(), &evidence(&chirp(&ModelFile::default(), BaseMount::Fixed), &ModelFile::default()));
     check(&page);
-    assert!(page.contains("<h1>Nothing is wrong above the noise.</h1>"));
-    assert!(!page.contains("What causes it") && page.contains("no two causes"));
+    assert!(page.contains("<h1>No model error above the noise.</h1>"));
+    assert!(!page.contains("Identified causes") && page.contains("no two causes"));
 }
 
 #[test]
-fn unexplained_names_what_it_depends_on() {
+fn headline_states_what_the_residual_depends_on() {
     let unexplained = Unexplained {
         fraction: 0.8,
         depends_on: vec!["q_FR_hip".to_owned(), "dq_FR_hip".to_owned()],
@@ -167,7 +166,7 @@ fn text_from_files_is_never_markup() {
 }
 
 #[test]
-fn place_that_cannot_be_written_is_named() {
+fn error_names_a_path_that_cannot_be_written() {
     let evidence = evidence(&chirp(&ModelFile::default(), BaseMount::Fixed), &ModelFile::default());
     let error = crate::write_report(&nothing(), &evidence, std::path::Path::new("/no/such/report.html"))
         .unwrap_err()

@@ -1,4 +1,4 @@
-//! Logs and made-up diagnoses that the tests report.
+//! Logs and constructed diagnoses for the tests of the report.
 
 use std::path::Path;
 
@@ -16,12 +16,12 @@ use twinstep_identify::record;
 
 const RECORDING: &str = "data/go2_air_chirp";
 
-/// A real Go2, held in the air.
+/// Returns the recording of a real Go2 with a fixed base in the air.
 pub fn recording() -> Log {
     Log::open(Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(RECORDING)).unwrap()
 }
 
-/// `log` under the ideal Go2 and under `extended`.
+/// Returns the report data of `log` for the ideal Go2 and `extended`.
 pub fn evidence(log: &Log, extended: &ModelFile) -> ReportData {
     let mut simulator = BatchRollout::new(&go2(), &SimConfig::default()).unwrap();
     let provenance = Provenance {
@@ -33,7 +33,7 @@ pub fn evidence(log: &Log, extended: &ModelFile) -> ReportData {
     ReportData::gather(log, &ModelFile::default(), extended, &mut simulator, provenance).unwrap()
 }
 
-/// A model file with entries of name, scope, parameter and value.
+/// Returns a model file with entries of name, scope, parameter and value.
 fn model(entries: &[[&str; 4]]) -> ModelFile {
     let entry = |[name, scope, parameter, value]: &[&str; 4]| {
         format!("[[effect]]\nname = \"{name}\"\nscope = \"{scope}\"\n{parameter} = {value}\n")
@@ -41,7 +41,7 @@ fn model(entries: &[[&str; 4]]) -> ModelFile {
     ModelFile::parse(&format!("robot = \"go2\"\n{}", entries.iter().map(entry).collect::<String>()), "test").unwrap()
 }
 
-/// Three findings, and the model that they make.
+/// Returns a diagnosis with three causes, and the extended model.
 pub fn findings() -> (Diagnosis, ModelFile) {
     let extended = model(&[
         ["coulomb_friction", "calf", "torque_nm", "1.0"],
@@ -52,16 +52,16 @@ pub fn findings() -> (Diagnosis, ModelFile) {
     friction.held_out_gain = 0.44;
     friction.score_nats = 412.0;
     friction.evidence =
-        "The calves stick at every reversal: about 1 N·m, at any speed, with the sign of the speed.".to_owned();
+        "Friction of about 1 N·m at the calves, at any speed, with the sign of the velocity.".to_owned();
     friction.rivals = vec![rival("viscous_friction", "calf", 0.31), rival("coulomb_friction", "all", 0.29)];
     let mut armature = cause("armature", "calf", "inertia_kgm2", [0.015, 0.011, 0.019]);
     armature.held_out_gain = 0.21;
     armature.ambiguous_with = vec!["command_delay@calf".to_owned()];
-    armature.evidence = "Fast motion of the calves lags as if their rotors had 0.015 kg·m².".to_owned();
+    armature.evidence = "Fast motion of the calves lags as with a rotor inertia of 0.015 kg·m².".to_owned();
     armature.rivals = vec![rival("command_delay", "calf", 0.209)];
     let mut viscous = cause("viscous_friction", "thigh", "coefficient_nms", [0.3, 0.21, 0.39]);
     viscous.held_out_gain = 0.12;
-    viscous.evidence = "The thighs are slowed in proportion to their speed.".to_owned();
+    viscous.evidence = "Friction at the thighs is proportional to their velocity.".to_owned();
     viscous.rivals = vec![rival("coulomb_friction", "thigh", 0.08)];
     let diagnosis = Diagnosis {
         baseline: errors(0.036),
@@ -76,7 +76,7 @@ pub fn findings() -> (Diagnosis, ModelFile) {
         unexplained: Unexplained {
             fraction: 0.14,
             depends_on: vec!["q_FR_hip".to_owned()],
-            text: "A little is left at the front right hip, near its end of travel.".to_owned(),
+            text: "The residual is above the noise at the front right hip, near its joint limit.".to_owned(),
         },
         next_experiment: Some(NextExperiment {
             motion: "next_experiment".to_owned(),
@@ -85,7 +85,8 @@ pub fn findings() -> (Diagnosis, ModelFile) {
                 predicted_nats: 80.0,
                 median_nats: 20.0,
             }],
-            text: "Play steps, 10 s of small steps: it parts armature@calf from command_delay@calf.".to_owned(),
+            text: "Run steps, 10 s of small steps. It discriminates between armature@calf and command_delay@calf."
+                .to_owned(),
         }),
         extended_model: "extended.toml".to_owned(),
     };
@@ -115,7 +116,7 @@ fn rival(effect: &str, scope: &str, held_out_gain: f64) -> AlternativeCause {
     AlternativeCause { effect: effect.to_owned(), scope: scope.to_owned(), held_out_gain }
 }
 
-/// What a robot does under a chirp of all joints; with torques.
+/// Returns the simulated log of a chirp of all joints, with torques.
 pub fn chirp(robot: &ModelFile, base: BaseMount) -> Log {
     let segments = vec![Segment { name: "chirp".to_owned(), base }];
     let meta = Meta {
@@ -136,7 +137,7 @@ pub fn chirp(robot: &ModelFile, base: BaseMount) -> Log {
     record(&motion, &robot, None, backend, "test".to_owned(), &mut |_| true).unwrap()
 }
 
-/// A simulated log with torques, what is said of it, and the model that made it.
+/// Returns a simulated log with torques, its diagnosis, and the model that it was simulated with.
 pub fn simulated() -> (Log, Diagnosis, ModelFile) {
     let extended = model(&[
         ["viscous_friction", "FL_thigh", "coefficient_nms", "0.3"],
@@ -156,7 +157,7 @@ pub fn simulated() -> (Log, Diagnosis, ModelFile) {
     (chirp(&extended, BaseMount::Fixed), diagnosis, extended)
 }
 
-/// A robot on its feet with a load on its trunk, and the model that made it.
+/// Returns the log of a standing robot with a payload on its base, and the model that it was simulated with.
 pub fn loaded() -> (Log, ModelFile) {
     let extended = ModelFile::parse(
         "robot = \"go2\"\n[[effect]]\nname = \"payload\"\nscope = \"base\"\n\
@@ -167,7 +168,7 @@ pub fn loaded() -> (Log, ModelFile) {
     (chirp(&extended, BaseMount::Floating), extended)
 }
 
-/// A log of one leg.
+/// Returns the recording of one leg.
 pub fn three_joints() -> Log {
     let log = recording();
     let leg = |name: &str| name.ends_with("_RR_hip") || name.ends_with("_RR_thigh") || name.ends_with("_RR_calf");
