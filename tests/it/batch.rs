@@ -1,4 +1,4 @@
-//! The batch engine against rapier and against physics.
+//! Comparison of the batch engine with rapier and with closed forms.
 
 use rand::RngExt;
 use twinstep_model::{
@@ -38,12 +38,12 @@ fn batch(config: SimConfig, robots: usize) -> BatchBackend {
     BatchBackend::new(go2(), config, robots).unwrap()
 }
 
-/// Every joint is told to move at once.
+/// Returns the position targets of a simultaneous step of all joints [rad].
 fn step_target(_: usize) -> PerJoint {
     std::array::from_fn(|j| pose()[j] + if j % 3 == 2 { -0.2 } else { 0.1 })
 }
 
-/// Diagonal legs swing in turn, 2 Hz.
+/// Returns the position targets of a trot at 2 Hz [rad].
 fn trot_target(period: usize) -> PerJoint {
     let phase = std::f32::consts::TAU * 2.0 * period as f32 / SECOND as f32;
     std::array::from_fn(|j| {
@@ -53,21 +53,21 @@ fn trot_target(period: usize) -> PerJoint {
     })
 }
 
-/// Joint positions over one second of `target`, after half a second to settle.
+/// Returns the joint positions over one second of `target`, after 0.5 s in the default pose.
 fn motion(backend: &mut impl Backend, height: f32, target: fn(usize) -> PerJoint) -> Vec<PerJoint> {
-    let placement = InitialState::at_rest(height, pose());
-    backend.reset(&[(0, placement)]).unwrap();
+    let initial_state = InitialState::at_rest(height, pose());
+    backend.reset(&[(0, initial_state)]).unwrap();
     let robots = backend.num_robots();
-    let mut play = |target: PerJoint, periods: usize| {
+    let mut follow = |target: PerJoint, periods: usize| {
         let commands = vec![Command::hold(target, 40.0, 1.0); robots];
         backend.step(&commands, &vec![true; robots], periods).unwrap();
         backend.states().q[0]
     };
-    play(pose(), SECOND / 2);
-    (0..SECOND).map(|period| play(target(period), 1)).collect()
+    follow(pose(), SECOND / 2);
+    (0..SECOND).map(|period| follow(target(period), 1)).collect()
 }
 
-/// Of the trunk of a robot that stands [m].
+/// Returns the height of the trunk of a standing robot [m].
 fn standing_height(backend: &mut impl Backend) -> f32 {
     backend.reset(&[(0, InitialState::at_rest(0.335, pose()))]).unwrap();
     backend.step(&[Command::hold(pose(), 40.0, 1.0)], &[true], 3 * SECOND).unwrap();
@@ -81,44 +81,44 @@ fn rms_difference(one: &[PerJoint], other: &[PerJoint]) -> f32 {
 
 fn check(base: BaseMount, height: f32, target: fn(usize) -> PerJoint, limit: f32) {
     let reference = motion(&mut finest_rapier(base), height, target);
-    let ours = motion(&mut batch(at(1000, 4, base), 1), height, target);
-    let difference = rms_difference(&ours, &reference);
+    let in_batch = motion(&mut batch(at(1000, 4, base), 1), height, target);
+    let difference = rms_difference(&in_batch, &reference);
     println!("{difference}");
-    assert!(difference < limit, "{difference} rad from rapier");
+    assert!(difference < limit, "RMS difference to rapier: {difference} rad");
 }
 
 #[test]
-fn robot_on_a_stand_moves_as_in_rapier() {
+fn fixed_base_motion_agrees_with_rapier() {
     check(BaseMount::Fixed, 1.0, step_target, 0.001);
     check(BaseMount::Fixed, 1.0, trot_target, 0.001);
 }
 
 #[test]
-fn stance_step_is_as_in_rapier() {
+fn stance_step_agrees_with_rapier() {
     check(BaseMount::Floating, 0.335, step_target, 0.006);
 }
 
 #[test]
-fn trot_is_as_in_rapier() {
+fn trot_agrees_with_rapier() {
     check(BaseMount::Floating, 0.335, trot_target, 0.02);
 }
 
 #[test]
-fn robot_sinks_as_deep_into_soft_ground_as_in_rapier() {
+fn penetration_of_soft_ground_agrees_with_rapier() {
     let mut robot = go2();
     robot.contact.time_constant = 0.05;
     let config = || at(1000, 4, BaseMount::Floating);
     let hard = standing_height(&mut batch(config(), 1));
-    let [ours, rapier] = [
+    let [batch, rapier] = [
         hard - standing_height(&mut BatchBackend::new(robot.clone(), config(), 1).unwrap()),
         hard - standing_height(&mut RapierBackend::new(robot.clone(), config(), 1).unwrap()),
     ];
-    println!("{ours} m, in rapier {rapier} m");
-    assert!(ours > 0.005 && (rapier / ours - 1.0).abs() < 0.4, "{ours} m, in rapier {rapier} m");
+    println!("{batch} m, in rapier {rapier} m");
+    assert!(batch > 0.005 && (rapier / batch - 1.0).abs() < 0.4, "{batch} m, in rapier {rapier} m");
 }
 
 #[test]
-fn feet_carry_the_weight() {
+fn foot_forces_sum_to_the_weight() {
     let mut backend = batch(at(1000, 4, BaseMount::Floating), 1);
     backend.step(&[Command::hold(pose(), 40.0, 1.0)], &[true], 10 * SECOND).unwrap();
     let force: f32 = backend.states().foot_force[0].iter().sum();
@@ -128,19 +128,19 @@ fn feet_carry_the_weight() {
 }
 
 #[test]
-fn robot_gives_the_same_bits_in_any_lane_batch_and_number_of_threads() {
+fn result_is_bitwise_independent_of_lane_batch_and_number_of_threads() {
     let run = |robots: usize, at_index: usize, threads: usize| {
         let config = SimConfig { threads, ..at(400, 4, BaseMount::Floating) };
         let mut backend = batch(config, robots);
-        let placement = |robot: usize| {
-            let variation =
+        let initial_state = |robot: usize| {
+            let randomisation =
                 RandomisationSample { mass_scale: 0.8 + 0.05 * robot as f32, ..RandomisationSample::default() };
-            InitialState { randomisation: variation, ..InitialState::at_rest(0.3 + 0.01 * robot as f32, pose()) }
+            InitialState { randomisation, ..InitialState::at_rest(0.3 + 0.01 * robot as f32, pose()) }
         };
-        let chosen = InitialState { base_linear_velocity: [0.5, 0.2, 0.0], ..placement(3) };
-        let placements: Vec<_> =
-            (0..robots).map(|robot| (robot, if robot == at_index { chosen } else { placement(robot) })).collect();
-        backend.reset(&placements).unwrap();
+        let tested = InitialState { base_linear_velocity: [0.5, 0.2, 0.0], ..initial_state(3) };
+        let initial_states: Vec<_> =
+            (0..robots).map(|robot| (robot, if robot == at_index { tested } else { initial_state(robot) })).collect();
+        backend.reset(&initial_states).unwrap();
         for period in 0..SECOND {
             let commands = vec![Command::hold(trot_target(period), 30.0, 0.75); robots];
             backend.step(&commands, &vec![true; robots], 1).unwrap();
@@ -154,10 +154,10 @@ fn robot_gives_the_same_bits_in_any_lane_batch_and_number_of_threads() {
     }
 }
 
-/// A robot that trots for a second, in the numbers that `lanes` names: joints after each actuator period.
-fn trot_in(lanes: SimdPrecision) -> Vec<PerJoint> {
+/// Returns the joint positions after each actuator period of one second of trot, with this precision.
+fn trot_in(precision: SimdPrecision) -> Vec<PerJoint> {
     motion(
-        &mut BatchBackend::with_precision(go2(), at(1000, 4, BaseMount::Floating), 1, lanes).unwrap(),
+        &mut BatchBackend::with_precision(go2(), at(1000, 4, BaseMount::Floating), 1, precision).unwrap(),
         0.335,
         trot_target,
     )
@@ -172,7 +172,7 @@ fn every_instruction_set_gives_the_same_bits() {
 }
 
 #[test]
-fn single_precision_is_enough() {
+fn single_precision_agrees_with_double() {
     let (single, double) = (trot_in(SimdPrecision::Single(InstructionSet::best())), trot_in(SimdPrecision::Double));
     let difference = rms_difference(&single, &double);
     assert!(difference > 0.0 && difference < 1e-4, "{difference} rad");
@@ -205,17 +205,17 @@ fn a_million_random_steps_of_random_robots_stay_finite() {
     const ROBOTS: usize = 1024;
     let mut random = stream(2, "robots", 0);
     let mut backend = batch(SimConfig::default(), ROBOTS);
-    let mut placements = Vec::new();
+    let mut initial_states = Vec::new();
     for robot in 0..ROBOTS {
-        let variation = RandomisationSample {
+        let randomisation = RandomisationSample {
             mass_scale: random.random_range(0.7..1.3),
             payload: random.random_range(-1.0..5.0),
             com_shift: std::array::from_fn(|_| random.random_range(-0.05..0.05)),
             friction_scale: random.random_range(0.2..1.7),
         };
-        placements.push((robot, InitialState { randomisation: variation, ..InitialState::at_rest(0.4, pose()) }));
+        initial_states.push((robot, InitialState { randomisation, ..InitialState::at_rest(0.4, pose()) }));
     }
-    backend.reset(&placements).unwrap();
+    backend.reset(&initial_states).unwrap();
     for _ in 0..1_000_000 / ROBOTS {
         let commands: Vec<_> =
             (0..ROBOTS).map(|_| Command::hold(pose().map(|q| q + random.random_range(-0.8..0.8)), 40.0, 1.0)).collect();
@@ -230,7 +230,7 @@ fn a_million_random_steps_of_random_robots_stay_finite() {
 }
 
 #[test]
-fn robot_that_diverges_is_named_and_its_neighbours_do_not_notice() {
+fn diverged_robot_is_named_and_the_others_are_not_affected() {
     let run = |broken: bool| {
         let mut backend = batch(at(400, 4, BaseMount::Floating), 8);
         let mut commands = vec![Command::hold(pose(), 30.0, 0.75); 8];
@@ -240,32 +240,32 @@ fn robot_that_diverges_is_named_and_its_neighbours_do_not_notice() {
         let results: Vec<_> = (0..20).map(|_| backend.step(&commands, &[true; 8], 1)).collect();
         (backend.states().clone(), results.into_iter().find_map(Result::err).map(|error| error.to_string()))
     };
-    let ((sound, nothing), (states, error)) = (run(false), run(true));
-    assert_eq!(nothing, None);
+    let ((expected, no_error), (states, error)) = (run(false), run(true));
+    assert_eq!(no_error, None);
     assert!(error.unwrap().starts_with("the simulation of robot 2 diverged"));
     for robot in (0..8).filter(|robot| *robot != 2) {
-        assert_eq!(states.q[robot], sound.q[robot], "robot {robot}");
+        assert_eq!(states.q[robot], expected.q[robot], "robot {robot}");
     }
 }
 
 #[test]
-fn snapshot_continues_bit_for_bit_in_the_same_place() {
+fn restored_snapshot_continues_bitwise_identically() {
     let mut backend = batch(at(400, 4, BaseMount::Floating), 3);
-    let go_on = |backend: &mut BatchBackend| {
+    let trot = |backend: &mut BatchBackend| {
         for period in 0..50 {
             backend.step(&[Command::hold(trot_target(period), 30.0, 0.75); 3], &[true; 3], 1).unwrap();
         }
         (backend.states().q[1], backend.states().base_position[1])
     };
-    go_on(&mut backend);
+    trot(&mut backend);
     let snapshot = backend.snapshot(1);
-    let first = go_on(&mut backend);
+    let first = trot(&mut backend);
     backend.restore(1, &snapshot);
-    assert_eq!(go_on(&mut backend), first);
+    assert_eq!(trot(&mut backend), first);
 }
 
 #[test]
-fn inactive_robots_stay_as_they_are() {
+fn inactive_robots_do_not_change() {
     let mut backend = batch(at(400, 4, BaseMount::Floating), 3);
     let before = backend.states().clone();
     backend.step(&[Command::hold(pose(), 30.0, 0.75); 3], &[true, false, true], 10).unwrap();

@@ -1,4 +1,4 @@
-//! Diagnosis through the real process: what is hidden is named, and what is healthy is not.
+//! `twinstep diagnose` as a process: it finds hidden effects and reports none for the ideal robot.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use twinstep_tests::ground_truth_actuator::{DRIVES, Motion, NOISE_NM};
 
 use crate::identify::{log_of, twinstep};
 
-/// Diagnoses what `robot`, in the other engine, leaves in the air.
+/// Diagnoses `robot` from a fixed-base log simulated in the other engine.
 fn diagnosed(robot: &RobotModel, folder: &Path) -> Diagnosis {
     let log = folder.join("log.parquet");
     log_of(robot).write(&log).unwrap();
@@ -30,7 +30,7 @@ fn diagnosed(robot: &RobotModel, folder: &Path) -> Diagnosis {
 }
 
 #[test]
-fn hidden_friction_is_named_with_its_scope_and_size_and_the_model_mended() {
+fn hidden_friction_is_found_with_its_scope_and_size_and_the_extended_model_fits() {
     let folder = tempfile::tempdir().unwrap();
     let entry = |name, scope: &str, value| {
         EffectEntry::new(Effect::named(name).unwrap(), scope.parse().unwrap(), vec![value]).unwrap()
@@ -45,13 +45,13 @@ fn hidden_friction_is_named_with_its_scope_and_size_and_the_model_mended() {
     assert!(cause.score_nats > cause.threshold_nats);
     let [before, after] = [diagnosis.baseline, diagnosis.extended].map(|errors| errors.q_rmse_rad.unwrap());
     assert!(after < 0.4 * before, "{before} -> {after} rad on held-out seconds");
-    stands_in_a_browser(&folder.path().join("diagnosis/report.html"));
+    check_in_a_browser(&folder.path().join("diagnosis/report.html"));
 }
 
-/// Every picture is there, the page fits the window, and nothing is fetched.
-fn stands_in_a_browser(page: &Path) {
+/// Checks that every plot is present, the page fits the window, and nothing is loaded.
+fn check_in_a_browser(page: &Path) {
     let Some(browser) = browser() else {
-        println!("there is no Chromium here: the report was not looked at");
+        println!("no Chromium is installed: the layout of the report was not checked");
         return;
     };
     let found = layout(&browser, page);
@@ -62,7 +62,7 @@ fn stands_in_a_browser(page: &Path) {
 }
 
 #[test]
-fn delay_with_which_a_loop_rings_is_named() {
+fn torque_delay_of_an_oscillating_loop_is_found() {
     let folder = tempfile::tempdir().unwrap();
     let delay = Effect::named("torque_delay").unwrap();
     let robot =
@@ -77,7 +77,7 @@ fn delay_with_which_a_loop_rings_is_named() {
 }
 
 #[test]
-fn healthy_robot_gets_no_name() {
+fn ideal_robot_has_no_finding() {
     let folder = tempfile::tempdir().unwrap();
     let diagnosis = diagnosed(&go2(), folder.path());
     assert!(diagnosis.findings.is_empty(), "{:#?}", diagnosis.findings);
@@ -90,7 +90,7 @@ fn healthy_robot_gets_no_name() {
 }
 
 #[test]
-fn bad_input_is_refused_before_any_work() {
+fn bad_input_is_rejected_before_the_computation() {
     let output = twinstep(&["diagnose", "data/go2_air_chirp", "--out", "/proc/nowhere"]);
     assert_eq!(output.status.code(), Some(2));
     assert!(output.stdout.is_empty());
@@ -99,9 +99,9 @@ fn bad_input_is_refused_before_any_work() {
     assert_eq!(output.status.code(), Some(2));
 }
 
-/// Legs of a robot with other names, whose motors saturate: no body of it is known.
+/// The joints have other names than the Go2's, so there is no rigid-body model, and the motors saturate.
 #[test]
-fn drives_of_another_robot_are_looked_at_by_their_torques() {
+fn actuators_of_another_robot_are_diagnosed_from_their_torques() {
     let folder = tempfile::tempdir().unwrap();
     let motion = Motion { seconds: 10.0, amplitude: 0.3, hz: [0.5, 5.0], seed: 4 };
     let go2 = DRIVES[1].logs(motion).measured;
@@ -128,7 +128,7 @@ fn drives_of_another_robot_are_looked_at_by_their_torques() {
 
     let model = folder.path().join("model.toml");
     std::fs::write(&model, ModelFile::default().to_toml()).unwrap();
-    let refused = twinstep(&[&command[..], &["--model", model.to_str().unwrap()]].concat());
-    assert_eq!(refused.status.code(), Some(2));
-    assert!(String::from_utf8_lossy(&refused.stderr).contains("FL_shank"), "{refused:?}");
+    let rejected = twinstep(&[&command[..], &["--model", model.to_str().unwrap()]].concat());
+    assert_eq!(rejected.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&rejected.stderr).contains("FL_shank"), "{rejected:?}");
 }

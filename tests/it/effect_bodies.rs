@@ -1,4 +1,4 @@
-//! Effects of bodies and ground against closed forms.
+//! Comparison of effects of bodies and ground with closed forms.
 
 use std::f64::consts::TAU;
 
@@ -12,7 +12,7 @@ use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 
 const GRAVITY: f64 = 9.81;
 const CALF: usize = 2;
-/// Log-Cholesky coordinates of a body without products of inertia.
+/// Log-Cholesky parameters of a body without products of inertia.
 const ALPHA: f64 = -0.55;
 const D1: f64 = -3.2;
 const D2: f64 = -3.0;
@@ -50,7 +50,7 @@ pub fn pose() -> PerJoint {
     go2().control.default_pose_f32()
 }
 
-/// Where the frames of the bodies are, trunk first.
+/// Returns the poses of the bodies' frames in the world, trunk first.
 fn frames_of(states: &RobotStates) -> Vec<Pose> {
     let trunk = Pose {
         position: Vec3::from(states.base_position[0]),
@@ -59,19 +59,20 @@ fn frames_of(states: &RobotStates) -> Vec<Pose> {
     body_poses(&go2(), trunk, &states.q[0]).to_vec()
 }
 
-/// Masses [kg] and where they are in their bodies' frames [m]: the nominal ones, and `body` with what `change` makes of
-/// it.
+/// Returns the body index, mass [kg] and position in the body's frame [m] of every point mass.
+///
+/// Body `body` consists of the masses that `change` returns, every other body of its nominal mass.
 fn masses(body: usize, change: impl Fn(&RigidBody) -> Vec<(f64, DVec3)>) -> Vec<(usize, f64, DVec3)> {
     let robot = go2();
     let bodies = std::iter::once(&robot.trunk).chain(robot.legs.iter().flat_map(|leg| &leg.bodies));
     let masses = bodies.enumerate().flat_map(|(index, own)| {
         let parts = if index == body { change(own) } else { vec![(own.mass, own.com)] };
-        parts.into_iter().map(move |(mass, place)| (index, mass, place))
+        parts.into_iter().map(move |(mass, position)| (index, mass, position))
     });
     masses.collect()
 }
 
-/// Effects of a body, and the masses that it consists of then.
+/// An effect of a body with its values, and the point masses of the changed body.
 type BodyCase<'a> = ((&'a str, &'a [f64]), fn(&RigidBody) -> Vec<(f64, DVec3)>);
 
 const LINK_CASES: [BodyCase; 3] = [
@@ -83,7 +84,7 @@ const LINK_CASES: [BodyCase; 3] = [
 ];
 
 #[test]
-fn held_leg_carries_the_weight_of_its_links() {
+fn holding_torques_balance_the_weight_of_the_links() {
     for ((name, values), change) in LINK_CASES {
         let robot = with(&go2(), &[(name, "FL_calf", values)]);
         let mut backend = batch(&robot, config(BaseMount::Fixed, 1000), InitialState::at_rest(1.0, pose()));
@@ -91,21 +92,21 @@ fn held_leg_carries_the_weight_of_its_links() {
         let (states, frames) = (backend.states(), frames_of(backend.states()));
         for joint in 0..3 {
             let axis = frames[1 + joint].rotation * RobotModel::axis(Joint::ALL[joint]).as_vec3();
-            let carried: f64 = masses(1 + CALF, change)
+            let expected: f64 = masses(1 + CALF, change)
                 .iter()
                 .filter(|(body, ..)| (1 + joint..=3).contains(body))
-                .map(|(body, mass, place)| {
-                    let lever = frames[*body].transform(place.as_vec3()) - frames[1 + joint].position;
+                .map(|(body, mass, position)| {
+                    let lever = frames[*body].transform(position.as_vec3()) - frames[1 + joint].position;
                     mass * GRAVITY * f64::from(axis.dot(lever.cross(Vec3::Z)))
                 })
                 .sum();
             let tau = f64::from(states.tau[0][joint]);
-            assert!((tau - carried).abs() < 2e-3, "`{name}`, joint {joint}: {tau} N·m carry {carried}");
+            assert!((tau - expected).abs() < 2e-3, "`{name}`, joint {joint}: {tau} N·m, expected {expected} N·m");
         }
     }
 }
 
-/// Every joint but one has so heavy a rotor that it stays.
+/// Returns `robot` with such a high rotor inertia at every joint except [`CALF`] that only this joint moves.
 fn lone_calf(robot: &RobotModel) -> RobotModel {
     let mut robot = robot.clone();
     for (_, model) in robot.joints.iter_mut().enumerate().filter(|(joint, _)| *joint != CALF) {
@@ -116,23 +117,23 @@ fn lone_calf(robot: &RobotModel) -> RobotModel {
 }
 
 #[test]
-fn limp_calf_swings_with_the_period_of_its_pendulum() {
-    // Moments about the calf's axis, y, beside those of the masses.
+fn unactuated_calf_swings_with_the_period_of_its_pendulum() {
+    // Moments of inertia about the calf's axis, y, without those of the point masses.
     let own = go2().legs[0].bodies[2].inertia.y_axis.y;
     let moments = [own, own, (2.0 * ALPHA).exp() * ((2.0 * D1).exp() + (2.0 * D3).exp())];
     for (((name, values), change), moment) in LINK_CASES.into_iter().zip(moments) {
         let robot = lone_calf(&with(&go2(), &[(name, "FL_calf", values)]));
         let (mut inertia, mut lever) = (moment + robot.joints[CALF].armature, DVec3::ZERO);
-        for (_, mass, place) in masses(1 + CALF, change).iter().filter(|(body, ..)| *body == 1 + CALF) {
-            inertia += mass * (place.x.powi(2) + place.z.powi(2));
-            lever += *mass * *place;
+        for (_, mass, position) in masses(1 + CALF, change).iter().filter(|(body, ..)| *body == 1 + CALF) {
+            inertia += mass * (position.x.powi(2) + position.z.powi(2));
+            lever += *mass * *position;
         }
         let expected = TAU * (inertia / (GRAVITY * lever.x.hypot(lever.z))).sqrt();
 
         let rest = lever.x.atan2(-lever.z);
-        let mut placement = InitialState::at_rest(2.0, [0.0; 12]);
-        placement.q[CALF] = rest as f32 + 0.1;
-        let mut backend = batch(&robot, config(BaseMount::Fixed, 1000), placement);
+        let mut initial_state = InitialState::at_rest(2.0, [0.0; 12]);
+        initial_state.q[CALF] = rest as f32 + 0.1;
+        let mut backend = batch(&robot, config(BaseMount::Fixed, 1000), initial_state);
         let mut crossings = Vec::new();
         let mut before = 1.0;
         for period in 1..=1000 {
@@ -150,7 +151,7 @@ fn limp_calf_swings_with_the_period_of_its_pendulum() {
 }
 
 #[test]
-fn feet_of_a_standing_robot_carry_its_trunk_where_its_mass_is() {
+fn centre_of_pressure_is_below_the_centre_of_mass() {
     let cases: [BodyCase; 3] = [
         (("payload", &[3.0, 0.12, 0.05, 0.1]), |own| vec![(own.mass, own.com), (3.0, DVec3::new(0.12, 0.05, 0.1))]),
         (("com_shift", &[-0.05, 0.03, 0.02]), |own| vec![(own.mass, own.com + DVec3::new(-0.05, 0.03, 0.02))]),
@@ -164,49 +165,54 @@ fn feet_of_a_standing_robot_carry_its_trunk_where_its_mass_is() {
         run(&mut backend, &Command::hold(pose(), 100.0, 3.0), 4.0);
         let (states, frames) = (backend.states(), frames_of(backend.states()));
         let (mut weight, mut moment) = (0.0, DVec3::ZERO);
-        for (body, mass, place) in masses(0, change) {
+        for (body, mass, position) in masses(0, change) {
             weight += GRAVITY * mass;
-            moment += GRAVITY * mass * frames[body].transform(place.as_vec3()).as_dvec3();
+            moment += GRAVITY * mass * frames[body].transform(position.as_vec3()).as_dvec3();
         }
-        let (mut carried, mut foot_moment) = (0.0, DVec3::ZERO);
+        let (mut total_force, mut foot_moment) = (0.0, DVec3::ZERO);
         for (leg, force) in states.foot_force[0].into_iter().enumerate() {
-            carried += f64::from(force);
+            total_force += f64::from(force);
             let foot = frames[3 + 3 * leg].transform(robot.shapes.foot_centre.as_vec3());
             foot_moment += f64::from(force) * foot.as_dvec3();
         }
-        assert!((carried / weight - 1.0).abs() < 2e-3, "`{name}`: {carried} N of {weight} N");
-        let off = (foot_moment / carried - moment / weight).truncate();
-        assert!(off.length() < 1e-3, "`{name}`: the feet's centre of pressure is {off} m off");
+        assert!((total_force / weight - 1.0).abs() < 2e-3, "`{name}`: {total_force} N on the feet, weight {weight} N");
+        let error = (foot_moment / total_force - moment / weight).truncate();
+        assert!(error.length() < 1e-3, "`{name}`: error of the centre of pressure: {error} m");
     }
 }
 
 #[test]
-fn sliding_robot_is_slowed_by_friction_times_gravity() {
-    fn slowed(mut backend: impl Backend, hold: &Command) -> f64 {
+fn sliding_robot_decelerates_by_friction_times_gravity() {
+    fn deceleration(mut backend: impl Backend, hold: &Command) -> f64 {
         run(&mut backend, hold, 0.1);
         let before = backend.states().base_linear_velocity[0][0];
         run(&mut backend, hold, 0.2);
         f64::from(before - backend.states().base_linear_velocity[0][0]) / 0.2
     }
-    // Crouched and stiff, so that it does not tip over.
+    // A stiff crouch, so that the robot does not tip over.
     let crouch = Joint::map_kinds(0.0, 1.3, -2.6);
     let ground = InitialState::standing_on(&twinstep_model::Ground::FLAT, &go2(), crouch, 0.0);
-    let placement = InitialState { base_linear_velocity: [2.0, 0.0, 0.0], ..ground };
+    let initial_state = InitialState { base_linear_velocity: [2.0, 0.0, 0.0], ..ground };
     let hold = Command::hold(crouch, 200.0, 5.0);
     for coefficient in [0.1, 0.3] {
         let robot = with(&go2(), &[("ground_friction", "ground", &[coefficient])]);
-        let stand = config(BaseMount::Floating, 1000);
-        let engines = [slowed(batch(&robot, stand, placement), &hold), slowed(rapier(&robot, stand, placement), &hold)];
-        for slowed in engines {
+        let config = config(BaseMount::Floating, 1000);
+        let engines = [
+            deceleration(batch(&robot, config, initial_state), &hold),
+            deceleration(rapier(&robot, config, initial_state), &hold),
+        ];
+        for measured in engines {
             let expected = coefficient * GRAVITY;
-            assert!((slowed / expected - 1.0).abs() < 0.03, "{slowed} m/s², closed form {expected}: {engines:?}");
+            assert!((measured / expected - 1.0).abs() < 0.03, "{measured} m/s², closed form {expected}: {engines:?}");
         }
     }
 }
 
-/// Heights [m] of a point on MuJoCo's contact of time constant T [s] after each 5 ms, from 0 under a pull of `free`
-/// [m/s²]: `a = d (−b v − k d r) + (1 − d) free`, where the impedance d grows with the depth from 0.9 to 0.95 in 1 mm.
-fn sinking(time_constant: f64, free: f64, periods: usize) -> Vec<f64> {
+/// Integrates MuJoCo's soft contact with time constant T [s] and returns the height [m] after each 5 ms.
+///
+/// `a = d (−b v − k d r) + (1 − d) free`, with the unconstrained acceleration `free` [m/s²] and the initial height 0.
+/// The impedance d grows with the depth, from 0.9 to 0.95 over 1 mm.
+fn penetration(time_constant: f64, free: f64, periods: usize) -> Vec<f64> {
     let (h, [mut r, mut v]) = (5e-6, [0.0, 0.0]);
     let (b, k) = (2.0 / (0.95 * time_constant), (0.95 * time_constant).powi(-2));
     let mut after_5_ms = || {
@@ -220,9 +226,9 @@ fn sinking(time_constant: f64, free: f64, periods: usize) -> Vec<f64> {
     (0..periods).map(|_| after_5_ms()).collect()
 }
 
-/// A foot that a constant torque presses onto the ground without friction, its joint alone free to move.
+/// A constant torque presses a foot onto ground without friction. Only its joint can move.
 #[test]
-fn pressed_foot_sinks_in_and_settles_with_the_grounds_time_constant() {
+fn pressed_foot_penetrates_with_the_time_constant_of_the_ground() {
     for time_constant in [0.05, 0.1] {
         let mut robot = lone_calf(&with(&go2(), &[("ground_stiffness", "ground", &[time_constant])]));
         robot.contact.friction = 0.0;
@@ -230,37 +236,37 @@ fn pressed_foot_sinks_in_and_settles_with_the_grounds_time_constant() {
             let foot = frames_of(states)[3].transform(robot.shapes.foot_centre.as_vec3());
             f64::from(foot.z) - robot.shapes.foot_radius
         };
-        // Above it first, to know how high it is; the other legs are out of the way.
+        // The foot height is measured above the ground first. The other legs are folded.
         let mut q = pose();
         for leg in 1..4 {
             (q[3 * leg + 1], q[3 * leg + 2]) = (1.5, -2.7);
         }
-        let far = batch(&robot, config(BaseMount::Fixed, 2000), InitialState::at_rest(1.0, q));
-        let touching = 1.0 - height(far.states());
+        let above_ground = batch(&robot, config(BaseMount::Fixed, 2000), InitialState::at_rest(1.0, q));
+        let touching = 1.0 - height(above_ground.states());
         let mut backend = batch(&robot, config(BaseMount::Fixed, 2000), InitialState::at_rest(touching as f32, q));
 
         let body = &robot.legs[0].bodies[2];
         let inertia =
             body.inertia.y_axis.y + body.mass * (body.com.x.powi(2) + body.com.z.powi(2)) + robot.joints[CALF].armature;
-        // As much as sinks the foot 4 mm.
-        let pull = -0.004 / (0.05 * time_constant * time_constant);
-        let pushing = |states: &RobotStates| {
+        // Acceleration that causes a penetration of 4 mm.
+        let free_acceleration = -0.004 / (0.05 * time_constant * time_constant);
+        let pressing_command = |states: &RobotStates| {
             let rotation = frames_of(states)[3].rotation;
-            // The foot's height by the joint's angle, about y.
-            let slope = -f64::from((rotation * robot.shapes.foot_centre.as_vec3()).x);
+            // Derivative of the foot height with respect to the joint angle, about y.
+            let derivative = -f64::from((rotation * robot.shapes.foot_centre.as_vec3()).x);
             let weight = body.mass * GRAVITY * f64::from((rotation * body.com.as_vec3()).x);
             let mut command = Command::hold(q, 0.0, 0.0);
-            command.tau_ff[CALF] = (pull / slope * inertia - weight) as f32;
+            command.tau_ff[CALF] = (free_acceleration / derivative * inertia - weight) as f32;
             command
         };
-        let expected = sinking(time_constant, pull, (10.0 * time_constant / 0.005) as usize);
+        let expected = penetration(time_constant, free_acceleration, (10.0 * time_constant / 0.005) as usize);
         for (period, expected) in expected.iter().enumerate() {
-            let command = pushing(backend.states());
+            let command = pressing_command(backend.states());
             run(&mut backend, &command, 0.005);
             let measured = height(backend.states());
             assert!((measured - expected).abs() < 4e-5, "T = {time_constant} s, {period}: {measured} m, {expected} m");
         }
-        // At full impedance: a spring of 1/T² against a twentieth of the pull.
+        // At full impedance, a spring of 1/T² balances a twentieth of the acceleration.
         assert!((expected[expected.len() - 1] / -0.004 - 1.0).abs() < 0.01, "{expected:?}");
     }
 }

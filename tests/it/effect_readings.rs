@@ -1,4 +1,4 @@
-//! What sensors show and a log tells, against the definitions of the effects.
+//! Comparison of sensor effects, and of effects that depend on logged channels, with their definitions.
 
 use glam::Vec3;
 use twinstep_identify::{Experiment, WindowConfig};
@@ -12,27 +12,27 @@ use crate::effect_bodies::{batch, config, pose, rapier, run, with};
 
 const CALF: usize = 2;
 
-fn check_gyroscope<B: Backend>(of: impl Fn(&RobotModel, SimConfig, InitialState) -> B) {
+fn check_gyroscope<B: Backend>(backend: impl Fn(&RobotModel, SimConfig, InitialState) -> B) {
     let biased = [("gyro_bias", "base", &[0.3, -0.2, 0.1][..]), ("gyro_bias", "base", &[0.1, 0.0, 0.0])];
-    let thrown = InitialState { base_angular_velocity: [1.0, 0.5, -0.8], ..InitialState::at_rest(3.0, pose()) };
+    let initial_state = InitialState { base_angular_velocity: [1.0, 0.5, -0.8], ..InitialState::at_rest(3.0, pose()) };
     let [mut biased, mut ideal] =
-        [with(&go2(), &biased), go2()].map(|robot| of(&robot, config(BaseMount::Floating, 1000), thrown));
+        [with(&go2(), &biased), go2()].map(|robot| backend(&robot, config(BaseMount::Floating, 1000), initial_state));
     for _ in 0..20 {
         run(&mut biased, &Command::hold(pose(), 30.0, 0.75), 0.02);
         run(&mut ideal, &Command::hold(pose(), 30.0, 0.75), 0.02);
         assert_eq!(biased.states().base_orientation, ideal.states().base_orientation);
-        let [shown, turning] = [&biased, &ideal].map(|one| Vec3::from(one.states().base_angular_velocity[0]));
-        assert!((shown - turning - Vec3::new(0.4, -0.2, 0.1)).length() < 1e-6, "{shown} of {turning}");
+        let [measured, exact] = [&biased, &ideal].map(|one| Vec3::from(one.states().base_angular_velocity[0]));
+        assert!((measured - exact - Vec3::new(0.4, -0.2, 0.1)).length() < 1e-6, "{measured}, without bias {exact}");
     }
 }
 
 #[test]
-fn gyroscope_shows_its_bias_and_the_motion_is_the_same() {
+fn gyro_bias_shifts_the_reading_and_does_not_change_the_motion() {
     check_gyroscope(batch);
     check_gyroscope(rapier);
 }
 
-/// Keeps what it is told, and answers with a torque that grows by 0.1 N·m an actuator period.
+/// Records the commands and returns a torque that grows by 0.1 N·m per actuator period.
 #[derive(Default)]
 struct CommandRecorder(Vec<Command>);
 
@@ -47,8 +47,11 @@ impl Rollout for CommandRecorder {
     }
 }
 
-/// Residuals and commands of a log of the FL calf at 200 Hz: 30 to 24 V, 30 to 90 °C, a torque `late` periods late.
-fn told(robot: &RobotModel, late: f64) -> (Vec<f64>, Vec<Command>) {
+/// Returns the residuals [standard deviations] and the commands for a log of the FL calf at 200 Hz.
+///
+/// The supply voltage falls from 30 to 24 V and the temperature rises from 30 to 90 °C. The logged torque is delayed by
+/// `delay` periods.
+fn residuals_and_commands(robot: &RobotModel, delay: f64) -> (Vec<f64>, Vec<Command>) {
     let rows = 60;
     let column = |of: &dyn Fn(f64) -> f64| (0..rows).map(|row| of(f64::from(row))).collect::<Vec<_>>();
     let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
@@ -58,7 +61,7 @@ fn told(robot: &RobotModel, late: f64) -> (Vec<f64>, Vec<Command>) {
         ("kd", column(&|_| 0.75)),
         ("q_FL_calf", column(&|_| 0.0)),
         ("q_cmd_FL_calf", column(&|_| 0.0)),
-        ("tau_measured_FL_calf", column(&|row| 0.1 * (row - late))),
+        ("tau_measured_FL_calf", column(&|row| 0.1 * (row - delay))),
         ("battery_V", column(&|row| 30.0 - 0.1 * row)),
         ("temp_FL_calf", column(&|row| 30.0 + row)),
     ];
@@ -74,24 +77,25 @@ fn told(robot: &RobotModel, late: f64) -> (Vec<f64>, Vec<Command>) {
 }
 
 #[test]
-fn late_torque_sensor_shows_what_was() {
-    for (delay, late) in [(0.0, 0.0), (0.01, 2.0), (0.0065, 1.3)] {
-        let (residuals, _) = told(&with(&go2(), &[("torque_sensor_delay", "all", &[delay])]), late);
-        let worst = residuals.iter().fold(0.0f64, |worst, residual| worst.max(residual.abs()));
-        assert!(worst < 1e-3, "{delay} s: {worst} deviations");
+fn torque_sensor_delay_shifts_the_logged_torque() {
+    for (delay, periods) in [(0.0, 0.0), (0.01, 2.0), (0.0065, 1.3)] {
+        let robot = with(&go2(), &[("torque_sensor_delay", "all", &[delay])]);
+        let (residuals, _) = residuals_and_commands(&robot, periods);
+        let largest = residuals.iter().fold(0.0f64, |largest, residual| largest.max(residual.abs()));
+        assert!(largest < 1e-3, "{delay} s: a residual of {largest} standard deviations");
     }
-    let (residuals, _) = told(&go2(), 2.0);
+    let (residuals, _) = residuals_and_commands(&go2(), 2.0);
     assert!(residuals.iter().any(|residual| residual.abs() > 0.1), "{residuals:?}");
 }
 
 #[test]
-fn supply_and_heat_leave_the_share_of_torque_that_their_laws_say() {
+fn supply_sag_and_thermal_derating_reduce_torque_by_their_laws() {
     let robot = with(&go2(), &[("supply_sag", "all", &[1.7]), ("thermal_derating", "FL_calf", &[0.004, 40.0])]);
-    for (row, command) in told(&robot, 0.0).1.iter().enumerate() {
+    for (row, command) in residuals_and_commands(&robot, 0.0).1.iter().enumerate() {
         let row = row as f64;
         let cold = ((30.0 - 0.1 * row) / 30.0).powf(1.7);
         let hot = cold * (1.0 - 0.004 * (row - 10.0).max(0.0));
-        let [of_calf, of_thigh] = [CALF, CALF - 1].map(|joint| f64::from(command.derating_factor[joint]));
-        assert!((of_calf - hot).abs() < 1e-6 && (of_thigh - cold).abs() < 1e-6, "row {row}: {of_calf} {of_thigh}");
+        let [calf, thigh] = [CALF, CALF - 1].map(|joint| f64::from(command.derating_factor[joint]));
+        assert!((calf - hot).abs() < 1e-6 && (thigh - cold).abs() < 1e-6, "row {row}: {calf} {thigh}");
     }
 }

@@ -1,4 +1,4 @@
-//! Effects of the catalogue do the same in both engines.
+//! Comparison of all effects of the catalogue between the two engines, and of a served model file with the ideal robot.
 
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Scope, Target, apply_effects};
@@ -10,20 +10,21 @@ use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 
 use crate::remote;
 
-/// A joint rattles in its play, and small differences grow: the motions part in time, and the size of the change is held.
-const RATTLES: &str = "backlash";
-/// The engines have two laws of a contact, which agree only while it is stiff: how much a soft ground changes is not held
-/// (docs/physics.md has the numbers).
-const DISAGREES: &str = "ground_stiffness";
+/// The effect with chaotic motion: small differences grow over time, so only the size of the change is compared.
+const CHAOTIC: &str = "backlash";
+/// The effect that is not compared: the contact models agree only for stiff contacts (see `docs/physics.md`).
+const NOT_COMPARED: &str = "ground_stiffness";
 
-/// Actuator periods of the motion.
+/// Length of the motion [actuator periods].
 const PERIODS: usize = 200;
 
 fn config(engine: Engine, base: BaseMount) -> SimConfig {
     SimConfig { engine, base, physics_hz: Some(2000), threads: 1, ..SimConfig::default() }
 }
 
-/// Joint positions and torques in each actuator period of a chirp in the air, or of a sway on the feet.
+/// Returns joint positions, torques and angular velocities of each actuator period, scaled to comparable sizes.
+///
+/// The motion is a chirp with a fixed base, or sway with a floating base.
 fn motion(backend: &mut impl Backend, base: BaseMount) -> Vec<PerJoint> {
     let pose = go2().control.default_pose_f32();
     let height = if base == BaseMount::Fixed { 1.0 } else { 0.3236 };
@@ -65,7 +66,7 @@ fn entry(effect: &'static Effect) -> EffectEntry {
         std::iter::repeat_n(low + 0.7 * (high - low), parameter.count)
     });
     let values = match effect.name {
-        // A trunk twice as heavy and wide.
+        // A trunk with 1.5 times the mass and inertia.
         "inertia" => {
             let body = go2().trunk;
             body.scaled(1.5).log_cholesky().to_vec()
@@ -81,42 +82,42 @@ fn entry(effect: &'static Effect) -> EffectEntry {
 }
 
 #[test]
-fn effects_do_the_same_in_both_engines() {
-    // These need a log's voltage, temperature or torque channel, and leave the motion alone.
-    let elsewhere = ["supply_sag", "thermal_derating", "torque_sensor_delay"];
-    for effect in CATALOGUE.into_iter().filter(|effect| !elsewhere.contains(&effect.name)) {
+fn effects_agree_between_the_engines() {
+    // These depend on a logged voltage, temperature or torque and do not change the motion here.
+    let log_effects = ["supply_sag", "thermal_derating", "torque_sensor_delay"];
+    for effect in CATALOGUE.into_iter().filter(|effect| !log_effects.contains(&effect.name)) {
         let base = if effect.target == Target::Joints { BaseMount::Fixed } else { BaseMount::Floating };
         let ideal = in_both(&go2(), base);
         let [rapier, batch] = in_both(&apply_effects(&go2(), &[entry(effect)]).unwrap(), base);
-        let (apart, changed) = (rms(&rapier, &batch), rms(&batch, &ideal[1]));
+        let (difference, changed) = (rms(&rapier, &batch), rms(&batch, &ideal[1]));
         println!(
-            "{:<20} changes {changed:.5}, engines {apart:.5} apart, ideal {:.5}",
+            "{:<20} change {changed:.5}, difference between engines {difference:.5}, without effect {:.5}",
             effect.name,
             rms(&ideal[0], &ideal[1])
         );
-        let ideal_apart = rms(&ideal[0], &ideal[1]);
+        let ideal_difference = rms(&ideal[0], &ideal[1]);
         assert!(
-            changed > 3.0 * ideal_apart,
-            "`{}` changes {changed}, the engines differ by {ideal_apart}",
+            changed > 3.0 * ideal_difference,
+            "`{}`: change {changed}, difference between engines {ideal_difference}",
             effect.name
         );
-        if effect.name == DISAGREES {
+        if effect.name == NOT_COMPARED {
             continue;
         }
-        if effect.name == RATTLES {
+        if effect.name == CHAOTIC {
             let in_rapier = rms(&rapier, &ideal[0]);
             assert!((0.8..1.25).contains(&(in_rapier / changed)), "`{}`: {in_rapier} and {changed}", effect.name);
         } else {
             assert!(
-                apart < 0.15 * changed + 2.0 * ideal_apart,
-                "`{}`: {apart} apart, it changes {changed}",
+                difference < 0.15 * changed + 2.0 * ideal_difference,
+                "`{}`: difference {difference}, change {changed}",
                 effect.name
             );
         }
     }
 }
 
-/// Joints that are held by more friction than their actuators have torque stay where they are, over the wire too.
+/// Joints whose friction exceeds the actuator torque do not move, also on a server.
 #[test]
 fn server_simulates_the_effects_of_its_model_file() {
     let folder = tempfile::tempdir().unwrap();
@@ -136,7 +137,7 @@ fn server_simulates_the_effects_of_its_model_file() {
         server.shutdown();
         before.iter().zip(&after).map(|(before, after)| (before - after).abs()).fold(0.0, f32::max)
     };
-    let (ideal, held) = (moved(None), moved(Some(path)));
+    let (ideal, with_friction) = (moved(None), moved(Some(path)));
     assert!(ideal > 0.05, "{ideal} rad");
-    assert!(held < 0.3 * ideal, "{held} rad, without friction {ideal}");
+    assert!(with_friction < 0.3 * ideal, "{with_friction} rad, without friction {ideal} rad");
 }

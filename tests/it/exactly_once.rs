@@ -1,4 +1,4 @@
-//! Every sequence number is executed once, and what is refused is executed never. The task `counter` proves it.
+//! Every sequence number is executed once, and a rejected request is never executed. Checked with the task `counter`.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use twinstep_protocol::{ErrorCode, PROTOCOL, encode, keys};
 use crate::raw_client::{RawClient, only_reply, reset_bytes, resets_in, step_bytes, step_with, steps_in};
 use crate::remote::{FailingEnvFactory, config, start, start_with};
 
-/// Runs `test` with a client whose lease of two counters was reset under number 1.
+/// Runs `test` with a client and its lease of two counters, reset with sequence number 1.
 fn with_counters(test: impl FnOnce(&RawClient, &LeaseReply)) {
     let (server, endpoint) = start(&config(TaskName::Counter));
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
@@ -22,7 +22,7 @@ fn with_counters(test: impl FnOnce(&RawClient, &LeaseReply)) {
 }
 
 #[test]
-fn request_sent_three_times_is_executed_once_with_equal_bytes() {
+fn request_sent_three_times_is_executed_once_with_equal_replies() {
     with_counters(|client, lease| {
         let step = client.step(lease, 2).unwrap();
         assert_eq!(steps_in(&step), 1.0);
@@ -41,15 +41,15 @@ fn request_sent_again_while_it_is_in_progress_is_executed_once() {
         let key = keys::env(&client.sid, &lease.lease, EnvMethod::Step);
         for seq in 2..50 {
             let sent: Vec<_> = (0..3).map(|_| client.send(&key, &step_bytes(lease, seq))).collect();
-            let answers: Vec<_> = sent.iter().map(|replies| only_reply(replies, &key).unwrap()).collect();
-            assert_eq!(steps_in(&answers[0]), (seq - 1) as f32);
-            assert!(answers.iter().all(|answer| *answer == answers[0]));
+            let replies: Vec<_> = sent.iter().map(|replies| only_reply(replies, &key).unwrap()).collect();
+            assert_eq!(steps_in(&replies[0]), (seq - 1) as f32);
+            assert!(replies.iter().all(|reply| *reply == replies[0]));
         }
     });
 }
 
 #[test]
-fn repeated_close_gives_its_answer_or_finds_no_lease() {
+fn repeated_close_returns_the_same_reply_or_finds_no_lease() {
     with_counters(|client, lease| {
         let closed = client.close(lease, 2).unwrap();
         match client.close(lease, 2) {
@@ -61,7 +61,7 @@ fn repeated_close_gives_its_answer_or_finds_no_lease() {
 }
 
 #[test]
-fn numbers_and_epochs_out_of_order_are_refused_without_effect() {
+fn sequence_numbers_and_epochs_out_of_order_are_rejected_without_effect() {
     with_counters(|client, lease| {
         client.step(lease, 2).unwrap();
         let other_epoch = |epoch| LeaseReply { epoch, ..lease.clone() };
@@ -77,13 +77,13 @@ fn numbers_and_epochs_out_of_order_are_refused_without_effect() {
             let error = client.step(&other_epoch(epoch), seq).unwrap_err();
             assert_eq!(error.code, expected, "epoch {epoch}, seq {seq}");
         }
-        assert_eq!(client.reset(lease, 2).unwrap_err().code, ErrorCode::StaleSequence, "number 2 was a step");
+        assert_eq!(client.reset(lease, 2).unwrap_err().code, ErrorCode::StaleSequence, "sequence number 2 was a step");
         assert_eq!(steps_in(&client.step(lease, 3).unwrap()), 2.0);
     });
 }
 
 #[test]
-fn wrong_arrays_are_refused_by_name_without_effect() {
+fn invalid_arrays_are_rejected_by_name_without_effect() {
     with_counters(|client, lease| {
         let step = |actions: &[f32]| client.ask_env(lease, EnvMethod::Step, &step_with(lease, 2, actions)).unwrap_err();
         // The last is a payload of 16 MiB.
@@ -107,12 +107,12 @@ fn wrong_arrays_are_refused_by_name_without_effect() {
             let error = client.ask_env(lease, EnvMethod::Reset, &encode(&request)).unwrap_err();
             assert_eq!((error.code, error.field.as_str()), (ErrorCode::BadShape, field));
         }
-        assert_eq!(steps_in(&client.step(lease, 2).unwrap()), 1.0, "the number was free");
+        assert_eq!(steps_in(&client.step(lease, 2).unwrap()), 1.0, "the sequence number was not consumed");
     });
 }
 
 #[test]
-fn foreign_version_is_refused_at_every_key_but_hello() {
+fn other_protocol_version_is_rejected_at_every_key_except_hello() {
     with_counters(|client, lease| {
         for key in [
             keys::lease(&client.sid),
@@ -121,7 +121,7 @@ fn foreign_version_is_refused_at_every_key_but_hello() {
             keys::env(&client.sid, &lease.lease, EnvMethod::Close),
             keys::env(&client.sid, &lease.lease, EnvMethod::Render),
         ] {
-            // Once with all fields of the message, once with none that version 1 knows.
+            // Once with all fields of the message, once with no field of version 1 except `protocol`.
             let close = encode(&CloseRequest { protocol: 2, epoch: 1, seq: 2 });
             for payload in [close.as_slice(), b"\x82\xa8protocol\x02\xa3new\xc0"] {
                 assert_eq!(client.ask(&key, payload).unwrap_err().code, ErrorCode::Version, "{key}");
@@ -133,10 +133,10 @@ fn foreign_version_is_refused_at_every_key_but_hello() {
 }
 
 #[test]
-fn lease_that_never_was_is_told_apart_from_unknown_keys() {
+fn unknown_lease_is_distinguished_from_unknown_keys() {
     with_counters(|client, lease| {
-        let foreign = LeaseReply { lease: "0123456789abcdef".to_owned(), ..lease.clone() };
-        assert_eq!(client.step(&foreign, 2).unwrap_err().code, ErrorCode::LeaseLost);
+        let unknown = LeaseReply { lease: "0123456789abcdef".to_owned(), ..lease.clone() };
+        assert_eq!(client.step(&unknown, 2).unwrap_err().code, ErrorCode::LeaseLost);
         for rest in ["", "/env", "/lease/x", "/*", "/**"] {
             let key = format!("twinstep/{}{rest}", client.sid);
             assert_eq!(client.ask(&key, b"").unwrap_err().code, ErrorCode::UnknownKey, "{key}");
@@ -148,7 +148,7 @@ fn lease_that_never_was_is_told_apart_from_unknown_keys() {
 }
 
 #[test]
-fn lease_whose_environments_panicked_can_be_closed_or_asked_anew() {
+fn lease_whose_environments_panicked_can_be_closed_or_replaced_by_a_new_one() {
     let (server, endpoint) = start_with(&config(TaskName::Counter), Arc::new(FailingEnvFactory));
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
     let panicked = || {

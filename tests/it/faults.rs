@@ -1,4 +1,4 @@
-//! Some thirty faults through real processes. `target/release/faults --faults 1000` injects many more.
+//! 32 faults injected into real processes. `target/release/faults --faults 1000` injects more.
 
 use std::sync::atomic::AtomicBool;
 
@@ -20,16 +20,16 @@ fn inject(faults: usize, lanes: usize, server_arguments: &[&str]) -> FaultReport
 }
 
 #[test]
-fn faults_never_execute_a_step_twice_skip_or_invent_one() {
+fn no_fault_causes_a_duplicate_a_skipped_or_an_invented_step() {
     let tally = inject(32, 8, &[]);
     println!("{tally}");
     assert_eq!(tally.total(), 32);
-    assert_eq!(tally.injected.len(), 8, "every kind was injected");
+    assert_eq!(tally.injected.len(), 8, "every kind of fault was injected");
     assert!(tally.failures.is_empty(), "{:#?}", tally.failures);
 }
 
 #[test]
-fn server_that_executes_a_step_twice_is_found_out() {
-    let tally = inject(2, 1, &["--double-every", "5"]);
+fn server_that_executes_a_step_twice_is_detected() {
+    let tally = inject(2, 1, &["--duplicate-step-every", "5"]);
     assert!(tally.failures.iter().any(|(_, evidence)| evidence.starts_with("violation")), "{:#?}", tally.failures);
 }

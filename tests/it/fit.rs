@@ -1,4 +1,4 @@
-//! `twinstep fit` through the real program, on a robot whose actuators act late and saturate.
+//! `twinstep fit` as a process, with a robot whose actuators have a torque delay and saturate.
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
@@ -16,7 +16,7 @@ use twinstep_tests::python::Programs;
 
 const RATE_HZ: f64 = 200.0;
 const ROWS: usize = 2400;
-/// Noise of the torque's sensor [N·m].
+/// Standard deviation of the torque sensor [N·m].
 const NOISE: f64 = 0.1;
 
 fn twinstep(arguments: &[&str]) -> Output {
@@ -32,7 +32,7 @@ fn robot() -> RobotModel {
     apply_effects(&go2(), &entries).unwrap()
 }
 
-/// Twelve seconds of steps in the air, each joint's about `amplitude` to both sides [rad].
+/// Returns a log of 12 s of square waves with a fixed base, with an amplitude of about `amplitude` [rad].
 fn log(amplitude: f64) -> Log {
     let mut columns = BTreeMap::<String, Vec<f64>>::new();
     for row in 0..ROWS {
@@ -57,8 +57,7 @@ fn log(amplitude: f64) -> Log {
         BatchBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)))
     };
     let exact =
-        record(&motion, &robot, None, backend, "a robot that acts late and saturates".to_owned(), &mut |_| true)
-            .unwrap();
+        record(&motion, &robot, None, backend, "a robot with delay and saturation".to_owned(), &mut |_| true).unwrap();
     apply_sensors(&exact, &[Sensor { quantity: "tau_measured", sigma: NOISE, resolution: 0.0 }], 1).unwrap()
 }
 
@@ -72,7 +71,7 @@ fn stderr(output: &Output) -> String {
 }
 
 #[test]
-fn ensemble_predicts_late_and_saturating_drives_and_disagrees_where_it_has_not_been() {
+fn ensemble_predicts_delay_and_saturation_and_is_more_uncertain_on_unseen_motion() {
     let folder = tempfile::tempdir().unwrap();
     let (path, out, plot) =
         (folder.path().join("air.parquet"), folder.path().join("air.safetensors"), folder.path().join("curves.svg"));
@@ -89,8 +88,8 @@ fn ensemble_predicts_late_and_saturating_drives_and_disagrees_where_it_has_not_b
     let euf = |data: &DataSet| {
         let (mut error, mut ideal, mut sum, mut count) = (0.0, 0.0, 0.0, 0.0);
         for (run, rows) in data.runs(Split::Test).zip(ensemble.predict(data.runs(Split::Test))) {
-            let unseen = run.torques.len() - rows.len();
-            for ((members, torque), [dq, ddq]) in rows.iter().zip(&run.torques[unseen..]).zip(&run.errors[unseen..]) {
+            let first = run.torques.len() - rows.len();
+            for ((members, torque), [dq, ddq]) in rows.iter().zip(&run.torques[first..]).zip(&run.errors[first..]) {
                 let (means, variances): (Vec<_>, Vec<_>) =
                     members.iter().map(|member| (member.mean, member.variance)).unzip();
                 error += (means.iter().sum::<f64>() / means.len() as f64 - torque).powi(2);
@@ -102,13 +101,13 @@ fn ensemble_predicts_late_and_saturating_drives_and_disagrees_where_it_has_not_b
         [(error / count).sqrt(), (ideal / count).sqrt(), sum / count]
     };
     let [error, ideal, seen] = euf(&DataSet::new(&[("gentle".to_owned(), gentle)]).unwrap());
-    assert!(error < 0.3 * ideal, "{error} N·m, of the gains alone {ideal} N·m");
+    assert!(error < 0.3 * ideal, "RMSE {error} N·m, ideal PD {ideal} N·m");
     let [_, _, unseen] = euf(&DataSet::new(&[("violent".to_owned(), log(0.3))]).unwrap());
-    assert!(unseen > 2.0 * seen, "disagreement {seen} where it was, {unseen} where it was not");
+    assert!(unseen > 2.0 * seen, "epistemic uncertainty {seen} on seen motion, {unseen} on unseen motion");
 }
 
 #[test]
-fn stages_are_judged_by_each_other_and_what_saw_more_disagrees_less() {
+fn cross_evaluation_shows_lower_error_and_uncertainty_for_wider_training_data() {
     let folder = tempfile::tempdir().unwrap();
     let paths = [("gentle.csv", 0.1), ("violent.csv", 0.3)].map(|(name, amplitude)| {
         let path = folder.path().join(name);
@@ -138,11 +137,11 @@ fn stages_are_judged_by_each_other_and_what_saw_more_disagrees_less() {
     let written = |name: &str| std::fs::metadata(out.join(name)).unwrap().modified().unwrap();
     let before = written("2.safetensors");
     assert_eq!(cross(&["--resume"]), numbers);
-    assert_eq!(written("2.safetensors"), before, "what was learnt is not learnt again");
+    assert_eq!(written("2.safetensors"), before, "a trained ensemble is not trained again");
 }
 
 #[test]
-fn interrupted_training_goes_on_to_the_same_bits() {
+fn resumed_training_is_bitwise_identical_to_uninterrupted_training() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("air.csv");
     log(0.1).write(&path).unwrap();
@@ -154,7 +153,7 @@ fn interrupted_training_goes_on_to_the_same_bits() {
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
     let files = ["fit", path.to_str().unwrap(), "--out", twice.to_str().unwrap()];
     let mut ended = Command::new(programs.0.join("twinstep")).args(files).args(settings).spawn().unwrap();
-    // Once it has saved itself; wherever it is by then, the result has to be the same.
+    // Interrupt it after the first checkpoint. The result must not depend on the time of the interruption.
     let saved = folder.path().join("twice.training");
     while !std::fs::read(&saved).is_ok_and(|content| !content.is_empty()) && ended.try_wait().unwrap().is_none() {
         std::thread::sleep(std::time::Duration::from_millis(5));
@@ -171,7 +170,7 @@ fn interrupted_training_goes_on_to_the_same_bits() {
 }
 
 #[test]
-fn logs_that_cannot_be_learnt_from_are_refused_with_the_reason() {
+fn logs_unsuitable_for_training_are_rejected_with_the_reason() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("none.safetensors");
     let chirps = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().join("data/go2_air_chirp");

@@ -1,6 +1,7 @@
-//! A small trained ensemble and what it says, kept in `ensemble/golden/` for other readers of its file.
+//! A small trained ensemble and its predictions in `ensemble/golden/`, a reference for other readers of the file
+//! format.
 //!
-//! `UPDATE_GOLDEN=1 cargo test --release --workspace --test it golden_ensemble` trains it anew and writes both files.
+//! `UPDATE_GOLDEN=1 cargo test --release --workspace --test it golden_ensemble` trains a new one and writes both files.
 
 use std::path::{Path, PathBuf};
 
@@ -11,15 +12,15 @@ use twinstep_tests::ground_truth_actuator::{DRIVES, Motion};
 
 const ROWS: usize = 60;
 
-/// What every joint of a robot shows, row by row from an unseen past, and what every member makes of it.
+/// Inputs of every joint of a robot, and the predictions of every member. Before the first row there is no input.
 #[derive(Serialize, Deserialize)]
 struct Golden {
     joints: Vec<String>,
-    /// ξ [rad, rad/s], `[row][joint]`.
+    /// Inputs ξ [rad, rad/s], `[row][joint]`.
     errors: Vec<[[f64; 2]; NUM_JOINTS]>,
-    /// [N·m], `[row][member][joint]`.
+    /// Mean torque [N·m], `[row][member][joint]`.
     mean: Vec<Vec<[f64; NUM_JOINTS]>>,
-    /// [N²·m²], `[row][member][joint]`.
+    /// Variance of the torque [N²·m²], `[row][member][joint]`.
     variance: Vec<Vec<[f64; NUM_JOINTS]>>,
 }
 
@@ -29,16 +30,16 @@ fn path(name: &str) -> PathBuf {
 
 fn trained() -> Ensemble {
     let motion = Motion { seconds: 12.0, amplitude: 0.3, hz: [0.3, 6.0], seed: 5 };
-    let data = DataSet::new(&[("an actuator that saturates".to_owned(), DRIVES[1].logs(motion).measured)]).unwrap();
+    let data = DataSet::new(&[("a saturating actuator".to_owned(), DRIVES[1].logs(motion).measured)]).unwrap();
     let options = TrainingOptions { members: 3, hidden: 8, joint_input: JointEncoding::Kind, epochs: 20, seed: 5 };
     match Training::new(&data, options).unwrap().run(2, None, &mut |_| true).unwrap() {
         TrainingResult::Trained(ensemble, _) => *ensemble,
-        TrainingResult::Interrupted(_) => panic!("it had no reason to end"),
+        TrainingResult::Interrupted(_) => panic!("the callback never interrupts"),
     }
 }
 
-/// What the ensemble says of joints that swing and now and then jump.
-fn said(ensemble: &Ensemble) -> Golden {
+/// Returns the predictions of the ensemble for sines with occasional steps.
+fn predictions(ensemble: &Ensemble) -> Golden {
     let mut inference = Inference::new(ensemble, 1);
     let joints = JOINT_NAMES.map(str::to_owned).to_vec();
     let mut golden = Golden { joints, errors: Vec::new(), mean: Vec::new(), variance: Vec::new() };
@@ -58,19 +59,19 @@ fn said(ensemble: &Ensemble) -> Golden {
 }
 
 #[test]
-fn golden_ensemble_says_what_is_written_beside_it() {
+fn golden_ensemble_reproduces_the_stored_predictions() {
     if std::env::var_os("UPDATE_GOLDEN").is_some() {
         let ensemble = trained();
         std::fs::create_dir_all(path("")).unwrap();
         ensemble.write(path("actuators.safetensors")).unwrap();
-        std::fs::write(path("said.json"), serde_json::to_string(&said(&ensemble)).unwrap()).unwrap();
+        std::fs::write(path("said.json"), serde_json::to_string(&predictions(&ensemble)).unwrap()).unwrap();
     }
     let written: Golden = serde_json::from_slice(&std::fs::read(path("said.json")).unwrap()).unwrap();
-    let found = said(&Ensemble::read(path("actuators.safetensors")).unwrap());
+    let found = predictions(&Ensemble::read(path("actuators.safetensors")).unwrap());
     for (written, found) in [(written.mean, found.mean), (written.variance, found.variance)] {
         let [written, found] = [written, found].map(|rows| rows.concat().concat());
         assert_eq!(written.len(), ROWS * 3 * NUM_JOINTS);
-        // Digits of the text: the kernel has the same bits everywhere.
+        // The tolerance is for the rounding of the text; the kernel is bitwise reproducible.
         assert!(written.iter().zip(&found).all(|(one, other)| (one - other).abs() < 1e-9));
     }
 }

@@ -1,4 +1,4 @@
-//! Identification: what was put into a plant is found again, and the real recording through the real process.
+//! Identification: recovery of known effects in simulation, and the recording of a real Go2 with the program.
 
 use std::collections::BTreeMap;
 use std::process::Command as Process;
@@ -17,7 +17,7 @@ use twinstep_model::{
 use twinstep_sim::{BatchBackend, BatchRollout, Engine, RapierBackend, SimConfig};
 use twinstep_tests::python::{Programs, root};
 
-/// What is sought, and the truth.
+/// Effects to identify and their true values.
 const HIDDEN: [(&str, &str, f64); 5] = [
     ("coulomb_friction", "calf", 0.8),
     ("coulomb_friction", "hip", 0.25),
@@ -37,12 +37,14 @@ fn scope(text: &str) -> Scope {
 fn ground_truth() -> RobotModel {
     let entries: Vec<_> = HIDDEN
         .iter()
-        .map(|(name, place, value)| EffectEntry::new(named(name), scope(place), vec![*value]).unwrap())
+        .map(|(name, joints, value)| EffectEntry::new(named(name), scope(joints), vec![*value]).unwrap())
         .collect();
     apply_effects(&go2(), &entries).unwrap()
 }
 
-/// Eight seconds of chirps in the air, measured by encoders with noise, from the other engine at a finer step.
+/// Returns a log of 8 s of chirps with a fixed base and noisy encoders.
+///
+/// It is simulated with the other engine and a smaller step.
 pub fn log_of(robot: &RobotModel) -> Log {
     let config = SimConfig {
         engine: Engine::Rapier,
@@ -64,7 +66,7 @@ pub fn log_of(robot: &RobotModel) -> Log {
         for (joint, name) in JOINT_NAMES.iter().enumerate() {
             command.q[joint] += (0.3 * (phase + joint as f64).sin()) as f32;
             let noise = 0.002 * (random.random::<f64>() + random.random::<f64>() + random.random::<f64>() - 1.5);
-            // The encoder's steps.
+            // Resolution of the encoder.
             let measured = ((f64::from(backend.states().q[0][joint]) + noise) / 0.0005).round() * 0.0005;
             columns.entry(format!("q_{name}")).or_default().push(measured);
             columns.entry(format!("dq_{name}")).or_default().push(f64::from(backend.states().dq[0][joint]));
@@ -83,8 +85,8 @@ fn simulator() -> BatchRollout {
     BatchRollout::new(&go2(), &SimConfig::default()).unwrap()
 }
 
-/// Seeks `effects` in `log`; `progress` may end it.
-fn seek(log: &Log, effects: &[(&str, &str)], progress: fn(usize) -> bool) -> Identification {
+/// Identifies `effects` from `log`. `progress` returns false to interrupt the search.
+fn identified(log: &Log, effects: &[(&str, &str)], progress: fn(usize) -> bool) -> Identification {
     resume(None, log, effects, progress).unwrap()
 }
 
@@ -95,7 +97,7 @@ fn resume(
     progress: fn(usize) -> bool,
 ) -> Result<Identification, IdentifyError> {
     let experiment = Experiment::new(log, &go2(), WindowConfig::IDENTIFICATION).unwrap();
-    let effects: Vec<_> = effects.iter().map(|(name, place)| (named(name), scope(place))).collect();
+    let effects: Vec<_> = effects.iter().map(|(name, joints)| (named(name), scope(joints))).collect();
     let model = ModelFile::default();
     let mut progress = |_: Stage, step: usize, _: f64| progress(step);
     let options = IdentifyOptions { resume: search, ..IdentifyOptions::default() };
@@ -103,9 +105,9 @@ fn resume(
 }
 
 #[test]
-fn hidden_effects_are_found_with_intervals_that_hold_them() {
+fn hidden_effects_are_recovered_with_intervals_that_cover_them() {
     let log = log_of(&ground_truth());
-    let found = seek(&log, &HIDDEN.map(|(name, place, _)| (name, place)), |_| true);
+    let found = identified(&log, &HIDDEN.map(|(name, joints, _)| (name, joints)), |_| true);
     for (finding, (name, _, truth)) in found.findings.iter().zip(HIDDEN) {
         println!("{name}: {} {:?}, truth {truth}", finding.value, finding.interval);
         assert_eq!(finding.verdict, EstimateStatus::Identified);
@@ -122,34 +124,35 @@ fn hidden_effects_are_found_with_intervals_that_hold_them() {
 }
 
 #[test]
-fn what_a_log_cannot_tell_is_left_and_said() {
-    // A fixed base: neither a payload on it nor the ground show.
+fn parameters_that_are_not_identifiable_are_reported_and_not_fitted() {
+    // With a fixed base, a payload on it and the ground have no effect.
     let log = log_of(&go2());
-    let found = seek(&log, &[("payload", "base"), ("ground_friction", "ground")], |_| true);
+    let found = identified(&log, &[("payload", "base"), ("ground_friction", "ground")], |_| true);
     assert!(found.findings.iter().all(|finding| finding.verdict == EstimateStatus::NotIdentifiable));
     assert_eq!(found.model, ModelFile::default());
 }
 
 #[test]
-fn search_that_is_ended_keeps_the_best_so_far_and_can_be_taken_up_again() {
+fn interrupted_search_returns_the_best_candidate_and_can_be_resumed() {
     let log = log_of(&ground_truth());
     let effects = [("coulomb_friction", "calf")];
-    let found = seek(&log, &effects, |step| step < 2);
+    let found = identified(&log, &effects, |step| step < 2);
     assert!(found.rms[1] < found.rms[0], "{:?}", found.rms);
-    let search = found.checkpoint.expect("it was ended");
+    let search = found.checkpoint.expect("the search was interrupted");
     let stored = serde_json::to_string(&search).unwrap();
     let resumed = resume(Some(serde_json::from_str(&stored).unwrap()), &log, &effects, |_| true).unwrap();
-    assert_eq!(resumed.model, seek(&log, &effects, |_| true).model, "as if it had never been ended");
+    let uninterrupted = identified(&log, &effects, |_| true);
+    assert_eq!(resumed.model, uninterrupted.model, "the result does not depend on the interruption");
     let other = resume(Some(search), &log, &[("coulomb_friction", "hip")], |_| true);
     assert!(matches!(other, Err(IdentifyError::ResumeMismatch { .. })));
 }
 
 #[test]
-fn supply_and_heat_are_identified_from_logs_that_tell_them() {
+fn supply_sag_is_identified_from_a_log_with_varying_voltage() {
     let mut robot = go2();
     robot.derating.voltage_exponent = 1.5;
     let rows = 1600;
-    // The battery sags and recovers in waves.
+    // The supply voltage oscillates.
     let voltage: Vec<f64> = (0..rows).map(|row| 25.0 + 3.0 * (f64::from(row) * 0.005).sin()).collect();
     let motion = log_of(&go2());
     let columns = motion.channels().map(|(name, cells)| (name.to_owned(), cells.to_vec()));
@@ -160,7 +163,7 @@ fn supply_and_heat_are_identified_from_logs_that_tell_them() {
         BatchBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)))
     };
     let log = record(&motion, &robot, None, backend, "sagging".to_owned(), &mut |_| true).unwrap();
-    let found = seek(&log, &[("supply_sag", "all")], |_| true);
+    let found = identified(&log, &[("supply_sag", "all")], |_| true);
     let [low, high] = found.findings[0].interval.unwrap();
     assert!((low..high).contains(&1.5) && high - low < 0.5, "{:?}", found.findings[0]);
 }
@@ -178,9 +181,9 @@ fn q_rmse(arguments: &[&str]) -> f64 {
     evaluation["q_rmse_rad"].as_f64().unwrap()
 }
 
-/// Fitted to the first ten seconds, judged on the last six: the split was chosen before the first fit.
+/// The model is fitted to the first 10 s and evaluated on the last 6 s. The split was chosen before the first fit.
 #[test]
-fn real_go2_is_followed_far_better_after_identification() {
+fn identification_reduces_the_held_out_error_on_a_real_go2_by_65_percent() {
     let folder = tempfile::tempdir().unwrap();
     let fitted = folder.path().join("fitted.toml");
     let fitted = fitted.to_str().unwrap();
@@ -188,23 +191,23 @@ fn real_go2_is_followed_far_better_after_identification() {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     println!("{}", String::from_utf8_lossy(&output.stdout));
     let (ideal, after) = (q_rmse(&["--from", "10"]), q_rmse(&["--from", "10", "--model", fitted]));
-    println!("unseen rows: {ideal} -> {after} rad");
-    assert!(after < 0.35 * ideal, "{ideal} -> {after} rad on rows that it has not seen");
+    println!("held-out rows: {ideal} -> {after} rad");
+    assert!(after < 0.35 * ideal, "{ideal} -> {after} rad on held-out rows");
 }
 
 #[test]
-fn mistakes_on_the_command_line_are_named() {
+fn errors_on_the_command_line_are_named() {
     for (effects, expected) in [
         ("coulomb_friction", "has no scope"),
         ("friction@calf", "not in the catalogue"),
-        ("coulomb_friction@knee", "is no scope"),
+        ("coulomb_friction@knee", "is not a scope"),
         ("payload@all", "cannot have scope"),
     ] {
         let output = twinstep(&["identify", "data/go2_air_chirp", "--effects", effects, "--out", "/dev/null"]);
         assert_eq!(output.status.code(), Some(2));
         assert!(output.stdout.is_empty());
-        let told = String::from_utf8_lossy(&output.stderr);
-        assert!(told.contains(expected), "{told}");
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert!(error.contains(expected), "{error}");
     }
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("fitted.toml");
@@ -222,7 +225,7 @@ fn mistakes_on_the_command_line_are_named() {
 }
 
 #[test]
-fn catalogue_explains_every_effect() {
+fn effects_prints_the_equation_and_parameters_of_every_effect() {
     let list = String::from_utf8(twinstep(&["effects"]).stdout).unwrap();
     for effect in twinstep_effects::CATALOGUE {
         assert!(list.contains(effect.name));
@@ -233,15 +236,15 @@ fn catalogue_explains_every_effect() {
 }
 
 #[test]
-fn bench_has_rollouts_and_a_whole_search_beside_their_aims() {
+fn identify_benchmark_reports_rollouts_and_a_whole_search_with_their_goals() {
     let output = twinstep(&["bench", "identify", "--json", "--window-s", "0.01", "--python", "/no/python"]);
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success() && told.contains("left out: MuJoCo"), "{told}");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && stderr.contains("skipped: MuJoCo"), "{stderr}");
     let results: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let rows = results["rows"].as_array().unwrap();
     assert!(rows.iter().map(|row| row["unit"].as_str().unwrap()).eq(["robot-s/s", "robot-s/s", "robot-s/s", "s", "s"]));
     assert!(rows.iter().all(|row| row["value"].as_f64().unwrap() > 0.0));
-    assert!(rows[0]["ratio"].is_null(), "without MuJoCo there is nothing beside it");
+    assert!(rows[0]["ratio"].is_null(), "without MuJoCo there is no baseline");
     assert!(rows[1]["reference"].as_str().unwrap().starts_with("f32"));
     let number = |row: usize, key: &str| rows[row][key].as_f64().unwrap();
     for (row, aim) in [(3, 10.0), (4, 20.0)] {

@@ -1,10 +1,10 @@
-//! Who may use whom: the star around `model`, and one wall around each big library.
+//! Allowed dependencies between the crates, and the crates that may use each large library.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Crate folder and the workspace crates that it may use. Leaves use only the core; the edge composes them.
+/// Crate folders and the workspace crates that each may use. Leaf crates use only the core; applications combine them.
 const MAY_USE: [(&str, &[&str]); 19] = [
     // Core.
     ("crates/simd", &[]),
@@ -12,14 +12,14 @@ const MAY_USE: [(&str, &[&str]); 19] = [
     ("crates/effects", &["model"]),
     ("crates/logs", &["model", "effects"]),
     ("protocol", &["model"]),
-    // Leaves.
+    // Leaf crates.
     ("crates/sim", &["simd", "model"]),
     ("crates/envs", &["model", "effects"]),
     ("crates/identify", &["model", "effects", "logs"]),
     ("crates/diagnose", &["model", "effects", "logs", "identify"]),
     ("crates/session", &[]),
     ("ensemble", &["simd", "model", "effects", "logs"]),
-    // Edge.
+    // Applications.
     ("env-server", &["model", "effects", "protocol", "session", "sim", "envs", "ensemble"]),
     ("clients/rust", &["model", "protocol", "session"]),
     ("crates/report", &["model", "effects", "logs", "sim", "identify", "diagnose"]),
@@ -80,8 +80,8 @@ const MAY_USE: [(&str, &[&str]); 19] = [
     ),
 ];
 
-/// A library that only some crates may use.
-const WALLS: [(&str, &[&str]); 8] = [
+/// Libraries and the only crates that may use them.
+const RESTRICTED_LIBRARIES: [(&str, &[&str]); 8] = [
     ("rapier3d", &["crates/sim"]),
     ("burn", &["ensemble"]),
     ("zenoh", &["crates/session", "env-server", "clients/rust", "tests"]),
@@ -96,7 +96,7 @@ fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_owned()
 }
 
-/// Names of all dependencies in the manifest of `folder`, of every kind.
+/// Returns the names of all dependencies in the manifest of `folder`, including those for tests and builds.
 fn dependencies(folder: &str) -> BTreeSet<String> {
     let text = std::fs::read_to_string(root().join(folder).join("Cargo.toml")).unwrap();
     let manifest: toml::Table = text.parse().unwrap();
@@ -108,7 +108,7 @@ fn dependencies(folder: &str) -> BTreeSet<String> {
 }
 
 #[test]
-fn every_member_of_the_workspace_has_its_place_in_the_star() {
+fn every_workspace_member_has_a_list_of_allowed_dependencies() {
     let text = std::fs::read_to_string(root().join("Cargo.toml")).unwrap();
     let manifest: toml::Table = text.parse().unwrap();
     let members: BTreeSet<&str> =
@@ -117,7 +117,7 @@ fn every_member_of_the_workspace_has_its_place_in_the_star() {
 }
 
 #[test]
-fn crates_use_only_what_the_star_allows() {
+fn crates_use_only_allowed_crates() {
     for (folder, allowed) in MAY_USE {
         for name in dependencies(folder) {
             if let Some(used) = name.strip_prefix("twinstep-") {
@@ -128,19 +128,19 @@ fn crates_use_only_what_the_star_allows() {
 }
 
 #[test]
-fn big_libraries_stay_behind_their_walls() {
+fn large_libraries_are_used_only_by_their_crates() {
     for (folder, _) in MAY_USE {
         let used = dependencies(folder);
-        for (library, inside) in WALLS {
+        for (library, allowed) in RESTRICTED_LIBRARIES {
             assert!(
-                !used.contains(library) || inside.contains(&folder),
-                "{folder} uses {library}; only {inside:?} may"
+                !used.contains(library) || allowed.contains(&folder),
+                "{folder} uses {library}; only {allowed:?} may"
             );
         }
     }
 }
 
-/// Every third-party crate that `arguments` select, with the features it is built with.
+/// Returns every crate that `arguments` select, with the features it is built with.
 fn features(arguments: &[&str]) -> BTreeMap<String, BTreeSet<String>> {
     let tree = Command::new(env!("CARGO"))
         .args(["tree", "--offline", "--prefix", "none", "--no-dedupe", "--format", "{p}\t{f}"])
@@ -162,6 +162,6 @@ fn program_and_tests_share_one_build_of_every_dependency() {
     let everything = features(&["--workspace", "--edges", "normal,build,dev"]);
     for (package, features) in features(&["--package", "twinstep-cli", "--edges", "normal,build"]) {
         let more: Vec<_> = everything[&package].difference(&features).collect();
-        assert!(more.is_empty(), "{package} is built a second time for the tests, with {more:?}: add them in `cli`");
+        assert!(more.is_empty(), "the tests build {package} a second time, with {more:?}: add these features in `cli`");
     }
 }

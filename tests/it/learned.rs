@@ -1,4 +1,4 @@
-//! Robots that an ensemble actuators: in both engines, through the server, and through the other programs that take a model.
+//! Robots with actuator networks: in both engines, on the server, and with the other commands that take a model.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -23,9 +23,9 @@ use crate::remote;
 
 const ENVS: usize = 5;
 
-/// What a small ensemble for the Go2 depends on.
+/// Returns the metadata of a small ensemble for the Go2.
 fn description() -> EnsembleMetadata {
-    let scale = |deviation| Normaliser { mean: 0.0, std: deviation };
+    let scale = |std| Normaliser { mean: 0.0, std };
     EnsembleMetadata {
         members: 3,
         hidden: 6,
@@ -41,7 +41,9 @@ fn description() -> EnsembleMetadata {
     }
 }
 
-/// A folder with an ensemble and a model file that names it, with more lines under `[actuator]` and before it.
+/// Returns a folder with an ensemble and a model file that refers to it.
+///
+/// `effects` are lines before `[actuator]`, `keys` are lines below it.
 fn model_with(description: EnsembleMetadata, effects: &str, keys: &str) -> (TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("robot.toml");
@@ -64,7 +66,7 @@ fn envs(config: &Config, num_envs: usize) -> Box<dyn VecEnv> {
     SimEnvFactory::new(config.clone()).unwrap().build(num_envs, AutoresetMode::NextStep, Some(6)).unwrap()
 }
 
-/// Steps of environments that are seeded from `seed`; environment by environment the same actions.
+/// Returns the steps of environments with seeds from `seed`. All environments receive the same actions.
 fn episode(env: &mut dyn VecEnv, seed: u64) -> Vec<StepBatch> {
     let num_envs = env.num_envs();
     env.reset(&ResetRequest::seeded(seed, num_envs)).unwrap();
@@ -73,7 +75,7 @@ fn episode(env: &mut dyn VecEnv, seed: u64) -> Vec<StepBatch> {
 }
 
 #[test]
-fn environment_of_a_batch_is_the_single_one_of_its_seed() {
+fn environment_in_a_batch_equals_the_single_one_with_its_seed() {
     for keys in ["draw = \"episode\"\nsample = true", "draw = \"step\""] {
         let (_folder, model) = model_with(description(), "", keys);
         for engine in [Engine::Batch, Engine::Rapier] {
@@ -93,32 +95,35 @@ fn environment_of_a_batch_is_the_single_one_of_its_seed() {
 }
 
 #[test]
-fn uncertainty_is_a_reward_and_changes_no_motion() {
+fn epistemic_uncertainty_reward_does_not_change_the_motion() {
     let (_folder, model) = model_with(description(), "", "");
     let plain = config(Engine::Batch, &model, 1);
-    let mut curious = plain.clone();
-    curious.task.reward.epistemic_uncertainty = 2.0;
-    let [plain, curious] = [plain, curious].map(|config| episode(envs(&config, ENVS).as_mut(), 3));
-    for (plain, curious) in plain.iter().zip(&curious) {
-        assert_eq!(plain.obs, curious.obs);
-        for (env, (without, with)) in plain.reward.iter().zip(&curious.reward).enumerate() {
-            // Untrained members disagree; the step in which an episode starts anew has no reward.
+    let mut exploring = plain.clone();
+    exploring.task.reward.epistemic_uncertainty = 2.0;
+    let [plain, exploring] = [plain, exploring].map(|config| episode(envs(&config, ENVS).as_mut(), 3));
+    for (plain, exploring) in plain.iter().zip(&exploring) {
+        assert_eq!(plain.obs, exploring.obs);
+        for (env, (without, with)) in plain.reward.iter().zip(&exploring.reward).enumerate() {
+            // Untrained members have epistemic uncertainty. The step that resets an environment has no reward.
             assert!(with > without || *with == 0.0, "environment {env}: {without} {with}");
         }
     }
-    assert!(curious[3].reward.iter().zip(&plain[3].reward).all(|(with, without)| with > without));
+    assert!(exploring[3].reward.iter().zip(&plain[3].reward).all(|(with, without)| with > without));
 }
 
-/// Largest difference of a standing robot's joints [rad], and of its torques [N·m], from those of its own actuators.
-fn away_from_own_drives(tau_sensor: TorqueSensor) -> [f32; 2] {
+/// Returns the largest differences of joint positions [rad] and torques [N·m] between networks and analytic actuators.
+///
+/// The robot stands on a network that was set up as a linear PD controller.
+fn difference_from_analytic_actuators(tau_sensor: TorqueSensor) -> [f32; 2] {
     let description = EnsembleMetadata { tau_sensor, ..description() };
     let settings = ActuatorNetworkConfig { ensemble: PathBuf::new(), draw: MemberSampling::PerStep, sample: false };
     let learned = ActuatorNetworkRobot::new(&ModelFile::default(), Ensemble::linear_pd(description), settings).unwrap();
     let sim = SimConfig { engine: Engine::Batch, threads: 1, ..SimConfig::default() };
-    let own = BatchBackend::new(go2(), sim, 1).unwrap();
+    let analytic = BatchBackend::new(go2(), sim, 1).unwrap();
     let backend = BatchBackend::new(learned.robot.clone(), sim, 1).unwrap();
     let pose = go2().control.default_pose_f32();
-    let [own, other] = [own, backend.with_actuator(Box::new(learned.actuators(1, false)))].map(|mut backend| {
+    let network = backend.with_actuator(Box::new(learned.actuators(1, false)));
+    let [analytic, network] = [analytic, network].map(|mut backend| {
         backend.reset(&[(0, InitialState::at_rest(0.34, pose))]).unwrap();
         let command = RobotCommand::hold(pose.map(|q| q + 0.05), 30.0, 0.75);
         backend.step(&[command], &[true], 200).unwrap();
@@ -127,22 +132,22 @@ fn away_from_own_drives(tau_sensor: TorqueSensor) -> [f32; 2] {
         [states.q[0], states.tau[0]]
     });
     [0, 1].map(|quantity| {
-        own[quantity].iter().zip(&other[quantity]).map(|(one, other)| (one - other).abs()).fold(0.0, f32::max)
+        analytic[quantity].iter().zip(&network[quantity]).map(|(one, other)| (one - other).abs()).fold(0.0, f32::max)
     })
 }
 
 #[test]
-fn robot_stands_on_networks_that_know_its_gains() {
-    let [q, tau] = away_from_own_drives(TorqueSensor::MotorCurrent);
-    // The networks bend by some percent of the torque, and differ by one.
+fn robot_with_linear_pd_networks_stands_as_with_analytic_actuators() {
+    let [q, tau] = difference_from_analytic_actuators(TorqueSensor::MotorCurrent);
+    // The networks are nonlinear by a few percent of the torque, and the members differ by one percent.
     assert!(q < 0.02 && tau < 0.7, "{q} rad, {tau} N·m");
-    // Without the rotor, which its own actuators have, it stands alike.
-    let [q, tau] = away_from_own_drives(TorqueSensor::JointOutput);
+    // With an output sensor the network replaces the rotor inertia, which has no effect at rest.
+    let [q, tau] = difference_from_analytic_actuators(TorqueSensor::JointOutput);
     assert!(q < 0.02 && tau < 0.7, "{q} rad, {tau} N·m");
 }
 
 #[test]
-fn rotor_is_in_what_was_learnt_behind_it() {
+fn ensemble_trained_on_output_torque_replaces_the_rotor_inertia() {
     for (tau_sensor, rotor) in
         [(TorqueSensor::MotorCurrent, go2().joints[0].armature), (TorqueSensor::JointOutput, 0.0)]
     {
@@ -155,51 +160,52 @@ fn rotor_is_in_what_was_learnt_behind_it() {
     }
 }
 
-/// Steps that robots take from where they are, two of them together.
+/// Steps two robots from their current state and returns positions, torques and uncertainty of each.
 fn steps<B: Backend>(backend: &mut B, active: [bool; 2]) -> Vec<Vec<f32>> {
     let control = go2().control;
     let hold = RobotCommand::hold(control.default_pose_f32(), control.kp as f32, control.kd as f32);
-    let mut seen = Vec::new();
+    let mut rows = Vec::new();
     for _ in 0..6 {
         backend.step(&[hold; 2], &active, 3).unwrap();
         let states = backend.states();
-        seen.extend((0..2).map(|robot| {
+        rows.extend((0..2).map(|robot| {
             [&states.q[robot][..], &states.tau[robot], &states.epistemic_uncertainty[robot..][..1]].concat()
         }));
     }
-    seen
+    rows
 }
 
 fn check_snapshots<B: Backend>(mut backend: B) {
-    let placement =
+    let initial_state =
         |seed| InitialState { actuator_seed: seed, ..InitialState::at_rest(0.34, go2().control.default_pose_f32()) };
-    backend.reset(&[(0, placement(7)), (1, placement(8))]).unwrap();
+    backend.reset(&[(0, initial_state(7)), (1, initial_state(8))]).unwrap();
     steps(&mut backend, [true, true]);
-    let kept = [0, 1].map(|robot| backend.snapshot(robot));
+    let snapshots = [0, 1].map(|robot| backend.snapshot(robot));
     let first = steps(&mut backend, [true, true]);
-    // Another member may actuator robot 0 by now; what stands still stays as it is, in its actuators too.
-    backend.reset(&[(0, placement(9))]).unwrap();
+    // After this reset another member may be the actuator of robot 0. Inactive robots and their actuators do not
+    // change.
+    backend.reset(&[(0, initial_state(9))]).unwrap();
     steps(&mut backend, [true, false]);
-    (0..2).for_each(|robot| backend.restore(robot, &kept[robot]));
+    (0..2).for_each(|robot| backend.restore(robot, &snapshots[robot]));
     assert!(steps(&mut backend, [true, true]) == first);
-    // Either state in either place.
-    (0..2).for_each(|robot| backend.restore(robot, &kept[1 - robot]));
+    // Each snapshot can be restored to either robot.
+    (0..2).for_each(|robot| backend.restore(robot, &snapshots[1 - robot]));
     let swapped = steps(&mut backend, [true, true]);
     assert!(swapped.iter().zip(first.chunks(2).flat_map(|both| both.iter().rev())).all(|(one, other)| one == other));
 
-    (0..2).for_each(|robot| backend.restore(robot, &kept[robot]));
+    (0..2).for_each(|robot| backend.restore(robot, &snapshots[robot]));
     steps(&mut backend, [true, false]);
-    backend.restore(0, &kept[0]);
+    backend.restore(0, &snapshots[0]);
     assert!(steps(&mut backend, [true, true]) == first);
 
-    backend.reset(&[(0, placement(7)), (1, placement(8))]).unwrap();
-    let anew = steps(&mut backend, [true, true]);
-    backend.reset(&[(0, placement(7)), (1, placement(8))]).unwrap();
-    assert!(steps(&mut backend, [true, true]) == anew && anew != first);
+    backend.reset(&[(0, initial_state(7)), (1, initial_state(8))]).unwrap();
+    let after_reset = steps(&mut backend, [true, true]);
+    backend.reset(&[(0, initial_state(7)), (1, initial_state(8))]).unwrap();
+    assert!(steps(&mut backend, [true, true]) == after_reset && after_reset != first);
 }
 
 #[test]
-fn drives_go_back_with_the_robots_snapshot() {
+fn snapshot_includes_the_state_of_the_actuator_networks() {
     for (keys, uncertain) in [("sample = true", false), ("", true), ("draw = \"step\"", false)] {
         let (_folder, model) = model_with(description(), "", keys);
         let learned = ActuatorNetworkRobot::load(&ModelFile::load(&model).unwrap()).unwrap().unwrap();
@@ -212,23 +218,24 @@ fn drives_go_back_with_the_robots_snapshot() {
 }
 
 #[test]
-fn commands_that_no_network_has_heard_of_are_refused_and_nothing_is_stepped() {
+fn commands_outside_the_training_conditions_are_rejected_and_no_robot_is_stepped() {
     let (_folder, model) = model_with(description(), "", "");
     let learned = ActuatorNetworkRobot::load(&ModelFile::load(&model).unwrap()).unwrap().unwrap();
     let sim = SimConfig { engine: Engine::Batch, threads: 1, ..SimConfig::default() };
     let mut backend = BatchBackend::new(go2(), sim, 2).unwrap().with_actuator(Box::new(learned.actuators(2, false)));
-    let known = RobotCommand::hold(go2().control.default_pose_f32(), 30.0, 0.75);
+    let supported = RobotCommand::hold(go2().control.default_pose_f32(), 30.0, 0.75);
     let before = backend.states().clone();
-    let pushed = RobotCommand { tau_ff: std::array::from_fn(|joint| if joint == 4 { 1.5 } else { 0.0 }), ..known };
-    let soft = RobotCommand::hold(known.q, 20.0, 0.75);
-    for (command, reason) in [(pushed, "FR_thigh has 1.5"), (soft, "FL_hip has [20.0, 0.75]")] {
-        let error = backend.step(&[known, command], &[true, true], 4).unwrap_err();
+    let feedforward =
+        RobotCommand { tau_ff: std::array::from_fn(|joint| if joint == 4 { 1.5 } else { 0.0 }), ..supported };
+    let soft = RobotCommand::hold(supported.q, 20.0, 0.75);
+    for (command, reason) in [(feedforward, "FR_thigh has 1.5"), (soft, "FL_hip has [20.0, 0.75]")] {
+        let error = backend.step(&[supported, command], &[true, true], 4).unwrap_err();
         assert!(
             matches!(error, BackendError::UnsupportedCommand { robot: 1, .. }) && error.to_string().contains(reason),
             "{error}"
         );
         assert_eq!(*backend.states(), before);
-        backend.step(&[known, command], &[false, false], 4).unwrap();
+        backend.step(&[supported, command], &[false, false], 4).unwrap();
     }
 }
 
@@ -237,16 +244,16 @@ fn twinstep(arguments: &[&str]) -> Output {
     Command::new(programs.0.join("twinstep")).args(arguments).output().unwrap()
 }
 
-/// What a program says of a model that it refuses.
-fn refusal(program: &[&str], model: &Path) -> String {
-    let output = twinstep(&[program, &["--model", model.to_str().unwrap()]].concat());
+/// Returns the error of a command that rejects `model`.
+fn rejection(command: &[&str], model: &Path) -> String {
+    let output = twinstep(&[command, &["--model", model.to_str().unwrap()]].concat());
     let error = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(2), "{error}");
     error
 }
 
 #[test]
-fn serve_drives_robots_by_the_ensemble_of_its_model() {
+fn serve_simulates_robots_with_the_ensemble_of_its_model() {
     let (_folder, model) = model_with(description(), "", "sample = true");
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
     let arguments = ["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "8", "--model", model.to_str().unwrap()];
@@ -262,7 +269,7 @@ fn serve_drives_robots_by_the_ensemble_of_its_model() {
 }
 
 #[test]
-fn served_robot_has_the_gains_that_its_ensemble_learnt_with_and_says_so() {
+fn served_robot_and_its_spec_have_the_gains_of_the_training_data() {
     let folder = tempfile::tempdir().unwrap();
     let model = folder.path().join("robot.toml");
     let soft = EnsembleMetadata { gains: vec![[25.0, 0.6]; 12], ..description() };
@@ -284,14 +291,14 @@ fn served_robot_has_the_gains_that_its_ensemble_learnt_with_and_says_so() {
 }
 
 #[test]
-fn ensembles_that_do_not_go_with_the_robot_are_refused_with_the_reason() {
+fn ensembles_that_do_not_fit_the_robot_are_rejected_with_the_reason() {
     let serve = ["serve", "--listen", "tcp/127.0.0.1:0"];
     let lag = "[[effect]]\nname = \"drive_lag\"\nscope = \"all\"\ntime_constant_s = 0.01";
-    let ripple = "[[effect]]\nname = \"coulomb_friction\"\nscope = \"calf\"\ntorque_nm = 0.2";
+    let friction = "[[effect]]\nname = \"coulomb_friction\"\nscope = \"calf\"\ntorque_nm = 0.2";
     let slow = EnsembleMetadata { dt: 0.02, ..description() };
     let mut uneven = description();
     uneven.gains[4] = [20.0, 0.5];
-    let behind = EnsembleMetadata { tau_sensor: TorqueSensor::JointOutput, ..description() };
+    let output = EnsembleMetadata { tau_sensor: TorqueSensor::JointOutput, ..description() };
     let hip = EnsembleMetadata {
         joints: vec!["FL_hip".to_owned()],
         gains: vec![[30.0, 0.75]],
@@ -306,30 +313,30 @@ fn ensembles_that_do_not_go_with_the_robot_are_refused_with_the_reason() {
             lag,
             "`drive_lag` on all is part of this ensemble, which is trained on the torque at `current`",
         ),
-        (behind, ripple, "replaces stages 1 to 14 of the chain, including `coulomb_friction` (13, friction)"),
+        (output, friction, "replaces stages 1 to 14 of the chain, including `coulomb_friction` (13, friction)"),
         (hip, "", "is not trained for FL_thigh"),
     ] {
         let (_folder, model) = model_with(description, effects, "");
-        let error = refusal(&serve, &model);
+        let error = rejection(&serve, &model);
         assert!(error.contains(reason), "{error}");
     }
-    // Behind the current there is friction.
-    let (_folder, model) = model_with(description(), ripple, "");
+    // With a motor-current sensor, friction is not part of the ensemble.
+    let (_folder, model) = model_with(description(), friction, "");
     assert!(SimEnvFactory::new(config(Engine::Batch, &model, 1)).is_ok());
 }
 
 #[test]
-fn settings_that_learned_drives_cannot_follow_are_refused_by_name() {
+fn settings_that_actuator_networks_do_not_support_are_rejected_by_name() {
     let (_folder, model) = model_with(description(), "", "");
-    let refused = |change: fn(&mut Config), expected: &str| {
+    let check = |change: fn(&mut Config), expected: &str| {
         let mut config = config(Engine::Batch, &model, 1);
         change(&mut config);
         let error = SimEnvFactory::new(config).err().unwrap();
         assert!(matches!(error, EnvFactoryError::ActuatorNetwork { field, .. } if field == expected), "{error}");
     };
-    refused(|config| config.randomise.kp_scale = [0.9, 1.1], "randomise.kp_scale");
-    refused(|config| config.randomise.kd_scale = [0.9, 0.9], "randomise.kd_scale");
-    refused(
+    check(|config| config.randomise.kp_scale = [0.9, 1.1], "randomise.kp_scale");
+    check(|config| config.randomise.kd_scale = [0.9, 0.9], "randomise.kd_scale");
+    check(
         |config| {
             config.server.model = None;
             config.task.reward.epistemic_uncertainty = 1.0;
@@ -339,7 +346,7 @@ fn settings_that_learned_drives_cannot_follow_are_refused_by_name() {
 }
 
 #[test]
-fn play_runs_learned_drives_and_who_needs_their_laws_refuses_them() {
+fn play_simulates_actuator_networks_and_identify_evaluate_and_diagnose_reject_them() {
     let (folder, model) = model_with(description(), "", "draw = \"step\"");
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
     let meta = Meta::new(50.0, TorqueSensor::None, vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }]);
@@ -351,12 +358,12 @@ fn play_runs_learned_drives_and_who_needs_their_laws_refuses_them() {
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         Log::open(out).unwrap()
     };
-    let learned = play(&path("learned"), &["--model", model.to_str().unwrap()]);
-    assert_ne!(learned.q("FL_calf"), play(&path("own"), &[]).q("FL_calf"));
+    let with_networks = play(&path("learned"), &["--model", model.to_str().unwrap()]);
+    assert_ne!(with_networks.q("FL_calf"), play(&path("analytic"), &[]).q("FL_calf"));
 
     let (log, out) = (path("learned"), path("out"));
-    for program in [&["evaluate", &log][..], &["identify", &log, "--out", &out], &["diagnose", &log, "--out", &out]] {
-        let error = refusal(program, &model);
+    for command in [&["evaluate", &log][..], &["identify", &log, "--out", &out], &["diagnose", &log, "--out", &out]] {
+        let error = rejection(command, &model);
         assert!(error.contains("robot.toml: `[actuator]` is for `twinstep serve` and `twinstep play`"), "{error}");
     }
 }

@@ -1,4 +1,4 @@
-//! Who holds a lease, for how long, and who takes it over.
+//! Ownership, expiry and reclaiming of leases.
 
 use std::time::{Duration, Instant};
 
@@ -10,8 +10,8 @@ use twinstep_protocol::message::LeaseRequest;
 use crate::raw_client::{RawClient, steps_in};
 use crate::remote::{config, start};
 
-/// How long a test waits for what must happen: far longer than it takes.
-const PATIENCE: Duration = Duration::from_secs(20);
+/// Maximum wait for a condition, much longer than needed.
+const TIMEOUT: Duration = Duration::from_secs(20);
 
 fn start_counters(lease_grace_s: f64) -> (Server, String) {
     let mut config = config(TaskName::Counter);
@@ -19,16 +19,16 @@ fn start_counters(lease_grace_s: f64) -> (Server, String) {
     start(&config)
 }
 
-/// Asks again and again until `condition` holds.
+/// Polls until `condition` holds. Fails after [`TIMEOUT`].
 fn wait_until(what: &str, mut condition: impl FnMut() -> bool) {
     let since = Instant::now();
     while !condition() {
-        assert!(since.elapsed() < PATIENCE, "{what}: not after {PATIENCE:?}");
+        assert!(since.elapsed() < TIMEOUT, "not within {TIMEOUT:?}: {what}");
     }
 }
 
 #[test]
-fn numbers_of_environments_that_cannot_be_are_refused() {
+fn invalid_numbers_of_environments_are_rejected() {
     let (server, endpoint) = start_counters(10.0);
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
     for (num_envs, expected) in [
@@ -45,7 +45,7 @@ fn numbers_of_environments_that_cannot_be_are_refused() {
 }
 
 #[test]
-fn clients_without_a_proper_id_are_refused() {
+fn clients_with_an_invalid_id_are_rejected() {
     let (server, endpoint) = start_counters(10.0);
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
     for id in [String::new(), "a/b".to_owned(), "*".to_owned(), "é".to_owned(), "c".repeat(65)] {
@@ -56,7 +56,7 @@ fn clients_without_a_proper_id_are_refused() {
 }
 
 #[test]
-fn lease_asked_again_is_the_same_lease() {
+fn repeated_lease_request_returns_the_same_lease() {
     let (server, endpoint) = start_counters(10.0);
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
     let lease = client.lease(3);
@@ -67,7 +67,7 @@ fn lease_asked_again_is_the_same_lease() {
 }
 
 #[test]
-fn lost_client_is_followed_within_the_grace_and_forgotten_after_it() {
+fn lease_of_a_lost_client_can_be_reclaimed_within_the_grace_period_only() {
     let grace_s = 1.0;
     let (server, endpoint) = start_counters(grace_s);
     let first = RawClient::connect(&endpoint, server.sid(), "first");
@@ -76,43 +76,43 @@ fn lost_client_is_followed_within_the_grace_and_forgotten_after_it() {
     let last = first.step(&lease, 2).unwrap();
     let second = RawClient::connect(&endpoint, server.sid(), "second");
     first.vanish();
-    wait_until("the first client is gone", || !second.sees("first"));
+    wait_until("the first client is disconnected", || !second.sees("first"));
 
-    let taken = second.reclaim(&lease.lease, lease.epoch).unwrap();
-    assert_eq!((taken.epoch, taken.last_seq), (2, 2));
-    assert_eq!(second.step(&taken, 2).unwrap(), last, "the last answer again, in case it was lost");
-    assert_eq!(steps_in(&second.step(&taken, 3).unwrap()), 2.0, "it goes on where the first client was");
+    let reclaimed = second.reclaim(&lease.lease, lease.epoch).unwrap();
+    assert_eq!((reclaimed.epoch, reclaimed.last_seq), (2, 2));
+    assert_eq!(second.step(&reclaimed, 2).unwrap(), last, "the last reply can be requested again");
+    assert_eq!(steps_in(&second.step(&reclaimed, 3).unwrap()), 2.0, "the environments continue from their state");
 
     let third = RawClient::connect(&endpoint, server.sid(), "third");
     let since = Instant::now();
     second.vanish();
-    wait_until("the lease is freed", || third.hello().free_envs == 64);
-    assert!(since.elapsed().as_secs_f64() >= grace_s, "freed before the grace had passed");
+    wait_until("the lease has expired", || third.hello().free_envs == 64);
+    assert!(since.elapsed().as_secs_f64() >= grace_s, "the lease expired before the end of the grace period");
     assert_eq!(third.reclaim(&lease.lease, 2).unwrap_err().code, ErrorCode::LeaseLost);
-    assert_eq!(third.step(&taken, 4).unwrap_err().code, ErrorCode::LeaseLost);
+    assert_eq!(third.step(&reclaimed, 4).unwrap_err().code, ErrorCode::LeaseLost);
     server.shutdown();
 }
 
 #[test]
-fn reclaim_sent_again_gets_its_answer_again() {
+fn repeated_reclaim_returns_the_same_reply() {
     let (server, endpoint) = start_counters(10.0);
     let first = RawClient::connect(&endpoint, server.sid(), "first");
     let lease = first.lease(1);
     let second = RawClient::connect(&endpoint, server.sid(), "second");
-    let taken = second.reclaim(&lease.lease, 1).unwrap();
-    assert_eq!(second.reclaim(&lease.lease, 1).unwrap(), taken);
+    let reclaimed = second.reclaim(&lease.lease, 1).unwrap();
+    assert_eq!(second.reclaim(&lease.lease, 1).unwrap(), reclaimed);
     assert_eq!(
         first.reclaim(&lease.lease, 1).unwrap_err().code,
         ErrorCode::StaleEpoch,
-        "only its new owner repeats it"
+        "only the new owner may repeat the request"
     );
     assert_eq!(first.reset(&lease, 1).unwrap_err().code, ErrorCode::StaleEpoch);
-    second.reset(&taken, 1).unwrap();
+    second.reset(&reclaimed, 1).unwrap();
     server.shutdown();
 }
 
 #[test]
-fn reclaim_under_a_wrong_epoch_takes_nothing() {
+fn reclaim_with_a_wrong_epoch_has_no_effect() {
     let grace_s = 0.3;
     let (server, endpoint) = start_counters(grace_s);
     let owner = RawClient::connect(&endpoint, server.sid(), "owner");
@@ -121,22 +121,22 @@ fn reclaim_under_a_wrong_epoch_takes_nothing() {
     for epoch in [0, 2, u64::MAX] {
         assert_eq!(intruder.reclaim(&lease.lease, epoch).unwrap_err().code, ErrorCode::StaleEpoch, "epoch {epoch}");
     }
-    // The owner is silent, as one that learns between two rollouts is: its token alone keeps the lease.
+    // The owner sends nothing, as during learning between two rollouts. Its liveliness token alone keeps the lease.
     let since = Instant::now();
     while since.elapsed().as_secs_f64() < 3.0 * grace_s {
-        assert_eq!(intruder.hello().free_envs, 63, "the owner's lease was freed");
+        assert_eq!(intruder.hello().free_envs, 63, "the owner's lease expired");
     }
     owner.reset(&lease, 1).unwrap();
     server.shutdown();
 }
 
 #[test]
-fn client_that_never_shows_a_token_loses_its_lease_to_silence() {
+fn lease_of_a_client_without_liveliness_token_expires() {
     let (server, endpoint) = start_counters(0.3);
     let client = RawClient::without_token(&endpoint, server.sid(), "ghost");
     let lease = client.lease(1);
     client.reset(&lease, 1).unwrap();
-    wait_until("the lease is freed", || client.hello().free_envs == 64);
+    wait_until("the lease has expired", || client.hello().free_envs == 64);
     assert_eq!(client.step(&lease, 2).unwrap_err().code, ErrorCode::LeaseLost);
     server.shutdown();
 }

@@ -1,4 +1,4 @@
-//! `twinstep log` through the real program.
+//! `twinstep log` as a process.
 
 use std::path::Path;
 use std::process::{Command, Output};
@@ -8,7 +8,7 @@ use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::BaseMount;
 use twinstep_tests::python::Programs;
 
-/// The real robot in the air, 16 s at 200 Hz.
+/// Recording of a real Go2 with a fixed base, 16 s at 200 Hz.
 const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../data/go2_air_chirp");
 
 fn log(arguments: &[&str]) -> Output {
@@ -26,13 +26,13 @@ fn convert(from: &Path, to: &Path) -> String {
     stdout(&[from.to_str().unwrap(), "--convert", to.to_str().unwrap()])
 }
 
-fn check_refusal(output: &Output, folder: &Path, message: &Expect) {
+fn check_error(output: &Output, folder: &Path, message: &Expect) {
     assert_eq!(output.status.code(), Some(2));
-    assert!(output.stdout.is_empty(), "on failure stdout stays empty");
+    assert!(output.stdout.is_empty(), "stdout is empty after an error");
     message.assert_eq(&String::from_utf8_lossy(&output.stderr).replace(&folder.display().to_string(), "log"));
 }
 
-/// A robot with a floating base that turns over after a second.
+/// Returns a log of a robot with a floating base that tips over after 1 s.
 fn tumble() -> Log {
     const ROWS: usize = 400;
     let t = |row: usize| row as f64 * 0.005;
@@ -76,12 +76,12 @@ fn log_of_the_real_robot_is_described() {
 }
 
 #[test]
-fn description_of_a_tumble_has_the_fall_and_what_it_can_tell() {
+fn description_of_a_tumble_has_the_fall_and_the_identifiability() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("tumble.csv.gz");
     tumble().write(&path).unwrap();
     let text = stdout(&[path.to_str().unwrap()]);
-    let told = text.split_once("joints  ").unwrap().1;
+    let details = text.split_once("joints  ").unwrap().1;
     expect![[r#"
                    position [rad]          speed [rad/s]        torque [N·m]     reversals   frequency
                          low    high  to limit    RMS   peak  limit    RMS   peak  limit              [Hz]
@@ -91,11 +91,13 @@ fn description_of_a_tumble_has_the_fall_and_what_it_can_tell() {
         identifiability
           command_delay        yes   FL_hip moves in both directions, recorded at 200 Hz; confounded with armature in slow motion
           encoder_offset       weak  kp is constant: repeat the motion with another kp; confounded with a constant load at a single kp
+          pd_gain              weak  kd is constant: repeat the motion with another kd
           torque_saturation    yes   FL_hip reaches 76 % of its torque limit
           supply_sag           no    no battery_V was recorded
           thermal_derating     no    no temp was recorded
           torque_delay         yes   FL_hip moves in both directions, recorded at 200 Hz; differs from command_delay only if the joint is pushed
           torque_speed_limit   no    no joint exceeds 20 % of its speed limit: reach 50 % or more
+          torque_dead_zone     yes   torque was measured, FL_hip moves in both directions
           drive_lag            yes   FL_hip moves in both directions, recorded at 200 Hz, motion reaches 3.2 Hz; its gain falls with frequency, that of a delay does not
           torque_sensor_delay  yes   torque was measured, FL_hip moves in both directions, recorded at 200 Hz
           torque_gain          yes   FL_hip moves in both directions; confounded with a wrong kp or mass
@@ -114,7 +116,7 @@ fn description_of_a_tumble_has_the_fall_and_what_it_can_tell() {
           ground_friction      yes   the base is floating for 2.0 s; only slipping feet determine its value
           ground_stiffness     weak  no foot_force or contact was recorded
           gyro_bias            yes   the gyro reaches 2.00 rad/s
-    "#]].assert_eq(told);
+    "#]].assert_eq(details);
 }
 
 #[test]
@@ -124,15 +126,15 @@ fn description_is_one_json_object() {
     assert_eq!(text.lines().count(), 1);
     assert_eq!((&json["rows"], &json["segments"][0]["base"]), (&3200.into(), &"fixed".into()));
     assert_eq!(json["joints"].as_array().unwrap().len(), 12);
-    let verdict = |effect: &str| {
+    let identifiability = |effect: &str| {
         let conclusions = json["conclusions"].as_array().unwrap();
         conclusions.iter().find(|conclusion| conclusion["effect"] == effect).unwrap()["verdict"].clone()
     };
-    assert_eq!((verdict("coulomb_friction"), verdict("payload")), ("weakly".into(), "cannot".into()));
+    assert_eq!((identifiability("coulomb_friction"), identifiability("payload")), ("weakly".into(), "cannot".into()));
 }
 
 #[test]
-fn log_goes_through_every_format_and_comes_back() {
+fn conversion_through_every_format_preserves_the_log() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
     let original = Log::open(RECORDING).unwrap();
@@ -154,13 +156,13 @@ fn log_goes_through_every_format_and_comes_back() {
     let end = Log::open(path("end.csv")).unwrap();
     assert_eq!((end.meta(), end.joints(), end.segment()), (original.meta(), original.joints(), original.segment()));
     for (name, cells) in original.channels() {
-        // MCAP holds single precision.
+        // MCAP stores single precision.
         assert!(cells.iter().zip(end.channel(name).unwrap()).all(|(a, b)| f64::from(*a as f32) == *b), "{name}");
     }
 }
 
 #[test]
-fn conversion_says_what_it_leaves_out() {
+fn conversion_reports_omitted_columns() {
     let folder = tempfile::tempdir().unwrap();
     let (csv, mcap) = (folder.path().join("tumble.csv"), folder.path().join("tumble.mcap"));
     tumble().write(&csv).unwrap();
@@ -171,13 +173,13 @@ fn conversion_says_what_it_leaves_out() {
 }
 
 #[test]
-fn log_is_not_overwritten_with_itself() {
+fn conversion_does_not_overwrite_its_source() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).display().to_string();
     tumble().write(path("data.csv")).unwrap();
-    let refused = |from: &str, to: &str| log(&[&path(from), "--convert", &path(to)]);
-    check_refusal(
-        &refused("data.csv", "data.csv"),
+    let convert = |from: &str, to: &str| log(&[&path(from), "--convert", &path(to)]);
+    check_error(
+        &convert("data.csv", "data.csv"),
         folder.path(),
         &expect![[r#"
         error: `--convert log/data.csv` would replace `log/data.csv`, which belongs to the log itself
@@ -185,8 +187,8 @@ fn log_is_not_overwritten_with_itself() {
     "#]],
     );
     // Another data file, but the same meta.json.
-    check_refusal(
-        &refused("", "data.parquet"),
+    check_error(
+        &convert("", "data.parquet"),
         folder.path(),
         &expect![[r#"
         error: `--convert log/data.parquet` would replace `log/meta.json`, which belongs to the log itself
@@ -197,14 +199,14 @@ fn log_is_not_overwritten_with_itself() {
 }
 
 #[test]
-fn bad_input_is_named_and_stdout_stays_empty() {
+fn bad_input_is_named_and_stdout_is_empty() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("walk.csv");
     std::fs::write(&path, "t,q_FL_hip_deg,q_cmd_FL_hip,kp,kd\n0,0,0,20,0.5\n").unwrap();
     let segments = vec![Segment { name: "walk".to_owned(), base: BaseMount::Floating }];
     let meta = serde_json::to_string(&Meta::new(200.0, TorqueSensor::None, segments)).unwrap();
     std::fs::write(folder.path().join("walk.json"), meta).unwrap();
-    check_refusal(
+    check_error(
         &log(&[path.to_str().unwrap(), "--json"]),
         folder.path(),
         &expect![[r#"
@@ -212,7 +214,7 @@ fn bad_input_is_named_and_stdout_stays_empty() {
           rename the column to `q_FL_hip`, in rad; column names do not contain units
     "#]],
     );
-    check_refusal(
+    check_error(
         &log(&["nowhere"]),
         folder.path(),
         &expect![[r#"
@@ -220,7 +222,7 @@ fn bad_input_is_named_and_stdout_stays_empty() {
           pass a folder with meta.json and one of data.parquet, data.csv, data.csv.gz and data.mcap, or a data file
     "#]],
     );
-    check_refusal(
+    check_error(
         &log(&[RECORDING, "--convert", "walk.xlsx"]),
         folder.path(),
         &expect![[r#"
@@ -231,7 +233,7 @@ fn bad_input_is_named_and_stdout_stays_empty() {
 }
 
 #[test]
-fn motion_is_described_without_conclusions() {
+fn motion_file_is_described_without_identifiability() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("sway.csv");
     let segments = vec![Segment { name: "sway".to_owned(), base: BaseMount::Fixed }];

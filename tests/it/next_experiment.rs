@@ -1,4 +1,4 @@
-//! The next experiment: every motion that it is chosen from is safe, and the chosen one parts what another does not.
+//! The next experiment: all excitation trajectories are safe, and the chosen one discriminates better than the median.
 
 use std::f64::consts::TAU;
 
@@ -14,13 +14,13 @@ use twinstep_tests::ground_truth_robot::effect;
 
 use crate::identify::twinstep;
 
-/// Distance that joints keep from the ends of their range [rad].
+/// Minimum distance of a joint from the limits of its range [rad].
 const MARGIN: f64 = 0.1;
-/// Highest speed of a joint [rad/s]; the calf's actuator ends at 15.7.
-const FASTEST: f64 = 10.0;
+/// Maximum speed of a joint [rad/s]. The speed limit of the calf actuator is 15.7 rad/s.
+const MAX_SPEED: f64 = 10.0;
 
-/// What `robot` does in a motion, simulated at a finer step than models are.
-fn played(motion: &Log, robot: &RobotModel) -> Log {
+/// Returns the log of `robot` for the commands of `motion`, simulated with a smaller step than the models.
+fn simulated(motion: &Log, robot: &RobotModel) -> Log {
     let backend = |base: BaseMount, robot: &RobotModel| {
         let config = SimConfig { base, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
         Ok(BatchBackend::new(robot.clone(), config, 1).unwrap())
@@ -28,21 +28,22 @@ fn played(motion: &Log, robot: &RobotModel) -> Log {
     record(motion, robot, None, backend, String::new(), &mut |_| true).unwrap()
 }
 
-/// The same as encoders with noise see it, and nothing else.
-fn encoders(log: &Log) -> Log {
-    let kept = |name: &str| name.starts_with("q_") || name.starts_with('k');
-    let columns = log.channels().filter(|(name, _)| kept(name)).map(|(name, cells)| (name.to_owned(), cells.to_vec()));
+/// Returns only the noisy encoder readings and the commands of `log`.
+fn with_encoders_only(log: &Log) -> Log {
+    let is_kept = |name: &str| name.starts_with("q_") || name.starts_with('k');
+    let kept = log.channels().filter(|(name, _)| is_kept(name));
+    let columns = kept.map(|(name, cells)| (name.to_owned(), cells.to_vec()));
     let columns = columns.chain([("t".to_owned(), log.t().to_vec())]);
     let log = Log::new(Meta { tau_sensor: TorqueSensor::None, ..log.meta().clone() }, columns).unwrap();
     apply_sensors(&log, &[Sensor { quantity: "q", sigma: 0.002, resolution: 0.0 }], 1).unwrap()
 }
 
 #[test]
-fn nominal_robot_gets_through_every_safe_motion() {
+fn nominal_robot_executes_every_trajectory_within_its_limits() {
     for motion in EXCITATION_TRAJECTORIES {
-        let (name, log) = (motion.name, played(&motion.motion(&go2()), &go2()));
-        let most = |cells: &[f64]| {
-            cells.iter().filter(|cell| cell.is_finite()).fold(0.0, |most: f64, cell| most.max(cell.abs()))
+        let (name, log) = (motion.name, simulated(&motion.motion(&go2()), &go2()));
+        let largest = |cells: &[f64]| {
+            cells.iter().filter(|cell| cell.is_finite()).fold(0.0, |largest: f64, cell| largest.max(cell.abs()))
         };
         for joint in Joint::ALL {
             let limits = go2().joints[joint.index()];
@@ -50,12 +51,12 @@ fn nominal_robot_gets_through_every_safe_motion() {
             for cells in [log.q(joint.name()).unwrap(), log.q_cmd(joint.name()).unwrap()] {
                 assert!(
                     cells.iter().all(|q| (low + MARGIN..high - MARGIN).contains(q)),
-                    "{name}: {joint} near its end"
+                    "{name}: {joint} is close to its limit"
                 );
             }
-            let speed = most(log.dq(joint.name()).unwrap());
-            let torque = most(log.tau_measured(joint.name()).unwrap());
-            assert!(speed < FASTEST, "{name}: {joint} at {speed} rad/s");
+            let speed = largest(log.dq(joint.name()).unwrap());
+            let torque = largest(log.tau_measured(joint.name()).unwrap());
+            assert!(speed < MAX_SPEED, "{name}: {joint} at {speed} rad/s");
             assert!(torque < 0.9 * limits.torque_limit, "{name}: {joint} with {torque} N·m");
         }
         if motion.base == BaseMount::Floating {
@@ -69,7 +70,7 @@ fn nominal_robot_gets_through_every_safe_motion() {
 }
 
 #[test]
-fn safe_motions_have_names_of_their_own_and_begin_and_end_in_the_default_pose() {
+fn trajectories_have_unique_names_and_begin_and_end_in_the_default_pose() {
     for (index, motion) in EXCITATION_TRAJECTORIES.iter().enumerate() {
         assert!(EXCITATION_TRAJECTORIES[..index].iter().all(|other| other.name != motion.name));
         let log = motion.motion(&go2());
@@ -81,23 +82,23 @@ fn safe_motions_have_names_of_their_own_and_begin_and_end_in_the_default_pose() 
 }
 
 #[test]
-fn chosen_motion_beats_the_median_one() {
+fn chosen_trajectory_discriminates_better_than_the_median_one() {
     // Actuator lag or torque delay; `results/next_experiment.md` has more pairs.
     let pair = &PAIRS[2];
     let (pair, robot) = (pair.hypothesis_pair(), pair.robot().robot_model().unwrap());
     let mut simulator = BatchRollout::new(&go2(), &SimConfig::default()).unwrap();
-    let mut told: Vec<[f64; 2]> = Vec::new();
+    let mut ratios: Vec<[f64; 2]> = Vec::new();
     for motion in EXCITATION_TRAJECTORIES.iter().filter(|motion| motion.base == BaseMount::Fixed) {
-        let log = encoders(&played(&motion.motion(&go2()), &robot));
+        let log = with_encoders_only(&simulated(&motion.motion(&go2()), &robot));
         let predicted = pair.expected_log_likelihood_ratio(motion, &log, &mut simulator).unwrap();
-        told.push([predicted, pair.log_likelihood_ratio(log, &mut simulator).unwrap()]);
+        ratios.push([predicted, pair.log_likelihood_ratio(log, &mut simulator).unwrap()]);
     }
-    let chosen = told.iter().max_by(|one, other| one[0].total_cmp(&other[0])).unwrap()[1];
-    told.sort_by(|one, other| one[1].total_cmp(&other[1]));
-    assert!(chosen > told[told.len() / 2][1] + 10.0, "chosen {chosen:.1}: {told:.1?}");
+    let chosen = ratios.iter().max_by(|one, other| one[0].total_cmp(&other[0])).unwrap()[1];
+    ratios.sort_by(|one, other| one[1].total_cmp(&other[1]));
+    assert!(chosen > ratios[ratios.len() / 2][1] + 10.0, "chosen {chosen:.1}: {ratios:.1?}");
 }
 
-/// Six seconds of one slow sine a joint, at which a delay and viscous friction are the same.
+/// Returns commands of one slow sine per joint for 6 s, at which a delay and viscous friction have the same effect.
 fn slow_sines() -> Log {
     let segments = vec![Segment { name: "sines".to_owned(), base: BaseMount::Fixed }];
     let meta = Meta {
@@ -115,7 +116,7 @@ fn slow_sines() -> Log {
 }
 
 #[test]
-fn diagnosis_with_a_rival_writes_a_motion_that_play_takes() {
+fn diagnosis_with_an_alternative_writes_commands_that_play_accepts() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
     let (viscous, thighs) = effect("viscous_friction", "thigh");
@@ -127,10 +128,11 @@ fn diagnosis_with_a_rival_writes_a_motion_that_play_takes() {
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         output.stdout
     };
-    encoders(&played(&slow_sines(), &robot.robot_model().unwrap())).write(path("first.parquet")).unwrap();
-    let said = run(&["diagnose", &path("first.parquet"), "--out", &path("one"), "--json"]);
-    let diagnosis: Diagnosis = serde_json::from_slice(&said).unwrap();
-    let next = diagnosis.next_experiment.expect("a delay looks the same");
+    let log = with_encoders_only(&simulated(&slow_sines(), &robot.robot_model().unwrap()));
+    log.write(path("first.parquet")).unwrap();
+    let printed = run(&["diagnose", &path("first.parquet"), "--out", &path("one"), "--json"]);
+    let diagnosis: Diagnosis = serde_json::from_slice(&printed).unwrap();
+    let next = diagnosis.next_experiment.expect("a delay has the same effect");
     assert!(next.parts[0].effects.iter().any(|name| name.starts_with("command_delay@")), "{next:?}");
     assert!(next.parts[0].predicted_nats > next.parts[0].median_nats, "{next:?}");
     let page = std::fs::read_to_string(path("one/report.html")).unwrap();

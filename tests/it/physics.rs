@@ -1,4 +1,4 @@
-//! An engine against physics: closed forms and conservation. Run for each engine, as its `Simulator`.
+//! Comparison of an engine with closed forms and conservation laws. Included once per engine, as its `Simulator`.
 
 use std::f32::consts::PI;
 
@@ -19,13 +19,13 @@ const DT: f64 = 1e-5;
 /// The joint `FL_calf`.
 const CALF: usize = 2;
 
-fn backend(config: SimConfig, placement: InitialState) -> Simulator {
+fn backend(config: SimConfig, initial_state: InitialState) -> Simulator {
     let mut backend = Simulator::new(go2(), SimConfig { engine: ENGINE, threads: 1, ..config }, 1).unwrap();
-    backend.reset(&[(0, placement)]).unwrap();
+    backend.reset(&[(0, initial_state)]).unwrap();
     backend
 }
 
-fn limp() -> Command {
+fn zero_gains() -> Command {
     Command::hold([0.0; NUM_JOINTS], 0.0, 0.0)
 }
 
@@ -43,13 +43,13 @@ fn run(backend: &mut Simulator, command: &Command, seconds: f32) {
     backend.step(&[*command], &[true], periods).unwrap();
 }
 
-/// Momentum, angular momentum about the world's origin, and centre of mass of the whole robot, from its state alone.
+/// Returns momentum, angular momentum about the world origin and centre of mass of the robot, from its state.
 fn momentum(robot: &RobotModel, backend: &Simulator) -> (DVec3, DVec3, DVec3) {
     let (linear, angular, com, _) = motion(robot, backend);
     (linear, angular, com)
 }
 
-/// As [`momentum`], and kinetic and potential energy [J].
+/// Returns the quantities of [`momentum`] and the sum of kinetic and potential energy [J].
 fn motion(robot: &RobotModel, backend: &Simulator) -> (DVec3, DVec3, DVec3, f64) {
     let states = backend.states();
     let rotation = frames::world_from_base(states.base_orientation[0]).as_dquat();
@@ -91,49 +91,51 @@ fn motion(robot: &RobotModel, backend: &Simulator) -> (DVec3, DVec3, DVec3, f64)
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(16))]
     #[test]
-    fn limp_robot_in_flight_keeps_momentum_and_energy(
+    fn unactuated_robot_in_flight_conserves_momentum_and_energy(
         spin in prop::array::uniform3(-2.0f32..2.0),
         dq in prop::array::uniform12(-2.0f32..2.0),
     ) {
         let robot = go2();
-        let placement = InitialState { base_angular_velocity: spin, dq, ..InitialState::at_rest(20.0, default_pose()) };
-        let mut backend = backend(SimConfig { physics_hz: Some(4000), ..SimConfig::default() }, placement);
+        let initial_state =
+            InitialState { base_angular_velocity: spin, dq, ..InitialState::at_rest(20.0, default_pose()) };
+        let mut backend = backend(SimConfig { physics_hz: Some(4000), ..SimConfig::default() }, initial_state);
         let (linear, angular, com, energy) = motion(&robot, &backend);
-        run(&mut backend, &limp(), 0.1);
+        run(&mut backend, &zero_gains(), 0.1);
         let (linear_after, angular_after, com_after, energy_after) = motion(&robot, &backend);
-        let fallen = DVec3::new(0.0, 0.0, -9.81 * robot.total_mass() * 0.1);
-        prop_assert!((linear_after - linear - fallen).length() < 0.01);
-        let own = |angular: DVec3, com: DVec3, linear: DVec3| angular - com.cross(linear);
-        prop_assert!((own(angular_after, com_after, linear_after) - own(angular, com, linear)).length() < 0.01);
-        let moving = energy - robot.total_mass() * f64::from(GRAVITY) * com.z;
-        prop_assert!((energy_after - energy).abs() < 0.01 * moving + 0.1, "{energy} J, then {energy_after} J");
+        let gravity_impulse = DVec3::new(0.0, 0.0, -9.81 * robot.total_mass() * 0.1);
+        prop_assert!((linear_after - linear - gravity_impulse).length() < 0.01);
+        let about_com = |angular: DVec3, com: DVec3, linear: DVec3| angular - com.cross(linear);
+        let change = about_com(angular_after, com_after, linear_after) - about_com(angular, com, linear);
+        prop_assert!(change.length() < 0.01);
+        let kinetic = energy - robot.total_mass() * f64::from(GRAVITY) * com.z;
+        prop_assert!((energy_after - energy).abs() < 0.01 * kinetic + 0.1, "{energy} J, then {energy_after} J");
     }
 }
 
 #[test]
-fn dropped_robot_falls_as_galilei_says() {
+fn dropped_robot_falls_with_gravity() {
     let mut backend = backend(
         SimConfig { physics_hz: Some(400), solver_iterations: Some(1), ..SimConfig::default() },
         InitialState::at_rest(10.0, default_pose()),
     );
     run(&mut backend, &hold_default_pose(), 1.0);
     let fallen = 10.0 - backend.states().base_position[0][2];
-    // Semi-implicit Euler falls g·dt·t/2 too far, 12 mm at 400 Hz, which the batch engine takes off where it is read. The
-    // legs may move the trunk a little about the CoM.
+    // Semi-implicit Euler falls g·dt·t/2 too far, 12 mm at 400 Hz. The batch engine subtracts this from the positions
+    // that it reports. The tolerance covers the motion of the trunk relative to the centre of mass.
     let excess = if ENGINE == Engine::Rapier { 0.01226 } else { 0.0 };
     assert!((fallen - GRAVITY / 2.0 - excess).abs() < 0.004, "fell {fallen} m");
     assert!((backend.states().base_linear_velocity[0][2] + GRAVITY).abs() < 0.02);
 }
 
 #[test]
-fn momentum_is_kept_in_flight_while_the_legs_swing() {
+fn momentum_is_conserved_in_flight_while_the_legs_swing() {
     let robot = go2();
-    let placement = InitialState {
+    let initial_state = InitialState {
         base_linear_velocity: [0.3, -0.2, 5.0],
         base_angular_velocity: [1.0, 1.5, -0.8],
         ..InitialState::at_rest(20.0, default_pose())
     };
-    let mut backend = backend(SimConfig { physics_hz: Some(1000), ..SimConfig::default() }, placement);
+    let mut backend = backend(SimConfig { physics_hz: Some(1000), ..SimConfig::default() }, initial_state);
     let (linear, _, com) = momentum(&robot, &backend);
     let about_com = |backend: &Simulator| {
         let (linear, angular, com) = momentum(&robot, backend);
@@ -149,21 +151,23 @@ fn momentum_is_kept_in_flight_while_the_legs_swing() {
     let (linear_after, _, com_after) = momentum(&robot, &backend);
     assert!((linear_after - linear - gravity_impulse).length() < 0.02, "{linear_after} after {linear}");
     assert!((about_com(&backend) - spin).length() < 0.02, "{} after {spin}", about_com(&backend));
-    let flown = com_after - com;
+    let displacement = com_after - com;
     let ballistic = linear / robot.total_mass() - DVec3::new(0.0, 0.0, 9.81 / 2.0);
-    // A root frame away from the centre of mass makes this 0.04 m wrong.
-    assert!((flown - ballistic).length() < 0.008, "flew {flown}, ballistic {ballistic}");
+    // With a root frame that is not at the centre of mass, the error would be 0.04 m.
+    assert!((displacement - ballistic).length() < 0.008, "moved {displacement}, ballistic {ballistic}");
 }
 
 #[test]
-fn torque_step_turns_the_calf_by_its_inertia() {
+fn torque_step_accelerates_the_calf_by_its_inertia() {
     let robot = lone_calf(0.0, 0.0);
     let closed_form = 0.5 * 0.02 / calf_inertia(&robot);
     let gained = calf_velocity(&robot, 0.0, 0.5);
     assert!((gained / closed_form - 1.0).abs() < 0.005, "{gained} rad/s, closed form {closed_form}");
 }
 
-/// A robot whose calf `CALF` turns alone, with this friction: every other joint has so heavy a rotor that it stays.
+/// Returns a robot of which only the joint `CALF` moves, with this friction.
+///
+/// The other joints have such a high rotor inertia that they do not move.
 fn lone_calf(viscous: f64, coulomb: f64) -> RobotModel {
     let mut robot = go2();
     for (joint, model) in robot.joints.iter_mut().enumerate() {
@@ -176,30 +180,31 @@ fn lone_calf(viscous: f64, coulomb: f64) -> RobotModel {
     robot
 }
 
-/// Velocity of the lone calf [rad/s] after 20 ms, from a velocity [rad/s] and under a torque [N·m]; half the difference
-/// to the opposite of both, so that gravity drops out.
+/// Returns the velocity of the calf [rad/s] after 20 ms, from an initial velocity [rad/s] and with a torque [N·m].
+///
+/// It is half the difference between the results for these values and for their negatives, so that gravity cancels.
 fn calf_velocity(robot: &RobotModel, dq: f32, tau: f32) -> f64 {
-    let stand = SimConfig {
+    let config = SimConfig {
         engine: ENGINE,
         base: BaseMount::Fixed,
         physics_hz: Some(4000),
         threads: 1,
         ..SimConfig::default()
     };
-    let [forth, back] = [1.0, -1.0].map(|sign| {
-        let mut backend = Simulator::new(robot.clone(), stand, 1).unwrap();
-        let mut placement = InitialState::at_rest(2.0, default_pose());
-        placement.dq[CALF] = sign * dq;
-        backend.reset(&[(0, placement)]).unwrap();
-        let mut command = limp();
+    let [forward, backward] = [1.0, -1.0].map(|sign| {
+        let mut backend = Simulator::new(robot.clone(), config, 1).unwrap();
+        let mut initial_state = InitialState::at_rest(2.0, default_pose());
+        initial_state.dq[CALF] = sign * dq;
+        backend.reset(&[(0, initial_state)]).unwrap();
+        let mut command = zero_gains();
         command.tau_ff[CALF] = sign * tau;
         run(&mut backend, &command, 0.02);
         f64::from(backend.states().dq[0][CALF])
     });
-    (forth - back) / 2.0
+    (forward - backward) / 2.0
 }
 
-/// Of the lone calf about its joint, with its rotor [kg·m²].
+/// Returns the moment of inertia of the calf about its joint, with its rotor [kg·m²].
 fn calf_inertia(robot: &RobotModel) -> f64 {
     let body = &robot.legs[0].bodies[2];
     body.inertia.y_axis.y + body.mass * (body.com.x.powi(2) + body.com.z.powi(2)) + robot.joints[CALF].armature
@@ -214,7 +219,7 @@ fn viscous_friction_slows_the_calf_exponentially() {
 }
 
 #[test]
-fn coulomb_friction_takes_its_torque_from_a_moving_calf() {
+fn coulomb_friction_reduces_the_torque_on_a_moving_calf() {
     let robot = lone_calf(0.0, 0.4);
     let closed_form = 2.0 + (1.0 - 0.4) * 0.02 / calf_inertia(&robot);
     let gained = calf_velocity(&robot, 2.0, 1.0);
@@ -222,42 +227,41 @@ fn coulomb_friction_takes_its_torque_from_a_moving_calf() {
 }
 
 #[test]
-fn coulomb_friction_holds_what_is_weaker() {
-    let stand = SimConfig { engine: ENGINE, base: BaseMount::Fixed, threads: 1, ..SimConfig::default() };
+fn coulomb_friction_balances_smaller_torques() {
+    let config = SimConfig { engine: ENGINE, base: BaseMount::Fixed, threads: 1, ..SimConfig::default() };
     let angle_after = |tau: f32| {
-        let mut backend = Simulator::new(lone_calf(0.0, 0.8), stand, 1).unwrap();
+        let mut backend = Simulator::new(lone_calf(0.0, 0.8), config, 1).unwrap();
         backend.reset(&[(0, InitialState::at_rest(2.0, default_pose()))]).unwrap();
-        let mut command = limp();
+        let mut command = zero_gains();
         command.tau_ff[CALF] = tau;
         run(&mut backend, &command, 1.0);
         (backend.states().q[0][CALF] - default_pose()[CALF]).abs()
     };
-    // Gravity pulls with 0.2 N·m.
+    // The torque due to gravity is 0.2 N·m.
     assert!(angle_after(0.4) < 1e-3, "moved by {} rad", angle_after(0.4));
     assert!(angle_after(1.5) > 0.5, "moved by {} rad", angle_after(1.5));
 }
 
-/// Velocities over 5 ms of flight are those of the equations of motion, integrated in double precision in steps of
-/// 10 µs.
+/// The reference integrates the equations of motion over 5 ms of flight in double precision with steps of 10 µs.
 #[test]
-fn engine_accelerates_as_the_equations_of_motion_say() {
+fn acceleration_agrees_with_the_equations_of_motion() {
     let tree = KinematicTree::<f64>::splat(&go2());
-    let placement = InitialState {
+    let initial_state = InitialState {
         base_linear_velocity: [0.3, -0.2, 1.0],
         base_angular_velocity: [1.0, 1.5, -0.8],
         dq: std::array::from_fn(|joint| (joint as f32 - 5.0) * 0.5),
         ..InitialState::at_rest(20.0, default_pose())
     };
-    let mut command = limp();
+    let mut command = zero_gains();
     command.tau_ff = std::array::from_fn(|joint| ((joint * 7 % 12) as f32 - 5.5) * 0.8);
-    let mut backend = backend(SimConfig { physics_hz: Some(4000), ..SimConfig::default() }, placement);
+    let mut backend = backend(SimConfig { physics_hz: Some(4000), ..SimConfig::default() }, initial_state);
     backend.step(&[command], &[true], 1).unwrap();
 
     let mut state = State::<f64> {
-        linear_velocity: LaneVec3(placement.base_linear_velocity.map(f64::from)),
-        angular_velocity: LaneVec3(placement.base_angular_velocity.map(f64::from)),
-        q: placement.q.map(f64::from),
-        dq: placement.dq.map(f64::from),
+        linear_velocity: LaneVec3(initial_state.base_linear_velocity.map(f64::from)),
+        angular_velocity: LaneVec3(initial_state.base_angular_velocity.map(f64::from)),
+        q: initial_state.q.map(f64::from),
+        dq: initial_state.dq.map(f64::from),
         ..State::origin()
     };
     for _ in 0..500 {
@@ -265,8 +269,8 @@ fn engine_accelerates_as_the_equations_of_motion_say() {
             forward_dynamics(&tree, &state, &command.tau_ff.map(f64::from), f64::from(GRAVITY));
         let [w, x, y, z] = state.orientation;
         let rotation = glam::DQuat::from_xyzw(x, y, z, w);
-        let push = rotation * DVec3::from(linear.0) * DT;
-        state.linear_velocity = state.linear_velocity + LaneVec3(push.to_array());
+        let velocity_change = rotation * DVec3::from(linear.0) * DT;
+        state.linear_velocity = state.linear_velocity + LaneVec3(velocity_change.to_array());
         state.angular_velocity = state.angular_velocity + angular.scaled(DT);
         let turned = rotation * glam::DQuat::from_scaled_axis(DVec3::from(state.angular_velocity.0) * DT);
         state.orientation = [turned.w, turned.x, turned.y, turned.z];
@@ -277,19 +281,19 @@ fn engine_accelerates_as_the_equations_of_motion_say() {
     }
     let states = backend.states();
     for joint in 0..NUM_JOINTS {
-        let (ours, exact) = (f64::from(states.dq[0][joint]), state.dq[joint]);
-        assert!((ours - exact).abs() < 0.01 + 0.01 * exact.abs(), "joint {joint}: {ours} and {exact} rad/s");
+        let (engine, exact) = (f64::from(states.dq[0][joint]), state.dq[joint]);
+        assert!((engine - exact).abs() < 0.01 + 0.01 * exact.abs(), "joint {joint}: {engine} and {exact} rad/s");
     }
     for axis in 0..3 {
-        let (ours, exact) = (f64::from(states.base_angular_velocity[0][axis]), state.angular_velocity.0[axis]);
-        assert!((ours - exact).abs() < 0.01, "{ours} and {exact} rad/s");
-        let (ours, exact) = (f64::from(states.base_linear_velocity[0][axis]), state.linear_velocity.0[axis]);
-        assert!((ours - exact).abs() < 0.002, "{ours} and {exact} m/s");
+        let (engine, exact) = (f64::from(states.base_angular_velocity[0][axis]), state.angular_velocity.0[axis]);
+        assert!((engine - exact).abs() < 0.01, "{engine} and {exact} rad/s");
+        let (engine, exact) = (f64::from(states.base_linear_velocity[0][axis]), state.linear_velocity.0[axis]);
+        assert!((engine - exact).abs() < 0.002, "{engine} and {exact} m/s");
     }
 }
 
 #[test]
-fn standing_robot_weighs_its_mass_and_stays_where_it_is() {
+fn foot_forces_of_a_standing_robot_equal_its_weight_and_it_does_not_drift() {
     let robot = go2();
     let mut backend = backend(SimConfig::default(), InitialState::at_rest(0.33, default_pose()));
     let stiff = Command::hold(default_pose(), 60.0, 2.0);
@@ -308,15 +312,15 @@ fn standing_robot_weighs_its_mass_and_stays_where_it_is() {
 #[test]
 fn robot_on_a_slope_slides_only_beyond_the_friction_angle() {
     let friction = go2().contact.friction as f32;
-    let slid = |angle: f32| {
+    let slip = |angle: f32| {
         let config = SimConfig { physics_hz: Some(1000), terrain: Terrain::SlopeRad(angle), ..SimConfig::default() };
-        // Crouched and stiff, so that it slides before it tips over.
+        // A stiff crouch, so that the robot slides before it tips over.
         let crouch: PerJoint = Joint::map_kinds(0.0, 1.3, -2.6);
-        let placement = InitialState {
+        let initial_state = InitialState {
             base_orientation: frames::to_wxyz(glam::Quat::from_rotation_y(-angle)),
             ..InitialState::at_rest(0.16 / angle.cos(), crouch)
         };
-        let mut backend = backend(config, placement);
+        let mut backend = backend(config, initial_state);
         let hold = Command::hold(crouch, 200.0, 5.0);
         run(&mut backend, &hold, 0.5);
         let before = Vec3::from(backend.states().base_position[0]);
@@ -324,11 +328,11 @@ fn robot_on_a_slope_slides_only_beyond_the_friction_angle() {
         (Vec3::from(backend.states().base_position[0]) - before).length()
     };
     let limit = friction.atan();
-    assert!(slid(limit - 0.1) < 0.01, "below the friction angle: {} m", slid(limit - 0.1));
-    assert!(slid(limit + 0.1) > 0.1, "above the friction angle: {} m", slid(limit + 0.1));
+    assert!(slip(limit - 0.1) < 0.01, "below the friction angle: {} m", slip(limit - 0.1));
+    assert!(slip(limit + 0.1) > 0.1, "above the friction angle: {} m", slip(limit + 0.1));
 }
 
-fn trot_hash(threads: usize) -> Vec<u32> {
+fn trot_bits(threads: usize) -> Vec<u32> {
     let robots = 7;
     let mut backend = Simulator::new(go2(), SimConfig { threads, ..SimConfig::default() }, robots).unwrap();
     for period in 0..100 {
@@ -345,12 +349,12 @@ fn trot_hash(threads: usize) -> Vec<u32> {
 }
 
 #[test]
-fn one_thread_and_two_give_the_same_bits() {
-    assert_eq!(trot_hash(1), trot_hash(2));
+fn result_is_bitwise_independent_of_the_number_of_threads() {
+    assert_eq!(trot_bits(1), trot_bits(2));
 }
 
 #[test]
-fn restored_robot_continues_bit_for_bit() {
+fn restored_robot_continues_bitwise_identically() {
     let mut backend = backend(SimConfig::default(), InitialState::at_rest(0.33, default_pose()));
     run(&mut backend, &hold_default_pose(), 0.3);
     let snapshot = backend.snapshot(0);
@@ -366,17 +370,17 @@ fn restored_robot_continues_bit_for_bit() {
 fn inactive_robot_does_not_move() {
     let mut backend = Simulator::new(go2(), SimConfig::default(), 2).unwrap();
     let before = backend.states().clone();
-    backend.step(&[limp(); 2], &[false, true], 20).unwrap();
+    backend.step(&[zero_gains(); 2], &[false, true], 20).unwrap();
     assert_eq!(backend.states().q[0], before.q[0]);
     assert_ne!(backend.states().q[1], before.q[1]);
 }
 
 #[test]
-fn payload_and_scale_show_on_the_feet() {
-    let mut placement = InitialState::at_rest(0.33, default_pose());
-    placement.randomisation.payload = 3.0;
-    placement.randomisation.mass_scale = 1.1;
-    let mut backend = backend(SimConfig::default(), placement);
+fn foot_forces_include_payload_and_mass_scale() {
+    let mut initial_state = InitialState::at_rest(0.33, default_pose());
+    initial_state.randomisation.payload = 3.0;
+    initial_state.randomisation.mass_scale = 1.1;
+    let mut backend = backend(SimConfig::default(), initial_state);
     run(&mut backend, &Command::hold(default_pose(), 80.0, 3.0), 4.0);
     let force: f32 = backend.states().foot_force[0].iter().sum();
     let weight = (go2().total_mass() as f32 * 1.1 + 3.0) * GRAVITY;

@@ -1,4 +1,4 @@
-//! `twinstep play` and `twinstep mjcf` through the real program.
+//! `twinstep play` and `twinstep mjcf` as processes.
 
 use std::path::Path;
 use std::process::{Command, Output};
@@ -11,10 +11,10 @@ use twinstep_model::{
 use twinstep_sim::{BatchBackend, Engine, SimConfig};
 use twinstep_tests::python::Programs;
 
-/// Rows of the motion at 50 Hz, four actuator periods each.
+/// Number of rows of the commands, at 50 Hz with four actuator periods each.
 const ROWS: usize = 40;
-/// The row at which the robot is placed anew.
-const ANEW: usize = 25;
+/// Row at which the second episode begins with a reset.
+const RESET_ROW: usize = 25;
 const KP: f64 = 40.0;
 
 fn twinstep(arguments: &[&str]) -> Output {
@@ -32,15 +32,15 @@ fn target(row: usize) -> PerJoint {
     std::array::from_fn(|joint| pose[joint] + 0.1 * (0.3 * row as f32 + joint as f32).sin())
 }
 
-fn motion(base: BaseMount, seconds_a_row: f64) -> Log {
+fn motion(base: BaseMount, row_period: f64) -> Log {
     let segments = vec![Segment { name: "sway".to_owned(), base }];
     let meta = Meta { kp: Some(Gain::Uniform(KP)), ..Meta::new(50.0, TorqueSensor::None, segments) };
-    let episode = |row| f64::from(u8::from(row >= ANEW));
+    let episode = |row| f64::from(u8::from(row >= RESET_ROW));
     let mut columns = vec![
-        ("t".to_owned(), (0..ROWS).map(|row| row as f64 * seconds_a_row).collect()),
+        ("t".to_owned(), (0..ROWS).map(|row| row as f64 * row_period).collect()),
         ("episode".to_owned(), (0..ROWS).map(episode).collect()),
     ];
-    // The last joint has no column, and holds its pose.
+    // The last joint has no column and holds its default pose.
     for (joint, name) in JOINT_NAMES.iter().enumerate().take(NUM_JOINTS - 1) {
         columns.push((format!("q_cmd_{name}"), (0..ROWS).map(|row| f64::from(target(row)[joint])).collect()));
     }
@@ -48,7 +48,7 @@ fn motion(base: BaseMount, seconds_a_row: f64) -> Log {
 }
 
 #[test]
-fn played_motion_is_a_log_of_what_the_model_does() {
+fn play_writes_the_log_of_the_simulated_robot() {
     let folder = tempfile::tempdir().unwrap();
     let (source, out) = (folder.path().join("sway.csv"), folder.path().join("played"));
     motion(BaseMount::Floating, 0.02).write(&source).unwrap();
@@ -65,7 +65,7 @@ fn played_motion_is_a_log_of_what_the_model_does() {
     let start = InitialState::standing_on(&Ground::FLAT, &robot, pose, 0.0);
     assert_eq!(log.rows(), ROWS);
     for row in 0..ROWS {
-        if row == 0 || row == ANEW {
+        if row == 0 || row == RESET_ROW {
             backend.reset(&[(0, start)]).unwrap();
         }
         let states = backend.states();
@@ -83,8 +83,8 @@ fn played_motion_is_a_log_of_what_the_model_does() {
             torque += f64::from(backend.states().tau[0][1]) / 4.0;
         }
         let logged = log.tau_measured("FL_thigh").unwrap()[row];
-        if row + 1 == ANEW || row + 1 == ROWS {
-            assert!(logged.is_nan(), "no interval follows the last row of a part");
+        if row + 1 == RESET_ROW || row + 1 == ROWS {
+            assert!(logged.is_nan(), "no interval follows the last row of an episode");
         } else {
             assert!((logged - torque).abs() < 1e-9, "row {row}: {logged} N·m, not {torque}");
         }
@@ -96,9 +96,9 @@ fn played_motion_is_a_log_of_what_the_model_does() {
 }
 
 #[test]
-fn flag_goes_before_the_base_of_the_motion() {
+fn base_flag_overrides_the_base_of_the_log() {
     let folder = tempfile::tempdir().unwrap();
-    let (source, out) = (folder.path().join("sway.parquet"), folder.path().join("held.parquet"));
+    let (source, out) = (folder.path().join("sway.parquet"), folder.path().join("fixed.parquet"));
     motion(BaseMount::Floating, 0.02).write(&source).unwrap();
     assert!(play(&source, &out, &["--base", "fixed"]).status.success());
     let log = Log::open(&out).unwrap();
@@ -106,18 +106,18 @@ fn flag_goes_before_the_base_of_the_motion() {
     assert!(log.channel("pos_z").is_none() && log.tau_measured("RR_calf").is_some());
 }
 
-fn check_refusal(output: &Output, message: &Expect) {
+fn check_error(output: &Output, message: &Expect) {
     assert_eq!(output.status.code(), Some(2));
     assert!(output.stdout.is_empty());
     message.assert_eq(&String::from_utf8_lossy(&output.stderr));
 }
 
 #[test]
-fn motion_between_the_periods_of_the_drive_is_refused() {
+fn rate_that_is_not_a_fraction_of_the_actuator_rate_is_rejected() {
     let folder = tempfile::tempdir().unwrap();
     let (source, out) = (folder.path().join("sway.csv"), folder.path().join("played.csv"));
     motion(BaseMount::Fixed, 0.013).write(&source).unwrap();
-    check_refusal(
+    check_error(
         &play(&source, &out, &[]),
         &expect![[r"
             error: the log's median sample period is 13.000 ms, not a whole number of the actuator's 5.000 ms within 2 %
@@ -128,7 +128,7 @@ fn motion_between_the_periods_of_the_drive_is_refused() {
 }
 
 #[test]
-fn motion_is_not_overwritten() {
+fn play_does_not_overwrite_its_input() {
     let folder = tempfile::tempdir().unwrap();
     let source = folder.path().join("sway.csv");
     motion(BaseMount::Fixed, 0.02).write(&source).unwrap();
@@ -139,8 +139,8 @@ fn motion_is_not_overwritten() {
 }
 
 #[test]
-fn rate_that_the_drive_does_not_divide_is_refused_by_name() {
-    check_refusal(
+fn physics_rate_that_is_not_a_multiple_of_the_actuator_rate_is_rejected_by_name() {
+    check_error(
         &play(Path::new("none.csv"), Path::new("out.csv"), &["--physics-hz", "500"]),
         &expect![[r"
             error: `sim.physics_hz` = 500 is not allowed: a multiple of the actuator rate, 200 Hz, up to 20000
@@ -149,8 +149,8 @@ fn rate_that_the_drive_does_not_divide_is_refused_by_name() {
 }
 
 #[test]
-fn step_of_a_mujoco_model_is_checked() {
-    check_refusal(
+fn time_step_of_a_mujoco_model_is_validated() {
+    check_error(
         &twinstep(&["mjcf", "--timestep", "5"]),
         &expect![[r"
             error: `--timestep` = 5 is not allowed: 0.00001 to 0.02 s

@@ -1,4 +1,4 @@
-//! Pictures of effects and of evaluations, through the real program.
+//! Plots of effects and of evaluations, written by the program.
 
 use std::path::Path;
 use std::process::{Command, Output};
@@ -15,46 +15,46 @@ fn twinstep(arguments: &[&str]) -> Output {
     Command::new(programs.0.join("twinstep")).args(arguments).current_dir(root()).output().unwrap()
 }
 
-/// The picture that a command writes.
-fn picture(arguments: &[&str]) -> String {
+/// Returns the plot that a command writes.
+fn plot(arguments: &[&str]) -> String {
     let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("picture.svg");
+    let path = folder.path().join("plot.svg");
     let output = twinstep(&[arguments, &["--plot", path.to_str().unwrap()]].concat());
     assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
-    assert!(!output.stdout.is_empty(), "the page is printed all the same");
+    assert!(!output.stdout.is_empty(), "the text is printed as well");
     let svg = std::fs::read_to_string(path).unwrap();
     assert!(svg.starts_with("<svg ") && svg.trim_end().ends_with("</svg>"), "{arguments:?}");
     assert!(!svg.contains("NaN") && !svg.contains("inf"), "{arguments:?}");
     svg
 }
 
-/// Points of every line in a colour, as written.
+/// Returns the `points` attribute of every polyline with this colour.
 fn lines<'a>(svg: &'a str, colour: &str) -> Vec<&'a str> {
     let of_colour = |line: &&str| line.contains("<polyline") && line.contains(&format!("stroke=\"{colour}\""));
     svg.lines().filter(of_colour).filter_map(|line| line.split("points=\"").nth(1)?.split('"').next()).collect()
 }
 
 #[test]
-fn every_effect_is_drawn_with_a_difference_that_can_be_seen() {
+fn plot_of_every_effect_has_a_visible_difference() {
     for effect in CATALOGUE {
-        let svg = picture(&["effects", effect.name]);
+        let svg = plot(&["effects", effect.name]);
         assert!(svg.contains(effect.name) && svg.contains("difference due to the effect"), "{}", effect.name);
-        // The legend's sample first, then a line in each of the three panels.
+        // The first line is the legend's sample; the others are in the three panels.
         let (without, with) = (lines(&svg, "#262626"), lines(&svg, "#F2A71B"));
         assert_eq!([without.len(), with.len()], [4, 4], "{}", effect.name);
-        // Points of the panel's y axis, over which the largest difference spans nearly all.
+        // Vertical positions of the points [half px]. The panel of the difference is scaled to the largest one.
         let heights = |line: &str| -> Vec<f64> {
             line.split_whitespace().map(|point| point.split_once(',').unwrap().1.parse().unwrap()).collect()
         };
-        let [same, other] = [without[2], with[2]].map(heights);
-        let apart = same.iter().zip(&other).map(|(one, other)| (one - other).abs()).fold(0.0, f64::max);
-        assert!(apart > 10.0, "{}: {apart} half pixels apart", effect.name);
+        let [without, with] = [without[2], with[2]].map(heights);
+        let difference = without.iter().zip(&with).map(|(one, other)| (one - other).abs()).fold(0.0, f64::max);
+        assert!(difference > 10.0, "{}: the lines differ by at most {difference} half px", effect.name);
     }
 }
 
 #[test]
-fn evaluation_is_drawn_with_every_joint_and_the_worst_one_over_time() {
-    let svg = picture(&["evaluate", LOG, "--from", "10"]);
+fn evaluation_plot_has_every_joint_and_the_worst_one_over_time() {
+    let svg = plot(&["evaluate", LOG, "--from", "10"]);
     for name in JOINT_NAMES {
         assert!(svg.contains(name), "{name}");
     }
@@ -63,7 +63,7 @@ fn evaluation_is_drawn_with_every_joint_and_the_worst_one_over_time() {
 }
 
 #[test]
-fn torque_has_bars_of_its_own_where_it_was_measured() {
+fn evaluation_plot_has_torque_errors_if_torque_was_measured() {
     let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
     let meta = Meta {
         kp: Some(Gain::Uniform(30.0)),
@@ -71,7 +71,7 @@ fn torque_has_bars_of_its_own_where_it_was_measured() {
         ..Meta::new(200.0, TorqueSensor::MotorCurrent, segments)
     };
     let column =
-        |name: &str, of: fn(f64) -> f64| (name.to_owned(), (0..50).map(|row| of(f64::from(row) * 0.005)).collect());
+        |name: &str, at: fn(f64) -> f64| (name.to_owned(), (0..50).map(|row| at(f64::from(row) * 0.005)).collect());
     let columns = [
         column("t", |t| t),
         column("q_FL_calf", |t| -1.8 + 0.1 * t),
@@ -82,19 +82,19 @@ fn torque_has_bars_of_its_own_where_it_was_measured() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("log");
     Log::new(meta, columns).unwrap().write(&path).unwrap();
-    let svg = picture(&["evaluate", path.to_str().unwrap()]);
+    let svg = plot(&["evaluate", path.to_str().unwrap()]);
     assert!(svg.contains("torque, RMSE [N·m]") && svg.contains("joint position, RMSE [rad]"));
 }
 
 #[test]
-fn place_that_cannot_be_written_is_refused_before_the_work() {
-    let nowhere = Path::new("/nowhere/picture.svg").to_str().unwrap();
+fn unwritable_plot_path_is_rejected_before_the_computation() {
+    let nowhere = Path::new("/nowhere/plot.svg").to_str().unwrap();
     for arguments in [&["effects", "armature"][..], &["evaluate", LOG]] {
         let output = twinstep(&[arguments, &["--plot", nowhere]].concat());
         assert_eq!(output.status.code(), Some(2));
         assert!(output.stdout.is_empty());
-        let told = String::from_utf8_lossy(&output.stderr);
-        assert!(told.starts_with("error: cannot write `/nowhere/picture.svg`"), "{told}");
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert!(error.starts_with("error: cannot write `/nowhere/plot.svg`"), "{error}");
     }
-    assert_eq!(twinstep(&["effects", "--plot", "list.svg"]).status.code(), Some(2), "the list has no picture");
+    assert_eq!(twinstep(&["effects", "--plot", "list.svg"]).status.code(), Some(2), "the list of effects has no plot");
 }

@@ -1,4 +1,4 @@
-//! The Python client: its lints, its types, its tests, its installation, and faults around it.
+//! The Python client: lints, types, tests, installation and fault injection.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -18,7 +18,7 @@ fn client() -> PathBuf {
     root().join("clients/python")
 }
 
-/// Runs a module of the tests' environment in the client's folder; does nothing where there is no Python.
+/// Runs a Python module in the client's folder with the test environment. Does nothing if there is no Python.
 fn check(module: &str, arguments: &[&str]) {
     let Some(python) = python(&target()).unwrap() else { return };
     let programs = Programs::beside(FAULTS).unwrap();
@@ -39,7 +39,7 @@ fn python_is_formatted_and_linted() {
 }
 
 #[test]
-fn python_types_hold() {
+fn python_types_are_correct() {
     let python = target().join("python/bin/python");
     check("pyright", &["--pythonpath", python.to_str().unwrap()]);
 }
@@ -50,10 +50,10 @@ fn python_tests_pass() {
 }
 
 #[test]
-fn python_client_survives_faults() {
+fn python_client_continues_after_every_fault() {
     let Some(python) = python(&target()).unwrap() else { return };
     let script = client().join("tests/fault_client.py");
-    // The lanes' processes inherit it.
+    // `env` sets the variable for the client only, not for the other processes of the test bed.
     let program = vec!["env".to_owned(), format!("PYTHONPATH={}", client().join("src").display())];
     let client = [program, vec![python.display().to_string(), script.display().to_string()]].concat();
     let plan = FaultPlan {
@@ -75,7 +75,7 @@ fn package_installs_into_an_empty_environment_and_steps() {
     run(Command::new(&python).args(["-m", "venv"]).arg(&venv)).unwrap();
     let empty = venv.join("bin/python");
     let install = ["-m", "pip", "install", "--quiet", "--no-deps"];
-    // Its dependencies are the tests' own; what is tried is the wheel and the program in it.
+    // The dependencies come from the test environment: only the wheel and the program in it are tested.
     run(outside_cargo(&mut Command::new(&empty)).args(install).arg(client()).env("CARGO_TARGET_DIR", target()))
         .unwrap();
     let site = run(Command::new(&python).args(["-c", "import site; print(site.getsitepackages()[0])"])).unwrap();

@@ -1,4 +1,4 @@
-//! Robots drawn from the intervals of a model file, in both engines and through the server.
+//! Domain randomisation from the intervals of a model file, in both engines and on the server.
 
 use std::path::PathBuf;
 use std::process::Command;
@@ -16,7 +16,7 @@ use twinstep_tests::python::Programs;
 
 use crate::remote;
 
-/// Effects of actuator, joint, body, ground and sensor.
+/// Effects of actuator, joint, body, ground and sensor, with intervals.
 const MEASURED: &str = "
 [[effect]]
 name = \"command_delay\"
@@ -45,7 +45,7 @@ bias_rad_s = [0.0, 0.0, 0.0]
 interval = { bias_rad_s = [[-0.1, -0.1, -0.1], [0.1, 0.1, 0.1]] }
 ";
 
-/// A model file with MEASURED, and without its intervals.
+/// Writes a model file with [`MEASURED`], with or without its intervals.
 fn model(name: &str, intervals: bool) -> (TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(name);
@@ -54,7 +54,7 @@ fn model(name: &str, intervals: bool) -> (TempDir, PathBuf) {
     (folder, path)
 }
 
-/// Robots that differ by nothing but what is drawn from the model file.
+/// Returns a configuration in which robots differ only by the values sampled from the model file.
 fn config(engine: Engine, model: &std::path::Path, effects: bool) -> Config {
     let mut config = remote::config(TaskName::Walk);
     config.sim.engine = engine;
@@ -68,7 +68,7 @@ fn config(engine: Engine, model: &std::path::Path, effects: bool) -> Config {
     config
 }
 
-/// Observations of `envs` environments, row by row: after a reset with seeds from `seed` and after each of some steps.
+/// Returns the observations of `env` after the reset and after each of ten steps.
 fn episode(env: &mut dyn VecEnv, request: &ResetRequest) -> Vec<Vec<f32>> {
     let mut rows = vec![env.reset(request).unwrap().to_vec()];
     for step in 0..10 {
@@ -87,7 +87,7 @@ fn robot(rows: &[Vec<f32>], env: usize) -> Vec<&[f32]> {
 }
 
 #[test]
-fn each_robot_and_episode_has_its_own_effects_and_seeds_repeat_them() {
+fn effects_are_sampled_per_robot_and_episode_and_reproduced_by_seeds() {
     let (_folder, path) = model("measured.toml", true);
     for engine in [Engine::Rapier, Engine::Batch] {
         let run = |effects: bool, envs: usize, seed: u64| {
@@ -96,23 +96,23 @@ fn each_robot_and_episode_has_its_own_effects_and_seeds_repeat_them() {
             (first, episode(&mut *env, &ResetRequest::default()))
         };
         let (nominal, _) = run(false, 2, 7);
-        assert_eq!(robot(&nominal, 0), robot(&nominal, 1), "{engine:?}: nothing else varies");
+        assert_eq!(robot(&nominal, 0), robot(&nominal, 1), "{engine:?}: without randomisation");
         let (first, second) = run(true, 2, 7);
         assert_ne!(robot(&first, 0), robot(&first, 1), "{engine:?}: two robots");
         assert_ne!(robot(&first, 0), robot(&second, 0), "{engine:?}: two episodes");
         assert_eq!(run(true, 2, 7), (first.clone(), second), "{engine:?}: the same seeds");
         let (alone, _) = run(true, 1, 8);
-        assert_eq!(robot(&alone, 0), robot(&first, 1), "{engine:?}: row 1 is the single environment of its seed");
+        assert_eq!(robot(&alone, 0), robot(&first, 1), "{engine:?}: row 1 equals the single environment with its seed");
     }
 }
 
 #[test]
-fn model_without_intervals_is_the_same_to_the_last_bit() {
-    let (_folder, path) = model("told.toml", false);
+fn randomisation_without_intervals_is_bitwise_identical_to_none() {
+    let (_folder, path) = model("without_intervals.toml", false);
     for engine in [Engine::Rapier, Engine::Batch] {
         let [without, with] = [false, true].map(|effects| {
             let mut config = config(engine, &path, effects);
-            // What else is drawn is not shifted.
+            // Other random quantities must not change either.
             config.task.reset_joint_noise_rad = 0.1;
             config.randomise.mass_scale = [0.9, 1.1];
             episode(&mut *local(&config, 2), &ResetRequest::seeded(3, 2))
@@ -122,7 +122,7 @@ fn model_without_intervals_is_the_same_to_the_last_bit() {
 }
 
 #[test]
-fn server_process_draws_effects_as_its_config_or_its_flag_says() {
+fn server_process_randomises_effects_by_configuration_or_by_flag() {
     let (folder, path) = model("measured.toml", true);
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
     for (engine, flag) in [(Engine::Rapier, false), (Engine::Batch, true)] {
@@ -142,7 +142,7 @@ fn server_process_draws_effects_as_its_config_or_its_flag_says() {
 }
 
 #[test]
-fn intervals_that_are_of_hardly_any_robot_are_bad_input() {
+fn intervals_that_rarely_give_a_valid_robot_are_rejected() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("late.toml");
     let delay = |name: &str| {
@@ -159,7 +159,7 @@ fn intervals_that_are_of_hardly_any_robot_are_bad_input() {
     assert!(error.contains("`randomise.effects`") && error.contains("0.04 s"), "{error}");
 }
 
-/// A second on the feet, after whatever was before.
+/// Simulates one second of sway from the current state.
 fn sway(backend: &mut impl Backend) -> (Vec<[f32; 12]>, [f32; 3], [f32; 3]) {
     let pose = go2().control.default_pose_f32();
     let mut rows = Vec::new();
@@ -171,27 +171,27 @@ fn sway(backend: &mut impl Backend) -> (Vec<[f32; 12]>, [f32; 3], [f32; 3]) {
     (rows, backend.states().base_position[0], backend.states().base_angular_velocity[0])
 }
 
-fn check_robot_of_its_own<B: Backend>(of: impl Fn(RobotModel) -> B) {
-    let drawn = twinstep_effects::parse_robot(&format!("robot = \"go2\"\n{MEASURED}"), "drawn").unwrap();
-    let placement = InitialState::at_rest(0.34, go2().control.default_pose_f32());
-    let mut all = of(drawn.clone());
-    all.reset(&[(0, placement)]).unwrap();
-    let expected = sway(&mut all);
+fn check_reset_with_model<B: Backend>(new_backend: impl Fn(RobotModel) -> B) {
+    let sampled = twinstep_effects::parse_robot(&format!("robot = \"go2\"\n{MEASURED}"), "sampled").unwrap();
+    let initial_state = InitialState::at_rest(0.34, go2().control.default_pose_f32());
+    let mut reference = new_backend(sampled.clone());
+    reference.reset(&[(0, initial_state)]).unwrap();
+    let expected = sway(&mut reference);
 
-    let mut backend = of(go2());
-    backend.reset_with_model(0, &drawn, &placement).unwrap();
+    let mut backend = new_backend(go2());
+    backend.reset_with_model(0, &sampled, &initial_state).unwrap();
     let start = backend.snapshot(0);
-    assert!(sway(&mut backend) == expected, "it moves as if all robots were so");
-    backend.reset(&[(0, placement)]).unwrap();
-    assert!(sway(&mut backend) != expected, "the nominal robot is back");
+    assert!(sway(&mut backend) == expected, "the motion equals that of a backend built with this model");
+    backend.reset(&[(0, initial_state)]).unwrap();
+    assert!(sway(&mut backend) != expected, "a plain reset restores the nominal model");
     backend.restore(0, &start);
-    assert!(sway(&mut backend) == expected, "a snapshot holds the robot too");
-    assert!(backend.reset_with_model(1, &drawn, &placement).is_err(), "there is one robot");
+    assert!(sway(&mut backend) == expected, "a snapshot includes the model");
+    assert!(backend.reset_with_model(1, &sampled, &initial_state).is_err(), "the backend has one robot");
 }
 
 #[test]
-fn robot_of_its_own_moves_in_its_own_way() {
+fn reset_with_model_changes_the_model_of_one_robot() {
     let sim = SimConfig { threads: 1, ..SimConfig::default() };
-    check_robot_of_its_own(|robot| BatchBackend::new(robot, sim, 1).unwrap());
-    check_robot_of_its_own(|robot| RapierBackend::new(robot, SimConfig { engine: Engine::Rapier, ..sim }, 1).unwrap());
+    check_reset_with_model(|robot| BatchBackend::new(robot, sim, 1).unwrap());
+    check_reset_with_model(|robot| RapierBackend::new(robot, SimConfig { engine: Engine::Rapier, ..sim }, 1).unwrap());
 }

@@ -1,4 +1,4 @@
-//! The rapier engine against physics.
+//! Comparison of the rapier engine with closed forms and conservation laws.
 
 use twinstep_sim::{Engine, RapierBackend as Simulator};
 

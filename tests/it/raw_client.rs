@@ -1,4 +1,4 @@
-//! A client without the client library: any bytes at any key, and every reply is seen.
+//! A client without the client library. It sends any bytes to any key and returns every reply.
 
 use std::time::Duration;
 
@@ -15,10 +15,10 @@ use zenoh::liveliness::LivelinessToken;
 use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 use zenoh::{Session, Wait};
 
-/// The bytes of a good reply, or the error that was replied.
+/// Payload of a successful reply, or the error reply.
 pub type Answer = Result<Vec<u8>, ErrorReply>;
 
-/// A session at one server.
+/// A Zenoh session with one server.
 pub struct RawClient {
     session: Session,
     pub sid: String,
@@ -28,7 +28,7 @@ pub struct RawClient {
 }
 
 impl RawClient {
-    /// Connects to the server `sid` and declares the client's token.
+    /// Connects to the server `sid` and declares the client's liveliness token.
     pub fn connect(endpoint: &str, sid: &str, client: &str) -> Self {
         let mut this = Self::without_token(endpoint, sid, client);
         let key = keys::live_client(sid, client);
@@ -36,7 +36,7 @@ impl RawClient {
         this
     }
 
-    /// Connects to the server `sid` as a client that nobody sees.
+    /// Connects to the server `sid` without a liveliness token.
     pub fn without_token(endpoint: &str, sid: &str, client: &str) -> Self {
         let mut config = zenoh::Config::default();
         let endpoints = format!("[\"{endpoint}\"]");
@@ -53,19 +53,19 @@ impl RawClient {
         Self { session, sid, client, token: None, query_timeout: Duration::from_secs(5) }
     }
 
-    /// Ends as a crashed client does, without closing its lease.
+    /// Closes the session without closing the lease, like a crashed client.
     pub fn vanish(self) {
         self.session.close().wait().unwrap();
     }
 
-    /// True while the server's other clients see the token of `client`.
+    /// Returns true if the liveliness token of `client` is visible.
     pub fn sees(&self, client: &str) -> bool {
         let key = keys::live_client(&self.sid, client);
         let replies = self.session.liveliness().get(key).timeout(self.query_timeout).wait().unwrap();
         replies.recv().is_ok()
     }
 
-    /// Sends a query without waiting.
+    /// Sends a query without waiting for its reply.
     pub fn send(&self, key: &str, payload: &[u8]) -> FifoChannelHandler<Reply> {
         self.session
             .get(key)
@@ -77,7 +77,7 @@ impl RawClient {
             .unwrap()
     }
 
-    /// Asks, and fails unless there is exactly one reply, good or a typed error.
+    /// Sends a query and returns its reply. Panics unless there is exactly one successful reply or typed error.
     pub fn ask(&self, key: &str, payload: &[u8]) -> Answer {
         only_reply(&self.send(key, payload), key)
     }
@@ -129,7 +129,7 @@ impl RawClient {
     }
 }
 
-/// The one reply to a query at `key`.
+/// Returns the only reply to a query at `key`. Panics if there is none or more than one.
 pub fn only_reply(replies: &FifoChannelHandler<Reply>, key: &str) -> Answer {
     let mut replies: Vec<Reply> = std::iter::from_fn(|| replies.recv().ok()).collect();
     assert_eq!(replies.len(), 1, "replies at {key}: {replies:?}");
@@ -137,33 +137,33 @@ pub fn only_reply(replies: &FifoChannelHandler<Reply>, key: &str) -> Answer {
         Ok(sample) => Ok(sample.payload().to_bytes().into_owned()),
         Err(error) => {
             let bytes = error.payload().to_bytes();
-            Err(decode(&bytes).unwrap_or_else(|_| panic!("{key}: {} is no typed error", bytes.escape_ascii())))
+            Err(decode(&bytes).unwrap_or_else(|_| panic!("{key}: {} is not a typed error", bytes.escape_ascii())))
         }
     }
 }
 
-/// A reset of everything.
+/// Encodes a reset of all environments.
 pub fn reset_bytes(lease: &LeaseReply, seq: u64) -> Vec<u8> {
     encode(&ResetRequest { protocol: PROTOCOL, epoch: lease.epoch, seq, seeds: None, mask: None })
 }
 
-/// A step with the actions 0.5.
+/// Encodes a step with all actions 0.5.
 pub fn step_bytes(lease: &LeaseReply, seq: u64) -> Vec<u8> {
     step_with(lease, seq, &vec![0.5; lease.num_envs as usize * lease.spec.action_len()])
 }
 
-/// A step with these actions, whatever their number.
+/// Encodes a step with these actions, of any length.
 pub fn step_with(lease: &LeaseReply, seq: u64, actions: &[f32]) -> Vec<u8> {
     encode(&StepRequest { protocol: PROTOCOL, epoch: lease.epoch, seq, actions: as_bytes(actions) })
 }
 
-/// Steps that the first environment of the task `counter` has executed in its life, from a step's reply.
+/// Returns the total number of steps of the first environment of the task `counter`, from a step reply.
 pub fn steps_in(step: &[u8]) -> f32 {
     let reply: StepReply<'_> = decode(step).unwrap();
     tensor::read::<f32>(reply.obs, "obs").unwrap()[0]
 }
 
-/// Resets that the first environment of the task `counter` has executed in its life, from a reset's reply.
+/// Returns the total number of resets of the first environment of the task `counter`, from a reset reply.
 pub fn resets_in(reset: &[u8]) -> f32 {
     let reply: ResetReply<'_> = decode(reset).unwrap();
     tensor::read::<f32>(reply.obs, "obs").unwrap()[1]

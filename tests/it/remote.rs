@@ -1,4 +1,4 @@
-//! The server and its client in one process, over a real Zenoh link on loopback.
+//! The server and its client in one process, over a Zenoh link on loopback.
 
 use std::sync::Arc;
 
@@ -28,10 +28,10 @@ pub fn start_with(config: &Config, host: Arc<dyn EnvFactory>) -> (Server, String
     (server, endpoint)
 }
 
-fn refusal(error: &EnvError) -> ErrorCode {
+fn rejection(error: &EnvError) -> ErrorCode {
     let EnvError::Remote(error) = error else { panic!("{error}") };
     match error.downcast_ref::<ClientError>() {
-        Some(ClientError::Rejected(refusal)) => refusal.code,
+        Some(ClientError::Rejected(rejection)) => rejection.code,
         other => panic!("{other:?}"),
     }
 }
@@ -60,7 +60,7 @@ fn walk_on_the_batch_engine_passes_the_checker() {
 }
 
 #[test]
-fn remote_and_local_walk_give_the_same_bits() {
+fn remote_and_local_walk_are_bitwise_identical() {
     let config = config(TaskName::Walk);
     let (server, endpoint) = start(&config);
     let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
@@ -75,7 +75,7 @@ fn remote_and_local_walk_give_the_same_bits() {
 }
 
 #[test]
-fn several_clients_have_their_own_environments() {
+fn concurrent_clients_have_separate_environments() {
     let (server, endpoint) = start(&config(TaskName::Counter));
     let clients: Vec<_> = (1..4usize)
         .map(|num_envs| {
@@ -83,11 +83,11 @@ fn several_clients_have_their_own_environments() {
             std::thread::spawn(move || {
                 let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, num_envs)).unwrap();
                 env.reset(&ResetRequest::default()).unwrap();
-                let mut own = vec![Counter { resets: 1, ..Counter::default() }; num_envs];
+                let mut expected = vec![Counter { resets: 1, ..Counter::default() }; num_envs];
                 for step in 0..200 {
                     let actions: Vec<f32> = (0..12 * num_envs).map(|index| (step + index * num_envs) as f32).collect();
                     let batch = env.step(&actions).unwrap();
-                    for (index, counter) in own.iter_mut().enumerate() {
+                    for (index, counter) in expected.iter_mut().enumerate() {
                         counter.step(&actions[12 * index..12 * (index + 1)]);
                         assert_eq!(batch.obs[index * OBS_LEN..][..4], counter.observation());
                     }
@@ -116,22 +116,22 @@ fn overlapped_steps_are_executed_once_each() {
 }
 
 #[test]
-fn bad_input_is_refused_by_name_and_the_next_good_step_works() {
+fn bad_input_is_rejected_by_name_and_the_next_valid_step_succeeds() {
     let (server, endpoint) = start(&config(TaskName::Walk));
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
-    assert_eq!(refusal(&env.step(&[0.0; 24]).unwrap_err()), ErrorCode::NeedsReset);
+    assert_eq!(rejection(&env.step(&[0.0; 24]).unwrap_err()), ErrorCode::NeedsReset);
     env.reset(&ResetRequest::seeded(1, 2)).unwrap();
     let mut actions = [0.0; 24];
     actions[13] = f32::NAN;
     let error = env.step(&actions).unwrap_err();
-    assert_eq!(refusal(&error), ErrorCode::NotFinite);
-    assert!(error.to_string().contains("environment 1, joint_position_offset[FL_thigh], is NaN"), "{error}");
+    assert_eq!(rejection(&error), ErrorCode::NotFinite);
+    assert!(error.to_string().contains("environment 1: joint_position_offset[FL_thigh] is NaN"), "{error}");
     assert!(env.step(&[0.0; 24]).is_ok());
     server.shutdown();
 }
 
 #[test]
-fn more_environments_than_there_are_are_refused_with_both_numbers() {
+fn request_for_too_many_environments_is_rejected_with_both_numbers() {
     let (server, endpoint) = start(&config(TaskName::Walk));
     for num_envs in [65, 1_000_000_000] {
         let error = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, num_envs)).err().unwrap().to_string();
@@ -142,7 +142,7 @@ fn more_environments_than_there_are_are_refused_with_both_numbers() {
 }
 
 #[test]
-fn policy_made_for_another_robot_is_refused() {
+fn spec_hash_of_another_robot_is_rejected() {
     let (server, endpoint) = start(&config(TaskName::Walk));
     let options = ConnectOptions { spec_hash: Some("0".repeat(32)), ..ConnectOptions::new(&endpoint, 1) };
     let Some(ClientError::Rejected(error)) = RemoteVecEnv::connect(&options).err() else { panic!("accepted") };
@@ -151,21 +151,21 @@ fn policy_made_for_another_robot_is_refused() {
 }
 
 #[test]
-fn lease_is_reclaimed_with_its_number_and_the_old_client_is_told() {
+fn reclaimed_lease_continues_and_the_old_client_is_rejected() {
     let (server, endpoint) = start(&config(TaskName::Counter));
     let options = ConnectOptions::new(&endpoint, 1);
     let mut first = RemoteVecEnv::connect(&options).unwrap();
     first.reset(&ResetRequest::default()).unwrap();
     first.step(&[1.0; 12]).unwrap();
     let mut second = RemoteVecEnv::reclaim(&options, first.ticket()).unwrap();
-    assert_eq!(second.step(&[2.0; 12]).unwrap().obs[0], 2.0, "it continues where the first was");
-    assert_eq!(refusal(&first.step(&[3.0; 12]).unwrap_err()), ErrorCode::StaleEpoch);
-    assert_eq!(second.step(&[4.0; 12]).unwrap().obs[0], 3.0, "the old client executed nothing");
+    assert_eq!(second.step(&[2.0; 12]).unwrap().obs[0], 2.0, "it continues from the state of the first client");
+    assert_eq!(rejection(&first.step(&[3.0; 12]).unwrap_err()), ErrorCode::StaleEpoch);
+    assert_eq!(second.step(&[4.0; 12]).unwrap().obs[0], 3.0, "the rejected step was not executed");
     server.shutdown();
 }
 
 #[test]
-fn nobody_at_the_endpoint_is_said_with_the_command_to_start_one() {
+fn error_without_a_server_names_the_command_to_start_one() {
     let mut options = ConnectOptions::new("tcp/127.0.0.1:9", 1);
     options.connect_timeout = std::time::Duration::from_millis(300);
     let error = RemoteVecEnv::connect(&options).err().unwrap().to_string();
@@ -173,7 +173,7 @@ fn nobody_at_the_endpoint_is_said_with_the_command_to_start_one() {
     assert!(error.contains("no program accepts connections there: start a server with `twinstep serve"), "{error}");
 }
 
-/// A host whose environments panic at their third step.
+/// A factory of environments that panic in their third step.
 pub struct FailingEnvFactory;
 
 struct FragileEnv(Box<dyn VecEnv>, u32);
@@ -211,7 +211,7 @@ impl VecEnv for FragileEnv {
 }
 
 #[test]
-fn panic_in_an_environment_is_answered_and_the_server_lives_on() {
+fn panic_in_an_environment_gets_an_error_reply_and_the_server_continues() {
     let (server, endpoint) = start_with(&config(TaskName::Counter), Arc::new(FailingEnvFactory));
     let options = ConnectOptions::new(&endpoint, 1);
     let mut env = RemoteVecEnv::connect(&options).unwrap();
@@ -220,7 +220,7 @@ fn panic_in_an_environment_is_answered_and_the_server_lives_on() {
     env.step(&[0.0; 12]).unwrap();
     for _ in 0..2 {
         let error = env.step(&[0.0; 12]).unwrap_err();
-        assert_eq!(refusal(&error), ErrorCode::LeaseLost);
+        assert_eq!(rejection(&error), ErrorCode::LeaseLost);
         assert!(error.to_string().contains("planted in the third step"), "{error}");
     }
     let mut other = RemoteVecEnv::connect(&options).unwrap();
@@ -229,7 +229,7 @@ fn panic_in_an_environment_is_answered_and_the_server_lives_on() {
 }
 
 #[test]
-fn stopping_server_tells_its_client() {
+fn client_of_a_stopping_server_receives_an_error() {
     let (server, endpoint) = start(&config(TaskName::Counter));
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 1)).unwrap();
     env.reset(&ResetRequest::default()).unwrap();

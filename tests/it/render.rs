@@ -1,4 +1,4 @@
-//! What is sent for a picture is what the simulation has, and asking for it changes nothing.
+//! Rendering: a remote scene equals the simulated one, and requesting it does not change the episode.
 
 use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{EnvFactory, SimEnvFactory};
@@ -17,23 +17,24 @@ fn render(client: &RawClient, lease: &LeaseReply, env: u64) -> Answer {
 }
 
 #[test]
-fn remote_and_local_scenes_are_equal_and_drawing_changes_no_bit_of_the_episode() {
+fn remote_and_local_scenes_are_equal_and_rendering_does_not_change_the_episode() {
     let config = config(TaskName::Walk);
     let (server, endpoint) = start(&config);
     let host = SimEnvFactory::new(config).unwrap();
     let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
     let mut local = host.build(2, AutoresetMode::NextStep, None).unwrap();
-    let mut unseen = host.build(2, AutoresetMode::NextStep, None).unwrap();
+    let mut unrendered = host.build(2, AutoresetMode::NextStep, None).unwrap();
     let request = ResetRequest::seeded(5, 2);
     remote.reset(&request).unwrap();
-    assert_eq!(local.reset(&request).unwrap(), unseen.reset(&request).unwrap());
+    assert_eq!(local.reset(&request).unwrap(), unrendered.reset(&request).unwrap());
     for step in 0..20 {
         for env in 0..2 {
             assert_eq!(remote.scene(env).unwrap(), local.scene(env).unwrap(), "step {step}, environment {env}");
         }
         let actions: Vec<f32> = (0..24).map(|index| ((step * 7 + index) as f32).sin()).collect();
-        let unseen = unseen.step(&actions).unwrap();
-        assert_eq!((remote.step(&actions).unwrap(), local.step(&actions).unwrap()), (unseen, unseen), "step {step}");
+        let expected = unrendered.step(&actions).unwrap();
+        assert_eq!(remote.step(&actions).unwrap(), expected, "step {step}");
+        assert_eq!(local.step(&actions).unwrap(), expected, "step {step}");
     }
     assert_ne!(remote.scene(0).unwrap().pose, remote.scene(1).unwrap().pose);
     remote.send(&[0.0; 24]).unwrap();
@@ -44,7 +45,7 @@ fn remote_and_local_scenes_are_equal_and_drawing_changes_no_bit_of_the_episode()
 }
 
 #[test]
-fn scene_has_the_ground_that_is_simulated() {
+fn scene_has_the_simulated_ground() {
     let mut config = config(TaskName::Walk);
     config.sim.terrain = Terrain::SlopeRad(0.2);
     let mut env = SimEnvFactory::new(config).unwrap().build(1, AutoresetMode::NextStep, None).unwrap();
@@ -54,7 +55,7 @@ fn scene_has_the_ground_that_is_simulated() {
 }
 
 #[test]
-fn render_is_refused_by_name_and_uses_no_number_up() {
+fn invalid_render_is_rejected_by_name_and_consumes_no_sequence_number() {
     let (server, endpoint) = start(&config(TaskName::Walk));
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
     let lease = client.lease(2);
@@ -75,14 +76,14 @@ fn render_is_refused_by_name_and_uses_no_number_up() {
 }
 
 #[test]
-fn counter_has_nothing_to_draw() {
+fn counter_cannot_be_rendered() {
     let (server, endpoint) = start(&config(TaskName::Counter));
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 1)).unwrap();
     env.reset(&ResetRequest::default()).unwrap();
-    let EnvError::Remote(error) = env.scene(0).unwrap_err() else { panic!("the server refused it") };
-    let Some(ClientError::Rejected(refusal)) = error.downcast_ref() else { panic!("{error}") };
+    let EnvError::Remote(error) = env.scene(0).unwrap_err() else { panic!("not an error of the server") };
+    let Some(ClientError::Rejected(rejection)) = error.downcast_ref() else { panic!("{error}") };
     assert_eq!(
-        (refusal.code, refusal.message.as_str()),
+        (rejection.code, rejection.message.as_str()),
         (ErrorCode::UnknownKey, "the task `counter` cannot be rendered")
     );
     env.step(&[0.0; 12]).unwrap();

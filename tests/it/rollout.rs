@@ -1,4 +1,4 @@
-//! Rollouts in the batch engine: a job is the same alone and among others, and goes on from a past.
+//! Rollouts in the batch engine: a request is independent of the others and can continue from a history.
 
 use twinstep_effects::{EffectEntry, apply_effects};
 use twinstep_model::{
@@ -7,19 +7,19 @@ use twinstep_model::{
 use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_tests::ground_truth_robot::effect;
 
-/// More than one register of either precision, and no whole number of them.
+/// Number of requests: more than one SIMD register of either precision, and not a multiple of a register.
 const JOBS: usize = 21;
-/// The job whose command is no number, from the third actuator period on.
+/// Index of the request with NaN commands from the third actuator period on.
 const BROKEN: usize = 5;
 
-/// Every other robot has a delay, so that it remembers commands.
+/// Returns robot `index`. Every second one has a command delay, and thus a state.
 fn robot(index: usize) -> RobotModel {
     let (effect, scope) = effect("command_delay", "all");
     let delay = 0.002 * (index % 2) as f64;
     apply_effects(&go2(), &[EffectEntry::new(effect, scope, vec![delay]).unwrap()]).unwrap()
 }
 
-/// 3 to 60 actuator periods, no neighbours alike.
+/// Returns the commands of request `index`, 3 to 60 actuator periods. Consecutive requests differ in length.
 fn commands(index: usize) -> Vec<Command> {
     let pose = go2().control.default_pose_f32();
     let command = |period: usize| {
@@ -33,7 +33,7 @@ fn commands(index: usize) -> Vec<Command> {
 }
 
 #[test]
-fn a_job_is_the_same_alone_and_among_others_of_other_lengths() {
+fn request_is_independent_of_other_requests_and_their_lengths() {
     let robots: Vec<_> = (0..JOBS).map(robot).collect();
     let commands: Vec<_> = (0..JOBS).map(commands).collect();
     let start = |index: usize| InitialState::at_rest(0.3 + 0.005 * index as f32, go2().control.default_pose_f32());
@@ -58,14 +58,14 @@ fn a_job_is_the_same_alone_and_among_others_of_other_lengths() {
                 continue;
             }
             let alone: RobotStates = simulator.run(&jobs[index..=index], precision).remove(0);
-            assert_eq!(*states, alone, "job {index} in {precision:?}");
+            assert_eq!(*states, alone, "request {index}, {precision:?}");
             assert!(diverged.iter().all(|diverged| !diverged));
         }
     }
 }
 
 #[test]
-fn a_job_with_a_past_goes_on_as_if_it_had_never_ended() {
+fn request_with_a_history_continues_an_earlier_rollout() {
     let entries = [("torque_delay", 0.008), ("command_delay", 0.006), ("drive_lag", 0.005), ("encoder_offset", 0.02)]
         .map(|(name, value)| {
             let (effect, scope) = effect(name, "all");
@@ -76,21 +76,21 @@ fn a_job_with_a_past_goes_on_as_if_it_had_never_ended() {
     let command = |period: usize| Command::hold(pose.map(|q| q + 0.2 * (0.2 * period as f32).sin()), 30.0, 0.75);
     let commands: Vec<_> = (0..90).map(command).collect();
     let mut simulator = BatchRollout::new(&go2(), &SimConfig { threads: 1, ..SimConfig::default() }).unwrap();
-    let mut play = |start: InitialState, past: &[HistoryStep], commands: &[Command]| {
-        let job = RolloutRequest { robot: &robot, base: BaseMount::Fixed, start, history: past, commands };
+    let mut simulate = |start: InitialState, history: &[HistoryStep], commands: &[Command]| {
+        let job = RolloutRequest { robot: &robot, base: BaseMount::Fixed, start, history, commands };
         simulator.run(&[job], Precision::Double).remove(0)
     };
-    let whole = play(InitialState::at_rest(1.0, pose), &[], &commands);
+    let whole = simulate(InitialState::at_rest(1.0, pose), &[], &commands);
     let now = 50;
     let start = InitialState { q: whole.q[now], dq: whole.dq[now], ..InitialState::at_rest(1.0, pose) };
-    let past: Vec<_> = (now - 8..now)
+    let history: Vec<_> = (now - 8..now)
         .map(|period| HistoryStep { command: commands[period], q: whole.q[period], dq: whole.dq[period] })
         .collect();
-    let mut error = |past: &[HistoryStep]| {
-        let states = play(start, past, &commands[now..]);
+    let mut error = |history: &[HistoryStep]| {
+        let states = simulate(start, history, &commands[now..]);
         let pairs = states.q.iter().flatten().zip(whole.q[now..].iter().flatten());
         pairs.map(|(one, other)| (one - other).abs()).fold(0.0, f32::max)
     };
-    let [with, without] = [error(&past), error(&[])];
-    assert!(with < 0.02 * without, "{with} rad with its past, {without} rad without");
+    let [with, without] = [error(&history), error(&[])];
+    assert!(with < 0.02 * without, "{with} rad with its history, {without} rad without");
 }

@@ -1,4 +1,4 @@
-//! The shipped security files: who gets in, who does not, and what those are told.
+//! The shipped security files: which clients are accepted, which are rejected, and with which errors.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -10,7 +10,9 @@ use twinstep_envs::TaskName;
 use twinstep_model::{ResetRequest, VecEnv};
 use twinstep_tests::security::SecurityFolder;
 
-/// A server with the Zenoh configuration `zenoh` and a lease grace of 0: a client it does not see loses its environments.
+/// Starts a server with the Zenoh configuration `zenoh` and a lease grace period of 0.
+///
+/// A client whose liveliness token is not visible to the server then loses its environments.
 fn serve(protocol: &str, zenoh: &Path) -> (Server, String) {
     let mut config = Config::default();
     config.task.name = TaskName::Counter;
@@ -27,7 +29,7 @@ fn connect(endpoint: &str, zenoh: Option<PathBuf>) -> Result<RemoteVecEnv, Clien
     RemoteVecEnv::connect(&ConnectOptions { zenoh, connect_timeout, ..ConnectOptions::new(endpoint, 4) })
 }
 
-/// Connects, steps for longer than the server takes to free what it thinks is lost, and closes.
+/// Connects, steps for longer than the server needs to expire the lease of a lost client, and closes.
 fn steps(endpoint: &str, zenoh: Option<PathBuf>) {
     let mut env = connect(endpoint, zenoh).unwrap();
     env.reset(&ResetRequest::default()).unwrap();
@@ -40,14 +42,14 @@ fn steps(endpoint: &str, zenoh: Option<PathBuf>) {
     env.close().unwrap();
 }
 
-fn refused(endpoint: &str, zenoh: Option<PathBuf>) -> String {
-    let error = connect(endpoint, zenoh).err().expect("refused");
+fn rejected(endpoint: &str, zenoh: Option<PathBuf>) -> String {
+    let error = connect(endpoint, zenoh).err().expect("rejected");
     assert!(matches!(error, ClientError::NoServer { .. }), "{error:?}");
     error.to_string()
 }
 
 #[test]
-fn user_with_the_password_steps() {
+fn user_with_the_password_is_accepted() {
     let folder = SecurityFolder::new().unwrap();
     let (server, endpoint) = serve("tcp", &folder.path("server-users.json5"));
     steps(&endpoint, Some(folder.path("client-user.json5")));
@@ -55,27 +57,27 @@ fn user_with_the_password_steps() {
 }
 
 #[test]
-fn wrong_password_unknown_user_and_no_password_are_refused() {
+fn wrong_password_unknown_user_and_no_password_are_rejected() {
     let folder = SecurityFolder::new().unwrap();
     let (server, endpoint) = serve("tcp", &folder.path("server-users.json5"));
     let wrong_password = folder.edited("client-user.json5", "change-me-1", "change-me-2").unwrap();
-    let text = refused(&endpoint, Some(wrong_password));
-    for said in [
+    let text = rejected(&endpoint, Some(wrong_password));
+    for part in [
         "no server answers at tcp/127.0.0.1:",
         "not a Zenoh server, or it rejects this client",
         "twinstep serve --zenoh",
         "TWINSTEP_LOG",
     ] {
-        assert!(text.contains(said), "{text}");
+        assert!(text.contains(part), "{text}");
     }
     assert!(!text.contains(".rs:"), "{text}");
-    refused(&endpoint, Some(folder.edited("client-user.json5", "alice", "mallory").unwrap()));
-    refused(&endpoint, None);
+    rejected(&endpoint, Some(folder.edited("client-user.json5", "alice", "mallory").unwrap()));
+    rejected(&endpoint, None);
     server.shutdown();
 }
 
 #[test]
-fn user_file_without_users_does_not_open_the_server() {
+fn server_does_not_start_with_an_empty_user_file() {
     let folder = SecurityFolder::new().unwrap();
     folder.write("users.txt", "\n").unwrap();
     let mut config = Config::default();
@@ -87,7 +89,7 @@ fn user_file_without_users_does_not_open_the_server() {
 }
 
 #[test]
-fn refusals_with_a_reason_pass_access_control() {
+fn error_replies_pass_access_control() {
     let folder = SecurityFolder::new().unwrap();
     let (server, endpoint) = serve("tcp", &folder.path("server-acl.json5"));
     let mut env = connect(&endpoint, Some(folder.path("client-user.json5"))).unwrap();
@@ -97,7 +99,7 @@ fn refusals_with_a_reason_pass_access_control() {
 }
 
 #[test]
-fn allowed_user_steps_and_is_seen_by_the_server() {
+fn allowed_user_steps_and_its_liveliness_token_is_visible() {
     let folder = SecurityFolder::new().unwrap();
     let (server, endpoint) = serve("tcp", &folder.path("server-acl.json5"));
     steps(&endpoint, Some(folder.path("client-user.json5")));
@@ -105,22 +107,22 @@ fn allowed_user_steps_and_is_seen_by_the_server() {
 }
 
 #[test]
-fn user_without_a_policy_sees_no_server_and_is_told_both_reasons() {
+fn error_of_a_user_without_a_policy_names_both_possible_reasons() {
     let folder = SecurityFolder::new().unwrap();
     let (server, endpoint) = serve("tcp", &folder.path("server-acl.json5"));
     folder.edited("client-user.json5", "alice", "bob").unwrap();
     let bob = folder.edited("edited-client-user.json5", "change-me-1", "change-me-2").unwrap();
-    let error = connect(&endpoint, Some(bob)).err().expect("refused");
+    let error = connect(&endpoint, Some(bob)).err().expect("rejected");
     assert!(matches!(error, ClientError::NoServerVisible { .. }), "{error:?}");
     let text = error.to_string();
-    for said in ["no server is visible", "no server is running", "access control", "TWINSTEP_LOG"] {
-        assert!(text.contains(said), "{text}");
+    for part in ["no server is visible", "no server is running", "access control", "TWINSTEP_LOG"] {
+        assert!(text.contains(part), "{text}");
     }
     server.shutdown();
 }
 
 #[test]
-fn steps_go_through_tls() {
+fn client_steps_over_tls() {
     let folder = SecurityFolder::new().unwrap();
     let (server, endpoint) = serve("tls", &folder.path("server-tls.json5"));
     assert!(endpoint.starts_with("tls/"));
@@ -129,44 +131,44 @@ fn steps_go_through_tls() {
 }
 
 #[test]
-fn client_that_trusts_another_authority_refuses_the_server() {
+fn client_that_trusts_another_authority_rejects_the_server() {
     let (folder, other) = (SecurityFolder::new().unwrap(), SecurityFolder::new().unwrap());
     let (server, endpoint) = serve("tls", &folder.path("server-tls.json5"));
-    let text = refused(&endpoint, Some(other.path("client-tls.json5")));
+    let text = rejected(&endpoint, Some(other.path("client-tls.json5")));
     assert!(text.contains("certificate"), "{text}");
-    refused(&endpoint, None);
+    rejected(&endpoint, None);
     server.shutdown();
 }
 
 #[test]
-fn mutual_tls_lets_in_whoever_has_a_certificate_of_the_authority() {
+fn mutual_tls_accepts_only_certificates_of_the_authority() {
     let (folder, other) = (SecurityFolder::new().unwrap(), SecurityFolder::new().unwrap());
     let (server, endpoint) = serve("tls", &folder.uncommented("server-tls.json5").unwrap());
     steps(&endpoint, Some(folder.uncommented("client-tls.json5").unwrap()));
     assert!(connect(&endpoint, Some(folder.path("client-tls.json5"))).is_err(), "no certificate");
-    // Trusts the server, but its own certificate is another authority's.
+    // This client trusts the server, but another authority issued its own certificate.
     std::fs::copy(folder.path("ca.pem"), other.path("ca.pem")).unwrap();
     let foreign = other.uncommented("client-tls.json5").unwrap();
-    assert!(connect(&endpoint, Some(foreign)).is_err(), "a foreign certificate");
+    assert!(connect(&endpoint, Some(foreign)).is_err(), "a certificate of another authority");
     steps(&endpoint, Some(folder.uncommented("client-tls.json5").unwrap()));
     server.shutdown();
 }
 
 #[test]
-fn password_goes_through_tls() {
+fn password_is_checked_over_tls() {
     let folder = SecurityFolder::new().unwrap();
     let (server, endpoint) = serve("tls", &folder.uncommented("server-users.json5").unwrap());
     steps(&endpoint, Some(folder.uncommented("client-user.json5").unwrap()));
-    refused(&endpoint, Some(folder.path("client-tls.json5")));
+    rejected(&endpoint, Some(folder.path("client-tls.json5")));
     server.shutdown();
 }
 
 #[test]
-fn access_control_by_certificate_name_lets_its_owner_step() {
+fn access_control_by_certificate_name_accepts_its_owner() {
     let folder = SecurityFolder::new().unwrap();
     let by_name = folder.edited("server-acl.json5", "usernames: [\"alice\"],", "").unwrap();
     let by_name = folder.uncommented(by_name.file_name().unwrap().to_str().unwrap()).unwrap();
-    // The certificate stands in the password's place.
+    // The certificate replaces the password.
     let tls = std::fs::read_to_string(folder.uncommented("server-tls.json5").unwrap()).unwrap();
     let access = std::fs::read_to_string(by_name).unwrap();
     let access = access.split_once("access_control: {").unwrap().1;

@@ -1,4 +1,4 @@
-//! Rough ground: robots stand on it, and server and client have the same.
+//! Rough terrain: robots stand on it, and server and client have the same heights.
 
 use glam::{Quat, Vec3};
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
@@ -16,7 +16,7 @@ fn rough(height_m: f32, cell_m: f32, seed: u64) -> Terrain {
     Terrain::Rough(RoughTerrain { height_m, cell_m, size_m: 20.0, seed })
 }
 
-/// Makes a robot of one engine.
+/// Constructor of a backend.
 type Make<B> = fn(SimConfig) -> B;
 
 fn rapier(config: SimConfig) -> RapierBackend {
@@ -30,8 +30,8 @@ fn batch(config: SimConfig) -> BatchBackend {
 fn backend<B: Backend>(make: Make<B>, terrain: Terrain, clearance: f32) -> B {
     let q = go2().control.default_pose_f32();
     let mut backend = make(SimConfig { terrain, threads: 1, ..SimConfig::default() });
-    let placement = InitialState::standing_on(&backend.ground(), backend.robot(), q, clearance);
-    backend.reset(&[(0, placement)]).unwrap();
+    let initial_state = InitialState::standing_on(&backend.ground(), backend.robot(), q, clearance);
+    backend.reset(&[(0, initial_state)]).unwrap();
     backend
 }
 
@@ -45,7 +45,7 @@ fn foot_centres(backend: &impl Backend) -> [Vec3; NUM_LEGS] {
     std::array::from_fn(|leg| poses[3 + 3 * leg].transform(robot.shapes.foot_centre.as_vec3()))
 }
 
-/// How far each foot's ball is from the nearest point of the ground [m].
+/// Returns the signed distance of each foot sphere from the nearest point of the ground [m].
 fn foot_gaps(backend: &impl Backend, ground: &Ground) -> [f32; NUM_LEGS] {
     foot_centres(backend).map(|centre| {
         let around = (-30..=30).flat_map(|x| (-30..=30).map(move |y| (x as f32 / 1000.0, y as f32 / 1000.0)));
@@ -57,7 +57,7 @@ fn foot_gaps(backend: &impl Backend, ground: &Ground) -> [f32; NUM_LEGS] {
     })
 }
 
-/// A robot that stood for ten seconds.
+/// Returns a backend whose robot has stood for 10 s.
 fn stood<B: Backend>(make: Make<B>, terrain: Terrain) -> B {
     let mut backend = backend(make, terrain, 0.01);
     let hold = Command::hold(go2().control.default_pose_f32(), 60.0, 2.0);
@@ -85,30 +85,31 @@ fn stands_on_its_feet<B: Backend>(make: Make<B>) {
 }
 
 #[test]
-fn robot_on_gentle_ground_weighs_its_mass() {
-    weighs_its_mass(rapier);
-    weighs_its_mass(batch);
+fn foot_forces_on_gentle_terrain_equal_the_weight() {
+    check_foot_forces(rapier);
+    check_foot_forces(batch);
 }
 
-fn weighs_its_mass<B: Backend>(make: Make<B>) {
+fn check_foot_forces<B: Backend>(make: Make<B>) {
     let weight = go2().total_mass() as f32 * 9.81;
     for seed in 1..=3 {
-        // Forces are along the normals: on triangles of slope 0.1 they add up to less than the weight, by up to 0.5 %.
+        // The forces are normal to the ground. On triangles of slope 0.1 their sum is up to 0.5 % less than the weight.
         let force: f32 = stood(make, rough(0.02, 0.25, seed)).states().foot_force[0].iter().sum();
         assert!((force / weight - 1.0).abs() < 0.01, "seed {seed}: {force} N on the feet, weight {weight} N");
     }
 }
 
 #[test]
-fn robot_that_is_dropped_and_kicks_does_not_fall_through() {
-    // rapier's field is a surface with nothing in it: a foot that lands from 1 m may go through for as long as it is
-    // pressed. Of the batch engine's trunk only the corners touch, so that a ridge may reach under its belly.
+fn dropped_robot_does_not_fall_through_the_terrain() {
+    // rapier's height field is a surface without volume: after a fall from 1 m, a foot may penetrate while it is
+    // pressed. In the batch engine only the corners of the trunk have contacts, so a ridge may penetrate the trunk from
+    // below.
     does_not_fall_through(rapier, -0.15, 0.03);
     does_not_fall_through(batch, 0.005, 0.0);
 }
 
-fn does_not_fall_through<B: Backend>(make: Make<B>, from_high: f32, belly: f32) {
-    for (seed, height, lowest_allowed) in [(1, 0.1, 0.01), (2, 0.5, 0.01), (3, 1.0, from_high)] {
+fn does_not_fall_through<B: Backend>(make: Make<B>, min_foot_from_1_m: f32, min_trunk: f32) {
+    for (seed, height, min_foot) in [(1, 0.1, 0.01), (2, 0.5, 0.01), (3, 1.0, min_foot_from_1_m)] {
         let mut backend = backend(make, rough(0.1, 0.2, seed), height);
         let ground = backend.ground();
         let pose = go2().control.default_pose_f32();
@@ -121,22 +122,22 @@ fn does_not_fall_through<B: Backend>(make: Make<B>, from_high: f32, belly: f32) 
             let feet = foot_centres(&backend).map(|centre| centre.z - ground.height(centre.x, centre.y));
             lowest_foot = feet.into_iter().fold(lowest_foot, f32::min);
         }
-        assert!(lowest_trunk > belly, "dropped from {height} m: the trunk was {lowest_trunk} m above the ground");
-        assert!(lowest_foot > lowest_allowed, "dropped from {height} m: a foot was {lowest_foot} m above the ground");
+        assert!(lowest_trunk > min_trunk, "dropped from {height} m: the trunk was {lowest_trunk} m above the ground");
+        assert!(lowest_foot > min_foot, "dropped from {height} m: a foot was {lowest_foot} m above the ground");
     }
 }
 
 #[test]
-fn robot_beside_the_field_stands_on_level_ground() {
-    stands_beside_the_field(rapier);
-    stands_beside_the_field(batch);
+fn robot_outside_the_height_field_stands_on_level_ground() {
+    stands_outside_the_height_field(rapier);
+    stands_outside_the_height_field(batch);
 }
 
-fn stands_beside_the_field<B: Backend>(make: Make<B>) {
+fn stands_outside_the_height_field<B: Backend>(make: Make<B>) {
     let mut backend = backend(make, rough(0.05, 0.25, 1), 0.0);
     let q = go2().control.default_pose_f32();
-    let placement = InitialState { base_position: [10.5, -3.0, 0.34], ..InitialState::at_rest(0.34, q) };
-    backend.reset(&[(0, placement)]).unwrap();
+    let initial_state = InitialState { base_position: [10.5, -3.0, 0.34], ..InitialState::at_rest(0.34, q) };
+    backend.reset(&[(0, initial_state)]).unwrap();
     backend.step(&[Command::hold(q, 60.0, 2.0)], &[true], 400).unwrap();
     assert!((0.27..0.33).contains(&backend.states().base_position[0][2]), "{:?}", backend.states().base_position[0]);
 }
@@ -147,14 +148,14 @@ terrain = { rough = { height_m = 0.08, cell_m = 0.25, size_m = 30.0, seed = 7 } 
 ";
 
 #[test]
-fn server_with_rough_ground_in_its_file_sends_the_heights_around_the_robot() {
+fn server_sends_the_heights_around_the_robot() {
     let file = Config::parse(CONFIG, "server.toml").unwrap();
     let terrain = file.sim.terrain;
     let (server, endpoint) = start(&Config { sim: file.sim, ..config(TaskName::Walk) });
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
     env.reset(&ResetRequest::seeded(1, 2)).unwrap();
     for _ in 0..50 {
-        assert!(!env.step(&[0.0; 24]).unwrap().terminated.contains(&true), "who stands still does not fall");
+        assert!(!env.step(&[0.0; 24]).unwrap().terminated.contains(&true), "a standing robot does not fall");
     }
     let scene = env.scene(1).unwrap();
     let (sent, whole) = (scene.ground.height_field.unwrap(), terrain.ground());
@@ -174,7 +175,7 @@ fn server_with_rough_ground_in_its_file_sends_the_heights_around_the_robot() {
 }
 
 #[test]
-fn server_refuses_rough_ground_that_cannot_be_before_it_starts() {
+fn server_rejects_invalid_terrain_before_it_starts() {
     for (text, expected) in [
         (
             "[sim]\nterrain = { rough = { height_m = 9.0, cell_m = 0.25, seed = 7 } }",
@@ -189,7 +190,7 @@ fn server_refuses_rough_ground_that_cannot_be_before_it_starts() {
 }
 
 #[test]
-fn walk_on_a_steep_slope_starts_with_the_feet_on_it() {
+fn walk_on_a_steep_slope_starts_with_the_feet_on_the_ground() {
     let mut config = config(TaskName::Walk);
     config.sim.terrain = Terrain::SlopeRad(0.3);
     config.task.reset_joint_noise_rad = 0.0;

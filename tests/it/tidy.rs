@@ -1,4 +1,4 @@
-//! What a reader relies on and nobody would notice going stale.
+//! Checks of the repository itself: unfinished code, file headers, documented commands, vocabulary, links, file sizes.
 
 use std::path::{Path, PathBuf};
 
@@ -6,7 +6,7 @@ fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_owned()
 }
 
-/// Every file of the project with one of `extensions`, outside build outputs.
+/// Appends every file below `folder` with one of `extensions` to `found`, without build outputs.
 fn files(folder: &Path, extensions: &[&str], found: &mut Vec<PathBuf>) {
     for entry in std::fs::read_dir(folder).unwrap().map(Result::unwrap) {
         let (path, name) = (entry.path(), entry.file_name());
@@ -25,13 +25,13 @@ fn files(folder: &Path, extensions: &[&str], found: &mut Vec<PathBuf>) {
 fn sources(extensions: &[&str]) -> Vec<(PathBuf, String)> {
     let mut found = Vec::new();
     files(&root(), extensions, &mut found);
-    assert!(found.len() > 2, "the search found its files");
+    assert!(found.len() > 2, "the search found no files");
     found.into_iter().map(|path| (path.clone(), std::fs::read_to_string(&path).unwrap())).collect()
 }
 
 #[test]
-fn nothing_is_left_to_do_in_the_code() {
-    // Put together at run time, so that this file does not find itself.
+fn code_has_no_markers_of_unfinished_work() {
+    // Assembled at run time, so that this file has no match.
     let marks =
         [["TO", "DO"].concat(), ["FIX", "ME"].concat(), ["todo", "!("].concat(), ["unimplemented", "!("].concat()];
     for (path, text) in sources(&["rs", "py", "toml", "md"]) {
@@ -42,21 +42,21 @@ fn nothing_is_left_to_do_in_the_code() {
 }
 
 #[test]
-fn every_rust_file_says_first_what_it_holds() {
+fn every_rust_file_begins_with_a_module_comment() {
     for (path, text) in sources(&["rs"]) {
         assert!(text.starts_with("//! "), "{} starts without `//!`", path.display());
     }
 }
 
 #[test]
-fn readme_gives_the_two_commands_and_ci_runs_the_same_test_command() {
+fn readme_has_the_two_commands_and_ci_runs_the_same_test_command() {
     let read = |path: &str| std::fs::read_to_string(root().join(path)).unwrap();
     let (readme, ci) = (read("README.md"), read(".ci/run"));
     assert!(readme.contains("cargo run --release -- demo"));
     assert!(readme.contains("cargo test --release --workspace") && ci.contains("cargo test --release --workspace"));
 }
 
-/// Words that this project does not use, with the term of the field that stands in their place.
+/// Replaced words, each with the standard term to use instead.
 const REPLACED_WORDS: [(&str, &str); 32] = [
     ("learned drive", "actuator network"),
     ("learned drives", "actuator networks"),
@@ -92,7 +92,7 @@ const REPLACED_WORDS: [(&str, &str); 32] = [
     ("sysid", "identify"),
 ];
 
-/// True if `word` is in `text` and no part of a longer name.
+/// Returns true if `text` contains `word` as a whole word.
 fn has_word(text: &str, word: &str) -> bool {
     let is_name = |character: Option<char>| character.is_some_and(|c| c.is_alphanumeric() || c == '_');
     text.match_indices(word).any(|(start, _)| {
@@ -111,9 +111,9 @@ fn every_file_of_the_catalogue_is_in_the_catalogue() {
 }
 
 #[test]
-fn words_that_were_replaced_stay_away() {
+fn sources_and_documents_do_not_use_replaced_words() {
     for (path, text) in sources(&["rs", "py", "md"]) {
-        // The changelog names what was renamed, and this file has the list.
+        // The changelog lists the renamed identifiers, and this file lists the words.
         if path.ends_with("CHANGELOG.md") || path.ends_with("tests/it/tidy.rs") {
             continue;
         }
@@ -124,7 +124,7 @@ fn words_that_were_replaced_stay_away() {
 }
 
 #[test]
-fn links_in_the_documents_lead_somewhere() {
+fn relative_links_in_documents_have_existing_targets() {
     for (path, text) in sources(&["md"]) {
         for target in text.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
             let file = target.split('#').next().unwrap();
@@ -137,7 +137,7 @@ fn links_in_the_documents_lead_somewhere() {
 }
 
 #[test]
-fn examples_are_short_enough_to_read_at_once() {
+fn examples_have_at_most_60_lines() {
     let mut found = Vec::new();
     files(&root().join("examples"), &["rs"], &mut found);
     for path in found {

@@ -112,7 +112,7 @@ pub fn motion(variant: u64) -> Log {
     Log::new_commands(meta, columns).expect("a motion")
 }
 
-/// Returns the joint offset [rad] of slow sines that lift, pitch, roll and shift the trunk while the feet stay in place.
+/// Returns the joint offset [rad] that lifts, pitches, rolls and shifts the trunk slowly while the feet stay in place.
 fn sway(joint: Joint, time: f64, shift: f64) -> f64 {
     let wave = |way: f64| {
         let waves = [(0.31, 0.5), (0.57, 0.3), (0.97, 0.2)].into_iter().enumerate();
@@ -141,6 +141,6 @@ pub fn log_of(robot: &ModelFile, motion: &Log, seed: u64) -> Log {
             SimConfig { engine: Engine::Rapier, base, physics_hz: Some(4000), threads: 1, ..SimConfig::default() };
         RapierBackend::new(robot.clone(), config, 1).map_err(|error| RecordError::Backend(Box::new(error)))
     };
-    let exact = record(motion, &robot, None, backend, "a robot of `hidden_robot`".to_owned(), &mut |_| true);
+    let exact = record(motion, &robot, None, backend, "a robot of `ground_truth_robot`".to_owned(), &mut |_| true);
     apply_sensors(&exact.expect("the simulation completes"), &SENSORS, seed).expect("a log")
 }

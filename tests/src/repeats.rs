@@ -1,4 +1,4 @@
-//! A client that sends every request three times at once, by hand: no library that repeats stands between.
+//! A client that sends every request three times at once, without the client library and its own repeats.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ use zenoh::{Session, Wait};
 const TIMEOUT: Duration = Duration::from_secs(5);
 const STEPS: u64 = 5;
 
-/// Leases one counter of the server at `endpoint` and steps it, every request three times at once.
+/// Leases one counter of the server at `endpoint` and steps it. Sends every request three times at once.
 pub fn three_times(endpoint: &str) -> Result<(), String> {
     let session = open(endpoint)?;
     let sid = first_server(&session)?;
@@ -28,29 +28,29 @@ pub fn three_times(endpoint: &str) -> Result<(), String> {
             spec_hash: None,
             reclaim: None,
         };
-        // The same client asks three times and must get one lease.
-        let answers = ask_three_times(&session, &keys::lease(&sid), encode(&request))?;
-        decode(&answers).map_err(text)?
+        // Three requests of the same client must yield one lease.
+        let reply = request_three_times(&session, &keys::lease(&sid), encode(&request))?;
+        decode(&reply).map_err(text)?
     };
     let key = |verb| keys::env(&sid, &lease.lease, verb);
     let (protocol, epoch) = (PROTOCOL, lease.epoch);
     let reset = message::ResetRequest { protocol, epoch, seq: 1, seeds: None, mask: None };
-    ask_three_times(&session, &key(EnvMethod::Reset), encode(&reset))?;
+    request_three_times(&session, &key(EnvMethod::Reset), encode(&reset))?;
     let mut counter = Counter { resets: 1, ..Counter::default() };
     for step in 1..=STEPS {
         let action = [step as f32; 12];
         let actions = tensor::as_bytes(&action);
         let request = message::StepRequest { protocol, epoch, seq: step + 1, actions };
-        let answer = ask_three_times(&session, &key(EnvMethod::Step), encode(&request))?;
-        let reply: message::StepReply<'_> = decode(&answer).map_err(text)?;
+        let payload = request_three_times(&session, &key(EnvMethod::Step), encode(&request))?;
+        let reply: message::StepReply<'_> = decode(&payload).map_err(text)?;
         let obs: Vec<f32> = tensor::read(reply.obs, "obs").map_err(text)?;
         counter.step(&action);
         if obs.len() != OBS_LEN || obs[..4] != counter.observation() {
-            return Err(format!("step {step} sent three times gave {:?}, not {counter:?}", &obs[..4]));
+            return Err(format!("step {step}, sent three times: observed {:?}, expected {counter:?}", &obs[..4]));
         }
     }
     let close = message::CloseRequest { protocol, epoch, seq: STEPS + 2 };
-    ask_three_times(&session, &key(EnvMethod::Close), encode(&close))?;
+    request_three_times(&session, &key(EnvMethod::Close), encode(&close))?;
     session.close().wait().map_err(text)
 }
 
@@ -72,12 +72,14 @@ fn open(endpoint: &str) -> Result<Session, String> {
 fn first_server(session: &Session) -> Result<String, String> {
     let replies = session.liveliness().get(keys::LIVE_SERVERS).timeout(TIMEOUT).wait().map_err(text)?;
     let sample = replies.recv().map_err(text)?.into_result().map_err(|error| format!("{error:?}"))?;
-    let (sid, _) = keys::parse_live_server(sample.key_expr().as_str()).ok_or("a foreign key among the servers'")?;
+    let (sid, _) = keys::parse_live_server(sample.key_expr().as_str()).ok_or("not the liveliness token of a server")?;
     Ok(sid.to_owned())
 }
 
-/// The one answer that all three got. A repeat that comes after a close may find the lease gone.
-fn ask_three_times(session: &Session, key: &str, request: Vec<u8>) -> Result<Vec<u8>, String> {
+/// Sends `request` three times and returns the reply, which must be the same for all three.
+///
+/// Repeats of a close may fail because the lease no longer exists.
+fn request_three_times(session: &Session, key: &str, request: Vec<u8>) -> Result<Vec<u8>, String> {
     let send = || {
         session
             .get(key)
@@ -89,18 +91,18 @@ fn ask_three_times(session: &Session, key: &str, request: Vec<u8>) -> Result<Vec
             .map_err(text)
     };
     let sent = [send()?, send()?, send()?];
-    let mut answers = Vec::new();
+    let mut payloads = Vec::new();
     for (index, replies) in sent.iter().enumerate() {
         match replies.recv().map_err(|_| format!("no reply to copy {index} at {key}"))?.into_result() {
-            Ok(sample) => answers.push(sample.payload().to_bytes().into_owned()),
+            Ok(sample) => payloads.push(sample.payload().to_bytes().into_owned()),
             Err(_) if index > 0 && key.ends_with("/close") => {}
             Err(error) => {
                 return Err(format!("copy {index} at {key}: {}", String::from_utf8_lossy(&error.payload().to_bytes())));
             }
         }
     }
-    if answers.windows(2).any(|pair| pair[0] != pair[1]) {
-        return Err(format!("the three answers at {key} differ"));
+    if payloads.windows(2).any(|pair| pair[0] != pair[1]) {
+        return Err(format!("the three replies at {key} differ"));
     }
-    answers.pop().ok_or_else(|| format!("no answer at {key}"))
+    payloads.pop().ok_or_else(|| format!("no reply at {key}"))
 }

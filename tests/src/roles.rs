@@ -1,4 +1,4 @@
-//! What the processes of a lane do.
+//! Roles of the processes of a test bed: server, client and router.
 
 use std::io::Read;
 use std::sync::Arc;
@@ -8,52 +8,51 @@ use twinstep_client::{ClientError, ConnectOptions, LeaseHandle, RemoteVecEnv};
 use twinstep_env_server::{EnvFactory, EnvFactoryError, Server, ServerConfig};
 use twinstep_envs::{Counter, CounterEnv};
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv, go2};
-use zenoh::Wait;
 
 use crate::step_oracle::{NUM_ENVS, StepOracle};
 
-/// One process of a lane.
+/// Role of one process of a test bed.
 #[derive(clap::Subcommand, Clone, Debug)]
 pub enum Role {
-    /// A server whose steps take time, so that it can be hit in the middle of one.
+    /// A server whose steps take time, so that a fault can occur during a step.
     Server(ServerArgs),
     /// A client that steps counters and checks every observation.
     Client(ClientArgs),
     /// A Zenoh session in router mode.
     Router {
-        /// Where it listens.
+        /// Endpoint on which it listens.
         listen: String,
     },
 }
 
-/// Of [`Role::Server`].
+/// Arguments of [`Role::Server`].
 #[derive(clap::Args, Clone, Debug)]
 pub struct ServerArgs {
-    /// Where it listens.
+    /// Endpoint on which it listens.
     pub listen: String,
-    /// Router that it connects to.
+    /// Endpoint of the router to which it connects.
     #[arg(long)]
     pub connect: Option<String>,
     /// Duration of a step [ms].
     #[arg(long, default_value_t = 4)]
     pub step_ms: u64,
-    /// Plants the error that all this is here to find: every so many steps, one is executed twice.
+    /// Executes every N-th step twice: the fault that the checks must detect.
     #[arg(long)]
     pub duplicate_step_every: Option<u32>,
 }
 
-/// Of [`Role::Client`].
+/// Arguments of [`Role::Client`].
 #[derive(clap::Args, Clone, Debug)]
 pub struct ClientArgs {
-    /// Where it connects.
+    /// Endpoint to which it connects.
     pub endpoint: String,
-    /// The dead client's lease to take over, its epoch, and steps, resets and mixes it had acknowledged.
+    /// Lease of the killed client, its epoch, and the last acknowledged steps, resets and action hash of each counter.
     #[arg(long, num_args = 2 + 3 * NUM_ENVS)]
     pub reclaim: Option<Vec<String>>,
 }
 
 impl Role {
-    /// Does what the role does, until killed or until stdin closes, as it does when the lane's process dies.
+    /// Runs the role until it is killed or stdin closes. Stdin closes when the process of the test bed exits.
     pub fn run(&self) -> Result<(), Box<dyn std::error::Error>> {
         std::thread::spawn(|| {
             while matches!(std::io::stdin().read(&mut [0; 64]), Ok(1..)) {}
@@ -79,7 +78,7 @@ fn route(listen: &str) -> Result<(), Box<dyn std::error::Error>> {
     }
     let _session = twinstep_session::open(config).map_err(|error| error.to_string())?;
     println!("listening {listen}");
-    wait_for_a_signal()
+    wait_until_killed()
 }
 
 fn serve(arguments: &ServerArgs) -> Result<(), Box<dyn std::error::Error>> {
@@ -91,10 +90,10 @@ fn serve(arguments: &ServerArgs) -> Result<(), Box<dyn std::error::Error>> {
     };
     let server = Server::start(&config, Arc::new(SlowHost(arguments.clone())))?;
     println!("listening {}", server.endpoints().join(" "));
-    wait_for_a_signal()
+    wait_until_killed()
 }
 
-fn wait_for_a_signal() -> ! {
+fn wait_until_killed() -> ! {
     loop {
         std::thread::park();
     }
@@ -105,7 +104,7 @@ struct SlowHost(ServerArgs);
 struct SlowEnv {
     inner: CounterEnv,
     step: Duration,
-    double_every: Option<u32>,
+    duplicate_step_every: Option<u32>,
     steps: u32,
 }
 
@@ -118,7 +117,7 @@ impl EnvFactory for SlowHost {
     ) -> Result<Box<dyn VecEnv>, EnvFactoryError> {
         let inner = CounterEnv::new(&go2(), num_envs, autoreset);
         let step = Duration::from_millis(self.0.step_ms);
-        Ok(Box::new(SlowEnv { inner, step, double_every: self.0.duplicate_step_every, steps: 0 }))
+        Ok(Box::new(SlowEnv { inner, step, duplicate_step_every: self.0.duplicate_step_every, steps: 0 }))
     }
 }
 
@@ -141,10 +140,10 @@ impl VecEnv for SlowEnv {
 
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
         self.steps += 1;
-        if self.double_every.is_some_and(|every| self.steps.is_multiple_of(every)) {
+        if self.duplicate_step_every.is_some_and(|every| self.steps.is_multiple_of(every)) {
             self.inner.step(actions)?;
         }
-        // Half of the time before and half after, so that a fault hits both sides of the execution.
+        // Half of the time passes before and half after the execution, so that faults occur on both sides of it.
         std::thread::sleep(self.step / 2);
         let batch = self.inner.step(actions)?;
         std::thread::sleep(self.step / 2);
@@ -152,22 +151,24 @@ impl VecEnv for SlowEnv {
     }
 }
 
-/// Steps until killed. Prints `lease ID EPOCH`, `acked` with the counters of each step, `lost REASON` when its
-/// environments are gone, and `violation` with the evidence.
+/// Steps until killed.
+///
+/// Prints `lease ID EPOCH`, `acked` with the counters of each step, `lost REASON` after the lease is lost, and
+/// `violation` with the evidence.
 fn client(arguments: &ClientArgs) -> Result<(), ClientError> {
-    // Shorter than a freeze, so that the client gives up a request and takes it up again.
+    // Shorter than the suspension of the server, so that the client times out and repeats the request.
     let options = ConnectOptions {
         timeout: Duration::from_secs(2),
         connect_timeout: Duration::from_secs(20),
         ..ConnectOptions::new(&arguments.endpoint, NUM_ENVS)
     };
-    let mut heritage = arguments.reclaim.as_deref().map(read_heritage);
+    let mut reclaimed = arguments.reclaim.as_deref().map(parse_reclaimed_state);
     loop {
-        let (env, ledger) = match heritage.take() {
+        let (env, oracle) = match reclaimed.take() {
             Some((ticket, counters)) => {
                 (RemoteVecEnv::reclaim(&options, &ticket)?, StepOracle::after_client_crash(counters))
             }
-            None => match fresh(&options) {
+            None => match connect_and_reset(&options) {
                 Ok(started) => started,
                 Err(reason) => {
                     println!("lost {}", reason.replace('\n', " "));
@@ -177,19 +178,19 @@ fn client(arguments: &ClientArgs) -> Result<(), ClientError> {
         };
         let LeaseHandle { lease, epoch } = env.ticket();
         println!("lease {lease} {epoch}");
-        match step_until_lost(env, ledger) {
+        match step_until_lost(env, oracle) {
             Ended::Lost(reason) => println!("lost {}", reason.replace('\n', " ")),
             Ended::Violation(evidence) => println!("violation {evidence}"),
         }
     }
 }
 
-fn fresh(options: &ConnectOptions) -> Result<(RemoteVecEnv, StepOracle), String> {
+fn connect_and_reset(options: &ConnectOptions) -> Result<(RemoteVecEnv, StepOracle), String> {
     let mut env = RemoteVecEnv::connect(options).map_err(|error| error.to_string())?;
-    let mut ledger = StepOracle::after_first_reset();
+    let mut oracle = StepOracle::after_first_reset();
     let obs = env.reset(&ResetRequest::default()).map_err(|error| error.to_string())?;
-    ledger.settle(obs)?;
-    Ok((env, ledger))
+    oracle.settle(obs)?;
+    Ok((env, oracle))
 }
 
 enum Ended {
@@ -197,9 +198,9 @@ enum Ended {
     Violation(String),
 }
 
-fn step_until_lost(mut env: RemoteVecEnv, mut ledger: StepOracle) -> Ended {
+fn step_until_lost(mut env: RemoteVecEnv, mut oracle: StepOracle) -> Ended {
     loop {
-        let actions = ledger.actions();
+        let actions = oracle.actions();
         if let Err(error) = env.send(&actions) {
             return Ended::Lost(error.to_string());
         }
@@ -210,14 +211,14 @@ fn step_until_lost(mut env: RemoteVecEnv, mut ledger: StepOracle) -> Ended {
                 Err(error) => return Ended::Lost(error.to_string()),
             }
         };
-        match ledger.observe(&actions, &batch.obs) {
+        match oracle.observe(&actions, &batch.obs) {
             Ok(counters) => println!("acked {}", write_counters(&counters)),
             Err(evidence) => return Ended::Violation(evidence),
         }
     }
 }
 
-/// True if nobody knows whether the request was executed: it is asked for again.
+/// True if the request timed out. Whether it was executed is unknown, so the client receives again.
 fn is_timeout(error: &EnvError) -> bool {
     let EnvError::Remote(error) = error else { return false };
     matches!(error.downcast_ref(), Some(ClientError::RequestTimeout { .. }))
@@ -228,8 +229,8 @@ fn write_counters(counters: &[Counter; NUM_ENVS]) -> String {
     numbers.map(|number| number.to_string()).collect::<Vec<_>>().join(" ")
 }
 
-fn read_heritage(words: &[String]) -> (LeaseHandle, [Counter; NUM_ENVS]) {
-    let number = |index: usize| words[index].parse::<u64>().expect("the lane passes what a client printed");
+fn parse_reclaimed_state(words: &[String]) -> (LeaseHandle, [Counter; NUM_ENVS]) {
+    let number = |index: usize| words[index].parse::<u64>().expect("the test bed passes a printed line");
     let counter = |env: usize| Counter {
         steps: number(2 + 3 * env) as u32,
         resets: number(3 + 3 * env) as u32,

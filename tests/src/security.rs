@@ -1,24 +1,26 @@
-//! The shipped security files, in a folder of their own, with fresh certificates.
+//! Copy of the shipped security files in a temporary folder, with new certificates.
 
 use std::path::{Path, PathBuf};
 
 use rcgen::{BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair};
 use tempfile::TempDir;
 
-/// Where the shipped files are.
+/// Folder of the shipped files.
 const SHIPPED: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/security");
-/// How they name each other.
+/// Prefix of the paths with which the shipped files refer to each other.
 const PREFIX: &str = "examples/security/";
 
-/// Why the folder could not be made.
+/// Any error while the folder is created.
 pub type Failure = Box<dyn std::error::Error + Send + Sync>;
 
-/// A copy of `examples/security` whose files name each other where they are, with an authority, a server's certificate
-/// for this machine and a client's with the common name `alice`. Gone when dropped.
+/// A copy of `examples/security` with adapted paths and new certificates. It is deleted when dropped.
+///
+/// The certificates are those of an authority, of a server for `127.0.0.1`, and of a client with the common name
+/// `alice`.
 pub struct SecurityFolder(TempDir);
 
 impl SecurityFolder {
-    /// Copies the shipped files and makes the certificates.
+    /// Copies the shipped files and creates the certificates.
     pub fn new() -> Result<Self, Failure> {
         let folder = Self(TempDir::new()?);
         for entry in std::fs::read_dir(SHIPPED)? {
@@ -32,19 +34,19 @@ impl SecurityFolder {
         Ok(folder)
     }
 
-    /// Where the file `name` is.
+    /// Returns the path of the file `name`.
     pub fn path(&self, name: &str) -> PathBuf {
         self.0.path().join(name)
     }
 
-    /// Writes another file into the folder.
+    /// Writes a file into the folder and returns its path.
     pub fn write(&self, name: &str, text: &str) -> std::io::Result<PathBuf> {
         let path = self.path(name);
         std::fs::write(&path, text)?;
         Ok(path)
     }
 
-    /// A copy of the file `name` with `from` replaced by `to`.
+    /// Writes a copy of the file `name` with `from` replaced by `to`, and returns its path.
     pub fn edited(&self, name: &str, from: &str, to: &str) -> Result<PathBuf, Failure> {
         let text = std::fs::read_to_string(self.path(name))?;
         if !text.contains(from) {
@@ -53,10 +55,10 @@ impl SecurityFolder {
         Ok(self.write(&format!("edited-{name}"), &text.replace(from, to))?)
     }
 
-    /// A copy of the file `name` with the settings that its comments offer switched on.
+    /// Writes a copy of the file `name` with its commented-out settings enabled, and returns its path.
     pub fn uncommented(&self, name: &str) -> Result<PathBuf, Failure> {
         let text = std::fs::read_to_string(self.path(name))?;
-        let lines: Vec<&str> = text.lines().map(|line| offered_setting(line).unwrap_or(line)).collect();
+        let lines: Vec<&str> = text.lines().map(|line| commented_setting(line).unwrap_or(line)).collect();
         Ok(self.write(&format!("uncommented-{name}"), &lines.join("\n"))?)
     }
 
@@ -80,8 +82,8 @@ impl SecurityFolder {
     }
 }
 
-/// The setting or the brace behind a line's `//`, if one is there; sentences are not.
-fn offered_setting(line: &str) -> Option<&str> {
+/// Returns the setting or brace after a line's `//`, or `None` if there is none or the comment is prose.
+fn commented_setting(line: &str) -> Option<&str> {
     let setting = line.trim_start().strip_prefix("//")?.trim_start();
     let key = setting.split_once(':').map_or("", |(key, _)| key);
     let is_setting = !key.is_empty() && key.bytes().all(|byte| byte.is_ascii_lowercase() || byte == b'_');

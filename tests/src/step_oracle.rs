@@ -1,37 +1,37 @@
-//! What a client knows about its counters, and whether an observation can be true.
+//! Expected states of a client's counters, against which observations are checked.
 
 use twinstep_envs::{Counter, OBS_LEN};
 
-/// Counters a client steps. They differ in their actions, so that mixed up rows show.
+/// Number of counters per client. Their actions differ, so that exchanged rows are detected.
 pub const NUM_ENVS: usize = 2;
 
-/// The states that the counters may be in.
+/// Possible states of the counters.
 ///
-/// Usually one. After a client's death two: its last request was executed, or was not.
+/// There is one, or two after the termination of a client: its last request was executed, or was not.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct StepOracle {
     possible: Vec<[Counter; NUM_ENVS]>,
 }
 
 impl StepOracle {
-    /// Freshly built environments that were reset once.
+    /// Returns the state of new environments after one reset.
     pub fn after_first_reset() -> Self {
         Self { possible: vec![[Counter { resets: 1, ..Counter::default() }; NUM_ENVS]] }
     }
 
-    /// The last acknowledged state of a client that died with a request under way.
+    /// Returns both possible states after the termination of a client with a request in flight.
     pub fn after_client_crash(acknowledged: [Counter; NUM_ENVS]) -> Self {
         let mut executed = acknowledged;
         step(&mut executed, &actions(&acknowledged));
         Self { possible: vec![acknowledged, executed] }
     }
 
-    /// The actions to send next: they follow from the state, so that an heir knows what its predecessor sent.
+    /// Returns the next actions. They are a function of the state, so a reclaiming client knows those last sent.
     pub fn actions(&self) -> Vec<f32> {
         actions(&self.possible[0])
     }
 
-    /// Takes in the observations after `actions`; an error if no possible state explains them.
+    /// Advances the possible states by `actions` and checks the observations. Fails if no possible state matches.
     pub fn observe(&mut self, actions: &[f32], obs: &[f32]) -> Result<[Counter; NUM_ENVS], String> {
         for counters in &mut self.possible {
             step(counters, actions);
@@ -39,19 +39,19 @@ impl StepOracle {
         self.settle(obs)
     }
 
-    /// Checks observations that no step came before.
+    /// Checks observations without a preceding step.
     pub fn settle(&mut self, obs: &[f32]) -> Result<[Counter; NUM_ENVS], String> {
-        let seen: Vec<&[f32]> = obs.chunks_exact(OBS_LEN).map(|row| &row[..4]).collect();
+        let observed: Vec<&[f32]> = obs.chunks_exact(OBS_LEN).map(|row| &row[..4]).collect();
         let expected = self.possible.clone();
-        self.possible.retain(|counters| counters.iter().map(Counter::observation).eq(seen.iter().copied()));
+        self.possible.retain(|counters| counters.iter().map(Counter::observation).eq(observed.iter().copied()));
         match self.possible[..] {
             [counters] => Ok(counters),
-            _ => Err(format!("observed {seen:?}, possible were {expected:?}")),
+            _ => Err(format!("observed {observed:?}; possible: {expected:?}")),
         }
     }
 }
 
-/// Sixteen-bit numbers that the state determines.
+/// Returns sixteen-bit numbers that are a function of the state.
 fn actions(counters: &[Counter; NUM_ENVS]) -> Vec<f32> {
     let value = |counter: &Counter, env: usize, joint: usize| {
         let seed = counter.action_hash ^ (counter.steps * 97 + env as u32 * 31 + joint as u32);
@@ -77,20 +77,20 @@ mod tests {
     }
 
     #[test]
-    fn step_executed_twice_or_skipped_is_noticed() {
+    fn step_executed_twice_or_skipped_is_detected() {
         for executed in [0, 2] {
-            let mut ledger = StepOracle::after_first_reset();
-            let mut counters = ledger.possible[0];
-            let actions = ledger.actions();
+            let mut oracle = StepOracle::after_first_reset();
+            let mut counters = oracle.possible[0];
+            let actions = oracle.actions();
             for _ in 0..executed {
                 step(&mut counters, &actions);
             }
-            assert!(ledger.observe(&actions, &observation(&counters)).is_err(), "{executed} times");
+            assert!(oracle.observe(&actions, &observation(&counters)).is_err(), "{executed} times");
         }
     }
 
     #[test]
-    fn heir_accepts_the_last_request_executed_once_or_not_at_all() {
+    fn reclaiming_client_accepts_the_last_request_executed_once_or_not_at_all() {
         let acknowledged = [Counter { steps: 5, resets: 1, action_hash: 77 }; NUM_ENVS];
         let sent = actions(&acknowledged);
         for executed in 0..3 {
@@ -98,10 +98,10 @@ mod tests {
             for _ in 0..executed {
                 step(&mut counters, &sent);
             }
-            let mut ledger = StepOracle::after_client_crash(acknowledged);
-            let next = ledger.actions();
+            let mut oracle = StepOracle::after_client_crash(acknowledged);
+            let next = oracle.actions();
             step(&mut counters, &next);
-            assert_eq!(ledger.observe(&next, &observation(&counters)).is_ok(), executed < 2, "{executed} times");
+            assert_eq!(oracle.observe(&next, &observation(&counters)).is_ok(), executed < 2, "{executed} times");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! A server, a client and perhaps a router between them, and what faults do to them.
+//! A test bed: a server, a client and optionally a router between them, into which faults are injected.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -11,43 +11,43 @@ use crate::process::Process;
 use crate::proxy::Proxy;
 use crate::repeats;
 
-/// How long a lane may take to go on after a fault.
+/// Maximum time for a test bed to continue after a fault.
 const RECOVERY_TIMEOUT: Duration = Duration::from_secs(30);
-/// How long the news of a server may take through the router.
+/// Maximum time for the discovery of a server through the router.
 const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(3);
-/// Steps after which a lane counts as going on.
+/// Number of acknowledged steps after which a test bed counts as running again.
 const PROGRESS: usize = 3;
 
-/// The processes of one lane.
+/// The processes of one test bed.
 pub struct TestBed {
     router: Option<Process>,
     server: Process,
     client: Process,
-    /// Where the server listens.
+    /// Endpoint of the server.
     listen: String,
-    /// Where other clients connect, and the server too if it is a router.
+    /// Endpoint for other clients: the router's if there is one, the server's otherwise.
     endpoint: String,
-    /// Where the client connects, on its way to `endpoint`.
+    /// Proxy between the client and `endpoint`.
     proxy: Proxy,
     plan: TestBedConfig,
-    /// The client's lease and epoch.
+    /// Lease and epoch of the client.
     lease: [String; 2],
-    /// Counters after the last acknowledged step, as the client printed them.
+    /// Counters after the last acknowledged step, as printed by the client.
     acknowledged: Vec<String>,
-    /// Steps that the client acknowledged.
+    /// Number of steps that the client acknowledged.
     pub steps: u64,
-    /// The longest time from a fault's end to the third step after it.
+    /// Longest time from the end of a fault to the third step after it.
     pub slowest: Duration,
 }
 
-/// What the processes of a lane run.
+/// Commands of the processes of a test bed.
 #[derive(Clone, Debug)]
 pub struct TestBedConfig {
-    /// The program with the roles of [`crate::roles`].
+    /// Program with the roles of [`crate::roles`].
     pub program: PathBuf,
-    /// Further arguments of the server.
+    /// Additional arguments of the server.
     pub server: Vec<String>,
-    /// Program and first arguments of another client, which prints the same lines and does not reclaim.
+    /// Program and first arguments of another client. It prints the same lines and does not reclaim leases.
     pub client: Option<Vec<String>>,
 }
 
@@ -61,11 +61,11 @@ impl TestBedConfig {
     }
 }
 
-/// Whether the lease must outlive a fault.
+/// Lease that is expected after a fault.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Lease {
-    GoesOn,
-    IsNew,
+    Same,
+    New,
 }
 
 impl TestBed {
@@ -78,7 +78,7 @@ impl TestBed {
         let server = start_server(program, &listen, router.as_ref().map(|_| endpoint.as_str()), &plan.server)?;
         let proxy = Proxy::start(&endpoint)?;
         let client = plan.start_client(&proxy.endpoint, &[])?;
-        let mut lane = Self {
+        let mut test_bed = Self {
             router,
             server,
             client,
@@ -91,18 +91,18 @@ impl TestBed {
             steps: 0,
             slowest: Duration::ZERO,
         };
-        lane.wait_for_progress(Lease::IsNew)?;
-        // Starting is no fault.
-        lane.slowest = Duration::ZERO;
-        Ok(lane)
+        test_bed.wait_for_progress(Lease::New)?;
+        // The time of the start is not a recovery time.
+        test_bed.slowest = Duration::ZERO;
+        Ok(test_bed)
     }
 
-    /// Whether there is a router to kill.
+    /// True if the test bed has a router.
     pub fn has_router(&self) -> bool {
         self.router.is_some()
     }
 
-    /// Does `fault`, and waits until the lane goes on as it must; the error is the evidence that it does not.
+    /// Injects `fault` and waits until the test bed continues as required. The error is the evidence of a failure.
     pub fn inject(&mut self, fault: Fault, random: &mut Stream) -> Result<(), String> {
         std::thread::sleep(moment(random, 0..40));
         match fault {
@@ -111,19 +111,19 @@ impl TestBed {
             Fault::RouterKilled => self.kill_router(moment(random, 0..800)),
             Fault::ClientFrozen => {
                 freeze(&self.client, moment(random, 50..3000))?;
-                self.wait_for_progress(Lease::GoesOn)
+                self.wait_for_progress(Lease::Same)
             }
             Fault::ServerFrozen => {
                 freeze(&self.server, moment(random, 2500..4000))?;
-                self.wait_for_progress(Lease::GoesOn)
+                self.wait_for_progress(Lease::Same)
             }
             Fault::MessagesDelayed => {
                 self.proxy.hold(moment(random, 50..3000));
-                self.wait_for_progress(Lease::GoesOn)
+                self.wait_for_progress(Lease::Same)
             }
             Fault::RequestRepeated => {
                 repeats::three_times(&self.endpoint)?;
-                self.wait_for_progress(Lease::GoesOn)
+                self.wait_for_progress(Lease::Same)
             }
             Fault::SecondServer => self.start_second_server(),
         }
@@ -136,34 +136,36 @@ impl TestBed {
     fn kill_server(&mut self) -> Result<(), String> {
         self.server.kill();
         self.server = start_server(&self.plan.program, &self.listen, self.router_endpoint(), &self.plan.server)?;
-        self.wait_for_progress(Lease::IsNew)
+        self.wait_for_progress(Lease::New)
     }
 
     fn kill_client(&mut self) -> Result<(), String> {
         for line in self.client.kill() {
-            self.note(&line)?;
+            self.record_line(&line)?;
         }
         if self.plan.client.is_some() {
             self.client = self.plan.start_client(&self.proxy.endpoint, &[])?;
-            return self.wait_for_progress(Lease::IsNew);
+            return self.wait_for_progress(Lease::New);
         }
         let [lease, epoch] = self.lease.clone();
-        let mut heritage = vec!["--inherit".to_owned(), lease, epoch];
-        heritage.extend(self.acknowledged.iter().cloned());
-        self.client = self.plan.start_client(&self.proxy.endpoint, &heritage)?;
-        self.wait_for_progress(Lease::GoesOn)
+        let mut reclaimed_state = vec!["--reclaim".to_owned(), lease, epoch];
+        reclaimed_state.extend(self.acknowledged.iter().cloned());
+        self.client = self.plan.start_client(&self.proxy.endpoint, &reclaimed_state)?;
+        self.wait_for_progress(Lease::Same)
     }
 
     fn kill_router(&mut self, pause: Duration) -> Result<(), String> {
-        let Some(router) = &mut self.router else { return Err("this lane has no router".to_owned()) };
+        let Some(router) = &mut self.router else { return Err("this test bed has no router".to_owned()) };
         router.kill();
         std::thread::sleep(pause);
         self.router = Some(start_router(&self.plan.program, &self.endpoint)?);
-        self.wait_for_progress(Lease::GoesOn)
+        self.wait_for_progress(Lease::Same)
     }
 
-    /// Behind a router both servers are visible, and a new client must not choose blindly. At one endpoint the second
-    /// cannot even start.
+    /// Starts a second server and checks that it has no effect.
+    ///
+    /// Behind a router both servers are visible, and a new client must not choose one of them arbitrarily. At the same
+    /// endpoint the second server cannot start.
     fn start_second_server(&mut self) -> Result<(), String> {
         if self.has_router() {
             let _second = start_server(&self.plan.program, &free_endpoint()?, self.router_endpoint(), &[])?;
@@ -174,9 +176,9 @@ impl TestBed {
             let since = Instant::now();
             loop {
                 match RemoteVecEnv::connect(&options) {
-                    Err(ClientError::AmbiguousRobot { .. }) => return self.wait_for_progress(Lease::GoesOn),
+                    Err(ClientError::AmbiguousRobot { .. }) => return self.wait_for_progress(Lease::Same),
                     Err(error) => return Err(format!("two servers: {error}")),
-                    // The router may not have heard of the second server yet.
+                    // The router may not have discovered the second server yet.
                     Ok(_) if since.elapsed() < DISCOVERY_TIMEOUT => {}
                     Ok(_) => return Err("a client chose one of two servers".to_owned()),
                 }
@@ -185,36 +187,36 @@ impl TestBed {
             let mut second = Process::start(&self.plan.program, &["server".to_owned(), self.listen.clone()])?;
             match second.exit_code(RECOVERY_TIMEOUT) {
                 Some(0) | None => Err("a second server started at the same endpoint".to_owned()),
-                Some(_) => self.wait_for_progress(Lease::GoesOn),
+                Some(_) => self.wait_for_progress(Lease::Same),
             }
         }
     }
 
     /// Waits until the client steps again, under the same lease or a new one.
     fn wait_for_progress(&mut self, lease: Lease) -> Result<(), String> {
-        // What was printed before the fault's end says nothing about after it.
+        // Lines printed before the end of the fault do not count as progress.
         let (before, since) = (self.lease[0].clone(), Instant::now());
         for line in self.client.lines_so_far() {
-            self.note(&line)?;
+            self.record_line(&line)?;
         }
         let mut progress = 0;
         while progress < PROGRESS {
-            let left = RECOVERY_TIMEOUT.saturating_sub(since.elapsed());
-            let Some(line) = self.client.line(left) else {
-                return Err(format!("the client does not go on after {:.1} s", since.elapsed().as_secs_f64()));
+            let timeout = RECOVERY_TIMEOUT.saturating_sub(since.elapsed());
+            let Some(line) = self.client.line(timeout) else {
+                return Err(format!("the client did not continue within {:.1} s", since.elapsed().as_secs_f64()));
             };
-            self.note(&line)?;
-            let is_in_its_lease = lease == Lease::GoesOn || self.lease[0] != before;
-            progress += usize::from(line.starts_with("acked") && is_in_its_lease);
+            self.record_line(&line)?;
+            let has_expected_lease = lease == Lease::Same || self.lease[0] != before;
+            progress += usize::from(line.starts_with("acked") && has_expected_lease);
         }
-        if lease == Lease::GoesOn && self.lease[0] != before {
-            return Err("the lease was lost, and its counters with it".to_owned());
+        if lease == Lease::Same && self.lease[0] != before {
+            return Err("the lease and its counters were lost".to_owned());
         }
         self.slowest = self.slowest.max(since.elapsed());
         Ok(())
     }
 
-    fn note(&mut self, line: &str) -> Result<(), String> {
+    fn record_line(&mut self, line: &str) -> Result<(), String> {
         let mut words = line.split(' ').map(str::to_owned);
         match words.next().as_deref() {
             Some("lease") => self.lease = [words.next().unwrap_or_default(), words.next().unwrap_or_default()],
@@ -253,7 +255,9 @@ fn start_server(program: &Path, listen: &str, router: Option<&str>, extra: &[Str
     start(program, &arguments)
 }
 
-/// Starts a process that says when it listens. A port may stay taken for a moment after its owner's death.
+/// Starts a process and waits until it prints `listening`.
+///
+/// Retries, because a port may remain in use for a short time after its process was killed.
 fn start(program: &Path, arguments: &[String]) -> Result<Process, String> {
     let since = Instant::now();
     while since.elapsed() < RECOVERY_TIMEOUT {
@@ -263,5 +267,5 @@ fn start(program: &Path, arguments: &[String]) -> Result<Process, String> {
         }
         std::thread::sleep(Duration::from_millis(50));
     }
-    Err(format!("`{}` does not start", arguments.join(" ")))
+    Err(format!("`{}` did not start", arguments.join(" ")))
 }

@@ -1,4 +1,4 @@
-//! What ours is measured beside, in Python: a child process that measures one window at a time.
+//! Baselines in Python: a child process that measures one window at a time.
 
 use std::io::{BufRead, BufReader, Lines, Write};
 use std::path::Path;
@@ -8,41 +8,43 @@ use serde::Serialize;
 
 use crate::error::{BenchError, failed};
 
-/// The module of the Python client that is the child.
+/// Module of the Python client that the child process runs.
 const MODULE: &str = "twinstep.baseline_simulators";
 
-/// What the peers are given: the same robots and the same motion as ours.
+/// Setup of the baseline simulators: the same robots and the same motion as for Twinstep.
 #[derive(Serialize)]
 pub struct Setup {
     /// MuJoCo models with a position actuator, by their rate [Hz].
     pub models: std::collections::BTreeMap<u32, String>,
-    /// Threads of EnvPool, one peer each.
+    /// Numbers of threads of EnvPool, with one baseline for each.
     pub threads: Vec<usize>,
-    /// Wanted joint positions in each policy period of the motion [rad].
+    /// Joint position targets of each policy period of the motion [rad].
     pub targets: Vec<Vec<f32>>,
-    /// The same in units of the action scale.
+    /// The targets as actions, in units of the action scale.
     pub actions: Vec<Vec<f32>>,
-    /// One policy period [s].
+    /// Policy period [s].
     pub policy_dt: f64,
-    /// Robots.
+    /// Number of robots.
     pub num_envs: usize,
     /// Length of a window [s].
     pub window_s: f64,
 }
 
-/// A program of the interpreter. It reads a line of setup, answers with the names of its peers as JSON, and then to each
-/// name with a number.
+/// Program of the interpreter.
+///
+/// It reads one line of setup and prints the names of its baselines as JSON. Then it reads names and prints a number
+/// for each.
 #[derive(Clone, Copy)]
 pub struct Program<'a> {
-    /// What the interpreter runs.
+    /// Arguments of the interpreter.
     pub arguments: &'a [&'a str],
-    /// What it measures.
+    /// Name of what it measures.
     pub name: &'a str,
-    /// How to get what it lacks.
+    /// Command that installs missing packages.
     pub install: &'a str,
 }
 
-/// The peers that are installed; none without Python.
+/// Installed baselines; none without Python.
 pub struct Baselines {
     process: Option<Process>,
     names: Vec<String>,
@@ -52,33 +54,33 @@ pub struct Baselines {
 struct Process {
     child: Child,
     requests: ChildStdin,
-    answers: Lines<BufReader<ChildStdout>>,
+    replies: Lines<BufReader<ChildStdout>>,
 }
 
-/// The child ended, or answered nonsense.
+/// The child process stopped, or its reply is not a number.
 #[derive(Debug, thiserror::Error)]
-#[error("{program} failed at `{peer}`; the reason is above")]
-struct PeerError {
+#[error("{program} failed at `{baseline}`\n  its error message is above")]
+struct BaselineError {
     program: String,
-    peer: String,
+    baseline: String,
 }
 
 impl Baselines {
-    /// Asks the interpreter `python` which simulators it has; what it lacks is said on stderr, and left out.
+    /// Starts the baseline simulators of the interpreter `python`. Missing ones are skipped with a message on stderr.
     pub fn start(python: &Path, setup: &Setup) -> Self {
         let install = "pip install \"./clients/python[bench]\"";
         Self::start_program(python, Program { arguments: &["-m", MODULE], name: "MuJoCo and EnvPool", install }, setup)
     }
 
-    /// The same of another program.
+    /// Starts the baselines of another program, in the same way.
     pub fn start_program(python: &Path, program: Program, setup: &impl Serialize) -> Self {
         let Program { arguments, name, install } = program;
         let (process, names) = match Process::start(python, arguments, setup) {
             Ok((process, names)) => (Some(process), names),
             Err(reason) => {
                 eprintln!(
-                    "left out: {name}, because its program in `{}` {reason}\n  {install}, and name its interpreter with \
-                     `--python`",
+                    "skipped: {name}, because its program in `{}` {reason}\n  install it with `{install}` and select \
+                     its interpreter with `--python`",
                     python.display()
                 );
                 (None, Vec::new())
@@ -87,15 +89,15 @@ impl Baselines {
         Self { process, names, program: name.to_owned() }
     }
 
-    /// True if there is a peer of that name.
-    pub fn has(&self, peer: &str) -> bool {
-        self.names.iter().any(|name| name == peer)
+    /// True if there is a baseline of this name.
+    pub fn has(&self, baseline: &str) -> bool {
+        self.names.iter().any(|name| name == baseline)
     }
 
-    /// What a peer measures in one window: env-steps a second of a simulator.
-    pub fn window(&mut self, peer: &str) -> Result<f64, BenchError> {
-        let answer = self.process.as_mut().and_then(|process| process.ask(peer));
-        answer.ok_or_else(|| failed(PeerError { program: self.program.clone(), peer: peer.to_owned() }))
+    /// Returns what a baseline measures in one window; for a simulator the env-steps per second.
+    pub fn window(&mut self, baseline: &str) -> Result<f64, BenchError> {
+        let rate = self.process.as_mut().and_then(|process| process.measure(baseline));
+        rate.ok_or_else(|| failed(BaselineError { program: self.program.clone(), baseline: baseline.to_owned() }))
     }
 }
 
@@ -109,26 +111,26 @@ impl Process {
             .map_err(|error| format!("does not start: {error}"))?;
         let (requests, stdout) = (child.stdin.take(), child.stdout.take());
         let (Some(requests), Some(stdout)) = (requests, stdout) else { return Err("has no stdin".to_owned()) };
-        let mut process = Self { child, requests, answers: BufReader::new(stdout).lines() };
+        let mut process = Self { child, requests, replies: BufReader::new(stdout).lines() };
         let setup = serde_json::to_string(setup).map_err(|error| error.to_string())?;
-        let names = process.answer(&setup).ok_or("ended at once")?;
-        let names = serde_json::from_str(&names).map_err(|error| format!("answered `{names}`: {error}"))?;
+        let names = process.reply_to(&setup).ok_or("stopped at once")?;
+        let names = serde_json::from_str(&names).map_err(|error| format!("replied `{names}`: {error}"))?;
         Ok((process, names))
     }
 
-    fn ask(&mut self, peer: &str) -> Option<f64> {
-        self.answer(peer)?.parse().ok()
+    fn measure(&mut self, baseline: &str) -> Option<f64> {
+        self.reply_to(baseline)?.parse().ok()
     }
 
-    fn answer(&mut self, line: &str) -> Option<String> {
+    fn reply_to(&mut self, line: &str) -> Option<String> {
         writeln!(self.requests, "{line}").and_then(|()| self.requests.flush()).ok()?;
-        self.answers.next()?.ok()
+        self.replies.next()?.ok()
     }
 }
 
 impl Drop for Process {
     fn drop(&mut self) {
-        // It may be in the middle of a window; nothing is lost.
+        // The child may be measuring a window, whose result is not needed.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }

@@ -6,7 +6,7 @@ pub enum BenchError {
     /// The caller interrupted it.
     #[error("interrupted")]
     Interrupted,
-    /// Something that it measures failed.
+    /// A part of the measurement failed.
     #[error(transparent)]
     Failed(Box<dyn std::error::Error + Send + Sync>),
 }
@@ -19,7 +19,7 @@ pub(crate) fn failed(error: impl std::error::Error + Send + Sync + 'static) -> B
 /// Returns true once the user has asked to stop; called between windows.
 pub type Interrupted<'a> = &'a dyn Fn() -> bool;
 
-/// Ends a benchmark if the user has asked to stop.
+/// Returns an error if the user has asked to stop.
 pub(crate) fn check(interrupted: Interrupted) -> Result<(), BenchError> {
     if interrupted() { Err(BenchError::Interrupted) } else { Ok(()) }
 }

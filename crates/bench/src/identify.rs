@@ -1,4 +1,4 @@
-//! Identification: closed-loop rollouts of the built-in recording's commands, and a whole search.
+//! Identification: closed-loop rollouts of the built-in recording's commands, and one whole identification.
 
 use std::path::Path;
 use std::time::Instant;
@@ -18,20 +18,22 @@ use crate::throughput::{WINDOWS, measure as pace, median_of};
 use twinstep_identify::default_effects;
 use twinstep_logs::recording;
 
-/// Rollouts that are timed on all cores, and the length of each [s].
+/// Number of rollouts that are timed on all cores.
 const ROLLOUTS: usize = 1000;
+/// Length of each rollout [s].
 const ROLLOUT_S: f64 = 10.0;
-/// Candidates that are judged at a time: their trajectories fit into memory, and there is work for many cores.
+/// Candidates that are evaluated at a time: their trajectories fit into memory, and there is work for many cores.
 const BATCH_SIZE: usize = 100;
-/// Candidates that are judged at a time on one core: half a generation of the search, which fills every register.
+/// Candidates that are evaluated at a time on one core: half a generation of the search, which fills SIMD registers.
 const ON_ONE_CORE: usize = 16;
-/// Robots in MuJoCo: it steps them one after the other.
+/// Number of robots in MuJoCo, which steps them one after the other.
 const MUJOCO_ROBOTS: usize = 2;
-/// What the rollouts, and a whole identification, may take on two cores [s].
-const ROLLOUTS_AIM_S: f64 = 10.0;
-const IDENTIFICATION_AIM_S: f64 = 20.0;
+/// Goal for the time of all rollouts on two cores [s].
+const ROLLOUTS_GOAL_S: f64 = 10.0;
+/// Goal for the time of one identification on two cores [s].
+const IDENTIFICATION_GOAL_S: f64 = 20.0;
 
-/// Robot-seconds a second, seconds for a thousand rollouts, and seconds for an identification.
+/// Measures rollouts [robot-s/s], the time of a thousand rollouts [s] and the time of one identification [s].
 pub fn measure(python: &Path, window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
     let folder = std::env::temp_dir().join(format!("twinstep-bench-{}", std::process::id()));
     let log = recording::unpack(&folder);
@@ -41,15 +43,15 @@ pub fn measure(python: &Path, window_s: f64, interrupted: Interrupted) -> Result
     let experiment = Experiment::new(&log, &go2(), WindowConfig::IDENTIFICATION).map_err(failed)?;
     let rollouts = experiment.clone().filter_rows(|row| log.t()[row] - first <= ROLLOUT_S);
     let candidates = candidates()?;
-    let mut peers = Baselines::start(python, &setup(&log, window_s));
+    let mut baselines = Baselines::start(python, &setup(&log, window_s));
     let mut rows =
-        on_one_core(&rollouts, &candidates[..ON_ONE_CORE], &mut peers, window_s)?.into_iter().collect::<Vec<_>>();
+        on_one_core(&rollouts, &candidates[..ON_ONE_CORE], &mut baselines, window_s)?.into_iter().collect::<Vec<_>>();
     rows.extend(on_all_cores(&rollouts, &candidates, interrupted)?);
-    rows.push(whole_search(&experiment, interrupted)?);
+    rows.push(whole_identification(&experiment, interrupted)?);
     Ok(rows)
 }
 
-/// Robots with a random value of every effect that `twinstep identify` seeks by itself, within what is plausible.
+/// Returns robots with random values of the default effects of `twinstep identify`, within their prior ranges.
 fn candidates() -> Result<Vec<RobotModel>, BenchError> {
     let mut random = stream(1, "bench identify", 0);
     let mut candidate = || {
@@ -69,27 +71,27 @@ fn simulator(threads: usize) -> Result<BatchRollout, BenchError> {
     BatchRollout::new(&go2(), &SimConfig { threads, ..SimConfig::default() }).map_err(failed)
 }
 
-/// Windows of ours in single and in double precision and of MuJoCo in turn.
+/// Measures windows of single precision, double precision and MuJoCo alternately.
 fn on_one_core(
     rollouts: &Experiment,
     candidates: &[RobotModel],
-    peers: &mut Baselines,
+    baselines: &mut Baselines,
     window_s: f64,
 ) -> Result<[Measurement; 2], BenchError> {
     let hz = SimConfig::default().physics_hz();
-    let (mut simulator, peer) = (simulator(1)?, format!("mujoco {hz}"));
+    let (mut simulator, baseline) = (simulator(1)?, format!("mujoco {hz}"));
     let (mut single, mut double, mut theirs) = (Vec::new(), Vec::new(), Vec::new());
     for _ in 0..WINDOWS {
         for (precision, paces) in [(Precision::Single, &mut single), (Precision::Double, &mut double)] {
-            let judged = pace(window_s, || {
+            let rate = pace(window_s, || {
                 rollouts.residuals(&mut simulator, candidates, precision);
                 Ok(())
             })?;
-            paces.push(judged.per_second * candidates.len() as f64 * ROLLOUT_S);
+            paces.push(rate.per_second * candidates.len() as f64 * ROLLOUT_S);
         }
-        if peers.has(&peer) {
-            // It counts actuator periods.
-            theirs.push(peers.window(&peer)? * go2().control.actuator_dt());
+        if baselines.has(&baseline) {
+            // Its steps are actuator periods.
+            theirs.push(baselines.window(&baseline)? * go2().control.actuator_dt());
         }
     }
     let (single, double) = (median_of(single), median_of(double));
@@ -123,13 +125,13 @@ fn on_all_cores(
         case: format!("{ROLLOUTS} closed-loop rollouts of {ROLLOUT_S} s, {case}"),
         value,
         unit,
-        reference: Some(format!("the aim of {ROLLOUTS_AIM_S} s for all")),
-        ratio: Some(ROLLOUTS_AIM_S / seconds),
+        reference: Some(format!("goal of {ROLLOUTS_GOAL_S} s for all")),
+        ratio: Some(ROLLOUTS_GOAL_S / seconds),
     };
     Ok([row("all cores", ROLLOUTS as f64 * ROLLOUT_S / seconds, "robot-s/s"), row("time", seconds, "s")])
 }
 
-fn whole_search(experiment: &Experiment, interrupted: Interrupted) -> Result<Measurement, BenchError> {
+fn whole_identification(experiment: &Experiment, interrupted: Interrupted) -> Result<Measurement, BenchError> {
     let (model, effects, mut simulator) = (ModelFile::default(), default_effects(), simulator(0)?);
     let since = Instant::now();
     let found = identify(
@@ -145,23 +147,22 @@ fn whole_search(experiment: &Experiment, interrupted: Interrupted) -> Result<Mea
         return Err(BenchError::Interrupted);
     }
     Ok(Measurement {
-        case: format!("identify {} numbers from 16 s of twelve joints", effects.len()),
+        case: format!("identify {} parameters from 16 s of twelve joints", effects.len()),
         value: seconds,
         unit: "s",
-        reference: Some(format!("the aim of {IDENTIFICATION_AIM_S} s")),
-        ratio: Some(IDENTIFICATION_AIM_S / seconds),
+        reference: Some(format!("goal of {IDENTIFICATION_GOAL_S} s")),
+        ratio: Some(IDENTIFICATION_GOAL_S / seconds),
     })
 }
 
-/// What MuJoCo needs to follow the same commands, its actuator in the model.
+/// Returns the setup with which MuJoCo follows the same commands, with position actuators in the model.
 fn setup(log: &Log, window_s: f64) -> Setup {
     let (control, hz) = (go2().control, SimConfig::default().physics_hz());
     let actuator = MjcfActuator::Position {
         kp: log.kp(JOINT_NAMES[0], 0).unwrap_or(control.kp),
         kd: log.kd(JOINT_NAMES[0], 0).unwrap_or(control.kd),
     };
-    let model =
-        mjcf(&go2(), &MjcfOptions { base: BaseMount::Fixed, timestep: 1.0 / f64::from(hz), actuator: actuator });
+    let model = mjcf(&go2(), &MjcfOptions { base: BaseMount::Fixed, timestep: 1.0 / f64::from(hz), actuator });
     let periods = (ROLLOUT_S / control.actuator_dt()).round() as usize;
     let target = |row: usize| {
         let command = |(name, pose): (&&str, f64)| log.q_cmd(name).map_or(pose, |cells| cells[row]) as f32;

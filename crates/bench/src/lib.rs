@@ -1,7 +1,7 @@
-//! Benchmarks: our numbers side by side with their references, in one run.
+//! Benchmarks of Twinstep and of its baselines, in one run.
 //!
 //! Each module has one function `measure` that returns [`Measurement`]s. A case is the median of
-//! [`throughput::WINDOWS`] windows; ours and the reference are measured in turn.
+//! [`throughput::WINDOWS`] windows; Twinstep and the reference are measured alternately.
 
 pub mod baselines;
 pub mod ensemble;
@@ -28,14 +28,14 @@ pub struct Measurement {
     pub unit: &'static str,
     /// Reference that the value is compared with.
     pub reference: Option<String>,
-    /// Ratio of ours to the reference; above 1 is better.
+    /// Ratio of Twinstep to the reference; above 1 is better.
     pub ratio: Option<f64>,
 }
 
 /// Measurements and the machine that they were made on.
 #[derive(Debug, Serialize)]
 pub struct Results {
-    /// In the order of measuring.
+    /// Measurements, in the order in which they were made.
     pub rows: Vec<Measurement>,
     /// The machine.
     pub machine: Machine,

@@ -1,4 +1,4 @@
-//! Environments with physics: the same walk over Zenoh and in process, in turn.
+//! Environments with physics: the same walk over Zenoh and in process.
 
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
@@ -10,11 +10,11 @@ use crate::throughput::{Throughput, WINDOWS, measure as pace, median};
 use twinstep_client::ServerProcess;
 use twinstep_envs::trot;
 
-/// Environment steps a second, remote beside in process.
+/// Measures env-steps/s, remote compared with in process.
 pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
     let mut rows = Vec::new();
     for num_envs in [64, 1024, 4096] {
-        let (remote, local) = side_by_side(num_envs, window_s, interrupted)?;
+        let (remote, local) = compare(num_envs, window_s, interrupted)?;
         let env_steps = num_envs as f64;
         rows.push(Measurement {
             case: format!("walk in process, {num_envs} envs"),
@@ -34,11 +34,7 @@ pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measuremen
     Ok(rows)
 }
 
-fn side_by_side(
-    num_envs: usize,
-    window_s: f64,
-    interrupted: Interrupted,
-) -> Result<(Throughput, Throughput), BenchError> {
+fn compare(num_envs: usize, window_s: f64, interrupted: Interrupted) -> Result<(Throughput, Throughput), BenchError> {
     let server = ServerProcess::start(&[]).map_err(failed)?;
     let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&server.endpoint, num_envs)).map_err(failed)?;
     let mut local = SimEnvFactory::new(Config::default())
@@ -47,7 +43,7 @@ fn side_by_side(
     let request = ResetRequest::seeded(1, num_envs);
     remote.reset(&request).map_err(failed)?;
     local.reset(&request).map_err(failed)?;
-    // The same trot in both, so that both meet the same contacts.
+    // Both execute the same trot, with the same contacts.
     let (mut remote_steps, mut local_steps) = (0, 0);
     let (mut ours, mut reference) = (Vec::new(), Vec::new());
     for _ in 0..WINDOWS {

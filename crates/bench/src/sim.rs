@@ -1,4 +1,5 @@
-//! Physics on one core: what each setting costs beside other simulators, and what accuracy it buys against the finest one.
+//! Physics on one core: speed of each setting compared with other simulators, and accuracy compared with the finest
+//! one.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -17,7 +18,7 @@ use crate::error::{BenchError, Interrupted, check, failed};
 use crate::throughput::{WINDOWS, measure as pace, median_of};
 use twinstep_envs::trot;
 
-/// One way to simulate a robot.
+/// Simulator with its settings.
 #[derive(Clone, Copy)]
 struct Setting {
     simulator: Simulator,
@@ -31,7 +32,7 @@ enum Simulator {
     Batch(SimdPrecision),
 }
 
-/// Wanted joint positions [rad] in an actuator period of a motion.
+/// Function that returns the joint position targets [rad] of an actuator period of a motion.
 type Target = fn(usize) -> PerJoint;
 
 const fn rapier(physics_hz: u32, solver_iterations: u32) -> Setting {
@@ -46,7 +47,7 @@ fn fastest(physics_hz: u32) -> Setting {
     batch(SimdPrecision::Single(InstructionSet::best()), physics_hz)
 }
 
-/// Everything that is measured: rapier, and the batch engine with each instruction set that this processor has.
+/// Returns all measured settings: rapier, and the batch engine with each instruction set of this processor.
 fn settings() -> Vec<Setting> {
     let mut settings =
         vec![rapier(200, 1), rapier(200, 2), rapier(200, 4), rapier(400, 1), rapier(1000, 1), rapier(1000, 4)];
@@ -57,40 +58,41 @@ fn settings() -> Vec<Setting> {
     settings
 }
 
-/// What the others are compared with.
+/// Reference for the accuracy of the other settings.
 const FINEST: Setting = rapier(4000, 4);
-/// Rates at which MuJoCo runs beside ours [Hz].
+/// Physics rates at which MuJoCo is measured [Hz].
 const MUJOCO_HZ: [u32; 3] = [200, 400, 1000];
-/// Numbers of threads at which EnvPool runs beside our environments.
+/// Numbers of threads at which EnvPool is measured.
 const ENVPOOL_THREADS: [usize; 2] = [1, 2];
-/// Rate of the environments' physics [Hz]: the default; EnvPool's has 250.
+/// Physics rate of the environments [Hz]: the default. EnvPool has 250.
 const ENVS_HZ: u32 = 1000;
-/// Robots that are stepped on two cores and on one.
+/// Number of robots in the comparison of one and two cores.
 const MANY: usize = 1024;
-/// Robots in a measured batch.
+/// Number of robots in the other speed measurements.
 const ROBOTS: usize = 64;
-/// The height [m] from which the robots drop onto their feet, by millimetres.
+/// Initial height of the base [m], from which the robots drop by some millimetres onto their feet.
 const START_HEIGHT: f32 = 0.335;
-/// Actuator periods in the second that accuracy is measured over.
+/// Number of actuator periods of the second over which accuracy is measured.
 const SECOND: usize = 200;
-/// Policy periods of the peers' motion: one cycle of the trot.
+/// Policy periods of the baselines' motion: one cycle of the trot.
 const CYCLE: usize = 25;
-/// Gains [N·m/rad, N·m·s/rad]: stiff enough to stand on, in the range of policies for this robot.
+/// Position gain [N·m/rad]: high enough to stand, in the range of policies for this robot.
 const KP: f32 = 40.0;
+/// Velocity gain [N·m·s/rad].
 const KD: f32 = 1.0;
 
-/// Environment steps a second and joint error of every setting, beside the simulators that `python` has.
+/// Measures env-steps/s and joint error of every setting, and the simulators of the interpreter `python`.
 pub fn measure(python: &Path, window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
     let motions: [(&str, Target); 2] = [("stance step", stance_step), ("trot", trot_target)];
     let finest = motions.iter().map(|(_, target)| joint_positions(FINEST, *target)).collect::<Result<Vec<_>, _>>()?;
     let finest_name = name(FINEST);
-    let mut peers = Baselines::start(python, &setup(window_s));
+    let mut baselines = Baselines::start(python, &setup(window_s));
     let (mut rows, mut mujoco) = (Vec::new(), BTreeMap::<u32, Vec<f64>>::new());
     for setting in settings() {
         check(interrupted)?;
         let name = name(setting);
         let case = format!("{name}, one core");
-        let (ours, theirs) = compare_with_mujoco(setting, &mut peers, window_s)?;
+        let (ours, theirs) = compare_with_mujoco(setting, &mut baselines, window_s)?;
         let reference = mujoco_name(setting.physics_hz);
         rows.extend(speed_rows(&case, setting.physics_hz, ours, theirs.map(|rate| (&*reference, rate))));
         mujoco.entry(setting.physics_hz).or_default().extend(theirs);
@@ -110,13 +112,13 @@ pub fn measure(python: &Path, window_s: f64, interrupted: Interrupted) -> Result
     }
     for threads in ENVPOOL_THREADS {
         check(interrupted)?;
-        rows.extend(beside_envpool(threads, &mut peers, window_s)?);
+        rows.extend(compare_with_envpool(threads, &mut baselines, window_s)?);
     }
-    rows.extend(whole_and_parts(window_s)?);
+    rows.extend(task_and_engine(window_s)?);
     Ok(rows)
 }
 
-/// Env-steps a second, and the time that one robot's physics step takes of it, beside a reference.
+/// Returns env-steps/s and the time per physics step of one robot [µs], compared with a reference.
 fn speed_rows(case: &str, physics_hz: u32, rate: f64, reference: Option<(&str, f64)>) -> [Measurement; 2] {
     let steps = go2().control.policy_dt() * f64::from(physics_hz);
     let row = |case: String, value: f64, unit: &'static str| Measurement {
@@ -129,48 +131,53 @@ fn speed_rows(case: &str, physics_hz: u32, rate: f64, reference: Option<(&str, f
     };
     [
         row(case.to_owned(), rate, "env-steps/s"),
-        row(format!("{case}, a physics step of a robot"), 1e6 / (rate * steps), "us"),
+        row(format!("{case}, one physics step of one robot"), 1e6 / (rate * steps), "us"),
     ]
 }
 
-/// Env-steps a second of ours, and of MuJoCo at the same rate if it is there, in turn.
+/// Measures env-steps/s of a setting and, if installed, of MuJoCo at the same physics rate, alternately.
 fn compare_with_mujoco(
     setting: Setting,
-    peers: &mut Baselines,
+    baselines: &mut Baselines,
     window_s: f64,
 ) -> Result<(f64, Option<f64>), BenchError> {
-    let peer = format!("mujoco {}", setting.physics_hz);
+    let baseline = format!("mujoco {}", setting.physics_hz);
     match setting.simulator {
         Simulator::Rapier => {
             let backend = RapierBackend::new(go2(), config(setting), ROBOTS).map_err(failed)?;
-            beside_peer(trotting(backend)?, peers, &peer, window_s)
+            compare_with_baseline(trotting(backend)?, baselines, &baseline, window_s)
         }
         Simulator::Batch(lanes) => {
             let backend = BatchBackend::with_precision(go2(), config(setting), ROBOTS, lanes).map_err(failed)?;
-            beside_peer(trotting(backend)?, peers, &peer, window_s)
+            compare_with_baseline(trotting(backend)?, baselines, &baseline, window_s)
         }
     }
 }
 
-/// Our environments beside EnvPool's, with observations, rewards and resets on both sides.
-fn beside_envpool(threads: usize, peers: &mut Baselines, window_s: f64) -> Result<Vec<Measurement>, BenchError> {
-    let peer = format!("EnvPool Go1 (flat), {ROBOTS} envs, {threads} thread(s)");
-    let (ours, theirs) = beside_peer(walking(ROBOTS, threads)?, peers, &format!("envpool {threads}"), window_s)?;
+/// Measures our environments and EnvPool's, both with observations, rewards and resets.
+fn compare_with_envpool(
+    threads: usize,
+    baselines: &mut Baselines,
+    window_s: f64,
+) -> Result<Vec<Measurement>, BenchError> {
+    let baseline = format!("EnvPool Go1 (flat), {ROBOTS} envs, {threads} thread(s)");
+    let name_in_child = format!("envpool {threads}");
+    let (ours, theirs) = compare_with_baseline(walking(ROBOTS, threads)?, baselines, &name_in_child, window_s)?;
     let case = format!("walk, {}, {ROBOTS} envs, {threads} thread(s)", name(fastest(ENVS_HZ)));
-    let mut rows = vec![row(case, ours, theirs.map(|theirs| (&*peer, theirs)))];
-    rows.extend(theirs.map(|theirs| row(peer.clone(), theirs, None)));
+    let mut rows = vec![row(case, ours, theirs.map(|theirs| (&*baseline, theirs)))];
+    rows.extend(theirs.map(|theirs| row(baseline.clone(), theirs, None)));
     Ok(rows)
 }
 
-/// What the task costs on top of the bare engine, and what the second core brings.
-fn whole_and_parts(window_s: f64) -> Result<[Measurement; 3], BenchError> {
+/// Measures the cost of the task compared with the bare engine, and the speed-up by the second core.
+fn task_and_engine(window_s: f64) -> Result<[Measurement; 3], BenchError> {
     let bare = |threads| {
         let config = SimConfig { threads, ..config(fastest(ENVS_HZ)) };
         trotting(BatchBackend::new(go2(), config, MANY).map_err(failed)?)
     };
-    let (walk, engine) = in_turn(walking(MANY, 1)?, bare(1)?, window_s)?;
-    let (both, one) = in_turn(bare(2)?, bare(1)?, window_s)?;
-    let (walk_both, engine_both) = in_turn(walking(MANY, 2)?, bare(2)?, window_s)?;
+    let (walk, engine) = alternately(walking(MANY, 1)?, bare(1)?, window_s)?;
+    let (both, one) = alternately(bare(2)?, bare(1)?, window_s)?;
+    let (walk_both, engine_both) = alternately(walking(MANY, 2)?, bare(2)?, window_s)?;
     let name = name(fastest(ENVS_HZ));
     let reference = format!("bare {name}, {MANY} robots, one core");
     let reference_both = format!("bare {name}, {MANY} robots, two threads");
@@ -181,7 +188,7 @@ fn whole_and_parts(window_s: f64) -> Result<[Measurement; 3], BenchError> {
     ])
 }
 
-/// A policy period of `num_envs` environments of the task `walk`, again and again.
+/// Returns a function that steps `num_envs` environments of the task `walk` by one policy period.
 fn walking(num_envs: usize, threads: usize) -> Result<impl FnMut() -> Result<(), BenchError>, BenchError> {
     let config = Config { sim: SimConfig { threads, ..config(fastest(ENVS_HZ)) }, ..Config::default() };
     let mut envs = SimEnvFactory::new(config)
@@ -206,8 +213,8 @@ fn row(case: String, value: f64, reference: Option<(&str, f64)>) -> Measurement 
     }
 }
 
-/// Env-steps a second of two of ours with [`MANY`] robots; windows of both in turn.
-fn in_turn(
+/// Measures env-steps/s of two functions that step [`MANY`] robots, in alternate windows.
+fn alternately(
     mut one: impl FnMut() -> Result<(), BenchError>,
     mut other: impl FnMut() -> Result<(), BenchError>,
     window_s: f64,
@@ -220,30 +227,30 @@ fn in_turn(
     Ok((median_of(first), median_of(second)))
 }
 
-/// Env-steps a second of `once`, which steps [`ROBOTS`] robots, and of a peer; windows of both in turn.
-fn beside_peer(
+/// Measures env-steps/s of `once`, which steps [`ROBOTS`] robots, and of a baseline, in alternate windows.
+fn compare_with_baseline(
     mut once: impl FnMut() -> Result<(), BenchError>,
-    peers: &mut Baselines,
-    peer: &str,
+    baselines: &mut Baselines,
+    baseline: &str,
     window_s: f64,
 ) -> Result<(f64, Option<f64>), BenchError> {
     let (mut ours, mut theirs) = (Vec::new(), Vec::new());
     for _ in 0..WINDOWS {
         ours.push(pace(window_s, &mut once)?.per_second * ROBOTS as f64);
-        if peers.has(peer) {
-            theirs.push(peers.window(peer)?);
+        if baselines.has(baseline) {
+            theirs.push(baselines.window(baseline)?);
         }
     }
     Ok((median_of(ours), (!theirs.is_empty()).then(|| median_of(theirs))))
 }
 
-/// What the peers need to trot as ours do.
+/// Returns the setup with which the baselines execute the same trot.
 fn setup(window_s: f64) -> Setup {
     let control = go2().control;
     let model = |physics_hz: u32| {
         let actuator = MjcfActuator::Position { kp: f64::from(KP), kd: f64::from(KD) };
         let timestep = 1.0 / f64::from(physics_hz);
-        (physics_hz, mjcf(&go2(), &MjcfOptions { base: BaseMount::Floating, timestep, actuator: actuator }))
+        (physics_hz, mjcf(&go2(), &MjcfOptions { base: BaseMount::Floating, timestep, actuator }))
     };
     Setup {
         models: MUJOCO_HZ.into_iter().map(model).collect(),
@@ -278,19 +285,19 @@ fn config(Setting { simulator, physics_hz, solver_iterations }: Setting) -> SimC
     SimConfig { engine, physics_hz, solver_iterations, threads: 1, ..SimConfig::default() }
 }
 
-fn place(backend: &mut impl Backend) -> Result<(), BenchError> {
-    let placement = InitialState::at_rest(START_HEIGHT, go2().control.default_pose_f32());
-    let placements: Vec<_> = (0..backend.num_robots()).map(|robot| (robot, placement)).collect();
-    backend.reset(&placements).map_err(failed)
+fn reset_all(backend: &mut impl Backend) -> Result<(), BenchError> {
+    let start = InitialState::at_rest(START_HEIGHT, go2().control.default_pose_f32());
+    let starts: Vec<_> = (0..backend.num_robots()).map(|robot| (robot, start)).collect();
+    backend.reset(&starts).map_err(failed)
 }
 
 fn command(target: PerJoint) -> Command {
     Command::hold(target, KP, KD)
 }
 
-/// A policy period of all robots of `backend`, again and again.
+/// Returns a function that steps all robots of `backend` by one policy period.
 fn trotting(mut backend: impl Backend) -> Result<impl FnMut() -> Result<(), BenchError>, BenchError> {
-    place(&mut backend)?;
+    reset_all(&mut backend)?;
     let (decimation, active) = (go2().control.decimation, vec![true; backend.num_robots()]);
     let mut period = 0;
     Ok(move || {
@@ -300,18 +307,18 @@ fn trotting(mut backend: impl Backend) -> Result<impl FnMut() -> Result<(), Benc
     })
 }
 
-/// Joint positions after each actuator period of one second, after half a second to settle.
+/// Returns the joint positions after each actuator period of one second, after half a second of settling.
 fn joint_positions(setting: Setting, target: Target) -> Result<Vec<PerJoint>, BenchError> {
     match setting.simulator {
-        Simulator::Rapier => play(RapierBackend::new(go2(), config(setting), 1).map_err(failed)?, target),
+        Simulator::Rapier => record(RapierBackend::new(go2(), config(setting), 1).map_err(failed)?, target),
         Simulator::Batch(lanes) => {
-            play(BatchBackend::with_precision(go2(), config(setting), 1, lanes).map_err(failed)?, target)
+            record(BatchBackend::with_precision(go2(), config(setting), 1, lanes).map_err(failed)?, target)
         }
     }
 }
 
-fn play(mut backend: impl Backend, target: Target) -> Result<Vec<PerJoint>, BenchError> {
-    place(&mut backend)?;
+fn record(mut backend: impl Backend, target: Target) -> Result<Vec<PerJoint>, BenchError> {
+    reset_all(&mut backend)?;
     let stand = command(go2().control.default_pose_f32());
     backend.step(&[stand], &[true], SECOND / 2).map_err(failed)?;
     (0..SECOND)
@@ -322,7 +329,7 @@ fn play(mut backend: impl Backend, target: Target) -> Result<Vec<PerJoint>, Benc
         .collect()
 }
 
-/// Every joint is told to move by 0.2 rad at once.
+/// Returns the targets of a step: thighs and hips by 0.1 rad, calves by −0.2 rad.
 fn stance_step(_: usize) -> PerJoint {
     let pose = go2().control.default_pose_f32();
     std::array::from_fn(|j| pose[j] + if j % 3 == 2 { -0.2 } else { 0.1 })

@@ -1,4 +1,4 @@
-//! The reference: a raw TCP ping-pong between two processes, with the payload sizes of a step.
+//! Reference of the transport: raw TCP ping-pong between two processes, with the payload sizes of a step.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -6,7 +6,7 @@ use std::process::{Child, Command, Stdio};
 
 use crate::error::{BenchError, failed};
 
-/// A connection to an echo process: it reads `request` bytes and writes `reply` bytes, again and again.
+/// Connection to an echo process, which reads `request` bytes and writes `reply` bytes in a loop.
 pub struct PingPong {
     stream: TcpStream,
     request: Vec<u8>,
@@ -15,7 +15,7 @@ pub struct PingPong {
 }
 
 impl PingPong {
-    /// Starts the other process and connects.
+    /// Starts the echo process and connects to it.
     pub fn start(request: usize, reply: usize) -> Result<Self, BenchError> {
         let mut child = Command::new(std::env::current_exe().map_err(failed)?)
             .args(["bench", "tcp-echo"])
@@ -34,7 +34,7 @@ impl PingPong {
         Ok(Self { stream, request: vec![0; request], reply: vec![0; reply], child })
     }
 
-    /// One round trip.
+    /// Executes one round trip.
     pub fn once(&mut self) -> Result<(), BenchError> {
         self.stream.write_all(&self.request).map_err(failed)?;
         self.stream.read_exact(&mut self.reply).map_err(failed)
@@ -43,13 +43,13 @@ impl PingPong {
 
 impl Drop for PingPong {
     fn drop(&mut self) {
-        // The echo ends when the connection does.
+        // The echo process stops when the connection is closed.
         let _ = self.stream.shutdown(std::net::Shutdown::Both);
         let _ = self.child.wait();
     }
 }
 
-/// The other end: prints its address, answers one connection, ends with it.
+/// Runs the echo process: prints its address and serves one connection until it is closed.
 pub fn echo() -> Result<(), BenchError> {
     let listener = TcpListener::bind("127.0.0.1:0").map_err(failed)?;
     println!("{}", listener.local_addr().map_err(failed)?);

@@ -1,4 +1,4 @@
-//! Round trips with the physics switched off: the task `counter`, beside a raw TCP ping-pong.
+//! Round trips without physics: the task `counter`, compared with a raw TCP ping-pong.
 
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_model::{ResetRequest, StepBatch, VecEnv};
@@ -10,14 +10,14 @@ use crate::tcp::PingPong;
 use crate::throughput::{Throughput, WINDOWS, measure as pace, median};
 use twinstep_client::ServerProcess;
 
-/// Environments in a message, and whether through shared memory.
+/// Number of environments in a message, and whether it uses shared memory.
 const CASES: [(usize, bool); 6] = [(1, false), (64, false), (1024, false), (1024, true), (4096, false), (4096, true)];
 
-/// Round trips a second and median latency of each case.
+/// Measures round trips per second and median latency of each case.
 pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
     let mut rows = Vec::new();
     for (num_envs, shared_memory) in CASES {
-        let (ours, tcp) = side_by_side(num_envs, shared_memory, window_s, interrupted)?;
+        let (ours, tcp) = compare(num_envs, shared_memory, window_s, interrupted)?;
         let profile = if shared_memory { ", shared memory" } else { "" };
         let reference = Some("raw TCP ping-pong with the same payloads".to_owned());
         rows.push(Measurement {
@@ -38,8 +38,8 @@ pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measuremen
     Ok(rows)
 }
 
-/// Windows of ours and of TCP in turn, so that both see the same machine.
-fn side_by_side(
+/// Measures windows of Twinstep and of TCP alternately, so that both have the same load of the machine.
+fn compare(
     num_envs: usize,
     shared_memory: bool,
     window_s: f64,

@@ -13,7 +13,7 @@ use twinstep_logs::Log;
 
 use crate::cross_evaluation;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
-use twinstep_report::chart::{self, GREY, HPos, Line, ORANGE, Panel, PlotError, RGBColor};
+use twinstep_report::chart::{self, GREY, HPos, Line, ORANGE, Panel, PlotError};
 
 /// Interval at which a running training is saved.
 const SAVE_EVERY: Duration = Duration::from_secs(30);

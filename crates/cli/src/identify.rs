@@ -129,7 +129,7 @@ pub fn run(args: &Args) -> CommandResult {
     std::fs::write(&args.out, found.model.to_toml()).map_err(unwritable)?;
     match &found.checkpoint {
         Some(checkpoint) => {
-            std::fs::write(&search, serde_json::to_string(checkpoint).map_err(other)?).map_err(unwritable)?
+            std::fs::write(&search, serde_json::to_string(checkpoint).map_err(other)?).map_err(unwritable)?;
         }
         None if search.exists() => std::fs::remove_file(&search).map_err(unwritable)?,
         None => {}

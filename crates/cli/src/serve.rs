@@ -30,13 +30,14 @@ pub struct Args {
     /// Config file (TOML) with [server], [task], [sim] and [randomise]. Flags override its values.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Name of the robot, by which clients find the server.
+    /// Name of the robot, by which clients find the server. Default: go2.
     #[arg(long)]
     name: Option<String>,
-    /// Task: walk, or counter (no physics, to measure the transport).
+    /// Task: walk, or counter (no physics, to measure the transport). Default: walk.
     #[arg(long, value_parser = task_name)]
     task: Option<TaskName>,
     /// Maximum number of environments of all clients together. Each client requests its number with its lease.
+    /// Default: 4096.
     #[arg(long, value_name = "N")]
     envs: Option<usize>,
     /// Model file of the robot. Default: the ideal Go2.
@@ -60,13 +61,13 @@ pub struct Args {
     /// Rate of the physics [Hz], a multiple of the actuators' 200 Hz. Default: 200 with rapier, 1000 with batch.
     #[arg(long, value_name = "HZ")]
     physics_hz: Option<u32>,
-    /// Number of threads that step robots; 0 uses all cores.
+    /// Number of threads that step robots; 0 uses all cores. Default: 0.
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
     /// Sample every parameter of the model file that has an interval, for every robot in every episode.
     #[arg(long)]
     randomise_effects: bool,
-    /// Time for which the environments of a disconnected client are kept [s].
+    /// Time for which the environments of a disconnected client are kept [s]. Default: 10.
     #[arg(long, value_name = "S")]
     lease_grace_s: Option<f64>,
     /// Seed of environments that a client does not seed.

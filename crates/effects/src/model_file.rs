@@ -464,7 +464,7 @@ mod tests {
         check_refusal(
             &FRICTION.replace("coulomb_friction", "coulomb"),
             &expect![[
-                r#"robot.toml: effect 1: `name` = "coulomb" is not in the catalogue; possible: command_delay, encoder_offset, torque_saturation, supply_sag, thermal_derating, torque_delay, torque_speed_limit, drive_lag, torque_sensor_delay, torque_gain, torque_ripple, backlash, joint_elasticity, coulomb_friction, viscous_friction, stribeck_friction, load_friction, armature, joint_spring, payload, com_shift, inertia, ground_friction, ground_stiffness, gyro_bias"#
+                r#"robot.toml: effect 1: `name` = "coulomb" is not in the catalogue; possible: command_delay, encoder_offset, pd_gain, torque_saturation, supply_sag, thermal_derating, torque_delay, torque_speed_limit, torque_dead_zone, drive_lag, torque_sensor_delay, torque_gain, torque_ripple, backlash, joint_elasticity, coulomb_friction, viscous_friction, stribeck_friction, load_friction, armature, joint_spring, payload, com_shift, inertia, ground_friction, ground_stiffness, gyro_bias"#
             ]],
         );
         check_refusal(FRICTION, &expect![[r#"robot.toml: effect 1: `torque_nm` is missing; expected a number"#]]);

@@ -1,4 +1,4 @@
-//! What is hidden in a case; everything follows from the seed of the game and the case's number.
+//! Samples the cases of a blind test. Seed and case number determine everything.
 
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
@@ -8,23 +8,23 @@ use twinstep_model::{Joint, JointKind, Leg, Stream, standard_normal, stream};
 
 use crate::unmodelled::UnmodelledEffect;
 
-/// What a case hides.
+/// Kind of a case: what it hides.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum CaseKind {
-    /// One effect, from half of its plausible range on.
+    /// One effect of half its prior range or more.
     LargeEffect,
-    /// One effect, at a fifth of its plausible range.
+    /// One effect of a fifth of its prior range.
     SmallEffect,
-    /// Nothing.
+    /// No effect.
     Healthy,
-    /// Something that the catalogue does not have.
+    /// One effect outside the catalogue.
     UnmodelledEffect,
-    /// Two effects, each from half of its plausible range on.
+    /// Two effects, each of half its prior range or more.
     TwoEffects,
 }
 
-/// How often each kind comes in a shuffled deck, so that any 28 cases in a row from a multiple of 28 have the same mix.
+/// Number of cases of each kind among 28 cases, which are then shuffled. Cases 28 k to 28 k + 27 have this mix.
 const CASE_MIX: [(CaseKind, usize); 5] = [
     (CaseKind::LargeEffect, 6),
     (CaseKind::SmallEffect, 6),
@@ -33,35 +33,35 @@ const CASE_MIX: [(CaseKind, usize); 5] = [
     (CaseKind::TwoEffects, 4),
 ];
 
-/// Where the robot moves.
+/// Mounting of the base during a case.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum BaseSchedule {
-    /// The base is fixed.
+    /// Fixed base.
     Fixed,
-    /// The robot stands.
+    /// Floating base: the robot stands.
     Floating,
-    /// First one, then the other.
+    /// First fixed, then floating.
     FixedThenFloating,
 }
 
-/// What the log will have, whatever is hidden.
+/// Base mounting and channels of a case's log; independent of the hidden effects.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LogSetup {
-    /// Where the robot moves.
+    /// Mounting of the base.
     pub place: BaseSchedule,
-    /// Whether the motors' current was measured.
+    /// True if the motor currents are measured.
     pub torque: bool,
-    /// Whether the supply's voltage was measured.
+    /// True if the supply voltage is measured.
     pub battery: bool,
-    /// Whether the motors' temperatures were measured.
+    /// True if the motor temperatures are measured.
     pub temperature: bool,
 }
 
-/// What an effect needs to show.
+/// Requirement on a log for an effect to be visible.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Requirement {
-    /// Legs that are free to move fast, creep and step.
+    /// Legs in the air: fast motion, slow motion and steps.
     Air,
     /// Feet on the ground.
     Ground,
@@ -70,8 +70,10 @@ enum Requirement {
     Temperature,
 }
 
-/// What each effect needs to show. Not drawn are `inertia`, ten numbers that are another way to say payload and shift,
-/// and `ground_friction`: no foot slips in these motions.
+/// Requirements of each effect.
+///
+/// Two effects are not sampled: `inertia`, whose ten parameters also describe a payload or a centre-of-mass shift, and
+/// `ground_friction`, because no foot slips in these motions.
 const NEEDS: [(&str, &[Requirement]); 25] = [
     ("command_delay", &[Requirement::Air]),
     ("encoder_offset", &[Requirement::Ground]),
@@ -100,25 +102,25 @@ const NEEDS: [(&str, &[Requirement]); 25] = [
     ("gyro_bias", &[Requirement::Ground]),
 ];
 
-/// One round of the game.
+/// One case of a blind test.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Case {
-    /// Of the game.
+    /// Seed of the blind test.
     pub seed: u64,
-    /// Of the case, from 0.
+    /// Number of the case, from 0.
     pub number: u64,
-    /// What it hides.
+    /// Kind of the case.
     pub kind: CaseKind,
-    /// What the log will have.
+    /// Base mounting and channels of the log.
     pub setting: LogSetup,
     /// Hidden effects of the catalogue.
     pub hidden: Vec<EffectEntry>,
-    /// What else is hidden.
+    /// Hidden effect outside the catalogue.
     pub outside: Option<UnmodelledEffect>,
 }
 
 impl Case {
-    /// Case `number` of the game with this seed.
+    /// Samples case `number` of the blind test with this seed.
     pub fn draw(seed: u64, number: u64) -> Self {
         let kind = kind(seed, number);
         let setting = setting(&mut stream(seed, "hunt setting", number));
@@ -133,26 +135,26 @@ impl Case {
         Self { seed, number, kind, setting, hidden, outside }
     }
 
-    /// The named random stream of this case.
+    /// Returns the random stream of this case with this name.
     pub fn stream(&self, name: &str) -> Stream {
         stream(self.seed, name, self.number)
     }
 
-    /// The true effects in our own model; of what is outside the catalogue it has nothing.
+    /// Returns the ground truth as a model file, without an effect outside the catalogue.
     pub fn truth(&self) -> ModelFile {
         ModelFile { effects: self.hidden.clone(), ..ModelFile::default() }
     }
 }
 
 fn kind(seed: u64, number: u64) -> CaseKind {
-    let mut deck: Vec<_> = CASE_MIX.iter().flat_map(|(kind, count)| std::iter::repeat_n(*kind, *count)).collect();
-    let size = deck.len() as u64;
+    let mut kinds: Vec<_> = CASE_MIX.iter().flat_map(|(kind, count)| std::iter::repeat_n(*kind, *count)).collect();
+    let size = kinds.len() as u64;
     let random = &mut stream(seed, "hunt deck", number / size);
-    // Fisher and Yates.
-    for last in (1..deck.len()).rev() {
-        deck.swap(last, random.random_range(0..=last));
+    // Fisher–Yates shuffle.
+    for last in (1..kinds.len()).rev() {
+        kinds.swap(last, random.random_range(0..=last));
     }
-    deck[(number % size) as usize]
+    kinds[(number % size) as usize]
 }
 
 fn setting(random: &mut impl Rng) -> LogSetup {
@@ -180,37 +182,37 @@ impl LogSetup {
         }
     }
 
-    /// Effects that a log of this setting can show.
-    fn shown(self) -> Vec<&'static Effect> {
-        let shown = NEEDS.iter().filter(|(_, needs)| needs.iter().all(|need| self.has(*need)));
-        shown.map(|(name, _)| Effect::named(name).expect("in the catalogue")).collect()
+    /// Returns the effects whose requirements this log meets.
+    fn visible_effects(self) -> Vec<&'static Effect> {
+        let visible = NEEDS.iter().filter(|(_, needs)| needs.iter().all(|need| self.has(*need)));
+        visible.map(|(name, _)| Effect::named(name).expect("in the catalogue")).collect()
     }
 }
 
-/// An effect with a size of half of its plausible range to all of it.
+/// Samples an effect with a size of half its prior range to all of it.
 fn from_half(setting: LogSetup, random: &mut impl Rng) -> EffectEntry {
     let share = random.random_range(0.5..1.0);
     entry(setting, share, random)
 }
 
-/// An effect at `share` of the way from nothing to the end of what is plausible.
+/// Samples an effect whose size is `share` of the distance from no effect to the end of its prior range.
 fn entry(setting: LogSetup, share: f64, random: &mut impl Rng) -> EffectEntry {
-    let shown = setting.shown();
-    let effect = shown[random.random_range(0..shown.len())];
+    let visible = setting.visible_effects();
+    let effect = visible[random.random_range(0..visible.len())];
     let scope = scope(effect.target, random);
-    EffectEntry::new(effect, scope, values(effect, share, random)).expect("plausible values are allowed")
+    EffectEntry::new(effect, scope, values(effect, share, random)).expect("values of the prior range are allowed")
 }
 
-/// Two effects that are not taken for each other and meet at no joint.
+/// Samples two effects that are not confounders of each other and have no joint in common.
 fn two(setting: LogSetup, random: &mut impl Rng) -> Vec<EffectEntry> {
     loop {
         let pair = [from_half(setting, random), from_half(setting, random)];
         let [one, other] = &pair;
-        let meet = Joint::ALL.into_iter().any(|joint| one.scope.contains(joint) && other.scope.contains(joint));
-        let confused = |one: &Effect, other: &Effect| one.confounders.iter().any(|like| like.effect == other.name);
-        let alike =
-            one.effect == other.effect || confused(one.effect, other.effect) || confused(other.effect, one.effect);
-        if !meet && !alike {
+        let overlap = Joint::ALL.into_iter().any(|joint| one.scope.contains(joint) && other.scope.contains(joint));
+        let lists = |one: &Effect, other: &Effect| one.confounders.iter().any(|item| item.effect == other.name);
+        let confounded =
+            one.effect == other.effect || lists(one.effect, other.effect) || lists(other.effect, one.effect);
+        if !overlap && !confounded {
             return pair.to_vec();
         }
     }
@@ -232,7 +234,7 @@ fn scope(target: Target, random: &mut impl Rng) -> Scope {
     }
 }
 
-/// The first parameter is the effect's size; the others are anywhere in what is plausible.
+/// Returns the parameter values of an effect. The first parameter has the size `share`; the others are sampled.
 fn values(effect: &Effect, share: f64, random: &mut impl Rng) -> Vec<f64> {
     let mut values = Vec::new();
     for (index, parameter) in effect.parameters.iter().enumerate() {
@@ -244,7 +246,7 @@ fn values(effect: &Effect, share: f64, random: &mut impl Rng) -> Vec<f64> {
             let length = way.iter().map(|part| part * part).sum::<f64>().sqrt();
             values.extend(way.iter().map(|part| part / length * share * high));
         } else if parameter.no_effect_value.is_infinite() {
-            // A limit or a stiffness: what counts is its inverse, 0 for none.
+            // A limit or a stiffness: its size is its inverse, which is 0 for no effect.
             values.push(low / share);
         } else {
             values.push(
@@ -256,7 +258,7 @@ fn values(effect: &Effect, share: f64, random: &mut impl Rng) -> Vec<f64> {
     values
 }
 
-/// The end of the range that is farther from the neutral value; any of two as far.
+/// Returns the end of the range that is farther from the no-effect value; a random end if both are equally far.
 fn far_end(neutral: f64, [low, high]: [f64; 2], random: &mut impl Rng) -> f64 {
     let (down, up) = (neutral - low, high - neutral);
     let downwards = if (down - up).abs() < 1e-9 { random.random_bool(0.5) } else { down > up };
@@ -274,13 +276,13 @@ mod tests {
     #[test]
     fn every_effect_but_inertia_and_ground_friction_can_be_hidden() {
         let known: Vec<_> = NEEDS.iter().map(|(name, _)| *name).collect();
-        let left_out = ["inertia", "ground_friction"];
-        let catalogue = CATALOGUE.iter().map(|effect| effect.name).filter(|name| !left_out.contains(name));
+        let excluded = ["inertia", "ground_friction"];
+        let catalogue = CATALOGUE.iter().map(|effect| effect.name).filter(|name| !excluded.contains(name));
         assert_eq!(catalogue.collect::<Vec<_>>(), known);
     }
 
     #[test]
-    fn two_hundred_cases_have_the_mix_that_is_promised() {
+    fn two_hundred_cases_have_the_stated_mix() {
         let count = |kind| (0..200).filter(|number| super::kind(3, *number) == kind).count();
         assert!(count(CaseKind::Healthy) >= 50, "a quarter");
         assert!(count(CaseKind::TwoEffects) >= 28 && count(CaseKind::UnmodelledEffect) >= 28, "a seventh");
@@ -288,19 +290,19 @@ mod tests {
     }
 
     #[test]
-    fn same_seed_and_number_draw_the_same_case_and_another_seed_another() {
+    fn seed_and_number_determine_the_case() {
         let cases = |seed| (0..20).map(|number| Case::draw(seed, number)).collect::<Vec<_>>();
         assert_eq!(cases(5), cases(5));
         assert_ne!(cases(5), cases(6));
     }
 
     #[test]
-    fn every_case_is_a_robot_and_shows_what_it_hides() {
+    fn every_case_is_a_valid_robot_with_visible_effects() {
         for number in 0..300 {
             let case = Case::draw(1, number);
-            apply_effects(&go2(), &case.hidden).expect("a robot");
-            let shown = case.setting.shown();
-            assert!(case.hidden.iter().all(|entry| shown.contains(&entry.effect)), "{case:?}");
+            apply_effects(&go2(), &case.hidden).expect("a valid robot");
+            let visible = case.setting.visible_effects();
+            assert!(case.hidden.iter().all(|entry| visible.contains(&entry.effect)), "{case:?}");
             let hidden = match case.kind {
                 CaseKind::LargeEffect | CaseKind::SmallEffect => 1,
                 CaseKind::TwoEffects => 2,
@@ -311,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn fifth_of_the_range_is_a_fifth_of_the_way_from_nothing() {
+    fn size_is_relative_to_the_distance_from_no_effect() {
         let random = &mut stream(0, "test", 0);
         let mut of = |name: &str| values(Effect::named(name).expect("known"), 0.2, random)[0];
         assert!((of("coulomb_friction") - 0.3).abs() < 1e-12);

@@ -1,4 +1,6 @@
-//! The sealed robot and its log: another engine, a finer step, slightly other masses, lengths and contact.
+//! Ground-truth robot of a case and its log.
+//!
+//! The robot runs in another engine at a smaller time step. It has small errors of mass, leg mounts and contact.
 
 use rand::{Rng, RngExt};
 use twinstep_effects::apply_effects;
@@ -11,16 +13,17 @@ use crate::draw::Case;
 use crate::motion::{RATE_HZ, motion};
 use crate::unmodelled::PerturbedBackend;
 
-/// Rate of the plant's physics [Hz]; the model's is 1000.
+/// Physics rate of the ground truth [Hz]; that of the model is 1000.
 const PHYSICS_HZ: u32 = 4000;
-/// Errors of masses, relative, and of where the legs are mounted [m]: below what anybody should name.
+/// Maximum relative error of the masses, too small to be reported as a cause.
 const MASS_ERROR: f64 = 0.01;
+/// Maximum error of the leg mounting positions [m], too small to be reported as a cause.
 const LENGTH_ERROR: f64 = 0.002;
 
-/// The log of a case; `progress` may end it.
+/// Simulates the log of a case. `progress` receives the number of completed rows and returns false to interrupt.
 pub fn log_of(case: &Case, progress: &mut dyn FnMut(usize) -> bool) -> Result<Log, RecordError> {
     let robot = perturbed(&mut case.stream("hunt body"));
-    let robot = apply_effects(&robot, &case.hidden).expect("drawn so that it is a robot");
+    let robot = apply_effects(&robot, &case.hidden).expect("cases are sampled as valid robots");
     let backend = |base: BaseMount, robot: &RobotModel| {
         let physics_hz = Some(PHYSICS_HZ);
         let config = SimConfig { engine: Engine::Rapier, base, physics_hz, threads: 1, ..SimConfig::default() };
@@ -30,25 +33,25 @@ pub fn log_of(case: &Case, progress: &mut dyn FnMut(usize) -> bool) -> Result<Lo
             .map_err(|error| RecordError::Backend(error.into()))
     };
     let motion = motion(case.setting, &mut case.stream("hunt motion"));
-    // Says nothing of what is hidden.
+    // The source of the log does not reveal the hidden effects.
     let exact = record(&motion, &robot, None, backend, "twinstep hunt".to_owned(), progress)?;
     let random = &mut case.stream("hunt sensors");
     let sensors = sensors(random);
-    let shown = torque_sensor(&exact, &robot, case.setting.torque)?;
-    Ok(apply_sensors(&shown, &sensors, random.random())?)
+    let delayed = torque_sensor(&exact, &robot, case.setting.torque)?;
+    Ok(apply_sensors(&delayed, &sensors, random.random())?)
 }
 
-/// The built-in robot, not quite.
+/// Returns the built-in robot with small random errors.
 fn perturbed(random: &mut impl Rng) -> RobotModel {
     let mut robot = go2();
-    let mut error = |most: f64| random.random_range(-most..most);
+    let mut error = |max: f64| random.random_range(-max..max);
     robot.trunk = robot.trunk.scaled(1.0 + error(MASS_ERROR));
     for leg in &mut robot.legs {
         for body in &mut leg.bodies {
             *body = body.scaled(1.0 + error(MASS_ERROR));
         }
-        // Where the leg is mounted, and no length beyond: errors of a whole leg would add up to more than 2 mm at its foot,
-        // and a foot 2 mm too low turns the standing robot's joints by 10 mrad already.
+        // Only the mounting position has an error. Errors of all lengths of a leg would add up to more than 2 mm at its
+        // foot, and a foot that is 2 mm too low changes the joint angles of the standing robot by 10 mrad.
         let mount = &mut leg.origins[0];
         for length in [&mut mount.x, &mut mount.y, &mut mount.z] {
             *length += error(LENGTH_ERROR);
@@ -59,11 +62,11 @@ fn perturbed(random: &mut impl Rng) -> RobotModel {
     robot
 }
 
-/// Noise and steps.
+/// Samples noise and resolution of the sensors.
 fn sensors(random: &mut impl Rng) -> Vec<Sensor> {
-    let mut sensor = |quantity, [low, high]: [f64; 2], step| {
+    let mut sensor = |quantity, [low, high]: [f64; 2], resolution| {
         let sigma = random.random_range(low..high);
-        Sensor { quantity, sigma, resolution: step }
+        Sensor { quantity, sigma, resolution }
     };
     vec![
         sensor("q", [0.0005, 0.002], 0.0002),
@@ -77,7 +80,7 @@ fn sensors(random: &mut impl Rng) -> Vec<Sensor> {
     ]
 }
 
-/// The torque channels as late as the robot's sensors are, or none of them; a recording has the torque itself.
+/// Delays the torque channels by the delay of the robot's sensors, or removes them if torque is not measured.
 fn torque_sensor(log: &Log, robot: &RobotModel, measured: bool) -> Result<Log, LogError> {
     let mut meta = log.meta().clone();
     if !measured {
@@ -96,24 +99,24 @@ fn torque_sensor(log: &Log, robot: &RobotModel, measured: bool) -> Result<Log, L
         };
         if measured {
             let joint: Joint = joint.parse().expect("one of the twelve");
-            let late = robot.joints[joint.index()].actuator.sensor_delay * RATE_HZ;
-            let parts = log.segments().flat_map(|(_, rows)| delayed(&cells[rows], late));
+            let delay = robot.joints[joint.index()].actuator.sensor_delay * RATE_HZ;
+            let parts = log.segments().flat_map(|(_, rows)| delayed(&cells[rows], delay));
             columns.push((name.to_owned(), parts.collect()));
         }
     }
     Log::new(meta, columns)
 }
 
-/// `cells` of one part `late` rows late; a whole number of rows or not.
-fn delayed(cells: &[f64], late: f64) -> Vec<f64> {
-    let shown = |row: usize| {
-        let place = (row as f64 - late).max(0.0);
-        let (before, part) = (place.floor() as usize, place.fract());
+/// Returns `cells` of one contiguous range with a delay of `delay` rows, interpolated linearly.
+fn delayed(cells: &[f64], delay: f64) -> Vec<f64> {
+    let value = |row: usize| {
+        let position = (row as f64 - delay).max(0.0);
+        let (before, part) = (position.floor() as usize, position.fract());
         let after = cells[(before + 1).min(cells.len() - 1)];
         if part > 0.0 { cells[before] * (1.0 - part) + after * part } else { cells[before] }
     };
-    // The last row has no torque, however late the others are.
-    (0..cells.len()).map(|row| if cells[row].is_nan() { f64::NAN } else { shown(row) }).collect()
+    // Rows without torque, such as the last one, stay without it.
+    (0..cells.len()).map(|row| if cells[row].is_nan() { f64::NAN } else { value(row) }).collect()
 }
 
 #[cfg(test)]
@@ -136,7 +139,7 @@ mod tests {
             [(BaseSchedule::Fixed, 1), (BaseSchedule::Floating, 2), (BaseSchedule::FixedThenFloating, 3)]
         {
             let folder = tempfile::tempdir().expect("a folder");
-            let log = log_of(&case(place, seed, Vec::new()), &mut |_| true).expect("the robot gets through");
+            let log = log_of(&case(place, seed, Vec::new()), &mut |_| true).expect("the simulation succeeds");
             log.write(folder.path()).expect("written");
             let log = Log::open(folder.path()).expect("a log");
             for channel in ["dq_RR_calf", "tau_measured_FL_hip", "battery_V", "kp"] {
@@ -158,20 +161,20 @@ mod tests {
     }
 
     #[test]
-    fn late_torque_sensor_shows_in_the_torque_alone() {
+    fn delay_of_the_torque_sensor_changes_only_the_torque() {
         let effect = Effect::named("torque_sensor_delay").expect("known");
-        let late = EffectEntry::new(effect, Scope::All, vec![0.0125]).expect("allowed");
-        let [healthy, late] = [vec![], vec![late]].map(|hidden| {
+        let delay = EffectEntry::new(effect, Scope::All, vec![0.0125]).expect("allowed");
+        let [healthy, delayed] = [vec![], vec![delay]].map(|hidden| {
             let case = case(BaseSchedule::Fixed, 1, hidden);
-            log_of(&case, &mut |_| true).expect("the robot gets through")
+            log_of(&case, &mut |_| true).expect("the simulation succeeds")
         });
-        assert_eq!(healthy.q("FL_calf"), late.q("FL_calf"));
-        let [healthy, late] = [&healthy, &late].map(|log| log.tau_measured("FL_calf").expect("measured"));
-        assert_ne!(healthy, late);
+        assert_eq!(healthy.q("FL_calf"), delayed.q("FL_calf"));
+        let [healthy, delayed] = [&healthy, &delayed].map(|log| log.tau_measured("FL_calf").expect("measured"));
+        assert_ne!(healthy, delayed);
     }
 
     #[test]
-    fn late_cells_are_between_their_neighbours() {
+    fn delayed_cells_are_interpolated() {
         assert_eq!(delayed(&[1.0, 2.0, 4.0, 8.0], 1.5)[1..], [1.0, 1.5, 3.0]);
         assert_eq!(delayed(&[1.0, 2.0], 0.0), [1.0, 2.0]);
     }

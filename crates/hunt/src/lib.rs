@@ -1,4 +1,4 @@
-//! `twinstep hunt`: hide effects, diagnose, judge.
+//! Blind test of diagnosis: hides effects in simulated robots, diagnoses their logs and scores the findings.
 
 mod draw;
 mod ground_truth;
@@ -40,32 +40,32 @@ pub struct HuntConfig {
 /// Called with the number of completed cases; returns true once the user has asked to stop.
 pub type Interrupted<'a> = &'a dyn Fn() -> bool;
 
-/// A line of `cases.jsonl`: a case and what came of it.
+/// Line of `cases.jsonl`: a case and its result.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct CaseResult {
-    /// Of the game.
+    /// Seed of the blind test.
     seed: u64,
-    /// Of the case.
+    /// Number of the case.
     case: u64,
     kind: CaseKind,
     setting: LogSetup,
     outside: Option<UnmodelledEffect>,
-    /// Errors on the log of the model that the diagnosis was given.
+    /// Errors of the given model on the log.
     nominal: RmsErrors,
-    /// Errors on the log of the true effects in our own model.
+    /// Errors of the true model on the log.
     truth: RmsErrors,
     verdict: Score,
-    /// What the diagnosis complained of, if it gave no answer.
+    /// Error message of a failed diagnosis.
     error: Option<String>,
-    /// Time of the diagnosis [s].
+    /// Duration of the diagnosis [s].
     seconds: f64,
 }
 
-/// Why a game cannot be played.
+/// Reason why a blind test cannot run.
 #[derive(Debug, thiserror::Error)]
 pub enum HuntError {
     /// The folder holds another blind test.
-    #[error("{} has a blind test already\n  --resume continues it; or name another --out", .0.display())]
+    #[error("{} has a blind test already\n  continue it with --resume, or choose another --out", .0.display())]
     Exists(PathBuf),
     /// A line of `cases.jsonl` is not a result.
     #[error("{}:{line}: {cause}", path.display())]
@@ -78,7 +78,10 @@ pub enum HuntError {
         cause: serde_json::Error,
     },
     /// The folder's results have another seed.
-    #[error("{} has the results of seed {theirs}, not {ours}\n  name another --out", path.display())]
+    #[error(
+        "{} has the results of seed {theirs}, not {ours}\n  use --seed {theirs}, or choose another --out",
+        path.display()
+    )]
     OtherSeed {
         /// The file.
         path: PathBuf,
@@ -92,15 +95,15 @@ pub enum HuntError {
     File {
         /// The file.
         path: PathBuf,
-        /// The system's answer.
+        /// Error of the operating system.
         cause: std::io::Error,
     },
-    /// The diagnosing program refuses its input.
+    /// The diagnosing program rejects its input.
     #[error("the diagnosis of {} does not start: {message}", log.display())]
     NoDiagnosis {
         /// The log.
         log: PathBuf,
-        /// What the program printed.
+        /// Error message of the program.
         message: String,
     },
     /// The user interrupted it.
@@ -122,7 +125,8 @@ fn failed(error: impl std::error::Error + Send + Sync + 'static) -> HuntError {
     HuntError::Failed(Box::new(error))
 }
 
-/// A command that diagnoses the first path, a log, with the second, a model, and may write to the third, a folder.
+/// Function that returns a command. The command diagnoses a log (first path) with a model (second path) and may write
+/// to a folder (third path).
 pub type Diagnose = dyn Fn(&Path, &Path, &Path) -> Command;
 
 /// Runs all cases with a diagnosing program and returns the table, which it also writes to `hunt.md`.
@@ -135,20 +139,20 @@ pub fn hunt(
     progress: &mut dyn FnMut(u64),
 ) -> Result<String, HuntError> {
     let HuntConfig { cases, seed, out, resume } = config;
-    let ledger = out.join("cases.jsonl");
-    let mut results = if *resume { read_results(&ledger, *seed)? } else { Vec::new() };
-    if !resume && ledger.metadata().is_ok_and(|file| file.len() > 0) {
+    let cases_file = out.join("cases.jsonl");
+    let mut results = if *resume { read_results(&cases_file, *seed)? } else { Vec::new() };
+    if !resume && cases_file.metadata().is_ok_and(|file| file.len() > 0) {
         return Err(HuntError::Exists(out.clone()));
     }
     std::fs::create_dir_all(out).map_err(at(out))?;
-    let mut lines = OpenOptions::new().append(true).create(true).open(&ledger).map_err(at(&ledger))?;
+    let mut lines = OpenOptions::new().append(true).create(true).open(&cases_file).map_err(at(&cases_file))?;
     let simulator = BatchRollout::new(&go2(), &SimConfig::default()).map_err(failed)?;
     let mut test = BlindTest { out, diagnose, interrupted, simulator };
     for number in 0..*cases {
         if !results.iter().any(|result| result.case == number) {
             let result = test.run_case(&Case::draw(*seed, number))?;
             let line = serde_json::to_string(&result).map_err(failed)?;
-            writeln!(lines, "{line}").map_err(at(&ledger))?;
+            writeln!(lines, "{line}").map_err(at(&cases_file))?;
             results.push(result);
         }
         progress(number + 1);
@@ -160,20 +164,20 @@ pub fn hunt(
     Ok(text)
 }
 
-/// The cases that were judged before.
-fn read_results(ledger: &Path, seed: u64) -> Result<Vec<CaseResult>, HuntError> {
-    let path = || ledger.to_owned();
-    let text = std::fs::read_to_string(ledger).map_err(|cause| HuntError::File { path: path(), cause })?;
-    let round = |(index, line): (usize, &str)| {
-        let round: CaseResult =
+/// Reads the results of completed cases.
+fn read_results(cases_file: &Path, seed: u64) -> Result<Vec<CaseResult>, HuntError> {
+    let path = || cases_file.to_owned();
+    let text = std::fs::read_to_string(cases_file).map_err(|cause| HuntError::File { path: path(), cause })?;
+    let result = |(index, line): (usize, &str)| {
+        let result: CaseResult =
             serde_json::from_str(line).map_err(|cause| HuntError::Line { path: path(), line: index + 1, cause })?;
-        if round.seed == seed {
-            Ok(round)
+        if result.seed == seed {
+            Ok(result)
         } else {
-            Err(HuntError::OtherSeed { path: path(), theirs: round.seed, ours: seed })
+            Err(HuntError::OtherSeed { path: path(), theirs: result.seed, ours: seed })
         }
     };
-    text.lines().enumerate().map(round).collect()
+    text.lines().enumerate().map(result).collect()
 }
 
 #[cfg(test)]
@@ -181,18 +185,18 @@ mod tests {
     use super::*;
     use crate::draw::BaseSchedule;
 
-    /// Finds nothing, and notes what it was given.
+    /// Diagnosis that reports no cause, and asserts that it receives the log and the model only.
     fn nothing(log: &Path, model: &Path, out: &Path) -> Command {
         assert!(log.join("meta.json").exists() && model.exists());
-        assert!(!out.with_file_name("truth.toml").exists(), "the truth is not told");
+        assert!(!out.with_file_name("truth.toml").exists(), "the ground truth is not available");
         let errors = r#"{"torque_rmse_nm": null, "q_rmse_rad": 0.01}"#;
         let unexplained = r#"{"fraction": 0.0, "depends_on": [], "text": ""}"#;
-        let said = format!(
+        let findings = format!(
             r#"{{"baseline": {errors}, "extended": {errors}, "noise_floor": {errors}, "findings": [], "confusable": [],
                  "unexplained": {unexplained}, "extended_model": "extended.toml"}}"#
         );
         let mut command = Command::new("echo");
-        command.arg(said);
+        command.arg(findings);
         command
     }
 
@@ -209,47 +213,47 @@ mod tests {
     }
 
     #[test]
-    fn game_goes_on_where_it_ended_and_is_not_overwritten() {
+    fn blind_test_continues_where_it_stopped_and_is_not_overwritten() {
         let folder = tempfile::tempdir().expect("a folder");
-        let out = folder.path().join("game");
-        run(&config(1, 4, &out, false), &nothing).expect("played");
+        let out = folder.path().join("hunt");
+        run(&config(1, 4, &out, false), &nothing).expect("completed");
         assert!(message(run(&config(2, 4, &out, false), &nothing)).contains("has a blind test already"));
         assert!(message(run(&config(2, 5, &out, true), &nothing)).contains("has the results of seed 4, not 5"));
-        let dies = |_: &Path, _: &Path, _: &Path| {
+        let fails = |_: &Path, _: &Path, _: &Path| {
             let mut command = Command::new("sh");
             command.args(["-c", "echo it broke >&2; exit 1"]);
             command
         };
-        let text = run(&config(2, 4, &out, true), &dies).expect("a diagnosis that dies does not end the game");
-        assert!(text.contains("| the diagnosis died | none | 1 of 2: 50 % |"), "{text}");
-        let rounds = read_results(&out.join("cases.jsonl"), 4).expect("lines");
-        assert_eq!(rounds.iter().map(|round| round.case).collect::<Vec<_>>(), [0, 1]);
-        assert!(rounds[1].error.as_ref().is_some_and(|died| died.contains("it broke")));
+        let text = run(&config(2, 4, &out, true), &fails).expect("a failed diagnosis does not end the blind test");
+        assert!(text.contains("| diagnosis failed | none | 1 of 2: 50 % |"), "{text}");
+        let results = read_results(&out.join("cases.jsonl"), 4).expect("lines");
+        assert_eq!(results.iter().map(|result| result.case).collect::<Vec<_>>(), [0, 1]);
+        assert!(results[1].error.as_ref().is_some_and(|error| error.contains("it broke")));
         assert!(out.join("hunt.md").exists() && out.join("0000/truth.toml").exists());
     }
 
-    /// What the table of needs in `draw.rs` promises, and what hides nothing is all but perfect.
+    /// Checks the requirements in `draw.rs`, and that a healthy robot is close to the nominal model.
     #[test]
-    #[ignore = "minutes: plays 28 cases"]
-    fn what_is_hidden_shows_in_the_log_and_the_truth_explains_it() {
+    #[ignore = "minutes: runs 28 cases"]
+    fn hidden_effects_are_visible_in_the_log_and_the_true_model_explains_them() {
         let folder = tempfile::tempdir().expect("a folder");
-        run(&config(28, 100, folder.path(), false), &nothing).expect("played");
-        let rounds = read_results(&folder.path().join("cases.jsonl"), 100).expect("lines");
-        for CaseResult { case, kind, setting, outside, nominal, truth, verdict, .. } in &rounds {
+        run(&config(28, 100, folder.path(), false), &nothing).expect("completed");
+        let results = read_results(&folder.path().join("cases.jsonl"), 100).expect("lines");
+        for CaseResult { case, kind, setting, outside, nominal, truth, verdict, .. } in &results {
             let hidden: Vec<_> = verdict.hits.iter().map(|hit| format!("{}@{}", hit.effect, hit.scope)).collect();
             println!("{case} {kind:?} {:?} {hidden:?} {outside:?} {nominal:?} {truth:?}", setting.place);
         }
-        for CaseResult { case, kind, setting, nominal, truth, verdict, .. } in rounds {
+        for CaseResult { case, kind, setting, nominal, truth, verdict, .. } in results {
             let [before, after] = [nominal, truth].map(|errors| errors.q_rmse_rad.expect("q is in every log"));
-            // What no error of motion can show.
-            let unseen = verdict.hits.iter().any(|hit| ["gyro_bias", "torque_sensor_delay"].contains(&&*hit.effect));
+            // Effects that do not change the motion.
+            let invisible = verdict.hits.iter().any(|hit| ["gyro_bias", "torque_sensor_delay"].contains(&&*hit.effect));
             match kind {
                 CaseKind::Healthy if setting.place == BaseSchedule::Fixed => {
-                    assert!(before < 0.003, "case {case}: {before} rad")
+                    assert!(before < 0.003, "case {case}: {before} rad");
                 }
                 CaseKind::Healthy => assert!(before < 0.012, "case {case}: {before} rad"),
                 CaseKind::LargeEffect | CaseKind::TwoEffects => {
-                    assert!(unseen || after < before, "case {case}: {before} -> {after} rad")
+                    assert!(invisible || after < before, "case {case}: {before} -> {after} rad");
                 }
                 CaseKind::SmallEffect | CaseKind::UnmodelledEffect => {}
             }
@@ -257,14 +261,14 @@ mod tests {
     }
 
     #[test]
-    fn game_without_a_diagnosis_ends_at_once() {
+    fn blind_test_without_a_diagnosis_stops_at_once() {
         let folder = tempfile::tempdir().expect("a folder");
         let refuses = |_: &Path, _: &Path, _: &Path| {
             let mut command = Command::new("sh");
-            command.args(["-c", "echo no such verb >&2; exit 2"]);
+            command.args(["-c", "echo no such command >&2; exit 2"]);
             command
         };
-        let said = message(run(&config(1, 0, folder.path(), false), &refuses));
-        assert!(said.contains("does not start: no such verb"), "{said}");
+        let error = message(run(&config(1, 0, folder.path(), false), &refuses));
+        assert!(error.contains("does not start: no such command"), "{error}");
     }
 }

@@ -1,4 +1,4 @@
-//! The motions of a case: on a stand, on the feet, or one after the other, 20 to 25 s.
+//! Motions of a case: with a fixed base, standing, or both in turn, 20 to 25 s.
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
@@ -11,42 +11,45 @@ use crate::draw::{BaseSchedule, LogSetup};
 
 /// Rate of the log [Hz].
 pub const RATE_HZ: f64 = 200.0;
-/// Poses of [`Phase::Holds`], and how long each takes with the way to it [s].
+/// Number of poses of [`Phase::Holds`].
 const POSES: usize = 12;
+/// Duration of a pose, with the transition to it [s].
 const POSE_S: f64 = 1.0;
+/// Duration of the transition to a pose [s].
 const WAY_S: f64 = 0.35;
-/// A period of [`Phase::Sway`], and the part of it in which the robot moves [s].
+/// Period of [`Phase::Sway`] [s].
 const SWAY_S: f64 = 3.0;
+/// Part of the period of [`Phase::Sway`] in which the robot moves [s].
 const SWAYING_S: f64 = 2.2;
 
-/// What is done for a while.
+/// Phase of a motion, and what it makes visible.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
-    /// Every joint waves ever faster: inertia, viscous friction, delays.
+    /// Chirps of all joints: inertia, viscous friction, delays.
     Chirp,
-    /// Ramps of about 0.15 rad/s with reversals: friction at low speed, gear play.
+    /// Ramps of about 0.15 rad/s with reversals: friction at low speed, backlash.
     Creep,
-    /// Squares with firmer gains: torque and speed limits, delays.
+    /// Square waves with higher gains: torque and speed limits, delays.
     Steps,
-    /// Poses, one after the other: gravity, springs, gains.
+    /// Sequence of poses: gravity, springs, gains.
     Holds,
-    /// Slow waves of the trunk over standing feet, with holds: payload, offsets, ground.
+    /// Slow motion of the base over standing feet, with pauses: payload, offsets, ground.
     Sway,
 }
 
-/// What a motion is drawn of.
+/// Random parameters of a motion.
 struct Style {
-    /// Of each joint [rad].
+    /// Phase shift of each joint [rad].
     shift: [f64; NUM_JOINTS],
     /// Factor on each joint's rate.
     pace: [f64; NUM_JOINTS],
-    /// Of [`Phase::Holds`] [rad].
+    /// Poses of [`Phase::Holds`], as offsets from the default pose [rad].
     poses: [[f64; NUM_JOINTS]; POSES],
     /// Highest frequency of the chirp [Hz].
     chirp_hz: f64,
-    /// Position gains: soft, firm, standing [N·m/rad].
+    /// Position gains: low, high, standing [N·m/rad].
     kp: [f64; 3],
-    /// [N·m·s/rad]
+    /// Velocity gain [N·m·s/rad].
     kd: f64,
 }
 
@@ -59,7 +62,7 @@ impl Style {
         Self { shift, pace, poses, chirp_hz: random.random_range(4.0..6.0), kp, kd: random.random_range(0.6..1.0) }
     }
 
-    /// Position gain in a phase.
+    /// Returns the position gain of a phase [N·m/rad].
     fn kp(&self, phase: Phase) -> f64 {
         match phase {
             Phase::Steps => self.kp[1],
@@ -68,7 +71,7 @@ impl Style {
         }
     }
 
-    /// Commanded offset from the default pose [rad], `time` [s] into a phase of `length` [s].
+    /// Returns the commanded offset from the default pose [rad], `time` [s] into a phase of `length` [s].
     fn offset(&self, phase: Phase, joint: Joint, time: f64, length: f64) -> f64 {
         let index = joint.index();
         let (shift, pace) = (self.shift[index], self.pace[index]);
@@ -82,7 +85,7 @@ impl Style {
                 }
                 Phase::Creep => ease * triangle(0.15 * pace * time / 0.8 + shift / TAU) * 0.2,
                 Phase::Steps => {
-                    // Away from the end of the calf's range: steps overshoot.
+                    // Keeps a distance from the end of the calf's range, because steps overshoot.
                     let middle = if joint.kind == JointKind::Calf { -0.2 } else { 0.0 };
                     middle + 0.34 * (TAU * 1.4 * pace * time + shift).sin().signum()
                 }
@@ -96,7 +99,7 @@ impl Style {
             }
     }
 
-    /// Waves that lift, pitch, roll and shift the trunk while the feet stay; they stop now and then.
+    /// Returns the offset [rad] of a joint that lifts, pitches, rolls and shifts the base over fixed feet, with pauses.
     fn sway(&self, joint: Joint, time: f64) -> f64 {
         let swaying = (time / SWAY_S).floor() * SWAYING_S + (time % SWAY_S).min(SWAYING_S);
         let wave = |way: usize| {
@@ -116,12 +119,12 @@ impl Style {
     }
 }
 
-/// A triangle wave of period 1, from −1 to 1.
+/// Returns a triangle wave of period 1, from −1 to 1.
 fn triangle(turns: f64) -> f64 {
     4.0 * ((turns - turns.floor()) - 0.5).abs() - 1.0
 }
 
-/// Phases with their lengths [s]; the base is fixed in all but the swaying.
+/// Returns the phases with their durations [s]. The base is fixed in all phases except [`Phase::Sway`].
 fn phases(place: BaseSchedule) -> &'static [(Phase, f64)] {
     match place {
         BaseSchedule::Fixed => &[(Phase::Chirp, 8.0), (Phase::Creep, 5.0), (Phase::Steps, 4.0), (Phase::Holds, 6.0)],
@@ -132,7 +135,7 @@ fn phases(place: BaseSchedule) -> &'static [(Phase, f64)] {
     }
 }
 
-/// The commands of a case, with voltage and temperatures where they are measured.
+/// Returns the commands of a case, with voltage and temperatures if they are measured.
 pub fn motion(setting: LogSetup, random: &mut impl Rng) -> Log {
     let style = Style::draw(random);
     let mut columns = BTreeMap::<String, Vec<f64>>::new();
@@ -172,13 +175,13 @@ pub fn motion(setting: LogSetup, random: &mut impl Rng) -> Log {
     Log::new_commands(meta, columns).expect("a motion")
 }
 
-/// A battery that empties and sags under loads that come and go [V].
+/// Returns the voltage of a battery that discharges and sags under a varying load [V].
 fn voltage(t: f64, shift: f64) -> f64 {
     let load = 0.5 + 0.3 * (TAU * t / 3.7 + shift).sin() + 0.2 * (TAU * t / 1.3).sin();
     29.4 - 0.05 * t - 3.5 * load
 }
 
-/// A motor that heats up [°C]; faster than real ones, so that half a minute tells.
+/// Returns the temperature of a motor that heats up [°C], faster than a real one, so that half a minute is enough.
 fn temperature(t: f64, pace: f64) -> f64 {
     30.0 + 50.0 * (1.0 - (-t * pace / 12.0).exp())
 }
@@ -190,7 +193,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn commands_stay_inside_the_joints_ranges() {
+    fn commands_stay_within_the_joint_ranges() {
         for (place, seed) in
             [BaseSchedule::Fixed, BaseSchedule::Floating, BaseSchedule::FixedThenFloating].into_iter().zip(0..)
         {

@@ -1,4 +1,4 @@
-//! One case of a game: a log is made, another process diagnoses it, and its words are judged.
+//! Runs one case: simulates its log, diagnoses it in another process and scores the findings.
 
 use std::fs::File;
 use std::path::Path;
@@ -15,31 +15,31 @@ use crate::draw::Case;
 use crate::score::judge;
 use crate::{CaseResult, Diagnose, HuntError, at, failed, ground_truth};
 
-/// How often a running diagnosis is looked after.
-const LOOK: Duration = Duration::from_millis(20);
-/// How a command ends whose input is at fault; a diagnosis that cannot even start ends the game.
+/// Interval at which a running diagnosis is polled.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
+/// Exit code of a command with invalid input. Such a diagnosis cannot start, which ends the blind test.
 const BAD_INPUT: i32 = 2;
 
-/// A game that is played.
+/// Running blind test.
 pub struct BlindTest<'a> {
-    /// Where it is kept.
+    /// Folder of the results.
     pub out: &'a Path,
-    /// What diagnoses.
+    /// Diagnosing program.
     pub diagnose: &'a Diagnose,
-    /// What may end it.
+    /// Returns true once the user has asked to stop.
     pub interrupted: crate::Interrupted<'a>,
-    /// What the truth is evaluated in.
+    /// Simulator in which the true model is evaluated.
     pub simulator: BatchRollout,
 }
 
-/// What a diagnosis said, or complained of.
+/// Findings of a diagnosis or its error message, with its duration.
 struct DiagnosisRun {
-    said: Result<Diagnosis, String>,
+    findings: Result<Diagnosis, String>,
     seconds: f64,
 }
 
 impl BlindTest<'_> {
-    /// Hides, diagnoses and judges.
+    /// Simulates, diagnoses and scores a case.
     pub fn run_case(&mut self, case: &Case) -> Result<CaseResult, HuntError> {
         let folder = self.out.join(format!("{:04}", case.number));
         let model = self.out.join("nominal.toml");
@@ -50,8 +50,8 @@ impl BlindTest<'_> {
         })?;
         let path = folder.join("log");
         log.write(&path).map_err(failed)?;
-        let DiagnosisRun { said, seconds } = self.answer(&path, &model, &folder)?;
-        // Only now: nobody can have read it before.
+        let DiagnosisRun { findings, seconds } = self.run_diagnosis(&path, &model, &folder)?;
+        // Written after the diagnosis, so that it cannot have read the file.
         let truth = folder.join("truth.toml");
         std::fs::write(&truth, case.truth().to_toml()).map_err(at(&truth))?;
         let mut errors = |robot: &RobotModel| {
@@ -68,14 +68,14 @@ impl BlindTest<'_> {
             outside: case.outside,
             nominal,
             truth,
-            verdict: judge(case, said.as_ref().ok(), [nominal, truth]),
-            error: said.err(),
+            verdict: judge(case, findings.as_ref().ok(), [nominal, truth]),
+            error: findings.err(),
             seconds,
         })
     }
 
-    /// Lets the diagnosis run; its words are kept beside the log.
-    fn answer(&self, log: &Path, model: &Path, folder: &Path) -> Result<DiagnosisRun, HuntError> {
+    /// Runs the diagnosis. Keeps its output in the folder of the case.
+    fn run_diagnosis(&self, log: &Path, model: &Path, folder: &Path) -> Result<DiagnosisRun, HuntError> {
         let [stdout, stderr] = ["diagnosis.json", "diagnosis.txt"].map(|name| folder.join(name));
         let start = Instant::now();
         let mut command = (self.diagnose)(log, model, &folder.join("report"));
@@ -83,29 +83,29 @@ impl BlindTest<'_> {
         let spawned = command.stdout(create(&stdout)?).stderr(create(&stderr)?).spawn();
         let status = self.wait(spawned.map_err(failed)?)?;
         let seconds = start.elapsed().as_secs_f64();
-        let complaint = std::fs::read_to_string(&stderr).map_err(failed)?.trim().to_owned();
+        let stderr_text = std::fs::read_to_string(&stderr).map_err(failed)?.trim().to_owned();
         if status.code() == Some(BAD_INPUT) {
-            return Err(HuntError::NoDiagnosis { log: log.to_owned(), message: complaint });
+            return Err(HuntError::NoDiagnosis { log: log.to_owned(), message: stderr_text });
         }
-        let said = if status.success() {
+        let findings = if status.success() {
             serde_json::from_str(&std::fs::read_to_string(&stdout).map_err(failed)?).map_err(|error| error.to_string())
         } else {
-            Err(format!("{status}: {complaint}"))
+            Err(format!("{status}: {stderr_text}"))
         };
-        Ok(DiagnosisRun { said, seconds })
+        Ok(DiagnosisRun { findings, seconds })
     }
 
     fn wait(&self, mut child: Child) -> Result<ExitStatus, HuntError> {
         loop {
             if let Some(status) = child.try_wait().map_err(failed)? {
-                // Ctrl-C reaches both; a diagnosis that it ended says nothing of the case.
+                // Ctrl-C reaches both processes; an interrupted diagnosis is not a result.
                 return if (self.interrupted)() { Err(HuntError::Interrupted) } else { Ok(status) };
             }
             if (self.interrupted)() {
                 child.kill().and_then(|()| child.wait()).map_err(failed)?;
                 return Err(HuntError::Interrupted);
             }
-            std::thread::sleep(LOOK);
+            std::thread::sleep(POLL_INTERVAL);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The table and the confusion matrix of a game, in markdown.
+//! Table of rates and confusion matrix of a blind test, in Markdown.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -7,19 +7,20 @@ use crate::CaseResult;
 use crate::draw::CaseKind;
 use crate::score::{EffectScore, ErrorReduction};
 
-/// What stands in the matrix for no name.
+/// Label in the matrix for no hidden effect and for no reported cause.
 const NONE: &str = "(none)";
 
-/// All that a game says.
-pub fn text(rounds: &[CaseResult]) -> String {
-    let mut text = format!("{} cases\n\n", rounds.len());
-    text += &rates(rounds);
-    text += &numbers(rounds);
-    text += "\nFirst name given (columns) for what was hidden (rows):\n\n";
-    text + &matrix(rounds)
+/// Returns the results of a blind test.
+pub fn text(results: &[CaseResult]) -> String {
+    let mut text = format!("{} cases\n\n", results.len());
+    text += &rates(results);
+    text += &numbers(results);
+    text += "\nFirst cause reported (columns) by hidden effect (rows), number of cases; \"(outside)\" is an effect \
+             outside the\ncatalogue:\n\n";
+    text + &matrix(results)
 }
 
-/// k of n with its 95 % interval: `12 of 13: 92 % (67 to 99)`.
+/// Returns a row with a rate, k of n, and its 95 % interval.
 fn rate(label: &str, aim: &str, outcomes: impl Iterator<Item = bool>) -> String {
     let outcomes: Vec<_> = outcomes.collect();
     let (count, hits) = (outcomes.len(), outcomes.iter().filter(|hit| **hit).count());
@@ -32,7 +33,7 @@ fn rate(label: &str, aim: &str, outcomes: impl Iterator<Item = bool>) -> String 
     format!("| {label} | {aim} | {hits} of {count}: {share} % | {} to {} % |\n", percent(low), percent(high))
 }
 
-/// Wilson's 95 % interval of a binomial rate.
+/// Returns Wilson's 95 % interval of a binomial rate.
 fn wilson(hits: usize, count: usize) -> [f64; 2] {
     const Z: f64 = 1.959_964;
     let (n, rate) = (count as f64, hits as f64 / count as f64);
@@ -41,44 +42,49 @@ fn wilson(hits: usize, count: usize) -> [f64; 2] {
     [middle - reach, middle + reach].map(|end| (end / (1.0 + Z * Z / n)).clamp(0.0, 1.0))
 }
 
-fn rates(rounds: &[CaseResult]) -> String {
-    let of = |kind: CaseKind| rounds.iter().filter(move |round| round.kind == kind);
-    let hits = |kind: CaseKind| of(kind).flat_map(|round| &round.verdict.hits);
+fn rates(results: &[CaseResult]) -> String {
+    let of = |kind: CaseKind| results.iter().filter(move |result| result.kind == kind);
+    let hits = |kind: CaseKind| of(kind).flat_map(|result| &result.verdict.hits);
     let mut text = "| | goal | rate | 95 % interval |\n|---|---|---|---|\n".to_owned();
     for (kind, size, first, three, scope) in [
         (CaseKind::LargeEffect, "half the range or more", ">= 90 %", ">= 97 %", ">= 92 %"),
         (CaseKind::SmallEffect, "a fifth of the range", ">= 70 %", "", ""),
     ] {
-        text += &rate(&format!("{size}: right name first"), first, hits(kind).map(|hit| hit.first));
-        text += &rate(&format!("{size}: said it could be the right one"), "", hits(kind).map(|hit| hit.ambiguous));
-        text += &rate(&format!("{size}: in first three"), three, hits(kind).map(|hit| hit.in_top_3));
-        text += &rate(&format!("{size}: right scope"), scope, hits(kind).map(|hit| hit.scope_right));
-        text += &rate(&format!("{size}: a wrong name, also"), "", of(kind).map(|round| round.verdict.wrong_names > 0));
+        text += &rate(&format!("{size}: top-1 correct"), first, hits(kind).map(|hit| hit.first));
+        text += &rate(&format!("{size}: listed as indistinguishable"), "", hits(kind).map(|hit| hit.ambiguous));
+        text += &rate(&format!("{size}: top-3 correct"), three, hits(kind).map(|hit| hit.in_top_3));
+        text += &rate(&format!("{size}: scope correct"), scope, hits(kind).map(|hit| hit.scope_right));
+        text += &rate(
+            &format!("{size}: additional false positive"),
+            "",
+            of(kind).map(|result| result.verdict.wrong_names > 0),
+        );
     }
-    let named = |kind: CaseKind| of(kind).map(|round| !round.verdict.named.is_empty());
-    text += &rate("nothing hidden: a name is given", "<= 3 %", named(CaseKind::Healthy));
-    text += &rate("outside the catalogue: a wrong name", "<= 10 %", named(CaseKind::UnmodelledEffect));
-    let depends_on = of(CaseKind::UnmodelledEffect).filter_map(|round| round.verdict.depends_on);
-    text += &rate("outside the catalogue: what it depends on is right", ">= 50 %", depends_on);
-    let both =
-        |good: fn(&EffectScore) -> bool| of(CaseKind::TwoEffects).map(move |round| round.verdict.hits.iter().all(good));
-    text += &rate("two effects: both named", ">= 65 %", both(|hit| hit.named));
-    text += &rate("two effects: both named, with their scopes", "", both(|hit| hit.named && hit.scope_right));
-    let sizes = rounds.iter().flat_map(|round| &round.verdict.hits).filter_map(|hit| hit.size);
+    let named = |kind: CaseKind| of(kind).map(|result| !result.verdict.named.is_empty());
+    text += &rate("nothing hidden: false positive", "<= 3 %", named(CaseKind::Healthy));
+    text += &rate("outside the catalogue: false positive", "<= 10 %", named(CaseKind::UnmodelledEffect));
+    let depends_on = of(CaseKind::UnmodelledEffect).filter_map(|result| result.verdict.depends_on);
+    text += &rate("outside the catalogue: what it depends on is correct", ">= 50 %", depends_on);
+    let both = |good: fn(&EffectScore) -> bool| {
+        of(CaseKind::TwoEffects).map(move |result| result.verdict.hits.iter().all(good))
+    };
+    text += &rate("two effects: both reported", ">= 65 %", both(|hit| hit.named));
+    text += &rate("two effects: both reported, scopes correct", "", both(|hit| hit.named && hit.scope_right));
+    let sizes = results.iter().flat_map(|result| &result.verdict.hits).filter_map(|hit| hit.size);
     text += &rate("size within its 95 % interval", "88 to 99 %", sizes.map(|size| size.covered));
-    text + &rate("the diagnosis died", "none", rounds.iter().map(|round| round.error.is_some()))
+    text + &rate("diagnosis failed", "none", results.iter().map(|result| result.error.is_some()))
 }
 
-fn numbers(rounds: &[CaseResult]) -> String {
-    let sizes = rounds.iter().flat_map(|round| &round.verdict.hits).filter_map(|hit| hit.size);
+fn numbers(results: &[CaseResult]) -> String {
+    let sizes = results.iter().flat_map(|result| &result.verdict.hits).filter_map(|hit| hit.size);
     let removed =
-        |of: fn(&ErrorReduction) -> Option<f64>| rounds.iter().filter_map(move |round| of(&round.verdict.removed));
-    let seconds = rounds.iter().map(|round| round.seconds);
+        |of: fn(&ErrorReduction) -> Option<f64>| results.iter().filter_map(move |result| of(&result.verdict.removed));
+    let seconds = results.iter().map(|result| result.seconds);
     let line = |label: &str, goal: &str, value: Option<f64>, unit: &str, scale: f64| {
         let value = value.map_or("no case".to_owned(), |value| format!("{:.1} {unit}", scale * value));
         format!("| {label} | {goal} | {value} | |\n")
     };
-    let share = "% of what the truth removes";
+    let share = "% of the true model's reduction";
     let mut text = line("median error of size", "<= 10 %", median(sizes.map(|size| size.error)), "%", 100.0);
     for (label, shares) in [
         ("held-out torque error removed, median", median(removed(|removed| removed.torque))),
@@ -88,12 +94,13 @@ fn numbers(rounds: &[CaseResult]) -> String {
     }
     text += &line("time of a diagnosis, median", "", median(seconds.clone()), "s", 1.0);
     text += &line("time of a diagnosis, longest", "", seconds.reduce(f64::max), "s", 1.0);
-    let penalty = rounds.iter().map(penalty).sum::<usize>() as f64 / rounds.len().max(1) as f64;
-    text + &line("penalty a case: 1 for each effect not named, 2 for each wrong name", "", Some(penalty), "", 1.0)
+    let penalty = results.iter().map(penalty).sum::<usize>() as f64 / results.len().max(1) as f64;
+    let label = "penalty per case: 1 for each effect not reported, 2 for each false positive";
+    text + &line(label, "", Some(penalty), "", 1.0)
 }
 
-fn penalty(round: &CaseResult) -> usize {
-    round.verdict.hits.iter().filter(|hit| !hit.named).count() + 2 * round.verdict.wrong_names
+fn penalty(result: &CaseResult) -> usize {
+    result.verdict.hits.iter().filter(|hit| !hit.named).count() + 2 * result.verdict.wrong_names
 }
 
 fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
@@ -104,18 +111,19 @@ fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(if odd { upper } else { 0.5 * (values[half - 1] + upper) })
 }
 
-/// What was hidden in cases of at most one thing, and how often each name was given first.
-fn matrix(rounds: &[CaseResult]) -> String {
+/// Returns the confusion matrix: how often each effect was reported first, by hidden effect. Omits cases with two
+/// effects.
+fn matrix(results: &[CaseResult]) -> String {
     let mut counts = BTreeMap::<(&str, &str), usize>::new();
-    for round in rounds.iter().filter(|round| round.kind != CaseKind::TwoEffects) {
-        let hidden = match round.kind {
+    for result in results.iter().filter(|result| result.kind != CaseKind::TwoEffects) {
+        let hidden = match result.kind {
             CaseKind::Healthy => NONE,
             CaseKind::UnmodelledEffect => "(outside)",
             CaseKind::LargeEffect | CaseKind::SmallEffect | CaseKind::TwoEffects => {
-                round.verdict.hits.first().map_or(NONE, |hit| &hit.effect)
+                result.verdict.hits.first().map_or(NONE, |hit| &hit.effect)
             }
         };
-        let named = round.verdict.named.first().and_then(|named| named.split('@').next()).unwrap_or(NONE);
+        let named = result.verdict.named.first().and_then(|named| named.split('@').next()).unwrap_or(NONE);
         *counts.entry((hidden, named)).or_default() += 1;
     }
     let rows: BTreeSet<_> = counts.keys().map(|(hidden, _)| *hidden).collect();
@@ -145,7 +153,7 @@ mod tests {
     use crate::draw::{BaseSchedule, LogSetup};
     use crate::score::{Score, Size};
 
-    fn round(kind: CaseKind, hidden: &[&str], named: &[&str]) -> CaseResult {
+    fn result(kind: CaseKind, hidden: &[&str], named: &[&str]) -> CaseResult {
         let hit = |name: &&str| EffectScore {
             effect: (*name).to_owned(),
             scope: "all".to_owned(),
@@ -180,51 +188,52 @@ mod tests {
     }
 
     #[test]
-    fn interval_is_wilsons() {
+    fn interval_is_that_of_wilson() {
         let [low, high] = wilson(9, 10);
         assert!((low - 0.5958).abs() < 1e-4 && (high - 0.9821).abs() < 1e-4, "{low} {high}");
         assert_eq!(wilson(0, 20)[0], 0.0);
     }
 
     #[test]
-    fn game_of_five_cases_reads_so() {
-        let rounds = [
-            round(CaseKind::LargeEffect, &["armature"], &["armature"]),
-            round(CaseKind::LargeEffect, &["drive_lag"], &["torque_delay"]),
-            round(CaseKind::Healthy, &[], &[]),
-            round(CaseKind::UnmodelledEffect, &[], &[]),
-            round(CaseKind::TwoEffects, &["armature", "payload"], &["payload"]),
+    fn five_cases_give_this_table() {
+        let results = [
+            result(CaseKind::LargeEffect, &["armature"], &["armature"]),
+            result(CaseKind::LargeEffect, &["drive_lag"], &["torque_delay"]),
+            result(CaseKind::Healthy, &[], &[]),
+            result(CaseKind::UnmodelledEffect, &[], &[]),
+            result(CaseKind::TwoEffects, &["armature", "payload"], &["payload"]),
         ];
         expect![[r#"
             5 cases
 
             | | goal | rate | 95 % interval |
             |---|---|---|---|
-            | half the range or more: right name first | >= 90 % | 1 of 2: 50 % | 9 to 91 % |
-            | half the range or more: said it could be the right one |  | 0 of 2: 0 % | 0 to 66 % |
-            | half the range or more: in first three | >= 97 % | 1 of 2: 50 % | 9 to 91 % |
-            | half the range or more: right scope | >= 92 % | 1 of 2: 50 % | 9 to 91 % |
-            | half the range or more: a wrong name, also |  | 1 of 2: 50 % | 9 to 91 % |
-            | a fifth of the range: right name first | >= 70 % | no case | |
-            | a fifth of the range: said it could be the right one |  | no case | |
-            | a fifth of the range: in first three |  | no case | |
-            | a fifth of the range: right scope |  | no case | |
-            | a fifth of the range: a wrong name, also |  | no case | |
-            | nothing hidden: a name is given | <= 3 % | 0 of 1: 0 % | 0 to 79 % |
-            | outside the catalogue: a wrong name | <= 10 % | 0 of 1: 0 % | 0 to 79 % |
-            | outside the catalogue: what it depends on is right | >= 50 % | 1 of 1: 100 % | 21 to 100 % |
-            | two effects: both named | >= 65 % | 0 of 1: 0 % | 0 to 79 % |
-            | two effects: both named, with their scopes |  | 0 of 1: 0 % | 0 to 79 % |
+            | half the range or more: top-1 correct | >= 90 % | 1 of 2: 50 % | 9 to 91 % |
+            | half the range or more: listed as indistinguishable |  | 0 of 2: 0 % | 0 to 66 % |
+            | half the range or more: top-3 correct | >= 97 % | 1 of 2: 50 % | 9 to 91 % |
+            | half the range or more: scope correct | >= 92 % | 1 of 2: 50 % | 9 to 91 % |
+            | half the range or more: additional false positive |  | 1 of 2: 50 % | 9 to 91 % |
+            | a fifth of the range: top-1 correct | >= 70 % | no case | |
+            | a fifth of the range: listed as indistinguishable |  | no case | |
+            | a fifth of the range: top-3 correct |  | no case | |
+            | a fifth of the range: scope correct |  | no case | |
+            | a fifth of the range: additional false positive |  | no case | |
+            | nothing hidden: false positive | <= 3 % | 0 of 1: 0 % | 0 to 79 % |
+            | outside the catalogue: false positive | <= 10 % | 0 of 1: 0 % | 0 to 79 % |
+            | outside the catalogue: what it depends on is correct | >= 50 % | 1 of 1: 100 % | 21 to 100 % |
+            | two effects: both reported | >= 65 % | 0 of 1: 0 % | 0 to 79 % |
+            | two effects: both reported, scopes correct |  | 0 of 1: 0 % | 0 to 79 % |
             | size within its 95 % interval | 88 to 99 % | 2 of 2: 100 % | 34 to 100 % |
-            | the diagnosis died | none | 0 of 5: 0 % | 0 to 43 % |
+            | diagnosis failed | none | 0 of 5: 0 % | 0 to 43 % |
             | median error of size | <= 10 % | 4.0 % | |
             | held-out torque error removed, median | >= 85 % | no case | |
-            | held-out motion error removed, median | >= 85 % | 90.0 % of what the truth removes | |
+            | held-out motion error removed, median | >= 85 % | 90.0 % of the true model's reduction | |
             | time of a diagnosis, median |  | 12.0 s | |
             | time of a diagnosis, longest |  | 12.0 s | |
-            | penalty a case: 1 for each effect not named, 2 for each wrong name |  | 0.8  | |
+            | penalty per case: 1 for each effect not reported, 2 for each false positive |  | 0.8  | |
 
-            First name given (columns) for what was hidden (rows):
+            First cause reported (columns) by hidden effect (rows), number of cases; "(outside)" is an effect outside the
+            catalogue:
 
             | hidden | (none) | armature | torque_delay |
             |---|---|---|---|
@@ -233,6 +242,6 @@ mod tests {
             | armature |  | 1 |  |
             | drive_lag |  |  | 1 |
         "#]]
-        .assert_eq(&text(&rounds));
+        .assert_eq(&text(&results));
     }
 }

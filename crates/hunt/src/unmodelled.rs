@@ -1,4 +1,4 @@
-//! What no effect of the catalogue is: laws that only this game knows, between the commands that are logged and the robot.
+//! Effects outside the catalogue: laws between the logged commands and the robot.
 
 use std::f64::consts::TAU;
 
@@ -8,29 +8,29 @@ use twinstep_model::{Backend, BackendError, Command, Ground, InitialState, Joint
 
 use crate::draw::BaseSchedule;
 
-/// A law outside the catalogue. Joints by their index.
+/// Effect outside the catalogue. Joints are given by their index.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum UnmodelledEffect {
-    /// A share of one joint's torque acts on another one too, behind the current's sensor.
+    /// A fraction of one joint's torque also acts on another joint, behind the current sensor.
     CrossTalk { from: usize, into: usize, share: f64 },
     /// Friction of this torque [N·m] while the joint moves in its positive direction, none in the other.
     OneWayFriction { joint: usize, torque: f64 },
-    /// A torque from outside, of this amplitude [N·m] and frequency [Hz].
+    /// External torque of this amplitude [N·m] and frequency [Hz].
     Disturbance { joint: usize, amplitude: f64, frequency: f64 },
     /// The position gain grows with the error e [rad] by the factor 1 + `cubic`·e².
     HardeningGain { joint: usize, cubic: f64 },
-    /// Actuator and log see a position that drifts away [rad/s].
+    /// Encoder whose reading drifts at this rate [rad/s].
     EncoderDrift { joint: usize, rate: f64 },
 }
 
 impl UnmodelledEffect {
-    /// Any of them, on a joint that works in this place.
+    /// Samples an effect that is visible with this mounting of the base.
     pub fn draw(place: BaseSchedule, random: &mut impl Rng) -> Self {
         let joint = random.random_range(0..12);
         match random.random_range(0..5) {
             0 => {
-                // Along a leg, as cables and gears do it.
+                // Between joints of one leg, as with cables and gears.
                 let into = 3 * (joint / 3) + (joint + random.random_range(1..3)) % 3;
                 UnmodelledEffect::CrossTalk { from: joint, into, share: random.random_range(0.15..0.4) }
             }
@@ -38,11 +38,11 @@ impl UnmodelledEffect {
                 let (amplitude, frequency) = (random.random_range(0.4..1.2), random.random_range(1.0..7.0));
                 UnmodelledEffect::Disturbance { joint, amplitude, frequency }
             }
-            // On the ground only steps in the air have errors that are large.
+            // Needs large position errors, which occur only in the steps with a fixed base.
             3 if place != BaseSchedule::Floating => {
                 UnmodelledEffect::HardeningGain { joint, cubic: random.random_range(8.0..25.0) }
             }
-            // With the trunk held nothing but gravity, by so much as a cosine, shows where an encoder has drifted to.
+            // With a fixed base, the drift changes only the gravity torque, by the cosine of a small angle.
             4 if place != BaseSchedule::Fixed => {
                 UnmodelledEffect::EncoderDrift { joint, rate: random.random_range(0.0015..0.004) }
             }
@@ -50,10 +50,10 @@ impl UnmodelledEffect {
         }
     }
 
-    /// True if `told`, a channel or a sentence, is what this depends on.
-    pub fn depends_on(self, told: &str) -> bool {
+    /// True if `text`, a channel or a sentence, names what the residual of this effect depends on.
+    pub fn depends_on(self, text: &str) -> bool {
         let of = |joint: usize, quantities: &[&str]| {
-            quantities.iter().any(|quantity| told == format!("{quantity}_{}", Joint::ALL[joint].name()))
+            quantities.iter().any(|quantity| text == format!("{quantity}_{}", Joint::ALL[joint].name()))
         };
         let all = ["q", "dq", "q_cmd", "dq_cmd", "tau", "tau_measured", "tau_cmd"];
         match self {
@@ -62,67 +62,70 @@ impl UnmodelledEffect {
                 of(joint, &all)
             }
             UnmodelledEffect::Disturbance { frequency, .. } => {
-                frequencies(told).any(|found| (found / frequency - 1.0).abs() < 0.05)
+                frequencies(text).any(|found| (found / frequency - 1.0).abs() < 0.05)
             }
-            UnmodelledEffect::EncoderDrift { joint, .. } => told == "t" || of(joint, &["q"]),
+            UnmodelledEffect::EncoderDrift { joint, .. } => text == "t" || of(joint, &["q"]),
         }
     }
 
-    /// What the robot is told instead of `command`, and the torque in it that no current makes, by joint; `seen` is what
-    /// the actuators have measured of it, at `time` [s].
-    fn apply(self, command: &mut Command, seen: &RobotStates, time: f64) -> [f32; 12] {
-        let mut unseen = [0.0; 12];
+    /// Changes `command` as the effect does at `time` [s], given the measured states.
+    ///
+    /// Returns the part of the torque that the current sensors do not measure, by joint [N·m].
+    fn apply(self, command: &mut Command, measured: &RobotStates, time: f64) -> [f32; 12] {
+        let mut unmeasured = [0.0; 12];
         match self {
-            UnmodelledEffect::CrossTalk { from, into, share } => unseen[into] = share as f32 * seen.tau[0][from],
+            UnmodelledEffect::CrossTalk { from, into, share } => {
+                unmeasured[into] = share as f32 * measured.tau[0][from];
+            }
             UnmodelledEffect::OneWayFriction { joint, torque } => {
                 // Full friction from 0.1 rad/s on: a step at rest would chatter at the actuator rate.
-                unseen[joint] = -(torque as f32) * (seen.dq[0][joint] / 0.1).clamp(0.0, 1.0);
+                unmeasured[joint] = -(torque as f32) * (measured.dq[0][joint] / 0.1).clamp(0.0, 1.0);
             }
             UnmodelledEffect::Disturbance { joint, amplitude, frequency } => {
-                unseen[joint] = (amplitude * (TAU * frequency * time).sin()) as f32;
+                unmeasured[joint] = (amplitude * (TAU * frequency * time).sin()) as f32;
             }
             UnmodelledEffect::HardeningGain { joint, cubic } => {
-                let error = command.q[joint] - seen.q[0][joint];
+                let error = command.q[joint] - measured.q[0][joint];
                 command.tau_ff[joint] += command.kp[joint] * cubic as f32 * error.powi(3);
             }
             UnmodelledEffect::EncoderDrift { joint, rate } => command.q[joint] -= (rate * time) as f32,
         }
-        for (feed_forward, more) in command.tau_ff.iter_mut().zip(unseen) {
+        for (feed_forward, more) in command.tau_ff.iter_mut().zip(unmeasured) {
             *feed_forward += more;
         }
-        unseen
+        unmeasured
     }
 }
 
-/// The numbers before `Hz` in a text.
+/// Returns the numbers before `Hz` in a text.
 fn frequencies(text: &str) -> impl Iterator<Item = f64> + '_ {
-    let before = text.match_indices("Hz").map(|(place, _)| text[..place].trim_end());
+    let before = text.match_indices("Hz").map(|(start, _)| text[..start].trim_end());
     before.filter_map(|before| {
         let number = before.rsplit(|character: char| !(character.is_ascii_digit() || character == '.')).next()?;
         number.parse().ok()
     })
 }
 
-/// A backend of one robot on which a law outside the catalogue acts.
+/// Backend of one robot with an effect outside the catalogue.
 pub struct PerturbedBackend<B> {
     inner: B,
     outside: Option<UnmodelledEffect>,
-    /// What sensors show.
+    /// States as the sensors measure them.
     measured: RobotStates,
     time: f64,
 }
 
 impl<B: Backend> PerturbedBackend<B> {
-    /// The robot of `inner` with `outside`.
+    /// Creates the backend with the effect `outside`.
     pub fn new(inner: B, outside: Option<UnmodelledEffect>) -> Self {
         let measured = inner.states().clone();
         Self { inner, outside, measured, time: 0.0 }
     }
 
-    fn see(&mut self, unseen: [f32; 12]) {
+    fn update_measured(&mut self, unmeasured: [f32; 12]) {
         self.measured = self.inner.states().clone();
-        for (torque, unseen) in self.measured.tau[0].iter_mut().zip(unseen) {
-            *torque -= unseen;
+        for (torque, unmeasured) in self.measured.tau[0].iter_mut().zip(unmeasured) {
+            *torque -= unmeasured;
         }
         if let Some(UnmodelledEffect::EncoderDrift { joint, rate }) = self.outside {
             self.measured.q[0][joint] += (rate * self.time) as f32;
@@ -147,7 +150,7 @@ impl<B: Backend> Backend for PerturbedBackend<B> {
 
     fn reset(&mut self, placements: &[(usize, InitialState)]) -> Result<(), BackendError> {
         self.inner.reset(placements)?;
-        self.see([0.0; 12]);
+        self.update_measured([0.0; 12]);
         Ok(())
     }
 
@@ -158,18 +161,18 @@ impl<B: Backend> Backend for PerturbedBackend<B> {
         placement: &InitialState,
     ) -> Result<(), BackendError> {
         self.inner.reset_with_model(robot, model, placement)?;
-        self.see([0.0; 12]);
+        self.update_measured([0.0; 12]);
         Ok(())
     }
 
     fn step(&mut self, commands: &[Command], active: &[bool], actuator_periods: usize) -> Result<(), BackendError> {
         for _ in 0..actuator_periods {
             let mut command = commands[0];
-            let unseen =
+            let unmeasured =
                 self.outside.map_or([0.0; 12], |outside| outside.apply(&mut command, &self.measured, self.time));
             self.inner.step(&[command], active, 1)?;
             self.time += self.inner.robot().control.actuator_dt();
-            self.see(unseen);
+            self.update_measured(unmeasured);
         }
         Ok(())
     }
@@ -178,9 +181,9 @@ impl<B: Backend> Backend for PerturbedBackend<B> {
         (self.inner.snapshot(robot), self.measured.clone(), self.time)
     }
 
-    fn restore(&mut self, robot: usize, (inner, seen, time): &Self::Snapshot) {
+    fn restore(&mut self, robot: usize, (inner, measured, time): &Self::Snapshot) {
         self.inner.restore(robot, inner);
-        (self.measured, self.time) = (seen.clone(), *time);
+        (self.measured, self.time) = (measured.clone(), *time);
     }
 }
 
@@ -189,7 +192,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn line_in_the_spectrum_is_found_in_a_sentence() {
+    fn frequency_is_found_in_a_sentence() {
         let law = UnmodelledEffect::Disturbance { joint: 3, amplitude: 0.5, frequency: 3.1 };
         assert!(law.depends_on("a line at 3.05 Hz on FR_hip"));
         assert!(law.depends_on("t@3.1Hz"));
@@ -197,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn cross_talk_depends_on_the_joint_that_it_comes_from() {
+    fn cross_talk_depends_on_its_source_joint() {
         let law = UnmodelledEffect::CrossTalk { from: 1, into: 2, share: 0.2 };
         assert!(law.depends_on("tau_FL_thigh") && !law.depends_on("tau_FL_calf"));
     }

@@ -137,7 +137,7 @@ impl Recording {
             }
             Record::Message { header, data } => self.message(file, &header, &data)?,
             Record::Metadata(metadata) if metadata.name == METADATA => {
-                self.own_meta = Some(read_metadata(file, &metadata)?)
+                self.own_meta = Some(read_metadata(file, &metadata)?);
             }
             _ => {}
         }

@@ -157,7 +157,7 @@ fn median_period(log: &Log) -> Result<f64, ReplayError> {
 /// PD loop. A slower log is replayed at the smallest multiple of its rate that reaches the actuator rate of `robot`.
 pub fn at_log_rate(log: &Log, robot: &RobotModel) -> Result<RobotModel, ReplayError> {
     let (period, stated) = (median_period(log)?, log.meta().rate_hz);
-    // The stated rate has no jitter; the measured one is used where the two disagree.
+    // The stated rate has no jitter; the measured one is used if they differ.
     let agree = (period * stated - 1.0).abs() <= PERIOD_TOLERANCE;
     let rate = if agree { stated } else { 1.0 / period };
     if !(MIN_RATE_HZ * (1.0 - PERIOD_TOLERANCE)..=MAX_RATE_HZ * (1.0 + PERIOD_TOLERANCE)).contains(&rate) {

@@ -313,7 +313,7 @@ mod tests {
     #[test]
     fn position_actuator_has_the_gains_and_the_torque_limit() {
         let actuator = MjcfActuator::Position { kp: 40.0, kd: 1.0 };
-        let xml = model(MjcfOptions { actuator: actuator, ..MjcfOptions::default() });
+        let xml = model(MjcfOptions { actuator, ..MjcfOptions::default() });
         assert_eq!(values(&xml, "position", "kp"), ["40"; NUM_JOINTS]);
         assert_eq!(values(&xml, "position", "kv"), ["1"; NUM_JOINTS]);
         assert_eq!(values(&xml, "position", "forcerange")[2], "-45.43 45.43");

@@ -109,7 +109,8 @@ pub fn ranking(diagnosis: &Diagnosis) -> String {
     }
     format!(
         "<section>\n<h2>Alternative hypotheses</h2>\n<div class=\"wide\"><table class=\"ranking\">\n\
-         <thead><tr><th>hypothesis</th><th>error reduction, cross-validated</th><th></th><th>log-likelihood gain</th></tr></thead>\n\
+         <thead><tr><th>hypothesis</th><th>error reduction, cross-validated</th><th></th>\
+         <th>log-likelihood gain</th></tr></thead>\n\
          <tbody>\n{rows}</tbody></table></div>\n\
          <p class=\"note\">Error reduction: relative reduction of the RMSE in the channels that the effect acts on, \
          cross-validated. Each cause is added to those above it; its alternatives take its place. The log-likelihood \

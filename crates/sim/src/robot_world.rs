@@ -174,7 +174,7 @@ impl RobotWorld {
         let (mut q, mut dq) = self.joints();
         match input {
             ActuatorInputRef::Command(command) => {
-                self.actuator.update_command(&SimdCommands::new(std::slice::from_ref(command)), &q, &dq)
+                self.actuator.update_command(&SimdCommands::new(std::slice::from_ref(command)), &q, &dq);
             }
             ActuatorInputRef::Torques(tau) => self.actuator.set_torque(tau.map(f64::from)),
         }

@@ -3,7 +3,7 @@
 use std::cmp::Reverse;
 
 use rayon::prelude::*;
-use twinstep_model::{BaseMount, Ground, Precision, RobotModel, RobotStates, Rollout, RolloutRequest};
+use twinstep_model::{Ground, Precision, RobotModel, RobotStates, Rollout, RolloutRequest};
 use twinstep_simd::InstructionSet;
 
 use crate::batch::{SimdPrecision, batch_simulator};

@@ -14,6 +14,7 @@
 //! operations round as IEEE 754 says, so every instruction set gives the same bits.
 
 #![allow(clippy::inline_always, reason = "a function that is not inlined is compiled for the oldest processor")]
+#![allow(clippy::needless_range_loop, reason = "indices of lanes and coefficients read as in the textbook")]
 
 mod dispatch;
 mod float;

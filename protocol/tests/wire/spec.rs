@@ -110,9 +110,9 @@ fn table_of_errors_has_exactly_the_codes() {
 
 #[test]
 fn every_verb_key_and_mode_is_named() {
-    let verbs = EnvMethod::ALL.map(|verb| keys::env("<sid>", "<lease>", verb));
-    let places = [keys::hello("<sid>"), keys::lease("<sid>"), keys::LIVE_SERVERS.to_owned()];
-    let tokens = [keys::live_server("<sid>", "<name>"), keys::live_client("<sid>", "<client>")];
+    let verbs = EnvMethod::ALL.map(|verb| keys::env("<server_id>", "<lease>", verb));
+    let places = [keys::hello("<server_id>"), keys::lease("<server_id>"), keys::LIVE_SERVERS.to_owned()];
+    let tokens = [keys::live_server("<server_id>", "<name>"), keys::live_client("<server_id>", "<client>")];
     for key in verbs.iter().chain(&places).chain(&tokens) {
         assert!(SPEC.contains(&format!("`{key}`")), "SPEC.md says nothing of the key `{key}`");
     }

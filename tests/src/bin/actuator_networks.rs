@@ -1,6 +1,6 @@
-//! How well does an ensemble learn an actuator that has effects nobody told it, and does it know where it has not been?
+//! Evaluates actuator networks on simulated actuators: torque error, and epistemic uncertainty on unseen motion.
 //!
-//! `cargo run --release -p twinstep-tests --bin actuators > results/actuators.md`
+//! `cargo run --release -p twinstep-tests --bin actuator_networks > results/actuator_networks.md`
 
 use std::path::{Path, PathBuf};
 
@@ -13,28 +13,28 @@ use twinstep_ensemble::{
 use twinstep_logs::Log;
 use twinstep_tests::ground_truth_actuator::{DRIVES, HiddenDrive, Motion, NOISE_NM};
 
-/// Train ensembles on hidden actuators and judge them beside an ideal actuator, a linear filter and one network.
+/// Train ensembles on simulated actuators and compare them with an ideal actuator, a linear filter and one network.
 #[derive(Parser)]
 struct Args {
-    /// Length of the logs that are learnt from [s].
+    /// Length of the training logs [s].
     #[arg(long, default_value_t = 60.0)]
     seconds: f64,
-    /// Most passes over the data.
+    /// Maximum number of passes over the data.
     #[arg(long, default_value_t = 60)]
     epochs: usize,
-    /// Of motions, sensors and networks.
+    /// Seed of the motions, the sensor noise and the networks.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Write the logs of three stages, ever more violent, for `twinstep fit --cross`, and nothing else.
+    /// Write only the logs of three stages of increasing amplitude, for `twinstep fit --cross`.
     #[arg(long, value_name = "DIR")]
     stages: Option<PathBuf>,
 }
 
-/// Rows that the linear filter sees; all are judged on rows with so many before them.
+/// Number of input rows of the linear filter. All models are evaluated on rows with at least so many before them.
 const HISTORY: usize = 32;
-/// Added to the filter's normal equations, so that inputs which go together do not make them singular.
+/// Relative ridge term of the filter's normal equations. Without it, correlated inputs make them singular.
 const RIDGE: f64 = 1e-6;
-/// Rows of a control step, over which a reward counts uncertainty.
+/// Rows of a control step, over which a reward averages the uncertainty.
 const CONTROL_STEP: usize = 4;
 
 fn main() {
@@ -43,31 +43,32 @@ fn main() {
         return write_stages(&args, folder);
     }
     let bar = ProgressBar::new_spinner();
-    println!("# Ensembles on hidden actuators\n");
+    println!("# Actuator networks on simulated actuators\n");
     println!(
-        "`cargo run --release -p twinstep-tests --bin actuators -- --seconds {} --epochs {} --seed {}`\n",
+        "`cargo run --release -p twinstep-tests --bin actuator_networks -- --seconds {} --epochs {} --seed {}`\n",
         args.seconds, args.epochs, args.seed
     );
-    println!("## Fit: held-out torque RMSE [N·m], in units of the sensor's noise of {NOISE_NM} N·m\n");
+    println!("## Fit: held-out torque RMSE, in units of the sensor noise of {NOISE_NM} N·m\n");
     println!(
-        "| actuator | ideal PD | linear filter of {HISTORY} rows | one network | ensemble of 6 | 90 % intervals cover |"
+        "| actuator | ideal PD | linear filter over {HISTORY} rows | one network | ensemble of 6 | coverage of 90 % intervals |"
     );
     println!("|---|---|---|---|---|---|");
     for actuator in &DRIVES {
         println!("{}", fit(actuator, &args, &bar));
     }
-    println!("\n## Uncertainty: learnt from gentle motion, judged on other gentle and on violent motion\n");
+    println!("\n## Epistemic uncertainty: trained on gentle motion, evaluated on other gentle and on violent motion\n");
     println!(
-        "| actuator | EUF | AUROC, row by row | AUROC, control steps | Spearman with the true error, rows | of control steps | below zero |"
+        "| actuator | measure | AUROC, rows | AUROC, control steps | Spearman with the true error, rows | \
+         Spearman, control steps | below zero |"
     );
     println!("|---|---|---|---|---|---|---|");
     for actuator in &DRIVES {
-        uncertainty(actuator, &args, &bar);
+        print_uncertainty(actuator, &args, &bar);
     }
     bar.finish_and_clear();
 }
 
-/// The last actuator in motions of which each holds those before it.
+/// Writes logs of the last actuator in three motions, each with a larger amplitude and frequency range.
 fn write_stages(args: &Args, folder: &Path) {
     std::fs::create_dir_all(folder).expect("a folder");
     let actuator = &DRIVES[DRIVES.len() - 1];
@@ -77,7 +78,7 @@ fn write_stages(args: &Args, folder: &Path) {
     }
 }
 
-/// Calm enough that no limit is met often.
+/// Returns a motion that rarely reaches a limit.
 fn gentle(args: &Args, seed: u64) -> Motion {
     Motion { seconds: args.seconds, amplitude: 0.12, hz: [0.3, 2.0], seed }
 }
@@ -86,7 +87,7 @@ fn violent(args: &Args, seed: u64) -> Motion {
     Motion { seconds: args.seconds, amplitude: 0.45, hz: [1.5, 6.0], seed }
 }
 
-/// All of what the actuator may meet.
+/// Returns a motion with a wide range of amplitudes and frequencies.
 fn rich(args: &Args, seed: u64) -> Motion {
     Motion { seconds: args.seconds, amplitude: 0.3, hz: [0.5, 5.0], seed }
 }
@@ -108,11 +109,11 @@ fn trained(data: &DataSet, args: &Args, bar: &ProgressBar) -> Ensemble {
     });
     match ended.expect("trained") {
         TrainingResult::Trained(ensemble, _) => *ensemble,
-        TrainingResult::Interrupted(_) => unreachable!("nobody ended it"),
+        TrainingResult::Interrupted(_) => unreachable!("the callback never interrupts"),
     }
 }
 
-/// A line of the table of fits.
+/// Returns one line of the table of fits.
 fn fit(actuator: &HiddenDrive, args: &Args, bar: &ProgressBar) -> String {
     let data = data(actuator.logs(rich(args, args.seed)).measured);
     let ensemble = trained(&data, args, bar);
@@ -126,9 +127,9 @@ fn fit(actuator: &HiddenDrive, args: &Args, bar: &ProgressBar) -> String {
         for row in HISTORY..run.torques.len() {
             let [dq, ddq] = run.errors[row];
             let members = &predicted[row - skipped];
-            let guesses = [kp * dq + kd * ddq, filter.torque(run, row), members[0].mean, mean(members)];
-            for (sum, guess) in squares.iter_mut().zip(guesses) {
-                *sum += (run.torques[row] - guess).powi(2);
+            let predictions = [kp * dq + kd * ddq, filter.torque(run, row), members[0].mean, mean(members)];
+            for (sum, prediction) in squares.iter_mut().zip(predictions) {
+                *sum += (run.torques[row] - prediction).powi(2);
             }
             rows += 1.0;
         }
@@ -142,7 +143,7 @@ fn mean(members: &[Gaussian]) -> f64 {
     members.iter().map(|member| member.mean).sum::<f64>() / members.len() as f64
 }
 
-/// The best linear filter of the last rows of ξ, by least squares on what is learnt from.
+/// Linear filter of the last rows of ξ, fitted to the training blocks by least squares.
 struct Filter {
     weights: Vec<f64>,
 }
@@ -170,7 +171,7 @@ impl Filter {
         for (index, line) in matrix.iter_mut().enumerate() {
             line[index] *= 1.0 + RIDGE;
         }
-        Self { weights: solved(matrix, right) }
+        Self { weights: solve(matrix, right) }
     }
 
     fn torque(&self, run: &Sequence, row: usize) -> f64 {
@@ -178,8 +179,8 @@ impl Filter {
     }
 }
 
-/// Gauss's elimination, for a matrix that is positive definite.
-fn solved(mut matrix: Vec<Vec<f64>>, mut right: Vec<f64>) -> Vec<f64> {
+/// Solves a linear system with a positive definite matrix by Gaussian elimination.
+fn solve(mut matrix: Vec<Vec<f64>>, mut right: Vec<f64>) -> Vec<f64> {
     let count = right.len();
     for pivot in 0..count {
         for row in pivot + 1..count {
@@ -196,17 +197,17 @@ fn solved(mut matrix: Vec<Vec<f64>>, mut right: Vec<f64>) -> Vec<f64> {
     right
 }
 
-/// A row, or a control step: uncertainty, the error without the sensor's noise, and whether the motion was unseen.
-struct Judged {
+/// Epistemic uncertainty and error without sensor noise of a row or a control step; `unseen` marks violent motion.
+struct Evaluated {
     euf: f64,
     error: f64,
     unseen: bool,
 }
 
-/// Two lines of the table of uncertainty: U2E's own and the corrected one.
-fn uncertainty(actuator: &HiddenDrive, args: &Args, bar: &ProgressBar) {
-    let seen = data(actuator.logs(gentle(args, args.seed)).measured);
-    let ensemble = trained(&seen, args, bar);
+/// Prints two lines of the table of uncertainty: U2E's measure and the corrected one.
+fn print_uncertainty(actuator: &HiddenDrive, args: &Args, bar: &ProgressBar) {
+    let training_data = data(actuator.logs(gentle(args, args.seed)).measured);
+    let ensemble = trained(&training_data, args, bar);
     let motions = [(gentle(args, args.seed + 100), false), (violent(args, args.seed + 200), true)];
     let runs: Vec<(Sequence, Vec<Vec<Gaussian>>, bool)> = motions
         .into_iter()
@@ -214,16 +215,15 @@ fn uncertainty(actuator: &HiddenDrive, args: &Args, bar: &ProgressBar) {
             let logs = actuator.logs(motion);
             let (measured, exact) = (data(logs.measured), data(logs.exact));
             let all = [Split::Training, Split::Validation, Split::Test];
-            let of = |set: &DataSet| all.iter().flat_map(|block| set.runs(*block)).cloned().collect::<Vec<_>>();
-            let (noisy, exact) = (of(&measured), of(&exact));
+            let runs_of = |set: &DataSet| all.iter().flat_map(|block| set.runs(*block)).cloned().collect::<Vec<_>>();
+            let (noisy, exact) = (runs_of(&measured), runs_of(&exact));
             let predicted = ensemble.predict(noisy.iter());
             exact.into_iter().zip(predicted).map(move |(run, predicted)| (run, predicted, unseen))
         })
         .collect();
-    for (name, euf) in [("as in U2E", jensen_renyi as fn(&[f64], &[f64]) -> f64), ("corrected", epistemic_uncertainty)]
-    {
-        let rows: Vec<Judged> =
-            runs.iter().flat_map(|(run, predicted, unseen)| judged(run, predicted, *unseen, euf)).collect();
+    for (name, euf) in [("U2E", jensen_renyi as fn(&[f64], &[f64]) -> f64), ("corrected", epistemic_uncertainty)] {
+        let rows: Vec<Evaluated> =
+            runs.iter().flat_map(|(run, predicted, unseen)| evaluated(run, predicted, *unseen, euf)).collect();
         let steps = control_steps(&runs, euf);
         let negative = rows.iter().filter(|row| row.euf < 0.0).count() as f64 / rows.len() as f64;
         println!(
@@ -238,34 +238,40 @@ fn uncertainty(actuator: &HiddenDrive, args: &Args, bar: &ProgressBar) {
     }
 }
 
-fn judged(run: &Sequence, predicted: &[Vec<Gaussian>], unseen: bool, euf: fn(&[f64], &[f64]) -> f64) -> Vec<Judged> {
+fn evaluated(
+    run: &Sequence,
+    predicted: &[Vec<Gaussian>],
+    unseen: bool,
+    euf: fn(&[f64], &[f64]) -> f64,
+) -> Vec<Evaluated> {
     let truth = &run.torques[run.torques.len() - predicted.len()..];
     let row = |(members, truth): (&Vec<Gaussian>, &f64)| {
         let (means, variances): (Vec<f64>, Vec<f64>) =
             members.iter().map(|member| (member.mean, member.variance)).unzip();
-        Judged { euf: euf(&means, &variances), error: (mean(members) - truth).abs(), unseen }
+        Evaluated { euf: euf(&means, &variances), error: (mean(members) - truth).abs(), unseen }
     };
     predicted.iter().zip(truth).map(row).collect()
 }
 
-/// Means over the rows of a control step and the twelve joints, as a reward has them (U2E §III-C). Runs of the joints follow
-/// one another block by block.
-fn control_steps(runs: &[(Sequence, Vec<Vec<Gaussian>>, bool)], euf: fn(&[f64], &[f64]) -> f64) -> Vec<Judged> {
+/// Returns means over the rows of each control step and the twelve joints, as in a reward (U2E §III-C).
+///
+/// `runs` contains, block by block, the runs of all twelve joints.
+fn control_steps(runs: &[(Sequence, Vec<Vec<Gaussian>>, bool)], euf: fn(&[f64], &[f64]) -> f64) -> Vec<Evaluated> {
     let mut steps = Vec::new();
     for joints in runs.chunks(12) {
-        let all: Vec<Vec<Judged>> =
-            joints.iter().map(|(run, predicted, unseen)| judged(run, predicted, *unseen, euf)).collect();
+        let all: Vec<Vec<Evaluated>> =
+            joints.iter().map(|(run, predicted, unseen)| evaluated(run, predicted, *unseen, euf)).collect();
         let length = all.iter().map(Vec::len).min().unwrap_or(0);
         for first in (0..length.saturating_sub(CONTROL_STEP - 1)).step_by(CONTROL_STEP) {
             let rows = || all.iter().flat_map(|rows| &rows[first..first + CONTROL_STEP]);
-            let mean = |of: fn(&Judged) -> f64| rows().map(of).sum::<f64>() / (12 * CONTROL_STEP) as f64;
-            steps.push(Judged { euf: mean(|row| row.euf), error: mean(|row| row.error), unseen: all[0][0].unseen });
+            let mean = |value: fn(&Evaluated) -> f64| rows().map(value).sum::<f64>() / (12 * CONTROL_STEP) as f64;
+            steps.push(Evaluated { euf: mean(|row| row.euf), error: mean(|row| row.error), unseen: all[0][0].unseen });
         }
     }
     steps
 }
 
-/// Ranks from 1, equal values share theirs.
+/// Returns the ranks of `values`, from 1. Equal values have the mean of their ranks.
 fn ranks(values: impl Iterator<Item = f64>) -> Vec<f64> {
     let values: Vec<f64> = values.collect();
     let mut order: Vec<usize> = (0..values.len()).collect();
@@ -282,16 +288,16 @@ fn ranks(values: impl Iterator<Item = f64>) -> Vec<f64> {
     ranks
 }
 
-/// The probability that an unseen row has more uncertainty than a seen one.
-fn auroc(rows: &[Judged]) -> f64 {
+/// Returns the area under the ROC curve: the probability that an unseen row has a higher uncertainty than a seen one.
+fn auroc(rows: &[Evaluated]) -> f64 {
     let ranks = ranks(rows.iter().map(|row| row.euf));
     let unseen = rows.iter().filter(|row| row.unseen).count() as f64;
     let sum: f64 = ranks.iter().zip(rows).filter(|(_, row)| row.unseen).map(|(rank, _)| rank).sum();
     (sum - 0.5 * unseen * (unseen + 1.0)) / (unseen * (rows.len() as f64 - unseen))
 }
 
-/// Correlation of the ranks of uncertainty and of error.
-fn spearman(rows: &[Judged]) -> f64 {
+/// Returns Spearman's rank correlation of uncertainty and error.
+fn spearman(rows: &[Evaluated]) -> f64 {
     let (eufs, errors) = (ranks(rows.iter().map(|row| row.euf)), ranks(rows.iter().map(|row| row.error)));
     let middle = 0.5 * (rows.len() + 1) as f64;
     let product = |one: &[f64], other: &[f64]| -> f64 {

@@ -1,4 +1,4 @@
-//! Injects faults into real processes and shows that no step is executed twice, skipped or invented.
+//! Injects faults into real processes and checks that no step is executed twice, skipped or invented.
 //!
 //! `cargo build --release --workspace && target/release/faults --faults 1000`
 
@@ -12,26 +12,26 @@ use twinstep_tests::fault_injection::{self, FaultPlan};
 use twinstep_tests::roles::Role;
 use twinstep_tests::test_bed::TestBedConfig;
 
-/// Kill, freeze and confuse servers, clients and routers, and count what goes wrong.
+/// Inject faults into servers, clients and routers, and count the failures.
 ///
-/// Each lane is a server whose counters prove every step, a client that checks every observation, and on every second
-/// lane a router between them. Exit code 1 if anything was executed twice, skipped, invented, or did not go on.
+/// Each test bed has a server of counters and a client that checks every observation. Every second one also has a
+/// router between them. Exit code 1 if a step was executed twice, skipped or invented, or if a client did not continue.
 #[derive(Parser)]
 #[command(args_conflicts_with_subcommands = true)]
 struct Arguments {
     /// Number of faults.
     #[arg(long, default_value_t = 1000)]
     faults: usize,
-    /// Lanes at once.
+    /// Number of test beds in parallel.
     #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u16).range(1..=64))]
     lanes: u16,
-    /// Seed of the faults and their moments.
+    /// Seed of the faults and their times.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Another client, program and first arguments, in place of the Rust one; it is given the endpoint.
+    /// Program and first arguments of another client in place of the Rust one. The endpoint is appended.
     #[arg(long, num_args = 1.., value_name = "COMMAND")]
     client: Option<Vec<String>>,
-    /// One process of a lane; the lanes start these themselves.
+    /// Role of one process of a test bed, which starts these itself.
     #[command(subcommand)]
     role: Option<Role>,
 }
@@ -63,14 +63,14 @@ fn inject(arguments: &Arguments) -> Result<bool, Box<dyn std::error::Error>> {
     let style = ProgressStyle::with_template("{bar:40} {pos}/{len} faults, {per_sec}, {eta} left: {msg}")?;
     let bar = ProgressBar::new(arguments.faults as u64).with_style(style);
     let since = Instant::now();
-    let tally = fault_injection::run(&plan, &AtomicBool::new(false), |fault| {
+    let report = fault_injection::run(&plan, &AtomicBool::new(false), |fault| {
         bar.set_message(fault.name());
         bar.inc(1);
     })?;
     bar.finish_and_clear();
-    println!("{tally}\nseed {}, {:.0} s", arguments.seed, since.elapsed().as_secs_f64());
-    for (fault, evidence) in &tally.failures {
+    println!("{report}\nseed {}, {:.0} s", arguments.seed, since.elapsed().as_secs_f64());
+    for (fault, evidence) in &report.failures {
         println!("FAILED {}: {evidence}", fault.name());
     }
-    Ok(tally.failures.is_empty())
+    Ok(report.failures.is_empty())
 }

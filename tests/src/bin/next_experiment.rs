@@ -1,5 +1,7 @@
-//! Is the motion that diagnosis would choose next a good one? For pairs of effects that are taken for each other, a robot in
-//! the other engine that has the first plays every safe motion, and what each log says is compared with what was predicted.
+//! Evaluates the choice of the next experiment: predicted against achieved discrimination of confounded effects.
+//!
+//! A robot with the first effect of a pair, simulated in the other engine, executes every safe excitation trajectory.
+//! The log-likelihood ratio of each log is compared with the prediction.
 //!
 //! `cargo run --release -p twinstep-tests --bin next_experiment > results/next_experiment.md`
 
@@ -12,10 +14,10 @@ use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_tests::confounded_pairs::{PAIRS, Pair};
 use twinstep_tests::ground_truth_robot::log_of;
 
-/// Predict what safe motions tell of pairs of effects, and measure it.
+/// Compare predicted and achieved discrimination of confounded effects by safe excitation trajectories.
 #[derive(Parser)]
 struct Args {
-    /// Seed of the sensors' noise.
+    /// Seed of the sensor noise.
     #[arg(long, default_value_t = 1)]
     seed: u64,
 }
@@ -23,28 +25,30 @@ struct Args {
 fn main() {
     let args = Args::parse();
     let rows: Vec<Row> = PAIRS.par_iter().map(|pair| row(pair, args.seed)).collect();
-    println!("# The next experiment: predicted and achieved\n");
+    println!("# Next experiment: predicted and achieved discrimination\n");
     println!("`cargo run --release -p twinstep-tests --bin next_experiment -- --seed {}`\n", args.seed);
     println!(
-        "A robot in rapier at 4 kHz has the first effect and plays each of {} safe motions (10 s, noisy sensors); the \
-         models are simulated by the batch engine. Predicted: the evidence expected for the true one of the two, the \
-         other's size refitted. Achieved: the evidence of the log for the first, both fitted to it.\n",
+        "A robot in rapier at 4 kHz has the first effect and executes each of {} safe excitation trajectories (10 s, \
+         noisy sensors). The models are simulated with the batch engine. Predicted: the expected log-likelihood ratio \
+         of the true model to the alternative, with the alternative's size refitted. Achieved: the log-likelihood \
+         ratio of the first to the second on the log, both fitted to it.\n",
         EXCITATION_TRAJECTORIES.len()
     );
     println!(
-        "| first | second | chosen | predicted [nats] | achieved [nats] | median motion achieved | best motion | best achieved | rank |"
+        "| first | second | chosen | predicted [nat] | achieved [nat] | achieved by the median trajectory | \
+         best trajectory | achieved by the best | rank |"
     );
     println!("|---|---|---|---|---|---|---|---|---|");
     rows.iter().for_each(Row::print);
     let better = rows.iter().filter(|row| row.achieved > row.median).count();
     let first = rows.iter().filter(|row| row.rank == 1).count();
     println!(
-        "\nThe chosen motion beats the median one in {better} of {} pairs and is the best in {first}.",
+        "\nThe chosen trajectory is better than the median one in {better} of {} pairs and is the best in {first}.",
         rows.len()
     );
 }
 
-/// What became of a pair.
+/// Result of a pair.
 struct Row {
     names: [String; 2],
     chosen: &'static str,
@@ -62,9 +66,9 @@ fn row(pair: &Pair, seed: u64) -> Row {
         EXCITATION_TRAJECTORIES.iter().filter(|motion| pair.on_ground || motion.base == BaseMount::Fixed).collect();
     let robot = pair.robot();
     let logs: Vec<Log> = motions.par_iter().map(|motion| log_of(&robot, &motion.motion(&go2()), seed)).collect();
-    // What is measured, and how well: the same in every log.
-    let like = logs.last().expect("there are motions");
-    let told: Vec<[f64; 2]> = motions
+    // Measured channels and noise are the same in every log.
+    let like = logs.last().expect("there are trajectories");
+    let ratios: Vec<[f64; 2]> = motions
         .par_iter()
         .zip(&logs)
         .map(|(motion, log)| {
@@ -74,20 +78,22 @@ fn row(pair: &Pair, seed: u64) -> Row {
             [predicted, hypotheses.log_likelihood_ratio(log.clone(), &mut simulator).expect("an experiment")]
         })
         .collect();
-    let most =
-        |of: usize| (0..told.len()).max_by(|a, b| told[*a][of].total_cmp(&told[*b][of])).expect("there are motions");
-    let (chosen, best) = (most(0), most(1));
-    let mut achieved: Vec<f64> = told.iter().map(|told| told[1]).collect();
+    let largest = |column: usize| {
+        let order = |a: &usize, b: &usize| ratios[*a][column].total_cmp(&ratios[*b][column]);
+        (0..ratios.len()).max_by(order).expect("there are trajectories")
+    };
+    let (chosen, best) = (largest(0), largest(1));
+    let mut achieved: Vec<f64> = ratios.iter().map(|ratio| ratio[1]).collect();
     achieved.sort_by(f64::total_cmp);
     Row {
         names: hypotheses.names(),
         chosen: motions[chosen].name,
-        predicted: told[chosen][0],
-        achieved: told[chosen][1],
+        predicted: ratios[chosen][0],
+        achieved: ratios[chosen][1],
         median: achieved[achieved.len() / 2],
         best: motions[best].name,
-        best_achieved: told[best][1],
-        rank: 1 + achieved.iter().filter(|other| **other > told[chosen][1]).count(),
+        best_achieved: ratios[best][1],
+        rank: 1 + achieved.iter().filter(|other| **other > ratios[chosen][1]).count(),
     }
 }
 

@@ -1,7 +1,10 @@
-//! Are hidden bodies and motors found again? One robot after the other is drawn, simulated in another engine than the
-//! model's at a finer step, and identified from its noisy log; whether the log can tell a number is decided before the fit.
+//! Parameter recovery: estimates the parameters of sampled robots from noisy logs and compares them with the true
+//! values.
 //!
-//! `cargo run --release -p twinstep-tests --bin recovery > results/recovery.md`
+//! The robots are simulated in another engine than the model and at a smaller step. Whether a parameter is identifiable
+//! is decided before the fit.
+//!
+//! `cargo run --release -p twinstep-tests --bin parameter_recovery > results/parameter_recovery.md`
 
 use clap::Parser;
 use indicatif::ProgressBar;
@@ -12,29 +15,30 @@ use twinstep_model::go2;
 use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_tests::ground_truth_robot::{estimated_effects, ground_truth_robot, log_of, motion};
 
-/// Find hidden bodies and motors again, and print the table.
+/// Estimate the parameters of ground-truth robots and print a table of the errors.
 #[derive(Parser)]
 struct Args {
-    /// Robots.
+    /// Number of robots.
     #[arg(long, default_value_t = 30)]
     cases: u64,
-    /// Number of the first; 1000 and up were never looked at in development.
+    /// Seed of the first robot. Seeds from 1000 on were not used during development.
     #[arg(long, default_value_t = 1000)]
     first: u64,
 }
 
-/// A number of one case.
-struct Answer {
+/// One estimated parameter of one robot.
+struct RecoveredValue {
     quantity: &'static str,
-    /// How far off it may be.
+    /// Largest allowed error, in the unit of [`ROWS`].
     goal: f64,
     error: f64,
-    /// Predicted half-width of its interval, in the same unit.
+    /// Predicted half-width of the 95 % interval, in the same unit.
     predicted: f64,
+    /// True if the 95 % interval covers the true value.
     covered: bool,
 }
 
-/// A row of the table: what it is called, of which unknowns, in which unit errors are, and the goal.
+/// Rows of the table: name, effect, parameter, unit of errors, and goal.
 const ROWS: [(&str, &str, &str, &str, f64); 8] = [
     ("base mass", "inertia", "theta.0", "%", 2.0),
     ("centre of mass, x", "inertia", "theta.7", "mm", 5.0),
@@ -50,41 +54,46 @@ fn main() {
     let args = Args::parse();
     let bar = ProgressBar::new(args.cases);
     let motion = motion(0);
-    let answers: Vec<Answer> = (args.first..args.first + args.cases)
+    let values: Vec<RecoveredValue> = (args.first..args.first + args.cases)
         .into_par_iter()
         .flat_map_iter(|case| {
-            let answers = recovered(case, &motion);
+            let values = recover(case, &motion);
             bar.inc(1);
-            answers
+            values
         })
         .collect();
     bar.finish_and_clear();
-    println!("# Hidden bodies and motors, found again\n");
+    println!("# Parameter recovery\n");
     println!(
-        "`cargo run --release -p twinstep-tests --bin recovery -- --first {} --cases {}`\n",
+        "`cargo run --release -p twinstep-tests --bin parameter_recovery -- --first {} --cases {}`\n",
         args.first, args.cases
     );
-    println!("| | goal | the log can tell | within the goal | median error | 95 % interval holds the truth |");
+    println!(
+        "| parameter | goal | identifiable | within the goal | median error | 95 % interval covers the true value |"
+    );
     println!("|---|---|---|---|---|---|");
     for (name, _, _, unit, goal) in ROWS {
-        let of: Vec<_> = answers.iter().filter(|answer| answer.quantity == name).collect();
-        let told: Vec<_> = of.iter().filter(|answer| answer.predicted < answer.goal).collect();
-        let within = told.iter().filter(|answer| answer.error.abs() < answer.goal).count();
-        let share = if told.is_empty() { "-".to_owned() } else { format!("{} %", 100 * within / told.len()) };
+        let all: Vec<_> = values.iter().filter(|value| value.quantity == name).collect();
+        let identifiable: Vec<_> = all.iter().filter(|value| value.predicted < value.goal).collect();
+        let within = identifiable.iter().filter(|value| value.error.abs() < value.goal).count();
+        let share = match identifiable.len() {
+            0 => "-".to_owned(),
+            count => format!("{} %", 100 * within / count),
+        };
         println!(
             "| {name} | {goal} {unit} | {} of {} | {share} | {:.2} {unit} | {} |",
-            told.len(),
-            of.len(),
-            median(of.iter().map(|answer| answer.error.abs())),
-            coverage(&of)
+            identifiable.len(),
+            all.len(),
+            median(all.iter().map(|value| value.error.abs())),
+            coverage(&all)
         );
     }
-    println!("| all | | | | | {} |", coverage(&answers.iter().collect::<Vec<_>>()));
+    println!("| all | | | | | {} |", coverage(&values.iter().collect::<Vec<_>>()));
 }
 
-fn coverage(answers: &[&Answer]) -> String {
-    let covered = answers.iter().filter(|answer| answer.covered).count();
-    format!("{covered} of {} ({} %)", answers.len(), 100 * covered / answers.len())
+fn coverage(values: &[&RecoveredValue]) -> String {
+    let covered = values.iter().filter(|value| value.covered).count();
+    format!("{covered} of {} ({} %)", values.len(), 100 * covered / values.len())
 }
 
 fn median(values: impl Iterator<Item = f64>) -> f64 {
@@ -93,9 +102,10 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
     values[values.len() / 2]
 }
 
-fn recovered(case: u64, motion: &twinstep_logs::Log) -> Vec<Answer> {
-    let hidden = ground_truth_robot(case);
-    let log = log_of(&hidden, motion, case);
+/// Identifies robot `case` from its log of `motion`.
+fn recover(case: u64, motion: &twinstep_logs::Log) -> Vec<RecoveredValue> {
+    let robot = ground_truth_robot(case);
+    let log = log_of(&robot, motion, case);
     let experiment = Experiment::new(&log, &go2(), WindowConfig::IDENTIFICATION).expect("an experiment");
     let mut simulator =
         BatchRollout::new(&go2(), &SimConfig { threads: 1, ..SimConfig::default() }).expect("a simulator");
@@ -108,18 +118,19 @@ fn recovered(case: u64, motion: &twinstep_logs::Log) -> Vec<Answer> {
         &mut |_, _, _| true,
     )
     .expect("the ideal robot can be simulated");
-    let truths = hidden.effects.iter().flat_map(|entry| entry.values.iter().copied());
-    found.findings.iter().zip(truths).filter_map(|(finding, truth)| answer(finding, truth)).collect()
+    let truths = robot.effects.iter().flat_map(|entry| entry.values.iter().copied());
+    found.findings.iter().zip(truths).filter_map(|(finding, truth)| recovered_value(finding, truth)).collect()
 }
 
-fn answer(finding: &ParameterEstimate, truth: f64) -> Option<Answer> {
-    let of = |row: &&(_, &str, &str, _, _)| {
+/// Compares an estimate with its true value. Returns `None` if the table has no row for the parameter.
+fn recovered_value(finding: &ParameterEstimate, truth: f64) -> Option<RecoveredValue> {
+    let is_its_row = |row: &&(_, &str, &str, _, _)| {
         row.1 == finding.parameter.effect.name && row.2 == finding.parameter.parameter_name
     };
-    let (quantity, _, _, unit, goal) = *ROWS.iter().find(of)?;
+    let (quantity, _, _, unit, goal) = *ROWS.iter().find(is_its_row)?;
     let half = 0.5 * (finding.predicted_interval[1] - finding.predicted_interval[0]);
     let middle = 0.5 * (finding.predicted_interval[0] + finding.predicted_interval[1]);
-    // Per unit of the unknown, at `value`.
+    // Factor from the parameter's unit to that of the table, linearised at `value`.
     let scale = |value: f64| match (quantity, unit) {
         // mass = exp(2 α)
         ("base mass", _) => 200.0,
@@ -128,7 +139,7 @@ fn answer(finding: &ParameterEstimate, truth: f64) -> Option<Answer> {
         _ => 1000.0,
     };
     let interval = finding.interval.unwrap_or([f64::NEG_INFINITY, f64::INFINITY]);
-    Some(Answer {
+    Some(RecoveredValue {
         quantity,
         goal,
         error: (finding.value - truth) * scale(truth),

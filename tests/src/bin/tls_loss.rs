@@ -1,5 +1,6 @@
-//! Counts the queries that TLS leaves unanswered, with and without Zenoh's `express`: one query at a time, none repeated,
-//! the server in a process of its own.
+//! Counts queries over TLS that end without a reply, with and without Zenoh's `express`.
+//!
+//! One query is sent at a time and none is repeated. The server is a process of its own.
 
 use std::io::{Read, Write};
 use std::path::PathBuf;
@@ -19,13 +20,13 @@ use zenoh::qos::CongestionControl;
 use zenoh::query::{ConsolidationMode, Querier, QueryTarget};
 use zenoh::{Session, Wait};
 
-/// After this long a query counts as unanswered.
+/// Time after which a query counts as unanswered.
 const QUERY_TIMEOUT: Duration = Duration::from_secs(2);
 /// Joints in an action.
 const ACTION_LEN: usize = 12;
-/// Pause between the uncounted queries that find out whether a broken link stands again.
+/// Pause between the uncounted queries that check whether a broken link is up again.
 const PAUSE: Duration = Duration::from_millis(20);
-/// What the echoing server answers.
+/// Key expression of the echo server.
 const ECHO_KEY: &str = "echo";
 
 /// Count the queries over TLS that end without a reply.
@@ -33,10 +34,10 @@ const ECHO_KEY: &str = "echo";
 struct Args {
     #[command(subcommand)]
     verb: Option<Role>,
-    /// Round trips of each case.
+    /// Number of round trips of each case.
     #[arg(long, default_value_t = 100_000, value_name = "N")]
     round_trips: usize,
-    /// Environments in a message; may be given several times.
+    /// Number of environments in a message. May be given several times.
     #[arg(long, default_values_t = [64, 256, 1024], value_name = "N")]
     envs: Vec<usize>,
     /// Link protocol: tls, or tcp for comparison.
@@ -46,7 +47,7 @@ struct Args {
 
 #[derive(Subcommand)]
 enum Role {
-    /// The other end: answers every query with a reply of a step's length until stdin closes.
+    /// Echo server: replies to every query with as many bytes as a step reply until stdin closes.
     #[command(hide = true)]
     Echo {
         #[arg(long)]
@@ -60,41 +61,41 @@ enum Role {
     },
 }
 
-/// How queries and replies are sent.
+/// Server and transport setting of a case.
 #[derive(Clone, Copy, PartialEq)]
-enum Way {
-    /// Zenoh's default: a message may wait for others.
+enum Case {
+    /// Zenoh's default: a message may wait to be batched with others.
     Batched,
-    /// Queries and replies do not wait.
+    /// Queries and replies are sent immediately.
     Express,
-    /// `twinstep serve` as it is, and the client's own queries.
+    /// `twinstep serve` unchanged, with the client's own queries.
     Twinstep,
 }
 
-impl Way {
-    const ALL: [Way; 3] = [Way::Batched, Way::Express, Way::Twinstep];
+impl Case {
+    const ALL: [Case; 3] = [Case::Batched, Case::Express, Case::Twinstep];
 
     fn name(self) -> &'static str {
         match self {
-            Way::Batched => "echo, batched",
-            Way::Express => "echo, express",
-            Way::Twinstep => "twinstep serve, express",
+            Case::Batched => "echo, batched",
+            Case::Express => "echo, express",
+            Case::Twinstep => "twinstep serve, express",
         }
     }
 }
 
-/// What became of a case's queries.
+/// Result of the queries of a case.
 struct Tally {
-    /// Queries that ended without a reply and without an error.
+    /// Number of queries that ended without a reply and without an error.
     empty: usize,
-    /// Queries that ended with an error, Zenoh's timeout among them.
+    /// Number of queries that ended with an error, including Zenoh's timeout.
     failed: usize,
-    /// Of the answered queries, in rising order.
+    /// Latency of the answered queries, in ascending order.
     latency: Vec<Duration>,
 }
 
 impl Tally {
-    /// Latency that `per_cent` of the answered queries stay below [us].
+    /// Returns a percentile of the latency of the answered queries [us].
     fn percentile(&self, per_cent: usize) -> u128 {
         let rank = self.latency.len().saturating_sub(1) * per_cent / 100;
         self.latency.get(rank).map_or(0, Duration::as_micros)
@@ -108,14 +109,14 @@ fn main() -> Result<(), Failure> {
     }
     zenoh::try_init_log_from_env();
     let folder = SecurityFolder::new()?;
-    println!("| way, {} | envs | round trips | no reply | error | p50 [us] | p99 [us] |", args.protocol);
+    println!("| case, {} | envs | round trips | no reply | error | p50 [us] | p99 [us] |", args.protocol);
     println!("|---|---|---|---|---|---|---|");
     for &envs in &args.envs {
-        for way in Way::ALL {
-            let tally = measure(&args, &folder, way, envs)?;
+        for case in Case::ALL {
+            let tally = measure(&args, &folder, case, envs)?;
             println!(
                 "| {} | {envs} | {} | {} | {} | {} | {} |",
-                way.name(),
+                case.name(),
                 args.round_trips,
                 tally.empty,
                 tally.failed,
@@ -127,31 +128,31 @@ fn main() -> Result<(), Failure> {
     Ok(())
 }
 
-fn measure(args: &Args, folder: &SecurityFolder, way: Way, envs: usize) -> Result<Tally, Failure> {
+fn measure(args: &Args, folder: &SecurityFolder, case: Case, envs: usize) -> Result<Tally, Failure> {
     let server_config = folder.path("server-tls.json5").display().to_string();
     let mut arguments = vec!["--zenoh".to_owned(), server_config];
     arguments.extend(["--listen".to_owned(), format!("{}/127.0.0.1:0", args.protocol)]);
     arguments.extend(["--envs".to_owned(), envs.to_string()]);
     let own = std::env::current_exe()?;
-    if way == Way::Twinstep {
+    if case == Case::Twinstep {
         arguments.splice(0..0, ["serve", "--task", "counter", "--until-stdin-closes"].map(str::to_owned));
         let (_server, endpoint) = Process::listening(&own.with_file_name("twinstep"), &arguments)?;
-        ask_twinstep(args.round_trips, folder, &endpoint, envs)
+        query_twinstep(args.round_trips, folder, &endpoint, envs)
     } else {
         arguments.insert(0, "echo".to_owned());
-        if way != Way::Batched {
+        if case != Case::Batched {
             arguments.push("--express".to_owned());
         }
         let (_server, endpoint) = Process::listening(&own, &arguments)?;
-        ask_echo(args.round_trips, folder, &endpoint, way, envs)
+        query_echo(args.round_trips, folder, &endpoint, case, envs)
     }
 }
 
-fn ask_echo(
+fn query_echo(
     round_trips: usize,
     folder: &SecurityFolder,
     endpoint: &str,
-    way: Way,
+    case: Case,
     envs: usize,
 ) -> Result<Tally, Failure> {
     let mut config = zenoh::Config::from_file(folder.path("client-tls.json5"))?;
@@ -163,17 +164,19 @@ fn ask_echo(
         .target(QueryTarget::BestMatching)
         .consolidation(ConsolidationMode::None)
         .congestion_control(CongestionControl::Block)
-        .express(way != Way::Batched)
+        .express(case != Case::Batched)
         .timeout(QUERY_TIMEOUT)
         .wait()?;
     let actions = vec![0.1f32; envs * ACTION_LEN];
     let actions = tensor::as_bytes(&actions);
     let request = encode(&message::StepRequest { protocol: PROTOCOL, epoch: 1, seq: 1, actions });
-    ask(&querier, round_trips, way, envs, |_| request.clone())
+    run_queries(&querier, round_trips, case, envs, |_| request.clone())
 }
 
-/// Steps a lease of `twinstep serve` without the client's repeats: a lost step's number is sent again as the next query.
-fn ask_twinstep(round_trips: usize, folder: &SecurityFolder, endpoint: &str, envs: usize) -> Result<Tally, Failure> {
+/// Steps a lease of `twinstep serve` without the client's repeats.
+///
+/// After a lost step, the next query has the same sequence number.
+fn query_twinstep(round_trips: usize, folder: &SecurityFolder, endpoint: &str, envs: usize) -> Result<Tally, Failure> {
     let options =
         ConnectOptions { zenoh: Some(folder.path("client-tls.json5")), ..ConnectOptions::new(endpoint, envs) };
     let link = Connection::open(&options)?;
@@ -194,23 +197,25 @@ fn ask_twinstep(round_trips: usize, folder: &SecurityFolder, endpoint: &str, env
     link.request(&querier(EnvMethod::Reset)?, encode(&reset))?;
     let actions = vec![0.1f32; envs * ACTION_LEN];
     let actions = tensor::as_bytes(&actions);
-    ask(&querier(EnvMethod::Step)?, round_trips, Way::Twinstep, envs, |answered| {
+    run_queries(&querier(EnvMethod::Step)?, round_trips, Case::Twinstep, envs, |answered| {
         encode(&message::StepRequest { protocol: PROTOCOL, epoch, seq: 2 + answered as u64, actions })
     })
 }
 
-/// Sends one query after the other; `request` is told how many were answered. After an unanswered one it waits until the
-/// link stands again, so that a broken link counts once.
-fn ask(
+/// Sends queries one after another and counts those without a reply.
+///
+/// `request` receives the number of queries answered so far. After an unanswered query it waits until the link is up
+/// again, so that a broken link counts once.
+fn run_queries(
     querier: &Querier<'_>,
     round_trips: usize,
-    way: Way,
+    case: Case,
     envs: usize,
     request: impl Fn(usize) -> Vec<u8>,
 ) -> Result<Tally, Failure> {
     let template = "{msg} {wide_bar} {pos}/{len} {eta}";
     let bar = ProgressBar::new(round_trips as u64).with_style(ProgressStyle::with_template(template)?);
-    bar.set_message(format!("{}, {envs} envs", way.name()));
+    bar.set_message(format!("{}, {envs} envs", case.name()));
     let mut tally = Tally { empty: 0, failed: 0, latency: Vec::with_capacity(round_trips) };
     let mut answered = 0;
     for round_trip in 0..round_trips {
@@ -226,8 +231,8 @@ fn ask(
             Outcome::Error(_) => tally.failed += 1,
         }
         if outcome != Outcome::Answer {
-            let case = format!("{}, {envs} envs, query {round_trip}", way.name());
-            bar.suspend(|| eprintln!("{case}: {outcome:?} after {} us", waited.as_micros()));
+            let query = format!("{}, {envs} envs, query {round_trip}", case.name());
+            bar.suspend(|| eprintln!("{query}: {outcome:?} after {} us", waited.as_micros()));
             while once(querier, request(answered))? != Outcome::Answer {
                 std::thread::sleep(PAUSE);
             }
@@ -243,7 +248,7 @@ fn ask(
 #[derive(Debug, PartialEq)]
 enum Outcome {
     Answer,
-    /// Zero replies and no error.
+    /// No reply and no error.
     Empty,
     Error(String),
 }

@@ -1,4 +1,4 @@
-//! Robots that walk on the batch engine, driven by an ensemble, on one core.
+//! Walking robots in the batch engine with an ensemble as actuators, on one core.
 
 use twinstep_effects::{ActuatorNetworkConfig, MemberSampling, ModelFile};
 use twinstep_ensemble::ActuatorNetworkRobot;
@@ -12,33 +12,33 @@ use crate::error::{BenchError, Interrupted, check, failed};
 use crate::throughput::{WINDOWS, measure as pace, median_of};
 use twinstep_envs::trot;
 
-/// Robots that are stepped together: what six networks remember of 64 fits into a core's own cache.
+/// Numbers of robots. The states of six networks for 64 robots fit into the cache of a core.
 const ROBOTS: [usize; 2] = [64, 1024];
 
-/// Who actuators the robots.
+/// Actuators of the robots.
 #[derive(Clone, Copy)]
 enum ActuatorKind {
-    /// Their own.
+    /// Analytic actuators of the robot model.
     Analytic,
-    /// One member a robot, drawn when it is placed.
+    /// One member per robot, sampled at each reset.
     NetworkPerEpisode,
-    /// One member a robot and actuator period: all hear of every robot, and their disagreement is evaluated once a step.
+    /// One member per robot and actuator period. All members receive the inputs of every robot, and the epistemic
+    /// uncertainty is evaluated once per step.
     NetworkPerStep,
 }
 
-/// Env-steps a second of each kind of actuator.
+/// Measures env-steps/s with each kind of actuators.
 pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
-    let rows: Result<Vec<_>, _> =
-        ROBOTS.into_iter().map(|robots| side_by_side(robots, window_s, interrupted)).collect();
+    let rows: Result<Vec<_>, _> = ROBOTS.into_iter().map(|robots| compare(robots, window_s, interrupted)).collect();
     Ok(rows?.concat())
 }
 
-/// Windows of all actuators in turn.
-fn side_by_side(robots: usize, window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
+/// Measures windows of all kinds of actuators alternately.
+fn compare(robots: usize, window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
     let cases = [
-        (ActuatorKind::Analytic, "own actuators"),
-        (ActuatorKind::NetworkPerEpisode, "one member an episode"),
-        (ActuatorKind::NetworkPerStep, "six members and EUF"),
+        (ActuatorKind::Analytic, "analytic actuators"),
+        (ActuatorKind::NetworkPerEpisode, "one member per episode"),
+        (ActuatorKind::NetworkPerStep, "six members with uncertainty"),
     ];
     let mut walks = cases.iter().map(|(actuators, _)| walking(*actuators, robots)).collect::<Result<Vec<_>, _>>()?;
     let mut rates = vec![Vec::new(); cases.len()];
@@ -53,13 +53,13 @@ fn side_by_side(robots: usize, window_s: f64, interrupted: Interrupted) -> Resul
         case: format!("walk, {robots} robots, one core, {name}"),
         value: *rate,
         unit: "env-steps/s",
-        reference: Some("own actuators".to_owned()),
+        reference: Some("analytic actuators".to_owned()),
         ratio: Some(rate / rates[0]),
     };
     Ok(cases.iter().zip(&rates).map(row).collect())
 }
 
-/// A policy period of robots that are told to trot, again and again.
+/// Returns a function that steps trotting robots by one policy period.
 fn walking(actuators: ActuatorKind, robots: usize) -> Result<impl FnMut() -> Result<(), BenchError>, BenchError> {
     let sim = SimConfig { threads: 1, physics_hz: Some(1000), ..SimConfig::default() };
     let backend = BatchBackend::new(go2(), sim, robots).map_err(failed)?;

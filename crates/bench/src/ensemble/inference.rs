@@ -1,4 +1,4 @@
-//! One row of the networks for many robots on one core, with states carried from row to row.
+//! Inference of one row for many robots on one core, with states carried from row to row.
 
 use std::path::Path;
 
@@ -11,10 +11,12 @@ use crate::Measurement;
 use crate::error::{BenchError, Interrupted, check};
 use crate::throughput::{WINDOWS, measure as pace, median_of};
 
-/// Robots of a query.
+/// Numbers of robots of a query.
 const ROBOTS: [usize; 4] = [1, 64, 1024, 4096];
 
-/// Microseconds a query: one member, and six with their disagreement; ours, PyTorch's and burn's in turn.
+/// Measures the time of a query [µs] with one member, and with six and their uncertainty.
+///
+/// Windows of Twinstep, PyTorch and burn alternate.
 pub fn measure(python: &Path, window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
     let (members, robots, learning) = (&[1, MEMBERS], &ROBOTS, Learning::default());
     let mut torch = Torch::start(python, &Setup { hidden: HIDDEN, members, robots, learning, window_s });
@@ -36,8 +38,8 @@ fn query(members: usize, robots: usize, torch: &mut Torch, window_s: f64) -> Res
         time += 1;
         errors(robots, time)
     };
-    let peer = name(members, robots);
-    let [mut own, mut torches, mut by_burn] = [(); 3].map(|()| Vec::new());
+    let torch_name = name(members, robots);
+    let [mut own, mut torches, mut burn_times] = [(); 3].map(|()| Vec::new());
     for _ in 0..WINDOWS {
         own.push(median_us(window_s, || {
             ours.step(&errors());
@@ -45,13 +47,13 @@ fn query(members: usize, robots: usize, torch: &mut Torch, window_s: f64) -> Res
                 std::hint::black_box(ours.epistemic_uncertainty());
             }
         })?);
-        by_burn.push(median_us(window_s, || drop(std::hint::black_box(burns.hear(&errors()))))?);
-        if torch.has(&peer) {
-            torches.push(torch.window(&peer)?);
+        burn_times.push(median_us(window_s, || drop(std::hint::black_box(burns.hear(&errors()))))?);
+        if torch.has(&torch_name) {
+            torches.push(torch.window(&torch_name)?);
         }
     }
-    let (own, by_burn) = (median_of(own), median_of(by_burn));
-    let what = if members == 1 { "one member".to_owned() } else { format!("{members} members and EUF") };
+    let (own, burn_times) = (median_of(own), median_of(burn_times));
+    let what = if members == 1 { "one member".to_owned() } else { format!("{members} members with uncertainty") };
     let case = format!("query of {what}, {robots} robots");
     let row = |case: String, value: f64, reference: Option<(&str, f64)>| Measurement {
         case,
@@ -60,13 +62,13 @@ fn query(members: usize, robots: usize, torch: &mut Torch, window_s: f64) -> Res
         reference: reference.map(|(name, _)| name.to_owned()),
         ratio: reference.map(|(_, theirs)| theirs / value),
     };
-    let mut rows = vec![row(case.clone(), own, Some(("burn's operations", by_burn)))];
+    let mut rows = vec![row(case.clone(), own, Some(("burn's operations", burn_times)))];
     if !torches.is_empty() {
         rows.push(row(case.clone(), own, Some(("PyTorch, one thread", median_of(torches.clone())))));
         rows.push(row(format!("{case}, PyTorch, one thread"), median_of(torches), None));
     }
-    // burn has no disagreement to compute: its time is of the networks alone.
-    rows.push(row(format!("{case}, burn's operations (no EUF)"), by_burn, None));
+    // burn's time is that of the networks only: it does not compute the uncertainty.
+    rows.push(row(format!("{case}, burn's operations (without uncertainty)"), burn_times, None));
     Ok(rows)
 }
 
@@ -78,7 +80,7 @@ fn median_us(window_s: f64, mut once: impl FnMut()) -> Result<f64, BenchError> {
     pace(window_s, once).map(|pace| pace.median_us)
 }
 
-/// ξ of robots whose joints swing.
+/// Returns ξ of robots with swinging joints.
 fn errors(robots: usize, time: usize) -> Vec<[[f64; 2]; NUM_JOINTS]> {
     let phase = 0.05 * time as f64;
     let one: [[f64; 2]; NUM_JOINTS] = std::array::from_fn(|joint| {

@@ -1,4 +1,4 @@
-//! Actuator networks: how fast networks answer and learn beside others, and robots that they actuator.
+//! Actuator networks: speed of inference and training compared with baselines, and of robots simulated with them.
 
 mod in_loop;
 mod inference;
@@ -14,11 +14,12 @@ use twinstep_model::{JOINT_NAMES, go2};
 use crate::Measurement;
 use crate::error::{BenchError, Interrupted};
 
-/// U2E's sizes.
+/// Number of members in U2E.
 const MEMBERS: usize = 6;
+/// Number of hidden units in U2E.
 const HIDDEN: usize = 32;
 
-/// Every number of the ensemble.
+/// Measures inference, training and simulation with an ensemble.
 pub fn measure(python: &Path, window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
     let mut rows = inference::measure(python, window_s, interrupted)?;
     rows.extend(training::measure(python, window_s, interrupted)?);
@@ -26,9 +27,9 @@ pub fn measure(python: &Path, window_s: f64, interrupted: Interrupted) -> Result
     Ok(rows)
 }
 
-/// An ensemble that actuators a Go2 by its gains: as fast as any other of its size, and robots stay on their feet.
+/// Returns an ensemble that computes the PD law of a Go2: as fast as any other of its size, and robots keep standing.
 fn ensemble(members: usize) -> Ensemble {
-    let (control, scale) = (go2().control, |deviation| Normaliser { mean: 0.0, std: deviation });
+    let (control, scale) = (go2().control, |std| Normaliser { mean: 0.0, std });
     Ensemble::linear_pd(EnsembleMetadata {
         members,
         hidden: HIDDEN,

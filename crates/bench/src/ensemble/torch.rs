@@ -1,4 +1,4 @@
-//! The same networks in PyTorch: a child process that measures one window at a time.
+//! Baseline of the networks in PyTorch: a child process that measures one window at a time.
 
 use std::path::Path;
 
@@ -7,19 +7,19 @@ use serde::Serialize;
 use crate::baselines::{Baselines, Program};
 use crate::error::BenchError;
 
-/// What the child runs; it needs nothing but PyTorch.
+/// Program of the child process; it needs only PyTorch.
 const SCRIPT: &str = include_str!("torch_baseline.py");
 
-/// What is measured.
+/// Setup of the measurement.
 #[derive(Serialize)]
 pub struct Setup<'a> {
-    /// Units of an encoder.
+    /// Number of hidden units.
     pub hidden: usize,
-    /// Networks of a query.
+    /// Numbers of members of a query.
     pub members: &'a [usize],
-    /// Robots of a query.
+    /// Numbers of robots of a query.
     pub robots: &'a [usize],
-    /// Trainings.
+    /// Trainings to measure.
     pub learning: Learning<'a>,
     /// Length of a window [s].
     pub window_s: f64,
@@ -28,41 +28,41 @@ pub struct Setup<'a> {
 /// Trainings of one network, one for each number of threads.
 #[derive(Default, Serialize)]
 pub struct Learning<'a> {
-    /// Sequences of a batch.
+    /// Number of sequences of a batch.
     pub batch: usize,
-    /// Rows of a sequence.
+    /// Number of rows of a sequence.
     pub rows: usize,
-    /// Threads.
+    /// Numbers of threads.
     pub threads: &'a [usize],
 }
 
-/// PyTorch, if the interpreter has it.
+/// PyTorch, if it is installed.
 pub struct Torch(Baselines);
 
-/// What the child calls a query.
+/// Returns the name of a query in the child process.
 pub fn name(members: usize, robots: usize) -> String {
     format!("{members} {robots}")
 }
 
-/// What the child calls a training.
+/// Returns the name of a training in the child process.
 pub fn training(threads: usize) -> String {
     format!("training {threads}")
 }
 
 impl Torch {
-    /// Asks the interpreter `python`; what it lacks is said on stderr, and left out.
+    /// Starts the child process in the interpreter `python`. Without PyTorch it is skipped with a message on stderr.
     pub fn start(python: &Path, setup: &Setup) -> Self {
         let program =
             Program { arguments: &["-c", SCRIPT], name: "the networks in PyTorch", install: "pip install torch" };
         Self(Baselines::start_program(python, program, setup))
     }
 
-    /// True if it has a query or a training of that name.
+    /// True if it has a query or a training of this name.
     pub fn has(&self, query: &str) -> bool {
         self.0.has(query)
     }
 
-    /// Median time of a query, or of a training's step, in one window [µs].
+    /// Returns the median time of a query, or of a training step, in one window [µs].
     pub fn window(&mut self, query: &str) -> Result<f64, BenchError> {
         self.0.window(query)
     }

@@ -1,8 +1,8 @@
 """The networks of `twinstep bench ensemble` in PyTorch.
 
-Reads a line of JSON (hidden, members, robots, learning, window_s), answers with the names of what it has, and then to each
-name with a median time in microseconds over one window: to a query, "members robots", that of one row of every joint, on
-one thread; to "training threads" that of one step of Adam of one network, on so many.
+Reads one line of JSON (hidden, members, robots, learning, window_s) and prints the names of its measurements. Then it
+reads names and prints for each the median time over one window in microseconds. A query, "members robots", is one row
+of every joint on one thread. "training threads" is one Adam step of one network on this number of threads.
 """
 
 import json
@@ -19,7 +19,7 @@ torch.manual_seed(1)
 
 
 class Member:
-    """One network, by PyTorch's own LSTM cell."""
+    """One network with PyTorch's LSTM cell."""
 
     def __init__(self, hidden, rows):
         self.cell = torch.nn.LSTMCell(2, hidden)
@@ -27,14 +27,14 @@ class Member:
         self.mean, self.variance = head(), head()
         self.state = (torch.zeros(rows, hidden), torch.zeros(rows, hidden))
 
-    def hear(self, errors):
+    def step(self, errors):
         self.state = self.cell(errors, self.state)
         hidden = self.state[0]
         return self.mean(hidden), softplus(self.variance(hidden)) + 1e-6
 
 
 class Stack:
-    """Several networks as one batched product, and how much they disagree."""
+    """Several networks as one batched product, with their epistemic uncertainty."""
 
     def __init__(self, members, hidden, rows):
         random = lambda *shape: 0.2 * torch.randn(*shape)
@@ -44,24 +44,27 @@ class Stack:
         self.hidden = hidden
         self.state = [torch.zeros(members, rows, hidden) for _ in range(2)]
 
-    def hear(self, errors):
+    def step(self, errors):
         state, cell = self.state
-        heard = torch.cat([errors.expand(state.shape[0], -1, -1), state], 2)
-        into, forget, new, out = torch.baddbmm(self.bias, heard, self.weight).chunk(4, 2)
+        inputs = torch.cat([errors.expand(state.shape[0], -1, -1), state], 2)
+        into, forget, new, out = torch.baddbmm(self.bias, inputs, self.weight).chunk(4, 2)
         cell = forget.sigmoid() * cell + into.sigmoid() * new.tanh()
         state = out.sigmoid() * cell.tanh()
         self.state = [state, cell]
         layers = torch.baddbmm(self.layers[1], state, self.layers[0]).relu().chunk(2, 2)
         mean, raw = (layer.contiguous() @ output for layer, output in zip(layers, self.outputs))
         variance = softplus(raw) + 1e-6
-        apart, both = mean.unsqueeze(0) - mean.unsqueeze(1), variance.unsqueeze(0) + variance.unsqueeze(1)
+        difference, total = mean.unsqueeze(0) - mean.unsqueeze(1), variance.unsqueeze(0) + variance.unsqueeze(1)
         product = variance.unsqueeze(0) * variance.unsqueeze(1)
-        alike = (2 * product.sqrt() / both).sqrt() * (-0.5 * apart * apart / both).exp()
-        return -alike.mean((0, 1)).log()
+        overlap = (2 * product.sqrt() / total).sqrt() * (-0.5 * difference * difference / total).exp()
+        return -overlap.mean((0, 1)).log()
 
 
 class Training:
-    """One network on sequences, by PyTorch's own LSTM, loss and optimiser; the heads see the rows of all sequences at once."""
+    """Training of one network on sequences with PyTorch's LSTM, loss and optimiser.
+
+    The heads process the rows of all sequences at once.
+    """
 
     def __init__(self, hidden, batch, rows):
         self.lstm = torch.nn.LSTM(2, hidden)
@@ -71,7 +74,7 @@ class Training:
         self.optimiser = torch.optim.Adam(modules.parameters(), lr=5e-3)
         self.torques = torch.randn(rows, batch, 1)
 
-    def hear(self, errors):
+    def step(self, errors):
         states, _ = self.lstm(errors)
         variance = softplus(self.variance(states)) + 1e-6
         loss = gaussian_nll_loss(self.mean(states), self.torques, variance)
@@ -82,10 +85,10 @@ class Training:
 
 def window(network, errors, seconds):
     times = []
-    network.hear(errors)
+    network.step(errors)
     since = last = time.perf_counter()
     while last - since < seconds or not times:
-        network.hear(errors)
+        network.step(errors)
         now = time.perf_counter()
         times.append(now - last)
         last = now

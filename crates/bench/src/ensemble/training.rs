@@ -1,4 +1,4 @@
-//! How fast members learn, beside PyTorch.
+//! Speed of training compared with PyTorch.
 
 use std::f64::consts::TAU;
 use std::path::Path;
@@ -14,14 +14,14 @@ use crate::Measurement;
 use crate::error::{BenchError, Interrupted, check, failed};
 use crate::throughput::{WINDOWS, median_of};
 
-/// Rows of the log at 200 Hz: ten minutes, so that batches are full and a window of seconds ends within an epoch.
+/// Number of rows of the log at 200 Hz: ten minutes, so that batches are full and a window ends within an epoch.
 const ROWS: usize = 120_000;
-/// Sequences of a batch and rows of a sequence, as [`Training`] has them.
+/// Sequences per batch and rows per sequence, as in [`Training`].
 const LEARNING: (usize, usize) = (256, 64);
 
-/// Member-sequences a second on one thread and on all, ours and PyTorch's in turn.
+/// Measures member-sequences/s on one thread and on all, of Twinstep and PyTorch alternately.
 pub fn measure(python: &Path, window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
-    let data = DataSet::new(&[("joints that swing".to_owned(), log()?)]).map_err(failed)?;
+    let data = DataSet::new(&[("swinging joints".to_owned(), log()?)]).map_err(failed)?;
     let options = TrainingOptions { members: MEMBERS, hidden: HIDDEN, ..TrainingOptions::default() };
     let ours = Training::new(&data, options).map_err(failed)?;
     let mut threads = vec![1, std::thread::available_parallelism().map_or(1, usize::from)];
@@ -42,14 +42,14 @@ pub fn measure(python: &Path, window_s: f64, interrupted: Interrupted) -> Result
     Ok(threads.iter().zip(rates).flat_map(|(threads, rates)| rows_of(*threads, rates)).collect())
 }
 
-/// Sequences that members learn from in a second, from the first batch of a training on.
+/// Returns the member-sequences per second of a training, counted from its first batch.
 fn window(training: &Training, threads: usize, window_s: f64) -> Result<f64, BenchError> {
     let window = Duration::from_secs_f64(window_s);
     let (mut since, mut sequences, mut rate) = (None::<Instant>, 0, 0.0);
     let ended = training.run(threads, None, &mut |progress| {
         let TrainingEvent::Sequences(count) = progress else { return true };
         let Some(since) = since else {
-            // Until now the networks were made.
+            // The time until here was spent on creating the networks.
             since = Some(Instant::now());
             return true;
         };
@@ -79,7 +79,7 @@ fn rows_of(threads: usize, [own, torches]: [Vec<f64>; 2]) -> Vec<Measurement> {
     vec![row(case.clone(), own, Some(theirs)), row(format!("{case}, PyTorch"), theirs, None)]
 }
 
-/// Twelve joints that swing, and torques that follow a row late.
+/// Returns a log of twelve swinging joints, with torques that are delayed by one row.
 fn log() -> Result<Log, BenchError> {
     let time = |row: usize| row as f64 / 200.0;
     let mut columns = vec![("t".to_owned(), (0..ROWS).map(time).collect::<Vec<_>>())];

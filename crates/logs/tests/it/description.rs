@@ -45,11 +45,13 @@ fn summary_of_the_real_recording() {
         identifiability
           command_delay        weak  motion reaches only 0.5 Hz: move at 2 Hz or more; confounded with armature in slow motion
           encoder_offset       weak  kp is constant: repeat the motion with another kp; confounded with a constant load at a single kp
+          pd_gain              no    torque was not measured: only motion is available
           torque_saturation    no    no joint exceeds 13 % of its torque limit: reach 60 % or more
           supply_sag           no    no joint exceeds 13 % of its torque limit: reach 40 % or more
           thermal_derating     no    no temp was recorded
           torque_delay         weak  motion reaches only 0.5 Hz: move at 2 Hz or more; differs from command_delay only if the joint is pushed
           torque_speed_limit   no    no joint exceeds 15 % of its speed limit: reach 50 % or more
+          torque_dead_zone     no    torque was not measured: only motion is available
           drive_lag            no    motion reaches only 0.5 Hz: move at 2 Hz or more
           torque_sensor_delay  no    torque was not measured: only motion is available
           torque_gain          weak  torque was not measured: only motion is available; confounded with a wrong kp or mass
@@ -114,11 +116,13 @@ fn summary_of_a_log_with_gaps_missing_channels_and_warnings() {
         identifiability
           command_delay        no    no joint reverses four times: move one back and forth
           encoder_offset       no    no joint reverses four times: move one back and forth
+          pd_gain              no    torque was not measured: only motion is available
           torque_saturation    no    the torque limits of the joints are unknown
           supply_sag           no    the torque limits of the joints are unknown
           thermal_derating     no    the torque limits of the joints are unknown
           torque_delay         no    no joint reverses four times: move one back and forth
           torque_speed_limit   no    the speed limits of the joints are unknown
+          torque_dead_zone     no    torque was not measured: only motion is available
           drive_lag            no    no joint reverses four times: move one back and forth
           torque_sensor_delay  no    torque was not measured: only motion is available
           torque_gain          no    no joint reverses four times: move one back and forth

@@ -18,7 +18,7 @@ use twinstep_logs::{Gain, Meta, Segment, TorqueSensor};
 use twinstep_model::BaseMount;
 
 /// Recording of a real robot with its feet in the air, 16 s at 200 Hz.
-const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../data/go2_air_chirp");
+const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../data/go2_air_chirp");
 
 /// Minimal metadata.
 const META: &str = r#"{"rate_hz": 200, "tau_sensor": "none", "segments": [{"name": "stand", "base": "fixed"}]}"#;

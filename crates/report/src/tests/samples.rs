@@ -53,16 +53,16 @@ pub fn findings() -> (Diagnosis, ModelFile) {
     friction.score_nats = 412.0;
     friction.evidence =
         "Friction of about 1 N·m at the calves, at any speed, with the sign of the velocity.".to_owned();
-    friction.rivals = vec![rival("viscous_friction", "calf", 0.31), rival("coulomb_friction", "all", 0.29)];
+    friction.rivals = vec![alternative("viscous_friction", "calf", 0.31), alternative("coulomb_friction", "all", 0.29)];
     let mut armature = cause("armature", "calf", "inertia_kgm2", [0.015, 0.011, 0.019]);
     armature.held_out_gain = 0.21;
     armature.ambiguous_with = vec!["command_delay@calf".to_owned()];
     armature.evidence = "Fast motion of the calves lags as with a rotor inertia of 0.015 kg·m².".to_owned();
-    armature.rivals = vec![rival("command_delay", "calf", 0.209)];
+    armature.rivals = vec![alternative("command_delay", "calf", 0.209)];
     let mut viscous = cause("viscous_friction", "thigh", "coefficient_nms", [0.3, 0.21, 0.39]);
     viscous.held_out_gain = 0.12;
     viscous.evidence = "Friction at the thighs is proportional to their velocity.".to_owned();
-    viscous.rivals = vec![rival("coulomb_friction", "thigh", 0.08)];
+    viscous.rivals = vec![alternative("coulomb_friction", "thigh", 0.08)];
     let diagnosis = Diagnosis {
         baseline: errors(0.036),
         extended: errors(0.014),
@@ -112,7 +112,7 @@ fn cause(effect: &str, scope: &str, parameter: &str, [value, low, high]: [f64; 3
     }
 }
 
-fn rival(effect: &str, scope: &str, held_out_gain: f64) -> AlternativeCause {
+fn alternative(effect: &str, scope: &str, held_out_gain: f64) -> AlternativeCause {
     AlternativeCause { effect: effect.to_owned(), scope: scope.to_owned(), held_out_gain }
 }
 

@@ -190,7 +190,7 @@ impl<T: SimdFloat> RobotBatch<T> {
         for _ in 0..actuator_periods {
             match input {
                 ActuatorInput::Commands(commands) => {
-                    self.actuator.update_command(commands, &self.sampled_q(), &self.state.dq)
+                    self.actuator.update_command(commands, &self.sampled_q(), &self.state.dq);
                 }
                 ActuatorInput::Torques(tau) => self.actuator.set_torque(*tau),
             }
