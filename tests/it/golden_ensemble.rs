@@ -64,9 +64,9 @@ fn golden_ensemble_reproduces_the_stored_predictions() {
         let ensemble = trained();
         std::fs::create_dir_all(path("")).unwrap();
         ensemble.write(path("actuators.safetensors")).unwrap();
-        std::fs::write(path("said.json"), serde_json::to_string(&predictions(&ensemble)).unwrap()).unwrap();
+        std::fs::write(path("expected.json"), serde_json::to_string(&predictions(&ensemble)).unwrap()).unwrap();
     }
-    let written: Golden = serde_json::from_slice(&std::fs::read(path("said.json")).unwrap()).unwrap();
+    let written: Golden = serde_json::from_slice(&std::fs::read(path("expected.json")).unwrap()).unwrap();
     let found = predictions(&Ensemble::read(path("actuators.safetensors")).unwrap());
     for (written, found) in [(written.mean, found.mean), (written.variance, found.variance)] {
         let [written, found] = [written, found].map(|rows| rows.concat().concat());

@@ -85,12 +85,12 @@ impl<'a> ForwardSelection<'a> {
             if let Some(next) = next {
                 self.accepted.push(next);
             } else {
-                let Some(place) = self.to_eliminate() else { break };
+                let Some(place) = self.find_cause_to_eliminate() else { break };
                 excluded.push(self.accepted.remove(place).0.hypothesis.name());
             }
             self.refit();
         }
-        while let Some(place) = self.to_eliminate() {
+        while let Some(place) = self.find_cause_to_eliminate() {
             self.accepted.remove(place);
             self.refit();
         }
@@ -98,7 +98,7 @@ impl<'a> ForwardSelection<'a> {
     }
 
     /// Returns the index of a cause to eliminate after the joint refit, if any.
-    fn to_eliminate(&mut self) -> Option<usize> {
+    fn find_cause_to_eliminate(&mut self) -> Option<usize> {
         let WindowedData { evidence, given } = self.looked_at();
         let robot = self.model.robot_model().expect("fitted within its bounds");
         let left = evidence.residual_power(self.simulator, &robot);

@@ -289,7 +289,9 @@ impl Experiment {
     /// Returns the robots with the actuator rate of the log.
     fn at_rate(&self, robots: &[RobotModel]) -> Vec<RobotModel> {
         let mut robots = robots.to_vec();
-        robots.iter_mut().for_each(|robot| robot.control.actuator_hz = self.actuator_hz);
+        for robot in &mut robots {
+            robot.control.actuator_hz = self.actuator_hz;
+        }
         robots
     }
 
