@@ -104,9 +104,7 @@ def test_fixed_base_is_closer_to_fine_mujoco_than_mujoco_at_the_same_step(
 
 
 @pytest.mark.parametrize(("target", "limit"), [(step_target, 0.003), (trot_target, 0.015)])
-def test_floating_base_moves_as_in_fine_mujoco(
-    tmp_path: Path, target: Callable[[int], Array], limit: float
-) -> None:
+def test_floating_base_moves_as_in_fine_mujoco(tmp_path: Path, target: Callable[[int], Array], limit: float) -> None:
     targets = motion(target)
     played = play(tmp_path, targets, "floating", 1000)
     joints, _ = in_mujoco(targets, played, "floating", 0.0005)

@@ -74,16 +74,17 @@ enum Requirement {
 ///
 /// Two effects are not sampled: `inertia`, whose ten parameters also describe a payload or a centre-of-mass shift, and
 /// `ground_friction`, because no foot slips in these motions.
-const NEEDS: [(&str, &[Requirement]); 25] = [
+///
+/// `pd_gain` and `torque_dead_zone` are not drawn yet either: with them every seed would give other cases than those of
+/// `results/hunt.md`, whose rates were measured without them.
+const NEEDS: [(&str, &[Requirement]); 23] = [
     ("command_delay", &[Requirement::Air]),
     ("encoder_offset", &[Requirement::Ground]),
-    ("pd_gain", &[Requirement::Torque, Requirement::Air]),
     ("torque_saturation", &[Requirement::Air]),
     ("supply_sag", &[Requirement::Battery]),
     ("thermal_derating", &[Requirement::Temperature, Requirement::Air]),
     ("torque_delay", &[Requirement::Air]),
     ("torque_speed_limit", &[Requirement::Air]),
-    ("torque_dead_zone", &[Requirement::Torque, Requirement::Air]),
     ("drive_lag", &[Requirement::Air]),
     ("torque_sensor_delay", &[Requirement::Torque, Requirement::Air]),
     ("torque_gain", &[Requirement::Air]),
@@ -274,9 +275,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_effect_but_inertia_and_ground_friction_can_be_hidden() {
+    fn every_effect_but_four_can_be_hidden() {
         let known: Vec<_> = NEEDS.iter().map(|(name, _)| *name).collect();
-        let excluded = ["inertia", "ground_friction"];
+        let excluded = ["inertia", "ground_friction", "pd_gain", "torque_dead_zone"];
         let catalogue = CATALOGUE.iter().map(|effect| effect.name).filter(|name| !excluded.contains(name));
         assert_eq!(catalogue.collect::<Vec<_>>(), known);
     }

@@ -11,17 +11,17 @@ with this process.
 import gymnasium
 
 from .checker import VecEnvError, check_vec_env
-from .codec import MalformedError, SpecField, Spec
+from .codec import MalformedError, Spec, SpecField
 from .env import Go2Env
 from .errors import (
+    AmbiguousRobotError,
     Error,
     InvalidActionError,
     InvalidOptionError,
     LeaseLostError,
-    RequestTimeoutError,
     NoServerError,
-    AmbiguousRobotError,
     RequestRejectedError,
+    RequestTimeoutError,
     ResetNeededError,
     ServerExitedError,
     SpecMismatchError,
@@ -32,6 +32,8 @@ from .server import EmbeddedServer, ServerNotFoundError, ServerStartError
 from .vector_env import Go2VectorEnv
 
 __all__ = [
+    "AmbiguousRobotError",
+    "ConnectOptions",
     "EmbeddedServer",
     "Error",
     "Go2Env",
@@ -40,17 +42,15 @@ __all__ = [
     "InvalidOptionError",
     "LeaseLostError",
     "MalformedError",
-    "RequestTimeoutError",
     "NoServerError",
-    "AmbiguousRobotError",
-    "ConnectOptions",
-    "SpecField",
     "RequestRejectedError",
+    "RequestTimeoutError",
     "ResetNeededError",
     "ServerExitedError",
     "ServerNotFoundError",
     "ServerStartError",
     "Spec",
+    "SpecField",
     "SpecMismatchError",
     "VecEnvError",
     "VersionError",

@@ -12,12 +12,12 @@ import zenoh
 
 from . import codec
 from .errors import (
+    AmbiguousRobotError,
     Error,
     InvalidOptionError,
     LeaseLostError,
-    RequestTimeoutError,
     NoServerError,
-    AmbiguousRobotError,
+    RequestTimeoutError,
     ServerExitedError,
     VersionError,
     from_reply,
@@ -84,7 +84,9 @@ class Connection:
             self.server_id, self.name = self._find_server(robot)
             self.client = uuid.uuid4().hex
             self.hello = self._handshake()
-            self._token = self._session.liveliness().declare_token(f"twinstep/live/client/{self.server_id}/{self.client}")
+            self._token = self._session.liveliness().declare_token(
+                f"twinstep/live/client/{self.server_id}/{self.client}"
+            )
         except BaseException:
             self._session.close()
             raise
@@ -178,7 +180,9 @@ class Connection:
 
     def _server_restarted(self) -> bool:
         visible = self._visible_servers()
-        return all(server_id != self.server_id for server_id, _ in visible) and any(name == self.name for _, name in visible)
+        return all(server_id != self.server_id for server_id, _ in visible) and any(
+            name == self.name for _, name in visible
+        )
 
     def _timeout_reason(self) -> str:
         info = self._session.info
@@ -194,7 +198,7 @@ class Connection:
             )
         if hello is _NoReply.TIMEOUT:
             return "the server is visible but unresponsive: it does not reply to requests"
-            return "the server is visible, but queries get no reply: access control may deny queries to this user"
+        return "the server is visible, but queries get no reply: access control may deny queries to this user"
 
 
 class _NoReply:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InvalidActionError, InvalidOptionError
-from .remote import UNLIMITED, StepBatch, ConnectOptions, RemoteVecEnv
+from .remote import UNLIMITED, ConnectOptions, RemoteVecEnv, StepBatch
 from .render import Viewer
 from .spaces import action_space, observation_space
 

@@ -9,8 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import codec
-from .errors import Error, InvalidActionError, InvalidOptionError, RequestTimeoutError, RequestRejectedError, SpecMismatchError
 from .connection import Connection, Pending
+from .errors import (
+    Error,
+    InvalidActionError,
+    InvalidOptionError,
+    RequestRejectedError,
+    RequestTimeoutError,
+    SpecMismatchError,
+)
 from .server import EmbeddedServer
 
 UNLIMITED = 2**32 - 1
@@ -109,7 +116,9 @@ class RemoteVecEnv:
         Policy steps after which an episode is truncated. ``None``: the number of the task.
     """
 
-    def __init__(self, options: ConnectOptions, *, num_envs: int, autoreset: str, max_episode_steps: int | None) -> None:
+    def __init__(
+        self, options: ConnectOptions, *, num_envs: int, autoreset: str, max_episode_steps: int | None
+    ) -> None:
         if num_envs < 1:
             raise InvalidOptionError(f"`num_envs` = {num_envs}; must be at least 1")
         if max_episode_steps is not None and not 1 <= max_episode_steps <= UNLIMITED:
@@ -155,7 +164,8 @@ class RemoteVecEnv:
         self._epoch: int = lease["epoch"]
         self._last_seq: int = lease["last_seq"]
         self._methods = {
-            method: connection.querier(f"env/{lease['lease']}/{method}") for method in ("reset", "step", "render", "close")
+            method: connection.querier(f"env/{lease['lease']}/{method}")
+            for method in ("reset", "step", "render", "close")
         }
         self._pending: tuple[str, Pending, float] | None = None
 
@@ -217,7 +227,9 @@ class RemoteVecEnv:
 
     def scene(self, env: int) -> dict[str, Any]:
         """Return shapes and poses of one robot, and its ground, for rendering."""
-        return self._connection.request(self._methods["render"], {"epoch": self._epoch, "env": env}, self._options.timeout_s)
+        return self._connection.request(
+            self._methods["render"], {"epoch": self._epoch, "env": env}, self._options.timeout_s
+        )
 
     def close(self) -> None:
         """End the lease. Further calls have no effect."""

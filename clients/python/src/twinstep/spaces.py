@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
-from .codec import SpecField, Spec
+from .codec import Spec, SpecField
 
 
 def observation_space(spec: Spec) -> Space[NDArray[np.float32]]:

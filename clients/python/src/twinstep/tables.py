@@ -1,6 +1,6 @@
 """Generate the observation and action tables: ``python -m twinstep.tables > docs/go2-walk.md``."""
 
-from .codec import SpecField, Spec
+from .codec import Spec, SpecField
 from .vector_env import Go2VectorEnv
 
 
@@ -29,7 +29,9 @@ def _table(parts: tuple[SpecField, ...]) -> str:
     rows, start = list[str](), 0
     for part in parts:
         index = f"{start}" if part.size == 1 else f"{start}–{start + part.size - 1}"
-        rows.append(f"| {index} | `{part.name}` | {part.unit or '–'} | {part.low:g} | {part.high:g} | {part.description} |")
+        rows.append(
+            f"| {index} | `{part.name}` | {part.unit or '–'} | {part.low:g} | {part.high:g} | {part.description} |"
+        )
         start += part.size
     return "| index | name | unit | low | high | meaning |\n|---|---|---|---|---|---|\n" + "\n".join(rows) + "\n"
 

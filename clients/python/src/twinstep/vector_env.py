@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .env import OptionArguments, RenderMode, checked_render_mode, reward_terms
 from .errors import InvalidOptionError
-from .remote import StepBatch, ConnectOptions, RemoteVecEnv
+from .remote import ConnectOptions, RemoteVecEnv, StepBatch
 from .render import Viewer
 from .spaces import action_space, observation_space
 
