@@ -53,13 +53,14 @@ pub fn with_intervals(
         for (j, other) in fit.unknowns.iter().enumerate().take(i) {
             let correlation = covariance.map_or(0.0, |covariance| covariance[(i, j)] / (deviation(i) * deviation(j)));
             if correlation.abs() >= CORRELATED && one.effect != other.effect {
-                let told = |from: &'static twinstep_effects::Effect, to: &str| {
+                let experiment_between = |from: &'static twinstep_effects::Effect, to: &str| {
                     from.confounders
                         .iter()
                         .find(|confusion| confusion.effect == to)
                         .map(|confusion| confusion.discriminating_experiment)
                 };
-                let experiment = told(one.effect, other.effect.name).or(told(other.effect, one.effect.name));
+                let experiment = experiment_between(one.effect, other.effect.name)
+                    .or(experiment_between(other.effect, one.effect.name));
                 confusable.push(CorrelatedPair {
                     effects: [other.effect.name.to_owned(), one.effect.name.to_owned()],
                     correlation,

@@ -69,13 +69,13 @@ impl JointGroupResult {
     fn new(slots: &JointSlots, causes: &[TorqueCandidate], log: &Log) -> Self {
         let entries: Vec<EffectEntry> = causes.iter().map(|cause| cause.entry.clone()).collect();
         let [given, named] = [&[][..], &entries].map(|entries| slots.robot(entries).expect("entries that were fitted"));
-        let told = |index: usize| {
+        let torque_cause = |index: usize| {
             let others = entries.iter().enumerate().filter(|(other, _)| *other != index);
             let others: Vec<EffectEntry> = others.map(|(_, entry)| entry.clone()).collect();
             cause(slots, &causes[index], &others)
         };
         Self {
-            causes: (0..causes.len()).map(told).collect(),
+            causes: (0..causes.len()).map(torque_cause).collect(),
             before: slots.held_out_sums(&given),
             after: slots.held_out_sums(&named),
             unexplained: left(slots, [&given, &named], log),
@@ -212,7 +212,7 @@ fn cause(slots: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) ->
     let (effect, scope) = (found.entry.effect, slots.scope_name(found.entry.scope));
     let fit = TorqueFit::new(slots, others, &found.entry).expect("it was fitted before");
     let numbers = effect.parameters.iter().zip(&found.entry.values).zip(fit.intervals());
-    let told = |((parameter, value), [low, high]): ((&Parameter, &f64), [f64; 2])| {
+    let estimate = |((parameter, value), [low, high]): ((&Parameter, &f64), [f64; 2])| {
         // Torques in the slots are scaled.
         let unit =
             if parameter.unit.contains("N·m") || parameter.unit == "kg·m²" { slots.torque_scale } else { 1.0 };
@@ -238,7 +238,7 @@ fn cause(slots: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) ->
     }
     Cause {
         effect: effect.name.to_owned(),
-        parameters: numbers.map(told).collect(),
+        parameters: numbers.map(estimate).collect(),
         held_out_gain: found.gain,
         score_nats: found.score,
         threshold_nats: THRESHOLD,
@@ -340,8 +340,8 @@ mod tests {
         assert!(late.contains(&found.findings[0].ambiguous_with[0].as_str()), "{:#?}", found.findings[0]);
         assert_eq!(names[1..], ["torque_gain@axis_13"], "{:#?}", found.findings);
         let within = |place: usize, name: &str, truth: f64| {
-            let told = &found.findings[place].parameters[name];
-            let [ParameterValue::Number(low), ParameterValue::Number(high)] = [&told.low, &told.high] else {
+            let estimate = &found.findings[place].parameters[name];
+            let [ParameterValue::Number(low), ParameterValue::Number(high)] = [&estimate.low, &estimate.high] else {
                 return false;
             };
             (*low..=*high).contains(&truth)

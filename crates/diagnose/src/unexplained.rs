@@ -62,10 +62,10 @@ pub fn describe_residual(
         .collect();
     found.sort_by(|one, other| other.0.total_cmp(&one.0));
     found.truncate(3);
-    let told = found.first().map_or("it depends on none of the channels".to_owned(), |(share, variable)| {
+    let dependence = found.first().map_or("it depends on none of the channels".to_owned(), |(share, variable)| {
         format!("{:.0} % of its variance is explained by {variable}", 100.0 * share)
     });
-    let text = format!("{whose} has a residual above noise that no cause explains: {told}.");
+    let text = format!("{whose} has a residual above noise that no cause explains: {dependence}.");
     Unexplained { fraction, depends_on: found.into_iter().map(|(_, name)| name).collect(), text }
 }
 

@@ -1,6 +1,6 @@
 //! The bytes of every kind of message, kept in `golden/` for the clients in other languages to read as well.
 //!
-//! `UPDATE_GOLDEN=1 cargo test --release --workspace --test wire golden` writes the files anew. Other bytes are another
+//! `UPDATE_GOLDEN=1 cargo test --release --workspace --test wire golden` writes the files again. Other bytes are another
 //! protocol: clients in the field stop understanding the server unless the change only adds an optional field.
 
 use std::fmt::Debug;
