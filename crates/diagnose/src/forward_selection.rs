@@ -28,8 +28,9 @@ const MAX_BODY_CANDIDATES: usize = 2;
 pub const MIN_EXPLAINED_FRACTION: f64 = 0.3;
 /// Fraction of the power above noise that may remain in the channels that a cause affects, after the joint refit.
 ///
-/// A constant gain, for example, partly imitates a gain that grows with the error.
-pub const MAX_REMAINING_FRACTION: f64 = 0.5;
+/// A cause must halve the RMS error there. A wrong law imitates the true one in part: Coulomb friction explains 57 % of
+/// the power of friction that acts in one direction only. True causes of the blind test leave less than 1 %.
+pub const MAX_REMAINING_FRACTION: f64 = 0.25;
 /// Power above noise per row that is negligible [noise variance].
 pub const NEGLIGIBLE_EXCESS: f64 = 1.0;
 
@@ -77,7 +78,7 @@ impl<'a> ForwardSelection<'a> {
     /// Runs forward selection with backward elimination.
     ///
     /// Each round adds the best candidate and refits all causes. If none reaches the threshold, a cause that is too
-    /// small, implausible, or leaves more than half of its own channels' error is removed and excluded.
+    /// small, implausible, or does not halve the RMS error of its own channels is removed and excluded.
     pub fn run(&mut self) -> Result<(), DiagnoseError> {
         let mut excluded = Vec::new();
         for _ in 0..MOST_SEARCHES {
@@ -192,7 +193,7 @@ fn best_first(one: &CandidateFit, other: &CandidateFit) -> std::cmp::Ordering {
     other.score.total_cmp(&one.score)
 }
 
-/// Returns true if most of the excess power in the channels that a cause affects is explained.
+/// Returns true if a cause leaves at most a quarter of the excess power in the channels that it affects.
 fn explains_affected_channels(hypothesis: &Hypothesis, given: &ResidualPower, left: &ResidualPower) -> bool {
     affected_channels(hypothesis).into_iter().all(|channels| {
         let excess = |left: &ResidualPower| channels.iter().map(|channel| left.channel_excess(*channel)).sum::<f64>();
@@ -265,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn cause_must_explain_half_of_the_excess_in_its_channels() {
+    fn cause_must_explain_three_quarters_of_the_excess_in_its_channels() {
         let (hip, calf) = (Joint::ALL[0], Joint::ALL[2]);
         let given = residual_power(|channel| if channel == hip.index() { 20.0 } else { 10.0 });
         let only_hip = residual_power(|channel| if channel == hip.index() { 1.0 } else { 9.9 });

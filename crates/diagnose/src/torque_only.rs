@@ -173,8 +173,7 @@ impl TorqueForwardSelection<'_, '_> {
         Some(scored.into_iter().map(|(_, entry)| entry).collect())
     }
 
-    /// Returns the index of a cause that is too small, implausible, or leaves half of the excess power at its own
-    /// joints.
+    /// Returns the index of a cause that is too small, implausible, or does not halve the RMS error of its own joints.
     fn untenable(&self) -> Option<usize> {
         let (given, named) = (self.slots.robot(&[])?, self.slots.robot(&self.entries())?);
         let left = self.slots.residual_powers(&[given, named]);
