@@ -3,8 +3,8 @@
 use rand::RngExt;
 use twinstep_effects::{ActuatorNetworkConfig, MemberSampling};
 use twinstep_model::{
-    Actuator, ActuatorSnapshot, BackendError, Command, EpistemicUncertainty, JOINT_NAMES, NUM_JOINTS, PerJoint,
-    RobotStates, Stream, standard_normal, stream,
+    Actuator, ActuatorSnapshot, BackendError, Command, EpistemicUncertainty, JOINT_NAMES, Measured, NUM_JOINTS,
+    PerJoint, Stream, standard_normal, stream,
 };
 use twinstep_simd::InstructionSet;
 
@@ -182,7 +182,7 @@ impl Actuator for ActuatorNetwork {
         &mut self,
         commands: &[Command],
         active: &[bool],
-        states: &RobotStates,
+        measured: &Measured,
         tau: &mut [PerJoint],
     ) -> Result<(), BackendError> {
         self.check(commands, active)?;
@@ -191,7 +191,7 @@ impl Actuator for ActuatorNetwork {
             if self.draw == MemberSampling::PerStep {
                 self.robots[robot].member = self.robots[robot].random.random_range(0..self.members);
             }
-            let errors = self.errors(&commands[robot], &states.q[robot], &states.dq[robot]);
+            let errors = self.errors(&commands[robot], &measured.q[robot], &measured.dq[robot]);
             for slot in self.fed_slots(robot) {
                 self.networks.push_input(slot, &errors, slot.member == self.robots[robot].member);
             }
@@ -249,6 +249,7 @@ impl EpistemicUncertainty for ActuatorNetwork {
 #[cfg(test)]
 mod tests {
     use twinstep_logs::TorqueSensor;
+    use twinstep_model::RobotStates;
 
     use super::*;
     use crate::ensemble::{EnsembleMetadata, JointEncoding};
@@ -286,7 +287,7 @@ mod tests {
         let mut tau = vec![[0.0; 12]; robots];
         let command = Command::hold([0.02 * row as f32; 12], 30.0, 0.75);
         actuators
-            .torques(&vec![command; robots], &vec![true; robots], &RobotStates::new(robots), &mut tau)
+            .torques(&vec![command; robots], &vec![true; robots], &RobotStates::new(robots).measured, &mut tau)
             .expect("supported commands");
         tau
     }

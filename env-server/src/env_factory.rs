@@ -3,8 +3,8 @@
 use twinstep_effects::{ModelFile, ModelFileError};
 use twinstep_effects::{RobotSampler, SamplingError};
 use twinstep_ensemble::{ActuatorNetworkRobot, EnsembleError};
-use twinstep_envs::{CounterEnv, TaskEnv, TaskEnvConfig, TaskName};
-use twinstep_model::{Actuator, AutoresetMode, RobotModel, VecEnv};
+use twinstep_envs::{CounterEnv, TaskConfig, TaskEnv, TaskEnvConfig, Walk};
+use twinstep_model::{Actuator, AutoresetMode, Backend, RobotModel, VecEnv};
 use twinstep_sim::{BackendBuildError, BatchBackend, Engine, RapierBackend};
 
 use crate::Config;
@@ -80,7 +80,7 @@ impl SimEnvFactory {
 
     /// Returns the actuator networks of `num_envs` robots, or `None` if the actuators are analytic.
     fn actuators(&self, num_envs: usize) -> Option<Box<dyn Actuator>> {
-        let uncertain = self.config.task.reward.epistemic_uncertainty != 0.0;
+        let uncertain = self.config.task.epistemic_uncertainty_weight() != 0.0;
         self.learned.as_ref().map(|learned| Box::new(learned.actuators(num_envs, uncertain)) as Box<dyn Actuator>)
     }
 }
@@ -89,7 +89,7 @@ impl SimEnvFactory {
 fn check_actuators(config: &Config, learned: Option<&ActuatorNetworkRobot>) -> Result<(), EnvFactoryError> {
     let reject = |field, reason| Err(EnvFactoryError::ActuatorNetwork { field, reason });
     let Some(learned) = learned else {
-        return match config.task.reward.epistemic_uncertainty {
+        return match config.task.epistemic_uncertainty_weight() {
             0.0 => Ok(()),
             _ => reject(
                 "task.reward.epistemic_uncertainty",
@@ -120,29 +120,44 @@ impl EnvFactory for SimEnvFactory {
         autoreset: AutoresetMode,
         max_episode_steps: Option<u32>,
     ) -> Result<Box<dyn VecEnv>, EnvFactoryError> {
-        if self.config.task.name == TaskName::Counter {
+        if self.config.task == TaskConfig::Counter {
             return Ok(Box::new(CounterEnv::new(&self.robot, num_envs, autoreset)));
         }
+        let (robot, sim, actuators) = (self.robot.clone(), self.config.sim, self.actuators(num_envs));
         let settings = TaskEnvConfig {
-            task: self.config.task.clone(),
             randomise: self.config.randomise,
             robot_sampler: self.robots.clone(),
             autoreset,
             max_episode_steps,
             seed: self.seed,
         };
-        let (robot, sim, actuators) = (self.robot.clone(), self.config.sim, self.actuators(num_envs));
         match sim.engine {
             Engine::Rapier => {
                 let backend = RapierBackend::new(robot, sim, num_envs)?;
                 let backend = if let Some(actuators) = actuators { backend.with_actuator(actuators) } else { backend };
-                Ok(Box::new(TaskEnv::new(backend, settings)?))
+                task_env(&self.config.task, backend, settings)
             }
             Engine::Batch => {
                 let backend = BatchBackend::new(robot, sim, num_envs)?;
                 let backend = if let Some(actuators) = actuators { backend.with_actuator(actuators) } else { backend };
-                Ok(Box::new(TaskEnv::new(backend, settings)?))
+                task_env(&self.config.task, backend, settings)
             }
         }
+    }
+}
+
+/// Builds the environments of the configured task on a backend.
+fn task_env(
+    config: &TaskConfig,
+    backend: impl Backend + 'static,
+    settings: TaskEnvConfig,
+) -> Result<Box<dyn VecEnv>, EnvFactoryError> {
+    let (robot, has_ground_truth) = (backend.robot(), backend.ground_truth().is_some());
+    match config {
+        TaskConfig::Walk(config) => {
+            let walk = Walk::new(config.clone(), robot, has_ground_truth)?;
+            Ok(Box::new(TaskEnv::new(backend, walk, settings)?))
+        }
+        TaskConfig::Counter => Ok(Box::new(CounterEnv::new(robot, backend.num_robots(), settings.autoreset))),
     }
 }

@@ -261,6 +261,7 @@ impl LeaseManager {
             num_envs,
             autoreset: request.autoreset,
             max_episode_steps: request.max_episode_steps,
+            critic: request.critic,
         };
         let (sender, receiver) = sync_channel(WORKER_QUEUE);
         let (factory, shared, lease_queue) =

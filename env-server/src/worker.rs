@@ -50,6 +50,8 @@ pub struct LeaseParams {
     pub autoreset: AutoresetMode,
     /// Number of policy steps after which an episode is truncated. Default: that of the task.
     pub max_episode_steps: Option<u32>,
+    /// True if the client receives the observations of group `critic`.
+    pub critic: bool,
 }
 
 /// Owns the environments of one lease.
@@ -123,6 +125,10 @@ impl Worker {
             self.request_release();
             return CachedReply::Err(lost_environments(reason));
         }
+        let mut spec = self.env.spec().clone();
+        if !self.grant.critic {
+            spec.critic_observation.clear();
+        }
         CachedReply::Ok(ZBytes::from(encode(&message::LeaseReply {
             protocol: PROTOCOL,
             lease: self.grant.lease.clone(),
@@ -130,7 +136,7 @@ impl Worker {
             num_envs: self.grant.num_envs as u64,
             autoreset: self.grant.autoreset,
             last_seq: self.last_seq,
-            spec: self.env.spec().clone(),
+            spec,
         })))
     }
 
@@ -226,9 +232,9 @@ impl Worker {
             EnvMethod::Reset => {
                 let request: message::ResetRequest<'_> = decode(payload)?;
                 let reset = convert::read_reset(&request)?;
-                let obs = self.env.reset(&reset).map_err(|error| convert::wire_error(&error))?;
-                let obs = tensor::as_bytes(obs);
-                Ok(encode(&message::ResetReply { protocol: PROTOCOL, seq: request.seq, obs }))
+                let obs = self.env.reset(&reset).map_err(|error| convert::wire_error(&error))?.to_vec();
+                let critic_obs = if self.grant.critic { self.env.critic_obs() } else { &[] };
+                Ok(convert::encode_observations(&obs, critic_obs, request.seq))
             }
             EnvMethod::Step => {
                 let request: message::StepRequest<'_> = decode(payload)?;
@@ -236,7 +242,7 @@ impl Worker {
                 read_actions(request.actions, expected, &mut self.actions)?;
                 let batch = self.env.step(&self.actions).map_err(|error| logged(&error))?;
                 self.shared.env_steps.fetch_add(batch.reward.len() as u64, Ordering::Relaxed);
-                Ok(convert::encode_step(batch, request.seq))
+                Ok(convert::encode_step(batch, request.seq, self.grant.critic))
             }
             EnvMethod::Close => {
                 let request: message::CloseRequest = decode(payload)?;

@@ -27,14 +27,37 @@ pub fn read_reset(request: &message::ResetRequest<'_>) -> Result<ResetRequest, E
     Ok(ResetRequest { seeds, mask: request.mask.map(tensor::flags_from_bytes) })
 }
 
-/// Encodes the reply to a step.
-pub fn encode_step(batch: &StepBatch, seq: u64) -> Vec<u8> {
+/// Encodes the reply to a reset. `critic_obs` is empty unless the lease requested the group `critic`.
+pub fn encode_observations(obs: &[f32], critic_obs: &[f32], seq: u64) -> Vec<u8> {
+    let (obs, critic_obs) = (tensor::as_bytes(obs), tensor::as_bytes(critic_obs));
+    encode(&message::ResetReply { protocol: PROTOCOL, seq, obs, critic_obs })
+}
+
+/// Decodes the reply to a reset into `batch`. Fails if a length does not match `num_envs` environments of `spec`.
+pub fn decode_observations(
+    reply: &message::ResetReply<'_>,
+    spec: &EnvSpec,
+    num_envs: usize,
+    batch: &mut StepBatch,
+) -> Result<(), ErrorReply> {
+    tensor::read_into(reply.obs, &mut batch.obs, "obs")?;
+    tensor::read_into(reply.critic_obs, &mut batch.critic_obs, "critic_obs")?;
+    check_length("obs", batch.obs.len(), num_envs * spec.obs_len())?;
+    check_length("critic_obs", batch.critic_obs.len(), num_envs * spec.critic_obs_len())
+}
+
+/// Encodes the reply to a step, with the group `critic` if the lease requested it.
+pub fn encode_step(batch: &StepBatch, seq: u64, with_critic: bool) -> Vec<u8> {
     let ended = &batch.ended;
     let env: Vec<u32> = ended.iter().map(|episode| episode.env as u32).collect();
     let length: Vec<u32> = ended.iter().map(|episode| episode.length).collect();
     let episode_return: Vec<f32> = ended.iter().map(|episode| episode.episode_return).collect();
     let terms: Vec<f32> = ended.iter().flat_map(|episode| episode.terms.iter().copied()).collect();
     let final_obs: Vec<f32> = ended.iter().flat_map(|episode| episode.final_obs.iter().copied()).collect();
+    let critic_obs = if with_critic { &batch.critic_obs[..] } else { &[] };
+    let with_final_critic = ended.iter().filter(|_| with_critic);
+    let final_critic_obs: Vec<f32> =
+        with_final_critic.flat_map(|episode| episode.final_critic_obs.iter().copied()).collect();
     let reply = message::StepReply {
         protocol: PROTOCOL,
         seq,
@@ -47,8 +70,11 @@ pub fn encode_step(batch: &StepBatch, seq: u64) -> Vec<u8> {
         ended_return: tensor::as_bytes(&episode_return),
         ended_terms: tensor::as_bytes(&terms),
         final_obs: tensor::as_bytes(&final_obs),
+        critic_obs: tensor::as_bytes(critic_obs),
+        final_critic_obs: tensor::as_bytes(&final_critic_obs),
     };
-    let numbers = batch.obs.len() + batch.reward.len() + 3 * ended.len() + terms.len() + final_obs.len();
+    let critic = critic_obs.len() + final_critic_obs.len();
+    let numbers = batch.obs.len() + batch.reward.len() + 3 * ended.len() + terms.len() + final_obs.len() + critic;
     let flags = batch.terminated.len() + batch.truncated.len();
     encode_with_capacity(&reply, MAP_OVERHEAD + numbers * size_of::<f32>() + flags)
 }
@@ -76,7 +102,10 @@ pub fn decode_step(
     let episode_return: Vec<f32> = tensor::read(reply.ended_return, "ended_return")?;
     let terms: Vec<f32> = tensor::read(reply.ended_terms, "ended_terms")?;
     let final_obs: Vec<f32> = tensor::read(reply.final_obs, "final_obs")?;
+    tensor::read_into(reply.critic_obs, &mut batch.critic_obs, "critic_obs")?;
+    let final_critic_obs: Vec<f32> = tensor::read(reply.final_critic_obs, "final_critic_obs")?;
     let (ended, obs_len, num_terms) = (env.len(), spec.obs_len(), spec.reward_terms.len());
+    let critic_len = spec.critic_obs_len();
     for (field, given, expected) in [
         ("obs", batch.obs.len(), num_envs * obs_len),
         ("reward", batch.reward.len(), num_envs),
@@ -86,6 +115,8 @@ pub fn decode_step(
         ("ended_return", episode_return.len(), ended),
         ("ended_terms", terms.len(), ended * num_terms),
         ("final_obs", final_obs.len(), if final_obs.is_empty() { 0 } else { ended * obs_len }),
+        ("critic_obs", batch.critic_obs.len(), num_envs * critic_len),
+        ("final_critic_obs", final_critic_obs.len(), if final_obs.is_empty() { 0 } else { ended * critic_len }),
     ] {
         check_length(field, given, expected)?;
     }
@@ -100,6 +131,7 @@ pub fn decode_step(
             episode_return: episode_return[k],
             terms: terms[k * num_terms..(k + 1) * num_terms].to_vec(),
             final_obs: final_obs.get(k * obs_len..(k + 1) * obs_len).unwrap_or_default().to_vec(),
+            final_critic_obs: final_critic_obs.get(k * critic_len..(k + 1) * critic_len).unwrap_or_default().to_vec(),
         })
         .collect();
     Ok(())

@@ -56,6 +56,9 @@ pub struct LeaseRequest {
     /// Number of policy steps after which an episode is truncated. Default: the server's.
     #[serde(default)]
     pub max_episode_steps: Option<u32>,
+    /// True to receive the observations of group `critic` with every reset and step.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub critic: bool,
     /// Spec hash for which the client's policy was trained. A server with a different one rejects the request.
     #[serde(default)]
     pub spec_hash: Option<String>,
@@ -88,7 +91,7 @@ pub struct LeaseReply {
     pub autoreset: AutoresetMode,
     /// Last sequence number that was consumed; 0 for none. The next request has this number plus one.
     pub last_seq: u64,
-    /// Spec of the environments, with `max_episode_steps` as granted.
+    /// Spec of the environments, with `max_episode_steps` as granted, and without the group `critic` unless requested.
     pub spec: EnvSpec,
 }
 
@@ -119,6 +122,9 @@ pub struct ResetReply<'a> {
     /// Observations, `num_envs × obs_len` × f32.
     #[serde(borrow, with = "serde_bytes")]
     pub obs: &'a [u8],
+    /// Observations of group `critic`, `num_envs × critic_obs_len` × f32; absent unless the lease requested it.
+    #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "<[u8]>::is_empty")]
+    pub critic_obs: &'a [u8],
 }
 
 /// Advances all environments by one policy period.
@@ -169,6 +175,12 @@ pub struct StepReply<'a> {
     /// Their last observations, `k × obs_len` × f32; empty unless autoreset is SameStep.
     #[serde(borrow, with = "serde_bytes")]
     pub final_obs: &'a [u8],
+    /// Observations of group `critic`, `num_envs × critic_obs_len` × f32; absent unless the lease requested it.
+    #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "<[u8]>::is_empty")]
+    pub critic_obs: &'a [u8],
+    /// As `final_obs`, of group `critic`.
+    #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "<[u8]>::is_empty")]
+    pub final_critic_obs: &'a [u8],
 }
 
 /// Ends the lease.

@@ -45,8 +45,10 @@ fn simulate(robots: &[RobotModel], base: BaseMount) -> Vec<RobotStates> {
     let pose = go2().control.default_pose_f32();
     let commands = vec![Command::hold(pose.map(|q| q + 0.2), 30.0, 0.75); PERIODS];
     let start = InitialState::at_rest(0.33, pose);
-    let jobs: Vec<_> =
-        robots.iter().map(|robot| RolloutRequest { robot, base, start, history: &[], commands: &commands }).collect();
+    let jobs: Vec<_> = robots
+        .iter()
+        .map(|robot| RolloutRequest { robot, base, start, history: &[], commands: &commands, derating: &[] })
+        .collect();
     let config = SimConfig { threads: 1, ..SimConfig::default() };
     BatchRollout::new(&go2(), &config).unwrap().run(&jobs, Precision::Double)
 }
@@ -72,7 +74,7 @@ proptest! {
         prop_assert_eq!(&rollouts[0], &simulate(&robots[..1], base)[0]);
         prop_assert!((0..=PERIODS).all(|entry| rollouts[0].first_not_finite(entry).is_none()));
         for states in &rollouts {
-            prop_assert_eq!(states.q.len(), PERIODS + 1);
+            prop_assert_eq!(states.measured.q.len(), PERIODS + 1);
             // A diverged robot remains diverged.
             let diverged = (0..=PERIODS).map(|entry| states.first_not_finite(entry).is_some());
             prop_assert!(diverged.is_sorted());

@@ -1,10 +1,11 @@
 //! Comparison of the batch engine with rapier and with closed forms.
 
 use rand::RngExt;
+use twinstep_envs::Randomisation;
 use twinstep_model::{
-    Backend, BaseMount, Command, InitialState, NUM_JOINTS, PerJoint, RandomisationSample, go2, stream,
+    Backend, BaseMount, Command, InitialState, NUM_JOINTS, PerJoint, RobotModel, Simulator, go2, stream,
 };
-use twinstep_sim::{BatchBackend, BatchBackend as Simulator, Engine, RapierBackend, SimConfig, SimdPrecision};
+use twinstep_sim::{BatchBackend, BatchBackend as TestedBackend, Engine, RapierBackend, SimConfig, SimdPrecision};
 use twinstep_simd::InstructionSet;
 
 const ENGINE: Engine = Engine::Batch;
@@ -54,24 +55,24 @@ fn trot_target(period: usize) -> PerJoint {
 }
 
 /// Returns the joint positions over one second of `target`, after 0.5 s in the default pose.
-fn motion(backend: &mut impl Backend, height: f32, target: fn(usize) -> PerJoint) -> Vec<PerJoint> {
+fn motion(backend: &mut impl Simulator, height: f32, target: fn(usize) -> PerJoint) -> Vec<PerJoint> {
     let initial_state = InitialState::at_rest(height, pose());
     backend.reset(&[(0, initial_state)]).unwrap();
     let robots = backend.num_robots();
     let mut follow = |target: PerJoint, periods: usize| {
         let commands = vec![Command::hold(target, 40.0, 1.0); robots];
         backend.step(&commands, &vec![true; robots], periods).unwrap();
-        backend.states().q[0]
+        backend.measured().q[0]
     };
     follow(pose(), SECOND / 2);
     (0..SECOND).map(|period| follow(target(period), 1)).collect()
 }
 
 /// Returns the height of the trunk of a standing robot [m].
-fn standing_height(backend: &mut impl Backend) -> f32 {
+fn standing_height(backend: &mut impl Simulator) -> f32 {
     backend.reset(&[(0, InitialState::at_rest(0.335, pose()))]).unwrap();
     backend.step(&[Command::hold(pose(), 40.0, 1.0)], &[true], 3 * SECOND).unwrap();
-    backend.states().base_position[0][2]
+    backend.states().truth.base_position[0][2]
 }
 
 fn rms_difference(one: &[PerJoint], other: &[PerJoint]) -> f32 {
@@ -121,10 +122,18 @@ fn penetration_of_soft_ground_agrees_with_rapier() {
 fn foot_forces_sum_to_the_weight() {
     let mut backend = batch(at(1000, 4, BaseMount::Floating), 1);
     backend.step(&[Command::hold(pose(), 40.0, 1.0)], &[true], 10 * SECOND).unwrap();
-    let force: f32 = backend.states().foot_force[0].iter().sum();
+    let force: f32 = backend.states().truth.foot_force[0].iter().sum();
     let weight = go2().total_mass() as f32 * 9.81;
     assert!((force / weight - 1.0).abs() < 1e-3, "{force} N of {weight} N");
-    assert!(!backend.states().body_contact[0]);
+    assert!(!backend.states().truth.body_contact[0]);
+}
+
+/// Returns the Go2 with all masses multiplied by `factor`.
+fn scaled(factor: f64) -> RobotModel {
+    let mut robot = go2();
+    let bodies = robot.legs.iter_mut().flat_map(|leg| &mut leg.bodies).chain([&mut robot.trunk]);
+    bodies.for_each(|body| *body = body.scaled(factor));
+    robot
 }
 
 #[test]
@@ -132,21 +141,18 @@ fn result_is_bitwise_independent_of_lane_batch_and_number_of_threads() {
     let run = |robots: usize, at_index: usize, threads: usize| {
         let config = SimConfig { threads, ..at(400, 4, BaseMount::Floating) };
         let mut backend = batch(config, robots);
-        let initial_state = |robot: usize| {
-            let randomisation =
-                RandomisationSample { mass_scale: 0.8 + 0.05 * robot as f32, ..RandomisationSample::default() };
-            InitialState { randomisation, ..InitialState::at_rest(0.3 + 0.01 * robot as f32, pose()) }
-        };
+        let initial_state = |robot: usize| InitialState::at_rest(0.3 + 0.01 * robot as f32, pose());
         let tested = InitialState { base_linear_velocity: [0.5, 0.2, 0.0], ..initial_state(3) };
-        let initial_states: Vec<_> =
-            (0..robots).map(|robot| (robot, if robot == at_index { tested } else { initial_state(robot) })).collect();
-        backend.reset(&initial_states).unwrap();
+        for robot in 0..robots {
+            let (number, state) = if robot == at_index { (3, tested) } else { (robot, initial_state(robot)) };
+            backend.reset_with_model(robot, &scaled(0.8 + 0.05 * number as f64), &state).unwrap();
+        }
         for period in 0..SECOND {
             let commands = vec![Command::hold(trot_target(period), 30.0, 0.75); robots];
             backend.step(&commands, &vec![true; robots], 1).unwrap();
         }
         let states = backend.states();
-        (states.q[at_index], states.base_position[at_index], states.base_orientation[at_index])
+        (states.measured.q[at_index], states.truth.base_position[at_index], states.measured.orientation[at_index])
     };
     let alone = run(1, 0, 1);
     for (robots, index, threads) in [(1, 0, 2), (8, 5, 1), (21, 20, 1), (21, 20, 2), (40, 9, 2)] {
@@ -193,7 +199,7 @@ fn joint_limits_hold_against_targets_beyond_them() {
             })
             .collect();
         backend.step(&commands, &[true; 64], 4).unwrap();
-        for q in &backend.states().q {
+        for q in &backend.measured().q {
             beyond = (0..12).map(|j| (lower[j] - q[j]).max(q[j] - upper[j])).fold(beyond, f32::max);
         }
     }
@@ -205,17 +211,17 @@ fn a_million_random_steps_of_random_robots_stay_finite() {
     const ROBOTS: usize = 1024;
     let mut random = stream(2, "robots", 0);
     let mut backend = batch(SimConfig::default(), ROBOTS);
-    let mut initial_states = Vec::new();
+    let randomise = Randomisation {
+        mass_scale: [0.7, 1.3],
+        payload_kg: [-1.0, 5.0],
+        com_shift_m: [-0.05, 0.05],
+        friction_scale: [0.2, 1.7],
+        ..Randomisation::default()
+    };
     for robot in 0..ROBOTS {
-        let randomisation = RandomisationSample {
-            mass_scale: random.random_range(0.7..1.3),
-            payload: random.random_range(-1.0..5.0),
-            com_shift: std::array::from_fn(|_| random.random_range(-0.05..0.05)),
-            friction_scale: random.random_range(0.2..1.7),
-        };
-        initial_states.push((robot, InitialState { randomisation, ..InitialState::at_rest(0.4, pose()) }));
+        let model = randomise.sample(&go2(), &mut random).unwrap();
+        backend.reset_with_model(robot, &model, &InitialState::at_rest(0.4, pose())).unwrap();
     }
-    backend.reset(&initial_states).unwrap();
     for _ in 0..1_000_000 / ROBOTS {
         let commands: Vec<_> =
             (0..ROBOTS).map(|_| Command::hold(pose().map(|q| q + random.random_range(-0.8..0.8)), 40.0, 1.0)).collect();
@@ -223,9 +229,13 @@ fn a_million_random_steps_of_random_robots_stay_finite() {
     }
     let states = backend.states();
     for robot in 0..ROBOTS {
-        let [.., z] = states.base_position[robot];
+        let [.., z] = states.truth.base_position[robot];
         assert!((-0.05..2.0).contains(&z), "robot {robot} is at a height of {z} m");
-        assert!(states.dq[robot].iter().all(|dq| dq.abs() < 100.0), "robot {robot}: {:?}", states.dq[robot]);
+        assert!(
+            states.measured.dq[robot].iter().all(|dq| dq.abs() < 100.0),
+            "robot {robot}: {:?}",
+            states.measured.dq[robot]
+        );
     }
 }
 
@@ -244,7 +254,7 @@ fn diverged_robot_is_named_and_the_others_are_not_affected() {
     assert_eq!(no_error, None);
     assert!(error.unwrap().starts_with("the simulation of robot 2 diverged"));
     for robot in (0..8).filter(|robot| *robot != 2) {
-        assert_eq!(states.q[robot], expected.q[robot], "robot {robot}");
+        assert_eq!(states.measured.q[robot], expected.measured.q[robot], "robot {robot}");
     }
 }
 
@@ -255,7 +265,7 @@ fn restored_snapshot_continues_bitwise_identically() {
         for period in 0..50 {
             backend.step(&[Command::hold(trot_target(period), 30.0, 0.75); 3], &[true; 3], 1).unwrap();
         }
-        (backend.states().q[1], backend.states().base_position[1])
+        (backend.measured().q[1], backend.states().truth.base_position[1])
     };
     trot(&mut backend);
     let snapshot = backend.snapshot(1);
@@ -269,7 +279,7 @@ fn inactive_robots_do_not_change() {
     let mut backend = batch(at(400, 4, BaseMount::Floating), 3);
     let before = backend.states().clone();
     backend.step(&[Command::hold(pose(), 30.0, 0.75); 3], &[true, false, true], 10).unwrap();
-    assert_eq!(backend.states().q[1], before.q[1]);
-    assert_ne!(backend.states().q[2], before.q[2]);
-    assert_eq!(backend.states().base_position[1], before.base_position[1]);
+    assert_eq!(backend.measured().q[1], before.measured.q[1]);
+    assert_ne!(backend.measured().q[2], before.measured.q[2]);
+    assert_eq!(backend.states().truth.base_position[1], before.truth.base_position[1]);
 }

@@ -5,8 +5,8 @@ use std::f64::consts::TAU;
 use glam::{DVec3, Vec3};
 use twinstep_effects::{Effect, EffectEntry, apply_effects};
 use twinstep_model::{
-    Backend, BaseMount, Command, InitialState, Joint, PerJoint, Pose, RigidBody, RobotModel, RobotStates, body_poses,
-    frames, go2,
+    Backend, BaseMount, Command, InitialState, Joint, PerJoint, Pose, RigidBody, RobotModel, RobotStates, Simulator,
+    body_poses, frames, go2,
 };
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 
@@ -42,7 +42,7 @@ pub fn rapier(robot: &RobotModel, config: SimConfig, placement: InitialState) ->
     backend
 }
 
-pub fn run(backend: &mut impl Backend, command: &Command, seconds: f64) {
+pub fn run(backend: &mut impl Simulator, command: &Command, seconds: f64) {
     backend.step(&[*command], &[true], (seconds * 200.0).round() as usize).unwrap();
 }
 
@@ -53,10 +53,10 @@ pub fn pose() -> PerJoint {
 /// Returns the poses of the bodies' frames in the world, trunk first.
 fn frames_of(states: &RobotStates) -> Vec<Pose> {
     let trunk = Pose {
-        position: Vec3::from(states.base_position[0]),
-        rotation: frames::world_from_base(states.base_orientation[0]),
+        position: Vec3::from(states.truth.base_position[0]),
+        rotation: frames::world_from_base(states.measured.orientation[0]),
     };
-    body_poses(&go2(), trunk, &states.q[0]).to_vec()
+    body_poses(&go2(), trunk, &states.measured.q[0]).to_vec()
 }
 
 /// Returns the body index, mass [kg] and position in the body's frame [m] of every point mass.
@@ -100,7 +100,7 @@ fn holding_torques_balance_the_weight_of_the_links() {
                     mass * GRAVITY * f64::from(axis.dot(lever.cross(Vec3::Z)))
                 })
                 .sum();
-            let tau = f64::from(states.tau[0][joint]);
+            let tau = f64::from(states.measured.tau[0][joint]);
             assert!((tau - expected).abs() < 2e-3, "`{name}`, joint {joint}: {tau} N·m, expected {expected} N·m");
         }
     }
@@ -138,7 +138,7 @@ fn unactuated_calf_swings_with_the_period_of_its_pendulum() {
         let mut before = 1.0;
         for period in 1..=1000 {
             run(&mut backend, &Command::hold([0.0; 12], 0.0, 0.0), 0.005);
-            let now = f64::from(backend.states().q[0][CALF]) - rest;
+            let now = f64::from(backend.measured().q[0][CALF]) - rest;
             if before > 0.0 && now <= 0.0 {
                 crossings.push(0.005 * (f64::from(period) - now / (now - before)));
             }
@@ -170,7 +170,7 @@ fn centre_of_pressure_is_below_the_centre_of_mass() {
             moment += GRAVITY * mass * frames[body].transform(position.as_vec3()).as_dvec3();
         }
         let (mut total_force, mut foot_moment) = (0.0, DVec3::ZERO);
-        for (leg, force) in states.foot_force[0].into_iter().enumerate() {
+        for (leg, force) in states.truth.foot_force[0].into_iter().enumerate() {
             total_force += f64::from(force);
             let foot = frames[3 + 3 * leg].transform(robot.shapes.foot_centre.as_vec3());
             foot_moment += f64::from(force) * foot.as_dvec3();
@@ -183,11 +183,11 @@ fn centre_of_pressure_is_below_the_centre_of_mass() {
 
 #[test]
 fn sliding_robot_decelerates_by_friction_times_gravity() {
-    fn deceleration(mut backend: impl Backend, hold: &Command) -> f64 {
+    fn deceleration(mut backend: impl Simulator, hold: &Command) -> f64 {
         run(&mut backend, hold, 0.1);
-        let before = backend.states().base_linear_velocity[0][0];
+        let before = backend.states().truth.base_linear_velocity[0][0];
         run(&mut backend, hold, 0.2);
-        f64::from(before - backend.states().base_linear_velocity[0][0]) / 0.2
+        f64::from(before - backend.states().truth.base_linear_velocity[0][0]) / 0.2
     }
     // A stiff crouch, so that the robot does not tip over.
     let crouch = Joint::map_kinds(0.0, 1.3, -2.6);

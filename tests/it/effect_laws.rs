@@ -7,7 +7,8 @@
 use glam::DVec3;
 use twinstep_effects::{Effect, EffectEntry, apply_effects};
 use twinstep_model::{
-    Backend, BaseMount, Command, InitialState, Precision, RobotModel, RobotStates, Rollout, RolloutRequest, go2,
+    Backend, BaseMount, Command, InitialState, Precision, RobotModel, RobotStates, Rollout, RolloutRequest, Simulator,
+    go2,
 };
 use twinstep_sim::{BatchRollout, Engine, RapierBackend, SimConfig};
 
@@ -213,7 +214,7 @@ fn config(engine: Engine) -> SimConfig {
 }
 
 fn measured(states: &RobotStates, entry: usize) -> [f64; 2] {
-    [states.q[entry][CALF], states.tau[entry][CALF]].map(f64::from)
+    [states.measured.q[entry][CALF], states.measured.tau[entry][CALF]].map(f64::from)
 }
 
 fn in_rapier(robot: RobotModel) -> Vec<[f64; 2]> {
@@ -251,6 +252,7 @@ fn joint_effects_follow_their_laws_in_both_engines() {
             start: initial_state(),
             history: &[],
             commands: &commands,
+            derating: &[],
         })
         .collect();
     let rollouts = BatchRollout::new(&lone_calf(), &config(Engine::Batch)).unwrap().run(&jobs, Precision::Double);

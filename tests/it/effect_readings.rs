@@ -4,7 +4,8 @@ use glam::Vec3;
 use twinstep_identify::{Experiment, WindowConfig};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{
-    Backend, BaseMount, Command, InitialState, Precision, RobotModel, RobotStates, Rollout, RolloutRequest, go2,
+    BaseMount, Command, InitialState, PerJoint, Precision, RobotModel, RobotStates, Rollout, RolloutRequest, Simulator,
+    go2,
 };
 use twinstep_sim::SimConfig;
 
@@ -12,7 +13,7 @@ use crate::effect_bodies::{batch, config, pose, rapier, run, with};
 
 const CALF: usize = 2;
 
-fn check_gyroscope<B: Backend>(backend: impl Fn(&RobotModel, SimConfig, InitialState) -> B) {
+fn check_gyroscope<B: Simulator>(backend: impl Fn(&RobotModel, SimConfig, InitialState) -> B) {
     let biased = [("gyro_bias", "base", &[0.3, -0.2, 0.1][..]), ("gyro_bias", "base", &[0.1, 0.0, 0.0])];
     let initial_state = InitialState { base_angular_velocity: [1.0, 0.5, -0.8], ..InitialState::at_rest(3.0, pose()) };
     let [mut biased, mut ideal] =
@@ -20,8 +21,8 @@ fn check_gyroscope<B: Backend>(backend: impl Fn(&RobotModel, SimConfig, InitialS
     for _ in 0..20 {
         run(&mut biased, &Command::hold(pose(), 30.0, 0.75), 0.02);
         run(&mut ideal, &Command::hold(pose(), 30.0, 0.75), 0.02);
-        assert_eq!(biased.states().base_orientation, ideal.states().base_orientation);
-        let [measured, exact] = [&biased, &ideal].map(|one| Vec3::from(one.states().base_angular_velocity[0]));
+        assert_eq!(biased.measured().orientation, ideal.measured().orientation);
+        let [measured, exact] = [&biased, &ideal].map(|one| Vec3::from(one.measured().gyro[0]));
         assert!((measured - exact - Vec3::new(0.4, -0.2, 0.1)).length() < 1e-6, "{measured}, without bias {exact}");
     }
 }
@@ -32,26 +33,26 @@ fn gyro_bias_shifts_the_reading_and_does_not_change_the_motion() {
     check_gyroscope(rapier);
 }
 
-/// Records the commands and returns a torque that grows by 0.1 N·m per actuator period.
+/// Records the derating factors and returns a torque that grows by 0.1 N·m per actuator period.
 #[derive(Default)]
-struct CommandRecorder(Vec<Command>);
+struct DeratingRecorder(Vec<PerJoint>);
 
-impl Rollout for CommandRecorder {
+impl Rollout for DeratingRecorder {
     fn run(&mut self, jobs: &[RolloutRequest], _: Precision) -> Vec<RobotStates> {
-        self.0 = jobs[0].commands.to_vec();
-        let mut states = RobotStates::new(self.0.len() + 1);
-        for (entry, tau) in states.tau.iter_mut().enumerate().skip(1) {
+        self.0 = jobs[0].derating.to_vec();
+        let mut states = RobotStates::new(jobs[0].commands.len() + 1);
+        for (entry, tau) in states.measured.tau.iter_mut().enumerate().skip(1) {
             *tau = [0.1 * (entry - 1) as f32; 12];
         }
         vec![states]
     }
 }
 
-/// Returns the residuals [standard deviations] and the commands for a log of the FL calf at 200 Hz.
+/// Returns the residuals [standard deviations] and the derating factors for a log of the FL calf at 200 Hz.
 ///
 /// The supply voltage falls from 30 to 24 V and the temperature rises from 30 to 90 °C. The logged torque is delayed by
 /// `delay` periods.
-fn residuals_and_commands(robot: &RobotModel, delay: f64) -> (Vec<f64>, Vec<Command>) {
+fn residuals_and_derating(robot: &RobotModel, delay: f64) -> (Vec<f64>, Vec<PerJoint>) {
     let rows = 60;
     let column = |of: &dyn Fn(f64) -> f64| (0..rows).map(|row| of(f64::from(row))).collect::<Vec<_>>();
     let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
@@ -69,7 +70,7 @@ fn residuals_and_commands(robot: &RobotModel, delay: f64) -> (Vec<f64>, Vec<Comm
         Meta::new(200.0, TorqueSensor::MotorCurrent, segments),
         columns.map(|(name, cells)| (name.to_owned(), cells)),
     );
-    let mut simulator = CommandRecorder::default();
+    let mut simulator = DeratingRecorder::default();
     let experiment =
         Experiment::new(&log.unwrap(), robot, WindowConfig::EVALUATION).unwrap().filter_rows(|row| row >= 10);
     let residuals = experiment.residuals(&mut simulator, std::slice::from_ref(robot), Precision::Double);
@@ -80,22 +81,22 @@ fn residuals_and_commands(robot: &RobotModel, delay: f64) -> (Vec<f64>, Vec<Comm
 fn torque_sensor_delay_shifts_the_logged_torque() {
     for (delay, periods) in [(0.0, 0.0), (0.01, 2.0), (0.0065, 1.3)] {
         let robot = with(&go2(), &[("torque_sensor_delay", "all", &[delay])]);
-        let (residuals, _) = residuals_and_commands(&robot, periods);
+        let (residuals, _) = residuals_and_derating(&robot, periods);
         let largest = residuals.iter().fold(0.0f64, |largest, residual| largest.max(residual.abs()));
         assert!(largest < 1e-3, "{delay} s: a residual of {largest} standard deviations");
     }
-    let (residuals, _) = residuals_and_commands(&go2(), 2.0);
+    let (residuals, _) = residuals_and_derating(&go2(), 2.0);
     assert!(residuals.iter().any(|residual| residual.abs() > 0.1), "{residuals:?}");
 }
 
 #[test]
 fn supply_sag_and_thermal_derating_reduce_torque_by_their_laws() {
     let robot = with(&go2(), &[("supply_sag", "all", &[1.7]), ("thermal_derating", "FL_calf", &[0.004, 40.0])]);
-    for (row, command) in residuals_and_commands(&robot, 0.0).1.iter().enumerate() {
+    for (row, factors) in residuals_and_derating(&robot, 0.0).1.iter().enumerate() {
         let row = row as f64;
         let cold = ((30.0 - 0.1 * row) / 30.0).powf(1.7);
         let hot = cold * (1.0 - 0.004 * (row - 10.0).max(0.0));
-        let [calf, thigh] = [CALF, CALF - 1].map(|joint| f64::from(command.derating_factor[joint]));
+        let [calf, thigh] = [CALF, CALF - 1].map(|joint| f64::from(factors[joint]));
         assert!((calf - hot).abs() < 1e-6 && (thigh - cold).abs() < 1e-6, "row {row}: {calf} {thigh}");
     }
 }

@@ -2,9 +2,9 @@
 
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Scope, Target, apply_effects};
-use twinstep_envs::TaskName;
+use twinstep_envs::TaskConfig;
 use twinstep_model::{
-    Backend, BaseMount, Command, InitialState, NUM_JOINTS, PerJoint, ResetRequest, RobotModel, VecEnv, go2,
+    BaseMount, Command, InitialState, NUM_JOINTS, PerJoint, ResetRequest, RobotModel, Simulator, VecEnv, go2,
 };
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 
@@ -25,7 +25,7 @@ fn config(engine: Engine, base: BaseMount) -> SimConfig {
 /// Returns joint positions, torques and angular velocities of each actuator period, scaled to comparable sizes.
 ///
 /// The motion is a chirp with a fixed base, or sway with a floating base.
-fn motion(backend: &mut impl Backend, base: BaseMount) -> Vec<PerJoint> {
+fn motion(backend: &mut impl Simulator, base: BaseMount) -> Vec<PerJoint> {
     let pose = go2().control.default_pose_f32();
     let height = if base == BaseMount::Fixed { 1.0 } else { 0.3236 };
     backend.reset(&[(0, InitialState::at_rest(height, pose))]).unwrap();
@@ -36,9 +36,9 @@ fn motion(backend: &mut impl Backend, base: BaseMount) -> Vec<PerJoint> {
         let target =
             std::array::from_fn(|j| pose[j] + if base == BaseMount::Fixed { 0.3 * swing } else { 0.08 * swing });
         backend.step(&[Command::hold(target, 30.0, 0.75)], &[true], 1).unwrap();
-        rows.push(backend.states().q[0]);
-        rows.push(backend.states().tau[0].map(|tau| 0.02 * tau));
-        let [x, y, z] = backend.states().base_angular_velocity[0];
+        rows.push(backend.measured().q[0]);
+        rows.push(backend.measured().tau[0].map(|tau| 0.02 * tau));
+        let [x, y, z] = backend.measured().gyro[0];
         rows.push([[x, y, z].map(|rate| 0.2 * rate); 4].concat().try_into().unwrap());
     }
     rows
@@ -125,7 +125,7 @@ fn server_simulates_the_effects_of_its_model_file() {
     let friction = "[[effect]]\nname = \"coulomb_friction\"\nscope = \"all\"\ntorque_nm = 20.0\n";
     std::fs::write(&path, format!("robot = \"go2\"\n{friction}")).unwrap();
     let moved = |model: Option<std::path::PathBuf>| {
-        let mut config = remote::config(TaskName::Walk);
+        let mut config = remote::config(TaskConfig::default());
         config.server.model = model;
         let (server, endpoint) = remote::start(&config);
         let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 1)).unwrap();

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use twinstep_envs::TaskName;
+use twinstep_envs::TaskConfig;
 use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::message::{CloseRequest, LeaseReply, ResetRequest};
 use twinstep_protocol::tensor::as_bytes;
@@ -13,7 +13,7 @@ use crate::remote::{FailingEnvFactory, config, start, start_with};
 
 /// Runs `test` with a client and its lease of two counters, reset with sequence number 1.
 fn with_counters(test: impl FnOnce(&RawClient, &LeaseReply)) {
-    let (server, endpoint) = start(&config(TaskName::Counter));
+    let (server, endpoint) = start(&config(TaskConfig::Counter));
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
     let lease = client.lease(2);
     client.reset(&lease, 1).unwrap();
@@ -149,7 +149,7 @@ fn unknown_lease_is_distinguished_from_unknown_keys() {
 
 #[test]
 fn lease_whose_environments_panicked_can_be_closed_or_replaced_by_a_new_one() {
-    let (server, endpoint) = start_with(&config(TaskName::Counter), Arc::new(FailingEnvFactory));
+    let (server, endpoint) = start_with(&config(TaskConfig::Counter), Arc::new(FailingEnvFactory));
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
     let panicked = || {
         let lease = client.lease(64);

@@ -67,9 +67,9 @@ pub fn log_of(robot: &RobotModel) -> Log {
             command.q[joint] += (0.3 * (phase + joint as f64).sin()) as f32;
             let noise = 0.002 * (random.random::<f64>() + random.random::<f64>() + random.random::<f64>() - 1.5);
             // Resolution of the encoder.
-            let measured = ((f64::from(backend.states().q[0][joint]) + noise) / 0.0005).round() * 0.0005;
+            let measured = ((f64::from(backend.measured().q[0][joint]) + noise) / 0.0005).round() * 0.0005;
             columns.entry(format!("q_{name}")).or_default().push(measured);
-            columns.entry(format!("dq_{name}")).or_default().push(f64::from(backend.states().dq[0][joint]));
+            columns.entry(format!("dq_{name}")).or_default().push(f64::from(backend.measured().dq[0][joint]));
             columns.entry(format!("q_cmd_{name}")).or_default().push(f64::from(command.q[joint]));
         }
         backend.step(&[command], &[true], 1).unwrap();

@@ -9,11 +9,11 @@ use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_effects::{ActuatorNetworkConfig, MemberSampling, ModelFile};
 use twinstep_ensemble::{ActuatorNetworkRobot, Ensemble, EnsembleMetadata, JointEncoding, Normaliser, Normalisers};
 use twinstep_env_server::{Config, EnvFactory, EnvFactoryError, SimEnvFactory};
-use twinstep_envs::{TaskName, walk_spec};
+use twinstep_envs::{TaskConfig, base_spec};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{
     AutoresetMode, Backend, BackendError, BaseMount, Command as RobotCommand, InitialState, JOINT_NAMES, ResetRequest,
-    StepBatch, VecEnv, go2,
+    Simulator, StepBatch, VecEnv, go2,
 };
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 use twinstep_tests::process::Process;
@@ -54,11 +54,11 @@ fn model_with(description: EnsembleMetadata, effects: &str, keys: &str) -> (Temp
 }
 
 fn config(engine: Engine, model: &Path, threads: usize) -> Config {
-    let mut config = remote::config(TaskName::Walk);
+    let mut config = remote::config(TaskConfig::default());
     (config.sim.engine, config.sim.threads) = (engine, threads);
     config.server.model = Some(model.to_owned());
-    config.task.min_base_height_m = -1.0;
-    config.task.max_tilt_rad = 3.2;
+    remote::walk(&mut config).min_base_height_m = -1.0;
+    remote::walk(&mut config).max_tilt_rad = 3.2;
     config
 }
 
@@ -99,7 +99,7 @@ fn epistemic_uncertainty_reward_does_not_change_the_motion() {
     let (_folder, model) = model_with(description(), "", "");
     let plain = config(Engine::Batch, &model, 1);
     let mut exploring = plain.clone();
-    exploring.task.reward.epistemic_uncertainty = 2.0;
+    remote::walk(&mut exploring).reward.epistemic_uncertainty = 2.0;
     let [plain, exploring] = [plain, exploring].map(|config| episode(envs(&config, ENVS).as_mut(), 3));
     for (plain, exploring) in plain.iter().zip(&exploring) {
         assert_eq!(plain.obs, exploring.obs);
@@ -128,8 +128,8 @@ fn difference_from_analytic_actuators(tau_sensor: TorqueSensor) -> [f32; 2] {
         let command = RobotCommand::hold(pose.map(|q| q + 0.05), 30.0, 0.75);
         backend.step(&[command], &[true], 200).unwrap();
         let states = backend.states();
-        assert!(states.base_position[0][2] > 0.25, "{:?}", states.base_position);
-        [states.q[0], states.tau[0]]
+        assert!(states.truth.base_position[0][2] > 0.25, "{:?}", states.truth.base_position);
+        [states.measured.q[0], states.measured.tau[0]]
     });
     [0, 1].map(|quantity| {
         analytic[quantity].iter().zip(&network[quantity]).map(|(one, other)| (one - other).abs()).fold(0.0, f32::max)
@@ -161,7 +161,7 @@ fn ensemble_trained_on_output_torque_replaces_the_rotor_inertia() {
 }
 
 /// Steps two robots from their current state and returns positions, torques and uncertainty of each.
-fn steps<B: Backend>(backend: &mut B, active: [bool; 2]) -> Vec<Vec<f32>> {
+fn steps<B: Simulator>(backend: &mut B, active: [bool; 2]) -> Vec<Vec<f32>> {
     let control = go2().control;
     let hold = RobotCommand::hold(control.default_pose_f32(), control.kp as f32, control.kd as f32);
     let mut rows = Vec::new();
@@ -169,13 +169,18 @@ fn steps<B: Backend>(backend: &mut B, active: [bool; 2]) -> Vec<Vec<f32>> {
         backend.step(&[hold; 2], &active, 3).unwrap();
         let states = backend.states();
         rows.extend((0..2).map(|robot| {
-            [&states.q[robot][..], &states.tau[robot], &states.epistemic_uncertainty[robot..][..1]].concat()
+            [
+                &states.measured.q[robot][..],
+                &states.measured.tau[robot],
+                &states.truth.epistemic_uncertainty[robot..][..1],
+            ]
+            .concat()
         }));
     }
     rows
 }
 
-fn check_snapshots<B: Backend>(mut backend: B) {
+fn check_snapshots<B: Simulator>(mut backend: B) {
     let initial_state =
         |seed| InitialState { actuator_seed: seed, ..InitialState::at_rest(0.34, go2().control.default_pose_f32()) };
     backend.reset(&[(0, initial_state(7)), (1, initial_state(8))]).unwrap();
@@ -279,7 +284,7 @@ fn served_robot_and_its_spec_have_the_gains_of_the_training_data() {
     let arguments = ["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "2", "--model", model.to_str().unwrap()];
     let (_server, endpoint) = Process::listening(&programs.0.join("twinstep"), &arguments.map(str::to_owned)).unwrap();
     let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
-    let nominal = walk_spec(&go2(), &Config::default().task);
+    let nominal = base_spec("walk", &go2(), Vec::new(), 20.0);
     let spec = remote.spec().clone();
     assert_eq!([spec.kp, spec.kd], [25.0, 0.6]);
     assert_ne!(spec.hash(), nominal.hash());
@@ -339,7 +344,7 @@ fn settings_that_actuator_networks_do_not_support_are_rejected_by_name() {
     check(
         |config| {
             config.server.model = None;
-            config.task.reward.epistemic_uncertainty = 1.0;
+            remote::walk(config).reward.epistemic_uncertainty = 1.0;
         },
         "task.reward.epistemic_uncertainty",
     );

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use twinstep_env_server::Server;
-use twinstep_envs::TaskName;
+use twinstep_envs::TaskConfig;
 use twinstep_protocol::ErrorCode;
 use twinstep_protocol::message::LeaseRequest;
 
@@ -14,7 +14,7 @@ use crate::remote::{config, start};
 const TIMEOUT: Duration = Duration::from_secs(20);
 
 fn start_counters(lease_grace_s: f64) -> (Server, String) {
-    let mut config = config(TaskName::Counter);
+    let mut config = config(TaskConfig::Counter);
     config.server.lease_grace_s = lease_grace_s;
     start(&config)
 }

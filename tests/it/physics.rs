@@ -1,17 +1,18 @@
-//! Comparison of an engine with closed forms and conservation laws. Included once per engine, as its `Simulator`.
+//! Comparison of an engine with closed forms and conservation laws. Included once per engine, as its `TestedBackend`.
 
 use std::f32::consts::PI;
 
 use glam::{DMat3, DVec3, Vec3};
 use proptest::prelude::*;
+use twinstep_envs::Randomisation;
 use twinstep_model::{
-    Backend, BaseMount, Command, InitialState, Joint, NUM_JOINTS, PerJoint, RobotModel,
+    Backend, BaseMount, Command, InitialState, Joint, NUM_JOINTS, PerJoint, RobotModel, Simulator,
     dynamics::{Acceleration, KinematicTree, State, Vec3 as LaneVec3, forward_dynamics},
-    frames, go2,
+    frames, go2, stream,
 };
 use twinstep_sim::{Engine, SimConfig, Terrain};
 
-use super::{ENGINE, Simulator};
+use super::{ENGINE, TestedBackend};
 
 const GRAVITY: f32 = 9.81;
 /// Step of the reference integration [s].
@@ -19,8 +20,8 @@ const DT: f64 = 1e-5;
 /// The joint `FL_calf`.
 const CALF: usize = 2;
 
-fn backend(config: SimConfig, initial_state: InitialState) -> Simulator {
-    let mut backend = Simulator::new(go2(), SimConfig { engine: ENGINE, threads: 1, ..config }, 1).unwrap();
+fn backend(config: SimConfig, initial_state: InitialState) -> TestedBackend {
+    let mut backend = TestedBackend::new(go2(), SimConfig { engine: ENGINE, threads: 1, ..config }, 1).unwrap();
     backend.reset(&[(0, initial_state)]).unwrap();
     backend
 }
@@ -38,26 +39,27 @@ fn hold_default_pose() -> Command {
     Command::hold(default_pose(), control.kp as f32, control.kd as f32)
 }
 
-fn run(backend: &mut Simulator, command: &Command, seconds: f32) {
+fn run(backend: &mut TestedBackend, command: &Command, seconds: f32) {
     let periods = (seconds * go2().control.actuator_hz as f32).round() as usize;
     backend.step(&[*command], &[true], periods).unwrap();
 }
 
 /// Returns momentum, angular momentum about the world origin and centre of mass of the robot, from its state.
-fn momentum(robot: &RobotModel, backend: &Simulator) -> (DVec3, DVec3, DVec3) {
+fn momentum(robot: &RobotModel, backend: &TestedBackend) -> (DVec3, DVec3, DVec3) {
     let (linear, angular, com, _) = motion(robot, backend);
     (linear, angular, com)
 }
 
 /// Returns the quantities of [`momentum`] and the sum of kinetic and potential energy [J].
-fn motion(robot: &RobotModel, backend: &Simulator) -> (DVec3, DVec3, DVec3, f64) {
+fn motion(robot: &RobotModel, backend: &TestedBackend) -> (DVec3, DVec3, DVec3, f64) {
     let states = backend.states();
-    let rotation = frames::world_from_base(states.base_orientation[0]).as_dquat();
-    let origin = Vec3::from(states.base_position[0]).as_dvec3();
-    let velocity = Vec3::from(states.base_linear_velocity[0]).as_dvec3();
-    let spin = rotation * Vec3::from(states.base_angular_velocity[0]).as_dvec3();
+    let rotation = frames::world_from_base(states.measured.orientation[0]).as_dquat();
+    let origin = Vec3::from(states.truth.base_position[0]).as_dvec3();
+    let velocity = Vec3::from(states.truth.base_linear_velocity[0]).as_dvec3();
+    let spin = rotation * Vec3::from(states.measured.gyro[0]).as_dvec3();
     let (mut linear, mut angular, mut first_moment) = (DVec3::ZERO, DVec3::ZERO, DVec3::ZERO);
-    let rotors = robot.joints.iter().zip(states.dq[0]).map(|(joint, dq)| 0.5 * joint.armature * f64::from(dq).powi(2));
+    let rotors =
+        robot.joints.iter().zip(states.measured.dq[0]).map(|(joint, dq)| 0.5 * joint.armature * f64::from(dq).powi(2));
     let mut energy: f64 = rotors.sum();
     let mut add =
         |body: &twinstep_model::RigidBody, rotation: glam::DQuat, origin: DVec3, velocity: DVec3, spin: DVec3| {
@@ -80,8 +82,8 @@ fn motion(robot: &RobotModel, backend: &Simulator) -> (DVec3, DVec3, DVec3, f64)
             velocity += spin.cross(offset);
             origin += offset;
             let axis = RobotModel::axis(Joint::ALL[joint]);
-            spin += rotation * axis * f64::from(states.dq[0][joint]);
-            rotation *= glam::DQuat::from_axis_angle(axis, f64::from(states.q[0][joint]));
+            spin += rotation * axis * f64::from(states.measured.dq[0][joint]);
+            rotation *= glam::DQuat::from_axis_angle(axis, f64::from(states.measured.q[0][joint]));
             add(&model.bodies[kind], rotation, origin, velocity, spin);
         }
     }
@@ -119,12 +121,12 @@ fn dropped_robot_falls_with_gravity() {
         InitialState::at_rest(10.0, default_pose()),
     );
     run(&mut backend, &hold_default_pose(), 1.0);
-    let fallen = 10.0 - backend.states().base_position[0][2];
+    let fallen = 10.0 - backend.states().truth.base_position[0][2];
     // Semi-implicit Euler falls g·dt·t/2 too far, 12 mm at 400 Hz. The batch engine subtracts this from the positions
     // that it reports. The tolerance covers the motion of the trunk relative to the centre of mass.
     let excess = if ENGINE == Engine::Rapier { 0.01226 } else { 0.0 };
     assert!((fallen - GRAVITY / 2.0 - excess).abs() < 0.004, "fell {fallen} m");
-    assert!((backend.states().base_linear_velocity[0][2] + GRAVITY).abs() < 0.02);
+    assert!((backend.states().truth.base_linear_velocity[0][2] + GRAVITY).abs() < 0.02);
 }
 
 #[test]
@@ -137,7 +139,7 @@ fn momentum_is_conserved_in_flight_while_the_legs_swing() {
     };
     let mut backend = backend(SimConfig { physics_hz: Some(1000), ..SimConfig::default() }, initial_state);
     let (linear, _, com) = momentum(&robot, &backend);
-    let about_com = |backend: &Simulator| {
+    let about_com = |backend: &TestedBackend| {
         let (linear, angular, com) = momentum(&robot, backend);
         angular - com.cross(linear)
     };
@@ -192,14 +194,14 @@ fn calf_velocity(robot: &RobotModel, dq: f32, tau: f32) -> f64 {
         ..SimConfig::default()
     };
     let [forward, backward] = [1.0, -1.0].map(|sign| {
-        let mut backend = Simulator::new(robot.clone(), config, 1).unwrap();
+        let mut backend = TestedBackend::new(robot.clone(), config, 1).unwrap();
         let mut initial_state = InitialState::at_rest(2.0, default_pose());
         initial_state.dq[CALF] = sign * dq;
         backend.reset(&[(0, initial_state)]).unwrap();
         let mut command = zero_gains();
         command.tau_ff[CALF] = sign * tau;
         run(&mut backend, &command, 0.02);
-        f64::from(backend.states().dq[0][CALF])
+        f64::from(backend.measured().dq[0][CALF])
     });
     (forward - backward) / 2.0
 }
@@ -230,12 +232,12 @@ fn coulomb_friction_reduces_the_torque_on_a_moving_calf() {
 fn coulomb_friction_balances_smaller_torques() {
     let config = SimConfig { engine: ENGINE, base: BaseMount::Fixed, threads: 1, ..SimConfig::default() };
     let angle_after = |tau: f32| {
-        let mut backend = Simulator::new(lone_calf(0.0, 0.8), config, 1).unwrap();
+        let mut backend = TestedBackend::new(lone_calf(0.0, 0.8), config, 1).unwrap();
         backend.reset(&[(0, InitialState::at_rest(2.0, default_pose()))]).unwrap();
         let mut command = zero_gains();
         command.tau_ff[CALF] = tau;
         run(&mut backend, &command, 1.0);
-        (backend.states().q[0][CALF] - default_pose()[CALF]).abs()
+        (backend.measured().q[0][CALF] - default_pose()[CALF]).abs()
     };
     // The torque due to gravity is 0.2 N·m.
     assert!(angle_after(0.4) < 1e-3, "moved by {} rad", angle_after(0.4));
@@ -281,13 +283,13 @@ fn acceleration_agrees_with_the_equations_of_motion() {
     }
     let states = backend.states();
     for joint in 0..NUM_JOINTS {
-        let (engine, exact) = (f64::from(states.dq[0][joint]), state.dq[joint]);
+        let (engine, exact) = (f64::from(states.measured.dq[0][joint]), state.dq[joint]);
         assert!((engine - exact).abs() < 0.01 + 0.01 * exact.abs(), "joint {joint}: {engine} and {exact} rad/s");
     }
     for axis in 0..3 {
-        let (engine, exact) = (f64::from(states.base_angular_velocity[0][axis]), state.angular_velocity.0[axis]);
+        let (engine, exact) = (f64::from(states.measured.gyro[0][axis]), state.angular_velocity.0[axis]);
         assert!((engine - exact).abs() < 0.01, "{engine} and {exact} rad/s");
-        let (engine, exact) = (f64::from(states.base_linear_velocity[0][axis]), state.linear_velocity.0[axis]);
+        let (engine, exact) = (f64::from(states.truth.base_linear_velocity[0][axis]), state.linear_velocity.0[axis]);
         assert!((engine - exact).abs() < 0.002, "{engine} and {exact} m/s");
     }
 }
@@ -298,15 +300,15 @@ fn foot_forces_of_a_standing_robot_equal_its_weight_and_it_does_not_drift() {
     let mut backend = backend(SimConfig::default(), InitialState::at_rest(0.33, default_pose()));
     let stiff = Command::hold(default_pose(), 60.0, 2.0);
     run(&mut backend, &stiff, 5.0);
-    let (start, weight) = (backend.states().base_position[0], robot.total_mass() as f32 * GRAVITY);
+    let (start, weight) = (backend.states().truth.base_position[0], robot.total_mass() as f32 * GRAVITY);
     run(&mut backend, &stiff, 60.0);
     let states = backend.states();
-    let force: f32 = states.foot_force[0].iter().sum();
+    let force: f32 = states.truth.foot_force[0].iter().sum();
     assert!((force / weight - 1.0).abs() < 0.002, "{force} N on the feet, weight {weight} N");
-    let drift = (Vec3::from(states.base_position[0]) - Vec3::from(start)).length();
+    let drift = (Vec3::from(states.truth.base_position[0]) - Vec3::from(start)).length();
     assert!(drift < 0.01, "drifted {drift} m in a minute");
-    assert!(!states.body_contact[0]);
-    assert!(frames::projected_gravity(states.base_orientation[0]).z < -0.99);
+    assert!(!states.truth.body_contact[0]);
+    assert!(frames::projected_gravity(states.measured.orientation[0]).z < -0.99);
 }
 
 #[test]
@@ -323,9 +325,9 @@ fn robot_on_a_slope_slides_only_beyond_the_friction_angle() {
         let mut backend = backend(config, initial_state);
         let hold = Command::hold(crouch, 200.0, 5.0);
         run(&mut backend, &hold, 0.5);
-        let before = Vec3::from(backend.states().base_position[0]);
+        let before = Vec3::from(backend.states().truth.base_position[0]);
         run(&mut backend, &hold, 0.5);
-        (Vec3::from(backend.states().base_position[0]) - before).length()
+        (Vec3::from(backend.states().truth.base_position[0]) - before).length()
     };
     let limit = friction.atan();
     assert!(slip(limit - 0.1) < 0.01, "below the friction angle: {} m", slip(limit - 0.1));
@@ -334,7 +336,7 @@ fn robot_on_a_slope_slides_only_beyond_the_friction_angle() {
 
 fn trot_bits(threads: usize) -> Vec<u32> {
     let robots = 7;
-    let mut backend = Simulator::new(go2(), SimConfig { threads, ..SimConfig::default() }, robots).unwrap();
+    let mut backend = TestedBackend::new(go2(), SimConfig { threads, ..SimConfig::default() }, robots).unwrap();
     for period in 0..100 {
         let commands: Vec<Command> = (0..robots)
             .map(|robot| {
@@ -345,7 +347,14 @@ fn trot_bits(threads: usize) -> Vec<u32> {
         backend.step(&commands, &vec![true; robots], 1).unwrap();
     }
     let states = backend.states();
-    states.q.iter().flatten().chain(states.base_position.iter().flatten()).map(|value| value.to_bits()).collect()
+    states
+        .measured
+        .q
+        .iter()
+        .flatten()
+        .chain(states.truth.base_position.iter().flatten())
+        .map(|value| value.to_bits())
+        .collect()
 }
 
 #[test]
@@ -368,21 +377,22 @@ fn restored_robot_continues_bitwise_identically() {
 
 #[test]
 fn inactive_robot_does_not_move() {
-    let mut backend = Simulator::new(go2(), SimConfig::default(), 2).unwrap();
+    let mut backend = TestedBackend::new(go2(), SimConfig::default(), 2).unwrap();
     let before = backend.states().clone();
     backend.step(&[zero_gains(); 2], &[false, true], 20).unwrap();
-    assert_eq!(backend.states().q[0], before.q[0]);
-    assert_ne!(backend.states().q[1], before.q[1]);
+    assert_eq!(backend.measured().q[0], before.measured.q[0]);
+    assert_ne!(backend.measured().q[1], before.measured.q[1]);
 }
 
 #[test]
 fn foot_forces_include_payload_and_mass_scale() {
-    let mut initial_state = InitialState::at_rest(0.33, default_pose());
-    initial_state.randomisation.payload = 3.0;
-    initial_state.randomisation.mass_scale = 1.1;
+    let initial_state = InitialState::at_rest(0.33, default_pose());
     let mut backend = backend(SimConfig::default(), initial_state);
+    let randomise = Randomisation { mass_scale: [1.1; 2], payload_kg: [3.0; 2], ..Randomisation::default() };
+    let model = randomise.sample(&go2(), &mut stream(0, "test", 0)).unwrap();
+    backend.reset_with_model(0, &model, &initial_state).unwrap();
     run(&mut backend, &Command::hold(default_pose(), 80.0, 3.0), 4.0);
-    let force: f32 = backend.states().foot_force[0].iter().sum();
+    let force: f32 = backend.states().truth.foot_force[0].iter().sum();
     let weight = (go2().total_mass() as f32 * 1.1 + 3.0) * GRAVITY;
     assert!((force / weight - 1.0).abs() < 0.005, "{force} N, weight {weight} N");
 }

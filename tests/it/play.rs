@@ -6,7 +6,8 @@ use std::process::{Command, Output};
 use expect_test::{Expect, expect};
 use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{
-    Backend, BaseMount, Command as RobotCommand, Ground, InitialState, JOINT_NAMES, NUM_JOINTS, PerJoint, go2,
+    Backend, BaseMount, Command as RobotCommand, Ground, InitialState, JOINT_NAMES, NUM_JOINTS, PerJoint, Simulator,
+    go2,
 };
 use twinstep_sim::{BatchBackend, Engine, SimConfig};
 use twinstep_tests::python::Programs;
@@ -70,17 +71,17 @@ fn play_writes_the_log_of_the_simulated_robot() {
         }
         let states = backend.states();
         for (joint, name) in JOINT_NAMES.iter().enumerate() {
-            assert_eq!(log.q(name).unwrap()[row], f64::from(states.q[0][joint]), "row {row}");
-            assert_eq!(log.dq(name).unwrap()[row], f64::from(states.dq[0][joint]), "row {row}");
+            assert_eq!(log.q(name).unwrap()[row], f64::from(states.measured.q[0][joint]), "row {row}");
+            assert_eq!(log.dq(name).unwrap()[row], f64::from(states.measured.dq[0][joint]), "row {row}");
         }
-        assert_eq!(log.channel("pos_z").unwrap()[row], f64::from(states.base_position[0][2]));
-        assert_eq!(log.channel("gyro_y").unwrap()[row], f64::from(states.base_angular_velocity[0][1]));
+        assert_eq!(log.channel("pos_z").unwrap()[row], f64::from(states.truth.base_position[0][2]));
+        assert_eq!(log.channel("gyro_y").unwrap()[row], f64::from(states.measured.gyro[0][1]));
         let mut command = RobotCommand::hold(target(row), KP as f32, robot.control.kd as f32);
         (command.q[NUM_JOINTS - 1], command.kp[NUM_JOINTS - 1]) = (pose[NUM_JOINTS - 1], robot.control.kp as f32);
         let mut torque = 0.0;
         for _ in 0..4 {
             backend.step(&[command], &[true], 1).unwrap();
-            torque += f64::from(backend.states().tau[0][1]) / 4.0;
+            torque += f64::from(backend.measured().tau[0][1]) / 4.0;
         }
         let logged = log.tau_measured("FL_thigh").unwrap()[row];
         if row + 1 == RESET_ROW || row + 1 == ROWS {

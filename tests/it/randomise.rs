@@ -6,9 +6,9 @@ use std::process::Command;
 use tempfile::TempDir;
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
-use twinstep_envs::{OBS_LEN, TaskName};
+use twinstep_envs::{OBS_LEN, TaskConfig};
 use twinstep_model::{
-    AutoresetMode, Backend, Command as RobotCommand, InitialState, ResetRequest, RobotModel, VecEnv, go2,
+    AutoresetMode, Command as RobotCommand, InitialState, ResetRequest, RobotModel, Simulator, VecEnv, go2,
 };
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 use twinstep_tests::process::Process;
@@ -56,14 +56,14 @@ fn model(name: &str, intervals: bool) -> (TempDir, PathBuf) {
 
 /// Returns a configuration in which robots differ only by the values sampled from the model file.
 fn config(engine: Engine, model: &std::path::Path, effects: bool) -> Config {
-    let mut config = remote::config(TaskName::Walk);
+    let mut config = remote::config(TaskConfig::default());
     config.sim.engine = engine;
     config.sim.threads = 1;
     config.server.model = Some(model.to_owned());
-    config.task.reset_joint_noise_rad = 0.0;
-    config.task.command.linear_velocity_x = [0.3, 0.3];
-    config.task.command.linear_velocity_y = [0.0, 0.0];
-    config.task.command.angular_velocity_z = [0.0, 0.0];
+    remote::walk(&mut config).reset_joint_noise_rad = 0.0;
+    remote::walk(&mut config).command.linear_velocity_x = [0.3, 0.3];
+    remote::walk(&mut config).command.linear_velocity_y = [0.0, 0.0];
+    remote::walk(&mut config).command.angular_velocity_z = [0.0, 0.0];
     config.randomise.effects = effects;
     config
 }
@@ -113,7 +113,7 @@ fn randomisation_without_intervals_is_bitwise_identical_to_none() {
         let [without, with] = [false, true].map(|effects| {
             let mut config = config(engine, &path, effects);
             // Other random quantities must not change either.
-            config.task.reset_joint_noise_rad = 0.1;
+            remote::walk(&mut config).reset_joint_noise_rad = 0.1;
             config.randomise.mass_scale = [0.9, 1.1];
             episode(&mut *local(&config, 2), &ResetRequest::seeded(3, 2))
         });
@@ -160,18 +160,18 @@ fn intervals_that_rarely_give_a_valid_robot_are_rejected() {
 }
 
 /// Simulates one second of sway from the current state.
-fn sway(backend: &mut impl Backend) -> (Vec<[f32; 12]>, [f32; 3], [f32; 3]) {
+fn sway(backend: &mut impl Simulator) -> (Vec<[f32; 12]>, [f32; 3], [f32; 3]) {
     let pose = go2().control.default_pose_f32();
     let mut rows = Vec::new();
     for period in 0..200 {
         let target = pose.map(|q| q + 0.1 * (0.1 * period as f32).sin());
         backend.step(&[RobotCommand::hold(target, 30.0, 0.75)], &[true], 1).unwrap();
-        rows.push(backend.states().q[0]);
+        rows.push(backend.measured().q[0]);
     }
-    (rows, backend.states().base_position[0], backend.states().base_angular_velocity[0])
+    (rows, backend.states().truth.base_position[0], backend.measured().gyro[0])
 }
 
-fn check_reset_with_model<B: Backend>(new_backend: impl Fn(RobotModel) -> B) {
+fn check_reset_with_model<B: Simulator>(new_backend: impl Fn(RobotModel) -> B) {
     let sampled = twinstep_effects::parse_robot(&format!("robot = \"go2\"\n{MEASURED}"), "sampled").unwrap();
     let initial_state = InitialState::at_rest(0.34, go2().control.default_pose_f32());
     let mut reference = new_backend(sampled.clone());

@@ -1,6 +1,6 @@
 //! Comparison of the rapier engine with closed forms and conservation laws.
 
-use twinstep_sim::{Engine, RapierBackend as Simulator};
+use twinstep_sim::{Engine, RapierBackend as TestedBackend};
 
 const ENGINE: Engine = Engine::Rapier;
 

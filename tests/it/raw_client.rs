@@ -94,6 +94,7 @@ impl RawClient {
             num_envs,
             autoreset: AutoresetMode::NextStep,
             max_episode_steps: None,
+            critic: false,
             spec_hash: None,
             reclaim: None,
         }

@@ -4,18 +4,24 @@ use std::sync::Arc;
 
 use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{Config, EnvFactory, EnvFactoryError, Server, SimEnvFactory};
-use twinstep_envs::{Counter, OBS_LEN, TaskName, check_vec_env};
+use twinstep_envs::{Counter, OBS_LEN, TaskConfig, WalkConfig, check_vec_env};
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv, go2};
 use twinstep_protocol::ErrorCode;
 use twinstep_sim::Engine;
 
-pub fn config(task: TaskName) -> Config {
+pub fn config(task: TaskConfig) -> Config {
     let mut config = Config::default();
-    config.task.name = task;
+    config.task = task;
     config.server.listen = "tcp/127.0.0.1:0".to_owned();
     config.server.envs = 64;
     config.server.seed = Some(1);
     config
+}
+
+/// Returns the settings of the task `walk`.
+pub fn walk(config: &mut Config) -> &mut WalkConfig {
+    let TaskConfig::Walk(walk) = &mut config.task else { panic!("another task") };
+    walk
 }
 
 pub fn start(config: &Config) -> (Server, String) {
@@ -37,10 +43,45 @@ fn rejection(error: &EnvError) -> ErrorCode {
 }
 
 #[test]
+fn critic_observations_are_sent_only_to_a_lease_that_requests_them() {
+    let config = config(TaskConfig::default());
+    let (server, endpoint) = start(&config);
+    let mut local = SimEnvFactory::new(config).unwrap().build(2, AutoresetMode::SameStep, Some(3)).unwrap();
+    for critic in [false, true] {
+        let options = ConnectOptions {
+            autoreset: AutoresetMode::SameStep,
+            max_episode_steps: Some(3),
+            critic,
+            ..ConnectOptions::new(&endpoint, 2)
+        };
+        let mut remote = RemoteVecEnv::connect(&options).unwrap();
+        assert_eq!(remote.spec().critic_observation.is_empty(), !critic);
+        local.reset(&ResetRequest::seeded(5, 2)).unwrap();
+        remote.reset(&ResetRequest::seeded(5, 2)).unwrap();
+        assert_eq!(remote.critic_obs(), if critic { local.critic_obs() } else { &[] });
+        for _ in 0..3 {
+            let expected = local.step(&[0.1; 24]).unwrap().clone();
+            let batch = remote.step(&[0.1; 24]).unwrap();
+            assert_eq!(batch.obs, expected.obs);
+            if critic {
+                assert_eq!(*batch, expected);
+            } else {
+                assert!(batch.critic_obs.is_empty());
+                assert!(batch.ended.iter().all(|episode| episode.final_critic_obs.is_empty()));
+            }
+        }
+        remote.close().unwrap();
+    }
+    server.shutdown();
+}
+
+#[test]
 fn remote_walk_passes_the_checker_in_every_autoreset_mode() {
-    let (server, endpoint) = start(&config(TaskName::Walk));
+    let (server, endpoint) = start(&config(TaskConfig::default()));
     for autoreset in [AutoresetMode::NextStep, AutoresetMode::SameStep, AutoresetMode::Disabled] {
-        let options = ConnectOptions { autoreset, max_episode_steps: Some(7), ..ConnectOptions::new(&endpoint, 3) };
+        let critic = autoreset != AutoresetMode::Disabled;
+        let options =
+            ConnectOptions { autoreset, max_episode_steps: Some(7), critic, ..ConnectOptions::new(&endpoint, 3) };
         let mut env = RemoteVecEnv::connect(&options).unwrap();
         check_vec_env(&mut env, 30).unwrap();
         env.close().unwrap();
@@ -50,7 +91,7 @@ fn remote_walk_passes_the_checker_in_every_autoreset_mode() {
 
 #[test]
 fn walk_on_the_batch_engine_passes_the_checker() {
-    let mut config = config(TaskName::Walk);
+    let mut config = config(TaskConfig::default());
     config.sim.engine = Engine::Batch;
     config.randomise.mass_scale = [0.9, 1.1];
     let (server, endpoint) = start(&config);
@@ -61,7 +102,7 @@ fn walk_on_the_batch_engine_passes_the_checker() {
 
 #[test]
 fn remote_and_local_walk_are_bitwise_identical() {
-    let config = config(TaskName::Walk);
+    let config = config(TaskConfig::default());
     let (server, endpoint) = start(&config);
     let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
     let mut local = SimEnvFactory::new(config).unwrap().build(2, AutoresetMode::NextStep, None).unwrap();
@@ -76,7 +117,7 @@ fn remote_and_local_walk_are_bitwise_identical() {
 
 #[test]
 fn concurrent_clients_have_separate_environments() {
-    let (server, endpoint) = start(&config(TaskName::Counter));
+    let (server, endpoint) = start(&config(TaskConfig::Counter));
     let clients: Vec<_> = (1..4usize)
         .map(|num_envs| {
             let endpoint = endpoint.clone();
@@ -103,7 +144,7 @@ fn concurrent_clients_have_separate_environments() {
 
 #[test]
 fn overlapped_steps_are_executed_once_each() {
-    let (server, endpoint) = start(&config(TaskName::Counter));
+    let (server, endpoint) = start(&config(TaskConfig::Counter));
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 1)).unwrap();
     env.reset(&ResetRequest::default()).unwrap();
     for step in 1..=20u32 {
@@ -117,7 +158,7 @@ fn overlapped_steps_are_executed_once_each() {
 
 #[test]
 fn bad_input_is_rejected_by_name_and_the_next_valid_step_succeeds() {
-    let (server, endpoint) = start(&config(TaskName::Walk));
+    let (server, endpoint) = start(&config(TaskConfig::default()));
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
     assert_eq!(rejection(&env.step(&[0.0; 24]).unwrap_err()), ErrorCode::NeedsReset);
     env.reset(&ResetRequest::seeded(1, 2)).unwrap();
@@ -132,7 +173,7 @@ fn bad_input_is_rejected_by_name_and_the_next_valid_step_succeeds() {
 
 #[test]
 fn request_for_too_many_environments_is_rejected_with_both_numbers() {
-    let (server, endpoint) = start(&config(TaskName::Walk));
+    let (server, endpoint) = start(&config(TaskConfig::default()));
     for num_envs in [65, 1_000_000_000] {
         let error = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, num_envs)).err().unwrap().to_string();
         assert!(error.contains(&format!("{num_envs} is too large: 64 of 64 are free")), "{error}");
@@ -143,7 +184,7 @@ fn request_for_too_many_environments_is_rejected_with_both_numbers() {
 
 #[test]
 fn spec_hash_of_another_robot_is_rejected() {
-    let (server, endpoint) = start(&config(TaskName::Walk));
+    let (server, endpoint) = start(&config(TaskConfig::default()));
     let options = ConnectOptions { spec_hash: Some("0".repeat(32)), ..ConnectOptions::new(&endpoint, 1) };
     let Some(ClientError::Rejected(error)) = RemoteVecEnv::connect(&options).err() else { panic!("accepted") };
     assert_eq!(error.code, ErrorCode::SpecMismatch);
@@ -152,7 +193,7 @@ fn spec_hash_of_another_robot_is_rejected() {
 
 #[test]
 fn reclaimed_lease_continues_and_the_old_client_is_rejected() {
-    let (server, endpoint) = start(&config(TaskName::Counter));
+    let (server, endpoint) = start(&config(TaskConfig::Counter));
     let options = ConnectOptions::new(&endpoint, 1);
     let mut first = RemoteVecEnv::connect(&options).unwrap();
     first.reset(&ResetRequest::default()).unwrap();
@@ -212,7 +253,7 @@ impl VecEnv for FragileEnv {
 
 #[test]
 fn panic_in_an_environment_gets_an_error_reply_and_the_server_continues() {
-    let (server, endpoint) = start_with(&config(TaskName::Counter), Arc::new(FailingEnvFactory));
+    let (server, endpoint) = start_with(&config(TaskConfig::Counter), Arc::new(FailingEnvFactory));
     let options = ConnectOptions::new(&endpoint, 1);
     let mut env = RemoteVecEnv::connect(&options).unwrap();
     env.reset(&ResetRequest::default()).unwrap();
@@ -230,7 +271,7 @@ fn panic_in_an_environment_gets_an_error_reply_and_the_server_continues() {
 
 #[test]
 fn client_of_a_stopping_server_receives_an_error() {
-    let (server, endpoint) = start(&config(TaskName::Counter));
+    let (server, endpoint) = start(&config(TaskConfig::Counter));
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 1)).unwrap();
     env.reset(&ResetRequest::default()).unwrap();
     let stopper = std::thread::spawn(move || server.shutdown());

@@ -2,7 +2,7 @@
 
 use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{EnvFactory, SimEnvFactory};
-use twinstep_envs::TaskName;
+use twinstep_envs::TaskConfig;
 use twinstep_model::{AutoresetMode, EnvError, Ground, ResetRequest, VecEnv};
 use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::message::{LeaseReply, RenderRequest};
@@ -18,7 +18,7 @@ fn render(client: &RawClient, lease: &LeaseReply, env: u64) -> Answer {
 
 #[test]
 fn remote_and_local_scenes_are_equal_and_rendering_does_not_change_the_episode() {
-    let config = config(TaskName::Walk);
+    let config = config(TaskConfig::default());
     let (server, endpoint) = start(&config);
     let host = SimEnvFactory::new(config).unwrap();
     let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
@@ -46,7 +46,7 @@ fn remote_and_local_scenes_are_equal_and_rendering_does_not_change_the_episode()
 
 #[test]
 fn scene_has_the_simulated_ground() {
-    let mut config = config(TaskName::Walk);
+    let mut config = config(TaskConfig::default());
     config.sim.terrain = Terrain::SlopeRad(0.2);
     let mut env = SimEnvFactory::new(config).unwrap().build(1, AutoresetMode::NextStep, None).unwrap();
     env.reset(&ResetRequest::default()).unwrap();
@@ -56,7 +56,7 @@ fn scene_has_the_simulated_ground() {
 
 #[test]
 fn invalid_render_is_rejected_by_name_and_consumes_no_sequence_number() {
-    let (server, endpoint) = start(&config(TaskName::Walk));
+    let (server, endpoint) = start(&config(TaskConfig::default()));
     let client = RawClient::connect(&endpoint, server.sid(), "c1");
     let lease = client.lease(2);
     assert_eq!(render(&client, &lease, 0).unwrap_err().code, ErrorCode::NeedsReset);
@@ -77,7 +77,7 @@ fn invalid_render_is_rejected_by_name_and_consumes_no_sequence_number() {
 
 #[test]
 fn counter_cannot_be_rendered() {
-    let (server, endpoint) = start(&config(TaskName::Counter));
+    let (server, endpoint) = start(&config(TaskConfig::Counter));
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 1)).unwrap();
     env.reset(&ResetRequest::default()).unwrap();
     let EnvError::Remote(error) = env.scene(0).unwrap_err() else { panic!("not an error of the server") };

@@ -44,6 +44,7 @@ fn request_is_independent_of_other_requests_and_their_lengths() {
             start: start(index),
             history: &[],
             commands: &commands[index],
+            derating: &[],
         })
         .collect();
     let mut simulator = BatchRollout::new(&go2(), &SimConfig { threads: 2, ..SimConfig::default() }).unwrap();
@@ -51,7 +52,7 @@ fn request_is_independent_of_other_requests_and_their_lengths() {
         let together = simulator.run(&jobs, precision);
         for (index, states) in together.iter().enumerate() {
             let periods = commands[index].len();
-            assert_eq!(states.q.len(), periods + 1);
+            assert_eq!(states.measured.q.len(), periods + 1);
             let diverged: Vec<_> = (0..=periods).map(|entry| states.first_not_finite(entry).is_some()).collect();
             if index == BROKEN {
                 assert!(!diverged[2] && diverged[3..].iter().all(|diverged| *diverged), "{diverged:?}");
@@ -77,18 +78,23 @@ fn request_with_a_history_continues_an_earlier_rollout() {
     let commands: Vec<_> = (0..90).map(command).collect();
     let mut simulator = BatchRollout::new(&go2(), &SimConfig { threads: 1, ..SimConfig::default() }).unwrap();
     let mut simulate = |start: InitialState, history: &[HistoryStep], commands: &[Command]| {
-        let job = RolloutRequest { robot: &robot, base: BaseMount::Fixed, start, history, commands };
+        let job = RolloutRequest { robot: &robot, base: BaseMount::Fixed, start, history, commands, derating: &[] };
         simulator.run(&[job], Precision::Double).remove(0)
     };
     let whole = simulate(InitialState::at_rest(1.0, pose), &[], &commands);
     let now = 50;
-    let start = InitialState { q: whole.q[now], dq: whole.dq[now], ..InitialState::at_rest(1.0, pose) };
+    let start =
+        InitialState { q: whole.measured.q[now], dq: whole.measured.dq[now], ..InitialState::at_rest(1.0, pose) };
     let history: Vec<_> = (now - 8..now)
-        .map(|period| HistoryStep { command: commands[period], q: whole.q[period], dq: whole.dq[period] })
+        .map(|period| HistoryStep {
+            command: commands[period],
+            q: whole.measured.q[period],
+            dq: whole.measured.dq[period],
+        })
         .collect();
     let mut error = |history: &[HistoryStep]| {
         let states = simulate(start, history, &commands[now..]);
-        let pairs = states.q.iter().flatten().zip(whole.q[now..].iter().flatten());
+        let pairs = states.measured.q.iter().flatten().zip(whole.measured.q[now..].iter().flatten());
         pairs.map(|(one, other)| (one - other).abs()).fold(0.0, f32::max)
     };
     let [with, without] = [error(&history), error(&[])];

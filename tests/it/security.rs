@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{Config, Server, ServerError, SimEnvFactory};
-use twinstep_envs::TaskName;
+use twinstep_envs::TaskConfig;
 use twinstep_model::{ResetRequest, VecEnv};
 use twinstep_tests::security::SecurityFolder;
 
@@ -15,7 +15,7 @@ use twinstep_tests::security::SecurityFolder;
 /// A client whose liveliness token is not visible to the server then loses its environments.
 fn serve(protocol: &str, zenoh: &Path) -> (Server, String) {
     let mut config = Config::default();
-    config.task.name = TaskName::Counter;
+    config.task = TaskConfig::Counter;
     config.server.listen = format!("{protocol}/127.0.0.1:0");
     config.server.zenoh = Some(zenoh.to_owned());
     config.server.lease_grace_s = 0.0;

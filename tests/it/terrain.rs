@@ -3,14 +3,14 @@
 use glam::{Quat, Vec3};
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
-use twinstep_envs::TaskName;
+use twinstep_envs::TaskConfig;
 use twinstep_model::{
-    AutoresetMode, Backend, Command, Ground, InitialState, NUM_LEGS, Pose, ResetRequest, ShapeKind, VecEnv, body_poses,
-    frames, go2,
+    AutoresetMode, Command, Ground, InitialState, NUM_LEGS, Pose, ResetRequest, ShapeKind, Simulator, VecEnv,
+    body_poses, frames, go2,
 };
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, RoughTerrain, SimConfig, Terrain};
 
-use crate::remote::{config, start};
+use crate::remote::{self, config, start};
 
 fn rough(height_m: f32, cell_m: f32, seed: u64) -> Terrain {
     Terrain::Rough(RoughTerrain { height_m, cell_m, size_m: 20.0, seed })
@@ -27,7 +27,7 @@ fn batch(config: SimConfig) -> BatchBackend {
     BatchBackend::new(go2(), config, 1).unwrap()
 }
 
-fn backend<B: Backend>(make: Make<B>, terrain: Terrain, clearance: f32) -> B {
+fn backend<B: Simulator>(make: Make<B>, terrain: Terrain, clearance: f32) -> B {
     let q = go2().control.default_pose_f32();
     let mut backend = make(SimConfig { terrain, threads: 1, ..SimConfig::default() });
     let initial_state = InitialState::standing_on(&backend.ground(), backend.robot(), q, clearance);
@@ -35,18 +35,18 @@ fn backend<B: Backend>(make: Make<B>, terrain: Terrain, clearance: f32) -> B {
     backend
 }
 
-fn foot_centres(backend: &impl Backend) -> [Vec3; NUM_LEGS] {
+fn foot_centres(backend: &impl Simulator) -> [Vec3; NUM_LEGS] {
     let (robot, states) = (backend.robot(), backend.states());
     let world_from_base = Pose {
-        position: Vec3::from(states.base_position[0]),
-        rotation: frames::world_from_base(states.base_orientation[0]),
+        position: Vec3::from(states.truth.base_position[0]),
+        rotation: frames::world_from_base(states.measured.orientation[0]),
     };
-    let poses = body_poses(robot, world_from_base, &states.q[0]);
+    let poses = body_poses(robot, world_from_base, &states.measured.q[0]);
     std::array::from_fn(|leg| poses[3 + 3 * leg].transform(robot.shapes.foot_centre.as_vec3()))
 }
 
 /// Returns the signed distance of each foot sphere from the nearest point of the ground [m].
-fn foot_gaps(backend: &impl Backend, ground: &Ground) -> [f32; NUM_LEGS] {
+fn foot_gaps(backend: &impl Simulator, ground: &Ground) -> [f32; NUM_LEGS] {
     foot_centres(backend).map(|centre| {
         let around = (-30..=30).flat_map(|x| (-30..=30).map(move |y| (x as f32 / 1000.0, y as f32 / 1000.0)));
         let distance = around
@@ -58,7 +58,7 @@ fn foot_gaps(backend: &impl Backend, ground: &Ground) -> [f32; NUM_LEGS] {
 }
 
 /// Returns a backend whose robot has stood for 10 s.
-fn stood<B: Backend>(make: Make<B>, terrain: Terrain) -> B {
+fn stood<B: Simulator>(make: Make<B>, terrain: Terrain) -> B {
     let mut backend = backend(make, terrain, 0.01);
     let hold = Command::hold(go2().control.default_pose_f32(), 60.0, 2.0);
     backend.step(&[hold], &[true], 2000).unwrap();
@@ -71,16 +71,16 @@ fn robot_stands_with_its_feet_on_rough_ground() {
     stands_on_its_feet(batch);
 }
 
-fn stands_on_its_feet<B: Backend>(make: Make<B>) {
+fn stands_on_its_feet<B: Simulator>(make: Make<B>) {
     for seed in 1..=3 {
         let backend = stood(make, rough(0.05, 0.25, seed));
         let (gaps, states) = (foot_gaps(&backend, &backend.ground()), backend.states());
-        for (gap, force) in gaps.iter().zip(states.foot_force[0]) {
+        for (gap, force) in gaps.iter().zip(states.truth.foot_force[0]) {
             assert!(*gap > -0.005, "seed {seed}: a foot is {gap} m in the ground");
             assert!((force > 0.0) == (*gap < 0.001), "seed {seed}: {gap} m from the ground with {force} N");
         }
-        assert!(!states.body_contact[0], "seed {seed}");
-        assert!(frames::projected_gravity(states.base_orientation[0]).z < -0.98, "seed {seed}");
+        assert!(!states.truth.body_contact[0], "seed {seed}");
+        assert!(frames::projected_gravity(states.measured.orientation[0]).z < -0.98, "seed {seed}");
     }
 }
 
@@ -90,11 +90,11 @@ fn foot_forces_on_gentle_terrain_equal_the_weight() {
     check_foot_forces(batch);
 }
 
-fn check_foot_forces<B: Backend>(make: Make<B>) {
+fn check_foot_forces<B: Simulator>(make: Make<B>) {
     let weight = go2().total_mass() as f32 * 9.81;
     for seed in 1..=3 {
         // The forces are normal to the ground. On triangles of slope 0.1 their sum is up to 0.5 % less than the weight.
-        let force: f32 = stood(make, rough(0.02, 0.25, seed)).states().foot_force[0].iter().sum();
+        let force: f32 = stood(make, rough(0.02, 0.25, seed)).states().truth.foot_force[0].iter().sum();
         assert!((force / weight - 1.0).abs() < 0.01, "seed {seed}: {force} N on the feet, weight {weight} N");
     }
 }
@@ -108,7 +108,7 @@ fn dropped_robot_does_not_fall_through_the_terrain() {
     does_not_fall_through(batch, 0.005, 0.0);
 }
 
-fn does_not_fall_through<B: Backend>(make: Make<B>, min_foot_from_1_m: f32, min_trunk: f32) {
+fn does_not_fall_through<B: Simulator>(make: Make<B>, min_foot_from_1_m: f32, min_trunk: f32) {
     for (seed, height, min_foot) in [(1, 0.1, 0.01), (2, 0.5, 0.01), (3, 1.0, min_foot_from_1_m)] {
         let mut backend = backend(make, rough(0.1, 0.2, seed), height);
         let ground = backend.ground();
@@ -117,7 +117,7 @@ fn does_not_fall_through<B: Backend>(make: Make<B>, min_foot_from_1_m: f32, min_
         for period in 0..1000 {
             let kick = std::array::from_fn(|j| pose[j] + 0.5 * ((period / 20 * 12 + j) as f32 * 2.4).sin());
             backend.step(&[Command::hold(kick, 60.0, 1.0)], &[true], 1).unwrap();
-            let [x, y, z] = backend.states().base_position[0];
+            let [x, y, z] = backend.states().truth.base_position[0];
             lowest_trunk = lowest_trunk.min(z - ground.height(x, y));
             let feet = foot_centres(&backend).map(|centre| centre.z - ground.height(centre.x, centre.y));
             lowest_foot = feet.into_iter().fold(lowest_foot, f32::min);
@@ -133,13 +133,17 @@ fn robot_outside_the_height_field_stands_on_level_ground() {
     stands_outside_the_height_field(batch);
 }
 
-fn stands_outside_the_height_field<B: Backend>(make: Make<B>) {
+fn stands_outside_the_height_field<B: Simulator>(make: Make<B>) {
     let mut backend = backend(make, rough(0.05, 0.25, 1), 0.0);
     let q = go2().control.default_pose_f32();
     let initial_state = InitialState { base_position: [10.5, -3.0, 0.34], ..InitialState::at_rest(0.34, q) };
     backend.reset(&[(0, initial_state)]).unwrap();
     backend.step(&[Command::hold(q, 60.0, 2.0)], &[true], 400).unwrap();
-    assert!((0.27..0.33).contains(&backend.states().base_position[0][2]), "{:?}", backend.states().base_position[0]);
+    assert!(
+        (0.27..0.33).contains(&backend.states().truth.base_position[0][2]),
+        "{:?}",
+        backend.states().truth.base_position[0]
+    );
 }
 
 const CONFIG: &str = "
@@ -151,7 +155,7 @@ terrain = { rough = { height_m = 0.08, cell_m = 0.25, size_m = 30.0, seed = 7 } 
 fn server_sends_the_heights_around_the_robot() {
     let file = Config::parse(CONFIG, "server.toml").unwrap();
     let terrain = file.sim.terrain;
-    let (server, endpoint) = start(&Config { sim: file.sim, ..config(TaskName::Walk) });
+    let (server, endpoint) = start(&Config { sim: file.sim, ..config(TaskConfig::default()) });
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
     env.reset(&ResetRequest::seeded(1, 2)).unwrap();
     for _ in 0..50 {
@@ -191,9 +195,9 @@ fn server_rejects_invalid_terrain_before_it_starts() {
 
 #[test]
 fn walk_on_a_steep_slope_starts_with_the_feet_on_the_ground() {
-    let mut config = config(TaskName::Walk);
+    let mut config = config(TaskConfig::default());
     config.sim.terrain = Terrain::SlopeRad(0.3);
-    config.task.reset_joint_noise_rad = 0.0;
+    remote::walk(&mut config).reset_joint_noise_rad = 0.0;
     let mut env = SimEnvFactory::new(config).unwrap().build(1, AutoresetMode::NextStep, None).unwrap();
     env.reset(&ResetRequest::default()).unwrap();
     let up = Ground { normal: [-0.3f32.sin(), 0.0, 0.3f32.cos()], ..Ground::FLAT }.up();

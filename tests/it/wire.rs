@@ -8,7 +8,7 @@ use proptest::sample::Index;
 use proptest::strategy::ValueTree;
 use proptest::test_runner::TestRunner;
 use serde::de::IgnoredAny;
-use twinstep_envs::TaskName;
+use twinstep_envs::TaskConfig;
 use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::message::{CloseRequest, HelloRequest, LeaseReply, RenderRequest};
 use twinstep_protocol::{ErrorCode, PROTOCOL, decode, encode, keys};
@@ -83,7 +83,7 @@ impl Payload {
 
 #[test]
 fn any_bytes_at_any_key_get_one_reply_and_other_clients_continue() {
-    let mut config = config(TaskName::Counter);
+    let mut config = config(TaskConfig::Counter);
     // Leases granted to a mutated client id expire.
     config.server.lease_grace_s = 0.1;
     let (server, endpoint) = start(&config);
@@ -136,7 +136,7 @@ fn twenty_thousand_bad_requests() {
     const GIANT: usize = 64 << 20;
     // Zenoh's client retains memory for each query until its timeout.
     const RELEASE_TIME: Duration = Duration::from_millis(2500);
-    let (server, endpoint) = start(&config(TaskName::Counter));
+    let (server, endpoint) = start(&config(TaskConfig::Counter));
     let mut client = RawClient::connect(&endpoint, server.sid(), "c1");
     client.query_timeout = Duration::from_secs(2);
     let lease = client.lease(1);

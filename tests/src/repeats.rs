@@ -25,6 +25,7 @@ pub fn three_times(endpoint: &str) -> Result<(), String> {
             num_envs: 1,
             autoreset: AutoresetMode::NextStep,
             max_episode_steps: None,
+            critic: false,
             spec_hash: None,
             reclaim: None,
         };

@@ -58,6 +58,24 @@ def test_a_sequence_of_seeds_sets_each_environment() -> None:
     envs.close()
 
 
+def test_privileged_observations_are_in_the_info_with_the_option_critic() -> None:
+    envs = Go2VectorEnv(2, critic=True, autoreset_mode="SameStep", max_episode_steps=2)
+    names = [part.name for part in envs.twinstep_spec.critic_observation]
+    assert names == ["true_linear_velocity", "true_angular_velocity", "base_height", "foot_force"]
+    _, info = envs.reset(seed=1)
+    assert info["critic_obs"].shape == (2, 11)
+    assert ((0.2 < info["critic_obs"][:, 6]) & (info["critic_obs"][:, 6] < 0.5)).all(), "height of the base"
+    envs.step(np.zeros((2, 12), dtype=np.float32))
+    *_, info = envs.step(np.zeros((2, 12), dtype=np.float32))
+    assert info["critic_obs"].shape == info["final_info"]["critic_obs"].shape == (2, 11)
+    assert (info["critic_obs"] != info["final_info"]["critic_obs"]).any()
+    envs.close()
+    env = Go2Env(critic=True)
+    assert env.reset(seed=1)[1]["critic_obs"].shape == (11,)
+    assert env.step(np.zeros(12, dtype=np.float32))[4]["critic_obs"].shape == (11,)
+    env.close()
+
+
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 def test_info_at_the_end_of_an_episode_has_its_reward_terms(mode: str) -> None:
     envs = Go2VectorEnv(2, autoreset_mode=mode, max_episode_steps=4)

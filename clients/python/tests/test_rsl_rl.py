@@ -37,6 +37,22 @@ def test_the_runner_trains_for_two_iterations(tmp_path: Path) -> None:
     assert (tmp_path / "model_1.pt").exists()
 
 
+def test_the_runner_trains_with_a_privileged_critic(tmp_path: Path) -> None:
+    torch.set_num_threads(1)
+    envs = make_vec_env(num_envs=4, seed=1, critic=True)
+    runner = OnPolicyRunner(
+        envs,
+        {**config(), "obs_groups": {"actor": ["policy"], "critic": ["policy", "critic"]}},
+        log_dir=str(tmp_path),
+        device="cpu",
+    )
+    runner.learn(1)
+    observations = envs.get_observations()
+    envs.close()
+    assert observations["policy"].shape == (4, 45)
+    assert observations["critic"].shape == (4, 11)
+
+
 def test_time_outs_are_distinguished_from_failures() -> None:
     envs = make_vec_env(num_envs=3, seed=1, max_episode_steps=4)
     ends = [envs.step(torch.zeros(3, 12)) for _ in range(4)]

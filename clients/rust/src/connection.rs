@@ -42,6 +42,8 @@ pub struct ConnectOptions {
     pub autoreset: AutoresetMode,
     /// Number of policy steps after which an episode is truncated. Default: the server's.
     pub max_episode_steps: Option<u32>,
+    /// Requests the privileged observations of group `critic`, for an asymmetric critic. A real robot has none.
+    pub critic: bool,
     /// Spec hash that was stored with a policy; a server with a different one is rejected. Default: accept any.
     pub spec_hash: Option<String>,
     /// Zenoh configuration file (JSON5) for TLS, user and password.
@@ -63,6 +65,7 @@ impl ConnectOptions {
             num_envs,
             autoreset: AutoresetMode::NextStep,
             max_episode_steps: None,
+            critic: false,
             spec_hash: None,
             zenoh: None,
             shared_memory: false,

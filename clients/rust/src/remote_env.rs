@@ -4,7 +4,7 @@ use std::sync::OnceLock;
 
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, Scene, StepBatch, VecEnv};
 use twinstep_protocol::keys::EnvMethod;
-use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, keys, message, tensor};
+use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, keys, message};
 use zenoh::bytes::ZBytes;
 use zenoh::query::Querier;
 
@@ -57,6 +57,7 @@ impl RemoteVecEnv {
             num_envs: options.num_envs as u64,
             autoreset: options.autoreset,
             max_episode_steps: options.max_episode_steps,
+            critic: options.critic,
             spec_hash: options.spec_hash.clone(),
             reclaim: ticket.map(|ticket| message::Reclaim { lease: ticket.lease.clone(), epoch: ticket.epoch }),
         };
@@ -67,7 +68,7 @@ impl RemoteVecEnv {
         let (step, reset) = (connection.querier(key(EnvMethod::Step))?, connection.querier(key(EnvMethod::Reset))?);
         let num_envs = granted.num_envs as usize;
         Ok(Self {
-            batch: StepBatch::new(num_envs, granted.spec.obs_len()),
+            batch: StepBatch::new(num_envs, &granted.spec),
             ticket: LeaseHandle { lease: granted.lease, epoch: granted.epoch },
             spec: granted.spec,
             num_envs,
@@ -191,10 +192,13 @@ impl VecEnv for RemoteVecEnv {
         let answer = self.await_pending()?;
         let bytes = answer.to_bytes();
         let reply: message::ResetReply<'_> = decode(&bytes).map_err(|error| malformed("reset", error))?;
-        tensor::read_into(reply.obs, &mut self.batch.obs, "obs").map_err(|error| malformed("reset", error))?;
-        convert::check_length("obs", self.batch.obs.len(), self.num_envs * self.spec.obs_len())
+        convert::decode_observations(&reply, &self.spec, self.num_envs, &mut self.batch)
             .map_err(|error| malformed("reset", error))?;
         Ok(&self.batch.obs)
+    }
+
+    fn critic_obs(&self) -> &[f32] {
+        &self.batch.critic_obs
     }
 
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {

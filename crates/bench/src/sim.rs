@@ -324,7 +324,7 @@ fn record(mut backend: impl Backend, target: Target) -> Result<Vec<PerJoint>, Be
     (0..SECOND)
         .map(|period| {
             backend.step(&[command(target(period))], &[true], 1).map_err(failed)?;
-            Ok(backend.states().q[0])
+            Ok(backend.measured().q[0])
         })
         .collect()
 }

@@ -56,7 +56,7 @@ fn compare(
     let actions = vec![0.1; num_envs * env.spec().action_len()];
     let mut tcp = {
         let request = convert::encode_actions(&actions, 1, 1);
-        let reply = convert::encode_step(&StepBatch::new(num_envs, env.spec().obs_len()), 1);
+        let reply = convert::encode_step(&StepBatch::new(num_envs, env.spec()), 1, false);
         PingPong::start(request.len(), reply.len())?
     };
     let (mut ours, mut reference) = (Vec::new(), Vec::new());

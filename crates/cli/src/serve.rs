@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_env_server::{Config, Server, ServerError, SimEnvFactory};
-use twinstep_envs::TaskName;
+use twinstep_envs::TaskConfig;
 use twinstep_sim::Engine;
 
 use crate::exit::{CommandResult, Signals, input, other};
@@ -35,7 +35,7 @@ pub struct Args {
     name: Option<String>,
     /// Task: walk, or counter (no physics, to measure the transport). Default: walk.
     #[arg(long, value_parser = task_name)]
-    task: Option<TaskName>,
+    task: Option<&'static str>,
     /// Maximum number of environments of all clients together. Each client requests its number with its lease.
     /// Default: 4096.
     #[arg(long, value_name = "N")]
@@ -91,9 +91,9 @@ pub fn run(args: &Args) -> CommandResult {
     println!("listening {endpoint}");
     std::io::stdout().flush().map_err(other)?;
     eprintln!(
-        "robot `{}`, task {:?}, up to {} environments, server {}; Ctrl-C stops it",
+        "robot `{}`, task `{}`, up to {} environments, server {}; Ctrl-C stops it",
         config.server.name,
-        config.task.name,
+        config.task.name(),
         config.server.envs,
         server.sid()
     );
@@ -121,7 +121,10 @@ impl Args {
         server.zenoh = self.zenoh.clone().or(server.zenoh.take());
         server.seed = self.seed.or(server.seed);
         server.shared_memory |= self.shared_memory;
-        set(&mut config.task.name, self.task.as_ref());
+        // The settings of the config file are those of its own task.
+        if let Some(task) = self.task.filter(|task| *task != config.task.name()) {
+            config.task = TaskConfig::named(task).expect("the flag was checked");
+        }
         set(&mut config.sim.engine, self.engine.as_ref());
         config.sim.physics_hz = self.physics_hz.or(config.sim.physics_hz);
         config.randomise.effects |= self.randomise_effects;
@@ -137,12 +140,10 @@ fn set<T: Clone>(value: &mut T, flag: Option<&T>) {
     }
 }
 
-fn task_name(text: &str) -> Result<TaskName, String> {
-    match text {
-        "walk" => Ok(TaskName::Walk),
-        "counter" => Ok(TaskName::Counter),
-        _ => Err("must be `walk` or `counter`".to_owned()),
-    }
+fn task_name(text: &str) -> Result<&'static str, String> {
+    let names = TaskConfig::NAMES;
+    let known = names.into_iter().find(|name| *name == text);
+    known.ok_or_else(|| format!("not a task; possible: {}", names.join(", ")))
 }
 
 /// Parses the name of an engine.

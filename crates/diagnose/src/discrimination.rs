@@ -138,7 +138,7 @@ fn simulated(
     };
     let states = simulator
         .run(
-            &[RolloutRequest { robot, base: motion.base, start, history: &[], commands: &commands }],
+            &[RolloutRequest { robot, base: motion.base, start, history: &[], commands: &commands, derating: &[] }],
             Precision::Double,
         )
         .remove(0);
@@ -149,9 +149,9 @@ fn simulated(
         columns.push((name, (0..commands.len()).map(|row| f64::from(of(row))).collect()));
     };
     for (joint, name) in JOINT_NAMES.into_iter().enumerate() {
-        channel(format!("q_{name}"), &|row| states.q[row][joint]);
+        channel(format!("q_{name}"), &|row| states.measured.q[row][joint]);
         if like.dq(name).is_some() {
-            channel(format!("dq_{name}"), &|row| states.dq[row][joint]);
+            channel(format!("dq_{name}"), &|row| states.measured.dq[row][joint]);
         }
         if like.tau_measured(name).is_some() {
             // Also for an output sensor: the additional information that it has is not assumed.
@@ -163,12 +163,12 @@ fn simulated(
     }
     if !held {
         for (axis, letter) in ["x", "y", "z"].into_iter().enumerate() {
-            channel(format!("pos_{letter}"), &|row| states.base_position[row][axis]);
-            channel(format!("vel_{letter}"), &|row| states.base_linear_velocity[row][axis]);
-            channel(format!("gyro_{letter}"), &|row| states.base_angular_velocity[row][axis]);
+            channel(format!("pos_{letter}"), &|row| states.truth.base_position[row][axis]);
+            channel(format!("vel_{letter}"), &|row| states.truth.base_linear_velocity[row][axis]);
+            channel(format!("gyro_{letter}"), &|row| states.measured.gyro[row][axis]);
         }
         for (part, letter) in ["w", "x", "y", "z"].into_iter().enumerate() {
-            channel(format!("quat_{letter}"), &|row| states.base_orientation[row][part]);
+            channel(format!("quat_{letter}"), &|row| states.measured.orientation[row][part]);
         }
     }
     Log::new(meta, columns).ok()

@@ -128,7 +128,7 @@ mod tests {
         fn run(&mut self, jobs: &[RolloutRequest], _: Precision) -> Vec<RobotStates> {
             let play = |job: &RolloutRequest| {
                 let mut states = RobotStates::new(job.commands.len() + 1);
-                for (row, q) in states.q.iter_mut().enumerate() {
+                for (row, q) in states.measured.q.iter_mut().enumerate() {
                     q[0] = position(job.robot.joints[0].viscous_friction, row) as f32;
                 }
                 states

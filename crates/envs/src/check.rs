@@ -1,6 +1,6 @@
 //! A checker for vector environments, local or remote, similar to Gymnasium's `check_env`.
 
-use twinstep_model::{AutoresetMode, EnvError, ResetRequest, StepBatch, VecEnv};
+use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, SpecField, StepBatch, VecEnv};
 
 /// Seed of the checker's resets and actions.
 const SEED: u64 = 1234;
@@ -42,8 +42,8 @@ fn rollout(env: &mut dyn VecEnv, steps: usize) -> Result<Vec<StepBatch>, CheckEr
     let (num_envs, action_len) = (env.num_envs(), env.spec().action_len());
     let spec = env.spec().clone();
     let failed = |doing| move |source| CheckError::Failed { doing, source };
-    let obs = env.reset(&ResetRequest::seeded(SEED, num_envs)).map_err(failed("reset with seeds"))?;
-    check_numbers(obs, &spec, num_envs)?;
+    let obs = env.reset(&ResetRequest::seeded(SEED, num_envs)).map_err(failed("reset with seeds"))?.to_vec();
+    check_observations(&obs, env.critic_obs(), &spec, num_envs)?;
     let mut batches: Vec<StepBatch> = Vec::with_capacity(steps);
     let mut lengths = vec![0u32; num_envs];
     for step in 0..steps {
@@ -54,7 +54,7 @@ fn rollout(env: &mut dyn VecEnv, steps: usize) -> Result<Vec<StepBatch>, CheckEr
         }
         let restarts = env.autoreset() == AutoresetMode::NextStep;
         let batch = env.step(&actions).map_err(failed("step"))?.clone();
-        check_numbers(&batch.obs, &spec, num_envs)?;
+        check_observations(&batch.obs, &batch.critic_obs, &spec, num_envs)?;
         for env in 0..num_envs {
             if restarts && waiting[env] && (batch.reward[env] != 0.0 || batch.done(env)) {
                 let what =
@@ -74,25 +74,25 @@ fn test_action(step: usize, index: usize) -> f32 {
     0.3 * ((step * 31 + index * 17) as f32).sin()
 }
 
-fn check_numbers(obs: &[f32], spec: &twinstep_model::EnvSpec, num_envs: usize) -> Result<(), CheckError> {
-    let obs_len = spec.obs_len();
-    if obs.len() != num_envs * obs_len {
-        return Err(CheckError::ContractViolation(format!(
-            "`obs` has {} entries; {} are expected",
-            obs.len(),
-            num_envs * obs_len
-        )));
-    }
-    let bounds: Vec<(f32, f32)> =
-        spec.observation.iter().flat_map(|field| std::iter::repeat_n((field.low, field.high), field.size)).collect();
-    for (index, value) in obs.iter().enumerate() {
-        let (low, high) = bounds[index % obs_len];
-        if !(low..=high).contains(value) {
-            let entry = spec.observation_entry(index % obs_len);
-            let env = index / obs_len;
-            return Err(CheckError::ContractViolation(format!(
-                "{entry} of environment {env} is {value}, outside {low}..{high}"
-            )));
+/// Checks lengths and bounds of both observation groups.
+fn check_observations(obs: &[f32], critic_obs: &[f32], spec: &EnvSpec, num_envs: usize) -> Result<(), CheckError> {
+    for (field, values, layout) in
+        [("obs", obs, &spec.observation), ("critic_obs", critic_obs, &spec.critic_observation)]
+    {
+        let names: Vec<(&SpecField, usize)> =
+            layout.iter().flat_map(|field| (0..field.size).map(move |index| (field, index))).collect();
+        let expected = num_envs * names.len();
+        if values.len() != expected {
+            let text = format!("`{field}` has {} entries; {expected} are expected", values.len());
+            return Err(CheckError::ContractViolation(text));
+        }
+        for (index, value) in values.iter().enumerate() {
+            let (field, entry) = names[index % names.len()];
+            if !(field.low..=field.high).contains(value) {
+                let (env, SpecField { name, low, high, .. }) = (index / names.len(), field);
+                let text = format!("{name}[{entry}] of environment {env} is {value}, outside {low}..{high}");
+                return Err(CheckError::ContractViolation(text));
+            }
         }
     }
     Ok(())
@@ -105,7 +105,8 @@ fn check_ended(batch: &StepBatch, lengths: &mut [u32], env: &dyn VecEnv, step: u
     if batch.ended.len() != done {
         return violation(format!("{done} environments are done, but {} ended episodes are listed", batch.ended.len()));
     }
-    let final_obs_len = if env.autoreset() == AutoresetMode::SameStep { spec.obs_len() } else { 0 };
+    let same_step = env.autoreset() == AutoresetMode::SameStep;
+    let final_len = if same_step { [spec.obs_len(), spec.critic_obs_len()] } else { [0, 0] };
     for episode in &batch.ended {
         let index = episode.env;
         if !batch.done(index) || episode.length != lengths[index] || episode.length > spec.max_episode_steps {
@@ -117,9 +118,10 @@ fn check_ended(batch: &StepBatch, lengths: &mut [u32], env: &dyn VecEnv, step: u
         if batch.truncated[index] && episode.length != spec.max_episode_steps {
             return violation(format!("environment {index} was truncated after {} steps", episode.length));
         }
-        if episode.final_obs.len() != final_obs_len || episode.terms.len() != spec.reward_terms.len() {
+        let given = [episode.final_obs.len(), episode.final_critic_obs.len()];
+        if given != final_len || episode.terms.len() != spec.reward_terms.len() {
             return violation(format!(
-                "`terms` or `final_obs` of the ended episode of environment {index} has the wrong length"
+                "`terms`, `final_obs` or `final_critic_obs` of the ended episode of environment {index} has the wrong length"
             ));
         }
         lengths[index] = 0;

@@ -1,13 +1,12 @@
 //! The task `counter`: no physics, and an observation that verifies which steps were executed.
 //!
-//! It has the shapes of `walk`. Its observation contains the total number of steps and of resets of the environment,
+//! It has the layout of `walk`. Its observation contains the total number of steps and of resets of the environment,
 //! and a running hash of all actions in their order. A step that is repeated, lost or inserted changes the next
 //! observation. The task also measures the transport without the cost of physics.
 
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, RobotModel, StepBatch, VecEnv};
 
-use crate::TaskConfig;
-use crate::observation::{OBS_LEN, walk_spec};
+use crate::observation::{OBS_LEN, base_spec};
 
 /// Vectorised environments that count steps instead of simulating robots.
 pub struct CounterEnv {
@@ -56,13 +55,11 @@ impl Counter {
 impl CounterEnv {
     /// Creates `num_envs` counters.
     pub fn new(robot: &RobotModel, num_envs: usize, autoreset: AutoresetMode) -> Self {
-        let mut spec = walk_spec(robot, &TaskConfig::default());
-        spec.task = "counter".to_owned();
-        spec.reward_terms.clear();
+        let mut spec = base_spec("counter", robot, Vec::new(), 20.0);
         for field in &mut spec.observation {
             (field.low, field.high) = (-16_777_216.0, 16_777_216.0);
         }
-        Self { spec, autoreset, batch: StepBatch::new(num_envs, OBS_LEN), counters: vec![Counter::default(); num_envs] }
+        Self { batch: StepBatch::new(num_envs, &spec), spec, autoreset, counters: vec![Counter::default(); num_envs] }
     }
 
     fn observe(&mut self, env: usize) {

@@ -1,8 +1,10 @@
 //! Reinforcement-learning tasks on any [`twinstep_model::Backend`]: observation, reward, termination, reset.
 //!
-//! - [`TaskEnv`]: the task `walk`, a [`twinstep_model::VecEnv`] on any backend. [`TaskConfig`] and [`Randomisation`]
-//!   are the `[task]` and `[randomise]` tables of a config file.
-//! - [`observe`] and [`walk_spec`]: the observation of U2E, eq. 14, for simulator, log and robot.
+//! - [`Task`]: what a policy and a critic observe, the reward terms, and the end of an episode. [`tasks`] has one file
+//!   per task; [`TaskConfig`] is the `[task]` table of a config file.
+//! - [`TaskEnv`]: a task on all robots of a backend, as a [`twinstep_model::VecEnv`].
+//! - [`Randomisation`]: the `[randomise]` table; each episode has its own robot.
+//! - [`observe`]: the observation of U2E, eq. 14, for simulator, log and robot.
 //! - [`reward`]: one function per reward term. Its name is the config key and the log key.
 //! - [`CounterEnv`]: a task without physics, whose observation verifies which steps were executed.
 //! - [`check_vec_env`]: checks the contract of a vector environment, local or remote.
@@ -12,12 +14,18 @@ mod config;
 mod counter;
 mod episode;
 mod observation;
+mod randomise;
 pub mod reward;
+mod task;
 mod task_env;
+pub mod tasks;
 pub mod trot;
 
 pub use check::{CheckError, check_vec_env};
-pub use config::{CommandRanges, ConfigError, Randomisation, RewardWeights, TaskConfig, TaskName};
+pub use config::ConfigError;
 pub use counter::{Counter, CounterEnv};
-pub use observation::{OBS_LEN, observe, walk_spec};
+pub use observation::{CRITIC_OBS_LEN, OBS_LEN, base_spec, observe, observe_privileged, privileged_fields};
+pub use randomise::Randomisation;
+pub use task::{RobotView, Step, Task};
 pub use task_env::{TaskEnv, TaskEnvConfig};
+pub use tasks::{TaskConfig, Walk, WalkConfig};

@@ -1,32 +1,25 @@
-//! Layout of observation and action, and the observation of U2E, eq. 14, for simulator, log and robot.
+//! Observation and action entries that tasks share: U2E, eq. 14, and privileged entries for a critic.
 
-use twinstep_model::{EnvSpec, JOINT_NAMES, NUM_JOINTS, PerJoint, RobotModel, RobotStates, SpecField, frames};
+use glam::Vec3;
+use twinstep_model::{EnvSpec, GroundTruth, JOINT_NAMES, NUM_JOINTS, PerJoint, RobotModel, SpecField, frames};
 
-use crate::{RewardWeights, TaskConfig};
+use crate::task::RobotView;
 
-/// Length of an observation.
+/// Length of the observation of U2E, eq. 14.
 pub const OBS_LEN: usize = 45;
+/// Length of the privileged observation.
+pub const CRITIC_OBS_LEN: usize = 11;
 
-/// Returns the spec of the task `walk`: layouts, periods, gains and limits.
-pub fn walk_spec(robot: &RobotModel, task: &TaskConfig) -> EnvSpec {
+/// Returns the spec of a task with the observation of U2E, eq. 14, and joint position offsets as actions.
+///
+/// `reward_terms` are the names of the terms, `max_episode_s` is the time after which an episode is truncated [s].
+pub fn base_spec(task: &str, robot: &RobotModel, reward_terms: Vec<String>, max_episode_s: f32) -> EnvSpec {
     let control = &robot.control;
     EnvSpec {
-        task: "walk".to_owned(),
+        task: task.to_owned(),
         robot: robot.name.clone(),
-        observation: vec![
-            field("base_angular_velocity", 3, "rad/s", 50.0, "angular velocity of the base in the base frame, omega_t"),
-            field("projected_gravity", 3, "", 1.0, "unit vector of gravity in the base frame, g_t"),
-            field(
-                "velocity_command",
-                3,
-                "m/s, m/s, rad/s",
-                5.0,
-                "commanded velocity in the base frame: forward, left, yaw rate, c_t",
-            ),
-            field("joint_position", NUM_JOINTS, "rad", 6.3, "position relative to the default pose, q - q_default"),
-            field("joint_velocity", NUM_JOINTS, "rad/s", 100.0, "velocity, dq"),
-            field("previous_action", NUM_JOINTS, "", 1.0, "action of the previous step, clipped, a_(t-1)"),
-        ],
+        observation: policy_fields(),
+        critic_observation: Vec::new(),
         action: vec![field(
             "joint_position_offset",
             NUM_JOINTS,
@@ -41,9 +34,37 @@ pub fn walk_spec(robot: &RobotModel, task: &TaskConfig) -> EnvSpec {
         kd: control.kd,
         action_scale: control.action_scale,
         default_pose: control.default_pose.to_vec(),
-        reward_terms: RewardWeights::NAMES.iter().map(|name| (*name).to_owned()).collect(),
-        max_episode_steps: (f64::from(task.max_episode_s) / control.policy_dt()).round() as u32,
+        reward_terms,
+        max_episode_steps: (f64::from(max_episode_s) / control.policy_dt()).round() as u32,
     }
+}
+
+/// Returns the entries of U2E, eq. 14, which [`observe`] writes.
+fn policy_fields() -> Vec<SpecField> {
+    vec![
+        field("base_angular_velocity", 3, "rad/s", 50.0, "angular velocity of the base in the base frame, omega_t"),
+        field("projected_gravity", 3, "", 1.0, "unit vector of gravity in the base frame, g_t"),
+        field(
+            "velocity_command",
+            3,
+            "m/s, m/s, rad/s",
+            5.0,
+            "commanded velocity in the base frame: forward, left, yaw rate, c_t",
+        ),
+        field("joint_position", NUM_JOINTS, "rad", 6.3, "position relative to the default pose, q - q_default"),
+        field("joint_velocity", NUM_JOINTS, "rad/s", 100.0, "velocity, dq"),
+        field("previous_action", NUM_JOINTS, "", 1.0, "action of the previous step, clipped, a_(t-1)"),
+    ]
+}
+
+/// Returns the privileged entries, which [`observe_privileged`] writes.
+pub fn privileged_fields() -> Vec<SpecField> {
+    vec![
+        field("true_linear_velocity", 3, "m/s", 50.0, "velocity of the base in the base frame"),
+        field("true_angular_velocity", 3, "rad/s", 50.0, "angular velocity of the base in the base frame"),
+        field("base_height", 1, "m", 5.0, "height of the base above the ground under it"),
+        field("foot_force", 4, "N", 1000.0, "normal force on each foot: FL, FR, RL, RR"),
+    ]
 }
 
 fn field(name: &str, size: usize, unit: &str, bound: f32, text: &str) -> SpecField {
@@ -57,23 +78,39 @@ fn field(name: &str, size: usize, unit: &str, bound: f32, text: &str) -> SpecFie
     }
 }
 
-/// Writes the observation of `robot` into `obs` (45 values), clipped to the bounds of [`walk_spec`].
-pub fn observe(
-    states: &RobotStates,
-    robot: usize,
-    command: [f32; 3],
-    default_pose: &PerJoint,
-    previous_action: &PerJoint,
-    obs: &mut [f32],
-) {
-    let gravity = frames::projected_gravity(states.base_orientation[robot]);
-    write_clipped(&mut obs[0..3], states.base_angular_velocity[robot], 50.0);
+/// Writes the observation of U2E, eq. 14, into `obs` (45 values), clipped to the bounds of [`base_spec`].
+pub fn observe(robot: &RobotView, command: [f32; 3], default_pose: &PerJoint, action: &PerJoint, obs: &mut [f32]) {
+    let (measured, index) = (robot.measured, robot.index);
+    let gravity = frames::projected_gravity(measured.orientation[index]);
+    write_clipped(&mut obs[0..3], measured.gyro[index], 50.0);
     write_clipped(&mut obs[3..6], gravity.to_array(), 1.0);
     write_clipped(&mut obs[6..9], command, 5.0);
-    let q = &states.q[robot];
+    let q = &measured.q[index];
     write_clipped(&mut obs[9..21], std::array::from_fn::<f32, NUM_JOINTS, _>(|j| q[j] - default_pose[j]), 6.3);
-    write_clipped(&mut obs[21..33], states.dq[robot], 100.0);
-    obs[33..45].copy_from_slice(previous_action);
+    write_clipped(&mut obs[21..33], measured.dq[index], 100.0);
+    obs[33..45].copy_from_slice(action);
+}
+
+/// Writes the privileged observation into `obs` (11 values), clipped to the bounds of [`privileged_fields`].
+pub fn observe_privileged(robot: &RobotView, truth: &GroundTruth, obs: &mut [f32]) {
+    let index = robot.index;
+    let velocity = linear_velocity_in_base(robot, truth);
+    write_clipped(&mut obs[0..3], velocity.to_array(), 50.0);
+    write_clipped(&mut obs[3..6], truth.base_angular_velocity[index], 50.0);
+    write_clipped(&mut obs[6..7], [base_height(robot, truth)], 5.0);
+    write_clipped(&mut obs[7..11], truth.foot_force[index], 1000.0);
+}
+
+/// Returns the velocity of the base in the base frame [m/s].
+pub fn linear_velocity_in_base(robot: &RobotView, truth: &GroundTruth) -> Vec3 {
+    let base_from_world = frames::world_from_base(robot.measured.orientation[robot.index]).inverse();
+    base_from_world * Vec3::from(truth.base_linear_velocity[robot.index])
+}
+
+/// Returns the height of the base above the ground under it [m].
+pub fn base_height(robot: &RobotView, truth: &GroundTruth) -> f32 {
+    let [x, y, z] = truth.base_position[robot.index];
+    z - robot.ground.height(x, y)
 }
 
 fn write_clipped<const N: usize>(entries: &mut [f32], values: [f32; N], bound: f32) {
@@ -84,44 +121,55 @@ fn write_clipped<const N: usize>(entries: &mut [f32], values: [f32; N], bound: f
 
 #[cfg(test)]
 mod tests {
-    use twinstep_model::go2;
+    use twinstep_model::{Ground, RobotStates, go2};
 
     use super::*;
 
     #[test]
     fn layout_is_that_of_equation_14() {
-        let spec = walk_spec(&go2(), &TaskConfig::default());
+        let spec = base_spec("walk", &go2(), Vec::new(), 20.0);
         assert_eq!((spec.obs_len(), spec.action_len()), (OBS_LEN, 12));
         assert_eq!(spec.observation_entry(9), "joint_position[FL_hip]");
         assert_eq!(spec.observation_entry(44), "previous_action[RR_calf]");
         assert_eq!((spec.policy_dt, spec.actuator_dt, spec.max_episode_steps), (0.02, 0.005, 1000));
+        assert_eq!(privileged_fields().iter().map(|field| field.size).sum::<usize>(), CRITIC_OBS_LEN);
     }
 
     #[test]
     fn each_quantity_has_its_index() {
         let robot = go2();
         let mut states = RobotStates::new(1);
-        states.base_angular_velocity[0] = [1.0, 2.0, 3.0];
-        states.q[0] = std::array::from_fn(|j| robot.control.default_pose[j] as f32 + 0.01 * j as f32);
-        states.dq[0] = std::array::from_fn(|j| j as f32 - 5.0);
+        states.measured.gyro[0] = [1.0, 2.0, 3.0];
+        states.measured.q[0] = std::array::from_fn(|j| robot.control.default_pose[j] as f32 + 0.01 * j as f32);
+        states.measured.dq[0] = std::array::from_fn(|j| j as f32 - 5.0);
         let action: PerJoint = std::array::from_fn(|j| 0.05 * j as f32);
         let mut obs = [f32::NAN; OBS_LEN];
-        observe(&states, 0, [0.4, 0.5, 0.6], &robot.control.default_pose_f32(), &action, &mut obs);
+        let ground = Ground::FLAT;
+        let view = RobotView { measured: &states.measured, truth: None, ground: &ground, index: 0 };
+        observe(&view, [0.4, 0.5, 0.6], &robot.control.default_pose_f32(), &action, &mut obs);
         assert_eq!(obs[..9], [1.0, 2.0, 3.0, 0.0, 0.0, -1.0, 0.4, 0.5, 0.6]);
         for j in 0..NUM_JOINTS {
             assert!((obs[9 + j] - 0.01 * j as f32).abs() < 1e-6);
-            assert_eq!((obs[21 + j], obs[33 + j]), (states.dq[0][j], action[j]));
+            assert_eq!((obs[21 + j], obs[33 + j]), (states.measured.dq[0][j], action[j]));
         }
     }
 
     #[test]
-    fn hash_depends_on_the_gains_but_not_on_the_episode_length() {
-        let task = TaskConfig::default();
-        let spec = walk_spec(&go2(), &task);
-        let mut other_gain = go2();
-        other_gain.control.kp += 1.0;
-        assert_ne!(walk_spec(&other_gain, &task).hash(), spec.hash());
-        let longer = TaskConfig { max_episode_s: 30.0, ..task };
-        assert_eq!(walk_spec(&go2(), &longer).hash(), spec.hash());
+    fn privileged_velocity_is_in_the_base_frame_and_without_the_bias_of_the_gyroscope() {
+        let mut states = RobotStates::new(1);
+        // Turned to the left by 90 degrees: forward is the world's y axis.
+        let half = std::f32::consts::FRAC_1_SQRT_2;
+        states.measured.orientation[0] = [half, 0.0, 0.0, half];
+        states.measured.gyro[0] = [0.2; 3];
+        states.truth.base_position[0] = [3.0, 0.0, 0.9];
+        states.truth.base_linear_velocity[0] = [0.0, 0.7, 0.1];
+        states.truth.base_angular_velocity[0] = [0.1; 3];
+        states.truth.foot_force[0] = [10.0, 20.0, 30.0, 40.0];
+        let ground = Ground { point: [0.0, 0.0, 0.5], ..Ground::FLAT };
+        let view = RobotView { measured: &states.measured, truth: None, ground: &ground, index: 0 };
+        let mut obs = [f32::NAN; CRITIC_OBS_LEN];
+        observe_privileged(&view, &states.truth, &mut obs);
+        let expected = [0.7, 0.0, 0.1, 0.1, 0.1, 0.1, 0.4, 10.0, 20.0, 30.0, 40.0];
+        assert!(obs.iter().zip(expected).all(|(one, other)| (one - other).abs() < 1e-6), "{obs:?}");
     }
 }

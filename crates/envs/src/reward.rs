@@ -1,6 +1,44 @@
-//! Reward terms of the task `walk`, one function each. Weights and signs are in [`crate::RewardWeights`].
+//! Reward terms, one function each. Weights and signs are in the file of a task.
 
 use twinstep_model::{NUM_JOINTS, PerJoint, PerLeg};
+
+/// Terms that depend on the ground truth of a simulator. A task on a real robot has no such term.
+pub const NEED_GROUND_TRUTH: [&str; 5] =
+    ["track_linear_velocity", "linear_velocity_z", "feet_air_time", "undesired_contact", "epistemic_uncertainty"];
+
+/// Defines the weights of a task's reward terms: `name = default weight`, in the order of every per-term array.
+///
+/// A weight is per second: a term adds `weight · value · policy_dt` to the reward of a step. The name of a field is
+/// that of its function in [`crate::reward`], of its key in a config file and of its log entry.
+macro_rules! reward_weights {
+    ($($(#[$doc:meta])* $name:ident = $weight:expr),+ $(,)?) => {
+        /// Weights of the reward terms, per second: a term adds `weight · value · policy_dt` to the reward of a step.
+        ///
+        /// The name of a field is that of its function in [`crate::reward`], of its key and of its log entry.
+        #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields, default)]
+        pub struct RewardWeights { $($(#[$doc])* pub $name: f32),+ }
+
+        impl Default for RewardWeights {
+            fn default() -> Self { Self { $($name: $weight),+ } }
+        }
+
+        impl RewardWeights {
+            /// Names of the terms, in the order of every per-term array.
+            pub const NAMES: &'static [&'static str] = &[$(stringify!($name)),+];
+
+            /// Returns the value of each weighted term, in the order of [`RewardWeights::NAMES`].
+            pub fn evaluate(&self, input: &crate::reward::RewardInput<'_>) -> [f32; Self::NAMES.len()] {
+                [$(self.$name * crate::reward::$name(input) * input.policy_dt),+]
+            }
+
+            fn values(&self) -> impl Iterator<Item = (&'static str, f32)> {
+                [$((stringify!($name), self.$name)),+].into_iter()
+            }
+        }
+    };
+}
+pub(crate) use reward_weights;
 
 /// State of one robot after one policy step, from which the reward terms are computed.
 #[derive(Clone, Copy, Debug)]
@@ -174,7 +212,7 @@ mod tests {
 
     #[test]
     fn standing_in_the_default_pose_has_no_penalty() {
-        let terms = crate::RewardWeights::default().evaluate(&at_rest());
+        let terms = crate::tasks::walk::RewardWeights::default().evaluate(&at_rest());
         let expected = 0.02 * (1.0 + 0.5);
         assert!((terms.iter().sum::<f32>() - expected).abs() < 1e-6, "{terms:?}");
     }

@@ -1,14 +1,15 @@
-//! The task `walk` on any backend: robots that follow velocity commands.
+//! A task on all robots of a backend.
 
+use glam::Vec3;
 use twinstep_effects::RobotSampler;
 use twinstep_model::{
-    AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, InitialState, ResetRequest,
-    RobotModel, Scene, StepBatch, VecEnv,
+    AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, Ground, InitialState, Pose,
+    ResetRequest, Scene, StepBatch, VecEnv, frames,
 };
 
-use crate::episode::{Episode, EpisodeConfig, StepOutcome};
-use crate::observation::{OBS_LEN, walk_spec};
-use crate::{ConfigError, Randomisation, TaskConfig};
+use crate::episode::{Episode, StepOutcome};
+use crate::task::{RobotView, Task};
+use crate::{ConfigError, Randomisation};
 
 /// Initial height of the lowest foot above the ground [m].
 const START_CLEARANCE: f32 = 0.01;
@@ -16,52 +17,59 @@ const START_CLEARANCE: f32 = 0.01;
 /// Settings of a [`TaskEnv`].
 #[derive(Clone, Debug)]
 pub struct TaskEnvConfig {
-    /// The task.
-    pub task: TaskConfig,
     /// Domain randomisation.
     pub randomise: Randomisation,
     /// Samples the robot of each episode. Default: the robot of the backend.
     pub robot_sampler: Option<RobotSampler>,
     /// When a new episode starts after one has ended.
     pub autoreset: AutoresetMode,
-    /// Number of policy steps after which an episode is truncated. Default: `max_episode_s` of the task.
+    /// Number of policy steps after which an episode is truncated. Default: that of the task.
     pub max_episode_steps: Option<u32>,
     /// Seed of environment 0 until a reset sets another. Environment `i` has the seed `seed + i`.
     pub seed: u64,
 }
 
-/// Vectorised environments of the task `walk` on a backend.
-pub struct TaskEnv<B: Backend> {
+/// Vectorised environments of a task on a backend.
+pub struct TaskEnv<B: Backend, T: Task> {
     backend: B,
+    task: T,
     spec: EnvSpec,
-    config: EpisodeConfig,
+    randomise: Randomisation,
     robots: Option<RobotSampler>,
+    ground: Ground,
     autoreset: AutoresetMode,
-    episodes: Vec<Episode>,
+    episodes: Vec<Episode<T::State>>,
     commands: Vec<Command>,
     active: Vec<bool>,
     batch: StepBatch,
+    /// Weighted reward terms of one step.
+    terms: Vec<f32>,
 }
 
-impl<B: Backend> TaskEnv<B> {
+impl<B: Backend, T: Task> TaskEnv<B, T> {
     /// Creates one environment per robot of `backend`.
-    pub fn new(backend: B, settings: TaskEnvConfig) -> Result<Self, ConfigError> {
-        let TaskEnvConfig { task, randomise, robot_sampler: robots, autoreset, max_episode_steps, seed } = settings;
-        task.check()?;
-        randomise.check()?;
+    pub fn new(backend: B, task: T, settings: TaskEnvConfig) -> Result<Self, ConfigError> {
+        let TaskEnvConfig { randomise, robot_sampler: robots, autoreset, max_episode_steps, seed } = settings;
         let robot = backend.robot();
-        let mut spec = walk_spec(robot, &task);
+        randomise.check()?;
+        randomise.check_robot(robot)?;
+        let mut spec = task.spec().clone();
         spec.max_episode_steps = max_episode_steps.unwrap_or(spec.max_episode_steps);
-        let num_envs = backend.num_robots();
+        let (num_envs, control) = (backend.num_robots(), &robot.control);
+        let command = Command::hold(control.default_pose_f32(), control.kp as f32, control.kd as f32);
+        let not_started = |env: u64| Episode::not_started(&task, seed.wrapping_add(env));
         Ok(Self {
-            config: EpisodeConfig::new(task, randomise, robot, backend.ground(), &spec),
-            spec,
+            randomise,
             robots,
+            ground: backend.ground(),
             autoreset,
-            episodes: (0..num_envs as u64).map(|env| Episode::not_started(seed.wrapping_add(env))).collect(),
-            commands: vec![Command::hold(robot.control.default_pose_f32(), 0.0, 0.0); num_envs],
+            episodes: (0..num_envs as u64).map(not_started).collect(),
+            commands: vec![command; num_envs],
             active: vec![true; num_envs],
-            batch: StepBatch::new(num_envs, OBS_LEN),
+            batch: StepBatch::new(num_envs, &spec),
+            terms: vec![0.0; spec.reward_terms.len()],
+            spec,
+            task,
             backend,
         })
     }
@@ -84,42 +92,48 @@ impl<B: Backend> TaskEnv<B> {
             return Err(EnvError::ActionNotFinite { env: index / action_len, entry, value: actions[index] });
         }
         let restarts = self.autoreset == AutoresetMode::NextStep;
-        let needs_reset = |episode: &Episode| !episode.running && (!restarts || !episode.was_started());
+        let needs_reset = |episode: &Episode<T::State>| !episode.running && (!restarts || !episode.was_started());
         self.episodes.iter().position(needs_reset).map_or(Ok(()), |env| Err(EnvError::NeedsReset { env }))
     }
 
     fn start_episodes(&mut self, envs: &[usize]) -> Result<(), BackendError> {
         for env in envs {
-            let (initial_state, robot) = self.start(*env);
-            match robot {
-                Some(robot) => self.backend.reset_with_model(*env, &robot, &initial_state)?,
-                None => self.backend.reset(&[(*env, initial_state)])?,
+            let Self { task, backend, randomise, robots, .. } = self;
+            let start = self.episodes[*env].start(task, backend.robot(), randomise, robots.as_ref());
+            self.commands[*env].q = start.q;
+            let initial_state = InitialState {
+                actuator_seed: start.actuator_seed,
+                ..InitialState::standing_on(&self.ground, backend.robot(), start.q, START_CLEARANCE)
+            };
+            match start.robot {
+                Some(robot) => backend.reset_with_model(*env, &robot, &initial_state)?,
+                None => backend.reset(&[(*env, initial_state)])?,
             }
-            let row = &mut self.batch.obs[env * OBS_LEN..(env + 1) * OBS_LEN];
-            self.episodes[*env].observe(&self.config, self.backend.states(), *env, row);
+            self.observe(*env);
         }
         Ok(())
     }
 
-    fn start(&mut self, env: usize) -> (InitialState, Option<RobotModel>) {
-        let mut start = self.episodes[env].start(&self.config);
-        self.commands[env] = Command::hold(start.q, start.kp, start.kd);
-        let initial_state =
-            InitialState::standing_on(self.config.ground(), self.backend.robot(), start.q, START_CLEARANCE);
-        let robot = self.robots.as_ref().map(|robots| robots.sample(&mut start.effects));
-        (InitialState { randomisation: start.variation, actuator_seed: start.actuator_seed, ..initial_state }, robot)
+    /// Writes the observations of environment `env`.
+    fn observe(&mut self, env: usize) {
+        let Self { backend, task, ground, episodes, batch, spec, .. } = self;
+        let episode = &episodes[env];
+        let robot = view(backend, ground, env);
+        task.observe(&episode.state, &robot, &episode.action, row(&mut batch.obs, env, spec.obs_len()));
+        if !spec.critic_observation.is_empty() {
+            task.observe_critic(&episode.state, &robot, row(&mut batch.critic_obs, env, spec.critic_obs_len()));
+        }
     }
 
     /// Sets the commands of all running environments, and resets those whose episode has ended (NextStep).
     fn prepare(&mut self, actions: &[f32]) -> Result<(), BackendError> {
-        let dq = &self.backend.states().dq;
+        let (dq, control) = (&self.backend.measured().dq, &self.backend.robot().control);
         let (actions, _) = actions.as_chunks();
         let mut waiting = Vec::new();
         for (env, (episode, action)) in self.episodes.iter_mut().zip(actions).enumerate() {
             self.active[env] = episode.running;
             if episode.running {
-                // The gains are constant during an episode.
-                self.commands[env].q = episode.joint_targets(&self.config, action, &dq[env]);
+                self.commands[env].q = episode.joint_targets(control, action, &dq[env]);
             } else {
                 waiting.push(env);
             }
@@ -129,15 +143,17 @@ impl<B: Backend> TaskEnv<B> {
 
     /// Writes reward, end flags and observation of every environment that was stepped.
     fn finish(&mut self) {
-        let Self { episodes, active, batch, config, backend, .. } = self;
-        let rows = batch.obs.chunks_exact_mut(OBS_LEN);
-        for (env, (episode, obs)) in episodes.iter_mut().zip(rows).enumerate() {
-            let not_stepped = StepOutcome { reward: 0.0, terminated: false, truncated: false };
-            let outcome =
-                if active[env] { episode.evaluate_step(config, backend.states(), env, obs) } else { not_stepped };
-            batch.reward[env] = outcome.reward;
-            batch.terminated[env] = outcome.terminated;
-            batch.truncated[env] = outcome.truncated;
+        for env in 0..self.episodes.len() {
+            let mut outcome = StepOutcome::default();
+            if self.active[env] {
+                let Self { backend, task, spec, ground, episodes, terms, .. } = self;
+                let robot = view(backend, ground, env);
+                outcome = episodes[env].evaluate_step(task, robot, spec.max_episode_steps, terms);
+                self.observe(env);
+            }
+            self.batch.reward[env] = outcome.reward;
+            self.batch.terminated[env] = outcome.terminated;
+            self.batch.truncated[env] = outcome.truncated;
         }
         self.batch.ended.clear();
         for env in 0..self.episodes.len() {
@@ -148,22 +164,36 @@ impl<B: Backend> TaskEnv<B> {
     }
 
     fn report(&mut self, env: usize) {
+        let Self { spec, batch, .. } = self;
         let episode = &self.episodes[env];
-        let final_obs = match self.autoreset {
-            AutoresetMode::SameStep => self.batch.obs[env * OBS_LEN..(env + 1) * OBS_LEN].to_vec(),
-            AutoresetMode::NextStep | AutoresetMode::Disabled => Vec::new(),
+        let (final_obs, final_critic_obs) = match self.autoreset {
+            AutoresetMode::SameStep => (
+                row(&mut batch.obs, env, spec.obs_len()).to_vec(),
+                row(&mut batch.critic_obs, env, spec.critic_obs_len()).to_vec(),
+            ),
+            AutoresetMode::NextStep | AutoresetMode::Disabled => (Vec::new(), Vec::new()),
         };
         self.batch.ended.push(EndedEpisode {
             env,
             length: episode.length,
             episode_return: episode.episode_return,
-            terms: episode.term_sums.to_vec(),
+            terms: episode.term_sums.clone(),
             final_obs,
+            final_critic_obs,
         });
     }
 }
 
-impl<B: Backend> VecEnv for TaskEnv<B> {
+/// Returns entries of environment `env` in an array with `len` entries per environment.
+fn row(array: &mut [f32], env: usize, len: usize) -> &mut [f32] {
+    &mut array[env * len..(env + 1) * len]
+}
+
+fn view<'a>(backend: &'a impl Backend, ground: &'a Ground, index: usize) -> RobotView<'a> {
+    RobotView { measured: backend.measured(), truth: backend.ground_truth(), ground, index }
+}
+
+impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
     fn spec(&self) -> &EnvSpec {
         &self.spec
     }
@@ -181,11 +211,15 @@ impl<B: Backend> VecEnv for TaskEnv<B> {
         let envs: Vec<usize> = (0..self.num_envs()).filter(|env| request.selects(*env)).collect();
         if let Some(seeds) = &request.seeds {
             for env in &envs {
-                self.episodes[*env].seed(seeds[*env]);
+                self.episodes[*env].seed(&self.task, seeds[*env]);
             }
         }
         self.start_episodes(&envs)?;
         Ok(&self.batch.obs)
+    }
+
+    fn critic_obs(&self) -> &[f32] {
+        &self.batch.critic_obs
     }
 
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
@@ -215,8 +249,15 @@ impl<B: Backend> VecEnv for TaskEnv<B> {
         if !episode.running && !episode.was_started() {
             return Err(EnvError::NeedsReset { env });
         }
-        let backend = &self.backend;
-        let scene = Scene::new(backend.robot(), backend.states(), env, self.config.ground());
-        Ok(Scene { command: Some(episode.command), ..scene })
+        let robot = view(&self.backend, &self.ground, env);
+        // Where the position is not measured, the robot stands at the origin.
+        let position = robot.truth.map_or_else(
+            || InitialState::standing_on(robot.ground, self.backend.robot(), robot.measured.q[env], 0.0).base_position,
+            |truth| truth.base_position[env],
+        );
+        let rotation = frames::world_from_base(robot.measured.orientation[env]);
+        let world_from_base = Pose { position: Vec3::from(position), rotation };
+        let scene = Scene::new(self.backend.robot(), world_from_base, &robot.measured.q[env], robot.ground);
+        Ok(Scene { command: self.task.velocity_command(&episode.state), ..scene })
     }
 }

@@ -4,7 +4,10 @@ use std::f64::consts::TAU;
 
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
-use twinstep_model::{Backend, BackendError, Command, Ground, InitialState, Joint, RobotModel, RobotStates};
+use twinstep_model::{
+    Backend, BackendError, Command, Ground, GroundTruth, InitialState, Joint, Measured, PerJoint, RobotModel,
+    RobotStates, Simulator,
+};
 
 use crate::draw::BaseSchedule;
 
@@ -71,7 +74,7 @@ impl UnmodelledEffect {
     /// Changes `command` as the effect does at `time` [s], given the measured states.
     ///
     /// Returns the part of the torque that the current sensors do not measure, by joint [N·m].
-    fn apply(self, command: &mut Command, measured: &RobotStates, time: f64) -> [f32; 12] {
+    fn apply(self, command: &mut Command, measured: &Measured, time: f64) -> [f32; 12] {
         let mut unmeasured = [0.0; 12];
         match self {
             UnmodelledEffect::CrossTalk { from, into, share } => {
@@ -107,41 +110,43 @@ fn frequencies(text: &str) -> impl Iterator<Item = f64> + '_ {
 }
 
 /// Backend of one robot with an effect outside the catalogue.
-pub struct PerturbedBackend<B> {
-    inner: B,
+pub struct PerturbedBackend<S> {
+    inner: S,
     outside: Option<UnmodelledEffect>,
     /// States as the sensors measure them.
-    measured: RobotStates,
+    states: RobotStates,
     time: f64,
 }
 
-impl<B: Backend> PerturbedBackend<B> {
+impl<S: Simulator> PerturbedBackend<S> {
     /// Creates the backend with the effect `outside`.
-    pub fn new(inner: B, outside: Option<UnmodelledEffect>) -> Self {
-        let measured = inner.states().clone();
-        Self { inner, outside, measured, time: 0.0 }
+    pub fn new(inner: S, outside: Option<UnmodelledEffect>) -> Self {
+        let states = inner.states().clone();
+        Self { inner, outside, states, time: 0.0 }
     }
 
     fn update_measured(&mut self, unmeasured: [f32; 12]) {
-        self.measured = self.inner.states().clone();
-        for (torque, unmeasured) in self.measured.tau[0].iter_mut().zip(unmeasured) {
+        self.states = self.inner.states().clone();
+        for (torque, unmeasured) in self.states.measured.tau[0].iter_mut().zip(unmeasured) {
             *torque -= unmeasured;
         }
         if let Some(UnmodelledEffect::EncoderDrift { joint, rate }) = self.outside {
-            self.measured.q[0][joint] += (rate * self.time) as f32;
+            self.states.measured.q[0][joint] += (rate * self.time) as f32;
         }
     }
 }
 
-impl<B: Backend> Backend for PerturbedBackend<B> {
-    type Snapshot = (B::Snapshot, RobotStates, f64);
-
+impl<S: Simulator> Backend for PerturbedBackend<S> {
     fn robot(&self) -> &RobotModel {
         self.inner.robot()
     }
 
-    fn states(&self) -> &RobotStates {
-        &self.measured
+    fn measured(&self) -> &Measured {
+        &self.states.measured
+    }
+
+    fn ground_truth(&self) -> Option<&GroundTruth> {
+        Some(&self.states.truth)
     }
 
     fn ground(&self) -> Ground {
@@ -169,21 +174,33 @@ impl<B: Backend> Backend for PerturbedBackend<B> {
         for _ in 0..actuator_periods {
             let mut command = commands[0];
             let unmeasured =
-                self.outside.map_or([0.0; 12], |outside| outside.apply(&mut command, &self.measured, self.time));
+                self.outside.map_or([0.0; 12], |outside| outside.apply(&mut command, &self.states.measured, self.time));
             self.inner.step(&[command], active, 1)?;
             self.time += self.inner.robot().control.actuator_dt();
             self.update_measured(unmeasured);
         }
         Ok(())
     }
+}
 
-    fn snapshot(&self, robot: usize) -> Self::Snapshot {
-        (self.inner.snapshot(robot), self.measured.clone(), self.time)
+impl<S: Simulator> Simulator for PerturbedBackend<S> {
+    type Snapshot = (S::Snapshot, RobotStates, f64);
+
+    fn states(&self) -> &RobotStates {
+        &self.states
     }
 
-    fn restore(&mut self, robot: usize, (inner, measured, time): &Self::Snapshot) {
+    fn set_derating(&mut self, robot: usize, factors: &PerJoint) {
+        self.inner.set_derating(robot, factors);
+    }
+
+    fn snapshot(&self, robot: usize) -> Self::Snapshot {
+        (self.inner.snapshot(robot), self.states.clone(), self.time)
+    }
+
+    fn restore(&mut self, robot: usize, (inner, states, time): &Self::Snapshot) {
         self.inner.restore(robot, inner);
-        (self.measured, self.time) = (measured.clone(), *time);
+        (self.states, self.time) = (states.clone(), *time);
     }
 }
 
@@ -207,7 +224,7 @@ mod tests {
 
     #[test]
     fn one_way_friction_acts_in_the_positive_direction_only() {
-        let mut measured = RobotStates::new(1);
+        let mut measured = RobotStates::new(1).measured;
         let law = UnmodelledEffect::OneWayFriction { joint: 0, torque: 1.0 };
         for (speed, expected) in [(2.0, -1.0), (0.05, -0.5), (0.0, 0.0), (-2.0, 0.0)] {
             measured.dq[0][0] = speed;

@@ -4,7 +4,7 @@ use glam::DQuat;
 use rayon::prelude::*;
 use twinstep_logs::{Log, TorqueSensor};
 use twinstep_model::{
-    BaseMount, Command, Joint, NUM_JOINTS, Precision, RobotModel, RobotStates, Rollout, RolloutRequest,
+    BaseMount, Joint, NUM_JOINTS, PerJoint, Precision, RobotModel, RobotStates, Rollout, RolloutRequest,
 };
 
 use crate::window::{Window, WindowConfig, orientation, windows};
@@ -301,34 +301,40 @@ impl Experiment {
         candidates: &[RobotModel],
         precision: Precision,
     ) -> Vec<RobotStates> {
-        let derated: Vec<_> = candidates.iter().map(|robot| self.derated_commands(robot)).collect();
+        let derating: Vec<_> = candidates.iter().map(|robot| self.derating(robot)).collect();
         let mut jobs = Vec::new();
-        for (robot, derated) in candidates.iter().zip(&derated) {
+        for (robot, derating) in candidates.iter().zip(&derating) {
             for (index, window) in self.windows.iter().enumerate() {
                 // The measured initial state contains the gyroscope bias.
                 let mut start = window.start;
                 for (rate, bias) in start.base_angular_velocity.iter_mut().zip(robot.gyro_bias.to_array()) {
                     *rate -= bias as f32;
                 }
-                let commands = derated.get(index).unwrap_or(&window.commands);
-                jobs.push(RolloutRequest { robot, base: window.base, start, history: &window.history, commands });
+                jobs.push(RolloutRequest {
+                    robot,
+                    base: window.base,
+                    start,
+                    history: &window.history,
+                    commands: &window.commands,
+                    derating: derating.get(index).map_or(&[], Vec::as_slice),
+                });
             }
         }
         simulator.run(&jobs, precision)
     }
 
-    /// Returns the commands of the windows with derating factors; empty if the log has neither voltage nor temperature.
-    fn derated_commands(&self, robot: &RobotModel) -> Vec<Vec<Command>> {
+    /// Returns the derating factors of the windows by actuator period; empty if the log has neither voltage nor
+    /// temperature.
+    fn derating(&self, robot: &RobotModel) -> Vec<Vec<PerJoint>> {
         if self.conditions.is_empty() {
             return Vec::new();
         }
         let of = |window: &Window| {
-            let mut commands = window.commands.clone();
+            let mut factors = vec![[1.0; NUM_JOINTS]; window.commands.len()];
             for (pair, row) in window.period.windows(2).zip(window.rows.clone()) {
-                let derating_factors = self.conditions.derating_factors(&robot.derating, row);
-                commands[pair[0]..pair[1]].iter_mut().for_each(|command| command.derating_factor = derating_factors);
+                factors[pair[0]..pair[1]].fill(self.conditions.derating_factors(&robot.derating, row));
             }
-            commands
+            factors
         };
         self.windows.iter().map(of).collect()
     }
@@ -354,21 +360,21 @@ impl Experiment {
         for (index, row) in channel.rows(window) {
             let period = window.period[index];
             let simulated = match channel.quantity {
-                ResidualChannel::Position(joint) => f64::from(states.q[period][joint]),
-                ResidualChannel::Velocity(joint) => f64::from(states.dq[period][joint]),
+                ResidualChannel::Position(joint) => f64::from(states.measured.q[period][joint]),
+                ResidualChannel::Velocity(joint) => f64::from(states.measured.dq[period][joint]),
                 ResidualChannel::Torque(joint) => {
                     let until = window.period.get(index + 1).copied().unwrap_or(period + 1);
                     estimated_torque(states, robot, joint, period, until)
                 }
-                ResidualChannel::BasePosition(axis) => f64::from(states.base_position[period][axis]),
+                ResidualChannel::BasePosition(axis) => f64::from(states.truth.base_position[period][axis]),
                 ResidualChannel::BaseOrientation(axis) => {
-                    let [w, x, y, z] = states.base_orientation[period].map(f64::from);
+                    let [w, x, y, z] = states.measured.orientation[period].map(f64::from);
                     let rotation = self.orientations[row].inverse() * DQuat::from_xyzw(x, y, z, w);
                     let rotation = if rotation.w < 0.0 { -rotation } else { rotation };
                     rotation.to_scaled_axis()[axis]
                 }
-                ResidualChannel::BaseVelocity(axis) => f64::from(states.base_linear_velocity[period][axis]),
-                ResidualChannel::BaseRate(axis) => f64::from(states.base_angular_velocity[period][axis]),
+                ResidualChannel::BaseVelocity(axis) => f64::from(states.truth.base_linear_velocity[period][axis]),
+                ResidualChannel::BaseRate(axis) => f64::from(states.measured.gyro[period][axis]),
             };
             each(row, simulated - channel.measured[row]);
         }
@@ -379,8 +385,12 @@ impl Experiment {
 pub fn estimated_torque(states: &RobotStates, robot: &RobotModel, joint: usize, from: usize, until: usize) -> f64 {
     let delay = robot.joints[joint].actuator.sensor_delay / robot.control.actuator_dt();
     // Entry p + 1 has the torque of period p.
-    let last = states.tau.len() - 1;
-    delayed_mean(|period| f64::from(states.tau[(period + 1).min(last)][joint]), from..until.max(from + 1), delay)
+    let last = states.measured.tau.len() - 1;
+    delayed_mean(
+        |period| f64::from(states.measured.tau[(period + 1).min(last)][joint]),
+        from..until.max(from + 1),
+        delay,
+    )
 }
 
 fn channels(log: &Log, joints: &[Joint]) -> Vec<Channel> {

@@ -105,9 +105,8 @@ impl ActuatorReplay<'_> {
         // Torque at the sensor in each actuator period since the start of the range [N·m].
         let mut history: Vec<[f64; NUM_JOINTS]> = Vec::new();
         for row in rows.start..rows.end - 1 {
-            let mut command = command(robot, &self.joints, row);
-            command.derating_factor = conditions.derating_factors(&robot.derating, row);
-            let commands = SimdCommands::new(&[command]);
+            let commands = SimdCommands::new(&[command(robot, &self.joints, row)]);
+            actuator.set_derating(0, &conditions.derating_factors(&robot.derating, row));
             let (q, dq) = self.sampled(row);
             let middle = self.middle(row);
             let required = inverse_dynamics(&tree, &middle.0, &middle.1, GRAVITY).1;

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use twinstep_logs::{Gain, Log, LogError, Meta, Segment, TorqueSensor};
 use twinstep_model::{
-    Backend, BaseMount, FIXED_BASE_HEIGHT, Ground, InitialState, JOINT_NAMES, Joint, Leg, RobotModel, RobotStates,
+    BaseMount, FIXED_BASE_HEIGHT, Ground, InitialState, JOINT_NAMES, Joint, Leg, RobotModel, RobotStates, Simulator,
 };
 
 use twinstep_logs::operating_conditions::OperatingConditions;
@@ -36,11 +36,11 @@ pub enum RecordError {
 ///
 /// `backend` makes a backend of one robot for a base mount and the robot at the rate of the motion. `base` overrides
 /// the mount of the segments. `progress` receives the number of completed rows and returns false to interrupt.
-pub fn record<B: Backend>(
+pub fn record<S: Simulator>(
     motion: &Log,
     robot: &RobotModel,
     base: Option<BaseMount>,
-    mut backend: impl FnMut(BaseMount, &RobotModel) -> Result<B, RecordError>,
+    mut backend: impl FnMut(BaseMount, &RobotModel) -> Result<S, RecordError>,
     source: String,
     progress: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Log, RecordError> {
@@ -94,14 +94,14 @@ fn sensor_names() -> Vec<String> {
 
 /// Returns the sensor values of one row. Foot forces are not known before the first step.
 fn sensors(states: &RobotStates, stepped: bool) -> Vec<f64> {
-    let foot_force = if stepped { states.foot_force[0] } else { [f32::NAN; 4] };
+    let foot_force = if stepped { states.truth.foot_force[0] } else { [f32::NAN; 4] };
     let channels: [&[f32]; 7] = [
-        &states.q[0],
-        &states.dq[0],
-        &states.base_position[0],
-        &states.base_orientation[0],
-        &states.base_linear_velocity[0],
-        &states.base_angular_velocity[0],
+        &states.measured.q[0],
+        &states.measured.dq[0],
+        &states.truth.base_position[0],
+        &states.measured.orientation[0],
+        &states.truth.base_linear_velocity[0],
+        &states.measured.gyro[0],
         &foot_force,
     ];
     channels.into_iter().flatten().copied().map(f64::from).collect()
@@ -118,9 +118,9 @@ struct CommandPlayer<'a> {
 
 impl CommandPlayer<'_> {
     /// Simulates a contiguous range of rows.
-    fn simulate<B: Backend>(
+    fn simulate<S: Simulator>(
         &self,
-        mut backend: B,
+        mut backend: S,
         segment: &str,
         base: BaseMount,
         rows: Range<usize>,
@@ -137,11 +137,11 @@ impl CommandPlayer<'_> {
             record.sensors.push(sensors(backend.states(), row > rows.start));
             let mut sums = [0.0; JOINT_NAMES.len()];
             let periods = if row + 1 < rows.end { self.clock.periods_between(t, row - rows.start) } else { 0 };
-            let mut command = command(self.robot, &self.joints, row);
-            command.derating_factor = self.conditions.derating_factors(&self.robot.derating, row);
+            let command = command(self.robot, &self.joints, row);
+            backend.set_derating(0, &self.conditions.derating_factors(&self.robot.derating, row));
             for _ in 0..periods {
                 backend.step(&[command], &[true], 1).map_err(failed(row))?;
-                for (sum, torque) in sums.iter_mut().zip(backend.states().tau[0]) {
+                for (sum, torque) in sums.iter_mut().zip(backend.measured().tau[0]) {
                     *sum += f64::from(torque);
                 }
             }

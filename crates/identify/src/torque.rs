@@ -132,8 +132,8 @@ impl MeasuredTorque {
                 actuator.set(0, robot, &at(0.0)[0].map(|q| q as f32), &[0.0; NUM_JOINTS]);
                 torques.clear();
             }
-            let derating_factor = self.conditions.derating_factors(&robot.derating, row.row);
-            let commands = SimdCommands::new(&[Command { derating_factor, ..row.command }]);
+            actuator.set_derating(0, &self.conditions.derating_factors(&robot.derating, row.row));
+            let commands = SimdCommands::new(&[row.command]);
             let steps = row.periods * self.substeps;
             for step in 0..steps {
                 let [q, dq] = at(step as f64 * dt);

@@ -3,44 +3,65 @@
 use std::any::Any;
 use std::sync::Arc;
 
-use crate::{Command, Ground, InitialState, PerJoint, RobotModel, RobotStates};
+use crate::{Command, Ground, GroundTruth, InitialState, Measured, PerJoint, RobotModel, RobotStates};
 
 /// Batch of robots that are commanded and observed together: a simulator, a replayed log or the real robot.
 pub trait Backend: Send {
-    /// Full state of one robot. After [`Backend::restore`] the robot continues bit for bit as from the snapshot.
-    type Snapshot: Clone + Send;
-
     /// Returns the number of robots.
     fn num_robots(&self) -> usize {
-        self.states().q.len()
+        self.measured().q.len()
     }
 
     /// Returns the nominal robot.
     fn robot(&self) -> &RobotModel;
 
-    /// Returns the states after the last [`Backend::reset`] or [`Backend::step`].
-    fn states(&self) -> &RobotStates;
+    /// Returns the sensor readings after the last [`Backend::reset`] or [`Backend::step`].
+    fn measured(&self) -> &Measured;
 
-    /// Returns the ground under the robots.
+    /// Returns what the sensors do not measure. `None` on a real robot.
+    fn ground_truth(&self) -> Option<&GroundTruth> {
+        None
+    }
+
+    /// Returns the ground under the robots; flat if it is not known.
     fn ground(&self) -> Ground {
         Ground::FLAT
     }
 
     /// Resets robots to initial states, with the nominal model. Each pair is a robot's index and its initial state.
+    ///
+    /// A real robot moves to the joint positions, and its base stays where it is.
     fn reset(&mut self, initial_states: &[(usize, InitialState)]) -> Result<(), BackendError>;
 
     /// Resets one robot to an initial state, with the parameters of `model` until its next reset.
+    ///
+    /// Fails with [`BackendError::FixedParameters`] on a real robot.
     fn reset_with_model(
         &mut self,
         robot: usize,
-        model: &RobotModel,
-        initial_state: &InitialState,
-    ) -> Result<(), BackendError>;
+        _model: &RobotModel,
+        _initial_state: &InitialState,
+    ) -> Result<(), BackendError> {
+        Err(BackendError::FixedParameters { robot })
+    }
 
     /// Advances every `active` robot by `actuator_periods` actuator periods under its command.
     ///
     /// `commands` and `active` have one entry per robot. Inactive robots do not change.
     fn step(&mut self, commands: &[Command], active: &[bool], actuator_periods: usize) -> Result<(), BackendError>;
+}
+
+/// Backend whose robots are simulated.
+pub trait Simulator: Backend {
+    /// Full state of one robot. After [`Simulator::restore`] the robot continues bit for bit as from the snapshot.
+    type Snapshot: Clone + Send;
+
+    /// Returns the states after the last [`Backend::reset`] or [`Backend::step`].
+    fn states(&self) -> &RobotStates;
+
+    /// Sets the factors on the torque of each joint of `robot`, for supply voltage and motor temperature, until its
+    /// next reset.
+    fn set_derating(&mut self, robot: usize, factors: &PerJoint);
 
     /// Returns the full state of `robot`.
     fn snapshot(&self, robot: usize) -> Self::Snapshot;
@@ -60,7 +81,7 @@ pub trait Actuator: Send {
         &mut self,
         commands: &[Command],
         active: &[bool],
-        states: &RobotStates,
+        measured: &Measured,
         tau: &mut [PerJoint],
     ) -> Result<(), BackendError>;
 
@@ -130,6 +151,36 @@ pub enum BackendError {
         robot: usize,
         /// What is not supported.
         reason: String,
+    },
+    /// The physical parameters of a real robot cannot be changed.
+    #[error("robot {robot} is not simulated, so its parameters cannot be randomised")]
+    FixedParameters {
+        /// The robot.
+        robot: usize,
+    },
+    /// No message of the robot arrived in time. No command is executed until it answers again.
+    #[error("the link to robot {robot} is lost: its last message is {silent_ms} ms old")]
+    LostLink {
+        /// The robot.
+        robot: usize,
+        /// Age of its last message [ms].
+        silent_ms: u32,
+    },
+    /// The robot reports a fault, or a safety check stopped it.
+    #[error("robot {robot} has stopped: {reason}")]
+    Fault {
+        /// The robot.
+        robot: usize,
+        /// What the robot or the check reported.
+        reason: String,
+    },
+    /// The command arrived after the policy period for which it was computed. It was not executed.
+    #[error("the command of robot {robot} was {late_ms} ms late and was not executed")]
+    MissedDeadline {
+        /// The robot.
+        robot: usize,
+        /// Delay behind the deadline [ms].
+        late_ms: u32,
     },
     /// The simulation of some robots diverged to values that are not finite. The other robots were stepped.
     #[error("the simulation of robot {robot} diverged: `{quantity}` is not finite ({more} more robots); reset it")]

@@ -19,29 +19,33 @@
 mod backend;
 mod base_mount;
 mod body;
+mod command;
 pub mod dynamics;
 pub mod frames;
 mod go2;
 mod ground;
 mod height_field;
+mod initial_state;
 mod joint;
 mod kinematics;
 mod log_cholesky;
 mod mjcf;
 mod robot;
+mod robot_states;
 mod rollout;
 mod scene;
 mod spec;
-mod state;
 mod stream;
 mod vec_env;
 
-pub use backend::{Actuator, ActuatorSnapshot, Backend, BackendError, EpistemicUncertainty};
+pub use backend::{Actuator, ActuatorSnapshot, Backend, BackendError, EpistemicUncertainty, Simulator};
 pub use base_mount::BaseMount;
 pub use body::RigidBody;
+pub use command::Command;
 pub use go2::go2;
 pub use ground::Ground;
 pub use height_field::{HeightField, HeightFieldError};
+pub use initial_state::InitialState;
 pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};
 pub use kinematics::{FIXED_BASE_HEIGHT, NUM_BODIES, Pose, body_poses};
 pub use mjcf::{MjcfActuator, MjcfOptions, mjcf};
@@ -49,9 +53,9 @@ pub use robot::{
     ActuatorParams, Contact, ControlConfig, Derating, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes,
     Stribeck,
 };
+pub use robot_states::{GroundTruth, Measured, RobotStates, RobotStatesMut};
 pub use rollout::{HistoryStep, Precision, Rollout, RolloutRequest};
 pub use scene::{Scene, SceneShape, ShapeKind};
 pub use spec::{EnvSpec, SpecField};
-pub use state::{Command, InitialState, RandomisationSample, RobotStates, RobotStatesMut};
 pub use stream::{Stream, standard_normal, stream};
 pub use vec_env::{AutoresetMode, EndedEpisode, EnvError, ResetRequest, StepBatch, VecEnv};

@@ -16,6 +16,8 @@ pub struct RolloutRequest<'a> {
     pub history: &'a [HistoryStep],
     /// Commands, one per actuator period.
     pub commands: &'a [Command],
+    /// Factors on the torque for supply voltage and motor temperature, one entry per actuator period; empty for 1.
+    pub derating: &'a [PerJoint],
 }
 
 /// Command and measured state of one past actuator period.

@@ -4,7 +4,7 @@ use glam::{DVec3, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
 use crate::kinematics::{Pose, body_poses};
-use crate::{Ground, JOINT_NAMES, Leg, RobotModel, RobotStates, frames};
+use crate::{Ground, JOINT_NAMES, Leg, PerJoint, RobotModel};
 
 /// Scene for rendering. Poses are `[x, y, z, w, x, y, z]`: position [m], then quaternion.
 #[derive(Clone, Debug, PartialEq)]
@@ -48,13 +48,9 @@ pub enum ShapeKind {
 }
 
 impl Scene {
-    /// Returns the scene of robot `index` of `states` on `ground`.
-    pub fn new(robot: &RobotModel, states: &RobotStates, index: usize, ground: &Ground) -> Self {
-        let world_from_base = Pose {
-            position: Vec3::from(states.base_position[index]),
-            rotation: frames::world_from_base(states.base_orientation[index]),
-        };
-        let poses = body_poses(robot, world_from_base, &states.q[index]);
+    /// Returns the scene of a robot with this pose of its base and joint positions `q` [rad], on `ground`.
+    pub fn new(robot: &RobotModel, world_from_base: Pose, q: &PerJoint, ground: &Ground) -> Self {
+        let poses = body_poses(robot, world_from_base, q);
         Self {
             bodies: ["trunk"].iter().chain(&JOINT_NAMES).map(ToString::to_string).collect(),
             pose: poses.map(Pose::to_array).to_vec(),
@@ -118,10 +114,8 @@ mod tests {
 
     fn standing() -> Scene {
         let robot = go2();
-        let mut states = RobotStates::new(1);
-        states.q[0] = robot.control.default_pose_f32();
-        states.base_position[0] = [0.0, 0.0, 0.32];
-        Scene::new(&robot, &states, 0, &Ground::FLAT)
+        let world_from_base = Pose { position: Vec3::new(0.0, 0.0, 0.32), rotation: Quat::IDENTITY };
+        Scene::new(&robot, world_from_base, &robot.control.default_pose_f32(), &Ground::FLAT)
     }
 
     #[test]

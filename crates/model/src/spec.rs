@@ -27,8 +27,11 @@ pub struct EnvSpec {
     pub task: String,
     /// Name of the nominal robot, such as `go2`.
     pub robot: String,
-    /// Parts of the observation, in order.
+    /// Parts of the observation of group `policy`, in order.
     pub observation: Vec<SpecField>,
+    /// Parts of the privileged observation of group `critic`, in order; empty if there is none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub critic_observation: Vec<SpecField>,
     /// Parts of the action, in order.
     pub action: Vec<SpecField>,
     /// Joint names in the order of every per-joint array.
@@ -52,9 +55,14 @@ pub struct EnvSpec {
 }
 
 impl EnvSpec {
-    /// Returns the length of one observation.
+    /// Returns the length of one observation of group `policy`.
     pub fn obs_len(&self) -> usize {
         self.observation.iter().map(|field| field.size).sum()
+    }
+
+    /// Returns the length of one observation of group `critic`; 0 if there is none.
+    pub fn critic_obs_len(&self) -> usize {
+        self.critic_observation.iter().map(|field| field.size).sum()
     }
 
     /// Returns the length of one action.
@@ -74,7 +82,7 @@ impl EnvSpec {
 
     /// Returns the hash of all that an agent and a robot must agree on, as 32 hexadecimal digits.
     ///
-    /// It covers layouts, joint order, policy period, gains, action scale and default pose: [`EnvSpec::hash_input`].
+    /// It covers the layouts of observation and action, joint order, policy period, gains, action scale and default pose: [`EnvSpec::hash_input`].
     pub fn hash(&self) -> String {
         let digest: [u8; 32] = Sha256::digest(self.hash_input()).into();
         let half: [u8; 16] = std::array::from_fn(|index| digest[index]);

@@ -17,8 +17,15 @@ pub trait VecEnv: Send {
     /// Returns when an environment is reset after the end of its episode.
     fn autoreset(&self) -> AutoresetMode;
 
-    /// Resets the selected environments and returns the observations of all environments.
+    /// Resets the selected environments and returns the observations of all environments, group `policy`.
     fn reset(&mut self, request: &ResetRequest) -> Result<&[f32], EnvError>;
+
+    /// Returns the observations of group `critic` after the last reset or step, `num_envs × critic_obs_len`.
+    ///
+    /// Empty if the spec has no such group.
+    fn critic_obs(&self) -> &[f32] {
+        &[]
+    }
 
     /// Advances every environment by one policy period.
     ///
@@ -83,8 +90,10 @@ impl ResetRequest {
 /// Result of one step of all environments.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StepBatch {
-    /// Observations, `num_envs × obs_len`.
+    /// Observations of group `policy`, `num_envs × obs_len`.
     pub obs: Vec<f32>,
+    /// Observations of group `critic`, `num_envs × critic_obs_len`.
+    pub critic_obs: Vec<f32>,
     /// Rewards, one per environment.
     pub reward: Vec<f32>,
     /// True if the task ended the episode, per environment.
@@ -97,9 +106,10 @@ pub struct StepBatch {
 
 impl StepBatch {
     /// Returns a batch of zeros for `num_envs` environments.
-    pub fn new(num_envs: usize, obs_len: usize) -> Self {
+    pub fn new(num_envs: usize, spec: &EnvSpec) -> Self {
         Self {
-            obs: vec![0.0; num_envs * obs_len],
+            obs: vec![0.0; num_envs * spec.obs_len()],
+            critic_obs: vec![0.0; num_envs * spec.critic_obs_len()],
             reward: vec![0.0; num_envs],
             terminated: vec![false; num_envs],
             truncated: vec![false; num_envs],
@@ -126,6 +136,8 @@ pub struct EndedEpisode {
     pub terms: Vec<f32>,
     /// Last observation of the episode with [`AutoresetMode::SameStep`]. Empty in the other modes: `obs` contains it.
     pub final_obs: Vec<f32>,
+    /// The same of group `critic`.
+    pub final_critic_obs: Vec<f32>,
 }
 
 /// Error of a batch of environments.

@@ -2,7 +2,8 @@
 
 use rayon::prelude::*;
 use twinstep_model::{
-    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, InitialState, PerJoint, RobotModel, RobotStates,
+    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, GroundTruth, InitialState, Measured, PerJoint,
+    RobotModel, RobotStates, Simulator,
 };
 
 use crate::ground_shapes::GroundShapes;
@@ -104,28 +105,30 @@ impl RapierBackend {
             actuator.reset(robot, initial_state.actuator_seed);
         }
         self.read_state(robot);
-        self.states.tau[robot] = PerJoint::default();
-        self.states.epistemic_uncertainty[robot] = 0.0;
+        self.states.measured.stamp[robot] = 0.0;
+        self.states.measured.tau[robot] = PerJoint::default();
+        self.states.truth.epistemic_uncertainty[robot] = 0.0;
     }
 
     fn read_state(&mut self, robot: usize) {
-        let (world, states) = (&self.worlds[robot], &mut self.states);
-        world.read_joints(&mut states.q[robot], &mut states.dq[robot]);
+        let (world, RobotStates { measured, truth }) = (&self.worlds[robot], &mut self.states);
+        world.read_joints(&mut measured.q[robot], &mut measured.dq[robot]);
         let base = world.read_base();
-        states.base_position[robot] = base.position;
-        states.base_orientation[robot] = base.orientation;
-        states.base_linear_velocity[robot] = base.linear_velocity;
-        states.base_angular_velocity[robot] = base.angular_velocity;
-        states.foot_force[robot] = world.foot_forces();
-        states.body_contact[robot] = world.body_contact();
+        measured.orientation[robot] = base.orientation;
+        measured.gyro[robot] = base.gyro;
+        truth.base_position[robot] = base.position;
+        truth.base_linear_velocity[robot] = base.linear_velocity;
+        truth.base_angular_velocity[robot] = base.angular_velocity;
+        truth.foot_force[robot] = world.foot_forces();
+        truth.body_contact[robot] = world.body_contact();
     }
 
     /// Advances all active robots by one actuator period.
     fn actuator_period(&mut self, commands: &[Command], active: &[bool], steps: usize) -> Result<(), BackendError> {
         let external = match &mut self.actuator {
             Some(actuator) => {
-                let mut tau = self.states.tau.clone();
-                self.pool.install(|| actuator.torques(commands, active, &self.states, &mut tau))?;
+                let mut tau = self.states.measured.tau.clone();
+                self.pool.install(|| actuator.torques(commands, active, &self.states.measured, &mut tau))?;
                 Some(tau)
             }
             None => None,
@@ -134,8 +137,8 @@ impl RapierBackend {
             Some(tau) => ActuatorInputRef::Torques(&tau[robot]),
             None => ActuatorInputRef::Command(&commands[robot]),
         };
-        let states = &mut self.states;
-        let robots = (&mut self.worlds, &mut states.tau, &mut states.q, &mut states.dq, active);
+        let measured = &mut self.states.measured;
+        let robots = (&mut self.worlds, &mut measured.tau, &mut measured.q, &mut measured.dq, active);
         self.pool.install(|| {
             let robots = robots.into_par_iter().enumerate().filter(|(_, (.., active))| **active);
             robots.for_each(|(robot, (world, tau, q, dq, _))| {
@@ -157,14 +160,16 @@ impl RapierBackend {
 }
 
 impl Backend for RapierBackend {
-    type Snapshot = RobotSnapshot;
-
     fn robot(&self) -> &RobotModel {
         &self.robot
     }
 
-    fn states(&self) -> &RobotStates {
-        &self.states
+    fn measured(&self) -> &Measured {
+        &self.states.measured
+    }
+
+    fn ground_truth(&self) -> Option<&GroundTruth> {
+        Some(&self.states.truth)
     }
 
     fn ground(&self) -> Ground {
@@ -201,12 +206,26 @@ impl Backend for RapierBackend {
             self.actuator_period(commands, active, steps)?;
         }
         if let Some(evaluator) = self.actuator.as_mut().and_then(|actuator| actuator.uncertainty()) {
-            self.pool.install(|| evaluator.evaluate(active, &mut self.states.epistemic_uncertainty));
+            self.pool.install(|| evaluator.evaluate(active, &mut self.states.truth.epistemic_uncertainty));
         }
+        let elapsed = actuator_periods as f64 * self.robot.control.actuator_dt();
         for robot in (0..robots).filter(|robot| active[*robot]) {
             self.read_state(robot);
+            self.states.measured.stamp[robot] += elapsed;
         }
         self.first_diverged(active).map_or(Ok(()), Err)
+    }
+}
+
+impl Simulator for RapierBackend {
+    type Snapshot = RobotSnapshot;
+
+    fn states(&self) -> &RobotStates {
+        &self.states
+    }
+
+    fn set_derating(&mut self, robot: usize, factors: &PerJoint) {
+        self.worlds[robot].set_derating(factors);
     }
 
     fn snapshot(&self, robot: usize) -> RobotSnapshot {

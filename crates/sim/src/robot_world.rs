@@ -93,20 +93,19 @@ impl RobotWorld {
     pub fn new(robot: &RobotModel, config: &SimConfig, ground: &GroundShapes, initial_state: &InitialState) -> Self {
         let mut world = PhysicsWorld { gravity: Vec3::new(0.0, 0.0, -9.81), ..PhysicsWorld::default() };
         world.integration_parameters = integration_parameters(robot, config);
-        let friction = robot.contact.friction as f32 * initial_state.randomisation.friction_scale;
+        let friction = robot.contact.friction as f32;
         insert_ground(&mut world, ground, friction);
 
-        let (trunk_body, leg_scale) = randomised_bodies(robot, initial_state);
-        let trunk_com = trunk_body.com.as_vec3();
-        let trunk = insert_trunk(&mut world, config.base, &trunk_body, initial_state);
+        let trunk_com = robot.trunk.com.as_vec3();
+        let trunk = insert_trunk(&mut world, config.base, &robot.trunk, initial_state);
         let mut upper_body = vec![insert_shape(&mut world, trunk, trunk_box(robot).translation(-trunk_com), friction)];
         let mut feet = Vec::with_capacity(4);
         let mut multibody = None;
         for leg in Leg::ALL {
-            let mut parent = (trunk, -trunk_body.com);
+            let mut parent = (trunk, -robot.trunk.com);
             for kind in JointKind::ALL {
                 let joint = Joint { leg, kind };
-                let body = robot.legs[leg as usize].bodies[kind as usize].scaled(leg_scale);
+                let body = robot.legs[leg as usize].bodies[kind as usize];
                 let child = world.insert_body(moving_body(RigidBodyBuilder::dynamic(), &body, body.com));
                 let origin = robot.legs[leg as usize].origins[kind as usize] + parent.1;
                 multibody = world.insert_multibody_joint(parent.0, child, revolute(robot, joint, origin));
@@ -167,6 +166,11 @@ impl RobotWorld {
         multibody.generalized_velocity_mut().as_mut_slice().copy_from_slice(&velocity);
         multibody.forward_kinematics(&self.world.bodies, false);
         multibody.update_rigid_bodies(&mut self.world.bodies, true);
+    }
+
+    /// Sets the factors on the torque for supply voltage and motor temperature.
+    pub fn set_derating(&mut self, factors: &PerJoint) {
+        self.actuator.set_derating(0, factors);
     }
 
     /// Advances by one actuator period of `steps` physics steps and returns the mean estimated torque [N·m].
@@ -236,7 +240,8 @@ impl RobotWorld {
             position: (trunk.translation() - offset_world).to_array(),
             orientation: frames::to_wxyz(rotation),
             linear_velocity: (linear_com - angular_world.cross(offset_world)).to_array(),
-            angular_velocity: (rotation.inverse() * angular_world + self.gyro_bias).to_array(),
+            angular_velocity: (rotation.inverse() * angular_world).to_array(),
+            gyro: (rotation.inverse() * angular_world + self.gyro_bias).to_array(),
         }
     }
 
@@ -317,6 +322,8 @@ pub struct BaseState {
     pub linear_velocity: [f32; 3],
     /// Angular velocity in the base frame [rad/s].
     pub angular_velocity: [f32; 3],
+    /// Reading of the gyroscope: angular velocity with bias, in the base frame [rad/s].
+    pub gyro: [f32; 3],
 }
 
 fn integration_parameters(robot: &RobotModel, config: &SimConfig) -> IntegrationParameters {
@@ -345,15 +352,6 @@ fn insert_ground(world: &mut PhysicsWorld, ground: &GroundShapes, friction: f32)
     for collider in ground.colliders() {
         world.insert_collider(collider.friction(friction).collision_groups(GROUND_GROUP), None);
     }
-}
-
-/// Returns the trunk with payload and shifted centre of mass, and the mass factor of the leg bodies.
-fn randomised_bodies(robot: &RobotModel, initial_state: &InitialState) -> (RigidBody, f64) {
-    let randomisation = &initial_state.randomisation;
-    let scale = f64::from(randomisation.mass_scale);
-    let trunk = robot.trunk.scaled(scale).with_point_mass(f64::from(randomisation.payload), robot.trunk.com);
-    let shift = DVec3::from(randomisation.com_shift.map(f64::from));
-    (RigidBody { com: trunk.com + shift, ..trunk }, scale)
 }
 
 fn insert_trunk(

@@ -51,7 +51,7 @@ impl BatchRollout {
         }
         let steps = config.steps_per_actuator_period(&robot.control);
         robots.remember(&jobs.iter().map(|job| job.history).collect::<Vec<_>>(), steps);
-        robots.play(&jobs.iter().map(|job| job.commands).collect::<Vec<_>>(), steps, &mut records);
+        robots.play(jobs, steps, &mut records);
         records
     }
 }

@@ -66,12 +66,12 @@ proptest! {
     #[test]
     fn requests_for_a_lease_round_trip(
         protocol: u16, client: String, num_envs: u64, autoreset in any_autoreset(), max_episode_steps: Option<u32>,
-        spec_hash: Option<String>, reclaim: Option<(String, u64)>,
+        critic: bool, spec_hash: Option<String>, reclaim: Option<(String, u64)>,
     ) {
         round_trips(&HelloRequest { protocol, client: client.clone() }, &mut Vec::new());
         let reclaim = reclaim.map(|(lease, epoch)| Reclaim { lease, epoch });
         let request =
-            LeaseRequest { protocol, client, num_envs, autoreset, max_episode_steps, spec_hash, reclaim };
+            LeaseRequest { protocol, client, num_envs, autoreset, max_episode_steps, critic, spec_hash, reclaim };
         round_trips(&request, &mut Vec::new());
     }
 
@@ -98,7 +98,7 @@ proptest! {
     ) {
         let (seeds, mask) = (seeds.as_deref(), mask.as_deref());
         round_trips(&ResetRequest { protocol, epoch, seq, seeds, mask }, &mut Vec::new());
-        round_trips(&ResetReply { protocol, seq, obs: &bytes }, &mut Vec::new());
+        round_trips(&ResetReply { protocol, seq, obs: &bytes, critic_obs: &bytes }, &mut Vec::new());
         round_trips(&StepRequest { protocol, epoch, seq, actions: &bytes }, &mut Vec::new());
         round_trips(&CloseRequest { protocol, epoch, seq }, &mut Vec::new());
         round_trips(&CloseReply { protocol, seq }, &mut Vec::new());
@@ -115,8 +115,9 @@ proptest! {
     fn steps_round_trip_with_their_ended_episodes(
         rows in prop::collection::vec((-1e9f32..1e9, any::<bool>(), any::<bool>(), any::<u32>()), 1..6), seq: u64,
     ) {
-        let spec = golden::small_spec();
-        let mut batch = StepBatch::new(rows.len(), spec.obs_len());
+        let mut spec = golden::small_spec();
+        spec.critic_observation = spec.action.clone();
+        let mut batch = StepBatch::new(rows.len(), &spec);
         for (env, (reward, terminated, truncated, length)) in rows.iter().copied().enumerate() {
             batch.reward[env] = reward;
             batch.terminated[env] = terminated;
@@ -125,10 +126,13 @@ proptest! {
             if batch.done(env) {
                 let terms = vec![reward, -reward];
                 let final_obs = vec![reward; spec.obs_len()];
-                batch.ended.push(EndedEpisode { env, length, episode_return: reward, terms, final_obs });
+                let final_critic_obs = vec![-reward; spec.critic_obs_len()];
+                let ended = EndedEpisode { env, length, episode_return: reward, terms, final_obs, final_critic_obs };
+                batch.ended.push(ended);
             }
         }
-        let bytes = convert::encode_step(&batch, seq);
+        batch.critic_obs.fill(0.5);
+        let bytes = convert::encode_step(&batch, seq, true);
         let reply: StepReply<'_> = decode(&bytes).expect("what was encoded decodes");
         let mut read = StepBatch::default();
         convert::decode_step(&reply, &spec, rows.len(), &mut read).expect("the lengths fit");

@@ -17,19 +17,22 @@ use twinstep_protocol::tensor::as_bytes;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, decode, encode};
 
 /// Name of every golden file, without `.msgpack`.
-pub const NAMES: [&str; 18] = [
+pub const NAMES: [&str; 21] = [
     "hello_request",
     "hello_reply",
     "lease_request",
     "lease_request_reclaim",
+    "lease_request_critic",
     "lease_reply",
     "lease_reply_reclaimed",
     "reset_request",
     "reset_request_seeds_mask",
     "reset_reply",
+    "reset_reply_critic",
     "step_request",
     "step_reply",
     "step_reply_ended",
+    "step_reply_critic",
     "close_request",
     "close_reply",
     "render_request",
@@ -92,6 +95,7 @@ pub fn small_spec() -> EnvSpec {
             field("gravity", 3, "", 1.0, "unit vector of gravity in the base frame"),
             field("joint_position", 2, "rad", 6.25, "q - q_default"),
         ],
+        critic_observation: Vec::new(),
         action: vec![field("joint_position_offset", 2, "action_scale", 1.0, "offset from q_default")],
         joint_order: vec!["FL_hip".to_owned(), "FL_thigh".to_owned()],
         policy_dt: 0.02,
@@ -132,10 +136,12 @@ fn lease_has_its_golden_bytes() {
         num_envs: 2,
         autoreset: AutoresetMode::SameStep,
         max_episode_steps: None,
+        critic: false,
         spec_hash: None,
         reclaim: None,
     };
     check("lease_request", &request);
+    check("lease_request_critic", &LeaseRequest { critic: true, ..request.clone() });
     let reclaim = LeaseRequest {
         autoreset: AutoresetMode::NextStep,
         max_episode_steps: Some(500),
@@ -164,7 +170,9 @@ fn reset_has_its_golden_bytes() {
     let seeds = [7u64, u64::MAX];
     check("reset_request_seeds_mask", &ResetRequest { seeds: Some(as_bytes(&seeds)), mask: Some(&[0, 1]), ..request });
     let obs = [0.0f32, 0.0, -1.0, 0.125, -0.25, 0.5, 0.5, -0.5, 1.5, -2.5];
-    check("reset_reply", &ResetReply { protocol: PROTOCOL, seq: 1, obs: as_bytes(&obs) });
+    let reply = ResetReply { protocol: PROTOCOL, seq: 1, obs: as_bytes(&obs), critic_obs: &[] };
+    check("reset_reply", &reply);
+    check("reset_reply_critic", &ResetReply { critic_obs: as_bytes(&[0.5f32, -0.25, 1.5, 2.5]), ..reply });
 }
 
 #[test]
@@ -184,6 +192,8 @@ fn step_has_its_golden_bytes() {
         ended_return: &[],
         ended_terms: &[],
         final_obs: &[],
+        critic_obs: &[],
+        final_critic_obs: &[],
     };
     check("step_reply", &running);
     let ended = StepReply {
@@ -197,6 +207,10 @@ fn step_has_its_golden_bytes() {
         ..running
     };
     check("step_reply_ended", &ended);
+    let (critic_obs, final_critic_obs) = ([0.5f32, -0.25, 1.5, 2.5], [0.75f32, -1.0]);
+    let critic =
+        StepReply { critic_obs: as_bytes(&critic_obs), final_critic_obs: as_bytes(&final_critic_obs), ..ended };
+    check("step_reply_critic", &critic);
 }
 
 #[test]

@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use clap::{Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_client::{ConnectOptions, Connection};
-use twinstep_envs::OBS_LEN;
-use twinstep_model::{AutoresetMode, StepBatch};
+use twinstep_envs::base_spec;
+use twinstep_model::{AutoresetMode, StepBatch, go2};
 use twinstep_protocol::keys::{self, EnvMethod};
 use twinstep_protocol::{PROTOCOL, convert, decode, encode, message, tensor};
 use twinstep_tests::process::Process;
@@ -186,6 +186,7 @@ fn query_twinstep(round_trips: usize, folder: &SecurityFolder, endpoint: &str, e
         num_envs: envs as u64,
         autoreset: AutoresetMode::NextStep,
         max_episode_steps: None,
+        critic: false,
         spec_hash: None,
         reclaim: None,
     };
@@ -269,7 +270,8 @@ fn echo(config: &std::path::Path, listen: &str, envs: usize, express: bool) -> R
     zenoh.insert_json5("listen/endpoints", &format!("[\"{listen}\"]"))?;
     let session: Session = twinstep_session::open(zenoh)?;
     let queries = session.declare_queryable(ECHO_KEY).complete(true).wait()?;
-    let reply = ZBytes::from(convert::encode_step(&StepBatch::new(envs, OBS_LEN), 1));
+    let spec = base_spec("walk", &go2(), Vec::new(), 20.0);
+    let reply = ZBytes::from(convert::encode_step(&StepBatch::new(envs, &spec), 1, false));
     let endpoint = session.info().locators().wait().first().map(ToString::to_string).unwrap_or_default();
     println!("listening {endpoint}");
     std::io::stdout().flush()?;

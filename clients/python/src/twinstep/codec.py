@@ -82,6 +82,7 @@ class Spec:
     task: str
     robot: str
     observation: tuple[SpecField, ...]
+    critic_observation: tuple[SpecField, ...]
     action: tuple[SpecField, ...]
     joint_order: tuple[str, ...]
     policy_dt: float
@@ -98,6 +99,11 @@ class Spec:
     def obs_len(self) -> int:
         """Length of an observation."""
         return sum(part.size for part in self.observation)
+
+    @property
+    def critic_len(self) -> int:
+        """Length of a privileged observation of group ``critic``; 0 if there is none."""
+        return sum(part.size for part in self.critic_observation)
 
     @property
     def action_len(self) -> int:
@@ -117,8 +123,8 @@ class Spec:
 def read_spec(message: Mapping[str, Any], spec_hash: str) -> Spec:
     """Read the ``spec`` of a hello or lease reply."""
     try:
-        fields = dict(cast(Mapping[str, Any], message["spec"]))
-        for name in ("observation", "action"):
+        fields = {"critic_observation": (), **cast(Mapping[str, Any], message["spec"])}
+        for name in ("observation", "critic_observation", "action"):
             fields[name] = tuple(
                 SpecField(**{key: part[key] for key in ("name", "size", "unit", "low", "high", "description")})
                 for part in fields[name]

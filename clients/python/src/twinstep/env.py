@@ -24,6 +24,7 @@ class OptionArguments(TypedDict, total=False):
     model: str | None
     zenoh_config: str | None
     spec_hash: str | None
+    critic: bool
     timeout_s: float
     reset_timeout_s: float
 
@@ -88,7 +89,7 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         -------
         obs : (45,) float32
         info : dict
-            Empty.
+            With the option ``critic``: ``critic_obs``, (critic_len,) float32. Else empty.
         """
         super().reset(seed=seed)
         if options:
@@ -96,7 +97,7 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         seeds = None if seed is None else np.array([seed], dtype=np.uint64)
         obs = self._remote.reset(seeds, None)[0]
         self._show()
-        return obs, {}
+        return obs, self._critic_info()
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Advance by one policy period (20 ms).
@@ -112,7 +113,8 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         reward : float
         terminated, truncated : bool
         info : dict
-            At the end of an episode ``reward_terms``, the episode's sum of each weighted reward term.
+            At the end of an episode ``reward_terms``, the episode's sum of each weighted reward term. With the option
+            ``critic``: ``critic_obs``.
         """
         self.send(action)
         return self.recv()
@@ -127,7 +129,7 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def recv(self) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Wait for the result of the action; may be called again after a ``RequestTimeoutError``."""
         batch = self._remote.recv()
-        info: dict[str, Any] = {}
+        info = self._critic_info()
         if len(batch.ended):
             info["reward_terms"] = reward_terms(batch, 0, self.twinstep_spec.reward_terms)
         if self._info_timing:
@@ -148,6 +150,9 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self._viewer is not None:
             self._viewer.close()
         self._remote.close()
+
+    def _critic_info(self) -> dict[str, Any]:
+        return {"critic_obs": self._remote.critic_obs[0]} if self.twinstep_spec.critic_len > 0 else {}
 
     def _show(self) -> None:
         if self.render_mode == "human":

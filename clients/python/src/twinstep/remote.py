@@ -45,6 +45,8 @@ class ConnectOptions:
         Zenoh configuration file (JSON5) for TLS, user and password.
     spec_hash
         Spec hash for which the agent was trained. A server with a different hash is rejected.
+    critic
+        Requests the privileged observations of group ``critic``; they are in the info of every reset and step.
     timeout_s, reset_timeout_s
         Timeout of a step and of a reset [s].
     """
@@ -56,6 +58,7 @@ class ConnectOptions:
     model: str | None = None
     zenoh_config: str | None = None
     spec_hash: str | None = None
+    critic: bool = False
     timeout_s: float = 5.0
     reset_timeout_s: float = 10.0
 
@@ -86,6 +89,10 @@ class StepBatch:
         Sums of their weighted reward terms.
     final_obs : (k, obs_len) float32, or empty
         Their last observations; empty unless autoreset is SameStep.
+    critic_obs : (num_envs, critic_len) float32
+        Observations of group ``critic``; ``critic_len`` is 0 unless the option ``critic`` is set.
+    final_critic_obs : (k, critic_len) float32, or empty
+        As ``final_obs``, of group ``critic``.
     round_trip_s
         Time from sending the actions to the reply [s].
     """
@@ -98,6 +105,8 @@ class StepBatch:
     ended_length: NDArray[np.int64]
     ended_terms: NDArray[np.float32]
     final_obs: NDArray[np.float32]
+    critic_obs: NDArray[np.float32]
+    final_critic_obs: NDArray[np.float32]
     round_trip_s: float = field(compare=False)
 
 
@@ -156,6 +165,7 @@ class RemoteVecEnv:
             "num_envs": self.num_envs,
             "autoreset": autoreset,
             "max_episode_steps": max_episode_steps,
+            "critic": options.critic,
             "spec_hash": options.spec_hash,
         }
         lease = connection.request(connection.querier("lease"), request, options.reset_timeout_s)
@@ -168,6 +178,8 @@ class RemoteVecEnv:
             for method in ("reset", "step", "render", "close")
         }
         self._pending: tuple[str, Pending, float] | None = None
+        self.critic_obs = np.zeros((self.num_envs, self.spec.critic_len), dtype=np.float32)
+        """Observations of group ``critic`` after the last reset or step: (num_envs, critic_len)."""
 
     def reset(self, seeds: NDArray[np.uint64] | None, mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
         """Start new episodes.
@@ -192,6 +204,7 @@ class RemoteVecEnv:
             request["mask"] = mask.astype(np.uint8).tobytes()
         self._send("reset", request)
         reply = self._await_pending(self._options.reset_timeout_s)
+        self.critic_obs = self._critic(reply, "critic_obs", self.num_envs)
         return codec.tensor(reply, "obs", "<f4", self.num_envs, self.spec.obs_len)
 
     def send(self, actions: NDArray[Any]) -> None:
@@ -213,6 +226,8 @@ class RemoteVecEnv:
         reply = self._await_pending(self._options.timeout_s)
         n, k, obs_len = self.num_envs, len(reply.get("ended_env", b"")) // 4, self.spec.obs_len
         terms = len(self.spec.reward_terms)
+        num_final = k if reply.get("final_obs") else 0
+        self.critic_obs = self._critic(reply, "critic_obs", n)
         return StepBatch(
             obs=codec.tensor(reply, "obs", "<f4", n, obs_len),
             reward=codec.tensor(reply, "reward", "<f4", n),
@@ -221,9 +236,15 @@ class RemoteVecEnv:
             ended=codec.tensor(reply, "ended_env", "<u4", k).astype(np.int64),
             ended_length=codec.tensor(reply, "ended_length", "<u4", k).astype(np.int64),
             ended_terms=codec.tensor(reply, "ended_terms", "<f4", k, terms),
-            final_obs=codec.tensor(reply, "final_obs", "<f4", k if reply.get("final_obs") else 0, obs_len),
+            final_obs=codec.tensor(reply, "final_obs", "<f4", num_final, obs_len),
+            critic_obs=self.critic_obs,
+            final_critic_obs=self._critic(reply, "final_critic_obs", num_final),
             round_trip_s=time.monotonic() - since,
         )
+
+    def _critic(self, reply: dict[str, Any], field: str, rows: int) -> NDArray[np.float32]:
+        """Return observations of group ``critic``, which a reply without the group does not contain."""
+        return codec.tensor({field: b"", **reply}, field, "<f4", rows, self.spec.critic_len)
 
     def scene(self, env: int) -> dict[str, Any]:
         """Return shapes and poses of one robot, and its ground, for rendering."""

@@ -56,6 +56,9 @@ def make_vec_env(
 class Go2VecEnv(VecEnv):
     """Robots on one server as a ``VecEnv`` with the observation group ``"policy"``.
 
+    With the option ``critic``, there is also the privileged group ``"critic"``: ``obs_groups`` of the runner is then
+    ``{"actor": ["policy"], "critic": ["policy", "critic"]}``.
+
     Parameters
     ----------
     envs
@@ -83,11 +86,14 @@ class Go2VecEnv(VecEnv):
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self.device = device
         self.cfg = asdict(envs.twinstep_spec)
-        self._obs, _ = envs.reset(seed=seed)
+        self._obs, self._info = envs.reset(seed=seed)
 
     def get_observations(self) -> TensorDict:
-        """Return the last observations: ``policy``, (num_envs, 45) float32."""
-        return TensorDict({"policy": self._tensor(self._obs)}, batch_size=[self.num_envs])
+        """Return the last observations: ``policy``, (num_envs, 45) float32, and with the option ``critic`` ``critic``."""
+        groups = {"policy": self._tensor(self._obs)}
+        if "critic_obs" in self._info:
+            groups["critic"] = self._tensor(self._info["critic_obs"])
+        return TensorDict(groups, batch_size=[self.num_envs])
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Advance every environment by one policy period (20 ms).
@@ -107,19 +113,20 @@ class Go2VecEnv(VecEnv):
             ``time_outs``, (num_envs,) float32, 1 where the time limit ended the episode. In a step that ended episodes
             also ``log``, the mean of each of their weighted reward terms.
         """
-        self._obs, reward, terminated, truncated, vector_info = self.envs.step(actions.detach().cpu().numpy())
+        self._obs, reward, terminated, truncated, step_info = self.envs.step(actions.detach().cpu().numpy())
+        self._info = step_info
         self.episode_length_buf += 1
         # The buffer exceeds the server's count only if the runner has written to it.
         at_limit = self.episode_length_buf.cpu().numpy() >= self.max_episode_length
         early = at_limit & ~terminated & ~truncated
         if early.any():
-            self._obs, _ = self.envs.reset(options={"reset_mask": early})
+            self._obs, self._info = self.envs.reset(options={"reset_mask": early})
             truncated = truncated | early
         done = self._tensor(terminated | truncated)
         self.episode_length_buf[done] = 0
         extras: dict[str, Any] = {"time_outs": self._tensor((truncated & ~terminated).astype(np.float32))}
-        if "final_info" in vector_info:
-            extras["log"] = _mean_terms(vector_info["final_info"]["reward_terms"])
+        if "final_info" in step_info:
+            extras["log"] = _mean_terms(step_info["final_info"]["reward_terms"])
         return self.get_observations(), self._tensor(reward.astype(np.float32)), done, extras
 
     def close(self) -> None:

@@ -14,7 +14,11 @@ One step is one policy period of {spec.policy_dt:g} s. The actuators' PD loop ru
 kp = {spec.kp:g} N·m/rad and kd = {spec.kd:g} N·m·s/rad. An action of 1 offsets a joint by {spec.action_scale:g} rad
 from the default pose. Episodes are truncated after {spec.max_episode_steps} steps.
 """
-    parts = [("Observation", spec.observation, spec.obs_len), ("Action", spec.action, spec.action_len)]
+    parts = [
+        ("Observation of group `policy`", spec.observation, spec.obs_len),
+        ("Privileged observation of group `critic`", spec.critic_observation, spec.critic_len),
+        ("Action", spec.action, spec.action_len),
+    ]
     sections = [f"## {name}: {size} × float32\n\n{_table(part)}" for name, part, size in parts]
     joints = "\n".join(
         f"| {index} | `{joint}` | {angle:g} |"
@@ -37,6 +41,6 @@ def _table(parts: tuple[SpecField, ...]) -> str:
 
 
 if __name__ == "__main__":
-    envs = Go2VectorEnv(1)
+    envs = Go2VectorEnv(1, critic=True)
     print(tables(envs.twinstep_spec), end="")
     envs.close()

@@ -84,13 +84,13 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         obs : (num_envs, 45) float32
             Observations of all environments, reset or not.
         info : dict
-            Empty.
+            With the option ``critic``: ``critic_obs``, (num_envs, critic_len) float32. Else empty.
         """
         if seed is None or isinstance(seed, int | np.integer):
             super().reset(seed=None if seed is None else int(seed))
         obs = self._remote.reset(self._seeds(seed), self._mask(options))
         self._show()
-        return obs, {}
+        return obs, self._critic_info()
 
     @property
     def lease(self) -> str:
@@ -112,6 +112,7 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         terminated, truncated : (num_envs,) bool
         info : dict
             ``reward_terms`` of the episodes that ended; with ``"SameStep"`` in ``final_info``, next to ``final_obs``.
+            With the option ``critic``: ``critic_obs``, and ``critic_obs`` in ``final_info``.
         """
         self.send(actions)
         return self.recv()
@@ -173,17 +174,24 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         return mask
 
     def _infos(self, batch: StepBatch) -> dict[str, Any]:
-        infos: dict[str, Any] = {}
+        infos = self._critic_info()
         names = self.twinstep_spec.reward_terms
         for index, env in enumerate(batch.ended):
-            info = {"reward_terms": reward_terms(batch, index, names)}
+            info: dict[str, Any] = {"reward_terms": reward_terms(batch, index, names)}
             if self._mode is AutoresetMode.SAME_STEP:
+                if self.twinstep_spec.critic_len > 0:
+                    info["critic_obs"] = batch.final_critic_obs[index]
                 info = {"final_obs": batch.final_obs[index], "final_info": info}
             infos = self._add_info(infos, info, int(env))
         if self._info_timing:
             infos["round_trip_s"] = np.full(self.num_envs, batch.round_trip_s)
             infos["_round_trip_s"] = np.ones(self.num_envs, dtype=np.bool_)
         return infos
+
+    def _critic_info(self) -> dict[str, Any]:
+        if self.twinstep_spec.critic_len == 0:
+            return {}
+        return {"critic_obs": self._remote.critic_obs, "_critic_obs": np.ones(self.num_envs, dtype=np.bool_)}
 
     def _show(self) -> None:
         if self.render_mode == "human":

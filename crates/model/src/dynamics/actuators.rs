@@ -29,15 +29,13 @@ pub struct SimdCommands<T> {
     pub kp: [T; 12],
     /// Velocity gain [N·m·s/rad].
     pub kd: [T; 12],
-    /// Derating factor: factor on the torque for supply voltage and motor temperature.
-    pub strength: [T; 12],
 }
 
 impl<T: SimdFloat> SimdCommands<T> {
     /// Creates the commands of at most `T::LANES` robots, in the order of the lanes.
     pub fn new(commands: &[Command]) -> Self {
         let zero = [T::splat(0.0); 12];
-        let mut this = Self { q: zero, dq: zero, tau_ff: zero, kp: zero, kd: zero, strength: zero };
+        let mut this = Self { q: zero, dq: zero, tau_ff: zero, kp: zero, kd: zero };
         for (lane, command) in commands.iter().enumerate() {
             this.set(lane, command);
         }
@@ -52,7 +50,6 @@ impl<T: SimdFloat> SimdCommands<T> {
             self.tau_ff[joint].set(lane, f64::from(command.tau_ff[joint]));
             self.kp[joint].set(lane, f64::from(command.kp[joint]));
             self.kd[joint].set(lane, f64::from(command.kd[joint]));
-            self.strength[joint].set(lane, f64::from(command.derating_factor[joint]));
         }
     }
 }
@@ -173,6 +170,8 @@ pub struct SimdActuators<T> {
     state: ActuatorState<T>,
     /// Torque that the current sensor measures, mean over the last physics step [N·m].
     estimated_torque: [T; 12],
+    /// Factor on the torque for supply voltage and motor temperature.
+    derating: [T; 12],
     active: ActiveEffects,
     /// Physics step [actuator periods].
     step_fraction: T,
@@ -208,6 +207,7 @@ impl<T: SimdFloat> SimdActuators<T> {
             coefficients,
             state,
             estimated_torque: zero,
+            derating: [T::splat(1.0); 12],
             active: ActiveEffects::default(),
             step_fraction: T::splat(dt / actuator_dt),
             dt,
@@ -237,8 +237,16 @@ impl<T: SimdFloat> SimdActuators<T> {
             state.rotor[0][index].set(lane, f64::from(q[index]));
             state.rotor[1][index].set(lane, f64::from(dq[index]));
         }
+        self.set_derating(lane, &[1.0; 12]);
         self.update_active_effects();
         on_link
+    }
+
+    /// Sets the factors on the torque of one lane for supply voltage and motor temperature. A reset sets them to 1.
+    pub fn set_derating(&mut self, lane: usize, factors: &PerJoint) {
+        for (derating, factor) in self.derating.iter_mut().zip(factors) {
+            derating.set(lane, f64::from(*factor));
+        }
     }
 
     /// Returns true if any actuator in the batch has a delay or lag, so that its torque depends on earlier periods.
@@ -313,7 +321,7 @@ impl<T: SimdFloat> SimdActuators<T> {
             }
             // NaN must propagate: clipped to the limit, a diverged torque would not be detected.
             let limit = n.torque_limit;
-            torque[joint] = limit.min((tau * commands.strength[joint]).max(-limit));
+            torque[joint] = limit.min((tau * self.derating[joint]).max(-limit));
         }
         self.set_torque(torque);
     }
@@ -454,7 +462,8 @@ impl<T: SimdFloat> SimdActuators<T> {
             coefficients.visit(&mut visit);
         }
         let ActuatorState { commands, torque_history: torque, current, rotor } = &mut self.state;
-        commands.iter_mut().flatten().chain(torque).chain([current]).chain(rotor).flatten().for_each(visit);
+        commands.iter_mut().flatten().chain(torque).chain([current]).chain(rotor).flatten().for_each(&mut visit);
+        self.derating.iter_mut().for_each(visit);
     }
 
     /// Updates derived state; call it after [`SimdActuators::visit`] has changed values.

@@ -9,7 +9,7 @@ use plotters::prelude::RGBColor;
 use plotters::style::text_anchor::HPos;
 use twinstep_effects::{Effect, EffectEntry, Scope, Target, apply_effects};
 use twinstep_model::{
-    BaseMount, Command, FIXED_BASE_HEIGHT, Ground, InitialState, Joint, Leg, Precision, RobotModel, Rollout,
+    BaseMount, Command, FIXED_BASE_HEIGHT, Ground, InitialState, Joint, Leg, PerJoint, Precision, RobotModel, Rollout,
     RolloutRequest, go2,
 };
 use twinstep_sim::{BatchRollout, SimConfig};
@@ -83,7 +83,7 @@ fn play<'a>(motion: &DemoMotion, robots: impl Iterator<Item = &'a RobotModel>) -
     let config = SimConfig { threads: 1, ..SimConfig::default() };
     let mut simulator = BatchRollout::new(&go2(), &config).map_err(simulate)?;
     let runs = robots.map(|robot| {
-        let (commands, supply) = commands(motion, robot);
+        let (commands, supply, derating) = commands(motion, robot);
         let pose = commands[0].q;
         let start = match motion.base {
             BaseMount::Fixed => InitialState::at_rest(FIXED_BASE_HEIGHT as f32, pose),
@@ -91,19 +91,26 @@ fn play<'a>(motion: &DemoMotion, robots: impl Iterator<Item = &'a RobotModel>) -
         };
         let states = simulator
             .run(
-                &[RolloutRequest { robot, base: motion.base, start, history: &[], commands: &commands }],
+                &[RolloutRequest {
+                    robot,
+                    base: motion.base,
+                    start,
+                    history: &[],
+                    commands: &commands,
+                    derating: &derating,
+                }],
                 Precision::Double,
             )
             .remove(0);
         let joint = Joint { leg: Leg::FL, kind: motion.joint }.index();
         let settle = (motion.settle / robot.control.actuator_dt()).round() as usize;
-        SimulatedRun { robot: robot.clone(), commands, supply, joint, settle, states }
+        SimulatedRun { robot: robot.clone(), commands, supply, derating, joint, settle, states }
     });
     Ok(runs.collect())
 }
 
-/// Returns command, battery voltage [V] and motor temperature [°C] of each actuator period.
-fn commands(motion: &DemoMotion, robot: &RobotModel) -> (Vec<Command>, Vec<[f64; 2]>) {
+/// Returns command, battery voltage [V] and motor temperature [°C], and derating factors of each actuator period.
+fn commands(motion: &DemoMotion, robot: &RobotModel) -> (Vec<Command>, Vec<[f64; 2]>, Vec<PerJoint>) {
     let (dt, pose) = (robot.control.actuator_dt(), robot.control.default_pose);
     let period = |period: usize| {
         let t = (period as f64 * dt - motion.settle).max(0.0);
@@ -112,11 +119,9 @@ fn commands(motion: &DemoMotion, robot: &RobotModel) -> (Vec<Command>, Vec<[f64;
         let offset = (motion.target)(t);
         let q = std::array::from_fn(|joint| (pose[joint] + offset[Joint::ALL[joint].kind as usize]) as f32);
         let factor = |joint| robot.derating.derating_factor(joint, volts / FULL_V, celsius) as f32;
-        let command =
-            Command { derating_factor: std::array::from_fn(factor), ..Command::hold(q, motion.kp, motion.kd) };
-        (command, [volts, celsius])
+        (Command::hold(q, motion.kp, motion.kd), [volts, celsius], std::array::from_fn(factor))
     };
-    (0..((motion.settle + motion.duration) / dt).round() as usize).map(period).unzip()
+    (0..((motion.settle + motion.duration) / dt).round() as usize).map(period).collect()
 }
 
 fn draw(

@@ -2,7 +2,7 @@
 
 use twinstep_identify::experiment::estimated_torque;
 use twinstep_model::{
-    Command, NUM_JOINTS, RobotModel, RobotStates,
+    Command, NUM_JOINTS, PerJoint, RobotModel, RobotStates,
     dynamics::{Acceleration, KinematicTree, State, Vec3, inverse_dynamics},
     go2,
 };
@@ -61,6 +61,8 @@ pub struct SimulatedRun {
     pub commands: Vec<Command>,
     /// Battery voltage [V] and motor temperature [°C] of each actuator period.
     pub supply: Vec<[f64; 2]>,
+    /// Derating factor of each joint in each actuator period.
+    pub derating: Vec<PerJoint>,
     /// Index of the plotted joint.
     pub joint: usize,
     /// Number of actuator periods before time 0.
@@ -99,30 +101,32 @@ impl PlotQuantity {
     pub fn of(self, run: &SimulatedRun, period: usize) -> f64 {
         let (states, joint, dt) = (&run.states, run.joint, run.robot.control.actuator_dt());
         let change = |of: &dyn Fn(usize) -> f32| f64::from(of(period + 1) - of(period)) / dt;
-        let feet = states.foot_force[period + 1].map(f64::from);
+        let feet = states.truth.foot_force[period + 1].map(f64::from);
         match self {
             Self::Time => (period as f64 - run.settle as f64) * dt,
-            Self::Position => f64::from(states.q[period][joint]),
-            Self::Velocity => f64::from(states.dq[period][joint]),
-            Self::Acceleration => change(&|row| states.dq[row][joint]),
+            Self::Position => f64::from(states.measured.q[period][joint]),
+            Self::Velocity => f64::from(states.measured.dq[period][joint]),
+            Self::Acceleration => change(&|row| states.measured.dq[row][joint]),
             Self::CommandedTorque => run.commanded_torque(period),
             Self::EstimatedTorque => run.measured_torque(period),
-            Self::InverseDynamicsResidual => f64::from(states.tau[period + 1][joint]) - run.required_torque(period),
-            Self::Height => f64::from(states.base_position[period][2]),
-            Self::Sideways => f64::from(states.base_position[period][1]),
+            Self::InverseDynamicsResidual => {
+                f64::from(states.measured.tau[period + 1][joint]) - run.required_torque(period)
+            }
+            Self::Height => f64::from(states.truth.base_position[period][2]),
+            Self::Sideways => f64::from(states.truth.base_position[period][1]),
             Self::Pitch => {
-                let [w, x, y, z] = states.base_orientation[period].map(f64::from);
+                let [w, x, y, z] = states.measured.orientation[period].map(f64::from);
                 (2.0 * (w * y - z * x)).asin()
             }
-            Self::Gyro => f64::from(states.base_angular_velocity[period][0]),
+            Self::Gyro => f64::from(states.measured.gyro[period][0]),
             Self::RollRate => Self::Gyro.of(run, period) - run.robot.gyro_bias.x,
             Self::Force => feet.iter().sum(),
             Self::FrontShare => (feet[0] + feet[1]) / feet.iter().sum::<f64>(),
-            Self::VerticalAcceleration => change(&|row| states.base_linear_velocity[row][2]) + GRAVITY,
-            Self::LateralAcceleration => change(&|row| states.base_linear_velocity[row][1]),
+            Self::VerticalAcceleration => change(&|row| states.truth.base_linear_velocity[row][2]) + GRAVITY,
+            Self::LateralAcceleration => change(&|row| states.truth.base_linear_velocity[row][1]),
             Self::Voltage => run.supply[period][0],
             Self::Temperature => run.supply[period][1],
-            Self::DeratingFactor => f64::from(run.commands[period].derating_factor[joint]),
+            Self::DeratingFactor => f64::from(run.derating[period][joint]),
         }
     }
 }
@@ -131,7 +135,7 @@ impl SimulatedRun {
     /// Returns the torque of an actuator without effects in the measured state [N·m].
     fn commanded_torque(&self, period: usize) -> f64 {
         let (command, joint) = (&self.commands[period], self.joint);
-        let [q, dq] = [self.states.q[period][joint], self.states.dq[period][joint]];
+        let [q, dq] = [self.states.measured.q[period][joint], self.states.measured.dq[period][joint]];
         f64::from(command.kp[joint] * (command.q[joint] - q) - command.kd[joint] * dq)
     }
 
@@ -146,9 +150,9 @@ impl SimulatedRun {
         let mean =
             |of: &[[f32; NUM_JOINTS]], joint: usize| f64::from(f32::midpoint(of[period][joint], of[period + 1][joint]));
         let mut state = State::<f64>::origin();
-        state.q = std::array::from_fn(|joint| mean(&self.states.q, joint));
-        state.dq = std::array::from_fn(|joint| mean(&self.states.dq, joint));
-        let speed = &self.states.dq;
+        state.q = std::array::from_fn(|joint| mean(&self.states.measured.q, joint));
+        state.dq = std::array::from_fn(|joint| mean(&self.states.measured.dq, joint));
+        let speed = &self.states.measured.dq;
         let ddq = std::array::from_fn(|joint| f64::from(speed[period + 1][joint] - speed[period][joint]) / dt);
         let acceleration = Acceleration { angular: Vec3::zero(), linear: Vec3::zero(), ddq };
         let (_, torques) = inverse_dynamics(&KinematicTree::splat(&go2()), &state, &acceleration, GRAVITY);

@@ -21,7 +21,8 @@ mod rows;
 mod simulator;
 
 use twinstep_model::{
-    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, InitialState, RobotModel, RobotStates,
+    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, GroundTruth, InitialState, Measured, PerJoint,
+    RobotModel, RobotStates, Simulator,
 };
 use twinstep_simd::InstructionSet;
 
@@ -94,7 +95,8 @@ impl BatchBackend {
 
     fn after_reset(&mut self, robot: usize, initial_state: &InitialState) {
         self.robots.read(robot, &mut self.states);
-        self.states.epistemic_uncertainty[robot] = 0.0;
+        self.states.measured.stamp[robot] = 0.0;
+        self.states.truth.epistemic_uncertainty[robot] = 0.0;
         if let Some(actuator) = &mut self.actuator {
             actuator.reset(robot, initial_state.actuator_seed);
         }
@@ -130,14 +132,16 @@ fn check_tree(robot: &RobotModel) -> Result<(), SimConfigError> {
 }
 
 impl Backend for BatchBackend {
-    type Snapshot = BatchSnapshot;
-
     fn robot(&self) -> &RobotModel {
         &self.robot
     }
 
-    fn states(&self) -> &RobotStates {
-        &self.states
+    fn measured(&self) -> &Measured {
+        &self.states.measured
+    }
+
+    fn ground_truth(&self) -> Option<&GroundTruth> {
+        Some(&self.states.truth)
     }
 
     fn ground(&self) -> Ground {
@@ -174,14 +178,14 @@ impl Backend for BatchBackend {
         let pool = pool.as_ref();
         let mut finite = true;
         if let Some(actuator) = actuator {
-            let mut tau = states.tau.clone();
+            let mut tau = states.measured.tau.clone();
             for _ in 0..actuator_periods {
-                on(pool, || actuator.torques(commands, active, states, &mut tau))?;
+                on(pool, || actuator.torques(commands, active, &states.measured, &mut tau))?;
                 let period = StepCount { actuator_periods: 1, steps };
                 finite &= robots.advance(pool, ActuatorInputs::Torques(&tau), active, period, states);
             }
             if let Some(evaluator) = actuator.uncertainty() {
-                on(pool, || evaluator.evaluate(active, &mut states.epistemic_uncertainty));
+                on(pool, || evaluator.evaluate(active, &mut states.truth.epistemic_uncertainty));
             }
         } else {
             finite = robots.advance(
@@ -192,8 +196,24 @@ impl Backend for BatchBackend {
                 states,
             );
         }
+        let elapsed = actuator_periods as f64 * self.robot.control.actuator_dt();
+        for (stamp, _) in states.measured.stamp.iter_mut().zip(active).filter(|(_, active)| **active) {
+            *stamp += elapsed;
+        }
         let diverged = if finite { None } else { self.first_diverged(active) };
         diverged.map_or(Ok(()), Err)
+    }
+}
+
+impl Simulator for BatchBackend {
+    type Snapshot = BatchSnapshot;
+
+    fn states(&self) -> &RobotStates {
+        &self.states
+    }
+
+    fn set_derating(&mut self, robot: usize, factors: &PerJoint) {
+        self.robots.set_derating(robot, factors);
     }
 
     fn snapshot(&self, robot: usize) -> BatchSnapshot {

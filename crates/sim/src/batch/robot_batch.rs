@@ -1,8 +1,8 @@
 //! State of the robots in one SIMD register, and one physics step of them.
 
-use glam::{DVec3, dvec3};
+use glam::dvec3;
 use twinstep_model::{
-    BaseMount, Ground, HistoryStep, InitialState, PerJoint, RandomisationSample, RigidBody, RobotModel,
+    BaseMount, Ground, HistoryStep, InitialState, PerJoint, RobotModel,
     dynamics::{FactoredDynamics, JointLoad, KinematicTree, SimdActuators, SimdCommands, State, Vec3},
 };
 use twinstep_simd::SimdFloat;
@@ -111,13 +111,7 @@ impl<T: SimdFloat> RobotBatch<T> {
 
     /// Resets one robot to an initial state.
     pub fn place(&mut self, lane: usize, robot: &RobotModel, initial_state: &InitialState) {
-        let randomisation = &initial_state.randomisation;
-        let mut randomised = robot.clone();
-        randomised.trunk = randomised_trunk(robot, randomisation);
-        for body in randomised.legs.iter_mut().flat_map(|leg| &mut leg.bodies) {
-            *body = body.scaled(f64::from(randomisation.mass_scale));
-        }
-        self.tree.set(lane, &randomised);
+        self.tree.set(lane, robot);
         // An initial state contains encoder readings.
         let offsets = robot.joints.map(|joint| joint.actuator.encoder_offset as f32);
         let q: PerJoint = std::array::from_fn(|joint| initial_state.q[joint] - offsets[joint]);
@@ -126,7 +120,7 @@ impl<T: SimdFloat> RobotBatch<T> {
             armature.set(lane, rotor);
         }
         self.gyro_bias.set(lane, robot.gyro_bias);
-        self.surface.friction.set(lane, robot.contact.friction * f64::from(randomisation.friction_scale));
+        self.surface.friction.set(lane, robot.contact.friction);
         // At least two steps, below which the constraint is unstable (MuJoCo's `refsafe`).
         self.surface.time_constant.set(lane, robot.contact.time_constant.max(2.0 * self.dt.get(lane)));
 
@@ -161,13 +155,12 @@ impl<T: SimdFloat> RobotBatch<T> {
         if !self.actuator.has_memory() {
             return;
         }
-        let (zero, one) = (T::splat(0.0), T::splat(1.0));
+        let zero = T::splat(0.0);
         let q = self.sampled_q();
         let still = std::array::from_fn(|joint| self.actuator.encoder_reading(joint, q[joint], zero).0);
         for age in (0..past.iter().map(|past| past.len()).max().unwrap_or(0)).rev() {
             let (mut q, mut dq) = (still, [zero; 12]);
-            let mut commands =
-                SimdCommands { q, dq, tau_ff: [zero; 12], kp: [zero; 12], kd: [zero; 12], strength: [one; 12] };
+            let mut commands = SimdCommands { q, dq, tau_ff: [zero; 12], kp: [zero; 12], kd: [zero; 12] };
             for (lane, past) in past.iter().enumerate() {
                 let Some(past) = past.len().checked_sub(age + 1).map(|index| &past[index]) else { continue };
                 commands.set(lane, &past.command);
@@ -176,6 +169,11 @@ impl<T: SimdFloat> RobotBatch<T> {
             }
             self.actuator.replay_history(&commands, &q, &dq, steps);
         }
+    }
+
+    /// Sets the factors on the torque of one robot for supply voltage and motor temperature, until its next reset.
+    pub fn set_derating(&mut self, lane: usize, factors: &PerJoint) {
+        self.actuator.set_derating(lane, factors);
     }
 
     /// Advances all robots and returns their sensor readings.
@@ -333,13 +331,6 @@ fn set<T: SimdFloat, const N: usize>(values: &mut [T; N], lane: usize, given: [f
     for (value, given) in values.iter_mut().zip(given) {
         value.set(lane, given);
     }
-}
-
-/// Returns the trunk with payload and shifted centre of mass.
-fn randomised_trunk(robot: &RobotModel, randomisation: &RandomisationSample) -> RigidBody {
-    let trunk = robot.trunk.scaled(f64::from(randomisation.mass_scale));
-    let trunk = trunk.with_point_mass(f64::from(randomisation.payload), robot.trunk.com);
-    RigidBody { com: trunk.com + DVec3::from(randomisation.com_shift.map(f64::from)), ..trunk }
 }
 
 fn surface<T: SimdFloat>(robot: &RobotModel, config: &SimConfig, ground: &Ground, dt: f64) -> ContactParams<T> {

@@ -3,7 +3,9 @@
 use rayon::ThreadPool;
 use rayon::prelude::*;
 use twinstep_model::dynamics::SimdCommands;
-use twinstep_model::{Command, Ground, HistoryStep, InitialState, PerJoint, RobotModel, RobotStates, RobotStatesMut};
+use twinstep_model::{
+    Command, Ground, HistoryStep, InitialState, PerJoint, RobotModel, RobotStates, RobotStatesMut, RolloutRequest,
+};
 use twinstep_simd::{InstructionSet, SimdFloat, SimdKernel, SimdTask, with_f32, with_f64};
 
 use super::robot_batch::{ActuatorInput, LaneSnapshot, RobotBatch, SensorReadings, StepCount, Workspace};
@@ -48,10 +50,12 @@ pub trait BatchSimulator: Send + Sync {
     ///
     /// `past` has one entry per robot; a period has `steps` physics steps.
     fn remember(&mut self, past: &[&[HistoryStep]], steps: usize);
-    /// Simulates every robot with its commands on the current thread, one command per actuator period.
+    /// Sets the factors on the torque of `robot` for supply voltage and motor temperature, until its next reset.
+    fn set_derating(&mut self, robot: usize, factors: &PerJoint);
+    /// Simulates every robot with the commands of its request on the current thread.
     ///
     /// A period has `steps` physics steps. The state after period `i` is entry `i + 1` of a robot's record.
-    fn play(&mut self, commands: &[&[Command]], steps: usize, records: &mut [RobotStates]);
+    fn play(&mut self, requests: &[&RolloutRequest], steps: usize, records: &mut [RobotStates]);
     /// Returns the full state of `robot`.
     fn snapshot(&self, robot: usize) -> LaneSnapshot;
     /// Restores the state of `robot`.
@@ -174,25 +178,33 @@ impl<T: SimdFloat> BatchSimulator for RobotBatches<T> {
         }
     }
 
-    fn play(&mut self, commands: &[&[Command]], steps: usize, records: &mut [RobotStates]) {
+    fn set_derating(&mut self, robot: usize, factors: &PerJoint) {
+        self.batches[robot / T::LANES].set_derating(robot % T::LANES, factors);
+    }
+
+    fn play(&mut self, requests: &[&RolloutRequest], steps: usize, records: &mut [RobotStates]) {
         let mut scratch = Workspace::empty();
-        let robots = commands.chunks(T::LANES).zip(records.chunks_mut(T::LANES));
-        for (group, (commands, records)) in self.batches.iter_mut().zip(robots) {
+        let robots = requests.chunks(T::LANES).zip(records.chunks_mut(T::LANES));
+        for (group, (requests, records)) in self.batches.iter_mut().zip(robots) {
             let mut records: Vec<_> = records.iter_mut().map(RobotStates::all_mut).collect();
             let mut now = SimdCommands::new(&[]);
             let time = StepCount { actuator_periods: 1, steps };
-            for period in 0..commands.iter().map(|commands| commands.len()).max().unwrap_or(0) {
+            for period in 0..requests.iter().map(|request| request.commands.len()).max().unwrap_or(0) {
                 for lane in 0..T::LANES {
                     // An unused lane copies the last robot. A falling robot would add contacts that cost time.
-                    if let Some(command) = commands[lane.min(commands.len() - 1)].get(period) {
+                    let request = requests[lane.min(requests.len() - 1)];
+                    if let Some(command) = request.commands.get(period) {
                         now.set(lane, command);
+                    }
+                    if let Some(factors) = request.derating.get(period) {
+                        group.set_derating(lane, factors);
                     }
                 }
                 // A robot whose commands have ended is stepped without being recorded. Lanes are independent, so this
                 // has no effect on the others.
                 let sample = advance(group, &ActuatorInput::Commands(now), time, &mut scratch);
-                for (lane, record) in records.iter_mut().enumerate().filter(|(lane, _)| period < commands[*lane].len())
-                {
+                let recorded = |lane: usize| period < requests[lane].commands.len();
+                for (lane, record) in records.iter_mut().enumerate().filter(|(lane, _)| recorded(*lane)) {
                     read(group, &sample, lane, record, period + 1);
                 }
             }
@@ -246,9 +258,10 @@ fn read<T: SimdFloat>(
 ) {
     let state = group.state();
     states.base_position[at] = values(&sample.position.0, lane);
-    states.base_orientation[at] = values(&sample.orientation, lane);
+    states.orientation[at] = values(&sample.orientation, lane);
     states.base_linear_velocity[at] = values(&state.linear_velocity.0, lane);
-    states.base_angular_velocity[at] = std::array::from_fn(|axis| group.gyro(lane, axis) as f32);
+    states.base_angular_velocity[at] = values(&state.angular_velocity.0, lane);
+    states.gyro[at] = std::array::from_fn(|axis| group.gyro(lane, axis) as f32);
     states.q[at] = values(&sample.q, lane);
     states.dq[at] = values(&sample.dq, lane);
     states.tau[at] = values(group.tau(), lane);
@@ -260,8 +273,8 @@ fn read<T: SimdFloat>(
 fn is_finite(states: &RobotStatesMut, robot: usize) -> bool {
     // A sum with a term that is not finite is not finite. The finite terms are too small to overflow.
     let sum = |values: &[f32]| values.iter().sum::<f32>();
-    let trunk = sum(&states.base_position[robot]) + sum(&states.base_orientation[robot]);
-    let velocity = sum(&states.base_linear_velocity[robot]) + sum(&states.base_angular_velocity[robot]);
+    let trunk = sum(&states.base_position[robot]) + sum(&states.orientation[robot]);
+    let velocity = sum(&states.base_linear_velocity[robot]) + sum(&states.gyro[robot]);
     (trunk + velocity + sum(&states.q[robot]) + sum(&states.dq[robot]) + sum(&states.tau[robot])).is_finite()
 }
 

@@ -163,9 +163,10 @@ proptest! {
 
 #[test]
 fn derating_factor_multiplies_the_torque() {
-    let mut command = torque(4.0);
-    command.derating_factor = [0.7; NUM_JOINTS];
-    assert!((simulate(&go2(), [command], 0.0, 0.0)[0] - 2.8).abs() < 1e-6);
+    let mut actuator = actuator(&go2());
+    actuator.set_derating(0, &[0.7; NUM_JOINTS]);
+    actuator.update_command(&SimdCommands::new(&[torque(4.0)]), &[0.0; NUM_JOINTS], &[0.0; NUM_JOINTS]);
+    assert!((actuator.step(0, &[0.0; NUM_JOINTS], &[0.0; NUM_JOINTS]).tau[0] - 2.8).abs() < 1e-6);
 }
 
 #[test]

@@ -1,0 +1,152 @@
+//! Domain randomisation: each episode has its own robot. The differences are effects of the catalogue.
+
+use rand::RngExt;
+use serde::{Deserialize, Serialize};
+use twinstep_effects::{Effect, EffectSite};
+use twinstep_model::{NUM_JOINTS, RobotModel, Stream};
+
+use crate::config::{ConfigError, Range, check_range};
+
+/// Domain randomisation. Each value is sampled uniformly from its range at every reset.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Randomisation {
+    /// Factor on the mass and inertia of every body.
+    pub mass_scale: Range,
+    /// Point mass at the trunk's centre of mass [kg].
+    pub payload_kg: Range,
+    /// Shift of the trunk's centre of mass, each axis [m].
+    pub com_shift_m: Range,
+    /// Factor on the ground's friction coefficient.
+    pub friction_scale: Range,
+    /// Factor on the position gain.
+    pub kp_scale: Range,
+    /// Factor on the velocity gain.
+    pub kd_scale: Range,
+    /// True to sample every value of the model file that has an interval from that interval.
+    pub effects: bool,
+}
+
+impl Default for Randomisation {
+    /// No randomisation.
+    fn default() -> Self {
+        Self {
+            mass_scale: [1.0, 1.0],
+            payload_kg: [0.0, 0.0],
+            com_shift_m: [0.0, 0.0],
+            friction_scale: [1.0, 1.0],
+            kp_scale: [1.0, 1.0],
+            kd_scale: [1.0, 1.0],
+            effects: false,
+        }
+    }
+}
+
+impl Randomisation {
+    /// Checks that every range is one for which the simulation is stable.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        check_range("randomise.mass_scale", self.mass_scale, 0.1, 10.0)?;
+        check_range("randomise.payload_kg", self.payload_kg, -3.0, 20.0)?;
+        check_range("randomise.com_shift_m", self.com_shift_m, -0.2, 0.2)?;
+        check_range("randomise.friction_scale", self.friction_scale, 0.0, 10.0)?;
+        check_range("randomise.kp_scale", self.kp_scale, 0.0, 10.0)?;
+        check_range("randomise.kd_scale", self.kd_scale, 0.0, 10.0)
+    }
+
+    /// Checks that the trunk of `robot` keeps a positive mass.
+    pub fn check_robot(&self, robot: &RobotModel) -> Result<(), ConfigError> {
+        let [scale, payload] = [self.mass_scale[0], self.payload_kg[0]];
+        let lowest = -(robot.trunk.mass as f32) * scale;
+        if payload > lowest {
+            return Ok(());
+        }
+        Err(ConfigError {
+            field: "randomise.payload_kg".to_owned(),
+            value: format!("{:?}", self.payload_kg),
+            allowed: format!("above {lowest:.2} kg, because the trunk with the lowest `mass_scale` weighs that much"),
+        })
+    }
+
+    /// Samples the robot of an episode: `robot` with effects. Returns `None` if no range differs from no effect.
+    ///
+    /// The number of random numbers does not depend on the ranges, so that poses and commands do not either.
+    pub fn sample(&self, robot: &RobotModel, random: &mut Stream) -> Option<RobotModel> {
+        let mut draw = |[low, high]: Range| f64::from(low + (high - low) * random.random::<f32>());
+        let mass_scale = draw(self.mass_scale);
+        let payload = draw(self.payload_kg);
+        let shift: [f64; 3] = std::array::from_fn(|_| draw(self.com_shift_m));
+        let friction_scale = draw(self.friction_scale);
+        let gains = [draw(self.kp_scale), draw(self.kd_scale)];
+        if (Self { effects: self.effects, ..Self::default() }) == *self {
+            return None;
+        }
+        let mut sampled = robot.clone();
+        let bodies = sampled.legs.iter_mut().flat_map(|leg| &mut leg.bodies).chain([&mut sampled.trunk]);
+        bodies.for_each(|body| *body = body.scaled(mass_scale));
+        let com = robot.trunk.com;
+        apply(&mut sampled, "payload", EffectSite::Global, &[payload, com.x, com.y, com.z]);
+        apply(&mut sampled, "com_shift", EffectSite::Global, &shift);
+        apply(&mut sampled, "ground_friction", EffectSite::Global, &[friction_scale * robot.contact.friction]);
+        for joint in 0..NUM_JOINTS {
+            apply(&mut sampled, "pd_gain", EffectSite::Joint(joint), &gains);
+        }
+        Some(sampled)
+    }
+}
+
+fn apply(robot: &mut RobotModel, name: &str, site: EffectSite, values: &[f64]) {
+    let effect = Effect::named(name).expect("an effect of the catalogue");
+    (effect.apply)(robot, site, values).expect("`check_robot` has checked the ranges");
+}
+
+#[cfg(test)]
+mod tests {
+    use expect_test::expect;
+    use twinstep_model::{go2, stream};
+
+    use super::*;
+
+    #[test]
+    fn reversed_range_is_rejected_with_its_key() {
+        let config = Randomisation { payload_kg: [2.0, 1.0], ..Randomisation::default() };
+        expect![
+            "`randomise.payload_kg` = [2.0, 1.0] is not allowed: [low, high] with low <= high, both within -3 to 20"
+        ]
+        .assert_eq(&config.check().expect_err("reversed").to_string());
+    }
+
+    #[test]
+    fn payload_that_outweighs_the_trunk_is_rejected() {
+        let config = Randomisation { mass_scale: [0.4, 1.0], payload_kg: [-3.0, 0.0], ..Randomisation::default() };
+        expect!["`randomise.payload_kg` = [-3.0, 0.0] is not allowed: above -2.77 kg, because the trunk with the lowest `mass_scale` weighs that much"].assert_eq(&config.check_robot(&go2()).expect_err("too light").to_string());
+    }
+
+    #[test]
+    fn defaults_are_valid_and_return_no_robot() {
+        let config = Randomisation::default();
+        assert_eq!((config.check(), config.check_robot(&go2())), (Ok(()), Ok(())));
+        assert_eq!(config.sample(&go2(), &mut stream(0, "test", 0)), None);
+    }
+
+    #[test]
+    fn sampled_robot_has_the_requested_differences() {
+        let config = Randomisation {
+            mass_scale: [1.1, 1.1],
+            payload_kg: [2.0, 2.0],
+            com_shift_m: [0.01, 0.01],
+            friction_scale: [0.5, 0.5],
+            kp_scale: [0.9, 0.9],
+            kd_scale: [1.2, 1.2],
+            effects: false,
+        };
+        let (ideal, sampled) = (go2(), config.sample(&go2(), &mut stream(0, "test", 0)).expect("differs"));
+        let near = |one: f64, other: f64| assert!((one - other).abs() < 1e-6, "{one} {other}");
+        near(sampled.total_mass(), 1.1 * ideal.total_mass() + 2.0);
+        near(sampled.trunk.com.y, ideal.trunk.com.y + 0.01);
+        near(sampled.contact.friction, 0.5 * ideal.contact.friction);
+        for joint in &sampled.joints {
+            near(joint.actuator.kp_scale, 0.9);
+            near(joint.actuator.kd_scale, 1.2);
+        }
+    }
+}

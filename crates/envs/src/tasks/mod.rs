@@ -1,0 +1,120 @@
+//! The tasks, one file each, and the `[task]` table of a config file.
+
+use serde::{Deserialize, Serialize};
+
+use crate::ConfigError;
+
+pub mod walk;
+
+pub use walk::{Walk, WalkConfig};
+
+/// A task and its settings: the `[task]` table of a config file. `name` selects the task; default: `walk`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "name", rename_all = "snake_case", try_from = "toml::Table")]
+pub enum TaskConfig {
+    /// Locomotion with velocity commands.
+    Walk(WalkConfig),
+    /// Counts steps without physics, to verify and measure the transport. It has no settings.
+    Counter,
+}
+
+impl Default for TaskConfig {
+    fn default() -> Self {
+        Self::Walk(WalkConfig::default())
+    }
+}
+
+impl TaskConfig {
+    /// Names of all tasks.
+    pub const NAMES: [&str; 2] = ["walk", "counter"];
+
+    /// Returns the task of this name with default settings. Returns `None` if there is no such task.
+    pub fn named(name: &str) -> Option<Self> {
+        match name {
+            "walk" => Some(Self::default()),
+            "counter" => Some(Self::Counter),
+            _ => None,
+        }
+    }
+
+    /// Returns the name of the task.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Walk(_) => "walk",
+            Self::Counter => "counter",
+        }
+    }
+
+    /// Checks that every value is within its range.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        match self {
+            Self::Walk(config) => config.check(),
+            Self::Counter => Ok(()),
+        }
+    }
+
+    /// Returns the weight of the reward term `epistemic_uncertainty`, which needs actuator networks.
+    pub fn epistemic_uncertainty_weight(&self) -> f32 {
+        match self {
+            Self::Walk(config) => config.reward.epistemic_uncertainty,
+            Self::Counter => 0.0,
+        }
+    }
+}
+
+impl TryFrom<toml::Table> for TaskConfig {
+    type Error = String;
+
+    fn try_from(mut table: toml::Table) -> Result<Self, String> {
+        let name = table.remove("name").unwrap_or_else(|| "walk".into());
+        match name.as_str() {
+            Some("walk") => table.try_into().map(Self::Walk).map_err(|error| error.to_string().trim_end().to_owned()),
+            Some("counter") if table.is_empty() => Ok(Self::Counter),
+            Some("counter") => Err("the task `counter` has no settings besides `name`".to_owned()),
+            _ => Err(format!("`name` = {name} is not a task; possible: {}", Self::NAMES.join(", "))),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use expect_test::expect;
+
+    use super::*;
+
+    #[test]
+    fn name_selects_the_task_and_its_settings() {
+        let parse = |text: &str| toml::from_str::<TaskConfig>(text);
+        let walk = parse("tracking_sigma = 0.5").expect("valid");
+        assert_eq!(walk, TaskConfig::Walk(WalkConfig { tracking_sigma: 0.5, ..WalkConfig::default() }));
+        assert_eq!(parse("name = \"counter\"").expect("valid"), TaskConfig::Counter);
+        for task in [walk, TaskConfig::Counter] {
+            assert_eq!(parse(&toml::to_string(&task).expect("serialised")).expect("valid"), task);
+        }
+        for name in TaskConfig::NAMES {
+            assert_eq!(TaskConfig::named(name).expect("a task").name(), name);
+        }
+    }
+
+    #[test]
+    fn errors_name_the_key_and_what_is_possible() {
+        let error = |text: &str| toml::from_str::<TaskConfig>(text).expect_err("invalid").to_string();
+        expect![[r#"
+            unknown field `torques`, expected one of `track_linear_velocity`, `track_angular_velocity`, `linear_velocity_z`, `angular_velocity_xy`, `flat_orientation`, `joint_torque`, `joint_acceleration`, `action_rate`, `joint_position_limits`, `feet_air_time`, `undesired_contact`, `stand_still`, `epistemic_uncertainty`
+            in `reward`
+        "#]].assert_eq(&error("[reward]\ntorques = -1.0"));
+        expect![[r#"
+            `name` = "fly" is not a task; possible: walk, counter
+        "#]]
+        .assert_eq(&error("name = \"fly\""));
+        expect![[r#"
+            the task `counter` has no settings besides `name`
+        "#]]
+        .assert_eq(&error("name = \"counter\"\ntracking_sigma = 0.5"));
+    }
+
+    #[test]
+    fn defaults_are_valid() {
+        assert_eq!(TaskConfig::default().check(), Ok(()));
+    }
+}
