@@ -21,7 +21,7 @@ fn any_entry() -> impl Strategy<Value = EffectEntry> {
                 Target::Joints => Scope::of_joints(),
                 Target::Supply => vec![Scope::All],
                 Target::Bodies => bodies.collect(),
-                Target::Base => vec![Scope::Base],
+                Target::Imu => vec![Scope::Base],
                 Target::Ground => vec![Scope::Ground],
             };
             let parameters = effect.parameters.iter().flat_map(|one| std::iter::repeat_n(one, one.count));

@@ -58,7 +58,7 @@ fn rms(one: &[PerJoint], other: &[PerJoint]) -> f32 {
 fn entry(effect: &'static Effect) -> EffectEntry {
     let scope = match effect.target {
         Target::Joints | Target::Supply => Scope::All,
-        Target::Bodies | Target::Base => Scope::Base,
+        Target::Bodies | Target::Imu => Scope::Base,
         Target::Ground => Scope::Ground,
     };
     let values = effect.parameters.iter().flat_map(|parameter| {

@@ -263,7 +263,7 @@ fn serve_simulates_robots_with_the_ensemble_of_its_model() {
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
     let arguments = ["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "8", "--model", model.to_str().unwrap()];
     let (_server, endpoint) = Process::listening(&programs.0.join("twinstep"), &arguments.map(str::to_owned)).unwrap();
-    let options = ConnectOptions { max_episode_steps: Some(6), ..ConnectOptions::new(&endpoint, ENVS) };
+    let options = ConnectOptions { max_episode_steps: Some(6), critic: true, ..ConnectOptions::new(&endpoint, ENVS) };
     let mut remote = RemoteVecEnv::connect(&options).unwrap();
     let mut default = Config::default();
     default.server.model = Some(model);

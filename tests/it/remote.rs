@@ -10,8 +10,7 @@ use twinstep_protocol::ErrorCode;
 use twinstep_sim::Engine;
 
 pub fn config(task: TaskConfig) -> Config {
-    let mut config = Config::default();
-    config.task = task;
+    let mut config = Config { task, ..Config::default() };
     config.server.listen = "tcp/127.0.0.1:0".to_owned();
     config.server.envs = 64;
     config.server.seed = Some(1);
@@ -104,7 +103,8 @@ fn walk_on_the_batch_engine_passes_the_checker() {
 fn remote_and_local_walk_are_bitwise_identical() {
     let config = config(TaskConfig::default());
     let (server, endpoint) = start(&config);
-    let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
+    let options = ConnectOptions { critic: true, ..ConnectOptions::new(&endpoint, 2) };
+    let mut remote = RemoteVecEnv::connect(&options).unwrap();
     let mut local = SimEnvFactory::new(config).unwrap().build(2, AutoresetMode::NextStep, None).unwrap();
     let request = ResetRequest::seeded(5, 2);
     assert_eq!(remote.reset(&request).unwrap(), local.reset(&request).unwrap());

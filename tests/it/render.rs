@@ -21,7 +21,8 @@ fn remote_and_local_scenes_are_equal_and_rendering_does_not_change_the_episode()
     let config = config(TaskConfig::default());
     let (server, endpoint) = start(&config);
     let host = SimEnvFactory::new(config).unwrap();
-    let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
+    let options = ConnectOptions { critic: true, ..ConnectOptions::new(&endpoint, 2) };
+    let mut remote = RemoteVecEnv::connect(&options).unwrap();
     let mut local = host.build(2, AutoresetMode::NextStep, None).unwrap();
     let mut unrendered = host.build(2, AutoresetMode::NextStep, None).unwrap();
     let request = ResetRequest::seeded(5, 2);

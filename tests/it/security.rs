@@ -14,8 +14,7 @@ use twinstep_tests::security::SecurityFolder;
 ///
 /// A client whose liveliness token is not visible to the server then loses its environments.
 fn serve(protocol: &str, zenoh: &Path) -> (Server, String) {
-    let mut config = Config::default();
-    config.task = TaskConfig::Counter;
+    let mut config = Config { task: TaskConfig::Counter, ..Config::default() };
     config.server.listen = format!("{protocol}/127.0.0.1:0");
     config.server.zenoh = Some(zenoh.to_owned());
     config.server.lease_grace_s = 0.0;

@@ -55,7 +55,7 @@ fn text(effect: &Effect) -> String {
         Target::Joints => "all, hip, thigh, calf, FL, FR, RL, RR, left, right, or a joint such as FL_hip",
         Target::Supply => "all",
         Target::Bodies => "base, or a joint for its child link",
-        Target::Base => "base",
+        Target::Imu => "base",
         Target::Ground => "ground",
     };
     lines.push(format!("  scopes     {scopes}"));

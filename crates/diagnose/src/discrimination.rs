@@ -34,6 +34,11 @@ impl HypothesisPair {
         Self { model, sides: sides.map(|(effect, scope, values)| Hypothesis { effect, scope, values }) }
     }
 
+    /// Returns the effects of both hypotheses.
+    pub fn effects(&self) -> [&'static Effect; 2] {
+        self.sides.each_ref().map(|side| side.effect)
+    }
+
     /// Returns the names of the hypotheses, as in `armature@calf`.
     pub fn names(&self) -> [String; 2] {
         self.sides.each_ref().map(Hypothesis::name)

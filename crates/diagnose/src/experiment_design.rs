@@ -14,8 +14,6 @@ use crate::findings::{CorrelatedPair, DiscriminatedPair, NextExperiment};
 
 /// Maximum number of pairs of causes; each is simulated with every trajectory.
 const MAX_PAIRS: usize = 4;
-/// Effects that are not predicted, because voltage and temperature are not simulated.
-const NOT_PREDICTED: [&str; 2] = ["supply_sag", "thermal_derating"];
 
 /// Proposed experiment with its commands.
 #[derive(Clone, Debug)]
@@ -79,10 +77,7 @@ pub fn pairs(extended: &ModelFile, accepted: &Accepted, confusable: &[Correlated
         });
         pairs.extend(one.zip(other).map(|(one, other)| hypothesis_pair(extended, one, other)));
     }
-    pairs.retain(|pair| {
-        let known = |name: String| NOT_PREDICTED.iter().all(|other| !name.starts_with(other));
-        pair.names().into_iter().all(known)
-    });
+    pairs.retain(|pair| pair.effects().iter().all(|effect| effect.search.predictable));
     pairs.truncate(MAX_PAIRS);
     pairs
 }

@@ -1,7 +1,7 @@
 //! Forward selection of causes with backward elimination.
 
 use twinstep_effects::ModelFile;
-use twinstep_effects::Target;
+use twinstep_effects::{Probes, Target};
 use twinstep_model::{Joint, RobotModel, Rollout};
 
 use super::DiagnoseError;
@@ -211,8 +211,8 @@ fn affected_channels(hypothesis: &Hypothesis) -> Vec<Vec<usize>> {
             let joints = || Joint::ALL.into_iter().filter(|joint| hypothesis.scope.contains(*joint));
             [0, TORQUE].map(|first| joints().map(|joint| first + joint.index()).collect()).to_vec()
         }
-        Target::Base if hypothesis.effect.name == "gyro_bias" => vec![(GYRO..CHANNELS).collect()],
-        Target::Base | Target::Bodies | Target::Ground => vec![(0..TORQUE).chain(TRUNK..GYRO).collect()],
+        Target::Imu => vec![(GYRO..CHANNELS).collect()],
+        Target::Bodies | Target::Ground => vec![(0..TORQUE).chain(TRUNK..GYRO).collect()],
         Target::Supply => Vec::new(),
     }
 }
@@ -230,11 +230,12 @@ pub fn write_estimates(accepted: &mut Accepted, fit: &FitProblem, point: &[f64])
 /// Joints, bodies and encoder offsets are ranked separately, because the scan evaluates them on different rows.
 fn candidates(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<Hypothesis> {
     let scored = scan(evidence, model, simulator).into_iter().filter(|scored| scored.score > 0.0);
-    let (offsets, others): (Vec<_>, Vec<_>) =
-        scored.partition(|scored| scored.hypothesis.effect.name == "encoder_offset");
-    let (joints, whole): (Vec<_>, Vec<_>) = others
-        .into_iter()
-        .partition(|scored| matches!(scored.hypothesis.effect.target, Target::Joints | Target::Supply));
+    let of_joints =
+        |scored: &ScoredHypothesis| matches!(scored.hypothesis.effect.target, Target::Joints | Target::Supply);
+    let (offsets, others): (Vec<_>, Vec<_>) = scored.partition(|scored| {
+        of_joints(scored) && !matches!(scored.hypothesis.effect.search.whole_log_probes, Probes::None)
+    });
+    let (joints, whole): (Vec<_>, Vec<_>) = others.into_iter().partition(of_joints);
     let tried = |scored: Vec<ScoredHypothesis>, most: usize| {
         let least = 0.3 * scored.first().map_or(0.0, |best| best.score);
         scored.into_iter().filter(move |scored| scored.score >= least).take(most).map(|scored| scored.hypothesis)

@@ -4,10 +4,10 @@
 //! score of a scope is the sum over its joints. Effects on base, ground and gyroscope are evaluated on the whole log.
 
 use twinstep_effects::ModelFile;
-use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Scope, Target};
+use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Probes, Scope, Target};
 use twinstep_model::{Joint, RobotModel, Rollout};
 
-use super::hypothesis::{Hypothesis, body_grid, fine_grid, grid, selection_penalty, with_effect};
+use super::hypothesis::{Hypothesis, fine_probes, selection_penalty, with_effect};
 use super::residual_data::ResidualData;
 use super::residual_power::{CHANNELS, ResidualPower, TORQUE};
 
@@ -50,7 +50,8 @@ fn scan_effect(
         let robot = with_effect(model, effect, &values).ok()?.robot_model().ok()?;
         Some((values, robot))
     };
-    let (values, robots): (Vec<_>, Vec<_>) = grid(effect).into_iter().filter_map(built).unzip();
+    let (values, robots): (Vec<_>, Vec<_>) =
+        effect.probe_values(effect.search.probes).into_iter().filter_map(built).unzip();
     let gains: Vec<_> = evidence
         .residual_powers(simulator, &robots, true)
         .iter()
@@ -100,7 +101,7 @@ pub fn confounders_of(
         alike && effect.target == best.effect.target && is_new(effect) && evidence.has_required_torque(effect)
     });
     let first = |effect: &'static Effect| {
-        let at = fine_grid(effect);
+        let at = fine_probes(effect);
         Some(Hypothesis {
             effect,
             scope: best.scope,
@@ -121,11 +122,11 @@ pub fn refine_delay_grid(
     simulator: &mut dyn Rollout,
 ) -> Hypothesis {
     let Hypothesis { effect, scope, mut values } = hypothesis;
-    if !["command_delay", "torque_delay", "drive_lag"].contains(&effect.name) {
+    if !effect.search.oscillates {
         return Hypothesis { effect, scope, values };
     }
     let [least, most] = effect.parameters[0].bounds;
-    let mut tried = fine_grid(effect);
+    let mut tried = fine_probes(effect);
     tried.push(values.clone());
     for around in [[0.88, 0.94, 1.06, 1.12], [0.97, 0.985, 1.015, 1.03]] {
         let Some(best) = best_values(evidence, model, effect, scope, tried, before, simulator) else { break };
@@ -170,18 +171,21 @@ pub fn log_likelihood_gain(evidence: &ResidualData, now: &ResidualPower, before:
     (0..CHANNELS).map(of).sum::<f64>() + now.tolerated_gain(before)
 }
 
-/// Returns effects on base and ground, and encoder offsets, with their scopes.
+/// Returns the effects that are evaluated on the whole log, with their scopes.
 ///
-/// Encoder offsets are included because with a fixed base they are visible only through gravity.
-fn body_effects() -> Vec<(&'static Effect, Scope)> {
-    let named = |name: &str| Effect::named(name).expect("an effect of the catalogue");
-    let whole = ["payload", "com_shift", "gyro_bias"].map(|name| (named(name), Scope::Base));
-    let ground = ["ground_friction", "ground_stiffness"].map(|name| (named(name), Scope::Ground));
-    let offsets = Scope::of_joints().into_iter().map(|scope| (named("encoder_offset"), scope));
-    whole.into_iter().chain(ground).chain(offsets).collect()
+/// Encoder offsets are among them because with a fixed base they are visible only through gravity.
+fn whole_log_effects() -> Vec<(&'static Effect, Scope)> {
+    let scopes = |effect: &Effect| match effect.target {
+        Target::Joints => Scope::of_joints(),
+        Target::Supply => vec![Scope::All],
+        Target::Bodies | Target::Imu => vec![Scope::Base],
+        Target::Ground => vec![Scope::Ground],
+    };
+    let effects = CATALOGUE.into_iter().filter(|effect| !matches!(effect.search.whole_log_probes, Probes::None));
+    effects.flat_map(|effect| scopes(effect).into_iter().map(move |scope| (effect, scope))).collect()
 }
 
-/// Scans the effects of [`body_effects`].
+/// Scans the effects of [`whole_log_effects`].
 fn scan_whole(
     evidence: &ResidualData,
     model: &ModelFile,
@@ -190,13 +194,14 @@ fn scan_whole(
 ) -> Vec<ScoredHypothesis> {
     let before = evidence.residual_power(simulator, robot);
     let mut scored = Vec::new();
-    for (effect, scope) in body_effects() {
+    for (effect, scope) in whole_log_effects() {
         let built = |values: Vec<f64>| {
             let mut file = model.clone();
             file.effects.push(EffectEntry::new(effect, scope, values.clone()).ok()?);
             Some((values, file.robot_model().ok()?))
         };
-        let (values, robots): (Vec<_>, Vec<_>) = body_grid(effect).into_iter().filter_map(built).unzip();
+        let (values, robots): (Vec<_>, Vec<_>) =
+            effect.probe_values(effect.search.whole_log_probes).into_iter().filter_map(built).unzip();
         let gains = evidence
             .residual_powers(simulator, &robots, false)
             .into_iter()

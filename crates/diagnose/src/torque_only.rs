@@ -11,7 +11,7 @@ use twinstep_logs::Log;
 use twinstep_model::RobotModel;
 
 use super::forward_selection::{MAX_REMAINING_FRACTION, MIN_EXPLAINED_FRACTION, NEGLIGIBLE_EXCESS, THRESHOLD};
-use super::hypothesis::{Hypothesis, grid, selection_penalty};
+use super::hypothesis::{Hypothesis, selection_penalty};
 use super::joint_slots::JointSlots;
 use super::residual_power::{ResidualPower, TORQUE};
 use super::torque_fit::{TorqueCandidate, TorqueFit};
@@ -153,7 +153,8 @@ impl TorqueForwardSelection<'_, '_> {
                 let entry = EffectEntry::new(effect, Scope::All, values.clone()).ok()?;
                 Some((values, self.slots.robot(&[entries, &[entry]].concat())?))
             };
-            let (values, robots): (Vec<_>, Vec<_>) = grid(effect).into_iter().filter_map(with).unzip();
+            let (values, robots): (Vec<_>, Vec<_>) =
+                effect.probe_values(effect.search.probes).into_iter().filter_map(with).unzip();
             if !robots.iter().any(|robot| self.slots.affects_torque(robot, &now)) {
                 continue;
             }

@@ -78,7 +78,7 @@ impl EffectEntry {
             }
             Target::Supply => (scope == Scope::All, "all"),
             Target::Bodies => (matches!(scope, Scope::Base | Scope::Joint(_)), "base, or a joint for its child link"),
-            Target::Base => (scope == Scope::Base, "base"),
+            Target::Imu => (scope == Scope::Base, "base"),
             Target::Ground => (scope == Scope::Ground, "ground"),
         };
         if !fits {
@@ -122,9 +122,9 @@ impl EffectEntry {
 /// Returns `robot` with the effects of `entries`, combined by their [`Composition`].
 pub fn apply_effects(robot: &RobotModel, entries: &[EffectEntry]) -> Result<RobotModel, EntryError> {
     let mut composed = robot.clone();
-    // `inertia` replaces a body, so it is applied before effects that add to the body.
+    // An effect that replaces a body is applied before effects that add to the body.
     let (whole, others): (Vec<_>, Vec<_>) =
-        entries.iter().enumerate().partition(|(_, entry)| entry.effect.name == "inertia");
+        entries.iter().enumerate().partition(|(_, entry)| entry.effect.replaces_body());
     for (index, entry) in whole.into_iter().chain(others) {
         entry.check()?;
         for site in entry.sites() {

@@ -2,6 +2,7 @@
 //!
 //! - [`Effect`]: an effect of the catalogue: equation, parameters, signature in data, confounders, and the change of a
 //!   [`RobotModel`]. One file per effect.
+//! - [`Search`], [`Visibility`], [`Variable`], [`demo`]: how diagnosis searches for an effect and how it is plotted.
 //! - [`CATALOGUE`]: all effects, in the order of the chain from command to motion.
 //! - [`Scope`]: the joints or the part of the robot to which an entry of a model file applies.
 //! - [`EffectEntry`]: an effect with a scope and values; [`apply_effects`] applies several to a robot.
@@ -12,19 +13,24 @@
 
 mod catalogue;
 mod data_requirement;
+pub mod demo;
 mod entry;
 mod model_file;
 mod sampler;
 mod scope;
+mod search;
 
 pub use catalogue::CATALOGUE;
 pub use data_requirement::{DataRequirement, LOW_SPEED};
+pub use demo::{DemoMotion, EffectDemo, PlotQuantity};
 pub use entry::{EffectEntry, EntryError, apply_effects};
 pub use model_file::{
     ActuatorNetworkConfig, EffectEntryError, MemberSampling, ModelFile, ModelFileError, load_robot, parse_robot,
 };
 pub use sampler::{RobotSampler, SamplingError};
 pub use scope::{Scope, UnknownScope};
+pub use search::{BlindTestCondition, Probes, Search, Variable, Visibility};
+use search::{probes_along_axes, probes_over};
 
 use twinstep_model::RobotModel;
 
@@ -55,6 +61,16 @@ pub struct Effect {
     pub recommended: &'static [DataRequirement],
     /// Caveat to any conclusion about the effect; empty for none.
     pub caveat: &'static str,
+    /// How diagnosis searches for it.
+    pub search: Search,
+    /// Residual in which it is visible.
+    pub visibility: Visibility,
+    /// Variable that explains its residual.
+    pub explained_by: Variable,
+    /// Motion and quantities of its plot.
+    pub demo: EffectDemo,
+    /// What a log of the blind test must contain for it to be hidden there. `None`: it is not hidden.
+    pub blind_test: Option<&'static [BlindTestCondition]>,
     /// Applies the values to the robot at one site. The values of a parameter are contiguous.
     pub apply: fn(&mut RobotModel, EffectSite, &[f64]) -> Result<(), &'static str>,
 }
@@ -98,8 +114,8 @@ pub enum Target {
     Supply,
     /// The trunk, or the child link of a joint.
     Bodies,
-    /// The trunk.
-    Base,
+    /// The inertial measurement unit in the trunk.
+    Imu,
     /// The ground.
     Ground,
 }
@@ -126,6 +142,26 @@ impl Effect {
     /// Returns the effect of this name. Returns `None` if the catalogue has no such effect.
     pub fn named(name: &str) -> Option<&'static Effect> {
         CATALOGUE.into_iter().find(|effect| effect.name == name)
+    }
+
+    /// Returns true if it replaces a body, so that effects that change the body are applied after it.
+    pub fn replaces_body(&self) -> bool {
+        self.composition == Composition::Replace && self.target == Target::Bodies
+    }
+
+    /// Returns the values of `probes`, from small to large.
+    pub fn probe_values(&self, probes: Probes) -> Vec<Vec<f64>> {
+        let first = &self.parameters[0];
+        match probes {
+            Probes::FirstParameter(others) => {
+                let [least, most] = first.bounds;
+                let values = probes_over(first.prior_range, first.no_effect_value);
+                let values = values.into_iter().map(|value| value.clamp(least, most));
+                values.flat_map(|value| others.iter().map(move |others| [&[value], *others].concat())).collect()
+            }
+            Probes::Values(values) => values(),
+            Probes::None => Vec::new(),
+        }
     }
 
     /// Returns the number of components of all parameters.

@@ -521,7 +521,7 @@ mod tests {
                 let scope = match effect.target {
                     Target::Joints => Scope::of_joints()[scope],
                     Target::Supply => Scope::All,
-                    Target::Bodies | Target::Base => Scope::Base,
+                    Target::Bodies | Target::Imu => Scope::Base,
                     Target::Ground => Scope::Ground,
                 };
                 let parameters =

@@ -17,7 +17,7 @@ fn entry(name: &str, scope: &str, values: &[f64]) -> EffectEntry {
 fn some_scope(effect: &Effect) -> Scope {
     match effect.target {
         Target::Joints | Target::Supply => Scope::All,
-        Target::Bodies | Target::Base => Scope::Base,
+        Target::Bodies | Target::Imu => Scope::Base,
         Target::Ground => Scope::Ground,
     }
 }
@@ -34,6 +34,20 @@ fn names_are_unique_and_confounders_are_in_the_catalogue() {
             let [from, to] = parameter.prior_range;
             assert!(low <= from && from < to && to <= high, "{}.{}", effect.name, parameter.name);
         }
+    }
+}
+
+#[test]
+fn probes_are_allowed_values_and_every_effect_but_one_has_some() {
+    for effect in CATALOGUE {
+        let probes = [effect.search.probes, effect.search.whole_log_probes].map(|probes| effect.probe_values(probes));
+        for values in probes.iter().flatten() {
+            EffectEntry::new(effect, some_scope(effect), values.clone()).expect(effect.name);
+        }
+        let count = probes.concat().len();
+        assert_eq!(count == 0, effect.name == "inertia", "{} has {count} probes", effect.name);
+        // The scan of joints evaluates each joint alone, which effects on base and ground do not allow.
+        assert!(probes[0].is_empty() || matches!(effect.target, Target::Joints | Target::Supply), "{}", effect.name);
     }
 }
 

@@ -80,7 +80,7 @@ pub fn free_parameters(
         let own = file.effects.iter().rfind(|entry| entry.effect == *effect && entry.scope == *scope);
         let start = match own {
             Some(entry) if effect.composition == Composition::Replace => entry.values.clone(),
-            _ if effect.name == "inertia" => nominal_inertia(model, *scope)?,
+            _ if effect.replaces_body() => nominal_inertia(model, *scope)?,
             _ => start,
         };
         if effect.composition == Composition::Replace {
@@ -94,7 +94,7 @@ pub fn free_parameters(
                 let inverse = parameter.no_effect_value.is_infinite();
                 let [low, high] = parameter.prior_range.map(|value| if inverse { 1.0 / value } else { value });
                 let (low, high) = if inverse { (0.0, low) } else { (low, high) };
-                let inertia = effect.name == "inertia";
+                let inertia = effect.replaces_body();
                 let mean = if inertia { start[component_index] } else { 0.5 * (low + high) };
                 let std = if inertia { INERTIA_PRIOR[component_index] } else { (high - low).abs() / 3.92 };
                 unknowns.push(FreeParameter {

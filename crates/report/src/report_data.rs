@@ -1,7 +1,7 @@
 //! Data of the report: errors of the given and the extended model on one log, and the law of each cause.
 
 use twinstep_effects::ModelFile;
-use twinstep_effects::{CATALOGUE, EffectEntry, EntryError, Target, apply_effects};
+use twinstep_effects::{EffectEntry, EntryError, Target, Visibility, apply_effects};
 use twinstep_identify::{
     Evaluation, ExperimentError, InverseDynamicsResidual, JointSeries, JointTrajectory, evaluate, position_errors,
 };
@@ -207,18 +207,15 @@ enum Residual {
 
 /// Returns the residual in which `entry` is most visible: torque for effects before the torque sensor, else motion.
 fn best_residual(log: &Log, entry: &EffectEntry) -> Residual {
-    let chain = |name: &str| CATALOGUE.iter().position(|effect| effect.name == name);
-    let at_motor = chain(entry.effect.name) <= chain("torque_sensor_delay");
     let fixed_base = log.segments().all(|(segment, _)| segment.base == twinstep_model::BaseMount::Fixed);
     let of_joints = matches!(entry.effect.target, Target::Joints | Target::Supply);
-    if !of_joints || matches!(entry.effect.name, "backlash" | "joint_elasticity") {
-        return Residual::Position;
-    }
-    let sensor = log.meta().tau_sensor;
     let measured = log.joints().iter().any(|joint| log.tau_measured(joint).is_some());
-    match (measured, sensor) {
-        (true, TorqueSensor::JointOutput) if entry.effect.name != "joint_spring" => Residual::Torque,
-        (true, TorqueSensor::MotorCurrent) if at_motor => Residual::Torque,
+    let sensor = if measured { log.meta().tau_sensor } else { TorqueSensor::None };
+    match (entry.effect.visibility, sensor) {
+        (Visibility::Position, _) => Residual::Position,
+        _ if !of_joints => Residual::Position,
+        (Visibility::MotorTorque, TorqueSensor::MotorCurrent | TorqueSensor::JointOutput)
+        | (Visibility::OutputTorque, TorqueSensor::JointOutput) => Residual::Torque,
         _ if fixed_base => Residual::Unexplained,
         _ => Residual::Position,
     }

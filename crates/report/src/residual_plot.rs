@@ -1,6 +1,6 @@
 //! Residual of a log over the variable that explains it, with the part that a cause explains.
 
-use twinstep_effects::{EffectEntry, Target};
+use twinstep_effects::{EffectEntry, Target, Variable};
 use twinstep_identify::{JointSeries, JointTrajectory};
 use twinstep_logs::Log;
 use twinstep_logs::replay::{JointCommands, cell_or_zero};
@@ -37,72 +37,44 @@ pub struct Bin {
     pub law: f64,
 }
 
-/// Variable on which an effect depends.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Variable {
-    Position,
-    Velocity,
-    Acceleration,
-    /// Torque of an actuator without effects.
-    CommandedTorque,
-    CommandedTorqueRate,
-    CommandRate,
-    /// Magnitude of that torque with the sign of the velocity.
-    Load,
-    Voltage,
-    Temperature,
-    Time,
+/// Returns the name of a variable, with its unit.
+fn label(variable: Variable) -> &'static str {
+    match variable {
+        Variable::Position => "joint position [rad]",
+        Variable::Velocity => "joint velocity [rad/s]",
+        Variable::Acceleration => "joint acceleration [rad/s²]",
+        Variable::CommandedTorque => "torque of the ideal actuator [N·m]",
+        Variable::CommandedTorqueRate => "rate of the ideal actuator's torque [N·m/s]",
+        Variable::CommandRate => "rate of the commanded position [rad/s]",
+        Variable::Load => "torque magnitude, sign of the velocity [N·m]",
+        Variable::Voltage => "battery voltage [V]",
+        Variable::Temperature => "motor temperature [°C]",
+        Variable::Time => "time [s]",
+    }
 }
 
-impl Variable {
-    /// Returns the variable that explains an entry.
-    pub fn of(entry: &EffectEntry) -> Self {
-        match entry.effect.name {
-            "coulomb_friction" | "viscous_friction" | "stribeck_friction" | "torque_speed_limit" => Self::Velocity,
-            "joint_spring" | "torque_ripple" | "encoder_offset" => Self::Position,
-            "torque_gain" | "torque_saturation" | "backlash" | "joint_elasticity" => Self::CommandedTorque,
-            "torque_delay" | "drive_lag" | "torque_sensor_delay" => Self::CommandedTorqueRate,
-            "command_delay" => Self::CommandRate,
-            "armature" => Self::Acceleration,
-            "load_friction" => Self::Load,
-            "supply_sag" => Self::Voltage,
-            "thermal_derating" => Self::Temperature,
-            _ => Self::Time,
-        }
-    }
-
-    fn label(self) -> &'static str {
-        match self {
-            Self::Position => "joint position [rad]",
-            Self::Velocity => "joint velocity [rad/s]",
-            Self::Acceleration => "joint acceleration [rad/s²]",
-            Self::CommandedTorque => "torque of the ideal actuator [N·m]",
-            Self::CommandedTorqueRate => "rate of the ideal actuator's torque [N·m/s]",
-            Self::CommandRate => "rate of the commanded position [rad/s]",
-            Self::Load => "torque magnitude, sign of the velocity [N·m]",
-            Self::Voltage => "battery voltage [V]",
-            Self::Temperature => "motor temperature [°C]",
-            Self::Time => "time [s]",
-        }
-    }
-
-    /// Returns the value of the variable in every row.
-    fn values(self, log: &Log, robot: &RobotModel, joint: &JointCommands, kinematics: &JointTrajectory) -> Vec<f64> {
-        let index = joint.joint.index();
-        let torque = || commanded_torque(log, robot, joint, kinematics);
-        let channel = |name: &str| log.channel(name).map_or(Vec::new(), <[f64]>::to_vec);
-        match self {
-            Self::Position => kinematics.q[index].clone(),
-            Self::Velocity => kinematics.dq[index].clone(),
-            Self::Acceleration => kinematics.ddq[index].clone(),
-            Self::CommandedTorque => torque(),
-            Self::CommandedTorqueRate => rates(log, &torque()),
-            Self::CommandRate => rates(log, joint.q_cmd),
-            Self::Load => torque().iter().zip(&kinematics.dq[index]).map(|(tau, dq)| tau.abs() * dq.signum()).collect(),
-            Self::Voltage => channel("battery_V"),
-            Self::Temperature => channel(&format!("temp_{}", joint.joint)),
-            Self::Time => log.t().to_vec(),
-        }
+/// Returns the value of a variable in every row.
+fn values(
+    variable: Variable,
+    log: &Log,
+    robot: &RobotModel,
+    joint: &JointCommands,
+    kinematics: &JointTrajectory,
+) -> Vec<f64> {
+    let index = joint.joint.index();
+    let torque = || commanded_torque(log, robot, joint, kinematics);
+    let channel = |name: &str| log.channel(name).map_or(Vec::new(), <[f64]>::to_vec);
+    match variable {
+        Variable::Position => kinematics.q[index].clone(),
+        Variable::Velocity => kinematics.dq[index].clone(),
+        Variable::Acceleration => kinematics.ddq[index].clone(),
+        Variable::CommandedTorque => torque(),
+        Variable::CommandedTorqueRate => rates(log, &torque()),
+        Variable::CommandRate => rates(log, joint.q_cmd),
+        Variable::Load => torque().iter().zip(&kinematics.dq[index]).map(|(tau, dq)| tau.abs() * dq.signum()).collect(),
+        Variable::Voltage => channel("battery_V"),
+        Variable::Temperature => channel(&format!("temp_{}", joint.joint)),
+        Variable::Time => log.t().to_vec(),
     }
 }
 
@@ -122,13 +94,13 @@ pub struct Residuals<'a> {
 impl Residuals<'_> {
     /// Returns the residual plot of `entry`. Returns `None` if fewer than two bins have enough rows.
     pub fn law(&self, entry: &EffectEntry) -> Option<ResidualPlot> {
-        let variable = Variable::of(entry);
+        let variable = entry.effect.explained_by;
         let of_bodies = !matches!(entry.effect.target, Target::Joints | Target::Supply);
         let is_affected = |joint: Joint| of_bodies || entry.scope.contains(joint);
         let mut points = Vec::new();
         for joint in self.joints.iter().filter(|joint| is_affected(joint.joint)) {
             let index = joint.joint.index();
-            let x = variable.values(self.log, self.robot, joint, self.kinematics);
+            let x = values(variable, self.log, self.robot, joint, self.kinematics);
             for (x, (without, with)) in x.iter().zip(self.without[index].iter().zip(&self.with[index])) {
                 if x.is_finite() && without.is_finite() && with.is_finite() {
                     // Over time the magnitude is plotted: residuals of different joints would cancel.
@@ -139,7 +111,7 @@ impl Residuals<'_> {
         }
         let bins = bins(points);
         let cause = (entry.effect.name.to_owned(), entry.scope.to_string());
-        (bins.len() > 1).then_some(ResidualPlot { cause, x_label: variable.label(), y_label: self.y_label, bins })
+        (bins.len() > 1).then_some(ResidualPlot { cause, x_label: label(variable), y_label: self.y_label, bins })
     }
 }
 

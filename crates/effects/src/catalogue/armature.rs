@@ -1,6 +1,9 @@
 //! Rotor inertia reflected through the gear to the joint.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "armature",
@@ -34,6 +37,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::Rate(100.0), DataRequirement::Bandwidth(1.0)],
     recommended: &[DataRequirement::Bandwidth(3.0)],
     caveat: "confounded with a delay: two spectra, or the first 10 ms of a step, discriminate",
+    search: Search::DEFAULT,
+    visibility: Visibility::OutputTorque,
+    explained_by: Variable::Acceleration,
+    demo: EffectDemo {
+        motion: &demo::CHIRP,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::Acceleration, PlotQuantity::InverseDynamicsResidual],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| {
         crate::joint(robot, site).armature += values[0];
         Ok(())

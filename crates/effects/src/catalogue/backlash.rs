@@ -1,6 +1,9 @@
 //! Backlash in the gear between rotor and link.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "backlash",
@@ -36,6 +39,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::Rate(200.0)],
     recommended: &[DataRequirement::LowSpeed, DataRequirement::TorqueMeasured],
     caveat: "visible where the load changes sign",
+    search: Search::DEFAULT,
+    visibility: Visibility::Position,
+    explained_by: Variable::CommandedTorque,
+    demo: EffectDemo {
+        motion: &demo::CHIRP,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::Time, PlotQuantity::InverseDynamicsResidual],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| {
         crate::joint(robot, site).actuator.backlash = values[0];
         Ok(())

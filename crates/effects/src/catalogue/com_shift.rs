@@ -2,7 +2,10 @@
 
 use glam::DVec3;
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
+    Search, Target, Variable, Visibility, demo, probes_along_axes,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "com_shift",
@@ -32,6 +35,20 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Floating],
     recommended: &[DataRequirement::Orientation, DataRequirement::TorqueMeasured],
     caveat: "",
+    search: Search {
+        probes: Probes::None,
+        whole_log_probes: Probes::Values(|| probes_along_axes(0.05)),
+        min_share: 0.12,
+        ..Search::DEFAULT
+    },
+    visibility: Visibility::Position,
+    explained_by: Variable::Time,
+    demo: EffectDemo {
+        motion: &demo::SLOW_SQUATS,
+        over_time: PlotQuantity::Pitch,
+        law: [PlotQuantity::Time, PlotQuantity::FrontShare],
+    },
+    blind_test: Some(&[BlindTestCondition::FloatingBase]),
     apply: |robot, site, values| {
         crate::body(robot, site).com += DVec3::new(values[0], values[1], values[2]);
         Ok(())

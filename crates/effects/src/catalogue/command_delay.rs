@@ -1,6 +1,9 @@
 //! Delay between a command and its arrival at the actuator.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "command_delay",
@@ -40,5 +43,14 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::Rate(100.0)],
     recommended: &[DataRequirement::Bandwidth(2.0)],
     caveat: "confounded with armature in slow motion",
+    search: Search { oscillates: true, ..Search::DEFAULT },
+    visibility: Visibility::MotorTorque,
+    explained_by: Variable::CommandRate,
+    demo: EffectDemo {
+        motion: &demo::CHIRP,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| crate::delayed(&mut crate::joint(robot, site).actuator.command_delay, values[0]),
 };

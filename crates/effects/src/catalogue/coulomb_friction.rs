@@ -1,6 +1,9 @@
 //! Dry friction, independent of speed, which also holds the joint at rest.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "coulomb_friction",
@@ -42,6 +45,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    search: Search::DEFAULT,
+    visibility: Visibility::OutputTorque,
+    explained_by: Variable::Velocity,
+    demo: EffectDemo {
+        motion: &demo::SWING,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::Velocity, PlotQuantity::InverseDynamicsResidual],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| {
         crate::joint(robot, site).coulomb_friction += values[0];
         Ok(())

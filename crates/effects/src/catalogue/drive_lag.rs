@@ -1,6 +1,9 @@
 //! The motor current follows its setpoint as a first-order lag.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "drive_lag",
@@ -38,6 +41,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::Rate(200.0), DataRequirement::Bandwidth(2.0)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "its gain falls with frequency, that of a delay does not",
+    search: Search { oscillates: true, ..Search::DEFAULT },
+    visibility: Visibility::MotorTorque,
+    explained_by: Variable::CommandedTorqueRate,
+    demo: EffectDemo {
+        motion: &demo::CHIRP,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| {
         crate::joint(robot, site).actuator.torque_time_constant = values[0];
         Ok(())

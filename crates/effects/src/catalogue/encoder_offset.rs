@@ -1,6 +1,9 @@
 //! The encoder zero is offset from the joint zero.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
+    Search, Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "encoder_offset",
@@ -35,6 +38,19 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals],
     recommended: &[DataRequirement::KpVaries],
     caveat: "confounded with a constant load at a single kp",
+    search: Search {
+        whole_log_probes: Probes::Values(|| vec![vec![-0.02], vec![0.02]]),
+        min_share: 0.3,
+        ..Search::DEFAULT
+    },
+    visibility: Visibility::MotorTorque,
+    explained_by: Variable::Position,
+    demo: EffectDemo {
+        motion: &demo::SLOW_SQUATS,
+        over_time: PlotQuantity::Height,
+        law: [PlotQuantity::Position, PlotQuantity::Height],
+    },
+    blind_test: Some(&[BlindTestCondition::FloatingBase]),
     apply: |robot, site, values| {
         crate::joint(robot, site).actuator.encoder_offset += values[0];
         Ok(())

@@ -1,6 +1,9 @@
 //! Friction coefficient of the ground.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search, Target,
+    Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "ground_friction",
@@ -26,6 +29,19 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Floating],
     recommended: &[DataRequirement::BasePose],
     caveat: "only slipping feet determine its value",
+    search: Search {
+        probes: Probes::None,
+        whole_log_probes: Probes::Values(|| [0.3, 0.5, 0.65, 1.1].map(|friction| vec![friction]).to_vec()),
+        ..Search::DEFAULT
+    },
+    visibility: Visibility::Position,
+    explained_by: Variable::Time,
+    demo: EffectDemo {
+        motion: &demo::SWAY,
+        over_time: PlotQuantity::Sideways,
+        law: [PlotQuantity::Time, PlotQuantity::LateralAcceleration],
+    },
+    blind_test: None,
     apply: |robot, _, values| {
         robot.contact.friction = values[0];
         Ok(())

@@ -1,6 +1,9 @@
 //! Compliance of the ground or of the feet.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
+    Search, Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "ground_stiffness",
@@ -28,6 +31,20 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Floating, DataRequirement::Rate(200.0)],
     recommended: &[DataRequirement::FootContact],
     caveat: "",
+    search: Search {
+        probes: Probes::None,
+        whole_log_probes: Probes::Values(|| [0.005, 0.01, 0.02, 0.04].map(|time| vec![time]).to_vec()),
+        min_share: 0.3,
+        ..Search::DEFAULT
+    },
+    visibility: Visibility::Position,
+    explained_by: Variable::Time,
+    demo: EffectDemo {
+        motion: &demo::DROP,
+        over_time: PlotQuantity::Height,
+        law: [PlotQuantity::Time, PlotQuantity::Force],
+    },
+    blind_test: Some(&[BlindTestCondition::FloatingBase]),
     apply: |robot, _, values| {
         robot.contact.time_constant = values[0];
         Ok(())

@@ -2,7 +2,10 @@
 
 use glam::DVec3;
 
-use crate::{Composition, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search,
+    Target, Variable, Visibility, demo, probes_along_axes,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "gyro_bias",
@@ -19,12 +22,25 @@ pub const EFFECT: Effect = Effect {
         source: "MEMS gyroscopes",
     }],
     composition: Composition::Add,
-    target: Target::Base,
+    target: Target::Imu,
     signature: "The measured angular velocity has a constant error, also at rest.",
     confounders: &[],
     needs: &[DataRequirement::BaseRotation(0.0)],
     recommended: &[DataRequirement::Orientation],
     caveat: "",
+    search: Search {
+        probes: Probes::None,
+        whole_log_probes: Probes::Values(|| probes_along_axes(0.02)),
+        ..Search::DEFAULT
+    },
+    visibility: Visibility::Position,
+    explained_by: Variable::Time,
+    demo: EffectDemo {
+        motion: &demo::LEAN,
+        over_time: PlotQuantity::Gyro,
+        law: [PlotQuantity::RollRate, PlotQuantity::Gyro],
+    },
+    blind_test: Some(&[BlindTestCondition::FloatingBase]),
     apply: |robot, _, values| {
         robot.gyro_bias += DVec3::new(values[0], values[1], values[2]);
         Ok(())

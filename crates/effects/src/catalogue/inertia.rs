@@ -1,6 +1,9 @@
 //! Replaces all ten inertial parameters of a body.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search, Target,
+    Variable, Visibility, demo,
+};
 use twinstep_model::RigidBody;
 
 pub const EFFECT: Effect = Effect {
@@ -34,6 +37,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Floating, DataRequirement::BaseRotation(1.0)],
     recommended: &[DataRequirement::Orientation],
     caveat: "",
+    search: Search { probes: Probes::None, ..Search::DEFAULT },
+    visibility: Visibility::Position,
+    explained_by: Variable::Time,
+    demo: EffectDemo {
+        motion: &demo::SQUATS,
+        over_time: PlotQuantity::Height,
+        law: [PlotQuantity::VerticalAcceleration, PlotQuantity::Force],
+    },
+    blind_test: None,
     apply: |robot, site, values| {
         let theta: [f64; 10] = values.try_into().expect("ten values");
         *crate::body(robot, site) = RigidBody::from_log_cholesky(&theta);

@@ -1,6 +1,9 @@
 //! Elastic gear between rotor and link.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "joint_elasticity",
@@ -33,6 +36,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Rate(500.0), DataRequirement::Bandwidth(5.0)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    search: Search::DEFAULT,
+    visibility: Visibility::Position,
+    explained_by: Variable::CommandedTorque,
+    demo: EffectDemo {
+        motion: &demo::STEP,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::Time, PlotQuantity::InverseDynamicsResidual],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| {
         crate::joint(robot, site).actuator.gear_stiffness = values[0];
         Ok(())

@@ -1,6 +1,9 @@
 //! A cable or a spring pulls the joint towards a rest position.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
+    Search, Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "joint_spring",
@@ -45,6 +48,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Range(0.5)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    search: Search { probes: Probes::FirstParameter(&[&[-1.2], &[0.0], &[1.2]]), ..Search::DEFAULT },
+    visibility: Visibility::LinkTorque,
+    explained_by: Variable::Position,
+    demo: EffectDemo {
+        motion: &demo::SWING,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::Position, PlotQuantity::InverseDynamicsResidual],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| {
         let spring = &mut crate::joint(robot, site).spring;
         spring.stiffness += values[0];

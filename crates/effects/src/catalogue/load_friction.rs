@@ -1,6 +1,9 @@
 //! Friction proportional to the magnitude of the motor torque.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "load_friction",
@@ -34,6 +37,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::Torque(0.15)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "differs from coulomb_friction only under different loads",
+    search: Search::DEFAULT,
+    visibility: Visibility::OutputTorque,
+    explained_by: Variable::Load,
+    demo: EffectDemo {
+        motion: &demo::CHIRP,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::EstimatedTorque, PlotQuantity::InverseDynamicsResidual],
+    },
+    blind_test: Some(&[BlindTestCondition::FloatingBase]),
     apply: |robot, site, values| {
         crate::joint(robot, site).load_friction += values[0];
         Ok(())

@@ -2,7 +2,10 @@
 
 use glam::DVec3;
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
+    Search, Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "payload",
@@ -46,6 +49,19 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Floating],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "a load on a leg is also identifiable with a fixed base",
+    search: Search {
+        probes: Probes::None,
+        whole_log_probes: Probes::Values(|| [-0.5, 0.3, 0.8, 2.0].map(|mass| vec![mass, 0.0, 0.0, 0.0]).to_vec()),
+        ..Search::DEFAULT
+    },
+    visibility: Visibility::Position,
+    explained_by: Variable::Time,
+    demo: EffectDemo {
+        motion: &demo::SQUATS,
+        over_time: PlotQuantity::Height,
+        law: [PlotQuantity::VerticalAcceleration, PlotQuantity::Force],
+    },
+    blind_test: Some(&[BlindTestCondition::FloatingBase]),
     apply: |robot, site, values| {
         let body = crate::body(robot, site);
         if body.mass + values[0] <= 0.0 {

@@ -1,6 +1,14 @@
 //! The gains of the PD loop differ from the commanded gains.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search, Target,
+    Variable, Visibility, demo, probes_over,
+};
+
+/// Prior range of the factor on kp.
+const KP_RANGE: [f64; 2] = [0.7, 1.3];
+/// Prior range of the factor on kd.
+const KD_RANGE: [f64; 2] = [0.5, 1.5];
 
 /// The gains of the PD loop differ from the commanded gains.
 pub const EFFECT: Effect = Effect {
@@ -14,7 +22,7 @@ pub const EFFECT: Effect = Effect {
             unit: "",
             count: 1,
             bounds: [0.1, 5.0],
-            prior_range: [0.7, 1.3],
+            prior_range: KP_RANGE,
             no_effect_value: 1.0,
             source: "legged_gym and Walk These Ways randomise the stiffness by 0.8 to 1.3",
         },
@@ -23,7 +31,7 @@ pub const EFFECT: Effect = Effect {
             unit: "",
             count: 1,
             bounds: [0.0, 10.0],
-            prior_range: [0.5, 1.5],
+            prior_range: KD_RANGE,
             no_effect_value: 1.0,
             source: "legged_gym and Walk These Ways randomise the damping by 0.5 to 1.5",
         },
@@ -48,6 +56,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::TorqueMeasured, DataRequirement::Reversals],
     recommended: &[DataRequirement::KdVaries],
     caveat: "",
+    search: Search { probes: Probes::Values(probes), ..Search::DEFAULT },
+    visibility: Visibility::MotorTorque,
+    explained_by: Variable::CommandedTorque,
+    demo: EffectDemo {
+        motion: &demo::CHIRP,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
+    },
+    blind_test: None,
     apply: |robot, site, values| {
         let actuator = &mut crate::joint(robot, site).actuator;
         actuator.kp_scale *= values[0];
@@ -55,3 +72,9 @@ pub const EFFECT: Effect = Effect {
         Ok(())
     },
 };
+
+/// Returns scales of one gain at a time, from small to large changes.
+fn probes() -> Vec<Vec<f64>> {
+    let kp = probes_over(KP_RANGE, 1.0).into_iter().map(|scale| vec![scale, 1.0]);
+    kp.chain(probes_over(KD_RANGE, 1.0).into_iter().map(|scale| vec![1.0, scale])).collect()
+}

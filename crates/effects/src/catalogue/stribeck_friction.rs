@@ -1,6 +1,9 @@
 //! Additional friction near standstill that decays with speed.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
+    Search, Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "stribeck_friction",
@@ -37,6 +40,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::LowSpeed],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    search: Search { probes: Probes::FirstParameter(&[&[0.15], &[0.6], &[2.0]]), ..Search::DEFAULT },
+    visibility: Visibility::OutputTorque,
+    explained_by: Variable::Velocity,
+    demo: EffectDemo {
+        motion: &demo::SWING,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::Velocity, PlotQuantity::InverseDynamicsResidual],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| {
         let friction = &mut crate::joint(robot, site).stribeck_friction;
         if friction.breakaway_torque > 0.0 && (friction.stribeck_velocity - values[1]).abs() > 1e-9 {

@@ -1,6 +1,9 @@
 //! Motor torque decreases with the battery voltage.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "supply_sag",
@@ -34,6 +37,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Torque(0.4), DataRequirement::Voltage(0.5)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    search: Search { predictable: false, ..Search::DEFAULT },
+    visibility: Visibility::MotorTorque,
+    explained_by: Variable::Voltage,
+    demo: EffectDemo {
+        motion: &demo::BATTERY,
+        over_time: PlotQuantity::Height,
+        law: [PlotQuantity::Voltage, PlotQuantity::DeratingFactor],
+    },
+    blind_test: Some(&[BlindTestCondition::Voltage]),
     apply: |robot, _, values| {
         robot.derating.voltage_exponent = values[0];
         Ok(())

@@ -1,6 +1,9 @@
 //! Motor torque decreases with the motor temperature.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, EffectSite, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, EffectSite, Parameter,
+    PlotQuantity, Probes, Search, Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "thermal_derating",
@@ -44,6 +47,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Torque(0.1), DataRequirement::Temperature(10.0)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    search: Search { probes: Probes::FirstParameter(&[&[35.0]]), predictable: false, ..Search::DEFAULT },
+    visibility: Visibility::MotorTorque,
+    explained_by: Variable::Temperature,
+    demo: EffectDemo {
+        motion: &demo::HEAT,
+        over_time: PlotQuantity::Height,
+        law: [PlotQuantity::Temperature, PlotQuantity::DeratingFactor],
+    },
+    blind_test: Some(&[BlindTestCondition::Temperature, BlindTestCondition::FixedBase]),
     apply: |robot, site, values| {
         if let EffectSite::Joint(index) = site {
             robot.derating.per_kelvin[index] = values[0];

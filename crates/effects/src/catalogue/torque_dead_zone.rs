@@ -1,6 +1,9 @@
 //! The motor produces no torque for small commanded torques.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search, Target, Variable,
+    Visibility, demo,
+};
 
 /// The motor produces no torque for small commanded torques.
 pub const EFFECT: Effect = Effect {
@@ -37,6 +40,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::TorqueMeasured, DataRequirement::Reversals],
     recommended: &[],
     caveat: "",
+    search: Search::DEFAULT,
+    visibility: Visibility::MotorTorque,
+    explained_by: Variable::CommandedTorque,
+    demo: EffectDemo {
+        motion: &demo::CHIRP,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
+    },
+    blind_test: None,
     apply: |robot, site, values| {
         crate::joint(robot, site).actuator.dead_zone = values[0];
         Ok(())

@@ -1,6 +1,9 @@
 //! Delay of the torque that the PD loop computes.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "torque_delay",
@@ -38,5 +41,14 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::Rate(200.0)],
     recommended: &[DataRequirement::Bandwidth(2.0), DataRequirement::TorqueMeasured],
     caveat: "differs from command_delay only if the joint is pushed",
+    search: Search { oscillates: true, ..Search::DEFAULT },
+    visibility: Visibility::MotorTorque,
+    explained_by: Variable::CommandedTorqueRate,
+    demo: EffectDemo {
+        motion: &demo::CHIRP,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| crate::delayed(&mut crate::joint(robot, site).actuator.torque_delay, values[0]),
 };

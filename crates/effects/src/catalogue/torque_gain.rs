@@ -1,6 +1,9 @@
 //! The torque constant differs from the one that converts motor current to torque.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "torque_gain",
@@ -37,6 +40,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals],
     recommended: &[DataRequirement::TorqueMeasured, DataRequirement::Torque(0.1)],
     caveat: "confounded with a wrong kp or mass",
+    search: Search::DEFAULT,
+    visibility: Visibility::OutputTorque,
+    explained_by: Variable::CommandedTorque,
+    demo: EffectDemo {
+        motion: &demo::CHIRP,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::EstimatedTorque, PlotQuantity::InverseDynamicsResidual],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| {
         crate::joint(robot, site).actuator.gain *= values[0];
         Ok(())

@@ -1,6 +1,9 @@
 //! Motor torque ripple that depends on the joint position.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
+    Search, Target, Variable, Visibility, demo,
+};
 use twinstep_model::Ripple;
 
 pub const EFFECT: Effect = Effect {
@@ -47,6 +50,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Range(0.5), DataRequirement::Rate(100.0)],
     recommended: &[DataRequirement::LowSpeed, DataRequirement::TorqueMeasured],
     caveat: "",
+    search: Search { probes: Probes::Values(probes), ..Search::DEFAULT },
+    visibility: Visibility::OutputTorque,
+    explained_by: Variable::Position,
+    demo: EffectDemo {
+        motion: &demo::SWING,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::Position, PlotQuantity::InverseDynamicsResidual],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| {
         let ripple = &mut crate::joint(robot, site).actuator.ripple;
         let [amplitude, cycles, phase] = [values[0], values[1], values[2]];
@@ -59,3 +71,12 @@ pub const EFFECT: Effect = Effect {
         Ok(())
     },
 };
+
+/// Returns ripples of one amplitude, with every third number of cycles and four phases.
+///
+/// Joints move within 0.5 rad of their mean position. There the phase error to the nearest probe is at most 0.5 rad,
+/// which the refinement corrects.
+fn probes() -> Vec<Vec<f64>> {
+    let phases = [0.0, 0.5, 1.0, -0.5].map(|turn| turn * std::f64::consts::PI);
+    (7..=150).step_by(3).flat_map(|cycles| phases.map(|phase| vec![0.12, f64::from(cycles), phase])).collect()
+}

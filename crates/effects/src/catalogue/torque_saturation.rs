@@ -1,6 +1,9 @@
 //! Smooth saturation of the motor torque.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "torque_saturation",
@@ -37,6 +40,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Torque(0.6)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    search: Search::DEFAULT,
+    visibility: Visibility::MotorTorque,
+    explained_by: Variable::CommandedTorque,
+    demo: EffectDemo {
+        motion: &demo::THROWS,
+        over_time: PlotQuantity::EstimatedTorque,
+        law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| {
         crate::joint(robot, site).actuator.saturation = values[0];
         Ok(())

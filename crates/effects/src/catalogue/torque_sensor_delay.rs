@@ -1,6 +1,9 @@
 //! Delay of the logged torque; the motion is not delayed.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "torque_sensor_delay",
@@ -26,5 +29,14 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::TorqueMeasured, DataRequirement::Reversals, DataRequirement::Rate(200.0)],
     recommended: &[DataRequirement::Bandwidth(2.0)],
     caveat: "",
+    search: Search::DEFAULT,
+    visibility: Visibility::MotorTorque,
+    explained_by: Variable::CommandedTorqueRate,
+    demo: EffectDemo {
+        motion: &demo::CHIRP,
+        over_time: PlotQuantity::EstimatedTorque,
+        law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
+    },
+    blind_test: Some(&[BlindTestCondition::Torque, BlindTestCondition::FixedBase]),
     apply: |robot, site, values| crate::delayed(&mut crate::joint(robot, site).actuator.sensor_delay, values[0]),
 };

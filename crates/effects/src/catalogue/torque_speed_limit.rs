@@ -1,6 +1,9 @@
 //! Back-EMF reduces the available torque with speed.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "torque_speed_limit",
@@ -32,6 +35,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Speed(0.5)],
     recommended: &[DataRequirement::Torque(0.5)],
     caveat: "",
+    search: Search::DEFAULT,
+    visibility: Visibility::MotorTorque,
+    explained_by: Variable::Velocity,
+    demo: EffectDemo {
+        motion: &demo::THROWS,
+        over_time: PlotQuantity::EstimatedTorque,
+        law: [PlotQuantity::Velocity, PlotQuantity::EstimatedTorque],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| {
         crate::joint(robot, site).actuator.no_load_speed = values[0];
         Ok(())

@@ -1,6 +1,9 @@
 //! Friction proportional to the joint velocity.
 
-use crate::{Composition, Confounder, DataRequirement, Effect, Parameter, Target};
+use crate::{
+    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
+    Target, Variable, Visibility, demo,
+};
 
 pub const EFFECT: Effect = Effect {
     name: "viscous_friction",
@@ -32,6 +35,15 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::Speed(0.03)],
     recommended: &[DataRequirement::KdVaries],
     caveat: "confounded with a wrong kd at a single kd",
+    search: Search::DEFAULT,
+    visibility: Visibility::OutputTorque,
+    explained_by: Variable::Velocity,
+    demo: EffectDemo {
+        motion: &demo::CHIRP,
+        over_time: PlotQuantity::Position,
+        law: [PlotQuantity::Velocity, PlotQuantity::InverseDynamicsResidual],
+    },
+    blind_test: Some(&[BlindTestCondition::FixedBase]),
     apply: |robot, site, values| {
         crate::joint(robot, site).viscous_friction += values[0];
         Ok(())

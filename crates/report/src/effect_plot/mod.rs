@@ -1,13 +1,12 @@
 //! Plot of an effect: a motion without and with it, the difference, and its law in measured quantities.
 
-mod experiment;
 mod quantity;
 
 use std::path::Path;
 
 use plotters::prelude::RGBColor;
 use plotters::style::text_anchor::HPos;
-use twinstep_effects::{Effect, EffectEntry, Scope, Target, apply_effects};
+use twinstep_effects::{DemoMotion, Effect, EffectDemo, EffectEntry, PlotQuantity, Scope, Target, apply_effects};
 use twinstep_model::{
     BaseMount, Command, FIXED_BASE_HEIGHT, Ground, InitialState, Joint, Leg, PerJoint, Precision, RobotModel, Rollout,
     RolloutRequest, go2,
@@ -15,8 +14,7 @@ use twinstep_model::{
 use twinstep_sim::{BatchRollout, SimConfig};
 
 use crate::chart::{self, GREY, INK, Panel, PlotError};
-use experiment::{DemoMotion, EffectDemo};
-use quantity::{PlotQuantity, SimulatedRun};
+use quantity::{SimulatedRun, value};
 
 /// Width and height of the plot [px].
 const SIZE: (u32, u32) = (1500, 1000);
@@ -31,12 +29,11 @@ const FULL_V: f64 = 33.6;
 /// Simulates the effect and writes the plot.
 pub fn write_svg(effect: &'static Effect, path: &Path) -> Result<(), PlotError> {
     chart::check_writable(path)?;
-    let experiment = experiment::of(effect);
     let mut robots = vec![("without".to_owned(), go2())];
     robots.extend(variants(effect)?);
-    let runs = play(experiment.motion, robots.iter().map(|(_, robot)| robot))?;
+    let runs = play(effect.demo.motion, robots.iter().map(|(_, robot)| robot))?;
     let names: Vec<_> = robots.into_iter().map(|(name, _)| name).collect();
-    chart::write(&draw(effect, &experiment, &names, &runs).map_err(simulate)?, path)
+    chart::write(&draw(effect, &names, &runs).map_err(simulate)?, path)
 }
 
 /// Returns robots with a low, middle and high value of the prior range, except a value that has no effect.
@@ -45,12 +42,12 @@ pub fn write_svg(effect: &'static Effect, path: &Path) -> Result<(), PlotError> 
 fn variants(effect: &'static Effect) -> Result<Vec<(String, RobotModel)>, PlotError> {
     let scope = match effect.target {
         Target::Joints | Target::Supply => Scope::All,
-        Target::Bodies | Target::Base => Scope::Base,
+        Target::Bodies | Target::Imu => Scope::Base,
         Target::Ground => Scope::Ground,
     };
     let robot =
         |values| apply_effects(&go2(), &[EffectEntry::new(effect, scope, values).map_err(simulate)?]).map_err(simulate);
-    if effect.name == "inertia" {
+    if effect.replaces_body() {
         // Ten coordinates without a useful prior range each: a lighter and a heavier base of the same shape.
         let scaled = |factor: f64| {
             let values = go2().trunk.scaled(factor).log_cholesky().to_vec();
@@ -124,26 +121,21 @@ fn commands(motion: &DemoMotion, robot: &RobotModel) -> (Vec<Command>, Vec<[f64;
     (0..((motion.settle + motion.duration) / dt).round() as usize).map(period).collect()
 }
 
-fn draw(
-    effect: &Effect,
-    experiment: &EffectDemo,
-    names: &[String],
-    runs: &[SimulatedRun],
-) -> Result<String, PlotError> {
+fn draw(effect: &Effect, names: &[String], runs: &[SimulatedRun]) -> Result<String, PlotError> {
     chart::picture(SIZE, |root| {
         let (header, panels) = root.split_vertically(HEADER_HEIGHT);
         chart::text(&header, &format!("{}: {}", effect.name, effect.summary), 52, HPos::Center, (SIZE.0 as i32, 56))?;
         chart::text(&header, effect.equation, 36, HPos::Center, (SIZE.0 as i32, 124))?;
         let mut legend: Vec<_> = names.iter().map(String::as_str).zip([INK].into_iter().chain(COLOURS)).collect();
-        if experiment.over_time == PlotQuantity::Position {
+        if effect.demo.over_time == PlotQuantity::Position {
             legend.push(("command", GREY));
         }
         chart::legend(&header, &legend, 590, (60, 210))?;
         let (upper, lower) = panels.split_vertically(UPPER_HEIGHT);
         let (left, right) = lower.split_horizontally(SIZE.0);
-        let EffectDemo { motion, over_time, law: [x, y] } = *experiment;
+        let EffectDemo { motion, over_time, law: [x, y] } = effect.demo;
         let mut upper_panel = panel(motion.what.to_owned(), PlotQuantity::Time, over_time, runs, &|run, period| {
-            over_time.of(run, period)
+            value(over_time, run, period)
         });
         if over_time == PlotQuantity::Position {
             let command =
@@ -153,10 +145,10 @@ fn draw(
         }
         upper_panel.draw(&upper)?;
         panel("difference due to the effect".to_owned(), PlotQuantity::Time, over_time, runs, &|run, period| {
-            over_time.of(run, period) - over_time.of(&runs[0], period)
+            value(over_time, run, period) - value(over_time, &runs[0], period)
         })
         .draw(&left)?;
-        panel("law in measured quantities".to_owned(), x, y, runs, &|run, period| y.of(run, period)).draw(&right)
+        panel("law in measured quantities".to_owned(), x, y, runs, &|run, period| value(y, run, period)).draw(&right)
     })
 }
 
@@ -175,7 +167,7 @@ fn panel(
 fn lines(runs: &[SimulatedRun], x: PlotQuantity, of: &dyn Fn(&SimulatedRun, usize) -> f64) -> Vec<chart::Line> {
     let line = |(run, colour): (&SimulatedRun, RGBColor)| {
         let periods = run.settle..run.commands.len();
-        let piece = periods.map(|period| (x.of(run, period), of(run, period))).collect();
+        let piece = periods.map(|period| (value(x, run, period), of(run, period))).collect();
         chart::Line { colour, width: 4, pieces: vec![piece] }
     };
     runs.iter().zip([INK].into_iter().chain(COLOURS)).map(line).collect()
