@@ -28,6 +28,7 @@ mod rapier;
 mod raw_client;
 mod remote;
 mod render;
+mod robots;
 mod rollout;
 mod security;
 mod terrain;

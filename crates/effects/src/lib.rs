@@ -6,7 +6,7 @@
 //! - [`CATALOGUE`]: all effects, in the order of the chain from command to motion.
 //! - [`Scope`]: the joints or the part of the robot to which an entry of a model file applies.
 //! - [`EffectEntry`]: an effect with a scope and values; [`apply_effects`] applies several to a robot.
-//! - [`ModelFile`]: a nominal robot and a list of entries, in TOML.
+//! - [`ModelFile`]: a nominal robot and a list of entries, in TOML; [`NominalRobot`]: built in, or from a robot file.
 //! - [`RobotSampler`]: domain randomisation within the intervals of a model file.
 //!
 //! An effect only changes parameters. [`twinstep_model::dynamics::SimdActuators`] and the engines implement the laws.
@@ -16,6 +16,7 @@ mod data_requirement;
 pub mod demo;
 mod entry;
 mod model_file;
+mod nominal;
 mod sampler;
 mod scope;
 mod search;
@@ -27,6 +28,7 @@ pub use entry::{EffectEntry, EntryError, apply_effects};
 pub use model_file::{
     ActuatorNetworkConfig, EffectEntryError, MemberSampling, ModelFile, ModelFileError, load_robot, parse_robot,
 };
+pub use nominal::{ControlTable, JointsTable, NominalRobot, NominalRobotError};
 pub use sampler::{RobotSampler, SamplingError};
 pub use scope::{Scope, UnknownScope};
 pub use search::{BlindTestCondition, Probes, Search, Variable, Visibility};

@@ -2,15 +2,14 @@
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use serde::Deserialize;
 use toml::{Table, Value};
 
+use crate::nominal::{ControlTable, JointsTable, NominalRobot, NominalRobotError, is_robot_file};
 use crate::{CATALOGUE, Effect, EffectEntry, EntryError, Parameter, Scope, apply_effects};
-use twinstep_model::{RobotModel, go2};
-
-/// Allowed values of `robot`.
-const BUILT_IN: [&str; 1] = ["go2"];
+use twinstep_model::RobotModel;
 
 /// Interval of a component that was not measured, in a vector with measured components.
 const UNBOUNDED: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
@@ -34,13 +33,13 @@ pub enum ModelFileError {
         /// Problem, with line and column.
         message: String,
     },
-    /// The robot is unknown.
-    #[error("{name}: `robot` = \"{robot}\" is unknown; possible: \"{possible}\"", possible = BUILT_IN.join("\", \""))]
-    UnknownRobot {
+    /// The nominal robot is unknown, or its file or tables are not valid.
+    #[error("{name}: {cause}")]
+    Robot {
         /// The file, or another source of the text.
         name: String,
-        /// Value of `robot`.
-        robot: String,
+        /// What is wrong.
+        cause: NominalRobotError,
     },
     /// An entry of `[[effect]]` is wrong.
     #[error("{name}: effect {number}: {problem}")]
@@ -112,8 +111,8 @@ fn names(effect: &str) -> String {
 /// A nominal robot and its effects.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ModelFile {
-    /// Name of the built-in nominal robot.
-    pub robot: String,
+    /// The nominal robot. Shared, because diagnosis copies a model for each candidate.
+    pub nominal: Arc<NominalRobot>,
     /// Effects, in the order of the file.
     pub effects: Vec<EffectEntry>,
     /// Actuator network that replaces the first stages of the chain from command to torque, if any.
@@ -151,6 +150,8 @@ pub enum MemberSampling {
 #[serde(deny_unknown_fields)]
 struct ModelText {
     robot: String,
+    control: Option<ControlTable>,
+    joints: Option<JointsTable>,
     #[serde(default)]
     effect: Vec<Table>,
     actuator: Option<ActuatorNetworkConfig>,
@@ -159,20 +160,23 @@ struct ModelText {
 impl Default for ModelFile {
     /// The ideal Go2.
     fn default() -> Self {
-        Self { robot: "go2".to_owned(), effects: Vec::new(), actuator: None }
+        Self { nominal: Arc::new(NominalRobot::go2()), effects: Vec::new(), actuator: None }
     }
 }
 
 impl ModelFile {
-    /// Reads a model file. The path of an ensemble becomes absolute.
+    /// Reads a model file, or a robot file (URDF, MJCF) as a model without effects. Paths in it become absolute.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, ModelFileError> {
         let path = path.as_ref();
+        if is_robot_file(path) {
+            return Self::parse(&format!("robot = {}", Value::from(path.display().to_string())), "`--model`");
+        }
         let text = std::fs::read_to_string(path)
             .map_err(|source| ModelFileError::Unreadable { path: path.to_owned(), source })?;
         let unreadable = |source| ModelFileError::Unreadable { path: path.to_owned(), source };
-        let mut file = Self::parse(&text, &path.display().to_string())?;
-        if let (Some(actuator), Some(folder)) = (&mut file.actuator, path.parent()) {
-            // Absolute, so that the model is still valid after a tool writes it to another folder.
+        let folder = path.parent().unwrap_or(Path::new(""));
+        let mut file = Self::parse_in(folder, &text, &path.display().to_string())?;
+        if let Some(actuator) = &mut file.actuator {
             actuator.ensemble = std::path::absolute(folder.join(&actuator.ensemble)).map_err(unreadable)?;
         }
         Ok(file)
@@ -184,13 +188,16 @@ impl ModelFile {
         analytic(Self::load(path)?, &path.display().to_string())
     }
 
-    /// Parses the text of a model file. Errors use `name` for the file.
+    /// Parses the text of a model file. Errors use `name` for the file. Paths are relative to the working directory.
     pub fn parse(text: &str, name: &str) -> Result<Self, ModelFileError> {
-        let ModelText { robot, effect, actuator } = toml::from_str(text)
+        Self::parse_in(Path::new(""), text, name)
+    }
+
+    fn parse_in(folder: &Path, text: &str, name: &str) -> Result<Self, ModelFileError> {
+        let ModelText { robot, control, joints, effect, actuator } = toml::from_str(text)
             .map_err(|error| ModelFileError::Malformed { name: name.to_owned(), message: error.to_string() })?;
-        if !BUILT_IN.contains(&robot.as_str()) {
-            return Err(ModelFileError::UnknownRobot { name: name.to_owned(), robot });
-        }
+        let nominal = NominalRobot::read(&robot, control, joints, folder)
+            .map_err(|cause| ModelFileError::Robot { name: name.to_owned(), cause })?;
         let effects = effect.iter().enumerate().map(|(index, table)| {
             read_entry(table).map_err(|problem| ModelFileError::Effect {
                 name: name.to_owned(),
@@ -198,7 +205,7 @@ impl ModelFile {
                 problem,
             })
         });
-        let file = Self { robot, effects: effects.collect::<Result<_, _>>()?, actuator };
+        let file = Self { nominal: Arc::new(nominal), effects: effects.collect::<Result<_, _>>()?, actuator };
         match file.robot_model() {
             Ok(_) => Ok(file),
             Err(cause) => Err(ModelFileError::Conflict { name: name.to_owned(), cause }),
@@ -207,12 +214,20 @@ impl ModelFile {
 
     /// Returns the nominal robot with all effects applied.
     pub fn robot_model(&self) -> Result<RobotModel, EntryError> {
-        apply_effects(&go2(), &self.effects)
+        apply_effects(&self.nominal.model, &self.effects)
     }
 
     /// Returns the text of the file. [`ModelFile::parse`] reads exactly the same model from it.
     pub fn to_toml(&self) -> String {
-        let mut text = format!("robot = {}\n", Value::from(self.robot.clone()));
+        let NominalRobot { robot, control, joints, .. } = &*self.nominal;
+        let mut text = format!("robot = {}\n", Value::from(robot.clone()));
+        let tables =
+            [("control", control.as_ref().map(Value::try_from)), ("joints", joints.as_ref().map(Value::try_from))];
+        for (name, table) in tables {
+            if let Some(Ok(Value::Table(table))) = table {
+                write!(text, "\n[{name}]\n{table}").expect("a String takes every text");
+            }
+        }
         for entry in &self.effects {
             writeln!(text, "\n[[effect]]\nname = \"{}\"\nscope = \"{}\"", entry.effect.name, entry.scope)
                 .expect("a String takes every text");
@@ -378,6 +393,7 @@ mod tests {
 
     use super::*;
     use crate::Target;
+    use twinstep_model::go2;
 
     fn check_refusal(text: &str, message: &Expect) {
         let error = parse_robot(text, "robot.toml").expect_err("refused");
@@ -543,7 +559,7 @@ mod tests {
     proptest! {
         #[test]
         fn written_model_files_are_read_back_unchanged(entries in prop::collection::vec(some_entry(), 0..6)) {
-            let file = ModelFile { robot: "go2".to_owned(), effects: entries, actuator: None };
+            let file = ModelFile { effects: entries, ..ModelFile::default() };
             // Two ripples on one joint may conflict; such a file is not valid.
             if file.robot_model().is_ok() {
                 prop_assert_eq!(ModelFile::parse(&file.to_toml(), "written").expect("valid"), file);

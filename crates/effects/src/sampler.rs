@@ -1,6 +1,6 @@
 //! Domain randomisation: robots sampled from the intervals of a model file.
 
-use super::{EffectEntry, EntryError};
+use super::{EffectEntry, EntryError, apply_effects};
 use crate::ModelFile;
 use twinstep_model::{RobotModel, Stream, standard_normal, stream};
 
@@ -58,8 +58,8 @@ impl RobotSampler {
     }
 
     fn attempt(&self, random: &mut Stream) -> Result<RobotModel, EntryError> {
-        let effects = self.0.effects.iter().map(|entry| entry.sampled(random)).collect();
-        ModelFile { robot: self.0.robot.clone(), effects, actuator: None }.robot_model()
+        let effects: Vec<_> = self.0.effects.iter().map(|entry| entry.sampled(random)).collect();
+        apply_effects(&self.0.nominal.model, &effects)
     }
 }
 

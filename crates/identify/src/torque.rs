@@ -2,9 +2,8 @@
 
 use twinstep_logs::{Log, TorqueSensor};
 use twinstep_model::{
-    Command, JointModel, NUM_JOINTS, RobotModel,
+    ActuatorParams, Command, JointSpring, NUM_JOINTS, RobotModel, Stribeck,
     dynamics::{SimdActuators, SimdCommands},
-    go2,
 };
 
 use twinstep_logs::operating_conditions::OperatingConditions;
@@ -167,14 +166,14 @@ impl MeasuredTorque {
 /// These are springs at the link, and backlash and elasticity of the gear, because the encoder is at the rotor.
 fn upstream_of_sensor(robot: &RobotModel, sensor: TorqueSensor) -> RobotModel {
     let mut robot = robot.clone();
-    let ideal = go2().joints;
-    for (joint, ideal) in robot.joints.iter_mut().zip(ideal) {
-        joint.spring = ideal.spring;
-        (joint.actuator.backlash, joint.actuator.gear_stiffness) =
-            (ideal.actuator.backlash, ideal.actuator.gear_stiffness);
+    let ideal = ActuatorParams::IDEAL;
+    for joint in &mut robot.joints {
+        joint.spring = JointSpring::NONE;
+        (joint.actuator.backlash, joint.actuator.gear_stiffness) = (ideal.backlash, ideal.gear_stiffness);
         if sensor == TorqueSensor::MotorCurrent {
-            (joint.actuator.gain, joint.actuator.ripple) = (ideal.actuator.gain, ideal.actuator.ripple);
-            *joint = JointModel { torque_limit: joint.torque_limit, actuator: joint.actuator, ..ideal };
+            (joint.actuator.gain, joint.actuator.ripple) = (ideal.gain, ideal.ripple);
+            (joint.viscous_friction, joint.coulomb_friction, joint.load_friction) = (0.0, 0.0, 0.0);
+            (joint.stribeck_friction, joint.armature) = (Stribeck::NONE, 0.0);
         }
     }
     robot

@@ -31,6 +31,14 @@ impl RigidBody {
         Self { mass: self.mass * factor, com: self.com, inertia: self.inertia * factor }
     }
 
+    /// Returns the body with another body of the same frame fixed to it.
+    pub fn combined(self, other: Self) -> Self {
+        let mass = self.mass + other.mass;
+        let com = if mass > 0.0 { (self.mass * self.com + other.mass * other.com) / mass } else { self.com };
+        let about_com = |body: &Self| body.inertia + body.mass * parallel_axis(body.com - com);
+        Self { mass, com, inertia: about_com(&self) + about_com(&other) }
+    }
+
     /// Returns the body with a point mass [kg] fixed to it at `position` [m, body frame].
     pub fn with_point_mass(self, mass: f64, position: DVec3) -> Self {
         let total = self.mass + mass;

@@ -87,9 +87,9 @@ fn joint(joint: Joint) -> JointModel {
         armature: 0.01,
         viscous_friction: 0.0,
         coulomb_friction: 0.0,
-        stribeck_friction: Stribeck { breakaway_torque: 0.0, stribeck_velocity: 0.1 },
+        stribeck_friction: Stribeck::NONE,
         load_friction: 0.0,
-        spring: JointSpring { stiffness: 0.0, torque_offset: 0.0 },
+        spring: JointSpring::NONE,
         actuator: ActuatorParams::IDEAL,
     }
 }

@@ -8,7 +8,7 @@
 //!   [`EnvSpec`]: layouts, periods, gains and limits of an environment.
 //! - [`Scene`]: shapes and poses for rendering; [`body_poses`]: forward kinematics.
 //! - [`Ground`]: a plane, or a [`HeightField`] for uneven terrain.
-//! - [`mjcf()`]: the robot as a MuJoCo model.
+//! - [`import_robot`]: robots from URDF and MJCF files; [`mjcf()`]: the robot as a MuJoCo model.
 //! - [`dynamics`]: kinematics, dynamics and actuator laws, with one robot per SIMD lane.
 //! - [`Rollout`]: simulates command sequences with many candidate robots at once.
 //! - [`stream`]: reproducible random streams, one per consumer, from one seed.
@@ -25,6 +25,7 @@ pub mod frames;
 mod go2;
 mod ground;
 mod height_field;
+mod import;
 mod initial_state;
 mod joint;
 mod kinematics;
@@ -45,6 +46,7 @@ pub use command::Command;
 pub use go2::go2;
 pub use ground::Ground;
 pub use height_field::{HeightField, HeightFieldError};
+pub use import::{ImportError, ImportNames, import_robot};
 pub use initial_state::InitialState;
 pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};
 pub use kinematics::{FIXED_BASE_HEIGHT, NUM_BODIES, Pose, body_poses};

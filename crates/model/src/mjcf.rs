@@ -142,15 +142,16 @@ fn link(xml: &mut Xml, robot: &RobotModel, joint: Joint) {
     let origin = leg.origins[joint.kind as usize];
     xml.open("body", &[("name", joint.name().to_owned()), ("pos", numbers(origin.to_array()))]);
     inertial(xml, &leg.bodies[joint.kind as usize]);
-    xml.leaf(
-        "joint",
-        &[
-            ("name", joint.name().to_owned()),
-            ("axis", numbers(RobotModel::axis(joint).to_array())),
-            ("range", numbers(numbers_of.range)),
-            ("armature", numbers_of.armature.to_string()),
-        ],
-    );
+    let mut attributes = vec![
+        ("name", joint.name().to_owned()),
+        ("axis", numbers(RobotModel::axis(joint).to_array())),
+        ("range", numbers(numbers_of.range)),
+        ("armature", numbers_of.armature.to_string()),
+    ];
+    let friction = [("damping", numbers_of.viscous_friction), ("frictionloss", numbers_of.coulomb_friction)];
+    attributes
+        .extend(friction.into_iter().filter(|(_, value)| *value > 0.0).map(|(name, value)| (name, value.to_string())));
+    xml.leaf("joint", &attributes);
 }
 
 fn calf_geoms(xml: &mut Xml, robot: &RobotModel, leg: Leg) {

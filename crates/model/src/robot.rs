@@ -126,6 +126,11 @@ pub struct Stribeck {
     pub stribeck_velocity: f64,
 }
 
+impl Stribeck {
+    /// No additional friction.
+    pub const NONE: Self = Self { breakaway_torque: 0.0, stribeck_velocity: 0.1 };
+}
+
 /// Spring torque `−stiffness · q + torque_offset` on the joint.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct JointSpring {
@@ -133,6 +138,11 @@ pub struct JointSpring {
     pub stiffness: f64,
     /// Torque at q = 0: stiffness times rest position [N·m].
     pub torque_offset: f64,
+}
+
+impl JointSpring {
+    /// No spring.
+    pub const NONE: Self = Self { stiffness: 0.0, torque_offset: 0.0 };
 }
 
 /// Parameters of an actuator from command to gear torque, in the order in which they act.

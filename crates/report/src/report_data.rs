@@ -7,7 +7,7 @@ use twinstep_identify::{
 };
 use twinstep_logs::replay::{JointCommands, ReplayError, joint_commands};
 use twinstep_logs::{Log, TorqueSensor};
-use twinstep_model::{Joint, NUM_JOINTS, RobotModel, Rollout, go2};
+use twinstep_model::{Joint, NUM_JOINTS, RobotModel, Rollout};
 
 use crate::residual_plot::{ResidualPlot, Residuals};
 use crate::time_series::TimeSeries;
@@ -120,7 +120,7 @@ fn without(given: &ModelFile, extended: &ModelFile, index: usize) -> Result<Robo
         Some(entry) if entries.iter().filter(same).count() == 1 => entries[index] = entry.clone(),
         _ => drop(entries.remove(index)),
     }
-    apply_effects(&go2(), &entries)
+    apply_effects(&given.nominal.model, &entries)
 }
 
 /// Evaluation of a model on a log.
