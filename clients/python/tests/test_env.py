@@ -64,7 +64,7 @@ def test_privileged_observations_are_in_the_info_with_the_option_critic() -> Non
     assert names == ["true_linear_velocity", "true_angular_velocity", "base_height", "foot_force"]
     _, info = envs.reset(seed=1)
     assert info["critic_obs"].shape == (2, 11)
-    assert ((0.2 < info["critic_obs"][:, 6]) & (info["critic_obs"][:, 6] < 0.5)).all(), "height of the base"
+    assert ((info["critic_obs"][:, 6] > 0.2) & (info["critic_obs"][:, 6] < 0.5)).all(), "height of the base"
     envs.step(np.zeros((2, 12), dtype=np.float32))
     *_, info = envs.step(np.zeros((2, 12), dtype=np.float32))
     assert info["critic_obs"].shape == info["final_info"]["critic_obs"].shape == (2, 11)

@@ -89,7 +89,7 @@ class Go2VecEnv(VecEnv):
         self._obs, self._info = envs.reset(seed=seed)
 
     def get_observations(self) -> TensorDict:
-        """Return the last observations: ``policy``, (num_envs, 45) float32, and with the option ``critic`` ``critic``."""
+        """Return the last observations: ``policy``, (num_envs, 45) float32, and ``critic`` if it was requested."""
         groups = {"policy": self._tensor(self._obs)}
         if "critic_obs" in self._info:
             groups["critic"] = self._tensor(self._info["critic_obs"])
