@@ -252,8 +252,8 @@ mod tests {
     use twinstep_model::RobotStates;
 
     use super::*;
-    use crate::ensemble::{EnsembleMetadata, JointEncoding};
     use crate::inference::Inference;
+    use crate::metadata::{EnsembleMetadata, JointEncoding};
     use crate::normaliser::Normaliser;
 
     fn ensemble(members: usize) -> Ensemble {

@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 use twinstep_model::stream;
 
 use crate::EnsembleError;
-use crate::ensemble::EnsembleMetadata;
 use crate::file::{Arrays, Bytes, write};
-use crate::train::{Epoch, TrainingOptions};
+use crate::metadata::EnsembleMetadata;
+use crate::training_options::TrainingOptions;
 use crate::weights::{Shape, Weights};
 
 /// State of every member at the end of its last epoch. A resumed training gives bitwise equal results.
@@ -31,6 +31,15 @@ pub struct MemberState {
     pub optimizer: Vec<u8>,
     /// Epochs so far.
     pub curve: Vec<Epoch>,
+}
+
+/// Losses of one epoch.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Epoch {
+    /// Mean negative log-likelihood of the training rows during the epoch, of torque in N·m [nat].
+    pub training_nll: f64,
+    /// Mean negative log-likelihood of the validation rows after the epoch [nat].
+    pub validation_nll: f64,
 }
 
 /// Metadata of the file.

@@ -8,7 +8,8 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::EnsembleError;
-use crate::ensemble::{Ensemble, EnsembleMetadata};
+use crate::ensemble::Ensemble;
+use crate::metadata::EnsembleMetadata;
 use crate::weights::{Shape, Weights};
 
 /// An array of a file.
@@ -172,7 +173,7 @@ mod tests {
     use twinstep_model::stream;
 
     use super::*;
-    use crate::ensemble::JointEncoding;
+    use crate::metadata::JointEncoding;
     use crate::normaliser::{Normaliser, Normalisers};
 
     fn ensemble() -> Ensemble {

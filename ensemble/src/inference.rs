@@ -85,8 +85,8 @@ mod tests {
 
     use super::*;
     use crate::data::Sequence;
-    use crate::ensemble::{EnsembleMetadata, JointEncoding};
     use crate::epistemic_uncertainty::epistemic_uncertainty;
+    use crate::metadata::{EnsembleMetadata, JointEncoding};
     use crate::network::Network;
     use crate::normaliser::Normaliser;
     use crate::sequences::SequenceDataset;

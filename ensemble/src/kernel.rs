@@ -1,7 +1,7 @@
 //! One row of one network, for the joints of two SIMD registers. Two registers hide the latency of the instructions.
 //!
 //! The order of the sums does not depend on the register: inputs before states. All functions must be inlined, because
-//! only their callers in [`crate::member_batch`] are compiled for the instruction set of the processor.
+//! only their callers in `member_batch` are compiled for the instruction set of the processor.
 
 #![allow(clippy::inline_always, reason = "a function that is not inlined is compiled for the baseline instruction set")]
 #![allow(clippy::needless_range_loop, reason = "closures may not be inlined")]
@@ -9,7 +9,7 @@
 use twinstep_model::NUM_JOINTS;
 
 use crate::activation::{wide_exp, wide_softplus, wide_tanh};
-use crate::ensemble::EnsembleMetadata;
+use crate::metadata::EnsembleMetadata;
 use crate::network::VARIANCE_FLOOR;
 use crate::weights::Weights;
 use twinstep_simd::SimdFloat;

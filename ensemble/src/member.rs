@@ -8,10 +8,10 @@ use twinstep_model::stream;
 
 use crate::EnsembleError;
 use crate::adam::adam;
-use crate::checkpoint::MemberState;
+use crate::checkpoint::{Epoch, MemberState};
 use crate::network::Network;
 use crate::sequences::SequenceDataset;
-use crate::train::{Epoch, TrainingOptions};
+use crate::training_options::TrainingOptions;
 use crate::weights::{Shape, Weights};
 
 /// Maximum number of sequences in a batch.

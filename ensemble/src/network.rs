@@ -203,7 +203,8 @@ mod tests {
     use crate::data::tests::log;
     use crate::data::{DataSet, Split};
     use crate::sequences::SequenceDataset;
-    use crate::train::{Training, TrainingOptions};
+    use crate::train::Training;
+    use crate::training_options::TrainingOptions;
 
     const SHAPE: Shape = Shape { inputs: 2, hidden: 8 };
 

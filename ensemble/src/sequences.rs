@@ -3,7 +3,7 @@
 use burn::tensor::TensorData;
 
 use crate::data::Sequence;
-use crate::ensemble::EnsembleMetadata;
+use crate::metadata::EnsembleMetadata;
 
 /// Number of rows of a training slice: a third of a second at 200 Hz, ten times the time constant of an actuator.
 pub const SEQUENCE_ROWS: usize = 64;

@@ -2,7 +2,8 @@
 
 use twinstep_model::stream;
 
-use crate::ensemble::{Ensemble, EnsembleMetadata};
+use crate::ensemble::Ensemble;
+use crate::metadata::EnsembleMetadata;
 use crate::weights::Weights;
 
 /// Argument of the encoder's tanh in [`Ensemble::linear_pd`] per standard deviation of torque.

@@ -7,65 +7,21 @@ use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 
 use burn::tensor::Device;
-use serde::{Deserialize, Serialize};
 
 use crate::EnsembleError;
 use crate::calibration::variance_scale;
-use crate::checkpoint::{Checkpoint, MemberState};
+use crate::checkpoint::{Checkpoint, Epoch, MemberState};
 use crate::data::{DataSet, Split};
-use crate::ensemble::{Ensemble, EnsembleMetadata, JointEncoding};
+use crate::ensemble::Ensemble;
 use crate::gpu;
 use crate::member::{EpochEnd, MemberTrainer, finished};
+use crate::metadata::EnsembleMetadata;
 use crate::normaliser::Normalisers;
 use crate::sequences::SequenceDataset;
+use crate::training_options::TrainingOptions;
 
 /// Maximum time between two calls of `progress`.
 const TICK: Duration = Duration::from_millis(100);
-
-/// Options of a training.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TrainingOptions {
-    /// Number of networks.
-    pub members: usize,
-    /// Number of LSTM units.
-    pub hidden: usize,
-    /// Encoding of the joint in the input.
-    pub joint_input: JointEncoding,
-    /// Maximum number of epochs.
-    pub epochs: usize,
-    /// Seed of initial weights and order of the data. Equal seeds give equal ensembles for any number of threads.
-    pub seed: u64,
-}
-
-impl Default for TrainingOptions {
-    /// Six members as in U2E.
-    fn default() -> Self {
-        Self { members: 6, hidden: 32, joint_input: JointEncoding::Pooled, epochs: 100, seed: 0 }
-    }
-}
-
-impl TrainingOptions {
-    fn check(&self) -> Result<(), EnsembleError> {
-        for (option, given, max) in
-            [("members", self.members, 100), ("hidden", self.hidden, 512), ("epochs", self.epochs, 100_000)]
-        {
-            if !(1..=max).contains(&given) {
-                return Err(EnsembleError::Option { option, given, most: max });
-            }
-        }
-        Ok(())
-    }
-}
-
-/// Losses of one epoch.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Epoch {
-    /// Mean negative log-likelihood of the training rows during the epoch, of torque in N·m [nat].
-    pub training_nll: f64,
-    /// Mean negative log-likelihood of the validation rows after the epoch [nat].
-    pub validation_nll: f64,
-}
 
 /// Progress of a training.
 pub enum TrainingEvent<'a> {
@@ -249,6 +205,7 @@ mod tests {
     use super::*;
     use crate::calibration::Calibration;
     use crate::data::tests::{NOISE, log};
+    use crate::metadata::JointEncoding;
 
     fn data() -> DataSet {
         DataSet::new(&[("here".to_owned(), log(4000, |_, _| {}))]).expect("a set")

@@ -8,6 +8,7 @@ use twinstep_model::{Actuator, AutoresetMode, Backend, RobotModel, VecEnv};
 use twinstep_sim::{BackendBuildError, BatchBackend, Engine, RapierBackend};
 
 use crate::Config;
+use crate::random::random_u64;
 
 /// Builds the environments of a lease.
 pub trait EnvFactory: Send + Sync + 'static {
@@ -73,7 +74,7 @@ impl SimEnvFactory {
             None => file.robot_model().expect("the model file was checked when it was read"),
         };
         config.sim.check(&robot.control).map_err(BackendBuildError::Config)?;
-        let seed = config.server.seed.unwrap_or_else(crate::server::random_u64);
+        let seed = config.server.seed.unwrap_or_else(random_u64);
         let robots = if config.randomise.effects { Some(RobotSampler::new(file)?) } else { None };
         Ok(Self { config, robot, learned, robots, seed })
     }

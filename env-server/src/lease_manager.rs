@@ -14,25 +14,16 @@ use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
 use crate::EnvFactory;
-use crate::server::{SHUTDOWN_GRACE, random_id};
-use crate::worker::{LeaseParams, ServerState, Worker, WorkerRequest, reply, reply_error, shutting_down, stale_epoch};
+use crate::messages::{LeaseManagerMessage, LeaseParams, ServerState, WorkerRequest};
+use crate::random::random_id;
+use crate::worker::{Worker, reply, reply_error, shutting_down, stale_epoch};
 
 /// Capacity of a worker's request queue. A client has one request in progress; the rest is for its repeats.
 const WORKER_QUEUE: usize = 32;
 /// Period at which leases of disconnected clients are checked for expiry.
 const EXPIRY_PERIOD: Duration = Duration::from_millis(100);
-
-/// Message to the lease manager.
-pub enum LeaseManagerMessage {
-    /// A query that no worker handles.
-    Query(Query),
-    /// The liveliness token of a client appeared (`true`) or disappeared (`false`).
-    Client(String, bool),
-    /// A worker requests the release of its lease.
-    Closed(String),
-    /// Stop; return after the workers have terminated.
-    Stop,
-}
+/// Time between the start of a shutdown and the end of the session, in which requests get `shutting_down`.
+pub const SHUTDOWN_GRACE: Duration = Duration::from_millis(200);
 
 /// Worker of each lease, by lease id. Zenoh's threads read it.
 pub type WorkerTable = Arc<RwLock<HashMap<String, WorkerHandle>>>;

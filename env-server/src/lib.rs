@@ -12,6 +12,8 @@
 mod config;
 mod env_factory;
 mod lease_manager;
+mod messages;
+mod random;
 mod server;
 mod worker;
 

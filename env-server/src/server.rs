@@ -1,14 +1,11 @@
 //! One run of a server: its Zenoh session, its lease manager and its shutdown.
 
 use std::collections::HashMap;
-use std::collections::hash_map::RandomState;
-use std::hash::{BuildHasher, Hasher};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, RwLock};
 use std::thread::JoinHandle;
-use std::time::Duration;
 
 use twinstep_model::AutoresetMode;
 use twinstep_protocol::keys;
@@ -17,14 +14,13 @@ use zenoh::query::Queryable;
 use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait};
 
-use crate::lease_manager::{LeaseManager, LeaseManagerMessage, ServerInfo, dispatch};
-use crate::worker::ServerState;
+use crate::lease_manager::{LeaseManager, SHUTDOWN_GRACE, ServerInfo, dispatch};
+use crate::messages::{LeaseManagerMessage, ServerState};
+use crate::random::random_id;
 use crate::{EnvFactory, EnvFactoryError, ServerConfig};
 
 /// Capacity of the lease manager's queue.
 const LEASE_QUEUE: usize = 1024;
-/// Time between the start of a shutdown and the end of the session, in which requests get `shutting_down`.
-pub const SHUTDOWN_GRACE: Duration = Duration::from_millis(200);
 
 /// A running server.
 pub struct Server {
@@ -230,14 +226,4 @@ fn check_users(config: &ServerConfig, zenoh: &zenoh::Config) -> Result<(), Serve
         Ok(_) => Ok(()),
         Err(error) => reject(format!("its `dictionary_file` {}: {error}", users.display())),
     }
-}
-
-/// Returns a random number from the entropy of the operating system.
-pub fn random_u64() -> u64 {
-    RandomState::new().build_hasher().finish()
-}
-
-/// Returns a random id of 16 hexadecimal digits.
-pub fn random_id() -> String {
-    format!("{:016x}", random_u64())
 }

@@ -6,10 +6,10 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, SyncSender};
 
-use twinstep_model::{AutoresetMode, EnvError, VecEnv};
+use twinstep_model::{EnvError, VecEnv};
 use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, message, tensor};
 use zenoh::Wait;
@@ -17,42 +17,7 @@ use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
 use crate::EnvFactory;
-use crate::lease_manager::LeaseManagerMessage;
-
-/// Request to a worker.
-pub enum WorkerRequest {
-    /// A query at one of the lease's keys.
-    Env(EnvMethod, Query),
-    /// A request for the lease itself.
-    Lease {
-        /// The query to answer.
-        query: Query,
-        /// Epoch of the lease from this request on; increased if the lease is reclaimed.
-        epoch: u64,
-    },
-}
-
-/// State that the workers share with the server.
-pub struct ServerState {
-    /// True once the server shuts down; no new request is executed.
-    pub shutting_down: AtomicBool,
-    /// Environment steps executed by all workers.
-    pub env_steps: AtomicU64,
-}
-
-/// Parameters of a granted lease.
-pub struct LeaseParams {
-    /// Id of the lease.
-    pub lease: String,
-    /// Number of environments.
-    pub num_envs: usize,
-    /// When a new episode starts after one has ended.
-    pub autoreset: AutoresetMode,
-    /// Number of policy steps after which an episode is truncated. Default: that of the task.
-    pub max_episode_steps: Option<u32>,
-    /// True if the client receives the observations of group `critic`.
-    pub critic: bool,
-}
+use crate::messages::{LeaseManagerMessage, LeaseParams, ServerState, WorkerRequest};
 
 /// Owns the environments of one lease.
 pub struct Worker {
@@ -264,7 +229,7 @@ fn read_actions(bytes: &[u8], expected: usize, actions: &mut Vec<f32>) -> Result
 }
 
 fn logged(error: &EnvError) -> ErrorReply {
-    if matches!(error, EnvError::Diverged { .. } | EnvError::Backend(_)) {
+    if matches!(error, EnvError::Backend(_)) {
         tracing::warn!(%error, "step failed");
     }
     convert::wire_error(error)

@@ -2,10 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{ErrorCode, ErrorReply};
-
-/// Protocol version of this crate.
-pub const PROTOCOL: u16 = 1;
+use crate::error::{ErrorCode, ErrorReply};
+use crate::version::PROTOCOL;
 
 #[derive(Deserialize)]
 struct Version {

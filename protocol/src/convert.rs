@@ -53,6 +53,7 @@ pub fn encode_step(batch: &StepBatch, seq: u64, with_critic: bool) -> Vec<u8> {
     let length: Vec<u32> = ended.iter().map(|episode| episode.length).collect();
     let episode_return: Vec<f32> = ended.iter().map(|episode| episode.episode_return).collect();
     let terms: Vec<f32> = ended.iter().flat_map(|episode| episode.terms.iter().copied()).collect();
+    let diverged: Vec<bool> = ended.iter().map(|episode| episode.diverged).collect();
     let final_obs: Vec<f32> = ended.iter().flat_map(|episode| episode.final_obs.iter().copied()).collect();
     let critic_obs = if with_critic { &batch.critic_obs[..] } else { &[] };
     let with_final_critic = ended.iter().filter(|_| with_critic);
@@ -69,6 +70,7 @@ pub fn encode_step(batch: &StepBatch, seq: u64, with_critic: bool) -> Vec<u8> {
         ended_length: tensor::as_bytes(&length),
         ended_return: tensor::as_bytes(&episode_return),
         ended_terms: tensor::as_bytes(&terms),
+        ended_diverged: tensor::flags_as_bytes(if diverged.contains(&true) { &diverged } else { &[] }),
         final_obs: tensor::as_bytes(&final_obs),
         critic_obs: tensor::as_bytes(critic_obs),
         final_critic_obs: tensor::as_bytes(&final_critic_obs),
@@ -101,11 +103,15 @@ pub fn decode_step(
     let length: Vec<u32> = tensor::read(reply.ended_length, "ended_length")?;
     let episode_return: Vec<f32> = tensor::read(reply.ended_return, "ended_return")?;
     let terms: Vec<f32> = tensor::read(reply.ended_terms, "ended_terms")?;
+    let mut diverged = tensor::flags_from_bytes(reply.ended_diverged);
     let final_obs: Vec<f32> = tensor::read(reply.final_obs, "final_obs")?;
     tensor::read_into(reply.critic_obs, &mut batch.critic_obs, "critic_obs")?;
     let final_critic_obs: Vec<f32> = tensor::read(reply.final_critic_obs, "final_critic_obs")?;
     let (ended, obs_len, num_terms) = (env.len(), spec.obs_len(), spec.reward_terms.len());
     let critic_len = spec.critic_obs_len();
+    if diverged.is_empty() {
+        diverged.resize(ended, false);
+    }
     for (field, given, expected) in [
         ("obs", batch.obs.len(), num_envs * obs_len),
         ("reward", batch.reward.len(), num_envs),
@@ -114,6 +120,7 @@ pub fn decode_step(
         ("ended_length", length.len(), ended),
         ("ended_return", episode_return.len(), ended),
         ("ended_terms", terms.len(), ended * num_terms),
+        ("ended_diverged", diverged.len(), ended),
         ("final_obs", final_obs.len(), if final_obs.is_empty() { 0 } else { ended * obs_len }),
         ("critic_obs", batch.critic_obs.len(), num_envs * critic_len),
         ("final_critic_obs", final_critic_obs.len(), if final_obs.is_empty() { 0 } else { ended * critic_len }),
@@ -130,6 +137,7 @@ pub fn decode_step(
             length: length[k],
             episode_return: episode_return[k],
             terms: terms[k * num_terms..(k + 1) * num_terms].to_vec(),
+            diverged: diverged[k],
             final_obs: final_obs.get(k * obs_len..(k + 1) * obs_len).unwrap_or_default().to_vec(),
             final_critic_obs: final_critic_obs.get(k * critic_len..(k + 1) * critic_len).unwrap_or_default().to_vec(),
         })
@@ -202,7 +210,6 @@ pub fn wire_error(error: &EnvError) -> ErrorReply {
         EnvError::NeedsReset { .. } => (ErrorCode::NeedsReset, "", "send `reset`, with `mask` for some environments"),
         EnvError::EnvOutOfRange { .. } => (ErrorCode::OutOfRange, "env", "environments are numbered from 0"),
         EnvError::RenderUnsupported { .. } => (ErrorCode::UnknownKey, "", "use a task with a robot, such as `walk`"),
-        EnvError::Diverged { .. } => (ErrorCode::Diverged, "", "send `reset` with `mask`"),
         EnvError::Backend(_) | EnvError::Remote(_) => (ErrorCode::Internal, "", "read the log of the server"),
     };
     ErrorReply::new(code, field, error.to_string()).with_hint(hint)

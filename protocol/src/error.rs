@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::PROTOCOL;
+use crate::version::PROTOCOL;
 
 /// Kind of an error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -34,8 +34,6 @@ pub enum ErrorCode {
     SequenceGap,
     /// An environment has no episode and must be reset first.
     NeedsReset,
-    /// The simulation of an environment became NaN or infinite.
-    Diverged,
     /// The client's spec hash differs from the server's.
     SpecMismatch,
     /// Too many requests are queued; repeat the request later.
@@ -48,7 +46,7 @@ pub enum ErrorCode {
 
 impl ErrorCode {
     /// All error codes.
-    pub const ALL: [ErrorCode; 17] = [
+    pub const ALL: [ErrorCode; 16] = [
         ErrorCode::Version,
         ErrorCode::Malformed,
         ErrorCode::UnknownKey,
@@ -61,7 +59,6 @@ impl ErrorCode {
         ErrorCode::StaleSequence,
         ErrorCode::SequenceGap,
         ErrorCode::NeedsReset,
-        ErrorCode::Diverged,
         ErrorCode::SpecMismatch,
         ErrorCode::Busy,
         ErrorCode::ShuttingDown,
@@ -70,7 +67,7 @@ impl ErrorCode {
 
     /// Returns true if a request with this error had effects and so consumed its sequence number.
     pub fn consumes_seq(self) -> bool {
-        matches!(self, ErrorCode::Diverged | ErrorCode::Internal)
+        self == ErrorCode::Internal
     }
 }
 

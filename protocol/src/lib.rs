@@ -13,6 +13,8 @@ mod error;
 pub mod keys;
 pub mod message;
 pub mod tensor;
+mod version;
 
-pub use codec::{PROTOCOL, decode, encode};
+pub use codec::{decode, encode};
 pub use error::{ErrorCode, ErrorReply};
+pub use version::PROTOCOL;

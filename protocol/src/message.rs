@@ -172,6 +172,9 @@ pub struct StepReply<'a> {
     /// Sums of their weighted reward terms, `k × reward_terms` × f32.
     #[serde(borrow, with = "serde_bytes")]
     pub ended_terms: &'a [u8],
+    /// 1 for those whose simulation became NaN or infinite, k × u8; absent if there is none.
+    #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "<[u8]>::is_empty")]
+    pub ended_diverged: &'a [u8],
     /// Their last observations, `k × obs_len` × f32; empty unless autoreset is SameStep.
     #[serde(borrow, with = "serde_bytes")]
     pub final_obs: &'a [u8],

@@ -1,9 +1,10 @@
 //! Comparison of the batch engine with rapier and with closed forms.
 
 use rand::RngExt;
-use twinstep_envs::Randomisation;
+use twinstep_envs::{Randomisation, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
 use twinstep_model::{
-    Backend, BaseMount, Command, InitialState, NUM_JOINTS, PerJoint, RobotModel, Simulator, go2, stream,
+    AutoresetMode, Backend, BackendError, BaseMount, Command, GroundTruth, InitialState, Measured, NUM_JOINTS,
+    PerJoint, ResetRequest, RobotModel, Simulator, StepBatch, VecEnv, go2, stream,
 };
 use twinstep_sim::{BatchBackend, BatchBackend as TestedBackend, Engine, RapierBackend, SimConfig, SimdPrecision};
 use twinstep_simd::InstructionSet;
@@ -236,6 +237,85 @@ fn a_million_random_steps_of_random_robots_stay_finite() {
             "robot {robot}: {:?}",
             states.measured.dq[robot]
         );
+    }
+}
+
+/// Backend in which a torque of one robot becomes NaN in one step.
+struct FailingBackend {
+    inner: BatchBackend,
+    step: usize,
+}
+
+const FAILING_STEP: usize = 3;
+const FAILING_ROBOT: usize = 5;
+
+impl Backend for FailingBackend {
+    fn robot(&self) -> &RobotModel {
+        Backend::robot(&self.inner)
+    }
+
+    fn measured(&self) -> &Measured {
+        self.inner.measured()
+    }
+
+    fn ground_truth(&self) -> Option<&GroundTruth> {
+        self.inner.ground_truth()
+    }
+
+    fn reset(&mut self, initial_states: &[(usize, InitialState)]) -> Result<(), BackendError> {
+        self.inner.reset(initial_states)
+    }
+
+    fn step(&mut self, commands: &[Command], active: &[bool], periods: usize) -> Result<(), BackendError> {
+        let mut commands = commands.to_vec();
+        if self.step == FAILING_STEP {
+            commands[FAILING_ROBOT].tau_ff[0] = f32::NAN;
+        }
+        self.step += 1;
+        self.inner.step(&commands, active, periods)
+    }
+}
+
+#[test]
+fn diverged_robot_is_truncated_with_its_last_observation_and_everyone_else_gets_their_step() {
+    const ROBOTS: usize = 4096;
+    for autoreset in [AutoresetMode::NextStep, AutoresetMode::SameStep, AutoresetMode::Disabled] {
+        let run = |fails: bool| {
+            let inner = batch(SimConfig::default(), ROBOTS);
+            let backend = FailingBackend { inner, step: if fails { 0 } else { usize::MAX / 2 } };
+            let walk = Walk::new(WalkConfig::default(), &go2(), true).unwrap();
+            let (randomise, robot_sampler) = (Randomisation::default(), None);
+            let settings = TaskEnvConfig { randomise, robot_sampler, autoreset, max_episode_steps: None, seed: 1 };
+            let mut env = TaskEnv::new(backend, walk, settings).unwrap();
+            env.reset(&ResetRequest::seeded(7, ROBOTS)).unwrap();
+            let mut steps: Vec<StepBatch> = Vec::new();
+            for step in 0..FAILING_STEP + 3 {
+                if autoreset == AutoresetMode::Disabled && steps.last().is_some_and(|last| last.done(FAILING_ROBOT)) {
+                    let mask = (0..ROBOTS).map(|robot| robot == FAILING_ROBOT).collect();
+                    env.reset(&ResetRequest::masked(mask)).unwrap();
+                }
+                steps.push(env.step(&vec![0.1 * (step as f32).sin(); 12 * ROBOTS]).unwrap().clone());
+            }
+            steps
+        };
+        let (expected, steps) = (run(false), run(true));
+        let row = |batch: &StepBatch, robot: usize| batch.obs[45 * robot..45 * (robot + 1)].to_vec();
+        for (step, (expected, batch)) in expected.iter().zip(&steps).enumerate() {
+            for robot in (0..ROBOTS).filter(|robot| *robot != FAILING_ROBOT) {
+                assert_eq!(row(batch, robot), row(expected, robot), "{autoreset:?}, step {step}, robot {robot}");
+                assert_eq!(batch.reward[robot], expected.reward[robot]);
+            }
+            assert!(batch.obs.iter().all(|entry| entry.is_finite()));
+            assert_eq!(batch.truncated[FAILING_ROBOT], step == FAILING_STEP, "{autoreset:?}, step {step}");
+        }
+        let (before, failed) = (&steps[FAILING_STEP - 1], &steps[FAILING_STEP]);
+        let [ended] = &failed.ended[..] else { panic!("{:?}", failed.ended) };
+        assert!(ended.diverged && ended.env == FAILING_ROBOT && !failed.terminated[FAILING_ROBOT]);
+        let last =
+            if autoreset == AutoresetMode::SameStep { ended.final_obs.clone() } else { row(failed, FAILING_ROBOT) };
+        assert_eq!(last, row(before, FAILING_ROBOT), "{autoreset:?}: the last finite observation");
+        let after = steps.last().unwrap();
+        assert_ne!(row(after, FAILING_ROBOT), row(before, FAILING_ROBOT), "{autoreset:?}: a new episode runs");
     }
 }
 

@@ -1,4 +1,4 @@
-//! Allowed dependencies between the crates, and the crates that may use each large library.
+//! Allowed dependencies between the crates and between their modules, and the crates that may use each large library.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -137,6 +137,103 @@ fn large_libraries_are_used_only_by_their_crates() {
                 "{folder} uses {library}; only {allowed:?} may"
             );
         }
+    }
+}
+
+/// Path of a module in its crate; empty for the root.
+type Module = Vec<String>;
+
+/// Appends the modules in `folder`, each with its code without comments and tests. `parent` is the module of `folder`.
+fn modules(folder: &Path, parent: &[String], found: &mut BTreeMap<Module, String>) {
+    let paths = std::fs::read_dir(folder).into_iter().flatten().map(|entry| entry.unwrap().path());
+    for path in paths.filter(|path| path.file_stem().unwrap() != "tests") {
+        let name = path.file_stem().unwrap().to_str().unwrap().to_owned();
+        let is_parent = ["lib", "main", "mod"].contains(&name.as_str());
+        let module = if is_parent { parent.to_vec() } else { [parent, std::slice::from_ref(&name)].concat() };
+        if path.is_dir() {
+            modules(&path, &module, found);
+        } else if path.extension().is_some_and(|extension| extension == "rs") {
+            let text = std::fs::read_to_string(&path).unwrap().replace("#[cfg(test)]\nmod tests;", "");
+            let code = text.split("#[cfg(test)]").next().unwrap();
+            found.insert(module, code.lines().filter(|line| !line.trim_start().starts_with("//")).collect());
+        }
+    }
+}
+
+/// Reads the paths of `a::b` or `a::{b, c::d}` at the start of `text`. Returns them and the text behind them.
+fn paths(text: &str) -> (Vec<Module>, &str) {
+    let text = text.trim_start();
+    if let Some(mut rest) = text.strip_prefix('{') {
+        let mut all = Vec::new();
+        loop {
+            let (found, after) = paths(rest);
+            // A comma may be the last character in the braces.
+            all.extend(found.into_iter().filter(|path| !path[0].is_empty()));
+            let end = after.find([',', '}']).unwrap();
+            rest = &after[end + 1..];
+            if after[end..].starts_with('}') {
+                return (all, rest);
+            }
+        }
+    }
+    let end = text.find(|character: char| !character.is_alphanumeric() && character != '_').unwrap_or(text.len());
+    let (name, rest) = (text[..end].to_owned(), &text[end..]);
+    let Some(rest) = rest.strip_prefix("::") else { return (vec![vec![name]], rest) };
+    let (found, rest) = paths(rest);
+    (found.into_iter().map(|path| [vec![name.clone()], path].concat()).collect(), rest)
+}
+
+/// Returns the module that defines `path`, which may be an item that another module publishes with `pub use`.
+fn defining_module(path: &[String], all: &BTreeMap<Module, String>) -> Module {
+    let length = (0..=path.len()).rev().find(|length| all.contains_key(&path[..*length])).unwrap();
+    let module = path[..length].to_vec();
+    let published = all[&module].split("pub use ").skip(1).flat_map(|text| paths(text).0);
+    let mut same_name = published.filter(|found| found.last() == path.get(length));
+    let source = same_name.find_map(|found| {
+        let full = [module.clone(), found].concat();
+        all.contains_key(&full[..=length]).then_some(full)
+    });
+    source.map_or(module, |full| defining_module(&full, all))
+}
+
+/// Returns which modules each module imports, itself or in its children. An import connects two modules of one parent.
+fn imports(all: &BTreeMap<Module, String>) -> BTreeMap<Module, BTreeSet<Module>> {
+    let mut found = BTreeMap::<Module, BTreeSet<Module>>::new();
+    for (module, code) in all {
+        for (start, _) in code.match_indices("crate::").chain(code.match_indices("super::")) {
+            for path in paths(&code[start..]).0.iter().filter(|_| !code[..start].ends_with("::")) {
+                let ups = path.iter().take_while(|name| *name == "super").count();
+                let base = if ups > 0 { &module[..module.len() - ups] } else { &[] };
+                let imported = defining_module(&[base, &path[ups.max(1)..]].concat(), all);
+                let common = module.iter().zip(&imported).take_while(|(own, other)| own == other).count();
+                if common < module.len().min(imported.len()) {
+                    found.entry(module[..=common].to_vec()).or_default().insert(imported[..=common].to_vec());
+                }
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn modules_of_a_crate_import_each_other_in_one_direction() {
+    for (folder, _) in MAY_USE {
+        let mut all = BTreeMap::new();
+        modules(&root().join(folder).join("src"), &[], &mut all);
+        let mut left = imports(&all);
+        // A module that imports none of those left is not in a circle.
+        while let Some((end, _)) = left.iter().find(|(_, to)| to.iter().all(|to| !left.contains_key(to))) {
+            let end = end.clone();
+            left.remove(&end);
+        }
+        // Every module left imports another one left, so a walk along the imports comes back to one of its modules.
+        let mut walk: Vec<&Module> = left.keys().take(1).collect();
+        while let Some((last, _)) = walk.split_last().filter(|(last, before)| !before.contains(last)) {
+            walk.push(left[*last].iter().find(|to| left.contains_key(*to)).unwrap());
+        }
+        let first = walk.iter().position(|module| Some(module) == walk.last()).unwrap_or(0);
+        let names: Vec<_> = walk[first..].iter().map(|module| module.join("::")).collect();
+        assert!(names.is_empty(), "modules of {folder} import each other in a circle: {}", names.join(" -> "));
     }
 }
 

@@ -2,6 +2,10 @@
 
 #![allow(clippy::unwrap_used)]
 
+/// Counts the allocated bytes, for the tests that bound memory.
+#[global_allocator]
+static ALLOCATOR: cap::Cap<std::alloc::System> = cap::Cap::new(std::alloc::System, usize::MAX);
+
 mod any_robot;
 mod batch;
 mod diagnose;

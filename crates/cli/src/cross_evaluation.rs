@@ -3,15 +3,12 @@
 //! U2E, §IV-B and Fig. 2.
 
 use std::fmt::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use twinstep_ensemble::{
-    Checkpoint, DataSet, Ensemble, EnsembleError, Gaussian, Sequence, Split, epistemic_uncertainty,
-};
+use twinstep_ensemble::{DataSet, Ensemble, EnsembleError, Gaussian, Sequence, Split, epistemic_uncertainty};
 use twinstep_logs::Log;
 
 use crate::exit::{CommandResult, Failure, input, other};
-use crate::fit::{Args, train_and_save, training_file};
 use twinstep_report::chart::{self, GREY, INK, Line, ORANGE, Panel, PlotError};
 
 /// Width and height of one cell of the grid [px].
@@ -31,13 +28,20 @@ struct Cell {
     drawn: Vec<[f64; 4]>,
 }
 
-/// Trains an ensemble on each stage, evaluates it on all stages and writes the grid.
-pub fn run(logs: &[(String, Log)], args: &Args) -> CommandResult {
-    std::fs::create_dir_all(&args.out).map_err(input)?;
-    let [svg, csv] = ["cross.svg", "cross.csv"].map(|name| args.out.join(name));
+/// Evaluates an ensemble of each stage on all stages, and writes the grid to the folder `out`.
+///
+/// `train` returns the ensemble of a stage, which it stores in a file. `smooth` is the smoothing of the training data [Hz].
+pub fn run(
+    logs: &[(String, Log)],
+    smooth: Option<f64>,
+    out: &Path,
+    train: impl Fn(&DataSet, &Path) -> Result<Ensemble, Failure>,
+) -> CommandResult {
+    std::fs::create_dir_all(out).map_err(input)?;
+    let [svg, csv] = ["cross.svg", "cross.csv"].map(|name| out.join(name));
     chart::check_writable(&svg).map_err(input)?;
     let names: Vec<&str> = logs.iter().map(|(name, _)| name.as_str()).collect();
-    let stages = logs.iter().map(|log| DataSet::smoothed(std::slice::from_ref(log), args.smooth).map_err(input));
+    let stages = logs.iter().map(|log| DataSet::smoothed(std::slice::from_ref(log), smooth).map_err(input));
     let stages: Vec<DataSet> = stages.collect::<Result<_, _>>()?;
     if let Some(index) = stages.iter().position(|stage| stage.joints != stages[0].joints) {
         return Err(input(EnsembleError::JointsMismatch { log: names[index].to_owned() }));
@@ -45,7 +49,7 @@ pub fn run(logs: &[(String, Log)], args: &Args) -> CommandResult {
     let mut ensembles = Vec::new();
     for (number, (stage, name)) in stages.iter().zip(&names).enumerate() {
         println!("training on {name}");
-        ensembles.push(train_or_load(stage, args, &args.out.join(format!("{}.safetensors", number + 1)))?);
+        ensembles.push(train(stage, &out.join(format!("{}.safetensors", number + 1)))?);
     }
     let cells: Vec<Vec<Cell>> =
         ensembles.iter().map(|ensemble| stages.iter().map(|stage| cell(ensemble, stage)).collect()).collect();
@@ -53,21 +57,8 @@ pub fn run(logs: &[(String, Log)], args: &Args) -> CommandResult {
     let table = csv_text(&cells, &names);
     std::fs::write(&csv, &table).map_err(other)?;
     print!("{table}");
-    println!("written to {}", args.out.display());
+    println!("written to {}", out.display());
     Ok(())
-}
-
-/// Returns the ensemble of a stage. With --resume, reads a finished one and continues an interrupted one.
-fn train_or_load(stage: &DataSet, args: &Args, out: &Path) -> Result<Ensemble, Failure> {
-    let saved: PathBuf = training_file(out);
-    if args.resumes() && out.exists() && !saved.exists() {
-        let ensemble = Ensemble::read(out).map_err(input)?;
-        if ensemble.description.data_hash == stage.hash() {
-            return Ok(ensemble);
-        }
-    }
-    let resume = (args.resumes() && saved.exists()).then(|| Checkpoint::read(&saved)).transpose().map_err(input)?;
-    Ok(train_and_save(stage, args, out, resume)?.0)
 }
 
 fn cell(ensemble: &Ensemble, stage: &DataSet) -> Cell {

@@ -63,7 +63,7 @@ pub struct Args {
     /// Smooth the training split with a cubic spline, as U2E does. The spline halves the amplitude at this frequency
     /// [Hz]. The validation and test splits stay as measured.
     #[arg(long, value_name = "HZ")]
-    pub smooth: Option<f64>,
+    smooth: Option<f64>,
     /// Train on the best available GPU (builds with `--features gpu`). Results differ from the CPU's by rounding.
     #[arg(long)]
     gpu: bool,
@@ -78,7 +78,7 @@ pub struct Args {
     cross: bool,
     /// File to write (safetensors); with --cross, folder to write.
     #[arg(long, value_name = "FILE")]
-    pub out: PathBuf,
+    out: PathBuf,
 }
 
 /// [`JointEncoding`] as a value of the command line.
@@ -97,7 +97,7 @@ pub fn run(args: &Args) -> CommandResult {
     }
     let data = DataSet::smoothed(&logs, args.smooth).map_err(input)?;
     if args.cross {
-        return cross_evaluation::run(&logs, args);
+        return cross_evaluation::run(&logs, args.smooth, &args.out, |stage, out| train_or_load(stage, args, out));
     }
     args.plot.as_deref().map_or(Ok(()), chart::check_writable).map_err(input)?;
     let resume = if args.resume { Some(Checkpoint::read(&training_file(&args.out)).map_err(input)?) } else { None };
@@ -113,7 +113,7 @@ pub fn run(args: &Args) -> CommandResult {
 }
 
 /// Trains an ensemble and writes it to `out`. Saves an interrupted training in [`training_file`].
-pub fn train_and_save(
+fn train_and_save(
     data: &DataSet,
     args: &Args,
     out: &Path,
@@ -142,12 +142,20 @@ pub fn train_and_save(
     }
 }
 
-impl Args {
-    /// True if an interrupted training is to be continued.
-    pub fn resumes(&self) -> bool {
-        self.resume
+/// Returns the ensemble of a stage. With --resume, reads a finished one and continues an interrupted one.
+fn train_or_load(stage: &DataSet, args: &Args, out: &Path) -> Result<Ensemble, Failure> {
+    let saved: PathBuf = training_file(out);
+    if args.resume && out.exists() && !saved.exists() {
+        let ensemble = Ensemble::read(out).map_err(input)?;
+        if ensemble.description.data_hash == stage.hash() {
+            return Ok(ensemble);
+        }
     }
+    let resume = (args.resume && saved.exists()).then(|| Checkpoint::read(&saved)).transpose().map_err(input)?;
+    Ok(train_and_save(stage, args, out, resume)?.0)
+}
 
+impl Args {
     fn options(&self) -> TrainingOptions {
         let joint_input = match self.joint_input {
             JointEncodingArg::Pooled => JointEncoding::Pooled,
@@ -165,7 +173,7 @@ impl Args {
 }
 
 /// Returns the file in which an unfinished training is saved.
-pub fn training_file(out: &Path) -> PathBuf {
+fn training_file(out: &Path) -> PathBuf {
     let mut name = out.as_os_str().to_owned();
     name.push(".training");
     name.into()

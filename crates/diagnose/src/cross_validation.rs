@@ -132,3 +132,84 @@ pub fn cross_validate(
         explained_fraction: if above > 0.0 { 1.0 - left_above / above } else { 0.0 },
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+    use twinstep_model::{BaseMount, Joint, RobotStates, RolloutRequest, go2};
+
+    use super::*;
+    use crate::forward_selection::THRESHOLD;
+    use twinstep_identify::window::WindowConfig;
+
+    /// Standard deviation of the measured positions [rad].
+    const NOISE: f64 = 0.001;
+
+    /// Positions that are proportional to the viscous friction of the first joint, with another shape for Coulomb
+    /// friction.
+    struct Linear;
+
+    fn position(viscous: f64, coulomb: f64, row: usize) -> f64 {
+        0.05 * viscous * (0.11 * row as f64).sin() + 0.02 * coulomb * (0.11 * row as f64).sin().signum()
+    }
+
+    impl Rollout for Linear {
+        fn run(&mut self, jobs: &[RolloutRequest], _: Precision) -> Vec<RobotStates> {
+            let play = |job: &RolloutRequest| {
+                let joint = &job.robot.joints[0];
+                let mut states = RobotStates::new(job.commands.len() + 1);
+                for (row, q) in states.measured.q.iter_mut().enumerate() {
+                    q[0] = position(joint.viscous_friction, joint.coulomb_friction, row) as f32;
+                }
+                states
+            };
+            jobs.iter().map(play).collect()
+        }
+    }
+
+    /// Returns the data of a robot with this viscous friction and measurement noise.
+    fn data(viscous: f64) -> ResidualData {
+        const WINDOW: usize = 400;
+        let rows = 10 * WINDOW;
+        let column = |name: &str, of: &dyn Fn(usize) -> f64| (name.to_owned(), (0..rows).map(of).collect());
+        let noise = |row: usize| 3.46 * NOISE * ((row * 7919 % 1009) as f64 / 1009.0 - 0.5);
+        // The first row of a window is the last row of the previous one.
+        let in_window = |row: usize| if row == 0 { 0 } else { (row - 1) % WINDOW + 1 };
+        let columns = [
+            column("t", &|row| row as f64 / 200.0),
+            column("q_FL_hip", &|row| position(viscous, 0.0, in_window(row)) + noise(row)),
+            column("q_cmd_FL_hip", &|_| 0.0),
+            column("kp", &|_| 25.0),
+            column("kd", &|_| 0.6),
+        ];
+        let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
+        let mut meta = Meta::new(200.0, TorqueSensor::None, segments);
+        meta.noise.insert("q_FL_hip".to_owned(), NOISE);
+        let log = Log::new(meta, columns).expect("a log");
+        ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
+    }
+
+    fn fit(data: &ResidualData, name: &str) -> CandidateFit {
+        let effect = Effect::named(name).expect("in the catalogue");
+        let hypothesis = Hypothesis { effect, scope: Scope::Joint(Joint::ALL[0]), values: vec![0.1] };
+        let before = data.residual_power(&mut Linear, &go2());
+        cross_validate(data, &ModelFile::default(), &before, &hypothesis, &mut Linear).expect("a robot")
+    }
+
+    #[test]
+    fn true_effect_is_accepted_with_its_size_and_explains_the_excess() {
+        let data = data(0.4);
+        let found = fit(&data, "viscous_friction");
+        assert!((found.hypothesis.values[0] - 0.4).abs() < 0.01, "{:?}", found.hypothesis);
+        assert!(found.score > THRESHOLD && found.explained_fraction > 0.99, "{found:?}");
+        let other = fit(&data, "coulomb_friction");
+        assert!(other.score < found.score && other.explained_fraction < 0.9, "{other:?}");
+    }
+
+    #[test]
+    fn effect_that_is_not_there_scores_below_zero() {
+        let found = fit(&data(0.0), "viscous_friction");
+        assert!(found.score < 0.0, "{found:?}");
+        assert!(!found.hypothesis.exceeds_min_size(), "{found:?}");
+    }
+}

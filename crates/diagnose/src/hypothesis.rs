@@ -102,3 +102,54 @@ pub fn selection_penalty(scope: Scope) -> f64 {
     };
     kinds.ln()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn hypothesis(effect: &str, values: &[f64]) -> Hypothesis {
+        let effect = Effect::named(effect).expect("in the catalogue");
+        Hypothesis { effect, scope: Scope::All, values: values.to_vec() }
+    }
+
+    #[test]
+    fn size_is_relative_to_the_prior_range() {
+        let large_enough = |effect: &str, values: &[f64]| hypothesis(effect, values).exceeds_min_size();
+        // Prior range 0 to 1.5 N·m, at least a tenth.
+        assert!(large_enough("coulomb_friction", &[0.16]) && !large_enough("coulomb_friction", &[0.14]));
+        // A limit has no effect at infinity: half the range is twice the limit of the full range.
+        let low = Effect::named("torque_saturation").expect("known").parameters[0].prior_range[0];
+        assert!(large_enough("torque_saturation", &[2.0 * low]) && !large_enough("torque_saturation", &[20.0 * low]));
+        // Geometry errors of a millimetre imitate small encoder offsets.
+        let high = Effect::named("encoder_offset").expect("known").parameters[0].prior_range[1];
+        assert!(large_enough("encoder_offset", &[0.31 * high]) && !large_enough("encoder_offset", &[0.29 * high]));
+        // The largest component of a vector counts.
+        assert!(large_enough("com_shift", &[0.0, 0.0, -0.04]) && !large_enough("com_shift", &[0.001; 3]));
+    }
+
+    #[test]
+    fn values_far_outside_the_prior_range_are_implausible() {
+        let plausible = |values: &[f64]| hypothesis("coulomb_friction", values).is_plausible();
+        assert!(plausible(&[1.5]) && plausible(&[2.2]) && !plausible(&[2.3]));
+    }
+
+    #[test]
+    fn probes_of_a_delay_are_closer_to_each_other_than_those_of_a_friction() {
+        let ratio = |name: &str| {
+            let probes = fine_probes(Effect::named(name).expect("known"));
+            let mut sizes: Vec<f64> = probes.iter().map(|values| values[0]).collect();
+            sizes.sort_by(f64::total_cmp);
+            sizes.windows(2).map(|pair| pair[1] / pair[0]).fold(f64::INFINITY, f64::min)
+        };
+        assert!(ratio("torque_delay") < 1.3 && ratio("viscous_friction") > 1.5);
+    }
+
+    #[test]
+    fn effect_on_every_joint_replaces_the_entries_of_the_model() {
+        let effect = Effect::named("viscous_friction").expect("known");
+        let file = with_effect(&ModelFile::default(), effect, &[0.2]).expect("allowed");
+        let twice = with_effect(&file, effect, &[0.3]).expect("allowed").robot_model().expect("a robot");
+        let expected = if effect.composition == Composition::Replace { 0.3 } else { 0.5 };
+        assert!(twice.joints.iter().all(|joint| (joint.viscous_friction - expected).abs() < 1e-12));
+    }
+}

@@ -53,8 +53,8 @@ use forward_selection::{Accepted, ForwardSelection, THRESHOLD, WindowedData, wri
 use hypothesis::Hypothesis;
 use residual_data::ResidualData;
 pub use torque_only::diagnose_torques;
+use twinstep_identify::ExperimentError;
 use twinstep_identify::evaluate::evaluate;
-use twinstep_identify::experiment::ExperimentError;
 use twinstep_identify::identify::blocks;
 use twinstep_identify::nuisance::NuisanceModel;
 use twinstep_identify::refine::{SIMULATOR_MISMATCH_STD, covariance};

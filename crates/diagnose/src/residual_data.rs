@@ -7,7 +7,8 @@ use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout};
 
 use super::residual_power::{GYRO, ResidualPower, TORQUE, TRUNK};
 use super::residual_rows::{ResidualRows, fold_of};
-use twinstep_identify::experiment::{Experiment, ExperimentError};
+use twinstep_identify::ExperimentError;
+use twinstep_identify::experiment::Experiment;
 use twinstep_identify::nuisance::NuisanceModel;
 use twinstep_identify::torque::MeasuredTorque;
 use twinstep_identify::window::WindowConfig;

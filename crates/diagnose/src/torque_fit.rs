@@ -1,7 +1,6 @@
 //! Fit of one cause to torques, with other causes unchanged.
 
-use twinstep_effects::EffectEntry;
-use twinstep_effects::ModelFile;
+use twinstep_effects::{EffectEntry, ModelFile, Scope};
 use twinstep_model::RobotModel;
 
 use super::hypothesis::selection_penalty;
@@ -9,7 +8,6 @@ use super::joint_slots::JointSlots;
 use super::profile_likelihood::LOG_LIKELIHOOD_DROP_95;
 use super::reporting::{SIMULATOR_MISMATCH_REL_STD, TWO_SIDED_95};
 use super::residual_power::{ResidualPower, TORQUE};
-use super::torque_only::{excess, nats};
 use twinstep_identify::parameter::{FreeParameter, free_parameters};
 
 /// First and last step of the coordinate descent [prior std].
@@ -148,4 +146,17 @@ impl<'a> TorqueFit<'a> {
         };
         robots.iter().map(found).collect()
     }
+}
+
+/// Returns the log-likelihood gain of `now` over `before` on a scope [nat].
+pub fn nats(slots: &JointSlots, scope: Scope, now: &ResidualPower, before: &ResidualPower, folds: &[usize]) -> f64 {
+    let rows = slots.rows_in_one();
+    let of =
+        |seat: usize| folds.iter().map(|fold| now.log_likelihood_gain(before, TORQUE + seat, *fold, rows)).sum::<f64>();
+    slots.of(scope).map(of).sum()
+}
+
+/// Returns the power above noise on a scope.
+pub fn excess(slots: &JointSlots, scope: Scope, left: &ResidualPower) -> f64 {
+    slots.of(scope).map(|seat| left.channel_excess(TORQUE + seat)).sum()
 }

@@ -14,11 +14,11 @@ use super::forward_selection::{MAX_REMAINING_FRACTION, MIN_EXPLAINED_FRACTION, N
 use super::hypothesis::{Hypothesis, selection_penalty};
 use super::joint_slots::JointSlots;
 use super::residual_power::{ResidualPower, TORQUE};
-use super::torque_fit::{TorqueCandidate, TorqueFit};
+use super::torque_fit::{TorqueCandidate, TorqueFit, excess, nats};
 use super::unexplained::{self, LEAST_EXCESS};
 use super::{AMBIGUITY_FRACTION, AMBIGUITY_NATS, DiagnoseError, DiagnoseProgress};
 use crate::findings::{AlternativeCause, Cause, Diagnosis, Estimate, ParameterValue, RmsErrors, Unexplained};
-use twinstep_identify::experiment::ExperimentError;
+use twinstep_identify::ExperimentError;
 
 /// Number of joints in a group: the number of slots of the Go2.
 const TOGETHER: usize = twinstep_model::NUM_JOINTS;
@@ -188,19 +188,6 @@ impl TorqueForwardSelection<'_, '_> {
         };
         self.causes.iter().position(|cause| !stands(cause))
     }
-}
-
-/// Returns the log-likelihood gain of `now` over `before` on a scope [nat].
-pub fn nats(slots: &JointSlots, scope: Scope, now: &ResidualPower, before: &ResidualPower, folds: &[usize]) -> f64 {
-    let rows = slots.rows_in_one();
-    let of =
-        |seat: usize| folds.iter().map(|fold| now.log_likelihood_gain(before, TORQUE + seat, *fold, rows)).sum::<f64>();
-    slots.of(scope).map(of).sum()
-}
-
-/// Returns the power above noise on a scope.
-pub fn excess(slots: &JointSlots, scope: Scope, left: &ResidualPower) -> f64 {
-    slots.of(scope).map(|seat| left.channel_excess(TORQUE + seat)).sum()
 }
 
 fn hypothesis(entry: &EffectEntry) -> Hypothesis {

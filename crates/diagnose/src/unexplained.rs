@@ -171,3 +171,57 @@ fn binned_r_squared(log: &Log, residual: &[f64], cells: &[f64]) -> f64 {
     }
     if total > 0.0 { 1.0 - rest / total } else { 0.0 }
 }
+
+#[cfg(test)]
+mod tests {
+    use twinstep_logs::{Meta, Segment, TorqueSensor};
+    use twinstep_model::BaseMount;
+
+    use super::*;
+
+    const ROWS: usize = 4000;
+
+    /// Returns a log of 20 s whose hip and thigh move with different frequencies.
+    fn log() -> Log {
+        let column = |name: &str, of: &dyn Fn(f64) -> f64| {
+            (name.to_owned(), (0..ROWS).map(|row| of(row as f64 / 200.0)).collect::<Vec<_>>())
+        };
+        let columns = [
+            column("t", &|t| t),
+            column("q_FL_hip", &|t| (3.7 * t).sin()),
+            column("q_cmd_FL_hip", &|t| (3.7 * t).sin()),
+            column("q_FL_thigh", &|t| (5.3 * t + 1.0).sin()),
+            column("q_cmd_FL_thigh", &|t| (5.3 * t + 1.0).sin()),
+            column("kp", &|_| 25.0),
+            column("kd", &|_| 0.6),
+        ];
+        let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
+        Log::new(Meta::new(200.0, TorqueSensor::None, segments), columns).expect("a log")
+    }
+
+    fn described(residual: impl Fn(f64) -> f64) -> Unexplained {
+        let log = log();
+        let residual: Vec<f64> = log.t().iter().map(|t| residual(*t)).collect();
+        describe_residual(&log, &residual, measured(&log), 0.5, "The position")
+    }
+
+    #[test]
+    fn nonlinear_dependence_on_another_joint_is_found() {
+        let unexplained = described(|t| 0.01 * (5.3 * t + 1.0).sin().powi(3));
+        assert_eq!(unexplained.depends_on[0], "q_FL_thigh", "{unexplained:?}");
+    }
+
+    #[test]
+    fn sine_that_follows_no_channel_is_found_by_its_frequency() {
+        let unexplained = described(|t| 0.01 * (std::f64::consts::TAU * 4.1 * t).sin());
+        let [line] = &unexplained.depends_on[..] else { panic!("{unexplained:?}") };
+        assert!(line.starts_with("a spectral line at 4.1"), "{line}");
+    }
+
+    #[test]
+    fn noise_depends_on_nothing() {
+        let unexplained = described(|t| ((t * 200.0) as usize * 7919 % 1009) as f64 / 1009.0 - 0.5);
+        assert!(unexplained.depends_on.is_empty(), "{unexplained:?}");
+        assert!(unexplained.text.contains("depends on none"), "{}", unexplained.text);
+    }
+}

@@ -39,7 +39,7 @@ pub enum ModelFileError {
         /// The file, or another source of the text.
         name: String,
         /// What is wrong.
-        cause: NominalRobotError,
+        cause: Box<NominalRobotError>,
     },
     /// An entry of `[[effect]]` is wrong.
     #[error("{name}: effect {number}: {problem}")]
@@ -197,7 +197,7 @@ impl ModelFile {
         let ModelText { robot, control, joints, effect, actuator } = toml::from_str(text)
             .map_err(|error| ModelFileError::Malformed { name: name.to_owned(), message: error.to_string() })?;
         let nominal = NominalRobot::read(&robot, control, joints, folder)
-            .map_err(|cause| ModelFileError::Robot { name: name.to_owned(), cause })?;
+            .map_err(|cause| ModelFileError::Robot { name: name.to_owned(), cause: Box::new(cause) })?;
         let effects = effect.iter().enumerate().map(|(index, table)| {
             read_entry(table).map_err(|problem| ModelFileError::Effect {
                 name: name.to_owned(),
@@ -410,18 +410,23 @@ mod tests {
         check_refusal(
             "# my robot\nrobto = \"go2\"\n",
             &expect![[r#"
-            robot.toml: TOML parse error at line 2, column 1
-              |
-            2 | robto = "go2"
-              | ^^^^^
-            unknown field `robto`, expected one of `robot`, `effect`, `actuator`
-        "#]],
+                robot.toml: TOML parse error at line 2, column 1
+                  |
+                2 | robto = "go2"
+                  | ^^^^^
+                unknown field `robto`, expected one of `robot`, `control`, `joints`, `effect`, `actuator`
+            "#]],
         );
     }
 
     #[test]
     fn error_for_an_unknown_robot_lists_the_known_ones() {
-        check_refusal("robot = \"spot\"", &expect![[r#"robot.toml: `robot` = "spot" is unknown; possible: "go2""#]]);
+        check_refusal(
+            "robot = \"spot\"",
+            &expect![[
+                r#"robot.toml: `robot` = "spot" is unknown; possible: "go2", or a file that ends with .urdf or .xml (MJCF)"#
+            ]],
+        );
     }
 
     #[test]

@@ -169,7 +169,8 @@ impl ControlTable {
             expected: "twelve positions within ±2π rad",
         };
         let default_pose = default_pose.ok_or_else(|| pose_error("missing".to_owned()))?;
-        if let Some(value) = default_pose.iter().find(|value| !(value.abs() <= std::f64::consts::TAU)) {
+        let allowed = -std::f64::consts::TAU..=std::f64::consts::TAU;
+        if let Some(value) = default_pose.iter().find(|value| !allowed.contains(value)) {
             return Err(pose_error(value.to_string()));
         }
         Ok(ControlConfig {

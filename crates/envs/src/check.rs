@@ -115,7 +115,7 @@ fn check_ended(batch: &StepBatch, lengths: &mut [u32], env: &dyn VecEnv, step: u
                 episode.length, lengths[index]
             ));
         }
-        if batch.truncated[index] && episode.length != spec.max_episode_steps {
+        if batch.truncated[index] && !episode.diverged && episode.length != spec.max_episode_steps {
             return violation(format!("environment {index} was truncated after {} steps", episode.length));
         }
         let given = [episode.final_obs.len(), episode.final_critic_obs.len()];

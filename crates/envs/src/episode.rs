@@ -18,6 +18,8 @@ pub struct Episode<S> {
     episode_index: u64,
     /// True from a reset to the end of the episode.
     pub running: bool,
+    /// True if the simulation diverged in the last step.
+    pub diverged: bool,
     /// Number of policy steps so far.
     pub length: u32,
     /// Sum of rewards so far.
@@ -61,6 +63,7 @@ impl<S: Default> Episode<S> {
             seed,
             episode_index: 0,
             running: false,
+            diverged: false,
             length: 0,
             episode_return: 0.0,
             term_sums: vec![0.0; spec.reward_terms.len()],
@@ -75,7 +78,13 @@ impl<S: Default> Episode<S> {
         (self.random, self.seed, self.episode_index) = (stream(seed, &task.spec().task, 0), seed, 0);
     }
 
-    /// Returns true if an episode has run. False before the first reset and after a divergence.
+    /// Ends the episode in a step in which the simulation diverged.
+    pub fn diverge(&mut self) {
+        (self.running, self.diverged) = (false, true);
+        self.length += 1;
+    }
+
+    /// Returns true if an episode has run.
     pub fn was_started(&self) -> bool {
         self.length > 0
     }
@@ -96,7 +105,7 @@ impl<S: Default> Episode<S> {
         let (q, state) = task.start(&mut self.random);
         self.state = state;
         self.episode_index += 1;
-        self.running = true;
+        (self.running, self.diverged) = (true, false);
         self.length = 0;
         self.episode_return = 0.0;
         self.term_sums.fill(0.0);

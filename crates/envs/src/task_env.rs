@@ -144,7 +144,8 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
     /// Writes reward, end flags and observation of every environment that was stepped.
     fn finish(&mut self) {
         for env in 0..self.episodes.len() {
-            let mut outcome = StepOutcome::default();
+            // A diverged robot keeps its last observation.
+            let mut outcome = StepOutcome { truncated: self.episodes[env].diverged, ..StepOutcome::default() };
             if self.active[env] {
                 let Self { backend, task, spec, ground, episodes, terms, .. } = self;
                 let robot = view(backend, ground, env);
@@ -178,6 +179,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             length: episode.length,
             episode_return: episode.episode_return,
             terms: episode.term_sums.clone(),
+            diverged: episode.diverged,
             final_obs,
             final_critic_obs,
         });
@@ -226,14 +228,15 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
         self.check_actions(actions)?;
         self.prepare(actions)?;
         let decimation = self.backend.robot().control.decimation;
-        match self.backend.step(&self.commands, &self.active, decimation) {
-            Ok(()) => {}
-            Err(BackendError::Diverged { robot, quantity, .. }) => {
-                self.episodes[robot].running = false;
-                self.episodes[robot].length = 0;
-                return Err(EnvError::Diverged { env: robot, quantity: quantity.to_owned() });
-            }
+        let diverged = match self.backend.step(&self.commands, &self.active, decimation) {
+            Ok(()) => Vec::new(),
+            // The other robots were stepped.
+            Err(BackendError::Diverged { robots }) => robots,
             Err(error) => return Err(error.into()),
+        };
+        for (env, _) in &diverged {
+            self.active[*env] = false;
+            self.episodes[*env].diverge();
         }
         self.finish();
         if self.autoreset == AutoresetMode::SameStep {

@@ -6,6 +6,7 @@ use twinstep_effects::ModelFile;
 use twinstep_effects::{BlindTestCondition, CATALOGUE, Effect, EffectEntry, Scope, Target};
 use twinstep_model::{Joint, JointKind, Leg, Stream, standard_normal, stream};
 
+use crate::base_schedule::BaseSchedule;
 use crate::unmodelled::UnmodelledEffect;
 
 /// Kind of a case: what it hides.
@@ -32,18 +33,6 @@ const CASE_MIX: [(CaseKind, usize); 5] = [
     (CaseKind::UnmodelledEffect, 4),
     (CaseKind::TwoEffects, 4),
 ];
-
-/// Mounting of the base during a case.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum BaseSchedule {
-    /// Fixed base.
-    Fixed,
-    /// Floating base: the robot stands.
-    Floating,
-    /// First fixed, then floating.
-    FixedThenFloating,
-}
 
 /// Base mounting and channels of a case's log; independent of the hidden effects.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -126,7 +126,8 @@ mod tests {
     use twinstep_sim::BatchRollout;
 
     use super::*;
-    use crate::draw::{BaseSchedule, CaseKind, LogSetup};
+    use crate::base_schedule::BaseSchedule;
+    use crate::draw::{CaseKind, LogSetup};
 
     fn case(place: BaseSchedule, seed: u64, hidden: Vec<EffectEntry>) -> Case {
         let setting = LogSetup { place, torque: true, battery: true, temperature: false };

@@ -1,5 +1,6 @@
 //! Blind test of diagnosis: hides effects in simulated robots, diagnoses their logs and scores the findings.
 
+mod base_schedule;
 mod draw;
 mod ground_truth;
 mod motion;
@@ -183,7 +184,7 @@ fn read_results(cases_file: &Path, seed: u64) -> Result<Vec<CaseResult>, HuntErr
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::draw::BaseSchedule;
+    use crate::base_schedule::BaseSchedule;
 
     /// Diagnosis that reports no cause, and asserts that it receives the log and the model only.
     fn nothing(log: &Path, model: &Path, out: &Path) -> Command {

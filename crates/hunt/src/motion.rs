@@ -7,7 +7,8 @@ use rand::{Rng, RngExt};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{BaseMount, JOINT_NAMES, Joint, JointKind, NUM_JOINTS, go2};
 
-use crate::draw::{BaseSchedule, LogSetup};
+use crate::base_schedule::BaseSchedule;
+use crate::draw::LogSetup;
 
 /// Rate of the log [Hz].
 pub const RATE_HZ: f64 = 200.0;

@@ -185,7 +185,8 @@ mod tests {
     use twinstep_effects::Effect;
 
     use super::*;
-    use crate::draw::{BaseSchedule, CaseKind, LogSetup};
+    use crate::base_schedule::BaseSchedule;
+    use crate::draw::{CaseKind, LogSetup};
     use crate::unmodelled::UnmodelledEffect;
 
     fn case(hidden: &[(&str, &str, f64)]) -> Case {

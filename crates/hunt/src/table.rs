@@ -150,7 +150,8 @@ mod tests {
     use twinstep_diagnose::RmsErrors;
 
     use super::*;
-    use crate::draw::{BaseSchedule, LogSetup};
+    use crate::base_schedule::BaseSchedule;
+    use crate::draw::LogSetup;
     use crate::score::{Score, Size};
 
     fn result(kind: CaseKind, hidden: &[&str], named: &[&str]) -> CaseResult {

@@ -9,7 +9,7 @@ use twinstep_model::{
     RobotStates, Simulator,
 };
 
-use crate::draw::BaseSchedule;
+use crate::base_schedule::BaseSchedule;
 
 /// Effect outside the catalogue. Joints are given by their index.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout};
 
-use crate::experiment::{Experiment, ExperimentError};
+use crate::error::ExperimentError;
+use crate::experiment::Experiment;
 use crate::torque::torque_errors;
 use crate::window::WindowConfig;
 

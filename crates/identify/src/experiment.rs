@@ -7,34 +7,16 @@ use twinstep_model::{
     BaseMount, Joint, NUM_JOINTS, PerJoint, Precision, RobotModel, RobotStates, Rollout, RolloutRequest,
 };
 
+use crate::error::ExperimentError;
 use crate::window::{Window, WindowConfig, orientation, windows};
 use twinstep_logs::operating_conditions::OperatingConditions;
-use twinstep_logs::replay::{ReplayError, at_log_rate, delayed_mean, joint_commands};
+use twinstep_logs::replay::{at_log_rate, delayed_mean, joint_commands};
 
 /// Length of a block [s]; residuals of different blocks are treated as independent.
 const BLOCK_S: f64 = 0.5;
 /// Standard deviation of the noise of each quantity, for channels whose metadata do not state it.
 const ASSUMED_NOISE: [(&str, f64); 7] =
     [("q", 0.002), ("dq", 0.05), ("tau_measured", 0.2), ("pos", 0.005), ("quat", 0.01), ("vel", 0.05), ("gyro", 0.02)];
-
-/// Reason why a log cannot be used as an experiment.
-#[derive(Debug, thiserror::Error)]
-pub enum ExperimentError {
-    /// The commands of the log cannot be simulated.
-    #[error(transparent)]
-    Motion(#[from] ReplayError),
-    /// The motion of a floating base was not measured.
-    #[error(
-        "segment `{segment}` has base \"floating\", but the log has no `{missing}`, which is needed for the initial \
-         state of a window"
-    )]
-    MissingBaseState {
-        /// Name of the segment.
-        segment: String,
-        /// The missing channel.
-        missing: &'static str,
-    },
-}
 
 /// Channel that is compared in every row.
 #[derive(Clone, Debug)]

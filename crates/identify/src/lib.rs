@@ -17,6 +17,7 @@
 
 mod cmaes;
 mod effect_list;
+mod error;
 pub mod evaluate;
 pub mod experiment;
 mod global_search;
@@ -32,9 +33,13 @@ mod sensors;
 pub mod torque;
 pub mod window;
 
+#[cfg(test)]
+mod tests;
+
 pub use effect_list::{DEFAULT_EFFECTS, EffectAtScope, EffectAtScopeError, UnknownEffect, default_effects, named};
+pub use error::ExperimentError;
 pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};
-pub use experiment::{Experiment, ExperimentError};
+pub use experiment::Experiment;
 pub use global_search::GlobalSearch;
 pub use identify::{
     EstimateStatus, Identification, IdentifyError, IdentifyOptions, IdentifyProgress, ParameterEstimate, Stage,

@@ -5,8 +5,8 @@ use std::ops::Range;
 use twinstep_logs::Log;
 use twinstep_model::{RobotModel, Rollout};
 
+use crate::error::ExperimentError;
 use crate::evaluate::position_errors;
-use crate::experiment::ExperimentError;
 
 /// Measured and simulated joint positions of a log.
 #[derive(Clone, Debug, PartialEq)]

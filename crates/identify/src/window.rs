@@ -7,7 +7,7 @@ use nalgebra::{DMatrix, DVector};
 use twinstep_logs::Log;
 use twinstep_model::{ActuatorParams, BaseMount, Command, Ground, HistoryStep, InitialState, RobotModel};
 
-use crate::experiment::ExperimentError;
+use crate::error::ExperimentError;
 use twinstep_logs::replay::{ActuatorClock, JointCommands, command, joint_commands};
 
 /// Lengths of the windows of a log.
@@ -217,4 +217,81 @@ fn smoothed(t: &[f64], cells: &[f64], row: usize) -> [f64; 2] {
     let values = DVector::from_iterator(near.len(), near.iter().map(|(_, value)| *value));
     let solved = (design.transpose() * &design).cholesky().map(|factor| factor.solve(&(design.transpose() * values)));
     solved.map_or([cells[row], 0.0], |fit| [fit[0], fit.get(1).map_or(0.0, |derivative| derivative / 0.02)])
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use twinstep_logs::{Meta, Segment, TorqueSensor};
+    use twinstep_model::go2;
+
+    use super::*;
+
+    const RATE_HZ: f64 = 200.0;
+
+    /// Returns a log of one joint, whose position is `q` at a time [s].
+    fn log(rows: usize, base: BaseMount, q: impl Fn(f64) -> f64) -> Log {
+        let segments = vec![Segment { name: "all".to_owned(), base }];
+        let column = |name: &str, of: &dyn Fn(f64) -> f64| {
+            (name.to_owned(), (0..rows).map(|row| of(row as f64 / RATE_HZ)).collect::<Vec<_>>())
+        };
+        let columns = [
+            column("t", &|t| t),
+            column("q_FL_hip", &q),
+            column("q_cmd_FL_hip", &|t| t),
+            column("kp", &|_| 25.0),
+            column("kd", &|_| 0.6),
+        ];
+        Log::new(Meta::new(RATE_HZ, TorqueSensor::None, segments), columns).expect("a log")
+    }
+
+    proptest! {
+        #[test]
+        fn windows_cover_every_row_and_overlap_in_one(rows in 3usize..1500, length_s in 0.05f64..3.0) {
+            let horizon = WindowConfig { fixed_length_s: length_s, ..WindowConfig::DIAGNOSIS };
+            let windows = windows(&log(rows, BaseMount::Fixed, |t| t), &go2(), horizon).expect("a fixed base");
+            prop_assert_eq!(windows[0].rows.start, 0);
+            prop_assert_eq!(windows[windows.len() - 1].rows.end, rows);
+            for pair in windows.windows(2) {
+                prop_assert_eq!(pair[0].rows.end, pair[1].rows.start + 1);
+            }
+            for window in &windows {
+                // One actuator period per row at 200 Hz.
+                prop_assert_eq!(window.commands.len(), window.rows.len() - 1);
+                prop_assert!(window.history.len() <= (HISTORY_S * RATE_HZ) as usize);
+                prop_assert_eq!(window.history.is_empty(), window.rows.start == 0);
+            }
+        }
+
+        #[test]
+        fn initial_state_of_a_parabola_is_exact(a in -1.0f64..1.0, b in -5.0f64..5.0, c in -20.0f64..20.0) {
+            let motion = |t: f64| a + b * t + 0.5 * c * t * t;
+            let horizon = WindowConfig { fixed_length_s: 0.1, ..WindowConfig::DIAGNOSIS };
+            let windows = windows(&log(100, BaseMount::Fixed, motion), &go2(), horizon).expect("a fixed base");
+            for window in &windows {
+                let t = window.rows.start as f64 / RATE_HZ;
+                prop_assert!((f64::from(window.start.q[0]) - motion(t)).abs() < 1e-5);
+                prop_assert!((f64::from(window.start.dq[0]) - (b + c * t)).abs() < 1e-4);
+            }
+        }
+    }
+
+    #[test]
+    fn floating_base_without_its_motion_is_refused_by_name() {
+        let error =
+            windows(&log(50, BaseMount::Floating, |t| t), &go2(), WindowConfig::EVALUATION).expect_err("refused");
+        assert!(error.to_string().contains("the log has no `pos_z`"), "{error}");
+    }
+
+    #[test]
+    fn history_has_the_commands_before_the_window_oldest_first() {
+        let horizon = WindowConfig { fixed_length_s: 0.1, ..WindowConfig::DIAGNOSIS };
+        let windows = windows(&log(100, BaseMount::Fixed, |t| t), &go2(), horizon).expect("a fixed base");
+        let window = &windows[2];
+        let commanded: Vec<f32> = window.history.iter().map(|step| step.command.q[0]).collect();
+        let expected: Vec<f32> =
+            (0..8).map(|age| (window.rows.start as f64 / RATE_HZ - 0.005 * f64::from(8 - age)) as f32).collect();
+        assert!(commanded.iter().zip(&expected).all(|(one, other)| (one - other).abs() < 1e-6), "{commanded:?}");
+        assert_eq!(commanded.len(), 8);
+    }
 }

@@ -1,101 +1,15 @@
 //! Summary of a log: size, timing, contents and motion of the joints.
 
-use serde::Serialize;
-use twinstep_model::{BaseMount, Joint};
+use twinstep_model::Joint;
 
 use crate::columns::{Column, QUANTITIES, Quantity};
-use crate::excitation::{Excitation, excitation};
-use crate::falls::{Fall, falls};
-use crate::identifiability::{Identifiability, conclusions};
+use crate::excitation::excitation;
+use crate::falls::falls;
+use crate::identifiability::conclusions;
 use crate::missing_channels::absent;
+use crate::statistics::{quantile, standard_deviation};
+use crate::summary::{ChannelDescription, LogSummary, MissingChannel, SegmentDescription, Timing};
 use crate::{Log, TorqueSensor};
-
-/// Summary of a log, as text (`Display`) or data (`Serialize`).
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct LogSummary {
-    /// Number of rows.
-    pub rows: usize,
-    /// Recorded time, without the pauses between contiguous ranges of rows [s].
-    pub duration_s: f64,
-    /// Timing of the rows.
-    pub timing: Timing,
-    /// Segments with rows, in the order of `meta.json`.
-    pub segments: Vec<SegmentDescription>,
-    /// Recorded quantities.
-    pub channels: Vec<ChannelDescription>,
-    /// Quantities that were not recorded, and the consequences.
-    pub absent: Vec<MissingChannel>,
-    /// Excitation of each joint.
-    pub joints: Vec<Excitation>,
-    /// Falls of a robot with a floating base; `None` if the log has neither orientation nor height.
-    pub falls: Option<Vec<Fall>>,
-    /// Identifiability of each effect of the catalogue; empty for a motion file.
-    pub conclusions: Vec<Identifiability>,
-    /// Ignored columns of the file.
-    pub ignored: Vec<String>,
-    /// Warnings about the log.
-    #[serde(rename = "notes")]
-    pub warnings: Vec<String>,
-}
-
-/// Timing of the rows of a log. Values are `None` if no two rows are consecutive.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Timing {
-    /// Nominal rate in `meta.json` [Hz].
-    pub stated_rate_hz: f64,
-    /// Reciprocal of the median time step [Hz].
-    pub rate_hz: Option<f64>,
-    /// Standard deviation of the time step [s].
-    pub step_std_s: Option<f64>,
-    /// Median of the absolute difference of a time step from the median step [s].
-    pub jitter_p50_s: Option<f64>,
-    /// 99 % quantile of the absolute difference of a time step from the median step [s].
-    pub jitter_p99_s: Option<f64>,
-    /// Maximum of the absolute difference of a time step from the median step [s].
-    pub jitter_max_s: Option<f64>,
-    /// Number of gaps: time steps longer than 1.5 times the median.
-    pub gaps: usize,
-    /// Longest gap [s].
-    pub largest_gap_s: Option<f64>,
-}
-
-/// Summary of a segment.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct SegmentDescription {
-    /// Name of the segment.
-    pub name: String,
-    /// Mount of the base.
-    pub base: BaseMount,
-    /// Number of contiguous ranges of rows.
-    pub parts: usize,
-    /// Number of rows.
-    pub rows: usize,
-    /// Recorded time [s].
-    pub duration_s: f64,
-}
-
-/// Summary of a recorded quantity.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct ChannelDescription {
-    /// Name of the quantity, such as `tau_measured`.
-    pub quantity: &'static str,
-    /// Unit; empty if dimensionless.
-    pub unit: &'static str,
-    /// Number of columns.
-    pub columns: usize,
-    /// Number of empty cells in the columns.
-    pub missing_cells: usize,
-}
-
-/// Quantity that was not recorded.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct MissingChannel {
-    /// Name of the quantity, such as `tau_measured`.
-    pub quantity: &'static str,
-    /// Consequence for simulation, evaluation and identification.
-    #[serde(rename = "cost")]
-    pub consequence: &'static str,
-}
 
 impl Log {
     /// Returns the summary of the log.
@@ -214,21 +128,4 @@ impl Log {
     fn differences(&self, channel: &[f64]) -> impl Iterator<Item = (usize, f64)> {
         self.segments().flat_map(|(_, rows)| rows.start..rows.end - 1).map(|row| (row, channel[row + 1] - channel[row]))
     }
-}
-
-/// Returns the largest number; ignores NaN.
-pub(crate) fn largest(values: impl Iterator<Item = f64>) -> Option<f64> {
-    values.filter(|value| !value.is_nan()).reduce(f64::max)
-}
-
-/// Returns a quantile of sorted numbers, without interpolation.
-pub(crate) fn quantile(sorted: &[f64], fraction: f64) -> Option<f64> {
-    let index = (fraction * sorted.len().saturating_sub(1) as f64).round() as usize;
-    sorted.get(index).copied()
-}
-
-fn standard_deviation(values: &[f64]) -> f64 {
-    let count = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / count;
-    (values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count).sqrt()
 }

@@ -2,11 +2,9 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use crate::Identifiability;
-use crate::describe::{ChannelDescription, LogSummary, Timing};
 use crate::excitation::{Excitation, SpeedSource, TorqueSource};
 use crate::falls::Fall;
-use crate::identifiability::IdentifiabilityLevel;
+use crate::summary::{ChannelDescription, Identifiability, IdentifiabilityLevel, LogSummary, Timing};
 use twinstep_model::BaseMount;
 
 impl Display for LogSummary {

@@ -3,7 +3,7 @@
 use serde::Serialize;
 use twinstep_model::{Joint, JointModel, go2};
 
-use crate::describe::{largest, quantile};
+use crate::statistics::{largest, quantile, root_mean_square};
 use crate::{Log, TorqueSensor};
 
 /// Excitation of a joint: of its measured motion, or of its commands in a motion file.
@@ -151,10 +151,4 @@ fn band(reversals: &[Vec<f64>]) -> Option<[f64; 2]> {
     halves.sort_by(f64::total_cmp);
     Some([0.9, 0.1].map(|fraction| quantile(&halves, fraction)).map(|half| half.map(|half| 0.5 / half)))
         .and_then(|band| Some([band[0]?, band[1]?]))
-}
-
-fn root_mean_square(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let (count, sum) =
-        values.filter(|value| !value.is_nan()).fold((0, 0.0), |(count, sum), value| (count + 1, sum + value * value));
-    (count > 0).then(|| (sum / f64::from(count)).sqrt())
 }

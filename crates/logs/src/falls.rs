@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use crate::Log;
+use crate::statistics::quantile;
 use twinstep_model::BaseMount;
 
 /// Cosine of the tilt beyond which the robot has fallen: 60°.
@@ -38,7 +39,7 @@ pub(crate) fn falls(log: &Log) -> Option<Vec<Fall>> {
     for (segment, rows) in log.segments().filter(|(segment, _)| segment.base == BaseMount::Floating) {
         let mut heights: Vec<f64> = rows.clone().filter_map(metres).collect();
         heights.sort_by(f64::total_cmp);
-        let low = crate::describe::quantile(&heights, 0.5).map(|median| FALLEN_HEIGHT * median);
+        let low = quantile(&heights, 0.5).map(|median| FALLEN_HEIGHT * median);
         let mut upright = false;
         for row in rows {
             let tilted = cosine(row).is_some_and(|cosine| cosine < FALLEN_COSINE);

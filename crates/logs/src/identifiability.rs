@@ -1,39 +1,12 @@
 //! Identifiability of each effect of the catalogue from a log.
 
-use serde::Serialize;
 use twinstep_effects::{CATALOGUE, DataRequirement, Effect, LOW_SPEED};
 
-use crate::describe::{LogSummary, largest};
 use crate::excitation::{Excitation, velocity};
+use crate::statistics::largest;
+use crate::summary::{Identifiability, IdentifiabilityLevel, LogSummary};
 use crate::{Log, TorqueSensor};
 use twinstep_model::BaseMount;
-
-/// Identifiability of one effect from a log.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Identifiability {
-    /// Name of the effect in the catalogue.
-    pub effect: &'static str,
-    /// Level of identifiability.
-    pub verdict: IdentifiabilityLevel,
-    /// Reason, as text.
-    #[serde(rename = "because")]
-    pub reason: String,
-}
-
-/// Level of identifiability of an effect.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum IdentifiabilityLevel {
-    /// The log meets all necessary and recommended requirements.
-    #[serde(rename = "can")]
-    Identifiable,
-    /// The log meets the necessary requirements, but not all recommended ones.
-    #[serde(rename = "weakly")]
-    Weak,
-    /// The log does not meet a necessary requirement.
-    #[serde(rename = "cannot")]
-    NotIdentifiable,
-}
 
 /// Returns the identifiability of each effect; empty for a motion file, which has no measurements.
 pub(crate) fn conclusions(log: &Log, description: &LogSummary) -> Vec<Identifiability> {

@@ -28,7 +28,7 @@
 //! # Ok::<(), twinstep_logs::LogError>(())
 //! ```
 //!
-//! Reading passes through these modules: `files` finds the files; `csv_table`, `parquet_table` or `mcap_file` reads the
+//! Reading begins in `read` and passes through these modules: `files` finds the files; `csv_table`, `parquet_table` or `mcap_file` reads the
 //! cells; `columns` parses the column names; `check` validates the log.
 
 mod cdr;
@@ -49,17 +49,21 @@ mod meta;
 mod missing_channels;
 pub mod operating_conditions;
 mod parquet_table;
+mod read;
 pub mod recording;
 pub mod replay;
+mod statistics;
+mod summary;
 mod table;
 mod write;
 
 pub use cdr::CdrError;
-pub use describe::{ChannelDescription, LogSummary, MissingChannel, SegmentDescription, Timing};
 pub use error::{CellLocation, LogError};
 pub use excitation::{Excitation, SpeedSource, TorqueSource};
 pub use falls::Fall;
 pub use files::overwritten_file;
-pub use identifiability::{Identifiability, IdentifiabilityLevel};
 pub use log::Log;
 pub use meta::{Gain, Meta, Segment, TorqueSensor};
+pub use summary::{
+    ChannelDescription, Identifiability, IdentifiabilityLevel, LogSummary, MissingChannel, SegmentDescription, Timing,
+};

@@ -183,13 +183,12 @@ pub enum BackendError {
         late_ms: u32,
     },
     /// The simulation of some robots diverged to values that are not finite. The other robots were stepped.
-    #[error("the simulation of robot {robot} diverged: `{quantity}` is not finite ({more} more robots); reset it")]
+    #[error(
+        "the simulation of robot {} diverged: `{}` is not finite ({} more robots); reset it",
+        robots[0].0, robots[0].1, robots.len() - 1
+    )]
     Diverged {
-        /// The first robot that diverged.
-        robot: usize,
-        /// Its first quantity that is not finite.
-        quantity: &'static str,
-        /// Number of other robots that diverged in the same step.
-        more: usize,
+        /// The robots that diverged, at least one, each with its first quantity that is not finite.
+        robots: Vec<(usize, &'static str)>,
     },
 }

@@ -98,7 +98,7 @@ pub struct StepBatch {
     pub reward: Vec<f32>,
     /// True if the task ended the episode, per environment.
     pub terminated: Vec<bool>,
-    /// True if the time limit ended the episode, per environment.
+    /// True if the time limit or a diverged simulation ended the episode, per environment.
     pub truncated: Vec<bool>,
     /// Episodes that ended in this step.
     pub ended: Vec<EndedEpisode>,
@@ -134,6 +134,9 @@ pub struct EndedEpisode {
     pub episode_return: f32,
     /// Sum of each weighted reward term, in the order of [`EnvSpec::reward_terms`].
     pub terms: Vec<f32>,
+    /// True if the simulation of the robot became NaN or infinite in this step. The episode is truncated, and its last
+    /// observation is that before the step.
+    pub diverged: bool,
     /// Last observation of the episode with [`AutoresetMode::SameStep`]. Empty in the other modes: `obs` contains it.
     pub final_obs: Vec<f32>,
     /// The same of group `critic`.
@@ -182,14 +185,6 @@ pub enum EnvError {
     RenderUnsupported {
         /// The task.
         task: String,
-    },
-    /// The simulation of an environment diverged to values that are not finite. The others were stepped.
-    #[error("environment {env} diverged: `{quantity}` is not finite; reset it (`mask`) before the next step")]
-    Diverged {
-        /// The environment.
-        env: usize,
-        /// First quantity that is not finite.
-        quantity: String,
     },
     /// The backend failed.
     #[error(transparent)]

@@ -13,6 +13,7 @@ mod html;
 pub mod joint_plot;
 mod joint_table;
 mod limitations;
+mod model_evaluation;
 mod overview;
 mod page;
 mod plot;

@@ -9,6 +9,7 @@ use twinstep_logs::replay::{JointCommands, ReplayError, joint_commands};
 use twinstep_logs::{Log, TorqueSensor};
 use twinstep_model::{Joint, NUM_JOINTS, RobotModel, Rollout};
 
+use crate::model_evaluation::ModelEvaluation;
 use crate::residual_plot::{ResidualPlot, Residuals};
 use crate::time_series::TimeSeries;
 
@@ -121,16 +122,6 @@ fn without(given: &ModelFile, extended: &ModelFile, index: usize) -> Result<Robo
         _ => drop(entries.remove(index)),
     }
     apply_effects(&given.nominal.model, &entries)
-}
-
-/// Evaluation of a model on a log.
-pub struct ModelEvaluation {
-    /// Errors by joint.
-    pub evaluation: Evaluation,
-    /// Simulated minus measured position [rad], by joint and row.
-    pub position: JointSeries,
-    /// Modelled torques of the measured motion.
-    pub balance: InverseDynamicsResidual,
 }
 
 /// Evaluates models on one log.

@@ -6,7 +6,7 @@ use twinstep_identify::{Evaluation, JointEvaluation};
 use twinstep_logs::{Log, TorqueSensor};
 use twinstep_model::Joint;
 
-use crate::report_data::ModelEvaluation;
+use crate::model_evaluation::ModelEvaluation;
 use crate::timeline::Timeline;
 
 /// Maximum length of the detail plot [s].

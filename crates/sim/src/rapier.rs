@@ -149,13 +149,13 @@ impl RapierBackend {
         Ok(())
     }
 
-    fn first_diverged(&self, active: &[bool]) -> Option<BackendError> {
-        let mut diverged = (0..self.worlds.len()).filter(|robot| active[*robot]).filter_map(|robot| {
+    fn check_finite(&self, active: &[bool]) -> Result<(), BackendError> {
+        let diverged = (0..self.worlds.len()).filter(|robot| active[*robot]).filter_map(|robot| {
             let quantity = self.states.first_not_finite(robot);
             quantity.or_else(|| self.worlds[robot].diverged().then_some("dq")).map(|quantity| (robot, quantity))
         });
-        let (robot, quantity) = diverged.next()?;
-        Some(BackendError::Diverged { robot, quantity, more: diverged.count() })
+        let robots: Vec<_> = diverged.collect();
+        if robots.is_empty() { Ok(()) } else { Err(BackendError::Diverged { robots }) }
     }
 }
 
@@ -213,7 +213,7 @@ impl Backend for RapierBackend {
             self.read_state(robot);
             self.states.measured.stamp[robot] += elapsed;
         }
-        self.first_diverged(active).map_or(Ok(()), Err)
+        self.check_finite(active)
     }
 }
 

@@ -1,9 +1,9 @@
 //! From an instruction set to the code that runs on its registers.
 
-#[cfg(not(target_arch = "x86_64"))]
-use crate::float::F32x4 as BaselineF32;
 use crate::float::SimdFloat;
 use crate::instruction_set::{InstructionSet, Level};
+#[cfg(not(target_arch = "x86_64"))]
+use crate::portable::F32x4 as BaselineF32;
 #[cfg(target_arch = "x86_64")]
 use crate::x86::{Avx2F32, Avx2F64, Avx512F32, Sse2F32 as BaselineF32};
 

@@ -1,6 +1,6 @@
 //! Elementary functions from additions, multiplications and divisions alone, so that all lanes run the same code.
 
-use crate::SimdFloat;
+use crate::float::SimdFloat;
 
 /// Sine and cosine in single precision without a branch or an integer: Cody-Waite reduction to ±π/2, then Taylor
 /// polynomials.

@@ -20,10 +20,12 @@ mod dispatch;
 mod float;
 mod functions;
 mod instruction_set;
+mod portable;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
 pub use dispatch::{SimdTask, with_f32, with_f64};
-pub use float::{F32x4, SimdFloat, SimdKernel};
+pub use float::{SimdFloat, SimdKernel};
 pub use functions::exponential;
 pub use instruction_set::InstructionSet;
+pub use portable::F32x4;

@@ -127,7 +127,7 @@ proptest! {
                 let terms = vec![reward, -reward];
                 let final_obs = vec![reward; spec.obs_len()];
                 let final_critic_obs = vec![-reward; spec.critic_obs_len()];
-                let ended = EndedEpisode { env, length, episode_return: reward, terms, final_obs, final_critic_obs };
+                let ended = EndedEpisode { env, length, episode_return: reward, terms, diverged: env == 0, final_obs, final_critic_obs };
                 batch.ended.push(ended);
             }
         }

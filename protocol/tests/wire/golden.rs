@@ -191,6 +191,7 @@ fn step_has_its_golden_bytes() {
         ended_length: &[],
         ended_return: &[],
         ended_terms: &[],
+        ended_diverged: &[],
         final_obs: &[],
         critic_obs: &[],
         final_critic_obs: &[],
@@ -208,8 +209,12 @@ fn step_has_its_golden_bytes() {
     };
     check("step_reply_ended", &ended);
     let (critic_obs, final_critic_obs) = ([0.5f32, -0.25, 1.5, 2.5], [0.75f32, -1.0]);
-    let critic =
-        StepReply { critic_obs: as_bytes(&critic_obs), final_critic_obs: as_bytes(&final_critic_obs), ..ended };
+    let critic = StepReply {
+        ended_diverged: &[1],
+        critic_obs: as_bytes(&critic_obs),
+        final_critic_obs: as_bytes(&final_critic_obs),
+        ..ended
+    };
     check("step_reply_critic", &critic);
 }
 

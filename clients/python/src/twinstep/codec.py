@@ -123,7 +123,7 @@ class Spec:
 def read_spec(message: Mapping[str, Any], spec_hash: str) -> Spec:
     """Read the ``spec`` of a hello or lease reply."""
     try:
-        fields = {"critic_observation": (), **cast(Mapping[str, Any], message["spec"])}
+        fields: dict[str, Any] = {"critic_observation": (), **cast(Mapping[str, Any], message["spec"])}
         for name in ("observation", "critic_observation", "action"):
             fields[name] = tuple(
                 SpecField(**{key: part[key] for key in ("name", "size", "unit", "low", "high", "description")})

@@ -113,8 +113,8 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         reward : float
         terminated, truncated : bool
         info : dict
-            At the end of an episode ``reward_terms``, the episode's sum of each weighted reward term. With the option
-            ``critic``: ``critic_obs``.
+            At the end of an episode ``reward_terms``, the episode's sum of each weighted reward term, and
+            ``diverged`` if the simulation became NaN or infinite. With the option ``critic``: ``critic_obs``.
         """
         self.send(action)
         return self.recv()
@@ -132,6 +132,8 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         info = self._critic_info()
         if len(batch.ended):
             info["reward_terms"] = reward_terms(batch, 0, self.twinstep_spec.reward_terms)
+            if batch.ended_diverged[0]:
+                info["diverged"] = True
         if self._info_timing:
             info["round_trip_s"] = batch.round_trip_s
         self._show()

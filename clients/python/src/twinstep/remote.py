@@ -24,7 +24,7 @@ UNLIMITED = 2**32 - 1
 """``max_episode_steps`` that never truncates."""
 
 _CAPACITY = "1000000"
-_CONSUMES_SEQ = ("diverged", "internal")
+_CONSUMES_SEQ = ("internal",)
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,8 @@ class StepBatch:
         Policy steps of those episodes.
     ended_terms : (k, reward_terms) float32
         Sums of their weighted reward terms.
+    ended_diverged : (k,) bool
+        True for those whose simulation became NaN or infinite. They are truncated; ``obs`` is that before the step.
     final_obs : (k, obs_len) float32, or empty
         Their last observations; empty unless autoreset is SameStep.
     critic_obs : (num_envs, critic_len) float32
@@ -104,6 +106,7 @@ class StepBatch:
     ended: NDArray[np.int64]
     ended_length: NDArray[np.int64]
     ended_terms: NDArray[np.float32]
+    ended_diverged: NDArray[np.bool_]
     final_obs: NDArray[np.float32]
     critic_obs: NDArray[np.float32]
     final_critic_obs: NDArray[np.float32]
@@ -236,6 +239,9 @@ class RemoteVecEnv:
             ended=codec.tensor(reply, "ended_env", "<u4", k).astype(np.int64),
             ended_length=codec.tensor(reply, "ended_length", "<u4", k).astype(np.int64),
             ended_terms=codec.tensor(reply, "ended_terms", "<f4", k, terms),
+            ended_diverged=codec.tensor(reply, "ended_diverged", "?", k)
+            if reply.get("ended_diverged")
+            else np.zeros(k, np.bool_),
             final_obs=codec.tensor(reply, "final_obs", "<f4", num_final, obs_len),
             critic_obs=self.critic_obs,
             final_critic_obs=self._critic(reply, "final_critic_obs", num_final),

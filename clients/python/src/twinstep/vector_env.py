@@ -112,6 +112,7 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         terminated, truncated : (num_envs,) bool
         info : dict
             ``reward_terms`` of the episodes that ended; with ``"SameStep"`` in ``final_info``, next to ``final_obs``.
+            ``diverged`` is next to ``reward_terms`` for robots whose simulation became NaN or infinite.
             With the option ``critic``: ``critic_obs``, and ``critic_obs`` in ``final_info``.
         """
         self.send(actions)
@@ -178,6 +179,8 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         names = self.twinstep_spec.reward_terms
         for index, env in enumerate(batch.ended):
             info: dict[str, Any] = {"reward_terms": reward_terms(batch, index, names)}
+            if batch.ended_diverged[index]:
+                info["diverged"] = True
             if self._mode is AutoresetMode.SAME_STEP:
                 if self.twinstep_spec.critic_len > 0:
                     info["critic_obs"] = batch.final_critic_obs[index]

@@ -3,7 +3,6 @@
 //! Recursive Newton–Euler algorithm for forces, composite-rigid-body algorithm for the mass matrix (Featherstone,
 //! "Rigid Body Dynamics Algorithms", 2008, chapters 5 and 6).
 
-use super::factored::{FactoredDynamics, JointLoad};
 use super::spatial::{Inertia, Vec3};
 use super::tree::{KinematicTree, LegFrames, State};
 use twinstep_simd::SimdFloat;
@@ -53,22 +52,6 @@ pub fn inverse_dynamics<T: SimdFloat>(
         }
     }
     (Wrench { force, moment }, tau)
-}
-
-/// Computes forward dynamics: accelerations for joint torques `tau` [N·m] without contact.
-#[inline(always)]
-pub fn forward_dynamics<T: SimdFloat>(
-    tree: &KinematicTree<T>,
-    state: &State<T>,
-    tau: &[T; 12],
-    gravity: T,
-) -> Acceleration<T> {
-    let (one, zero) = (T::splat(1.0), T::splat(0.0));
-    let load = JointLoad { tau: *tau, damping: [zero; 12] };
-    let mut factored = FactoredDynamics::empty();
-    factored.set_up(tree, state, &load, one, gravity, one);
-    let ([ax, ay, az, lx, ly, lz], ddq) = factored.solution();
-    Acceleration { angular: Vec3([ax, ay, az]), linear: Vec3([lx, ly, lz]), ddq }
 }
 
 /// Returns the symmetric mass matrix, in the order angular and linear base velocity in base axes, joint velocities.

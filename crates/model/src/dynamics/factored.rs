@@ -6,7 +6,7 @@
 //! coordinates (u, g) is `Δq̇ = G⁻ᵀ (g − W Δv)`, `Δv = B⁻ᵀ u`. A constraint row is then nine numbers, y and z, with
 //! `J Δ = y·u + z·g`. Two rows are coupled through y·y' and, on the same leg, z·z'.
 
-use super::equations::{LegForces, LegInertia, spatial_matrix};
+use super::equations::{Acceleration, LegForces, LegInertia, spatial_matrix};
 use super::spatial::{Cholesky, Inertia, Vec3};
 use super::tree::{KinematicTree, LegFrames, State};
 use twinstep_simd::SimdFloat;
@@ -155,4 +155,20 @@ impl<T: SimdFloat> FactoredDynamics<T> {
         }
         (trunk, joints)
     }
+}
+
+/// Computes forward dynamics: accelerations for joint torques `tau` [N·m] without contact.
+#[inline(always)]
+pub fn forward_dynamics<T: SimdFloat>(
+    tree: &KinematicTree<T>,
+    state: &State<T>,
+    tau: &[T; 12],
+    gravity: T,
+) -> Acceleration<T> {
+    let (one, zero) = (T::splat(1.0), T::splat(0.0));
+    let load = JointLoad { tau: *tau, damping: [zero; 12] };
+    let mut factored = FactoredDynamics::empty();
+    factored.set_up(tree, state, &load, one, gravity, one);
+    let ([ax, ay, az, lx, ly, lz], ddq) = factored.solution();
+    Acceleration { angular: Vec3([ax, ay, az]), linear: Vec3([lx, ly, lz]), ddq }
 }

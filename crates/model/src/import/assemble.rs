@@ -27,8 +27,8 @@ pub fn assemble(
         let parent = if joint.kind == JointKind::Hip { 0 } else { links[joint.index() - 1] };
         check(joint, &description.links[links[joint.index()]], parent)?;
     }
-    let moving = description.links.iter().skip(1).enumerate();
-    for (_, link) in moving.filter(|(index, _)| !links.contains(&(index + 1))) {
+    let mut others = (1..description.links.len()).filter(|index| !links.contains(index));
+    if let Some(link) = others.next().map(|index| &description.links[index]) {
         let problem = "it is none of the twelve joints of the legs; make it `fixed`".to_owned();
         return Err(ImportError::Joint { joint: joint_of(link).name.clone(), problem });
     }

@@ -102,11 +102,10 @@ impl BatchBackend {
         }
     }
 
-    fn first_diverged(&self, active: &[bool]) -> Option<BackendError> {
+    fn check_finite(&self, active: &[bool]) -> Result<(), BackendError> {
         let active = (0..active.len()).filter(|robot| active[*robot]);
-        let mut diverged = active.filter_map(|robot| Some((robot, self.states.first_not_finite(robot)?)));
-        let (robot, quantity) = diverged.next()?;
-        Some(BackendError::Diverged { robot, quantity, more: diverged.count() })
+        let robots: Vec<_> = active.filter_map(|robot| Some((robot, self.states.first_not_finite(robot)?))).collect();
+        if robots.is_empty() { Ok(()) } else { Err(BackendError::Diverged { robots }) }
     }
 }
 
@@ -200,8 +199,7 @@ impl Backend for BatchBackend {
         for (stamp, _) in states.measured.stamp.iter_mut().zip(active).filter(|(_, active)| **active) {
             *stamp += elapsed;
         }
-        let diverged = if finite { None } else { self.first_diverged(active) };
-        diverged.map_or(Ok(()), Err)
+        if finite { Ok(()) } else { self.check_finite(active) }
     }
 }
 

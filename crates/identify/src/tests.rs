@@ -1,0 +1,226 @@
+//! Tests of search and refinement with a simulator in which the optimum has a closed form.
+
+use nalgebra::DMatrix;
+use proptest::prelude::*;
+use twinstep_effects::{CATALOGUE, Effect, ModelFile, Scope, Target};
+use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{BaseMount, Precision, RobotStates, Rollout, RolloutRequest, go2};
+
+use crate::experiment::Experiment;
+use crate::global_search::GlobalSearch;
+use crate::least_squares::LeastSquaresProblem;
+use crate::parameter::{FreeParameter, drop_unidentifiable, free_parameters, initial_coordinate, with_values};
+use crate::refine::{SIMULATOR_MISMATCH_STD, covariance, information, refine};
+use crate::window::WindowConfig;
+
+const ROWS: usize = 400;
+const RATE_HZ: f64 = 200.0;
+/// Viscous friction [N·m·s/rad] and Coulomb friction [N·m] of the robot.
+const TRUTH: [f64; 2] = [0.25, 0.6];
+
+/// Positions that are linear in the two frictions of the first joint: 1 mrad per standard deviation of the prior.
+fn position([viscous, coulomb]: [f64; 2], row: usize) -> f64 {
+    let row = row as f64;
+    0.01 * viscous * (0.7 * row).sin() + 0.004 * coulomb * (0.31 * row).cos()
+}
+
+struct Linear;
+
+impl Rollout for Linear {
+    fn run(&mut self, jobs: &[RolloutRequest], _: Precision) -> Vec<RobotStates> {
+        let play = |job: &RolloutRequest| {
+            let joint = &job.robot.joints[0];
+            let mut states = RobotStates::new(job.commands.len() + 1);
+            for (row, q) in states.measured.q.iter_mut().enumerate() {
+                q[0] = position([joint.viscous_friction, joint.coulomb_friction], row) as f32;
+            }
+            states
+        };
+        jobs.iter().map(play).collect()
+    }
+}
+
+fn named(name: &str) -> &'static Effect {
+    Effect::named(name).expect("in the catalogue")
+}
+
+fn experiment() -> Experiment {
+    let column = |name: &str, of: &dyn Fn(usize) -> f64| (name.to_owned(), (0..ROWS).map(of).collect());
+    let columns = [
+        column("t", &|row| row as f64 / RATE_HZ),
+        column("q_FL_hip", &|row| position(TRUTH, row)),
+        column("q_cmd_FL_hip", &|_| 0.0),
+        column("kp", &|_| 25.0),
+        column("kd", &|_| 0.6),
+    ];
+    let mut meta =
+        Meta::new(RATE_HZ, TorqueSensor::None, vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }]);
+    meta.noise.insert("q_FL_hip".to_owned(), 1e-4);
+    let log = Log::new(meta, columns).expect("a log");
+    Experiment::new(&log, &go2(), WindowConfig::IDENTIFICATION).expect("an experiment")
+}
+
+/// Calls `ask` with the problem of finding both frictions of the first joint.
+fn with_problem<R>(ask: impl FnOnce(&LeastSquaresProblem, Vec<f64>) -> R) -> R {
+    let scope = "FL_hip".parse::<Scope>().expect("a scope");
+    let effects = [(named("viscous_friction"), scope), (named("coulomb_friction"), scope)];
+    let (file, unknowns) = free_parameters(&ModelFile::default(), &effects).expect("no conflict");
+    let experiments = [experiment()];
+    let begin = unknowns.iter().map(|unknown| initial_coordinate(&file, unknown)).collect();
+    let (tolerances, precision) = (None, Precision::Double);
+    let (file, unknowns, experiments) = (&file, &unknowns[..], &experiments[..]);
+    ask(&LeastSquaresProblem { file, unknowns, experiments, residual_scale: &[], tolerances, precision }, begin)
+}
+
+#[test]
+fn refinement_converges_to_the_truth_up_to_the_pull_of_the_prior() {
+    with_problem(|task, begin| {
+        let found = refine(task, &mut Linear, begin, |_| true);
+        let here = task.linearise(&mut Linear, &found).expect("finite");
+        let information = information(&here);
+        for (index, truth) in TRUTH.iter().enumerate() {
+            let unknown = &task.unknowns[index];
+            // A linear problem: the estimate is the mean of truth and prior mean, weighted by their information.
+            let pull = (unknown.prior[0] - truth) / information[(index, index)];
+            assert!((found[index] - truth - pull).abs() < 0.01 * unknown.prior[1], "{} for {truth}", found[index]);
+        }
+    });
+}
+
+#[test]
+fn refinement_stops_when_it_is_told_to() {
+    with_problem(|task, begin| {
+        let mut steps = 0;
+        refine(task, &mut Linear, begin.clone(), |_| {
+            steps += 1;
+            false
+        });
+        assert_eq!(steps, 1);
+    });
+}
+
+#[test]
+fn covariance_of_white_residuals_is_the_inverse_information_and_correlation_increases_it() {
+    with_problem(|task, begin| {
+        let mut here = task.linearise(&mut Linear, &begin).expect("finite");
+        let count = here.residuals.len();
+        let inverse = information(&here).cholesky().expect("positive definite").inverse();
+        // A sign for each row, and for each ten rows.
+        let sign = |index: usize| if (index * 7919 % 101).is_multiple_of(2) { 1.0 } else { -1.0 };
+        let std = |here: &crate::least_squares::Linearisation, rows_per_block: usize| {
+            let blocks: Vec<usize> = (0..count).map(|row| row / rows_per_block).collect();
+            covariance(here, &blocks, &[]).expect("positive definite")[(0, 0)].sqrt()
+        };
+        here.residuals.iter_mut().enumerate().for_each(|(row, residual)| *residual = sign(row));
+        let white = std(&here, 1);
+        let expected = (inverse[(0, 0)] + SIMULATOR_MISMATCH_STD.powi(2)).sqrt();
+        assert!((white / expected - 1.0).abs() < 0.2, "{white}, {expected} expected");
+        let jacobian = here.jacobian.clone();
+        here.residuals.iter_mut().enumerate().for_each(|(row, residual)| *residual = 3.0 * jacobian[(row, 0)].signum());
+        assert!(std(&here, 50) > 2.0 * white, "residuals that follow the derivative are a model error");
+    });
+}
+
+#[test]
+fn covariance_includes_the_effect_of_nuisance_parameters() {
+    with_problem(|task, begin| {
+        let here = task.linearise(&mut Linear, &begin).expect("finite");
+        let blocks: Vec<usize> = (0..here.residuals.len()).collect();
+        let without = covariance(&here, &blocks, &[]).expect("positive definite");
+        let error: Vec<f64> = here.jacobian.column(0).iter().copied().collect();
+        let with = covariance(&here, &blocks, &[error]).expect("positive definite");
+        // The error moves the estimate by one standard deviation of the prior, less the pull of the prior.
+        assert!((with[(0, 0)] - without[(0, 0)] - 1.0).abs() < 0.1, "{} {}", with[(0, 0)], without[(0, 0)]);
+    });
+}
+
+#[test]
+fn interrupted_global_search_continues_as_if_it_had_not_been_interrupted() {
+    with_problem(|task, begin| {
+        let new = || GlobalSearch::new("frictions".to_owned(), task, begin.clone(), &mut Linear);
+        let mut whole = new();
+        assert!(!whole.run(task, &mut Linear, 40, 3, |_, _| true), "not interrupted");
+        let mut parts = new();
+        assert!(parts.run(task, &mut Linear, 40, 3, |generation, _| generation < 2), "interrupted");
+        let text = serde_json::to_string(&parts).expect("serialised");
+        let mut parts: GlobalSearch = serde_json::from_str(&text).expect("read back");
+        parts.run(task, &mut Linear, 40, 3, |_, _| true);
+        assert_eq!(parts, whole);
+        for (index, truth) in TRUTH.iter().enumerate() {
+            let error = (whole.best[index] - truth).abs() / task.unknowns[index].prior[1];
+            assert!(error < 0.1, "{} for {truth}", whole.best[index]);
+        }
+    });
+}
+
+#[test]
+fn residual_scale_of_a_quantity_is_its_rms_in_units_of_noise() {
+    with_problem(|task, begin| {
+        let scale = task.estimate_residual_scale(&mut Linear, &begin);
+        let residuals = task.residuals(&mut Linear, std::slice::from_ref(&begin)).remove(0).expect("finite");
+        let rms = (residuals.iter().map(|residual| residual * residual).sum::<f64>() / residuals.len() as f64).sqrt();
+        assert!(rms > 1.0 && scale.iter().all(|scale| (scale - rms).abs() < 1e-9), "{rms} {scale:?}");
+    });
+}
+
+#[test]
+fn added_entries_without_an_identifiable_parameter_are_dropped() {
+    let scope = "FL_hip".parse::<Scope>().expect("a scope");
+    let effects = [(named("viscous_friction"), scope), (named("coulomb_friction"), scope)];
+    let (mut file, unknowns) = free_parameters(&ModelFile::default(), &effects).expect("no conflict");
+    drop_unidentifiable(&mut file, &ModelFile::default(), &unknowns, &[false, true]);
+    let left: Vec<_> = file.effects.iter().map(|entry| entry.effect.name).collect();
+    assert_eq!(left, ["coulomb_friction"]);
+}
+
+/// Returns the free parameters of an effect on its widest scope.
+fn parameters_of(effect: &'static Effect) -> (ModelFile, Vec<FreeParameter>) {
+    let scope = match effect.target {
+        Target::Joints | Target::Supply => Scope::All,
+        Target::Bodies | Target::Imu => Scope::Base,
+        Target::Ground => Scope::Ground,
+    };
+    free_parameters(&ModelFile::default(), &[(effect, scope)]).expect("no conflict")
+}
+
+proptest! {
+    #[test]
+    fn coordinates_of_every_parameter_round_trip(index in 0..CATALOGUE.len(), share in 0.01f64..0.99) {
+        let (file, unknowns) = parameters_of(CATALOGUE[index]);
+        let inside = |[low, high]: [f64; 2]| low + share * (high - low);
+        let coordinates: Vec<f64> = unknowns.iter().map(|unknown| inside(unknown.coordinate_bounds())).collect();
+        let moved = with_values(&file, &unknowns, &coordinates);
+        for (unknown, coordinate) in unknowns.iter().zip(&coordinates) {
+            let [low, high] = unknown.coordinate_bounds();
+            prop_assert!(low < high && unknown.prior[1] > 0.0);
+            let value = unknown.value(*coordinate);
+            prop_assert!((unknown.coordinate(value) - coordinate).abs() <= 1e-9 * coordinate.abs().max(1.0));
+            prop_assert!((initial_coordinate(&moved, unknown) - coordinate).abs() <= 1e-9 * coordinate.abs().max(1.0));
+        }
+    }
+}
+
+#[test]
+fn prior_of_a_parameter_is_its_central_95_percent() {
+    for effect in CATALOGUE.into_iter().filter(|effect| !effect.replaces_body()) {
+        for unknown in parameters_of(effect).1 {
+            let [mean, std] = unknown.prior;
+            let parameter = effect.parameters.iter().find(|one| unknown.parameter_name.starts_with(one.name));
+            let [low, high] = parameter.expect("its own").prior_range;
+            let ends = [mean - 1.96 * std, mean + 1.96 * std];
+            // A limit has its prior on the inverse, which is 0 for no effect.
+            let expected = if unknown.neutral.is_infinite() { [0.0, 1.0 / low] } else { [low, high] };
+            let tolerance = 1e-3 * (expected[1] - expected[0]);
+            assert!((0..2).all(|end| (ends[end] - expected[end]).abs() < tolerance), "{}: {ends:?}", unknown.name());
+        }
+    }
+}
+
+#[test]
+fn information_contains_the_prior() {
+    with_problem(|task, begin| {
+        let mut here = task.linearise(&mut Linear, &begin).expect("finite");
+        here.jacobian = DMatrix::zeros(here.jacobian.nrows(), 2);
+        assert_eq!(information(&here), DMatrix::identity(2, 2));
+    });
+}

@@ -1,0 +1,71 @@
+//! Reading logs from files, and creating logs from columns in memory.
+
+use std::path::Path;
+
+use crate::check::{self, LogKind};
+use crate::files::{Files, Format};
+use crate::table::Table;
+use crate::{Log, LogError, Meta, csv_table, mcap_file, parquet_table};
+
+impl Log {
+    /// Reads a log from its folder or its data file.
+    ///
+    /// A folder contains `meta.json` and one of `data.parquet`, `data.csv`, `data.csv.gz` and `data.mcap`. The metadata
+    /// of a data file `walk.csv` is `walk.json` or `meta.json` in the same folder. MCAP needs no metadata file: a file
+    /// that [`Log::write`] wrote contains its metadata, and for other recordings default metadata are used.
+    pub fn open(path: impl AsRef<Path>) -> Result<Log, LogError> {
+        read(path.as_ref(), LogKind::Measurement)
+    }
+
+    /// Reads a motion file: a log that needs only command columns, and no gains.
+    ///
+    /// A measured log is also a valid motion file.
+    pub fn open_commands(path: impl AsRef<Path>) -> Result<Log, LogError> {
+        read(path.as_ref(), LogKind::Commands)
+    }
+
+    /// Creates a log from columns in memory, validated like a file. A missing cell is NaN.
+    pub fn new(meta: Meta, columns: impl IntoIterator<Item = (String, Vec<f64>)>) -> Result<Log, LogError> {
+        from_columns(meta, columns, LogKind::Measurement)
+    }
+
+    /// Creates a log from command columns in memory, as [`Log::open_commands`] reads them.
+    pub fn new_commands(meta: Meta, columns: impl IntoIterator<Item = (String, Vec<f64>)>) -> Result<Log, LogError> {
+        from_columns(meta, columns, LogKind::Commands)
+    }
+}
+
+fn read(path: &Path, need: LogKind) -> Result<Log, LogError> {
+    let files = Files::find(path)?;
+    let meta = files.meta.as_deref().map(Meta::read).transpose()?;
+    let meta_file = files.meta.as_ref().unwrap_or(&files.data);
+    let needed = |meta: Option<Meta>| {
+        meta.ok_or_else(|| LogError::NoMeta { expected: files.expected_meta(), data: files.data.clone() })
+    };
+    let open = || std::fs::File::open(&files.data).map_err(|cause| LogError::Read { file: files.data.clone(), cause });
+    let (table, meta) = match files.format {
+        Format::Csv => (csv_table::read(&files.data, open()?)?, needed(meta)?),
+        Format::CsvGz => (csv_table::read(&files.data, flate2::read::MultiGzDecoder::new(open()?))?, needed(meta)?),
+        Format::Parquet => (parquet_table::read(&files.data)?, needed(meta)?),
+        Format::Mcap => mcap_file::read(&files.data, meta)?,
+    };
+    check::assemble(table, meta, meta_file, need)
+}
+
+fn from_columns(
+    meta: Meta,
+    columns: impl IntoIterator<Item = (String, Vec<f64>)>,
+    need: LogKind,
+) -> Result<Log, LogError> {
+    // Errors show this instead of a path.
+    let here = Path::new("columns in memory");
+    meta.check(here)?;
+    let (names, cells): (Vec<_>, Vec<_>) = columns.into_iter().unzip();
+    let (mut table, indices) = Table::from_header(here, &names)?;
+    for (cells, index) in cells.into_iter().zip(indices) {
+        if let Some(index) = index {
+            table.columns[index].1 = cells;
+        }
+    }
+    check::assemble(table, meta, here, need)
+}

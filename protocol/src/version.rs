@@ -1,0 +1,4 @@
+//! Version of the protocol.
+
+/// Protocol version of this crate.
+pub const PROTOCOL: u16 = 1;
