@@ -119,7 +119,7 @@ fn hello_has_its_golden_bytes() {
         name: "go2".to_owned(),
         server_id: "0123456789abcdef".to_owned(),
         spec_hash: small_spec().hash(),
-        spec: small_spec(),
+        spec: EnvSpec { critic_observation: small_spec().observation[..1].to_vec(), ..small_spec() },
         max_envs: 4096,
         free_envs: 4032,
         lease_grace_s: 10.0,
