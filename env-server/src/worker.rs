@@ -1,9 +1,10 @@
 //! Worker of one lease: owns its environments and executes every request exactly once, in order.
 //!
 //! Requests carry the lease's epoch and a sequence number. The worker executes the next number and caches the reply.
-//! A repeated number gets the cached reply. Any other number is an error. A request that is rejected without effect
+//! A repeated request gets the cached reply. Any other number, or the same number with another request, is an error. A request that is rejected without effect
 //! does not consume its number. `render` only reads: it has no number and is answered between two requests.
 
+use std::hash::{BuildHasher, RandomState};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -29,6 +30,10 @@ pub struct Worker {
     last_seq: u64,
     /// Method and reply of `last_seq`.
     last_reply: Option<(EnvMethod, CachedReply)>,
+    /// Hash of the request of `last_seq`; `None` if another process has reclaimed the lease since.
+    last_request: Option<u64>,
+    /// Hashes requests, with random keys.
+    hasher: RandomState,
     actions: Vec<f32>,
     /// Reason why the environments cannot be used any more; `None` while they can.
     failure: Option<String>,
@@ -64,6 +69,8 @@ impl Worker {
             epoch: 1,
             last_seq: 0,
             last_reply: None,
+            last_request: None,
+            hasher: RandomState::new(),
             actions: Vec::new(),
             failure: None,
             grant,
@@ -84,7 +91,10 @@ impl Worker {
     }
 
     fn transfer(&mut self, epoch: u64) -> CachedReply {
-        self.epoch = epoch;
+        if epoch != self.epoch {
+            // The new owner may repeat the last request without knowing what it contained.
+            (self.epoch, self.last_request) = (epoch, None);
+        }
         if let Some(reason) = &self.failure {
             // The lease is unusable: release its environments for another lease.
             self.request_release();
@@ -124,8 +134,9 @@ impl Worker {
             return CachedReply::Err(error);
         }
         if header.seq == self.last_seq {
+            let is_repeat = self.last_request.is_none_or(|last| last == self.hasher.hash_one(&*payload));
             return match &self.last_reply {
-                Some((answered, answer)) if *answered == verb => answer.clone(),
+                Some((answered, answer)) if *answered == verb && is_repeat => answer.clone(),
                 _ => CachedReply::Err(stale_sequence(header.seq, self.last_seq)),
             };
         }
@@ -150,6 +161,7 @@ impl Worker {
         };
         self.last_seq = header.seq;
         self.last_reply = Some((verb, answer.clone()));
+        self.last_request = Some(self.hasher.hash_one(&*payload));
         answer
     }
 

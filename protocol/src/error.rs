@@ -42,10 +42,13 @@ pub enum ErrorCode {
     ShuttingDown,
     /// The server failed; its log contains the reason.
     Internal,
+    /// A code of a newer server that this version does not know; [`ErrorReply::message`] says what it means.
+    #[serde(other)]
+    Unknown,
 }
 
 impl ErrorCode {
-    /// All error codes.
+    /// All error codes of this version.
     pub const ALL: [ErrorCode; 16] = [
         ErrorCode::Version,
         ErrorCode::Malformed,

@@ -36,6 +36,17 @@ fn request_sent_three_times_is_executed_once_with_equal_replies() {
 }
 
 #[test]
+fn same_number_with_another_request_is_rejected_without_effect() {
+    with_counters(|client, lease| {
+        let step = |action: f32| client.ask_env(lease, EnvMethod::Step, &step_with(lease, 2, &[action; 24]));
+        let first = step(0.2).unwrap();
+        assert_eq!(step(0.7).unwrap_err().code, ErrorCode::StaleSequence, "its transition would be that of 0.2");
+        assert_eq!(step(0.2).unwrap(), first);
+        assert_eq!(steps_in(&client.step(lease, 3).unwrap()), 2.0);
+    });
+}
+
+#[test]
 fn request_sent_again_while_it_is_in_progress_is_executed_once() {
     with_counters(|client, lease| {
         let key = keys::env(&client.sid, &lease.lease, EnvMethod::Step);

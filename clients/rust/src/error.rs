@@ -108,6 +108,11 @@ pub enum ClientError {
         /// What is wrong with the reply.
         reason: String,
     },
+    /// An earlier reply could not be read, so the state of the environments is unknown.
+    #[error(
+        "the state of the environments is unknown, because a reply could not be read\n  call `reset` without a mask to continue"
+    )]
+    UnknownState,
 }
 
 /// Value of `TWINSTEP_LOG` with which a server logs each rejected client and the reason.

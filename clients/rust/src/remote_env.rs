@@ -34,6 +34,8 @@ pub struct RemoteVecEnv {
     render: OnceLock<Querier<'static>>,
     /// The request in progress, with its method.
     pending: Option<(EnvMethod, Pending)>,
+    /// True if a reply could not be read, so that the state of the environments is unknown. A reset heals it.
+    is_unknown: bool,
     batch: StepBatch,
 }
 
@@ -78,6 +80,7 @@ impl RemoteVecEnv {
             reset,
             render: OnceLock::new(),
             pending: None,
+            is_unknown: false,
             connection,
         })
     }
@@ -91,6 +94,9 @@ impl RemoteVecEnv {
     pub fn send(&mut self, actions: &[f32]) -> Result<(), EnvError> {
         if let Some((verb, _)) = &self.pending {
             return Err(remote(ClientError::RequestPending(verb.name())));
+        }
+        if self.is_unknown {
+            return Err(remote(ClientError::UnknownState));
         }
         let expected = self.num_envs * self.spec.action_len();
         if actions.len() != expected {
@@ -114,9 +120,12 @@ impl RemoteVecEnv {
         }
         let answer = self.await_pending()?;
         let bytes = answer.to_bytes();
+        self.is_unknown = true;
         let reply: message::StepReply<'_> = decode(&bytes).map_err(|error| malformed("step", error))?;
+        check_seq("step", reply.seq, self.last_seq)?;
         convert::decode_step(&reply, &self.spec, self.num_envs, &mut self.batch)
             .map_err(|error| malformed("step", error))?;
+        self.is_unknown = false;
         Ok(&self.batch)
     }
 
@@ -191,9 +200,13 @@ impl VecEnv for RemoteVecEnv {
         self.pending = Some((EnvMethod::Reset, send(&self.reset, payload).map_err(remote)?));
         let answer = self.await_pending()?;
         let bytes = answer.to_bytes();
+        let was_unknown = std::mem::replace(&mut self.is_unknown, true);
         let reply: message::ResetReply<'_> = decode(&bytes).map_err(|error| malformed("reset", error))?;
+        check_seq("reset", reply.seq, self.last_seq)?;
         convert::decode_observations(&reply, &self.spec, self.num_envs, &mut self.batch)
             .map_err(|error| malformed("reset", error))?;
+        // A mask leaves the other environments as they are.
+        self.is_unknown = was_unknown && request.mask.is_some();
         Ok(&self.batch.obs)
     }
 
@@ -218,6 +231,15 @@ impl VecEnv for RemoteVecEnv {
 
 fn remote(error: ClientError) -> EnvError {
     EnvError::Remote(Box::new(error))
+}
+
+/// Fails if a reply is not that to the last request.
+fn check_seq(request: &str, given: u64, expected: u64) -> Result<(), EnvError> {
+    if given == expected {
+        return Ok(());
+    }
+    let reason = format!("its `seq` is {given}, not {expected}");
+    Err(remote(ClientError::Malformed { request: request.to_owned(), reason }))
 }
 
 fn malformed(request: &str, error: ErrorReply) -> EnvError {

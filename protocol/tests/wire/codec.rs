@@ -268,3 +268,13 @@ fn rough_ground_survives_the_wire_and_a_grid_with_too_few_heights_is_refused() {
         assert_eq!((error.code, error.field.as_str()), (ErrorCode::BadShape, "height_field"), "{rows} × {columns}");
     }
 }
+
+#[test]
+fn error_code_of_a_newer_server_is_read_with_its_message() {
+    let mut reply = ErrorReply::new(ErrorCode::Busy, "", "the robot has fallen");
+    let bytes = encode(&reply);
+    let at = bytes.windows(4).position(|window| window == b"busy").expect("the code");
+    let newer = [&bytes[..at], b"fell", &bytes[at + 4..]].concat();
+    reply.code = ErrorCode::Unknown;
+    assert_eq!(decode::<ErrorReply>(&newer).expect("read"), reply);
+}

@@ -16,6 +16,7 @@ from .env import Go2Env
 from .errors import (
     AmbiguousRobotError,
     Error,
+    ForkedProcessError,
     InvalidActionError,
     InvalidOptionError,
     LeaseLostError,
@@ -36,6 +37,7 @@ __all__ = [
     "ConnectOptions",
     "EmbeddedServer",
     "Error",
+    "ForkedProcessError",
     "Go2Env",
     "Go2VectorEnv",
     "InvalidActionError",

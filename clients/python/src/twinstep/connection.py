@@ -14,6 +14,7 @@ from . import codec
 from .errors import (
     AmbiguousRobotError,
     Error,
+    ForkedProcessError,
     InvalidOptionError,
     LeaseLostError,
     NoServerError,
@@ -39,21 +40,35 @@ _RESTART_CONFIRMATION_S = 2.0
 _LIVE_SERVERS = "twinstep/live/server/*/*"
 
 
+class _ZenohProcess:
+    """The process in which the threads of Zenoh run. A forked process has none, and Zenoh would wait for them."""
+
+    pid: int | None = None
+
+    @classmethod
+    def check(cls) -> None:
+        if cls.pid is not None and cls.pid != os.getpid():
+            raise ForkedProcessError(
+                "this process was forked from one with a Twinstep environment, and Zenoh does not work in it\n"
+                "  start processes with `spawn`: multiprocessing.get_context('spawn'), or with Gymnasium\n"
+                "  make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})"
+            )
+
+
 class Pending:
     """A request in progress."""
 
     def __init__(self, querier: zenoh.Querier, payload: bytes) -> None:
         self.querier = querier
         self.payload = payload
-        self.replies = self._get()
+        # None: not sent yet, or interrupted while it was sent.
+        self.replies: Any = None
 
-    def repeat(self) -> None:
-        """Send the request again with the same number, so that it is executed once."""
-        self.replies = self._get()
-
-    def _get(self) -> Any:
+    def send(self) -> None:
+        """Send the request, the first time or again with the same number, so that it is executed once."""
+        _ZenohProcess.check()
         try:
-            return self.querier.get(payload=self.payload)
+            self.replies = self.querier.get(payload=self.payload)
         except zenoh.ZError as error:
             raise NoServerError(f"the Zenoh session is closed: {error}") from error
 
@@ -110,7 +125,9 @@ class Connection:
 
     def request(self, querier: zenoh.Querier, message: dict[str, object], timeout_s: float) -> dict[str, Any]:
         """Send a request and wait for the reply."""
-        return self.wait_reply(Pending(querier, codec.encode(message)), timeout_s)
+        pending = Pending(querier, codec.encode(message))
+        pending.send()
+        return self.wait_reply(pending, timeout_s)
 
     def wait_reply(self, pending: Pending, timeout_s: float) -> dict[str, Any]:
         """Wait for the reply to a request, and repeat the request. May be called again after a timeout."""
@@ -137,7 +154,7 @@ class Connection:
                 )
             time.sleep(pause)
             pause = min(2 * pause, _MAX_BACKOFF_S)
-            pending.repeat()
+            pending.send()
 
     def _handshake(self) -> dict[str, Any]:
         request: dict[str, object] = {"client": "twinstep-python"}
@@ -190,7 +207,9 @@ class Connection:
             return "the connection is lost and cannot be restored; check that the server or the router is running"
         if all(server_id != self.server_id for server_id, _ in self._visible_servers()):
             return "the connection works, but the server is no longer visible: it has terminated or lost its router"
-        hello = _outcome(Pending(self.querier("hello"), codec.encode({"client": "twinstep-python"})))
+        pending = Pending(self.querier("hello"), codec.encode({"client": "twinstep-python"}))
+        pending.send()
+        hello = _outcome(pending)
         if isinstance(hello, dict):
             return (
                 "the server answers `hello`, but not this request: it is still in progress (increase `timeout_s`), or "
@@ -214,6 +233,8 @@ _NoReply.NONE, _NoReply.TIMEOUT, _NoReply.BUSY = _NoReply(), _NoReply(), _NoRepl
 
 def _outcome(pending: Pending) -> dict[str, Any] | _NoReply:
     """Return the reply to one query, or why there is none. Raises error replies of the server."""
+    if pending.replies is None:
+        return _NoReply.TIMEOUT
     for reply in pending.replies:
         if reply.ok is not None:
             return codec.decode(reply.ok.payload.to_bytes())
@@ -229,7 +250,9 @@ def _outcome(pending: Pending) -> dict[str, Any] | _NoReply:
 
 
 def _open_session(endpoint: str, path: str | None, server: EmbeddedServer | None) -> zenoh.Session:
+    _ZenohProcess.check()
     config = _zenoh_config(endpoint, path)
+    _ZenohProcess.pid = os.getpid()
     since = time.monotonic()
     while True:
         try:

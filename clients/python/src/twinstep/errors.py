@@ -50,6 +50,10 @@ class ResetNeededError(Error, gymnasium.error.ResetNeeded):
     """An environment has no episode: call ``reset`` first."""
 
 
+class ForkedProcessError(Error):
+    """Zenoh cannot be used in a process that was forked after a session was opened; start processes with ``spawn``."""
+
+
 class RequestRejectedError(Error):
     """The server rejected a request.
 

@@ -180,7 +180,9 @@ class RemoteVecEnv:
             method: connection.querier(f"env/{lease['lease']}/{method}")
             for method in ("reset", "step", "render", "close")
         }
-        self._pending: tuple[str, Pending, float] | None = None
+        self._pending: tuple[str, int, Pending, float] | None = None
+        # Why the state of the environments is unknown: a reply was lost. A reset of all of them heals it.
+        self._unknown: str | None = None
         self.critic_obs = np.zeros((self.num_envs, self.spec.critic_len), dtype=np.float32)
         """Observations of group ``critic`` after the last reset or step: (num_envs, critic_len)."""
 
@@ -200,6 +202,8 @@ class RemoteVecEnv:
             Observations of all environments, reset or not.
         """
         self._resolve_abandoned_request()
+        if mask is not None:
+            self._check_known()
         request: dict[str, object] = {}
         if seeds is not None:
             request["seeds"] = seeds.astype("<u8").tobytes()
@@ -207,8 +211,11 @@ class RemoteVecEnv:
             request["mask"] = mask.astype(np.uint8).tobytes()
         self._send("reset", request)
         reply = self._await_pending(self._options.reset_timeout_s)
+        self._unknown = "the reply to a reset could not be read"
         self.critic_obs = self._critic(reply, "critic_obs", self.num_envs)
-        return codec.tensor(reply, "obs", "<f4", self.num_envs, self.spec.obs_len)
+        obs = codec.tensor(reply, "obs", "<f4", self.num_envs, self.spec.obs_len)
+        self._unknown = None
+        return obs
 
     def send(self, actions: NDArray[Any]) -> None:
         """Send actions without waiting, so that the caller can compute during the step. Call :meth:`recv` next."""
@@ -217,6 +224,7 @@ class RemoteVecEnv:
                 f"the last `{self._pending[0]}` has no reply yet\n"
                 "  call `recv` to wait for it, or `reset` to wait and start new episodes"
             )
+        self._check_known()
         self._send("step", {"actions": self._checked(actions).tobytes()})
 
     def recv(self) -> StepBatch:
@@ -225,8 +233,15 @@ class RemoteVecEnv:
             raise Error("no request is in progress: call `send` before `recv`")
         if self._pending[0] != "step":
             raise Error(f"the last `{self._pending[0]}` has no reply yet\n  call `reset` to wait for it")
-        since = self._pending[2]
+        since = self._pending[3]
         reply = self._await_pending(self._options.timeout_s)
+        try:
+            return self._step_batch(reply, since)
+        except codec.MalformedError as error:
+            self._unknown = f"the reply to a step could not be read: {error}"
+            raise
+
+    def _step_batch(self, reply: dict[str, Any], since: float) -> StepBatch:
         n, k, obs_len = self.num_envs, len(reply.get("ended_env", b"")) // 4, self.spec.obs_len
         terms = len(self.spec.reward_terms)
         num_final = k if reply.get("final_obs") else 0
@@ -275,8 +290,22 @@ class RemoteVecEnv:
     def _send(self, method: str, request: dict[str, object]) -> None:
         if not self._release.alive:
             raise Error("the environment is closed")
-        payload = codec.encode({**request, "epoch": self._epoch, "seq": self._last_seq + 1})
-        self._pending = (method, Pending(self._methods[method], payload), time.monotonic())
+        seq = self._last_seq + 1
+        pending = Pending(self._methods[method], codec.encode({**request, "epoch": self._epoch, "seq": seq}))
+        # Pending before it is sent: after an interrupt in between, the same request is sent again, not another with
+        # its number.
+        self._pending = (method, seq, pending, time.monotonic())
+        try:
+            pending.send()
+        except Error:
+            self._pending = None
+            raise
+
+    def _check_known(self) -> None:
+        if self._unknown is not None:
+            raise Error(
+                f"the state of the environments is unknown: {self._unknown}\n  call `reset` without a mask to continue"
+            )
 
     def _await_pending(self, timeout_s: float) -> dict[str, Any]:
         """Wait for the reply to the pending request.
@@ -285,16 +314,25 @@ class RemoteVecEnv:
         consumes its number.
         """
         assert self._pending is not None
+        method, seq, pending, _ = self._pending
         try:
-            reply = self._connection.wait_reply(self._pending[1], timeout_s)
+            reply = self._connection.wait_reply(pending, timeout_s)
         except (RequestTimeoutError, KeyboardInterrupt):
             raise
         except Error as error:
+            malformed = isinstance(error, codec.MalformedError)
+            if malformed:
+                self._unknown = f"the reply to `{method}` could not be read: {error}"
+            if malformed or (isinstance(error, RequestRejectedError) and error.code in _CONSUMES_SEQ):
+                self._last_seq = seq
             self._pending = None
-            self._last_seq += isinstance(error, RequestRejectedError) and error.code in _CONSUMES_SEQ
             raise
+        # In this order: an interrupt in between leaves a request that the server answers again.
+        self._last_seq = seq
         self._pending = None
-        self._last_seq += 1
+        if reply.get("seq") != seq:
+            self._unknown = f"the reply to `{method}` has sequence number {reply.get('seq')}, not {seq}"
+            raise codec.MalformedError(self._unknown)
         return reply
 
     def _resolve_abandoned_request(self) -> None:
