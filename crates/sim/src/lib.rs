@@ -10,12 +10,15 @@
 
 mod batch;
 mod config;
+mod error;
 mod ground_shapes;
 mod rapier;
 mod robot_world;
 mod rollout;
+mod thread_pool;
 
 pub use batch::{BatchBackend, BatchSnapshot, SimdPrecision};
 pub use config::{Engine, RoughTerrain, SimConfig, SimConfigError, Terrain};
-pub use rapier::{BackendBuildError, RapierBackend, RobotSnapshot};
+pub use error::BackendBuildError;
+pub use rapier::{RapierBackend, RobotSnapshot};
 pub use rollout::BatchRollout;

@@ -1,5 +1,7 @@
 //! The rapier engine: one world per robot, stepped on all cores.
 
+use std::sync::Arc;
+
 use rayon::prelude::*;
 use twinstep_model::{
     Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, GroundTruth, InitialState, Measured, PerJoint,
@@ -8,7 +10,8 @@ use twinstep_model::{
 
 use crate::ground_shapes::GroundShapes;
 use crate::robot_world::{ActuatorInputRef, RobotWorld, WorldSnapshot};
-use crate::{SimConfig, SimConfigError};
+use crate::thread_pool::thread_pool;
+use crate::{BackendBuildError, SimConfig};
 
 /// Backend that simulates each robot in a rapier3d world.
 pub struct RapierBackend {
@@ -20,35 +23,7 @@ pub struct RapierBackend {
     states: RobotStates,
     /// Replaces the actuators of the robot model. `None`: analytic actuators.
     actuator: Option<Box<dyn Actuator>>,
-    pool: rayon::ThreadPool,
-}
-
-/// Reasons why a backend cannot be built.
-#[derive(Debug, thiserror::Error)]
-pub enum BackendBuildError {
-    /// A setting is not allowed.
-    #[error(transparent)]
-    Config(#[from] SimConfigError),
-    /// The operating system could not start the threads.
-    #[error("cannot start {threads} simulation threads: {source}")]
-    Threads {
-        /// Requested number of threads.
-        threads: usize,
-        /// Error of the thread pool.
-        source: rayon::ThreadPoolBuildError,
-    },
-}
-
-/// Creates the pool of threads that step robots; 0 means one per core.
-pub(crate) fn thread_pool(threads: usize) -> Result<rayon::ThreadPool, BackendBuildError> {
-    let threads = match threads {
-        0 => std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
-        threads => threads,
-    };
-    rayon::ThreadPoolBuilder::new()
-        .num_threads(threads)
-        .build()
-        .map_err(|source| BackendBuildError::Threads { threads, source })
+    pool: Arc<rayon::ThreadPool>,
 }
 
 /// Checks that there are one command and one flag per robot.

@@ -1,6 +1,7 @@
 //! Rollouts in the batch engine: one candidate per SIMD lane, and one batch of candidates per task of the thread pool.
 
 use std::cmp::Reverse;
+use std::sync::Arc;
 
 use rayon::prelude::*;
 use twinstep_model::{Ground, Precision, RobotModel, RobotStates, Rollout, RolloutRequest};
@@ -21,14 +22,14 @@ fn batch_size(precision: Precision) -> usize {
 pub struct BatchRollout {
     robot: RobotModel,
     config: SimConfig,
-    pool: rayon::ThreadPool,
+    pool: Arc<rayon::ThreadPool>,
 }
 
 impl BatchRollout {
     /// Creates rollouts with the rates and threads of `config`. `robot` is the nominal robot.
     pub fn new(robot: &RobotModel, config: &SimConfig) -> Result<Self, BackendBuildError> {
         config.check(&robot.control)?;
-        let pool = crate::rapier::thread_pool(config.threads)?;
+        let pool = crate::thread_pool::thread_pool(config.threads)?;
         Ok(Self { robot: robot.clone(), config: *config, pool })
     }
 

@@ -20,6 +20,8 @@ mod robot_batch;
 mod rows;
 mod simulator;
 
+use std::sync::Arc;
+
 use twinstep_model::{
     Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, GroundTruth, InitialState, Measured, PerJoint,
     RobotModel, RobotStates, Simulator,
@@ -28,7 +30,8 @@ use twinstep_simd::InstructionSet;
 
 pub use simulator::SimdPrecision;
 
-use crate::rapier::{BackendBuildError, check_lengths};
+use crate::BackendBuildError;
+use crate::rapier::check_lengths;
 use crate::{SimConfig, SimConfigError};
 use robot_batch::{LaneSnapshot, StepCount};
 pub(crate) use simulator::batch_simulator;
@@ -44,7 +47,7 @@ pub struct BatchBackend {
     /// Replaces the actuators of the robot model. `None`: analytic actuators.
     actuator: Option<Box<dyn Actuator>>,
     /// `None` if there is one thread: the caller's.
-    pool: Option<rayon::ThreadPool>,
+    pool: Option<Arc<rayon::ThreadPool>>,
 }
 
 /// State of one robot. After a restore the simulation continues bit for bit.
@@ -71,7 +74,7 @@ impl BatchBackend {
         config.check(&robot.control)?;
         let config = config.at_actuator_rate(&robot.control);
         check_tree(&robot)?;
-        let pool = if config.threads == 1 { None } else { Some(crate::rapier::thread_pool(config.threads)?) };
+        let pool = if config.threads == 1 { None } else { Some(crate::thread_pool::thread_pool(config.threads)?) };
         let ground = config.terrain.ground();
         let initial_state = InitialState::standing_on(&ground, &robot, robot.control.default_pose_f32(), 0.0);
         let robots = batch_simulator(precision, &robot, &config, &ground, &initial_state, num_robots);
@@ -174,7 +177,7 @@ impl Backend for BatchBackend {
         check_lengths(commands, active, self.num_robots())?;
         let steps = self.config.steps_per_actuator_period(&self.robot.control);
         let Self { robots, states, actuator, pool, .. } = self;
-        let pool = pool.as_ref();
+        let pool = pool.as_deref();
         let mut finite = true;
         if let Some(actuator) = actuator {
             let mut tau = states.measured.tau.clone();
