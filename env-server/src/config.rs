@@ -39,8 +39,12 @@ pub struct ServerConfig {
     pub envs: usize,
     /// Model file of the robot. Default: the ideal Go2.
     pub model: Option<PathBuf>,
+    /// Maximum number of environments that one client id may lease. Default: all.
+    pub max_envs_per_client: Option<usize>,
     /// Time for which the environments of a disconnected client are kept [s].
     pub lease_grace_s: f64,
+    /// Time without a request after which a lease is released even if its client is connected [s]. Default: never.
+    pub lease_idle_s: Option<f64>,
     /// Seed of environments that the client does not seed. Default: a random seed at each start.
     pub seed: Option<u64>,
 }
@@ -55,7 +59,9 @@ impl Default for ServerConfig {
             shared_memory: false,
             envs: 4096,
             model: None,
+            max_envs_per_client: None,
             lease_grace_s: 10.0,
+            lease_idle_s: None,
             seed: None,
         }
     }
@@ -134,6 +140,12 @@ impl Config {
         }
         if !(0.0..=86_400.0).contains(&server.lease_grace_s) {
             return out_of_range("server.lease_grace_s", server.lease_grace_s.to_string(), "0 to 86400 s");
+        }
+        if server.max_envs_per_client == Some(0) {
+            return out_of_range("server.max_envs_per_client", "0".to_owned(), "at least 1");
+        }
+        if let Some(idle) = server.lease_idle_s.filter(|idle| !(1.0..=31_536_000.0).contains(idle)) {
+            return out_of_range("server.lease_idle_s", idle.to_string(), "1 to 31536000 s");
         }
         self.task.check()?;
         self.randomise.check()?;

@@ -7,8 +7,9 @@ use twinstep_envs::{CounterEnv, TaskConfig, TaskEnv, TaskEnvConfig, Walk};
 use twinstep_model::{Actuator, AutoresetMode, Backend, RobotModel, VecEnv};
 use twinstep_sim::{BackendBuildError, BatchBackend, Engine, RapierBackend};
 
+use twinstep_protocol::random_u64;
+
 use crate::Config;
-use crate::random::random_u64;
 
 /// Builds the environments of a lease.
 pub trait EnvFactory: Send + Sync + 'static {

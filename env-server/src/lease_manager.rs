@@ -2,38 +2,22 @@
 
 use std::collections::{HashMap, HashSet};
 use std::sync::atomic::Ordering;
-use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, RwLock};
-use std::thread::JoinHandle;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use twinstep_model::EnvSpec;
-use twinstep_protocol::keys::{self, Request};
-use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, decode, encode, message};
+use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, Secret, convert, decode, encode, message, random_id};
 use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
 use crate::EnvFactory;
-use crate::messages::{LeaseManagerMessage, LeaseParams, ServerState, WorkerRequest};
-use crate::random::random_id;
-use crate::worker::{Worker, reply, reply_error, shutting_down, stale_epoch};
+use crate::dispatch::{Route, Routes, attached_secret, no_such_lease};
+use crate::executor::{Executor, Handler, Mailbox, lock};
+use crate::messages::{LeaseParams, Reply, Request, RequestKind, ServerState};
+use crate::worker::{Worker, stale_epoch};
 
-/// Capacity of a worker's request queue. A client has one request in progress; the rest is for its repeats.
-const WORKER_QUEUE: usize = 32;
-/// Period at which leases of disconnected clients are checked for expiry.
-const EXPIRY_PERIOD: Duration = Duration::from_millis(100);
-/// Time between the start of a shutdown and the end of the session, in which requests get `shutting_down`.
-pub const SHUTDOWN_GRACE: Duration = Duration::from_millis(200);
-
-/// Worker of each lease, by lease id. Zenoh's threads read it.
-pub type WorkerTable = Arc<RwLock<HashMap<String, WorkerHandle>>>;
-
-/// Request queue of a worker, and the time of its last request.
-pub struct WorkerHandle {
-    jobs: SyncSender<WorkerRequest>,
-    /// Time of the client's last request. Keeps the lease alive when the token is not visible.
-    last_request: RwLock<Instant>,
-}
+/// Capacity of a lease's mailbox. A client has one request in progress; the rest is for its repeats.
+const LEASE_CAPACITY: usize = 16;
 
 /// Properties of the server that `hello` reports and leases are granted by.
 pub struct ServerInfo {
@@ -45,51 +29,50 @@ pub struct ServerInfo {
     pub spec: EnvSpec,
     /// Maximum total number of environments.
     pub max_envs: usize,
+    /// Maximum number of environments of one client id.
+    pub max_envs_per_client: usize,
     /// Time for which the environments of a disconnected client are kept.
     pub lease_grace: Duration,
+    /// Time without a request after which a lease is released; `None` for never.
+    pub lease_idle: Option<Duration>,
 }
 
-/// Grants leases and releases those of disconnected clients.
+/// Grants leases and releases those of disconnected or idle clients.
 pub struct LeaseManager {
     info: ServerInfo,
     factory: Arc<dyn EnvFactory>,
-    shared: Arc<ServerState>,
-    routes: WorkerTable,
-    own_queue: SyncSender<LeaseManagerMessage>,
-    leases: HashMap<String, Lease>,
+    state: Arc<ServerState>,
+    routes: Routes,
+    executor: Executor,
+    leases: Mutex<Leases>,
+}
+
+#[derive(Default)]
+struct Leases {
+    by_id: HashMap<String, Lease>,
     /// Clients whose liveliness token is visible.
     live_clients: HashSet<String>,
 }
 
 struct Lease {
     client: String,
+    secret: Secret,
     num_envs: usize,
     /// Fencing token, increased by one at each reclaim; sent to the worker.
     epoch: u64,
     /// Time at which the client's token disappeared; `None` while it is visible.
     disconnected_since: Option<Instant>,
-    thread: JoinHandle<()>,
 }
 
-/// Enqueues a query at the worker of its lease, or at the lease manager. Never blocks; runs on Zenoh's threads.
-pub fn dispatch(query: Query, sid: &str, routes: &WorkerTable, lease_queue: &SyncSender<LeaseManagerMessage>) {
-    let Some(Request::Env { lease, verb }) = keys::parse(query.key_expr().as_str(), sid) else {
-        // A full queue drops the query. The client gets no reply and repeats it.
-        let _ = lease_queue.try_send(LeaseManagerMessage::Query(query));
-        return;
-    };
-    let routes = routes.read().unwrap_or_else(std::sync::PoisonError::into_inner);
-    match routes.get(lease) {
-        None => drop(lease_queue.try_send(LeaseManagerMessage::Query(query.clone()))),
-        Some(route) => {
-            *route.last_request.write().unwrap_or_else(std::sync::PoisonError::into_inner) = Instant::now();
-            if let Err(TrySendError::Full(WorkerRequest::Env(_, query))) =
-                route.jobs.try_send(WorkerRequest::Env(verb, query.clone()))
-            {
-                let message = format!("{WORKER_QUEUE} requests of this lease are already queued");
-                let error = ErrorReply::new(ErrorCode::Busy, "", message).with_hint("send one request at a time");
-                reply_error(&query, &error);
-            }
+/// Answers `hello` and `lease` requests.
+pub struct LeaseHandler(pub Arc<LeaseManager>);
+
+impl Handler for LeaseHandler {
+    fn handle(&mut self, kind: RequestKind, query: &Query) -> Option<Reply> {
+        match kind {
+            RequestKind::Hello => Some(self.0.hello(query).into()),
+            // The lease itself replies.
+            _ => self.0.lease(query).err().map(Reply::Err),
         }
     }
 }
@@ -99,56 +82,11 @@ impl LeaseManager {
     pub fn new(
         info: ServerInfo,
         factory: Arc<dyn EnvFactory>,
-        shared: Arc<ServerState>,
-        routes: WorkerTable,
-        own_queue: SyncSender<LeaseManagerMessage>,
+        state: Arc<ServerState>,
+        routes: Routes,
+        executor: Executor,
     ) -> Self {
-        Self { info, factory, shared, routes, own_queue, leases: HashMap::new(), live_clients: HashSet::new() }
-    }
-
-    /// Handles messages until [`LeaseManagerMessage::Stop`], then waits for the workers. Runs on a thread of its own.
-    pub fn run(mut self, jobs: &Receiver<LeaseManagerMessage>) {
-        loop {
-            match jobs.recv_timeout(EXPIRY_PERIOD) {
-                Ok(LeaseManagerMessage::Query(query)) => self.answer(&query),
-                Ok(LeaseManagerMessage::Client(client, present)) => self.update_liveliness(client, present),
-                Ok(LeaseManagerMessage::Closed(lease)) => self.release(&lease, "closed by its client"),
-                Ok(LeaseManagerMessage::Stop) | Err(RecvTimeoutError::Disconnected) => break,
-                Err(RecvTimeoutError::Timeout) => {}
-            }
-            self.expire_leases();
-        }
-        self.routes.write().unwrap_or_else(std::sync::PoisonError::into_inner).clear();
-        for (_, lease) in self.leases.drain() {
-            // The worker caught, logged and reported its panics.
-            let _ = lease.thread.join();
-        }
-        // Further requests get `shutting_down` until the server closes its session.
-        while let Ok(job) = jobs.recv_timeout(SHUTDOWN_GRACE) {
-            if let LeaseManagerMessage::Query(query) = job {
-                reply_error(&query, &shutting_down());
-            }
-        }
-    }
-
-    fn answer(&mut self, query: &Query) {
-        let result = match keys::parse(query.key_expr().as_str(), &self.info.sid) {
-            Some(Request::Hello) => self.hello(query),
-            Some(Request::Lease) => return self.lease(query),
-            Some(Request::Env { lease, .. }) => {
-                let message = format!("lease `{lease}` does not exist: it was closed, expired, or was never granted");
-                Err(ErrorReply::new(ErrorCode::LeaseLost, "lease", message).with_hint("request a new lease"))
-            }
-            None => {
-                let message = format!("the key `{}` does not exist", query.key_expr());
-                let hint = "use hello, lease, or env/<lease>/reset, step, close or render";
-                Err(ErrorReply::new(ErrorCode::UnknownKey, "", message).with_hint(hint))
-            }
-        };
-        match result {
-            Ok(bytes) => reply(query, ZBytes::from(bytes)),
-            Err(error) => reply_error(query, &error),
-        }
+        Self { info, factory, state, routes, executor, leases: Mutex::default() }
     }
 
     fn hello(&self, query: &Query) -> Result<Vec<u8>, ErrorReply> {
@@ -159,37 +97,42 @@ impl LeaseManager {
         {
             return Err(error);
         }
+        let info = &self.info;
         Ok(encode(&message::HelloReply {
             protocol: PROTOCOL,
             protocols: [PROTOCOL, PROTOCOL],
             server_version: concat!("twinstep ", env!("CARGO_PKG_VERSION")).to_owned(),
-            name: self.info.name.clone(),
-            server_id: self.info.sid.clone(),
-            spec_hash: self.info.spec.hash(),
-            spec: self.info.spec.clone(),
-            max_envs: self.info.max_envs as u64,
-            free_envs: self.free_envs() as u64,
-            lease_grace_s: self.info.lease_grace.as_secs_f64(),
-            env_steps: self.shared.env_steps.load(Ordering::Relaxed),
+            name: info.name.clone(),
+            server_id: info.sid.clone(),
+            spec_hash: info.spec.hash(),
+            spec: info.spec.clone(),
+            max_envs: info.max_envs as u64,
+            free_envs: self.free_envs(&lock(&self.leases)) as u64,
+            max_envs_per_client: info.max_envs_per_client as u64,
+            max_request_bytes: convert::max_request_bytes(info.max_envs, &info.spec) as u64,
+            lease_grace_s: info.lease_grace.as_secs_f64(),
+            lease_idle_s: info.lease_idle.map(|idle| idle.as_secs_f64()),
+            env_steps: self.state.env_steps.load(Ordering::Relaxed),
         }))
     }
 
-    fn free_envs(&self) -> usize {
-        self.info.max_envs - self.leases.values().map(|lease| lease.num_envs).sum::<usize>()
+    fn free_envs(&self, leases: &Leases) -> usize {
+        self.info.max_envs - leases.by_id.values().map(|lease| lease.num_envs).sum::<usize>()
     }
 
-    /// Forwards the request to the worker of the lease, which replies. Starts a worker for a new lease.
-    fn lease(&mut self, query: &Query) {
+    /// Forwards the request to the lease, which replies. Creates a new lease first if none is reclaimed.
+    fn lease(self: &Arc<Self>, query: &Query) -> Result<(), ErrorReply> {
         let payload = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
-        let result = decode::<message::LeaseRequest>(&payload).and_then(|request| {
-            self.check_lease_request(&request)?;
-            match &request.reclaim {
-                Some(reclaim) => self.reclaim(&request.client, reclaim, query),
-                None => self.grant(&request, query),
-            }
-        });
-        if let Err(error) = result {
-            reply_error(query, &error);
+        let request: message::LeaseRequest = decode(&payload)?;
+        self.check_lease_request(&request)?;
+        let secret = attached_secret(query).ok_or_else(|| {
+            ErrorReply::new(ErrorCode::Malformed, "secret", "the request has no secret: an attachment of 16 bytes")
+                .with_hint("attach 16 random bytes to the lease request, and the same to every request for the lease")
+        })?;
+        let mut leases = lock(&self.leases);
+        match &request.reclaim {
+            Some(reclaim) => self.reclaim(&mut leases, &request.client, secret, reclaim, query),
+            None => self.grant(&mut leases, &request, secret, query),
         }
     }
 
@@ -223,121 +166,155 @@ impl LeaseManager {
         Ok(())
     }
 
-    fn grant(&mut self, request: &message::LeaseRequest, query: &Query) -> Result<(), ErrorReply> {
-        let held = self.leases.iter().find(|(_, lease)| lease.client == request.client);
+    fn grant(
+        self: &Arc<Self>,
+        leases: &mut Leases,
+        request: &message::LeaseRequest,
+        secret: Secret,
+        query: &Query,
+    ) -> Result<(), ErrorReply> {
+        let held = leases.by_id.iter().find(|(_, lease)| lease.secret == secret);
         if let Some((id, lease)) = held {
-            if lease.num_envs as u64 == request.num_envs {
-                return self.forward(id, WorkerRequest::Lease { query: query.clone(), epoch: lease.epoch });
+            if lease.num_envs as u64 == request.num_envs && lease.client == request.client {
+                return self.forward(id, query, lease.epoch);
             }
-            let message = format!("client `{}` already has a lease of {} environments", request.client, lease.num_envs);
-            return Err(ErrorReply::new(ErrorCode::OutOfRange, "client", message)
-                .with_hint("close that lease first, or use another client id"));
+            let message = format!("the attached secret already has a lease of {} environments", lease.num_envs);
+            return Err(ErrorReply::new(ErrorCode::OutOfRange, "secret", message)
+                .with_hint("close that lease first, or attach another secret"));
         }
-        let free = self.free_envs();
-        if request.num_envs > free as u64 {
-            let message =
-                format!("`num_envs` = {} is too large: {free} of {} are free", request.num_envs, self.info.max_envs);
-            return Err(ErrorReply::new(ErrorCode::TooManyEnvs, "num_envs", message)
-                .with_hint("request fewer, or start the server with a larger `--envs`"));
-        }
+        self.check_num_envs(leases, request)?;
         let id = random_id();
-        self.start_worker(&id, request)?;
-        self.forward(&id, WorkerRequest::Lease { query: query.clone(), epoch: 1 })
+        self.create(leases, &id, request, secret);
+        self.forward(&id, query, 1)
     }
 
-    fn start_worker(&mut self, id: &str, request: &message::LeaseRequest) -> Result<(), ErrorReply> {
+    fn check_num_envs(&self, leases: &Leases, request: &message::LeaseRequest) -> Result<(), ErrorReply> {
+        let reject = |message: String, hint: &str| {
+            Err(ErrorReply::new(ErrorCode::TooManyEnvs, "num_envs", message).with_hint(hint))
+        };
+        let (num_envs, max, free) = (request.num_envs, self.info.max_envs_per_client, self.free_envs(leases));
+        let held = leases.by_id.values().filter(|lease| lease.client == request.client);
+        let held: usize = held.map(|lease| lease.num_envs).sum();
+        if num_envs > free as u64 {
+            let message = format!("`num_envs` = {num_envs} is too large: {free} of {} are free", self.info.max_envs);
+            return reject(message, "request fewer, or start the server with a larger `--envs`");
+        }
+        if num_envs.saturating_add(held as u64) > max as u64 {
+            let message = format!("`num_envs` = {num_envs} is too large: a client may lease {max} in all");
+            return reject(message, "close other leases, or start the server with a larger `max_envs_per_client`");
+        }
+        Ok(())
+    }
+
+    /// Creates a lease. Its environments are built by its first request.
+    fn create(self: &Arc<Self>, leases: &mut Leases, id: &str, request: &message::LeaseRequest, secret: Secret) {
         let num_envs = request.num_envs as usize;
-        let grant = LeaseParams {
+        let params = LeaseParams {
             lease: id.to_owned(),
             num_envs,
             autoreset: request.autoreset,
             max_episode_steps: request.max_episode_steps,
             critic: request.critic,
         };
-        let (sender, receiver) = sync_channel(WORKER_QUEUE);
-        let (factory, shared, lease_queue) =
-            (Arc::clone(&self.factory), Arc::clone(&self.shared), self.own_queue.clone());
-        let thread = std::thread::Builder::new()
-            .name(format!("lease-{id}"))
-            .spawn(move || Worker::run(grant, &*factory, shared, lease_queue, &receiver))
-            .map_err(|error| {
-                ErrorReply::new(ErrorCode::Internal, "", format!("cannot start a thread for the lease: {error}"))
-            })?;
         tracing::info!(lease = id, client = request.client, num_envs, "lease granted");
-        let route = WorkerHandle { jobs: sender, last_request: RwLock::new(Instant::now()) };
-        self.routes.write().unwrap_or_else(std::sync::PoisonError::into_inner).insert(id.to_owned(), route);
-        let disconnected_since = (!self.live_clients.contains(&request.client)).then(Instant::now);
-        let lease = Lease { client: request.client.clone(), num_envs, epoch: 1, disconnected_since, thread };
-        self.leases.insert(id.to_owned(), lease);
-        Ok(())
-    }
-
-    fn reclaim(&mut self, client: &str, reclaim: &message::Reclaim, query: &Query) -> Result<(), ErrorReply> {
-        let Some(lease) = self.leases.get(&reclaim.lease) else {
-            let message = format!("lease `{}` does not exist: it was closed or expired", reclaim.lease);
-            return Err(
-                ErrorReply::new(ErrorCode::LeaseLost, "reclaim.lease", message).with_hint("request a new lease")
-            );
+        let (manager, lease) = (Arc::clone(self), id.to_owned());
+        let release = Box::new(move |reason: &str| manager.release(&lease, reason));
+        let worker = Worker::new(params, Arc::clone(&self.factory), Arc::clone(&self.state), release);
+        let route = Route {
+            secret,
+            max_request_bytes: convert::max_request_bytes(num_envs, &self.info.spec),
+            mailbox: Mailbox::new(&self.executor, LEASE_CAPACITY, worker),
+            last_request: Mutex::new(Instant::now()),
         };
-        let epoch = lease.epoch;
+        self.routes.write().unwrap_or_else(PoisonError::into_inner).insert(id.to_owned(), Arc::new(route));
+        let disconnected_since = (!leases.live_clients.contains(&request.client)).then(Instant::now);
+        let lease = Lease { client: request.client.clone(), secret, num_envs, epoch: 1, disconnected_since };
+        leases.by_id.insert(id.to_owned(), lease);
+    }
+
+    fn reclaim(
+        &self,
+        leases: &mut Leases,
+        client: &str,
+        secret: Secret,
+        reclaim: &message::Reclaim,
+        query: &Query,
+    ) -> Result<(), ErrorReply> {
+        let is_live = leases.live_clients.contains(client);
+        let lease = leases.by_id.get_mut(&reclaim.lease).filter(|lease| lease.secret == secret);
+        let lease = lease.ok_or_else(|| no_such_lease(&reclaim.lease))?;
         // The reply to the new owner was lost: repeat it with the same epoch.
-        let repeated = lease.client == client && reclaim.epoch == epoch - 1;
-        if !repeated && reclaim.epoch != epoch {
-            return Err(stale_epoch("reclaim.epoch", reclaim.epoch, epoch));
+        let is_repeated = lease.client == client && reclaim.epoch == lease.epoch - 1;
+        if !is_repeated && reclaim.epoch != lease.epoch {
+            return Err(stale_epoch("reclaim.epoch", reclaim.epoch, lease.epoch));
         }
-        let epoch = if repeated { epoch } else { epoch + 1 };
-        self.forward(&reclaim.lease, WorkerRequest::Lease { query: query.clone(), epoch })?;
-        let disconnected_since = (!self.live_clients.contains(client)).then(Instant::now);
-        if let Some(lease) = self.leases.get_mut(&reclaim.lease) {
-            (lease.client, lease.epoch, lease.disconnected_since) = (client.to_owned(), epoch, disconnected_since);
-        }
+        let epoch = if is_repeated { lease.epoch } else { lease.epoch + 1 };
+        self.forward(&reclaim.lease, query, epoch)?;
+        (lease.client, lease.epoch) = (client.to_owned(), epoch);
+        lease.disconnected_since = (!is_live).then(Instant::now);
         Ok(())
     }
 
-    fn forward(&self, lease: &str, job: WorkerRequest) -> Result<(), ErrorReply> {
-        let routes = self.routes.read().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let sent = routes.get(lease).is_some_and(|route| route.jobs.try_send(job).is_ok());
-        if sent { Ok(()) } else { Err(ErrorReply::new(ErrorCode::Busy, "", "the request queue of this lease is full")) }
+    fn forward(&self, lease: &str, query: &Query, epoch: u64) -> Result<(), ErrorReply> {
+        let routes = self.routes.read().unwrap_or_else(PoisonError::into_inner);
+        let request = Request { query: query.clone(), kind: RequestKind::Granted { epoch } };
+        let is_sent = routes.get(lease).is_some_and(|route| route.mailbox.push(request).is_ok());
+        if is_sent { Ok(()) } else { Err(ErrorReply::new(ErrorCode::Busy, "", "the mailbox of this lease is full")) }
     }
 
-    fn update_liveliness(&mut self, client: String, present: bool) {
-        for (id, lease) in self.leases.iter_mut().filter(|(_, lease)| lease.client == client) {
+    /// Records that the liveliness token of a client appeared or disappeared.
+    pub fn update_liveliness(&self, client: &str, present: bool) {
+        let mut leases = lock(&self.leases);
+        for (id, lease) in leases.by_id.iter_mut().filter(|(_, lease)| lease.client == client) {
             tracing::info!(lease = id, client, present, "client liveliness changed");
             lease.disconnected_since = (!present).then(Instant::now);
         }
         if present {
-            self.live_clients.insert(client);
+            leases.live_clients.insert(client.to_owned());
         } else {
-            self.live_clients.remove(&client);
+            leases.live_clients.remove(client);
         }
     }
 
-    fn expire_leases(&mut self) {
-        let grace = self.info.lease_grace;
-        let expired: Vec<String> = {
-            let routes = self.routes.read().unwrap_or_else(std::sync::PoisonError::into_inner);
-            let is_idle = |id: &String| {
-                routes.get(id).is_none_or(|route| {
-                    route.last_request.read().unwrap_or_else(std::sync::PoisonError::into_inner).elapsed() > grace
-                })
-            };
-            let is_disconnected = |lease: &Lease| lease.disconnected_since.is_some_and(|since| since.elapsed() > grace);
-            self.leases
-                .iter()
-                .filter(|(id, lease)| is_disconnected(lease) && is_idle(id))
-                .map(|(id, _)| id.clone())
-                .collect()
+    /// Releases the leases of clients that are disconnected for the grace period, and leases that are idle too long.
+    pub fn expire_leases(&self) {
+        let mut leases = lock(&self.leases);
+        let routes = self.routes.read().unwrap_or_else(PoisonError::into_inner);
+        let unused = |id: &String| match routes.get(id) {
+            Some(route) if route.mailbox.is_busy() => Duration::ZERO,
+            Some(route) => lock(&route.last_request).elapsed(),
+            None => Duration::MAX,
         };
-        for id in expired {
-            self.release(&id, "its client is disconnected and the grace period has passed");
+        let expired: Vec<(String, &str)> = leases
+            .by_id
+            .iter()
+            .filter_map(|(id, lease)| {
+                let disconnected = lease.disconnected_since.map_or(Duration::ZERO, |since| since.elapsed());
+                if disconnected.min(unused(id)) > self.info.lease_grace {
+                    Some((id.clone(), "its client is disconnected and the grace period has passed"))
+                } else {
+                    let is_idle = self.info.lease_idle.is_some_and(|idle| unused(id) > idle);
+                    is_idle.then(|| (id.clone(), "it is idle"))
+                }
+            })
+            .collect();
+        drop(routes);
+        for (id, reason) in expired {
+            self.remove(&mut leases, &id, reason);
         }
     }
 
-    /// Removes a lease. Its worker terminates after the request in progress.
-    fn release(&mut self, lease: &str, reason: &str) {
-        if self.leases.remove(lease).is_some() {
+    /// Releases a lease. Requests that are in its mailbox are still answered.
+    pub fn release(&self, lease: &str, reason: &str) {
+        self.remove(&mut lock(&self.leases), lease, reason);
+    }
+
+    fn remove(&self, leases: &mut Leases, lease: &str, reason: &str) {
+        if leases.by_id.remove(lease).is_some() {
             tracing::info!(lease, reason, "lease released");
         }
-        self.routes.write().unwrap_or_else(std::sync::PoisonError::into_inner).remove(lease);
+        // The environments are dropped after the lock is released.
+        let route = self.routes.write().unwrap_or_else(PoisonError::into_inner).remove(lease);
+        drop(route);
     }
 }

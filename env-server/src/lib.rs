@@ -5,15 +5,18 @@
 //! - [`EnvFactory`]: builds the environments of a lease. [`SimEnvFactory`] builds simulated ones from a [`Config`].
 //! - [`Config`]: the config file with the tables `[server]`, `[task]`, `[sim]` and `[randomise]`.
 //!
-//! There are three kinds of thread. Zenoh's threads only enqueue requests. The *lease manager* grants leases and
-//! monitors the liveliness of clients. One *worker* per lease owns its environments and executes its requests in order.
-//! A repeated request therefore waits for the one in progress and gets its reply.
+//! Zenoh's threads only put requests into mailboxes (`dispatch`). Each lease has a mailbox; so have `hello`, `lease` and
+//! refused requests. The threads of one pool (`executor`) execute the requests of a mailbox in order, one at a time, and
+//! send the replies. A repeated request therefore waits for the one in progress and gets its reply. The *lease manager*
+//! grants leases, monitors the liveliness of clients and releases expired leases. The *worker* of a lease owns its
+//! environments.
 
 mod config;
+mod dispatch;
 mod env_factory;
+mod executor;
 mod lease_manager;
 mod messages;
-mod random;
 mod server;
 mod worker;
 

@@ -1,34 +1,69 @@
-//! Messages between the threads of the server, and the state that they share.
+//! Requests and replies inside the server, and the state that its threads share.
 
 use std::sync::atomic::{AtomicBool, AtomicU64};
 
 use twinstep_model::AutoresetMode;
 use twinstep_protocol::keys::EnvMethod;
+use twinstep_protocol::{ErrorReply, encode};
+use zenoh::Wait;
+use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
-/// Message to the lease manager.
-pub enum LeaseManagerMessage {
-    /// A query that no worker handles.
-    Query(Query),
-    /// The liveliness token of a client appeared (`true`) or disappeared (`false`).
-    Client(String, bool),
-    /// A worker requests the release of its lease.
-    Closed(String),
-    /// Stop; return after the workers have terminated.
-    Stop,
+/// Zenoh's encoding of replies.
+const ENCODING: &str = "application/msgpack";
+
+/// A query and what to do with it.
+pub struct Request {
+    /// The query to answer.
+    pub query: Query,
+    /// What it requests.
+    pub kind: RequestKind,
 }
 
-/// Request to a worker.
-pub enum WorkerRequest {
-    /// A query at one of the lease's keys.
-    Env(EnvMethod, Query),
-    /// A request for the lease itself.
-    Lease {
-        /// The query to answer.
-        query: Query,
+/// What a query requests.
+pub enum RequestKind {
+    /// Identity of the server.
+    Hello,
+    /// A lease.
+    Lease,
+    /// A method of the environments of a lease.
+    Env(EnvMethod),
+    /// The reply to a lease request, from the lease itself.
+    Granted {
         /// Epoch of the lease from this request on; increased if the lease is reclaimed.
         epoch: u64,
     },
+    /// Nothing: the request was refused.
+    Refused(ErrorReply),
+}
+
+/// An encoded reply. Cloning shares the bytes.
+#[derive(Clone)]
+pub enum Reply {
+    /// The message that was requested.
+    Ok(ZBytes),
+    /// An error.
+    Err(ErrorReply),
+}
+
+impl Reply {
+    /// Sends the reply. Failures are only logged, because the client may have disconnected. May block while the client
+    /// does not read.
+    pub fn send(&self, query: &Query) {
+        let sent = match self {
+            Self::Ok(bytes) => query.reply(query.key_expr(), bytes.clone()).encoding(ENCODING).express(true).wait(),
+            Self::Err(error) => query.reply_err(encode(error)).encoding(ENCODING).wait(),
+        };
+        if let Err(error) = sent {
+            tracing::debug!(%error, key = %query.key_expr(), "reply not sent");
+        }
+    }
+}
+
+impl From<Result<Vec<u8>, ErrorReply>> for Reply {
+    fn from(result: Result<Vec<u8>, ErrorReply>) -> Self {
+        result.map_or_else(Reply::Err, |bytes| Reply::Ok(ZBytes::from(bytes)))
+    }
 }
 
 /// Parameters of a granted lease.
@@ -45,10 +80,11 @@ pub struct LeaseParams {
     pub critic: bool,
 }
 
-/// State that the workers share with the server.
+/// State that the leases share with the server.
+#[derive(Default)]
 pub struct ServerState {
     /// True once the server shuts down; no new request is executed.
     pub shutting_down: AtomicBool,
-    /// Environment steps executed by all workers.
+    /// Environment steps executed by all leases.
     pub env_steps: AtomicU64,
 }

@@ -2,25 +2,33 @@
 
 use std::collections::HashMap;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::{SyncSender, sync_channel};
-use std::sync::{Arc, RwLock};
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
+use std::sync::{Arc, PoisonError, RwLock};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use twinstep_model::AutoresetMode;
-use twinstep_protocol::keys;
+use twinstep_protocol::{convert, keys, random_id};
 use zenoh::liveliness::LivelinessToken;
 use zenoh::query::Queryable;
 use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait};
 
-use crate::lease_manager::{LeaseManager, SHUTDOWN_GRACE, ServerInfo, dispatch};
-use crate::messages::{LeaseManagerMessage, ServerState};
-use crate::random::random_id;
+use crate::dispatch::{Dispatcher, Routes, refusals};
+use crate::executor::{Executor, Mailbox};
+use crate::lease_manager::{LeaseHandler, LeaseManager, ServerInfo};
+use crate::messages::ServerState;
 use crate::{EnvFactory, EnvFactoryError, ServerConfig};
 
-/// Capacity of the lease manager's queue.
-const LEASE_QUEUE: usize = 1024;
+/// Capacity of the mailboxes of `hello` and `lease` requests.
+const CONTROL_CAPACITY: usize = 1024;
+/// Period at which leases are checked for expiry.
+const EXPIRY_PERIOD: Duration = Duration::from_millis(100);
+/// Time between the start of a shutdown and the end of the session, in which requests get `shutting_down`.
+const SHUTDOWN_GRACE: Duration = Duration::from_millis(200);
+/// Minimum size of a message that Zenoh accepts [bytes]. Up to it, an oversized request gets an error reply.
+const MIN_ZENOH_MESSAGE: usize = 4 << 20;
 
 /// A running server.
 pub struct Server {
@@ -28,9 +36,12 @@ pub struct Server {
     session: Session,
     queryable: Queryable<()>,
     token: LivelinessToken,
-    lease_queue: SyncSender<LeaseManagerMessage>,
-    lease_thread: JoinHandle<()>,
-    shared: Arc<ServerState>,
+    routes: Routes,
+    executor: Executor,
+    /// Ends the expiry thread when it is dropped.
+    running: Sender<()>,
+    expiry: JoinHandle<()>,
+    state: Arc<ServerState>,
 }
 
 /// Reasons why a server cannot start.
@@ -77,7 +88,7 @@ pub enum ServerError {
     #[error(transparent)]
     Host(#[from] EnvFactoryError),
     /// The operating system could not start a thread.
-    #[error("cannot start the lease manager's thread: {0}")]
+    #[error("cannot start a thread of the server: {0}")]
     Thread(std::io::Error),
 }
 
@@ -86,35 +97,42 @@ impl Server {
     pub fn start(config: &ServerConfig, factory: Arc<dyn EnvFactory>) -> Result<Self, ServerError> {
         // One environment provides the spec, and shows before the first lease that the factory works.
         let spec = factory.build(1, AutoresetMode::NextStep, None)?.spec().clone();
+        let max_request_bytes = convert::max_request_bytes(config.envs, &spec);
         let sid = random_id();
-        let session = twinstep_session::open(zenoh_config(config)?)
+        let session = twinstep_session::open(zenoh_config(config, max_request_bytes)?)
             .map_err(|error| ServerError::Open { listen: config.listen.clone(), reason: error.to_string() })?;
-        let (lease_queue, jobs) = sync_channel(LEASE_QUEUE);
-        let routes = Arc::new(RwLock::new(HashMap::new()));
-        let shared = Arc::new(ServerState { shutting_down: AtomicBool::new(false), env_steps: AtomicU64::new(0) });
+        let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+        let executor = Executor::start(2 * cores.max(2)).map_err(ServerError::Thread)?;
+        let (routes, state) = (Routes::new(RwLock::new(HashMap::new())), Arc::new(ServerState::default()));
         let info = ServerInfo {
             name: config.name.clone(),
             sid: sid.clone(),
             spec,
             max_envs: config.envs,
+            max_envs_per_client: config.max_envs_per_client.unwrap_or(config.envs).min(config.envs),
             lease_grace: config.lease_grace(),
+            lease_idle: config.lease_idle_s.map(Duration::from_secs_f64),
         };
         let lease_manager =
-            LeaseManager::new(info, factory, Arc::clone(&shared), Arc::clone(&routes), lease_queue.clone());
-        let lease_thread = std::thread::Builder::new()
-            .name("lease-manager".to_owned())
-            .spawn(move || lease_manager.run(&jobs))
-            .map_err(ServerError::Thread)?;
-        watch_clients(&session, &sid, lease_queue.clone())?;
-        let queryable = {
-            let (sid, lease_queue, key) = (sid.clone(), lease_queue.clone(), keys::server(&sid));
-            session
-                .declare_queryable(&key)
-                .complete(true)
-                .callback(move |query| dispatch(query, &sid, &routes, &lease_queue))
-                .wait()
-                .map_err(|error| ServerError::Declare { key, reason: error.to_string() })?
+            Arc::new(LeaseManager::new(info, factory, Arc::clone(&state), Arc::clone(&routes), executor.clone()));
+        let (running, expiry) = expire_leases(Arc::clone(&lease_manager)).map_err(ServerError::Thread)?;
+        watch_clients(&session, &sid, Arc::clone(&lease_manager))?;
+        let control = || Mailbox::new(&executor, CONTROL_CAPACITY, LeaseHandler(Arc::clone(&lease_manager)));
+        let dispatcher = Dispatcher {
+            sid: sid.clone(),
+            routes: Arc::clone(&routes),
+            hello: control(),
+            lease: control(),
+            refusals: refusals(&executor),
+            state: Arc::clone(&state),
         };
+        let key = keys::server(&sid);
+        let queryable = session
+            .declare_queryable(&key)
+            .complete(true)
+            .callback(move |query| dispatcher.dispatch(query))
+            .wait()
+            .map_err(|error| ServerError::Declare { key, reason: error.to_string() })?;
         // The token is declared last: a client that sees it can send requests.
         let key = keys::live_server(&sid, &config.name);
         let token = session
@@ -122,7 +140,7 @@ impl Server {
             .declare_token(&key)
             .wait()
             .map_err(|error| ServerError::Declare { key, reason: error.to_string() })?;
-        Ok(Self { sid, session, queryable, token, lease_queue, lease_thread, shared })
+        Ok(Self { sid, session, queryable, token, routes, executor, running, expiry, state })
     }
 
     /// Returns the id of the server, which is new at each start.
@@ -137,27 +155,37 @@ impl Server {
 
     /// Returns the number of environment steps executed so far.
     pub fn env_steps(&self) -> u64 {
-        self.shared.env_steps.load(Ordering::Relaxed)
+        self.state.env_steps.load(Ordering::Relaxed)
     }
 
     /// Finishes the steps in progress, notifies the clients, and closes the session.
     pub fn shutdown(self) {
-        self.shared.shutting_down.store(true, Ordering::Release);
+        self.state.shutting_down.store(true, Ordering::Release);
         // Clients detect that the token disappears; new requests get `shutting_down`.
         let _ = self.token.undeclare().wait();
-        let _ = self.lease_queue.send(LeaseManagerMessage::Stop);
         std::thread::sleep(SHUTDOWN_GRACE);
         let _ = self.queryable.undeclare().wait();
-        let _ = self.lease_thread.join();
+        drop(self.running);
+        let _ = self.expiry.join();
+        self.executor.stop();
+        // The leases and the lease manager refer to each other.
+        self.routes.write().unwrap_or_else(PoisonError::into_inner).clear();
         let _ = self.session.close().wait();
     }
 }
 
-fn watch_clients(
-    session: &Session,
-    sid: &str,
-    lease_queue: SyncSender<LeaseManagerMessage>,
-) -> Result<(), ServerError> {
+/// Starts a thread that releases expired leases until the sender is dropped.
+fn expire_leases(lease_manager: Arc<LeaseManager>) -> std::io::Result<(Sender<()>, JoinHandle<()>)> {
+    let (running, stopped) = channel();
+    let thread = std::thread::Builder::new().name("lease-expiry".to_owned()).spawn(move || {
+        while stopped.recv_timeout(EXPIRY_PERIOD) == Err(RecvTimeoutError::Timeout) {
+            lease_manager.expire_leases();
+        }
+    })?;
+    Ok((running, thread))
+}
+
+fn watch_clients(session: &Session, sid: &str, lease_manager: Arc<LeaseManager>) -> Result<(), ServerError> {
     let key = keys::live_clients(sid);
     let own_sid = sid.to_owned();
     session
@@ -166,9 +194,7 @@ fn watch_clients(
         .history(true)
         .callback(move |sample| {
             if let Some(client) = keys::parse_live_client(sample.key_expr().as_str(), &own_sid) {
-                // Blocks only while the queue is full. A dropped message would keep the lease of a disconnected client.
-                let _ =
-                    lease_queue.send(LeaseManagerMessage::Client(client.to_owned(), sample.kind() == SampleKind::Put));
+                lease_manager.update_liveliness(client, sample.kind() == SampleKind::Put);
             }
         })
         .background()
@@ -177,7 +203,7 @@ fn watch_clients(
 }
 
 /// Returns the Zenoh configuration: the user's file, overridden by the settings that Twinstep requires.
-fn zenoh_config(config: &ServerConfig) -> Result<zenoh::Config, ServerError> {
+fn zenoh_config(config: &ServerConfig, max_request_bytes: usize) -> Result<zenoh::Config, ServerError> {
     let mut zenoh = match &config.zenoh {
         Some(path) => zenoh::Config::from_file(path)
             .map_err(|error| ServerError::ZenohConfig { path: path.clone(), reason: error.to_string() })?,
@@ -186,7 +212,8 @@ fn zenoh_config(config: &ServerConfig) -> Result<zenoh::Config, ServerError> {
     check_users(config, &zenoh)?;
     let listen = serde_json::json!([config.listen]).to_string();
     let connect = serde_json::json!(config.connect).to_string();
-    let settings: [(&'static str, &str, &str); 9] = [
+    let max_message = (4 * max_request_bytes).max(MIN_ZENOH_MESSAGE).to_string();
+    let settings: [(&'static str, &str, &str); 11] = [
         ("listen", "listen/endpoints", &listen),
         ("connect", "connect/endpoints", &connect),
         ("zenoh", "mode", "\"peer\""),
@@ -198,6 +225,10 @@ fn zenoh_config(config: &ServerConfig) -> Result<zenoh::Config, ServerError> {
         // each one.
         ("zenoh", "transport/link/tx/queue/size/data", "16"),
         ("zenoh", "transport/link/rx/buffer_size", "2097152"),
+        // Zenoh would collect messages of up to 1 GiB.
+        ("envs", "transport/link/rx/max_message_size", &max_message),
+        // A client that does not read loses its link after 2 s instead of Zenoh's 5 s [µs].
+        ("zenoh", "transport/link/tx/queue/congestion_control/block/wait_before_close", "2000000"),
         // The connection to a restarted router is restored within 1 s instead of Zenoh's 4 s.
         ("zenoh", "connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
         ("shared_memory", "transport/shared_memory/enabled", if config.shared_memory { "true" } else { "false" }),

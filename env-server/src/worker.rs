@@ -1,35 +1,41 @@
 //! Worker of one lease: owns its environments and executes every request exactly once, in order.
 //!
 //! Requests carry the lease's epoch and a sequence number. The worker executes the next number and caches the reply.
-//! A repeated request gets the cached reply. Any other number, or the same number with another request, is an error. A request that is rejected without effect
-//! does not consume its number. `render` only reads: it has no number and is answered between two requests.
+//! A repeated request gets the cached reply. Any other number, or the same number with another request, is an error. A
+//! request that is rejected without effect does not consume its number. `render` only reads: it has no number and is
+//! answered between two requests.
 
 use std::hash::{BuildHasher, RandomState};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::sync::mpsc::{Receiver, SyncSender};
 
 use twinstep_model::{EnvError, VecEnv};
 use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, message, tensor};
-use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
 use crate::EnvFactory;
-use crate::messages::{LeaseManagerMessage, LeaseParams, ServerState, WorkerRequest};
+use crate::dispatch::shutting_down;
+use crate::executor::{Handler, panic_text};
+use crate::messages::{LeaseParams, Reply, RequestKind, ServerState};
 
-/// Owns the environments of one lease.
+/// Releases the lease of a worker, for the given reason.
+pub type Release = Box<dyn Fn(&str) + Send>;
+
+/// The environments of one lease.
 pub struct Worker {
-    grant: LeaseParams,
-    env: Box<dyn VecEnv>,
-    shared: Arc<ServerState>,
-    lease_queue: SyncSender<LeaseManagerMessage>,
+    params: LeaseParams,
+    factory: Arc<dyn EnvFactory>,
+    state: Arc<ServerState>,
+    release: Release,
+    /// `None` until the first request.
+    env: Option<Box<dyn VecEnv>>,
     epoch: u64,
     last_seq: u64,
     /// Method and reply of `last_seq`.
-    last_reply: Option<(EnvMethod, CachedReply)>,
+    last_reply: Option<(EnvMethod, Reply)>,
     /// Hash of the request of `last_seq`; `None` if another process has reclaimed the lease since.
     last_request: Option<u64>,
     /// Hashes requests, with random keys.
@@ -39,33 +45,26 @@ pub struct Worker {
     failure: Option<String>,
 }
 
-/// An encoded reply, cached for repeated requests. Cloning shares the bytes.
-#[derive(Clone)]
-enum CachedReply {
-    Ok(ZBytes),
-    Err(ErrorReply),
+impl Handler for Worker {
+    fn handle(&mut self, kind: RequestKind, query: &Query) -> Option<Reply> {
+        self.build();
+        match kind {
+            RequestKind::Env(verb) => Some(self.answer(verb, query)),
+            RequestKind::Granted { epoch } => Some(self.transfer(epoch)),
+            RequestKind::Hello | RequestKind::Lease | RequestKind::Refused(_) => None,
+        }
+    }
 }
 
 impl Worker {
-    /// Builds the environments and handles requests until the lease is released. Runs on a thread of its own.
-    pub fn run(
-        grant: LeaseParams,
-        factory: &dyn EnvFactory,
-        shared: Arc<ServerState>,
-        lease_queue: SyncSender<LeaseManagerMessage>,
-        jobs: &Receiver<WorkerRequest>,
-    ) {
-        let built = catch_unwind(AssertUnwindSafe(|| {
-            factory.build(grant.num_envs, grant.autoreset, grant.max_episode_steps).map_err(|error| error.to_string())
-        }));
-        let env = match built.unwrap_or_else(|panic| Err(panic_text(&panic))) {
-            Ok(env) => env,
-            Err(reason) => return reject_all(jobs, &lease_queue, &grant.lease, &reason),
-        };
-        let mut worker = Self {
-            env,
-            shared,
-            lease_queue,
+    /// Creates a worker whose environments are built by its first request.
+    pub fn new(params: LeaseParams, factory: Arc<dyn EnvFactory>, state: Arc<ServerState>, release: Release) -> Self {
+        Self {
+            params,
+            factory,
+            state,
+            release,
+            env: None,
             epoch: 1,
             last_seq: 0,
             last_reply: None,
@@ -73,90 +72,94 @@ impl Worker {
             hasher: RandomState::new(),
             actions: Vec::new(),
             failure: None,
-            grant,
-        };
-        // The loop ends when the lease manager removes the lease and so drops the sender.
-        while let Ok(job) = jobs.recv() {
-            match job {
-                WorkerRequest::Env(verb, query) => {
-                    let answer = worker.answer(verb, &query);
-                    send(&query, answer);
-                }
-                WorkerRequest::Lease { query, epoch } => {
-                    let answer = worker.transfer(epoch);
-                    send(&query, answer);
-                }
+        }
+    }
+
+    /// Builds the environments unless they are built or could not be built.
+    fn build(&mut self) {
+        if self.env.is_some() || self.failure.is_some() {
+            return;
+        }
+        let LeaseParams { lease, num_envs, autoreset, max_episode_steps, .. } = &self.params;
+        let built = catch_unwind(AssertUnwindSafe(|| {
+            self.factory.build(*num_envs, *autoreset, *max_episode_steps).map_err(|error| error.to_string())
+        }));
+        match built.unwrap_or_else(|panic| Err(panic_text(&panic))) {
+            Ok(env) => self.env = Some(env),
+            Err(reason) => {
+                tracing::error!(lease, reason, "environments could not be built");
+                self.failure = Some(format!("they could not be built: {reason}"));
             }
         }
     }
 
-    fn transfer(&mut self, epoch: u64) -> CachedReply {
+    fn transfer(&mut self, epoch: u64) -> Reply {
         if epoch != self.epoch {
             // The new owner may repeat the last request without knowing what it contained.
             (self.epoch, self.last_request) = (epoch, None);
         }
         if let Some(reason) = &self.failure {
             // The lease is unusable: release its environments for another lease.
-            self.request_release();
-            return CachedReply::Err(lost_environments(reason));
+            let lost = lost_environments(reason);
+            (self.release)("its environments failed");
+            return Reply::Err(lost);
         }
-        let mut spec = self.env.spec().clone();
-        if !self.grant.critic {
+        let mut spec = self.env().spec().clone();
+        if !self.params.critic {
             spec.critic_observation.clear();
         }
-        CachedReply::Ok(ZBytes::from(encode(&message::LeaseReply {
+        Reply::Ok(ZBytes::from(encode(&message::LeaseReply {
             protocol: PROTOCOL,
-            lease: self.grant.lease.clone(),
+            lease: self.params.lease.clone(),
             epoch: self.epoch,
-            num_envs: self.grant.num_envs as u64,
-            autoreset: self.grant.autoreset,
+            num_envs: self.params.num_envs as u64,
+            autoreset: self.params.autoreset,
             last_seq: self.last_seq,
             spec,
         })))
     }
 
-    /// Requests the release of the lease. If the queue is full, the lease is released later: at the next lease request
-    /// or when it expires.
-    fn request_release(&self) {
-        let _ = self.lease_queue.try_send(LeaseManagerMessage::Closed(self.grant.lease.clone()));
+    /// Returns the environments, which exist unless there is a `failure`.
+    fn env(&mut self) -> &mut dyn VecEnv {
+        self.env.as_deref_mut().expect("a worker without environments has a failure")
     }
 
-    fn answer(&mut self, verb: EnvMethod, query: &Query) -> CachedReply {
+    fn answer(&mut self, verb: EnvMethod, query: &Query) -> Reply {
         let payload = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
         if verb == EnvMethod::Render {
-            return self.render(&payload).map_or_else(CachedReply::Err, |bytes| CachedReply::Ok(ZBytes::from(bytes)));
+            return self.render(&payload).into();
         }
         let header = match decode::<message::RequestHeader>(&payload) {
             Ok(header) => header,
-            Err(error) => return CachedReply::Err(error),
+            Err(error) => return Reply::Err(error),
         };
         if let Err(error) = self.check_header(&header) {
-            return CachedReply::Err(error);
+            return Reply::Err(error);
         }
         if header.seq == self.last_seq {
             let is_repeat = self.last_request.is_none_or(|last| last == self.hasher.hash_one(&*payload));
             return match &self.last_reply {
                 Some((answered, answer)) if *answered == verb && is_repeat => answer.clone(),
-                _ => CachedReply::Err(stale_sequence(header.seq, self.last_seq)),
+                _ => Reply::Err(stale_sequence(header.seq, self.last_seq)),
             };
         }
-        if self.shared.shutting_down.load(Ordering::Acquire) {
-            return CachedReply::Err(shutting_down());
+        if self.state.shutting_down.load(Ordering::Acquire) {
+            return Reply::Err(shutting_down());
         }
         if let Some(reason) = self.failure.as_ref().filter(|_| verb != EnvMethod::Close) {
-            return CachedReply::Err(lost_environments(reason));
+            return Reply::Err(lost_environments(reason));
         }
         let outcome = catch_unwind(AssertUnwindSafe(|| self.execute(verb, &payload)));
         let answer = match outcome {
-            Ok(Ok(bytes)) => CachedReply::Ok(ZBytes::from(bytes)),
+            Ok(Ok(bytes)) => Reply::Ok(ZBytes::from(bytes)),
             // Rejected without effect: the number is not consumed.
-            Ok(Err(error)) if !error.code.consumes_seq() => return CachedReply::Err(error),
-            Ok(Err(error)) => CachedReply::Err(error),
+            Ok(Err(error)) if !error.code.consumes_seq() => return Reply::Err(error),
+            Ok(Err(error)) => Reply::Err(error),
             Err(panic) => {
                 let reason = panic_text(&panic);
-                tracing::error!(lease = self.grant.lease, reason, "environments panicked");
+                tracing::error!(lease = self.params.lease, reason, "environments panicked");
                 self.failure = Some(reason.clone());
-                CachedReply::Err(lost_environments(&reason))
+                Reply::Err(lost_environments(&reason))
             }
         };
         self.last_seq = header.seq;
@@ -188,10 +191,10 @@ impl Worker {
         Ok(())
     }
 
-    fn render(&self, payload: &[u8]) -> Result<Vec<u8>, ErrorReply> {
+    fn render(&mut self, payload: &[u8]) -> Result<Vec<u8>, ErrorReply> {
         let request: message::RenderRequest = decode(payload)?;
         self.check_owner(request.protocol, request.epoch)?;
-        if self.shared.shutting_down.load(Ordering::Acquire) {
+        if self.state.shutting_down.load(Ordering::Acquire) {
             return Err(shutting_down());
         }
         if let Some(reason) = &self.failure {
@@ -199,7 +202,7 @@ impl Worker {
         }
         let env = usize::try_from(request.env).unwrap_or(usize::MAX);
         // `scene` does not change the environments, so they stay usable after a panic.
-        let scene = catch_unwind(AssertUnwindSafe(|| self.env.scene(env)))
+        let scene = catch_unwind(AssertUnwindSafe(|| self.env().scene(env)))
             .map_err(|panic| ErrorReply::new(ErrorCode::Internal, "", panic_text(&panic)))?;
         scene.map(convert::encode_scene).map_err(|error| convert::wire_error(&error))
     }
@@ -208,23 +211,25 @@ impl Worker {
         match verb {
             EnvMethod::Reset => {
                 let request: message::ResetRequest<'_> = decode(payload)?;
-                let reset = convert::read_reset(&request)?;
-                let obs = self.env.reset(&reset).map_err(|error| convert::wire_error(&error))?.to_vec();
-                let critic_obs = if self.grant.critic { self.env.critic_obs() } else { &[] };
+                let critic = self.params.critic;
+                let env = self.env();
+                let reset = convert::read_reset(&request, env.num_envs())?;
+                let obs = env.reset(&reset).map_err(|error| convert::wire_error(&error))?.to_vec();
+                let critic_obs = if critic { env.critic_obs() } else { &[] };
                 Ok(convert::encode_observations(&obs, critic_obs, request.seq))
             }
             EnvMethod::Step => {
                 let request: message::StepRequest<'_> = decode(payload)?;
-                let expected = self.env.num_envs() * self.env.spec().action_len();
-                read_actions(request.actions, expected, &mut self.actions)?;
-                let batch = self.env.step(&self.actions).map_err(|error| logged(&error))?;
-                self.shared.env_steps.fetch_add(batch.reward.len() as u64, Ordering::Relaxed);
-                Ok(convert::encode_step(batch, request.seq, self.grant.critic))
+                let env = self.env.as_deref_mut().expect("a worker without environments has a failure");
+                read_actions(request.actions, env.num_envs() * env.spec().action_len(), &mut self.actions)?;
+                let batch = env.step(&self.actions).map_err(|error| logged(&error))?;
+                self.state.env_steps.fetch_add(batch.reward.len() as u64, Ordering::Relaxed);
+                Ok(convert::encode_step(batch, request.seq, self.params.critic))
             }
             EnvMethod::Close => {
                 let request: message::CloseRequest = decode(payload)?;
                 self.failure = Some("the client closed the lease".to_owned());
-                self.request_release();
+                (self.release)("closed by its client");
                 Ok(encode(&message::CloseReply { protocol: PROTOCOL, seq: request.seq }))
             }
             EnvMethod::Render => self.render(payload),
@@ -247,56 +252,9 @@ fn logged(error: &EnvError) -> ErrorReply {
     convert::wire_error(error)
 }
 
-/// Answers every request with the reason why the environments could not be built, until the lease is released.
-fn reject_all(
-    jobs: &Receiver<WorkerRequest>,
-    lease_queue: &SyncSender<LeaseManagerMessage>,
-    lease: &str,
-    reason: &str,
-) {
-    tracing::error!(lease, reason, "environments could not be built");
-    let _ = lease_queue.try_send(LeaseManagerMessage::Closed(lease.to_owned()));
-    while let Ok(job) = jobs.recv() {
-        let (WorkerRequest::Env(_, query) | WorkerRequest::Lease { query, .. }) = job;
-        let message = format!("the environments could not be built: {reason}");
-        send(&query, CachedReply::Err(ErrorReply::new(ErrorCode::Internal, "", message)));
-    }
-}
-
-fn send(query: &Query, answer: CachedReply) {
-    match answer {
-        CachedReply::Ok(bytes) => reply(query, bytes),
-        CachedReply::Err(error) => reply_error(query, &error),
-    }
-}
-
-/// Sends a reply. Failures are only logged, because the client may have disconnected.
-pub fn reply(query: &Query, bytes: ZBytes) {
-    if let Err(error) = query.reply(query.key_expr(), bytes).express(true).wait() {
-        tracing::debug!(%error, key = %query.key_expr(), "reply not sent");
-    }
-}
-
-/// Sends an error reply. Failures are only logged, because the client may have disconnected.
-pub fn reply_error(query: &Query, error: &ErrorReply) {
-    if let Err(failure) = query.reply_err(encode(error)).wait() {
-        tracing::debug!(%failure, key = %query.key_expr(), "error reply not sent");
-    }
-}
-
-fn panic_text(panic: &Box<dyn std::any::Any + Send>) -> String {
-    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
-    text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "panicked".to_owned())
-}
-
 fn lost_environments(reason: &str) -> ErrorReply {
     ErrorReply::new(ErrorCode::LeaseLost, "lease", format!("the environments of this lease are lost: {reason}"))
         .with_hint("request a new lease")
-}
-
-/// Returns the error reply to every new request while the server shuts down.
-pub fn shutting_down() -> ErrorReply {
-    ErrorReply::new(ErrorCode::ShuttingDown, "", "the server is shutting down; nothing was executed")
 }
 
 /// Returns the error reply to a request whose epoch differs from that of the lease.

@@ -21,8 +21,21 @@ pub fn encode_reset(request: &ResetRequest, epoch: u64, seq: u64) -> Vec<u8> {
     })
 }
 
-/// Decodes a reset request.
-pub fn read_reset(request: &message::ResetRequest<'_>) -> Result<ResetRequest, ErrorReply> {
+/// Returns the maximum size of a request to `num_envs` environments [bytes].
+pub fn max_request_bytes(num_envs: usize, spec: &EnvSpec) -> usize {
+    let reset = size_of::<u64>() + size_of::<u8>();
+    let step = spec.action_len() * size_of::<f32>();
+    4 * MAP_OVERHEAD + num_envs * reset.max(step)
+}
+
+/// Decodes a reset request for `num_envs` environments. Checks lengths before it copies.
+pub fn read_reset(request: &message::ResetRequest<'_>, num_envs: usize) -> Result<ResetRequest, ErrorReply> {
+    if let Some(seeds) = request.seeds {
+        check_length("seeds", seeds.len() / size_of::<u64>(), num_envs)?;
+    }
+    if let Some(mask) = request.mask {
+        check_length("mask", mask.len(), num_envs)?;
+    }
     let seeds = request.seeds.map(|bytes| tensor::read(bytes, "seeds")).transpose()?;
     Ok(ResetRequest { seeds, mask: request.mask.map(tensor::flags_from_bytes) })
 }

@@ -22,7 +22,9 @@ pub enum ErrorCode {
     NotFinite,
     /// A value is outside its range.
     OutOfRange,
-    /// Fewer environments are free than requested.
+    /// The request is larger than the server accepts.
+    TooLarge,
+    /// Fewer environments are free, or allowed to this client, than requested.
     TooManyEnvs,
     /// The lease was closed or expired, never existed, or its environments failed.
     LeaseLost,
@@ -49,13 +51,14 @@ pub enum ErrorCode {
 
 impl ErrorCode {
     /// All error codes of this version.
-    pub const ALL: [ErrorCode; 16] = [
+    pub const ALL: [ErrorCode; 17] = [
         ErrorCode::Version,
         ErrorCode::Malformed,
         ErrorCode::UnknownKey,
         ErrorCode::BadShape,
         ErrorCode::NotFinite,
         ErrorCode::OutOfRange,
+        ErrorCode::TooLarge,
         ErrorCode::TooManyEnvs,
         ErrorCode::LeaseLost,
         ErrorCode::StaleEpoch,

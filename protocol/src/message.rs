@@ -36,8 +36,15 @@ pub struct HelloReply {
     pub max_envs: u64,
     /// Number of environments that are not leased.
     pub free_envs: u64,
+    /// Maximum number of environments that one client id may lease.
+    pub max_envs_per_client: u64,
+    /// Maximum size of a request [bytes]; larger ones are rejected or get no reply.
+    pub max_request_bytes: u64,
     /// Time for which the environments of a disconnected client are kept [s].
     pub lease_grace_s: f64,
+    /// Time without a request after which a lease is released, even if its client is connected [s]. Default: never.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lease_idle_s: Option<f64>,
     /// Number of environment steps executed since the start of the server.
     pub env_steps: u64,
 }

@@ -4,10 +4,11 @@ use std::time::{Duration, Instant};
 
 use twinstep_env_server::Server;
 use twinstep_envs::TaskConfig;
-use twinstep_protocol::ErrorCode;
-use twinstep_protocol::message::LeaseRequest;
+use twinstep_protocol::keys::EnvMethod;
+use twinstep_protocol::message::{LeaseReply, LeaseRequest};
+use twinstep_protocol::{ErrorCode, ErrorReply, Secret, keys};
 
-use crate::raw_client::{RawClient, steps_in};
+use crate::raw_client::{RawClient, step_bytes, steps_in};
 use crate::remote::{config, start};
 
 /// Maximum wait for a condition, much longer than needed.
@@ -66,6 +67,108 @@ fn repeated_lease_request_returns_the_same_lease() {
     server.shutdown();
 }
 
+/// Returns the text of a refusal, without the id of the lease.
+fn refusal(error: &ErrorReply, lease: &str) -> String {
+    assert_eq!(error.code, ErrorCode::LeaseLost, "{error}");
+    format!("{} {error}", error.field).replace(lease, "…")
+}
+
+#[test]
+fn lease_cannot_be_used_or_taken_over_without_its_secret() {
+    let (server, endpoint) = start_counters(10.0);
+    let victim = RawClient::connect(&endpoint, server.sid(), "victim");
+    let lease = victim.lease(2);
+    victim.reset(&lease, 1).unwrap();
+    let step = victim.step(&lease, 2).unwrap();
+    // The intruder knows everything but the secret: the client id, the lease, its epoch and sequence number.
+    let intruder = RawClient::without_token(&endpoint, server.sid(), "victim");
+    let own = intruder.lease(2);
+    assert_ne!(own.lease, lease.lease, "the same client id got the victim's lease");
+    let unknown = LeaseReply { lease: "0123456789abcdef".to_owned(), ..lease.clone() };
+    let expected = refusal(&intruder.step(&unknown, 2).unwrap_err(), &unknown.lease);
+    for verb in EnvMethod::ALL {
+        for seq in [2, 3] {
+            let error = intruder.ask_env(&lease, verb, &step_bytes(&lease, seq)).unwrap_err();
+            assert_eq!(refusal(&error, &lease.lease), expected, "{verb:?}: a refusal says that the lease exists");
+        }
+    }
+    assert_eq!(refusal(&intruder.reclaim(&lease.lease, 1).unwrap_err(), &lease.lease), expected);
+    assert_eq!(refusal(&intruder.reclaim(&unknown.lease, 1).unwrap_err(), &unknown.lease), expected);
+    assert_eq!(victim.step(&lease, 2).unwrap(), step, "the intruder changed the stored reply");
+    assert_eq!(steps_in(&victim.step(&lease, 3).unwrap()), 2.0, "the intruder stepped the victim's robots");
+    server.shutdown();
+}
+
+#[test]
+fn requests_without_the_secret_do_not_fill_the_mailbox_of_a_lease() {
+    let (server, endpoint) = start_counters(10.0);
+    let victim = RawClient::connect(&endpoint, server.sid(), "victim");
+    let lease = victim.lease(64);
+    victim.reset(&lease, 1).unwrap();
+    let intruder = RawClient::without_token(&endpoint, server.sid(), "intruder");
+    let key = keys::env(server.sid(), &lease.lease, EnvMethod::Step);
+    for seq in 2..200 {
+        let unread: Vec<_> = (0..40).map(|_| intruder.send(&key, &step_bytes(&lease, seq))).collect();
+        assert_eq!(steps_in(&victim.step(&lease, seq).unwrap()), (seq - 1) as f32, "`busy` or stolen");
+        drop(unread);
+    }
+    server.shutdown();
+}
+
+#[test]
+fn client_cannot_lease_more_than_its_share() {
+    let mut config = config(TaskConfig::Counter);
+    config.server.max_envs_per_client = Some(5);
+    let (server, endpoint) = start(&config);
+    let mut client = RawClient::connect(&endpoint, server.sid(), "c1");
+    assert_eq!(client.hello().max_envs_per_client, 5);
+    assert_eq!(client.ask_lease(&client.lease_request(6)).unwrap_err().code, ErrorCode::TooManyEnvs);
+    client.lease(3);
+    client.secret = Secret::random();
+    let error = client.ask_lease(&client.lease_request(3)).unwrap_err();
+    assert_eq!((error.code, error.field.as_str()), (ErrorCode::TooManyEnvs, "num_envs"));
+    client.lease(2);
+    assert_eq!(client.hello().free_envs, 59);
+    server.shutdown();
+}
+
+#[test]
+fn idle_lease_of_a_connected_client_is_released() {
+    let mut config = config(TaskConfig::Counter);
+    config.server.lease_idle_s = Some(1.0);
+    let (server, endpoint) = start(&config);
+    let client = RawClient::connect(&endpoint, server.sid(), "c1");
+    let lease = client.lease(1);
+    client.reset(&lease, 1).unwrap();
+    let since = Instant::now();
+    for seq in 2.. {
+        if since.elapsed() > Duration::from_millis(1500) {
+            break;
+        }
+        client.step(&lease, seq).expect("a lease in use is kept");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    wait_until("the idle lease is released", || client.hello().free_envs == 64);
+    assert_eq!(client.reset(&lease, 1).unwrap_err().code, ErrorCode::LeaseLost);
+    server.shutdown();
+}
+
+#[test]
+fn token_of_somebody_else_does_not_end_a_lease() {
+    let grace_s = 0.3;
+    let (server, endpoint) = start_counters(grace_s);
+    let owner = RawClient::connect(&endpoint, server.sid(), "owner");
+    let lease = owner.lease(1);
+    // Client ids are visible, so anybody can declare and withdraw the owner's token.
+    RawClient::connect(&endpoint, server.sid(), "owner").vanish();
+    let since = Instant::now();
+    while since.elapsed().as_secs_f64() < 4.0 * grace_s {
+        assert_eq!(owner.hello().free_envs, 63, "the owner's lease expired");
+    }
+    owner.reset(&lease, 1).unwrap();
+    server.shutdown();
+}
+
 #[test]
 fn lease_of_a_lost_client_can_be_reclaimed_within_the_grace_period_only() {
     let grace_s = 1.0;
@@ -74,7 +177,8 @@ fn lease_of_a_lost_client_can_be_reclaimed_within_the_grace_period_only() {
     let lease = first.lease(1);
     first.reset(&lease, 1).unwrap();
     let last = first.step(&lease, 2).unwrap();
-    let second = RawClient::connect(&endpoint, server.sid(), "second");
+    let mut second = RawClient::connect(&endpoint, server.sid(), "second");
+    second.secret = first.secret;
     first.vanish();
     wait_until("the first client is disconnected", || !second.sees("first"));
 
@@ -83,7 +187,8 @@ fn lease_of_a_lost_client_can_be_reclaimed_within_the_grace_period_only() {
     assert_eq!(second.step(&reclaimed, 2).unwrap(), last, "the last reply can be requested again");
     assert_eq!(steps_in(&second.step(&reclaimed, 3).unwrap()), 2.0, "the environments continue from their state");
 
-    let third = RawClient::connect(&endpoint, server.sid(), "third");
+    let mut third = RawClient::connect(&endpoint, server.sid(), "third");
+    third.secret = second.secret;
     let since = Instant::now();
     second.vanish();
     wait_until("the lease has expired", || third.hello().free_envs == 64);
@@ -98,7 +203,8 @@ fn repeated_reclaim_returns_the_same_reply() {
     let (server, endpoint) = start_counters(10.0);
     let first = RawClient::connect(&endpoint, server.sid(), "first");
     let lease = first.lease(1);
-    let second = RawClient::connect(&endpoint, server.sid(), "second");
+    let mut second = RawClient::connect(&endpoint, server.sid(), "second");
+    second.secret = first.secret;
     let reclaimed = second.reclaim(&lease.lease, 1).unwrap();
     assert_eq!(second.reclaim(&lease.lease, 1).unwrap(), reclaimed);
     assert_eq!(
@@ -117,7 +223,8 @@ fn reclaim_with_a_wrong_epoch_has_no_effect() {
     let (server, endpoint) = start_counters(grace_s);
     let owner = RawClient::connect(&endpoint, server.sid(), "owner");
     let lease = owner.lease(1);
-    let intruder = RawClient::without_token(&endpoint, server.sid(), "intruder");
+    let mut intruder = RawClient::without_token(&endpoint, server.sid(), "intruder");
+    intruder.secret = owner.secret;
     for epoch in [0, 2, u64::MAX] {
         assert_eq!(intruder.reclaim(&lease.lease, epoch).unwrap_err().code, ErrorCode::StaleEpoch, "epoch {epoch}");
     }

@@ -9,7 +9,7 @@ use twinstep_protocol::message::{
     StepRequest,
 };
 use twinstep_protocol::tensor::{self, as_bytes};
-use twinstep_protocol::{ErrorReply, PROTOCOL, decode, encode, keys};
+use twinstep_protocol::{ErrorReply, PROTOCOL, Secret, decode, encode, keys};
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
@@ -23,6 +23,8 @@ pub struct RawClient {
     session: Session,
     pub sid: String,
     pub client: String,
+    /// Attached to every request.
+    pub secret: Secret,
     token: Option<LivelinessToken>,
     pub query_timeout: Duration,
 }
@@ -50,7 +52,7 @@ impl RawClient {
         }
         let session = twinstep_session::open(config).unwrap();
         let (sid, client) = (sid.to_owned(), client.to_owned());
-        Self { session, sid, client, token: None, query_timeout: Duration::from_secs(5) }
+        Self { session, sid, client, secret: Secret::random(), token: None, query_timeout: Duration::from_secs(5) }
     }
 
     /// Closes the session without closing the lease, like a crashed client.
@@ -70,6 +72,7 @@ impl RawClient {
         self.session
             .get(key)
             .payload(payload)
+            .attachment(self.secret.as_bytes())
             .target(QueryTarget::BestMatching)
             .consolidation(ConsolidationMode::None)
             .timeout(self.query_timeout)
@@ -108,6 +111,7 @@ impl RawClient {
         self.ask_lease(&self.lease_request(num_envs)).unwrap()
     }
 
+    /// Reclaims a lease. The client needs its secret.
     pub fn reclaim(&self, lease: &str, epoch: u64) -> Result<LeaseReply, ErrorReply> {
         let reclaim = Some(Reclaim { lease: lease.to_owned(), epoch });
         self.ask_lease(&LeaseRequest { reclaim, ..self.lease_request(1) })

@@ -148,7 +148,10 @@ fn twenty_thousand_bad_requests() {
         payload[0] = 0xc1;
         if let Err(error) = client.ask(key, &payload) {
             assert!(
-                matches!(error.code, ErrorCode::Malformed | ErrorCode::LeaseLost | ErrorCode::UnknownKey),
+                matches!(
+                    error.code,
+                    ErrorCode::Malformed | ErrorCode::LeaseLost | ErrorCode::UnknownKey | ErrorCode::TooLarge
+                ),
                 "{error}"
             );
         }
@@ -162,8 +165,9 @@ fn twenty_thousand_bad_requests() {
     assert!(grown < BOUND, "{grown} bytes more after 20000 bad requests");
 
     let giant = step_with(&lease, 2, &vec![0.0; GIANT / 4]);
+    // Zenoh drops them, so that there is no reply.
     for _ in 0..8 {
-        assert_eq!(client.ask_env(&lease, EnvMethod::Step, &giant).unwrap_err().code, ErrorCode::BadShape);
+        drop(client.send(&keys::env(server.sid(), &lease.lease, EnvMethod::Step), &giant));
     }
     drop(giant);
     // These requests run until Zenoh has released the memory of the giant queries.

@@ -5,7 +5,7 @@ use std::time::Duration;
 use twinstep_envs::{Counter, OBS_LEN};
 use twinstep_model::AutoresetMode;
 use twinstep_protocol::keys::{self, EnvMethod};
-use twinstep_protocol::{PROTOCOL, decode, encode, message, tensor};
+use twinstep_protocol::{PROTOCOL, Secret, decode, encode, message, tensor};
 use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::{Session, Wait};
 
@@ -18,6 +18,8 @@ pub fn three_times(endpoint: &str) -> Result<(), String> {
     let sid = first_server(&session)?;
     let client = format!("repeats-{}", session.zid());
     let _token = session.liveliness().declare_token(keys::live_client(&sid, &client)).wait().map_err(text)?;
+    let secret = Secret::random();
+    let request_three_times = |key: &str, request| request_three_times(&session, secret, key, request);
     let lease: message::LeaseReply = {
         let request = message::LeaseRequest {
             protocol: PROTOCOL,
@@ -30,19 +32,19 @@ pub fn three_times(endpoint: &str) -> Result<(), String> {
             reclaim: None,
         };
         // Three requests of the same client must yield one lease.
-        let reply = request_three_times(&session, &keys::lease(&sid), encode(&request))?;
+        let reply = request_three_times(&keys::lease(&sid), encode(&request))?;
         decode(&reply).map_err(text)?
     };
     let key = |verb| keys::env(&sid, &lease.lease, verb);
     let (protocol, epoch) = (PROTOCOL, lease.epoch);
     let reset = message::ResetRequest { protocol, epoch, seq: 1, seeds: None, mask: None };
-    request_three_times(&session, &key(EnvMethod::Reset), encode(&reset))?;
+    request_three_times(&key(EnvMethod::Reset), encode(&reset))?;
     let mut counter = Counter { resets: 1, ..Counter::default() };
     for step in 1..=STEPS {
         let action = [step as f32; 12];
         let actions = tensor::as_bytes(&action);
         let request = message::StepRequest { protocol, epoch, seq: step + 1, actions };
-        let payload = request_three_times(&session, &key(EnvMethod::Step), encode(&request))?;
+        let payload = request_three_times(&key(EnvMethod::Step), encode(&request))?;
         let reply: message::StepReply<'_> = decode(&payload).map_err(text)?;
         let obs: Vec<f32> = tensor::read(reply.obs, "obs").map_err(text)?;
         counter.step(&action);
@@ -51,7 +53,7 @@ pub fn three_times(endpoint: &str) -> Result<(), String> {
         }
     }
     let close = message::CloseRequest { protocol, epoch, seq: STEPS + 2 };
-    request_three_times(&session, &key(EnvMethod::Close), encode(&close))?;
+    request_three_times(&key(EnvMethod::Close), encode(&close))?;
     session.close().wait().map_err(text)
 }
 
@@ -80,7 +82,7 @@ fn first_server(session: &Session) -> Result<String, String> {
 /// Sends `request` three times and returns the reply, which must be the same for all three.
 ///
 /// Repeats of a close may fail because the lease no longer exists.
-fn request_three_times(session: &Session, key: &str, request: Vec<u8>) -> Result<Vec<u8>, String> {
+fn request_three_times(session: &Session, secret: Secret, key: &str, request: Vec<u8>) -> Result<Vec<u8>, String> {
     let send = || {
         session
             .get(key)
@@ -88,6 +90,7 @@ fn request_three_times(session: &Session, key: &str, request: Vec<u8>) -> Result
             .consolidation(ConsolidationMode::None)
             .timeout(TIMEOUT)
             .payload(request.clone())
+            .attachment(secret.as_bytes())
             .wait()
             .map_err(text)
     };

@@ -46,8 +46,8 @@ pub struct ServerArgs {
 pub struct ClientArgs {
     /// Endpoint to which it connects.
     pub endpoint: String,
-    /// Lease of the killed client, its epoch, and the last acknowledged steps, resets and action hash of each counter.
-    #[arg(long, num_args = 2 + 3 * NUM_ENVS)]
+    /// Lease of the killed client, its epoch, its secret, and the last acknowledged steps, resets and action hash of each counter.
+    #[arg(long, num_args = 3 + 3 * NUM_ENVS)]
     pub reclaim: Option<Vec<String>>,
 }
 
@@ -176,8 +176,8 @@ fn client(arguments: &ClientArgs) -> Result<(), ClientError> {
                 }
             },
         };
-        let LeaseHandle { lease, epoch } = env.ticket();
-        println!("lease {lease} {epoch}");
+        let LeaseHandle { lease, epoch, secret } = env.ticket();
+        println!("lease {lease} {epoch} {}", secret.reveal());
         match step_until_lost(env, oracle) {
             Ended::Lost(reason) => println!("lost {}", reason.replace('\n', " ")),
             Ended::Violation(evidence) => println!("violation {evidence}"),
@@ -232,9 +232,10 @@ fn write_counters(counters: &[Counter; NUM_ENVS]) -> String {
 fn parse_reclaimed_state(words: &[String]) -> (LeaseHandle, [Counter; NUM_ENVS]) {
     let number = |index: usize| words[index].parse::<u64>().expect("the test bed passes a printed line");
     let counter = |env: usize| Counter {
-        steps: number(2 + 3 * env) as u32,
-        resets: number(3 + 3 * env) as u32,
-        action_hash: number(4 + 3 * env) as u32,
+        steps: number(3 + 3 * env) as u32,
+        resets: number(4 + 3 * env) as u32,
+        action_hash: number(5 + 3 * env) as u32,
     };
-    (LeaseHandle { lease: words[0].clone(), epoch: number(1) }, std::array::from_fn(counter))
+    let secret = words[2].parse().expect("the test bed passes a printed line");
+    (LeaseHandle { lease: words[0].clone(), epoch: number(1), secret }, std::array::from_fn(counter))
 }

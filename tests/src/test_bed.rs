@@ -31,7 +31,8 @@ pub struct TestBed {
     proxy: Proxy,
     plan: TestBedConfig,
     /// Lease and epoch of the client.
-    lease: [String; 2],
+    /// Id, epoch and secret.
+    lease: [String; 3],
     /// Counters after the last acknowledged step, as printed by the client.
     acknowledged: Vec<String>,
     /// Number of steps that the client acknowledged.
@@ -147,8 +148,8 @@ impl TestBed {
             self.client = self.plan.start_client(&self.proxy.endpoint, &[])?;
             return self.wait_for_progress(Lease::New);
         }
-        let [lease, epoch] = self.lease.clone();
-        let mut reclaimed_state = vec!["--reclaim".to_owned(), lease, epoch];
+        let [lease, epoch, secret] = self.lease.clone();
+        let mut reclaimed_state = vec!["--reclaim".to_owned(), lease, epoch, secret];
         reclaimed_state.extend(self.acknowledged.iter().cloned());
         self.client = self.plan.start_client(&self.proxy.endpoint, &reclaimed_state)?;
         self.wait_for_progress(Lease::Same)
@@ -219,7 +220,7 @@ impl TestBed {
     fn record_line(&mut self, line: &str) -> Result<(), String> {
         let mut words = line.split(' ').map(str::to_owned);
         match words.next().as_deref() {
-            Some("lease") => self.lease = [words.next().unwrap_or_default(), words.next().unwrap_or_default()],
+            Some("lease") => self.lease = std::array::from_fn(|_| words.next().unwrap_or_default()),
             Some("acked") => {
                 self.acknowledged = words.collect();
                 self.steps += 1;

@@ -1,6 +1,7 @@
 """Step robots with only Zenoh and MessagePack, as in ``protocol/SPEC.md``: a template for other languages."""
 
 import argparse
+import secrets
 import struct
 import time
 import uuid
@@ -11,13 +12,16 @@ import zenoh
 
 msgpack: Any = untyped_msgpack
 ENVS, STEPS, TIMEOUT_S = 2, 10, 20.0
+SECRET = secrets.token_bytes(16)
+"""Attached to every request: nobody else can use the environments."""
+NONE = zenoh.ConsolidationMode.NONE
 
 
 def send_request(session: zenoh.Session, key: str, **request: object) -> dict[str, Any]:
     """Send a request and repeat it until a reply arrives; its number makes the repeats harmless."""
     payload, deadline = msgpack.packb({"protocol": 1, **request}), time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline:
-        for reply in session.get(key, payload=payload, consolidation=zenoh.ConsolidationMode.NONE, timeout=2.0):
+        for reply in session.get(key, payload=payload, attachment=SECRET, consolidation=NONE, timeout=2.0):
             if reply.ok:
                 return msgpack.unpackb(reply.ok.payload.to_bytes())
             error = cast(zenoh.ReplyError, reply.err).payload.to_bytes()

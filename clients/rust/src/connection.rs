@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use twinstep_model::AutoresetMode;
-use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, decode, encode, keys, message};
+use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, Secret, decode, encode, keys, message, random_id};
 use zenoh::bytes::ZBytes;
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::liveliness::LivelinessToken;
@@ -83,13 +83,24 @@ pub struct Connection {
     sid: String,
     name: String,
     client: String,
+    secret: Secret,
+    /// Maximum size of a request [bytes], from `hello`.
+    max_request_bytes: usize,
     _token: LivelinessToken,
 }
 
 /// A request in progress.
 pub struct Pending {
-    payload: ZBytes,
+    request: Request,
     replies: FifoChannelHandler<Reply>,
+}
+
+/// What is sent, the first time and in every repeat.
+#[derive(Clone)]
+struct Request {
+    payload: ZBytes,
+    /// The secret.
+    attachment: ZBytes,
 }
 
 /// Result of one query.
@@ -103,15 +114,25 @@ enum QueryOutcome {
 }
 
 impl Connection {
-    /// Opens a session, finds the server, and declares the client's liveliness token.
-    pub fn open(options: &ConnectOptions) -> Result<Self, ClientError> {
+    /// Opens a session, finds the server, declares the client's liveliness token, and requests `hello`.
+    ///
+    /// Fails if the server does not support this protocol version. `secret` is that of the lease to use.
+    pub fn open(options: &ConnectOptions, secret: Secret) -> Result<Self, ClientError> {
         let session = open_session(options)?;
         let (sid, name) = find_server(&session, options)?;
-        let client = random_id(&session);
+        let client = format!("{}-{}", session.zid(), random_id());
         let key = keys::live_client(&sid, &client);
         let token = session.liveliness().declare_token(&key).wait().map_err(|error| zenoh_error(&error))?;
         let endpoint = options.endpoint.clone();
-        Ok(Self { endpoint, timeout: options.timeout, session, sid, name, client, _token: token })
+        let (timeout, max_request_bytes) = (options.timeout, usize::MAX);
+        let mut this = Self { endpoint, timeout, session, sid, name, client, secret, max_request_bytes, _token: token };
+        this.max_request_bytes = usize::try_from(this.hello()?.max_request_bytes).unwrap_or(usize::MAX);
+        Ok(this)
+    }
+
+    /// Returns the secret that is attached to every request.
+    pub fn secret(&self) -> Secret {
+        self.secret
     }
 
     /// Returns the id of the client, as in its liveliness token.
@@ -137,8 +158,7 @@ impl Connection {
             .map_err(|error| zenoh_error(&error))
     }
 
-    /// Requests `hello`. Fails if the server does not support this protocol version.
-    pub fn hello(&self) -> Result<message::HelloReply, ClientError> {
+    fn hello(&self) -> Result<message::HelloReply, ClientError> {
         let querier = self.querier(keys::hello(&self.sid))?;
         let client = concat!("twinstep-client ", env!("CARGO_PKG_VERSION")).to_owned();
         let answer = self.request(&querier, encode(&message::HelloRequest { protocol: PROTOCOL, client }))?;
@@ -151,7 +171,18 @@ impl Connection {
 
     /// Sends a request and waits for the reply.
     pub fn request(&self, querier: &Querier<'static>, request: Vec<u8>) -> Result<ZBytes, ClientError> {
-        self.wait_reply(querier, &mut send(querier, request)?)
+        self.wait_reply(querier, &mut self.send(querier, request)?)
+    }
+
+    /// Sends a request without waiting for the reply.
+    pub fn send(&self, querier: &Querier<'static>, payload: Vec<u8>) -> Result<Pending, ClientError> {
+        let (bytes, limit) = (payload.len(), self.max_request_bytes);
+        if bytes > limit {
+            return Err(ClientError::TooLarge { request: querier.key_expr().to_string(), bytes, limit });
+        }
+        let request = Request { payload: ZBytes::from(payload), attachment: ZBytes::from(self.secret.as_bytes()) };
+        let replies = get(querier, &request)?;
+        Ok(Pending { request, replies })
     }
 
     /// Waits for the reply to a request and repeats the request until the timeout. May be called again after a timeout.
@@ -184,7 +215,7 @@ impl Connection {
             }
             std::thread::sleep(pause);
             pause = (pause * 2).min(RETRY_BACKOFF[1]);
-            pending.replies = get(querier, &pending.payload)?;
+            pending.replies = get(querier, &pending.request)?;
         }
     }
 
@@ -208,7 +239,7 @@ impl Connection {
         }
         let hello = self.querier(keys::hello(&self.sid)).and_then(|querier| {
             let request = message::HelloRequest { protocol: PROTOCOL, client: self.client.clone() };
-            Ok(outcome(&send(&querier, encode(&request))?.replies))
+            Ok(outcome(&self.send(&querier, encode(&request))?.replies))
         });
         match hello {
             Ok(QueryOutcome::Answer(_)) => {
@@ -222,15 +253,9 @@ impl Connection {
     }
 }
 
-/// Sends a request without waiting for the reply.
-pub fn send(querier: &Querier<'static>, request: Vec<u8>) -> Result<Pending, ClientError> {
-    let payload = ZBytes::from(request);
-    let replies = get(querier, &payload)?;
-    Ok(Pending { payload, replies })
-}
-
-fn get(querier: &Querier<'static>, payload: &ZBytes) -> Result<FifoChannelHandler<Reply>, ClientError> {
-    querier.get().payload(payload.clone()).wait().map_err(|error| zenoh_error(&error))
+fn get(querier: &Querier<'static>, request: &Request) -> Result<FifoChannelHandler<Reply>, ClientError> {
+    let Request { payload, attachment } = request.clone();
+    querier.get().payload(payload).attachment(attachment).wait().map_err(|error| zenoh_error(&error))
 }
 
 fn outcome(replies: &FifoChannelHandler<Reply>) -> QueryOutcome {
@@ -350,12 +375,6 @@ fn find_server(session: &Session, options: &ConnectOptions) -> Result<(String, S
             }
         }
     }
-}
-
-fn random_id(session: &Session) -> String {
-    use std::hash::{BuildHasher, Hasher};
-    let number = std::hash::RandomState::new().build_hasher().finish();
-    format!("{}-{number:016x}", session.zid())
 }
 
 fn zenoh_error(error: &zenoh::Error) -> ClientError {

@@ -54,6 +54,16 @@ pub enum ClientError {
         /// `name (sid)` of every visible server.
         visible: Vec<String>,
     },
+    /// The request is larger than the server accepts. It was not sent.
+    #[error("`{request}` has {bytes} bytes; the server accepts at most {limit}\n  it hosts fewer environments")]
+    TooLarge {
+        /// Key of the request.
+        request: String,
+        /// Its size [bytes].
+        bytes: usize,
+        /// The server's limit [bytes].
+        limit: usize,
+    },
     /// The server does not support the client's protocol version.
     #[error(
         "the server supports protocol {} to {}, this client {ours}\n  install the same Twinstep at both ends",

@@ -26,3 +26,4 @@ pub use connection::{ConnectOptions, Connection};
 pub use error::ClientError;
 pub use remote_env::{LeaseHandle, RemoteVecEnv};
 pub use server_process::ServerProcess;
+pub use twinstep_protocol::Secret;

@@ -4,20 +4,23 @@ use std::sync::OnceLock;
 
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, Scene, StepBatch, VecEnv};
 use twinstep_protocol::keys::EnvMethod;
-use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, keys, message};
+use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, Secret, convert, decode, encode, keys, message};
 use zenoh::bytes::ZBytes;
 use zenoh::query::Querier;
 
-use crate::connection::{Pending, read_answer, send};
+use crate::connection::{Pending, read_answer};
 use crate::{ClientError, ConnectOptions, Connection};
 
-/// Id and epoch of a lease, with which another process can reclaim it. Store it where a crash does not lose it.
+/// Id, epoch and secret of a lease, with which another process can reclaim it. Store it where a crash does not lose it
+/// and nobody else can read it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LeaseHandle {
     /// Id of the lease.
     pub lease: String,
     /// Epoch of the lease.
     pub epoch: u64,
+    /// Secret of the lease. Whoever has it can use the environments.
+    pub secret: Secret,
 }
 
 /// Environments on a server, leased by this client.
@@ -51,8 +54,8 @@ impl RemoteVecEnv {
     }
 
     fn open(options: &ConnectOptions, ticket: Option<&LeaseHandle>) -> Result<Self, ClientError> {
-        let connection = Connection::open(options)?;
-        connection.hello()?;
+        let secret = ticket.map_or_else(Secret::random, |ticket| ticket.secret);
+        let connection = Connection::open(options, secret)?;
         let request = message::LeaseRequest {
             protocol: PROTOCOL,
             client: connection.client().to_owned(),
@@ -71,7 +74,7 @@ impl RemoteVecEnv {
         let num_envs = granted.num_envs as usize;
         Ok(Self {
             batch: StepBatch::new(num_envs, &granted.spec),
-            ticket: LeaseHandle { lease: granted.lease, epoch: granted.epoch },
+            ticket: LeaseHandle { lease: granted.lease, epoch: granted.epoch, secret },
             spec: granted.spec,
             num_envs,
             autoreset: granted.autoreset,
@@ -104,7 +107,7 @@ impl RemoteVecEnv {
         }
         let (epoch, seq) = (self.ticket.epoch, self.last_seq + 1);
         let request = convert::encode_actions(actions, epoch, seq);
-        self.pending = Some((EnvMethod::Step, send(&self.step, request).map_err(remote)?));
+        self.pending = Some((EnvMethod::Step, self.connection.send(&self.step, request).map_err(remote)?));
         Ok(())
     }
 
@@ -197,7 +200,7 @@ impl VecEnv for RemoteVecEnv {
         }
         request.check(self.num_envs)?;
         let payload = convert::encode_reset(request, self.ticket.epoch, self.last_seq + 1);
-        self.pending = Some((EnvMethod::Reset, send(&self.reset, payload).map_err(remote)?));
+        self.pending = Some((EnvMethod::Reset, self.connection.send(&self.reset, payload).map_err(remote)?));
         let answer = self.await_pending()?;
         let bytes = answer.to_bytes();
         let was_unknown = std::mem::replace(&mut self.is_unknown, true);

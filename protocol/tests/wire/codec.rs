@@ -83,7 +83,8 @@ proptest! {
         let spec = golden::small_spec();
         let hello = HelloReply {
             protocol: PROTOCOL, protocols, server_version: name.clone(), server_id: name.clone(), spec_hash: spec.hash(),
-            spec: spec.clone(), max_envs, free_envs, lease_grace_s, env_steps, name: name.clone(),
+            spec: spec.clone(), max_envs, free_envs, lease_grace_s, max_envs_per_client: max_envs, max_request_bytes: free_envs,
+            lease_idle_s: Some(lease_grace_s), env_steps, name: name.clone(),
         };
         round_trips(&hello, &mut Vec::new());
         let granted = LeaseReply {

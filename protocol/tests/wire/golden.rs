@@ -122,7 +122,10 @@ fn hello_has_its_golden_bytes() {
         spec: EnvSpec { critic_observation: small_spec().observation[..1].to_vec(), ..small_spec() },
         max_envs: 4096,
         free_envs: 4032,
+        max_envs_per_client: 1024,
+        max_request_bytes: 197_632,
         lease_grace_s: 10.0,
+        lease_idle_s: Some(600.0),
         env_steps: 1_000_000_007,
     };
     check("hello_reply", &reply);

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use clap::{Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
-use twinstep_client::{ConnectOptions, Connection};
+use twinstep_client::{ConnectOptions, Connection, Secret};
 use twinstep_envs::base_spec;
 use twinstep_model::{AutoresetMode, StepBatch, go2};
 use twinstep_protocol::keys::{self, EnvMethod};
@@ -170,7 +170,7 @@ fn query_echo(
     let actions = vec![0.1f32; envs * ACTION_LEN];
     let actions = tensor::as_bytes(&actions);
     let request = encode(&message::StepRequest { protocol: PROTOCOL, epoch: 1, seq: 1, actions });
-    run_queries(&querier, round_trips, case, envs, |_| request.clone())
+    run_queries(&querier, Secret::random(), round_trips, case, envs, |_| request.clone())
 }
 
 /// Steps a lease of `twinstep serve` without the client's repeats.
@@ -179,7 +179,7 @@ fn query_echo(
 fn query_twinstep(round_trips: usize, folder: &SecurityFolder, endpoint: &str, envs: usize) -> Result<Tally, Failure> {
     let options =
         ConnectOptions { zenoh: Some(folder.path("client-tls.json5")), ..ConnectOptions::new(endpoint, envs) };
-    let link = Connection::open(&options)?;
+    let link = Connection::open(&options, Secret::random())?;
     let lease = message::LeaseRequest {
         protocol: PROTOCOL,
         client: link.client().to_owned(),
@@ -198,7 +198,7 @@ fn query_twinstep(round_trips: usize, folder: &SecurityFolder, endpoint: &str, e
     link.request(&querier(EnvMethod::Reset)?, encode(&reset))?;
     let actions = vec![0.1f32; envs * ACTION_LEN];
     let actions = tensor::as_bytes(&actions);
-    run_queries(&querier(EnvMethod::Step)?, round_trips, Case::Twinstep, envs, |answered| {
+    run_queries(&querier(EnvMethod::Step)?, link.secret(), round_trips, Case::Twinstep, envs, |answered| {
         encode(&message::StepRequest { protocol: PROTOCOL, epoch, seq: 2 + answered as u64, actions })
     })
 }
@@ -209,6 +209,7 @@ fn query_twinstep(round_trips: usize, folder: &SecurityFolder, endpoint: &str, e
 /// again, so that a broken link counts once.
 fn run_queries(
     querier: &Querier<'_>,
+    secret: Secret,
     round_trips: usize,
     case: Case,
     envs: usize,
@@ -221,7 +222,7 @@ fn run_queries(
     let mut answered = 0;
     for round_trip in 0..round_trips {
         let since = Instant::now();
-        let outcome = once(querier, request(answered))?;
+        let outcome = once(querier, secret, request(answered))?;
         let waited = since.elapsed();
         match &outcome {
             Outcome::Answer => {
@@ -234,7 +235,7 @@ fn run_queries(
         if outcome != Outcome::Answer {
             let query = format!("{}, {envs} envs, query {round_trip}", case.name());
             bar.suspend(|| eprintln!("{query}: {outcome:?} after {} us", waited.as_micros()));
-            while once(querier, request(answered))? != Outcome::Answer {
+            while once(querier, secret, request(answered))? != Outcome::Answer {
                 std::thread::sleep(PAUSE);
             }
             answered += 1;
@@ -254,8 +255,8 @@ enum Outcome {
     Error(String),
 }
 
-fn once(querier: &Querier<'_>, request: Vec<u8>) -> Result<Outcome, Failure> {
-    let replies = querier.get().payload(request).wait()?;
+fn once(querier: &Querier<'_>, secret: Secret, request: Vec<u8>) -> Result<Outcome, Failure> {
+    let replies = querier.get().payload(request).attachment(secret.as_bytes()).wait()?;
     Ok(match replies.recv().map(zenoh::query::Reply::into_result) {
         Ok(Ok(_)) => Outcome::Answer,
         Ok(Err(error)) => Outcome::Error(String::from_utf8_lossy(&error.payload().to_bytes()).into_owned()),

@@ -1,7 +1,9 @@
 """Connection to one server: session, discovery, requests with retries, reasons of timeouts."""
 
 import json
+import math
 import os
+import secrets
 import socket
 import time
 import uuid
@@ -58,9 +60,10 @@ class _ZenohProcess:
 class Pending:
     """A request in progress."""
 
-    def __init__(self, querier: zenoh.Querier, payload: bytes) -> None:
+    def __init__(self, querier: zenoh.Querier, payload: bytes, secret: bytes) -> None:
         self.querier = querier
         self.payload = payload
+        self.secret = secret
         # None: not sent yet, or interrupted while it was sent.
         self.replies: Any = None
 
@@ -68,7 +71,7 @@ class Pending:
         """Send the request, the first time or again with the same number, so that it is executed once."""
         _ZenohProcess.check()
         try:
-            self.replies = self.querier.get(payload=self.payload)
+            self.replies = self.querier.get(payload=self.payload, attachment=self.secret)
         except zenoh.ZError as error:
             raise NoServerError(f"the Zenoh session is closed: {error}") from error
 
@@ -98,7 +101,11 @@ class Connection:
         try:
             self.server_id, self.name = self._find_server(robot)
             self.client = uuid.uuid4().hex
+            # Proves that a request comes from this client. It is in no key, reply or log.
+            self._secret = secrets.token_bytes(16)
+            self._max_request_bytes = math.inf
             self.hello = self._handshake()
+            self._max_request_bytes = self.hello["max_request_bytes"]
             self._token = self._session.liveliness().declare_token(
                 f"twinstep/live/client/{self.server_id}/{self.client}"
             )
@@ -125,9 +132,19 @@ class Connection:
 
     def request(self, querier: zenoh.Querier, message: dict[str, object], timeout_s: float) -> dict[str, Any]:
         """Send a request and wait for the reply."""
-        pending = Pending(querier, codec.encode(message))
+        pending = self.pending(querier, message)
         pending.send()
         return self.wait_reply(pending, timeout_s)
+
+    def pending(self, querier: zenoh.Querier, message: dict[str, object]) -> Pending:
+        """Return a request that is not sent yet."""
+        payload = codec.encode(message)
+        if len(payload) > self._max_request_bytes:
+            raise InvalidOptionError(
+                f"a request to `{querier.key_expr}` has {len(payload)} bytes; the server accepts at most "
+                f"{self._max_request_bytes}\n  it hosts fewer environments"
+            )
+        return Pending(querier, payload, self._secret)
 
     def wait_reply(self, pending: Pending, timeout_s: float) -> dict[str, Any]:
         """Wait for the reply to a request, and repeat the request. May be called again after a timeout."""
@@ -207,7 +224,7 @@ class Connection:
             return "the connection is lost and cannot be restored; check that the server or the router is running"
         if all(server_id != self.server_id for server_id, _ in self._visible_servers()):
             return "the connection works, but the server is no longer visible: it has terminated or lost its router"
-        pending = Pending(self.querier("hello"), codec.encode({"client": "twinstep-python"}))
+        pending = self.pending(self.querier("hello"), {"client": "twinstep-python"})
         pending.send()
         hello = _outcome(pending)
         if isinstance(hello, dict):

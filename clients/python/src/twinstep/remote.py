@@ -291,7 +291,7 @@ class RemoteVecEnv:
         if not self._release.alive:
             raise Error("the environment is closed")
         seq = self._last_seq + 1
-        pending = Pending(self._methods[method], codec.encode({**request, "epoch": self._epoch, "seq": seq}))
+        pending = self._connection.pending(self._methods[method], {**request, "epoch": self._epoch, "seq": seq})
         # Pending before it is sent: after an interrupt in between, the same request is sent again, not another with
         # its number.
         self._pending = (method, seq, pending, time.monotonic())

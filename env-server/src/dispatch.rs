@@ -1,0 +1,149 @@
+//! Puts each query into the mailbox that answers it. Runs on Zenoh's threads, so it neither computes nor sends.
+
+use std::collections::HashMap;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::time::Instant;
+
+use twinstep_protocol::keys::{self, EnvMethod};
+use twinstep_protocol::{ErrorCode, ErrorReply, Secret};
+use zenoh::bytes::ZBytes;
+use zenoh::query::Query;
+
+use crate::executor::{Executor, Handler, Mailbox, lock};
+use crate::messages::{Reply, Request, RequestKind, ServerState};
+
+/// Maximum size of a `hello` or `lease` request [bytes].
+const MAX_CONTROL_BYTES: usize = 16 << 10;
+
+/// Leases by id.
+pub type Routes = Arc<RwLock<HashMap<String, Arc<Route>>>>;
+
+/// How to reach a lease.
+pub struct Route {
+    /// Secret of its client.
+    pub secret: Secret,
+    /// Maximum size of a request to its environments [bytes].
+    pub max_request_bytes: usize,
+    /// Requests to its environments.
+    pub mailbox: Arc<Mailbox>,
+    /// Time of the client's last request. Keeps the lease alive when the token is not visible.
+    pub last_request: Mutex<Instant>,
+}
+
+/// Puts queries into mailboxes.
+pub struct Dispatcher {
+    /// Id of the server.
+    pub sid: String,
+    /// The leases.
+    pub routes: Routes,
+    /// Mailbox of `hello` requests.
+    pub hello: Arc<Mailbox>,
+    /// Mailbox of `lease` requests.
+    pub lease: Arc<Mailbox>,
+    /// Mailbox of refused requests. Their payloads are dropped first.
+    pub refusals: Arc<Mailbox>,
+    /// State of the server.
+    pub state: Arc<ServerState>,
+}
+
+impl Dispatcher {
+    /// Enqueues a query. Never blocks.
+    pub fn dispatch(&self, query: Query) {
+        let (mailbox, kind) = match self.route(&query) {
+            Ok(route) => route,
+            Err(error) => return self.refuse(query, error),
+        };
+        if let Err(request) = mailbox.push(Request { query, kind }) {
+            let error = ErrorReply::new(ErrorCode::Busy, "", "too many requests are queued already");
+            self.refuse(request.query, error.with_hint("send one request at a time"));
+        }
+    }
+
+    fn route(&self, query: &Query) -> Result<(Arc<Mailbox>, RequestKind), ErrorReply> {
+        let request = keys::parse(query.key_expr().as_str(), &self.sid).ok_or_else(|| {
+            let message = format!("the key `{}` does not exist", query.key_expr());
+            let hint = "use hello, lease, or env/<lease>/reset, step, close or render";
+            ErrorReply::new(ErrorCode::UnknownKey, "", message).with_hint(hint)
+        })?;
+        if let keys::Request::Env { lease, verb } = request {
+            return self.route_env(query, lease, verb);
+        }
+        if self.state.shutting_down.load(Ordering::Acquire) {
+            return Err(shutting_down());
+        }
+        check_size(query, MAX_CONTROL_BYTES)?;
+        Ok(match request {
+            keys::Request::Hello => (Arc::clone(&self.hello), RequestKind::Hello),
+            _ => (Arc::clone(&self.lease), RequestKind::Lease),
+        })
+    }
+
+    fn route_env(
+        &self,
+        query: &Query,
+        lease: &str,
+        verb: EnvMethod,
+    ) -> Result<(Arc<Mailbox>, RequestKind), ErrorReply> {
+        let secret = attached_secret(query);
+        let routes = self.routes.read().unwrap_or_else(PoisonError::into_inner);
+        let route = routes.get(lease).filter(|route| secret == Some(route.secret));
+        let route = route.ok_or_else(|| no_such_lease(lease))?;
+        check_size(query, route.max_request_bytes)?;
+        *lock(&route.last_request) = Instant::now();
+        Ok((Arc::clone(&route.mailbox), RequestKind::Env(verb)))
+    }
+
+    fn refuse(&self, mut query: Query, error: ErrorReply) {
+        if let Some(payload) = query.payload_mut() {
+            *payload = ZBytes::new();
+        }
+        // The mailbox is never full.
+        let _ = self.refusals.push(Request { query, kind: RequestKind::Refused(error) });
+    }
+}
+
+/// Creates the mailbox of refused requests. It is not bounded: a client that does not read its refusals loses its link
+/// when the oldest of them cannot be sent, and the others are dropped with it.
+pub fn refusals(executor: &Executor) -> Arc<Mailbox> {
+    Mailbox::new(executor, usize::MAX, Refusals)
+}
+
+struct Refusals;
+
+impl Handler for Refusals {
+    fn handle(&mut self, kind: RequestKind, _query: &Query) -> Option<Reply> {
+        match kind {
+            RequestKind::Refused(error) => Some(Reply::Err(error)),
+            _ => None,
+        }
+    }
+}
+
+/// Returns the secret that is attached to a query.
+pub fn attached_secret(query: &Query) -> Option<Secret> {
+    Secret::from_bytes(&query.attachment()?.to_bytes())
+}
+
+fn check_size(query: &Query, limit: usize) -> Result<(), ErrorReply> {
+    let bytes = query.payload().map_or(0, ZBytes::len);
+    if bytes <= limit {
+        return Ok(());
+    }
+    let message = format!("the request has {bytes} bytes; at most {limit} are accepted at this key");
+    Err(ErrorReply::new(ErrorCode::TooLarge, "", message).with_hint("send arrays of `num_envs` rows"))
+}
+
+/// Returns the error reply to a request for a lease that does not exist or belongs to somebody else. It does not say
+/// which.
+pub fn no_such_lease(lease: &str) -> ErrorReply {
+    let message = format!(
+        "lease `{lease}` was closed, expired, or was never granted, or the attached secret is not that of its client"
+    );
+    ErrorReply::new(ErrorCode::LeaseLost, "lease", message).with_hint("request a new lease")
+}
+
+/// Returns the error reply to every new request while the server shuts down.
+pub fn shutting_down() -> ErrorReply {
+    ErrorReply::new(ErrorCode::ShuttingDown, "", "the server is shutting down; nothing was executed")
+}

@@ -1,0 +1,208 @@
+//! Threads that execute requests and send replies, and the mailboxes that requests wait in.
+//!
+//! A reply to a client that does not read can block its sender until Zenoh closes the link. A thread that sends a reply
+//! therefore does not count as running: another thread executes the next request. A mailbox has at most one request in
+//! execution or one reply being sent, so a client that does not read delays only the mailbox that it writes to.
+
+use std::collections::VecDeque;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use twinstep_protocol::{ErrorCode, ErrorReply};
+use zenoh::query::Query;
+
+use crate::messages::{Reply, Request, RequestKind};
+
+/// Maximum number of threads, of which most can only be sending.
+const MAX_THREADS: usize = 512;
+/// Time after which a thread without work ends, except the last one.
+const KEEP_ALIVE: Duration = Duration::from_secs(5);
+
+/// Executes the requests of mailboxes. Clones share the threads.
+#[derive(Clone)]
+pub struct Executor(Arc<Shared>);
+
+struct Shared {
+    state: Mutex<State>,
+    changed: Condvar,
+    max_running: usize,
+}
+
+#[derive(Default)]
+struct State {
+    /// Mailboxes with a request and without a thread.
+    ready: VecDeque<Arc<Mailbox>>,
+    threads: usize,
+    /// Threads that execute a request; those that send a reply do not count.
+    running: usize,
+    waiting: usize,
+    is_stopping: bool,
+}
+
+impl Executor {
+    /// Starts the first thread. At most `max_running` threads execute requests at the same time.
+    pub fn start(max_running: usize) -> std::io::Result<Self> {
+        let shared = Shared { state: Mutex::default(), changed: Condvar::new(), max_running };
+        let this = Self(Arc::new(shared));
+        this.spawn(&mut lock(&this.0.state))?;
+        Ok(this)
+    }
+
+    /// Ends the threads after the requests in the mailboxes have been executed, and waits for them.
+    pub fn stop(&self) {
+        let mut state = lock(&self.0.state);
+        state.is_stopping = true;
+        self.0.changed.notify_all();
+        while state.threads > 0 {
+            state = self.0.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    fn schedule(&self, mailbox: Arc<Mailbox>) {
+        let mut state = lock(&self.0.state);
+        state.ready.push_back(mailbox);
+        self.wake_a_thread(&mut state);
+    }
+
+    /// Wakes or starts a thread if there is a mailbox that it may execute.
+    fn wake_a_thread(&self, state: &mut State) {
+        if state.ready.is_empty() || state.running >= self.0.max_running {
+            return;
+        }
+        if state.waiting > 0 {
+            self.0.changed.notify_one();
+        } else if state.threads < MAX_THREADS
+            && let Err(error) = self.spawn(state)
+        {
+            // The request waits for one of the threads that there are.
+            tracing::warn!(%error, threads = state.threads, "cannot start a thread");
+        }
+    }
+
+    fn spawn(&self, state: &mut State) -> std::io::Result<()> {
+        let this = self.clone();
+        std::thread::Builder::new().name("request".to_owned()).spawn(move || this.run())?;
+        state.threads += 1;
+        Ok(())
+    }
+
+    fn run(&self) {
+        let mut state = lock(&self.0.state);
+        loop {
+            if state.running < self.0.max_running
+                && let Some(mailbox) = state.ready.pop_front()
+            {
+                state.running += 1;
+                drop(state);
+                let executed = mailbox.execute_next();
+                let mut finished = lock(&self.0.state);
+                finished.running -= 1;
+                self.wake_a_thread(&mut finished);
+                drop(finished);
+                if let Some((query, Some(reply))) = &executed {
+                    reply.send(query);
+                }
+                // Dropping the query sends a message as well, so that it happens here.
+                drop(executed);
+                mailbox.finish();
+                state = lock(&self.0.state);
+            } else if state.is_stopping && state.ready.is_empty() {
+                break;
+            } else {
+                state.waiting += 1;
+                let (awake, wait) =
+                    self.0.changed.wait_timeout(state, KEEP_ALIVE).unwrap_or_else(PoisonError::into_inner);
+                state = awake;
+                state.waiting -= 1;
+                if wait.timed_out() && state.ready.is_empty() && state.threads > 1 {
+                    break;
+                }
+            }
+        }
+        state.threads -= 1;
+        self.0.changed.notify_all();
+    }
+}
+
+/// Executes the requests of one mailbox.
+pub trait Handler: Send {
+    /// Returns the reply to a query, or `None` if another mailbox has received it.
+    fn handle(&mut self, kind: RequestKind, query: &Query) -> Option<Reply>;
+}
+
+/// Queue of requests that are executed in order, one at a time.
+pub struct Mailbox {
+    queue: Mutex<Queue>,
+    capacity: usize,
+    handler: Mutex<Box<dyn Handler>>,
+    executor: Executor,
+}
+
+#[derive(Default)]
+struct Queue {
+    requests: VecDeque<Request>,
+    /// True from the first request until the reply to the last one has been sent.
+    is_busy: bool,
+}
+
+impl Mailbox {
+    /// Creates a mailbox in which at most `capacity` requests wait.
+    pub fn new(executor: &Executor, capacity: usize, handler: impl Handler + 'static) -> Arc<Self> {
+        let (queue, handler) = (Mutex::default(), Mutex::new(Box::new(handler) as Box<dyn Handler>));
+        Arc::new(Self { queue, capacity, handler, executor: executor.clone() })
+    }
+
+    /// Enqueues a request. Never blocks. Returns the request if the mailbox is full.
+    pub fn push(self: &Arc<Self>, request: Request) -> Result<(), Box<Request>> {
+        let mut queue = lock(&self.queue);
+        if queue.requests.len() >= self.capacity {
+            return Err(Box::new(request));
+        }
+        queue.requests.push_back(request);
+        let was_busy = std::mem::replace(&mut queue.is_busy, true);
+        drop(queue);
+        if !was_busy {
+            self.executor.schedule(Arc::clone(self));
+        }
+        Ok(())
+    }
+
+    /// Returns true if a request waits, is in execution, or its reply is being sent.
+    pub fn is_busy(&self) -> bool {
+        lock(&self.queue).is_busy
+    }
+
+    /// Executes the first request. Returns its query, and the reply if there is one.
+    fn execute_next(&self) -> Option<(Query, Option<Reply>)> {
+        let Request { query, kind } = lock(&self.queue).requests.pop_front()?;
+        let outcome = catch_unwind(AssertUnwindSafe(|| lock(&self.handler).handle(kind, &query)));
+        let reply = outcome.unwrap_or_else(|panic| {
+            let reason = panic_text(&panic);
+            tracing::error!(reason, key = %query.key_expr(), "a request panicked");
+            Some(Reply::Err(ErrorReply::new(ErrorCode::Internal, "", reason)))
+        });
+        Some((query, reply))
+    }
+
+    fn finish(self: Arc<Self>) {
+        let mut queue = lock(&self.queue);
+        queue.is_busy = !queue.requests.is_empty();
+        let is_busy = queue.is_busy;
+        drop(queue);
+        if is_busy {
+            self.executor.clone().schedule(self);
+        }
+    }
+}
+
+/// Returns the text of a panic.
+pub fn panic_text(panic: &Box<dyn std::any::Any + Send>) -> String {
+    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+    text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "panicked".to_owned())
+}
+
+/// Locks a mutex whose data a panic leaves valid.
+pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
