@@ -1,0 +1,100 @@
+//! Reasons why a model file was rejected.
+
+use std::path::PathBuf;
+
+use crate::nominal::NominalRobotError;
+use crate::{CATALOGUE, Effect, EntryError};
+
+/// Reason why a model file was rejected.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelFileError {
+    /// The file could not be read.
+    #[error("cannot read the model file {}: {source}", path.display())]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// Error of the operating system.
+        source: std::io::Error,
+    },
+    /// The text is not TOML, a key is unknown, or a value has the wrong type.
+    #[error("{name}: {message}")]
+    Malformed {
+        /// The file, or another source of the text.
+        name: String,
+        /// Problem, with line and column.
+        message: String,
+    },
+    /// The nominal robot is unknown, or its file or tables are not valid.
+    #[error("{name}: {cause}")]
+    Robot {
+        /// The file, or another source of the text.
+        name: String,
+        /// What is wrong.
+        cause: Box<NominalRobotError>,
+    },
+    /// An entry of `[[effect]]` is wrong.
+    #[error("{name}: effect {number}: {problem}")]
+    Effect {
+        /// The file, or another source of the text.
+        name: String,
+        /// Number of the entry, from 1.
+        number: usize,
+        /// Problem of the entry, and what is allowed.
+        problem: EffectEntryError,
+    },
+    /// The robot has an actuator network, but the caller needs analytic actuators.
+    #[error(
+        "{name}: `[actuator]` is for `twinstep serve` and `twinstep play`; no other command simulates actuator \
+         networks. Remove the table to use the analytic actuators with the effects of the file"
+    )]
+    ActuatorNetwork {
+        /// The file, or another source of the text.
+        name: String,
+    },
+    /// Entries cannot be combined.
+    #[error("{name}: {cause}")]
+    Conflict {
+        /// The file, or another source of the text.
+        name: String,
+        /// Conflicting entry, and the reason.
+        cause: EntryError,
+    },
+}
+
+/// Problem of an entry of a model file.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum EffectEntryError {
+    /// The catalogue has no such effect.
+    #[error("`name` = \"{given}\" is not in the catalogue; possible: {}", CATALOGUE.map(|effect| effect.name).join(", "))]
+    Unknown {
+        /// The name.
+        given: String,
+    },
+    /// A key is missing or of the wrong kind.
+    #[error("`{key}` is {found}; expected {expected}")]
+    Key {
+        /// The key.
+        key: String,
+        /// Value in the file.
+        found: String,
+        /// Expected value.
+        expected: String,
+    },
+    /// The effect does not have this key.
+    #[error("`{effect}` has no key `{key}`; possible: name, scope, interval, {}", names(effect))]
+    UnknownKey {
+        /// The effect.
+        effect: &'static str,
+        /// The key.
+        key: String,
+    },
+    /// Scope or values are not allowed.
+    #[error(transparent)]
+    Entry(#[from] EntryError),
+}
+
+/// Returns the names of an effect's parameters, separated by commas.
+fn names(effect: &str) -> String {
+    let parameters = Effect::named(effect).map_or(&[][..], |effect| effect.parameters);
+    parameters.iter().map(|parameter| parameter.name).collect::<Vec<_>>().join(", ")
+}
