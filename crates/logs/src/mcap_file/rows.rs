@@ -1,0 +1,61 @@
+//! Rows of a log from messages: each state of the robot with the command in force.
+
+use crate::go2_message::{LowCmd, LowState, MotorCmd, NO_POSITION, NO_VELOCITY};
+
+/// State with the command in force from it to the next state.
+pub(crate) struct StateWithCommand<'a> {
+    pub time: u64,
+    pub state: &'a LowState,
+    pub command: LowCmd,
+}
+
+impl StateWithCommand<'_> {
+    /// Replaces the robot's special values (no position, no velocity, stopped motor) by gains of 0.
+    ///
+    /// Returns the number of motor commands without a position or with a stopped motor.
+    pub fn normalise_stop_commands(&mut self) -> usize {
+        let mut stops = 0;
+        for (command, state) in self.command.motors.iter_mut().zip(&self.state.motors) {
+            if command.mode == 0 {
+                *command = MotorCmd { mode: 0, q: state.q, ..MotorCmd::default() };
+                stops += 1;
+            }
+            if command.q >= NO_POSITION {
+                (command.q, command.kp) = (state.q, 0.0);
+                stops += 1;
+            }
+            if command.dq == NO_VELOCITY {
+                (command.dq, command.kd) = (0.0, 0.0);
+            }
+        }
+        stops
+    }
+}
+
+/// Returns the median time between states [ns]; zero for a single state.
+pub(crate) fn median_step(states: &[(u64, LowState)]) -> u64 {
+    let mut steps: Vec<u64> = states.windows(2).map(|pair| pair[1].0 - pair[0].0).collect();
+    steps.sort_unstable();
+    steps.get(steps.len() / 2).copied().unwrap_or(0)
+}
+
+/// Returns for each state the index of the command in force midway between it and the next state.
+///
+/// A controller's command arrives shortly after the state that it responds to, and is in force for most of the
+/// interval. `median` is the median time between states [ns].
+pub(crate) fn commands_in_force(
+    states: &[(u64, LowState)],
+    commands: &[(u64, LowCmd)],
+    median: u64,
+) -> Vec<Option<usize>> {
+    let mut next = 0;
+    let in_force = |(row, (time, _)): (usize, &(u64, LowState))| {
+        let step = states.get(row + 1).map_or(median, |(later, _)| later - time);
+        let middle = time + step.min(median) / 2;
+        while commands.get(next).is_some_and(|(time, _)| *time <= middle) {
+            next += 1;
+        }
+        next.checked_sub(1)
+    };
+    states.iter().enumerate().map(in_force).collect()
+}
