@@ -1,0 +1,121 @@
+//! Torque and friction at the joints, once per physics step: torque delay, back-EMF, dead zone, lag, gain, ripple, gear,
+//! friction and spring.
+
+use super::SimdActuators;
+use super::coefficients::Coefficients;
+use twinstep_simd::{SimdFloat, exponential};
+
+/// Integration steps of a rotor with an elastic gear per physics step.
+const GEAR_SUBSTEPS: usize = 8;
+
+/// Torque and friction at the joints in one physics step.
+#[derive(Clone, Copy, Debug)]
+pub struct JointForces<T> {
+    /// Torque [N·m].
+    pub tau: [T; 12],
+    /// Coefficient of viscous friction [N·m·s/rad].
+    pub damping: [T; 12],
+    /// Maximum torque of dry friction [N·m].
+    pub dry_friction: [T; 12],
+}
+
+impl<T: SimdFloat> SimdActuators<T> {
+    /// Advances the actuators by physics step `index` of the actuator period and returns torque and friction.
+    ///
+    /// `q` [rad] and `dq` [rad/s] are the joint positions and velocities.
+    #[inline(always)]
+    pub fn step(&mut self, index: usize, q: &[T; 12], dq: &[T; 12]) -> JointForces<T> {
+        let active = self.active;
+        let input = if active.torque_delay { self.delayed_torque(index) } else { self.state.torque_history[0] };
+        let (zero, one) = (T::splat(0.0), T::splat(1.0));
+        let mut forces = JointForces { tau: [zero; 12], damping: [zero; 12], dry_friction: [zero; 12] };
+        for joint in 0..12 {
+            let n = &self.coefficients[joint];
+            // Back-EMF and ripple depend on the rotor, whose motion differs from the link's if the gear is elastic.
+            let rotor_q = zero.select_lt(n.gear, self.state.rotor[0][joint], q[joint]);
+            let rotor_dq = zero.select_lt(n.gear, self.state.rotor[1][joint], dq[joint]);
+            let mut tau = input[joint];
+            if active.back_emf {
+                let (limit, share) = (n.torque_limit, rotor_dq * n.back_emf);
+                let forth = limit * (one - share).max(zero).min(one);
+                let back = limit * (one + share).max(zero).min(one);
+                tau = forth.min(tau.max(-back));
+            }
+            if active.dead_zone {
+                let size = (tau.abs() - n.dead_zone).max(zero);
+                // Robots without a dead zone keep the bits of their torque.
+                tau = zero.select_lt(n.dead_zone, tau.select_lt(zero, -size, size), tau);
+            }
+            let (current, input) = (&mut self.state.current[joint], tau);
+            self.estimated_torque[joint] = input + n.lag_mean * (*current - input);
+            *current += n.lag * (input - *current);
+            tau = n.gain * self.estimated_torque[joint];
+            if active.ripple {
+                let (sin, _) = (n.ripple_cycles * rotor_q + n.ripple_phase).sin_cos();
+                tau += n.ripple_amplitude * sin;
+            }
+            (forces.damping[joint], forces.dry_friction[joint]) = (n.viscous, n.coulomb);
+            if active.speed_friction {
+                let speed = dq[joint] * n.inv_stribeck_velocity;
+                forces.dry_friction[joint] += n.breakaway * exponential(-(speed * speed)) + n.load * tau.abs();
+            }
+            forces.tau[joint] = tau;
+        }
+        if active.elastic {
+            self.integrate_gear(&mut forces.tau, q, dq);
+        }
+        if active.spring {
+            for joint in 0..12 {
+                let n = &self.coefficients[joint];
+                forces.tau[joint] += n.spring_offset - n.spring * q[joint];
+            }
+        }
+        forces
+    }
+
+    /// Returns the mean of the delayed torque over physics step `index` [N·m].
+    #[inline(always)]
+    fn delayed_torque(&self, index: usize) -> [T; 12] {
+        let (zero, one) = (T::splat(0.0), T::splat(1.0));
+        let start = self.step_fraction * T::splat(index as f64);
+        let mut delayed = [zero; 12];
+        for joint in 0..12 {
+            let from = start - self.coefficients[joint].torque_delay;
+            let to = from + self.step_fraction;
+            for (age, torque) in self.state.torque_history.iter().enumerate() {
+                let period = T::splat(-(age as f64));
+                let shared = (to.min(period + one) - from.max(period)).max(zero);
+                delayed[joint] += shared / self.step_fraction * torque[joint];
+            }
+            // Without delay the exact value, so that the result does not depend on the other lanes.
+            delayed[joint] = zero.select_lt(
+                self.coefficients[joint].torque_delay,
+                delayed[joint],
+                self.state.torque_history[0][joint],
+            );
+        }
+        delayed
+    }
+
+    /// Integrates the rotors of elastic gears in substeps with constant link velocities.
+    ///
+    /// Replaces `tau` by the mean torque that the gear transmits to the link [N·m].
+    #[inline(always)]
+    fn integrate_gear(&mut self, tau: &mut [T; 12], q: &[T; 12], dq: &[T; 12]) {
+        let (zero, dt) = (T::splat(0.0), T::splat(self.dt / GEAR_SUBSTEPS as f64));
+        let [angle, speed] = &mut self.state.rotor;
+        for joint in 0..12 {
+            let Coefficients { half_backlash, gear: stiffness, rotor, .. } = self.coefficients[joint];
+            let (mut link, mut mean) = (q[joint], zero);
+            for _ in 0..GEAR_SUBSTEPS {
+                let twist = angle[joint] - link;
+                let transmitted = stiffness * ((twist - half_backlash).max(zero) + (twist + half_backlash).min(zero));
+                speed[joint] += dt * (tau[joint] - transmitted) / rotor;
+                angle[joint] += dt * speed[joint];
+                link += dt * dq[joint];
+                mean += transmitted * T::splat(1.0 / GEAR_SUBSTEPS as f64);
+            }
+            tau[joint] = zero.select_lt(stiffness, mean, tau[joint]);
+        }
+    }
+}
