@@ -1,0 +1,219 @@
+//! One Go2 in a rapier world of its own: actuation and readout.
+//!
+//! - [`construction`]: the world with the robot in its initial state.
+//! - [`snapshot`]: saves and restores the state.
+//!
+//! A legged robot in rapier 0.36 needs these corrections. Each is covered by a test in `tests/it/physics.rs`:
+//!
+//! - *Default damping.* A multibody joint damps its angular axes by 0.1 N·m·s, those of the floating root included.
+//!   The damping is set to zero.
+//! - *Root frame.* A floating root whose centre of mass is not at its origin drifts in flight, because rapier moves the
+//!   origin with the velocity of the centre of mass. The frame of the root body is therefore at the trunk's centre of
+//!   mass, and anchors and shapes are shifted.
+//! - *Torque.* rapier has no generalised forces. A spring of low stiffness (k = 1 mN·m/rad) with the rest position
+//!   `q + τ/k` applies the torque without world-frame sums, and keeps it over the physics steps.
+//! - *Reset.* Contact caches and joint coordinates survive an in-place reset. A reset therefore builds a new world
+//!   (31 µs), which cannot depend on the previous state.
+
+mod construction;
+mod snapshot;
+
+use glam::{Quat, Vec3};
+use rapier3d::prelude::*;
+use twinstep_model::{
+    Command, NUM_JOINTS, PerJoint, PerLeg,
+    dynamics::{JointForces, SimdActuators, SimdCommands},
+    frames,
+};
+
+pub use snapshot::WorldSnapshot;
+
+/// Stiffness of the spring that applies a joint torque [N·m/rad].
+const TORQUE_SPRING: f32 = 1e-3;
+/// Index of a revolute joint's axis in rapier's six-axis layout.
+const REVOLUTE_AXIS: usize = 3;
+
+/// World with one robot and the ground.
+pub struct RobotWorld {
+    world: PhysicsWorld,
+    trunk: RigidBodyHandle,
+    multibody: MultibodyJointHandle,
+    /// Centre of mass of the trunk in the base frame [m].
+    trunk_com: Vec3,
+    /// Degrees of freedom of the root: 6, or 0 with a fixed base.
+    root_dofs: usize,
+    feet: [ColliderHandle; 4],
+    upper_body: Vec<ColliderHandle>,
+    actuator: SimdActuators<f64>,
+    /// Gyroscope bias [rad/s].
+    gyro_bias: Vec3,
+}
+
+/// Input of the actuators of one robot.
+#[derive(Clone, Copy)]
+pub enum ActuatorInputRef<'a> {
+    /// A command to the actuators of the robot model.
+    Command(&'a Command),
+    /// Joint torques of an external actuator [N·m].
+    Torques(&'a PerJoint),
+}
+
+impl RobotWorld {
+    /// Sets the factors on the torque for supply voltage and motor temperature.
+    pub fn set_derating(&mut self, factors: &PerJoint) {
+        self.actuator.set_derating(0, factors);
+    }
+
+    /// Advances by one actuator period of `steps` physics steps and returns the mean estimated torque [N·m].
+    pub fn actuator_period(&mut self, input: ActuatorInputRef, steps: usize) -> PerJoint {
+        let (mut q, mut dq) = self.joints();
+        match input {
+            ActuatorInputRef::Command(command) => {
+                self.actuator.update_command(&SimdCommands::new(std::slice::from_ref(command)), &q, &dq);
+            }
+            ActuatorInputRef::Torques(tau) => self.actuator.set_torque(tau.map(f64::from)),
+        }
+        let mut estimated = [0.0; NUM_JOINTS];
+        for index in 0..steps {
+            let JointForces { tau, dry_friction: dry, .. } = self.actuator.step(index, &q, &dq);
+            let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
+            for (joint, link) in multibody.links_mut().skip(1).enumerate() {
+                let position = link.joint().coords()[REVOLUTE_AXIS];
+                link.joint.set_spring(REVOLUTE_AXIS, TORQUE_SPRING, position + tau[joint] as f32 / TORQUE_SPRING);
+            }
+            for (joint, dry) in dry.into_iter().enumerate() {
+                multibody.frictions_mut()[self.root_dofs + joint] = dry as f32;
+            }
+            self.world.step();
+            (q, dq) = self.joints();
+            for (estimated, current) in estimated.iter_mut().zip(self.actuator.estimated_torque()) {
+                *estimated += current / steps as f64;
+            }
+        }
+        estimated.map(|tau| tau as f32)
+    }
+
+    /// Returns the positions [rad] and velocities [rad/s] of the joints.
+    fn joints(&self) -> ([f64; NUM_JOINTS], [f64; NUM_JOINTS]) {
+        let (multibody, _) = self.world.multibody_joints.get(self.multibody).expect("built with the world");
+        let (mut q, mut dq) = ([0.0; NUM_JOINTS], [0.0; NUM_JOINTS]);
+        let velocities = multibody.generalized_velocity();
+        for (joint, link) in multibody.links().skip(1).enumerate() {
+            q[joint] = f64::from(link.joint().coords()[REVOLUTE_AXIS]);
+            dq[joint] = f64::from(velocities[self.root_dofs + joint]);
+        }
+        (q, dq)
+    }
+
+    /// Returns true if a number became NaN or infinite in the last step. rapier then quarantines the body.
+    pub fn diverged(&self) -> bool {
+        !self.world.quarantine().bodies().is_empty() || !self.world.quarantine().colliders().is_empty()
+    }
+
+    /// Reads the encoders: positions [rad] and velocities [rad/s].
+    pub fn read_joints(&self, q: &mut PerJoint, dq: &mut PerJoint) {
+        let (positions, velocities) = self.joints();
+        for joint in 0..NUM_JOINTS {
+            let (encoder_q, encoder_dq) = self.actuator.encoder_reading(joint, positions[joint], velocities[joint]);
+            (q[joint], dq[joint]) = (encoder_q as f32, encoder_dq as f32);
+        }
+    }
+
+    /// Returns the pose and the velocity of the base frame.
+    ///
+    /// The velocity is that of the joint coordinates, because the trunk body's velocity is delayed by one physics step.
+    pub fn read_base(&self) -> BaseState {
+        let trunk = &self.world.bodies[self.trunk];
+        let rotation = Quat::from_array(trunk.position().rotation.to_array());
+        let offset_world = rotation * self.trunk_com;
+        let (linear_com, angular_world) = self.root_velocity();
+        BaseState {
+            position: (trunk.translation() - offset_world).to_array(),
+            orientation: frames::to_wxyz(rotation),
+            linear_velocity: (linear_com - angular_world.cross(offset_world)).to_array(),
+            angular_velocity: (rotation.inverse() * angular_world).to_array(),
+            gyro: (rotation.inverse() * angular_world + self.gyro_bias).to_array(),
+        }
+    }
+
+    /// Returns the velocity of the trunk's centre of mass [m/s] and its angular velocity [rad/s], in the world frame.
+    fn root_velocity(&self) -> (Vec3, Vec3) {
+        if self.root_dofs == 0 {
+            return (Vec3::ZERO, Vec3::ZERO);
+        }
+        let (multibody, _) = self.world.multibody_joints.get(self.multibody).expect("built with the world");
+        let velocity = multibody.generalized_velocity();
+        (Vec3::new(velocity[0], velocity[1], velocity[2]), Vec3::new(velocity[3], velocity[4], velocity[5]))
+    }
+
+    /// Returns the normal force on each foot, mean over the last physics step [N].
+    pub fn foot_forces(&self) -> PerLeg {
+        self.feet.map(|foot| self.normal_impulse(foot) / self.world.integration_parameters.dt)
+    }
+
+    /// Returns true if the trunk or a thigh touches the ground.
+    pub fn body_contact(&self) -> bool {
+        self.upper_body.iter().any(|shape| self.normal_impulse(*shape) > 0.0)
+    }
+
+    fn normal_impulse(&self, shape: ColliderHandle) -> f32 {
+        self.world.narrow_phase.contact_pairs_with(shape).map(ContactPair::total_impulse_magnitude).sum()
+    }
+}
+
+/// Pose and velocity of the base frame, as in [`twinstep_model::RobotStates`].
+pub struct BaseState {
+    /// Position of the origin in the world frame [m].
+    pub position: [f32; 3],
+    /// World-from-base, `[w, x, y, z]`.
+    pub orientation: [f32; 4],
+    /// Velocity of the origin in the world frame [m/s].
+    pub linear_velocity: [f32; 3],
+    /// Angular velocity in the base frame [rad/s].
+    pub angular_velocity: [f32; 3],
+    /// Reading of the gyroscope: angular velocity with bias, in the base frame [rad/s].
+    pub gyro: [f32; 3],
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f32::consts::TAU;
+
+    use twinstep_model::{Ground, InitialState, body_poses, go2};
+
+    use super::*;
+    use crate::SimConfig;
+    use crate::ground_shapes::GroundShapes;
+
+    /// Rendering uses the forward kinematics of the model, so they must agree with the engine.
+    #[test]
+    fn body_poses_agree_with_the_forward_kinematics() {
+        let robot = go2();
+        let q = std::array::from_fn(|j| robot.control.default_pose[j] as f32 + 0.2 * (j as f32).sin());
+        let tilted = Quat::from_euler(glam::EulerRot::ZYX, 0.1 * TAU, 0.05 * TAU, -0.03 * TAU);
+        let initial_state = InitialState { base_orientation: frames::to_wxyz(tilted), ..InitialState::at_rest(0.6, q) };
+        let mut world =
+            RobotWorld::new(&robot, &SimConfig::default(), &GroundShapes::new(&Ground::FLAT), &initial_state);
+        for steps in [0, 40] {
+            world.actuator_period(ActuatorInputRef::Torques(&std::array::from_fn(|j| (j as f32).cos())), steps);
+            let (mut q, mut dq) = (PerJoint::default(), PerJoint::default());
+            world.read_joints(&mut q, &mut dq);
+            let base = world.read_base();
+            let world_from_base = twinstep_model::Pose {
+                position: Vec3::from(base.position),
+                rotation: frames::world_from_base(base.orientation),
+            };
+            let (multibody, _) = world.world.multibody_joints.get(world.multibody).expect("built with the world");
+            let expected = body_poses(&robot, world_from_base, &q);
+            for (link, expected) in multibody.links().skip(1).zip(&expected[1..]) {
+                let body = &world.world.bodies[link.rigid_body_handle()];
+                assert!((body.translation() - expected.position).length() < 1e-5, "after {steps} steps");
+                let rotation = Quat::from_array(body.position().rotation.to_array());
+                // Compares axes, because the arc cosine of nearly 1 loses half the digits.
+                for axis in [Vec3::X, Vec3::Y, Vec3::Z] {
+                    assert!((rotation * axis - expected.rotation * axis).length() < 1e-4, "after {steps} steps");
+                }
+            }
+        }
+    }
+}
