@@ -1,0 +1,132 @@
+//! Experiment: windows of a log that are simulated from measured states, and the channels that are compared.
+//!
+//! - [`channel`]: the channels that are compared, and their noise.
+//! - [`residuals`]: simulation of the windows, and comparison with the log.
+//! - [`residual_index`]: channel and row, window, group and block of each residual.
+
+mod channel;
+mod residual_index;
+mod residuals;
+
+use glam::DQuat;
+use twinstep_logs::Log;
+use twinstep_logs::operating_conditions::OperatingConditions;
+use twinstep_logs::replay::{at_log_rate, joint_commands};
+use twinstep_model::{Joint, RobotModel};
+
+pub use channel::ResidualChannel;
+pub use residuals::estimated_torque;
+
+use crate::error::ExperimentError;
+use crate::window::{Window, WindowConfig, orientation, windows};
+use channel::{Channel, channels};
+
+/// Length of a block [s]; residuals of different blocks are treated as independent.
+const BLOCK_S: f64 = 0.5;
+
+/// Log split into windows.
+#[derive(Clone, Debug)]
+pub struct Experiment {
+    windows: Vec<Window>,
+    channels: Vec<Channel>,
+    /// Rate at which the actuators are replayed [Hz].
+    actuator_hz: f64,
+    /// Measured orientations by row; empty without a floating base.
+    orientations: Vec<DQuat>,
+    /// Joints of the log.
+    joints: Vec<Joint>,
+    /// Number of rows in a block.
+    rows_per_block: usize,
+    conditions: OperatingConditions,
+}
+
+impl Experiment {
+    /// Creates an experiment from `log`, for robots with the gains and rates of `robot`.
+    pub fn new(log: &Log, robot: &RobotModel, horizon: WindowConfig) -> Result<Self, ExperimentError> {
+        let joints: Vec<_> = joint_commands(log)?.iter().map(|joint| joint.joint).collect();
+        let robot = &at_log_rate(log, robot)?;
+        let windows = windows(log, robot, horizon)?;
+        let floating = windows.iter().any(|window| !window.base.is_fixed());
+        let orientations =
+            if floating { (0..log.rows()).map(|row| orientation(log, row)).collect() } else { Vec::new() };
+        Ok(Self {
+            actuator_hz: robot.control.actuator_hz,
+            windows,
+            channels: channels(log, &joints),
+            orientations,
+            joints,
+            rows_per_block: ((BLOCK_S * log.meta().rate_hz).round() as usize).max(1),
+            conditions: OperatingConditions::of(log),
+        })
+    }
+
+    /// Returns the joints of the log.
+    pub fn joints(&self) -> &[Joint] {
+        &self.joints
+    }
+
+    /// Returns the experiment restricted to the rows that `keep` selects.
+    #[must_use]
+    pub fn filter_rows(mut self, keep: impl Fn(usize) -> bool) -> Self {
+        for channel in &mut self.channels {
+            for (row, cell) in channel.measured.iter_mut().enumerate() {
+                if !keep(row) {
+                    *cell = f64::NAN;
+                }
+            }
+        }
+        for window in &mut self.windows {
+            // Rows after the last selected one are not simulated.
+            let last = window.rows.clone().rev().find(|row| keep(*row)).unwrap_or(window.rows.start);
+            let count = last + 1 - window.rows.start;
+            window.rows.end = last + 1;
+            window.period.truncate(count);
+            window.commands.truncate(window.period[count - 1] + 1);
+        }
+        self.windows.retain(|window| window.rows.len() > 1);
+        self
+    }
+
+    /// Returns the experiment restricted to windows with a fixed base, if there are any.
+    #[must_use]
+    pub fn prefer_fixed_base(mut self) -> Self {
+        if self.windows.iter().any(|window| window.base.is_fixed()) {
+            self.windows.retain(|window| window.base.is_fixed());
+        }
+        self
+    }
+
+    /// Returns true if a window has a floating base.
+    pub fn has_floating_base(&self) -> bool {
+        self.windows.iter().any(|window| !window.base.is_fixed())
+    }
+
+    /// Dimension of a floating base's initial state: position, orientation, velocity, angular velocity.
+    pub const INITIAL_STATE_DIM: usize = 12;
+
+    /// Returns the experiment with one component of every initial base state perturbed.
+    ///
+    /// The perturbation is `size` standard deviations of the smoothed measurement.
+    pub fn with_perturbed_start(&self, number: usize, size: f64) -> Self {
+        let (of_axis, axis) = (number / 3, number % 3);
+        let quantity = [
+            ResidualChannel::BasePosition,
+            ResidualChannel::BaseOrientation,
+            ResidualChannel::BaseVelocity,
+            ResidualChannel::BaseRate,
+        ][of_axis];
+        // The variance of a parabola fit through n cells within 20 ms is 9 / 4n of a cell's variance at the midpoint.
+        let cells = 1.0 + 0.04 * self.rows_per_block as f64 / BLOCK_S;
+        let error = size * (2.25 / cells).sqrt().min(1.0) * self.sigma(quantity(axis));
+        let mut perturbed = self.clone();
+        for window in perturbed.windows.iter_mut().filter(|window| !window.base.is_fixed()) {
+            window.perturb_start(of_axis, axis, error);
+        }
+        perturbed
+    }
+
+    /// Returns the standard deviation of a channel's noise, in the channel's unit; 1 if it is not compared.
+    pub fn sigma(&self, quantity: ResidualChannel) -> f64 {
+        self.channels.iter().find(|channel| channel.quantity == quantity).map_or(1.0, |channel| channel.sigma)
+    }
+}
