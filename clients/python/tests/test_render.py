@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from twinstep.render import Viewer, _HeightField, _intersect_field  # pyright: ignore[reportPrivateUsage]
+from twinstep.render import Viewer
+from twinstep.render.height_field import HeightField, intersect_field
 
 GOLDEN = Path(__file__).parents[3] / "protocol" / "golden"
 
@@ -100,14 +101,14 @@ def test_level_field_looks_like_the_plane() -> None:
 def test_rays_hit_an_inclined_field_like_the_plane() -> None:
     angle = 0.2
     x = np.linspace(-10.0, 10.0, 81, dtype=np.float32) * np.float32(np.tan(angle))
-    rising = _HeightField.read(field(np.repeat(x[:, None], 81, axis=1), 0.25))
+    rising = HeightField.read(field(np.repeat(x[:, None], 81, axis=1), 0.25))
     across, along = np.meshgrid(np.linspace(-1, 1, 161), np.linspace(-1, 1, 121))
     rays = np.stack([across, along, np.full_like(across, -1)], axis=2).astype(np.float32)
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     start = np.array([0.5, -0.5, 1.0], dtype=np.float32)
     normal = np.array([-np.sin(angle), 0.0, np.cos(angle)], dtype=np.float32)
     expected = -(start @ normal) / (rays @ normal)
-    assert np.allclose(_intersect_field(rising, start, rays), expected, atol=1e-3)
+    assert np.allclose(intersect_field(rising, start, rays), expected, atol=1e-3)
 
 
 def test_height_field_is_drawn_and_hides_the_robot() -> None:
