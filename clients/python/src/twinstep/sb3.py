@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .env import OptionArguments, RenderMode
 from .errors import InvalidOptionError
+from .sub_env import SubEnvView
 from .vector_env import Go2VectorEnv
 
 try:
@@ -75,8 +76,6 @@ class Go2VecEnv(VecEnv):
             raise InvalidOptionError(f"`autoreset_mode` = {mode.value!r}; Stable-Baselines3 needs 'SameStep'")
         self.envs = envs
         self.twinstep_spec = envs.twinstep_spec
-        # Before the base class, which reads the `render_mode` of each row.
-        self._rows = [SubEnvView(envs, index) for index in range(envs.num_envs)]
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
         # VecVideoRecorder reads the frame rate here.
         self.metadata = {**envs.metadata, **self.metadata}
@@ -150,10 +149,7 @@ class Go2VecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of :class:`SubEnvView`, or ``render``, on each of the environments ``indices``."""
-        if method_name == "render":
-            drawn = self.envs.render_mode == "rgb_array"
-            return [self.envs.draw(row.index) if drawn else None for row in self._sub_envs(indices)]
+        """Call a method of :class:`SubEnvView` on each of the environments ``indices``."""
         return [getattr(row, method_name)(*method_args, **method_kwargs) for row in self._sub_envs(indices)]
 
     def env_is_wrapped(
@@ -162,57 +158,8 @@ class Go2VecEnv(VecEnv):
         """Return ``False`` for each of the environments ``indices``: they have no wrappers."""
         return [False for _ in self._sub_envs(indices)]
 
-    def _sub_envs(self, indices: Indices) -> "list[SubEnvView]":
-        return [self._rows[index] for index in self._get_indices(indices)]
-
-
-class SubEnvView:
-    """View of one robot, for ``get_attr``, ``set_attr`` and ``env_method``.
-
-    Attributes
-    ----------
-    index
-        Row of the robot in every array.
-    spec, twinstep_spec, render_mode, metadata, observation_space, action_space
-        Same as in a single environment.
-    """
-
-    def __init__(self, envs: Go2VectorEnv, index: int) -> None:
-        shared: dict[str, object] = {
-            "spec": envs.spec,
-            "twinstep_spec": envs.twinstep_spec,
-            "render_mode": envs.render_mode,
-            "metadata": envs.metadata,
-            "observation_space": envs.single_observation_space,
-            "action_space": envs.single_action_space,
-        }
-        self.index = index
-        self._envs = envs
-        self.__dict__.update(shared)
-        self._fixed = frozenset(shared)
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if name in self.__dict__.get("_fixed", ()):
-            raise AttributeError(
-                f"`{name}` is the same for all robots and cannot be set; create new environments with it"
-            )
-        super().__setattr__(name, value)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode of this robot. The episodes of the others continue.
-
-        Returns
-        -------
-        obs : (45,) float32
-        info : dict
-            Empty.
-        """
-        mask = np.arange(self._envs.num_envs) == self.index
-        seeds = None if seed is None else np.where(mask, seed, 0).tolist()
-        obs, info = self._envs.reset(seed=seeds, options={**(options or {}), "reset_mask": mask})
-        return obs[self.index], info
+    def _sub_envs(self, indices: Indices) -> list[SubEnvView]:
+        return [self.envs.sub_env(index) for index in self._get_indices(indices)]
 
 
 def _info_of(vector_info: dict[str, Any], env: int) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Gymnasium vector environment of many robots, which one message steps."""
 
 from collections.abc import Sequence
-from typing import Any, Unpack
+from typing import Any, Unpack, cast
 
 import gymnasium
 import numpy as np
@@ -14,6 +14,7 @@ from .errors import InvalidOptionError
 from .remote import ConnectOptions, RemoteVecEnv, StepBatch
 from .render import Viewer
 from .spaces import action_space, observation_space
+from .sub_env import SubEnvView
 
 StepResult = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
@@ -63,6 +64,7 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         self.single_action_space = action_space(self._remote.spec)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
+        self._attributes: list[dict[str, Any]] = [{} for _ in range(num_envs)]
 
     def reset(
         self,
@@ -138,6 +140,47 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
             self._show()
             return None
         return tuple(self.draw(env) for env in range(self.num_envs))
+
+    def sub_env(self, index: int) -> SubEnvView:
+        """Return a view of one robot, which has the attributes and methods of :meth:`call`."""
+        return SubEnvView(self, index, self._attributes[index])
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call a method of every robot, or return an attribute: one value per robot, as in ``SyncVectorEnv``.
+
+        Parameters
+        ----------
+        name
+            Name in :class:`twinstep.sub_env.SubEnvView`: ``render``, ``reset``, ``spec``, ``metadata``, ….
+
+        Raises
+        ------
+        AttributeError
+            There is no such method or attribute; the message contains the names that exist.
+        """
+        # All are looked up before the first is called.
+        found = [getattr(self.sub_env(index), name) for index in range(self.num_envs)]
+        return tuple(one(*args, **kwargs) if callable(one) else one for one in found)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return an attribute of every robot, see :meth:`call`."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of every robot in this process; the server does not read it.
+
+        Parameters
+        ----------
+        name
+            Name of the attribute. Attributes that come from the server cannot be set.
+        values
+            A list or tuple with one value per robot, or one value for all.
+        """
+        given = cast(Sequence[Any], values if isinstance(values, list | tuple) else [values] * self.num_envs)
+        if len(given) != self.num_envs:
+            raise InvalidOptionError(f"`values` has {len(given)} entries; {self.num_envs} are expected")
+        for index, value in enumerate(given):
+            setattr(self.sub_env(index), name, value)
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the lease and close the window."""
