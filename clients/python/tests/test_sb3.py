@@ -49,6 +49,19 @@ def test_rows_equal_those_of_the_gymnasium_environment() -> None:
     envs.close()
 
 
+def test_privileged_observations_are_in_the_infos_with_the_option_critic() -> None:
+    envs = make_vec_env(n_envs=2, seed=1, critic=True, max_episode_steps=2)
+    envs.reset()
+    assert envs.reset_infos[0]["critic_obs"].shape == (11,)
+    envs.step(ACTIONS[:2])
+    *_, done, infos = envs.step(ACTIONS[:2])
+    assert done.all()
+    assert infos[1]["critic_obs"].shape == infos[1]["terminal_critic_obs"].shape == (11,)
+    assert (infos[1]["critic_obs"] != infos[1]["terminal_critic_obs"]).any()
+    np.testing.assert_array_equal(infos[1]["critic_obs"], envs.reset_infos[1]["critic_obs"])
+    envs.close()
+
+
 def test_a_seed_is_used_by_one_reset() -> None:
     envs = make_vec_env(n_envs=3)
     assert envs.seed(7) == [7, 8, 9]

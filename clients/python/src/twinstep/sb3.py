@@ -88,9 +88,9 @@ class Go2VecEnv(VecEnv):
         obs : (n_envs, 45) float32
         """
         seeds = [seed for seed in self._seeds if seed is not None]
-        obs, _ = self.envs.reset(seed=seeds or None)
+        obs, infos = self.envs.reset(seed=seeds or None)
         self._reset_seeds()
-        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self.reset_infos = [_critic_info(infos, env) for env in range(self.num_envs)]
         return obs
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
@@ -108,18 +108,22 @@ class Go2VecEnv(VecEnv):
         done : (n_envs,) bool
         infos : list of dict
             ``TimeLimit.truncated``. Where an episode ended also ``terminal_observation`` and ``reward_terms``, the sum
-            of each weighted reward term over the episode.
+            of each weighted reward term over the episode. With the option ``critic``: ``critic_obs``, (critic_len,)
+            float32, and where an episode ended ``terminal_critic_obs``.
         """
         obs, reward, terminated, truncated, vector_info = self.envs.recv()
         done = terminated | truncated
-        infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
-        for env in np.flatnonzero(done):
-            infos[env] = {
+        infos = [{"TimeLimit.truncated": False, **_critic_info(vector_info, env)} for env in range(self.num_envs)]
+        for env in map(int, np.flatnonzero(done)):
+            self.reset_infos[env] = _critic_info(vector_info, env)
+            final = _info_of(vector_info["final_info"], env)
+            if "critic_obs" in final:
+                final["terminal_critic_obs"] = final.pop("critic_obs")
+            infos[env] |= {
                 "TimeLimit.truncated": bool(truncated[env] and not terminated[env]),
                 "terminal_observation": vector_info["final_obs"][env],
-                **_info_of(vector_info["final_info"], int(env)),
+                **final,
             }
-            self.reset_infos[env] = {}
         return obs, reward.astype(np.float32), done, infos
 
     def close(self) -> None:
@@ -162,11 +166,19 @@ class Go2VecEnv(VecEnv):
         return [self.envs.sub_env(index) for index in self._get_indices(indices)]
 
 
+def _critic_info(vector_info: dict[str, Any], env: int) -> dict[str, Any]:
+    """Return the privileged observation of one environment; empty without the option ``critic``."""
+    return {"critic_obs": vector_info["critic_obs"][env]} if "critic_obs" in vector_info else {}
+
+
 def _info_of(vector_info: dict[str, Any], env: int) -> dict[str, Any]:
     """Return the info of one environment from those of all: each ``key`` has a mask ``_key``."""
     info: dict[str, Any] = {}
     for key, values in vector_info.items():
-        if not key.startswith("_") and vector_info[f"_{key}"][env]:
-            nested = isinstance(values, dict)
-            info[key] = _info_of(cast(dict[str, Any], values), env) if nested else values[env].item()
+        if key.startswith("_") or not vector_info[f"_{key}"][env]:
+            continue
+        if isinstance(values, dict):
+            info[key] = _info_of(cast(dict[str, Any], values), env)
+        else:
+            info[key] = values[env] if np.ndim(values[env]) else values[env].item()
     return info
