@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 
 import twinstep
 from twinstep import Go2Env, Go2VectorEnv
+from twinstep.remote import RemoteVecEnv
 
 
 @pytest.fixture
@@ -56,6 +57,47 @@ def test_a_sequence_of_seeds_sets_each_environment() -> None:
     with pytest.raises(twinstep.InvalidOptionError, match="`seed` has 1 entries; 2 are expected"):
         envs.reset(seed=[3])
     envs.close()
+
+
+def test_an_environment_without_a_seed_continues_its_random_stream() -> None:
+    envs = Go2VectorEnv(3)
+    envs.reset(seed=[1, 2, 3])
+    continued, _ = envs.reset()
+    fresh, _ = envs.reset(seed=[7, 8, 9])
+    envs.reset(seed=[1, 2, 3])
+    mixed, _ = envs.reset(seed=[7, None, 9])
+    np.testing.assert_array_equal(mixed, [fresh[0], continued[1], fresh[2]])
+    envs.reset(seed=[1, 2, 3])
+    masked, _ = envs.reset(seed=[7, None, 9], options={"reset_mask": np.array([False, True, True])})
+    np.testing.assert_array_equal(masked[1:], mixed[1:])
+    envs.close()
+
+
+def test_seeds_with_none_reset_each_environment_once(counters: Go2VectorEnv) -> None:
+    for seed in ([1, None, 3], [None, None, None], [None, 0, None]):
+        before, _ = counters.reset()
+        obs, _ = counters.reset(seed=seed)
+        np.testing.assert_array_equal(obs[:, 1], before[:, 1] + 1)
+
+
+def test_an_incomplete_reset_blocks_steps_until_a_complete_one(
+    counters: Go2VectorEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    send = RemoteVecEnv._send
+
+    def fails_without_seeds(self: RemoteVecEnv, method: str, request: dict[str, object]) -> None:
+        if "seeds" not in request:
+            raise twinstep.NoServerError("the Zenoh session is closed")
+        send(self, method, request)
+
+    monkeypatch.setattr(RemoteVecEnv, "_send", fails_without_seeds)
+    with pytest.raises(twinstep.NoServerError):
+        counters.reset(seed=[1, None, 3])
+    monkeypatch.undo()
+    with pytest.raises(twinstep.Error, match="only the environments with a seed were reset"):
+        counters.step(np.zeros((3, 12), np.float32))
+    counters.reset(seed=[1, None, 3])
+    counters.step(np.zeros((3, 12), np.float32))
 
 
 def test_privileged_observations_are_in_the_info_with_the_option_critic() -> None:

@@ -70,6 +70,8 @@ def test_a_seed_is_used_by_one_reset() -> None:
     np.testing.assert_array_equal(envs.reset(), first)
     np.testing.assert_array_equal(envs.reset(), second)
     assert not np.array_equal(first, second)
+    envs._seeds = [7, None, 9]
+    np.testing.assert_array_equal(envs.reset()[[0, 2]], first[[0, 2]])
     envs.close()
 
 

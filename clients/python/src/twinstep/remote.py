@@ -186,7 +186,12 @@ class RemoteVecEnv:
         self.critic_obs = np.zeros((self.num_envs, self.spec.critic_len), dtype=np.float32)
         """Observations of group ``critic`` after the last reset or step: (num_envs, critic_len)."""
 
-    def reset(self, seeds: NDArray[np.uint64] | None, mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+    def reset(
+        self,
+        seeds: NDArray[np.uint64] | None,
+        mask: NDArray[np.bool_] | None,
+        seeded: NDArray[np.bool_] | None = None,
+    ) -> NDArray[np.float32]:
         """Start new episodes.
 
         Parameters
@@ -195,6 +200,8 @@ class RemoteVecEnv:
             Seed of each environment. ``None``: each continues its random stream.
         mask : (num_envs,) bool, optional
             True for environments to reset. ``None``: all.
+        seeded : (num_envs,) bool, optional
+            True for environments that start from their seed; the others continue their random stream. ``None``: all.
 
         Returns
         -------
@@ -204,6 +211,20 @@ class RemoteVecEnv:
         self._resolve_abandoned_request()
         if mask is not None:
             self._check_known()
+        chosen = np.ones(self.num_envs, dtype=np.bool_) if mask is None else mask
+        unseeded = chosen & False if seeded is None else chosen & ~seeded
+        if not unseeded.any():
+            return self._reset(seeds, mask)
+        if np.array_equal(unseeded, chosen):
+            return self._reset(None, mask)
+        # One request has seeds for all of its environments or for none.
+        self._reset(seeds, chosen & ~unseeded, then_unknown="only the environments with a seed were reset")
+        return self._reset(None, unseeded)
+
+    def _reset(
+        self, seeds: NDArray[np.uint64] | None, mask: NDArray[np.bool_] | None, then_unknown: str | None = None
+    ) -> NDArray[np.float32]:
+        """Send one request. ``then_unknown`` is the reason why the state is unknown until the next one."""
         request: dict[str, object] = {}
         if seeds is not None:
             request["seeds"] = seeds.astype("<u8").tobytes()
@@ -214,7 +235,7 @@ class RemoteVecEnv:
         self._unknown = "the reply to a reset could not be read"
         self.critic_obs = self._critic(reply, "critic_obs", self.num_envs)
         obs = codec.tensor(reply, "obs", "<f4", self.num_envs, self.spec.obs_len)
-        self._unknown = None
+        self._unknown = then_unknown
         return obs
 
     def send(self, actions: NDArray[Any]) -> None:

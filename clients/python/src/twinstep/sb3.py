@@ -87,8 +87,7 @@ class Go2VecEnv(VecEnv):
         -------
         obs : (n_envs, 45) float32
         """
-        seeds = [seed for seed in self._seeds if seed is not None]
-        obs, infos = self.envs.reset(seed=seeds or None)
+        obs, infos = self.envs.reset(seed=list(self._seeds))
         self._reset_seeds()
         self.reset_infos = [_critic_info(infos, env) for env in range(self.num_envs)]
         return obs

@@ -69,7 +69,7 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
     def reset(
         self,
         *,
-        seed: int | Sequence[int] | None = None,  # pyright: ignore[reportIncompatibleMethodOverride]
+        seed: int | Sequence[int | None] | None = None,  # pyright: ignore[reportIncompatibleMethodOverride]
         options: dict[str, Any] | None = None,
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start episodes.
@@ -77,7 +77,8 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         Parameters
         ----------
         seed
-            Environment i has the seed ``seed + i``, or entry i of a sequence. ``None`` continues the random streams.
+            Environment i has the seed ``seed + i``, or entry i of a sequence. ``None`` continues the random streams,
+            as an entry that of its environment. A sequence with both sends two requests.
         options
             ``{"reset_mask": mask}``, mask (num_envs,) bool, resets only the environments where it is true.
 
@@ -90,7 +91,8 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         """
         if seed is None or isinstance(seed, int | np.integer):
             super().reset(seed=None if seed is None else int(seed))
-        obs = self._remote.reset(self._seeds(seed), self._mask(options))
+        seeds, seeded = self._seeds(seed)
+        obs = self._remote.reset(seeds, self._mask(options), seeded)
         self._show()
         return obs, self._critic_info()
 
@@ -190,16 +192,21 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         if hasattr(self, "_remote"):
             self._remote.close()
 
-    def _seeds(self, seed: int | Sequence[int] | None) -> NDArray[np.uint64] | None:
+    def _seeds(
+        self, seed: int | Sequence[int | None] | None
+    ) -> tuple[NDArray[np.uint64] | None, NDArray[np.bool_] | None]:
+        """Return the seed of each environment, and which of them have one; ``None``: none, and all."""
         if seed is None:
-            return None
+            return None, None
         if isinstance(seed, int | np.integer):
-            return (np.arange(self.num_envs, dtype=np.uint64) + np.uint64(seed)).astype(np.uint64)
+            return (np.arange(self.num_envs, dtype=np.uint64) + np.uint64(seed)).astype(np.uint64), None
         if len(seed) != self.num_envs:
             raise InvalidOptionError(f"`seed` has {len(seed)} entries; {self.num_envs} are expected")
-        if any(one < 0 for one in seed):
-            raise InvalidOptionError(f"`seed` has {min(seed)}; must be 0 or more")
-        return np.array(seed, dtype=np.uint64)
+        negative = [one for one in seed if one is not None and one < 0]
+        if negative:
+            raise InvalidOptionError(f"`seed` has {negative[0]}; must be 0 or more")
+        seeds = np.array([one or 0 for one in seed], dtype=np.uint64)
+        return seeds, np.array([one is not None for one in seed], dtype=np.bool_)
 
     def _mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_] | None:
         unknown = sorted(set(options or ()) - {"reset_mask"})
