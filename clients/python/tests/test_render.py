@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from twinstep import EmbeddedServer, Go2Env, Go2VectorEnv
 from twinstep.render import Viewer
 from twinstep.render.height_field import HeightField, intersect_field
 
@@ -148,3 +149,26 @@ def test_error_without_pygame_has_the_install_command(monkeypatch: pytest.Monkey
     with pytest.raises(ImportError, match=r'pip install "twinstep\[render\]"'):
         Viewer("human")
     assert len(Viewer("rgb_array").draw(scene())) == 480
+
+
+def test_frame_rate_is_that_of_the_policy(tmp_path: Path) -> None:
+    robots = Path(__file__).parents[3] / "data" / "robots"
+    model = tmp_path / "fast.toml"
+    model.write_text(f'robot = "{robots / "go1.urdf"}"\n[control]\npolicy_hz = 100.0\n')
+    with Go2Env() as env:
+        assert env.metadata["render_fps"] == 50
+    envs = Go2VectorEnv(1, model=str(model))
+    assert (envs.twinstep_spec.policy_dt, envs.metadata["render_fps"]) == (0.01, 100)
+    envs.close()
+
+
+def test_window_without_pygame_leaves_no_server_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise ModuleNotFoundError(name)
+
+    before = dict(EmbeddedServer._shared)  # pyright: ignore[reportPrivateUsage]
+    monkeypatch.setattr(importlib, "import_module", missing)
+    for make in (Go2Env, Go2VectorEnv):
+        with pytest.raises(ImportError, match="needs pygame"):
+            make(render_mode="human", task="counter")
+    assert before == EmbeddedServer._shared  # pyright: ignore[reportPrivateUsage]

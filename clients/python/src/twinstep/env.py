@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from .codec import Spec
 from .errors import InvalidActionError, InvalidOptionError
 from .remote import UNLIMITED, ConnectOptions, RemoteVecEnv, StepBatch
 from .render import Viewer
@@ -49,7 +50,8 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     Observation (45,) and action (12,) are float32; ``docs/go2-walk.md`` lists their entries with units and frames.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}  # noqa: RUF012
+    # `gymnasium.make` reads the modes here. An environment adds `render_fps`, the rate of its policy.
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"]}  # noqa: RUF012
 
     def __init__(
         self,
@@ -61,7 +63,6 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     ) -> None:
         checked_mode = checked_render_mode(render_mode)
         self.render_mode = checked_mode
-        self._viewer = Viewer(checked_mode) if checked_mode else None
         self._info_timing = info_timing
         self._remote = RemoteVecEnv(
             ConnectOptions(**options),
@@ -69,7 +70,9 @@ class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             autoreset="Disabled",
             max_episode_steps=UNLIMITED if max_episode_steps is None else max_episode_steps,
         )
+        self._viewer = open_viewer(checked_mode, self._remote)
         self.twinstep_spec = self._remote.spec
+        self.metadata = {**self.metadata, "render_fps": render_fps(self._remote.spec)}
         self.observation_space = observation_space(self._remote.spec)
         self.action_space = action_space(self._remote.spec)
 
@@ -170,6 +173,20 @@ def checked_render_mode(mode: str | None) -> RenderMode | None:
     if mode is None or mode == "rgb_array" or mode == "human":
         return mode
     raise InvalidOptionError(f"`render_mode` = {mode!r}; expected is 'rgb_array', 'human' or None")
+
+
+def render_fps(spec: Spec) -> int:
+    """Return the rate of the policy [Hz], at which a video of one image per step has the speed of the robot."""
+    return max(1, round(1 / spec.policy_dt))
+
+
+def open_viewer(mode: RenderMode | None, remote: RemoteVecEnv) -> Viewer | None:
+    """Return the viewer of a render mode. Ends the lease if there is none, because pygame is not installed."""
+    try:
+        return None if mode is None else Viewer(mode, fps=render_fps(remote.spec))
+    except BaseException:
+        remote.close()
+        raise
 
 
 def reward_terms(batch: StepBatch, index: int, names: tuple[str, ...]) -> dict[str, float]:

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from .env import OptionArguments, RenderMode, checked_render_mode, reward_terms
+from .env import OptionArguments, RenderMode, checked_render_mode, open_viewer, render_fps, reward_terms
 from .errors import InvalidOptionError
 from .remote import ConnectOptions, RemoteVecEnv, StepBatch
 from .render import Viewer
@@ -49,17 +49,21 @@ class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[A
         **options: Unpack[OptionArguments],
     ) -> None:
         mode = _autoreset_mode(autoreset_mode)
-        self.metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 50, "autoreset_mode": mode}
         checked_mode = checked_render_mode(render_mode)
         self.render_mode = checked_mode
-        self._viewer = Viewer(checked_mode) if checked_mode else None
         self._mode = mode
         self._info_timing = info_timing
         self._remote = RemoteVecEnv(
             ConnectOptions(**options), num_envs=num_envs, autoreset=mode.value, max_episode_steps=max_episode_steps
         )
+        self._viewer = open_viewer(checked_mode, self._remote)
         self.num_envs = num_envs
         self.twinstep_spec = self._remote.spec
+        self.metadata = {
+            "render_modes": ["rgb_array", "human"],
+            "render_fps": render_fps(self._remote.spec),
+            "autoreset_mode": mode,
+        }
         self.single_observation_space = observation_space(self._remote.spec)
         self.single_action_space = action_space(self._remote.spec)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
