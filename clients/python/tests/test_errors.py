@@ -1,13 +1,17 @@
 """Exceptions and their messages."""
 
 import os
+import re
 import signal
+import socket
 import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zenoh
+from loopback import free_endpoint
 
 import twinstep
 from twinstep import EmbeddedServer, Go2Env, Go2VectorEnv
@@ -24,12 +28,32 @@ def suspend(pid: int) -> None:
         time.sleep(0.001)
 
 
-def test_error_without_a_server_says_how_to_start_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twinstep.connection.CONNECT_TIMEOUT_S", 0.3)
+def test_error_without_a_server_says_how_to_start_one() -> None:
     with pytest.raises(twinstep.NoServerError) as error:
-        Go2Env(endpoint="tcp/127.0.0.1:9")
-    assert str(error.value).startswith("no server answers at tcp/127.0.0.1:9 after")
+        Go2Env(endpoint="tcp/127.0.0.1:9", connect_timeout_s=0.3)
+    assert re.match(r"no server answers at tcp/127\.0\.0\.1:9 after 0\.\d s \(`connect_timeout_s`\)", str(error.value))
     assert "no program accepts connections there\n  start a server with `twinstep serve`" in str(error.value)
+
+
+def test_connect_timeout_bounds_the_wait_for_a_program_that_is_not_a_server() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        since = time.monotonic()
+        with pytest.raises(twinstep.NoServerError, match="either it is not a Twinstep server, or it rejects"):
+            Go2Env(endpoint=f"tcp/127.0.0.1:{silent.getsockname()[1]}", connect_timeout_s=0.5)
+        assert 0.4 < time.monotonic() - since < 3
+
+
+def test_connect_timeout_bounds_the_wait_for_the_first_reply() -> None:
+    config, endpoint = zenoh.Config(), free_endpoint()
+    config.insert_json5("listen/endpoints", f'["{endpoint}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    # A liveliness token without a queryable: the server is visible, and no request gets a reply.
+    with (
+        zenoh.open(config) as session,
+        session.liveliness().declare_token("twinstep/live/server/0123/go2"),
+        pytest.raises(twinstep.RequestTimeoutError, match=r"hello` after .* s \(`connect_timeout_s`\): the server is"),
+    ):
+        Go2Env(endpoint=endpoint, connect_timeout_s=0.5)
 
 
 @pytest.mark.parametrize(
@@ -39,6 +63,7 @@ def test_error_without_a_server_says_how_to_start_one(monkeypatch: pytest.Monkey
         ({"zenoh_config": "/no/such/file"}, "`zenoh_config` = /no/such/file: the file does not exist"),
         ({"endpoint": "tcp/127.0.0.1:9", "model": "robot.toml"}, "`config` and `model` are options of the bundled"),
         ({"timeout_s": 0.0}, "`timeout_s` = 0.0 s; must be greater than 0"),
+        ({"connect_timeout_s": -1.0}, "`connect_timeout_s` = -1.0 s; must be greater than 0"),
         ({"render_mode": "ansi"}, "`render_mode` = 'ansi'; expected is 'rgb_array', 'human' or None"),
         ({"max_episode_steps": 0}, "`max_episode_steps` = 0 is not allowed: 1 to"),
     ],
@@ -72,10 +97,8 @@ def test_wrong_task_hash_and_robot_are_rejected() -> None:
         Go2Env(endpoint=server.endpoint)
     with pytest.raises(twinstep.SpecMismatchError, match="`spec_hash` = 00 differs from this server's"):
         Go2Env(endpoint=server.endpoint, task="counter", spec_hash="00")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("twinstep.connection.CONNECT_TIMEOUT_S", 0.2)
-        with pytest.raises(twinstep.AmbiguousRobotError, match="0 robots have the name `rex`; visible: fido"):
-            Go2Env(endpoint=server.endpoint, task="counter", robot="rex")
+    with pytest.raises(twinstep.AmbiguousRobotError, match="0 robots have the name `rex`; visible: fido"):
+        Go2Env(endpoint=server.endpoint, task="counter", robot="rex", connect_timeout_s=0.2)
     with Go2Env(endpoint=server.endpoint, task="counter", robot="fido") as env:
         env.reset()
     server.release()

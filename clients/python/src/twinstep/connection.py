@@ -34,11 +34,9 @@ A step may take longer, because a repeat waits for the request in progress. The 
 state for each query this long.
 """
 
-CONNECT_TIMEOUT_S = 5.0
-"""Time after which the discovery of a server fails."""
-
 _FIRST_BACKOFF_S, _MAX_BACKOFF_S = 0.002, 0.2
 _RESTART_CONFIRMATION_S = 2.0
+_MAX_CONNECT_TIMEOUT_S = 1e9
 _LIVE_SERVERS = "twinstep/live/server/*/*"
 
 
@@ -89,22 +87,31 @@ class Connection:
         Zenoh configuration file (JSON5) for TLS, user and password.
     server
         The server at ``endpoint`` if this process started it.
+    connect_timeout_s
+        Timeout of opening the session, finding the server and its first reply together [s].
     """
 
     def __init__(
-        self, endpoint: str, *, robot: str | None, zenoh_config: str | None, server: EmbeddedServer | None
+        self,
+        endpoint: str,
+        *,
+        robot: str | None,
+        zenoh_config: str | None,
+        server: EmbeddedServer | None,
+        connect_timeout_s: float,
     ) -> None:
         self.endpoint = endpoint
         self._server = server
         self._pid = os.getpid()
-        self._session = _open_session(endpoint, zenoh_config, server)
+        since = time.monotonic()
+        self._session = _open_session(endpoint, zenoh_config, server, connect_timeout_s)
         try:
-            self.server_id, self.name = self._find_server(robot)
+            self.server_id, self.name = self._find_server(robot, since, connect_timeout_s)
             self.client = uuid.uuid4().hex
             # Proves that a request comes from this client. It is in no key, reply or log.
             self._secret = secrets.token_bytes(16)
             self._max_request_bytes = math.inf
-            self.hello = self._handshake()
+            self.hello = self._handshake(connect_timeout_s - (time.monotonic() - since))
             self._max_request_bytes = self.hello["max_request_bytes"]
             self._token = self._session.liveliness().declare_token(
                 f"twinstep/live/client/{self.server_id}/{self.client}"
@@ -130,11 +137,13 @@ class Connection:
             timeout=QUERY_TIMEOUT_S,
         )
 
-    def request(self, querier: zenoh.Querier, message: dict[str, object], timeout_s: float) -> dict[str, Any]:
-        """Send a request and wait for the reply."""
+    def request(
+        self, querier: zenoh.Querier, message: dict[str, object], timeout_s: float, option: str
+    ) -> dict[str, Any]:
+        """Send a request and wait for the reply. The error of a timeout names the ``option`` that sets it."""
         pending = self.pending(querier, message)
         pending.send()
-        return self.wait_reply(pending, timeout_s)
+        return self.wait_reply(pending, timeout_s, option)
 
     def pending(self, querier: zenoh.Querier, message: dict[str, object]) -> Pending:
         """Return a request that is not sent yet."""
@@ -146,7 +155,7 @@ class Connection:
             )
         return Pending(querier, payload, self._secret)
 
-    def wait_reply(self, pending: Pending, timeout_s: float) -> dict[str, Any]:
+    def wait_reply(self, pending: Pending, timeout_s: float, option: str) -> dict[str, Any]:
         """Wait for the reply to a request, and repeat the request. May be called again after a timeout."""
         since, pause, replaced_since = time.monotonic(), _FIRST_BACKOFF_S, None
         while True:
@@ -166,16 +175,16 @@ class Connection:
                 )
             if now - since >= timeout_s:
                 raise RequestTimeoutError(
-                    f"no reply from {self.endpoint} to `{pending.querier.key_expr}` after {now - since:.1f} s: "
-                    f"{self._timeout_reason()}"
+                    f"no reply from {self.endpoint} to `{pending.querier.key_expr}` after {now - since:.1f} s "
+                    f"(`{option}`): {self._timeout_reason(option)}"
                 )
             time.sleep(pause)
             pause = min(2 * pause, _MAX_BACKOFF_S)
             pending.send()
 
-    def _handshake(self) -> dict[str, Any]:
+    def _handshake(self, timeout_s: float) -> dict[str, Any]:
         request: dict[str, object] = {"client": "twinstep-python"}
-        hello = self.request(self.querier("hello"), request, CONNECT_TIMEOUT_S)
+        hello = self.request(self.querier("hello"), request, timeout_s, "connect_timeout_s")
         low, high = hello["protocols"]
         if not low <= codec.PROTOCOL <= high:
             raise VersionError(
@@ -190,21 +199,21 @@ class Connection:
         keys = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
         return sorted((key.split("/")[3], key.split("/")[4]) for key in keys)
 
-    def _find_server(self, robot: str | None) -> tuple[str, str]:
-        since = time.monotonic()
+    def _find_server(self, robot: str | None, since: float, timeout_s: float) -> tuple[str, str]:
         while True:
             visible = self._visible_servers()
             matching = [server for server in visible if robot in (None, server[1])]
             if len(matching) == 1:
                 return matching[0]
             waited_s = time.monotonic() - since
-            if waited_s < CONNECT_TIMEOUT_S:
+            if waited_s < timeout_s:
                 # The old token of a restarted server may be visible for a moment.
                 time.sleep(0.05)
                 continue
             if not visible:
                 raise NoServerError(
-                    f"connected to {self.endpoint}, but no server is visible there after {waited_s:.1f} s\n"
+                    f"connected to {self.endpoint}, but no server is visible there after {waited_s:.1f} s "
+                    "(`connect_timeout_s`)\n"
                     "  either no server is running, or access control hides it from this user: read the server's log"
                 )
             count = len(matching)
@@ -218,7 +227,7 @@ class Connection:
             name == self.name for _, name in visible
         )
 
-    def _timeout_reason(self) -> str:
+    def _timeout_reason(self, option: str) -> str:
         info = self._session.info
         if not info.routers_zid() and not info.peers_zid():
             return "the connection is lost and cannot be restored; check that the server or the router is running"
@@ -229,7 +238,7 @@ class Connection:
         hello = _outcome(pending)
         if isinstance(hello, dict):
             return (
-                "the server answers `hello`, but not this request: it is still in progress (increase `timeout_s`), or "
+                f"the server answers `hello`, but not this request: it is still in progress (increase `{option}`), or "
                 "access control or a message size limit rejects it"
             )
         if hello is _NoReply.TIMEOUT:
@@ -266,22 +275,17 @@ def _outcome(pending: Pending) -> dict[str, Any] | _NoReply:
     return _NoReply.NONE
 
 
-def _open_session(endpoint: str, path: str | None, server: EmbeddedServer | None) -> zenoh.Session:
+def _open_session(endpoint: str, path: str | None, server: EmbeddedServer | None, timeout_s: float) -> zenoh.Session:
     _ZenohProcess.check()
-    config = _zenoh_config(endpoint, path)
+    config = _zenoh_config(endpoint, path, timeout_s)
     _ZenohProcess.pid = os.getpid()
     since = time.monotonic()
-    while True:
-        try:
-            return zenoh.open(config)
-        except zenoh.ZError as error:
-            if server is not None and not server.alive:
-                raise ServerExitedError(server.exit_report()) from error
-            waited_s = time.monotonic() - since
-            if waited_s < CONNECT_TIMEOUT_S:
-                time.sleep(0.2)
-                continue
-            raise _connect_error(endpoint, waited_s) from error
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        if server is not None and not server.alive:
+            raise ServerExitedError(server.exit_report()) from error
+        raise _connect_error(endpoint, time.monotonic() - since) from error
 
 
 def _connect_error(endpoint: str, waited_s: float) -> Error:
@@ -292,7 +296,7 @@ def _connect_error(endpoint: str, waited_s: float) -> Error:
         )
     else:
         reason = "no program accepts connections there\n  start a server with `twinstep serve`, or omit `endpoint`"
-    return NoServerError(f"no server answers at {endpoint} after {waited_s:.1f} s: {reason}")
+    return NoServerError(f"no server answers at {endpoint} after {waited_s:.1f} s (`connect_timeout_s`): {reason}")
 
 
 def _port_open(endpoint: str) -> bool:
@@ -305,7 +309,7 @@ def _port_open(endpoint: str) -> bool:
     return True
 
 
-def _zenoh_config(endpoint: str, path: str | None) -> zenoh.Config:
+def _zenoh_config(endpoint: str, path: str | None, timeout_s: float) -> zenoh.Config:
     if path is not None and not Path(path).is_file():
         raise InvalidOptionError(f"`zenoh_config` = {path}: the file does not exist")
     try:
@@ -313,6 +317,8 @@ def _zenoh_config(endpoint: str, path: str | None) -> zenoh.Config:
         for key, value in (
             ("mode", '"client"'),
             ("connect/endpoints", json.dumps([endpoint])),
+            # Zenoh repeats failed attempts until this timeout.
+            ("connect/timeout_ms", str(max(1, round(1000 * min(timeout_s, _MAX_CONNECT_TIMEOUT_S))))),
             ("connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
             ("scouting/multicast/enabled", "false"),
             ("transport/link/tx/lease", "2000"),

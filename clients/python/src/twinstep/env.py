@@ -28,6 +28,7 @@ class OptionArguments(TypedDict, total=False):
     critic: bool
     timeout_s: float
     reset_timeout_s: float
+    connect_timeout_s: float
 
 
 class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):

@@ -3,7 +3,7 @@
 import time
 import weakref
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,8 @@ class ConnectOptions:
         Requests the privileged observations of group ``critic``; they are in the info of every reset and step.
     timeout_s, reset_timeout_s
         Timeout of a step and of a reset [s].
+    connect_timeout_s
+        Timeout of connecting to a server and finding the robot [s].
     """
 
     endpoint: str | None = None
@@ -61,12 +63,13 @@ class ConnectOptions:
     critic: bool = False
     timeout_s: float = 5.0
     reset_timeout_s: float = 10.0
+    connect_timeout_s: float = 5.0
 
     def __post_init__(self) -> None:
         """Check the options that do not depend on a server."""
         if self.endpoint is not None and (self.config is not None or self.model is not None):
             raise InvalidOptionError("`config` and `model` are options of the bundled server: omit them or `endpoint`")
-        for name in ("timeout_s", "reset_timeout_s"):
+        for name in ("timeout_s", "reset_timeout_s", "connect_timeout_s"):
             value = getattr(self, name)
             if not value > 0:
                 raise InvalidOptionError(f"`{name}` = {value} s; must be greater than 0")
@@ -141,7 +144,13 @@ class RemoteVecEnv:
         try:
             endpoint = options.endpoint if server is None else server.endpoint
             assert endpoint is not None
-            connection = Connection(endpoint, robot=options.robot, zenoh_config=options.zenoh_config, server=server)
+            connection = Connection(
+                endpoint,
+                robot=options.robot,
+                zenoh_config=options.zenoh_config,
+                server=server,
+                connect_timeout_s=options.connect_timeout_s,
+            )
         except BaseException:
             if server is not None:
                 server.release()
@@ -171,7 +180,7 @@ class RemoteVecEnv:
             "critic": options.critic,
             "spec_hash": options.spec_hash,
         }
-        lease = connection.request(connection.querier("lease"), request, options.reset_timeout_s)
+        lease = connection.request(connection.querier("lease"), request, options.reset_timeout_s, "reset_timeout_s")
         self.spec = codec.read_spec(lease, connection.hello["spec_hash"])
         self.lease: str = lease["lease"]
         self._epoch: int = lease["epoch"]
@@ -231,7 +240,7 @@ class RemoteVecEnv:
         if mask is not None:
             request["mask"] = mask.astype(np.uint8).tobytes()
         self._send("reset", request)
-        reply = self._await_pending(self._options.reset_timeout_s)
+        reply = self._await_pending("reset_timeout_s")
         self._unknown = "the reply to a reset could not be read"
         self.critic_obs = self._critic(reply, "critic_obs", self.num_envs)
         obs = codec.tensor(reply, "obs", "<f4", self.num_envs, self.spec.obs_len)
@@ -255,7 +264,7 @@ class RemoteVecEnv:
         if self._pending[0] != "step":
             raise Error(f"the last `{self._pending[0]}` has no reply yet\n  call `reset` to wait for it")
         since = self._pending[3]
-        reply = self._await_pending(self._options.timeout_s)
+        reply = self._await_pending("timeout_s")
         try:
             return self._step_batch(reply, since)
         except codec.MalformedError as error:
@@ -290,9 +299,8 @@ class RemoteVecEnv:
 
     def scene(self, env: int) -> dict[str, Any]:
         """Return shapes and poses of one robot, and its ground, for rendering."""
-        return self._connection.request(
-            self._methods["render"], {"epoch": self._epoch, "env": env}, self._options.timeout_s
-        )
+        request: dict[str, object] = {"epoch": self._epoch, "env": env}
+        return self._connection.request(self._methods["render"], request, self._options.timeout_s, "timeout_s")
 
     def close(self) -> None:
         """End the lease. Further calls have no effect."""
@@ -301,7 +309,7 @@ class RemoteVecEnv:
         try:
             self._resolve_abandoned_request()
             request: dict[str, object] = {"epoch": self._epoch, "seq": self._last_seq + 1}
-            self._connection.request(self._methods["close"], request, self._options.timeout_s)
+            self._connection.request(self._methods["close"], request, self._options.timeout_s, "timeout_s")
         except Error:
             # The error does not matter to a closed client. The server releases the lease after the grace period.
             pass
@@ -328,8 +336,8 @@ class RemoteVecEnv:
                 f"the state of the environments is unknown: {self._unknown}\n  call `reset` without a mask to continue"
             )
 
-    def _await_pending(self, timeout_s: float) -> dict[str, Any]:
-        """Wait for the reply to the pending request.
+    def _await_pending(self, option: Literal["timeout_s", "reset_timeout_s"]) -> dict[str, Any]:
+        """Wait for the reply to the pending request, as long as ``option`` says.
 
         After a timeout the request stays pending, because it may have been executed. A reply or an error with effects
         consumes its number.
@@ -337,7 +345,7 @@ class RemoteVecEnv:
         assert self._pending is not None
         method, seq, pending, _ = self._pending
         try:
-            reply = self._connection.wait_reply(pending, timeout_s)
+            reply = self._connection.wait_reply(pending, getattr(self._options, option), option)
         except (RequestTimeoutError, KeyboardInterrupt):
             raise
         except Error as error:
@@ -359,7 +367,7 @@ class RemoteVecEnv:
     def _resolve_abandoned_request(self) -> None:
         if self._pending is not None:
             try:
-                self._await_pending(self._options.reset_timeout_s)
+                self._await_pending("reset_timeout_s")
             except RequestTimeoutError:
                 raise
             except Error:
