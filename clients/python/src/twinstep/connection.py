@@ -1,13 +1,10 @@
-"""Connection to one server: session, discovery, requests with retries, reasons of timeouts."""
+"""Connection to one server: discovery, requests with retries, reasons of timeouts."""
 
-import json
 import math
 import os
 import secrets
-import socket
 import time
 import uuid
-from pathlib import Path
 from typing import Any, cast
 
 import zenoh
@@ -15,8 +12,6 @@ import zenoh
 from . import codec
 from .errors import (
     AmbiguousRobotError,
-    Error,
-    ForkedProcessError,
     InvalidOptionError,
     LeaseLostError,
     NoServerError,
@@ -26,33 +21,11 @@ from .errors import (
     from_reply,
 )
 from .server import EmbeddedServer
-
-QUERY_TIMEOUT_S = 1.0
-"""Timeout of one query, after which it is repeated.
-
-A step may take longer, because a repeat waits for the request in progress. The timeout is short, because Zenoh keeps
-state for each query this long.
-"""
+from .session import SharedSession, check_process, connect_error, undeclare
 
 _FIRST_BACKOFF_S, _MAX_BACKOFF_S = 0.002, 0.2
 _RESTART_CONFIRMATION_S = 2.0
-_MAX_CONNECT_TIMEOUT_S = 1e9
-_LIVE_SERVERS = "twinstep/live/server/*/*"
-
-
-class _ZenohProcess:
-    """The process in which the threads of Zenoh run. A forked process has none, and Zenoh would wait for them."""
-
-    pid: int | None = None
-
-    @classmethod
-    def check(cls) -> None:
-        if cls.pid is not None and cls.pid != os.getpid():
-            raise ForkedProcessError(
-                "this process was forked from one with a Twinstep environment, and Zenoh does not work in it\n"
-                "  start processes with `spawn`: multiprocessing.get_context('spawn'), or with Gymnasium\n"
-                "  make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})"
-            )
+_HELLO: dict[str, object] = {"client": "twinstep-python"}
 
 
 class Pending:
@@ -67,7 +40,7 @@ class Pending:
 
     def send(self) -> None:
         """Send the request, the first time or again with the same number, so that it is executed once."""
-        _ZenohProcess.check()
+        check_process()
         try:
             self.replies = self.querier.get(payload=self.payload, attachment=self.secret)
         except zenoh.ZError as error:
@@ -104,38 +77,35 @@ class Connection:
         self._server = server
         self._pid = os.getpid()
         since = time.monotonic()
-        self._session = _open_session(endpoint, zenoh_config, server, connect_timeout_s)
+        self._declared: list[zenoh.Querier | zenoh.LivelinessToken] = []
+        self._session = self._open(zenoh_config, connect_timeout_s)
         try:
             self.server_id, self.name = self._find_server(robot, since, connect_timeout_s)
             self.client = uuid.uuid4().hex
+            """Id of this client, of which the server knows by the liveliness token that it runs."""
             # Proves that a request comes from this client. It is in no key, reply or log.
             self._secret = secrets.token_bytes(16)
             self._max_request_bytes = math.inf
             self.hello = self._handshake(connect_timeout_s - (time.monotonic() - since))
             self._max_request_bytes = self.hello["max_request_bytes"]
-            self._token = self._session.liveliness().declare_token(
-                f"twinstep/live/client/{self.server_id}/{self.client}"
-            )
+            self._declared.append(self._session.declare_token(f"twinstep/live/client/{self.server_id}/{self.client}"))
         except BaseException:
-            self._session.close()
+            self.close()
             raise
 
     def close(self) -> None:
-        """Close the session."""
+        """Undeclare the token and the queriers, and leave the session to its other users."""
         # A forked child has the object, but not the threads of the session.
         if self._pid == os.getpid():
-            self._session.close()
+            undeclare(*self._declared)
+            self._declared.clear()
+            del self._session
 
     def querier(self, key: str) -> zenoh.Querier:
-        """Declare a querier for ``twinstep/<server_id>/<key>``."""
-        return self._session.declare_querier(
-            f"twinstep/{self.server_id}/{key}",
-            target=zenoh.QueryTarget.BEST_MATCHING,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            express=True,
-            timeout=QUERY_TIMEOUT_S,
-        )
+        """Declare a querier for ``twinstep/<server_id>/<key>``, until :meth:`close`."""
+        querier = self._session.declare_querier(f"twinstep/{self.server_id}/{key}")
+        self._declared.append(querier)
+        return querier
 
     def request(
         self, querier: zenoh.Querier, message: dict[str, object], timeout_s: float, option: str
@@ -182,9 +152,17 @@ class Connection:
             pause = min(2 * pause, _MAX_BACKOFF_S)
             pending.send()
 
+    def _open(self, zenoh_config: str | None, timeout_s: float) -> SharedSession:
+        try:
+            return SharedSession.open(self.endpoint, zenoh_config, timeout_s)
+        except NoServerError as error:
+            if self._server is not None and not self._server.alive:
+                raise ServerExitedError(self._server.exit_report()) from error
+            raise
+
     def _handshake(self, timeout_s: float) -> dict[str, Any]:
-        request: dict[str, object] = {"client": "twinstep-python"}
-        hello = self.request(self.querier("hello"), request, timeout_s, "connect_timeout_s")
+        self._hello_querier = self.querier("hello")
+        hello = self.request(self._hello_querier, _HELLO, timeout_s, "connect_timeout_s")
         low, high = hello["protocols"]
         if not low <= codec.PROTOCOL <= high:
             raise VersionError(
@@ -193,15 +171,9 @@ class Connection:
             )
         return hello
 
-    def _visible_servers(self) -> list[tuple[str, str]]:
-        """Return the server id and the robot name of every visible server."""
-        replies = self._session.liveliness().get(_LIVE_SERVERS, timeout=QUERY_TIMEOUT_S)
-        keys = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
-        return sorted((key.split("/")[3], key.split("/")[4]) for key in keys)
-
     def _find_server(self, robot: str | None, since: float, timeout_s: float) -> tuple[str, str]:
         while True:
-            visible = self._visible_servers()
+            visible = self._session.visible_servers()
             matching = [server for server in visible if robot in (None, server[1])]
             if len(matching) == 1:
                 return matching[0]
@@ -210,6 +182,8 @@ class Connection:
                 # The old token of a restarted server may be visible for a moment.
                 time.sleep(0.05)
                 continue
+            if not visible and not self._session.connected:
+                raise connect_error(self.endpoint, waited_s)
             if not visible:
                 raise NoServerError(
                     f"connected to {self.endpoint}, but no server is visible there after {waited_s:.1f} s "
@@ -222,18 +196,17 @@ class Connection:
             raise AmbiguousRobotError(f"{found}; visible: {names}\n  set `robot` to the name of one of them")
 
     def _server_restarted(self) -> bool:
-        visible = self._visible_servers()
+        visible = self._session.visible_servers()
         return all(server_id != self.server_id for server_id, _ in visible) and any(
             name == self.name for _, name in visible
         )
 
     def _timeout_reason(self, option: str) -> str:
-        info = self._session.info
-        if not info.routers_zid() and not info.peers_zid():
+        if not self._session.connected:
             return "the connection is lost and cannot be restored; check that the server or the router is running"
-        if all(server_id != self.server_id for server_id, _ in self._visible_servers()):
+        if all(server_id != self.server_id for server_id, _ in self._session.visible_servers()):
             return "the connection works, but the server is no longer visible: it has terminated or lost its router"
-        pending = self.pending(self.querier("hello"), {"client": "twinstep-python"})
+        pending = self.pending(self._hello_querier, _HELLO)
         pending.send()
         hello = _outcome(pending)
         if isinstance(hello, dict):
@@ -273,62 +246,3 @@ def _outcome(pending: Pending) -> dict[str, Any] | _NoReply:
             return _NoReply.BUSY
         raise from_reply(error["code"], error["field"], error["message"], error["hint"])
     return _NoReply.NONE
-
-
-def _open_session(endpoint: str, path: str | None, server: EmbeddedServer | None, timeout_s: float) -> zenoh.Session:
-    _ZenohProcess.check()
-    config = _zenoh_config(endpoint, path, timeout_s)
-    _ZenohProcess.pid = os.getpid()
-    since = time.monotonic()
-    try:
-        return zenoh.open(config)
-    except zenoh.ZError as error:
-        if server is not None and not server.alive:
-            raise ServerExitedError(server.exit_report()) from error
-        raise _connect_error(endpoint, time.monotonic() - since) from error
-
-
-def _connect_error(endpoint: str, waited_s: float) -> Error:
-    if _port_open(endpoint):
-        reason = (
-            "a program accepts connections there: either it is not a Twinstep server, or it rejects this client's "
-            "user, password or certificate; read the server's log"
-        )
-    else:
-        reason = "no program accepts connections there\n  start a server with `twinstep serve`, or omit `endpoint`"
-    return NoServerError(f"no server answers at {endpoint} after {waited_s:.1f} s (`connect_timeout_s`): {reason}")
-
-
-def _port_open(endpoint: str) -> bool:
-    address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
-    host, _, port = address.rpartition(":")
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
-    except (OSError, ValueError):
-        return False
-    return True
-
-
-def _zenoh_config(endpoint: str, path: str | None, timeout_s: float) -> zenoh.Config:
-    if path is not None and not Path(path).is_file():
-        raise InvalidOptionError(f"`zenoh_config` = {path}: the file does not exist")
-    try:
-        config = zenoh.Config() if path is None else zenoh.Config.from_file(path)
-        for key, value in (
-            ("mode", '"client"'),
-            ("connect/endpoints", json.dumps([endpoint])),
-            # Zenoh repeats failed attempts until this timeout.
-            ("connect/timeout_ms", str(max(1, round(1000 * min(timeout_s, _MAX_CONNECT_TIMEOUT_S))))),
-            ("connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
-            ("scouting/multicast/enabled", "false"),
-            ("transport/link/tx/lease", "2000"),
-            # A step of 4096 robots is sent in twelve fragments; Zenoh's default queue of two delays them.
-            ("transport/link/tx/queue/size/data", "16"),
-            ("transport/link/rx/buffer_size", "2097152"),
-            ("transport/shared_memory/enabled", "false"),
-        ):
-            config.insert_json5(key, value)
-    except zenoh.ZError as error:
-        option = f"`zenoh_config` = {path}" if path else f"`endpoint` = {endpoint}"
-        raise InvalidOptionError(f"Zenoh rejects {option}: {error}") from error
-    return config

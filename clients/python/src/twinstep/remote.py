@@ -217,6 +217,7 @@ class RemoteVecEnv:
         obs : (num_envs, obs_len) float32
             Observations of all environments, reset or not.
         """
+        self._check_open()
         self._resolve_abandoned_request()
         if mask is not None:
             self._check_known()
@@ -259,6 +260,7 @@ class RemoteVecEnv:
 
     def recv(self) -> StepBatch:
         """Wait for the result of the actions. May be called again after a :class:`RequestTimeoutError`."""
+        self._check_open()
         if self._pending is None:
             raise Error("no request is in progress: call `send` before `recv`")
         if self._pending[0] != "step":
@@ -299,6 +301,7 @@ class RemoteVecEnv:
 
     def scene(self, env: int) -> dict[str, Any]:
         """Return shapes and poses of one robot, and its ground, for rendering."""
+        self._check_open()
         request: dict[str, object] = {"epoch": self._epoch, "env": env}
         return self._connection.request(self._methods["render"], request, self._options.timeout_s, "timeout_s")
 
@@ -317,8 +320,7 @@ class RemoteVecEnv:
             self._release()
 
     def _send(self, method: str, request: dict[str, object]) -> None:
-        if not self._release.alive:
-            raise Error("the environment is closed")
+        self._check_open()
         seq = self._last_seq + 1
         pending = self._connection.pending(self._methods[method], {**request, "epoch": self._epoch, "seq": seq})
         # Pending before it is sent: after an interrupt in between, the same request is sent again, not another with
@@ -329,6 +331,10 @@ class RemoteVecEnv:
         except Error:
             self._pending = None
             raise
+
+    def _check_open(self) -> None:
+        if not self._release.alive:
+            raise Error("the environment is closed")
 
     def _check_known(self) -> None:
         if self._unknown is not None:

@@ -1,0 +1,193 @@
+"""Zenoh sessions, one per endpoint and configuration, which all environments of this process share."""
+
+import contextlib
+import json
+import os
+import socket
+import threading
+import time
+import weakref
+from pathlib import Path
+from typing import Any, ClassVar
+
+import zenoh
+
+from .errors import Error, ForkedProcessError, InvalidOptionError, NoServerError
+
+QUERY_TIMEOUT_S = 1.0
+"""Timeout of one query, after which it is repeated.
+
+A step may take longer, because a repeat waits for the request in progress. The timeout is short, because Zenoh keeps
+state for each query this long.
+"""
+
+_MAX_CONNECT_TIMEOUT_S = 1e9
+_LIVE_SERVERS = "twinstep/live/server/*/*"
+
+_Key = tuple[str, str | None]
+
+
+class SharedSession:
+    """A session that is closed when the last of its users has dropped it.
+
+    Python counts the users: each keeps a reference. A lock would not do, because the garbage collector may drop a user
+    while the same thread holds it.
+
+    Parameters
+    ----------
+    session
+        The open session.
+    """
+
+    _lock = threading.Lock()
+    _open: ClassVar["weakref.WeakValueDictionary[_Key, SharedSession]"] = weakref.WeakValueDictionary()
+    _opening: ClassVar["weakref.WeakValueDictionary[_Key, Any]"] = weakref.WeakValueDictionary()
+    """A lock for each session that a thread opens."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        # Runs when the last user has dropped its reference, or at the end of the interpreter.
+        weakref.finalize(self, _close, session, os.getpid())
+
+    @classmethod
+    def open(cls, endpoint: str, zenoh_config: str | None, timeout_s: float) -> "SharedSession":
+        """Return the session for this endpoint and configuration file. Opens one if there is none."""
+        check_process()
+        since = time.monotonic()
+        key = (endpoint, _content(zenoh_config))
+        with cls._lock:
+            opening = cls._opening.setdefault(key, threading.Lock())
+        if not opening.acquire(timeout=min(timeout_s, threading.TIMEOUT_MAX)):
+            # Another thread has tried to connect for this long.
+            raise connect_error(endpoint, timeout_s)
+        try:
+            shared = cls._open.get(key)
+            if shared is None or shared._session.is_closed():
+                left_s = timeout_s - (time.monotonic() - since)
+                shared = cls(_open_session(endpoint, zenoh_config, left_s, since))
+                cls._open[key] = shared
+            return shared
+        finally:
+            opening.release()
+
+    @property
+    def connected(self) -> bool:
+        """True while there is a link. Zenoh restores a lost link by itself."""
+        info = self._session.info
+        return bool(info.routers_zid() or info.peers_zid())
+
+    def visible_servers(self) -> list[tuple[str, str]]:
+        """Return the server id and the robot name of every visible server."""
+        replies = self._session.liveliness().get(_LIVE_SERVERS, timeout=QUERY_TIMEOUT_S)
+        keys = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+        return sorted((key.split("/")[3], key.split("/")[4]) for key in keys)
+
+    def declare_token(self, key: str) -> zenoh.LivelinessToken:
+        """Declare a liveliness token."""
+        return self._session.liveliness().declare_token(key)
+
+    def declare_querier(self, key: str) -> zenoh.Querier:
+        """Declare a querier with the settings of ``protocol/SPEC.md``."""
+        return self._session.declare_querier(
+            key,
+            target=zenoh.QueryTarget.BEST_MATCHING,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            express=True,
+            timeout=QUERY_TIMEOUT_S,
+        )
+
+
+def undeclare(*declared: zenoh.Querier | zenoh.LivelinessToken) -> None:
+    """Undeclare tokens and queriers. The session may be closed."""
+    for each in declared:
+        with contextlib.suppress(zenoh.ZError):
+            each.undeclare()
+
+
+class _ZenohProcess:
+    """The process in which the threads of Zenoh run. A forked process has none, and Zenoh would wait for them."""
+
+    pid: int | None = None
+
+
+def check_process() -> None:
+    """Raise a ``ForkedProcessError`` in a process that was forked from one with a session."""
+    if _ZenohProcess.pid not in (None, os.getpid()):
+        raise ForkedProcessError(
+            "this process was forked from one with a Twinstep environment, and Zenoh does not work in it\n"
+            "  start processes with `spawn`: multiprocessing.get_context('spawn'), or with Gymnasium\n"
+            "  make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})"
+        )
+
+
+def connect_error(endpoint: str, waited_s: float) -> Error:
+    """Return the error of a client that could not connect; it depends on whether the port is open."""
+    if _port_open(endpoint):
+        reason = (
+            "a program accepts connections there: either it is not a Twinstep server, or it rejects this client's "
+            "user, password or certificate; read the server's log"
+        )
+    else:
+        reason = "no program accepts connections there\n  start a server with `twinstep serve`, or omit `endpoint`"
+    return NoServerError(f"no server answers at {endpoint} after {waited_s:.1f} s (`connect_timeout_s`): {reason}")
+
+
+def _close(session: zenoh.Session, pid: int) -> None:
+    # A forked child has the object, but not the threads of the session.
+    if pid == os.getpid():
+        session.close()
+
+
+def _open_session(endpoint: str, path: str | None, timeout_s: float, since: float) -> zenoh.Session:
+    config = _zenoh_config(endpoint, path, timeout_s)
+    _ZenohProcess.pid = os.getpid()
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise connect_error(endpoint, time.monotonic() - since) from error
+
+
+def _port_open(endpoint: str) -> bool:
+    address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def _content(path: str | None) -> str | None:
+    """Return the text of a configuration file: after a change of the file there is another session."""
+    if path is None:
+        return None
+    if not Path(path).is_file():
+        raise InvalidOptionError(f"`zenoh_config` = {path}: the file does not exist")
+    try:
+        return Path(path).read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidOptionError(f"`zenoh_config` = {path} cannot be read: {error}") from error
+
+
+def _zenoh_config(endpoint: str, path: str | None, timeout_s: float) -> zenoh.Config:
+    try:
+        config = zenoh.Config() if path is None else zenoh.Config.from_file(path)
+        for key, value in (
+            ("mode", '"client"'),
+            ("connect/endpoints", json.dumps([endpoint])),
+            # Zenoh repeats failed attempts until this timeout.
+            ("connect/timeout_ms", str(max(1, round(1000 * min(timeout_s, _MAX_CONNECT_TIMEOUT_S))))),
+            ("connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
+            ("scouting/multicast/enabled", "false"),
+            ("transport/link/tx/lease", "2000"),
+            # A step of 4096 robots is sent in twelve fragments; Zenoh's default queue of two delays them.
+            ("transport/link/tx/queue/size/data", "16"),
+            ("transport/link/rx/buffer_size", "2097152"),
+            ("transport/shared_memory/enabled", "false"),
+        ):
+            config.insert_json5(key, value)
+    except zenoh.ZError as error:
+        option = f"`zenoh_config` = {path}" if path else f"`endpoint` = {endpoint}"
+        raise InvalidOptionError(f"Zenoh rejects {option}: {error}") from error
+    return config
