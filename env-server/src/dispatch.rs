@@ -10,7 +10,7 @@ use twinstep_protocol::{ErrorCode, ErrorReply, Secret};
 use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
-use crate::executor::{Executor, Handler, Mailbox, lock};
+use crate::executor::{Executor, Handler, Mailbox, SendLock, lock};
 use crate::messages::{Reply, Request, RequestKind, ServerState};
 
 /// Maximum size of a `hello` or `lease` request [bytes].
@@ -25,6 +25,8 @@ pub struct Route {
     pub secret: Secret,
     /// Maximum size of a request to its environments [bytes].
     pub max_request_bytes: usize,
+    /// Held while a reply is sent; that of all leases with this secret.
+    pub send_lock: SendLock,
     /// Requests to its environments.
     pub mailbox: Arc<Mailbox>,
     /// Time of the client's last request. Keeps the lease alive when the token is not visible.
@@ -105,8 +107,8 @@ impl Dispatcher {
 
 /// Creates the mailbox of refused requests. It is not bounded: a client that does not read its refusals loses its link
 /// when the oldest of them cannot be sent, and the others are dropped with it.
-pub fn refusals(executor: &Executor) -> Arc<Mailbox> {
-    Mailbox::new(executor, usize::MAX, Refusals)
+pub fn refusals(executor: &Executor, send_lock: SendLock) -> Arc<Mailbox> {
+    Mailbox::new(executor, send_lock, usize::MAX, Refusals)
 }
 
 struct Refusals;

@@ -2,7 +2,10 @@
 //!
 //! A reply to a client that does not read can block its sender until Zenoh closes the link. A thread that sends a reply
 //! therefore does not count as running: another thread executes the next request. A mailbox has at most one request in
-//! execution or one reply being sent, so a client that does not read delays only the mailbox that it writes to.
+//! execution or one reply being sent, so a client that does not read delays only the mailboxes that it writes to.
+//!
+//! Mailboxes of one client share a [`SendLock`]: Zenoh's thread that closes a link waits for the threads that send to it,
+//! and no other link sends meanwhile.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -100,11 +103,7 @@ impl Executor {
                 finished.running -= 1;
                 self.wake_a_thread(&mut finished);
                 drop(finished);
-                if let Some((query, Some(reply))) = &executed {
-                    reply.send(query);
-                }
-                // Dropping the query sends a message as well, so that it happens here.
-                drop(executed);
+                mailbox.send(executed);
                 mailbox.finish();
                 state = lock(&self.0.state);
             } else if state.is_stopping && state.ready.is_empty() {
@@ -131,11 +130,15 @@ pub trait Handler: Send {
     fn handle(&mut self, kind: RequestKind, query: &Query) -> Option<Reply>;
 }
 
+/// Held by the thread that sends a reply.
+pub type SendLock = Arc<Mutex<()>>;
+
 /// Queue of requests that are executed in order, one at a time.
 pub struct Mailbox {
     queue: Mutex<Queue>,
     capacity: usize,
     handler: Mutex<Box<dyn Handler>>,
+    send_lock: SendLock,
     executor: Executor,
 }
 
@@ -148,9 +151,14 @@ struct Queue {
 
 impl Mailbox {
     /// Creates a mailbox in which at most `capacity` requests wait.
-    pub fn new(executor: &Executor, capacity: usize, handler: impl Handler + 'static) -> Arc<Self> {
+    pub fn new(
+        executor: &Executor,
+        send_lock: SendLock,
+        capacity: usize,
+        handler: impl Handler + 'static,
+    ) -> Arc<Self> {
         let (queue, handler) = (Mutex::default(), Mutex::new(Box::new(handler) as Box<dyn Handler>));
-        Arc::new(Self { queue, capacity, handler, executor: executor.clone() })
+        Arc::new(Self { queue, capacity, handler, send_lock, executor: executor.clone() })
     }
 
     /// Enqueues a request. Never blocks. Returns the request if the mailbox is full.
@@ -183,6 +191,17 @@ impl Mailbox {
             Some(Reply::Err(ErrorReply::new(ErrorCode::Internal, "", reason)))
         });
         Some((query, reply))
+    }
+
+    /// Sends the reply that [`Mailbox::execute_next`] returned.
+    fn send(&self, executed: Option<(Query, Option<Reply>)>) {
+        let sending = lock(&self.send_lock);
+        if let Some((query, Some(reply))) = &executed {
+            reply.send(query);
+        }
+        // Dropping the query sends a message as well.
+        drop(executed);
+        drop(sending);
     }
 
     fn finish(self: Arc<Self>) {

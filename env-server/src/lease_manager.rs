@@ -12,7 +12,7 @@ use zenoh::query::Query;
 
 use crate::EnvFactory;
 use crate::dispatch::{Route, Routes, attached_secret, no_such_lease};
-use crate::executor::{Executor, Handler, Mailbox, lock};
+use crate::executor::{Executor, Handler, Mailbox, SendLock, lock};
 use crate::messages::{LeaseParams, Reply, Request, RequestKind, ServerState};
 use crate::worker::{Worker, stale_epoch};
 
@@ -220,13 +220,19 @@ impl LeaseManager {
         let (manager, lease) = (Arc::clone(self), id.to_owned());
         let release = Box::new(move |reason: &str| manager.release(&lease, reason));
         let worker = Worker::new(params, Arc::clone(&self.factory), Arc::clone(&self.state), release);
+        let mut routes = self.routes.write().unwrap_or_else(PoisonError::into_inner);
+        let of_same_client = routes.values().find(|route| route.secret == secret);
+        let send_lock = of_same_client.map_or_else(SendLock::default, |route| Arc::clone(&route.send_lock));
+        let mailbox = Mailbox::new(&self.executor, Arc::clone(&send_lock), LEASE_CAPACITY, worker);
         let route = Route {
             secret,
+            send_lock,
             max_request_bytes: convert::max_request_bytes(num_envs, &self.info.spec),
-            mailbox: Mailbox::new(&self.executor, LEASE_CAPACITY, worker),
+            mailbox,
             last_request: Mutex::new(Instant::now()),
         };
-        self.routes.write().unwrap_or_else(PoisonError::into_inner).insert(id.to_owned(), Arc::new(route));
+        routes.insert(id.to_owned(), Arc::new(route));
+        drop(routes);
         let disconnected_since = (!leases.live_clients.contains(&request.client)).then(Instant::now);
         let lease = Lease { client: request.client.clone(), secret, num_envs, epoch: 1, disconnected_since };
         leases.by_id.insert(id.to_owned(), lease);

@@ -16,7 +16,7 @@ use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait};
 
 use crate::dispatch::{Dispatcher, Routes, refusals};
-use crate::executor::{Executor, Mailbox};
+use crate::executor::{Executor, Mailbox, SendLock};
 use crate::lease_manager::{LeaseHandler, LeaseManager, ServerInfo};
 use crate::messages::ServerState;
 use crate::{EnvFactory, EnvFactoryError, ServerConfig};
@@ -117,13 +117,15 @@ impl Server {
             Arc::new(LeaseManager::new(info, factory, Arc::clone(&state), Arc::clone(&routes), executor.clone()));
         let (running, expiry) = expire_leases(Arc::clone(&lease_manager)).map_err(ServerError::Thread)?;
         watch_clients(&session, &sid, Arc::clone(&lease_manager))?;
-        let control = || Mailbox::new(&executor, CONTROL_CAPACITY, LeaseHandler(Arc::clone(&lease_manager)));
+        let send_lock = SendLock::default();
+        let handler = || LeaseHandler(Arc::clone(&lease_manager));
+        let control = || Mailbox::new(&executor, Arc::clone(&send_lock), CONTROL_CAPACITY, handler());
         let dispatcher = Dispatcher {
             sid: sid.clone(),
             routes: Arc::clone(&routes),
             hello: control(),
             lease: control(),
-            refusals: refusals(&executor),
+            refusals: refusals(&executor, Arc::clone(&send_lock)),
             state: Arc::clone(&state),
         };
         let key = keys::server(&sid);

@@ -22,6 +22,7 @@ mod identify;
 mod layering;
 mod learned;
 mod leases;
+mod load;
 mod log;
 mod next_experiment;
 mod play;

@@ -38,6 +38,17 @@ impl RawClient {
         this
     }
 
+    /// Connects to the only server at `endpoint` and declares the client's liveliness token.
+    pub fn connect_to_only_server(endpoint: &str, client: &str) -> Self {
+        let mut this = Self::without_token(endpoint, "", client);
+        let replies = this.session.liveliness().get("twinstep/live/server/*/*").wait().unwrap();
+        let reply = replies.recv().unwrap().into_result().unwrap();
+        this.sid = reply.key_expr().as_str().split('/').nth(3).unwrap().to_owned();
+        let key = keys::live_client(&this.sid, client);
+        this.token = Some(this.session.liveliness().declare_token(key).wait().unwrap());
+        this
+    }
+
     /// Connects to the server `sid` without a liveliness token.
     pub fn without_token(endpoint: &str, sid: &str, client: &str) -> Self {
         let mut config = zenoh::Config::default();

@@ -16,6 +16,10 @@ use crate::exit::{CommandResult, Signals, input, other};
 /// Interval at which the server checks for signals.
 const TICK: Duration = Duration::from_millis(50);
 
+/// Environment variable with the numbers of Zenoh's threads, and its value.
+const ZENOH_THREADS: (&str, &str) =
+    ("ZENOH_RUNTIME", "(tx: (worker_threads: 4), rx: (worker_threads: 4), net: (worker_threads: 4))");
+
 /// Serve simulated Go2 environments over Zenoh.
 ///
 /// Agents lease environments and call `reset` and `step`: from Rust (`twinstep-client`), from Python (`twinstep`) or,
@@ -81,6 +85,7 @@ pub struct Args {
 /// Serves until a signal or, with `--until-stdin-closes`, the end of stdin.
 pub fn run(args: &Args) -> CommandResult {
     let config = args.config()?;
+    set_zenoh_threads();
     let signals = Signals::listen()?;
     let host = SimEnvFactory::new(config.clone()).map_err(input)?;
     let server = Server::start(&config.server, Arc::new(host)).map_err(|error| match error {
@@ -101,6 +106,19 @@ pub fn run(args: &Args) -> CommandResult {
     let outcome = watch(&server, &signals, &stdin_closed);
     server.shutdown();
     outcome
+}
+
+/// Gives Zenoh several threads that send, unless the user has chosen their number.
+///
+/// With one, which is Zenoh's default, all links wait while the link of a client that does not read is closed.
+fn set_zenoh_threads() {
+    if std::env::var_os(ZENOH_THREADS.0).is_none() {
+        // SAFETY: the program has no other thread yet that could read the environment.
+        #[expect(unsafe_code, reason = "Zenoh reads the number of its threads from the environment only")]
+        unsafe {
+            std::env::set_var(ZENOH_THREADS.0, ZENOH_THREADS.1);
+        }
+    }
 }
 
 impl Args {
