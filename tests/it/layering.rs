@@ -262,3 +262,13 @@ fn program_and_tests_share_one_build_of_every_dependency() {
         assert!(more.is_empty(), "the tests build {package} a second time, with {more:?}: add these features in `cli`");
     }
 }
+
+#[test]
+fn lock_file_has_the_corrected_crate_of_zenoh() {
+    // Cargo ignores a patch with another version than the dependency, with a warning only.
+    let lock: toml::Table = std::fs::read_to_string(root().join("Cargo.lock")).unwrap().parse().unwrap();
+    let packages = lock["package"].as_array().unwrap();
+    let copies: Vec<_> = packages.iter().filter(|package| package["name"].as_str() == Some("zenoh-link-tls")).collect();
+    assert_eq!(copies.len(), 1, "{copies:?}");
+    assert!(copies[0].get("source").is_none(), "not from third_party: {:?}", copies[0]);
+}

@@ -71,9 +71,16 @@ pub struct Args {
     /// Sample every parameter of the model file that has an interval, for every robot in every episode.
     #[arg(long)]
     randomise_effects: bool,
+    /// Maximum number of environments that one client may lease. Default: all.
+    #[arg(long, value_name = "N")]
+    max_envs_per_client: Option<usize>,
     /// Time for which the environments of a disconnected client are kept [s]. Default: 10.
     #[arg(long, value_name = "S")]
     lease_grace_s: Option<f64>,
+    /// Time without a request after which environments are released even if their client is connected [s]. Default:
+    /// never.
+    #[arg(long, value_name = "S")]
+    lease_idle_s: Option<f64>,
     /// Seed of environments that a client does not seed.
     #[arg(long)]
     seed: Option<u64>,
@@ -137,6 +144,8 @@ impl Args {
         }
         server.model = self.model.clone().or(server.model.take());
         server.zenoh = self.zenoh.clone().or(server.zenoh.take());
+        server.max_envs_per_client = self.max_envs_per_client.or(server.max_envs_per_client);
+        server.lease_idle_s = self.lease_idle_s.or(server.lease_idle_s);
         server.seed = self.seed.or(server.seed);
         server.shared_memory |= self.shared_memory;
         // The settings of the config file are those of its own task.
