@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv};
+use twinstep_client::{ClientError, ConnectOptions, GroupedVecEnv, RemoteVecEnv};
 use twinstep_env_server::{Config, EnvFactory, EnvFactoryError, Server, SimEnvFactory};
 use twinstep_envs::{Counter, OBS_LEN, TaskConfig, WalkConfig, check_vec_env};
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, StepBatch, VecEnv, go2};
@@ -71,6 +71,36 @@ fn critic_observations_are_sent_only_to_a_lease_that_requests_them() {
         }
         remote.close().unwrap();
     }
+    server.shutdown();
+}
+
+#[test]
+fn groups_step_like_one_batch() {
+    let config = config(TaskConfig::default());
+    let (server, endpoint) = start(&config);
+    for groups in [0, 8] {
+        let error = GroupedVecEnv::connect(&ConnectOptions::new(&endpoint, 7), groups).err().unwrap();
+        assert!(error.to_string().contains(&format!("`groups` = {groups}")), "{error}");
+    }
+    let options = ConnectOptions { max_episode_steps: Some(4), critic: true, ..ConnectOptions::new(&endpoint, 7) };
+    let mut one = RemoteVecEnv::connect(&options).unwrap();
+    let mut groups = GroupedVecEnv::connect(&options, 3).unwrap();
+    assert_eq!([0, 1, 2].map(|group| groups.range(group)), [0..2, 2..4, 4..7]);
+    let request = ResetRequest::seeded(5, 7);
+    assert_eq!(groups.reset(&request).unwrap(), one.reset(&request).unwrap());
+    for step in 0..9 {
+        let actions: Vec<f32> = (0..7 * 12).map(|index| ((step * 84 + index) as f32).sin()).collect();
+        assert_eq!(groups.step(&actions).unwrap(), one.step(&actions).unwrap(), "step {step}");
+    }
+    let mask = ResetRequest::masked((0..7).map(|env| env % 3 == 0).collect());
+    assert_eq!(groups.reset(&mask).unwrap(), one.reset(&mask).unwrap());
+    assert_eq!(groups.critic_obs(), one.critic_obs());
+    assert_eq!(groups.scene(6).unwrap().pose, one.scene(6).unwrap().pose);
+    // A group steps while the others do not.
+    groups.send(1, &[0.3; 24]).unwrap();
+    assert_eq!(groups.recv(1).unwrap().reward.len(), 2);
+    groups.close().unwrap();
+    one.close().unwrap();
     server.shutdown();
 }
 

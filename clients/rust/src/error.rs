@@ -54,6 +54,14 @@ pub enum ClientError {
         /// `name (sid)` of every visible server.
         visible: Vec<String>,
     },
+    /// The environments cannot be divided like this.
+    #[error("`groups` = {groups} is not allowed: 1 to {num_envs}, the number of environments")]
+    Groups {
+        /// Number of groups.
+        groups: usize,
+        /// Number of environments.
+        num_envs: usize,
+    },
     /// The request is larger than the server accepts. It was not sent.
     #[error("`{request}` has {bytes} bytes; the server accepts at most {limit}\n  it hosts fewer environments")]
     TooLarge {

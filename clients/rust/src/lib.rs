@@ -13,17 +13,21 @@
 //! # }
 //! ```
 //!
+//! [`GroupedVecEnv`] keeps several groups of environments stepping while the agent computes actions.
+//!
 //! The client repeats a request with the same sequence number until a reply arrives. The server executes each number
 //! once. A lost reply, an unresponsive server or a restarted router costs time, but no step is lost or executed twice.
 //! If no reply arrives, [`ClientError`] contains the reason.
 
 mod connection;
 mod error;
+mod grouped_env;
 mod remote_env;
 mod server_process;
 
 pub use connection::{ConnectOptions, Connection};
 pub use error::ClientError;
+pub use grouped_env::GroupedVecEnv;
 pub use remote_env::{LeaseHandle, RemoteVecEnv};
 pub use server_process::ServerProcess;
 pub use twinstep_protocol::Secret;

@@ -1,6 +1,6 @@
 //! Environments with physics: the same walk over Zenoh and in process.
 
-use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_client::{ConnectOptions, GroupedVecEnv, RemoteVecEnv};
 use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
 
@@ -9,6 +9,10 @@ use crate::error::{BenchError, Interrupted, check, failed};
 use crate::throughput::{Throughput, WINDOWS, measure as pace, median};
 use twinstep_client::ServerProcess;
 use twinstep_envs::trot;
+
+/// Groups that step at the same time, and environments of each.
+const GROUPS: usize = 3;
+const GROUP_ENVS: usize = 64;
 
 /// Measures env-steps/s, remote compared with in process.
 pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
@@ -31,7 +35,49 @@ pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measuremen
             ratio: Some(remote.per_second / local.per_second),
         });
     }
+    let (remote, local) = compare_groups(window_s, interrupted)?;
+    rows.push(Measurement {
+        case: format!("walk over Zenoh, {GROUPS} groups of {GROUP_ENVS} envs in flight"),
+        value: remote.per_second * (GROUPS * GROUP_ENVS) as f64,
+        unit: "env-steps/s",
+        reference: Some(format!("{} envs in process", GROUPS * GROUP_ENVS)),
+        ratio: Some(remote.per_second / local.per_second),
+    });
     Ok(rows)
+}
+
+/// Compares groups in flight with as many environments in process. One call steps every environment once.
+fn compare_groups(window_s: f64, interrupted: Interrupted) -> Result<(Throughput, Throughput), BenchError> {
+    let num_envs = GROUPS * GROUP_ENVS;
+    let server = ServerProcess::start(&[]).map_err(failed)?;
+    let options = ConnectOptions::new(&server.endpoint, num_envs);
+    let mut remote = GroupedVecEnv::connect(&options, GROUPS).map_err(failed)?;
+    let mut local = SimEnvFactory::new(Config::default())
+        .and_then(|host| host.build(num_envs, AutoresetMode::NextStep, None))
+        .map_err(failed)?;
+    let request = ResetRequest::seeded(1, num_envs);
+    remote.reset(&request).map_err(failed)?;
+    local.reset(&request).map_err(failed)?;
+    let policy_dt = remote.spec().policy_dt as f32;
+    let actions = |steps: u32| trot::action(steps as f32 * policy_dt).repeat(GROUP_ENVS);
+    let (mut remote_steps, mut local_steps) = (0, 0);
+    for group in 0..GROUPS {
+        remote.send(group, &actions(remote_steps)).map_err(failed)?;
+    }
+    let (mut ours, mut reference) = (Vec::new(), Vec::new());
+    for _ in 0..WINDOWS {
+        check(interrupted)?;
+        ours.push(pace(window_s, || {
+            remote_steps += 1;
+            for group in 0..GROUPS {
+                remote.recv(group).map_err(failed)?;
+                remote.send(group, &actions(remote_steps)).map_err(failed)?;
+            }
+            Ok(())
+        })?);
+        reference.push(pace(window_s, || step(&mut *local, &mut local_steps))?);
+    }
+    Ok((median(&ours), median(&reference)))
 }
 
 fn compare(num_envs: usize, window_s: f64, interrupted: Interrupted) -> Result<(Throughput, Throughput), BenchError> {
