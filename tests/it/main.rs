@@ -9,6 +9,7 @@ static ALLOCATOR: cap::Cap<std::alloc::System> = cap::Cap::new(std::alloc::Syste
 mod any_robot;
 mod batch;
 mod diagnose;
+mod discovery;
 mod effect_bodies;
 mod effect_laws;
 mod effect_readings;

@@ -238,12 +238,14 @@ fn freeze(process: &Process, pause: Duration) -> Result<(), String> {
     process.thaw()
 }
 
-fn free_endpoint() -> Result<String, String> {
+/// Returns an endpoint on this machine with a free port.
+pub fn free_endpoint() -> Result<String, String> {
     let listener = std::net::TcpListener::bind("127.0.0.1:0").map_err(|error| error.to_string())?;
     Ok(format!("tcp/{}", listener.local_addr().map_err(|error| error.to_string())?))
 }
 
-fn start_router(program: &Path, listen: &str) -> Result<Process, String> {
+/// Starts a router that listens at `listen`.
+pub fn start_router(program: &Path, listen: &str) -> Result<Process, String> {
     start(program, &["router".to_owned(), listen.to_owned()])
 }
 

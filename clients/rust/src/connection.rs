@@ -1,10 +1,7 @@
-//! Connection to one server: session, discovery, requests with retries, reasons of timeouts.
+//! Connection to one server: requests with retries, reasons of timeouts.
 
-use std::net::{TcpStream, ToSocketAddrs};
-use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use twinstep_model::AutoresetMode;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, Secret, decode, encode, keys, message, random_id};
 use zenoh::bytes::ZBytes;
 use zenoh::handlers::FifoChannelHandler;
@@ -13,7 +10,8 @@ use zenoh::qos::CongestionControl;
 use zenoh::query::{ConsolidationMode, Querier, QueryTarget, Reply};
 use zenoh::{Session, Wait};
 
-use crate::ClientError;
+use crate::discovery::{choose_server, visible_servers};
+use crate::{ClientError, ConnectOptions, session};
 
 /// Timeout of one query, after which it is repeated.
 ///
@@ -26,54 +24,6 @@ const RETRY_BACKOFF: [Duration; 2] = [Duration::from_millis(2), Duration::from_m
 ///
 /// A server that lost its router is visible again within 1 s.
 const RESTART_CONFIRMATION: Duration = Duration::from_secs(2);
-/// Timeout of the test whether a port accepts connections.
-const PROBE_TIMEOUT: Duration = Duration::from_secs(1);
-
-/// Server to connect to, and the environments to request.
-#[derive(Clone, Debug)]
-pub struct ConnectOptions {
-    /// Zenoh endpoint of the server or of a router, such as `tcp/127.0.0.1:7447`.
-    pub endpoint: String,
-    /// Name of the robot. Required if several are visible.
-    pub robot: Option<String>,
-    /// Number of environments.
-    pub num_envs: usize,
-    /// When a new episode starts after one has ended.
-    pub autoreset: AutoresetMode,
-    /// Number of policy steps after which an episode is truncated. Default: the server's.
-    pub max_episode_steps: Option<u32>,
-    /// Requests the privileged observations of group `critic`, for an asymmetric critic. A real robot has none.
-    pub critic: bool,
-    /// Spec hash that was stored with a policy; a server with a different one is rejected. Default: accept any.
-    pub spec_hash: Option<String>,
-    /// Zenoh configuration file (JSON5) for TLS, user and password.
-    pub zenoh: Option<PathBuf>,
-    /// Sends large messages through shared memory if client and server run on one machine.
-    pub shared_memory: bool,
-    /// Time after which connecting fails.
-    pub connect_timeout: Duration,
-    /// Time after which an unanswered request fails.
-    pub timeout: Duration,
-}
-
-impl ConnectOptions {
-    /// Creates options for `num_envs` environments of the only server at `endpoint`, with default timeouts.
-    pub fn new(endpoint: impl Into<String>, num_envs: usize) -> Self {
-        Self {
-            endpoint: endpoint.into(),
-            robot: None,
-            num_envs,
-            autoreset: AutoresetMode::NextStep,
-            max_episode_steps: None,
-            critic: false,
-            spec_hash: None,
-            zenoh: None,
-            shared_memory: false,
-            connect_timeout: Duration::from_secs(5),
-            timeout: Duration::from_secs(20),
-        }
-    }
-}
 
 /// A connection to one server, at which the client has declared its liveliness token.
 pub struct Connection {
@@ -118,8 +68,8 @@ impl Connection {
     ///
     /// Fails if the server does not support this protocol version. `secret` is that of the lease to use.
     pub fn open(options: &ConnectOptions, secret: Secret) -> Result<Self, ClientError> {
-        let session = open_session(options)?;
-        let (sid, name) = find_server(&session, options)?;
+        let session = session::open(options)?;
+        let (sid, name) = choose_server(&session, options)?;
         let client = format!("{}-{}", session.zid(), random_id());
         let key = keys::live_client(&sid, &client);
         let token = session.liveliness().declare_token(&key).wait().map_err(|error| zenoh_error(&error))?;
@@ -271,110 +221,6 @@ fn outcome(replies: &FifoChannelHandler<Reply>) -> QueryOutcome {
 pub fn read_answer<T: serde::de::DeserializeOwned>(answer: &ZBytes, request: &str) -> Result<T, ClientError> {
     decode(&answer.to_bytes())
         .map_err(|error| ClientError::Malformed { request: request.to_owned(), reason: error.message })
-}
-
-fn open_session(options: &ConnectOptions) -> Result<Session, ClientError> {
-    let since = Instant::now();
-    loop {
-        let config = zenoh_config(options)?;
-        match twinstep_session::open(config) {
-            Ok(session) => return Ok(session),
-            Err(error) if since.elapsed() >= options.connect_timeout => {
-                return Err(ClientError::NoServer {
-                    endpoint: options.endpoint.clone(),
-                    waited_s: since.elapsed().as_secs_f64(),
-                    reason: without_source_line(&error.to_string()),
-                    port_open: port_open(&options.endpoint),
-                });
-            }
-            Err(_) => std::thread::sleep(RETRY_BACKOFF[1]),
-        }
-    }
-}
-
-/// Returns an error text of Zenoh without the source location at its end.
-fn without_source_line(error: &str) -> String {
-    error.split(" at /").next().unwrap_or(error).trim_end().to_owned()
-}
-
-/// Returns true if a program accepts connections at the endpoint.
-///
-/// Distinguishes a server that rejects this client from an absent server.
-fn port_open(endpoint: &str) -> bool {
-    let address = endpoint.split_once('/').map_or(endpoint, |(_, rest)| rest);
-    let address = address.split(['?', '#']).next().unwrap_or_default();
-    let mut addresses = address.to_socket_addrs().into_iter().flatten();
-    addresses.any(|address| TcpStream::connect_timeout(&address, PROBE_TIMEOUT).is_ok())
-}
-
-fn zenoh_config(options: &ConnectOptions) -> Result<zenoh::Config, ClientError> {
-    let invalid = |reason: String| ClientError::Config { path: options.zenoh.clone(), reason };
-    let mut config = match &options.zenoh {
-        Some(path) => zenoh::Config::from_file(path).map_err(|error| invalid(error.to_string()))?,
-        None => zenoh::Config::default(),
-    };
-    let endpoints = serde_json::json!([options.endpoint]).to_string();
-    for (key, value) in [
-        ("mode", "\"client\""),
-        ("connect/endpoints", endpoints.as_str()),
-        ("scouting/multicast/enabled", "false"),
-        ("transport/link/tx/lease", "2000"),
-        // A step of 4096 robots is sent in twelve fragments. With Zenoh's default queue of two, the writing thread
-        // waits for the sending thread after every second fragment. With its default buffer, the receiver allocates
-        // each one.
-        ("transport/link/tx/queue/size/data", "16"),
-        ("transport/link/rx/buffer_size", "2097152"),
-        // The connection to a restarted server or router is restored within 1 s instead of Zenoh's 4 s.
-        ("connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
-        ("transport/shared_memory/enabled", if options.shared_memory { "true" } else { "false" }),
-    ] {
-        config.insert_json5(key, value).map_err(|error| invalid(format!("`{key}` = {value}: {error}")))?;
-    }
-    Ok(config)
-}
-
-/// Returns the server id and the robot name of every visible server.
-fn visible_servers(session: &Session) -> Vec<(String, String)> {
-    let Ok(replies) = session.liveliness().get(keys::LIVE_SERVERS).timeout(QUERY_TIMEOUT).wait() else {
-        return Vec::new();
-    };
-    let mut servers: Vec<(String, String)> = std::iter::from_fn(|| replies.recv().ok())
-        .filter_map(|reply| reply.into_result().ok())
-        .filter_map(|sample| {
-            let (sid, name) = keys::parse_live_server(sample.key_expr().as_str())?;
-            Some((sid.to_owned(), name.to_owned()))
-        })
-        .collect();
-    servers.sort();
-    servers.dedup();
-    servers
-}
-
-fn find_server(session: &Session, options: &ConnectOptions) -> Result<(String, String), ClientError> {
-    let since = Instant::now();
-    loop {
-        let visible = visible_servers(session);
-        let matches = |name: &str| options.robot.as_ref().is_none_or(|robot| robot == name);
-        let mut matching: Vec<_> = visible.iter().filter(|(_, name)| matches(name)).cloned().collect();
-        match (matching.pop(), matching.is_empty()) {
-            (Some(server), true) => return Ok(server),
-            // The old token of a restarted server may be visible for a moment.
-            _ if since.elapsed() < options.connect_timeout => std::thread::sleep(RETRY_BACKOFF[1] / 4),
-            (None, _) if visible.is_empty() => {
-                let waited_s = since.elapsed().as_secs_f64();
-                return Err(ClientError::NoServerVisible { endpoint: options.endpoint.clone(), waited_s });
-            }
-            (found, _) => {
-                let count = matching.len() + usize::from(found.is_some());
-                let expected = match &options.robot {
-                    Some(robot) => format!("{count} robots have the name `{robot}`"),
-                    None => format!("{count} robots are visible, and `robot` is not set"),
-                };
-                let visible = visible.iter().map(|(sid, name)| format!("{name} ({sid})")).collect();
-                return Err(ClientError::AmbiguousRobot { expected, visible });
-            }
-        }
-    }
 }
 
 fn zenoh_error(error: &zenoh::Error) -> ClientError {

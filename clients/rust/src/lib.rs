@@ -20,14 +20,19 @@
 //! If no reply arrives, [`ClientError`] contains the reason.
 
 mod connection;
+mod discovery;
 mod error;
 mod grouped_env;
+mod options;
 mod remote_env;
 mod server_process;
+mod session;
 
-pub use connection::{ConnectOptions, Connection};
+pub use connection::Connection;
+pub use discovery::{Discovery, ServerInfo};
 pub use error::ClientError;
 pub use grouped_env::GroupedVecEnv;
+pub use options::ConnectOptions;
 pub use remote_env::{LeaseHandle, RemoteVecEnv};
 pub use server_process::ServerProcess;
 pub use twinstep_protocol::Secret;

@@ -10,6 +10,7 @@ mod exit;
 mod fit;
 mod hunt;
 mod identify;
+mod list;
 mod log;
 mod mjcf;
 mod play;
@@ -36,6 +37,7 @@ enum CliCommand {
     Fit(fit::Args),
     Hunt(hunt::Args),
     Identify(identify::Args),
+    List(list::Args),
     Log(log::Args),
     Mjcf(mjcf::Args),
     Play(play::Args),
@@ -59,6 +61,7 @@ fn main() -> std::process::ExitCode {
         CliCommand::Fit(args) => fit::run(&args),
         CliCommand::Hunt(args) => hunt::run(&args),
         CliCommand::Identify(args) => identify::run(&args),
+        CliCommand::List(args) => list::run(&args),
         CliCommand::Log(args) => log::run(&args),
         CliCommand::Mjcf(args) => mjcf::run(&args),
         CliCommand::Play(args) => play::run(&args),
