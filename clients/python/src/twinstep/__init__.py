@@ -21,6 +21,7 @@ from .errors import (
     InvalidOptionError,
     LeaseLostError,
     NoServerError,
+    NotPicklableError,
     RequestRejectedError,
     RequestTimeoutError,
     ResetNeededError,
@@ -28,6 +29,7 @@ from .errors import (
     SpecMismatchError,
     VersionError,
 )
+from .factory import EnvFactory
 from .remote import ConnectOptions
 from .server import EmbeddedServer, ServerNotFoundError, ServerStartError
 from .vector_env import Go2VectorEnv
@@ -36,6 +38,7 @@ __all__ = [
     "AmbiguousRobotError",
     "ConnectOptions",
     "EmbeddedServer",
+    "EnvFactory",
     "Error",
     "ForkedProcessError",
     "Go2Env",
@@ -45,6 +48,7 @@ __all__ = [
     "LeaseLostError",
     "MalformedError",
     "NoServerError",
+    "NotPicklableError",
     "RequestRejectedError",
     "RequestTimeoutError",
     "ResetNeededError",

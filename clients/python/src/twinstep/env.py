@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from .codec import Spec
 from .errors import InvalidActionError, InvalidOptionError
+from .pickling import NotPicklable
 from .remote import UNLIMITED, ConnectOptions, RemoteVecEnv, StepBatch
 from .render import Viewer
 from .spaces import action_space, observation_space
@@ -31,7 +32,7 @@ class OptionArguments(TypedDict, total=False):
     connect_timeout_s: float
 
 
-class Go2Env(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+class Go2Env(NotPicklable, gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """One robot, simulated or real.
 
     Parameters

@@ -54,6 +54,10 @@ class ForkedProcessError(Error):
     """Zenoh cannot be used in a process that was forked after a session was opened; start processes with ``spawn``."""
 
 
+class NotPicklableError(Error, TypeError):
+    """An environment cannot be pickled or copied; send a :class:`twinstep.EnvFactory` to the other process."""
+
+
 class RequestRejectedError(Error):
     """The server rejected a request.
 

@@ -18,6 +18,7 @@ from .errors import (
     RequestTimeoutError,
     SpecMismatchError,
 )
+from .pickling import NotPicklable
 from .server import EmbeddedServer
 
 UNLIMITED = 2**32 - 1
@@ -116,7 +117,7 @@ class StepBatch:
     round_trip_s: float = field(compare=False)
 
 
-class RemoteVecEnv:
+class RemoteVecEnv(NotPicklable):
     """Environments on a server, leased by this client.
 
     Parameters

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .env import OptionArguments
 from .errors import InvalidOptionError
+from .pickling import NotPicklable
 from .vector_env import Go2VectorEnv
 
 try:
@@ -53,7 +54,7 @@ def make_vec_env(
     return Go2VecEnv(cast(Go2VectorEnv, envs), seed=seed, device=device)
 
 
-class Go2VecEnv(VecEnv):
+class Go2VecEnv(NotPicklable, VecEnv):
     """Robots on one server as a ``VecEnv`` with the observation group ``"policy"``.
 
     With the option ``critic``, there is also the privileged group ``"critic"``: ``obs_groups`` of the runner is then

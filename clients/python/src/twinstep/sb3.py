@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .env import OptionArguments, RenderMode
 from .errors import InvalidOptionError
+from .pickling import NotPicklable
 from .sub_env import SubEnvView
 from .vector_env import Go2VectorEnv
 
@@ -61,7 +62,7 @@ def make_vec_env(
     return vec_env
 
 
-class Go2VecEnv(VecEnv):
+class Go2VecEnv(NotPicklable, VecEnv):
     """Robots on one server as a ``VecEnv``.
 
     Parameters

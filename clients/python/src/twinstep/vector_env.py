@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .env import OptionArguments, RenderMode, checked_render_mode, open_viewer, render_fps, reward_terms
 from .errors import InvalidOptionError
+from .pickling import NotPicklable
 from .remote import ConnectOptions, RemoteVecEnv, StepBatch
 from .render import Viewer
 from .spaces import action_space, observation_space
@@ -19,7 +20,7 @@ from .sub_env import SubEnvView
 StepResult = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
 
-class Go2VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
+class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
     """``num_envs`` robots on one server. Row i with seed s equals the single environment with seed s + i.
 
     Parameters
