@@ -8,6 +8,10 @@
 with this process.
 """
 
+import importlib
+from types import ModuleType
+from typing import TYPE_CHECKING
+
 import gymnasium
 
 from .checker import VecEnvError, check_vec_env
@@ -33,6 +37,10 @@ from .factory import EnvFactory
 from .remote import ConnectOptions
 from .server import EmbeddedServer, ServerNotFoundError, ServerStartError
 from .vector_env import Go2VectorEnv
+
+if TYPE_CHECKING:
+    from . import rsl_rl as rsl_rl
+    from . import sb3 as sb3
 
 __all__ = [
     "AmbiguousRobotError",
@@ -71,3 +79,11 @@ gymnasium.register(
     max_episode_steps=1000,
     kwargs={"task": "walk"},
 )
+
+if not TYPE_CHECKING:
+    # For a type checker, this function would make every name an attribute of the package.
+    def __getattr__(name: str) -> ModuleType:
+        """Import a module of an extra at its first use. The error without the extra says how to install it."""
+        if name not in ("rsl_rl", "sb3"):
+            raise AttributeError(f"module `twinstep` has no attribute `{name}`")
+        return importlib.import_module(f".{name}", __name__)
