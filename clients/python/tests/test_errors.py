@@ -6,26 +6,17 @@ import signal
 import socket
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import zenoh
-from loopback import free_endpoint
+from loopback import free_endpoint, suspend
 
 import twinstep
 from twinstep import EmbeddedServer, Go2Env, Go2VectorEnv
 from twinstep.errors import from_reply
 
 STILL = np.zeros((2, 12), np.float32)
-
-
-def suspend(pid: int) -> None:
-    """Suspend a process and return when all its threads have stopped, which takes a while on a busy machine."""
-    os.kill(pid, signal.SIGSTOP)
-    threads = [Path(f"/proc/{pid}/task/{thread}/stat") for thread in os.listdir(f"/proc/{pid}/task")]
-    while any(stat.read_text().rsplit(") ")[1][0] != "T" for stat in threads):
-        time.sleep(0.001)
 
 
 def test_error_without_a_server_says_how_to_start_one() -> None:

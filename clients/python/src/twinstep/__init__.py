@@ -16,6 +16,7 @@ import gymnasium
 
 from .checker import VecEnvError, check_vec_env
 from .codec import MalformedError, Spec, SpecField
+from .discovery import ServerInfo, discover
 from .env import Go2Env
 from .errors import (
     AmbiguousRobotError,
@@ -61,6 +62,7 @@ __all__ = [
     "RequestTimeoutError",
     "ResetNeededError",
     "ServerExitedError",
+    "ServerInfo",
     "ServerNotFoundError",
     "ServerStartError",
     "Spec",
@@ -69,6 +71,7 @@ __all__ = [
     "VecEnvError",
     "VersionError",
     "check_vec_env",
+    "discover",
 ]
 
 gymnasium.register(

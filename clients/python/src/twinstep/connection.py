@@ -25,7 +25,7 @@ from .session import SharedSession, check_process, connect_error, undeclare
 
 _FIRST_BACKOFF_S, _MAX_BACKOFF_S = 0.002, 0.2
 _RESTART_CONFIRMATION_S = 2.0
-_HELLO: dict[str, object] = {"client": "twinstep-python"}
+HELLO: dict[str, object] = {"client": "twinstep-python"}
 
 
 class Pending:
@@ -129,14 +129,14 @@ class Connection:
         """Wait for the reply to a request, and repeat the request. May be called again after a timeout."""
         since, pause, replaced_since = time.monotonic(), _FIRST_BACKOFF_S, None
         while True:
-            answer = _outcome(pending)
+            answer = outcome(pending)
             if isinstance(answer, dict):
                 return answer
             if self._server is not None and not self._server.alive:
                 raise ServerExitedError(self._server.exit_report())
             now = time.monotonic()
             # Only zero replies can be due to a restart. A query that times out has reached the server.
-            replaced = answer is _NoReply.NONE and self._server_restarted()
+            replaced = answer is NoReply.NONE and self._server_restarted()
             replaced_since = (replaced_since or now) if replaced else None
             if replaced_since is not None and now - replaced_since >= _RESTART_CONFIRMATION_S:
                 raise LeaseLostError(
@@ -162,7 +162,7 @@ class Connection:
 
     def _handshake(self, timeout_s: float) -> dict[str, Any]:
         self._hello_querier = self.querier("hello")
-        hello = self.request(self._hello_querier, _HELLO, timeout_s, "connect_timeout_s")
+        hello = self.request(self._hello_querier, HELLO, timeout_s, "connect_timeout_s")
         low, high = hello["protocols"]
         if not low <= codec.PROTOCOL <= high:
             raise VersionError(
@@ -206,43 +206,43 @@ class Connection:
             return "the connection is lost and cannot be restored; check that the server or the router is running"
         if all(server_id != self.server_id for server_id, _ in self._session.visible_servers()):
             return "the connection works, but the server is no longer visible: it has terminated or lost its router"
-        pending = self.pending(self._hello_querier, _HELLO)
+        pending = self.pending(self._hello_querier, HELLO)
         pending.send()
-        hello = _outcome(pending)
+        hello = outcome(pending)
         if isinstance(hello, dict):
             return (
                 f"the server answers `hello`, but not this request: it is still in progress (increase `{option}`), or "
                 "access control or a message size limit rejects it"
             )
-        if hello is _NoReply.TIMEOUT:
+        if hello is NoReply.TIMEOUT:
             return "the server is visible but unresponsive: it does not reply to requests"
         return "the server is visible, but queries get no reply: access control may deny queries to this user"
 
 
-class _NoReply:
+class NoReply:
     """Why a query got no reply."""
 
-    NONE: "_NoReply"
-    TIMEOUT: "_NoReply"
-    BUSY: "_NoReply"
+    NONE: "NoReply"
+    TIMEOUT: "NoReply"
+    BUSY: "NoReply"
 
 
-_NoReply.NONE, _NoReply.TIMEOUT, _NoReply.BUSY = _NoReply(), _NoReply(), _NoReply()
+NoReply.NONE, NoReply.TIMEOUT, NoReply.BUSY = NoReply(), NoReply(), NoReply()
 
 
-def _outcome(pending: Pending) -> dict[str, Any] | _NoReply:
+def outcome(pending: Pending) -> dict[str, Any] | NoReply:
     """Return the reply to one query, or why there is none. Raises error replies of the server."""
     if pending.replies is None:
-        return _NoReply.TIMEOUT
+        return NoReply.TIMEOUT
     for reply in pending.replies:
         if reply.ok is not None:
             return codec.decode(reply.ok.payload.to_bytes())
         payload = cast(bytes, reply.err.payload.to_bytes())
         # Errors of Zenoh, such as its timeout, are plain text; a map starts with 0x80 to 0x8f, 0xde or 0xdf.
         if not payload or not (0x80 <= payload[0] <= 0x8F or payload[0] in (0xDE, 0xDF)):
-            return _NoReply.TIMEOUT
+            return NoReply.TIMEOUT
         error = codec.decode(payload)
         if error.get("retryable"):
-            return _NoReply.BUSY
+            return NoReply.BUSY
         raise from_reply(error["code"], error["field"], error["message"], error["hint"])
-    return _NoReply.NONE
+    return NoReply.NONE

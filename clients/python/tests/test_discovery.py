@@ -1,0 +1,59 @@
+"""Discovery of servers at an endpoint."""
+
+import os
+import signal
+import time
+
+import pytest
+from loopback import free_endpoint, router, suspend
+
+import twinstep
+from twinstep import EmbeddedServer, Go2VectorEnv, discover
+
+
+def test_servers_behind_a_router_are_found_with_task_and_free_environments() -> None:
+    with router() as endpoint:
+        assert discover(endpoint) == []
+        walk = EmbeddedServer(("--task", "walk", "--name", "rex", "--envs", "8", "--connect", endpoint))
+        counter = EmbeddedServer(("--task", "counter", "--name", "fido", "--envs", "4", "--connect", endpoint))
+        envs = Go2VectorEnv(3, robot="rex", endpoint=endpoint)
+        envs.reset(seed=1)
+        envs.step(envs.action_space.sample())
+        fido, rex = discover(endpoint)
+        assert [(info.endpoint, info.robot, info.reachable) for info in (fido, rex)] == [
+            (endpoint, "fido", True),
+            (endpoint, "rex", True),
+        ]
+        assert (rex.max_envs, rex.free_envs, rex.max_envs_per_client, rex.env_steps) == (8, 5, 8, 3)
+        assert (fido.max_envs, fido.free_envs, fido.max_envs_per_client, fido.env_steps) == (4, 4, 4, 0)
+        assert rex.spec is not None
+        assert fido.spec is not None
+        assert (rex.spec.task, fido.spec.task, rex.spec.robot) == ("walk", "counter", "go2")
+        assert (rex.spec.hash, rex.server_id) == (envs.twinstep_spec.hash, envs._remote._connection.server_id)
+        assert rex.protocols == (1, 1)
+        assert (rex.server_version or "").startswith("twinstep ")
+        envs.close()
+        walk.release()
+        counter.release()
+
+
+def test_a_server_that_does_not_answer_is_not_reachable() -> None:
+    with router() as endpoint:
+        first = EmbeddedServer(("--task", "counter", "--name", "rex", "--connect", endpoint))
+        second = EmbeddedServer(("--task", "counter", "--name", "fido", "--connect", endpoint))
+        suspend(second.pid)
+        since = time.monotonic()
+        fido, rex = discover(endpoint, timeout_s=0.5)
+        assert time.monotonic() - since < 3
+        assert (fido.robot, fido.reachable, fido.spec, fido.free_envs) == ("fido", False, None, None)
+        assert (rex.robot, rex.reachable, rex.free_envs) == ("rex", True, 4096)
+        os.kill(second.pid, signal.SIGCONT)
+        first.release()
+        second.release()
+
+
+def test_invalid_endpoint_and_timeout_are_errors() -> None:
+    with pytest.raises(twinstep.NoServerError, match="no program accepts connections there"):
+        discover(free_endpoint(), connect_timeout_s=0.3)
+    with pytest.raises(twinstep.InvalidOptionError, match="`timeout_s` = 0 s; must be greater than 0"):
+        discover("tcp/127.0.0.1:9", timeout_s=0)
