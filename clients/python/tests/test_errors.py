@@ -139,6 +139,20 @@ def test_suspended_server_causes_a_timeout_and_its_step_is_executed_once() -> No
     envs.close()
 
 
+def test_closing_does_not_wait_for_a_server_that_does_not_read() -> None:
+    server = EmbeddedServer(("--task", "counter"))
+    envs = Go2VectorEnv(2, task="counter", endpoint=server.endpoint, timeout_s=0.5, reset_timeout_s=4.0)
+    suspend(server.pid)
+    # Longer than the lease of the link, after which Zenoh tries to open another.
+    with pytest.raises(twinstep.RequestTimeoutError):
+        envs.reset()
+    since = time.monotonic()
+    envs._remote._release()
+    assert time.monotonic() - since < 5
+    os.kill(server.pid, signal.SIGCONT)
+    server.release()
+
+
 def test_reset_waits_for_an_abandoned_step() -> None:
     envs = Go2VectorEnv(2, task="counter", timeout_s=0.5)
     envs.reset()

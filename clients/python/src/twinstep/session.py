@@ -1,5 +1,6 @@
 """Zenoh sessions, one per endpoint and configuration, which all environments of this process share."""
 
+import _thread
 import contextlib
 import json
 import os
@@ -22,6 +23,9 @@ state for each query this long.
 """
 
 _MAX_CONNECT_TIMEOUT_S = 1e9
+
+_CLOSE_TIMEOUT_S = 1.0
+"""Zenoh tries for 10 s to close a link to a server that does not read. The rest of this happens in a thread."""
 _LIVE_SERVERS = "twinstep/live/server/*/*"
 
 _Key = tuple[str, str | None]
@@ -135,8 +139,24 @@ def connect_error(endpoint: str, waited_s: float) -> Error:
 
 def _close(session: zenoh.Session, pid: int) -> None:
     # A forked child has the object, but not the threads of the session.
-    if pid == os.getpid():
+    if pid != os.getpid():
+        return
+    closed = _thread.allocate_lock()
+    closed.acquire()
+    try:
+        # Without locks of `threading`, which the thread that the garbage collector interrupts may hold.
+        _thread.start_new_thread(_close_session, (session, closed))
+    except RuntimeError:
+        # The interpreter starts no threads at its end.
+        _close_session(session, closed)
+    closed.acquire(timeout=_CLOSE_TIMEOUT_S)
+
+
+def _close_session(session: zenoh.Session, closed: _thread.LockType) -> None:
+    # Zenoh raises an error after 10 s. There is nothing more to release.
+    with contextlib.suppress(zenoh.ZError):
         session.close()
+    closed.release()
 
 
 def _open_session(endpoint: str, path: str | None, timeout_s: float, since: float) -> zenoh.Session:
