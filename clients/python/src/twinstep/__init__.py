@@ -35,8 +35,9 @@ from .errors import (
     VersionError,
 )
 from .factory import EnvFactory
-from .remote import ConnectOptions
+from .remote import ConnectOptions, RemoteVecEnv, StepBatch
 from .server import EmbeddedServer, ServerNotFoundError, ServerStartError
+from .sharded import ShardedVecEnv
 from .vector_env import Go2VectorEnv
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ __all__ = [
     "MalformedError",
     "NoServerError",
     "NotPicklableError",
+    "RemoteVecEnv",
     "RequestRejectedError",
     "RequestTimeoutError",
     "ResetNeededError",
@@ -65,9 +67,11 @@ __all__ = [
     "ServerInfo",
     "ServerNotFoundError",
     "ServerStartError",
+    "ShardedVecEnv",
     "Spec",
     "SpecField",
     "SpecMismatchError",
+    "StepBatch",
     "VecEnvError",
     "VersionError",
     "check_vec_env",

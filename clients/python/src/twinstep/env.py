@@ -1,5 +1,6 @@
 """One robot as a Gymnasium environment."""
 
+from collections.abc import Sequence
 from typing import Any, Literal, TypedDict, Unpack
 
 import gymnasium
@@ -7,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .codec import Spec
+from .discovery import ServerInfo
 from .errors import InvalidActionError, InvalidOptionError
 from .pickling import NotPicklable
 from .remote import UNLIMITED, ConnectOptions, RemoteVecEnv, StepBatch
 from .render import Viewer
+from .sharded import ShardedVecEnv
 from .spaces import action_space, observation_space
 
 RenderMode = Literal["rgb_array", "human"]
@@ -30,6 +33,12 @@ class OptionArguments(TypedDict, total=False):
     timeout_s: float
     reset_timeout_s: float
     connect_timeout_s: float
+
+
+class VectorOptionArguments(OptionArguments, total=False):
+    """Keyword arguments of vector environments: also several servers, see :class:`twinstep.ShardedVecEnv`."""
+
+    endpoints: Sequence[str | ServerInfo] | None
 
 
 class Go2Env(NotPicklable, gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -182,7 +191,7 @@ def render_fps(spec: Spec) -> int:
     return max(1, round(1 / spec.policy_dt))
 
 
-def open_viewer(mode: RenderMode | None, remote: RemoteVecEnv) -> Viewer | None:
+def open_viewer(mode: RenderMode | None, remote: RemoteVecEnv | ShardedVecEnv) -> Viewer | None:
     """Return the viewer of a render mode. Ends the lease if there is none, because pygame is not installed."""
     try:
         return None if mode is None else Viewer(mode, fps=render_fps(remote.spec))

@@ -93,6 +93,10 @@ class StepBatch:
         Sums of their weighted reward terms.
     ended_diverged : (k,) bool
         True for those whose simulation became NaN or infinite. They are truncated; ``obs`` is that before the step.
+    ended_lost : (k,) bool
+        True for those whose server was lost, see :class:`twinstep.ShardedVecEnv`. Their ``ended_terms`` are NaN.
+    held : (num_envs,) bool
+        True for environments whose action was not executed, because they have no server or have just got one.
     final_obs : (k, obs_len) float32, or empty
         Their last observations; empty unless autoreset is SameStep.
     critic_obs : (num_envs, critic_len) float32
@@ -111,6 +115,8 @@ class StepBatch:
     ended_length: NDArray[np.int64]
     ended_terms: NDArray[np.float32]
     ended_diverged: NDArray[np.bool_]
+    ended_lost: NDArray[np.bool_]
+    held: NDArray[np.bool_]
     final_obs: NDArray[np.float32]
     critic_obs: NDArray[np.float32]
     final_critic_obs: NDArray[np.float32]
@@ -257,17 +263,23 @@ class RemoteVecEnv(NotPicklable):
                 "  call `recv` to wait for it, or `reset` to wait and start new episodes"
             )
         self._check_known()
-        self._send("step", {"actions": self._checked(actions).tobytes()})
+        self._send("step", {"actions": checked_actions(actions, self.num_envs, self.spec).tobytes()})
 
-    def recv(self) -> StepBatch:
-        """Wait for the result of the actions. May be called again after a :class:`RequestTimeoutError`."""
+    def recv(self, timeout_s: float | None = None) -> StepBatch:
+        """Wait for the result of the actions. May be called again after a :class:`RequestTimeoutError`.
+
+        Parameters
+        ----------
+        timeout_s
+            Timeout [s]. ``None``: that of the options.
+        """
         self._check_open()
         if self._pending is None:
             raise Error("no request is in progress: call `send` before `recv`")
         if self._pending[0] != "step":
             raise Error(f"the last `{self._pending[0]}` has no reply yet\n  call `reset` to wait for it")
         since = self._pending[3]
-        reply = self._await_pending("timeout_s")
+        reply = self._await_pending("timeout_s", timeout_s)
         try:
             return self._step_batch(reply, since)
         except codec.MalformedError as error:
@@ -290,6 +302,8 @@ class RemoteVecEnv(NotPicklable):
             ended_diverged=codec.tensor(reply, "ended_diverged", "?", k)
             if reply.get("ended_diverged")
             else np.zeros(k, np.bool_),
+            ended_lost=np.zeros(k, np.bool_),
+            held=np.zeros(n, np.bool_),
             final_obs=codec.tensor(reply, "final_obs", "<f4", num_final, obs_len),
             critic_obs=self.critic_obs,
             final_critic_obs=self._critic(reply, "final_critic_obs", num_final),
@@ -320,6 +334,15 @@ class RemoteVecEnv(NotPicklable):
         finally:
             self._release()
 
+    @property
+    def in_progress(self) -> bool:
+        """True if a request was sent whose reply was not received."""
+        return self._pending is not None
+
+    def abandon(self) -> None:
+        """End the use of the environments without a request. The server releases them after the grace period."""
+        self._release()
+
     def _send(self, method: str, request: dict[str, object]) -> None:
         self._check_open()
         seq = self._last_seq + 1
@@ -343,8 +366,10 @@ class RemoteVecEnv(NotPicklable):
                 f"the state of the environments is unknown: {self._unknown}\n  call `reset` without a mask to continue"
             )
 
-    def _await_pending(self, option: Literal["timeout_s", "reset_timeout_s"]) -> dict[str, Any]:
-        """Wait for the reply to the pending request, as long as ``option`` says.
+    def _await_pending(
+        self, option: Literal["timeout_s", "reset_timeout_s"], timeout_s: float | None = None
+    ) -> dict[str, Any]:
+        """Wait for the reply to the pending request for ``timeout_s``, or as long as ``option`` says.
 
         After a timeout the request stays pending, because it may have been executed. A reply or an error with effects
         consumes its number.
@@ -352,7 +377,8 @@ class RemoteVecEnv(NotPicklable):
         assert self._pending is not None
         method, seq, pending, _ = self._pending
         try:
-            reply = self._connection.wait_reply(pending, getattr(self._options, option), option)
+            limit_s = getattr(self._options, option) if timeout_s is None else timeout_s
+            reply = self._connection.wait_reply(pending, limit_s, option)
         except (RequestTimeoutError, KeyboardInterrupt):
             raise
         except Error as error:
@@ -381,21 +407,23 @@ class RemoteVecEnv(NotPicklable):
                 # Its error is not needed, but whether its number was consumed is.
                 pass
 
-    def _checked(self, actions: NDArray[Any]) -> NDArray[np.float32]:
-        given = np.asarray(actions)
-        expected = (self.num_envs, self.spec.action_len)
-        if given.shape != expected:
-            raise InvalidActionError(f"`actions` has shape {given.shape}; {expected} is expected")
-        if given.dtype.kind not in "fiu":
-            raise InvalidActionError(f"`actions` has dtype {given.dtype}; float32 is expected")
-        checked = np.ascontiguousarray(given, dtype="<f4")
-        if not np.isfinite(checked).all():
-            env, entry = (int(index) for index in np.argwhere(~np.isfinite(checked))[0])
-            raise InvalidActionError(
-                f"the action of environment {env}, {self.spec.action_entry(entry)}, is {checked[env, entry]}\n"
-                "  nothing was stepped; check the policy that computed the action"
-            )
-        return checked
+
+def checked_actions(actions: NDArray[Any], num_envs: int, spec: codec.Spec) -> NDArray[np.float32]:
+    """Return actions, (num_envs, action_len) finite numbers, as contiguous little-endian float32."""
+    given = np.asarray(actions)
+    expected = (num_envs, spec.action_len)
+    if given.shape != expected:
+        raise InvalidActionError(f"`actions` has shape {given.shape}; {expected} is expected")
+    if given.dtype.kind not in "fiu":
+        raise InvalidActionError(f"`actions` has dtype {given.dtype}; float32 is expected")
+    checked = np.ascontiguousarray(given, dtype="<f4")
+    if not np.isfinite(checked).all():
+        env, entry = (int(index) for index in np.argwhere(~np.isfinite(checked))[0])
+        raise InvalidActionError(
+            f"the action of environment {env}, {spec.action_entry(entry)}, is {checked[env, entry]}\n"
+            "  nothing was stepped; check the policy that computed the action"
+        )
+    return checked
 
 
 def _flags(options: ConnectOptions) -> tuple[str, ...]:

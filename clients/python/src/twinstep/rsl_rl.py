@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from .env import OptionArguments
+from .env import VectorOptionArguments
 from .errors import InvalidOptionError
 from .pickling import NotPicklable
 from .vector_env import Go2VectorEnv
@@ -28,7 +28,7 @@ def make_vec_env(
     seed: int | None = None,
     max_episode_steps: int | None = None,
     device: str = "cpu",
-    **options: Unpack[OptionArguments],
+    **options: Unpack[VectorOptionArguments],
 ) -> "Go2VecEnv":
     """Create robots for an ``OnPolicyRunner``.
 
@@ -45,7 +45,7 @@ def make_vec_env(
     device
         Device of the returned tensors.
     **options
-        See :class:`twinstep.ConnectOptions`.
+        See :class:`twinstep.ConnectOptions`, and ``endpoints`` of :class:`twinstep.Go2VectorEnv`.
     """
     arguments: dict[str, Any] = dict(options)
     if max_episode_steps is not None:
@@ -126,7 +126,7 @@ class Go2VecEnv(NotPicklable, VecEnv):
         done = self._tensor(terminated | truncated)
         self.episode_length_buf[done] = 0
         extras: dict[str, Any] = {"time_outs": self._tensor((truncated & ~terminated).astype(np.float32))}
-        if "final_info" in step_info:
+        if "reward_terms" in step_info.get("final_info", {}):
             extras["log"] = _mean_terms(step_info["final_info"]["reward_terms"])
         return self.get_observations(), self._tensor(reward.astype(np.float32)), done, extras
 

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from .env import OptionArguments, RenderMode
+from .env import RenderMode, VectorOptionArguments
 from .errors import InvalidOptionError
 from .pickling import NotPicklable
 from .sub_env import SubEnvView
@@ -30,7 +30,7 @@ def make_vec_env(
     seed: int | None = None,
     max_episode_steps: int | None = None,
     render_mode: RenderMode | None = None,
-    **options: Unpack[OptionArguments],
+    **options: Unpack[VectorOptionArguments],
 ) -> "Go2VecEnv":
     """Create robots for an agent of Stable-Baselines3, like its function ``make_vec_env``.
 
@@ -47,7 +47,7 @@ def make_vec_env(
     render_mode
         ``"rgb_array"``, ``"human"`` (shows the first robot), or ``None``.
     **options
-        See :class:`twinstep.ConnectOptions`.
+        See :class:`twinstep.ConnectOptions`, and ``endpoints`` of :class:`twinstep.Go2VectorEnv`.
 
     Notes
     -----
@@ -109,11 +109,14 @@ class Go2VecEnv(NotPicklable, VecEnv):
         infos : list of dict
             ``TimeLimit.truncated``. Where an episode ended also ``terminal_observation`` and ``reward_terms``, the sum
             of each weighted reward term over the episode. With the option ``critic``: ``critic_obs``, (critic_len,)
-            float32, and where an episode ended ``terminal_critic_obs``.
+            float32, and where an episode ended ``terminal_critic_obs``. With ``endpoints``: ``held`` is True where the
+            action was not executed because the robot has no server, and ``lost`` where the server was lost.
         """
         obs, reward, terminated, truncated, vector_info = self.envs.recv()
         done = terminated | truncated
         infos = [{"TimeLimit.truncated": False, **_critic_info(vector_info, env)} for env in range(self.num_envs)]
+        for env in map(int, np.flatnonzero(vector_info.get("held", ()))):
+            infos[env]["held"] = True
         for env in map(int, np.flatnonzero(done)):
             self.reset_infos[env] = _critic_info(vector_info, env)
             final = _info_of(vector_info["final_info"], env)

@@ -1,6 +1,7 @@
 """Gymnasium vector environment of many robots, which one message steps."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Unpack, cast
 
 import gymnasium
@@ -9,11 +10,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from .discovery import ServerInfo
 from .env import OptionArguments, RenderMode, checked_render_mode, open_viewer, render_fps, reward_terms
 from .errors import InvalidOptionError
 from .pickling import NotPicklable
 from .remote import ConnectOptions, RemoteVecEnv, StepBatch
 from .render import Viewer
+from .sharded import ShardedVecEnv
 from .spaces import action_space, observation_space
 from .sub_env import SubEnvView
 
@@ -35,6 +38,9 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
         As for :class:`Go2Env`; ``"human"`` shows the first robot.
     info_timing
         Adds ``round_trip_s`` [s] to the info of every step. Without it, infos depend only on seeds and actions.
+    endpoints
+        Endpoints of several servers, or results of :func:`twinstep.discover`, among which the robots are divided; see
+        :class:`twinstep.ShardedVecEnv`. Not allowed with ``endpoint``.
     **options
         See :class:`twinstep.ConnectOptions`.
     """
@@ -47,6 +53,7 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
         max_episode_steps: int | None = None,
         render_mode: RenderMode | None = None,
         info_timing: bool = False,
+        endpoints: Sequence[str | ServerInfo] | None = None,
         **options: Unpack[OptionArguments],
     ) -> None:
         mode = _autoreset_mode(autoreset_mode)
@@ -54,9 +61,9 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
         self.render_mode = checked_mode
         self._mode = mode
         self._info_timing = info_timing
-        self._remote = RemoteVecEnv(
-            ConnectOptions(**options), num_envs=num_envs, autoreset=mode.value, max_episode_steps=max_episode_steps
-        )
+        settings = ConnectOptions(**options)
+        create = partial(RemoteVecEnv, settings) if endpoints is None else partial(ShardedVecEnv, settings, endpoints)
+        self._remote = create(num_envs=num_envs, autoreset=mode.value, max_episode_steps=max_episode_steps)
         self._viewer = open_viewer(checked_mode, self._remote)
         self.num_envs = num_envs
         self.twinstep_spec = self._remote.spec
@@ -122,6 +129,8 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
         info : dict
             ``reward_terms`` of the episodes that ended; with ``"SameStep"`` in ``final_info``, next to ``final_obs``.
             ``diverged`` is next to ``reward_terms`` for robots whose simulation became NaN or infinite.
+            With ``endpoints``: ``lost`` in place of ``reward_terms`` for robots whose server was lost in this step, and
+            ``held``, (num_envs,) bool, true for robots whose action was not executed because they have no server.
             With the option ``critic``: ``critic_obs``, and ``critic_obs`` in ``final_info``.
         """
         self.send(actions)
@@ -233,7 +242,8 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
         infos = self._critic_info()
         names = self.twinstep_spec.reward_terms
         for index, env in enumerate(batch.ended):
-            info: dict[str, Any] = {"reward_terms": reward_terms(batch, index, names)}
+            lost = bool(batch.ended_lost[index])
+            info: dict[str, Any] = {"lost": True} if lost else {"reward_terms": reward_terms(batch, index, names)}
             if batch.ended_diverged[index]:
                 info["diverged"] = True
             if self._mode is AutoresetMode.SAME_STEP:
@@ -241,6 +251,9 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
                     info["critic_obs"] = batch.final_critic_obs[index]
                 info = {"final_obs": batch.final_obs[index], "final_info": info}
             infos = self._add_info(infos, info, int(env))
+        if batch.held.any():
+            infos["held"] = batch.held
+            infos["_held"] = np.ones(self.num_envs, dtype=np.bool_)
         if self._info_timing:
             infos["round_trip_s"] = np.full(self.num_envs, batch.round_trip_s)
             infos["_round_trip_s"] = np.ones(self.num_envs, dtype=np.bool_)
