@@ -1,4 +1,4 @@
-//! 32 faults injected into real processes. `target/release/faults --faults 1000` injects more.
+//! 40 faults injected into real processes. `target/release/faults --faults 1000` injects more.
 
 use std::sync::atomic::AtomicBool;
 
@@ -21,10 +21,10 @@ fn inject(faults: usize, lanes: usize, server_arguments: &[&str]) -> FaultReport
 
 #[test]
 fn no_fault_causes_a_duplicate_a_skipped_or_an_invented_step() {
-    let tally = inject(32, 8, &[]);
+    let tally = inject(40, 8, &[]);
     println!("{tally}");
-    assert_eq!(tally.total(), 32);
-    assert_eq!(tally.injected.len(), 8, "every kind of fault was injected");
+    assert_eq!(tally.total(), 40);
+    assert_eq!(tally.injected.len(), 10, "every kind of fault was injected");
     assert!(tally.failures.is_empty(), "{:#?}", tally.failures);
 }
 

@@ -54,6 +54,7 @@ const MAY_USE: [(&str, &[&str]); 19] = [
             "ensemble",
             "env-server",
             "client",
+            "session",
             "report",
             "hunt",
             "bench",

@@ -23,14 +23,18 @@ pub enum Fault {
     MessagesDelayed,
     /// Every request is sent three times at once: it is executed once, and the three replies are equal.
     RequestRepeated,
-    /// A second server is started behind the same router or at the same endpoint: it is rejected, and the client
-    /// continues.
+    /// A second server of the same robot is started. Behind a router a new client uses one of them. At the same endpoint
+    /// the second server cannot start. The client continues.
     SecondServer,
+    /// Another client uses and reclaims the lease without its secret: every request is refused.
+    LeaseAttacked,
+    /// Another client sends thousands of requests and reads no reply: the lease remains valid.
+    RepliesUnread,
 }
 
 impl Fault {
     /// All faults.
-    pub const ALL: [Fault; 8] = [
+    pub const ALL: [Fault; 10] = [
         Fault::ServerKilled,
         Fault::ClientKilled,
         Fault::RouterKilled,
@@ -39,6 +43,8 @@ impl Fault {
         Fault::MessagesDelayed,
         Fault::RequestRepeated,
         Fault::SecondServer,
+        Fault::LeaseAttacked,
+        Fault::RepliesUnread,
     ];
 
     /// Returns the name used in tables.
@@ -51,7 +57,9 @@ impl Fault {
             Fault::ServerFrozen => "server suspended beyond the timeout, resumed",
             Fault::MessagesDelayed => "messages delayed",
             Fault::RequestRepeated => "requests sent three times at once",
-            Fault::SecondServer => "second server started by mistake",
+            Fault::SecondServer => "second server of the same robot started",
+            Fault::LeaseAttacked => "lease used by another client",
+            Fault::RepliesUnread => "another client reads no replies",
         }
     }
 

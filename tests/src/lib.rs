@@ -28,4 +28,5 @@ pub mod repeats;
 pub mod roles;
 pub mod security;
 pub mod step_oracle;
+pub mod stranger;
 pub mod test_bed;

@@ -3,18 +3,16 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv};
 use twinstep_model::Stream;
 
 use crate::fault::{Fault, moment};
 use crate::process::Process;
 use crate::proxy::Proxy;
 use crate::repeats;
+use crate::stranger;
 
 /// Maximum time for a test bed to continue after a fault.
 const RECOVERY_TIMEOUT: Duration = Duration::from_secs(30);
-/// Maximum time for the discovery of a server through the router.
-const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(3);
 /// Number of acknowledged steps after which a test bed counts as running again.
 const PROGRESS: usize = 3;
 
@@ -30,8 +28,7 @@ pub struct TestBed {
     /// Proxy between the client and `endpoint`.
     proxy: Proxy,
     plan: TestBedConfig,
-    /// Lease and epoch of the client.
-    /// Id, epoch and secret.
+    /// Id, epoch and secret of the client's lease.
     lease: [String; 3],
     /// Counters after the last acknowledged step, as printed by the client.
     acknowledged: Vec<String>,
@@ -127,6 +124,15 @@ impl TestBed {
                 self.wait_for_progress(Lease::Same)
             }
             Fault::SecondServer => self.start_second_server(),
+            Fault::LeaseAttacked => {
+                let epoch = self.lease[1].parse().map_err(|_| format!("epoch {}", self.lease[1]))?;
+                stranger::use_foreign_lease(&self.endpoint, &self.lease[0], epoch, self.steps)?;
+                self.wait_for_progress(Lease::Same)
+            }
+            Fault::RepliesUnread => {
+                stranger::read_nothing(&self.endpoint)?;
+                self.wait_for_progress(Lease::Same)
+            }
         }
     }
 
@@ -163,27 +169,14 @@ impl TestBed {
         self.wait_for_progress(Lease::Same)
     }
 
-    /// Starts a second server and checks that it has no effect.
+    /// Starts a second server and checks that it has no effect on the client.
     ///
-    /// Behind a router both servers are visible, and a new client must not choose one of them arbitrarily. At the same
-    /// endpoint the second server cannot start.
+    /// Behind a router a new client uses one of the two. At the same endpoint the second server cannot start.
     fn start_second_server(&mut self) -> Result<(), String> {
         if self.has_router() {
             let _second = start_server(&self.plan.program, &free_endpoint()?, self.router_endpoint(), &[])?;
-            let options = ConnectOptions {
-                connect_timeout: Duration::from_millis(500),
-                ..ConnectOptions::new(&self.endpoint, 1)
-            };
-            let since = Instant::now();
-            loop {
-                match RemoteVecEnv::connect(&options) {
-                    Err(ClientError::AmbiguousRobot { .. }) => return self.wait_for_progress(Lease::Same),
-                    Err(error) => return Err(format!("two servers: {error}")),
-                    // The router may not have discovered the second server yet.
-                    Ok(_) if since.elapsed() < DISCOVERY_TIMEOUT => {}
-                    Ok(_) => return Err("a client chose one of two servers".to_owned()),
-                }
-            }
+            repeats::three_times(&self.endpoint)?;
+            self.wait_for_progress(Lease::Same)
         } else {
             let mut second = Process::start(&self.plan.program, &["server".to_owned(), self.listen.clone()])?;
             match second.exit_code(RECOVERY_TIMEOUT) {

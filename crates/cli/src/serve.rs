@@ -9,16 +9,13 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_env_server::{Config, Server, ServerError, SimEnvFactory};
 use twinstep_envs::TaskConfig;
+use twinstep_session::SERVER_THREADS;
 use twinstep_sim::Engine;
 
 use crate::exit::{CommandResult, Signals, input, other};
 
 /// Interval at which the server checks for signals.
 const TICK: Duration = Duration::from_millis(50);
-
-/// Environment variable with the numbers of Zenoh's threads, and its value.
-const ZENOH_THREADS: (&str, &str) =
-    ("ZENOH_RUNTIME", "(tx: (worker_threads: 4), rx: (worker_threads: 4), net: (worker_threads: 4))");
 
 /// Serve simulated Go2 environments over Zenoh.
 ///
@@ -116,14 +113,13 @@ pub fn run(args: &Args) -> CommandResult {
 }
 
 /// Gives Zenoh several threads that send, unless the user has chosen their number.
-///
-/// With one, which is Zenoh's default, all links wait while the link of a client that does not read is closed.
 fn set_zenoh_threads() {
-    if std::env::var_os(ZENOH_THREADS.0).is_none() {
+    let (variable, threads) = SERVER_THREADS;
+    if std::env::var_os(variable).is_none() {
         // SAFETY: the program has no other thread yet that could read the environment.
         #[expect(unsafe_code, reason = "Zenoh reads the number of its threads from the environment only")]
         unsafe {
-            std::env::set_var(ZENOH_THREADS.0, ZENOH_THREADS.1);
+            std::env::set_var(variable, threads);
         }
     }
 }
