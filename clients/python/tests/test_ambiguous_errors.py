@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from twinstep import Error, Go2Env, Go2VectorEnv, MalformedError
-from twinstep.connection import Connection, Pending
+from twinstep.connection import Connection
+from twinstep.query import Pending
 
 
 @pytest.fixture

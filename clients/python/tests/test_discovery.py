@@ -52,6 +52,57 @@ def test_a_server_that_does_not_answer_is_not_reachable() -> None:
         second.release()
 
 
+def test_client_takes_the_server_with_the_most_free_environments() -> None:
+    with router() as endpoint:
+        servers = [EmbeddedServer(("--task", "counter", "--envs", n, "--connect", endpoint)) for n in ("4", "6")]
+        small, large = sorted(discover(endpoint), key=lambda info: info.max_envs or 0)
+        found: list[str] = []
+        for robot in (None, "go2", None):
+            envs = Go2VectorEnv(1, task="counter", endpoint=endpoint, robot=robot)
+            found.append(envs._remote._connection.server_id)
+            if len(found) == 1:
+                filler = Go2VectorEnv(4, task="counter", endpoint=endpoint)
+            envs.close()
+        assert found == [large.server_id, small.server_id, small.server_id]
+        filler.close()
+        for server in servers:
+            server.release()
+
+
+def test_a_server_that_does_not_answer_for_a_second_is_not_chosen() -> None:
+    with router() as endpoint:
+        servers = [EmbeddedServer(("--task", "counter", "--envs", n, "--connect", endpoint)) for n in ("4", "6")]
+        small, _ = sorted(discover(endpoint), key=lambda info: info.max_envs or 0)
+        suspend(servers[1].pid)
+        since = time.monotonic()
+        envs = Go2VectorEnv(1, task="counter", endpoint=endpoint)
+        assert time.monotonic() - since > 0.9
+        assert envs._remote._connection.server_id == small.server_id
+        os.kill(servers[1].pid, signal.SIGCONT)
+        envs.close()
+        for server in servers:
+            server.release()
+
+
+def test_client_does_not_choose_between_different_robots_or_tasks() -> None:
+    with router() as endpoint:
+        servers = [
+            EmbeddedServer(("--task", task, "--name", name, "--connect", endpoint))
+            for task, name in (("counter", "go2"), ("walk", "go2"), ("counter", "spot"))
+        ]
+        for robot, words in (
+            (None, "3 robots are visible, and `robot` is not set; visible: go2"),
+            ("go2", "2 robots have the name `go2`, and differ in task or layout or do not reply; visible: go2"),
+        ):
+            since = time.monotonic()
+            with pytest.raises(twinstep.AmbiguousRobotError, match=words):
+                Go2VectorEnv(1, task="counter", endpoint=endpoint, robot=robot, connect_timeout_s=1.0)
+            assert time.monotonic() - since > 0.9
+        Go2VectorEnv(1, task="counter", endpoint=endpoint, robot="spot").close()
+        for server in servers:
+            server.release()
+
+
 def test_invalid_endpoint_and_timeout_are_errors() -> None:
     with pytest.raises(twinstep.NoServerError, match="no program accepts connections there"):
         discover(free_endpoint(), connect_timeout_s=0.3)

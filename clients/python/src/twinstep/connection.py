@@ -1,50 +1,30 @@
-"""Connection to one server: discovery, requests with retries, reasons of timeouts."""
+"""Connection to one server: requests with retries, reasons of timeouts."""
 
 import math
 import os
 import secrets
 import time
 import uuid
-from typing import Any, cast
+from typing import Any
 
 import zenoh
 
 from . import codec
+from .discovery import choose_server
 from .errors import (
-    AmbiguousRobotError,
     InvalidOptionError,
     LeaseLostError,
     NoServerError,
     RequestTimeoutError,
     ServerExitedError,
     VersionError,
-    from_reply,
 )
+from .query import HELLO, NoReply, Pending, outcome
 from .server import EmbeddedServer
-from .session import SharedSession, check_process, connect_error, undeclare
+from .session import SharedSession, undeclare
 
 _FIRST_BACKOFF_S, _MAX_BACKOFF_S = 0.002, 0.2
 _RESTART_CONFIRMATION_S = 2.0
-HELLO: dict[str, object] = {"client": "twinstep-python"}
-
-
-class Pending:
-    """A request in progress."""
-
-    def __init__(self, querier: zenoh.Querier, payload: bytes, secret: bytes) -> None:
-        self.querier = querier
-        self.payload = payload
-        self.secret = secret
-        # None: not sent yet, or interrupted while it was sent.
-        self.replies: Any = None
-
-    def send(self) -> None:
-        """Send the request, the first time or again with the same number, so that it is executed once."""
-        check_process()
-        try:
-            self.replies = self.querier.get(payload=self.payload, attachment=self.secret)
-        except zenoh.ZError as error:
-            raise NoServerError(f"the Zenoh session is closed: {error}") from error
 
 
 class Connection:
@@ -55,7 +35,7 @@ class Connection:
     endpoint
         Zenoh endpoint of the server or of a router, such as ``tcp/127.0.0.1:7447``.
     robot
-        Name of the robot. Required if several are visible.
+        Name of the robot. Required if servers of several names or specs are visible.
     zenoh_config
         Zenoh configuration file (JSON5) for TLS, user and password.
     server
@@ -80,7 +60,8 @@ class Connection:
         self._declared: list[zenoh.Querier | zenoh.LivelinessToken] = []
         self._session = self._open(zenoh_config, connect_timeout_s)
         try:
-            self.server_id, self.name = self._find_server(robot, since, connect_timeout_s)
+            chosen = choose_server(self._session, endpoint, robot, since=since, timeout_s=connect_timeout_s)
+            self.server_id, self.name = chosen
             self.client = uuid.uuid4().hex
             """Id of this client, of which the server knows by the liveliness token that it runs."""
             # Proves that a request comes from this client. It is in no key, reply or log.
@@ -171,30 +152,6 @@ class Connection:
             )
         return hello
 
-    def _find_server(self, robot: str | None, since: float, timeout_s: float) -> tuple[str, str]:
-        while True:
-            visible = self._session.visible_servers()
-            matching = [server for server in visible if robot in (None, server[1])]
-            if len(matching) == 1:
-                return matching[0]
-            waited_s = time.monotonic() - since
-            if waited_s < timeout_s:
-                # The old token of a restarted server may be visible for a moment.
-                time.sleep(0.05)
-                continue
-            if not visible and not self._session.connected:
-                raise connect_error(self.endpoint, waited_s)
-            if not visible:
-                raise NoServerError(
-                    f"connected to {self.endpoint}, but no server is visible there after {waited_s:.1f} s "
-                    "(`connect_timeout_s`)\n"
-                    "  either no server is running, or access control hides it from this user: read the server's log"
-                )
-            count = len(matching)
-            found = f"{count} robots have the name `{robot}`" if robot else f"{count} robots are visible"
-            names = ", ".join(f"{name} ({server_id})" for server_id, name in visible)
-            raise AmbiguousRobotError(f"{found}; visible: {names}\n  set `robot` to the name of one of them")
-
     def _server_restarted(self) -> bool:
         visible = self._session.visible_servers()
         return all(server_id != self.server_id for server_id, _ in visible) and any(
@@ -217,32 +174,3 @@ class Connection:
         if hello is NoReply.TIMEOUT:
             return "the server is visible but unresponsive: it does not reply to requests"
         return "the server is visible, but queries get no reply: access control may deny queries to this user"
-
-
-class NoReply:
-    """Why a query got no reply."""
-
-    NONE: "NoReply"
-    TIMEOUT: "NoReply"
-    BUSY: "NoReply"
-
-
-NoReply.NONE, NoReply.TIMEOUT, NoReply.BUSY = NoReply(), NoReply(), NoReply()
-
-
-def outcome(pending: Pending) -> dict[str, Any] | NoReply:
-    """Return the reply to one query, or why there is none. Raises error replies of the server."""
-    if pending.replies is None:
-        return NoReply.TIMEOUT
-    for reply in pending.replies:
-        if reply.ok is not None:
-            return codec.decode(reply.ok.payload.to_bytes())
-        payload = cast(bytes, reply.err.payload.to_bytes())
-        # Errors of Zenoh, such as its timeout, are plain text; a map starts with 0x80 to 0x8f, 0xde or 0xdf.
-        if not payload or not (0x80 <= payload[0] <= 0x8F or payload[0] in (0xDE, 0xDF)):
-            return NoReply.TIMEOUT
-        error = codec.decode(payload)
-        if error.get("retryable"):
-            return NoReply.BUSY
-        raise from_reply(error["code"], error["field"], error["message"], error["hint"])
-    return NoReply.NONE

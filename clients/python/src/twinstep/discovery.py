@@ -1,4 +1,4 @@
-"""Servers that are visible at an endpoint, with their tasks and free environments."""
+"""Servers that are visible at an endpoint, and the choice of one."""
 
 import contextlib
 import time
@@ -7,9 +7,15 @@ from typing import Any
 
 from . import codec
 from .codec import Spec
-from .connection import HELLO, Pending, outcome
-from .errors import Error, InvalidOptionError
-from .session import SharedSession, undeclare
+from .errors import AmbiguousRobotError, Error, InvalidOptionError, NoServerError
+from .query import HELLO, Pending, outcome
+from .session import SharedSession, connect_error, undeclare
+
+_GONE_S = 1.0
+"""Time without a reply after which a visible server counts as gone. A router needs a moment to find the way to it."""
+
+_POLL_PERIOD_S = 0.05
+"""Pause between two queries for the visible servers."""
 
 
 @dataclass(frozen=True)
@@ -77,10 +83,89 @@ def discover(
         if not value > 0:
             raise InvalidOptionError(f"`{option}` = {value} s; must be greater than 0")
     session = SharedSession.open(endpoint, zenoh_config, connect_timeout_s)
-    visible = session.visible_servers()
-    hellos = _hellos(session, [server_id for server_id, _ in visible], timeout_s)
-    found = (_info(endpoint, server_id, robot, hellos.get(server_id)) for server_id, robot in visible)
+    found = _infos(session, endpoint, session.visible_servers(), timeout_s)
     return sorted(found, key=lambda info: (info.robot, info.server_id))
+
+
+def choose_server(
+    session: SharedSession, endpoint: str, robot: str | None, *, since: float, timeout_s: float
+) -> tuple[str, str]:
+    """Return the id and the robot of the server to connect to.
+
+    Among several servers with the same robot, task and spec hash it is the one with the most free environments.
+
+    Parameters
+    ----------
+    session
+        Session with the endpoint.
+    endpoint
+        Endpoint, for the errors.
+    robot
+        Name of the robot. ``None``: any.
+    since
+        Start of connecting, on the clock of ``time.monotonic`` [s].
+    timeout_s
+        Timeout of connecting [s].
+    """
+    while True:
+        visible = session.visible_servers()
+        matching = [server for server in visible if robot in (None, server[1])]
+        if len(matching) == 1:
+            return matching[0]
+        left_s = since + timeout_s - time.monotonic()
+        servers = _infos(session, endpoint, matching, min(_GONE_S, left_s))
+        waited_s = time.monotonic() - since
+        if waited_s >= min(_GONE_S, timeout_s):
+            servers = [server for server in servers if server.reachable]
+        chosen = _most_free(servers)
+        if chosen is not None:
+            return chosen.server_id, chosen.robot
+        if waited_s >= timeout_s:
+            raise _no_choice(session, endpoint, robot, visible, waited_s)
+        # The token of a server that starts or has ended may be visible a moment later or longer.
+        time.sleep(_POLL_PERIOD_S)
+
+
+def _most_free(servers: list[ServerInfo]) -> ServerInfo | None:
+    """Return the server with the most free environments.
+
+    Returns ``None`` if they differ in robot, task or spec, or one has not answered.
+    """
+    kinds = {(server.robot, server.spec.task, server.spec.hash) if server.spec else None for server in servers}
+    if len(kinds) != 1 or None in kinds:
+        return None
+    return max(servers, key=lambda server: server.free_envs or 0)
+
+
+def _no_choice(
+    session: SharedSession,
+    endpoint: str,
+    robot: str | None,
+    visible: list[tuple[str, str]],
+    waited_s: float,
+) -> Error:
+    if not visible and not session.connected:
+        return connect_error(endpoint, waited_s)
+    if not visible:
+        return NoServerError(
+            f"connected to {endpoint}, but no server is visible there after {waited_s:.1f} s "
+            "(`connect_timeout_s`)\n"
+            "  either no server is running, or access control hides it from this user: read the server's log"
+        )
+    count = sum(robot in (None, name) for _, name in visible)
+    if robot is None:
+        found = f"{count} robots are visible, and `robot` is not set"
+    elif count == 0:
+        found = f"0 robots have the name `{robot}`"
+    else:
+        found = f"{count} robots have the name `{robot}`, and differ in task or layout or do not reply"
+    names = ", ".join(f"{name} ({server_id})" for server_id, name in visible)
+    return AmbiguousRobotError(f"{found}; visible: {names}\n  set `robot` to the name of one of them")
+
+
+def _infos(session: SharedSession, endpoint: str, servers: list[tuple[str, str]], timeout_s: float) -> list[ServerInfo]:
+    hellos = _hellos(session, [server_id for server_id, _ in servers], timeout_s)
+    return [_info(endpoint, server_id, robot, hellos.get(server_id)) for server_id, robot in servers]
 
 
 def _hellos(session: SharedSession, server_ids: list[str], timeout_s: float) -> dict[str, dict[str, Any]]:

@@ -12,7 +12,7 @@ class NoServerError(Error):
 
 
 class AmbiguousRobotError(Error):
-    """No robot has the requested name, or several robots are visible and ``robot`` is not set."""
+    """No robot has the requested name, or several servers match and differ in robot, task or spec."""
 
 
 class VersionError(Error):

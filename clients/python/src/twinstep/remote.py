@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import codec
-from .connection import Connection, Pending
+from .connection import Connection
 from .errors import (
     Error,
     InvalidActionError,
@@ -19,6 +19,7 @@ from .errors import (
     SpecMismatchError,
 )
 from .pickling import NotPicklable
+from .query import Pending
 from .server import EmbeddedServer
 
 UNLIMITED = 2**32 - 1
@@ -37,7 +38,8 @@ class ConnectOptions:
     endpoint
         Zenoh endpoint of a server, a robot or a router. ``None`` starts the bundled server.
     robot
-        Name of the robot. Required if several are visible at ``endpoint``.
+        Name of the robot. Required if several are visible at ``endpoint``. Among several servers of the same robot,
+        task and spec hash, that with the most free environments is chosen.
     task
         Name of the task. A server at ``endpoint`` must have this task.
     config, model
