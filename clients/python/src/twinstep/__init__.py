@@ -35,6 +35,7 @@ from .errors import (
     VersionError,
 )
 from .factory import EnvFactory
+from .grouped import GroupedVecEnv
 from .remote import ConnectOptions, RemoteVecEnv, StepBatch
 from .server import EmbeddedServer, ServerNotFoundError, ServerStartError
 from .sharded import ShardedVecEnv
@@ -53,6 +54,7 @@ __all__ = [
     "ForkedProcessError",
     "Go2Env",
     "Go2VectorEnv",
+    "GroupedVecEnv",
     "InvalidActionError",
     "InvalidOptionError",
     "LeaseLostError",

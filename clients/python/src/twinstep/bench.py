@@ -11,19 +11,23 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 
+from .grouped import GroupedVecEnv
+from .remote import ConnectOptions
 from .server import find_program
 from .vector_env import Go2VectorEnv
 
 WINDOWS = 5
 NUM_ENVS = (1, 64, 1024)
 ANT_ENVS = 64
+GROUPS, GROUP_ENVS = 3, 64
 
 Row = dict[str, Any]
 
@@ -43,6 +47,24 @@ def measure_rate(once: Callable[[], object], window_s: float) -> tuple[float, fl
         rates.append(len(times) / (last - since))
         medians.append(1e6 * statistics.median(times))
     return statistics.median(rates), statistics.median(medians)
+
+
+def measure_alternately(cases: Sequence[Callable[[], object]], window_s: float) -> list[float]:
+    """Return the calls per second of each case, the median of five windows.
+
+    The windows alternate, so that other programs on the machine disturb all cases alike.
+    """
+    rates: list[list[float]] = [[] for _ in cases]
+    for once in cases:
+        once()
+    for _ in range(WINDOWS):
+        for once, of_case in zip(cases, rates, strict=True):
+            calls, since = 0, time.perf_counter()
+            while time.perf_counter() - since < window_s:
+                once()
+                calls += 1
+            of_case.append(calls / (time.perf_counter() - since))
+    return [statistics.median(of_case) for of_case in rates]
 
 
 @contextmanager
@@ -82,6 +104,51 @@ def physics(window_s: float) -> Iterator[Row]:
         if num_envs == ANT_ENVS:
             for baseline, baseline_rate in ant_rates(window_s):
                 yield row(f"walk, {num_envs} envs", rate, "env-steps/s", f"{baseline}, Ant-v5", baseline_rate)
+
+
+def groups(window_s: float) -> Iterator[Row]:
+    """Measure three groups of 64 robots in flight, compared with one lease of 64 and one of 192.
+
+    The actions come from a small network: the groups step while it computes.
+    """
+    generator = np.random.default_rng(1)
+    weights = [generator.normal(0, 0.05, size).astype(np.float32) for size in ((45, 256), (256, 12))]
+
+    def policy(obs: NDArray[np.float32]) -> NDArray[np.float32]:
+        for weight in weights:
+            # Not `@`: the threads of BLAS compete with the server for the cores.
+            obs = np.tanh(np.einsum("ij,jk->ik", obs, weight))
+        return obs
+
+    num_envs = GROUPS * GROUP_ENVS
+    options = ConnectOptions()
+    together, one, all_rows = (
+        GroupedVecEnv(options, groups=count, num_envs=envs, autoreset="NextStep", max_episode_steps=None)
+        for count, envs in ((GROUPS, num_envs), (1, GROUP_ENVS), (1, num_envs))
+    )
+
+    def step_groups() -> None:
+        for group in range(GROUPS):
+            together.send(group, policy(together.recv(group).obs))
+
+    def stepped(envs: GroupedVecEnv) -> Callable[[], object]:
+        last = [envs.reset(np.arange(envs.num_envs, dtype=np.uint64), None)]
+
+        def step() -> None:
+            last[0] = envs.step(policy(last[0])).obs
+
+        return step
+
+    obs = together.reset(np.arange(num_envs, dtype=np.uint64), None)
+    for group in range(GROUPS):
+        together.send(group, policy(obs[together.rows(group)]))
+    rates = measure_alternately([step_groups, stepped(one), stepped(all_rows)], window_s)
+    in_flight, of_one, of_all = rates[0] * num_envs, rates[1] * GROUP_ENVS, rates[2] * num_envs
+    case = f"walk, {GROUPS} groups of {GROUP_ENVS}"
+    yield row(case, in_flight, "env-steps/s", f"one group of {GROUP_ENVS}", of_one)
+    yield row(case, in_flight, "env-steps/s", f"{num_envs} in one lease", of_all)
+    for envs in (together, one, all_rows):
+        envs.close()
 
 
 def row(case: str, value: float, unit: str, reference: str | None = None, reference_value: float | None = None) -> Row:
@@ -131,15 +198,17 @@ def installed(module: str) -> bool:
     return False
 
 
+PARTS: dict[str, Callable[[float], Iterator[Row]]] = {"transport": transport, "physics": physics, "groups": groups}
+
+
 def main() -> None:
     """Run the measurements and print the results."""
     parser = argparse.ArgumentParser(prog="python -m twinstep.bench", description=__doc__)
-    parser.add_argument("what", nargs="?", choices=["transport", "physics"], help="default: both")
+    parser.add_argument("what", nargs="?", choices=list(PARTS), help="default: all")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--window-s", type=float, default=1.0, help="length of one of the five windows of each case")
     arguments = parser.parse_args()
-    parts = {"transport": transport, "physics": physics}
-    chosen = [parts[arguments.what]] if arguments.what else list(parts.values())
+    chosen = [PARTS[arguments.what]] if arguments.what else list(PARTS.values())
     rows = list[Row]()
     for part in chosen:
         for each in part(arguments.window_s):

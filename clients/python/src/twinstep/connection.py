@@ -42,6 +42,8 @@ class Connection:
         The server at ``endpoint`` if this process started it.
     connect_timeout_s
         Timeout of opening the session, finding the server and its first reply together [s].
+    server_id
+        Id of the server. ``None``: any.
     """
 
     def __init__(
@@ -52,6 +54,7 @@ class Connection:
         zenoh_config: str | None,
         server: EmbeddedServer | None,
         connect_timeout_s: float,
+        server_id: str | None = None,
     ) -> None:
         self.endpoint = endpoint
         self._server = server
@@ -60,7 +63,7 @@ class Connection:
         self._declared: list[zenoh.Querier | zenoh.LivelinessToken] = []
         self._session = self._open(zenoh_config, connect_timeout_s)
         try:
-            chosen = choose_server(self._session, endpoint, robot, since=since, timeout_s=connect_timeout_s)
+            chosen = choose_server(self._session, endpoint, robot, server_id, since=since, timeout_s=connect_timeout_s)
             self.server_id, self.name = chosen
             self.client = uuid.uuid4().hex
             """Id of this client, of which the server knows by the liveliness token that it runs."""

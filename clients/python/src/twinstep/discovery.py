@@ -88,7 +88,13 @@ def discover(
 
 
 def choose_server(
-    session: SharedSession, endpoint: str, robot: str | None, *, since: float, timeout_s: float
+    session: SharedSession,
+    endpoint: str,
+    robot: str | None,
+    server_id: str | None,
+    *,
+    since: float,
+    timeout_s: float,
 ) -> tuple[str, str]:
     """Return the id and the robot of the server to connect to.
 
@@ -102,6 +108,8 @@ def choose_server(
         Endpoint, for the errors.
     robot
         Name of the robot. ``None``: any.
+    server_id
+        Id of the server. ``None``: any.
     since
         Start of connecting, on the clock of ``time.monotonic`` [s].
     timeout_s
@@ -109,7 +117,7 @@ def choose_server(
     """
     while True:
         visible = session.visible_servers()
-        matching = [server for server in visible if robot in (None, server[1])]
+        matching = [one for one in visible if server_id in (None, one[0]) and robot in (None, one[1])]
         if len(matching) == 1:
             return matching[0]
         left_s = since + timeout_s - time.monotonic()

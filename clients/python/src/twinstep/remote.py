@@ -138,10 +138,18 @@ class RemoteVecEnv(NotPicklable):
         ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``; executed by the server.
     max_episode_steps
         Policy steps after which an episode is truncated. ``None``: the number of the task.
+    server_id
+        Id of the server among those at the endpoint. ``None``: any.
     """
 
     def __init__(
-        self, options: ConnectOptions, *, num_envs: int, autoreset: str, max_episode_steps: int | None
+        self,
+        options: ConnectOptions,
+        *,
+        num_envs: int,
+        autoreset: str,
+        max_episode_steps: int | None,
+        server_id: str | None = None,
     ) -> None:
         if num_envs < 1:
             raise InvalidOptionError(f"`num_envs` = {num_envs}; must be at least 1")
@@ -159,6 +167,7 @@ class RemoteVecEnv(NotPicklable):
                 zenoh_config=options.zenoh_config,
                 server=server,
                 connect_timeout_s=options.connect_timeout_s,
+                server_id=server_id,
             )
         except BaseException:
             if server is not None:
@@ -335,6 +344,11 @@ class RemoteVecEnv(NotPicklable):
             pass
         finally:
             self._release()
+
+    @property
+    def server_id(self) -> str:
+        """Id of the server, new at every start."""
+        return self._connection.server_id
 
     @property
     def in_progress(self) -> bool:

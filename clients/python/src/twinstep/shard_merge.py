@@ -1,11 +1,18 @@
-"""Merges the steps of several servers into one step of all environments."""
+"""Environments divided among several leases, and their steps merged into one."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .remote import StepBatch
+
+
+def divide(num_envs: int, parts: int) -> list[slice]:
+    """Return the rows of each part. The numbers of rows differ by at most one."""
+    bounds = [num_envs * index // parts for index in range(parts + 1)]
+    return [slice(start, stop) for start, stop in pairwise(bounds)]
 
 
 def merge(
@@ -24,7 +31,7 @@ def merge(
     Parameters
     ----------
     parts
-        Rows of each server, and its step.
+        Rows of each lease, and its step.
     lost : (k,) int
         Environments to truncate, because their server was lost.
     obs, critic_obs : (num_envs, obs_len) and (num_envs, critic_len) float32

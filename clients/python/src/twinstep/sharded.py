@@ -18,7 +18,7 @@ from .pickling import NotPicklable
 from .recovery import Recovery, lease_again, recovery_seed
 from .remote import ConnectOptions, RemoteVecEnv, StepBatch, checked_actions
 from .session import QUERY_TIMEOUT_S, check_process
-from .shard_merge import merge
+from .shard_merge import divide, merge
 
 _LOG = logging.getLogger(__name__)
 
@@ -60,8 +60,8 @@ class ShardedVecEnv(NotPicklable):
     options
         Task and timeouts. ``endpoint`` and ``robot`` of the servers replace those of the options.
     servers
-        Endpoints, or results of :func:`twinstep.discover`, which also have the name of the robot. Servers behind the
-        same router need different names (``twinstep serve --name``).
+        Endpoints, or results of :func:`twinstep.discover`, which also have the name of the robot. Among servers of the
+        same name behind a router, each lease is at the one with the most free environments.
     num_envs, autoreset, max_episode_steps
         As for ``RemoteVecEnv``. ``num_envs`` is at least the number of servers.
     """
@@ -85,10 +85,8 @@ class ShardedVecEnv(NotPicklable):
         self._shards: list[_Shard] = []
         # Ends the threads at garbage collection if `close` was not called. The leases have finalizers of their own.
         self._release = weakref.finalize(self, _stop, self._shards)
-        bounds = [num_envs * index // len(found) for index in range(len(found) + 1)]
         try:
-            for index, own in enumerate(found):
-                rows = slice(bounds[index], bounds[index + 1])
+            for own, rows in zip(found, divide(num_envs, len(found)), strict=True):
                 remote = RemoteVecEnv(
                     own, num_envs=rows.stop - rows.start, autoreset=autoreset, max_episode_steps=max_episode_steps
                 )
