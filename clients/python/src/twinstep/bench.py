@@ -28,6 +28,7 @@ WINDOWS = 5
 NUM_ENVS = (1, 64, 1024)
 ANT_ENVS = 64
 GROUPS, GROUP_ENVS = 3, 64
+SHARED_MEMORY_ENVS = (1024, 4096)
 
 Row = dict[str, Any]
 
@@ -68,9 +69,9 @@ def measure_alternately(cases: Sequence[Callable[[], object]], window_s: float) 
 
 
 @contextmanager
-def stepping(num_envs: int, task: str) -> Generator[Callable[[], object], None, None]:
+def stepping(num_envs: int, task: str, *, shared_memory: bool = False) -> Generator[Callable[[], object], None, None]:
     """Yield a function that executes one step of ``num_envs`` robots of the bundled server."""
-    envs = Go2VectorEnv(num_envs, task=task)
+    envs = Go2VectorEnv(num_envs, task=task, shared_memory=shared_memory)
     envs.reset(seed=1)
     actions = np.zeros((num_envs, 12), np.float32)
     try:
@@ -104,6 +105,14 @@ def physics(window_s: float) -> Iterator[Row]:
         if num_envs == ANT_ENVS:
             for baseline, baseline_rate in ant_rates(window_s):
                 yield row(f"walk, {num_envs} envs", rate, "env-steps/s", f"{baseline}, Ant-v5", baseline_rate)
+
+
+def shared_memory(window_s: float) -> Iterator[Row]:
+    """Measure the transport through shared memory, compared with TCP."""
+    for num_envs in SHARED_MEMORY_ENVS:
+        with stepping(num_envs, "counter") as tcp, stepping(num_envs, "counter", shared_memory=True) as shared:
+            rates = measure_alternately([shared, tcp], window_s)
+        yield row(f"shared memory, {num_envs} envs", rates[0], "round trips/s", "TCP", rates[1])
 
 
 def groups(window_s: float) -> Iterator[Row]:
@@ -198,7 +207,12 @@ def installed(module: str) -> bool:
     return False
 
 
-PARTS: dict[str, Callable[[float], Iterator[Row]]] = {"transport": transport, "physics": physics, "groups": groups}
+PARTS: dict[str, Callable[[float], Iterator[Row]]] = {
+    "transport": transport,
+    "shared-memory": shared_memory,
+    "physics": physics,
+    "groups": groups,
+}
 
 
 def main() -> None:

@@ -44,6 +44,8 @@ class Connection:
         Timeout of opening the session, finding the server and its first reply together [s].
     server_id
         Id of the server. ``None``: any.
+    shared_memory
+        Sends large messages through shared memory.
     """
 
     def __init__(
@@ -55,13 +57,14 @@ class Connection:
         server: EmbeddedServer | None,
         connect_timeout_s: float,
         server_id: str | None = None,
+        shared_memory: bool = False,
     ) -> None:
         self.endpoint = endpoint
         self._server = server
         self._pid = os.getpid()
         since = time.monotonic()
         self._declared: list[zenoh.Querier | zenoh.LivelinessToken] = []
-        self._session = self._open(zenoh_config, connect_timeout_s)
+        self._session = self._open(zenoh_config, shared_memory, connect_timeout_s)
         try:
             chosen = choose_server(self._session, endpoint, robot, server_id, since=since, timeout_s=connect_timeout_s)
             self.server_id, self.name = chosen
@@ -136,9 +139,9 @@ class Connection:
             pause = min(2 * pause, _MAX_BACKOFF_S)
             pending.send()
 
-    def _open(self, zenoh_config: str | None, timeout_s: float) -> SharedSession:
+    def _open(self, zenoh_config: str | None, shared_memory: bool, timeout_s: float) -> SharedSession:
         try:
-            return SharedSession.open(self.endpoint, zenoh_config, timeout_s)
+            return SharedSession.open(self.endpoint, zenoh_config, timeout_s, shared_memory=shared_memory)
         except NoServerError as error:
             if self._server is not None and not self._server.alive:
                 raise ServerExitedError(self._server.exit_report()) from error

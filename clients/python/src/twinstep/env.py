@@ -28,6 +28,7 @@ class OptionArguments(TypedDict, total=False):
     config: str | None
     model: str | None
     zenoh_config: str | None
+    shared_memory: bool
     spec_hash: str | None
     critic: bool
     timeout_s: float

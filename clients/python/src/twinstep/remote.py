@@ -46,6 +46,9 @@ class ConnectOptions:
         Config file and model file of the bundled server (``twinstep serve --help``). Not allowed with ``endpoint``.
     zenoh_config
         Zenoh configuration file (JSON5) for TLS, user and password.
+    shared_memory
+        Sends large messages through shared memory. The server must run on this machine with the flag
+        ``--shared-memory``, which the bundled server gets; otherwise the messages are sent over the network.
     spec_hash
         Spec hash for which the agent was trained. A server with a different hash is rejected.
     critic
@@ -62,6 +65,7 @@ class ConnectOptions:
     config: str | None = None
     model: str | None = None
     zenoh_config: str | None = None
+    shared_memory: bool = False
     spec_hash: str | None = None
     critic: bool = False
     timeout_s: float = 5.0
@@ -165,6 +169,7 @@ class RemoteVecEnv(NotPicklable):
                 endpoint,
                 robot=options.robot,
                 zenoh_config=options.zenoh_config,
+                shared_memory=options.shared_memory,
                 server=server,
                 connect_timeout_s=options.connect_timeout_s,
                 server_id=server_id,
@@ -448,6 +453,8 @@ def _flags(options: ConnectOptions) -> tuple[str, ...]:
         flags += ["--config", options.config]
     if options.model is not None:
         flags += ["--model", options.model]
+    if options.shared_memory:
+        flags.append("--shared-memory")
     return tuple(flags)
 
 

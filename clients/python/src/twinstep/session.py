@@ -28,7 +28,7 @@ _CLOSE_TIMEOUT_S = 1.0
 """Zenoh tries for 10 s to close a link to a server that does not read. The rest of this happens in a thread."""
 _LIVE_SERVERS = "twinstep/live/server/*/*"
 
-_Key = tuple[str, str | None]
+_Key = tuple[str, str | None, bool]
 
 
 class SharedSession:
@@ -54,11 +54,16 @@ class SharedSession:
         weakref.finalize(self, _close, session, os.getpid())
 
     @classmethod
-    def open(cls, endpoint: str, zenoh_config: str | None, timeout_s: float) -> "SharedSession":
-        """Return the session for this endpoint and configuration file. Opens one if there is none."""
+    def open(
+        cls, endpoint: str, zenoh_config: str | None, timeout_s: float, *, shared_memory: bool = False
+    ) -> "SharedSession":
+        """Return the session with this endpoint, configuration file and use of shared memory.
+
+        Opens one if there is none.
+        """
         check_process()
         since = time.monotonic()
-        key = (endpoint, _content(zenoh_config))
+        key = (endpoint, _content(zenoh_config), shared_memory)
         with cls._lock:
             opening = cls._opening.setdefault(key, threading.Lock())
         if not opening.acquire(timeout=min(timeout_s, threading.TIMEOUT_MAX)):
@@ -67,8 +72,8 @@ class SharedSession:
         try:
             shared = cls._open.get(key)
             if shared is None or shared._session.is_closed():
-                left_s = timeout_s - (time.monotonic() - since)
-                shared = cls(_open_session(endpoint, zenoh_config, left_s, since))
+                config = _zenoh_config(endpoint, zenoh_config, timeout_s - (time.monotonic() - since), shared_memory)
+                shared = cls(_open_session(config, endpoint, since))
                 cls._open[key] = shared
             return shared
         finally:
@@ -159,8 +164,7 @@ def _close_session(session: zenoh.Session, closed: _thread.LockType) -> None:
     closed.release()
 
 
-def _open_session(endpoint: str, path: str | None, timeout_s: float, since: float) -> zenoh.Session:
-    config = _zenoh_config(endpoint, path, timeout_s)
+def _open_session(config: zenoh.Config, endpoint: str, since: float) -> zenoh.Session:
     _ZenohProcess.pid = os.getpid()
     try:
         return zenoh.open(config)
@@ -190,7 +194,7 @@ def _content(path: str | None) -> str | None:
         raise InvalidOptionError(f"`zenoh_config` = {path} cannot be read: {error}") from error
 
 
-def _zenoh_config(endpoint: str, path: str | None, timeout_s: float) -> zenoh.Config:
+def _zenoh_config(endpoint: str, path: str | None, timeout_s: float, shared_memory: bool) -> zenoh.Config:
     try:
         config = zenoh.Config() if path is None else zenoh.Config.from_file(path)
         for key, value in (
@@ -204,7 +208,7 @@ def _zenoh_config(endpoint: str, path: str | None, timeout_s: float) -> zenoh.Co
             # A step of 4096 robots is sent in twelve fragments; Zenoh's default queue of two delays them.
             ("transport/link/tx/queue/size/data", "16"),
             ("transport/link/rx/buffer_size", "2097152"),
-            ("transport/shared_memory/enabled", "false"),
+            ("transport/shared_memory/enabled", json.dumps(shared_memory)),
         ):
             config.insert_json5(key, value)
     except zenoh.ZError as error:
