@@ -166,9 +166,16 @@ class Connection:
 
     def _timeout_reason(self, option: str) -> str:
         if not self._session.connected:
-            return "the connection is lost and cannot be restored; check that the server or the router is running"
+            return (
+                "the connection is lost and cannot be restored; check that the server or the router is running and not "
+                "suspended"
+            )
         if all(server_id != self.server_id for server_id, _ in self._session.visible_servers()):
-            return "the connection works, but the server is no longer visible: it has terminated or lost its router"
+            # A suspended server that is connected directly does not answer the query for visible servers either.
+            return (
+                "the server is no longer visible: it has terminated or lost its router, or, without a router, it is "
+                "unresponsive"
+            )
         pending = self.pending(self._hello_querier, HELLO)
         pending.send()
         hello = outcome(pending)
