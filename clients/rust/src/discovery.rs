@@ -82,7 +82,7 @@ fn with_hellos(session: &Session, servers: Vec<(String, String)>) -> Vec<ServerI
 
 /// Returns the id and the robot of the server to connect to.
 ///
-/// Among several servers with the same robot and spec it is the one with the most free environments.
+/// Among several servers with the same robot, task and layout it is the one with the most free environments.
 pub fn choose_server(session: &Session, options: &ConnectOptions) -> Result<(String, String), ClientError> {
     let since = Instant::now();
     loop {
@@ -107,9 +107,12 @@ pub fn choose_server(session: &Session, options: &ConnectOptions) -> Result<(Str
     }
 }
 
-/// Returns the server with the most free environments. `None` if they differ in robot or spec, or one does not answer.
+/// Returns the server with the most free environments. `None` if they differ in robot, task or layout, or one does not answer.
 fn most_free(servers: Vec<ServerInfo>) -> Option<ServerInfo> {
-    let kind = |server: &ServerInfo| Some((server.robot.clone(), server.hello.as_ref()?.spec_hash.clone()));
+    let kind = |server: &ServerInfo| {
+        let hello = server.hello.as_ref()?;
+        Some((server.robot.clone(), hello.spec.task.clone(), hello.spec_hash.clone()))
+    };
     let first = kind(servers.first()?)?;
     let all_alike = servers.iter().all(|server| kind(server).as_ref() == Some(&first));
     let free = |server: &ServerInfo| server.hello.as_ref().map_or(0, |hello| hello.free_envs);
