@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io::Write;
+use std::panic::catch_unwind;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -21,6 +22,15 @@ use crate::table::Table;
 
 /// Reads all row groups.
 pub(crate) fn read(file: &Path) -> Result<Table, LogError> {
+    // The Parquet library panics on some damaged files: negative offsets, dictionary indices without a dictionary,
+    // pages that are shorter than their number of values.
+    catch_unwind(|| read_row_groups(file)).unwrap_or_else(|_| {
+        let cause = ParquetError::General("its metadata and its pages contradict each other".to_owned());
+        Err(LogError::Parquet { file: file.into(), cause })
+    })
+}
+
+fn read_row_groups(file: &Path) -> Result<Table, LogError> {
     let failed = |cause| LogError::Parquet { file: file.into(), cause };
     let opened = File::open(file).map_err(|cause| LogError::Read { file: file.into(), cause })?;
     let reader = SerializedFileReader::new(opened).map_err(failed)?;

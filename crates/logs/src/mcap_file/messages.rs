@@ -9,12 +9,10 @@ use mcap::McapError;
 use mcap::records::{MessageHeader, Metadata, Record};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
+use super::lengths::{MAX_READ, check_texts, is_used, length_limit};
 use super::{METADATA, PART_TOPIC, SegmentStart};
 use crate::go2_message::{LowCmd, LowState};
 use crate::{LogError, Meta, cdr};
-
-/// Limit of the length of chunks and records; longer ones are treated as damage [bytes].
-const LENGTH_LIMIT: usize = 1 << 30;
 
 /// Content of an MCAP file that belongs to a log.
 #[derive(Default)]
@@ -50,19 +48,23 @@ impl Recording {
     pub fn read(file: &Path) -> Result<Recording, LogError> {
         let refused = |cause| LogError::Read { file: file.into(), cause };
         let damaged = |cause| LogError::Mcap { file: file.into(), cause };
-        let mut source = BufReader::new(File::open(file).map_err(refused)?);
+        let opened = File::open(file).map_err(refused)?;
+        let limit = length_limit(opened.metadata().map_err(refused)?.len());
+        let mut source = BufReader::new(opened);
         let options = LinearReaderOptions::default().with_prevalidate_chunk_crcs(true);
-        let mut reader = LinearReader::new_with_options(options.with_record_length_limit(LENGTH_LIMIT));
+        let mut reader = LinearReader::new_with_options(options.with_record_length_limit(limit));
         let mut recording = Recording::default();
         while let Some(event) = reader.next_event() {
             match event {
                 Ok(LinearReadEvent::ReadRequest(bytes)) => {
-                    let got = source.read(reader.insert(bytes)).map_err(refused)?;
+                    let got = source.read(reader.insert(bytes.min(MAX_READ))).map_err(refused)?;
                     reader.notify_read(got);
                 }
-                Ok(LinearReadEvent::Record { data, opcode }) => {
-                    recording.add(file, mcap::parse_record(opcode, data).map_err(damaged)?)?;
+                Ok(LinearReadEvent::Record { data, opcode }) if is_used(opcode) => {
+                    let record = check_texts(opcode, data).and_then(|()| mcap::parse_record(opcode, data));
+                    recording.add(file, record.map_err(damaged)?)?;
                 }
+                Ok(LinearReadEvent::Record { .. }) => {}
                 // A recorder that lost power wrote complete chunks up to that time.
                 Err(McapError::UnexpectedEof) if !recording.states.is_empty() => {
                     recording.truncated = true;

@@ -1,11 +1,13 @@
 //! Logs as MCAP: reading and writing the robot's `/lowstate` and `/lowcmd`, one row per state.
 //!
 //! - [`messages`]: the messages of a file, and the metadata of a file that `Log::write` wrote.
+//! - [`lengths`]: limits of the lengths in a file.
 //! - [`rows`]: each state with the command in force.
 //! - [`columns`]: the columns of these rows.
 //! - [`mod@read`], [`mod@write`]: a log from a file, and a file from a log.
 
 mod columns;
+mod lengths;
 mod messages;
 mod read;
 mod rows;

@@ -450,3 +450,14 @@ fn invalid_mcap_file_is_rejected() {
     fs::write(&path, "").expect("a file");
     assert!(matches!(Log::open(&path), Err(LogError::Mcap { .. })));
 }
+
+#[test]
+fn record_that_claims_to_be_longer_than_the_file_is_an_error() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("data.mcap");
+    // A channel of 2^29 bytes, in a file of 17.
+    let record = [&[4][..], &(1u64 << 29).to_le_bytes()].concat();
+    fs::write(&file, [b"\x89MCAP0\r\n", &record[..]].concat()).expect("written");
+    let error = Log::open(&file).expect_err("damaged");
+    assert!(matches!(error, LogError::Mcap { .. }), "{error}");
+}
