@@ -143,6 +143,10 @@ impl Ensemble {
     pub fn read(path: impl AsRef<Path>) -> Result<Self, EnsembleError> {
         let arrays = Arrays::read(path.as_ref())?;
         let description: EnsembleMetadata = arrays.header("ensemble")?;
+        let EnsembleMetadata { members, hidden, .. } = description;
+        if members == 0 || hidden == 0 {
+            return Err(arrays.problem(format!("has {members} members of {hidden} units; both must be 1 or more")));
+        }
         if let Some(problem) = bad_gains(&description) {
             return Err(arrays.problem(problem));
         }
@@ -247,6 +251,17 @@ mod tests {
         );
         let negative = error(&[[20.0, 0.5], [20.0, -0.5]]);
         assert!(negative.ends_with("of FL_calf with kp 20 and kd -0.5; both must be 0 or more"), "{negative}");
+    }
+
+    #[test]
+    fn ensemble_without_members_is_rejected() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("ensemble.safetensors");
+        let mut ensemble = ensemble();
+        (ensemble.description.members, ensemble.members) = (0, Vec::new());
+        ensemble.write(&path).expect("written");
+        let error = Ensemble::read(&path).expect_err("error").to_string();
+        assert!(error.ends_with("has 0 members of 3 units; both must be 1 or more"), "{error}");
     }
 
     #[test]
