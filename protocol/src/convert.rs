@@ -10,6 +10,31 @@ use crate::{ErrorCode, ErrorReply, PROTOCOL, encode, message, tensor};
 /// Upper bound on the size of a message without its tensors [bytes].
 const MAP_OVERHEAD: usize = 256;
 
+/// Maximum size of one array in the reply to a step [bytes]. Zenoh refuses messages of more than 1 GiB.
+const MAX_ARRAY_BYTES: u64 = 1 << 30;
+
+/// Returns the number of environments of a lease. Fails if a client could not receive their observations.
+///
+/// Without this check, the lengths in a damaged lease reply would decide how much memory a client allocates.
+pub fn check_lease(num_envs: u64, spec: &EnvSpec) -> Result<usize, ErrorReply> {
+    let too_large = |field, sum: u64| {
+        let message = format!("the lease has {num_envs} environments with {sum} numbers each, more than a reply holds");
+        Err(ErrorReply::new(ErrorCode::OutOfRange, field, message))
+    };
+    let fields = [
+        ("observation", &spec.observation),
+        ("critic_observation", &spec.critic_observation),
+        ("action", &spec.action),
+    ];
+    for (name, fields) in fields {
+        let sum = fields.iter().fold(0u64, |sum, field| sum.saturating_add(field.size as u64));
+        if num_envs.saturating_mul(sum.max(1)).saturating_mul(size_of::<f32>() as u64) > MAX_ARRAY_BYTES {
+            return too_large(name, sum);
+        }
+    }
+    Ok(num_envs as usize)
+}
+
 /// Encodes a reset request.
 pub fn encode_reset(request: &ResetRequest, epoch: u64, seq: u64) -> Vec<u8> {
     encode(&message::ResetRequest {

@@ -71,7 +71,8 @@ impl RemoteVecEnv {
         let granted: message::LeaseReply = read_answer(&answer, "lease")?;
         let key = |verb| keys::env(connection.sid(), &granted.lease, verb);
         let (step, reset) = (connection.querier(key(EnvMethod::Step))?, connection.querier(key(EnvMethod::Reset))?);
-        let num_envs = granted.num_envs as usize;
+        let num_envs = convert::check_lease(granted.num_envs, &granted.spec)
+            .map_err(|error| ClientError::Malformed { request: "lease".to_owned(), reason: error.message })?;
         Ok(Self {
             batch: StepBatch::new(num_envs, &granted.spec),
             ticket: LeaseHandle { lease: granted.lease, epoch: granted.epoch, secret },

@@ -243,6 +243,17 @@ fn tensors_are_read_from_golden_bytes() {
 }
 
 #[test]
+fn lease_that_no_reply_could_hold_is_refused() {
+    let mut spec = golden::small_spec();
+    assert_eq!(convert::check_lease(4096, &spec), Ok(4096));
+    let error = convert::check_lease(u64::MAX, &spec).expect_err("too many environments");
+    assert_eq!((error.code, error.field.as_str()), (ErrorCode::OutOfRange, "observation"));
+    // The sum of both sizes is 1 in 64-bit arithmetic without a check.
+    (spec.observation[0].size, spec.observation[1].size) = (usize::MAX, 2);
+    assert!(convert::check_lease(1, &spec).is_err());
+}
+
+#[test]
 fn scene_survives_the_wire_and_a_shape_without_a_body_is_refused() {
     let scene = golden::small_scene();
     let bytes = convert::encode_scene(scene.clone());
