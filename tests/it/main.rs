@@ -17,6 +17,7 @@ mod effects;
 mod exactly_once;
 mod faults;
 mod fit;
+mod fuzz;
 mod golden_ensemble;
 mod hunt;
 mod identify;

@@ -11,6 +11,7 @@
 //! - [`ground_truth_robot`]: robots with known parameters, for system identification
 //! - [`ground_truth_actuator`]: actuators with known effects, for actuator networks
 //! - [`confounded_pairs`]: pairs of confounded effects, for experiment design
+//! - [`fuzz`]: random changes to messages and files
 //! - [`browser`]: layout of an HTML report in a real browser
 //! - [`security`]: files and certificates for TLS, users and access control
 //! - [`python`]: environment for the tests of the Python client
@@ -19,6 +20,7 @@ pub mod browser;
 pub mod confounded_pairs;
 pub mod fault;
 pub mod fault_injection;
+pub mod fuzz;
 pub mod ground_truth_actuator;
 pub mod ground_truth_robot;
 pub mod process;
