@@ -18,6 +18,8 @@ const LEASES: usize = 200;
 const MAX_THREADS: usize = 100;
 const UNREAD_REQUESTS: usize = 6000;
 const UNDISTURBED: Duration = Duration::from_secs(2);
+/// Time for which the silent client reads nothing.
+const SILENCE: Duration = Duration::from_secs(3600);
 /// Longer than Zenoh waits for a client that does not read.
 const AFTERWARDS: Duration = Duration::from_secs(7);
 /// A server whose threads wait for the silent client answers nobody for seconds.
@@ -38,7 +40,7 @@ fn client_that_reads_no_replies_does_not_delay_the_steps_of_others() {
     silent.query_timeout = Duration::from_secs(20);
     let own = silent.lease(1);
     silent.hello();
-    proxy.stop_replies();
+    proxy.hold_replies(SILENCE);
     let is_finished = AtomicBool::new(false);
     let disturbed = scope(|scope| {
         let steps = scope

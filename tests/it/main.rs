@@ -38,6 +38,7 @@ mod render;
 mod robots;
 mod rollout;
 mod security;
+mod soak;
 mod terrain;
 mod tidy;
 mod wire;

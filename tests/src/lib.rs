@@ -12,6 +12,7 @@
 //! - [`ground_truth_actuator`]: actuators with known effects, for actuator networks
 //! - [`confounded_pairs`]: pairs of confounded effects, for experiment design
 //! - [`fuzz`]: random changes to messages and files
+//! - [`soak`]: many clients that end in different ways
 //! - [`browser`]: layout of an HTML report in a real browser
 //! - [`security`]: files and certificates for TLS, users and access control
 //! - [`python`]: environment for the tests of the Python client
@@ -29,6 +30,7 @@ pub mod python;
 pub mod repeats;
 pub mod roles;
 pub mod security;
+pub mod soak;
 pub mod step_oracle;
 pub mod stranger;
 pub mod test_bed;

@@ -53,12 +53,14 @@ pub fn read_nothing(endpoint: &str) -> Result<(), String> {
     env.reset(&ResetRequest::default()).map_err(text)?;
     let connection = Connection::open(&ConnectOptions::new(&proxy.endpoint, 1), Secret::random()).map_err(text)?;
     let unknown = connection.querier(format!("twinstep/{}/{}", connection.sid(), "x".repeat(1000))).map_err(text)?;
-    proxy.stop_replies();
+    proxy.hold_replies(SILENCE);
     env.send(&[0.5; 12]).map_err(text)?;
     let unread: Result<Vec<_>, _> = (0..UNREAD_REQUESTS).map(|_| connection.send(&unknown, Vec::new())).collect();
     // The link may be closed already.
     drop(unread);
     std::thread::sleep(SILENCE);
+    // Both clients notice the end of their links at once.
+    proxy.cut();
     Ok(())
 }
 
