@@ -10,6 +10,8 @@ from pathlib import Path
 
 import zenoh
 
+from twinstep import ServerInfo, discover
+
 
 def free_endpoint() -> str:
     """Return a Zenoh endpoint at a port that no program uses."""
@@ -30,6 +32,17 @@ def router() -> Iterator[str]:
         config.insert_json5(key, value)
     with zenoh.open(config):
         yield endpoint
+
+
+def wait_for_servers(endpoint: str, count: int) -> list[ServerInfo]:
+    """Return the servers behind a router when it knows ``count`` of them, some time after they have started."""
+    deadline = time.monotonic() + 20
+    while True:
+        found = discover(endpoint)
+        if len(found) == count and all(info.reachable for info in found):
+            return found
+        assert time.monotonic() < deadline, f"{len(found)} servers are visible, {count} are expected"
+        time.sleep(0.02)
 
 
 def suspend(pid: int) -> None:

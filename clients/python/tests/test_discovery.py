@@ -5,7 +5,7 @@ import signal
 import time
 
 import pytest
-from loopback import free_endpoint, router, suspend
+from loopback import free_endpoint, router, suspend, wait_for_servers
 
 import twinstep
 from twinstep import EmbeddedServer, Go2VectorEnv, discover
@@ -16,6 +16,7 @@ def test_servers_behind_a_router_are_found_with_task_and_free_environments() -> 
         assert discover(endpoint) == []
         walk = EmbeddedServer(("--task", "walk", "--name", "rex", "--envs", "8", "--connect", endpoint))
         counter = EmbeddedServer(("--task", "counter", "--name", "fido", "--envs", "4", "--connect", endpoint))
+        wait_for_servers(endpoint, 2)
         envs = Go2VectorEnv(3, robot="rex", endpoint=endpoint)
         envs.reset(seed=1)
         envs.step(envs.action_space.sample())
@@ -41,6 +42,7 @@ def test_a_server_that_does_not_answer_is_not_reachable() -> None:
     with router() as endpoint:
         first = EmbeddedServer(("--task", "counter", "--name", "rex", "--connect", endpoint))
         second = EmbeddedServer(("--task", "counter", "--name", "fido", "--connect", endpoint))
+        wait_for_servers(endpoint, 2)
         suspend(second.pid)
         since = time.monotonic()
         fido, rex = discover(endpoint, timeout_s=0.5)
@@ -55,7 +57,7 @@ def test_a_server_that_does_not_answer_is_not_reachable() -> None:
 def test_client_takes_the_server_with_the_most_free_environments() -> None:
     with router() as endpoint:
         servers = [EmbeddedServer(("--task", "counter", "--envs", n, "--connect", endpoint)) for n in ("4", "6")]
-        small, large = sorted(discover(endpoint), key=lambda info: info.max_envs or 0)
+        small, large = sorted(wait_for_servers(endpoint, 2), key=lambda info: info.max_envs or 0)
         found: list[str] = []
         for robot in (None, "go2", None):
             envs = Go2VectorEnv(1, task="counter", endpoint=endpoint, robot=robot)
@@ -72,7 +74,7 @@ def test_client_takes_the_server_with_the_most_free_environments() -> None:
 def test_a_server_that_does_not_answer_for_a_second_is_not_chosen() -> None:
     with router() as endpoint:
         servers = [EmbeddedServer(("--task", "counter", "--envs", n, "--connect", endpoint)) for n in ("4", "6")]
-        small, _ = sorted(discover(endpoint), key=lambda info: info.max_envs or 0)
+        small, _ = sorted(wait_for_servers(endpoint, 2), key=lambda info: info.max_envs or 0)
         suspend(servers[1].pid)
         since = time.monotonic()
         envs = Go2VectorEnv(1, task="counter", endpoint=endpoint)
@@ -90,9 +92,10 @@ def test_client_does_not_choose_between_different_robots_or_tasks() -> None:
             EmbeddedServer(("--task", task, "--name", name, "--connect", endpoint))
             for task, name in (("counter", "go2"), ("walk", "go2"), ("counter", "spot"))
         ]
+        wait_for_servers(endpoint, 3)
         for robot, words in (
-            (None, "3 robots are visible, and `robot` is not set; visible: go2"),
-            ("go2", "2 robots have the name `go2`, and differ in task or layout or do not reply; visible: go2"),
+            (None, "3 robots are visible, and `robot` is not set; visible: "),
+            ("go2", "2 robots have the name `go2`, and differ in task or layout or do not reply; visible: "),
         ):
             since = time.monotonic()
             with pytest.raises(twinstep.AmbiguousRobotError, match=words):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loopback import router, suspend
+from loopback import router, suspend, wait_for_servers
 
 import twinstep
 from twinstep import ConnectOptions, EmbeddedServer, GroupedVecEnv, RemoteVecEnv, StepBatch
@@ -143,6 +143,7 @@ def test_all_groups_are_at_one_server_and_invalid_use_raises() -> None:
             GroupedVecEnv(ConnectOptions(), groups=groups, **SETTINGS)
     with router() as endpoint:
         servers = [EmbeddedServer(("--task", "counter", "--envs", "8", "--connect", endpoint)) for _ in range(2)]
+        wait_for_servers(endpoint, 2)
         envs = GroupedVecEnv(ConnectOptions(task="counter", endpoint=endpoint), groups=2, **SETTINGS)
         assert sorted(info.free_envs or 0 for info in twinstep.discover(endpoint)) == [8 - N, 8]
         envs.reset(None, None)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loopback import router
+from loopback import router, wait_for_servers
 
 import twinstep
 from twinstep import EmbeddedServer
@@ -24,6 +24,7 @@ def endpoint() -> Iterator[str]:
     """Run two servers of the same robot behind a router."""
     with router() as endpoint:
         servers = [EmbeddedServer(("--task", "walk", "--envs", "8", "--connect", endpoint)) for _ in range(2)]
+        wait_for_servers(endpoint, 2)
         yield endpoint
         for server in servers:
             server.release()
