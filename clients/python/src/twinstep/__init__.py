@@ -36,9 +36,11 @@ from .errors import (
 )
 from .factory import EnvFactory
 from .grouped import GroupedVecEnv
-from .remote import ConnectOptions, RemoteVecEnv, StepBatch
+from .options import ConnectOptions
+from .remote import RemoteVecEnv
 from .server import EmbeddedServer, ServerNotFoundError, ServerStartError
 from .sharded import ShardedVecEnv
+from .step import StepBatch
 from .vector_env import Go2VectorEnv
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .grouped import GroupedVecEnv
-from .remote import ConnectOptions
+from .options import ConnectOptions
 from .server import find_program
 from .vector_env import Go2VectorEnv
 

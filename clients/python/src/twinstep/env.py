@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from .codec import Spec
 from .discovery import ServerInfo
 from .errors import InvalidActionError, InvalidOptionError
+from .options import UNLIMITED, ConnectOptions
 from .pickling import NotPicklable
-from .remote import UNLIMITED, ConnectOptions, RemoteVecEnv, StepBatch
+from .remote import RemoteVecEnv
 from .render import Viewer
 from .sharded import ShardedVecEnv
 from .spaces import action_space, observation_space
+from .step import StepBatch
 
 RenderMode = Literal["rgb_array", "human"]
 

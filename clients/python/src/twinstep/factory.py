@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass, field
 from typing import cast
 
 from .env import Go2Env, OptionArguments, RenderMode
-from .remote import ConnectOptions
+from .options import ConnectOptions
 
 
 @dataclass(frozen=True)

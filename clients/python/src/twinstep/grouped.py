@@ -7,9 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import Error, InvalidOptionError
+from .options import ConnectOptions
 from .pickling import NotPicklable
-from .remote import ConnectOptions, RemoteVecEnv, StepBatch, checked_actions
+from .remote import RemoteVecEnv
 from .shard_merge import divide, merge
+from .step import StepBatch, checked_actions
 
 
 class GroupedVecEnv(NotPicklable):

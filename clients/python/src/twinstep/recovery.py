@@ -8,7 +8,8 @@ import zenoh
 
 from .codec import Spec
 from .errors import Error, SpecMismatchError
-from .remote import ConnectOptions, RemoteVecEnv
+from .options import ConnectOptions
+from .remote import RemoteVecEnv
 
 _FIRST_PAUSE_S, _MAX_PAUSE_S = 0.05, 1.0
 

@@ -2,7 +2,6 @@
 
 import time
 import weakref
-from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -12,121 +11,18 @@ from . import codec
 from .connection import Connection
 from .errors import (
     Error,
-    InvalidActionError,
     InvalidOptionError,
     RequestRejectedError,
     RequestTimeoutError,
     SpecMismatchError,
 )
+from .options import UNLIMITED, ConnectOptions, server_flags
 from .pickling import NotPicklable
 from .query import Pending
 from .server import EmbeddedServer
+from .step import StepBatch, checked_actions, read_critic, read_step
 
-UNLIMITED = 2**32 - 1
-"""``max_episode_steps`` that never truncates."""
-
-_CAPACITY = "1000000"
 _CONSUMES_SEQ = ("internal",)
-
-
-@dataclass(frozen=True)
-class ConnectOptions:
-    """Options of a connection, common to all environments.
-
-    Attributes
-    ----------
-    endpoint
-        Zenoh endpoint of a server, a robot or a router. ``None`` starts the bundled server.
-    robot
-        Name of the robot. Required if several are visible at ``endpoint``. Among several servers of the same robot,
-        task and spec hash, that with the most free environments is chosen.
-    task
-        Name of the task. A server at ``endpoint`` must have this task.
-    config, model
-        Config file and model file of the bundled server (``twinstep serve --help``). Not allowed with ``endpoint``.
-    zenoh_config
-        Zenoh configuration file (JSON5) for TLS, user and password.
-    shared_memory
-        Sends large messages through shared memory. The server must run on this machine with the flag
-        ``--shared-memory``, which the bundled server gets; otherwise the messages are sent over the network.
-    spec_hash
-        Spec hash for which the agent was trained. A server with a different hash is rejected.
-    critic
-        Requests the privileged observations of group ``critic``; they are in the info of every reset and step.
-    timeout_s, reset_timeout_s
-        Timeout of a step and of a reset [s].
-    connect_timeout_s
-        Timeout of connecting to a server and finding the robot [s].
-    """
-
-    endpoint: str | None = None
-    robot: str | None = None
-    task: str = "walk"
-    config: str | None = None
-    model: str | None = None
-    zenoh_config: str | None = None
-    shared_memory: bool = False
-    spec_hash: str | None = None
-    critic: bool = False
-    timeout_s: float = 5.0
-    reset_timeout_s: float = 10.0
-    connect_timeout_s: float = 5.0
-
-    def __post_init__(self) -> None:
-        """Check the options that do not depend on a server."""
-        if self.endpoint is not None and (self.config is not None or self.model is not None):
-            raise InvalidOptionError("`config` and `model` are options of the bundled server: omit them or `endpoint`")
-        for name in ("timeout_s", "reset_timeout_s", "connect_timeout_s"):
-            value = getattr(self, name)
-            if not value > 0:
-                raise InvalidOptionError(f"`{name}` = {value} s; must be greater than 0")
-
-
-@dataclass
-class StepBatch:
-    """Result of one step. The arrays are new and not written to later.
-
-    Attributes
-    ----------
-    obs : (num_envs, obs_len) float32
-    reward : (num_envs,) float32
-    terminated, truncated : (num_envs,) bool
-    ended : (k,) int
-        Environments whose episode ended.
-    ended_length : (k,) int
-        Policy steps of those episodes.
-    ended_terms : (k, reward_terms) float32
-        Sums of their weighted reward terms.
-    ended_diverged : (k,) bool
-        True for those whose simulation became NaN or infinite. They are truncated; ``obs`` is that before the step.
-    ended_lost : (k,) bool
-        True for those whose server was lost, see :class:`twinstep.ShardedVecEnv`. Their ``ended_terms`` are NaN.
-    held : (num_envs,) bool
-        True for environments whose action was not executed, because they have no server or have just got one.
-    final_obs : (k, obs_len) float32, or empty
-        Their last observations; empty unless autoreset is SameStep.
-    critic_obs : (num_envs, critic_len) float32
-        Observations of group ``critic``; ``critic_len`` is 0 unless the option ``critic`` is set.
-    final_critic_obs : (k, critic_len) float32, or empty
-        As ``final_obs``, of group ``critic``.
-    round_trip_s
-        Time from sending the actions to the reply [s].
-    """
-
-    obs: NDArray[np.float32]
-    reward: NDArray[np.float32]
-    terminated: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
-    ended: NDArray[np.int64]
-    ended_length: NDArray[np.int64]
-    ended_terms: NDArray[np.float32]
-    ended_diverged: NDArray[np.bool_]
-    ended_lost: NDArray[np.bool_]
-    held: NDArray[np.bool_]
-    final_obs: NDArray[np.float32]
-    critic_obs: NDArray[np.float32]
-    final_critic_obs: NDArray[np.float32]
-    round_trip_s: float = field(compare=False)
 
 
 class RemoteVecEnv(NotPicklable):
@@ -161,7 +57,7 @@ class RemoteVecEnv(NotPicklable):
             raise InvalidOptionError(f"`max_episode_steps` = {max_episode_steps} is not allowed: 1 to {UNLIMITED}")
         self.num_envs = num_envs
         self._options = options
-        server = EmbeddedServer.shared(_flags(options)) if options.endpoint is None else None
+        server = EmbeddedServer.shared(server_flags(options)) if options.endpoint is None else None
         try:
             endpoint = options.endpoint if server is None else server.endpoint
             assert endpoint is not None
@@ -266,7 +162,7 @@ class RemoteVecEnv(NotPicklable):
         self._send("reset", request)
         reply = self._await_pending("reset_timeout_s")
         self._unknown = "the reply to a reset could not be read"
-        self.critic_obs = self._critic(reply, "critic_obs", self.num_envs)
+        self.critic_obs = read_critic(reply, "critic_obs", self.num_envs, self.spec)
         obs = codec.tensor(reply, "obs", "<f4", self.num_envs, self.spec.obs_len)
         self._unknown = then_unknown
         return obs
@@ -297,38 +193,12 @@ class RemoteVecEnv(NotPicklable):
         since = self._pending[3]
         reply = self._await_pending("timeout_s", timeout_s)
         try:
-            return self._step_batch(reply, since)
+            batch = read_step(reply, self.num_envs, self.spec, since)
         except codec.MalformedError as error:
             self._unknown = f"the reply to a step could not be read: {error}"
             raise
-
-    def _step_batch(self, reply: dict[str, Any], since: float) -> StepBatch:
-        n, k, obs_len = self.num_envs, len(reply.get("ended_env", b"")) // 4, self.spec.obs_len
-        terms = len(self.spec.reward_terms)
-        num_final = k if reply.get("final_obs") else 0
-        self.critic_obs = self._critic(reply, "critic_obs", n)
-        return StepBatch(
-            obs=codec.tensor(reply, "obs", "<f4", n, obs_len),
-            reward=codec.tensor(reply, "reward", "<f4", n),
-            terminated=codec.tensor(reply, "terminated", "?", n),
-            truncated=codec.tensor(reply, "truncated", "?", n),
-            ended=codec.tensor(reply, "ended_env", "<u4", k).astype(np.int64),
-            ended_length=codec.tensor(reply, "ended_length", "<u4", k).astype(np.int64),
-            ended_terms=codec.tensor(reply, "ended_terms", "<f4", k, terms),
-            ended_diverged=codec.tensor(reply, "ended_diverged", "?", k)
-            if reply.get("ended_diverged")
-            else np.zeros(k, np.bool_),
-            ended_lost=np.zeros(k, np.bool_),
-            held=np.zeros(n, np.bool_),
-            final_obs=codec.tensor(reply, "final_obs", "<f4", num_final, obs_len),
-            critic_obs=self.critic_obs,
-            final_critic_obs=self._critic(reply, "final_critic_obs", num_final),
-            round_trip_s=time.monotonic() - since,
-        )
-
-    def _critic(self, reply: dict[str, Any], field: str, rows: int) -> NDArray[np.float32]:
-        """Return observations of group ``critic``, which a reply without the group does not contain."""
-        return codec.tensor({field: b"", **reply}, field, "<f4", rows, self.spec.critic_len)
+        self.critic_obs = batch.critic_obs
+        return batch
 
     def scene(self, env: int) -> dict[str, Any]:
         """Return shapes and poses of one robot, and its ground, for rendering."""
@@ -427,35 +297,6 @@ class RemoteVecEnv(NotPicklable):
             except Error:
                 # Its error is not needed, but whether its number was consumed is.
                 pass
-
-
-def checked_actions(actions: NDArray[Any], num_envs: int, spec: codec.Spec) -> NDArray[np.float32]:
-    """Return actions, (num_envs, action_len) finite numbers, as contiguous little-endian float32."""
-    given = np.asarray(actions)
-    expected = (num_envs, spec.action_len)
-    if given.shape != expected:
-        raise InvalidActionError(f"`actions` has shape {given.shape}; {expected} is expected")
-    if given.dtype.kind not in "fiu":
-        raise InvalidActionError(f"`actions` has dtype {given.dtype}; float32 is expected")
-    checked = np.ascontiguousarray(given, dtype="<f4")
-    if not np.isfinite(checked).all():
-        env, entry = (int(index) for index in np.argwhere(~np.isfinite(checked))[0])
-        raise InvalidActionError(
-            f"the action of environment {env}, {spec.action_entry(entry)}, is {checked[env, entry]}\n"
-            "  nothing was stepped; check the policy that computed the action"
-        )
-    return checked
-
-
-def _flags(options: ConnectOptions) -> tuple[str, ...]:
-    flags = ["--task", options.task, "--envs", _CAPACITY]
-    if options.config is not None:
-        flags += ["--config", options.config]
-    if options.model is not None:
-        flags += ["--model", options.model]
-    if options.shared_memory:
-        flags.append("--shared-memory")
-    return tuple(flags)
 
 
 def _release(connection: Connection, server: EmbeddedServer | None) -> None:

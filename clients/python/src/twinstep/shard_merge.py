@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from .remote import StepBatch
+from .step import StepBatch
 
 
 def divide(num_envs: int, parts: int) -> list[slice]:

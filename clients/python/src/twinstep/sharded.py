@@ -4,41 +4,26 @@ import logging
 import time
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .codec import Spec
 from .discovery import ServerInfo
-from .errors import Error, ForkedProcessError, InvalidOptionError, NoServerError, ResetNeededError, SpecMismatchError
+from .errors import Error, ForkedProcessError, InvalidOptionError, NoServerError, ResetNeededError
+from .options import ConnectOptions
 from .pickling import NotPicklable
-from .recovery import Recovery, lease_again, recovery_seed
-from .remote import ConnectOptions, RemoteVecEnv, StepBatch, checked_actions
+from .recovery import recovery_seed
+from .remote import RemoteVecEnv
 from .session import QUERY_TIMEOUT_S, check_process
+from .shard import Shard, same_spec, server_options, stop_recoveries
 from .shard_merge import divide, merge
+from .step import StepBatch, checked_actions
 
 _LOG = logging.getLogger(__name__)
 
-_RECOVERY_TIMEOUT_S = 1.0
-"""Timeout of connecting to one server during a recovery [s]. Another one may be waiting to be tried."""
-
 _MIN_WAIT_S = 2 * QUERY_TIMEOUT_S
 """A server is waited for at least this long after another one was lost: until its request was repeated once [s]."""
-
-
-@dataclass
-class _Shard:
-    """Neighbouring rows on one server."""
-
-    rows: slice
-    servers: list[ConnectOptions]
-    remote: RemoteVecEnv | None
-    recovery: Recovery | None = None
-    sent: bool = False
-    batch: StepBatch | None = None
 
 
 class ShardedVecEnv(NotPicklable):
@@ -75,24 +60,24 @@ class ShardedVecEnv(NotPicklable):
         autoreset: str,
         max_episode_steps: int | None,
     ) -> None:
-        found = _server_options(options, servers)
+        found = server_options(options, servers)
         if num_envs < len(found):
             raise InvalidOptionError(f"`num_envs` = {num_envs}; must be at least 1 per server: {len(found)}")
         self.num_envs = num_envs
         self._options = options
         self._autoreset = autoreset
         self._limit = max_episode_steps
-        self._shards: list[_Shard] = []
+        self._shards: list[Shard] = []
         # Ends the threads at garbage collection if `close` was not called. The leases have finalizers of their own.
-        self._release = weakref.finalize(self, _stop, self._shards)
+        self._release = weakref.finalize(self, stop_recoveries, self._shards)
         try:
             for own, rows in zip(found, divide(num_envs, len(found)), strict=True):
                 remote = RemoteVecEnv(
                     own, num_envs=rows.stop - rows.start, autoreset=autoreset, max_episode_steps=max_episode_steps
                 )
                 others = [other for other in found if other != own]
-                self._shards.append(_Shard(rows, [own, *others], remote))
-                self.spec = _same_spec(self._shards)
+                self._shards.append(Shard(rows, [own, *others], remote))
+                self.spec = same_spec(self._shards)
         except BaseException:
             self.close()
             raise
@@ -252,7 +237,7 @@ class ShardedVecEnv(NotPicklable):
             self._running[batch.ended] = False
         self._unreported[:] = False
 
-    def _reset_shard(self, shard: _Shard, chosen: NDArray[np.bool_]) -> bool:
+    def _reset_shard(self, shard: Shard, chosen: NDArray[np.bool_]) -> bool:
         """Start episodes of one shard. Returns False if its server was lost."""
         assert shard.remote is not None
         rows = shard.rows
@@ -271,24 +256,21 @@ class ShardedVecEnv(NotPicklable):
         self._length[started] = 0
         return True
 
-    def _lose(self, shard: _Shard, error: Error) -> None:
+    def _lose(self, shard: Shard, error: Error) -> None:
         assert shard.remote is not None
         _LOG.warning("environments %d to %d are lost: %s", shard.rows.start, shard.rows.stop - 1, error)
         lost, shard.remote, shard.batch = shard.remote, None, None
         self._unreported[shard.rows] = True
         self._losses[shard.rows] += 1
-        lease = partial(
-            lease_again,
+        shard.start_recovery(
+            lost,
             spec=self.spec,
-            num_envs=shard.rows.stop - shard.rows.start,
             autoreset=self._autoreset,
             max_episode_steps=self._limit,
+            connect_timeout_s=self._options.connect_timeout_s,
         )
-        timeout_s = min(_RECOVERY_TIMEOUT_S, self._options.connect_timeout_s)
-        servers = [replace(one, spec_hash=self.spec.hash, connect_timeout_s=timeout_s) for one in shard.servers]
-        shard.recovery = Recovery(servers, lease, lost)
 
-    def _recover(self, shards: list[_Shard], *, wait: bool) -> list[_Shard]:
+    def _recover(self, shards: list[Shard], *, wait: bool) -> list[Shard]:
         """Start episodes in those of ``shards`` for which a server has granted a new lease, and return these.
 
         With ``wait``, if no environment has a server, waits until one has.
@@ -305,7 +287,7 @@ class ShardedVecEnv(NotPicklable):
                 )
             time.sleep(0.02)
 
-    def _take_over(self, shard: _Shard) -> bool:
+    def _take_over(self, shard: Shard) -> bool:
         found = shard.recovery.take() if shard.recovery is not None else None
         if found is None:
             return False
@@ -319,33 +301,3 @@ class ShardedVecEnv(NotPicklable):
         # If it fails, there is no new episode that could be truncated.
         self._unreported[shard.rows] = False if started else unreported
         return started
-
-
-def _server_options(options: ConnectOptions, servers: Sequence[str | ServerInfo]) -> list[ConnectOptions]:
-    if options.endpoint is not None:
-        raise InvalidOptionError("`endpoint` and `endpoints` are set; one of them is expected")
-    if isinstance(servers, str) or not servers:
-        raise InvalidOptionError(f"`endpoints` = {servers!r}; a list of at least one server is expected")
-    return [
-        replace(options, endpoint=one, robot=options.robot)
-        if isinstance(one, str)
-        else replace(options, endpoint=one.endpoint, robot=one.robot)
-        for one in servers
-    ]
-
-
-def _same_spec(shards: list[_Shard]) -> Spec:
-    first, last = shards[0].remote, shards[-1].remote
-    assert first is not None
-    assert last is not None
-    if first.spec != last.spec:
-        raise SpecMismatchError(
-            f"the servers at {shards[0].servers[0].endpoint} and {shards[-1].servers[0].endpoint} have different specs"
-        )
-    return first.spec
-
-
-def _stop(shards: list[_Shard]) -> None:
-    for shard in shards:
-        if shard.recovery is not None:
-            shard.recovery.stop()

@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from .discovery import ServerInfo
 from .env import OptionArguments, RenderMode, checked_render_mode, open_viewer, render_fps, reward_terms
 from .errors import InvalidOptionError
+from .options import ConnectOptions
 from .pickling import NotPicklable
-from .remote import ConnectOptions, RemoteVecEnv, StepBatch
+from .remote import RemoteVecEnv
 from .render import Viewer
 from .sharded import ShardedVecEnv
 from .spaces import action_space, observation_space
+from .step import StepBatch
 from .sub_env import SubEnvView
 
 StepResult = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]

@@ -1,0 +1,105 @@
+"""Actions and results of one step."""
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import codec
+from .errors import InvalidActionError
+
+
+@dataclass
+class StepBatch:
+    """Result of one step. The arrays are new and not written to later.
+
+    Attributes
+    ----------
+    obs : (num_envs, obs_len) float32
+    reward : (num_envs,) float32
+    terminated, truncated : (num_envs,) bool
+    ended : (k,) int
+        Environments whose episode ended.
+    ended_length : (k,) int
+        Policy steps of those episodes.
+    ended_terms : (k, reward_terms) float32
+        Sums of their weighted reward terms.
+    ended_diverged : (k,) bool
+        True for those whose simulation became NaN or infinite. They are truncated; ``obs`` is that before the step.
+    ended_lost : (k,) bool
+        True for those whose server was lost, see :class:`twinstep.ShardedVecEnv`. Their ``ended_terms`` are NaN.
+    held : (num_envs,) bool
+        True for environments whose action was not executed, because they have no server or have just got one.
+    final_obs : (k, obs_len) float32, or empty
+        Their last observations; empty unless autoreset is SameStep.
+    critic_obs : (num_envs, critic_len) float32
+        Observations of group ``critic``; ``critic_len`` is 0 unless the option ``critic`` is set.
+    final_critic_obs : (k, critic_len) float32, or empty
+        As ``final_obs``, of group ``critic``.
+    round_trip_s
+        Time from sending the actions to the reply [s].
+    """
+
+    obs: NDArray[np.float32]
+    reward: NDArray[np.float32]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    ended: NDArray[np.int64]
+    ended_length: NDArray[np.int64]
+    ended_terms: NDArray[np.float32]
+    ended_diverged: NDArray[np.bool_]
+    ended_lost: NDArray[np.bool_]
+    held: NDArray[np.bool_]
+    final_obs: NDArray[np.float32]
+    critic_obs: NDArray[np.float32]
+    final_critic_obs: NDArray[np.float32]
+    round_trip_s: float = field(compare=False)
+
+
+def checked_actions(actions: NDArray[Any], num_envs: int, spec: codec.Spec) -> NDArray[np.float32]:
+    """Return actions, (num_envs, action_len) finite numbers, as contiguous little-endian float32."""
+    given = np.asarray(actions)
+    expected = (num_envs, spec.action_len)
+    if given.shape != expected:
+        raise InvalidActionError(f"`actions` has shape {given.shape}; {expected} is expected")
+    if given.dtype.kind not in "fiu":
+        raise InvalidActionError(f"`actions` has dtype {given.dtype}; float32 is expected")
+    checked = np.ascontiguousarray(given, dtype="<f4")
+    if not np.isfinite(checked).all():
+        env, entry = (int(index) for index in np.argwhere(~np.isfinite(checked))[0])
+        raise InvalidActionError(
+            f"the action of environment {env}, {spec.action_entry(entry)}, is {checked[env, entry]}\n"
+            "  nothing was stepped; check the policy that computed the action"
+        )
+    return checked
+
+
+def read_step(reply: dict[str, Any], num_envs: int, spec: codec.Spec, since: float) -> StepBatch:
+    """Return the result of a step that was sent at ``since``, on the clock of ``time.monotonic`` [s]."""
+    k = len(reply.get("ended_env", b"")) // 4
+    num_final = k if reply.get("final_obs") else 0
+    return StepBatch(
+        obs=codec.tensor(reply, "obs", "<f4", num_envs, spec.obs_len),
+        reward=codec.tensor(reply, "reward", "<f4", num_envs),
+        terminated=codec.tensor(reply, "terminated", "?", num_envs),
+        truncated=codec.tensor(reply, "truncated", "?", num_envs),
+        ended=codec.tensor(reply, "ended_env", "<u4", k).astype(np.int64),
+        ended_length=codec.tensor(reply, "ended_length", "<u4", k).astype(np.int64),
+        ended_terms=codec.tensor(reply, "ended_terms", "<f4", k, len(spec.reward_terms)),
+        ended_diverged=codec.tensor(reply, "ended_diverged", "?", k)
+        if reply.get("ended_diverged")
+        else np.zeros(k, np.bool_),
+        ended_lost=np.zeros(k, np.bool_),
+        held=np.zeros(num_envs, np.bool_),
+        final_obs=codec.tensor(reply, "final_obs", "<f4", num_final, spec.obs_len),
+        critic_obs=read_critic(reply, "critic_obs", num_envs, spec),
+        final_critic_obs=read_critic(reply, "final_critic_obs", num_final, spec),
+        round_trip_s=time.monotonic() - since,
+    )
+
+
+def read_critic(reply: dict[str, Any], name: str, rows: int, spec: codec.Spec) -> NDArray[np.float32]:
+    """Return observations of group ``critic``, which a reply without the group does not contain."""
+    return codec.tensor({name: b"", **reply}, name, "<f4", rows, spec.critic_len)
