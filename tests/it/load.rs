@@ -19,7 +19,7 @@ const MAX_THREADS: usize = 100;
 const UNREAD_REQUESTS: usize = 6000;
 const UNDISTURBED: Duration = Duration::from_secs(2);
 /// Time for which the silent client reads nothing.
-const SILENCE: Duration = Duration::from_secs(3600);
+const SILENCE: Duration = Duration::from_hours(1);
 /// Longer than Zenoh waits for a client that does not read.
 const AFTERWARDS: Duration = Duration::from_secs(7);
 /// A server whose threads wait for the silent client answers nobody for seconds.

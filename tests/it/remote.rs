@@ -96,6 +96,10 @@ fn groups_step_like_one_batch() {
     assert_eq!(groups.reset(&mask).unwrap(), one.reset(&mask).unwrap());
     assert_eq!(groups.critic_obs(), one.critic_obs());
     assert_eq!(groups.scene(6).unwrap().pose, one.scene(6).unwrap().pose);
+    let mut unseeded = GroupedVecEnv::connect(&ConnectOptions::new(&endpoint, 2), 2).unwrap();
+    let obs = unseeded.reset(&ResetRequest::default()).unwrap();
+    assert_ne!(obs[..obs.len() / 2], obs[obs.len() / 2..], "the groups are copies of each other");
+    unseeded.close().unwrap();
     // A group steps while the others do not.
     groups.send(1, &[0.3; 24]).unwrap();
     assert_eq!(groups.recv(1).unwrap().reward.len(), 2);

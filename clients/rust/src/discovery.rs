@@ -87,8 +87,11 @@ pub fn choose_server(session: &Session, options: &ConnectOptions) -> Result<(Str
     let since = Instant::now();
     loop {
         let visible = visible_servers(session);
-        let is_requested = |name: &str| options.robot.as_ref().is_none_or(|robot| robot == name);
-        let matching: Vec<_> = visible.iter().filter(|(_, name)| is_requested(name)).cloned().collect();
+        let is_requested = |(id, name): &&(String, String)| {
+            options.robot.as_ref().is_none_or(|robot| robot == name)
+                && options.server_id.as_ref().is_none_or(|server| server == id)
+        };
+        let matching: Vec<_> = visible.iter().filter(is_requested).cloned().collect();
         if let [only] = &matching[..] {
             return Ok(only.clone());
         }

@@ -4,6 +4,8 @@ use std::ops::Range;
 
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, Scene, StepBatch, VecEnv};
 
+use twinstep_protocol::random_u64;
+
 use crate::{ClientError, ConnectOptions, RemoteVecEnv};
 
 /// Environments on a server, in groups with a lease each. Several groups step while the agent computes actions.
@@ -37,6 +39,8 @@ pub struct GroupedVecEnv {
     /// First environment of each group.
     first: Vec<usize>,
     batch: StepBatch,
+    /// True after the first reset.
+    has_seeds: bool,
 }
 
 impl GroupedVecEnv {
@@ -50,10 +54,16 @@ impl GroupedVecEnv {
         }
         let first: Vec<usize> = (0..groups).map(|group| group * num_envs / groups).collect();
         let size = |group: usize| first.get(group + 1).unwrap_or(&num_envs) - first[group];
-        let leases = (0..groups)
-            .map(|group| RemoteVecEnv::connect(&ConnectOptions { num_envs: size(group), ..options.clone() }))
-            .collect::<Result<Vec<_>, _>>()?;
-        Ok(Self { batch: StepBatch::new(num_envs, leases[0].spec()), groups: leases, first })
+        let mut options = options.clone();
+        let mut leases = Vec::new();
+        for group in 0..groups {
+            let env = RemoteVecEnv::connect(&ConnectOptions { num_envs: size(group), ..options.clone() })?;
+            // All groups are at one server.
+            options.server_id = Some(env.server_id().to_owned());
+            leases.push(env);
+        }
+        let batch = StepBatch::new(num_envs, leases[0].spec());
+        Ok(Self { batch, groups: leases, first, has_seeds: false })
     }
 
     /// Returns the number of groups.
@@ -106,15 +116,19 @@ impl VecEnv for GroupedVecEnv {
 
     fn reset(&mut self, request: &ResetRequest) -> Result<&[f32], EnvError> {
         request.check(self.num_envs())?;
+        // Without seeds every lease has the same random streams, and the groups would be copies of each other.
+        let random = || ResetRequest::seeded(random_u64(), self.num_envs()).seeds;
+        let all_seeds = request.seeds.clone().or_else(|| (!self.has_seeds).then(random).flatten());
         for group in 0..self.groups.len() {
             let range = self.range(group);
-            let seeds = request.seeds.as_ref().map(|seeds| seeds[range.clone()].to_vec());
+            let seeds = all_seeds.as_ref().map(|seeds| seeds[range.clone()].to_vec());
             let mask = request.mask.as_ref().map(|mask| mask[range.clone()].to_vec());
             let env = &mut self.groups[group];
             let obs = env.reset(&ResetRequest { seeds, mask })?;
             copy_rows(&mut self.batch.obs, range.start, obs, range.len());
             copy_rows(&mut self.batch.critic_obs, range.start, env.critic_obs(), range.len());
         }
+        self.has_seeds |= request.mask.is_none();
         Ok(&self.batch.obs)
     }
 

@@ -13,6 +13,8 @@ pub struct ConnectOptions {
     /// Name of the robot. Required if several are visible. Among several servers of the same robot and task the one
     /// with the most free environments is chosen.
     pub robot: Option<String>,
+    /// Id of the server, from [`crate::Discovery`]. Default: any.
+    pub server_id: Option<String>,
     /// Number of environments.
     pub num_envs: usize,
     /// When a new episode starts after one has ended.
@@ -39,6 +41,7 @@ impl ConnectOptions {
         Self {
             endpoint: endpoint.into(),
             robot: None,
+            server_id: None,
             num_envs,
             autoreset: AutoresetMode::NextStep,
             max_episode_steps: None,

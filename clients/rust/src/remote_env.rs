@@ -89,6 +89,11 @@ impl RemoteVecEnv {
         })
     }
 
+    /// Returns the id of the server.
+    pub fn server_id(&self) -> &str {
+        self.connection.sid()
+    }
+
     /// Returns the handle with which another process can reclaim this lease.
     pub fn ticket(&self) -> &LeaseHandle {
         &self.ticket
