@@ -25,8 +25,6 @@ pub struct Route {
     pub secret: Secret,
     /// Maximum size of a request to its environments [bytes].
     pub max_request_bytes: usize,
-    /// Held while a reply is sent; that of all leases with this secret.
-    pub send_lock: SendLock,
     /// Requests to its environments.
     pub mailbox: Arc<Mailbox>,
     /// Time of the client's last request. Keeps the lease alive when the token is not visible.

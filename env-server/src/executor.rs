@@ -4,8 +4,8 @@
 //! therefore does not count as running: another thread executes the next request. A mailbox has at most one request in
 //! execution or one reply being sent, so a client that does not read delays only the mailboxes that it writes to.
 //!
-//! Mailboxes of one client share a [`SendLock`]: Zenoh's thread that closes a link waits for the threads that send to it,
-//! and no other link sends meanwhile.
+//! The mailboxes that every client may fill share a [`SendLock`]: Zenoh's thread that closes a link waits for all threads
+//! that send to it, and serves no other link meanwhile.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};

@@ -220,19 +220,13 @@ impl LeaseManager {
         let (manager, lease) = (Arc::clone(self), id.to_owned());
         let release = Box::new(move |reason: &str| manager.release(&lease, reason));
         let worker = Worker::new(params, Arc::clone(&self.factory), Arc::clone(&self.state), release);
-        let mut routes = self.routes.write().unwrap_or_else(PoisonError::into_inner);
-        let of_same_client = routes.values().find(|route| route.secret == secret);
-        let send_lock = of_same_client.map_or_else(SendLock::default, |route| Arc::clone(&route.send_lock));
-        let mailbox = Mailbox::new(&self.executor, Arc::clone(&send_lock), LEASE_CAPACITY, worker);
         let route = Route {
             secret,
-            send_lock,
             max_request_bytes: convert::max_request_bytes(num_envs, &self.info.spec),
-            mailbox,
+            mailbox: Mailbox::new(&self.executor, SendLock::default(), LEASE_CAPACITY, worker),
             last_request: Mutex::new(Instant::now()),
         };
-        routes.insert(id.to_owned(), Arc::new(route));
-        drop(routes);
+        self.routes.write().unwrap_or_else(PoisonError::into_inner).insert(id.to_owned(), Arc::new(route));
         let disconnected_since = (!leases.live_clients.contains(&request.client)).then(Instant::now);
         let lease = Lease { client: request.client.clone(), secret, num_envs, epoch: 1, disconnected_since };
         leases.by_id.insert(id.to_owned(), lease);
@@ -319,7 +313,7 @@ impl LeaseManager {
         if leases.by_id.remove(lease).is_some() {
             tracing::info!(lease, reason, "lease released");
         }
-        // The environments are dropped after the lock is released.
+        // The environments are dropped after the lock of the routes is released.
         let route = self.routes.write().unwrap_or_else(PoisonError::into_inner).remove(lease);
         drop(route);
     }

@@ -180,11 +180,14 @@ impl Connection {
         let info = self.session.info();
         let linked = info.routers_zid().wait().next().is_some() || info.peers_zid().wait().next().is_some();
         if !linked {
-            return "the connection is lost and cannot be restored; check that the server or the router is running"
+            return "the connection is lost and cannot be restored; check that the server or the router is running and \
+                    not suspended"
                 .to_owned();
         }
         if !visible_servers(&self.session).iter().any(|(sid, _)| *sid == self.sid) {
-            return "the connection works, but the server is no longer visible: it has terminated or lost its router"
+            // A suspended server that is connected directly does not answer the query for visible servers either.
+            return "the server is no longer visible: it has terminated or lost its router, or, without a router, it is \
+                    unresponsive"
                 .to_owned();
         }
         let hello = self.querier(keys::hello(&self.sid)).and_then(|querier| {
