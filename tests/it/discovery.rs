@@ -81,6 +81,10 @@ fn list_shows_task_free_environments_and_load_of_each_server() {
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         String::from_utf8(output.stdout).unwrap()
     };
+    let output = Command::new(&program).args(["list", &free_endpoint().unwrap()]).output().unwrap();
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert!(error.starts_with("error: no server answers") && error.lines().count() == 2, "{error}");
+    assert_eq!(output.status.code(), Some(1));
     let (_router, endpoint) = router();
     assert!(list(&endpoint, &[]).contains("no server is visible"));
     let idle = behind(&endpoint, TaskConfig::default(), 8, "idle");

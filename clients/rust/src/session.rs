@@ -68,7 +68,9 @@ fn zenoh_config(options: &ConnectOptions) -> Result<zenoh::Config, ClientError> 
         ("connect/retry", "{period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2}"),
         ("transport/shared_memory/enabled", if options.shared_memory { "true" } else { "false" }),
     ] {
-        config.insert_json5(key, value).map_err(|error| invalid(format!("`{key}` = {value}: {error}")))?;
+        config
+            .insert_json5(key, value)
+            .map_err(|error| invalid(format!("`{key}` = {value}: {}", without_source_line(&error.to_string()))))?;
     }
     Ok(config)
 }

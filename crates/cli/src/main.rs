@@ -45,14 +45,17 @@ enum CliCommand {
 }
 
 fn main() -> std::process::ExitCode {
+    let command = Cli::parse().command;
+    let log = match &command {
+        // Its error has the reason; Zenoh would write two lines for each attempt to connect.
+        CliCommand::List(_) => "warn,zenoh=off",
+        _ => "warn,zenoh::api::session=error,twinstep=info",
+    };
     tracing_subscriber::fmt()
-        .with_env_filter(
-            tracing_subscriber::EnvFilter::try_from_env("TWINSTEP_LOG")
-                .unwrap_or_else(|_| "warn,zenoh::api::session=error,twinstep=info".into()),
-        )
+        .with_env_filter(tracing_subscriber::EnvFilter::try_from_env("TWINSTEP_LOG").unwrap_or_else(|_| log.into()))
         .with_writer(std::io::stderr)
         .init();
-    let result = match Cli::parse().command {
+    let result = match command {
         CliCommand::Bench(args) => bench::run(&args),
         CliCommand::Demo(args) => demo::run(&args),
         CliCommand::Diagnose(args) => diagnose::run(&args),
