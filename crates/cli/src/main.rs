@@ -16,6 +16,7 @@ mod mjcf;
 mod play;
 mod robot_file;
 mod serve;
+mod train;
 
 use clap::{Parser, Subcommand};
 
@@ -42,6 +43,7 @@ enum CliCommand {
     Mjcf(mjcf::Args),
     Play(play::Args),
     Serve(serve::Args),
+    Train(train::Args),
 }
 
 fn main() -> std::process::ExitCode {
@@ -69,6 +71,7 @@ fn main() -> std::process::ExitCode {
         CliCommand::Mjcf(args) => mjcf::run(&args),
         CliCommand::Play(args) => play::run(&args),
         CliCommand::Serve(args) => serve::run(&args),
+        CliCommand::Train(args) => train::run(&args),
     };
     exit::code(result)
 }

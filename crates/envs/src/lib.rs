@@ -13,6 +13,7 @@ mod check;
 mod config;
 mod counter;
 mod episode;
+mod feet;
 mod observation;
 mod randomise;
 pub mod reward;

@@ -3,8 +3,16 @@
 use twinstep_model::{NUM_JOINTS, PerJoint, PerLeg};
 
 /// Terms that depend on the ground truth of a simulator. A task on a real robot has no such term.
-pub const NEED_GROUND_TRUTH: [&str; 5] =
-    ["track_linear_velocity", "linear_velocity_z", "feet_air_time", "undesired_contact", "epistemic_uncertainty"];
+pub const NEED_GROUND_TRUTH: [&str; 8] = [
+    "track_linear_velocity",
+    "linear_velocity_z",
+    "base_height",
+    "feet_air_time",
+    "feet_clearance",
+    "feet_slip",
+    "undesired_contact",
+    "epistemic_uncertainty",
+];
 
 /// Defines the weights of a task's reward terms: `name = default weight`, in the order of every per-term array.
 ///
@@ -32,7 +40,7 @@ macro_rules! reward_weights {
                 [$(self.$name * crate::reward::$name(input) * input.policy_dt),+]
             }
 
-            fn values(&self) -> impl Iterator<Item = (&'static str, f32)> {
+            pub(crate) fn values(&self) -> impl Iterator<Item = (&'static str, f32)> {
                 [$((stringify!($name), self.$name)),+].into_iter()
             }
         }
@@ -75,6 +83,22 @@ pub struct RewardInput<'a> {
     pub soft_upper: &'a PerJoint,
     /// Air time of each foot that touched down in this step, 0 for the others [s].
     pub touchdown_air_time: PerLeg,
+    /// Duration of a swing phase above which [`feet_air_time`] is positive [s].
+    pub target_air_time: f32,
+    /// True for each foot on the ground.
+    pub foot_contact: [bool; 4],
+    /// Height of each foot's centre above the ground under it [m].
+    pub foot_height: PerLeg,
+    /// Horizontal speed of each foot [m/s].
+    pub foot_speed: PerLeg,
+    /// Height of swinging feet without a penalty [m].
+    pub target_foot_height: f32,
+    /// Height of the base above the ground under it [m].
+    pub base_height: f32,
+    /// Height of the base without a penalty [m].
+    pub target_base_height: f32,
+    /// True if the episode ends in this step, other than by the time limit.
+    pub is_terminated: bool,
     /// True if the trunk or a thigh touches the ground.
     pub body_contact: bool,
     /// Epistemic uncertainty of the actuators, mean over the joints [nat].
@@ -142,13 +166,50 @@ pub fn joint_position_limits(input: &RewardInput<'_>) -> f32 {
     (0..NUM_JOINTS).map(outside).sum()
 }
 
-/// Returns Σ (air time − 0.5 s) over the feet that touched down, or 0 if the velocity command is below 0.1 [s].
+/// Returns Σ (air time − target) over the feet that touched down, or 0 if the velocity command is below 0.1 [s].
 #[inline]
 pub fn feet_air_time(input: &RewardInput<'_>) -> f32 {
     if !has_motion_command(input) {
         return 0.0;
     }
-    input.touchdown_air_time.iter().filter(|time| **time > 0.0).map(|time| time - 0.5).sum()
+    input.touchdown_air_time.iter().filter(|time| **time > 0.0).map(|time| time - input.target_air_time).sum()
+}
+
+/// Returns Σ |height − target| · √speed over the feet, or 0 if the velocity command is below 0.1 [m^1.5/s^0.5].
+///
+/// The speed is horizontal, so that only swinging feet count.
+#[inline]
+pub fn feet_clearance(input: &RewardInput<'_>) -> f32 {
+    if !has_motion_command(input) {
+        return 0.0;
+    }
+    let feet = input.foot_height.iter().zip(&input.foot_speed);
+    feet.map(|(height, speed)| (height - input.target_foot_height).abs() * speed.sqrt()).sum()
+}
+
+/// Returns Σ of the squared horizontal speeds of the feet on the ground [m²/s²].
+#[inline]
+pub fn feet_slip(input: &RewardInput<'_>) -> f32 {
+    let feet = input.foot_speed.iter().zip(&input.foot_contact);
+    feet.map(|(speed, contact)| if *contact { speed * speed } else { 0.0 }).sum()
+}
+
+/// Returns `(height − target)²` of the base above the ground [m²].
+#[inline]
+pub fn base_height(input: &RewardInput<'_>) -> f32 {
+    (input.base_height - input.target_base_height).powi(2)
+}
+
+/// Returns Σ (q − q_default)² over the hips [rad²].
+#[inline]
+pub fn hip_deviation(input: &RewardInput<'_>) -> f32 {
+    (0..NUM_JOINTS).step_by(3).map(|hip| (input.q[hip] - input.default_pose[hip]).powi(2)).sum()
+}
+
+/// Returns `1 / policy_dt` if the episode ends in this step other than by the time limit, else 0 [1/s].
+#[inline]
+pub fn termination(input: &RewardInput<'_>) -> f32 {
+    if input.is_terminated { 1.0 / input.policy_dt } else { 0.0 }
 }
 
 /// Returns 1 if the trunk or a thigh touches the ground, else 0.
@@ -198,6 +259,14 @@ mod tests {
             soft_lower: &[-1.0; NUM_JOINTS],
             soft_upper: &[1.0; NUM_JOINTS],
             touchdown_air_time: [0.0; 4],
+            target_air_time: 0.1,
+            foot_contact: [true; 4],
+            foot_height: [0.022; 4],
+            foot_speed: [0.0; 4],
+            target_foot_height: 0.08,
+            base_height: 0.3,
+            target_base_height: 0.3,
+            is_terminated: false,
             body_contact: false,
             uncertainty: 0.0,
         }
@@ -212,16 +281,34 @@ mod tests {
 
     #[test]
     fn standing_in_the_default_pose_has_no_penalty() {
-        let terms = crate::tasks::walk::RewardWeights::default().evaluate(&at_rest());
-        let expected = 0.02 * (1.0 + 0.5);
+        let terms = crate::tasks::walk_config::RewardWeights::default().evaluate(&at_rest());
+        let expected = 0.02 * (2.0 + 1.0);
         assert!((terms.iter().sum::<f32>() - expected).abs() < 1e-6, "{terms:?}");
     }
 
     #[test]
     fn long_swing_phase_is_rewarded_only_with_a_velocity_command() {
-        let landed = RewardInput { touchdown_air_time: [0.7, 0.0, 0.0, 0.0], ..at_rest() };
+        let landed = RewardInput { touchdown_air_time: [0.3, 0.0, 0.0, 0.0], ..at_rest() };
         assert_eq!(feet_air_time(&landed), 0.0);
         assert!((feet_air_time(&RewardInput { command: [1.0, 0.0, 0.0], ..landed }) - 0.2).abs() < 1e-6);
+    }
+
+    #[test]
+    fn only_feet_on_the_ground_slip_and_only_moving_feet_need_clearance() {
+        let moving = RewardInput { command: [1.0, 0.0, 0.0], foot_speed: [0.5, 0.0, 0.0, 2.0], ..at_rest() };
+        assert_eq!(feet_slip(&RewardInput { foot_contact: [true, true, true, false], ..moving }), 0.25);
+        let expected = 0.058 * (0.5f32.sqrt() + 2f32.sqrt());
+        assert!((feet_clearance(&moving) - expected).abs() < 1e-6);
+        assert_eq!(feet_clearance(&RewardInput { foot_height: [0.08; 4], ..moving }), 0.0);
+        assert_eq!(feet_clearance(&RewardInput { command: [0.0; 3], ..moving }), 0.0);
+    }
+
+    #[test]
+    fn weight_of_a_fall_does_not_depend_on_the_policy_period() {
+        let fallen = RewardInput { is_terminated: true, ..at_rest() };
+        let index = crate::tasks::walk_config::RewardWeights::NAMES.iter().position(|name| *name == "termination");
+        let term = crate::tasks::walk_config::RewardWeights::default().evaluate(&fallen)[index.expect("a term")];
+        assert!((term + 1.0).abs() < 1e-6, "{term}");
     }
 
     #[test]

@@ -6,7 +6,8 @@
 //! - [`Actuator`]: computes torques from commands and states. Actuator networks implement it.
 //! - [`VecEnv`]: a batch of environments that are reset and stepped together, in process or over a network;
 //!   [`EnvSpec`]: layouts, periods, gains and limits of an environment.
-//! - [`Scene`]: shapes and poses for rendering; [`body_poses`]: forward kinematics.
+//! - [`Scene`]: shapes and poses for rendering; [`body_poses`]: forward kinematics;
+//!   [`FootKinematics`]: position and velocity of the feet.
 //! - [`Ground`]: a plane, or a [`HeightField`] for uneven terrain.
 //! - [`import_robot`]: robots from URDF and MJCF files; [`mjcf()`]: the robot as a MuJoCo model.
 //! - [`dynamics`]: kinematics, dynamics and actuator laws, with one robot per SIMD lane.
@@ -21,6 +22,7 @@ mod base_mount;
 mod body;
 mod command;
 pub mod dynamics;
+mod foot_kinematics;
 pub mod frames;
 mod go2;
 mod ground;
@@ -43,6 +45,7 @@ pub use backend::{Actuator, ActuatorSnapshot, Backend, BackendError, EpistemicUn
 pub use base_mount::BaseMount;
 pub use body::RigidBody;
 pub use command::Command;
+pub use foot_kinematics::{FootKinematics, FootMotion};
 pub use go2::go2;
 pub use ground::Ground;
 pub use height_field::{HeightField, HeightFieldError};

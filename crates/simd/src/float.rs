@@ -42,6 +42,10 @@ pub trait SimdFloat:
     fn get(&self, lane: usize) -> f64;
     /// Sets the value of one lane.
     fn set(&mut self, lane: usize, value: f64);
+    /// Returns the first [`SimdFloat::LANES`] values of a slice.
+    fn load(values: &[f32]) -> Self;
+    /// Writes the lanes to the first [`SimdFloat::LANES`] entries of a slice, rounded to single precision.
+    fn store(self, values: &mut [f32]);
     /// Returns the square root.
     fn sqrt(self) -> Self;
     /// Returns `self · factor + summand`, rounded once. Slow where the processor has no such instruction.

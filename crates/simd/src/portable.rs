@@ -56,6 +56,16 @@ impl SimdFloat for F32x4 {
     }
 
     #[inline(always)]
+    fn load(values: &[f32]) -> Self {
+        Self(*values.first_chunk().expect("as many values as lanes"))
+    }
+
+    #[inline(always)]
+    fn store(self, values: &mut [f32]) {
+        values[..4].copy_from_slice(&self.0);
+    }
+
+    #[inline(always)]
     fn sqrt(mut self) -> Self {
         for lane in 0..4 {
             self.0[lane] = self.0[lane].sqrt();
@@ -130,6 +140,16 @@ impl SimdFloat for f64 {
     #[inline(always)]
     fn set(&mut self, _: usize, value: f64) {
         *self = value;
+    }
+
+    #[inline(always)]
+    fn load(values: &[f32]) -> Self {
+        f64::from(values[0])
+    }
+
+    #[inline(always)]
+    fn store(self, values: &mut [f32]) {
+        values[0] = self as f32;
     }
 
     #[inline(always)]

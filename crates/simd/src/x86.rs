@@ -81,6 +81,27 @@ macro_rules! register {
             }
 
             #[inline(always)]
+            fn load(values: &[f32]) -> Self {
+                let values: &[f32; $lanes] = values.first_chunk().expect("as many values as lanes");
+                let mut lanes = [0 as $scalar; $lanes];
+                for lane in 0..$lanes {
+                    lanes[lane] = values[lane] as $scalar;
+                }
+                // SAFETY: a register is its lanes, one after the other.
+                Self(unsafe { std::mem::transmute::<[$scalar; $lanes], $raw>(lanes) })
+            }
+
+            #[inline(always)]
+            fn store(self, values: &mut [f32]) {
+                let values: &mut [f32; $lanes] = values.first_chunk_mut().expect("as many values as lanes");
+                // SAFETY: a register is its lanes, one after the other.
+                let lanes = unsafe { std::mem::transmute::<$raw, [$scalar; $lanes]>(self.0) };
+                for lane in 0..$lanes {
+                    values[lane] = lanes[lane] as f32;
+                }
+            }
+
+            #[inline(always)]
             fn sqrt(self) -> Self {
                 Self(unsafe { $sqrt(self.0) })
             }
@@ -218,14 +239,17 @@ mod tests {
     struct OnRegisters<T>(T, T);
 
     impl<T: SimdFloat> SimdKernel for OnRegisters<T> {
-        type Output = [u64; 13];
+        type Output = [u64; 14];
 
         #[inline(always)]
-        fn run(self) -> [u64; 13] {
+        fn run(self) -> [u64; 14] {
             let Self(x, y) = self;
             let (sin, cos) = x.sin_cos();
             let selected = x.select_lt(y, x * x, y);
             let power = T::splat(-3.0).exp2_integer();
+            let mut memory = [0.0; 16];
+            x.store(&mut memory[..T::LANES]);
+            let copied = T::load(&memory);
             let results = [
                 x + y,
                 x - y,
@@ -240,6 +264,7 @@ mod tests {
                 selected,
                 sin,
                 cos,
+                copied,
             ];
             // The payload of a NaN differs between processors.
             results.map(|result| {
@@ -250,9 +275,9 @@ mod tests {
     }
 
     impl SimdTask for EveryOperation {
-        type Output = [u64; 13];
+        type Output = [u64; 14];
 
-        fn run<T: SimdFloat>(self) -> [u64; 13] {
+        fn run<T: SimdFloat>(self) -> [u64; 14] {
             T::vectorise(OnRegisters(T::splat(self.0), T::splat(self.1)))
         }
     }

@@ -5,8 +5,10 @@ use serde::{Deserialize, Serialize};
 use crate::ConfigError;
 
 pub mod walk;
+pub mod walk_config;
 
-pub use walk::{Walk, WalkConfig};
+pub use walk::Walk;
+pub use walk_config::WalkConfig;
 
 /// A task and its settings: the `[task]` table of a config file. `name` selects the task; default: `walk`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -1,0 +1,26 @@
+//! Proximal policy optimisation on any [`twinstep_model::VecEnv`], in process or remote.
+//!
+//! - [`Trainer`]: collects transitions with the current policy ([`Group`]), and updates actor and critic with them. A
+//!   [`Learner`] is what is learnt; [`Iteration`] reports one rollout and update.
+//! - [`PpoConfig`]: the settings, the `[train]` table of a config file.
+//! - [`gae`]: the advantages; `update`: the gradient of the loss.
+//!
+//! Equal seeds, settings and environments give equal bits on any number of threads.
+
+mod adam;
+mod config;
+mod evaluation;
+pub mod gae;
+mod rollout;
+mod statistics;
+mod symmetry;
+mod trainer;
+mod update;
+
+pub use adam::Adam;
+pub use config::{PpoConfig, PpoConfigError};
+pub use evaluation::{Evaluation, EvaluationError, evaluate};
+pub use rollout::Group;
+pub use statistics::{Statistics, VelocityLayout};
+pub use symmetry::{Mirror, NoMirror};
+pub use trainer::{Iteration, Learner, LearningError, Trainer};

@@ -1,0 +1,122 @@
+//! Statistics of collected steps: reward terms, falls, velocity errors.
+
+use twinstep_model::{EnvSpec, SpecField, StepBatch};
+
+/// Sums over collected steps.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Statistics {
+    /// Number of steps.
+    pub steps: u64,
+    /// Sum of the rewards.
+    pub reward: f64,
+    /// Number of ended episodes.
+    pub episodes: u64,
+    /// Number of terminated episodes.
+    pub falls: u64,
+    /// Sum of the lengths of the ended episodes [steps].
+    pub length: u64,
+    /// Sum of each weighted reward term over the ended episodes.
+    pub terms: Vec<f64>,
+    /// Sum of the squared error of the horizontal velocity [m²/s²]. Zero if it is not observed.
+    pub velocity_error: f64,
+    /// Sum of the squared error of the yaw rate [rad²/s²].
+    pub yaw_rate_error: f64,
+    layout: Option<VelocityLayout>,
+}
+
+/// Positions of command and velocity in the observations.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VelocityLayout {
+    obs_len: usize,
+    critic_len: usize,
+    command: usize,
+    linear_velocity: usize,
+    angular_velocity: usize,
+}
+
+impl VelocityLayout {
+    /// Returns the positions. Returns `None` if the task has no velocity command, or velocities are not observed.
+    pub fn new(spec: &EnvSpec) -> Option<Self> {
+        Some(Self {
+            obs_len: spec.obs_len(),
+            critic_len: spec.critic_obs_len(),
+            command: position(&spec.observation, "velocity_command")?,
+            linear_velocity: position(&spec.critic_observation, "true_linear_velocity")?,
+            angular_velocity: position(&spec.critic_observation, "true_angular_velocity")?,
+        })
+    }
+
+    /// Returns the squared errors of horizontal velocity [m²/s²] and yaw rate [rad²/s²] of a robot.
+    ///
+    /// `obs` are the observations before a step, with the command of the step; `critic_obs` those after it.
+    pub fn squared_errors(&self, obs: &[f32], critic_obs: &[f32], robot: usize) -> [f32; 2] {
+        let command = &obs[robot * self.obs_len + self.command..][..3];
+        let truth = &critic_obs[robot * self.critic_len..][..self.critic_len];
+        let velocity = &truth[self.linear_velocity..][..2];
+        let yaw_rate = truth[self.angular_velocity + 2];
+        let linear = (velocity[0] - command[0]).powi(2) + (velocity[1] - command[1]).powi(2);
+        [linear, (yaw_rate - command[2]).powi(2)]
+    }
+}
+
+fn position(fields: &[SpecField], name: &str) -> Option<usize> {
+    let index = fields.iter().position(|field| field.name == name)?;
+    Some(fields[..index].iter().map(|field| field.size).sum())
+}
+
+impl Statistics {
+    /// Creates sums of zero for the task of `spec`.
+    pub fn new(spec: &EnvSpec) -> Self {
+        Self {
+            steps: 0,
+            reward: 0.0,
+            episodes: 0,
+            falls: 0,
+            length: 0,
+            terms: vec![0.0; spec.reward_terms.len()],
+            velocity_error: 0.0,
+            yaw_rate_error: 0.0,
+            layout: VelocityLayout::new(spec),
+        }
+    }
+
+    /// Adds a step of all robots. `obs` are the observations before it.
+    pub fn add(&mut self, obs: &[f32], batch: &StepBatch) {
+        self.steps += batch.reward.len() as u64;
+        self.reward += batch.reward.iter().map(|reward| f64::from(*reward)).sum::<f64>();
+        for episode in &batch.ended {
+            self.episodes += 1;
+            self.falls += u64::from(batch.terminated[episode.env]);
+            self.length += u64::from(episode.length);
+            self.terms.iter_mut().zip(&episode.terms).for_each(|(sum, term)| *sum += f64::from(*term));
+        }
+        if let Some(layout) = self.layout {
+            // The observation of an ended episode is already that of the next one.
+            for robot in (0..batch.reward.len()).filter(|robot| !batch.done(*robot)) {
+                let [linear, yaw] = layout.squared_errors(obs, &batch.critic_obs, robot);
+                self.velocity_error += f64::from(linear);
+                self.yaw_rate_error += f64::from(yaw);
+            }
+        }
+    }
+
+    /// Adds the sums of other steps.
+    pub fn merge(&mut self, other: &Self) {
+        self.steps += other.steps;
+        self.reward += other.reward;
+        self.episodes += other.episodes;
+        self.falls += other.falls;
+        self.length += other.length;
+        self.velocity_error += other.velocity_error;
+        self.yaw_rate_error += other.yaw_rate_error;
+        self.terms.iter_mut().zip(&other.terms).for_each(|(sum, term)| *sum += term);
+    }
+
+    /// Returns the root mean square errors of horizontal velocity [m/s] and yaw rate [rad/s].
+    ///
+    /// Returns `None` if velocities are not observed.
+    pub fn velocity_rms(&self) -> Option<[f64; 2]> {
+        let rms = |sum: f64| (sum / self.steps.max(1) as f64).sqrt();
+        self.layout.map(|_| [rms(self.velocity_error), rms(self.yaw_rate_error)])
+    }
+}

@@ -1,0 +1,93 @@
+//! Mirroring of observations and actions at the robot's sagittal plane: left and right are exchanged.
+
+use twinstep_model::{EnvSpec, Joint, JointKind, Leg, NUM_JOINTS, SpecField};
+
+/// Mirrored vector: entry `i` is `signs[i] · vector[indices[i]]`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mirror {
+    indices: Vec<usize>,
+    signs: Vec<f32>,
+}
+
+/// A part of an observation or action has no known mirror image.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("`train.symmetry` is not possible: the mirror image of `{field}` is not known")]
+pub struct NoMirror {
+    /// The part.
+    pub field: String,
+}
+
+impl Mirror {
+    /// Returns the mirror of the observation of a policy, followed by the privileged one of a critic.
+    pub fn of_observations(spec: &EnvSpec) -> Result<Self, NoMirror> {
+        Self::of_fields(spec.observation.iter().chain(&spec.critic_observation))
+    }
+
+    /// Returns the mirror of an action.
+    pub fn of_actions(spec: &EnvSpec) -> Result<Self, NoMirror> {
+        Self::of_fields(&spec.action)
+    }
+
+    fn of_fields<'a>(fields: impl IntoIterator<Item = &'a SpecField>) -> Result<Self, NoMirror> {
+        let mut mirror = Self { indices: Vec::new(), signs: Vec::new() };
+        for field in fields {
+            let start = mirror.indices.len();
+            let entries = entries(field).ok_or_else(|| NoMirror { field: field.name.clone() })?;
+            for (index, sign) in entries {
+                mirror.indices.push(start + index);
+                mirror.signs.push(sign);
+            }
+        }
+        Ok(mirror)
+    }
+
+    /// Writes the mirror image of `vector`.
+    pub fn apply(&self, vector: &[f32], mirrored: &mut [f32]) {
+        for ((mirrored, index), sign) in mirrored.iter_mut().zip(&self.indices).zip(&self.signs) {
+            *mirrored = sign * vector[*index];
+        }
+    }
+
+    /// Replaces mean and variance by those of the vectors and their mirror images together.
+    pub fn symmetrise(&self, mean: &mut [f64], variance: &mut [f64]) {
+        let moments: Vec<[f64; 2]> = mean.iter().zip(variance.iter()).map(|(mean, var)| [*mean, *var]).collect();
+        for entry in 0..mean.len() {
+            let [own_mean, own_variance] = moments[entry];
+            let [other_mean, other_variance] = moments[self.indices[entry]];
+            let other_mean = f64::from(self.signs[entry]) * other_mean;
+            mean[entry] = f64::midpoint(own_mean, other_mean);
+            let between = (own_mean - other_mean).powi(2) / 4.0;
+            variance[entry] = f64::midpoint(own_variance, other_variance) + between;
+        }
+    }
+}
+
+/// Returns source index and sign of each entry of a field. Returns `None` if the field is not known.
+fn entries(field: &SpecField) -> Option<Vec<(usize, f32)>> {
+    // Vectors change the sign of y, pseudovectors that of x and z.
+    let signs = |signs: [f32; 3]| Some(signs.into_iter().enumerate().collect());
+    match field.name.as_str() {
+        "base_angular_velocity" | "true_angular_velocity" => signs([-1.0, 1.0, -1.0]),
+        "projected_gravity" | "true_linear_velocity" => signs([1.0, -1.0, 1.0]),
+        "velocity_command" => signs([1.0, -1.0, -1.0]),
+        "base_height" => Some(vec![(0, 1.0)]),
+        "foot_force" => Some(Leg::ALL.map(|leg| (opposite(leg) as usize, 1.0)).to_vec()),
+        "joint_position" | "joint_velocity" | "previous_action" | "joint_position_offset" => {
+            let joint = |joint: Joint| {
+                let sign = if joint.kind == JointKind::Hip { -1.0 } else { 1.0 };
+                (3 * opposite(joint.leg) as usize + joint.kind as usize, sign)
+            };
+            (field.size == NUM_JOINTS).then(|| Joint::ALL.map(joint).to_vec())
+        }
+        _ => None,
+    }
+}
+
+fn opposite(leg: Leg) -> Leg {
+    match leg {
+        Leg::FL => Leg::FR,
+        Leg::FR => Leg::FL,
+        Leg::RL => Leg::RR,
+        Leg::RR => Leg::RL,
+    }
+}
