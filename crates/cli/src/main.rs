@@ -17,6 +17,8 @@ mod play;
 mod robot_file;
 mod serve;
 mod train;
+mod train_config;
+mod train_log;
 
 use clap::{Parser, Subcommand};
 

@@ -1,101 +1,271 @@
 //! `twinstep train`: trains a policy by proximal policy optimisation.
 
-use std::path::PathBuf;
-use std::time::Instant;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
-use serde::{Deserialize, Serialize};
-use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
-use twinstep_envs::{Randomisation, TaskConfig};
-use twinstep_learning::{PpoConfig, Trainer, evaluate};
-use twinstep_model::{AutoresetMode, VecEnv};
-use twinstep_sim::SimConfig;
+use indicatif::{ProgressBar, ProgressStyle};
+use twinstep_envs::TaskConfig;
+use twinstep_learning::{Checkpoint, Evaluation, LearningError, Trainer, evaluate};
+use twinstep_policy::{CurvePoint, Policy, PolicyOrigin};
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::train_config::TrainConfig;
+use crate::train_log::{TrainLog, curve_point, write_curve};
 
-/// Train.
+/// Interval at which a running training is saved.
+const SAVE_EVERY: Duration = Duration::from_secs(10);
+/// Robots, simulated time [s] and seed of the evaluation after the training.
+const EVALUATION: (usize, f64, u64) = (256, 20.0, 1_000_000);
+
+/// Train a policy by proximal policy optimisation, in this process.
+///
+/// Simulates the robots on all cores and learns from them. The folder then contains:
+///
+///   policy.safetensors     the policy, with the spec of its environment
+///   policy.onnx            the same for other runtimes: input `obs` [batch, 45] in SI units, output `action` [batch, 12]
+///   evaluation.json        velocity errors and falls of 256 fresh robots
+///   config.toml            all settings; --config config.toml repeats the training
+///   progress.csv           errors, falls, reward terms and times of every update; TensorBoard reads events.out.*
+///   curve.svg              learning curve
+///   checkpoint.safetensors state of the training, saved every 10 s
+///
+/// Ctrl-C saves the training and ends it; --resume continues it. Equal seeds and settings give equal policies.
+///
+/// Example: `twinstep train walk --out walk --seed 1`, or on the robot that a diagnosis found:
+/// `twinstep train walk --out walk --model diagnosis/extended.toml --randomise-effects`
 #[derive(clap::Args)]
 pub struct Args {
-    /// The task.
-    #[arg(default_value = "walk")]
+    /// Task to learn.
+    #[arg(default_value = "walk", value_parser = ["walk"])]
     task: String,
-    /// Config file.
-    #[arg(long)]
+    /// Folder to write.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Config file (TOML) with [task], [sim], [randomise] and [train]. Flags override its values.
+    #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Seed.
+    /// Model file of the robot. Default: the ideal Go2.
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// Sample every parameter of the model file that has an interval, for every robot in every episode.
+    #[arg(long)]
+    randomise_effects: bool,
+    /// Seed of networks, robots, commands and exploration.
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Total number of environment steps. Default: 7 million.
+    #[arg(long, value_name = "N")]
+    steps: Option<u64>,
+    /// Time after which the training ends even if steps are left [min].
+    #[arg(long, value_name = "MIN")]
+    minutes: Option<f64>,
+    /// Number of robots. Default: 1024.
+    #[arg(long, value_name = "N")]
+    envs: Option<usize>,
+    /// Continue the training in the folder with its settings and seed.
+    #[arg(long, conflicts_with_all = ["config", "model", "randomise_effects", "seed", "envs"])]
+    resume: bool,
+    /// Print the evaluation as JSON on stdout.
+    #[arg(long)]
+    json: bool,
 }
 
-/// Config file of a training.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-struct TrainConfig {
-    task: TaskConfig,
-    sim: SimConfig,
-    randomise: Randomisation,
-    train: PpoConfig,
-}
-
-fn envs(config: &TrainConfig, num_envs: usize, groups: usize, threads: usize) -> Result<Vec<Box<dyn VecEnv>>, Failure> {
-    let sim = SimConfig { threads, ..config.sim };
-    let config = Config { task: config.task.clone(), sim, randomise: config.randomise, ..Config::default() };
-    let factory = SimEnvFactory::new(config).map_err(input)?;
-    (0..groups)
-        .map(|group| {
-            let robots = num_envs / groups + usize::from(group < num_envs % groups);
-            factory.build(robots, AutoresetMode::SameStep, None).map_err(input)
-        })
-        .collect()
-}
-
-/// Trains.
+/// Trains, then evaluates the policy.
 pub fn run(args: &Args) -> CommandResult {
     let start = Instant::now();
     let signals = Signals::listen()?;
-    let text = match &args.config {
-        Some(path) => std::fs::read_to_string(path).map_err(input)?,
-        None => String::new(),
+    let checkpoint = args.resume.then(|| Checkpoint::read(args.checkpoint())).transpose().map_err(input)?;
+    let mut config = match &checkpoint {
+        Some(checkpoint) => TrainConfig::parse(&checkpoint.config, "the checkpoint's config")?,
+        None => args.config()?,
     };
-    let config: TrainConfig = toml::from_str(&text).map_err(input)?;
-    let mut trainer = Trainer::new(
-        config.train.clone(),
-        envs(&config, config.train.num_envs, config.train.groups, 1)?,
-        None,
-        args.seed,
-    )
-    .map_err(input)?;
-    let (mut rollout, mut update) = (0.0, 0.0);
-    while trainer.learner().env_steps < config.train.total_steps {
-        signals.check()?;
-        let it = trainer.iterate().map_err(other)?;
-        rollout += it.rollout_time.as_secs_f64();
-        update += it.update_time.as_secs_f64();
-        if it.iteration % 20 == 0 {
-            let rms = it.statistics.velocity_rms().unwrap_or_default();
-            eprintln!(
-                "{:4} {:.2}M {:5.1}s rew/step {:.4} v {:.3} w {:.3} falls {} eps {} std {:.3} kl {:.4} lr {:.5} clip {:.2} vl {:.4} rollout {:.1} update {:.1}",
-                it.iteration,
-                it.env_steps as f64 / 1e6,
-                start.elapsed().as_secs_f64(),
-                it.statistics.reward / it.statistics.steps as f64,
-                rms[0],
-                rms[1],
-                it.statistics.falls,
-                it.statistics.episodes,
-                it.action_std,
-                it.kl,
-                it.learning_rate,
-                it.clipped_share,
-                it.value_loss,
-                rollout,
-                update
-            );
+    config.train.total_steps = args.steps.unwrap_or(config.train.total_steps);
+    std::fs::create_dir_all(&args.out).map_err(|cause| folder_error(&args.out, cause))?;
+    let text = toml::to_string(&config).expect("settings are plain data");
+    std::fs::write(args.out.join("config.toml"), &text).map_err(|cause| folder_error(&args.out, cause))?;
+    let mut session = TrainSession::new(args, config, text, checkpoint)?;
+    let ended = session.train(&signals, start);
+    session.save()?;
+    match ended {
+        Ok(()) => session.report(args, start),
+        Err(Failure::Interrupted) => {
+            eprintln!("interrupted; continue with: twinstep train --out {} --resume", args.out.display());
+            Err(Failure::Interrupted)
+        }
+        Err(failure) => {
+            eprintln!("the policy before the failure is in {}", args.out.display());
+            Err(failure)
         }
     }
-    let policy = trainer.learner().policy(trainer.spec());
-    let fresh = TrainConfig { task: TaskConfig::default(), ..config.clone() };
-    let mut env = envs(&fresh, 256, 1, 0)?.remove(0);
-    let evaluation = evaluate(&policy, env.as_mut(), 20.0, 12345, |_| ()).map_err(other)?;
-    println!("{:.1} s total; {evaluation:?}", start.elapsed().as_secs_f64());
-    Ok(())
+}
+
+fn folder_error(folder: &Path, cause: std::io::Error) -> Failure {
+    Failure::Input(miette::miette!("`--out` = {}: cannot write the folder: {cause}", folder.display()))
+}
+
+impl Args {
+    fn checkpoint(&self) -> PathBuf {
+        self.out.join("checkpoint.safetensors")
+    }
+
+    fn config(&self) -> Result<TrainConfig, Failure> {
+        let mut config = self.config.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::load)?;
+        if config.task.name() != self.task {
+            config.task = TaskConfig::named(&self.task).expect("the argument was checked");
+        }
+        // The folder may be used from another working directory.
+        config.model = self.model.clone().or(config.model).map(|path| path.canonicalize().unwrap_or(path));
+        config.randomise.effects |= self.randomise_effects;
+        config.train.num_envs = self.envs.unwrap_or(config.train.num_envs);
+        config.train.groups = config.train.groups.min(config.train.num_envs);
+        if self.minutes.is_some_and(|minutes| !(minutes > 0.0)) {
+            return Err(Failure::Input(miette::miette!("`--minutes` must be positive")));
+        }
+        Ok(config)
+    }
+}
+
+/// A training that runs.
+struct TrainSession {
+    config: TrainConfig,
+    text: String,
+    seed: u64,
+    out: PathBuf,
+    minutes: Option<f64>,
+    trainer: Trainer,
+    curve: Vec<CurvePoint>,
+    log: TrainLog,
+}
+
+impl TrainSession {
+    fn new(args: &Args, config: TrainConfig, text: String, checkpoint: Option<Checkpoint>) -> Result<Self, Failure> {
+        config.train.check().map_err(input)?;
+        let envs = config.envs(config.train.num_envs, config.train.groups, 1)?;
+        let seed = checkpoint.as_ref().map_or(args.seed, |checkpoint| checkpoint.seed);
+        let (learner, curve) =
+            checkpoint.map_or((None, Vec::new()), |checkpoint| (Some(checkpoint.learner), checkpoint.curve));
+        let trainer = Trainer::new(config.train.clone(), envs, learner, seed).map_err(input)?;
+        let log = TrainLog::open(&args.out, &trainer.spec().reward_terms, args.resume)
+            .map_err(|cause| folder_error(&args.out, cause))?;
+        Ok(Self { config, text, seed, out: args.out.clone(), minutes: args.minutes, trainer, curve, log })
+    }
+
+    /// Trains until all steps are done, the time is over, or the user interrupts.
+    fn train(&mut self, signals: &Signals, start: Instant) -> CommandResult {
+        let total = self.config.train.total_steps;
+        let earlier = self.curve.last().map_or(0.0, |point| point.seconds);
+        let bar = ProgressBar::new(total).with_position(self.trainer.learner().env_steps).with_style(
+            ProgressStyle::with_template("{bar:24} {human_pos}/{human_len} env-steps  {per_sec}  ETA {eta}  {msg}")
+                .expect("the template is valid"),
+        );
+        let mut saved = Instant::now();
+        while self.trainer.learner().env_steps < total {
+            if signals.check()? || self.minutes.is_some_and(|minutes| start.elapsed().as_secs_f64() > 60.0 * minutes) {
+                break;
+            }
+            let iteration = self.trainer.iterate().map_err(|error| match error {
+                LearningError::Config(_) => input(error),
+                _ => other(error),
+            })?;
+            let seconds = earlier + start.elapsed().as_secs_f64();
+            let point = curve_point(&iteration, self.trainer.spec().policy_dt, seconds);
+            self.log.write(&iteration, &point).map_err(other)?;
+            self.curve.push(point);
+            bar.set_position(iteration.env_steps);
+            bar.set_message(progress_text(&point));
+            if saved.elapsed() > SAVE_EVERY {
+                self.save()?;
+                saved = Instant::now();
+            }
+        }
+        bar.finish_and_clear();
+        Ok(())
+    }
+
+    /// Writes checkpoint, policy and learning curve.
+    fn save(&self) -> CommandResult {
+        let (learner, spec) = (self.trainer.learner(), self.trainer.spec());
+        let checkpoint = Checkpoint {
+            learner: learner.clone(),
+            spec: spec.clone(),
+            seed: self.seed,
+            config: self.text.clone(),
+            curve: self.curve.clone(),
+        };
+        checkpoint.write(self.out.join("checkpoint.safetensors")).map_err(other)?;
+        let policy = learner.policy(spec);
+        policy.write(self.out.join("policy.safetensors"), self.origin()).map_err(other)?;
+        policy.write_onnx(self.out.join("policy.onnx")).map_err(other)?;
+        write_curve(&self.curve, &self.out.join("curve.svg")).map_err(other)
+    }
+
+    fn origin(&self) -> PolicyOrigin {
+        PolicyOrigin {
+            command: std::env::args().collect::<Vec<_>>().join(" "),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            seed: self.seed,
+            config: self.text.clone(),
+            env_steps: self.trainer.learner().env_steps,
+            curve: thinned(&self.curve),
+        }
+    }
+
+    fn report(&self, args: &Args, start: Instant) -> CommandResult {
+        let policy = self.trainer.learner().policy(self.trainer.spec());
+        let evaluation = self.evaluate(&policy)?;
+        let json = serde_json::to_string_pretty(&evaluation).expect("an evaluation is plain data");
+        std::fs::write(self.out.join("evaluation.json"), &json).map_err(other)?;
+        let steps = self.trainer.learner().env_steps as f64 / 1e6;
+        let seconds = start.elapsed().as_secs_f64();
+        if args.json {
+            println!("{json}");
+        } else {
+            println!("trained {steps:.1} million steps in {seconds:.1} s; policy and curves in {}", args.out.display());
+            print!("{}", evaluation_text(&evaluation));
+        }
+        Ok(())
+    }
+
+    /// Evaluates the policy on fresh robots of the training's model, with default commands and physics.
+    fn evaluate(&self, policy: &Policy) -> Result<Evaluation, Failure> {
+        let (robots, seconds, seed) = EVALUATION;
+        let fresh = TrainConfig { model: self.config.model.clone(), ..TrainConfig::default() };
+        let mut env = fresh.envs(robots, 1, 0)?.remove(0);
+        evaluate(policy, env.as_mut(), seconds, seed, |_| ()).map_err(other)
+    }
+}
+
+fn progress_text(point: &CurvePoint) -> String {
+    let error = |value: Option<f64>, unit: &str| value.map_or(String::new(), |value| format!("{value:.2} {unit}, "));
+    format!(
+        "errors {}{}falls/min {:.1}, reward {:.3}",
+        error(point.velocity_rms, "m/s"),
+        error(point.yaw_rate_rms, "rad/s"),
+        point.falls_per_minute,
+        point.reward
+    )
+}
+
+/// Returns at most some hundred points of a curve, with its last one.
+fn thinned(curve: &[CurvePoint]) -> Vec<CurvePoint> {
+    let step = curve.len().div_ceil(200).max(1);
+    curve.iter().rev().step_by(step).rev().copied().collect()
+}
+
+/// Returns the table of an evaluation.
+pub fn evaluation_text(evaluation: &Evaluation) -> String {
+    let Evaluation { robots, seconds, up, velocity_rms, settled_velocity_rms, .. } = evaluation;
+    let Evaluation { yaw_rate_rms, settled_yaw_rate_rms, swing_height, duty_factor, .. } = evaluation;
+    format!(
+        "{robots} fresh robots, {seconds:.0} s, mean action:\n\
+         \x20 still up                 {:.1} %\n\
+         \x20 velocity error, RMS      {velocity_rms:.3} m/s   ({settled_velocity_rms:.3} from 1 s after each new command)\n\
+         \x20 yaw rate error, RMS      {yaw_rate_rms:.3} rad/s ({settled_yaw_rate_rms:.3})\n\
+         \x20 swing height of the sole {:.1} cm, duty factor {duty_factor:.2}, {:.1} swings/s per foot\n\
+         \x20 speed of feet on ground  {:.3} m/s\n",
+        100.0 * up,
+        100.0 * swing_height,
+        evaluation.swings_per_second,
+        evaluation.slip_speed,
+    )
 }

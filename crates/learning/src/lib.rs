@@ -8,19 +8,26 @@
 //! Equal seeds, settings and environments give equal bits on any number of threads.
 
 mod adam;
+mod checkpoint;
 mod config;
 mod evaluation;
 pub mod gae;
 mod rollout;
 mod statistics;
 mod symmetry;
+mod tensorboard;
 mod trainer;
 mod update;
 
 pub use adam::Adam;
+pub use checkpoint::Checkpoint;
 pub use config::{PpoConfig, PpoConfigError};
 pub use evaluation::{Evaluation, EvaluationError, evaluate};
 pub use rollout::Group;
 pub use statistics::{Statistics, VelocityLayout};
 pub use symmetry::{Mirror, NoMirror};
+pub use tensorboard::EventFile;
 pub use trainer::{Iteration, Learner, LearningError, Trainer};
+
+#[cfg(test)]
+mod tests;

@@ -216,7 +216,7 @@ impl Trainer {
             env_steps: self.learner.env_steps,
             surrogate: losses.surrogate / samples,
             value_loss: losses.value / samples,
-            kl: losses.kl / samples,
+            kl: losses.mean_kl(),
             clipped_share: losses.clipped as f64 / samples,
             learning_rate: self.learner.learning_rate,
             action_std: stds.sum::<f32>() / self.learner.log_std.len() as f32,
@@ -263,7 +263,8 @@ impl Trainer {
         for (group, segment) in segments.iter().enumerate() {
             let indices = 0..segment.values.len() as u32;
             // Every second sample is mirrored in the first pass, the others in the second.
-            let sample = |index: u32| Sample { group: group as u32, index, is_mirrored: index % 2 == 1 };
+            let is_mirrored = |index: u32| config.symmetry && index % 2 == 1;
+            let sample = |index| Sample { group: group as u32, index, is_mirrored: is_mirrored(index) };
             samples.extend(indices.map(sample));
         }
         let mut random = stream(self.seed, "minibatches", learner.iteration);
@@ -274,19 +275,16 @@ impl Trainer {
                 let [actor, critic] = networks;
                 let parameters = Parameters { actor, critic, log_std: &learner.log_std };
                 let sums = task.run(&batch, minibatch, &parameters, config);
-                adapt_learning_rate(&mut learner.learning_rate, sums.kl / minibatch.len() as f64, config);
+                adapt_learning_rate(&mut learner.learning_rate, sums.mean_kl(), config);
                 let is_finite = apply(learner, task, minibatch.len(), config);
                 networks[0].update(&learner.actor);
                 networks[1].update(&learner.critic);
                 if !is_finite {
                     return Err(LearningError::NotFinite { iteration: learner.iteration + 1 });
                 }
-                losses.surrogate += sums.surrogate;
-                losses.value += sums.value;
-                losses.kl += sums.kl;
-                losses.clipped += sums.clipped;
+                losses.add(&sums);
             }
-            samples.iter_mut().for_each(|sample| sample.is_mirrored = !sample.is_mirrored);
+            samples.iter_mut().for_each(|sample| sample.is_mirrored ^= config.symmetry);
         }
         Ok(losses)
     }

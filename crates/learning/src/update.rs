@@ -66,8 +66,26 @@ pub struct LossSums {
     pub value: f64,
     /// Kullback–Leibler divergence from the policy that collected the samples [nat].
     pub kl: f64,
+    /// Number of samples in `kl`.
+    pub kl_samples: u64,
     /// Number of samples whose probability ratio was clipped.
     pub clipped: u64,
+}
+
+impl LossSums {
+    /// Adds the sums over other samples.
+    pub fn add(&mut self, other: &Self) {
+        self.surrogate += other.surrogate;
+        self.value += other.value;
+        self.kl += other.kl;
+        self.kl_samples += other.kl_samples;
+        self.clipped += other.clipped;
+    }
+
+    /// Returns the mean Kullback–Leibler divergence [nat].
+    pub fn mean_kl(&self) -> f64 {
+        self.kl / self.kl_samples.max(1) as f64
+    }
 }
 
 /// Sum of the gradients over a part of a minibatch.
@@ -154,12 +172,7 @@ impl GradientTask {
             shard.run(batch, &samples[range], parameters, config);
         });
         let mut losses = LossSums::default();
-        for shard in &self.shards {
-            losses.surrogate += shard.losses.surrogate;
-            losses.value += shard.losses.value;
-            losses.kl += shard.losses.kl;
-            losses.clipped += shard.losses.clipped;
-        }
+        self.shards.iter().for_each(|shard| losses.add(&shard.losses));
         for (index, sum) in self.gradient.arrays_mut().into_iter().enumerate() {
             sum.fill(0.0);
             for shard in &self.shards {
@@ -222,7 +235,11 @@ impl Shard {
         // The smaller of the two; the clipped one has no gradient.
         let is_clipped = clipped_ratio * advantage < ratio * advantage;
         self.losses.surrogate += f64::from((ratio * advantage).min(clipped_ratio * advantage));
-        self.losses.kl += f64::from(ratio - 1.0 - log_ratio);
+        // The mirrored action was not sampled from the policy, so its divergence does not measure the update.
+        if !sample.is_mirrored {
+            self.losses.kl += f64::from(ratio - 1.0 - log_ratio);
+            self.losses.kl_samples += 1;
+        }
         self.losses.clipped += u64::from(is_clipped);
         let factor = if is_clipped { 0.0 } else { -ratio * advantage };
         let mean_gradient = self.actor.output_gradient(row);

@@ -3,21 +3,27 @@
 //! - [`Mlp`]: parameters of a multilayer perceptron; [`Network`]: its forward and backward pass for a batch of rows, on
 //!   SIMD registers ([`mod@matrix`]).
 //! - [`Normaliser`]: mean and standard deviation of observations; [`gaussian`]: noise of actions.
-//! - [`Policy`]: normaliser, actor and the spec of the environment; [`PolicyRunner`] evaluates it.
+//! - [`Policy`]: normaliser, actor and the spec of the environment; [`PolicyRunner`] evaluates it. [`Policy::read`] and
+//!   [`Policy::write`]: the policy file; [`Policy::write_onnx`]: the same for other runtimes.
+//! - [`array_file`]: named arrays in a safetensors file.
 //!
 //! Equal weights and observations give equal bits on every instruction set and in every batch.
 
 #![allow(clippy::inline_always, reason = "a function that is not inlined is compiled for the baseline instruction set")]
 #![allow(clippy::needless_range_loop, reason = "closures may not be inlined")]
 
+pub mod array_file;
 pub mod gaussian;
 mod matrix;
 mod mlp;
 mod network;
 mod normaliser;
+mod onnx;
 mod policy;
+mod policy_file;
 
 pub use mlp::{LayerLayout, Mlp};
 pub use network::{Activations, Network};
 pub use normaliser::Normaliser;
 pub use policy::{Policy, PolicyRunner};
+pub use policy_file::{CurvePoint, PolicyHeader, PolicyOrigin, mlp_arrays, take_mlp};

@@ -247,7 +247,7 @@ mod tests {
     use super::*;
 
     /// Returns the gradient of Σ weightᵢ · outputᵢ over all rows by the backward pass.
-    fn gradient(network: &Mlp, instructions: InstructionSet, inputs: &[Vec<f32>]) -> (f64, Vec<f32>) {
+    fn gradient_of(network: &Mlp, instructions: InstructionSet, inputs: &[Vec<f32>]) -> (f64, Vec<f32>) {
         let packed = Network::with_instructions(network, instructions);
         let mut activations = Activations::new(network, inputs.len());
         for (row, input) in inputs.iter().enumerate() {
@@ -281,13 +281,13 @@ mod tests {
     #[test]
     fn gradient_agrees_with_finite_differences() {
         let (network, inputs) = example();
-        let (_, gradient) = gradient(&network, InstructionSet::best(), &inputs);
+        let (_, gradient) = gradient_of(&network, InstructionSet::best(), &inputs);
         let mut checked = 0;
         for index in (0..network.parameters.len()).step_by(7) {
             let loss = |offset: f32| {
                 let mut other = network.clone();
                 other.parameters[index] += offset;
-                super::tests::gradient(&other, InstructionSet::best(), &inputs).0
+                gradient_of(&other, InstructionSet::best(), &inputs).0
             };
             if gradient[index] != 0.0 {
                 let difference = (loss(1e-3) - loss(-1e-3)) / 2e-3;
@@ -302,12 +302,13 @@ mod tests {
     #[test]
     fn every_instruction_set_gives_the_same_bits_and_padding_has_no_gradient() {
         let (network, inputs) = example();
-        let expected = gradient(&network, InstructionSet::BASELINE, &inputs);
+        let expected = gradient_of(&network, InstructionSet::BASELINE, &inputs);
         for instructions in InstructionSet::available() {
-            assert_eq!(gradient(&network, instructions, &inputs), expected, "{instructions}");
+            assert_eq!(gradient_of(&network, instructions, &inputs), expected, "{instructions}");
         }
         let mut unpadded = Mlp::zeros(network.sizes());
-        let all = Mlp { parameters: expected.1.clone(), ..network.clone() };
+        let mut all = network.clone();
+        all.parameters.clone_from(&expected.1);
         for index in 0..network.layers().len() {
             let (weight, bias) = all.layer(index);
             unpadded.set_layer(index, &weight, &bias);

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 /// Limit of normalised entries.
-const CLIP: f32 = 10.0;
+pub const CLIP: f32 = 10.0;
 /// Added to the variance, so that constant entries stay finite.
 const VARIANCE_FLOOR: f64 = 1e-8;
 
@@ -33,6 +33,15 @@ impl Normaliser {
         normaliser
     }
 
+    /// Creates a normaliser with the given mean and standard deviation of each entry.
+    pub fn from_mean_and_std(mean: &[f32], std: &[f32]) -> Self {
+        let mut normaliser = Self::identity(mean.len());
+        normaliser.mean = mean.iter().map(|mean| f64::from(*mean)).collect();
+        normaliser.variance = std.iter().map(|std| f64::from(*std).powi(2) - VARIANCE_FLOOR).collect();
+        normaliser.scale = mean.iter().zip(std).map(|(mean, std)| [*mean, *std]).collect();
+        normaliser
+    }
+
     /// Returns the number of entries of an observation.
     pub fn len(&self) -> usize {
         self.mean.len()
@@ -45,7 +54,7 @@ impl Normaliser {
 
     /// Returns mean and standard deviation of each entry, as [`Normaliser::apply`] uses them.
     pub fn mean_and_std(&self) -> (Vec<f32>, Vec<f32>) {
-        self.mean.iter().zip(&self.variance).map(|(mean, variance)| (*mean as f32, std(*variance))).unzip()
+        self.scale.iter().map(|[mean, std]| (*mean, *std)).unzip()
     }
 
     /// Updates the moments with `rows`, observations one after the other.
@@ -92,14 +101,14 @@ impl Normaliser {
     }
 
     fn update_scale(&mut self) {
-        let scale = |(mean, variance): (&f64, &f64)| [*mean as f32, 1.0 / std(*variance)];
+        let scale = |(mean, variance): (&f64, &f64)| [*mean as f32, std(*variance)];
         self.scale = self.mean.iter().zip(&self.variance).map(scale).collect();
     }
 
     /// Writes the normalised observation `row`, clipped to ±10, to the first entries of `output`.
     pub fn apply(&self, row: &[f32], output: &mut [f32]) {
-        for ((value, [mean, factor]), output) in row.iter().zip(&self.scale).zip(output) {
-            *output = ((value - mean) * factor).clamp(-CLIP, CLIP);
+        for ((value, [mean, std]), output) in row.iter().zip(&self.scale).zip(output) {
+            *output = ((value - mean) / std).clamp(-CLIP, CLIP);
         }
     }
 }

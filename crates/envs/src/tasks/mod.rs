@@ -102,7 +102,7 @@ mod tests {
     fn errors_name_the_key_and_what_is_possible() {
         let error = |text: &str| toml::from_str::<TaskConfig>(text).expect_err("invalid").to_string();
         expect![[r#"
-            unknown field `torques`, expected one of `track_linear_velocity`, `track_angular_velocity`, `linear_velocity_z`, `angular_velocity_xy`, `flat_orientation`, `joint_torque`, `joint_acceleration`, `action_rate`, `joint_position_limits`, `feet_air_time`, `undesired_contact`, `stand_still`, `epistemic_uncertainty`
+            unknown field `torques`, expected one of `track_linear_velocity`, `track_angular_velocity`, `linear_velocity_z`, `angular_velocity_xy`, `flat_orientation`, `base_height`, `joint_torque`, `joint_acceleration`, `action_rate`, `joint_position_limits`, `hip_deviation`, `feet_air_time`, `feet_clearance`, `feet_slip`, `undesired_contact`, `stand_still`, `termination`, `epistemic_uncertainty`
             in `reward`
         "#]].assert_eq(&error("[reward]\ntorques = -1.0"));
         expect![[r#"

@@ -1,0 +1,62 @@
+//! Config file of `twinstep train`, and the environments that it describes.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use twinstep_env_server::{Config, ConfigFileError, EnvFactory, ServerConfig, SimEnvFactory};
+use twinstep_envs::{Randomisation, TaskConfig};
+use twinstep_learning::PpoConfig;
+use twinstep_model::{AutoresetMode, VecEnv};
+use twinstep_sim::SimConfig;
+
+use crate::exit::{Failure, input};
+
+/// Config file of a training (TOML). Every key is optional.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainConfig {
+    /// Model file of the robot. Default: the ideal Go2.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub model: Option<PathBuf>,
+    /// The task and its rewards.
+    pub task: TaskConfig,
+    /// Simulation settings.
+    pub sim: SimConfig,
+    /// Domain randomisation.
+    pub randomise: Randomisation,
+    /// Settings of the learner.
+    pub train: PpoConfig,
+}
+
+impl TrainConfig {
+    /// Reads a config file.
+    pub fn load(path: &Path) -> Result<Self, Failure> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| input(ConfigFileError::Unreadable { path: path.to_owned(), source }))?;
+        Self::parse(&text, &path.display().to_string())
+    }
+
+    /// Parses the text of a config file. Errors refer to the file as `name`.
+    pub fn parse(text: &str, name: &str) -> Result<Self, Failure> {
+        toml::from_str(text)
+            .map_err(|error| input(ConfigFileError::Malformed { name: name.to_owned(), message: error.to_string() }))
+    }
+
+    /// Builds `groups` batches of environments, `num_envs` in total, that are stepped by `threads` threads each.
+    pub fn envs(&self, num_envs: usize, groups: usize, threads: usize) -> Result<Vec<Box<dyn VecEnv>>, Failure> {
+        let config = Config {
+            server: ServerConfig { model: self.model.clone(), ..ServerConfig::default() },
+            task: self.task.clone(),
+            sim: SimConfig { threads, ..self.sim },
+            randomise: self.randomise,
+        };
+        config.check().map_err(input)?;
+        let factory = SimEnvFactory::new(config).map_err(input)?;
+        (0..groups)
+            .map(|group| {
+                let robots = num_envs / groups + usize::from(group < num_envs % groups);
+                factory.build(robots, AutoresetMode::SameStep, None).map_err(input)
+            })
+            .collect()
+    }
+}
