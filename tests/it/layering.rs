@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Crate folders and the workspace crates that each may use. Leaf crates use only the core; applications combine them.
-const MAY_USE: [(&str, &[&str]); 19] = [
+const MAY_USE: [(&str, &[&str]); 21] = [
     // Core.
     ("crates/simd", &[]),
     ("crates/model", &["simd"]),
@@ -17,6 +17,8 @@ const MAY_USE: [(&str, &[&str]); 19] = [
     ("crates/envs", &["model", "effects"]),
     ("crates/identify", &["model", "effects", "logs"]),
     ("crates/diagnose", &["model", "effects", "logs", "identify"]),
+    ("crates/policy", &["simd", "model"]),
+    ("crates/learning", &["model", "policy"]),
     ("crates/session", &[]),
     ("ensemble", &["simd", "model", "effects", "logs"]),
     // Applications.
@@ -54,6 +56,8 @@ const MAY_USE: [(&str, &[&str]); 19] = [
             "ensemble",
             "env-server",
             "client",
+            "policy",
+            "learning",
             "session",
             "report",
             "hunt",
@@ -74,6 +78,8 @@ const MAY_USE: [(&str, &[&str]); 19] = [
             "envs",
             "identify",
             "diagnose",
+            "policy",
+            "learning",
             "ensemble",
             "env-server",
             "client",
@@ -84,7 +90,7 @@ const MAY_USE: [(&str, &[&str]); 19] = [
 /// Libraries and the only crates that may use them.
 const RESTRICTED_LIBRARIES: [(&str, &[&str]); 8] = [
     ("rapier3d", &["crates/sim"]),
-    ("burn", &["ensemble"]),
+    ("burn", &["ensemble", "tests"]),
     ("zenoh", &["crates/session", "env-server", "clients/rust", "tests"]),
     ("clap", &["crates/cli", "tests"]),
     ("plotters", &["crates/report"]),

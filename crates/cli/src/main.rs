@@ -6,6 +6,7 @@ mod demo;
 mod diagnose;
 mod effects;
 mod evaluate;
+mod evaluate_policy;
 mod exit;
 mod fit;
 mod hunt;
@@ -37,6 +38,7 @@ enum CliCommand {
     Diagnose(diagnose::Args),
     Effects(effects::Args),
     Evaluate(evaluate::Args),
+    EvaluatePolicy(evaluate_policy::Args),
     Fit(fit::Args),
     Hunt(hunt::Args),
     Identify(identify::Args),
@@ -65,6 +67,7 @@ fn main() -> std::process::ExitCode {
         CliCommand::Diagnose(args) => diagnose::run(&args),
         CliCommand::Effects(args) => effects::run(&args),
         CliCommand::Evaluate(args) => evaluate::run(&args),
+        CliCommand::EvaluatePolicy(args) => evaluate_policy::run(&args),
         CliCommand::Fit(args) => fit::run(&args),
         CliCommand::Hunt(args) => hunt::run(&args),
         CliCommand::Identify(args) => identify::run(&args),

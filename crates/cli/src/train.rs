@@ -116,8 +116,10 @@ impl Args {
         // The folder may be used from another working directory.
         config.model = self.model.clone().or(config.model).map(|path| path.canonicalize().unwrap_or(path));
         config.randomise.effects |= self.randomise_effects;
-        config.train.num_envs = self.envs.unwrap_or(config.train.num_envs);
-        config.train.groups = config.train.groups.min(config.train.num_envs);
+        if let Some(envs) = self.envs {
+            (config.train.num_envs, config.train.groups) = (envs, config.train.groups.min(envs.max(1)));
+        }
+        config.train.check().map_err(input)?;
         if self.minutes.is_some_and(|minutes| !(minutes > 0.0)) {
             return Err(Failure::Input(miette::miette!("`--minutes` must be positive")));
         }
@@ -139,7 +141,6 @@ struct TrainSession {
 
 impl TrainSession {
     fn new(args: &Args, config: TrainConfig, text: String, checkpoint: Option<Checkpoint>) -> Result<Self, Failure> {
-        config.train.check().map_err(input)?;
         let envs = config.envs(config.train.num_envs, config.train.groups, 1)?;
         let seed = checkpoint.as_ref().map_or(args.seed, |checkpoint| checkpoint.seed);
         let (learner, curve) =

@@ -64,6 +64,7 @@ impl Checkpoint {
         };
         let vector = |values: &Vec<f32>| Array { dimensions: vec![values.len()], values: values.clone() };
         let mut arrays = mlp_arrays("actor", &learner.actor);
+        arrays.extend(mlp_arrays("mean_actor", &learner.mean_actor));
         arrays.extend(mlp_arrays("critic", &learner.critic));
         arrays.insert("log_std".to_owned(), vector(&learner.log_std));
         for (name, optimiser) in OPTIMISED.iter().zip(&learner.optimisers) {
@@ -84,6 +85,7 @@ impl Checkpoint {
             }
         }
         let actor = take_mlp(&mut arrays, "actor", &header.actor_sizes, path)?;
+        let mean_actor = take_mlp(&mut arrays, "mean_actor", &header.actor_sizes, path)?;
         let critic = take_mlp(&mut arrays, "critic", &header.critic_sizes, path)?;
         let log_std = take(&mut arrays, "log_std", &[actor.outputs()], path)?;
         let lengths = [actor.parameters.len(), critic.parameters.len(), log_std.len()];
@@ -100,6 +102,7 @@ impl Checkpoint {
         }
         let learner = Learner {
             actor,
+            mean_actor,
             critic,
             log_std,
             normaliser: Normaliser::from_moments(count, mean, variance),

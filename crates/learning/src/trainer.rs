@@ -18,6 +18,8 @@ use crate::update::{Batch, GradientTask, LossSums, Mirrors, Parameters, Sample};
 const MIN_LEARNING_RATE: f32 = 1e-5;
 /// Factor by which the learning rate changes.
 const LEARNING_RATE_FACTOR: f32 = 1.5;
+/// Share of the earlier mean that remains in [`Learner::mean_actor`] after an update.
+const MEAN_DECAY: f32 = 0.9;
 /// Gain of the actor's last layer, so that the first actions are close to the default pose.
 const ACTOR_OUTPUT_GAIN: f32 = 0.01;
 
@@ -26,6 +28,10 @@ const ACTOR_OUTPUT_GAIN: f32 = 0.01;
 pub struct Learner {
     /// Network from the normalised observation of group `policy` to the mean action.
     pub actor: Mlp,
+    /// Mean of the actor's parameters over the last updates: the policy that is kept.
+    ///
+    /// Its actions are less noisy than those of the actor after any one update (Polyak and Juditsky 1992).
+    pub mean_actor: Mlp,
     /// Network from the normalised observations of both groups to the value.
     pub critic: Mlp,
     /// Logarithm of the standard deviation of each entry of the action.
@@ -56,6 +62,7 @@ impl Learner {
         let log_std = vec![config.initial_std.ln(); action_len];
         let lengths = [actor.parameters.len(), critic.parameters.len(), log_std.len()];
         Self {
+            mean_actor: actor.clone(),
             actor,
             critic,
             log_std,
@@ -75,7 +82,7 @@ impl Learner {
             self.normaliser.mean[..obs_len].to_vec(),
             self.normaliser.variance[..obs_len].to_vec(),
         );
-        Policy { spec: spec.clone(), normaliser, actor: self.actor.clone(), log_std: self.log_std.clone() }
+        Policy { spec: spec.clone(), normaliser, actor: self.mean_actor.clone(), log_std: self.log_std.clone() }
     }
 
     /// Returns true if all parameters are finite.
@@ -207,6 +214,8 @@ impl Trainer {
         let rollout_time = start.elapsed();
         let before = self.learner.clone();
         let losses = self.update().inspect_err(|_| self.learner = before)?;
+        let mean = self.learner.mean_actor.parameters.iter_mut().zip(&self.learner.actor.parameters);
+        mean.for_each(|(mean, value)| *mean = MEAN_DECAY * *mean + (1.0 - MEAN_DECAY) * value);
         let samples = (self.config.epochs * self.samples.len()) as f64;
         self.learner.iteration += 1;
         self.learner.env_steps += statistics.steps;

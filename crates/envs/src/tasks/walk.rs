@@ -36,6 +36,8 @@ pub struct Walk {
 pub struct WalkState {
     /// Velocity command: forward [m/s], left [m/s], yaw rate [rad/s].
     command: [f32; 3],
+    /// Policy steps until the next command.
+    steps_to_command: u32,
     contacts: FootContacts,
 }
 
@@ -128,7 +130,10 @@ impl Task for Walk {
     fn start(&self, random: &mut Stream) -> (PerJoint, WalkState) {
         let noise = self.config.reset_joint_noise_rad;
         let q = self.default_pose.map(|position| position + (2.0 * noise * random.random::<f32>() - noise));
-        (q, WalkState { command: self.draw_command(random), contacts: FootContacts::default() })
+        let command = self.draw_command(random);
+        // The first command is shorter, so that robots that start together do not change their commands together.
+        let steps_to_command = random.random_range(1..=self.resample_steps);
+        (q, WalkState { command, steps_to_command, contacts: FootContacts::default() })
     }
 
     fn observe(&self, state: &WalkState, robot: &RobotView, action: &PerJoint, obs: &mut [f32]) {
@@ -150,8 +155,9 @@ impl Task for Walk {
         for (term, index) in terms.iter_mut().zip(&self.terms) {
             *term = values[*index];
         }
-        if step.length.is_multiple_of(self.resample_steps) {
-            state.command = self.draw_command(random);
+        state.steps_to_command = state.steps_to_command.saturating_sub(1);
+        if state.steps_to_command == 0 {
+            (state.command, state.steps_to_command) = (self.draw_command(random), self.resample_steps);
         }
         is_terminated
     }

@@ -1,0 +1,97 @@
+//! `twinstep train` and `twinstep evaluate-policy` as processes.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use twinstep_policy::Policy;
+
+fn twinstep(arguments: &[&str]) -> Output {
+    let program = Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep");
+    Command::new(program).args(arguments).output().unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+#[test]
+fn training_writes_its_folder_and_is_resumed_in_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("walk");
+    let out_text = out.to_str().unwrap();
+    let trained = twinstep(&["train", "walk", "--out", out_text, "--envs", "64", "--steps", "6144", "--seed", "5"]);
+    assert!(trained.status.success(), "{}", text(&trained.stderr));
+    for name in ["policy.safetensors", "policy.onnx", "evaluation.json", "config.toml", "curve.svg"] {
+        assert!(out.join(name).metadata().unwrap().len() > 100, "{name}");
+    }
+    let table = || std::fs::read_to_string(out.join("progress.csv")).unwrap();
+    assert_eq!(table().lines().count(), 1 + 4, "a header and 6144 / (64 · 24) updates");
+    let (policy, header) = Policy::read(out.join("policy.safetensors")).unwrap();
+    assert_eq!((header.origin.env_steps, header.origin.seed, header.origin.curve.len()), (6144, 5, 4));
+
+    let resumed = twinstep(&["train", "walk", "--out", out_text, "--resume", "--steps", "9216", "--json"]);
+    assert!(resumed.status.success(), "{}", text(&resumed.stderr));
+    let evaluation: serde_json::Value = serde_json::from_slice(&resumed.stdout).unwrap();
+    assert_eq!(evaluation["robots"], 256);
+    assert_eq!(table().lines().count(), 1 + 6);
+    let (longer, header) = Policy::read(out.join("policy.safetensors")).unwrap();
+    assert!(header.origin.env_steps == 9216 && longer.actor != policy.actor);
+}
+
+#[test]
+fn equal_seeds_give_equal_policies() {
+    let folder = tempfile::tempdir().unwrap();
+    let policy = |name: &str, seed: &str| {
+        let out = folder.path().join(name);
+        let arguments = ["train", "--out", out.to_str().unwrap(), "--envs", "32", "--steps", "1536", "--seed", seed];
+        let output = twinstep(&arguments);
+        assert!(output.status.success(), "{}", text(&output.stderr));
+        Policy::read(out.join("policy.safetensors")).unwrap().0
+    };
+    let first = policy("first", "1");
+    assert!(first == policy("again", "1"));
+    assert!(first != policy("other", "2"));
+}
+
+#[test]
+fn policy_is_evaluated_on_each_engine_and_refused_where_it_does_not_fit() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("walk");
+    let trained = twinstep(&["train", "--out", out.to_str().unwrap(), "--envs", "32", "--steps", "768"]);
+    assert!(trained.status.success(), "{}", text(&trained.stderr));
+    let policy = out.join("policy.safetensors");
+    let policy = policy.to_str().unwrap();
+    let evaluated = twinstep(&["evaluate-policy", policy, "--robots", "4", "--seconds", "2", "--json"]);
+    assert!(evaluated.status.success(), "{}", text(&evaluated.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&evaluated.stdout).unwrap();
+    let rows: Vec<_> =
+        report["rows"].as_array().unwrap().iter().map(|row| (&row["condition"], &row["engine"])).collect();
+    assert_eq!(rows.len(), 4);
+    assert!(rows.contains(&(&"nominal".into(), &"rapier".into())), "{rows:?}");
+
+    let model = folder.path().join("soft.toml");
+    std::fs::write(&model, "robot = \"go2\"\n[control]\nkp = 20.0\n").unwrap();
+    let other = twinstep(&["evaluate-policy", policy, "--robots", "4", "--model", model.to_str().unwrap()]);
+    assert_eq!(other.status.code(), Some(2));
+    assert!(text(&other.stderr).contains("the policy was trained with spec"), "{}", text(&other.stderr));
+}
+
+#[test]
+fn bad_settings_are_rejected_with_the_key_before_anything_is_simulated() {
+    let folder = tempfile::tempdir().unwrap();
+    let error = |config: &str| {
+        let path = folder.path().join("config.toml");
+        std::fs::write(&path, config).unwrap();
+        let out = folder.path().join("out");
+        let output = twinstep(&["train", "--out", out.to_str().unwrap(), "--config", path.to_str().unwrap()]);
+        assert_eq!(output.status.code(), Some(2), "{config}: {}", text(&output.stderr));
+        text(&output.stderr)
+    };
+    assert!(error("[train]\ngamma = 2.0").contains("`train.gamma` = 2 is not allowed: 0 to 1"));
+    assert!(error("[train]\ngama = 0.9").contains("unknown field `gama`"));
+    assert!(error("[task.reward]\nfeet_slip = nan").contains("`task.reward.feet_slip` = NaN is not allowed"));
+    assert!(error("[train]\nnum_envs = 0").contains("`train.num_envs` = 0 is not allowed"));
+    let resumed = twinstep(&["train", "--out", folder.path().join("none").to_str().unwrap(), "--resume"]);
+    assert_eq!(resumed.status.code(), Some(2));
+    assert!(text(&resumed.stderr).contains("cannot read"), "{}", text(&resumed.stderr));
+}
