@@ -194,3 +194,15 @@ def test_process_answers_in_lock_step_and_terminates_with_its_stdin(model: str, 
     assert list(tmp_path.iterdir()) == []
     process.stdout.close()
     process.stderr.close()
+
+
+def test_bundled_server_simulates_in_the_mujoco_of_this_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(twinstep.__file__).parents[1]))
+    monkeypatch.delenv("TWINSTEP_PYTHON", raising=False)
+    config = tmp_path / "server.toml"
+    config.write_text('[sim]\nengine = "mujoco"\n')
+    envs = twinstep.Go2VectorEnv(2, config=str(config))
+    envs.reset(seed=1)
+    obs, *_ = envs.step(np.zeros((2, 12), np.float32))
+    assert np.isfinite(obs).all()
+    envs.close()
