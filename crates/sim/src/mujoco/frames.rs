@@ -110,7 +110,9 @@ pub fn reset(resets: &[Reset]) -> Vec<u8> {
             actuator_seed: _,
         } = initial_state;
         let values: [&[f32]; 6] = [base_position, base_orientation, base_linear_velocity, base_angular_velocity, q, dq];
-        values.into_iter().for_each(|values| put(&mut body, values));
+        for values in values {
+            put(&mut body, values);
+        }
         put_number(&mut body, mjcf.len());
         body.extend_from_slice(mjcf.as_bytes());
     }
@@ -123,7 +125,9 @@ pub fn step(commands: &[Command], active: &[bool], actuator_periods: usize) -> V
     put_number(&mut body, actuator_periods);
     body.extend(active.iter().map(|active| u8::from(*active)));
     for Command { q, dq, tau_ff, kp, kd } in commands {
-        [q, dq, tau_ff, kp, kd].into_iter().for_each(|values| put(&mut body, values));
+        for values in [q, dq, tau_ff, kp, kd] {
+            put(&mut body, values);
+        }
     }
     body
 }

@@ -113,7 +113,9 @@ impl MujocoBackend {
         let resets: Vec<_> = true_states.iter().map(|(robot, state)| reset((*robot, state))).collect();
         let indices: Vec<_> = robots.iter().map(|(robot, _)| *robot).collect();
         self.request(RESET, &frames::reset(&resets), &indices)?;
-        indices.into_iter().for_each(|robot| self.states.measured.stamp[robot] = 0.0);
+        for robot in indices {
+            self.states.measured.stamp[robot] = 0.0;
+        }
         Ok(())
     }
 }
@@ -153,7 +155,9 @@ impl Backend for MujocoBackend {
             self.check_index(*robot)?;
         }
         let nominal = Adjustments::new(&self.robot);
-        initial_states.iter().for_each(|(robot, _)| self.adjustments[*robot] = nominal);
+        for (robot, _) in initial_states {
+            self.adjustments[*robot] = nominal;
+        }
         self.reset_robots(initial_states, "")
     }
 
@@ -180,7 +184,9 @@ impl Backend for MujocoBackend {
         self.request(STEP, &frames::step(&commands, active, actuator_periods), &all)?;
         let elapsed = actuator_periods as f64 * self.robot.control.actuator_dt();
         let stepped: Vec<_> = all.into_iter().filter(|robot| active[*robot]).collect();
-        stepped.iter().for_each(|robot| self.states.measured.stamp[*robot] += elapsed);
+        for robot in &stepped {
+            self.states.measured.stamp[*robot] += elapsed;
+        }
         let diverged = |robot| Some((robot, self.states.first_not_finite(robot)?));
         let robots: Vec<_> = stepped.into_iter().filter_map(diverged).collect();
         if robots.is_empty() { Ok(()) } else { Err(BackendError::Diverged { robots }) }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use super::frames::{ERROR, Frame, HELLO, check_greeting, read_frame, write_frame};
 
 /// Longest time from a request to its reply. The first one includes the start of Python.
-const REPLY_TIMEOUT: Duration = Duration::from_secs(60);
+const REPLY_TIMEOUT: Duration = Duration::from_mins(1);
 /// Longest time from the end of stdin or stdout to the end of the process.
 const EXIT_TIMEOUT: Duration = Duration::from_secs(2);
 
