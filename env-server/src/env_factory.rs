@@ -5,7 +5,7 @@ use twinstep_effects::{RobotSampler, SamplingError};
 use twinstep_ensemble::{ActuatorNetworkRobot, EnsembleError};
 use twinstep_envs::{CounterEnv, TaskConfig, TaskEnv, TaskEnvConfig, Walk};
 use twinstep_model::{Actuator, AutoresetMode, Backend, RobotModel, VecEnv};
-use twinstep_sim::{BackendBuildError, BatchBackend, Engine, RapierBackend};
+use twinstep_sim::{BackendBuildError, BatchBackend, Engine, MujocoBackend, RapierBackend};
 
 use twinstep_protocol::random_u64;
 
@@ -99,6 +99,9 @@ fn check_actuators(config: &Config, learned: Option<&ActuatorNetworkRobot>) -> R
             ),
         };
     };
+    if config.sim.engine == Engine::Mujoco {
+        return reject("sim.engine", "its actuator network does not run in `mujoco`; use `batch` or `rapier`");
+    }
     let fixed_gains = "its actuator network is trained for one pair of gains; use [1, 1]";
     if config.randomise.kp_scale != [1.0, 1.0] {
         return reject("randomise.kp_scale", fixed_gains);
@@ -144,6 +147,7 @@ impl EnvFactory for SimEnvFactory {
                 let backend = if let Some(actuators) = actuators { backend.with_actuator(actuators) } else { backend };
                 task_env(&self.config.task, backend, settings)
             }
+            Engine::Mujoco => task_env(&self.config.task, MujocoBackend::new(robot, sim, num_envs)?, settings),
         }
     }
 }

@@ -4,7 +4,7 @@ use rand::RngExt;
 use twinstep_envs::{Randomisation, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
 use twinstep_model::{
     AutoresetMode, Backend, BackendError, BaseMount, Command, GroundTruth, InitialState, Measured, NUM_JOINTS,
-    PerJoint, ResetRequest, RobotModel, Simulator, StepBatch, VecEnv, go2, stream,
+    PerJoint, ResetRequest, Restorable, RobotModel, Simulator, StepBatch, VecEnv, go2, stream,
 };
 use twinstep_sim::{BatchBackend, BatchBackend as TestedBackend, Engine, RapierBackend, SimConfig, SimdPrecision};
 use twinstep_simd::InstructionSet;

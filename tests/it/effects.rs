@@ -1,4 +1,4 @@
-//! Comparison of all effects of the catalogue between the two engines, and of a served model file with the ideal robot.
+//! Comparison of all effects of the catalogue between batch and rapier, and of a served model file with the ideal robot.
 
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Scope, Target, apply_effects};
@@ -22,13 +22,22 @@ fn config(engine: Engine, base: BaseMount) -> SimConfig {
     SimConfig { engine, base, physics_hz: Some(2000), threads: 1, ..SimConfig::default() }
 }
 
+/// Returns the initial state of the motion.
+pub fn start(base: BaseMount) -> InitialState {
+    let height = if base == BaseMount::Fixed { 1.0 } else { 0.3236 };
+    InitialState::at_rest(height, go2().control.default_pose_f32())
+}
+
+fn motion(backend: &mut impl Simulator, base: BaseMount) -> Vec<PerJoint> {
+    backend.reset(&[(0, start(base))]).unwrap();
+    rows(backend, base)
+}
+
 /// Returns joint positions, torques and angular velocities of each actuator period, scaled to comparable sizes.
 ///
 /// The motion is a chirp with a fixed base, or sway with a floating base.
-fn motion(backend: &mut impl Simulator, base: BaseMount) -> Vec<PerJoint> {
+pub fn rows(backend: &mut impl Simulator, base: BaseMount) -> Vec<PerJoint> {
     let pose = go2().control.default_pose_f32();
-    let height = if base == BaseMount::Fixed { 1.0 } else { 0.3236 };
-    backend.reset(&[(0, InitialState::at_rest(height, pose))]).unwrap();
     let mut rows = Vec::new();
     for period in 0..PERIODS {
         let t = period as f32 * 0.005;
@@ -50,12 +59,14 @@ fn in_both(robot: &RobotModel, base: BaseMount) -> [Vec<PerJoint>; 2] {
     [motion(&mut rapier, base), motion(&mut batch, base)]
 }
 
-fn rms(one: &[PerJoint], other: &[PerJoint]) -> f32 {
+/// Returns the RMS difference.
+pub fn rms(one: &[PerJoint], other: &[PerJoint]) -> f32 {
     let squares = one.iter().flatten().zip(other.iter().flatten()).map(|(one, other)| (one - other).powi(2));
     (squares.sum::<f32>() / (one.len() * NUM_JOINTS) as f32).sqrt()
 }
 
-fn entry(effect: &'static Effect) -> EffectEntry {
+/// Returns an entry with values for which the effect changes the motion.
+pub fn entry(effect: &'static Effect) -> EffectEntry {
     let scope = match effect.target {
         Target::Joints | Target::Supply => Scope::All,
         Target::Bodies | Target::Imu => Scope::Base,

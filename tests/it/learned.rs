@@ -13,7 +13,7 @@ use twinstep_envs::{TaskConfig, base_spec};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{
     AutoresetMode, Backend, BackendError, BaseMount, Command as RobotCommand, InitialState, JOINT_NAMES, ResetRequest,
-    Simulator, StepBatch, VecEnv, go2,
+    Restorable, Simulator, StepBatch, VecEnv, go2,
 };
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 use twinstep_tests::process::Process;
@@ -180,7 +180,7 @@ fn steps<B: Simulator>(backend: &mut B, active: [bool; 2]) -> Vec<Vec<f32>> {
     rows
 }
 
-fn check_snapshots<B: Simulator>(mut backend: B) {
+fn check_snapshots<B: Restorable>(mut backend: B) {
     let initial_state =
         |seed| InitialState { actuator_seed: seed, ..InitialState::at_rest(0.34, go2().control.default_pose_f32()) };
     backend.reset(&[(0, initial_state(7)), (1, initial_state(8))]).unwrap();

@@ -6,7 +6,7 @@ use glam::{DMat3, DVec3, Vec3};
 use proptest::prelude::*;
 use twinstep_envs::Randomisation;
 use twinstep_model::{
-    Backend, BaseMount, Command, InitialState, Joint, NUM_JOINTS, PerJoint, RobotModel, Simulator,
+    Backend, BaseMount, Command, InitialState, Joint, NUM_JOINTS, PerJoint, Restorable, RobotModel, Simulator,
     dynamics::{Acceleration, KinematicTree, State, Vec3 as LaneVec3, forward_dynamics},
     frames, go2, stream,
 };

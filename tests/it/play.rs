@@ -33,7 +33,8 @@ fn target(row: usize) -> PerJoint {
     std::array::from_fn(|joint| pose[joint] + 0.1 * (0.3 * row as f32 + joint as f32).sin())
 }
 
-fn motion(base: BaseMount, row_period: f64) -> Log {
+/// Returns commands for all joints but one, in two episodes.
+pub fn motion(base: BaseMount, row_period: f64) -> Log {
     let segments = vec![Segment { name: "sway".to_owned(), base }];
     let meta = Meta { kp: Some(Gain::Uniform(KP)), ..Meta::new(50.0, TorqueSensor::None, segments) };
     let episode = |row| f64::from(u8::from(row >= RESET_ROW));

@@ -10,7 +10,8 @@ use twinstep_tests::test_bed::TestBedConfig;
 
 const FAULTS: &str = env!("CARGO_BIN_EXE_faults");
 
-fn target() -> PathBuf {
+/// Returns the target folder of the workspace.
+pub fn target() -> PathBuf {
     Path::new(FAULTS).ancestors().nth(2).unwrap().to_owned()
 }
 

@@ -8,7 +8,7 @@ use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
 use twinstep_envs::{OBS_LEN, TaskConfig};
 use twinstep_model::{
-    AutoresetMode, Command as RobotCommand, InitialState, ResetRequest, RobotModel, Simulator, VecEnv, go2,
+    AutoresetMode, Command as RobotCommand, InitialState, ResetRequest, Restorable, RobotModel, Simulator, VecEnv, go2,
 };
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 use twinstep_tests::process::Process;
@@ -171,7 +171,7 @@ fn sway(backend: &mut impl Simulator) -> (Vec<[f32; 12]>, [f32; 3], [f32; 3]) {
     (rows, backend.states().truth.base_position[0], backend.measured().gyro[0])
 }
 
-fn check_reset_with_model<B: Simulator>(new_backend: impl Fn(RobotModel) -> B) {
+fn check_reset_with_model<B: Restorable>(new_backend: impl Fn(RobotModel) -> B) {
     let sampled = twinstep_effects::parse_robot(&format!("robot = \"go2\"\n{MEASURED}"), "sampled").unwrap();
     let initial_state = InitialState::at_rest(0.34, go2().control.default_pose_f32());
     let mut reference = new_backend(sampled.clone());

@@ -162,7 +162,10 @@ fn setup(log: &Log, window_s: f64) -> Setup {
         kp: log.kp(JOINT_NAMES[0], 0).unwrap_or(control.kp),
         kd: log.kd(JOINT_NAMES[0], 0).unwrap_or(control.kd),
     };
-    let model = mjcf(&go2(), &MjcfOptions { base: BaseMount::Fixed, timestep: 1.0 / f64::from(hz), actuator });
+    let model = mjcf(
+        &go2(),
+        &MjcfOptions { base: BaseMount::Fixed, timestep: 1.0 / f64::from(hz), actuator, ..MjcfOptions::default() },
+    );
     let periods = (ROLLOUT_S / control.actuator_dt()).round() as usize;
     let target = |row: usize| {
         let command = |(name, pose): (&&str, f64)| log.q_cmd(name).map_or(pose, |cells| cells[row]) as f32;

@@ -6,8 +6,8 @@ use std::path::Path;
 
 use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
 use twinstep_model::{
-    AutoresetMode, Backend, BaseMount, Command, InitialState, MjcfActuator, MjcfOptions, NUM_JOINTS, PerJoint,
-    ResetRequest, go2, mjcf,
+    AutoresetMode, Backend, Command, InitialState, MjcfActuator, MjcfOptions, NUM_JOINTS, PerJoint, ResetRequest, go2,
+    mjcf,
 };
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig, SimdPrecision};
 use twinstep_simd::InstructionSet;
@@ -250,7 +250,7 @@ fn setup(window_s: f64) -> Setup {
     let model = |physics_hz: u32| {
         let actuator = MjcfActuator::Position { kp: f64::from(KP), kd: f64::from(KD) };
         let timestep = 1.0 / f64::from(physics_hz);
-        (physics_hz, mjcf(&go2(), &MjcfOptions { base: BaseMount::Floating, timestep, actuator }))
+        (physics_hz, mjcf(&go2(), &MjcfOptions { timestep, actuator, ..MjcfOptions::default() }))
     };
     Setup {
         models: MUJOCO_HZ.into_iter().map(model).collect(),

@@ -54,7 +54,7 @@ pub fn run(args: &Args) -> CommandResult {
         return Err(input(TimestepError(args.timestep)));
     }
     let robot = robot_model(args.model.as_deref())?;
-    let options = MjcfOptions { base: args.base, timestep: args.timestep, actuator: MjcfActuator::Torque };
+    let options = MjcfOptions { base: args.base, timestep: args.timestep, actuator: MjcfActuator::Torque, slope: 0.0 };
     let text = mjcf(&robot, &options);
     match &args.out {
         Some(path) => std::fs::write(path, text).map_err(|cause| input(WriteError { path: path.clone(), cause })),

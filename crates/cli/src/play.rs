@@ -9,7 +9,7 @@ use twinstep_identify::{RecordError, record};
 use twinstep_logs::Log;
 use twinstep_logs::replay::at_log_rate;
 use twinstep_model::{Actuator, BaseMount, RobotModel};
-use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
+use twinstep_sim::{BatchBackend, Engine, MujocoBackend, RapierBackend, SimConfig};
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::serve::engine;
@@ -41,14 +41,15 @@ pub struct Args {
     /// Mounting of the base: floating or fixed. Default: that of each segment in meta.json.
     #[arg(long)]
     base: Option<BaseMount>,
-    /// Physics engine: rapier (the reference) or batch (SIMD, faster). Default: batch.
+    /// Physics engine: rapier (the reference), batch (SIMD, faster), or mujoco (in a Python process; see
+    /// docs/physics.md). Default: batch.
     #[arg(long, value_parser = engine)]
     engine: Option<Engine>,
-    /// Rate of the physics [Hz], a multiple of the actuator rate. Default: 200 with rapier, 1000 with batch, rounded up
-    /// to a multiple.
+    /// Rate of the physics [Hz], a multiple of the actuator rate. Default: 200 with rapier, 1000 with batch and
+    /// mujoco, rounded up to a multiple.
     #[arg(long, value_name = "HZ")]
     physics_hz: Option<u32>,
-    /// Solver iterations per physics step. Default: 2 with rapier, 4 with batch.
+    /// Solver iterations per physics step. Default: 2 with rapier, 4 with batch, at most 64 with mujoco.
     #[arg(long, value_name = "N")]
     solver_iterations: Option<u32>,
     /// Log to write: *.parquet, *.csv or *.csv.gz, or a folder, which gets data.parquet and meta.json.
@@ -72,6 +73,11 @@ struct EnsembleRate {
     ensemble_hz: f64,
 }
 
+/// The engine does not support the actuator network of the model file.
+#[derive(Debug, thiserror::Error)]
+#[error("the actuator network of the model file does not run in engine `mujoco`\n  use `--engine batch` or `rapier`")]
+struct NetworkInMujoco;
+
 /// Simulates the motion and writes the log.
 pub fn run(args: &Args) -> CommandResult {
     if args.motion.canonicalize().is_ok_and(|motion| args.out.canonicalize().is_ok_and(|out| out == motion)) {
@@ -91,6 +97,9 @@ pub fn run(args: &Args) -> CommandResult {
     if learned.is_some() && replayed.control.actuator_hz != robot.control.actuator_hz {
         let (motion_hz, ensemble_hz) = (replayed.control.actuator_hz, robot.control.actuator_hz);
         return Err(input(EnsembleRate { motion_hz, ensemble_hz }));
+    }
+    if learned.is_some() && config.engine == Engine::Mujoco {
+        return Err(input(NetworkInMujoco));
     }
     let signals = Signals::listen()?;
     let bar = ProgressBar::new(motion.rows() as u64);
@@ -157,6 +166,14 @@ pub fn play(
             source,
             progress,
         ),
+        Engine::Mujoco => record(
+            motion,
+            robot,
+            base,
+            |base, robot| MujocoBackend::new(robot.clone(), based(base), 1).map_err(failed),
+            source,
+            progress,
+        ),
     }
 }
 
@@ -166,6 +183,7 @@ fn source(robot: &RobotModel, config: SimConfig) -> String {
     let engine = match config.engine {
         Engine::Rapier => "rapier",
         Engine::Batch => "batch",
+        Engine::Mujoco => "mujoco",
     };
     format!("twinstep play: `{}` simulated by {engine} at {physics_hz} Hz x {solver_iterations}", robot.name)
 }

@@ -56,10 +56,12 @@ pub struct Args {
     /// Use shared memory for large messages to clients on the same machine.
     #[arg(long)]
     shared_memory: bool,
-    /// Physics engine: rapier (the reference) or batch (one robot per SIMD lane, faster). Default: batch.
+    /// Physics engine: rapier (the reference), batch (one robot per SIMD lane, faster), or mujoco (in a Python process;
+    /// see docs/physics.md). Default: batch.
     #[arg(long, value_parser = engine)]
     engine: Option<Engine>,
-    /// Rate of the physics [Hz], a multiple of the actuators' 200 Hz. Default: 200 with rapier, 1000 with batch.
+    /// Rate of the physics [Hz], a multiple of the actuators' 200 Hz. Default: 200 with rapier, 1000 with batch and
+    /// mujoco.
     #[arg(long, value_name = "HZ")]
     physics_hz: Option<u32>,
     /// Number of threads that step robots; 0 uses all cores. Default: 0.
@@ -174,7 +176,8 @@ pub fn engine(text: &str) -> Result<Engine, String> {
     match text {
         "rapier" => Ok(Engine::Rapier),
         "batch" => Ok(Engine::Batch),
-        _ => Err("must be `rapier` or `batch`".to_owned()),
+        "mujoco" => Ok(Engine::Mujoco),
+        _ => Err("must be `rapier`, `batch` or `mujoco`".to_owned()),
     }
 }
 

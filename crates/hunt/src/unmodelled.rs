@@ -5,8 +5,8 @@ use std::f64::consts::TAU;
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
 use twinstep_model::{
-    Backend, BackendError, Command, Ground, GroundTruth, InitialState, Joint, Measured, PerJoint, RobotModel,
-    RobotStates, Simulator,
+    Backend, BackendError, Command, Ground, GroundTruth, InitialState, Joint, Measured, PerJoint, Restorable,
+    RobotModel, RobotStates, Simulator,
 };
 
 use crate::base_schedule::BaseSchedule;
@@ -184,8 +184,6 @@ impl<S: Simulator> Backend for PerturbedBackend<S> {
 }
 
 impl<S: Simulator> Simulator for PerturbedBackend<S> {
-    type Snapshot = (S::Snapshot, RobotStates, f64);
-
     fn states(&self) -> &RobotStates {
         &self.states
     }
@@ -193,6 +191,10 @@ impl<S: Simulator> Simulator for PerturbedBackend<S> {
     fn set_derating(&mut self, robot: usize, factors: &PerJoint) {
         self.inner.set_derating(robot, factors);
     }
+}
+
+impl<S: Restorable> Restorable for PerturbedBackend<S> {
+    type Snapshot = (S::Snapshot, RobotStates, f64);
 
     fn snapshot(&self, robot: usize) -> Self::Snapshot {
         (self.inner.snapshot(robot), self.states.clone(), self.time)

@@ -53,15 +53,18 @@ pub trait Backend: Send {
 
 /// Backend whose robots are simulated.
 pub trait Simulator: Backend {
-    /// Full state of one robot. After [`Simulator::restore`] the robot continues bit for bit as from the snapshot.
-    type Snapshot: Clone + Send;
-
     /// Returns the states after the last [`Backend::reset`] or [`Backend::step`].
     fn states(&self) -> &RobotStates;
 
     /// Sets the factors on the torque of each joint of `robot`, for supply voltage and motor temperature, until its
     /// next reset.
     fn set_derating(&mut self, robot: usize, factors: &PerJoint);
+}
+
+/// Simulator in this process, whose full state can be saved and restored.
+pub trait Restorable: Simulator {
+    /// Full state of one robot. After [`Restorable::restore`] the robot continues bit for bit as from the snapshot.
+    type Snapshot: Clone + Send;
 
     /// Returns the full state of `robot`.
     fn snapshot(&self, robot: usize) -> Self::Snapshot;
@@ -181,6 +184,24 @@ pub enum BackendError {
         robot: usize,
         /// Delay behind the deadline [ms].
         late_ms: u32,
+    },
+    /// The engine cannot simulate an effect of the robot's model. The robot was not reset.
+    #[error("engine `{engine}` cannot simulate the effect `{effect}` of robot {robot}; use `batch` or `rapier`")]
+    UnsupportedEffect {
+        /// The robot.
+        robot: usize,
+        /// The engine.
+        engine: &'static str,
+        /// The effect, as named in the catalogue.
+        effect: &'static str,
+    },
+    /// The process of an engine exited, does not reply or violates the protocol. Its robots are lost.
+    #[error("the process of engine `{engine}` failed: {reason}; its robots are lost, create them again")]
+    EngineProcess {
+        /// The engine.
+        engine: &'static str,
+        /// What the process did.
+        reason: String,
     },
     /// The simulation of some robots diverged to values that are not finite. The other robots were stepped.
     #[error(

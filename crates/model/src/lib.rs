@@ -41,7 +41,7 @@ mod spec;
 mod stream;
 mod vec_env;
 
-pub use backend::{Actuator, ActuatorSnapshot, Backend, BackendError, EpistemicUncertainty, Simulator};
+pub use backend::{Actuator, ActuatorSnapshot, Backend, BackendError, EpistemicUncertainty, Restorable, Simulator};
 pub use base_mount::BaseMount;
 pub use body::RigidBody;
 pub use command::Command;

@@ -5,7 +5,9 @@ use std::fmt::Write as _;
 use glam::{DMat3, DVec3};
 
 use crate::kinematics::FIXED_BASE_HEIGHT;
-use crate::{BaseMount, Ground, InitialState, Joint, JointKind, Leg, RigidBody, RobotModel};
+use crate::{
+    ActuatorParams, BaseMount, Ground, InitialState, Joint, JointKind, JointModel, Leg, RigidBody, RobotModel,
+};
 
 /// Gravity of the model [m/s²].
 const GRAVITY: f64 = 9.81;
@@ -19,19 +21,22 @@ pub struct MjcfOptions {
     pub timestep: f64,
     /// Type of the twelve actuators, which determines the meaning of `ctrl`.
     pub actuator: MjcfActuator,
+    /// Angle by which the ground rises along x [rad].
+    pub slope: f64,
 }
 
 impl Default for MjcfOptions {
-    /// Floating base, torque control, 1 kHz.
+    /// Floating base, torque control, 1 kHz, level ground.
     fn default() -> Self {
-        Self { base: BaseMount::Floating, timestep: 0.001, actuator: MjcfActuator::Torque }
+        Self { base: BaseMount::Floating, timestep: 0.001, actuator: MjcfActuator::Torque, slope: 0.0 }
     }
 }
 
 /// Type of the actuators of a MuJoCo model, which are in the order of [`Joint::ALL`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum MjcfActuator {
-    /// `ctrl` is torque [N·m], clipped to the joint's limit.
+    /// `ctrl` is the torque of the current sensor [N·m], clipped to the joint's limit. The gain of the torque acts as a
+    /// gear.
     Torque,
     /// `ctrl` is the commanded position [rad]. PD control at every physics step, clipped to the joint's torque limit.
     Position {
@@ -42,7 +47,7 @@ pub enum MjcfActuator {
     },
 }
 
-/// Returns the MuJoCo model (MJCF, XML) of `robot` on the plane z = 0.
+/// Returns the MuJoCo model (MJCF, XML) of `robot` on a plane through the origin.
 ///
 /// The trunk is named `trunk`, and each link has the name of its joint. The contact points are those of the batch
 /// engine: a sphere at the foot, a sphere at each end of the calf's capsule, and the corners of the trunk's box. There
@@ -68,16 +73,18 @@ pub fn mjcf(robot: &RobotModel, options: &MjcfOptions) -> String {
     let height = base_height(robot, options.base);
     xml.open("worldbody", &[]);
     xml.leaf("light", &[("pos", numbers([0.0, 0.0, 3.0])), ("directional", "true".to_owned())]);
-    xml.leaf(
-        "geom",
-        &[
-            ("name", "ground".to_owned()),
-            ("type", "plane".to_owned()),
-            ("size", numbers([0.0, 0.0, 0.05])),
-            ("contype", "1".to_owned()),
-            ("conaffinity", "0".to_owned()),
-        ],
-    );
+    let mut ground = vec![
+        ("name", "ground".to_owned()),
+        ("type", "plane".to_owned()),
+        ("size", numbers([0.0, 0.0, 0.05])),
+        ("contype", "1".to_owned()),
+        ("conaffinity", "0".to_owned()),
+    ];
+    if options.slope != 0.0 {
+        let (sin, cos) = (-0.5 * options.slope).sin_cos();
+        ground.push(("quat", numbers([cos, 0.0, sin, 0.0])));
+    }
+    xml.leaf("geom", &ground);
     trunk(&mut xml, robot, options.base, height);
     xml.close("worldbody");
     actuators(&mut xml, robot, options.actuator);
@@ -148,9 +155,15 @@ fn link(xml: &mut Xml, robot: &RobotModel, joint: Joint) {
         ("range", numbers(numbers_of.range)),
         ("armature", numbers_of.armature.to_string()),
     ];
-    let friction = [("damping", numbers_of.viscous_friction), ("frictionloss", numbers_of.coulomb_friction)];
+    let JointModel { viscous_friction, coulomb_friction, spring, .. } = numbers_of;
+    let forces = [
+        ("damping", *viscous_friction),
+        ("frictionloss", *coulomb_friction),
+        ("stiffness", spring.stiffness),
+        ("springref", if spring.stiffness > 0.0 { spring.torque_offset / spring.stiffness } else { 0.0 }),
+    ];
     attributes
-        .extend(friction.into_iter().filter(|(_, value)| *value > 0.0).map(|(name, value)| (name, value.to_string())));
+        .extend(forces.into_iter().filter(|(_, value)| *value != 0.0).map(|(name, value)| (name, value.to_string())));
     xml.leaf("joint", &attributes);
 }
 
@@ -182,11 +195,14 @@ fn inertial(xml: &mut Xml, body: &RigidBody) {
 fn actuators(xml: &mut Xml, robot: &RobotModel, actuator: MjcfActuator) {
     xml.open("actuator", &[]);
     for joint in Joint::ALL {
-        let limit = robot.joints[joint.index()].torque_limit;
+        let JointModel { torque_limit: limit, actuator: ActuatorParams { gain, .. }, .. } = robot.joints[joint.index()];
         let name = joint.name().to_owned();
         let (named, range) = ([("name", name.clone()), ("joint", name)], numbers([-limit, limit]));
         match actuator {
-            MjcfActuator::Torque => xml.leaf("motor", &[&named[..], &[("ctrlrange", range)]].concat()),
+            MjcfActuator::Torque => {
+                let gear = (gain != 1.0).then(|| ("gear", gain.to_string()));
+                xml.leaf("motor", &named.into_iter().chain([("ctrlrange", range)]).chain(gear).collect::<Vec<_>>());
+            }
             MjcfActuator::Position { kp, kd } => {
                 let gains = [("kp", kp.to_string()), ("kv", kd.to_string()), ("forcerange", range)];
                 xml.leaf("position", &[&named[..], &gains].concat());
@@ -309,6 +325,16 @@ mod tests {
         assert_eq!(fixed.matches("<freejoint").count(), 0);
         let positions = |xml: &str| values(xml, "key", "qpos")[0].split(' ').count();
         assert_eq!((positions(&floating), positions(&fixed)), (7 + NUM_JOINTS, NUM_JOINTS));
+    }
+
+    #[test]
+    fn spring_and_torque_gain_are_exported() {
+        let mut robot = go2();
+        robot.joints[2].spring = crate::JointSpring { stiffness: 2.0, torque_offset: -3.0 };
+        robot.joints[2].actuator.gain = 0.9;
+        let xml = mjcf(&robot, &MjcfOptions::default());
+        assert_eq!((values(&xml, "joint", "stiffness"), values(&xml, "joint", "springref")), (vec!["2"], vec!["-1.5"]));
+        assert_eq!(values(&xml, "motor", "gear"), ["0.9"]);
     }
 
     #[test]

@@ -18,7 +18,8 @@ pub struct SimConfig {
     /// Solver iterations per physics step. Default: recommended for the engine.
     ///
     /// rapier integrates the joints in each iteration, so two iterations have about the cost and the accuracy of twice
-    /// the rate. In the batch engine the iterations refine only the contact forces.
+    /// the rate. In the batch engine the iterations refine only the contact forces. In MuJoCo they are an upper limit
+    /// for its Newton solver.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub solver_iterations: Option<u32>,
     /// The ground.
@@ -50,6 +51,8 @@ pub enum Engine {
     Rapier,
     /// One robot per SIMD lane, with MuJoCo's soft constraints. The default, and the faster one.
     Batch,
+    /// MuJoCo, in a Python process of its own: an engine that others wrote, for comparison. The slowest one.
+    Mujoco,
 }
 
 impl Engine {
@@ -60,6 +63,8 @@ impl Engine {
         match self {
             Engine::Rapier => (200, 2),
             Engine::Batch => (1000, 4),
+            // The time step of the comparisons in `docs/physics.md`. MuJoCo's Newton solver stops long before its limit.
+            Engine::Mujoco => (1000, 64),
         }
     }
 }
@@ -264,5 +269,6 @@ mod tests {
         let rapier = read("engine = \"rapier\"");
         assert_eq!((rapier.physics_hz(), rapier.solver_iterations()), (200, 2));
         assert_eq!(read("engine = \"rapier\"\nphysics_hz = 400").physics_hz(), 400);
+        assert_eq!(read("engine = \"mujoco\"").physics_hz(), 1000);
     }
 }

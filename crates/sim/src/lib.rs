@@ -1,10 +1,11 @@
-//! Simulation of many Go2 robots behind the trait [`twinstep_model::Backend`], with two engines.
+//! Simulation of many Go2 robots behind the trait [`twinstep_model::Backend`], with three engines.
 //!
 //! - [`SimConfig`]: engine, rates, terrain, base, threads; the `[sim]` table of a config file.
 //! - [`RapierBackend`]: one rapier3d world per robot, stepped on all cores. The results are bitwise equal for any
 //!   number of threads.
 //! - [`BatchBackend`]: one robot per SIMD lane. The results are bitwise equal for any lane, batch size and number of
 //!   threads.
+//! - [`MujocoBackend`]: MuJoCo in a Python process, for comparison with an engine that others wrote.
 //!
 //! In one actuator period the PD loop samples the state once, and `physics_hz / actuator_hz` physics steps follow.
 
@@ -12,6 +13,7 @@ mod batch;
 mod config;
 mod error;
 mod ground_shapes;
+mod mujoco;
 mod rapier;
 mod robot_world;
 mod rollout;
@@ -20,5 +22,6 @@ mod thread_pool;
 pub use batch::{BatchBackend, BatchSnapshot, SimdPrecision};
 pub use config::{Engine, RoughTerrain, SimConfig, SimConfigError, Terrain};
 pub use error::BackendBuildError;
+pub use mujoco::MujocoBackend;
 pub use rapier::{RapierBackend, RobotSnapshot};
 pub use rollout::BatchRollout;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 use twinstep_model::{
     Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, GroundTruth, InitialState, Measured, PerJoint,
-    RobotModel, RobotStates, Simulator,
+    Restorable, RobotModel, RobotStates, Simulator,
 };
 
 use crate::ground_shapes::GroundShapes;
@@ -193,8 +193,6 @@ impl Backend for RapierBackend {
 }
 
 impl Simulator for RapierBackend {
-    type Snapshot = RobotSnapshot;
-
     fn states(&self) -> &RobotStates {
         &self.states
     }
@@ -202,6 +200,10 @@ impl Simulator for RapierBackend {
     fn set_derating(&mut self, robot: usize, factors: &PerJoint) {
         self.worlds[robot].set_derating(factors);
     }
+}
+
+impl Restorable for RapierBackend {
+    type Snapshot = RobotSnapshot;
 
     fn snapshot(&self, robot: usize) -> RobotSnapshot {
         let mut state = RobotStates::new(1);

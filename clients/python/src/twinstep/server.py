@@ -3,6 +3,7 @@
 import os
 import shutil
 import subprocess
+import sys
 import sysconfig
 import threading
 from collections import deque
@@ -73,6 +74,8 @@ class EmbeddedServer:
             stderr=subprocess.PIPE,
             text=True,
             process_group=0,
+            # The engine `mujoco` runs in this Python, which has the extra.
+            env={"TWINSTEP_PYTHON": sys.executable, **os.environ},
         )
         assert self._process.stdout is not None
         assert self._process.stderr is not None

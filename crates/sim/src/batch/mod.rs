@@ -24,7 +24,7 @@ use std::sync::Arc;
 
 use twinstep_model::{
     Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, GroundTruth, InitialState, Measured, PerJoint,
-    RobotModel, RobotStates, Simulator,
+    Restorable, RobotModel, RobotStates, Simulator,
 };
 use twinstep_simd::InstructionSet;
 
@@ -207,8 +207,6 @@ impl Backend for BatchBackend {
 }
 
 impl Simulator for BatchBackend {
-    type Snapshot = BatchSnapshot;
-
     fn states(&self) -> &RobotStates {
         &self.states
     }
@@ -216,6 +214,10 @@ impl Simulator for BatchBackend {
     fn set_derating(&mut self, robot: usize, factors: &PerJoint) {
         self.robots.set_derating(robot, factors);
     }
+}
+
+impl Restorable for BatchBackend {
+    type Snapshot = BatchSnapshot;
 
     fn snapshot(&self, robot: usize) -> BatchSnapshot {
         let mut state = RobotStates::new(1);

@@ -1,0 +1,204 @@
+//! The engine `mujoco`: MuJoCo itself, in a Python process of its own.
+//!
+//! The process has this robot as a MuJoCo model ([`twinstep_model::mjcf()`]), and its own integrator, contacts, joint
+//! limits and friction. It computes the torque of the PD loop once per actuator period. A step of all robots is one
+//! request with the commands and one reply with the states ([`frames`]).
+
+mod effects;
+mod frames;
+mod process;
+
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+
+use twinstep_model::{
+    Backend, BackendError, Command, Ground, GroundTruth, InitialState, Measured, MjcfActuator, MjcfOptions, PerJoint,
+    RobotModel, RobotStates, Simulator, mjcf,
+};
+
+use crate::rapier::check_lengths;
+use crate::{BackendBuildError, SimConfig, SimConfigError, Terrain};
+use effects::{Adjustments, unsupported};
+use frames::{RESET, Reset, STATES, STEP, Settings};
+use process::Process;
+
+/// Environment variable with the Python interpreter that has the packages `twinstep` and `mujoco`.
+const PYTHON: &str = "TWINSTEP_PYTHON";
+/// Name of the engine in errors.
+const ENGINE: &str = "mujoco";
+
+/// Backend that simulates its robots in MuJoCo, in a child process.
+pub struct MujocoBackend {
+    robot: RobotModel,
+    options: MjcfOptions,
+    ground: Ground,
+    process: Process,
+    states: RobotStates,
+    /// Effects of each robot that are not in its MuJoCo model.
+    adjustments: Vec<Adjustments>,
+}
+
+impl MujocoBackend {
+    /// Creates `num_robots` robots that stand in their default pose.
+    ///
+    /// The interpreter is that of the environment variable `TWINSTEP_PYTHON`, or else `python3`.
+    pub fn new(robot: RobotModel, config: SimConfig, num_robots: usize) -> Result<Self, BackendBuildError> {
+        let python = std::env::var_os(PYTHON).filter(|python| !python.is_empty());
+        Self::with_python(robot, config, num_robots, Path::new(&python.unwrap_or(OsString::from("python3"))))
+    }
+
+    /// Creates robots like [`MujocoBackend::new`], with the Python interpreter `python`.
+    pub fn with_python(
+        robot: RobotModel,
+        config: SimConfig,
+        num_robots: usize,
+        python: &Path,
+    ) -> Result<Self, BackendBuildError> {
+        config.check(&robot.control)?;
+        let config = config.at_actuator_rate(&robot.control);
+        let slope = slope(config.terrain)?;
+        if let Some(effect) = unsupported(&robot) {
+            return Err(BackendBuildError::Effect { engine: ENGINE, effect });
+        }
+        let timestep = 1.0 / f64::from(config.physics_hz());
+        let options = MjcfOptions { base: config.base, timestep, actuator: MjcfActuator::Torque, slope };
+        let settings = Settings {
+            robots: num_robots,
+            threads: config.threads,
+            iterations: config.solver_iterations(),
+            steps: config.steps_per_actuator_period(&robot.control),
+        };
+        let process = Process::start(python, &frames::hello(&settings, &mjcf(&robot, &options)))
+            .map_err(|reason| BackendBuildError::Mujoco { python: PathBuf::from(python), reason })?;
+        let ground = config.terrain.ground();
+        let initial_state = InitialState::standing_on(&ground, &robot, robot.control.default_pose_f32(), 0.0);
+        let (states, adjustments) = (RobotStates::new(num_robots), vec![Adjustments::new(&robot); num_robots]);
+        let mut this = Self { robot, options, ground, process, states, adjustments };
+        let standing: Vec<_> = (0..num_robots).map(|robot| (robot, initial_state)).collect();
+        this.reset(&standing)
+            .map_err(|error| BackendBuildError::Mujoco { python: PathBuf::from(python), reason: error.to_string() })?;
+        Ok(this)
+    }
+
+    /// Returns the id of the process.
+    pub fn process_id(&self) -> u32 {
+        self.process.id()
+    }
+
+    fn check_index(&self, robot: usize) -> Result<(), BackendError> {
+        let num_robots = self.num_robots();
+        if robot < num_robots { Ok(()) } else { Err(BackendError::RobotOutOfRange { robot, num_robots }) }
+    }
+
+    /// Sends a request and reads the states of `robots` from its reply.
+    fn request(&mut self, kind: u8, body: &[u8], robots: &[usize]) -> Result<(), BackendError> {
+        let failed = |reason| BackendError::EngineProcess { engine: ENGINE, reason };
+        let reply = self.process.request(kind, body, STATES).map_err(failed)?;
+        frames::read_states(&reply, robots, &mut self.states).map_err(|reason| {
+            self.process.fail(reason.clone());
+            failed(reason)
+        })?;
+        let measured = &mut self.states.measured;
+        for robot in robots {
+            self.adjustments[*robot].readings(&mut measured.q[*robot], &mut measured.gyro[*robot]);
+        }
+        Ok(())
+    }
+
+    /// Resets robots to initial states. An empty model is the nominal one.
+    fn reset_robots(&mut self, robots: &[(usize, InitialState)], mjcf: &str) -> Result<(), BackendError> {
+        let true_states: Vec<_> =
+            robots.iter().map(|(robot, state)| (*robot, self.adjustments[*robot].initial_state(state))).collect();
+        let reset = |(robot, initial_state)| Reset { robot, initial_state, mjcf };
+        let resets: Vec<_> = true_states.iter().map(|(robot, state)| reset((*robot, state))).collect();
+        let indices: Vec<_> = robots.iter().map(|(robot, _)| *robot).collect();
+        self.request(RESET, &frames::reset(&resets), &indices)?;
+        for robot in indices {
+            self.states.measured.stamp[robot] = 0.0;
+        }
+        Ok(())
+    }
+}
+
+/// Returns the slope of the terrain along x [rad].
+fn slope(terrain: Terrain) -> Result<f64, SimConfigError> {
+    match terrain {
+        Terrain::Flat => Ok(0.0),
+        Terrain::SlopeRad(angle) => Ok(f64::from(angle)),
+        Terrain::Rough(_) => Err(SimConfigError {
+            field: "terrain",
+            value: "rough".to_owned(),
+            allowed: "with engine `mujoco`, flat or slope_rad".to_owned(),
+        }),
+    }
+}
+
+impl Backend for MujocoBackend {
+    fn robot(&self) -> &RobotModel {
+        &self.robot
+    }
+
+    fn measured(&self) -> &Measured {
+        &self.states.measured
+    }
+
+    fn ground_truth(&self) -> Option<&GroundTruth> {
+        Some(&self.states.truth)
+    }
+
+    fn ground(&self) -> Ground {
+        self.ground.clone()
+    }
+
+    fn reset(&mut self, initial_states: &[(usize, InitialState)]) -> Result<(), BackendError> {
+        for (robot, _) in initial_states {
+            self.check_index(*robot)?;
+        }
+        let nominal = Adjustments::new(&self.robot);
+        for (robot, _) in initial_states {
+            self.adjustments[*robot] = nominal;
+        }
+        self.reset_robots(initial_states, "")
+    }
+
+    fn reset_with_model(
+        &mut self,
+        robot: usize,
+        model: &RobotModel,
+        initial_state: &InitialState,
+    ) -> Result<(), BackendError> {
+        self.check_index(robot)?;
+        if let Some(effect) = unsupported(model) {
+            return Err(BackendError::UnsupportedEffect { robot, engine: ENGINE, effect });
+        }
+        self.adjustments[robot] = Adjustments::new(model);
+        self.reset_robots(&[(robot, *initial_state)], &mjcf(model, &self.options))
+    }
+
+    fn step(&mut self, commands: &[Command], active: &[bool], actuator_periods: usize) -> Result<(), BackendError> {
+        let num_robots = self.num_robots();
+        check_lengths(commands, active, num_robots)?;
+        let commands: Vec<_> =
+            commands.iter().zip(&self.adjustments).map(|(command, adjustments)| adjustments.command(command)).collect();
+        let all: Vec<_> = (0..num_robots).collect();
+        self.request(STEP, &frames::step(&commands, active, actuator_periods), &all)?;
+        let elapsed = actuator_periods as f64 * self.robot.control.actuator_dt();
+        let stepped: Vec<_> = all.into_iter().filter(|robot| active[*robot]).collect();
+        for robot in &stepped {
+            self.states.measured.stamp[*robot] += elapsed;
+        }
+        let diverged = |robot| Some((robot, self.states.first_not_finite(robot)?));
+        let robots: Vec<_> = stepped.into_iter().filter_map(diverged).collect();
+        if robots.is_empty() { Ok(()) } else { Err(BackendError::Diverged { robots }) }
+    }
+}
+
+impl Simulator for MujocoBackend {
+    fn states(&self) -> &RobotStates {
+        &self.states
+    }
+
+    fn set_derating(&mut self, robot: usize, factors: &PerJoint) {
+        self.adjustments[robot].derating = *factors;
+    }
+}

@@ -1,0 +1,130 @@
+//! The process `python -m twinstep.mujoco`.
+
+use std::io::BufReader;
+use std::os::unix::process::CommandExt;
+use std::path::Path;
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::time::{Duration, Instant};
+
+use super::frames::{ERROR, Frame, HELLO, check_greeting, read_frame, write_frame};
+
+/// Longest time from a request to its reply. The first one includes the start of Python.
+const REPLY_TIMEOUT: Duration = Duration::from_mins(1);
+/// Longest time from the end of stdin or stdout to the end of the process.
+const EXIT_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// A child process that answers one request after another. It terminates when its stdin closes, also if this process
+/// is killed.
+pub struct Process {
+    child: Child,
+    /// `None` after the first failure.
+    stdin: Option<ChildStdin>,
+    /// Replies, or the reason why there are no more.
+    replies: Receiver<Result<Frame, String>>,
+    /// Reason of the first failure, which is also that of all later requests.
+    failure: String,
+}
+
+impl Process {
+    /// Starts the process with the interpreter `python` and sends the first request. Returns the reason if it fails.
+    pub fn start(python: &Path, hello: &[u8]) -> Result<Self, String> {
+        let mut child = Command::new(python)
+            .args(["-m", "twinstep.mujoco"])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            // Ctrl-C in a terminal reaches this process only, which then closes the stdin of the child.
+            .process_group(0)
+            .spawn()
+            .map_err(|error| format!("the interpreter does not start: {error}"))?;
+        let stdin = child.stdin.take();
+        let stdout = child.stdout.take().expect("stdout is a pipe");
+        let mut process = Self { child, stdin, replies: read_replies(stdout), failure: String::new() };
+        let greeting = process.request(HELLO, hello, HELLO)?;
+        check_greeting(&greeting)?;
+        Ok(process)
+    }
+
+    /// Returns the process id.
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Sends a request and returns the body of its reply, which is of kind `expected`. Returns the reason if it fails.
+    pub fn request(&mut self, kind: u8, body: &[u8], expected: u8) -> Result<Vec<u8>, String> {
+        let result = self.exchange(kind, body, expected);
+        if let Err(reason) = &result {
+            self.fail(reason.clone());
+        }
+        result
+    }
+
+    /// Ends the process because of `reason`, which is that of all later requests.
+    pub fn fail(&mut self, reason: String) {
+        if self.stdin.take().is_some() {
+            self.failure = reason;
+        }
+    }
+
+    fn exchange(&mut self, kind: u8, body: &[u8], expected: u8) -> Result<Vec<u8>, String> {
+        let Some(stdin) = &mut self.stdin else { return Err(self.failure.clone()) };
+        // A request that cannot be written has no reply: the process has exited, or explains itself in its last reply.
+        let _ = write_frame(stdin, kind, body);
+        match self.replies.recv_timeout(REPLY_TIMEOUT) {
+            Ok(Ok((kind, body))) if kind == expected => Ok(body),
+            Ok(Ok((ERROR, text))) => Err(String::from_utf8_lossy(&text).into_owned()),
+            Ok(Ok((kind, body))) => {
+                let kind = char::from(kind);
+                Err(format!("it wrote a frame of kind {kind:?} with {} bytes as a reply", body.len()))
+            }
+            Ok(Err(reason)) => Err(reason),
+            Err(RecvTimeoutError::Timeout) => Err(format!("it did not reply within {} s", REPLY_TIMEOUT.as_secs())),
+            Err(RecvTimeoutError::Disconnected) => Err(self.exit_report()),
+        }
+    }
+
+    /// Returns how the process ended, after its stdout has.
+    fn exit_report(&mut self) -> String {
+        match self.wait() {
+            Some(status) => format!("it ended ({status}); its messages are on stderr"),
+            None => "it closed its stdout".to_owned(),
+        }
+    }
+
+    fn wait(&mut self) -> Option<std::process::ExitStatus> {
+        let since = Instant::now();
+        while since.elapsed() < EXIT_TIMEOUT {
+            if let Ok(Some(status)) = self.child.try_wait() {
+                return Some(status);
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        None
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let failed = self.stdin.take().is_none();
+        if failed || self.wait().is_none() {
+            // Both fail only if the process has ended.
+            let _ = self.child.kill();
+            let _ = self.child.wait();
+        }
+    }
+}
+
+/// Reads frames on a thread, so that a process that hangs can be given up.
+fn read_replies(stdout: ChildStdout) -> Receiver<Result<Frame, String>> {
+    let (sender, replies) = channel();
+    std::thread::spawn(move || {
+        let mut stdout = BufReader::new(stdout);
+        while let Some(reply) = read_frame(&mut stdout).map_err(|error| error.to_string()).transpose() {
+            let last = reply.is_err();
+            if sender.send(reply).is_err() || last {
+                break;
+            }
+        }
+    });
+    replies
+}

@@ -1,0 +1,345 @@
+//! The engine `mujoco`: motions next to the batch engine, and failures of its process. Skipped without Python.
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use expect_test::{Expect, expect};
+use tempfile::TempDir;
+use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_effects::{CATALOGUE, Effect, Target, apply_effects};
+use twinstep_envs::{Randomisation, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
+use twinstep_logs::Log;
+use twinstep_model::{
+    AutoresetMode, Backend, BackendError, BaseMount, Command, EnvError, InitialState, NUM_JOINTS, PerJoint,
+    ResetRequest, RobotModel, Simulator, VecEnv, go2,
+};
+use twinstep_sim::{BackendBuildError, BatchBackend, Engine, MujocoBackend, RoughTerrain, SimConfig, Terrain};
+use twinstep_tests::process::Process;
+use twinstep_tests::python::{Programs, python, root, run};
+
+use crate::effects::{entry, rms, rows, start};
+
+/// Python interpreter with the package of this repository: a script, whose folder is deleted with it.
+struct Interpreter(TempDir);
+
+impl Interpreter {
+    /// Returns the interpreter of the tests. Returns `None` with a message on stderr if there is no Python.
+    fn of_tests() -> Option<Self> {
+        let python = python(&crate::python::target()).unwrap()?;
+        let source = root().join("clients/python/src");
+        Some(Self::script(&format!("PYTHONPATH={} exec {} \"$@\"", source.display(), python.display())))
+    }
+
+    /// Returns a shell script in place of an interpreter.
+    fn script(commands: &str) -> Self {
+        let this = Self(tempfile::tempdir().unwrap());
+        std::fs::write(this.path(), format!("#!/bin/sh\n{commands}\n")).unwrap();
+        std::fs::set_permissions(this.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+        this
+    }
+
+    fn path(&self) -> PathBuf {
+        self.0.path().join("python")
+    }
+
+    fn backend(&self, robot: RobotModel, config: SimConfig, robots: usize) -> MujocoBackend {
+        MujocoBackend::with_python(robot, config, robots, &self.path()).unwrap()
+    }
+}
+
+fn config() -> SimConfig {
+    SimConfig { engine: Engine::Mujoco, threads: 1, ..SimConfig::default() }
+}
+
+fn hold() -> Command {
+    Command::hold(go2().control.default_pose_f32(), 40.0, 1.0)
+}
+
+/// Returns the joint targets of a trot at 2 Hz, in which diagonal legs alternate.
+fn trot(step: usize) -> PerJoint {
+    let phase = std::f32::consts::TAU * 2.0 * step as f32 / 50.0;
+    let pose = go2().control.default_pose_f32();
+    std::array::from_fn(|joint| {
+        let swing = phase.sin() * if [0, 3].contains(&(joint / 3)) { 1.0 } else { -1.0 };
+        pose[joint] + [0.0, 0.1 * phase.cos() * swing.signum(), -0.25 * swing.max(0.0)][joint % 3]
+    })
+}
+
+#[test]
+fn robot_stands_for_5_s_of_zero_actions() {
+    let Some(python) = Interpreter::of_tests() else { return };
+    let walk = Walk::new(WalkConfig::default(), &go2(), true).unwrap();
+    let settings = TaskEnvConfig {
+        randomise: Randomisation { friction_scale: [0.8, 1.2], payload_kg: [0.0, 2.0], ..Randomisation::default() },
+        robot_sampler: None,
+        autoreset: AutoresetMode::NextStep,
+        max_episode_steps: None,
+        seed: 1,
+    };
+    let mut env = TaskEnv::new(python.backend(go2(), config(), 3), walk, settings).unwrap();
+    env.reset(&ResetRequest::seeded(7, 3)).unwrap();
+    for step in 0..250 {
+        let batch = env.step(&[0.0; 3 * NUM_JOINTS]).unwrap();
+        assert!(!(0..3).any(|robot| batch.done(robot)), "step {step}");
+    }
+    let states = env.backend().states();
+    for robot in 0..3 {
+        assert!(states.truth.base_position[robot][2] > 0.25 && !states.truth.body_contact[robot]);
+        assert!(states.truth.foot_force[robot].iter().all(|force| *force > 5.0), "{:?}", states.truth.foot_force);
+        assert!((states.measured.stamp[robot] - 5.0).abs() < 1e-9);
+    }
+}
+
+#[test]
+fn first_second_of_a_trot_agrees_with_the_batch_engine() {
+    let Some(python) = Interpreter::of_tests() else { return };
+    let run = |backend: &mut dyn Backend| -> Vec<PerJoint> {
+        let ground = backend.ground();
+        let placed = InitialState::standing_on(&ground, &go2(), go2().control.default_pose_f32(), 0.0);
+        backend.reset(&[(0, placed)]).unwrap();
+        let step = |step| {
+            backend.step(&[Command { q: trot(step), ..hold() }], &[true], 4).unwrap();
+            backend.measured().q[0]
+        };
+        (0..50).map(step).collect()
+    };
+    for (terrain, bound) in [(Terrain::Flat, 0.005), (Terrain::SlopeRad(0.1), 0.005)] {
+        let config = SimConfig { terrain, ..config() };
+        let ours = run(&mut BatchBackend::new(go2(), SimConfig { engine: Engine::Batch, ..config }, 1).unwrap());
+        let theirs = run(&mut python.backend(go2(), config, 1));
+        let (difference, travel) = (rms(&ours, &theirs), rms(&theirs, &vec![go2().control.default_pose_f32(); 50]));
+        println!("{terrain:?}: {difference:.5} rad RMS, motion {travel:.5} rad");
+        assert!(difference < bound && travel > 0.05, "{difference} rad");
+    }
+}
+
+#[test]
+fn every_effect_acts_as_in_the_batch_engine_or_is_rejected_by_name() {
+    let Some(python) = Interpreter::of_tests() else { return };
+    // These depend on a logged voltage, temperature or torque and do not change the motion here.
+    let log_effects = ["supply_sag", "thermal_derating", "torque_sensor_delay"];
+    let mut rejected = Vec::new();
+    for base in [BaseMount::Fixed, BaseMount::Floating] {
+        // In the air the error of MuJoCo's integrator is proportional to its step: 0.0005 rad at 2 kHz.
+        let physics_hz = Some(if base.is_fixed() { 10_000 } else { 2000 });
+        let config = SimConfig { base, physics_hz, ..config() };
+        let mut theirs = python.backend(go2(), config, 1);
+        let mut ours = BatchBackend::new(go2(), SimConfig { engine: Engine::Batch, ..config }, 1).unwrap();
+        theirs.reset(&[(0, start(base))]).unwrap();
+        ours.reset(&[(0, start(base))]).unwrap();
+        let ideal = [rows(&mut theirs, base), rows(&mut ours, base)];
+        let ideal_difference = rms(&ideal[0], &ideal[1]);
+        let tested = |effect: &&&Effect| {
+            (effect.target == Target::Joints) == base.is_fixed() && !log_effects.contains(&effect.name)
+        };
+        for effect in CATALOGUE.iter().filter(tested) {
+            let model = apply_effects(&go2(), &[entry(effect)]).unwrap();
+            match theirs.reset_with_model(0, &model, &start(base)) {
+                Ok(()) => {}
+                Err(error) => {
+                    let engine = "mujoco";
+                    assert_eq!(error, BackendError::UnsupportedEffect { robot: 0, engine, effect: effect.name });
+                    rejected.push(effect.name);
+                    continue;
+                }
+            }
+            ours.reset_with_model(0, &model, &start(base)).unwrap();
+            let (theirs, ours) = (rows(&mut theirs, base), rows(&mut ours, base));
+            let (difference, changed) = (rms(&theirs, &ours), rms(&theirs, &ideal[0]));
+            println!(
+                "{:<20} change {changed:.5}, difference {difference:.5}, ideal {ideal_difference:.5}",
+                effect.name
+            );
+            assert!(changed > 3.0 * ideal_difference, "`{}`: change {changed}", effect.name);
+            let bound = 0.15 * changed + 2.0 * ideal_difference;
+            assert!(difference < bound, "`{}`: difference {difference}, change {changed}", effect.name);
+        }
+    }
+    expect![[r#"
+        command_delay, torque_saturation, torque_delay, torque_speed_limit, torque_dead_zone, drive_lag, torque_ripple, backlash, joint_elasticity, stribeck_friction, load_friction"#]]
+    .assert_eq(&rejected.join(", "));
+}
+
+#[test]
+fn only_the_robot_that_diverged_is_named_and_it_recovers_at_its_reset() {
+    let Some(python) = Interpreter::of_tests() else { return };
+    let mut backend = python.backend(go2(), config(), 3);
+    let mut commands = [hold(); 3];
+    commands[1].tau_ff[4] = f32::NAN;
+    let error = backend.step(&commands, &[true, true, false], 4).unwrap_err();
+    assert_eq!(error, BackendError::Diverged { robots: vec![(1, "q")] });
+    let states = backend.states();
+    assert!(states.measured.q[0].iter().all(|q| q.is_finite()));
+    assert_eq!((states.measured.stamp[0], states.measured.stamp[2]), (0.02, 0.0));
+    assert_eq!(states.measured.q[2], go2().control.default_pose_f32(), "an inactive robot does not change");
+    backend.reset(&[(1, InitialState::at_rest(0.33, go2().control.default_pose_f32()))]).unwrap();
+    backend.step(&[hold(); 3], &[true; 3], 4).unwrap();
+    let unknown = backend.reset(&[(3, InitialState::at_rest(0.33, hold().q))]).unwrap_err();
+    assert_eq!(unknown, BackendError::RobotOutOfRange { robot: 3, num_robots: 3 });
+}
+
+#[test]
+fn killed_process_is_an_error_of_every_later_request() {
+    let Some(python) = Interpreter::of_tests() else { return };
+    let walk = Walk::new(WalkConfig::default(), &go2(), true).unwrap();
+    let (autoreset, robot_sampler) = (AutoresetMode::NextStep, None);
+    let settings = TaskEnvConfig {
+        randomise: Randomisation::default(),
+        robot_sampler,
+        autoreset,
+        max_episode_steps: None,
+        seed: 1,
+    };
+    let backend = python.backend(go2(), config(), 1);
+    let id = backend.process_id().to_string();
+    let mut env = TaskEnv::new(backend, walk, settings).unwrap();
+    env.reset(&ResetRequest::seeded(7, 1)).unwrap();
+    let killer = std::thread::spawn(move || {
+        std::thread::sleep(Duration::from_millis(50));
+        run(std::process::Command::new("kill").args(["-KILL", &id])).unwrap();
+    });
+    let error = loop {
+        if let Err(error) = env.step(&[0.0; NUM_JOINTS]) {
+            break error;
+        }
+    };
+    killer.join().unwrap();
+    let EnvError::Backend(BackendError::EngineProcess { engine: "mujoco", reason }) = &error else { panic!("{error}") };
+    assert_eq!(reason, "it ended (signal: 9 (SIGKILL)); its messages are on stderr");
+    let again = env.reset(&ResetRequest::seeded(7, 1)).unwrap_err();
+    assert_eq!(again.to_string(), error.to_string());
+}
+
+fn check_error(python: &Path, robot: RobotModel, config: SimConfig, message: &Expect) {
+    let error = MujocoBackend::with_python(robot, config, 1, python).err().unwrap().to_string();
+    message.assert_eq(&error.replace(python.to_str().unwrap(), "PYTHON"));
+}
+
+#[test]
+fn interpreter_that_cannot_run_the_module_is_an_error_that_says_how_to_install_it() {
+    check_error(
+        Path::new("/nowhere/python3"),
+        go2(),
+        config(),
+        &expect![[r#"
+            cannot start `PYTHON -m twinstep.mujoco`, the process of engine `mujoco`: the interpreter does not start: No such file or directory (os error 2)
+              install it with `pip install "twinstep[mujoco]"`, or select another Python with TWINSTEP_PYTHON=PATH"#]],
+    );
+    check_error(
+        &Interpreter::script("echo \"No module named $2\" >&2; exit 1").path(),
+        go2(),
+        config(),
+        &expect![[r#"
+        cannot start `PYTHON -m twinstep.mujoco`, the process of engine `mujoco`: it ended (exit status: 1); its messages are on stderr
+          install it with `pip install "twinstep[mujoco]"`, or select another Python with TWINSTEP_PYTHON=PATH"#]],
+    );
+}
+
+#[test]
+fn output_that_is_no_reply_is_an_error() {
+    let reason = |commands: &str| {
+        let script = Interpreter::script(commands);
+        match MujocoBackend::with_python(go2(), config(), 1, &script.path()).err() {
+            Some(BackendBuildError::Mujoco { reason, .. }) => reason,
+            other => panic!("{other:?}"),
+        }
+    };
+    let reasons = [
+        reason("echo Traceback; exec sleep 9"),
+        reason(r"printf '\005\000\000\000Habcd'; exec sleep 9"),
+        reason(r"printf '\002\000\000\000Da'; exec sleep 9"),
+        reason(r"printf '\005\000\000\000Ha'"),
+        reason(r"printf '\023\000\000\000Htwinstep-mujoco 1 \002\000\000\000Da'; exec cat > /dev/null"),
+    ];
+    expect![[r#"
+        it wrote "Trac", which is not the start of a frame
+        it is another version: it wrote "abcd", not `twinstep-mujoco 1`
+        it wrote a frame of kind 'D' with 1 bytes as a reply
+        it ended (exit status: 0); its messages are on stderr
+        the process of engine `mujoco` failed: it wrote the states of its robots in 1 bytes; 228 are expected; its robots are lost, create them again"#]].assert_eq(&reasons.join("\n"));
+}
+
+#[test]
+fn effect_or_terrain_that_mujoco_does_not_have_is_rejected_before_its_process_starts() {
+    let mut robot = go2();
+    robot.joints[5].actuator.backlash = 0.01;
+    let nowhere = Path::new("/nowhere/python3");
+    check_error(
+        nowhere,
+        robot,
+        config(),
+        &expect!["engine `mujoco` cannot simulate the effect `backlash` of the robot's model; use `batch` or `rapier`"],
+    );
+    let rough = Terrain::Rough(RoughTerrain { height_m: 0.05, cell_m: 0.25, size_m: 40.0, seed: 1 });
+    check_error(
+        nowhere,
+        go2(),
+        SimConfig { terrain: rough, ..config() },
+        &expect!["`sim.terrain` = rough is not allowed: with engine `mujoco`, flat or slope_rad"],
+    );
+}
+
+/// Returns the ids of the child processes of `process`.
+fn children(process: u32) -> Vec<String> {
+    let tasks = std::fs::read_dir(format!("/proc/{process}/task")).unwrap();
+    let lists = tasks.map(|task| std::fs::read_to_string(task.unwrap().path().join("children")).unwrap_or_default());
+    lists.flat_map(|list| list.split_whitespace().map(str::to_owned).collect::<Vec<_>>()).collect()
+}
+
+/// Joints whose friction exceeds the actuator torque do not move.
+#[test]
+fn served_robots_have_the_friction_of_the_model_file_and_end_with_a_killed_server() {
+    let Some(python) = Interpreter::of_tests() else { return };
+    let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
+    let folder = python.0.path();
+    std::fs::write(folder.join("server.toml"), "[sim]\nengine = \"mujoco\"\n").unwrap();
+    let friction = "robot = \"go2\"\n[[effect]]\nname = \"coulomb_friction\"\nscope = \"all\"\ntorque_nm = 20.0\n";
+    std::fs::write(folder.join("stiff.toml"), friction).unwrap();
+    let moved = |model: &[&str]| {
+        let interpreter = format!("TWINSTEP_PYTHON={}", python.path().display());
+        let program = programs.0.join("twinstep").display().to_string();
+        let config = folder.join("server.toml").display().to_string();
+        let serve = [&interpreter, &program, "serve", "--listen", "tcp/127.0.0.1:0", "--config", &config];
+        let arguments: Vec<_> = serve.iter().chain(model).map(|word| (*word).to_owned()).collect();
+        let (mut server, endpoint) = Process::listening(Path::new("env"), &arguments).unwrap();
+        let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
+        let before = env.reset(&ResetRequest::seeded(1, 2)).unwrap()[9..21].to_vec();
+        let mut after = before.clone();
+        for _ in 0..5 {
+            after = env.step(&[0.3; 2 * NUM_JOINTS]).unwrap().obs[9..21].to_vec();
+        }
+        let simulators = children(server.id());
+        assert!(!simulators.is_empty());
+        server.kill();
+        let since = Instant::now();
+        while simulators.iter().any(|id| Path::new(&format!("/proc/{id}/exe")).exists()) {
+            assert!(since.elapsed() < Duration::from_secs(20), "{simulators:?} run without their server");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        before.iter().zip(after).map(|(before, after)| (before - after).abs()).fold(0.0, f32::max)
+    };
+    let stiff = folder.join("stiff.toml").display().to_string();
+    let (free, stuck) = (moved(&[]), moved(&["--model", &stiff]));
+    assert!(free > 0.05 && stuck < 0.2 * free, "{free} and {stuck} rad");
+}
+
+#[test]
+fn played_motion_agrees_with_the_batch_engine() {
+    let Some(python) = Interpreter::of_tests() else { return };
+    let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
+    let source = python.0.path().join("sway.csv");
+    crate::play::motion(BaseMount::Floating, 0.02).write(&source).unwrap();
+    let [ours, theirs] = ["batch", "mujoco"].map(|engine| {
+        let out = python.0.path().join(format!("{engine}.csv"));
+        let mut play = std::process::Command::new(programs.0.join("twinstep"));
+        play.arg("play").arg(&source).args(["--engine", engine, "--out"]).arg(&out);
+        run(play.env("TWINSTEP_PYTHON", python.path())).unwrap();
+        let log = Log::open(&out).unwrap();
+        let q = |row| twinstep_model::JOINT_NAMES.map(|name| log.q(name).unwrap()[row] as f32);
+        ((0..log.rows()).map(q).collect::<Vec<_>>(), log.meta().source.clone().unwrap())
+    });
+    let difference = rms(&ours.0, &theirs.0);
+    assert!(difference < 0.005, "{difference} rad");
+    assert_eq!(theirs.1, "twinstep play: `go2` simulated by mujoco at 1000 Hz x 64");
+}
