@@ -1,4 +1,5 @@
-//! `twinstep demo`: steps robots over Zenoh, then compares a real recording with the simulation and diagnoses it.
+//! `twinstep demo`: a Go2 learns to walk and is stepped over Zenoh; then a real recording is compared with the simulation
+//! and diagnosed.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -9,20 +10,26 @@ use twinstep_model::{ResetRequest, VecEnv, go2};
 use twinstep_sim::SimConfig;
 
 use twinstep_client::ServerProcess;
-use twinstep_envs::trot;
 use twinstep_identify::replay::replay;
 use twinstep_logs::recording;
-use twinstep_report::{joint_plot, joint_table};
+use twinstep_policy::{Policy, PolicyRunner};
+use twinstep_report::{film_strip, joint_plot, joint_table};
 use twinstep_sim::BatchRollout;
 
 use crate::diagnose;
 use crate::exit::{CommandResult, Signals, input, other};
+use crate::train;
+
+/// Frames of the film strip, and policy steps between two of them.
+const FILM_FRAMES: usize = 15;
+const FILM_STEPS: u64 = 4;
 
 /// Show the main features in two minutes; needs only this program.
 ///
-/// Starts a server in another process, connects to it over Zenoh and steps robots in a scripted trot. Then compares a
-/// recording of a real Go2, with a fixed base in the air, with the simulation joint by joint. At the end it diagnoses
-/// the recording: it reports which effects explain the difference, and writes the HTML report.
+/// Trains a policy that walks. Starts a server in another process, connects to it over Zenoh, and lets the policy walk
+/// its robots. Then compares a recording of a real Go2, with a fixed base in the air, with the simulation joint by
+/// joint. At the end it diagnoses the recording: it reports which effects explain the difference, and writes the HTML
+/// report.
 ///
 /// Example: `twinstep demo --envs 256 --seconds 5`
 #[derive(clap::Args)]
@@ -33,52 +40,69 @@ pub struct Args {
     /// Simulated time [s].
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=3600))]
     seconds: u32,
-    /// Folder for the plot, the recording and the diagnosis.
+    /// Number of environment steps of the training. With a million the robot does not walk yet.
+    #[arg(long, default_value_t = 5_000_000, value_name = "N")]
+    train_steps: u64,
+    /// Folder for the policy, the plots, the recording and the diagnosis.
     #[arg(long, default_value = "twinstep-demo", value_name = "DIR")]
     out: PathBuf,
 }
 
-/// Runs the three parts of the demo.
+/// Runs the parts of the demo.
 pub fn run(args: &Args) -> CommandResult {
+    eprintln!("1. A Go2 learns to walk: {:.1} million steps of 1024 robots.", args.train_steps as f64 / 1e6);
+    let training = train::Args::new(args.out.join("walk"), 1, args.train_steps);
+    train::run(&training)?;
     let signals = Signals::listen()?;
-    walk(args, &signals)?;
+    walk(args, &training.policy(), &signals)?;
     compare(&args.out, &signals)
 }
 
-fn walk(args: &Args, signals: &Signals) -> CommandResult {
+fn walk(args: &Args, policy: &Path, signals: &Signals) -> CommandResult {
     let num_envs = args.envs as usize;
-    eprintln!("1. A server in another process simulates {num_envs} Go2; this process steps them over Zenoh.");
+    eprintln!("\n2. A server in another process simulates {num_envs} Go2; this process walks them over Zenoh.");
+    let (policy, _) = Policy::read(policy).map_err(other)?;
+    let mut runner = PolicyRunner::new(&policy);
     let server = ServerProcess::start(&["--envs", &num_envs.to_string()]).map_err(other)?;
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&server.endpoint, num_envs)).map_err(other)?;
-    env.reset(&ResetRequest::seeded(1, num_envs)).map_err(other)?;
-    let dt = env.spec().policy_dt as f32;
-    let steps = (args.seconds as f32 / dt) as u64;
+    let mut obs = env.reset(&ResetRequest::seeded(1, num_envs)).map_err(other)?.to_vec();
+    let dt = env.spec().policy_dt;
+    let steps = (f64::from(args.seconds) / dt) as u64;
     let bar = ProgressBar::new(steps * num_envs as u64).with_style(
         ProgressStyle::with_template("   {bar:32} {pos}/{len} env-steps  {per_sec}  ETA {eta}")
             .expect("the template is valid"),
     );
-    let (since, mut ended) = (Instant::now(), 0);
+    let (since, mut falls) = (Instant::now(), 0);
+    let mut actions = vec![0.0; num_envs * env.spec().action_len()];
+    let mut frames = Vec::new();
     for step in 0..steps {
         signals.check()?;
-        let action = trot::action(step as f32 * dt);
-        let batch = env.step(&action.repeat(num_envs)).map_err(other)?;
-        ended += batch.ended.len();
+        if step % FILM_STEPS == 0 && frames.len() < FILM_FRAMES {
+            frames.push((step as f64 * dt, env.scene(0).map_err(other)?));
+        }
+        runner.run(&obs, &mut actions);
+        let batch = env.step(&actions).map_err(other)?;
+        falls += batch.terminated.iter().filter(|fell| **fell).count();
+        obs.copy_from_slice(&batch.obs);
         bar.inc(num_envs as u64);
     }
     bar.finish_and_clear();
     let (wall, env_steps) = (since.elapsed().as_secs_f64(), steps * num_envs as u64);
     println!(
-        "stepped {num_envs} robots for {} s of simulated time in {wall:.1} s: {:.0} env-steps/s, {:.0} times real time",
+        "walked {num_envs} robots for {} s of simulated time in {wall:.1} s: {:.0} env-steps/s, {:.0} times real time",
         args.seconds,
         env_steps as f64 / wall,
-        env_steps as f64 * f64::from(dt) / wall,
+        env_steps as f64 * dt / wall,
     );
-    println!("ended episodes (falls, or the time limit): {ended}");
+    println!("falls: {falls}");
+    let film = args.out.join("walk.svg");
+    std::fs::write(&film, film_strip(&frames)).map_err(other)?;
+    println!("film strip of the first robot: {}", film.display());
     env.close().map_err(other)
 }
 
 fn compare(out: &Path, signals: &Signals) -> CommandResult {
-    eprintln!("\n2. A recording of a real Go2, with a fixed base in the air, compared with the ideal simulation.");
+    eprintln!("\n3. A recording of a real Go2, with a fixed base in the air, compared with the ideal simulation.");
     let folder = out.join("go2_air_chirp");
     let log = recording::unpack(&folder).map_err(input)?;
     let mut simulator = BatchRollout::new(&go2(), &SimConfig::default()).map_err(other)?;
@@ -90,6 +114,6 @@ fn compare(out: &Path, signals: &Signals) -> CommandResult {
         .map_err(other)?;
     println!("measured and simulated position of each joint: {}", picture.display());
     println!("recording, as a log folder: {}", folder.display());
-    eprintln!("\n3. Diagnosis: which effects explain the difference?");
+    eprintln!("\n4. Diagnosis: which effects explain the difference?");
     diagnose::run(&diagnose::Args::new(folder, out.join("diagnosis")))
 }

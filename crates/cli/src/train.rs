@@ -7,6 +7,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_envs::TaskConfig;
 use twinstep_learning::{Checkpoint, Evaluation, LearningError, Trainer, evaluate};
 use twinstep_policy::{CurvePoint, Policy, PolicyOrigin};
+use twinstep_sim::SimConfig;
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::train_config::TrainConfig;
@@ -104,6 +105,28 @@ fn folder_error(folder: &Path, cause: std::io::Error) -> Failure {
 }
 
 impl Args {
+    /// Returns the arguments of a training with default settings in the folder `out`.
+    pub fn new(out: PathBuf, seed: u64, steps: u64) -> Self {
+        Self {
+            task: "walk".to_owned(),
+            out,
+            config: None,
+            model: None,
+            randomise_effects: false,
+            seed,
+            steps: Some(steps),
+            minutes: None,
+            envs: None,
+            resume: false,
+            json: false,
+        }
+    }
+
+    /// Returns the path of the policy that the training writes.
+    pub fn policy(&self) -> PathBuf {
+        self.out.join("policy.safetensors")
+    }
+
     fn checkpoint(&self) -> PathBuf {
         self.out.join("checkpoint.safetensors")
     }
@@ -133,6 +156,7 @@ struct TrainSession {
     text: String,
     seed: u64,
     out: PathBuf,
+    policy: PathBuf,
     minutes: Option<f64>,
     trainer: Trainer,
     curve: Vec<CurvePoint>,
@@ -148,7 +172,17 @@ impl TrainSession {
         let trainer = Trainer::new(config.train.clone(), envs, learner, seed).map_err(input)?;
         let log = TrainLog::open(&args.out, &trainer.spec().reward_terms, args.resume)
             .map_err(|cause| folder_error(&args.out, cause))?;
-        Ok(Self { config, text, seed, out: args.out.clone(), minutes: args.minutes, trainer, curve, log })
+        Ok(Self {
+            config,
+            text,
+            seed,
+            out: args.out.clone(),
+            policy: args.policy(),
+            minutes: args.minutes,
+            trainer,
+            curve,
+            log,
+        })
     }
 
     /// Trains until all steps are done, the time is over, or the user interrupts.
@@ -195,7 +229,7 @@ impl TrainSession {
         };
         checkpoint.write(self.out.join("checkpoint.safetensors")).map_err(other)?;
         let policy = learner.policy(spec);
-        policy.write(self.out.join("policy.safetensors"), self.origin()).map_err(other)?;
+        policy.write(&self.policy, self.origin()).map_err(other)?;
         policy.write_onnx(self.out.join("policy.onnx")).map_err(other)?;
         write_curve(&self.curve, &self.out.join("curve.svg")).map_err(other)
     }
@@ -230,7 +264,8 @@ impl TrainSession {
     /// Evaluates the policy on fresh robots of the training's model, with default commands and physics.
     fn evaluate(&self, policy: &Policy) -> Result<Evaluation, Failure> {
         let (robots, seconds, seed) = EVALUATION;
-        let fresh = TrainConfig { model: self.config.model.clone(), ..TrainConfig::default() };
+        let fresh =
+            TrainConfig { model: self.config.model.clone(), sim: SimConfig::default(), ..TrainConfig::default() };
         let mut env = fresh.envs(robots, 1, 0)?.remove(0);
         evaluate(policy, env.as_mut(), seconds, seed, |_| ()).map_err(other)
     }

@@ -312,6 +312,8 @@ fn apply(learner: &mut Learner, task: &GradientTask, samples: usize, config: &Pp
 }
 
 /// Adapts the learning rate to the divergence of the last minibatch (Schulman's rule, as in rsl_rl).
+///
+/// The first minibatch of an update has no divergence, which says nothing about the rate.
 fn adapt_learning_rate(learning_rate: &mut f32, kl: f64, config: &PpoConfig) {
     let target = f64::from(config.target_kl);
     if target == 0.0 {
@@ -319,7 +321,7 @@ fn adapt_learning_rate(learning_rate: &mut f32, kl: f64, config: &PpoConfig) {
     }
     if kl > 2.0 * target {
         *learning_rate = (*learning_rate / LEARNING_RATE_FACTOR).max(MIN_LEARNING_RATE);
-    } else if kl < 0.5 * target {
+    } else if kl > 0.0 && kl < 0.5 * target {
         *learning_rate = (*learning_rate * LEARNING_RATE_FACTOR).min(config.max_learning_rate);
     }
 }

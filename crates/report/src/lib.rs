@@ -8,6 +8,7 @@
 pub mod chart;
 pub mod effect_plot;
 pub mod evaluation_plot;
+mod film_strip;
 mod findings;
 mod html;
 pub mod joint_plot;
@@ -25,6 +26,7 @@ mod text;
 mod time_series;
 mod timeline;
 
+pub use film_strip::film_strip;
 pub use joint_table::joint_table;
 pub use page::{ReportError, write as write_report};
 pub use report_data::ReportData;

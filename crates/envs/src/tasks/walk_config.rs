@@ -45,7 +45,7 @@ impl Default for WalkConfig {
             reward: RewardWeights::default(),
             tracking_sigma: 0.25,
             target_base_height_m: 0.30,
-            target_foot_height_m: 0.08,
+            target_foot_height_m: 0.1,
             target_air_time_s: 0.1,
             max_tilt_rad: 1.0,
             min_base_height_m: 0.15,
