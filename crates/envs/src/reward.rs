@@ -308,7 +308,7 @@ mod tests {
         let fallen = RewardInput { is_terminated: true, ..at_rest() };
         let index = crate::tasks::walk_config::RewardWeights::NAMES.iter().position(|name| *name == "termination");
         let term = crate::tasks::walk_config::RewardWeights::default().evaluate(&fallen)[index.expect("a term")];
-        assert!((term + 1.0).abs() < 1e-6, "{term}");
+        assert!((term + 5.0).abs() < 1e-6, "{term}");
     }
 
     #[test]

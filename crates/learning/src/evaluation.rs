@@ -26,7 +26,9 @@ pub struct Evaluation {
     pub seconds: f64,
     /// Share of the robots that did not fall.
     pub up: f64,
-    /// Root mean square error of the horizontal velocity, of robots that are up [m/s].
+    /// Root mean square of the norm of the horizontal velocity error, of robots that are up [m/s].
+    ///
+    /// The error of one axis is smaller by √2.
     pub velocity_rms: f64,
     /// The same, without the first second after each change of the command [m/s].
     pub settled_velocity_rms: f64,

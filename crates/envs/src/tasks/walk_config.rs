@@ -45,7 +45,7 @@ impl Default for WalkConfig {
             reward: RewardWeights::default(),
             tracking_sigma: 0.25,
             target_base_height_m: 0.30,
-            target_foot_height_m: 0.1,
+            target_foot_height_m: 0.11,
             target_air_time_s: 0.1,
             max_tilt_rad: 1.0,
             min_base_height_m: 0.15,
@@ -123,7 +123,7 @@ reward_weights! {
     /// Long swing phases of the feet (`feet_air_time`).
     feet_air_time = 2.0,
     /// Height error of swinging feet (MuJoCo Playground: `feet_clearance`).
-    feet_clearance = -1.0,
+    feet_clearance = -2.0,
     /// Horizontal velocity of feet on the ground, squared (`feet_slide`).
     feet_slip = -0.1,
     /// Contact of the trunk or a thigh with the ground (`undesired_contacts`).
@@ -131,7 +131,7 @@ reward_weights! {
     /// Offset from the default pose while the velocity command is zero.
     stand_still = -0.2,
     /// End of the episode by a fall; the weight is per fall, not per second.
-    termination = -1.0,
+    termination = -5.0,
     /// Epistemic uncertainty of the actuator networks. Only for model files with an actuator network.
     epistemic_uncertainty = 0.0,
 }
