@@ -1,5 +1,6 @@
 //! `twinstep evaluate-policy`: velocity errors, falls and gait of a policy, on engines and robots that it has not seen.
 
+use std::fmt::Write;
 use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
@@ -131,8 +132,9 @@ fn table(args: &Args, rows: &[Row]) -> String {
     );
     for Row { condition, engine, evaluation: e } in rows {
         let engine = format!("{engine:?}").to_lowercase();
-        text += &format!(
-            "{condition:10} {engine:8} {:5.1} %  {:.3} ({:.3})   {:.3} ({:.3})     {:.1} cm  {:.2}  {:.3} m/s\n",
+        let _ = writeln!(
+            text,
+            "{condition:10} {engine:8} {:5.1} %  {:.3} ({:.3})   {:.3} ({:.3})     {:.1} cm  {:.2}  {:.3} m/s",
             100.0 * e.up,
             e.velocity_rms,
             e.settled_velocity_rms,

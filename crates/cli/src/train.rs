@@ -54,7 +54,7 @@ pub struct Args {
     /// Seed of networks, robots, commands and exploration.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Total number of environment steps. Default: 7 million.
+    /// Total number of environment steps. Default: 8 million.
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
     /// Time after which the training ends even if steps are left [min].
@@ -143,7 +143,7 @@ impl Args {
             (config.train.num_envs, config.train.groups) = (envs, config.train.groups.min(envs.max(1)));
         }
         config.train.check().map_err(input)?;
-        if self.minutes.is_some_and(|minutes| !(minutes > 0.0)) {
+        if self.minutes.is_some_and(|minutes| minutes.is_nan() || minutes <= 0.0) {
             return Err(Failure::Input(miette::miette!("`--minutes` must be positive")));
         }
         Ok(config)

@@ -49,8 +49,8 @@ pub struct FootContacts {
 impl FootContacts {
     /// Updates the contacts after a policy step with the normal force on each foot [N].
     pub fn update(&mut self, foot_force: &PerLeg, policy_dt: f32) {
-        for leg in 0..4 {
-            let touches = foot_force[leg] > CONTACT_FORCE_THRESHOLD;
+        for (leg, force) in foot_force.iter().enumerate() {
+            let touches = *force > CONTACT_FORCE_THRESHOLD;
             self.on_ground[leg] = touches || self.touched[leg];
             self.touched[leg] = touches;
             self.touchdown_air_time[leg] = if self.on_ground[leg] { self.air_time[leg] } else { 0.0 };

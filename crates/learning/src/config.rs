@@ -37,6 +37,8 @@ pub struct PpoConfig {
     /// Highest learning rate.
     pub max_learning_rate: f32,
     /// Kullback–Leibler divergence between two policies, to which the learning rate is adapted [nat]. 0: constant rate.
+    ///
+    /// It decreases to a tenth in the second half of the training.
     pub target_kl: f32,
     /// Upper limit of the norm of the gradient.
     pub max_gradient_norm: f32,
@@ -69,7 +71,7 @@ impl Default for PpoConfig {
             max_gradient_norm: 1.0,
             initial_std: 0.5,
             symmetry: false,
-            total_steps: 7_000_000,
+            total_steps: 8_000_000,
         }
     }
 }

@@ -37,12 +37,12 @@ pub fn advantages(transitions: &Transitions, discounts: Discounts, advantages: &
     let Discounts { gamma, lambda } = discounts;
     let steps = rewards.len() / num_envs;
     for step in (0..steps).rev() {
-        for env in 0..num_envs {
+        for (env, last_value) in last_values.iter().enumerate() {
             let index = step * num_envs + env;
             let (next_value, next_advantage) = if done[index] {
                 (truncated_values[index], 0.0)
             } else if step + 1 == steps {
-                (last_values[env], 0.0)
+                (*last_value, 0.0)
             } else {
                 (values[index + num_envs], advantages[index + num_envs])
             };

@@ -155,8 +155,8 @@ impl<T: ToyTask> VecEnv for ToyEnv<T> {
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
         self.batch.ended.clear();
         self.steps += 1;
-        for env in 0..self.states.len() {
-            let (reward, terminated) = self.states[env].step(actions[env]);
+        for (env, action) in actions.iter().enumerate() {
+            let (reward, terminated) = self.states[env].step(*action);
             self.lengths[env] += 1;
             self.returns[env] += reward;
             let truncated = self.lengths[env] == T::EPISODE_STEPS && !terminated;

@@ -18,6 +18,9 @@ use crate::update::{Batch, GradientTask, LossSums, Mirrors, Parameters, Sample};
 const MIN_LEARNING_RATE: f32 = 1e-5;
 /// Factor by which the learning rate changes.
 const LEARNING_RATE_FACTOR: f32 = 1.5;
+/// Share of the training after which the target of the divergence decreases, and its share that is left at the end.
+const DECAY_START: f64 = 0.5;
+const FINAL_KL_SHARE: f64 = 0.1;
 /// Share of the earlier mean that remains in [`Learner::mean_actor`] after an update.
 const MEAN_DECAY: f32 = 0.9;
 /// Gain of the actor's last layer, so that the first actions are close to the default pose.
@@ -175,9 +178,10 @@ impl Trainer {
         if let Some(given) = envs.iter().map(|env| env.autoreset()).find(|mode| *mode != AutoresetMode::SameStep) {
             return Err(LearningError::Autoreset { given });
         }
-        let mirrors = match config.symmetry {
-            true => Some(Mirrors { features: Mirror::of_observations(&spec)?, actions: Mirror::of_actions(&spec)? }),
-            false => None,
+        let mirrors = if config.symmetry {
+            Some(Mirrors { features: Mirror::of_observations(&spec)?, actions: Mirror::of_actions(&spec)? })
+        } else {
+            None
         };
         let learner = learner.unwrap_or_else(|| Learner::new(&config, &spec, seed));
         // A continued training has other episodes than those that it has seen.
@@ -231,7 +235,7 @@ impl Trainer {
             action_std: stds.sum::<f32>() / self.learner.log_std.len() as f32,
             statistics,
             rollout_time,
-            update_time: start.elapsed() - rollout_time,
+            update_time: start.elapsed().saturating_sub(rollout_time),
         })
     }
 
@@ -284,7 +288,7 @@ impl Trainer {
                 let [actor, critic] = networks;
                 let parameters = Parameters { actor, critic, log_std: &learner.log_std };
                 let sums = task.run(&batch, minibatch, &parameters, config);
-                adapt_learning_rate(&mut learner.learning_rate, sums.mean_kl(), config);
+                adapt_learning_rate(learner, sums.mean_kl(), config);
                 let is_finite = apply(learner, task, minibatch.len(), config);
                 networks[0].update(&learner.actor);
                 networks[1].update(&learner.critic);
@@ -293,7 +297,9 @@ impl Trainer {
                 }
                 losses.add(&sums);
             }
-            samples.iter_mut().for_each(|sample| sample.is_mirrored ^= config.symmetry);
+            for sample in samples.iter_mut() {
+                sample.is_mirrored ^= config.symmetry;
+            }
         }
         Ok(losses)
     }
@@ -314,8 +320,11 @@ fn apply(learner: &mut Learner, task: &GradientTask, samples: usize, config: &Pp
 /// Adapts the learning rate to the divergence of the last minibatch (Schulman's rule, as in rsl_rl).
 ///
 /// The first minibatch of an update has no divergence, which says nothing about the rate.
-fn adapt_learning_rate(learning_rate: &mut f32, kl: f64, config: &PpoConfig) {
-    let target = f64::from(config.target_kl);
+fn adapt_learning_rate(learner: &mut Learner, kl: f64, config: &PpoConfig) {
+    let progress = learner.env_steps as f64 / config.total_steps as f64;
+    let decay = ((progress - DECAY_START) / (1.0 - DECAY_START)).clamp(0.0, 1.0);
+    let target = f64::from(config.target_kl) * (1.0 - decay * (1.0 - FINAL_KL_SHARE));
+    let learning_rate = &mut learner.learning_rate;
     if target == 0.0 {
         return;
     }

@@ -26,7 +26,7 @@ impl FootKinematics {
     /// Reads the lengths of the legs of `robot`.
     pub fn new(robot: &RobotModel) -> Self {
         Self {
-            origins: std::array::from_fn(|leg| robot.legs[leg].origins.map(|origin| origin.as_vec3())),
+            origins: std::array::from_fn(|leg| robot.legs[leg].origins.map(glam::DVec3::as_vec3)),
             foot_centre: robot.shapes.foot_centre.as_vec3(),
         }
     }

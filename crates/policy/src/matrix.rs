@@ -41,7 +41,7 @@ pub struct Right<'a> {
 impl<'a> Right<'a> {
     /// Returns the entries from column `first` of a block on, and the distance between rows in memory.
     #[inline(always)]
-    fn from_column(self, first: usize) -> (&'a [f32], usize) {
+    fn columns_from(self, first: usize) -> (&'a [f32], usize) {
         if !self.is_packed {
             return (&self.values[first..], self.columns);
         }
@@ -96,7 +96,7 @@ fn add_columns<T: SimdFloat, const ROWS: usize, const REGISTERS: usize>(
     column: usize,
     product: &mut [f32],
 ) {
-    let (b, b_stride) = right.from_column(column);
+    let (b, b_stride) = right.columns_from(column);
     let mut row = 0;
     while row < rows {
         let c = &mut product[row * right.columns + column..];

@@ -131,8 +131,7 @@ fn orthogonal(rows: usize, columns: usize, random: &mut impl Rng) -> Vec<f32> {
             vector.iter_mut().zip(other).for_each(|(entry, other)| *entry -= dot * other);
         }
         let norm = vector.iter().map(|entry| entry * entry).sum::<f64>().sqrt();
-        vector.iter_mut().for_each(|entry| *entry /= norm);
-        vectors.push(vector);
+        vectors.push(vector.into_iter().map(|entry| entry / norm).collect());
     }
     let entry = |row: usize, column: usize| if rows < columns { vectors[row][column] } else { vectors[column][row] };
     (0..rows * columns).map(|index| entry(index / columns, index % columns) as f32).collect()

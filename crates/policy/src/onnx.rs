@@ -80,7 +80,9 @@ impl Policy {
 
 fn node(inputs: &[&str], operator: &str, output: &str) -> Message {
     let mut node = Message::default();
-    inputs.iter().for_each(|input| node.text(1, input));
+    for input in inputs {
+        node.text(1, input);
+    }
     node.text(2, output);
     node.text(3, output);
     node.text(4, operator);
@@ -89,7 +91,9 @@ fn node(inputs: &[&str], operator: &str, output: &str) -> Message {
 
 fn tensor(name: &str, dimensions: &[usize], values: &[f32]) -> Message {
     let mut tensor = Message::default();
-    dimensions.iter().for_each(|len| tensor.integer(1, *len as u64));
+    for len in dimensions {
+        tensor.integer(1, *len as u64);
+    }
     tensor.integer(2, FLOAT);
     tensor.text(8, name);
     tensor.bytes(9, &values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<_>>());
