@@ -4,6 +4,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use twinstep_policy::Policy;
+use twinstep_tests::python::root;
 
 fn twinstep(arguments: &[&str]) -> Output {
     let program = Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep");
@@ -74,6 +75,21 @@ fn policy_is_evaluated_on_each_engine_and_refused_where_it_does_not_fit() {
     let other = twinstep(&["evaluate-policy", policy, "--robots", "4", "--model", model.to_str().unwrap()]);
     assert_eq!(other.status.code(), Some(2));
     assert!(text(&other.stderr).contains("the policy was trained with spec"), "{}", text(&other.stderr));
+}
+
+#[test]
+fn shipped_policy_walks_in_both_engines() {
+    let policy = root().join("data/policies/walk.safetensors");
+    let arguments = ["evaluate-policy", policy.to_str().unwrap(), "--robots", "32", "--seconds", "6", "--json"];
+    let evaluated = twinstep(&arguments);
+    assert!(evaluated.status.success(), "{}", text(&evaluated.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&evaluated.stdout).unwrap();
+    for row in report["rows"].as_array().unwrap() {
+        let number = |key: &str| row[key].as_f64().unwrap();
+        // A robot that stands still has 0.65 m/s.
+        assert!(number("up") > 0.9 && number("velocity_rms") < 0.3, "{row}");
+        assert!(number("swing_height") > 0.03, "{row}");
+    }
 }
 
 #[test]

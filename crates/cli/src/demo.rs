@@ -41,7 +41,7 @@ pub struct Args {
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=3600))]
     seconds: u32,
     /// Number of environment steps of the training. With a million the robot does not walk yet.
-    #[arg(long, default_value_t = 5_000_000, value_name = "N")]
+    #[arg(long, default_value_t = 8_000_000, value_name = "N")]
     train_steps: u64,
     /// Folder for the policy, the plots, the recording and the diagnosis.
     #[arg(long, default_value = "twinstep-demo", value_name = "DIR")]

@@ -123,8 +123,8 @@ pub fn write_curve(curve: &[CurvePoint], path: &Path) -> Result<(), PlotError> {
     let svg = chart::picture(SIZE, |area| {
         let (top, bottom) = area.split_vertically(640);
         let names = [("velocity [m/s]", ORANGE), ("yaw rate [rad/s]", INK)];
-        chart::legend(&top, &names, 520, (520, 110))?;
         panel("RMS error during training, with exploration noise", "", "", errors).draw(&top)?;
+        chart::legend(&top, &names, 520, (520, 110))?;
         chart::text(&bottom, "mean reward per step", 40, HPos::Left, (180, 30))?;
         panel("", "environment steps [million]", "", reward).draw(&bottom)
     })?;

@@ -3,7 +3,9 @@
 //! - [`Trainer`]: collects transitions with the current policy ([`Group`]), and updates actor and critic with them. A
 //!   [`Learner`] is what is learnt; [`Iteration`] reports one rollout and update.
 //! - [`PpoConfig`]: the settings, the `[train]` table of a config file.
-//! - [`gae`]: the advantages; `update`: the gradient of the loss.
+//! - [`gae`]: the advantages; `update`: the gradient of the loss; [`Mirror`]: left and right exchanged.
+//! - [`Checkpoint`]: state of a training in a file; [`EventFile`]: scalars for TensorBoard.
+//! - [`evaluate`]: velocity errors, falls and gait of a walking policy.
 //!
 //! Equal seeds, settings and environments give equal bits on any number of threads.
 
