@@ -1,7 +1,8 @@
 //! `twinstep train` and `twinstep evaluate-policy` as processes.
 
+use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 use twinstep_policy::Policy;
 use twinstep_tests::python::root;
@@ -52,6 +53,35 @@ fn equal_seeds_give_equal_policies() {
     let first = policy("first", "1");
     assert!(first == policy("again", "1"));
     assert!(first != policy("other", "2"));
+}
+
+#[test]
+fn training_on_the_robots_of_a_server_gives_the_same_policy_as_in_process() {
+    let folder = tempfile::tempdir().unwrap();
+    let program = Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep");
+    let mut server = Command::new(program)
+        .args(["serve", "--listen", "tcp/127.0.0.1:0", "--until-stdin-closes", "--envs", "320", "--physics-hz", "400"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    BufReader::new(server.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    let endpoint = line.trim().strip_prefix("listening ").unwrap();
+    let config = folder.path().join("config.toml");
+    std::fs::write(&config, "[sim]\nphysics_hz = 400\n[train]\nnum_envs = 48\ngroups = 2\ntotal_steps = 4608\n")
+        .unwrap();
+    let policy = |name: &str, endpoint: &[&str]| {
+        let out = folder.path().join(name);
+        let arguments = ["train", "--out", out.to_str().unwrap(), "--config", config.to_str().unwrap()];
+        let output = twinstep(&[&arguments, endpoint].concat());
+        assert!(output.status.success(), "{}", text(&output.stderr));
+        Policy::read(out.join("policy.safetensors")).unwrap().0
+    };
+    assert!(policy("local", &[]) == policy("remote", &["--endpoint", endpoint]));
+    drop(server.stdin.take());
+    server.wait().unwrap();
 }
 
 #[test]

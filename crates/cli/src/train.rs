@@ -4,8 +4,10 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
+use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_envs::TaskConfig;
 use twinstep_learning::{Checkpoint, Evaluation, LearningError, Trainer, evaluate};
+use twinstep_model::{AutoresetMode, VecEnv};
 use twinstep_policy::{CurvePoint, Policy, PolicyOrigin};
 use twinstep_sim::SimConfig;
 
@@ -15,12 +17,14 @@ use crate::train_log::{TrainLog, curve_point, write_curve};
 
 /// Interval at which a running training is saved.
 const SAVE_EVERY: Duration = Duration::from_secs(10);
+/// Groups of robots of a server: while the policy handles one, the server steps the other.
+const REMOTE_GROUPS: usize = 2;
 /// Robots, simulated time [s] and seed of the evaluation after the training.
 const EVALUATION: (usize, f64, u64) = (256, 20.0, 1_000_000);
 
-/// Train a policy by proximal policy optimisation, in this process.
+/// Train a policy by proximal policy optimisation.
 ///
-/// Simulates the robots on all cores and learns from them. The folder then contains:
+/// Simulates the robots on all cores, or steps those of a server (--endpoint), and learns from them. The folder then contains:
 ///
 ///   policy.safetensors     the policy, with the spec of its environment
 ///   policy.onnx            the same for other runtimes: input `obs` [batch, 45] in SI units, output `action` [batch, 12]
@@ -63,6 +67,10 @@ pub struct Args {
     /// Number of robots. Default: 1024.
     #[arg(long, value_name = "N")]
     envs: Option<usize>,
+    /// Train on the robots of a server at this Zenoh endpoint, such as tcp/127.0.0.1:7447. The settings [task], [sim]
+    /// and [randomise] are then those of the server. Default: simulate in this process.
+    #[arg(long, value_name = "ENDPOINT", conflicts_with_all = ["model", "randomise_effects"])]
+    endpoint: Option<String>,
     /// Continue the training in the folder with its settings and seed.
     #[arg(long, conflicts_with_all = ["config", "model", "randomise_effects", "seed", "envs"])]
     resume: bool,
@@ -117,6 +125,7 @@ impl Args {
             steps: Some(steps),
             minutes: None,
             envs: None,
+            endpoint: None,
             resume: false,
             json: false,
         }
@@ -157,6 +166,7 @@ struct TrainSession {
     seed: u64,
     out: PathBuf,
     policy: PathBuf,
+    endpoint: Option<String>,
     minutes: Option<f64>,
     trainer: Trainer,
     curve: Vec<CurvePoint>,
@@ -165,24 +175,19 @@ struct TrainSession {
 
 impl TrainSession {
     fn new(args: &Args, config: TrainConfig, text: String, checkpoint: Option<Checkpoint>) -> Result<Self, Failure> {
-        let envs = config.envs(config.train.num_envs, config.train.groups, 1)?;
+        let envs = match &args.endpoint {
+            Some(endpoint) => remote_envs(endpoint, config.train.num_envs, REMOTE_GROUPS)?,
+            None => config.envs(config.train.num_envs, config.train.groups, 1)?,
+        };
         let seed = checkpoint.as_ref().map_or(args.seed, |checkpoint| checkpoint.seed);
         let (learner, curve) =
             checkpoint.map_or((None, Vec::new()), |checkpoint| (Some(checkpoint.learner), checkpoint.curve));
         let trainer = Trainer::new(config.train.clone(), envs, learner, seed).map_err(input)?;
         let log = TrainLog::open(&args.out, &trainer.spec().reward_terms, args.resume)
             .map_err(|cause| folder_error(&args.out, cause))?;
-        Ok(Self {
-            config,
-            text,
-            seed,
-            out: args.out.clone(),
-            policy: args.policy(),
-            minutes: args.minutes,
-            trainer,
-            curve,
-            log,
-        })
+        let (out, policy) = (args.out.clone(), args.policy());
+        let (endpoint, minutes) = (args.endpoint.clone(), args.minutes);
+        Ok(Self { config, text, seed, out, policy, endpoint, minutes, trainer, curve, log })
     }
 
     /// Trains until all steps are done, the time is over, or the user interrupts.
@@ -261,14 +266,33 @@ impl TrainSession {
         Ok(())
     }
 
-    /// Evaluates the policy on fresh robots of the training's model, with default commands and physics.
+    /// Evaluates the policy on fresh robots of the server, or of the training's model with default commands and physics.
     fn evaluate(&self, policy: &Policy) -> Result<Evaluation, Failure> {
         let (robots, seconds, seed) = EVALUATION;
         let fresh =
             TrainConfig { model: self.config.model.clone(), sim: SimConfig::default(), ..TrainConfig::default() };
-        let mut env = fresh.envs(robots, 1, 0)?.remove(0);
+        let mut env = match &self.endpoint {
+            Some(endpoint) => remote_envs(endpoint, robots, 1)?.remove(0),
+            None => fresh.envs(robots, 1, 0)?.remove(0),
+        };
         evaluate(policy, env.as_mut(), seconds, seed, |_| ()).map_err(other)
     }
+}
+
+/// Leases environments of a server, in `groups` leases.
+fn remote_envs(endpoint: &str, num_envs: usize, groups: usize) -> Result<Vec<Box<dyn VecEnv>>, Failure> {
+    let groups = groups.min(num_envs);
+    let connect = |group: usize| {
+        let robots = num_envs / groups + usize::from(group < num_envs % groups);
+        let options = ConnectOptions {
+            autoreset: AutoresetMode::SameStep,
+            critic: true,
+            ..ConnectOptions::new(endpoint, robots)
+        };
+        let env = RemoteVecEnv::connect(&options).map_err(other)?;
+        Ok(Box::new(env) as Box<dyn VecEnv>)
+    };
+    (0..groups).map(connect).collect()
 }
 
 fn progress_text(point: &CurvePoint) -> String {
