@@ -26,6 +26,7 @@ mod learned;
 mod leases;
 mod load;
 mod log;
+mod mirror;
 mod mujoco;
 mod next_experiment;
 mod play;

@@ -31,6 +31,10 @@ fn training_writes_its_folder_and_is_resumed_in_it() {
     let (policy, header) = Policy::read(out.join("policy.safetensors")).unwrap();
     assert_eq!((header.origin.env_steps, header.origin.seed, header.origin.curve.len()), (6144, 5, 4));
 
+    let again = twinstep(&["train", "walk", "--out", out_text]);
+    assert_eq!(again.status.code(), Some(2), "an earlier training is not overwritten");
+    assert!(text(&again.stderr).contains("continue it with --resume"), "{}", text(&again.stderr));
+
     let resumed = twinstep(&["train", "walk", "--out", out_text, "--resume", "--steps", "9216", "--json"]);
     assert!(resumed.status.success(), "{}", text(&resumed.stderr));
     let evaluation: serde_json::Value = serde_json::from_slice(&resumed.stdout).unwrap();

@@ -52,6 +52,8 @@ pub struct Args {
 pub fn run(args: &Args) -> CommandResult {
     eprintln!("1. A Go2 learns to walk: {:.1} million steps of 1024 robots.", args.train_steps as f64 / 1e6);
     let training = train::Args::new(args.out.join("walk"), 1, args.train_steps);
+    // The demo repeats its own training.
+    training.remove_checkpoint().map_err(other)?;
     train::run(&training)?;
     let signals = Signals::listen()?;
     walk(args, &training.policy(), &signals)?;

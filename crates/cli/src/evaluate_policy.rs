@@ -6,11 +6,12 @@ use std::path::PathBuf;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use twinstep_envs::Randomisation;
-use twinstep_learning::{Evaluation, evaluate};
+use twinstep_learning::{Evaluation, EvaluationError, EvaluationPlan, evaluate};
 use twinstep_policy::Policy;
 use twinstep_sim::{Engine, RoughTerrain, SimConfig, Terrain};
 
 use crate::exit::{CommandResult, Failure, Signals, input};
+use crate::robot_file::robot_model;
 use crate::serve::engine;
 use crate::train_config::TrainConfig;
 
@@ -101,17 +102,24 @@ pub fn run(args: &Args) -> CommandResult {
         return Err(Failure::Input(miette::miette!("`--seconds` = {} is not allowed: 1 to 3600 s", args.seconds)));
     }
     let (policy, _) = Policy::read(&args.policy).map_err(input)?;
+    let robot = robot_model(args.model.as_deref())?;
+    let plan = EvaluationPlan { robot: &robot, seconds: args.seconds, seed: args.seed };
     let mut rows = Vec::new();
     for Condition { name, engine, randomise, terrain } in conditions(args.engine) {
-        signals.check()?;
         let sim = SimConfig { engine, terrain, ..SimConfig::default() };
         let config = TrainConfig { model: args.model.clone(), sim, randomise, ..TrainConfig::default() };
         let mut env = config.envs(args.robots as usize, 1, 0)?.remove(0);
         let bar = ProgressBar::new(100).with_message(name).with_style(
             ProgressStyle::with_template("{msg:10} {bar:32} {pos} %  ETA {eta}").expect("the template is valid"),
         );
-        let progress = |share: f64| bar.set_position((100.0 * share) as u64);
-        let evaluation = evaluate(&policy, env.as_mut(), args.seconds, args.seed, progress).map_err(input)?;
+        let proceed = |share: f64| {
+            bar.set_position((100.0 * share) as u64);
+            matches!(signals.check(), Ok(false))
+        };
+        let evaluation = evaluate(&policy, env.as_mut(), plan, proceed).map_err(|error| match error {
+            EvaluationError::Stopped => Failure::Interrupted,
+            _ => input(error),
+        })?;
         bar.finish_and_clear();
         rows.push(Row { condition: name, engine, evaluation });
     }

@@ -6,12 +6,13 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_envs::TaskConfig;
-use twinstep_learning::{Checkpoint, Evaluation, LearningError, Trainer, evaluate};
+use twinstep_learning::{Checkpoint, Evaluation, EvaluationPlan, LearningError, Trainer, evaluate};
 use twinstep_model::{AutoresetMode, VecEnv};
 use twinstep_policy::{CurvePoint, Policy, PolicyOrigin};
 use twinstep_sim::SimConfig;
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::robot_file::robot_model;
 use crate::train_config::TrainConfig;
 use crate::train_log::{TrainLog, curve_point, write_curve};
 
@@ -62,7 +63,7 @@ pub struct Args {
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
     /// Time after which the training ends even if steps are left [min].
-    #[arg(long, value_name = "MIN")]
+    #[arg(long, value_name = "MIN", allow_negative_numbers = true)]
     minutes: Option<f64>,
     /// Number of robots. Default: 1024.
     #[arg(long, value_name = "N")]
@@ -83,6 +84,7 @@ pub struct Args {
 pub fn run(args: &Args) -> CommandResult {
     let start = Instant::now();
     let signals = Signals::listen()?;
+    args.check()?;
     let checkpoint = args.resume.then(|| Checkpoint::read(args.checkpoint())).transpose().map_err(input)?;
     let mut config = match &checkpoint {
         Some(checkpoint) => TrainConfig::parse(&checkpoint.config, "the checkpoint's config")?,
@@ -136,8 +138,30 @@ impl Args {
         self.out.join("policy.safetensors")
     }
 
+    /// Removes the checkpoint of an earlier training, if any.
+    pub fn remove_checkpoint(&self) -> std::io::Result<()> {
+        match std::fs::remove_file(self.checkpoint()) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error),
+            _ => Ok(()),
+        }
+    }
+
     fn checkpoint(&self) -> PathBuf {
         self.out.join("checkpoint.safetensors")
+    }
+
+    /// Checks the arguments, and that no earlier training would be overwritten.
+    fn check(&self) -> CommandResult {
+        if let Some(minutes) = self.minutes.filter(|minutes| minutes.is_nan() || *minutes <= 0.0) {
+            return Err(Failure::Input(miette::miette!("`--minutes` = {minutes} is not allowed: it must be positive")));
+        }
+        if !self.resume && self.checkpoint().exists() {
+            let folder = self.out.display();
+            return Err(Failure::Input(miette::miette!(
+                "`--out` = {folder}: the folder has a training\n  continue it with --resume, or name another folder"
+            )));
+        }
+        Ok(())
     }
 
     fn config(&self) -> Result<TrainConfig, Failure> {
@@ -152,9 +176,6 @@ impl Args {
             (config.train.num_envs, config.train.groups) = (envs, config.train.groups.min(envs.max(1)));
         }
         config.train.check().map_err(input)?;
-        if self.minutes.is_some_and(|minutes| minutes.is_nan() || minutes <= 0.0) {
-            return Err(Failure::Input(miette::miette!("`--minutes` must be positive")));
-        }
         Ok(config)
     }
 }
@@ -275,7 +296,9 @@ impl TrainSession {
             Some(endpoint) => remote_envs(endpoint, robots, 1)?.remove(0),
             None => fresh.envs(robots, 1, 0)?.remove(0),
         };
-        evaluate(policy, env.as_mut(), seconds, seed, |_| ()).map_err(other)
+        let robot = robot_model(self.config.model.as_deref())?;
+        let plan = EvaluationPlan { robot: &robot, seconds, seed };
+        evaluate(policy, env.as_mut(), plan, |_| true).map_err(other)
     }
 }
 

@@ -5,7 +5,7 @@
 
 use glam::Vec3;
 use serde::Serialize;
-use twinstep_model::{EnvError, EnvSpec, FootKinematics, ResetRequest, RobotModel, SpecField, VecEnv, go2};
+use twinstep_model::{EnvError, EnvSpec, FootKinematics, ResetRequest, RobotModel, SpecField, VecEnv};
 use twinstep_policy::{Policy, PolicyRunner};
 
 use crate::statistics::VelocityLayout;
@@ -63,6 +63,9 @@ pub enum EvaluationError {
     /// A part of the observation is missing.
     #[error("the environment does not observe `{0}`, which the evaluation needs")]
     Missing(&'static str),
+    /// The caller stopped the evaluation.
+    #[error("the evaluation was stopped")]
+    Stopped,
     /// The environment failed.
     #[error(transparent)]
     Env(#[from] EnvError),
@@ -127,23 +130,34 @@ struct Sums {
     swing_heights: Vec<f32>,
 }
 
-/// Runs the mean action of `policy` on all robots of `env` for `seconds` of simulated time.
+/// Robots of an evaluation.
+#[derive(Clone, Copy, Debug)]
+pub struct EvaluationPlan<'a> {
+    /// Model of the robots, for the lengths of their legs.
+    pub robot: &'a RobotModel,
+    /// Simulated time of each robot [s].
+    pub seconds: f64,
+    /// Seed of robots and commands.
+    pub seed: u64,
+}
+
+/// Runs the mean action of `policy` on all robots of `env`.
 ///
-/// A robot that has fallen no longer counts for the errors.
+/// A robot that has fallen no longer counts for the errors. `proceed` is called after each step with the share that is
+/// done; the evaluation stops if it returns false.
 pub fn evaluate(
     policy: &Policy,
     env: &mut dyn VecEnv,
-    seconds: f64,
-    seed: u64,
-    mut progress: impl FnMut(f64),
+    plan: EvaluationPlan,
+    mut proceed: impl FnMut(f64) -> bool,
 ) -> Result<Evaluation, EvaluationError> {
+    let EvaluationPlan { robot, seconds, seed } = plan;
     let spec = env.spec().clone();
     if spec.hash() != policy.spec.hash() {
         return Err(EvaluationError::OtherSpec { policy: policy.spec.hash(), env: spec.hash() });
     }
     let layout = Layout::new(&spec)?;
-    let robot = go2();
-    let feet = FootKinematics::new(&robot);
+    let feet = FootKinematics::new(robot);
     let num_envs = env.num_envs();
     let mut runner = PolicyRunner::new(policy);
     let mut obs = env.reset(&ResetRequest::seeded(seed, num_envs))?.to_vec();
@@ -166,11 +180,13 @@ pub fn evaluate(
                     &batch.obs[index * spec.obs_len()..][..spec.obs_len()],
                     &batch.critic_obs[index * spec.critic_obs_len()..][..spec.critic_obs_len()],
                 ];
-                walker.add_feet(&mut sums, &layout, &feet, &robot, rows, spec.policy_dt);
+                walker.add_feet(&mut sums, &layout, &feet, robot, rows, spec.policy_dt);
             }
         }
         obs.copy_from_slice(&batch.obs);
-        progress((step + 1) as f64 / steps as f64);
+        if !proceed((step + 1) as f64 / steps as f64) {
+            return Err(EvaluationError::Stopped);
+        }
     }
     let up = walkers.iter().filter(|walker| !walker.has_fallen).count();
     Ok(sums.evaluation(num_envs, up, seconds, spec.policy_dt))

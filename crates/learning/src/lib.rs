@@ -24,7 +24,7 @@ mod update;
 pub use adam::Adam;
 pub use checkpoint::Checkpoint;
 pub use config::{PpoConfig, PpoConfigError};
-pub use evaluation::{Evaluation, EvaluationError, evaluate};
+pub use evaluation::{Evaluation, EvaluationError, EvaluationPlan, evaluate};
 pub use rollout::Group;
 pub use statistics::{Statistics, VelocityLayout};
 pub use symmetry::{Mirror, NoMirror};

@@ -1,5 +1,6 @@
 //! Collection of transitions: a group of robots is stepped with the current policy.
 
+use rand::Rng;
 use twinstep_model::{EnvError, EnvSpec, ResetRequest, Stream, VecEnv, stream};
 use twinstep_policy::{Activations, Mlp, Network, Normaliser, gaussian};
 
@@ -213,6 +214,5 @@ pub fn feature_len(spec: &EnvSpec) -> usize {
 
 /// Returns the seed of robot `robot`'s environment.
 fn stream_seed(seed: u64, robot: u64) -> u64 {
-    use rand::Rng;
     stream(seed, "environment", robot).next_u64()
 }

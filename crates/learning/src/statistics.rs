@@ -17,6 +17,8 @@ pub struct Statistics {
     pub length: u64,
     /// Sum of each weighted reward term over the ended episodes.
     pub terms: Vec<f64>,
+    /// Number of steps with an observed velocity: all but the last one of each episode.
+    pub velocity_steps: u64,
     /// Sum of the squared error of the horizontal velocity [m²/s²]. Zero if it is not observed.
     pub velocity_error: f64,
     /// Sum of the squared error of the yaw rate [rad²/s²].
@@ -74,6 +76,7 @@ impl Statistics {
             falls: 0,
             length: 0,
             terms: vec![0.0; spec.reward_terms.len()],
+            velocity_steps: 0,
             velocity_error: 0.0,
             yaw_rate_error: 0.0,
             layout: VelocityLayout::new(spec),
@@ -94,6 +97,7 @@ impl Statistics {
             // The observation of an ended episode is already that of the next one.
             for robot in (0..batch.reward.len()).filter(|robot| !batch.done(*robot)) {
                 let [linear, yaw] = layout.squared_errors(obs, &batch.critic_obs, robot);
+                self.velocity_steps += 1;
                 self.velocity_error += f64::from(linear);
                 self.yaw_rate_error += f64::from(yaw);
             }
@@ -107,6 +111,7 @@ impl Statistics {
         self.episodes += other.episodes;
         self.falls += other.falls;
         self.length += other.length;
+        self.velocity_steps += other.velocity_steps;
         self.velocity_error += other.velocity_error;
         self.yaw_rate_error += other.yaw_rate_error;
         self.terms.iter_mut().zip(&other.terms).for_each(|(sum, term)| *sum += term);
@@ -116,7 +121,7 @@ impl Statistics {
     ///
     /// Returns `None` if velocities are not observed.
     pub fn velocity_rms(&self) -> Option<[f64; 2]> {
-        let rms = |sum: f64| (sum / self.steps.max(1) as f64).sqrt();
+        let rms = |sum: f64| (sum / self.velocity_steps.max(1) as f64).sqrt();
         self.layout.map(|_| [rms(self.velocity_error), rms(self.yaw_rate_error)])
     }
 }

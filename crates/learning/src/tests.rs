@@ -283,6 +283,17 @@ fn resumed_learner_is_the_one_that_was_saved() {
 }
 
 #[test]
+fn learner_of_another_task_is_refused() {
+    let config = config();
+    let learner = Learner::new(&config, envs::<Identity>(&config)[0].spec(), 1);
+    let error = Trainer::new(config.clone(), envs::<Pendulum>(&config), Some(learner), 1).err().expect("refused");
+    assert_eq!(
+        error.to_string(),
+        "the learner has [1, 1, 1] observation and action entries, the environments have [3, 3, 1]"
+    );
+}
+
+#[test]
 fn task_without_a_known_mirror_image_is_refused_with_its_field() {
     let config = PpoConfig { symmetry: true, ..config() };
     let error = Trainer::new(config.clone(), envs::<Pendulum>(&config), None, 1).err().expect("refused").to_string();

@@ -88,6 +88,16 @@ impl Learner {
         Policy { spec: spec.clone(), normaliser, actor: self.mean_actor.clone(), log_std: self.log_std.clone() }
     }
 
+    /// Checks that the networks fit the observations and actions of `spec`.
+    fn check_layout(&self, spec: &EnvSpec) -> Result<(), LearningError> {
+        let own = [self.actor.inputs(), self.critic.inputs(), self.actor.outputs()];
+        let expected = [spec.obs_len(), feature_len(spec), spec.action_len()];
+        if own == expected {
+            return Ok(());
+        }
+        Err(LearningError::OtherLayout { learner: format!("{own:?}"), envs: format!("{expected:?}") })
+    }
+
     /// Returns true if all parameters are finite.
     fn is_finite(&self) -> bool {
         [&self.actor.parameters, &self.critic.parameters, &self.log_std]
@@ -138,6 +148,14 @@ pub enum LearningError {
         /// The mode of the environments.
         given: AutoresetMode,
     },
+    /// The learner that is continued is for other observations or actions.
+    #[error("the learner has {learner} observation and action entries, the environments have {envs}")]
+    OtherLayout {
+        /// Numbers of entries of observation, both groups, and action of the learner.
+        learner: String,
+        /// The same of the environments.
+        envs: String,
+    },
     /// The environments failed.
     #[error(transparent)]
     Env(#[from] EnvError),
@@ -184,6 +202,7 @@ impl Trainer {
             None
         };
         let learner = learner.unwrap_or_else(|| Learner::new(&config, &spec, seed));
+        learner.check_layout(&spec)?;
         // A continued training has other episodes than those that it has seen.
         let env_seed = seed.wrapping_add(learner.iteration);
         let mut first_robot = 0;
