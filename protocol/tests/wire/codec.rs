@@ -171,11 +171,13 @@ proptest! {
         prop_assert!(refusals(&message).iter().all(|code| matches!(code, ErrorCode::Malformed | ErrorCode::Version)));
     }
 
+    // A few random bytes can be a message whose fields are all optional, so not all of them are refused.
     #[test]
-    fn random_bytes_are_refused(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+    fn random_bytes_are_refused_or_read(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
         let codes = refusals(&bytes);
-        prop_assert_eq!(codes.len(), KINDS);
         prop_assert!(codes.iter().all(|code| matches!(code, ErrorCode::Malformed | ErrorCode::Version)));
+        let is_map = matches!(bytes.first(), Some(0x80..=0x8f | 0xde | 0xdf));
+        prop_assert!(is_map || codes.len() == KINDS);
     }
 }
 
