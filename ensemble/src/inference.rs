@@ -198,7 +198,7 @@ mod tests {
                 (answers.map(|answer| answer.map(|numbers| numbers.map(f32::to_bits))),
                     inference.epistemic_uncertainty()[last].to_bits())
             };
-            let alone = bits(robots - 1..robots, InstructionSet::BASELINE);
+            let alone = bits(robots - 1..robots, InstructionSet::PORTABLE);
             for instructions in InstructionSet::available() {
                 prop_assert_eq!(bits(0..robots, instructions), alone);
             }

@@ -109,6 +109,10 @@ fn check_actuators(config: &Config, learned: Option<&ActuatorNetworkRobot>) -> R
     if config.randomise.kd_scale != [1.0, 1.0] {
         return reject("randomise.kd_scale", fixed_gains);
     }
+    if config.randomise.command_delay_ms != [0.0, 0.0] {
+        let reason = "its actuator network includes the delay of the robot it was trained with; use [0, 0]";
+        return reject("randomise.command_delay_ms", reason);
+    }
     if config.randomise.effects && learned.includes_rotor() {
         return reject(
             "randomise.effects",

@@ -97,6 +97,8 @@ impl Executor {
                 && let Some(mailbox) = state.ready.pop_front()
             {
                 state.running += 1;
+                // Two requests may have notified the same waiting thread.
+                self.wake_a_thread(&mut state);
                 drop(state);
                 let executed = mailbox.execute_next();
                 let mut finished = lock(&self.0.state);

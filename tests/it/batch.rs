@@ -172,7 +172,7 @@ fn trot_in(precision: SimdPrecision) -> Vec<PerJoint> {
 
 #[test]
 fn every_instruction_set_gives_the_same_bits() {
-    let baseline = trot_in(SimdPrecision::Single(InstructionSet::BASELINE));
+    let baseline = trot_in(SimdPrecision::Single(InstructionSet::PORTABLE));
     for instructions in InstructionSet::available() {
         assert_eq!(trot_in(SimdPrecision::Single(instructions)), baseline, "{instructions}");
     }

@@ -45,6 +45,7 @@ const MAY_USE: [(&str, &[&str]); 21] = [
     (
         "crates/cli",
         &[
+            "simd",
             "model",
             "effects",
             "logs",

@@ -10,6 +10,7 @@ mod any_robot;
 mod batch;
 mod diagnose;
 mod discovery;
+mod disturbances;
 mod effect_bodies;
 mod effect_laws;
 mod effect_readings;

@@ -92,6 +92,19 @@ fn robot_stands_for_5_s_of_zero_actions() {
 }
 
 #[test]
+fn pushed_robot_is_faster_by_the_push() {
+    let Some(python) = Interpreter::of_tests() else { return };
+    let mut backend = python.backend(go2(), config(), 2);
+    backend.push(1, [0.5, -0.25, 0.0]).unwrap();
+    assert_eq!(backend.states().truth.base_linear_velocity, [[0.0; 3], [0.5, -0.25, 0.0]]);
+    backend.step(&[hold(); 2], &[true; 2], 1).unwrap();
+    let [still, pushed] = [0, 1].map(|robot| backend.states().truth.base_position[robot][0]);
+    assert!((0.001..0.003).contains(&(pushed - still)), "0.5 m/s for 5 ms, slowed by the feet: {still} {pushed}");
+    let error = backend.push(2, [0.5, 0.0, 0.0]).unwrap_err();
+    assert_eq!(error.to_string(), "robot 2 does not exist; the number of robots is 2");
+}
+
+#[test]
 fn first_second_of_a_trot_agrees_with_the_batch_engine() {
     let Some(python) = Interpreter::of_tests() else { return };
     let run = |backend: &mut dyn Backend| -> Vec<PerJoint> {
@@ -250,11 +263,11 @@ fn output_that_is_no_reply_is_an_error() {
         reason(r"printf '\005\000\000\000Habcd'; exec sleep 9"),
         reason(r"printf '\002\000\000\000Da'; exec sleep 9"),
         reason(r"printf '\005\000\000\000Ha'"),
-        reason(r"printf '\023\000\000\000Htwinstep-mujoco 1 \002\000\000\000Da'; exec cat > /dev/null"),
+        reason(r"printf '\023\000\000\000Htwinstep-mujoco 2 \002\000\000\000Da'; exec cat > /dev/null"),
     ];
     expect![[r#"
         it wrote "Trac", which is not the start of a frame
-        it is another version: it wrote "abcd", not `twinstep-mujoco 1`
+        it is another version: it wrote "abcd", not `twinstep-mujoco 2`
         it wrote a frame of kind 'D' with 1 bytes as a reply
         it ended (exit status: 0); its messages are on stderr
         the process of engine `mujoco` failed: it wrote the states of its robots in 1 bytes; 228 are expected; its robots are lost, create them again"#]].assert_eq(&reasons.join("\n"));

@@ -396,3 +396,33 @@ fn foot_forces_include_payload_and_mass_scale() {
     let weight = (go2().total_mass() as f32 * 1.1 + 3.0) * GRAVITY;
     assert!((force / weight - 1.0).abs() < 0.005, "{force} N, weight {weight} N");
 }
+
+#[test]
+fn push_adds_its_velocity_to_every_body_of_the_robot() {
+    let mut initial_state = InitialState::at_rest(1.0, default_pose().map(|q| q + 0.1));
+    initial_state.base_angular_velocity = [0.5, -0.3, 0.8];
+    initial_state.dq = std::array::from_fn(|joint| 0.3 * joint as f32 - 2.0);
+    let mut backend = backend(SimConfig::default(), initial_state);
+    let before = backend.states().clone();
+    let (linear, ..) = momentum(&go2(), &backend);
+    let velocity = [0.4, -0.3, 0.1];
+    backend.push(0, velocity).unwrap();
+    let after = backend.states();
+    for axis in 0..3 {
+        let [one, other] = [&before, after].map(|states| states.truth.base_linear_velocity[0][axis]);
+        assert!((other - one - velocity[axis]).abs() < 1e-5, "{one} {other}");
+        let [one, other] = [&before, after].map(|states| states.truth.base_angular_velocity[0][axis]);
+        assert!((other - one).abs() < 1e-5, "{one} {other}");
+    }
+    let change = momentum(&go2(), &backend).0 - linear;
+    let expected = Vec3::from(velocity).as_dvec3() * go2().total_mass();
+    assert!((change - expected).length() < 1e-3, "{change} {expected}");
+}
+
+#[test]
+fn fixed_base_cannot_be_pushed() {
+    let config = SimConfig { base: BaseMount::Fixed, ..SimConfig::default() };
+    let mut backend = backend(config, InitialState::at_rest(1.0, default_pose()));
+    let error = backend.push(0, [0.5, 0.0, 0.0]).unwrap_err();
+    assert_eq!(error.to_string(), "robot 0 cannot be pushed: its base is fixed");
+}

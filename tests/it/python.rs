@@ -68,17 +68,27 @@ fn python_client_continues_after_every_fault() {
 }
 
 #[test]
-fn package_installs_into_an_empty_environment_and_steps() {
+fn wheel_installs_without_rust_into_an_empty_environment_and_steps() {
     let Some(python) = python(&target()).unwrap() else { return };
     Programs::beside(FAULTS).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let venv = folder.path().join("venv");
     run(Command::new(&python).args(["-m", "venv"]).arg(&venv)).unwrap();
     let empty = venv.join("bin/python");
-    let install = ["-m", "pip", "install", "--quiet", "--no-deps"];
-    // The dependencies come from the test environment: only the wheel and the program in it are tested.
-    run(outside_cargo(&mut Command::new(&empty)).args(install).arg(client()).env("CARGO_TARGET_DIR", target()))
-        .unwrap();
+    let dist = folder.path().join("dist");
+    let wheel = ["-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir"];
+    run(outside_cargo(&mut Command::new(&empty))
+        .args(wheel)
+        .arg(&dist)
+        .arg(client())
+        .env("CARGO_TARGET_DIR", target()))
+    .unwrap();
+    let wheel = std::fs::read_dir(&dist).unwrap().next().unwrap().unwrap().path();
+    // Neither `cargo` nor another `twinstep` is on the path. The dependencies come from the test environment: only the
+    // wheel and the program in it are tested.
+    let path = format!("{}:/usr/bin:/bin", venv.join("bin").display());
+    let install = ["-m", "pip", "install", "--quiet", "--no-deps", "--no-index"];
+    run(Command::new(&empty).args(install).arg(wheel).env("PATH", &path)).unwrap();
     let site = run(Command::new(&python).args(["-c", "import site; print(site.getsitepackages()[0])"])).unwrap();
     let site = String::from_utf8(site.stdout).unwrap();
     let first_step = "import gymnasium, twinstep\n\
@@ -88,6 +98,6 @@ fn package_installs_into_an_empty_environment_and_steps() {
                       env.close()\n\
                       assert 'venv' in twinstep.__file__";
     let mut command = Command::new(&empty);
-    command.args(["-c", first_step]).current_dir(folder.path()).env("PYTHONPATH", site.trim());
+    command.args(["-c", first_step]).current_dir(folder.path()).env("PYTHONPATH", site.trim()).env("PATH", path);
     run(&mut command).unwrap_or_else(|printed| panic!("{printed}"));
 }

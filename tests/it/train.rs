@@ -7,9 +7,12 @@ use std::process::{Command, Output, Stdio};
 use twinstep_policy::Policy;
 use twinstep_tests::python::root;
 
+fn program() -> Command {
+    Command::new(Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep"))
+}
+
 fn twinstep(arguments: &[&str]) -> Output {
-    let program = Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep");
-    Command::new(program).args(arguments).output().unwrap()
+    program().args(arguments).output().unwrap()
 }
 
 fn text(bytes: &[u8]) -> String {
@@ -35,6 +38,9 @@ fn training_writes_its_folder_and_is_resumed_in_it() {
     assert_eq!(again.status.code(), Some(2), "an earlier training is not overwritten");
     assert!(text(&again.stderr).contains("continue it with --resume"), "{}", text(&again.stderr));
 
+    // A crash between two checkpoints leaves rows of updates that are repeated.
+    let after_the_checkpoint = "5,7680,1.0\n6,92";
+    std::fs::write(out.join("progress.csv"), table() + after_the_checkpoint).unwrap();
     let resumed = twinstep(&["train", "walk", "--out", out_text, "--resume", "--steps", "9216", "--json"]);
     assert!(resumed.status.success(), "{}", text(&resumed.stderr));
     let evaluation: serde_json::Value = serde_json::from_slice(&resumed.stdout).unwrap();
@@ -96,12 +102,17 @@ fn policy_is_evaluated_on_each_engine_and_refused_where_it_does_not_fit() {
     assert!(trained.status.success(), "{}", text(&trained.stderr));
     let policy = out.join("policy.safetensors");
     let policy = policy.to_str().unwrap();
-    let evaluated = twinstep(&["evaluate-policy", policy, "--robots", "4", "--seconds", "2", "--json"]);
+    let film = folder.path().join("film.svg");
+    let film = film.to_str().unwrap();
+    let evaluated = twinstep(&["evaluate-policy", policy, "--robots", "4", "--seconds", "2", "--json", "--film", film]);
     assert!(evaluated.status.success(), "{}", text(&evaluated.stderr));
     let report: serde_json::Value = serde_json::from_slice(&evaluated.stdout).unwrap();
     let rows: Vec<_> =
         report["rows"].as_array().unwrap().iter().map(|row| (&row["condition"], &row["engine"])).collect();
-    assert_eq!(rows.len(), 4);
+    assert_eq!(rows.len(), 8);
+    let shares = report["rows"][0]["by_speed"].as_array().unwrap();
+    let share: f64 = shares.iter().map(|bin| bin["share"].as_f64().unwrap()).sum();
+    assert!((share - 1.0).abs() < 1e-9 && std::fs::read_to_string(film).unwrap().starts_with("<svg"));
     assert!(rows.contains(&(&"nominal".into(), &"rapier".into())), "{rows:?}");
 
     let model = folder.path().join("soft.toml");
@@ -123,7 +134,17 @@ fn shipped_policy_walks_in_both_engines() {
         // A robot that stands still has 0.65 m/s.
         assert!(number("up") > 0.9 && number("velocity_rms") < 0.3, "{row}");
         assert!(number("swing_height") > 0.03, "{row}");
+        // A Go2 lifts 149 N: 20 to 200 W are a cost of transport of 0.2 to 2 at some 0.6 m/s.
+        assert!((20.0..200.0).contains(&number("power")), "{row}");
     }
+}
+
+#[test]
+fn unknown_instruction_set_is_rejected_with_those_that_exist() {
+    let output = program().arg("effects").env("TWINSTEP_SIMD", "neon").output().unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    let error = text(&output.stderr);
+    assert!(error.contains("`TWINSTEP_SIMD` = \"neon\" is not allowed: this processor has portable"), "{error}");
 }
 
 #[test]

@@ -35,8 +35,17 @@ def test_minimal_client() -> None:
 
 def test_an_agent_is_trained_and_runs_on_another_server(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3")
-    run("ppo.py", "--envs", "4", "--steps", "256", "--out", str(tmp_path))
+    printed = run("ppo.py", "--envs", "4", "--steps", "192", "--out", str(tmp_path))
+    assert "192 steps" in printed
+    assert "velocity error" in printed
     server = twinstep.EmbeddedServer(("--task", "walk", "--envs", "64"))
     printed = run("remote.py", "--endpoint", server.endpoint, "--policy", str(tmp_path), "--steps", "10")
     server.release()
     assert printed.startswith("mean reward of a step")
+
+
+def test_rsl_rl_trains_a_policy(tmp_path: Path) -> None:
+    pytest.importorskip("rsl_rl")
+    printed = run("ppo_rsl_rl.py", "--envs", "4", "--steps", "192", "--out", str(tmp_path))
+    assert "192 steps" in printed
+    assert "velocity error" in printed

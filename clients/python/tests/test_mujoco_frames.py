@@ -16,9 +16,11 @@ from twinstep.mujoco.frames import (
     MEASURED,
     FrameError,
     Hello,
+    Push,
     Reset,
     Step,
     parse_hello,
+    parse_push,
     parse_reset,
     parse_step,
     read_frame,
@@ -57,12 +59,12 @@ def test_length_outside_its_range_is_rejected(length: int) -> None:
 
 @given(INDEX, INDEX, INDEX, INDEX, st.text())
 def test_hello_is_parsed(robots: int, threads: int, iterations: int, steps: int, mjcf: str) -> None:
-    line = f"twinstep-mujoco 1 robots={robots} threads={threads} iterations={iterations} steps={steps}\n"
+    line = f"twinstep-mujoco 2 robots={robots} threads={threads} iterations={iterations} steps={steps}\n"
     assert parse_hello((line + mjcf).encode()) == Hello(robots, threads, iterations, steps, mjcf)
 
 
 @pytest.mark.parametrize(
-    "line", [b"twinstep-mujoco 2 robots=1", b"other 1", b"", b"twinstep-mujoco 1 robots=1", b"\xff\xff"]
+    "line", [b"twinstep-mujoco 1 robots=1", b"other 1", b"", b"twinstep-mujoco 2 robots=1", b"\xff\xff"]
 )
 def test_hello_of_another_program_is_rejected(line: bytes) -> None:
     with pytest.raises(FrameError, match="the first request"):
@@ -93,14 +95,18 @@ def test_step_is_parsed(robots: int, periods: int, seed: int) -> None:
     assert parsed.commands.tobytes() == step.commands.tobytes()
 
 
+def test_push_is_parsed() -> None:
+    assert parse_push(b"\x03\0\0\0\0\0\0\x3f\0\0\x80\xbf\0\0\0\0") == Push(3, [0.5, -1.0, 0.0])
+
+
 @given(st.binary(max_size=600), st.integers(1, 3))
 def test_any_other_body_is_a_frame_error(body: bytes, robots: int) -> None:
-    for parse in (parse_reset, lambda body: parse_step(body, robots), parse_hello):
+    for parse in (parse_reset, lambda body: parse_step(body, robots), parse_push, parse_hello):
         try:
             parse(body)
         except FrameError:
             continue
-        assert parse is parse_reset or len(body) == 4 + robots * 241
+        assert parse is parse_reset or len(body) == (16 if parse is parse_push else 4 + robots * 241)
 
 
 def test_sizes_are_those_of_the_server() -> None:

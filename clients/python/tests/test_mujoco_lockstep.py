@@ -178,7 +178,7 @@ def test_process_answers_in_lock_step_and_terminates_with_its_stdin(model: str, 
     assert process.stdout is not None
     assert process.stderr is not None
     write_frame(process.stdin, b"H", hello(model))
-    assert read_frame(process.stdout) == (b"H", f"twinstep-mujoco 1 mujoco={mujoco.__version__}".encode())
+    assert read_frame(process.stdout) == (b"H", f"twinstep-mujoco 2 mujoco={mujoco.__version__}".encode())
     commands = hold(1)
     commands["kp"] = np.inf
     for body in (step_body(Step(4, np.ones(1, np.bool_), hold(1))), step_body(Step(4, np.ones(1, np.bool_), commands))):

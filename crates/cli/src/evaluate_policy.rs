@@ -5,15 +5,21 @@ use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
-use twinstep_envs::Randomisation;
-use twinstep_learning::{Evaluation, EvaluationError, EvaluationPlan, evaluate};
-use twinstep_policy::Policy;
+use twinstep_envs::{ObservationNoise, Randomisation};
+use twinstep_learning::{Evaluation, EvaluationError, EvaluationPlan, SpeedBin, evaluate};
+use twinstep_model::{EnvError, ResetRequest, VecEnv};
+use twinstep_policy::{Policy, PolicyRunner};
+use twinstep_report::film_strip;
 use twinstep_sim::{Engine, RoughTerrain, SimConfig, Terrain};
 
 use crate::exit::{CommandResult, Failure, Signals, input};
 use crate::robot_file::robot_model;
 use crate::serve::engine;
 use crate::train_config::TrainConfig;
+
+/// Frames of the film strip, and policy steps between two of them.
+const FILM_FRAMES: usize = 15;
+const FILM_STEPS: usize = 10;
 
 /// Evaluate a policy: velocity errors, falls and gait, on engines and robots that it has not seen.
 ///
@@ -23,9 +29,13 @@ use crate::train_config::TrainConfig;
 ///   nominal   the robot of the model file on flat ground
 ///   robots    masses +-15 %, friction 0.4 to 1.25, gains +-10 %
 ///   ground    random heights of up to 3 cm
+///   pushes    0.5 m/s in a random direction, every 5 to 10 s
+///   delay     commands arrive 0 to 20 ms late
+///   noise     errors of the sensors as in Isaac Lab
+///   robust    robots, ground, pushes and delay at once
 ///
 /// Without --engine the nominal robot is also simulated in rapier, which no policy is trained in. `--engine mujoco`
-/// needs `pip install "twinstep[mujoco]"` and simulates a thousand env-steps per second, without rough ground.
+/// needs `pip install "twinstep[mujoco]"` and simulates a thousand env-steps per second, without rough ground and delay.
 ///
 /// Examples: `twinstep evaluate-policy walk/policy.safetensors` and
 /// `twinstep evaluate-policy walk/policy.safetensors --engine mujoco --robots 64`
@@ -48,6 +58,9 @@ pub struct Args {
     /// Seed of robots and commands.
     #[arg(long, default_value_t = 1_000_000)]
     seed: u64,
+    /// Write a film strip (SVG) of three seconds of a robot with the first condition.
+    #[arg(long, value_name = "FILE")]
+    film: Option<PathBuf>,
     /// Print one JSON object on stdout.
     #[arg(long)]
     json: bool,
@@ -71,28 +84,55 @@ struct Row {
 }
 
 fn conditions(engine: Option<Engine>) -> Vec<Condition> {
-    let nominal =
-        |engine| Condition { name: "nominal", engine, randomise: Randomisation::default(), terrain: Terrain::Flat };
     let first = engine.unwrap_or(Engine::Batch);
-    let randomise = Randomisation {
+    let calm = Randomisation::default();
+    let condition = |name, randomise| Condition { name, engine: first, randomise, terrain: Terrain::Flat };
+    let robots = Randomisation {
         mass_scale: [0.85, 1.15],
         // The nominal coefficient of friction is 0.8.
         friction_scale: [0.4 / 0.8, 1.25 / 0.8],
         kp_scale: [0.9, 1.1],
         kd_scale: [0.9, 1.1],
-        ..Randomisation::default()
+        ..calm
     };
-    let rough = Terrain::Rough(RoughTerrain { height_m: 0.03, cell_m: 0.3, size_m: 40.0, seed: 1 });
-    let mut conditions = vec![nominal(first)];
+    let push_m_s = [0.5, 0.5];
+    let noise = ObservationNoise {
+        angular_velocity_rad_s: 0.2,
+        gravity: 0.05,
+        joint_position_rad: 0.01,
+        joint_velocity_rad_s: 1.5,
+    };
+    let mut conditions = vec![
+        condition("nominal", calm),
+        condition("robots", robots),
+        condition("pushes", Randomisation { push_m_s, ..calm }),
+        condition("noise", Randomisation { noise, ..calm }),
+    ];
     if engine.is_none() {
-        conditions.push(nominal(Engine::Rapier));
+        conditions.insert(1, Condition { engine: Engine::Rapier, ..condition("nominal", calm) });
     }
-    conditions.push(Condition { name: "robots", randomise, ..nominal(first) });
-    // MuJoCo does not simulate rough terrain of ours.
+    // MuJoCo simulates neither our rough terrain nor the delay.
     if first != Engine::Mujoco {
-        conditions.push(Condition { name: "ground", terrain: rough, ..nominal(first) });
+        let terrain = Terrain::Rough(RoughTerrain { height_m: 0.03, cell_m: 0.3, size_m: 40.0, seed: 1 });
+        let command_delay_ms = [0.0, 20.0];
+        let robust = Randomisation { push_m_s, command_delay_ms, ..robots };
+        conditions.extend([
+            Condition { terrain, ..condition("ground", calm) },
+            condition("delay", Randomisation { command_delay_ms, ..calm }),
+            Condition { terrain, ..condition("robust", robust) },
+        ]);
     }
     conditions
+}
+
+impl Condition {
+    /// Creates `robots` robots.
+    fn env(&self, args: &Args, robots: usize) -> Result<Box<dyn VecEnv>, Failure> {
+        let sim = SimConfig { engine: self.engine, terrain: self.terrain, ..SimConfig::default() };
+        let config =
+            TrainConfig { model: args.model.clone(), sim, randomise: self.randomise, ..TrainConfig::default() };
+        Ok(config.envs(robots, 1, 0)?.remove(0))
+    }
 }
 
 /// Evaluates the policy under each condition.
@@ -104,11 +144,18 @@ pub fn run(args: &Args) -> CommandResult {
     let (policy, _) = Policy::read(&args.policy).map_err(input)?;
     let robot = robot_model(args.model.as_deref())?;
     let plan = EvaluationPlan { robot: &robot, seconds: args.seconds, seed: args.seed };
+    let conditions = conditions(args.engine);
+    if let Some(path) = &args.film {
+        let mut env = conditions[0].env(args, 1)?;
+        let film = film(&policy, env.as_mut(), args.seed).map_err(input)?;
+        std::fs::write(path, film).map_err(|cause| {
+            Failure::Input(miette::miette!("`--film` = {}: cannot write the file: {cause}", path.display()))
+        })?;
+    }
     let mut rows = Vec::new();
-    for Condition { name, engine, randomise, terrain } in conditions(args.engine) {
-        let sim = SimConfig { engine, terrain, ..SimConfig::default() };
-        let config = TrainConfig { model: args.model.clone(), sim, randomise, ..TrainConfig::default() };
-        let mut env = config.envs(args.robots as usize, 1, 0)?.remove(0);
+    for condition in conditions {
+        let mut env = condition.env(args, args.robots as usize)?;
+        let Condition { name, engine, .. } = condition;
         let bar = ProgressBar::new(100).with_message(name).with_style(
             ProgressStyle::with_template("{msg:10} {bar:32} {pos} %  ETA {eta}").expect("the template is valid"),
         );
@@ -126,7 +173,7 @@ pub fn run(args: &Args) -> CommandResult {
     if args.json {
         println!("{}", serde_json::json!({ "policy": args.policy, "rows": rows }));
     } else {
-        print!("{}", table(args, &rows));
+        print!("{}\n{}", table(args, &rows), speed_table(&rows[0].evaluation));
     }
     Ok(())
 }
@@ -135,14 +182,14 @@ pub fn run(args: &Args) -> CommandResult {
 fn table(args: &Args, rows: &[Row]) -> String {
     let mut text = format!(
         "{} robots, {} s, new command every 5 s. Errors: RMS (from 1 s after each new command)\n\n\
-         condition  engine   up       velocity [m/s]  yaw rate [rad/s]  swing    duty  slip\n",
+         condition  engine   up       velocity [m/s]  yaw rate [rad/s]  swing    duty  slip       power\n",
         args.robots, args.seconds
     );
     for Row { condition, engine, evaluation: e } in rows {
         let engine = format!("{engine:?}").to_lowercase();
         let _ = writeln!(
             text,
-            "{condition:10} {engine:8} {:5.1} %  {:.3} ({:.3})   {:.3} ({:.3})     {:.1} cm  {:.2}  {:.3} m/s",
+            "{condition:10} {engine:8} {:5.1} %  {:.3} ({:.3})   {:.3} ({:.3})     {:.1} cm  {:.2}  {:.3} m/s  {:3.0} W",
             100.0 * e.up,
             e.velocity_rms,
             e.settled_velocity_rms,
@@ -151,7 +198,35 @@ fn table(args: &Args, rows: &[Row]) -> String {
             100.0 * e.swing_height,
             e.duty_factor,
             e.slip_speed,
+            e.power,
         );
     }
     text
+}
+
+/// Returns the errors of an evaluation by the commanded speed.
+fn speed_table(evaluation: &Evaluation) -> String {
+    let mut text = "First row by commanded speed:\nspeed [m/s]  share  velocity [m/s]  yaw rate [rad/s]\n".to_owned();
+    for (index, SpeedBin { from, share, velocity_rms, yaw_rate_rms }) in evaluation.by_speed.iter().enumerate() {
+        let to = evaluation.by_speed.get(index + 1).map_or("".to_owned(), |next| next.from.to_string());
+        let range = format!("{from} to {to}");
+        let _ = writeln!(text, "{range:11} {:4.0} %  {velocity_rms:.3}           {yaw_rate_rms:.3}", 100.0 * share);
+    }
+    text
+}
+
+/// Returns a film strip of the first robot of `env` under the mean action of `policy`.
+fn film(policy: &Policy, env: &mut dyn VecEnv, seed: u64) -> Result<String, EnvError> {
+    let mut runner = PolicyRunner::new(policy);
+    let mut obs = env.reset(&ResetRequest::seeded(seed, env.num_envs()))?.to_vec();
+    let mut actions = vec![0.0; env.num_envs() * env.spec().action_len()];
+    let mut frames = Vec::new();
+    for step in 0..FILM_FRAMES * FILM_STEPS {
+        if step % FILM_STEPS == 0 {
+            frames.push((step as f64 * env.spec().policy_dt, env.scene(0)?));
+        }
+        runner.run(&obs, &mut actions);
+        obs.copy_from_slice(&env.step(&actions)?.obs);
+    }
+    Ok(film_strip(&frames))
 }

@@ -22,6 +22,7 @@ mod train_config;
 mod train_log;
 
 use clap::{Parser, Subcommand};
+use twinstep_simd::InstructionSet;
 
 /// Simulate thousands of Unitree Go2 robots for reinforcement learning, and measure the gap to the real robot.
 #[derive(Parser)]
@@ -61,7 +62,7 @@ fn main() -> std::process::ExitCode {
         .with_env_filter(tracing_subscriber::EnvFilter::try_from_env("TWINSTEP_LOG").unwrap_or_else(|_| log.into()))
         .with_writer(std::io::stderr)
         .init();
-    let result = match command {
+    let result = InstructionSet::from_environment().map_err(exit::input).and_then(|_| match command {
         CliCommand::Bench(args) => bench::run(&args),
         CliCommand::Demo(args) => demo::run(&args),
         CliCommand::Diagnose(args) => diagnose::run(&args),
@@ -77,6 +78,6 @@ fn main() -> std::process::ExitCode {
         CliCommand::Play(args) => play::run(&args),
         CliCommand::Serve(args) => serve::run(&args),
         CliCommand::Train(args) => train::run(&args),
-    };
+    });
     exit::code(result)
 }

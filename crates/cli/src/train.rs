@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_envs::TaskConfig;
-use twinstep_learning::{Checkpoint, Evaluation, EvaluationPlan, LearningError, Trainer, evaluate};
+use twinstep_learning::{Checkpoint, Evaluation, EvaluationError, EvaluationPlan, LearningError, Trainer, evaluate};
 use twinstep_model::{AutoresetMode, VecEnv};
 use twinstep_policy::{CurvePoint, Policy, PolicyOrigin};
 use twinstep_sim::SimConfig;
@@ -98,7 +98,7 @@ pub fn run(args: &Args) -> CommandResult {
     let ended = session.train(&signals, start);
     session.save()?;
     match ended {
-        Ok(()) => session.report(args, start),
+        Ok(()) => session.report(args, &signals, start),
         Err(Failure::Interrupted) => {
             eprintln!("interrupted; continue with: twinstep train --out {} --resume", args.out.display());
             Err(Failure::Interrupted)
@@ -201,10 +201,11 @@ impl TrainSession {
             None => config.envs(config.train.num_envs, config.train.groups, 1)?,
         };
         let seed = checkpoint.as_ref().map_or(args.seed, |checkpoint| checkpoint.seed);
+        let resumed_at = checkpoint.as_ref().map(|checkpoint| checkpoint.learner.env_steps);
         let (learner, curve) =
             checkpoint.map_or((None, Vec::new()), |checkpoint| (Some(checkpoint.learner), checkpoint.curve));
         let trainer = Trainer::new(config.train.clone(), envs, learner, seed).map_err(input)?;
-        let log = TrainLog::open(&args.out, &trainer.spec().reward_terms, args.resume)
+        let log = TrainLog::open(&args.out, &trainer.spec().reward_terms, resumed_at)
             .map_err(|cause| folder_error(&args.out, cause))?;
         let (out, policy) = (args.out.clone(), args.policy());
         let (endpoint, minutes) = (args.endpoint.clone(), args.minutes);
@@ -271,9 +272,9 @@ impl TrainSession {
         }
     }
 
-    fn report(&self, args: &Args, start: Instant) -> CommandResult {
+    fn report(&self, args: &Args, signals: &Signals, start: Instant) -> CommandResult {
         let policy = self.trainer.learner().policy(self.trainer.spec());
-        let evaluation = self.evaluate(&policy)?;
+        let evaluation = self.evaluate(&policy, signals)?;
         let json = serde_json::to_string_pretty(&evaluation).expect("an evaluation is plain data");
         std::fs::write(self.out.join("evaluation.json"), &json).map_err(other)?;
         let steps = self.trainer.learner().env_steps as f64 / 1e6;
@@ -288,7 +289,7 @@ impl TrainSession {
     }
 
     /// Evaluates the policy on fresh robots of the server, or of the training's model with default commands and physics.
-    fn evaluate(&self, policy: &Policy) -> Result<Evaluation, Failure> {
+    fn evaluate(&self, policy: &Policy, signals: &Signals) -> Result<Evaluation, Failure> {
         let (robots, seconds, seed) = EVALUATION;
         let fresh =
             TrainConfig { model: self.config.model.clone(), sim: SimConfig::default(), ..TrainConfig::default() };
@@ -298,7 +299,10 @@ impl TrainSession {
         };
         let robot = robot_model(self.config.model.as_deref())?;
         let plan = EvaluationPlan { robot: &robot, seconds, seed };
-        evaluate(policy, env.as_mut(), plan, |_| true).map_err(other)
+        evaluate(policy, env.as_mut(), plan, |_| signals.check().is_ok()).map_err(|error| match error {
+            EvaluationError::Stopped => Failure::Interrupted,
+            _ => other(error),
+        })
     }
 }
 

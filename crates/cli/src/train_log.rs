@@ -1,6 +1,6 @@
 //! Files that a training writes while it runs: progress as CSV and TensorBoard events, learning curve as SVG.
 
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::Write;
 use std::path::Path;
 
@@ -19,18 +19,15 @@ pub struct TrainLog {
 }
 
 impl TrainLog {
-    /// Creates the files in `folder`, or continues the table of a training that is resumed.
-    pub fn open(folder: &Path, terms: &[String], is_resumed: bool) -> std::io::Result<Self> {
+    /// Creates the files in `folder`. The table of a training that was resumed at `resumed_at` environment steps keeps its
+    /// rows up to there: those after the last checkpoint are written again.
+    pub fn open(folder: &Path, terms: &[String], resumed_at: Option<u64>) -> std::io::Result<Self> {
         let path = folder.join("progress.csv");
-        let mut table = if is_resumed && path.exists() {
-            OpenOptions::new().append(true).open(&path)?
-        } else {
-            File::create(&path)?
-        };
-        if table.metadata()?.len() == 0 {
-            let columns: Vec<&str> = NAMES.iter().copied().chain(terms.iter().map(String::as_str)).collect();
-            writeln!(table, "{}", columns.join(","))?;
-        }
+        let earlier = resumed_at.map(|steps| rows_until(&path, steps)).transpose()?.unwrap_or_default();
+        let mut table = File::create(&path)?;
+        let columns: Vec<&str> = NAMES.iter().copied().chain(terms.iter().map(String::as_str)).collect();
+        writeln!(table, "{}", columns.join(","))?;
+        table.write_all(earlier.as_bytes())?;
         Ok(Self { table, events: EventFile::create(folder)?, terms: terms.to_vec() })
     }
 
@@ -46,6 +43,21 @@ impl TrainLog {
         let scalars: Vec<_> = names.zip(values).filter(|(_, value)| value.is_finite()).collect();
         self.events.write(iteration.env_steps, &scalars)
     }
+}
+
+/// Returns the rows of an earlier table up to `env_steps` environment steps.
+fn rows_until(path: &Path, env_steps: u64) -> std::io::Result<String> {
+    let text = match std::fs::read_to_string(path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(String::new()),
+        result => result?,
+    };
+    let column = NAMES.iter().position(|name| *name == "env_steps").expect("a column of the table");
+    // A row that a crash cut off has no end of line.
+    let rows = text.split_inclusive('\n').skip(1).filter(|row| row.ends_with('\n'));
+    let is_kept = |row: &&str| {
+        row.split(',').nth(column).and_then(|cell| cell.parse().ok()).is_some_and(|steps: u64| steps <= env_steps)
+    };
+    Ok(rows.filter(is_kept).collect())
 }
 
 /// Names of the columns before the reward terms.

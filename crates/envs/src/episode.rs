@@ -13,6 +13,12 @@ pub struct Episode<S> {
     pub state: S,
     /// Source of random numbers for robots, poses and commands.
     random: Stream,
+    /// Source of the noise of the observation.
+    pub noise: Stream,
+    /// Source of the pushes.
+    pushes: Stream,
+    /// Policy steps until the next push.
+    steps_to_push: u32,
     seed: u64,
     /// Number of episodes that were started with this seed.
     episode_index: u64,
@@ -60,6 +66,9 @@ impl<S: Default> Episode<S> {
         Self {
             state: S::default(),
             random: stream(seed, &spec.task, 0),
+            noise: stream(seed, "noise", 0),
+            pushes: stream(seed, "push", 0),
+            steps_to_push: 0,
             seed,
             episode_index: 0,
             running: false,
@@ -97,9 +106,13 @@ impl<S: Default> Episode<S> {
         randomise: &Randomisation,
         sampler: Option<&RobotSampler>,
     ) -> EpisodeStart {
-        // Separate streams: poses and commands do not depend on whether effects and actuators use random numbers.
+        // Separate streams: poses and commands do not depend on whether effects, actuators, noise and pushes use random
+        // numbers.
         let mut effects = stream(self.seed, "effects", self.episode_index);
         let actuator_seed = stream(self.seed, "drives", self.episode_index).next_u64();
+        self.noise = stream(self.seed, "noise", self.episode_index);
+        self.pushes = stream(self.seed, "push", self.episode_index);
+        self.steps_to_push = randomise.sample_push_steps(task.spec().policy_dt, &mut self.pushes);
         let sampled = sampler.map(|sampler| sampler.sample(&mut effects));
         let robot = randomise.sample(sampled.as_ref().unwrap_or(nominal), &mut self.random).or(sampled);
         let (q, state) = task.start(&mut self.random);
@@ -111,6 +124,16 @@ impl<S: Default> Episode<S> {
         self.term_sums.fill(0.0);
         self.action = [0.0; NUM_JOINTS];
         EpisodeStart { robot, actuator_seed, q }
+    }
+
+    /// Returns the velocity that a push adds before this step, in the world frame [m/s]. `None`: there is no push.
+    pub fn next_push(&mut self, randomise: &Randomisation, policy_dt: f64) -> Option<[f32; 3]> {
+        self.steps_to_push -= 1;
+        if self.steps_to_push > 0 {
+            return None;
+        }
+        self.steps_to_push = randomise.sample_push_steps(policy_dt, &mut self.pushes);
+        Some(randomise.sample_push(&mut self.pushes))
     }
 
     /// Stores the action before a step and returns the commanded joint positions [rad].

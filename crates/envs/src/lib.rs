@@ -3,7 +3,8 @@
 //! - [`Task`]: what a policy and a critic observe, the reward terms, and the end of an episode. [`tasks`] has one file
 //!   per task; [`TaskConfig`] is the `[task]` table of a config file.
 //! - [`TaskEnv`]: a task on all robots of a backend, as a [`twinstep_model::VecEnv`].
-//! - [`Randomisation`]: the `[randomise]` table; each episode has its own robot.
+//! - [`Randomisation`]: the `[randomise]` table; each episode has its own robot, is pushed, and observes with
+//!   [`ObservationNoise`].
 //! - [`observe`]: the observation of U2E, eq. 14, for simulator, log and robot.
 //! - [`reward`]: one function per reward term. Its name is the config key and the log key.
 //! - [`CounterEnv`]: a task without physics, whose observation verifies which steps were executed.
@@ -15,6 +16,7 @@ mod counter;
 mod episode;
 mod feet;
 mod observation;
+mod observation_noise;
 mod randomise;
 pub mod reward;
 mod task;
@@ -26,6 +28,7 @@ pub use check::{CheckError, check_vec_env};
 pub use config::ConfigError;
 pub use counter::{Counter, CounterEnv};
 pub use observation::{CRITIC_OBS_LEN, OBS_LEN, base_spec, observe, observe_privileged, privileged_fields};
+pub use observation_noise::ObservationNoise;
 pub use randomise::Randomisation;
 pub use task::{RobotView, Step, Task};
 pub use task_env::{TaskEnv, TaskEnvConfig};

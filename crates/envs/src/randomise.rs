@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use twinstep_effects::{Effect, EffectSite};
 use twinstep_model::{NUM_JOINTS, RobotModel, Stream};
 
+use crate::ObservationNoise;
 use crate::config::{ConfigError, Range, check_range};
 
 /// Domain randomisation. Each value is sampled uniformly from its range at every reset.
@@ -23,6 +24,14 @@ pub struct Randomisation {
     pub kp_scale: Range,
     /// Factor on the velocity gain.
     pub kd_scale: Range,
+    /// Delay between a command and its arrival at the actuators [ms].
+    pub command_delay_ms: Range,
+    /// Velocity that a push adds to that of the base, in a random horizontal direction [m/s].
+    pub push_m_s: Range,
+    /// Time between two pushes [s].
+    pub push_interval_s: Range,
+    /// Noise of the observation.
+    pub noise: ObservationNoise,
     /// True to sample every value of the model file that has an interval from that interval.
     pub effects: bool,
 }
@@ -37,6 +46,10 @@ impl Default for Randomisation {
             friction_scale: [1.0, 1.0],
             kp_scale: [1.0, 1.0],
             kd_scale: [1.0, 1.0],
+            command_delay_ms: [0.0, 0.0],
+            push_m_s: [0.0, 0.0],
+            push_interval_s: [5.0, 10.0],
+            noise: ObservationNoise::default(),
             effects: false,
         }
     }
@@ -50,7 +63,16 @@ impl Randomisation {
         check_range("randomise.com_shift_m", self.com_shift_m, -0.2, 0.2)?;
         check_range("randomise.friction_scale", self.friction_scale, 0.0, 10.0)?;
         check_range("randomise.kp_scale", self.kp_scale, 0.0, 10.0)?;
-        check_range("randomise.kd_scale", self.kd_scale, 0.0, 10.0)
+        check_range("randomise.kd_scale", self.kd_scale, 0.0, 10.0)?;
+        check_range("randomise.command_delay_ms", self.command_delay_ms, 0.0, 40.0)?;
+        check_range("randomise.push_m_s", self.push_m_s, 0.0, 5.0)?;
+        check_range("randomise.push_interval_s", self.push_interval_s, 0.02, 1e6)?;
+        self.noise.check()
+    }
+
+    /// Returns true if robots are pushed.
+    pub fn has_pushes(&self) -> bool {
+        self.push_m_s[1] > 0.0
     }
 
     /// Checks that the trunk of `robot` keeps a positive mass.
@@ -67,17 +89,31 @@ impl Randomisation {
         })
     }
 
+    /// Samples the number of policy steps until the next push, at least 1.
+    pub fn sample_push_steps(&self, policy_dt: f64, random: &mut Stream) -> u32 {
+        (f64::from(sample(self.push_interval_s, random)) / policy_dt).round().max(1.0) as u32
+    }
+
+    /// Samples the velocity that a push adds, in the world frame [m/s].
+    pub fn sample_push(&self, random: &mut Stream) -> [f32; 3] {
+        let (sin, cos) = sample([0.0, std::f32::consts::TAU], random).sin_cos();
+        let speed = sample(self.push_m_s, random);
+        [speed * cos, speed * sin, 0.0]
+    }
+
     /// Samples the robot of an episode: `robot` with effects. Returns `None` if no range differs from no effect.
     ///
     /// The number of random numbers does not depend on the ranges, so that poses and commands do not either.
     pub fn sample(&self, robot: &RobotModel, random: &mut Stream) -> Option<RobotModel> {
-        let mut draw = |[low, high]: Range| f64::from(low + (high - low) * random.random::<f32>());
+        let mut draw = |range: Range| f64::from(sample(range, random));
         let mass_scale = draw(self.mass_scale);
         let payload = draw(self.payload_kg);
         let shift: [f64; 3] = std::array::from_fn(|_| draw(self.com_shift_m));
         let friction_scale = draw(self.friction_scale);
         let gains = [draw(self.kp_scale), draw(self.kd_scale)];
-        if (Self { effects: self.effects, ..Self::default() }) == *self {
+        let delay_s = 1e-3 * draw(self.command_delay_ms);
+        let Self { push_m_s, push_interval_s, noise, effects, .. } = *self;
+        if (Self { push_m_s, push_interval_s, noise, effects, ..Self::default() }) == *self {
             return None;
         }
         let mut sampled = robot.clone();
@@ -89,9 +125,15 @@ impl Randomisation {
         apply(&mut sampled, "ground_friction", EffectSite::Global, &[friction_scale * robot.contact.friction]);
         for joint in 0..NUM_JOINTS {
             apply(&mut sampled, "pd_gain", EffectSite::Joint(joint), &gains);
+            apply(&mut sampled, "command_delay", EffectSite::Joint(joint), &[delay_s]);
         }
         Some(sampled)
     }
+}
+
+/// Returns a value from a range, with uniform probability.
+fn sample([low, high]: Range, random: &mut Stream) -> f32 {
+    low + (high - low) * random.random::<f32>()
 }
 
 fn apply(robot: &mut RobotModel, name: &str, site: EffectSite, values: &[f64]) {
@@ -137,7 +179,8 @@ mod tests {
             friction_scale: [0.5, 0.5],
             kp_scale: [0.9, 0.9],
             kd_scale: [1.2, 1.2],
-            effects: false,
+            command_delay_ms: [15.0, 15.0],
+            ..Randomisation::default()
         };
         let (ideal, sampled) = (go2(), config.sample(&go2(), &mut stream(0, "test", 0)).expect("differs"));
         let near = |one: f64, other: f64| assert!((one - other).abs() < 1e-6, "{one} {other}");
@@ -147,6 +190,21 @@ mod tests {
         for joint in &sampled.joints {
             near(joint.actuator.kp_scale, 0.9);
             near(joint.actuator.kd_scale, 1.2);
+            near(joint.actuator.command_delay, 0.015);
+        }
+    }
+
+    #[test]
+    fn pushes_are_horizontal_and_have_the_speed_of_their_range() {
+        let config = Randomisation { push_m_s: [0.2, 0.5], ..Randomisation::default() };
+        let mut random = stream(0, "test", 0);
+        let pushes: Vec<_> = (0..1000).map(|_| config.sample_push(&mut random)).collect();
+        let speed = |[x, y, z]: [f32; 3]| x.hypot(y).hypot(z);
+        assert!(pushes.iter().all(|push| push[2] == 0.0 && (0.199..0.501).contains(&speed(*push))));
+        // The mean of uniform directions is 0, with a standard deviation of 0.35 / sqrt(2000).
+        for axis in 0..2 {
+            let mean = pushes.iter().map(|push| push[axis]).sum::<f32>() / 1000.0;
+            assert!(mean.abs() < 0.04, "{mean}");
         }
     }
 }

@@ -8,6 +8,7 @@ use twinstep_model::{
 };
 
 use crate::episode::{Episode, StepOutcome};
+use crate::observation_noise::{NoisyEntry, add_noise};
 use crate::task::{RobotView, Task};
 use crate::{ConfigError, Randomisation};
 
@@ -35,6 +36,7 @@ pub struct TaskEnv<B: Backend, T: Task> {
     task: T,
     spec: EnvSpec,
     randomise: Randomisation,
+    noise: Vec<NoisyEntry>,
     robots: Option<RobotSampler>,
     ground: Ground,
     autoreset: AutoresetMode,
@@ -59,6 +61,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
         let command = Command::hold(control.default_pose_f32(), control.kp as f32, control.kd as f32);
         let not_started = |env: u64| Episode::not_started(&task, seed.wrapping_add(env));
         Ok(Self {
+            noise: randomise.noise.entries(&spec),
             randomise,
             robots,
             ground: backend.ground(),
@@ -116,10 +119,12 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
 
     /// Writes the observations of environment `env`.
     fn observe(&mut self, env: usize) {
-        let Self { backend, task, ground, episodes, batch, spec, .. } = self;
-        let episode = &episodes[env];
+        let Self { backend, task, ground, episodes, batch, spec, noise, .. } = self;
+        let episode = &mut episodes[env];
         let robot = view(backend, ground, env);
-        task.observe(&episode.state, &robot, &episode.action, row(&mut batch.obs, env, spec.obs_len()));
+        let obs = row(&mut batch.obs, env, spec.obs_len());
+        task.observe(&episode.state, &robot, &episode.action, obs);
+        add_noise(noise, obs, &mut episode.noise);
         if !spec.critic_observation.is_empty() {
             task.observe_critic(&episode.state, &robot, row(&mut batch.critic_obs, env, spec.critic_obs_len()));
         }
@@ -139,6 +144,20 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             }
         }
         self.start_episodes(&waiting)
+    }
+
+    /// Pushes the robots whose next push is due.
+    fn push(&mut self) -> Result<(), BackendError> {
+        if !self.randomise.has_pushes() {
+            return Ok(());
+        }
+        let policy_dt = self.spec.policy_dt;
+        for (env, episode) in self.episodes.iter_mut().enumerate().filter(|(env, _)| self.active[*env]) {
+            if let Some(velocity) = episode.next_push(&self.randomise, policy_dt) {
+                self.backend.push(env, velocity)?;
+            }
+        }
+        Ok(())
     }
 
     /// Writes reward, end flags and observation of every environment that was stepped.
@@ -227,6 +246,7 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
         self.check_actions(actions)?;
         self.prepare(actions)?;
+        self.push()?;
         let decimation = self.backend.robot().control.decimation;
         let diverged = match self.backend.step(&self.commands, &self.active, decimation) {
             Ok(()) => Vec::new(),

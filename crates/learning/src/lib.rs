@@ -5,7 +5,7 @@
 //! - [`PpoConfig`]: the settings, the `[train]` table of a config file.
 //! - [`gae`]: the advantages; `update`: the gradient of the loss; [`Mirror`]: left and right exchanged.
 //! - [`Checkpoint`]: state of a training in a file; [`EventFile`]: scalars for TensorBoard.
-//! - [`evaluate`]: velocity errors, falls and gait of a walking policy.
+//! - [`evaluate`]: velocity errors, falls, gait and power of a walking policy; `walking` has their sums.
 //!
 //! Equal seeds, settings and environments give equal bits on any number of threads.
 
@@ -20,11 +20,12 @@ mod symmetry;
 mod tensorboard;
 mod trainer;
 mod update;
+mod walking;
 
 pub use adam::Adam;
 pub use checkpoint::Checkpoint;
 pub use config::{PpoConfig, PpoConfigError};
-pub use evaluation::{Evaluation, EvaluationError, EvaluationPlan, evaluate};
+pub use evaluation::{Evaluation, EvaluationError, EvaluationPlan, SpeedBin, evaluate};
 pub use rollout::Group;
 pub use statistics::{Statistics, VelocityLayout};
 pub use symmetry::{Mirror, NoMirror};

@@ -45,6 +45,13 @@ pub trait Backend: Send {
         Err(BackendError::FixedParameters { robot })
     }
 
+    /// Adds `velocity` to the linear velocity of a robot's base, in the world frame [m/s].
+    ///
+    /// Fails with [`BackendError::CannotPush`] if the base is fixed, and on a real robot.
+    fn push(&mut self, robot: usize, _velocity: [f32; 3]) -> Result<(), BackendError> {
+        Err(BackendError::CannotPush { robot, reason: "it is not simulated" })
+    }
+
     /// Advances every `active` robot by `actuator_periods` actuator periods under its command.
     ///
     /// `commands` and `active` have one entry per robot. Inactive robots do not change.
@@ -160,6 +167,14 @@ pub enum BackendError {
     FixedParameters {
         /// The robot.
         robot: usize,
+    },
+    /// The velocity of the base cannot be changed.
+    #[error("robot {robot} cannot be pushed: {reason}")]
+    CannotPush {
+        /// The robot.
+        robot: usize,
+        /// Why not.
+        reason: &'static str,
     },
     /// No message of the robot arrived in time. No command is executed until it answers again.
     #[error("the link to robot {robot} is lost: its last message is {silent_ms} ms old")]

@@ -36,6 +36,14 @@ pub(crate) fn check_lengths(commands: &[Command], active: &[bool], robots: usize
     Ok(())
 }
 
+/// Checks that the base of a robot can be pushed.
+pub(crate) fn check_floating(robot: usize, config: &SimConfig) -> Result<(), BackendError> {
+    if config.base.is_fixed() {
+        return Err(BackendError::CannotPush { robot, reason: "its base is fixed" });
+    }
+    Ok(())
+}
+
 /// State of one robot. After a restore the simulation continues bit for bit.
 #[derive(Clone)]
 pub struct RobotSnapshot {
@@ -170,6 +178,14 @@ impl Backend for RapierBackend {
     ) -> Result<(), BackendError> {
         self.check_index(robot)?;
         self.reset_robot(robot, model, initial_state);
+        Ok(())
+    }
+
+    fn push(&mut self, robot: usize, velocity: [f32; 3]) -> Result<(), BackendError> {
+        self.check_index(robot)?;
+        check_floating(robot, &self.config)?;
+        self.worlds[robot].push(velocity);
+        self.read_state(robot);
         Ok(())
     }
 

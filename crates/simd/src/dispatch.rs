@@ -2,10 +2,9 @@
 
 use crate::float::SimdFloat;
 use crate::instruction_set::{InstructionSet, Level};
-#[cfg(not(target_arch = "x86_64"))]
-use crate::portable::F32x4 as BaselineF32;
+use crate::portable::F32x4;
 #[cfg(target_arch = "x86_64")]
-use crate::x86::{Avx2F32, Avx2F64, Avx512F32, Sse2F32 as BaselineF32};
+use crate::x86::{Avx2F32, Avx2F64, Avx512F32, Sse2F32};
 
 /// Code that is generic over the register type.
 pub trait SimdTask {
@@ -23,7 +22,9 @@ pub fn with_f32<K: SimdTask>(instructions: InstructionSet, task: K) -> K::Output
         Level::Avx512 => task.run::<Avx512F32>(),
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 => task.run::<Avx2F32>(),
-        Level::Baseline => task.run::<BaselineF32>(),
+        #[cfg(target_arch = "x86_64")]
+        Level::Sse2 => task.run::<Sse2F32>(),
+        Level::Portable => task.run::<F32x4>(),
     }
 }
 
@@ -34,6 +35,8 @@ pub fn with_f64<K: SimdTask>(instructions: InstructionSet, task: K) -> K::Output
         Level::Avx512 if !InstructionSet::available().contains(&InstructionSet(Level::Avx2)) => task.run::<f64>(),
         #[cfg(target_arch = "x86_64")]
         Level::Avx512 | Level::Avx2 => task.run::<Avx2F64>(),
-        Level::Baseline => task.run::<f64>(),
+        #[cfg(target_arch = "x86_64")]
+        Level::Sse2 => task.run::<f64>(),
+        Level::Portable => task.run::<f64>(),
     }
 }

@@ -3,7 +3,7 @@
 //! - [`SimdFloat`]: one number in each lane of a register. The physics engine puts one robot in a lane, the actuator
 //!   networks one joint.
 //! - [`InstructionSet`]: a proof that the processor has an instruction set. It cannot be made without asking the
-//!   processor.
+//!   processor. The environment variable `TWINSTEP_SIMD` selects one: `portable`, `sse2`, `avx2` or `avx512`.
 //! - [`SimdTask`], [`with_f32`], [`with_f64`]: run generic code with the register type of an instruction set. The
 //!   register types of x86-64 have no public name, so no value of them exists without that proof.
 //! - [`SimdKernel`], [`SimdFloat::vectorise`]: compile an inner loop for the instruction set.
@@ -27,5 +27,5 @@ mod x86;
 pub use dispatch::{SimdTask, with_f32, with_f64};
 pub use float::{SimdFloat, SimdKernel};
 pub use functions::exponential;
-pub use instruction_set::InstructionSet;
+pub use instruction_set::{InstructionSet, UnknownInstructionSet};
 pub use portable::F32x4;

@@ -31,7 +31,7 @@ use twinstep_simd::InstructionSet;
 pub use simulator::SimdPrecision;
 
 use crate::BackendBuildError;
-use crate::rapier::check_lengths;
+use crate::rapier::{check_floating, check_lengths};
 use crate::{SimConfig, SimConfigError};
 use robot_batch::{LaneSnapshot, StepCount};
 pub(crate) use simulator::batch_simulator;
@@ -170,6 +170,14 @@ impl Backend for BatchBackend {
         self.check_index(robot)?;
         self.robots.place(robot, model, initial_state);
         self.after_reset(robot, initial_state);
+        Ok(())
+    }
+
+    fn push(&mut self, robot: usize, velocity: [f32; 3]) -> Result<(), BackendError> {
+        self.check_index(robot)?;
+        check_floating(robot, &self.config)?;
+        self.robots.push(robot, velocity);
+        self.robots.read(robot, &mut self.states);
         Ok(())
     }
 

@@ -171,6 +171,13 @@ impl<T: SimdFloat> RobotBatch<T> {
         }
     }
 
+    /// Adds `velocity` to the linear velocity of the base of one robot, in the world frame [m/s].
+    pub fn push(&mut self, lane: usize, velocity: [f32; 3]) {
+        for (component, change) in self.state.linear_velocity.0.iter_mut().zip(velocity) {
+            component.set(lane, component.get(lane) + f64::from(change));
+        }
+    }
+
     /// Sets the factors on the torque of one robot for supply voltage and motor temperature, until its next reset.
     pub fn set_derating(&mut self, lane: usize, factors: &PerJoint) {
         self.actuator.set_derating(lane, factors);

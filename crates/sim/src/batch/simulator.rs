@@ -50,6 +50,8 @@ pub trait BatchSimulator: Send + Sync {
     ///
     /// `past` has one entry per robot; a period has `steps` physics steps.
     fn remember(&mut self, past: &[&[HistoryStep]], steps: usize);
+    /// Adds `velocity` to the linear velocity of the base of `robot`, in the world frame [m/s].
+    fn push(&mut self, robot: usize, velocity: [f32; 3]);
     /// Sets the factors on the torque of `robot` for supply voltage and motor temperature, until its next reset.
     fn set_derating(&mut self, robot: usize, factors: &PerJoint);
     /// Simulates every robot with the commands of its request on the current thread.
@@ -176,6 +178,10 @@ impl<T: SimdFloat> BatchSimulator for RobotBatches<T> {
         for (group, past) in self.batches.iter_mut().zip(past.chunks(T::LANES)) {
             group.replay_history(past, steps);
         }
+    }
+
+    fn push(&mut self, robot: usize, velocity: [f32; 3]) {
+        self.batches[robot / T::LANES].push(robot % T::LANES, velocity);
     }
 
     fn set_derating(&mut self, robot: usize, factors: &PerJoint) {

@@ -7,7 +7,7 @@ use std::io::{Error, ErrorKind, Read, Write};
 use twinstep_model::{Command, InitialState, NUM_JOINTS, RobotStates};
 
 /// Version of the frames. The Python package has the same one.
-const PROTOCOL: u32 = 1;
+const PROTOCOL: u32 = 2;
 const GREETING: &str = "twinstep-mujoco";
 /// Longest frame [bytes].
 const MAX_FRAME: usize = 1 << 28;
@@ -20,6 +20,8 @@ pub const HELLO: u8 = b'H';
 pub const RESET: u8 = b'R';
 /// Kind of a step.
 pub const STEP: u8 = b'S';
+/// Kind of a push of one robot.
+pub const PUSH: u8 = b'P';
 /// Kind of a reply with the states of robots.
 pub const STATES: u8 = b'D';
 /// Kind of a reply with the text of an error.
@@ -116,6 +118,14 @@ pub fn reset(resets: &[Reset]) -> Vec<u8> {
         put_number(&mut body, mjcf.len());
         body.extend_from_slice(mjcf.as_bytes());
     }
+    body
+}
+
+/// Returns the body of a push: `velocity` is added to that of the base, in the world frame [m/s].
+pub fn push(robot: usize, velocity: [f32; 3]) -> Vec<u8> {
+    let mut body = Vec::new();
+    put_number(&mut body, robot);
+    put(&mut body, &velocity);
     body
 }
 

@@ -19,7 +19,7 @@ use twinstep_model::{
 use crate::rapier::check_lengths;
 use crate::{BackendBuildError, SimConfig, SimConfigError, Terrain};
 use effects::{Adjustments, unsupported};
-use frames::{RESET, Reset, STATES, STEP, Settings};
+use frames::{PUSH, RESET, Reset, STATES, STEP, Settings};
 use process::Process;
 
 /// Environment variable with the Python interpreter that has the packages `twinstep` and `mujoco`.
@@ -173,6 +173,14 @@ impl Backend for MujocoBackend {
         }
         self.adjustments[robot] = Adjustments::new(model);
         self.reset_robots(&[(robot, *initial_state)], &mjcf(model, &self.options))
+    }
+
+    fn push(&mut self, robot: usize, velocity: [f32; 3]) -> Result<(), BackendError> {
+        self.check_index(robot)?;
+        if self.options.base.is_fixed() {
+            return Err(BackendError::CannotPush { robot, reason: "its base is fixed" });
+        }
+        self.request(PUSH, &frames::push(robot, velocity), &[robot])
     }
 
     fn step(&mut self, commands: &[Command], active: &[bool], actuator_periods: usize) -> Result<(), BackendError> {

@@ -64,6 +64,14 @@ impl RobotWorld {
         self.actuator.set_derating(0, factors);
     }
 
+    /// Adds `velocity` to the linear velocity of the base, in the world frame [m/s]. The base is floating.
+    pub fn push(&mut self, velocity: [f32; 3]) {
+        let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
+        for (component, change) in multibody.generalized_velocity_mut().as_mut_slice().iter_mut().zip(velocity) {
+            *component += change;
+        }
+    }
+
     /// Advances by one actuator period of `steps` physics steps and returns the mean estimated torque [N·m].
     pub fn actuator_period(&mut self, input: ActuatorInputRef, steps: usize) -> PerJoint {
         let (mut q, mut dq) = self.joints();

@@ -6,11 +6,13 @@ request   body
 ``H``     text: ``twinstep-mujoco VERSION robots=N threads=N iterations=N steps=N``, newline, nominal model (MJCF)
 ``R``     reset: number of robots; for each its index, ``INITIAL_STATE``, length of its model, its model (MJCF).
           The length 0 selects the nominal model.
+``P``     push: index of a robot, three ``<f4``: velocity added to that of its base, in the world frame [m/s]
 ``S``     step: number of actuator periods; one byte per robot, 0 if it is not stepped; ``COMMAND`` per robot
 ========  ======================================================================================================
 
 The reply to ``H`` is the text ``twinstep-mujoco VERSION mujoco=VERSION``. The reply to a reset is ``MEASURED`` for each
-of its robots, then ``GROUND_TRUTH`` for each; to a step the same for all robots. Any request may be answered by ``E``,
+of its robots, then ``GROUND_TRUTH`` for each; to a push the same for its robot; to a step the same for all
+robots. Any request may be answered by ``E``,
 the text of an error, after which the process terminates. The robot that diverged has NaN in every reading.
 """
 
@@ -23,12 +25,13 @@ from numpy.typing import NDArray
 
 from ..errors import Error
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Version of the frames. The server has the same one."""
 
 GREETING = "twinstep-mujoco"
 MAX_FRAME_BYTES = 1 << 28
 _LENGTH = struct.Struct("<I")
+_PUSH = struct.Struct("<I3f")
 
 Rows = NDArray[np.void]
 """Structured array with one row per robot."""
@@ -87,6 +90,14 @@ class Reset:
     robot: int
     initial_state: Rows
     mjcf: str
+
+
+@dataclass(frozen=True)
+class Push:
+    """Velocity that is added to that of the base of one robot, in the world frame [m/s]."""
+
+    robot: int
+    velocity: list[float]
 
 
 @dataclass(frozen=True)
@@ -169,6 +180,14 @@ def parse_reset(body: bytes) -> list[Reset]:
     if at != len(body):
         raise FrameError(f"a reset has {len(body) - at} bytes too many")
     return resets
+
+
+def parse_push(body: bytes) -> Push:
+    """Parse a push."""
+    if len(body) != _PUSH.size:
+        raise FrameError(f"a push has {len(body)} bytes; {_PUSH.size} are expected")
+    robot, *velocity = _PUSH.unpack(body)
+    return Push(robot, velocity)
 
 
 def parse_step(body: bytes, robots: int) -> Step:

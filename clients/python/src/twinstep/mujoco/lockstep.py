@@ -12,10 +12,12 @@ from .frames import (
     MEASURED,
     FrameError,
     Hello,
+    Push,
     Reset,
     Step,
     greeting,
     parse_hello,
+    parse_push,
     parse_reset,
     parse_step,
     read_frame,
@@ -52,12 +54,18 @@ class Robots:
         """Reset robots and return their readings."""
         robots = [reset.robot for reset in resets]
         for reset in resets:
-            if reset.robot >= len(self._robots):
-                raise FrameError(f"robot {reset.robot} does not exist; there are {len(self._robots)}")
+            self._check_index(reset.robot)
             model = self._compile(reset.mjcf) if reset.mjcf else self._nominal
             self._robots[reset.robot].reset(model, reset.initial_state)
             self._read(reset.robot)
         return self._readings(np.array(robots, np.intp))
+
+    def push(self, push: Push) -> bytes:
+        """Push one robot and return its readings."""
+        self._check_index(push.robot)
+        self._robots[push.robot].push(push.velocity)
+        self._read(push.robot)
+        return self._readings(np.array([push.robot], np.intp))
 
     def step(self, step: Step) -> bytes:
         """Advance the active robots and return the readings of all."""
@@ -75,6 +83,10 @@ class Robots:
             # `list` raises the error of a thread.
             list(self._pool.map(advance, [active[first :: self._threads] for first in range(self._threads)]))
         return self._readings(np.arange(len(self._robots)))
+
+    def _check_index(self, robot: int) -> None:
+        if robot >= len(self._robots):
+            raise FrameError(f"robot {robot} does not exist; there are {len(self._robots)}")
 
     def _compile(self, mjcf: str) -> object:
         try:
@@ -102,6 +114,8 @@ def serve(requests: BinaryIO, replies: BinaryIO) -> None:
             match frame[0]:
                 case b"R":
                     reply = robots.reset(parse_reset(frame[1]))
+                case b"P":
+                    reply = robots.push(parse_push(frame[1]))
                 case b"S":
                     reply = robots.step(parse_step(frame[1], hello.robots))
                 case kind:

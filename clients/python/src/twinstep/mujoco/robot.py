@@ -106,6 +106,10 @@ class Robot:
             self._data.qvel[:6] = [*values["base_linear_velocity"], *values["base_angular_velocity"]]
         self._q[:], self._dq[:] = values["q"], values["dq"]
 
+    def push(self, velocity: list[float]) -> None:
+        """Add to the velocity of the floating base, in the world frame [m/s]."""
+        self._data.qvel[:3] += velocity
+
     def advance(self, command: Command, periods: int, steps: int) -> None:
         """Advance by ``periods`` actuator periods of ``steps`` physics steps. A robot that diverged stays as it is."""
         if self.diverged:

@@ -1,0 +1,218 @@
+//! Sums over the steps of walking robots: velocity errors, the motion of the feet, power.
+
+use glam::Vec3;
+use twinstep_model::{EnvSpec, FootKinematics, NUM_JOINTS, PerJoint, RobotModel, SpecField};
+
+use crate::evaluation::{Evaluation, EvaluationError, SPEED_BINS, SpeedBin};
+use crate::statistics::VelocityLayout;
+
+/// Time after a change of the command that is left out of the settled errors [s].
+const TRANSIENT_S: f64 = 1.0;
+/// Force above which a foot is on the ground [N].
+const CONTACT_FORCE: f32 = 1.0;
+/// Duration from which on a phase without contact is a swing [s].
+const MIN_SWING_S: f64 = 0.04;
+/// Entry of a command above which a motion is commanded [m/s, rad/s].
+const MOVING: f32 = 0.1;
+
+/// What the robots have in common: the layout of their observations, their gains and limbs.
+pub struct Robots {
+    obs_len: usize,
+    critic_len: usize,
+    policy_dt: f64,
+    velocity: VelocityLayout,
+    command: usize,
+    gravity: usize,
+    q: usize,
+    dq: usize,
+    action: usize,
+    angular_velocity: usize,
+    linear_velocity: usize,
+    height: usize,
+    foot_force: usize,
+    feet: FootKinematics,
+    foot_radius: f32,
+    default_pose: PerJoint,
+    torque_limits: PerJoint,
+    action_scale: f32,
+    gains: [f32; 2],
+}
+
+impl Robots {
+    /// Fails if a quantity is not observed.
+    pub fn new(spec: &EnvSpec, robot: &RobotModel) -> Result<Self, EvaluationError> {
+        let find = |fields: &[SpecField], name: &'static str| {
+            let index = fields.iter().position(|field| field.name == name).ok_or(EvaluationError::Missing(name))?;
+            Ok::<_, EvaluationError>(fields[..index].iter().map(|field| field.size).sum::<usize>())
+        };
+        let (policy, critic) = (&spec.observation, &spec.critic_observation);
+        Ok(Self {
+            obs_len: spec.obs_len(),
+            critic_len: spec.critic_obs_len(),
+            policy_dt: spec.policy_dt,
+            velocity: VelocityLayout::new(spec).ok_or(EvaluationError::Missing("true_linear_velocity"))?,
+            command: find(policy, "velocity_command")?,
+            gravity: find(policy, "projected_gravity")?,
+            q: find(policy, "joint_position")?,
+            dq: find(policy, "joint_velocity")?,
+            action: find(policy, "previous_action")?,
+            angular_velocity: find(critic, "true_angular_velocity")?,
+            linear_velocity: find(critic, "true_linear_velocity")?,
+            height: find(critic, "base_height")?,
+            foot_force: find(critic, "foot_force")?,
+            feet: FootKinematics::new(robot),
+            foot_radius: robot.shapes.foot_radius as f32,
+            default_pose: robot.control.default_pose_f32(),
+            torque_limits: robot.torque_limits(),
+            action_scale: spec.action_scale as f32,
+            gains: [spec.kp as f32, spec.kd as f32],
+        })
+    }
+
+    /// Returns the mechanical power of all motors at the end of a step, without that of braking ones [W].
+    fn power(&self, obs: &[f32]) -> f32 {
+        let [q, dq, action] = [self.q, self.dq, self.action].map(|start| &obs[start..start + NUM_JOINTS]);
+        let [kp, kd] = self.gains;
+        let joint_power = |joint: usize| {
+            let tau = kp * (self.action_scale * action[joint] - q[joint]) - kd * dq[joint];
+            let limit = self.torque_limits[joint];
+            (tau.clamp(-limit, limit) * dq[joint]).max(0.0)
+        };
+        (0..NUM_JOINTS).map(joint_power).sum()
+    }
+}
+
+/// Motion of one robot so far.
+#[derive(Clone, Default)]
+pub struct Walker {
+    /// True from its first fall on.
+    pub has_fallen: bool,
+    /// Steps since the command changed.
+    steps_of_command: usize,
+    command: [f32; 3],
+    air_steps: [usize; 4],
+    /// Highest position of each foot in its swing phase [m].
+    peak: [f32; 4],
+}
+
+impl Walker {
+    /// Adds a step of robot `index` to `sums`.
+    ///
+    /// `observations` of all robots are those of group `policy` before and after the step, and of group `critic` after it.
+    pub fn add(&mut self, sums: &mut Sums, robots: &Robots, index: usize, observations: [&[f32]; 3]) {
+        let [before, after, critic] = observations;
+        let errors = robots.velocity.squared_errors(before, critic, index).map(f64::from);
+        let obs = &after[index * robots.obs_len..][..robots.obs_len];
+        let critic = &critic[index * robots.critic_len..][..robots.critic_len];
+        let command = &before[index * robots.obs_len + robots.command..][..3];
+        self.add_errors(sums, errors, command, robots.policy_dt);
+        let is_moving = self.command.iter().any(|value| value.abs() > MOVING);
+        if is_moving {
+            sums.moving_steps += 1;
+            sums.power += f64::from(robots.power(obs));
+        }
+        self.add_feet(sums, robots, [obs, critic], is_moving);
+    }
+
+    fn add_errors(&mut self, sums: &mut Sums, errors: [f64; 2], command: &[f32], policy_dt: f64) {
+        if command != self.command {
+            (self.command, self.steps_of_command) = ([command[0], command[1], command[2]], 0);
+        }
+        self.steps_of_command += 1;
+        sums.all.add(errors);
+        if self.steps_of_command as f64 * policy_dt > TRANSIENT_S {
+            sums.settled.add(errors);
+        }
+        let speed = command[0].hypot(command[1]);
+        sums.by_speed[SPEED_BINS.iter().filter(|limit| speed >= **limit).count()].add(errors);
+    }
+
+    /// Adds the motion of the feet. `rows` are the observations of both groups after the step.
+    fn add_feet(&mut self, sums: &mut Sums, robots: &Robots, [obs, critic]: [&[f32]; 2], is_moving: bool) {
+        let q = std::array::from_fn(|joint| obs[robots.q + joint] + robots.default_pose[joint]);
+        let dq = std::array::from_fn(|joint| obs[robots.dq + joint]);
+        let vector = |values: &[f32], start: usize| Vec3::from_slice(&values[start..start + 3]);
+        // The gravity vector points down.
+        let up = -vector(obs, robots.gravity);
+        let (velocity, rotation) = (vector(critic, robots.linear_velocity), vector(critic, robots.angular_velocity));
+        for (leg, foot) in robots.feet.feet(&q, &dq).into_iter().enumerate() {
+            let height = critic[robots.height] + up.dot(foot.position) - robots.foot_radius;
+            let touches = critic[robots.foot_force + leg] > CONTACT_FORCE;
+            if touches {
+                let motion = velocity + rotation.cross(foot.position) + foot.velocity;
+                sums.slip += if is_moving { f64::from((motion - up * up.dot(motion)).length()) } else { 0.0 };
+                if is_moving && self.air_steps[leg] as f64 * robots.policy_dt >= MIN_SWING_S {
+                    sums.swing_heights.push(self.peak[leg]);
+                }
+                (self.air_steps[leg], self.peak[leg]) = (0, 0.0);
+            } else {
+                self.air_steps[leg] += 1;
+                self.peak[leg] = self.peak[leg].max(height);
+            }
+            sums.contacts += u64::from(touches && is_moving);
+        }
+    }
+}
+
+/// Number of steps and their squared errors of velocity [m²/s²] and yaw rate [rad²/s²].
+#[derive(Clone, Copy, Default)]
+struct Errors {
+    steps: u64,
+    squared: [f64; 2],
+}
+
+impl Errors {
+    fn add(&mut self, errors: [f64; 2]) {
+        self.steps += 1;
+        self.squared.iter_mut().zip(errors).for_each(|(sum, error)| *sum += error);
+    }
+
+    /// Returns the root mean squares.
+    fn rms(&self) -> [f64; 2] {
+        self.squared.map(|sum| (sum / self.steps.max(1) as f64).sqrt())
+    }
+}
+
+/// Sums over all robots.
+#[derive(Default)]
+pub struct Sums {
+    all: Errors,
+    settled: Errors,
+    by_speed: [Errors; SPEED_BINS.len() + 1],
+    moving_steps: u64,
+    contacts: u64,
+    slip: f64,
+    power: f64,
+    swing_heights: Vec<f32>,
+}
+
+impl Sums {
+    /// Returns the evaluation of `robots` robots, of which `up` did not fall in `seconds` seconds.
+    pub fn evaluation(mut self, robots: usize, up: usize, seconds: f64, policy_dt: f64) -> Evaluation {
+        self.swing_heights.sort_by(f32::total_cmp);
+        let moving_steps = self.moving_steps.max(1) as f64;
+        let foot_steps = 4.0 * moving_steps;
+        let [velocity_rms, yaw_rate_rms] = self.all.rms();
+        let [settled_velocity_rms, settled_yaw_rate_rms] = self.settled.rms();
+        let limits = [0.0].into_iter().chain(SPEED_BINS);
+        let bin = |(from, errors): (f32, &Errors)| {
+            let [velocity_rms, yaw_rate_rms] = errors.rms();
+            SpeedBin { from, share: errors.steps as f64 / self.all.steps.max(1) as f64, velocity_rms, yaw_rate_rms }
+        };
+        Evaluation {
+            robots,
+            seconds,
+            up: up as f64 / robots as f64,
+            velocity_rms,
+            settled_velocity_rms,
+            yaw_rate_rms,
+            settled_yaw_rate_rms,
+            swing_height: self.swing_heights.get(self.swing_heights.len() / 2).map_or(0.0, |height| f64::from(*height)),
+            duty_factor: self.contacts as f64 / foot_steps,
+            swings_per_second: self.swing_heights.len() as f64 / (foot_steps * policy_dt),
+            slip_speed: self.slip / self.contacts.max(1) as f64,
+            power: self.power / moving_steps,
+            by_speed: limits.zip(&self.by_speed).map(bin).collect(),
+        }
+    }
+}
