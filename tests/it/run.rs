@@ -12,7 +12,7 @@ use twinstep_model::{EnvSpec, go2, stream};
 use twinstep_policy::{Policy, PolicyRunner};
 use twinstep_tests::foreign_policy::foreign_policy;
 use twinstep_tests::process::Process;
-use twinstep_tests::python::root;
+use twinstep_tests::python::{python, root, run as run_command};
 
 const TYPES: &str = r#"
 joints = ["FL_hip", "FR_hip", "RL_hip", "RR_hip", "FL_thigh", "FR_thigh", "RL_thigh", "RR_thigh", "FL_calf", "FR_calf", "RL_calf", "RR_calf"]
@@ -128,6 +128,58 @@ fn onnx_file_gives_the_actions_of_the_policy_file() {
     let policy = walk();
     for obs in observations(200) {
         assert_near(&network.run(&obs).unwrap(), &original_action(&policy, &obs), 1e-5);
+    }
+}
+
+/// Exports a policy as rsl_rl has it, and one as HIMLoco has it, with both exporters of PyTorch.
+const EXPORT_SCRIPT: &str = r#"
+import json, sys, numpy, onnxruntime, torch
+from torch import nn
+
+class Policy(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("mean", 0.1 * torch.randn(48))
+        self.register_buffer("std", 0.5 + torch.rand(48))
+        self.net = nn.Sequential(nn.Linear(48, 512), nn.ELU(), nn.Linear(512, 256), nn.ELU(), nn.Linear(256, 128),
+                                 nn.ELU(), nn.Linear(128, 12))
+    def forward(self, obs):
+        return self.net((obs - self.mean) / (self.std + 1e-2))
+
+class Estimator(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.estimator = nn.Sequential(nn.Linear(270, 128), nn.ELU(), nn.Linear(128, 19))
+        self.actor = nn.Sequential(nn.Linear(64, 128), nn.Tanh(), nn.Linear(128, 12))
+    def forward(self, history):
+        parts = self.estimator(history)
+        latent = nn.functional.normalize(parts[..., 3:], dim=-1, p=2)
+        return self.actor(torch.cat((history[:, :45], parts[..., :3], latent), dim=-1))
+
+torch.manual_seed(0)
+cases = []
+for module, size in [(Policy(), 48), (Estimator(), 270)]:
+    for dynamo in [False, True]:
+        path = f"{sys.argv[1]}/policy_{size}_{int(dynamo)}.onnx"
+        torch.onnx.export(module.eval(), (torch.zeros(1, size),), path, input_names=["obs"], output_names=["actions"],
+                          dynamo=dynamo)
+        obs = numpy.random.default_rng(1).uniform(-1, 1, (1, size)).astype(numpy.float32)
+        action = onnxruntime.InferenceSession(path).run(None, {"obs": obs})[0]
+        cases.append({"path": path, "obs": obs[0].tolist(), "action": action[0].tolist()})
+json.dump(cases, open(f"{sys.argv[1]}/cases.json", "w"))
+"#;
+
+#[test]
+fn exports_of_pytorch_give_the_actions_of_onnxruntime() {
+    let target = Path::new(env!("CARGO_BIN_EXE_faults")).ancestors().nth(2).unwrap();
+    let Some(python) = python(target).unwrap() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    run_command(Command::new(python).args(["-c", EXPORT_SCRIPT]).arg(folder.path())).unwrap();
+    let cases = std::fs::read_to_string(folder.path().join("cases.json")).unwrap();
+    for case in serde_json::from_str::<Vec<serde_json::Value>>(&cases).unwrap() {
+        let numbers = |key: &str| -> Vec<f32> { serde_json::from_value(case[key].clone()).unwrap() };
+        let network = OnnxNetwork::read(case["path"].as_str().unwrap()).unwrap();
+        assert_near(&network.run(&numbers("obs")).unwrap(), &numbers("action"), 1e-5);
     }
 }
 

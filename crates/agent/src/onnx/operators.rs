@@ -184,11 +184,19 @@ fn product(a: &Tensor, b: &Tensor, transposed: [bool; 2]) -> Result<Tensor, Stri
     let (a, b) = (a.as_floats()?, b.as_floats()?);
     let mut values = vec![0.0; len(&[rows, columns])?];
     for row in 0..rows {
-        for k in 0..inner {
-            let factor = if transposed[0] { a[k * a_columns + row] } else { a[row * a_columns + k] };
-            for column in 0..columns {
-                let weight = if transposed[1] { b[column * b_columns + k] } else { b[k * b_columns + column] };
-                values[row * columns + column] += factor * weight;
+        let factor = |k: usize| if transposed[0] { a[k * a_columns + row] } else { a[row * a_columns + k] };
+        let results = &mut values[row * columns..][..columns];
+        // Weights are read in the order in which they are stored.
+        if transposed[1] {
+            for (result, weights) in results.iter_mut().zip(b.chunks_exact(b_columns.max(1))) {
+                *result = weights.iter().enumerate().map(|(k, weight)| factor(k) * weight).sum();
+            }
+        } else {
+            for (k, weights) in b.chunks_exact(columns.max(1)).enumerate() {
+                let factor = factor(k);
+                for (result, weight) in results.iter_mut().zip(weights) {
+                    *result += factor * weight;
+                }
             }
         }
     }
