@@ -222,6 +222,10 @@ impl Worker {
                 let request: message::StepRequest<'_> = decode(payload)?;
                 let env = self.env.as_deref_mut().expect("a worker without environments has a failure");
                 read_actions(request.actions, env.num_envs() * env.spec().action_len(), &mut self.actions)?;
+                if let Some(bytes) = request.command {
+                    let commands = convert::read_commands(bytes, env.num_envs())?;
+                    env.set_velocity_commands(&commands).map_err(|error| convert::wire_error(&error))?;
+                }
                 let batch = env.step(&self.actions).map_err(|error| logged(&error))?;
                 self.state.env_steps.fetch_add(batch.reward.len() as u64, Ordering::Relaxed);
                 Ok(convert::encode_step(batch, request.seq, self.params.critic))

@@ -10,6 +10,9 @@ use crate::{ErrorCode, ErrorReply, PROTOCOL, encode, message, tensor};
 /// Upper bound on the size of a message without its tensors [bytes].
 const MAP_OVERHEAD: usize = 256;
 
+/// Entries of a velocity command: forward, left, yaw rate.
+const VELOCITY_COMMAND_LEN: usize = 3;
+
 /// Maximum size of one array in the reply to a step [bytes]. Zenoh refuses messages of more than 1 GiB.
 const MAX_ARRAY_BYTES: u64 = 1 << 30;
 
@@ -49,7 +52,7 @@ pub fn encode_reset(request: &ResetRequest, epoch: u64, seq: u64) -> Vec<u8> {
 /// Returns the maximum size of a request to `num_envs` environments [bytes].
 pub fn max_request_bytes(num_envs: usize, spec: &EnvSpec) -> usize {
     let reset = size_of::<u64>() + size_of::<u8>();
-    let step = spec.action_len() * size_of::<f32>();
+    let step = (spec.action_len() + VELOCITY_COMMAND_LEN) * size_of::<f32>();
     4 * MAP_OVERHEAD + num_envs * reset.max(step)
 }
 
@@ -119,11 +122,17 @@ pub fn encode_step(batch: &StepBatch, seq: u64, with_critic: bool) -> Vec<u8> {
     encode_with_capacity(&reply, MAP_OVERHEAD + numbers * size_of::<f32>() + flags)
 }
 
-/// Encodes a step request.
-pub fn encode_actions(actions: &[f32], epoch: u64, seq: u64) -> Vec<u8> {
-    let actions = tensor::as_bytes(actions);
-    let request = message::StepRequest { protocol: PROTOCOL, epoch, seq, actions };
-    encode_with_capacity(&request, MAP_OVERHEAD + actions.len())
+/// Encodes a step request. `commands` are the velocity commands, if the client gives them.
+pub fn encode_actions(actions: &[f32], commands: Option<&[[f32; 3]]>, epoch: u64, seq: u64) -> Vec<u8> {
+    let (actions, command) = (tensor::as_bytes(actions), commands.map(tensor::as_bytes));
+    let request = message::StepRequest { protocol: PROTOCOL, epoch, seq, actions, command };
+    encode_with_capacity(&request, MAP_OVERHEAD + actions.len() + command.map_or(0, <[u8]>::len))
+}
+
+/// Decodes the velocity commands of a step request for `num_envs` environments. Checks the length before it copies.
+pub fn read_commands(bytes: &[u8], num_envs: usize) -> Result<Vec<[f32; 3]>, ErrorReply> {
+    check_length("command", bytes.len() / size_of::<f32>(), num_envs * VELOCITY_COMMAND_LEN)?;
+    tensor::read(bytes, "command")
 }
 
 /// Decodes the reply to a step into `batch`. Fails if a length does not match `num_envs` environments of `spec`.
@@ -244,6 +253,15 @@ pub fn wire_error(error: &EnvError) -> ErrorReply {
         }
         EnvError::ActionNotFinite { .. } => {
             (ErrorCode::NotFinite, "actions", "check the policy that computed the action")
+        }
+        EnvError::NoVelocityCommand { .. } => (
+            ErrorCode::OutOfRange,
+            "command",
+            "leave the field out, or use a task with a velocity command, such as `walk`",
+        ),
+        EnvError::VelocityCommand { value, .. } => {
+            let code = if value.is_finite() { ErrorCode::OutOfRange } else { ErrorCode::NotFinite };
+            (code, "command", "the bounds are those of `velocity_command` in the spec")
         }
         EnvError::NeedsReset { .. } => (ErrorCode::NeedsReset, "", "send `reset`, with `mask` for some environments"),
         EnvError::EnvOutOfRange { .. } => (ErrorCode::OutOfRange, "env", "environments are numbered from 0"),

@@ -146,6 +146,10 @@ pub struct StepRequest<'a> {
     /// Actions, `num_envs × action_len` × f32.
     #[serde(borrow, with = "serde_bytes")]
     pub actions: &'a [u8],
+    /// Velocity commands from this step on, in place of the task's own, `num_envs × 3` × f32: forward [m/s], left [m/s],
+    /// yaw rate [rad/s]. Default: unchanged.
+    #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "Option::is_none")]
+    pub command: Option<&'a [u8]>,
 }
 
 /// Result of a step.

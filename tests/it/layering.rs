@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Crate folders and the workspace crates that each may use. Leaf crates use only the core; applications combine them.
-const MAY_USE: [(&str, &[&str]); 21] = [
+const MAY_USE: [(&str, &[&str]); 22] = [
     // Core.
     ("crates/simd", &[]),
     ("crates/model", &["simd"]),
@@ -19,6 +19,7 @@ const MAY_USE: [(&str, &[&str]); 21] = [
     ("crates/diagnose", &["model", "effects", "logs", "identify"]),
     ("crates/policy", &["simd", "model"]),
     ("crates/learning", &["model", "policy"]),
+    ("crates/agent", &["model", "logs", "policy"]),
     ("crates/session", &[]),
     ("ensemble", &["simd", "model", "effects", "logs"]),
     // Applications.
@@ -59,6 +60,7 @@ const MAY_USE: [(&str, &[&str]); 21] = [
             "client",
             "policy",
             "learning",
+            "agent",
             "session",
             "report",
             "hunt",
@@ -81,6 +83,7 @@ const MAY_USE: [(&str, &[&str]); 21] = [
             "diagnose",
             "policy",
             "learning",
+            "agent",
             "ensemble",
             "env-server",
             "client",

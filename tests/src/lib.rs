@@ -11,6 +11,7 @@
 //! - [`ground_truth_robot`]: robots with known parameters, for system identification
 //! - [`ground_truth_actuator`]: actuators with known effects, for actuator networks
 //! - [`confounded_pairs`]: pairs of confounded effects, for experiment design
+//! - [`foreign_policy`]: policies with the conventions of other programs
 //! - [`fuzz`]: random changes to messages and files
 //! - [`soak`]: many clients that end in different ways
 //! - [`browser`]: layout of an HTML report in a real browser
@@ -21,6 +22,7 @@ pub mod browser;
 pub mod confounded_pairs;
 pub mod fault;
 pub mod fault_injection;
+pub mod foreign_policy;
 pub mod fuzz;
 pub mod ground_truth_actuator;
 pub mod ground_truth_robot;

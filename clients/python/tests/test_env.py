@@ -48,6 +48,29 @@ def test_row_of_a_vector_is_the_single_environment_with_its_seed() -> None:
     np.testing.assert_array_equal(np.array(rows)[:, 1], single)
 
 
+def test_velocity_commands_of_the_agent_replace_those_of_the_task() -> None:
+    commands = np.array([[0.5, 0.0, 0.0], [-0.25, 0.125, 1.0]], np.float32)
+    envs = Go2VectorEnv(2, max_episode_steps=3)
+    envs.reset(seed=1)
+    envs.set_velocity_commands(commands)
+    for _ in range(5):
+        obs = envs.step(np.zeros((2, 12), np.float32))[0]
+        np.testing.assert_array_equal(obs[:, 6:9], commands)
+    with pytest.raises(twinstep.InvalidOptionError, match=r"environment 1: velocity_command\[0\] is 7.0; -5 to 5"):
+        envs.set_velocity_commands(np.array([[0, 0, 0], [7, 0, 0]], np.float32))
+    envs.close()
+    with Go2Env() as env:
+        env.reset(seed=1)
+        env.set_velocity_command(commands[1])
+        np.testing.assert_array_equal(env.step(np.zeros(12, np.float32))[0][6:9], commands[1])
+
+
+def test_a_task_without_velocity_commands_refuses_them(counters: Go2VectorEnv) -> None:
+    counters.set_velocity_commands(np.zeros((3, 3), np.float32))
+    with pytest.raises(twinstep.RequestRejectedError, match="the task `counter` has no velocity command"):
+        counters.step(np.zeros((3, 12), np.float32))
+
+
 def test_a_sequence_of_seeds_sets_each_environment() -> None:
     with Go2Env() as env:
         first = env.reset(seed=9)[0]

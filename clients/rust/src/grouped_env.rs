@@ -136,6 +136,15 @@ impl VecEnv for GroupedVecEnv {
         &self.batch.critic_obs
     }
 
+    fn set_velocity_commands(&mut self, commands: &[[f32; 3]]) -> Result<(), EnvError> {
+        self.spec().check_velocity_commands(commands, self.num_envs())?;
+        for group in 0..self.groups.len() {
+            let range = self.range(group);
+            self.groups[group].set_velocity_commands(&commands[range])?;
+        }
+        Ok(())
+    }
+
     /// Steps all groups. After an error some groups have stepped and others have not: reset all.
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
         let action_len = self.spec().action_len();

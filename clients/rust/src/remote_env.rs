@@ -39,6 +39,8 @@ pub struct RemoteVecEnv {
     pending: Option<(EnvMethod, Pending)>,
     /// True if a reply could not be read, so that the state of the environments is unknown. A reset heals it.
     is_unknown: bool,
+    /// Velocity commands, which every step request repeats.
+    velocity_commands: Option<Vec<[f32; 3]>>,
     batch: StepBatch,
 }
 
@@ -85,6 +87,7 @@ impl RemoteVecEnv {
             render: OnceLock::new(),
             pending: None,
             is_unknown: false,
+            velocity_commands: None,
             connection,
         })
     }
@@ -112,7 +115,7 @@ impl RemoteVecEnv {
             return Err(EnvError::WrongLength { field: "actions", given: actions.len(), expected });
         }
         let (epoch, seq) = (self.ticket.epoch, self.last_seq + 1);
-        let request = convert::encode_actions(actions, epoch, seq);
+        let request = convert::encode_actions(actions, self.velocity_commands.as_deref(), epoch, seq);
         self.pending = Some((EnvMethod::Step, self.connection.send(&self.step, request).map_err(remote)?));
         Ok(())
     }
@@ -221,6 +224,13 @@ impl VecEnv for RemoteVecEnv {
 
     fn critic_obs(&self) -> &[f32] {
         &self.batch.critic_obs
+    }
+
+    /// Every later step request contains the commands. A server that is older than the field ignores it.
+    fn set_velocity_commands(&mut self, commands: &[[f32; 3]]) -> Result<(), EnvError> {
+        self.spec.check_velocity_commands(commands, self.num_envs)?;
+        self.velocity_commands = Some(commands.to_vec());
+        Ok(())
     }
 
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {

@@ -208,7 +208,7 @@ fn table(args: &Args, rows: &[Row]) -> String {
 fn speed_table(evaluation: &Evaluation) -> String {
     let mut text = "First row by commanded speed:\nspeed [m/s]  share  velocity [m/s]  yaw rate [rad/s]\n".to_owned();
     for (index, SpeedBin { from, share, velocity_rms, yaw_rate_rms }) in evaluation.by_speed.iter().enumerate() {
-        let to = evaluation.by_speed.get(index + 1).map_or("".to_owned(), |next| next.from.to_string());
+        let to = evaluation.by_speed.get(index + 1).map_or(String::new(), |next| next.from.to_string());
         let range = format!("{from} to {to}");
         let _ = writeln!(text, "{range:11} {:4.0} %  {velocity_rms:.3}           {yaw_rate_rms:.3}", 100.0 * share);
     }

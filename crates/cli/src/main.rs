@@ -16,10 +16,13 @@ mod log;
 mod mjcf;
 mod play;
 mod robot_file;
+mod run;
 mod serve;
+mod status_line;
 mod train;
 mod train_config;
 mod train_log;
+mod velocity_input;
 
 use clap::{Parser, Subcommand};
 use twinstep_simd::InstructionSet;
@@ -47,6 +50,7 @@ enum CliCommand {
     Log(log::Args),
     Mjcf(mjcf::Args),
     Play(play::Args),
+    Run(run::Args),
     Serve(serve::Args),
     Train(train::Args),
 }
@@ -54,8 +58,8 @@ enum CliCommand {
 fn main() -> std::process::ExitCode {
     let command = Cli::parse().command;
     let log = match &command {
-        // Its error has the reason; Zenoh would write two lines for each attempt to connect.
-        CliCommand::List(_) => "warn,zenoh=off",
+        // Their errors have the reason; Zenoh would write two lines for each attempt to connect.
+        CliCommand::List(_) | CliCommand::Run(_) => "warn,zenoh=off",
         _ => "warn,zenoh::api::session=error,twinstep=info",
     };
     tracing_subscriber::fmt()
@@ -76,6 +80,7 @@ fn main() -> std::process::ExitCode {
         CliCommand::Log(args) => log::run(&args),
         CliCommand::Mjcf(args) => mjcf::run(&args),
         CliCommand::Play(args) => play::run(&args),
+        CliCommand::Run(args) => run::run(&args),
         CliCommand::Serve(args) => serve::run(&args),
         CliCommand::Train(args) => train::run(&args),
     });

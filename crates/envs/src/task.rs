@@ -31,6 +31,9 @@ pub trait Task: Send {
     fn velocity_command(&self, _state: &Self::State) -> Option<[f32; 3]> {
         None
     }
+
+    /// Sets the velocity command for the rest of the episode. A task with `velocity_command` in its observation has one.
+    fn set_velocity_command(&self, _state: &mut Self::State, _command: [f32; 3]) {}
 }
 
 /// One robot after a reset or a step.

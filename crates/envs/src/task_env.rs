@@ -43,6 +43,10 @@ pub struct TaskEnv<B: Backend, T: Task> {
     episodes: Vec<Episode<T::State>>,
     commands: Vec<Command>,
     active: Vec<bool>,
+    /// Velocity commands of the agent; `None` while the task has its own.
+    velocity_commands: Option<Vec<[f32; 3]>>,
+    /// Velocity commands that were set since the last step.
+    next_velocity_commands: Option<Vec<[f32; 3]>>,
     batch: StepBatch,
     /// Weighted reward terms of one step.
     terms: Vec<f32>,
@@ -69,6 +73,8 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             episodes: (0..num_envs as u64).map(not_started).collect(),
             commands: vec![command; num_envs],
             active: vec![true; num_envs],
+            velocity_commands: None,
+            next_velocity_commands: None,
             batch: StepBatch::new(num_envs, &spec),
             terms: vec![0.0; spec.reward_terms.len()],
             spec,
@@ -103,6 +109,9 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
         for env in envs {
             let Self { task, backend, randomise, robots, .. } = self;
             let start = self.episodes[*env].start(task, backend.robot(), randomise, robots.as_ref());
+            if let Some(commands) = &self.velocity_commands {
+                task.set_velocity_command(&mut self.episodes[*env].state, commands[*env]);
+            }
             self.commands[*env].q = start.q;
             let initial_state = InitialState {
                 actuator_seed: start.actuator_seed,
@@ -128,6 +137,14 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
         if !spec.critic_observation.is_empty() {
             task.observe_critic(&episode.state, &robot, row(&mut batch.critic_obs, env, spec.critic_obs_len()));
         }
+    }
+
+    /// Puts velocity commands of the agent into force.
+    fn apply_velocity_commands(&mut self, commands: Vec<[f32; 3]>) {
+        for (episode, command) in self.episodes.iter_mut().zip(&commands) {
+            self.task.set_velocity_command(&mut episode.state, *command);
+        }
+        self.velocity_commands = Some(commands);
     }
 
     /// Sets the commands of all running environments, and resets those whose episode has ended (NextStep).
@@ -243,8 +260,18 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
         &self.batch.critic_obs
     }
 
+    fn set_velocity_commands(&mut self, commands: &[[f32; 3]]) -> Result<(), EnvError> {
+        self.spec.check_velocity_commands(commands, self.num_envs())?;
+        self.next_velocity_commands = Some(commands.to_vec());
+        Ok(())
+    }
+
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
+        let velocity_commands = self.next_velocity_commands.take();
         self.check_actions(actions)?;
+        if let Some(commands) = velocity_commands {
+            self.apply_velocity_commands(commands);
+        }
         self.prepare(actions)?;
         self.push()?;
         let decimation = self.backend.robot().control.decimation;

@@ -76,7 +76,7 @@ fn number(cell: &[u8]) -> Option<f64> {
 }
 
 /// Returns the shortest text that parses to the same number; empty for NaN.
-fn shortest(value: f64) -> String {
+pub(crate) fn shortest(value: f64) -> String {
     if value.is_nan() {
         return String::new();
     }

@@ -48,6 +48,12 @@ pub enum LogError {
         /// Names of the data files.
         found: Vec<String>,
     },
+    /// The folder of a new log has files already.
+    #[error("`{folder}` is not empty\n  name a new folder: a log is not overwritten")]
+    FolderNotEmpty {
+        /// The folder.
+        folder: PathBuf,
+    },
     /// The extension of a data file is unknown.
     #[error("the format of `{file}` is unknown\n  name it *.parquet, *.csv, *.csv.gz or *.mcap")]
     UnknownFormat {

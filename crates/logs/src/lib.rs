@@ -44,6 +44,7 @@ mod files;
 mod go2_message;
 mod identifiability;
 mod log;
+mod log_writer;
 mod mcap_file;
 mod meta;
 mod missing_channels;
@@ -63,6 +64,7 @@ pub use excitation::{Excitation, SpeedSource, TorqueSource};
 pub use falls::Fall;
 pub use files::overwritten_file;
 pub use log::Log;
+pub use log_writer::LogWriter;
 pub use meta::{Gain, Meta, Segment, TorqueSensor};
 pub use summary::{
     ChannelDescription, Identifiability, IdentifiabilityLevel, LogSummary, MissingChannel, SegmentDescription, Timing,

@@ -61,6 +61,6 @@ pub use robot::{
 pub use robot_states::{GroundTruth, Measured, RobotStates, RobotStatesMut};
 pub use rollout::{HistoryStep, Precision, Rollout, RolloutRequest};
 pub use scene::{Scene, SceneShape, ShapeKind};
-pub use spec::{EnvSpec, SpecField};
+pub use spec::{EnvSpec, SpecDifference, SpecField};
 pub use stream::{Stream, standard_normal, stream};
 pub use vec_env::{AutoresetMode, EndedEpisode, EnvError, ResetRequest, StepBatch, VecEnv};

@@ -20,6 +20,15 @@ pub struct SpecField {
     pub description: String,
 }
 
+/// A quantity on which two specs do not agree.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SpecDifference {
+    /// Name of the quantity, such as `kp`.
+    pub quantity: String,
+    /// Value in each spec, as in [`EnvSpec::hash_input`].
+    pub values: [String; 2],
+}
+
 /// Specification of an environment: layouts, periods, gains and limits.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EnvSpec {
@@ -80,6 +89,29 @@ impl EnvSpec {
         entry_name(&self.action, &self.joint_order, index)
     }
 
+    /// Returns the part of the observation with this name and the index of its first entry.
+    pub fn observation_field(&self, name: &str) -> Option<(usize, &SpecField)> {
+        find_field(&self.observation, name)
+    }
+
+    /// Returns the part of the observation of group `critic` with this name and the index of its first entry.
+    pub fn critic_field(&self, name: &str) -> Option<(usize, &SpecField)> {
+        find_field(&self.critic_observation, name)
+    }
+
+    /// Returns each quantity of [`EnvSpec::hash_input`] that differs from that of `other`, one per line of the text.
+    pub fn differences(&self, other: &EnvSpec) -> Vec<SpecDifference> {
+        let (ours, theirs) = (self.hash_input(), other.hash_input());
+        let pairs = ours.lines().zip(theirs.lines()).filter(|(ours, theirs)| ours != theirs);
+        pairs
+            .map(|(ours, theirs)| {
+                let value = |line: &str| line.split_once(' ').unwrap_or_default().1.to_owned();
+                let quantity = ours.split(' ').next().unwrap_or_default().to_owned();
+                SpecDifference { quantity, values: [value(ours), value(theirs)] }
+            })
+            .collect()
+    }
+
     /// Returns the hash of all that an agent and a robot must agree on, as 32 hexadecimal digits.
     ///
     /// It covers the layouts of observation and action, joint order, policy period, gains, action scale and default pose: [`EnvSpec::hash_input`].
@@ -107,6 +139,11 @@ impl EnvSpec {
             self.action_scale,
         )
     }
+}
+
+fn find_field<'a>(fields: &'a [SpecField], name: &str) -> Option<(usize, &'a SpecField)> {
+    let index = fields.iter().position(|field| field.name == name)?;
+    Some((fields[..index].iter().map(|field| field.size).sum(), &fields[index]))
 }
 
 fn entry_name(fields: &[SpecField], joint_order: &[String], index: usize) -> String {

@@ -2,7 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{EnvSpec, Scene};
+use crate::{EnvSpec, Scene, SpecField};
+
+/// Name of the part of the observation that a client may set.
+const VELOCITY_COMMAND: &str = "velocity_command";
 
 /// Batch of environments of one task, in this process or on a server.
 ///
@@ -27,6 +30,15 @@ pub trait VecEnv: Send {
         &[]
     }
 
+    /// Replaces the velocity commands of the task: forward [m/s], left [m/s], yaw rate [rad/s], one per environment.
+    ///
+    /// They are in force from the next step on, also in later episodes, until they are set again. A step that is rejected
+    /// discards those that were set since the last step. Fails if the task has no velocity command, or if one is not
+    /// finite or outside the bounds of `velocity_command` in the spec.
+    fn set_velocity_commands(&mut self, _commands: &[[f32; 3]]) -> Result<(), EnvError> {
+        Err(EnvError::NoVelocityCommand { task: self.spec().task.clone() })
+    }
+
     /// Advances every environment by one policy period.
     ///
     /// `actions` are offsets from the default pose in units of `action_scale`, clipped to [−1, 1]. Fails if one is NaN
@@ -36,6 +48,27 @@ pub trait VecEnv: Send {
     /// Returns the current scene of environment `env` for rendering.
     fn scene(&self, _env: usize) -> Result<Scene, EnvError> {
         Err(EnvError::RenderUnsupported { task: self.spec().task.clone() })
+    }
+}
+
+impl EnvSpec {
+    /// Checks velocity commands, one per environment, against the bounds of `velocity_command`.
+    pub fn check_velocity_commands(&self, commands: &[[f32; 3]], num_envs: usize) -> Result<(), EnvError> {
+        let field = self.observation_field(VELOCITY_COMMAND).map(|(_, field)| field).filter(|field| field.size == 3);
+        let Some(SpecField { low, high, .. }) = field else {
+            return Err(EnvError::NoVelocityCommand { task: self.task.clone() });
+        };
+        if commands.len() != num_envs {
+            let (given, expected) = (3 * commands.len(), 3 * num_envs);
+            return Err(EnvError::WrongLength { field: "command", given, expected });
+        }
+        match commands.iter().flatten().enumerate().find(|(_, value)| !(*low..=*high).contains(value)) {
+            Some((index, &value)) => {
+                let (env, entry) = (index / 3, format!("{VELOCITY_COMMAND}[{}]", index % 3));
+                Err(EnvError::VelocityCommand { env, entry, value, low: *low, high: *high })
+            }
+            None => Ok(()),
+        }
     }
 }
 
@@ -171,6 +204,28 @@ pub enum EnvError {
     NeedsReset {
         /// The environment.
         env: usize,
+    },
+    /// The task has no velocity command. No environment was stepped.
+    #[error("the task `{task}` has no velocity command")]
+    NoVelocityCommand {
+        /// The task.
+        task: String,
+    },
+    /// A velocity command is not finite or too large. No environment was stepped.
+    #[error(
+        "`command` of environment {env}: {entry} is {value}; {low} to {high} is allowed; no environment was stepped"
+    )]
+    VelocityCommand {
+        /// The environment.
+        env: usize,
+        /// Name of the entry, such as `velocity_command[0]`.
+        entry: String,
+        /// Value of the entry.
+        value: f32,
+        /// Lowest allowed value.
+        low: f32,
+        /// Highest allowed value.
+        high: f32,
     },
     /// There is no such environment.
     #[error("`env` = {env} does not exist; the number of environments is {num_envs}")]

@@ -100,7 +100,7 @@ proptest! {
         let (seeds, mask) = (seeds.as_deref(), mask.as_deref());
         round_trips(&ResetRequest { protocol, epoch, seq, seeds, mask }, &mut Vec::new());
         round_trips(&ResetReply { protocol, seq, obs: &bytes, critic_obs: &bytes }, &mut Vec::new());
-        round_trips(&StepRequest { protocol, epoch, seq, actions: &bytes }, &mut Vec::new());
+        round_trips(&StepRequest { protocol, epoch, seq, actions: &bytes, command: None }, &mut Vec::new());
         round_trips(&CloseRequest { protocol, epoch, seq }, &mut Vec::new());
         round_trips(&CloseReply { protocol, seq }, &mut Vec::new());
         round_trips(&RenderRequest { protocol, epoch, env: seq }, &mut Vec::new());

@@ -17,7 +17,7 @@ use twinstep_protocol::tensor::as_bytes;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, decode, encode};
 
 /// Name of every golden file, without `.msgpack`.
-pub const NAMES: [&str; 21] = [
+pub const NAMES: [&str; 22] = [
     "hello_request",
     "hello_reply",
     "lease_request",
@@ -30,6 +30,7 @@ pub const NAMES: [&str; 21] = [
     "reset_reply",
     "reset_reply_critic",
     "step_request",
+    "step_request_command",
     "step_reply",
     "step_reply_ended",
     "step_reply_critic",
@@ -181,7 +182,10 @@ fn reset_has_its_golden_bytes() {
 #[test]
 fn step_has_its_golden_bytes() {
     let actions = [0.5f32, -0.5, 1.0, -1.0];
-    check("step_request", &StepRequest { protocol: PROTOCOL, epoch: 1, seq: 2, actions: as_bytes(&actions) });
+    let request = StepRequest { protocol: PROTOCOL, epoch: 1, seq: 2, actions: as_bytes(&actions), command: None };
+    check("step_request", &request);
+    let commands = [0.5f32, 0.0, -0.25, 0.0, 0.125, 1.0];
+    check("step_request_command", &StepRequest { command: Some(as_bytes(&commands)), ..request });
     let obs = [0.0f32, 0.0, -1.0, 0.25, -0.5, 0.0, 0.0, -1.0, 0.0, 0.125];
     let running = StepReply {
         protocol: PROTOCOL,

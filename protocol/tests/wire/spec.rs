@@ -59,7 +59,7 @@ fn tables_have_exactly_the_fields_of_the_messages() {
         ("### lease reply", "lease_reply"),
         ("### reset request", "reset_request"),
         ("### reset reply", "reset_reply_critic"),
-        ("### step request", "step_request"),
+        ("### step request", "step_request_command"),
         ("### step reply", "step_reply_critic"),
         ("### close request", "close_request"),
         ("### close reply", "close_reply"),

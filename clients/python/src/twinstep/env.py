@@ -136,6 +136,17 @@ class Go2Env(NotPicklable, gymnasium.Env[NDArray[np.float32], NDArray[np.float32
         self.send(action)
         return self.recv()
 
+    def set_velocity_command(self, command: NDArray[np.float32]) -> None:
+        """Set the velocity command of every later step and episode, in place of the task's own.
+
+        Parameters
+        ----------
+        command : (3,) float32
+            Forward [m/s], left [m/s], yaw rate [rad/s], within the bounds of ``velocity_command`` in the spec. A server
+            that is older than this command ignores it.
+        """
+        self._remote.set_velocity_commands(np.asarray(command)[None])
+
     def send(self, action: NDArray[np.float32]) -> None:
         """Send an action without waiting. Call :meth:`recv` next."""
         given = np.asarray(action)

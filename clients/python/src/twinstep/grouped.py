@@ -11,7 +11,7 @@ from .options import ConnectOptions
 from .pickling import NotPicklable
 from .remote import RemoteVecEnv
 from .shard_merge import divide, merge
-from .step import StepBatch, checked_actions
+from .step import StepBatch, checked_actions, checked_velocity_commands
 
 
 class GroupedVecEnv(NotPicklable):
@@ -127,6 +127,12 @@ class GroupedVecEnv(NotPicklable):
         ]
         self._never_seeded[given | new] = False
         return np.concatenate(obs)
+
+    def set_velocity_commands(self, commands: NDArray[Any]) -> None:
+        """Set the velocity commands of every later step, (num_envs, 3), in place of the task's own."""
+        checked = checked_velocity_commands(commands, self.num_envs, self.spec)
+        for group, rows in zip(self._groups, self._rows, strict=True):
+            group.set_velocity_commands(checked[rows])
 
     def send(self, group: int, actions: NDArray[Any]) -> None:
         """Send the actions of a group, (rows of the group, action_len), without waiting. Call :meth:`recv` next."""

@@ -20,7 +20,7 @@ from .options import UNLIMITED, ConnectOptions, server_flags
 from .pickling import NotPicklable
 from .query import Pending
 from .server import EmbeddedServer
-from .step import StepBatch, checked_actions, read_critic, read_step
+from .step import StepBatch, checked_actions, checked_velocity_commands, read_critic, read_step
 
 _CONSUMES_SEQ = ("internal",)
 
@@ -111,6 +111,7 @@ class RemoteVecEnv(NotPicklable):
         self._pending: tuple[str, int, Pending, float] | None = None
         # Why the state of the environments is unknown: a reply was lost. A reset of all of them heals it.
         self._unknown: str | None = None
+        self._commands: bytes | None = None
         self.critic_obs = np.zeros((self.num_envs, self.spec.critic_len), dtype=np.float32)
         """Observations of group ``critic`` after the last reset or step: (num_envs, critic_len)."""
 
@@ -167,6 +168,10 @@ class RemoteVecEnv(NotPicklable):
         self._unknown = then_unknown
         return obs
 
+    def set_velocity_commands(self, commands: NDArray[Any]) -> None:
+        """Set the velocity commands of every later step, (num_envs, 3), in place of the task's own."""
+        self._commands = checked_velocity_commands(commands, self.num_envs, self.spec).tobytes()
+
     def send(self, actions: NDArray[Any]) -> None:
         """Send actions without waiting, so that the caller can compute during the step. Call :meth:`recv` next."""
         if self._pending is not None:
@@ -175,7 +180,10 @@ class RemoteVecEnv(NotPicklable):
                 "  call `recv` to wait for it, or `reset` to wait and start new episodes"
             )
         self._check_known()
-        self._send("step", {"actions": checked_actions(actions, self.num_envs, self.spec).tobytes()})
+        request: dict[str, object] = {"actions": checked_actions(actions, self.num_envs, self.spec).tobytes()}
+        if self._commands is not None:
+            request["command"] = self._commands
+        self._send("step", request)
 
     def recv(self, timeout_s: float | None = None) -> StepBatch:
         """Wait for the result of the actions. May be called again after a :class:`RequestTimeoutError`.

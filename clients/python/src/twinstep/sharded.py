@@ -18,7 +18,7 @@ from .remote import RemoteVecEnv
 from .session import QUERY_TIMEOUT_S, check_process
 from .shard import Shard, same_spec, server_options, stop_recoveries
 from .shard_merge import divide, merge
-from .step import StepBatch, checked_actions
+from .step import StepBatch, checked_actions, checked_velocity_commands
 
 _LOG = logging.getLogger(__name__)
 
@@ -82,6 +82,7 @@ class ShardedVecEnv(NotPicklable):
             self.close()
             raise
         self._actions: NDArray[np.float32] | None = None
+        self._commands: NDArray[np.float32] | None = None
         self._sent_at = 0.0
         self._obs = np.zeros((num_envs, self.spec.obs_len), np.float32)
         self.critic_obs = np.zeros((num_envs, self.spec.critic_len), np.float32)
@@ -127,6 +128,10 @@ class ShardedVecEnv(NotPicklable):
             if shard.remote is not None and shard not in started and chosen[shard.rows].any():
                 self._reset_shard(shard, chosen[shard.rows])
         return self._obs.copy()
+
+    def set_velocity_commands(self, commands: NDArray[Any]) -> None:
+        """Set the velocity commands of every later step, (num_envs, 3), in place of the task's own."""
+        self._commands = checked_velocity_commands(commands, self.num_envs, self.spec)
 
     def send(self, actions: NDArray[Any]) -> None:
         """Send actions to all servers without waiting. Call :meth:`recv` next."""
@@ -204,6 +209,9 @@ class ShardedVecEnv(NotPicklable):
                 # Before it is sent: after an interrupt no step is executed twice, but these may be held for a step.
                 shard.sent = True
                 try:
+                    # Another server may have taken over the environments since they were set.
+                    if self._commands is not None:
+                        shard.remote.set_velocity_commands(self._commands[shard.rows])
                     shard.remote.send(self._actions[shard.rows])
                 except ForkedProcessError:
                     raise

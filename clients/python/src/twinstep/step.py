@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import codec
-from .errors import InvalidActionError
+from .errors import InvalidActionError, InvalidOptionError
 
 
 @dataclass
@@ -72,6 +72,25 @@ def checked_actions(actions: NDArray[Any], num_envs: int, spec: codec.Spec) -> N
         raise InvalidActionError(
             f"the action of environment {env}, {spec.action_entry(entry)}, is {checked[env, entry]}\n"
             "  nothing was stepped; check the policy that computed the action"
+        )
+    return checked
+
+
+def checked_velocity_commands(commands: NDArray[Any], num_envs: int, spec: codec.Spec) -> NDArray[np.float32]:
+    """Return velocity commands, (num_envs, 3) within the bounds of the spec, as contiguous little-endian float32."""
+    parts = [part for part in spec.observation if part.name == "velocity_command" and part.size == 3]
+    if not parts:
+        raise InvalidOptionError(f"the task `{spec.task}` has no velocity command")
+    checked = np.ascontiguousarray(commands, dtype="<f4")
+    if checked.shape != (num_envs, 3):
+        raise InvalidOptionError(f"`commands` has shape {checked.shape}; {(num_envs, 3)} is expected")
+    low, high = parts[0].low, parts[0].high
+    allowed = (checked >= low) & (checked <= high)
+    if not allowed.all():
+        env, entry = (int(index) for index in np.argwhere(~allowed)[0])
+        raise InvalidOptionError(
+            f"`commands` of environment {env}: velocity_command[{entry}] is {checked[env, entry]}; "
+            f"{low:g} to {high:g} is allowed"
         )
     return checked
 

@@ -138,6 +138,17 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
         self.send(actions)
         return self.recv()
 
+    def set_velocity_commands(self, commands: NDArray[np.float32]) -> None:
+        """Set the velocity commands of every later step and episode, in place of the task's own.
+
+        Parameters
+        ----------
+        commands : (num_envs, 3) float32
+            Forward [m/s], left [m/s], yaw rate [rad/s], within the bounds of ``velocity_command`` in the spec. A server
+            that is older than these commands ignores them.
+        """
+        self._remote.set_velocity_commands(commands)
+
     def send(self, actions: NDArray[np.float32]) -> None:
         """Send actions without waiting, so that the caller can compute during the step. Call :meth:`recv` next."""
         self._remote.send(actions)

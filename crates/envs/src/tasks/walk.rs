@@ -36,8 +36,8 @@ pub struct Walk {
 pub struct WalkState {
     /// Velocity command: forward [m/s], left [m/s], yaw rate [rad/s].
     command: [f32; 3],
-    /// Policy steps until the next command.
-    steps_to_command: u32,
+    /// Policy steps until the next command; `None` if the agent sets it.
+    steps_to_command: Option<u32>,
     contacts: FootContacts,
 }
 
@@ -132,7 +132,7 @@ impl Task for Walk {
         let q = self.default_pose.map(|position| position + (2.0 * noise * random.random::<f32>() - noise));
         let command = self.draw_command(random);
         // The first command is shorter, so that robots that start together do not change their commands together.
-        let steps_to_command = random.random_range(1..=self.resample_steps);
+        let steps_to_command = Some(random.random_range(1..=self.resample_steps));
         (q, WalkState { command, steps_to_command, contacts: FootContacts::default() })
     }
 
@@ -155,15 +155,19 @@ impl Task for Walk {
         for (term, index) in terms.iter_mut().zip(&self.terms) {
             *term = values[*index];
         }
-        state.steps_to_command = state.steps_to_command.saturating_sub(1);
-        if state.steps_to_command == 0 {
-            (state.command, state.steps_to_command) = (self.draw_command(random), self.resample_steps);
+        state.steps_to_command = state.steps_to_command.map(|steps| steps.saturating_sub(1));
+        if state.steps_to_command == Some(0) {
+            (state.command, state.steps_to_command) = (self.draw_command(random), Some(self.resample_steps));
         }
         is_terminated
     }
 
     fn velocity_command(&self, state: &WalkState) -> Option<[f32; 3]> {
         Some(state.command)
+    }
+
+    fn set_velocity_command(&self, state: &mut WalkState, command: [f32; 3]) {
+        (state.command, state.steps_to_command) = (command, None);
     }
 }
 

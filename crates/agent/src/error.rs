@@ -1,0 +1,124 @@
+//! Errors of an agent.
+
+use std::path::PathBuf;
+
+use twinstep_logs::LogError;
+use twinstep_model::{EnvError, SpecDifference};
+use twinstep_policy::array_file::ArrayFileError;
+
+use crate::onnx::OnnxError;
+
+/// Reasons why a policy cannot run.
+#[derive(Debug, thiserror::Error)]
+pub enum AgentError {
+    /// The extension of the policy is unknown.
+    #[error("`{}` is neither *.safetensors nor *.onnx", path.display())]
+    UnknownFormat {
+        /// The policy.
+        path: PathBuf,
+    },
+    /// The policy file cannot be read.
+    #[error(transparent)]
+    PolicyFile(#[from] ArrayFileError),
+    /// The ONNX file cannot be read or evaluated.
+    #[error(transparent)]
+    Onnx(#[from] OnnxError),
+    /// An ONNX file of another program was given without a mapping.
+    #[error(
+        "{} has no `spec` in its metadata, as the files of `twinstep train` have\n  say with --mapping FILE how its observation \
+         and action are made (docs/run.md)",
+        path.display()
+    )]
+    NoMapping {
+        /// The policy.
+        path: PathBuf,
+    },
+    /// A mapping was given for a policy of `twinstep train`.
+    #[error("{} has its own spec; a mapping is for policies of other programs\n  leave --mapping out", path.display())]
+    UnusedMapping {
+        /// The policy.
+        path: PathBuf,
+    },
+    /// The `spec` in the metadata of an ONNX file is invalid.
+    #[error("{} has an invalid `spec` in its metadata: {reason}", path.display())]
+    Spec {
+        /// The policy.
+        path: PathBuf,
+        /// The reason.
+        reason: String,
+    },
+    /// The mapping cannot be read.
+    #[error("mapping {}: {reason}", path.display())]
+    Mapping {
+        /// The mapping.
+        path: PathBuf,
+        /// What is wrong, where, and what is allowed.
+        reason: String,
+    },
+    /// Policy and endpoint do not agree. No action was sent.
+    #[error("policy and endpoint do not agree; no action was sent\n{}\n  {hint}", lines(differences))]
+    Disagreement {
+        /// Every difference; the first value is that of the policy.
+        differences: Vec<SpecDifference>,
+        /// How to make them agree.
+        hint: String,
+    },
+    /// The endpoint does not have a part of the observation.
+    #[error(
+        "the policy observes `{term}`, which this endpoint does not give\n  its observations are {available}\n  {hint}"
+    )]
+    MissingObservation {
+        /// Name of the term.
+        term: String,
+        /// What the endpoint gives.
+        available: String,
+        /// What to do.
+        hint: &'static str,
+    },
+    /// The network has another number of inputs or outputs than expected.
+    #[error("the network has {given} {what}; {expected} are expected\n  {hint}")]
+    NetworkSize {
+        /// `inputs` or `outputs`.
+        what: &'static str,
+        /// Number in the network.
+        given: usize,
+        /// Expected number.
+        expected: usize,
+        /// How the expected number is made up.
+        hint: String,
+    },
+    /// The policy computed NaN or an infinite number. It was not sent.
+    #[error("the policy's action for {joint} is {value} after {steps} steps; it was not sent")]
+    NotFinite {
+        /// The joint.
+        joint: String,
+        /// The value.
+        value: f32,
+        /// Number of steps so far.
+        steps: u64,
+    },
+    /// The server is older than velocity commands.
+    #[error(
+        "the endpoint ignores velocity commands: it observes {observed:?} instead of {wanted:?}\n  its server is older than \
+         the field `command`; run without a velocity, or install the same Twinstep at both ends"
+    )]
+    CommandIgnored {
+        /// Velocity command in the observation.
+        observed: [f32; 3],
+        /// Velocity command that was sent.
+        wanted: [f32; 3],
+    },
+    /// The log cannot be written.
+    #[error(transparent)]
+    Log(#[from] LogError),
+    /// The robot or the connection failed.
+    #[error(transparent)]
+    Env(#[from] EnvError),
+}
+
+fn lines(differences: &[SpecDifference]) -> String {
+    let line = |SpecDifference { quantity, values: [policy, endpoint] }: &SpecDifference| {
+        format!("  {quantity}: the policy has {policy}, the endpoint {endpoint}")
+    };
+    differences.iter().map(line).collect::<Vec<_>>().join("\n")
+}

@@ -1,0 +1,30 @@
+//! Runs policies of any source on a robot, simulated or real, and records a log.
+//!
+//! - [`LoadedPolicy`]: a policy file, an ONNX file of `twinstep train`, or an ONNX file of another program with its
+//!   [`Mapping`]. [`LoadedPolicy::bind`] compares it with the robot; a [`BoundPolicy`] computes actions.
+//! - [`run`]: steps one robot with the actions of a policy, in real time. [`Recorder`] writes the log.
+//! - [`OnnxNetwork`]: an ONNX file with one observation as input.
+//!
+//! A *mapping* says how the observation and the action of a policy are made from those of Twinstep: order of the joints,
+//! scales, default pose, history.
+
+mod error;
+mod history;
+mod mapped_policy;
+mod mapping;
+mod onnx;
+mod pacer;
+mod policy;
+mod policy_input;
+mod recorder;
+mod run;
+mod summary;
+
+pub use error::AgentError;
+pub use mapping::{History, HistoryLayout, HistoryOrder, Mapping, Numbers, Term, TermName};
+pub use onnx::{OnnxError, OnnxNetwork};
+pub use policy::{BoundPolicy, LoadedPolicy};
+pub use policy_input::PolicyInput;
+pub use recorder::Recorder;
+pub use run::{Control, RunPlan, Status, run};
+pub use summary::{RunSummary, Spread};

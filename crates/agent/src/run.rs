@@ -1,0 +1,224 @@
+//! Runs a policy on one robot.
+
+use std::time::{Duration, Instant};
+
+use twinstep_model::{EnvError, EnvSpec, ResetRequest, VecEnv};
+
+use crate::error::AgentError;
+use crate::pacer::Pacer;
+use crate::policy::BoundPolicy;
+use crate::policy_input::PolicyInput;
+use crate::recorder::Recorder;
+use crate::summary::{RunSummary, Sums};
+
+/// What to run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RunPlan {
+    /// Time of the policy after which the run ends [s]. Default: never.
+    pub seconds: Option<f64>,
+    /// True to begin a step every policy period; false to step as fast as the robot answers.
+    pub real_time: bool,
+    /// Seed of the robot's random numbers.
+    pub seed: u64,
+}
+
+/// What to do in the next step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Control {
+    /// Step with this velocity command: forward [m/s], left [m/s], yaw rate [rad/s]. `None`: the endpoint's own.
+    Step(Option<[f32; 3]>),
+    /// End the run.
+    End,
+}
+
+/// State of a run before a step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Status {
+    /// Time of the policy so far [s].
+    pub seconds: f64,
+    /// Velocity command in force; `None` if the endpoint has none.
+    pub command: Option<[f32; 3]>,
+    /// Velocity in the base frame: forward [m/s], left [m/s], yaw rate [rad/s]. `None` on a real robot.
+    pub velocity: Option<[f32; 3]>,
+    /// Number of falls so far.
+    pub falls: u64,
+    /// Time of the last step [s].
+    pub step_time: f64,
+    /// Lateness of the last step [s].
+    pub lateness: f64,
+}
+
+/// Parts of the observation that a run reads.
+#[derive(Clone, Copy)]
+struct Layout {
+    command: Option<usize>,
+    yaw_rate: Option<usize>,
+    /// In group `critic`.
+    velocity: Option<usize>,
+}
+
+impl Layout {
+    fn new(spec: &EnvSpec) -> Self {
+        let vector = |field: Option<(usize, &twinstep_model::SpecField)>| {
+            field.filter(|(_, field)| field.size == 3).map(|(start, _)| start)
+        };
+        Self {
+            command: vector(spec.observation_field("velocity_command")),
+            yaw_rate: vector(spec.observation_field("base_angular_velocity")).map(|start| start + 2),
+            velocity: vector(spec.critic_field("true_linear_velocity")),
+        }
+    }
+
+    /// Returns the velocity in the base frame, with the yaw rate of the gyroscope.
+    fn velocity(self, obs: &[f32], critic_obs: &[f32]) -> Option<[f32; 3]> {
+        let (linear, yaw_rate) = (self.velocity?, self.yaw_rate?);
+        Some([critic_obs[linear], critic_obs[linear + 1], obs[yaw_rate]])
+    }
+}
+
+/// Steps robot 0 of `env`, which must have one robot and [`twinstep_model::AutoresetMode::Disabled`].
+///
+/// `control` is called before every step. After a fall the robot is reset and the run goes on. If it fails, the rows of all
+/// executed steps are in the log.
+pub fn run(
+    env: &mut dyn VecEnv,
+    policy: &mut BoundPolicy,
+    mut recorder: Option<&mut Recorder>,
+    plan: RunPlan,
+    control: &mut dyn FnMut(&Status) -> Control,
+) -> Result<RunSummary, AgentError> {
+    let spec = env.spec().clone();
+    let layout = Layout::new(&spec);
+    let mut agent = Agent { layout, obs: Vec::new(), critic_obs: Vec::new(), episode: 0, time_steps: 0 };
+    agent.reset(env, policy, &ResetRequest::seeded(plan.seed, 1))?;
+    let (mut sums, mut step_time, mut lateness) = (Sums::default(), 0.0, 0.0);
+    let mut pacer = Pacer::new(Duration::from_secs_f64(spec.policy_dt));
+    loop {
+        let seconds = sums.steps as f64 * spec.policy_dt;
+        // Half a period of tolerance for the rounding of the product.
+        if plan.seconds.is_some_and(|end| seconds + 0.5 * spec.policy_dt >= end) {
+            break;
+        }
+        let (command, velocity) = (agent.command(), layout.velocity(&agent.obs, &agent.critic_obs));
+        let status = Status { seconds, command, velocity, falls: sums.falls, step_time, lateness };
+        let Control::Step(wanted) = control(&status) else { break };
+        if let Some(recorder) = &mut recorder {
+            agent.observe(env, recorder, &spec)?;
+        }
+        let action = agent.action(policy, wanted, &spec, &mut sums)?;
+        if plan.real_time {
+            lateness = pacer.wait().as_secs_f64();
+        }
+        let start = Instant::now();
+        let ended = agent.step(env, wanted, &action, &mut sums)?;
+        step_time = start.elapsed().as_secs_f64();
+        sums.add_times(step_time, lateness);
+        agent.check_command(wanted, sums.steps)?;
+        if let Some(recorder) = &mut recorder {
+            recorder.write(&action)?;
+        }
+        if ended {
+            agent.reset(env, policy, &ResetRequest::default())?;
+        }
+    }
+    let rows = recorder.map_or(0, |recorder| recorder.rows());
+    Ok(sums.summary(spec.policy_dt, layout.command.is_some(), layout.velocity.is_some(), rows))
+}
+
+/// What the agent observes.
+struct Agent {
+    layout: Layout,
+    obs: Vec<f32>,
+    critic_obs: Vec<f32>,
+    episode: u64,
+    /// Policy periods since the start, with one for each reset.
+    time_steps: u64,
+}
+
+impl Agent {
+    fn reset(
+        &mut self,
+        env: &mut dyn VecEnv,
+        policy: &mut BoundPolicy,
+        request: &ResetRequest,
+    ) -> Result<(), EnvError> {
+        self.obs = env.reset(request)?.to_vec();
+        self.critic_obs = env.critic_obs().to_vec();
+        policy.reset();
+        Ok(())
+    }
+
+    /// Returns the velocity command in the observation.
+    fn command(&self) -> Option<[f32; 3]> {
+        self.layout.command.map(|start| [self.obs[start], self.obs[start + 1], self.obs[start + 2]])
+    }
+
+    /// Gives the measurements of this moment to the recorder.
+    fn observe(&self, env: &dyn VecEnv, recorder: &mut Recorder, spec: &EnvSpec) -> Result<(), EnvError> {
+        let pose = if recorder.has_orientation() { env.scene(0)?.pose.first().copied() } else { None };
+        let t = self.time_steps as f64 * spec.policy_dt;
+        recorder.observe(t, self.episode, &self.obs, &self.critic_obs, pose);
+        Ok(())
+    }
+
+    /// Returns the action, clipped to [−1, 1]. The policy observes the command that is wanted now.
+    fn action(
+        &mut self,
+        policy: &mut BoundPolicy,
+        wanted: Option<[f32; 3]>,
+        spec: &EnvSpec,
+        sums: &mut Sums,
+    ) -> Result<Vec<f32>, AgentError> {
+        if let (Some(start), Some(wanted)) = (self.layout.command, wanted) {
+            self.obs[start..start + 3].copy_from_slice(&wanted);
+        }
+        let action = policy.action(&PolicyInput { obs: &self.obs, critic_obs: &self.critic_obs })?;
+        if let Some(index) = action.iter().position(|value| !value.is_finite()) {
+            let joint = spec.action_entry(index);
+            return Err(AgentError::NotFinite { joint, value: action[index], steps: sums.steps });
+        }
+        let clipped = action.iter().filter(|value| value.abs() > 1.0).count();
+        sums.clipped[0] += clipped as u64;
+        sums.clipped[1] += action.len() as u64;
+        Ok(action.iter().map(|value| value.clamp(-1.0, 1.0)).collect())
+    }
+
+    /// Steps the robot. Returns true if the episode ended.
+    fn step(
+        &mut self,
+        env: &mut dyn VecEnv,
+        wanted: Option<[f32; 3]>,
+        action: &[f32],
+        sums: &mut Sums,
+    ) -> Result<bool, AgentError> {
+        if let Some(wanted) = wanted {
+            env.set_velocity_commands(&[wanted])?;
+        }
+        let command = self.command();
+        let batch = env.step(action)?;
+        (self.obs, self.critic_obs) = (batch.obs.clone(), batch.critic_obs.clone());
+        sums.steps += 1;
+        self.time_steps += 1;
+        sums.falls += u64::from(batch.terminated[0]);
+        sums.diverged += batch.ended.iter().filter(|episode| episode.diverged).count() as u64;
+        let velocity = self.layout.velocity(&self.obs, &self.critic_obs);
+        let yaw_rate = self.layout.yaw_rate.map_or(0.0, |entry| self.obs[entry]);
+        sums.add_motion(command.unwrap_or_default(), velocity.unwrap_or([0.0, 0.0, yaw_rate]));
+        let ended = batch.done(0);
+        if ended {
+            self.episode += 1;
+            self.time_steps += 1;
+        }
+        Ok(ended)
+    }
+
+    /// Checks after the first step that the endpoint uses the commands that it gets.
+    fn check_command(&self, wanted: Option<[f32; 3]>, steps: u64) -> Result<(), AgentError> {
+        match (self.command(), wanted) {
+            (Some(observed), Some(wanted)) if steps == 1 && observed != wanted => {
+                Err(AgentError::CommandIgnored { observed, wanted })
+            }
+            _ => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,243 @@
+//! `twinstep run`: runs a policy on a robot and records a log.
+
+use std::path::PathBuf;
+
+use serde::Serialize;
+use twinstep_agent::{
+    AgentError, BoundPolicy, Control, LoadedPolicy, Recorder, RunPlan, RunSummary, Status, run as run_policy,
+};
+use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
+
+use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::status_line::StatusLine;
+use crate::velocity_input::VelocityInput;
+
+/// Run a policy on a robot, simulated or real, and record a log.
+///
+/// POLICY is a policy of `twinstep train` (policy.safetensors or policy.onnx), or the ONNX file of another program with a
+/// mapping: order of the joints, scales, default pose, history (docs/run.md). Before the first action it is compared with
+/// the robot: observations, gains, rates, default pose. If they differ, nothing is sent.
+///
+/// Steps follow real time. After a fall the robot is reset and the run goes on. It ends after --seconds, with q or Esc on
+/// the keyboard, or with Ctrl-C. The log in DIR (docs/logs.md) has the rate of the policy, and a row for every executed step
+/// however the run ends.
+///
+/// Keys: W S or up down: forward, backward; A D: left, right; left right: turn; space: stop; q or Esc: end.
+/// Gamepad: left stick forward, backward, left, right; right stick: turn.
+///
+/// Examples: `twinstep run data/policies/walk.safetensors --velocity 0.5,0,0 --seconds 20 --log walk` and
+/// `twinstep run policy.onnx --mapping data/policies/mappings/isaaclab_go2_flat.toml --keyboard`
+#[derive(clap::Args)]
+pub struct Args {
+    /// Policy: *.safetensors or *.onnx.
+    policy: PathBuf,
+    /// Mapping of the ONNX file of another program (TOML).
+    #[arg(long, value_name = "FILE")]
+    mapping: Option<PathBuf>,
+    /// Zenoh endpoint of the robot or of a server.
+    #[arg(long, value_name = "ENDPOINT", default_value = "tcp/127.0.0.1:7447")]
+    endpoint: String,
+    /// Name of the robot, if several are visible.
+    #[arg(long, value_name = "NAME")]
+    robot: Option<String>,
+    /// Zenoh configuration file (JSON5) for TLS, user and password.
+    #[arg(long, value_name = "FILE")]
+    zenoh: Option<PathBuf>,
+    /// Folder of the log, which must not exist or be empty. Default: no log.
+    #[arg(long, value_name = "DIR")]
+    log: Option<PathBuf>,
+    /// Constant velocity command: forward [m/s], left [m/s], yaw rate [rad/s]. Default: the endpoint's own commands.
+    #[arg(long, value_name = "VX,VY,WZ", value_parser = velocity, allow_hyphen_values = true)]
+    velocity: Option<[f32; 3]>,
+    /// Take the velocity command from the keyboard.
+    #[arg(long, conflicts_with = "velocity")]
+    keyboard: bool,
+    /// Take the velocity command from a gamepad. Default device: /dev/input/js0.
+    #[arg(long, value_name = "DEVICE", num_args = 0..=1, default_missing_value = "/dev/input/js0", conflicts_with_all = ["velocity", "keyboard"])]
+    gamepad: Option<PathBuf>,
+    /// Time after which the run ends [s]. Default: when it is ended.
+    #[arg(long, value_name = "S", allow_negative_numbers = true)]
+    seconds: Option<f64>,
+    /// Step as fast as the endpoint answers. Default: in real time.
+    #[arg(long)]
+    fast: bool,
+    /// Seed of the robot's random numbers: initial pose, own commands.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Print the summary as one JSON object on stdout.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Output of `--json`.
+#[derive(Serialize)]
+struct Report<'a> {
+    policy: &'a PathBuf,
+    endpoint: &'a str,
+    robot: &'a str,
+    task: &'a str,
+    #[serde(flatten)]
+    summary: &'a RunSummary,
+}
+
+/// Source of the velocity command.
+enum Velocity {
+    Endpoint,
+    Constant([f32; 3]),
+    Person(VelocityInput),
+}
+
+/// Runs the policy.
+pub fn run(args: &Args) -> CommandResult {
+    let signals = Signals::listen()?;
+    if let Some(seconds) = args.seconds.filter(|seconds| !(seconds.is_finite() && *seconds > 0.0)) {
+        return Err(Failure::Input(miette::miette!("`--seconds` = {seconds} is not allowed: it must be positive")));
+    }
+    let loaded = LoadedPolicy::read(&args.policy, args.mapping.as_deref()).map_err(input)?;
+    let mut env = RemoteVecEnv::connect(&args.options()).map_err(other)?;
+    let mut policy = loaded.bind(env.spec()).map_err(input)?;
+    if let Some(velocity) = args.velocity {
+        env.set_velocity_commands(&[velocity]).map_err(input)?;
+    }
+    let mut recorder = args.recorder(&mut env)?;
+    let velocity = args.velocity_source()?;
+    let result = args.steps(&mut env, &mut policy, recorder.as_mut(), &velocity, &signals);
+    let device_failure = if let Velocity::Person(device) = &velocity { device.failure() } else { None };
+    // Restores the terminal before anything is printed.
+    drop(velocity);
+    if let (Some(folder), Some(recorder)) = (&args.log, &recorder) {
+        eprintln!("{} rows in {}", recorder.rows(), folder.display());
+    }
+    let summary = result.map_err(other)?;
+    // Its error is of no interest any more: the run is complete.
+    let (robot, task) = (env.spec().robot.clone(), env.spec().task.clone());
+    let _ = env.close();
+    if let Some(reason) = device_failure {
+        return Err(Failure::Other(miette::Report::msg(reason)));
+    }
+    if args.seconds.is_some() {
+        // Ctrl-C before the end is an interruption; without --seconds it is the end.
+        signals.check()?;
+    }
+    if args.json {
+        let report =
+            Report { policy: &args.policy, endpoint: &args.endpoint, robot: &robot, task: &task, summary: &summary };
+        println!("{}", serde_json::to_string(&report).map_err(other)?);
+    } else {
+        print!("{}", summary_text(&summary));
+    }
+    Ok(())
+}
+
+impl Args {
+    fn options(&self) -> ConnectOptions {
+        ConnectOptions {
+            robot: self.robot.clone(),
+            zenoh: self.zenoh.clone(),
+            autoreset: AutoresetMode::Disabled,
+            // No time limit: SPEC.md.
+            max_episode_steps: Some(u32::MAX),
+            critic: true,
+            ..ConnectOptions::new(self.endpoint.as_str(), 1)
+        }
+    }
+
+    fn recorder(&self, env: &mut RemoteVecEnv) -> Result<Option<Recorder>, Failure> {
+        let Some(folder) = &self.log else { return Ok(None) };
+        env.reset(&ResetRequest::seeded(self.seed, 1)).map_err(other)?;
+        let has_scene = match env.scene(0) {
+            Ok(_) => true,
+            Err(error) => {
+                eprintln!("the log has no orientation, because the endpoint gives no scene: {error}");
+                false
+            }
+        };
+        let (policy, spec) = (self.policy.display(), env.spec());
+        let source = format!("twinstep run {policy} on `{}`, task `{}`, at {}", spec.robot, spec.task, self.endpoint);
+        Recorder::create(folder, spec, has_scene, &source).map(Some).map_err(input)
+    }
+
+    fn velocity_source(&self) -> Result<Velocity, Failure> {
+        Ok(match (&self.velocity, &self.gamepad) {
+            (Some(velocity), _) => Velocity::Constant(*velocity),
+            (None, Some(device)) => Velocity::Person(VelocityInput::gamepad(device)?),
+            (None, None) if self.keyboard => Velocity::Person(VelocityInput::keyboard()?),
+            (None, None) => Velocity::Endpoint,
+        })
+    }
+
+    fn steps(
+        &self,
+        env: &mut RemoteVecEnv,
+        policy: &mut BoundPolicy,
+        recorder: Option<&mut Recorder>,
+        velocity: &Velocity,
+        signals: &Signals,
+    ) -> Result<RunSummary, AgentError> {
+        let (mut line, mut falls) = (StatusLine::new(), 0);
+        let plan = RunPlan { seconds: self.seconds, real_time: !self.fast, seed: self.seed };
+        let mut control = |status: &Status| {
+            if status.falls > falls {
+                falls = status.falls;
+                line.message(&format!("{:.2} s: the robot has fallen and is reset", status.seconds));
+            }
+            line.show(|| status_text(status));
+            if !matches!(signals.check(), Ok(false)) {
+                return Control::End;
+            }
+            match velocity {
+                Velocity::Endpoint => Control::Step(None),
+                Velocity::Constant(command) => Control::Step(Some(*command)),
+                Velocity::Person(device) => {
+                    device.command().map_or(Control::End, |command| Control::Step(Some(command)))
+                }
+            }
+        };
+        let result = run_policy(env, policy, recorder, plan, &mut control);
+        line.clear();
+        result
+    }
+}
+
+/// Parses `VX,VY,WZ`.
+fn velocity(text: &str) -> Result<[f32; 3], String> {
+    let numbers: Result<Vec<f32>, _> = text.split(',').map(|number| number.trim().parse()).collect();
+    numbers.ok().and_then(|numbers| <[f32; 3]>::try_from(numbers).ok()).ok_or_else(|| {
+        "three numbers are expected: forward [m/s], left [m/s], yaw rate [rad/s], such as 0.5,0,0".to_owned()
+    })
+}
+
+fn status_text(status: &Status) -> String {
+    let vector = |name: &str, value: Option<[f32; 3]>| {
+        value.map_or_else(String::new, |[x, y, yaw]| format!("{name} {x:+.2} {y:+.2} m/s {yaw:+.2} rad/s   "))
+    };
+    format!(
+        "{:7.2} s   {}{}falls {}   step {:.1} ms, late {:.1} ms",
+        status.seconds,
+        vector("command", status.command),
+        vector("is", status.velocity),
+        status.falls,
+        1e3 * status.step_time,
+        1e3 * status.lateness
+    )
+}
+
+/// Returns the summary for people.
+fn summary_text(summary: &RunSummary) -> String {
+    let RunSummary { seconds, steps, falls, step_time, lateness, .. } = summary;
+    let mut lines = vec![format!("{seconds:.2} s, {steps} steps, {falls} falls")];
+    if summary.diverged > 0 {
+        lines.push(format!("{} episodes ended with a simulation that became NaN or infinite", summary.diverged));
+    }
+    for (name, value) in [("command ", summary.mean_command), ("velocity", summary.mean_velocity)] {
+        lines.extend(value.map(|[x, y, yaw]| format!("mean {name}   {x:+.3}, {y:+.3} m/s, {yaw:+.3} rad/s")));
+    }
+    if let (Some(velocity), Some(yaw_rate)) = (summary.velocity_rms, summary.yaw_rate_rms) {
+        lines.push(format!("RMS error       {velocity:.3} m/s, {yaw_rate:.3} rad/s"));
+    }
+    lines.push(format!("step time       {:.2} ms, at most {:.2} ms", step_time.mean_ms, step_time.max_ms));
+    lines.push(format!("lateness        {:.2} ms, at most {:.2} ms", lateness.mean_ms, lateness.max_ms));
+    lines.push(format!("clipped actions {:.2} %", 100.0 * summary.clipped_share));
+    lines.join("\n") + "\n"
+}
