@@ -22,8 +22,8 @@ const MAY_USE: [(&str, &[&str]); 21] = [
     ("crates/session", &[]),
     ("ensemble", &["simd", "model", "effects", "logs"]),
     // Applications.
-    ("env-server", &["model", "effects", "protocol", "session", "sim", "envs", "ensemble"]),
-    ("clients/rust", &["model", "protocol", "session"]),
+    ("env-server", &["model", "effects", "protocol", "session", "sim", "envs", "ensemble", "policy"]),
+    ("clients/rust", &["model", "protocol", "session", "policy"]),
     ("crates/report", &["model", "effects", "logs", "sim", "identify", "diagnose"]),
     ("crates/hunt", &["model", "effects", "logs", "sim", "identify", "diagnose"]),
     (

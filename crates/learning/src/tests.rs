@@ -5,6 +5,8 @@ use twinstep_model::{
     AutoresetMode, EndedEpisode, EnvError, EnvSpec, ResetRequest, SpecField, StepBatch, Stream, VecEnv, stream,
 };
 
+use twinstep_policy::{Collector, StepCollector};
+
 use crate::{Learner, LearningError, PpoConfig, Trainer};
 
 /// State of one environment of a small task.
@@ -152,6 +154,10 @@ impl<T: ToyTask> VecEnv for ToyEnv<T> {
         Ok(&self.obs)
     }
 
+    fn obs(&self) -> &[f32] {
+        &self.obs
+    }
+
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
         self.batch.ended.clear();
         self.steps += 1;
@@ -193,8 +199,9 @@ fn config() -> PpoConfig {
     }
 }
 
-fn envs<T: ToyTask>(config: &PpoConfig) -> Vec<Box<dyn VecEnv>> {
-    (0..config.groups).map(|_| ToyEnv::<T>::boxed(config.num_envs / config.groups, None)).collect()
+fn envs<T: ToyTask>(config: &PpoConfig) -> Vec<Box<dyn Collector>> {
+    let env = |_| ToyEnv::<T>::boxed(config.num_envs / config.groups, None);
+    (0..config.groups).map(env).map(|env| Box::new(StepCollector(env)) as Box<dyn Collector>).collect()
 }
 
 /// Returns the mean reward per step of the last of `iterations` iterations.
@@ -250,7 +257,7 @@ fn equal_seeds_give_equal_bits_on_any_number_of_threads() {
 fn nan_ends_the_training_with_the_last_good_policy() {
     let config = PpoConfig { groups: 1, ..config() };
     let env = ToyEnv::<Pendulum>::boxed(config.num_envs, Some(3 * config.horizon as u64 + 5));
-    let mut trainer = Trainer::new(config, vec![env], None, 1).expect("valid");
+    let mut trainer = Trainer::new(config, vec![Box::new(StepCollector(env))], None, 1).expect("valid");
     for _ in 0..3 {
         trainer.iterate().expect("finite");
     }
