@@ -102,7 +102,7 @@ impl Dispatcher {
         }
         if self.state.max_rollout_steps == 0 {
             let error = ErrorReply::new(ErrorCode::UnknownKey, "", "this server has no rollouts");
-            return Err(error.with_hint("use step, or start the server with `max_rollout_steps` above 0"));
+            return Err(error.with_hint("use step, or start the server with `--max-rollout-steps` above 0"));
         }
         Ok(MAX_ROLLOUT_REQUEST_BYTES)
     }

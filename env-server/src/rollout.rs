@@ -47,22 +47,22 @@ pub fn run(
 
 /// Checks the number of steps, and that episodes are restarted by the environments.
 fn check_steps(steps: u64, env: &dyn VecEnv, limit: usize) -> Result<usize, ErrorReply> {
-    let reject = |field, message: String, hint| {
-        Err(ErrorReply::new(ErrorCode::OutOfRange, field, message).with_hint(hint))
-    };
+    let reject =
+        |field, message: String, hint| Err(ErrorReply::new(ErrorCode::OutOfRange, field, message).with_hint(hint));
     if env.autoreset() == AutoresetMode::Disabled {
         let message = "the lease has autoreset `Disabled`; a rollout needs `NextStep` or `SameStep`".to_owned();
         return reject("autoreset", message, "request a lease with another autoreset mode");
     }
     if !(1..=limit as u64).contains(&steps) {
         let message = format!("`steps` = {steps} is not allowed: 1 to {limit}, `max_rollout_steps` of this server");
-        return reject("steps", message, "divide the rollout, or start the server with a larger `max_rollout_steps`");
+        return reject("steps", message, "divide the rollout, or start the server with a larger `--max-rollout-steps`");
     }
     let spec = env.spec();
     let entries = spec.obs_len() + spec.critic_obs_len() + spec.action_len() + 3;
     let bytes = (steps + 1) * (env.num_envs() * entries * size_of::<f32>()) as u64;
     if bytes > MAX_TRAJECTORY_BYTES {
-        let message = format!("`steps` = {steps} gives a reply of {bytes} bytes; at most {MAX_TRAJECTORY_BYTES} are sent");
+        let message =
+            format!("`steps` = {steps} gives a reply of {bytes} bytes; at most {MAX_TRAJECTORY_BYTES} are sent");
         return reject("steps", message, "divide the rollout");
     }
     Ok(steps as usize)
@@ -70,7 +70,11 @@ fn check_steps(steps: u64, env: &dyn VecEnv, limit: usize) -> Result<usize, Erro
 
 fn held_policy(id: Option<u64>, held: Option<&(u64, BehaviourPolicy)>) -> Result<&BehaviourPolicy, ErrorReply> {
     let Some(id) = id else {
-        return Err(ErrorReply::new(ErrorCode::Malformed, "policy", "the request has neither `policy` nor `policy_id`"));
+        return Err(ErrorReply::new(
+            ErrorCode::Malformed,
+            "policy",
+            "the request has neither `policy` nor `policy_id`",
+        ));
     };
     held.filter(|(held, _)| *held == id).map(|(_, policy)| policy).ok_or_else(|| {
         let held = held.map_or("no policy".to_owned(), |(held, _)| format!("only that of number {held}"));
@@ -90,7 +94,10 @@ fn read_policy(policy: &message::RolloutPolicy<'_>, spec: &EnvSpec) -> Result<Be
         return reject("policy.std", format!("`policy.std` has {value}, which must be positive"));
     }
     if let Some(value) = log_std.iter().find(|value| value.abs() > MAX_LOG_STD) {
-        return reject("policy.log_std", format!("`policy.log_std` has {value}; allowed: −{MAX_LOG_STD} to {MAX_LOG_STD}"));
+        return reject(
+            "policy.log_std",
+            format!("`policy.log_std` has {value}; allowed: −{MAX_LOG_STD} to {MAX_LOG_STD}"),
+        );
     }
     let expected = Mlp::num_weights(&sizes).unwrap_or(usize::MAX);
     let weights = read_finite(policy.weights, "policy.weights", expected)?;

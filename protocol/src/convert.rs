@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use twinstep_model::{EndedEpisode, EnvError, EnvSpec, Ground, HeightField, ResetRequest, Scene, StepBatch, Trajectory};
+use twinstep_model::{
+    EndedEpisode, EnvError, EnvSpec, Ground, HeightField, ResetRequest, Scene, StepBatch, Trajectory,
+};
 
 use crate::codec::encode_with_capacity;
 use crate::{ErrorCode, ErrorReply, PROTOCOL, encode, message, tensor};

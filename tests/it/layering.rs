@@ -40,6 +40,8 @@ const MAY_USE: [(&str, &[&str]); 21] = [
             "ensemble",
             "env-server",
             "client",
+            "policy",
+            "learning",
         ],
     ),
     (

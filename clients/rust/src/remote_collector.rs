@@ -37,7 +37,11 @@ pub struct RemoteCollector {
 enum LeaseState {
     Leased(RemoteVecEnv),
     /// A thread requests a new lease, and sends it. It ends when `_needed` is dropped.
-    Lost { granted: Receiver<RemoteVecEnv>, _needed: Arc<()> },
+    Lost {
+        granted: Receiver<RemoteVecEnv>,
+        _needed: Arc<()>,
+    },
+    Closed,
 }
 
 impl RemoteCollector {
@@ -78,11 +82,25 @@ impl RemoteCollector {
         let (options, needed) = (self.options.clone(), Arc::new(()));
         let is_needed = Arc::downgrade(&needed);
         let thread = std::thread::Builder::new().name("lease".to_owned());
-        thread.spawn(move || request_lease(&options, &is_needed, &sender)).map_err(|cause| EnvError::Remote(Box::new(cause)))?;
+        thread
+            .spawn(move || request_lease(&options, &is_needed, &sender))
+            .map_err(|cause| EnvError::Remote(Box::new(cause)))?;
         // The old connection ends, so that its lease expires at a server that still runs.
         self.state = LeaseState::Lost { granted, _needed: needed };
         self.losses += 1;
         Ok(())
+    }
+}
+
+impl Drop for RemoteCollector {
+    /// Ends the lease, so that its robots are free at once.
+    fn drop(&mut self) {
+        if let LeaseState::Leased(env) = std::mem::replace(&mut self.state, LeaseState::Closed)
+            && env.server_is_visible()
+            && let Err(error) = env.close()
+        {
+            tracing::debug!(%error, "lease not closed");
+        }
     }
 }
 

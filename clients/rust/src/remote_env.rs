@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, Scene, StepBatch, Trajectory, VecEnv};
 use twinstep_policy::BehaviourPolicy;
-use twinstep_protocol::tensor::as_bytes;
 use twinstep_protocol::keys::EnvMethod;
+use twinstep_protocol::tensor::as_bytes;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, Secret, convert, decode, encode, keys, message};
 use zenoh::bytes::ZBytes;
 use zenoh::query::Querier;

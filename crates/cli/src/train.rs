@@ -7,7 +7,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_client::{ConnectOptions, RemoteCollector, RemoteVecEnv};
 use twinstep_envs::TaskConfig;
 use twinstep_learning::{Checkpoint, Evaluation, EvaluationPlan, LearningError, PpoConfig, Trainer, evaluate};
-use twinstep_model::{AutoresetMode, VecEnv};
+use twinstep_model::AutoresetMode;
 use twinstep_policy::{Collector, CurvePoint, Policy, PolicyOrigin, StepCollector};
 use twinstep_sim::SimConfig;
 
@@ -295,13 +295,15 @@ impl TrainSession {
         let (robots, seconds, seed) = EVALUATION;
         let fresh =
             TrainConfig { model: self.config.model.clone(), sim: SimConfig::default(), ..TrainConfig::default() };
-        let mut env = match &self.endpoints[..] {
-            [] => fresh.envs(robots, 1, 0)?.remove(0),
-            endpoints => remote_env(endpoints, robots)?,
-        };
         let robot = robot_model(self.config.model.as_deref())?;
         let plan = EvaluationPlan { robot: &robot, seconds, seed };
-        evaluate(policy, env.as_mut(), plan, |_| true).map_err(other)
+        if self.endpoints.is_empty() {
+            return evaluate(policy, fresh.envs(robots, 1, 0)?.remove(0).as_mut(), plan, |_| true).map_err(other);
+        }
+        let mut env = remote_env(&self.endpoints, robots)?;
+        let evaluation = evaluate(policy, &mut env, plan, |_| true).map_err(other)?;
+        env.close().map_err(other)?;
+        Ok(evaluation)
     }
 }
 
@@ -311,11 +313,10 @@ fn connect_options(endpoint: &str, num_envs: usize) -> ConnectOptions {
 }
 
 /// Leases environments of the first server that grants them.
-fn remote_env(endpoints: &[String], num_envs: usize) -> Result<Box<dyn VecEnv>, Failure> {
+fn remote_env(endpoints: &[String], num_envs: usize) -> Result<RemoteVecEnv, Failure> {
     let connect = |endpoint: &String| RemoteVecEnv::connect(&connect_options(endpoint, num_envs));
     let (last, others) = endpoints.split_last().expect("there is an endpoint");
-    let env = others.iter().find_map(|endpoint| connect(endpoint).ok()).map_or_else(|| connect(last), Ok);
-    Ok(Box::new(env.map_err(other)?))
+    others.iter().find_map(|endpoint| connect(endpoint).ok()).map_or_else(|| connect(last), Ok).map_err(other)
 }
 
 /// Leases the environments of each group. The groups are divided among the servers in order.
@@ -340,7 +341,7 @@ fn remote_collector(endpoint: &str, num_envs: usize, horizon: usize) -> Result<B
         }
         max if (horizon as u64) > max => Err(Failure::Input(miette::miette!(
             "`train.horizon` = {horizon} is not allowed: the server at {endpoint} has rollouts of at most {max} steps\n  \
-             use a shorter horizon, or start the server with a larger `max_rollout_steps`"
+             use a shorter horizon, or start the server with a larger `--max-rollout-steps`"
         ))),
         _ => Ok(Box::new(RemoteCollector::new(env, &options))),
     }

@@ -2,10 +2,11 @@
 
 use rand::RngExt;
 use twinstep_model::{
-    AutoresetMode, EndedEpisode, EnvError, EnvSpec, ResetRequest, SpecField, StepBatch, Stream, VecEnv, stream,
+    AutoresetMode, EndedEpisode, EnvError, EnvSpec, ResetRequest, SpecField, StepBatch, Stream, Trajectory, VecEnv,
+    stream,
 };
 
-use twinstep_policy::{Collector, StepCollector};
+use twinstep_policy::{BehaviourPolicy, Collector, StepCollector};
 
 use crate::{Learner, LearningError, PpoConfig, Trainer};
 
@@ -287,6 +288,49 @@ fn resumed_learner_is_the_one_that_was_saved() {
     let mut resumed = Trainer::new(config.clone(), envs::<Pendulum>(&config), Some(read.learner), 3).expect("valid");
     let iteration = resumed.iterate().expect("finite");
     assert_eq!((iteration.iteration, iteration.env_steps), (4, 4 * config.batch_len() as u64));
+}
+
+/// Robots that cannot be reached in their second rollout.
+struct Unreliable(StepCollector, u32);
+
+impl Collector for Unreliable {
+    fn spec(&self) -> &EnvSpec {
+        self.0.spec()
+    }
+
+    fn num_envs(&self) -> usize {
+        self.0.num_envs()
+    }
+
+    fn autoreset(&self) -> AutoresetMode {
+        self.0.autoreset()
+    }
+
+    fn reset(&mut self, seeds: &[u64]) -> Result<(), EnvError> {
+        self.0.reset(seeds)
+    }
+
+    fn collect(
+        &mut self,
+        policy: &BehaviourPolicy,
+        noise_seed: u64,
+        steps: usize,
+        trajectory: &mut Trajectory,
+    ) -> Result<bool, EnvError> {
+        self.1 += 1;
+        if self.1 == 2 { Ok(false) } else { self.0.collect(policy, noise_seed, steps, trajectory) }
+    }
+}
+
+#[test]
+fn robots_that_cannot_be_reached_are_left_out_of_the_update() {
+    let config = config();
+    let mut collectors = envs::<Pendulum>(&config);
+    collectors[1] = Box::new(Unreliable(StepCollector(ToyEnv::<Pendulum>::boxed(16, None)), 0));
+    let mut trainer = Trainer::new(config.clone(), collectors, None, 1).expect("valid");
+    let steps: Vec<u64> = (0..3).map(|_| trainer.iterate().expect("finite").env_steps).collect();
+    let batch = config.batch_len() as u64;
+    assert_eq!(steps, [batch, batch + batch / 2, 2 * batch + batch / 2]);
 }
 
 #[test]
