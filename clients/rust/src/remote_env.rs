@@ -172,11 +172,10 @@ impl RemoteVecEnv {
         self.check_idle()?;
         let fingerprint = policy.fingerprint();
         let policy_id = self.held_policy.filter(|(held, _)| *held == fingerprint).map(|(_, id)| id);
-        let weights = if policy_id.is_none() { policy.actor().weights() } else { Vec::new() };
         let (mean, std) = policy.normaliser().mean_and_std();
         let sent = message::RolloutPolicy {
             sizes: policy.actor().sizes().iter().map(|size| *size as u64).collect(),
-            weights: as_bytes(&weights),
+            weights: as_bytes(policy.weights()),
             mean: as_bytes(&mean),
             std: as_bytes(&std),
             log_std: as_bytes(policy.log_std()),

@@ -1,6 +1,7 @@
 //! The policy that collects transitions: a normal distribution of actions around the output of a network.
 
 use std::hash::{DefaultHasher, Hasher};
+use std::sync::OnceLock;
 
 use rand::Rng;
 use twinstep_model::{EnvError, Stream, Trajectory, VecEnv, stream};
@@ -20,6 +21,8 @@ pub struct BehaviourPolicy {
     normaliser: Normaliser,
     log_std: Vec<f32>,
     network: Network,
+    /// Weights and fingerprint, computed when a policy is sent first.
+    sent: OnceLock<(Vec<f32>, u64)>,
 }
 
 impl BehaviourPolicy {
@@ -29,11 +32,24 @@ impl BehaviourPolicy {
     /// Panics if the sizes do not fit each other.
     pub fn new(actor: Mlp, normaliser: Normaliser, log_std: Vec<f32>) -> Self {
         assert_eq!((actor.inputs(), actor.outputs()), (normaliser.len(), log_std.len()), "sizes of the policy");
-        Self { network: Network::new(&actor), actor, normaliser, log_std }
+        Self { network: Network::new(&actor), actor, normaliser, log_std, sent: OnceLock::new() }
     }
 
     /// Returns a hash of everything that decides on the actions, the same within this process.
     pub fn fingerprint(&self) -> u64 {
+        self.sent().1
+    }
+
+    /// Returns [`Mlp::weights`] of the actor.
+    pub fn weights(&self) -> &[f32] {
+        &self.sent().0
+    }
+
+    fn sent(&self) -> &(Vec<f32>, u64) {
+        self.sent.get_or_init(|| (self.actor.weights(), self.hash()))
+    }
+
+    fn hash(&self) -> u64 {
         let (mean, std) = self.normaliser.mean_and_std();
         let mut hasher = DefaultHasher::new();
         self.actor.sizes().iter().for_each(|size| hasher.write_usize(*size));

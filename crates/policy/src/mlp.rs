@@ -153,8 +153,11 @@ impl Mlp {
 /// Returns the transpose of a row-major matrix with `rows` rows.
 pub fn transposed(values: &[f32], rows: usize) -> Vec<f32> {
     let columns = values.len() / rows;
-    let column = |column: usize| (0..rows).map(move |row| values[row * columns + column]);
-    (0..columns).flat_map(column).collect()
+    let mut result = Vec::with_capacity(values.len());
+    for column in 0..columns {
+        result.extend(values[column..].iter().step_by(columns));
+    }
+    result
 }
 
 /// Returns a matrix with orthonormal rows or columns, whichever are fewer (Gram–Schmidt on normal numbers).
