@@ -5,6 +5,7 @@ use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 use std::time::Instant;
 
+use twinstep_protocol::convert::MAX_ROLLOUT_REQUEST_BYTES;
 use twinstep_protocol::keys::{self, EnvMethod};
 use twinstep_protocol::{ErrorCode, ErrorReply, Secret};
 use zenoh::bytes::ZBytes;
@@ -23,7 +24,7 @@ pub type Routes = Arc<RwLock<HashMap<String, Arc<Route>>>>;
 pub struct Route {
     /// Secret of its client.
     pub secret: Secret,
-    /// Maximum size of a request to its environments [bytes].
+    /// Maximum size of a request to its environments, except a rollout [bytes].
     pub max_request_bytes: usize,
     /// Requests to its environments.
     pub mailbox: Arc<Mailbox>,
@@ -63,7 +64,7 @@ impl Dispatcher {
     fn route(&self, query: &Query) -> Result<(Arc<Mailbox>, RequestKind), ErrorReply> {
         let request = keys::parse(query.key_expr().as_str(), &self.sid).ok_or_else(|| {
             let message = format!("the key `{}` does not exist", query.key_expr());
-            let hint = "use hello, lease, or env/<lease>/reset, step, close or render";
+            let hint = "use hello, lease, or env/<lease>/reset, step, rollout, close or render";
             ErrorReply::new(ErrorCode::UnknownKey, "", message).with_hint(hint)
         })?;
         if let keys::Request::Env { lease, verb } = request {
@@ -89,9 +90,21 @@ impl Dispatcher {
         let routes = self.routes.read().unwrap_or_else(PoisonError::into_inner);
         let route = routes.get(lease).filter(|route| secret == Some(route.secret));
         let route = route.ok_or_else(|| no_such_lease(lease))?;
-        check_size(query, route.max_request_bytes)?;
+        check_size(query, self.max_request_bytes(route, verb)?)?;
         *lock(&route.last_request) = Instant::now();
         Ok((Arc::clone(&route.mailbox), RequestKind::Env(verb)))
+    }
+
+    /// Returns the maximum size of a request for `verb` [bytes]. Fails if the server does not have the verb.
+    fn max_request_bytes(&self, route: &Route, verb: EnvMethod) -> Result<usize, ErrorReply> {
+        if verb != EnvMethod::Rollout {
+            return Ok(route.max_request_bytes);
+        }
+        if self.state.max_rollout_steps == 0 {
+            let error = ErrorReply::new(ErrorCode::UnknownKey, "", "this server has no rollouts");
+            return Err(error.with_hint("use step, or start the server with `--max-rollout-steps` above 0"));
+        }
+        Ok(MAX_ROLLOUT_REQUEST_BYTES)
     }
 
     fn refuse(&self, mut query: Query, error: ErrorReply) {

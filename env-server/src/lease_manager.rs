@@ -31,6 +31,8 @@ pub struct ServerInfo {
     pub max_envs: usize,
     /// Maximum number of environments of one client id.
     pub max_envs_per_client: usize,
+    /// Maximum size of a request [bytes].
+    pub max_request_bytes: usize,
     /// Time for which the environments of a disconnected client are kept.
     pub lease_grace: Duration,
     /// Time without a request after which a lease is released; `None` for never.
@@ -109,10 +111,11 @@ impl LeaseManager {
             max_envs: info.max_envs as u64,
             free_envs: self.free_envs(&lock(&self.leases)) as u64,
             max_envs_per_client: info.max_envs_per_client as u64,
-            max_request_bytes: convert::max_request_bytes(info.max_envs, &info.spec) as u64,
+            max_request_bytes: info.max_request_bytes as u64,
             lease_grace_s: info.lease_grace.as_secs_f64(),
             lease_idle_s: info.lease_idle.map(|idle| idle.as_secs_f64()),
             env_steps: self.state.env_steps.load(Ordering::Relaxed),
+            max_rollout_steps: self.state.max_rollout_steps as u64,
         }))
     }
 

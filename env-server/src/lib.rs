@@ -17,6 +17,7 @@ mod env_factory;
 mod executor;
 mod lease_manager;
 mod messages;
+mod rollout;
 mod server;
 mod worker;
 

@@ -87,4 +87,6 @@ pub struct ServerState {
     pub shutting_down: AtomicBool,
     /// Environment steps executed by all leases.
     pub env_steps: AtomicU64,
+    /// Maximum number of steps of a rollout; 0 for a server without rollouts.
+    pub max_rollout_steps: usize,
 }

@@ -8,7 +8,7 @@ use std::sync::{Arc, PoisonError, RwLock};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use twinstep_model::AutoresetMode;
+use twinstep_model::{AutoresetMode, EnvSpec};
 use twinstep_protocol::{convert, keys, random_id};
 use zenoh::liveliness::LivelinessToken;
 use zenoh::query::Queryable;
@@ -97,19 +97,21 @@ impl Server {
     pub fn start(config: &ServerConfig, factory: Arc<dyn EnvFactory>) -> Result<Self, ServerError> {
         // One environment provides the spec, and shows before the first lease that the factory works.
         let spec = factory.build(1, AutoresetMode::NextStep, None)?.spec().clone();
-        let max_request_bytes = convert::max_request_bytes(config.envs, &spec);
+        let max_request_bytes = max_request_bytes(config, &spec);
         let sid = random_id();
         let session = twinstep_session::open(zenoh_config(config, max_request_bytes)?)
             .map_err(|error| ServerError::Open { listen: config.listen.clone(), reason: error.to_string() })?;
         let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
         let executor = Executor::start(2 * cores.max(2)).map_err(ServerError::Thread)?;
-        let (routes, state) = (Routes::new(RwLock::new(HashMap::new())), Arc::new(ServerState::default()));
+        let state = ServerState { max_rollout_steps: config.max_rollout_steps, ..ServerState::default() };
+        let (routes, state) = (Routes::new(RwLock::new(HashMap::new())), Arc::new(state));
         let info = ServerInfo {
             name: config.name.clone(),
             sid: sid.clone(),
             spec,
             max_envs: config.envs,
             max_envs_per_client: config.max_envs_per_client.unwrap_or(config.envs).min(config.envs),
+            max_request_bytes,
             lease_grace: config.lease_grace(),
             lease_idle: config.lease_idle_s.map(Duration::from_secs_f64),
         };
@@ -174,6 +176,12 @@ impl Server {
         self.routes.write().unwrap_or_else(PoisonError::into_inner).clear();
         let _ = self.session.close().wait();
     }
+}
+
+/// Returns the maximum size of a request [bytes].
+fn max_request_bytes(config: &ServerConfig, spec: &EnvSpec) -> usize {
+    let rollout = if config.max_rollout_steps == 0 { 0 } else { convert::MAX_ROLLOUT_REQUEST_BYTES };
+    convert::max_request_bytes(config.envs, spec).max(rollout)
 }
 
 /// Starts a thread that releases expired leases until the sender is dropped.

@@ -10,7 +10,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use twinstep_model::{EnvError, VecEnv};
+use twinstep_model::{EnvError, Trajectory, VecEnv};
+use twinstep_policy::BehaviourPolicy;
 use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, message, tensor};
 use zenoh::bytes::ZBytes;
@@ -20,6 +21,7 @@ use crate::EnvFactory;
 use crate::dispatch::shutting_down;
 use crate::executor::{Handler, panic_text};
 use crate::messages::{LeaseParams, Reply, RequestKind, ServerState};
+use crate::rollout;
 
 /// Releases the lease of a worker, for the given reason.
 pub type Release = Box<dyn Fn(&str) + Send>;
@@ -41,6 +43,9 @@ pub struct Worker {
     /// Hashes requests, with random keys.
     hasher: RandomState,
     actions: Vec<f32>,
+    /// Policy of the last rollout that sent one, with its sequence number.
+    policy: Option<(u64, BehaviourPolicy)>,
+    trajectory: Trajectory,
     /// Reason why the environments cannot be used any more; `None` while they can.
     failure: Option<String>,
 }
@@ -71,6 +76,8 @@ impl Worker {
             last_request: None,
             hasher: RandomState::new(),
             actions: Vec::new(),
+            policy: None,
+            trajectory: Trajectory::default(),
             failure: None,
         }
     }
@@ -229,6 +236,15 @@ impl Worker {
                 let batch = env.step(&self.actions).map_err(|error| logged(&error))?;
                 self.state.env_steps.fetch_add(batch.reward.len() as u64, Ordering::Relaxed);
                 Ok(convert::encode_step(batch, request.seq, self.params.critic))
+            }
+            EnvMethod::Rollout => {
+                let request: message::RolloutRequest<'_> = decode(payload)?;
+                let Self { env, policy, trajectory, state, params, .. } = self;
+                let env = env.as_deref_mut().expect("a worker without environments has a failure");
+                if let Some(new) = rollout::run(&request, policy.as_ref(), env, state, trajectory)? {
+                    *policy = Some((request.seq, new));
+                }
+                Ok(convert::encode_trajectory(trajectory, request.seq, params.critic))
             }
             EnvMethod::Close => {
                 let request: message::CloseRequest = decode(payload)?;

@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use twinstep_model::{EndedEpisode, EnvError, EnvSpec, Ground, HeightField, ResetRequest, Scene, StepBatch};
+use twinstep_model::{
+    EndedEpisode, EnvError, EnvSpec, Ground, HeightField, ResetRequest, Scene, StepBatch, Trajectory,
+};
 
 use crate::codec::encode_with_capacity;
 use crate::{ErrorCode, ErrorReply, PROTOCOL, encode, message, tensor};
@@ -12,6 +14,8 @@ const MAP_OVERHEAD: usize = 256;
 
 /// Entries of a velocity command: forward, left, yaw rate.
 const VELOCITY_COMMAND_LEN: usize = 3;
+/// Maximum size of a rollout request [bytes]: a policy with a million weights.
+pub const MAX_ROLLOUT_REQUEST_BYTES: usize = 4 << 20;
 
 /// Maximum size of one array in the reply to a step [bytes]. Zenoh refuses messages of more than 1 GiB.
 const MAX_ARRAY_BYTES: u64 = 1 << 30;
@@ -49,7 +53,8 @@ pub fn encode_reset(request: &ResetRequest, epoch: u64, seq: u64) -> Vec<u8> {
     })
 }
 
-/// Returns the maximum size of a request to `num_envs` environments [bytes].
+/// Returns the maximum size of a request to `num_envs` environments [bytes]. A rollout may have
+/// [`MAX_ROLLOUT_REQUEST_BYTES`].
 pub fn max_request_bytes(num_envs: usize, spec: &EnvSpec) -> usize {
     let reset = size_of::<u64>() + size_of::<u8>();
     let step = (spec.action_len() + VELOCITY_COMMAND_LEN) * size_of::<f32>();
@@ -89,17 +94,8 @@ pub fn decode_observations(
 
 /// Encodes the reply to a step, with the group `critic` if the lease requested it.
 pub fn encode_step(batch: &StepBatch, seq: u64, with_critic: bool) -> Vec<u8> {
-    let ended = &batch.ended;
-    let env: Vec<u32> = ended.iter().map(|episode| episode.env as u32).collect();
-    let length: Vec<u32> = ended.iter().map(|episode| episode.length).collect();
-    let episode_return: Vec<f32> = ended.iter().map(|episode| episode.episode_return).collect();
-    let terms: Vec<f32> = ended.iter().flat_map(|episode| episode.terms.iter().copied()).collect();
-    let diverged: Vec<bool> = ended.iter().map(|episode| episode.diverged).collect();
-    let final_obs: Vec<f32> = ended.iter().flat_map(|episode| episode.final_obs.iter().copied()).collect();
+    let ended = EndedArrays::new(batch.ended.iter(), with_critic);
     let critic_obs = if with_critic { &batch.critic_obs[..] } else { &[] };
-    let with_final_critic = ended.iter().filter(|_| with_critic);
-    let final_critic_obs: Vec<f32> =
-        with_final_critic.flat_map(|episode| episode.final_critic_obs.iter().copied()).collect();
     let reply = message::StepReply {
         protocol: PROTOCOL,
         seq,
@@ -107,19 +103,125 @@ pub fn encode_step(batch: &StepBatch, seq: u64, with_critic: bool) -> Vec<u8> {
         reward: tensor::as_bytes(&batch.reward),
         terminated: tensor::flags_as_bytes(&batch.terminated),
         truncated: tensor::flags_as_bytes(&batch.truncated),
-        ended_env: tensor::as_bytes(&env),
-        ended_length: tensor::as_bytes(&length),
-        ended_return: tensor::as_bytes(&episode_return),
-        ended_terms: tensor::as_bytes(&terms),
-        ended_diverged: tensor::flags_as_bytes(if diverged.contains(&true) { &diverged } else { &[] }),
-        final_obs: tensor::as_bytes(&final_obs),
+        ended_env: tensor::as_bytes(&ended.env),
+        ended_length: tensor::as_bytes(&ended.length),
+        ended_return: tensor::as_bytes(&ended.episode_return),
+        ended_terms: tensor::as_bytes(&ended.terms),
+        ended_diverged: ended.diverged(),
+        final_obs: tensor::as_bytes(&ended.final_obs),
         critic_obs: tensor::as_bytes(critic_obs),
-        final_critic_obs: tensor::as_bytes(&final_critic_obs),
+        final_critic_obs: tensor::as_bytes(&ended.final_critic_obs),
     };
-    let critic = critic_obs.len() + final_critic_obs.len();
-    let numbers = batch.obs.len() + batch.reward.len() + 3 * ended.len() + terms.len() + final_obs.len() + critic;
+    let numbers = batch.obs.len() + batch.reward.len() + critic_obs.len();
     let flags = batch.terminated.len() + batch.truncated.len();
-    encode_with_capacity(&reply, MAP_OVERHEAD + numbers * size_of::<f32>() + flags)
+    encode_with_capacity(&reply, MAP_OVERHEAD + numbers * size_of::<f32>() + flags + ended.num_bytes())
+}
+
+/// Encodes the reply to a rollout, with the group `critic` if the lease requested it.
+pub fn encode_trajectory(trajectory: &Trajectory, seq: u64, with_critic: bool) -> Vec<u8> {
+    let ended = EndedArrays::new(trajectory.ended.iter().map(|(_, episode)| episode), with_critic);
+    let ended_step: Vec<u32> = trajectory.ended.iter().map(|(step, _)| *step as u32).collect();
+    let critic_obs = if with_critic { &trajectory.critic_obs[..] } else { &[] };
+    let reply = message::RolloutReply {
+        protocol: PROTOCOL,
+        seq,
+        obs: tensor::as_bytes(&trajectory.obs),
+        critic_obs: tensor::as_bytes(critic_obs),
+        actions: tensor::as_bytes(&trajectory.actions),
+        log_prob: tensor::as_bytes(&trajectory.log_prob),
+        reward: tensor::as_bytes(&trajectory.reward),
+        terminated: tensor::flags_as_bytes(&trajectory.terminated),
+        truncated: tensor::flags_as_bytes(&trajectory.truncated),
+        ended_step: tensor::as_bytes(&ended_step),
+        ended_env: tensor::as_bytes(&ended.env),
+        ended_length: tensor::as_bytes(&ended.length),
+        ended_return: tensor::as_bytes(&ended.episode_return),
+        ended_terms: tensor::as_bytes(&ended.terms),
+        ended_diverged: ended.diverged(),
+        final_obs: tensor::as_bytes(&ended.final_obs),
+        final_critic_obs: tensor::as_bytes(&ended.final_critic_obs),
+    };
+    let Trajectory { obs, actions, log_prob, reward, terminated, truncated, .. } = trajectory;
+    let numbers = obs.len() + critic_obs.len() + actions.len() + log_prob.len() + reward.len() + ended_step.len();
+    let flags = terminated.len() + truncated.len();
+    encode_with_capacity(&reply, 2 * MAP_OVERHEAD + numbers * size_of::<f32>() + flags + ended.num_bytes())
+}
+
+/// Episodes as arrays.
+#[derive(Default)]
+struct EndedArrays {
+    env: Vec<u32>,
+    length: Vec<u32>,
+    episode_return: Vec<f32>,
+    terms: Vec<f32>,
+    diverged: Vec<bool>,
+    final_obs: Vec<f32>,
+    final_critic_obs: Vec<f32>,
+}
+
+impl EndedArrays {
+    fn new<'a>(episodes: impl Iterator<Item = &'a EndedEpisode>, with_critic: bool) -> Self {
+        let mut arrays = Self::default();
+        for episode in episodes {
+            arrays.env.push(episode.env as u32);
+            arrays.length.push(episode.length);
+            arrays.episode_return.push(episode.episode_return);
+            arrays.terms.extend(&episode.terms);
+            arrays.diverged.push(episode.diverged);
+            arrays.final_obs.extend(&episode.final_obs);
+            if with_critic {
+                arrays.final_critic_obs.extend(&episode.final_critic_obs);
+            }
+        }
+        arrays
+    }
+
+    /// Returns the field `ended_diverged`, which is absent if no simulation diverged.
+    fn diverged(&self) -> &[u8] {
+        tensor::flags_as_bytes(if self.diverged.contains(&true) { &self.diverged } else { &[] })
+    }
+
+    /// Returns the size of all arrays [bytes].
+    fn num_bytes(&self) -> usize {
+        let numbers = 3 * self.env.len() + self.terms.len() + self.final_obs.len() + self.final_critic_obs.len();
+        numbers * size_of::<f32>() + self.diverged.len()
+    }
+
+    /// Returns the episodes. Fails if a length does not match, or if there is no such environment.
+    fn read(mut self, spec: &EnvSpec, num_envs: usize) -> Result<impl Iterator<Item = EndedEpisode>, ErrorReply> {
+        let (ended, obs_len, critic_len) = (self.env.len(), spec.obs_len(), spec.critic_obs_len());
+        let num_terms = spec.reward_terms.len();
+        if self.diverged.is_empty() {
+            self.diverged.resize(ended, false);
+        }
+        let finals = if self.final_obs.is_empty() { 0 } else { ended };
+        for (field, given, expected) in [
+            ("ended_length", self.length.len(), ended),
+            ("ended_return", self.episode_return.len(), ended),
+            ("ended_terms", self.terms.len(), ended * num_terms),
+            ("ended_diverged", self.diverged.len(), ended),
+            ("final_obs", self.final_obs.len(), finals * obs_len),
+            ("final_critic_obs", self.final_critic_obs.len(), finals * critic_len),
+        ] {
+            check_length(field, given, expected)?;
+        }
+        if let Some(env) = self.env.iter().find(|env| **env as usize >= num_envs) {
+            let message = format!("`ended_env` has environment {env}; there are {num_envs}");
+            return Err(ErrorReply::new(ErrorCode::OutOfRange, "ended_env", message));
+        }
+        let row = |values: &[f32], index: usize, len: usize| {
+            values.get(index * len..(index + 1) * len).unwrap_or_default().to_vec()
+        };
+        Ok((0..ended).map(move |k| EndedEpisode {
+            env: self.env[k] as usize,
+            length: self.length[k],
+            episode_return: self.episode_return[k],
+            terms: row(&self.terms, k, num_terms),
+            diverged: self.diverged[k],
+            final_obs: row(&self.final_obs, k, obs_len),
+            final_critic_obs: row(&self.final_critic_obs, k, critic_len),
+        }))
+    }
 }
 
 /// Encodes a step request. `commands` are the velocity commands, if the client gives them.
@@ -146,49 +248,76 @@ pub fn decode_step(
     tensor::read_into(reply.reward, &mut batch.reward, "reward")?;
     tensor::read_flags_into(reply.terminated, &mut batch.terminated);
     tensor::read_flags_into(reply.truncated, &mut batch.truncated);
-    let env: Vec<u32> = tensor::read(reply.ended_env, "ended_env")?;
-    let length: Vec<u32> = tensor::read(reply.ended_length, "ended_length")?;
-    let episode_return: Vec<f32> = tensor::read(reply.ended_return, "ended_return")?;
-    let terms: Vec<f32> = tensor::read(reply.ended_terms, "ended_terms")?;
-    let mut diverged = tensor::flags_from_bytes(reply.ended_diverged);
-    let final_obs: Vec<f32> = tensor::read(reply.final_obs, "final_obs")?;
     tensor::read_into(reply.critic_obs, &mut batch.critic_obs, "critic_obs")?;
-    let final_critic_obs: Vec<f32> = tensor::read(reply.final_critic_obs, "final_critic_obs")?;
-    let (ended, obs_len, num_terms) = (env.len(), spec.obs_len(), spec.reward_terms.len());
-    let critic_len = spec.critic_obs_len();
-    if diverged.is_empty() {
-        diverged.resize(ended, false);
-    }
     for (field, given, expected) in [
-        ("obs", batch.obs.len(), num_envs * obs_len),
+        ("obs", batch.obs.len(), num_envs * spec.obs_len()),
         ("reward", batch.reward.len(), num_envs),
         ("terminated", batch.terminated.len(), num_envs),
         ("truncated", batch.truncated.len(), num_envs),
-        ("ended_length", length.len(), ended),
-        ("ended_return", episode_return.len(), ended),
-        ("ended_terms", terms.len(), ended * num_terms),
-        ("ended_diverged", diverged.len(), ended),
-        ("final_obs", final_obs.len(), if final_obs.is_empty() { 0 } else { ended * obs_len }),
-        ("critic_obs", batch.critic_obs.len(), num_envs * critic_len),
-        ("final_critic_obs", final_critic_obs.len(), if final_obs.is_empty() { 0 } else { ended * critic_len }),
+        ("critic_obs", batch.critic_obs.len(), num_envs * spec.critic_obs_len()),
     ] {
         check_length(field, given, expected)?;
     }
-    if let Some(env) = env.iter().find(|env| **env as usize >= num_envs) {
-        let message = format!("`ended_env` has environment {env}; there are {num_envs}");
-        return Err(ErrorReply::new(ErrorCode::OutOfRange, "ended_env", message));
+    let ended = EndedArrays {
+        env: tensor::read(reply.ended_env, "ended_env")?,
+        length: tensor::read(reply.ended_length, "ended_length")?,
+        episode_return: tensor::read(reply.ended_return, "ended_return")?,
+        terms: tensor::read(reply.ended_terms, "ended_terms")?,
+        diverged: tensor::flags_from_bytes(reply.ended_diverged),
+        final_obs: tensor::read(reply.final_obs, "final_obs")?,
+        final_critic_obs: tensor::read(reply.final_critic_obs, "final_critic_obs")?,
+    };
+    batch.ended = ended.read(spec, num_envs)?.collect();
+    Ok(())
+}
+
+/// Decodes the reply to a rollout of `steps` steps into `trajectory`.
+///
+/// Fails if a length does not match `num_envs` environments of `spec`. `steps × num_envs` numbers of each entry must be
+/// within the memory of this process.
+pub fn decode_trajectory(
+    reply: &message::RolloutReply<'_>,
+    spec: &EnvSpec,
+    num_envs: usize,
+    steps: usize,
+    trajectory: &mut Trajectory,
+) -> Result<(), ErrorReply> {
+    (trajectory.steps, trajectory.num_envs) = (steps, num_envs);
+    tensor::read_into(reply.obs, &mut trajectory.obs, "obs")?;
+    tensor::read_into(reply.critic_obs, &mut trajectory.critic_obs, "critic_obs")?;
+    tensor::read_into(reply.actions, &mut trajectory.actions, "actions")?;
+    tensor::read_into(reply.log_prob, &mut trajectory.log_prob, "log_prob")?;
+    tensor::read_into(reply.reward, &mut trajectory.reward, "reward")?;
+    tensor::read_flags_into(reply.terminated, &mut trajectory.terminated);
+    tensor::read_flags_into(reply.truncated, &mut trajectory.truncated);
+    let rows = steps * num_envs;
+    for (field, given, expected) in [
+        ("obs", trajectory.obs.len(), (rows + num_envs) * spec.obs_len()),
+        ("critic_obs", trajectory.critic_obs.len(), (rows + num_envs) * spec.critic_obs_len()),
+        ("actions", trajectory.actions.len(), rows * spec.action_len()),
+        ("log_prob", trajectory.log_prob.len(), rows),
+        ("reward", trajectory.reward.len(), rows),
+        ("terminated", trajectory.terminated.len(), rows),
+        ("truncated", trajectory.truncated.len(), rows),
+    ] {
+        check_length(field, given, expected)?;
     }
-    batch.ended = (0..ended)
-        .map(|k| EndedEpisode {
-            env: env[k] as usize,
-            length: length[k],
-            episode_return: episode_return[k],
-            terms: terms[k * num_terms..(k + 1) * num_terms].to_vec(),
-            diverged: diverged[k],
-            final_obs: final_obs.get(k * obs_len..(k + 1) * obs_len).unwrap_or_default().to_vec(),
-            final_critic_obs: final_critic_obs.get(k * critic_len..(k + 1) * critic_len).unwrap_or_default().to_vec(),
-        })
-        .collect();
+    let ended_step: Vec<u32> = tensor::read(reply.ended_step, "ended_step")?;
+    if let Some(step) = ended_step.iter().find(|step| **step as usize >= steps) {
+        let message = format!("`ended_step` has step {step}; there are {steps}");
+        return Err(ErrorReply::new(ErrorCode::OutOfRange, "ended_step", message));
+    }
+    let ended = EndedArrays {
+        env: tensor::read(reply.ended_env, "ended_env")?,
+        length: tensor::read(reply.ended_length, "ended_length")?,
+        episode_return: tensor::read(reply.ended_return, "ended_return")?,
+        terms: tensor::read(reply.ended_terms, "ended_terms")?,
+        diverged: tensor::flags_from_bytes(reply.ended_diverged),
+        final_obs: tensor::read(reply.final_obs, "final_obs")?,
+        final_critic_obs: tensor::read(reply.final_critic_obs, "final_critic_obs")?,
+    };
+    check_length("ended_step", ended_step.len(), ended.env.len())?;
+    trajectory.ended = ended_step.iter().map(|step| *step as usize).zip(ended.read(spec, num_envs)?).collect();
     Ok(())
 }
 

@@ -36,6 +36,10 @@ pub enum ErrorCode {
     SequenceGap,
     /// An environment has no episode and must be reset first.
     NeedsReset,
+    /// The server does not hold the policy of this id.
+    UnknownPolicy,
+    /// A rollout failed after at least one of its steps, whose results are lost.
+    RolloutFailed,
     /// The client's spec hash differs from the server's.
     SpecMismatch,
     /// Too many requests are queued; repeat the request later.
@@ -51,7 +55,7 @@ pub enum ErrorCode {
 
 impl ErrorCode {
     /// All error codes of this version.
-    pub const ALL: [ErrorCode; 17] = [
+    pub const ALL: [ErrorCode; 19] = [
         ErrorCode::Version,
         ErrorCode::Malformed,
         ErrorCode::UnknownKey,
@@ -65,6 +69,8 @@ impl ErrorCode {
         ErrorCode::StaleSequence,
         ErrorCode::SequenceGap,
         ErrorCode::NeedsReset,
+        ErrorCode::UnknownPolicy,
+        ErrorCode::RolloutFailed,
         ErrorCode::SpecMismatch,
         ErrorCode::Busy,
         ErrorCode::ShuttingDown,
@@ -73,7 +79,7 @@ impl ErrorCode {
 
     /// Returns true if a request with this error had effects and so consumed its sequence number.
     pub fn consumes_seq(self) -> bool {
-        self == ErrorCode::Internal
+        matches!(self, ErrorCode::Internal | ErrorCode::RolloutFailed)
     }
 }
 

@@ -50,6 +50,8 @@ pub enum EnvMethod {
     Reset,
     /// Advances all environments by one policy period.
     Step,
+    /// Runs a policy on the server for several policy periods.
+    Rollout,
     /// Ends the lease.
     Close,
     /// Returns the scene of one environment. Only reads, so it has no sequence number.
@@ -58,13 +60,15 @@ pub enum EnvMethod {
 
 impl EnvMethod {
     /// All methods.
-    pub const ALL: [EnvMethod; 4] = [EnvMethod::Reset, EnvMethod::Step, EnvMethod::Close, EnvMethod::Render];
+    pub const ALL: [EnvMethod; 5] =
+        [EnvMethod::Reset, EnvMethod::Step, EnvMethod::Rollout, EnvMethod::Close, EnvMethod::Render];
 
     /// Returns the last segment of the method's key.
     pub const fn name(self) -> &'static str {
         match self {
             EnvMethod::Reset => "reset",
             EnvMethod::Step => "step",
+            EnvMethod::Rollout => "rollout",
             EnvMethod::Close => "close",
             EnvMethod::Render => "render",
         }

@@ -47,6 +47,9 @@ pub struct HelloReply {
     pub lease_idle_s: Option<f64>,
     /// Number of environment steps executed since the start of the server.
     pub env_steps: u64,
+    /// Maximum number of steps of a rollout. Default: 0, a server without rollouts.
+    #[serde(default)]
+    pub max_rollout_steps: u64,
 }
 
 /// Requests a lease of environments.
@@ -197,6 +200,100 @@ pub struct StepReply<'a> {
     pub final_critic_obs: &'a [u8],
 }
 
+/// Runs a policy next to the environments for several policy periods.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RolloutRequest<'a> {
+    /// Protocol version of the client.
+    pub protocol: u16,
+    /// Epoch of the lease.
+    pub epoch: u64,
+    /// Sequence number: the last one plus one.
+    pub seq: u64,
+    /// Number of steps.
+    pub steps: u64,
+    /// Seed of the noise of environment 0; environment `i` has this plus `i`.
+    pub noise_seed: u64,
+    /// The policy. Default: the one of `policy_id`, which is then required.
+    #[serde(default, borrow, skip_serializing_if = "Option::is_none")]
+    pub policy: Option<RolloutPolicy<'a>>,
+    /// Sequence number of the last rollout that was executed with a `policy`, which is used again.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub policy_id: Option<u64>,
+}
+
+/// A policy: a normal distribution of actions around the output of a network.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RolloutPolicy<'a> {
+    /// Numbers of inputs, of units of each hidden layer, and of outputs.
+    pub sizes: Vec<u64>,
+    /// Weight (outputs × inputs) and bias of each layer, one after the other, f32.
+    #[serde(borrow, with = "serde_bytes")]
+    pub weights: &'a [u8],
+    /// Mean of each entry of the observation, `obs_len` × f32.
+    #[serde(borrow, with = "serde_bytes")]
+    pub mean: &'a [u8],
+    /// Standard deviation of each entry of the observation, `obs_len` × f32.
+    #[serde(borrow, with = "serde_bytes")]
+    pub std: &'a [u8],
+    /// Logarithm of the standard deviation of each entry of the action, `action_len` × f32.
+    #[serde(borrow, with = "serde_bytes")]
+    pub log_std: &'a [u8],
+}
+
+/// Result of a rollout of `k` steps, in which `e` episodes ended.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RolloutReply<'a> {
+    /// Protocol version of the server.
+    pub protocol: u16,
+    /// Sequence number of the request.
+    pub seq: u64,
+    /// Observations, `k + 1 × num_envs × obs_len` × f32.
+    #[serde(borrow, with = "serde_bytes")]
+    pub obs: &'a [u8],
+    /// Observations of group `critic`, `k + 1 × num_envs × critic_obs_len` × f32; absent unless the lease requested it.
+    #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "<[u8]>::is_empty")]
+    pub critic_obs: &'a [u8],
+    /// Sampled actions, not clipped, `k × num_envs × action_len` × f32.
+    #[serde(borrow, with = "serde_bytes")]
+    pub actions: &'a [u8],
+    /// Logarithm of the probability density of each action, `k × num_envs` × f32.
+    #[serde(borrow, with = "serde_bytes")]
+    pub log_prob: &'a [u8],
+    /// Rewards, `k × num_envs` × f32.
+    #[serde(borrow, with = "serde_bytes")]
+    pub reward: &'a [u8],
+    /// 1 if the task ended the episode, `k × num_envs` × u8.
+    #[serde(borrow, with = "serde_bytes")]
+    pub terminated: &'a [u8],
+    /// 1 if the time limit ended the episode, `k × num_envs` × u8.
+    #[serde(borrow, with = "serde_bytes")]
+    pub truncated: &'a [u8],
+    /// Step in which each ended episode ended, e × u32, in ascending order.
+    #[serde(borrow, with = "serde_bytes")]
+    pub ended_step: &'a [u8],
+    /// Its environment, e × u32.
+    #[serde(borrow, with = "serde_bytes")]
+    pub ended_env: &'a [u8],
+    /// Its policy steps, e × u32.
+    #[serde(borrow, with = "serde_bytes")]
+    pub ended_length: &'a [u8],
+    /// Its sum of rewards, e × f32.
+    #[serde(borrow, with = "serde_bytes")]
+    pub ended_return: &'a [u8],
+    /// Sums of its weighted reward terms, `e × reward_terms` × f32.
+    #[serde(borrow, with = "serde_bytes")]
+    pub ended_terms: &'a [u8],
+    /// 1 if its simulation became NaN or infinite, e × u8; absent if none did.
+    #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "<[u8]>::is_empty")]
+    pub ended_diverged: &'a [u8],
+    /// Its last observation, `e × obs_len` × f32; empty unless autoreset is SameStep.
+    #[serde(borrow, with = "serde_bytes")]
+    pub final_obs: &'a [u8],
+    /// As `final_obs`, of group `critic`.
+    #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "<[u8]>::is_empty")]
+    pub final_critic_obs: &'a [u8],
+}
+
 /// Ends the lease.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CloseRequest {
@@ -276,7 +373,7 @@ pub struct HeightField<'a> {
     pub heights: &'a [u8],
 }
 
-/// Common fields of [`ResetRequest`], [`StepRequest`] and [`CloseRequest`], which decide whether to execute one.
+/// Common fields of [`ResetRequest`], [`StepRequest`], [`RolloutRequest`] and [`CloseRequest`], which decide whether to execute one.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 pub struct RequestHeader {
     /// Protocol version of the client.

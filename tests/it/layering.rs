@@ -23,8 +23,8 @@ const MAY_USE: [(&str, &[&str]); 22] = [
     ("crates/session", &[]),
     ("ensemble", &["simd", "model", "effects", "logs"]),
     // Applications.
-    ("env-server", &["model", "effects", "protocol", "session", "sim", "envs", "ensemble"]),
-    ("clients/rust", &["model", "protocol", "session"]),
+    ("env-server", &["model", "effects", "protocol", "session", "sim", "envs", "ensemble", "policy"]),
+    ("clients/rust", &["model", "protocol", "session", "policy"]),
     ("crates/report", &["model", "effects", "logs", "sim", "identify", "diagnose"]),
     ("crates/hunt", &["model", "effects", "logs", "sim", "identify", "diagnose"]),
     (
@@ -41,6 +41,8 @@ const MAY_USE: [(&str, &[&str]); 22] = [
             "ensemble",
             "env-server",
             "client",
+            "policy",
+            "learning",
         ],
     ),
     (

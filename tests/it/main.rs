@@ -38,6 +38,7 @@ mod randomise;
 mod rapier;
 mod raw_client;
 mod remote;
+mod remote_rollout;
 mod render;
 mod robots;
 mod rollout;

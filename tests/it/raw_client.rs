@@ -49,6 +49,13 @@ impl RawClient {
         this
     }
 
+    /// Opens another lease's client in the session of `client`, with a secret of its own.
+    pub fn with_own_secret(client: &Self) -> Self {
+        let (session, sid, name) = (client.session.clone(), client.sid.clone(), client.client.clone());
+        let (secret, query_timeout) = (Secret::random(), client.query_timeout);
+        Self { session, sid, client: name, secret, token: None, query_timeout }
+    }
+
     /// Connects to the server `sid` without a liveliness token.
     pub fn without_token(endpoint: &str, sid: &str, client: &str) -> Self {
         let mut config = zenoh::Config::default();

@@ -278,6 +278,9 @@ impl VecEnv for FragileEnv {
     fn reset(&mut self, request: &ResetRequest) -> Result<&[f32], EnvError> {
         self.0.reset(request)
     }
+    fn obs(&self) -> &[f32] {
+        self.0.obs()
+    }
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
         self.1 += 1;
         assert!(self.1 < 3, "planted in the third step");

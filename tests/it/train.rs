@@ -2,7 +2,8 @@
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Command, Output, Stdio};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
 
 use twinstep_policy::Policy;
 use twinstep_tests::python::root;
@@ -65,33 +66,116 @@ fn equal_seeds_give_equal_policies() {
     assert!(first != policy("other", "2"));
 }
 
+/// A server process, which is killed when it is dropped.
+struct ServerChild {
+    child: Child,
+    endpoint: String,
+}
+
+impl ServerChild {
+    /// Starts a server of the training's robots at `listen` and waits until it listens.
+    fn start(listen: &str, flags: &[&str]) -> Self {
+        let program = Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep");
+        let mut child = Command::new(program)
+            .args(["serve", "--listen", listen, "--physics-hz", "400"])
+            .args(flags)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let endpoint = line.trim().strip_prefix("listening ").unwrap().to_owned();
+        Self { child, endpoint }
+    }
+}
+
+impl Drop for ServerChild {
+    fn drop(&mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+}
+
 #[test]
-fn training_on_the_robots_of_a_server_gives_the_same_policy_as_in_process() {
+fn training_on_the_robots_of_servers_gives_the_same_policy_as_in_process() {
     let folder = tempfile::tempdir().unwrap();
-    let program = Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep");
-    let mut server = Command::new(program)
-        .args(["serve", "--listen", "tcp/127.0.0.1:0", "--until-stdin-closes", "--envs", "320", "--physics-hz", "400"])
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
-    let mut line = String::new();
-    BufReader::new(server.stdout.take().unwrap()).read_line(&mut line).unwrap();
-    let endpoint = line.trim().strip_prefix("listening ").unwrap();
+    let servers = [(); 2].map(|()| ServerChild::start("tcp/127.0.0.1:0", &["--envs", "320"]));
+    let old_server = ServerChild::start("tcp/127.0.0.1:0", &["--envs", "320", "--max-rollout-steps", "0"]);
     let config = folder.path().join("config.toml");
-    std::fs::write(&config, "[sim]\nphysics_hz = 400\n[train]\nnum_envs = 48\ngroups = 2\ntotal_steps = 4608\n")
+    std::fs::write(&config, "[sim]\nphysics_hz = 400\n[train]\nnum_envs = 49\ngroups = 4\ntotal_steps = 4704\n")
         .unwrap();
-    let policy = |name: &str, endpoint: &[&str]| {
+    let policy = |name: &str, endpoints: &[&str]| {
         let out = folder.path().join(name);
         let arguments = ["train", "--out", out.to_str().unwrap(), "--config", config.to_str().unwrap()];
-        let output = twinstep(&[&arguments, endpoint].concat());
+        let endpoints = endpoints.iter().flat_map(|endpoint| ["--endpoint", endpoint]);
+        let output = twinstep(&arguments.into_iter().chain(endpoints).collect::<Vec<_>>());
         assert!(output.status.success(), "{}", text(&output.stderr));
-        Policy::read(out.join("policy.safetensors")).unwrap().0
+        (Policy::read(out.join("policy.safetensors")).unwrap().0, text(&output.stderr))
     };
-    assert!(policy("local", &[]) == policy("remote", &["--endpoint", endpoint]));
-    drop(server.stdin.take());
-    server.wait().unwrap();
+    let (local, _) = policy("local", &[]);
+    assert!(policy("one", &[&servers[0].endpoint]).0 == local);
+    assert!(policy("two", &[&servers[0].endpoint, &servers[1].endpoint]).0 == local);
+    let (stepped, log) = policy("stepped", &[&old_server.endpoint]);
+    assert!(stepped == local);
+    assert!(log.contains("the server has no rollouts; each step is a request"), "{log}");
+}
+
+#[test]
+fn training_continues_while_one_of_two_servers_is_killed_and_restarted() {
+    let folder = tempfile::tempdir().unwrap();
+    let flags = ["--envs", "300"];
+    let (kept, killed) = (ServerChild::start("tcp/127.0.0.1:0", &flags), ServerChild::start("tcp/127.0.0.1:0", &flags));
+    let out = folder.path().join("walk");
+    let (log_path, second) = (folder.path().join("log"), killed.endpoint.clone());
+    let endpoints = format!("{},{second}", kept.endpoint);
+    let train = |rest: &[&str]| {
+        let program = Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep");
+        let mut command = Command::new(program);
+        command.args(["train", "--out", out.to_str().unwrap(), "--endpoint", &endpoints]).args(rest);
+        command.stdout(Stdio::null()).stderr(std::fs::File::create(&log_path).unwrap());
+        command.spawn().unwrap()
+    };
+    // Steps so far, after each update.
+    let steps = || -> Vec<u64> {
+        let table = std::fs::read_to_string(out.join("progress.csv")).unwrap_or_default();
+        let complete = table.lines().skip(1).filter(|line| line.matches(',').count() > 10);
+        complete.map(|line| line.split(',').nth(1).unwrap().parse::<f64>().unwrap() as u64).collect()
+    };
+    let wait_for = |what: &str, is_done: &dyn Fn() -> bool| {
+        let since = Instant::now();
+        while !is_done() {
+            let log = std::fs::read_to_string(&log_path).unwrap();
+            assert!(since.elapsed() < Duration::from_secs(120), "{what}: {log}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    };
+    let logged = |text: &str| std::fs::read_to_string(&log_path).unwrap().matches(text).count();
+    let has_increment = |from: usize, increment: u64| {
+        let steps = steps();
+        steps.len() > from + 2 && steps[from..].windows(2).any(|pair| pair[1] - pair[0] == increment)
+    };
+
+    let mut training = train(&["--envs", "32", "--steps", "1000000000"]);
+    wait_for("all 32 robots are trained on", &|| has_increment(0, 32 * 24));
+    drop(killed);
+    wait_for("the server is lost", &|| logged("robots lost") == 4);
+    let lost = steps().len();
+    wait_for("16 robots are trained on", &|| has_increment(lost, 16 * 24));
+    let _restarted = ServerChild::start(&second, &flags);
+    wait_for("the robots are leased again", &|| logged("robots leased again") == 4);
+    let leased = steps().len();
+    wait_for("all 32 robots are trained on again", &|| has_increment(leased, 32 * 24));
+    assert!(Command::new("kill").args(["-INT", &training.id().to_string()]).status().unwrap().success());
+    assert_eq!(training.wait().unwrap().code(), Some(130));
+
+    let done = *steps().last().unwrap();
+    let total = (done + 10 * 32 * 24).to_string();
+    let mut resumed = train(&["--resume", "--steps", &total]);
+    assert!(resumed.wait().unwrap().success(), "{}", std::fs::read_to_string(&log_path).unwrap());
+    let (_, header) = Policy::read(out.join("policy.safetensors")).unwrap();
+    assert_eq!(header.origin.env_steps, done + 10 * 32 * 24);
+    assert_eq!(steps().last(), Some(&header.origin.env_steps));
 }
 
 #[test]

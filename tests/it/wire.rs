@@ -15,6 +15,7 @@ use twinstep_protocol::{ErrorCode, PROTOCOL, decode, encode, keys};
 
 use crate::raw_client::{RawClient, reset_bytes, step_bytes, step_with, steps_in};
 use crate::remote::{config, start};
+use crate::remote_rollout::{policy, rollout_bytes};
 
 const MEASURED_IN_A_PROCESS: &str = "wire::twenty_thousand_bad_requests";
 
@@ -36,6 +37,7 @@ fn all_messages(client: &RawClient, lease: &LeaseReply) -> Vec<Vec<u8>> {
         encode(&client.lease_request(1)),
         reset_bytes(lease, seq),
         step_bytes(lease, seq),
+        rollout_bytes(lease, seq, &policy(&lease.spec, 0.1), 2),
         encode(&CloseRequest { protocol: PROTOCOL, epoch: lease.epoch, seq }),
         encode(&RenderRequest { protocol: PROTOCOL, epoch: lease.epoch, env: 0 }),
     ]

@@ -138,6 +138,10 @@ impl VecEnv for SlowEnv {
         self.inner.reset(request)
     }
 
+    fn obs(&self) -> &[f32] {
+        self.inner.obs()
+    }
+
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
         self.steps += 1;
         if self.duplicate_step_every.is_some_and(|every| self.steps.is_multiple_of(every)) {

@@ -36,6 +36,8 @@ pub struct Connection {
     secret: Secret,
     /// Maximum size of a request [bytes], from `hello`.
     max_request_bytes: usize,
+    /// Maximum number of steps of a rollout, from `hello`; 0 for a server without rollouts.
+    max_rollout_steps: u64,
     _token: LivelinessToken,
 }
 
@@ -74,9 +76,21 @@ impl Connection {
         let key = keys::live_client(&sid, &client);
         let token = session.liveliness().declare_token(&key).wait().map_err(|error| zenoh_error(&error))?;
         let endpoint = options.endpoint.clone();
-        let (timeout, max_request_bytes) = (options.timeout, usize::MAX);
-        let mut this = Self { endpoint, timeout, session, sid, name, client, secret, max_request_bytes, _token: token };
-        this.max_request_bytes = usize::try_from(this.hello()?.max_request_bytes).unwrap_or(usize::MAX);
+        let mut this = Self {
+            endpoint,
+            timeout: options.timeout,
+            session,
+            sid,
+            name,
+            client,
+            secret,
+            max_request_bytes: usize::MAX,
+            max_rollout_steps: 0,
+            _token: token,
+        };
+        let hello = this.hello()?;
+        this.max_request_bytes = usize::try_from(hello.max_request_bytes).unwrap_or(usize::MAX);
+        this.max_rollout_steps = hello.max_rollout_steps;
         Ok(this)
     }
 
@@ -93,6 +107,16 @@ impl Connection {
     /// Returns the id of the server.
     pub fn sid(&self) -> &str {
         &self.sid
+    }
+
+    /// Returns the maximum number of steps of a rollout; 0 for a server without rollouts.
+    pub fn max_rollout_steps(&self) -> u64 {
+        self.max_rollout_steps
+    }
+
+    /// Returns true if the server's liveliness token is visible.
+    pub fn server_is_visible(&self) -> bool {
+        visible_servers(&self.session).iter().any(|(sid, _)| *sid == self.sid)
     }
 
     /// Declares a querier for one key of the server.
@@ -121,7 +145,7 @@ impl Connection {
 
     /// Sends a request and waits for the reply.
     pub fn request(&self, querier: &Querier<'static>, request: Vec<u8>) -> Result<ZBytes, ClientError> {
-        self.wait_reply(querier, &mut self.send(querier, request)?)
+        self.wait_reply(querier, &mut self.send(querier, request)?, self.timeout)
     }
 
     /// Sends a request without waiting for the reply.
@@ -136,7 +160,12 @@ impl Connection {
     }
 
     /// Waits for the reply to a request and repeats the request until the timeout. May be called again after a timeout.
-    pub fn wait_reply(&self, querier: &Querier<'static>, pending: &mut Pending) -> Result<ZBytes, ClientError> {
+    pub fn wait_reply(
+        &self,
+        querier: &Querier<'static>,
+        pending: &mut Pending,
+        timeout: Duration,
+    ) -> Result<ZBytes, ClientError> {
         let since = Instant::now();
         let mut pause = RETRY_BACKOFF[0];
         let mut replaced_since: Option<Instant> = None;
@@ -155,7 +184,7 @@ impl Connection {
                     }
                 }
             }
-            if since.elapsed() >= self.timeout {
+            if since.elapsed() >= timeout {
                 return Err(ClientError::RequestTimeout {
                     endpoint: self.endpoint.clone(),
                     request: querier.key_expr().to_string(),
@@ -167,6 +196,11 @@ impl Connection {
             pause = (pause * 2).min(RETRY_BACKOFF[1]);
             pending.replies = get(querier, &pending.request)?;
         }
+    }
+
+    /// Returns the time after which an unanswered request fails.
+    pub fn timeout(&self) -> Duration {
+        self.timeout
     }
 
     /// Returns true if a server of this robot's name is visible under another id, and this server is not visible.
@@ -184,7 +218,7 @@ impl Connection {
                     not suspended"
                 .to_owned();
         }
-        if !visible_servers(&self.session).iter().any(|(sid, _)| *sid == self.sid) {
+        if !self.server_is_visible() {
             // A suspended server that is connected directly does not answer the query for visible servers either.
             return "the server is no longer visible: it has terminated or lost its router, or, without a router, it is \
                     unresponsive"

@@ -132,6 +132,10 @@ impl VecEnv for GroupedVecEnv {
         Ok(&self.batch.obs)
     }
 
+    fn obs(&self) -> &[f32] {
+        &self.batch.obs
+    }
+
     fn critic_obs(&self) -> &[f32] {
         &self.batch.critic_obs
     }

@@ -15,6 +15,8 @@
 //!
 //! [`GroupedVecEnv`] keeps several groups of environments stepping while the agent computes actions.
 //!
+//! [`RemoteVecEnv::rollout`] runs a policy on the server, next to its robots; [`RemoteCollector`] does it for a learner.
+//!
 //! The client repeats a request with the same sequence number until a reply arrives. The server executes each number
 //! once. A lost reply, an unresponsive server or a restarted router costs time, but no step is lost or executed twice.
 //! If no reply arrives, [`ClientError`] contains the reason.
@@ -24,6 +26,7 @@ mod discovery;
 mod error;
 mod grouped_env;
 mod options;
+mod remote_collector;
 mod remote_env;
 mod server_process;
 mod session;
@@ -33,6 +36,7 @@ pub use discovery::{Discovery, ServerInfo};
 pub use error::ClientError;
 pub use grouped_env::GroupedVecEnv;
 pub use options::ConnectOptions;
+pub use remote_collector::RemoteCollector;
 pub use remote_env::{LeaseHandle, RemoteVecEnv};
 pub use server_process::ServerProcess;
 pub use twinstep_protocol::Secret;

@@ -1,9 +1,12 @@
 //! Vectorised environments on a server.
 
 use std::sync::OnceLock;
+use std::time::Duration;
 
-use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, Scene, StepBatch, VecEnv};
+use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, Scene, StepBatch, Trajectory, VecEnv};
+use twinstep_policy::BehaviourPolicy;
 use twinstep_protocol::keys::EnvMethod;
+use twinstep_protocol::tensor::as_bytes;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, Secret, convert, decode, encode, keys, message};
 use zenoh::bytes::ZBytes;
 use zenoh::query::Querier;
@@ -35,6 +38,12 @@ pub struct RemoteVecEnv {
     reset: Querier<'static>,
     /// Declared at the first `scene`, which most agents never request.
     render: OnceLock<Querier<'static>>,
+    /// Declared at the first rollout.
+    rollout: OnceLock<Querier<'static>>,
+    /// Number of steps of the rollout in progress, and the fingerprint of its policy if the request contains it.
+    sent_rollout: (usize, Option<u64>),
+    /// Fingerprint of the policy that the server holds, and its id.
+    held_policy: Option<(u64, u64)>,
     /// The request in progress, with its method.
     pending: Option<(EnvMethod, Pending)>,
     /// True if a reply could not be read, so that the state of the environments is unknown. A reset heals it.
@@ -85,6 +94,9 @@ impl RemoteVecEnv {
             step,
             reset,
             render: OnceLock::new(),
+            rollout: OnceLock::new(),
+            sent_rollout: (0, None),
+            held_policy: None,
             pending: None,
             is_unknown: false,
             velocity_commands: None,
@@ -104,12 +116,7 @@ impl RemoteVecEnv {
 
     /// Sends actions without waiting, so that the caller can compute during the step. Call [`RemoteVecEnv::recv`] next.
     pub fn send(&mut self, actions: &[f32]) -> Result<(), EnvError> {
-        if let Some((verb, _)) = &self.pending {
-            return Err(remote(ClientError::RequestPending(verb.name())));
-        }
-        if self.is_unknown {
-            return Err(remote(ClientError::UnknownState));
-        }
+        self.check_idle()?;
         let expected = self.num_envs * self.spec.action_len();
         if actions.len() != expected {
             return Err(EnvError::WrongLength { field: "actions", given: actions.len(), expected });
@@ -125,12 +132,8 @@ impl RemoteVecEnv {
     /// It may be called again after a [`ClientError::RequestTimeout`]. The step is then repeated with the same sequence
     /// number, and executed once.
     pub fn recv(&mut self) -> Result<&StepBatch, EnvError> {
-        match &self.pending {
-            Some((EnvMethod::Step, _)) => {}
-            Some((verb, _)) => return Err(remote(ClientError::RequestPending(verb.name()))),
-            None => return Err(remote(ClientError::NothingSent)),
-        }
-        let answer = self.await_pending()?;
+        self.check_pending(EnvMethod::Step)?;
+        let answer = self.await_pending(self.connection.timeout())?;
         let bytes = answer.to_bytes();
         self.is_unknown = true;
         let reply: message::StepReply<'_> = decode(&bytes).map_err(|error| malformed("step", error))?;
@@ -141,11 +144,111 @@ impl RemoteVecEnv {
         Ok(&self.batch)
     }
 
+    /// Returns the maximum number of steps of a rollout; 0 for a server without rollouts.
+    pub fn max_rollout_steps(&self) -> u64 {
+        self.connection.max_rollout_steps()
+    }
+
+    /// Runs `policy` on the server for `steps` steps of all environments.
+    ///
+    /// The noise of environment `i` is a function of `noise_seed + i` alone. The weights are sent only if they differ
+    /// from those of the last rollout. Sends the request and waits, as [`RemoteVecEnv::send_rollout`] and
+    /// [`RemoteVecEnv::recv_rollout`] do.
+    pub fn rollout(
+        &mut self,
+        policy: &BehaviourPolicy,
+        noise_seed: u64,
+        steps: usize,
+        trajectory: &mut Trajectory,
+    ) -> Result<(), EnvError> {
+        self.send_rollout(policy, noise_seed, steps)?;
+        let result = self.recv_rollout(trajectory);
+        if !result.as_ref().is_err_and(is_unknown_policy) {
+            return result;
+        }
+        self.send_rollout(policy, noise_seed, steps)?;
+        self.recv_rollout(trajectory)
+    }
+
+    /// Sends the request for a rollout without waiting. Call [`RemoteVecEnv::recv_rollout`] next.
+    pub fn send_rollout(&mut self, policy: &BehaviourPolicy, noise_seed: u64, steps: usize) -> Result<(), EnvError> {
+        self.check_idle()?;
+        let fingerprint = policy.fingerprint();
+        let policy_id = self.held_policy.filter(|(held, _)| *held == fingerprint).map(|(_, id)| id);
+        let (mean, std) = policy.normaliser().mean_and_std();
+        let sent = message::RolloutPolicy {
+            sizes: policy.actor().sizes().iter().map(|size| *size as u64).collect(),
+            weights: as_bytes(policy.weights()),
+            mean: as_bytes(&mean),
+            std: as_bytes(&std),
+            log_std: as_bytes(policy.log_std()),
+        };
+        let request = message::RolloutRequest {
+            protocol: PROTOCOL,
+            epoch: self.ticket.epoch,
+            seq: self.last_seq + 1,
+            steps: steps as u64,
+            noise_seed,
+            policy: policy_id.is_none().then_some(sent),
+            policy_id,
+        };
+        let querier = self.declared(&self.rollout, EnvMethod::Rollout).map_err(remote)?;
+        let pending = self.connection.send(querier, encode(&request)).map_err(remote)?;
+        self.pending = Some((EnvMethod::Rollout, pending));
+        self.sent_rollout = (steps, policy_id.is_none().then_some(fingerprint));
+        Ok(())
+    }
+
+    /// Waits for the trajectory of a rollout.
+    ///
+    /// It may be called again after a [`ClientError::RequestTimeout`]. After
+    /// [`ErrorCode::UnknownPolicy`](twinstep_protocol::ErrorCode::UnknownPolicy) the next request contains the policy.
+    pub fn recv_rollout(&mut self, trajectory: &mut Trajectory) -> Result<(), EnvError> {
+        self.recv_rollout_within(self.connection.timeout(), trajectory)
+    }
+
+    /// As [`RemoteVecEnv::recv_rollout`], with another timeout.
+    pub fn recv_rollout_within(&mut self, timeout: Duration, trajectory: &mut Trajectory) -> Result<(), EnvError> {
+        self.check_pending(EnvMethod::Rollout)?;
+        let answer = self.await_pending(timeout).inspect_err(|error| {
+            if is_unknown_policy(error) {
+                self.held_policy = None;
+            }
+            // The steps before the failed one were executed.
+            self.is_unknown |= is_rejected_with(error, ErrorCode::RolloutFailed);
+        })?;
+        let bytes = answer.to_bytes();
+        self.is_unknown = true;
+        let reply: message::RolloutReply<'_> = decode(&bytes).map_err(|error| malformed("rollout", error))?;
+        check_seq("rollout", reply.seq, self.last_seq)?;
+        let (steps, new_policy) = self.sent_rollout;
+        convert::decode_trajectory(&reply, &self.spec, self.num_envs, steps, trajectory)
+            .map_err(|error| malformed("rollout", error))?;
+        if let Some(fingerprint) = new_policy {
+            self.held_policy = Some((fingerprint, self.last_seq));
+        }
+        let last = |rows: &[f32], len: usize| rows[rows.len() - len..].to_vec();
+        self.batch.obs = last(&trajectory.obs, self.batch.obs.len());
+        self.batch.critic_obs = last(&trajectory.critic_obs, self.batch.critic_obs.len());
+        self.is_unknown = false;
+        Ok(())
+    }
+
+    /// Returns true if the server's liveliness token is visible.
+    pub fn server_is_visible(&self) -> bool {
+        self.connection.server_is_visible()
+    }
+
+    /// Returns true if a request is in progress.
+    pub fn is_pending(&self) -> bool {
+        self.pending.is_some()
+    }
+
     /// Ends the lease at once. Without it, the server keeps the environments for the grace period.
     pub fn close(mut self) -> Result<(), ClientError> {
         if self.pending.is_some() {
             // Its result is not needed, but whether its number was consumed is.
-            let _ = self.await_pending();
+            let _ = self.await_pending(self.connection.timeout());
         }
         let querier =
             self.connection.querier(keys::env(self.connection.sid(), &self.ticket.lease, EnvMethod::Close))?;
@@ -157,23 +260,48 @@ impl RemoteVecEnv {
         }
     }
 
-    fn render_querier(&self) -> Result<&Querier<'static>, ClientError> {
-        if let Some(querier) = self.render.get() {
+    /// Returns the querier in `cell` for a method; declares it at its first use.
+    fn declared<'a>(
+        &self,
+        cell: &'a OnceLock<Querier<'static>>,
+        verb: EnvMethod,
+    ) -> Result<&'a Querier<'static>, ClientError> {
+        if let Some(querier) = cell.get() {
             return Ok(querier);
         }
-        let querier =
-            self.connection.querier(keys::env(self.connection.sid(), &self.ticket.lease, EnvMethod::Render))?;
-        Ok(self.render.get_or_init(|| querier))
+        let querier = self.connection.querier(keys::env(self.connection.sid(), &self.ticket.lease, verb))?;
+        Ok(cell.get_or_init(|| querier))
+    }
+
+    /// Fails if a request is in progress, or the state of the environments is unknown.
+    fn check_idle(&self) -> Result<(), EnvError> {
+        if let Some((verb, _)) = &self.pending {
+            return Err(remote(ClientError::RequestPending(verb.name())));
+        }
+        if self.is_unknown { Err(remote(ClientError::UnknownState)) } else { Ok(()) }
+    }
+
+    /// Fails unless a request of this method is in progress.
+    fn check_pending(&self, expected: EnvMethod) -> Result<(), EnvError> {
+        match &self.pending {
+            Some((verb, _)) if *verb == expected => Ok(()),
+            Some((verb, _)) => Err(remote(ClientError::RequestPending(verb.name()))),
+            None => Err(remote(ClientError::NothingSent)),
+        }
     }
 
     /// Waits for the reply to the pending request.
     ///
     /// After a timeout the request stays pending, because it may have been executed. A reply or an error with effects
     /// consumes its number.
-    fn await_pending(&mut self) -> Result<ZBytes, EnvError> {
+    fn await_pending(&mut self, timeout: Duration) -> Result<ZBytes, EnvError> {
         let Some((verb, pending)) = &mut self.pending else { return Err(remote(ClientError::NothingSent)) };
-        let querier = if *verb == EnvMethod::Reset { &self.reset } else { &self.step };
-        let answer = self.connection.wait_reply(querier, pending);
+        let querier = match (verb, self.rollout.get()) {
+            (EnvMethod::Reset, _) => &self.reset,
+            (EnvMethod::Rollout, Some(rollout)) => rollout,
+            _ => &self.step,
+        };
+        let answer = self.connection.wait_reply(querier, pending, timeout);
         let executed = match &answer {
             Ok(_) => true,
             Err(ClientError::RequestTimeout { .. }) => return answer.map_err(remote),
@@ -202,7 +330,7 @@ impl VecEnv for RemoteVecEnv {
     fn reset(&mut self, request: &ResetRequest) -> Result<&[f32], EnvError> {
         if self.pending.is_some() {
             // An abandoned step: its result or error is not needed, but whether its number was consumed is.
-            let awaited = self.await_pending().map(drop);
+            let awaited = self.await_pending(self.connection.timeout()).map(drop);
             if self.pending.is_some() {
                 return awaited.map(|()| self.batch.obs.as_slice());
             }
@@ -210,7 +338,7 @@ impl VecEnv for RemoteVecEnv {
         request.check(self.num_envs)?;
         let payload = convert::encode_reset(request, self.ticket.epoch, self.last_seq + 1);
         self.pending = Some((EnvMethod::Reset, self.connection.send(&self.reset, payload).map_err(remote)?));
-        let answer = self.await_pending()?;
+        let answer = self.await_pending(self.connection.timeout())?;
         let bytes = answer.to_bytes();
         let was_unknown = std::mem::replace(&mut self.is_unknown, true);
         let reply: message::ResetReply<'_> = decode(&bytes).map_err(|error| malformed("reset", error))?;
@@ -220,6 +348,10 @@ impl VecEnv for RemoteVecEnv {
         // A mask leaves the other environments as they are.
         self.is_unknown = was_unknown && request.mask.is_some();
         Ok(&self.batch.obs)
+    }
+
+    fn obs(&self) -> &[f32] {
+        &self.batch.obs
     }
 
     fn critic_obs(&self) -> &[f32] {
@@ -240,7 +372,7 @@ impl VecEnv for RemoteVecEnv {
 
     /// If a step is in progress, the scene is that after the step.
     fn scene(&self, env: usize) -> Result<Scene, EnvError> {
-        let querier = self.render_querier().map_err(remote)?;
+        let querier = self.declared(&self.render, EnvMethod::Render).map_err(remote)?;
         let request = message::RenderRequest { protocol: PROTOCOL, epoch: self.ticket.epoch, env: env as u64 };
         let answer = self.connection.request(querier, encode(&request)).map_err(remote)?;
         let bytes = answer.to_bytes();
@@ -250,6 +382,23 @@ impl VecEnv for RemoteVecEnv {
 
 fn remote(error: ClientError) -> EnvError {
     EnvError::Remote(Box::new(error))
+}
+
+/// Returns the error of the client inside an error of its environments.
+pub fn client_error(error: &EnvError) -> Option<&ClientError> {
+    match error {
+        EnvError::Remote(error) => error.downcast_ref(),
+        _ => None,
+    }
+}
+
+fn is_rejected_with(error: &EnvError, code: ErrorCode) -> bool {
+    matches!(client_error(error), Some(ClientError::Rejected(rejection)) if rejection.code == code)
+}
+
+/// Returns true if the server does not hold the policy whose id was sent.
+pub fn is_unknown_policy(error: &EnvError) -> bool {
+    is_rejected_with(error, ErrorCode::UnknownPolicy)
 }
 
 /// Fails if a reply is not that to the last request.

@@ -8,6 +8,7 @@ pub mod ensemble;
 mod error;
 pub mod identify;
 pub mod remote;
+pub mod remote_training;
 pub mod sim;
 pub mod tcp;
 pub mod throughput;

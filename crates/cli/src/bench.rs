@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use twinstep_bench::{BenchError, Machine, Results, ensemble, identify, remote, sim, tcp, transport};
+use twinstep_bench::{BenchError, Machine, Results, ensemble, identify, remote, remote_training, sim, tcp, transport};
 
 use crate::exit::{CommandResult, Failure, Signals, other};
 
@@ -34,7 +34,7 @@ enum What {
     Transport,
     /// Physics: env-steps/s on one core at each setting, and accuracy, compared with MuJoCo and EnvPool.
     Sim,
-    /// Environments with physics over Zenoh, compared with the same environments in process.
+    /// Environments with physics over Zenoh, and training on them by rollouts, compared with the same in process.
     Remote,
     /// Identification: closed-loop rollouts of the built-in recording compared with MuJoCo, and one whole run.
     Identify,
@@ -67,6 +67,7 @@ pub fn run(args: &Args) -> CommandResult {
     }
     if selected(What::Remote) {
         rows.extend(remote::measure(args.window_s, &interrupted).map_err(failure)?);
+        rows.extend(remote_training::measure(args.window_s, &interrupted).map_err(failure)?);
     }
     if selected(What::Identify) {
         rows.extend(identify::measure(&args.python, args.window_s, &interrupted).map_err(failure)?);

@@ -73,6 +73,9 @@ pub struct Args {
     /// Maximum number of environments that one client may lease. Default: all.
     #[arg(long, value_name = "N")]
     max_envs_per_client: Option<usize>,
+    /// Maximum number of steps of a rollout, 0 for none. Default: 128.
+    #[arg(long, value_name = "N")]
+    max_rollout_steps: Option<usize>,
     /// Time for which the environments of a disconnected client are kept [s]. Default: 10.
     #[arg(long, value_name = "S")]
     lease_grace_s: Option<f64>,
@@ -136,6 +139,7 @@ impl Args {
         set(&mut server.name, self.name.as_ref());
         set(&mut server.listen, self.listen.as_ref());
         set(&mut server.envs, self.envs.as_ref());
+        set(&mut server.max_rollout_steps, self.max_rollout_steps.as_ref());
         set(&mut server.lease_grace_s, self.lease_grace_s.as_ref());
         if !self.connect.is_empty() {
             server.connect.clone_from(&self.connect);

@@ -4,11 +4,13 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_client::{ConnectOptions, RemoteCollector, RemoteVecEnv};
 use twinstep_envs::TaskConfig;
-use twinstep_learning::{Checkpoint, Evaluation, EvaluationError, EvaluationPlan, LearningError, Trainer, evaluate};
-use twinstep_model::{AutoresetMode, VecEnv};
-use twinstep_policy::{CurvePoint, Policy, PolicyOrigin};
+use twinstep_learning::{
+    Checkpoint, Evaluation, EvaluationError, EvaluationPlan, LearningError, PpoConfig, Trainer, evaluate,
+};
+use twinstep_model::AutoresetMode;
+use twinstep_policy::{Collector, CurvePoint, Policy, PolicyOrigin, StepCollector};
 use twinstep_sim::SimConfig;
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
@@ -18,14 +20,13 @@ use crate::train_log::{TrainLog, curve_point, write_curve};
 
 /// Interval at which a running training is saved.
 const SAVE_EVERY: Duration = Duration::from_secs(10);
-/// Groups of robots of a server: while the policy handles one, the server steps the other.
-const REMOTE_GROUPS: usize = 2;
 /// Robots, simulated time [s] and seed of the evaluation after the training.
 const EVALUATION: (usize, f64, u64) = (256, 20.0, 1_000_000);
 
 /// Train a policy by proximal policy optimisation.
 ///
-/// Simulates the robots on all cores, or steps those of a server (--endpoint), and learns from them. The folder then contains:
+/// Simulates the robots on all cores, or runs the policy on the robots of servers (--endpoint), and learns from the
+/// trajectories. The folder then contains:
 ///
 ///   policy.safetensors     the policy, with the spec of its environment
 ///   policy.onnx            the same for other runtimes: input `obs` [batch, 45] in SI units, output `action` [batch, 12]
@@ -68,10 +69,11 @@ pub struct Args {
     /// Number of robots. Default: 1024.
     #[arg(long, value_name = "N")]
     envs: Option<usize>,
-    /// Train on the robots of a server at this Zenoh endpoint, such as tcp/127.0.0.1:7447. The settings [task], [sim]
-    /// and [randomise] are then those of the server. Default: simulate in this process.
-    #[arg(long, value_name = "ENDPOINT", conflicts_with_all = ["model", "randomise_effects"])]
-    endpoint: Option<String>,
+    /// Train on the robots of a server at this Zenoh endpoint, such as tcp/127.0.0.1:7447; repeat it to divide the
+    /// robots among several servers. A server that is lost is left out until it is back. The settings [task], [sim] and
+    /// [randomise] are then those of the servers. Default: simulate in this process.
+    #[arg(long, value_name = "ENDPOINT", value_delimiter = ',', conflicts_with_all = ["model", "randomise_effects"])]
+    endpoint: Vec<String>,
     /// Continue the training in the folder with its settings and seed.
     #[arg(long, conflicts_with_all = ["config", "model", "randomise_effects", "seed", "envs"])]
     resume: bool,
@@ -127,7 +129,7 @@ impl Args {
             steps: Some(steps),
             minutes: None,
             envs: None,
-            endpoint: None,
+            endpoint: Vec::new(),
             resume: false,
             json: false,
         }
@@ -187,7 +189,7 @@ struct TrainSession {
     seed: u64,
     out: PathBuf,
     policy: PathBuf,
-    endpoint: Option<String>,
+    endpoints: Vec<String>,
     minutes: Option<f64>,
     trainer: Trainer,
     curve: Vec<CurvePoint>,
@@ -196,20 +198,23 @@ struct TrainSession {
 
 impl TrainSession {
     fn new(args: &Args, config: TrainConfig, text: String, checkpoint: Option<Checkpoint>) -> Result<Self, Failure> {
-        let envs = match &args.endpoint {
-            Some(endpoint) => remote_envs(endpoint, config.train.num_envs, REMOTE_GROUPS)?,
-            None => config.envs(config.train.num_envs, config.train.groups, 1)?,
+        let collectors = match &args.endpoint[..] {
+            [] => {
+                let envs = config.envs(config.train.num_envs, config.train.groups, 1)?;
+                envs.into_iter().map(|env| Box::new(StepCollector(env)) as Box<dyn Collector>).collect()
+            }
+            endpoints => remote_collectors(endpoints, &config.train)?,
         };
         let seed = checkpoint.as_ref().map_or(args.seed, |checkpoint| checkpoint.seed);
         let resumed_at = checkpoint.as_ref().map(|checkpoint| checkpoint.learner.env_steps);
         let (learner, curve) =
             checkpoint.map_or((None, Vec::new()), |checkpoint| (Some(checkpoint.learner), checkpoint.curve));
-        let trainer = Trainer::new(config.train.clone(), envs, learner, seed).map_err(input)?;
+        let trainer = Trainer::new(config.train.clone(), collectors, learner, seed).map_err(input)?;
         let log = TrainLog::open(&args.out, &trainer.spec().reward_terms, resumed_at)
             .map_err(|cause| folder_error(&args.out, cause))?;
         let (out, policy) = (args.out.clone(), args.policy());
-        let (endpoint, minutes) = (args.endpoint.clone(), args.minutes);
-        Ok(Self { config, text, seed, out, policy, endpoint, minutes, trainer, curve, log })
+        let (endpoints, minutes) = (args.endpoint.clone(), args.minutes);
+        Ok(Self { config, text, seed, out, policy, endpoints, minutes, trainer, curve, log })
     }
 
     /// Trains until all steps are done, the time is over, or the user interrupts.
@@ -293,33 +298,62 @@ impl TrainSession {
         let (robots, seconds, seed) = EVALUATION;
         let fresh =
             TrainConfig { model: self.config.model.clone(), sim: SimConfig::default(), ..TrainConfig::default() };
-        let mut env = match &self.endpoint {
-            Some(endpoint) => remote_envs(endpoint, robots, 1)?.remove(0),
-            None => fresh.envs(robots, 1, 0)?.remove(0),
-        };
         let robot = robot_model(self.config.model.as_deref())?;
         let plan = EvaluationPlan { robot: &robot, seconds, seed };
-        evaluate(policy, env.as_mut(), plan, |_| signals.check().is_ok()).map_err(|error| match error {
+        let proceed = |_: f64| signals.check().is_ok();
+        let failure = |error| match error {
             EvaluationError::Stopped => Failure::Interrupted,
             _ => other(error),
-        })
+        };
+        if self.endpoints.is_empty() {
+            let mut env = fresh.envs(robots, 1, 0)?.remove(0);
+            return evaluate(policy, env.as_mut(), plan, proceed).map_err(failure);
+        }
+        let mut env = remote_env(&self.endpoints, robots)?;
+        let evaluation = evaluate(policy, &mut env, plan, proceed).map_err(failure)?;
+        env.close().map_err(other)?;
+        Ok(evaluation)
     }
 }
 
-/// Leases environments of a server, in `groups` leases.
-fn remote_envs(endpoint: &str, num_envs: usize, groups: usize) -> Result<Vec<Box<dyn VecEnv>>, Failure> {
-    let groups = groups.min(num_envs);
-    let connect = |group: usize| {
+/// Returns the options of a connection for training.
+fn connect_options(endpoint: &str, num_envs: usize) -> ConnectOptions {
+    ConnectOptions { autoreset: AutoresetMode::SameStep, critic: true, ..ConnectOptions::new(endpoint, num_envs) }
+}
+
+/// Leases environments of the first server that grants them.
+fn remote_env(endpoints: &[String], num_envs: usize) -> Result<RemoteVecEnv, Failure> {
+    let connect = |endpoint: &String| RemoteVecEnv::connect(&connect_options(endpoint, num_envs));
+    let (last, others) = endpoints.split_last().expect("there is an endpoint");
+    others.iter().find_map(|endpoint| connect(endpoint).ok()).map_or_else(|| connect(last), Ok).map_err(other)
+}
+
+/// Leases the environments of each group. The groups are divided among the servers in order.
+fn remote_collectors(endpoints: &[String], config: &PpoConfig) -> Result<Vec<Box<dyn Collector>>, Failure> {
+    let PpoConfig { num_envs, groups, horizon, .. } = *config;
+    let mut collectors = Vec::new();
+    for group in 0..groups {
         let robots = num_envs / groups + usize::from(group < num_envs % groups);
-        let options = ConnectOptions {
-            autoreset: AutoresetMode::SameStep,
-            critic: true,
-            ..ConnectOptions::new(endpoint, robots)
-        };
-        let env = RemoteVecEnv::connect(&options).map_err(other)?;
-        Ok(Box::new(env) as Box<dyn VecEnv>)
-    };
-    (0..groups).map(connect).collect()
+        let endpoint = &endpoints[group * endpoints.len() / groups];
+        collectors.push(remote_collector(endpoint, robots, horizon)?);
+    }
+    Ok(collectors)
+}
+
+fn remote_collector(endpoint: &str, num_envs: usize, horizon: usize) -> Result<Box<dyn Collector>, Failure> {
+    let options = connect_options(endpoint, num_envs);
+    let env = RemoteVecEnv::connect(&options).map_err(other)?;
+    match env.max_rollout_steps() {
+        0 => {
+            tracing::warn!(endpoint, num_envs, "the server has no rollouts; each step is a request");
+            Ok(Box::new(StepCollector(Box::new(env))))
+        }
+        max if (horizon as u64) > max => Err(Failure::Input(miette::miette!(
+            "`train.horizon` = {horizon} is not allowed: the server at {endpoint} has rollouts of at most {max} steps\n  \
+             use a shorter horizon, or start the server with a larger `--max-rollout-steps`"
+        ))),
+        _ => Ok(Box::new(RemoteCollector::new(env, &options))),
+    }
 }
 
 fn progress_text(point: &CurvePoint) -> String {

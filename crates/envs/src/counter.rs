@@ -90,6 +90,10 @@ impl VecEnv for CounterEnv {
         Ok(&self.batch.obs)
     }
 
+    fn obs(&self) -> &[f32] {
+        &self.batch.obs
+    }
+
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
         let action_len = self.spec.action_len();
         let expected = self.num_envs() * action_len;

@@ -256,6 +256,10 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
         Ok(&self.batch.obs)
     }
 
+    fn obs(&self) -> &[f32] {
+        &self.batch.obs
+    }
+
     fn critic_obs(&self) -> &[f32] {
         &self.batch.critic_obs
     }

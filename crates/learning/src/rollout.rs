@@ -1,8 +1,8 @@
-//! Collection of transitions: a group of robots is stepped with the current policy.
+//! Transitions of a group of robots: the trajectory that the current policy collected, with values and advantages.
 
 use rand::Rng;
-use twinstep_model::{EnvError, EnvSpec, ResetRequest, Stream, VecEnv, stream};
-use twinstep_policy::{Activations, Mlp, Network, Normaliser, gaussian};
+use twinstep_model::{EnvError, EnvSpec, Trajectory, stream};
+use twinstep_policy::{Activations, BehaviourPolicy, Collector, Mlp, Network, Normaliser};
 
 use crate::gae::{Discounts, Transitions, advantages};
 use crate::statistics::Statistics;
@@ -10,21 +10,21 @@ use crate::statistics::Statistics;
 /// Number of rows that are evaluated together, so that they stay in the processor's cache.
 pub const BLOCK: usize = 64;
 
-/// Actor, critic and normaliser while transitions are collected.
+/// Policy, critic and normaliser while transitions are collected.
 pub struct Behaviour<'a> {
-    /// Network from the normalised observation of group `policy` to the mean action.
-    pub actor: &'a Network,
+    /// The policy.
+    pub policy: &'a BehaviourPolicy,
+    /// Seed of the noise of robot 0; robot `i` has this plus `i`.
+    pub noise_seed: u64,
     /// Network from the normalised observations of both groups to the value.
     pub critic: &'a Network,
-    /// Logarithm of the standard deviation of each entry of the action.
-    pub log_std: &'a [f32],
     /// Moments of the observations of both groups, `policy` first.
     pub normaliser: &'a Normaliser,
     /// Discounts of the advantage estimator.
     pub discounts: Discounts,
 }
 
-/// Transitions of a group of robots, row-major: `[step][robot]`.
+/// Transitions of a group of robots, row-major: `[step][robot]`. Empty if the robots could not be reached.
 ///
 /// A row of `features` has the normalised observation of group `policy`, then that of group `critic`.
 #[derive(Clone, Debug, Default)]
@@ -39,21 +39,16 @@ pub struct Segment {
     pub values: Vec<f32>,
     /// Advantage of each step.
     pub advantages: Vec<f32>,
-    rewards: Vec<f32>,
-    done: Vec<bool>,
-    /// Normalised last observation of each truncated episode, and the index of its transition.
-    truncated: Vec<(usize, Vec<f32>)>,
 }
 
 /// Robots that are stepped together, and their transitions.
 pub struct Group {
-    env: Box<dyn VecEnv>,
-    obs: Vec<f32>,
-    critic_obs: Vec<f32>,
-    random: Vec<Stream>,
-    actor: Activations,
-    critic: Activations,
+    collector: Box<dyn Collector>,
+    spec: EnvSpec,
+    first_robot: u64,
     horizon: usize,
+    trajectory: Trajectory,
+    critic: Activations,
     /// Transitions of the last rollout.
     pub segment: Segment,
     /// Moments of the observations of the last rollout.
@@ -63,122 +58,85 @@ pub struct Group {
 }
 
 impl Group {
-    /// Resets the robots of `env` with the seeds from `seed` on. `first_robot` is the index of its first robot.
+    /// Resets the robots of `collector` with the seeds from `seed` on. `first_robot` is the index of its first robot.
     pub fn new(
-        mut env: Box<dyn VecEnv>,
-        networks: [&Mlp; 2],
+        mut collector: Box<dyn Collector>,
+        critic: &Mlp,
         horizon: usize,
         seed: u64,
         first_robot: usize,
     ) -> Result<Self, EnvError> {
-        let num_envs = env.num_envs();
-        let robots = first_robot as u64..(first_robot + num_envs) as u64;
-        let seeds = robots.clone().map(|robot| stream_seed(seed, robot)).collect();
-        let obs = env.reset(&ResetRequest { seeds: Some(seeds), mask: None })?.to_vec();
-        let feature_len = feature_len(env.spec());
+        let (spec, first_robot) = (collector.spec().clone(), first_robot as u64);
+        let robots = first_robot..first_robot + collector.num_envs() as u64;
+        collector.reset(&robots.map(|robot| stream_seed(seed, robot)).collect::<Vec<_>>())?;
         Ok(Self {
-            obs,
-            critic_obs: env.critic_obs().to_vec(),
-            random: robots.map(|robot| stream(seed, "action", robot)).collect(),
-            actor: Activations::new(networks[0], BLOCK),
-            critic: Activations::new(networks[1], BLOCK),
+            first_robot,
             horizon,
+            trajectory: Trajectory::default(),
+            critic: Activations::new(critic, BLOCK),
             segment: Segment::default(),
-            moments: Normaliser::identity(feature_len),
-            statistics: Statistics::new(env.spec()),
-            env,
+            moments: Normaliser::identity(feature_len(&spec)),
+            statistics: Statistics::new(&spec),
+            spec,
+            collector,
         })
     }
 
-    /// Returns the number of robots.
-    pub fn num_envs(&self) -> usize {
-        self.env.num_envs()
+    /// Sends the request for a rollout, if the robots are on a server. [`Group::collect`] follows.
+    pub fn send(&mut self, behaviour: &Behaviour) -> Result<(), EnvError> {
+        self.collector.send(behaviour.policy, behaviour.noise_seed.wrapping_add(self.first_robot), self.horizon)
     }
 
     /// Steps the robots `horizon` times, and estimates the advantages.
     pub fn collect(&mut self, behaviour: &Behaviour) -> Result<(), EnvError> {
-        let (num_envs, spec) = (self.env.num_envs(), self.env.spec().clone());
-        let (action_len, feature_len) = (spec.action_len(), feature_len(&spec));
-        let len = self.horizon * num_envs;
-        let Segment { features, actions, log_probs, values, advantages, rewards, done, truncated } = &mut self.segment;
-        features.resize(len * feature_len, 0.0);
-        actions.resize(len * action_len, 0.0);
-        for array in [&mut *log_probs, values, advantages, rewards] {
-            array.resize(len, 0.0);
+        let Self { collector, spec, trajectory, horizon, segment, .. } = self;
+        self.moments = Normaliser::identity(feature_len(spec));
+        self.statistics = Statistics::new(spec);
+        let noise_seed = behaviour.noise_seed.wrapping_add(self.first_robot);
+        if !collector.collect(behaviour.policy, noise_seed, *horizon, trajectory)? {
+            *segment = Segment::default();
+            return Ok(());
         }
-        done.resize(len, false);
-        truncated.clear();
-        self.moments = Normaliser::identity(feature_len);
-        self.statistics = Statistics::new(&spec);
-        for step in 0..self.horizon {
-            let range = step * num_envs..(step + 1) * num_envs;
-            self.sample_actions(behaviour, &spec, range.clone());
-            let Segment { actions, rewards, done, truncated, .. } = &mut self.segment;
-            let batch = self.env.step(&actions[range.start * action_len..range.end * action_len])?;
-            rewards[range.clone()].copy_from_slice(&batch.reward);
-            for robot in 0..num_envs {
-                done[range.start + robot] = batch.done(robot);
-            }
-            self.statistics.add(&self.obs, batch);
-            for episode in &batch.ended {
-                if batch.truncated[episode.env] {
-                    let mut row = [&episode.final_obs[..], &episode.final_critic_obs].concat();
-                    let raw = row.clone();
-                    behaviour.normaliser.apply(&raw, &mut row);
-                    truncated.push((range.start + episode.env, row));
-                }
-            }
-            self.obs.copy_from_slice(&batch.obs);
-            self.critic_obs.copy_from_slice(&batch.critic_obs);
-        }
-        self.estimate_advantages(behaviour, &spec);
+        std::mem::swap(&mut segment.actions, &mut trajectory.actions);
+        std::mem::swap(&mut segment.log_probs, &mut trajectory.log_prob);
+        self.statistics.add(trajectory);
+        let last_features = self.normalise(behaviour);
+        self.estimate_advantages(behaviour, &last_features);
         Ok(())
     }
 
-    /// Normalises the current observations, and samples an action of each robot for the transitions `range`.
-    fn sample_actions(&mut self, behaviour: &Behaviour, spec: &EnvSpec, range: std::ops::Range<usize>) {
-        let (obs_len, critic_len) = (spec.obs_len(), spec.critic_obs_len());
-        let (action_len, feature_len) = (spec.action_len(), obs_len + critic_len);
-        let std: Vec<f32> = behaviour.log_std.iter().map(|log_std| log_std.exp()).collect();
-        let mut raw = vec![0.0; feature_len * range.len()];
-        for (robot, raw) in raw.chunks_exact_mut(feature_len).enumerate() {
-            raw[..obs_len].copy_from_slice(&self.obs[robot * obs_len..][..obs_len]);
-            raw[obs_len..].copy_from_slice(&self.critic_obs[robot * critic_len..][..critic_len]);
-            let row = &mut self.segment.features[(range.start + robot) * feature_len..][..feature_len];
-            behaviour.normaliser.apply(raw, row);
-        }
-        self.moments.update(&raw);
-        let mut noise = vec![0.0; action_len];
-        for first in range.clone().step_by(BLOCK) {
-            let rows = BLOCK.min(range.end - first);
-            for row in 0..rows {
-                let features = &self.segment.features[(first + row) * feature_len..];
-                self.actor.input(row)[..obs_len].copy_from_slice(&features[..obs_len]);
+    /// Writes the normalised observations before each step, and adds them to the moments. Returns those after the last.
+    fn normalise(&mut self, behaviour: &Behaviour) -> Vec<f32> {
+        let Self { spec, trajectory, segment, moments, .. } = self;
+        let (feature_len, num_envs) = (feature_len(spec), trajectory.num_envs);
+        let mut raw = vec![0.0; num_envs * feature_len];
+        let mut normalised = |step: usize, features: &mut [f32]| {
+            for (robot, row) in raw.chunks_exact_mut(feature_len).enumerate() {
+                let index = step * num_envs + robot;
+                let (obs, critic_obs) = row.split_at_mut(spec.obs_len());
+                obs.copy_from_slice(&trajectory.obs[index * obs.len()..][..obs.len()]);
+                critic_obs.copy_from_slice(&trajectory.critic_obs[index * critic_obs.len()..][..critic_obs.len()]);
+                behaviour.normaliser.apply(row, &mut features[robot * feature_len..][..feature_len]);
             }
-            behaviour.actor.forward(&mut self.actor, rows);
-            for row in 0..rows {
-                let index = first + row;
-                gaussian::fill_standard_normal(&mut self.random[index - range.start], &mut noise);
-                let mean = &self.actor.output(row)[..action_len];
-                let action = &mut self.segment.actions[index * action_len..][..action_len];
-                for entry in 0..action_len {
-                    action[entry] = mean[entry] + std[entry] * noise[entry];
-                }
-                self.segment.log_probs[index] = gaussian::log_probability(action, mean, behaviour.log_std);
+            if step < trajectory.steps {
+                moments.update(&raw);
             }
+        };
+        segment.features.resize(trajectory.steps * num_envs * feature_len, 0.0);
+        for (step, features) in segment.features.chunks_exact_mut(num_envs * feature_len).enumerate() {
+            normalised(step, features);
         }
+        let mut last_features = vec![0.0; num_envs * feature_len];
+        normalised(trajectory.steps, &mut last_features);
+        last_features
     }
 
-    fn estimate_advantages(&mut self, behaviour: &Behaviour, spec: &EnvSpec) {
-        let (num_envs, feature_len) = (self.env.num_envs(), feature_len(spec));
-        let mut last_features = vec![0.0; num_envs * feature_len];
-        let (obs_len, critic_len) = (spec.obs_len(), spec.critic_obs_len());
-        for (robot, row) in last_features.chunks_exact_mut(feature_len).enumerate() {
-            let obs = &self.obs[robot * obs_len..][..obs_len];
-            let critic_obs = &self.critic_obs[robot * critic_len..][..critic_len];
-            behaviour.normaliser.apply(&[obs, critic_obs].concat(), row);
-        }
-        let Self { critic, segment, .. } = self;
+    fn estimate_advantages(&mut self, behaviour: &Behaviour, last_features: &[f32]) {
+        let Self { critic, spec, trajectory, segment, .. } = self;
+        let (num_envs, feature_len) = (trajectory.num_envs, feature_len(spec));
+        let len = trajectory.steps * num_envs;
+        segment.values.resize(len, 0.0);
+        segment.advantages.resize(len, 0.0);
         let mut evaluate = |rows: &[f32], values: &mut [f32]| {
             for (rows, values) in rows.chunks(BLOCK * feature_len).zip(values.chunks_mut(BLOCK)) {
                 for (row, features) in rows.chunks_exact(feature_len).enumerate() {
@@ -190,16 +148,24 @@ impl Group {
         };
         let mut last_values = vec![0.0; num_envs];
         evaluate(&segment.features, &mut segment.values);
-        evaluate(&last_features, &mut last_values);
-        let mut truncated_values = vec![0.0; segment.values.len()];
-        for (index, features) in &segment.truncated {
-            evaluate(features, &mut truncated_values[*index..=*index]);
+        evaluate(last_features, &mut last_values);
+        let mut truncated_values = vec![0.0; len];
+        for (step, episode) in &trajectory.ended {
+            let index = step * num_envs + episode.env;
+            if trajectory.truncated[index] {
+                let raw = [&episode.final_obs[..], &episode.final_critic_obs].concat();
+                let mut features = vec![0.0; feature_len];
+                behaviour.normaliser.apply(&raw, &mut features);
+                evaluate(&features, &mut truncated_values[index..=index]);
+            }
         }
+        let done: Vec<bool> =
+            trajectory.terminated.iter().zip(&trajectory.truncated).map(|(one, other)| one | other).collect();
         let transitions = Transitions {
             num_envs,
-            rewards: &segment.rewards,
+            rewards: &trajectory.reward,
             values: &segment.values,
-            done: &segment.done,
+            done: &done,
             truncated_values: &truncated_values,
             last_values: &last_values,
         };

@@ -1,6 +1,6 @@
 //! Statistics of collected steps: reward terms, falls, velocity errors.
 
-use twinstep_model::{EnvSpec, SpecField, StepBatch};
+use twinstep_model::{EnvSpec, SpecField, Trajectory};
 
 /// Sums over collected steps.
 #[derive(Clone, Debug, PartialEq)]
@@ -83,20 +83,24 @@ impl Statistics {
         }
     }
 
-    /// Adds a step of all robots. `obs` are the observations before it.
-    pub fn add(&mut self, obs: &[f32], batch: &StepBatch) {
-        self.steps += batch.reward.len() as u64;
-        self.reward += batch.reward.iter().map(|reward| f64::from(*reward)).sum::<f64>();
-        for episode in &batch.ended {
+    /// Adds the steps of all robots.
+    pub fn add(&mut self, trajectory: &Trajectory) {
+        let num_envs = trajectory.num_envs;
+        self.steps += trajectory.reward.len() as u64;
+        self.reward += trajectory.reward.iter().map(|reward| f64::from(*reward)).sum::<f64>();
+        for (step, episode) in &trajectory.ended {
             self.episodes += 1;
-            self.falls += u64::from(batch.terminated[episode.env]);
+            self.falls += u64::from(trajectory.terminated[step * num_envs + episode.env]);
             self.length += u64::from(episode.length);
             self.terms.iter_mut().zip(&episode.terms).for_each(|(sum, term)| *sum += f64::from(*term));
         }
-        if let Some(layout) = self.layout {
+        let Some(layout) = self.layout else { return };
+        for step in 0..trajectory.steps {
+            let obs = &trajectory.obs[step * num_envs * layout.obs_len..];
+            let critic_obs = &trajectory.critic_obs[(step + 1) * num_envs * layout.critic_len..];
             // The observation of an ended episode is already that of the next one.
-            for robot in (0..batch.reward.len()).filter(|robot| !batch.done(*robot)) {
-                let [linear, yaw] = layout.squared_errors(obs, &batch.critic_obs, robot);
+            for robot in (0..num_envs).filter(|robot| !trajectory.done(step, *robot)) {
+                let [linear, yaw] = layout.squared_errors(obs, critic_obs, robot);
                 self.velocity_steps += 1;
                 self.velocity_error += f64::from(linear);
                 self.yaw_rate_error += f64::from(yaw);

@@ -2,8 +2,11 @@
 
 use rand::RngExt;
 use twinstep_model::{
-    AutoresetMode, EndedEpisode, EnvError, EnvSpec, ResetRequest, SpecField, StepBatch, Stream, VecEnv, stream,
+    AutoresetMode, EndedEpisode, EnvError, EnvSpec, ResetRequest, SpecField, StepBatch, Stream, Trajectory, VecEnv,
+    stream,
 };
+
+use twinstep_policy::{BehaviourPolicy, Collector, StepCollector};
 
 use crate::{Learner, LearningError, PpoConfig, Trainer};
 
@@ -152,6 +155,10 @@ impl<T: ToyTask> VecEnv for ToyEnv<T> {
         Ok(&self.obs)
     }
 
+    fn obs(&self) -> &[f32] {
+        &self.obs
+    }
+
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
         self.batch.ended.clear();
         self.steps += 1;
@@ -193,8 +200,9 @@ fn config() -> PpoConfig {
     }
 }
 
-fn envs<T: ToyTask>(config: &PpoConfig) -> Vec<Box<dyn VecEnv>> {
-    (0..config.groups).map(|_| ToyEnv::<T>::boxed(config.num_envs / config.groups, None)).collect()
+fn envs<T: ToyTask>(config: &PpoConfig) -> Vec<Box<dyn Collector>> {
+    let env = |_| ToyEnv::<T>::boxed(config.num_envs / config.groups, None);
+    (0..config.groups).map(env).map(|env| Box::new(StepCollector(env)) as Box<dyn Collector>).collect()
 }
 
 /// Returns the mean reward per step of the last of `iterations` iterations.
@@ -250,7 +258,7 @@ fn equal_seeds_give_equal_bits_on_any_number_of_threads() {
 fn nan_ends_the_training_with_the_last_good_policy() {
     let config = PpoConfig { groups: 1, ..config() };
     let env = ToyEnv::<Pendulum>::boxed(config.num_envs, Some(3 * config.horizon as u64 + 5));
-    let mut trainer = Trainer::new(config, vec![env], None, 1).expect("valid");
+    let mut trainer = Trainer::new(config, vec![Box::new(StepCollector(env))], None, 1).expect("valid");
     for _ in 0..3 {
         trainer.iterate().expect("finite");
     }
@@ -280,6 +288,49 @@ fn resumed_learner_is_the_one_that_was_saved() {
     let mut resumed = Trainer::new(config.clone(), envs::<Pendulum>(&config), Some(read.learner), 3).expect("valid");
     let iteration = resumed.iterate().expect("finite");
     assert_eq!((iteration.iteration, iteration.env_steps), (4, 4 * config.batch_len() as u64));
+}
+
+/// Robots that cannot be reached in their second rollout.
+struct Unreliable(StepCollector, u32);
+
+impl Collector for Unreliable {
+    fn spec(&self) -> &EnvSpec {
+        self.0.spec()
+    }
+
+    fn num_envs(&self) -> usize {
+        self.0.num_envs()
+    }
+
+    fn autoreset(&self) -> AutoresetMode {
+        self.0.autoreset()
+    }
+
+    fn reset(&mut self, seeds: &[u64]) -> Result<(), EnvError> {
+        self.0.reset(seeds)
+    }
+
+    fn collect(
+        &mut self,
+        policy: &BehaviourPolicy,
+        noise_seed: u64,
+        steps: usize,
+        trajectory: &mut Trajectory,
+    ) -> Result<bool, EnvError> {
+        self.1 += 1;
+        if self.1 == 2 { Ok(false) } else { self.0.collect(policy, noise_seed, steps, trajectory) }
+    }
+}
+
+#[test]
+fn robots_that_cannot_be_reached_are_left_out_of_the_update() {
+    let config = config();
+    let mut collectors = envs::<Pendulum>(&config);
+    collectors[1] = Box::new(Unreliable(StepCollector(ToyEnv::<Pendulum>::boxed(16, None)), 0));
+    let mut trainer = Trainer::new(config.clone(), collectors, None, 1).expect("valid");
+    let steps: Vec<u64> = (0..3).map(|_| trainer.iterate().expect("finite").env_steps).collect();
+    let batch = config.batch_len() as u64;
+    assert_eq!(steps, [batch, batch + batch / 2, 2 * batch + batch / 2]);
 }
 
 #[test]

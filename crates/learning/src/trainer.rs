@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use rand::seq::SliceRandom;
 use rayon::prelude::*;
-use twinstep_model::{AutoresetMode, EnvError, EnvSpec, VecEnv, stream};
-use twinstep_policy::{Mlp, Network, Normaliser, Policy};
+use twinstep_model::{AutoresetMode, EnvError, EnvSpec, stream};
+use twinstep_policy::{BehaviourPolicy, Collector, Mlp, Network, Normaliser, Policy, noise_seed};
 
 use crate::adam::Adam;
 use crate::config::{PpoConfig, PpoConfigError};
@@ -25,6 +25,11 @@ const FINAL_KL_SHARE: f64 = 0.1;
 const MEAN_DECAY: f32 = 0.9;
 /// Gain of the actor's last layer, so that the first actions are close to the default pose.
 const ACTOR_OUTPUT_GAIN: f32 = 0.01;
+
+/// Time without any robot after which the training ends.
+const MAX_ENV_LOSS: Duration = Duration::from_secs(60);
+/// Pause before the next attempt to reach a robot.
+const RETRY_PERIOD: Duration = Duration::from_millis(100);
 
 /// What is learnt, with the state of the optimiser.
 #[derive(Clone, Debug, PartialEq)]
@@ -79,13 +84,19 @@ impl Learner {
 
     /// Returns the policy, with the normaliser of the observation of group `policy`.
     pub fn policy(&self, spec: &EnvSpec) -> Policy {
-        let obs_len = spec.obs_len();
-        let normaliser = Normaliser::from_moments(
-            self.normaliser.count,
-            self.normaliser.mean[..obs_len].to_vec(),
-            self.normaliser.variance[..obs_len].to_vec(),
-        );
+        let normaliser = self.policy_normaliser(spec.obs_len());
         Policy { spec: spec.clone(), normaliser, actor: self.mean_actor.clone(), log_std: self.log_std.clone() }
+    }
+
+    /// Returns the policy that collects the next transitions.
+    fn behaviour_policy(&self, obs_len: usize) -> BehaviourPolicy {
+        BehaviourPolicy::new(self.actor.clone(), self.policy_normaliser(obs_len), self.log_std.clone())
+    }
+
+    /// Returns the normaliser of the observation of group `policy`.
+    fn policy_normaliser(&self, obs_len: usize) -> Normaliser {
+        let Normaliser { count, mean, variance, .. } = &self.normaliser;
+        Normaliser::from_moments(*count, mean[..obs_len].to_vec(), variance[..obs_len].to_vec())
     }
 
     /// Checks that the networks fit the observations and actions of `spec`.
@@ -159,6 +170,12 @@ pub enum LearningError {
     /// The environments failed.
     #[error(transparent)]
     Env(#[from] EnvError),
+    /// No environment can be reached.
+    #[error("no robot can be reached for {waited_s:.0} s: start a server again, then continue with --resume")]
+    NoEnvs {
+        /// Time since the last rollout [s].
+        waited_s: f64,
+    },
     /// A parameter or the gradient became NaN or infinite.
     #[error(
         "the gradient of update {iteration} is not finite; the learner is that before the update. A lower \
@@ -170,7 +187,7 @@ pub enum LearningError {
     },
 }
 
-/// Trains a policy on groups of robots.
+/// Trains a policy on groups of robots. Robots that cannot be reached are left out of the updates until they are back.
 pub struct Trainer {
     config: PpoConfig,
     spec: EnvSpec,
@@ -184,16 +201,17 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// Starts or continues the training of `learner` on `envs`, one batch of environments for each group.
+    /// Starts or continues the training of `learner` on the robots of `collectors`, one for each group.
     pub fn new(
         config: PpoConfig,
-        envs: Vec<Box<dyn VecEnv>>,
+        collectors: Vec<Box<dyn Collector>>,
         learner: Option<Learner>,
         seed: u64,
     ) -> Result<Self, LearningError> {
         config.check()?;
-        let spec = envs[0].spec().clone();
-        if let Some(given) = envs.iter().map(|env| env.autoreset()).find(|mode| *mode != AutoresetMode::SameStep) {
+        let spec = collectors[0].spec().clone();
+        let mut modes = collectors.iter().map(|collector| collector.autoreset());
+        if let Some(given) = modes.find(|mode| *mode != AutoresetMode::SameStep) {
             return Err(LearningError::Autoreset { given });
         }
         let mirrors = if config.symmetry {
@@ -207,10 +225,9 @@ impl Trainer {
         let env_seed = seed.wrapping_add(learner.iteration);
         let mut first_robot = 0;
         let mut groups = Vec::new();
-        for env in envs {
-            let num_envs = env.num_envs();
-            let networks = [&learner.actor, &learner.critic];
-            groups.push(Group::new(env, networks, config.horizon, env_seed, first_robot)?);
+        for collector in collectors {
+            let num_envs = collector.num_envs();
+            groups.push(Group::new(collector, &learner.critic, config.horizon, env_seed, first_robot)?);
             first_robot += num_envs;
         }
         let networks = [Network::new(&learner.actor), Network::new(&learner.critic)];
@@ -261,13 +278,25 @@ impl Trainer {
     fn collect(&mut self) -> Result<Statistics, LearningError> {
         let Self { groups, learner, networks, config, .. } = self;
         let behaviour = Behaviour {
-            actor: &networks[0],
+            policy: &learner.behaviour_policy(self.spec.obs_len()),
+            noise_seed: noise_seed(self.seed, learner.iteration),
             critic: &networks[1],
-            log_std: &learner.log_std,
             normaliser: &learner.normaliser,
             discounts: config.discounts(),
         };
-        groups.par_iter_mut().try_for_each(|group| group.collect(&behaviour))?;
+        let since = Instant::now();
+        loop {
+            groups.iter_mut().try_for_each(|group| group.send(&behaviour))?;
+            groups.par_iter_mut().try_for_each(|group| group.collect(&behaviour))?;
+            if groups.iter().any(|group| group.statistics.steps > 0) {
+                break;
+            }
+            let waited = since.elapsed();
+            if waited > MAX_ENV_LOSS {
+                return Err(LearningError::NoEnvs { waited_s: waited.as_secs_f64() });
+            }
+            std::thread::sleep(RETRY_PERIOD);
+        }
         let mut statistics = Statistics::new(&self.spec);
         for group in &self.groups {
             self.learner.normaliser.merge(&group.moments);

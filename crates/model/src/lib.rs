@@ -5,7 +5,7 @@
 //! - [`Backend`]: a batch of robots that are commanded and observed together (simulator, replayed log, real robot).
 //! - [`Actuator`]: computes torques from commands and states. Actuator networks implement it.
 //! - [`VecEnv`]: a batch of environments that are reset and stepped together, in process or over a network;
-//!   [`EnvSpec`]: layouts, periods, gains and limits of an environment.
+//!   [`EnvSpec`]: layouts, periods, gains and limits of an environment; [`Trajectory`]: its steps in a row.
 //! - [`Scene`]: shapes and poses for rendering; [`body_poses`]: forward kinematics;
 //!   [`FootKinematics`]: position and velocity of the feet.
 //! - [`Ground`]: a plane, or a [`HeightField`] for uneven terrain.
@@ -39,6 +39,7 @@ mod rollout;
 mod scene;
 mod spec;
 mod stream;
+mod trajectory;
 mod vec_env;
 
 pub use backend::{Actuator, ActuatorSnapshot, Backend, BackendError, EpistemicUncertainty, Restorable, Simulator};
@@ -63,4 +64,5 @@ pub use rollout::{HistoryStep, Precision, Rollout, RolloutRequest};
 pub use scene::{Scene, SceneShape, ShapeKind};
 pub use spec::{EnvSpec, SpecDifference, SpecField};
 pub use stream::{Stream, standard_normal, stream};
+pub use trajectory::Trajectory;
 pub use vec_env::{AutoresetMode, EndedEpisode, EnvError, ResetRequest, StepBatch, VecEnv};

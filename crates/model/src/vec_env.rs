@@ -23,6 +23,9 @@ pub trait VecEnv: Send {
     /// Resets the selected environments and returns the observations of all environments, group `policy`.
     fn reset(&mut self, request: &ResetRequest) -> Result<&[f32], EnvError>;
 
+    /// Returns the observations of group `policy` after the last reset or step, `num_envs × obs_len`.
+    fn obs(&self) -> &[f32];
+
     /// Returns the observations of group `critic` after the last reset or step, `num_envs × critic_obs_len`.
     ///
     /// Empty if the spec has no such group.

@@ -5,6 +5,7 @@
 //! - [`Normaliser`]: mean and standard deviation of observations; [`gaussian`]: noise of actions.
 //! - [`Policy`]: normaliser, actor and the spec of the environment; [`PolicyRunner`] evaluates it. [`Policy::read`] and
 //!   [`Policy::write`]: the policy file; [`Policy::write_onnx`]: the same for other runtimes.
+//! - [`BehaviourPolicy`]: a policy that explores; [`Collector`]: robots that can be run with it, in process or remote.
 //! - [`array_file`]: named arrays in a safetensors file.
 //!
 //! Equal weights and observations give equal bits on every instruction set and in every batch.
@@ -13,6 +14,8 @@
 #![allow(clippy::needless_range_loop, reason = "closures may not be inlined")]
 
 pub mod array_file;
+mod behaviour;
+mod collector;
 pub mod gaussian;
 mod matrix;
 mod mlp;
@@ -22,6 +25,8 @@ mod onnx;
 mod policy;
 mod policy_file;
 
+pub use behaviour::{ActionSampler, BehaviourPolicy, noise_seed};
+pub use collector::{Collector, StepCollector};
 pub use mlp::{LayerLayout, Mlp};
 pub use network::{Activations, Network};
 pub use normaliser::Normaliser;

@@ -109,6 +109,36 @@ impl Mlp {
         (weight, self.parameters[layer.bias()][..layer.outputs].to_vec())
     }
 
+    /// Returns the weight (outputs × inputs, as in PyTorch) and the bias of each layer, one after the other.
+    pub fn weights(&self) -> Vec<f32> {
+        let layers = (0..self.sizes.len() - 1).map(|index| (self.layer(index), self.sizes[index]));
+        layers.flat_map(|((weight, bias), inputs)| [transposed(&weight, inputs), bias].concat()).collect()
+    }
+
+    /// Creates the network of [`Mlp::weights`]. Returns `None` unless there are [`Mlp::num_weights`] of them.
+    pub fn from_weights(sizes: &[usize], mut weights: &[f32]) -> Option<Self> {
+        if Some(weights.len()) != Self::num_weights(sizes) {
+            return None;
+        }
+        let mut network = Self::zeros(sizes);
+        for (index, pair) in sizes.windows(2).enumerate() {
+            let (weight, rest) = weights.split_at(pair[0] * pair[1]);
+            let (bias, rest) = rest.split_at(pair[1]);
+            network.set_layer(index, &transposed(weight, pair[1]), bias);
+            weights = rest;
+        }
+        Some(network)
+    }
+
+    /// Returns the number of weights and biases of a network of these sizes. Returns `None` if a size is zero, or the
+    /// number overflows.
+    pub fn num_weights(sizes: &[usize]) -> Option<usize> {
+        if sizes.len() < 2 || sizes.contains(&0) {
+            return None;
+        }
+        sizes.windows(2).try_fold(0usize, |sum, pair| sum.checked_add(pair[0].checked_add(1)?.checked_mul(pair[1])?))
+    }
+
     /// Sets weight (inputs × outputs, row-major) and bias of layer `index`.
     pub fn set_layer(&mut self, index: usize, weight: &[f32], bias: &[f32]) {
         let layer = self.layers()[index];
@@ -118,6 +148,16 @@ impl Mlp {
         }
         self.parameters[layer.bias()][..layer.outputs].copy_from_slice(bias);
     }
+}
+
+/// Returns the transpose of a row-major matrix with `rows` rows.
+pub fn transposed(values: &[f32], rows: usize) -> Vec<f32> {
+    let columns = values.len() / rows;
+    let mut result = Vec::with_capacity(values.len());
+    for column in 0..columns {
+        result.extend(values[column..].iter().step_by(columns));
+    }
+    result
 }
 
 /// Returns a matrix with orthonormal rows or columns, whichever are fewer (Gram–Schmidt on normal numbers).
@@ -154,6 +194,18 @@ mod tests {
         let (last, _) = network.layer(1);
         let norm: f32 = (0..128).map(|row| last[row * 12].powi(2)).sum();
         assert!((norm - 1e-4).abs() < 1e-8, "{norm}");
+    }
+
+    #[test]
+    fn weights_are_read_as_they_were_written_and_refused_if_they_do_not_fit() {
+        let network = Mlp::orthogonal(&[3, 5, 2], 1.0, &mut stream(3, "test", 0));
+        let weights = network.weights();
+        assert_eq!(weights.len(), 3 * 5 + 5 + 5 * 2 + 2);
+        assert_eq!(weights[1], network.layer(0).0[5], "the second weight of the first unit is of the second input");
+        assert_eq!(Mlp::from_weights(&[3, 5, 2], &weights), Some(network));
+        for sizes in [&[3, 5, 3][..], &[37], &[0, 37], &[usize::MAX, usize::MAX]] {
+            assert_eq!(Mlp::from_weights(sizes, &weights), None, "{sizes:?}");
+        }
     }
 
     #[test]

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use twinstep_model::EnvSpec;
 
 use crate::array_file::{Array, ArrayFileError, Arrays, read, take, write};
-use crate::mlp::Mlp;
+use crate::mlp::{Mlp, transposed};
 use crate::normaliser::Normaliser;
 use crate::policy::Policy;
 
@@ -139,10 +139,4 @@ pub fn take_mlp(arrays: &mut Arrays, name: &str, sizes: &[usize], path: &Path) -
         network.set_layer(index, &transposed(&weight, layer.outputs), &bias);
     }
     Ok(network)
-}
-
-/// Returns the transpose of a row-major matrix with `rows` rows.
-fn transposed(values: &[f32], rows: usize) -> Vec<f32> {
-    let columns = values.len() / rows;
-    (0..values.len()).map(|index| values[index % rows * columns + index / rows]).collect()
 }

@@ -4,17 +4,17 @@ use std::fmt::Debug;
 
 use proptest::prelude::*;
 use serde::{Deserialize, Serialize};
-use twinstep_model::{AutoresetMode, EndedEpisode, Scene, StepBatch};
+use twinstep_model::{AutoresetMode, EndedEpisode, Scene, StepBatch, Trajectory};
 use twinstep_protocol::message::{
     CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply, RenderRequest,
-    RequestHeader, ResetReply, ResetRequest, StepReply, StepRequest,
+    RequestHeader, ResetReply, ResetRequest, RolloutPolicy, RolloutReply, RolloutRequest, StepReply, StepRequest,
 };
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, tensor};
 
 use crate::golden;
 
 /// Kinds of messages.
-const KINDS: usize = 14;
+const KINDS: usize = 16;
 
 /// Decodes `bytes` as every kind of message; the codes of those that were refused.
 fn refusals(bytes: &[u8]) -> Vec<ErrorCode> {
@@ -30,6 +30,8 @@ fn refusals(bytes: &[u8]) -> Vec<ErrorCode> {
         refusal::<ResetReply<'_>>(bytes),
         refusal::<StepRequest<'_>>(bytes),
         refusal::<StepReply<'_>>(bytes),
+        refusal::<RolloutRequest<'_>>(bytes),
+        refusal::<RolloutReply<'_>>(bytes),
         refusal::<CloseRequest>(bytes),
         refusal::<CloseReply>(bytes),
         refusal::<RenderRequest>(bytes),
@@ -53,13 +55,18 @@ fn any_autoreset() -> impl Strategy<Value = AutoresetMode> {
 
 /// The same message with one more field, first or last.
 fn with_unknown_field(message: &[u8], first: bool, value: &[u8]) -> Vec<u8> {
-    assert!((0x80..0x8f).contains(&message[0]), "a map of at most 14 fields");
+    // A map of up to 15 fields, or `map 16`.
+    let (count, fields) = match message[0] {
+        0xde => (u16::from_be_bytes([message[1], message[2]]), &message[3..]),
+        short => (u16::from(short & 0x0f), &message[1..]),
+    };
+    let head = [&[0xde][..], &(count + 1).to_be_bytes()].concat();
     let mut field = b"\xa7unknown".to_vec();
     // `value` as MessagePack `bin 8`.
     field.extend([0xc4, value.len() as u8]);
     field.extend(value);
     let (before, after) = if first { (field, Vec::new()) } else { (Vec::new(), field) };
-    [vec![message[0] + 1], before, message[1..].to_vec(), after].concat()
+    [head, before, fields.to_vec(), after].concat()
 }
 
 proptest! {
@@ -84,7 +91,7 @@ proptest! {
         let hello = HelloReply {
             protocol: PROTOCOL, protocols, server_version: name.clone(), server_id: name.clone(), spec_hash: spec.hash(),
             spec: spec.clone(), max_envs, free_envs, lease_grace_s, max_envs_per_client: max_envs, max_request_bytes: free_envs,
-            lease_idle_s: Some(lease_grace_s), env_steps, name: name.clone(),
+            lease_idle_s: Some(lease_grace_s), env_steps, max_rollout_steps: env_steps, name: name.clone(),
         };
         round_trips(&hello, &mut Vec::new());
         let granted = LeaseReply {
@@ -101,6 +108,11 @@ proptest! {
         round_trips(&ResetRequest { protocol, epoch, seq, seeds, mask }, &mut Vec::new());
         round_trips(&ResetReply { protocol, seq, obs: &bytes, critic_obs: &bytes }, &mut Vec::new());
         round_trips(&StepRequest { protocol, epoch, seq, actions: &bytes, command: None }, &mut Vec::new());
+        let policy = RolloutPolicy { sizes: vec![epoch, seq], weights: &bytes, mean: &bytes, std: &bytes, log_std: &bytes };
+        for (policy, policy_id) in [(Some(policy), None), (None, Some(epoch))] {
+            let request = RolloutRequest { protocol, epoch, seq, steps: seq, noise_seed: epoch, policy, policy_id };
+            round_trips(&request, &mut Vec::new());
+        }
         round_trips(&CloseRequest { protocol, epoch, seq }, &mut Vec::new());
         round_trips(&CloseReply { protocol, seq }, &mut Vec::new());
         round_trips(&RenderRequest { protocol, epoch, env: seq }, &mut Vec::new());
@@ -138,6 +150,48 @@ proptest! {
         let mut read = StepBatch::default();
         convert::decode_step(&reply, &spec, rows.len(), &mut read).expect("the lengths fit");
         prop_assert_eq!(read, batch);
+    }
+
+    #[test]
+    fn rollouts_round_trip_with_their_ended_episodes(
+        num_envs in 1..4usize, ends in prop::collection::vec((any::<bool>(), any::<bool>(), -1e9f32..1e9), 1..20), seq: u64,
+        with_critic: bool,
+    ) {
+        let mut spec = golden::small_spec();
+        if with_critic {
+            spec.critic_observation = spec.action.clone();
+        }
+        let steps = ends.len() / num_envs;
+        let mut trajectory = Trajectory::default();
+        let critic_obs = vec![0.25; num_envs * spec.critic_obs_len()];
+        trajectory.start(steps, &spec, &vec![0.5; num_envs * spec.obs_len()], &critic_obs);
+        for step in ends.chunks_exact(num_envs) {
+            let mut batch = StepBatch::new(num_envs, &spec);
+            for (env, (terminated, truncated, reward)) in step.iter().copied().enumerate() {
+                (batch.terminated[env], batch.truncated[env], batch.reward[env]) = (terminated, truncated, reward);
+                batch.obs[env] = -reward;
+                if batch.done(env) {
+                    batch.ended.push(EndedEpisode {
+                        env,
+                        length: 7,
+                        episode_return: reward,
+                        terms: vec![reward, 1.0],
+                        diverged: truncated,
+                        final_obs: vec![reward; spec.obs_len()],
+                        final_critic_obs: vec![-reward; spec.critic_obs_len()],
+                    });
+                }
+            }
+            trajectory.push(&batch);
+        }
+        let bytes = convert::encode_trajectory(&trajectory, seq, with_critic);
+        let reply: RolloutReply<'_> = decode(&bytes).expect("what was encoded decodes");
+        let mut read = Trajectory::default();
+        convert::decode_trajectory(&reply, &spec, num_envs, steps, &mut read).expect("the lengths fit");
+        prop_assert_eq!(&read, &trajectory);
+        // A reply with another number of steps or environments does not fit.
+        prop_assert!(convert::decode_trajectory(&reply, &spec, num_envs, steps + 1, &mut read).is_err());
+        prop_assert!(convert::decode_trajectory(&reply, &spec, num_envs + 1, steps, &mut read).is_err());
     }
 
     #[test]

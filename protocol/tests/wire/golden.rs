@@ -11,13 +11,13 @@ use twinstep_model::{AutoresetMode, EnvSpec, Ground, HeightField, Scene, SceneSh
 use twinstep_protocol::convert::encode_ground;
 use twinstep_protocol::message::{
     CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply, RenderRequest,
-    ResetReply, ResetRequest, StepReply, StepRequest,
+    ResetReply, ResetRequest, RolloutPolicy, RolloutReply, RolloutRequest, StepReply, StepRequest,
 };
 use twinstep_protocol::tensor::as_bytes;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, decode, encode};
 
 /// Name of every golden file, without `.msgpack`.
-pub const NAMES: [&str; 22] = [
+pub const NAMES: [&str; 26] = [
     "hello_request",
     "hello_reply",
     "lease_request",
@@ -34,6 +34,10 @@ pub const NAMES: [&str; 22] = [
     "step_reply",
     "step_reply_ended",
     "step_reply_critic",
+    "rollout_request",
+    "rollout_request_held",
+    "rollout_reply",
+    "rollout_reply_critic",
     "close_request",
     "close_reply",
     "render_request",
@@ -128,6 +132,7 @@ fn hello_has_its_golden_bytes() {
         lease_grace_s: 10.0,
         lease_idle_s: Some(600.0),
         env_steps: 1_000_000_007,
+        max_rollout_steps: 128,
     };
     check("hello_reply", &reply);
 }
@@ -223,6 +228,61 @@ fn step_has_its_golden_bytes() {
         ..ended
     };
     check("step_reply_critic", &critic);
+}
+
+#[test]
+fn rollout_has_its_golden_bytes() {
+    // One layer: outputs × inputs, then the biases.
+    let weights = [0.5f32, -0.5, 0.25, 0.0, 1.0, -1.0, 0.125, 0.0, 2.0, -0.25, 0.75, -0.75];
+    let (mean, std) = ([0.0f32, 0.0, -1.0, 0.5, -0.5], [1.0f32, 1.0, 0.5, 2.0, 0.25]);
+    let policy = RolloutPolicy {
+        sizes: vec![5, 2],
+        weights: as_bytes(&weights),
+        mean: as_bytes(&mean),
+        std: as_bytes(&std),
+        log_std: as_bytes(&[-0.5f32, -1.0]),
+    };
+    let request = RolloutRequest {
+        protocol: PROTOCOL,
+        epoch: 1,
+        seq: 4,
+        steps: 2,
+        noise_seed: 77,
+        policy: Some(policy),
+        policy_id: None,
+    };
+    check("rollout_request", &request);
+    check("rollout_request_held", &RolloutRequest { seq: 5, policy: None, policy_id: Some(4), ..request });
+    let obs: Vec<f32> = (0..30).map(|index| index as f32 / 8.0 - 1.0).collect();
+    let actions = [0.5f32, -0.5, 1.0, -1.0, 1.5, 0.25, -0.125, 0.0];
+    let reply = RolloutReply {
+        protocol: PROTOCOL,
+        seq: 4,
+        obs: as_bytes(&obs),
+        critic_obs: &[],
+        actions: as_bytes(&actions),
+        log_prob: as_bytes(&[-1.0f32, -2.0, -0.5, -4.0]),
+        reward: as_bytes(&[0.75f32, -1.25, 0.5, 0.0]),
+        terminated: &[0, 0, 0, 1],
+        truncated: &[1, 0, 0, 0],
+        ended_step: as_bytes(&[0u32, 1]),
+        ended_env: as_bytes(&[0u32, 1]),
+        ended_length: as_bytes(&[1000u32, 300]),
+        ended_return: as_bytes(&[12.5f32, -3.0]),
+        ended_terms: as_bytes(&[15.0f32, -2.5, 1.0, -4.0]),
+        ended_diverged: &[],
+        final_obs: as_bytes(&[0.5f32, 0.5, -0.5, 1.5, -2.5, 0.25, 0.25, -0.25, 0.75, -1.25]),
+        final_critic_obs: &[],
+    };
+    check("rollout_reply", &reply);
+    let (critic_obs, final_critic_obs) = ([0.5f32; 12], [0.75f32, -1.0, 0.25, 2.0]);
+    let critic = RolloutReply {
+        critic_obs: as_bytes(&critic_obs),
+        ended_diverged: &[1, 0],
+        final_critic_obs: as_bytes(&final_critic_obs),
+        ..reply
+    };
+    check("rollout_reply_critic", &critic);
 }
 
 #[test]

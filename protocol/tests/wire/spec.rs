@@ -61,6 +61,7 @@ fn tables_have_exactly_the_fields_of_the_messages() {
         ("### reset reply", "reset_reply_critic"),
         ("### step request", "step_request_command"),
         ("### step reply", "step_reply_critic"),
+        ("### rollout reply", "rollout_reply_critic"),
         ("### close request", "close_request"),
         ("### close reply", "close_reply"),
         ("### render request", "render_request"),
@@ -71,6 +72,11 @@ fn tables_have_exactly_the_fields_of_the_messages() {
         let fields: BTreeSet<String> = golden_map(name).into_keys().collect();
         assert_eq!(first_cells(section(title)), fields, "{title}");
     }
+    let sent = [golden_map("rollout_request"), golden_map("rollout_request_held")].into_iter().flatten();
+    let fields: BTreeSet<String> = sent.map(|(name, _)| name).collect();
+    assert_eq!(first_cells(section("### rollout request")), fields);
+    let Some(Value::Map(policy)) = golden_map("rollout_request").remove("policy") else { panic!("a map") };
+    assert_eq!(first_cells(section("### rollout policy")), policy.into_keys().collect());
     let Some(Value::Map(spec)) = golden_map("hello_reply").remove("spec") else { panic!("`spec` is a map") };
     assert_eq!(first_cells(section("### spec")), spec.keys().cloned().collect());
     let Some(Value::List(shapes)) = golden_map("render_reply").remove("shapes") else { panic!("`shapes` is a list") };

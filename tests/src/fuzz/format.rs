@@ -32,6 +32,8 @@ pub enum Message {
     ResetReply,
     StepRequest,
     StepReply,
+    RolloutRequest,
+    RolloutReply,
     CloseRequest,
     CloseReply,
     RenderRequest,
@@ -41,7 +43,7 @@ pub enum Message {
 
 impl Message {
     /// All kinds, with the beginning of the names of their golden files.
-    pub const ALL: [(Message, &str); 13] = [
+    pub const ALL: [(Message, &str); 15] = [
         (Message::HelloRequest, "hello_request"),
         (Message::HelloReply, "hello_reply"),
         (Message::LeaseRequest, "lease_request"),
@@ -50,6 +52,8 @@ impl Message {
         (Message::ResetReply, "reset_reply"),
         (Message::StepRequest, "step_request"),
         (Message::StepReply, "step_reply"),
+        (Message::RolloutRequest, "rollout_request"),
+        (Message::RolloutReply, "rollout_reply"),
         (Message::CloseRequest, "close_request"),
         (Message::CloseReply, "close_reply"),
         (Message::RenderRequest, "render_request"),

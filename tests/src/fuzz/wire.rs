@@ -3,10 +3,10 @@
 use std::sync::LazyLock;
 
 use serde::Deserialize;
-use twinstep_model::{EnvSpec, StepBatch};
+use twinstep_model::{EnvSpec, StepBatch, Trajectory};
 use twinstep_protocol::message::{
     CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, RenderReply, RenderRequest,
-    RequestHeader, ResetReply, ResetRequest, StepReply, StepRequest,
+    RequestHeader, ResetReply, ResetRequest, RolloutReply, RolloutRequest, StepReply, StepRequest,
 };
 use twinstep_protocol::{ErrorReply, convert, decode, encode, keys, tensor};
 
@@ -14,6 +14,8 @@ use super::format::{Message, Outcome, examples_in};
 
 /// Number of environments in the golden messages.
 const NUM_ENVS: usize = 2;
+/// Number of steps in the golden rollout.
+const NUM_STEPS: usize = 2;
 
 impl Message {
     /// Returns the golden files of this kind.
@@ -30,7 +32,11 @@ impl Message {
     /// Decodes a message and converts it as its reader does.
     pub fn read(self, bytes: &[u8]) -> Outcome {
         // The server refuses larger requests before it decodes them.
-        if self.is_request() && bytes.len() > convert::max_request_bytes(64, &GOLDEN_SPEC) {
+        let limit = match self {
+            Message::RolloutRequest => convert::MAX_ROLLOUT_REQUEST_BYTES,
+            _ => convert::max_request_bytes(64, &GOLDEN_SPEC),
+        };
+        if self.is_request() && bytes.len() > limit {
             return Outcome::Refused;
         }
         match self {
@@ -59,6 +65,17 @@ impl Message {
             }
             Message::StepReply => then::<StepReply<'_>>(bytes, |reply| {
                 convert::decode_step(&reply, spec_of(reply.critic_obs), NUM_ENVS, &mut StepBatch::default()).is_ok()
+            }),
+            Message::RolloutRequest => {
+                header(bytes);
+                then::<RolloutRequest<'_>>(bytes, |request| match request.policy {
+                    Some(policy) => tensor::read::<f32>(policy.weights, "policy.weights").is_ok(),
+                    None => request.policy_id.is_some(),
+                })
+            }
+            Message::RolloutReply => then::<RolloutReply<'_>>(bytes, |reply| {
+                let (spec, mut trajectory) = (spec_of(reply.critic_obs), Trajectory::default());
+                convert::decode_trajectory(&reply, spec, NUM_ENVS, NUM_STEPS, &mut trajectory).is_ok()
             }),
             Message::CloseRequest => then::<CloseRequest>(bytes, |_| true),
             Message::CloseReply => then::<CloseReply>(bytes, |_| true),

@@ -38,6 +38,7 @@ from .factory import EnvFactory
 from .grouped import GroupedVecEnv
 from .options import ConnectOptions
 from .remote import RemoteVecEnv
+from .rollout import GaussianPolicy, Trajectory
 from .server import EmbeddedServer, ServerNotFoundError, ServerStartError
 from .sharded import ShardedVecEnv
 from .step import StepBatch
@@ -54,6 +55,7 @@ __all__ = [
     "EnvFactory",
     "Error",
     "ForkedProcessError",
+    "GaussianPolicy",
     "Go2Env",
     "Go2VectorEnv",
     "GroupedVecEnv",
@@ -76,6 +78,7 @@ __all__ = [
     "SpecField",
     "SpecMismatchError",
     "StepBatch",
+    "Trajectory",
     "VecEnvError",
     "VersionError",
     "check_vec_env",

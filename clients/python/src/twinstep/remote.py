@@ -19,10 +19,11 @@ from .errors import (
 from .options import UNLIMITED, ConnectOptions, server_flags
 from .pickling import NotPicklable
 from .query import Pending
+from .rollout import GaussianPolicy, Trajectory, encode_policy, read_trajectory
 from .server import EmbeddedServer
 from .step import StepBatch, checked_actions, checked_velocity_commands, read_critic, read_step
 
-_CONSUMES_SEQ = ("internal",)
+_CONSUMES_SEQ = ("internal", "rollout_failed")
 
 
 class RemoteVecEnv(NotPicklable):
@@ -106,12 +107,16 @@ class RemoteVecEnv(NotPicklable):
         self._last_seq: int = lease["last_seq"]
         self._methods = {
             method: connection.querier(f"env/{lease['lease']}/{method}")
-            for method in ("reset", "step", "render", "close")
+            for method in ("reset", "step", "rollout", "render", "close")
         }
         self._pending: tuple[str, int, Pending, float] | None = None
         # Why the state of the environments is unknown: a reply was lost. A reset of all of them heals it.
         self._unknown: str | None = None
         self._commands: bytes | None = None
+        # Encoded policy that the server holds, and its id.
+        self._held_policy: tuple[dict[str, object], int] | None = None
+        # Request of the rollout in progress.
+        self._rollout: dict[str, object] = {}
         self.critic_obs = np.zeros((self.num_envs, self.spec.critic_len), dtype=np.float32)
         """Observations of group ``critic`` after the last reset or step: (num_envs, critic_len)."""
 
@@ -207,6 +212,68 @@ class RemoteVecEnv(NotPicklable):
             raise
         self.critic_obs = batch.critic_obs
         return batch
+
+    def rollout(self, policy: GaussianPolicy, steps: int, *, noise_seed: int) -> Trajectory:
+        """Run a policy on the server for some steps of all environments, from their current observations.
+
+        The weights are sent only if they differ from those of the last rollout. After a :class:`RequestTimeoutError`
+        call it again with the same arguments: the rollout is executed once.
+
+        Parameters
+        ----------
+        policy
+            The policy, which samples its actions on the server.
+        steps
+            Number of steps, 1 to ``max_rollout_steps`` of the server.
+        noise_seed
+            The noise of environment i is a function of ``noise_seed + i`` alone. Use another one for each rollout.
+        """
+        self._check_open()
+        if not 0 <= noise_seed < 2**64:
+            raise InvalidOptionError(f"`noise_seed` = {noise_seed} is not allowed: 0 to 2**64 - 1")
+        limit = int(self._connection.hello.get("max_rollout_steps", 0))
+        if not 1 <= steps <= limit:
+            raise InvalidOptionError(
+                f"`steps` = {steps} is not allowed: 1 to {limit}, `max_rollout_steps` of the server"
+                if limit
+                else "the server has no rollouts: use `step`"
+            )
+        encoded = encode_policy(policy, self.spec)
+        try:
+            return self._execute_rollout(encoded, steps, noise_seed)
+        except RequestRejectedError as error:
+            if error.code != "unknown_policy":
+                raise
+            self._held_policy = None
+            return self._execute_rollout(encoded, steps, noise_seed)
+
+    def _execute_rollout(self, policy: dict[str, object], steps: int, noise_seed: int) -> Trajectory:
+        held = self._held_policy is not None and self._held_policy[0] == policy
+        chosen = {"policy_id": self._held_policy[1]} if self._held_policy is not None and held else {"policy": policy}
+        request: dict[str, object] = {"steps": steps, "noise_seed": noise_seed, **chosen}
+        if self._pending is None:
+            self._check_known()
+            self._rollout = request
+            self._send("rollout", request)
+        elif self._pending[0] != "rollout" or self._rollout != request:
+            raise Error(
+                f"the last `{self._pending[0]}` has no reply yet\n  call `reset` to wait and start new episodes"
+            )
+        try:
+            reply = self._await_pending("timeout_s")
+        except RequestRejectedError as error:
+            if error.code in _CONSUMES_SEQ:
+                self._unknown = f"a rollout failed after some of its steps: {error}"
+            raise
+        try:
+            trajectory = read_trajectory(reply, steps, self.num_envs, self.spec)
+        except codec.MalformedError as error:
+            self._unknown = f"the reply to a rollout could not be read: {error}"
+            raise
+        if not held:
+            self._held_policy = (policy, self._last_seq)
+        self.critic_obs = trajectory.critic_obs[-1].copy()
+        return trajectory
 
     def scene(self, env: int) -> dict[str, Any]:
         """Return shapes and poses of one robot, and its ground, for rendering."""

@@ -17,6 +17,7 @@ from .options import ConnectOptions
 from .pickling import NotPicklable
 from .remote import RemoteVecEnv
 from .render import Viewer
+from .rollout import GaussianPolicy, Trajectory
 from .sharded import ShardedVecEnv
 from .spaces import action_space, observation_space
 from .step import StepBatch
@@ -159,6 +160,28 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
         infos = self._infos(batch)
         self._show()
         return batch.obs, batch.reward.astype(np.float64), batch.terminated, batch.truncated, infos
+
+    def rollout(self, policy: GaussianPolicy, steps: int, *, noise_seed: int) -> Trajectory:
+        """Run a policy on the server for some steps of all environments: one request instead of one for each step.
+
+        Starts from the current observations, so call :meth:`reset` before the first rollout. ``step`` may follow. Not
+        available in the autoreset mode ``"Disabled"`` and with ``endpoints``: a learner with several servers has an
+        environment for each of them.
+
+        Parameters
+        ----------
+        policy
+            The policy, which samples its actions on the server. Its weights are sent only if they have changed.
+        steps
+            Number of steps, 1 to ``max_rollout_steps`` of the server.
+        noise_seed
+            The noise of environment i is a function of ``noise_seed + i`` alone. Use another one for each rollout.
+        """
+        if isinstance(self._remote, ShardedVecEnv):
+            raise InvalidOptionError("`rollout` needs one server; create an environment for each of the `endpoints`")
+        trajectory = self._remote.rollout(policy, steps, noise_seed=noise_seed)
+        self._show()
+        return trajectory
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Render every robot: a tuple of (480, 640, 3) uint8 with ``render_mode="rgb_array"``, else ``None``."""
