@@ -146,7 +146,7 @@ fn training_continues_while_one_of_two_servers_is_killed_and_restarted() {
         let since = Instant::now();
         while !is_done() {
             let log = std::fs::read_to_string(&log_path).unwrap();
-            assert!(since.elapsed() < Duration::from_secs(120), "{what}: {log}");
+            assert!(since.elapsed() < Duration::from_mins(2), "{what}: {log}");
             std::thread::sleep(Duration::from_millis(20));
         }
     };

@@ -35,7 +35,7 @@ pub struct RemoteCollector {
 }
 
 enum LeaseState {
-    Leased(RemoteVecEnv),
+    Leased(Box<RemoteVecEnv>),
     /// A thread requests a new lease, and sends it. It ends when `_needed` is dropped.
     Lost {
         granted: Receiver<RemoteVecEnv>,
@@ -50,7 +50,14 @@ impl RemoteCollector {
         let spec = env.spec().clone();
         // The policy is trained for the robots of the first lease.
         let options = ConnectOptions { spec_hash: Some(spec.hash()), ..options.clone() };
-        Self { options, spec, state: LeaseState::Leased(env), seeds: Vec::new(), losses: 0, sent: Instant::now() }
+        Self {
+            options,
+            spec,
+            state: LeaseState::Leased(Box::new(env)),
+            seeds: Vec::new(),
+            losses: 0,
+            sent: Instant::now(),
+        }
     }
 
     /// Takes a new lease if it has been granted since the loss, and starts its episodes.
@@ -60,7 +67,7 @@ impl RemoteCollector {
         let losses = self.losses;
         let seeds = self.seeds.iter().map(|seed| stream(*seed, "lost server", losses).next_u64()).collect();
         let result = env.reset(&ResetRequest { seeds: Some(seeds), mask: None }).map(drop);
-        self.state = LeaseState::Leased(env);
+        self.state = LeaseState::Leased(Box::new(env));
         match result {
             Ok(()) => {
                 let (endpoint, num_envs) = (&self.options.endpoint, self.options.num_envs);

@@ -27,7 +27,7 @@ const MEAN_DECAY: f32 = 0.9;
 const ACTOR_OUTPUT_GAIN: f32 = 0.01;
 
 /// Time without any robot after which the training ends.
-const MAX_ENV_LOSS: Duration = Duration::from_secs(60);
+const MAX_ENV_LOSS: Duration = Duration::from_mins(1);
 /// Pause before the next attempt to reach a robot.
 const RETRY_PERIOD: Duration = Duration::from_millis(100);
 

@@ -111,8 +111,13 @@ impl Mlp {
 
     /// Returns the weight (outputs × inputs, as in PyTorch) and the bias of each layer, one after the other.
     pub fn weights(&self) -> Vec<f32> {
-        let layers = (0..self.sizes.len() - 1).map(|index| (self.layer(index), self.sizes[index]));
-        layers.flat_map(|((weight, bias), inputs)| [transposed(&weight, inputs), bias].concat()).collect()
+        let mut weights = Vec::with_capacity(self.parameters.len());
+        for (index, inputs) in self.sizes[..self.sizes.len() - 1].iter().enumerate() {
+            let (weight, bias) = self.layer(index);
+            weights.extend(transposed(&weight, *inputs));
+            weights.extend(bias);
+        }
+        weights
     }
 
     /// Creates the network of [`Mlp::weights`]. Returns `None` unless there are [`Mlp::num_weights`] of them.
