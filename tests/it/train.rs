@@ -232,6 +232,18 @@ fn unknown_instruction_set_is_rejected_with_those_that_exist() {
 }
 
 #[test]
+fn shipped_robust_policy_walks_pushed_delayed_and_on_other_robots_and_grounds() {
+    let policy = root().join("data/policies/walk_robust.safetensors");
+    let arguments = ["evaluate-policy", policy.to_str().unwrap(), "--engine", "batch"];
+    let evaluated = twinstep(&[&arguments[..], &["--robots", "64", "--seconds", "8", "--json"]].concat());
+    assert!(evaluated.status.success(), "{}", text(&evaluated.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&evaluated.stdout).unwrap();
+    for row in report["rows"].as_array().unwrap() {
+        assert!(row["up"].as_f64().unwrap() > 0.9 && row["velocity_rms"].as_f64().unwrap() < 0.25, "{row}");
+    }
+}
+
+#[test]
 fn bad_settings_are_rejected_with_the_key_before_anything_is_simulated() {
     let folder = tempfile::tempdir().unwrap();
     let error = |config: &str| {

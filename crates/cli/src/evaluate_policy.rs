@@ -19,7 +19,7 @@ use crate::train_config::TrainConfig;
 
 /// Frames of the film strip, and policy steps between two of them.
 const FILM_FRAMES: usize = 15;
-const FILM_STEPS: usize = 10;
+const FILM_STEPS: usize = 4;
 
 /// Evaluate a policy: velocity errors, falls and gait, on engines and robots that it has not seen.
 ///
@@ -58,7 +58,7 @@ pub struct Args {
     /// Seed of robots and commands.
     #[arg(long, default_value_t = 1_000_000)]
     seed: u64,
-    /// Write a film strip (SVG) of three seconds of a robot with the first condition.
+    /// Write a film strip (SVG) of a robot with the first condition, 0.08 s between two frames.
     #[arg(long, value_name = "FILE")]
     film: Option<PathBuf>,
     /// Print one JSON object on stdout.

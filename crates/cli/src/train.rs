@@ -268,7 +268,10 @@ impl TrainSession {
 
     fn origin(&self) -> PolicyOrigin {
         PolicyOrigin {
-            command: std::env::args().collect::<Vec<_>>().join(" "),
+            command: std::iter::once("twinstep".to_owned())
+                .chain(std::env::args().skip(1))
+                .collect::<Vec<_>>()
+                .join(" "),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             seed: self.seed,
             config: self.text.clone(),

@@ -3,62 +3,10 @@
 //! A policy is judged by the measured velocity and by falls, never by its reward: policies that stand still collect
 //! reward as well.
 
-use serde::Serialize;
 use twinstep_model::{EnvError, ResetRequest, RobotModel, VecEnv};
 use twinstep_policy::{Policy, PolicyRunner};
 
-use crate::walking::{Robots, Sums, Walker};
-
-/// Measured motion of robots under a policy.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Evaluation {
-    /// Number of robots.
-    pub robots: usize,
-    /// Simulated time of each robot [s].
-    pub seconds: f64,
-    /// Share of the robots that did not fall.
-    pub up: f64,
-    /// Root mean square of the norm of the horizontal velocity error, of robots that are up [m/s].
-    ///
-    /// The error of one axis is smaller by √2.
-    pub velocity_rms: f64,
-    /// The same, without the first second after each change of the command [m/s].
-    pub settled_velocity_rms: f64,
-    /// Root mean square error of the yaw rate [rad/s].
-    pub yaw_rate_rms: f64,
-    /// The same, without the first second after each change of the command [rad/s].
-    pub settled_yaw_rate_rms: f64,
-    /// Median over swing phases of the highest position of the sole above the ground [m].
-    pub swing_height: f64,
-    /// Share of the time in which a foot is on the ground, mean over the feet, while a motion is commanded.
-    pub duty_factor: f64,
-    /// Swing phases per second and foot, while a motion is commanded [1/s].
-    pub swings_per_second: f64,
-    /// Mean speed of feet on the ground [m/s].
-    pub slip_speed: f64,
-    /// Mean of the mechanical power of all motors while a motion is commanded [W]. Braking counts as 0.
-    ///
-    /// The torque is that of the PD loop with nominal gains at the end of each policy step.
-    pub power: f64,
-    /// Errors by the commanded speed. [`SPEED_BINS`] are its ranges.
-    pub by_speed: Vec<SpeedBin>,
-}
-
-/// Limits of the ranges of commanded speed, above standing robots [m/s].
-pub const SPEED_BINS: [f32; 3] = [0.05, 0.4, 0.8];
-
-/// Errors in a range of commanded speed.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct SpeedBin {
-    /// Lowest commanded horizontal speed [m/s].
-    pub from: f32,
-    /// Share of the steps.
-    pub share: f64,
-    /// Root mean square of the norm of the horizontal velocity error [m/s].
-    pub velocity_rms: f64,
-    /// Root mean square error of the yaw rate [rad/s].
-    pub yaw_rate_rms: f64,
-}
+use crate::walking::{Evaluation, Robots, Sums, Walker};
 
 /// The environment does not observe what the evaluation needs.
 #[derive(Debug, thiserror::Error)]
@@ -111,7 +59,7 @@ pub fn evaluate(
     if spec.hash() != policy.spec.hash() {
         return Err(EvaluationError::OtherSpec { policy: policy.spec.hash(), env: spec.hash() });
     }
-    let robots = Robots::new(&spec, robot)?;
+    let robots = Robots::new(&spec, robot).map_err(EvaluationError::Missing)?;
     let num_envs = env.num_envs();
     let mut runner = PolicyRunner::new(policy);
     let mut obs = env.reset(&ResetRequest::seeded(seed, num_envs))?.to_vec();

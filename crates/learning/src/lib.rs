@@ -25,12 +25,13 @@ mod walking;
 pub use adam::Adam;
 pub use checkpoint::Checkpoint;
 pub use config::{PpoConfig, PpoConfigError};
-pub use evaluation::{Evaluation, EvaluationError, EvaluationPlan, SpeedBin, evaluate};
+pub use evaluation::{EvaluationError, EvaluationPlan, evaluate};
 pub use rollout::Group;
 pub use statistics::{Statistics, VelocityLayout};
 pub use symmetry::{Mirror, NoMirror};
 pub use tensorboard::EventFile;
 pub use trainer::{Iteration, Learner, LearningError, Trainer};
+pub use walking::{Evaluation, SpeedBin};
 
 #[cfg(test)]
 mod tests;

@@ -1,9 +1,9 @@
 //! Sums over the steps of walking robots: velocity errors, the motion of the feet, power.
 
 use glam::Vec3;
+use serde::Serialize;
 use twinstep_model::{EnvSpec, FootKinematics, NUM_JOINTS, PerJoint, RobotModel, SpecField};
 
-use crate::evaluation::{Evaluation, EvaluationError, SPEED_BINS, SpeedBin};
 use crate::statistics::VelocityLayout;
 
 /// Time after a change of the command that is left out of the settled errors [s].
@@ -14,6 +14,57 @@ const CONTACT_FORCE: f32 = 1.0;
 const MIN_SWING_S: f64 = 0.04;
 /// Entry of a command above which a motion is commanded [m/s, rad/s].
 const MOVING: f32 = 0.1;
+
+/// Measured motion of robots under a policy.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Evaluation {
+    /// Number of robots.
+    pub robots: usize,
+    /// Simulated time of each robot [s].
+    pub seconds: f64,
+    /// Share of the robots that did not fall.
+    pub up: f64,
+    /// Root mean square of the norm of the horizontal velocity error, of robots that are up [m/s].
+    ///
+    /// The error of one axis is smaller by √2.
+    pub velocity_rms: f64,
+    /// The same, without the first second after each change of the command [m/s].
+    pub settled_velocity_rms: f64,
+    /// Root mean square error of the yaw rate [rad/s].
+    pub yaw_rate_rms: f64,
+    /// The same, without the first second after each change of the command [rad/s].
+    pub settled_yaw_rate_rms: f64,
+    /// Median over swing phases of the highest position of the sole above the ground [m].
+    pub swing_height: f64,
+    /// Share of the time in which a foot is on the ground, mean over the feet, while a motion is commanded.
+    pub duty_factor: f64,
+    /// Swing phases per second and foot, while a motion is commanded [1/s].
+    pub swings_per_second: f64,
+    /// Mean speed of feet on the ground [m/s].
+    pub slip_speed: f64,
+    /// Mean of the mechanical power of all motors while a motion is commanded [W]. Braking counts as 0.
+    ///
+    /// The torque is that of the PD loop with nominal gains at the end of each policy step.
+    pub power: f64,
+    /// Errors by the commanded speed. [`SPEED_BINS`] are its ranges.
+    pub by_speed: Vec<SpeedBin>,
+}
+
+/// Limits of the ranges of commanded speed, above standing robots [m/s].
+pub const SPEED_BINS: [f32; 3] = [0.05, 0.4, 0.8];
+
+/// Errors in a range of commanded speed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct SpeedBin {
+    /// Lowest commanded horizontal speed [m/s].
+    pub from: f32,
+    /// Share of the steps.
+    pub share: f64,
+    /// Root mean square of the norm of the horizontal velocity error [m/s].
+    pub velocity_rms: f64,
+    /// Root mean square error of the yaw rate [rad/s].
+    pub yaw_rate_rms: f64,
+}
 
 /// What the robots have in common: the layout of their observations, their gains and limbs.
 pub struct Robots {
@@ -39,18 +90,18 @@ pub struct Robots {
 }
 
 impl Robots {
-    /// Fails if a quantity is not observed.
-    pub fn new(spec: &EnvSpec, robot: &RobotModel) -> Result<Self, EvaluationError> {
+    /// Returns the name of a quantity that is not observed, if there is one, as error.
+    pub fn new(spec: &EnvSpec, robot: &RobotModel) -> Result<Self, &'static str> {
         let find = |fields: &[SpecField], name: &'static str| {
-            let index = fields.iter().position(|field| field.name == name).ok_or(EvaluationError::Missing(name))?;
-            Ok::<_, EvaluationError>(fields[..index].iter().map(|field| field.size).sum::<usize>())
+            let index = fields.iter().position(|field| field.name == name).ok_or(name)?;
+            Ok::<_, &'static str>(fields[..index].iter().map(|field| field.size).sum::<usize>())
         };
         let (policy, critic) = (&spec.observation, &spec.critic_observation);
         Ok(Self {
             obs_len: spec.obs_len(),
             critic_len: spec.critic_obs_len(),
             policy_dt: spec.policy_dt,
-            velocity: VelocityLayout::new(spec).ok_or(EvaluationError::Missing("true_linear_velocity"))?,
+            velocity: VelocityLayout::new(spec).ok_or("true_linear_velocity")?,
             command: find(policy, "velocity_command")?,
             gravity: find(policy, "projected_gravity")?,
             q: find(policy, "joint_position")?,
