@@ -17,6 +17,7 @@ from twinstep.mujoco.frames import (
     GROUND_TRUTH,
     INITIAL_STATE,
     MEASURED,
+    PROTOCOL,
     Hello,
     Reset,
     Step,
@@ -137,7 +138,7 @@ def test_invalid_model_is_rejected(model: str) -> None:
         standing(model, 1).reset([Reset(0, initial_state(0.33), "<mujoco><nonsense/></mujoco>")])
 
 
-def hello(model: str, version: int = 1) -> bytes:
+def hello(model: str, version: int = PROTOCOL) -> bytes:
     return f"twinstep-mujoco {version} robots=1 threads=1 iterations=64 steps={STEPS}\n{model}".encode()
 
 
@@ -145,6 +146,8 @@ def hello(model: str, version: int = 1) -> bytes:
     ("kind", "body", "message"),
     [
         (b"Q", b"", "b'Q' is not a request"),
+        (b"P", b"\x01\0\0\0", "a push has 4 bytes; 16 are expected"),
+        (b"P", b"\x07\0\0\0" + bytes(12), "robot 7 does not exist; there are 1"),
         (b"S", b"\x01\0\0\0", "a step of 1 robots has 4 bytes; 245 are expected"),
         (b"R", b"\x01\0\0\0", "ends too early"),
         (b"R", reset_body([Reset(7, initial_state(0.3), "")]), "robot 7 does not exist; there are 1"),
