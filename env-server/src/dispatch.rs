@@ -7,10 +7,11 @@ use std::time::Instant;
 
 use twinstep_protocol::convert::MAX_ROLLOUT_REQUEST_BYTES;
 use twinstep_protocol::keys::{self, EnvMethod};
-use twinstep_protocol::{ErrorCode, ErrorReply, Secret};
+use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, Secret, encode, message};
 use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
+use crate::EnvFactory;
 use crate::executor::{Executor, Handler, Mailbox, SendLock, lock};
 use crate::messages::{Reply, Request, RequestKind, ServerState};
 
@@ -42,10 +43,12 @@ pub struct Dispatcher {
     pub hello: Arc<Mailbox>,
     /// Mailbox of `lease` requests.
     pub lease: Arc<Mailbox>,
-    /// Mailbox of refused requests. Their payloads are dropped first.
+    /// Mailbox of requests that are refused, or executed already. The payloads of refused ones are dropped first.
     pub refusals: Arc<Mailbox>,
     /// State of the server.
     pub state: Arc<ServerState>,
+    /// Stops the robot.
+    pub factory: Arc<dyn EnvFactory>,
 }
 
 impl Dispatcher {
@@ -64,11 +67,14 @@ impl Dispatcher {
     fn route(&self, query: &Query) -> Result<(Arc<Mailbox>, RequestKind), ErrorReply> {
         let request = keys::parse(query.key_expr().as_str(), &self.sid).ok_or_else(|| {
             let message = format!("the key `{}` does not exist", query.key_expr());
-            let hint = "use hello, lease, or env/<lease>/reset, step, rollout, close or render";
+            let hint = "use hello, lease, stop, or env/<lease>/reset, step, rollout, close or render";
             ErrorReply::new(ErrorCode::UnknownKey, "", message).with_hint(hint)
         })?;
         if let keys::Request::Env { lease, verb } = request {
             return self.route_env(query, lease, verb);
+        }
+        if request == keys::Request::Stop {
+            return Ok((Arc::clone(&self.refusals), RequestKind::Answered(self.stop().into())));
         }
         if self.state.shutting_down.load(Ordering::Acquire) {
             return Err(shutting_down());
@@ -78,6 +84,15 @@ impl Dispatcher {
             keys::Request::Hello => (Arc::clone(&self.hello), RequestKind::Hello),
             _ => (Arc::clone(&self.lease), RequestKind::Lease),
         })
+    }
+
+    /// Stops the robot before any other request is looked at.
+    fn stop(&self) -> Result<Vec<u8>, ErrorReply> {
+        if self.factory.stop() {
+            return Ok(encode(&message::StopReply { protocol: PROTOCOL }));
+        }
+        let error = ErrorReply::new(ErrorCode::UnknownKey, "", "this server simulates: there is no robot to stop");
+        Err(error.with_hint("end the lease with close"))
     }
 
     fn route_env(
@@ -112,7 +127,7 @@ impl Dispatcher {
             *payload = ZBytes::new();
         }
         // The mailbox is never full.
-        let _ = self.refusals.push(Request { query, kind: RequestKind::Refused(error) });
+        let _ = self.refusals.push(Request { query, kind: RequestKind::Answered(Reply::Err(error)) });
     }
 }
 
@@ -127,7 +142,7 @@ struct Refusals;
 impl Handler for Refusals {
     fn handle(&mut self, kind: RequestKind, _query: &Query) -> Option<Reply> {
         match kind {
-            RequestKind::Refused(error) => Some(Reply::Err(error)),
+            RequestKind::Answered(reply) => Some(reply),
             _ => None,
         }
     }

@@ -7,7 +7,7 @@ use twinstep_envs::{CounterEnv, TaskConfig, TaskEnv, TaskEnvConfig, Walk};
 use twinstep_model::{Actuator, AutoresetMode, Backend, RobotModel, VecEnv};
 use twinstep_sim::{BackendBuildError, BatchBackend, Engine, MujocoBackend, RapierBackend};
 
-use twinstep_protocol::random_u64;
+use twinstep_protocol::{message, random_u64};
 
 use crate::Config;
 
@@ -20,6 +20,16 @@ pub trait EnvFactory: Send + Sync + 'static {
         autoreset: AutoresetMode,
         max_episode_steps: Option<u32>,
     ) -> Result<Box<dyn VecEnv>, EnvFactoryError>;
+
+    /// Returns what differs from a simulation. `None`: the environments are simulated.
+    fn real_time(&self) -> Option<message::RealTime> {
+        None
+    }
+
+    /// Stops the robot at once: its motors are damped. Never blocks. Returns false if there is no robot.
+    fn stop(&self) -> bool {
+        false
+    }
 }
 
 /// Reasons why environments cannot be built.
@@ -78,6 +88,11 @@ impl SimEnvFactory {
         let seed = config.server.seed.unwrap_or_else(random_u64);
         let robots = if config.randomise.effects { Some(RobotSampler::new(file)?) } else { None };
         Ok(Self { config, robot, learned, robots, seed })
+    }
+
+    /// Returns the nominal robot.
+    pub fn robot(&self) -> &RobotModel {
+        &self.robot
     }
 
     /// Returns the actuator networks of `num_envs` robots, or `None` if the actuators are analytic.

@@ -91,6 +91,11 @@ impl LeaseManager {
         Self { info, factory, state, routes, executor, leases: Mutex::default() }
     }
 
+    /// Returns the ids of the clients that have a lease.
+    pub fn clients(&self) -> Vec<String> {
+        lock(&self.leases).by_id.values().map(|lease| lease.client.clone()).collect()
+    }
+
     fn hello(&self, query: &Query) -> Result<Vec<u8>, ErrorReply> {
         let payload = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
         // A client of any version gets a reply, which contains the supported versions.
@@ -116,6 +121,7 @@ impl LeaseManager {
             lease_idle_s: info.lease_idle.map(|idle| idle.as_secs_f64()),
             env_steps: self.state.env_steps.load(Ordering::Relaxed),
             max_rollout_steps: self.state.max_rollout_steps as u64,
+            real_time: self.factory.real_time(),
         }))
     }
 

@@ -33,8 +33,8 @@ pub enum RequestKind {
         /// Epoch of the lease from this request on; increased if the lease is reclaimed.
         epoch: u64,
     },
-    /// Nothing: the request was refused.
-    Refused(ErrorReply),
+    /// Nothing more: the request was refused or executed already, and the reply waits to be sent.
+    Answered(Reply),
 }
 
 /// An encoded reply. Cloning shares the bytes.

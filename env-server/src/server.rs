@@ -1,6 +1,7 @@
 //! One run of a server: its Zenoh session, its lease manager and its shutdown.
 
 use std::collections::HashMap;
+use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
@@ -42,6 +43,7 @@ pub struct Server {
     running: Sender<()>,
     expiry: JoinHandle<()>,
     state: Arc<ServerState>,
+    lease_manager: Arc<LeaseManager>,
 }
 
 /// Reasons why a server cannot start.
@@ -99,7 +101,11 @@ impl Server {
         let spec = factory.build(1, AutoresetMode::NextStep, None)?.spec().clone();
         let max_request_bytes = max_request_bytes(config, &spec);
         let sid = random_id();
-        let session = twinstep_session::open(zenoh_config(config, max_request_bytes)?)
+        let zenoh = zenoh_config(config, max_request_bytes)?;
+        if factory.real_time().is_some() {
+            check_protection(config, &zenoh)?;
+        }
+        let session = twinstep_session::open(zenoh)
             .map_err(|error| ServerError::Open { listen: config.listen.clone(), reason: error.to_string() })?;
         let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
         let executor = Executor::start(2 * cores.max(2)).map_err(ServerError::Thread)?;
@@ -115,8 +121,13 @@ impl Server {
             lease_grace: config.lease_grace(),
             lease_idle: config.lease_idle_s.map(Duration::from_secs_f64),
         };
-        let lease_manager =
-            Arc::new(LeaseManager::new(info, factory, Arc::clone(&state), Arc::clone(&routes), executor.clone()));
+        let lease_manager = Arc::new(LeaseManager::new(
+            info,
+            Arc::clone(&factory),
+            Arc::clone(&state),
+            Arc::clone(&routes),
+            executor.clone(),
+        ));
         let (running, expiry) = expire_leases(Arc::clone(&lease_manager)).map_err(ServerError::Thread)?;
         watch_clients(&session, &sid, Arc::clone(&lease_manager))?;
         let send_lock = SendLock::default();
@@ -129,6 +140,7 @@ impl Server {
             lease: control(),
             refusals: refusals(&executor, Arc::clone(&send_lock)),
             state: Arc::clone(&state),
+            factory,
         };
         let key = keys::server(&sid);
         let queryable = session
@@ -144,7 +156,7 @@ impl Server {
             .declare_token(&key)
             .wait()
             .map_err(|error| ServerError::Declare { key, reason: error.to_string() })?;
-        Ok(Self { sid, session, queryable, token, routes, executor, running, expiry, state })
+        Ok(Self { sid, session, queryable, token, routes, executor, running, expiry, state, lease_manager })
     }
 
     /// Returns the id of the server, which is new at each start.
@@ -160,6 +172,11 @@ impl Server {
     /// Returns the number of environment steps executed so far.
     pub fn env_steps(&self) -> u64 {
         self.state.env_steps.load(Ordering::Relaxed)
+    }
+
+    /// Returns the ids of the clients that have environments.
+    pub fn clients(&self) -> Vec<String> {
+        self.lease_manager.clients()
     }
 
     /// Finishes the steps in progress, notifies the clients, and closes the session.
@@ -251,6 +268,33 @@ fn zenoh_config(config: &ServerConfig, max_request_bytes: usize) -> Result<zenoh
         })?;
     }
     Ok(zenoh)
+}
+
+/// Checks that only this machine, or somebody with a password or a certificate, can command a robot.
+fn check_protection(config: &ServerConfig, zenoh: &zenoh::Config) -> Result<(), ServerError> {
+    let setting = |key: &str| zenoh.get_json(key).unwrap_or_default();
+    let has_users = !matches!(setting("transport/auth/usrpwd/dictionary_file").as_str(), "" | "null");
+    let has_certificates = setting("transport/link/tls/enable_mtls") == "true";
+    let is_loopback = |endpoint: &str| {
+        let address = endpoint.split_once('/').map_or(endpoint, |(_, address)| address);
+        let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
+        host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
+    };
+    let endpoints = [("listen", vec![&config.listen]), ("connect", config.connect.iter().collect())];
+    let exposed = endpoints.iter().find_map(|(field, endpoints)| {
+        endpoints.iter().find(|endpoint| !is_loopback(endpoint)).map(|endpoint| (*field, (*endpoint).clone()))
+    });
+    match exposed {
+        Some((field, value)) if !has_users && !has_certificates => Err(ServerError::Setting {
+            field,
+            value,
+            reason:
+                "everybody in this network could move the robot: use a loopback address, or set users and passwords \
+                     or TLS with client certificates in a Zenoh file (`--zenoh`, examples/security)"
+                    .to_owned(),
+        }),
+        _ => Ok(()),
+    }
 }
 
 /// Checks that a dictionary file of users, if configured, is not empty. Zenoh would accept every client.

@@ -10,7 +10,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use twinstep_model::{EnvError, Trajectory, VecEnv};
+use twinstep_model::{BackendError, EnvError, Trajectory, VecEnv};
 use twinstep_policy::BehaviourPolicy;
 use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, message, tensor};
@@ -56,7 +56,7 @@ impl Handler for Worker {
         match kind {
             RequestKind::Env(verb) => Some(self.answer(verb, query)),
             RequestKind::Granted { epoch } => Some(self.transfer(epoch)),
-            RequestKind::Hello | RequestKind::Lease | RequestKind::Refused(_) => None,
+            RequestKind::Hello | RequestKind::Lease | RequestKind::Answered(_) => None,
         }
     }
 }
@@ -223,7 +223,7 @@ impl Worker {
                 let reset = convert::read_reset(&request, env.num_envs())?;
                 let obs = env.reset(&reset).map_err(|error| convert::wire_error(&error))?.to_vec();
                 let critic_obs = if critic { env.critic_obs() } else { &[] };
-                Ok(convert::encode_observations(&obs, critic_obs, request.seq))
+                Ok(convert::encode_observations(&obs, critic_obs, env.real_time(), request.seq))
             }
             EnvMethod::Step => {
                 let request: message::StepRequest<'_> = decode(payload)?;
@@ -232,6 +232,9 @@ impl Worker {
                 if let Some(bytes) = request.command {
                     let commands = convert::read_commands(bytes, env.num_envs())?;
                     env.set_velocity_commands(&commands).map_err(|error| convert::wire_error(&error))?;
+                }
+                if let Some(tick) = request.for_tick {
+                    env.set_action_tick(tick);
                 }
                 let batch = env.step(&self.actions).map_err(|error| logged(&error))?;
                 self.state.env_steps.fetch_add(batch.reward.len() as u64, Ordering::Relaxed);
@@ -266,7 +269,8 @@ fn read_actions(bytes: &[u8], expected: usize, actions: &mut Vec<f32>) -> Result
 }
 
 fn logged(error: &EnvError) -> ErrorReply {
-    if matches!(error, EnvError::Backend(_)) {
+    let is_failure = |error: &BackendError| !matches!(error, BackendError::Waiting { .. });
+    if matches!(error, EnvError::Backend(backend) if is_failure(backend)) {
         tracing::warn!(%error, "step failed");
     }
     convert::wire_error(error)

@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use twinstep_model::{
-    EndedEpisode, EnvError, EnvSpec, Ground, HeightField, ResetRequest, Scene, StepBatch, Trajectory,
+    BackendError, EndedEpisode, EnvError, EnvSpec, Ground, HeightField, NUM_JOINTS, PerJoint, RealTimeReport,
+    ResetRequest, RobotStop, Scene, StepBatch, Trajectory,
 };
 
 use crate::codec::encode_with_capacity;
@@ -74,9 +75,10 @@ pub fn read_reset(request: &message::ResetRequest<'_>, num_envs: usize) -> Resul
 }
 
 /// Encodes the reply to a reset. `critic_obs` is empty unless the lease requested the group `critic`.
-pub fn encode_observations(obs: &[f32], critic_obs: &[f32], seq: u64) -> Vec<u8> {
+pub fn encode_observations(obs: &[f32], critic_obs: &[f32], robot: Option<&RealTimeReport>, seq: u64) -> Vec<u8> {
     let (obs, critic_obs) = (tensor::as_bytes(obs), tensor::as_bytes(critic_obs));
-    encode(&message::ResetReply { protocol: PROTOCOL, seq, obs, critic_obs })
+    let (tick, stamp_ns) = (robot.map(|report| report.tick), robot.map(|report| report.stamp_ns));
+    encode(&message::ResetReply { protocol: PROTOCOL, seq, obs, critic_obs, tick, stamp_ns })
 }
 
 /// Decodes the reply to a reset into `batch`. Fails if a length does not match `num_envs` environments of `spec`.
@@ -94,6 +96,7 @@ pub fn decode_observations(
 
 /// Encodes the reply to a step, with the group `critic` if the lease requested it.
 pub fn encode_step(batch: &StepBatch, seq: u64, with_critic: bool) -> Vec<u8> {
+    let robot = batch.real_time.as_ref();
     let ended = EndedArrays::new(batch.ended.iter(), with_critic);
     let critic_obs = if with_critic { &batch.critic_obs[..] } else { &[] };
     let reply = message::StepReply {
@@ -111,6 +114,12 @@ pub fn encode_step(batch: &StepBatch, seq: u64, with_critic: bool) -> Vec<u8> {
         final_obs: tensor::as_bytes(&ended.final_obs),
         critic_obs: tensor::as_bytes(critic_obs),
         final_critic_obs: tensor::as_bytes(&ended.final_critic_obs),
+        tick: robot.map(|report| report.tick),
+        stamp_ns: robot.map(|report| report.stamp_ns),
+        late_ticks: robot.map(|report| report.late_ticks),
+        applied: robot.map_or(&[], |report| tensor::as_bytes(&report.applied)),
+        refused: robot.and_then(|report| report.refused.as_deref()),
+        fault: robot.and_then(|report| report.stop.as_ref()).map(|stop| stop.reason.as_str()),
     };
     let numbers = batch.obs.len() + batch.reward.len() + critic_obs.len();
     let flags = batch.terminated.len() + batch.truncated.len();
@@ -224,10 +233,17 @@ impl EndedArrays {
     }
 }
 
-/// Encodes a step request. `commands` are the velocity commands, if the client gives them.
-pub fn encode_actions(actions: &[f32], commands: Option<&[[f32; 3]]>, epoch: u64, seq: u64) -> Vec<u8> {
+/// Encodes a step request. `commands` are the velocity commands, if the client gives them. `for_tick` is the policy
+/// period of the actions, if it is not that of the last observation.
+pub fn encode_actions(
+    actions: &[f32],
+    commands: Option<&[[f32; 3]]>,
+    for_tick: Option<u64>,
+    epoch: u64,
+    seq: u64,
+) -> Vec<u8> {
     let (actions, command) = (tensor::as_bytes(actions), commands.map(tensor::as_bytes));
-    let request = message::StepRequest { protocol: PROTOCOL, epoch, seq, actions, command };
+    let request = message::StepRequest { protocol: PROTOCOL, epoch, seq, actions, command, for_tick };
     encode_with_capacity(&request, MAP_OVERHEAD + actions.len() + command.map_or(0, <[u8]>::len))
 }
 
@@ -268,7 +284,24 @@ pub fn decode_step(
         final_critic_obs: tensor::read(reply.final_critic_obs, "final_critic_obs")?,
     };
     batch.ended = ended.read(spec, num_envs)?.collect();
+    batch.real_time = decode_real_time(reply, batch.terminated.contains(&true))?;
     Ok(())
+}
+
+/// Returns the report of a robot in real time. `None` if the server simulates. `terminates`: the episode terminated.
+fn decode_real_time(reply: &message::StepReply<'_>, terminates: bool) -> Result<Option<RealTimeReport>, ErrorReply> {
+    let Some(tick) = reply.tick else { return Ok(None) };
+    let applied: Vec<f32> = tensor::read(reply.applied, "applied")?;
+    let applied: PerJoint =
+        applied.try_into().map_err(|applied: Vec<f32>| wrong_length("applied", applied.len(), NUM_JOINTS))?;
+    Ok(Some(RealTimeReport {
+        tick,
+        stamp_ns: reply.stamp_ns.unwrap_or_default(),
+        late_ticks: reply.late_ticks.unwrap_or_default(),
+        applied,
+        refused: reply.refused.map(str::to_owned),
+        stop: reply.fault.map(|reason| RobotStop { reason: reason.to_owned(), terminates }),
+    }))
 }
 
 /// Decodes the reply to a rollout of `steps` steps into `trajectory`.
@@ -323,7 +356,7 @@ pub fn decode_trajectory(
 
 /// Encodes the reply to a render request.
 pub fn encode_scene(scene: Scene) -> Vec<u8> {
-    let Scene { bodies, pose, shapes, ground, command } = scene;
+    let Scene { bodies, pose, shapes, ground, command, .. } = scene;
     let pose = tensor::as_bytes(&pose);
     encode(&message::RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground: encode_ground(&ground), command })
 }
@@ -349,7 +382,8 @@ pub fn decode_scene(reply: message::RenderReply<'_>) -> Result<Scene, ErrorReply
         let message = format!("`shapes` has body {}; there are {}", shape.body, bodies.len());
         return Err(ErrorReply::new(ErrorCode::OutOfRange, "shapes", message));
     }
-    Ok(Scene { bodies, pose, shapes, ground: decode_ground(ground)?, command })
+    let ground = decode_ground(ground)?;
+    Ok(Scene { bodies, pose, shapes, ground, command, velocity: None, torque: None, foot_force: None })
 }
 
 fn decode_ground(ground: message::Ground<'_>) -> Result<Ground, ErrorReply> {
@@ -367,11 +401,12 @@ fn read_height_field(field: message::HeightField<'_>) -> Result<HeightField, Err
 
 /// Checks that the length `given` of a field equals `expected`.
 pub fn check_length(field: &'static str, given: usize, expected: usize) -> Result<(), ErrorReply> {
-    if given == expected {
-        return Ok(());
-    }
+    if given == expected { Ok(()) } else { Err(wrong_length(field, given, expected)) }
+}
+
+fn wrong_length(field: &'static str, given: usize, expected: usize) -> ErrorReply {
     let message = format!("`{field}` has {given} entries; {expected} are expected");
-    Err(ErrorReply::new(ErrorCode::BadShape, field, message))
+    ErrorReply::new(ErrorCode::BadShape, field, message)
 }
 
 /// Converts an error of an environment to an error reply.
@@ -395,6 +430,9 @@ pub fn wire_error(error: &EnvError) -> ErrorReply {
         EnvError::NeedsReset { .. } => (ErrorCode::NeedsReset, "", "send `reset`, with `mask` for some environments"),
         EnvError::EnvOutOfRange { .. } => (ErrorCode::OutOfRange, "env", "environments are numbered from 0"),
         EnvError::RenderUnsupported { .. } => (ErrorCode::UnknownKey, "", "use a task with a robot, such as `walk`"),
+        EnvError::Backend(BackendError::Waiting { .. }) => {
+            (ErrorCode::Waiting, "", "repeat the request; the robot's operator moves it to its standing pose")
+        }
         EnvError::Backend(_) | EnvError::Remote(_) => (ErrorCode::Internal, "", "read the log of the server"),
     };
     ErrorReply::new(code, field, error.to_string()).with_hint(hint)

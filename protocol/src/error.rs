@@ -44,6 +44,8 @@ pub enum ErrorCode {
     SpecMismatch,
     /// Too many requests are queued; repeat the request later.
     Busy,
+    /// The robot is not ready; repeat the request until it is.
+    Waiting,
     /// The server is shutting down.
     ShuttingDown,
     /// The server failed; its log contains the reason.
@@ -55,7 +57,7 @@ pub enum ErrorCode {
 
 impl ErrorCode {
     /// All error codes of this version.
-    pub const ALL: [ErrorCode; 19] = [
+    pub const ALL: [ErrorCode; 20] = [
         ErrorCode::Version,
         ErrorCode::Malformed,
         ErrorCode::UnknownKey,
@@ -73,6 +75,7 @@ impl ErrorCode {
         ErrorCode::RolloutFailed,
         ErrorCode::SpecMismatch,
         ErrorCode::Busy,
+        ErrorCode::Waiting,
         ErrorCode::ShuttingDown,
         ErrorCode::Internal,
     ];
@@ -109,7 +112,7 @@ impl ErrorReply {
             field: field.into(),
             message: message.into(),
             hint: String::new(),
-            retryable: matches!(code, ErrorCode::Busy),
+            retryable: matches!(code, ErrorCode::Busy | ErrorCode::Waiting),
         }
     }
 

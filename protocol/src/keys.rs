@@ -20,6 +20,11 @@ pub fn lease(sid: &str) -> String {
     format!("{ROOT}/{sid}/lease")
 }
 
+/// Returns the key that stops a robot.
+pub fn stop(sid: &str) -> String {
+    format!("{ROOT}/{sid}/stop")
+}
+
 /// Returns the key of a method of the environments of `lease`.
 pub fn env(sid: &str, lease: &str, verb: EnvMethod) -> String {
     format!("{ROOT}/{sid}/env/{lease}/{}", verb.name())
@@ -82,6 +87,8 @@ pub enum Request<'a> {
     Hello,
     /// [`lease`].
     Lease,
+    /// [`stop`].
+    Stop,
     /// [`env`].
     Env {
         /// Id of the lease.
@@ -97,6 +104,7 @@ pub fn parse<'a>(key: &'a str, sid: &str) -> Option<Request<'a>> {
     match rest.split('/').collect::<Vec<_>>()[..] {
         ["hello"] => Some(Request::Hello),
         ["lease"] => Some(Request::Lease),
+        ["stop"] => Some(Request::Stop),
         ["env", lease, verb] => {
             let verb = EnvMethod::ALL.into_iter().find(|known| known.name() == verb)?;
             Some(Request::Env { lease, verb })
@@ -123,6 +131,7 @@ mod tests {
     fn parsing_inverts_formatting() {
         assert_eq!(parse(&hello("a1"), "a1"), Some(Request::Hello));
         assert_eq!(parse(&lease("a1"), "a1"), Some(Request::Lease));
+        assert_eq!(parse(&stop("a1"), "a1"), Some(Request::Stop));
         for verb in EnvMethod::ALL {
             assert_eq!(parse(&env("a1", "77", verb), "a1"), Some(Request::Env { lease: "77", verb }));
         }

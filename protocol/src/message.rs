@@ -50,6 +50,20 @@ pub struct HelloReply {
     /// Maximum number of steps of a rollout. Default: 0, a server without rollouts.
     #[serde(default)]
     pub max_rollout_steps: u64,
+    /// What differs from a simulation; absent if the server simulates.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub real_time: Option<RealTime>,
+}
+
+/// What differs from a simulation if the server fronts a robot, which does not wait for its agent.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RealTime {
+    /// Reward terms of the task that need the ground truth. They are absent, not estimated.
+    pub absent_reward_terms: Vec<String>,
+    /// Ends of episodes that need the ground truth. No episode ends for these reasons.
+    pub absent_ends: Vec<String>,
+    /// State of the robot, such as `observe` or `ready`.
+    pub state: String,
 }
 
 /// Requests a lease of environments.
@@ -135,6 +149,12 @@ pub struct ResetReply<'a> {
     /// Observations of group `critic`, `num_envs × critic_obs_len` × f32; absent unless the lease requested it.
     #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "<[u8]>::is_empty")]
     pub critic_obs: &'a [u8],
+    /// Policy period that begins with the observation; absent in a simulation.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tick: Option<u64>,
+    /// Time of the sensor readings since the start of the robot's clock [ns]; absent in a simulation.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stamp_ns: Option<u64>,
 }
 
 /// Advances all environments by one policy period.
@@ -153,6 +173,9 @@ pub struct StepRequest<'a> {
     /// yaw rate [rad/s]. Default: unchanged.
     #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "Option::is_none")]
     pub command: Option<&'a [u8]>,
+    /// Policy period for which the actions are, on a robot in real time. Default: `tick` of the last reply.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub for_tick: Option<u64>,
 }
 
 /// Result of a step.
@@ -198,6 +221,24 @@ pub struct StepReply<'a> {
     /// As `final_obs`, of group `critic`.
     #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "<[u8]>::is_empty")]
     pub final_critic_obs: &'a [u8],
+    /// Policy period that begins with the observation; absent in a simulation, as are all fields below.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tick: Option<u64>,
+    /// Time of the sensor readings since the start of the robot's clock [ns].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stamp_ns: Option<u64>,
+    /// Number of policy periods in a row that ended without an action.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub late_ticks: Option<u64>,
+    /// Action in force after clipping and limiting, `action_len` × f32. The next observation contains it.
+    #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "<[u8]>::is_empty")]
+    pub applied: &'a [u8],
+    /// Reason why the action was not executed; absent if it was.
+    #[serde(default, borrow, skip_serializing_if = "Option::is_none")]
+    pub refused: Option<&'a str>,
+    /// Why the robot follows no actions; absent while it follows them.
+    #[serde(default, borrow, skip_serializing_if = "Option::is_none")]
+    pub fault: Option<&'a str>,
 }
 
 /// Runs a policy next to the environments for several policy periods.
@@ -312,6 +353,20 @@ pub struct CloseReply {
     pub protocol: u16,
     /// Sequence number of the request.
     pub seq: u64,
+}
+
+/// Stops a robot at once. Needs neither a lease nor a sequence number.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StopRequest {
+    /// Protocol version of the client.
+    pub protocol: u16,
+}
+
+/// Confirms that the motors are damped from now on, until the robot's operator arms them again.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StopReply {
+    /// Protocol version of the server.
+    pub protocol: u16,
 }
 
 /// Requests the scene of one environment. Only reads, so it has no sequence number.

@@ -5,12 +5,13 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Crate folders and the workspace crates that each may use. Leaf crates use only the core; applications combine them.
-const MAY_USE: [(&str, &[&str]); 22] = [
+const MAY_USE: [(&str, &[&str]); 25] = [
     // Core.
     ("crates/simd", &[]),
     ("crates/model", &["simd"]),
     ("crates/effects", &["model"]),
-    ("crates/logs", &["model", "effects"]),
+    ("crates/unitree", &["model"]),
+    ("crates/logs", &["model", "effects", "unitree"]),
     ("protocol", &["model"]),
     // Leaf crates.
     ("crates/sim", &["simd", "model"]),
@@ -21,6 +22,8 @@ const MAY_USE: [(&str, &[&str]); 22] = [
     ("crates/learning", &["model", "policy"]),
     ("crates/agent", &["model", "logs", "policy"]),
     ("crates/session", &[]),
+    ("crates/viewer", &["model"]),
+    ("crates/robot", &["model", "logs", "unitree"]),
     ("ensemble", &["simd", "model", "effects", "logs"]),
     // Applications.
     ("env-server", &["model", "effects", "protocol", "session", "sim", "envs", "ensemble", "policy"]),
@@ -63,10 +66,13 @@ const MAY_USE: [(&str, &[&str]); 22] = [
             "policy",
             "learning",
             "agent",
+            "robot",
+            "unitree",
             "session",
             "report",
             "hunt",
             "bench",
+            "viewer",
         ],
     ),
     ("examples", &["model", "env-server", "client"]),
@@ -89,19 +95,24 @@ const MAY_USE: [(&str, &[&str]); 22] = [
             "ensemble",
             "env-server",
             "client",
+            "unitree",
+            "robot",
         ],
     ),
 ];
 
 /// Libraries and the only crates that may use them.
-const RESTRICTED_LIBRARIES: [(&str, &[&str]); 8] = [
+const RESTRICTED_LIBRARIES: [(&str, &[&str]); 11] = [
     ("rapier3d", &["crates/sim"]),
     ("burn", &["ensemble", "tests"]),
     ("zenoh", &["crates/session", "env-server", "clients/rust", "tests"]),
     ("clap", &["crates/cli", "tests"]),
     ("plotters", &["crates/report"]),
     ("parquet", &["crates/logs"]),
-    ("mcap", &["crates/logs"]),
+    ("mcap", &["crates/logs", "tests"]),
+    ("rustdds", &["crates/robot"]),
+    ("ratatui", &["crates/cli"]),
+    ("axum", &["crates/viewer"]),
     ("nalgebra", &["crates/identify", "crates/diagnose"]),
 ];
 

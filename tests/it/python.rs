@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 use twinstep_tests::fault_injection::{self, FaultPlan};
 use twinstep_tests::python::{Programs, outside_cargo, python, root, run};
@@ -23,12 +24,23 @@ fn client() -> PathBuf {
 fn check(module: &str, arguments: &[&str]) {
     let Some(python) = python(&target()).unwrap() else { return };
     let programs = Programs::beside(FAULTS).unwrap();
+    // Cargo replaces the program at every build, also at that of a test beside this one: for a moment there is none.
+    let folder = tempfile::tempdir_in(target()).unwrap();
+    let program = folder.path().join("twinstep");
+    let link = || std::fs::hard_link(programs.0.join("twinstep"), &program).is_ok();
+    let is_linked = (0..100).any(|_| {
+        link() || {
+            std::thread::sleep(Duration::from_millis(50));
+            false
+        }
+    });
+    assert!(is_linked, "{} cannot be linked", programs.0.display());
     let mut command = Command::new(&python);
     command
         .args(["-m", module])
         .args(arguments)
         .current_dir(client())
-        .env("TWINSTEP_SERVER", programs.0.join("twinstep"))
+        .env("TWINSTEP_SERVER", &program)
         .env("PYTHONPATH", client().join("src"));
     run(&mut command).unwrap_or_else(|printed| panic!("{printed}"));
 }

@@ -177,7 +177,14 @@ pub fn step_bytes(lease: &LeaseReply, seq: u64) -> Vec<u8> {
 
 /// Encodes a step with these actions, of any length.
 pub fn step_with(lease: &LeaseReply, seq: u64, actions: &[f32]) -> Vec<u8> {
-    encode(&StepRequest { protocol: PROTOCOL, epoch: lease.epoch, seq, actions: as_bytes(actions), command: None })
+    encode(&StepRequest {
+        protocol: PROTOCOL,
+        epoch: lease.epoch,
+        seq,
+        actions: as_bytes(actions),
+        command: None,
+        for_tick: None,
+    })
 }
 
 /// Returns the total number of steps of the first environment of the task `counter`, from a step reply.

@@ -81,7 +81,14 @@ fn invalid_commands_are_errors_of_the_environment() {
 
 fn step(client: &RawClient, lease: &LeaseReply, seq: u64, action: f32, command: Option<&[f32]>) -> Answer {
     let (actions, command) = ([action; 24], command.map(as_bytes));
-    let request = StepRequest { protocol: PROTOCOL, epoch: lease.epoch, seq, actions: as_bytes(&actions), command };
+    let request = StepRequest {
+        protocol: PROTOCOL,
+        epoch: lease.epoch,
+        seq,
+        actions: as_bytes(&actions),
+        command,
+        for_tick: None,
+    };
     client.ask_env(lease, EnvMethod::Step, &encode(&request))
 }
 

@@ -13,12 +13,16 @@
 //! - [`confounded_pairs`]: pairs of confounded effects, for experiment design
 //! - [`foreign_policy`]: policies with the conventions of other programs
 //! - [`fuzz`]: random changes to messages and files
+//! - [`robot_rig`]: a fake Go2 under the safety state machine, on an accelerated clock
+//! - [`robot_campaign`]: faults of this robot in each state, and random sequences of events
 //! - [`soak`]: many clients that end in different ways
+//! - [`chrome_page`]: a page in a real browser that a test clicks
 //! - [`browser`]: layout of an HTML report in a real browser
 //! - [`security`]: files and certificates for TLS, users and access control
 //! - [`python`]: environment for the tests of the Python client
 
 pub mod browser;
+pub mod chrome_page;
 pub mod confounded_pairs;
 pub mod fault;
 pub mod fault_injection;
@@ -30,6 +34,9 @@ pub mod process;
 pub mod proxy;
 pub mod python;
 pub mod repeats;
+pub mod robot_campaign;
+pub mod robot_pair;
+pub mod robot_rig;
 pub mod roles;
 pub mod security;
 pub mod soak;

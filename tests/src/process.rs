@@ -1,6 +1,6 @@
 //! A child process that can be killed, suspended and resumed, and whose output is read line by line.
 
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
@@ -59,6 +59,17 @@ impl Process {
     /// Returns the next line, or `None` after `timeout` or if the process has exited.
     pub fn line(&self, timeout: Duration) -> Option<String> {
         self.lines.recv_timeout(timeout).ok()
+    }
+
+    /// Writes a line to the stdin of the process.
+    pub fn write_line(&mut self, text: &str) -> Result<(), String> {
+        let stdin = self.child.stdin.as_mut().ok_or("the child has no stdin")?;
+        writeln!(stdin, "{text}").and_then(|()| stdin.flush()).map_err(|error| format!("`{text}`: {error}"))
+    }
+
+    /// Sends SIGINT.
+    pub fn interrupt(&self) -> Result<(), String> {
+        self.signal("INT")
     }
 
     /// Returns all lines received so far.

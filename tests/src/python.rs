@@ -62,6 +62,35 @@ fn prepare(target: &Path) -> Result<PathBuf, String> {
     Ok(python)
 }
 
+/// Returns the interpreter of an environment with Cyclone DDS 0.10.2, the version on the robot, or why there is none.
+///
+/// It has wheels up to Python 3.10.
+pub fn cyclone_python(target: &Path) -> Result<PathBuf, String> {
+    static ENVIRONMENT: OnceLock<Result<PathBuf, String>> = OnceLock::new();
+    let prepare = || {
+        let python = target.join("python3.10/bin/python");
+        let has_cyclone = |python: &Path| run(Command::new(python).args(["-c", "import cyclonedds"])).is_ok();
+        if !has_cyclone(&python) {
+            let base = python_3_10().ok_or("there is no Python 3.10 on the PATH or among the versions of pyenv")?;
+            run(Command::new(base).args(["-m", "venv"]).arg(target.join("python3.10")))?;
+            run(Command::new(&python).args(["-m", "pip", "install", "--quiet", "cyclonedds==0.10.2"]))?;
+        }
+        Ok(python)
+    };
+    ENVIRONMENT.get_or_init(prepare).clone()
+}
+
+fn python_3_10() -> Option<PathBuf> {
+    let on_path =
+        std::env::var_os("PATH").into_iter().flat_map(|path| std::env::split_paths(&path).collect::<Vec<_>>());
+    let pyenv = std::env::var_os("HOME").map(|home| Path::new(&home).join(".pyenv/versions"));
+    let versions = pyenv.and_then(|versions| std::fs::read_dir(versions).ok()).into_iter().flatten().flatten();
+    let versions = versions.map(|version| version.path().join("bin"));
+    // The scripts of pyenv on the PATH fail if the version is not selected.
+    let is_usable = |python: &PathBuf| run(Command::new(python).arg("--version")).is_ok();
+    on_path.chain(versions).map(|folder| folder.join("python3.10")).filter(|python| python.exists()).find(is_usable)
+}
+
 /// Returns the dependencies of the package and of its extras, except `bench`.
 fn requirements(pyproject: &str) -> Result<Vec<String>, String> {
     let project: toml::Table = pyproject.parse().map_err(|error| format!("pyproject.toml: {error}"))?;

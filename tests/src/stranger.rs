@@ -29,7 +29,7 @@ pub fn use_foreign_lease(endpoint: &str, lease: &str, epoch: u64, last_seq: u64)
     };
     let key = |method| keys::env(connection.sid(), lease, method);
     for seq in [last_seq, last_seq + 1] {
-        refused(key(EnvMethod::Step), convert::encode_actions(&[0.9; 24], None, epoch, seq))?;
+        refused(key(EnvMethod::Step), convert::encode_actions(&[0.9; 24], None, None, epoch, seq))?;
         refused(key(EnvMethod::Reset), convert::encode_reset(&ResetRequest::default(), epoch, seq))?;
         refused(key(EnvMethod::Close), encode(&CloseRequest { protocol: PROTOCOL, epoch, seq }))?;
     }

@@ -56,8 +56,8 @@ def test_interrupt_while_sending_never_exchanges_transitions(
 def test_interrupt_after_the_reply_returns_it_again(counters: Go2VectorEnv, monkeypatch: pytest.MonkeyPatch) -> None:
     wait = Connection.wait_reply
 
-    def interrupted(self: Connection, *arguments: Any) -> dict[str, Any]:
-        wait(self, *arguments)
+    def interrupted(self: Connection, *arguments: Any, **options: Any) -> dict[str, Any]:
+        wait(self, *arguments, **options)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Connection, "wait_reply", interrupted)
@@ -73,7 +73,11 @@ def test_reply_that_cannot_be_read_blocks_steps_until_a_reset(
     counters: Go2VectorEnv, monkeypatch: pytest.MonkeyPatch, damage: dict[str, Any]
 ) -> None:
     wait = Connection.wait_reply
-    monkeypatch.setattr(Connection, "wait_reply", lambda *arguments: {**wait(*arguments), **damage})
+
+    def damaged(self: Connection, *arguments: Any, **options: Any) -> dict[str, Any]:
+        return {**wait(self, *arguments, **options), **damage}
+
+    monkeypatch.setattr(Connection, "wait_reply", damaged)
     with pytest.raises(MalformedError):
         counters.step(actions(0.25))
     monkeypatch.undo()

@@ -167,6 +167,14 @@ def test_reset_waits_for_an_abandoned_step() -> None:
     envs.close()
 
 
+def test_server_that_simulates_has_no_robot_to_stop() -> None:
+    env = Go2Env(task="counter")
+    endpoint = env._remote._connection.endpoint
+    with pytest.raises(twinstep.RequestRejectedError, match="there is no robot to stop"):
+        twinstep.stop_robot(endpoint)
+    env.close()
+
+
 def test_closed_environment_raises() -> None:
     env = Go2Env(task="counter")
     env.close()

@@ -1,5 +1,7 @@
 //! Connection to one server: requests with retries, reasons of timeouts.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, Secret, decode, encode, keys, message, random_id};
@@ -38,6 +40,10 @@ pub struct Connection {
     max_request_bytes: usize,
     /// Maximum number of steps of a rollout, from `hello`; 0 for a server without rollouts.
     max_rollout_steps: u64,
+    /// True if the server fronts a robot, from `hello`.
+    is_real_time: bool,
+    /// Set by the user to end the wait for a robot that is not ready.
+    interrupted: Arc<AtomicBool>,
     _token: LivelinessToken,
 }
 
@@ -86,12 +92,21 @@ impl Connection {
             secret,
             max_request_bytes: usize::MAX,
             max_rollout_steps: 0,
+            is_real_time: false,
+            interrupted: Arc::clone(&options.interrupted),
             _token: token,
         };
         let hello = this.hello()?;
         this.max_request_bytes = usize::try_from(hello.max_request_bytes).unwrap_or(usize::MAX);
         this.max_rollout_steps = hello.max_rollout_steps;
+        this.is_real_time = hello.real_time.is_some();
         Ok(this)
+    }
+
+    /// Damps the motors of the robot at once, whoever controls it.
+    pub fn stop_robot(&self) -> Result<(), ClientError> {
+        let querier = self.querier(keys::stop(&self.sid))?;
+        self.request(&querier, encode(&message::StopRequest { protocol: PROTOCOL })).map(drop)
     }
 
     /// Returns the secret that is attached to every request.
@@ -112,6 +127,11 @@ impl Connection {
     /// Returns the maximum number of steps of a rollout; 0 for a server without rollouts.
     pub fn max_rollout_steps(&self) -> u64 {
         self.max_rollout_steps
+    }
+
+    /// Returns true if the server fronts a robot, whose steps take one policy period of real time.
+    pub fn is_real_time(&self) -> bool {
+        self.is_real_time
     }
 
     /// Returns true if the server's liveliness token is visible.
@@ -166,7 +186,8 @@ impl Connection {
         pending: &mut Pending,
         timeout: Duration,
     ) -> Result<ZBytes, ClientError> {
-        let since = Instant::now();
+        let mut since = Instant::now();
+        let mut waiting_for = String::new();
         let mut pause = RETRY_BACKOFF[0];
         let mut replaced_since: Option<Instant> = None;
         loop {
@@ -174,6 +195,17 @@ impl Connection {
                 QueryOutcome::Answer(bytes) => return Ok(bytes),
                 QueryOutcome::Error(error) if error.code == ErrorCode::ShuttingDown => {
                     return Err(ClientError::ShuttingDown { endpoint: self.endpoint.clone() });
+                }
+                QueryOutcome::Error(error) if error.code == ErrorCode::Waiting => {
+                    // The robot waits for its operator, who may take any time.
+                    since = Instant::now();
+                    if self.interrupted.load(Ordering::Acquire) {
+                        return Err(ClientError::Interrupted { reason: error.message });
+                    }
+                    if error.message != waiting_for {
+                        eprintln!("{}: {}", self.name, error.message);
+                        waiting_for = error.message;
+                    }
                 }
                 QueryOutcome::Error(error) if !error.retryable => return Err(error.into()),
                 QueryOutcome::Error(_) | QueryOutcome::Timeout => {}

@@ -7,6 +7,12 @@ use twinstep_protocol::ErrorReply;
 /// Reasons why a request fails.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
+    /// The program was interrupted while a robot was not ready.
+    #[error("interrupted while the robot was not ready: {reason}")]
+    Interrupted {
+        /// What the robot waits for.
+        reason: String,
+    },
     /// The server process could not be started.
     #[error("the server process did not start: {0}")]
     ServerStart(String),

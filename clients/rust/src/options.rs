@@ -1,6 +1,8 @@
 //! Options of a connection.
 
 use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use twinstep_model::AutoresetMode;
@@ -33,6 +35,8 @@ pub struct ConnectOptions {
     pub connect_timeout: Duration,
     /// Time after which an unanswered request fails.
     pub timeout: Duration,
+    /// Set to true by the user's program to end the wait for a robot that is not ready, such as by a signal handler.
+    pub interrupted: Arc<AtomicBool>,
 }
 
 impl ConnectOptions {
@@ -51,6 +55,7 @@ impl ConnectOptions {
             shared_memory: false,
             connect_timeout: Duration::from_secs(5),
             timeout: Duration::from_secs(20),
+            interrupted: Arc::default(),
         }
     }
 }

@@ -3,7 +3,9 @@
 use std::sync::OnceLock;
 use std::time::Duration;
 
-use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, Scene, StepBatch, Trajectory, VecEnv};
+use twinstep_model::{
+    AutoresetMode, EnvError, EnvSpec, RealTimeReport, ResetRequest, Scene, StepBatch, Trajectory, VecEnv,
+};
 use twinstep_policy::BehaviourPolicy;
 use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::tensor::as_bytes;
@@ -50,6 +52,8 @@ pub struct RemoteVecEnv {
     is_unknown: bool,
     /// Velocity commands, which every step request repeats.
     velocity_commands: Option<Vec<[f32; 3]>>,
+    /// Policy period of the next actions, if the agent has set it.
+    action_tick: Option<u64>,
     batch: StepBatch,
 }
 
@@ -100,6 +104,7 @@ impl RemoteVecEnv {
             pending: None,
             is_unknown: false,
             velocity_commands: None,
+            action_tick: None,
             connection,
         })
     }
@@ -122,7 +127,8 @@ impl RemoteVecEnv {
             return Err(EnvError::WrongLength { field: "actions", given: actions.len(), expected });
         }
         let (epoch, seq) = (self.ticket.epoch, self.last_seq + 1);
-        let request = convert::encode_actions(actions, self.velocity_commands.as_deref(), epoch, seq);
+        let for_tick = self.action_tick.take();
+        let request = convert::encode_actions(actions, self.velocity_commands.as_deref(), for_tick, epoch, seq);
         self.pending = Some((EnvMethod::Step, self.connection.send(&self.step, request).map_err(remote)?));
         Ok(())
     }
@@ -142,6 +148,17 @@ impl RemoteVecEnv {
             .map_err(|error| malformed("step", error))?;
         self.is_unknown = false;
         Ok(&self.batch)
+    }
+
+    /// Returns true if the server fronts a robot, whose steps take one policy period of real time.
+    pub fn is_real_time(&self) -> bool {
+        self.connection.is_real_time()
+    }
+
+    /// Stops the robot at once: its motors are damped until its operator arms them again.
+    pub fn stop(&self) -> Result<(), ClientError> {
+        let querier = self.connection.querier(keys::stop(self.connection.sid()))?;
+        self.connection.request(&querier, encode(&message::StopRequest { protocol: PROTOCOL })).map(drop)
     }
 
     /// Returns the maximum number of steps of a rollout; 0 for a server without rollouts.
@@ -363,6 +380,14 @@ impl VecEnv for RemoteVecEnv {
         self.spec.check_velocity_commands(commands, self.num_envs)?;
         self.velocity_commands = Some(commands.to_vec());
         Ok(())
+    }
+
+    fn set_action_tick(&mut self, tick: u64) {
+        self.action_tick = Some(tick);
+    }
+
+    fn real_time(&self) -> Option<&RealTimeReport> {
+        self.batch.real_time.as_ref()
     }
 
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {

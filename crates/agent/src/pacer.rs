@@ -16,7 +16,7 @@ impl Pacer {
 
     /// Waits until the next period begins. Returns how late the call is.
     ///
-    /// After a delay of more than a period, the periods begin anew: no burst of steps follows.
+    /// After a delay of more than a period, the periods begin at the next step: no burst of steps follows.
     pub fn wait(&mut self) -> Duration {
         let now = Instant::now();
         let late = now.saturating_duration_since(self.next);

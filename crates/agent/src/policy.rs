@@ -58,6 +58,15 @@ impl LoadedPolicy {
         }
     }
 
+    /// Returns the spec that the policy was trained for. `None`: the file of another program has none.
+    pub fn spec(&self) -> Option<&EnvSpec> {
+        match &self.0 {
+            Source::File(policy) => Some(&policy.spec),
+            Source::Onnx(_, spec) => Some(spec),
+            Source::Mapped(..) => None,
+        }
+    }
+
     /// Returns the policy for a robot. Fails with every difference if they do not agree.
     pub fn bind(self, spec: &EnvSpec) -> Result<BoundPolicy, AgentError> {
         match self.0 {

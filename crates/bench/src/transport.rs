@@ -55,7 +55,7 @@ fn compare(
     env.reset(&ResetRequest::default()).map_err(failed)?;
     let actions = vec![0.1; num_envs * env.spec().action_len()];
     let mut tcp = {
-        let request = convert::encode_actions(&actions, None, 1, 1);
+        let request = convert::encode_actions(&actions, None, None, 1, 1);
         let reply = convert::encode_step(&StepBatch::new(num_envs, env.spec()), 1, false);
         PingPong::start(request.len(), reply.len())?
     };

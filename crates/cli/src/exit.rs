@@ -46,24 +46,33 @@ fn print_error(report: &miette::Report, code: u8) -> ExitCode {
 }
 
 /// SIGINT and SIGTERM. The program handles the first one; a second one terminates it at once.
-pub struct Signals(Arc<AtomicUsize>);
+pub struct Signals {
+    last: Arc<AtomicUsize>,
+    flag: Arc<AtomicBool>,
+}
 
 impl Signals {
     /// Registers the handlers of SIGINT and SIGTERM.
     pub fn listen() -> Result<Self, Failure> {
-        let last = Arc::new(AtomicUsize::new(0));
+        let (last, flag) = (Arc::new(AtomicUsize::new(0)), Arc::new(AtomicBool::new(false)));
         for signal in [SIGINT, SIGTERM] {
             let armed = Arc::new(AtomicBool::new(false));
             signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&armed)).map_err(other)?;
             signal_hook::flag::register(signal, armed).map_err(other)?;
             signal_hook::flag::register_usize(signal, Arc::clone(&last), signal as usize).map_err(other)?;
+            signal_hook::flag::register(signal, Arc::clone(&flag)).map_err(other)?;
         }
-        Ok(Self(last))
+        Ok(Self { last, flag })
+    }
+
+    /// Returns a flag that is true after either signal.
+    pub fn flag(&self) -> Arc<AtomicBool> {
+        Arc::clone(&self.flag)
     }
 
     /// Returns `Err(Interrupted)` after a SIGINT, `Ok(true)` after a SIGTERM, and `Ok(false)` before either.
     pub fn check(&self) -> Result<bool, Failure> {
-        match self.0.load(Ordering::Acquire) as i32 {
+        match self.last.load(Ordering::Acquire) as i32 {
             SIGINT => Err(Failure::Interrupted),
             SIGTERM => Ok(true),
             _ => Ok(false),

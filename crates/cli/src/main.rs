@@ -8,13 +8,23 @@ mod effects;
 mod evaluate;
 mod evaluate_policy;
 mod exit;
+mod fake_process;
+mod fake_robot;
 mod fit;
 mod hunt;
 mod identify;
+mod key_terminal;
 mod list;
 mod log;
+mod log_writer;
 mod mjcf;
+mod onboard_policy;
+mod operator;
+mod operator_screen;
 mod play;
+mod preflight;
+mod robot;
+mod robot_env_factory;
 mod robot_file;
 mod run;
 mod serve;
@@ -23,6 +33,10 @@ mod train;
 mod train_config;
 mod train_log;
 mod velocity_input;
+mod view;
+mod view_log;
+mod view_policy;
+mod web_view;
 
 use clap::{Parser, Subcommand};
 use twinstep_simd::InstructionSet;
@@ -43,6 +57,7 @@ enum CliCommand {
     Effects(effects::Args),
     Evaluate(evaluate::Args),
     EvaluatePolicy(evaluate_policy::Args),
+    FakeRobot(fake_robot::Args),
     Fit(fit::Args),
     Hunt(hunt::Args),
     Identify(identify::Args),
@@ -50,9 +65,12 @@ enum CliCommand {
     Log(log::Args),
     Mjcf(mjcf::Args),
     Play(play::Args),
+    Preflight(preflight::Args),
+    Robot(robot::Args),
     Run(run::Args),
     Serve(serve::Args),
     Train(train::Args),
+    View(view::Args),
 }
 
 fn main() -> std::process::ExitCode {
@@ -60,11 +78,11 @@ fn main() -> std::process::ExitCode {
     let log = match &command {
         // Their errors have the reason; Zenoh would write two lines for each attempt to connect.
         CliCommand::List(_) | CliCommand::Run(_) => "warn,zenoh=off",
-        _ => "warn,zenoh::api::session=error,twinstep=info",
+        _ => "warn,zenoh::api::session=error,rustdds=off,twinstep=info",
     };
     tracing_subscriber::fmt()
         .with_env_filter(tracing_subscriber::EnvFilter::try_from_env("TWINSTEP_LOG").unwrap_or_else(|_| log.into()))
-        .with_writer(std::io::stderr)
+        .with_writer(|| log_writer::LogWriter)
         .init();
     let result = InstructionSet::from_environment().map_err(exit::input).and_then(|_| match command {
         CliCommand::Bench(args) => bench::run(&args),
@@ -73,6 +91,7 @@ fn main() -> std::process::ExitCode {
         CliCommand::Effects(args) => effects::run(&args),
         CliCommand::Evaluate(args) => evaluate::run(&args),
         CliCommand::EvaluatePolicy(args) => evaluate_policy::run(&args),
+        CliCommand::FakeRobot(args) => fake_robot::run(&args),
         CliCommand::Fit(args) => fit::run(&args),
         CliCommand::Hunt(args) => hunt::run(&args),
         CliCommand::Identify(args) => identify::run(&args),
@@ -80,9 +99,12 @@ fn main() -> std::process::ExitCode {
         CliCommand::Log(args) => log::run(&args),
         CliCommand::Mjcf(args) => mjcf::run(&args),
         CliCommand::Play(args) => play::run(&args),
+        CliCommand::Preflight(args) => preflight::run(&args),
+        CliCommand::Robot(args) => robot::run(&args),
         CliCommand::Run(args) => run::run(&args),
         CliCommand::Serve(args) => serve::run(&args),
         CliCommand::Train(args) => train::run(&args),
+        CliCommand::View(args) => view::run(&args),
     });
     exit::code(result)
 }

@@ -95,12 +95,12 @@ pub fn run(args: &Args) -> CommandResult {
         return Err(Failure::Input(miette::miette!("`--seconds` = {seconds} is not allowed: it must be positive")));
     }
     let loaded = LoadedPolicy::read(&args.policy, args.mapping.as_deref()).map_err(input)?;
-    let mut env = RemoteVecEnv::connect(&args.options()).map_err(other)?;
+    let mut env = RemoteVecEnv::connect(&args.options(&signals)).map_err(other)?;
     let mut policy = loaded.bind(env.spec()).map_err(input)?;
     if let Some(velocity) = args.velocity {
         env.set_velocity_commands(&[velocity]).map_err(input)?;
     }
-    let mut recorder = args.recorder(&mut env)?;
+    let mut recorder = args.recorder(&mut env, &signals)?;
     let velocity = args.velocity_source()?;
     let result = args.steps(&mut env, &mut policy, recorder.as_mut(), &velocity, &signals);
     let device_failure = if let Velocity::Person(device) = &velocity { device.failure() } else { None };
@@ -109,7 +109,7 @@ pub fn run(args: &Args) -> CommandResult {
     if let (Some(folder), Some(recorder)) = (&args.log, &recorder) {
         eprintln!("{} rows in {}", recorder.rows(), folder.display());
     }
-    let summary = result.map_err(other)?;
+    let summary = result.map_err(|error| interrupted(&signals, error))?;
     // Its error is of no interest any more: the run is complete.
     let (robot, task) = (env.spec().robot.clone(), env.spec().task.clone());
     let _ = env.close();
@@ -131,8 +131,9 @@ pub fn run(args: &Args) -> CommandResult {
 }
 
 impl Args {
-    fn options(&self) -> ConnectOptions {
+    fn options(&self, signals: &Signals) -> ConnectOptions {
         ConnectOptions {
+            interrupted: signals.flag(),
             robot: self.robot.clone(),
             zenoh: self.zenoh.clone(),
             autoreset: AutoresetMode::Disabled,
@@ -143,9 +144,9 @@ impl Args {
         }
     }
 
-    fn recorder(&self, env: &mut RemoteVecEnv) -> Result<Option<Recorder>, Failure> {
+    fn recorder(&self, env: &mut RemoteVecEnv, signals: &Signals) -> Result<Option<Recorder>, Failure> {
         let Some(folder) = &self.log else { return Ok(None) };
-        env.reset(&ResetRequest::seeded(self.seed, 1)).map_err(other)?;
+        env.reset(&ResetRequest::seeded(self.seed, 1)).map_err(|error| interrupted(signals, error))?;
         let has_scene = match env.scene(0) {
             Ok(_) => true,
             Err(error) => {
@@ -176,7 +177,9 @@ impl Args {
         signals: &Signals,
     ) -> Result<RunSummary, AgentError> {
         let (mut line, mut falls) = (StatusLine::new(), 0);
-        let plan = RunPlan { seconds: self.seconds, real_time: !self.fast, seed: self.seed };
+        // A robot sets the pace itself.
+        let real_time = !self.fast && !env.is_real_time();
+        let plan = RunPlan { seconds: self.seconds, real_time, seed: self.seed };
         let mut control = |status: &Status| {
             if status.falls > falls {
                 falls = status.falls;
@@ -198,6 +201,11 @@ impl Args {
         line.clear();
         result
     }
+}
+
+/// Returns the failure of an error, which an interruption may have caused.
+fn interrupted(signals: &Signals, error: impl std::error::Error + Send + Sync + 'static) -> Failure {
+    signals.check().err().unwrap_or_else(|| other(error))
 }
 
 /// Parses `VX,VY,WZ`.

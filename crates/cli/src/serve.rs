@@ -7,12 +7,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use twinstep_env_server::{Config, Server, ServerError, SimEnvFactory};
+use twinstep_env_server::{Config, EnvFactory, Server, ServerError, SimEnvFactory};
 use twinstep_envs::TaskConfig;
+use twinstep_model::AutoresetMode;
 use twinstep_session::SERVER_THREADS;
 use twinstep_sim::Engine;
 
 use crate::exit::{CommandResult, Signals, input, other};
+use crate::web_view::{ViewArgs, WatchedFactory};
 
 /// Interval at which the server checks for signals.
 const TICK: Duration = Duration::from_millis(50);
@@ -86,6 +88,8 @@ pub struct Args {
     /// Seed of environments that a client does not seed.
     #[arg(long)]
     seed: Option<u64>,
+    #[command(flatten)]
+    view: ViewArgs,
     /// Stop when stdin closes, for programs that start a server and must not leave it running.
     #[arg(long)]
     until_stdin_closes: bool,
@@ -96,8 +100,19 @@ pub fn run(args: &Args) -> CommandResult {
     let config = args.config()?;
     set_zenoh_threads();
     let signals = Signals::listen()?;
-    let host = SimEnvFactory::new(config.clone()).map_err(input)?;
-    let server = Server::start(&config.server, Arc::new(host)).map_err(|error| match error {
+    let factory = SimEnvFactory::new(config.clone()).map_err(input)?;
+    let page = if args.view.is_wanted() {
+        let mut env = factory.build(1, AutoresetMode::NextStep, None).map_err(input)?;
+        let title = format!("twinstep serve, robot {}", config.server.name);
+        args.view.open(&title, env.as_mut(), factory.robot().torque_limits())?
+    } else {
+        None
+    };
+    let factory: Arc<dyn EnvFactory> = match &page {
+        Some(page) => Arc::new(WatchedFactory { factory, hub: Arc::clone(page.hub()) }),
+        None => Arc::new(factory),
+    };
+    let server = Server::start(&config.server, factory).map_err(|error| match error {
         ServerError::ZenohConfig { .. } | ServerError::Setting { .. } | ServerError::Host(_) => input(error),
         _ => other(error),
     })?;

@@ -17,6 +17,7 @@ use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::robot_file::robot_model;
 use crate::train_config::TrainConfig;
 use crate::train_log::{TrainLog, curve_point, write_curve};
+use crate::web_view::{Page, ViewArgs};
 
 /// Interval at which a running training is saved.
 const SAVE_EVERY: Duration = Duration::from_secs(10);
@@ -77,6 +78,8 @@ pub struct Args {
     /// Continue the training in the folder with its settings and seed.
     #[arg(long, conflicts_with_all = ["config", "model", "randomise_effects", "seed", "envs"])]
     resume: bool,
+    #[command(flatten)]
+    view: ViewArgs,
     /// Print the evaluation as JSON on stdout.
     #[arg(long)]
     json: bool,
@@ -120,6 +123,7 @@ impl Args {
     /// Returns the arguments of a training with default settings in the folder `out`.
     pub fn new(out: PathBuf, seed: u64, steps: u64) -> Self {
         Self {
+            view: ViewArgs::default(),
             task: "walk".to_owned(),
             out,
             config: None,
@@ -194,14 +198,38 @@ struct TrainSession {
     trainer: Trainer,
     curve: Vec<CurvePoint>,
     log: TrainLog,
+    /// Serves the robots of the first group.
+    _page: Option<Page>,
+}
+
+/// Serves a page of the robots, if there is to be one. The robots of the training stay untouched.
+fn open_page(args: &Args, config: &TrainConfig) -> Result<Option<Page>, Failure> {
+    if !args.view.is_wanted() {
+        return Ok(None);
+    }
+    let mut example = config.envs(1, 1, 1)?.remove(0);
+    let limits = robot_model(config.model.as_deref())?.torque_limits();
+    args.view.open(&format!("twinstep train {}", args.task), example.as_mut(), limits)
 }
 
 impl TrainSession {
     fn new(args: &Args, config: TrainConfig, text: String, checkpoint: Option<Checkpoint>) -> Result<Self, Failure> {
+        let mut page = None;
         let collectors = match &args.endpoint[..] {
             [] => {
-                let envs = config.envs(config.train.num_envs, config.train.groups, 1)?;
+                let mut envs = config.envs(config.train.num_envs, config.train.groups, 1)?;
+                page = open_page(args, &config)?;
+                if let Some(page) = &page {
+                    let first = envs.remove(0);
+                    envs.insert(0, page.watch(first));
+                }
                 envs.into_iter().map(|env| Box::new(StepCollector(env)) as Box<dyn Collector>).collect()
+            }
+            _ if args.view.is_wanted() => {
+                return Err(Failure::Input(miette::miette!(
+                    "`--view` shows robots of this process, and --endpoint has others\n  start the server with \
+                     `twinstep serve --view`"
+                )));
             }
             endpoints => remote_collectors(endpoints, &config.train)?,
         };
@@ -214,7 +242,7 @@ impl TrainSession {
             .map_err(|cause| folder_error(&args.out, cause))?;
         let (out, policy) = (args.out.clone(), args.policy());
         let (endpoints, minutes) = (args.endpoint.clone(), args.minutes);
-        Ok(Self { config, text, seed, out, policy, endpoints, minutes, trainer, curve, log })
+        Ok(Self { config, text, seed, out, policy, endpoints, minutes, trainer, curve, log, _page: page })
     }
 
     /// Trains until all steps are done, the time is over, or the user interrupts.

@@ -1,17 +1,17 @@
 //! Velocity commands of a person: keyboard and gamepad.
 
 use std::fs::File;
-use std::io::{Read, stdin};
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
-use rustix::termios::{LocalModes, OptionalActions, SpecialCodeIndex, Termios, tcgetattr, tcsetattr};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use twinstep_envs::WalkConfig;
 
 use crate::exit::{Failure, other};
+use crate::key_terminal::KeyTerminal;
 
 /// Change of a velocity per key press: forward and left [m/s], yaw rate [rad/s].
 const KEY_STEP: [f32; 3] = [0.1, 0.1, 0.2];
@@ -41,9 +41,6 @@ enum Key {
     Stop,
     Quit,
 }
-
-/// Terminal that does not wait for whole lines and does not show the keys, until the value is dropped.
-struct KeyTerminal(Termios);
 
 /// The gamepad cannot be read.
 #[derive(Debug, thiserror::Error)]
@@ -120,40 +117,18 @@ impl State {
     }
 }
 
-impl KeyTerminal {
-    fn open() -> rustix::io::Result<Self> {
-        let before = tcgetattr(stdin())?;
-        let mut modes = before.clone();
-        // Ctrl-C stays a signal.
-        modes.local_modes -= LocalModes::ICANON | LocalModes::ECHO;
-        // A read returns after 0.1 s without a key.
-        modes.special_codes[SpecialCodeIndex::VMIN] = 0;
-        modes.special_codes[SpecialCodeIndex::VTIME] = 1;
-        tcsetattr(stdin(), OptionalActions::Now, &modes)?;
-        Ok(Self(before))
-    }
-}
-
-impl Drop for KeyTerminal {
-    fn drop(&mut self) {
-        // Nothing is left to do if it fails.
-        let _ = tcsetattr(stdin(), OptionalActions::Now, &self.0);
-    }
-}
-
 /// Reads keys until the run ends or a signal arrives.
 fn read_keys(state: &State, interrupted: &AtomicBool, terminal: KeyTerminal) {
     let (mut command, mut bytes) = ([0.0; 3], [0; 64]);
     while !state.has_ended.load(Ordering::Acquire) && !interrupted.load(Ordering::Acquire) {
-        let len = match stdin().lock().read(&mut bytes) {
-            Ok(len) => len,
-            Err(error) if error.kind() == std::io::ErrorKind::Interrupted => continue,
+        let pressed = match terminal.read(&mut bytes) {
+            Ok(pressed) => pressed,
             Err(error) => {
                 state.fail(format!("the keyboard cannot be read: {error}"));
                 break;
             }
         };
-        for key in keys(&bytes[..len]) {
+        for key in keys(pressed) {
             match key {
                 Key::Quit => state.has_ended.store(true, Ordering::Release),
                 pressed => {

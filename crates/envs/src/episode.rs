@@ -93,6 +93,13 @@ impl<S: Default> Episode<S> {
         self.length += 1;
     }
 
+    /// Ends the episode in a step after which the robot follows no actions. `terminates`: its motion is the reason.
+    pub fn stop(&mut self, outcome: StepOutcome, terminates: bool) -> StepOutcome {
+        self.running = false;
+        let terminated = outcome.terminated || terminates;
+        StepOutcome { terminated, truncated: !terminated, ..outcome }
+    }
+
     /// Returns true if an episode has run.
     pub fn was_started(&self) -> bool {
         self.length > 0

@@ -4,7 +4,7 @@ use glam::Vec3;
 use twinstep_effects::RobotSampler;
 use twinstep_model::{
     AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, Ground, InitialState, Pose,
-    ResetRequest, Scene, StepBatch, VecEnv, frames,
+    RealTimeReport, ResetCause, ResetRequest, Scene, StepBatch, VecEnv, frames,
 };
 
 use crate::episode::{Episode, StepOutcome};
@@ -100,12 +100,15 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             let entry = self.spec.action_entry(index % action_len);
             return Err(EnvError::ActionNotFinite { env: index / action_len, entry, value: actions[index] });
         }
-        let restarts = self.autoreset == AutoresetMode::NextStep;
+        let restarts = self.autoreset != AutoresetMode::Disabled;
         let needs_reset = |episode: &Episode<T::State>| !episode.running && (!restarts || !episode.was_started());
         self.episodes.iter().position(needs_reset).map_or(Ok(()), |env| Err(EnvError::NeedsReset { env }))
     }
 
-    fn start_episodes(&mut self, envs: &[usize]) -> Result<(), BackendError> {
+    fn start_episodes(&mut self, envs: &[usize], cause: ResetCause) -> Result<(), BackendError> {
+        if !envs.is_empty() {
+            self.backend.prepare_reset(cause)?;
+        }
         for env in envs {
             let Self { task, backend, randomise, robots, .. } = self;
             let start = self.episodes[*env].start(task, backend.robot(), randomise, robots.as_ref());
@@ -121,9 +124,23 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
                 Some(robot) => backend.reset_with_model(*env, &robot, &initial_state)?,
                 None => backend.reset(&[(*env, initial_state)])?,
             }
+            self.follow_robot(*env);
             self.observe(*env);
         }
         Ok(())
+    }
+
+    /// Takes the velocity command of the operator, unless the agent has its own, and the action that a robot in real
+    /// time has executed.
+    fn follow_robot(&mut self, env: usize) {
+        let Self { backend, task, episodes, .. } = self;
+        let episode = &mut episodes[env];
+        if let Some(command) = backend.velocity_command().filter(|_| self.velocity_commands.is_none()) {
+            task.set_velocity_command(&mut episode.state, command);
+        }
+        if let Some(report) = backend.real_time() {
+            episode.action = report.applied;
+        }
     }
 
     /// Writes the observations of environment `env`.
@@ -160,7 +177,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
                 waiting.push(env);
             }
         }
-        self.start_episodes(&waiting)
+        self.start_episodes(&waiting, ResetCause::Autoreset)
     }
 
     /// Pushes the robots whose next push is due.
@@ -183,15 +200,20 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             // A diverged robot keeps its last observation.
             let mut outcome = StepOutcome { truncated: self.episodes[env].diverged, ..StepOutcome::default() };
             if self.active[env] {
+                self.follow_robot(env);
                 let Self { backend, task, spec, ground, episodes, terms, .. } = self;
                 let robot = view(backend, ground, env);
                 outcome = episodes[env].evaluate_step(task, robot, spec.max_episode_steps, terms);
+                if let Some(stop) = backend.real_time().and_then(|report| report.stop.as_ref()) {
+                    outcome = episodes[env].stop(outcome, stop.terminates);
+                }
                 self.observe(env);
             }
             self.batch.reward[env] = outcome.reward;
             self.batch.terminated[env] = outcome.terminated;
             self.batch.truncated[env] = outcome.truncated;
         }
+        self.batch.real_time = self.backend.real_time().cloned();
         self.batch.ended.clear();
         for env in 0..self.episodes.len() {
             if self.batch.done(env) {
@@ -252,7 +274,7 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
                 self.episodes[*env].seed(&self.task, seeds[*env]);
             }
         }
-        self.start_episodes(&envs)?;
+        self.start_episodes(&envs, ResetCause::Request)?;
         Ok(&self.batch.obs)
     }
 
@@ -268,6 +290,14 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
         self.spec.check_velocity_commands(commands, self.num_envs())?;
         self.next_velocity_commands = Some(commands.to_vec());
         Ok(())
+    }
+
+    fn set_action_tick(&mut self, tick: u64) {
+        self.backend.set_action_tick(tick);
+    }
+
+    fn real_time(&self) -> Option<&RealTimeReport> {
+        self.backend.real_time()
     }
 
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
@@ -292,7 +322,11 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
         self.finish();
         if self.autoreset == AutoresetMode::SameStep {
             let ended: Vec<usize> = self.batch.ended.iter().map(|episode| episode.env).collect();
-            self.start_episodes(&ended)?;
+            match self.start_episodes(&ended, ResetCause::Autoreset) {
+                // The episode has ended all the same; the next step starts another one, as with `NextStep`.
+                Err(BackendError::Waiting { .. }) => {}
+                started => started?,
+            }
         }
         Ok(&self.batch)
     }
@@ -312,6 +346,24 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
         let rotation = frames::world_from_base(robot.measured.orientation[env]);
         let world_from_base = Pose { position: Vec3::from(position), rotation };
         let scene = Scene::new(self.backend.robot(), world_from_base, &robot.measured.q[env], robot.ground);
-        Ok(Scene { command: self.task.velocity_command(&episode.state), ..scene })
+        let velocity = robot.truth.map(|truth| {
+            let linear = rotation.inverse() * Vec3::from(truth.base_linear_velocity[env]);
+            [linear.x, linear.y, robot.measured.gyro[env][2]]
+        });
+        Ok(Scene {
+            command: self.task.velocity_command(&episode.state),
+            velocity,
+            torque: Some(robot.measured.tau[env]),
+            foot_force: robot.truth.map(|truth| truth.foot_force[env]),
+            ..scene
+        })
+    }
+
+    fn push(&mut self, env: usize, velocity: [f32; 3]) -> Result<(), EnvError> {
+        let num_envs = self.num_envs();
+        if env >= num_envs {
+            return Err(EnvError::EnvOutOfRange { env, num_envs });
+        }
+        self.backend.push(env, velocity).map_err(EnvError::from)
     }
 }

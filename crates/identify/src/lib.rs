@@ -39,7 +39,7 @@ mod tests;
 pub use effect_list::{DEFAULT_EFFECTS, EffectAtScope, EffectAtScopeError, UnknownEffect, default_effects, named};
 pub use error::ExperimentError;
 pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};
-pub use experiment::Experiment;
+pub use experiment::{Experiment, SimulatedPose};
 pub use global_search::GlobalSearch;
 pub use identify::{
     EstimateStatus, Identification, IdentifyError, IdentifyOptions, IdentifyProgress, ParameterEstimate, Stage,

@@ -31,7 +31,6 @@
 //! Reading begins in `read` and passes through these modules: `files` finds the files; `csv_table`, `parquet_table` or `mcap_file` reads the
 //! cells; `columns` parses the column names; `check` validates the log.
 
-mod cdr;
 mod check;
 mod columns;
 mod csv_table;
@@ -58,14 +57,15 @@ mod summary;
 mod table;
 mod write;
 
-pub use cdr::CdrError;
 pub use error::{CellLocation, LogError};
 pub use excitation::{Excitation, SpeedSource, TorqueSource};
 pub use falls::Fall;
 pub use files::overwritten_file;
 pub use log::Log;
 pub use log_writer::LogWriter;
+pub use mcap_file::{McapRecorder, RecordedTopic};
 pub use meta::{Gain, Meta, Segment, TorqueSensor};
 pub use summary::{
     ChannelDescription, Identifiability, IdentifiabilityLevel, LogSummary, MissingChannel, SegmentDescription, Timing,
 };
+pub use twinstep_unitree::CdrError;

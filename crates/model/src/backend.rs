@@ -3,7 +3,9 @@
 use std::any::Any;
 use std::sync::Arc;
 
-use crate::{Command, Ground, GroundTruth, InitialState, Measured, PerJoint, RobotModel, RobotStates};
+use crate::{
+    Command, Ground, GroundTruth, InitialState, Measured, PerJoint, RealTimeReport, ResetCause, RobotModel, RobotStates,
+};
 
 /// Batch of robots that are commanded and observed together: a simulator, a replayed log or the real robot.
 pub trait Backend: Send {
@@ -28,9 +30,16 @@ pub trait Backend: Send {
         Ground::FLAT
     }
 
+    /// Prepares robots for a reset, which follows at once if this succeeds.
+    ///
+    /// A simulator has nothing to prepare. A real robot fails with [`BackendError::Waiting`] until it stands.
+    fn prepare_reset(&mut self, _cause: ResetCause) -> Result<(), BackendError> {
+        Ok(())
+    }
+
     /// Resets robots to initial states, with the nominal model. Each pair is a robot's index and its initial state.
     ///
-    /// A real robot moves to the joint positions, and its base stays where it is.
+    /// A real robot stays as it is.
     fn reset(&mut self, initial_states: &[(usize, InitialState)]) -> Result<(), BackendError>;
 
     /// Resets one robot to an initial state, with the parameters of `model` until its next reset.
@@ -56,6 +65,20 @@ pub trait Backend: Send {
     ///
     /// `commands` and `active` have one entry per robot. Inactive robots do not change.
     fn step(&mut self, commands: &[Command], active: &[bool], actuator_periods: usize) -> Result<(), BackendError>;
+
+    /// Returns the report after the last reset or step. `None` in a simulation, which has no real time.
+    fn real_time(&self) -> Option<&RealTimeReport> {
+        None
+    }
+
+    /// Sets the policy period for which the commands of the next step are, instead of that of the last observation.
+    fn set_action_tick(&mut self, _tick: u64) {}
+
+    /// Returns the velocity command of the operator: forward [m/s], left [m/s], yaw rate [rad/s]. `None` in a
+    /// simulation, where the task has its own.
+    fn velocity_command(&self) -> Option<[f32; 3]> {
+        None
+    }
 }
 
 /// Backend whose robots are simulated.
@@ -175,6 +198,12 @@ pub enum BackendError {
         robot: usize,
         /// Why not.
         reason: &'static str,
+    },
+    /// The robot is not ready for an episode. Nothing was changed; the same request succeeds later.
+    #[error("the robot is not ready: {reason}")]
+    Waiting {
+        /// What it waits for.
+        reason: String,
     },
     /// No message of the robot arrived in time. No command is executed until it answers again.
     #[error("the link to robot {robot} is lost: its last message is {silent_ms} ms old")]

@@ -4,7 +4,7 @@ use glam::{DVec3, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
 use crate::kinematics::{Pose, body_poses};
-use crate::{Ground, JOINT_NAMES, Leg, PerJoint, RobotModel};
+use crate::{Ground, JOINT_NAMES, Leg, PerJoint, PerLeg, RobotModel};
 
 /// Scene for rendering. Poses are `[x, y, z, w, x, y, z]`: position [m], then quaternion.
 #[derive(Clone, Debug, PartialEq)]
@@ -19,6 +19,12 @@ pub struct Scene {
     pub ground: Ground,
     /// Commanded base velocity in the base frame: forward [m/s], left [m/s], yaw [rad/s]. `None` if the task has none.
     pub command: Option<[f32; 3]>,
+    /// Velocity in the base frame: forward [m/s], left [m/s], yaw [rad/s]. `None` if it is not known; a server does not send it.
+    pub velocity: Option<[f32; 3]>,
+    /// Torque of each joint [N·m]. `None` if it is not known; a server does not send it.
+    pub torque: Option<PerJoint>,
+    /// Normal force on each foot [N]. `None` if it is not known; a server does not send it.
+    pub foot_force: Option<PerLeg>,
 }
 
 /// Shape of a body.
@@ -57,6 +63,9 @@ impl Scene {
             shapes: shapes(robot),
             ground: ground.crop(world_from_base.position.x, world_from_base.position.y),
             command: None,
+            velocity: None,
+            torque: None,
+            foot_force: None,
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{EnvSpec, Scene, SpecField};
+use crate::{BackendError, EnvSpec, RealTimeReport, Scene, SpecField};
 
 /// Name of the part of the observation that a client may set.
 const VELOCITY_COMMAND: &str = "velocity_command";
@@ -42,11 +42,28 @@ pub trait VecEnv: Send {
         Err(EnvError::NoVelocityCommand { task: self.spec().task.clone() })
     }
 
+    /// Sets the policy period for which the actions of the next step are. Default: that of the last observation.
+    ///
+    /// Only a robot in real time has such periods; a simulation ignores it.
+    fn set_action_tick(&mut self, _tick: u64) {}
+
+    /// Returns the report of the robot after the last reset or step. `None` in a simulation.
+    fn real_time(&self) -> Option<&RealTimeReport> {
+        None
+    }
+
     /// Advances every environment by one policy period.
     ///
     /// `actions` are offsets from the default pose in units of `action_scale`, clipped to [−1, 1]. Fails if one is NaN
     /// or infinite.
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError>;
+
+    /// Adds `velocity` to the linear velocity of the robot of environment `env`, in the world frame [m/s].
+    ///
+    /// Fails if the robot is not simulated in this process.
+    fn push(&mut self, env: usize, _velocity: [f32; 3]) -> Result<(), EnvError> {
+        Err(BackendError::CannotPush { robot: env, reason: "it is not simulated in this process" }.into())
+    }
 
     /// Returns the current scene of environment `env` for rendering.
     fn scene(&self, _env: usize) -> Result<Scene, EnvError> {
@@ -138,6 +155,8 @@ pub struct StepBatch {
     pub truncated: Vec<bool>,
     /// Episodes that ended in this step.
     pub ended: Vec<EndedEpisode>,
+    /// Report of a robot in real time. `None` in a simulation.
+    pub real_time: Option<RealTimeReport>,
 }
 
 impl StepBatch {
@@ -150,6 +169,7 @@ impl StepBatch {
             terminated: vec![false; num_envs],
             truncated: vec![false; num_envs],
             ended: Vec::new(),
+            real_time: None,
         }
     }
 
@@ -246,7 +266,7 @@ pub enum EnvError {
     },
     /// The backend failed.
     #[error(transparent)]
-    Backend(#[from] crate::BackendError),
+    Backend(#[from] BackendError),
     /// The server or the connection to it failed.
     #[error(transparent)]
     Remote(Box<dyn std::error::Error + Send + Sync>),

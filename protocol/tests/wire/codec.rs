@@ -4,17 +4,18 @@ use std::fmt::Debug;
 
 use proptest::prelude::*;
 use serde::{Deserialize, Serialize};
-use twinstep_model::{AutoresetMode, EndedEpisode, Scene, StepBatch, Trajectory};
+use twinstep_model::{AutoresetMode, EndedEpisode, RealTimeReport, RobotStop, Scene, StepBatch, Trajectory};
 use twinstep_protocol::message::{
-    CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply, RenderRequest,
-    RequestHeader, ResetReply, ResetRequest, RolloutPolicy, RolloutReply, RolloutRequest, StepReply, StepRequest,
+    CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, RealTime, Reclaim, RenderReply,
+    RenderRequest, RequestHeader, ResetReply, ResetRequest, RolloutPolicy, RolloutReply, RolloutRequest, StepReply,
+    StepRequest, StopReply, StopRequest,
 };
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, tensor};
 
 use crate::golden;
 
 /// Kinds of messages.
-const KINDS: usize = 16;
+const KINDS: usize = 18;
 
 /// Decodes `bytes` as every kind of message; the codes of those that were refused.
 fn refusals(bytes: &[u8]) -> Vec<ErrorCode> {
@@ -34,6 +35,8 @@ fn refusals(bytes: &[u8]) -> Vec<ErrorCode> {
         refusal::<RolloutReply<'_>>(bytes),
         refusal::<CloseRequest>(bytes),
         refusal::<CloseReply>(bytes),
+        refusal::<StopRequest>(bytes),
+        refusal::<StopReply>(bytes),
         refusal::<RenderRequest>(bytes),
         refusal::<RenderReply<'_>>(bytes),
         refusal::<RequestHeader>(bytes),
@@ -92,6 +95,7 @@ proptest! {
             protocol: PROTOCOL, protocols, server_version: name.clone(), server_id: name.clone(), spec_hash: spec.hash(),
             spec: spec.clone(), max_envs, free_envs, lease_grace_s, max_envs_per_client: max_envs, max_request_bytes: free_envs,
             lease_idle_s: Some(lease_grace_s), env_steps, max_rollout_steps: env_steps, name: name.clone(),
+            real_time: Some(RealTime { absent_reward_terms: vec![name.clone()], state: name.clone(), ..RealTime::default() }),
         };
         round_trips(&hello, &mut Vec::new());
         let granted = LeaseReply {
@@ -103,11 +107,12 @@ proptest! {
     #[test]
     fn requests_of_a_lease_round_trip(
         protocol: u16, epoch: u64, seq: u64, bytes: Vec<u8>, seeds: Option<Vec<u8>>, mask: Option<Vec<u8>>,
+        tick: Option<u64>,
     ) {
         let (seeds, mask) = (seeds.as_deref(), mask.as_deref());
         round_trips(&ResetRequest { protocol, epoch, seq, seeds, mask }, &mut Vec::new());
-        round_trips(&ResetReply { protocol, seq, obs: &bytes, critic_obs: &bytes }, &mut Vec::new());
-        round_trips(&StepRequest { protocol, epoch, seq, actions: &bytes, command: None }, &mut Vec::new());
+        round_trips(&ResetReply { protocol, seq, obs: &bytes, critic_obs: &bytes, tick, stamp_ns: tick }, &mut Vec::new());
+        round_trips(&StepRequest { protocol, epoch, seq, actions: &bytes, command: None, for_tick: tick }, &mut Vec::new());
         let policy = RolloutPolicy { sizes: vec![epoch, seq], weights: &bytes, mean: &bytes, std: &bytes, log_std: &bytes };
         for (policy, policy_id) in [(Some(policy), None), (None, Some(epoch))] {
             let request = RolloutRequest { protocol, epoch, seq, steps: seq, noise_seed: epoch, policy, policy_id };
@@ -115,6 +120,8 @@ proptest! {
         }
         round_trips(&CloseRequest { protocol, epoch, seq }, &mut Vec::new());
         round_trips(&CloseReply { protocol, seq }, &mut Vec::new());
+        round_trips(&StopRequest { protocol }, &mut Vec::new());
+        round_trips(&StopReply { protocol }, &mut Vec::new());
         round_trips(&RenderRequest { protocol, epoch, env: seq }, &mut Vec::new());
     }
 
@@ -127,6 +134,7 @@ proptest! {
     #[test]
     fn steps_round_trip_with_their_ended_episodes(
         rows in prop::collection::vec((-1e9f32..1e9, any::<bool>(), any::<bool>(), any::<u32>()), 1..6), seq: u64,
+        tick: Option<u64>, reason: Option<String>,
     ) {
         let mut spec = golden::small_spec();
         spec.critic_observation = spec.action.clone();
@@ -145,6 +153,15 @@ proptest! {
             }
         }
         batch.critic_obs.fill(0.5);
+        let terminates = batch.terminated.contains(&true);
+        batch.real_time = tick.map(|tick| RealTimeReport {
+            tick,
+            stamp_ns: seq,
+            late_ticks: 3,
+            applied: [0.5; 12],
+            refused: reason.clone(),
+            stop: reason.map(|reason| RobotStop { reason, terminates }),
+        });
         let bytes = convert::encode_step(&batch, seq, true);
         let reply: StepReply<'_> = decode(&bytes).expect("what was encoded decodes");
         let mut read = StepBatch::default();

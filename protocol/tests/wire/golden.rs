@@ -10,16 +10,18 @@ use serde::{Deserialize, Serialize};
 use twinstep_model::{AutoresetMode, EnvSpec, Ground, HeightField, Scene, SceneShape, ShapeKind, SpecField};
 use twinstep_protocol::convert::encode_ground;
 use twinstep_protocol::message::{
-    CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, Reclaim, RenderReply, RenderRequest,
-    ResetReply, ResetRequest, RolloutPolicy, RolloutReply, RolloutRequest, StepReply, StepRequest,
+    CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, RealTime, Reclaim, RenderReply,
+    RenderRequest, ResetReply, ResetRequest, RolloutPolicy, RolloutReply, RolloutRequest, StepReply, StepRequest,
+    StopReply, StopRequest,
 };
 use twinstep_protocol::tensor::as_bytes;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, decode, encode};
 
 /// Name of every golden file, without `.msgpack`.
-pub const NAMES: [&str; 26] = [
+pub const NAMES: [&str; 32] = [
     "hello_request",
     "hello_reply",
+    "hello_reply_real_time",
     "lease_request",
     "lease_request_reclaim",
     "lease_request_critic",
@@ -29,15 +31,20 @@ pub const NAMES: [&str; 26] = [
     "reset_request_seeds_mask",
     "reset_reply",
     "reset_reply_critic",
+    "reset_reply_real_time",
     "step_request",
     "step_request_command",
+    "step_request_real_time",
     "step_reply",
     "step_reply_ended",
     "step_reply_critic",
+    "step_reply_real_time",
     "rollout_request",
     "rollout_request_held",
     "rollout_reply",
     "rollout_reply_critic",
+    "stop_request",
+    "stop_reply",
     "close_request",
     "close_reply",
     "render_request",
@@ -133,8 +140,15 @@ fn hello_has_its_golden_bytes() {
         lease_idle_s: Some(600.0),
         env_steps: 1_000_000_007,
         max_rollout_steps: 128,
+        real_time: None,
     };
     check("hello_reply", &reply);
+    let real_time = RealTime {
+        absent_reward_terms: vec!["tracking".to_owned()],
+        absent_ends: vec!["base_height".to_owned()],
+        state: "ready".to_owned(),
+    };
+    check("hello_reply_real_time", &HelloReply { max_envs: 1, real_time: Some(real_time), ..reply });
 }
 
 #[test]
@@ -179,18 +193,23 @@ fn reset_has_its_golden_bytes() {
     let seeds = [7u64, u64::MAX];
     check("reset_request_seeds_mask", &ResetRequest { seeds: Some(as_bytes(&seeds)), mask: Some(&[0, 1]), ..request });
     let obs = [0.0f32, 0.0, -1.0, 0.125, -0.25, 0.5, 0.5, -0.5, 1.5, -2.5];
-    let reply = ResetReply { protocol: PROTOCOL, seq: 1, obs: as_bytes(&obs), critic_obs: &[] };
+    let (obs, tick, stamp_ns) = (as_bytes(&obs), None, None);
+    let reply = ResetReply { protocol: PROTOCOL, seq: 1, obs, critic_obs: &[], tick, stamp_ns };
     check("reset_reply", &reply);
+    let real_time = ResetReply { tick: Some(70), stamp_ns: Some(1_400_500_000), ..reply.clone() };
+    check("reset_reply_real_time", &real_time);
     check("reset_reply_critic", &ResetReply { critic_obs: as_bytes(&[0.5f32, -0.25, 1.5, 2.5]), ..reply });
 }
 
 #[test]
 fn step_has_its_golden_bytes() {
     let actions = [0.5f32, -0.5, 1.0, -1.0];
-    let request = StepRequest { protocol: PROTOCOL, epoch: 1, seq: 2, actions: as_bytes(&actions), command: None };
+    let (actions, command, for_tick) = (as_bytes(&actions), None, None);
+    let request = StepRequest { protocol: PROTOCOL, epoch: 1, seq: 2, actions, command, for_tick };
     check("step_request", &request);
     let commands = [0.5f32, 0.0, -0.25, 0.0, 0.125, 1.0];
-    check("step_request_command", &StepRequest { command: Some(as_bytes(&commands)), ..request });
+    check("step_request_command", &StepRequest { command: Some(as_bytes(&commands)), ..request.clone() });
+    check("step_request_real_time", &StepRequest { for_tick: Some(70), ..request });
     let obs = [0.0f32, 0.0, -1.0, 0.25, -0.5, 0.0, 0.0, -1.0, 0.0, 0.125];
     let running = StepReply {
         protocol: PROTOCOL,
@@ -207,8 +226,25 @@ fn step_has_its_golden_bytes() {
         final_obs: &[],
         critic_obs: &[],
         final_critic_obs: &[],
+        tick: None,
+        stamp_ns: None,
+        late_ticks: None,
+        applied: &[],
+        refused: None,
+        fault: None,
     };
     check("step_reply", &running);
+    let applied = [0.5f32, -0.5, 0.25, 0.0, 0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.125];
+    let real_time = StepReply {
+        tick: Some(71),
+        stamp_ns: Some(1_420_500_000),
+        late_ticks: Some(2),
+        applied: as_bytes(&applied),
+        refused: Some("the action is for tick 69, but 70 is the present one"),
+        fault: Some("the trunk is tilted by 61°"),
+        ..running.clone()
+    };
+    check("step_reply_real_time", &real_time);
     let ended = StepReply {
         seq: 3,
         terminated: &[0, 1],
@@ -228,6 +264,12 @@ fn step_has_its_golden_bytes() {
         ..ended
     };
     check("step_reply_critic", &critic);
+}
+
+#[test]
+fn stop_has_its_golden_bytes() {
+    check("stop_request", &StopRequest { protocol: PROTOCOL });
+    check("stop_reply", &StopReply { protocol: PROTOCOL });
 }
 
 #[test]
@@ -304,6 +346,9 @@ pub fn small_scene() -> Scene {
         ],
         ground: Ground::FLAT,
         command: Some([1.0, 0.0, -0.5]),
+        velocity: None,
+        torque: None,
+        foot_force: None,
     }
 }
 
@@ -317,7 +362,7 @@ pub fn rough_ground() -> Ground {
 #[test]
 fn render_has_its_golden_bytes() {
     check("render_request", &RenderRequest { protocol: PROTOCOL, epoch: 1, env: 1 });
-    let Scene { bodies, pose, shapes, ground, command } = small_scene();
+    let Scene { bodies, pose, shapes, ground, command, .. } = small_scene();
     let pose = as_bytes(&pose);
     let flat = RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground: encode_ground(&ground), command };
     check("render_reply", &flat);

@@ -169,7 +169,8 @@ fn query_echo(
         .wait()?;
     let actions = vec![0.1f32; envs * ACTION_LEN];
     let actions = tensor::as_bytes(&actions);
-    let request = encode(&message::StepRequest { protocol: PROTOCOL, epoch: 1, seq: 1, actions, command: None });
+    let request =
+        encode(&message::StepRequest { protocol: PROTOCOL, epoch: 1, seq: 1, actions, command: None, for_tick: None });
     run_queries(&querier, Secret::random(), round_trips, case, envs, |_| request.clone())
 }
 
@@ -199,7 +200,14 @@ fn query_twinstep(round_trips: usize, folder: &SecurityFolder, endpoint: &str, e
     let actions = vec![0.1f32; envs * ACTION_LEN];
     let actions = tensor::as_bytes(&actions);
     run_queries(&querier(EnvMethod::Step)?, link.secret(), round_trips, Case::Twinstep, envs, |answered| {
-        encode(&message::StepRequest { protocol: PROTOCOL, epoch, seq: 2 + answered as u64, actions, command: None })
+        encode(&message::StepRequest {
+            protocol: PROTOCOL,
+            epoch,
+            seq: 2 + answered as u64,
+            actions,
+            command: None,
+            for_tick: None,
+        })
     })
 }
 

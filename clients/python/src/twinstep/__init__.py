@@ -42,6 +42,7 @@ from .rollout import GaussianPolicy, Trajectory
 from .server import EmbeddedServer, ServerNotFoundError, ServerStartError
 from .sharded import ShardedVecEnv
 from .step import StepBatch
+from .stop import stop_robot
 from .vector_env import Go2VectorEnv
 
 if TYPE_CHECKING:
@@ -83,6 +84,7 @@ __all__ = [
     "VersionError",
     "check_vec_env",
     "discover",
+    "stop_robot",
 ]
 
 gymnasium.register(

@@ -3,6 +3,7 @@
 import math
 import os
 import secrets
+import sys
 import time
 import uuid
 from typing import Any
@@ -18,8 +19,9 @@ from .errors import (
     RequestTimeoutError,
     ServerExitedError,
     VersionError,
+    from_reply,
 )
-from .query import HELLO, NoReply, Pending, outcome
+from .query import HELLO, NoReply, Pending, Waiting, outcome
 from .server import EmbeddedServer
 from .session import SharedSession, undeclare
 
@@ -112,9 +114,15 @@ class Connection:
             )
         return Pending(querier, payload, self._secret)
 
-    def wait_reply(self, pending: Pending, timeout_s: float, option: str) -> dict[str, Any]:
-        """Wait for the reply to a request, and repeat the request. May be called again after a timeout."""
+    def wait_reply(
+        self, pending: Pending, timeout_s: float, option: str, *, until_ready: bool = True
+    ) -> dict[str, Any]:
+        """Wait for the reply to a request, and repeat the request. May be called again after a timeout.
+
+        While a robot is not ready, it waits without a limit, or raises if ``until_ready`` is false.
+        """
         since, pause, replaced_since = time.monotonic(), _FIRST_BACKOFF_S, None
+        reason = ""
         while True:
             answer = outcome(pending)
             if isinstance(answer, dict):
@@ -122,6 +130,14 @@ class Connection:
             if self._server is not None and not self._server.alive:
                 raise ServerExitedError(self._server.exit_report())
             now = time.monotonic()
+            if isinstance(answer, Waiting):
+                if not until_ready:
+                    raise from_reply("waiting", "", answer.reason, "")
+                # The robot waits for its operator, who may take any time.
+                since = now
+                if answer.reason != reason:
+                    reason = answer.reason
+                    print(f"{self.name}: {reason}", file=sys.stderr, flush=True)
             # Only zero replies can be due to a restart. A query that times out has reached the server.
             replaced = answer is NoReply.NONE and self._server_restarted()
             replaced_since = (replaced_since or now) if replaced else None

@@ -131,7 +131,9 @@ class Go2Env(NotPicklable, gymnasium.Env[NDArray[np.float32], NDArray[np.float32
         terminated, truncated : bool
         info : dict
             At the end of an episode ``reward_terms``, the episode's sum of each weighted reward term, and
-            ``diverged`` if the simulation became NaN or infinite. With the option ``critic``: ``critic_obs``.
+            ``diverged`` if the simulation became NaN or infinite. With the option ``critic``: ``critic_obs``. On a
+            robot in real time: ``tick``, ``stamp_ns``, ``late_ticks``, ``applied`` (12,), and ``refused`` and
+            ``fault`` if there are any, as in ``protocol/SPEC.md``.
         """
         self.send(action)
         return self.recv()
@@ -157,7 +159,7 @@ class Go2Env(NotPicklable, gymnasium.Env[NDArray[np.float32], NDArray[np.float32
     def recv(self) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Wait for the result of the action; may be called again after a ``RequestTimeoutError``."""
         batch = self._remote.recv()
-        info = self._critic_info()
+        info = {**self._critic_info(), **batch.robot}
         if len(batch.ended):
             info["reward_terms"] = reward_terms(batch, 0, self.twinstep_spec.reward_terms)
             if batch.ended_diverged[0]:

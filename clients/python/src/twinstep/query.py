@@ -41,6 +41,13 @@ class NoReply:
 NoReply.NONE, NoReply.TIMEOUT, NoReply.BUSY = NoReply(), NoReply(), NoReply()
 
 
+class Waiting(NoReply):
+    """The robot is not ready for the request."""
+
+    def __init__(self, reason: str) -> None:
+        self.reason = reason
+
+
 def outcome(pending: Pending) -> dict[str, Any] | NoReply:
     """Return the reply to one query, or why there is none. Raises error replies of the server."""
     if pending.replies is None:
@@ -54,6 +61,6 @@ def outcome(pending: Pending) -> dict[str, Any] | NoReply:
             return NoReply.TIMEOUT
         error = codec.decode(payload)
         if error.get("retryable"):
-            return NoReply.BUSY
+            return Waiting(error["message"]) if error["code"] == "waiting" else NoReply.BUSY
         raise from_reply(error["code"], error["field"], error["message"], error["hint"])
     return NoReply.NONE

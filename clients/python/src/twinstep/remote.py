@@ -333,7 +333,11 @@ class RemoteVecEnv(NotPicklable):
             )
 
     def _await_pending(
-        self, option: Literal["timeout_s", "reset_timeout_s"], timeout_s: float | None = None
+        self,
+        option: Literal["timeout_s", "reset_timeout_s"],
+        timeout_s: float | None = None,
+        *,
+        until_ready: bool = True,
     ) -> dict[str, Any]:
         """Wait for the reply to the pending request for ``timeout_s``, or as long as ``option`` says.
 
@@ -344,7 +348,7 @@ class RemoteVecEnv(NotPicklable):
         method, seq, pending, _ = self._pending
         try:
             limit_s = getattr(self._options, option) if timeout_s is None else timeout_s
-            reply = self._connection.wait_reply(pending, limit_s, option)
+            reply = self._connection.wait_reply(pending, limit_s, option, until_ready=until_ready)
         except (RequestTimeoutError, KeyboardInterrupt):
             raise
         except Error as error:
@@ -366,7 +370,8 @@ class RemoteVecEnv(NotPicklable):
     def _resolve_abandoned_request(self) -> None:
         if self._pending is not None:
             try:
-                self._await_pending("reset_timeout_s")
+                # A robot that is not ready has not executed it.
+                self._await_pending("reset_timeout_s", until_ready=False)
             except RequestTimeoutError:
                 raise
             except Error:

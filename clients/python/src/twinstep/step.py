@@ -40,6 +40,9 @@ class StepBatch:
         As ``final_obs``, of group ``critic``.
     round_trip_s
         Time from sending the actions to the reply [s].
+    robot
+        Report of a robot in real time: ``tick``, ``stamp_ns``, ``late_ticks``, ``applied``, and ``refused`` and
+        ``fault`` if there are any, see ``protocol/SPEC.md``. Empty in a simulation.
     """
 
     obs: NDArray[np.float32]
@@ -56,6 +59,7 @@ class StepBatch:
     critic_obs: NDArray[np.float32]
     final_critic_obs: NDArray[np.float32]
     round_trip_s: float = field(compare=False)
+    robot: dict[str, Any] = field(default_factory=dict[str, Any])
 
 
 def checked_actions(actions: NDArray[Any], num_envs: int, spec: codec.Spec) -> NDArray[np.float32]:
@@ -116,7 +120,17 @@ def read_step(reply: dict[str, Any], num_envs: int, spec: codec.Spec, since: flo
         critic_obs=read_critic(reply, "critic_obs", num_envs, spec),
         final_critic_obs=read_critic(reply, "final_critic_obs", num_final, spec),
         round_trip_s=time.monotonic() - since,
+        robot=read_robot(reply, spec),
     )
+
+
+def read_robot(reply: dict[str, Any], spec: codec.Spec) -> dict[str, Any]:
+    """Return the report of a robot in real time, which the reply of a simulation does not contain."""
+    names = ("tick", "stamp_ns", "late_ticks", "refused", "fault")
+    report = {name: reply[name] for name in names if reply.get(name) is not None}
+    if "applied" in reply:
+        report["applied"] = codec.tensor(reply, "applied", "<f4", spec.action_len)
+    return report
 
 
 def read_critic(reply: dict[str, Any], name: str, rows: int, spec: codec.Spec) -> NDArray[np.float32]:

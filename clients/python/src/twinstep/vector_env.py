@@ -276,6 +276,8 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
 
     def _infos(self, batch: StepBatch) -> dict[str, Any]:
         infos = self._critic_info()
+        if batch.robot:
+            infos = self._add_info(infos, batch.robot, 0)
         names = self.twinstep_spec.reward_terms
         for index, env in enumerate(batch.ended):
             lost = bool(batch.ended_lost[index])

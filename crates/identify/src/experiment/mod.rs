@@ -15,7 +15,7 @@ use twinstep_logs::replay::{at_log_rate, joint_commands};
 use twinstep_model::{Joint, RobotModel};
 
 pub use channel::ResidualChannel;
-pub use residuals::estimated_torque;
+pub use residuals::{SimulatedPose, estimated_torque};
 
 use crate::error::ExperimentError;
 use crate::window::{Window, WindowConfig, orientation, windows};

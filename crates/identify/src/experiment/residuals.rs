@@ -9,6 +9,19 @@ use super::Experiment;
 use super::channel::{Channel, ResidualChannel};
 use crate::window::Window;
 
+/// Pose of a simulated robot at a row of a log.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SimulatedPose {
+    /// The row.
+    pub row: usize,
+    /// Position of the base in the world frame [m].
+    pub position: [f32; 3],
+    /// Rotation world-from-base, w, x, y, z.
+    pub orientation: [f32; 4],
+    /// Joint positions [rad].
+    pub q: PerJoint,
+}
+
 impl Experiment {
     /// Returns the residuals of each candidate: simulated minus measured, divided by the noise.
     ///
@@ -48,6 +61,23 @@ impl Experiment {
             }
         }
         errors
+    }
+
+    /// Returns the simulated pose at every row of the windows, each of which starts from its first measured state.
+    pub fn simulated_poses(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> Vec<SimulatedPose> {
+        let robot = &self.at_rate(std::slice::from_ref(robot))[0];
+        let windows = self.simulate(simulator, std::slice::from_ref(robot), Precision::Double);
+        let pose = |states: &RobotStates, row: usize, period: usize| SimulatedPose {
+            row,
+            position: states.truth.base_position[period],
+            orientation: states.measured.orientation[period],
+            q: states.measured.q[period],
+        };
+        let of_window = |(window, states): (&Window, &RobotStates)| {
+            let rows = window.rows.clone().zip(&window.period);
+            rows.map(|(row, period)| pose(states, row, *period)).collect::<Vec<_>>()
+        };
+        self.windows.iter().zip(&windows).flat_map(of_window).collect()
     }
 
     /// Returns the robots with the actuator rate of the log.

@@ -1,10 +1,11 @@
 //! Columns of a log from the rows of an MCAP file.
 
 use twinstep_model::{Joint, Leg};
+use twinstep_unitree::{foot_index, motor_index};
 
 use super::rows::StateWithCommand;
 use super::{NANOSECONDS, NO_FORCE, NO_TEMPERATURE, SegmentStart};
-use crate::go2_message::{MotorCmd, MotorState, foot, motor};
+use crate::go2_message::{MotorCmd, MotorState};
 
 /// Function that returns a value of a motor.
 type OfMotor = fn(&MotorState, &MotorCmd) -> f32;
@@ -22,8 +23,9 @@ pub(crate) fn columns(
     let mut columns = time_columns(rows, parts);
 
     let of_motors = |of: OfMotor| {
-        let of_joint =
-            |joint: &Joint| column(&|row| of(&row.state.motors[motor(*joint)], &row.command.motors[motor(*joint)]));
+        let of_joint = |joint: &Joint| {
+            column(&|row| of(&row.state.motors[motor_index(*joint)], &row.command.motors[motor_index(*joint)]))
+        };
         joints.iter().map(of_joint).collect::<Vec<_>>()
     };
     let gains: [(&str, OfMotor); 2] = [("kp", |_, command| command.kp), ("kd", |_, command| command.kd)];
@@ -62,7 +64,7 @@ pub(crate) fn columns(
     of_robot("acc", &["_x", "_y", "_z"], (0..3).map(|axis| column(&|row| row.state.accelerometer[axis])).collect());
     of_robot("quat", &["_w", "_x", "_y", "_z"], (0..4).map(|part| column(&|row| row.state.quaternion[part])).collect());
     let force = |leg: Leg| {
-        column(&|row| match row.state.foot_force[foot(leg)] {
+        column(&|row| match row.state.foot_force[foot_index(leg)] {
             NO_FORCE => f32::NAN,
             force => f32::from(force),
         })

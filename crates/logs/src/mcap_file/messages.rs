@@ -8,17 +8,22 @@ use std::path::Path;
 use mcap::McapError;
 use mcap::records::{MessageHeader, Metadata, Record};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use twinstep_unitree::decode;
 
+use super::clock::sender_times;
 use super::lengths::{MAX_READ, check_texts, is_used, length_limit};
 use super::{METADATA, PART_TOPIC, SegmentStart};
-use crate::go2_message::{LowCmd, LowState};
-use crate::{LogError, Meta, cdr};
+use crate::go2_message::{BaseState, LowCmd, LowState};
+use crate::{LogError, Meta};
 
 /// Content of an MCAP file that belongs to a log.
 #[derive(Default)]
 pub(crate) struct Recording {
     pub states: Vec<(u64, LowState)>,
     pub commands: Vec<(u64, LowCmd)>,
+    pub base_states: Vec<(u64, BaseState)>,
+    /// Clock of the sender of each base state [ns].
+    base_clock: Vec<u64>,
     pub parts: Vec<(u64, SegmentStart)>,
     /// Metadata and column names, in a file that `Log::write` wrote.
     pub own_meta: Option<(Meta, Vec<String>)>,
@@ -39,6 +44,7 @@ pub(crate) struct Channel {
 pub(crate) enum Content {
     State,
     Command,
+    BaseState,
     Part,
     Other,
 }
@@ -100,6 +106,7 @@ impl Recording {
         let (content, name) = match channel.topic.trim_start_matches('/') {
             "lowstate" | "rt/lowstate" => (Content::State, "LowState"),
             "lowcmd" | "rt/lowcmd" => (Content::Command, "LowCmd"),
+            "sportmodestate" | "rt/sportmodestate" => (Content::BaseState, "SportModeState"),
             _ => return Ok(Content::Other),
         };
         let schema = self.schemas.get(&channel.schema_id).map_or("", String::as_str);
@@ -123,8 +130,19 @@ impl Recording {
         let refused = |cause| LogError::McapMessage { file: file.into(), topic, message, cause };
         let time = header.log_time;
         match channel.content {
-            Content::State => self.states.push((time, cdr::decode(data).map_err(refused)?)),
-            Content::Command => self.commands.push((time, cdr::decode(data).map_err(refused)?)),
+            Content::State => {
+                let state: twinstep_unitree::LowState = decode(data).map_err(refused)?;
+                self.states.push((time, state.into()));
+            }
+            Content::Command => {
+                let command: twinstep_unitree::LowCmd = decode(data).map_err(refused)?;
+                self.commands.push((time, command.into()));
+            }
+            Content::BaseState => {
+                let state: twinstep_unitree::SportModeState = decode(data).map_err(refused)?;
+                self.base_clock.push(u64::from(state.sec.unsigned_abs()) * 1_000_000_000 + u64::from(state.nanosec));
+                self.base_states.push((time, BaseState { position: state.position, velocity: state.velocity }));
+            }
             Content::Part => {
                 let part = serde_json::from_slice(data);
                 self.parts.push((time, part.map_err(|cause| LogError::MetaSyntax { file: file.into(), cause })?));
@@ -134,8 +152,13 @@ impl Recording {
         Ok(())
     }
 
-    /// Sorts states, commands and parts by time.
+    /// Sorts all messages by time.
     pub fn order(&mut self) {
+        let arrivals: Vec<u64> = self.base_states.iter().map(|(time, _)| *time).collect();
+        for ((time, _), sent) in self.base_states.iter_mut().zip(sender_times(&arrivals, &self.base_clock)) {
+            *time = sent;
+        }
+        self.base_states.sort_by_key(|(time, _)| *time);
         self.states.sort_by_key(|(time, _)| *time);
         self.commands.sort_by_key(|(time, _)| *time);
         self.parts.sort_by_key(|(time, _)| *time);

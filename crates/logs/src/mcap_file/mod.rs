@@ -3,19 +3,24 @@
 //! - [`messages`]: the messages of a file, and the metadata of a file that `Log::write` wrote.
 //! - [`lengths`]: limits of the lengths in a file.
 //! - [`rows`]: each state with the command in force.
-//! - [`columns`]: the columns of these rows.
+//! - [`columns`]: the columns of these rows; [`base_state`]: those of the base; [`clock`]: times by the sender's clock.
 //! - [`mod@read`], [`mod@write`]: a log from a file, and a file from a log.
+//! - [`recorder`]: a file from the messages of a robot while they arrive.
 
+mod base_state;
+mod clock;
 mod columns;
 mod lengths;
 mod messages;
 mod read;
+mod recorder;
 mod rows;
 mod write;
 
 use serde::{Deserialize, Serialize};
 
 pub(crate) use read::read;
+pub use recorder::{McapRecorder, RecordedTopic};
 pub(crate) use write::{unsupported_columns, write};
 
 /// Topic with the start of each segment of each episode, in files that `Log::write` wrote.

@@ -5,6 +5,8 @@ use std::path::Path;
 use twinstep_model::BaseMount;
 
 use super::NANOSECONDS;
+use super::base_state::base_columns;
+use super::clock::sender_times;
 use super::columns::columns;
 use super::messages::{Content, Recording};
 use super::rows::{StateWithCommand, commands_in_force, median_step};
@@ -61,8 +63,8 @@ fn table(mut recording: Recording, file: &Path, written: Option<&[String]>) -> R
         same
     });
     note_count(&mut notes, states - recording.states.len(), "with the same time as a later one");
-    let median = median_step(&recording.states);
-    let in_force = commands_in_force(&recording.states, &recording.commands, median);
+    let arrivals = recording.states.iter().map(|(time, _)| *time);
+    let in_force = commands_in_force(&recording.states, &recording.commands, median_step(arrivals));
     let start = in_force.iter().position(Option::is_some).unwrap_or(recording.states.len());
     if start == recording.states.len() {
         return Err(LogError::McapTopic {
@@ -72,10 +74,12 @@ fn table(mut recording: Recording, file: &Path, written: Option<&[String]>) -> R
         });
     }
     note_count(&mut notes, start, "before the first command");
+    let times = state_times(&recording, written);
+    let median = median_step(times.iter().copied());
     let mut rows: Vec<StateWithCommand> = (start..recording.states.len())
         .filter_map(|row| {
             Some(StateWithCommand {
-                time: recording.states[row].0,
+                time: times[row],
                 state: &recording.states[row].1,
                 command: recording.commands[in_force[row]?].1.clone(),
             })
@@ -92,13 +96,21 @@ fn table(mut recording: Recording, file: &Path, written: Option<&[String]>) -> R
                 .to_owned(),
         );
     }
-    let columns = columns(&rows, &recording.parts, written);
+    let mut columns = columns(&rows, &recording.parts, written);
+    columns.extend(base_columns(&times[start..], &recording.base_states));
     let ignored = recording.channels.values().filter(|channel| channel.content == Content::Other);
     let ignored = ignored.map(|channel| format!("topic {} ({} messages)", channel.topic, channel.messages)).collect();
     Ok((
         Table { file: file.into(), columns, ignored, lines: Vec::new(), notes },
         if median == 0 { 1.0 } else { NANOSECONDS / median as f64 },
     ))
+}
+
+/// Returns the time of each state by the robot's clock, or its arrival in a file that `Log::write` wrote.
+fn state_times(recording: &Recording, written: Option<&[String]>) -> Vec<u64> {
+    let arrivals: Vec<u64> = recording.states.iter().map(|(time, _)| *time).collect();
+    let clock = recording.states.iter().map(|(_, state)| u64::from(state.tick) * 1_000_000);
+    if written.is_some() { arrivals } else { sender_times(&arrivals, &clock.collect::<Vec<_>>()) }
 }
 
 fn note_count(notes: &mut Vec<String>, count: usize, what: &str) {

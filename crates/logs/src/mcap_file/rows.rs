@@ -1,6 +1,8 @@
 //! Rows of a log from messages: each state of the robot with the command in force.
 
-use crate::go2_message::{LowCmd, LowState, MotorCmd, NO_POSITION, NO_VELOCITY};
+use twinstep_unitree::{NO_POSITION, NO_VELOCITY};
+
+use crate::go2_message::{LowCmd, LowState, MotorCmd};
 
 /// State with the command in force from it to the next state.
 pub(crate) struct StateWithCommand<'a> {
@@ -32,9 +34,10 @@ impl StateWithCommand<'_> {
     }
 }
 
-/// Returns the median time between states [ns]; zero for a single state.
-pub(crate) fn median_step(states: &[(u64, LowState)]) -> u64 {
-    let mut steps: Vec<u64> = states.windows(2).map(|pair| pair[1].0 - pair[0].0).collect();
+/// Returns the median time between rows [ns]; zero for a single row.
+pub(crate) fn median_step(times: impl IntoIterator<Item = u64>) -> u64 {
+    let times: Vec<u64> = times.into_iter().collect();
+    let mut steps: Vec<u64> = times.windows(2).map(|pair| pair[1] - pair[0]).collect();
     steps.sort_unstable();
     steps.get(steps.len() / 2).copied().unwrap_or(0)
 }

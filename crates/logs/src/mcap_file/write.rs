@@ -7,13 +7,21 @@ use std::path::Path;
 use mcap::McapError;
 use mcap::records::{MessageHeader, Metadata};
 use twinstep_model::{Joint, Leg};
+use twinstep_unitree::{
+    HEAD, ImuState, LOW_LEVEL, LowCmd, LowState, MotorCmd, MotorState, SERVO, encode, foot_index, motor_index,
+};
 
 use super::{METADATA, NANOSECONDS, NO_FORCE, NO_TEMPERATURE, PART_TOPIC, SegmentStart};
-use crate::go2_message::{LowCmd, LowState, MotorCmd, MotorState, SERVO, foot, motor};
-use crate::{CellLocation, Log, LogError, cdr};
+use crate::{CellLocation, Log, LogError};
 
 /// Quantities that are in neither message.
 const NOT_IN_MESSAGES: [&str; 3] = ["pos", "vel", "contact"];
+
+/// Topic, name and definition of the robot's messages.
+pub(super) const SCHEMAS: [(&str, &str, &[u8]); 2] = [
+    ("/lowstate", "unitree_go/msg/LowState", include_bytes!("schema/LowState.msg")),
+    ("/lowcmd", "unitree_go/msg/LowCmd", include_bytes!("schema/LowCmd.msg")),
+];
 
 /// Returns the columns of a log that MCAP does not support.
 pub(crate) fn unsupported_columns(log: &Log) -> Vec<String> {
@@ -46,17 +54,13 @@ fn write_messages(
     metadata: BTreeMap<String, String>,
     target: impl Write + Seek,
 ) -> Result<(), McapError> {
-    const MESSAGES: [(&str, &str, &[u8]); 2] = [
-        ("/lowstate", "unitree_go/msg/LowState", include_bytes!("schema/LowState.msg")),
-        ("/lowcmd", "unitree_go/msg/LowCmd", include_bytes!("schema/LowCmd.msg")),
-    ];
     let mut writer = mcap::WriteOptions::new().profile("ros2").library("twinstep").create(target)?;
     let none = BTreeMap::new();
     let mut channel = |(topic, name, schema): (&str, &str, &[u8])| {
         let schema = writer.add_schema(name, "ros2msg", schema)?;
         writer.add_channel(schema, topic, "cdr", &none)
     };
-    let (states, commands) = (channel(MESSAGES[0])?, channel(MESSAGES[1])?);
+    let (states, commands) = (channel(SCHEMAS[0])?, channel(SCHEMAS[1])?);
     let parts = writer.add_channel(0, PART_TOPIC, "json", &none)?;
     writer.write_metadata(&Metadata { name: METADATA.to_owned(), metadata })?;
     let pause = (NANOSECONDS / log.meta().rate_hz) as u64 + 1;
@@ -73,8 +77,8 @@ fn write_messages(
                 let part = SegmentStart { segment: log.segment()[row], episode: log.episode()[row], t: log.t()[row] };
                 send(parts, serde_json::to_string(&part).unwrap_or_default().as_bytes())?;
             }
-            send(states, &cdr::encode(&mut state(log, joints, row)))?;
-            send(commands, &cdr::encode(&mut command(log, joints, row)))?;
+            send(states, &encode(&state(log, joints, row)))?;
+            send(commands, &encode(&command(log, joints, row)))?;
         }
         start = time + pause;
     }
@@ -89,41 +93,45 @@ fn cell(log: &Log, name: &str, row: usize, missing: f64) -> f64 {
 fn state(log: &Log, joints: &[Joint], row: usize) -> LowState {
     let number = |name: &str| cell(log, name, row, 0.0) as f32;
     let axes = |quantity: &str| ["x", "y", "z"].map(|axis| number(&format!("{quantity}_{axis}")));
-    let mut state = LowState {
+    let imu_state = ImuState {
         quaternion: ["w", "x", "y", "z"].map(|part| number(&format!("quat_{part}"))),
         gyroscope: axes("gyro"),
         accelerometer: axes("acc"),
-        power_v: number("battery_V"),
-        ..LowState::default()
+        ..ImuState::default()
     };
+    let mut state =
+        LowState { head: HEAD, level_flag: LOW_LEVEL, imu_state, power_v: number("battery_V"), ..LowState::default() };
     for leg in Leg::ALL {
         let force = cell(log, &format!("foot_force_{}", leg.name()), row, 0.0);
-        state.foot_force[foot(leg)] = if force.is_nan() { NO_FORCE } else { force.round() as i16 };
+        state.foot_force[foot_index(leg)] = if force.is_nan() { NO_FORCE } else { force.round() as i16 };
     }
     for joint in joints {
         let temperature = cell(log, &format!("temp_{joint}"), row, 0.0);
-        state.motors[motor(*joint)] = MotorState {
+        state.motor_state[motor_index(*joint)] = MotorState {
             mode: SERVO,
             q: number(&format!("q_{joint}")),
             dq: number(&format!("dq_{joint}")),
             tau_est: number(&format!("tau_measured_{joint}")),
             temperature: if temperature.is_nan() { NO_TEMPERATURE } else { temperature.round() as u8 },
+            ..MotorState::default()
         };
     }
     state
 }
 
 fn command(log: &Log, joints: &[Joint], row: usize) -> LowCmd {
-    let mut command = LowCmd::default();
+    // The checksum is zero, so that a robot ignores commands replayed from a log.
+    let mut command = LowCmd { head: HEAD, level_flag: LOW_LEVEL, ..LowCmd::default() };
     for joint in joints {
         let number = |quantity: &str| cell(log, &format!("{quantity}_{joint}"), row, 0.0) as f32;
-        command.motors[motor(*joint)] = MotorCmd {
+        command.motor_cmd[motor_index(*joint)] = MotorCmd {
             mode: SERVO,
             q: number("q_cmd"),
             dq: number("dq_cmd"),
             tau: number("tau_ff"),
             kp: log.kp(joint.name(), row).unwrap_or(0.0) as f32,
             kd: log.kd(joint.name(), row).unwrap_or(0.0) as f32,
+            ..MotorCmd::default()
         };
     }
     command

@@ -1,0 +1,137 @@
+//! What the operator at the robot's host types, and what the robot answers.
+
+use std::io::{BufRead, Write};
+use std::time::Duration;
+
+use twinstep_robot::{Board, Histogram, OperatorRequest, RobotHandle, Timing};
+
+/// Time in which the control loop takes in a request.
+const ANSWER_TIME: Duration = Duration::from_millis(500);
+
+/// What the operator can type.
+pub const HELP: &str = "\
+arm      send damping to the motors, and forget the last fault
+stand    move to the standing pose; clients may then act
+sit      move to the crouched pose, then damping
+damp     damping at once
+disarm   stop sending commands
+release  release the robot's built-in controller
+stop     damping at once, as a fault
+status   state, temperatures, battery, timing
+timing   how punctual the control loop is, as JSON
+quit     damp, then end";
+
+/// Reads requests from stdin until it closes or `quit`. Returns the receiver of `quit`.
+pub fn listen(handle: &RobotHandle) -> std::sync::mpsc::Receiver<()> {
+    let (quit, quits) = std::sync::mpsc::channel();
+    let handle = handle.clone();
+    std::thread::spawn(move || {
+        for line in std::io::stdin().lock().lines().map_while(Result::ok) {
+            match line.trim() {
+                "" => {}
+                "quit" => {
+                    let _ = quit.send(());
+                    return;
+                }
+                request => println!("{}", answer(&handle, request)),
+            }
+            let _ = std::io::stdout().flush();
+        }
+        // The robot stays as it is without an operator's terminal; signals still end it.
+        std::mem::forget(quit);
+    });
+    quits
+}
+
+/// Executes a request and returns the answer, which begins with `ok` or `error`.
+pub fn answer(handle: &RobotHandle, request: &str) -> String {
+    let request = match request {
+        "arm" => OperatorRequest::Arm,
+        "stand" => OperatorRequest::Stand,
+        "sit" => OperatorRequest::Sit,
+        "damp" => OperatorRequest::Damp,
+        "disarm" => OperatorRequest::Disarm,
+        "release" => {
+            handle.release_controller();
+            return "ok release".to_owned();
+        }
+        "stop" => {
+            handle.stop();
+            return "ok stop".to_owned();
+        }
+        "status" => return status(handle),
+        "timing" => return format!("ok {}", timing_json(&handle.timing())),
+        "help" => return format!("ok help\n{HELP}"),
+        _ => return format!("error `{request}` is not known; possible:\n{HELP}"),
+    };
+    let before = handle.board().requests;
+    handle.request(request);
+    let board = handle.wait_until(ANSWER_TIME, |board| board.requests > before);
+    let name = format!("{request:?}").to_lowercase();
+    match board.request_refused {
+        _ if board.requests == before => format!("error {name}: the control loop does not answer"),
+        Some(refusal) => format!("error {name}: {refusal}"),
+        None => format!("ok {name}"),
+    }
+}
+
+/// Returns the state of the robot in a line.
+pub fn state_line(board: &Board) -> String {
+    let state = board.state.map_or_else(|| "starting".to_owned(), |state| state.to_string());
+    board.fault.map_or_else(|| format!("state {state}"), |fault| format!("state {state}: {fault}"))
+}
+
+fn timing_json(timing: &Timing) -> serde_json::Value {
+    let times = |histogram: &Histogram| {
+        let ms = |time: Duration| 1e3 * time.as_secs_f64();
+        serde_json::json!({
+            "count": histogram.count(),
+            "p50_ms": ms(histogram.quantile(0.5)),
+            "p99_ms": ms(histogram.quantile(0.99)),
+            "max_ms": ms(histogram.max()),
+            "above_10_ms": histogram.count_above(Duration::from_millis(10)),
+        })
+    };
+    serde_json::json!({
+        "state_to_command": times(&timing.latency),
+        "lateness": times(&timing.lateness),
+        "tick_jitter": times(&timing.tick_jitter),
+        "gaps": times(&timing.gaps),
+        "bad_states": timing.bad_states,
+        "unrecorded": timing.unrecorded,
+    })
+}
+
+fn status(handle: &RobotHandle) -> String {
+    let (board, timing) = (handle.board(), handle.timing());
+    let mut lines = vec![state_line(&board)];
+    if let Some((_, reading)) = &board.reading {
+        let hottest = reading.temperature.iter().max().copied().unwrap_or_default();
+        lines.push(format!(
+            "battery {} %, {:.1} V; hottest motor {hottest} °C; tilt {:.0}°",
+            reading.charge,
+            reading.voltage,
+            reading.tilt.to_degrees()
+        ));
+    }
+    let controller = if board.controller_released { "released" } else { "not released" };
+    lines.push(format!(
+        "built-in controller {controller}; other writers {}; client {}",
+        board.foreign_writers,
+        if board.has_client { "yes" } else { "no" }
+    ));
+    let ms = |time: Duration| 1e3 * time.as_secs_f64();
+    lines.push(format!(
+        "steps {}; state to command p50 {:.3} p99 {:.3} ms; loop late p99 {:.3} ms; tick jitter p99 {:.3} ms; \
+         longest gap {:.2} ms; bad states {}; unrecorded {}",
+        timing.steps,
+        ms(timing.latency.quantile(0.5)),
+        ms(timing.latency.quantile(0.99)),
+        ms(timing.lateness.quantile(0.99)),
+        ms(timing.tick_jitter.quantile(0.99)),
+        ms(timing.gaps.max()),
+        timing.bad_states,
+        timing.unrecorded,
+    ));
+    lines.join("\n")
+}

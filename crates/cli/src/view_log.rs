@@ -1,0 +1,167 @@
+//! A log in the browser: the measured robot, and the simulation under the same commands as its ghost.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use twinstep_identify::{Experiment, WindowConfig};
+use twinstep_logs::Log;
+use twinstep_model::{FIXED_BASE_HEIGHT, Ground, InitialState, Joint, PerJoint, Pose, RobotModel, Scene, frames};
+use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo};
+
+use crate::evaluate::simulator;
+use crate::exit::{CommandResult, Failure, Signals, input};
+use crate::robot_file::robot_model;
+use crate::web_view::PageArgs;
+
+/// Time between two looks at the requests.
+const TICK: Duration = Duration::from_millis(10);
+/// Slowest and fastest speed.
+const SPEEDS: [f64; 2] = [0.05, 4.0];
+
+/// Plays a log until a signal.
+pub fn run(path: &Path, model: Option<&Path>, page: &PageArgs, signals: &Signals) -> CommandResult {
+    let log = Log::open(path).map_err(input)?;
+    let robot = robot_model(model)?;
+    let measured = measured_poses(&log, &robot);
+    let simulated = if model.is_some() { simulated_poses(&log, &robot)? } else { Vec::new() };
+    let first = measured[0].scene(&robot);
+    let scene = SceneInfo {
+        is_interactive: true,
+        has_ghost: model.is_some(),
+        ..SceneInfo::new(path.display().to_string(), &first, robot.torque_limits())
+    };
+    let page = page.open(scene)?;
+    let (start, end) = (log.t()[0], log.t()[log.rows() - 1]);
+    let mut player =
+        Player { log, robot, measured, simulated, time: 0.0, duration: end - start, is_paused: false, speed: 1.0 };
+    player.run(page.hub(), signals)
+}
+
+/// Pose of the robot at one time.
+#[derive(Clone, Copy)]
+struct RobotPose {
+    base: Pose,
+    q: PerJoint,
+}
+
+impl RobotPose {
+    fn scene(&self, robot: &RobotModel) -> Scene {
+        Scene::new(robot, self.base, &self.q, &Ground::FLAT)
+    }
+}
+
+/// Returns the measured pose of each row. A position that was not measured is that of a robot that stands or hangs at the
+/// origin.
+fn measured_poses(log: &Log, robot: &RobotModel) -> Vec<RobotPose> {
+    let default_pose = robot.control.default_pose_f32();
+    let columns = Joint::ALL.map(|joint| log.q(joint.name()));
+    let channel = |name: &str| log.channel(name);
+    let position = ["pos_x", "pos_y", "pos_z"].map(channel);
+    let orientation = ["quat_w", "quat_x", "quat_y", "quat_z"].map(channel);
+    let mut poses = Vec::with_capacity(log.rows());
+    for (segment, rows) in log.segments() {
+        for row in rows {
+            let at = |column: Option<&[f64]>, missing: f32| column.map_or(missing, |column| column[row] as f32);
+            let q = std::array::from_fn(|joint| at(columns[joint], default_pose[joint]));
+            let quaternion =
+                [(0, 1.0), (1, 0.0), (2, 0.0), (3, 0.0)].map(|(part, missing)| at(orientation[part], missing));
+            let standing = InitialState::standing_on(&Ground::FLAT, robot, q, 0.0).base_position[2];
+            let height = if segment.base.is_fixed() { FIXED_BASE_HEIGHT as f32 } else { standing };
+            let place = [at(position[0], 0.0), at(position[1], 0.0), at(position[2], height)];
+            let base = Pose { position: place.into(), rotation: frames::world_from_base(quaternion).normalize() };
+            poses.push(RobotPose { base, q });
+        }
+    }
+    poses
+}
+
+/// Returns the simulated pose of each row; `None` for rows that are not simulated.
+fn simulated_poses(log: &Log, robot: &RobotModel) -> Result<Vec<Option<RobotPose>>, Failure> {
+    let experiment = Experiment::new(log, robot, WindowConfig::EVALUATION).map_err(input)?;
+    let mut poses = vec![None; log.rows()];
+    for pose in experiment.simulated_poses(&mut simulator(robot)?, robot) {
+        let rotation = frames::world_from_base(pose.orientation);
+        poses[pose.row] = Some(RobotPose { base: Pose { position: pose.position.into(), rotation }, q: pose.q });
+    }
+    Ok(poses)
+}
+
+struct Player {
+    log: Log,
+    robot: RobotModel,
+    measured: Vec<RobotPose>,
+    /// Empty without a model.
+    simulated: Vec<Option<RobotPose>>,
+    /// Time since the first row [s].
+    time: f64,
+    duration: f64,
+    is_paused: bool,
+    speed: f64,
+}
+
+impl Player {
+    fn run(&mut self, hub: &Hub, signals: &Signals) -> CommandResult {
+        let mut last = Instant::now();
+        while !signals.check()? {
+            for request in hub.take_requests() {
+                self.obey(request);
+            }
+            let elapsed = last.elapsed().as_secs_f64();
+            last = Instant::now();
+            if !self.is_paused && hub.pages() > 0 {
+                self.time = (self.time + self.speed * elapsed).min(self.duration);
+                // The last row stays until somebody goes back.
+                self.is_paused = self.time >= self.duration;
+            }
+            if hub.is_due() {
+                hub.publish(&self.frame());
+            }
+            std::thread::sleep(TICK);
+        }
+        Ok(())
+    }
+
+    fn obey(&mut self, request: PageRequest) {
+        match request {
+            PageRequest::Pause(is_paused) => {
+                if !is_paused && self.time >= self.duration {
+                    self.time = 0.0;
+                }
+                self.is_paused = is_paused;
+            }
+            PageRequest::Speed(speed) if speed.is_finite() => self.speed = speed.clamp(SPEEDS[0], SPEEDS[1]),
+            PageRequest::Seek(time) if time.is_finite() => self.time = time.clamp(0.0, self.duration),
+            _ => {}
+        }
+    }
+
+    fn row(&self) -> usize {
+        let times = self.log.t();
+        times.partition_point(|time| *time <= times[0] + self.time).saturating_sub(1)
+    }
+
+    fn frame(&self) -> Frame {
+        let row = self.row();
+        let measured = self.measured[row];
+        let tau = Joint::ALL.map(|joint| self.log.tau_measured(joint.name()).map(|column| column[row] as f32));
+        let torque = tau.iter().all(Option::is_some).then(|| tau.map(Option::unwrap_or_default));
+        let mut robot = RobotFrame { torque, ..RobotFrame::of_scene(&measured.scene(&self.robot)) };
+        let mut curves = Vec::new();
+        if self.simulated.is_empty() {
+            let position = |joint: Joint| (format!("{} [rad]", joint.name()), f64::from(measured.q[joint.index()]));
+            curves.extend(Joint::ALL.map(position));
+        } else {
+            let simulated = self.simulated[row];
+            let unknown = vec![[f32::NAN; 7]; robot.poses.len()];
+            robot.ghost = simulated.map_or(unknown, |pose| pose.scene(&self.robot).pose);
+            let error = |joint: Joint| {
+                let index = joint.index();
+                let error = simulated.map_or(f64::NAN, |pose| f64::from(pose.q[index] - measured.q[index]));
+                (format!("{} error [rad]", joint.name()), error)
+            };
+            curves.extend(Joint::ALL.map(error));
+        }
+        let playback = Playback { duration: Some(self.duration), is_paused: self.is_paused, speed: self.speed };
+        Frame { time: self.time, robots: vec![robot], curves, playback: Some(playback) }
+    }
+}

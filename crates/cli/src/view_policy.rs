@@ -1,0 +1,178 @@
+//! Robots that walk with a policy, in the browser.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use twinstep_agent::{BoundPolicy, LoadedPolicy, PolicyInput};
+use twinstep_env_server::{Config, EnvFactory, ServerConfig, SimEnvFactory};
+use twinstep_model::{AutoresetMode, EnvSpec, ResetRequest, VecEnv};
+use twinstep_sim::{Engine, SimConfig};
+use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo};
+
+use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::robot_file::robot_model;
+use crate::serve::engine;
+use crate::web_view::PageArgs;
+
+/// Time without a page or while paused between two looks at the requests.
+const IDLE: Duration = Duration::from_millis(20);
+/// Slowest and fastest speed.
+const SPEEDS: [f64; 2] = [0.05, 4.0];
+/// Largest push [m/s].
+const MAX_PUSH: f32 = 3.0;
+
+/// Options of robots that walk with a policy.
+#[derive(clap::Args)]
+pub struct WalkArgs {
+    /// Mapping of a policy of another program (TOML), as for `twinstep run`.
+    #[arg(long, value_name = "FILE")]
+    mapping: Option<PathBuf>,
+    /// Number of robots that walk with a policy, 1 to 64.
+    #[arg(long, default_value_t = 1, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=64))]
+    robots: u16,
+    /// Physics engine of a policy: batch, rapier or mujoco.
+    #[arg(long, value_parser = engine, default_value = "batch")]
+    engine: Engine,
+    /// Seed of the robots of a policy.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+}
+
+/// Simulates the robots until a signal.
+pub fn run(path: &Path, model: Option<&Path>, args: &WalkArgs, page: &PageArgs, signals: &Signals) -> CommandResult {
+    let robots = usize::from(args.robots);
+    let mut env = env(model, args.engine, robots)?;
+    let load = || LoadedPolicy::read(path, args.mapping.as_deref()).map_err(input)?.bind(env.spec()).map_err(input);
+    let policies = (0..robots).map(|_| load()).collect::<Result<Vec<_>, _>>()?;
+    env.reset(&ResetRequest::seeded(args.seed, robots)).map_err(other)?;
+    let limits = robot_model(model)?.torque_limits();
+    let scene = SceneInfo {
+        is_interactive: true,
+        velocity_bounds: velocity_bounds(env.spec()),
+        ..SceneInfo::new(path.display().to_string(), &env.scene(0).map_err(other)?, limits)
+    };
+    let page = page.open(scene)?;
+    let mut walk = PolicyWalk { env, policies, command: None, is_paused: false, speed: 1.0, steps: 0, falls: 0 };
+    walk.run(page.hub(), signals)
+}
+
+fn env(model: Option<&Path>, engine: Engine, robots: usize) -> Result<Box<dyn VecEnv>, Failure> {
+    let config = Config {
+        server: ServerConfig { model: model.map(Path::to_owned), envs: robots, ..ServerConfig::default() },
+        sim: SimConfig { engine, threads: 1, ..SimConfig::default() },
+        ..Config::default()
+    };
+    config.check().map_err(input)?;
+    let factory = SimEnvFactory::new(config).map_err(input)?;
+    factory.build(robots, AutoresetMode::SameStep, Some(u32::MAX)).map_err(input)
+}
+
+/// Returns the bounds of the velocity command; `None` if the task has none.
+fn velocity_bounds(spec: &EnvSpec) -> Option<[[f32; 2]; 3]> {
+    let ranges = twinstep_envs::WalkConfig::default().command;
+    let bounds = [ranges.linear_velocity_x, ranges.linear_velocity_y, ranges.angular_velocity_z];
+    spec.observation_field("velocity_command").map(|_| bounds)
+}
+
+struct PolicyWalk {
+    env: Box<dyn VecEnv>,
+    policies: Vec<BoundPolicy>,
+    /// Velocity command of the page; `None` while the task has its own.
+    command: Option<[f32; 3]>,
+    is_paused: bool,
+    speed: f64,
+    steps: u64,
+    falls: u64,
+}
+
+impl PolicyWalk {
+    fn run(&mut self, hub: &Hub, signals: &Signals) -> CommandResult {
+        let mut due = Instant::now();
+        while !signals.check()? {
+            for request in hub.take_requests() {
+                self.obey(request)?;
+            }
+            if hub.is_due() {
+                hub.publish(&self.frame()?);
+            }
+            if self.is_paused || hub.pages() == 0 {
+                std::thread::sleep(IDLE);
+                due = Instant::now();
+                continue;
+            }
+            self.step()?;
+            due += Duration::from_secs_f64(self.env.spec().policy_dt / self.speed);
+            // A slow computer plays slower, and does not catch up.
+            let now = Instant::now();
+            if now.saturating_duration_since(due) > IDLE {
+                due = now;
+            }
+            std::thread::sleep(due.saturating_duration_since(now));
+        }
+        Ok(())
+    }
+
+    fn obey(&mut self, request: PageRequest) -> CommandResult {
+        match request {
+            PageRequest::Pause(is_paused) => self.is_paused = is_paused,
+            PageRequest::Speed(speed) if speed.is_finite() => self.speed = speed.clamp(SPEEDS[0], SPEEDS[1]),
+            PageRequest::Velocity(command) => {
+                let commands = vec![command; self.policies.len()];
+                // One that is outside the bounds changes nothing.
+                if self.env.set_velocity_commands(&commands).is_ok() {
+                    self.command = Some(command);
+                }
+            }
+            PageRequest::Push { robot, velocity } if velocity.iter().all(|part| part.is_finite()) => {
+                // The page may know robots that there are not.
+                let _ = self.env.push(robot, velocity.map(|part| part.clamp(-MAX_PUSH, MAX_PUSH)));
+            }
+            PageRequest::Reset => {
+                self.env.reset(&ResetRequest::default()).map_err(other)?;
+                self.policies.iter_mut().for_each(BoundPolicy::reset);
+            }
+            PageRequest::Speed(_) | PageRequest::Push { .. } | PageRequest::Seek(_) => {}
+        }
+        Ok(())
+    }
+
+    fn step(&mut self) -> CommandResult {
+        let spec = self.env.spec();
+        let (obs_len, critic_len) = (spec.obs_len(), spec.critic_obs_len());
+        let mut actions = Vec::with_capacity(self.policies.len() * spec.action_len());
+        for (robot, policy) in self.policies.iter_mut().enumerate() {
+            let obs = &self.env.obs()[robot * obs_len..(robot + 1) * obs_len];
+            let critic_obs = &self.env.critic_obs()[robot * critic_len..(robot + 1) * critic_len];
+            let action = policy.action(&PolicyInput { obs, critic_obs }).map_err(other)?;
+            actions.extend(action.iter().map(|value| value.clamp(-1.0, 1.0)));
+        }
+        let batch = self.env.step(&actions).map_err(other)?;
+        self.falls += batch.terminated.iter().filter(|fell| **fell).count() as u64;
+        let ended: Vec<usize> = (0..self.policies.len()).filter(|robot| batch.done(*robot)).collect();
+        for robot in ended {
+            self.policies[robot].reset();
+        }
+        self.steps += 1;
+        Ok(())
+    }
+
+    fn frame(&self) -> Result<Frame, Failure> {
+        let scene = |robot| self.env.scene(robot).map(|scene| RobotFrame::of_scene(&scene));
+        let robots = (0..self.policies.len()).map(scene).collect::<Result<Vec<_>, _>>().map_err(other)?;
+        let first = &robots[0];
+        let mut curves = Vec::new();
+        if let (Some(command), Some(velocity)) = (first.command, first.velocity) {
+            curves.push(("forward [m/s]".to_owned(), f64::from(velocity[0])));
+            curves.push(("error, forward [m/s]".to_owned(), f64::from(command[0] - velocity[0])));
+        }
+        if let Some(torque) = first.torque {
+            let largest = torque.iter().fold(0.0_f32, |largest, tau| largest.max(tau.abs()));
+            curves.push(("largest torque [N·m]".to_owned(), f64::from(largest)));
+        }
+        curves.push(("height of the trunk [m]".to_owned(), f64::from(first.poses[0][2])));
+        curves.push(("falls".to_owned(), self.falls as f64));
+        let time = self.steps as f64 * self.env.spec().policy_dt;
+        let playback = Some(Playback { duration: None, is_paused: self.is_paused, speed: self.speed });
+        Ok(Frame { time, robots, curves, playback })
+    }
+}

@@ -1,0 +1,235 @@
+//! What other threads see of the control loop, and what they ask of it.
+
+use std::collections::VecDeque;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use crate::fault::Fault;
+use crate::input::{Action, ActionRefused, Client, OperatorRequest, Output, RequestRefused};
+use crate::reading::Reading;
+use crate::state::State;
+use crate::timing::Timing;
+
+/// Access to a running control loop. Clones are the same loop.
+#[derive(Clone, Default)]
+pub struct RobotHandle(Arc<Shared>);
+
+#[derive(Default)]
+struct Shared {
+    inbox: Mutex<Inbox>,
+    board: Mutex<Board>,
+    timing: Mutex<Timing>,
+    /// The board has a new tick or state.
+    changed: Condvar,
+    stop_requested: AtomicBool,
+    is_ending: AtomicBool,
+    foreign_writers: AtomicUsize,
+    controller_released: AtomicBool,
+    release_requested: AtomicBool,
+}
+
+/// What the loop takes in at its next step.
+#[derive(Default)]
+struct Inbox {
+    requests: VecDeque<OperatorRequest>,
+    action: Option<(u64, Action)>,
+    /// Number of clients that hold the robot: none or one.
+    clients: usize,
+    ends_episode: bool,
+    /// Number of actions so far.
+    actions: u64,
+}
+
+/// What the loop takes in at one step.
+pub(crate) struct Taken {
+    pub request: Option<OperatorRequest>,
+    /// The action with its number.
+    pub action: Option<(u64, Action)>,
+    pub client: Client,
+    pub has_client: bool,
+}
+
+/// State of the loop after its last step.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Board {
+    /// Time of the last step since the start of the loop's clock.
+    pub now: Duration,
+    /// State of the safety state machine; `None` before the first step.
+    pub state: Option<State>,
+    /// Fault that was not cleared by arming again.
+    pub fault: Option<Fault>,
+    /// Present policy period.
+    pub tick: u64,
+    /// Number of policy periods in a row without an action.
+    pub missed_ticks: u64,
+    /// Action in force; zero if there is none.
+    pub applied: [f32; 12],
+    /// Newest measurements, with the time when they arrived.
+    pub reading: Option<(Duration, Reading)>,
+    /// Number of the last action, and why it was not executed.
+    pub action_result: (u64, Option<ActionRefused>),
+    /// Why the last request of the operator was not executed.
+    pub request_refused: Option<RequestRefused>,
+    /// Number of requests of the operator that were executed or refused.
+    pub requests: u64,
+    /// True while a client holds the robot.
+    pub has_client: bool,
+    /// Number of other writers of `rt/lowcmd`.
+    pub foreign_writers: usize,
+    /// True if the built-in controller is released.
+    pub controller_released: bool,
+    /// True once the loop has ended.
+    pub has_ended: bool,
+}
+
+impl RobotHandle {
+    /// Asks the loop for something on behalf of the operator. [`Board::request_refused`] has the result.
+    pub fn request(&self, request: OperatorRequest) {
+        lock(&self.0.inbox).requests.push_back(request);
+    }
+
+    /// Releases the robot's built-in controller, in the background.
+    pub fn release_controller(&self) {
+        self.0.release_requested.store(true, Ordering::Release);
+    }
+
+    /// Damps the motors at the next step of the loop, until the operator arms again. Never waits.
+    pub fn stop(&self) {
+        self.0.stop_requested.store(true, Ordering::Release);
+    }
+
+    /// Ends the loop. An armed robot is damped first.
+    pub fn end(&self) {
+        self.0.is_ending.store(true, Ordering::Release);
+    }
+
+    /// Returns the state after the last step.
+    pub fn board(&self) -> Board {
+        lock(&self.0.board).clone()
+    }
+
+    /// Returns how punctual the loop has been until the last tick.
+    pub fn timing(&self) -> Timing {
+        lock(&self.0.timing).clone()
+    }
+
+    /// Waits until `is_met`, or the timeout. Returns the state then.
+    pub fn wait_until(&self, timeout: Duration, is_met: impl Fn(&Board) -> bool) -> Board {
+        let end = Instant::now() + timeout;
+        let mut board = lock(&self.0.board);
+        while !is_met(&board) && !board.has_ended {
+            let left = end.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                break;
+            }
+            board = self.0.changed.wait_timeout(board, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+        board.clone()
+    }
+
+    /// Takes or gives back the robot.
+    pub(crate) fn set_client(&self, is_present: bool) {
+        let mut inbox = lock(&self.0.inbox);
+        inbox.clients = if is_present { inbox.clients + 1 } else { inbox.clients.saturating_sub(1) };
+        inbox.ends_episode |= !is_present;
+        inbox.action = None;
+    }
+
+    /// Ends the episode: the robot moves to its standing pose.
+    pub(crate) fn end_episode(&self) {
+        lock(&self.0.inbox).ends_episode = true;
+    }
+
+    /// Sends an action. Returns its number.
+    pub(crate) fn act(&self, action: Action) -> u64 {
+        let mut inbox = lock(&self.0.inbox);
+        inbox.actions += 1;
+        let number = inbox.actions;
+        inbox.action = Some((number, action));
+        number
+    }
+
+    pub(crate) fn take(&self) -> Taken {
+        let mut inbox = lock(&self.0.inbox);
+        let client = match (std::mem::take(&mut inbox.ends_episode), inbox.clients) {
+            (true, _) => Client::EndsEpisode,
+            (false, 0) => Client::Absent,
+            (false, _) => Client::Connected,
+        };
+        let has_client = inbox.clients > 0;
+        Taken { request: inbox.requests.pop_front(), action: inbox.action.take(), client, has_client }
+    }
+
+    /// Publishes the state after a step. Wakes those who wait for a tick or a state.
+    pub(crate) fn publish(
+        &self,
+        now: Duration,
+        output: &Output,
+        reading: Option<Reading>,
+        update: impl FnOnce(&mut Board),
+    ) {
+        let mut board = lock(&self.0.board);
+        let is_new = board.tick != output.tick || board.state != Some(output.state);
+        board.now = now;
+        board.state = Some(output.state);
+        board.fault = output.fault;
+        board.tick = output.tick;
+        board.missed_ticks = output.missed_ticks;
+        board.applied = output.applied.unwrap_or_default();
+        board.foreign_writers = self.foreign_writers();
+        board.controller_released = self.controller_released();
+        if let Some(reading) = reading {
+            board.reading = Some((now, reading));
+        }
+        update(&mut board);
+        drop(board);
+        if is_new {
+            self.0.changed.notify_all();
+        }
+    }
+
+    pub(crate) fn publish_timing(&self, timing: &Timing) {
+        lock(&self.0.timing).clone_from(timing);
+    }
+
+    pub(crate) fn publish_end(&self) {
+        lock(&self.0.board).has_ended = true;
+        self.0.changed.notify_all();
+    }
+
+    pub(crate) fn take_stop(&self) -> bool {
+        self.0.stop_requested.swap(false, Ordering::AcqRel)
+    }
+
+    /// Returns true if the loop is to end.
+    pub fn is_ending(&self) -> bool {
+        self.0.is_ending.load(Ordering::Acquire)
+    }
+
+    pub(crate) fn foreign_writers(&self) -> usize {
+        self.0.foreign_writers.load(Ordering::Acquire)
+    }
+
+    pub(crate) fn set_foreign_writers(&self, writers: usize) {
+        self.0.foreign_writers.store(writers, Ordering::Release);
+    }
+
+    /// Returns true if the built-in controller is released.
+    pub fn controller_released(&self) -> bool {
+        self.0.controller_released.load(Ordering::Acquire)
+    }
+
+    pub(crate) fn set_controller_released(&self, is_released: bool) {
+        self.0.controller_released.store(is_released, Ordering::Release);
+    }
+
+    pub(crate) fn take_release_request(&self) -> bool {
+        self.0.release_requested.swap(false, Ordering::AcqRel)
+    }
+}
+
+/// Locks a mutex whose data a panic leaves valid.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,180 @@
+//! What a page shows, and its bytes.
+
+use bytes::{BufMut, Bytes, BytesMut};
+use serde::Serialize;
+use twinstep_model::{Ground, PerJoint, PerLeg, Scene, SceneShape};
+
+/// What stays the same while a page is open.
+#[derive(Clone, Debug, Serialize)]
+pub struct SceneInfo {
+    /// Heading of the page.
+    pub title: String,
+    /// Names of the bodies.
+    pub bodies: Vec<String>,
+    /// Shapes of the bodies.
+    pub shapes: Vec<SceneShape>,
+    /// Heights of the ground; `None` for level ground at z = 0.
+    pub heights: Option<Heights>,
+    /// Largest torque of each joint [N·m], for its colour.
+    pub torque_limits: PerJoint,
+    /// True if every robot has a second pose, that of a simulation under the same commands.
+    pub has_ghost: bool,
+    /// True if the page may pause, change the speed and, with a velocity command, walk and push the robots.
+    pub is_interactive: bool,
+    /// Bounds of the velocity command: forward [m/s], left [m/s], yaw rate [rad/s]. `None` if there is no command.
+    pub velocity_bounds: Option<[[f32; 2]; 3]>,
+}
+
+/// Heights of the ground on a regular grid.
+#[derive(Clone, Debug, Serialize)]
+pub struct Heights {
+    /// Position of the first point [m].
+    pub origin: [f32; 2],
+    /// Distance of neighbouring points [m].
+    pub cell_size: f32,
+    /// Number of points along x and along y.
+    pub shape: [usize; 2],
+    /// Heights [m], y fastest.
+    pub heights: Vec<f32>,
+}
+
+impl SceneInfo {
+    /// Returns the description of a scene without controls.
+    pub fn new(title: impl Into<String>, scene: &Scene, torque_limits: PerJoint) -> Self {
+        Self {
+            title: title.into(),
+            bodies: scene.bodies.clone(),
+            shapes: scene.shapes.clone(),
+            heights: heights(&scene.ground),
+            torque_limits,
+            has_ghost: false,
+            is_interactive: false,
+            velocity_bounds: None,
+        }
+    }
+}
+
+fn heights(ground: &Ground) -> Option<Heights> {
+    let field = ground.height_field.as_ref()?;
+    Some(Heights {
+        origin: field.origin(),
+        cell_size: field.cell_size(),
+        shape: field.shape(),
+        heights: field.heights().to_vec(),
+    })
+}
+
+/// One robot at one time.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RobotFrame {
+    /// Pose world-from-body of each body: position [m], quaternion w, x, y, z.
+    pub poses: Vec<[f32; 7]>,
+    /// The same of the simulation, if the scene has ghosts.
+    pub ghost: Vec<[f32; 7]>,
+    /// Torque of each joint [N·m]; `None` if it is not known.
+    pub torque: Option<PerJoint>,
+    /// Normal force on each foot [N]; `None` if it is not known.
+    pub foot_force: Option<PerLeg>,
+    /// Commanded velocity in the base frame: forward [m/s], left [m/s], yaw rate [rad/s].
+    pub command: Option<[f32; 3]>,
+    /// Velocity in the base frame: forward [m/s], left [m/s], yaw rate [rad/s].
+    pub velocity: Option<[f32; 3]>,
+}
+
+impl RobotFrame {
+    /// Returns the robot of a scene.
+    pub fn of_scene(scene: &Scene) -> Self {
+        Self {
+            poses: scene.pose.clone(),
+            ghost: Vec::new(),
+            torque: scene.torque,
+            foot_force: scene.foot_force,
+            command: scene.command,
+            velocity: scene.velocity,
+        }
+    }
+}
+
+/// Where a playback is.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Playback {
+    /// Length of what is played [s]; `None` for a simulation that goes on.
+    pub duration: Option<f64>,
+    /// True while it stands still.
+    pub is_paused: bool,
+    /// Speed, 1 for real time.
+    pub speed: f64,
+}
+
+/// All robots at one time.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Frame {
+    /// Time [s].
+    pub time: f64,
+    /// The robots, equally many in every frame.
+    pub robots: Vec<RobotFrame>,
+    /// Values of the curves beside the scene, by name.
+    pub curves: Vec<(String, f64)>,
+    /// Playback; `None` if the page has no influence.
+    pub playback: Option<Playback>,
+}
+
+#[derive(Serialize)]
+struct Header<'a> {
+    time: f64,
+    robots: usize,
+    curves: std::collections::BTreeMap<&'a str, f64>,
+    playback: Option<Playback>,
+}
+
+impl Frame {
+    /// Returns the bytes of the frame: its length and that of its header (u32 each), the header as JSON, padding to a multiple
+    /// of four, then numbers (f32): for every robot the poses, the ghost's poses, 12 torques, 4 foot forces, 3 + 3 velocities.
+    /// All little-endian; a number that is not known is NaN.
+    pub fn to_bytes(&self) -> Bytes {
+        let curves = self.curves.iter().map(|(name, value)| (name.as_str(), *value)).collect();
+        let header = Header { time: self.time, robots: self.robots.len(), curves, playback: self.playback };
+        // Numbers and names are always JSON.
+        let mut header = serde_json::to_vec(&header).unwrap_or_default();
+        header.resize(header.len().next_multiple_of(4), b' ');
+        let mut numbers = Vec::new();
+        for robot in &self.robots {
+            numbers.extend(robot.poses.iter().chain(&robot.ghost).flatten().copied());
+            numbers.extend(robot.torque.unwrap_or([f32::NAN; 12]));
+            numbers.extend(robot.foot_force.unwrap_or([f32::NAN; 4]));
+            numbers.extend(robot.command.unwrap_or([f32::NAN; 3]));
+            numbers.extend(robot.velocity.unwrap_or([f32::NAN; 3]));
+        }
+        let mut bytes = BytesMut::with_capacity(8 + header.len() + 4 * numbers.len());
+        bytes.put_u32_le((header.len() + 4 * numbers.len()) as u32);
+        bytes.put_u32_le(header.len() as u32);
+        bytes.put_slice(&header);
+        for number in numbers {
+            bytes.put_f32_le(number);
+        }
+        bytes.freeze()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_have_lengths_header_and_numbers() {
+        let robot = RobotFrame { poses: vec![[1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]; 2], ..RobotFrame::default() };
+        let robot = RobotFrame { torque: Some([7.0; 12]), ..robot };
+        let frame = Frame { time: 0.5, robots: vec![robot.clone(), robot], ..Frame::default() };
+        let bytes = frame.to_bytes();
+        let word = |at: usize| u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
+        let (all, header) = (word(0) as usize, word(4) as usize);
+        assert_eq!(bytes.len(), 8 + all);
+        let text: serde_json::Value = serde_json::from_slice(&bytes[8..8 + header]).expect("JSON");
+        assert_eq!((&text["time"], &text["robots"]), (&0.5.into(), &2.into()));
+        // Two bodies with seven numbers, torques, forces, two velocities.
+        assert_eq!(all - header, 2 * 4 * (14 + 12 + 4 + 6));
+        let number = |index: usize| f32::from_bits(word(8 + header + 4 * index));
+        assert_eq!((number(0), number(2), number(14)), (1.0, 3.0, 7.0));
+        assert!(number(26).is_nan(), "foot forces are not known");
+    }
+}

@@ -1,0 +1,19 @@
+//! Robots in the browser: a local web server with one page, and what it shows.
+//!
+//! - [`Hub`]: between a program and its pages. The program publishes frames and takes the requests of the pages.
+//! - [`SceneInfo`]: what stays the same: shapes, ground, and which controls the page has. [`Frame`]: what moves.
+//! - [`WatchedVecEnv`]: environments whose robots are seen while an agent steps them.
+//! - [`WebServer`]: serves the page, frames as one endless response, and the page's requests.
+//!
+//! A frame that no page asks for is not made, and a page that reads slowly misses frames: it never delays the program.
+//! The page is plain JavaScript with three.js in `web/`; nothing is loaded from elsewhere.
+
+mod frame;
+mod hub;
+mod watched_env;
+mod web_server;
+
+pub use frame::{Frame, Playback, RobotFrame, SceneInfo};
+pub use hub::{Hub, PageRequest};
+pub use watched_env::{MAX_ROBOTS, WatchedVecEnv};
+pub use web_server::{ViewError, WebServer};

@@ -1,0 +1,44 @@
+//! `twinstep robot` in front of a robot that uses the vendor's DDS library, Cyclone DDS 0.10.2.
+
+use std::io::Write;
+use std::path::Path;
+use std::time::Duration;
+
+use twinstep_tests::process::Process;
+use twinstep_tests::python::{cyclone_python, root};
+use twinstep_tests::robot_pair::{RobotPair, next_domain};
+
+#[test]
+fn robot_with_the_vendors_dds_is_observed_released_and_stands_up() {
+    let python = match cyclone_python(&crate::python::target()) {
+        Ok(python) => python,
+        Err(reason) => {
+            // Written directly to stderr: the test harness hides the output of passing tests.
+            let _ = writeln!(std::io::stderr(), "\nSKIPPED the test with Cyclone DDS 0.10.2: {reason}");
+            return;
+        }
+    };
+    let program = Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep");
+    let (script, domain) = (root().join("clients/python/tests/cyclone_robot.py"), next_domain());
+    let robot = Process::start(&python, &[script.display().to_string(), domain.to_string()]).unwrap();
+    let mut pair = RobotPair::in_front_of(robot, domain, &program, &[]).unwrap();
+    pair.stand().unwrap();
+    let report = pair.ask("statistics").unwrap();
+    assert_eq!(report["wrong_checksum"], 0, "by its own code: {report}");
+    assert_eq!((&report["not_low_level"], &report["before_release"]), (&0.into(), &0.into()), "{report}");
+    // At most 500 Hz for the 3 s in which it stands up: a busy machine runs the robot's Python slower.
+    assert!(report["received"].as_u64().unwrap() > 100, "{report}");
+    // Motors in the robot's order, which begins with the right front leg: the hips of the two sides differ by sign.
+    let q: Vec<f64> = report["q"].as_array().unwrap().iter().map(|q| q.as_f64().unwrap()).collect();
+    let default_pose = twinstep_model::go2().control.default_pose_f32();
+    for (motor, joint) in [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8].into_iter().enumerate() {
+        assert!((q[motor] - f64::from(default_pose[joint])).abs() < 0.05, "motor {motor}: {report}");
+    }
+    pair.robot.interrupt().unwrap();
+    assert_eq!(pair.robot.exit_code(Duration::from_secs(10)), Some(130));
+    let report = pair.ask("statistics").unwrap();
+    assert!(
+        report["last_gains"].as_array().unwrap().iter().all(|gains| gains[0] == 0.0 && gains[1] == 3.0),
+        "{report}"
+    );
+}

@@ -1,0 +1,189 @@
+//! `twinstep view` in a real browser, and its web server.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_model::{ResetRequest, VecEnv};
+use twinstep_tests::browser::browser;
+use twinstep_tests::chrome_page::ChromePage;
+use twinstep_tests::python::root;
+
+const PATIENCE: Duration = Duration::from_secs(30);
+
+fn program() -> PathBuf {
+    Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep")
+}
+
+/// A command whose page is open; killed when dropped.
+struct Viewed {
+    child: std::process::Child,
+    url: String,
+    /// First line on stdout of a server; empty for other commands.
+    first_line: String,
+}
+
+impl Viewed {
+    fn start(arguments: &[&str]) -> Self {
+        let mut child = Command::new(program())
+            .args(arguments)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut lines = std::io::BufRead::lines(std::io::BufReader::new(child.stderr.take().unwrap()));
+        let url = lines.find_map(|line| line.unwrap().strip_prefix("the robots are at ").map(str::to_owned));
+        // Nobody may block on the pipe.
+        std::thread::spawn(move || lines.for_each(drop));
+        let mut output = std::io::BufRead::lines(std::io::BufReader::new(child.stdout.take().unwrap()));
+        let first_line = if arguments[0] == "serve" { output.next().unwrap().unwrap() } else { String::new() };
+        Self { child, url: url.expect("the command prints an address"), first_line }
+    }
+
+    fn policy() -> Self {
+        let policy = root().join("data/policies/walk.safetensors");
+        Self::start(&["view", policy.to_str().unwrap(), "--listen", "127.0.0.1:0"])
+    }
+
+    /// Endpoint of a server, from its first line.
+    fn endpoint(&self) -> &str {
+        self.first_line.trim_start_matches("listening ")
+    }
+
+    fn address(&self) -> &str {
+        self.url.trim_start_matches("http://").trim_end_matches('/')
+    }
+
+    /// Sends a request and returns the status line with the beginning of the answer.
+    fn http(&self, request: &str) -> String {
+        let mut stream = TcpStream::connect(self.address()).unwrap();
+        stream.write_all(request.as_bytes()).unwrap();
+        stream.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
+        let mut answer = vec![0; 4096];
+        let len = stream.read(&mut answer).unwrap();
+        String::from_utf8_lossy(&answer[..len]).into_owned()
+    }
+}
+
+impl Drop for Viewed {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+#[test]
+fn page_draws_a_walking_robot_and_its_controls_work() {
+    let Some(browser) = browser() else { return };
+    let viewed = Viewed::policy();
+    let mut page = ChromePage::open(&browser, &viewed.url, [1000, 700]);
+    page.wait_for("Number(document.body.dataset.frames) > 20", PATIENCE);
+    page.evaluate("document.getElementById('vx').value = 0.5; document.getElementById('vx').oninput()");
+    page.wait_for("document.getElementById('facts').innerText.includes('0.50 0.00 0.00')", PATIENCE);
+    let time = "Number(document.querySelector('#facts tr:nth-child(2) td:nth-child(2)').innerText.split(' ')[0])";
+    let before = page.evaluate(time).as_f64().unwrap();
+    page.wait_for(&format!("{time} > {}", before + 1.0), PATIENCE);
+    page.evaluate("document.getElementById('pause').click()");
+    page.wait_for("document.getElementById('pause').innerText == 'play'", PATIENCE);
+    let paused = page.evaluate(time).as_f64().unwrap();
+    std::thread::sleep(Duration::from_millis(500));
+    assert_eq!(page.evaluate(time).as_f64().unwrap(), paused, "it stands still");
+    page.evaluate("document.getElementById('push').click()");
+    assert!(page.screenshot().len() > 10_000, "a picture");
+    let loaded =
+        page.evaluate("performance.getEntriesByType('resource').every((one) => one.name.startsWith(location.origin))");
+    assert_eq!(loaded, true, "nothing is loaded from elsewhere");
+}
+
+#[test]
+fn log_and_its_simulation_are_drawn_on_top_of_each_other() {
+    let Some(browser) = browser() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let model = folder.path().join("nominal.toml");
+    std::fs::write(&model, "robot = \"go2\"\n").unwrap();
+    let log = root().join("data/go2_air_chirp");
+    let (log, model) = (log.to_str().unwrap(), model.to_str().unwrap());
+    let viewed = Viewed::start(&["view", log, "--model", model, "--listen", "127.0.0.1:0"]);
+    let mut page = ChromePage::open(&browser, &viewed.url, [1000, 700]);
+    page.wait_for("document.getElementById('facts').innerText.includes('simulated trunk is off by')", PATIENCE);
+    page.wait_for("document.getElementById('curves').innerText.includes('FL_calf error [rad]')", PATIENCE);
+    page.evaluate("document.getElementById('seek').value = 5; document.getElementById('seek').oninput()");
+    let time = "document.querySelector('#facts tr:nth-child(2) td:nth-child(2)').innerText";
+    page.wait_for(&format!("Number({time}.split(' ')[0]) >= 5"), PATIENCE);
+}
+
+#[test]
+fn page_of_another_site_gets_nothing_and_cannot_move_the_robots() {
+    let viewed = Viewed::policy();
+    let local = viewed.http("GET /scene HTTP/1.1\r\nHost: localhost:7480\r\n\r\n");
+    assert!(local.starts_with("HTTP/1.1 200") && local.contains("torque_limits"), "{local}");
+    let foreign = viewed.http("GET /scene HTTP/1.1\r\nHost: evil.example\r\n\r\n");
+    assert!(foreign.starts_with("HTTP/1.1 403"), "{foreign}");
+    let body = r#"{"reset":null}"#;
+    let post = |kind: &str| {
+        let len = body.len();
+        format!(
+            "POST /request HTTP/1.1\r\nHost: localhost\r\nContent-Type: {kind}\r\nContent-Length: {len}\r\n\r\n{body}"
+        )
+    };
+    // A form of another site can send text, but not JSON.
+    assert!(viewed.http(&post("text/plain")).starts_with("HTTP/1.1 415"));
+    assert!(viewed.http(&post("application/json")).starts_with("HTTP/1.1 204"));
+    let wrong = "POST /request HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 13\r\n\r\n{\"fly\":\"high\"}";
+    assert!(viewed.http(wrong).starts_with("HTTP/1.1 4"), "{}", viewed.http(wrong));
+}
+
+#[test]
+fn address_that_others_can_reach_needs_a_token() {
+    let policy = root().join("data/policies/walk.safetensors");
+    let arguments = ["view", policy.to_str().unwrap(), "--listen", "0.0.0.0:0"];
+    let output = Command::new(program()).args(arguments).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.code() == Some(2) && text.contains("--token"), "{text}");
+    let missing = Command::new(program()).args(["view", "no/such/file"]).output().unwrap();
+    assert!(missing.status.code() == Some(2) && String::from_utf8_lossy(&missing.stderr).contains("no/such/file"));
+}
+
+#[test]
+fn robots_of_a_lease_are_seen_while_an_agent_steps_them() {
+    let viewed = Viewed::start(&["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "3", "--view", "127.0.0.1:0"]);
+    let options = ConnectOptions::new(viewed.endpoint(), 3);
+    let mut env = RemoteVecEnv::connect(&options).unwrap();
+    env.reset(&ResetRequest::seeded(1, 3)).unwrap();
+    let mut page = TcpStream::connect(viewed.address()).unwrap();
+    page.write_all(b"GET /frames HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+    page.set_read_timeout(Some(Duration::from_millis(5))).unwrap();
+    let (mut bytes, mut buffer, since) = (Vec::new(), vec![0; 1 << 16], Instant::now());
+    let has_robots = |bytes: &[u8]| String::from_utf8_lossy(bytes).contains("\"robots\":3");
+    while !has_robots(&bytes) && since.elapsed() < PATIENCE {
+        env.step(&[0.0; 36]).unwrap();
+        let len = page.read(&mut buffer).unwrap_or(0);
+        bytes.extend_from_slice(&buffer[..len]);
+    }
+    assert!(has_robots(&bytes), "{} bytes without a frame of three robots", bytes.len());
+    let request =
+        "POST /request HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 14\r\n\r\n";
+    let answer = viewed.http(&format!("{request}{{\"reset\":null}}"));
+    assert!(answer.starts_with("HTTP/1.1 409"), "they are looked at only: {answer}");
+}
+
+#[test]
+fn page_that_stops_reading_does_not_stop_the_robots() {
+    let viewed = Viewed::policy();
+    let mut silent = TcpStream::connect(viewed.address()).unwrap();
+    silent.write_all(b"GET /frames HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+    // A second page sees the time go on, long after the buffers of the silent one are full.
+    let mut reader = TcpStream::connect(viewed.address()).unwrap();
+    reader.write_all(b"GET /frames HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+    reader.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
+    let (since, mut bytes, mut buffer) = (Instant::now(), 0, vec![0; 1 << 16]);
+    while since.elapsed() < Duration::from_secs(6) {
+        bytes += reader.read(&mut buffer).unwrap();
+    }
+    // 30 frames a second of about 1 kB.
+    assert!(bytes > 100_000, "{bytes} bytes in 6 s");
+}
