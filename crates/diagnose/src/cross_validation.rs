@@ -112,7 +112,6 @@ pub fn cross_validate(
     };
     let tolerated: f64 = left[..2].iter().map(|left| 0.5 * left.tolerated_gain(before)).sum();
     let evidence_nats: f64 = (0..CHANNELS).map(judged).sum::<f64>() + tolerated;
-    let parameters = 0.5 * fit.unknowns.len() as f64 * 200f64.ln();
     let held_out = |channel: usize| left[0].sums[channel][1] + left[1].sums[channel][0];
     let acts: Vec<usize> = (0..CHANNELS).filter(|channel| judged(*channel) > 1.0).collect();
     let [then, now] = [
@@ -127,10 +126,39 @@ pub fn cross_validate(
     let values = fit.unknowns.iter().zip(&whole).map(|(unknown, coordinate)| unknown.value(*coordinate)).collect();
     Some(CandidateFit {
         hypothesis: Hypothesis { values, ..hypothesis.clone() },
-        score: evidence_nats - selection_penalty(hypothesis.scope) - parameters,
+        score: evidence_nats - selection_penalty(hypothesis.scope) - parameter_penalty(&fit),
         gain: if then > 0.0 { 1.0 - (now / then).sqrt() } else { 0.0 },
         explained_fraction: if above > 0.0 { 1.0 - left_above / above } else { 0.0 },
     })
+}
+
+/// Returns the cross-validated log-likelihood gain of `hypotheses` over `model`, minus the penalties for their scopes and
+/// parameters [nat]: all are fitted together to one fold and evaluated on the other.
+pub fn cross_validate_together(
+    evidence: &ResidualData,
+    model: &ModelFile,
+    hypotheses: &[Hypothesis],
+    simulator: &mut dyn Rollout,
+) -> f64 {
+    let Some(fit) = FitProblem::new(model, hypotheses).filter(|_| !hypotheses.is_empty()) else { return 0.0 };
+    let points = [0, 1].map(|fold| fit.solve(&evidence.folds[fold], simulator));
+    let models = [model.clone(), fit.model(&points[0]), fit.model(&points[1])];
+    let robots: Option<Vec<RobotModel>> = models.iter().map(|model| model.robot_model().ok()).collect();
+    let Some(robots) = robots else { return f64::NEG_INFINITY };
+    let left = evidence.residual_powers(simulator, &robots, false);
+    let judged = |channel: usize| {
+        let rows = evidence.correlation_rows(channel);
+        left[1].log_likelihood_gain(&left[0], channel, 1, rows)
+            + left[2].log_likelihood_gain(&left[0], channel, 0, rows)
+    };
+    let tolerated: f64 = left[1..].iter().map(|now| 0.5 * now.tolerated_gain(&left[0])).sum();
+    let penalties: f64 = hypotheses.iter().map(|hypothesis| selection_penalty(hypothesis.scope)).sum();
+    (0..CHANNELS).map(judged).sum::<f64>() + tolerated - penalties - parameter_penalty(&fit)
+}
+
+/// Returns the penalty for the parameters of a fit [nat].
+fn parameter_penalty(fit: &FitProblem) -> f64 {
+    0.5 * fit.unknowns.len() as f64 * 200f64.ln()
 }
 
 #[cfg(test)]

@@ -17,9 +17,9 @@ use super::scan::{self, ScoredHypothesis, scan};
 /// Set by hand after a false positive with 22 nat in a case of `twinstep hunt` that is not in a published table.
 pub const THRESHOLD: f64 = 30.0;
 /// Maximum number of causes.
-const MOST_CAUSES: usize = 5;
+const MOST_CAUSES: usize = 12;
 /// Maximum number of rounds of selection and elimination.
-const MOST_SEARCHES: usize = 10;
+const MOST_SEARCHES: usize = 24;
 /// Maximum number of hypotheses about joints that are fitted in full simulation.
 const MAX_JOINT_CANDIDATES: usize = 5;
 /// Maximum number of hypotheses about base, ground and gyroscope, and about encoders.
@@ -169,7 +169,7 @@ impl<'a> ForwardSelection<'a> {
     }
 
     /// Refits all accepted causes jointly.
-    fn refit(&mut self) {
+    pub fn refit(&mut self) {
         let hypotheses: Vec<_> = self.accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
         self.model = self.baseline.clone();
         let Some(fit) = FitProblem::new(&self.baseline, &hypotheses).filter(|_| !hypotheses.is_empty()) else { return };

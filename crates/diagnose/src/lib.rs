@@ -4,6 +4,7 @@
 //!   [`residual_power`]: their sums of squares; [`residual_data`]: residuals of motion and torque together.
 //! - [`hypothesis`]: an effect on a scope, with values.
 //! - [`forward_selection`]: forward selection with backward elimination, which uses the following modules in turn.
+//! - [`friction_family`]: a search that begins with the friction and inertia of all joints, fitted together.
 //! - [`scan`]: evaluates every effect on all joints at once, and returns the best candidates.
 //! - [`cross_validation`]: fits a hypothesis to one fold and evaluates it on the other, in full simulation.
 //! - [`profile_likelihood`]: restarts from other local minima, and profile-likelihood intervals.
@@ -23,6 +24,7 @@ mod excitation;
 mod experiment_design;
 mod findings;
 mod forward_selection;
+mod friction_family;
 mod hypothesis;
 mod joint_slots;
 mod profile_likelihood;
@@ -129,6 +131,7 @@ pub fn diagnose(
         progress: &mut say,
     };
     search.run()?;
+    friction_family::extend(&mut search)?;
     let ForwardSelection { view, mut accepted, model: named, .. } = search;
     let WindowedData { evidence, given } = &views[view];
     let left = evidence.residual_power(simulator, &named.robot_model()?);

@@ -21,6 +21,9 @@ const MAX_UNTRACKED_VARIANCE: f64 = 0.1;
 /// error.
 const INDEPENDENT_S: [f64; 4] = [0.2, 0.1, 0.5, 0.05];
 
+/// Duration of fixed, standing and slowly moving parts of the logs from which on the other parts are not simulated [s].
+const LEAST_QUIET_S: f64 = 8.0;
+
 /// Residual data of the logs of one robot.
 pub struct ResidualData {
     logs: Vec<Log>,
@@ -38,6 +41,7 @@ impl ResidualData {
     pub fn new(logs: Vec<Log>, robot: &RobotModel, horizon: WindowConfig) -> Result<Self, ExperimentError> {
         let experiments: Vec<Experiment> =
             logs.iter().map(|log| Experiment::new(log, robot, horizon)).collect::<Result<_, _>>()?;
+        let experiments = without_dynamic_windows(&logs, experiments);
         let only = |keep: &dyn Fn(Option<usize>) -> bool| -> Vec<Experiment> {
             let pairs = logs.iter().zip(&experiments);
             pairs.map(|(log, experiment)| experiment.clone().filter_rows(|row| keep(fold_of(log, row)))).collect()
@@ -145,6 +149,13 @@ impl ResidualData {
     pub fn torques(&self) -> &MeasuredTorque {
         &self.torques[0]
     }
+}
+
+/// Returns the experiments without windows in which the robot walks or jumps, if the others last [`LEAST_QUIET_S`].
+fn without_dynamic_windows(logs: &[Log], experiments: Vec<Experiment>) -> Vec<Experiment> {
+    let quiet: Vec<Experiment> = experiments.iter().cloned().map(Experiment::without_dynamic_windows).collect();
+    let seconds: f64 = logs.iter().zip(&quiet).map(|(log, quiet)| quiet.num_rows() as f64 / log.meta().rate_hz).sum();
+    if seconds >= LEAST_QUIET_S { quiet } else { experiments }
 }
 
 fn variance(values: &[f64]) -> f64 {

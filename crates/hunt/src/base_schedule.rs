@@ -12,4 +12,6 @@ pub enum BaseSchedule {
     Floating,
     /// First fixed, then floating.
     FixedThenFloating,
+    /// First fixed, then standing, swaying, trotting and hopping: a minute in all.
+    Whole,
 }

@@ -6,6 +6,7 @@ use twinstep_effects::ModelFile;
 use twinstep_effects::{BlindTestCondition, CATALOGUE, Effect, EffectEntry, Scope, Target};
 use twinstep_model::{Joint, JointKind, Leg, Stream, standard_normal, stream};
 
+use crate::Plant;
 use crate::base_schedule::BaseSchedule;
 use crate::unmodelled::UnmodelledEffect;
 
@@ -66,9 +67,12 @@ pub struct Case {
 
 impl Case {
     /// Samples case `number` of the blind test with this seed.
-    pub fn draw(seed: u64, number: u64) -> Self {
+    pub fn draw(seed: u64, number: u64, plant: Plant) -> Self {
         let kind = kind(seed, number);
-        let setting = setting(&mut stream(seed, "hunt setting", number));
+        let mut setting = setting(&mut stream(seed, "hunt setting", number));
+        if plant == Plant::Mujoco {
+            setting = LogSetup { place: BaseSchedule::Whole, torque: true, ..setting };
+        }
         let random = &mut stream(seed, "hunt hidden", number);
         let hidden = match kind {
             CaseKind::LargeEffect => vec![from_half(setting, random)],
@@ -236,7 +240,7 @@ mod tests {
 
     #[test]
     fn seed_and_number_determine_the_case() {
-        let cases = |seed| (0..20).map(|number| Case::draw(seed, number)).collect::<Vec<_>>();
+        let cases = |seed| (0..20).map(|number| Case::draw(seed, number, Plant::Rapier)).collect::<Vec<_>>();
         assert_eq!(cases(5), cases(5));
         assert_ne!(cases(5), cases(6));
     }
@@ -244,7 +248,7 @@ mod tests {
     #[test]
     fn every_case_is_a_valid_robot_with_visible_effects() {
         for number in 0..300 {
-            let case = Case::draw(1, number);
+            let case = Case::draw(1, number, Plant::Rapier);
             apply_effects(&go2(), &case.hidden).expect("a valid robot");
             let visible = case.setting.visible_effects();
             assert!(case.hidden.iter().all(|entry| visible.contains(&entry.effect)), "{case:?}");

@@ -1,16 +1,19 @@
 //! Ground-truth robot of a case and its log.
 //!
-//! The robot runs in another engine at a smaller time step. It has small errors of mass, leg mounts and contact.
+//! The robot runs in another engine at a smaller time step. It has small errors of mass, leg mounts and contact. In
+//! MuJoCo its actuators follow laws that are written without the model's code.
 
 use rand::{Rng, RngExt};
 use twinstep_effects::apply_effects;
 use twinstep_identify::{RecordError, Sensor, apply_sensors, record};
 use twinstep_logs::{Log, LogError, TorqueSensor};
-use twinstep_model::{BaseMount, Joint, RobotModel, go2};
-use twinstep_sim::{Engine, RapierBackend, SimConfig};
+use twinstep_model::{BaseMount, Joint, RobotModel, Simulator, go2};
+use twinstep_sim::{BackendBuildError, Engine, RapierBackend, SimConfig};
 
+use crate::Plant;
 use crate::draw::Case;
 use crate::motion::{RATE_HZ, motion};
+use crate::mujoco_plant::MujocoPlant;
 use crate::unmodelled::PerturbedBackend;
 
 /// Physics rate of the ground truth [Hz]; that of the model is 1000.
@@ -20,25 +23,39 @@ const MASS_ERROR: f64 = 0.01;
 /// Maximum error of the leg mounting positions [m], too small to be reported as a cause.
 const LENGTH_ERROR: f64 = 0.002;
 
-/// Simulates the log of a case. `progress` receives the number of completed rows and returns false to interrupt.
-pub fn log_of(case: &Case, progress: &mut dyn FnMut(usize) -> bool) -> Result<Log, RecordError> {
+/// Simulates the log of a case on `plant`. `progress` receives the number of completed rows and returns false to
+/// interrupt.
+pub fn log_of(case: &Case, plant: Plant, progress: &mut dyn FnMut(usize) -> bool) -> Result<Log, RecordError> {
     let robot = perturbed(&mut case.stream("hunt body"));
     let robot = apply_effects(&robot, &case.hidden).expect("cases are sampled as valid robots");
-    let backend = |base: BaseMount, robot: &RobotModel| {
-        let physics_hz = Some(PHYSICS_HZ);
-        let config = SimConfig { engine: Engine::Rapier, base, physics_hz, threads: 1, ..SimConfig::default() };
-        let backend = RapierBackend::new(robot.clone(), config, 1);
-        backend
-            .map(|backend| PerturbedBackend::new(backend, case.outside))
-            .map_err(|error| RecordError::Backend(error.into()))
-    };
     let motion = motion(case.setting, &mut case.stream("hunt motion"));
     // The source of the log does not reveal the hidden effects.
-    let exact = record(&motion, &robot, None, backend, "twinstep hunt".to_owned(), progress)?;
+    let exact = match plant {
+        Plant::Rapier => played(&motion, &robot, progress, |base, robot| {
+            let physics_hz = Some(PHYSICS_HZ);
+            let config = SimConfig { engine: Engine::Rapier, base, physics_hz, threads: 1, ..SimConfig::default() };
+            Ok(PerturbedBackend::new(RapierBackend::new(robot.clone(), config, 1)?, case.outside))
+        }),
+        Plant::Mujoco => played(&motion, &robot, progress, |base, robot| {
+            let config = SimConfig { base, threads: 1, ..SimConfig::default() };
+            Ok(PerturbedBackend::new(MujocoPlant::new(robot.clone(), config)?, case.outside))
+        }),
+    }?;
     let random = &mut case.stream("hunt sensors");
     let sensors = sensors(random);
     let delayed = torque_sensor(&exact, &robot, case.setting.torque)?;
     Ok(apply_sensors(&delayed, &sensors, random.random())?)
+}
+
+/// Returns the log of `motion` on `robot`, without noise.
+fn played<S: Simulator>(
+    motion: &Log,
+    robot: &RobotModel,
+    progress: &mut dyn FnMut(usize) -> bool,
+    backend: impl Fn(BaseMount, &RobotModel) -> Result<S, BackendBuildError>,
+) -> Result<Log, RecordError> {
+    let backend = |base, robot: &RobotModel| backend(base, robot).map_err(|error| RecordError::Backend(error.into()));
+    record(motion, robot, None, backend, "twinstep hunt".to_owned(), progress)
 }
 
 /// Returns the built-in robot with small random errors.
@@ -140,7 +157,8 @@ mod tests {
             [(BaseSchedule::Fixed, 1), (BaseSchedule::Floating, 2), (BaseSchedule::FixedThenFloating, 3)]
         {
             let folder = tempfile::tempdir().expect("a folder");
-            let log = log_of(&case(place, seed, Vec::new()), &mut |_| true).expect("the simulation succeeds");
+            let log =
+                log_of(&case(place, seed, Vec::new()), Plant::Rapier, &mut |_| true).expect("the simulation succeeds");
             log.write(folder.path()).expect("written");
             let log = Log::open(folder.path()).expect("a log");
             for channel in ["dq_RR_calf", "tau_measured_FL_hip", "battery_V", "kp"] {
@@ -167,7 +185,7 @@ mod tests {
         let delay = EffectEntry::new(effect, Scope::All, vec![0.0125]).expect("allowed");
         let [healthy, delayed] = [vec![], vec![delay]].map(|hidden| {
             let case = case(BaseSchedule::Fixed, 1, hidden);
-            log_of(&case, &mut |_| true).expect("the simulation succeeds")
+            log_of(&case, Plant::Rapier, &mut |_| true).expect("the simulation succeeds")
         });
         assert_eq!(healthy.q("FL_calf"), delayed.q("FL_calf"));
         let [healthy, delayed] = [&healthy, &delayed].map(|log| log.tau_measured("FL_calf").expect("measured"));

@@ -4,6 +4,8 @@ mod base_schedule;
 mod draw;
 mod ground_truth;
 mod motion;
+mod mujoco_plant;
+mod plant_actuator;
 mod runner;
 mod score;
 mod table;
@@ -25,9 +27,23 @@ use runner::BlindTest;
 use score::Score;
 use unmodelled::UnmodelledEffect;
 
+/// Simulation that takes the place of the real robot.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Plant {
+    /// rapier with the actuators of the model: logs of 20 to 25 s.
+    #[default]
+    Rapier,
+    /// MuJoCo with actuators by equations of their own: logs of a minute, in which the robot hangs, stands, sways, trots
+    /// and hops.
+    Mujoco,
+}
+
 /// Settings of a blind test.
 #[derive(Clone, Debug)]
 pub struct HuntConfig {
+    /// The robot of the cases.
+    pub plant: Plant,
     /// Number of cases.
     pub cases: u64,
     /// Seed of the cases.
@@ -48,6 +64,8 @@ pub struct CaseResult {
     seed: u64,
     /// Number of the case.
     case: u64,
+    #[serde(default)]
+    plant: Plant,
     kind: CaseKind,
     setting: LogSetup,
     outside: Option<UnmodelledEffect>,
@@ -90,6 +108,19 @@ pub enum HuntError {
         theirs: u64,
         /// Seed that was requested.
         ours: u64,
+    },
+    /// The folder's results are those of another plant.
+    #[error(
+        "{} has the results of plant {theirs:?}, not {ours:?}\n  use that --plant, or choose another --out",
+        path.display()
+    )]
+    OtherPlant {
+        /// The file.
+        path: PathBuf,
+        /// Plant of the file.
+        theirs: Plant,
+        /// Plant that was requested.
+        ours: Plant,
     },
     /// A file could not be read or written.
     #[error("{}: {cause}", path.display())]
@@ -139,19 +170,19 @@ pub fn hunt(
     interrupted: Interrupted,
     progress: &mut dyn FnMut(u64),
 ) -> Result<String, HuntError> {
-    let HuntConfig { cases, seed, out, resume } = config;
+    let HuntConfig { plant, cases, seed, out, resume } = config;
     let cases_file = out.join("cases.jsonl");
-    let mut results = if *resume { read_results(&cases_file, *seed)? } else { Vec::new() };
+    let mut results = if *resume { read_results(&cases_file, *seed, *plant)? } else { Vec::new() };
     if !resume && cases_file.metadata().is_ok_and(|file| file.len() > 0) {
         return Err(HuntError::Exists(out.clone()));
     }
     std::fs::create_dir_all(out).map_err(at(out))?;
     let mut lines = OpenOptions::new().append(true).create(true).open(&cases_file).map_err(at(&cases_file))?;
     let simulator = BatchRollout::new(&go2(), &SimConfig::default()).map_err(failed)?;
-    let mut test = BlindTest { out, diagnose, interrupted, simulator };
+    let mut test = BlindTest { plant: *plant, out, diagnose, interrupted, simulator };
     for number in 0..*cases {
         if !results.iter().any(|result| result.case == number) {
-            let result = test.run_case(&Case::draw(*seed, number))?;
+            let result = test.run_case(&Case::draw(*seed, number, *plant))?;
             let line = serde_json::to_string(&result).map_err(failed)?;
             writeln!(lines, "{line}").map_err(at(&cases_file))?;
             results.push(result);
@@ -166,17 +197,19 @@ pub fn hunt(
 }
 
 /// Reads the results of completed cases.
-fn read_results(cases_file: &Path, seed: u64) -> Result<Vec<CaseResult>, HuntError> {
+fn read_results(cases_file: &Path, seed: u64, plant: Plant) -> Result<Vec<CaseResult>, HuntError> {
     let path = || cases_file.to_owned();
     let text = std::fs::read_to_string(cases_file).map_err(|cause| HuntError::File { path: path(), cause })?;
     let result = |(index, line): (usize, &str)| {
         let result: CaseResult =
             serde_json::from_str(line).map_err(|cause| HuntError::Line { path: path(), line: index + 1, cause })?;
-        if result.seed == seed {
-            Ok(result)
-        } else {
-            Err(HuntError::OtherSeed { path: path(), theirs: result.seed, ours: seed })
+        if result.seed != seed {
+            return Err(HuntError::OtherSeed { path: path(), theirs: result.seed, ours: seed });
         }
+        if result.plant != plant {
+            return Err(HuntError::OtherPlant { path: path(), theirs: result.plant, ours: plant });
+        }
+        Ok(result)
     };
     text.lines().enumerate().map(result).collect()
 }
@@ -202,7 +235,7 @@ mod tests {
     }
 
     fn config(cases: u64, seed: u64, out: &Path, resume: bool) -> HuntConfig {
-        HuntConfig { cases, seed, out: out.to_owned(), resume }
+        HuntConfig { plant: Plant::Rapier, cases, seed, out: out.to_owned(), resume }
     }
 
     fn run(config: &HuntConfig, diagnose: &Diagnose) -> Result<String, HuntError> {
@@ -227,7 +260,7 @@ mod tests {
         };
         let text = run(&config(2, 4, &out, true), &fails).expect("a failed diagnosis does not end the blind test");
         assert!(text.contains("| diagnosis failed | none | 1 of 2: 50 % |"), "{text}");
-        let results = read_results(&out.join("cases.jsonl"), 4).expect("lines");
+        let results = read_results(&out.join("cases.jsonl"), 4, Plant::Rapier).expect("lines");
         assert_eq!(results.iter().map(|result| result.case).collect::<Vec<_>>(), [0, 1]);
         assert!(results[1].error.as_ref().is_some_and(|error| error.contains("it broke")));
         assert!(out.join("hunt.md").exists() && out.join("0000/truth.toml").exists());
@@ -239,7 +272,7 @@ mod tests {
     fn hidden_effects_are_visible_in_the_log_and_the_true_model_explains_them() {
         let folder = tempfile::tempdir().expect("a folder");
         run(&config(28, 100, folder.path(), false), &nothing).expect("completed");
-        let results = read_results(&folder.path().join("cases.jsonl"), 100).expect("lines");
+        let results = read_results(&folder.path().join("cases.jsonl"), 100, Plant::Rapier).expect("lines");
         for CaseResult { case, kind, setting, outside, nominal, truth, verdict, .. } in &results {
             let hidden: Vec<_> = verdict.hits.iter().map(|hit| format!("{}@{}", hit.effect, hit.scope)).collect();
             println!("{case} {kind:?} {:?} {hidden:?} {outside:?} {nominal:?} {truth:?}", setting.place);

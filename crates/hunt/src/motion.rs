@@ -1,4 +1,4 @@
-//! Motions of a case: with a fixed base, standing, or both in turn, 20 to 25 s.
+//! Motions of a case: with a fixed base, standing, or both in turn, 20 to 25 s; with trot and hops, a minute.
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
@@ -36,6 +36,12 @@ enum Phase {
     Holds,
     /// Slow motion of the base over standing feet, with pauses: payload, offsets, ground.
     Sway,
+    /// The default pose.
+    Stand,
+    /// Trot on the spot: diagonal pairs of legs swing in turn.
+    Trot,
+    /// Hops on all legs.
+    Hop,
 }
 
 /// Random parameters of a motion.
@@ -67,7 +73,7 @@ impl Style {
     fn kp(&self, phase: Phase) -> f64 {
         match phase {
             Phase::Steps => self.kp[1],
-            Phase::Sway => self.kp[2],
+            Phase::Sway | Phase::Stand | Phase::Trot | Phase::Hop => self.kp[2],
             Phase::Chirp | Phase::Creep | Phase::Holds => self.kp[0],
         }
     }
@@ -97,6 +103,17 @@ impl Style {
                     before + (self.poses[pose][index] - before) * way * way * (3.0 - 2.0 * way)
                 }
                 Phase::Sway => self.sway(joint, time) / reach,
+                Phase::Stand => 0.0,
+                Phase::Trot => {
+                    let first = joint.leg.front_sign() * joint.leg.left_sign() > 0.0;
+                    let half = if first { 0.0 } else { 0.5 };
+                    let swing = (TAU * (1.8 * self.pace[0] * time + half)).sin().max(0.0);
+                    ease * fold(joint.kind, 0.25 * swing)
+                }
+                Phase::Hop => {
+                    let crouch = 0.5 - 0.5 * (TAU * 2.0 * self.pace[1] * time).cos();
+                    ease * fold(joint.kind, 0.3 * crouch)
+                }
             }
     }
 
@@ -120,12 +137,21 @@ impl Style {
     }
 }
 
+/// Returns the offset of a joint [rad] when a leg is folded by `angle` [rad] below its hip.
+fn fold(kind: JointKind, angle: f64) -> f64 {
+    match kind {
+        JointKind::Hip => 0.0,
+        JointKind::Thigh => angle,
+        JointKind::Calf => -2.0 * angle,
+    }
+}
+
 /// Returns a triangle wave of period 1, from −1 to 1.
 fn triangle(turns: f64) -> f64 {
     4.0 * ((turns - turns.floor()) - 0.5).abs() - 1.0
 }
 
-/// Returns the phases with their durations [s]. The base is fixed in all phases except [`Phase::Sway`].
+/// Returns the phases with their durations [s]. The base floats in [`Phase::Sway`] and the phases after it.
 fn phases(place: BaseSchedule) -> &'static [(Phase, f64)] {
     match place {
         BaseSchedule::Fixed => &[(Phase::Chirp, 8.0), (Phase::Creep, 5.0), (Phase::Steps, 4.0), (Phase::Holds, 6.0)],
@@ -133,6 +159,16 @@ fn phases(place: BaseSchedule) -> &'static [(Phase, f64)] {
         BaseSchedule::FixedThenFloating => {
             &[(Phase::Chirp, 5.0), (Phase::Creep, 4.0), (Phase::Steps, 2.5), (Phase::Holds, 4.0), (Phase::Sway, 9.0)]
         }
+        BaseSchedule::Whole => &[
+            (Phase::Chirp, 6.0),
+            (Phase::Creep, 5.0),
+            (Phase::Steps, 3.0),
+            (Phase::Holds, 4.0),
+            (Phase::Stand, 6.0),
+            (Phase::Sway, 16.0),
+            (Phase::Trot, 12.0),
+            (Phase::Hop, 8.0),
+        ],
     }
 }
 
@@ -146,8 +182,7 @@ pub fn motion(setting: LogSetup, random: &mut impl Rng) -> Log {
             let t = columns.get("t").map_or(0, Vec::len) as f64 / RATE_HZ;
             let mut cell = |name: String, value: f64| columns.entry(name).or_default().push(value);
             cell("t".to_owned(), t);
-            let second = setting.place == BaseSchedule::FixedThenFloating && *phase == Phase::Sway;
-            cell("segment".to_owned(), f64::from(u8::from(second)));
+            cell("segment".to_owned(), segment_index(setting.place, *phase));
             cell("kp".to_owned(), style.kp(*phase));
             cell("kd".to_owned(), style.kd);
             for joint in Joint::ALL {
@@ -170,10 +205,24 @@ pub fn motion(setting: LogSetup, random: &mut impl Rng) -> Log {
         BaseSchedule::Fixed => vec![air],
         BaseSchedule::Floating => vec![stance],
         BaseSchedule::FixedThenFloating => vec![air, stance],
+        BaseSchedule::Whole => {
+            vec![air, stance, segment("trot", BaseMount::Floating), segment("hop", BaseMount::Floating)]
+        }
     };
     let mut meta = Meta::new(RATE_HZ, TorqueSensor::MotorCurrent, segments);
     meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
     Log::new_commands(meta, columns).expect("a motion")
+}
+
+/// Returns the index of the segment of a phase.
+fn segment_index(place: BaseSchedule, phase: Phase) -> f64 {
+    match (place, phase) {
+        (BaseSchedule::Fixed | BaseSchedule::Floating, _) => 0.0,
+        (_, Phase::Chirp | Phase::Creep | Phase::Steps | Phase::Holds) => 0.0,
+        (_, Phase::Sway | Phase::Stand) => 1.0,
+        (_, Phase::Trot) => 2.0,
+        (_, Phase::Hop) => 3.0,
+    }
 }
 
 /// Returns the voltage of a battery that discharges and sags under a varying load [V].
@@ -195,12 +244,15 @@ mod tests {
 
     #[test]
     fn commands_stay_within_the_joint_ranges() {
-        for (place, seed) in
-            [BaseSchedule::Fixed, BaseSchedule::Floating, BaseSchedule::FixedThenFloating].into_iter().zip(0..)
-        {
+        for (place, seconds, seed) in [
+            (BaseSchedule::Fixed, 20.0..25.0, 0),
+            (BaseSchedule::Floating, 20.0..25.0, 1),
+            (BaseSchedule::FixedThenFloating, 20.0..25.0, 2),
+            (BaseSchedule::Whole, 60.0..61.0, 3),
+        ] {
             let setting = LogSetup { place, torque: true, battery: true, temperature: true };
             let motion = motion(setting, &mut stream(seed, "test", 0));
-            assert!((20.0..25.0).contains(&(motion.rows() as f64 / RATE_HZ)), "20 to 25 s");
+            assert!(seconds.contains(&(motion.rows() as f64 / RATE_HZ)), "{place:?}");
             for joint in Joint::ALL {
                 let [low, high] = go2().joints[joint.index()].range;
                 let cells = motion.q_cmd(joint.name()).expect("commanded");

@@ -13,7 +13,7 @@ use twinstep_sim::BatchRollout;
 
 use crate::draw::Case;
 use crate::score::judge;
-use crate::{CaseResult, Diagnose, HuntError, at, failed, ground_truth};
+use crate::{CaseResult, Diagnose, HuntError, Plant, at, failed, ground_truth};
 
 /// Interval at which a running diagnosis is polled.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
@@ -22,6 +22,8 @@ const BAD_INPUT: i32 = 2;
 
 /// Running blind test.
 pub struct BlindTest<'a> {
+    /// The robot of the cases.
+    pub plant: Plant,
     /// Folder of the results.
     pub out: &'a Path,
     /// Diagnosing program.
@@ -44,10 +46,11 @@ impl BlindTest<'_> {
         let folder = self.out.join(format!("{:04}", case.number));
         let model = self.out.join("nominal.toml");
         std::fs::write(&model, ModelFile::default().to_toml()).map_err(at(&model))?;
-        let log = ground_truth::log_of(case, &mut |_| !(self.interrupted)()).map_err(|error| match error {
-            RecordError::Interrupted => HuntError::Interrupted,
-            error => failed(error),
-        })?;
+        let log =
+            ground_truth::log_of(case, self.plant, &mut |_| !(self.interrupted)()).map_err(|error| match error {
+                RecordError::Interrupted => HuntError::Interrupted,
+                error => failed(error),
+            })?;
         let path = folder.join("log");
         log.write(&path).map_err(failed)?;
         let DiagnosisRun { findings, seconds } = self.run_diagnosis(&path, &model, &folder)?;
@@ -63,6 +66,7 @@ impl BlindTest<'_> {
         Ok(CaseResult {
             seed: case.seed,
             case: case.number,
+            plant: self.plant,
             kind: case.kind,
             setting: case.setting,
             outside: case.outside,

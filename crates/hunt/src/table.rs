@@ -175,6 +175,7 @@ mod tests {
         let setting = LogSetup { place: BaseSchedule::Fixed, torque: true, battery: false, temperature: false };
         let (nominal, truth) = (RmsErrors::default(), RmsErrors::default());
         CaseResult {
+            plant: crate::Plant::Rapier,
             seed: 0,
             case: 0,
             kind,
