@@ -5,10 +5,13 @@ use std::path::Path;
 use twinstep_diagnose::{Diagnosis, ParameterValue};
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, EffectEntry, apply_effects};
+use twinstep_identify::evaluate;
 use twinstep_logs::{Log, Meta};
 use twinstep_model::{RobotModel, go2};
+use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_tests::browser::{browser, layout};
 use twinstep_tests::ground_truth_actuator::{DRIVES, Motion, NOISE_NM};
+use twinstep_tests::python::root;
 
 use crate::identify::{log_of, twinstep};
 
@@ -49,6 +52,41 @@ fn hidden_friction_is_found_with_its_scope_and_size_and_the_extended_model_fits(
 }
 
 /// Checks that every plot is present, the page fits the window, and nothing is loaded.
+/// Returns the rows of a log, with time from 0.
+fn part(log: &Log, rows: std::ops::Range<usize>) -> Log {
+    let t = log.t()[rows.clone()].iter().map(|t| t - log.t()[rows.start]).collect();
+    let segment = log.segment()[rows.clone()].iter().map(|segment| f64::from(*segment)).collect();
+    let channels = log.channels().map(|(name, cells)| (name.to_owned(), cells[rows.clone()].to_vec()));
+    let columns = [("t".to_owned(), t), ("segment".to_owned(), segment)].into_iter().chain(channels);
+    Log::new(log.meta().clone(), columns).unwrap()
+}
+
+/// The recording is a chirp, so its second half is faster than its first.
+#[test]
+fn models_of_both_halves_of_a_real_recording_name_the_same_friction_and_predict_the_other_half() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = Log::open(root().join("data/go2_air_chirp")).unwrap();
+    let middle = log.rows() / 2;
+    let halves = [part(&log, 0..middle), part(&log, middle..log.rows())];
+    let mut simulator = BatchRollout::new(&go2(), &SimConfig::default()).unwrap();
+    for (fitted, other) in [(0, 1), (1, 0)] {
+        let (log, out) = (folder.path().join(format!("{fitted}.parquet")), folder.path().join(fitted.to_string()));
+        halves[fitted].write(&log).unwrap();
+        let output = twinstep(&["diagnose", log.to_str().unwrap(), "--out", out.to_str().unwrap(), "--json"]);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let diagnosis: Diagnosis = serde_json::from_slice(&output.stdout).unwrap();
+        let names: Vec<String> =
+            diagnosis.findings.iter().map(|cause| format!("{}@{}", cause.effect, cause.scope)).collect();
+        for name in ["viscous_friction@hip", "coulomb_friction@thigh", "coulomb_friction@calf"] {
+            assert!(names.iter().any(|found| found == name), "half {fitted}: {names:?}");
+        }
+        let robot = ModelFile::load(out.join(&diagnosis.extended_model)).unwrap().robot_model().unwrap();
+        let error = evaluate(&halves[other], &robot, &mut simulator, |_| true).unwrap().q_rmse_rad.unwrap();
+        println!("model of half {fitted} on the other: {error:.4} rad, {names:?}");
+        assert!(error < 0.0105, "model of half {fitted} on the other: {error} rad");
+    }
+}
+
 fn check_in_a_browser(page: &Path) {
     let Some(browser) = browser() else {
         println!("no Chromium is installed: the layout of the report was not checked");

@@ -7,8 +7,9 @@ use std::time::{Duration, Instant};
 use expect_test::{Expect, expect};
 use tempfile::TempDir;
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
-use twinstep_effects::{CATALOGUE, Effect, Target, apply_effects};
+use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Target, apply_effects};
 use twinstep_envs::{Randomisation, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
+use twinstep_hunt::MujocoPlant;
 use twinstep_logs::Log;
 use twinstep_model::{
     AutoresetMode, Backend, BackendError, BaseMount, Command, EnvError, InitialState, NUM_JOINTS, PerJoint,
@@ -355,4 +356,46 @@ fn played_motion_agrees_with_the_batch_engine() {
     let difference = rms(&ours.0, &theirs.0);
     assert!(difference < 0.005, "{difference} rad");
     assert_eq!(theirs.1, "twinstep play: `go2` simulated by mujoco at 1000 Hz x 64");
+}
+
+/// The plant of the blind test computes its torques by equations of its own.
+#[test]
+fn plant_of_the_blind_test_moves_like_the_model_with_the_same_effects() {
+    let Some(interpreter) = Interpreter::of_tests() else { return };
+    let hidden: [(&str, &str, &[f64]); 6] = [
+        ("coulomb_friction", "thigh", &[0.5]),
+        ("viscous_friction", "calf", &[0.2]),
+        ("torque_delay", "hip", &[0.004]),
+        ("drive_lag", "RR", &[0.005]),
+        ("torque_gain", "FL_calf", &[0.85]),
+        ("torque_ripple", "FR_thigh", &[0.6, 8.0, 0.3]),
+    ];
+    let effects = hidden.map(|(name, scope, values)| {
+        EffectEntry::new(Effect::named(name).unwrap(), scope.parse().unwrap(), values.to_vec()).unwrap()
+    });
+    let mut robot = apply_effects(&go2(), &effects).unwrap();
+    robot.control.actuator_hz = 200.0;
+    let config = SimConfig { base: BaseMount::Fixed, threads: 1, ..SimConfig::default() };
+    let mut model = BatchBackend::new(robot.clone(), config, 1).unwrap();
+    let mut plant = MujocoPlant::with_python(robot, config, &interpreter.path()).unwrap();
+    let pose = go2().control.default_pose_f32();
+    let initial_state = InitialState::at_rest(0.6, pose);
+    model.reset(&[(0, initial_state)]).unwrap();
+    plant.reset(&[(0, initial_state)]).unwrap();
+    let (mut sum, mut moved) = (0.0, 0.0);
+    for period in 0..400 {
+        let wave = 0.3 * (0.03 * period as f32).sin();
+        let command = Command::hold(pose.map(|q| q + wave), 30.0, 0.8);
+        for backend in [&mut model as &mut dyn Backend, &mut plant] {
+            backend.step(&[command], &[true], 1).unwrap();
+        }
+        for joint in 0..NUM_JOINTS {
+            let [one, other] = [model.measured().q[0][joint], plant.measured().q[0][joint]];
+            sum += f64::from(one - other).powi(2);
+            moved += f64::from(one - pose[joint]).powi(2);
+        }
+    }
+    let [error, moved] = [sum, moved].map(|sum| (sum / (400 * NUM_JOINTS) as f64).sqrt());
+    println!("difference {error:.5} rad of {moved:.3} rad");
+    assert!(error < 0.003 && moved > 0.1, "difference {error} rad of {moved} rad");
 }

@@ -9,7 +9,7 @@ use super::cross_validation::{CandidateFit, FitProblem, cross_validate};
 use super::hypothesis::Hypothesis;
 use super::profile_likelihood::refine_with_restarts;
 use super::residual_data::ResidualData;
-use super::residual_power::{CHANNELS, GYRO, ResidualPower, TORQUE, TRUNK};
+use super::residual_power::{CHANNELS, GYRO, ResidualPower, STANCE, TORQUE, TRUNK};
 use super::scan::{self, ScoredHypothesis, scan};
 
 /// Log-likelihood gain that a cause must reach [nat].
@@ -195,7 +195,8 @@ fn best_first(one: &CandidateFit, other: &CandidateFit) -> std::cmp::Ordering {
 
 /// Returns true if a cause leaves at most a quarter of the excess power in the channels that it affects.
 fn explains_affected_channels(hypothesis: &Hypothesis, given: &ResidualPower, left: &ResidualPower) -> bool {
-    affected_channels(hypothesis).into_iter().all(|channels| {
+    let held = given.counts[..TORQUE].iter().flatten().any(|count| *count > 0.0);
+    affected_channels(hypothesis, held).into_iter().all(|channels| {
         let excess = |left: &ResidualPower| channels.iter().map(|channel| left.channel_excess(*channel)).sum::<f64>();
         let rows: f64 = channels.iter().flat_map(|channel| left.counts[*channel]).sum();
         excess(left) <= NEGLIGIBLE_EXCESS * rows || excess(left) <= MAX_REMAINING_FRACTION * excess(given)
@@ -204,15 +205,18 @@ fn explains_affected_channels(hypothesis: &Hypothesis, given: &ResidualPower, le
 
 /// Returns the groups of channels that a cause must explain, each separately.
 ///
-/// For joints, positions and torques are separate groups. For base and ground, the group is all motion channels.
-fn affected_channels(hypothesis: &Hypothesis) -> Vec<Vec<usize>> {
+/// For joints, positions and torques are separate groups: positions with a fixed base, if there are any (`held`). For
+/// base and ground, the group is all motion channels with a floating base.
+fn affected_channels(hypothesis: &Hypothesis, held: bool) -> Vec<Vec<usize>> {
     match hypothesis.effect.target {
         Target::Joints => {
             let joints = || Joint::ALL.into_iter().filter(|joint| hypothesis.scope.contains(*joint));
-            [0, TORQUE].map(|first| joints().map(|joint| first + joint.index()).collect()).to_vec()
+            [if held { 0 } else { STANCE }, TORQUE]
+                .map(|first| joints().map(|joint| first + joint.index()).collect())
+                .to_vec()
         }
-        Target::Imu => vec![(GYRO..CHANNELS).collect()],
-        Target::Bodies | Target::Ground => vec![(0..TORQUE).chain(TRUNK..GYRO).collect()],
+        Target::Imu => vec![(GYRO..STANCE).collect()],
+        Target::Bodies | Target::Ground => vec![(TRUNK..GYRO).chain(STANCE..CHANNELS).collect()],
         Target::Supply => Vec::new(),
     }
 }

@@ -6,13 +6,14 @@
 
 use twinstep_effects::{Effect, ModelFile, Scope};
 use twinstep_identify::refine::information;
-use twinstep_model::{Joint, JointKind, Rollout};
+use twinstep_model::{Joint, JointKind, NUM_JOINTS, Rollout};
 
 use super::DiagnoseError;
 use super::cross_validation::{CandidateFit, FitProblem, cross_validate, cross_validate_together};
 use super::forward_selection::{Accepted, ForwardSelection, THRESHOLD};
 use super::hypothesis::Hypothesis;
 use super::residual_data::ResidualData;
+use super::residual_power::STANCE;
 use super::residual_rows::PRECISION;
 
 /// Laws that every joint has.
@@ -28,7 +29,10 @@ const MOST_JOINTS: usize = 8;
 /// Number of joints with the largest residuals that are tried.
 const TRIED_JOINTS: usize = 4;
 /// Power above noise that single causes may leave, relative to that of the given model, without a fit of the family.
-const UNEXPLAINED_FRACTION: f64 = 0.02;
+const UNEXPLAINED_FRACTION: f64 = 0.05;
+/// Root mean square of the positions' residuals that single causes may leave [rad]: two engines with the same laws differ
+/// by less.
+const UNEXPLAINED_RAD: f64 = 0.004;
 
 /// Replaces the causes of a search by those of a search that begins with the friction family, if the first leaves much
 /// unexplained and the second has the higher cross-validated likelihood.
@@ -65,12 +69,26 @@ fn unscored(hypothesis: Hypothesis) -> CandidateFit {
     CandidateFit { hypothesis, score: 0.0, gain: 0.0, explained_fraction: 0.0 }
 }
 
-/// Returns true if the causes leave more than [`UNEXPLAINED_FRACTION`] in rows that simulators follow alike.
+/// Returns true if the given model lacks something at most joints, and the causes leave more than
+/// [`UNEXPLAINED_FRACTION`] and [`UNEXPLAINED_RAD`] of it, in rows with a fixed base, if there are any.
 fn leaves_much(search: &mut ForwardSelection) -> bool {
     let evidence = &search.views[search.view].evidence;
     let robots = [&search.baseline, &search.model].map(|model| model.robot_model().expect("fitted within its bounds"));
     let left = evidence.residual_powers(search.simulator, &robots, true);
-    left[1].power_above_noise() > UNEXPLAINED_FRACTION * left[0].power_above_noise()
+    // Mean squares above noise by joint [rad²].
+    let [given, now] = [0, 1].map(|model: usize| {
+        let of = |joint: usize| {
+            let both = [joint, STANCE + joint];
+            let rows: f64 = both.iter().flat_map(|channel| left[model].counts[*channel]).sum();
+            let excess: f64 = both.iter().map(|channel| left[model].channel_excess(*channel)).sum();
+            (rows > 0.0).then(|| excess / rows * evidence.fit_rows.position_std(joint).powi(2))
+        };
+        (0..NUM_JOINTS).filter_map(of).collect::<Vec<f64>>()
+    });
+    let least = UNEXPLAINED_RAD * UNEXPLAINED_RAD;
+    let affected = given.iter().filter(|square| **square > least).count();
+    let [before, after] = [&given, &now].map(|squares| squares.iter().sum::<f64>() / squares.len().max(1) as f64);
+    4 * affected >= 3 * given.len() && after > least && after > UNEXPLAINED_FRACTION * before
 }
 
 /// Returns the cross-validated log-likelihood gain of all causes of a search [nat].

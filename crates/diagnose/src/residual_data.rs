@@ -5,7 +5,7 @@ use twinstep_effects::{DataRequirement, Effect};
 use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout};
 
-use super::residual_power::{GYRO, ResidualPower, TORQUE, TRUNK};
+use super::residual_power::{GYRO, ResidualPower, STANCE, TORQUE, TRUNK};
 use super::residual_rows::{ResidualRows, fold_of};
 use twinstep_identify::ExperimentError;
 use twinstep_identify::experiment::Experiment;
@@ -17,9 +17,11 @@ use twinstep_identify::window::WindowConfig;
 const MISFIT_NM: f64 = 0.02;
 /// Mean squared position error, divided by the variance of the measured position, above which a joint is not tracked.
 const MAX_UNTRACKED_VARIANCE: f64 = 0.1;
-/// Correlation time of residuals [s]: positions, torques, base motion, and gyroscope, whose noise exceeds its model
-/// error.
-const INDEPENDENT_S: [f64; 4] = [0.2, 0.1, 0.5, 0.05];
+/// Correlation time of residuals [s]: positions with a fixed base, torques, base motion, gyroscope, whose noise exceeds
+/// its model error, and positions with a floating base.
+///
+/// An error of contact or geometry moves the joints of a standing robot by the same angle in a whole window.
+const INDEPENDENT_S: [f64; 5] = [0.2, 0.1, 0.5, 0.05, 1.0];
 
 /// Duration of fixed, standing and slowly moving parts of the logs from which on the other parts are not simulated [s].
 const LEAST_QUIET_S: f64 = 8.0;
@@ -74,9 +76,11 @@ impl ResidualData {
     pub fn fails_to_track(&self, left: &ResidualPower) -> bool {
         let log = &self.logs[0];
         (0..NUM_JOINTS).any(|joint| {
-            let rows: f64 = left.counts[joint].iter().sum();
+            let both = [joint, STANCE + joint];
+            let rows: f64 = both.iter().flat_map(|channel| left.counts[*channel]).sum();
             let sigma = self.fit_rows.position_std(joint);
-            let error = left.sums[joint].iter().sum::<f64>() / rows.max(1.0) * sigma * sigma;
+            let sum: f64 = both.iter().flat_map(|channel| left.sums[*channel]).sum();
+            let error = sum / rows.max(1.0) * sigma * sigma;
             log.q(JOINT_NAMES[joint]).is_some_and(|q| error > MAX_UNTRACKED_VARIANCE * variance(q))
         })
     }
@@ -141,7 +145,7 @@ impl ResidualData {
 
     /// Returns the correlation length of a channel [rows].
     pub fn correlation_rows(&self, channel: usize) -> f64 {
-        let kind = [TORQUE, TRUNK, GYRO].into_iter().filter(|first| channel >= *first).count();
+        let kind = [TORQUE, TRUNK, GYRO, STANCE].into_iter().filter(|first| channel >= *first).count();
         (INDEPENDENT_S[kind] * self.max_rate_hz()).max(1.0)
     }
 

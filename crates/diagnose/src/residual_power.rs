@@ -4,14 +4,19 @@ use twinstep_model::NUM_JOINTS;
 
 use twinstep_identify::nuisance;
 
-/// Number of channels: joint positions, torques, and base position, orientation, velocity and angular velocity.
-pub const CHANNELS: usize = 2 * NUM_JOINTS + 12;
+/// Number of channels: joint positions with a fixed base, torques, base position, orientation, velocity and angular
+/// velocity, and joint positions with a floating base.
+///
+/// Positions with a floating base are channels of their own, because they have the errors of the contact model, too.
+pub const CHANNELS: usize = 3 * NUM_JOINTS + 12;
 /// First channel of the torques.
 pub const TORQUE: usize = NUM_JOINTS;
 /// First channel of the base.
 pub const TRUNK: usize = 2 * NUM_JOINTS;
 /// First channel of the gyroscope.
 pub const GYRO: usize = TRUNK + 9;
+/// First channel of the joint positions with a floating base.
+pub const STANCE: usize = TRUNK + 12;
 
 /// Sums of squared residuals and numbers of rows by channel and fold, in units of the variance of noise and model
 /// error.

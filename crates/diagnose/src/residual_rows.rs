@@ -4,7 +4,7 @@ use rayon::prelude::*;
 use twinstep_logs::Log;
 use twinstep_model::{Precision, RobotModel, Rollout};
 
-use super::residual_power::{GYRO, ResidualPower, TRUNK};
+use super::residual_power::{GYRO, ResidualPower, STANCE, TRUNK};
 use twinstep_identify::experiment::{Experiment, ResidualChannel};
 use twinstep_identify::nuisance::NuisanceModel;
 
@@ -36,11 +36,14 @@ impl ResidualRows {
     pub fn new(logs: &[Log], experiments: Vec<Experiment>) -> Self {
         let mut cells = Vec::new();
         for (log, experiment) in logs.iter().zip(&experiments) {
-            cells.extend(experiment.residual_index().map(|(quantity, row)| {
+            cells.extend(experiment.residual_index().zip(experiment.groups()).map(|((quantity, row), group)| {
                 // Velocities repeat the information of positions with more noise. Torques are evaluated without
                 // simulation.
                 let (channel, misfit) = match quantity {
-                    ResidualChannel::Position(joint) => (joint, MODEL_ERROR_RAD / experiment.sigma(quantity)),
+                    ResidualChannel::Position(joint) => {
+                        let first = if Experiment::is_held(group) { 0 } else { STANCE };
+                        (first + joint, MODEL_ERROR_RAD / experiment.sigma(quantity))
+                    }
                     ResidualChannel::Velocity(_) | ResidualChannel::Torque(_) => return (0, None, 0.0),
                     ResidualChannel::BasePosition(axis) => (TRUNK + axis, MODEL_ERROR_BASE),
                     ResidualChannel::BaseOrientation(axis) => (TRUNK + 3 + axis, MODEL_ERROR_BASE),

@@ -9,7 +9,7 @@ use twinstep_model::{Joint, RobotModel, Rollout};
 
 use super::hypothesis::{Hypothesis, fine_probes, selection_penalty, with_effect};
 use super::residual_data::ResidualData;
-use super::residual_power::{CHANNELS, ResidualPower, TORQUE};
+use super::residual_power::{CHANNELS, ResidualPower, STANCE, TORQUE};
 
 /// Maximum number of scopes per effect in the result.
 const OF_ONE_EFFECT: usize = 2;
@@ -218,7 +218,7 @@ fn scan_whole(
 /// Returns the log-likelihood gain by joint and fold, of its position and torque [nat].
 fn joint_gains(evidence: &ResidualData, now: &ResidualPower, before: &ResidualPower) -> Vec<[f64; 2]> {
     let of = |joint: usize, fold: usize| {
-        [joint, TORQUE + joint]
+        [joint, TORQUE + joint, STANCE + joint]
             .map(|channel| now.log_likelihood_gain(before, channel, fold, evidence.correlation_rows(channel)))
             .iter()
             .sum::<f64>()

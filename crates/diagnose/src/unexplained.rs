@@ -4,11 +4,11 @@ use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, RobotModel, Rollout};
 
 use super::residual_data::ResidualData;
-use super::residual_power::{ResidualPower, TORQUE, TRUNK};
+use super::residual_power::{CHANNELS, ResidualPower, STANCE, TORQUE, TRUNK};
 use super::residual_rows::fold_of;
 use super::spectral_line::spectral_line;
 use crate::findings::Unexplained;
-use twinstep_identify::experiment::ResidualChannel;
+use twinstep_identify::experiment::{Experiment, ResidualChannel};
 use twinstep_logs::replay::{JointCommands, command, joint_commands};
 
 /// Number of bins of a variable that may explain a residual.
@@ -30,6 +30,7 @@ pub fn unexplained(
     let fraction = if before > 0.0 { (after / before).min(1.0) } else { 0.0 };
     let count = |channel: usize| left.counts[channel].iter().sum::<f64>();
     let worst = (0..TRUNK)
+        .chain(STANCE..CHANNELS)
         .filter(|channel| count(*channel) > 0.0)
         .max_by(|one, other| {
             let of = |channel: usize| left.channel_excess(channel) / count(channel);
@@ -39,7 +40,7 @@ pub fn unexplained(
     let Some(channel) = worst else { return only_noise() };
     let log = &evidence.logs()[0];
     let residual = residual(evidence, robot, channel, simulator);
-    let kind = if channel < TORQUE { "position" } else { "torque" };
+    let kind = if (TORQUE..TRUNK).contains(&channel) { "torque" } else { "position" };
     let whose = format!("The {kind} of {}", JOINT_NAMES[channel % 12]);
     describe_residual(log, &residual, variables(log, robot), fraction, &whose)
 }
@@ -97,7 +98,7 @@ fn line_of(log: &Log, residual: &[f64]) -> Option<(f64, f64)> {
 fn residual(evidence: &ResidualData, robot: &RobotModel, channel: usize, simulator: &mut dyn Rollout) -> Vec<f64> {
     let log = &evidence.logs()[0];
     let mut residual = vec![f64::NAN; log.rows()];
-    if channel >= TORQUE {
+    if (TORQUE..TRUNK).contains(&channel) {
         let each = |joint: usize, row: usize, difference: f64| {
             if TORQUE + joint == channel {
                 residual[row] = difference;
@@ -106,9 +107,11 @@ fn residual(evidence: &ResidualData, robot: &RobotModel, channel: usize, simulat
         evidence.torques().differences(robot, each);
     } else {
         let corrected = evidence.fit_rows.nuisance_corrected(simulator, robot);
-        for (corrected, (quantity, row)) in corrected.into_iter().zip(evidence.fit_rows.experiments[0].residual_index())
-        {
-            if quantity == ResidualChannel::Position(channel) {
+        let (experiment, held) = (&evidence.fit_rows.experiments[0], channel < STANCE);
+        let joint = if held { channel } else { channel - STANCE };
+        let cells = experiment.residual_index().zip(experiment.groups());
+        for (corrected, ((quantity, row), group)) in corrected.into_iter().zip(cells) {
+            if quantity == ResidualChannel::Position(joint) && Experiment::is_held(group) == held {
                 residual[row] = corrected;
             }
         }

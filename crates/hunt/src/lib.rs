@@ -23,6 +23,7 @@ use twinstep_model::go2;
 use twinstep_sim::{BatchRollout, SimConfig};
 
 use draw::{Case, CaseKind, LogSetup};
+pub use mujoco_plant::MujocoPlant;
 use runner::BlindTest;
 use score::Score;
 use unmodelled::UnmodelledEffect;

@@ -1,5 +1,7 @@
 //! Robot whose bodies and contacts are MuJoCo's and whose actuators are a [`PlantActuator`].
 
+use std::path::Path;
+
 use twinstep_model::{
     ActuatorParams, Backend, BackendError, Command, Ground, GroundTruth, InitialState, JointSpring, Measured,
     NUM_JOINTS, PerJoint, RobotModel, RobotStates, Simulator, Stribeck,
@@ -24,8 +26,23 @@ pub struct MujocoPlant {
 }
 
 impl MujocoPlant {
-    /// Creates the robot, with the base as in `config`.
+    /// Creates the robot, with the base as in `config`. The interpreter is that of [`MujocoBackend::new`].
     pub fn new(robot: RobotModel, config: SimConfig) -> Result<Self, BackendBuildError> {
+        Self::with_bodies(robot, config, MujocoBackend::new)
+    }
+
+    /// Creates the robot, with the interpreter `python`.
+    pub fn with_python(robot: RobotModel, config: SimConfig, python: &Path) -> Result<Self, BackendBuildError> {
+        Self::with_bodies(robot, config, |robot, config, count| {
+            MujocoBackend::with_python(robot, config, count, python)
+        })
+    }
+
+    fn with_bodies(
+        robot: RobotModel,
+        config: SimConfig,
+        create: impl FnOnce(RobotModel, SimConfig, usize) -> Result<MujocoBackend, BackendBuildError>,
+    ) -> Result<Self, BackendBuildError> {
         let steps = (STEP_HZ / robot.control.actuator_hz).ceil() as usize;
         let mut bodies = robot.clone();
         bodies.control.actuator_hz *= steps as f64;
@@ -39,7 +56,7 @@ impl MujocoPlant {
         }
         let physics_hz = Some(bodies.control.actuator_hz as u32);
         let config = SimConfig { engine: Engine::Mujoco, physics_hz, ..config };
-        let bodies = MujocoBackend::new(bodies, config, 1)?;
+        let bodies = create(bodies, config, 1)?;
         let actuator = PlantActuator::new(&robot, steps, &widened(&bodies.states().measured.q[0]));
         let states = bodies.states().clone();
         Ok(Self { robot, bodies, actuator, steps, states })

@@ -167,3 +167,45 @@ impl Experiment {
         self.channels.iter().find(|channel| channel.quantity == quantity).map_or(1.0, |channel| channel.sigma)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use twinstep_logs::{Meta, Segment, TorqueSensor};
+    use twinstep_model::{BaseMount, go2};
+
+    use super::*;
+
+    /// Returns an experiment of 4 s of `base` whose joints swing by 0.2 rad at `hz`, with noise of 2 mrad.
+    fn experiment(base: BaseMount, hz: f64) -> Experiment {
+        const ROWS: usize = 800;
+        let column = |name: String, of: &dyn Fn(f64) -> f64| {
+            (name, (0..ROWS).map(|row| of(row as f64 / 200.0)).collect::<Vec<f64>>())
+        };
+        let noise = |t: f64| 0.004 * ((t * 200.0 * 7919.0) % 1009.0 / 1009.0 - 0.5);
+        let mut columns = vec![column("t".to_owned(), &|t| t)];
+        for (name, value) in [("kp", 30.0), ("kd", 0.8), ("pos_z", 0.3), ("quat_w", 1.0), ("vel_x", 0.0)] {
+            columns.push(column(name.to_owned(), &|_| value));
+        }
+        for joint in Joint::ALL {
+            let swing = move |t: f64| 0.2 * (std::f64::consts::TAU * hz * t).sin();
+            columns.push(column(format!("q_{joint}"), &|t| swing(t) + noise(t)));
+            columns.push(column(format!("q_cmd_{joint}"), &swing));
+        }
+        let segments = vec![Segment { name: "part".to_owned(), base }];
+        let log = Log::new(Meta::new(200.0, TorqueSensor::None, segments), columns).expect("a log");
+        Experiment::new(&log, &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
+    }
+
+    #[test]
+    fn windows_with_fast_joints_are_left_out_if_the_base_floats() {
+        let rows = |base, hz| {
+            let experiment = experiment(base, hz);
+            (experiment.num_rows(), experiment.without_dynamic_windows().num_rows())
+        };
+        let (all, kept) = rows(BaseMount::Floating, 0.4);
+        assert_eq!(all, kept, "a robot that sways");
+        assert_eq!(rows(BaseMount::Floating, 2.0).1, 0, "a robot that trots");
+        let (all, kept) = rows(BaseMount::Fixed, 2.0);
+        assert_eq!(all, kept, "a robot that hangs");
+    }
+}
