@@ -216,12 +216,14 @@ pub fn motion(setting: LogSetup, random: &mut impl Rng) -> Log {
 
 /// Returns the index of the segment of a phase.
 fn segment_index(place: BaseSchedule, phase: Phase) -> f64 {
-    match (place, phase) {
-        (BaseSchedule::Fixed | BaseSchedule::Floating, _) => 0.0,
-        (_, Phase::Chirp | Phase::Creep | Phase::Steps | Phase::Holds) => 0.0,
-        (_, Phase::Sway | Phase::Stand) => 1.0,
-        (_, Phase::Trot) => 2.0,
-        (_, Phase::Hop) => 3.0,
+    if matches!(place, BaseSchedule::Fixed | BaseSchedule::Floating) {
+        return 0.0;
+    }
+    match phase {
+        Phase::Chirp | Phase::Creep | Phase::Steps | Phase::Holds => 0.0,
+        Phase::Sway | Phase::Stand => 1.0,
+        Phase::Trot => 2.0,
+        Phase::Hop => 3.0,
     }
 }
 
