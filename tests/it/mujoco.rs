@@ -389,10 +389,10 @@ fn plant_of_the_blind_test_moves_like_the_model_with_the_same_effects() {
         for backend in [&mut model as &mut dyn Backend, &mut plant] {
             backend.step(&[command], &[true], 1).unwrap();
         }
-        for joint in 0..NUM_JOINTS {
-            let [one, other] = [model.measured().q[0][joint], plant.measured().q[0][joint]];
+        let both = model.measured().q[0].iter().zip(&plant.measured().q[0]);
+        for ((one, other), rest) in both.zip(&pose) {
             sum += f64::from(one - other).powi(2);
-            moved += f64::from(one - pose[joint]).powi(2);
+            moved += f64::from(one - rest).powi(2);
         }
     }
     let [error, moved] = [sum, moved].map(|sum| (sum / (400 * NUM_JOINTS) as f64).sqrt());
