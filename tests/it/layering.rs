@@ -97,6 +97,7 @@ const MAY_USE: [(&str, &[&str]); 25] = [
             "client",
             "unitree",
             "robot",
+            "hunt",
         ],
     ),
 ];
