@@ -227,7 +227,7 @@ fn bad_input_is_named_and_stdout_is_empty() {
         folder.path(),
         &expect![[r#"
         error: the format of `walk.xlsx` is unknown
-          name it *.parquet, *.csv, *.csv.gz or *.mcap
+          name it *.parquet, *.csv, *.csv.gz or *.mcap; docs/logs.md says how to convert *.npz and *.db3
     "#]],
     );
 }

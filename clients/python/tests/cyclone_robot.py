@@ -1,8 +1,8 @@
 """A robot on the vendor's own DDS library, Cyclone DDS 0.10.2, for the interoperation test of the crate ``robot``.
 
-It publishes ``rt/lowstate`` with 500 Hz, or as often as the machine allows, answers the services ``motion_switcher`` and
-``sport``, and its joints follow ``rt/lowcmd``. Its types and its checksum are written from the IDL of the vendor's SDK,
-not from the crate ``unitree``.
+It publishes ``rt/lowstate`` with 500 Hz, or as often as the machine allows, answers the services ``motion_switcher``
+and ``sport``, and its joints follow ``rt/lowcmd``. Its types and its checksum are written from the IDL of the vendor's
+SDK, not from the crate ``unitree``.
 
 Usage: ``cyclone_robot.py DOMAIN``. It prints ``ready`` and, for each line ``statistics`` on stdin, a line of JSON. It
 ends when stdin closes. Needs Python 3.10: Cyclone DDS 0.10.2 has no wheels for newer versions.

@@ -8,11 +8,11 @@ use twinstep_diagnose::{
     DiagnoseError, Diagnosis, DiagnosisOutput, ParameterValue, RmsErrors, diagnose, diagnose_torques,
 };
 use twinstep_effects::ModelFile;
-use twinstep_logs::Log;
 use twinstep_model::Joint;
 
 use crate::evaluate::simulator;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::open_log::open_log;
 use twinstep_report::report_data::{LogFacts, Provenance, ReportData};
 use twinstep_report::write_report;
 
@@ -85,7 +85,7 @@ pub fn run(args: &Args) -> CommandResult {
         .as_ref()
         .map_or(Ok(ModelFile::default()), ModelFile::load_without_actuator_network)
         .map_err(input)?;
-    let logs = args.logs.iter().map(|path| Log::open(path).map_err(input)).collect::<Result<Vec<_>, _>>()?;
+    let logs = args.logs.iter().map(|path| open_log(path)).collect::<Result<Vec<_>, _>>()?;
     // Checked before the search, so that its result cannot be lost.
     std::fs::create_dir_all(&args.out).map_err(|source| input(Unwritable { path: args.out.clone(), source }))?;
     let other_joint = logs[0].joints().iter().find(|name| name.parse::<Joint>().is_err());

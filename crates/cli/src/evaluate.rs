@@ -8,6 +8,7 @@ use twinstep_model::RobotModel;
 use twinstep_sim::{BatchRollout, SimConfig};
 
 use crate::exit::{CommandResult, Failure, input, other};
+use crate::open_log::open_log;
 use crate::robot_file::robot_model;
 use twinstep_report::{chart, evaluation_plot};
 
@@ -76,7 +77,7 @@ pub fn simulator(robot: &RobotModel) -> Result<BatchRollout, Failure> {
 /// Evaluates the model and prints its errors.
 pub fn run(args: &Args) -> CommandResult {
     let robot = robot_model(args.model.as_deref())?;
-    let log = Log::open(&args.log).map_err(input)?;
+    let log = open_log(&args.log)?;
     let rows = args.rows.of(&log)?;
     if let Some(path) = &args.plot {
         chart::check_writable(path).map_err(input)?;

@@ -9,10 +9,10 @@ use twinstep_ensemble::{
     Calibration, Checkpoint, Coverage, DataSet, Ensemble, EnsembleError, Epoch, JointEncoding, Training, TrainingEvent,
     TrainingOptions, TrainingResult as Ended,
 };
-use twinstep_logs::Log;
 
 use crate::cross_evaluation;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::open_log::open_log;
 use twinstep_report::chart::{self, GREY, HPos, Line, ORANGE, Panel, PlotError};
 
 /// Interval at which a running training is saved.
@@ -93,7 +93,7 @@ enum JointEncodingArg {
 pub fn run(args: &Args) -> CommandResult {
     let mut logs = Vec::new();
     for path in &args.logs {
-        logs.push((path.display().to_string(), Log::open(path).map_err(input)?));
+        logs.push((path.display().to_string(), open_log(path)?));
     }
     let data = DataSet::smoothed(&logs, args.smooth).map_err(input)?;
     if args.cross {

@@ -8,10 +8,10 @@ use twinstep_identify::{
     DEFAULT_EFFECTS, EffectAtScope, EstimateStatus, Experiment, GlobalSearch, Identification, IdentifyOptions,
     ParameterEstimate, Stage, WindowConfig, evaluate, identify,
 };
-use twinstep_logs::Log;
 
 use crate::evaluate::{Rows, simulator};
 use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::open_log::open_log;
 
 /// Estimate the parameters of effects from measured logs (sampling-based parameter identification, SPI-Active).
 ///
@@ -96,7 +96,7 @@ pub fn run(args: &Args) -> CommandResult {
     let robot = model.robot_model().map_err(input)?;
     let (mut experiments, mut logs) = (Vec::new(), Vec::new());
     for path in &args.logs {
-        let log = Log::open(path).map_err(input)?;
+        let log = open_log(path)?;
         let rows = args.rows.of(&log)?;
         experiments.push(
             Experiment::new(&log, &robot, WindowConfig::IDENTIFICATION).map_err(input)?.filter_rows(|row| rows[row]),

@@ -19,6 +19,7 @@ mod log;
 mod log_writer;
 mod mjcf;
 mod onboard_policy;
+mod open_log;
 mod operator;
 mod operator_screen;
 mod play;

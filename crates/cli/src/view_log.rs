@@ -10,6 +10,7 @@ use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo};
 
 use crate::evaluate::simulator;
 use crate::exit::{CommandResult, Failure, Signals, input};
+use crate::open_log::open_log;
 use crate::robot_file::robot_model;
 use crate::web_view::PageArgs;
 
@@ -20,7 +21,7 @@ const SPEEDS: [f64; 2] = [0.05, 4.0];
 
 /// Plays a log until a signal.
 pub fn run(path: &Path, model: Option<&Path>, page: &PageArgs, signals: &Signals) -> CommandResult {
-    let log = Log::open(path).map_err(input)?;
+    let log = open_log(path)?;
     let robot = robot_model(model)?;
     let measured = measured_poses(&log, &robot);
     let simulated = if model.is_some() { simulated_poses(&log, &robot)? } else { Vec::new() };

@@ -8,15 +8,16 @@ pub enum ExperimentError {
     /// The commands of the log cannot be simulated.
     #[error(transparent)]
     Motion(#[from] ReplayError),
-    /// The motion of a floating base was not measured.
+    /// The motion of a floating base was not measured and cannot be estimated.
     #[error(
-        "segment `{segment}` has base \"floating\", but the log has no `{missing}`, which is needed for the initial \
-         state of a window"
+        "segment `{segment}` has base \"floating\", but the log has no `{missing}`; a window starts from the orientation \
+         (quat) and from position and velocity of the base (pos, vel), or from an estimate of both, which needs quat, \
+         gyro and all joints"
     )]
     MissingBaseState {
         /// Name of the segment.
         segment: String,
         /// The missing channel.
-        missing: &'static str,
+        missing: String,
     },
 }

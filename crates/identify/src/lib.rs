@@ -4,6 +4,7 @@
 //! - [`apply_sensors()`]: adds sensor noise and resolution to a simulated log.
 //! - [`Experiment`]: a log split into windows that are simulated from measured states, with residuals in units of
 //!   noise.
+//! - [`BaseEstimate`]: motion of a floating base without motion capture, from legs and IMU.
 //! - [`EffectAtScope`]: an effect to estimate, as in `coulomb_friction@calf`.
 //! - [`replay`]: measured and simulated positions joint by joint.
 //! - [`evaluate()`]: the errors of a model on a log; [`position_errors`]: the same over time.
@@ -15,6 +16,7 @@
 //!
 //! Simulators implement [`twinstep_model::Rollout`]; this crate does not depend on an engine.
 
+mod base_estimate;
 mod cmaes;
 mod effect_list;
 mod error;
@@ -36,6 +38,7 @@ pub mod window;
 #[cfg(test)]
 mod tests;
 
+pub use base_estimate::BaseEstimate;
 pub use effect_list::{DEFAULT_EFFECTS, EffectAtScope, EffectAtScopeError, UnknownEffect, default_effects, named};
 pub use error::ExperimentError;
 pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};

@@ -55,7 +55,10 @@ pub enum LogError {
         folder: PathBuf,
     },
     /// The extension of a data file is unknown.
-    #[error("the format of `{file}` is unknown\n  name it *.parquet, *.csv, *.csv.gz or *.mcap")]
+    #[error(
+        "the format of `{file}` is unknown\n  name it *.parquet, *.csv, *.csv.gz or *.mcap; docs/logs.md says how to \
+         convert *.npz and *.db3"
+    )]
     UnknownFormat {
         /// The file.
         file: PathBuf,

@@ -9,9 +9,12 @@ use twinstep_model::BaseMount;
 use crate::LogError;
 use crate::columns::{Column, quantity};
 
+/// Keys of `meta.json`.
+pub(crate) const KEYS: [&str; 11] =
+    ["rate_hz", "policy_hz", "joints", "tau_sensor", "segments", "pd", "kp", "kd", "noise", "source", "licence"];
+
 /// Metadata of a log, the content of `meta.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Meta {
     /// Nominal rate of the rows [Hz].
     pub rate_hz: f64,
@@ -61,7 +64,6 @@ pub enum TorqueSensor {
 
 /// Named range of rows with one mount of the base.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Segment {
     /// Name, such as `air_chirp`.
     pub name: String,
@@ -97,13 +99,14 @@ impl Meta {
         }
     }
 
-    /// Reads metadata and checks all ranges.
-    pub(crate) fn read(file: &Path) -> Result<Meta, LogError> {
+    /// Reads metadata and checks all ranges. Returns them with the names of unknown keys, which are ignored.
+    pub(crate) fn read(file: &Path) -> Result<(Meta, Vec<String>), LogError> {
         let text = std::fs::read_to_string(file).map_err(|cause| LogError::Read { file: file.into(), cause })?;
-        let meta: Meta =
-            serde_json::from_str(&text).map_err(|cause| LogError::MetaSyntax { file: file.into(), cause })?;
+        let wrong = |cause| LogError::MetaSyntax { file: file.into(), cause };
+        let meta: Meta = serde_json::from_str(&text).map_err(wrong)?;
+        let given: BTreeMap<String, serde_json::Value> = serde_json::from_str(&text).map_err(wrong)?;
         meta.check(file)?;
-        Ok(meta)
+        Ok((meta, given.into_keys().filter(|key| !KEYS.contains(&key.as_str())).collect()))
     }
 
     /// Checks all ranges. Errors contain `file`.
@@ -164,5 +167,29 @@ impl Gain {
             Gain::Uniform(gain) => std::slice::from_ref(gain),
             Gain::PerJoint(gains) => gains,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keys_are_those_of_complete_metadata() {
+        let all = Meta {
+            policy_hz: Some(50.0),
+            joints: vec!["FL_hip".to_owned()],
+            pd: Some(String::new()),
+            kp: Some(Gain::Uniform(30.0)),
+            kd: Some(Gain::Uniform(1.0)),
+            noise: [("q".to_owned(), 0.001)].into(),
+            source: Some(String::new()),
+            licence: Some(String::new()),
+            ..Meta::new(200.0, TorqueSensor::None, Vec::new())
+        };
+        let written: serde_json::Map<_, _> =
+            serde_json::from_str(&serde_json::to_string(&all).expect("text")).expect("an object");
+        let keys: BTreeSet<&str> = written.keys().map(String::as_str).collect();
+        assert_eq!(keys, KEYS.into());
     }
 }

@@ -24,8 +24,8 @@ const COSTS: [(&str, Missed, &str); 14] = [
     ("quat", Missed::Always, "the base is assumed level: a tilt is attributed to a load"),
     ("gyro", Missed::Floating, "base rotation is not compared, and a gyro bias is not identifiable"),
     ("acc", Missed::Floating, "base acceleration is not compared"),
-    ("pos", Missed::Floating, "base position is not compared"),
-    ("vel", Missed::Floating, "base velocity is not compared, and initial states lack it"),
+    ("pos", Missed::Floating, "base height is estimated from the feet, and not compared"),
+    ("vel", Missed::Floating, "base velocity is estimated from the legs, and not compared"),
     ("contact", Missed::Floating, "contact times are inferred from a model"),
     ("foot_force", Missed::Floating, "contact forces are inferred from a model"),
 ];

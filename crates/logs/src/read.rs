@@ -4,6 +4,7 @@ use std::path::Path;
 
 use crate::check::{self, LogKind};
 use crate::files::{Files, Format};
+use crate::meta::KEYS;
 use crate::table::Table;
 use crate::{Log, LogError, Meta, csv_table, mcap_file, parquet_table};
 
@@ -37,18 +38,26 @@ impl Log {
 
 fn read(path: &Path, need: LogKind) -> Result<Log, LogError> {
     let files = Files::find(path)?;
-    let meta = files.meta.as_deref().map(Meta::read).transpose()?;
+    let (meta, unknown) = match files.meta.as_deref().map(Meta::read).transpose()? {
+        Some((meta, unknown)) => (Some(meta), unknown),
+        None => (None, Vec::new()),
+    };
     let meta_file = files.meta.as_ref().unwrap_or(&files.data);
     let needed = |meta: Option<Meta>| {
         meta.ok_or_else(|| LogError::NoMeta { expected: files.expected_meta(), data: files.data.clone() })
     };
     let open = || std::fs::File::open(&files.data).map_err(|cause| LogError::Read { file: files.data.clone(), cause });
-    let (table, meta) = match files.format {
+    let (mut table, meta) = match files.format {
         Format::Csv => (csv_table::read(&files.data, open()?)?, needed(meta)?),
         Format::CsvGz => (csv_table::read(&files.data, flate2::read::MultiGzDecoder::new(open()?))?, needed(meta)?),
         Format::Parquet => (parquet_table::read(&files.data)?, needed(meta)?),
         Format::Mcap => mcap_file::read(&files.data, meta)?,
     };
+    table.notes.extend(
+        unknown.iter().map(|key| {
+            format!("unknown key `{key}` of the meta file is ignored; the known keys are {}", KEYS.join(", "))
+        }),
+    );
     check::assemble(table, meta, meta_file, need)
 }
 

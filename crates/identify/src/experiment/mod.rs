@@ -18,7 +18,7 @@ pub use channel::ResidualChannel;
 pub use residuals::{SimulatedPose, estimated_torque};
 
 use crate::error::ExperimentError;
-use crate::window::{Window, WindowConfig, orientation, windows};
+use crate::window::{Window, WindowConfig, base_estimate, orientation, windows};
 use channel::{Channel, channels};
 
 /// Length of a block [s]; residuals of different blocks are treated as independent.
@@ -45,6 +45,8 @@ pub struct Experiment {
     /// Number of rows in a block.
     rows_per_block: usize,
     conditions: OperatingConditions,
+    /// Standard deviations of position and velocity of the initial states, where they are estimated [m], [m/s].
+    estimated_start: Option<[f64; 2]>,
 }
 
 impl Experiment {
@@ -64,6 +66,8 @@ impl Experiment {
             joints,
             rows_per_block: ((BLOCK_S * log.meta().rate_hz).round() as usize).max(1),
             conditions: OperatingConditions::of(log),
+            estimated_start: base_estimate(log, robot)?
+                .map(|estimate| [estimate.height_sigma, estimate.velocity_sigma]),
         })
     }
 
@@ -154,7 +158,17 @@ impl Experiment {
         ][of_axis];
         // The variance of a parabola fit through n cells within 20 ms is 9 / 4n of a cell's variance at the midpoint.
         let cells = 1.0 + 0.04 * self.rows_per_block as f64 / BLOCK_S;
-        let error = size * (2.25 / cells).sqrt().min(1.0) * self.sigma(quantity(axis));
+        let quantity = quantity(axis);
+        let is_compared = self.channels.iter().any(|channel| channel.quantity == quantity);
+        let error = match (quantity, self.estimated_start) {
+            (ResidualChannel::BasePosition(_), Some([sigma, _]))
+            | (ResidualChannel::BaseVelocity(_), Some([_, sigma]))
+                if !is_compared =>
+            {
+                size * sigma
+            }
+            _ => size * (2.25 / cells).sqrt().min(1.0) * self.sigma(quantity),
+        };
         let mut perturbed = self.clone();
         for window in perturbed.windows.iter_mut().filter(|window| !window.base.is_fixed()) {
             window.perturb_start(of_axis, axis, error);

@@ -104,8 +104,8 @@ fn summary_of_a_log_with_gaps_missing_channels_and_warnings() {
           quat           the base is assumed level: a tilt is attributed to a load
           gyro           base rotation is not compared, and a gyro bias is not identifiable
           acc            base acceleration is not compared
-          pos            base position is not compared
-          vel            base velocity is not compared, and initial states lack it
+          pos            base height is estimated from the feet, and not compared
+          vel            base velocity is estimated from the legs, and not compared
           contact        contact times are inferred from a model
           foot_force     contact forces are inferred from a model
         joints             position [rad]          speed [rad/s]        torque [N·m]     reversals   frequency

@@ -55,7 +55,7 @@ fn error_for_an_unknown_format_lists_the_known_ones() {
     let error = Log::open(file).expect_err("no log").to_string();
     expect![[r#"
         the format of `log/walk.xlsx` is unknown
-          name it *.parquet, *.csv, *.csv.gz or *.mcap"#]]
+          name it *.parquet, *.csv, *.csv.gz or *.mcap; docs/logs.md says how to convert *.npz and *.db3"#]]
     .assert_eq(&error.replace(&folder.path().display().to_string(), "log"));
 }
 
@@ -215,13 +215,20 @@ fn columns_of_unequal_length_are_rejected() {
 }
 
 #[test]
-fn error_for_a_misspelt_key_lists_the_keys() {
+fn missing_key_of_the_metadata_is_named() {
     check_meta(
         &META.replace("rate_hz", "rate"),
-        &expect![
-            "`log/meta.json`: unknown field `rate`, expected one of `rate_hz`, `policy_hz`, `joints`, `tau_sensor`, `segments`, `pd`, `kp`, `kd`, `noise`, `source`, `licence` at line 1 column 7"
-        ],
+        &expect!["`log/meta.json`: missing field `rate_hz` at line 1 column 85"],
     );
+}
+
+#[test]
+fn unknown_key_of_the_metadata_is_ignored_with_a_warning() {
+    let log = folder(CSV, &META.replacen('{', r#"{"robot": "Go2 EDU", "#, 1));
+    let log = Log::open(log.path()).expect("a log");
+    expect![[r"
+        unknown key `robot` of the meta file is ignored; the known keys are rate_hz, policy_hz, joints, tau_sensor, segments, pd, kp, kd, noise, source, licence"]]
+    .assert_eq(&log.read_warnings().join("\n"));
 }
 
 #[test]
