@@ -16,6 +16,10 @@ use super::scan::{self, ScoredHypothesis, scan};
 ///
 /// Set by hand after a false positive with 22 nat in a case of `twinstep hunt` that is not in a published table.
 pub const THRESHOLD: f64 = 30.0;
+/// Share of the largest log-likelihood gain that a further cause must reach.
+///
+/// The laws of the catalogue are approximations, and what a large effect leaves imitates small ones.
+const MIN_SHARE_OF_LARGEST: f64 = 0.01;
 /// Maximum number of causes.
 const MOST_CAUSES: usize = 12;
 /// Maximum number of rounds of selection and elimination.
@@ -129,8 +133,10 @@ impl<'a> ForwardSelection<'a> {
             trials.extend(self.evaluate(alike, excluded, &left)?);
             trials.sort_by(best_first);
         }
+        let largest = self.accepted.iter().map(|(best, _)| best.score).fold(0.0, f64::max);
+        let least = THRESHOLD.max(MIN_SHARE_OF_LARGEST * largest);
         let earns_name = |trial: &CandidateFit| {
-            trial.score >= THRESHOLD
+            trial.score >= least
                 && trial.explained_fraction >= MIN_EXPLAINED_FRACTION
                 && trial.hypothesis.exceeds_min_size()
         };
@@ -231,7 +237,8 @@ pub fn write_estimates(accepted: &mut Accepted, fit: &FitProblem, point: &[f64])
 
 /// Returns the hypotheses of the scan to fit in full simulation.
 ///
-/// Joints, bodies and encoder offsets are ranked separately, because the scan evaluates them on different rows.
+/// Joints, bodies and encoder offsets are ranked separately, because the scan evaluates them on different rows. Encoder
+/// offsets are left out where the robot walks: feet that touch down at other times in the model imitate them.
 fn candidates(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<Hypothesis> {
     let scored = scan(evidence, model, simulator).into_iter().filter(|scored| scored.score > 0.0);
     let of_joints =
@@ -246,7 +253,7 @@ fn candidates(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Ro
     };
     tried(joints, MAX_JOINT_CANDIDATES)
         .chain(tried(whole, MAX_BODY_CANDIDATES))
-        .chain(tried(offsets, MAX_BODY_CANDIDATES))
+        .chain(tried(offsets, if evidence.is_dynamic { 0 } else { MAX_BODY_CANDIDATES }))
         .collect()
 }
 

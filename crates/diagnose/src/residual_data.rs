@@ -36,6 +36,8 @@ pub struct ResidualData {
     /// Rows of `fit_rows` with a fixed base, in which the joints are nearly decoupled; all rows if there are none.
     fixed_base_rows: ResidualRows,
     torques: Vec<MeasuredTorque>,
+    /// True if the robot walks, trots or jumps in windows that are compared.
+    pub is_dynamic: bool,
 }
 
 impl ResidualData {
@@ -43,7 +45,7 @@ impl ResidualData {
     pub fn new(logs: Vec<Log>, robot: &RobotModel, horizon: WindowConfig) -> Result<Self, ExperimentError> {
         let experiments: Vec<Experiment> =
             logs.iter().map(|log| Experiment::new(log, robot, horizon)).collect::<Result<_, _>>()?;
-        let experiments = without_dynamic_windows(&logs, experiments);
+        let (experiments, is_dynamic) = without_dynamic_windows(&logs, experiments);
         let only = |keep: &dyn Fn(Option<usize>) -> bool| -> Vec<Experiment> {
             let pairs = logs.iter().zip(&experiments);
             pairs.map(|(log, experiment)| experiment.clone().filter_rows(|row| keep(fold_of(log, row)))).collect()
@@ -55,6 +57,7 @@ impl ResidualData {
             folds: [0, 1].map(|fold| ResidualRows::new(&logs, only(&|of| of == Some(fold)))),
             fit_rows: ResidualRows::new(&logs, whole),
             fixed_base_rows: ResidualRows::new(&logs, quick),
+            is_dynamic,
             logs,
         })
     }
@@ -156,10 +159,17 @@ impl ResidualData {
 }
 
 /// Returns the experiments without windows in which the robot walks or jumps, if the others last [`LEAST_QUIET_S`].
-fn without_dynamic_windows(logs: &[Log], experiments: Vec<Experiment>) -> Vec<Experiment> {
+///
+/// Also returns whether such windows are left.
+fn without_dynamic_windows(logs: &[Log], experiments: Vec<Experiment>) -> (Vec<Experiment>, bool) {
     let quiet: Vec<Experiment> = experiments.iter().cloned().map(Experiment::without_dynamic_windows).collect();
+    let rows = |experiments: &[Experiment]| experiments.iter().map(Experiment::num_rows).sum::<usize>();
     let seconds: f64 = logs.iter().zip(&quiet).map(|(log, quiet)| quiet.num_rows() as f64 / log.meta().rate_hz).sum();
-    if seconds >= LEAST_QUIET_S { quiet } else { experiments }
+    if seconds >= LEAST_QUIET_S {
+        return (quiet, false);
+    }
+    let is_dynamic = rows(&quiet) < rows(&experiments);
+    (experiments, is_dynamic)
 }
 
 fn variance(values: &[f64]) -> f64 {
