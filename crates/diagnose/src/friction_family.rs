@@ -26,6 +26,8 @@ const INITIAL_SHARE: f64 = 0.1;
 const LEAST_EVIDENCE: f64 = THRESHOLD / 3.0;
 /// Maximum number of joints whose friction differs from that of their type.
 const MOST_JOINTS: usize = 8;
+/// Share of the single causes' log-likelihood gain that the three laws alone must reach for the search to go on.
+const LEAST_SHARE: f64 = 0.5;
 /// Number of joints with the largest residuals that are tried.
 const TRIED_JOINTS: usize = 4;
 /// Power above noise that single causes may leave, relative to that of the given model, without a fit of the family.
@@ -46,11 +48,13 @@ pub fn extend(search: &mut ForwardSelection) -> Result<(), DiagnoseError> {
     let laws = JointKind::ALL.into_iter().flat_map(|kind| of_scope(Scope::Kind(kind)));
     search.accepted = laws.map(|hypothesis| (unscored(hypothesis), Vec::new())).collect();
     search.refit();
-    eliminate_without_evidence(search);
-    add_joints_that_differ(search)?;
-    search.run()?;
-    eliminate_without_evidence(search);
-    update_evidence(search)?;
+    if together(search) > LEAST_SHARE * before {
+        eliminate_without_evidence(search);
+        add_joints_that_differ(search)?;
+        search.run()?;
+        eliminate_without_evidence(search);
+        update_evidence(search)?;
+    }
     if together(search) <= before {
         (search.accepted, search.model, search.view) = (single, model, view);
     }
