@@ -2,11 +2,13 @@
 
 use std::f64::consts::TAU;
 
+use glam::DVec3;
 use twinstep_diagnose::{Diagnosis, ParameterValue};
 use twinstep_effects::{Effect, EffectEntry, Scope, apply_effects};
+use twinstep_identify::window::orientation;
 use twinstep_identify::{BaseEstimate, Sensor, apply_sensors, record};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
-use twinstep_model::{BaseMount, Joint, JointKind, Leg, RobotModel, go2};
+use twinstep_model::{BaseMount, Joint, JointKind, Leg, RobotModel, go2, standard_normal, stream};
 use twinstep_sim::{Engine, RapierBackend, SimConfig};
 
 use crate::identify::twinstep;
@@ -65,15 +67,40 @@ fn errors(log: &Log, estimate: &BaseEstimate, rows: std::ops::Range<usize>) -> [
 
 #[test]
 fn height_and_velocity_of_a_trotting_and_hopping_robot_are_estimated_from_its_legs() {
-    let log = log(&go2(), ROWS);
-    let estimate = BaseEstimate::of(&log, &go2());
-    for (name, rows, most) in [("trot", 0..800, [0.002, 0.06]), ("hop", 800..ROWS, [0.012, 0.2])] {
-        let [height, velocity] = errors(&log, &estimate, rows);
-        let told = format!("{name}: height {height:.4} m, velocity {velocity:.3} m/s");
-        println!("{told}; predicted {:.4} m, {:.3} m/s", estimate.height_sigma, estimate.velocity_sigma);
-        assert!(height < most[0] && velocity < most[1], "{told}");
-        assert!(height < 4.0 * estimate.height_sigma && velocity < 4.0 * estimate.velocity_sigma, "{told}");
+    let forces = log(&go2(), ROWS);
+    let accelerometer = with_accelerometer(&forces);
+    for (sensor, log) in [("forces", forces), ("accelerometer", accelerometer)] {
+        let estimate = BaseEstimate::of(&log, &go2());
+        for (name, rows, most) in [("trot", 0..800, [0.002, 0.06]), ("hop", 800..ROWS, [0.012, 0.2])] {
+            let [height, velocity] = errors(&log, &estimate, rows);
+            let told = format!("{sensor}, {name}: height {height:.4} m, velocity {velocity:.3} m/s");
+            println!("{told}; predicted {:.4} m, {:.3} m/s", estimate.height_sigma, estimate.velocity_sigma);
+            assert!(height < most[0] && velocity < most[1], "{told}");
+            assert!(height < 4.0 * estimate.height_sigma && velocity < 4.0 * estimate.velocity_sigma, "{told}");
+        }
     }
+}
+
+/// Returns the log with an accelerometer of 0.2 m/s² noise in place of force sensors.
+fn with_accelerometer(log: &Log) -> Log {
+    let row_of =
+        |kind: &str, row: usize| ["x", "y", "z"].map(|axis| log.channel(&format!("{kind}_{axis}")).unwrap()[row]);
+    let mut random = stream(2, "accelerometer", 0);
+    let of_row = |row: usize| {
+        let [before, after] = [row.saturating_sub(1), (row + 1).min(log.rows() - 1)];
+        let [v0, v1] = [before, after].map(|row| DVec3::from_array(row_of("vel", row)));
+        let force = (v1 - v0) / (log.t()[after] - log.t()[before]) + DVec3::new(0.0, 0.0, 9.81);
+        orientation(log, row).inverse() * force
+    };
+    let exact: Vec<DVec3> = (0..log.rows()).map(of_row).collect();
+    let kept = log.channels().filter(|(name, _)| !name.starts_with("foot_force_"));
+    let columns = kept.map(|(name, cells)| (name.to_owned(), cells.to_vec())).collect::<Vec<_>>();
+    let acc = (0..3).map(|axis| {
+        let cells = exact.iter().map(|acc| acc[axis] + 0.2 * standard_normal(&mut random)).collect();
+        (format!("acc_{}", ["x", "y", "z"][axis]), cells)
+    });
+    let acc: Vec<(String, Vec<f64>)> = acc.collect();
+    Log::new(log.meta().clone(), columns.into_iter().chain(acc).chain([("t".to_owned(), log.t().to_vec())])).unwrap()
 }
 
 #[test]

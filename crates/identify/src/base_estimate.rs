@@ -3,7 +3,8 @@
 //! A foot on the ground does not slip, and rolls about its contact point, so that joint positions and velocities,
 //! angular velocity and orientation give the velocity of the base; on flat ground they give its height. Each foot is a
 //! measurement in a Kalman filter for each world axis, with the accelerometer as input. Feet in the air are left out: by
-//! the log's `contact` or `foot_force`, or because they contradict the filter. A Rauch–Tung–Striebel smoother then uses the rows before and after each row.
+//! the log's `contact` or `foot_force`, or because they contradict the filter. A Rauch–Tung–Striebel smoother then uses
+//! the rows before and after each row.
 //!
 //! Bloesch et al., *State Estimation for Legged Robots – Consistent Fusion of Leg Kinematics and IMU*, 2012, estimate
 //! orientation too; here it is the robot's own.
@@ -30,7 +31,6 @@ const SWING_HEIGHT: f64 = 0.02;
 const MEASURED_ACCELERATION_DENSITY: f64 = 0.1;
 /// Spectral density of the accelerations of a robot without an accelerometer [m²/s³].
 const UNKNOWN_ACCELERATION_DENSITY: f64 = 5.0;
-
 /// Share of a foot's highest force below which it is in the air; feet that never fall below it always stand.
 const CONTACT_SHARE: f64 = 0.15;
 
@@ -148,18 +148,18 @@ fn measurements(log: &Log, robot: &RobotModel) -> Vec<RowMeasurement> {
     (0..log.rows()).map(of_row).collect()
 }
 
-/// Returns whether a foot stands in each row, from `contact` or `foot_force`; `None` if the log has neither.
+/// Returns whether a foot stands in each row, from `contact` or `foot_force`; `None` if the log has neither, or zeros.
 fn contacts(log: &Log, leg: Leg) -> Option<Vec<Option<bool>>> {
     let known = |cells: &[f64], threshold: f64| -> Vec<Option<bool>> {
         cells.iter().map(|cell| cell.is_finite().then_some(*cell > threshold)).collect()
     };
-    if let Some(cells) = log.channel(&format!("contact_{leg:?}")) {
+    if let Some(cells) = log.channel(&format!("contact_{leg:?}")).filter(|cells| cells.iter().any(|cell| *cell > 0.5)) {
         return Some(known(cells, 0.5));
     }
     let forces = log.channel(&format!("foot_force_{leg:?}"))?;
     let mut sorted: Vec<f64> = forces.iter().copied().filter(|force| force.is_finite()).collect();
     sorted.sort_by(f64::total_cmp);
-    let highest = *sorted.get(sorted.len().saturating_sub(1) * 9 / 10)?;
+    let highest = *sorted.get(sorted.len().saturating_sub(1) * 9 / 10).filter(|force| **force > 0.0)?;
     Some(known(forces, CONTACT_SHARE * highest))
 }
 
