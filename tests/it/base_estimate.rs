@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use glam::DVec3;
 use twinstep_diagnose::{Diagnosis, ParameterValue};
 use twinstep_effects::{Effect, EffectEntry, Scope, apply_effects};
-use twinstep_identify::window::orientation;
+use twinstep_identify::orientation::orientation;
 use twinstep_identify::{BaseEstimate, Sensor, apply_sensors, record};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{BaseMount, Joint, JointKind, Leg, RobotModel, go2, standard_normal, stream};

@@ -13,7 +13,7 @@ use glam::{DMat2, DVec2, DVec3};
 use twinstep_logs::Log;
 use twinstep_model::{FootKinematics, Joint, Leg, NUM_JOINTS, NUM_LEGS, RobotModel};
 
-use crate::window::orientation;
+use crate::orientation::orientation;
 
 /// Gravitational acceleration [m/s²].
 const GRAVITY: DVec3 = DVec3::new(0.0, 0.0, -9.81);

@@ -27,6 +27,7 @@ pub mod identify;
 mod inverse_dynamics;
 pub mod least_squares;
 pub mod nuisance;
+pub mod orientation;
 pub mod parameter;
 mod record;
 pub mod refine;

@@ -9,6 +9,7 @@ use twinstep_model::{ActuatorParams, BaseMount, Command, Ground, HistoryStep, In
 
 use crate::base_estimate::BaseEstimate;
 use crate::error::ExperimentError;
+use crate::orientation::normalized;
 use twinstep_logs::replay::{ActuatorClock, JointCommands, command, joint_commands};
 
 /// Lengths of the windows of a log.
@@ -132,19 +133,6 @@ pub fn base_estimate(log: &Log, robot: &RobotModel) -> Result<Option<BaseEstimat
         }
         None => Ok((!is_measured).then(|| BaseEstimate::of(log, robot))),
     }
-}
-
-/// Returns the measured orientation world-from-base; the identity if it is missing.
-pub fn orientation(log: &Log, row: usize) -> DQuat {
-    let [w, x, y, z] =
-        ["w", "x", "y", "z"].map(|part| log.channel(&format!("quat_{part}")).map_or(f64::NAN, |cells| cells[row]));
-    normalized([w, x, y, z])
-}
-
-/// Returns the normalised quaternion; the identity if it is not finite or nearly zero.
-fn normalized([w, x, y, z]: [f64; 4]) -> DQuat {
-    let rotation = DQuat::from_xyzw(x, y, z, w);
-    if rotation.is_finite() && rotation.length() > 0.5 { rotation.normalize() } else { DQuat::IDENTITY }
 }
 
 /// Builder of windows from a log.

@@ -18,7 +18,8 @@ pub use channel::ResidualChannel;
 pub use residuals::{SimulatedPose, estimated_torque};
 
 use crate::error::ExperimentError;
-use crate::window::{Window, WindowConfig, base_estimate, orientation, windows};
+use crate::orientation::orientation;
+use crate::window::{Window, WindowConfig, base_estimate, windows};
 use channel::{Channel, channels};
 
 /// Length of a block [s]; residuals of different blocks are treated as independent.
