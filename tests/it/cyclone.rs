@@ -26,7 +26,7 @@ fn robot_with_the_vendors_dds_is_observed_released_and_stands_up() {
     let report = pair.ask("statistics").unwrap();
     assert_eq!(report["wrong_checksum"], 0, "by its own code: {report}");
     assert_eq!((&report["not_low_level"], &report["before_release"]), (&0.into(), &0.into()), "{report}");
-    // At most 500 Hz for the 3 s in which it stands up: a busy machine runs the robot's Python slower.
+    // Up to 500 Hz for the 3 s in which it stands up: a busy machine runs the robot's Python slower.
     assert!(report["received"].as_u64().unwrap() > 100, "{report}");
     // Motors in the robot's order, which begins with the right front leg: the hips of the two sides differ by sign.
     let q: Vec<f64> = report["q"].as_array().unwrap().iter().map(|q| q.as_f64().unwrap()).collect();
