@@ -1,6 +1,7 @@
 //! The shipped security files: which clients are accepted, which are rejected, and with which errors.
 
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -8,6 +9,7 @@ use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{Config, Server, ServerError, SimEnvFactory};
 use twinstep_envs::TaskConfig;
 use twinstep_model::{ResetRequest, VecEnv};
+use twinstep_tests::python::{python, root, run};
 use twinstep_tests::security::SecurityFolder;
 
 /// Starts a server with the Zenoh configuration `zenoh` and a lease grace period of 0.
@@ -126,6 +128,39 @@ fn client_steps_over_tls() {
     let (server, endpoint) = serve("tls", &folder.path("server-tls.json5"));
     assert!(endpoint.starts_with("tls/"));
     steps(&endpoint, Some(folder.path("client-tls.json5")));
+    server.shutdown();
+}
+
+#[test]
+fn client_steps_over_quic_with_the_files_of_tls() {
+    let folder = SecurityFolder::new().unwrap();
+    let (server, endpoint) = serve("quic", &folder.path("server-tls.json5"));
+    assert!(endpoint.starts_with("quic/"));
+    steps(&endpoint, Some(folder.path("client-tls.json5")));
+    rejected(&endpoint, None);
+    server.shutdown();
+}
+
+const PYTHON_STEPS: &str = "
+import sys
+import numpy as np
+import twinstep
+env = twinstep.Go2VectorEnv(256, task='counter', endpoint=sys.argv[1], zenoh_config=sys.argv[2])
+env.reset()
+for count in range(1, 201):
+    observation = env.step(np.full((256, 12), 0.5, np.float32))[0]
+    assert (observation[:, 0] == count).all(), (count, observation[:, 0])
+env.close()
+";
+
+#[test]
+fn python_client_steps_over_quic() {
+    let Some(python) = python(&crate::python::target()).unwrap() else { return };
+    let folder = SecurityFolder::new().unwrap();
+    let (server, endpoint) = serve("quic", &folder.path("server-tls.json5"));
+    let mut client = Command::new(python);
+    client.args(["-c", PYTHON_STEPS, &endpoint]).arg(folder.path("client-tls.json5"));
+    run(client.env("PYTHONPATH", root().join("clients/python/src"))).unwrap_or_else(|printed| panic!("{printed}"));
     server.shutdown();
 }
 
