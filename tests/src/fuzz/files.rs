@@ -12,7 +12,7 @@ use twinstep_model::{BaseMount, ImportError, ImportNames, Joint, MjcfOptions, go
 use twinstep_protocol::{Secret, keys};
 
 use super::format::{Format, Outcome, examples_in};
-use super::{log_examples, weights_examples};
+use super::{log_examples, policies, weights_examples};
 
 /// Returns bytes compressed with gzip.
 pub fn compressed(bytes: &[u8]) -> Vec<u8> {
@@ -126,6 +126,9 @@ pub fn read(format: Format, bytes: &[u8], folder: &Path) -> Outcome {
         Format::Ensemble => read_ensemble(&write(folder, "ensemble", bytes)),
         Format::Training => {
             outcome(Checkpoint::read(&write(folder, "training", bytes)), |checkpoint| checkpoint.curves().count() > 0)
+        }
+        Format::Policy | Format::Onnx | Format::Mapping | Format::LowState | Format::RpcResponse => {
+            policies::read(format, bytes, &write(folder, "policy", bytes))
         }
         text => match std::str::from_utf8(bytes) {
             Ok(text_of_file) => read_text(text, text_of_file, folder),

@@ -91,6 +91,16 @@ pub enum Format {
     Training,
     /// Interrupted identification (JSON).
     Search,
+    /// Policy (safetensors).
+    Policy,
+    /// Policy as an ONNX model.
+    Onnx,
+    /// Mapping of a foreign policy (TOML).
+    Mapping,
+    /// State of the robot, as its DDS topic has it (CDR).
+    LowState,
+    /// Response of a service of the robot (CDR).
+    RpcResponse,
     /// Zenoh configuration (JSON5).
     Zenoh,
     /// Arguments of the command line that are parsed: scopes, effects, joints, secrets; and keys of the protocol.
@@ -98,7 +108,7 @@ pub enum Format {
 }
 
 /// Formats of files, with their names.
-const FILES: [(Format, &str); 14] = [
+const FILES: [(Format, &str); 19] = [
     (Format::Model, "model_file"),
     (Format::Urdf, "robot_urdf"),
     (Format::Mjcf, "robot_mjcf"),
@@ -111,6 +121,11 @@ const FILES: [(Format, &str); 14] = [
     (Format::Ensemble, "ensemble"),
     (Format::Training, "training"),
     (Format::Search, "search"),
+    (Format::Policy, "policy"),
+    (Format::Onnx, "policy_onnx"),
+    (Format::Mapping, "policy_mapping"),
+    (Format::LowState, "robot_low_state"),
+    (Format::RpcResponse, "robot_rpc_response"),
     (Format::Zenoh, "zenoh_config"),
     (Format::Argument, "argument"),
 ];
@@ -158,8 +173,8 @@ impl Format {
 
     /// Returns true if changes to words and lines are useful.
     pub fn is_text(self) -> bool {
-        use Format::{Argument, Config, Csv, Meta, Mjcf, Model, Search, Urdf, Zenoh};
-        matches!(self, Model | Urdf | Mjcf | Config | Csv | Meta | Search | Zenoh | Argument)
+        use Format::{Argument, Config, Csv, Mapping, Meta, Mjcf, Model, Search, Urdf, Zenoh};
+        matches!(self, Model | Urdf | Mjcf | Config | Csv | Mapping | Meta | Search | Zenoh | Argument)
     }
 
     /// Returns the maximum memory that reading an input may need.

@@ -43,7 +43,7 @@ impl Corpus {
                 compressed(&mutate(&mut random, &csv, std::slice::from_ref(&csv), true))
             }
             // Words of the header are changed together with its length.
-            Format::Ensemble | Format::Training if random.random_range(0..4) > 0 => {
+            Format::Ensemble | Format::Training | Format::Policy if random.random_range(0..4) > 0 => {
                 let (header, data) = weights_examples::header_and_data(base);
                 weights_examples::with_header(&mutate(&mut random, header, &[header.to_vec()], true), data)
             }

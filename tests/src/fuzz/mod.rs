@@ -11,6 +11,7 @@ pub mod format;
 pub mod input;
 pub mod log_examples;
 pub mod mutation;
+pub mod policies;
 pub mod readers;
 pub mod report;
 pub mod weights_examples;

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::format::{Format, Outcome, examples_in};
-use super::{files, log_examples, weights_examples};
+use super::{files, log_examples, policies, weights_examples};
 
 impl Format {
     /// Returns valid inputs.
@@ -20,6 +20,9 @@ impl Format {
             Format::Meta => vec![log_examples::meta().into_bytes()],
             Format::Ensemble => vec![weights_examples::ensemble()],
             Format::Training => vec![weights_examples::training()],
+            Format::Policy | Format::Onnx | Format::Mapping | Format::LowState | Format::RpcResponse => {
+                policies::examples(self)
+            }
             text => files::text_examples(text),
         }
     }
