@@ -3,7 +3,7 @@
 use twinstep_effects::{ModelFile, ModelFileError};
 use twinstep_effects::{RobotSampler, SamplingError};
 use twinstep_ensemble::{ActuatorNetworkRobot, EnsembleError};
-use twinstep_envs::{CounterEnv, TaskConfig, TaskEnv, TaskEnvConfig, Walk};
+use twinstep_envs::{CounterEnv, TaskConfig, TaskEnv, TaskEnvConfig, Track, Walk};
 use twinstep_model::{Actuator, AutoresetMode, Backend, RobotModel, VecEnv};
 use twinstep_sim::{BackendBuildError, BatchBackend, Engine, MujocoBackend, RapierBackend};
 
@@ -182,6 +182,10 @@ fn task_env(
         TaskConfig::Walk(config) => {
             let walk = Walk::new(config.clone(), robot, has_ground_truth)?;
             Ok(Box::new(TaskEnv::new(backend, walk, settings)?))
+        }
+        TaskConfig::Track(config) => {
+            let track = Track::new(config.clone(), robot, has_ground_truth)?;
+            Ok(Box::new(TaskEnv::new(backend, track, settings)?))
         }
         TaskConfig::Counter => Ok(Box::new(CounterEnv::new(robot, backend.num_robots(), settings.autoreset))),
     }

@@ -1,13 +1,17 @@
-"""Documents that are generated from the spec of the server."""
+"""The pages of entries are those of the server."""
 
 from pathlib import Path
 
-from twinstep import Go2VectorEnv
+import pytest
+
+import twinstep
 from twinstep.tables import tables
 
 
-def test_page_of_the_walk_task_is_up_to_date() -> None:
-    page = Path(__file__).parents[3] / "docs" / "go2-walk.md"
-    envs = Go2VectorEnv(1, critic=True)
-    assert page.read_text() == tables(envs.twinstep_spec), "update it: python -m twinstep.tables > docs/go2-walk.md"
+@pytest.mark.parametrize("task", ["walk", "track"])
+def test_page_is_up_to_date(task: str) -> None:
+    page = Path(__file__).parents[3] / f"docs/go2-{task}.md"
+    envs = twinstep.Go2VectorEnv(1, critic=True, task=task)
+    command = f"python -m twinstep.tables {task} > docs/go2-{task}.md"
+    assert page.read_text() == tables(envs.twinstep_spec), f"update it: {command}"
     envs.close()

@@ -5,13 +5,14 @@ use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
-use twinstep_envs::{ObservationNoise, Randomisation};
+use twinstep_envs::{ObservationNoise, Randomisation, TaskConfig};
 use twinstep_learning::{Evaluation, EvaluationError, EvaluationPlan, SpeedBin, evaluate};
-use twinstep_model::{EnvError, ResetRequest, VecEnv};
+use twinstep_model::{EnvError, EnvSpec, ResetRequest, VecEnv};
 use twinstep_policy::{Policy, PolicyRunner};
 use twinstep_report::film_strip;
 use twinstep_sim::{Engine, RoughTerrain, SimConfig, Terrain};
 
+use crate::evaluate_tracking::{self, TrackingRow};
 use crate::exit::{CommandResult, Failure, Signals, input};
 use crate::robot_file::robot_model;
 use crate::serve::engine;
@@ -23,8 +24,9 @@ const FILM_STEPS: usize = 4;
 
 /// Evaluate a policy: velocity errors, falls and gait, on engines and robots that it has not seen.
 ///
-/// The mean action of the policy steps fresh robots with the default commands of `walk`: a new one every 5 s. A robot
-/// that has fallen no longer counts for the errors. Conditions:
+/// The mean action of the policy steps fresh robots with the default commands of `walk`: a new one every 5 s. A policy of
+/// `track` follows a circle, a figure of eight and a square, with and without motion capture. A robot that has fallen no
+/// longer counts for the errors. Conditions:
 ///
 ///   nominal   the robot of the model file on flat ground
 ///   robots    masses +-15 %, friction 0.4 to 1.25, gains +-10 %
@@ -127,10 +129,10 @@ fn conditions(engine: Option<Engine>) -> Vec<Condition> {
 
 impl Condition {
     /// Creates `robots` robots.
-    fn env(&self, args: &Args, robots: usize) -> Result<Box<dyn VecEnv>, Failure> {
+    fn env(&self, args: &Args, task: TaskConfig, robots: usize) -> Result<Box<dyn VecEnv>, Failure> {
         let sim = SimConfig { engine: self.engine, terrain: self.terrain, ..SimConfig::default() };
-        let config =
-            TrainConfig { model: args.model.clone(), sim, randomise: self.randomise, ..TrainConfig::default() };
+        let (model, randomise) = (args.model.clone(), self.randomise);
+        let config = TrainConfig { model, task, sim, randomise, ..TrainConfig::default() };
         Ok(config.envs(robots, 1, 0)?.remove(0))
     }
 }
@@ -142,40 +144,95 @@ pub fn run(args: &Args) -> CommandResult {
         return Err(Failure::Input(miette::miette!("`--seconds` = {} is not allowed: 1 to 3600 s", args.seconds)));
     }
     let (policy, _) = Policy::read(&args.policy).map_err(input)?;
-    let robot = robot_model(args.model.as_deref())?;
-    let plan = EvaluationPlan { robot: &robot, seconds: args.seconds, seed: args.seed };
-    let conditions = conditions(args.engine);
+    let task = TaskConfig::named(&policy.spec.task).unwrap_or_default();
     if let Some(path) = &args.film {
-        let mut env = conditions[0].env(args, 1)?;
+        let mut env = conditions(args.engine)[0].env(args, task.clone(), 1)?;
+        check_spec(&policy, env.spec())?;
         let film = film(&policy, env.as_mut(), args.seed).map_err(input)?;
         std::fs::write(path, film).map_err(|cause| {
             Failure::Input(miette::miette!("`--film` = {}: cannot write the file: {cause}", path.display()))
         })?;
     }
+    let text = match task {
+        TaskConfig::Track(_) => {
+            let rows = tracking(args, &policy, &signals)?;
+            if args.json { json(args, &rows) } else { evaluate_tracking::table(args.robots, args.seconds, &rows) }
+        }
+        _ => {
+            let rows = walking(args, &policy, &signals)?;
+            if args.json {
+                json(args, &rows)
+            } else {
+                format!("{}\n{}", table(args, &rows), speed_table(&rows[0].evaluation))
+            }
+        }
+    };
+    print!("{text}");
+    Ok(())
+}
+
+fn json(args: &Args, rows: &impl Serialize) -> String {
+    format!("{}\n", serde_json::json!({ "policy": args.policy, "rows": rows }))
+}
+
+/// Evaluates the policy by velocity commands under each condition.
+fn walking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<Row>, Failure> {
+    let robot = robot_model(args.model.as_deref())?;
+    let plan = EvaluationPlan { robot: &robot, seconds: args.seconds, seed: args.seed };
     let mut rows = Vec::new();
-    for condition in conditions {
-        let mut env = condition.env(args, args.robots as usize)?;
+    for condition in conditions(args.engine) {
+        let mut env = condition.env(args, TaskConfig::default(), args.robots as usize)?;
         let Condition { name, engine, .. } = condition;
-        let bar = ProgressBar::new(100).with_message(name).with_style(
-            ProgressStyle::with_template("{msg:10} {bar:32} {pos} %  ETA {eta}").expect("the template is valid"),
-        );
-        let proceed = |share: f64| {
-            bar.set_position((100.0 * share) as u64);
-            matches!(signals.check(), Ok(false))
-        };
-        let evaluation = evaluate(&policy, env.as_mut(), plan, proceed).map_err(|error| match error {
+        let bar = progress_bar(name);
+        let proceed = |share: f64| show(&bar, share, signals);
+        let evaluation = evaluate(policy, env.as_mut(), plan, proceed).map_err(|error| match error {
             EvaluationError::Stopped => Failure::Interrupted,
             _ => input(error),
         })?;
         bar.finish_and_clear();
         rows.push(Row { condition: name, engine, evaluation });
     }
-    if args.json {
-        println!("{}", serde_json::json!({ "policy": args.policy, "rows": rows }));
-    } else {
-        print!("{}\n{}", table(args, &rows), speed_table(&rows[0].evaluation));
+    Ok(rows)
+}
+
+/// Evaluates the policy along each path, with and without motion capture, under each condition.
+fn tracking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<TrackingRow>, Failure> {
+    let mut rows = Vec::new();
+    for condition in conditions(args.engine) {
+        let Condition { name, engine, .. } = condition;
+        let bar = progress_bar(name);
+        let (tasks, mut paths) = (evaluate_tracking::tasks(), Vec::new());
+        for (index, (task, path)) in tasks.iter().enumerate() {
+            let TaskConfig::Track(config) = task else { continue };
+            let mut env = condition.env(args, task.clone(), args.robots as usize)?;
+            check_spec(policy, env.spec())?;
+            let proceed = |share: f64| show(&bar, (index as f64 + share) / tasks.len() as f64, signals);
+            let errors = evaluate_tracking::evaluate(policy, env.as_mut(), (config, path), args.seconds, proceed);
+            paths.push(errors.map_err(input)?.ok_or(Failure::Interrupted)?);
+        }
+        bar.finish_and_clear();
+        rows.push(TrackingRow { condition: name, engine, paths });
     }
-    Ok(())
+    Ok(rows)
+}
+
+fn check_spec(policy: &Policy, env: &EnvSpec) -> CommandResult {
+    if policy.spec.hash() == env.hash() {
+        return Ok(());
+    }
+    Err(input(EvaluationError::OtherSpec { policy: policy.spec.hash(), env: env.hash() }))
+}
+
+fn progress_bar(name: &'static str) -> ProgressBar {
+    ProgressBar::new(100).with_message(name).with_style(
+        ProgressStyle::with_template("{msg:10} {bar:32} {pos} %  ETA {eta}").expect("the template is valid"),
+    )
+}
+
+/// Shows the share that is done. Returns false if the user has interrupted.
+fn show(bar: &ProgressBar, share: f64, signals: &Signals) -> bool {
+    bar.set_position((100.0 * share) as u64);
+    matches!(signals.check(), Ok(false))
 }
 
 /// Returns the evaluations as a table.

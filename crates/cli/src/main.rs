@@ -7,6 +7,7 @@ mod diagnose;
 mod effects;
 mod evaluate;
 mod evaluate_policy;
+mod evaluate_tracking;
 mod exit;
 mod fake_process;
 mod fake_robot;

@@ -103,7 +103,7 @@ impl RobotConfig {
     pub fn walk(&self) -> Result<WalkConfig, Failure> {
         match &self.task {
             TaskConfig::Walk(walk) => Ok(walk.clone()),
-            TaskConfig::Counter => Err(text("`task.name` = \"counter\" has no robot: use \"walk\"")),
+            other => Err(text(&format!("`task.name` = \"{}\" has no robot: use \"walk\"", other.name()))),
         }
     }
 }

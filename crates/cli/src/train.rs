@@ -39,12 +39,12 @@ const EVALUATION: (usize, f64, u64) = (256, 20.0, 1_000_000);
 ///
 /// Ctrl-C saves the training and ends it; --resume continues it. Equal seeds and settings give equal policies.
 ///
-/// Example: `twinstep train walk --out walk --seed 1`, or on the robot that a diagnosis found:
+/// Examples: `twinstep train walk --out walk --seed 1`, or on the robot that a diagnosis found:
 /// `twinstep train walk --out walk --model diagnosis/extended.toml --randomise-effects`
 #[derive(clap::Args)]
 pub struct Args {
     /// Task to learn.
-    #[arg(default_value = "walk", value_parser = ["walk"])]
+    #[arg(default_value = "walk", value_parser = ["walk", "track"])]
     task: String,
     /// Folder to write.
     #[arg(long, value_name = "DIR")]
@@ -327,8 +327,12 @@ impl TrainSession {
     /// Evaluates the policy on fresh robots of the server, or of the training's model with default commands and physics.
     fn evaluate(&self, policy: &Policy, signals: &Signals) -> Result<Evaluation, Failure> {
         let (robots, seconds, seed) = EVALUATION;
-        let fresh =
-            TrainConfig { model: self.config.model.clone(), sim: SimConfig::default(), ..TrainConfig::default() };
+        let fresh = TrainConfig {
+            model: self.config.model.clone(),
+            task: TaskConfig::named(self.config.task.name()).expect("a task has its name"),
+            sim: SimConfig::default(),
+            ..TrainConfig::default()
+        };
         let robot = robot_model(self.config.model.as_deref())?;
         let plan = EvaluationPlan { robot: &robot, seconds, seed };
         let proceed = |_: f64| signals.check().is_ok();

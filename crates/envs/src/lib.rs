@@ -3,6 +3,7 @@
 //! - [`Task`]: what a policy and a critic observe, the reward terms, and the end of an episode. [`tasks`] has one file
 //!   per task; [`TaskConfig`] is the `[task]` table of a config file.
 //! - [`TaskEnv`]: a task on all robots of a backend, as a [`twinstep_model::VecEnv`].
+//! - [`Path`]: a reference that moves along arcs on the ground, for the task `track`.
 //! - [`Randomisation`]: the `[randomise]` table; each episode has its own robot, is pushed, and observes with
 //!   [`ObservationNoise`].
 //! - [`observe`]: the observation of U2E, eq. 14, for simulator, log and robot.
@@ -17,6 +18,7 @@ mod episode;
 mod feet;
 mod observation;
 mod observation_noise;
+mod path;
 mod randomise;
 pub mod reward;
 mod task;
@@ -29,7 +31,8 @@ pub use config::ConfigError;
 pub use counter::{Counter, CounterEnv};
 pub use observation::{CRITIC_OBS_LEN, OBS_LEN, base_spec, observe, observe_privileged, privileged_fields};
 pub use observation_noise::ObservationNoise;
+pub use path::{GroundPose, Path, PathShape};
 pub use randomise::Randomisation;
 pub use task::{RobotView, Step, Task};
 pub use task_env::{TaskEnv, TaskEnvConfig};
-pub use tasks::{TaskConfig, Walk, WalkConfig};
+pub use tasks::{TaskConfig, Track, TrackConfig, Walk, WalkConfig};

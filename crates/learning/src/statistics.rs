@@ -37,12 +37,15 @@ pub struct VelocityLayout {
 }
 
 impl VelocityLayout {
-    /// Returns the positions. Returns `None` if the task has no velocity command, or velocities are not observed.
+    /// Returns the positions. The command of a task with a path is the velocity of the path.
+    ///
+    /// Returns `None` if the task has no such command, or velocities are not observed.
     pub fn new(spec: &EnvSpec) -> Option<Self> {
         Some(Self {
             obs_len: spec.obs_len(),
             critic_len: spec.critic_obs_len(),
-            command: position(&spec.observation, "velocity_command")?,
+            command: position(&spec.observation, "velocity_command")
+                .or_else(|| position(&spec.observation, "path_velocity"))?,
             linear_velocity: position(&spec.critic_observation, "true_linear_velocity")?,
             angular_velocity: position(&spec.critic_observation, "true_angular_velocity")?,
         })

@@ -102,7 +102,7 @@ impl Robots {
             critic_len: spec.critic_obs_len(),
             policy_dt: spec.policy_dt,
             velocity: VelocityLayout::new(spec).ok_or("true_linear_velocity")?,
-            command: find(policy, "velocity_command")?,
+            command: find(policy, "velocity_command").or_else(|_| find(policy, "path_velocity"))?,
             gravity: find(policy, "projected_gravity")?,
             q: find(policy, "joint_position")?,
             dq: find(policy, "joint_velocity")?,

@@ -87,14 +87,15 @@ __all__ = [
     "stop_robot",
 ]
 
-gymnasium.register(
-    id="twinstep/Go2-Walk-v0",
-    entry_point="twinstep.env:Go2Env",
-    vector_entry_point="twinstep.vector_env:Go2VectorEnv",
-    # 20 s, the time limit of the task.
-    max_episode_steps=1000,
-    kwargs={"task": "walk"},
-)
+for _task in ("walk", "track"):
+    gymnasium.register(
+        id=f"twinstep/Go2-{_task.capitalize()}-v0",
+        entry_point="twinstep.env:Go2Env",
+        vector_entry_point="twinstep.vector_env:Go2VectorEnv",
+        # 20 s, the time limit of the tasks.
+        max_episode_steps=1000,
+        kwargs={"task": _task},
+    )
 
 if not TYPE_CHECKING:
     # For a type checker, this function would make every name an attribute of the package.

@@ -4,9 +4,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::ConfigError;
 
+pub mod track;
+pub mod track_config;
 pub mod walk;
 pub mod walk_config;
 
+pub use track::Track;
+pub use track_config::TrackConfig;
 pub use walk::Walk;
 pub use walk_config::WalkConfig;
 
@@ -16,6 +20,8 @@ pub use walk_config::WalkConfig;
 pub enum TaskConfig {
     /// Locomotion with velocity commands.
     Walk(WalkConfig),
+    /// Following a path on the ground.
+    Track(TrackConfig),
     /// Counts steps without physics, to verify and measure the transport. It has no settings.
     Counter,
 }
@@ -28,12 +34,13 @@ impl Default for TaskConfig {
 
 impl TaskConfig {
     /// Names of all tasks.
-    pub const NAMES: [&str; 2] = ["walk", "counter"];
+    pub const NAMES: [&str; 3] = ["walk", "track", "counter"];
 
     /// Returns the task of this name with default settings. Returns `None` if there is no such task.
     pub fn named(name: &str) -> Option<Self> {
         match name {
             "walk" => Some(Self::default()),
+            "track" => Some(Self::Track(TrackConfig::default())),
             "counter" => Some(Self::Counter),
             _ => None,
         }
@@ -43,6 +50,7 @@ impl TaskConfig {
     pub fn name(&self) -> &'static str {
         match self {
             Self::Walk(_) => "walk",
+            Self::Track(_) => "track",
             Self::Counter => "counter",
         }
     }
@@ -51,6 +59,7 @@ impl TaskConfig {
     pub fn check(&self) -> Result<(), ConfigError> {
         match self {
             Self::Walk(config) => config.check(),
+            Self::Track(config) => config.check(),
             Self::Counter => Ok(()),
         }
     }
@@ -59,6 +68,7 @@ impl TaskConfig {
     pub fn epistemic_uncertainty_weight(&self) -> f32 {
         match self {
             Self::Walk(config) => config.reward.epistemic_uncertainty,
+            Self::Track(config) => config.walk.reward.epistemic_uncertainty,
             Self::Counter => 0.0,
         }
     }
@@ -69,8 +79,10 @@ impl TryFrom<toml::Table> for TaskConfig {
 
     fn try_from(mut table: toml::Table) -> Result<Self, String> {
         let name = table.remove("name").unwrap_or_else(|| "walk".into());
+        let text = |error: toml::de::Error| error.to_string().trim_end().to_owned();
         match name.as_str() {
-            Some("walk") => table.try_into().map(Self::Walk).map_err(|error| error.to_string().trim_end().to_owned()),
+            Some("walk") => table.try_into().map(Self::Walk).map_err(text),
+            Some("track") => table.try_into().map(Self::Track).map_err(text),
             Some("counter") if table.is_empty() => Ok(Self::Counter),
             Some("counter") => Err("the task `counter` has no settings besides `name`".to_owned()),
             _ => Err(format!("`name` = {name} is not a task; possible: {}", Self::NAMES.join(", "))),
@@ -89,8 +101,12 @@ mod tests {
         let parse = |text: &str| toml::from_str::<TaskConfig>(text);
         let walk = parse("tracking_sigma = 0.5").expect("valid");
         assert_eq!(walk, TaskConfig::Walk(WalkConfig { tracking_sigma: 0.5, ..WalkConfig::default() }));
+        let track = parse("name = \"track\"\npath = \"figure_eight\"\nwalk.tracking_sigma = 0.5").expect("valid");
+        let config = TrackConfig { path: crate::PathShape::FigureEight, ..TrackConfig::default() };
+        let common = WalkConfig { tracking_sigma: 0.5, ..WalkConfig::default() };
+        assert_eq!(track, TaskConfig::Track(TrackConfig { walk: common, ..config }));
         assert_eq!(parse("name = \"counter\"").expect("valid"), TaskConfig::Counter);
-        for task in [walk, TaskConfig::Counter] {
+        for task in [walk, track, TaskConfig::Counter] {
             assert_eq!(parse(&toml::to_string(&task).expect("serialised")).expect("valid"), task);
         }
         for name in TaskConfig::NAMES {
@@ -106,7 +122,7 @@ mod tests {
             in `reward`
         "#]].assert_eq(&error("[reward]\ntorques = -1.0"));
         expect![[r#"
-            `name` = "fly" is not a task; possible: walk, counter
+            `name` = "fly" is not a task; possible: walk, track, counter
         "#]]
         .assert_eq(&error("name = \"fly\""));
         expect![[r#"
@@ -117,6 +133,8 @@ mod tests {
 
     #[test]
     fn defaults_are_valid() {
-        assert_eq!(TaskConfig::default().check(), Ok(()));
+        for name in TaskConfig::NAMES {
+            assert_eq!(TaskConfig::named(name).expect("a task").check(), Ok(()), "{name}");
+        }
     }
 }
