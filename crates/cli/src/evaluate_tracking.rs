@@ -112,11 +112,7 @@ pub fn table(robots: u32, seconds: f64, rows: &[TrackingRow]) -> String {
         "{robots} robots, {seconds} s along each path at 0.5 m/s. L_track: mean |dx| + |dy| + |dyaw| [m + rad] (RMS \
          distance [m], share that stayed up\nand within 1 m). The pose error is observed by motion capture, or zero.\n\n"
     );
-    let _ = writeln!(
-        text,
-        "condition  engine   motion capture  {:24} {:24} {:24}",
-        PATHS[0].1, PATHS[1].1, PATHS[2].1
-    );
+    let _ = writeln!(text, "condition  engine   motion capture  {:24} {:24} {:24}", PATHS[0].1, PATHS[1].1, PATHS[2].1);
     for TrackingRow { condition, engine, paths } in rows {
         let engine = format!("{engine:?}").to_lowercase();
         for paths in paths.chunks(PATHS.len()) {

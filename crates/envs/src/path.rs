@@ -182,8 +182,13 @@ mod tests {
 
     #[test]
     fn figure_eight_turns_left_then_right_and_square_has_its_corners() {
-        let eight = poses(&path(PathShape::FigureEight), TAU / 50.0, 100);
-        assert!((eight[24].y - 2.0).abs() < 1e-3 && (eight[74].y + 2.0).abs() < 1e-3, "{:?} {:?}", eight[24], eight[74]);
+        let eight = poses(&path(PathShape::FigureEight), TAU / 25.0, 100);
+        assert!(
+            (eight[24].y - 2.0).abs() < 1e-3 && (eight[74].y + 2.0).abs() < 1e-3,
+            "{:?} {:?}",
+            eight[24],
+            eight[74]
+        );
         assert!(eight[99].x.hypot(eight[99].y) < 1e-3, "{:?}", eight[99]);
         // A side takes 4 s, a corner π/2 s.
         let corner = poses(&path(PathShape::Square), 4.0 + FRAC_PI_2, 3);

@@ -35,11 +35,8 @@ fn written(name: &str) -> Vec<u8> {
     let policy = Policy { spec, normaliser, actor: Mlp::zeros(&sizes), log_std };
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join(name);
-    let result = if name.ends_with("onnx") {
-        policy.write_onnx(&path)
-    } else {
-        policy.write(&path, PolicyOrigin::default())
-    };
+    let result =
+        if name.ends_with("onnx") { policy.write_onnx(&path) } else { policy.write(&path, PolicyOrigin::default()) };
     result.expect("a policy can be written");
     std::fs::read(path).expect("the policy was written")
 }

@@ -16,8 +16,8 @@ use crate::task::{RobotView, Step, Task};
 
 /// Bound of the pose error in the observation [m, rad].
 const ERROR_BOUND: f32 = 3.2;
-/// Largest velocity of the tracking rewards, along each axis [m/s, rad/s].
-const MAX_VELOCITY: f32 = 1.5;
+/// Largest correction of the velocity in the tracking rewards, along each axis [m/s, rad/s].
+const MAX_CORRECTION: f32 = 0.5;
 /// Names of the terms that `walk` does not have.
 const TERMS: [&str; 2] = ["track_position", "track_heading"];
 
@@ -79,7 +79,7 @@ impl Track {
         let (sin, cos) = error[2].sin_cos();
         let of_path = [cos * vx - sin * vy, sin * vx + cos * vy, rate];
         std::array::from_fn(|axis| {
-            (of_path[axis] + self.config.correction_rate * error[axis]).clamp(-MAX_VELOCITY, MAX_VELOCITY)
+            of_path[axis] + (self.config.correction_rate * error[axis]).clamp(-MAX_CORRECTION, MAX_CORRECTION)
         })
     }
 }

@@ -46,11 +46,11 @@ impl Default for TrackConfig {
             speed: 0.5,
             start_offset_m: 0.2,
             start_offset_rad: 0.3,
-            correction_rate: 2.0,
+            correction_rate: 1.0,
             track_position: 2.0,
             track_heading: 1.0,
-            position_sigma: 0.01,
-            heading_sigma: 0.02,
+            position_sigma: 0.04,
+            heading_sigma: 0.05,
             max_position_error_m: 1.0,
             observe_pose_error: true,
             walk: WalkConfig::default(),
@@ -71,9 +71,8 @@ impl TrackConfig {
         check_value("task.position_sigma", self.position_sigma, 1e-6, 1e6)?;
         check_value("task.heading_sigma", self.heading_sigma, 1e-6, 1e6)?;
         check_value("task.max_position_error_m", self.max_position_error_m, 0.01, 1e6)?;
-        self.walk.check().map_err(|error| ConfigError {
-            field: error.field.replacen("task.", "task.walk.", 1),
-            ..error
-        })
+        self.walk
+            .check()
+            .map_err(|error| ConfigError { field: error.field.replacen("task.", "task.walk.", 1), ..error })
     }
 }
