@@ -224,6 +224,63 @@ fn shipped_policy_walks_in_both_engines() {
 }
 
 #[test]
+fn shipped_policy_follows_a_circle_a_figure_of_eight_and_a_square() {
+    let policy = root().join("data/policies/track.safetensors");
+    let arguments = ["evaluate-policy", policy.to_str().unwrap(), "--robots", "8", "--seconds", "8", "--json"];
+    let evaluated = twinstep(&arguments);
+    assert!(evaluated.status.success(), "{}", text(&evaluated.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&evaluated.stdout).unwrap();
+    let rows = report["rows"].as_array().unwrap();
+    let nominal = rows.iter().filter(|row| row["condition"] == "nominal");
+    for errors in nominal.flat_map(|row| row["paths"].as_array().unwrap()) {
+        let l_track = errors["l_track"].as_f64().unwrap();
+        assert!(errors["up"] == 1.0, "{errors}");
+        // Blind robots drift.
+        let limits = if errors["motion_capture"] == true { 0.0..0.15 } else { 0.15..4.0 };
+        assert!(limits.contains(&l_track), "{errors}");
+    }
+    assert_eq!(rows.iter().map(|row| row["paths"].as_array().unwrap().len()).max(), Some(6));
+}
+
+#[test]
+fn task_of_the_config_file_is_trained_and_another_one_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("track.toml");
+    std::fs::write(&config, "[task]\nname = \"track\"\npath = \"circle\"\n").unwrap();
+    let train = |task: &[&str], out: &str| {
+        let out = folder.path().join(out);
+        let arguments = ["--config", config.to_str().unwrap(), "--out", out.to_str().unwrap()];
+        twinstep(&[&["train"], task, &arguments, &["--envs", "32", "--steps", "768"]].concat())
+    };
+    let trained = train(&[], "track");
+    assert!(trained.status.success(), "{}", text(&trained.stderr));
+    let (policy, _) = Policy::read(folder.path().join("track/policy.safetensors")).unwrap();
+    assert_eq!((policy.spec.task.as_str(), policy.spec.obs_len()), ("track", 48));
+    let start = folder.path().join("track/checkpoint.safetensors");
+    let tuned = train(&["--from", start.to_str().unwrap(), "--seed", "2"], "tuned");
+    assert!(tuned.status.success(), "{}", text(&tuned.stderr));
+    let (tuned, header) = Policy::read(folder.path().join("tuned/policy.safetensors")).unwrap();
+    let distance = |one: &Policy, other: &Policy| {
+        one.actor
+            .weights()
+            .iter()
+            .zip(other.actor.weights())
+            .map(|(one, other)| (one - other).abs())
+            .fold(0.0, f32::max)
+    };
+    // One update moves a weight by a few times the learning rate of 0.001; other networks differ by 0.1 and more.
+    assert!((1e-6..0.03).contains(&distance(&policy, &tuned)) && header.origin.env_steps == 768);
+    let other = folder.path().join("other");
+    let refused = twinstep(&["train", "--out", other.to_str().unwrap(), "--from", start.to_str().unwrap()]);
+    assert!(text(&refused.stderr).contains("the policy was trained with spec"), "{}", text(&refused.stderr));
+    let refused = train(&["walk"], "walk");
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(text(&refused.stderr).contains("`walk` is not the task of the config file, `track`"));
+    std::fs::write(&config, "[task]\nname = \"track\"\nspeed = 9.0\n").unwrap();
+    assert!(text(&train(&[], "fast").stderr).contains("`task.speed` = 9 is not allowed: 0.05 to 5"));
+}
+
+#[test]
 fn unknown_instruction_set_is_rejected_with_those_that_exist() {
     let output = program().arg("effects").env("TWINSTEP_SIMD", "neon").output().unwrap();
     assert_eq!(output.status.code(), Some(2));

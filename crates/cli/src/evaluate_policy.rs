@@ -195,19 +195,21 @@ fn walking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<Row>, 
     Ok(rows)
 }
 
-/// Evaluates the policy along each path, with and without motion capture, under each condition.
+/// Evaluates the policy along each path under each condition.
 fn tracking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<TrackingRow>, Failure> {
     let mut rows = Vec::new();
     for condition in conditions(args.engine) {
         let Condition { name, engine, .. } = condition;
         let bar = progress_bar(name);
-        let (tasks, mut paths) = (evaluate_tracking::tasks(), Vec::new());
-        for (index, (task, path)) in tasks.iter().enumerate() {
-            let TaskConfig::Track(config) = task else { continue };
-            let mut env = condition.env(args, task.clone(), args.robots as usize)?;
+        // The drift without motion capture is shown once an engine.
+        let without = evaluate_tracking::tasks(false).into_iter().filter(|_| name == "nominal");
+        let tasks: Vec<_> = evaluate_tracking::tasks(true).into_iter().chain(without).collect();
+        let mut paths = Vec::new();
+        for (index, task) in tasks.iter().enumerate() {
+            let mut env = condition.env(args, TaskConfig::Track(task.0.clone()), args.robots as usize)?;
             check_spec(policy, env.spec())?;
             let proceed = |share: f64| show(&bar, (index as f64 + share) / tasks.len() as f64, signals);
-            let errors = evaluate_tracking::evaluate(policy, env.as_mut(), (config, path), args.seconds, proceed);
+            let errors = evaluate_tracking::evaluate(policy, env.as_mut(), task, args.seconds, proceed);
             paths.push(errors.map_err(input)?.ok_or(Failure::Interrupted)?);
         }
         bar.finish_and_clear();

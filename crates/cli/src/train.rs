@@ -7,10 +7,10 @@ use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_client::{ConnectOptions, RemoteCollector, RemoteVecEnv};
 use twinstep_envs::TaskConfig;
 use twinstep_learning::{
-    Checkpoint, Evaluation, EvaluationError, EvaluationPlan, LearningError, PpoConfig, Trainer, evaluate,
+    Checkpoint, Evaluation, EvaluationError, EvaluationPlan, Learner, LearningError, PpoConfig, Trainer, evaluate,
 };
-use twinstep_model::AutoresetMode;
-use twinstep_policy::{Collector, CurvePoint, Policy, PolicyOrigin, StepCollector};
+use twinstep_model::{AutoresetMode, EnvSpec};
+use twinstep_policy::{Collector, CurvePoint, Mlp, Policy, PolicyOrigin, StepCollector};
 use twinstep_sim::SimConfig;
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
@@ -40,12 +40,13 @@ const EVALUATION: (usize, f64, u64) = (256, 20.0, 1_000_000);
 /// Ctrl-C saves the training and ends it; --resume continues it. Equal seeds and settings give equal policies.
 ///
 /// Examples: `twinstep train walk --out walk --seed 1`, or on the robot that a diagnosis found:
-/// `twinstep train walk --out walk --model diagnosis/extended.toml --randomise-effects`
+/// `twinstep train walk --out walk --model diagnosis/extended.toml --randomise-effects`, or from an earlier training:
+/// `twinstep train walk --out tuned --from walk/checkpoint.safetensors --model extended.toml --steps 5000000`
 #[derive(clap::Args)]
 pub struct Args {
-    /// Task to learn.
-    #[arg(default_value = "walk", value_parser = ["walk", "track"])]
-    task: String,
+    /// Task to learn. Default: that of the config file, else walk.
+    #[arg(value_parser = ["walk", "track"])]
+    task: Option<String>,
     /// Folder to write.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -75,6 +76,10 @@ pub struct Args {
     /// [randomise] are then those of the servers. Default: simulate in this process.
     #[arg(long, value_name = "ENDPOINT", value_delimiter = ',', conflicts_with_all = ["model", "randomise_effects"])]
     endpoint: Vec<String>,
+    /// Start with the networks of this checkpoint.safetensors of another training: fine-tuning. Task and gains must be
+    /// the same; robot, rewards and randomisation may differ.
+    #[arg(long, value_name = "FILE", conflicts_with = "resume")]
+    from: Option<PathBuf>,
     /// Continue the training in the folder with its settings and seed.
     #[arg(long, conflicts_with_all = ["config", "model", "randomise_effects", "seed", "envs"])]
     resume: bool,
@@ -124,7 +129,7 @@ impl Args {
     pub fn new(out: PathBuf, seed: u64, steps: u64) -> Self {
         Self {
             view: ViewArgs::default(),
-            task: "walk".to_owned(),
+            task: Some("walk".to_owned()),
             out,
             config: None,
             model: None,
@@ -134,6 +139,7 @@ impl Args {
             minutes: None,
             envs: None,
             endpoint: Vec::new(),
+            from: None,
             resume: false,
             json: false,
         }
@@ -172,8 +178,19 @@ impl Args {
 
     fn config(&self) -> Result<TrainConfig, Failure> {
         let mut config = self.config.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::load)?;
-        if config.task.name() != self.task {
-            config.task = TaskConfig::named(&self.task).expect("the argument was checked");
+        if let Some(task) = self.task.as_deref().filter(|task| *task != config.task.name()) {
+            if config.task != TaskConfig::default() {
+                let of_config = config.task.name();
+                return Err(Failure::Input(miette::miette!(
+                    "`{task}` is not the task of the config file, `{of_config}`\n  name the same task, or none"
+                )));
+            }
+            config.task = TaskConfig::named(task).expect("the argument was checked");
+        }
+        if config.task == TaskConfig::Counter {
+            return Err(Failure::Input(miette::miette!(
+                "`task.name` = \"counter\" has nothing to learn: use \"walk\""
+            )));
         }
         // The folder may be used from another working directory.
         config.model = self.model.clone().or(config.model).map(|path| path.canonicalize().unwrap_or(path));
@@ -209,7 +226,7 @@ fn open_page(args: &Args, config: &TrainConfig) -> Result<Option<Page>, Failure>
     }
     let mut example = config.envs(1, 1, 1)?.remove(0);
     let limits = robot_model(config.model.as_deref())?.torque_limits();
-    args.view.open(&format!("twinstep train {}", args.task), example.as_mut(), limits)
+    args.view.open(&format!("twinstep train {}", config.task.name()), example.as_mut(), limits)
 }
 
 impl TrainSession {
@@ -235,8 +252,11 @@ impl TrainSession {
         };
         let seed = checkpoint.as_ref().map_or(args.seed, |checkpoint| checkpoint.seed);
         let resumed_at = checkpoint.as_ref().map(|checkpoint| checkpoint.learner.env_steps);
-        let (learner, curve) =
-            checkpoint.map_or((None, Vec::new()), |checkpoint| (Some(checkpoint.learner), checkpoint.curve));
+        let (learner, curve) = match (checkpoint, &args.from) {
+            (Some(checkpoint), _) => (Some(checkpoint.learner), checkpoint.curve),
+            (None, Some(path)) => (Some(earlier_networks(path, collectors[0].spec(), &config.train)?), Vec::new()),
+            (None, None) => (None, Vec::new()),
+        };
         let trainer = Trainer::new(config.train.clone(), collectors, learner, seed).map_err(input)?;
         let log = TrainLog::open(&args.out, &trainer.spec().reward_terms, resumed_at)
             .map_err(|cause| folder_error(&args.out, cause))?;
@@ -349,6 +369,27 @@ impl TrainSession {
         env.close().map_err(other)?;
         Ok(evaluation)
     }
+}
+
+/// Returns the networks of another training's checkpoint, for environments of this spec.
+fn earlier_networks(path: &Path, spec: &EnvSpec, config: &PpoConfig) -> Result<Learner, Failure> {
+    let Checkpoint { learner, spec: earlier, .. } = Checkpoint::read(path).map_err(input)?;
+    if earlier.hash() != spec.hash() {
+        let (policy, env) = (earlier.hash(), spec.hash());
+        return Err(input(EvaluationError::OtherSpec { policy, env }));
+    }
+    let hidden = |network: &Mlp| network.sizes()[1..network.sizes().len() - 1].to_vec();
+    let (actor, critic) = (hidden(&learner.actor), hidden(&learner.critic));
+    if (&actor, &critic) != (&config.actor_hidden, &config.critic_hidden) {
+        return Err(Failure::Input(miette::miette!(
+            "`--from` = {}: its networks have {actor:?} and {critic:?} hidden units, and the settings {:?} and {:?}\n  set \
+             `train.actor_hidden` and `train.critic_hidden` to those of the file",
+            path.display(),
+            config.actor_hidden,
+            config.critic_hidden
+        )));
+    }
+    Ok(learner.fine_tuned(config))
 }
 
 /// Returns the options of a connection for training.

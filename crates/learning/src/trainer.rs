@@ -82,6 +82,18 @@ impl Learner {
         }
     }
 
+    /// Returns the start of another training with these networks: its optimisers and counters are new.
+    pub fn fine_tuned(self, config: &PpoConfig) -> Self {
+        let lengths = [self.actor.parameters.len(), self.critic.parameters.len(), self.log_std.len()];
+        Self {
+            optimisers: lengths.map(Adam::new),
+            learning_rate: config.learning_rate,
+            iteration: 0,
+            env_steps: 0,
+            ..self
+        }
+    }
+
     /// Returns the policy, with the normaliser of the observation of group `policy`.
     pub fn policy(&self, spec: &EnvSpec) -> Policy {
         let normaliser = self.policy_normaliser(spec.obs_len());
