@@ -5,6 +5,8 @@ use twinstep_effects::{RobotSampler, SamplingError};
 use twinstep_ensemble::{ActuatorNetworkRobot, EnsembleError};
 use twinstep_envs::{CounterEnv, TaskConfig, TaskEnv, TaskEnvConfig, Track, Walk};
 use twinstep_model::{Actuator, AutoresetMode, Backend, RobotModel, VecEnv};
+use twinstep_policy::array_file::ArrayFileError;
+use twinstep_policy::{OtherBase, Policy, ResidualEnv};
 use twinstep_sim::{BackendBuildError, BatchBackend, Engine, MujocoBackend, RapierBackend};
 
 use twinstep_protocol::{message, random_u64};
@@ -55,6 +57,12 @@ pub enum EnvFactoryError {
     /// The simulation settings are invalid.
     #[error(transparent)]
     Sim(#[from] BackendBuildError),
+    /// The base policy cannot be read.
+    #[error("`task.base`: {0}")]
+    Base(#[from] ArrayFileError),
+    /// The base policy does not fit the robot.
+    #[error("`task.base`: {0}")]
+    OtherBase(#[from] OtherBase),
     /// The task settings are invalid.
     #[error(transparent)]
     Task(#[from] twinstep_envs::ConfigError),
@@ -69,6 +77,8 @@ pub struct SimEnvFactory {
     /// `None` unless the effects are sampled in each episode.
     robots: Option<RobotSampler>,
     seed: u64,
+    /// Base policy of the task `explore`.
+    base: Option<Policy>,
 }
 
 impl SimEnvFactory {
@@ -87,7 +97,11 @@ impl SimEnvFactory {
         config.sim.check(&robot.control).map_err(BackendBuildError::Config)?;
         let seed = config.server.seed.unwrap_or_else(random_u64);
         let robots = if config.randomise.effects { Some(RobotSampler::new(file)?) } else { None };
-        Ok(Self { config, robot, learned, robots, seed })
+        let base = match &config.task {
+            TaskConfig::Explore(explore) => Some(Policy::read(&explore.base)?.0),
+            _ => None,
+        };
+        Ok(Self { config, robot, learned, robots, seed, base })
     }
 
     /// Returns the nominal robot.
@@ -97,7 +111,7 @@ impl SimEnvFactory {
 
     /// Returns the actuator networks of `num_envs` robots, or `None` if the actuators are analytic.
     fn actuators(&self, num_envs: usize) -> Option<Box<dyn Actuator>> {
-        let uncertain = self.config.task.epistemic_uncertainty_weight() != 0.0;
+        let uncertain = self.config.task.epistemic_uncertainty_weight().1 != 0.0;
         self.learned.as_ref().map(|learned| Box::new(learned.actuators(num_envs, uncertain)) as Box<dyn Actuator>)
     }
 }
@@ -107,11 +121,8 @@ fn check_actuators(config: &Config, learned: Option<&ActuatorNetworkRobot>) -> R
     let reject = |field, reason| Err(EnvFactoryError::ActuatorNetwork { field, reason });
     let Some(learned) = learned else {
         return match config.task.epistemic_uncertainty_weight() {
-            0.0 => Ok(()),
-            _ => reject(
-                "task.reward.epistemic_uncertainty",
-                "it has no `[actuator]`, so there is no epistemic uncertainty; use 0",
-            ),
+            (_, 0.0) => Ok(()),
+            (field, _) => reject(field, "it has no `[actuator]`, so there is no epistemic uncertainty; use 0"),
         };
     };
     if config.sim.engine == Engine::Mujoco {
@@ -155,7 +166,7 @@ impl EnvFactory for SimEnvFactory {
             max_episode_steps,
             seed: self.seed,
         };
-        match sim.engine {
+        let env = match sim.engine {
             Engine::Rapier => {
                 let backend = RapierBackend::new(robot, sim, num_envs)?;
                 let backend = if let Some(actuators) = actuators { backend.with_actuator(actuators) } else { backend };
@@ -167,6 +178,12 @@ impl EnvFactory for SimEnvFactory {
                 task_env(&self.config.task, backend, settings)
             }
             Engine::Mujoco => task_env(&self.config.task, MujocoBackend::new(robot, sim, num_envs)?, settings),
+        }?;
+        match (&self.config.task, &self.base) {
+            (TaskConfig::Explore(explore), Some(base)) => {
+                Ok(Box::new(ResidualEnv::new(env, "explore", base, explore.max_residual)?))
+            }
+            _ => Ok(env),
         }
     }
 }
@@ -186,6 +203,11 @@ fn task_env(
         TaskConfig::Track(config) => {
             let track = Track::new(config.clone(), robot, has_ground_truth)?;
             Ok(Box::new(TaskEnv::new(backend, track, settings)?))
+        }
+        // The environments of the base policy; the residual is added to its actions by `ResidualEnv`.
+        TaskConfig::Explore(config) => {
+            let walk = Walk::new(config.weighted_walk(), robot, has_ground_truth)?;
+            Ok(Box::new(TaskEnv::new(backend, walk, settings)?))
         }
         TaskConfig::Counter => Ok(Box::new(CounterEnv::new(robot, backend.num_robots(), settings.autoreset))),
     }

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use rand::RngExt;
 use tempfile::TempDir;
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_effects::{ActuatorNetworkConfig, MemberSampling, ModelFile};
@@ -13,8 +14,9 @@ use twinstep_envs::{TaskConfig, base_spec};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{
     AutoresetMode, Backend, BackendError, BaseMount, Command as RobotCommand, InitialState, JOINT_NAMES, ResetRequest,
-    Restorable, Simulator, StepBatch, VecEnv, go2,
+    Restorable, Simulator, StepBatch, Stream, VecEnv, go2, stream,
 };
+use twinstep_policy::{Policy, PolicyRunner};
 use twinstep_sim::{BatchBackend, Engine, RapierBackend, SimConfig};
 use twinstep_tests::process::Process;
 use twinstep_tests::python::Programs;
@@ -328,6 +330,59 @@ fn ensembles_that_do_not_fit_the_robot_are_rejected_with_the_reason() {
     // With a motor-current sensor, friction is not part of the ensemble.
     let (_folder, model) = model_with(description(), friction, "");
     assert!(SimEnvFactory::new(config(Engine::Batch, &model, 1)).is_ok());
+}
+
+/// Runs `twinstep train` with few robots and steps.
+fn train(folder: &Path, arguments: &[&str]) -> Output {
+    let out = folder.join("out");
+    Command::new(Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().0.join("twinstep"))
+        .args(["train", "--out", out.to_str().unwrap(), "--envs", "16", "--steps", "384"])
+        .args(arguments)
+        .output()
+        .unwrap()
+}
+
+#[test]
+fn residual_that_was_trained_with_a_base_policy_is_written_with_it_as_one_policy() {
+    let (folder, model) = model_with(description(), "", "");
+    let model = model.to_str().unwrap();
+    let base_path = twinstep_tests::python::root().join("data/policies/walk.safetensors");
+    let trained = train(folder.path(), &["explore", "--base", base_path.to_str().unwrap(), "--model", model]);
+    assert!(trained.status.success(), "{}", String::from_utf8_lossy(&trained.stderr));
+    let read = |name: &str| Policy::read(folder.path().join("out").join(name)).unwrap().0;
+    let (base, residual, whole) =
+        (Policy::read(base_path).unwrap().0, read("policy.safetensors"), read("exploration.safetensors"));
+    assert_eq!((residual.spec.task.as_str(), &whole.spec), ("explore", &base.spec));
+    let mut random = stream(4, "observations", 0);
+    // The normalisers clip entries that are ten standard deviations from their mean, each its own.
+    let entry = |random: &mut Stream, index: usize| {
+        let of = |policy: &Policy| policy.normaliser.mean_and_std();
+        let ((base_mean, base_std), (mean, std)) = (of(&base), of(&residual));
+        let value = base_mean[index] + base_std[index] * random.random_range(-2.0..2.0);
+        value.clamp(mean[index] - 9.0 * std[index], mean[index] + 9.0 * std[index])
+    };
+    let obs: Vec<f32> = (0..64 * 45).map(|i| entry(&mut random, i % 45)).collect();
+    let [base, residual, whole] = [base, residual, whole].map(|policy| {
+        let mut actions = vec![0.0; 64 * 12];
+        PolicyRunner::new(&policy).run(&obs, &mut actions);
+        actions
+    });
+    for (whole, (base, residual)) in whole.iter().zip(base.iter().zip(&residual)) {
+        let expected = base + 0.5 * residual.clamp(-1.0, 1.0);
+        assert!((whole - expected).abs() < 1e-3 * (1.0 + expected.abs()), "{whole} {expected}");
+    }
+    let errors = [
+        (vec!["explore", "--model", model], "`task.base` = \"\" is not allowed"),
+        (vec!["explore", "--base", "none.safetensors", "--model", model], "`task.base`"),
+        (vec!["walk", "--base", "none.safetensors"], "`--base` is for the task `explore`"),
+        (vec!["explore", "--base", "README.md"], "`task.uncertainty_weight`"),
+    ];
+    for (arguments, expected) in errors {
+        let folder = tempfile::tempdir().unwrap();
+        let refused = train(folder.path(), &arguments);
+        let text = String::from_utf8_lossy(&refused.stderr).into_owned();
+        assert!(refused.status.code() == Some(2) && text.contains(expected), "{arguments:?}: {text}");
+    }
 }
 
 #[test]

@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import zenoh
@@ -74,6 +75,11 @@ def test_errors_name_the_invalid_vector_argument() -> None:
 def test_error_of_a_server_that_cannot_start_contains_its_log() -> None:
     with pytest.raises(twinstep.ServerStartError, match=r"exit code 2(.|\n)*robot\.toml"):
         Go2Env(model="/no/such/robot.toml")
+
+
+def test_exploration_without_its_base_policy_says_what_is_missing() -> None:
+    with pytest.raises(twinstep.ServerStartError, match="`task.base` = \"\" is not allowed: a policy file of `walk`"):
+        gym.make("twinstep/Go2-Explore-v0")
 
 
 def test_error_names_the_missing_program(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,6 @@ use twinstep_sim::{Engine, RoughTerrain, SimConfig, Terrain};
 
 use crate::evaluate_tracking::{self, TrackingRow};
 use crate::exit::{CommandResult, Failure, Signals, input};
-use crate::robot_file::robot_model;
 use crate::serve::engine;
 use crate::train_config::TrainConfig;
 
@@ -177,7 +176,7 @@ fn json(args: &Args, rows: &impl Serialize) -> String {
 
 /// Evaluates the policy by velocity commands under each condition.
 fn walking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<Row>, Failure> {
-    let robot = robot_model(args.model.as_deref())?;
+    let robot = TrainConfig { model: args.model.clone(), ..TrainConfig::default() }.robot()?;
     let plan = EvaluationPlan { robot: &robot, seconds: args.seconds, seed: args.seed };
     let mut rows = Vec::new();
     for condition in conditions(args.engine) {

@@ -33,6 +33,7 @@ mod serve;
 mod status_line;
 mod train;
 mod train_config;
+mod train_endpoints;
 mod train_log;
 mod velocity_input;
 mod view;

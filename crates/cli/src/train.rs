@@ -4,18 +4,17 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use twinstep_client::{ConnectOptions, RemoteCollector, RemoteVecEnv};
 use twinstep_envs::TaskConfig;
 use twinstep_learning::{
     Checkpoint, Evaluation, EvaluationError, EvaluationPlan, Learner, LearningError, PpoConfig, Trainer, evaluate,
 };
-use twinstep_model::{AutoresetMode, EnvSpec};
-use twinstep_policy::{Collector, CurvePoint, Mlp, Policy, PolicyOrigin, StepCollector};
+use twinstep_model::EnvSpec;
+use twinstep_policy::{Collector, CurvePoint, Mlp, Policy, PolicyOrigin, StepCollector, with_residual};
 use twinstep_sim::SimConfig;
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
-use crate::robot_file::robot_model;
 use crate::train_config::TrainConfig;
+use crate::train_endpoints::{remote_collectors, remote_env};
 use crate::train_log::{TrainLog, curve_point, write_curve};
 use crate::web_view::{Page, ViewArgs};
 
@@ -36,6 +35,7 @@ const EVALUATION: (usize, f64, u64) = (256, 20.0, 1_000_000);
 ///   progress.csv           errors, falls, reward terms and times of every update; TensorBoard reads events.out.*
 ///   curve.svg              learning curve
 ///   checkpoint.safetensors state of the training, saved every 10 s
+///   exploration.*          task `explore`: base policy and residual as one policy of `walk`
 ///
 /// Ctrl-C saves the training and ends it; --resume continues it. Equal seeds and settings give equal policies.
 ///
@@ -45,7 +45,7 @@ const EVALUATION: (usize, f64, u64) = (256, 20.0, 1_000_000);
 #[derive(clap::Args)]
 pub struct Args {
     /// Task to learn. Default: that of the config file, else walk.
-    #[arg(value_parser = ["walk", "track"])]
+    #[arg(value_parser = ["walk", "track", "explore"])]
     task: Option<String>,
     /// Folder to write.
     #[arg(long, value_name = "DIR")]
@@ -76,6 +76,9 @@ pub struct Args {
     /// [randomise] are then those of the servers. Default: simulate in this process.
     #[arg(long, value_name = "ENDPOINT", value_delimiter = ',', conflicts_with_all = ["model", "randomise_effects"])]
     endpoint: Vec<String>,
+    /// Policy of `walk` to whose actions the task `explore` adds a residual.
+    #[arg(long, value_name = "FILE")]
+    base: Option<PathBuf>,
     /// Start with the networks of this checkpoint.safetensors of another training: fine-tuning. Task and gains must be
     /// the same; robot, rewards and randomisation may differ.
     #[arg(long, value_name = "FILE", conflicts_with = "resume")]
@@ -139,6 +142,7 @@ impl Args {
             minutes: None,
             envs: None,
             endpoint: Vec::new(),
+            base: None,
             from: None,
             resume: false,
             json: false,
@@ -187,6 +191,19 @@ impl Args {
             }
             config.task = TaskConfig::named(task).expect("the argument was checked");
         }
+        match (&mut config.task, &self.base) {
+            (TaskConfig::Explore(explore), base) => {
+                let base = base.as_ref().unwrap_or(&explore.base);
+                explore.base = base.canonicalize().unwrap_or_else(|_| base.clone());
+            }
+            (other, Some(_)) => {
+                return Err(Failure::Input(miette::miette!(
+                    "`--base` is for the task `explore`, and the task is `{}`",
+                    other.name()
+                )));
+            }
+            _ => {}
+        }
         if config.task == TaskConfig::Counter {
             return Err(Failure::Input(miette::miette!(
                 "`task.name` = \"counter\" has nothing to learn: use \"walk\""
@@ -225,7 +242,7 @@ fn open_page(args: &Args, config: &TrainConfig) -> Result<Option<Page>, Failure>
         return Ok(None);
     }
     let mut example = config.envs(1, 1, 1)?.remove(0);
-    let limits = robot_model(config.model.as_deref())?.torque_limits();
+    let limits = config.robot()?.torque_limits();
     args.view.open(&format!("twinstep train {}", config.task.name()), example.as_mut(), limits)
 }
 
@@ -311,6 +328,12 @@ impl TrainSession {
         let policy = learner.policy(spec);
         policy.write(&self.policy, self.origin()).map_err(other)?;
         policy.write_onnx(self.out.join("policy.onnx")).map_err(other)?;
+        if let TaskConfig::Explore(explore) = &self.config.task {
+            let (base, _) = Policy::read(&explore.base).map_err(input)?;
+            let whole = with_residual(&base, &policy, explore.max_residual);
+            whole.write(self.out.join("exploration.safetensors"), self.origin()).map_err(other)?;
+            whole.write_onnx(self.out.join("exploration.onnx")).map_err(other)?;
+        }
         write_curve(&self.curve, &self.out.join("curve.svg")).map_err(other)
     }
 
@@ -349,11 +372,11 @@ impl TrainSession {
         let (robots, seconds, seed) = EVALUATION;
         let fresh = TrainConfig {
             model: self.config.model.clone(),
-            task: TaskConfig::named(self.config.task.name()).expect("a task has its name"),
+            task: self.config.task.with_default_settings(),
             sim: SimConfig::default(),
             ..TrainConfig::default()
         };
-        let robot = robot_model(self.config.model.as_deref())?;
+        let robot = fresh.robot()?;
         let plan = EvaluationPlan { robot: &robot, seconds, seed };
         let proceed = |_: f64| signals.check().is_ok();
         let failure = |error| match error {
@@ -390,46 +413,6 @@ fn earlier_networks(path: &Path, spec: &EnvSpec, config: &PpoConfig) -> Result<L
         )));
     }
     Ok(learner.fine_tuned(config))
-}
-
-/// Returns the options of a connection for training.
-fn connect_options(endpoint: &str, num_envs: usize) -> ConnectOptions {
-    ConnectOptions { autoreset: AutoresetMode::SameStep, critic: true, ..ConnectOptions::new(endpoint, num_envs) }
-}
-
-/// Leases environments of the first server that grants them.
-fn remote_env(endpoints: &[String], num_envs: usize) -> Result<RemoteVecEnv, Failure> {
-    let connect = |endpoint: &String| RemoteVecEnv::connect(&connect_options(endpoint, num_envs));
-    let (last, others) = endpoints.split_last().expect("there is an endpoint");
-    others.iter().find_map(|endpoint| connect(endpoint).ok()).map_or_else(|| connect(last), Ok).map_err(other)
-}
-
-/// Leases the environments of each group. The groups are divided among the servers in order.
-fn remote_collectors(endpoints: &[String], config: &PpoConfig) -> Result<Vec<Box<dyn Collector>>, Failure> {
-    let PpoConfig { num_envs, groups, horizon, .. } = *config;
-    let mut collectors = Vec::new();
-    for group in 0..groups {
-        let robots = num_envs / groups + usize::from(group < num_envs % groups);
-        let endpoint = &endpoints[group * endpoints.len() / groups];
-        collectors.push(remote_collector(endpoint, robots, horizon)?);
-    }
-    Ok(collectors)
-}
-
-fn remote_collector(endpoint: &str, num_envs: usize, horizon: usize) -> Result<Box<dyn Collector>, Failure> {
-    let options = connect_options(endpoint, num_envs);
-    let env = RemoteVecEnv::connect(&options).map_err(other)?;
-    match env.max_rollout_steps() {
-        0 => {
-            tracing::warn!(endpoint, num_envs, "the server has no rollouts; each step is a request");
-            Ok(Box::new(StepCollector(Box::new(env))))
-        }
-        max if (horizon as u64) > max => Err(Failure::Input(miette::miette!(
-            "`train.horizon` = {horizon} is not allowed: the server at {endpoint} has rollouts of at most {max} steps\n  \
-             use a shorter horizon, or start the server with a larger `--max-rollout-steps`"
-        ))),
-        _ => Ok(Box::new(RemoteCollector::new(env, &options))),
-    }
 }
 
 fn progress_text(point: &CurvePoint) -> String {

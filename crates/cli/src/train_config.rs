@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use twinstep_env_server::{Config, ConfigFileError, EnvFactory, ServerConfig, SimEnvFactory};
 use twinstep_envs::{Randomisation, TaskConfig};
 use twinstep_learning::PpoConfig;
-use twinstep_model::{AutoresetMode, VecEnv};
+use twinstep_model::{AutoresetMode, RobotModel, VecEnv};
 use twinstep_sim::SimConfig;
 
 use crate::exit::{Failure, input};
@@ -61,6 +61,21 @@ impl TrainConfig {
 
     /// Builds `groups` batches of environments, `num_envs` in total, that are stepped by `threads` threads each.
     pub fn envs(&self, num_envs: usize, groups: usize, threads: usize) -> Result<Vec<Box<dyn VecEnv>>, Failure> {
+        let factory = self.factory(threads)?;
+        (0..groups)
+            .map(|group| {
+                let robots = num_envs / groups + usize::from(group < num_envs % groups);
+                factory.build(robots, AutoresetMode::SameStep, None).map_err(input)
+            })
+            .collect()
+    }
+
+    /// Returns the nominal robot, also that of a model file with actuator networks.
+    pub fn robot(&self) -> Result<RobotModel, Failure> {
+        Ok(self.factory(1)?.robot().clone())
+    }
+
+    fn factory(&self, threads: usize) -> Result<SimEnvFactory, Failure> {
         let config = Config {
             server: ServerConfig { model: self.model.clone(), ..ServerConfig::default() },
             task: self.task.clone(),
@@ -68,12 +83,6 @@ impl TrainConfig {
             randomise: self.randomise,
         };
         config.check().map_err(input)?;
-        let factory = SimEnvFactory::new(config).map_err(input)?;
-        (0..groups)
-            .map(|group| {
-                let robots = num_envs / groups + usize::from(group < num_envs % groups);
-                factory.build(robots, AutoresetMode::SameStep, None).map_err(input)
-            })
-            .collect()
+        SimEnvFactory::new(config).map_err(input)
     }
 }

@@ -15,6 +15,13 @@ pub struct ConfigError {
     pub allowed: String,
 }
 
+impl ConfigError {
+    /// Returns the error of the same key in the table `table` of the task.
+    pub(crate) fn within(self, table: &str) -> Self {
+        Self { field: self.field.replacen("task.", &format!("task.{table}."), 1), ..self }
+    }
+}
+
 /// Checks that a value is within `low..=high`.
 pub fn check_value(field: &str, value: f32, low: f32, high: f32) -> Result<(), ConfigError> {
     if (low..=high).contains(&value) {

@@ -40,6 +40,11 @@ macro_rules! reward_weights {
                 [$(self.$name * crate::reward::$name(input) * input.policy_dt),+]
             }
 
+            /// Returns all weights times `factor`.
+            pub fn scaled(&self, factor: f32) -> Self {
+                Self { $($name: factor * self.$name),+ }
+            }
+
             pub(crate) fn values(&self) -> impl Iterator<Item = (&'static str, f32)> {
                 [$((stringify!($name), self.$name)),+].into_iter()
             }

@@ -6,6 +6,8 @@
 //! - [`Policy`]: normaliser, actor and the spec of the environment; [`PolicyRunner`] evaluates it. [`Policy::read`] and
 //!   [`Policy::write`]: the policy file; [`Policy::write_onnx`]: the same for other runtimes.
 //! - [`BehaviourPolicy`]: a policy that explores; [`Collector`]: robots that can be run with it, in process or remote.
+//! - [`ResidualEnv`]: environments whose action is added to that of a frozen base policy; [`with_residual`]: base policy
+//!   and residual as one policy.
 //! - [`array_file`]: named arrays in a safetensors file.
 //!
 //! Equal weights and observations give equal bits on every instruction set and in every batch.
@@ -24,6 +26,7 @@ mod normaliser;
 mod onnx;
 mod policy;
 mod policy_file;
+mod residual;
 
 pub use behaviour::{ActionSampler, BehaviourPolicy, noise_seed};
 pub use collector::{Collector, StepCollector};
@@ -32,3 +35,4 @@ pub use network::{Activations, Network};
 pub use normaliser::Normaliser;
 pub use policy::{Policy, PolicyRunner};
 pub use policy_file::{CurvePoint, PolicyHeader, PolicyOrigin, mlp_arrays, take_mlp};
+pub use residual::{OtherBase, ResidualEnv, with_residual};

@@ -87,7 +87,7 @@ __all__ = [
     "stop_robot",
 ]
 
-for _task in ("walk", "track"):
+for _task in ("walk", "track", "explore"):
     gymnasium.register(
         id=f"twinstep/Go2-{_task.capitalize()}-v0",
         entry_point="twinstep.env:Go2Env",

@@ -4,11 +4,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::ConfigError;
 
+pub mod explore_config;
 pub mod track;
 pub mod track_config;
 pub mod walk;
 pub mod walk_config;
 
+pub use explore_config::ExploreConfig;
 pub use track::Track;
 pub use track_config::TrackConfig;
 pub use walk::Walk;
@@ -22,6 +24,8 @@ pub enum TaskConfig {
     Walk(WalkConfig),
     /// Following a path on the ground.
     Track(TrackConfig),
+    /// A residual on a frozen policy of `walk`, rewarded for the uncertainty of the actuator networks.
+    Explore(ExploreConfig),
     /// Counts steps without physics, to verify and measure the transport. It has no settings.
     Counter,
 }
@@ -34,13 +38,14 @@ impl Default for TaskConfig {
 
 impl TaskConfig {
     /// Names of all tasks.
-    pub const NAMES: [&str; 3] = ["walk", "track", "counter"];
+    pub const NAMES: [&str; 4] = ["walk", "track", "explore", "counter"];
 
     /// Returns the task of this name with default settings. Returns `None` if there is no such task.
     pub fn named(name: &str) -> Option<Self> {
         match name {
             "walk" => Some(Self::default()),
             "track" => Some(Self::Track(TrackConfig::default())),
+            "explore" => Some(Self::Explore(ExploreConfig::default())),
             "counter" => Some(Self::Counter),
             _ => None,
         }
@@ -51,6 +56,7 @@ impl TaskConfig {
         match self {
             Self::Walk(_) => "walk",
             Self::Track(_) => "track",
+            Self::Explore(_) => "explore",
             Self::Counter => "counter",
         }
     }
@@ -60,16 +66,29 @@ impl TaskConfig {
         match self {
             Self::Walk(config) => config.check(),
             Self::Track(config) => config.check(),
+            Self::Explore(config) => config.check(),
             Self::Counter => Ok(()),
         }
     }
 
-    /// Returns the weight of the reward term `epistemic_uncertainty`, which needs actuator networks.
-    pub fn epistemic_uncertainty_weight(&self) -> f32 {
+    /// Returns the task with default settings, except for the base policy of `explore` and its largest correction.
+    pub fn with_default_settings(&self) -> Self {
         match self {
-            Self::Walk(config) => config.reward.epistemic_uncertainty,
-            Self::Track(config) => config.walk.reward.epistemic_uncertainty,
-            Self::Counter => 0.0,
+            Self::Explore(config) => {
+                let (base, max_residual) = (config.base.clone(), config.max_residual);
+                Self::Explore(ExploreConfig { base, max_residual, ..ExploreConfig::default() })
+            }
+            _ => Self::named(self.name()).expect("a task has its name"),
+        }
+    }
+
+    /// Returns key and weight of the reward term `epistemic_uncertainty`, which needs actuator networks.
+    pub fn epistemic_uncertainty_weight(&self) -> (&'static str, f32) {
+        match self {
+            Self::Walk(config) => ("task.reward.epistemic_uncertainty", config.reward.epistemic_uncertainty),
+            Self::Track(config) => ("task.walk.reward.epistemic_uncertainty", config.walk.reward.epistemic_uncertainty),
+            Self::Explore(config) => ("task.uncertainty_weight", config.uncertainty_weight),
+            Self::Counter => ("task", 0.0),
         }
     }
 }
@@ -83,6 +102,7 @@ impl TryFrom<toml::Table> for TaskConfig {
         match name.as_str() {
             Some("walk") => table.try_into().map(Self::Walk).map_err(text),
             Some("track") => table.try_into().map(Self::Track).map_err(text),
+            Some("explore") => table.try_into().map(Self::Explore).map_err(text),
             Some("counter") if table.is_empty() => Ok(Self::Counter),
             Some("counter") => Err("the task `counter` has no settings besides `name`".to_owned()),
             _ => Err(format!("`name` = {name} is not a task; possible: {}", Self::NAMES.join(", "))),
@@ -122,7 +142,7 @@ mod tests {
             in `reward`
         "#]].assert_eq(&error("[reward]\ntorques = -1.0"));
         expect![[r#"
-            `name` = "fly" is not a task; possible: walk, track, counter
+            `name` = "fly" is not a task; possible: walk, track, explore, counter
         "#]]
         .assert_eq(&error("name = \"fly\""));
         expect![[r#"
@@ -133,8 +153,14 @@ mod tests {
 
     #[test]
     fn defaults_are_valid() {
-        for name in TaskConfig::NAMES {
+        for name in ["walk", "track", "counter"] {
             assert_eq!(TaskConfig::named(name).expect("a task").check(), Ok(()), "{name}");
         }
+        let explore = ExploreConfig::default();
+        assert_eq!(explore.check().expect_err("no base policy").field, "task.base");
+        let explore = ExploreConfig { base: "walk.safetensors".into(), ..explore };
+        assert_eq!(explore.check(), Ok(()));
+        let weights = explore.weighted_walk().reward;
+        assert_eq!((weights.epistemic_uncertainty, weights.termination), (10.0, -2.5));
     }
 }

@@ -71,8 +71,6 @@ impl TrackConfig {
         check_value("task.position_sigma", self.position_sigma, 1e-6, 1e6)?;
         check_value("task.heading_sigma", self.heading_sigma, 1e-6, 1e6)?;
         check_value("task.max_position_error_m", self.max_position_error_m, 0.01, 1e6)?;
-        self.walk
-            .check()
-            .map_err(|error| ConfigError { field: error.field.replacen("task.", "task.walk.", 1), ..error })
+        self.walk.check().map_err(|error| error.within("walk"))
     }
 }
