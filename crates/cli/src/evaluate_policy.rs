@@ -152,18 +152,15 @@ pub fn run(args: &Args) -> CommandResult {
             Failure::Input(miette::miette!("`--film` = {}: cannot write the file: {cause}", path.display()))
         })?;
     }
-    let text = match task {
-        TaskConfig::Track(_) => {
-            let rows = tracking(args, &policy, &signals)?;
-            if args.json { json(args, &rows) } else { evaluate_tracking::table(args.robots, args.seconds, &rows) }
-        }
-        _ => {
-            let rows = walking(args, &policy, &signals)?;
-            if args.json {
-                json(args, &rows)
-            } else {
-                format!("{}\n{}", table(args, &rows), speed_table(&rows[0].evaluation))
-            }
+    let text = if matches!(task, TaskConfig::Track(_)) {
+        let rows = tracking(args, &policy, &signals)?;
+        if args.json { json(args, &rows) } else { evaluate_tracking::table(args.robots, args.seconds, &rows) }
+    } else {
+        let rows = walking(args, &policy, &signals)?;
+        if args.json {
+            json(args, &rows)
+        } else {
+            format!("{}\n{}", table(args, &rows), speed_table(&rows[0].evaluation))
         }
     };
     print!("{text}");

@@ -92,7 +92,7 @@ pub fn evaluate(
     let [l_track, position, yaw] = sums.map(|sum| sum / f64::from(count.max(1)));
     let up = is_up.iter().filter(|is_up| **is_up).count() as f64 / num_envs as f64;
     Ok(Some(TrackingErrors {
-        path: *name,
+        path: name,
         motion_capture: task.observe_pose_error,
         up,
         l_track,

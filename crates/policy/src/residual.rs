@@ -118,7 +118,9 @@ pub fn with_residual(base: &Policy, residual: &Policy, max_residual: f32) -> Pol
     let mut networks = [Layers::new(&base.actor), Layers::new(&residual.actor)];
     networks[1].read_inputs_of(base, residual);
     let depth = networks.iter().map(|network| network.0.len()).max().unwrap_or_default();
-    networks.iter_mut().for_each(|network| network.deepen(depth));
+    for network in &mut networks {
+        network.deepen(depth);
+    }
     let [base_layers, residual_layers] = networks;
     let mut layers: Vec<Layer> = Vec::new();
     for (index, (one, other)) in base_layers.0.iter().zip(&residual_layers.0).enumerate() {
