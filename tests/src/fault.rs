@@ -63,10 +63,12 @@ impl Fault {
         }
     }
 
-    /// Samples a fault uniformly. [`Fault::RouterKilled`] is sampled only if there is a router.
-    pub fn draw(random: &mut Stream, has_router: bool) -> Self {
+    /// Samples one of `faults` uniformly. [`Fault::RouterKilled`] is sampled only if there is a router.
+    ///
+    /// Without a router there must be another one.
+    pub fn draw(faults: &[Fault], random: &mut Stream, has_router: bool) -> Self {
         loop {
-            let fault = Self::ALL[random.random_range(0..Self::ALL.len())];
+            let fault = faults[random.random_range(0..faults.len())];
             if has_router || fault != Fault::RouterKilled {
                 return fault;
             }

@@ -11,12 +11,17 @@ use twinstep_model::stream;
 use crate::fault::Fault;
 use crate::test_bed::{TestBed, TestBedConfig};
 
+/// Attempts to start a test bed before the last one.
+const STARTS: usize = 4;
+
 /// Settings of a run of fault injection.
 pub struct FaultPlan {
     /// Commands of the processes.
     pub commands: TestBedConfig,
     /// Number of faults.
     pub faults: usize,
+    /// Faults that are sampled.
+    pub kinds: Vec<Fault>,
     /// Number of test beds in parallel. Every second one has a router.
     pub lanes: usize,
     /// Seed of the faults and their times.
@@ -30,6 +35,8 @@ pub struct FaultReport {
     pub injected: BTreeMap<Fault, usize>,
     /// Fault and evidence of every failure.
     pub failures: Vec<(Fault, String)>,
+    /// Problems of test beds that ended before their share of faults.
+    pub unfinished: Vec<String>,
     /// Number of steps that clients acknowledged; each was checked.
     pub steps: u64,
     /// Longest time from the end of a fault to the third step after it.
@@ -62,7 +69,7 @@ impl std::fmt::Display for FaultReport {
 }
 
 /// Injects the faults of `plan`. Calls `progress` for each; stops early once `stop` is true.
-pub fn run(plan: &FaultPlan, stop: &AtomicBool, progress: impl Fn(Fault)) -> Result<FaultReport, String> {
+pub fn run(plan: &FaultPlan, stop: &AtomicBool, progress: impl Fn(Fault)) -> FaultReport {
     let (sender, outcomes) = channel();
     std::thread::scope(|scope| {
         let threads: Vec<_> = (0..plan.lanes)
@@ -85,11 +92,16 @@ pub fn run(plan: &FaultPlan, stop: &AtomicBool, progress: impl Fn(Fault)) -> Res
             progress(fault);
         }
         for thread in threads {
-            let (steps, slowest) = thread.join().map_err(|_| "a test bed panicked".to_owned())??;
-            tally.steps += steps;
-            tally.slowest = tally.slowest.max(slowest);
+            match thread.join().map_err(|_| "a test bed panicked".to_owned()).flatten() {
+                Ok((steps, slowest)) => {
+                    tally.steps += steps;
+                    tally.slowest = tally.slowest.max(slowest);
+                }
+                // The report of the other test beds is kept.
+                Err(problem) => tally.unfinished.push(problem),
+            }
         }
-        Ok(tally)
+        tally
     })
 }
 
@@ -104,17 +116,22 @@ fn run_test_bed(
 ) -> Result<(u64, Duration), String> {
     let with_router = index % 2 == 1;
     let mut random = stream(plan.seed, "faults", index as u64);
-    let start = || TestBed::start(&plan.commands, with_router);
+    // A port that was free may be taken by another program before the test bed listens at it.
+    let start = || {
+        let attempts = || (0..STARTS).map(|_| TestBed::start(&plan.commands, with_router));
+        attempts().find(Result::is_ok).unwrap_or_else(|| TestBed::start(&plan.commands, with_router))
+    };
     let mut test_bed = start()?;
     let (mut steps, mut slowest) = (0, Duration::ZERO);
     for _ in 0..share {
         if stop.load(Ordering::Acquire) {
             break;
         }
-        let fault = Fault::draw(&mut random, test_bed.has_router());
+        let fault = Fault::draw(&plan.kinds, &mut random, test_bed.has_router());
         let outcome = test_bed.inject(fault, &mut random);
         let failed = outcome.is_err();
-        report(fault, outcome.err());
+        let place = if test_bed.has_router() { "behind a router" } else { "without a router" };
+        report(fault, outcome.err().map(|evidence| format!("{evidence} ({place})")));
         if failed {
             steps += test_bed.steps;
             slowest = slowest.max(test_bed.slowest);

@@ -78,7 +78,7 @@ def test_error_of_a_server_that_cannot_start_contains_its_log() -> None:
 
 
 def test_exploration_without_its_base_policy_says_what_is_missing() -> None:
-    with pytest.raises(twinstep.ServerStartError, match="`task.base`"):
+    with pytest.raises(twinstep.ServerStartError, match=r"`task\.base`"):
         gym.make("twinstep/Go2-Explore-v0")
 
 
