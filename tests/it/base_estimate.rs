@@ -73,10 +73,10 @@ fn height_and_velocity_of_a_trotting_and_hopping_robot_are_estimated_from_its_le
         let estimate = BaseEstimate::of(&log, &go2());
         for (name, rows, most) in [("trot", 0..800, [0.002, 0.06]), ("hop", 800..ROWS, [0.012, 0.2])] {
             let [height, velocity] = errors(&log, &estimate, rows);
-            let told = format!("{sensor}, {name}: height {height:.4} m, velocity {velocity:.3} m/s");
-            println!("{told}; predicted {:.4} m, {:.3} m/s", estimate.height_sigma, estimate.velocity_sigma);
-            assert!(height < most[0] && velocity < most[1], "{told}");
-            assert!(height < 4.0 * estimate.height_sigma && velocity < 4.0 * estimate.velocity_sigma, "{told}");
+            let text = format!("{sensor}, {name}: height {height:.4} m, velocity {velocity:.3} m/s");
+            println!("{text}; predicted {:.4} m, {:.3} m/s", estimate.height_sigma, estimate.velocity_sigma);
+            assert!(height < most[0] && velocity < most[1], "{text}");
+            assert!(height < 4.0 * estimate.height_sigma && velocity < 4.0 * estimate.velocity_sigma, "{text}");
         }
     }
 }

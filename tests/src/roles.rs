@@ -67,11 +67,10 @@ impl Role {
 }
 
 fn route(listen: &str) -> Result<(), Box<dyn std::error::Error>> {
-    let mut config = zenoh::Config::default();
+    // The shipped file, so that it is tested with every fault.
+    let mut config = zenoh::Config::from_json5(include_str!("../../examples/security/router.json5"))?;
     for (key, value) in [
-        ("mode", "\"router\"".to_owned()),
         ("listen/endpoints", format!("[\"{listen}\"]")),
-        ("scouting/multicast/enabled", "false".to_owned()),
         ("transport/link/tx/lease", "2000".to_owned()),
     ] {
         config.insert_json5(key, &value).map_err(|error| error.to_string())?;

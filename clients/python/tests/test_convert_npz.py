@@ -46,7 +46,7 @@ def test_twinstep_reads_the_converted_log(tmp_path: Path):
     options = ["--out", str(out), "--base", "fixed", "--kp", "30", "--kd", "0.8"]
     assert main([str(tmp_path / "chirp.npz"), *options]) == 0
     assert json.loads((out / "meta.json").read_text())["rate_hz"] == 200
-    told = subprocess.run([find_program(), "log", str(out)], capture_output=True, text=True, check=True)
-    assert "200 rows" in told.stdout
+    described = subprocess.run([find_program(), "log", str(out)], capture_output=True, text=True, check=True)
+    assert "200 rows" in described.stdout
     assert main([str(tmp_path / "chirp.npz"), *options]) == 1, "an existing folder is kept"
     assert main([str(tmp_path / "nothing.npz"), *options]) == 1
