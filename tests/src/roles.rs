@@ -69,10 +69,9 @@ impl Role {
 fn route(listen: &str) -> Result<(), Box<dyn std::error::Error>> {
     // The shipped file, so that it is tested with every fault.
     let mut config = zenoh::Config::from_json5(include_str!("../../examples/security/router.json5"))?;
-    for (key, value) in [
-        ("listen/endpoints", format!("[\"{listen}\"]")),
-        ("transport/link/tx/lease", "2000".to_owned()),
-    ] {
+    for (key, value) in
+        [("listen/endpoints", format!("[\"{listen}\"]")), ("transport/link/tx/lease", "2000".to_owned())]
+    {
         config.insert_json5(key, &value).map_err(|error| error.to_string())?;
     }
     let _session = twinstep_session::open(config).map_err(|error| error.to_string())?;
