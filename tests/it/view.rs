@@ -149,6 +149,21 @@ fn address_that_others_can_reach_needs_a_token() {
 }
 
 #[test]
+fn policy_that_follows_a_path_is_shown_in_its_task() {
+    let policy = root().join("data/policies/track.safetensors");
+    let viewed = Viewed::start(&["view", policy.to_str().unwrap(), "--listen", "127.0.0.1:0"]);
+    let mut page = TcpStream::connect(viewed.address()).unwrap();
+    page.write_all(b"GET /frames HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+    page.set_read_timeout(Some(PATIENCE)).unwrap();
+    let (mut bytes, mut buffer) = (Vec::new(), vec![0; 1 << 16]);
+    while !String::from_utf8_lossy(&bytes).contains("\"robots\":1") {
+        let len = page.read(&mut buffer).unwrap();
+        assert!(len > 0, "the page ended");
+        bytes.extend_from_slice(&buffer[..len]);
+    }
+}
+
+#[test]
 fn robots_of_a_lease_are_seen_while_an_agent_steps_them() {
     let viewed = Viewed::start(&["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "3", "--view", "127.0.0.1:0"]);
     let options = ConnectOptions::new(viewed.endpoint(), 3);

@@ -68,7 +68,8 @@ impl Role {
 
 fn route(listen: &str) -> Result<(), Box<dyn std::error::Error>> {
     // The shipped file, so that it is tested with every fault.
-    let mut config = zenoh::Config::from_json5(include_str!("../../examples/security/router.json5"))?;
+    let mut config = zenoh::Config::from_json5(include_str!("../../examples/security/router.json5"))
+        .map_err(|error| error.to_string())?;
     for (key, value) in
         [("listen/endpoints", format!("[\"{listen}\"]")), ("transport/link/tx/lease", "2000".to_owned())]
     {

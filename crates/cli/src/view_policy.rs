@@ -5,12 +5,12 @@ use std::time::{Duration, Instant};
 
 use twinstep_agent::{BoundPolicy, LoadedPolicy, PolicyInput};
 use twinstep_env_server::{Config, EnvFactory, ServerConfig, SimEnvFactory};
+use twinstep_envs::TaskConfig;
 use twinstep_model::{AutoresetMode, EnvSpec, ResetRequest, VecEnv};
 use twinstep_sim::{Engine, SimConfig};
 use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo};
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
-use crate::robot_file::robot_model;
 use crate::serve::engine;
 use crate::web_view::PageArgs;
 
@@ -41,11 +41,13 @@ pub struct WalkArgs {
 /// Simulates the robots until a signal.
 pub fn run(path: &Path, model: Option<&Path>, args: &WalkArgs, page: &PageArgs, signals: &Signals) -> CommandResult {
     let robots = usize::from(args.robots);
-    let mut env = env(model, args.engine, robots)?;
-    let load = || LoadedPolicy::read(path, args.mapping.as_deref()).map_err(input)?.bind(env.spec()).map_err(input);
+    let read = || LoadedPolicy::read(path, args.mapping.as_deref()).map_err(input);
+    let factory = factory(&read()?, model, args.engine, robots)?;
+    let mut env = factory.build(robots, AutoresetMode::SameStep, Some(u32::MAX)).map_err(input)?;
+    let load = || read()?.bind(env.spec()).map_err(input);
     let policies = (0..robots).map(|_| load()).collect::<Result<Vec<_>, _>>()?;
     env.reset(&ResetRequest::seeded(args.seed, robots)).map_err(other)?;
-    let limits = robot_model(model)?.torque_limits();
+    let limits = factory.robot().torque_limits();
     let scene = SceneInfo {
         is_interactive: true,
         velocity_bounds: velocity_bounds(env.spec()),
@@ -56,15 +58,22 @@ pub fn run(path: &Path, model: Option<&Path>, args: &WalkArgs, page: &PageArgs, 
     walk.run(page.hub(), signals)
 }
 
-fn env(model: Option<&Path>, engine: Engine, robots: usize) -> Result<Box<dyn VecEnv>, Failure> {
+/// Returns the factory of the environments of the policy's task.
+fn factory(
+    policy: &LoadedPolicy,
+    model: Option<&Path>,
+    engine: Engine,
+    robots: usize,
+) -> Result<SimEnvFactory, Failure> {
+    let task = policy.spec().and_then(|spec| TaskConfig::named(&spec.task)).unwrap_or_default();
     let config = Config {
+        task,
         server: ServerConfig { model: model.map(Path::to_owned), envs: robots, ..ServerConfig::default() },
         sim: SimConfig { engine, threads: 1, ..SimConfig::default() },
         ..Config::default()
     };
     config.check().map_err(input)?;
-    let factory = SimEnvFactory::new(config).map_err(input)?;
-    factory.build(robots, AutoresetMode::SameStep, Some(u32::MAX)).map_err(input)
+    SimEnvFactory::new(config).map_err(input)
 }
 
 /// Returns the bounds of the velocity command; `None` if the task has none.
