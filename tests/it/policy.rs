@@ -8,6 +8,7 @@ use rand::RngExt;
 use twinstep_envs::base_spec;
 use twinstep_model::{go2, stream};
 use twinstep_policy::{Activations, Mlp, Network, Normaliser, Policy, PolicyOrigin, PolicyRunner};
+use twinstep_tests::fuzz::weights_examples::{header_and_data, with_header};
 use twinstep_tests::python::python;
 
 fn example() -> (Policy, Vec<f32>) {
@@ -116,6 +117,16 @@ fn broken_policy_files_are_rejected_with_the_reason() {
     let short = Policy { log_std: vec![0.0; 11], ..policy.clone() };
     short.write(&path, PolicyOrigin::default()).unwrap();
     assert_eq!(error(), "FILE has `log_std` with dimensions [11] instead of [12]");
+    // A file of some kilobytes that claims a network of 340 GB.
+    policy.write(&path, PolicyOrigin::default()).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    let (header, data) = header_and_data(&bytes);
+    let claim = format!("[45,{}12]", "65000,".repeat(20));
+    let own = format!("{:?}", policy.actor.sizes()).replace(' ', "");
+    let large = String::from_utf8(header.to_vec()).unwrap().replace(&own, &claim);
+    assert_ne!(large.as_bytes(), header);
+    std::fs::write(&path, with_header(large.as_bytes(), data)).unwrap();
+    assert!(error().contains("`actor.0.weight` with dimensions"), "{}", error());
     let other = Policy { actor: Mlp::zeros(&[44, 8, 12]), ..policy };
     other.write(&path, PolicyOrigin::default()).unwrap();
     assert_eq!(error(), "FILE has `actor_sizes` = [44, 8, 12], which does not fit its spec");

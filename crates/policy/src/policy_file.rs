@@ -132,11 +132,16 @@ pub fn mlp_arrays(name: &str, network: &Mlp) -> Arrays {
 
 /// Removes the arrays of a network from `arrays`.
 pub fn take_mlp(arrays: &mut Arrays, name: &str, sizes: &[usize], path: &Path) -> Result<Mlp, ArrayFileError> {
+    // The sizes are only a claim until the file has all arrays: before, no memory is reserved for them.
+    let mut layers = Vec::new();
+    for (index, pair) in sizes.windows(2).enumerate() {
+        let weight = take(arrays, &format!("{name}.{index}.weight"), &[pair[1], pair[0]], path)?;
+        let bias = take(arrays, &format!("{name}.{index}.bias"), &[pair[1]], path)?;
+        layers.push((transposed(&weight, pair[1]), bias));
+    }
     let mut network = Mlp::zeros(sizes);
-    for (index, layer) in network.layers().iter().enumerate() {
-        let weight = take(arrays, &format!("{name}.{index}.weight"), &[layer.outputs, layer.inputs], path)?;
-        let bias = take(arrays, &format!("{name}.{index}.bias"), &[layer.outputs], path)?;
-        network.set_layer(index, &transposed(&weight, layer.outputs), &bias);
+    for (index, (weight, bias)) in layers.iter().enumerate() {
+        network.set_layer(index, weight, bias);
     }
     Ok(network)
 }
