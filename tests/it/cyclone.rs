@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use twinstep_tests::process::Process;
 use twinstep_tests::python::{cyclone_python, root};
-use twinstep_tests::robot_pair::{RobotPair, next_domain};
+use twinstep_tests::robot_pair::{PATIENT, RobotPair, next_domain};
 
 #[test]
 fn robot_with_the_vendors_dds_is_observed_released_and_stands_up() {
@@ -21,7 +21,9 @@ fn robot_with_the_vendors_dds_is_observed_released_and_stands_up() {
     let program = Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep");
     let (script, domain) = (root().join("clients/python/tests/cyclone_robot.py"), next_domain());
     let robot = Process::start(&python, &[script.display().to_string(), domain.to_string()]).unwrap();
-    let mut pair = RobotPair::in_front_of(robot, domain, &program, &[]).unwrap();
+    // Beside other tests, Python publishes its states more slowly than a real robot.
+    let config = format!("{PATIENT}min_state_hz = 100\n");
+    let mut pair = RobotPair::in_front_of(robot, domain, &config, &program, &[]).unwrap();
     pair.stand().unwrap();
     let report = pair.ask("statistics").unwrap();
     assert_eq!(report["wrong_checksum"], 0, "by its own code: {report}");

@@ -11,8 +11,8 @@ use twinstep_model::stream;
 use crate::fault::Fault;
 use crate::test_bed::{TestBed, TestBedConfig};
 
-/// Attempts to start a test bed before the last one.
-const STARTS: usize = 4;
+/// Attempts to start a test bed.
+const STARTS: usize = 5;
 
 /// Settings of a run of fault injection.
 pub struct FaultPlan {
@@ -118,8 +118,13 @@ fn run_test_bed(
     let mut random = stream(plan.seed, "faults", index as u64);
     // A port that was free may be taken by another program before the test bed listens at it.
     let start = || {
-        let attempts = || (0..STARTS).map(|_| TestBed::start(&plan.commands, with_router));
-        attempts().find(Result::is_ok).unwrap_or_else(|| TestBed::start(&plan.commands, with_router))
+        let mut test_bed = TestBed::start(&plan.commands, with_router);
+        for _ in 1..STARTS {
+            if test_bed.is_err() {
+                test_bed = TestBed::start(&plan.commands, with_router);
+            }
+        }
+        test_bed
     };
     let mut test_bed = start()?;
     let (mut steps, mut slowest) = (0, Duration::ZERO);

@@ -14,8 +14,8 @@ const START: Duration = Duration::from_secs(20);
 const ANSWER: Duration = Duration::from_secs(5);
 /// Domains of the pairs of one test process.
 static NEXT_DOMAIN: AtomicU16 = AtomicU16::new(210);
-/// Config of the robot. Virtual machines stand still for tens of milliseconds, and other tests run beside this one.
-pub const PATIENT: &str = "[safety]\nstate_timeout_ms = 150\nmin_state_hz = 100\n";
+/// Config of the robot. Virtual machines stand still for tens of milliseconds.
+pub const PATIENT: &str = "[safety]\nstate_timeout_ms = 150\n";
 /// Domains above are not valid.
 const LAST_DOMAIN: u16 = 232;
 
@@ -48,17 +48,23 @@ impl RobotPair {
     pub fn start(program: &Path, fake: &[&str], robot: &[&str]) -> Result<Self, String> {
         let domain = next_domain();
         let fake = arguments(&["fake-robot", "--until-stdin-closes", "--domain", &domain.to_string()], fake);
-        Self::in_front_of(Process::start(program, &fake)?, domain, program, robot)
+        Self::in_front_of(Process::start(program, &fake)?, domain, PATIENT, program, robot)
     }
 
-    /// Starts `twinstep robot` for the robot on `domain` that the process `fake` simulates.
-    pub fn in_front_of(fake: Process, domain: u16, program: &Path, robot: &[&str]) -> Result<Self, String> {
+    /// Starts `twinstep robot` with this config file for the robot on `domain` that the process `fake` simulates.
+    pub fn in_front_of(
+        fake: Process,
+        domain: u16,
+        config_text: &str,
+        program: &Path,
+        robot: &[&str],
+    ) -> Result<Self, String> {
         if fake.line(START).is_none_or(|line| !line.starts_with("ready")) {
             return Err("the fake robot did not start".to_owned());
         }
         let folder = tempfile::tempdir().map_err(|error| error.to_string())?;
         let config = folder.path().join("robot.toml");
-        std::fs::write(&config, PATIENT).map_err(|error| error.to_string())?;
+        std::fs::write(&config, config_text).map_err(|error| error.to_string())?;
         let config = config.to_str().unwrap_or_default();
         let own = ["robot", "--interface", "127.0.0.1", "--listen", "tcp/127.0.0.1:0", "--config", config];
         let domain_text = domain.to_string();

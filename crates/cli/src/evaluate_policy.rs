@@ -205,7 +205,8 @@ fn tracking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<Track
             let mut env = condition.env(args, TaskConfig::Track(task.0.clone()), args.robots as usize)?;
             check_spec(policy, env.spec())?;
             let proceed = |share: f64| show(&bar, (index as f64 + share) / tasks.len() as f64, signals);
-            let errors = evaluate_tracking::evaluate(policy, env.as_mut(), task, args.seconds, proceed);
+            let duration_and_seed = (args.seconds, args.seed);
+            let errors = evaluate_tracking::evaluate(policy, env.as_mut(), task, duration_and_seed, proceed);
             paths.push(errors.map_err(input)?.ok_or(Failure::Interrupted)?);
         }
         bar.finish_and_clear();

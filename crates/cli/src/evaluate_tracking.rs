@@ -48,7 +48,8 @@ pub fn tasks(observe_pose_error: bool) -> [(TrackConfig, &'static str); 3] {
     })
 }
 
-/// Steps all robots of `env` with the mean action of `policy` along the path of `task`, and measures their errors.
+/// Steps all robots of `env` for `seconds` with the mean action of `policy` along the path of `task`, and measures their
+/// errors.
 ///
 /// The pose is that of the drawn robot, and the reference is computed here: both are independent of the observation. A
 /// robot counts until it falls. `proceed` is called after each step; the evaluation stops if it returns false.
@@ -56,7 +57,7 @@ pub fn evaluate(
     policy: &Policy,
     env: &mut dyn VecEnv,
     (task, name): &(TrackConfig, &'static str),
-    seconds: f64,
+    (seconds, seed): (f64, u64),
     mut proceed: impl FnMut(f64) -> bool,
 ) -> Result<Option<TrackingErrors>, EnvError> {
     let spec = env.spec().clone();
@@ -64,7 +65,7 @@ pub fn evaluate(
     // Only random paths depend on these.
     let path = Path::new(task.path, task.radius_m, task.speed, [[0.0; 2]; 3], &mut stream(0, "path", 0));
     let mut runner = PolicyRunner::new(policy);
-    let mut obs = env.reset(&ResetRequest::seeded(1_000_000, num_envs))?.to_vec();
+    let mut obs = env.reset(&ResetRequest::seeded(seed, num_envs))?.to_vec();
     let mut actions = vec![0.0; num_envs * spec.action_len()];
     let mut is_up = vec![true; num_envs];
     let (mut reference, mut sums, mut count) = (GroundPose::default(), [0.0; 3], 0);
@@ -89,7 +90,8 @@ pub fn evaluate(
             return Ok(None);
         }
     }
-    let [l_track, position, yaw] = sums.map(|sum| sum / f64::from(count.max(1)));
+    // NaN if every robot fell in the first step: there is no error to report.
+    let [l_track, position, yaw] = sums.map(|sum| sum / f64::from(count));
     let up = is_up.iter().filter(|is_up| **is_up).count() as f64 / num_envs as f64;
     Ok(Some(TrackingErrors {
         path: name,

@@ -76,7 +76,7 @@ pub struct Args {
     /// [randomise] are then those of the servers. Default: simulate in this process.
     #[arg(long, value_name = "ENDPOINT", value_delimiter = ',', conflicts_with_all = ["model", "randomise_effects"])]
     endpoint: Vec<String>,
-    /// Policy of `walk` to whose actions the task `explore` adds a residual.
+    /// Policy of `walk` to whose actions the task `explore` adds a residual. With --endpoint: that of the servers.
     #[arg(long, value_name = "FILE")]
     base: Option<PathBuf>,
     /// Start with the networks of this checkpoint.safetensors of another training: fine-tuning. Task and gains must be
@@ -231,6 +231,8 @@ struct TrainSession {
     minutes: Option<f64>,
     trainer: Trainer,
     curve: Vec<CurvePoint>,
+    /// Base policy of the task `explore`.
+    base: Option<Policy>,
     log: TrainLog,
     /// Serves the robots of the first group.
     _page: Option<Page>,
@@ -267,6 +269,10 @@ impl TrainSession {
             }
             endpoints => remote_collectors(endpoints, &config.train)?,
         };
+        let base = match &config.task {
+            TaskConfig::Explore(explore) => Some(Policy::read(&explore.base).map_err(input)?.0),
+            _ => None,
+        };
         let seed = checkpoint.as_ref().map_or(args.seed, |checkpoint| checkpoint.seed);
         let resumed_at = checkpoint.as_ref().map(|checkpoint| checkpoint.learner.env_steps);
         let (learner, curve) = match (checkpoint, &args.from) {
@@ -279,7 +285,7 @@ impl TrainSession {
             .map_err(|cause| folder_error(&args.out, cause))?;
         let (out, policy) = (args.out.clone(), args.policy());
         let (endpoints, minutes) = (args.endpoint.clone(), args.minutes);
-        Ok(Self { config, text, seed, out, policy, endpoints, minutes, trainer, curve, log, _page: page })
+        Ok(Self { config, text, seed, out, policy, endpoints, minutes, trainer, curve, base, log, _page: page })
     }
 
     /// Trains until all steps are done, the time is over, or the user interrupts.
@@ -328,9 +334,8 @@ impl TrainSession {
         let policy = learner.policy(spec);
         policy.write(&self.policy, self.origin()).map_err(other)?;
         policy.write_onnx(self.out.join("policy.onnx")).map_err(other)?;
-        if let TaskConfig::Explore(explore) = &self.config.task {
-            let (base, _) = Policy::read(&explore.base).map_err(input)?;
-            let whole = with_residual(&base, &policy, explore.max_residual);
+        if let (TaskConfig::Explore(explore), Some(base)) = (&self.config.task, &self.base) {
+            let whole = with_residual(base, &policy, explore.max_residual);
             whole.write(self.out.join("exploration.safetensors"), self.origin()).map_err(other)?;
             whole.write_onnx(self.out.join("exploration.onnx")).map_err(other)?;
         }

@@ -26,6 +26,8 @@ pub struct ResidualEnv {
     max_residual: f32,
     /// Action of the base policy in each environment.
     base_actions: Vec<f32>,
+    /// Velocity commands that were set since the last step.
+    next_velocity_commands: Option<Vec<[f32; 3]>>,
 }
 
 impl ResidualEnv {
@@ -41,7 +43,8 @@ impl ResidualEnv {
                 format!("added to the action of the base policy, in units of {max_residual} · action_scale");
         }
         let base_actions = vec![0.0; env.num_envs() * spec.action_len()];
-        Ok(Self { base: PolicyRunner::new(base), env, spec, max_residual, base_actions })
+        let base = PolicyRunner::new(base);
+        Ok(Self { base, env, spec, max_residual, base_actions, next_velocity_commands: None })
     }
 }
 
@@ -71,7 +74,9 @@ impl VecEnv for ResidualEnv {
     }
 
     fn set_velocity_commands(&mut self, commands: &[[f32; 3]]) -> Result<(), EnvError> {
-        self.env.set_velocity_commands(commands)
+        self.spec.check_velocity_commands(commands, self.num_envs())?;
+        self.next_velocity_commands = Some(commands.to_vec());
+        Ok(())
     }
 
     fn set_action_tick(&mut self, tick: u64) {
@@ -83,6 +88,7 @@ impl VecEnv for ResidualEnv {
     }
 
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
+        let velocity_commands = self.next_velocity_commands.take();
         let expected = self.base_actions.len();
         if actions.len() != expected {
             return Err(EnvError::WrongLength { field: "actions", given: actions.len(), expected });
@@ -91,6 +97,9 @@ impl VecEnv for ResidualEnv {
             let (env, entry) = (index / self.spec.action_len(), index % self.spec.action_len());
             let entry = self.spec.action_entry(entry);
             return Err(EnvError::ActionNotFinite { env, entry, value: actions[index] });
+        }
+        if let Some(commands) = velocity_commands {
+            self.env.set_velocity_commands(&commands)?;
         }
         self.base.run(self.env.obs(), &mut self.base_actions);
         for (action, residual) in self.base_actions.iter_mut().zip(actions) {

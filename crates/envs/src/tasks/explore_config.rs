@@ -49,7 +49,7 @@ impl ExploreConfig {
                 allowed: "a policy file of `walk`, such as \"walk/policy.safetensors\"".to_owned(),
             });
         }
-        check_value("task.max_residual", self.max_residual, 0.0, 2.0)?;
+        check_value("task.max_residual", self.max_residual, 0.01, 2.0)?;
         check_value("task.uncertainty_weight", self.uncertainty_weight, 0.0, 1e6)?;
         check_value("task.task_weight", self.task_weight, 0.0, 1e6)?;
         self.walk.check().map_err(|error| error.within("walk"))
