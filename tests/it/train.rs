@@ -240,6 +240,11 @@ fn shipped_policy_follows_a_circle_a_figure_of_eight_and_a_square() {
         assert!(limits.contains(&l_track), "{errors}");
     }
     assert_eq!(rows.iter().map(|row| row["paths"].as_array().unwrap().len()).max(), Some(6));
+    let of_seed = |seed| {
+        let short = ["--robots", "2", "--seconds", "1", "--engine", "batch", "--json", "--seed", seed];
+        twinstep(&[&arguments[..2], &short].concat()).stdout
+    };
+    assert!(of_seed("1") == of_seed("1") && of_seed("1") != of_seed("2"), "the seed is that of the robots");
 }
 
 #[test]

@@ -67,6 +67,25 @@ fn random_numbers_of_the_task_do_not_depend_on_given_commands() {
 }
 
 #[test]
+fn residual_on_a_base_policy_keeps_the_contract_of_environments() {
+    let path = twinstep_tests::python::root().join("data/policies/walk.safetensors");
+    let base = twinstep_policy::Policy::read(path).unwrap().0;
+    let factory = SimEnvFactory::new(config(TaskConfig::default())).unwrap();
+    let walk = factory.build(2, AutoresetMode::NextStep, Some(20)).unwrap();
+    let mut env = twinstep_policy::ResidualEnv::new(walk, "explore", &base, 0.5).unwrap();
+    twinstep_envs::check_vec_env(&mut env, 60).unwrap();
+    env.reset(&ResetRequest::seeded(1, 2)).unwrap();
+    let before = env.obs()[6..9].to_vec();
+    env.set_velocity_commands(&COMMANDS).unwrap();
+    let error = env.step(&[f32::NAN; 24]).unwrap_err().to_string();
+    assert!(error.contains("residual[FL_hip] is NaN"), "{error}");
+    // A rejected step discards the commands, as it does without a residual.
+    assert_eq!(env.step(&[0.0; 24]).unwrap().obs[6..9], before);
+    env.set_velocity_commands(&COMMANDS).unwrap();
+    assert_eq!(env.step(&[0.0; 24]).unwrap().obs[6..9], COMMANDS[0]);
+}
+
+#[test]
 fn invalid_commands_are_errors_of_the_environment() {
     let factory = SimEnvFactory::new(config(TaskConfig::default())).unwrap();
     let mut env = factory.build(2, AutoresetMode::Disabled, None).unwrap();

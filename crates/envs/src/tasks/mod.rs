@@ -159,6 +159,8 @@ mod tests {
         let explore = ExploreConfig::default();
         assert_eq!(explore.check().expect_err("no base policy").field, "task.base");
         let explore = ExploreConfig { base: "walk.safetensors".into(), ..explore };
+        let none = ExploreConfig { max_residual: 0.0, ..explore.clone() };
+        assert_eq!(none.check().expect_err("no residual").field, "task.max_residual");
         assert_eq!(explore.check(), Ok(()));
         let weights = explore.weighted_walk().reward;
         assert_eq!((weights.epistemic_uncertainty, weights.termination), (10.0, -2.5));
