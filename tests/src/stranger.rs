@@ -20,12 +20,9 @@ const SILENCE: Duration = Duration::from_secs(3);
 /// Fails unless every request is refused in the same way.
 pub fn use_foreign_lease(endpoint: &str, lease: &str, epoch: u64, last_seq: u64) -> Result<(), String> {
     let connection = Connection::open(&ConnectOptions::new(endpoint, 1), Secret::random()).map_err(text)?;
-    let refused = |key: String, request: Vec<u8>| {
-        let querier = connection.querier(key.clone()).map_err(text)?;
-        match connection.request(&querier, request) {
-            Err(ClientError::Rejected(error)) if error.code == ErrorCode::LeaseLost => Ok(()),
-            other => Err(format!("a request without the secret at {key}: {other:?}")),
-        }
+    let refused = |key: String, request: Vec<u8>| match connection.request(&key, request) {
+        Err(ClientError::Rejected(error)) if error.code == ErrorCode::LeaseLost => Ok(()),
+        other => Err(format!("a request without the secret at {key}: {other:?}")),
     };
     let key = |method| keys::env(connection.sid(), lease, method);
     for seq in [last_seq, last_seq + 1] {
@@ -52,7 +49,7 @@ pub fn read_nothing(endpoint: &str) -> Result<(), String> {
     let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&proxy.endpoint, 1)).map_err(text)?;
     env.reset(&ResetRequest::default()).map_err(text)?;
     let connection = Connection::open(&ConnectOptions::new(&proxy.endpoint, 1), Secret::random()).map_err(text)?;
-    let unknown = connection.querier(format!("twinstep/{}/{}", connection.sid(), "x".repeat(1000))).map_err(text)?;
+    let unknown = format!("twinstep/{}/{}", connection.sid(), "x".repeat(1000));
     proxy.hold_replies(SILENCE);
     env.send(&[0.5; 12]).map_err(text)?;
     let unread: Result<Vec<_>, _> = (0..UNREAD_REQUESTS).map(|_| connection.send(&unknown, Vec::new())).collect();

@@ -130,7 +130,7 @@ def test_requests_without_the_secret_of_the_lease_are_refused(endpoint: str, env
     envs.reset(None, None)
     before = env_steps(endpoint)
     other = Connection(endpoint, robot=None, zenoh_config=None, server=None, connect_timeout_s=5.0)
-    step = other.querier(f"env/{envs.lease}/step")
+    step = f"env/{envs.lease}/step"
     message = {"epoch": envs._epoch, "seq": envs._last_seq + 1, "actions": bytes(8)}
     for secret in (other._secret, b"", envs._connection._secret[:-1]):
         other._secret = secret
@@ -183,7 +183,7 @@ def test_step_before_the_first_reset_is_rejected(envs: RemoteVecEnv) -> None:
 def test_a_lease_is_granted_once_released_by_close_and_reclaimed_with_its_secret(endpoint: str) -> None:
     def lease(connection: Connection, **fields: object) -> dict[str, Any]:
         message = {"client": connection.client, "num_envs": 2, "autoreset": "NextStep", **fields}
-        return connection.request(connection.querier("lease"), message, 5.0, "timeout_s")
+        return connection.request("lease", message, 5.0, "timeout_s")
 
     def free() -> int | None:
         (info,) = twinstep.discover(endpoint)
@@ -206,8 +206,8 @@ def test_a_lease_is_granted_once_released_by_close_and_reclaimed_with_its_secret
     assert lease(second, reclaim=reclaim)["epoch"] == lease(second, reclaim=reclaim)["epoch"] == 2
     close = {"epoch": 1, "seq": 1}
     with pytest.raises(twinstep.LeaseLostError, match="epoch"):
-        first.request(first.querier(f"env/{granted['lease']}/close"), close, 5.0, "timeout_s")
-    second.request(second.querier(f"env/{granted['lease']}/close"), {**close, "epoch": 2}, 5.0, "timeout_s")
+        first.request(f"env/{granted['lease']}/close", close, 5.0, "timeout_s")
+    second.request(f"env/{granted['lease']}/close", {**close, "epoch": 2}, 5.0, "timeout_s")
     assert free() == 64
     first.close()
     second.close()

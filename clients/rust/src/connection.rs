@@ -9,7 +9,7 @@ use zenoh::bytes::ZBytes;
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::qos::CongestionControl;
-use zenoh::query::{ConsolidationMode, Querier, QueryTarget, Reply};
+use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 use zenoh::{Session, Wait};
 
 use crate::discovery::{choose_server, visible_servers};
@@ -105,8 +105,7 @@ impl Connection {
 
     /// Damps the motors of the robot at once, whoever controls it.
     pub fn stop_robot(&self) -> Result<(), ClientError> {
-        let querier = self.querier(keys::stop(&self.sid))?;
-        self.request(&querier, encode(&message::StopRequest { protocol: PROTOCOL })).map(drop)
+        self.request(&keys::stop(&self.sid), encode(&message::StopRequest { protocol: PROTOCOL })).map(drop)
     }
 
     /// Returns the secret that is attached to every request.
@@ -117,6 +116,11 @@ impl Connection {
     /// Returns the id of the client, as in its liveliness token.
     pub fn client(&self) -> &str {
         &self.client
+    }
+
+    /// Returns the Zenoh session.
+    pub fn session(&self) -> &Session {
+        &self.session
     }
 
     /// Returns the id of the server.
@@ -139,10 +143,16 @@ impl Connection {
         visible_servers(&self.session).iter().any(|(sid, _)| *sid == self.sid)
     }
 
-    /// Declares a querier for one key of the server.
-    pub fn querier(&self, key: String) -> Result<Querier<'static>, ClientError> {
+    /// Sends one query.
+    ///
+    /// Not through a declared querier: routers and servers keep its key for ever if the client is lost
+    /// ([Zenoh's issue 1518](https://github.com/eclipse-zenoh/zenoh/issues/1518)).
+    fn get(&self, key: &str, request: &Request) -> Result<FifoChannelHandler<Reply>, ClientError> {
+        let Request { payload, attachment } = request.clone();
         self.session
-            .declare_querier(key)
+            .get(key)
+            .payload(payload)
+            .attachment(attachment)
             .target(QueryTarget::BestMatching)
             .consolidation(ConsolidationMode::None)
             .congestion_control(CongestionControl::Block)
@@ -153,9 +163,9 @@ impl Connection {
     }
 
     fn hello(&self) -> Result<message::HelloReply, ClientError> {
-        let querier = self.querier(keys::hello(&self.sid))?;
         let client = concat!("twinstep-client ", env!("CARGO_PKG_VERSION")).to_owned();
-        let answer = self.request(&querier, encode(&message::HelloRequest { protocol: PROTOCOL, client }))?;
+        let answer =
+            self.request(&keys::hello(&self.sid), encode(&message::HelloRequest { protocol: PROTOCOL, client }))?;
         let hello: message::HelloReply = read_answer(&answer, "hello")?;
         if !(hello.protocols[0]..=hello.protocols[1]).contains(&PROTOCOL) {
             return Err(ClientError::Version { theirs: hello.protocols, ours: PROTOCOL });
@@ -163,29 +173,24 @@ impl Connection {
         Ok(hello)
     }
 
-    /// Sends a request and waits for the reply.
-    pub fn request(&self, querier: &Querier<'static>, request: Vec<u8>) -> Result<ZBytes, ClientError> {
-        self.wait_reply(querier, &mut self.send(querier, request)?, self.timeout)
+    /// Sends a request to a key of the server and waits for the reply.
+    pub fn request(&self, key: &str, request: Vec<u8>) -> Result<ZBytes, ClientError> {
+        self.wait_reply(key, &mut self.send(key, request)?, self.timeout)
     }
 
     /// Sends a request without waiting for the reply.
-    pub fn send(&self, querier: &Querier<'static>, payload: Vec<u8>) -> Result<Pending, ClientError> {
+    pub fn send(&self, key: &str, payload: Vec<u8>) -> Result<Pending, ClientError> {
         let (bytes, limit) = (payload.len(), self.max_request_bytes);
         if bytes > limit {
-            return Err(ClientError::TooLarge { request: querier.key_expr().to_string(), bytes, limit });
+            return Err(ClientError::TooLarge { request: key.to_owned(), bytes, limit });
         }
         let request = Request { payload: ZBytes::from(payload), attachment: ZBytes::from(self.secret.as_bytes()) };
-        let replies = get(querier, &request)?;
+        let replies = self.get(key, &request)?;
         Ok(Pending { request, replies })
     }
 
     /// Waits for the reply to a request and repeats the request until the timeout. May be called again after a timeout.
-    pub fn wait_reply(
-        &self,
-        querier: &Querier<'static>,
-        pending: &mut Pending,
-        timeout: Duration,
-    ) -> Result<ZBytes, ClientError> {
+    pub fn wait_reply(&self, key: &str, pending: &mut Pending, timeout: Duration) -> Result<ZBytes, ClientError> {
         let mut since = Instant::now();
         let mut waiting_for = String::new();
         let mut pause = RETRY_BACKOFF[0];
@@ -219,14 +224,14 @@ impl Connection {
             if since.elapsed() >= timeout {
                 return Err(ClientError::RequestTimeout {
                     endpoint: self.endpoint.clone(),
-                    request: querier.key_expr().to_string(),
+                    request: key.to_owned(),
                     waited_s: since.elapsed().as_secs_f64(),
                     reason: self.timeout_reason(),
                 });
             }
             std::thread::sleep(pause);
             pause = (pause * 2).min(RETRY_BACKOFF[1]);
-            pending.replies = get(querier, &pending.request)?;
+            pending.replies = self.get(key, &pending.request)?;
         }
     }
 
@@ -256,11 +261,8 @@ impl Connection {
                     unresponsive"
                 .to_owned();
         }
-        let hello = self.querier(keys::hello(&self.sid)).and_then(|querier| {
-            let request = message::HelloRequest { protocol: PROTOCOL, client: self.client.clone() };
-            Ok(outcome(&self.send(&querier, encode(&request))?.replies))
-        });
-        match hello {
+        let request = message::HelloRequest { protocol: PROTOCOL, client: self.client.clone() };
+        match self.send(&keys::hello(&self.sid), encode(&request)).map(|hello| outcome(&hello.replies)) {
             Ok(QueryOutcome::Answer(_)) => {
                 "the server answers `hello`, but not this request: it is still in progress (increase `timeout`), or \
                  access control or a message size limit rejects it"
@@ -270,11 +272,6 @@ impl Connection {
         }
         .to_owned()
     }
-}
-
-fn get(querier: &Querier<'static>, request: &Request) -> Result<FifoChannelHandler<Reply>, ClientError> {
-    let Request { payload, attachment } = request.clone();
-    querier.get().payload(payload).attachment(attachment).wait().map_err(|error| zenoh_error(&error))
 }
 
 fn outcome(replies: &FifoChannelHandler<Reply>) -> QueryOutcome {

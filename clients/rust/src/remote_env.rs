@@ -1,6 +1,5 @@
 //! Vectorised environments on a server.
 
-use std::sync::OnceLock;
 use std::time::Duration;
 
 use twinstep_model::{
@@ -11,7 +10,6 @@ use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::tensor::as_bytes;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, Secret, convert, decode, encode, keys, message};
 use zenoh::bytes::ZBytes;
-use zenoh::query::Querier;
 
 use crate::connection::{Pending, read_answer};
 use crate::{ClientError, ConnectOptions, Connection};
@@ -36,12 +34,6 @@ pub struct RemoteVecEnv {
     num_envs: usize,
     autoreset: AutoresetMode,
     last_seq: u64,
-    step: Querier<'static>,
-    reset: Querier<'static>,
-    /// Declared at the first `scene`, which most agents never request.
-    render: OnceLock<Querier<'static>>,
-    /// Declared at the first rollout.
-    rollout: OnceLock<Querier<'static>>,
     /// Number of steps of the rollout in progress, and the fingerprint of its policy if the request contains it.
     sent_rollout: (usize, Option<u64>),
     /// Fingerprint of the policy that the server holds, and its id.
@@ -81,11 +73,8 @@ impl RemoteVecEnv {
             spec_hash: options.spec_hash.clone(),
             reclaim: ticket.map(|ticket| message::Reclaim { lease: ticket.lease.clone(), epoch: ticket.epoch }),
         };
-        let querier = connection.querier(keys::lease(connection.sid()))?;
-        let answer = connection.request(&querier, encode(&request))?;
+        let answer = connection.request(&keys::lease(connection.sid()), encode(&request))?;
         let granted: message::LeaseReply = read_answer(&answer, "lease")?;
-        let key = |verb| keys::env(connection.sid(), &granted.lease, verb);
-        let (step, reset) = (connection.querier(key(EnvMethod::Step))?, connection.querier(key(EnvMethod::Reset))?);
         let num_envs = convert::check_lease(granted.num_envs, &granted.spec)
             .map_err(|error| ClientError::Malformed { request: "lease".to_owned(), reason: error.message })?;
         Ok(Self {
@@ -95,10 +84,6 @@ impl RemoteVecEnv {
             num_envs,
             autoreset: granted.autoreset,
             last_seq: granted.last_seq,
-            step,
-            reset,
-            render: OnceLock::new(),
-            rollout: OnceLock::new(),
             sent_rollout: (0, None),
             held_policy: None,
             pending: None,
@@ -129,7 +114,7 @@ impl RemoteVecEnv {
         let (epoch, seq) = (self.ticket.epoch, self.last_seq + 1);
         let for_tick = self.action_tick.take();
         let request = convert::encode_actions(actions, self.velocity_commands.as_deref(), for_tick, epoch, seq);
-        self.pending = Some((EnvMethod::Step, self.connection.send(&self.step, request).map_err(remote)?));
+        self.send_request(EnvMethod::Step, request)?;
         Ok(())
     }
 
@@ -157,8 +142,7 @@ impl RemoteVecEnv {
 
     /// Stops the robot at once: its motors are damped until its operator arms them again.
     pub fn stop(&self) -> Result<(), ClientError> {
-        let querier = self.connection.querier(keys::stop(self.connection.sid()))?;
-        self.connection.request(&querier, encode(&message::StopRequest { protocol: PROTOCOL })).map(drop)
+        self.connection.stop_robot()
     }
 
     /// Returns the maximum number of steps of a rollout; 0 for a server without rollouts.
@@ -209,9 +193,7 @@ impl RemoteVecEnv {
             policy: policy_id.is_none().then_some(sent),
             policy_id,
         };
-        let querier = self.declared(&self.rollout, EnvMethod::Rollout).map_err(remote)?;
-        let pending = self.connection.send(querier, encode(&request)).map_err(remote)?;
-        self.pending = Some((EnvMethod::Rollout, pending));
+        self.send_request(EnvMethod::Rollout, encode(&request))?;
         self.sent_rollout = (steps, policy_id.is_none().then_some(fingerprint));
         Ok(())
     }
@@ -267,27 +249,24 @@ impl RemoteVecEnv {
             // Its result is not needed, but whether its number was consumed is.
             let _ = self.await_pending(self.connection.timeout());
         }
-        let querier =
-            self.connection.querier(keys::env(self.connection.sid(), &self.ticket.lease, EnvMethod::Close))?;
         let (epoch, seq) = (self.ticket.epoch, self.last_seq + 1);
-        match self.connection.request(&querier, encode(&message::CloseRequest { protocol: PROTOCOL, epoch, seq })) {
+        let request = encode(&message::CloseRequest { protocol: PROTOCOL, epoch, seq });
+        match self.connection.request(&self.key(EnvMethod::Close), request) {
             // The first reply was lost, or the grace period has passed: the lease has ended either way.
             Err(ClientError::Rejected(refusal)) if refusal.code == ErrorCode::LeaseLost => Ok(()),
             answer => answer.map(drop),
         }
     }
 
-    /// Returns the querier in `cell` for a method; declares it at its first use.
-    fn declared<'a>(
-        &self,
-        cell: &'a OnceLock<Querier<'static>>,
-        verb: EnvMethod,
-    ) -> Result<&'a Querier<'static>, ClientError> {
-        if let Some(querier) = cell.get() {
-            return Ok(querier);
-        }
-        let querier = self.connection.querier(keys::env(self.connection.sid(), &self.ticket.lease, verb))?;
-        Ok(cell.get_or_init(|| querier))
+    /// Returns the key of a method of the lease.
+    fn key(&self, method: EnvMethod) -> String {
+        keys::env(self.connection.sid(), &self.ticket.lease, method)
+    }
+
+    /// Sends a request, which is in progress from now on.
+    fn send_request(&mut self, method: EnvMethod, request: Vec<u8>) -> Result<(), EnvError> {
+        self.pending = Some((method, self.connection.send(&self.key(method), request).map_err(remote)?));
+        Ok(())
     }
 
     /// Fails if a request is in progress, or the state of the environments is unknown.
@@ -312,13 +291,9 @@ impl RemoteVecEnv {
     /// After a timeout the request stays pending, because it may have been executed. A reply or an error with effects
     /// consumes its number.
     fn await_pending(&mut self, timeout: Duration) -> Result<ZBytes, EnvError> {
-        let Some((verb, pending)) = &mut self.pending else { return Err(remote(ClientError::NothingSent)) };
-        let querier = match (verb, self.rollout.get()) {
-            (EnvMethod::Reset, _) => &self.reset,
-            (EnvMethod::Rollout, Some(rollout)) => rollout,
-            _ => &self.step,
-        };
-        let answer = self.connection.wait_reply(querier, pending, timeout);
+        let Some((method, pending)) = &mut self.pending else { return Err(remote(ClientError::NothingSent)) };
+        let key = keys::env(self.connection.sid(), &self.ticket.lease, *method);
+        let answer = self.connection.wait_reply(&key, pending, timeout);
         let executed = match &answer {
             Ok(_) => true,
             Err(ClientError::RequestTimeout { .. }) => return answer.map_err(remote),
@@ -354,7 +329,7 @@ impl VecEnv for RemoteVecEnv {
         }
         request.check(self.num_envs)?;
         let payload = convert::encode_reset(request, self.ticket.epoch, self.last_seq + 1);
-        self.pending = Some((EnvMethod::Reset, self.connection.send(&self.reset, payload).map_err(remote)?));
+        self.send_request(EnvMethod::Reset, payload)?;
         let answer = self.await_pending(self.connection.timeout())?;
         let bytes = answer.to_bytes();
         let was_unknown = std::mem::replace(&mut self.is_unknown, true);
@@ -397,9 +372,8 @@ impl VecEnv for RemoteVecEnv {
 
     /// If a step is in progress, the scene is that after the step.
     fn scene(&self, env: usize) -> Result<Scene, EnvError> {
-        let querier = self.declared(&self.render, EnvMethod::Render).map_err(remote)?;
         let request = message::RenderRequest { protocol: PROTOCOL, epoch: self.ticket.epoch, env: env as u64 };
-        let answer = self.connection.request(querier, encode(&request)).map_err(remote)?;
+        let answer = self.connection.request(&self.key(EnvMethod::Render), encode(&request)).map_err(remote)?;
         let bytes = answer.to_bytes();
         decode(&bytes).and_then(convert::decode_scene).map_err(|error| malformed("render", error))
     }

@@ -159,14 +159,7 @@ fn query_echo(
     config.insert_json5("mode", "\"client\"")?;
     config.insert_json5("connect/endpoints", &format!("[\"{endpoint}\"]"))?;
     let session = twinstep_session::open(config)?;
-    let querier = session
-        .declare_querier(ECHO_KEY)
-        .target(QueryTarget::BestMatching)
-        .consolidation(ConsolidationMode::None)
-        .congestion_control(CongestionControl::Block)
-        .express(case != Case::Batched)
-        .timeout(QUERY_TIMEOUT)
-        .wait()?;
+    let querier = declare_querier(&session, ECHO_KEY, case != Case::Batched)?;
     let actions = vec![0.1f32; envs * ACTION_LEN];
     let actions = tensor::as_bytes(&actions);
     let request =
@@ -191,15 +184,16 @@ fn query_twinstep(round_trips: usize, folder: &SecurityFolder, endpoint: &str, e
         spec_hash: None,
         reclaim: None,
     };
-    let granted = link.request(&link.querier(keys::lease(link.sid()))?, encode(&lease))?;
+    let granted = link.request(&keys::lease(link.sid()), encode(&lease))?;
     let granted: message::LeaseReply = decode(&granted.to_bytes())?;
-    let querier = |verb| link.querier(keys::env(link.sid(), &granted.lease, verb));
+    let key = |method| keys::env(link.sid(), &granted.lease, method);
     let epoch = granted.epoch;
     let reset = message::ResetRequest { protocol: PROTOCOL, epoch, seq: 1, seeds: None, mask: None };
-    link.request(&querier(EnvMethod::Reset)?, encode(&reset))?;
+    link.request(&key(EnvMethod::Reset), encode(&reset))?;
     let actions = vec![0.1f32; envs * ACTION_LEN];
     let actions = tensor::as_bytes(&actions);
-    run_queries(&querier(EnvMethod::Step)?, link.secret(), round_trips, Case::Twinstep, envs, |answered| {
+    let querier = declare_querier(link.session(), &key(EnvMethod::Step), true)?;
+    run_queries(&querier, link.secret(), round_trips, Case::Twinstep, envs, |answered| {
         encode(&message::StepRequest {
             protocol: PROTOCOL,
             epoch,
@@ -209,6 +203,17 @@ fn query_twinstep(round_trips: usize, folder: &SecurityFolder, endpoint: &str, e
             for_tick: None,
         })
     })
+}
+
+fn declare_querier(session: &Session, key: &str, express: bool) -> Result<Querier<'static>, Failure> {
+    let querier = session
+        .declare_querier(key.to_owned())
+        .target(QueryTarget::BestMatching)
+        .consolidation(ConsolidationMode::None)
+        .congestion_control(CongestionControl::Block)
+        .express(express)
+        .timeout(QUERY_TIMEOUT);
+    Ok(querier.wait()?)
 }
 
 /// Sends queries one after another and counts those without a reply.

@@ -192,9 +192,9 @@ impl Observer {
 
     fn hello(&self) -> Result<HelloReply, String> {
         let text = |error: &dyn std::fmt::Display| error.to_string();
-        let querier = self.connection.querier(keys::hello(self.connection.sid())).map_err(|error| text(&error))?;
         let request = encode(&HelloRequest { protocol: PROTOCOL, client: "soak".to_owned() });
-        let reply = self.connection.request(&querier, request).map_err(|error| text(&error))?;
+        let key = keys::hello(self.connection.sid());
+        let reply = self.connection.request(&key, request).map_err(|error| text(&error))?;
         decode(&reply.to_bytes()).map_err(|error| text(&error))
     }
 

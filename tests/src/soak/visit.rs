@@ -153,12 +153,12 @@ impl Visitor {
         let mut env = connected(&proxy.endpoint, num_envs, random)?;
         let options = options(&proxy.endpoint, num_envs);
         let connection = Connection::open(&options, Secret::random()).map_err(text)?;
-        let querier = connection.querier(keys::hello(connection.sid())).map_err(text)?;
+        let key = keys::hello(connection.sid());
         let pause = self.max_pause.mul_f64(random.random_range(0.1..1.0));
         proxy.hold_replies(pause);
         env.send(&actions(&env, random)).map_err(text)?;
         let hello = encode(&HelloRequest { protocol: PROTOCOL, client: "soak".to_owned() });
-        let requests = (0..UNREAD_REPLIES).map(|_| connection.send(&querier, hello.clone()));
+        let requests = (0..UNREAD_REPLIES).map(|_| connection.send(&key, hello.clone()));
         let unread = requests.collect::<Result<Vec<_>, _>>().map_err(text)?;
         std::thread::sleep(pause);
         drop(unread);

@@ -65,7 +65,7 @@ class Connection:
         self._server = server
         self._pid = os.getpid()
         since = time.monotonic()
-        self._declared: list[zenoh.Querier | zenoh.LivelinessToken] = []
+        self._token: zenoh.LivelinessToken | None = None
         self._session = self._open(zenoh_config, shared_memory, connect_timeout_s)
         try:
             chosen = choose_server(self._session, endpoint, robot, server_id, since=since, timeout_s=connect_timeout_s)
@@ -77,42 +77,35 @@ class Connection:
             self._max_request_bytes = math.inf
             self.hello = self._handshake(connect_timeout_s - (time.monotonic() - since))
             self._max_request_bytes = self.hello["max_request_bytes"]
-            self._declared.append(self._session.declare_token(f"twinstep/live/client/{self.server_id}/{self.client}"))
+            self._token = self._session.declare_token(f"twinstep/live/client/{self.server_id}/{self.client}")
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
-        """Undeclare the token and the queriers, and leave the session to its other users."""
+        """Undeclare the token, and leave the session to its other users."""
         # A forked child has the object, but not the threads of the session.
         if self._pid == os.getpid():
-            undeclare(*self._declared)
-            self._declared.clear()
+            if self._token is not None:
+                undeclare(self._token)
+                self._token = None
             del self._session
 
-    def querier(self, key: str) -> zenoh.Querier:
-        """Declare a querier for ``twinstep/<server_id>/<key>``, until :meth:`close`."""
-        querier = self._session.declare_querier(f"twinstep/{self.server_id}/{key}")
-        self._declared.append(querier)
-        return querier
-
-    def request(
-        self, querier: zenoh.Querier, message: dict[str, object], timeout_s: float, option: str
-    ) -> dict[str, Any]:
+    def request(self, key: str, message: dict[str, object], timeout_s: float, option: str) -> dict[str, Any]:
         """Send a request and wait for the reply. The error of a timeout names the ``option`` that sets it."""
-        pending = self.pending(querier, message)
+        pending = self.pending(key, message)
         pending.send()
         return self.wait_reply(pending, timeout_s, option)
 
-    def pending(self, querier: zenoh.Querier, message: dict[str, object]) -> Pending:
-        """Return a request that is not sent yet."""
-        payload = codec.encode(message)
+    def pending(self, key: str, message: dict[str, object]) -> Pending:
+        """Return a request to ``twinstep/<server_id>/<key>`` that is not sent yet."""
+        payload, key = codec.encode(message), f"twinstep/{self.server_id}/{key}"
         if len(payload) > self._max_request_bytes:
             raise InvalidOptionError(
-                f"a request to `{querier.key_expr}` has {len(payload)} bytes; the server accepts at most "
+                f"a request to `{key}` has {len(payload)} bytes; the server accepts at most "
                 f"{self._max_request_bytes}\n  it hosts fewer environments"
             )
-        return Pending(querier, payload, self._secret)
+        return Pending(self._session, key, payload, self._secret)
 
     def wait_reply(
         self, pending: Pending, timeout_s: float, option: str, *, until_ready: bool = True
@@ -148,7 +141,7 @@ class Connection:
                 )
             if now - since >= timeout_s:
                 raise RequestTimeoutError(
-                    f"no reply from {self.endpoint} to `{pending.querier.key_expr}` after {now - since:.1f} s "
+                    f"no reply from {self.endpoint} to `{pending.key}` after {now - since:.1f} s "
                     f"(`{option}`): {self._timeout_reason(option)}"
                 )
             time.sleep(pause)
@@ -164,8 +157,7 @@ class Connection:
             raise
 
     def _handshake(self, timeout_s: float) -> dict[str, Any]:
-        self._hello_querier = self.querier("hello")
-        hello = self.request(self._hello_querier, HELLO, timeout_s, "connect_timeout_s")
+        hello = self.request("hello", HELLO, timeout_s, "connect_timeout_s")
         low, high = hello["protocols"]
         if not low <= codec.PROTOCOL <= high:
             raise VersionError(
@@ -192,7 +184,7 @@ class Connection:
                 "the server is no longer visible: it has terminated or lost its router, or, without a router, it is "
                 "unresponsive"
             )
-        pending = self.pending(self._hello_querier, HELLO)
+        pending = self.pending("hello", HELLO)
         pending.send()
         hello = outcome(pending)
         if isinstance(hello, dict):

@@ -9,7 +9,7 @@ from . import codec
 from .codec import Spec
 from .errors import AmbiguousRobotError, Error, InvalidOptionError, NoServerError
 from .query import HELLO, Pending, outcome
-from .session import SharedSession, connect_error, undeclare
+from .session import SharedSession, connect_error
 
 _GONE_S = 1.0
 """Time without a reply after which a visible server counts as gone. A router needs a moment to find the way to it."""
@@ -178,25 +178,22 @@ def _infos(session: SharedSession, endpoint: str, servers: list[tuple[str, str]]
 
 def _hellos(session: SharedSession, server_ids: list[str], timeout_s: float) -> dict[str, dict[str, Any]]:
     """Return the reply of each server that answers in time. All are queried at once."""
-    queriers = {server_id: session.declare_querier(f"twinstep/{server_id}/hello") for server_id in server_ids}
-    waiting = {server_id: Pending(querier, codec.encode(HELLO), b"") for server_id, querier in queriers.items()}
+    hello = codec.encode(HELLO)
+    waiting = {each: Pending(session, f"twinstep/{each}/hello", hello, b"") for each in server_ids}
     found: dict[str, dict[str, Any]] = {}
     deadline = time.monotonic() + timeout_s
-    try:
-        while waiting and time.monotonic() < deadline:
-            for pending in waiting.values():
-                pending.send()
-            for server_id, pending in list(waiting.items()):
-                # An error reply is not a hello: this server stays unreachable.
-                with contextlib.suppress(Error):
-                    reply = outcome(pending)
-                    if not isinstance(reply, dict):
-                        continue
-                    found[server_id] = reply
-                del waiting[server_id]
-            time.sleep(0.02 if waiting else 0)
-    finally:
-        undeclare(*queriers.values())
+    while waiting and time.monotonic() < deadline:
+        for pending in waiting.values():
+            pending.send()
+        for server_id, pending in list(waiting.items()):
+            # An error reply is not a hello: this server stays unreachable.
+            with contextlib.suppress(Error):
+                reply = outcome(pending)
+                if not isinstance(reply, dict):
+                    continue
+                found[server_id] = reply
+            del waiting[server_id]
+        time.sleep(0.02 if waiting else 0)
     return found
 
 

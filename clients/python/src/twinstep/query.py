@@ -6,7 +6,7 @@ import zenoh
 
 from . import codec
 from .errors import NoServerError, from_reply
-from .session import check_process
+from .session import SharedSession, check_process
 
 HELLO: dict[str, object] = {"client": "twinstep-python"}
 
@@ -14,8 +14,9 @@ HELLO: dict[str, object] = {"client": "twinstep-python"}
 class Pending:
     """A request in progress."""
 
-    def __init__(self, querier: zenoh.Querier, payload: bytes, secret: bytes) -> None:
-        self.querier = querier
+    def __init__(self, session: SharedSession, key: str, payload: bytes, secret: bytes) -> None:
+        self.session = session
+        self.key = key
         self.payload = payload
         self.secret = secret
         # None: not sent yet, or interrupted while it was sent.
@@ -25,7 +26,7 @@ class Pending:
         """Send the request, the first time or again with the same number, so that it is executed once."""
         check_process()
         try:
-            self.replies = self.querier.get(payload=self.payload, attachment=self.secret)
+            self.replies = self.session.get(self.key, self.payload, self.secret)
         except zenoh.ZError as error:
             raise NoServerError(f"the Zenoh session is closed: {error}") from error
 

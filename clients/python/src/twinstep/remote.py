@@ -100,15 +100,11 @@ class RemoteVecEnv(NotPicklable):
             "critic": options.critic,
             "spec_hash": options.spec_hash,
         }
-        lease = connection.request(connection.querier("lease"), request, options.reset_timeout_s, "reset_timeout_s")
+        lease = connection.request("lease", request, options.reset_timeout_s, "reset_timeout_s")
         self.spec = codec.read_spec(lease, connection.hello["spec_hash"])
         self.lease: str = lease["lease"]
         self._epoch: int = lease["epoch"]
         self._last_seq: int = lease["last_seq"]
-        self._methods = {
-            method: connection.querier(f"env/{lease['lease']}/{method}")
-            for method in ("reset", "step", "rollout", "render", "close")
-        }
         self._pending: tuple[str, int, Pending, float] | None = None
         # Why the state of the environments is unknown: a reply was lost. A reset of all of them heals it.
         self._unknown: str | None = None
@@ -279,7 +275,7 @@ class RemoteVecEnv(NotPicklable):
         """Return shapes and poses of one robot, and its ground, for rendering."""
         self._check_open()
         request: dict[str, object] = {"epoch": self._epoch, "env": env}
-        return self._connection.request(self._methods["render"], request, self._options.timeout_s, "timeout_s")
+        return self._connection.request(f"env/{self.lease}/render", request, self._options.timeout_s, "timeout_s")
 
     def close(self) -> None:
         """End the lease. Further calls have no effect."""
@@ -288,7 +284,7 @@ class RemoteVecEnv(NotPicklable):
         try:
             self._resolve_abandoned_request()
             request: dict[str, object] = {"epoch": self._epoch, "seq": self._last_seq + 1}
-            self._connection.request(self._methods["close"], request, self._options.timeout_s, "timeout_s")
+            self._connection.request(f"env/{self.lease}/close", request, self._options.timeout_s, "timeout_s")
         except Error:
             # The error does not matter to a closed client. The server releases the lease after the grace period.
             pass
@@ -312,7 +308,7 @@ class RemoteVecEnv(NotPicklable):
     def _send(self, method: str, request: dict[str, object]) -> None:
         self._check_open()
         seq = self._last_seq + 1
-        pending = self._connection.pending(self._methods[method], {**request, "epoch": self._epoch, "seq": seq})
+        pending = self._connection.pending(f"env/{self.lease}/{method}", {**request, "epoch": self._epoch, "seq": seq})
         # Pending before it is sent: after an interrupt in between, the same request is sent again, not another with
         # its number.
         self._pending = (method, seq, pending, time.monotonic())

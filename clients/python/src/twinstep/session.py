@@ -95,10 +95,12 @@ class SharedSession:
         """Declare a liveliness token."""
         return self._session.liveliness().declare_token(key)
 
-    def declare_querier(self, key: str) -> zenoh.Querier:
-        """Declare a querier with the settings of ``protocol/SPEC.md``."""
-        return self._session.declare_querier(
+    def get(self, key: str, payload: bytes, secret: bytes) -> Any:
+        """Send one query with the settings of ``protocol/SPEC.md``, and return the channel of its replies."""
+        return self._session.get(
             key,
+            payload=payload,
+            attachment=secret,
             target=zenoh.QueryTarget.BEST_MATCHING,
             consolidation=zenoh.ConsolidationMode.NONE,
             congestion_control=zenoh.CongestionControl.BLOCK,
@@ -107,11 +109,10 @@ class SharedSession:
         )
 
 
-def undeclare(*declared: zenoh.Querier | zenoh.LivelinessToken) -> None:
-    """Undeclare tokens and queriers. The session may be closed."""
-    for each in declared:
-        with contextlib.suppress(zenoh.ZError):
-            each.undeclare()
+def undeclare(token: zenoh.LivelinessToken) -> None:
+    """Undeclare a token. The session may be closed."""
+    with contextlib.suppress(zenoh.ZError):
+        token.undeclare()
 
 
 class _ZenohProcess:

@@ -28,6 +28,6 @@ def stop_robot(
     """
     connection = Connection(endpoint, robot=robot, zenoh_config=zenoh_config, server=None, connect_timeout_s=timeout_s)
     try:
-        connection.request(connection.querier("stop"), {}, timeout_s, "timeout_s")
+        connection.request("stop", {}, timeout_s, "timeout_s")
     finally:
         connection.close()
