@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use twinstep_tests::process::Process;
-use twinstep_tests::python::{cyclone_python, root};
+use twinstep_tests::python::{Programs, cyclone_python, root};
 use twinstep_tests::robot_pair::{PATIENT, RobotPair, next_domain};
 
 /// Trials, of which one has to succeed beside other tests.
@@ -18,7 +18,7 @@ fn skip(reason: &str) {
 
 /// Starts the robot in Python and `twinstep robot` in front of it.
 fn pair(python: &Path) -> RobotPair {
-    let program = Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep");
+    let program = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep();
     let (script, domain) = (root().join("clients/python/tests/cyclone_robot.py"), next_domain());
     let robot = Process::start(python, &[script.display().to_string(), domain.to_string()]).unwrap();
     // Beside other tests, Python publishes its states more slowly than a real robot.

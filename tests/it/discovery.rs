@@ -75,7 +75,7 @@ fn client_does_not_choose_between_different_robots_or_tasks() {
 
 #[test]
 fn list_shows_task_free_environments_and_load_of_each_server() {
-    let program = Programs::beside(FAULTS).unwrap().0.join("twinstep");
+    let program = Programs::beside(FAULTS).unwrap().twinstep();
     let list = |endpoint: &str, more: &[&str]| {
         let output = Command::new(&program).args(["list", endpoint]).args(more).output().unwrap();
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

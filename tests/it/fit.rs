@@ -21,7 +21,7 @@ const NOISE: f64 = 0.1;
 
 fn twinstep(arguments: &[&str]) -> Output {
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
-    Command::new(programs.0.join("twinstep")).args(arguments).output().unwrap()
+    Command::new(programs.twinstep()).args(arguments).output().unwrap()
 }
 
 fn robot() -> RobotModel {
@@ -152,7 +152,7 @@ fn resumed_training_is_bitwise_identical_to_uninterrupted_training() {
 
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
     let files = ["fit", path.to_str().unwrap(), "--out", twice.to_str().unwrap()];
-    let mut ended = Command::new(programs.0.join("twinstep")).args(files).args(settings).spawn().unwrap();
+    let mut ended = Command::new(programs.twinstep()).args(files).args(settings).spawn().unwrap();
     // Interrupt it after the first checkpoint. The result must not depend on the time of the interruption.
     let saved = folder.path().join("twice.training");
     while !std::fs::read(&saved).is_ok_and(|content| !content.is_empty()) && ended.try_wait().unwrap().is_none() {

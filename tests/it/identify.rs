@@ -170,7 +170,7 @@ fn supply_sag_is_identified_from_a_log_with_varying_voltage() {
 
 pub fn twinstep(arguments: &[&str]) -> std::process::Output {
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
-    Process::new(programs.0.join("twinstep")).args(arguments).current_dir(root()).output().unwrap()
+    Process::new(programs.twinstep()).args(arguments).current_dir(root()).output().unwrap()
 }
 
 fn q_rmse(arguments: &[&str]) -> f64 {

@@ -248,7 +248,7 @@ fn commands_outside_the_training_conditions_are_rejected_and_no_robot_is_stepped
 
 fn twinstep(arguments: &[&str]) -> Output {
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
-    Command::new(programs.0.join("twinstep")).args(arguments).output().unwrap()
+    Command::new(programs.twinstep()).args(arguments).output().unwrap()
 }
 
 /// Returns the error of a command that rejects `model`.
@@ -264,7 +264,7 @@ fn serve_simulates_robots_with_the_ensemble_of_its_model() {
     let (_folder, model) = model_with(description(), "", "sample = true");
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
     let arguments = ["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "8", "--model", model.to_str().unwrap()];
-    let (_server, endpoint) = Process::listening(&programs.0.join("twinstep"), &arguments.map(str::to_owned)).unwrap();
+    let (_server, endpoint) = Process::listening(&programs.twinstep(), &arguments.map(str::to_owned)).unwrap();
     let options = ConnectOptions { max_episode_steps: Some(6), critic: true, ..ConnectOptions::new(&endpoint, ENVS) };
     let mut remote = RemoteVecEnv::connect(&options).unwrap();
     let mut default = Config::default();
@@ -284,7 +284,7 @@ fn served_robot_and_its_spec_have_the_gains_of_the_training_data() {
     std::fs::write(&model, "robot = \"go2\"\n[actuator]\nensemble = \"actuators.safetensors\"").unwrap();
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
     let arguments = ["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "2", "--model", model.to_str().unwrap()];
-    let (_server, endpoint) = Process::listening(&programs.0.join("twinstep"), &arguments.map(str::to_owned)).unwrap();
+    let (_server, endpoint) = Process::listening(&programs.twinstep(), &arguments.map(str::to_owned)).unwrap();
     let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
     let nominal = base_spec("walk", &go2(), Vec::new(), 20.0);
     let spec = remote.spec().clone();
@@ -335,7 +335,7 @@ fn ensembles_that_do_not_fit_the_robot_are_rejected_with_the_reason() {
 /// Runs `twinstep train` with few robots and steps.
 fn train(folder: &Path, arguments: &[&str]) -> Output {
     let out = folder.join("out");
-    Command::new(Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().0.join("twinstep"))
+    Command::new(Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep())
         .args(["train", "--out", out.to_str().unwrap(), "--envs", "16", "--steps", "384"])
         .args(arguments)
         .output()

@@ -70,7 +70,7 @@ fn serve(arguments: &[&str]) -> (Process, String) {
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
     let all = [&["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "200"], arguments].concat();
     let all: Vec<String> = all.into_iter().map(str::to_owned).collect();
-    Process::listening(&programs.0.join("twinstep"), &all).unwrap()
+    Process::listening(&programs.twinstep(), &all).unwrap()
 }
 
 /// Steps while `goes_on` and returns the durations of the steps, the longest last.

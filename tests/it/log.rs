@@ -13,7 +13,7 @@ const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../data/go2_air_ch
 
 fn log(arguments: &[&str]) -> Output {
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
-    Command::new(programs.0.join("twinstep")).arg("log").args(arguments).output().unwrap()
+    Command::new(programs.twinstep()).arg("log").args(arguments).output().unwrap()
 }
 
 fn stdout(arguments: &[&str]) -> String {

@@ -312,7 +312,7 @@ fn served_robots_have_the_friction_of_the_model_file_and_end_with_a_killed_serve
     std::fs::write(folder.join("stiff.toml"), friction).unwrap();
     let moved = |model: &[&str]| {
         let interpreter = format!("TWINSTEP_PYTHON={}", python.path().display());
-        let program = programs.0.join("twinstep").display().to_string();
+        let program = programs.twinstep().display().to_string();
         let config = folder.join("server.toml").display().to_string();
         let serve = [&interpreter, &program, "serve", "--listen", "tcp/127.0.0.1:0", "--config", &config];
         let arguments: Vec<_> = serve.iter().chain(model).map(|word| (*word).to_owned()).collect();
@@ -346,7 +346,7 @@ fn played_motion_agrees_with_the_batch_engine() {
     crate::play::motion(BaseMount::Floating, 0.02).write(&source).unwrap();
     let [ours, theirs] = ["batch", "mujoco"].map(|engine| {
         let out = python.0.path().join(format!("{engine}.csv"));
-        let mut play = std::process::Command::new(programs.0.join("twinstep"));
+        let mut play = std::process::Command::new(programs.twinstep());
         play.arg("play").arg(&source).args(["--engine", engine, "--out"]).arg(&out);
         run(play.env("TWINSTEP_PYTHON", python.path())).unwrap();
         let log = Log::open(&out).unwrap();

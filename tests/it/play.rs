@@ -20,7 +20,7 @@ const KP: f64 = 40.0;
 
 fn twinstep(arguments: &[&str]) -> Output {
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
-    Command::new(programs.0.join("twinstep")).args(arguments).output().unwrap()
+    Command::new(programs.twinstep()).args(arguments).output().unwrap()
 }
 
 fn play(motion: &Path, out: &Path, more: &[&str]) -> Output {

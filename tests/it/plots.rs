@@ -12,7 +12,7 @@ const LOG: &str = "data/go2_air_chirp";
 
 fn twinstep(arguments: &[&str]) -> Output {
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
-    Command::new(programs.0.join("twinstep")).args(arguments).current_dir(root()).output().unwrap()
+    Command::new(programs.twinstep()).args(arguments).current_dir(root()).output().unwrap()
 }
 
 /// Returns the plot that a command writes.

@@ -28,7 +28,7 @@ fn check(module: &str, arguments: &[&str]) {
     // Cargo replaces the program at every build, also at that of a test beside this one: for a moment there is none.
     let folder = tempfile::tempdir_in(target()).unwrap();
     let program = folder.path().join("twinstep");
-    let link = || std::fs::hard_link(programs.0.join("twinstep"), &program).is_ok();
+    let link = || std::fs::hard_link(programs.twinstep(), &program).is_ok();
     let is_linked = (0..100).any(|_| {
         link() || {
             std::thread::sleep(Duration::from_millis(50));

@@ -131,7 +131,7 @@ fn server_process_randomises_effects_by_configuration_or_by_flag() {
         std::fs::write(&file, toml::to_string(&config).unwrap()).unwrap();
         let mut arguments = vec!["serve".to_owned(), "--config".to_owned(), file.display().to_string()];
         arguments.extend(flag.then(|| "--randomise-effects".to_owned()));
-        let (_server, endpoint) = Process::listening(&programs.0.join("twinstep"), &arguments).unwrap();
+        let (_server, endpoint) = Process::listening(&programs.twinstep(), &arguments).unwrap();
         let mut env = RemoteVecEnv::connect(&ConnectOptions::new(&endpoint, 2)).unwrap();
         config.randomise.effects = true;
         let request = ResetRequest::seeded(7, 2);
@@ -153,7 +153,7 @@ fn intervals_that_rarely_give_a_valid_robot_are_rejected() {
     std::fs::write(&path, format!("robot = \"go2\"\n{}{}", delay("command_delay"), delay("command_delay"))).unwrap();
     let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
     let arguments = ["serve", "--listen", "tcp/127.0.0.1:0", "--randomise-effects", "--model", path.to_str().unwrap()];
-    let output = Command::new(programs.0.join("twinstep")).args(arguments).output().unwrap();
+    let output = Command::new(programs.twinstep()).args(arguments).output().unwrap();
     let error = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(2), "{error}");
     assert!(error.contains("`randomise.effects`") && error.contains("0.04 s"), "{error}");

@@ -11,13 +11,13 @@ use twinstep_model::{AutoresetMode, RealTimeReport, ResetRequest, VecEnv};
 use twinstep_protocol::keys;
 use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_tests::process::Process;
-use twinstep_tests::python::{python, root};
+use twinstep_tests::python::{Programs, python, root};
 use twinstep_tests::robot_pair::{PATIENT, RobotPair};
 
 use crate::raw_client::RawClient;
 
 fn program() -> PathBuf {
-    Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep")
+    Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep()
 }
 
 fn pair(robot: &[&str]) -> RobotPair {

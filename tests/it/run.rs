@@ -12,7 +12,7 @@ use twinstep_model::{EnvSpec, go2, stream};
 use twinstep_policy::{Policy, PolicyRunner};
 use twinstep_tests::foreign_policy::foreign_policy;
 use twinstep_tests::process::Process;
-use twinstep_tests::python::{python, root, run as run_command};
+use twinstep_tests::python::{Programs, python, root, run as run_command};
 
 const TYPES: &str = r#"
 joints = ["FL_hip", "FR_hip", "RL_hip", "RR_hip", "FL_thigh", "FR_thigh", "RL_thigh", "RR_thigh", "FL_calf", "FR_calf", "RL_calf", "RR_calf"]
@@ -55,7 +55,7 @@ term = "previous_action"
 "#;
 
 fn program() -> PathBuf {
-    Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep")
+    Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep()
 }
 
 fn serve(more: &[&str]) -> (Process, String) {

@@ -6,7 +6,7 @@ use twinstep_tests::python::Programs;
 
 #[test]
 fn server_releases_what_its_clients_used() {
-    let twinstep = Programs::beside(env!("CARGO_BIN_EXE_soak")).unwrap().0.join("twinstep");
+    let twinstep = Programs::beside(env!("CARGO_BIN_EXE_soak")).unwrap().twinstep();
     let arguments = ["--minutes", "0.3", "--lanes", "4", "--twinstep"];
     let output = Command::new(env!("CARGO_BIN_EXE_soak")).args(arguments).arg(twinstep).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout);

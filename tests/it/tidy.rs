@@ -1,4 +1,5 @@
-//! Checks of the repository itself: unfinished code, file headers, documented commands, vocabulary, links, file sizes.
+//! Checks of the repository itself: unfinished code, file headers, documented commands, vocabulary, links, file sizes,
+//! programs that tests start.
 
 use std::path::{Path, PathBuf};
 
@@ -133,6 +134,15 @@ fn relative_links_in_documents_have_existing_targets() {
             }
             assert!(path.parent().unwrap().join(file).exists(), "{} links to {target}", path.display());
         }
+    }
+}
+
+#[test]
+fn tests_build_the_program_before_they_start_it() {
+    // Cargo does not build programs of other crates for tests. A target folder that was used before hides that.
+    let path_without_build = ["with_file_name(", "\"twinstep\")"].concat();
+    for (path, text) in sources(&["rs"]).into_iter().filter(|(path, _)| path.starts_with(root().join("tests/it"))) {
+        assert!(!text.contains(&path_without_build), "{}: use `Programs::beside`", path.display());
     }
 }
 

@@ -1,15 +1,14 @@
 //! `twinstep train` and `twinstep evaluate-policy` as processes.
 
 use std::io::{BufRead, BufReader};
-use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use twinstep_policy::Policy;
-use twinstep_tests::python::root;
+use twinstep_tests::python::{Programs, root};
 
 fn program() -> Command {
-    Command::new(Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep"))
+    Command::new(Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep())
 }
 
 fn twinstep(arguments: &[&str]) -> Output {
@@ -75,7 +74,7 @@ struct ServerChild {
 impl ServerChild {
     /// Starts a server of the training's robots at `listen` and waits until it listens.
     fn start(listen: &str, flags: &[&str]) -> Self {
-        let program = Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep");
+        let program = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep();
         let mut child = Command::new(program)
             .args(["serve", "--listen", listen, "--physics-hz", "400"])
             .args(flags)
@@ -130,7 +129,7 @@ fn training_continues_while_one_of_two_servers_is_killed_and_restarted() {
     let (log_path, second) = (folder.path().join("log"), killed.endpoint.clone());
     let endpoints = format!("{},{second}", kept.endpoint);
     let train = |rest: &[&str]| {
-        let program = Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep");
+        let program = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep();
         let mut command = Command::new(program);
         command.args(["train", "--out", out.to_str().unwrap(), "--endpoint", &endpoints]).args(rest);
         command.stdout(Stdio::null()).stderr(std::fs::File::create(&log_path).unwrap());

@@ -2,7 +2,7 @@
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -10,12 +10,12 @@ use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_model::{ResetRequest, VecEnv};
 use twinstep_tests::browser::browser;
 use twinstep_tests::chrome_page::ChromePage;
-use twinstep_tests::python::root;
+use twinstep_tests::python::{Programs, root};
 
 const PATIENCE: Duration = Duration::from_secs(30);
 
 fn program() -> PathBuf {
-    Path::new(env!("CARGO_BIN_EXE_faults")).with_file_name("twinstep")
+    Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep()
 }
 
 /// A command whose page is open; killed when dropped.

@@ -13,16 +13,25 @@ pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").canonicalize().expect("the crate's folder has a parent")
 }
 
+/// Arguments of Cargo that build `twinstep`.
+const BUILD: [&str; 3] = ["build", "--release", "--quiet"];
+
 /// Folder with the built programs, including `faults` and `twinstep`.
 pub struct Programs(pub PathBuf);
 
 impl Programs {
     /// Returns the folder of `faults` after building `twinstep` there, which Cargo does not build for tests.
     pub fn beside(faults: &str) -> Result<Self, String> {
-        let mut build = Command::new(env!("CARGO"));
-        run(outside_cargo(&mut build).args(["build", "--release", "--quiet"]).current_dir(root()))?;
+        static BUILT: OnceLock<Result<(), String>> = OnceLock::new();
+        let build = || run(outside_cargo(&mut Command::new(env!("CARGO"))).args(BUILD).current_dir(root())).map(drop);
+        BUILT.get_or_init(build).clone()?;
         let folder = Path::new(faults).parent().ok_or("a program has a folder")?.to_owned();
         Ok(Self(folder))
+    }
+
+    /// Returns the program `twinstep`.
+    pub fn twinstep(&self) -> PathBuf {
+        self.0.join("twinstep")
     }
 }
 
