@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, Secret, decode, encode, keys, message, random_id};
 use zenoh::bytes::ZBytes;
 use zenoh::handlers::FifoChannelHandler;
+use zenoh::key_expr::KeyExpr;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::qos::CongestionControl;
 use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
@@ -44,6 +45,8 @@ pub struct Connection {
     is_real_time: bool,
     /// Set by the user to end the wait for a robot that is not ready.
     interrupted: Arc<AtomicBool>,
+    /// Key of frequent requests.
+    declared: Option<KeyExpr<'static>>,
     _token: LivelinessToken,
 }
 
@@ -94,6 +97,7 @@ impl Connection {
             max_rollout_steps: 0,
             is_real_time: false,
             interrupted: Arc::clone(&options.interrupted),
+            declared: None,
             _token: token,
         };
         let hello = this.hello()?;
@@ -143,14 +147,23 @@ impl Connection {
         visible_servers(&self.session).iter().any(|(sid, _)| *sid == self.sid)
     }
 
-    /// Sends one query.
+    /// Declares the key of frequent requests, whose route routers and servers then remember.
     ///
-    /// Not through a declared querier: routers and servers keep its key for ever if the client is lost
+    /// Not a querier: routers and servers keep the key of a querier for ever if the client is lost
     /// ([Zenoh's issue 1518](https://github.com/eclipse-zenoh/zenoh/issues/1518)).
+    pub fn declare(&mut self, key: String) -> Result<(), ClientError> {
+        self.declared = Some(self.session.declare_keyexpr(key).wait().map_err(|error| zenoh_error(&error))?);
+        Ok(())
+    }
+
+    /// Sends one query.
     fn get(&self, key: &str, request: &Request) -> Result<FifoChannelHandler<Reply>, ClientError> {
         let Request { payload, attachment } = request.clone();
-        self.session
-            .get(key)
+        let query = match self.declared.as_ref().filter(|declared| declared.as_str() == key) {
+            Some(declared) => self.session.get(declared),
+            None => self.session.get(key),
+        };
+        query
             .payload(payload)
             .attachment(attachment)
             .target(QueryTarget::BestMatching)

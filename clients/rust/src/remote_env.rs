@@ -62,7 +62,7 @@ impl RemoteVecEnv {
 
     fn open(options: &ConnectOptions, ticket: Option<&LeaseHandle>) -> Result<Self, ClientError> {
         let secret = ticket.map_or_else(Secret::random, |ticket| ticket.secret);
-        let connection = Connection::open(options, secret)?;
+        let mut connection = Connection::open(options, secret)?;
         let request = message::LeaseRequest {
             protocol: PROTOCOL,
             client: connection.client().to_owned(),
@@ -75,6 +75,7 @@ impl RemoteVecEnv {
         };
         let answer = connection.request(&keys::lease(connection.sid()), encode(&request))?;
         let granted: message::LeaseReply = read_answer(&answer, "lease")?;
+        connection.declare(keys::env(connection.sid(), &granted.lease, EnvMethod::Step))?;
         let num_envs = convert::check_lease(granted.num_envs, &granted.spec)
             .map_err(|error| ClientError::Malformed { request: "lease".to_owned(), reason: error.message })?;
         Ok(Self {

@@ -66,6 +66,7 @@ class Connection:
         self._pid = os.getpid()
         since = time.monotonic()
         self._token: zenoh.LivelinessToken | None = None
+        self._declared: tuple[str, zenoh.KeyExpr] | None = None
         self._session = self._open(zenoh_config, shared_memory, connect_timeout_s)
         try:
             chosen = choose_server(self._session, endpoint, robot, server_id, since=since, timeout_s=connect_timeout_s)
@@ -89,7 +90,18 @@ class Connection:
             if self._token is not None:
                 undeclare(self._token)
                 self._token = None
+            if self._declared is not None:
+                self._session.undeclare_key(self._declared[1])
+                self._declared = None
             del self._session
+
+    def declare(self, key: str) -> None:
+        """Declare the key of frequent requests.
+
+        Not a querier: routers and servers keep the key of a querier for ever if the client is lost
+        (https://github.com/eclipse-zenoh/zenoh/issues/1518).
+        """
+        self._declared = (key, self._session.declare_key(f"twinstep/{self.server_id}/{key}"))
 
     def request(self, key: str, message: dict[str, object], timeout_s: float, option: str) -> dict[str, Any]:
         """Send a request and wait for the reply. The error of a timeout names the ``option`` that sets it."""
@@ -99,13 +111,14 @@ class Connection:
 
     def pending(self, key: str, message: dict[str, object]) -> Pending:
         """Return a request to ``twinstep/<server_id>/<key>`` that is not sent yet."""
-        payload, key = codec.encode(message), f"twinstep/{self.server_id}/{key}"
+        payload, full_key = codec.encode(message), f"twinstep/{self.server_id}/{key}"
         if len(payload) > self._max_request_bytes:
             raise InvalidOptionError(
-                f"a request to `{key}` has {len(payload)} bytes; the server accepts at most "
+                f"a request to `{full_key}` has {len(payload)} bytes; the server accepts at most "
                 f"{self._max_request_bytes}\n  it hosts fewer environments"
             )
-        return Pending(self._session, key, payload, self._secret)
+        declared = self._declared[1] if self._declared is not None and self._declared[0] == key else full_key
+        return Pending(self._session, declared, payload, self._secret)
 
     def wait_reply(
         self, pending: Pending, timeout_s: float, option: str, *, until_ready: bool = True

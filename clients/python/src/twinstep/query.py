@@ -14,7 +14,7 @@ HELLO: dict[str, object] = {"client": "twinstep-python"}
 class Pending:
     """A request in progress."""
 
-    def __init__(self, session: SharedSession, key: str, payload: bytes, secret: bytes) -> None:
+    def __init__(self, session: SharedSession, key: str | zenoh.KeyExpr, payload: bytes, secret: bytes) -> None:
         self.session = session
         self.key = key
         self.payload = payload

@@ -103,6 +103,7 @@ class RemoteVecEnv(NotPicklable):
         lease = connection.request("lease", request, options.reset_timeout_s, "reset_timeout_s")
         self.spec = codec.read_spec(lease, connection.hello["spec_hash"])
         self.lease: str = lease["lease"]
+        connection.declare(f"env/{self.lease}/step")
         self._epoch: int = lease["epoch"]
         self._last_seq: int = lease["last_seq"]
         self._pending: tuple[str, int, Pending, float] | None = None

@@ -9,7 +9,7 @@ import threading
 import time
 import weakref
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import zenoh
 
@@ -95,7 +95,16 @@ class SharedSession:
         """Declare a liveliness token."""
         return self._session.liveliness().declare_token(key)
 
-    def get(self, key: str, payload: bytes, secret: bytes) -> Any:
+    def declare_key(self, key: str) -> zenoh.KeyExpr:
+        """Declare the key of frequent requests, whose route routers and servers then remember."""
+        return cast(zenoh.KeyExpr, self._session.declare_keyexpr(key))
+
+    def undeclare_key(self, key: zenoh.KeyExpr) -> None:
+        """Undeclare a key. The session may be closed."""
+        with contextlib.suppress(zenoh.ZError):
+            self._session.undeclare(key)
+
+    def get(self, key: str | zenoh.KeyExpr, payload: bytes, secret: bytes) -> Any:
         """Send one query with the settings of ``protocol/SPEC.md``, and return the channel of its replies."""
         return self._session.get(
             key,
