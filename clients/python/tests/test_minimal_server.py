@@ -105,7 +105,7 @@ def test_the_example_client_steps_the_example_server(endpoint: str) -> None:
 def request(envs: RemoteVecEnv, method: str, **fields: object) -> dict[str, Any]:
     """Send a request, which is not checked by the client."""
     message = {"epoch": envs._epoch, "seq": envs._last_seq + 1, **fields}
-    return envs._connection.request(envs._methods[method], message, 5.0, "timeout_s")
+    return envs._connection.request(f"env/{envs.lease}/{method}", message, 5.0, "timeout_s")
 
 
 def test_a_repeated_request_is_not_executed_again(endpoint: str, envs: RemoteVecEnv) -> None:
