@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Crate folders and the workspace crates that each may use. Leaf crates use only the core; applications combine them.
-const MAY_USE: [(&str, &[&str]); 25] = [
+const MAY_USE: [(&str, &[&str]); 26] = [
     // Core.
     ("crates/simd", &[]),
     ("crates/model", &["simd"]),
@@ -30,6 +30,7 @@ const MAY_USE: [(&str, &[&str]); 25] = [
     ("clients/rust", &["model", "protocol", "session", "policy"]),
     ("crates/report", &["model", "effects", "logs", "sim", "identify", "diagnose"]),
     ("crates/hunt", &["model", "effects", "logs", "sim", "identify", "diagnose"]),
+    ("crates/excite", &["model", "effects", "logs", "identify", "policy", "envs", "sim"]),
     (
         "crates/bench",
         &[
@@ -70,6 +71,7 @@ const MAY_USE: [(&str, &[&str]); 25] = [
             "unitree",
             "session",
             "report",
+            "excite",
             "hunt",
             "bench",
             "viewer",
@@ -97,6 +99,7 @@ const MAY_USE: [(&str, &[&str]); 25] = [
             "client",
             "unitree",
             "robot",
+            "excite",
             "hunt",
         ],
     ),
@@ -114,7 +117,7 @@ const RESTRICTED_LIBRARIES: [(&str, &[&str]); 11] = [
     ("rustdds", &["crates/robot"]),
     ("ratatui", &["crates/cli"]),
     ("axum", &["crates/viewer"]),
-    ("nalgebra", &["crates/identify", "crates/diagnose"]),
+    ("nalgebra", &["crates/identify", "crates/diagnose", "crates/excite"]),
 ];
 
 fn root() -> PathBuf {

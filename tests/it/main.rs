@@ -18,6 +18,7 @@ mod effect_laws;
 mod effect_readings;
 mod effects;
 mod exactly_once;
+mod excite;
 mod fake_robot;
 mod faults;
 mod fit;

@@ -23,7 +23,7 @@ const AIR_ROWS: usize = 1300;
 const STANCE_ROWS: usize = 2400;
 
 /// Noise and resolution of the sensors.
-const SENSORS: [Sensor; 7] = [
+pub const SENSORS: [Sensor; 7] = [
     Sensor { quantity: "q", sigma: 0.002, resolution: 0.0002 },
     Sensor { quantity: "dq", sigma: 0.05, resolution: 0.01 },
     Sensor { quantity: "tau_measured", sigma: 0.2, resolution: 0.05 },

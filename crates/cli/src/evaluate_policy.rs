@@ -215,7 +215,8 @@ fn tracking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<Track
     Ok(rows)
 }
 
-fn check_spec(policy: &Policy, env: &EnvSpec) -> CommandResult {
+/// Fails unless the policy is one of the environments' task and robot.
+pub fn check_spec(policy: &Policy, env: &EnvSpec) -> CommandResult {
     if policy.spec.hash() == env.hash() {
         return Ok(());
     }

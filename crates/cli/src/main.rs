@@ -8,6 +8,7 @@ mod effects;
 mod evaluate;
 mod evaluate_policy;
 mod evaluate_tracking;
+mod excite;
 mod exit;
 mod fake_process;
 mod fake_robot;
@@ -62,6 +63,7 @@ enum CliCommand {
     EvaluatePolicy(evaluate_policy::Args),
     FakeRobot(fake_robot::Args),
     Fit(fit::Args),
+    Excite(excite::Args),
     Hunt(hunt::Args),
     Identify(identify::Args),
     List(list::Args),
@@ -96,6 +98,7 @@ fn main() -> std::process::ExitCode {
         CliCommand::EvaluatePolicy(args) => evaluate_policy::run(&args),
         CliCommand::FakeRobot(args) => fake_robot::run(&args),
         CliCommand::Fit(args) => fit::run(&args),
+        CliCommand::Excite(args) => excite::run(&args),
         CliCommand::Hunt(args) => hunt::run(&args),
         CliCommand::Identify(args) => identify::run(&args),
         CliCommand::List(args) => list::run(&args),

@@ -1,12 +1,13 @@
 //! `twinstep run`: runs a policy on a robot and records a log.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use twinstep_agent::{
     AgentError, BoundPolicy, Control, LoadedPolicy, Recorder, RunPlan, RunSummary, Status, run as run_policy,
 };
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_excite::CommandSequence;
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
@@ -50,11 +51,15 @@ pub struct Args {
     /// Constant velocity command: forward [m/s], left [m/s], yaw rate [rad/s]. Default: the endpoint's own commands.
     #[arg(long, value_name = "VX,VY,WZ", value_parser = velocity, allow_hyphen_values = true)]
     velocity: Option<[f32; 3]>,
+    /// Follow the velocity commands in this file (CSV: start_s,end_s,vx,vy,wz), as `twinstep excite` writes it. The run
+    /// ends with the last one.
+    #[arg(long, value_name = "FILE", conflicts_with = "velocity")]
+    commands: Option<PathBuf>,
     /// Take the velocity command from the keyboard.
-    #[arg(long, conflicts_with = "velocity")]
+    #[arg(long, conflicts_with_all = ["velocity", "commands"])]
     keyboard: bool,
     /// Take the velocity command from a gamepad. Default device: /dev/input/js0.
-    #[arg(long, value_name = "DEVICE", num_args = 0..=1, default_missing_value = "/dev/input/js0", conflicts_with_all = ["velocity", "keyboard"])]
+    #[arg(long, value_name = "DEVICE", num_args = 0..=1, default_missing_value = "/dev/input/js0", conflicts_with_all = ["velocity", "commands", "keyboard"])]
     gamepad: Option<PathBuf>,
     /// Time after which the run ends [s]. Default: when it is ended.
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
@@ -85,6 +90,7 @@ struct Report<'a> {
 enum Velocity {
     Endpoint,
     Constant([f32; 3]),
+    Sequence(CommandSequence),
     Person(VelocityInput),
 }
 
@@ -94,6 +100,8 @@ pub fn run(args: &Args) -> CommandResult {
     if let Some(seconds) = args.seconds.filter(|seconds| !(seconds.is_finite() && *seconds > 0.0)) {
         return Err(Failure::Input(miette::miette!("`--seconds` = {seconds} is not allowed: it must be positive")));
     }
+    // Read before anything moves.
+    let commands = args.commands.as_deref().map(read_commands).transpose()?;
     let loaded = LoadedPolicy::read(&args.policy, args.mapping.as_deref()).map_err(input)?;
     let mut env = RemoteVecEnv::connect(&args.options(&signals)).map_err(other)?;
     let mut policy = loaded.bind(env.spec()).map_err(input)?;
@@ -101,7 +109,7 @@ pub fn run(args: &Args) -> CommandResult {
         env.set_velocity_commands(&[velocity]).map_err(input)?;
     }
     let mut recorder = args.recorder(&mut env, &signals)?;
-    let velocity = args.velocity_source()?;
+    let velocity = args.velocity_source(commands)?;
     let result = args.steps(&mut env, &mut policy, recorder.as_mut(), &velocity, &signals);
     let device_failure = if let Velocity::Person(device) = &velocity { device.failure() } else { None };
     // Restores the terminal before anything is printed.
@@ -159,7 +167,10 @@ impl Args {
         Recorder::create(folder, spec, has_scene, &source).map(Some).map_err(input)
     }
 
-    fn velocity_source(&self) -> Result<Velocity, Failure> {
+    fn velocity_source(&self, commands: Option<CommandSequence>) -> Result<Velocity, Failure> {
+        if let Some(commands) = commands {
+            return Ok(Velocity::Sequence(commands));
+        }
         Ok(match (&self.velocity, &self.gamepad) {
             (Some(velocity), _) => Velocity::Constant(*velocity),
             (None, Some(device)) => Velocity::Person(VelocityInput::gamepad(device)?),
@@ -192,6 +203,8 @@ impl Args {
             match velocity {
                 Velocity::Endpoint => Control::Step(None),
                 Velocity::Constant(command) => Control::Step(Some(*command)),
+                Velocity::Sequence(sequence) if status.seconds > sequence.duration_s() - 1e-6 => Control::End,
+                Velocity::Sequence(sequence) => Control::Step(Some(sequence.at(status.seconds))),
                 Velocity::Person(device) => {
                     device.command().map_or(Control::End, |command| Control::Step(Some(command)))
                 }
@@ -248,4 +261,10 @@ fn summary_text(summary: &RunSummary) -> String {
     lines.push(format!("lateness        {:.2} ms, at most {:.2} ms", lateness.mean_ms, lateness.max_ms));
     lines.push(format!("clipped actions {:.2} %", 100.0 * summary.clipped_share));
     lines.join("\n") + "\n"
+}
+
+fn read_commands(path: &Path) -> Result<CommandSequence, Failure> {
+    let wrong = |cause: String| Failure::Input(miette::miette!("`--commands` = {}: {cause}", path.display()));
+    let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+    CommandSequence::parse(&text).map_err(|error| wrong(error.to_string()))
 }

@@ -43,10 +43,15 @@ impl CmaEs {
         }
     }
 
+    /// Returns the number of points of a generation.
+    pub fn population(&self) -> usize {
+        2 * self.weights.len()
+    }
+
     /// Samples the points of a generation.
     pub fn ask(&self, random: &mut impl Rng) -> Vec<Vec<f64>> {
         let n = self.mean.len();
-        (0..2 * self.weights.len())
+        (0..self.population())
             .map(|_| {
                 let normal = DVector::from_fn(n, |_, _| standard_normal(random));
                 (&self.mean + self.sigma * (&self.root * normal)).iter().copied().collect()

@@ -1,5 +1,6 @@
 //! Identification: predicted identifiability, global search, refinement, and intervals.
 
+use nalgebra::DMatrix;
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, EntryError, Scope};
 use twinstep_model::{Precision, Rollout};
@@ -244,19 +245,30 @@ pub fn blocks(experiments: &[Experiment]) -> Vec<usize> {
 /// It is evaluated at the prior means, where every effect acts.
 fn predicted(task: &LeastSquaresProblem, simulator: &mut dyn Rollout) -> Vec<f64> {
     let prior_mean = task.from_prior_units(&vec![0.0; task.unknowns.len()]);
-    // Residuals are correlated: one row in thirty counts as independent, and one in 200, a window, with a floating
-    // base.
-    let independent = |group: &usize| if Experiment::is_held(*group) { 30f64.sqrt() } else { 200f64.sqrt() };
-    let groups: Vec<usize> = task.experiments.iter().flat_map(Experiment::groups).collect();
-    let spread: Vec<f64> = groups.iter().map(independent).collect();
-    let here = LeastSquaresProblem { residual_scale: &spread, ..*task }.linearise(simulator, &prior_mean);
-    let factor = here.and_then(|here| information(&here).cholesky());
+    let factor = predicted_information(task, simulator, &prior_mean).and_then(DMatrix::cholesky);
     factor.map_or_else(
         || vec![0.0; task.unknowns.len()],
         |factor| {
             factor.inverse().diagonal().iter().map(|variance| variance.sqrt().hypot(SIMULATOR_MISMATCH_STD)).collect()
         },
     )
+}
+
+/// Returns the Fisher information of residuals and prior at `point` [1/prior std²], before anything is fitted.
+///
+/// Returns `None` if a simulation diverges.
+pub fn predicted_information(
+    task: &LeastSquaresProblem,
+    simulator: &mut dyn Rollout,
+    point: &[f64],
+) -> Option<DMatrix<f64>> {
+    // Residuals are correlated: one row in thirty counts as independent, and one in 200, a window, with a floating
+    // base.
+    let independent = |group: &usize| if Experiment::is_held(*group) { 30f64.sqrt() } else { 200f64.sqrt() };
+    let groups: Vec<usize> = task.experiments.iter().flat_map(Experiment::groups).collect();
+    let spread: Vec<f64> = groups.iter().map(independent).collect();
+    let here = LeastSquaresProblem { residual_scale: &spread, ..*task }.linearise(simulator, point)?;
+    Some(information(&here))
 }
 
 type CorrelatedPairs = Vec<(String, String, f64, Option<&'static str>)>;
@@ -268,7 +280,7 @@ fn estimates(
     free: &[FreeParameter],
     point: &[f64],
     begin: &[f64],
-    spread: Option<&nalgebra::DMatrix<f64>>,
+    spread: Option<&DMatrix<f64>>,
 ) -> (Vec<ParameterEstimate>, CorrelatedPairs) {
     let mut findings = Vec::new();
     let mut free_index = 0;

@@ -10,7 +10,7 @@
 //! - [`evaluate()`]: the errors of a model on a log; [`position_errors`]: the same over time.
 //! - [`InverseDynamicsResidual`]: torque of the model's actuators minus the inverse dynamics, row by row.
 //! - [`FreeParameter`]: a parameter of a model file that is estimated, with bounds and prior.
-//! - [`GlobalSearch`]: CMA-ES, which can be interrupted and resumed.
+//! - [`CmaEs`]: the search distribution; [`GlobalSearch`]: CMA-ES on a least-squares problem, which can be interrupted and resumed.
 //! - [`NuisanceModel`]: nuisance parameters, eliminated by generalised least squares.
 //! - [`identify()`]: predicted identifiability, CMA-ES, Levenberg–Marquardt, then intervals and correlations.
 //!
@@ -40,6 +40,7 @@ pub mod window;
 mod tests;
 
 pub use base_estimate::BaseEstimate;
+pub use cmaes::CmaEs;
 pub use effect_list::{DEFAULT_EFFECTS, EffectAtScope, EffectAtScopeError, UnknownEffect, default_effects, named};
 pub use error::ExperimentError;
 pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};
@@ -47,7 +48,7 @@ pub use experiment::{Experiment, SimulatedPose};
 pub use global_search::GlobalSearch;
 pub use identify::{
     EstimateStatus, Identification, IdentifyError, IdentifyOptions, IdentifyProgress, ParameterEstimate, Stage,
-    identify,
+    identify, predicted_information,
 };
 pub use inverse_dynamics::{InverseDynamicsResidual, JointSeries, JointTrajectory};
 pub use nuisance::NuisanceModel;

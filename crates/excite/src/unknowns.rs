@@ -1,0 +1,72 @@
+//! Parameters that are sought, and what a log tells about them.
+
+use nalgebra::DMatrix;
+use twinstep_effects::{Effect, EntryError, ModelFile, Scope};
+use twinstep_identify::least_squares::LeastSquaresProblem;
+use twinstep_identify::{
+    Experiment, ExperimentError, FreeParameter, WindowConfig, free_parameters, initial_coordinate,
+    predicted_information,
+};
+use twinstep_logs::Log;
+use twinstep_model::{Precision, RobotModel, Rollout};
+
+/// Parameters of effects that are sought.
+pub struct Unknowns {
+    file: ModelFile,
+    parameters: Vec<FreeParameter>,
+    /// Coordinates at which the information is computed.
+    point: Vec<f64>,
+    robot: RobotModel,
+}
+
+/// The information of a log cannot be computed.
+#[derive(Debug, thiserror::Error)]
+pub enum InformationError {
+    /// An effect cannot have its scope, or the model is not valid.
+    #[error(transparent)]
+    Effect(#[from] EntryError),
+    /// The log cannot be simulated.
+    #[error(transparent)]
+    Experiment(#[from] ExperimentError),
+}
+
+impl Unknowns {
+    /// Prepares the parameters of `effects` on top of `model`.
+    ///
+    /// An effect that the model has is linearised at its value, others at the mean of their prior, where they act.
+    pub fn new(model: &ModelFile, effects: &[(&'static Effect, Scope)]) -> Result<Self, EntryError> {
+        let (file, parameters) = free_parameters(model, effects)?;
+        let coordinate = |parameter: &FreeParameter| {
+            let own = initial_coordinate(&file, parameter);
+            let has_no_effect = (own - parameter.coordinate(parameter.neutral)).abs() < 1e-9;
+            if has_no_effect { parameter.prior[0] } else { own }
+        };
+        let point = parameters.iter().map(coordinate).collect();
+        Ok(Self { robot: model.robot_model()?, file, parameters, point })
+    }
+
+    /// Returns the parameters.
+    pub fn parameters(&self) -> &[FreeParameter] {
+        &self.parameters
+    }
+
+    /// Returns the Fisher information of `log` and of the prior [1/prior std²].
+    ///
+    /// Returns `None` if a simulation diverges.
+    pub fn information(
+        &self,
+        log: &Log,
+        simulator: &mut dyn Rollout,
+    ) -> Result<Option<DMatrix<f64>>, InformationError> {
+        let experiment = Experiment::new(log, &self.robot, WindowConfig::IDENTIFICATION)?;
+        let problem = LeastSquaresProblem {
+            file: &self.file,
+            unknowns: &self.parameters,
+            experiments: &[experiment],
+            residual_scale: &[],
+            tolerances: None,
+            precision: Precision::Single,
+        };
+        Ok(predicted_information(&problem, simulator, &self.point))
+    }
+}
