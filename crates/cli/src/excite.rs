@@ -9,7 +9,7 @@ use serde::Serialize;
 use twinstep_effects::{Effect, ModelFile, Scope};
 use twinstep_envs::{Randomisation, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
 use twinstep_excite::{Criterion, Design, DesignOptions, Limits, Score, Unknowns, VelocityRanges, design, simulate};
-use twinstep_identify::{CmaEs, EffectAtScope};
+use twinstep_identify::{CmaEs, EffectAtScope, FreeParameter};
 use twinstep_model::{AutoresetMode, VecEnv};
 use twinstep_policy::Policy;
 use twinstep_sim::{BatchBackend, SimConfig};
@@ -246,7 +246,12 @@ impl Args {
             farthest_m: score.motion.farthest_m,
             rms_torque_nm: score.motion.rms_torque_nm,
             saturated: score.motion.saturated,
-            remaining_std: unknowns.parameters().iter().map(|one| one.name()).zip(score.std.iter().copied()).collect(),
+            remaining_std: unknowns
+                .parameters()
+                .iter()
+                .map(FreeParameter::name)
+                .zip(score.std.iter().copied())
+                .collect(),
         };
         Report {
             criterion: self.criterion.name().to_owned(),

@@ -84,14 +84,17 @@ pub enum DesignError {
     Interrupted,
 }
 
+/// Simulates sequences, as [`crate::simulate`].
+pub type RunSequences<'a> = dyn FnMut(&[CommandSequence]) -> Result<Vec<Trial>, TrialError> + 'a;
+
 /// Searches for the sequence that maximises the criterion.
 ///
-/// `run` simulates sequences, as [`crate::simulate`]. `progress` receives the number of simulated sequences and the best
+/// `progress` receives the number of simulated sequences and the best
 /// value so far after each generation, and returns false to end the search with the best sequence so far.
 pub fn design(
     unknowns: &Unknowns,
     options: &DesignOptions,
-    run: &mut dyn FnMut(&[CommandSequence]) -> Result<Vec<Trial>, TrialError>,
+    run: &mut RunSequences<'_>,
     simulator: &mut dyn Rollout,
     progress: &mut dyn FnMut(usize, f64) -> bool,
 ) -> Result<Design, DesignError> {
@@ -143,7 +146,7 @@ fn cost(score: &Result<Score, f64>, point: &[f64]) -> f64 {
 struct Evaluation<'a> {
     unknowns: &'a Unknowns,
     options: &'a DesignOptions,
-    run: &'a mut dyn FnMut(&[CommandSequence]) -> Result<Vec<Trial>, TrialError>,
+    run: &'a mut RunSequences<'a>,
     simulator: &'a mut dyn Rollout,
     simulated: usize,
     rejected: usize,

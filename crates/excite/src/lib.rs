@@ -23,7 +23,7 @@ mod trial;
 mod unknowns;
 
 pub use criterion::{Criterion, UnknownCriterion};
-pub use design::{Design, DesignError, DesignOptions, Score, design};
+pub use design::{Design, DesignError, DesignOptions, RunSequences, Score, design};
 pub use sequence::{CommandSequence, Segment, SequenceError, VelocityRanges};
 pub use trial::{Limits, Motion, Trial, Violation, simulate};
 pub use unknowns::{InformationError, Unknowns};

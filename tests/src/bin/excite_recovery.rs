@@ -69,7 +69,14 @@ fn main() {
         let truth = hidden_robot(case);
         for (method, sequence) in sequences.iter().enumerate() {
             match walk(&truth, &policy, sequence, case) {
-                Some(log) => errors.push(compare(method, &identified(&log, &mut rollouts), &truth)),
+                Some(log) => {
+                    let found = compare(method, &identified(&log, &mut rollouts), &truth);
+                    let (name, mass) = (METHODS[method], 100.0 * found.mass);
+                    bar.suspend(|| {
+                        eprintln!("robot {case}, {name}: mass {mass:.2} %, friction {:.3} N·m", found.friction_nm)
+                    });
+                    errors.push(found);
+                }
                 None => fell += 1,
             }
             bar.inc(1);

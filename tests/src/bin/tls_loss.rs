@@ -213,7 +213,7 @@ fn declare_querier(session: &Session, key: &str, express: bool) -> Result<Querie
         .congestion_control(CongestionControl::Block)
         .express(express)
         .timeout(QUERY_TIMEOUT);
-    Ok(querier.wait()?)
+    querier.wait()
 }
 
 /// Sends queries one after another and counts those without a reply.
