@@ -7,12 +7,12 @@ use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_diagnose::{
     DiagnoseError, Diagnosis, DiagnosisOutput, ParameterValue, RmsErrors, diagnose, diagnose_torques,
 };
-use twinstep_effects::ModelFile;
 use twinstep_model::Joint;
 
 use crate::evaluate::simulator;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::open_log::open_log;
+use crate::robot_file::analytic_model;
 use twinstep_report::report_data::{LogFacts, Provenance, ReportData};
 use twinstep_report::write_report;
 
@@ -80,11 +80,7 @@ struct UnsupportedRobot {
 
 /// Diagnoses the logs, writes the output folder and prints a summary.
 pub fn run(args: &Args) -> CommandResult {
-    let model = args
-        .model
-        .as_ref()
-        .map_or(Ok(ModelFile::default()), ModelFile::load_without_actuator_network)
-        .map_err(input)?;
+    let model = analytic_model(args.model.as_deref())?;
     let logs = args.logs.iter().map(|path| open_log(path)).collect::<Result<Vec<_>, _>>()?;
     // Checked before the search, so that its result cannot be lost.
     std::fs::create_dir_all(&args.out).map_err(|source| input(Unwritable { path: args.out.clone(), source }))?;

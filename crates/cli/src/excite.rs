@@ -1,22 +1,26 @@
 //! `twinstep excite`: velocity commands with which the log of a walking robot tells most about unknown parameters.
 
+use std::collections::BTreeMap;
 use std::fmt::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
-use twinstep_effects::{Effect, ModelFile, Scope};
-use twinstep_envs::{Randomisation, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
-use twinstep_excite::{Criterion, Design, DesignOptions, Limits, Score, Unknowns, VelocityRanges, design, simulate};
+use twinstep_effects::{Effect, Scope};
+use twinstep_envs::WalkConfig;
+use twinstep_excite::{
+    Criterion, Design, DesignOptions, Limits, Score, Unknowns, VelocityRanges, design, simulate, walking_env,
+};
 use twinstep_identify::{CmaEs, EffectAtScope, FreeParameter};
-use twinstep_model::{AutoresetMode, VecEnv};
+use twinstep_model::VecEnv;
 use twinstep_policy::Policy;
 use twinstep_sim::{BatchBackend, SimConfig};
 
 use crate::evaluate::simulator;
 use crate::evaluate_policy::check_spec;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::robot_file::analytic_model;
 
 /// Choose velocity commands with which the log of a run tells most about unknown parameters (SPI-Active).
 ///
@@ -86,7 +90,7 @@ struct Report {
     criterion: String,
     seed: u64,
     simulated: usize,
-    rejected: usize,
+    rejected: BTreeMap<&'static str, usize>,
     seconds: f64,
     design: ReportedScore,
     /// The random sequence with the median value.
@@ -112,28 +116,15 @@ pub fn run(args: &Args) -> CommandResult {
     std::fs::create_dir_all(&args.out).map_err(|cause| {
         Failure::Input(miette::miette!("`--out` = {}: cannot create the folder: {cause}", args.out.display()))
     })?;
-    let model = args
-        .model
-        .as_ref()
-        .map_or(Ok(ModelFile::default()), ModelFile::load_without_actuator_network)
-        .map_err(input)?;
+    let model = analytic_model(args.model.as_deref())?;
     let robot = model.robot_model().map_err(input)?;
     let unknowns = Unknowns::new(&model, &effects(&args.unknowns)).map_err(input)?;
     let (policy, _) = Policy::read(&args.policy).map_err(input)?;
-    let config = WalkConfig::default();
-    let options = args.options(&config, &unknowns)?;
+    let options = args.options(&unknowns)?;
     let population = CmaEs::new(&vec![0.0; 3 * options.segments], 1.0).population();
     let sim = SimConfig { physics_hz: args.physics_hz, ..SimConfig::default() };
     let backend = BatchBackend::new(robot.clone(), sim, population).map_err(input)?;
-    let walk = Walk::new(config, &robot, true).map_err(input)?;
-    let settings = TaskEnvConfig {
-        randomise: Randomisation::default(),
-        robot_sampler: None,
-        autoreset: AutoresetMode::NextStep,
-        max_episode_steps: Some(u32::MAX),
-        seed: args.seed,
-    };
-    let mut env = TaskEnv::new(backend, walk, settings).map_err(input)?;
+    let mut env = walking_env(backend, args.seed).map_err(input)?;
     check_spec(&policy, env.spec())?;
     let mut rollouts = simulator(&robot)?;
     let since = Instant::now();
@@ -163,7 +154,7 @@ pub fn run(args: &Args) -> CommandResult {
         std::fs::write(&path, text)
             .map_err(|cause| Failure::Input(miette::miette!("cannot write {}: {cause}", path.display())))?;
     }
-    print!("{}", text(&report, &options, &args.out.join("commands.csv").display().to_string()));
+    print!("{}", text(&report, &options, &args.policy, &args.out.join("commands.csv")));
     if interrupted { Err(Failure::Interrupted) } else { Ok(()) }
 }
 
@@ -202,7 +193,7 @@ impl Args {
         Ok(())
     }
 
-    fn options(&self, config: &WalkConfig, unknowns: &Unknowns) -> Result<DesignOptions, Failure> {
+    fn options(&self, unknowns: &Unknowns) -> Result<DesignOptions, Failure> {
         let of_interest = effects(&self.of_interest);
         let names = |(effect, scope): &(&'static Effect, Scope)| format!("{}@{scope}", effect.name);
         if let Some(missing) = of_interest.iter().find(|one| !effects(&self.unknowns).contains(one)) {
@@ -222,7 +213,7 @@ impl Args {
             }
             criterion => criterion.clone(),
         };
-        let command = &config.command;
+        let command = WalkConfig::default().command;
         let ranges: VelocityRanges = [command.linear_velocity_x, command.linear_velocity_y, command.angular_velocity_z];
         Ok(DesignOptions {
             segment_s: self.segment_s,
@@ -257,7 +248,7 @@ impl Args {
             criterion: self.criterion.name().to_owned(),
             seed: self.seed,
             simulated: found.simulated,
-            rejected: found.rejected,
+            rejected: found.rejected.clone(),
             seconds,
             design: reported(&found.best),
             random: reported(&found.random),
@@ -266,10 +257,13 @@ impl Args {
 }
 
 /// Returns the summary.
-fn text(report: &Report, options: &DesignOptions, path: &str) -> String {
+fn text(report: &Report, options: &DesignOptions, policy: &Path, path: &Path) -> String {
+    let path = path.display();
     let Report { criterion, simulated, rejected, seconds, design, random, .. } = report;
+    let limits: Vec<_> = rejected.iter().map(|(limit, count)| format!("{count} {limit}")).collect();
+    let limits = if limits.is_empty() { "none".to_owned() } else { limits.join(", ") };
     let mut text = format!(
-        "{simulated} sequences in {seconds:.0} s, {rejected} of them outside the limits\n\n{:<44}  design  random\n",
+        "{simulated} sequences in {seconds:.0} s; outside the limits: {limits}\n\n{:<44}  design  random\n",
         "remaining standard deviation / prior"
     );
     for ((name, design), (_, random)) in design.remaining_std.iter().zip(&random.remaining_std) {
@@ -291,6 +285,6 @@ fn text(report: &Report, options: &DesignOptions, path: &str) -> String {
         let start = index as f64 * options.segment_s;
         let _ = writeln!(text, "{start:>5.1}s {:>5.1}s  {vx:>6.2}  {vy:>6.2}  {wz:>6.2}", start + options.segment_s);
     }
-    let _ = writeln!(text, "written to {path}; run it: twinstep run POLICY --commands {path} --log DIR");
+    let _ = writeln!(text, "written to {path}; run it: twinstep run {} --commands {path} --log DIR", policy.display());
     text
 }

@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use twinstep_effects::ModelFile;
 use twinstep_identify::{
     DEFAULT_EFFECTS, EffectAtScope, EstimateStatus, Experiment, GlobalSearch, Identification, IdentifyOptions,
     ParameterEstimate, Stage, WindowConfig, evaluate, identify,
@@ -12,6 +11,7 @@ use twinstep_identify::{
 use crate::evaluate::{Rows, simulator};
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::open_log::open_log;
+use crate::robot_file::analytic_model;
 
 /// Estimate the parameters of effects from measured logs (sampling-based parameter identification, SPI-Active).
 ///
@@ -88,11 +88,7 @@ fn resumed(path: &Path) -> Result<GlobalSearch, NotResumable> {
 
 /// Estimates the parameters, prints them and writes the model.
 pub fn run(args: &Args) -> CommandResult {
-    let model = args
-        .model
-        .as_ref()
-        .map_or(Ok(ModelFile::default()), ModelFile::load_without_actuator_network)
-        .map_err(input)?;
+    let model = analytic_model(args.model.as_deref())?;
     let robot = model.robot_model().map_err(input)?;
     let (mut experiments, mut logs) = (Vec::new(), Vec::new());
     for path in &args.logs {

@@ -1,5 +1,7 @@
 //! Search for the command sequence whose log tells most.
 
+use std::collections::BTreeMap;
+
 use nalgebra::DMatrix;
 use twinstep_identify::CmaEs;
 use twinstep_model::{Rollout, stream};
@@ -53,10 +55,10 @@ pub struct Design {
     pub best: Score,
     /// The random sequence with the median value, among those that keep the limits.
     pub random: Score,
-    /// Number of simulated sequences, and of those that did not keep the limits.
+    /// Number of simulated sequences.
     pub simulated: usize,
-    /// Number of sequences that did not keep the limits.
-    pub rejected: usize,
+    /// Number of sequences that did not keep the limits, by the limit.
+    pub rejected: BTreeMap<&'static str, usize>,
 }
 
 /// No sequence was found.
@@ -70,7 +72,7 @@ pub enum DesignError {
     Information(#[from] InformationError),
     /// No random sequence keeps the limits.
     #[error(
-        "none of {tried} random sequences keeps the limits; the last one: {last:?}\n  allow a larger room, or give \
+        "none of {tried} random sequences keeps the limits; the last one: {last}\n  allow a larger room, or give \
          smaller velocities or shorter segments"
     )]
     NothingAllowed {
@@ -79,9 +81,6 @@ pub enum DesignError {
         /// What the robot did in the last one.
         last: Motion,
     },
-    /// `progress` returned false before a random sequence was scored.
-    #[error("interrupted before the first generation was complete")]
-    Interrupted,
 }
 
 /// Simulates sequences, as [`crate::simulate`].
@@ -101,7 +100,7 @@ pub fn design(
     let mut random = stream(options.seed, "excite", 0);
     let mut search = CmaEs::new(&vec![0.0; 3 * options.segments], FIRST_SPREAD);
     let population = search.population();
-    let mut evaluation = Evaluation { unknowns, options, run, simulator, simulated: 0, rejected: 0 };
+    let mut evaluation = Evaluation { unknowns, options, run, simulator, simulated: 0, rejected: BTreeMap::new() };
     let first: Vec<_> = (0..population)
         .map(|_| CommandSequence::random(options.segment_s, options.segments, &options.ranges, &mut random))
         .collect();
@@ -128,7 +127,7 @@ pub fn design(
             }
         }
     }
-    let (simulated, rejected) = (evaluation.simulated, evaluation.rejected);
+    let Evaluation { simulated, rejected, .. } = evaluation;
     Ok(Design { best, random: median, simulated, rejected })
 }
 
@@ -149,7 +148,7 @@ struct Evaluation<'a> {
     run: &'a mut RunSequences<'a>,
     simulator: &'a mut dyn Rollout,
     simulated: usize,
-    rejected: usize,
+    rejected: BTreeMap<&'static str, usize>,
 }
 
 impl Evaluation<'_> {
@@ -163,16 +162,18 @@ impl Evaluation<'_> {
             scores.push(self.score(sequence, trial)?);
         }
         self.simulated += sequences.len();
-        self.rejected += scores.iter().filter(|score| score.is_err()).count();
         Ok((scores, last))
     }
 
     fn score(&mut self, sequence: &CommandSequence, trial: Trial) -> Result<Result<Score, f64>, InformationError> {
         if let Some(violation) = self.options.limits.violation(&trial.motion, sequence.duration_s()) {
+            *self.rejected.entry(violation.name()).or_default() += 1;
             return Ok(Err(violation.excess()));
         }
+        // A log of one row has no window.
         let Some(log) = trial.log else { return Ok(Err(1.0)) };
         let Some(information): Option<DMatrix<f64>> = self.unknowns.information(&log, self.simulator)? else {
+            *self.rejected.entry("diverged").or_default() += 1;
             return Ok(Err(1.0));
         };
         let value = self.options.criterion.value(&information);

@@ -25,5 +25,5 @@ mod unknowns;
 pub use criterion::{Criterion, UnknownCriterion};
 pub use design::{Design, DesignError, DesignOptions, RunSequences, Score, design};
 pub use sequence::{CommandSequence, Segment, SequenceError, VelocityRanges};
-pub use trial::{Limits, Motion, Trial, Violation, simulate};
+pub use trial::{Limits, Motion, Trial, TrialError, Violation, simulate, walking_env};
 pub use unknowns::{InformationError, Unknowns};

@@ -1,9 +1,10 @@
 //! A policy that follows command sequences in a simulator, recorded as logs.
 
-use twinstep_envs::{Task, TaskEnv};
+use twinstep_envs::{ConfigError, Randomisation, Task, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
 use twinstep_logs::{Gain, Log, LogError, Meta, Segment, TorqueSensor};
 use twinstep_model::{
-    BaseMount, EnvError, EnvSpec, JOINT_NAMES, NUM_JOINTS, PerJoint, ResetRequest, RobotStates, Simulator, VecEnv,
+    AutoresetMode, Backend, BaseMount, EnvError, EnvSpec, JOINT_NAMES, NUM_JOINTS, PerJoint, ResetRequest, RobotStates,
+    Simulator, VecEnv,
 };
 use twinstep_policy::{Policy, PolicyRunner};
 
@@ -36,6 +37,18 @@ pub struct Motion {
     pub rms_torque_nm: f64,
 }
 
+impl std::fmt::Display for Motion {
+    fn fmt(&self, text: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        if let Some(fell_at_s) = self.fell_at_s {
+            write!(text, "it fell after {fell_at_s:.1} s, ")?;
+        }
+        let Self { farthest_m, saturated, rms_torque_nm, .. } = self;
+        let share = 100.0 * saturated;
+        write!(text, "{farthest_m:.1} m from the start, motors at their limit in {share:.1} % of the steps, ")?;
+        write!(text, "{rms_torque_nm:.1} N·m RMS")
+    }
+}
+
 /// A limit that a run does not keep, with the number by which it is exceeded relative to the limit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Violation {
@@ -50,6 +63,16 @@ pub enum Violation {
 }
 
 impl Violation {
+    /// Returns the name of the limit.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Fall(_) => "fall",
+            Self::Room(_) => "room",
+            Self::Torque(_) => "torque limit",
+            Self::Heat(_) => "RMS torque",
+        }
+    }
+
     /// Returns the number by which the limit is exceeded.
     pub fn excess(self) -> f64 {
         let (Self::Fall(excess) | Self::Room(excess) | Self::Torque(excess) | Self::Heat(excess)) = self;
@@ -92,6 +115,19 @@ struct Recording {
     torque_squares: [f64; NUM_JOINTS],
 }
 
+/// Returns the environments of the task `walk` without noise, randomisation and time limit, one for each robot.
+pub fn walking_env<B: Backend>(backend: B, seed: u64) -> Result<TaskEnv<B, Walk>, ConfigError> {
+    let settings = TaskEnvConfig {
+        randomise: Randomisation::default(),
+        robot_sampler: None,
+        autoreset: AutoresetMode::NextStep,
+        max_episode_steps: Some(u32::MAX),
+        seed,
+    };
+    let walk = Walk::new(WalkConfig::default(), backend.robot(), true)?;
+    TaskEnv::new(backend, walk, settings)
+}
+
 /// Lets `policy` follow one sequence on each robot of `env`, all of which start in the same state, drawn from `seed`.
 ///
 /// The sequences must have one duration, and `env` one robot for each. `policy` must be one of the environment's task.
@@ -102,7 +138,9 @@ pub fn simulate<B: Simulator, T: Task>(
     seed: u64,
 ) -> Result<Vec<Trial>, TrialError> {
     let spec = env.spec().clone();
+    let command = spec.observation_field("velocity_command").map(|(start, _)| start);
     let mut runner = PolicyRunner::new(policy);
+    let mut obs = Vec::new();
     let mut actions = vec![0.0; sequences.len() * spec.action_len()];
     env.reset(&ResetRequest { seeds: Some(vec![seed; sequences.len()]), ..ResetRequest::default() })?;
     let torque_limits = env.backend().robot().torque_limits();
@@ -113,7 +151,15 @@ pub fn simulate<B: Simulator, T: Task>(
         let t = step as f64 * spec.policy_dt;
         let commands: Vec<[f32; 3]> = sequences.iter().map(|sequence| sequence.at(t)).collect();
         env.set_velocity_commands(&commands)?;
-        runner.run(env.obs(), &mut actions);
+        obs.clear();
+        obs.extend_from_slice(env.obs());
+        // As in `twinstep run`, the policy observes the command that is wanted now.
+        if let Some(start) = command {
+            for (row, wanted) in obs.chunks_exact_mut(spec.obs_len()).zip(&commands) {
+                row[start..start + 3].copy_from_slice(wanted);
+            }
+        }
+        runner.run(&obs, &mut actions);
         let states = env.backend().states();
         for ((robot, recording), action) in
             recordings.iter_mut().enumerate().zip(actions.chunks_exact(spec.action_len()))

@@ -1,7 +1,7 @@
 //! Parameters that are sought, and what a log tells about them.
 
 use nalgebra::DMatrix;
-use twinstep_effects::{Effect, EntryError, ModelFile, Scope};
+use twinstep_effects::{Composition, Effect, EffectEntry, EntryError, ModelFile, Scope};
 use twinstep_identify::least_squares::LeastSquaresProblem;
 use twinstep_identify::{
     Experiment, ExperimentError, FreeParameter, WindowConfig, free_parameters, initial_coordinate,
@@ -33,13 +33,16 @@ pub enum InformationError {
 impl Unknowns {
     /// Prepares the parameters of `effects` on top of `model`.
     ///
-    /// An effect that the model has is linearised at its value, others at the mean of their prior, where they act.
+    /// An effect that the model has, and that a new entry replaces, is linearised at its value; others at the mean of
+    /// their prior, where they act.
     pub fn new(model: &ModelFile, effects: &[(&'static Effect, Scope)]) -> Result<Self, EntryError> {
         let (file, parameters) = free_parameters(model, effects)?;
+        let is_known = |parameter: &FreeParameter| {
+            let own = |entry: &EffectEntry| entry.effect == parameter.effect && entry.scope == parameter.scope;
+            parameter.effect.composition == Composition::Replace && model.effects.iter().any(own)
+        };
         let coordinate = |parameter: &FreeParameter| {
-            let own = initial_coordinate(&file, parameter);
-            let has_no_effect = (own - parameter.coordinate(parameter.neutral)).abs() < 1e-9;
-            if has_no_effect { parameter.prior[0] } else { own }
+            if is_known(parameter) { initial_coordinate(&file, parameter) } else { parameter.prior[0] }
         };
         let point = parameters.iter().map(coordinate).collect();
         Ok(Self { robot: model.robot_model()?, file, parameters, point })
@@ -68,5 +71,22 @@ impl Unknowns {
             precision: Precision::Single,
         };
         Ok(predicted_information(&problem, simulator, &self.point))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn known_effect_is_linearised_at_its_value_and_an_unknown_one_at_the_prior_mean() {
+        let effect = Effect::named("torque_saturation").expect("an effect of the catalogue");
+        let scope: Scope = "calf".parse().expect("a scope");
+        let unknown = Unknowns::new(&ModelFile::default(), &[(effect, scope)]).expect("a valid effect");
+        assert_eq!(unknown.point, [unknown.parameters[0].prior[0]]);
+        let entry = EffectEntry::new(effect, scope, vec![22.0]).expect("a valid entry");
+        let model = ModelFile { effects: vec![entry], ..ModelFile::default() };
+        let known = Unknowns::new(&model, &[(effect, scope)]).expect("a valid effect");
+        assert_eq!(known.point, [known.parameters[0].coordinate(22.0)]);
     }
 }

@@ -9,11 +9,11 @@ use std::time::Instant;
 use clap::Parser;
 use indicatif::ProgressBar;
 use twinstep_effects::{Effect, ModelFile, Scope};
-use twinstep_envs::{Randomisation, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
-use twinstep_excite::{CommandSequence, Criterion, DesignOptions, Limits, Unknowns, design, simulate};
+use twinstep_envs::{TaskEnv, Walk, WalkConfig};
+use twinstep_excite::{CommandSequence, Criterion, DesignOptions, Limits, Unknowns, design, simulate, walking_env};
 use twinstep_identify::{CmaEs, Experiment, Identification, IdentifyOptions, WindowConfig, apply_sensors, identify};
 use twinstep_logs::Log;
-use twinstep_model::{AutoresetMode, Backend, RobotModel, Simulator, go2};
+use twinstep_model::{RobotModel, Simulator, go2};
 use twinstep_policy::Policy;
 use twinstep_sim::{BatchBackend, BatchRollout, MujocoBackend, SimConfig};
 use twinstep_tests::ground_truth_robot::{SENSORS, effect, ground_truth_robot};
@@ -73,7 +73,7 @@ fn main() {
                     let found = compare(method, &identified(&log, &mut rollouts), &truth);
                     let (name, mass) = (METHODS[method], 100.0 * found.mass);
                     bar.suspend(|| {
-                        eprintln!("robot {case}, {name}: mass {mass:.2} %, friction {:.3} N·m", found.friction_nm)
+                        eprintln!("robot {case}, {name}: mass {mass:.2} %, friction {:.3} N·m", found.friction_nm);
                     });
                     errors.push(found);
                 }
@@ -99,18 +99,6 @@ fn unknowns() -> Vec<(&'static Effect, Scope)> {
     hidden_robot(0).effects.iter().map(|entry| (entry.effect, entry.scope)).chain(ground).collect()
 }
 
-fn env<B: Backend>(backend: B) -> TaskEnv<B, Walk> {
-    let settings = TaskEnvConfig {
-        randomise: Randomisation::default(),
-        robot_sampler: None,
-        autoreset: AutoresetMode::NextStep,
-        max_episode_steps: Some(u32::MAX),
-        seed: 1,
-    };
-    let walk = Walk::new(WalkConfig::default(), backend.robot(), true).expect("the default task");
-    TaskEnv::new(backend, walk, settings).expect("the default settings")
-}
-
 /// Returns the commands of a method, designed for the nominal robot.
 fn sequence(method: &str, args: &Args, policy: &Policy, rollouts: &mut BatchRollout) -> CommandSequence {
     let segments = (args.seconds / SEGMENT_S).round() as usize;
@@ -126,7 +114,7 @@ fn sequence(method: &str, args: &Args, policy: &Policy, rollouts: &mut BatchRoll
     };
     let population = CmaEs::new(&vec![0.0; 3 * segments], 1.0).population();
     let backend = BatchBackend::new(go2(), SimConfig::default(), population).expect("a backend");
-    let mut env = env(backend);
+    let mut env = walking_env(backend, 1).expect("the default task");
     let unknowns = Unknowns::new(&ModelFile::default(), &unknowns()).expect("effects of the catalogue");
     let bar = ProgressBar::new(options.candidates as u64);
     let found = design(
@@ -148,7 +136,7 @@ fn sequence(method: &str, args: &Args, policy: &Policy, rollouts: &mut BatchRoll
 fn walk(truth: &ModelFile, policy: &Policy, sequence: &CommandSequence, case: u64) -> Option<Log> {
     let robot = truth.robot_model().expect("a valid robot");
     let backend = MujocoBackend::new(robot, SimConfig::default(), 1).expect("MuJoCo");
-    let trial = run(&mut env(backend), policy, sequence, case);
+    let trial = run(&mut walking_env(backend, 1).expect("the default task"), policy, sequence, case);
     let log = trial.log.filter(|_| trial.motion.fell_at_s.is_none())?;
     Some(apply_sensors(&log, &SENSORS, case).expect("a valid log"))
 }

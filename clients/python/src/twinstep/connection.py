@@ -84,7 +84,7 @@ class Connection:
             raise
 
     def close(self) -> None:
-        """Undeclare the token, and leave the session to its other users."""
+        """Undeclare token and key, and leave the session to its other users."""
         # A forked child has the object, but not the threads of the session.
         if self._pid == os.getpid():
             if self._token is not None:

@@ -290,6 +290,8 @@ class RemoteVecEnv(NotPicklable):
             # The error does not matter to a closed client. The server releases the lease after the grace period.
             pass
         finally:
+            # It holds the session, which other environments may share.
+            self._pending = None
             self._release()
 
     @property
