@@ -53,6 +53,7 @@ mod rollout;
 mod run;
 mod security;
 mod soak;
+mod spi_active;
 mod terrain;
 mod tidy;
 mod train;

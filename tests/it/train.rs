@@ -247,6 +247,47 @@ fn shipped_policy_follows_a_circle_a_figure_of_eight_and_a_square() {
 }
 
 #[test]
+fn shipped_policy_jumps_to_its_target_in_two_engines() {
+    let policy = root().join("data/policies/jump.safetensors");
+    let evaluated = twinstep(&["evaluate-policy", policy.to_str().unwrap(), "--robots", "8", "--json"]);
+    assert!(evaluated.status.success(), "{}", text(&evaluated.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&evaluated.stdout).unwrap();
+    let rows = report["rows"].as_array().unwrap();
+    assert!(rows.iter().all(|row| row["condition"] != "pushes"), "a jump is over before the first push");
+    let nominal: Vec<_> = rows.iter().filter(|row| row["condition"] == "nominal").collect();
+    assert_eq!(nominal.len(), 2, "batch and rapier");
+    for landings in nominal.iter().flat_map(|row| row["targets"].as_array().unwrap()) {
+        assert!(landings["landed"] == 1.0 && landings["up"] == 1.0, "{landings}");
+        assert!(
+            landings["l_jump"].as_f64().unwrap() < 0.1 && landings["flight_s"].as_f64().unwrap() > 0.1,
+            "{landings}"
+        );
+    }
+}
+
+#[test]
+fn jump_is_trained_for_the_targets_of_its_config() {
+    let folder = tempfile::tempdir().unwrap();
+    let (config, out) = (folder.path().join("jump.toml"), folder.path().join("jump"));
+    std::fs::write(&config, "[task]\nname = \"jump\"\ntarget_x_m = [0.3, 0.5]\n").unwrap();
+    let arguments = ["train", "--config", config.to_str().unwrap(), "--out", out.to_str().unwrap()];
+    let trained = twinstep(&[&arguments[..], &["--envs", "32", "--steps", "768", "--json"]].concat());
+    assert!(trained.status.success(), "{}", text(&trained.stderr));
+    let targets: serde_json::Value = serde_json::from_slice(&trained.stdout).unwrap();
+    let distances: Vec<_> = targets.as_array().unwrap().iter().map(|landings| &landings["target"][0]).collect();
+    assert_eq!(serde_json::to_string(&distances).unwrap(), "[0.3,0.4,0.5]");
+    let (policy, _) = Policy::read(out.join("policy.safetensors")).unwrap();
+    assert_eq!((policy.spec.task.as_str(), policy.spec.obs_len(), policy.spec.max_episode_steps), ("jump", 49, 150));
+    std::fs::write(&config, "[task]\nname = \"jump\"\ntarget_x_m = [0.5, 0.3]\n").unwrap();
+    let refused = twinstep(&["train", "--config", config.to_str().unwrap(), "--out", "jump"]);
+    assert!(
+        text(&refused.stderr).contains("`task.target_x_m` = [0.5, 0.3] is not allowed"),
+        "{}",
+        text(&refused.stderr)
+    );
+}
+
+#[test]
 fn task_of_the_config_file_is_trained_and_another_one_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("track.toml");

@@ -38,7 +38,7 @@ pub struct Args {
 }
 
 /// Selection of rows by time.
-#[derive(clap::Args)]
+#[derive(Default, clap::Args)]
 pub struct Rows {
     /// Evaluate only rows from this time on [s].
     #[arg(long, value_name = "S")]

@@ -5,13 +5,14 @@ use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
-use twinstep_envs::{ObservationNoise, Randomisation, TaskConfig};
+use twinstep_envs::{JumpConfig, ObservationNoise, Randomisation, TaskConfig};
 use twinstep_learning::{Evaluation, EvaluationError, EvaluationPlan, SpeedBin, evaluate};
 use twinstep_model::{EnvError, EnvSpec, ResetRequest, VecEnv};
 use twinstep_policy::{Policy, PolicyRunner};
 use twinstep_report::film_strip;
 use twinstep_sim::{Engine, RoughTerrain, SimConfig, Terrain};
 
+use crate::evaluate_jump::{self, JumpRow};
 use crate::evaluate_tracking::{self, TrackingRow};
 use crate::exit::{CommandResult, Failure, Signals, input};
 use crate::serve::engine;
@@ -24,8 +25,9 @@ const FILM_STEPS: usize = 4;
 /// Evaluate a policy: velocity errors, falls and gait, on engines and robots that it has not seen.
 ///
 /// The mean action of the policy steps fresh robots with the default commands of `walk`: a new one every 5 s. A policy of
-/// `track` follows a circle, a figure of eight and a square, with and without motion capture. A robot that has fallen no
-/// longer counts for the errors. Conditions:
+/// `track` follows a circle, a figure of eight and a square, with and without motion capture. A policy of `jump` jumps
+/// once to the nearest, the middle and the farthest target of its training. A robot that has fallen no longer counts for
+/// the errors. Conditions:
 ///
 ///   nominal   the robot of the model file on flat ground
 ///   robots    masses +-15 %, friction 0.4 to 1.25, gains +-10 %
@@ -53,7 +55,7 @@ pub struct Args {
     /// Number of robots.
     #[arg(long, value_name = "N", default_value_t = 256, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     robots: u32,
-    /// Simulated time of each robot [s].
+    /// Simulated time of each robot [s]. A jump takes 3 s.
     #[arg(long, value_name = "S", default_value_t = 20.0)]
     seconds: f64,
     /// Seed of robots and commands.
@@ -142,8 +144,8 @@ pub fn run(args: &Args) -> CommandResult {
     if !(args.seconds >= 1.0 && args.seconds <= 3600.0) {
         return Err(Failure::Input(miette::miette!("`--seconds` = {} is not allowed: 1 to 3600 s", args.seconds)));
     }
-    let (policy, _) = Policy::read(&args.policy).map_err(input)?;
-    let task = TaskConfig::named(&policy.spec.task).unwrap_or_default();
+    let (policy, header) = Policy::read(&args.policy).map_err(input)?;
+    let task = task(&policy, &header.origin.config);
     if let Some(path) = &args.film {
         let mut env = conditions(args.engine)[0].env(args, task.clone(), 1)?;
         check_spec(&policy, env.spec())?;
@@ -152,19 +154,35 @@ pub fn run(args: &Args) -> CommandResult {
             Failure::Input(miette::miette!("`--film` = {}: cannot write the file: {cause}", path.display()))
         })?;
     }
-    let text = if matches!(task, TaskConfig::Track(_)) {
-        let rows = tracking(args, &policy, &signals)?;
-        if args.json { json(args, &rows) } else { evaluate_tracking::table(args.robots, args.seconds, &rows) }
-    } else {
-        let rows = walking(args, &policy, &signals)?;
-        if args.json {
-            json(args, &rows)
-        } else {
-            format!("{}\n{}", table(args, &rows), speed_table(&rows[0].evaluation))
+    let text = match &task {
+        TaskConfig::Track(_) => {
+            let rows = tracking(args, &policy, &signals)?;
+            if args.json { json(args, &rows) } else { evaluate_tracking::table(args.robots, args.seconds, &rows) }
+        }
+        TaskConfig::Jump(trained) => {
+            let rows = jumping(args, &policy, trained, &signals)?;
+            if args.json { json(args, &rows) } else { evaluate_jump::table(args.robots, &rows) }
+        }
+        _ => {
+            let rows = walking(args, &policy, &signals)?;
+            if args.json {
+                json(args, &rows)
+            } else {
+                format!("{}\n{}", table(args, &rows), speed_table(&rows[0].evaluation))
+            }
         }
     };
     print!("{text}");
     Ok(())
+}
+
+/// Returns the task of a policy: that of `jump` with the targets of its training, and the others with default settings.
+fn task(policy: &Policy, trained_with: &str) -> TaskConfig {
+    let trained = TrainConfig::parse(trained_with, "the policy's config").map(|config| config.task);
+    match (policy.spec.task.as_str(), trained) {
+        ("jump", Ok(task @ TaskConfig::Jump(_))) => task,
+        (name, _) => TaskConfig::named(name).unwrap_or_default(),
+    }
 }
 
 fn json(args: &Args, rows: &impl Serialize) -> String {
@@ -211,6 +229,29 @@ fn tracking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<Track
         }
         bar.finish_and_clear();
         rows.push(TrackingRow { condition: name, engine, paths });
+    }
+    Ok(rows)
+}
+
+/// Evaluates the landings of the policy under each condition.
+fn jumping(args: &Args, policy: &Policy, trained: &JumpConfig, signals: &Signals) -> Result<Vec<JumpRow>, Failure> {
+    let robot = TrainConfig { model: args.model.clone(), ..TrainConfig::default() }.robot()?;
+    let tasks = evaluate_jump::tasks(trained);
+    let mut rows = Vec::new();
+    // A jump is over before the first push.
+    for condition in conditions(args.engine).into_iter().filter(|condition| condition.name != "pushes") {
+        let Condition { name, engine, .. } = condition;
+        let bar = progress_bar(name);
+        let mut targets = Vec::new();
+        for (index, task) in tasks.iter().enumerate() {
+            let mut env = condition.env(args, TaskConfig::Jump(task.clone()), args.robots as usize)?;
+            check_spec(policy, env.spec())?;
+            let proceed = |share: f64| show(&bar, (index as f64 + share) / tasks.len() as f64, signals);
+            let landings = evaluate_jump::evaluate(policy, env.as_mut(), &robot, task, args.seed, proceed);
+            targets.push(landings.map_err(input)?.ok_or(Failure::Interrupted)?);
+        }
+        bar.finish_and_clear();
+        rows.push(JumpRow { condition: name, engine, targets });
     }
     Ok(rows)
 }

@@ -104,7 +104,7 @@ pub fn evaluate(
 }
 
 /// Returns the pose of a robot's trunk on the ground.
-fn ground_pose(scene: &Scene) -> GroundPose {
+pub fn ground_pose(scene: &Scene) -> GroundPose {
     let [x, y, _, qw, qx, qy, qz] = scene.pose[0];
     GroundPose { x, y, yaw: (2.0 * (qw * qz + qx * qy)).atan2(1.0 - 2.0 * (qy * qy + qz * qz)) }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
@@ -21,6 +21,9 @@ use crate::evaluate::simulator;
 use crate::evaluate_policy::check_spec;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::robot_file::analytic_model;
+
+/// Limits of a run unless others are given.
+pub const DEFAULT_LIMITS: Limits = Limits { room_m: 3.0, max_saturated: 0.05, max_rms_torque_nm: 15.0 };
 
 /// Choose velocity commands with which the log of a run tells most about unknown parameters (SPI-Active).
 ///
@@ -41,47 +44,47 @@ use crate::robot_file::analytic_model;
 #[derive(clap::Args)]
 pub struct Args {
     /// Policy file of the task `walk` (safetensors).
-    policy: PathBuf,
+    pub policy: PathBuf,
     /// Effects whose parameters are sought, with scopes, as in `payload@base,coulomb_friction@calf`. `twinstep effects`
     /// lists them.
     #[arg(long, value_name = "EFFECTS", value_delimiter = ',', required = true)]
-    unknowns: Vec<EffectAtScope>,
+    pub unknowns: Vec<EffectAtScope>,
     /// Model file of the robot, with what is known of it. Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
-    model: Option<PathBuf>,
+    pub model: Option<PathBuf>,
     /// trace, d-optimal or a-optimal.
     #[arg(long, default_value = "d-optimal")]
-    criterion: Criterion,
+    pub criterion: Criterion,
     /// Effects that matter for a-optimal. Default: all of --unknowns.
     #[arg(long, value_name = "EFFECTS", value_delimiter = ',')]
-    of_interest: Vec<EffectAtScope>,
+    pub of_interest: Vec<EffectAtScope>,
     /// Duration of the run [s].
     #[arg(long, value_name = "S", default_value_t = 25.0)]
-    seconds: f64,
+    pub seconds: f64,
     /// Duration of a command [s].
     #[arg(long, value_name = "S", default_value_t = 5.0)]
-    segment_s: f64,
+    pub segment_s: f64,
     /// Number of command sequences to simulate.
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
-    candidates: u32,
+    pub candidates: u32,
     /// Largest horizontal distance from the start [m].
-    #[arg(long, value_name = "M", default_value_t = 3.0)]
-    room: f64,
+    #[arg(long, value_name = "M", default_value_t = DEFAULT_LIMITS.room_m)]
+    pub room: f64,
     /// Largest share of the steps in which a motor is at its torque limit.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.05)]
-    max_saturated: f64,
+    #[arg(long, value_name = "SHARE", default_value_t = DEFAULT_LIMITS.max_saturated)]
+    pub max_saturated: f64,
     /// Largest root mean square of a motor's torque, which heats it [N·m].
-    #[arg(long, value_name = "NM", default_value_t = 15.0)]
-    max_rms_torque: f64,
+    #[arg(long, value_name = "NM", default_value_t = DEFAULT_LIMITS.max_rms_torque_nm)]
+    pub max_rms_torque: f64,
     /// Rate of the physics of the candidates' runs [Hz]. Default: 1000.
     #[arg(long, value_name = "HZ")]
-    physics_hz: Option<u32>,
+    pub physics_hz: Option<u32>,
     /// Seed of the search and of the initial state.
     #[arg(long, default_value_t = 1)]
-    seed: u64,
+    pub seed: u64,
     /// Folder for the results.
     #[arg(long, value_name = "DIR")]
-    out: PathBuf,
+    pub out: PathBuf,
 }
 
 /// Contents of `design.json`.
@@ -109,9 +112,19 @@ struct ReportedScore {
     remaining_std: Vec<(String, f64)>,
 }
 
-/// Designs the experiment and writes it.
+/// Designs the experiment, writes it, and says how to run it.
 pub fn run(args: &Args) -> CommandResult {
-    let signals = Signals::listen()?;
+    let designed = write_design(args, &Signals::listen()?);
+    if matches!(designed, Ok(()) | Err(Failure::Interrupted)) {
+        let (policy, path) = (args.policy.display(), args.out.join("commands.csv"));
+        let path = path.display();
+        println!("written to {path}; run it: twinstep run {policy} --commands {path} --log DIR");
+    }
+    designed
+}
+
+/// Designs the experiment, writes it, and prints what its log will tell.
+pub fn write_design(args: &Args, signals: &Signals) -> CommandResult {
     args.check()?;
     std::fs::create_dir_all(&args.out).map_err(|cause| {
         Failure::Input(miette::miette!("`--out` = {}: cannot create the folder: {cause}", args.out.display()))
@@ -154,8 +167,14 @@ pub fn run(args: &Args) -> CommandResult {
         std::fs::write(&path, text)
             .map_err(|cause| Failure::Input(miette::miette!("cannot write {}: {cause}", path.display())))?;
     }
-    print!("{}", text(&report, &options, &args.policy, &args.out.join("commands.csv")));
+    print!("{}", text(&report, &options));
     if interrupted { Err(Failure::Interrupted) } else { Ok(()) }
+}
+
+/// Returns the ranges of the velocity commands of `walk`.
+pub fn velocity_ranges() -> VelocityRanges {
+    let command = WalkConfig::default().command;
+    [command.linear_velocity_x, command.linear_velocity_y, command.angular_velocity_z]
 }
 
 fn effects(list: &[EffectAtScope]) -> Vec<(&'static Effect, Scope)> {
@@ -213,12 +232,10 @@ impl Args {
             }
             criterion => criterion.clone(),
         };
-        let command = WalkConfig::default().command;
-        let ranges: VelocityRanges = [command.linear_velocity_x, command.linear_velocity_y, command.angular_velocity_z];
         Ok(DesignOptions {
             segment_s: self.segment_s,
             segments: (self.seconds / self.segment_s).round() as usize,
-            ranges,
+            ranges: velocity_ranges(),
             limits: Limits {
                 room_m: self.room,
                 max_saturated: self.max_saturated,
@@ -257,8 +274,7 @@ impl Args {
 }
 
 /// Returns the summary.
-fn text(report: &Report, options: &DesignOptions, policy: &Path, path: &Path) -> String {
-    let path = path.display();
+fn text(report: &Report, options: &DesignOptions) -> String {
     let Report { criterion, simulated, rejected, seconds, design, random, .. } = report;
     let limits: Vec<_> = rejected.iter().map(|(limit, count)| format!("{count} {limit}")).collect();
     let limits = if limits.is_empty() { "none".to_owned() } else { limits.join(", ") };
@@ -285,6 +301,5 @@ fn text(report: &Report, options: &DesignOptions, policy: &Path, path: &Path) ->
         let start = index as f64 * options.segment_s;
         let _ = writeln!(text, "{start:>5.1}s {:>5.1}s  {vx:>6.2}  {vy:>6.2}  {wz:>6.2}", start + options.segment_s);
     }
-    let _ = writeln!(text, "written to {path}; run it: twinstep run {} --commands {path} --log DIR", policy.display());
     text
 }

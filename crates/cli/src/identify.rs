@@ -30,31 +30,49 @@ use crate::robot_file::analytic_model;
 pub struct Args {
     /// Measured logs: data files, or folders that contain one. Segments may have a fixed or a floating base.
     #[arg(required = true)]
-    logs: Vec<PathBuf>,
+    pub logs: Vec<PathBuf>,
     /// Model file to start from. Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
-    model: Option<PathBuf>,
+    pub model: Option<PathBuf>,
     /// Effects to estimate, with scopes, as in `coulomb_friction@calf,payload@base`. `twinstep effects` lists them.
     /// Default: armature, Coulomb and viscous friction by joint type, and the command delay.
     #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = DEFAULT_EFFECTS, hide_default_value = true)]
-    effects: Vec<EffectAtScope>,
+    pub effects: Vec<EffectAtScope>,
     #[command(flatten)]
-    rows: Rows,
+    pub rows: Rows,
     /// Estimate parameters that are not identifiable from the logs, too.
     #[arg(long)]
-    force: bool,
+    pub force: bool,
     /// Maximum number of generations of CMA-ES.
     #[arg(long, value_name = "N", default_value_t = IdentifyOptions::default().generations)]
-    generations: usize,
+    pub generations: usize,
     /// Seed of the search.
     #[arg(long, default_value_t = IdentifyOptions::default().seed)]
-    seed: u64,
+    pub seed: u64,
     /// Continue the interrupted search in OUT.search.json.
     #[arg(long)]
-    resume: bool,
+    pub resume: bool,
     /// Model file to write.
     #[arg(long, value_name = "FILE")]
-    out: PathBuf,
+    pub out: PathBuf,
+}
+
+impl Args {
+    /// Returns the arguments without logs and effects that write the model file `out`.
+    pub fn new(out: &Path) -> Self {
+        let IdentifyOptions { generations, seed, .. } = IdentifyOptions::default();
+        Self {
+            logs: Vec::new(),
+            model: None,
+            effects: Vec::new(),
+            rows: Rows::default(),
+            force: false,
+            generations,
+            seed,
+            resume: false,
+            out: out.to_owned(),
+        }
+    }
 }
 
 /// The output file cannot be written.
@@ -74,7 +92,7 @@ struct NotResumable {
 }
 
 /// Returns the file in which an interrupted search is saved.
-fn search_file(out: &Path) -> PathBuf {
+pub fn search_file(out: &Path) -> PathBuf {
     let mut name = out.as_os_str().to_owned();
     name.push(".search.json");
     name.into()
@@ -86,8 +104,20 @@ fn resumed(path: &Path) -> Result<GlobalSearch, NotResumable> {
     serde_json::from_str(&text).map_err(|error| failed(error.to_string()))
 }
 
-/// Estimates the parameters, prints them and writes the model.
+/// Estimates the parameters, writes the model, and says how to evaluate it.
 pub fn run(args: &Args) -> CommandResult {
+    let identified = write_model(args, &Signals::listen()?);
+    if matches!(identified, Ok(()) | Err(Failure::Interrupted)) {
+        println!("written to {}; evaluate it on other rows: twinstep evaluate --model", args.out.display());
+    }
+    if matches!(identified, Err(Failure::Interrupted)) {
+        println!("interrupted; the same command with --resume continues");
+    }
+    identified
+}
+
+/// Estimates the parameters, prints them and writes the model.
+pub fn write_model(args: &Args, signals: &Signals) -> CommandResult {
     let model = analytic_model(args.model.as_deref())?;
     let robot = model.robot_model().map_err(input)?;
     let (mut experiments, mut logs) = (Vec::new(), Vec::new());
@@ -102,7 +132,6 @@ pub fn run(args: &Args) -> CommandResult {
     // Checked before the search, so that its result cannot be lost.
     let unwritable = |source| input(Unwritable { path: args.out.clone(), source });
     std::fs::OpenOptions::new().append(true).create(true).open(&args.out).map_err(unwritable)?;
-    let signals = Signals::listen()?;
     let mut simulator = simulator(&robot)?;
     let effects: Vec<_> = args.effects.iter().map(|EffectAtScope(effect, scope)| (*effect, *scope)).collect();
     let search = search_file(&args.out);
@@ -141,12 +170,7 @@ pub fn run(args: &Args) -> CommandResult {
             );
         }
     }
-    println!("written to {}; evaluate it on other rows: twinstep evaluate --model", args.out.display());
-    if found.checkpoint.is_some() {
-        println!("interrupted; the same command with --resume continues");
-        return Err(Failure::Interrupted);
-    }
-    Ok(())
+    if found.checkpoint.is_some() { Err(Failure::Interrupted) } else { Ok(()) }
 }
 
 fn progress_bar(generations: usize) -> ProgressBar {

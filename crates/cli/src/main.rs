@@ -6,6 +6,7 @@ mod demo;
 mod diagnose;
 mod effects;
 mod evaluate;
+mod evaluate_jump;
 mod evaluate_policy;
 mod evaluate_tracking;
 mod excite;
@@ -26,15 +27,20 @@ mod operator;
 mod operator_screen;
 mod play;
 mod preflight;
+mod random_commands;
 mod robot;
 mod robot_env_factory;
 mod robot_file;
 mod run;
 mod serve;
+mod spi_active;
+mod spi_active_config;
+mod spi_active_report;
 mod status_line;
 mod train;
 mod train_config;
 mod train_endpoints;
+mod train_evaluation;
 mod train_log;
 mod velocity_input;
 mod view;
@@ -74,6 +80,7 @@ enum CliCommand {
     Robot(robot::Args),
     Run(run::Args),
     Serve(serve::Args),
+    SpiActive(spi_active::Args),
     Train(train::Args),
     View(view::Args),
 }
@@ -82,7 +89,7 @@ fn main() -> std::process::ExitCode {
     let command = Cli::parse().command;
     let log = match &command {
         // Their errors have the reason; Zenoh would write two lines for each attempt to connect.
-        CliCommand::List(_) | CliCommand::Run(_) => "warn,zenoh=off",
+        CliCommand::List(_) | CliCommand::Run(_) | CliCommand::SpiActive(_) => "warn,zenoh=off",
         _ => "warn,zenoh::api::session=error,rustdds=off,twinstep=info",
     };
     tracing_subscriber::fmt()
@@ -109,6 +116,7 @@ fn main() -> std::process::ExitCode {
         CliCommand::Robot(args) => robot::run(&args),
         CliCommand::Run(args) => run::run(&args),
         CliCommand::Serve(args) => serve::run(&args),
+        CliCommand::SpiActive(args) => spi_active::run(&args),
         CliCommand::Train(args) => train::run(&args),
         CliCommand::View(args) => view::run(&args),
     });

@@ -32,47 +32,47 @@ use crate::velocity_input::VelocityInput;
 #[derive(clap::Args)]
 pub struct Args {
     /// Policy: *.safetensors or *.onnx.
-    policy: PathBuf,
+    pub policy: PathBuf,
     /// Mapping of the ONNX file of another program (TOML).
     #[arg(long, value_name = "FILE")]
-    mapping: Option<PathBuf>,
+    pub mapping: Option<PathBuf>,
     /// Zenoh endpoint of the robot or of a server.
     #[arg(long, value_name = "ENDPOINT", default_value = "tcp/127.0.0.1:7447")]
-    endpoint: String,
+    pub endpoint: String,
     /// Name of the robot, if several are visible.
     #[arg(long, value_name = "NAME")]
-    robot: Option<String>,
+    pub robot: Option<String>,
     /// Zenoh configuration file (JSON5) for TLS, user and password.
     #[arg(long, value_name = "FILE")]
-    zenoh: Option<PathBuf>,
+    pub zenoh: Option<PathBuf>,
     /// Folder of the log, which must not exist or be empty. Default: no log.
     #[arg(long, value_name = "DIR")]
-    log: Option<PathBuf>,
+    pub log: Option<PathBuf>,
     /// Constant velocity command: forward [m/s], left [m/s], yaw rate [rad/s]. Default: the endpoint's own commands.
     #[arg(long, value_name = "VX,VY,WZ", value_parser = velocity, allow_hyphen_values = true)]
-    velocity: Option<[f32; 3]>,
+    pub velocity: Option<[f32; 3]>,
     /// Follow the velocity commands in this file (CSV: start_s,end_s,vx,vy,wz), as `twinstep excite` writes it. The run
     /// ends with the last one.
     #[arg(long, value_name = "FILE", conflicts_with = "velocity")]
-    commands: Option<PathBuf>,
+    pub commands: Option<PathBuf>,
     /// Take the velocity command from the keyboard.
     #[arg(long, conflicts_with_all = ["velocity", "commands"])]
-    keyboard: bool,
+    pub keyboard: bool,
     /// Take the velocity command from a gamepad. Default device: /dev/input/js0.
     #[arg(long, value_name = "DEVICE", num_args = 0..=1, default_missing_value = "/dev/input/js0", conflicts_with_all = ["velocity", "commands", "keyboard"])]
-    gamepad: Option<PathBuf>,
+    pub gamepad: Option<PathBuf>,
     /// Time after which the run ends [s]. Default: when it is ended.
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
-    seconds: Option<f64>,
+    pub seconds: Option<f64>,
     /// Step as fast as the endpoint answers. Default: in real time.
     #[arg(long)]
-    fast: bool,
+    pub fast: bool,
     /// Seed of the robot's random numbers: initial pose, own commands.
     #[arg(long, default_value_t = 1)]
-    seed: u64,
+    pub seed: u64,
     /// Print the summary as one JSON object on stdout.
     #[arg(long)]
-    json: bool,
+    pub json: bool,
 }
 
 /// Output of `--json`.
@@ -94,30 +94,51 @@ enum Velocity {
     Person(VelocityInput),
 }
 
-/// Runs the policy.
+/// Runs the policy and prints the summary.
 pub fn run(args: &Args) -> CommandResult {
     let signals = Signals::listen()?;
+    let Recording { robot, task, summary } = record(args, &signals)?;
+    if args.json {
+        let report =
+            Report { policy: &args.policy, endpoint: &args.endpoint, robot: &robot, task: &task, summary: &summary };
+        println!("{}", serde_json::to_string(&report).map_err(other)?);
+    } else {
+        print!("{}", summary_text(&summary));
+    }
+    Ok(())
+}
+
+/// A run, which may have a log.
+pub struct Recording {
+    robot: String,
+    task: String,
+    /// What the robot did.
+    pub summary: RunSummary,
+}
+
+/// Runs the policy and records the log.
+pub fn record(args: &Args, signals: &Signals) -> Result<Recording, Failure> {
     if let Some(seconds) = args.seconds.filter(|seconds| !(seconds.is_finite() && *seconds > 0.0)) {
         return Err(Failure::Input(miette::miette!("`--seconds` = {seconds} is not allowed: it must be positive")));
     }
     // Read before anything moves.
     let commands = args.commands.as_deref().map(read_commands).transpose()?;
     let loaded = LoadedPolicy::read(&args.policy, args.mapping.as_deref()).map_err(input)?;
-    let mut env = RemoteVecEnv::connect(&args.options(&signals)).map_err(other)?;
+    let mut env = RemoteVecEnv::connect(&args.options(signals)).map_err(other)?;
     let mut policy = loaded.bind(env.spec()).map_err(input)?;
     if let Some(velocity) = args.velocity {
         env.set_velocity_commands(&[velocity]).map_err(input)?;
     }
-    let mut recorder = args.recorder(&mut env, &signals)?;
+    let mut recorder = args.recorder(&mut env, signals)?;
     let velocity = args.velocity_source(commands)?;
-    let result = args.steps(&mut env, &mut policy, recorder.as_mut(), &velocity, &signals);
+    let result = args.steps(&mut env, &mut policy, recorder.as_mut(), &velocity, signals);
     let device_failure = if let Velocity::Person(device) = &velocity { device.failure() } else { None };
     // Restores the terminal before anything is printed.
     drop(velocity);
     if let (Some(folder), Some(recorder)) = (&args.log, &recorder) {
         eprintln!("{} rows in {}", recorder.rows(), folder.display());
     }
-    let summary = result.map_err(|error| interrupted(&signals, error))?;
+    let summary = result.map_err(|error| interrupted(signals, error))?;
     // Its error is of no interest any more: the run is complete.
     let (robot, task) = (env.spec().robot.clone(), env.spec().task.clone());
     let _ = env.close();
@@ -128,14 +149,7 @@ pub fn run(args: &Args) -> CommandResult {
         // Ctrl-C before the end is an interruption; without --seconds it is the end.
         signals.check()?;
     }
-    if args.json {
-        let report =
-            Report { policy: &args.policy, endpoint: &args.endpoint, robot: &robot, task: &task, summary: &summary };
-        println!("{}", serde_json::to_string(&report).map_err(other)?);
-    } else {
-        print!("{}", summary_text(&summary));
-    }
-    Ok(())
+    Ok(Recording { robot, task, summary })
 }
 
 impl Args {

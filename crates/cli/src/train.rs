@@ -5,23 +5,19 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_envs::TaskConfig;
-use twinstep_learning::{
-    Checkpoint, Evaluation, EvaluationError, EvaluationPlan, Learner, LearningError, PpoConfig, Trainer, evaluate,
-};
+use twinstep_learning::{Checkpoint, EvaluationError, Learner, LearningError, PpoConfig, Trainer};
 use twinstep_model::EnvSpec;
 use twinstep_policy::{Collector, CurvePoint, Mlp, Policy, PolicyOrigin, StepCollector, with_residual};
-use twinstep_sim::SimConfig;
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::train_config::TrainConfig;
-use crate::train_endpoints::{remote_collectors, remote_env};
+use crate::train_endpoints::remote_collectors;
+use crate::train_evaluation;
 use crate::train_log::{TrainLog, curve_point, write_curve};
 use crate::web_view::{Page, ViewArgs};
 
 /// Interval at which a running training is saved.
 const SAVE_EVERY: Duration = Duration::from_secs(10);
-/// Robots, simulated time [s] and seed of the evaluation after the training.
-const EVALUATION: (usize, f64, u64) = (256, 20.0, 1_000_000);
 
 /// Train a policy by proximal policy optimisation.
 ///
@@ -30,7 +26,7 @@ const EVALUATION: (usize, f64, u64) = (256, 20.0, 1_000_000);
 ///
 ///   policy.safetensors     the policy, with the spec of its environment
 ///   policy.onnx            the same for other runtimes: input `obs` [batch, 45] in SI units, output `action` [batch, 12]
-///   evaluation.json        velocity errors and falls of 256 fresh robots
+///   evaluation.json        velocity errors and falls of 256 fresh robots; task `jump`: where they land
 ///   config.toml            all settings; --config config.toml repeats the training
 ///   progress.csv           errors, falls, reward terms and times of every update; TensorBoard reads events.out.*
 ///   curve.svg              learning curve
@@ -45,7 +41,7 @@ const EVALUATION: (usize, f64, u64) = (256, 20.0, 1_000_000);
 #[derive(clap::Args)]
 pub struct Args {
     /// Task to learn. Default: that of the config file, else walk.
-    #[arg(value_parser = ["walk", "track", "explore"])]
+    #[arg(value_parser = ["walk", "track", "jump", "explore"])]
     task: Option<String>,
     /// Folder to write.
     #[arg(long, value_name = "DIR")]
@@ -358,8 +354,7 @@ impl TrainSession {
 
     fn report(&self, args: &Args, signals: &Signals, start: Instant) -> CommandResult {
         let policy = self.trainer.learner().policy(self.trainer.spec());
-        let evaluation = self.evaluate(&policy, signals)?;
-        let json = serde_json::to_string_pretty(&evaluation).expect("an evaluation is plain data");
+        let (json, text) = train_evaluation::evaluate_policy(&policy, &self.config, &self.endpoints, signals)?;
         std::fs::write(self.out.join("evaluation.json"), &json).map_err(other)?;
         let steps = self.trainer.learner().env_steps as f64 / 1e6;
         let seconds = start.elapsed().as_secs_f64();
@@ -367,35 +362,9 @@ impl TrainSession {
             println!("{json}");
         } else {
             println!("trained {steps:.1} million steps in {seconds:.1} s; policy and curves in {}", args.out.display());
-            print!("{}", evaluation_text(&evaluation));
+            print!("{text}");
         }
         Ok(())
-    }
-
-    /// Evaluates the policy on fresh robots of the server, or of the training's model with default commands and physics.
-    fn evaluate(&self, policy: &Policy, signals: &Signals) -> Result<Evaluation, Failure> {
-        let (robots, seconds, seed) = EVALUATION;
-        let fresh = TrainConfig {
-            model: self.config.model.clone(),
-            task: self.config.task.with_default_settings(),
-            sim: SimConfig::default(),
-            ..TrainConfig::default()
-        };
-        let robot = fresh.robot()?;
-        let plan = EvaluationPlan { robot: &robot, seconds, seed };
-        let proceed = |_: f64| signals.check().is_ok();
-        let failure = |error| match error {
-            EvaluationError::Stopped => Failure::Interrupted,
-            _ => other(error),
-        };
-        if self.endpoints.is_empty() {
-            let mut env = fresh.envs(robots, 1, 0)?.remove(0);
-            return evaluate(policy, env.as_mut(), plan, proceed).map_err(failure);
-        }
-        let mut env = remote_env(&self.endpoints, robots)?;
-        let evaluation = evaluate(policy, &mut env, plan, proceed).map_err(failure)?;
-        env.close().map_err(other)?;
-        Ok(evaluation)
     }
 }
 
@@ -435,22 +404,4 @@ fn progress_text(point: &CurvePoint) -> String {
 fn thinned(curve: &[CurvePoint]) -> Vec<CurvePoint> {
     let step = curve.len().div_ceil(200).max(1);
     curve.iter().rev().step_by(step).rev().copied().collect()
-}
-
-/// Returns the table of an evaluation.
-pub fn evaluation_text(evaluation: &Evaluation) -> String {
-    let Evaluation { robots, seconds, up, velocity_rms, settled_velocity_rms, .. } = evaluation;
-    let Evaluation { yaw_rate_rms, settled_yaw_rate_rms, swing_height, duty_factor, .. } = evaluation;
-    format!(
-        "{robots} fresh robots, {seconds:.0} s, mean action:\n\
-         \x20 still up                 {:.1} %\n\
-         \x20 velocity error, RMS      {velocity_rms:.3} m/s   ({settled_velocity_rms:.3} from 1 s after each new command)\n\
-         \x20 yaw rate error, RMS      {yaw_rate_rms:.3} rad/s ({settled_yaw_rate_rms:.3})\n\
-         \x20 swing height of the sole {:.1} cm, duty factor {duty_factor:.2}, {:.1} swings/s per foot\n\
-         \x20 speed of feet on ground  {:.3} m/s\n",
-        100.0 * up,
-        100.0 * swing_height,
-        evaluation.swings_per_second,
-        evaluation.slip_speed,
-    )
 }

@@ -17,12 +17,13 @@ pub const NEED_GROUND_TRUTH: [&str; 8] = [
 /// Defines the weights of a task's reward terms: `name = default weight`, in the order of every per-term array.
 ///
 /// A weight is per second: a term adds `weight · value · policy_dt` to the reward of a step. The name of a field is
-/// that of its function in [`crate::reward`], of its key in a config file and of its log entry.
+/// that of its function, of its key in a config file and of its log entry. The module that uses the macro imports the
+/// functions and their `RewardInput` as `terms`.
 macro_rules! reward_weights {
     ($($(#[$doc:meta])* $name:ident = $weight:expr),+ $(,)?) => {
         /// Weights of the reward terms, per second: a term adds `weight · value · policy_dt` to the reward of a step.
         ///
-        /// The name of a field is that of its function in [`crate::reward`], of its key and of its log entry.
+        /// The name of a field is that of its function, of its key and of its log entry.
         #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
         #[serde(deny_unknown_fields, default)]
         pub struct RewardWeights { $($(#[$doc])* pub $name: f32),+ }
@@ -36,8 +37,8 @@ macro_rules! reward_weights {
             pub const NAMES: &'static [&'static str] = &[$(stringify!($name)),+];
 
             /// Returns the value of each weighted term, in the order of [`RewardWeights::NAMES`].
-            pub fn evaluate(&self, input: &crate::reward::RewardInput<'_>) -> [f32; Self::NAMES.len()] {
-                [$(self.$name * crate::reward::$name(input) * input.policy_dt),+]
+            pub fn evaluate(&self, input: &terms::RewardInput<'_>) -> [f32; Self::NAMES.len()] {
+                [$(self.$name * terms::$name(input) * input.policy_dt),+]
             }
 
             /// Returns all weights times `factor`.

@@ -16,6 +16,7 @@
 
 mod criterion;
 mod design;
+mod random;
 mod sequence;
 #[cfg(test)]
 mod tests;
@@ -24,6 +25,7 @@ mod unknowns;
 
 pub use criterion::{Criterion, UnknownCriterion};
 pub use design::{Design, DesignError, DesignOptions, RunSequences, Score, design};
+pub use random::random_within_limits;
 pub use sequence::{CommandSequence, Segment, SequenceError, VelocityRanges};
 pub use trial::{Limits, Motion, Trial, TrialError, Violation, simulate, walking_env};
 pub use unknowns::{InformationError, Unknowns};

@@ -69,8 +69,12 @@ fn entries(field: &SpecField) -> Option<Vec<(usize, f32)>> {
     match field.name.as_str() {
         "base_angular_velocity" | "true_angular_velocity" => signs([-1.0, 1.0, -1.0]),
         "projected_gravity" | "true_linear_velocity" => signs([1.0, -1.0, 1.0]),
-        "velocity_command" | "path_velocity" | "pose_error" => signs([1.0, -1.0, -1.0]),
-        "base_height" => Some(vec![(0, 1.0)]),
+        "velocity_command" | "no_velocity_command" | "path_velocity" | "pose_error" | "landing_target" => {
+            signs([1.0, -1.0, -1.0])
+        }
+        "base_height" | "phase" => Some(vec![(0, 1.0)]),
+        // Stages and errors without a sign.
+        "jump_stage" | "landing_error" => Some(vec![(0, 1.0), (1, 1.0)]),
         "foot_force" => Some(Leg::ALL.map(|leg| (opposite(leg) as usize, 1.0)).to_vec()),
         "joint_position" | "joint_velocity" | "previous_action" | "joint_position_offset" => {
             let joint = |joint: Joint| {

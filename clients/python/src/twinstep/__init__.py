@@ -87,13 +87,13 @@ __all__ = [
     "stop_robot",
 ]
 
-for _task in ("walk", "track", "explore"):
+# With the number of policy steps of an episode: 20 s, a jump 3 s.
+for _task, _max_episode_steps in {"walk": 1000, "track": 1000, "jump": 150, "explore": 1000}.items():
     gymnasium.register(
         id=f"twinstep/Go2-{_task.capitalize()}-v0",
         entry_point="twinstep.env:Go2Env",
         vector_entry_point="twinstep.vector_env:Go2VectorEnv",
-        # 20 s, the time limit of the tasks.
-        max_episode_steps=1000,
+        max_episode_steps=_max_episode_steps,
         kwargs={"task": _task},
     )
 

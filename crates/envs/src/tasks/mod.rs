@@ -5,12 +5,18 @@ use serde::{Deserialize, Serialize};
 use crate::ConfigError;
 
 pub mod explore_config;
+pub mod jump;
+pub mod jump_config;
+pub mod jump_flight;
+pub mod jump_reward;
 pub mod track;
 pub mod track_config;
 pub mod walk;
 pub mod walk_config;
 
 pub use explore_config::ExploreConfig;
+pub use jump::Jump;
+pub use jump_config::JumpConfig;
 pub use track::Track;
 pub use track_config::TrackConfig;
 pub use walk::Walk;
@@ -24,6 +30,8 @@ pub enum TaskConfig {
     Walk(WalkConfig),
     /// Following a path on the ground.
     Track(TrackConfig),
+    /// A jump to a target, once, from standing.
+    Jump(JumpConfig),
     /// A residual on a frozen policy of `walk`, rewarded for the uncertainty of the actuator networks.
     Explore(ExploreConfig),
     /// Counts steps without physics, to verify and measure the transport. It has no settings.
@@ -38,13 +46,14 @@ impl Default for TaskConfig {
 
 impl TaskConfig {
     /// Names of all tasks.
-    pub const NAMES: [&str; 4] = ["walk", "track", "explore", "counter"];
+    pub const NAMES: [&str; 5] = ["walk", "track", "jump", "explore", "counter"];
 
     /// Returns the task of this name with default settings. Returns `None` if there is no such task.
     pub fn named(name: &str) -> Option<Self> {
         match name {
             "walk" => Some(Self::default()),
             "track" => Some(Self::Track(TrackConfig::default())),
+            "jump" => Some(Self::Jump(JumpConfig::default())),
             "explore" => Some(Self::Explore(ExploreConfig::default())),
             "counter" => Some(Self::Counter),
             _ => None,
@@ -56,6 +65,7 @@ impl TaskConfig {
         match self {
             Self::Walk(_) => "walk",
             Self::Track(_) => "track",
+            Self::Jump(_) => "jump",
             Self::Explore(_) => "explore",
             Self::Counter => "counter",
         }
@@ -66,6 +76,7 @@ impl TaskConfig {
         match self {
             Self::Walk(config) => config.check(),
             Self::Track(config) => config.check(),
+            Self::Jump(config) => config.check(),
             Self::Explore(config) => config.check(),
             Self::Counter => Ok(()),
         }
@@ -87,6 +98,7 @@ impl TaskConfig {
         match self {
             Self::Walk(config) => ("task.reward.epistemic_uncertainty", config.reward.epistemic_uncertainty),
             Self::Track(config) => ("task.walk.reward.epistemic_uncertainty", config.walk.reward.epistemic_uncertainty),
+            Self::Jump(config) => ("task.walk.reward.epistemic_uncertainty", config.walk.reward.epistemic_uncertainty),
             Self::Explore(config) => ("task.uncertainty_weight", config.uncertainty_weight),
             Self::Counter => ("task", 0.0),
         }
@@ -102,6 +114,7 @@ impl TryFrom<toml::Table> for TaskConfig {
         match name.as_str() {
             Some("walk") => table.try_into().map(Self::Walk).map_err(text),
             Some("track") => table.try_into().map(Self::Track).map_err(text),
+            Some("jump") => table.try_into().map(Self::Jump).map_err(text),
             Some("explore") => table.try_into().map(Self::Explore).map_err(text),
             Some("counter") if table.is_empty() => Ok(Self::Counter),
             Some("counter") => Err("the task `counter` has no settings besides `name`".to_owned()),
@@ -142,7 +155,7 @@ mod tests {
             in `reward`
         "#]].assert_eq(&error("[reward]\ntorques = -1.0"));
         expect![[r#"
-            `name` = "fly" is not a task; possible: walk, track, explore, counter
+            `name` = "fly" is not a task; possible: walk, track, jump, explore, counter
         "#]]
         .assert_eq(&error("name = \"fly\""));
         expect![[r#"
@@ -153,7 +166,7 @@ mod tests {
 
     #[test]
     fn defaults_are_valid() {
-        for name in ["walk", "track", "counter"] {
+        for name in ["walk", "track", "jump", "counter"] {
             assert_eq!(TaskConfig::named(name).expect("a task").check(), Ok(()), "{name}");
         }
         let explore = ExploreConfig::default();

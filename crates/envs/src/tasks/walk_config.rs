@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::config::{ConfigError, Range, check_range, check_value};
-use crate::reward::reward_weights;
+use crate::reward::{self as terms, reward_weights};
 
 /// The `[task]` table of `walk`: velocity commands, rewards, termination.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

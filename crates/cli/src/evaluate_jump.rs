@@ -1,0 +1,274 @@
+//! Evaluation of a policy of the task `jump`: where the robots land.
+
+use std::fmt::Write;
+
+use glam::{Quat, Vec3};
+use serde::Serialize;
+use twinstep_envs::{GroundPose, JumpConfig, WalkConfig};
+use twinstep_model::{EnvError, PerLeg, ResetRequest, RobotModel, Scene, VecEnv};
+use twinstep_policy::{Policy, PolicyRunner};
+
+use crate::evaluate_tracking::ground_pose;
+
+/// Simulated time of a jump with the recovery after it [s].
+pub const JUMP_S: f64 = 3.0;
+/// Normal force above which a foot touches the ground [N].
+const CONTACT_FORCE_THRESHOLD: f32 = 1.0;
+/// Time without contact of any foot after which a robot is in flight [s].
+const MIN_AIR_TIME: f64 = 0.06;
+/// Acceleration of gravity [m/s²].
+const GRAVITY: f32 = 9.81;
+/// Distance from the target within which a landing is a success [m].
+const SUCCESS_DISTANCE: f64 = 0.05;
+
+/// Landings under a condition.
+#[derive(Serialize)]
+pub struct JumpRow {
+    /// Conditions of the robots.
+    pub condition: &'static str,
+    /// Physics engine.
+    pub engine: twinstep_sim::Engine,
+    /// Landings by target.
+    pub targets: Vec<Landings>,
+}
+
+/// Landings of all robots for one target.
+#[derive(Debug, Serialize)]
+pub struct Landings {
+    /// The target relative to the start: forward [m], left [m], yaw [rad].
+    pub target: [f32; 3],
+    /// Share of the robots that jumped and landed.
+    pub landed: f64,
+    /// Share of the robots that did not fall.
+    pub up: f64,
+    /// L_jump: mean of |x_land − x_target| of those that landed (U2E, eq. 16) [m].
+    pub l_jump: f64,
+    /// Mean of x_land − x_target [m].
+    pub mean_error: f64,
+    /// Mean distance of the landing from the target [m].
+    pub distance: f64,
+    /// Mean angle between the landing and the target [rad].
+    pub yaw_error: f64,
+    /// Share of the robots that landed within 5 cm of the target.
+    pub within_5_cm: f64,
+    /// Mean of the time in flight [s].
+    pub flight_s: f64,
+    /// Mean of the highest clearance of the lowest foot [m].
+    pub clearance: f64,
+}
+
+/// Returns the settings of the task at both ends and in the middle of the ranges of its targets. Episodes end by falls
+/// only.
+pub fn tasks(trained: &JumpConfig) -> [JumpConfig; 3] {
+    [0.0, 0.5, 1.0].map(|share| {
+        let at = |[low, high]: [f32; 2]| [low + share * (high - low); 2];
+        JumpConfig {
+            target_x_m: at(trained.target_x_m),
+            target_y_m: at(trained.target_y_m),
+            target_yaw_rad: at(trained.target_yaw_rad),
+            phase_s: trained.phase_s,
+            walk: WalkConfig { max_episode_s: 1e6, ..JumpConfig::default().walk },
+            ..JumpConfig::default()
+        }
+    })
+}
+
+/// Lets all robots of `env` jump once with the mean action of `policy`, and measures where they land.
+///
+/// The landing is the pose of the base at the first contact of a foot after all feet were off the ground for at least 60
+/// ms, from the drawn poses: it is independent of the task's own. Robots start at the origin. `proceed` is called after
+/// each step; the evaluation stops if it returns false.
+pub fn evaluate(
+    policy: &Policy,
+    env: &mut dyn VecEnv,
+    robot: &RobotModel,
+    task: &JumpConfig,
+    seed: u64,
+    mut proceed: impl FnMut(f64) -> bool,
+) -> Result<Option<Landings>, EnvError> {
+    let spec = env.spec().clone();
+    let num_envs = env.num_envs();
+    let mut runner = PolicyRunner::new(policy);
+    let mut obs = env.reset(&ResetRequest::seeded(seed, num_envs))?.to_vec();
+    let mut actions = vec![0.0; num_envs * spec.action_len()];
+    let mut jumpers = vec![Jumper::default(); num_envs];
+    let steps = (JUMP_S / spec.policy_dt).round() as usize;
+    for step in 0..steps {
+        runner.run(&obs, &mut actions);
+        let batch = env.step(&actions)?;
+        for (index, jumper) in jumpers.iter_mut().enumerate() {
+            jumper.has_fallen |= batch.done(index);
+        }
+        obs.copy_from_slice(&batch.obs);
+        for (index, jumper) in jumpers.iter_mut().enumerate().filter(|(_, jumper)| !jumper.has_fallen) {
+            jumper.add(&env.scene(index)?, robot, spec.policy_dt as f32);
+        }
+        if !proceed((step + 1) as f64 / steps as f64) {
+            return Ok(None);
+        }
+    }
+    let target = [task.target_x_m[0], task.target_y_m[0], task.target_yaw_rad[0]];
+    Ok(Some(landings(target, &jumpers)))
+}
+
+/// A robot between start and landing.
+#[derive(Clone, Debug, Default)]
+struct Jumper {
+    has_fallen: bool,
+    /// True once a foot has touched the ground: the drop at the start is no jump.
+    has_stood: bool,
+    /// The last samples without contact, the newest last; the time in the air is their number.
+    in_air: Vec<Sample>,
+    landing: Option<Landing>,
+}
+
+/// Landing of a robot, and the flight before it.
+#[derive(Clone, Copy, Debug)]
+struct Landing {
+    pose: GroundPose,
+    /// Time in flight [s].
+    flight_s: f32,
+    /// Highest clearance of the lowest foot [m].
+    clearance: f32,
+}
+
+/// Base and feet of a robot after a policy step.
+#[derive(Clone, Copy, Debug)]
+struct Sample {
+    base: GroundPose,
+    /// Distance of each foot from the ground [m].
+    clearance: PerLeg,
+}
+
+impl Jumper {
+    fn add(&mut self, scene: &Scene, robot: &RobotModel, dt: f32) {
+        if self.landing.is_some() {
+            return;
+        }
+        let touches = scene.foot_force.is_none_or(|force| force.iter().any(|force| *force > CONTACT_FORCE_THRESHOLD));
+        if !touches {
+            if self.has_stood {
+                self.in_air.push(sample(scene, robot));
+            }
+            return;
+        }
+        self.has_stood = true;
+        let air_time = self.in_air.len() as f32 * dt;
+        if let [.., before, last] = &self.in_air[..]
+            && f64::from(air_time) > MIN_AIR_TIME - 1e-4
+        {
+            let lowest = |sample: &Sample| sample.clearance.iter().copied().fold(f32::INFINITY, f32::min);
+            let clearance = self.in_air.iter().map(lowest).fold(0.0, f32::max);
+            self.landing = Some(Landing { pose: touchdown(before, last, dt), flight_s: air_time, clearance });
+        }
+        self.in_air.clear();
+    }
+}
+
+/// Returns the pose of the base at the first contact after two samples in flight, `dt` [s] apart.
+fn touchdown(before: &Sample, last: &Sample, dt: f32) -> GroundPose {
+    let time_to_ground = |leg: usize| {
+        let velocity = (last.clearance[leg] - before.clearance[leg]) / dt - 0.5 * GRAVITY * dt;
+        let fall = velocity * velocity + 2.0 * GRAVITY * last.clearance[leg].max(0.0);
+        ((velocity + fall.sqrt()) / GRAVITY).clamp(0.0, dt)
+    };
+    let share = (0..4).map(time_to_ground).fold(dt, f32::min) / dt;
+    let [_, _, turned] = last.base.relative_to(before.base);
+    GroundPose {
+        x: last.base.x + share * (last.base.x - before.base.x),
+        y: last.base.y + share * (last.base.y - before.base.y),
+        yaw: last.base.yaw + share * turned,
+    }
+}
+
+fn sample(scene: &Scene, robot: &RobotModel) -> Sample {
+    let clearance = std::array::from_fn(|leg| {
+        let [x, y, z, qw, qx, qy, qz] = scene.pose[3 * leg + 3];
+        let calf = Quat::from_xyzw(qx, qy, qz, qw);
+        let foot = Vec3::new(x, y, z) + calf * robot.shapes.foot_centre.as_vec3();
+        foot.z - robot.shapes.foot_radius as f32 - scene.ground.height(foot.x, foot.y)
+    });
+    Sample { base: ground_pose(scene), clearance }
+}
+
+fn landings(target: [f32; 3], jumpers: &[Jumper]) -> Landings {
+    let goal = GroundPose { x: target[0], y: target[1], yaw: target[2] };
+    let landed: Vec<_> = jumpers.iter().filter_map(|jumper| jumper.landing).collect();
+    let share = |count: usize| count as f64 / jumpers.len() as f64;
+    let mean = |value: &dyn Fn(&Landing) -> f32| {
+        landed.iter().map(|landing| f64::from(value(landing))).sum::<f64>() / landed.len() as f64
+    };
+    let distance = |pose: &GroundPose| (pose.x - goal.x).hypot(pose.y - goal.y);
+    let is_near = |pose: &GroundPose| f64::from(distance(pose)) < SUCCESS_DISTANCE;
+    Landings {
+        target,
+        landed: share(landed.len()),
+        up: share(jumpers.iter().filter(|jumper| !jumper.has_fallen).count()),
+        l_jump: mean(&|landing| (landing.pose.x - goal.x).abs()),
+        mean_error: mean(&|landing| landing.pose.x - goal.x),
+        distance: mean(&|landing| distance(&landing.pose)),
+        yaw_error: mean(&|landing| landing.pose.relative_to(goal)[2].abs()),
+        within_5_cm: share(landed.iter().filter(|landing| is_near(&landing.pose)).count()),
+        flight_s: mean(&|landing| landing.flight_s),
+        clearance: mean(&|landing| landing.clearance),
+    }
+}
+
+/// Returns the landings as a table.
+pub fn table(robots: u32, rows: &[JumpRow]) -> String {
+    let mut text = format!(
+        "{robots} robots, one jump from standing, {JUMP_S} s. L_jump: mean |x_land - x_target|\n\n\
+         condition  engine   target [m, m, rad]  landed  up       L_jump    mean error  yaw error  flight  clearance\n"
+    );
+    for JumpRow { condition, engine, targets } in rows {
+        let engine = format!("{engine:?}").to_lowercase();
+        for landings in targets {
+            let [x, y, yaw] = landings.target;
+            let _ = writeln!(
+                text,
+                "{condition:10} {engine:8} {x:.2}, {y:.2}, {yaw:.2}    {:5.1} %  {:5.1} %  {:6.3} m  {:+7.3} m   {:.3} \
+                 rad  {:.2} s  {:4.1} cm",
+                100.0 * landings.landed,
+                100.0 * landings.up,
+                landings.l_jump,
+                landings.mean_error,
+                landings.yaw_error,
+                landings.flight_s,
+                100.0 * landings.clearance,
+            );
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn touchdown_between_two_steps_is_where_the_first_foot_falls_to_the_ground() {
+        // Forward at 1.5 m/s, falling at 1 m/s in the middle between the samples; the lowest foot is 15 mm high.
+        let sample = |time: f32, height: f32| Sample {
+            base: GroundPose { x: 1.5 * time, y: 0.0, yaw: 2.0 * time },
+            clearance: [height, height + 0.02, height + 0.05, height + 0.01],
+        };
+        let landing = touchdown(&sample(0.0, 0.035), &sample(0.02, 0.015), 0.02);
+        // 0.015 = 1.0981 t + 4.905 t², so t = 0.01289 s.
+        assert!((landing.x - 1.5 * 0.03289).abs() < 1e-4 && (landing.yaw - 2.0 * 0.03289).abs() < 1e-4, "{landing:?}");
+    }
+
+    #[test]
+    fn robots_that_never_jump_or_fall_are_counted() {
+        let pose = GroundPose { x: 0.55, y: 0.0, yaw: 0.1 };
+        let landing = |pose| Some(Landing { pose, flight_s: 0.3, clearance: 0.1 });
+        let jumpers = [
+            Jumper { landing: landing(pose), ..Jumper::default() },
+            Jumper::default(),
+            Jumper { has_fallen: true, ..Jumper::default() },
+            Jumper { landing: landing(GroundPose { x: 0.61, ..pose }), ..Jumper::default() },
+        ];
+        let landings = landings([0.6, 0.0, 0.0], &jumpers);
+        assert_eq!((landings.landed, landings.up, landings.within_5_cm), (0.5, 0.75, 0.25));
+        assert!((landings.l_jump - 0.03).abs() < 1e-6 && (landings.mean_error + 0.02).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,194 @@
+//! `twinstep spi-active`: collect, identify, design, collect, identify, report, as one resumable command.
+
+use std::path::{Path, PathBuf};
+
+use crate::exit::{CommandResult, Failure, Signals, other};
+use crate::spi_active_config::{Method, SpiActiveConfig};
+use crate::spi_active_report::{self, RobotTime, StageResult};
+use crate::{excite, identify, random_commands, run};
+
+/// Identify a robot with the two stages of SPI-Active: ordinary commands first, then designed ones.
+///
+/// The policy walks the robot at the endpoint, simulated or real. The folder of CONFIG, without its extension, receives:
+///
+///   1-random    random velocity commands, their log, and the model that is identified from it
+///   2-active    commands designed with that model, their log, and the model that is identified from both logs
+///   3-active    and so on, as often as `rounds` says
+///   held-out    random commands whose log is not used for identification: the models are compared on it
+///   report.md   parameters with intervals, errors on the held-out log, robot time and falls
+///
+/// The same command continues after Ctrl-C or a crash: what a stage has completed is kept, and a log that was interrupted
+/// is recorded again.
+///
+/// CONFIG (TOML); `policy` and `unknowns` are required, the others have these defaults:
+///
+///   policy = "data/policies/walk.safetensors"
+///   unknowns = ["payload@base", "coulomb_friction@calf"]   as of `twinstep identify --effects`
+///   endpoint = "tcp/127.0.0.1:7447"
+///   method = "d-optimal"      trace, d-optimal, or random: the later stages are like the first (SPI-Random)
+///   rounds = 1                number of stages after the first
+///   seconds = 25.0            duration of each log
+///   segment_s = 5.0           duration of a command
+///   candidates = 1000         command sequences that a design simulates
+///   room_m = 3.0              largest distance from the start
+///   fast = false              step a simulated robot as fast as it answers
+///   seed = 1
+///   model = "start.toml"      model to start from; none: the ideal Go2
+///
+/// Example: `twinstep serve --envs 1 --model hidden.toml` and, in another terminal, `twinstep spi-active spi.toml`
+#[derive(clap::Args)]
+#[allow(clippy::doc_link_with_quotes, reason = "it is TOML")]
+pub struct Args {
+    /// Config file (TOML).
+    config: PathBuf,
+}
+
+/// Seed of the held-out commands minus that of the config.
+const HELD_OUT_SEED: u64 = 1_000_000;
+
+/// Runs the stages that are not complete.
+pub fn run(args: &Args) -> CommandResult {
+    let signals = Signals::listen()?;
+    let (config, text) = SpiActiveConfig::load(&args.config)?;
+    let out = args.config.with_extension("");
+    if out == args.config {
+        let path = out.display();
+        return Err(Failure::Input(miette::miette!("`{path}`: the config file needs an extension, such as .toml")));
+    }
+    open_folder(&out, &text)?;
+    let result = stages(&config, &out, &signals);
+    if matches!(result, Err(Failure::Interrupted)) {
+        eprintln!("interrupted; the same command continues");
+    }
+    result
+}
+
+fn stages(config: &SpiActiveConfig, out: &Path, signals: &Signals) -> CommandResult {
+    let mut logs = Vec::new();
+    let mut results = Vec::new();
+    let mut model = config.model.clone();
+    for round in 0..=config.rounds {
+        let is_random = round == 0 || config.method == Method::Random;
+        let stage = Stage::new(out, &format!("{}-{}", round + 1, if is_random { "random" } else { "active" }))?;
+        eprintln!("\n{}: commands, log, model", stage.folder.display());
+        let seed = config.seed + round as u64;
+        stage.commands(|path| match config.method.criterion().filter(|_| !is_random) {
+            Some(criterion) => {
+                let folder = path.parent().expect("a folder");
+                excite::write_design(&config.excitation(criterion, model.as_deref(), seed, folder), signals)
+            }
+            None => random_commands::write(config, model.as_deref(), seed, path),
+        })?;
+        let robot_time = stage.collect(config, signals)?;
+        logs.push(stage.log());
+        stage.identify(config, &logs, signals)?;
+        model = Some(stage.model());
+        results.push(StageResult { name: stage.name.clone(), robot_time, model: stage.model() });
+    }
+    let held_out = Stage::new(out, "held-out")?;
+    eprintln!("\n{}: commands, log", held_out.folder.display());
+    held_out
+        .commands(|path| random_commands::write(config, config.model.as_deref(), config.seed + HELD_OUT_SEED, path))?;
+    let robot_time = held_out.collect(config, signals)?;
+    let report = spi_active_report::report(config, &results, &held_out.log(), robot_time)?;
+    write(&out.join("report.md"), &report)?;
+    print!("{report}");
+    println!("\nwritten to {}", out.join("report.md").display());
+    Ok(())
+}
+
+/// Creates the folder of the results, or fails if it has those of other settings.
+fn open_folder(out: &Path, text: &str) -> CommandResult {
+    std::fs::create_dir_all(out).map_err(|cause| unwritable(out, &cause))?;
+    let copy = out.join("config.toml");
+    match std::fs::read_to_string(&copy) {
+        Ok(earlier) if earlier != text => Err(Failure::Input(miette::miette!(
+            "{} has results of other settings\n  restore them (config.toml in the folder), or rename the config file",
+            out.display()
+        ))),
+        Ok(_) => Ok(()),
+        Err(_) => write(&copy, text),
+    }
+}
+
+/// A stage and its files. A file exists only when it is complete.
+struct Stage {
+    name: String,
+    folder: PathBuf,
+}
+
+impl Stage {
+    fn new(out: &Path, name: &str) -> Result<Self, Failure> {
+        let folder = out.join(name);
+        std::fs::create_dir_all(&folder).map_err(|cause| unwritable(&folder, &cause))?;
+        Ok(Self { name: name.to_owned(), folder })
+    }
+
+    fn log(&self) -> PathBuf {
+        self.folder.join("log")
+    }
+
+    fn model(&self) -> PathBuf {
+        self.folder.join("model.toml")
+    }
+
+    /// Chooses the commands with `choose`, which writes them to a path, unless they are there.
+    fn commands(&self, choose: impl FnOnce(&Path) -> CommandResult) -> CommandResult {
+        let path = self.folder.join("commands.csv");
+        if path.exists() {
+            return Ok(());
+        }
+        let partial = self.folder.join("design.partial");
+        std::fs::create_dir_all(&partial).map_err(|cause| unwritable(&partial, &cause))?;
+        choose(&partial.join("commands.csv"))?;
+        for name in ["design.json", "commands.csv"] {
+            let (from, to) = (partial.join(name), self.folder.join(name));
+            if from.exists() {
+                std::fs::rename(&from, &to).map_err(|cause| unwritable(&to, &cause))?;
+            }
+        }
+        std::fs::remove_dir_all(&partial).map_err(|cause| unwritable(&partial, &cause))
+    }
+
+    /// Records the log, unless it is there.
+    fn collect(&self, config: &SpiActiveConfig, signals: &Signals) -> Result<RobotTime, Failure> {
+        let (log, summary) = (self.log(), self.folder.join("run.json"));
+        if log.exists() && summary.exists() {
+            return read_json(&summary);
+        }
+        let partial = self.folder.join("log.partial");
+        for interrupted in [&partial, &log].into_iter().filter(|path| path.exists()) {
+            std::fs::remove_dir_all(interrupted).map_err(|cause| unwritable(interrupted, &cause))?;
+        }
+        let recorded = run::record(&config.recording(&self.folder.join("commands.csv"), &partial), signals)?.summary;
+        let found = RobotTime { seconds: recorded.seconds, falls: recorded.falls };
+        write(&summary, &serde_json::to_string_pretty(&found).map_err(other)?)?;
+        std::fs::rename(&partial, &log).map_err(|cause| unwritable(&log, &cause))?;
+        Ok(found)
+    }
+
+    /// Identifies the model from `logs`, unless it is there.
+    fn identify(&self, config: &SpiActiveConfig, logs: &[PathBuf], signals: &Signals) -> CommandResult {
+        let (model, partial) = (self.model(), self.folder.join("model.partial.toml"));
+        if model.exists() {
+            return Ok(());
+        }
+        let search = identify::search_file(&partial);
+        identify::write_model(&config.identification(logs, &partial, search.exists()), signals)?;
+        std::fs::rename(&partial, &model).map_err(|cause| unwritable(&model, &cause))
+    }
+}
+
+fn read_json(path: &Path) -> Result<RobotTime, Failure> {
+    let wrong = |cause: String| Failure::Input(miette::miette!("cannot read {}: {cause}", path.display()));
+    let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+    serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))
+}
+
+fn write(path: &Path, text: &str) -> CommandResult {
+    std::fs::write(path, text).map_err(|cause| unwritable(path, &cause))
+}
+
+fn unwritable(path: &Path, cause: &std::io::Error) -> Failure {
+    Failure::Input(miette::miette!("cannot write {}: {cause}", path.display()))
+}

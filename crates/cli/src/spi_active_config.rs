@@ -1,0 +1,202 @@
+//! Config file of `twinstep spi-active`, and the arguments of the commands of its stages.
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+use twinstep_excite::{Criterion, Limits};
+use twinstep_identify::EffectAtScope;
+
+use crate::exit::Failure;
+use crate::{excite, identify, run};
+
+/// How the commands after the first stage are chosen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Method {
+    /// Largest trace of the Fisher information (SPI-Active).
+    Trace,
+    /// Largest gain in information.
+    DOptimal,
+    /// Random, as in the first stage (SPI-Random).
+    Random,
+}
+
+impl Method {
+    /// Returns what a design maximises; `None` for random commands.
+    pub fn criterion(self) -> Option<Criterion> {
+        match self {
+            Self::Trace => Some(Criterion::Trace),
+            Self::DOptimal => Some(Criterion::DOptimal),
+            Self::Random => None,
+        }
+    }
+}
+
+/// Settings of `twinstep spi-active`.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SpiActiveConfig {
+    /// Policy of `walk`.
+    pub policy: PathBuf,
+    /// Effects with scopes whose parameters are sought.
+    unknowns: Vec<String>,
+    /// Zenoh endpoint of the robot.
+    #[serde(default = "default_endpoint")]
+    endpoint: String,
+    /// How the commands after the first stage are chosen.
+    #[serde(default = "default_method")]
+    pub method: Method,
+    /// Number of stages after the first.
+    #[serde(default = "default_rounds")]
+    pub rounds: usize,
+    /// Duration of each log [s].
+    #[serde(default = "default_seconds")]
+    pub seconds: f64,
+    /// Duration of a command [s].
+    #[serde(default = "default_segment")]
+    pub segment_s: f64,
+    /// Command sequences that a design simulates.
+    #[serde(default = "default_candidates")]
+    candidates: u32,
+    /// Largest distance from the start [m].
+    #[serde(default = "default_room")]
+    room_m: f64,
+    /// True to step a simulated robot as fast as it answers.
+    #[serde(default)]
+    fast: bool,
+    /// Seed of commands, searches and the robot's random numbers.
+    #[serde(default = "default_seed")]
+    pub seed: u64,
+    /// Model to start from. Default: the ideal Go2.
+    pub model: Option<PathBuf>,
+}
+
+fn default_endpoint() -> String {
+    "tcp/127.0.0.1:7447".to_owned()
+}
+
+const fn default_method() -> Method {
+    Method::DOptimal
+}
+
+const fn default_rounds() -> usize {
+    1
+}
+
+const fn default_seconds() -> f64 {
+    25.0
+}
+
+const fn default_segment() -> f64 {
+    5.0
+}
+
+const fn default_candidates() -> u32 {
+    1000
+}
+
+const fn default_room() -> f64 {
+    3.0
+}
+
+const fn default_seed() -> u64 {
+    1
+}
+
+impl SpiActiveConfig {
+    /// Reads and checks a config file. Returns it with its text.
+    pub fn load(path: &Path) -> Result<(Self, String), Failure> {
+        let wrong = |cause: String| Failure::Input(miette::miette!("{}: {cause}", path.display()));
+        let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+        let config: Self = toml::from_str(&text).map_err(|error| wrong(error.to_string()))?;
+        config.check().map_err(wrong)?;
+        Ok((config, text))
+    }
+
+    fn check(&self) -> Result<(), String> {
+        if self.unknowns.is_empty() {
+            return Err("`unknowns` is empty; name at least one effect, such as \"payload@base\"".to_owned());
+        }
+        for unknown in &self.unknowns {
+            unknown.parse::<EffectAtScope>().map_err(|error| format!("`unknowns`: {error}"))?;
+        }
+        let within = |name: &str, value: f64, low: f64, high: f64| {
+            let allowed = (low..=high).contains(&value);
+            if allowed { Ok(()) } else { Err(format!("`{name}` = {value} is outside {low} to {high}")) }
+        };
+        within("rounds", self.rounds as f64, 0.0, 100.0)?;
+        within("seconds", self.seconds, 1.0, 600.0)?;
+        within("segment_s", self.segment_s, 0.1, self.seconds)?;
+        within("candidates", f64::from(self.candidates), 1.0, 1e6)?;
+        within("room_m", self.room_m, 0.1, 1000.0)?;
+        let segments = self.seconds / self.segment_s;
+        if (segments - segments.round()).abs() > 1e-6 {
+            let (seconds, segment_s) = (self.seconds, self.segment_s);
+            return Err(format!("`seconds` = {seconds} is not a multiple of `segment_s` = {segment_s}"));
+        }
+        Ok(())
+    }
+
+    /// Returns the effects that are sought.
+    pub fn unknowns(&self) -> Vec<EffectAtScope> {
+        self.unknowns.iter().map(|text| text.parse().expect("the config was checked")).collect()
+    }
+
+    /// Returns the limits of a run.
+    pub fn limits(&self) -> Limits {
+        Limits { room_m: self.room_m, ..excite::DEFAULT_LIMITS }
+    }
+
+    /// Returns the arguments of `twinstep excite`, which writes the folder `out`.
+    pub fn excitation(&self, criterion: Criterion, model: Option<&Path>, seed: u64, out: &Path) -> excite::Args {
+        let limits = self.limits();
+        excite::Args {
+            policy: self.policy.clone(),
+            unknowns: self.unknowns(),
+            model: model.map(Path::to_owned),
+            criterion,
+            of_interest: Vec::new(),
+            seconds: self.seconds,
+            segment_s: self.segment_s,
+            candidates: self.candidates,
+            room: limits.room_m,
+            max_saturated: limits.max_saturated,
+            max_rms_torque: limits.max_rms_torque_nm,
+            physics_hz: None,
+            seed,
+            out: out.to_owned(),
+        }
+    }
+
+    /// Returns the arguments of `twinstep run`, which follows the commands in a file and records the folder `log`.
+    pub fn recording(&self, commands: &Path, log: &Path) -> run::Args {
+        run::Args {
+            policy: self.policy.clone(),
+            mapping: None,
+            endpoint: self.endpoint.clone(),
+            robot: None,
+            zenoh: None,
+            log: Some(log.to_owned()),
+            velocity: None,
+            commands: Some(commands.to_owned()),
+            keyboard: false,
+            gamepad: None,
+            seconds: Some(self.seconds),
+            fast: self.fast,
+            seed: self.seed,
+            json: false,
+        }
+    }
+
+    /// Returns the arguments of `twinstep identify`, which writes the model file `out`.
+    pub fn identification(&self, logs: &[PathBuf], out: &Path, resume: bool) -> identify::Args {
+        identify::Args {
+            logs: logs.to_vec(),
+            model: self.model.clone(),
+            effects: self.unknowns(),
+            seed: self.seed,
+            resume,
+            ..identify::Args::new(out)
+        }
+    }
+}

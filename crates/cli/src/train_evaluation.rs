@@ -1,0 +1,102 @@
+//! Evaluation of a policy at the end of its training.
+
+use twinstep_envs::{JumpConfig, TaskConfig};
+use twinstep_learning::{Evaluation, EvaluationError, EvaluationPlan, evaluate};
+use twinstep_policy::Policy;
+use twinstep_sim::{Engine, SimConfig};
+
+use crate::evaluate_jump::{self, JumpRow};
+use crate::exit::{Failure, Signals, other};
+use crate::train_config::TrainConfig;
+use crate::train_endpoints::remote_env;
+
+/// Robots, simulated time [s] and seed of the evaluation.
+const ROBOTS: usize = 256;
+const SECONDS: f64 = 20.0;
+const SEED: u64 = 1_000_000;
+
+/// Evaluates `policy`, which was trained with `config` on the robots of these servers, or in this process if there are
+/// none. Returns the evaluation as JSON and as a table.
+///
+/// The robots are fresh ones of the server, or of the training's model with default commands and physics. Jumps are
+/// evaluated in this process only.
+pub fn evaluate_policy(
+    policy: &Policy,
+    config: &TrainConfig,
+    endpoints: &[String],
+    signals: &Signals,
+) -> Result<(String, String), Failure> {
+    let json = |evaluation: serde_json::Result<String>| evaluation.expect("an evaluation is plain data");
+    if let TaskConfig::Jump(task) = &config.task {
+        let targets = jumps(policy, config, task, signals)?;
+        let rows = [JumpRow { condition: "nominal", engine: Engine::Batch, targets }];
+        let text = evaluate_jump::table(ROBOTS as u32, &rows);
+        return Ok((json(serde_json::to_string_pretty(&rows[0].targets)), text));
+    }
+    let evaluation = walking(policy, config, endpoints, signals)?;
+    Ok((json(serde_json::to_string_pretty(&evaluation)), evaluation_text(&evaluation)))
+}
+
+fn walking(
+    policy: &Policy,
+    config: &TrainConfig,
+    endpoints: &[String],
+    signals: &Signals,
+) -> Result<Evaluation, Failure> {
+    let fresh = fresh(config, config.task.with_default_settings());
+    let robot = fresh.robot()?;
+    let plan = EvaluationPlan { robot: &robot, seconds: SECONDS, seed: SEED };
+    let proceed = |_: f64| signals.check().is_ok();
+    let failure = |error| match error {
+        EvaluationError::Stopped => Failure::Interrupted,
+        _ => other(error),
+    };
+    if endpoints.is_empty() {
+        let mut env = fresh.envs(ROBOTS, 1, 0)?.remove(0);
+        return evaluate(policy, env.as_mut(), plan, proceed).map_err(failure);
+    }
+    let mut env = remote_env(endpoints, ROBOTS)?;
+    let evaluation = evaluate(policy, &mut env, plan, proceed).map_err(failure)?;
+    env.close().map_err(other)?;
+    Ok(evaluation)
+}
+
+fn jumps(
+    policy: &Policy,
+    config: &TrainConfig,
+    trained: &JumpConfig,
+    signals: &Signals,
+) -> Result<Vec<evaluate_jump::Landings>, Failure> {
+    let mut targets = Vec::new();
+    for task in evaluate_jump::tasks(trained) {
+        let fresh = fresh(config, TaskConfig::Jump(task.clone()));
+        let mut env = fresh.envs(ROBOTS, 1, 0)?.remove(0);
+        let proceed = |_: f64| signals.check().is_ok();
+        let landings = evaluate_jump::evaluate(policy, env.as_mut(), &fresh.robot()?, &task, SEED, proceed);
+        targets.push(landings.map_err(other)?.ok_or(Failure::Interrupted)?);
+    }
+    Ok(targets)
+}
+
+/// Returns the training's robot with default physics.
+fn fresh(config: &TrainConfig, task: TaskConfig) -> TrainConfig {
+    TrainConfig { model: config.model.clone(), task, sim: SimConfig::default(), ..TrainConfig::default() }
+}
+
+/// Returns the table of an evaluation.
+fn evaluation_text(evaluation: &Evaluation) -> String {
+    let Evaluation { robots, seconds, up, velocity_rms, settled_velocity_rms, .. } = evaluation;
+    let Evaluation { yaw_rate_rms, settled_yaw_rate_rms, swing_height, duty_factor, .. } = evaluation;
+    format!(
+        "{robots} fresh robots, {seconds:.0} s, mean action:\n\
+         \x20 still up                 {:.1} %\n\
+         \x20 velocity error, RMS      {velocity_rms:.3} m/s   ({settled_velocity_rms:.3} from 1 s after each new command)\n\
+         \x20 yaw rate error, RMS      {yaw_rate_rms:.3} rad/s ({settled_yaw_rate_rms:.3})\n\
+         \x20 swing height of the sole {:.1} cm, duty factor {duty_factor:.2}, {:.1} swings/s per foot\n\
+         \x20 speed of feet on ground  {:.3} m/s\n",
+        100.0 * up,
+        100.0 * swing_height,
+        evaluation.swings_per_second,
+        evaluation.slip_speed,
+    )
+}

@@ -1,0 +1,138 @@
+//! Reward terms of the task `jump`, one function each: U2E, Table II, and those that densify the reward.
+
+use twinstep_model::{Joint, JointKind, Leg, PerJoint, PerLeg};
+
+use super::jump_flight::Stage;
+
+/// Distance from the target within which a landing is a success [m].
+const SUCCESS_DISTANCE: f32 = 0.05;
+/// Yaw error within which a landing is a success [rad].
+const SUCCESS_YAW: f32 = 0.2;
+/// Width of the terms of landing and its prediction [m].
+const LANDING_WIDTH: f32 = 0.15;
+/// Width of the term of the prediction before the take-off [m].
+const TAKEOFF_WIDTH: f32 = 0.5;
+/// Distance that counts like an error of the yaw of 1 rad [m].
+const YAW_WEIGHT: f32 = 0.3;
+
+/// Distance and angle between two poses on the ground.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct LandingError {
+    /// Distance [m].
+    pub distance: f32,
+    /// Angle, without sign [rad].
+    pub yaw: f32,
+}
+
+impl LandingError {
+    fn total(self) -> f32 {
+        self.distance + YAW_WEIGHT * self.yaw
+    }
+}
+
+/// State of one robot after one policy step, from which the terms are computed.
+#[derive(Clone, Copy, Debug)]
+pub struct RewardInput<'a> {
+    /// One period of the policy [s].
+    pub policy_dt: f32,
+    /// Stage of the jump.
+    pub stage: Stage,
+    /// True before the phase has reached the time for the take-off.
+    pub may_take_off: bool,
+    /// True if the robot has landed in this step.
+    pub lands: bool,
+    /// Error of the landing: predicted from the motion until the robot has landed.
+    pub landing_error: LandingError,
+    /// Horizontal velocity of the base minus that of a take-off to the target [m/s].
+    pub takeoff_error_xy: f32,
+    /// Vertical velocity of the base minus that of a take-off to the target [m/s].
+    pub takeoff_error_z: f32,
+    /// Yaw rate of the base minus that of a take-off to the target [rad/s].
+    pub takeoff_error_yaw: f32,
+    /// Height of each foot relative to the base, in the base frame [m].
+    pub foot_z: PerLeg,
+    /// Height of the feet in flight relative to the base [m].
+    pub target_foot_z: f32,
+    /// Joint position [rad].
+    pub q: &'a PerJoint,
+    /// Joint position of the default pose [rad].
+    pub default_pose: &'a PerJoint,
+    /// Horizontal speed of the base [m/s].
+    pub speed: f32,
+}
+
+fn indicator(condition: bool) -> f32 {
+    f32::from(u8::from(condition))
+}
+
+/// Returns `exp(−error / width)` (U2E, Table III).
+fn rho(error: f32, width: f32) -> f32 {
+    (-error / width).exp()
+}
+
+/// Returns `exp(−error / 0.15 m) / policy_dt` in the step of the landing, else 0 [1/s]: the weight is per landing.
+pub fn landing_position(input: &RewardInput<'_>) -> f32 {
+    indicator(input.lands) * rho(input.landing_error.total(), LANDING_WIDTH) / input.policy_dt
+}
+
+/// Returns `1 / policy_dt` in the step of a landing within 5 cm and 0.2 rad of the target, else 0 [1/s].
+pub fn success(input: &RewardInput<'_>) -> f32 {
+    let LandingError { distance, yaw } = input.landing_error;
+    indicator(input.lands && distance < SUCCESS_DISTANCE && yaw < SUCCESS_YAW) / input.policy_dt
+}
+
+/// Returns 1 in flight, else 0.
+pub fn in_air(input: &RewardInput<'_>) -> f32 {
+    indicator(input.stage == Stage::Flight)
+}
+
+/// Returns `exp(−|Δv_xy| / 1 m/s)` before the take-off, else 0.
+pub fn takeoff_velocity_xy(input: &RewardInput<'_>) -> f32 {
+    indicator(input.may_take_off) * rho(input.takeoff_error_xy.abs(), 1.0)
+}
+
+/// Returns `exp(−|Δv_z| / 2.5 m/s)` before the take-off, else 0.
+pub fn takeoff_velocity_z(input: &RewardInput<'_>) -> f32 {
+    indicator(input.may_take_off) * rho(input.takeoff_error_z.abs(), 2.5)
+}
+
+/// Returns `exp(−Σ|z − target| / 0.75 m)` of the feet in flight, else 0.
+pub fn feet_relative_z(input: &RewardInput<'_>) -> f32 {
+    let error = input.foot_z.iter().map(|z| (z - input.target_foot_z).abs()).sum();
+    in_air(input) * rho(error, 0.75)
+}
+
+/// Returns the norm of the difference between the left legs and the mirrored right legs [rad].
+pub fn symmetry(input: &RewardInput<'_>) -> f32 {
+    let q = |leg: Leg, kind: JointKind| input.q[Joint { leg, kind }.index()];
+    let difference = |left: Leg, right: Leg| {
+        let hip = q(left, JointKind::Hip) + q(right, JointKind::Hip);
+        let others = [JointKind::Thigh, JointKind::Calf].map(|kind| q(left, kind) - q(right, kind));
+        hip * hip + others.iter().map(|other| other * other).sum::<f32>()
+    };
+    (difference(Leg::FL, Leg::FR) + difference(Leg::RL, Leg::RR)).sqrt()
+}
+
+/// Returns `exp(−|Δω_z| / 3 rad/s)` before the take-off, else 0.
+pub fn takeoff_yaw_rate(input: &RewardInput<'_>) -> f32 {
+    indicator(input.may_take_off) * rho(input.takeoff_error_yaw.abs(), 3.0)
+}
+
+/// Returns `exp(−error / 0.5 m)` of the predicted landing before the take-off, else 0.
+pub fn takeoff_prediction(input: &RewardInput<'_>) -> f32 {
+    indicator(input.may_take_off) * rho(input.landing_error.total(), TAKEOFF_WIDTH)
+}
+
+/// Returns `exp(−error / 0.15 m)` of the predicted landing in flight and of the actual one after it, else 0.
+///
+/// The landing is predicted as that of a projectile, which rewards every step of the flight for its end.
+pub fn landing_prediction(input: &RewardInput<'_>) -> f32 {
+    indicator(input.stage != Stage::BeforeTakeOff) * rho(input.landing_error.total(), LANDING_WIDTH)
+}
+
+/// Returns `exp(−|q − q_default| − speed / 0.5 m/s)` after the landing times the term of its error, else 0.
+pub fn recovery(input: &RewardInput<'_>) -> f32 {
+    let offset = input.q.iter().zip(input.default_pose).map(|(q, default)| (q - default).powi(2)).sum::<f32>().sqrt();
+    let accuracy = rho(input.landing_error.total(), LANDING_WIDTH);
+    indicator(input.stage == Stage::Landed) * rho(offset + 2.0 * input.speed, 1.0) * accuracy
+}

@@ -1,0 +1,36 @@
+//! Random velocity commands that keep the limits of a run.
+
+use rand::SeedableRng;
+use rand::rngs::StdRng;
+use twinstep_envs::{Task, TaskEnv};
+use twinstep_model::{Simulator, VecEnv};
+use twinstep_policy::Policy;
+
+use crate::sequence::{CommandSequence, VelocityRanges};
+use crate::trial::{Limits, TrialError, simulate};
+
+/// How often every robot of the environment tries a sequence.
+const ATTEMPTS: usize = 16;
+
+/// Returns the first random sequence of `segments` commands with which the robots of `env` keep the limits, or `None`
+/// after 16 attempts with every robot.
+pub fn random_within_limits<B: Simulator, T: Task>(
+    env: &mut TaskEnv<B, T>,
+    policy: &Policy,
+    (segment_s, segments): (f64, usize),
+    ranges: &VelocityRanges,
+    limits: &Limits,
+    seed: u64,
+) -> Result<Option<CommandSequence>, TrialError> {
+    let mut random = StdRng::seed_from_u64(seed);
+    for _ in 0..ATTEMPTS {
+        let draw = |_| CommandSequence::random(segment_s, segments, ranges, &mut random);
+        let sequences: Vec<_> = (0..env.num_envs()).map(draw).collect();
+        let trials = simulate(env, policy, &sequences, seed)?;
+        let keeps = |motion| limits.violation(motion, segment_s * segments as f64).is_none();
+        if let Some(index) = trials.iter().position(|trial| keeps(&trial.motion)) {
+            return Ok(sequences.into_iter().nth(index));
+        }
+    }
+    Ok(None)
+}
