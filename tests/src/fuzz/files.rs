@@ -6,6 +6,7 @@ use std::path::Path;
 use twinstep_effects::{CATALOGUE, Effect, EffectEntry, ModelFile, RobotSampler, Scope, Target};
 use twinstep_ensemble::{ActuatorNetworkRobot, Checkpoint, Ensemble, Inference};
 use twinstep_env_server::{Config, ConfigFileError, SimEnvFactory};
+use twinstep_excite::CommandSequence;
 use twinstep_identify::{EffectAtScope, GlobalSearch};
 use twinstep_logs::{Log, LogError};
 use twinstep_model::{BaseMount, ImportError, ImportNames, Joint, MjcfOptions, go2, import_robot, mjcf, stream};
@@ -32,13 +33,27 @@ pub fn text_examples(format: Format) -> Vec<Vec<u8>> {
         }
         Format::Config => {
             let default = toml::to_string(&Config::default()).expect("a config is plain data");
-            vec![default.into_bytes(), CONFIG.into()]
+            vec![default.into_bytes(), CONFIG.into(), JUMP_CONFIG.into()]
         }
+        Format::Commands => vec![COMMANDS.into()],
         Format::Search => vec![SEARCH.into()],
         Format::Zenoh => examples_in("examples/security", "", ".json5"),
         _ => ARGUMENTS.iter().map(|text| text.as_bytes().to_vec()).collect(),
     }
 }
+
+/// Velocity commands of a run.
+const COMMANDS: &str = "start_s,end_s,vx,vy,wz\n0,5,1,0,-0.5\n5,10,-0.25,0.5,1\n10,12.5,0,0,0\n";
+
+/// Config file of another task.
+const JUMP_CONFIG: &str = r#"
+[task]
+name = "jump"
+target_x_m = [0.2, 0.9]
+target_yaw_rad = [-0.5, 0.5]
+reward.success = 5.0
+walk.reward.action_rate = -0.01
+"#;
 
 /// Config file with the keys that have no default, and rough terrain.
 const CONFIG: &str = r#"
@@ -168,6 +183,11 @@ fn read_text(format: Format, text: &str, folder: &Path) -> Outcome {
             Err(error) => outcome(Err::<(), _>(error), |()| true).max_decoded(),
         },
         Format::Config => read_config(text),
+        Format::Commands => outcome(CommandSequence::parse(text), |commands| {
+            let again = CommandSequence::parse(&commands.to_csv()).expect("a written file can be read");
+            assert!(again == commands, "a written file has the same commands");
+            commands.at(0.5 * commands.duration_s()).iter().all(|velocity| velocity.is_finite())
+        }),
         Format::Search => outcome(serde_json::from_str::<GlobalSearch>(text), |_| true),
         _ => outcome(zenoh::Config::from_json5(text), |_| true),
     }

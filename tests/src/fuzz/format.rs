@@ -89,6 +89,8 @@ pub enum Format {
     Ensemble,
     /// Interrupted training of an ensemble (safetensors).
     Training,
+    /// Velocity commands (CSV).
+    Commands,
     /// Interrupted identification (JSON).
     Search,
     /// Policy (safetensors).
@@ -108,7 +110,7 @@ pub enum Format {
 }
 
 /// Formats of files, with their names.
-const FILES: [(Format, &str); 19] = [
+const FILES: [(Format, &str); 20] = [
     (Format::Model, "model_file"),
     (Format::Urdf, "robot_urdf"),
     (Format::Mjcf, "robot_mjcf"),
@@ -120,6 +122,7 @@ const FILES: [(Format, &str); 19] = [
     (Format::Meta, "log_meta"),
     (Format::Ensemble, "ensemble"),
     (Format::Training, "training"),
+    (Format::Commands, "commands_csv"),
     (Format::Search, "search"),
     (Format::Policy, "policy"),
     (Format::Onnx, "policy_onnx"),
@@ -173,8 +176,8 @@ impl Format {
 
     /// Returns true if changes to words and lines are useful.
     pub fn is_text(self) -> bool {
-        use Format::{Argument, Config, Csv, Mapping, Meta, Mjcf, Model, Search, Urdf, Zenoh};
-        matches!(self, Model | Urdf | Mjcf | Config | Csv | Mapping | Meta | Search | Zenoh | Argument)
+        use Format::{Argument, Commands, Config, Csv, Mapping, Meta, Mjcf, Model, Search, Urdf, Zenoh};
+        matches!(self, Model | Urdf | Mjcf | Config | Csv | Commands | Mapping | Meta | Search | Zenoh | Argument)
     }
 
     /// Returns the maximum memory that reading an input may need.
