@@ -25,10 +25,26 @@ fn write_config(path: &Path, endpoint: &str, more: &str) {
     let policy = root().join("data/policies/walk.safetensors");
     let text = format!(
         "policy = \"{}\"\nendpoint = \"{endpoint}\"\nunknowns = [\"payload@base\"]\ncandidates = 32\nseconds = 4.0\n\
-         segment_s = 1.0\nfast = true\n{more}",
+         segment_s = 1.0\n{more}",
         policy.display()
     );
     std::fs::write(path, text).unwrap();
+}
+
+/// Starts the command and sends it a signal when a file exists. Returns what it wrote to stderr.
+fn interrupted_when(config: &Path, exists: &Path, signal: &str) -> String {
+    let child = program().arg(config).spawn().unwrap();
+    let deadline = Instant::now() + Duration::from_mins(2);
+    while !exists.exists() {
+        assert!(Instant::now() < deadline, "no {} after 2 min", exists.display());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let sent = Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap();
+    assert!(sent.success());
+    let output = child.wait_with_output().unwrap();
+    let error = text(&output.stderr);
+    assert_eq!(output.status.code(), Some(130), "{error}");
+    error
 }
 
 #[test]
@@ -45,21 +61,17 @@ fn hidden_payload_is_found_and_an_interrupted_command_continues() {
     let twinstep = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep();
     let (_server, endpoint) = Process::listening(&twinstep, &serve).unwrap();
     let config = folder.path().join("spi.toml");
-    write_config(&config, &endpoint, "");
+    // The pace is no setting on which results depend.
+    write_config(&config, &endpoint, "fast = false\n");
 
     let out = folder.path().join("spi");
     let first_log = out.join("1-random/log");
-    let child = program().arg(&config).spawn().unwrap();
-    let deadline = Instant::now() + Duration::from_mins(2);
-    while !first_log.exists() {
-        assert!(Instant::now() < deadline, "no log after 120 s");
-        std::thread::sleep(Duration::from_millis(5));
-    }
-    let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
-    assert!(sent.success());
-    let interrupted = child.wait_with_output().unwrap();
-    assert_eq!(interrupted.status.code(), Some(130), "{}", text(&interrupted.stderr));
-    assert!(text(&interrupted.stderr).ends_with("the same command continues"), "{}", text(&interrupted.stderr));
+    let ended = interrupted_when(&config, &out.join("1-random/log.partial/data.csv"), "-TERM");
+    assert!(ended.contains("the same command continues") && !first_log.exists(), "an incomplete log: {ended}");
+
+    write_config(&config, &endpoint, "fast = true\n");
+    let interrupted = interrupted_when(&config, &first_log, "-INT");
+    assert!(interrupted.ends_with("the same command continues"), "{interrupted}");
     assert!(!out.join("report.md").exists());
     let recorded = first_log.metadata().unwrap().modified().unwrap();
 
@@ -77,10 +89,10 @@ fn hidden_payload_is_found_and_an_interrupted_command_continues() {
     let mass: f64 = row("payload@base mass_kg")[4].split(' ').next().unwrap().parse().unwrap();
     assert!((mass - 2.0).abs() < 0.2, "{report}");
 
-    write_config(&config, &endpoint, "rounds = 2\n");
+    write_config(&config, &endpoint, "fast = true\nrounds = 2\n");
     let other = run(&config);
     assert_eq!(other.status.code(), Some(2));
-    assert!(text(&other.stderr).contains("has results of other settings"), "{}", text(&other.stderr));
+    assert!(text(&other.stderr).contains("settings.toml differs"), "{}", text(&other.stderr));
 }
 
 #[test]
@@ -92,6 +104,7 @@ fn invalid_settings_are_named_before_a_robot_moves() {
         ("method = \"best\"\n", "unknown variant `best`, expected one of `trace`, `d-optimal`, `random`"),
         ("robots = 2\n", "unknown field `robots`"),
         ("room_m = nan\n", "`room_m` = NaN is outside 0.1 to 1000"),
+        ("model = \"missing.toml\"\n", "missing.toml"),
     ];
     for (more, expected) in cases {
         write_config(&config, "tcp/127.0.0.1:1", more);
@@ -103,4 +116,14 @@ fn invalid_settings_are_named_before_a_robot_moves() {
     std::fs::write(&config, "policy = \"walk.safetensors\"\nunknowns = [\"payload\"]\n").unwrap();
     let error = text(&run(&config).stderr);
     assert!(error.contains("`unknowns`: ") && error.contains("payload"), "{error}");
+    let policy = root().join("data/policies/walk.safetensors");
+    let wrong = [
+        ("[\"payload@base\", \"payload@base\"]", "`unknowns`: `payload@base` is named twice"),
+        ("[\"armature@base\"]", "`unknowns`: `armature` cannot have scope \"base\""),
+    ];
+    for (unknowns, expected) in wrong {
+        std::fs::write(&config, format!("policy = \"{}\"\nunknowns = {unknowns}\n", policy.display())).unwrap();
+        let error = text(&run(&config).stderr);
+        assert!(error.contains(expected) && !folder.path().join("spi").exists(), "{error}");
+    }
 }

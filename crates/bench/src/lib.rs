@@ -7,6 +7,7 @@ pub mod baselines;
 pub mod ensemble;
 mod error;
 pub mod identify;
+mod link;
 pub mod remote;
 pub mod remote_training;
 pub mod sim;

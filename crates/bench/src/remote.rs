@@ -1,13 +1,13 @@
 //! Environments with physics: the same walk over Zenoh and in process.
 
-use twinstep_client::{ConnectOptions, GroupedVecEnv, RemoteVecEnv};
+use twinstep_client::{GroupedVecEnv, RemoteVecEnv};
 use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
 
 use crate::Measurement;
 use crate::error::{BenchError, Interrupted, check, failed};
+use crate::link::Link;
 use crate::throughput::{Throughput, WINDOWS, measure as pace, median};
-use twinstep_client::ServerProcess;
 use twinstep_envs::trot;
 
 /// Groups that step at the same time, and environments of each.
@@ -35,23 +35,24 @@ pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measuremen
             ratio: Some(remote.per_second / local.per_second),
         });
     }
-    let (remote, local) = compare_groups(window_s, interrupted)?;
-    rows.push(Measurement {
-        case: format!("walk over Zenoh, {GROUPS} groups of {GROUP_ENVS} envs in flight"),
-        value: remote.per_second * (GROUPS * GROUP_ENVS) as f64,
-        unit: "env-steps/s",
-        reference: Some(format!("{} envs in process", GROUPS * GROUP_ENVS)),
-        ratio: Some(remote.per_second / local.per_second),
-    });
+    for link in [Link::Tcp, Link::LowLatency] {
+        let (remote, local) = compare_groups(link, window_s, interrupted)?;
+        rows.push(Measurement {
+            case: format!("walk over Zenoh, {GROUPS} groups of {GROUP_ENVS} envs in flight{}", link.suffix()),
+            value: remote.per_second * (GROUPS * GROUP_ENVS) as f64,
+            unit: "env-steps/s",
+            reference: Some(format!("{} envs in process", GROUPS * GROUP_ENVS)),
+            ratio: Some(remote.per_second / local.per_second),
+        });
+    }
     Ok(rows)
 }
 
 /// Compares groups in flight with as many environments in process. One call steps every environment once.
-fn compare_groups(window_s: f64, interrupted: Interrupted) -> Result<(Throughput, Throughput), BenchError> {
+fn compare_groups(link: Link, window_s: f64, interrupted: Interrupted) -> Result<(Throughput, Throughput), BenchError> {
     let num_envs = GROUPS * GROUP_ENVS;
-    let server = ServerProcess::start(&[]).map_err(failed)?;
-    let options = ConnectOptions::new(&server.endpoint, num_envs);
-    let mut remote = GroupedVecEnv::connect(&options, GROUPS).map_err(failed)?;
+    let server = link.server(&[])?;
+    let mut remote = GroupedVecEnv::connect(&server.options(num_envs), GROUPS).map_err(failed)?;
     let mut local = SimEnvFactory::new(Config::default())
         .and_then(|host| host.build(num_envs, AutoresetMode::NextStep, None))
         .map_err(failed)?;
@@ -81,8 +82,8 @@ fn compare_groups(window_s: f64, interrupted: Interrupted) -> Result<(Throughput
 }
 
 fn compare(num_envs: usize, window_s: f64, interrupted: Interrupted) -> Result<(Throughput, Throughput), BenchError> {
-    let server = ServerProcess::start(&[]).map_err(failed)?;
-    let mut remote = RemoteVecEnv::connect(&ConnectOptions::new(&server.endpoint, num_envs)).map_err(failed)?;
+    let server = Link::Tcp.server(&[])?;
+    let mut remote = RemoteVecEnv::connect(&server.options(num_envs)).map_err(failed)?;
     let mut local = SimEnvFactory::new(Config::default())
         .and_then(|host| host.build(num_envs, AutoresetMode::NextStep, None))
         .map_err(failed)?;

@@ -1,24 +1,32 @@
 //! Round trips without physics: the task `counter`, compared with a raw TCP ping-pong.
 
-use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_client::RemoteVecEnv;
 use twinstep_model::{ResetRequest, StepBatch, VecEnv};
 use twinstep_protocol::convert;
 
 use crate::Measurement;
 use crate::error::{BenchError, Interrupted, check, failed};
+use crate::link::Link;
 use crate::tcp::PingPong;
 use crate::throughput::{Throughput, WINDOWS, measure as pace, median};
-use twinstep_client::ServerProcess;
 
-/// Number of environments in a message, and whether it uses shared memory.
-const CASES: [(usize, bool); 6] = [(1, false), (64, false), (1024, false), (1024, true), (4096, false), (4096, true)];
+/// Number of environments in a message, and its link.
+const CASES: [(usize, Link); 7] = [
+    (1, Link::Tcp),
+    (64, Link::Tcp),
+    (64, Link::LowLatency),
+    (1024, Link::Tcp),
+    (1024, Link::SharedMemory),
+    (4096, Link::Tcp),
+    (4096, Link::SharedMemory),
+];
 
 /// Measures round trips per second and median latency of each case.
 pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
     let mut rows = Vec::new();
-    for (num_envs, shared_memory) in CASES {
-        let (ours, tcp) = compare(num_envs, shared_memory, window_s, interrupted)?;
-        let profile = if shared_memory { ", shared memory" } else { "" };
+    for (num_envs, link) in CASES {
+        let (ours, tcp) = compare(num_envs, link, window_s, interrupted)?;
+        let profile = link.suffix();
         let reference = Some("raw TCP ping-pong with the same payloads".to_owned());
         rows.push(Measurement {
             case: format!("transport, {num_envs} envs{profile}"),
@@ -41,17 +49,12 @@ pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measuremen
 /// Measures windows of Twinstep and of TCP alternately, so that both have the same load of the machine.
 fn compare(
     num_envs: usize,
-    shared_memory: bool,
+    link: Link,
     window_s: f64,
     interrupted: Interrupted,
 ) -> Result<(Throughput, Throughput), BenchError> {
-    let mut flags = vec!["--task", "counter"];
-    if shared_memory {
-        flags.push("--shared-memory");
-    }
-    let server = ServerProcess::start(&flags).map_err(failed)?;
-    let options = ConnectOptions { shared_memory, ..ConnectOptions::new(&server.endpoint, num_envs) };
-    let mut env = RemoteVecEnv::connect(&options).map_err(failed)?;
+    let server = link.server(&["--task", "counter"])?;
+    let mut env = RemoteVecEnv::connect(&server.options(num_envs)).map_err(failed)?;
     env.reset(&ResetRequest::default()).map_err(failed)?;
     let actions = vec![0.1; num_envs * env.spec().action_len()];
     let mut tcp = {

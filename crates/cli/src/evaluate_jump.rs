@@ -224,18 +224,19 @@ pub fn table(robots: u32, rows: &[JumpRow]) -> String {
         let engine = format!("{engine:?}").to_lowercase();
         for landings in targets {
             let [x, y, yaw] = landings.target;
-            let _ = writeln!(
+            let _ = write!(
                 text,
-                "{condition:10} {engine:8} {x:.2}, {y:.2}, {yaw:.2}    {:5.1} %  {:5.1} %  {:6.3} m  {:+7.3} m   {:.3} \
-                 rad  {:.2} s  {:4.1} cm",
+                "{condition:10} {engine:8} {x:.2}, {y:.2}, {yaw:.2}    {:5.1} %  {:5.1} %  ",
                 100.0 * landings.landed,
-                100.0 * landings.up,
-                landings.l_jump,
-                landings.mean_error,
-                landings.yaw_error,
-                landings.flight_s,
-                100.0 * landings.clearance,
+                100.0 * landings.up
             );
+            let Landings { l_jump, mean_error, yaw_error, flight_s, clearance, .. } = landings;
+            let _ = if landings.landed == 0.0 {
+                writeln!(text, "no robot has jumped and landed")
+            } else {
+                let cm = 100.0 * clearance;
+                writeln!(text, "{l_jump:6.3} m  {mean_error:+7.3} m   {yaw_error:.3} rad  {flight_s:.2} s  {cm:4.1} cm")
+            };
         }
     }
     text

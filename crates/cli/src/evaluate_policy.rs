@@ -26,8 +26,8 @@ const FILM_STEPS: usize = 4;
 ///
 /// The mean action of the policy steps fresh robots with the default commands of `walk`: a new one every 5 s. A policy of
 /// `track` follows a circle, a figure of eight and a square, with and without motion capture. A policy of `jump` jumps
-/// once to the nearest, the middle and the farthest target of its training. A robot that has fallen no longer counts for
-/// the errors. Conditions:
+/// once to both ends and the middle of the ranges of its targets. A robot that has fallen no longer counts for the errors,
+/// but its landing before the fall does. Conditions:
 ///
 ///   nominal   the robot of the model file on flat ground
 ///   robots    masses +-15 %, friction 0.4 to 1.25, gains +-10 %

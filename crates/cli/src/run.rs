@@ -124,7 +124,7 @@ pub fn record(args: &Args, signals: &Signals) -> Result<Recording, Failure> {
     // Read before anything moves.
     let commands = args.commands.as_deref().map(read_commands).transpose()?;
     let loaded = LoadedPolicy::read(&args.policy, args.mapping.as_deref()).map_err(input)?;
-    let mut env = RemoteVecEnv::connect(&args.options(signals)).map_err(other)?;
+    let mut env = RemoteVecEnv::connect(&args.options(signals)).map_err(|error| interrupted(signals, error))?;
     let mut policy = loaded.bind(env.spec()).map_err(input)?;
     if let Some(velocity) = args.velocity {
         env.set_velocity_commands(&[velocity]).map_err(input)?;

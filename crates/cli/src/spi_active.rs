@@ -18,7 +18,8 @@ use crate::{excite, identify, random_commands, run};
 ///   report.md   parameters with intervals, errors on the held-out log, robot time and falls
 ///
 /// The same command continues after Ctrl-C or a crash: what a stage has completed is kept, and a log that was interrupted
-/// is recorded again.
+/// is recorded again. The robot walks without a question as soon as a stage needs a log, `room_m` around where it then
+/// stands.
 ///
 /// CONFIG (TOML); `policy` and `unknowns` are required, the others have these defaults:
 ///
@@ -33,7 +34,8 @@ use crate::{excite, identify, random_commands, run};
 ///   room_m = 3.0              largest distance from the start
 ///   fast = false              step a simulated robot as fast as it answers
 ///   seed = 1
-///   model = "start.toml"      model to start from; none: the ideal Go2
+///   robot, zenoh              as of `twinstep run`; without a default
+///   model                     model file to start from; default: the ideal Go2
 ///
 /// Example: `twinstep serve --envs 1 --model hidden.toml` and, in another terminal, `twinstep spi-active spi.toml`
 #[derive(clap::Args)]
@@ -49,13 +51,13 @@ const HELD_OUT_SEED: u64 = 1_000_000;
 /// Runs the stages that are not complete.
 pub fn run(args: &Args) -> CommandResult {
     let signals = Signals::listen()?;
-    let (config, text) = SpiActiveConfig::load(&args.config)?;
+    let config = SpiActiveConfig::load(&args.config)?;
     let out = args.config.with_extension("");
     if out == args.config {
         let path = out.display();
         return Err(Failure::Input(miette::miette!("`{path}`: the config file needs an extension, such as .toml")));
     }
-    open_folder(&out, &text)?;
+    open_folder(&out, &config)?;
     let result = stages(&config, &out, &signals);
     if matches!(result, Err(Failure::Interrupted)) {
         eprintln!("interrupted; the same command continues");
@@ -77,7 +79,7 @@ fn stages(config: &SpiActiveConfig, out: &Path, signals: &Signals) -> CommandRes
                 let folder = path.parent().expect("a folder");
                 excite::write_design(&config.excitation(criterion, model.as_deref(), seed, folder), signals)
             }
-            None => random_commands::write(config, model.as_deref(), seed, path),
+            None => random_commands::write(config, model.as_deref(), seed, path, signals),
         })?;
         let robot_time = stage.collect(config, signals)?;
         logs.push(stage.log());
@@ -87,8 +89,9 @@ fn stages(config: &SpiActiveConfig, out: &Path, signals: &Signals) -> CommandRes
     }
     let held_out = Stage::new(out, "held-out")?;
     eprintln!("\n{}: commands, log", held_out.folder.display());
-    held_out
-        .commands(|path| random_commands::write(config, config.model.as_deref(), config.seed + HELD_OUT_SEED, path))?;
+    held_out.commands(|path| {
+        random_commands::write(config, config.model.as_deref(), config.seed + HELD_OUT_SEED, path, signals)
+    })?;
     let robot_time = held_out.collect(config, signals)?;
     let report = spi_active_report::report(config, &results, &held_out.log(), robot_time)?;
     write(&out.join("report.md"), &report)?;
@@ -97,18 +100,25 @@ fn stages(config: &SpiActiveConfig, out: &Path, signals: &Signals) -> CommandRes
     Ok(())
 }
 
-/// Creates the folder of the results, or fails if it has those of other settings.
-fn open_folder(out: &Path, text: &str) -> CommandResult {
-    std::fs::create_dir_all(out).map_err(|cause| unwritable(out, &cause))?;
-    let copy = out.join("config.toml");
-    match std::fs::read_to_string(&copy) {
-        Ok(earlier) if earlier != text => Err(Failure::Input(miette::miette!(
-            "{} has results of other settings\n  restore them (config.toml in the folder), or rename the config file",
-            out.display()
-        ))),
-        Ok(_) => Ok(()),
-        Err(_) => write(&copy, text),
+/// Creates the folder of the results with copies of the inputs, or fails if it has results of other inputs.
+fn open_folder(out: &Path, config: &SpiActiveConfig) -> CommandResult {
+    let inputs = out.join("inputs");
+    std::fs::create_dir_all(&inputs).map_err(|cause| unwritable(&inputs, &cause))?;
+    for (name, content) in config.inputs()? {
+        let copy = inputs.join(name);
+        match std::fs::read(&copy) {
+            Ok(earlier) if earlier != content => {
+                return Err(Failure::Input(miette::miette!(
+                    "{} has results of other inputs: {name} differs\n  restore it from {}, or rename the config file",
+                    out.display(),
+                    inputs.display()
+                )));
+            }
+            Ok(_) => {}
+            Err(_) => std::fs::write(&copy, content).map_err(|cause| unwritable(&copy, &cause))?,
+        }
     }
+    Ok(())
 }
 
 /// A stage and its files. A file exists only when it is complete.
@@ -161,6 +171,10 @@ impl Stage {
             std::fs::remove_dir_all(interrupted).map_err(|cause| unwritable(interrupted, &cause))?;
         }
         let recorded = run::record(&config.recording(&self.folder.join("commands.csv"), &partial), signals)?.summary;
+        // SIGTERM ends a run as its duration does.
+        if signals.check()? || recorded.seconds < config.seconds - 1e-6 {
+            return Err(Failure::Interrupted);
+        }
         let found = RobotTime { seconds: recorded.seconds, falls: recorded.falls };
         write(&summary, &serde_json::to_string_pretty(&found).map_err(other)?)?;
         std::fs::rename(&partial, &log).map_err(|cause| unwritable(&log, &cause))?;

@@ -2,15 +2,17 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use twinstep_excite::{Criterion, Limits};
-use twinstep_identify::EffectAtScope;
+use twinstep_identify::{EffectAtScope, free_parameters};
+use twinstep_policy::Policy;
 
-use crate::exit::Failure;
+use crate::exit::{Failure, input};
+use crate::robot_file::analytic_model;
 use crate::{excite, identify, run};
 
 /// How the commands after the first stage are chosen.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Method {
     /// Largest trace of the Fisher information (SPI-Active).
@@ -33,16 +35,23 @@ impl Method {
 }
 
 /// Settings of `twinstep spi-active`.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SpiActiveConfig {
     /// Policy of `walk`.
+    #[serde(skip_serializing)]
     pub policy: PathBuf,
     /// Effects with scopes whose parameters are sought.
     unknowns: Vec<String>,
     /// Zenoh endpoint of the robot.
-    #[serde(default = "default_endpoint")]
+    #[serde(default = "default_endpoint", skip_serializing)]
     endpoint: String,
+    /// Name of the robot, if several are visible.
+    #[serde(skip_serializing)]
+    robot: Option<String>,
+    /// Zenoh configuration file for TLS, user and password.
+    #[serde(skip_serializing)]
+    zenoh: Option<PathBuf>,
     /// How the commands after the first stage are chosen.
     #[serde(default = "default_method")]
     pub method: Method,
@@ -62,12 +71,13 @@ pub struct SpiActiveConfig {
     #[serde(default = "default_room")]
     room_m: f64,
     /// True to step a simulated robot as fast as it answers.
-    #[serde(default)]
+    #[serde(default, skip_serializing)]
     fast: bool,
     /// Seed of commands, searches and the robot's random numbers.
     #[serde(default = "default_seed")]
     pub seed: u64,
     /// Model to start from. Default: the ideal Go2.
+    #[serde(skip_serializing)]
     pub model: Option<PathBuf>,
 }
 
@@ -104,13 +114,17 @@ const fn default_seed() -> u64 {
 }
 
 impl SpiActiveConfig {
-    /// Reads and checks a config file. Returns it with its text.
-    pub fn load(path: &Path) -> Result<(Self, String), Failure> {
+    /// Reads and checks a config file, its policy and its model.
+    pub fn load(path: &Path) -> Result<Self, Failure> {
         let wrong = |cause: String| Failure::Input(miette::miette!("{}: {cause}", path.display()));
         let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
         let config: Self = toml::from_str(&text).map_err(|error| wrong(error.to_string()))?;
         config.check().map_err(wrong)?;
-        Ok((config, text))
+        Policy::read(&config.policy).map_err(input)?;
+        let model = analytic_model(config.model.as_deref())?;
+        let effects: Vec<_> = config.unknowns().iter().map(|EffectAtScope(effect, scope)| (*effect, *scope)).collect();
+        free_parameters(&model, &effects).map_err(|error| wrong(format!("`unknowns`: {error}")))?;
+        Ok(config)
     }
 
     fn check(&self) -> Result<(), String> {
@@ -119,6 +133,10 @@ impl SpiActiveConfig {
         }
         for unknown in &self.unknowns {
             unknown.parse::<EffectAtScope>().map_err(|error| format!("`unknowns`: {error}"))?;
+        }
+        let effects = self.unknowns();
+        if let Some(index) = (1..effects.len()).find(|index| effects[..*index].contains(&effects[*index])) {
+            return Err(format!("`unknowns`: `{}` is named twice", self.unknowns[index]));
         }
         let within = |name: &str, value: f64, low: f64, high: f64| {
             let allowed = (low..=high).contains(&value);
@@ -135,6 +153,19 @@ impl SpiActiveConfig {
             return Err(format!("`seconds` = {seconds} is not a multiple of `segment_s` = {segment_s}"));
         }
         Ok(())
+    }
+
+    /// Returns names and contents of what the results depend on: policy, model and settings other than the endpoint.
+    pub fn inputs(&self) -> Result<Vec<(&'static str, Vec<u8>)>, Failure> {
+        let read = |path: &Path| {
+            std::fs::read(path)
+                .map_err(|cause| Failure::Input(miette::miette!("cannot read {}: {cause}", path.display())))
+        };
+        let settings = toml::to_string(self).expect("settings are plain data").into_bytes();
+        let mut inputs = vec![("settings.toml", settings), ("policy.safetensors", read(&self.policy)?)];
+        // Without a model file the copy is empty, so that a later one differs.
+        inputs.push(("model.toml", self.model.as_deref().map_or(Ok(Vec::new()), read)?));
+        Ok(inputs)
     }
 
     /// Returns the effects that are sought.
@@ -174,8 +205,8 @@ impl SpiActiveConfig {
             policy: self.policy.clone(),
             mapping: None,
             endpoint: self.endpoint.clone(),
-            robot: None,
-            zenoh: None,
+            robot: self.robot.clone(),
+            zenoh: self.zenoh.clone(),
             log: Some(log.to_owned()),
             velocity: None,
             commands: Some(commands.to_owned()),

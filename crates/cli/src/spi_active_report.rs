@@ -46,7 +46,7 @@ pub fn report(
     }
     let mut text = format!(
         "# SPI-Active\n\nErrors on the held-out log ({:.0} s, {} falls), which was not used for identification.\n\n\
-         | model | robot time [s] | falls | joint position, RMSE [rad] | torque, RMSE [N·m] |\n|---|---|---|---|---|\n",
+         | model | robot time [s] | falls | joint position, RMSE [rad] |\n|---|---|---|---|\n",
         robot_time.seconds, robot_time.falls
     );
     let mut spent = RobotTime::default();
@@ -55,10 +55,8 @@ pub fn report(
             spent.seconds += stage.robot_time.seconds;
             spent.falls += stage.robot_time.falls;
         }
-        let Evaluation { q_rmse_rad, torque_rmse_nm, .. } = error(held_out, model)?;
-        let cell = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
-        let (q, torque) = (cell(q_rmse_rad), cell(torque_rmse_nm));
-        let _ = writeln!(text, "| {name} | {:.0} | {} | {q} | {torque} |", spent.seconds, spent.falls);
+        let q_rmse = error(held_out, model)?.q_rmse_rad.map_or("-".to_owned(), |value| format!("{value:.4}"));
+        let _ = writeln!(text, "| {name} | {:.0} | {} | {q_rmse} |", spent.seconds, spent.falls);
     }
     let names: Vec<&str> = models.iter().map(|(name, _)| *name).collect();
     let _ = writeln!(text, "\nParameters with 95 % intervals.\n\n| parameter | {} |", names.join(" | "));

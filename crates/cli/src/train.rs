@@ -25,7 +25,7 @@ const SAVE_EVERY: Duration = Duration::from_secs(10);
 /// trajectories. The folder then contains:
 ///
 ///   policy.safetensors     the policy, with the spec of its environment
-///   policy.onnx            the same for other runtimes: input `obs` [batch, 45] in SI units, output `action` [batch, 12]
+///   policy.onnx            the same for other runtimes: input `obs` [batch, N] in SI units, output `action` [batch, 12]
 ///   evaluation.json        velocity errors and falls of 256 fresh robots; task `jump`: where they land
 ///   config.toml            all settings; --config config.toml repeats the training
 ///   progress.csv           errors, falls, reward terms and times of every update; TensorBoard reads events.out.*
@@ -212,6 +212,9 @@ impl Args {
             (config.train.num_envs, config.train.groups) = (envs, config.train.groups.min(envs.max(1)));
         }
         config.train.check().map_err(input)?;
+        if self.endpoint.is_empty() {
+            config.check()?;
+        }
         Ok(config)
     }
 }
@@ -263,7 +266,11 @@ impl TrainSession {
                      `twinstep serve --view`"
                 )));
             }
-            endpoints => remote_collectors(endpoints, &config.train)?,
+            endpoints => {
+                let collectors = remote_collectors(endpoints, &config.train)?;
+                check_task(&collectors[0].spec().task, config.task.name())?;
+                collectors
+            }
         };
         let base = match &config.task {
             TaskConfig::Explore(explore) => Some(Policy::read(&explore.base).map_err(input)?.0),
@@ -366,6 +373,17 @@ impl TrainSession {
         }
         Ok(())
     }
+}
+
+/// Fails if the servers have another task than the one that is to be learned.
+fn check_task(of_servers: &str, named: &str) -> CommandResult {
+    if of_servers == named {
+        return Ok(());
+    }
+    Err(Failure::Input(miette::miette!(
+        "the servers have the task `{of_servers}`, and the task to learn is `{named}`\n  name that of the servers: twinstep \
+         train {of_servers}"
+    )))
 }
 
 /// Returns the networks of another training's checkpoint, for environments of this spec.

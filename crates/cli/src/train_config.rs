@@ -59,6 +59,11 @@ impl TrainConfig {
             .map_err(|error| input(ConfigFileError::Malformed { name: name.to_owned(), message: error.to_string() }))
     }
 
+    /// Checks robot, task, simulation and randomisation.
+    pub fn check(&self) -> Result<(), Failure> {
+        self.factory(1).map(drop)
+    }
+
     /// Builds `groups` batches of environments, `num_envs` in total, that are stepped by `threads` threads each.
     pub fn envs(&self, num_envs: usize, groups: usize, threads: usize) -> Result<Vec<Box<dyn VecEnv>>, Failure> {
         let factory = self.factory(threads)?;

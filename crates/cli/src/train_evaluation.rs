@@ -6,6 +6,7 @@ use twinstep_policy::Policy;
 use twinstep_sim::{Engine, SimConfig};
 
 use crate::evaluate_jump::{self, JumpRow};
+use crate::evaluate_policy::check_spec;
 use crate::exit::{Failure, Signals, other};
 use crate::train_config::TrainConfig;
 use crate::train_endpoints::remote_env;
@@ -30,7 +31,8 @@ pub fn evaluate_policy(
     if let TaskConfig::Jump(task) = &config.task {
         let targets = jumps(policy, config, task, signals)?;
         let rows = [JumpRow { condition: "nominal", engine: Engine::Batch, targets }];
-        let text = evaluate_jump::table(ROBOTS as u32, &rows);
+        let of = "Simulated here, with the model and the targets of this command; those of the servers may differ.\n";
+        let text = if endpoints.is_empty() { "" } else { of }.to_owned() + &evaluate_jump::table(ROBOTS as u32, &rows);
         return Ok((json(serde_json::to_string_pretty(&rows[0].targets)), text));
     }
     let evaluation = walking(policy, config, endpoints, signals)?;
@@ -72,6 +74,7 @@ fn jumps(
         let fresh = fresh(config, TaskConfig::Jump(task.clone()));
         let mut env = fresh.envs(ROBOTS, 1, 0)?.remove(0);
         let proceed = |_: f64| signals.check().is_ok();
+        check_spec(policy, env.spec())?;
         let landings = evaluate_jump::evaluate(policy, env.as_mut(), &fresh.robot()?, &task, SEED, proceed);
         targets.push(landings.map_err(other)?.ok_or(Failure::Interrupted)?);
     }

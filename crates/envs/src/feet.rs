@@ -15,6 +15,8 @@ pub struct FootState {
     pub height: f32,
     /// Horizontal speed [m/s].
     pub horizontal_speed: f32,
+    /// Vertical velocity [m/s].
+    pub vertical_velocity: f32,
 }
 
 /// Returns the motion of the feet of a simulated robot in the order FL, FR, RL, RR.
@@ -30,6 +32,7 @@ pub fn foot_states(kinematics: &FootKinematics, robot: &RobotView, truth: &Groun
         FootState {
             height: position.z - robot.ground.height(position.x, position.y),
             horizontal_speed: velocity.x.hypot(velocity.y),
+            vertical_velocity: velocity.z,
         }
     })
 }

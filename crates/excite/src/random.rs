@@ -13,7 +13,7 @@ use crate::trial::{Limits, TrialError, simulate};
 const ATTEMPTS: usize = 16;
 
 /// Returns the first random sequence of `segments` commands with which the robots of `env` keep the limits, or `None`
-/// after 16 attempts with every robot.
+/// after 16 attempts with every robot, or if `proceed` returns false before one.
 pub fn random_within_limits<B: Simulator, T: Task>(
     env: &mut TaskEnv<B, T>,
     policy: &Policy,
@@ -21,9 +21,13 @@ pub fn random_within_limits<B: Simulator, T: Task>(
     ranges: &VelocityRanges,
     limits: &Limits,
     seed: u64,
+    proceed: &mut dyn FnMut() -> bool,
 ) -> Result<Option<CommandSequence>, TrialError> {
     let mut random = StdRng::seed_from_u64(seed);
     for _ in 0..ATTEMPTS {
+        if !proceed() {
+            return Ok(None);
+        }
         let draw = |_| CommandSequence::random(segment_s, segments, ranges, &mut random);
         let sequences: Vec<_> = (0..env.num_envs()).map(draw).collect();
         let trials = simulate(env, policy, &sequences, seed)?;

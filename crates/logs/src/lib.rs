@@ -48,6 +48,7 @@ mod mcap_file;
 mod meta;
 mod missing_channels;
 pub mod operating_conditions;
+mod parquet_checks;
 mod parquet_table;
 mod read;
 pub mod recording;

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use parquet::basic::{Compression, ConvertedType, LogicalType, Repetition, Type as Physical, ZstdLevel};
-use parquet::column::reader::{ColumnReader, ColumnReaderImpl};
+use parquet::column::reader::{ColumnReader, ColumnReaderImpl, get_column_reader};
 use parquet::data_type::{DataType, DoubleType, Int64Type};
 use parquet::errors::{ParquetError, Result as ParquetResult};
 use parquet::file::properties::WriterProperties;
@@ -18,6 +18,7 @@ use parquet::schema::types::{ColumnDescriptor, Type};
 use crate::LogError;
 use crate::columns::Column;
 use crate::log::{ColumnCells, NamedColumn};
+use crate::parquet_checks::{CheckedFile, CheckedPages};
 use crate::table::Table;
 
 /// Reads all row groups.
@@ -33,7 +34,7 @@ pub(crate) fn read(file: &Path) -> Result<Table, LogError> {
 fn read_row_groups(file: &Path) -> Result<Table, LogError> {
     let failed = |cause| LogError::Parquet { file: file.into(), cause };
     let opened = File::open(file).map_err(|cause| LogError::Read { file: file.into(), cause })?;
-    let reader = SerializedFileReader::new(opened).map_err(failed)?;
+    let reader = SerializedFileReader::new(CheckedFile(opened)).map_err(failed)?;
     let leaves = reader.metadata().file_metadata().schema_descr().columns();
     let (mut table, indices) = Table::from_header(file, &column_names(file, leaves)?)?;
 
@@ -43,7 +44,9 @@ fn read_row_groups(file: &Path) -> Result<Table, LogError> {
         for group in 0..reader.num_row_groups() {
             let group = reader.get_row_group(group).map_err(failed)?;
             let rows = usize::try_from(group.metadata().num_rows()).unwrap_or(0);
-            let cells = group.get_column_reader(leaf).and_then(|column| read_column(column, number, rows));
+            let pages = group.get_column_page_reader(leaf).map(|pages| Box::new(CheckedPages(pages)));
+            let column = pages.map(|pages| get_column_reader(Arc::clone(descriptor), pages));
+            let cells = column.and_then(|column| read_column(column, number, rows));
             table.columns[index].1.extend(cells.map_err(failed)?);
         }
     }

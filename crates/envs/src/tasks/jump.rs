@@ -9,17 +9,18 @@ use rand::RngExt;
 use twinstep_model::{EnvSpec, FootKinematics, GroundTruth, PerJoint, RobotModel, SpecField, Stream, frames};
 
 use super::jump_config::{JumpConfig, RewardWeights};
-use super::jump_flight::{Flight, JumpMotion, Stage, foot_motion};
+use super::jump_flight::{Flight, JumpMotion, Stage};
 use super::jump_reward::{LandingError, RewardInput};
 use super::walk::{Walk, WalkState};
 use crate::config::{ConfigError, Range};
+use crate::feet::foot_states;
 use crate::observation::{CRITIC_OBS_LEN, OBS_LEN, observe, observe_privileged};
 use crate::path::GroundPose;
 use crate::task::{RobotView, Step, Task};
 
 /// Bound of the target and of errors in the observation [m, rad].
 const TARGET_BOUND: f32 = 5.0;
-/// Height of the base at the landing relative to its height on straightened legs; for predictions [m].
+/// Height of the base above the ground at the predicted landing [m].
 const LANDING_HEIGHT: f32 = 0.28;
 
 /// The task `jump` on one robot model.
@@ -93,25 +94,20 @@ impl Jump {
         let world_from_base = frames::world_from_base(measured.orientation[index]);
         let base = Vec3::from(truth.base_position[index]);
         let velocity = Vec3::from(truth.base_linear_velocity[index]);
-        let angular = Vec3::from(truth.base_angular_velocity[index]);
-        let feet = self.feet.feet(&measured.q[index], &measured.dq[index]);
-        let feet_in_world = feet.map(|foot| {
-            let position = world_from_base * foot.position;
-            let [height, velocity_z] = foot_motion(base, velocity, angular, position, world_from_base * foot.velocity);
-            let ground = robot.ground.height(base.x + position.x, base.y + position.y);
-            [height - self.foot_radius - ground, velocity_z]
-        });
+        let angular_velocity = world_from_base * Vec3::from(truth.base_angular_velocity[index]);
+        let feet = foot_states(&self.feet, robot, truth);
         let forward = world_from_base * Vec3::X;
         let motion = JumpMotion {
             pose: GroundPose { x: base.x, y: base.y, yaw: forward.y.atan2(forward.x) },
             height: base.z - robot.ground.height(base.x, base.y),
             velocity: velocity.to_array(),
-            yaw_rate: angular.z,
-            foot_clearance: feet_in_world.map(|[clearance, _]| clearance.max(0.0)),
-            foot_velocity_z: feet_in_world.map(|[_, velocity]| velocity),
+            yaw_rate: angular_velocity.z,
+            foot_clearance: feet.map(|foot| (foot.height - self.foot_radius).max(0.0)),
+            foot_velocity_z: feet.map(|foot| foot.vertical_velocity),
             foot_force: truth.foot_force[index],
         };
-        (motion, feet.map(|foot| foot.position.z))
+        let in_base = self.feet.feet(&measured.q[index], &measured.dq[index]);
+        (motion, in_base.map(|foot| foot.position.z))
     }
 
     /// Returns the terms that `walk` does not have, and advances the jump.
@@ -258,6 +254,25 @@ mod tests {
         assert!((sum("in_air") - 6.0 * 0.38).abs() < 1e-4, "{}", sum("in_air"));
         assert_eq!(steps[3]("recovery"), 0.0, "not before the landing");
         assert!(steps[44]("recovery") > 0.0 && sum("symmetry") == 0.0);
+    }
+
+    #[test]
+    fn motion_of_a_turned_and_pitching_robot_is_in_the_world_frame() {
+        let (task, ground) = (task(true), Ground::FLAT);
+        let mut states = jumping_robot(0.1);
+        let half = std::f32::consts::FRAC_PI_4;
+        states.measured.orientation[0] = [half.cos(), 0.0, 0.0, half.sin()];
+        states.truth.base_angular_velocity[0] = [0.0, 3.0, 0.7];
+        let robot = RobotView { measured: &states.measured, truth: Some(&states.truth), ground: &ground, index: 0 };
+        let (motion, foot_z) = task.motion(&robot, &states.truth);
+        assert!((motion.pose.yaw - 2.0 * half).abs() < 1e-6 && (motion.yaw_rate - 0.7).abs() < 1e-6);
+        // Nose down: v_z = v_z of the base − ω_y · x of the foot in the base frame.
+        let feet = task.feet.feet(&states.measured.q[0], &states.measured.dq[0]);
+        for leg in 0..4 {
+            let expected = states.truth.base_linear_velocity[0][2] - 3.0 * feet[leg].position.x;
+            assert!((motion.foot_velocity_z[leg] - expected).abs() < 1e-5, "{motion:?}");
+            assert_eq!(foot_z[leg], feet[leg].position.z);
+        }
     }
 
     #[test]

@@ -86,7 +86,7 @@ impl JumpConfig {
 reward_weights! {
     /// Distance of the landing from the target; the weight is per landing, not per second.
     landing_position = 5.0,
-    /// Landing within 5 cm of the target; the weight is per landing, not per second.
+    /// Landing within 5 cm and 0.2 rad of the target; the weight is per landing, not per second.
     success = 5.0,
     /// No foot touches the ground.
     in_air = 6.0,

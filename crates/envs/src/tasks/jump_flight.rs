@@ -1,6 +1,5 @@
 //! Stages of a jump, and where it lands.
 
-use glam::Vec3;
 use twinstep_model::PerLeg;
 
 use crate::path::GroundPose;
@@ -49,10 +48,10 @@ impl JumpMotion {
         self.after(fall_time(self.height - height, self.velocity[2]))
     }
 
-    /// Returns the pose at which the first foot touches the ground, if the legs keep their velocity.
-    fn touchdown(&self) -> GroundPose {
+    /// Returns the pose at which the first foot touches the ground, at the latest after `policy_dt` [s].
+    fn touchdown(&self, policy_dt: f32) -> GroundPose {
         let times = self.foot_clearance.iter().zip(&self.foot_velocity_z);
-        self.after(times.map(|(clearance, velocity)| fall_time(*clearance, *velocity)).fold(f32::INFINITY, f32::min))
+        self.after(times.map(|(clearance, velocity)| fall_time(*clearance, *velocity)).fold(policy_dt, f32::min))
     }
 
     fn after(&self, time: f32) -> GroundPose {
@@ -90,7 +89,7 @@ impl Flight {
         let lands = touches && self.stage == Stage::Flight;
         if lands {
             self.stage = Stage::Landed;
-            self.landing = Some(self.last.touchdown());
+            self.landing = Some(self.last.touchdown(policy_dt));
         } else if touches {
             self.has_stood = true;
             self.air_time = 0.0;
@@ -113,14 +112,6 @@ impl Flight {
     pub fn landing(&self) -> Option<GroundPose> {
         self.landing
     }
-}
-
-/// Returns clearance and vertical velocity of a foot at `position` from the base, both in the world frame.
-///
-/// `foot_velocity` is that relative to the base without its rotation.
-pub fn foot_motion(base: Vec3, velocity: Vec3, angular: Vec3, position: Vec3, foot_velocity: Vec3) -> [f32; 2] {
-    let vertical = velocity + foot_velocity + angular.cross(position);
-    [base.z + position.z, vertical.z]
 }
 
 #[cfg(test)]
@@ -156,6 +147,18 @@ mod tests {
         assert!((landing.x - 1.5 * time).abs() < 1e-4 && (landing.yaw - 0.5 * time).abs() < 1e-4, "{landing:?}");
         let predicted = motion(0.1).landing_at(0.3);
         assert!((predicted.x - landing.x).abs() < 1e-4, "{predicted:?}");
+    }
+
+    #[test]
+    fn legs_that_are_stretched_before_the_contact_do_not_move_the_landing_beyond_the_step() {
+        let mut flight = Flight::default();
+        flight.update(&motion(-0.01), 0.02);
+        for step in 1..=5 {
+            flight.update(&JumpMotion { foot_velocity_z: [0.0; 4], ..motion(0.02 * step as f32) }, 0.02);
+        }
+        flight.update(&JumpMotion { foot_force: [80.0; 4], ..motion(0.12) }, 0.02);
+        let landing = flight.landing().expect("landed");
+        assert!((landing.x - 1.5 * 0.12).abs() < 1e-4, "{landing:?}");
     }
 
     #[test]

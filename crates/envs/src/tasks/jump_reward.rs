@@ -136,3 +136,70 @@ pub fn recovery(input: &RewardInput<'_>) -> f32 {
     let accuracy = rho(input.landing_error.total(), LANDING_WIDTH);
     indicator(input.stage == Stage::Landed) * rho(offset + 2.0 * input.speed, 1.0) * accuracy
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ZERO: PerJoint = [0.0; 12];
+
+    fn input() -> RewardInput<'static> {
+        RewardInput {
+            policy_dt: 0.02,
+            stage: Stage::BeforeTakeOff,
+            may_take_off: true,
+            lands: false,
+            landing_error: LandingError { distance: 0.3, yaw: 0.5 },
+            takeoff_error_xy: -0.5,
+            takeoff_error_z: -1.0,
+            takeoff_error_yaw: 1.5,
+            foot_z: [-0.3, -0.2, -0.2, -0.15],
+            target_foot_z: -0.2,
+            q: &ZERO,
+            default_pose: &ZERO,
+            speed: 0.25,
+        }
+    }
+
+    fn close(value: f32, expected: f32) -> bool {
+        (value - expected).abs() < 1e-6
+    }
+
+    #[test]
+    fn terms_of_the_take_off_end_with_it() {
+        let before = input();
+        let terms = [takeoff_velocity_xy, takeoff_velocity_z, takeoff_yaw_rate, takeoff_prediction];
+        // 0.3 m and 0.5 rad at 0.3 m/rad are 0.45 m.
+        for (term, exponent) in terms.iter().zip([-0.5f32, -0.4, -0.5, -0.9]) {
+            assert!(close(term(&before), exponent.exp()), "{exponent}");
+            assert_eq!(term(&RewardInput { may_take_off: false, ..before }), 0.0);
+        }
+        assert_eq!(
+            [in_air(&before), landing_prediction(&before), feet_relative_z(&before), recovery(&before)],
+            [0.0; 4]
+        );
+    }
+
+    #[test]
+    fn flight_and_landing_are_rewarded_by_their_error() {
+        let flight = RewardInput { stage: Stage::Flight, may_take_off: false, ..input() };
+        assert!(close(landing_prediction(&flight), (-0.45f32 / 0.15).exp()) && in_air(&flight) == 1.0);
+        assert!(close(feet_relative_z(&flight), (-0.15f32 / 0.75).exp()));
+        let near = LandingError { distance: 0.04, yaw: 0.1 };
+        let landing = RewardInput { stage: Stage::Landed, lands: true, landing_error: near, ..flight };
+        assert!(close(landing_position(&landing) * 0.02, (-0.07f32 / 0.15).exp()) && success(&landing) == 50.0);
+        let turned = LandingError { distance: 0.04, yaw: 0.25 };
+        assert_eq!(success(&RewardInput { landing_error: turned, ..landing }), 0.0);
+        assert!(close(recovery(&landing), (-0.5f32 - 0.07 / 0.15).exp()));
+    }
+
+    #[test]
+    fn only_differences_between_left_and_right_are_asymmetric() {
+        let mut q = ZERO;
+        // Both hips outward, both thighs forward.
+        (q[0], q[3], q[1], q[4]) = (0.2, -0.2, 0.5, 0.5);
+        assert_eq!(symmetry(&RewardInput { q: &q, ..input() }), 0.0);
+        (q[3], q[8]) = (0.1, 0.4);
+        assert!(close(symmetry(&RewardInput { q: &q, ..input() }), 0.5));
+    }
+}

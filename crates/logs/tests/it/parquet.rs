@@ -8,7 +8,7 @@ use expect_test::expect;
 use parquet::data_type::{ByteArray, ByteArrayType, DoubleType, Int64Type};
 use parquet::file::writer::SerializedFileWriter;
 use parquet::schema::parser::parse_message_type;
-use twinstep_logs::Log;
+use twinstep_logs::{Log, LogError};
 
 use crate::{CSV, META, folder, write};
 
@@ -25,6 +25,16 @@ fn log_written_by_pyarrow_is_read() {
     assert_eq!(channel("contact_FL"), "[1.0, 0.0, NaN, 1.0]");
     assert_eq!(channel("battery_V"), "[28.5, NaN, 28.25, 28.0]");
     assert_eq!(log.ignored(), ["note", "raw.list.element"]);
+}
+
+/// Found by `fuzz --format log_parquet --seed 2`: a list in a page's header, and a dictionary, that claim more elements than
+/// the file has.
+#[test]
+fn damaged_files_that_claim_billions_of_elements_are_refused_at_once() {
+    for name in ["endless_header.parquet", "huge_dictionary.parquet"] {
+        let error = Log::open(format!("{}/tests/data/{name}", env!("CARGO_MANIFEST_DIR"))).expect_err(name);
+        assert!(matches!(error, LogError::Parquet { .. }), "{name}: {error}");
+    }
 }
 
 /// Writes a file of one row with this schema: text "x", 1 in an INT64, 1.0 in a DOUBLE.
