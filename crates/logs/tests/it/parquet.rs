@@ -32,7 +32,7 @@ fn log_written_by_pyarrow_is_read() {
 #[test]
 fn damaged_files_that_claim_billions_of_elements_are_refused_at_once() {
     for name in ["endless_header.parquet", "huge_dictionary.parquet"] {
-        let error = Log::open(format!("{}/tests/data/{name}", env!("CARGO_MANIFEST_DIR"))).expect_err(name);
+        let error = Log::open(format!("{}/tests/data/damaged/{name}", env!("CARGO_MANIFEST_DIR"))).expect_err(name);
         assert!(matches!(error, LogError::Parquet { .. }), "{name}: {error}");
     }
 }
