@@ -67,6 +67,37 @@ impl Viewed {
         let len = stream.read(&mut answer).unwrap();
         String::from_utf8_lossy(&answer[..len]).into_owned()
     }
+
+    /// Sends the request of a page, and returns the beginning of the answer.
+    fn ask(&self, body: &str) -> String {
+        let len = body.len();
+        let kind = "application/json";
+        self.http(&format!(
+            "POST /request HTTP/1.1\r\nHost: localhost\r\nContent-Type: {kind}\r\nContent-Length: {len}\r\n\r\n{body}"
+        ))
+    }
+
+    /// Waits for a frame whose header is as wanted.
+    fn wait_for_frame(&self, wanted: impl Fn(&serde_json::Value) -> bool) {
+        let mut page = TcpStream::connect(self.address()).unwrap();
+        page.write_all(b"GET /frames HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+        page.set_read_timeout(Some(PATIENCE)).unwrap();
+        let (mut bytes, mut buffer, since) = (Vec::new(), vec![0; 1 << 16], Instant::now());
+        while since.elapsed() < PATIENCE {
+            let len = page.read(&mut buffer).unwrap();
+            assert!(len > 0, "the page ended");
+            bytes.extend_from_slice(&buffer[..len]);
+            // A header is one line of JSON between binary numbers.
+            let starts = bytes.windows(8).enumerate().filter(|(_, text)| *text == br#"{"time":"#).map(|(at, _)| at);
+            let headers = starts.filter_map(|at| serde_json::Deserializer::from_slice(&bytes[at..]).into_iter().next());
+            if headers.filter_map(Result::ok).any(|header| wanted(&header)) {
+                return;
+            }
+            let newest = bytes.len().saturating_sub(1 << 20);
+            bytes.drain(..newest);
+        }
+        panic!("no such frame within {PATIENCE:?}");
+    }
 }
 
 impl Drop for Viewed {
@@ -152,15 +183,51 @@ fn address_that_others_can_reach_needs_a_token() {
 fn policy_that_follows_a_path_is_shown_in_its_task() {
     let policy = root().join("data/policies/track.safetensors");
     let viewed = Viewed::start(&["view", policy.to_str().unwrap(), "--listen", "127.0.0.1:0"]);
-    let mut page = TcpStream::connect(viewed.address()).unwrap();
-    page.write_all(b"GET /frames HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
-    page.set_read_timeout(Some(PATIENCE)).unwrap();
-    let (mut bytes, mut buffer) = (Vec::new(), vec![0; 1 << 16]);
-    while !String::from_utf8_lossy(&bytes).contains("\"robots\":1") {
-        let len = page.read(&mut buffer).unwrap();
-        assert!(len > 0, "the page ended");
-        bytes.extend_from_slice(&buffer[..len]);
+    viewed.wait_for_frame(|header| header["robots"] == 1);
+}
+
+#[test]
+fn robots_that_learn_are_seen() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("walk");
+    let viewed = Viewed::start(&["train", "walk", "--out", out.to_str().unwrap(), "--view", "127.0.0.1:0"]);
+    // 64 of the 128 of the first group.
+    viewed.wait_for_frame(|header| header["robots"] == 64 && header["curves"]["reward per step"].is_number());
+}
+
+#[test]
+fn sliders_of_the_page_steer_a_run_and_nothing_else_of_it_can_be_changed() {
+    let server = Viewed::start(&["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "1", "--view", "127.0.0.1:0"]);
+    let policy = root().join("data/policies/walk.safetensors");
+    let arguments = ["run", policy.to_str().unwrap(), "--endpoint", server.endpoint(), "--view", "127.0.0.1:0"];
+    let viewed = Viewed::start(&arguments);
+    let command = |header: &serde_json::Value| {
+        let curve = |name: &str| header["curves"][name].as_f64();
+        Some(curve("forward [m/s]")? + curve("error, forward [m/s]")?)
+    };
+    viewed.wait_for_frame(|header| command(header).is_some());
+    assert!(viewed.ask(r#"{"pause":true}"#).starts_with("HTTP/1.1 409"));
+    assert!(viewed.ask(r#"{"push":{"robot":0,"velocity":[1,0,0]}}"#).starts_with("HTTP/1.1 409"));
+    // The largest command is 1 m/s.
+    for (velocity, expected) in [("[0.4,0,0]", 0.4), ("[9,0,0]", 1.0)] {
+        assert!(viewed.ask(&format!("{{\"velocity\":{velocity}}}")).starts_with("HTTP/1.1 204"));
+        viewed.wait_for_frame(|header| command(header).is_some_and(|command| (command - expected).abs() < 1e-5));
     }
+    let Some(browser) = browser() else { return };
+    let mut page = ChromePage::open(&browser, &viewed.url, [1000, 700]);
+    page.wait_for("Number(document.body.dataset.frames) > 5", PATIENCE);
+    let groups = "['playback', 'velocity', 'robots'].map((group) => document.getElementById(group).hidden).join()";
+    assert_eq!(page.evaluate(groups), "true,false,true");
+    page.evaluate("document.getElementById('stop').click()");
+    viewed.wait_for_frame(|header| command(header).is_some_and(|command| command.abs() < 1e-5));
+}
+
+#[test]
+fn robot_is_seen_without_a_client() {
+    let viewed = Viewed::start(&["robot", "--fake", "--listen", "tcp/127.0.0.1:0", "--view", "127.0.0.1:0"]);
+    viewed
+        .wait_for_frame(|header| header["curves"]["supply voltage [V]"].as_f64().is_some_and(|voltage| voltage > 20.0));
+    assert!(viewed.ask(r#"{"velocity":[0.5,0,0]}"#).starts_with("HTTP/1.1 409"), "it is looked at only");
 }
 
 #[test]
@@ -180,9 +247,7 @@ fn robots_of_a_lease_are_seen_while_an_agent_steps_them() {
         bytes.extend_from_slice(&buffer[..len]);
     }
     assert!(has_robots(&bytes), "{} bytes without a frame of three robots", bytes.len());
-    let request =
-        "POST /request HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 14\r\n\r\n";
-    let answer = viewed.http(&format!("{request}{{\"reset\":null}}"));
+    let answer = viewed.ask(r#"{"reset":null}"#);
     assert!(answer.starts_with("HTTP/1.1 409"), "they are looked at only: {answer}");
 }
 

@@ -78,14 +78,14 @@ impl Layout {
 
 /// Steps robot 0 of `env`, which must have one robot and [`twinstep_model::AutoresetMode::Disabled`].
 ///
-/// `control` is called before every step. After a fall the robot is reset and the run goes on. If it fails, the rows of all
+/// `control` is called before every step, with the robot to look at. After a fall the robot is reset and the run goes on. If it fails, the rows of all
 /// executed steps are in the log.
 pub fn run(
     env: &mut dyn VecEnv,
     policy: &mut BoundPolicy,
     mut recorder: Option<&mut Recorder>,
     plan: RunPlan,
-    control: &mut dyn FnMut(&Status) -> Control,
+    control: &mut dyn FnMut(&Status, &dyn VecEnv) -> Control,
 ) -> Result<RunSummary, AgentError> {
     let spec = env.spec().clone();
     let layout = Layout::new(&spec);
@@ -101,7 +101,7 @@ pub fn run(
         }
         let (command, velocity) = (agent.command(), layout.velocity(&agent.obs, &agent.critic_obs));
         let status = Status { seconds, command, velocity, falls: sums.falls, step_time, lateness };
-        let Control::Step(wanted) = control(&status) else { break };
+        let Control::Step(wanted) = control(&status, env) else { break };
         if let Some(recorder) = &mut recorder {
             agent.observe(env, recorder, &spec)?;
         }

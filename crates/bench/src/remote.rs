@@ -10,9 +10,9 @@ use crate::link::Link;
 use crate::throughput::{Throughput, WINDOWS, measure as pace, median};
 use twinstep_envs::trot;
 
-/// Groups that step at the same time, and environments of each.
-const GROUPS: usize = 3;
-const GROUP_ENVS: usize = 64;
+/// Groups in flight, environments of each, and their link.
+const GROUPED: [(usize, usize, Link); 5] =
+    [(3, 64, Link::Tcp), (3, 64, Link::LowLatency), (2, 512, Link::Tcp), (4, 256, Link::Tcp), (2, 2048, Link::Tcp)];
 
 /// Measures env-steps/s, remote compared with in process.
 pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {
@@ -35,13 +35,13 @@ pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measuremen
             ratio: Some(remote.per_second / local.per_second),
         });
     }
-    for link in [Link::Tcp, Link::LowLatency] {
-        let (remote, local) = compare_groups(link, window_s, interrupted)?;
+    for (groups, group_envs, link) in GROUPED {
+        let (remote, local) = compare_groups(groups, group_envs, link, window_s, interrupted)?;
         rows.push(Measurement {
-            case: format!("walk over Zenoh, {GROUPS} groups of {GROUP_ENVS} envs in flight{}", link.suffix()),
-            value: remote.per_second * (GROUPS * GROUP_ENVS) as f64,
+            case: format!("walk over Zenoh, {groups} groups of {group_envs} envs in flight{}", link.suffix()),
+            value: remote.per_second * (groups * group_envs) as f64,
             unit: "env-steps/s",
-            reference: Some(format!("{} envs in process", GROUPS * GROUP_ENVS)),
+            reference: Some(format!("{} envs in process", groups * group_envs)),
             ratio: Some(remote.per_second / local.per_second),
         });
     }
@@ -49,10 +49,16 @@ pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measuremen
 }
 
 /// Compares groups in flight with as many environments in process. One call steps every environment once.
-fn compare_groups(link: Link, window_s: f64, interrupted: Interrupted) -> Result<(Throughput, Throughput), BenchError> {
-    let num_envs = GROUPS * GROUP_ENVS;
+fn compare_groups(
+    groups: usize,
+    group_envs: usize,
+    link: Link,
+    window_s: f64,
+    interrupted: Interrupted,
+) -> Result<(Throughput, Throughput), BenchError> {
+    let num_envs = groups * group_envs;
     let server = link.server(&[])?;
-    let mut remote = GroupedVecEnv::connect(&server.options(num_envs), GROUPS).map_err(failed)?;
+    let mut remote = GroupedVecEnv::connect(&server.options(num_envs), groups).map_err(failed)?;
     let mut local = SimEnvFactory::new(Config::default())
         .and_then(|host| host.build(num_envs, AutoresetMode::NextStep, None))
         .map_err(failed)?;
@@ -60,9 +66,9 @@ fn compare_groups(link: Link, window_s: f64, interrupted: Interrupted) -> Result
     remote.reset(&request).map_err(failed)?;
     local.reset(&request).map_err(failed)?;
     let policy_dt = remote.spec().policy_dt as f32;
-    let actions = |steps: u32| trot::action(steps as f32 * policy_dt).repeat(GROUP_ENVS);
+    let actions = |steps: u32| trot::action(steps as f32 * policy_dt).repeat(group_envs);
     let (mut remote_steps, mut local_steps) = (0, 0);
-    for group in 0..GROUPS {
+    for group in 0..groups {
         remote.send(group, &actions(remote_steps)).map_err(failed)?;
     }
     let (mut ours, mut reference) = (Vec::new(), Vec::new());
@@ -70,7 +76,7 @@ fn compare_groups(link: Link, window_s: f64, interrupted: Interrupted) -> Result
         check(interrupted)?;
         ours.push(pace(window_s, || {
             remote_steps += 1;
-            for group in 0..GROUPS {
+            for group in 0..groups {
                 remote.recv(group).map_err(failed)?;
                 remote.send(group, &actions(remote_steps)).map_err(failed)?;
             }

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use twinstep_agent::{BoundPolicy, Control, LoadedPolicy, RunPlan, run};
+use twinstep_agent::{BoundPolicy, Control, LoadedPolicy, RunPlan, Status, run};
 use twinstep_env_server::EnvFactory;
 use twinstep_model::{AutoresetMode, VecEnv};
 use twinstep_robot::{RobotHandle, State};
@@ -41,7 +41,8 @@ fn run_when_ready(mut env: Box<dyn VecEnv>, mut policy: BoundPolicy, handle: &Ro
         if handle.wait_until(PATIENCE, |board| board.state == Some(State::Ready)).state != Some(State::Ready) {
             continue;
         }
-        let mut control = |_: &_| if handle.is_ending() { Control::End } else { Control::Step(None) };
+        let mut control =
+            |_: &Status, _: &dyn VecEnv| if handle.is_ending() { Control::End } else { Control::Step(None) };
         if let Err(error) = run(&mut *env, &mut policy, None, plan, &mut control) {
             tracing::warn!("the policy stopped: {error}");
         }

@@ -18,6 +18,8 @@ use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::fake_process::FakeProcess;
 use crate::onboard_policy::OnboardPolicy;
 use crate::robot_env_factory::RobotEnvFactory;
+use crate::robot_view::RobotView;
+use crate::web_view::ViewArgs;
 use crate::{operator, operator_screen};
 
 /// Largest `safety.state_timeout_ms` with a real robot.
@@ -72,6 +74,8 @@ pub struct Args {
     /// Zenoh configuration file (JSON5) for TLS, users and access control; see examples/security.
     #[arg(long, value_name = "FILE")]
     zenoh: Option<PathBuf>,
+    #[command(flatten)]
+    view: ViewArgs,
 }
 
 /// The config file of a robot.
@@ -127,7 +131,13 @@ pub fn run(args: &Args) -> CommandResult {
     let dds = Dds::join(domain, address).map_err(input)?;
     let control = control_loop::start(&robot, config.safety, &dds, handle.clone(), recorder).map_err(input)?;
     let watch = watch::start(&dds, handle.clone()).map_err(other)?;
-    let outcome = args.serve(&config.server, robot, task, &handle, &signals);
+    let view = RobotView::start(&args.view, &robot, &handle);
+    let outcome = view.and_then(|view| {
+        let outcome = args.serve(&config.server, robot, task, &handle, &signals);
+        handle.end();
+        view.into_iter().for_each(RobotView::join);
+        outcome
+    });
     handle.end();
     let _ = (control.join(), watch.join());
     let recorded = recorder_thread.map_or(Ok(()), |thread| thread.join().unwrap_or(Ok(())));

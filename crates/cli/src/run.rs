@@ -11,8 +11,10 @@ use twinstep_excite::CommandSequence;
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::run_view::RunView;
 use crate::status_line::StatusLine;
 use crate::velocity_input::VelocityInput;
+use crate::web_view::ViewArgs;
 
 /// Run a policy on a robot, simulated or real, and record a log.
 ///
@@ -25,7 +27,8 @@ use crate::velocity_input::VelocityInput;
 /// however the run ends.
 ///
 /// Keys: W S or up down: forward, backward; A D: left, right; left right: turn; space: stop; q or Esc: end.
-/// Gamepad: left stick forward, backward, left, right; right stick: turn.
+/// Gamepad: left stick forward, backward, left, right; right stick: turn. With --view and no other velocity command, the page
+/// has sliders for it; before they are moved, the endpoint's own commands hold.
 ///
 /// Examples: `twinstep run data/policies/walk.safetensors --velocity 0.5,0,0 --seconds 20 --log walk` and
 /// `twinstep run policy.onnx --mapping data/policies/mappings/isaaclab_go2_flat.toml --keyboard`
@@ -73,6 +76,8 @@ pub struct Args {
     /// Print the summary as one JSON object on stdout.
     #[arg(long)]
     pub json: bool,
+    #[command(flatten)]
+    pub view: ViewArgs,
 }
 
 /// Output of `--json`.
@@ -131,7 +136,8 @@ pub fn record(args: &Args, signals: &Signals) -> Result<Recording, Failure> {
     }
     let mut recorder = args.recorder(&mut env, signals)?;
     let velocity = args.velocity_source(commands)?;
-    let result = args.steps(&mut env, &mut policy, recorder.as_mut(), &velocity, signals);
+    let view = RunView::open(&args.view, &mut env, matches!(velocity, Velocity::Endpoint))?;
+    let result = args.steps(&mut env, &mut policy, recorder.as_mut(), (&velocity, view.as_ref()), signals);
     let device_failure = if let Velocity::Person(device) = &velocity { device.failure() } else { None };
     // Restores the terminal before anything is printed.
     drop(velocity);
@@ -198,24 +204,25 @@ impl Args {
         env: &mut RemoteVecEnv,
         policy: &mut BoundPolicy,
         recorder: Option<&mut Recorder>,
-        velocity: &Velocity,
+        (velocity, view): (&Velocity, Option<&RunView>),
         signals: &Signals,
     ) -> Result<RunSummary, AgentError> {
         let (mut line, mut falls) = (StatusLine::new(), 0);
         // A robot sets the pace itself.
         let real_time = !self.fast && !env.is_real_time();
         let plan = RunPlan { seconds: self.seconds, real_time, seed: self.seed };
-        let mut control = |status: &Status| {
+        let mut control = |status: &Status, env: &dyn VecEnv| {
             if status.falls > falls {
                 falls = status.falls;
                 line.message(&format!("{:.2} s: the robot has fallen and is reset", status.seconds));
             }
             line.show(|| status_text(status));
+            view.inspect(|view| view.show(status, env));
             if !matches!(signals.check(), Ok(false)) {
                 return Control::End;
             }
             match velocity {
-                Velocity::Endpoint => Control::Step(None),
+                Velocity::Endpoint => Control::Step(view.and_then(RunView::velocity)),
                 Velocity::Constant(command) => Control::Step(Some(*command)),
                 Velocity::Sequence(sequence) if status.seconds > sequence.duration_s() - 1e-6 => Control::End,
                 Velocity::Sequence(sequence) => Control::Step(Some(sequence.at(status.seconds))),

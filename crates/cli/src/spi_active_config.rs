@@ -9,6 +9,7 @@ use twinstep_policy::Policy;
 
 use crate::exit::{Failure, input};
 use crate::robot_file::analytic_model;
+use crate::web_view::ViewArgs;
 use crate::{excite, identify, run};
 
 /// How the commands after the first stage are chosen.
@@ -216,6 +217,7 @@ impl SpiActiveConfig {
             fast: self.fast,
             seed: self.seed,
             json: false,
+            view: ViewArgs::default(),
         }
     }
 

@@ -194,7 +194,7 @@ fn after_key(command: [f32; 3], key: Key) -> [f32; 3] {
 }
 
 /// Returns lowest and highest velocity command: the range of the task's own commands.
-fn limits() -> [[f32; 2]; 3] {
+pub fn limits() -> [[f32; 2]; 3] {
     let ranges = WalkConfig::default().command;
     [ranges.linear_velocity_x, ranges.linear_velocity_y, ranges.angular_velocity_z]
 }

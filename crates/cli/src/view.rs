@@ -17,7 +17,7 @@ use crate::{view_log, view_policy};
 /// once per segment with a fixed one. The curves are the errors joint by joint.
 ///
 /// It prints the address of the page. On a remote machine: `ssh -L 7480:localhost:7480 HOST`, then http://localhost:7480.
-/// `twinstep serve --view` and `train --view` show their robots.
+/// `twinstep serve`, `train`, `run` and `robot` show their robots with --view.
 ///
 /// Examples: `twinstep view data/policies/walk.safetensors --robots 16` and `twinstep view walk.mcap --model extended.toml`
 #[derive(clap::Args)]

@@ -6,12 +6,13 @@ use std::time::{Duration, Instant};
 use twinstep_agent::{BoundPolicy, LoadedPolicy, PolicyInput};
 use twinstep_env_server::{Config, EnvFactory, ServerConfig, SimEnvFactory};
 use twinstep_envs::TaskConfig;
-use twinstep_model::{AutoresetMode, EnvSpec, ResetRequest, VecEnv};
+use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
 use twinstep_sim::{Engine, SimConfig};
 use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo};
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::serve::engine;
+use crate::velocity_input;
 use crate::web_view::PageArgs;
 
 /// Time without a page or while paused between two looks at the requests.
@@ -50,7 +51,7 @@ pub fn run(path: &Path, model: Option<&Path>, args: &WalkArgs, page: &PageArgs, 
     let limits = factory.robot().torque_limits();
     let scene = SceneInfo {
         is_interactive: true,
-        velocity_bounds: velocity_bounds(env.spec()),
+        velocity_bounds: env.spec().observation_field("velocity_command").map(|_| velocity_input::limits()),
         ..SceneInfo::new(path.display().to_string(), &env.scene(0).map_err(other)?, limits)
     };
     let page = page.open(scene)?;
@@ -74,13 +75,6 @@ fn factory(
     };
     config.check().map_err(input)?;
     SimEnvFactory::new(config).map_err(input)
-}
-
-/// Returns the bounds of the velocity command; `None` if the task has none.
-fn velocity_bounds(spec: &EnvSpec) -> Option<[[f32; 2]; 3]> {
-    let ranges = twinstep_envs::WalkConfig::default().command;
-    let bounds = [ranges.linear_velocity_x, ranges.linear_velocity_y, ranges.angular_velocity_z];
-    spec.observation_field("velocity_command").map(|_| bounds)
 }
 
 struct PolicyWalk {

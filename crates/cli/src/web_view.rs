@@ -1,4 +1,4 @@
-//! Options and start of a browser view: `--view` of `serve` and `train`, and `twinstep view`.
+//! Options and start of a browser view: `--view` of `serve`, `train`, `run` and `robot`, and `twinstep view`.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -16,7 +16,7 @@ const DEFAULT_ADDRESS: &str = "127.0.0.1:7480";
 /// Options of commands whose robots can be looked at.
 #[derive(Default, clap::Args)]
 pub struct ViewArgs {
-    /// Show the robots in the browser at this address, up to 64 of them. They are looked at only. Over ssh:
+    /// Show the robots in the browser at this address, up to 64 of them. Over ssh:
     /// `ssh -L 7480:localhost:7480 HOST`. Default address: 127.0.0.1:7480.
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = DEFAULT_ADDRESS)]
     view: Option<SocketAddr>,
@@ -52,10 +52,16 @@ pub struct Page {
 impl ViewArgs {
     /// Serves the page of robots like that of `env`, if there is to be one. `env` is reset.
     pub fn open(&self, title: &str, env: &mut dyn VecEnv, torque_limits: PerJoint) -> Result<Option<Page>, Failure> {
-        let Some(address) = self.view else { return Ok(None) };
+        if !self.is_wanted() {
+            return Ok(None);
+        }
         env.reset(&ResetRequest::default()).map_err(other)?;
-        let scene = SceneInfo::new(title, &env.scene(0).map_err(other)?, torque_limits);
-        Page::open(address, self.view_token.clone(), scene).map(Some)
+        self.serve(SceneInfo::new(title, &env.scene(0).map_err(other)?, torque_limits))
+    }
+
+    /// Serves the page of this scene, if there is to be one.
+    pub fn serve(&self, scene: SceneInfo) -> Result<Option<Page>, Failure> {
+        self.view.map(|address| Page::open(address, self.view_token.clone(), scene)).transpose()
     }
 
     /// Returns true if there is to be a page.

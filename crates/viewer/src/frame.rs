@@ -19,9 +19,9 @@ pub struct SceneInfo {
     pub torque_limits: PerJoint,
     /// True if every robot has a second pose, that of a simulation under the same commands.
     pub has_ghost: bool,
-    /// True if the page may pause, change the speed and, with a velocity command, walk and push the robots.
+    /// True if the page may pause, change the speed and, with a velocity command, push the robots and begin a new episode.
     pub is_interactive: bool,
-    /// Bounds of the velocity command: forward [m/s], left [m/s], yaw rate [rad/s]. `None` if there is no command.
+    /// Bounds of the velocity command of the page: forward [m/s], left [m/s], yaw rate [rad/s]. `None` if it has none.
     pub velocity_bounds: Option<[[f32; 2]; 3]>,
 }
 

@@ -93,10 +93,14 @@ impl Hub {
         self.requests.lock().unwrap_or_else(PoisonError::into_inner).drain(..).collect()
     }
 
-    /// Adds the request of a page. Returns false if too many wait, or if the scene has no controls.
+    /// Adds the request of a page. Returns false if too many wait, or if the scene has no such control.
     pub(crate) fn request(&self, request: PageRequest) -> bool {
         let mut requests = self.requests.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_taken = self.scene.is_interactive && requests.len() < CAPACITY;
+        let is_allowed = match request {
+            PageRequest::Velocity(_) => self.scene.velocity_bounds.is_some(),
+            _ => self.scene.is_interactive,
+        };
+        let is_taken = is_allowed && requests.len() < CAPACITY;
         if is_taken {
             requests.push_back(request);
         }

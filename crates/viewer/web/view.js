@@ -313,13 +313,14 @@ function showPlayback(playback, time) {
 }
 
 function connectControls() {
-  if (!info.is_interactive) return;
+  if (!info.is_interactive && !info.velocity_bounds) return;
   $('controls').hidden = false;
+  ['playback', 'robots'].forEach((group) => { $(group).hidden = !info.is_interactive; });
   $('pause').onclick = () => ask({ pause: !isPaused });
   $('speed').onchange = () => ask({ speed: Number($('speed').value) });
   $('seek').oninput = () => { isSeeking = true; ask({ seek: Number($('seek').value) }); };
   $('seek').onchange = () => { isSeeking = false; };
-  if (!info.velocity_bounds) return;
+  if (!info.velocity_bounds) { $('robots').hidden = true; return; }
   $('velocity').hidden = false;
   const sliders = ['vx', 'vy', 'wz'].map($);
   sliders.forEach((slider, axis) => {
