@@ -38,7 +38,7 @@ const FILM_STEPS: usize = 4;
 ///   robust    robots, ground, pushes and delay at once
 ///
 /// Without --engine the nominal robot is also simulated in rapier, which no policy is trained in. `--engine mujoco`
-/// needs `pip install "twinstep[mujoco]"` and simulates a thousand env-steps per second, without rough ground and delay.
+/// needs `pip install "twinstep[mujoco]"` and simulates a thousand env-steps per second.
 ///
 /// Examples: `twinstep evaluate-policy walk/policy.safetensors` and
 /// `twinstep evaluate-policy walk/policy.safetensors --engine mujoco --robots 64`
@@ -114,17 +114,14 @@ fn conditions(engine: Option<Engine>) -> Vec<Condition> {
     if engine.is_none() {
         conditions.insert(1, Condition { engine: Engine::Rapier, ..condition("nominal", calm) });
     }
-    // MuJoCo simulates neither our rough terrain nor the delay.
-    if first != Engine::Mujoco {
-        let terrain = Terrain::Rough(RoughTerrain { height_m: 0.03, cell_m: 0.3, size_m: 40.0, seed: 1 });
-        let command_delay_ms = [0.0, 20.0];
-        let robust = Randomisation { push_m_s, command_delay_ms, ..robots };
-        conditions.extend([
-            Condition { terrain, ..condition("ground", calm) },
-            condition("delay", Randomisation { command_delay_ms, ..calm }),
-            Condition { terrain, ..condition("robust", robust) },
-        ]);
-    }
+    let terrain = Terrain::Rough(RoughTerrain { height_m: 0.03, cell_m: 0.3, size_m: 40.0, seed: 1 });
+    let command_delay_ms = [0.0, 20.0];
+    let robust = Randomisation { push_m_s, command_delay_ms, ..robots };
+    conditions.extend([
+        Condition { terrain, ..condition("ground", calm) },
+        condition("delay", Randomisation { command_delay_ms, ..calm }),
+        Condition { terrain, ..condition("robust", robust) },
+    ]);
     conditions
 }
 

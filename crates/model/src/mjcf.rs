@@ -2,18 +2,23 @@
 
 use std::fmt::Write as _;
 
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DQuat, DVec3, Vec3};
 
 use crate::kinematics::FIXED_BASE_HEIGHT;
 use crate::{
-    ActuatorParams, BaseMount, Ground, InitialState, Joint, JointKind, JointModel, Leg, RigidBody, RobotModel,
+    ActuatorParams, BaseMount, Ground, HeightField, InitialState, Joint, JointKind, JointModel, Leg, RigidBody,
+    RobotModel,
 };
 
 /// Gravity of the model [m/s²].
 const GRAVITY: f64 = 9.81;
+/// Thickness of a height field below its lowest point [m].
+const FIELD_BASE: f64 = 0.5;
+/// Distance of the plane around a height field below z = 0 [m].
+const PLANE_BELOW_FIELD: f64 = 0.001;
 
 /// Options of a MuJoCo model.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct MjcfOptions {
     /// Mount of the base.
     pub base: BaseMount,
@@ -21,14 +26,14 @@ pub struct MjcfOptions {
     pub timestep: f64,
     /// Type of the twelve actuators, which determines the meaning of `ctrl`.
     pub actuator: MjcfActuator,
-    /// Angle by which the ground rises along x [rad].
-    pub slope: f64,
+    /// The ground. Around a height field it is the plane z = 0, at which the field's edge is expected.
+    pub ground: Ground,
 }
 
 impl Default for MjcfOptions {
     /// Floating base, torque control, 1 kHz, level ground.
     fn default() -> Self {
-        Self { base: BaseMount::Floating, timestep: 0.001, actuator: MjcfActuator::Torque, slope: 0.0 }
+        Self { base: BaseMount::Floating, timestep: 0.001, actuator: MjcfActuator::Torque, ground: Ground::FLAT }
     }
 }
 
@@ -47,7 +52,7 @@ pub enum MjcfActuator {
     },
 }
 
-/// Returns the MuJoCo model (MJCF, XML) of `robot` on a plane through the origin.
+/// Returns the MuJoCo model (MJCF, XML) of `robot` on the ground of `options`.
 ///
 /// The trunk is named `trunk`, and each link has the name of its joint. The contact points are those of the batch
 /// engine: a sphere at the foot, a sphere at each end of the calf's capsule, and the corners of the trunk's box. There
@@ -71,26 +76,69 @@ pub fn mjcf(robot: &RobotModel, options: &MjcfOptions) -> String {
     );
     defaults(&mut xml, robot, options.timestep);
     let height = base_height(robot, options.base);
+    if let Some(field) = &options.ground.height_field {
+        height_field(&mut xml, field);
+    }
     xml.open("worldbody", &[]);
     xml.leaf("light", &[("pos", numbers([0.0, 0.0, 3.0])), ("directional", "true".to_owned())]);
-    let mut ground = vec![
-        ("name", "ground".to_owned()),
-        ("type", "plane".to_owned()),
-        ("size", numbers([0.0, 0.0, 0.05])),
-        ("contype", "1".to_owned()),
-        ("conaffinity", "0".to_owned()),
-    ];
-    if options.slope != 0.0 {
-        let (sin, cos) = (-0.5 * options.slope).sin_cos();
-        ground.push(("quat", numbers([cos, 0.0, sin, 0.0])));
-    }
-    xml.leaf("geom", &ground);
+    ground(&mut xml, &options.ground);
     trunk(&mut xml, robot, options.base, height);
     xml.close("worldbody");
     actuators(&mut xml, robot, options.actuator);
     keyframe(&mut xml, robot, options.base, height);
     xml.close("mujoco");
     xml.text
+}
+
+/// Adds the heights. MuJoCo stretches them to the range 0 to 1, and reads the row with the largest y first.
+fn height_field(xml: &mut Xml, field: &HeightField) {
+    let ([rows, columns], [low, high]) = (field.shape(), height_range(field));
+    let size = |count: usize| 0.5 * f64::from(field.cell_size()) * (count - 1) as f64;
+    let row = |column: usize| (0..rows).map(move |row| f64::from(field.heights()[row * columns + column]));
+    xml.open("asset", &[]);
+    xml.leaf(
+        "hfield",
+        &[
+            ("name", "heights".to_owned()),
+            ("nrow", columns.to_string()),
+            ("ncol", rows.to_string()),
+            ("size", numbers([size(rows), size(columns), (high - low).max(1e-6), FIELD_BASE])),
+            ("elevation", numbers((0..columns).rev().flat_map(row))),
+        ],
+    );
+    xml.close("asset");
+}
+
+/// Returns the lowest and the highest height [m].
+fn height_range(field: &HeightField) -> [f64; 2] {
+    let heights = field.heights().iter().map(|height| f64::from(*height));
+    heights.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], height| [low.min(height), high.max(height)])
+}
+
+fn ground(xml: &mut Xml, ground: &Ground) {
+    let collides = [("contype", "1".to_owned()), ("conaffinity", "0".to_owned())];
+    let mut point = Vec3::from(ground.point).as_dvec3();
+    if let Some(field) = &ground.height_field {
+        let centre = |axis: usize| {
+            let length = f64::from(field.cell_size()) * (field.shape()[axis] - 1) as f64;
+            f64::from(field.origin()[axis]) + 0.5 * length
+        };
+        let place = numbers([centre(0), centre(1), height_range(field)[0]]);
+        let named = [("name", "heights".to_owned()), ("type", "hfield".to_owned()), ("hfield", "heights".to_owned())];
+        xml.leaf("geom", &named.into_iter().chain([("pos", place)]).chain(collides.clone()).collect::<Vec<_>>());
+        // So that a foot does not touch both.
+        point.z -= PLANE_BELOW_FIELD;
+    }
+    let size = ("size", numbers([0.0, 0.0, 0.05]));
+    let mut plane = vec![("name", "ground".to_owned()), ("type", "plane".to_owned()), size];
+    if point != DVec3::ZERO {
+        plane.push(("pos", numbers(point.to_array())));
+    }
+    let rotation = DQuat::from_rotation_arc(DVec3::Z, Vec3::from(ground.normal).as_dvec3().normalize());
+    if rotation != DQuat::IDENTITY {
+        plane.push(("quat", numbers([rotation.w, rotation.x, rotation.y, rotation.z])));
+    }
+    xml.leaf("geom", &plane.into_iter().chain(collides).collect::<Vec<_>>());
 }
 
 fn base_height(robot: &RobotModel, base: BaseMount) -> f64 {
@@ -315,6 +363,24 @@ mod tests {
         let mass: f64 =
             values(&xml, "inertial", "mass").into_iter().map(|mass| mass.parse::<f64>().expect("a number")).sum();
         assert!((mass - go2().total_mass()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn heights_have_their_range_as_size_and_the_largest_y_first() {
+        // Three rows along x, two columns along y.
+        let heights = vec![0.1, 0.2, 0.3, 0.4, 0.5, 0.6];
+        let field = HeightField::new([1.0, 2.0], 0.5, [3, 2], heights).expect("valid");
+        let ground = Ground { height_field: Some(field.into()), ..Ground::FLAT };
+        let xml = model(MjcfOptions { ground, ..MjcfOptions::default() });
+        let rounded = |attribute: &str| {
+            let numbers = values(&xml, "hfield", attribute)[0].split(' ').map(str::parse::<f64>);
+            numbers.map(|number| (1e6 * number.expect("a number")).round() / 1e6).collect::<Vec<_>>()
+        };
+        assert_eq!((values(&xml, "hfield", "nrow"), values(&xml, "hfield", "ncol")), (vec!["2"], vec!["3"]));
+        assert_eq!(rounded("size"), [0.5, 0.25, 0.5, FIELD_BASE]);
+        assert_eq!(rounded("elevation"), [0.2, 0.4, 0.6, 0.1, 0.3, 0.5]);
+        let places: Vec<_> = values(&xml, "geom", "pos")[0].split(' ').collect();
+        assert_eq!((places[0], places[1]), ("1.5", "2.25"));
     }
 
     #[test]

@@ -5,11 +5,11 @@ use twinstep_model::{ActuatorParams, Command, InitialState, PerJoint, RobotModel
 /// Returns the name of an effect of `robot` that MuJoCo does not simulate. Returns `None` if it simulates all.
 ///
 /// Its model (MJCF) has bodies, armature, viscous and Coulomb friction, springs, torque gains and the ground. Gains of the
-/// PD loop, offsets of the sensors and derating are added by [`Adjustments`].
+/// PD loop, offsets of the sensors and derating are added by [`Adjustments`], delays of commands by
+/// [`CommandDelay`](super::delay::CommandDelay).
 pub fn unsupported(robot: &RobotModel) -> Option<&'static str> {
     robot.joints.iter().find_map(|joint| {
         let ActuatorParams {
-            command_delay,
             saturation,
             torque_delay,
             no_load_speed,
@@ -18,7 +18,8 @@ pub fn unsupported(robot: &RobotModel) -> Option<&'static str> {
             ripple,
             backlash,
             gear_stiffness,
-            // In the model, or in `Adjustments`. The delay of the logged torque acts where a log is replayed.
+            // In the model, in `CommandDelay` or in `Adjustments`. The delay of the logged torque acts where a log is replayed.
+            command_delay: _,
             encoder_offset: _,
             kp_scale: _,
             kd_scale: _,
@@ -26,7 +27,6 @@ pub fn unsupported(robot: &RobotModel) -> Option<&'static str> {
             sensor_delay: _,
         } = joint.actuator;
         let present = [
-            ("command_delay", command_delay != 0.0),
             ("torque_saturation", saturation.is_finite()),
             ("torque_delay", torque_delay != 0.0),
             ("torque_speed_limit", no_load_speed.is_finite()),

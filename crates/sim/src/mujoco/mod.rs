@@ -4,6 +4,7 @@
 //! limits and friction. It computes the torque of the PD loop once per actuator period. A step of all robots is one
 //! request with the commands and one reply with the states ([`frames`]).
 
+mod delay;
 mod effects;
 mod frames;
 mod process;
@@ -17,7 +18,8 @@ use twinstep_model::{
 };
 
 use crate::rapier::check_lengths;
-use crate::{BackendBuildError, SimConfig, SimConfigError, Terrain};
+use crate::{BackendBuildError, SimConfig};
+use delay::CommandDelay;
 use effects::{Adjustments, unsupported};
 use frames::{PUSH, RESET, Reset, STATES, STEP, Settings};
 use process::Process;
@@ -31,11 +33,12 @@ const ENGINE: &str = "mujoco";
 pub struct MujocoBackend {
     robot: RobotModel,
     options: MjcfOptions,
-    ground: Ground,
     process: Process,
     states: RobotStates,
     /// Effects of each robot that are not in its MuJoCo model.
     adjustments: Vec<Adjustments>,
+    /// Delay of the commands of each robot, if there is one.
+    delays: Vec<Option<CommandDelay>>,
 }
 
 impl MujocoBackend {
@@ -56,12 +59,13 @@ impl MujocoBackend {
     ) -> Result<Self, BackendBuildError> {
         config.check(&robot.control)?;
         let config = config.at_actuator_rate(&robot.control);
-        let slope = slope(config.terrain)?;
         if let Some(effect) = unsupported(&robot) {
             return Err(BackendBuildError::Effect { engine: ENGINE, effect });
         }
         let timestep = 1.0 / f64::from(config.physics_hz());
-        let options = MjcfOptions { base: config.base, timestep, actuator: MjcfActuator::Torque, slope };
+        let ground = config.terrain.ground();
+        let initial_state = InitialState::standing_on(&ground, &robot, robot.control.default_pose_f32(), 0.0);
+        let options = MjcfOptions { base: config.base, timestep, actuator: MjcfActuator::Torque, ground };
         let settings = Settings {
             robots: num_robots,
             threads: config.threads,
@@ -70,10 +74,9 @@ impl MujocoBackend {
         };
         let process = Process::start(python, &frames::hello(&settings, &mjcf(&robot, &options)))
             .map_err(|reason| BackendBuildError::Mujoco { python: PathBuf::from(python), reason })?;
-        let ground = config.terrain.ground();
-        let initial_state = InitialState::standing_on(&ground, &robot, robot.control.default_pose_f32(), 0.0);
         let (states, adjustments) = (RobotStates::new(num_robots), vec![Adjustments::new(&robot); num_robots]);
-        let mut this = Self { robot, options, ground, process, states, adjustments };
+        let delays = vec![None; num_robots];
+        let mut this = Self { robot, options, process, states, adjustments, delays };
         let standing: Vec<_> = (0..num_robots).map(|robot| (robot, initial_state)).collect();
         this.reset(&standing)
             .map_err(|error| BackendBuildError::Mujoco { python: PathBuf::from(python), reason: error.to_string() })?;
@@ -105,6 +108,14 @@ impl MujocoBackend {
         Ok(())
     }
 
+    /// Advances the active robots by some actuator periods with constant commands.
+    fn advance(&mut self, commands: &[Command], active: &[bool], periods: usize) -> Result<(), BackendError> {
+        let adjusted =
+            commands.iter().zip(&self.adjustments).map(|(command, adjustments)| adjustments.command(command));
+        let body = frames::step(&adjusted.collect::<Vec<_>>(), active, periods);
+        self.request(STEP, &body, &(0..self.num_robots()).collect::<Vec<_>>())
+    }
+
     /// Resets robots to initial states. An empty model is the nominal one.
     fn reset_robots(&mut self, robots: &[(usize, InitialState)], mjcf: &str) -> Result<(), BackendError> {
         let true_states: Vec<_> =
@@ -117,19 +128,6 @@ impl MujocoBackend {
             self.states.measured.stamp[robot] = 0.0;
         }
         Ok(())
-    }
-}
-
-/// Returns the slope of the terrain along x [rad].
-fn slope(terrain: Terrain) -> Result<f64, SimConfigError> {
-    match terrain {
-        Terrain::Flat => Ok(0.0),
-        Terrain::SlopeRad(angle) => Ok(f64::from(angle)),
-        Terrain::Rough(_) => Err(SimConfigError {
-            field: "terrain",
-            value: "rough".to_owned(),
-            allowed: "with engine `mujoco`, flat or slope_rad".to_owned(),
-        }),
     }
 }
 
@@ -147,7 +145,7 @@ impl Backend for MujocoBackend {
     }
 
     fn ground(&self) -> Ground {
-        self.ground.clone()
+        self.options.ground.clone()
     }
 
     fn reset(&mut self, initial_states: &[(usize, InitialState)]) -> Result<(), BackendError> {
@@ -155,8 +153,9 @@ impl Backend for MujocoBackend {
             self.check_index(*robot)?;
         }
         let nominal = Adjustments::new(&self.robot);
-        for (robot, _) in initial_states {
+        for (robot, initial_state) in initial_states {
             self.adjustments[*robot] = nominal;
+            self.delays[*robot] = CommandDelay::new(&self.robot, &initial_state.q);
         }
         self.reset_robots(initial_states, "")
     }
@@ -172,6 +171,7 @@ impl Backend for MujocoBackend {
             return Err(BackendError::UnsupportedEffect { robot, engine: ENGINE, effect });
         }
         self.adjustments[robot] = Adjustments::new(model);
+        self.delays[robot] = CommandDelay::new(model, &initial_state.q);
         self.reset_robots(&[(robot, *initial_state)], &mjcf(model, &self.options))
     }
 
@@ -186,12 +186,21 @@ impl Backend for MujocoBackend {
     fn step(&mut self, commands: &[Command], active: &[bool], actuator_periods: usize) -> Result<(), BackendError> {
         let num_robots = self.num_robots();
         check_lengths(commands, active, num_robots)?;
-        let commands: Vec<_> =
-            commands.iter().zip(&self.adjustments).map(|(command, adjustments)| adjustments.command(command)).collect();
-        let all: Vec<_> = (0..num_robots).collect();
-        self.request(STEP, &frames::step(&commands, active, actuator_periods), &all)?;
+        if self.delays.iter().all(Option::is_none) {
+            self.advance(commands, active, actuator_periods)?;
+        } else {
+            let mut arrived = commands.to_vec();
+            for _ in 0..actuator_periods {
+                for (robot, delay) in self.delays.iter_mut().enumerate().filter(|(robot, _)| active[*robot]) {
+                    if let Some(delay) = delay {
+                        arrived[robot] = delay.next(&commands[robot]);
+                    }
+                }
+                self.advance(&arrived, active, 1)?;
+            }
+        }
         let elapsed = actuator_periods as f64 * self.robot.control.actuator_dt();
-        let stepped: Vec<_> = all.into_iter().filter(|robot| active[*robot]).collect();
+        let stepped: Vec<_> = (0..num_robots).filter(|robot| active[*robot]).collect();
         for robot in &stepped {
             self.states.measured.stamp[*robot] += elapsed;
         }
