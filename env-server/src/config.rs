@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use twinstep_envs::{Randomisation, TaskConfig};
-use twinstep_sim::{Engine, SimConfig};
+use twinstep_sim::SimConfig;
 
 /// The config file of a server: four tables, in which every key is optional.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -159,13 +159,9 @@ impl Config {
         }
         self.task.check()?;
         self.randomise.check()?;
-        let Randomisation { push_m_s, command_delay_ms, .. } = self.randomise;
+        let push_m_s = self.randomise.push_m_s;
         if self.randomise.has_pushes() && self.sim.base.is_fixed() {
             return out_of_range("randomise.push_m_s", format!("{push_m_s:?}"), "[0, 0] with a fixed base");
-        }
-        if command_delay_ms[1] > 0.0 && self.sim.engine == Engine::Mujoco {
-            let allowed = "[0, 0] with engine `mujoco`, which does not simulate it; use `batch` or `rapier`";
-            return out_of_range("randomise.command_delay_ms", format!("{command_delay_ms:?}"), allowed);
         }
         Ok(())
     }

@@ -318,6 +318,28 @@ fn effect_that_mujoco_does_not_have_is_rejected_before_its_process_starts() {
     );
 }
 
+#[test]
+fn shipped_policy_walks_in_mujoco_under_every_condition() {
+    let Some(python) = Interpreter::of_tests() else { return };
+    let program = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep();
+    let policy = root().join("data/policies/walk_robust.safetensors");
+    let output = std::process::Command::new(program)
+        .env("TWINSTEP_PYTHON", python.path())
+        .args(["evaluate-policy", policy.to_str().unwrap(), "--engine", "mujoco"])
+        .args(["--robots", "4", "--seconds", "4", "--json"])
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let rows = report["rows"].as_array().unwrap();
+    let conditions: Vec<_> = rows.iter().map(|row| row["condition"].as_str().unwrap()).collect();
+    assert_eq!(conditions, ["nominal", "robots", "pushes", "noise", "ground", "delay", "robust"]);
+    for row in rows {
+        // A robot that stands still has 0.65 m/s.
+        assert!(row["up"].as_f64().unwrap() > 0.7 && row["velocity_rms"].as_f64().unwrap() < 0.4, "{row}");
+    }
+}
+
 /// Returns the ids of the child processes of `process`.
 fn children(process: u32) -> Vec<String> {
     let tasks = std::fs::read_dir(format!("/proc/{process}/task")).unwrap();
