@@ -210,6 +210,23 @@ fn every_effect_acts_as_in_the_batch_engine_or_is_rejected_by_name() {
 fn only_the_robot_that_diverged_is_named_and_it_recovers_at_its_reset() {
     let Some(python) = Interpreter::of_tests() else { return };
     let mut backend = python.backend(go2(), config(), 3);
+    let pose = go2().control.default_pose_f32();
+    let mut late = go2();
+    late.joints[0].actuator.command_delay = 0.0075;
+    // Without a delay a policy step is one request; with one it is a request for each actuator period.
+    for model in [go2(), late] {
+        for robot in 1..3 {
+            backend.reset_with_model(robot, &model, &InitialState::at_rest(0.33, pose)).unwrap();
+        }
+        backend.reset(&[(0, InitialState::at_rest(0.33, pose))]).unwrap();
+        check_divergence(&mut backend);
+    }
+    let unknown = backend.reset(&[(3, InitialState::at_rest(0.33, pose))]).unwrap_err();
+    assert_eq!(unknown, BackendError::RobotOutOfRange { robot: 3, num_robots: 3 });
+}
+
+/// Robot 0 moves, robot 1 diverges, robot 2 is not active; then all move.
+fn check_divergence(backend: &mut MujocoBackend) {
     let mut commands = [hold(); 3];
     commands[1].tau_ff[4] = f32::NAN;
     let error = backend.step(&commands, &[true, true, false], 4).unwrap_err();
@@ -220,8 +237,7 @@ fn only_the_robot_that_diverged_is_named_and_it_recovers_at_its_reset() {
     assert_eq!(states.measured.q[2], go2().control.default_pose_f32(), "an inactive robot does not change");
     backend.reset(&[(1, InitialState::at_rest(0.33, go2().control.default_pose_f32()))]).unwrap();
     backend.step(&[hold(); 3], &[true; 3], 4).unwrap();
-    let unknown = backend.reset(&[(3, InitialState::at_rest(0.33, hold().q))]).unwrap_err();
-    assert_eq!(unknown, BackendError::RobotOutOfRange { robot: 3, num_robots: 3 });
+    assert_eq!(backend.states().measured.stamp, [0.04, 0.02, 0.02]);
 }
 
 #[test]

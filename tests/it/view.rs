@@ -171,10 +171,14 @@ fn page_of_another_site_gets_nothing_and_cannot_move_the_robots() {
 #[test]
 fn address_that_others_can_reach_needs_a_token() {
     let policy = root().join("data/policies/walk.safetensors");
-    let arguments = ["view", policy.to_str().unwrap(), "--listen", "0.0.0.0:0"];
-    let output = Command::new(program()).args(arguments).output().unwrap();
-    let text = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.code() == Some(2) && text.contains("--token"), "{text}");
+    // A run says so before it looks for its endpoint.
+    let (policy, nobody) = (policy.to_str().unwrap(), "tcp/127.0.0.1:9");
+    let run = ["run", policy, "--endpoint", nobody, "--view", "0.0.0.0:0"];
+    for arguments in [&["view", policy, "--listen", "0.0.0.0:0"][..], &run] {
+        let output = Command::new(program()).args(arguments).output().unwrap();
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code() == Some(2) && text.contains("--token"), "{text}");
+    }
     let missing = Command::new(program()).args(["view", "no/such/file"]).output().unwrap();
     assert!(missing.status.code() == Some(2) && String::from_utf8_lossy(&missing.stderr).contains("no/such/file"));
 }
@@ -213,12 +217,20 @@ fn sliders_of_the_page_steer_a_run_and_nothing_else_of_it_can_be_changed() {
         assert!(viewed.ask(&format!("{{\"velocity\":{velocity}}}")).starts_with("HTTP/1.1 204"));
         viewed.wait_for_frame(|header| command(header).is_some_and(|command| (command - expected).abs() < 1e-5));
     }
+    // No page repeats it.
+    viewed.wait_for_frame(|header| command(header).is_some_and(|command| command.abs() < 1e-5));
     let Some(browser) = browser() else { return };
     let mut page = ChromePage::open(&browser, &viewed.url, [1000, 700]);
     page.wait_for("Number(document.body.dataset.frames) > 5", PATIENCE);
     let groups = "['playback', 'velocity', 'robots'].map((group) => document.getElementById(group).hidden).join()";
     assert_eq!(page.evaluate(groups), "true,false,true");
-    page.evaluate("document.getElementById('stop').click()");
+    let is_half = |header: &serde_json::Value| command(header).is_some_and(|command| (command - 0.5).abs() < 1e-5);
+    page.evaluate("document.getElementById('vx').value = 0.5; document.getElementById('vx').oninput()");
+    viewed.wait_for_frame(is_half);
+    // Longer than a run waits for a page.
+    std::thread::sleep(Duration::from_secs(3));
+    viewed.wait_for_frame(is_half);
+    drop(page);
     viewed.wait_for_frame(|header| command(header).is_some_and(|command| command.abs() < 1e-5));
 }
 

@@ -89,7 +89,8 @@ pub fn run(
 ) -> Result<RunSummary, AgentError> {
     let spec = env.spec().clone();
     let layout = Layout::new(&spec);
-    let mut agent = Agent { layout, obs: Vec::new(), critic_obs: Vec::new(), episode: 0, time_steps: 0 };
+    let mut agent =
+        Agent { layout, obs: Vec::new(), critic_obs: Vec::new(), episode: 0, time_steps: 0, uses_commands: false };
     agent.reset(env, policy, &ResetRequest::seeded(plan.seed, 1))?;
     let (mut sums, mut step_time, mut lateness) = (Sums::default(), 0.0, 0.0);
     let mut pacer = Pacer::new(Duration::from_secs_f64(spec.policy_dt));
@@ -113,7 +114,7 @@ pub fn run(
         let ended = agent.step(env, wanted, &action, &mut sums)?;
         step_time = start.elapsed().as_secs_f64();
         sums.add_times(step_time, lateness);
-        agent.check_command(wanted, sums.steps)?;
+        agent.check_command(wanted)?;
         if let Some(recorder) = &mut recorder {
             recorder.write(&action)?;
         }
@@ -133,6 +134,8 @@ struct Agent {
     episode: u64,
     /// Policy periods since the start, with one for each reset.
     time_steps: u64,
+    /// True once the endpoint was seen to use a command.
+    uses_commands: bool,
 }
 
 impl Agent {
@@ -212,13 +215,16 @@ impl Agent {
         Ok(ended)
     }
 
-    /// Checks after the first step that the endpoint uses the commands that it gets.
-    fn check_command(&self, wanted: Option<[f32; 3]>, steps: u64) -> Result<(), AgentError> {
+    /// Checks after the first step with a command that the endpoint uses it.
+    fn check_command(&mut self, wanted: Option<[f32; 3]>) -> Result<(), AgentError> {
         match (self.command(), wanted) {
-            (Some(observed), Some(wanted)) if steps == 1 && observed != wanted => {
+            (Some(observed), Some(wanted)) if !self.uses_commands && observed != wanted => {
                 Err(AgentError::CommandIgnored { observed, wanted })
             }
-            _ => Ok(()),
+            (_, wanted) => {
+                self.uses_commands |= wanted.is_some();
+                Ok(())
+            }
         }
     }
 }

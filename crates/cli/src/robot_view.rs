@@ -30,7 +30,9 @@ impl RobotView {
         let (robot, handle, hub) = (robot.clone(), handle.clone(), Arc::clone(page.hub()));
         let thread = std::thread::Builder::new().name("view".to_owned()).spawn(move || {
             while !handle.is_ending() {
-                publish(&robot, &handle.board(), &hub);
+                if hub.is_due() {
+                    publish(&robot, &handle.board(), &hub);
+                }
                 std::thread::sleep(PERIOD);
             }
         });
@@ -44,13 +46,11 @@ impl RobotView {
 }
 
 fn publish(robot: &RobotModel, board: &Board, hub: &Hub) {
-    let Some((_, reading)) = &board.reading else { return };
-    if !hub.is_due() {
-        return;
-    }
+    let Some((arrived, reading)) = &board.reading else { return };
     let largest = reading.tau.iter().fold(0.0_f32, |largest, tau| largest.max(tau.abs()));
     let hottest = reading.temperature.iter().max().copied().unwrap_or_default();
     let curves = [
+        ("age of the reading [ms]", 1e3 * board.now.saturating_sub(*arrived).as_secs_f64()),
         ("largest torque [N·m]", f64::from(largest)),
         ("hottest motor [°C]", f64::from(hottest)),
         ("tilt [rad]", f64::from(reading.tilt)),

@@ -126,7 +126,8 @@ pub fn record(args: &Args, signals: &Signals) -> Result<Recording, Failure> {
     if let Some(seconds) = args.seconds.filter(|seconds| !(seconds.is_finite() && *seconds > 0.0)) {
         return Err(Failure::Input(miette::miette!("`--seconds` = {seconds} is not allowed: it must be positive")));
     }
-    // Read before anything moves.
+    // Read and checked before anything moves.
+    args.view.check()?;
     let commands = args.commands.as_deref().map(read_commands).transpose()?;
     let loaded = LoadedPolicy::read(&args.policy, args.mapping.as_deref()).map_err(input)?;
     let mut env = RemoteVecEnv::connect(&args.options(signals)).map_err(|error| interrupted(signals, error))?;
@@ -136,7 +137,10 @@ pub fn record(args: &Args, signals: &Signals) -> Result<Recording, Failure> {
     }
     let mut recorder = args.recorder(&mut env, signals)?;
     let velocity = args.velocity_source(commands)?;
-    let view = RunView::open(&args.view, &mut env, matches!(velocity, Velocity::Endpoint))?;
+    if args.view.is_wanted() && recorder.is_none() {
+        env.reset(&ResetRequest::seeded(args.seed, 1)).map_err(|error| interrupted(signals, error))?;
+    }
+    let view = RunView::open(&args.view, &env, matches!(velocity, Velocity::Endpoint))?;
     let result = args.steps(&mut env, &mut policy, recorder.as_mut(), (&velocity, view.as_ref()), signals);
     let device_failure = if let Velocity::Person(device) = &velocity { device.failure() } else { None };
     // Restores the terminal before anything is printed.

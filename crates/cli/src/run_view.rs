@@ -1,58 +1,58 @@
 //! The robot of `twinstep run` in the browser, with sliders for its velocity.
 
 use std::cell::Cell;
+use std::time::{Duration, Instant};
 
 use twinstep_agent::Status;
-use twinstep_model::{ResetRequest, VecEnv, go2};
-use twinstep_viewer::{Frame, PageRequest, RobotFrame, SceneInfo};
+use twinstep_model::{EnvSpec, VecEnv, go2};
+use twinstep_viewer::{Frame, RobotFrame, SceneInfo};
 
-use crate::exit::{Failure, other};
+use crate::exit::Failure;
 use crate::velocity_input;
 use crate::web_view::{Page, ViewArgs};
+
+/// Time without a request of the page after which the robot is to stand. The page sends its velocity every 0.5 s.
+const PAGE_IS_GONE: Duration = Duration::from_secs(2);
 
 /// Page of the robot.
 pub struct RunView {
     page: Page,
-    /// Velocity of the sliders; `None` before they are moved.
-    velocity: Cell<Option<[f32; 3]>>,
+    /// Lowest and highest velocity of the sliders.
+    bounds: Option<[[f32; 2]; 3]>,
+    /// Velocity of the sliders, with the time when it came; `None` before they are moved.
+    velocity: Cell<Option<(Instant, [f32; 3])>>,
 }
 
 impl RunView {
-    /// Serves the page of `env`, which is reset, if there is to be one. It has sliders if `steers`.
-    pub fn open(args: &ViewArgs, env: &mut dyn VecEnv, steers: bool) -> Result<Option<Self>, Failure> {
+    /// Serves the page of `env`, which was reset, if there is to be one. It has sliders if `steers`.
+    pub fn open(args: &ViewArgs, env: &dyn VecEnv, steers: bool) -> Result<Option<Self>, Failure> {
         if !args.is_wanted() {
             return Ok(None);
         }
-        env.reset(&ResetRequest::default()).map_err(other)?;
         let scene = env.scene(0).map_err(|error| {
             Failure::Input(miette::miette!("`--view` has nothing to show: the endpoint gives no scene: {error}"))
         })?;
         let title = format!("twinstep run on {}", env.spec().robot);
-        let has_command = env.spec().observation_field("velocity_command").is_some();
-        let velocity_bounds = (steers && has_command).then(velocity_input::limits);
-        let info = SceneInfo { velocity_bounds, ..SceneInfo::new(title, &scene, go2().torque_limits()) };
+        let bounds = if steers { slider_bounds(env.spec()) } else { None };
+        let info = SceneInfo { velocity_bounds: bounds, ..SceneInfo::new(title, &scene, go2().torque_limits()) };
         let page = args.serve(info)?;
-        Ok(page.map(|page| Self { page, velocity: Cell::new(None) }))
+        Ok(page.map(|page| Self { page, bounds, velocity: Cell::new(None) }))
     }
 
-    /// Returns the velocity command of the sliders; `None` before they are moved.
+    /// Returns the velocity command of the sliders; `None` before they are moved. It is zero once the page is gone.
     pub fn velocity(&self) -> Option<[f32; 3]> {
-        self.velocity.get()
+        let (since, velocity) = self.velocity.get()?;
+        let wanted = if since.elapsed() < PAGE_IS_GONE { velocity } else { [0.0; 3] };
+        let bounds = self.bounds?;
+        Some(std::array::from_fn(|axis| wanted[axis].clamp(bounds[axis][0], bounds[axis][1])))
     }
 
     /// Shows the robot before a step, and takes the requests of the page.
     pub fn show(&self, status: &Status, env: &dyn VecEnv) {
         let hub = self.page.hub();
-        for request in hub.take_requests() {
-            if let PageRequest::Velocity(velocity) = request
-                && velocity.iter().all(|part| part.is_finite())
-            {
-                let limits = velocity_input::limits();
-                let clamped = std::array::from_fn(|axis| velocity[axis].clamp(limits[axis][0], limits[axis][1]));
-                self.velocity.set(Some(clamped));
-            }
+        if let Some(asked) = hub.take_velocity() {
+            self.velocity.set(Some(asked));
         }
-        // A robot that cannot be seen for a moment walks on.
         if hub.is_due()
             && let Ok(scene) = env.scene(0)
         {
@@ -61,6 +61,13 @@ impl RunView {
             hub.publish(&Frame { time: status.seconds, robots: vec![robot], curves: curves(status), playback: None });
         }
     }
+}
+
+/// Returns the velocities that the keyboard has, within those of the endpoint; `None` if it has no velocity command.
+fn slider_bounds(spec: &EnvSpec) -> Option<[[f32; 2]; 3]> {
+    let (_, field) = spec.observation_field("velocity_command").filter(|(_, field)| field.size == 3)?;
+    let bounds = velocity_input::limits().map(|[low, high]| [low.max(field.low), high.min(field.high)]);
+    bounds.iter().all(|[low, high]| low <= high).then_some(bounds)
 }
 
 fn curves(status: &Status) -> Vec<(String, f64)> {

@@ -95,6 +95,9 @@ impl PolicyWalk {
             for request in hub.take_requests() {
                 self.obey(request)?;
             }
+            if let Some((_, velocity)) = hub.take_velocity() {
+                self.steer(velocity);
+            }
             if hub.is_due() {
                 hub.publish(&self.frame()?);
             }
@@ -119,13 +122,6 @@ impl PolicyWalk {
         match request {
             PageRequest::Pause(is_paused) => self.is_paused = is_paused,
             PageRequest::Speed(speed) if speed.is_finite() => self.speed = speed.clamp(SPEEDS[0], SPEEDS[1]),
-            PageRequest::Velocity(command) => {
-                let commands = vec![command; self.policies.len()];
-                // One that is outside the bounds changes nothing.
-                if self.env.set_velocity_commands(&commands).is_ok() {
-                    self.command = Some(command);
-                }
-            }
             PageRequest::Push { robot, velocity } if velocity.iter().all(|part| part.is_finite()) => {
                 // The page may know robots that there are not.
                 let _ = self.env.push(robot, velocity.map(|part| part.clamp(-MAX_PUSH, MAX_PUSH)));
@@ -134,9 +130,16 @@ impl PolicyWalk {
                 self.env.reset(&ResetRequest::default()).map_err(other)?;
                 self.policies.iter_mut().for_each(BoundPolicy::reset);
             }
-            PageRequest::Speed(_) | PageRequest::Push { .. } | PageRequest::Seek(_) => {}
+            PageRequest::Speed(_) | PageRequest::Push { .. } | PageRequest::Seek(_) | PageRequest::Velocity(_) => {}
         }
         Ok(())
+    }
+
+    fn steer(&mut self, command: [f32; 3]) {
+        // One that is outside the bounds changes nothing.
+        if self.env.set_velocity_commands(&vec![command; self.policies.len()]).is_ok() {
+            self.command = Some(command);
+        }
     }
 
     fn step(&mut self) -> CommandResult {

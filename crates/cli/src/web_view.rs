@@ -64,6 +64,11 @@ impl ViewArgs {
         self.view.map(|address| Page::open(address, self.view_token.clone(), scene)).transpose()
     }
 
+    /// Checks that the page can be served.
+    pub fn check(&self) -> Result<(), Failure> {
+        self.view.map_or(Ok(()), |address| WebServer::check(address, self.view_token.as_deref()).map_err(input))
+    }
+
     /// Returns true if there is to be a page.
     pub fn is_wanted(&self) -> bool {
         self.view.is_some()

@@ -47,13 +47,22 @@ pub struct Hub {
     /// Number of the environments that are shown.
     shown: AtomicU64,
     requests: Mutex<VecDeque<PageRequest>>,
+    /// Newest velocity that a page asked for, with the time when it came.
+    velocity: Mutex<Option<(Instant, [f32; 3])>>,
 }
 
 impl Hub {
     /// Returns a hub without a frame.
     pub fn new(scene: SceneInfo) -> Self {
         let latest = watch::Sender::new(Bytes::new());
-        Self { scene, latest, published: Mutex::default(), shown: AtomicU64::new(0), requests: Mutex::default() }
+        Self {
+            scene,
+            latest,
+            published: Mutex::default(),
+            shown: AtomicU64::new(0),
+            requests: Mutex::default(),
+            velocity: Mutex::default(),
+        }
     }
 
     /// Returns a number for environments that are shown from now on, in place of earlier ones.
@@ -88,19 +97,29 @@ impl Hub {
         self.latest.send_replace(frame.to_bytes());
     }
 
-    /// Returns the requests of the pages since the last call.
+    /// Returns the newest velocity that a page asked for since the last call, with the time when it came.
+    pub fn take_velocity(&self) -> Option<(Instant, [f32; 3])> {
+        self.velocity.lock().unwrap_or_else(PoisonError::into_inner).take()
+    }
+
+    /// Returns the other requests of the pages since the last call.
     pub fn take_requests(&self) -> Vec<PageRequest> {
         self.requests.lock().unwrap_or_else(PoisonError::into_inner).drain(..).collect()
     }
 
     /// Adds the request of a page. Returns false if too many wait, or if the scene has no such control.
+    ///
+    /// A velocity replaces the one before it, so that the last one is never refused.
     pub(crate) fn request(&self, request: PageRequest) -> bool {
+        if let PageRequest::Velocity(velocity) = request {
+            let is_taken = self.scene.velocity_bounds.is_some() && velocity.iter().all(|part| part.is_finite());
+            if is_taken {
+                *self.velocity.lock().unwrap_or_else(PoisonError::into_inner) = Some((Instant::now(), velocity));
+            }
+            return is_taken;
+        }
         let mut requests = self.requests.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_allowed = match request {
-            PageRequest::Velocity(_) => self.scene.velocity_bounds.is_some(),
-            _ => self.scene.is_interactive,
-        };
-        let is_taken = is_allowed && requests.len() < CAPACITY;
+        let is_taken = self.scene.is_interactive && requests.len() < CAPACITY;
         if is_taken {
             requests.push_back(request);
         }
@@ -109,5 +128,27 @@ impl Hub {
 
     pub(crate) fn subscribe(&self) -> watch::Receiver<Bytes> {
         self.latest.subscribe()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use twinstep_model::{Ground, Pose, Scene, go2};
+
+    #[test]
+    fn newest_velocity_is_kept_however_many_came_before() {
+        let robot = go2();
+        let pose = robot.control.default_pose_f32();
+        let scene = Scene::new(&robot, Pose::IDENTITY, &pose, &Ground::FLAT);
+        let info = SceneInfo::new("run", &scene, robot.torque_limits());
+        let hub = Hub::new(SceneInfo { velocity_bounds: Some([[-1.0, 1.0]; 3]), ..info });
+        for _ in 0..2 * CAPACITY {
+            assert!(hub.request(PageRequest::Velocity([1.0, 0.0, 0.0])));
+        }
+        assert!(hub.request(PageRequest::Velocity([0.0; 3])));
+        assert!(!hub.request(PageRequest::Velocity([f32::NAN; 3])) && !hub.request(PageRequest::Reset));
+        assert_eq!(hub.take_velocity().map(|(_, velocity)| velocity), Some([0.0; 3]));
+        assert!(hub.take_velocity().is_none() && hub.take_requests().is_empty());
     }
 }

@@ -42,7 +42,7 @@ pub enum ViewError {
     },
     /// Others could look at the robots and move them.
     #[error(
-        "others can reach {0}\n  give them a token: `--token WORD` of `view`, `--view-token WORD` of `serve` and `train`; the page is then at http://{0}/?token=WORD"
+        "others can reach {0}\n  give them a token: `--token WORD` of `view`, `--view-token WORD` of the others; the page is then at http://{0}/?token=WORD"
     )]
     NoToken(SocketAddr),
     /// The operating system could not start a thread.
@@ -66,11 +66,8 @@ struct Site {
 impl WebServer {
     /// Serves the pages of `hub` at an address. One that others can reach needs a token.
     pub fn start(address: SocketAddr, token: Option<String>, hub: Arc<Hub>) -> Result<Self, ViewError> {
-        if !address.ip().is_loopback() && token.is_none() {
-            return Err(ViewError::NoToken(address));
-        }
+        let listener = Self::listen(address, token.as_deref())?;
         let failed = |cause| ViewError::Listen { address, cause };
-        let listener = std::net::TcpListener::bind(address).map_err(failed)?;
         listener.set_nonblocking(true).map_err(failed)?;
         let address = listener.local_addr().map_err(failed)?;
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(ViewError::Thread)?;
@@ -87,6 +84,18 @@ impl WebServer {
         let thread = std::thread::Builder::new().name("viewer".to_owned());
         let thread = thread.spawn(move || runtime.block_on(serve)).map_err(ViewError::Thread)?;
         Ok(Self { address, token, end: Some(end), thread: Some(thread) })
+    }
+
+    /// Checks that pages can be served at an address.
+    pub fn check(address: SocketAddr, token: Option<&str>) -> Result<(), ViewError> {
+        Self::listen(address, token).map(drop)
+    }
+
+    fn listen(address: SocketAddr, token: Option<&str>) -> Result<std::net::TcpListener, ViewError> {
+        if !address.ip().is_loopback() && token.is_none() {
+            return Err(ViewError::NoToken(address));
+        }
+        std::net::TcpListener::bind(address).map_err(|cause| ViewError::Listen { address, cause })
     }
 
     /// Returns the address of the page.

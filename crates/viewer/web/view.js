@@ -298,6 +298,20 @@ async function ask(request) {
   });
 }
 
+// One request at a time, so that the newest velocity arrives last.
+let [wanted, isSteering] = [null, false];
+async function steer(velocity) {
+  wanted = velocity;
+  if (isSteering) return;
+  isSteering = true;
+  while (wanted) {
+    const next = wanted;
+    wanted = null;
+    try { await ask({ velocity: next }); } catch { break; }
+  }
+  isSteering = false;
+}
+
 let isPaused = false;
 let isSeeking = false;
 
@@ -326,9 +340,15 @@ function connectControls() {
   sliders.forEach((slider, axis) => {
     [slider.min, slider.max] = info.velocity_bounds[axis];
     slider.value = 0;
-    slider.oninput = () => ask({ velocity: sliders.map((other) => Number(other.value)) });
+    slider.oninput = () => send();
   });
-  $('stop').onclick = () => { sliders.forEach((slider) => { slider.value = 0; }); ask({ velocity: [0, 0, 0] }); };
+  let heartbeat = null;
+  const send = () => {
+    steer(sliders.map((slider) => Number(slider.value)));
+    // A run stops its robot when this page is gone.
+    if (!info.is_interactive) heartbeat ??= setInterval(send, 500);
+  };
+  $('stop').onclick = () => { sliders.forEach((slider) => { slider.value = 0; }); send(); };
   $('push').onclick = () => {
     const angle = 2 * Math.PI * Math.random();
     ask({ push: { robot: chosen, velocity: [Math.cos(angle), Math.sin(angle), 0] } });
