@@ -78,8 +78,8 @@ impl Layout {
 
 /// Steps robot 0 of `env`, which must have one robot and [`twinstep_model::AutoresetMode::Disabled`].
 ///
-/// `control` is called before every step, with the robot to look at. After a fall the robot is reset and the run goes on. If it fails, the rows of all
-/// executed steps are in the log.
+/// `control` is called before every step, with the robot to look at. After a fall the robot is reset and the run goes on.
+/// If it fails, the rows of all executed steps are in the log.
 pub fn run(
     env: &mut dyn VecEnv,
     policy: &mut BoundPolicy,
