@@ -3,6 +3,7 @@
 //! - [`Server`]: one run of a server. [`Server::start`] opens Zenoh and answers requests. [`Server::shutdown`] finishes
 //!   the steps in progress and notifies the clients.
 //! - [`EnvFactory`]: builds the environments of a lease. [`SimEnvFactory`] builds simulated ones from a [`Config`].
+//! - [`FramePublisher`]: shows the robots to those who only look.
 //! - [`Config`]: the config file with the tables `[server]`, `[task]`, `[sim]` and `[randomise]`.
 //!
 //! Zenoh's threads only put requests into mailboxes (`dispatch`). Each lease has a mailbox; so have `hello`, `lease` and
@@ -15,6 +16,7 @@ mod config;
 mod dispatch;
 mod env_factory;
 mod executor;
+mod frame_publisher;
 mod lease_manager;
 mod messages;
 mod rollout;
@@ -23,4 +25,5 @@ mod worker;
 
 pub use config::{Config, ConfigFileError, ServerConfig};
 pub use env_factory::{EnvFactory, EnvFactoryError, SimEnvFactory};
+pub use frame_publisher::FramePublisher;
 pub use server::{Server, ServerError};

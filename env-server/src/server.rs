@@ -18,6 +18,7 @@ use zenoh::{Session, Wait};
 
 use crate::dispatch::{Dispatcher, Routes, refusals};
 use crate::executor::{Executor, Mailbox, SendLock};
+use crate::frame_publisher::FramePublisher;
 use crate::lease_manager::{LeaseHandler, LeaseManager, ServerInfo};
 use crate::messages::ServerState;
 use crate::{EnvFactory, EnvFactoryError, ServerConfig};
@@ -172,6 +173,12 @@ impl Server {
     /// Returns the number of environment steps executed so far.
     pub fn env_steps(&self) -> u64 {
         self.state.env_steps.load(Ordering::Relaxed)
+    }
+
+    /// Returns what sends scene and frames to those who look at the robots. Stop using it before the shutdown.
+    pub fn frame_publisher(&self) -> Result<FramePublisher, ServerError> {
+        FramePublisher::declare(&self.session, &self.sid)
+            .map_err(|error| ServerError::Declare { key: keys::frame(&self.sid), reason: error.to_string() })
     }
 
     /// Returns the ids of the clients that have environments.

@@ -25,6 +25,16 @@ pub fn stop(sid: &str) -> String {
     format!("{ROOT}/{sid}/stop")
 }
 
+/// Returns the key at which a server publishes what stays the same in every frame of its robots.
+pub fn scene(sid: &str) -> String {
+    format!("{ROOT}/{sid}/view/scene")
+}
+
+/// Returns the key at which a server publishes frames of its robots.
+pub fn frame(sid: &str) -> String {
+    format!("{ROOT}/{sid}/view/frame")
+}
+
 /// Returns the key of a method of the environments of `lease`.
 pub fn env(sid: &str, lease: &str, verb: EnvMethod) -> String {
     format!("{ROOT}/{sid}/env/{lease}/{}", verb.name())

@@ -349,7 +349,7 @@ fn shipped_policy_walks_in_mujoco_under_every_condition() {
     let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let rows = report["rows"].as_array().unwrap();
     let conditions: Vec<_> = rows.iter().map(|row| row["condition"].as_str().unwrap()).collect();
-    assert_eq!(conditions, ["nominal", "robots", "pushes", "noise", "ground", "delay", "robust"]);
+    assert_eq!(conditions, ["nominal", "robots", "pushes", "noise", "ground", "steps", "delay", "robust"]);
     for row in rows {
         // A robot that stands still has 0.65 m/s.
         assert!(row["up"].as_f64().unwrap() > 0.7 && row["velocity_rms"].as_f64().unwrap() < 0.4, "{row}");

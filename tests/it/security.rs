@@ -3,9 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv};
+use twinstep_client::{ClientError, ConnectOptions, RemoteVecEnv, RobotWatch};
 use twinstep_env_server::{Config, Server, ServerError, SimEnvFactory};
 use twinstep_envs::TaskConfig;
 use twinstep_model::{ResetRequest, VecEnv};
@@ -105,6 +106,39 @@ fn allowed_user_steps_and_its_liveliness_token_is_visible() {
     let (server, endpoint) = serve("tcp", &folder.path("server-acl.json5"));
     steps(&endpoint, Some(folder.path("client-user.json5")));
     server.shutdown();
+}
+
+#[test]
+fn scene_is_seen_only_by_a_user_who_may_look() {
+    let folder = SecurityFolder::new().unwrap();
+    let scene = |file: &Path| {
+        let (server, endpoint) = serve("tcp", file);
+        let publisher = server.frame_publisher().unwrap();
+        let is_over = AtomicBool::new(false);
+        let scene = std::thread::scope(|scope| {
+            scope.spawn(|| {
+                while !is_over.load(Ordering::Acquire) {
+                    if publisher.is_scene_wanted() {
+                        publisher.send_scene(b"a scene");
+                    }
+                    std::thread::sleep(Duration::from_millis(20));
+                }
+            });
+            let zenoh = Some(folder.path("client-user.json5"));
+            let connect_timeout = Duration::from_secs(2);
+            let options = ConnectOptions { zenoh, connect_timeout, ..ConnectOptions::new(&endpoint, 1) };
+            let scene = RobotWatch::open(&options).unwrap().scene();
+            is_over.store(true, Ordering::Release);
+            scene
+        });
+        drop(publisher);
+        server.shutdown();
+        scene
+    };
+    assert_eq!(scene(&folder.path("server-acl.json5")).unwrap(), b"a scene");
+    let blind = folder.edited("server-acl.json5", "\"look\", \"see_robots\"", "").unwrap();
+    let error = scene(&blind).unwrap_err();
+    assert!(matches!(error, ClientError::NoScene { .. }) && error.to_string().contains("access control"), "{error}");
 }
 
 #[test]

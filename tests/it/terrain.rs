@@ -8,7 +8,7 @@ use twinstep_model::{
     AutoresetMode, Command, Ground, InitialState, NUM_LEGS, Pose, ResetRequest, ShapeKind, Simulator, VecEnv,
     body_poses, frames, go2,
 };
-use twinstep_sim::{BatchBackend, Engine, RapierBackend, RoughTerrain, SimConfig, Terrain};
+use twinstep_sim::{BatchBackend, Engine, RapierBackend, RoughTerrain, SimConfig, StepTerrain, Terrain};
 
 use crate::remote::{self, config, start};
 
@@ -67,13 +67,20 @@ fn stood<B: Simulator>(make: Make<B>, terrain: Terrain) -> B {
 
 #[test]
 fn robot_stands_with_its_feet_on_rough_ground() {
-    stands_on_its_feet(rapier);
-    stands_on_its_feet(batch);
+    stands_on_its_feet(rapier, |seed| rough(0.05, 0.25, seed));
+    stands_on_its_feet(batch, |seed| rough(0.05, 0.25, seed));
 }
 
-fn stands_on_its_feet<B: Simulator>(make: Make<B>) {
+#[test]
+fn robot_stands_with_its_feet_on_steps() {
+    let steps = |seed| Terrain::Steps(StepTerrain { height_m: 0.03, tread_m: 0.3, size_m: 4.0, seed });
+    stands_on_its_feet(rapier, steps);
+    stands_on_its_feet(batch, steps);
+}
+
+fn stands_on_its_feet<B: Simulator>(make: Make<B>, terrain: fn(u64) -> Terrain) {
     for seed in 1..=3 {
-        let backend = stood(make, rough(0.05, 0.25, seed));
+        let backend = stood(make, terrain(seed));
         let (gaps, states) = (foot_gaps(&backend, &backend.ground()), backend.states());
         for (gap, force) in gaps.iter().zip(states.truth.foot_force[0]) {
             assert!(*gap > -0.005, "seed {seed}: a foot is {gap} m in the ground");

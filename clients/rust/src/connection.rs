@@ -302,6 +302,6 @@ pub fn read_answer<T: serde::de::DeserializeOwned>(answer: &ZBytes, request: &st
         .map_err(|error| ClientError::Malformed { request: request.to_owned(), reason: error.message })
 }
 
-fn zenoh_error(error: &zenoh::Error) -> ClientError {
+pub(crate) fn zenoh_error(error: &zenoh::Error) -> ClientError {
     ClientError::Config { path: None, reason: error.to_string() }
 }

@@ -52,6 +52,18 @@ pub enum ClientError {
         /// Duration of the discovery [s].
         waited_s: f64,
     },
+    /// A server is visible, but sends no scene of its robots.
+    #[error(
+        "`{robot}` has sent no scene of its robots for {waited_s:.1} s\n  either its program cannot show them (`twinstep \
+         serve` and `twinstep robot` can), or access control hides them from this user: it needs what \
+         `examples/security/server-acl.json5` allows `alice`"
+    )]
+    NoScene {
+        /// Name of the robot.
+        robot: String,
+        /// Time until the request failed [s].
+        waited_s: f64,
+    },
     /// Servers are visible, but none or several match.
     #[error("{expected}; visible: {}\n  set `robot` to the name of one of them", visible.join(", "))]
     AmbiguousRobot {

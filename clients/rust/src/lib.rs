@@ -17,6 +17,8 @@
 //!
 //! [`RemoteVecEnv::rollout`] runs a policy on the server, next to its robots; [`RemoteCollector`] does it for a learner.
 //!
+//! [`RobotWatch`] sees the robots of a server without environments of its own.
+//!
 //! The client repeats a request with the same sequence number until a reply arrives. The server executes each number
 //! once. A lost reply, an unresponsive server or a restarted router costs time, but no step is lost or executed twice.
 //! If no reply arrives, [`ClientError`] contains the reason.
@@ -28,6 +30,7 @@ mod grouped_env;
 mod options;
 mod remote_collector;
 mod remote_env;
+mod robot_watch;
 mod server_process;
 mod session;
 
@@ -38,5 +41,6 @@ pub use grouped_env::GroupedVecEnv;
 pub use options::ConnectOptions;
 pub use remote_collector::RemoteCollector;
 pub use remote_env::{LeaseHandle, RemoteVecEnv};
+pub use robot_watch::{FrameSubscription, RobotWatch};
 pub use server_process::ServerProcess;
 pub use twinstep_protocol::Secret;

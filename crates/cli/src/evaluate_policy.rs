@@ -10,7 +10,7 @@ use twinstep_learning::{Evaluation, EvaluationError, EvaluationPlan, SpeedBin, e
 use twinstep_model::{EnvError, EnvSpec, ResetRequest, VecEnv};
 use twinstep_policy::{Policy, PolicyRunner};
 use twinstep_report::film_strip;
-use twinstep_sim::{Engine, RoughTerrain, SimConfig, Terrain};
+use twinstep_sim::{Engine, RoughTerrain, SimConfig, StepTerrain, Terrain};
 
 use crate::evaluate_jump::{self, JumpRow};
 use crate::evaluate_tracking::{self, TrackingRow};
@@ -32,10 +32,11 @@ const FILM_STEPS: usize = 4;
 ///   nominal   the robot of the model file on flat ground
 ///   robots    masses +-15 %, friction 0.4 to 1.25, gains +-10 %
 ///   ground    random heights of up to 3 cm
+///   steps     level treads of 30 cm with steps of 3 cm between them
 ///   pushes    0.5 m/s in a random direction, every 5 to 10 s
 ///   delay     commands arrive 0 to 20 ms late
 ///   noise     errors of the sensors as in Isaac Lab
-///   robust    robots, ground, pushes and delay at once
+///   robust    robots, steps, pushes and delay at once
 ///
 /// Without --engine the nominal robot is also simulated in rapier, which no policy is trained in. `--engine mujoco`
 /// needs `pip install "twinstep[mujoco]"` and simulates a thousand env-steps per second.
@@ -114,13 +115,15 @@ fn conditions(engine: Option<Engine>) -> Vec<Condition> {
     if engine.is_none() {
         conditions.insert(1, Condition { engine: Engine::Rapier, ..condition("nominal", calm) });
     }
-    let terrain = Terrain::Rough(RoughTerrain { height_m: 0.03, cell_m: 0.3, size_m: 40.0, seed: 1 });
+    let ground = Terrain::Rough(RoughTerrain { height_m: 0.03, cell_m: 0.3, size_m: 40.0, seed: 1 });
+    let steps = Terrain::Steps(StepTerrain { height_m: 0.03, tread_m: 0.3, size_m: 20.0, seed: 1 });
     let command_delay_ms = [0.0, 20.0];
     let robust = Randomisation { push_m_s, command_delay_ms, ..robots };
     conditions.extend([
-        Condition { terrain, ..condition("ground", calm) },
+        Condition { terrain: ground, ..condition("ground", calm) },
+        Condition { terrain: steps, ..condition("steps", calm) },
         condition("delay", Randomisation { command_delay_ms, ..calm }),
-        Condition { terrain, ..condition("robust", robust) },
+        Condition { terrain: steps, ..condition("robust", robust) },
     ]);
     conditions
 }

@@ -13,9 +13,11 @@ use twinstep_envs::{TaskConfig, WalkConfig};
 use twinstep_model::{PerJoint, RobotModel};
 use twinstep_robot::dds::Dds;
 use twinstep_robot::{Recorder, RobotHandle, SafetyConfig, control_loop, interface_address, watch};
+use twinstep_viewer::Hub;
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::fake_process::FakeProcess;
+use crate::frame_feed::FrameFeed;
 use crate::onboard_policy::OnboardPolicy;
 use crate::robot_env_factory::RobotEnvFactory;
 use crate::robot_view::RobotView;
@@ -118,6 +120,7 @@ pub fn run(args: &Args) -> CommandResult {
     let robot = ModelFile::default().robot_model().map_err(input)?;
     let task = config.walk()?;
     let signals = Signals::listen()?;
+    args.view.check()?;
     let fake = if args.fake { Some(FakeProcess::start(args.model.as_deref(), &[])?) } else { None };
     let (domain, address) = match (&fake, &args.interface) {
         (Some(fake), _) => (fake.domain, IpAddr::V4(Ipv4Addr::LOCALHOST)),
@@ -133,9 +136,9 @@ pub fn run(args: &Args) -> CommandResult {
     let watch = watch::start(&dds, handle.clone()).map_err(other)?;
     let view = RobotView::start(&args.view, &robot, &handle);
     let outcome = view.and_then(|view| {
-        let outcome = args.serve(&config.server, robot, task, &handle, &signals);
+        let outcome = args.serve(&config.server, (robot, task), &handle, view.hub(), &signals);
         handle.end();
-        view.into_iter().for_each(RobotView::join);
+        view.join();
         outcome
     });
     handle.end();
@@ -162,9 +165,9 @@ impl Args {
     fn serve(
         &self,
         server: &ServerConfig,
-        robot: RobotModel,
-        task: WalkConfig,
+        (robot, task): (RobotModel, WalkConfig),
         handle: &RobotHandle,
+        hub: &Arc<Hub>,
         signals: &Signals,
     ) -> CommandResult {
         let torque_limits = &robot.torque_limits();
@@ -181,8 +184,10 @@ impl Args {
             ServerError::ZenohConfig { .. } | ServerError::Setting { .. } => input(error),
             _ => other(error),
         })?;
+        let feed = FrameFeed::start(server.frame_publisher().map_err(other)?, Arc::clone(hub))?;
         let place = format!("listening {}", server.endpoints().first().cloned().unwrap_or_default());
         let result = watch_robot(handle, torque_limits, &place, &|| server.clients(), signals);
+        feed.stop();
         server.shutdown();
         result
     }

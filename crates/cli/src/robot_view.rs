@@ -14,32 +14,37 @@ use crate::web_view::{Page, ViewArgs};
 /// Time between two looks at the robot.
 const PERIOD: Duration = Duration::from_millis(10);
 
-/// Page of the robot as its sensors see it, in every state and without clients, too. It is looked at only.
+/// The robot as its sensors see it, in every state and without clients, too. It is looked at only.
 pub struct RobotView {
+    hub: Arc<Hub>,
     thread: JoinHandle<()>,
-    _page: Page,
+    _page: Option<Page>,
 }
 
 impl RobotView {
-    /// Serves the page, if there is to be one, until [`RobotHandle::end`].
-    pub fn start(args: &ViewArgs, robot: &RobotModel, handle: &RobotHandle) -> Result<Option<Self>, Failure> {
+    /// Shows the robot until [`RobotHandle::end`], also on a page, if there is to be one.
+    pub fn start(args: &ViewArgs, robot: &RobotModel, handle: &RobotHandle) -> Result<Self, Failure> {
         let standing = scene(robot, &robot.control.default_pose_f32(), [1.0, 0.0, 0.0, 0.0]);
-        let Some(page) = args.serve(SceneInfo::new("twinstep robot", &standing, robot.torque_limits()))? else {
-            return Ok(None);
-        };
-        let (robot, handle, hub) = (robot.clone(), handle.clone(), Arc::clone(page.hub()));
+        let hub = Arc::new(Hub::new(SceneInfo::new("twinstep robot", &standing, robot.torque_limits())));
+        let page = args.serve(&hub)?;
+        let (robot, handle, shown) = (robot.clone(), handle.clone(), Arc::clone(&hub));
         let thread = std::thread::Builder::new().name("view".to_owned()).spawn(move || {
             while !handle.is_ending() {
-                if hub.is_due() {
-                    publish(&robot, &handle.board(), &hub);
+                if shown.is_due() {
+                    publish(&robot, &handle.board(), &shown);
                 }
                 std::thread::sleep(PERIOD);
             }
         });
-        Ok(Some(Self { thread: thread.map_err(other)?, _page: page }))
+        Ok(Self { hub, thread: thread.map_err(other)?, _page: page })
     }
 
-    /// Waits for the end of the page, which comes after [`RobotHandle::end`].
+    /// Returns what is shown.
+    pub fn hub(&self) -> &Arc<Hub> {
+        &self.hub
+    }
+
+    /// Waits for the end of its thread, which comes after [`RobotHandle::end`].
     pub fn join(self) {
         let _ = self.thread.join();
     }

@@ -1,11 +1,12 @@
 //! The robot of `twinstep run` in the browser, with sliders for its velocity.
 
 use std::cell::Cell;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use twinstep_agent::Status;
 use twinstep_model::{EnvSpec, VecEnv, go2};
-use twinstep_viewer::{Frame, RobotFrame, SceneInfo};
+use twinstep_viewer::{Frame, Hub, RobotFrame, SceneInfo};
 
 use crate::exit::Failure;
 use crate::velocity_input;
@@ -35,7 +36,7 @@ impl RunView {
         let title = format!("twinstep run on {}", env.spec().robot);
         let bounds = if steers { slider_bounds(env.spec()) } else { None };
         let info = SceneInfo { velocity_bounds: bounds, ..SceneInfo::new(title, &scene, go2().torque_limits()) };
-        let page = args.serve(info)?;
+        let page = args.serve(&Arc::new(Hub::new(info)))?;
         Ok(page.map(|page| Self { page, bounds, velocity: Cell::new(None) }))
     }
 

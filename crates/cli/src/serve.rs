@@ -6,14 +6,17 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use glam::Quat;
 use indicatif::{ProgressBar, ProgressStyle};
-use twinstep_env_server::{Config, EnvFactory, Server, ServerError, SimEnvFactory};
+use twinstep_env_server::{Config, Server, ServerError, SimEnvFactory};
 use twinstep_envs::TaskConfig;
-use twinstep_model::AutoresetMode;
+use twinstep_model::{InitialState, Pose, RobotModel, Scene};
 use twinstep_session::SERVER_THREADS;
 use twinstep_sim::Engine;
+use twinstep_viewer::{Hub, SceneInfo};
 
 use crate::exit::{CommandResult, Signals, input, other};
+use crate::frame_feed::FrameFeed;
 use crate::web_view::{ViewArgs, WatchedFactory};
 
 /// Interval at which the server checks for signals.
@@ -101,21 +104,14 @@ pub fn run(args: &Args) -> CommandResult {
     set_zenoh_threads();
     let signals = Signals::listen()?;
     let factory = SimEnvFactory::new(config.clone()).map_err(input)?;
-    let page = if args.view.is_wanted() {
-        let mut env = factory.build(1, AutoresetMode::NextStep, None).map_err(input)?;
-        let title = format!("twinstep serve, robot {}", config.server.name);
-        args.view.open(&title, env.as_mut(), factory.robot().torque_limits())?
-    } else {
-        None
-    };
-    let factory: Arc<dyn EnvFactory> = match &page {
-        Some(page) => Arc::new(WatchedFactory { factory, hub: Arc::clone(page.hub()) }),
-        None => Arc::new(factory),
-    };
-    let server = Server::start(&config.server, factory).map_err(|error| match error {
+    let hub = Arc::new(Hub::new(scene(&config, factory.robot())));
+    let _page = args.view.serve(&hub)?;
+    let factory = WatchedFactory { factory, hub: Arc::clone(&hub) };
+    let server = Server::start(&config.server, Arc::new(factory)).map_err(|error| match error {
         ServerError::ZenohConfig { .. } | ServerError::Setting { .. } | ServerError::Host(_) => input(error),
         _ => other(error),
     })?;
+    let feed = FrameFeed::start(server.frame_publisher().map_err(other)?, hub)?;
     let endpoint = listening_endpoint(&server, &config);
     println!("listening {endpoint}");
     std::io::stdout().flush().map_err(other)?;
@@ -128,8 +124,18 @@ pub fn run(args: &Args) -> CommandResult {
     );
     let stdin_closed = if args.until_stdin_closes { watch_stdin() } else { Arc::default() };
     let outcome = watch(&server, &signals, &stdin_closed);
+    feed.stop();
     server.shutdown();
     outcome
+}
+
+/// Returns a robot that stands at the origin.
+fn scene(config: &Config, robot: &RobotModel) -> SceneInfo {
+    let (q, ground) = (robot.control.default_pose_f32(), config.sim.terrain.ground());
+    let position = InitialState::standing_on(&ground, robot, q, 0.0).base_position;
+    let pose = Pose { position: position.into(), rotation: Quat::IDENTITY };
+    let scene = Scene::new(robot, pose, &q, &ground.crop(0.0, 0.0));
+    SceneInfo::new(format!("twinstep serve, robot {}", config.server.name), &scene, robot.torque_limits())
 }
 
 /// Gives Zenoh several threads that send, unless the user has chosen their number.

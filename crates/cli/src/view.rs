@@ -1,13 +1,15 @@
-//! `twinstep view`: a policy or a log in the browser.
+//! `twinstep view`: a policy, a log or the robots of an endpoint in the browser.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+
+use twinstep_client::ConnectOptions;
 
 use crate::exit::{CommandResult, Signals, input};
 use crate::view_policy::WalkArgs;
 use crate::web_view::PageArgs;
-use crate::{view_log, view_policy};
+use crate::{view_endpoint, view_log, view_policy};
 
-/// Look at a policy or a log in the browser.
+/// Look at a policy, a log or the robots of an endpoint in the browser.
 ///
 /// POLICY (*.safetensors, *.onnx): robots walk with it in simulation. The page has pause and slow motion, sliders for the
 /// velocity command, pushes and a new start.
@@ -16,17 +18,27 @@ use crate::{view_log, view_policy};
 /// the simulation under the same commands is its ghost: it starts from measured states, every 0.5 s with a floating base,
 /// once per segment with a fixed one. The curves are the errors joint by joint.
 ///
+/// ENDPOINT (tcp/HOST:PORT, also tls, quic): the robots that step at a server (the newest lease, up to 64 robots), or the
+/// robot of `twinstep robot`. They are looked at only, and without an open page the server draws nothing.
+///
 /// It prints the address of the page. On a remote machine: `ssh -L 7480:localhost:7480 HOST`, then http://localhost:7480.
 /// `twinstep serve`, `train`, `run` and `robot` show their robots with --view.
 ///
-/// Examples: `twinstep view data/policies/walk.safetensors --robots 16` and `twinstep view walk.mcap --model extended.toml`
+/// Examples: `twinstep view data/policies/walk.safetensors --robots 16`, `twinstep view walk.mcap --model extended.toml` and
+/// `twinstep view tcp/127.0.0.1:7447`
 #[derive(clap::Args)]
 pub struct Args {
-    /// Policy file or log.
-    target: PathBuf,
+    /// Policy file, log, or endpoint.
+    target: String,
     /// Model file of the simulated robots. Default for a policy: the ideal Go2; for a log: no simulation.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
+    /// Zenoh configuration file (JSON5) for an endpoint with TLS, user and password; see examples/security.
+    #[arg(long, value_name = "FILE")]
+    zenoh: Option<PathBuf>,
+    /// Name of the robot, if an endpoint has several.
+    #[arg(long, value_name = "NAME")]
+    robot: Option<String>,
     #[command(flatten)]
     walk: WalkArgs,
     #[command(flatten)]
@@ -35,19 +47,25 @@ pub struct Args {
 
 /// The target does not exist.
 #[derive(Debug, thiserror::Error)]
-#[error("there is no file or folder {}\n  give a policy (*.safetensors, *.onnx) or a log", .0.display())]
-struct NoTarget(PathBuf);
+#[error(
+    "there is no file or folder {0}\n  give a policy (*.safetensors, *.onnx), a log, or an endpoint (tcp/HOST:PORT)"
+)]
+struct NoTarget(String);
 
 /// Shows the target until a signal.
 pub fn run(args: &Args) -> CommandResult {
     let signals = Signals::listen()?;
-    if !args.target.exists() {
-        return Err(input(NoTarget(args.target.clone())));
-    }
-    match args.target.extension().and_then(|extension| extension.to_str()) {
-        Some("safetensors" | "onnx") => {
-            view_policy::run(&args.target, args.model.as_deref(), &args.walk, &args.page, &signals)
+    let path = Path::new(&args.target);
+    if !path.exists() {
+        if !view_endpoint::is_endpoint(&args.target) {
+            return Err(input(NoTarget(args.target.clone())));
         }
-        _ => view_log::run(&args.target, args.model.as_deref(), &args.page, &signals),
+        let (zenoh, robot) = (args.zenoh.clone(), args.robot.clone());
+        let options = ConnectOptions { zenoh, robot, ..ConnectOptions::new(&args.target, 1) };
+        return view_endpoint::run(&options, &args.page, &signals);
+    }
+    match path.extension().and_then(|extension| extension.to_str()) {
+        Some("safetensors" | "onnx") => view_policy::run(path, args.model.as_deref(), &args.walk, &args.page, &signals),
+        _ => view_log::run(path, args.model.as_deref(), &args.page, &signals),
     }
 }

@@ -39,7 +39,7 @@ pub struct PageArgs {
 impl PageArgs {
     /// Serves a page and says where it is.
     pub fn open(&self, scene: SceneInfo) -> Result<Page, Failure> {
-        Page::open(self.listen, self.token.clone(), scene)
+        Page::open(self.listen, self.token.clone(), Arc::new(Hub::new(scene)))
     }
 }
 
@@ -56,12 +56,13 @@ impl ViewArgs {
             return Ok(None);
         }
         env.reset(&ResetRequest::default()).map_err(other)?;
-        self.serve(SceneInfo::new(title, &env.scene(0).map_err(other)?, torque_limits))
+        let scene = SceneInfo::new(title, &env.scene(0).map_err(other)?, torque_limits);
+        self.serve(&Arc::new(Hub::new(scene)))
     }
 
-    /// Serves the page of this scene, if there is to be one.
-    pub fn serve(&self, scene: SceneInfo) -> Result<Option<Page>, Failure> {
-        self.view.map(|address| Page::open(address, self.view_token.clone(), scene)).transpose()
+    /// Serves a page of what `hub` shows, if there is to be one.
+    pub fn serve(&self, hub: &Arc<Hub>) -> Result<Option<Page>, Failure> {
+        self.view.map(|address| Page::open(address, self.view_token.clone(), Arc::clone(hub))).transpose()
     }
 
     /// Checks that the page can be served.
@@ -76,8 +77,7 @@ impl ViewArgs {
 }
 
 impl Page {
-    fn open(address: SocketAddr, token: Option<String>, scene: SceneInfo) -> Result<Self, Failure> {
-        let hub = Arc::new(Hub::new(scene));
+    fn open(address: SocketAddr, token: Option<String>, hub: Arc<Hub>) -> Result<Self, Failure> {
         let server = WebServer::start(address, token, Arc::clone(&hub)).map_err(input)?;
         eprintln!("the robots are at {}", server.url());
         Ok(Self { hub, _server: server })
@@ -94,11 +94,11 @@ impl Page {
     }
 }
 
-/// Builds environments that a page sees. With several leases it sees the newest one.
+/// Builds environments that a hub shows. With several leases it shows the newest one.
 pub struct WatchedFactory<F> {
     /// Builds the environments.
     pub factory: F,
-    /// What the page shows.
+    /// What is shown.
     pub hub: Arc<Hub>,
 }
 

@@ -97,6 +97,30 @@ impl HeightField {
         Self::centred(cell_size, [cells + 1; 2], heights)
     }
 
+    /// Creates a square of `cells` × `cells` around the origin, with level treads of height 0 or `height` [m] at random.
+    ///
+    /// A tread is `tread_cells` long and wide with the face to its neighbour, which is as wide as a cell. The border is
+    /// at height 0, so that the field continues as the plane z = 0.
+    pub fn random_steps(
+        height: f32,
+        cell_size: f32,
+        tread_cells: usize,
+        cells: usize,
+        seed: u64,
+    ) -> Result<Self, HeightFieldError> {
+        let (mut stream, treads) = (stream(seed, "steps", 0), cells / tread_cells.max(1) + 1);
+        let is_high: Vec<bool> = (0..treads * treads).map(|_| stream.random()).collect();
+        let mut heights = Vec::with_capacity((cells + 1) * (cells + 1));
+        for row in 0..=cells {
+            for column in 0..=cells {
+                let on_border = row % cells.max(1) == 0 || column % cells.max(1) == 0;
+                let is_high = is_high[row / tread_cells.max(1) * treads + column / tread_cells.max(1)];
+                heights.push(if is_high && !on_border { height } else { 0.0 });
+            }
+        }
+        Self::centred(cell_size, [cells + 1; 2], heights)
+    }
+
     /// Returns the position of vertex (0, 0) [m].
     pub fn origin(&self) -> [f32; 2] {
         self.origin

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use twinstep_model::{BaseMount, ControlConfig, Ground, HeightField};
 
-/// Maximum number of cells along a side of rough terrain: a height field of 4 MB.
+/// Maximum number of cells along a side of a height field: 4 MB.
 const MAX_CELLS: f32 = 1024.0;
 
 /// Settings of the simulation.
@@ -79,6 +79,8 @@ pub enum Terrain {
     SlopeRad(f32),
     /// A height field with random heights around the origin.
     Rough(RoughTerrain),
+    /// A height field of level treads around the origin, with steps between them.
+    Steps(StepTerrain),
 }
 
 /// Rough terrain: heights at the corners of square cells, sampled uniformly from 0 to `height_m`.
@@ -109,24 +111,68 @@ impl RoughTerrain {
     }
 
     fn check(self) -> Result<(), SimConfigError> {
-        let reject =
-            |field, value: f32, allowed: String| Err(SimConfigError { field, value: value.to_string(), allowed });
-        if !(0.0..=0.3).contains(&self.height_m) {
-            return reject("terrain.rough.height_m", self.height_m, "0 to 0.3 m".to_owned());
-        }
-        if !(0.02..=10.0).contains(&self.cell_m) {
-            return reject("terrain.rough.cell_m", self.cell_m, "0.02 to 10 m".to_owned());
-        }
-        if !(2.0..=MAX_CELLS).contains(&self.cells()) {
-            let allowed = format!("2 to {MAX_CELLS} cells of {} m", self.cell_m);
-            return reject("terrain.rough.size_m", self.size_m, allowed);
-        }
-        Ok(())
+        in_range("terrain.rough.height_m", self.height_m, [0.0, 0.3], || "0 to 0.3 m".to_owned())?;
+        in_range("terrain.rough.cell_m", self.cell_m, [0.02, 10.0], || "0.02 to 10 m".to_owned())?;
+        let allowed = || format!("2 to {MAX_CELLS} cells of {} m", self.cell_m);
+        in_range("terrain.rough.size_m", self.cells(), [2.0, MAX_CELLS], allowed)
+            .map_err(|error| SimConfigError { value: self.size_m.to_string(), ..error })
     }
 }
 
+/// Steps: level square treads, each at random at height 0 or `height_m`, so that every step is `height_m` high.
+///
+/// A face is not vertical: it rises within [`StepTerrain::FACE_M`], because the ground is a height field. The border of
+/// the height field and everything outside are the plane z = 0.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StepTerrain {
+    /// Height of the steps [m].
+    pub height_m: f32,
+    /// Side length of a tread with the face to its neighbour [m], rounded to multiples of [`StepTerrain::FACE_M`].
+    pub tread_m: f32,
+    /// Side length of the height field [m], rounded to multiples of [`StepTerrain::FACE_M`]. Default: 20.
+    #[serde(default = "StepTerrain::default_size_m")]
+    pub size_m: f32,
+    /// Seed of the heights. Equal seeds give equal terrain, which all robots share.
+    pub seed: u64,
+}
+
+impl StepTerrain {
+    /// Width of a face [m]: one cell of the height field.
+    pub const FACE_M: f32 = 0.02;
+
+    fn default_size_m() -> f32 {
+        20.0
+    }
+
+    fn check(self) -> Result<(), SimConfigError> {
+        in_range("terrain.steps.height_m", self.height_m, [0.0, 0.3], || "0 to 0.3 m".to_owned())?;
+        in_range("terrain.steps.tread_m", self.tread_m, [0.1, 10.0], || "0.1 to 10 m".to_owned())?;
+        in_range("terrain.steps.size_m", self.size_m, [1.0, 20.0], || "1 to 20 m".to_owned())
+    }
+
+    fn field(self) -> HeightField {
+        let cells = |length_m: f32| (length_m / Self::FACE_M).round() as usize;
+        let (tread, cells) = (cells(self.tread_m), cells(self.size_m));
+        HeightField::random_steps(self.height_m, Self::FACE_M, tread, cells, self.seed).expect("the config was checked")
+    }
+}
+
+/// Checks that `value` is within the range `[low, high]`.
+fn in_range(
+    field: &'static str,
+    value: f32,
+    [low, high]: [f32; 2],
+    allowed: impl Fn() -> String,
+) -> Result<(), SimConfigError> {
+    if (low..=high).contains(&value) {
+        return Ok(());
+    }
+    Err(SimConfigError { field, value: value.to_string(), allowed: allowed() })
+}
+
 impl Terrain {
-    /// Builds the ground. Rough terrain is sampled in each call, so build it once and share it.
+    /// Builds the ground. A height field is sampled in each call, so build it once and share it.
     pub fn ground(self) -> Ground {
         match self {
             Terrain::Flat => Ground::FLAT,
@@ -136,6 +182,7 @@ impl Terrain {
                 let field = HeightField::random_uniform(rough.height_m, rough.cell_m, cells, rough.seed);
                 Ground { height_field: Some(field.expect("the config was checked").into()), ..Ground::FLAT }
             }
+            Terrain::Steps(steps) => Ground { height_field: Some(steps.field().into()), ..Ground::FLAT },
         }
     }
 }
@@ -194,6 +241,7 @@ impl SimConfig {
                 reject("terrain.slope_rad", angle.to_string(), "-1 to 1 rad".to_owned())
             }
             Terrain::Rough(rough) => rough.check(),
+            Terrain::Steps(steps) => steps.check(),
             Terrain::Flat | Terrain::SlopeRad(_) => Ok(()),
         }
     }
@@ -261,6 +309,33 @@ mod tests {
         assert_eq!(cell, "`sim.terrain.rough.cell_m` = NaN is not allowed: 0.02 to 10 m");
         let size = error(RoughTerrain { cell_m: 0.02, ..ROUGH });
         assert_eq!(size, "`sim.terrain.rough.size_m` = 40 is not allowed: 2 to 1024 cells of 0.02 m");
+    }
+
+    #[test]
+    fn every_step_has_the_given_height_and_its_treads_are_level() {
+        let steps = StepTerrain { height_m: 0.03, tread_m: 0.3, size_m: 6.0, seed: 1 };
+        let ground = Terrain::Steps(steps).ground();
+        let at = |tread: usize, part: f32| -3.0 + 0.3 * (tread as f32 + part);
+        let heights: Vec<f32> = (1..19).map(|tread| ground.height(at(tread, 0.5), 0.15)).collect();
+        assert!(heights.contains(&0.0) && heights.contains(&0.03), "{heights:?}");
+        for (tread, height) in (1..19).zip(heights) {
+            assert!(height == 0.0 || height == 0.03, "{height}");
+            for part in [0.02, 0.3, 0.9] {
+                assert_eq!(ground.height(at(tread, part), 0.15), height, "tread {tread} at {part}");
+            }
+        }
+        assert_eq!(ground.height(3.5, 0.15), 0.0);
+    }
+
+    #[test]
+    fn error_of_steps_outside_their_range_has_the_allowed_range() {
+        let error = |text: &str| read(text).check(&go2().control).expect_err("invalid").to_string();
+        let high = error("terrain = { steps = { height_m = 0.4, tread_m = 0.3, seed = 1 } }");
+        assert_eq!(high, "`sim.terrain.steps.height_m` = 0.4 is not allowed: 0 to 0.3 m");
+        let short = error("terrain = { steps = { height_m = 0.1, tread_m = nan, seed = 1 } }");
+        assert_eq!(short, "`sim.terrain.steps.tread_m` = NaN is not allowed: 0.1 to 10 m");
+        let large = error("terrain = { steps = { height_m = 0.1, tread_m = 0.3, size_m = 21, seed = 1 } }");
+        assert_eq!(large, "`sim.terrain.steps.size_m` = 21 is not allowed: 1 to 20 m");
     }
 
     #[test]

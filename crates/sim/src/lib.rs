@@ -20,7 +20,7 @@ mod rollout;
 mod thread_pool;
 
 pub use batch::{BatchBackend, BatchSnapshot, SimdPrecision};
-pub use config::{Engine, RoughTerrain, SimConfig, SimConfigError, Terrain};
+pub use config::{Engine, RoughTerrain, SimConfig, SimConfigError, StepTerrain, Terrain};
 pub use error::BackendBuildError;
 pub use mujoco::MujocoBackend;
 pub use rapier::{RapierBackend, RobotSnapshot};

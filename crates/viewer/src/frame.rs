@@ -1,11 +1,11 @@
 //! What a page shows, and its bytes.
 
 use bytes::{BufMut, Bytes, BytesMut};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use twinstep_model::{Ground, PerJoint, PerLeg, Scene, SceneShape};
 
 /// What stays the same while a page is open.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct SceneInfo {
     /// Heading of the page.
     pub title: String,
@@ -26,7 +26,7 @@ pub struct SceneInfo {
 }
 
 /// Heights of the ground on a regular grid.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Heights {
     /// Position of the first point [m].
     pub origin: [f32; 2],

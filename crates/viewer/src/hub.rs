@@ -80,21 +80,35 @@ impl Hub {
         &self.scene
     }
 
-    /// Returns the number of pages that receive frames.
+    /// Returns the number of readers of frames, which are pages and other programs.
     pub fn pages(&self) -> usize {
         self.latest.receiver_count()
     }
 
     /// Returns true if a page is open and the last frame is old enough. Cheap enough for every step.
     pub fn is_due(&self) -> bool {
-        let published = self.published.lock().unwrap_or_else(PoisonError::into_inner);
-        self.pages() > 0 && published.is_none_or(|at| at.elapsed() >= PERIOD)
+        self.pages() > 0 && {
+            let published = self.published.lock().unwrap_or_else(PoisonError::into_inner);
+            published.is_none_or(|at| at.elapsed() >= PERIOD)
+        }
     }
 
     /// Shows a frame. Never waits for a page.
     pub fn publish(&self, frame: &Frame) {
         *self.published.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
         self.latest.send_replace(frame.to_bytes());
+    }
+
+    /// Shows a frame of another program. Returns false if its lengths are wrong.
+    pub fn forward(&self, frame: &[u8]) -> bool {
+        let word =
+            |at: usize| frame.get(at..at + 4).map(|bytes| u32::from_le_bytes(bytes.try_into().unwrap_or_default()));
+        let (all, header) = (word(0).map(|all| all as usize), word(4).map(|header| header as usize));
+        let is_valid = all.is_some_and(|all| all + 8 == frame.len()) && header <= all;
+        if is_valid {
+            self.latest.send_replace(Bytes::copy_from_slice(frame));
+        }
+        is_valid
     }
 
     /// Returns the newest velocity that a page asked for since the last call, with the time when it came.
@@ -126,7 +140,8 @@ impl Hub {
         is_taken
     }
 
-    pub(crate) fn subscribe(&self) -> watch::Receiver<Bytes> {
+    /// Returns a reader of frames, which sees the newest one.
+    pub fn subscribe(&self) -> watch::Receiver<Bytes> {
         self.latest.subscribe()
     }
 }
@@ -150,5 +165,20 @@ mod tests {
         assert!(!hub.request(PageRequest::Velocity([f32::NAN; 3])) && !hub.request(PageRequest::Reset));
         assert_eq!(hub.take_velocity().map(|(_, velocity)| velocity), Some([0.0; 3]));
         assert!(hub.take_velocity().is_none() && hub.take_requests().is_empty());
+    }
+
+    #[test]
+    fn frame_of_another_program_is_shown_if_its_lengths_are_right() {
+        let robot = go2();
+        let scene = Scene::new(&robot, Pose::IDENTITY, &robot.control.default_pose_f32(), &Ground::FLAT);
+        let hub = Hub::new(SceneInfo::new("view", &scene, robot.torque_limits()));
+        let mut reader = hub.subscribe();
+        let frame = Frame { time: 2.0, ..Frame::default() }.to_bytes();
+        assert!(hub.forward(&frame));
+        assert_eq!(*reader.borrow_and_update(), frame);
+        for bad in [&frame[..frame.len() - 1], &frame[..3], &[], &[0, 0, 0, 0, 1, 0, 0, 0]] {
+            assert!(!hub.forward(bad), "{bad:?}");
+        }
+        assert!(!reader.has_changed().expect("the hub is there"));
     }
 }

@@ -121,8 +121,9 @@ fn table_of_errors_has_exactly_the_codes() {
 fn every_verb_key_and_mode_is_named() {
     let verbs = EnvMethod::ALL.map(|verb| keys::env("<server_id>", "<lease>", verb));
     let places = [keys::hello("<server_id>"), keys::lease("<server_id>"), keys::LIVE_SERVERS.to_owned()];
+    let views = [keys::scene("<server_id>"), keys::frame("<server_id>")];
     let tokens = [keys::live_server("<server_id>", "<name>"), keys::live_client("<server_id>", "<client>")];
-    for key in verbs.iter().chain(&places).chain(&tokens) {
+    for key in verbs.iter().chain(&places).chain(&views).chain(&tokens) {
         assert!(SPEC.contains(&format!("`{key}`")), "SPEC.md says nothing of the key `{key}`");
     }
     for mode in [AutoresetMode::NextStep, AutoresetMode::SameStep, AutoresetMode::Disabled] {
