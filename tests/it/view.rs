@@ -150,6 +150,32 @@ fn log_and_its_simulation_are_drawn_on_top_of_each_other() {
 }
 
 #[test]
+fn file_plays_the_motion_of_a_policy_or_a_log_without_a_program() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("motion.html");
+    let (policy, log) = (root().join("data/policies/walk.safetensors"), root().join("data/go2_air_chirp"));
+    for target in [policy, log] {
+        let (target, file) = (target.to_str().unwrap(), file.to_str().unwrap());
+        let arguments = ["view", target, "--html", file, "--seconds", "3"];
+        let output = Command::new(program()).args(arguments).output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let Some(browser) = browser() else { return };
+        let mut page = ChromePage::open(&browser, &format!("file://{file}"), [1000, 700]);
+        page.wait_for("Number(document.body.dataset.frames) > 5", PATIENCE);
+        let time = "Number(document.querySelector('#facts tr:nth-child(2) td:nth-child(2)').innerText.split(' ')[0])";
+        page.wait_for(&format!("{time} >= 2.9"), PATIENCE);
+        page.wait_for("document.getElementById('pause').innerText == 'play'", PATIENCE);
+        page.evaluate("document.getElementById('seek').value = 1; document.getElementById('seek').oninput()");
+        page.wait_for(&format!("{time} < 1.1"), PATIENCE);
+        page.wait_for("document.getElementById('curves').innerText.length > 20", PATIENCE);
+        assert_eq!(page.evaluate("performance.getEntriesByType('resource').length"), 0, "it loads nothing");
+    }
+    let endpoint = ["view", "tcp/127.0.0.1:9", "--html", "motion.html"];
+    let output = Command::new(program()).args(endpoint).output().unwrap();
+    assert!(output.status.code() == Some(2) && String::from_utf8_lossy(&output.stderr).contains("--log"));
+}
+
+#[test]
 fn page_of_another_site_gets_nothing_and_cannot_move_the_robots() {
     let viewed = Viewed::policy();
     let local = viewed.http("GET /scene HTTP/1.1\r\nHost: localhost:7480\r\n\r\n");

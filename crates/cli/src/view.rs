@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use twinstep_client::ConnectOptions;
 
-use crate::exit::{CommandResult, Signals, input};
+use crate::exit::{CommandResult, Failure, Signals, input};
 use crate::view_policy::WalkArgs;
 use crate::web_view::PageArgs;
 use crate::{view_endpoint, view_log, view_policy};
@@ -23,6 +23,9 @@ use crate::{view_endpoint, view_log, view_policy};
 ///
 /// It prints the address of the page. On a remote machine: `ssh -L 7480:localhost:7480 HOST`, then http://localhost:7480.
 /// `twinstep serve`, `train`, `run` and `robot` show their robots with --view.
+///
+/// With --html the motion of a policy or a log is written into one file that any browser plays, without Twinstep and without a
+/// network.
 ///
 /// Examples: `twinstep view data/policies/walk.safetensors --robots 16`, `twinstep view walk.mcap --model extended.toml` and
 /// `twinstep view tcp/127.0.0.1:7447`
@@ -43,6 +46,17 @@ pub struct Args {
     walk: WalkArgs,
     #[command(flatten)]
     page: PageArgs,
+    /// Write the page with its motion into this file instead of serving it.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["listen", "token"])]
+    html: Option<PathBuf>,
+    /// Length of the motion in the file [s]; a log may be shorter.
+    #[arg(long, value_name = "S", default_value_t = 20.0, value_parser = seconds)]
+    seconds: f64,
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    let seconds: f64 = text.parse().map_err(|_| "must be a number of seconds".to_owned())?;
+    if (0.1..=600.0).contains(&seconds) { Ok(seconds) } else { Err("must be 0.1 to 600 s".to_owned()) }
 }
 
 /// The target does not exist.
@@ -62,10 +76,30 @@ pub fn run(args: &Args) -> CommandResult {
         }
         let (zenoh, robot) = (args.zenoh.clone(), args.robot.clone());
         let options = ConnectOptions { zenoh, robot, ..ConnectOptions::new(&args.target, 1) };
+        if args.html.is_some() {
+            return Err(Failure::Input(miette::miette!(
+                "`--html` is for a policy or a log; {} is an endpoint\n  record it first: `twinstep run POLICY --endpoint {} \
+                 --log FILE`, then `twinstep view FILE --html ...`",
+                args.target,
+                args.target
+            )));
+        }
         return view_endpoint::run(&options, &args.page, &signals);
     }
-    match path.extension().and_then(|extension| extension.to_str()) {
-        Some("safetensors" | "onnx") => view_policy::run(path, args.model.as_deref(), &args.walk, &args.page, &signals),
-        _ => view_log::run(path, args.model.as_deref(), &args.page, &signals),
+    let model = args.model.as_deref();
+    let is_policy = path.extension().is_some_and(|extension| extension == "safetensors" || extension == "onnx");
+    match (&args.html, is_policy) {
+        (None, true) => view_policy::run(path, model, &args.walk, &args.page, &signals),
+        (None, false) => view_log::run(path, model, &args.page, &signals),
+        (Some(file), true) => write_page(file, &view_policy::page(path, model, &args.walk, args.seconds, &signals)?),
+        (Some(file), false) => write_page(file, &view_log::page(path, model, args.seconds)?),
     }
+}
+
+fn write_page(file: &Path, page: &str) -> CommandResult {
+    std::fs::write(file, page).map_err(|cause| {
+        Failure::Input(miette::miette!("`--html` = {}: cannot write the file: {cause}", file.display()))
+    })?;
+    println!("written to {} ({:.1} MB); open it in a browser", file.display(), page.len() as f64 / 1e6);
+    Ok(())
 }

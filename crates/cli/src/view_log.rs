@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use twinstep_identify::{Experiment, WindowConfig};
 use twinstep_logs::Log;
 use twinstep_model::{FIXED_BASE_HEIGHT, Ground, InitialState, Joint, PerJoint, Pose, RobotModel, Scene, frames};
-use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo};
+use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo, static_page};
 
 use crate::evaluate::simulator;
 use crate::exit::{CommandResult, Failure, Signals, input};
@@ -16,11 +16,30 @@ use crate::web_view::PageArgs;
 
 /// Time between two looks at the requests.
 const TICK: Duration = Duration::from_millis(10);
+/// Frames per second of a file.
+const FRAME_RATE: f64 = 30.0;
 /// Slowest and fastest speed.
 const SPEEDS: [f64; 2] = [0.05, 4.0];
 
 /// Plays a log until a signal.
 pub fn run(path: &Path, model: Option<&Path>, page: &PageArgs, signals: &Signals) -> CommandResult {
+    let (mut player, scene) = open(path, model)?;
+    let page = page.open(scene)?;
+    player.run(page.hub(), signals)
+}
+
+/// Returns a page that plays the first seconds of a log.
+pub fn page(path: &Path, model: Option<&Path>, seconds: f64) -> Result<String, Failure> {
+    let (mut player, scene) = open(path, model)?;
+    let count = (seconds.min(player.duration) * FRAME_RATE).floor() as usize;
+    let frame = |index| {
+        player.time = index as f64 / FRAME_RATE;
+        player.frame()
+    };
+    Ok(static_page(&scene, &(0..=count).map(frame).collect::<Vec<_>>()))
+}
+
+fn open(path: &Path, model: Option<&Path>) -> Result<(Player, SceneInfo), Failure> {
     let log = open_log(path)?;
     let robot = robot_model(model)?;
     let measured = measured_poses(&log, &robot);
@@ -31,11 +50,9 @@ pub fn run(path: &Path, model: Option<&Path>, page: &PageArgs, signals: &Signals
         has_ghost: model.is_some(),
         ..SceneInfo::new(path.display().to_string(), &first, robot.torque_limits())
     };
-    let page = page.open(scene)?;
-    let (start, end) = (log.t()[0], log.t()[log.rows() - 1]);
-    let mut player =
-        Player { log, robot, measured, simulated, time: 0.0, duration: end - start, is_paused: false, speed: 1.0 };
-    player.run(page.hub(), signals)
+    let duration = log.t()[log.rows() - 1] - log.t()[0];
+    let player = Player { log, robot, measured, simulated, time: 0.0, duration, is_paused: false, speed: 1.0 };
+    Ok((player, scene))
 }
 
 /// Pose of the robot at one time.

@@ -8,7 +8,7 @@ use twinstep_env_server::{Config, EnvFactory, ServerConfig, SimEnvFactory};
 use twinstep_envs::TaskConfig;
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
 use twinstep_sim::{Engine, SimConfig};
-use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo};
+use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo, static_page};
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::serve::engine;
@@ -19,6 +19,8 @@ use crate::web_view::PageArgs;
 const IDLE: Duration = Duration::from_millis(20);
 /// Slowest and fastest speed.
 const SPEEDS: [f64; 2] = [0.05, 4.0];
+/// Policy steps between two frames of a file.
+const STEPS_PER_FRAME: usize = 2;
 /// Largest push [m/s].
 const MAX_PUSH: f32 = 3.0;
 
@@ -41,6 +43,32 @@ pub struct WalkArgs {
 
 /// Simulates the robots until a signal.
 pub fn run(path: &Path, model: Option<&Path>, args: &WalkArgs, page: &PageArgs, signals: &Signals) -> CommandResult {
+    let (mut walk, scene) = start(path, model, args)?;
+    let page = page.open(scene)?;
+    walk.run(page.hub(), signals)
+}
+
+/// Returns a page that plays the first seconds.
+pub fn page(
+    path: &Path,
+    model: Option<&Path>,
+    args: &WalkArgs,
+    seconds: f64,
+    signals: &Signals,
+) -> Result<String, Failure> {
+    let (mut walk, scene) = start(path, model, args)?;
+    let mut frames = vec![walk.frame()?];
+    while frames.last().is_some_and(|frame| frame.time < seconds) && !signals.check()? {
+        for _ in 0..STEPS_PER_FRAME {
+            walk.step()?;
+        }
+        frames.push(walk.frame()?);
+    }
+    Ok(static_page(&scene, &frames))
+}
+
+/// Puts the robots at their start.
+fn start(path: &Path, model: Option<&Path>, args: &WalkArgs) -> Result<(PolicyWalk, SceneInfo), Failure> {
     let robots = usize::from(args.robots);
     let read = || LoadedPolicy::read(path, args.mapping.as_deref()).map_err(input);
     let factory = factory(&read()?, model, args.engine, robots)?;
@@ -54,9 +82,8 @@ pub fn run(path: &Path, model: Option<&Path>, args: &WalkArgs, page: &PageArgs, 
         velocity_bounds: env.spec().observation_field("velocity_command").map(|_| velocity_input::limits()),
         ..SceneInfo::new(path.display().to_string(), &env.scene(0).map_err(other)?, limits)
     };
-    let page = page.open(scene)?;
-    let mut walk = PolicyWalk { env, policies, command: None, is_paused: false, speed: 1.0, steps: 0, falls: 0 };
-    walk.run(page.hub(), signals)
+    let walk = PolicyWalk { env, policies, command: None, is_paused: false, speed: 1.0, steps: 0, falls: 0 };
+    Ok((walk, scene))
 }
 
 /// Returns the factory of the environments of the policy's task.

@@ -19,12 +19,24 @@ use tokio::sync::{oneshot, watch};
 
 use crate::hub::{Hub, PageRequest};
 
+/// The page.
+pub(crate) const INDEX: &str = include_str!("../web/index.html");
+/// Its program.
+pub(crate) const VIEW_SCRIPT: &str = include_str!("../web/view.js");
+/// The part of its program that plays recorded frames.
+pub(crate) const RECORDING_SCRIPT: &str = include_str!("../web/recording.js");
+/// Its style.
+pub(crate) const STYLE: &str = include_str!("../web/view.css");
+/// The library that draws.
+pub(crate) const THREE: &str = include_str!("../web/three.min.js");
+
 /// Files of the page: path, type and content.
-const FILES: [(&str, &str, &str); 4] = [
-    ("/", "text/html; charset=utf-8", include_str!("../web/index.html")),
-    ("/view.js", "text/javascript; charset=utf-8", include_str!("../web/view.js")),
-    ("/view.css", "text/css; charset=utf-8", include_str!("../web/view.css")),
-    ("/three.min.js", "text/javascript; charset=utf-8", include_str!("../web/three.min.js")),
+const FILES: [(&str, &str, &str); 5] = [
+    ("/", "text/html; charset=utf-8", INDEX),
+    ("/view.js", "text/javascript; charset=utf-8", VIEW_SCRIPT),
+    ("/recording.js", "text/javascript; charset=utf-8", RECORDING_SCRIPT),
+    ("/view.css", "text/css; charset=utf-8", STYLE),
+    ("/three.min.js", "text/javascript; charset=utf-8", THREE),
 ];
 /// Hosts of a page on this machine, also at the end of an `ssh -L` tunnel.
 const LOCAL_HOSTS: [&str; 3] = ["localhost", "127.0.0.1", "[::1]"];

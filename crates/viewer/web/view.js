@@ -4,6 +4,7 @@ import {
   Group, HemisphereLight, Mesh, MeshStandardMaterial, OrbitControls, PerspectiveCamera, PlaneGeometry, Raycaster, Scene,
   SphereGeometry, Vector2, Vector3, WebGLRenderer,
 } from './three.min.js';
+import { Recording } from './recording.js';
 
 const JOINTS = 12;
 const LEGS = 4;
@@ -19,6 +20,8 @@ const FULL = new Color(0xff7a1a);
 const $ = (id) => document.getElementById(id);
 const token = new URLSearchParams(location.search).get('token');
 const url = (path) => (token ? `${path}?token=${encodeURIComponent(token)}` : path);
+// A page that is a file has scene and frames inside.
+const recording = globalThis.recordedFrames ? new Recording(globalThis.recordedFrames) : null;
 
 const renderer = new WebGLRenderer({ canvas: $('scene'), antialias: true });
 renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
@@ -293,6 +296,7 @@ function animate() {
 
 // Requests of the controls.
 async function ask(request) {
+  if (recording) { recording.obey(request); return; }
   await fetch(url('request'), {
     method: 'POST', headers: { 'content-type': 'application/json' }, body: JSON.stringify(request),
   });
@@ -408,10 +412,30 @@ async function connect() {
   }
 }
 
+async function play() {
+  let last = performance.now();
+  let shown = null;
+  for (;;) {
+    await new Promise(requestAnimationFrame);
+    const now = performance.now();
+    const payload = recording.advance((now - last) / 1000);
+    last = now;
+    newest = decode(payload);
+    newest.playback = recording.playback;
+    if (payload !== shown) addCurves(newest);
+    shown = payload;
+    received += 1;
+  }
+}
+
 async function start() {
-  const response = await fetch(url('scene'));
-  if (!response.ok) { $('status').textContent = await response.text(); return; }
-  info = await response.json();
+  if (recording) {
+    info = globalThis.recordedScene;
+  } else {
+    const response = await fetch(url('scene'));
+    if (!response.ok) { $('status').textContent = await response.text(); return; }
+    info = await response.json();
+  }
   $('title').textContent = info.title;
   document.title = info.title;
   $('ghost-legend').hidden = !info.has_ghost;
@@ -426,7 +450,7 @@ async function start() {
     [lastReceived, lastDrawn] = [received, drawn];
     drawCurves();
   }, 1000);
-  connect();
+  if (recording) play(); else connect();
 }
 
 start();
