@@ -49,6 +49,10 @@ fn hidden_friction_is_found_with_its_scope_and_size_and_the_extended_model_fits(
     let [before, after] = [diagnosis.baseline, diagnosis.extended].map(|errors| errors.q_rmse_rad.unwrap());
     assert!(after < 0.4 * before, "{before} -> {after} rad on held-out seconds");
     check_in_a_browser(&folder.path().join("diagnosis/report.html"));
+    for motion in ["motion_before.html", "motion_after.html"] {
+        let page = std::fs::read_to_string(folder.path().join("diagnosis").join(motion)).unwrap();
+        assert!(page.contains(motion) && page.contains("\"has_ghost\":true"), "{motion}");
+    }
 }
 
 /// Checks that every plot is present, the page fits the window, and nothing is loaded.

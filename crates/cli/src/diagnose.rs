@@ -13,6 +13,7 @@ use crate::evaluate::simulator;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::open_log::open_log;
 use crate::robot_file::analytic_model;
+use crate::view_log;
 use twinstep_report::report_data::{LogFacts, Provenance, ReportData};
 use twinstep_report::write_report;
 
@@ -25,7 +26,8 @@ use twinstep_report::write_report;
 /// effect of the catalogue is the cause, the report states what the residual depends on.
 ///
 /// DIR gets report.html for a browser, findings.json for programs and extended.toml, the corrected model, which
-/// `twinstep serve --model` loads. If some causes are not distinguishable with this log, DIR also gets next_experiment,
+/// `twinstep serve --model` loads. motion_before.html and motion_after.html play the first 20 s of the log, with the
+/// simulation of the given and of the corrected model as the robot's ghost. If some causes are not distinguishable with this log, DIR also gets next_experiment,
 /// the safe motion that discriminates between them best. Execute it with `twinstep play` or on the robot, then diagnose
 /// both logs together.
 ///
@@ -58,6 +60,11 @@ impl Args {
 
 /// Folder of the proposed experiment, in the output folder.
 const NEXT_EXPERIMENT: &str = "next_experiment";
+
+/// Pages of the robot and its simulation with the given and with the corrected model, in the output folder.
+const MOTIONS: [&str; 2] = ["motion_before.html", "motion_after.html"];
+/// Length of their motion [s].
+const MOTION_S: f64 = 20.0;
 
 /// The output folder cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -112,13 +119,19 @@ pub fn run(args: &Args) -> CommandResult {
         date: today(),
         model: args.model.as_ref().map_or("the ideal go2".to_owned(), |path| path.display().to_string()),
         logs: args.logs.iter().zip(&logs).map(|(path, log)| LogFacts::of(&path.display().to_string(), log)).collect(),
+        motions: MOTIONS.map(str::to_owned).to_vec(),
     };
     let data = ReportData::gather(&logs[0], &model, &extended, &mut simulator, provenance).map_err(other)?;
     let report = args.out.join("report.html");
     write_report(&diagnosis, &data, &report).map_err(input)?;
+    for (file, robot) in [(MOTIONS[0], robot), (MOTIONS[1], extended.robot_model().map_err(input)?)] {
+        let title = format!("{} and {file}", args.logs[0].display());
+        write_file(args, file, &view_log::page_with_ghost(logs[0].clone(), title, robot, MOTION_S)?)?;
+    }
     print_findings(&diagnosis, args)?;
     if !args.json {
         println!("report: {}", report.display());
+        println!("robot and simulation: {}, {}", args.out.join(MOTIONS[0]).display(), MOTIONS[1]);
     }
     Ok(())
 }

@@ -30,26 +30,25 @@ pub fn run(path: &Path, model: Option<&Path>, page: &PageArgs, signals: &Signals
 
 /// Returns a page that plays the first seconds of a log.
 pub fn page(path: &Path, model: Option<&Path>, seconds: f64) -> Result<String, Failure> {
-    let (mut player, scene) = open(path, model)?;
-    let count = (seconds.min(player.duration) * FRAME_RATE).floor() as usize;
-    let frame = |index| {
-        player.time = index as f64 / FRAME_RATE;
-        player.frame()
-    };
-    Ok(static_page(&scene, &(0..=count).map(frame).collect::<Vec<_>>()))
+    let (player, scene) = open(path, model)?;
+    Ok(player.page(&scene, seconds))
+}
+
+/// Returns a page that plays the first seconds of a log, with the simulation of `robot` as its ghost.
+pub fn page_with_ghost(log: Log, title: String, robot: RobotModel, seconds: f64) -> Result<String, Failure> {
+    let (player, scene) = player(log, title, robot, true)?;
+    Ok(player.page(&scene, seconds))
 }
 
 fn open(path: &Path, model: Option<&Path>) -> Result<(Player, SceneInfo), Failure> {
-    let log = open_log(path)?;
-    let robot = robot_model(model)?;
+    player(open_log(path)?, path.display().to_string(), robot_model(model)?, model.is_some())
+}
+
+fn player(log: Log, title: String, robot: RobotModel, has_ghost: bool) -> Result<(Player, SceneInfo), Failure> {
     let measured = measured_poses(&log, &robot);
-    let simulated = if model.is_some() { simulated_poses(&log, &robot)? } else { Vec::new() };
-    let first = measured[0].scene(&robot);
-    let scene = SceneInfo {
-        is_interactive: true,
-        has_ghost: model.is_some(),
-        ..SceneInfo::new(path.display().to_string(), &first, robot.torque_limits())
-    };
+    let simulated = if has_ghost { simulated_poses(&log, &robot)? } else { Vec::new() };
+    let info = SceneInfo::new(title, &measured[0].scene(&robot), robot.torque_limits());
+    let scene = SceneInfo { is_interactive: true, has_ghost, ..info };
     let duration = log.t()[log.rows() - 1] - log.t()[0];
     let player = Player { log, robot, measured, simulated, time: 0.0, duration, is_paused: false, speed: 1.0 };
     Ok((player, scene))
@@ -137,6 +136,16 @@ impl Player {
             std::thread::sleep(TICK);
         }
         Ok(())
+    }
+
+    /// Returns a page that plays the first seconds.
+    fn page(mut self, scene: &SceneInfo, seconds: f64) -> String {
+        let count = (seconds.min(self.duration) * FRAME_RATE).floor() as usize;
+        let frame = |index| {
+            self.time = index as f64 / FRAME_RATE;
+            self.frame()
+        };
+        static_page(scene, &(0..=count).map(frame).collect::<Vec<_>>())
     }
 
     fn obey(&mut self, request: PageRequest) {

@@ -75,6 +75,7 @@ pub fn provenance(diagnosis: &Diagnosis, provenance: &Provenance) -> String {
     let code = |text: &str| format!("<code>{}</code>", escape(text));
     let list = [
         provenance.logs.iter().map(|log| entry("Log", facts(log))).collect(),
+        entry("Robot and simulation", text::listed(provenance.motions.iter().map(|file| code(file)))),
         entry("Given model", code(&provenance.model)),
         entry("Extended model", code(&diagnosis.extended_model)),
         entry("Command", code(&provenance.command)),

@@ -38,6 +38,8 @@ pub struct Provenance {
     pub model: String,
     /// Diagnosed logs. The first one is plotted.
     pub logs: Vec<LogFacts>,
+    /// Pages beside the report that play the first log, with the simulation as the robot's ghost.
+    pub motions: Vec<String>,
 }
 
 /// Summary of a log.

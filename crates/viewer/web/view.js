@@ -175,7 +175,13 @@ function footPosition(robot, leg) {
 }
 
 function draw(frame) {
-  if (robots.length !== frame.robots) makeRobots(frame.robots);
+  if (robots.length !== frame.robots) {
+    makeRobots(frame.robots);
+    // A robot may hang above the ground.
+    const height = frame.states[0].poses[2];
+    camera.position.z += height - orbit.target.z;
+    orbit.target.z = height;
+  }
   frame.states.forEach((state, index) => {
     const robot = robots[index];
     info.bodies.forEach((_, body) => place(robot.bodies[body], state.poses, 7 * body));
@@ -252,12 +258,15 @@ function addCurves(frame) {
     }
     const curve = curves.get(name);
     curve.values.push(value);
-    if (curve.values.length > CURVE_POINTS) curve.values.shift();
+    if (!recording && curve.values.length > CURVE_POINTS) curve.values.shift();
   }
 }
 
+// The last 20 s, or everything that was recorded with a line at the time that is shown.
 function drawCurves() {
+  const share = recording ? recording.time / (recording.duration || 1) : null;
   for (const { values, canvas, shown } of curves.values()) {
+    const points = recording ? values.length - 1 || 1 : CURVE_POINTS;
     const known = values.filter(Number.isFinite);
     const [low, high] = [Math.min(...known), Math.max(...known)];
     const span = high - low || 1;
@@ -267,10 +276,14 @@ function drawCurves() {
     context.lineWidth = 2;
     context.beginPath();
     values.forEach((value, index) => {
-      context.lineTo((index / CURVE_POINTS) * canvas.width, canvas.height - 6 - ((value - low) / span) * (canvas.height - 12));
+      context.lineTo((index / points) * canvas.width, canvas.height - 6 - ((value - low) / span) * (canvas.height - 12));
     });
     context.stroke();
-    shown.textContent = number(values[values.length - 1], 3);
+    if (recording) {
+      context.fillStyle = '#e8eaed';
+      context.fillRect(share * canvas.width - 1, 0, 2, canvas.height);
+    }
+    shown.textContent = number(values[recording ? Math.round(share * points) : values.length - 1], 3);
   }
 }
 
@@ -414,7 +427,7 @@ async function connect() {
 
 async function play() {
   let last = performance.now();
-  let shown = null;
+  recording.frames.forEach((frame) => addCurves(decode(frame)));
   for (;;) {
     await new Promise(requestAnimationFrame);
     const now = performance.now();
@@ -422,9 +435,8 @@ async function play() {
     last = now;
     newest = decode(payload);
     newest.playback = recording.playback;
-    if (payload !== shown) addCurves(newest);
-    shown = payload;
     received += 1;
+    drawCurves();
   }
 }
 
@@ -448,7 +460,7 @@ async function start() {
     if (received > lastReceived) $('status').textContent = `${drawn - lastDrawn} frames/s`;
     else if (received > 0) $('status').textContent = 'waits for the next frame';
     [lastReceived, lastDrawn] = [received, drawn];
-    drawCurves();
+    if (!recording) drawCurves();
   }, 1000);
   if (recording) play(); else connect();
 }

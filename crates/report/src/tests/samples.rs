@@ -29,6 +29,7 @@ pub fn evidence(log: &Log, extended: &ModelFile) -> ReportData {
         date: "2026-11-21".to_owned(),
         model: "the ideal go2".to_owned(),
         logs: vec![LogFacts::of(RECORDING, log)],
+        motions: vec!["motion_before.html".to_owned()],
     };
     ReportData::gather(log, &ModelFile::default(), extended, &mut simulator, provenance).unwrap()
 }
