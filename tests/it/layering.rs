@@ -47,6 +47,7 @@ const MAY_USE: [(&str, &[&str]); 26] = [
             "client",
             "policy",
             "learning",
+            "viewer",
         ],
     ),
     (

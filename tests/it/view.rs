@@ -115,6 +115,7 @@ fn page_draws_a_walking_robot_and_its_controls_work() {
     let viewed = Viewed::policy();
     let mut page = ChromePage::open(&browser, &viewed.url, [1000, 700]);
     page.wait_for("Number(document.body.dataset.frames) > 20", PATIENCE);
+    println!("first frame {} ms after opening", page.evaluate("document.body.dataset.firstFrameMs"));
     page.evaluate("document.getElementById('vx').value = 0.5; document.getElementById('vx').oninput()");
     page.wait_for("document.getElementById('facts').innerText.includes('0.50 0.00 0.00')", PATIENCE);
     let time = "Number(document.querySelector('#facts tr:nth-child(2) td:nth-child(2)').innerText.split(' ')[0])";

@@ -14,6 +14,7 @@ pub mod sim;
 pub mod tcp;
 pub mod throughput;
 pub mod transport;
+pub mod view;
 
 use serde::Serialize;
 

@@ -12,7 +12,7 @@ use crate::error::{BenchError, Interrupted, check, failed};
 use crate::throughput::{WINDOWS, measure as pace, median};
 
 /// Rate of the physics of `twinstep train` [Hz].
-const PHYSICS_HZ: u32 = 400;
+pub(crate) const PHYSICS_HZ: u32 = 400;
 
 /// Measures env-steps/s of rollouts and updates, on a server on this machine and in process.
 pub fn measure(window_s: f64, interrupted: Interrupted) -> Result<Vec<Measurement>, BenchError> {

@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
-use twinstep_bench::{BenchError, Machine, Results, ensemble, identify, remote, remote_training, sim, tcp, transport};
+use twinstep_bench::{
+    BenchError, Machine, Results, ensemble, identify, remote, remote_training, sim, tcp, transport, view,
+};
 
 use crate::exit::{CommandResult, Failure, Signals, other};
 
@@ -40,6 +42,8 @@ enum What {
     Identify,
     /// Actuator networks: speed compared with PyTorch and burn, and robots simulated with them.
     Ensemble,
+    /// Robots in the browser: processor time of a page, and what it costs a training.
+    View,
     /// Echo server of the TCP ping-pong.
     #[value(hide = true)]
     TcpEcho,
@@ -74,6 +78,9 @@ pub fn run(args: &Args) -> CommandResult {
     }
     if selected(What::Ensemble) {
         rows.extend(ensemble::measure(&args.python, args.window_s, &interrupted).map_err(failure)?);
+    }
+    if selected(What::View) {
+        rows.extend(view::measure(args.window_s, &interrupted).map_err(failure)?);
     }
     let results = Results { rows, machine: Machine::this() };
     if args.json {

@@ -19,6 +19,7 @@ use twinstep_sim::BatchRollout;
 use crate::diagnose;
 use crate::exit::{CommandResult, Signals, input, other};
 use crate::train;
+use crate::web_view::ViewArgs;
 
 /// Frames of the film strip, and policy steps between two of them.
 const FILM_FRAMES: usize = 15;
@@ -26,7 +27,7 @@ const FILM_STEPS: u64 = 4;
 
 /// Show the main features in two minutes; needs only this program.
 ///
-/// Trains a policy that walks. Starts a server in another process, connects to it over Zenoh, and lets the policy walk
+/// Trains a policy that walks; a page in the browser shows the robots while they learn. Starts a server in another process, connects to it over Zenoh, and lets the policy walk
 /// its robots. Then compares a recording of a real Go2, with a fixed base in the air, with the simulation joint by
 /// joint. At the end it diagnoses the recording: it reports which effects explain the difference, and writes the HTML
 /// report.
@@ -51,7 +52,7 @@ pub struct Args {
 /// Runs the parts of the demo.
 pub fn run(args: &Args) -> CommandResult {
     eprintln!("1. A Go2 learns to walk: {:.1} million steps of 1024 robots.", args.train_steps as f64 / 1e6);
-    let training = train::Args::new(args.out.join("walk"), 1, args.train_steps);
+    let training = train::Args::new(args.out.join("walk"), 1, args.train_steps, ViewArgs::default_page());
     // The demo repeats its own training.
     training.remove_checkpoint().map_err(other)?;
     train::run(&training)?;

@@ -125,9 +125,9 @@ fn folder_error(folder: &Path, cause: std::io::Error) -> Failure {
 
 impl Args {
     /// Returns the arguments of a training with default settings in the folder `out`.
-    pub fn new(out: PathBuf, seed: u64, steps: u64) -> Self {
+    pub fn new(out: PathBuf, seed: u64, steps: u64, view: ViewArgs) -> Self {
         Self {
-            view: ViewArgs::default(),
+            view,
             task: Some("walk".to_owned()),
             out,
             config: None,

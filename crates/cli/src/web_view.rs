@@ -50,6 +50,12 @@ pub struct Page {
 }
 
 impl ViewArgs {
+    /// Returns the options of a page at the default address; without a page if it cannot be served there.
+    pub fn default_page() -> Self {
+        let page = Self { view: DEFAULT_ADDRESS.parse().ok(), view_token: None };
+        if page.check().is_ok() { page } else { Self::default() }
+    }
+
     /// Serves the page of robots like that of `env`, if there is to be one. `env` is reset.
     pub fn open(&self, title: &str, env: &mut dyn VecEnv, torque_limits: PerJoint) -> Result<Option<Page>, Failure> {
         if !self.is_wanted() {

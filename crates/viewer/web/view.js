@@ -300,6 +300,7 @@ function animate() {
     showPlayback(newest.playback, newest.time);
     newest = null;
     drawn += 1;
+    if (drawn === 1) document.body.dataset.firstFrameMs = performance.now();
     document.body.dataset.frames = drawn;
   }
   orbit.update();
