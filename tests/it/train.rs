@@ -192,7 +192,7 @@ fn policy_is_evaluated_on_each_engine_and_refused_where_it_does_not_fit() {
     let report: serde_json::Value = serde_json::from_slice(&evaluated.stdout).unwrap();
     let rows: Vec<_> =
         report["rows"].as_array().unwrap().iter().map(|row| (&row["condition"], &row["engine"])).collect();
-    assert_eq!(rows.len(), 8);
+    assert_eq!(rows.len(), 9);
     let shares = report["rows"][0]["by_speed"].as_array().unwrap();
     let share: f64 = shares.iter().map(|bin| bin["share"].as_f64().unwrap()).sum();
     assert!((share - 1.0).abs() < 1e-9 && std::fs::read_to_string(film).unwrap().starts_with("<svg"));

@@ -7,7 +7,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_diagnose::{
     DiagnoseError, Diagnosis, DiagnosisOutput, ParameterValue, RmsErrors, diagnose, diagnose_torques,
 };
-use twinstep_model::Joint;
+use twinstep_logs::Log;
+use twinstep_model::{Joint, RobotModel};
 
 use crate::evaluate::simulator;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
@@ -114,26 +115,42 @@ pub fn run(args: &Args) -> CommandResult {
         NEXT_EXPERIMENT.clone_into(&mut entry.motion);
     }
     write_file(args, "extended.toml", &extended.to_toml())?;
+    let motions = motion_pages(args, &logs[0], robot, extended.robot_model().map_err(input)?)?;
     let provenance = Provenance {
         command: std::env::args().collect::<Vec<_>>().join(" "),
         date: today(),
         model: args.model.as_ref().map_or("the ideal go2".to_owned(), |path| path.display().to_string()),
         logs: args.logs.iter().zip(&logs).map(|(path, log)| LogFacts::of(&path.display().to_string(), log)).collect(),
-        motions: MOTIONS.map(str::to_owned).to_vec(),
+        motions: motions.clone(),
     };
     let data = ReportData::gather(&logs[0], &model, &extended, &mut simulator, provenance).map_err(other)?;
     let report = args.out.join("report.html");
     write_report(&diagnosis, &data, &report).map_err(input)?;
-    for (file, robot) in [(MOTIONS[0], robot), (MOTIONS[1], extended.robot_model().map_err(input)?)] {
-        let title = format!("{} and {file}", args.logs[0].display());
-        write_file(args, file, &view_log::page_with_ghost(logs[0].clone(), title, robot, MOTION_S)?)?;
-    }
     print_findings(&diagnosis, args)?;
     if !args.json {
         println!("report: {}", report.display());
-        println!("robot and simulation: {}, {}", args.out.join(MOTIONS[0]).display(), MOTIONS[1]);
+        for motion in motions {
+            println!("robot and simulation: {}", args.out.join(motion).display());
+        }
     }
     Ok(())
+}
+
+/// Writes the pages of the robot and its simulation with both models. Returns their names: none if the log cannot be played.
+fn motion_pages(args: &Args, log: &Log, given: RobotModel, extended: RobotModel) -> Result<Vec<String>, Failure> {
+    let mut written = Vec::new();
+    for (file, robot) in MOTIONS.into_iter().zip([given, extended]) {
+        let title = format!("{} and {file}", args.logs[0].display());
+        match view_log::page_with_ghost(log.clone(), title, robot, MOTION_S) {
+            Ok(page) => {
+                write_file(args, file, &page)?;
+                written.push(file.to_owned());
+            }
+            // The page of an earlier diagnosis must not be mistaken for the result of this one.
+            Err(_) => drop(std::fs::remove_file(args.out.join(file))),
+        }
+    }
+    Ok(written)
 }
 
 /// Runs `diagnose` with a progress spinner. Ctrl-C interrupts it.

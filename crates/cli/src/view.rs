@@ -42,6 +42,9 @@ pub struct Args {
     /// Name of the robot, if an endpoint has several.
     #[arg(long, value_name = "NAME")]
     robot: Option<String>,
+    /// Id of the server (see `twinstep list`), if an endpoint has several. Default: the one with the most free environments.
+    #[arg(long, value_name = "ID")]
+    server: Option<String>,
     #[command(flatten)]
     walk: WalkArgs,
     #[command(flatten)]
@@ -74,8 +77,8 @@ pub fn run(args: &Args) -> CommandResult {
         if !view_endpoint::is_endpoint(&args.target) {
             return Err(input(NoTarget(args.target.clone())));
         }
-        let (zenoh, robot) = (args.zenoh.clone(), args.robot.clone());
-        let options = ConnectOptions { zenoh, robot, ..ConnectOptions::new(&args.target, 1) };
+        let (zenoh, robot, server_id) = (args.zenoh.clone(), args.robot.clone(), args.server.clone());
+        let options = ConnectOptions { zenoh, robot, server_id, ..ConnectOptions::new(&args.target, 1) };
         if args.html.is_some() {
             return Err(Failure::Input(miette::miette!(
                 "`--html` is for a policy or a log; {} is an endpoint\n  record it first: `twinstep run POLICY --endpoint {} \

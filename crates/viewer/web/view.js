@@ -7,6 +7,7 @@ import {
 import { Recording } from './recording.js';
 
 const JOINTS = 12;
+const MAX_ROBOTS = 64;
 const LEGS = 4;
 const FEET = ['FL', 'FR', 'RL', 'RR'];
 const CURVE_POINTS = 600;
@@ -145,6 +146,7 @@ function decode(payload) {
   const numbers = new Float32Array(payload.slice(4 + length).buffer);
   const poses = 7 * info.bodies.length;
   const stride = poses * (info.has_ghost ? 2 : 1) + JOINTS + LEGS + 6;
+  header.robots = Math.min(header.robots, MAX_ROBOTS);
   header.states = Array.from({ length: header.robots }, (_, robot) => {
     let at = robot * stride;
     const take = (count) => { at += count; return numbers.subarray(at - count, at); };
