@@ -1,19 +1,24 @@
 //! Cross-validation: a hypothesis is fitted to one fold and evaluated on the other, in full simulation.
 
+use nalgebra::{DMatrix, DVector};
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, Scope};
 use twinstep_model::{Precision, RobotModel, Rollout};
 
 use super::hypothesis::{Hypothesis, selection_penalty};
 use super::residual_data::ResidualData;
-use super::residual_power::{CHANNELS, ResidualPower};
+use super::residual_power::{ResidualPower, evident_channels};
 use super::residual_rows::{PRECISION, ResidualRows};
-use twinstep_identify::least_squares::LeastSquaresProblem;
+use twinstep_identify::least_squares::{LeastSquaresProblem, Linearisation};
 use twinstep_identify::parameter::{FreeParameter, free_parameters, initial_coordinate, with_values};
-use twinstep_identify::refine::refine;
+use twinstep_identify::refine::{DAMPING_FACTORS, refine};
 
 /// Maximum number of refinement steps; the scan provides a start near the minimum.
 const STEPS: usize = 6;
+/// Maximum number of refinement steps of a candidate that is one of several.
+const TRIAL_STEPS: usize = 3;
+/// Damping factors of a candidate's steps.
+const TRIAL_DAMPING: [f64; 3] = [0.0, 0.1, 10.0];
 /// Relative decrease of the cost below which the refinement has converged.
 const SETTLED: f64 = 1e-3;
 
@@ -28,6 +33,8 @@ pub struct CandidateFit {
     pub gain: f64,
     /// Fraction of the power above noise that it explains in the affected channels.
     pub explained_fraction: f64,
+    /// Threshold that its score had to reach [nat]; of a candidate, 0.
+    pub threshold: f64,
 }
 
 /// Fit of effects on top of a model.
@@ -56,14 +63,45 @@ impl FitProblem {
 
     /// Returns the point with the least cost on `rows` [coordinates].
     pub fn solve(&self, rows: &ResidualRows, simulator: &mut dyn Rollout) -> Vec<f64> {
-        let (mut steps, mut last) = (0, f64::INFINITY);
         self.with_problem(rows, simulator, PRECISION, |task, simulator| {
-            refine(task, simulator, self.initial_point.clone(), |cost| {
-                steps += 1;
-                let settled = last - cost < SETTLED * cost;
-                last = cost;
-                steps < STEPS && !settled
-            })
+            self.refined(task, simulator, &DAMPING_FACTORS, STEPS)
+        })
+    }
+
+    /// Returns the points with the least cost on either fold of `rows` [coordinates].
+    ///
+    /// Both are steps of the model that is linearised at the fit to all rows. Returns `None` if the simulation diverges
+    /// there.
+    pub fn solve_folds(&self, rows: &ResidualRows, simulator: &mut dyn Rollout) -> Option<[Vec<f64>; 2]> {
+        self.with_problem(rows, simulator, PRECISION, |task, simulator| {
+            let whole = self.refined(task, simulator, &TRIAL_DAMPING, TRIAL_STEPS);
+            let here = task.linearise(simulator, &whole)?;
+            let points = [0, 1].map(|fold| {
+                // The penalties of nuisance parameters, behind the rows, belong to both folds.
+                let weight = |row: usize| match rows.fold_of_residual(row) {
+                    Some(of) => f64::from(of == Some(fold)),
+                    None => 0.5,
+                };
+                fold_step(task, &here, &whole, weight)
+            });
+            let [Some(one), Some(other)] = points else { return None };
+            Some([one, other])
+        })
+    }
+
+    fn refined(
+        &self,
+        task: &LeastSquaresProblem,
+        simulator: &mut dyn Rollout,
+        damping: &[f64],
+        most: usize,
+    ) -> Vec<f64> {
+        let (mut steps, mut last) = (0, f64::INFINITY);
+        refine(task, simulator, damping, self.initial_point.clone(), |cost| {
+            steps += 1;
+            let settled = last - cost < SETTLED * cost;
+            last = cost;
+            steps < most && !settled
         })
     }
 
@@ -100,7 +138,7 @@ pub fn cross_validate(
     simulator: &mut dyn Rollout,
 ) -> Option<CandidateFit> {
     let fit = FitProblem::new(model, std::slice::from_ref(hypothesis))?;
-    let points = [0, 1].map(|fold| fit.solve(&evidence.folds[fold], simulator));
+    let points = fit.solve_folds(&evidence.fit_rows, simulator)?;
     let whole: Vec<f64> = points[0].iter().zip(&points[1]).map(|(one, other)| 0.5 * (one + other)).collect();
     let models = [fit.model(&points[0]), fit.model(&points[1]), fit.model(&whole)];
     let robots: Vec<RobotModel> = models.iter().map(|model| model.robot_model().ok()).collect::<Option<_>>()?;
@@ -111,9 +149,10 @@ pub fn cross_validate(
         left[0].log_likelihood_gain(before, channel, 1, rows) + left[1].log_likelihood_gain(before, channel, 0, rows)
     };
     let tolerated: f64 = left[..2].iter().map(|left| 0.5 * left.tolerated_gain(before)).sum();
-    let evidence_nats: f64 = (0..CHANNELS).map(judged).sum::<f64>() + tolerated;
+    let channels = || evident_channels([hypothesis.effect.target]);
+    let evidence_nats: f64 = channels().map(judged).sum::<f64>() + tolerated;
     let held_out = |channel: usize| left[0].sums[channel][1] + left[1].sums[channel][0];
-    let acts: Vec<usize> = (0..CHANNELS).filter(|channel| judged(*channel) > 1.0).collect();
+    let acts: Vec<usize> = channels().filter(|channel| judged(*channel) > 1.0).collect();
     let [then, now] = [
         acts.iter().map(|channel| before.sums[*channel].iter().sum::<f64>()).sum::<f64>(),
         acts.iter().map(|channel| held_out(*channel)).sum::<f64>(),
@@ -126,9 +165,10 @@ pub fn cross_validate(
     let values = fit.unknowns.iter().zip(&whole).map(|(unknown, coordinate)| unknown.value(*coordinate)).collect();
     Some(CandidateFit {
         hypothesis: Hypothesis { values, ..hypothesis.clone() },
-        score: evidence_nats - selection_penalty(hypothesis.scope) - parameter_penalty(&fit),
+        score: evidence_nats - selection_penalty(hypothesis.scope) - parameter_penalty(fit.unknowns.len()),
         gain: if then > 0.0 { 1.0 - (now / then).sqrt() } else { 0.0 },
         explained_fraction: if above > 0.0 { 1.0 - left_above / above } else { 0.0 },
+        threshold: 0.0,
     })
 }
 
@@ -141,7 +181,7 @@ pub fn cross_validate_together(
     simulator: &mut dyn Rollout,
 ) -> f64 {
     let Some(fit) = FitProblem::new(model, hypotheses).filter(|_| !hypotheses.is_empty()) else { return 0.0 };
-    let points = [0, 1].map(|fold| fit.solve(&evidence.folds[fold], simulator));
+    let Some(points) = fit.solve_folds(&evidence.fit_rows, simulator) else { return f64::NEG_INFINITY };
     let models = [model.clone(), fit.model(&points[0]), fit.model(&points[1])];
     let robots: Option<Vec<RobotModel>> = models.iter().map(|model| model.robot_model().ok()).collect();
     let Some(robots) = robots else { return f64::NEG_INFINITY };
@@ -153,12 +193,38 @@ pub fn cross_validate_together(
     };
     let tolerated: f64 = left[1..].iter().map(|now| 0.5 * now.tolerated_gain(&left[0])).sum();
     let penalties: f64 = hypotheses.iter().map(|hypothesis| selection_penalty(hypothesis.scope)).sum();
-    (0..CHANNELS).map(judged).sum::<f64>() + tolerated - penalties - parameter_penalty(&fit)
+    let channels = evident_channels(hypotheses.iter().map(|hypothesis| hypothesis.effect.target));
+    channels.map(judged).sum::<f64>() + tolerated - penalties - parameter_penalty(fit.unknowns.len())
+}
+
+/// Returns the point with the least cost of the linearised model, with weights of the residuals [coordinates].
+///
+/// Half of the prior's information belongs to each fold.
+fn fold_step(
+    task: &LeastSquaresProblem,
+    here: &Linearisation,
+    point: &[f64],
+    weight: impl Fn(usize) -> f64,
+) -> Option<Vec<f64>> {
+    let count = point.len();
+    let prior = DVector::from_iterator(count, task.to_prior_units(point));
+    let mut information = 0.5 * DMatrix::<f64>::identity(count, count);
+    let mut gradient = 0.5 * &prior;
+    for (row, residual) in here.residuals.iter().enumerate() {
+        let weight = weight(row);
+        if weight > 0.0 {
+            let slope = here.jacobian.row(row).transpose();
+            gradient.axpy(weight * residual, &slope, 1.0);
+            information.ger(weight, &slope, &slope, 1.0);
+        }
+    }
+    let moved = prior - information.cholesky()?.solve(&gradient);
+    Some(task.from_prior_units(moved.as_slice()))
 }
 
 /// Returns the penalty for the parameters of a fit [nat].
-fn parameter_penalty(fit: &FitProblem) -> f64 {
-    0.5 * fit.unknowns.len() as f64 * 200f64.ln()
+pub fn parameter_penalty(parameters: usize) -> f64 {
+    0.5 * parameters as f64 * 200f64.ln()
 }
 
 #[cfg(test)]

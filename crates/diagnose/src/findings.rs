@@ -49,10 +49,13 @@ pub struct Cause {
     pub held_out_gain: f64,
     /// Cross-validated log-likelihood gain after penalties [nat].
     pub score_nats: f64,
-    /// Threshold of the log-likelihood gain, a constant [nat].
+    /// Threshold of the log-likelihood gain: a quantile of what the best of all hypotheses gains if none is true [nat].
     pub threshold_nats: f64,
     /// Ambiguous alternatives, which explain the log equally well, as in `armature@calf`.
     pub ambiguous_with: Vec<String>,
+    /// The hypotheses that the log cannot tell apart, the cause first, with their posterior probabilities.
+    #[serde(default)]
+    pub posterior: Vec<WeightedHypothesis>,
     /// Best alternative hypotheses.
     pub rivals: Vec<AlternativeCause>,
     /// Explanation of the cause, as text.
@@ -78,6 +81,17 @@ pub enum ParameterValue {
     Number(f64),
     /// A vector.
     Vector(Vec<f64>),
+}
+
+/// Hypothesis with its posterior probability among those that the log cannot tell apart.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct WeightedHypothesis {
+    /// Name of the effect.
+    pub effect: String,
+    /// Scope of the effect.
+    pub scope: String,
+    /// Probability, if one of them is the cause and all were equally likely before the log.
+    pub probability: f64,
 }
 
 /// Alternative hypothesis in place of a cause.

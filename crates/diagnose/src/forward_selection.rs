@@ -5,14 +5,17 @@ use twinstep_effects::{Probes, Target};
 use twinstep_model::{Joint, RobotModel, Rollout};
 
 use super::DiagnoseError;
+use super::backward_elimination;
 use super::cross_validation::{CandidateFit, FitProblem, cross_validate};
 use super::hypothesis::Hypothesis;
+use super::null_distribution::{self, LOWEST_THRESHOLD};
 use super::profile_likelihood::refine_with_restarts;
 use super::residual_data::ResidualData;
-use super::residual_power::{CHANNELS, GYRO, ResidualPower, STANCE, TORQUE, TRUNK};
+use super::residual_power::{CHANNELS, DYNAMIC, GYRO, ResidualPower, STANCE, TORQUE, TRUNK};
 use super::scan::{self, ScoredHypothesis, scan};
 
-/// Log-likelihood gain that a cause must reach [nat].
+/// Log-likelihood gain that a cause must reach where no null distribution is computed: torques of other robots, and the
+/// friction family [nat].
 ///
 /// Set by hand after a false positive with 22 nat in a case of `twinstep hunt` that is not in a published table.
 pub const THRESHOLD: f64 = 30.0;
@@ -24,6 +27,8 @@ const MIN_SHARE_OF_LARGEST: f64 = 0.01;
 const MOST_CAUSES: usize = 12;
 /// Maximum number of rounds of selection and elimination.
 const MOST_SEARCHES: usize = 24;
+/// Maximum number of causes that are eliminated before the search ends.
+const MOST_ELIMINATIONS: usize = 3;
 /// Maximum number of hypotheses about joints that are fitted in full simulation.
 const MAX_JOINT_CANDIDATES: usize = 5;
 /// Maximum number of hypotheses about base, ground and gyroscope, and about encoders.
@@ -32,9 +37,10 @@ const MAX_BODY_CANDIDATES: usize = 2;
 pub const MIN_EXPLAINED_FRACTION: f64 = 0.3;
 /// Fraction of the power above noise that may remain in the channels that a cause affects, after the joint refit.
 ///
-/// A cause must halve the RMS error there. A wrong law imitates the true one in part: Coulomb friction explains 57 % of
-/// the power of friction that acts in one direction only. True causes of the blind test leave less than 1 %.
-pub const MAX_REMAINING_FRACTION: f64 = 0.25;
+/// A wrong law imitates the true one in part: Coulomb friction explains 57 % of the power of friction that acts in one
+/// direction only. True causes leave less than 1 % if robot and model share the code of their laws, and up to 30 % in
+/// MuJoCo with actuators of their own.
+pub const MAX_REMAINING_FRACTION: f64 = 0.4;
 /// Power above noise per row that is negligible [noise variance].
 pub const NEGLIGIBLE_EXCESS: f64 = 1.0;
 
@@ -82,7 +88,7 @@ impl<'a> ForwardSelection<'a> {
     /// Runs forward selection with backward elimination.
     ///
     /// Each round adds the best candidate and refits all causes. If none reaches the threshold, a cause that is too
-    /// small, implausible, or does not halve the RMS error of its own channels is removed and excluded.
+    /// small, implausible, or leaves much of the error of its own channels is removed and excluded.
     pub fn run(&mut self) -> Result<(), DiagnoseError> {
         let mut excluded = Vec::new();
         for _ in 0..MOST_SEARCHES {
@@ -90,7 +96,8 @@ impl<'a> ForwardSelection<'a> {
             if let Some(next) = next {
                 self.accepted.push(next);
             } else {
-                let Some(place) = self.find_cause_to_eliminate() else { break };
+                let place = self.find_cause_to_eliminate().filter(|_| excluded.len() < MOST_ELIMINATIONS);
+                let Some(place) = place else { break };
                 excluded.push(self.accepted.remove(place).0.hypothesis.name());
             }
             self.refit();
@@ -99,7 +106,7 @@ impl<'a> ForwardSelection<'a> {
             self.accepted.remove(place);
             self.refit();
         }
-        Ok(())
+        backward_elimination::eliminate(self)
     }
 
     /// Returns the index of a cause to eliminate after the joint refit, if any.
@@ -126,7 +133,12 @@ impl<'a> ForwardSelection<'a> {
         (self.progress)(&format!("scanning the catalogue; causes: {named}"))?;
         let candidates = candidates(evidence, &self.model, self.simulator);
         let mut trials = self.evaluate(candidates, excluded, &left)?;
-        if let Some(best) = trials.first().filter(|best| best.score >= THRESHOLD) {
+        let Some(best) = trials.first().filter(|best| best.score >= LOWEST_THRESHOLD) else { return Ok(None) };
+        (self.progress)(&format!("computing the threshold; causes: {named}"))?;
+        let with_best = FitProblem::new(&self.model, std::slice::from_ref(&best.hypothesis));
+        let with_best = with_best.map_or(self.model.clone(), |fit| fit.model(&fit.initial_point));
+        let thresholds = null_distribution::thresholds(evidence, &with_best, self.simulator);
+        if let Some(best) = trials.first().filter(|best| best.score >= thresholds.of(best.hypothesis.effect)) {
             // Confounders of the best candidate, which the scan of all joints at once may have missed.
             let names: Vec<String> = trials.iter().map(|trial| trial.hypothesis.name()).collect();
             let alike = scan::confounders_of(evidence, &self.model, &best.hypothesis, &names, &left, self.simulator);
@@ -134,14 +146,18 @@ impl<'a> ForwardSelection<'a> {
             trials.sort_by(best_first);
         }
         let largest = self.accepted.iter().map(|(best, _)| best.score).fold(0.0, f64::max);
-        let least = THRESHOLD.max(MIN_SHARE_OF_LARGEST * largest);
+        let least = |trial: &CandidateFit| thresholds.of(trial.hypothesis.effect).max(MIN_SHARE_OF_LARGEST * largest);
         let earns_name = |trial: &CandidateFit| {
-            trial.score >= least
+            trial.score >= least(trial)
                 && trial.explained_fraction >= MIN_EXPLAINED_FRACTION
                 && trial.hypothesis.exceeds_min_size()
         };
         let place = trials.iter().position(earns_name);
-        Ok(place.map(|place| (trials.remove(place), trials)))
+        let accepted = place.map(|place| {
+            let trial = trials.remove(place);
+            CandidateFit { threshold: least(&trial), ..trial }
+        });
+        Ok(accepted.map(|best| (best, trials)))
     }
 
     /// Cross-validates hypotheses on top of the model with residual power `left`. Returns them with the best first.
@@ -199,10 +215,11 @@ fn best_first(one: &CandidateFit, other: &CandidateFit) -> std::cmp::Ordering {
     other.score.total_cmp(&one.score)
 }
 
-/// Returns true if a cause leaves at most a quarter of the excess power in the channels that it affects.
+/// Returns true if a cause leaves at most [`MAX_REMAINING_FRACTION`] of the excess power in the channels that it affects.
 fn explains_affected_channels(hypothesis: &Hypothesis, given: &ResidualPower, left: &ResidualPower) -> bool {
-    let held = given.counts[..TORQUE].iter().flatten().any(|count| *count > 0.0);
-    affected_channels(hypothesis, held).into_iter().all(|channels| {
+    let [held, walks] = [0..TORQUE, DYNAMIC..CHANNELS]
+        .map(|channels| given.counts[channels].iter().flatten().any(|count| *count > 0.0));
+    affected_channels(hypothesis, held, walks).into_iter().all(|channels| {
         let excess = |left: &ResidualPower| channels.iter().map(|channel| left.channel_excess(*channel)).sum::<f64>();
         let rows: f64 = channels.iter().flat_map(|channel| left.counts[*channel]).sum();
         excess(left) <= NEGLIGIBLE_EXCESS * rows || excess(left) <= MAX_REMAINING_FRACTION * excess(given)
@@ -212,8 +229,9 @@ fn explains_affected_channels(hypothesis: &Hypothesis, given: &ResidualPower, le
 /// Returns the groups of channels that a cause must explain, each separately.
 ///
 /// For joints, positions and torques are separate groups: positions with a fixed base, if there are any (`held`). For
-/// base and ground, the group is all motion channels with a floating base.
-fn affected_channels(hypothesis: &Hypothesis, held: bool) -> Vec<Vec<usize>> {
+/// the base, the group is all motion channels with a floating base; for the ground, those of a robot that walks or jumps,
+/// if it does (`walks`).
+fn affected_channels(hypothesis: &Hypothesis, held: bool, walks: bool) -> Vec<Vec<usize>> {
     match hypothesis.effect.target {
         Target::Joints => {
             let joints = || Joint::ALL.into_iter().filter(|joint| hypothesis.scope.contains(*joint));
@@ -222,7 +240,8 @@ fn affected_channels(hypothesis: &Hypothesis, held: bool) -> Vec<Vec<usize>> {
                 .to_vec()
         }
         Target::Imu => vec![(GYRO..STANCE).collect()],
-        Target::Bodies | Target::Ground => vec![(TRUNK..GYRO).chain(STANCE..CHANNELS).collect()],
+        Target::Ground if walks => vec![(DYNAMIC..CHANNELS).collect()],
+        Target::Bodies | Target::Ground => vec![(TRUNK..GYRO).chain(STANCE..DYNAMIC).collect()],
         Target::Supply => Vec::new(),
     }
 }
@@ -278,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn cause_must_explain_three_quarters_of_the_excess_in_its_channels() {
+    fn cause_must_explain_most_of_the_excess_in_its_channels() {
         let (hip, calf) = (Joint::ALL[0], Joint::ALL[2]);
         let given = residual_power(|channel| if channel == hip.index() { 20.0 } else { 10.0 });
         let only_hip = residual_power(|channel| if channel == hip.index() { 1.0 } else { 9.9 });

@@ -9,6 +9,7 @@ use twinstep_identify::refine::information;
 use twinstep_model::{Joint, JointKind, NUM_JOINTS, Rollout};
 
 use super::DiagnoseError;
+use super::backward_elimination::evidence_beside_others;
 use super::cross_validation::{CandidateFit, FitProblem, cross_validate, cross_validate_together};
 use super::forward_selection::{Accepted, ForwardSelection, THRESHOLD};
 use super::hypothesis::Hypothesis;
@@ -53,7 +54,7 @@ pub fn extend(search: &mut ForwardSelection) -> Result<(), DiagnoseError> {
         add_joints_that_differ(search)?;
         search.run()?;
         eliminate_without_evidence(search);
-        update_evidence(search)?;
+        evidence_beside_others(search)?;
     }
     if together(search) <= before {
         (search.accepted, search.model, search.view) = (single, model, view);
@@ -70,7 +71,7 @@ fn of_scope(scope: Scope) -> impl Iterator<Item = Hypothesis> {
 }
 
 fn unscored(hypothesis: Hypothesis) -> CandidateFit {
-    CandidateFit { hypothesis, score: 0.0, gain: 0.0, explained_fraction: 0.0 }
+    CandidateFit { hypothesis, score: 0.0, gain: 0.0, explained_fraction: 0.0, threshold: LEAST_EVIDENCE }
 }
 
 /// Returns true if the given model lacks something at most joints, and the causes leave more than
@@ -170,42 +171,8 @@ fn add_joints_that_differ(search: &mut ForwardSelection) -> Result<(), DiagnoseE
             found = trial.filter(|trial| trial.hypothesis.exceeds_min_size()).filter(better).or(found);
         }
         let Some(found) = found.filter(|found| found.score >= LEAST_EVIDENCE) else { break };
-        search.accepted.push((found, Vec::new()));
+        search.accepted.push((CandidateFit { threshold: LEAST_EVIDENCE, ..found }, Vec::new()));
         search.refit();
     }
     Ok(())
-}
-
-/// Sets evidence and gain of each cause to those that it has beside all others.
-fn update_evidence(search: &mut ForwardSelection) -> Result<(), DiagnoseError> {
-    (search.progress)("comparing with models that lack one of the causes")?;
-    let evidence = &search.views[search.view].evidence;
-    let hypotheses = current(&search.accepted);
-    for place in 0..hypotheses.len() {
-        let found = without(evidence, &search.baseline, &hypotheses, place, search.simulator);
-        search.accepted[place].0 = found.unwrap_or_else(|| unscored(hypotheses[place].clone()));
-    }
-    Ok(())
-}
-
-/// Returns the evidence for one of the causes, given that all others are refitted without it.
-fn without(
-    evidence: &ResidualData,
-    baseline: &ModelFile,
-    hypotheses: &[Hypothesis],
-    place: usize,
-    simulator: &mut dyn Rollout,
-) -> Option<CandidateFit> {
-    let others: Vec<Hypothesis> =
-        hypotheses.iter().enumerate().filter(|(index, _)| *index != place).map(|(_, one)| one.clone()).collect();
-    let model = if others.is_empty() {
-        baseline.clone()
-    } else {
-        let fit = FitProblem::new(baseline, &others)?;
-        let point = fit.solve(&evidence.fit_rows, simulator);
-        fit.model(&point)
-    };
-    let before = evidence.residual_power(simulator, &model.robot_model().ok()?);
-    let found = cross_validate(evidence, &model, &before, &hypotheses[place], simulator)?;
-    Some(CandidateFit { hypothesis: hypotheses[place].clone(), ..found })
 }

@@ -45,7 +45,7 @@ impl Hypothesis {
 /// Returns the size of an effect, relative to the distance from no effect to the end of the prior range.
 ///
 /// It is the largest of the components of the first parameter.
-fn relative_size(effect: &Effect, values: &[f64]) -> f64 {
+pub fn relative_size(effect: &Effect, values: &[f64]) -> f64 {
     let parameter = &effect.parameters[0];
     let [low, high] = parameter.prior_range;
     let of = |value: &f64| {

@@ -9,9 +9,9 @@ use twinstep_effects::{EffectEntry, Scope, apply_effects};
 use twinstep_logs::{Log, Meta, Segment};
 use twinstep_model::{BaseMount, JOINT_NAMES, Joint, RobotModel, go2};
 
+use super::data_split::DataSplit;
 use super::residual_data::torque_sigma;
 use super::residual_power::{ResidualPower, TORQUE};
-use super::residual_rows::fold_of;
 use twinstep_identify::torque::MeasuredTorque;
 use twinstep_logs::replay::ReplayError;
 
@@ -32,6 +32,7 @@ pub struct JointSlots {
     whole: bool,
     /// Logs with only these joints, renamed to their slots.
     logs: Vec<Log>,
+    splits: Vec<DataSplit>,
     torques: Vec<MeasuredTorque>,
     /// Unit of torque in the slots [N·m].
     pub torque_scale: f64,
@@ -54,7 +55,8 @@ impl JointSlots {
         let unit = if largest > 0.0 { largest / LARGEST_NM } else { 1.0 };
         let logs: Vec<Log> = logs.iter().map(|log| into_slots(log, names, unit)).collect::<Result<_, _>>()?;
         let torques = logs.iter().map(|log| MeasuredTorque::new(log, &ideal)).collect::<Result<_, _>>()?;
-        Ok(Self { names: names.to_vec(), whole, logs, torques, ideal, torque_scale: unit })
+        let splits = logs.iter().map(DataSplit::new).collect();
+        Ok(Self { names: names.to_vec(), whole, logs, splits, torques, ideal, torque_scale: unit })
     }
 
     /// Returns the scopes that a cause can have: all joints, or one joint.
@@ -107,10 +109,10 @@ impl JointSlots {
     pub fn residual_powers(&self, robots: &[RobotModel]) -> Vec<ResidualPower> {
         let left = |robot: &RobotModel| {
             let mut left = ResidualPower::empty();
-            for (log, torques) in self.logs.iter().zip(&self.torques) {
+            for ((log, split), torques) in self.logs.iter().zip(&self.splits).zip(&self.torques) {
                 let sigma = torque_sigma(log, &self.ideal);
                 torques.differences(robot, |seat, row, difference| {
-                    left.add(TORQUE + seat, fold_of(log, row), difference / sigma[seat]);
+                    left.add(TORQUE + seat, split.fold(row), difference / sigma[seat]);
                 });
             }
             left
@@ -121,10 +123,10 @@ impl JointSlots {
     /// Returns sums over held-out blocks: squared residuals of `robot` and noise variance [N²·m²], and number of rows.
     pub fn held_out_sums(&self, robot: &RobotModel) -> [f64; 3] {
         let (mut squares, mut noise, mut rows) = (0.0, 0.0, 0.0);
-        for (log, torques) in self.logs.iter().zip(&self.torques) {
+        for ((log, split), torques) in self.logs.iter().zip(&self.splits).zip(&self.torques) {
             let sigma = torque_sigma(log, &self.ideal);
             torques.differences(robot, |seat, row, difference| {
-                if fold_of(log, row).is_none() {
+                if split.is_held_out(row) {
                     squares += difference * difference;
                     noise += sigma[seat] * sigma[seat];
                     rows += 1.0;

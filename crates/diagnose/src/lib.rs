@@ -1,12 +1,15 @@
 //! Diagnosis: identifies the effects of the catalogue that a model lacks, by comparison with logs.
 //!
-//! - [`residual_rows`]: residuals of logs in two folds of alternating seconds, with every fifth second held out;
-//!   [`residual_power`]: their sums of squares; [`residual_data`]: residuals of motion and torque together.
+//! - [`data_split`]: rows for fits, in two folds, and held-out blocks of another regime; [`residual_rows`]: residuals
+//!   of these rows; [`residual_power`]: their sums of squares; [`residual_data`]: residuals of motion and torque
+//!   together.
 //! - [`hypothesis`]: an effect on a scope, with values.
 //! - [`forward_selection`]: forward selection with backward elimination, which uses the following modules in turn.
+//! - [`backward_elimination`]: evidence of each cause beside all others.
 //! - [`friction_family`]: a search that begins with the friction and inertia of all joints, fitted together.
 //! - [`scan`]: evaluates every effect on all joints at once, and returns the best candidates.
 //! - [`cross_validation`]: fits a hypothesis to one fold and evaluates it on the other, in full simulation.
+//! - [`null_distribution`]: the threshold of the evidence, from the log itself.
 //! - [`profile_likelihood`]: restarts from other local minima, and profile-likelihood intervals.
 //! - [`discrimination`], [`experiment_design`]: choose an experiment that discriminates between ambiguous causes.
 //! - [`unexplained`]: describes the unexplained residual; [`spectral_line`]: its strongest frequency.
@@ -14,11 +17,13 @@
 //! Joints that are not a Go2's are diagnosed by their torques only: [`torque_only`], with [`joint_slots`] and
 //! [`torque_fit`].
 //!
-//! A candidate is accepted as a cause if its log-likelihood gain exceeds [`forward_selection::THRESHOLD`], it explains
+//! A candidate is accepted as a cause if its log-likelihood gain exceeds [`null_distribution::thresholds`], it explains
 //! at least [`forward_selection::MIN_EXPLAINED_FRACTION`] of the residual power above noise, and it exceeds a minimum
 //! size. All accepted causes are then refitted together, and the search continues.
 
+mod backward_elimination;
 mod cross_validation;
+mod data_split;
 mod discrimination;
 mod excitation;
 mod experiment_design;
@@ -27,6 +32,7 @@ mod forward_selection;
 mod friction_family;
 mod hypothesis;
 mod joint_slots;
+mod null_distribution;
 mod profile_likelihood;
 mod reporting;
 mod residual_data;
@@ -49,9 +55,9 @@ pub use excitation::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
 pub use experiment_design::ProposedExperiment;
 pub use findings::{
     AlternativeCause, Cause, CorrelatedPair, Diagnosis, DiscriminatedPair, Estimate, NextExperiment, ParameterValue,
-    RmsErrors, Unexplained,
+    RmsErrors, Unexplained, WeightedHypothesis,
 };
-use forward_selection::{Accepted, ForwardSelection, THRESHOLD, WindowedData, write_estimates};
+use forward_selection::{Accepted, ForwardSelection, WindowedData, write_estimates};
 use hypothesis::Hypothesis;
 use residual_data::ResidualData;
 pub use torque_only::diagnose_torques;
@@ -135,6 +141,9 @@ pub fn diagnose(
     let ForwardSelection { view, mut accepted, model: named, .. } = search;
     let WindowedData { evidence, given } = &views[view];
     let left = evidence.residual_power(simulator, &named.robot_model()?);
+    say("refitting all causes")?;
+    refitted(&judged, &mut accepted, evidence, simulator);
+    let errors_of_fit = errors(evidence, &with_causes(model, &accepted).robot_model()?, simulator)?;
     say("computing intervals")?;
     let (extended, confusable) = intervals(model, &judged, &mut accepted, evidence, simulator);
     say("choosing the next experiment")?;
@@ -143,7 +152,7 @@ pub fn diagnose(
     let causes = accepted.iter().map(|(best, others)| cause(best, others, &extended)).collect();
     let diagnosis = Diagnosis {
         baseline: errors(evidence, &robot, simulator)?,
-        extended: errors(evidence, &extended.robot_model()?, simulator)?,
+        extended: errors_of_fit,
         noise_floor: reporting::noise_floor(evidence),
         findings: causes,
         confusable,
@@ -172,7 +181,28 @@ fn with_fitted_ground(evidence: &ResidualData, model: &ModelFile, simulator: &mu
     if fitted.exceeds_min_size() { model.clone() } else { fit.model(&point) }
 }
 
-/// Returns the model with the causes and their 95 % intervals, and the pairs of highly correlated causes.
+/// Returns the fit of all causes on top of `model`, from their current values; `None` without causes.
+fn joint_fit(model: &ModelFile, accepted: &Accepted) -> Option<FitProblem> {
+    let hypotheses: Vec<_> = accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
+    FitProblem::new(model, &hypotheses).filter(|_| !hypotheses.is_empty())
+}
+
+/// Returns `model` with the current values of all causes.
+fn with_causes(model: &ModelFile, accepted: &Accepted) -> ModelFile {
+    joint_fit(model, accepted).map_or(model.clone(), |fit| fit.model(&fit.initial_point))
+}
+
+/// Refits all causes without the held-out blocks, and writes their values to `accepted`.
+fn refitted(judged: &ModelFile, accepted: &mut Accepted, evidence: &ResidualData, simulator: &mut dyn Rollout) {
+    let Some(fit) = joint_fit(judged, accepted) else { return };
+    let point = profile_likelihood::refine_with_restarts(&fit, evidence, simulator);
+    write_estimates(accepted, &fit, &point);
+}
+
+/// Fits the causes to all rows. Returns the model with the causes and their 95 % intervals, and the pairs of highly
+/// correlated causes.
+///
+/// The held-out blocks have measured the errors by now. They contain what the other rows lack, such as fast motion.
 fn intervals(
     model: &ModelFile,
     judged: &ModelFile,
@@ -180,18 +210,18 @@ fn intervals(
     evidence: &ResidualData,
     simulator: &mut dyn Rollout,
 ) -> (ModelFile, Vec<CorrelatedPair>) {
-    let hypotheses: Vec<_> = accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
-    let fits = [judged, model].map(|model| FitProblem::new(model, &hypotheses).filter(|_| !hypotheses.is_empty()));
+    let fits = [judged, model].map(|model| joint_fit(model, accepted));
     let [Some(on_ground), Some(mut fit)] = fits else { return (model.clone(), Vec::new()) };
-    fit.initial_point = profile_likelihood::refine_with_restarts(&on_ground, evidence, simulator);
+    let all_rows = evidence.all_rows(&on_ground.model(&on_ground.initial_point), simulator);
+    fit.initial_point = on_ground.solve(&all_rows, simulator);
     write_estimates(accepted, &fit, &fit.initial_point);
-    let experiments = &evidence.fit_rows.experiments;
+    let experiments = &all_rows.experiments;
     let tolerances = fit
         .model(&fit.initial_point)
         .robot_model()
         .ok()
         .and_then(|robot| NuisanceModel::new(experiments, &robot, simulator));
-    let covariance = fit.with_problem(&evidence.fit_rows, simulator, Precision::Double, |task, simulator| {
+    let covariance = fit.with_problem(&all_rows, simulator, Precision::Double, |task, simulator| {
         let errors = tolerances.map_or(Vec::new(), |all| all.robot_errors(task.residual_scale, task.tolerances));
         covariance(&task.linearise(simulator, &fit.initial_point)?, &blocks(experiments), &errors)
     });
@@ -206,8 +236,8 @@ fn errors(
     simulator: &mut dyn Rollout,
 ) -> Result<RmsErrors, DiagnoseError> {
     let (mut torque, mut q) = (Vec::new(), Vec::new());
-    for log in evidence.logs() {
-        let evaluation = evaluate(log, robot, simulator, |row| residual_rows::fold_of(log, row).is_none())?;
+    for (log, split) in evidence.logs().iter().zip(evidence.splits()) {
+        let evaluation = evaluate(log, robot, simulator, |row| split.is_held_out(row))?;
         torque.extend(evaluation.torque_rmse_nm);
         q.extend(evaluation.q_rmse_rad);
     }
@@ -224,16 +254,32 @@ fn ambiguous<'a>(best: &CandidateFit, others: &'a [CandidateFit]) -> impl Iterat
     others.iter().filter(move |other| other.score > least)
 }
 
+/// Returns the posterior probabilities of hypotheses with these effects, scopes and scores [nat], the best first.
+///
+/// Scores of the same law in two simulators differ by [`AMBIGUITY_NATS`] or [`AMBIGUITY_FRACTION`]; the log-likelihood
+/// ratio counts in units of a third of that.
+fn posterior(hypotheses: Vec<(String, String, f64)>) -> Vec<WeightedHypothesis> {
+    let best = hypotheses.first().map_or(0.0, |(_, _, score)| *score);
+    let unit = AMBIGUITY_NATS.max(AMBIGUITY_FRACTION * best) / 3.0;
+    let weight = |score: f64| ((score - best) / unit).exp();
+    let total: f64 = hypotheses.iter().map(|(_, _, score)| weight(*score)).sum();
+    let weighted = |(effect, scope, score)| WeightedHypothesis { effect, scope, probability: weight(score) / total };
+    hypotheses.into_iter().map(weighted).collect()
+}
+
 fn cause(best: &CandidateFit, others: &[CandidateFit], extended: &ModelFile) -> Cause {
     let hypothesis = &best.hypothesis;
+    let scored =
+        |one: &CandidateFit| (one.hypothesis.effect.name.to_owned(), one.hypothesis.scope.to_string(), one.score);
     Cause {
         effect: hypothesis.effect.name.to_owned(),
         scope: hypothesis.scope.to_string(),
         parameters: reporting::estimates(hypothesis, extended),
         held_out_gain: best.gain,
         score_nats: best.score,
-        threshold_nats: THRESHOLD,
+        threshold_nats: best.threshold,
         ambiguous_with: ambiguous(best, others).map(|other| other.hypothesis.name()).collect(),
+        posterior: posterior(std::iter::once(best).chain(ambiguous(best, others)).map(scored).collect()),
         rivals: others.iter().take(5).map(reporting::rival).collect(),
         evidence: reporting::explanation(best, others),
     }

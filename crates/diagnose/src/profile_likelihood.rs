@@ -7,6 +7,7 @@ use twinstep_model::{RobotModel, Rollout};
 
 use super::cross_validation::FitProblem;
 use super::residual_data::ResidualData;
+use super::residual_power::evident_channels;
 use super::scan::log_likelihood_gain;
 
 /// Distances of the points from the estimate, in both directions [prior std].
@@ -92,7 +93,9 @@ fn gains(fit: &FitProblem, points: &[Vec<f64>], evidence: &ResidualData, simulat
     let mut left = evidence.residual_powers(simulator, &robots, false).into_iter();
     let mut left = all.iter().map(|robot| robot.as_ref().and_then(|_| left.next()));
     let Some(here) = left.next().flatten() else { return vec![f64::NEG_INFINITY; points.len()] };
-    left.map(|left| left.map_or(f64::NEG_INFINITY, |left| log_likelihood_gain(evidence, &left, &here))).collect()
+    let channels = || evident_channels(fit.unknowns.iter().map(|unknown| unknown.effect.target));
+    let gain = |left| log_likelihood_gain(evidence, &left, &here, channels());
+    left.map(|left| left.map_or(f64::NEG_INFINITY, gain)).collect()
 }
 
 #[cfg(test)]

@@ -1,12 +1,13 @@
-//! Residuals of motion and torque of logs, in two folds of alternating seconds. Every fifth second is held out.
+//! Residuals of motion and torque of logs, in two folds; the rest is held out ([`DataSplit`]).
 
 use rayon::prelude::*;
-use twinstep_effects::{DataRequirement, Effect};
+use twinstep_effects::{DataRequirement, Effect, ModelFile};
 use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout};
 
-use super::residual_power::{GYRO, ResidualPower, STANCE, TORQUE, TRUNK};
-use super::residual_rows::{ResidualRows, fold_of};
+use super::data_split::DataSplit;
+use super::residual_power::{CHANNELS, DYNAMIC, GYRO, ResidualPower, STANCE, TORQUE, TRUNK};
+use super::residual_rows::ResidualRows;
 use twinstep_identify::ExperimentError;
 use twinstep_identify::experiment::Experiment;
 use twinstep_identify::nuisance::NuisanceModel;
@@ -18,21 +19,23 @@ const MISFIT_NM: f64 = 0.02;
 /// Mean squared position error, divided by the variance of the measured position, above which a joint is not tracked.
 const MAX_UNTRACKED_VARIANCE: f64 = 0.1;
 /// Correlation time of residuals [s]: positions with a fixed base, torques, base motion, gyroscope, whose noise exceeds
-/// its model error, and positions with a floating base.
+/// its model error, positions with a floating base, and a robot that walks or jumps.
 ///
 /// An error of contact or geometry moves the joints of a standing robot by the same angle in a whole window.
-const INDEPENDENT_S: [f64; 5] = [0.2, 0.1, 0.5, 0.05, 1.0];
+const INDEPENDENT_S: [f64; 6] = [0.2, 0.1, 0.5, 0.05, 1.0, 0.3];
 
-/// Duration of fixed, standing and slowly moving parts of the logs from which on the other parts are not simulated [s].
+/// Duration of fixed, standing and slowly moving parts of the logs from which on the other parts have channels of their
+/// own [s].
 const LEAST_QUIET_S: f64 = 8.0;
 
 /// Residual data of the logs of one robot.
 pub struct ResidualData {
     logs: Vec<Log>,
+    splits: Vec<DataSplit>,
+    /// One experiment per log, with all rows.
+    experiments: Vec<Experiment>,
     /// All rows except held-out blocks.
     pub fit_rows: ResidualRows,
-    /// The two folds of `fit_rows`.
-    pub folds: [ResidualRows; 2],
     /// Rows of `fit_rows` with a fixed base, in which the joints are nearly decoupled; all rows if there are none.
     fixed_base_rows: ResidualRows,
     torques: Vec<MeasuredTorque>,
@@ -43,35 +46,42 @@ pub struct ResidualData {
 impl ResidualData {
     /// Creates the data from `logs` of a robot with the gains and rates of `robot`, in windows of `horizon`.
     pub fn new(logs: Vec<Log>, robot: &RobotModel, horizon: WindowConfig) -> Result<Self, ExperimentError> {
-        let experiments: Vec<Experiment> =
-            logs.iter().map(|log| Experiment::new(log, robot, horizon)).collect::<Result<_, _>>()?;
-        let (experiments, is_dynamic) = without_dynamic_windows(&logs, experiments);
-        let only = |keep: &dyn Fn(Option<usize>) -> bool| -> Vec<Experiment> {
-            let pairs = logs.iter().zip(&experiments);
-            pairs.map(|(log, experiment)| experiment.clone().filter_rows(|row| keep(fold_of(log, row)))).collect()
+        let experiment = |log| Ok(Experiment::new(log, robot, horizon)?.without_velocities());
+        let experiments: Vec<Experiment> = logs.iter().map(experiment).collect::<Result<_, ExperimentError>>()?;
+        let (experiments, is_dynamic) = with_dynamic_windows_apart(&logs, experiments);
+        let splits: Vec<DataSplit> = logs.iter().map(DataSplit::new).collect();
+        let of_folds = |(split, experiment): (&DataSplit, &Experiment)| {
+            experiment.clone().filter_rows(|row| split.fold(row).is_some())
         };
-        let whole = only(&|fold| fold.is_some());
+        let whole: Vec<Experiment> = splits.iter().zip(&experiments).map(of_folds).collect();
         let quick = whole.iter().cloned().map(Experiment::prefer_fixed_base).collect();
         Ok(Self {
             torques: logs.iter().map(|log| MeasuredTorque::new(log, robot)).collect::<Result<_, _>>()?,
-            folds: [0, 1].map(|fold| ResidualRows::new(&logs, only(&|of| of == Some(fold)))),
-            fit_rows: ResidualRows::new(&logs, whole),
-            fixed_base_rows: ResidualRows::new(&logs, quick),
+            fit_rows: ResidualRows::new(&splits, whole),
+            fixed_base_rows: ResidualRows::new(&splits, quick),
             is_dynamic,
+            experiments,
+            splits,
             logs,
         })
     }
 
-    /// Sets the nuisance parameters, linearised at `robot`, if a log has a floating base.
+    /// Sets the nuisance parameters, linearised at `robot`.
     pub fn set_nuisance_model(&mut self, robot: &RobotModel, simulator: &mut dyn Rollout) {
-        if self.has_free_parts() {
-            for rows in [&mut self.fit_rows].into_iter().chain(&mut self.folds) {
-                rows.tolerances = NuisanceModel::new(&rows.experiments, robot, simulator);
-            }
-            if self.fixed_base_rows.experiments.iter().any(Experiment::has_floating_base) {
-                self.fixed_base_rows.tolerances.clone_from(&self.fit_rows.tolerances);
-            }
+        self.fit_rows.tolerances = NuisanceModel::new(&self.fit_rows.experiments, robot, simulator);
+        // The scan of rows with a fixed base ranks candidates by joint, for which penalties of links have no share.
+        if self.fixed_base_rows.experiments.iter().any(Experiment::has_floating_base) {
+            self.fixed_base_rows.tolerances.clone_from(&self.fit_rows.tolerances);
         }
+    }
+
+    /// Returns all rows, held-out blocks included, with the nuisance parameters of `model`.
+    pub fn all_rows(&self, model: &ModelFile, simulator: &mut dyn Rollout) -> ResidualRows {
+        let mut rows = ResidualRows::new(&self.splits, self.experiments.clone());
+        if let Ok(robot) = model.robot_model() {
+            rows.tolerances = NuisanceModel::new(&rows.experiments, &robot, simulator);
+        }
+        rows
     }
 
     /// Returns true if the mean squared position error of any joint exceeds 10 % of the variance of its measured
@@ -93,6 +103,11 @@ impl ResidualData {
         &self.logs
     }
 
+    /// Returns how each log is divided into folds and held-out blocks.
+    pub fn splits(&self) -> &[DataSplit] {
+        &self.splits
+    }
+
     /// Returns true if a window has a floating base.
     pub fn has_free_parts(&self) -> bool {
         self.fit_rows.experiments.iter().any(Experiment::has_floating_base)
@@ -107,7 +122,7 @@ impl ResidualData {
     ) -> Vec<ResidualPower> {
         let rows = if quick { &self.fixed_base_rows } else { &self.fit_rows };
         let mut residual_powers = rows.residual_powers(simulator, robots);
-        for (log, torques) in self.logs.iter().zip(&self.torques) {
+        for ((log, split), torques) in self.logs.iter().zip(&self.splits).zip(&self.torques) {
             // Most effects act after the torque sensor, so consecutive candidates often predict the same torque.
             let alike: Vec<&[RobotModel]> =
                 robots.chunk_by(|one, other| torques.predict_same_torque(one, other)).collect();
@@ -117,7 +132,7 @@ impl ResidualData {
                     let mut left = ResidualPower::empty();
                     let sigma = torque_sigma(log, &robots[0]);
                     torques.differences(&robots[0], |joint, row, difference| {
-                        left.add(TORQUE + joint, fold_of(log, row), difference / sigma[joint]);
+                        left.add(TORQUE + joint, split.fold(row), difference / sigma[joint]);
                     });
                     left
                 })
@@ -131,6 +146,48 @@ impl ResidualData {
     /// Returns the residual power of one candidate on all rows.
     pub fn residual_power(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> ResidualPower {
         self.residual_powers(simulator, std::slice::from_ref(robot), false).remove(0)
+    }
+
+    /// Returns the products of the residuals of `robot` with the differences of those of `candidates`, by block.
+    pub fn block_products(
+        &self,
+        simulator: &mut dyn Rollout,
+        robot: &RobotModel,
+        candidates: &[RobotModel],
+    ) -> BlockProducts {
+        let num_blocks = self.splits.iter().map(DataSplit::num_blocks).sum();
+        let mut products = BlockProducts::new(num_blocks, candidates.len());
+        let mut first_block = 0;
+        for split in &self.splits {
+            let blocks = split.num_blocks();
+            (0..blocks).for_each(|block| products.fold_of_block[first_block + block] = block % 2);
+            first_block += blocks;
+        }
+        let given = self.residual_power(simulator, robot);
+        for (reference, (sums, counts)) in products.reference.iter_mut().zip(given.sums.iter().zip(&given.counts)) {
+            *reference = [0, 1].map(|fold| [counts[fold], sums[fold]]);
+        }
+        self.fit_rows.differences(simulator, robot, candidates, |index, channel, block, [residual, difference]| {
+            products.add(index, channel, block, [residual, difference]);
+        });
+        first_block = 0;
+        for ((log, split), torques) in self.logs.iter().zip(&self.splits).zip(&self.torques) {
+            let sigma = torque_sigma(log, robot);
+            let mut reference = vec![[0.0; NUM_JOINTS]; log.rows()];
+            torques.differences(robot, |joint, row, difference| reference[row][joint] = difference);
+            let changed = candidates.iter().enumerate();
+            for (index, candidate) in changed.filter(|(_, one)| !torques.predict_same_torque(robot, one)) {
+                torques.differences(candidate, |joint, row, difference| {
+                    if let Some(block) = split.block(row) {
+                        let before = reference[row][joint];
+                        let pair = [before, difference - before].map(|one| one / sigma[joint]);
+                        products.add(index, TORQUE + joint, first_block + block, pair);
+                    }
+                });
+            }
+            first_block += split.num_blocks();
+        }
+        products
     }
 
     /// Returns false if the effect is not identifiable without a torque sensor and the logs have none.
@@ -148,7 +205,7 @@ impl ResidualData {
 
     /// Returns the correlation length of a channel [rows].
     pub fn correlation_rows(&self, channel: usize) -> f64 {
-        let kind = [TORQUE, TRUNK, GYRO, STANCE].into_iter().filter(|first| channel >= *first).count();
+        let kind = [TORQUE, TRUNK, GYRO, STANCE, DYNAMIC].into_iter().filter(|first| channel >= *first).count();
         (INDEPENDENT_S[kind] * self.max_rate_hz()).max(1.0)
     }
 
@@ -158,17 +215,50 @@ impl ResidualData {
     }
 }
 
-/// Returns the experiments without windows in which the robot walks or jumps, if the others last [`LEAST_QUIET_S`].
-///
-/// Also returns whether such windows are left.
-fn without_dynamic_windows(logs: &[Log], experiments: Vec<Experiment>) -> (Vec<Experiment>, bool) {
-    let quiet: Vec<Experiment> = experiments.iter().cloned().map(Experiment::without_dynamic_windows).collect();
-    let rows = |experiments: &[Experiment]| experiments.iter().map(Experiment::num_rows).sum::<usize>();
-    let seconds: f64 = logs.iter().zip(&quiet).map(|(log, quiet)| quiet.num_rows() as f64 / log.meta().rate_hz).sum();
-    if seconds >= LEAST_QUIET_S {
-        return (quiet, false);
+/// Products of residuals with their differences in several directions, by channel and block.
+pub struct BlockProducts {
+    /// Number of blocks of all logs.
+    pub num_blocks: usize,
+    /// Fold of each block.
+    pub fold_of_block: Vec<usize>,
+    /// Number and sum of squares of the residuals, by channel and fold.
+    pub reference: [[[f64; 2]; 2]; CHANNELS],
+    /// Product of residual and difference, and square of the difference, by direction, channel and block.
+    pub directions: Vec<Vec<Vec<[f64; 2]>>>,
+    /// Sum of squares of the differences, by direction, channel and fold.
+    pub slopes: Vec<[[f64; 2]; CHANNELS]>,
+}
+
+impl BlockProducts {
+    fn new(num_blocks: usize, directions: usize) -> Self {
+        Self {
+            num_blocks,
+            fold_of_block: vec![0; num_blocks],
+            reference: [[[0.0; 2]; 2]; CHANNELS],
+            directions: vec![vec![vec![[0.0; 2]; num_blocks]; CHANNELS]; directions],
+            slopes: vec![[[0.0; 2]; CHANNELS]; directions],
+        }
     }
-    let is_dynamic = rows(&quiet) < rows(&experiments);
+
+    fn add(&mut self, direction: usize, channel: usize, block: usize, [residual, difference]: [f64; 2]) {
+        let [product, square] = &mut self.directions[direction][channel][block];
+        *product += residual * difference;
+        *square += difference * difference;
+        self.slopes[direction][channel][self.fold_of_block[block]] += difference * difference;
+    }
+}
+
+/// Returns the experiments with the windows in which the robot walks or jumps marked, if the others last
+/// [`LEAST_QUIET_S`].
+///
+/// Also returns whether the robot walks or jumps in windows that are not marked.
+fn with_dynamic_windows_apart(logs: &[Log], experiments: Vec<Experiment>) -> (Vec<Experiment>, bool) {
+    let marked: Vec<Experiment> = experiments.iter().cloned().map(Experiment::mark_dynamic_windows).collect();
+    let quiet = |(log, marked): (&Log, &Experiment)| marked.num_quiet_rows() as f64 / log.meta().rate_hz;
+    if logs.iter().zip(&marked).map(quiet).sum::<f64>() >= LEAST_QUIET_S {
+        return (marked, false);
+    }
+    let is_dynamic = experiments.iter().zip(&marked).any(|(all, marked)| marked.num_quiet_rows() < all.num_rows());
     (experiments, is_dynamic)
 }
 

@@ -1,14 +1,18 @@
 //! Residual power of each channel, in units of the variance of noise and model error.
 
+use std::ops::Range;
+
+use twinstep_effects::Target;
 use twinstep_model::NUM_JOINTS;
 
 use twinstep_identify::nuisance;
 
 /// Number of channels: joint positions with a fixed base, torques, base position, orientation, velocity and angular
-/// velocity, and joint positions with a floating base.
+/// velocity, joint positions with a floating base, and joint positions and base motion of a robot that walks or jumps.
 ///
-/// Positions with a floating base are channels of their own, because they have the errors of the contact model, too.
-pub const CHANNELS: usize = 3 * NUM_JOINTS + 12;
+/// Positions with a floating base are channels of their own, because they have the errors of the contact model, too. A
+/// robot that walks or jumps shows little else: its channels are evidence only about the ground.
+pub const CHANNELS: usize = DYNAMIC + NUM_JOINTS + 12;
 /// First channel of the torques.
 pub const TORQUE: usize = NUM_JOINTS;
 /// First channel of the base.
@@ -17,6 +21,15 @@ pub const TRUNK: usize = 2 * NUM_JOINTS;
 pub const GYRO: usize = TRUNK + 9;
 /// First channel of the joint positions with a floating base.
 pub const STANCE: usize = TRUNK + 12;
+/// First channel of a robot that walks or jumps: joint positions, then base position, orientation, velocity and angular
+/// velocity.
+pub const DYNAMIC: usize = STANCE + NUM_JOINTS;
+
+/// Returns the channels that are evidence about effects on these targets.
+pub fn evident_channels(targets: impl IntoIterator<Item = Target>) -> Range<usize> {
+    let on_ground = targets.into_iter().any(|target| target == Target::Ground);
+    0..if on_ground { CHANNELS } else { DYNAMIC }
+}
 
 /// Sums of squared residuals and numbers of rows by channel and fold, in units of the variance of noise and model
 /// error.
@@ -47,7 +60,8 @@ impl ResidualPower {
 
     /// Returns the mean power of all rows, in units of the variance of noise and model error.
     fn power(&self) -> f64 {
-        self.sums.iter().flatten().sum::<f64>() / self.counts.iter().flatten().sum::<f64>().max(1.0)
+        let [sums, counts] = [&self.sums, &self.counts].map(|all| all[..DYNAMIC].iter().flatten().sum::<f64>());
+        sums / counts.max(1.0)
     }
 
     /// Adds the normalised residual of a row in a fold. `None` is a held-out block, which is not added.
@@ -85,7 +99,7 @@ impl ResidualPower {
 
     /// Returns the power above noise and model error of all channels, and of the robot's nuisance parameters.
     pub fn power_above_noise(&self) -> f64 {
-        (0..CHANNELS).map(|channel| self.channel_excess(channel)).sum::<f64>() + self.tolerated_excess()
+        (0..DYNAMIC).map(|channel| self.channel_excess(channel)).sum::<f64>() + self.tolerated_excess()
     }
 
     /// Returns the power by which the robot's nuisance parameters exceed their expectation.

@@ -1,11 +1,11 @@
-//! Residuals of rows of logs, with the channel and fold of each. Every fifth second is a held-out block.
+//! Residuals of rows of logs, with the channel and fold of each.
 
 use rayon::prelude::*;
-use twinstep_logs::Log;
-use twinstep_model::{Precision, RobotModel, Rollout};
+use twinstep_model::{NUM_JOINTS, Precision, RobotModel, Rollout};
 
-use super::residual_power::{GYRO, ResidualPower, STANCE, TRUNK};
-use twinstep_identify::experiment::{Experiment, ResidualChannel};
+use super::data_split::DataSplit;
+use super::residual_power::{DYNAMIC, ResidualPower, STANCE, TRUNK};
+use twinstep_identify::experiment::{Experiment, Regime, ResidualChannel};
 use twinstep_identify::nuisance::NuisanceModel;
 
 /// Precision of the simulations.
@@ -18,42 +18,58 @@ const MODEL_ERROR_RAD: f64 = 0.001;
 const MODEL_ERROR_BASE: f64 = 1.0;
 /// Standard deviation of the model error of the gyroscope [noise std].
 const MISFIT_OF_GYRO: f64 = 1.0 / 3.0;
-/// Length of a block [s]; blocks are assigned to the two folds alternately.
-const BLOCK_S: f64 = 1.0;
 
 /// Residuals of rows of all logs.
 pub struct ResidualRows {
     /// The logs, each restricted to these rows.
     pub experiments: Vec<Experiment>,
-    /// Nuisance parameters; `None` without a floating base.
+    /// Nuisance parameters; `None` if they are not set, or the robot diverges.
     pub tolerances: Option<NuisanceModel>,
     /// Channel, fold and weight of every residual.
     cells: Vec<(usize, Option<usize>, f64)>,
+    /// Fold of every residual, also of those that only take part in fits.
+    folds: Vec<Option<usize>>,
+    /// Block of every residual, counted over all logs.
+    blocks: Vec<Option<usize>>,
 }
 
 impl ResidualRows {
-    /// Creates the residuals of `experiments`, which contain some or all rows of `logs`.
-    pub fn new(logs: &[Log], experiments: Vec<Experiment>) -> Self {
-        let mut cells = Vec::new();
-        for (log, experiment) in logs.iter().zip(&experiments) {
+    /// Creates the residuals of `experiments`, one for each log, which is divided as in `splits`.
+    pub fn new(splits: &[DataSplit], experiments: Vec<Experiment>) -> Self {
+        let (mut cells, mut folds, mut blocks, mut first_block) = (Vec::new(), Vec::new(), Vec::new(), 0);
+        for (split, experiment) in splits.iter().zip(&experiments) {
+            let block = |row: usize| split.block(row).map(|block| first_block + block);
+            blocks.extend(experiment.residual_index().map(|(_, row)| block(row)));
+            folds.extend(experiment.residual_index().map(|(_, row)| split.fold(row)));
             cells.extend(experiment.residual_index().zip(experiment.groups()).map(|((quantity, row), group)| {
-                // Velocities repeat the information of positions with more noise. Torques are evaluated without
-                // simulation.
+                // Torques are evaluated without simulation.
+                let regime = Experiment::regime(group);
+                let base = if regime == Regime::Dynamic { DYNAMIC + NUM_JOINTS } else { TRUNK };
                 let (channel, misfit) = match quantity {
                     ResidualChannel::Position(joint) => {
-                        let first = if Experiment::is_held(group) { 0 } else { STANCE };
+                        let first = match regime {
+                            Regime::Fixed => 0,
+                            Regime::Floating => STANCE,
+                            Regime::Dynamic => DYNAMIC,
+                        };
                         (first + joint, MODEL_ERROR_RAD / experiment.sigma(quantity))
                     }
                     ResidualChannel::Velocity(_) | ResidualChannel::Torque(_) => return (0, None, 0.0),
-                    ResidualChannel::BasePosition(axis) => (TRUNK + axis, MODEL_ERROR_BASE),
-                    ResidualChannel::BaseOrientation(axis) => (TRUNK + 3 + axis, MODEL_ERROR_BASE),
-                    ResidualChannel::BaseVelocity(axis) => (TRUNK + 6 + axis, MODEL_ERROR_BASE),
-                    ResidualChannel::BaseRate(axis) => (GYRO + axis, MISFIT_OF_GYRO),
+                    ResidualChannel::BasePosition(axis) => (base + axis, MODEL_ERROR_BASE),
+                    ResidualChannel::BaseOrientation(axis) => (base + 3 + axis, MODEL_ERROR_BASE),
+                    ResidualChannel::BaseVelocity(axis) => (base + 6 + axis, MODEL_ERROR_BASE),
+                    ResidualChannel::BaseRate(axis) => (base + 9 + axis, MISFIT_OF_GYRO),
                 };
-                (channel, fold_of(log, row), 1.0 / misfit.hypot(1.0))
+                (channel, split.fold(row), 1.0 / misfit.hypot(1.0))
             }));
+            first_block += split.num_blocks();
         }
-        Self { experiments, tolerances: None, cells }
+        Self { experiments, tolerances: None, cells, folds, blocks }
+    }
+
+    /// Returns the fold of a residual, or `None` for a penalty, which follows the residuals.
+    pub fn fold_of_residual(&self, residual: usize) -> Option<Option<usize>> {
+        self.folds.get(residual).copied()
     }
 
     /// Returns the standard deviation of noise and model error of a joint's position [rad].
@@ -84,6 +100,27 @@ impl ResidualRows {
         residuals
     }
 
+    /// Calls `each` with candidate, channel, block, residual of the first robot, and the difference of the candidate's
+    /// from it, both in units of noise and model error.
+    pub fn differences(
+        &self,
+        simulator: &mut dyn Rollout,
+        robot: &RobotModel,
+        candidates: &[RobotModel],
+        mut each: impl FnMut(usize, usize, usize, [f64; 2]),
+    ) {
+        let reference = self.nuisance_corrected(simulator, robot);
+        for (index, candidate) in candidates.iter().enumerate() {
+            let residuals = self.nuisance_corrected(simulator, candidate);
+            let pairs = reference.iter().zip(&residuals).zip(self.cells.iter().zip(&self.blocks));
+            for ((reference, residual), ((channel, fold, weight), block)) in pairs {
+                if let (Some(_), Some(block)) = (fold, block) {
+                    each(index, *channel, *block, [weight * reference, weight * (residual - reference)]);
+                }
+            }
+        }
+    }
+
     fn residual_power(&self, mut residuals: Vec<f64>) -> ResidualPower {
         if let Some(tolerances) = &self.tolerances {
             tolerances.project_out(&mut residuals);
@@ -94,37 +131,5 @@ impl ResidualRows {
             left.add(*channel, *fold, residual * weight);
         }
         left
-    }
-}
-
-/// Returns the fold of a row. Returns `None` for held-out blocks: every fifth block takes no part in any selection or
-/// fit.
-pub fn fold_of(log: &Log, row: usize) -> Option<usize> {
-    let block = (row as f64 / (BLOCK_S * log.meta().rate_hz)) as usize % 5;
-    (block < 4).then_some(block % 2)
-}
-
-#[cfg(test)]
-mod tests {
-    use twinstep_logs::{Meta, Segment, TorqueSensor};
-    use twinstep_model::BaseMount;
-
-    use super::*;
-
-    #[test]
-    fn every_fifth_second_is_held_out() {
-        let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
-        let column = |name: &str, value: fn(usize) -> f64| (name.to_owned(), (0..100).map(value).collect());
-        let columns = [
-            column("t", |row| row as f64 / 10.0),
-            column("q_FL_hip", |_| 0.0),
-            column("q_cmd_FL_hip", |_| 0.0),
-            column("kp", |_| 20.0),
-            column("kd", |_| 0.5),
-        ];
-        let log = Log::new(Meta::new(10.0, TorqueSensor::None, segments), columns).expect("a log");
-        let folds: Vec<_> = (0..100).step_by(10).map(|row| fold_of(&log, row)).collect();
-        let five = [Some(0), Some(1), Some(0), Some(1), None];
-        assert_eq!(folds, [five, five].concat());
     }
 }

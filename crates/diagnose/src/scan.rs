@@ -3,13 +3,15 @@
 //! With a fixed base the joints are nearly decoupled. One simulation therefore evaluates all twelve joints, and the
 //! score of a scope is the sum over its joints. Effects on base, ground and gyroscope are evaluated on the whole log.
 
+use std::ops::Range;
+
 use twinstep_effects::ModelFile;
 use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Probes, Scope, Target};
 use twinstep_model::{Joint, RobotModel, Rollout};
 
 use super::hypothesis::{Hypothesis, fine_probes, selection_penalty, with_effect};
 use super::residual_data::ResidualData;
-use super::residual_power::{CHANNELS, ResidualPower, STANCE, TORQUE};
+use super::residual_power::{ResidualPower, STANCE, TORQUE, evident_channels};
 
 /// Maximum number of scopes per effect in the result.
 const OF_ONE_EFFECT: usize = 2;
@@ -156,19 +158,24 @@ fn best_values(
     let scores = evidence
         .residual_powers(simulator, &robots, false)
         .into_iter()
-        .map(|now| log_likelihood_gain(evidence, &now, before));
+        .map(|now| log_likelihood_gain(evidence, &now, before, evident_channels([effect.target])));
     scores.zip(values).max_by(|one, other| one.0.total_cmp(&other.0)).map(|(_, values)| values)
 }
 
-/// Returns the log-likelihood gain of all channels, including the penalties of nuisance parameters [nat].
-pub fn log_likelihood_gain(evidence: &ResidualData, now: &ResidualPower, before: &ResidualPower) -> f64 {
+/// Returns the log-likelihood gain of `channels`, including the penalties of nuisance parameters [nat].
+pub fn log_likelihood_gain(
+    evidence: &ResidualData,
+    now: &ResidualPower,
+    before: &ResidualPower,
+    channels: Range<usize>,
+) -> f64 {
     let of = |channel: usize| {
         [0, 1]
             .map(|fold| now.log_likelihood_gain(before, channel, fold, evidence.correlation_rows(channel)))
             .iter()
             .sum::<f64>()
     };
-    (0..CHANNELS).map(of).sum::<f64>() + now.tolerated_gain(before)
+    channels.map(of).sum::<f64>() + now.tolerated_gain(before)
 }
 
 /// Returns the effects that are evaluated on the whole log, with their scopes.
@@ -205,7 +212,7 @@ fn scan_whole(
         let gains = evidence
             .residual_powers(simulator, &robots, false)
             .into_iter()
-            .map(|now| log_likelihood_gain(evidence, &now, &before));
+            .map(|now| log_likelihood_gain(evidence, &now, &before, evident_channels([effect.target])));
         let best = gains.zip(values).max_by(|one, other| one.0.total_cmp(&other.0));
         scored.extend(best.map(|(score, values)| ScoredHypothesis {
             hypothesis: Hypothesis { effect, scope, values },

@@ -16,7 +16,7 @@ use super::joint_slots::JointSlots;
 use super::residual_power::{ResidualPower, TORQUE};
 use super::torque_fit::{TorqueCandidate, TorqueFit, excess, nats};
 use super::unexplained::{self, LEAST_EXCESS};
-use super::{AMBIGUITY_FRACTION, AMBIGUITY_NATS, DiagnoseError, DiagnoseProgress};
+use super::{AMBIGUITY_FRACTION, AMBIGUITY_NATS, DiagnoseError, DiagnoseProgress, posterior};
 use crate::findings::{AlternativeCause, Cause, Diagnosis, Estimate, ParameterValue, RmsErrors, Unexplained};
 use twinstep_identify::ExperimentError;
 
@@ -209,6 +209,8 @@ fn cause(slots: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) ->
     let name = |entry: &EffectEntry| format!("{}@{}", entry.effect.name, slots.scope_name(entry.scope));
     let close =
         |other: &&TorqueCandidate| other.score > found.score - AMBIGUITY_NATS.max(AMBIGUITY_FRACTION * found.score);
+    let scored =
+        |one: &TorqueCandidate| (one.entry.effect.name.to_owned(), slots.scope_name(one.entry.scope), one.score);
     let rival = |other: &TorqueCandidate| AlternativeCause {
         effect: other.entry.effect.name.to_owned(),
         scope: slots.scope_name(other.entry.scope),
@@ -230,6 +232,7 @@ fn cause(slots: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) ->
         score_nats: found.score,
         threshold_nats: THRESHOLD,
         ambiguous_with: found.others.iter().filter(close).map(|other| name(&other.entry)).collect(),
+        posterior: posterior(std::iter::once(found).chain(found.others.iter().filter(close)).map(scored).collect()),
         rivals: found.others.iter().map(rival).collect(),
         evidence: format!("{evidence} {}", effect.signature),
         scope,

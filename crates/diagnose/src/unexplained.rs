@@ -3,12 +3,12 @@
 use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, RobotModel, Rollout};
 
+use super::data_split::DataSplit;
 use super::residual_data::ResidualData;
-use super::residual_power::{CHANNELS, ResidualPower, STANCE, TORQUE, TRUNK};
-use super::residual_rows::fold_of;
+use super::residual_power::{DYNAMIC, ResidualPower, STANCE, TORQUE, TRUNK};
 use super::spectral_line::spectral_line;
 use crate::findings::Unexplained;
-use twinstep_identify::experiment::{Experiment, ResidualChannel};
+use twinstep_identify::experiment::{Experiment, Regime, ResidualChannel};
 use twinstep_logs::replay::{JointCommands, command, joint_commands};
 
 /// Number of bins of a variable that may explain a residual.
@@ -30,7 +30,7 @@ pub fn unexplained(
     let fraction = if before > 0.0 { (after / before).min(1.0) } else { 0.0 };
     let count = |channel: usize| left.counts[channel].iter().sum::<f64>();
     let worst = (0..TRUNK)
-        .chain(STANCE..CHANNELS)
+        .chain(STANCE..DYNAMIC)
         .filter(|channel| count(*channel) > 0.0)
         .max_by(|one, other| {
             let of = |channel: usize| left.channel_excess(channel) / count(channel);
@@ -53,11 +53,13 @@ pub fn describe_residual(
     fraction: f64,
     whose: &str,
 ) -> Unexplained {
+    let split = DataSplit::new(log);
     let mut found: Vec<(f64, String)> = variables
         .into_iter()
-        .map(|(name, cells)| (binned_r_squared(log, residual, &cells), name))
+        .map(|(name, cells)| (binned_r_squared(&split, residual, &cells), name))
         .chain(
-            line_of(log, residual).map(|(frequency, share)| (share, format!("a spectral line at {frequency:.2} Hz"))),
+            line_of(log, &split, residual)
+                .map(|(frequency, share)| (share, format!("a spectral line at {frequency:.2} Hz"))),
         )
         .filter(|(share, _)| *share > MIN_R_SQUARED)
         .collect();
@@ -85,9 +87,9 @@ pub fn measured(log: &Log) -> Vec<(String, Vec<f64>)> {
 }
 
 /// Returns the frequency of the strongest spectral line of a residual [Hz], and the explained fraction.
-fn line_of(log: &Log, residual: &[f64]) -> Option<(f64, f64)> {
+fn line_of(log: &Log, split: &DataSplit, residual: &[f64]) -> Option<(f64, f64)> {
     let rows = (0..residual.len()).filter(|row| residual[*row].is_finite());
-    let rows: Vec<(usize, usize)> = rows.filter_map(|row| Some((row, fold_of(log, row)?))).collect();
+    let rows: Vec<(usize, usize)> = rows.filter_map(|row| Some((row, split.fold(row)?))).collect();
     let t: Vec<f64> = rows.iter().map(|(row, _)| log.t()[*row]).collect();
     let values: Vec<f64> = rows.iter().map(|(row, _)| residual[*row]).collect();
     let folds: Vec<usize> = rows.iter().map(|(_, fold)| *fold).collect();
@@ -107,11 +109,12 @@ fn residual(evidence: &ResidualData, robot: &RobotModel, channel: usize, simulat
         evidence.torques().differences(robot, each);
     } else {
         let corrected = evidence.fit_rows.nuisance_corrected(simulator, robot);
-        let (experiment, held) = (&evidence.fit_rows.experiments[0], channel < STANCE);
-        let joint = if held { channel } else { channel - STANCE };
+        let experiment = &evidence.fit_rows.experiments[0];
+        let (joint, regime) =
+            if channel < STANCE { (channel, Regime::Fixed) } else { (channel - STANCE, Regime::Floating) };
         let cells = experiment.residual_index().zip(experiment.groups());
         for (corrected, ((quantity, row), group)) in corrected.into_iter().zip(cells) {
-            if quantity == ResidualChannel::Position(joint) && Experiment::is_held(group) == held {
+            if quantity == ResidualChannel::Position(joint) && Experiment::regime(group) == regime {
                 residual[row] = corrected;
             }
         }
@@ -144,7 +147,7 @@ fn wanted_torques(log: &Log, robot: &RobotModel) -> Vec<(String, Vec<f64>)> {
 }
 
 /// Returns the R² of binned means: bins of `cells`, means from one fold, evaluated on the other.
-fn binned_r_squared(log: &Log, residual: &[f64], cells: &[f64]) -> f64 {
+fn binned_r_squared(split: &DataSplit, residual: &[f64], cells: &[f64]) -> f64 {
     let rows: Vec<usize> =
         (0..residual.len()).filter(|row| residual[*row].is_finite() && cells[*row].is_finite()).collect();
     if rows.len() < 10 * BINS {
@@ -159,7 +162,7 @@ fn binned_r_squared(log: &Log, residual: &[f64], cells: &[f64]) -> f64 {
     let (mut rest, mut total) = (0.0, 0.0);
     for fold in [0, 1] {
         let (mut sums, mut counts) = ([0.0; BINS], [0.0; BINS]);
-        let of_fold = |fold: usize| rows.iter().copied().filter(move |row| fold_of(log, *row) == Some(fold));
+        let of_fold = |fold: usize| rows.iter().copied().filter(move |row| split.fold(*row) == Some(fold));
         for row in of_fold(fold) {
             sums[bin(cells[row])] += residual[row];
             counts[bin(cells[row])] += 1.0;

@@ -8,6 +8,7 @@ use twinstep_model::{Joint, JointKind, Leg, Stream, standard_normal, stream};
 
 use crate::Plant;
 use crate::base_schedule::BaseSchedule;
+use crate::mismatch::Mismatch;
 use crate::unmodelled::UnmodelledEffect;
 
 /// Kind of a case: what it hides.
@@ -24,16 +25,29 @@ pub enum CaseKind {
     UnmodelledEffect,
     /// Two effects, each of half its prior range or more.
     TwoEffects,
+    /// Four effects, each of half its prior range or more, which may act on the same joints.
+    FourEffects,
 }
 
 /// Number of cases of each kind among 28 cases, which are then shuffled. Cases 28 k to 28 k + 27 have this mix.
-const CASE_MIX: [(CaseKind, usize); 5] = [
-    (CaseKind::LargeEffect, 6),
-    (CaseKind::SmallEffect, 6),
-    (CaseKind::Healthy, 8),
-    (CaseKind::UnmodelledEffect, 4),
-    (CaseKind::TwoEffects, 4),
-];
+fn case_mix(plant: Plant) -> [(CaseKind, usize); 5] {
+    match plant {
+        Plant::Rapier => [
+            (CaseKind::LargeEffect, 6),
+            (CaseKind::SmallEffect, 6),
+            (CaseKind::Healthy, 8),
+            (CaseKind::UnmodelledEffect, 4),
+            (CaseKind::TwoEffects, 4),
+        ],
+        Plant::Mujoco => [
+            (CaseKind::LargeEffect, 10),
+            (CaseKind::SmallEffect, 5),
+            (CaseKind::Healthy, Mismatch::ALL.len()),
+            (CaseKind::UnmodelledEffect, 3),
+            (CaseKind::FourEffects, 3),
+        ],
+    }
+}
 
 /// Base mounting and channels of a case's log; independent of the hidden effects.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -63,12 +77,14 @@ pub struct Case {
     pub hidden: Vec<EffectEntry>,
     /// Hidden effect outside the catalogue.
     pub outside: Option<UnmodelledEffect>,
+    /// Errors of a healthy robot in MuJoCo.
+    pub mismatch: Option<Mismatch>,
 }
 
 impl Case {
     /// Samples case `number` of the blind test with this seed.
     pub fn draw(seed: u64, number: u64, plant: Plant) -> Self {
-        let kind = kind(seed, number);
+        let kind = kind(seed, number, plant);
         let mut setting = setting(&mut stream(seed, "hunt setting", number));
         if plant == Plant::Mujoco {
             setting = LogSetup { place: BaseSchedule::Whole, torque: true, ..setting };
@@ -78,10 +94,12 @@ impl Case {
             CaseKind::LargeEffect => vec![from_half(setting, random)],
             CaseKind::SmallEffect => vec![entry(setting, 0.2, random)],
             CaseKind::TwoEffects => two(setting, random),
+            CaseKind::FourEffects => four(setting, random),
             CaseKind::Healthy | CaseKind::UnmodelledEffect => Vec::new(),
         };
         let outside = (kind == CaseKind::UnmodelledEffect).then(|| UnmodelledEffect::draw(setting.place, random));
-        Self { seed, number, kind, setting, hidden, outside }
+        let mismatch = (kind == CaseKind::Healthy && plant == Plant::Mujoco).then(|| mismatch(seed, number));
+        Self { seed, number, kind, setting, hidden, outside, mismatch }
     }
 
     /// Returns the random stream of this case with this name.
@@ -95,8 +113,16 @@ impl Case {
     }
 }
 
-fn kind(seed: u64, number: u64) -> CaseKind {
-    let mut kinds: Vec<_> = CASE_MIX.iter().flat_map(|(kind, count)| std::iter::repeat_n(*kind, *count)).collect();
+/// Returns the family of a healthy robot: each of 28 cases has another one.
+fn mismatch(seed: u64, number: u64) -> Mismatch {
+    let deck = number - number % 28;
+    let before = (deck..number).filter(|other| kind(seed, *other, Plant::Mujoco) == CaseKind::Healthy).count();
+    Mismatch::ALL[before % Mismatch::ALL.len()]
+}
+
+fn kind(seed: u64, number: u64, plant: Plant) -> CaseKind {
+    let mix = case_mix(plant);
+    let mut kinds: Vec<_> = mix.iter().flat_map(|(kind, count)| std::iter::repeat_n(*kind, *count)).collect();
     let size = kinds.len() as u64;
     let random = &mut stream(seed, "hunt deck", number / size);
     // Fisher–Yates shuffle.
@@ -160,13 +186,28 @@ fn two(setting: LogSetup, random: &mut impl Rng) -> Vec<EffectEntry> {
         let pair = [from_half(setting, random), from_half(setting, random)];
         let [one, other] = &pair;
         let overlap = Joint::ALL.into_iter().any(|joint| one.scope.contains(joint) && other.scope.contains(joint));
-        let lists = |one: &Effect, other: &Effect| one.confounders.iter().any(|item| item.effect == other.name);
-        let confounded =
-            one.effect == other.effect || lists(one.effect, other.effect) || lists(other.effect, one.effect);
-        if !overlap && !confounded {
+        if !overlap && !confounded(one.effect, other.effect) {
             return pair.to_vec();
         }
     }
+}
+
+/// Samples four effects of which none is a confounder of another. They may have joints in common.
+fn four(setting: LogSetup, random: &mut impl Rng) -> Vec<EffectEntry> {
+    let mut entries: Vec<EffectEntry> = Vec::new();
+    while entries.len() < 4 {
+        let entry = from_half(setting, random);
+        if entries.iter().all(|other| !confounded(entry.effect, other.effect)) {
+            entries.push(entry);
+        }
+    }
+    entries
+}
+
+/// Returns true if the effects are equal, or the catalogue lists one as a confounder of the other.
+fn confounded(one: &Effect, other: &Effect) -> bool {
+    let lists = |one: &Effect, other: &Effect| one.confounders.iter().any(|item| item.effect == other.name);
+    one == other || lists(one, other) || lists(other, one)
 }
 
 fn scope(target: Target, random: &mut impl Rng) -> Scope {
@@ -232,10 +273,18 @@ mod tests {
 
     #[test]
     fn two_hundred_cases_have_the_stated_mix() {
-        let count = |kind| (0..200).filter(|number| super::kind(3, *number) == kind).count();
+        let count = |kind| (0..200).filter(|number| super::kind(3, *number, Plant::Rapier) == kind).count();
         assert!(count(CaseKind::Healthy) >= 50, "a quarter");
         assert!(count(CaseKind::TwoEffects) >= 28 && count(CaseKind::UnmodelledEffect) >= 28, "a seventh");
         assert!(count(CaseKind::LargeEffect) >= 40 && count(CaseKind::SmallEffect) >= 40);
+    }
+
+    #[test]
+    fn each_family_of_healthy_robots_occurs_once_in_28_cases() {
+        let cases = (28..56).map(|number| Case::draw(3, number, Plant::Mujoco));
+        let mut families: Vec<_> = cases.filter_map(|case| case.mismatch).collect();
+        families.sort();
+        assert_eq!(families, Mismatch::ALL);
     }
 
     #[test]
@@ -247,14 +296,15 @@ mod tests {
 
     #[test]
     fn every_case_is_a_valid_robot_with_visible_effects() {
-        for number in 0..300 {
-            let case = Case::draw(1, number, Plant::Rapier);
+        for (number, plant) in (0..300).flat_map(|number| [(number, Plant::Rapier), (number, Plant::Mujoco)]) {
+            let case = Case::draw(1, number, plant);
             apply_effects(&go2(), &case.hidden).expect("a valid robot");
             let visible = case.setting.visible_effects();
             assert!(case.hidden.iter().all(|entry| visible.contains(&entry.effect)), "{case:?}");
             let hidden = match case.kind {
                 CaseKind::LargeEffect | CaseKind::SmallEffect => 1,
                 CaseKind::TwoEffects => 2,
+                CaseKind::FourEffects => 4,
                 CaseKind::Healthy | CaseKind::UnmodelledEffect => 0,
             };
             assert_eq!((case.hidden.len(), case.outside.is_some()), (hidden, case.kind == CaseKind::UnmodelledEffect));

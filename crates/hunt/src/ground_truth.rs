@@ -26,7 +26,11 @@ const LENGTH_ERROR: f64 = 0.002;
 /// Simulates the log of a case on `plant`. `progress` receives the number of completed rows and returns false to
 /// interrupt.
 pub fn log_of(case: &Case, plant: Plant, progress: &mut dyn FnMut(usize) -> bool) -> Result<Log, RecordError> {
-    let robot = perturbed(&mut case.stream("hunt body"));
+    let mut robot = perturbed(&mut case.stream("hunt body"));
+    let errors = &mut case.stream("hunt mismatch");
+    if let Some(mismatch) = case.mismatch {
+        mismatch.change_robot(&mut robot, errors);
+    }
     let robot = apply_effects(&robot, &case.hidden).expect("cases are sampled as valid robots");
     let motion = motion(case.setting, &mut case.stream("hunt motion"));
     // The source of the log does not reveal the hidden effects.
@@ -44,7 +48,8 @@ pub fn log_of(case: &Case, plant: Plant, progress: &mut dyn FnMut(usize) -> bool
     let random = &mut case.stream("hunt sensors");
     let sensors = sensors(random);
     let delayed = torque_sensor(&exact, &robot, case.setting.torque)?;
-    Ok(apply_sensors(&delayed, &sensors, random.random())?)
+    let noisy = apply_sensors(&delayed, &sensors, random.random())?;
+    Ok(case.mismatch.map_or(Ok(noisy.clone()), |mismatch| mismatch.change_log(noisy, errors))?)
 }
 
 /// Returns the log of `motion` on `robot`, without noise.
@@ -148,7 +153,7 @@ mod tests {
 
     fn case(place: BaseSchedule, seed: u64, hidden: Vec<EffectEntry>) -> Case {
         let setting = LogSetup { place, torque: true, battery: true, temperature: false };
-        Case { seed, number: 0, kind: CaseKind::Healthy, setting, hidden, outside: None }
+        Case { seed, number: 0, kind: CaseKind::Healthy, setting, hidden, outside: None, mismatch: None }
     }
 
     #[test]

@@ -3,6 +3,7 @@
 mod base_schedule;
 mod draw;
 mod ground_truth;
+mod mismatch;
 mod motion;
 mod mujoco_plant;
 mod plant_actuator;
@@ -23,6 +24,7 @@ use twinstep_model::go2;
 use twinstep_sim::{BatchRollout, SimConfig};
 
 use draw::{Case, CaseKind, LogSetup};
+use mismatch::Mismatch;
 pub use mujoco_plant::MujocoPlant;
 use runner::BlindTest;
 use score::Score;
@@ -70,6 +72,8 @@ pub struct CaseResult {
     kind: CaseKind,
     setting: LogSetup,
     outside: Option<UnmodelledEffect>,
+    #[serde(default)]
+    mismatch: Option<Mismatch>,
     /// Errors of the given model on the log.
     nominal: RmsErrors,
     /// Errors of the true model on the log.
@@ -287,7 +291,7 @@ mod tests {
                     assert!(before < 0.003, "case {case}: {before} rad");
                 }
                 CaseKind::Healthy => assert!(before < 0.012, "case {case}: {before} rad"),
-                CaseKind::LargeEffect | CaseKind::TwoEffects => {
+                CaseKind::LargeEffect | CaseKind::TwoEffects | CaseKind::FourEffects => {
                     assert!(invisible || after < before, "case {case}: {before} -> {after} rad");
                 }
                 CaseKind::SmallEffect | CaseKind::UnmodelledEffect => {}

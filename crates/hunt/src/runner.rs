@@ -70,6 +70,7 @@ impl BlindTest<'_> {
             kind: case.kind,
             setting: case.setting,
             outside: case.outside,
+            mismatch: case.mismatch,
             nominal,
             truth,
             verdict: judge(case, findings.as_ref().ok(), [nominal, truth]),

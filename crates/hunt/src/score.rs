@@ -44,6 +44,12 @@ pub struct EffectScore {
     pub ambiguous: bool,
     /// True if it is among the first three names, with alternative hypotheses after causes (top-3 correct).
     pub in_top_3: bool,
+    /// True if its effect is in the set of names of a cause: the cause and what the log cannot tell apart from it.
+    #[serde(default)]
+    pub in_set: bool,
+    /// Number of effects in that set; of the first cause's set if it is in none.
+    #[serde(default)]
+    pub set_size: usize,
     /// True if it is reported for the joints where it is hidden, and for no others.
     pub scope_right: bool,
     /// Score of the first parameter, if effect and scope are correct.
@@ -74,6 +80,7 @@ pub struct ErrorReduction {
 pub fn judge(case: &Case, diagnosis: Option<&Diagnosis>, [nominal, truth]: [RmsErrors; 2]) -> Score {
     let findings = diagnosis.map_or(&[][..], |diagnosis| &diagnosis.findings);
     let hidden = |name: &str| case.hidden.iter().any(|entry| entry.effect.name == name);
+    let describes = |name: &str| case.mismatch.is_some_and(|mismatch| mismatch.describes(name));
     let depends_on = case.outside.map(|outside| {
         diagnosis.is_some_and(|Diagnosis { unexplained, .. }| {
             let mut texts = unexplained.depends_on.iter().take(STRONGEST).chain([&unexplained.text]);
@@ -83,7 +90,7 @@ pub fn judge(case: &Case, diagnosis: Option<&Diagnosis>, [nominal, truth]: [RmsE
     Score {
         named: findings.iter().map(|cause| format!("{}@{}", cause.effect, cause.scope)).collect(),
         hits: case.hidden.iter().map(|entry| hit(entry, findings)).collect(),
-        wrong_names: findings.iter().filter(|cause| !hidden(&cause.effect)).count(),
+        wrong_names: findings.iter().filter(|cause| !hidden(&cause.effect) && !describes(&cause.effect)).count(),
         depends_on,
         removed: diagnosis.map(|diagnosis| removed(diagnosis, [nominal, truth])).unwrap_or_default(),
     }
@@ -94,6 +101,7 @@ fn hit(entry: &EffectEntry, findings: &[Cause]) -> EffectScore {
     let of_name: Vec<_> = findings.iter().filter(|cause| cause.effect == name).collect();
     let first = findings.first().is_some_and(|cause| cause.effect == name);
     let ambiguous = |cause: &Cause| cause.ambiguous_with.iter().any(|other| effect_of(other) == name);
+    let set = findings.iter().find(|cause| name_set(cause).contains(&name));
     // One effect may be reported leg by leg.
     let reported: Vec<_> = of_name.iter().flat_map(|cause| joints_of(&cause.scope)).collect();
     let scope_right = !of_name.is_empty() && same(reported, joints_of(&entry.scope.to_string()));
@@ -104,10 +112,23 @@ fn hit(entry: &EffectEntry, findings: &[Cause]) -> EffectScore {
         named: !of_name.is_empty(),
         first,
         ambiguous: !first && findings.first().is_some_and(ambiguous),
+        in_set: set.is_some(),
+        set_size: set.or(findings.first()).map_or(0, |cause| name_set(cause).len()),
         in_top_3: ranking(findings).iter().take(3).any(|effect| *effect == name),
         scope_right,
         size: exact.and_then(|cause| size(entry, cause.parameters.get(entry.effect.parameters[0].name)?)),
     }
+}
+
+/// Returns the effects that the log cannot tell apart from a cause, and the cause's own.
+fn name_set(cause: &Cause) -> Vec<&str> {
+    let mut names = vec![cause.effect.as_str()];
+    for other in &cause.ambiguous_with {
+        if !names.contains(&effect_of(other)) {
+            names.push(effect_of(other));
+        }
+    }
+    names
 }
 
 /// Returns the effects of a report in order, each once: causes, then ambiguous and other alternatives of each.
@@ -196,7 +217,7 @@ mod tests {
         };
         let setting = LogSetup { place: BaseSchedule::Fixed, torque: true, battery: false, temperature: false };
         let hidden = hidden.iter().map(entry).collect();
-        Case { seed: 0, number: 0, kind: CaseKind::LargeEffect, setting, hidden, outside: None }
+        Case { seed: 0, number: 0, kind: CaseKind::LargeEffect, setting, hidden, outside: None, mismatch: None }
     }
 
     fn cause(effect: &str, scope: &str, [low, value, high]: [f64; 3]) -> Cause {
@@ -210,6 +231,7 @@ mod tests {
             score_nats: 100.0,
             threshold_nats: 10.0,
             ambiguous_with: Vec::new(),
+            posterior: Vec::new(),
             rivals: Vec::new(),
             evidence: String::new(),
         }

@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 
 use crate::CaseResult;
 use crate::draw::CaseKind;
+use crate::mismatch::Mismatch;
 use crate::score::{EffectScore, ErrorReduction};
 
 /// Label in the matrix for no hidden effect and for no reported cause.
@@ -60,8 +61,20 @@ fn rates(results: &[CaseResult]) -> String {
             of(kind).map(|result| result.verdict.wrong_names > 0),
         );
     }
-    let named = |kind: CaseKind| of(kind).map(|result| !result.verdict.named.is_empty());
+    let single = || [CaseKind::LargeEffect, CaseKind::SmallEffect].into_iter().flat_map(hits);
+    text += &rate("one effect: within the set of names", ">= 90 %", single().map(|hit| hit.in_set));
+    let sizes: Vec<usize> = single().map(|hit| hit.set_size).filter(|size| *size > 0).collect();
+    let mean = sizes.iter().sum::<usize>() as f64 / sizes.len().max(1) as f64;
+    let _ = writeln!(text, "| one effect: mean size of the set | <= 2.5 | {mean:.1} | |");
+    let named = |kind: CaseKind| of(kind).map(|result| result.verdict.wrong_names > 0);
     text += &rate("nothing hidden: false positive", "<= 3 %", named(CaseKind::Healthy));
+    for family in Mismatch::ALL {
+        let cases = of(CaseKind::Healthy).filter(|result| result.mismatch == Some(family));
+        let mut outcomes = cases.map(|result| result.verdict.wrong_names > 0).peekable();
+        if outcomes.peek().is_some() {
+            text += &rate(&format!("nothing hidden, {}: false positive", family.name()), "", outcomes);
+        }
+    }
     text += &rate("outside the catalogue: false positive", "<= 10 %", named(CaseKind::UnmodelledEffect));
     let depends_on = of(CaseKind::UnmodelledEffect).filter_map(|result| result.verdict.depends_on);
     text += &rate("outside the catalogue: what it depends on is correct", ">= 50 %", depends_on);
@@ -70,6 +83,14 @@ fn rates(results: &[CaseResult]) -> String {
     };
     text += &rate("two effects: both reported", ">= 65 %", both(|hit| hit.named));
     text += &rate("two effects: both reported, scopes correct", "", both(|hit| hit.named && hit.scope_right));
+    let four = || of(CaseKind::FourEffects);
+    if four().next().is_some() {
+        let all = four().map(|result| result.verdict.hits.iter().all(|hit| hit.named));
+        text += &rate("four effects: all reported", ">= 60 %", all);
+        text += &rate("four effects: each", "", hits(CaseKind::FourEffects).map(|hit| hit.named));
+        let wrong = four().map(|result| result.verdict.wrong_names > 0);
+        text += &rate("four effects: false positive", "<= 10 %", wrong);
+    }
     let sizes = results.iter().flat_map(|result| &result.verdict.hits).filter_map(|hit| hit.size);
     text += &rate("size within its 95 % interval", "88 to 99 %", sizes.map(|size| size.covered));
     text + &rate("diagnosis failed", "none", results.iter().map(|result| result.error.is_some()))
@@ -111,15 +132,16 @@ fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(if odd { upper } else { 0.5 * (values[half - 1] + upper) })
 }
 
-/// Returns the confusion matrix: how often each effect was reported first, by hidden effect. Omits cases with two
+/// Returns the confusion matrix: how often each effect was reported first, by hidden effect. Omits cases with several
 /// effects.
 fn matrix(results: &[CaseResult]) -> String {
     let mut counts = BTreeMap::<(&str, &str), usize>::new();
-    for result in results.iter().filter(|result| result.kind != CaseKind::TwoEffects) {
+    let several = [CaseKind::TwoEffects, CaseKind::FourEffects];
+    for result in results.iter().filter(|result| !several.contains(&result.kind)) {
         let hidden = match result.kind {
             CaseKind::Healthy => NONE,
             CaseKind::UnmodelledEffect => "(outside)",
-            CaseKind::LargeEffect | CaseKind::SmallEffect | CaseKind::TwoEffects => {
+            CaseKind::LargeEffect | CaseKind::SmallEffect | CaseKind::TwoEffects | CaseKind::FourEffects => {
                 result.verdict.hits.first().map_or(NONE, |hit| &hit.effect)
             }
         };
@@ -162,6 +184,8 @@ mod tests {
             first: named.first() == Some(name),
             ambiguous: false,
             in_top_3: named.contains(name),
+            in_set: named.contains(name),
+            set_size: usize::from(!named.is_empty()),
             scope_right: named.contains(name),
             size: named.contains(name).then_some(Size { covered: true, error: 0.04 }),
         };
@@ -181,6 +205,7 @@ mod tests {
             kind,
             setting,
             outside: None,
+            mismatch: None,
             nominal,
             truth,
             verdict,
@@ -220,6 +245,8 @@ mod tests {
             | a fifth of the range: top-3 correct |  | no case | |
             | a fifth of the range: scope correct |  | no case | |
             | a fifth of the range: additional false positive |  | no case | |
+            | one effect: within the set of names | >= 90 % | 1 of 2: 50 % | 9 to 91 % |
+            | one effect: mean size of the set | <= 2.5 | 1.0 | |
             | nothing hidden: false positive | <= 3 % | 0 of 1: 0 % | 0 to 79 % |
             | outside the catalogue: false positive | <= 10 % | 0 of 1: 0 % | 0 to 79 % |
             | outside the catalogue: what it depends on is correct | >= 50 % | 1 of 1: 100 % | 21 to 100 % |

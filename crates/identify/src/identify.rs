@@ -5,13 +5,13 @@ use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, EntryError, Scope};
 use twinstep_model::{Precision, Rollout};
 
-use crate::experiment::Experiment;
+use crate::experiment::{Experiment, Regime};
 use crate::global_search::GlobalSearch;
 use crate::least_squares::LeastSquaresProblem;
 use crate::parameter::{
     FreeParameter, drop_unidentifiable, free_parameters, initial_coordinate, set_intervals, with_values,
 };
-use crate::refine::{SIMULATOR_MISMATCH_STD, covariance, information, refine};
+use crate::refine::{DAMPING_FACTORS, SIMULATOR_MISMATCH_STD, covariance, information, refine};
 
 /// Ratio of posterior to prior standard deviation above which a parameter is not identifiable and keeps its prior.
 const MAX_POSTERIOR_TO_PRIOR: f64 = 0.7;
@@ -190,7 +190,8 @@ pub fn identify(
         if free.is_empty() || interrupted {
             break;
         }
-        point = refine(&LeastSquaresProblem { residual_scale: &spread, ..task }, simulator, point, |cost| {
+        let scaled = LeastSquaresProblem { residual_scale: &spread, ..task };
+        point = refine(&scaled, simulator, &DAMPING_FACTORS, point, |cost| {
             steps += 1;
             interrupted = !progress(Stage::Refinement, steps, cost);
             !interrupted
@@ -264,7 +265,8 @@ pub fn predicted_information(
 ) -> Option<DMatrix<f64>> {
     // Residuals are correlated: one row in thirty counts as independent, and one in 200, a window, with a floating
     // base.
-    let independent = |group: &usize| if Experiment::is_held(*group) { 30f64.sqrt() } else { 200f64.sqrt() };
+    let independent =
+        |group: &usize| if Experiment::regime(*group) == Regime::Fixed { 30f64.sqrt() } else { 200f64.sqrt() };
     let groups: Vec<usize> = task.experiments.iter().flat_map(Experiment::groups).collect();
     let spread: Vec<f64> = groups.iter().map(independent).collect();
     let here = LeastSquaresProblem { residual_scale: &spread, ..*task }.linearise(simulator, point)?;

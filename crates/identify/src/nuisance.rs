@@ -13,17 +13,20 @@ use twinstep_model::{Precision, RobotModel, Rollout};
 
 use crate::experiment::Experiment;
 
-/// Relative standard deviation of masses.
-const MASS_STD: f64 = 0.006;
+/// Relative standard deviation of the trunk's mass.
+const TRUNK_MASS_STD: f64 = 0.006;
+/// Relative standard deviation of the mass of a link of a leg: cables, covers, feet that were replaced.
+const LINK_MASS_STD: f64 = 0.03;
+/// Standard deviation of the trunk's centre of mass along each axis [m].
+const CENTRE_STD_M: f64 = 0.003;
 /// Standard deviation of the mounting position of a leg along each axis [m].
 const MOUNT_OFFSET_STD_M: f64 = 0.0012;
+/// Standard deviation of the length of a thigh, and of all calves [m].
+const LENGTH_STD_M: f64 = 0.0025;
 /// Relative standard deviations of ground friction and of the contact's time constant.
 const GROUND_STD: [f64; 2] = [0.03, 0.15];
-/// Number of nuisance parameters of the robot.
-///
-/// Mounting positions of four legs along three axes; masses of trunk, hips, thighs and calves; friction and time
-/// constant of the ground.
-const NUM_NUISANCE: usize = 12 + 4 + 2;
+/// Number of nuisance parameters of the robot: [`perturbed_robot`] has the list.
+const NUM_NUISANCE: usize = 36;
 /// Correlation length of the residuals [rows].
 const CORRELATION_ROWS: f64 = 40.0;
 
@@ -41,8 +44,9 @@ pub struct NuisanceModel {
 struct NuisanceBlock {
     /// Indices of the residuals.
     rows: Vec<usize>,
-    /// Jacobian: one row per residual, one column per nuisance parameter [prior std].
-    jacobian: DMatrix<f64>,
+    /// Jacobian: one row per residual, one column per nuisance parameter [prior std]. Single precision halves the time of
+    /// an elimination, which reads it twice.
+    jacobian: DMatrix<f32>,
     factor: Cholesky<f64, Dyn>,
 }
 
@@ -50,22 +54,22 @@ impl NuisanceBlock {
     fn new(rows: Vec<usize>, jacobian: DMatrix<f64>) -> Option<Self> {
         let prior = DMatrix::identity(jacobian.ncols(), jacobian.ncols()) * CORRELATION_ROWS;
         let factor = (jacobian.tr_mul(&jacobian) + prior).cholesky()?;
-        Some(Self { rows, jacobian, factor })
+        Some(Self { rows, jacobian: jacobian.map(|slope| slope as f32), factor })
     }
 
     /// Subtracts the effect of the estimated nuisance parameters, and appends their penalties to the residuals.
     fn eliminate(&self, residuals: &mut Vec<f64>) {
-        let mut own = DVector::from_iterator(self.rows.len(), self.rows.iter().map(|row| residuals[*row]));
-        let sizes = self.factor.solve(&self.jacobian.tr_mul(&own));
-        own.gemv(-1.0, &self.jacobian, &sizes, 1.0);
-        for (row, value) in self.rows.iter().zip(&own) {
-            residuals[*row] = *value;
+        let own = DVector::from_iterator(self.rows.len(), self.rows.iter().map(|row| residuals[*row] as f32));
+        let sizes = self.factor.solve(&self.jacobian.tr_mul(&own).map(f64::from));
+        let explained = &self.jacobian * sizes.map(|size| size as f32);
+        for (row, value) in self.rows.iter().zip(&explained) {
+            residuals[*row] -= f64::from(*value);
         }
         residuals.extend(sizes.iter().map(|size| size * CORRELATION_ROWS.sqrt()));
     }
 
     fn rescaled(&self, spread: &[f64]) -> Option<Self> {
-        let mut jacobian = self.jacobian.clone();
+        let mut jacobian = self.jacobian.map(f64::from);
         for (mut derivative, row) in jacobian.row_iter_mut().zip(&self.rows) {
             derivative /= spread[*row];
         }
@@ -184,14 +188,18 @@ fn perturbed_robot(robot: &RobotModel, error: usize, size: f64) -> RobotModel {
     let mut robot = robot.clone();
     match error {
         0..12 => robot.legs[error / 3].origins[0][error % 3] += size * MOUNT_OFFSET_STD_M,
-        12 => robot.trunk = robot.trunk.scaled(1.0 + size * MASS_STD),
-        13..16 => {
-            for leg in &mut robot.legs {
-                leg.bodies[error - 13] = leg.bodies[error - 13].scaled(1.0 + size * MASS_STD);
-            }
+        12..24 => {
+            let body = &mut robot.legs[(error - 12) / 3].bodies[error % 3];
+            *body = body.scaled(1.0 + size * LINK_MASS_STD);
         }
-        16 => robot.contact.friction *= 1.0 + size * GROUND_STD[0],
-        _ => robot.contact.time_constant *= 1.0 + size * GROUND_STD[1],
+        24..28 => robot.legs[error - 24].origins[2].z += size * LENGTH_STD_M,
+        28 => robot.shapes.foot_centre.z += size * LENGTH_STD_M,
+        29 => robot.trunk = robot.trunk.scaled(1.0 + size * TRUNK_MASS_STD),
+        30..33 => robot.trunk.com[error - 30] += size * CENTRE_STD_M,
+        33 => robot.contact.friction *= 1.0 + size * GROUND_STD[0],
+        34 => robot.contact.time_constant *= 1.0 + size * GROUND_STD[1],
+        // The trunk's moments of inertia, at the same mass.
+        _ => robot.trunk.inertia *= 1.0 + size * LINK_MASS_STD,
     }
     robot
 }

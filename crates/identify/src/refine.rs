@@ -10,20 +10,22 @@ const COST_TOLERANCE: f64 = 0.1;
 /// Maximum number of iterations.
 const MAX_ITERATIONS: usize = 30;
 /// Levenberg–Marquardt damping factors, all evaluated in one batch per iteration.
-const DAMPING_FACTORS: [f64; 8] = [0.0, 1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3];
+pub const DAMPING_FACTORS: [f64; 8] = [0.0, 1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3];
 
 /// Minimises the cost from `point`. `each` receives the cost after every step and returns false to interrupt.
+///
+/// Each iteration evaluates the steps with all of these `damping` factors, such as [`DAMPING_FACTORS`].
 pub fn refine(
     task: &LeastSquaresProblem,
     simulator: &mut dyn Rollout,
+    damping: &[f64],
     mut point: Vec<f64>,
     mut each: impl FnMut(f64) -> bool,
 ) -> Vec<f64> {
     for _ in 0..MAX_ITERATIONS {
         let Some(here) = task.linearise(simulator, &point) else { break };
         let now = task.cost(here.residuals.as_slice(), &point);
-        let candidates: Vec<_> =
-            DAMPING_FACTORS.iter().filter_map(|damping| step(task, &here, &point, *damping)).collect();
+        let candidates: Vec<_> = damping.iter().filter_map(|damping| step(task, &here, &point, *damping)).collect();
         let costs: Vec<f64> = task
             .residuals(simulator, &candidates)
             .iter()

@@ -10,7 +10,7 @@ use crate::experiment::Experiment;
 use crate::global_search::GlobalSearch;
 use crate::least_squares::LeastSquaresProblem;
 use crate::parameter::{FreeParameter, drop_unidentifiable, free_parameters, initial_coordinate, with_values};
-use crate::refine::{SIMULATOR_MISMATCH_STD, covariance, information, refine};
+use crate::refine::{DAMPING_FACTORS, SIMULATOR_MISMATCH_STD, covariance, information, refine};
 use crate::window::WindowConfig;
 
 const ROWS: usize = 400;
@@ -75,7 +75,7 @@ fn with_problem<R>(ask: impl FnOnce(&LeastSquaresProblem, Vec<f64>) -> R) -> R {
 #[test]
 fn refinement_converges_to_the_truth_up_to_the_pull_of_the_prior() {
     with_problem(|task, begin| {
-        let found = refine(task, &mut Linear, begin, |_| true);
+        let found = refine(task, &mut Linear, &DAMPING_FACTORS, begin, |_| true);
         let here = task.linearise(&mut Linear, &found).expect("finite");
         let information = information(&here);
         for (index, truth) in TRUTH.iter().enumerate() {
@@ -91,7 +91,7 @@ fn refinement_converges_to_the_truth_up_to_the_pull_of_the_prior() {
 fn refinement_stops_when_it_is_told_to() {
     with_problem(|task, begin| {
         let mut steps = 0;
-        refine(task, &mut Linear, begin.clone(), |_| {
+        refine(task, &mut Linear, &DAMPING_FACTORS, begin.clone(), |_| {
             steps += 1;
             false
         });

@@ -63,11 +63,20 @@ pub struct Window {
     pub commands: Vec<Command>,
     /// Number of rows of the burn-in.
     pub settling: usize,
+    /// True if the robot walks, trots or jumps.
+    pub dynamic: bool,
     /// Actuator period at whose start each row was sampled.
     pub period: Vec<usize>,
 }
 
 impl Window {
+    /// Keeps the first `count` rows.
+    pub fn truncate(&mut self, count: usize) {
+        self.rows.end = self.rows.start + count;
+        self.period.truncate(count);
+        self.commands.truncate(self.period[count - 1] + 1);
+    }
+
     /// Perturbs the initial state by `error` along or about an axis.
     ///
     /// `quantity` is 0 for position, 1 for orientation, 2 for velocity, 3 for angular velocity.
@@ -157,7 +166,7 @@ impl WindowBuilder<'_> {
             }
         }
         let (start, history) = (self.start(range, rows.start, base), self.history(range, rows.start, base));
-        Window { base, settling: 1, start, history, rows, commands, period }
+        Window { base, settling: 1, dynamic: false, start, history, rows, commands, period }
     }
 
     /// Returns the actuator periods before `first`, at most to the start of the contiguous range.

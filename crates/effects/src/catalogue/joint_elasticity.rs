@@ -36,7 +36,8 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Rate(500.0), DataRequirement::Bandwidth(5.0)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
-    search: Search::DEFAULT,
+    // Other contact laws, and legs that bend, imitate small values.
+    search: Search { min_share: 0.15, ..Search::DEFAULT },
     visibility: Visibility::Position,
     explained_by: Variable::CommandedTorque,
     demo: EffectDemo {

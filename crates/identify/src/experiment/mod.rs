@@ -15,6 +15,7 @@ use twinstep_logs::replay::{at_log_rate, joint_commands};
 use twinstep_model::{Joint, RobotModel};
 
 pub use channel::ResidualChannel;
+pub use residual_index::Regime;
 pub use residuals::{SimulatedPose, estimated_torque};
 
 use crate::error::ExperimentError;
@@ -29,6 +30,8 @@ const BLOCK_S: f64 = 0.5;
 ///
 /// A robot that sways over standing feet moves its joints with 0.3 rad/s, one that trots with 1.5 rad/s.
 const DYNAMIC_SPEED: f64 = 0.7;
+/// Length of windows in which a robot with a floating base walks, trots or jumps [s].
+const DYNAMIC_S: f64 = 0.5;
 /// Time over which a joint speed is measured: long enough for encoder noise of 2 mrad [s].
 const SPEED_S: f64 = 0.05;
 
@@ -90,10 +93,7 @@ impl Experiment {
         for window in &mut self.windows {
             // Rows after the last selected one are not simulated.
             let last = window.rows.clone().rev().find(|row| keep(*row)).unwrap_or(window.rows.start);
-            let count = last + 1 - window.rows.start;
-            window.rows.end = last + 1;
-            window.period.truncate(count);
-            window.commands.truncate(window.period[count - 1] + 1);
+            window.truncate(last + 1 - window.rows.start);
         }
         self.windows.retain(|window| window.rows.len() > 1);
         self
@@ -108,16 +108,34 @@ impl Experiment {
         self
     }
 
-    /// Returns the experiment without windows in which a robot with a floating base walks, trots or jumps.
+    /// Returns the experiment without joint velocities, which repeat the information of positions with more noise.
+    #[must_use]
+    pub fn without_velocities(mut self) -> Self {
+        self.channels.retain(|channel| !matches!(channel.quantity, ResidualChannel::Velocity(_)));
+        self
+    }
+
+    /// Marks the windows in which a robot with a floating base walks, trots or jumps, and shortens them.
     ///
     /// Feet that touch down a few milliseconds earlier move the base by more than the effects that are looked for, and
-    /// two engines differ by as much. The torques of these rows remain evidence, because they need no simulation.
+    /// two engines differ by as much. The residuals of these windows are groups of their own ([`Regime::Dynamic`]), with
+    /// the error of the contact model as their scale. Errors grow less in short windows.
     #[must_use]
-    pub fn without_dynamic_windows(mut self) -> Self {
+    pub fn mark_dynamic_windows(mut self) -> Self {
         let fast: Vec<bool> = self.windows.iter().map(|window| self.joint_speed(window) > DYNAMIC_SPEED).collect();
-        let mut fast = fast.into_iter();
-        self.windows.retain(|window| !fast.next().unwrap_or(false) || window.base.is_fixed());
+        let most = ((DYNAMIC_S * self.rows_per_block as f64 / BLOCK_S).round() as usize).max(2);
+        for (window, fast) in self.windows.iter_mut().zip(fast) {
+            window.dynamic = fast && !window.base.is_fixed();
+            if window.dynamic {
+                window.truncate(most.min(window.rows.len()));
+            }
+        }
         self
+    }
+
+    /// Returns the number of rows in all windows that are not dynamic.
+    pub fn num_quiet_rows(&self) -> usize {
+        self.windows.iter().filter(|window| !window.dynamic).map(|window| window.rows.len()).sum()
     }
 
     /// Returns the number of rows in all windows.
@@ -212,10 +230,10 @@ mod tests {
     }
 
     #[test]
-    fn windows_with_fast_joints_are_left_out_if_the_base_floats() {
+    fn windows_with_fast_joints_are_dynamic_if_the_base_floats() {
         let rows = |base, hz| {
             let experiment = experiment(base, hz);
-            (experiment.num_rows(), experiment.without_dynamic_windows().num_rows())
+            (experiment.num_rows(), experiment.mark_dynamic_windows().num_quiet_rows())
         };
         let (all, kept) = rows(BaseMount::Floating, 0.4);
         assert_eq!(all, kept, "a robot that sways");

@@ -4,6 +4,20 @@ use super::Experiment;
 use super::channel::{Channel, ResidualChannel};
 use crate::window::Window;
 
+/// Number of values of [`Regime`].
+const REGIMES: usize = 3;
+
+/// How the base moves in a window.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Regime {
+    /// A floating base that stands or moves slowly.
+    Floating,
+    /// A fixed base.
+    Fixed,
+    /// A floating base that walks, trots or jumps.
+    Dynamic,
+}
+
 impl Experiment {
     /// Returns the channel and row of every residual.
     pub fn residual_index(&self) -> impl Iterator<Item = (ResidualChannel, usize)> {
@@ -27,14 +41,14 @@ impl Experiment {
     }
 
     /// Upper bound of the values of [`Experiment::groups`].
-    pub const GROUPS: usize = 14;
+    pub const GROUPS: usize = 7 * REGIMES;
 
-    /// Returns true if a group has a fixed base.
-    pub fn is_held(group: usize) -> bool {
-        group % 2 == 1
+    /// Returns the regime of a group.
+    pub fn regime(group: usize) -> Regime {
+        [Regime::Floating, Regime::Fixed, Regime::Dynamic][group % REGIMES]
     }
 
-    /// Returns the group of every residual: a number for its quantity and the mount of the base.
+    /// Returns the group of every residual: a number for its quantity and its [`Regime`].
     pub fn groups(&self) -> Vec<usize> {
         let group = |channel: &Channel, window: &Window| {
             let quantity = match channel.quantity {
@@ -46,7 +60,12 @@ impl Experiment {
                 ResidualChannel::BaseVelocity(_) => 5,
                 ResidualChannel::BaseRate(_) => 6,
             };
-            2 * quantity + usize::from(window.base.is_fixed())
+            let regime = match (window.base.is_fixed(), window.dynamic) {
+                (true, _) => Regime::Fixed,
+                (false, false) => Regime::Floating,
+                (false, true) => Regime::Dynamic,
+            };
+            REGIMES * quantity + regime as usize
         };
         let windows = self.channels.iter().flat_map(|channel| self.windows.iter().map(move |window| (channel, window)));
         let same = windows.flat_map(|(channel, window)| channel.rows(window).map(move |_| group(channel, window)));

@@ -108,6 +108,7 @@ fn cause(effect: &str, scope: &str, parameter: &str, [value, low, high]: [f64; 3
         score_nats: 88.0,
         threshold_nats: 14.2,
         ambiguous_with: Vec::new(),
+        posterior: Vec::new(),
         rivals: Vec::new(),
         evidence: String::new(),
     }
