@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, DVector};
 use twinstep_effects::ModelFile;
-use twinstep_effects::{Effect, Scope};
+use twinstep_effects::{Effect, Scope, Target};
 use twinstep_model::{Precision, RobotModel, Rollout};
 
 use super::hypothesis::{Hypothesis, selection_penalty};
@@ -74,7 +74,8 @@ impl FitProblem {
     /// there.
     pub fn solve_folds(&self, rows: &ResidualRows, simulator: &mut dyn Rollout) -> Option<[Vec<f64>; 2]> {
         self.with_problem(rows, simulator, PRECISION, |task, simulator| {
-            let whole = self.refined(task, simulator, &TRIAL_DAMPING, TRIAL_STEPS);
+            let steps = if self.unknowns.len() > 2 { STEPS } else { TRIAL_STEPS };
+            let whole = self.refined(task, simulator, &TRIAL_DAMPING, steps);
             let here = task.linearise(simulator, &whole)?;
             let points = [0, 1].map(|fold| {
                 // The penalties of nuisance parameters, behind the rows, belong to both folds.
@@ -116,7 +117,8 @@ impl FitProblem {
         let (file, unknowns, experiments) = (&self.file, &self.unknowns[..], &rows.experiments[..]);
         let tolerances = rows.tolerances.as_ref();
         let task = LeastSquaresProblem { file, unknowns, experiments, residual_scale: &[], tolerances, precision };
-        let spread = task.estimate_residual_scale(simulator, &self.initial_point);
+        let mut spread = task.estimate_residual_scale(simulator, &self.initial_point);
+        rows.ignore_dynamic(&mut spread, unknowns.iter().any(|unknown| unknown.effect.target == Target::Ground));
         let tolerances = tolerances.and_then(|tolerances| tolerances.rescaled(&spread));
         ask(&LeastSquaresProblem { residual_scale: &spread, tolerances: tolerances.as_ref(), ..task }, simulator)
     }

@@ -18,6 +18,8 @@ const MODEL_ERROR_RAD: f64 = 0.001;
 const MODEL_ERROR_BASE: f64 = 1.0;
 /// Standard deviation of the model error of the gyroscope [noise std].
 const MISFIT_OF_GYRO: f64 = 1.0 / 3.0;
+/// Scale of a residual that takes no part in a fit.
+const IGNORED: f64 = 1e6;
 
 /// Residuals of rows of all logs.
 pub struct ResidualRows {
@@ -31,13 +33,17 @@ pub struct ResidualRows {
     folds: Vec<Option<usize>>,
     /// Block of every residual, counted over all logs.
     blocks: Vec<Option<usize>>,
+    /// True for the residuals of a robot that walks or jumps.
+    dynamic: Vec<bool>,
 }
 
 impl ResidualRows {
     /// Creates the residuals of `experiments`, one for each log, which is divided as in `splits`.
     pub fn new(splits: &[DataSplit], experiments: Vec<Experiment>) -> Self {
-        let (mut cells, mut folds, mut blocks, mut first_block) = (Vec::new(), Vec::new(), Vec::new(), 0);
+        let (mut cells, mut folds, mut blocks, mut dynamic) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        let mut first_block = 0;
         for (split, experiment) in splits.iter().zip(&experiments) {
+            dynamic.extend(experiment.groups().into_iter().map(|group| Experiment::regime(group) == Regime::Dynamic));
             let block = |row: usize| split.block(row).map(|block| first_block + block);
             blocks.extend(experiment.residual_index().map(|(_, row)| block(row)));
             folds.extend(experiment.residual_index().map(|(_, row)| split.fold(row)));
@@ -64,7 +70,16 @@ impl ResidualRows {
             }));
             first_block += split.num_blocks();
         }
-        Self { experiments, tolerances: None, cells, folds, blocks }
+        Self { experiments, tolerances: None, cells, folds, blocks, dynamic }
+    }
+
+    /// Takes the rows of a robot that walks or jumps out of a fit, by a huge scale, unless it is `on_ground`: a fit of the
+    /// ground.
+    ///
+    /// Their derivatives are those of contact events: large, local, and of no use for a step.
+    pub fn ignore_dynamic(&self, scale: &mut [f64], on_ground: bool) {
+        let ignored = scale.iter_mut().zip(&self.dynamic).filter(|(_, dynamic)| **dynamic && !on_ground);
+        ignored.for_each(|(scale, _)| *scale = IGNORED);
     }
 
     /// Returns the fold of a residual, or `None` for a penalty, which follows the residuals.

@@ -208,7 +208,7 @@ fn perturbed_robot(robot: &RobotModel, error: usize, size: f64) -> RobotModel {
 mod tests {
     use super::*;
 
-    const ROWS: usize = 9_000;
+    const ROWS: usize = 18_000;
 
     fn derivative(row: usize, error: usize) -> f64 {
         if row % NUM_NUISANCE == error { 1.0 } else { 0.0 }
