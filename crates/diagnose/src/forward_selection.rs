@@ -31,7 +31,7 @@ const MOST_SEARCHES: usize = 24;
 const MOST_ELIMINATIONS: usize = 3;
 /// Maximum number of hypotheses about joints that are fitted in full simulation.
 const MAX_JOINT_CANDIDATES: usize = 5;
-/// Maximum number of hypotheses about base, ground and gyroscope, and about encoders.
+/// Maximum number of hypotheses about base and gyroscope, about the ground, and about encoders.
 const MAX_BODY_CANDIDATES: usize = 2;
 /// Fraction of the power above noise that a cause must explain.
 pub const MIN_EXPLAINED_FRACTION: f64 = 0.3;
@@ -40,7 +40,7 @@ pub const MIN_EXPLAINED_FRACTION: f64 = 0.3;
 /// A wrong law imitates the true one in part: Coulomb friction explains 57 % of the power of friction that acts in one
 /// direction only. True causes leave less than 1 % if robot and model share the code of their laws, and up to 30 % in
 /// MuJoCo with actuators of their own.
-pub const MAX_REMAINING_FRACTION: f64 = 0.4;
+pub const MAX_REMAINING_FRACTION: f64 = 0.27;
 /// Power above noise per row that is negligible [noise variance].
 pub const NEGLIGIBLE_EXCESS: f64 = 1.0;
 
@@ -256,7 +256,7 @@ pub fn write_estimates(accepted: &mut Accepted, fit: &FitProblem, point: &[f64])
 
 /// Returns the hypotheses of the scan to fit in full simulation.
 ///
-/// Joints, bodies and encoder offsets are ranked separately, because the scan evaluates them on different rows. Encoder
+/// Joints, bodies, the ground and encoder offsets are ranked separately, because the scan evaluates them on different rows. Encoder
 /// offsets are left out where the robot walks: feet that touch down at other times in the model imitate them.
 fn candidates(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<Hypothesis> {
     let scored = scan(evidence, model, simulator).into_iter().filter(|scored| scored.score > 0.0);
@@ -266,12 +266,15 @@ fn candidates(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Ro
         of_joints(scored) && !matches!(scored.hypothesis.effect.search.whole_log_probes, Probes::None)
     });
     let (joints, whole): (Vec<_>, Vec<_>) = others.into_iter().partition(of_joints);
+    let (ground, bodies): (Vec<_>, Vec<_>) =
+        whole.into_iter().partition(|scored| scored.hypothesis.effect.target == Target::Ground);
     let tried = |scored: Vec<ScoredHypothesis>, most: usize| {
         let least = 0.3 * scored.first().map_or(0.0, |best| best.score);
         scored.into_iter().filter(move |scored| scored.score >= least).take(most).map(|scored| scored.hypothesis)
     };
     tried(joints, MAX_JOINT_CANDIDATES)
-        .chain(tried(whole, MAX_BODY_CANDIDATES))
+        .chain(tried(bodies, MAX_BODY_CANDIDATES))
+        .chain(tried(ground, MAX_BODY_CANDIDATES))
         .chain(tried(offsets, if evidence.is_dynamic { 0 } else { MAX_BODY_CANDIDATES }))
         .collect()
 }

@@ -66,8 +66,13 @@ impl ResidualData {
         })
     }
 
-    /// Sets the nuisance parameters, linearised at `robot`.
+    /// Sets the nuisance parameters, linearised at `robot`, if a log has a floating base.
+    ///
+    /// With a fixed base alone, a mass that is wrong and a friction that acts in one direction only cannot be told apart.
     pub fn set_nuisance_model(&mut self, robot: &RobotModel, simulator: &mut dyn Rollout) {
+        if !self.has_free_parts() {
+            return;
+        }
         self.fit_rows.tolerances = NuisanceModel::new(&self.fit_rows.experiments, robot, simulator);
         // The scan of rows with a fixed base ranks candidates by joint, for which penalties of links have no share.
         if self.fixed_base_rows.experiments.iter().any(Experiment::has_floating_base) {
@@ -78,7 +83,7 @@ impl ResidualData {
     /// Returns all rows, held-out blocks included, with the nuisance parameters of `model`.
     pub fn all_rows(&self, model: &ModelFile, simulator: &mut dyn Rollout) -> ResidualRows {
         let mut rows = ResidualRows::new(&self.splits, self.experiments.clone());
-        if let Ok(robot) = model.robot_model() {
+        if let Some(robot) = model.robot_model().ok().filter(|_| self.has_free_parts()) {
             rows.tolerances = NuisanceModel::new(&rows.experiments, &robot, simulator);
         }
         rows

@@ -18,15 +18,17 @@ const TRUNK_MASS_STD: f64 = 0.006;
 /// Relative standard deviation of the mass of a link of a leg: cables, covers, feet that were replaced.
 const LINK_MASS_STD: f64 = 0.03;
 /// Standard deviation of the trunk's centre of mass along each axis [m].
-const CENTRE_STD_M: f64 = 0.003;
+const CENTRE_STD_M: f64 = 0.001;
 /// Standard deviation of the mounting position of a leg along each axis [m].
 const MOUNT_OFFSET_STD_M: f64 = 0.0012;
 /// Standard deviation of the length of a thigh, and of all calves [m].
-const LENGTH_STD_M: f64 = 0.0025;
+const LENGTH_STD_M: f64 = 0.001;
 /// Relative standard deviations of ground friction and of the contact's time constant.
 const GROUND_STD: [f64; 2] = [0.03, 0.15];
 /// Number of nuisance parameters of the robot: [`perturbed_robot`] has the list.
 const NUM_NUISANCE: usize = 36;
+/// Largest size of a nuisance parameter [prior std]: what is larger is an error of the model.
+const LARGEST: f64 = 3.0;
 /// Correlation length of the residuals [rows].
 const CORRELATION_ROWS: f64 = 40.0;
 
@@ -61,6 +63,7 @@ impl NuisanceBlock {
     fn eliminate(&self, residuals: &mut Vec<f64>) {
         let own = DVector::from_iterator(self.rows.len(), self.rows.iter().map(|row| residuals[*row] as f32));
         let sizes = self.factor.solve(&self.jacobian.tr_mul(&own).map(f64::from));
+        let sizes = sizes.map(|size| size.clamp(-LARGEST, LARGEST));
         let explained = &self.jacobian * sizes.map(|size| size as f32);
         for (row, value) in self.rows.iter().zip(&explained) {
             residuals[*row] -= f64::from(*value);
