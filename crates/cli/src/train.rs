@@ -41,7 +41,7 @@ const SAVE_EVERY: Duration = Duration::from_secs(10);
 #[derive(clap::Args)]
 pub struct Args {
     /// Task to learn. Default: that of the config file, else walk.
-    #[arg(value_parser = ["walk", "track", "jump", "explore"])]
+    #[arg(value_parser = ["walk", "track", "jump", "gait", "explore"])]
     task: Option<String>,
     /// Folder to write.
     #[arg(long, value_name = "DIR")]
