@@ -96,7 +96,9 @@ pub fn evaluate(
             return Ok(None);
         }
     }
-    walkers.iter_mut().for_each(|walker| walker.end_command(&layout, &mut sums));
+    for walker in &mut walkers {
+        walker.end_command(&layout, &mut sums);
+    }
     let up = walkers.iter().filter(|walker| !walker.has_fallen).count() as f64 / num_envs as f64;
     Ok(Some(sums.motion(gait, up)))
 }
@@ -301,7 +303,7 @@ mod tests {
 
     #[test]
     fn a_trot_is_followed_as_a_trot_and_not_as_a_pace() {
-        let spec = twinstep_envs::GaitTask::new(GaitConfig::default(), &twinstep_model::go2(), true).unwrap();
+        let spec = twinstep_envs::GaitTask::new(GaitConfig::default(), &twinstep_model::go2(), true).expect("valid");
         let layout = Layout::new(twinstep_envs::Task::spec(&spec));
         let measure = |offsets: [f32; 3]| {
             let (mut walker, mut sums) = (Walker::default(), Sums::default());

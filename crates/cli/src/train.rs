@@ -352,6 +352,7 @@ impl TrainSession {
                 .collect::<Vec<_>>()
                 .join(" "),
             version: env!("CARGO_PKG_VERSION").to_owned(),
+            revision: option_env!("TWINSTEP_REVISION").map(str::to_owned),
             seed: self.seed,
             config: self.text.clone(),
             env_steps: self.trainer.learner().env_steps,
