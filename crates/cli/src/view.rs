@@ -26,7 +26,7 @@ use crate::{view_endpoint, view_log, view_policy};
 /// `twinstep serve`, `train`, `run` and `robot` show their robots with --view.
 ///
 /// With --html the motion of a policy or a log is written into one file that any browser plays, without Twinstep and without a
-/// network. With --mcap it is written with Foxglove's schemas, which Foxglove and Rerun open as a scene with curves.
+/// network. With --mcap it is written with Foxglove's schemas: scene and curves in Foxglove, poses in Rerun.
 ///
 /// Examples: `twinstep view data/policies/walk.safetensors --robots 16`, `twinstep view walk.mcap --model extended.toml` and
 /// `twinstep view tcp/127.0.0.1:7447`

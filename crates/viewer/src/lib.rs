@@ -4,7 +4,7 @@
 //! - [`SceneInfo`]: what stays the same: shapes, ground, and which controls the page has. [`Frame`]: what moves.
 //! - [`WatchedVecEnv`]: environments whose robots are seen while an agent steps them.
 //! - [`static_page`]: one file with the page and its frames, which needs no program.
-//! - [`write_mcap`]: the same frames for Foxglove and Rerun.
+//! - [`write_mcap`]: the same frames as MCAP, for Foxglove.
 //! - [`WebServer`]: serves the page, frames as one endless response, and the page's requests.
 //!
 //! A frame that no page asks for is not made, and a page that reads slowly misses frames: it never delays the program.

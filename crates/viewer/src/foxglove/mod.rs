@@ -1,4 +1,4 @@
-//! Recording of robots as MCAP with Foxglove's schemas, which Foxglove and Rerun open as a scene.
+//! Recording of robots as MCAP with Foxglove's schemas.
 
 mod messages;
 mod protobuf;
