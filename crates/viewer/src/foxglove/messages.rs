@@ -109,7 +109,8 @@ fn height_field(field: &Heights) -> Message {
         let along = |index: usize, axis: usize| f64::from(field.origin[axis] + index as f32 * field.cell_size);
         numbers([along(row, 0), along(column, 1), f64::from(field.heights[row * columns + column])])
     };
-    let mut triangles = Message::default().message(1, with_pose(Message::default(), [1, 2], &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]));
+    let mut triangles =
+        Message::default().message(1, with_pose(Message::default(), [1, 2], &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]));
     for row in 0..rows {
         for column in 0..columns {
             triangles = triangles.message(2, point(row, column));

@@ -56,7 +56,8 @@ pub fn write_mcap(target: impl Write + Seek, scene: &SceneInfo, frames: &[Frame]
         for (channel, robot) in robots.iter().zip(&frame.robots) {
             write(*channel, frame.time, Value::Object(quantities(robot)).to_string().as_bytes())?;
         }
-        let values: Map<String, Value> = frame.curves.iter().map(|(name, value)| (name.clone(), (*value).into())).collect();
+        let values: Map<String, Value> =
+            frame.curves.iter().map(|(name, value)| (name.clone(), (*value).into())).collect();
         write(curves, frame.time, Value::Object(values).to_string().as_bytes())?;
     }
     writer.finish().map(drop)
@@ -101,13 +102,17 @@ mod tests {
         let mut file = Cursor::new(Vec::new());
         write_mcap(&mut file, &scene, &[frame(0.0), frame(0.5)]).expect("written");
         let bytes = file.into_inner();
-        let messages: Vec<_> = mcap::MessageStream::new(&bytes).expect("MCAP").map(|one| one.expect("a message")).collect();
+        let messages: Vec<_> =
+            mcap::MessageStream::new(&bytes).expect("MCAP").map(|one| one.expect("a message")).collect();
         let topics: Vec<_> = messages.iter().map(|message| message.channel.topic.as_str()).collect();
         let of_frame = ["/tf", "/robot_0", "/robot_1", "/curves"];
         assert_eq!(topics, [&["/scene"][..], &of_frame, &of_frame].concat());
         assert_eq!(messages.last().expect("one").log_time, 500_000_000);
         let text: Value = serde_json::from_slice(&messages[2].data).expect("JSON");
-        assert_eq!(text, serde_json::json!({ "torque": JOINT_NAMES.map(|name| (name, 1.5)).into_iter().collect::<BTreeMap<_, _>>() }));
+        assert_eq!(
+            text,
+            serde_json::json!({ "torque": JOINT_NAMES.map(|name| (name, 1.5)).into_iter().collect::<BTreeMap<_, _>>() })
+        );
         let schema = messages[0].channel.schema.as_ref().expect("a schema");
         assert_eq!((schema.name.as_str(), schema.encoding.as_str()), ("foxglove.SceneUpdate", "protobuf"));
     }
