@@ -102,7 +102,8 @@ impl Drop for ServerChild {
 #[test]
 fn training_on_the_robots_of_servers_gives_the_same_policy_as_in_process() {
     let folder = tempfile::tempdir().unwrap();
-    let servers = [(); 2].map(|()| ServerChild::start("tcp/127.0.0.1:0", &["--envs", "320"]));
+    // The robots of a training by rollouts are free again for the 256 of the evaluation.
+    let servers = [(); 2].map(|()| ServerChild::start("tcp/127.0.0.1:0", &["--envs", "256"]));
     let old_server = ServerChild::start("tcp/127.0.0.1:0", &["--envs", "320", "--max-rollout-steps", "0"]);
     let config = folder.path().join("config.toml");
     std::fs::write(&config, "[sim]\nphysics_hz = 400\n[train]\nnum_envs = 49\ngroups = 4\ntotal_steps = 4704\n")

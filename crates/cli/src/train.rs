@@ -360,11 +360,14 @@ impl TrainSession {
         }
     }
 
-    fn report(&self, args: &Args, signals: &Signals, start: Instant) -> CommandResult {
-        let policy = self.trainer.learner().policy(self.trainer.spec());
-        let (json, text) = train_evaluation::evaluate_policy(&policy, &self.config, &self.endpoints, signals)?;
-        std::fs::write(self.out.join("evaluation.json"), &json).map_err(other)?;
-        let steps = self.trainer.learner().env_steps as f64 / 1e6;
+    fn report(self, args: &Args, signals: &Signals, start: Instant) -> CommandResult {
+        let Self { config, endpoints, out, trainer, .. } = self;
+        let policy = trainer.learner().policy(trainer.spec());
+        let steps = trainer.learner().env_steps as f64 / 1e6;
+        // Robots of servers that collected rollouts are free for the evaluation.
+        drop(trainer);
+        let (json, text) = train_evaluation::evaluate_policy(&policy, &config, &endpoints, signals)?;
+        std::fs::write(out.join("evaluation.json"), &json).map_err(other)?;
         let seconds = start.elapsed().as_secs_f64();
         if args.json {
             println!("{json}");
