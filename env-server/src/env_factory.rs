@@ -3,7 +3,7 @@
 use twinstep_effects::{ModelFile, ModelFileError};
 use twinstep_effects::{RobotSampler, SamplingError};
 use twinstep_ensemble::{ActuatorNetworkRobot, EnsembleError};
-use twinstep_envs::{CounterEnv, Jump, TaskConfig, TaskEnv, TaskEnvConfig, Track, Walk};
+use twinstep_envs::{CounterEnv, GaitTask, Jump, TaskConfig, TaskEnv, TaskEnvConfig, Track, Walk};
 use twinstep_model::{Actuator, AutoresetMode, Backend, RobotModel, VecEnv};
 use twinstep_policy::array_file::ArrayFileError;
 use twinstep_policy::{OtherBase, Policy, ResidualEnv};
@@ -207,6 +207,10 @@ fn task_env(
         TaskConfig::Jump(config) => {
             let jump = Jump::new(config.clone(), robot, has_ground_truth)?;
             Ok(Box::new(TaskEnv::new(backend, jump, settings)?))
+        }
+        TaskConfig::Gait(config) => {
+            let gait = GaitTask::new(config.clone(), robot, has_ground_truth)?;
+            Ok(Box::new(TaskEnv::new(backend, gait, settings)?))
         }
         // The environments of the base policy; the residual is added to its actions by `ResidualEnv`.
         TaskConfig::Explore(config) => {

@@ -17,7 +17,7 @@ use crate::remote::{config, start};
 
 const FAULTS: &str = env!("CARGO_BIN_EXE_faults");
 
-fn router() -> (Process, String) {
+pub fn router() -> (Process, String) {
     let endpoint = free_endpoint().unwrap();
     (start_router(Path::new(FAULTS), &endpoint).unwrap(), endpoint)
 }
@@ -31,7 +31,7 @@ fn behind(router: &str, task: TaskConfig, envs: usize, name: &str) -> Server {
 }
 
 /// Waits until the router knows this number of servers.
-fn wait_for(endpoint: &str, servers: usize) {
+pub fn wait_for(endpoint: &str, servers: usize) {
     let discovery = Discovery::open(&ConnectOptions::new(endpoint, 1)).unwrap();
     let since = Instant::now();
     while discovery.servers().len() < servers {

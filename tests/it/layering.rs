@@ -114,7 +114,7 @@ const RESTRICTED_LIBRARIES: [(&str, &[&str]); 11] = [
     ("clap", &["crates/cli", "tests"]),
     ("plotters", &["crates/report"]),
     ("parquet", &["crates/logs"]),
-    ("mcap", &["crates/logs", "tests"]),
+    ("mcap", &["crates/logs", "crates/viewer", "tests"]),
     ("rustdds", &["crates/robot"]),
     ("ratatui", &["crates/cli"]),
     ("axum", &["crates/viewer"]),

@@ -52,6 +52,7 @@ mod robots;
 mod rollout;
 mod run;
 mod security;
+mod sharded;
 mod soak;
 mod spi_active;
 mod terrain;

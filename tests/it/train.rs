@@ -33,6 +33,9 @@ fn training_writes_its_folder_and_is_resumed_in_it() {
     assert_eq!(table().lines().count(), 1 + 4, "a header and 6144 / (64 · 24) updates");
     let (policy, header) = Policy::read(out.join("policy.safetensors")).unwrap();
     assert_eq!((header.origin.env_steps, header.origin.seed, header.origin.curve.len()), (6144, 5, 4));
+    let head = Command::new("git").args(["rev-parse", "HEAD"]).current_dir(root()).output();
+    let head = head.ok().filter(|output| output.status.success()).map(|output| text(&output.stdout).trim().to_owned());
+    assert_eq!(header.origin.revision, head, "the revision of the sources, if they are in a repository");
 
     let again = twinstep(&["train", "walk", "--out", out_text]);
     assert_eq!(again.status.code(), Some(2), "an earlier training is not overwritten");
@@ -99,7 +102,8 @@ impl Drop for ServerChild {
 #[test]
 fn training_on_the_robots_of_servers_gives_the_same_policy_as_in_process() {
     let folder = tempfile::tempdir().unwrap();
-    let servers = [(); 2].map(|()| ServerChild::start("tcp/127.0.0.1:0", &["--envs", "320"]));
+    // The robots of a training by rollouts are free again for the 256 of the evaluation.
+    let servers = [(); 2].map(|()| ServerChild::start("tcp/127.0.0.1:0", &["--envs", "256"]));
     let old_server = ServerChild::start("tcp/127.0.0.1:0", &["--envs", "320", "--max-rollout-steps", "0"]);
     let config = folder.path().join("config.toml");
     std::fs::write(&config, "[sim]\nphysics_hz = 400\n[train]\nnum_envs = 49\ngroups = 4\ntotal_steps = 4704\n")
@@ -266,6 +270,32 @@ fn shipped_policy_jumps_to_its_target_in_two_engines() {
         );
     }
 }
+
+#[test]
+fn shipped_policy_follows_each_gait_in_two_engines() {
+    let policy = root().join("data/policies/gait.safetensors");
+    let evaluated =
+        twinstep(&["evaluate-policy", policy.to_str().unwrap(), "--robots", "16", "--seconds", "6", "--json"]);
+    assert!(evaluated.status.success(), "{}", text(&evaluated.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&evaluated.stdout).unwrap();
+    let rows = report["rows"].as_array().unwrap();
+    let conditions: Vec<_> = rows.iter().map(|row| (&row["condition"], &row["engine"])).collect();
+    assert_eq!(serde_json::to_string(&conditions).unwrap(), GAIT_CONDITIONS);
+    for row in &rows[..2] {
+        let motions = row["gaits"].as_array().unwrap();
+        let names: Vec<_> = motions.iter().map(|motion| motion["gait"].as_str().unwrap()).collect();
+        assert_eq!(names, ["trot", "pace", "bound", "pronk"]);
+        for motion in motions {
+            let number = |name: &str| motion[name].as_f64().unwrap();
+            assert!(number("up") > 0.9 && number("followed") >= 0.75, "{motion}");
+            assert!(number("frequency_error") < 0.03 && number("phase_error") < 0.06, "{motion}");
+            assert!(number("velocity_rms") < 0.35 && number("duty_factor") < 0.6, "{motion}");
+        }
+    }
+}
+
+const GAIT_CONDITIONS: &str =
+    r#"[["nominal","batch"],["nominal","rapier"],["robots","batch"],["pushes","batch"],["delay","batch"]]"#;
 
 #[test]
 fn jump_is_trained_for_the_targets_of_its_config() {

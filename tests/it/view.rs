@@ -177,6 +177,29 @@ fn file_plays_the_motion_of_a_policy_or_a_log_without_a_program() {
 }
 
 #[test]
+fn recording_for_foxglove_has_the_frames_of_the_robot_and_of_its_simulation() {
+    let folder = tempfile::tempdir().unwrap();
+    let (file, model) = (folder.path().join("motion.mcap"), folder.path().join("nominal.toml"));
+    std::fs::write(&model, "robot = \"go2\"\n").unwrap();
+    let log = root().join("data/go2_air_chirp");
+    let arguments = ["view", log.to_str().unwrap(), "--model", model.to_str().unwrap(), "--seconds", "1"];
+    let output = Command::new(program()).args(arguments).args(["--mcap", file.to_str().unwrap()]).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let bytes = std::fs::read(&file).unwrap();
+    let messages: Vec<_> = mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap).collect();
+    let of = |topic: &str| messages.iter().filter(|message| message.channel.topic == topic).collect::<Vec<_>>();
+    assert_eq!((of("/scene").len(), of("/tf").len(), of("/curves").len()), (1, 31, 31));
+    let has = |bytes: &[u8], text: &str| bytes.windows(text.len()).any(|part| part == text.as_bytes());
+    for name in ["robot_0/FL_calf", "ghost_0/FL_calf", "robot_0/trunk"] {
+        assert!(has(&of("/scene")[0].data, name) && has(&of("/tf")[10].data, name), "{name}");
+    }
+    let curves: serde_json::Value = serde_json::from_slice(&of("/curves")[30].data).unwrap();
+    assert!(curves["FL_calf error [rad]"].as_f64().is_some_and(|error| error.abs() < 0.5), "{curves}");
+    let robot: serde_json::Value = serde_json::from_slice(&of("/robot_0")[30].data).unwrap();
+    assert_eq!(robot, serde_json::json!({}), "the log has neither forces nor the torques of all joints");
+}
+
+#[test]
 fn page_of_another_site_gets_nothing_and_cannot_move_the_robots() {
     let viewed = Viewed::policy();
     let local = viewed.http("GET /scene HTTP/1.1\r\nHost: localhost:7480\r\n\r\n");

@@ -33,6 +33,9 @@ pub struct ServerArgs {
     /// Endpoint of the router to which it connects.
     #[arg(long)]
     pub connect: Option<String>,
+    /// Number of environments.
+    #[arg(long, default_value_t = 64)]
+    pub envs: usize,
     /// Duration of a step [ms].
     #[arg(long, default_value_t = 4)]
     pub step_ms: u64,
@@ -84,7 +87,7 @@ fn serve(arguments: &ServerArgs) -> Result<(), Box<dyn std::error::Error>> {
     let config = ServerConfig {
         listen: arguments.listen.clone(),
         connect: arguments.connect.iter().cloned().collect(),
-        envs: 64,
+        envs: arguments.envs,
         ..ServerConfig::default()
     };
     let server = Server::start(&config, Arc::new(SlowHost(arguments.clone())))?;

@@ -242,7 +242,8 @@ pub fn start_router(program: &Path, listen: &str) -> Result<Process, String> {
     start(program, &["router".to_owned(), listen.to_owned()])
 }
 
-fn start_server(program: &Path, listen: &str, router: Option<&str>, extra: &[String]) -> Result<Process, String> {
+/// Starts a server of counters that listens at `listen`.
+pub fn start_server(program: &Path, listen: &str, router: Option<&str>, extra: &[String]) -> Result<Process, String> {
     let mut arguments = vec!["server".to_owned(), listen.to_owned()];
     if let Some(router) = router {
         arguments.extend(["--connect".to_owned(), router.to_owned()]);

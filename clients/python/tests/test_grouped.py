@@ -6,12 +6,13 @@ import signal
 import threading
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from loopback import router, suspend, wait_for_servers
 
 import twinstep
-from twinstep import ConnectOptions, EmbeddedServer, GroupedVecEnv, RemoteVecEnv, StepBatch
+from twinstep import ConnectOptions, EmbeddedServer, GroupedVecEnv, InvalidOptionError, RemoteVecEnv, StepBatch
 
 N, LIMIT = 5, 12
 SETTINGS: Any = {"num_envs": N, "autoreset": "SameStep", "max_episode_steps": LIMIT}
@@ -162,3 +163,30 @@ def test_all_groups_are_at_one_server_and_invalid_use_raises() -> None:
         assert [info.free_envs for info in twinstep.discover(endpoint)] == [8, 8]
         for server in servers:
             server.release()
+
+
+def test_vector_environment_with_groups_steps_like_one_without() -> None:
+    found: list[list[Any]] = []
+    for groups in (1, 3):
+        envs = gymnasium.make_vec("twinstep/Go2-Walk-v0", num_envs=N, groups=groups, critic=True)
+        obs, info = envs.reset(seed=40)
+        results: list[Any] = [obs, info["critic_obs"]]
+        for index in range(4):
+            *result, info = envs.step(actions(index))
+            results += [*result, info["critic_obs"]]
+        found.append(results)
+        assert isinstance(envs.unwrapped, twinstep.Go2VectorEnv)
+        assert envs.unwrapped.lease.count(", ") == groups - 1
+        envs.close()
+    np.testing.assert_equal(found[1], found[0])
+
+
+def test_groups_are_refused_with_several_servers_and_in_rollouts() -> None:
+    with pytest.raises(InvalidOptionError, match="`groups` = 2 and `endpoints` are set"):
+        twinstep.Go2VectorEnv(4, groups=2, endpoints=["tcp/127.0.0.1:9"])
+    with pytest.raises(InvalidOptionError, match=r"`groups` = 5 is not allowed: 1 to 4"):
+        twinstep.Go2VectorEnv(4, groups=5)
+    envs = twinstep.Go2VectorEnv(4, groups=2)
+    with pytest.raises(InvalidOptionError, match="`rollout` needs one lease"):
+        envs.rollout(None, 1, noise_seed=0)  # pyright: ignore[reportArgumentType]
+    envs.close()

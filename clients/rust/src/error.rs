@@ -80,6 +80,32 @@ pub enum ClientError {
         /// Number of environments.
         num_envs: usize,
     },
+    /// The environments cannot be divided among these servers.
+    #[error("{servers} servers are given for {num_envs} environments\n  give 1 server to one for each environment")]
+    Servers {
+        /// Number of servers.
+        servers: usize,
+        /// Number of environments.
+        num_envs: usize,
+    },
+    /// Two servers have different environments.
+    #[error(
+        "the servers at {} and {} have different specs: tasks, rewards, gains and episode lengths must be equal",
+        endpoints[0], endpoints[1]
+    )]
+    OtherSpec {
+        /// Endpoints of the servers.
+        endpoints: [String; 2],
+    },
+    /// No server of several is left.
+    #[error(
+        "all servers are lost, and none has granted a lease for {waited_s:.1} s\n  check that one of them is running and \
+         has free environments"
+    )]
+    NoServerLeft {
+        /// Time until the request failed [s].
+        waited_s: f64,
+    },
     /// The request is larger than the server accepts. It was not sent.
     #[error("`{request}` has {bytes} bytes; the server accepts at most {limit}\n  it hosts fewer environments")]
     TooLarge {

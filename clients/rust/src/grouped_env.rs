@@ -6,6 +6,7 @@ use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, Scene, Step
 
 use twinstep_protocol::random_u64;
 
+use crate::merge::{copy_rows, merge};
 use crate::{ClientError, ConnectOptions, RemoteVecEnv};
 
 /// Environments on a server, in groups with a lease each. Several groups step while the agent computes actions.
@@ -171,24 +172,4 @@ impl VecEnv for GroupedVecEnv {
         let group = self.first.partition_point(|first| *first <= env) - 1;
         self.groups[group].scene(env - self.first[group])
     }
-}
-
-/// Copies the rows of a group into the batch of all environments.
-fn merge(all: &mut StepBatch, group: &StepBatch, first: usize) {
-    let num_envs = group.reward.len();
-    copy_rows(&mut all.obs, first, &group.obs, num_envs);
-    copy_rows(&mut all.critic_obs, first, &group.critic_obs, num_envs);
-    copy_rows(&mut all.reward, first, &group.reward, num_envs);
-    copy_rows(&mut all.terminated, first, &group.terminated, num_envs);
-    copy_rows(&mut all.truncated, first, &group.truncated, num_envs);
-    all.ended.extend(group.ended.iter().cloned().map(|mut episode| {
-        episode.env += first;
-        episode
-    }));
-}
-
-/// Copies `num_envs` rows to the rows from `first` on.
-fn copy_rows<T: Copy>(all: &mut [T], first: usize, rows: &[T], num_envs: usize) {
-    let length = rows.len() / num_envs;
-    all[first * length..(first + num_envs) * length].copy_from_slice(rows);
 }

@@ -15,6 +15,8 @@
 //!
 //! [`GroupedVecEnv`] keeps several groups of environments stepping while the agent computes actions.
 //!
+//! [`ShardedVecEnv`] divides environments among several servers, and continues when one of them is lost.
+//!
 //! [`RemoteVecEnv::rollout`] runs a policy on the server, next to its robots; [`RemoteCollector`] does it for a learner.
 //!
 //! [`RobotWatch`] sees the robots of a server without environments of its own.
@@ -27,12 +29,16 @@ mod connection;
 mod discovery;
 mod error;
 mod grouped_env;
+mod merge;
 mod options;
+mod recovery;
 mod remote_collector;
 mod remote_env;
 mod robot_watch;
 mod server_process;
 mod session;
+mod shard;
+mod sharded_env;
 
 pub use connection::Connection;
 pub use discovery::{Discovery, ServerInfo};
@@ -43,4 +49,5 @@ pub use remote_collector::RemoteCollector;
 pub use remote_env::{LeaseHandle, RemoteVecEnv};
 pub use robot_watch::{FrameSubscription, RobotWatch};
 pub use server_process::ServerProcess;
+pub use sharded_env::ShardedVecEnv;
 pub use twinstep_protocol::Secret;

@@ -1,23 +1,13 @@
 //! Robots of a server that collect trajectories for a learner, and are leased again after their server was lost.
 
-use std::sync::mpsc::{Receiver, Sender, channel};
-use std::sync::{Arc, Weak};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use rand::Rng;
-use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, Trajectory, VecEnv, stream};
+use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, Trajectory, VecEnv};
 use twinstep_policy::{BehaviourPolicy, Collector};
-use twinstep_protocol::ErrorCode;
 
-use crate::remote_env::{client_error, is_unknown_policy};
-use crate::{ClientError, ConnectOptions, RemoteVecEnv};
-
-/// Time without a reply and without a visible server after which the server is lost.
-const LOSS_TIMEOUT: Duration = Duration::from_secs(3);
-/// Time after which it is checked whether the server is visible.
-const CHECK_PERIOD: Duration = Duration::from_millis(500);
-/// Pause before the next attempt to lease robots.
-const RETRY_PERIOD: Duration = Duration::from_millis(200);
+use crate::recovery::{CHECK_PERIOD, LOSS_TIMEOUT, Recovery, is_loss, is_timeout, recovery_seed};
+use crate::remote_env::is_unknown_policy;
+use crate::{ConnectOptions, RemoteVecEnv};
 
 /// Environments on a server that run the policy of a learner.
 ///
@@ -36,12 +26,9 @@ pub struct RemoteCollector {
 
 enum LeaseState {
     Leased(Box<RemoteVecEnv>),
-    /// A thread requests a new lease, and sends it. It ends when `_needed` is dropped.
-    Lost {
-        granted: Receiver<RemoteVecEnv>,
-        _needed: Arc<()>,
-    },
-    Closed,
+    Lost(Recovery),
+    /// The search for a new lease could not be started, or the collector is dropped.
+    None,
 }
 
 impl RemoteCollector {
@@ -62,10 +49,9 @@ impl RemoteCollector {
 
     /// Takes a new lease if it has been granted since the loss, and starts its episodes.
     fn take_new_lease(&mut self) -> Result<(), EnvError> {
-        let LeaseState::Lost { granted, .. } = &self.state else { return Ok(()) };
-        let Ok(mut env) = granted.try_recv() else { return Ok(()) };
-        let losses = self.losses;
-        let seeds = self.seeds.iter().map(|seed| stream(*seed, "lost server", losses).next_u64()).collect();
+        let LeaseState::Lost(recovery) = &self.state else { return Ok(()) };
+        let Some(mut env) = recovery.take() else { return Ok(()) };
+        let seeds = self.seeds.iter().map(|seed| recovery_seed(*seed, self.losses)).collect();
         let result = env.reset(&ResetRequest { seeds: Some(seeds), mask: None }).map(drop);
         self.state = LeaseState::Leased(Box::new(env));
         match result {
@@ -85,15 +71,9 @@ impl RemoteCollector {
         }
         let (endpoint, num_envs) = (&self.options.endpoint, self.options.num_envs);
         tracing::warn!(endpoint, num_envs, %error, "robots lost, and left out until a server has leased them again");
-        let (sender, granted) = channel();
-        let (options, needed) = (self.options.clone(), Arc::new(()));
-        let is_needed = Arc::downgrade(&needed);
-        let thread = std::thread::Builder::new().name("lease".to_owned());
-        thread
-            .spawn(move || request_lease(&options, &is_needed, &sender))
-            .map_err(|cause| EnvError::Remote(Box::new(cause)))?;
-        // The old connection ends, so that its lease expires at a server that still runs.
-        self.state = LeaseState::Lost { granted, _needed: needed };
+        if let LeaseState::Leased(env) = std::mem::replace(&mut self.state, LeaseState::None) {
+            self.state = LeaseState::Lost(Recovery::start(vec![self.options.clone()], *env)?);
+        }
         self.losses += 1;
         Ok(())
     }
@@ -102,36 +82,12 @@ impl RemoteCollector {
 impl Drop for RemoteCollector {
     /// Ends the lease, so that its robots are free at once.
     fn drop(&mut self) {
-        if let LeaseState::Leased(env) = std::mem::replace(&mut self.state, LeaseState::Closed)
+        if let LeaseState::Leased(env) = std::mem::replace(&mut self.state, LeaseState::None)
             && env.server_is_visible()
             && let Err(error) = env.close()
         {
             tracing::debug!(%error, "lease not closed");
         }
-    }
-}
-
-/// Requests a lease until it is granted or not needed any more.
-fn request_lease(options: &ConnectOptions, is_needed: &Weak<()>, granted: &Sender<RemoteVecEnv>) {
-    while is_needed.strong_count() > 0 {
-        match RemoteVecEnv::connect(options) {
-            Ok(env) => return drop(granted.send(env)),
-            Err(error) => tracing::debug!(endpoint = options.endpoint, %error, "no lease yet"),
-        }
-        std::thread::sleep(RETRY_PERIOD);
-    }
-}
-
-/// Returns true if the error means that the lease does not exist any more, or that its server cannot be reached.
-fn is_loss(error: &EnvError) -> bool {
-    match client_error(error) {
-        Some(ClientError::Restarted { .. } | ClientError::ShuttingDown { .. } | ClientError::RequestTimeout { .. }) => {
-            true
-        }
-        Some(ClientError::Rejected(rejection)) => {
-            matches!(rejection.code, ErrorCode::LeaseLost | ErrorCode::StaleEpoch)
-        }
-        _ => false,
     }
 }
 
@@ -178,8 +134,7 @@ impl Collector for RemoteCollector {
                 Ok(()) => return Ok(true),
                 Err(error) => error,
             };
-            let is_timeout = matches!(client_error(&error), Some(ClientError::RequestTimeout { .. }));
-            if is_timeout && (self.sent.elapsed() < LOSS_TIMEOUT || env.server_is_visible()) {
+            if is_timeout(&error) && (self.sent.elapsed() < LOSS_TIMEOUT || env.server_is_visible()) {
                 continue;
             }
             // The next request contains the policy.

@@ -124,8 +124,14 @@ impl RemoteVecEnv {
     /// It may be called again after a [`ClientError::RequestTimeout`]. The step is then repeated with the same sequence
     /// number, and executed once.
     pub fn recv(&mut self) -> Result<&StepBatch, EnvError> {
+        self.recv_within(self.connection.timeout())?;
+        Ok(&self.batch)
+    }
+
+    /// As [`RemoteVecEnv::recv`], with another timeout. [`RemoteVecEnv::last_step`] is then the result.
+    pub fn recv_within(&mut self, timeout: Duration) -> Result<(), EnvError> {
         self.check_pending(EnvMethod::Step)?;
-        let answer = self.await_pending(self.connection.timeout())?;
+        let answer = self.await_pending(timeout)?;
         let bytes = answer.to_bytes();
         self.is_unknown = true;
         let reply: message::StepReply<'_> = decode(&bytes).map_err(|error| malformed("step", error))?;
@@ -133,7 +139,12 @@ impl RemoteVecEnv {
         convert::decode_step(&reply, &self.spec, self.num_envs, &mut self.batch)
             .map_err(|error| malformed("step", error))?;
         self.is_unknown = false;
-        Ok(&self.batch)
+        Ok(())
+    }
+
+    /// Returns the result of the last step.
+    pub fn last_step(&self) -> &StepBatch {
+        &self.batch
     }
 
     /// Returns true if the server fronts a robot, whose steps take one policy period of real time.

@@ -12,6 +12,7 @@ use twinstep_policy::{Policy, PolicyRunner};
 use twinstep_report::film_strip;
 use twinstep_sim::{Engine, RoughTerrain, SimConfig, StepTerrain, Terrain};
 
+use crate::evaluate_gait::{self, GaitRow};
 use crate::evaluate_jump::{self, JumpRow};
 use crate::evaluate_tracking::{self, TrackingRow};
 use crate::exit::{CommandResult, Failure, Signals, input};
@@ -25,7 +26,8 @@ const FILM_STEPS: usize = 4;
 /// Evaluate a policy: velocity errors, falls and gait, on engines and robots that it has not seen.
 ///
 /// The mean action of the policy steps fresh robots with the default commands of `walk`: a new one every 5 s. A policy of
-/// `track` follows a circle, a figure of eight and a square, with and without motion capture. A policy of `jump` jumps
+/// `track` follows a circle, a figure of eight and a square, with and without motion capture. A policy of `gait` is
+/// commanded a trot, a pace, a bound and a pronk, under nominal, robots, pushes and delay. A policy of `jump` jumps
 /// once to both ends and the middle of the ranges of its targets. A robot that has fallen no longer counts for the errors,
 /// but its landing before the fall does. Conditions:
 ///
@@ -163,6 +165,10 @@ pub fn run(args: &Args) -> CommandResult {
             let rows = jumping(args, &policy, trained, &signals)?;
             if args.json { json(args, &rows) } else { evaluate_jump::table(args.robots, &rows) }
         }
+        TaskConfig::Gait(_) => {
+            let rows = gaits(args, &policy, &signals)?;
+            if args.json { json(args, &rows) } else { evaluate_gait::table(args.robots, args.seconds, &rows) }
+        }
         _ => {
             let rows = walking(args, &policy, &signals)?;
             if args.json {
@@ -229,6 +235,28 @@ fn tracking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<Track
         }
         bar.finish_and_clear();
         rows.push(TrackingRow { condition: name, engine, paths });
+    }
+    Ok(rows)
+}
+
+/// Evaluates how the policy follows each gait, under the conditions of gaits.
+fn gaits(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<GaitRow>, Failure> {
+    let tasks = evaluate_gait::tasks();
+    let mut rows = Vec::new();
+    let conditions = conditions(args.engine).into_iter();
+    for condition in conditions.filter(|condition| evaluate_gait::CONDITIONS.contains(&condition.name)) {
+        let Condition { name, engine, .. } = condition;
+        let bar = progress_bar(name);
+        let mut gaits = Vec::new();
+        for (index, (task, gait)) in tasks.iter().enumerate() {
+            let mut env = condition.env(args, TaskConfig::Gait(task.clone()), args.robots as usize)?;
+            check_spec(policy, env.spec())?;
+            let proceed = |share: f64| show(&bar, (index as f64 + share) / tasks.len() as f64, signals);
+            let motion = evaluate_gait::evaluate(policy, env.as_mut(), *gait, (args.seconds, args.seed), proceed);
+            gaits.push(motion.map_err(input)?.ok_or(Failure::Interrupted)?);
+        }
+        bar.finish_and_clear();
+        rows.push(GaitRow { condition: name, engine, gaits });
     }
     Ok(rows)
 }

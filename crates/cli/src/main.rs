@@ -6,6 +6,7 @@ mod demo;
 mod diagnose;
 mod effects;
 mod evaluate;
+mod evaluate_gait;
 mod evaluate_jump;
 mod evaluate_policy;
 mod evaluate_tracking;

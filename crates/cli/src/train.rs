@@ -41,7 +41,7 @@ const SAVE_EVERY: Duration = Duration::from_secs(10);
 #[derive(clap::Args)]
 pub struct Args {
     /// Task to learn. Default: that of the config file, else walk.
-    #[arg(value_parser = ["walk", "track", "jump", "explore"])]
+    #[arg(value_parser = ["walk", "track", "jump", "gait", "explore"])]
     task: Option<String>,
     /// Folder to write.
     #[arg(long, value_name = "DIR")]
@@ -352,6 +352,7 @@ impl TrainSession {
                 .collect::<Vec<_>>()
                 .join(" "),
             version: env!("CARGO_PKG_VERSION").to_owned(),
+            revision: option_env!("TWINSTEP_REVISION").map(str::to_owned),
             seed: self.seed,
             config: self.text.clone(),
             env_steps: self.trainer.learner().env_steps,
@@ -359,11 +360,14 @@ impl TrainSession {
         }
     }
 
-    fn report(&self, args: &Args, signals: &Signals, start: Instant) -> CommandResult {
-        let policy = self.trainer.learner().policy(self.trainer.spec());
-        let (json, text) = train_evaluation::evaluate_policy(&policy, &self.config, &self.endpoints, signals)?;
-        std::fs::write(self.out.join("evaluation.json"), &json).map_err(other)?;
-        let steps = self.trainer.learner().env_steps as f64 / 1e6;
+    fn report(self, args: &Args, signals: &Signals, start: Instant) -> CommandResult {
+        let Self { config, endpoints, out, trainer, .. } = self;
+        let policy = trainer.learner().policy(trainer.spec());
+        let steps = trainer.learner().env_steps as f64 / 1e6;
+        // Robots of servers that collected rollouts are free for the evaluation.
+        drop(trainer);
+        let (json, text) = train_evaluation::evaluate_policy(&policy, &config, &endpoints, signals)?;
+        std::fs::write(out.join("evaluation.json"), &json).map_err(other)?;
         let seconds = start.elapsed().as_secs_f64();
         if args.json {
             println!("{json}");

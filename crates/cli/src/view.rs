@@ -3,8 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use twinstep_client::ConnectOptions;
+use twinstep_viewer::{Frame, SceneInfo, static_page, write_mcap};
 
-use crate::exit::{CommandResult, Failure, Signals, input};
+use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::view_policy::WalkArgs;
 use crate::web_view::PageArgs;
 use crate::{view_endpoint, view_log, view_policy};
@@ -25,7 +26,7 @@ use crate::{view_endpoint, view_log, view_policy};
 /// `twinstep serve`, `train`, `run` and `robot` show their robots with --view.
 ///
 /// With --html the motion of a policy or a log is written into one file that any browser plays, without Twinstep and without a
-/// network.
+/// network. With --mcap it is written with Foxglove's schemas: scene and curves in Foxglove, poses in Rerun.
 ///
 /// Examples: `twinstep view data/policies/walk.safetensors --robots 16`, `twinstep view walk.mcap --model extended.toml` and
 /// `twinstep view tcp/127.0.0.1:7447`
@@ -52,6 +53,9 @@ pub struct Args {
     /// Write the page with its motion into this file instead of serving it.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["listen", "token"])]
     html: Option<PathBuf>,
+    /// Write the motion into this MCAP file with Foxglove's schemas instead of serving a page.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["listen", "token"])]
+    mcap: Option<PathBuf>,
     /// Length of the motion in the file [s]; a log may be shorter.
     #[arg(long, value_name = "S", default_value_t = 20.0, value_parser = seconds)]
     seconds: f64,
@@ -79,9 +83,9 @@ pub fn run(args: &Args) -> CommandResult {
         }
         let (zenoh, robot, server_id) = (args.zenoh.clone(), args.robot.clone(), args.server.clone());
         let options = ConnectOptions { zenoh, robot, server_id, ..ConnectOptions::new(&args.target, 1) };
-        if args.html.is_some() {
+        if args.html.is_some() || args.mcap.is_some() {
             return Err(Failure::Input(miette::miette!(
-                "`--html` is for a policy or a log; {} is an endpoint\n  record it first: `twinstep run POLICY --endpoint {} \
+                "`--html` and `--mcap` are for a policy or a log; {} is an endpoint\n  record it first: `twinstep run POLICY --endpoint {} \
                  --log FILE`, then `twinstep view FILE --html ...`",
                 args.target,
                 args.target
@@ -91,18 +95,40 @@ pub fn run(args: &Args) -> CommandResult {
     }
     let model = args.model.as_deref();
     let is_policy = path.extension().is_some_and(|extension| extension == "safetensors" || extension == "onnx");
-    match (&args.html, is_policy) {
-        (None, true) => view_policy::run(path, model, &args.walk, &args.page, &signals),
-        (None, false) => view_log::run(path, model, &args.page, &signals),
-        (Some(file), true) => write_page(file, &view_policy::page(path, model, &args.walk, args.seconds, &signals)?),
-        (Some(file), false) => write_page(file, &view_log::page(path, model, args.seconds)?),
+    if args.html.is_none() && args.mcap.is_none() {
+        return if is_policy {
+            view_policy::run(path, model, &args.walk, &args.page, &signals)
+        } else {
+            view_log::run(path, model, &args.page, &signals)
+        };
     }
+    let (scene, frames) = if is_policy {
+        view_policy::motion(path, model, &args.walk, args.seconds, &signals)?
+    } else {
+        view_log::motion(path, model, args.seconds)?
+    };
+    if let Some(file) = &args.html {
+        write_page(file, &static_page(&scene, &frames))?;
+    }
+    args.mcap.as_ref().map_or(Ok(()), |file| write_recording(file, &scene, &frames))
+}
+
+fn write_recording(file: &Path, scene: &SceneInfo, frames: &[Frame]) -> CommandResult {
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    write_mcap(&mut bytes, scene, frames).map_err(other)?;
+    write_file("--mcap", file, bytes.get_ref())?;
+    println!("written to {} ({:.1} MB)", file.display(), bytes.get_ref().len() as f64 / 1e6);
+    Ok(())
 }
 
 fn write_page(file: &Path, page: &str) -> CommandResult {
-    std::fs::write(file, page).map_err(|cause| {
-        Failure::Input(miette::miette!("`--html` = {}: cannot write the file: {cause}", file.display()))
-    })?;
+    write_file("--html", file, page.as_bytes())?;
     println!("written to {} ({:.1} MB); open it in a browser", file.display(), page.len() as f64 / 1e6);
     Ok(())
+}
+
+fn write_file(flag: &str, file: &Path, bytes: &[u8]) -> CommandResult {
+    std::fs::write(file, bytes).map_err(|cause| {
+        Failure::Input(miette::miette!("`{flag}` = {}: cannot write the file: {cause}", file.display()))
+    })
 }

@@ -28,16 +28,16 @@ pub fn run(path: &Path, model: Option<&Path>, page: &PageArgs, signals: &Signals
     player.run(page.hub(), signals)
 }
 
-/// Returns a page that plays the first seconds of a log.
-pub fn page(path: &Path, model: Option<&Path>, seconds: f64) -> Result<String, Failure> {
+/// Returns the first seconds of a log.
+pub fn motion(path: &Path, model: Option<&Path>, seconds: f64) -> Result<(SceneInfo, Vec<Frame>), Failure> {
     let (player, scene) = open(path, model)?;
-    Ok(player.page(&scene, seconds))
+    Ok((scene, player.motion(seconds)))
 }
 
 /// Returns a page that plays the first seconds of a log, with the simulation of `robot` as its ghost.
 pub fn page_with_ghost(log: Log, title: String, robot: RobotModel, seconds: f64) -> Result<String, Failure> {
     let (player, scene) = player(log, title, robot, true)?;
-    Ok(player.page(&scene, seconds))
+    Ok(static_page(&scene, &player.motion(seconds)))
 }
 
 fn open(path: &Path, model: Option<&Path>) -> Result<(Player, SceneInfo), Failure> {
@@ -138,14 +138,14 @@ impl Player {
         Ok(())
     }
 
-    /// Returns a page that plays the first seconds.
-    fn page(mut self, scene: &SceneInfo, seconds: f64) -> String {
+    /// Returns the frames of the first seconds.
+    fn motion(mut self, seconds: f64) -> Vec<Frame> {
         let count = (seconds.min(self.duration) * FRAME_RATE).floor() as usize;
         let frame = |index| {
             self.time = index as f64 / FRAME_RATE;
             self.frame()
         };
-        static_page(scene, &(0..=count).map(frame).collect::<Vec<_>>())
+        (0..=count).map(frame).collect()
     }
 
     fn obey(&mut self, request: PageRequest) {

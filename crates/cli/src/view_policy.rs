@@ -8,7 +8,7 @@ use twinstep_env_server::{Config, EnvFactory, ServerConfig, SimEnvFactory};
 use twinstep_envs::TaskConfig;
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
 use twinstep_sim::{Engine, SimConfig};
-use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo, static_page};
+use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo};
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::serve::engine;
@@ -48,14 +48,14 @@ pub fn run(path: &Path, model: Option<&Path>, args: &WalkArgs, page: &PageArgs, 
     walk.run(page.hub(), signals)
 }
 
-/// Returns a page that plays the first seconds.
-pub fn page(
+/// Returns the first seconds.
+pub fn motion(
     path: &Path,
     model: Option<&Path>,
     args: &WalkArgs,
     seconds: f64,
     signals: &Signals,
-) -> Result<String, Failure> {
+) -> Result<(SceneInfo, Vec<Frame>), Failure> {
     let (mut walk, scene) = start(path, model, args)?;
     let mut frames = vec![walk.frame()?];
     while frames.last().is_some_and(|frame| frame.time < seconds) && !signals.check()? {
@@ -64,7 +64,7 @@ pub fn page(
         }
         frames.push(walk.frame()?);
     }
-    Ok(static_page(&scene, &frames))
+    Ok((scene, frames))
 }
 
 /// Puts the robots at their start.

@@ -35,4 +35,6 @@ pub use path::{GroundPose, Path, PathShape};
 pub use randomise::Randomisation;
 pub use task::{RobotView, Step, Task};
 pub use task_env::{TaskEnv, TaskEnvConfig};
-pub use tasks::{ExploreConfig, Jump, JumpConfig, TaskConfig, Track, TrackConfig, Walk, WalkConfig};
+pub use tasks::{
+    ExploreConfig, Gait, GaitConfig, GaitTask, Jump, JumpConfig, TaskConfig, Track, TrackConfig, Walk, WalkConfig,
+};

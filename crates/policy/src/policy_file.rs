@@ -42,6 +42,9 @@ pub struct PolicyOrigin {
     pub command: String,
     /// Version of the program.
     pub version: String,
+    /// Git revision of the program's sources. `None` if it was built outside a repository.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub revision: Option<String>,
     /// Seed of the training.
     pub seed: u64,
     /// Settings of the training, as a config file (TOML).

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from .codec import Spec
 from .discovery import ServerInfo
 from .errors import InvalidActionError, InvalidOptionError
+from .grouped import AllGroups
 from .options import UNLIMITED, ConnectOptions
 from .pickling import NotPicklable
 from .remote import RemoteVecEnv
@@ -207,7 +208,7 @@ def render_fps(spec: Spec) -> int:
     return max(1, round(1 / spec.policy_dt))
 
 
-def open_viewer(mode: RenderMode | None, remote: RemoteVecEnv | ShardedVecEnv) -> Viewer | None:
+def open_viewer(mode: RenderMode | None, remote: RemoteVecEnv | ShardedVecEnv | AllGroups) -> Viewer | None:
     """Return the viewer of a render mode. Ends the lease if there is none, because pygame is not installed."""
     try:
         return None if mode is None else Viewer(mode, fps=render_fps(remote.spec))

@@ -62,6 +62,7 @@ class GroupedVecEnv(NotPicklable):
         self._rows = divide(num_envs, groups)
         self._groups: list[RemoteVecEnv] = []
         self._received: dict[int, StepBatch] = {}
+        self._sent_at = 0.0
         # Without seeds, the server has the same random streams for each lease.
         self._random_seeds = np.random.default_rng().integers(2**64, size=num_envs, dtype=np.uint64)
         self._never_seeded = np.ones(num_envs, np.bool_)
@@ -151,6 +152,11 @@ class GroupedVecEnv(NotPicklable):
         After an error some groups have stepped and others have not. :meth:`recv` returns the results of those that
         have; :meth:`reset` starts new episodes in all.
         """
+        self.send_all(actions)
+        return self.recv_all()
+
+    def send_all(self, actions: NDArray[Any]) -> None:
+        """Send the actions of all groups, (num_envs, action_len), without waiting. Call :meth:`recv_all` next."""
         checked = checked_actions(actions, self.num_envs, self.spec)
         for index, group in enumerate(self._groups):
             if index in self._received or group.in_progress:
@@ -158,11 +164,17 @@ class GroupedVecEnv(NotPicklable):
                     f"group {index} has a result that was not received: nothing was stepped\n"
                     "  call `recv` of the group, or `reset`"
                 )
-        since = time.monotonic()
+        self._sent_at = time.monotonic()
         for group, rows in zip(self._groups, self._rows, strict=True):
             group.send(checked[rows])
+
+    def recv_all(self) -> StepBatch:
+        """Wait for the results of all groups; may be called again after a ``RequestTimeoutError``."""
+        since = time.monotonic()
         error: Error | None = None
         for index, group in enumerate(self._groups):
+            if index in self._received:
+                continue
             try:
                 self._received[index] = group.recv(max(0.0, since + self._timeout_s - time.monotonic()))
             except Error as raised:
@@ -172,7 +184,7 @@ class GroupedVecEnv(NotPicklable):
             raise error
         parts = [(self._rows[index], batch) for index, batch in sorted(self._received.items())]
         self._received.clear()
-        return self._merged(parts, time.monotonic() - since)
+        return self._merged(parts, time.monotonic() - self._sent_at)
 
     def scene(self, env: int) -> dict[str, Any]:
         """Return shapes and poses of one robot, and its ground, for rendering."""
@@ -202,3 +214,31 @@ class GroupedVecEnv(NotPicklable):
 
 def _part(values: NDArray[Any] | None, rows: slice) -> NDArray[Any] | None:
     return None if values is None else values[rows]
+
+
+class AllGroups:
+    """All groups of a :class:`GroupedVecEnv` as one, with the interface of ``RemoteVecEnv`` and its arguments."""
+
+    def __init__(
+        self, options: ConnectOptions, groups: int, *, num_envs: int, autoreset: str, max_episode_steps: int | None
+    ) -> None:
+        self._envs = GroupedVecEnv(
+            options, groups=groups, num_envs=num_envs, autoreset=autoreset, max_episode_steps=max_episode_steps
+        )
+        self.spec = self._envs.spec
+        self.reset = self._envs.reset
+        self.set_velocity_commands = self._envs.set_velocity_commands
+        self.send = self._envs.send_all
+        self.recv = self._envs.recv_all
+        self.scene = self._envs.scene
+        self.close = self._envs.close
+
+    @property
+    def lease(self) -> str:
+        """Ids of the leases, as in the log of the server."""
+        return self._envs.lease
+
+    @property
+    def critic_obs(self) -> NDArray[np.float32]:
+        """Observations of group ``critic`` after the last reset or step: (num_envs, critic_len)."""
+        return self._envs.critic_obs

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .discovery import ServerInfo
 from .env import OptionArguments, RenderMode, checked_render_mode, open_viewer, render_fps, reward_terms
 from .errors import InvalidOptionError
+from .grouped import AllGroups
 from .options import ConnectOptions
 from .pickling import NotPicklable
 from .remote import RemoteVecEnv
@@ -44,6 +45,9 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
     endpoints
         Endpoints of several servers, or results of :func:`twinstep.discover`, among which the robots are divided; see
         :class:`twinstep.ShardedVecEnv`. Not allowed with ``endpoint``.
+    groups
+        Number of groups of robots with a lease each. The server steps one group while it receives and sends others.
+        Results do not depend on it. An agent that steps group by group uses :class:`twinstep.GroupedVecEnv`.
     **options
         See :class:`twinstep.ConnectOptions`.
     """
@@ -57,6 +61,7 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
         render_mode: RenderMode | None = None,
         info_timing: bool = False,
         endpoints: Sequence[str | ServerInfo] | None = None,
+        groups: int = 1,
         **options: Unpack[OptionArguments],
     ) -> None:
         mode = _autoreset_mode(autoreset_mode)
@@ -65,7 +70,12 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
         self._mode = mode
         self._info_timing = info_timing
         settings = ConnectOptions(**options)
-        create = partial(RemoteVecEnv, settings) if endpoints is None else partial(ShardedVecEnv, settings, endpoints)
+        if endpoints is not None and groups != 1:
+            raise InvalidOptionError(f"`groups` = {groups} and `endpoints` are set; one of them is expected")
+        if endpoints is not None:
+            create = partial(ShardedVecEnv, settings, endpoints)
+        else:
+            create = partial(RemoteVecEnv, settings) if groups == 1 else partial(AllGroups, settings, groups)
         self._remote = create(num_envs=num_envs, autoreset=mode.value, max_episode_steps=max_episode_steps)
         self._viewer = open_viewer(checked_mode, self._remote)
         self.num_envs = num_envs
@@ -165,8 +175,8 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
         """Run a policy on the server for some steps of all environments: one request instead of one for each step.
 
         Starts from the current observations, so call :meth:`reset` before the first rollout. ``step`` may follow. Not
-        available in the autoreset mode ``"Disabled"`` and with ``endpoints``: a learner with several servers has an
-        environment for each of them.
+        available in the autoreset mode ``"Disabled"``, and with ``endpoints`` or ``groups``: a learner with several
+        servers has an environment for each of them.
 
         Parameters
         ----------
@@ -177,8 +187,8 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
         noise_seed
             The noise of environment i is a function of ``noise_seed + i`` alone. Use another one for each rollout.
         """
-        if isinstance(self._remote, ShardedVecEnv):
-            raise InvalidOptionError("`rollout` needs one server; create an environment for each of the `endpoints`")
+        if not isinstance(self._remote, RemoteVecEnv):
+            raise InvalidOptionError("`rollout` needs one lease; create an environment for each endpoint or group")
         trajectory = self._remote.rollout(policy, steps, noise_seed=noise_seed)
         self._show()
         return trajectory

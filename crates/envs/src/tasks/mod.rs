@@ -5,6 +5,10 @@ use serde::{Deserialize, Serialize};
 use crate::ConfigError;
 
 pub mod explore_config;
+pub mod gait;
+pub mod gait_clock;
+pub mod gait_config;
+pub mod gait_reward;
 pub mod jump;
 pub mod jump_config;
 pub mod jump_flight;
@@ -15,6 +19,9 @@ pub mod walk;
 pub mod walk_config;
 
 pub use explore_config::ExploreConfig;
+pub use gait::GaitTask;
+pub use gait_clock::Gait;
+pub use gait_config::GaitConfig;
 pub use jump::Jump;
 pub use jump_config::JumpConfig;
 pub use track::Track;
@@ -32,6 +39,8 @@ pub enum TaskConfig {
     Track(TrackConfig),
     /// A jump to a target, once, from standing.
     Jump(JumpConfig),
+    /// Locomotion with velocity commands and a commanded gait.
+    Gait(GaitConfig),
     /// A residual on a frozen policy of `walk`, rewarded for the uncertainty of the actuator networks.
     Explore(ExploreConfig),
     /// Counts steps without physics, to verify and measure the transport. It has no settings.
@@ -46,7 +55,7 @@ impl Default for TaskConfig {
 
 impl TaskConfig {
     /// Names of all tasks.
-    pub const NAMES: [&str; 5] = ["walk", "track", "jump", "explore", "counter"];
+    pub const NAMES: [&str; 6] = ["walk", "track", "jump", "gait", "explore", "counter"];
 
     /// Returns the task of this name with default settings. Returns `None` if there is no such task.
     pub fn named(name: &str) -> Option<Self> {
@@ -54,6 +63,7 @@ impl TaskConfig {
             "walk" => Some(Self::default()),
             "track" => Some(Self::Track(TrackConfig::default())),
             "jump" => Some(Self::Jump(JumpConfig::default())),
+            "gait" => Some(Self::Gait(GaitConfig::default())),
             "explore" => Some(Self::Explore(ExploreConfig::default())),
             "counter" => Some(Self::Counter),
             _ => None,
@@ -66,6 +76,7 @@ impl TaskConfig {
             Self::Walk(_) => "walk",
             Self::Track(_) => "track",
             Self::Jump(_) => "jump",
+            Self::Gait(_) => "gait",
             Self::Explore(_) => "explore",
             Self::Counter => "counter",
         }
@@ -77,6 +88,7 @@ impl TaskConfig {
             Self::Walk(config) => config.check(),
             Self::Track(config) => config.check(),
             Self::Jump(config) => config.check(),
+            Self::Gait(config) => config.check(),
             Self::Explore(config) => config.check(),
             Self::Counter => Ok(()),
         }
@@ -99,6 +111,7 @@ impl TaskConfig {
             Self::Walk(config) => ("task.reward.epistemic_uncertainty", config.reward.epistemic_uncertainty),
             Self::Track(config) => ("task.walk.reward.epistemic_uncertainty", config.walk.reward.epistemic_uncertainty),
             Self::Jump(config) => ("task.walk.reward.epistemic_uncertainty", config.walk.reward.epistemic_uncertainty),
+            Self::Gait(config) => ("task.walk.reward.epistemic_uncertainty", config.walk.reward.epistemic_uncertainty),
             Self::Explore(config) => ("task.uncertainty_weight", config.uncertainty_weight),
             Self::Counter => ("task", 0.0),
         }
@@ -115,6 +128,7 @@ impl TryFrom<toml::Table> for TaskConfig {
             Some("walk") => table.try_into().map(Self::Walk).map_err(text),
             Some("track") => table.try_into().map(Self::Track).map_err(text),
             Some("jump") => table.try_into().map(Self::Jump).map_err(text),
+            Some("gait") => table.try_into().map(Self::Gait).map_err(text),
             Some("explore") => table.try_into().map(Self::Explore).map_err(text),
             Some("counter") if table.is_empty() => Ok(Self::Counter),
             Some("counter") => Err("the task `counter` has no settings besides `name`".to_owned()),
@@ -155,7 +169,7 @@ mod tests {
             in `reward`
         "#]].assert_eq(&error("[reward]\ntorques = -1.0"));
         expect![[r#"
-            `name` = "fly" is not a task; possible: walk, track, jump, explore, counter
+            `name` = "fly" is not a task; possible: walk, track, jump, gait, explore, counter
         "#]]
         .assert_eq(&error("name = \"fly\""));
         expect![[r#"
@@ -166,7 +180,7 @@ mod tests {
 
     #[test]
     fn defaults_are_valid() {
-        for name in ["walk", "track", "jump", "counter"] {
+        for name in ["walk", "track", "jump", "gait", "counter"] {
             assert_eq!(TaskConfig::named(name).expect("a task").check(), Ok(()), "{name}");
         }
         let explore = ExploreConfig::default();
