@@ -4,8 +4,6 @@ mod base_schedule;
 mod draw;
 mod ground_truth;
 mod motion;
-mod mujoco_plant;
-mod plant_actuator;
 mod runner;
 mod score;
 mod table;
@@ -23,7 +21,6 @@ use twinstep_model::go2;
 use twinstep_sim::{BatchRollout, SimConfig};
 
 use draw::{Case, CaseKind, LogSetup};
-pub use mujoco_plant::MujocoPlant;
 use runner::BlindTest;
 use score::Score;
 use unmodelled::UnmodelledEffect;
