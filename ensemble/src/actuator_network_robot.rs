@@ -43,7 +43,7 @@ impl ActuatorNetworkRobot {
         if let Some(joint) = unknown.filter(|_| model.joint_input == JointEncoding::Identity) {
             return Err(EnsembleError::UnknownJoint { joint: JOINT_NAMES[joint] });
         }
-        file.effects.iter().try_for_each(|entry| check_compatible(entry, model.tau_sensor))?;
+        check_effects(file, model.tau_sensor)?;
         if model.tau_sensor == TorqueSensor::JointOutput {
             // The training data contain the torque of the rotor inertia.
             robot.joints.iter_mut().for_each(|joint| joint.armature = 0.0);
@@ -80,6 +80,11 @@ impl ActuatorNetworkRobot {
     pub fn includes_rotor(&self) -> bool {
         self.ensemble.description.tau_sensor == TorqueSensor::JointOutput
     }
+}
+
+/// Checks that no effect of `file` belongs to a stage that an ensemble with this torque sensor replaces.
+pub fn check_effects(file: &ModelFile, sensor: TorqueSensor) -> Result<(), EnsembleError> {
+    file.effects.iter().try_for_each(|entry| check_compatible(entry, sensor))
 }
 
 /// Checks that an effect does not belong to a stage that an ensemble with this torque sensor replaces.

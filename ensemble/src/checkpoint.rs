@@ -53,11 +53,12 @@ struct Header {
 }
 
 impl Checkpoint {
-    /// Creates the initial state of a training.
-    pub(crate) fn new(options: TrainingOptions, description: &EnsembleMetadata) -> Self {
+    /// Creates the initial state of a training, with the weights in `initial` or sampled ones.
+    pub(crate) fn new(options: TrainingOptions, description: &EnsembleMetadata, initial: Option<&[Weights]>) -> Self {
         let shape = description.shape();
         let member = |index: usize| {
-            let weights = shape.random(&mut stream(options.seed, "first weights", index as u64));
+            let sampled = || shape.random(&mut stream(options.seed, "first weights", index as u64));
+            let weights = initial.map_or_else(sampled, |initial| initial[index].clone());
             MemberState { best: weights.clone(), weights, optimizer: Vec::new(), curve: Vec::new() }
         };
         let members = (0..options.members).map(member).collect();

@@ -31,6 +31,8 @@ pub enum Split {
 /// Contiguous rows of one joint within one block.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sequence {
+    /// Index of the log.
+    pub log: usize,
     /// Index into [`DataSet::joints`].
     pub joint: usize,
     /// True if the actuator was reset just before, so that no burn-in is needed.
@@ -83,7 +85,7 @@ impl DataSet {
         let longest = ((LONGEST_BLOCK_S / dt) as usize).max(SHORTEST_BLOCK);
         let block_rows = (rows / (2 * CYCLE)).clamp(SHORTEST_BLOCK, longest);
         let mut blocks = 0;
-        for (name, log) in logs {
+        for (index, (name, log)) in logs.iter().enumerate() {
             set.check(name, log)?;
             let columns = set.columns(name, log)?;
             for (_, part) in log.segments() {
@@ -93,7 +95,7 @@ impl DataSet {
                         log,
                         &columns,
                         &block,
-                        BlockContext { starts_part: start == part.start, number: blocks, hz },
+                        BlockContext { log: index, starts_part: start == part.start, number: blocks, hz },
                     );
                     blocks += 1;
                 }
@@ -109,6 +111,11 @@ impl DataSet {
     /// Returns the sequences of one split, in the order of logs, time and joints.
     pub fn runs(&self, expected: Split) -> impl Iterator<Item = &Sequence> + Clone {
         self.runs.iter().filter(move |(block, _)| *block == expected).map(|(_, run)| run)
+    }
+
+    /// Returns the sequences of all splits, in the order of logs, time and joints.
+    pub fn all_runs(&self) -> impl Iterator<Item = &Sequence> + Clone {
+        self.runs.iter().map(|(_, run)| run)
     }
 
     /// Returns a hash of the data in hexadecimal.
@@ -177,6 +184,7 @@ impl DataSet {
             for rows in contiguous_ranges(block.clone().filter(|row| usable(*row)), follows) {
                 let starts_part = place.starts_part && rows.start == block.start;
                 let mut run = Sequence {
+                    log: place.log,
                     joint: column.joint,
                     after_reset: starts_part,
                     errors: rows.clone().map(error).collect(),
@@ -194,6 +202,8 @@ impl DataSet {
 /// Context of a block.
 #[derive(Clone, Copy)]
 struct BlockContext {
+    /// Index of the log.
+    log: usize,
     /// True if the block is the first of a log segment.
     starts_part: bool,
     /// Index among the blocks of all logs.

@@ -153,6 +153,18 @@ pub enum EnsembleError {
         /// What differs.
         what: &'static str,
     },
+    /// The earlier ensemble of a warm start has other networks or joints.
+    #[error(
+        "the earlier ensemble has another {what} ({earlier}) than the training ({given}); a warm start needs the same"
+    )]
+    OtherEnsemble {
+        /// What differs.
+        what: &'static str,
+        /// Value of the earlier ensemble.
+        earlier: String,
+        /// Value of the training.
+        given: String,
+    },
     /// The file cannot be read or written.
     #[error("cannot {verb} `{path}`: {cause}")]
     File {

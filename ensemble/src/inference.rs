@@ -123,6 +123,7 @@ mod tests {
         const ROWS: usize = 1000;
         let ensemble = ensemble(2, hidden, joint_input);
         let run = |joint: usize| Sequence {
+            log: 0,
             joint,
             after_reset: true,
             errors: (0..ROWS).map(|row| error(1, joint, row)).collect(),

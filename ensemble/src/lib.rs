@@ -48,10 +48,11 @@ mod smooth;
 mod synthetic;
 mod train;
 mod training_options;
+mod warm_start;
 mod weights;
 
 pub use actuator_network::ActuatorNetwork;
-pub use actuator_network_robot::ActuatorNetworkRobot;
+pub use actuator_network_robot::{ActuatorNetworkRobot, check_effects};
 pub use burn_inference::BurnInference;
 pub use calibration::{Calibration, Coverage};
 pub use checkpoint::{Checkpoint, Epoch};

@@ -19,6 +19,8 @@ use crate::metadata::EnsembleMetadata;
 use crate::normaliser::Normalisers;
 use crate::sequences::SequenceDataset;
 use crate::training_options::TrainingOptions;
+use crate::warm_start::initial_weights;
+use crate::weights::Weights;
 
 /// Maximum time between two calls of `progress`.
 const TICK: Duration = Duration::from_millis(100);
@@ -59,6 +61,8 @@ pub struct Training<'a> {
     pub(crate) description: EnsembleMetadata,
     sequences: SequenceDataset,
     validation: SequenceDataset,
+    /// Initial weights of each member; `None` if they are sampled.
+    initial: Option<Vec<Weights>>,
     device: Device,
 }
 
@@ -89,7 +93,15 @@ impl<'a> Training<'a> {
         description.check()?;
         let sequences = SequenceDataset::sequences(data.runs(Split::Training), &description);
         let validation = SequenceDataset::sequences(data.runs(Split::Validation), &description);
-        Ok(Self { data, options, description, sequences, validation, device: Device::flex() })
+        Ok(Self { data, options, description, sequences, validation, initial: None, device: Device::flex() })
+    }
+
+    /// Starts each member with the weights of a member of `earlier` instead of sampled ones.
+    ///
+    /// The normalisation is that of the new data; the weights are converted to it.
+    pub fn warm_start(&mut self, earlier: &Ensemble) -> Result<(), EnsembleError> {
+        self.initial = Some(initial_weights(earlier, &self.description)?);
+        Ok(())
     }
 
     /// Selects the best GPU for training instead of the CPU, and returns its name.
@@ -118,7 +130,7 @@ impl<'a> Training<'a> {
     ) -> Result<TrainingResult, EnsembleError> {
         let mut checkpoint = match resume {
             Some(saved) => saved.of(&self.options, &self.description.data_hash)?,
-            None => Checkpoint::new(self.options.clone(), &self.description),
+            None => Checkpoint::new(self.options.clone(), &self.description, self.initial.as_deref()),
         };
         let done = |member: &MemberState| finished(&member.curve, &self.options);
         let all = checkpoint.members.iter().cloned().enumerate();

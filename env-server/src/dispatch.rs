@@ -67,7 +67,7 @@ impl Dispatcher {
     fn route(&self, query: &Query) -> Result<(Arc<Mailbox>, RequestKind), ErrorReply> {
         let request = keys::parse(query.key_expr().as_str(), &self.sid).ok_or_else(|| {
             let message = format!("the key `{}` does not exist", query.key_expr());
-            let hint = "use hello, lease, stop, or env/<lease>/reset, step, rollout, close or render";
+            let hint = "use hello, lease, stop, or env/<lease>/reset, step, rollout, close, render or samples";
             ErrorReply::new(ErrorCode::UnknownKey, "", message).with_hint(hint)
         })?;
         if let keys::Request::Env { lease, verb } = request {

@@ -7,7 +7,7 @@ use twinstep_envs::{CounterEnv, GaitTask, Jump, TaskConfig, TaskEnv, TaskEnvConf
 use twinstep_model::{Actuator, AutoresetMode, Backend, RobotModel, VecEnv};
 use twinstep_policy::array_file::ArrayFileError;
 use twinstep_policy::{OtherBase, Policy, ResidualEnv};
-use twinstep_sim::{BackendBuildError, BatchBackend, Engine, MujocoBackend, RapierBackend};
+use twinstep_sim::{BackendBuildError, BatchBackend, Engine, MujocoBackend, MujocoPlant, RapierBackend};
 
 use twinstep_protocol::{message, random_u64};
 
@@ -177,7 +177,10 @@ impl EnvFactory for SimEnvFactory {
                 let backend = if let Some(actuators) = actuators { backend.with_actuator(actuators) } else { backend };
                 task_env(&self.config.task, backend, settings)
             }
-            Engine::Mujoco => task_env(&self.config.task, MujocoBackend::new(robot, sim, num_envs)?, settings),
+            Engine::Mujoco if MujocoBackend::simulates(&robot) => {
+                task_env(&self.config.task, MujocoBackend::new(robot, sim, num_envs)?, settings)
+            }
+            Engine::Mujoco => task_env(&self.config.task, MujocoPlant::new(robot, sim, num_envs)?, settings),
         }?;
         match (&self.config.task, &self.base) {
             (TaskConfig::Explore(explore), Some(base)) => {

@@ -2,8 +2,8 @@
 //!
 //! Requests carry the lease's epoch and a sequence number. The worker executes the next number and caches the reply.
 //! A repeated request gets the cached reply. Any other number, or the same number with another request, is an error. A
-//! request that is rejected without effect does not consume its number. `render` only reads: it has no number and is
-//! answered between two requests.
+//! request that is rejected without effect does not consume its number. `render` and `samples` only read: they have no
+//! number and are answered between two requests.
 
 use std::hash::{BuildHasher, RandomState};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -136,6 +136,9 @@ impl Worker {
         if verb == EnvMethod::Render {
             return self.render(&payload).into();
         }
+        if verb == EnvMethod::Samples {
+            return self.samples(&payload).into();
+        }
         let header = match decode::<message::RequestHeader>(&payload) {
             Ok(header) => header,
             Err(error) => return Reply::Err(error),
@@ -198,16 +201,28 @@ impl Worker {
         Ok(())
     }
 
-    fn render(&mut self, payload: &[u8]) -> Result<Vec<u8>, ErrorReply> {
-        let request: message::RenderRequest = decode(payload)?;
-        self.check_owner(request.protocol, request.epoch)?;
+    /// Checks a request without a sequence number. Returns the index of its environment.
+    fn check_reading(&self, protocol: u16, epoch: u64, env: u64) -> Result<usize, ErrorReply> {
+        self.check_owner(protocol, epoch)?;
         if self.state.shutting_down.load(Ordering::Acquire) {
             return Err(shutting_down());
         }
         if let Some(reason) = &self.failure {
             return Err(lost_environments(reason));
         }
-        let env = usize::try_from(request.env).unwrap_or(usize::MAX);
+        Ok(usize::try_from(env).unwrap_or(usize::MAX))
+    }
+
+    fn samples(&mut self, payload: &[u8]) -> Result<Vec<u8>, ErrorReply> {
+        let message::SamplesRequest { protocol, epoch, env } = decode(payload)?;
+        let env = self.check_reading(protocol, epoch, env)?;
+        let samples = self.env().samples(env).map_err(|error| convert::wire_error(&error))?;
+        Ok(convert::encode_samples(&samples))
+    }
+
+    fn render(&mut self, payload: &[u8]) -> Result<Vec<u8>, ErrorReply> {
+        let message::RenderRequest { protocol, epoch, env } = decode(payload)?;
+        let env = self.check_reading(protocol, epoch, env)?;
         // `scene` does not change the environments, so they stay usable after a panic.
         let scene = catch_unwind(AssertUnwindSafe(|| self.env().scene(env)))
             .map_err(|panic| ErrorReply::new(ErrorCode::Internal, "", panic_text(&panic)))?;
@@ -256,6 +271,7 @@ impl Worker {
                 Ok(encode(&message::CloseReply { protocol: PROTOCOL, seq: request.seq }))
             }
             EnvMethod::Render => self.render(payload),
+            EnvMethod::Samples => self.samples(payload),
         }
     }
 }

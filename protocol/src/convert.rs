@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use twinstep_model::{
     BackendError, EndedEpisode, EnvError, EnvSpec, Ground, HeightField, NUM_JOINTS, PerJoint, RealTimeReport,
-    ResetRequest, RobotStop, Scene, StepBatch, Trajectory,
+    ResetRequest, RobotSample, RobotStop, Scene, StepBatch, Trajectory,
 };
 
 use crate::codec::encode_with_capacity;
@@ -361,6 +361,42 @@ pub fn encode_scene(scene: Scene) -> Vec<u8> {
     encode(&message::RenderReply { protocol: PROTOCOL, bodies, pose, shapes, ground: encode_ground(&ground), command })
 }
 
+/// Number of the numbers of a sample: four per joint; rotation, angular velocity, position and velocity of the base.
+const SAMPLE_LEN: usize = 4 * NUM_JOINTS + 13;
+
+/// Encodes the reply to a request for samples. An unknown position or velocity of the base is NaN.
+pub fn encode_samples(samples: &[RobotSample]) -> Vec<u8> {
+    let numbers = |sample: &RobotSample| -> [f32; SAMPLE_LEN] {
+        let [position, velocity] = sample.base.unwrap_or([[f32::NAN; 3]; 2]);
+        let joints = [sample.q, sample.dq, sample.q_cmd, sample.tau];
+        let mut rest = sample.orientation.into_iter().chain(sample.gyro).chain(position).chain(velocity);
+        let mut joints = joints.into_iter().flatten();
+        std::array::from_fn(|_| joints.next().or_else(|| rest.next()).unwrap_or(f32::NAN))
+    };
+    let samples: Vec<[f32; SAMPLE_LEN]> = samples.iter().map(numbers).collect();
+    encode(&message::SamplesReply { protocol: PROTOCOL, samples: tensor::as_bytes(samples.as_flattened()) })
+}
+
+/// Decodes the reply to a request for samples.
+pub fn decode_samples(reply: message::SamplesReply<'_>) -> Result<Vec<RobotSample>, ErrorReply> {
+    let numbers: Vec<f32> = tensor::read(reply.samples, "samples")?;
+    let (samples, rest) = numbers.as_chunks::<SAMPLE_LEN>();
+    if !rest.is_empty() {
+        return Err(wrong_length("samples", numbers.len(), samples.len() * SAMPLE_LEN));
+    }
+    Ok(samples.iter().map(read_sample).collect())
+}
+
+fn read_sample(numbers: &[f32; SAMPLE_LEN]) -> RobotSample {
+    let mut numbers = numbers.iter().copied();
+    let mut next = || numbers.next().expect("the sizes below add up to the length of the array");
+    let [q, dq, q_cmd, tau]: [PerJoint; 4] = std::array::from_fn(|_| std::array::from_fn(|_| next()));
+    let (orientation, gyro) = (std::array::from_fn(|_| next()), std::array::from_fn(|_| next()));
+    let base: [[f32; 3]; 2] = std::array::from_fn(|_| std::array::from_fn(|_| next()));
+    let base = base.iter().flatten().all(|value| value.is_finite()).then_some(base);
+    RobotSample { q, dq, q_cmd, tau, orientation, gyro, base }
+}
+
 /// Returns the ground of a scene as part of a message, without copying the heights.
 pub fn encode_ground(ground: &Ground) -> message::Ground<'_> {
     let height_field = ground.height_field.as_deref().map(|field| {
@@ -429,7 +465,9 @@ pub fn wire_error(error: &EnvError) -> ErrorReply {
         }
         EnvError::NeedsReset { .. } => (ErrorCode::NeedsReset, "", "send `reset`, with `mask` for some environments"),
         EnvError::EnvOutOfRange { .. } => (ErrorCode::OutOfRange, "env", "environments are numbered from 0"),
-        EnvError::RenderUnsupported { .. } => (ErrorCode::UnknownKey, "", "use a task with a robot, such as `walk`"),
+        EnvError::RenderUnsupported { .. } | EnvError::SamplesUnsupported { .. } => {
+            (ErrorCode::UnknownKey, "", "use a task with a robot, such as `walk`")
+        }
         EnvError::Backend(BackendError::Waiting { .. }) => {
             (ErrorCode::Waiting, "", "repeat the request; the robot's operator moves it to its standing pose")
         }

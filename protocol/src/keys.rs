@@ -71,12 +71,20 @@ pub enum EnvMethod {
     Close,
     /// Returns the scene of one environment. Only reads, so it has no sequence number.
     Render,
+    /// Returns the samples of one environment in the last step. It has no sequence number.
+    Samples,
 }
 
 impl EnvMethod {
     /// All methods.
-    pub const ALL: [EnvMethod; 5] =
-        [EnvMethod::Reset, EnvMethod::Step, EnvMethod::Rollout, EnvMethod::Close, EnvMethod::Render];
+    pub const ALL: [EnvMethod; 6] = [
+        EnvMethod::Reset,
+        EnvMethod::Step,
+        EnvMethod::Rollout,
+        EnvMethod::Close,
+        EnvMethod::Render,
+        EnvMethod::Samples,
+    ];
 
     /// Returns the last segment of the method's key.
     pub const fn name(self) -> &'static str {
@@ -86,6 +94,7 @@ impl EnvMethod {
             EnvMethod::Rollout => "rollout",
             EnvMethod::Close => "close",
             EnvMethod::Render => "render",
+            EnvMethod::Samples => "samples",
         }
     }
 }

@@ -380,6 +380,27 @@ pub struct RenderRequest {
     pub env: u64,
 }
 
+/// Requests the samples of one environment in the last step. It does not change an episode, so it has no sequence number.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SamplesRequest {
+    /// Protocol version of the client.
+    pub protocol: u16,
+    /// Epoch of the lease.
+    pub epoch: u64,
+    /// Index of the environment.
+    pub env: u64,
+}
+
+/// One robot over the actuator periods of the last step, as [`twinstep_model::RobotSample`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SamplesReply<'a> {
+    /// Protocol version of the server.
+    pub protocol: u16,
+    /// Numbers of each sample, samples × 61 × f32; no sample in the reply to the first request.
+    #[serde(borrow, with = "serde_bytes")]
+    pub samples: &'a [u8],
+}
+
 /// Everything needed to draw one robot without a robot model, as in [`twinstep_model::Scene`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RenderReply<'a> {

@@ -40,6 +40,7 @@ fn noise_changes_the_observation_but_not_the_motion() {
         gravity: 0.05,
         joint_position_rad: 0.01,
         joint_velocity_rad_s: 1.5,
+        ..ObservationNoise::default()
     };
     let exact = steps(Randomisation::default(), 7, ROBOTS, 20);
     let noisy = steps(Randomisation { noise, ..Randomisation::default() }, 7, ROBOTS, 20);

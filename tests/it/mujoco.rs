@@ -9,13 +9,14 @@ use tempfile::TempDir;
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Target, apply_effects};
 use twinstep_envs::{Randomisation, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
-use twinstep_hunt::MujocoPlant;
 use twinstep_logs::Log;
 use twinstep_model::{
     AutoresetMode, Backend, BackendError, BaseMount, Command, EnvError, InitialState, NUM_JOINTS, PerJoint,
     ResetRequest, RobotModel, Simulator, VecEnv, go2,
 };
-use twinstep_sim::{BackendBuildError, BatchBackend, Engine, MujocoBackend, RoughTerrain, SimConfig, Terrain};
+use twinstep_sim::{
+    BackendBuildError, BatchBackend, Engine, MujocoBackend, MujocoPlant, RoughTerrain, SimConfig, Terrain,
+};
 use twinstep_tests::process::Process;
 use twinstep_tests::python::{Programs, python, root, run};
 
@@ -439,7 +440,7 @@ fn plant_of_the_blind_test_moves_like_the_model_with_the_same_effects() {
     robot.control.actuator_hz = 200.0;
     let config = SimConfig { base: BaseMount::Fixed, threads: 1, ..SimConfig::default() };
     let mut model = BatchBackend::new(robot.clone(), config, 1).unwrap();
-    let mut plant = MujocoPlant::with_python(robot, config, &interpreter.path()).unwrap();
+    let mut plant = MujocoPlant::with_python(robot, config, 1, &interpreter.path()).unwrap();
     let pose = go2().control.default_pose_f32();
     let initial_state = InitialState::at_rest(0.6, pose);
     model.reset(&[(0, initial_state)]).unwrap();
@@ -460,4 +461,31 @@ fn plant_of_the_blind_test_moves_like_the_model_with_the_same_effects() {
     let [error, moved] = [sum, moved].map(|sum| (sum / (400 * NUM_JOINTS) as f64).sqrt());
     println!("difference {error:.5} rad of {moved:.3} rad");
     assert!(error < 0.003 && moved > 0.1, "difference {error} rad of {moved} rad");
+}
+
+#[test]
+fn robots_of_the_plant_do_not_influence_each_other_and_stay_within_the_saturation() {
+    let Some(interpreter) = Interpreter::of_tests() else { return };
+    let saturation =
+        EffectEntry::new(Effect::named("torque_saturation").unwrap(), "all".parse().unwrap(), vec![8.0]).unwrap();
+    let robot = apply_effects(&go2(), &[saturation]).unwrap();
+    let config = SimConfig { threads: 1, ..SimConfig::default() };
+    let plant = |robots| MujocoPlant::with_python(robot.clone(), config, robots, &interpreter.path()).unwrap();
+    let (mut both, mut single) = (plant(2), plant(1));
+    let pose = go2().control.default_pose_f32();
+    let start = InitialState::at_rest(0.33, pose);
+    both.reset(&[(0, start), (1, start)]).unwrap();
+    single.reset(&[(0, start)]).unwrap();
+    let mut largest = 0.0_f32;
+    for period in 0..100 {
+        let command = |size: f32| Command::hold(pose.map(|q| q + size * (0.1 * period as f32).sin()), 60.0, 0.8);
+        both.step(&[command(0.1), command(0.5)], &[true, period < 50], 1).unwrap();
+        single.step(&[command(0.1)], &[true], 1).unwrap();
+        assert_eq!(both.measured().q[0], single.measured().q[0], "period {period}");
+        assert_eq!(both.measured().tau[0], single.measured().tau[0], "period {period}");
+        largest = both.measured().tau[1].iter().fold(largest, |largest, tau| largest.max(tau.abs()));
+    }
+    assert!((7.0..=8.0).contains(&largest), "{largest} N·m");
+    assert_ne!(both.measured().q[0], both.measured().q[1]);
+    assert!((both.measured().stamp[0] - 0.5).abs() < 1e-9 && (both.measured().stamp[1] - 0.25).abs() < 1e-9);
 }

@@ -105,6 +105,42 @@ fn trained_policy_walks_the_fake_robot_and_no_command_is_refused() {
 }
 
 #[test]
+fn log_with_torques_of_the_fake_robot_follows_the_law_of_its_actuators() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = in_three_attempts(|| {
+        let pair = standing(&[]);
+        let (policy, log) = (root().join("data/policies/walk.safetensors"), folder.path().join("log"));
+        let _ = std::fs::remove_dir_all(&log);
+        let mut run = Command::new(program())
+            .arg("run")
+            .arg(policy)
+            .args(["--endpoint", &pair.endpoint, "--velocity", "0.5,0,0", "--seconds", "4", "--torque", "--log"])
+            .arg(&log)
+            .stdout(Stdio::null())
+            .spawn()
+            .unwrap();
+        ends_within(&mut run, LOST)?;
+        twinstep_logs::Log::open(&log).map_err(|error| error.to_string())
+    });
+    assert_eq!(log.meta().rate_hz, 200.0);
+    // A busy machine misses ticks, and the log is that of the whole time.
+    assert!((700..=1600).contains(&log.rows()), "{} rows of 200 steps", log.rows());
+    let (mut error, mut torque) = (0.0, 0.0);
+    for joint in log.joints() {
+        let [q, dq, q_cmd, tau] =
+            [log.q(joint), log.dq(joint), log.q_cmd(joint), log.tau_measured(joint)].map(Option::unwrap);
+        for row in 0..log.rows() {
+            // kp 30, kd 0.75; the ideal robot has no other law.
+            let wanted = 30.0 * (q_cmd[row] - q[row]) - 0.75 * dq[row];
+            error += (wanted - tau[row]).powi(2);
+            torque += tau[row].powi(2);
+        }
+    }
+    // The torque changes within the 5 ms whose mean is recorded.
+    assert!((error / torque).sqrt() < 0.35, "{}", (error / torque).sqrt());
+}
+
+#[test]
 fn nothing_is_sent_before_the_operator_arms_and_nothing_moves_before_he_makes_the_robot_stand() {
     let mut pair = pair(&[]);
     pair.wait_for("observe", Duration::from_secs(15)).unwrap();

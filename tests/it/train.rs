@@ -349,6 +349,11 @@ fn task_of_the_config_file_is_trained_and_another_one_is_refused() {
     };
     // One update moves a weight by a few times the learning rate of 0.001; other networks differ by 0.1 and more.
     assert!((1e-6..0.03).contains(&distance(&policy, &tuned)) && header.origin.env_steps == 768);
+    let policy_file = folder.path().join("track/policy.safetensors");
+    let tuned = train(&["--from", policy_file.to_str().unwrap(), "--seed", "2"], "tuned_policy");
+    assert!(tuned.status.success(), "{}", text(&tuned.stderr));
+    let (tuned, _) = Policy::read(folder.path().join("tuned_policy/policy.safetensors")).unwrap();
+    assert!((1e-6..0.03).contains(&distance(&policy, &tuned)), "the actor is that of the policy");
     let other = folder.path().join("other");
     let refused = twinstep(&["train", "--out", other.to_str().unwrap(), "--from", start.to_str().unwrap()]);
     assert!(text(&refused.stderr).contains("the policy was trained with spec"), "{}", text(&refused.stderr));

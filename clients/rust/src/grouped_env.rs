@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, Scene, StepBatch, VecEnv};
+use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, RobotSample, Scene, StepBatch, VecEnv};
 
 use twinstep_protocol::random_u64;
 
@@ -171,5 +171,10 @@ impl VecEnv for GroupedVecEnv {
     fn scene(&self, env: usize) -> Result<Scene, EnvError> {
         let group = self.first.partition_point(|first| *first <= env) - 1;
         self.groups[group].scene(env - self.first[group])
+    }
+
+    fn samples(&mut self, env: usize) -> Result<Vec<RobotSample>, EnvError> {
+        let group = self.first.partition_point(|first| *first <= env) - 1;
+        self.groups[group].samples(env - self.first[group])
     }
 }

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use twinstep_model::{
-    AutoresetMode, EnvError, EnvSpec, RealTimeReport, ResetRequest, Scene, StepBatch, Trajectory, VecEnv,
+    AutoresetMode, EnvError, EnvSpec, RealTimeReport, ResetRequest, RobotSample, Scene, StepBatch, Trajectory, VecEnv,
 };
 use twinstep_policy::BehaviourPolicy;
 use twinstep_protocol::keys::EnvMethod;
@@ -388,6 +388,14 @@ impl VecEnv for RemoteVecEnv {
         let answer = self.connection.request(&self.key(EnvMethod::Render), encode(&request)).map_err(remote)?;
         let bytes = answer.to_bytes();
         decode(&bytes).and_then(convert::decode_scene).map_err(|error| malformed("render", error))
+    }
+
+    /// A server that is older than this request answers that the key is unknown.
+    fn samples(&mut self, env: usize) -> Result<Vec<RobotSample>, EnvError> {
+        let request = message::SamplesRequest { protocol: PROTOCOL, epoch: self.ticket.epoch, env: env as u64 };
+        let answer = self.connection.request(&self.key(EnvMethod::Samples), encode(&request)).map_err(remote)?;
+        let bytes = answer.to_bytes();
+        decode(&bytes).and_then(convert::decode_samples).map_err(|error| malformed("samples", error))
     }
 }
 

@@ -2,7 +2,8 @@
 //!
 //! - [`LoadedPolicy`]: a policy file, an ONNX file of `twinstep train`, or an ONNX file of another program with its
 //!   [`Mapping`]. [`LoadedPolicy::bind`] compares it with the robot; a [`BoundPolicy`] computes actions.
-//! - [`run`]: steps one robot with the actions of a policy, in real time. [`Recorder`] writes the log.
+//! - [`run`]: steps one robot with the actions of a policy, in real time. [`Recorder`] writes the log, [`JointRecorder`]
+//!   one at the rate of the actuators.
 //! - [`OnnxNetwork`]: an ONNX file with one observation as input.
 //!
 //! A *mapping* says how the observation and the action of a policy are made from those of Twinstep: order of the joints,
@@ -10,6 +11,7 @@
 
 mod error;
 mod history;
+mod joint_recorder;
 mod mapped_policy;
 mod mapping;
 mod onnx;
@@ -21,10 +23,11 @@ mod run;
 mod summary;
 
 pub use error::AgentError;
+pub use joint_recorder::JointRecorder;
 pub use mapping::{History, HistoryLayout, HistoryOrder, Mapping, Numbers, Term, TermName};
 pub use onnx::{OnnxError, OnnxNetwork};
 pub use policy::{BoundPolicy, LoadedPolicy};
 pub use policy_input::PolicyInput;
 pub use recorder::Recorder;
-pub use run::{Control, RunPlan, Status, run};
+pub use run::{Control, Recorders, RunPlan, Status, run};
 pub use summary::{RunSummary, Spread};

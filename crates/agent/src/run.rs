@@ -2,9 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-use twinstep_model::{EnvError, EnvSpec, ResetRequest, VecEnv};
+use twinstep_model::{EnvError, EnvSpec, ResetRequest, Stream, VecEnv, standard_normal, stream};
 
 use crate::error::AgentError;
+use crate::joint_recorder::JointRecorder;
 use crate::pacer::Pacer;
 use crate::policy::BoundPolicy;
 use crate::policy_input::PolicyInput;
@@ -18,8 +19,19 @@ pub struct RunPlan {
     pub seconds: Option<f64>,
     /// True to begin a step every policy period; false to step as fast as the robot answers.
     pub real_time: bool,
-    /// Seed of the robot's random numbers.
+    /// Standard deviation of Gaussian noise that is added to every action; 0 for none.
+    pub action_noise: f64,
+    /// Seed of the robot's random numbers, and of the noise.
     pub seed: u64,
+}
+
+/// Logs of a run, at most one.
+#[derive(Default)]
+pub struct Recorders<'a> {
+    /// Log with a row per policy step.
+    pub steps: Option<&'a mut Recorder>,
+    /// Log with a row per actuator period.
+    pub joints: Option<&'a mut JointRecorder>,
 }
 
 /// What to do in the next step.
@@ -83,14 +95,22 @@ impl Layout {
 pub fn run(
     env: &mut dyn VecEnv,
     policy: &mut BoundPolicy,
-    mut recorder: Option<&mut Recorder>,
+    mut recorders: Recorders,
     plan: RunPlan,
     control: &mut dyn FnMut(&Status, &dyn VecEnv) -> Control,
 ) -> Result<RunSummary, AgentError> {
     let spec = env.spec().clone();
     let layout = Layout::new(&spec);
-    let mut agent =
-        Agent { layout, obs: Vec::new(), critic_obs: Vec::new(), episode: 0, time_steps: 0, uses_commands: false };
+    let mut agent = Agent {
+        layout,
+        obs: Vec::new(),
+        critic_obs: Vec::new(),
+        episode: 0,
+        time_steps: 0,
+        uses_commands: false,
+        action_noise: plan.action_noise,
+        noise: stream(plan.seed, "action noise", 0),
+    };
     agent.reset(env, policy, &ResetRequest::seeded(plan.seed, 1))?;
     let (mut sums, mut step_time, mut lateness) = (Sums::default(), 0.0, 0.0);
     let mut pacer = Pacer::new(Duration::from_secs_f64(spec.policy_dt));
@@ -103,7 +123,7 @@ pub fn run(
         let (command, velocity) = (agent.command(), layout.velocity(&agent.obs, &agent.critic_obs));
         let status = Status { seconds, command, velocity, falls: sums.falls, step_time, lateness };
         let Control::Step(wanted) = control(&status, env) else { break };
-        if let Some(recorder) = &mut recorder {
+        if let Some(recorder) = &mut recorders.steps {
             agent.observe(env, recorder, &spec)?;
         }
         let action = agent.action(policy, wanted, &spec, &mut sums)?;
@@ -115,14 +135,21 @@ pub fn run(
         step_time = start.elapsed().as_secs_f64();
         sums.add_times(step_time, lateness);
         agent.check_command(wanted)?;
-        if let Some(recorder) = &mut recorder {
+        if let Some(recorder) = &mut recorders.steps {
             recorder.write(&action)?;
+        }
+        if let Some(recorder) = &mut recorders.joints {
+            recorder.write(env)?;
         }
         if ended {
             agent.reset(env, policy, &ResetRequest::default())?;
+            if let Some(recorder) = &mut recorders.joints {
+                recorder.begin_episode();
+            }
         }
     }
-    let rows = recorder.map_or(0, |recorder| recorder.rows());
+    let rows = recorders.steps.map_or(0, |recorder| recorder.rows());
+    let rows = rows + recorders.joints.map_or(0, |recorder| recorder.rows());
     Ok(sums.summary(spec.policy_dt, layout.command.is_some(), layout.velocity.is_some(), rows))
 }
 
@@ -136,6 +163,9 @@ struct Agent {
     time_steps: u64,
     /// True once the endpoint was seen to use a command.
     uses_commands: bool,
+    /// Standard deviation of the noise of the actions.
+    action_noise: f64,
+    noise: Stream,
 }
 
 impl Agent {
@@ -175,7 +205,10 @@ impl Agent {
         if let (Some(start), Some(wanted)) = (self.layout.command, wanted) {
             self.obs[start..start + 3].copy_from_slice(&wanted);
         }
-        let action = policy.action(&PolicyInput { obs: &self.obs, critic_obs: &self.critic_obs })?;
+        let mut action = policy.action(&PolicyInput { obs: &self.obs, critic_obs: &self.critic_obs })?;
+        if self.action_noise > 0.0 {
+            action.iter_mut().for_each(|value| *value += (self.action_noise * standard_normal(&mut self.noise)) as f32);
+        }
         if let Some(index) = action.iter().position(|value| !value.is_finite()) {
             let joint = spec.action_entry(index);
             return Err(AgentError::NotFinite { joint, value: action[index], steps: sums.steps });

@@ -86,7 +86,7 @@ fn cell(ensemble: &Ensemble, stage: &DataSet) -> Cell {
 }
 
 /// Returns time, measured torque, mean torque and epistemic uncertainty of each row that has a prediction.
-fn evaluated_rows(run: &Sequence, rows: &[Vec<Gaussian>], dt: f64) -> Vec<[f64; 4]> {
+pub fn evaluated_rows(run: &Sequence, rows: &[Vec<Gaussian>], dt: f64) -> Vec<[f64; 4]> {
     let first = run.torques.len() - rows.len();
     let row = |(index, members): (usize, &Vec<Gaussian>)| {
         let (means, variances): (Vec<f64>, Vec<f64>) =

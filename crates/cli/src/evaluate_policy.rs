@@ -55,6 +55,9 @@ pub struct Args {
     /// Physics engine of all conditions. Default: batch, and rapier for the nominal robot.
     #[arg(long, value_parser = engine)]
     engine: Option<Engine>,
+    /// Evaluate under these conditions only; repeat it for several. Default: all.
+    #[arg(long, value_name = "NAME", value_parser = CONDITIONS)]
+    condition: Vec<String>,
     /// Number of robots.
     #[arg(long, value_name = "N", default_value_t = 256, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     robots: u32,
@@ -71,6 +74,9 @@ pub struct Args {
     #[arg(long)]
     json: bool,
 }
+
+/// Names of the conditions.
+const CONDITIONS: [&str; 8] = ["nominal", "robots", "pushes", "noise", "ground", "steps", "delay", "robust"];
 
 /// What the robots are like in an evaluation.
 struct Condition {
@@ -107,6 +113,7 @@ fn conditions(engine: Option<Engine>) -> Vec<Condition> {
         gravity: 0.05,
         joint_position_rad: 0.01,
         joint_velocity_rad_s: 1.5,
+        ..ObservationNoise::default()
     };
     let mut conditions = vec![
         condition("nominal", calm),
@@ -130,6 +137,14 @@ fn conditions(engine: Option<Engine>) -> Vec<Condition> {
     conditions
 }
 
+impl Args {
+    /// Returns the conditions that are wanted.
+    fn conditions(&self) -> Vec<Condition> {
+        let is_wanted = |condition: &Condition| self.condition.iter().any(|name| name == condition.name);
+        conditions(self.engine).into_iter().filter(|one| self.condition.is_empty() || is_wanted(one)).collect()
+    }
+}
+
 impl Condition {
     /// Creates `robots` robots.
     fn env(&self, args: &Args, task: TaskConfig, robots: usize) -> Result<Box<dyn VecEnv>, Failure> {
@@ -149,7 +164,7 @@ pub fn run(args: &Args) -> CommandResult {
     let (policy, header) = Policy::read(&args.policy).map_err(input)?;
     let task = task(&policy, &header.origin.config);
     if let Some(path) = &args.film {
-        let mut env = conditions(args.engine)[0].env(args, task.clone(), 1)?;
+        let mut env = args.conditions()[0].env(args, task.clone(), 1)?;
         check_spec(&policy, env.spec())?;
         let film = film(&policy, env.as_mut(), args.seed).map_err(input)?;
         std::fs::write(path, film).map_err(|cause| {
@@ -200,7 +215,7 @@ fn walking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<Row>, 
     let robot = TrainConfig { model: args.model.clone(), ..TrainConfig::default() }.robot()?;
     let plan = EvaluationPlan { robot: &robot, seconds: args.seconds, seed: args.seed };
     let mut rows = Vec::new();
-    for condition in conditions(args.engine) {
+    for condition in args.conditions() {
         let mut env = condition.env(args, TaskConfig::default(), args.robots as usize)?;
         let Condition { name, engine, .. } = condition;
         let bar = progress_bar(name);
@@ -218,7 +233,7 @@ fn walking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<Row>, 
 /// Evaluates the policy along each path under each condition.
 fn tracking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<TrackingRow>, Failure> {
     let mut rows = Vec::new();
-    for condition in conditions(args.engine) {
+    for condition in args.conditions() {
         let Condition { name, engine, .. } = condition;
         let bar = progress_bar(name);
         // The drift without motion capture is shown once an engine.
@@ -267,7 +282,7 @@ fn jumping(args: &Args, policy: &Policy, trained: &JumpConfig, signals: &Signals
     let tasks = evaluate_jump::tasks(trained);
     let mut rows = Vec::new();
     // A jump is over before the first push.
-    for condition in conditions(args.engine).into_iter().filter(|condition| condition.name != "pushes") {
+    for condition in args.conditions().into_iter().filter(|condition| condition.name != "pushes") {
         let Condition { name, engine, .. } = condition;
         let bar = progress_bar(name);
         let mut targets = Vec::new();

@@ -5,10 +5,13 @@ use std::time::{Duration, Instant};
 
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
+use serde::{Deserialize, Serialize};
 use twinstep_ensemble::{
     Calibration, Checkpoint, Coverage, DataSet, Ensemble, EnsembleError, Epoch, JointEncoding, Training, TrainingEvent,
     TrainingOptions, TrainingResult as Ended,
 };
+
+use twinstep_logs::Log;
 
 use crate::cross_evaluation;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
@@ -44,64 +47,79 @@ const SIZE: (u32, u32) = (900, 600);
 pub struct Args {
     /// Measured logs: data files, or folders that contain one.
     #[arg(required = true)]
-    logs: Vec<PathBuf>,
+    pub logs: Vec<PathBuf>,
     /// Number of members of the ensemble.
     #[arg(long, value_name = "N", default_value_t = TrainingOptions::default().members)]
-    members: usize,
+    pub members: usize,
     /// Number of hidden units of each member's LSTM.
     #[arg(long, value_name = "N", default_value_t = TrainingOptions::default().hidden)]
-    hidden: usize,
+    pub hidden: usize,
     /// Encoding of the joint in the input: none, as in U2E (pooled), the joint type (kind), or the joint (identity).
     #[arg(long, value_name = "WHAT", value_enum, default_value_t = JointEncodingArg::Pooled)]
-    joint_input: JointEncodingArg,
+    pub joint_input: JointEncodingArg,
     /// Maximum number of epochs. Most trainings end earlier, by early stopping on the validation split.
     #[arg(long, value_name = "N", default_value_t = TrainingOptions::default().epochs)]
-    epochs: usize,
+    pub epochs: usize,
     /// Seed of the initial weights and of the order of the data.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
-    seed: u64,
+    pub seed: u64,
     /// Smooth the training split with a cubic spline, as U2E does. The spline halves the amplitude at this frequency
     /// [Hz]. The validation and test splits stay as measured.
     #[arg(long, value_name = "HZ")]
-    smooth: Option<f64>,
+    pub smooth: Option<f64>,
+    /// Start with the weights of this ensemble, trained on earlier data with the same settings, instead of random ones.
+    #[arg(long, value_name = "FILE", conflicts_with = "cross")]
+    pub from: Option<PathBuf>,
     /// Train on the best available GPU (builds with `--features gpu`). Results differ from the CPU's by rounding.
     #[arg(long)]
-    gpu: bool,
+    pub gpu: bool,
     /// Continue the interrupted training in OUT.training.
     #[arg(long)]
-    resume: bool,
+    pub resume: bool,
     /// Write a plot of the learning curves.
     #[arg(long, value_name = "FILE.svg", conflicts_with = "cross")]
-    plot: Option<PathBuf>,
+    pub plot: Option<PathBuf>,
     /// Train one ensemble per log, and evaluate each of them on every log.
     #[arg(long)]
-    cross: bool,
+    pub cross: bool,
     /// File to write (safetensors); with --cross, folder to write.
     #[arg(long, value_name = "FILE")]
-    out: PathBuf,
+    pub out: PathBuf,
 }
 
 /// [`JointEncoding`] as a value of the command line.
-#[derive(Clone, Copy, ValueEnum)]
-enum JointEncodingArg {
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum JointEncodingArg {
+    /// The joint is not an input.
     Pooled,
+    /// The joint type.
     Kind,
+    /// The joint.
     Identity,
 }
 
 /// Trains, evaluates and writes the ensemble.
 pub fn run(args: &Args) -> CommandResult {
-    let mut logs = Vec::new();
-    for path in &args.logs {
-        logs.push((path.display().to_string(), open_log(path)?));
+    let signals = Signals::listen()?;
+    let result = if args.cross {
+        let train = |stage: &DataSet, out: &Path| train_or_load(stage, args, out, &signals);
+        args.open_logs().and_then(|logs| cross_evaluation::run(&logs, args.smooth, &args.out, train))
+    } else {
+        write_ensemble(args, &signals)
+    };
+    if matches!(result, Err(Failure::Interrupted)) {
+        println!("interrupted; the same command with --resume continues");
     }
-    let data = DataSet::smoothed(&logs, args.smooth).map_err(input)?;
-    if args.cross {
-        return cross_evaluation::run(&logs, args.smooth, &args.out, |stage, out| train_or_load(stage, args, out));
-    }
+    result
+}
+
+/// Trains and evaluates one ensemble of all logs, and writes it.
+pub fn write_ensemble(args: &Args, signals: &Signals) -> CommandResult {
+    let data = DataSet::smoothed(&args.open_logs()?, args.smooth).map_err(input)?;
     args.plot.as_deref().map_or(Ok(()), chart::check_writable).map_err(input)?;
     let resume = if args.resume { Some(Checkpoint::read(&training_file(&args.out)).map_err(input)?) } else { None };
-    let (ensemble, curves) = train_and_save(&data, args, &args.out, resume)?;
+    let (ensemble, curves) = train_and_save(&data, args, &args.out, (resume, signals))?;
     if let Some(path) = &args.plot {
         chart::write(&curves_svg(&curves).map_err(other)?, path).map_err(other)?;
     }
@@ -117,16 +135,19 @@ fn train_and_save(
     data: &DataSet,
     args: &Args,
     out: &Path,
-    resume: Option<Checkpoint>,
+    (resume, signals): (Option<Checkpoint>, &Signals),
 ) -> Result<(Ensemble, Vec<Vec<Epoch>>), Failure> {
     let mut training = Training::new(data, args.options()).map_err(input)?;
+    if let Some(path) = &args.from {
+        training.warm_start(&Ensemble::read(path).map_err(input)?).map_err(input)?;
+    }
     if args.gpu {
         println!("training on {}", training.on_gpu().map_err(input)?);
     }
     // Checked before the training, so that its result cannot be lost.
     check_writable(out).map_err(input)?;
     let saved = training_file(out);
-    match train(&training, args, &saved, resume)? {
+    match train(&training, args, &saved, (resume, signals))? {
         Ended::Trained(ensemble, curves) => {
             ensemble.write(out).map_err(other)?;
             if saved.exists() {
@@ -136,14 +157,13 @@ fn train_and_save(
         }
         Ended::Interrupted(checkpoint) => {
             checkpoint.write(&saved).map_err(other)?;
-            println!("interrupted; the same command with --resume continues");
             Err(Failure::Interrupted)
         }
     }
 }
 
 /// Returns the ensemble of a stage. With --resume, reads a finished one and continues an interrupted one.
-fn train_or_load(stage: &DataSet, args: &Args, out: &Path) -> Result<Ensemble, Failure> {
+fn train_or_load(stage: &DataSet, args: &Args, out: &Path, signals: &Signals) -> Result<Ensemble, Failure> {
     let saved: PathBuf = training_file(out);
     if args.resume && out.exists() && !saved.exists() {
         let ensemble = Ensemble::read(out).map_err(input)?;
@@ -152,10 +172,39 @@ fn train_or_load(stage: &DataSet, args: &Args, out: &Path) -> Result<Ensemble, F
         }
     }
     let resume = (args.resume && saved.exists()).then(|| Checkpoint::read(&saved)).transpose().map_err(input)?;
-    Ok(train_and_save(stage, args, out, resume)?.0)
+    Ok(train_and_save(stage, args, out, (resume, signals))?.0)
 }
 
 impl Args {
+    /// Returns the arguments of a training with default settings from `logs`, which writes the file `out`.
+    pub fn new(logs: Vec<PathBuf>, out: PathBuf) -> Self {
+        let TrainingOptions { members, hidden, epochs, seed, .. } = TrainingOptions::default();
+        Self {
+            logs,
+            members,
+            hidden,
+            joint_input: JointEncodingArg::Pooled,
+            epochs,
+            seed,
+            smooth: None,
+            from: None,
+            gpu: false,
+            resume: false,
+            plot: None,
+            cross: false,
+            out,
+        }
+    }
+
+    /// Continues the training that was interrupted, if there is one.
+    pub fn resumed_if_interrupted(self) -> Self {
+        Self { resume: training_file(&self.out).exists(), ..self }
+    }
+
+    fn open_logs(&self) -> Result<Vec<(String, Log)>, Failure> {
+        self.logs.iter().map(|path| Ok((path.display().to_string(), open_log(path)?))).collect()
+    }
+
     fn options(&self) -> TrainingOptions {
         let joint_input = match self.joint_input {
             JointEncodingArg::Pooled => JointEncoding::Pooled,
@@ -188,8 +237,12 @@ fn check_writable(out: &Path) -> Result<(), EnsembleError> {
     removed.map_err(|cause| EnsembleError::File { verb: "write", path: out.to_owned(), cause })
 }
 
-fn train(training: &Training, args: &Args, saved: &Path, resume: Option<Checkpoint>) -> Result<Ended, Failure> {
-    let signals = Signals::listen()?;
+fn train(
+    training: &Training,
+    args: &Args,
+    saved: &Path,
+    (resume, signals): (Option<Checkpoint>, &Signals),
+) -> Result<Ended, Failure> {
     let an_epoch = training.sequences_an_epoch();
     let done_before: usize = resume.iter().flat_map(Checkpoint::curves).map(|curve| curve.len() * an_epoch).sum();
     let bar = progress_bar(args.members * args.epochs * an_epoch);

@@ -40,12 +40,17 @@ mod serve;
 mod spi_active;
 mod spi_active_config;
 mod spi_active_report;
+mod stage_files;
 mod status_line;
 mod train;
 mod train_config;
 mod train_endpoints;
 mod train_evaluation;
 mod train_log;
+mod u2e;
+mod u2e_config;
+mod u2e_evaluation;
+mod u2e_report;
 mod velocity_input;
 mod view;
 mod view_endpoint;
@@ -87,6 +92,8 @@ enum CliCommand {
     Serve(serve::Args),
     SpiActive(spi_active::Args),
     Train(train::Args),
+    #[command(name = "u2e")]
+    U2e(u2e::Args),
     View(view::Args),
 }
 
@@ -94,7 +101,7 @@ fn main() -> std::process::ExitCode {
     let command = Cli::parse().command;
     let log = match &command {
         // Their errors have the reason; Zenoh would write two lines for each attempt to connect.
-        CliCommand::List(_) | CliCommand::Run(_) | CliCommand::SpiActive(_) => "warn,zenoh=off",
+        CliCommand::List(_) | CliCommand::Run(_) | CliCommand::SpiActive(_) | CliCommand::U2e(_) => "warn,zenoh=off",
         _ => "warn,zenoh::api::session=error,rustdds=off,twinstep=info",
     };
     tracing_subscriber::fmt()
@@ -123,6 +130,7 @@ fn main() -> std::process::ExitCode {
         CliCommand::Serve(args) => serve::run(&args),
         CliCommand::SpiActive(args) => spi_active::run(&args),
         CliCommand::Train(args) => train::run(&args),
+        CliCommand::U2e(args) => u2e::run(&args),
         CliCommand::View(args) => view::run(&args),
     });
     exit::code(result)

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use twinstep_agent::{BoundPolicy, Control, LoadedPolicy, RunPlan, Status, run};
+use twinstep_agent::{BoundPolicy, Control, LoadedPolicy, Recorders, RunPlan, Status, run};
 use twinstep_env_server::EnvFactory;
 use twinstep_model::{AutoresetMode, VecEnv};
 use twinstep_robot::{RobotHandle, State};
@@ -36,14 +36,14 @@ impl OnboardPolicy {
 }
 
 fn run_when_ready(mut env: Box<dyn VecEnv>, mut policy: BoundPolicy, handle: &RobotHandle) {
-    let plan = RunPlan { seconds: None, real_time: false, seed: 0 };
+    let plan = RunPlan { seconds: None, real_time: false, action_noise: 0.0, seed: 0 };
     while !handle.is_ending() {
         if handle.wait_until(PATIENCE, |board| board.state == Some(State::Ready)).state != Some(State::Ready) {
             continue;
         }
         let mut control =
             |_: &Status, _: &dyn VecEnv| if handle.is_ending() { Control::End } else { Control::Step(None) };
-        if let Err(error) = run(&mut *env, &mut policy, None, plan, &mut control) {
+        if let Err(error) = run(&mut *env, &mut policy, Recorders::default(), plan, &mut control) {
             tracing::warn!("the policy stopped: {error}");
         }
     }

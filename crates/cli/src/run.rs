@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use twinstep_agent::{
-    AgentError, BoundPolicy, Control, LoadedPolicy, Recorder, RunPlan, RunSummary, Status, run as run_policy,
+    AgentError, BoundPolicy, Control, JointRecorder, LoadedPolicy, Recorder, Recorders, RunPlan, RunSummary, Status,
+    run as run_policy,
 };
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_excite::CommandSequence;
@@ -51,6 +52,9 @@ pub struct Args {
     /// Folder of the log, which must not exist or be empty. Default: no log.
     #[arg(long, value_name = "DIR")]
     pub log: Option<PathBuf>,
+    /// Record the log at the rate of the actuators (200 Hz) and with the measured torques, as `twinstep fit` needs it.
+    #[arg(long, requires = "log")]
+    pub torque: bool,
     /// Constant velocity command: forward [m/s], left [m/s], yaw rate [rad/s]. Default: the endpoint's own commands.
     #[arg(long, value_name = "VX,VY,WZ", value_parser = velocity, allow_hyphen_values = true)]
     pub velocity: Option<[f32; 3]>,
@@ -67,6 +71,10 @@ pub struct Args {
     /// Time after which the run ends [s]. Default: when it is ended.
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     pub seconds: Option<f64>,
+    /// Add Gaussian noise of this standard deviation to every action, in units of `action_scale`: random excitation of the
+    /// joints.
+    #[arg(long, value_name = "STD", default_value_t = 0.0)]
+    pub action_noise: f64,
     /// Step as fast as the endpoint answers. Default: in real time.
     #[arg(long)]
     pub fast: bool,
@@ -126,6 +134,10 @@ pub fn record(args: &Args, signals: &Signals) -> Result<Recording, Failure> {
     if let Some(seconds) = args.seconds.filter(|seconds| !(seconds.is_finite() && *seconds > 0.0)) {
         return Err(Failure::Input(miette::miette!("`--seconds` = {seconds} is not allowed: it must be positive")));
     }
+    if !(0.0..=1.0).contains(&args.action_noise) {
+        let noise = args.action_noise;
+        return Err(Failure::Input(miette::miette!("`--action-noise` = {noise} is not allowed: 0 to 1")));
+    }
     // Read and checked before anything moves.
     args.view.check()?;
     let commands = args.commands.as_deref().map(read_commands).transpose()?;
@@ -135,18 +147,20 @@ pub fn record(args: &Args, signals: &Signals) -> Result<Recording, Failure> {
     if let Some(velocity) = args.velocity {
         env.set_velocity_commands(&[velocity]).map_err(input)?;
     }
-    let mut recorder = args.recorder(&mut env, signals)?;
+    let (mut recorder, mut joints) = args.recorders(&mut env, signals)?;
     let velocity = args.velocity_source(commands)?;
-    if args.view.is_wanted() && recorder.is_none() {
+    if args.view.is_wanted() && args.log.is_none() {
         env.reset(&ResetRequest::seeded(args.seed, 1)).map_err(|error| interrupted(signals, error))?;
     }
     let view = RunView::open(&args.view, &env, matches!(velocity, Velocity::Endpoint))?;
-    let result = args.steps(&mut env, &mut policy, recorder.as_mut(), (&velocity, view.as_ref()), signals);
+    let recorders = Recorders { steps: recorder.as_mut(), joints: joints.as_mut() };
+    let result = args.steps(&mut env, &mut policy, recorders, (&velocity, view.as_ref()), signals);
     let device_failure = if let Velocity::Person(device) = &velocity { device.failure() } else { None };
     // Restores the terminal before anything is printed.
     drop(velocity);
-    if let (Some(folder), Some(recorder)) = (&args.log, &recorder) {
-        eprintln!("{} rows in {}", recorder.rows(), folder.display());
+    if let Some(folder) = &args.log {
+        let rows = recorder.map_or(0, |recorder| recorder.rows()) + joints.map_or(0, |joints| joints.rows());
+        eprintln!("{rows} rows in {}", folder.display());
     }
     let summary = result.map_err(|error| interrupted(signals, error))?;
     // Its error is of no interest any more: the run is complete.
@@ -176,8 +190,13 @@ impl Args {
         }
     }
 
-    fn recorder(&self, env: &mut RemoteVecEnv, signals: &Signals) -> Result<Option<Recorder>, Failure> {
-        let Some(folder) = &self.log else { return Ok(None) };
+    /// Creates the log, if there is to be one.
+    fn recorders(
+        &self,
+        env: &mut RemoteVecEnv,
+        signals: &Signals,
+    ) -> Result<(Option<Recorder>, Option<JointRecorder>), Failure> {
+        let Some(folder) = &self.log else { return Ok((None, None)) };
         env.reset(&ResetRequest::seeded(self.seed, 1)).map_err(|error| interrupted(signals, error))?;
         let has_scene = match env.scene(0) {
             Ok(_) => true,
@@ -188,7 +207,12 @@ impl Args {
         };
         let (policy, spec) = (self.policy.display(), env.spec());
         let source = format!("twinstep run {policy} on `{}`, task `{}`, at {}", spec.robot, spec.task, self.endpoint);
-        Recorder::create(folder, spec, has_scene, &source).map(Some).map_err(input)
+        if self.torque {
+            // A simulator alone gives what no sensor measures.
+            let has_base = spec.critic_field("true_linear_velocity").is_some() && !env.is_real_time();
+            return Ok((None, Some(JointRecorder::create(folder, env, has_base, &source).map_err(input)?)));
+        }
+        Ok((Some(Recorder::create(folder, spec, has_scene, &source).map_err(input)?), None))
     }
 
     fn velocity_source(&self, commands: Option<CommandSequence>) -> Result<Velocity, Failure> {
@@ -207,14 +231,14 @@ impl Args {
         &self,
         env: &mut RemoteVecEnv,
         policy: &mut BoundPolicy,
-        recorder: Option<&mut Recorder>,
+        recorders: Recorders,
         (velocity, view): (&Velocity, Option<&RunView>),
         signals: &Signals,
     ) -> Result<RunSummary, AgentError> {
         let (mut line, mut falls) = (StatusLine::new(), 0);
         // A robot sets the pace itself.
         let real_time = !self.fast && !env.is_real_time();
-        let plan = RunPlan { seconds: self.seconds, real_time, seed: self.seed };
+        let plan = RunPlan { seconds: self.seconds, real_time, action_noise: self.action_noise, seed: self.seed };
         let mut control = |status: &Status, env: &dyn VecEnv| {
             if status.falls > falls {
                 falls = status.falls;
@@ -235,7 +259,7 @@ impl Args {
                 }
             }
         };
-        let result = run_policy(env, policy, recorder, plan, &mut control);
+        let result = run_policy(env, policy, recorders, plan, &mut control);
         line.clear();
         result
     }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::exit::{CommandResult, Failure, Signals, other};
 use crate::spi_active_config::{Method, SpiActiveConfig};
 use crate::spi_active_report::{self, RobotTime, StageResult};
-use crate::{excite, identify, random_commands, run};
+use crate::{excite, identify, run};
 
 /// Identify a robot with the two stages of SPI-Active: ordinary commands first, then designed ones.
 ///
@@ -79,7 +79,7 @@ fn stages(config: &SpiActiveConfig, out: &Path, signals: &Signals) -> CommandRes
                 let folder = path.parent().expect("a folder");
                 excite::write_design(&config.excitation(criterion, model.as_deref(), seed, folder), signals)
             }
-            None => random_commands::write(config, model.as_deref(), seed, path, signals),
+            None => config.random_commands(model.as_deref(), seed).write(path, signals),
         })?;
         let robot_time = stage.collect(config, signals)?;
         logs.push(stage.log());
@@ -89,9 +89,8 @@ fn stages(config: &SpiActiveConfig, out: &Path, signals: &Signals) -> CommandRes
     }
     let held_out = Stage::new(out, "held-out")?;
     eprintln!("\n{}: commands, log", held_out.folder.display());
-    held_out.commands(|path| {
-        random_commands::write(config, config.model.as_deref(), config.seed + HELD_OUT_SEED, path, signals)
-    })?;
+    let commands = config.random_commands(config.model.as_deref(), config.seed + HELD_OUT_SEED);
+    held_out.commands(|path| commands.write(path, signals))?;
     let robot_time = held_out.collect(config, signals)?;
     let report = spi_active_report::report(config, &results, &held_out.log(), robot_time)?;
     write(&out.join("report.md"), &report)?;

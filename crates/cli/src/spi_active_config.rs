@@ -8,6 +8,7 @@ use twinstep_identify::{EffectAtScope, free_parameters};
 use twinstep_policy::Policy;
 
 use crate::exit::{Failure, input};
+use crate::random_commands::RandomCommands;
 use crate::robot_file::analytic_model;
 use crate::web_view::ViewArgs;
 use crate::{excite, identify, run};
@@ -200,6 +201,12 @@ impl SpiActiveConfig {
         }
     }
 
+    /// Returns random commands for a log.
+    pub fn random_commands<'a>(&'a self, model: Option<&'a Path>, seed: u64) -> RandomCommands<'a> {
+        let (policy, seconds, segment_s) = (&self.policy, self.seconds, self.segment_s);
+        RandomCommands { policy, model, seconds, segment_s, limits: self.limits(), seed }
+    }
+
     /// Returns the arguments of `twinstep run`, which follows the commands in a file and records the folder `log`.
     pub fn recording(&self, commands: &Path, log: &Path) -> run::Args {
         run::Args {
@@ -209,11 +216,13 @@ impl SpiActiveConfig {
             robot: self.robot.clone(),
             zenoh: self.zenoh.clone(),
             log: Some(log.to_owned()),
+            torque: false,
             velocity: None,
             commands: Some(commands.to_owned()),
             keyboard: false,
             gamepad: None,
             seconds: Some(self.seconds),
+            action_noise: 0.0,
             fast: self.fast,
             seed: self.seed,
             json: false,

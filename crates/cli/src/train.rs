@@ -75,8 +75,9 @@ pub struct Args {
     /// Policy of `walk` to whose actions the task `explore` adds a residual. With --endpoint: that of the servers.
     #[arg(long, value_name = "FILE")]
     base: Option<PathBuf>,
-    /// Start with the networks of this checkpoint.safetensors of another training: fine-tuning. Task and gains must be
-    /// the same; robot, rewards and randomisation may differ.
+    /// Start with the networks of this checkpoint.safetensors of another training, or with the actor of this
+    /// policy.safetensors and an untrained critic: fine-tuning. Task and gains must be the same; robot, rewards and
+    /// randomisation may differ.
     #[arg(long, value_name = "FILE", conflicts_with = "resume")]
     from: Option<PathBuf>,
     /// Continue the training in the folder with its settings and seed.
@@ -93,6 +94,17 @@ pub struct Args {
 pub fn run(args: &Args) -> CommandResult {
     let start = Instant::now();
     let signals = Signals::listen()?;
+    train_policy(args, &signals, start)?.report(args, &signals, start)
+}
+
+/// Trains all steps, without an evaluation, and writes the policy. Fails with [`Failure::Interrupted`] if a signal ended it.
+pub fn write_policy(args: &Args, signals: &Signals) -> CommandResult {
+    let session = train_policy(args, signals, Instant::now())?;
+    let is_complete = session.trainer.learner().env_steps >= session.config.train.total_steps;
+    if is_complete { Ok(()) } else { Err(Failure::Interrupted) }
+}
+
+fn train_policy(args: &Args, signals: &Signals, start: Instant) -> Result<TrainSession, Failure> {
     args.check()?;
     let checkpoint = args.resume.then(|| Checkpoint::read(args.checkpoint())).transpose().map_err(input)?;
     let mut config = match &checkpoint {
@@ -104,10 +116,10 @@ pub fn run(args: &Args) -> CommandResult {
     let text = toml::to_string(&config).expect("settings are plain data");
     std::fs::write(args.out.join("config.toml"), &text).map_err(|cause| folder_error(&args.out, cause))?;
     let mut session = TrainSession::new(args, config, text, checkpoint)?;
-    let ended = session.train(&signals, start);
+    let ended = session.train(signals, start);
     session.save()?;
     match ended {
-        Ok(()) => session.report(args, &signals, start),
+        Ok(()) => Ok(session),
         Err(Failure::Interrupted) => {
             eprintln!("interrupted; continue with: twinstep train --out {} --resume", args.out.display());
             Err(Failure::Interrupted)
@@ -143,6 +155,14 @@ impl Args {
             resume: false,
             json: false,
         }
+    }
+
+    /// Returns the arguments of a training with the settings of a config file, or of its continuation if it was
+    /// interrupted.
+    pub fn with_config(out: PathBuf, config: PathBuf, seed: u64) -> Self {
+        let args =
+            Self { task: None, steps: None, config: Some(config), ..Self::new(out, seed, 0, ViewArgs::default()) };
+        if args.checkpoint().exists() { Self { config: None, resume: true, ..args } } else { args }
     }
 
     /// Returns the path of the policy that the training writes.
@@ -280,7 +300,9 @@ impl TrainSession {
         let resumed_at = checkpoint.as_ref().map(|checkpoint| checkpoint.learner.env_steps);
         let (learner, curve) = match (checkpoint, &args.from) {
             (Some(checkpoint), _) => (Some(checkpoint.learner), checkpoint.curve),
-            (None, Some(path)) => (Some(earlier_networks(path, collectors[0].spec(), &config.train)?), Vec::new()),
+            (None, Some(path)) => {
+                (Some(earlier_networks(path, collectors[0].spec(), &config.train, seed)?), Vec::new())
+            }
             (None, None) => (None, Vec::new()),
         };
         let trainer = Trainer::new(config.train.clone(), collectors, learner, seed).map_err(input)?;
@@ -390,12 +412,20 @@ fn check_task(of_servers: &str, named: &str) -> CommandResult {
     )))
 }
 
-/// Returns the networks of another training's checkpoint, for environments of this spec.
-fn earlier_networks(path: &Path, spec: &EnvSpec, config: &PpoConfig) -> Result<Learner, Failure> {
-    let Checkpoint { learner, spec: earlier, .. } = Checkpoint::read(path).map_err(input)?;
+/// Returns the networks of another training's checkpoint, or the actor of a policy, for environments of this spec.
+fn earlier_networks(path: &Path, spec: &EnvSpec, config: &PpoConfig, seed: u64) -> Result<Learner, Failure> {
+    let (learner, earlier) = match Policy::read(path) {
+        Ok((policy, _)) if policy.spec.hash() == spec.hash() => {
+            (Learner::from_policy(&policy, config, spec, seed), policy.spec)
+        }
+        Ok((policy, _)) => return Err(other_spec(&policy.spec, spec)),
+        Err(_) => {
+            let Checkpoint { learner, spec: earlier, .. } = Checkpoint::read(path).map_err(input)?;
+            (learner, earlier)
+        }
+    };
     if earlier.hash() != spec.hash() {
-        let (policy, env) = (earlier.hash(), spec.hash());
-        return Err(input(EvaluationError::OtherSpec { policy, env }));
+        return Err(other_spec(&earlier, spec));
     }
     let hidden = |network: &Mlp| network.sizes()[1..network.sizes().len() - 1].to_vec();
     let (actor, critic) = (hidden(&learner.actor), hidden(&learner.critic));
@@ -409,6 +439,10 @@ fn earlier_networks(path: &Path, spec: &EnvSpec, config: &PpoConfig) -> Result<L
         )));
     }
     Ok(learner.fine_tuned(config))
+}
+
+fn other_spec(earlier: &EnvSpec, spec: &EnvSpec) -> Failure {
+    input(EvaluationError::OtherSpec { policy: earlier.hash(), env: spec.hash() })
 }
 
 fn progress_text(point: &CurvePoint) -> String {

@@ -2,7 +2,7 @@
 
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
-use twinstep_model::{EnvSpec, Stream};
+use twinstep_model::{EnvSpec, RobotSample, Stream};
 
 use crate::config::{ConfigError, check_value};
 
@@ -20,6 +20,8 @@ pub struct ObservationNoise {
     pub joint_position_rad: f32,
     /// Error of the joint velocities [rad/s].
     pub joint_velocity_rad_s: f32,
+    /// Error of the measured torques [N·m]. They are in the samples of actuator periods, not in the observation.
+    pub joint_torque_nm: f32,
 }
 
 impl ObservationNoise {
@@ -28,7 +30,21 @@ impl ObservationNoise {
         check_value("randomise.noise.angular_velocity_rad_s", self.angular_velocity_rad_s, 0.0, 10.0)?;
         check_value("randomise.noise.gravity", self.gravity, 0.0, 1.0)?;
         check_value("randomise.noise.joint_position_rad", self.joint_position_rad, 0.0, 1.0)?;
-        check_value("randomise.noise.joint_velocity_rad_s", self.joint_velocity_rad_s, 0.0, 50.0)
+        check_value("randomise.noise.joint_velocity_rad_s", self.joint_velocity_rad_s, 0.0, 50.0)?;
+        check_value("randomise.noise.joint_torque_nm", self.joint_torque_nm, 0.0, 10.0)
+    }
+
+    /// Adds noise to the readings of a sample.
+    pub fn disturb(&self, sample: &mut RobotSample, random: &mut Stream) {
+        let readings = [
+            (&mut sample.q[..], self.joint_position_rad),
+            (&mut sample.dq[..], self.joint_velocity_rad_s),
+            (&mut sample.tau[..], self.joint_torque_nm),
+            (&mut sample.gyro[..], self.angular_velocity_rad_s),
+        ];
+        for (values, limit) in readings.into_iter().filter(|(_, limit)| *limit > 0.0) {
+            values.iter_mut().for_each(|value| *value += limit * (2.0 * random.random::<f32>() - 1.0));
+        }
     }
 
     /// Returns the entries of the observation that have noise, and the limits of their errors.
@@ -84,6 +100,7 @@ mod tests {
             gravity: 0.05,
             joint_position_rad: 0.01,
             joint_velocity_rad_s: 1.5,
+            joint_torque_nm: 0.3,
         };
         let entries = noise.entries(&base_spec("walk", &go2(), Vec::new(), 20.0));
         let mut random = stream(0, "test", 0);
@@ -103,6 +120,22 @@ mod tests {
         for (index, largest) in largest.into_iter().enumerate() {
             assert!((0.95 * limit(index)..=limit(index)).contains(&largest), "{index}: {largest}");
         }
+    }
+
+    #[test]
+    fn readings_of_a_sample_have_noise_and_commands_do_not() {
+        let noise = ObservationNoise { joint_torque_nm: 0.3, joint_position_rad: 0.01, ..ObservationNoise::default() };
+        let mut random = stream(0, "test", 0);
+        let mut largest = [0.0_f32; 3];
+        for _ in 0..100 {
+            let mut sample = RobotSample::default();
+            noise.disturb(&mut sample, &mut random);
+            assert_eq!((sample.q_cmd, sample.dq, sample.gyro), Default::default());
+            for (largest, values) in largest.iter_mut().zip([sample.q, sample.tau]) {
+                *largest = values.iter().fold(*largest, |largest, value| largest.max(value.abs()));
+            }
+        }
+        assert!((0.0095..=0.01).contains(&largest[0]) && (0.29..=0.3).contains(&largest[1]), "{largest:?}");
     }
 
     #[test]

@@ -4,7 +4,7 @@ use glam::Vec3;
 use twinstep_effects::RobotSampler;
 use twinstep_model::{
     AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, Ground, InitialState, Pose,
-    RealTimeReport, ResetCause, ResetRequest, Scene, StepBatch, VecEnv, frames,
+    RealTimeReport, ResetCause, ResetRequest, RobotSample, Scene, StepBatch, Stream, VecEnv, frames, stream,
 };
 
 use crate::episode::{Episode, StepOutcome};
@@ -50,6 +50,10 @@ pub struct TaskEnv<B: Backend, T: Task> {
     batch: StepBatch,
     /// Weighted reward terms of one step.
     terms: Vec<f32>,
+    /// Samples of each environment in the last step; `None` until somebody asks for them.
+    samples: Option<Vec<Vec<RobotSample>>>,
+    /// Random numbers of the noise of samples. Those of the episodes do not depend on sampling.
+    sample_noise: Stream,
 }
 
 impl<B: Backend, T: Task> TaskEnv<B, T> {
@@ -77,6 +81,8 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             next_velocity_commands: None,
             batch: StepBatch::new(num_envs, &spec),
             terms: vec![0.0; spec.reward_terms.len()],
+            samples: None,
+            sample_noise: stream(seed, "noise of samples", 0),
             spec,
             task,
             backend,
@@ -128,6 +134,49 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             self.observe(*env);
         }
         Ok(())
+    }
+
+    /// Removes the samples before a reset.
+    fn clear_samples(&mut self, envs: &[usize]) {
+        if let Some(samples) = &mut self.samples {
+            envs.iter().for_each(|env| samples[*env].clear());
+            let _ = self.backend.take_samples();
+        }
+    }
+
+    /// Advances the active robots by a policy period, and samples them if somebody has asked for it.
+    fn advance(&mut self) -> Result<(), BackendError> {
+        let Self { backend, commands, active, samples, randomise, sample_noise, .. } = self;
+        let decimation = backend.robot().control.decimation;
+        let Some(samples) = samples else { return backend.step(commands, active, decimation) };
+        samples.iter_mut().for_each(Vec::clear);
+        if backend.real_time().is_some() {
+            backend.step(commands, active, decimation)?;
+            samples[0] = backend.take_samples().unwrap_or_default();
+            return Ok(());
+        }
+        let (mut active, mut diverged) = (active.clone(), Vec::new());
+        for _ in 0..decimation {
+            let sampled: Vec<usize> = (0..active.len()).filter(|env| active[*env]).collect();
+            for env in &sampled {
+                let (measured, truth) = (backend.measured(), backend.ground_truth());
+                samples[*env].push(RobotSample::before(measured, truth, *env, &commands[*env]));
+            }
+            match backend.step(commands, &active, 1) {
+                Err(BackendError::Diverged { robots }) => {
+                    robots.iter().for_each(|(env, _)| active[*env] = false);
+                    diverged.extend(robots);
+                }
+                stepped => stepped?,
+            }
+            for env in sampled {
+                if let Some(sample) = samples[env].last_mut() {
+                    sample.tau = backend.measured().tau[env];
+                    randomise.noise.disturb(sample, sample_noise);
+                }
+            }
+        }
+        if diverged.is_empty() { Ok(()) } else { Err(BackendError::Diverged { robots: diverged }) }
     }
 
     /// Takes the velocity command of the operator, unless the agent has its own, and the action that a robot in real
@@ -274,6 +323,7 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
                 self.episodes[*env].seed(&self.task, seeds[*env]);
             }
         }
+        self.clear_samples(&envs);
         self.start_episodes(&envs, ResetCause::Request)?;
         Ok(&self.batch.obs)
     }
@@ -308,8 +358,7 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
         }
         self.prepare(actions)?;
         self.push()?;
-        let decimation = self.backend.robot().control.decimation;
-        let diverged = match self.backend.step(&self.commands, &self.active, decimation) {
+        let diverged = match self.advance() {
             Ok(()) => Vec::new(),
             // The other robots were stepped.
             Err(BackendError::Diverged { robots }) => robots,
@@ -357,6 +406,12 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
             foot_force: robot.truth.map(|truth| truth.foot_force[env]),
             ..scene
         })
+    }
+
+    fn samples(&mut self, env: usize) -> Result<Vec<RobotSample>, EnvError> {
+        let num_envs = self.num_envs();
+        let samples = self.samples.get_or_insert_with(|| vec![Vec::new(); num_envs]);
+        samples.get(env).cloned().ok_or(EnvError::EnvOutOfRange { env, num_envs })
     }
 
     fn push(&mut self, env: usize, velocity: [f32; 3]) -> Result<(), EnvError> {

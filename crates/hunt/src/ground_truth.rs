@@ -8,12 +8,11 @@ use twinstep_effects::apply_effects;
 use twinstep_identify::{RecordError, Sensor, apply_sensors, record};
 use twinstep_logs::{Log, LogError, TorqueSensor};
 use twinstep_model::{BaseMount, Joint, RobotModel, Simulator, go2};
-use twinstep_sim::{BackendBuildError, Engine, RapierBackend, SimConfig};
+use twinstep_sim::{BackendBuildError, Engine, MujocoPlant, RapierBackend, SimConfig};
 
 use crate::Plant;
 use crate::draw::Case;
 use crate::motion::{RATE_HZ, motion};
-use crate::mujoco_plant::MujocoPlant;
 use crate::unmodelled::PerturbedBackend;
 
 /// Physics rate of the ground truth [Hz]; that of the model is 1000.
@@ -42,7 +41,7 @@ pub fn log_of(case: &Case, plant: Plant, progress: &mut dyn FnMut(usize) -> bool
         }),
         Plant::Mujoco => played(&motion, &robot, progress, |base, robot| {
             let config = SimConfig { base, threads: 1, ..SimConfig::default() };
-            Ok(PerturbedBackend::new(MujocoPlant::new(robot.clone(), config)?, case.outside))
+            Ok(PerturbedBackend::new(MujocoPlant::new(robot.clone(), config, 1)?, case.outside))
         }),
     }?;
     let random = &mut case.stream("hunt sensors");

@@ -5,8 +5,6 @@ mod draw;
 mod ground_truth;
 mod mismatch;
 mod motion;
-mod mujoco_plant;
-mod plant_actuator;
 mod runner;
 mod score;
 mod table;
@@ -25,7 +23,6 @@ use twinstep_sim::{BatchRollout, SimConfig};
 
 use draw::{Case, CaseKind, LogSetup};
 use mismatch::Mismatch;
-pub use mujoco_plant::MujocoPlant;
 use runner::BlindTest;
 use score::Score;
 use unmodelled::UnmodelledEffect;

@@ -26,6 +26,9 @@ const MEAN_DECAY: f32 = 0.9;
 /// Gain of the actor's last layer, so that the first actions are close to the default pose.
 const ACTOR_OUTPUT_GAIN: f32 = 0.01;
 
+/// Number of observations for which the moments of a policy's normaliser count when another training starts with it.
+const POLICY_MOMENTS_COUNT: f64 = 1e5;
+
 /// Time without any robot after which the training ends.
 const MAX_ENV_LOSS: Duration = Duration::from_mins(1);
 /// Pause before the next attempt to reach a robot.
@@ -80,6 +83,20 @@ impl Learner {
             iteration: 0,
             env_steps: 0,
         }
+    }
+
+    /// Creates a learner whose actor is that of a policy for the same observations and actions. The critic is untrained.
+    pub fn from_policy(policy: &Policy, config: &PpoConfig, spec: &EnvSpec, seed: u64) -> Self {
+        let untrained = Self::new(config, spec, seed);
+        let Policy { actor, log_std, .. } = policy.clone();
+        let (mean, std) = policy.normaliser.mean_and_std();
+        // Group `critic` has no moments yet: the count is so small that a few updates find them.
+        let more = feature_len(spec) - mean.len();
+        let mean = mean.iter().map(|mean| f64::from(*mean)).chain(vec![0.0; more]).collect();
+        let variance = std.iter().map(|std| f64::from(*std).powi(2)).chain(vec![1.0; more]).collect();
+        let normaliser = Normaliser::from_moments(POLICY_MOMENTS_COUNT, mean, variance);
+        let optimisers = [actor.parameters.len(), untrained.critic.parameters.len(), log_std.len()].map(Adam::new);
+        Self { mean_actor: actor.clone(), actor, log_std, normaliser, optimisers, ..untrained }
     }
 
     /// Returns the start of another training with these networks: its optimisers and counters are new.

@@ -4,7 +4,8 @@ use std::any::Any;
 use std::sync::Arc;
 
 use crate::{
-    Command, Ground, GroundTruth, InitialState, Measured, PerJoint, RealTimeReport, ResetCause, RobotModel, RobotStates,
+    Command, Ground, GroundTruth, InitialState, Measured, PerJoint, RealTimeReport, ResetCause, RobotModel,
+    RobotSample, RobotStates,
 };
 
 /// Batch of robots that are commanded and observed together: a simulator, a replayed log or the real robot.
@@ -68,6 +69,13 @@ pub trait Backend: Send {
 
     /// Returns the report after the last reset or step. `None` in a simulation, which has no real time.
     fn real_time(&self) -> Option<&RealTimeReport> {
+        None
+    }
+
+    /// Returns the samples of a robot that samples itself since the last call, one per actuator period.
+    ///
+    /// `None` in a simulation: its caller steps one period at a time and reads the states between them.
+    fn take_samples(&mut self) -> Option<Vec<RobotSample>> {
         None
     }
 

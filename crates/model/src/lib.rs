@@ -35,6 +35,7 @@ mod log_cholesky;
 mod mjcf;
 mod real_time;
 mod robot;
+mod robot_sample;
 mod robot_states;
 mod rollout;
 mod scene;
@@ -61,6 +62,7 @@ pub use robot::{
     ActuatorParams, Contact, ControlConfig, Derating, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes,
     Stribeck,
 };
+pub use robot_sample::RobotSample;
 pub use robot_states::{GroundTruth, Measured, RobotStates, RobotStatesMut};
 pub use rollout::{HistoryStep, Precision, Rollout, RolloutRequest};
 pub use scene::{Scene, SceneShape, ShapeKind};

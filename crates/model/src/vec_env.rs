@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{BackendError, EnvSpec, RealTimeReport, Scene, SpecField};
+use crate::{BackendError, EnvSpec, RealTimeReport, RobotSample, Scene, SpecField};
 
 /// Name of the part of the observation that a client may set.
 const VELOCITY_COMMAND: &str = "velocity_command";
@@ -68,6 +68,13 @@ pub trait VecEnv: Send {
     /// Returns the current scene of environment `env` for rendering.
     fn scene(&self, _env: usize) -> Result<Scene, EnvError> {
         Err(EnvError::RenderUnsupported { task: self.spec().task.clone() })
+    }
+
+    /// Returns the samples of environment `env` in the last step, one per actuator period.
+    ///
+    /// Sampling begins with the first call, which returns no sample. A reset removes the samples.
+    fn samples(&mut self, _env: usize) -> Result<Vec<RobotSample>, EnvError> {
+        Err(EnvError::SamplesUnsupported { task: self.spec().task.clone() })
     }
 }
 
@@ -261,6 +268,12 @@ pub enum EnvError {
     /// The task has no robot to render.
     #[error("the task `{task}` cannot be rendered")]
     RenderUnsupported {
+        /// The task.
+        task: String,
+    },
+    /// The environment has no samples of its actuator periods.
+    #[error("the environment of task `{task}` has no samples of its actuator periods")]
+    SamplesUnsupported {
         /// The task.
         task: String,
     },

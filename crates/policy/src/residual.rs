@@ -1,6 +1,6 @@
 //! A residual on the actions of a frozen base policy (U2E, eq. 12): its environments, and both as one policy.
 
-use twinstep_model::{EnvError, EnvSpec, RealTimeReport, ResetRequest, Scene, StepBatch, VecEnv};
+use twinstep_model::{EnvError, EnvSpec, RealTimeReport, ResetRequest, RobotSample, Scene, StepBatch, VecEnv};
 
 use crate::mlp::Mlp;
 use crate::policy::{Policy, PolicyRunner};
@@ -114,6 +114,10 @@ impl VecEnv for ResidualEnv {
 
     fn scene(&self, env: usize) -> Result<Scene, EnvError> {
         self.env.scene(env)
+    }
+
+    fn samples(&mut self, env: usize) -> Result<Vec<RobotSample>, EnvError> {
+        self.env.samples(env)
     }
 }
 

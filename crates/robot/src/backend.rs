@@ -4,11 +4,12 @@ use std::time::Duration;
 
 use twinstep_model::{
     Backend, BackendError, Command, InitialState, Measured, NUM_JOINTS, PerJoint, RealTimeReport, ResetCause,
-    RobotModel, RobotStop,
+    RobotModel, RobotSample, RobotStop,
 };
 use twinstep_unitree::Remote;
 
 use crate::input::Action;
+use crate::resampler::Resampler;
 use crate::robot_handle::{Board, RobotHandle};
 use crate::state::State;
 
@@ -31,6 +32,7 @@ pub struct RobotBackend {
     /// Policy period of the next action; `None`: that of the last observation.
     action_tick: Option<u64>,
     remote: Option<Remote>,
+    resampler: Resampler,
 }
 
 impl RobotBackend {
@@ -45,8 +47,10 @@ impl RobotBackend {
             refused: None,
             stop: None,
         };
-        let mut backend =
-            Self { handle, robot, measured: Measured::default(), report, action_tick: None, remote: None };
+        let period = Duration::from_secs_f64(robot.control.actuator_dt());
+        let resampler = Resampler::new(period, robot.control.kp as f32);
+        let measured = Measured::default();
+        let mut backend = Self { handle, robot, measured, report, action_tick: None, remote: None, resampler };
         backend.observe(&Board::default());
         backend
     }
@@ -119,6 +123,7 @@ impl Backend for RobotBackend {
 
     fn reset(&mut self, _initial_states: &[(usize, InitialState)]) -> Result<(), BackendError> {
         self.observe(&self.handle.board());
+        self.resampler.restart();
         Ok(())
     }
 
@@ -145,6 +150,10 @@ impl Backend for RobotBackend {
 
     fn real_time(&self) -> Option<&RealTimeReport> {
         Some(&self.report)
+    }
+
+    fn take_samples(&mut self) -> Option<Vec<RobotSample>> {
+        Some(self.resampler.add(self.handle.take_samples()))
     }
 
     fn set_action_tick(&mut self, tick: u64) {

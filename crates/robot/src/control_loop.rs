@@ -9,7 +9,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use twinstep_logs::RecordedTopic;
-use twinstep_model::RobotModel;
+use twinstep_model::{Command, RobotModel};
 use twinstep_unitree::{LowState, decode, encode};
 
 use crate::command::SafeCommand;
@@ -20,7 +20,7 @@ use crate::machine::SafetyMachine;
 use crate::reading::Reading;
 use crate::real_time_thread;
 use crate::recorder::Recorder;
-use crate::robot_handle::{RobotHandle, Taken};
+use crate::robot_handle::{RobotHandle, Taken, TimedSample};
 use crate::timing::Timing;
 
 /// Time after the last step at which the timer steps. States arrive every 2 ms; a step must not come just before one.
@@ -187,6 +187,10 @@ impl ControlLoop {
         };
         let output = self.machine.step(&input);
         let is_from_state = input.reading.is_some();
+        if let (Some(reading), Some(command)) = (&input.reading, &output.command) {
+            let Command { q, kp, .. } = *command.command();
+            self.handle.add_sample(|| TimedSample { at: now, reading: reading.clone(), q_cmd: q, kp: kp[0] });
+        }
         self.send(output.command, now, is_from_state);
         self.note_tick(&output, now);
         if let Some((_, action)) = action {

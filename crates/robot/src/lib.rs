@@ -82,6 +82,7 @@ pub mod preflight_loop;
 mod reading;
 pub mod real_time_thread;
 mod recorder;
+mod resampler;
 mod robot_handle;
 mod state;
 mod timing;

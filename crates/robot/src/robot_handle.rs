@@ -5,6 +5,8 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use twinstep_model::PerJoint;
+
 use crate::fault::Fault;
 use crate::input::{Action, ActionRefused, Client, OperatorRequest, Output, RequestRefused};
 use crate::reading::Reading;
@@ -20,6 +22,8 @@ struct Shared {
     inbox: Mutex<Inbox>,
     board: Mutex<Board>,
     timing: Mutex<Timing>,
+    /// Readings and commands of the last steps, oldest first; `None` until somebody asks for them.
+    samples: Mutex<Option<VecDeque<TimedSample>>>,
     /// The board has a new tick or state.
     changed: Condvar,
     stop_requested: AtomicBool,
@@ -27,6 +31,22 @@ struct Shared {
     foreign_writers: AtomicUsize,
     controller_released: AtomicBool,
     release_requested: AtomicBool,
+}
+
+/// Largest number of samples that are kept: those of 2 s.
+const MAX_SAMPLES: usize = 1000;
+
+/// Reading of a step of the loop, with the command that was sent after it.
+#[derive(Clone, Debug)]
+pub(crate) struct TimedSample {
+    /// Time of the step.
+    pub at: Duration,
+    /// The reading.
+    pub reading: Reading,
+    /// Commanded joint positions [rad].
+    pub q_cmd: PerJoint,
+    /// Position gain of the command [N·m/rad].
+    pub kp: f32,
 }
 
 /// What the loop takes in at its next step.
@@ -186,6 +206,21 @@ impl RobotHandle {
         drop(board);
         if is_new {
             self.0.changed.notify_all();
+        }
+    }
+
+    /// Returns the samples since the last call, oldest first. Sampling begins with the first call.
+    pub(crate) fn take_samples(&self) -> Vec<TimedSample> {
+        lock(&self.0.samples).get_or_insert_default().drain(..).collect()
+    }
+
+    /// Keeps a sample, if somebody has asked for samples.
+    pub(crate) fn add_sample(&self, sample: impl FnOnce() -> TimedSample) {
+        if let Some(samples) = lock(&self.0.samples).as_mut() {
+            if samples.len() == MAX_SAMPLES {
+                samples.pop_front();
+            }
+            samples.push_back(sample());
         }
     }
 

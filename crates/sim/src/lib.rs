@@ -5,7 +5,8 @@
 //!   number of threads.
 //! - [`BatchBackend`]: one robot per SIMD lane. The results are bitwise equal for any lane, batch size and number of
 //!   threads.
-//! - [`MujocoBackend`]: MuJoCo in a Python process, for comparison with an engine that others wrote.
+//! - [`MujocoBackend`]: MuJoCo in a Python process, for comparison with an engine that others wrote. [`MujocoPlant`]: its
+//!   robots with every effect, by equations that are not the model's.
 //!
 //! In one actuator period the PD loop samples the state once, and `physics_hz / actuator_hz` physics steps follow.
 
@@ -22,6 +23,6 @@ mod thread_pool;
 pub use batch::{BatchBackend, BatchSnapshot, SimdPrecision};
 pub use config::{Engine, RoughTerrain, SimConfig, SimConfigError, StepTerrain, Terrain};
 pub use error::BackendBuildError;
-pub use mujoco::MujocoBackend;
+pub use mujoco::{MujocoBackend, MujocoPlant};
 pub use rapier::{RapierBackend, RobotSnapshot};
 pub use rollout::BatchRollout;

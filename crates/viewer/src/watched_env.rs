@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use twinstep_model::{AutoresetMode, EnvError, EnvSpec, RealTimeReport, ResetRequest, Scene, StepBatch, VecEnv};
+use twinstep_model::{
+    AutoresetMode, EnvError, EnvSpec, RealTimeReport, ResetRequest, RobotSample, Scene, StepBatch, VecEnv,
+};
 
 use crate::frame::{Frame, RobotFrame};
 use crate::hub::Hub;
@@ -113,5 +115,9 @@ impl VecEnv for WatchedVecEnv {
 
     fn scene(&self, env: usize) -> Result<Scene, EnvError> {
         self.env.scene(env)
+    }
+
+    fn samples(&mut self, env: usize) -> Result<Vec<RobotSample>, EnvError> {
+        self.env.samples(env)
     }
 }

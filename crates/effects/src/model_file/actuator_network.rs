@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use toml::Value;
 
 /// Table `[actuator]`: an ensemble of networks that replaces the first stages of the chain from command to torque.
@@ -21,7 +21,7 @@ pub struct ActuatorNetworkConfig {
 }
 
 /// When a robot samples the member of the ensemble that computes its torques.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MemberSampling {
     /// At every reset.

@@ -7,6 +7,8 @@
 mod delay;
 mod effects;
 mod frames;
+mod plant;
+mod plant_actuator;
 mod process;
 
 use std::ffi::OsString;
@@ -21,6 +23,8 @@ use crate::rapier::check_lengths;
 use crate::{BackendBuildError, SimConfig};
 use delay::CommandDelay;
 use effects::{Adjustments, unsupported};
+pub use plant::MujocoPlant;
+
 use frames::{PUSH, RESET, Reset, STATES, STEP, Settings};
 use process::Process;
 
@@ -81,6 +85,11 @@ impl MujocoBackend {
         this.reset(&standing)
             .map_err(|error| BackendBuildError::Mujoco { python: PathBuf::from(python), reason: error.to_string() })?;
         Ok(this)
+    }
+
+    /// Returns true if MuJoCo simulates every effect of `robot` without a [`MujocoPlant`].
+    pub fn simulates(robot: &RobotModel) -> bool {
+        unsupported(robot).is_none()
     }
 
     /// Returns the id of the process.

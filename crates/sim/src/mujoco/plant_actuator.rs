@@ -168,16 +168,14 @@ fn interpolated<T>(history: &VecDeque<T>, age: f64, of: impl Fn(&T) -> f64) -> f
 
 #[cfg(test)]
 mod tests {
-    use twinstep_effects::{Effect, EffectEntry, Scope, apply_effects};
     use twinstep_model::go2;
 
     use super::*;
 
     /// Returns the torques of a joint over 100 steps of 0.5 ms with constant wanted torque of 3 N·m and speed.
-    fn run(effect: &str, values: &[f64], dq: f64) -> Vec<[f64; 2]> {
-        let effect = Effect::named(effect).expect("in the catalogue");
-        let entry = EffectEntry::new(effect, Scope::All, values.to_vec()).expect("allowed");
-        let mut robot = apply_effects(&go2(), &[entry]).expect("a robot");
+    fn run(change: impl Fn(&mut JointModel), dq: f64) -> Vec<[f64; 2]> {
+        let mut robot = go2();
+        robot.joints.iter_mut().for_each(change);
         robot.control.actuator_hz = 200.0;
         let (q, dq) = ([0.3; NUM_JOINTS], [dq; NUM_JOINTS]);
         let mut actuator = PlantActuator::new(&robot, 10, &q);
@@ -197,32 +195,33 @@ mod tests {
     #[test]
     fn delay_shifts_and_lag_smooths_the_torque() {
         // Wanted from step 10 on, that is, from 5 ms.
-        let delayed = run("torque_delay", &[0.006], 0.0);
+        let delayed = run(|joint| joint.actuator.torque_delay = 0.006, 0.0);
         assert_eq!((delayed[20][0], delayed[23][0]), (0.0, 3.0));
-        let lagged = run("drive_lag", &[0.01], 0.0);
+        let lagged = run(|joint| joint.actuator.torque_time_constant = 0.01, 0.0);
         assert!((lagged[29][0] / 3.0 - (1.0 - (-1.0_f64).exp())).abs() < 0.01, "{:?}", lagged[29]);
     }
 
     #[test]
     fn gain_and_load_friction_are_behind_the_current_sensor() {
-        let [sensed, applied] = *run("torque_gain", &[0.8], 0.0).last().expect("steps");
+        let [sensed, applied] = *run(|joint| joint.actuator.gain = 0.8, 0.0).last().expect("steps");
         assert!((sensed - 3.0).abs() < 1e-9 && (applied - 2.4).abs() < 1e-9);
-        let [sensed, applied] = *run("load_friction", &[0.1], 2.0).last().expect("steps");
+        let [sensed, applied] = *run(|joint| joint.load_friction = 0.1, 2.0).last().expect("steps");
         assert!((sensed - 3.0).abs() < 1e-9 && (applied - 2.7).abs() < 1e-6);
     }
 
     #[test]
     fn torque_along_the_motion_falls_with_speed() {
-        let [along, _] = *run("torque_speed_limit", &[20.0], 19.0).last().expect("steps");
+        let limited = |joint: &mut JointModel| joint.actuator.no_load_speed = 20.0;
+        let [along, _] = *run(limited, 19.0).last().expect("steps");
         let limit = go2().joints[4].torque_limit;
         assert!((along - (0.05 * limit).min(3.0)).abs() < 1e-9, "{along}");
-        let [against, _] = *run("torque_speed_limit", &[20.0], -19.0).last().expect("steps");
+        let [against, _] = *run(limited, -19.0).last().expect("steps");
         assert!((against - 3.0).abs() < 1e-9);
     }
 
     #[test]
     fn rotor_turns_within_the_backlash_before_the_gear_transmits() {
-        let torques = run("backlash", &[0.02], 0.0);
+        let torques = run(|joint| joint.actuator.backlash = 0.02, 0.0);
         let first = torques.iter().position(|torque| torque[1] != 0.0).expect("the gear engages");
         assert!(first > 11, "{first}");
         let mean = torques[60..].iter().map(|torque| torque[1]).sum::<f64>() / 40.0;

@@ -1,0 +1,92 @@
+//! Files of a command with several stages: a file exists only when it is complete, also after a power failure.
+
+use std::fs::File;
+use std::path::Path;
+
+use crate::exit::{CommandResult, Failure};
+
+/// Writes a file under another name, and renames it once its content is stored.
+pub fn write(path: &Path, content: &[u8]) -> CommandResult {
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(".partial");
+    let partial = Path::new(&partial);
+    std::fs::write(partial, content).map_err(|cause| unwritable(partial, &cause))?;
+    complete(partial, path)
+}
+
+/// Renames a file, or a folder of files, once its content is stored.
+pub fn complete(partial: &Path, path: &Path) -> CommandResult {
+    let stored = store(partial)
+        .and_then(|()| std::fs::rename(partial, path))
+        .and_then(|()| path.parent().map_or(Ok(()), |folder| File::open(folder)?.sync_all()));
+    stored.map_err(|cause| unwritable(path, &cause))
+}
+
+fn store(path: &Path) -> std::io::Result<()> {
+    if path.is_dir() {
+        for entry in std::fs::read_dir(path)? {
+            store(&entry?.path())?;
+        }
+    }
+    File::open(path)?.sync_all()
+}
+
+/// Removes a file or folder that was not completed, if there is one.
+pub fn discard(partial: &Path) -> CommandResult {
+    let removed = match partial.symlink_metadata() {
+        Ok(found) if found.is_dir() => std::fs::remove_dir_all(partial),
+        Ok(_) => std::fs::remove_file(partial),
+        Err(_) => Ok(()),
+    };
+    removed.map_err(|cause| unwritable(partial, &cause))
+}
+
+/// Creates a folder with its parents.
+pub fn create_folder(folder: &Path) -> CommandResult {
+    std::fs::create_dir_all(folder).map_err(|cause| unwritable(folder, &cause))
+}
+
+/// Stores copies of the inputs in the folder `inputs` of `out`, or fails if `out` has results of other inputs.
+pub fn keep_inputs(out: &Path, inputs: Vec<(&'static str, Vec<u8>)>) -> CommandResult {
+    let folder = out.join("inputs");
+    create_folder(&folder)?;
+    for (name, content) in inputs {
+        let copy = folder.join(name);
+        match std::fs::read(&copy) {
+            Ok(earlier) if earlier != content => {
+                return Err(Failure::Input(miette::miette!(
+                    "{} has results of other inputs: {name} differs\n  restore it from {}, or rename the config file",
+                    out.display(),
+                    folder.display()
+                )));
+            }
+            Ok(_) => {}
+            Err(_) => write(&copy, &content)?,
+        }
+    }
+    Ok(())
+}
+
+fn unwritable(path: &Path, cause: &std::io::Error) -> Failure {
+    Failure::Input(miette::miette!("cannot write {}: {cause}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn file_of_a_stage_replaces_its_partial_one_and_other_inputs_are_named() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("result.json");
+        write(&path, b"1").expect("written");
+        assert_eq!(std::fs::read(&path).expect("read"), b"1");
+        assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), 1, "no partial file is left");
+        keep_inputs(folder.path(), vec![("settings.toml", b"a".to_vec())]).expect("new");
+        keep_inputs(folder.path(), vec![("settings.toml", b"a".to_vec())]).expect("the same");
+        let Err(Failure::Input(report)) = keep_inputs(folder.path(), vec![("settings.toml", b"b".to_vec())]) else {
+            panic!("it is refused")
+        };
+        assert!(report.to_string().contains("settings.toml differs"), "{report}");
+    }
+}

@@ -1,0 +1,211 @@
+//! Robots whose bodies and contacts are MuJoCo's and whose actuators are each a [`PlantActuator`].
+
+use std::path::Path;
+
+use twinstep_model::{
+    ActuatorParams, Backend, BackendError, Command, Ground, GroundTruth, InitialState, JointSpring, Measured,
+    NUM_JOINTS, PerJoint, RobotModel, RobotStates, Simulator, Stribeck,
+};
+
+use super::MujocoBackend;
+use super::plant_actuator::{Joints, PlantActuator};
+use crate::rapier::check_lengths;
+use crate::{BackendBuildError, Engine, SimConfig};
+
+/// Lowest rate of actuators and physics [Hz].
+const STEP_HZ: f64 = 2000.0;
+
+/// Robots in MuJoCo with every effect of the catalogue, by equations that share no code with the model's.
+pub struct MujocoPlant {
+    robot: RobotModel,
+    /// The robots without what [`PlantActuator`] computes.
+    bodies: MujocoBackend,
+    actuators: Vec<PlantActuator>,
+    /// Steps per actuator period.
+    steps: usize,
+    /// States as the sensors measure them.
+    states: RobotStates,
+}
+
+impl MujocoPlant {
+    /// Creates `num_robots` robots, with the base as in `config`. The interpreter is that of [`MujocoBackend::new`].
+    pub fn new(robot: RobotModel, config: SimConfig, num_robots: usize) -> Result<Self, BackendBuildError> {
+        Self::with_bodies(robot, config, num_robots, MujocoBackend::new)
+    }
+
+    /// Creates robots like [`MujocoPlant::new`], with the interpreter `python`.
+    pub fn with_python(
+        robot: RobotModel,
+        config: SimConfig,
+        num_robots: usize,
+        python: &Path,
+    ) -> Result<Self, BackendBuildError> {
+        Self::with_bodies(robot, config, num_robots, |robot, config, count| {
+            MujocoBackend::with_python(robot, config, count, python)
+        })
+    }
+
+    fn with_bodies(
+        robot: RobotModel,
+        config: SimConfig,
+        num_robots: usize,
+        create: impl FnOnce(RobotModel, SimConfig, usize) -> Result<MujocoBackend, BackendBuildError>,
+    ) -> Result<Self, BackendBuildError> {
+        let steps = (STEP_HZ / robot.control.actuator_hz).ceil() as usize;
+        let bodies = bodies(&robot, steps);
+        let physics_hz = Some(bodies.control.actuator_hz as u32);
+        let config = SimConfig { engine: Engine::Mujoco, physics_hz, ..config };
+        let bodies = create(bodies, config, num_robots)?;
+        let states = bodies.states().clone();
+        let actuators = states.measured.q.iter().map(|q| PlantActuator::new(&robot, steps, &widened(q))).collect();
+        Ok(Self { robot, bodies, actuators, steps, states })
+    }
+
+    /// Returns positions [rad] and velocities [rad/s] of the links of a robot.
+    fn links(&self, robot: usize) -> (Joints, Joints) {
+        let measured = self.bodies.measured();
+        (widened(&measured.q[robot]), widened(&measured.dq[robot]))
+    }
+
+    /// Reads the states of all robots, with the readings of their encoders.
+    fn update_states(&mut self) {
+        let tau = std::mem::take(&mut self.states.measured.tau);
+        self.states.clone_from(self.bodies.states());
+        self.states.measured.tau = tau;
+        for robot in 0..self.actuators.len() {
+            let (q, dq) = self.links(robot);
+            for joint in 0..NUM_JOINTS {
+                let (q, dq) = self.actuators[robot].reading(joint, q[joint], dq[joint]);
+                self.states.measured.q[robot][joint] = q as f32;
+                self.states.measured.dq[robot][joint] = dq as f32;
+            }
+        }
+    }
+
+    /// Replaces the actuators of a robot after its reset.
+    fn rest(&mut self, robot: usize, model: &RobotModel) {
+        self.actuators[robot] = PlantActuator::new(model, self.steps, &self.links(robot).0);
+        self.states.measured.tau[robot] = PerJoint::default();
+    }
+
+    /// Advances the active robots by an actuator period, and adds the sensed torques to `sums` [N·m]. Robots that diverge
+    /// become inactive.
+    fn period(
+        &mut self,
+        commands: &[Command],
+        active: &mut [bool],
+        sums: &mut [Joints],
+        diverged: &mut Vec<(usize, &'static str)>,
+    ) -> Result<(), BackendError> {
+        for robot in (0..active.len()).filter(|robot| active[*robot]) {
+            let (q, dq) = self.links(robot);
+            self.actuators[robot].sample(&commands[robot], &q, &dq);
+        }
+        let mut torques = vec![Command::hold([0.0; NUM_JOINTS], 0.0, 0.0); active.len()];
+        for _ in 0..self.steps {
+            for robot in (0..active.len()).filter(|robot| active[*robot]) {
+                let (q, dq) = self.links(robot);
+                let plant = self.actuators[robot].step(&q, &dq);
+                torques[robot].tau_ff = plant.applied.map(|tau| tau as f32);
+                sums[robot].iter_mut().zip(plant.sensed).for_each(|(sum, tau)| *sum += tau);
+            }
+            match self.bodies.step(&torques, active, 1) {
+                Err(BackendError::Diverged { robots }) => {
+                    robots.iter().for_each(|(robot, _)| active[*robot] = false);
+                    diverged.extend(robots);
+                }
+                stepped => stepped?,
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Returns the robot without what [`PlantActuator`] computes, with `steps` actuator periods in one of the robot's.
+fn bodies(robot: &RobotModel, steps: usize) -> RobotModel {
+    let mut bodies = robot.clone();
+    bodies.control.actuator_hz *= steps as f64;
+    for joint in &mut bodies.joints {
+        if PlantActuator::has_rotor(joint) {
+            // The rotor is not part of the link.
+            joint.armature = 0.0;
+        }
+        (joint.stribeck_friction, joint.load_friction) = (Stribeck::NONE, 0.0);
+        (joint.spring, joint.actuator) = (JointSpring::NONE, ActuatorParams::IDEAL);
+    }
+    bodies
+}
+
+fn widened(values: &PerJoint) -> Joints {
+    values.map(f64::from)
+}
+
+impl Backend for MujocoPlant {
+    fn robot(&self) -> &RobotModel {
+        &self.robot
+    }
+
+    fn measured(&self) -> &Measured {
+        &self.states.measured
+    }
+
+    fn ground_truth(&self) -> Option<&GroundTruth> {
+        Some(&self.states.truth)
+    }
+
+    fn ground(&self) -> Ground {
+        self.bodies.ground()
+    }
+
+    fn reset(&mut self, initial_states: &[(usize, InitialState)]) -> Result<(), BackendError> {
+        self.bodies.reset(initial_states)?;
+        let nominal = self.robot.clone();
+        initial_states.iter().for_each(|(robot, _)| self.rest(*robot, &nominal));
+        self.update_states();
+        Ok(())
+    }
+
+    fn reset_with_model(
+        &mut self,
+        robot: usize,
+        model: &RobotModel,
+        initial_state: &InitialState,
+    ) -> Result<(), BackendError> {
+        self.bodies.reset_with_model(robot, &bodies(model, self.steps), initial_state)?;
+        self.rest(robot, model);
+        self.update_states();
+        Ok(())
+    }
+
+    fn push(&mut self, robot: usize, velocity: [f32; 3]) -> Result<(), BackendError> {
+        self.bodies.push(robot, velocity)?;
+        self.update_states();
+        Ok(())
+    }
+
+    fn step(&mut self, commands: &[Command], active: &[bool], actuator_periods: usize) -> Result<(), BackendError> {
+        check_lengths(commands, active, self.num_robots())?;
+        let mut running = active.to_vec();
+        let (mut sums, mut diverged) = (vec![[0.0; NUM_JOINTS]; active.len()], Vec::new());
+        for _ in 0..actuator_periods {
+            // The sensor has the mean of the last actuator period.
+            sums.fill([0.0; NUM_JOINTS]);
+            self.period(commands, &mut running, &mut sums, &mut diverged)?;
+        }
+        for robot in (0..active.len()).filter(|robot| active[*robot]) {
+            self.states.measured.tau[robot] = sums[robot].map(|sum| (sum / self.steps as f64) as f32);
+        }
+        self.update_states();
+        if diverged.is_empty() { Ok(()) } else { Err(BackendError::Diverged { robots: diverged }) }
+    }
+}
+
+impl Simulator for MujocoPlant {
+    fn states(&self) -> &RobotStates {
+        &self.states
+    }
+
+    fn set_derating(&mut self, robot: usize, factors: &PerJoint) {
+        self.actuators[robot].derating = widened(factors);
+    }
+}

@@ -1,0 +1,396 @@
+//! U2E on a hidden robot in MuJoCo: actuator models for equal robot time, then two tasks on the models, judged on the robot.
+//!
+//! `cargo build --release --workspace && target/release/u2e_table --out u2e-table`. Needs Python with the package's extra
+//! `mujoco`; `TWINSTEP_PYTHON` is its interpreter. Each step is a command of `twinstep` whose result is kept, so that the
+//! same command continues after an interruption. `ledger.csv` has the command and the time of each step.
+
+use std::fmt::Write as _;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitCode};
+use std::time::Instant;
+
+use clap::Parser;
+use serde_json::Value;
+use twinstep_effects::ModelFile;
+use twinstep_ensemble::check_effects;
+use twinstep_logs::TorqueSensor;
+use twinstep_tests::process::Process;
+use twinstep_tests::python::root;
+
+/// Compare methods on a hidden robot, for one seed.
+#[derive(Parser)]
+struct Args {
+    /// Folder of all results.
+    #[arg(long)]
+    out: PathBuf,
+    /// Model file of the hidden robot. Default: examples/u2e/hidden.toml.
+    #[arg(long)]
+    hidden: Option<PathBuf>,
+    /// Seed of commands, networks and trainings.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Logs after the first one.
+    #[arg(long, default_value_t = 2)]
+    iterations: usize,
+    /// Duration of each log [s].
+    #[arg(long, default_value_t = 40)]
+    seconds: u64,
+    /// Members of the ensembles.
+    #[arg(long, default_value_t = 4)]
+    members: usize,
+    /// Maximum number of epochs of a fit.
+    #[arg(long, default_value_t = 20)]
+    epochs: usize,
+    /// Environment steps of the training of an exploration policy.
+    #[arg(long, default_value_t = 1_000_000)]
+    explore_steps: u64,
+    /// Environment steps of the fine-tuning of each method.
+    #[arg(long, default_value_t = 2_000_000)]
+    tune_steps: u64,
+    /// Engine of the evaluation of `track`; MuJoCo takes some minutes for each policy.
+    #[arg(long, default_value = "mujoco")]
+    track_engine: String,
+    /// Duration of the evaluation of `track` [s].
+    #[arg(long, default_value_t = 20)]
+    track_seconds: u32,
+    /// Robots of each evaluation.
+    #[arg(long, default_value_t = 4)]
+    robots: u32,
+}
+
+/// Ways of collecting logs that are compared on the held-out log.
+const COLLECTIONS: [&str; 3] = ["explore", "random", "base"];
+/// Methods whose policies are compared.
+const METHODS: [&str; 5] = ["vanilla", "single", "u2e", "laws", "ours"];
+/// Tasks, with the settings of their fine-tuning.
+const TASKS: [(&str, &str); 2] = [("track", ""), ("jump", "target_x_m = [0.6, 0.6]\n")];
+/// Jumps in the held-out log, and the duration of each [s].
+const JUMPS: u64 = 12;
+const JUMP_S: &str = "1.4";
+/// Noise of the robot's sensors.
+const SENSORS: &str = "[randomise.noise]\njoint_position_rad = 0.0005\njoint_velocity_rad_s = 0.1\n\
+                       joint_torque_nm = 0.35\nangular_velocity_rad_s = 0.02\n";
+/// Effects that the method `laws` identifies.
+const LAWS: &str = "command_delay@all,drive_lag@all,torque_saturation@all,torque_speed_limit@all,torque_gain@all,\
+                    viscous_friction@all,coulomb_friction@all,payload@base";
+/// Rows from which they are identified [s].
+const LAWS_UNTIL: &str = "12";
+
+/// Result of a step; the error says which command failed.
+type Step<T = ()> = Result<T, String>;
+
+fn main() -> ExitCode {
+    let args = Args::parse();
+    match Campaign::new(args).and_then(|campaign| campaign.run()) {
+        Ok(table) => {
+            print!("{table}");
+            ExitCode::SUCCESS
+        }
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// The steps and their folder.
+struct Campaign {
+    args: Args,
+    twinstep: PathBuf,
+    hidden: PathBuf,
+}
+
+impl Campaign {
+    fn new(mut args: Args) -> Step<Self> {
+        // The commands run in the folder of the repository.
+        args.out = std::path::absolute(&args.out).map_err(text)?;
+        args.hidden = args.hidden.map(std::path::absolute).transpose().map_err(text)?;
+        std::fs::create_dir_all(&args.out).map_err(text)?;
+        let program = std::env::current_exe().map_err(text)?;
+        let twinstep = program.with_file_name("twinstep");
+        let hidden = args.hidden.clone().unwrap_or_else(|| root().join("examples/u2e/hidden.toml"));
+        Ok(Self { args, twinstep, hidden })
+    }
+
+    fn run(&self) -> Step<String> {
+        self.collect()?;
+        self.models()?;
+        for (task, settings) in TASKS {
+            for method in METHODS {
+                self.tune(task, settings, method)?;
+                let policy = self.path(&format!("{method}-{task}/policy.safetensors"));
+                self.evaluate(task, method, &policy)?;
+            }
+            self.evaluate(task, "start", &start(task))?;
+        }
+        self.table()
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.args.out.join(name)
+    }
+
+    fn seed(&self) -> String {
+        self.args.seed.to_string()
+    }
+
+    /// Runs `twinstep` with `--out`, unless its result exists. A training that was interrupted continues.
+    fn step(&self, result: &Path, arguments: &[&str], out: &Path) -> Step {
+        if result.exists() {
+            return Ok(());
+        }
+        let out = out.display().to_string();
+        if Path::new(&out).join("checkpoint.safetensors").exists() {
+            return self.twinstep(&["train", "--resume", "--out", &out]).map(drop);
+        }
+        self.twinstep(&[arguments, &["--out", &out]].concat()).map(drop)
+    }
+
+    /// Runs `twinstep` and returns its stdout. Adds its time to the ledger.
+    fn twinstep(&self, arguments: &[&str]) -> Step<String> {
+        let (start, line) = (Instant::now(), arguments.join(" "));
+        eprintln!("twinstep {line}");
+        let output = Command::new(&self.twinstep).args(arguments).current_dir(root()).output().map_err(text)?;
+        if !output.status.success() {
+            return Err(format!("twinstep {line}: {}", String::from_utf8_lossy(&output.stderr)));
+        }
+        let mut ledger =
+            std::fs::OpenOptions::new().append(true).create(true).open(self.path("ledger.csv")).map_err(text)?;
+        writeln!(ledger, "{:.1},twinstep {line}", start.elapsed().as_secs_f64()).map_err(text)?;
+        Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+    }
+
+    /// Starts the hidden robot with a task. Returns its endpoint.
+    fn robot(&self, task: &str) -> Step<(Process, String)> {
+        let config = self.path(&format!("{task}-server.toml"));
+        std::fs::write(&config, format!("[task]\nname = \"{task}\"\n[sim]\nengine = \"mujoco\"\n{SENSORS}"))
+            .map_err(text)?;
+        let [config, hidden] = [&config, &self.hidden].map(|path| path.display().to_string());
+        let arguments =
+            ["serve", "--config", &config, "--model", &hidden, "--envs", "2", "--listen", "tcp/127.0.0.1:0"];
+        let arguments: Vec<String> = arguments
+            .iter()
+            .chain(&["--lease-grace-s", "0.1", "--until-stdin-closes"])
+            .map(ToString::to_string)
+            .collect();
+        Process::listening(&self.twinstep, &arguments)
+    }
+
+    /// Records the held-out jumps, then runs the loop for each way of collecting logs.
+    fn collect(&self) -> Step {
+        let held_out = self.path("held-out");
+        if !held_out.exists() {
+            let (_server, endpoint) = self.robot("jump")?;
+            let partial = self.path("held-out.partial");
+            let _ = std::fs::remove_dir_all(&partial);
+            for jump in 0..JUMPS {
+                let (log, seed) = (partial.join(jump.to_string()).display().to_string(), (1000 + jump).to_string());
+                let run = ["run", "data/policies/jump.safetensors", "--endpoint", &endpoint, "--torque", "--fast"];
+                self.twinstep(&[&run[..], &["--seconds", JUMP_S, "--seed", &seed, "--log", &log]].concat())?;
+            }
+            merge_logs(&partial, JUMPS)?;
+            std::fs::rename(&partial, &held_out).map_err(text)?;
+        }
+        let (_server, endpoint) = self.robot("walk")?;
+        for method in COLLECTIONS {
+            let config = self.path(&format!("{method}.toml"));
+            std::fs::write(&config, self.config(method, &endpoint)).map_err(text)?;
+            self.twinstep(&["u2e", &config.display().to_string()])?;
+        }
+        Ok(())
+    }
+
+    fn config(&self, method: &str, endpoint: &str) -> String {
+        let Args { seed, iterations, seconds, members, epochs, explore_steps, .. } = &self.args;
+        let held_out = self.path("held-out").display().to_string();
+        format!(
+            "policy = \"data/policies/walk.safetensors\"\nendpoint = \"{endpoint}\"\nmethod = \"{method}\"\nstop = \"never\"\n\
+             held_out = {held_out:?}\nfast = true\nseed = {seed}\niterations = {iterations}\nseconds = {seconds}.0\n\
+             [fit]\nmembers = {members}\nepochs = {epochs}\n[explore]\nmax_residual = 0.5\nuncertainty_weight = 40.0\n[train]\ntotal_steps = {explore_steps}\n"
+        )
+    }
+
+    /// Writes the models on which the methods train; that of U2E is there.
+    ///
+    /// `laws` has identified effects alone. `ours` has those behind the torque sensor, and the networks of U2E before it.
+    fn models(&self) -> Step {
+        let logs = |method: &str| -> Vec<String> {
+            let name = |iteration: usize| if iteration == 0 { "base" } else { method };
+            let log = |iteration: usize| self.path(method).join(format!("{iteration}-{}/log", name(iteration)));
+            (0..=self.args.iterations).map(|iteration| log(iteration).display().to_string()).collect()
+        };
+        let single = self.path("single.safetensors");
+        let (logs_of_random, epochs) = (logs("random"), self.args.epochs.to_string());
+        let mut fit: Vec<&str> = vec!["fit"];
+        fit.extend(logs_of_random.iter().map(String::as_str));
+        let seed = self.seed();
+        fit.extend(["--members", "1", "--epochs", &epochs, "--seed", &seed]);
+        self.step(&single, &fit, &single)?;
+        std::fs::write(self.path("single.toml"), "robot = \"go2\"\n[actuator]\nensemble = \"single.safetensors\"\n")
+            .map_err(text)?;
+        let (laws, partial) = (self.path("laws.toml"), self.path("laws.partial.toml"));
+        if !laws.exists() {
+            let log = logs("explore").pop().ok_or("there is a log")?;
+            let out = partial.display().to_string();
+            let seed = self.seed();
+            self.twinstep(&[
+                "identify",
+                &log,
+                "--until",
+                LAWS_UNTIL,
+                "--effects",
+                LAWS,
+                "--seed",
+                &seed,
+                "--out",
+                &out,
+            ])?;
+            std::fs::rename(&partial, &laws).map_err(text)?;
+        }
+        let mut ours = ModelFile::load(&laws).map_err(text)?;
+        ours.effects.retain(|entry| {
+            let alone = ModelFile { effects: vec![entry.clone()], ..ModelFile::default() };
+            check_effects(&alone, TorqueSensor::MotorCurrent).is_ok()
+        });
+        ours.actuator = ModelFile::load(self.path("explore/robot.toml")).map_err(text)?.actuator;
+        std::fs::write(self.path("ours.toml"), ours.to_toml()).map_err(text)
+    }
+
+    /// Trains a task from its start on the model of a method.
+    fn tune(&self, task: &str, settings: &str, method: &str) -> Step {
+        let out = self.path(&format!("{method}-{task}"));
+        let config = self.path(&format!("{method}-{task}.toml"));
+        let vanilla = std::fs::read_to_string(root().join("examples/u2e/vanilla.toml")).map_err(text)?;
+        let randomise = if method == "vanilla" { vanilla } else { String::new() };
+        std::fs::write(&config, format!("[task]\nname = \"{task}\"\n{settings}{randomise}")).map_err(text)?;
+        let model = match method {
+            "single" => Some(self.path("single.toml")),
+            "u2e" => Some(self.path("explore/robot.toml")),
+            "laws" | "ours" => Some(self.path(&format!("{method}.toml"))),
+            _ => None,
+        };
+        let from = start(task).display().to_string();
+        let (config, steps, seed) = (config.display().to_string(), self.args.tune_steps.to_string(), self.seed());
+        let mut arguments =
+            vec!["train", task, "--config", &config, "--from", &from, "--steps", &steps, "--seed", &seed];
+        let model = model.map(|path| path.display().to_string());
+        arguments.extend(model.iter().flat_map(|model| ["--model", model.as_str()]));
+        self.step(&out.join("evaluation.json"), &arguments, &out)
+    }
+
+    /// Evaluates a policy on the hidden robot.
+    fn evaluate(&self, task: &str, method: &str, policy: &Path) -> Step {
+        let result = self.path(&format!("{method}-{task}.json"));
+        if result.exists() {
+            return Ok(());
+        }
+        let [policy, hidden] = [policy, &self.hidden].map(|path| path.display().to_string());
+        let (engine, seconds) = match task {
+            "track" => (self.args.track_engine.as_str(), self.args.track_seconds),
+            _ => ("mujoco", 3),
+        };
+        let (robots, seconds) = (self.args.robots.to_string(), seconds.to_string());
+        let json = self.twinstep(&[
+            "evaluate-policy",
+            &policy,
+            "--engine",
+            engine,
+            "--model",
+            &hidden,
+            "--condition",
+            "nominal",
+            "--robots",
+            &robots,
+            "--seconds",
+            &seconds,
+            "--json",
+        ])?;
+        std::fs::write(&result, json).map_err(text)
+    }
+
+    /// Returns the tables of the results.
+    fn table(&self) -> Step<String> {
+        let mut table =
+            "| collection | robot time [min] | falls | torques at the limit | uncertainty of the new log [nat] | \
+                         held-out jumps: torque RMSE [N·m] | uncertainty [nat] |\n|---|---|---|---|---|---|---|\n"
+                .to_owned();
+        for method in COLLECTIONS {
+            for iteration in 0..=self.args.iterations {
+                let name = if iteration == 0 { "base" } else { method };
+                let found = read(&self.path(method).join(format!("{iteration}-{name}/evaluation.json")))?;
+                let minutes = (iteration as u64 + 1) as f64 * self.args.seconds as f64 / 60.0;
+                let (collection, held_out) = (&found["collection"], &found["held_out"]);
+                let _ = writeln!(
+                    table,
+                    "| {method} | {minutes:.2} | {} | {:.2} % | {} | {:.3} | {:.4} |",
+                    collection["falls"],
+                    100.0 * number(&collection["torque_limit_share"]),
+                    found["uncertainty"].as_f64().map_or("-".to_owned(), |value| format!("{value:.4}")),
+                    number(&held_out["torque_rmse_nm"]),
+                    number(&held_out["uncertainty_nat"])
+                );
+            }
+        }
+        table.push_str("\n| method | L_track, circle | without motion capture | up | jump of 0.6 m: landing error [m] | mean error [m] | landed |\n|---|---|---|---|---|---|---|\n");
+        for method in ["start"].iter().chain(&METHODS) {
+            let track = read(&self.path(&format!("{method}-track.json")))?;
+            let jump = read(&self.path(&format!("{method}-jump.json")))?;
+            let (paths, jumps) = (&track["rows"][0]["paths"], &jump["rows"][0]["targets"][1]);
+            let _ = writeln!(
+                table,
+                "| {method} | {:.3} | {:.3} | {:.0} % | {:.3} | {:+.3} | {:.0} % |",
+                number(&paths[0]["l_track"]),
+                number(&paths[3]["l_track"]),
+                100.0 * number(&paths[0]["up"]),
+                number(&jumps["l_jump"]),
+                number(&jumps["mean_error"]),
+                100.0 * number(&jumps["landed"])
+            );
+        }
+        Ok(table)
+    }
+}
+
+/// Returns the policy from which every method trains a task.
+fn start(task: &str) -> PathBuf {
+    root().join(format!("data/policies/{task}.safetensors"))
+}
+
+/// Merges the logs `0` to `count − 1` in `folder` into one log there: each is an episode.
+fn merge_logs(folder: &Path, count: u64) -> Step {
+    let (mut merged, mut start) = (String::new(), 0.0);
+    for log in 0..count {
+        let path = folder.join(log.to_string());
+        let table = std::fs::read_to_string(path.join("data.csv")).map_err(text)?;
+        let mut lines = table.lines();
+        let header = lines.next().ok_or("a log has a header")?;
+        if log == 0 {
+            merged = header.to_owned() + "\n";
+            std::fs::copy(path.join("meta.json"), folder.join("meta.json")).map_err(text)?;
+        }
+        let mut end = start;
+        for line in lines {
+            let (time, rest) = line.split_once(',').ok_or("a row has columns")?;
+            let (_, rest) = rest.split_once(',').ok_or("a row has columns")?;
+            end = start + time.parse::<f64>().map_err(text)?;
+            let _ = writeln!(merged, "{end:.3},{log},{rest}");
+        }
+        start = end + 0.5;
+        std::fs::remove_dir_all(&path).map_err(text)?;
+    }
+    std::fs::write(folder.join("data.csv"), merged).map_err(text)
+}
+
+fn read(path: &Path) -> Step<Value> {
+    let content = std::fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))?;
+    serde_json::from_str(&content).map_err(|error| format!("{}: {error}", path.display()))
+}
+
+fn number(value: &Value) -> f64 {
+    value.as_f64().unwrap_or(f64::NAN)
+}
+
+fn text(error: impl std::fmt::Display) -> String {
+    error.to_string()
+}
