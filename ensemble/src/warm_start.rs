@@ -90,7 +90,9 @@ mod tests {
         let scaled = log(4000, |_, columns| {
             for (name, cells) in columns.iter_mut().filter(|(name, _)| name != "t") {
                 let offset = if name.starts_with("q_cmd") { 0.05 } else { 0.0 };
-                cells.iter_mut().for_each(|cell| *cell = factor * *cell + offset);
+                for cell in cells.iter_mut() {
+                    *cell = factor * *cell + offset;
+                }
             }
         });
         DataSet::new(&[("here".to_owned(), scaled)]).expect("a set")

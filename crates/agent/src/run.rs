@@ -207,7 +207,9 @@ impl Agent {
         }
         let mut action = policy.action(&PolicyInput { obs: &self.obs, critic_obs: &self.critic_obs })?;
         if self.action_noise > 0.0 {
-            action.iter_mut().for_each(|value| *value += (self.action_noise * standard_normal(&mut self.noise)) as f32);
+            for value in &mut action {
+                *value += (self.action_noise * standard_normal(&mut self.noise)) as f32;
+            }
         }
         if let Some(index) = action.iter().position(|value| !value.is_finite()) {
             let joint = spec.action_entry(index);

@@ -34,6 +34,7 @@ use crate::web_view::ViewArgs;
 /// Examples: `twinstep run data/policies/walk.safetensors --velocity 0.5,0,0 --seconds 20 --log walk` and
 /// `twinstep run policy.onnx --mapping data/policies/mappings/isaaclab_go2_flat.toml --keyboard`
 #[derive(clap::Args)]
+#[allow(clippy::struct_excessive_bools, reason = "each is a flag of the command")]
 pub struct Args {
     /// Policy: *.safetensors or *.onnx.
     pub policy: PathBuf,

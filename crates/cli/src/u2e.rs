@@ -167,7 +167,7 @@ impl Stage {
         let (model, settings) = (self.folder.join("simulation.toml"), self.folder.join("training.toml"));
         let ensemble = Path::new("..").join(&earlier.name).join("ensemble.safetensors");
         stage_files::write(&model, config.simulated_robot(ensemble)?.as_bytes())?;
-        stage_files::write(&settings, config.training(model)?.as_bytes())?;
+        stage_files::write(&settings, config.training(model).as_bytes())?;
         let training = self.folder.join("training");
         train::write_policy(&config.exploration(&settings, &training, self.iteration), signals)?;
         let partial = self.folder.join("policy.partial.safetensors");

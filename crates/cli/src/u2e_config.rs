@@ -307,12 +307,12 @@ impl U2eConfig {
     }
 
     /// Returns the config file of the training of an exploration policy on the robot of a model file.
-    pub fn training(&self, model: PathBuf) -> Result<String, Failure> {
+    pub fn training(&self, model: PathBuf) -> String {
         let base = self.policy.canonicalize().unwrap_or_else(|_| self.policy.clone());
         let task = TaskConfig::Explore(ExploreConfig { base, ..self.explore.clone() });
         let (randomise, train) = (self.randomise, self.train.clone());
         let config = TrainConfig { model: Some(model), task, randomise, train, ..TrainConfig::default() };
-        Ok(toml::to_string(&config).expect("settings are plain data"))
+        toml::to_string(&config).expect("settings are plain data")
     }
 
     /// Returns the arguments of `twinstep train explore` in the folder `out`.

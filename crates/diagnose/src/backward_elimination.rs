@@ -24,7 +24,9 @@ pub fn evidence_beside_others(search: &mut ForwardSelection) -> Result<(), Diagn
         let (score, gain, explained_fraction) =
             found.map_or((0.0, 0.0, 0.0), |found| (found.score, found.gain, found.explained_fraction));
         // Alternatives keep their distance from the cause.
-        others.iter_mut().for_each(|other| other.score += score - best.score);
+        for other in others.iter_mut() {
+            other.score += score - best.score;
+        }
         (best.score, best.gain, best.explained_fraction) = (score, gain, explained_fraction);
     }
     Ok(())

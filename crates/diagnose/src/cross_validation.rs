@@ -78,11 +78,7 @@ impl FitProblem {
             let whole = self.refined(task, simulator, &TRIAL_DAMPING, steps);
             let here = task.linearise(simulator, &whole)?;
             let points = [0, 1].map(|fold| {
-                // The penalties of nuisance parameters, behind the rows, belong to both folds.
-                let weight = |row: usize| match rows.fold_of_residual(row) {
-                    Some(of) => f64::from(of == Some(fold)),
-                    None => 0.5,
-                };
+                let weight = |row: usize| rows.weight_in_fold(row, fold);
                 fold_step(task, &here, &whole, weight)
             });
             let [Some(one), Some(other)] = points else { return None };

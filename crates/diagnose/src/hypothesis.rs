@@ -122,7 +122,7 @@ mod tests {
         assert!(large_enough("torque_saturation", &[2.0 * low]) && !large_enough("torque_saturation", &[20.0 * low]));
         // Geometry errors of a millimetre imitate small encoder offsets.
         let high = Effect::named("encoder_offset").expect("known").parameters[0].prior_range[1];
-        assert!(large_enough("encoder_offset", &[0.31 * high]) && !large_enough("encoder_offset", &[0.29 * high]));
+        assert!(large_enough("encoder_offset", &[0.46 * high]) && !large_enough("encoder_offset", &[0.44 * high]));
         // The largest component of a vector counts.
         assert!(large_enough("com_shift", &[0.0, 0.0, -0.04]) && !large_enough("com_shift", &[0.001; 3]));
     }

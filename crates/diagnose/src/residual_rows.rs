@@ -82,9 +82,10 @@ impl ResidualRows {
         ignored.for_each(|(scale, _)| *scale = IGNORED);
     }
 
-    /// Returns the fold of a residual, or `None` for a penalty, which follows the residuals.
-    pub fn fold_of_residual(&self, residual: usize) -> Option<Option<usize>> {
-        self.folds.get(residual).copied()
+    /// Returns the weight of a residual in a fit to one fold: 1 for a row of the fold, 0 for another, and one half for the
+    /// penalty of a nuisance parameter, which follows the rows and belongs to both folds.
+    pub fn weight_in_fold(&self, residual: usize, fold: usize) -> f64 {
+        self.folds.get(residual).map_or(0.5, |of| f64::from(*of == Some(fold)))
     }
 
     /// Returns the standard deviation of noise and model error of a joint's position [rad].

@@ -43,7 +43,9 @@ impl ObservationNoise {
             (&mut sample.gyro[..], self.angular_velocity_rad_s),
         ];
         for (values, limit) in readings.into_iter().filter(|(_, limit)| *limit > 0.0) {
-            values.iter_mut().for_each(|value| *value += limit * (2.0 * random.random::<f32>() - 1.0));
+            for value in values.iter_mut() {
+                *value += limit * (2.0 * random.random::<f32>() - 1.0);
+            }
         }
     }
 

@@ -139,7 +139,9 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
     /// Removes the samples before a reset.
     fn clear_samples(&mut self, envs: &[usize]) {
         if let Some(samples) = &mut self.samples {
-            envs.iter().for_each(|env| samples[*env].clear());
+            for env in envs {
+                samples[*env].clear();
+            }
             let _ = self.backend.take_samples();
         }
     }
@@ -164,7 +166,9 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             }
             match backend.step(commands, &active, 1) {
                 Err(BackendError::Diverged { robots }) => {
-                    robots.iter().for_each(|(env, _)| active[*env] = false);
+                    for (env, _) in &robots {
+                        active[*env] = false;
+                    }
                     diverged.extend(robots);
                 }
                 stepped => stepped?,

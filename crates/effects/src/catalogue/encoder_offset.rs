@@ -40,7 +40,7 @@ pub const EFFECT: Effect = Effect {
     caveat: "confounded with a constant load at a single kp",
     search: Search {
         whole_log_probes: Probes::Values(|| vec![vec![-0.02], vec![0.02]]),
-        min_share: 0.3,
+        min_share: 0.45,
         ..Search::DEFAULT
     },
     visibility: Visibility::MotorTorque,

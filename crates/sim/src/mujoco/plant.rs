@@ -111,7 +111,9 @@ impl MujocoPlant {
             }
             match self.bodies.step(&torques, active, 1) {
                 Err(BackendError::Diverged { robots }) => {
-                    robots.iter().for_each(|(robot, _)| active[*robot] = false);
+                    for (robot, _) in &robots {
+                        active[*robot] = false;
+                    }
                     diverged.extend(robots);
                 }
                 stepped => stepped?,
@@ -160,7 +162,9 @@ impl Backend for MujocoPlant {
     fn reset(&mut self, initial_states: &[(usize, InitialState)]) -> Result<(), BackendError> {
         self.bodies.reset(initial_states)?;
         let nominal = self.robot.clone();
-        initial_states.iter().for_each(|(robot, _)| self.rest(*robot, &nominal));
+        for (robot, _) in initial_states {
+            self.rest(*robot, &nominal);
+        }
         self.update_states();
         Ok(())
     }
