@@ -34,15 +34,17 @@ pub fn evidence_beside_others(search: &mut ForwardSelection) -> Result<(), Diagn
 
 /// Removes causes without evidence beside the others, the weakest first, and refits the rest.
 pub fn eliminate(search: &mut ForwardSelection) -> Result<(), DiagnoseError> {
-    while search.accepted.len() > 1 {
+    if search.accepted.len() < 2 {
+        return Ok(());
+    }
+    loop {
         evidence_beside_others(search)?;
         let excess = |place: &usize| search.accepted[*place].0.score - search.accepted[*place].0.threshold;
         let weakest = (0..search.accepted.len()).min_by(|one, other| excess(one).total_cmp(&excess(other)));
-        let Some(weakest) = weakest.filter(|place| excess(place) < 0.0) else { break };
+        let Some(weakest) = weakest.filter(|place| excess(place) < 0.0) else { return Ok(()) };
         search.accepted.remove(weakest);
         search.refit();
     }
-    Ok(())
 }
 
 /// Returns the evidence for one of the causes, given that all others are refitted without it.

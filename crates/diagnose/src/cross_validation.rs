@@ -149,6 +149,7 @@ pub fn cross_validate(
     let tolerated: f64 = left[..2].iter().map(|left| 0.5 * left.tolerated_gain(before)).sum();
     let channels = || evident_channels([hypothesis.effect.target]);
     let evidence_nats: f64 = channels().map(judged).sum::<f64>() + tolerated;
+    let penalties = selection_penalty(hypothesis.scope) + parameter_penalty(fit.unknowns.len());
     let held_out = |channel: usize| left[0].sums[channel][1] + left[1].sums[channel][0];
     let acts: Vec<usize> = channels().filter(|channel| judged(*channel) > 1.0).collect();
     let [then, now] = [
@@ -163,7 +164,7 @@ pub fn cross_validate(
     let values = fit.unknowns.iter().zip(&whole).map(|(unknown, coordinate)| unknown.value(*coordinate)).collect();
     Some(CandidateFit {
         hypothesis: Hypothesis { values, ..hypothesis.clone() },
-        score: evidence_nats - selection_penalty(hypothesis.scope) - parameter_penalty(fit.unknowns.len()),
+        score: if evidence_nats.is_finite() { evidence_nats - penalties } else { f64::NEG_INFINITY },
         gain: if then > 0.0 { 1.0 - (now / then).sqrt() } else { 0.0 },
         explained_fraction: if above > 0.0 { 1.0 - left_above / above } else { 0.0 },
         threshold: 0.0,

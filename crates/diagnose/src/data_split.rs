@@ -6,8 +6,12 @@
 
 use twinstep_logs::Log;
 
-/// Length of a block [s]; blocks are assigned to the two folds alternately. Windows with a fixed base are as long.
-const BLOCK_S: f64 = 2.0;
+/// Longest block [s]; blocks are assigned to the two folds alternately. Windows with a fixed base are as long.
+const LONGEST_BLOCK_S: f64 = 2.0;
+/// Shortest block [s].
+const SHORTEST_BLOCK_S: f64 = 0.25;
+/// Least number of blocks of a log whose blocks are not the shortest: with fewer, random signs are too often all equal.
+const LEAST_BLOCKS: f64 = 10.0;
 /// Length of a range from which its end is held out [s].
 const DIVIDED_S: f64 = 5.0;
 /// Length of the gap before a held-out block [s].
@@ -43,6 +47,8 @@ impl DataSplit {
     fn with_held_out_ends(log: &Log, least: f64) -> Self {
         let rate = log.meta().rate_hz;
         let in_rows = |seconds: f64| (seconds * rate).round().max(1.0) as usize;
+        let fitted_s = 0.8 * log.rows() as f64 / rate;
+        let block = in_rows((fitted_s / LEAST_BLOCKS).clamp(SHORTEST_BLOCK_S, LONGEST_BLOCK_S));
         let (mut parts, mut blocks, mut short) = (vec![Part::Gap; log.rows()], 0, 0);
         for (_, rows) in log.segments() {
             let is_short = (rows.len() as f64) < least * rate;
@@ -56,8 +62,8 @@ impl DataSplit {
             let first_held_out = rows.end - held_out;
             let end = first_held_out - gap;
             parts[first_held_out..rows.end].fill(Part::HeldOut);
-            for start in (rows.start..end).step_by(in_rows(BLOCK_S)) {
-                parts[start..end.min(start + in_rows(BLOCK_S))].fill(Part::Block(blocks));
+            for start in (rows.start..end).step_by(block) {
+                parts[start..end.min(start + block)].fill(Part::Block(blocks));
                 blocks += 1;
             }
         }
@@ -121,7 +127,8 @@ mod tests {
         let held_out: Vec<usize> = (0..200).filter(|row| split.is_held_out(*row)).collect();
         assert_eq!((held_out[0], held_out.len()), (160, 40));
         assert!((155..200).all(|row| split.fold(row).is_none()), "0.5 s before it belong to no fold");
-        let folds: Vec<_> = [0, 19, 20, 39, 40, 154].map(|row| split.fold(row)).to_vec();
+        // 16 s in ten blocks.
+        let folds: Vec<_> = [0, 15, 16, 31, 32, 154].map(|row| split.fold(row)).to_vec();
         assert_eq!(folds, [Some(0), Some(0), Some(1), Some(1), Some(0), Some(1)]);
     }
 

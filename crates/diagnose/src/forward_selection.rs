@@ -5,7 +5,6 @@ use twinstep_effects::{Probes, Target};
 use twinstep_model::{Joint, RobotModel, Rollout};
 
 use super::DiagnoseError;
-use super::backward_elimination;
 use super::cross_validation::{CandidateFit, FitProblem, cross_validate};
 use super::hypothesis::Hypothesis;
 use super::null_distribution::{self, LOWEST_THRESHOLD};
@@ -106,7 +105,7 @@ impl<'a> ForwardSelection<'a> {
             self.accepted.remove(place);
             self.refit();
         }
-        backward_elimination::eliminate(self)
+        Ok(())
     }
 
     /// Returns the index of a cause to eliminate after the joint refit, if any.
@@ -155,6 +154,8 @@ impl<'a> ForwardSelection<'a> {
         let place = trials.iter().position(earns_name);
         let accepted = place.map(|place| {
             let trial = trials.remove(place);
+            // What was rejected although it scores more is no alternative.
+            trials.retain(|other| other.score <= trial.score);
             CandidateFit { threshold: least(&trial), ..trial }
         });
         Ok(accepted.map(|best| (best, trials)))

@@ -9,7 +9,7 @@ use twinstep_identify::refine::information;
 use twinstep_model::{Joint, JointKind, NUM_JOINTS, Rollout};
 
 use super::DiagnoseError;
-use super::backward_elimination::evidence_beside_others;
+use super::backward_elimination::{self, evidence_beside_others};
 use super::cross_validation::{CandidateFit, FitProblem, cross_validate, cross_validate_together};
 use super::forward_selection::{Accepted, ForwardSelection, THRESHOLD};
 use super::hypothesis::Hypothesis;
@@ -53,6 +53,7 @@ pub fn extend(search: &mut ForwardSelection) -> Result<(), DiagnoseError> {
         eliminate_without_evidence(search);
         add_joints_that_differ(search)?;
         search.run()?;
+        backward_elimination::eliminate(search)?;
         eliminate_without_evidence(search);
         evidence_beside_others(search)?;
     }

@@ -137,6 +137,7 @@ pub fn diagnose(
         progress: &mut say,
     };
     search.run()?;
+    backward_elimination::eliminate(&mut search)?;
     friction_family::extend(&mut search)?;
     let ForwardSelection { view, mut accepted, model: named, .. } = search;
     let WindowedData { evidence, given } = &views[view];

@@ -219,3 +219,90 @@ fn shows(scope: Scope, channel: usize) -> bool {
     };
     scope.joints() == 0 || scope.contains(Joint::ALL[joint])
 }
+
+#[cfg(test)]
+mod tests {
+    use twinstep_identify::window::WindowConfig;
+    use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+    use twinstep_model::{BaseMount, Precision, RobotStates, RolloutRequest, go2};
+
+    use super::*;
+    use crate::cross_validation::cross_validate;
+    use crate::hypothesis::Hypothesis;
+
+    /// Rows of a block, which is a window of [`WindowConfig::DIAGNOSIS`].
+    const BLOCK: usize = 400;
+    /// Standard deviation of the measured positions [rad].
+    const NOISE: f64 = 0.001;
+
+    /// Positions of the first joint that are proportional to its viscous friction.
+    struct Linear;
+
+    fn position(friction: f64, row: usize) -> f64 {
+        0.05 * friction * (0.11 * row as f64).sin()
+    }
+
+    impl Rollout for Linear {
+        fn run(&mut self, jobs: &[RolloutRequest], _: Precision) -> Vec<RobotStates> {
+            let play = |job: &RolloutRequest| {
+                let mut states = RobotStates::new(job.commands.len() + 1);
+                for (row, q) in states.measured.q.iter_mut().enumerate() {
+                    q[0] = position(job.robot.joints[0].viscous_friction, row) as f32;
+                }
+                states
+            };
+            jobs.iter().map(play).collect()
+        }
+    }
+
+    /// Returns the data of a robot whose friction differs from block to block.
+    fn data(friction: impl Fn(usize) -> f64) -> ResidualData {
+        let rows = 20 * BLOCK;
+        let column = |name: &str, of: &dyn Fn(usize) -> f64| (name.to_owned(), (0..rows).map(of).collect());
+        let noise = |row: usize| 3.46 * NOISE * ((row * 7919 % 1009) as f64 / 1009.0 - 0.5);
+        // The first row of a window is the last row of the previous one.
+        let in_window = |row: usize| if row == 0 { 0 } else { (row - 1) % BLOCK + 1 };
+        let columns = [
+            column("t", &|row| row as f64 / 200.0),
+            column("q_FL_hip", &|row| position(friction(row.saturating_sub(1) / BLOCK), in_window(row)) + noise(row)),
+            column("q_cmd_FL_hip", &|_| 0.0),
+            column("kp", &|_| 25.0),
+            column("kd", &|_| 0.6),
+        ];
+        let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
+        let mut meta = Meta::new(200.0, TorqueSensor::None, segments);
+        meta.noise.insert("q_FL_hip".to_owned(), NOISE);
+        let log = Log::new(meta, columns).expect("a log");
+        ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
+    }
+
+    /// Returns the score of viscous friction, and its threshold.
+    fn score_and_threshold(data: &ResidualData) -> [f64; 2] {
+        let effect = Effect::named("viscous_friction").expect("in the catalogue");
+        let hypothesis = Hypothesis { effect, scope: Scope::Joint(Joint::ALL[0]), values: vec![0.1] };
+        let before = data.residual_power(&mut Linear, &go2());
+        let model = ModelFile::default();
+        let found = cross_validate(data, &model, &before, &hypothesis, &mut Linear).expect("a robot");
+        let with_best = with_effect(&model, effect, &found.hypothesis.values).expect("allowed");
+        [found.score, thresholds(data, &with_best, &mut Linear).of(effect)]
+    }
+
+    #[test]
+    fn noise_needs_the_lowest_threshold_and_does_not_reach_it() {
+        let [score, threshold] = score_and_threshold(&data(|_| 0.0));
+        assert!(threshold == LOWEST_THRESHOLD && score < threshold, "{score} {threshold}");
+    }
+
+    #[test]
+    fn friction_that_all_blocks_have_in_common_exceeds_the_threshold() {
+        let [score, threshold] = score_and_threshold(&data(|_| 0.4));
+        assert!(score > 5.0 * threshold, "{score} {threshold}");
+    }
+
+    #[test]
+    fn error_that_differs_from_block_to_block_does_not_exceed_its_threshold() {
+        // Friction in a third of the blocks, the opposite in another third: what a wrong contact law may leave.
+        let [score, threshold] = score_and_threshold(&data(|block| [0.4, 0.0, -0.4][block * block % 3]));
+        assert!(threshold > 2.0 * LOWEST_THRESHOLD && score < threshold, "{score} {threshold}");
+    }
+}

@@ -54,7 +54,11 @@ impl ResidualData {
             experiment.clone().filter_rows(|row| split.fold(row).is_some())
         };
         let whole: Vec<Experiment> = splits.iter().zip(&experiments).map(of_folds).collect();
-        let quick = whole.iter().cloned().map(Experiment::prefer_fixed_base).collect();
+        let quick = if whole.iter().any(Experiment::has_fixed_base) {
+            whole.iter().cloned().map(Experiment::only_fixed_base).collect()
+        } else {
+            whole.clone()
+        };
         Ok(Self {
             torques: logs.iter().map(|log| MeasuredTorque::new(log, robot)).collect::<Result<_, _>>()?,
             fit_rows: ResidualRows::new(&splits, whole),

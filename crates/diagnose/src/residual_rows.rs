@@ -43,7 +43,7 @@ impl ResidualRows {
         let (mut cells, mut folds, mut blocks, mut dynamic) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         let mut first_block = 0;
         for (split, experiment) in splits.iter().zip(&experiments) {
-            dynamic.extend(experiment.groups().into_iter().map(|group| Experiment::regime(group) == Regime::Dynamic));
+            dynamic.extend(experiment.dynamic_residuals());
             let block = |row: usize| split.block(row).map(|block| first_block + block);
             blocks.extend(experiment.residual_index().map(|(_, row)| block(row)));
             folds.extend(experiment.residual_index().map(|(_, row)| split.fold(row)));

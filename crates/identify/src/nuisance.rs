@@ -50,25 +50,29 @@ struct NuisanceBlock {
     /// an elimination, which reads it twice.
     jacobian: DMatrix<f32>,
     factor: Cholesky<f64, Dyn>,
+    /// False if sizes have no penalty.
+    costs: bool,
 }
 
 impl NuisanceBlock {
     fn new(rows: Vec<usize>, jacobian: DMatrix<f64>) -> Option<Self> {
         let prior = DMatrix::identity(jacobian.ncols(), jacobian.ncols()) * CORRELATION_ROWS;
         let factor = (jacobian.tr_mul(&jacobian) + prior).cholesky()?;
-        Some(Self { rows, jacobian: jacobian.map(|slope| slope as f32), factor })
+        Some(Self { rows, jacobian: jacobian.map(|slope| slope as f32), factor, costs: true })
     }
 
-    /// Subtracts the effect of the estimated nuisance parameters, and appends their penalties to the residuals.
-    fn eliminate(&self, residuals: &mut Vec<f64>) {
+    /// Subtracts the effect of the estimated nuisance parameters, each at most `largest` [prior std], and appends their
+    /// penalties to the residuals.
+    fn eliminate(&self, residuals: &mut Vec<f64>, largest: f64) {
         let own = DVector::from_iterator(self.rows.len(), self.rows.iter().map(|row| residuals[*row] as f32));
         let sizes = self.factor.solve(&self.jacobian.tr_mul(&own).map(f64::from));
-        let sizes = sizes.map(|size| size.clamp(-LARGEST, LARGEST));
+        let sizes = sizes.map(|size| size.clamp(-largest, largest));
         let explained = &self.jacobian * sizes.map(|size| size as f32);
         for (row, value) in self.rows.iter().zip(&explained) {
             residuals[*row] -= f64::from(*value);
         }
-        residuals.extend(sizes.iter().map(|size| size * CORRELATION_ROWS.sqrt()));
+        let penalty = if self.costs { CORRELATION_ROWS.sqrt() } else { 0.0 };
+        residuals.extend(sizes.iter().map(|size| size * penalty));
     }
 
     fn rescaled(&self, spread: &[f64]) -> Option<Self> {
@@ -76,7 +80,7 @@ impl NuisanceBlock {
         for (mut derivative, row) in jacobian.row_iter_mut().zip(&self.rows) {
             derivative /= spread[*row];
         }
-        Self::new(self.rows.clone(), jacobian)
+        Some(Self { costs: self.costs, ..Self::new(self.rows.clone(), jacobian)? })
     }
 }
 
@@ -93,6 +97,11 @@ impl NuisanceModel {
                 column.extend(half_difference(&ends[0], &ends[1]));
             }
         }
+        // Where the robot walks, contact events would decide the sizes.
+        let dynamic: Vec<bool> = experiments.iter().flat_map(Experiment::dynamic_residuals).collect();
+        for column in &mut columns {
+            column.iter_mut().zip(&dynamic).filter(|(_, dynamic)| **dynamic).for_each(|(slope, _)| *slope = 0.0);
+        }
         let jacobian = DMatrix::from_iterator(columns[0].len(), NUM_NUISANCE, columns.into_iter().flatten());
         jacobian.iter().all(|derivative| derivative.is_finite()).then(|| Self::of(starts, jacobian)).flatten()
     }
@@ -101,7 +110,7 @@ impl NuisanceModel {
         let corrected = jacobian.column_iter().map(|column| {
             let mut column = column.iter().copied().collect();
             for start in &starts {
-                start.eliminate(&mut column);
+                start.eliminate(&mut column, f64::INFINITY);
             }
             DVector::from_vec(column)
         });
@@ -136,10 +145,10 @@ impl NuisanceModel {
 
     /// Eliminates all nuisance parameters from the residuals, and appends their penalties.
     ///
-    /// The sum of squares of the result is the generalised least-squares cost.
+    /// The sum of squares of the result is the generalised least-squares cost, if no parameter is larger than [`LARGEST`].
     pub fn project_out(&self, residuals: &mut Vec<f64>) {
         for errors in self.starts.iter().chain([&self.robot]) {
-            errors.eliminate(residuals);
+            errors.eliminate(residuals, LARGEST);
         }
     }
 
@@ -173,9 +182,12 @@ fn starts(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Ro
         if columns.iter().flatten().any(|derivative| !derivative.is_finite()) {
             return None;
         }
+        let dynamic = experiment.dynamic_residuals();
         for rows in experiment.free_windows() {
             let jacobian = DMatrix::from_fn(rows.len(), columns.len(), |row, column| columns[column][rows[row]]);
-            starts.push(NuisanceBlock::new(rows.into_iter().map(|row| first + row).collect(), jacobian)?);
+            let costs = !dynamic[rows[0]];
+            let block = NuisanceBlock::new(rows.into_iter().map(|row| first + row).collect(), jacobian)?;
+            starts.push(NuisanceBlock { costs, ..block });
         }
         first += columns[0].len();
     }

@@ -99,13 +99,16 @@ impl Experiment {
         self
     }
 
-    /// Returns the experiment restricted to windows with a fixed base, if there are any.
+    /// Returns the experiment restricted to windows with a fixed base.
     #[must_use]
-    pub fn prefer_fixed_base(mut self) -> Self {
-        if self.windows.iter().any(|window| window.base.is_fixed()) {
-            self.windows.retain(|window| window.base.is_fixed());
-        }
+    pub fn only_fixed_base(mut self) -> Self {
+        self.windows.retain(|window| window.base.is_fixed());
         self
+    }
+
+    /// Returns true if a window has a fixed base.
+    pub fn has_fixed_base(&self) -> bool {
+        self.windows.iter().any(|window| window.base.is_fixed())
     }
 
     /// Returns the experiment without joint velocities, which repeat the information of positions with more noise.

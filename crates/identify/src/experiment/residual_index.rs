@@ -40,6 +40,11 @@ impl Experiment {
         pairs.filter(|(window, own)| !window.base.is_fixed() && !own.is_empty()).map(|(_, own)| own).collect()
     }
 
+    /// Returns for every residual whether the robot walks, trots or jumps in a window that is marked as such.
+    pub fn dynamic_residuals(&self) -> Vec<bool> {
+        self.groups().into_iter().map(|group| Self::regime(group) == Regime::Dynamic).collect()
+    }
+
     /// Upper bound of the values of [`Experiment::groups`].
     pub const GROUPS: usize = 7 * REGIMES;
 
