@@ -46,6 +46,11 @@ fn ground_truth() -> RobotModel {
 ///
 /// It is simulated with the other engine and a smaller step.
 pub fn log_of(robot: &RobotModel) -> Log {
+    chirp_log(robot, 1600)
+}
+
+/// Returns the log of a robot with a fixed base whose joints follow a chirp over this number of rows of 5 ms.
+pub fn chirp_log(robot: &RobotModel, rows: u32) -> Log {
     let config = SimConfig {
         engine: Engine::Rapier,
         base: BaseMount::Fixed,
@@ -58,7 +63,7 @@ pub fn log_of(robot: &RobotModel) -> Log {
     backend.reset(&[(0, InitialState::at_rest(FIXED_BASE_HEIGHT as f32, pose))]).unwrap();
     let mut columns = BTreeMap::<String, Vec<f64>>::new();
     let mut random = stream(5, "noise", 0);
-    for row in 0..1600 {
+    for row in 0..rows {
         let t = f64::from(row) * 0.005;
         let phase = std::f64::consts::TAU * (0.4 + 0.15 * t) * t;
         let mut command = Command::hold(pose, 25.0, 0.6);
