@@ -1,6 +1,6 @@
 //! Threshold of the log-likelihood gain, from the log itself: what the best of all hypotheses gains if none is true.
 //!
-//! The residuals of the model with the best candidate are divided into blocks of two seconds, and each block is
+//! The residuals of the model with the best candidate are divided into the blocks of the folds, and each block is
 //! multiplied by +1 or −1 at random. Amplitudes, correlation times and outliers stay as they are; what all blocks have
 //! in common, as the trace of a cause would, is destroyed. Every hypothesis is then fitted to one fold and evaluated on
 //! the other, as in the search, with the residual's derivative in place of a simulation. The threshold is a quantile of
