@@ -72,7 +72,7 @@ impl ResidualData {
 
     /// Sets the nuisance parameters, linearised at `robot`, if a log has a floating base.
     ///
-    /// With a fixed base alone, a mass that is wrong and a friction that acts in one direction only cannot be told apart.
+    /// With a fixed base alone, a wrong mass imitates friction that acts in one direction only.
     pub fn set_nuisance_model(&mut self, robot: &RobotModel, simulator: &mut dyn Rollout) {
         if !self.has_free_parts() {
             return;
