@@ -24,7 +24,7 @@ fn program() -> PathBuf {
 struct Viewed {
     child: std::process::Child,
     url: String,
-    /// First line on stdout of a server; empty for other commands.
+    /// First line on stdout of a server; empty for other commands. The rest is not read: stdout is closed.
     first_line: String,
 }
 
@@ -288,7 +288,9 @@ fn sliders_of_the_page_steer_a_run_and_nothing_else_of_it_can_be_changed() {
 
 #[test]
 fn robot_is_seen_without_a_client() {
-    let viewed = Viewed::start(&["robot", "--fake", "--listen", "tcp/127.0.0.1:0", "--view", "127.0.0.1:0"]);
+    let mut viewed = Viewed::start(&["robot", "--fake", "--listen", "tcp/127.0.0.1:0", "--view", "127.0.0.1:0"]);
+    // Nobody reads its stdout any more, which must not end a process that holds a robot.
+    viewed.child.stdin.as_mut().unwrap().write_all(b"status\n").unwrap();
     viewed
         .wait_for_frame(|header| header["curves"]["supply voltage [V]"].as_f64().is_some_and(|voltage| voltage > 20.0));
     assert!(viewed.ask(r#"{"velocity":[0.5,0,0]}"#).starts_with("HTTP/1.1 409"), "it is looked at only");

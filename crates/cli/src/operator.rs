@@ -33,14 +33,19 @@ pub fn listen(handle: &RobotHandle) -> std::sync::mpsc::Receiver<()> {
                     let _ = quit.send(());
                     return;
                 }
-                request => println!("{}", answer(&handle, request)),
+                request => print_line(&answer(&handle, request)),
             }
-            let _ = std::io::stdout().flush();
         }
         // The robot stays as it is without an operator's terminal; signals still end it.
         std::mem::forget(quit);
     });
     quits
+}
+
+/// Prints a line to stdout. A reader that is gone must not end the process, because the process holds the robot.
+pub fn print_line(line: &str) {
+    let mut stdout = std::io::stdout().lock();
+    let _ = writeln!(stdout, "{line}").and_then(|()| stdout.flush());
 }
 
 /// Executes a request and returns the answer, which begins with `ok` or `error`.

@@ -1,6 +1,5 @@
 //! `twinstep robot`: the real Go2 behind the protocol of the simulation server.
 
-use std::io::Write;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -207,7 +206,7 @@ fn watch_robot(
     let result = if operator_screen::is_possible() {
         operator_screen::run(handle, torque_limits, place, clients, signals)
     } else {
-        println!("{place}");
+        operator::print_line(place);
         print_states(handle, signals)
     };
     handle.stop();
@@ -223,8 +222,7 @@ fn print_states(handle: &RobotHandle, signals: &Signals) -> CommandResult {
         let board = handle.board();
         let line = operator::state_line(&board);
         if line != shown {
-            println!("{line}");
-            std::io::stdout().flush().map_err(other)?;
+            operator::print_line(&line);
             shown = line;
         }
         match signals.check() {
