@@ -3,8 +3,8 @@
 use rand::RngExt;
 use twinstep_effects::{ActuatorNetworkConfig, MemberSampling};
 use twinstep_model::{
-    Actuator, ActuatorSnapshot, BackendError, Command, EpistemicUncertainty, JOINT_NAMES, Measured, NUM_JOINTS,
-    PerJoint, Stream, standard_normal, stream,
+    Actuator, ActuatorMode, ActuatorSnapshot, BackendError, Command, EpistemicUncertainty, JOINT_NAMES, Measured,
+    NUM_JOINTS, PerJoint, Stream, standard_normal, stream,
 };
 use twinstep_simd::InstructionSet;
 
@@ -13,9 +13,9 @@ use crate::kernel::Heads;
 use crate::member_batch::{MemberBatch, MemberSlot, member_batch};
 use crate::normaliser::Normalisers;
 
-/// Actuators of many robots, simulated with an ensemble. One member computes the torques of a robot.
+/// Actuators of many robots, simulated with an ensemble. One member computes the torques of a robot, or all of them.
 ///
-/// The input is ξ, computed from the encoder readings. The torques of a robot depend only on its own history and seed.
+/// The input is computed from commands and encoder readings. The torques of a robot depend only on its own history and seed.
 /// They are bitwise equal to those of a single robot, on any processor and for any number of threads.
 pub struct ActuatorNetwork {
     networks: Box<dyn MemberBatch>,
@@ -24,11 +24,15 @@ pub struct ActuatorNetwork {
     sample: bool,
     /// True if every member receives the inputs of every robot. The slot of a robot is then its index.
     feed_all_members: bool,
+    combination: Combination,
+    mode: ActuatorMode,
+    /// Time step of the networks [actuator periods], at least 1.
+    periods: f64,
     scales: Normalisers,
     /// Calibrated factor of the normalised variances.
     variance_scale: f64,
-    /// kp [N·m/rad] and kd [N·m·s/rad].
-    gains: [f32; 2],
+    /// kp [N·m/rad] and kd [N·m·s/rad] of the training data; `None` if the torque that was asked for is the input.
+    gains: Option<[f32; 2]>,
     /// Maximum torque [N·m]; infinite if the torque includes friction and rotor inertia.
     limits: PerJoint,
     robots: Vec<Robot>,
@@ -36,45 +40,72 @@ pub struct ActuatorNetwork {
     robots_by_member: Vec<Vec<usize>>,
 }
 
+/// Which members compute the torque of a robot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Combination {
+    /// One member at a time.
+    OneMember,
+    /// One member at a time; the others receive the same inputs, as [`EpistemicUncertainty`] requires.
+    OneMemberOfAll,
+    /// The mean of all members, the best prediction.
+    Mean,
+}
+
+/// How an ensemble is used by robots.
+pub(crate) struct NetworkUse {
+    pub combination: Combination,
+    pub mode: ActuatorMode,
+    /// Maximum torque of each joint [N·m].
+    pub limits: PerJoint,
+    /// Actuator period of the robots [s].
+    pub actuator_dt: f64,
+}
+
 #[derive(Clone)]
 struct Robot {
     random: Stream,
     member: usize,
     slot: usize,
+    /// Time until the networks are due [actuator periods]. They are due below half a period.
+    until_due: f64,
+    /// The last torque of the networks [N·m].
+    torque: PerJoint,
 }
 
 /// Actuator state of one robot.
 struct NetworkSnapshot {
     random: Stream,
     member: usize,
+    until_due: f64,
+    torque: PerJoint,
     /// State of the robot's member, or of all members if `feed_all_members`.
     states: Vec<Vec<f32>>,
 }
 
 impl ActuatorNetwork {
     /// Creates the actuators of `num_robots` robots, each with the seed 0.
-    ///
-    /// With `run_all_members` every member receives all inputs, as [`EpistemicUncertainty`] requires.
     pub(crate) fn new(
         ensemble: &Ensemble,
         settings: &ActuatorNetworkConfig,
-        run_all_members: bool,
-        limits: PerJoint,
+        NetworkUse { combination, mode, limits, actuator_dt }: NetworkUse,
         num_robots: usize,
         instructions: InstructionSet,
     ) -> Self {
         let model = &ensemble.description;
-        let all = run_all_members || settings.draw == MemberSampling::PerStep;
-        let initial = Robot { random: stream(0, "drives", 0), member: 0, slot: 0 };
+        let all = combination != Combination::OneMember || settings.draw == MemberSampling::PerStep;
+        let initial = Robot { random: stream(0, "drives", 0), member: 0, slot: 0, until_due: 0.0, torque: [0.0; 12] };
         let mut this = Self {
             networks: member_batch(ensemble, instructions),
             members: model.members,
             draw: settings.draw,
             sample: settings.sample,
             feed_all_members: all,
+            combination,
+            mode,
+            periods: (model.dt / actuator_dt).max(1.0),
             scales: model.scales,
             variance_scale: model.variance_scale,
-            gains: model.gains[0].map(|gain| gain as f32),
+            gains: model.gains.first().map(|gains| gains.map(|gain| gain as f32)),
             limits,
             robots: vec![initial; num_robots],
             robots_by_member: vec![Vec::new(); model.members],
@@ -130,13 +161,14 @@ impl ActuatorNetwork {
         self.networks.grow(member, robots.len());
     }
 
-    /// Checks that the commands have the gains of the training data and no feed-forward torque.
+    /// Checks that the commands have the gains of the training data and no feed-forward torque, unless the networks serve
+    /// all gains.
     fn check(&self, commands: &[Command], active: &[bool]) -> Result<(), BackendError> {
-        let [kp, kd] = self.gains;
+        let Some(gains @ [kp, kd]) = self.gains else { return Ok(()) };
         for (robot, command) in commands.iter().enumerate().filter(|(robot, _)| active[*robot]) {
             let reason = |joint: usize| {
                 let (given, name) = ([command.kp[joint], command.kd[joint]], JOINT_NAMES[joint]);
-                if given != self.gains {
+                if given != gains {
                     return format!("the actuator network supports only kp {kp} and kd {kd}; {name} has {given:?}");
                 }
                 format!("the actuator network does not support `tau_ff`; {name} has {}", command.tau_ff[joint])
@@ -150,20 +182,40 @@ impl ActuatorNetwork {
         Ok(())
     }
 
-    /// Returns the normalised ξ of a robot.
-    fn errors(&self, command: &Command, q: &PerJoint, dq: &PerJoint) -> [[f32; 2]; NUM_JOINTS] {
-        let [position, velocity] = self.scales.errors;
+    /// Returns the normalised input of the networks of a robot.
+    fn inputs(&self, command: &Command, q: &PerJoint, dq: &PerJoint) -> [[f32; 2]; NUM_JOINTS] {
+        let [first, second] = self.scales.inputs;
         std::array::from_fn(|joint| {
-            [
-                position.normalise(f64::from(command.q[joint]) - f64::from(q[joint])),
-                velocity.normalise(f64::from(command.dq[joint]) - f64::from(dq[joint])),
-            ]
+            let at = |values: &PerJoint| f64::from(values[joint]);
+            let [q_error, dq_error] = [at(&command.q) - at(q), at(&command.dq) - at(dq)];
+            let input = match self.gains {
+                Some(_) => [q_error, dq_error],
+                None => [at(&command.kp) * q_error + at(&command.kd) * dq_error + at(&command.tau_ff), at(dq)],
+            };
+            [first.normalise(input[0]), second.normalise(input[1])]
+        })
+    }
+
+    /// Returns the mean torque of all members of a robot, from their last outputs [N·m].
+    fn mean_torque(&self, robot: usize) -> PerJoint {
+        let mut sum = [0.0; NUM_JOINTS];
+        for slot in self.fed_slots(robot) {
+            let [means, _] = self.networks.output(slot);
+            sum.iter_mut().zip(means).for_each(|(sum, mean)| *sum += f64::from(mean) / self.members as f64);
+        }
+        let scale = self.scales.torque;
+        std::array::from_fn(|joint| {
+            let limit = self.limits[joint];
+            ((scale.mean + scale.std * sum[joint]) as f32).clamp(-limit, limit)
         })
     }
 
     /// Returns the torque of a robot, from the last output of its member [N·m].
     fn torque(&mut self, robot: usize) -> PerJoint {
-        let Robot { member, slot, random } = &mut self.robots[robot];
+        if self.combination == Combination::Mean {
+            return self.mean_torque(robot);
+        }
+        let Robot { member, slot, random, .. } = &mut self.robots[robot];
         let [means, variances] = self.networks.output(MemberSlot { member: *member, slot: *slot });
         let scale = self.scales.torque;
         std::array::from_fn(|joint| {
@@ -178,6 +230,10 @@ impl ActuatorNetwork {
 }
 
 impl Actuator for ActuatorNetwork {
+    fn mode(&self) -> ActuatorMode {
+        self.mode
+    }
+
     fn torques(
         &mut self,
         commands: &[Command],
@@ -187,24 +243,32 @@ impl Actuator for ActuatorNetwork {
     ) -> Result<(), BackendError> {
         self.check(commands, active)?;
         let robots = || (0..active.len()).filter(|robot| active[*robot]);
-        for robot in robots() {
+        let due: Vec<bool> = self.robots.iter().map(|robot| robot.until_due < 0.5).collect();
+        for robot in robots().filter(|robot| due[*robot]) {
             if self.draw == MemberSampling::PerStep {
                 self.robots[robot].member = self.robots[robot].random.random_range(0..self.members);
             }
-            let errors = self.errors(&commands[robot], &measured.q[robot], &measured.dq[robot]);
+            let inputs = self.inputs(&commands[robot], &measured.q[robot], &measured.dq[robot]);
             for slot in self.fed_slots(robot) {
-                self.networks.push_input(slot, &errors, slot.member == self.robots[robot].member);
+                let is_used = self.combination == Combination::Mean || slot.member == self.robots[robot].member;
+                self.networks.push_input(slot, &inputs, is_used);
             }
         }
         self.networks.advance(if self.sample { Heads::Both } else { Heads::Mean });
         for robot in robots() {
-            tau[robot] = self.torque(robot);
+            if due[robot] {
+                self.robots[robot].torque = self.torque(robot);
+                self.robots[robot].until_due += self.periods;
+            }
+            self.robots[robot].until_due -= 1.0;
+            tau[robot] = self.robots[robot].torque;
         }
         Ok(())
     }
 
     fn reset(&mut self, robot: usize, seed: u64) {
         self.robots[robot].random = stream(seed, "drives", 0);
+        (self.robots[robot].until_due, self.robots[robot].torque) = (0.0, [0.0; NUM_JOINTS]);
         if self.draw == MemberSampling::PerEpisode {
             let member = self.robots[robot].random.random_range(0..self.members);
             self.reassign(robot, member);
@@ -215,14 +279,16 @@ impl Actuator for ActuatorNetwork {
     }
 
     fn snapshot(&self, robot: usize) -> ActuatorSnapshot {
-        let Robot { random, member, .. } = self.robots[robot].clone();
+        let Robot { random, member, until_due, torque, .. } = self.robots[robot].clone();
         let states = self.fed_slots(robot).map(|slot| self.networks.state(slot)).collect();
-        ActuatorSnapshot::new(NetworkSnapshot { random, member, states })
+        ActuatorSnapshot::new(NetworkSnapshot { random, member, until_due, torque, states })
     }
 
     fn restore(&mut self, robot: usize, snapshot: &ActuatorSnapshot) {
-        let NetworkSnapshot { random, member, states } = snapshot.get().expect("a snapshot of the same ensemble");
+        let NetworkSnapshot { random, member, until_due, torque, states } =
+            snapshot.get().expect("a snapshot of the same ensemble");
         self.robots[robot].random = random.clone();
+        (self.robots[robot].until_due, self.robots[robot].torque) = (*until_due, *torque);
         self.reassign(robot, *member);
         for (slot, state) in self.fed_slots(robot).zip(states) {
             self.networks.set_state(slot, state);
@@ -249,11 +315,11 @@ impl EpistemicUncertainty for ActuatorNetwork {
 #[cfg(test)]
 mod tests {
     use twinstep_logs::TorqueSensor;
-    use twinstep_model::RobotStates;
+    use twinstep_model::{ActuatorTap, RobotStates};
 
     use super::*;
     use crate::inference::Inference;
-    use crate::metadata::{EnsembleMetadata, JointEncoding};
+    use crate::metadata::{EnsembleMetadata, JointEncoding, NetworkInput, NetworkTarget};
     use crate::normaliser::Normaliser;
 
     fn ensemble(members: usize) -> Ensemble {
@@ -264,7 +330,9 @@ mod tests {
             dt: 0.005,
             joints: JOINT_NAMES.map(str::to_owned).to_vec(),
             joint_input: JointEncoding::Identity,
-            scales: Normalisers { errors: [scale(0.01, 0.1), scale(0.2, 2.0)], torque: scale(1.5, 10.0) },
+            input: NetworkInput::Errors,
+            target: NetworkTarget::Torque,
+            scales: Normalisers { inputs: [scale(0.01, 0.1), scale(0.2, 2.0)], torque: scale(1.5, 10.0) },
             tau_sensor: TorqueSensor::MotorCurrent,
             gains: vec![[30.0, 0.75]; 12],
             variance_scale: 0.2,
@@ -273,10 +341,15 @@ mod tests {
         })
     }
 
+    fn used(actuator_dt: f64) -> NetworkUse {
+        let (combination, mode) = (Combination::OneMember, ActuatorMode::Replace(ActuatorTap::Current));
+        NetworkUse { combination, mode, limits: [9.0; 12], actuator_dt }
+    }
+
     fn actuators(members: usize, draw: MemberSampling, sample: bool, robots: usize) -> ActuatorNetwork {
-        let settings = ActuatorNetworkConfig { ensemble: "".into(), draw, sample };
+        let settings = ActuatorNetworkConfig { draw, sample, ..ActuatorNetworkConfig::default() };
         let mut actuators =
-            ActuatorNetwork::new(&ensemble(members), &settings, false, [9.0; 12], robots, InstructionSet::best());
+            ActuatorNetwork::new(&ensemble(members), &settings, used(0.005), robots, InstructionSet::best());
         (0..robots).for_each(|robot| actuators.reset(robot, robot as u64));
         actuators
     }
@@ -350,6 +423,29 @@ mod tests {
             assert!(mean.abs() < 5.0 * (expected.variance / ROBOTS as f64).sqrt(), "{joint}: {mean}");
             let error = 5.0 * (2.0 / ROBOTS as f64).sqrt();
             assert!((variance / expected.variance - 1.0).abs() < error, "{joint}: {variance} {}", expected.variance);
+        }
+    }
+
+    #[test]
+    fn networks_are_evaluated_at_their_own_rate_and_hold_the_torque_in_between() {
+        let settings = ActuatorNetworkConfig::default();
+        let mut fast = ActuatorNetwork::new(&ensemble(1), &settings, used(0.002), 1, InstructionSet::best());
+        fast.reset(0, 3);
+        let held: Vec<PerJoint> = (0..10).map(|_| torques(&mut fast, 1)[0]).collect();
+        let changes: Vec<usize> = (1..10).filter(|row| held[*row] != held[row - 1]).collect();
+        // A step of 5 ms is two and a half periods of 2 ms.
+        assert_eq!(changes, [3, 5, 8]);
+    }
+
+    #[test]
+    fn mean_of_all_members_is_the_best_prediction() {
+        let settings = ActuatorNetworkConfig::default();
+        let mean = NetworkUse { combination: Combination::Mean, limits: [f32::INFINITY; 12], ..used(0.005) };
+        let mut actuators = ActuatorNetwork::new(&ensemble(3), &settings, mean, 1, InstructionSet::best());
+        let (found, members) = (torques(&mut actuators, 0)[0], expected(3, 0));
+        for (joint, found) in found.iter().enumerate() {
+            let mean = members.iter().map(|member| member[joint].mean / 3.0).sum::<f64>();
+            assert!((f64::from(*found) - mean).abs() < 1e-5, "{joint}: {found} {mean}");
         }
     }
 

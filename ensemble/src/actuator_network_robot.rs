@@ -1,15 +1,16 @@
-//! The robot of a model file whose actuators are replaced by an ensemble, with a check of the remaining effects.
+//! The robot of a model file whose actuators an ensemble replaces or completes, with a check of the other effects.
 
 use twinstep_effects::EffectEntry;
-use twinstep_effects::{ActuatorNetworkConfig, ModelFile};
-use twinstep_logs::TorqueSensor;
-use twinstep_model::{JOINT_NAMES, RobotModel};
+use twinstep_effects::{ActuatorNetworkConfig, ModelFile, NetworkMode};
+use twinstep_logs::replay::at_log_rate;
+use twinstep_logs::{Log, TorqueSensor};
+use twinstep_model::{ActuatorMode, ActuatorTap, JOINT_NAMES, RobotModel};
 use twinstep_simd::InstructionSet;
 
 use crate::EnsembleError;
-use crate::actuator_network::ActuatorNetwork;
+use crate::actuator_network::{ActuatorNetwork, Combination, NetworkUse};
 use crate::ensemble::Ensemble;
-use crate::metadata::JointEncoding;
+use crate::metadata::{JointEncoding, NetworkInput};
 
 /// Last stage of the actuator chain that an ensemble replaces, for a motor-current sensor and a joint-output sensor.
 const LAST_REPLACED_STAGE: [u32; 2] = [9, 14];
@@ -17,7 +18,7 @@ const LAST_REPLACED_STAGE: [u32; 2] = [9, 14];
 /// A robot with actuator networks.
 #[derive(Clone, Debug)]
 pub struct ActuatorNetworkRobot {
-    /// The robot without the replaced stages. Its gains are those of the training data.
+    /// The robot without the replaced stages. Its gains are those of the training data, if the networks know only these.
     pub robot: RobotModel,
     ensemble: Ensemble,
     settings: ActuatorNetworkConfig,
@@ -30,21 +31,27 @@ impl ActuatorNetworkRobot {
         Self::new(file, Ensemble::read(&settings.ensemble)?, settings.clone()).map(Some)
     }
 
-    /// Replaces the actuators of the robot of `file` by `ensemble`.
+    /// Replaces or completes the actuators of the robot of `file` by `ensemble`.
     ///
     /// # Panics
     /// If the effects of the file are not compatible, which reading a model file checks.
     pub fn new(file: &ModelFile, ensemble: Ensemble, settings: ActuatorNetworkConfig) -> Result<Self, EnsembleError> {
         let mut robot = file.robot_model().expect("the model file was checked when it was read");
         let model = &ensemble.description;
-        ensemble.check_step("the robot's actuator", robot.control.actuator_dt())?;
-        [robot.control.kp, robot.control.kd] = model.uniform_gains()?;
+        ensemble.check_rate("the robot's actuator", robot.control.actuator_dt())?;
+        model.check_mode(settings.mode)?;
+        if model.input == NetworkInput::Errors {
+            [robot.control.kp, robot.control.kd] = model.uniform_gains()?;
+        }
         let unknown = (0..JOINT_NAMES.len()).find(|joint| model.one_hot_index(*joint).is_none());
         if let Some(joint) = unknown.filter(|_| model.joint_input == JointEncoding::Identity) {
             return Err(EnsembleError::UnknownJoint { joint: JOINT_NAMES[joint] });
         }
-        check_effects(file, model.tau_sensor)?;
-        if model.tau_sensor == TorqueSensor::JointOutput {
+        let replaces = settings.mode == NetworkMode::Replace;
+        if replaces {
+            check_effects(file, model.tau_sensor)?;
+        }
+        if replaces && model.tau_sensor == TorqueSensor::JointOutput {
             // The training data contain the torque of the rotor inertia.
             robot.joints.iter_mut().for_each(|joint| joint.armature = 0.0);
         }
@@ -58,6 +65,20 @@ impl ActuatorNetworkRobot {
         self.actuators_with(num_robots, run_all_members, InstructionSet::best())
     }
 
+    /// Returns actuators of `num_robots` robots that apply the mean of all members, the best prediction, at the actuator
+    /// rate of `robot`.
+    pub fn mean_actuators(&self, num_robots: usize, robot: &RobotModel) -> ActuatorNetwork {
+        self.create(num_robots, Combination::Mean, robot.control.actuator_dt(), InstructionSet::best())
+    }
+
+    /// Returns the same robot with actuators at `actuator_hz` [Hz], not slower than the networks.
+    pub fn at_rate(&self, actuator_hz: f64) -> Result<Self, EnsembleError> {
+        let mut this = self.clone();
+        this.robot.control.actuator_hz = actuator_hz;
+        this.ensemble.check_rate("the robot's actuator", this.robot.control.actuator_dt())?;
+        Ok(this)
+    }
+
     /// Returns actuators like [`ActuatorNetworkRobot::actuators`] on a given instruction set.
     ///
     /// # Panics
@@ -68,17 +89,73 @@ impl ActuatorNetworkRobot {
         run_all_members: bool,
         instructions: InstructionSet,
     ) -> ActuatorNetwork {
+        let combination = if run_all_members { Combination::OneMemberOfAll } else { Combination::OneMember };
+        self.create(num_robots, combination, self.robot.control.actuator_dt(), instructions)
+    }
+
+    fn create(
+        &self,
+        num_robots: usize,
+        combination: Combination,
+        actuator_dt: f64,
+        instructions: InstructionSet,
+    ) -> ActuatorNetwork {
+        let sensor = self.ensemble.description.tau_sensor;
         // The torque at the joint output can exceed that of the motor because of the rotor inertia.
-        let limits = match self.ensemble.description.tau_sensor {
+        let limits = match sensor {
             TorqueSensor::JointOutput => [f32::INFINITY; 12],
             TorqueSensor::MotorCurrent | TorqueSensor::None => self.robot.torque_limits(),
         };
-        ActuatorNetwork::new(&self.ensemble, &self.settings, run_all_members, limits, num_robots, instructions)
+        let tap = match sensor {
+            TorqueSensor::JointOutput => ActuatorTap::Output,
+            TorqueSensor::MotorCurrent | TorqueSensor::None => ActuatorTap::Current,
+        };
+        let mode = match self.settings.mode {
+            NetworkMode::Replace => ActuatorMode::Replace(tap),
+            NetworkMode::Residual => ActuatorMode::AddAt(tap),
+        };
+        let used = NetworkUse { combination, mode, limits, actuator_dt };
+        ActuatorNetwork::new(&self.ensemble, &self.settings, used, num_robots, instructions)
+    }
+
+    /// Returns whether the ensemble replaces the actuators or is added to them.
+    pub fn mode(&self) -> NetworkMode {
+        self.settings.mode
+    }
+
+    /// Returns true if the networks are valid for the gains of their training data only.
+    pub fn has_fixed_gains(&self) -> bool {
+        self.ensemble.description.input == NetworkInput::Errors
     }
 
     /// Returns true if the ensemble includes the rotor inertia. Every simulated robot must then have none.
     pub fn includes_rotor(&self) -> bool {
-        self.ensemble.description.tau_sensor == TorqueSensor::JointOutput
+        self.settings.mode == NetworkMode::Replace && self.ensemble.description.tau_sensor == TorqueSensor::JointOutput
+    }
+
+    /// Checks that the networks can be evaluated on the rows of a log: its rate, and its gains if they know only some.
+    ///
+    /// `name` is the log's name in errors.
+    pub fn check_log(&self, name: &str, log: &Log) -> Result<(), EnsembleError> {
+        if let Ok(robot) = at_log_rate(log, &self.robot) {
+            self.ensemble.check_rate(name, robot.control.actuator_dt())?;
+        }
+        if !self.has_fixed_gains() {
+            return Ok(());
+        }
+        let [kp, kd] = self.ensemble.description.uniform_gains()?;
+        for joint in log.joints() {
+            if let Some(row) = log.tau_ff(joint).and_then(|torque| torque.iter().position(|torque| *torque != 0.0)) {
+                return Err(EnsembleError::FeedForward { log: name.to_owned(), joint: joint.clone(), row });
+            }
+            let gains = |row| (log.kp(joint, row), log.kd(joint, row));
+            if let Some(row) = (0..log.rows()).find(|row| gains(*row) != (Some(kp), Some(kd))) {
+                let (kp, kd) = gains(row);
+                let [kp, kd] = [kp, kd].map(|gain| gain.unwrap_or(f64::NAN));
+                return Err(EnsembleError::GainsChange { log: name.to_owned(), joint: joint.clone(), row, kp, kd });
+            }
+        }
+        Ok(())
     }
 }
 

@@ -37,7 +37,7 @@ impl BurnInference {
     pub fn hear(&mut self, errors: &[[[f64; 2]; NUM_JOINTS]]) -> Vec<[Vec<f32>; 2]> {
         let rows = errors.len() * NUM_JOINTS;
         let mut inputs = vec![0.0; rows * self.inputs];
-        let [position, velocity] = self.scales.errors;
+        let [position, velocity] = self.scales.inputs;
         for (row, [q, dq]) in errors.iter().flatten().enumerate() {
             let input = &mut inputs[row * self.inputs..(row + 1) * self.inputs];
             (input[0], input[1]) = (position.normalise(*q), velocity.normalise(*dq));

@@ -6,6 +6,7 @@ use sha2::{Digest, Sha256};
 use twinstep_logs::{Log, TorqueSensor};
 
 use crate::EnsembleError;
+use crate::metadata::{NetworkInput, NetworkTarget};
 use crate::smooth::smoothed;
 
 /// Maximum length of a block [s]: long compared with an actuator's time constants, short compared with a motion.
@@ -37,9 +38,9 @@ pub struct Sequence {
     pub joint: usize,
     /// True if the actuator was reset just before, so that no burn-in is needed.
     pub after_reset: bool,
-    /// ξ = [q_cmd − q, dq_cmd − dq] of each row [rad, rad/s].
-    pub errors: Vec<[f64; 2]>,
-    /// Measured torque of each row, the mean until the next row [N·m].
+    /// The numbers of [`DataSet::input`] of each row.
+    pub inputs: Vec<[f64; 2]>,
+    /// Torque of each row, the mean until the next row [N·m].
     pub torques: Vec<f64>,
 }
 
@@ -56,21 +57,36 @@ pub struct DataSet {
     pub joints: Vec<String>,
     /// Location of the torque sensor.
     pub tau_sensor: TorqueSensor,
-    /// kp [N·m/rad] and kd [N·m·s/rad] of each joint.
+    /// kp [N·m/rad] and kd [N·m·s/rad] of each joint. Empty if the input is [`NetworkInput::Torque`].
     pub gains: Vec<[f64; 2]>,
+    /// The input of the networks.
+    pub input: NetworkInput,
+    /// Whether the torque of the logs is what was measured, or what a model lacks.
+    pub target: NetworkTarget,
     runs: Vec<(Split, Sequence)>,
 }
 
+/// What a [`DataSet`] contains.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct DataOptions {
+    /// Position, velocity and torque of the training split are smoothed: the amplitude at this frequency \[Hz] is halved.
+    /// Each sequence is smoothed separately.
+    pub smooth_hz: Option<f64>,
+    /// The input of the networks.
+    pub input: NetworkInput,
+    /// Whether the torque of the logs is what was measured, or what a model lacks.
+    pub target: NetworkTarget,
+}
+
 impl DataSet {
-    /// Creates the data set of `logs`, each with its name in errors.
+    /// Creates the data set of `logs` with default options, each with its name in errors.
     pub fn new(logs: &[(String, Log)]) -> Result<Self, EnsembleError> {
-        Self::smoothed(logs, None)
+        Self::with_options(logs, DataOptions::default())
     }
 
-    /// Creates a data set like [`DataSet::new`], with smoothed position, velocity and torque in the training split.
-    ///
-    /// Each sequence is smoothed separately. The amplitude at the frequency `hz` \[Hz] is halved.
-    pub fn smoothed(logs: &[(String, Log)], hz: Option<f64>) -> Result<Self, EnsembleError> {
+    /// Creates the data set of `logs`, each with its name in errors.
+    pub fn with_options(logs: &[(String, Log)], options: DataOptions) -> Result<Self, EnsembleError> {
+        let DataOptions { smooth_hz: hz, input, target } = options;
         let (first, first_log) = logs.first().ok_or(EnsembleError::TooShort { rows: 0, blocks: 0 })?;
         let tau_sensor = first_log.meta().tau_sensor;
         if tau_sensor == TorqueSensor::None {
@@ -80,7 +96,7 @@ impl DataSet {
         if let Some(given) = hz.filter(|hz| !(*hz > 0.0 && *hz < 0.5 / dt)) {
             return Err(EnsembleError::Smoothing { given, most: 0.5 / dt });
         }
-        let mut set = Self { dt, joints: Vec::new(), tau_sensor, gains: Vec::new(), runs: Vec::new() };
+        let mut set = Self { dt, joints: Vec::new(), tau_sensor, gains: Vec::new(), input, target, runs: Vec::new() };
         let rows: usize = logs.iter().map(|(_, log)| log.rows()).sum();
         let longest = ((LONGEST_BLOCK_S / dt) as usize).max(SHORTEST_BLOCK);
         let block_rows = (rows / (2 * CYCLE)).clamp(SHORTEST_BLOCK, longest);
@@ -123,9 +139,12 @@ impl DataSet {
         let mut hash = Sha256::new();
         hash.update(self.dt.to_le_bytes());
         hash.update(self.joints.join("\n"));
+        if (self.input, self.target) != Default::default() {
+            hash.update([self.input as u8, self.target as u8]);
+        }
         for (block, run) in &self.runs {
             hash.update([*block as u8, run.after_reset as u8, run.joint as u8]);
-            for number in run.errors.iter().flatten().chain(&run.torques) {
+            for number in run.inputs.iter().flatten().chain(&run.torques) {
                 hash.update(number.to_le_bytes());
             }
         }
@@ -152,22 +171,43 @@ impl DataSet {
             let (Some(torque), Some(q), Some(q_cmd)) = (log.tau_measured(joint), log.q(joint), log.q_cmd(joint)) else {
                 continue;
             };
-            if let Some(row) = log.tau_ff(joint).and_then(|torque| torque.iter().position(|torque| *torque != 0.0)) {
-                return Err(EnsembleError::FeedForward { log: name.to_owned(), joint: joint.clone(), row });
-            }
             let gains = |row| [log.kp(joint, row).unwrap_or(f64::NAN), log.kd(joint, row).unwrap_or(f64::NAN)];
             let index = self.joints.iter().position(|known| known == joint).unwrap_or_else(|| {
                 self.joints.push(joint.clone());
-                self.gains.push(gains(0));
                 self.joints.len() - 1
             });
-            if let Some(row) = (0..log.rows()).find(|row| gains(*row) != self.gains[index]) {
-                let [kp, kd] = gains(row);
-                return Err(EnsembleError::GainsChange { log: name.to_owned(), joint: joint.clone(), row, kp, kd });
-            }
-            all.push(Columns { joint: index, q, q_cmd, dq: log.dq(joint), dq_cmd: log.dq_cmd(joint), torque });
+            let asked = match self.input {
+                NetworkInput::Torque => {
+                    Some(AskedTorque { gains: (0..log.rows()).map(gains).collect(), tau_ff: log.tau_ff(joint) })
+                }
+                NetworkInput::Errors => {
+                    self.check_gains(name, log, joint, index)?;
+                    None
+                }
+            };
+            let (dq, dq_cmd) = (log.dq(joint), log.dq_cmd(joint));
+            all.push(Columns { joint: index, q, q_cmd, dq, dq_cmd, torque, asked });
         }
         if all.is_empty() { Err(EnsembleError::NoTorque { log: name.to_owned() }) } else { Ok(all) }
+    }
+
+    /// Checks that a joint has the gains of its first row in every row, and no feed-forward torque.
+    fn check_gains(&mut self, name: &str, log: &Log, joint: &str, index: usize) -> Result<(), EnsembleError> {
+        let (name, joint_name) = (name.to_owned(), joint.to_owned());
+        if let Some(row) = log.tau_ff(joint).and_then(|torque| torque.iter().position(|torque| *torque != 0.0)) {
+            return Err(EnsembleError::FeedForward { log: name, joint: joint_name, row });
+        }
+        let gains = |row| [log.kp(joint, row).unwrap_or(f64::NAN), log.kd(joint, row).unwrap_or(f64::NAN)];
+        if self.gains.len() == index {
+            self.gains.push(gains(0));
+        }
+        match (0..log.rows()).find(|row| gains(*row) != self.gains[index]) {
+            Some(row) => {
+                let [kp, kd] = gains(row);
+                Err(EnsembleError::GainsChange { log: name, joint: joint_name, row, kp, kd })
+            }
+            None => Ok(()),
+        }
     }
 
     /// Adds the sequences of a block.
@@ -180,19 +220,23 @@ impl DataSet {
         let follows = |row: usize| ((log.t()[row] - log.t()[row - 1]) / self.dt - 1.0).abs() <= JITTER;
         for column in columns {
             let error = |row| column.error(row, block, self.dt);
-            let usable = |row| error(row).iter().chain([&column.torque[row]]).all(|cell| cell.is_finite());
+            let usable = |row| {
+                let input = column.input(error(row), row);
+                error(row).iter().chain(&input).chain([&column.torque[row]]).all(|cell| cell.is_finite())
+            };
             for rows in contiguous_ranges(block.clone().filter(|row| usable(*row)), follows) {
                 let starts_part = place.starts_part && rows.start == block.start;
                 let mut run = Sequence {
                     log: place.log,
                     joint: column.joint,
                     after_reset: starts_part,
-                    errors: rows.clone().map(error).collect(),
+                    inputs: rows.clone().map(error).collect(),
                     torques: column.torque[rows.clone()].to_vec(),
                 };
                 if let Some(hz) = place.hz.filter(|_| role == Split::Training) {
-                    column.smooth(&mut run, rows, hz, self.dt);
+                    column.smooth(&mut run, rows.clone(), hz, self.dt);
                 }
+                run.inputs.iter_mut().zip(rows).for_each(|(input, row)| *input = column.input(*input, row));
                 self.runs.push((role, run));
             }
         }
@@ -220,9 +264,25 @@ struct Columns<'a> {
     dq: Option<&'a [f64]>,
     dq_cmd: Option<&'a [f64]>,
     torque: &'a [f64],
+    /// What the torque that was asked for consists of, if it is the input of the networks.
+    asked: Option<AskedTorque<'a>>,
+}
+
+/// Gains and feed-forward torque of a joint, by row.
+struct AskedTorque<'a> {
+    gains: Vec<[f64; 2]>,
+    tau_ff: Option<&'a [f64]>,
 }
 
 impl Columns<'_> {
+    /// Returns the input of the networks in `row`, given ξ.
+    fn input(&self, [q_error, dq_error]: [f64; 2], row: usize) -> [f64; 2] {
+        let Some(AskedTorque { gains, tau_ff }) = &self.asked else { return [q_error, dq_error] };
+        let [kp, kd] = gains[row];
+        let tau_ff = tau_ff.map_or(0.0, |tau_ff| tau_ff[row]);
+        [kp * q_error + kd * dq_error + tau_ff, self.dq_cmd.map_or(0.0, |dq_cmd| dq_cmd[row]) - dq_error]
+    }
+
     /// Returns ξ at `row`. A missing velocity is the difference of positions within `block`.
     fn error(&self, row: usize, block: &Range<usize>, dt: f64) -> [f64; 2] {
         let dq = self.dq.map_or_else(
@@ -242,8 +302,8 @@ impl Columns<'_> {
         for channel in 0..2 {
             let command = |row: usize| [Some(self.q_cmd), self.dq_cmd][channel].map_or(0.0, |cells| cells[row]);
             let state = |(error, row): (&[f64; 2], usize)| command(row) - error[channel];
-            let states: Vec<f64> = run.errors.iter().zip(rows.clone()).map(state).collect();
-            for ((error, state), row) in run.errors.iter_mut().zip(smoothed(&states, hz, dt)).zip(rows.clone()) {
+            let states: Vec<f64> = run.inputs.iter().zip(rows.clone()).map(state).collect();
+            for ((error, state), row) in run.inputs.iter_mut().zip(smoothed(&states, hz, dt)).zip(rows.clone()) {
                 error[channel] = command(row) - state;
             }
         }
@@ -274,13 +334,15 @@ pub mod tests {
     /// Standard deviation of the torque noise in [`log`] [N·m].
     pub const NOISE: f64 = 0.1;
 
+    /// Returns ξ in a row of [`log`].
+    fn error(row: usize) -> [f64; 2] {
+        let time = row as f64 * 0.005;
+        [0.1 * (7.0 * time).sin() + 0.05 * (23.0 * time).sin(), 0.3 * (11.0 * time).cos()]
+    }
+
     /// Returns the log of one joint in sinusoidal motion, whose actuator has a delay of one row.
     pub fn log(rows: usize, change: impl Fn(&mut Meta, &mut Vec<(String, Vec<f64>)>)) -> Log {
         let mut random = stream(3, "noise", 0);
-        let error = |row: usize| {
-            let time = row as f64 * 0.005;
-            [0.1 * (7.0 * time).sin() + 0.05 * (23.0 * time).sin(), 0.3 * (11.0 * time).cos()]
-        };
         let torque = |row: usize| {
             let [dq, ddq] = error(row.saturating_sub(1));
             20.0 * dq + 0.5 * ddq
@@ -311,6 +373,31 @@ pub mod tests {
 
     fn set(log: Log) -> Result<DataSet, EnsembleError> {
         DataSet::new(&[("here".to_owned(), log)])
+    }
+
+    fn smoothed_set(log: Log, hz: f64) -> Result<DataSet, EnsembleError> {
+        let options = DataOptions { smooth_hz: Some(hz), ..DataOptions::default() };
+        DataSet::with_options(&[("here".to_owned(), log)], options)
+    }
+
+    fn torque_set(log: Log) -> Result<DataSet, EnsembleError> {
+        let options = DataOptions { input: NetworkInput::Torque, ..DataOptions::default() };
+        DataSet::with_options(&[("here".to_owned(), log)], options)
+    }
+
+    #[test]
+    fn asked_torque_and_velocity_are_the_input_for_all_gains() {
+        let set = torque_set(log(2000, |meta, columns| {
+            meta.kp = None;
+            columns.push(("kp".to_owned(), (0..2000).map(|row| if row < 1000 { 20.0 } else { 40.0 }).collect()));
+            columns.push(("tau_ff_knee".to_owned(), vec![1.5; 2000]));
+        }))
+        .expect("a set");
+        let run = set.runs(Split::Training).last().expect("a sequence");
+        let (errors, torque) = (error(1890), run.inputs[90][0]);
+        assert!((torque - (40.0 * errors[0] + 0.5 * errors[1] + 1.5)).abs() < 1e-9, "{torque}");
+        assert_eq!(run.inputs[90][1], -errors[1], "the velocity of the joint");
+        assert!(set.gains.is_empty());
     }
 
     fn rows(set: &DataSet, block: Split) -> usize {
@@ -350,7 +437,7 @@ pub mod tests {
         .expect("a set");
         let [one, other] = [&with, &without].map(|set| set.runs(Split::Training).next().expect("a run").clone());
         for row in 1..99 {
-            assert!((one.errors[row][1] - other.errors[row][1]).abs() < 2e-4, "row {row}");
+            assert!((one.inputs[row][1] - other.inputs[row][1]).abs() < 2e-4, "row {row}");
         }
     }
 
@@ -362,7 +449,7 @@ pub mod tests {
             })
         };
         let raw = set(stepping()).expect("a set");
-        let smooth = DataSet::smoothed(&[("here".to_owned(), stepping())], Some(20.0)).expect("a set");
+        let smooth = smoothed_set(stepping(), 20.0).expect("a set");
         for block in [Split::Validation, Split::Test] {
             assert!(raw.runs(block).eq(smooth.runs(block)));
         }
@@ -374,10 +461,10 @@ pub mod tests {
         assert!(noise(&smooth) < 0.2 * noise(&raw), "{} of {}", noise(&smooth), noise(&raw));
         let step = |set: &DataSet| {
             let run = set.runs(Split::Training).next().expect("a run").clone();
-            run.errors[10][0] - run.errors[9][0]
+            run.inputs[10][0] - run.inputs[9][0]
         };
         assert!((step(&smooth) - step(&raw)).abs() < 0.01, "{} of {}", step(&smooth), step(&raw));
-        let error = DataSet::smoothed(&[("here".to_owned(), stepping())], Some(120.0)).expect_err("too high");
+        let error = smoothed_set(stepping(), 120.0).expect_err("too high");
         assert!(error.to_string().contains("120"), "{error}");
     }
 

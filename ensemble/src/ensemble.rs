@@ -12,6 +12,9 @@ use crate::weights::Weights;
 /// Number of sequences per batch in a prediction.
 const PREDICTION_BATCH: usize = 256;
 
+/// Relative difference of rates that are taken as equal.
+const RATE_TOLERANCE: f64 = 0.02;
+
 /// Predictive distribution of a torque.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gaussian {
@@ -37,6 +40,16 @@ impl Ensemble {
             return Ok(());
         }
         Err(EnsembleError::TimeStepMismatch { what: what.to_owned(), given: dt, expected })
+    }
+
+    /// Checks that the networks are not faster than an actuator with the period `dt` [s]. `what` describes the actuator in
+    /// the error. At a lower rate their torque is held.
+    pub fn check_rate(&self, what: &str, dt: f64) -> Result<(), EnsembleError> {
+        let network = self.description.dt;
+        if network >= dt * (1.0 - RATE_TOLERANCE) {
+            return Ok(());
+        }
+        Err(EnsembleError::TooFast { what: what.to_owned(), network_hz: 1.0 / network, hz: 1.0 / dt })
     }
 
     /// Predicts the torque of each row with each member, `[sequence][row][member]`, from states of zero.

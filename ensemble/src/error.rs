@@ -35,10 +35,31 @@ pub enum EnsembleError {
         /// Time step of the model [s].
         expected: f64,
     },
+    /// The networks have a shorter time step than the actuators that they stand for.
+    #[error(
+        "the ensemble computes a torque at {network_hz:.0} Hz, {what} at {hz:.0} Hz; it must not be slower: use a log or a \
+         robot at {network_hz:.0} Hz or more, or train an ensemble with `twinstep fit --rate-hz {hz:.0}`"
+    )]
+    TooFast {
+        /// The actuator.
+        what: String,
+        /// Rate of the networks [Hz].
+        network_hz: f64,
+        /// Rate of the actuator [Hz].
+        hz: f64,
+    },
+    /// `[actuator] mode` does not match what the networks predict.
+    #[error("`actuator.mode`: the ensemble predicts {target}; use mode = \"{allowed}\"")]
+    WrongMode {
+        /// What the networks predict.
+        target: &'static str,
+        /// The mode for it.
+        allowed: &'static str,
+    },
     /// The gains change. A network is valid for one value of the gains, because they are not an input.
     #[error(
-        "{log}: the gains of {joint} change (kp {kp}, kd {kd} at row {row}); gains are not an input of a network, so \
-         every row of every log must have the gains of the first row"
+        "{log}: the gains of {joint} change (kp {kp}, kd {kd} at row {row}); gains are not an input of this \
+         network, so every row of every log must have the same; `twinstep fit --input torque` learns for all gains"
     )]
     GainsChange {
         /// The log.
@@ -53,7 +74,10 @@ pub enum EnsembleError {
         kd: f64,
     },
     /// The log contains feed-forward torque.
-    #[error("{log} has `tau_ff_{joint}` at row {row}; it must be 0, because it is not an input of a network")]
+    #[error(
+        "{log} has `tau_ff_{joint}` at row {row}; it must be 0, because it is not an input of this network; \
+             `twinstep fit --input torque` learns with it"
+    )]
     FeedForward {
         /// The log.
         log: String,

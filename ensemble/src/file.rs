@@ -9,7 +9,7 @@ use serde::de::DeserializeOwned;
 
 use crate::EnsembleError;
 use crate::ensemble::Ensemble;
-use crate::metadata::EnsembleMetadata;
+use crate::metadata::{EnsembleMetadata, NetworkInput};
 use crate::weights::{Shape, Weights};
 
 /// An array of a file.
@@ -158,10 +158,11 @@ impl Ensemble {
 }
 
 /// Returns what is wrong with the gains, or `None` if they are valid.
-fn bad_gains(EnsembleMetadata { joints, gains, .. }: &EnsembleMetadata) -> Option<String> {
-    if joints.is_empty() || joints.len() != gains.len() {
+fn bad_gains(EnsembleMetadata { joints, gains, input, .. }: &EnsembleMetadata) -> Option<String> {
+    let serves_all = *input == NetworkInput::Torque;
+    if joints.is_empty() || gains.len() != if serves_all { 0 } else { joints.len() } {
         return Some(format!(
-            "has `gains` of {} joints, but {} joints; one pair per joint is expected",
+            "has `gains` of {} joints, but {} joints; one pair per joint is expected, and none with input \"torque\"",
             gains.len(),
             joints.len()
         ));
@@ -188,7 +189,9 @@ mod tests {
             dt: 0.005,
             joints: vec!["FL_hip".to_owned(), "FL_calf".to_owned()],
             joint_input: JointEncoding::Kind,
-            scales: Normalisers { errors: [scale, scale], torque: scale },
+            input: NetworkInput::default(),
+            target: crate::NetworkTarget::default(),
+            scales: Normalisers { inputs: [scale, scale], torque: scale },
             tau_sensor: TorqueSensor::JointOutput,
             gains: vec![[20.0, 0.5], [25.0, 0.6]],
             variance_scale: 1.25,

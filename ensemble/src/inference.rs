@@ -47,7 +47,7 @@ impl Inference {
     /// If the number of entries is not the number of robots.
     pub fn step(&mut self, errors: &[[[f64; 2]; NUM_JOINTS]]) {
         assert_eq!(errors.len(), self.num_robots, "one entry per robot");
-        let [position, velocity] = self.scales.errors;
+        let [position, velocity] = self.scales.inputs;
         for (slot, errors) in errors.iter().enumerate() {
             let errors = errors.map(|[q, dq]| [position.normalise(q), velocity.normalise(dq)]);
             for member in 0..self.members {
@@ -99,7 +99,9 @@ mod tests {
             dt: 0.005,
             joints: JOINT_NAMES.map(str::to_owned).to_vec(),
             joint_input,
-            scales: Normalisers { errors: [scale(0.02, 0.1), scale(-0.3, 2.5)], torque: scale(0.0, 1.0) },
+            input: crate::NetworkInput::default(),
+            target: crate::NetworkTarget::default(),
+            scales: Normalisers { inputs: [scale(0.02, 0.1), scale(-0.3, 2.5)], torque: scale(0.0, 1.0) },
             tau_sensor: TorqueSensor::MotorCurrent,
             gains: vec![[30.0, 0.75]; 12],
             variance_scale: 1.3,
@@ -126,7 +128,7 @@ mod tests {
             log: 0,
             joint,
             after_reset: true,
-            errors: (0..ROWS).map(|row| error(1, joint, row)).collect(),
+            inputs: (0..ROWS).map(|row| error(1, joint, row)).collect(),
             torques: vec![0.0; ROWS],
         };
         let runs: Vec<Sequence> = (0..NUM_JOINTS).map(run).collect();

@@ -1,6 +1,7 @@
 //! Metadata of an ensemble.
 
 use serde::{Deserialize, Serialize};
+use twinstep_effects::NetworkMode;
 use twinstep_logs::TorqueSensor;
 use twinstep_model::{JOINT_NAMES, Joint, JointKind};
 
@@ -20,6 +21,33 @@ pub enum JointEncoding {
     Identity,
 }
 
+/// The two numbers of each row in the input of a network.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NetworkInput {
+    /// ξ = [q_cmd − q, dq_cmd − dq] in \[rad] and \[rad/s], as in U2E (eq. 1). The networks learn the gains of the data.
+    #[default]
+    Errors,
+    /// Torque that was asked for, kp (q_cmd − q) + kd (dq_cmd − dq) + tau_ff \[N·m], and joint velocity \[rad/s]. The
+    /// networks are valid for all gains and for feed-forward torque.
+    Torque,
+}
+
+/// The torque that a network predicts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NetworkTarget {
+    /// The measured torque.
+    #[default]
+    Torque,
+    /// The torque that a model of the robot lacks: measured minus modelled.
+    Residual,
+}
+
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
+}
+
 /// Properties of the training data and the networks, stored in the file of an ensemble.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -34,11 +62,18 @@ pub struct EnsembleMetadata {
     pub joints: Vec<String>,
     /// Encoding of the joint in the input.
     pub joint_input: JointEncoding,
+    /// The two numbers of each row in the input.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub input: NetworkInput,
+    /// The torque that is predicted.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub target: NetworkTarget,
     /// Normalisers of inputs and output.
     pub scales: Normalisers,
     /// Location of the torque sensor in the training data.
     pub tau_sensor: TorqueSensor,
-    /// kp [N·m/rad] and kd [N·m·s/rad] of each joint in the training data.
+    /// kp [N·m/rad] and kd [N·m·s/rad] of each joint in the training data. Empty if the input is
+    /// [`NetworkInput::Torque`], which serves all gains.
     pub gains: Vec<[f64; 2]>,
     /// Calibrated factor of the predicted variances.
     pub variance_scale: f64,
@@ -87,6 +122,19 @@ impl EnsembleMetadata {
             let joints = [0, other].map(|joint| self.joints[joint].clone());
             Err(EnsembleError::GainsDiffer { joints, gains: [first, self.gains[other]] })
         })
+    }
+
+    /// Checks that networks that predict what a model lacks are added to one, and others are not.
+    pub(crate) fn check_mode(&self, mode: NetworkMode) -> Result<(), EnsembleError> {
+        match (mode, self.target) {
+            (NetworkMode::Replace, NetworkTarget::Torque) | (NetworkMode::Residual, NetworkTarget::Residual) => Ok(()),
+            (NetworkMode::Replace, NetworkTarget::Residual) => {
+                Err(EnsembleError::WrongMode { target: "the torque that a model lacks", allowed: "residual" })
+            }
+            (NetworkMode::Residual, NetworkTarget::Torque) => {
+                Err(EnsembleError::WrongMode { target: "the whole torque", allowed: "replace" })
+            }
+        }
     }
 
     /// Checks that every joint has a type if the joint type is an input.

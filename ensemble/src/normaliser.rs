@@ -19,8 +19,9 @@ pub struct Normaliser {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Normalisers {
-    /// Normalisers of Δq [rad] and Δq̇ [rad/s].
-    pub errors: [Normaliser; 2],
+    /// Normalisers of the two numbers of [`crate::NetworkInput`].
+    #[serde(rename = "errors")]
+    pub inputs: [Normaliser; 2],
     /// Normaliser of the torque [N·m].
     pub torque: Normaliser,
 }
@@ -43,12 +44,12 @@ impl Normaliser {
 impl Normalisers {
     /// Computes the normalisers of the training split.
     pub(crate) fn of(data: &DataSet) -> Self {
-        let error = |index: usize| {
+        let input = |index: usize| {
             Normaliser::of(
-                data.runs(Split::Training).flat_map(move |run| run.errors.iter().map(move |error| error[index])),
+                data.runs(Split::Training).flat_map(move |run| run.inputs.iter().map(move |input| input[index])),
             )
         };
         let torque = Normaliser::of(data.runs(Split::Training).flat_map(|run| run.torques.iter().copied()));
-        Self { errors: [error(0), error(1)], torque }
+        Self { inputs: [input(0), input(1)], torque }
     }
 }

@@ -20,8 +20,8 @@ pub struct SequenceDataset {
 }
 
 struct NormalisedRun {
-    /// Normalised ξ of each row.
-    errors: Vec<[f32; 2]>,
+    /// Normalised input of each row.
+    inputs: Vec<[f32; 2]>,
     torques: Vec<f32>,
     /// Index of the one-hot input of the joint.
     one_hot: Option<usize>,
@@ -66,9 +66,9 @@ impl SequenceDataset {
         let scales = &model.scales;
         let mut all = Self { inputs: model.shape().inputs, time, runs: Vec::new(), windows: Vec::new() };
         for (index, run) in runs.enumerate() {
-            let normalised = |error: &[f64; 2]| std::array::from_fn(|i| scales.errors[i].normalise(error[i]));
+            let normalised = |input: &[f64; 2]| std::array::from_fn(|i| scales.inputs[i].normalise(input[i]));
             all.runs.push(NormalisedRun {
-                errors: run.errors.iter().map(normalised).collect(),
+                inputs: run.inputs.iter().map(normalised).collect(),
                 torques: run.torques.iter().map(|torque| scales.torque.normalise(*torque)).collect(),
                 one_hot: model.one_hot(run.joint),
             });
@@ -104,7 +104,7 @@ impl SequenceDataset {
             for row in window.start..run.torques.len().min(window.start + time) {
                 let place = (row - window.start) * size + column;
                 let input = &mut batch.data[place * inputs..(place + 1) * inputs];
-                input[..2].copy_from_slice(&run.errors[row]);
+                input[..2].copy_from_slice(&run.inputs[row]);
                 if let Some(joint) = run.one_hot {
                     input[2 + joint] = 1.0;
                 }

@@ -45,7 +45,7 @@ fn pd_weights(model: &EnsembleMetadata, scale: f32) -> Weights {
         weights.entry(name).and_modify(|array| array[index] = value);
     };
     let ([kp, kd], scales) = (model.gains[0], model.scales);
-    let [position, velocity] = scales.errors;
+    let [position, velocity] = scales.inputs;
     let offset = kp * position.mean + kd * velocity.mean - scales.torque.mean;
     let scaled = |torque: f64| LINEAR_RANGE * (torque / scales.torque.std) as f32;
     // The cell gate of unit 0 computes the torque; its forget gate is closed, its input and output gates are open.

@@ -83,6 +83,8 @@ impl<'a> Training<'a> {
             dt: data.dt,
             joints: data.joints.clone(),
             joint_input: options.joint_input,
+            input: data.input,
+            target: data.target,
             scales: Normalisers::of(data),
             tau_sensor: data.tau_sensor,
             gains: data.gains.clone(),

@@ -24,6 +24,10 @@ pub fn initial_weights(earlier: &Ensemble, description: &EnsembleMetadata) -> Re
         let [one, other] = [old.joint_input, description.joint_input].map(|input| format!("{input:?}"));
         return differ("joint input", one, other);
     }
+    if (old.input, old.target) != (description.input, description.target) {
+        let [one, other] = [old, description].map(|model| format!("{:?}, {:?}", model.input, model.target));
+        return differ("input or target", one, other);
+    }
     if old.joints != description.joints {
         return differ("joints", old.joints.join(", "), description.joints.join(", "));
     }
@@ -44,7 +48,7 @@ fn rescale(weights: &mut Weights, shape: Shape, old: &Normalisers, new: &Normali
     let gates = 4 * shape.hidden;
     let mut shift = vec![0.0; gates];
     let input_weight = weights.get_mut("lstm.input_weight").expect("the layout has it");
-    for (row, (from, to)) in input_weight.chunks_exact_mut(gates).zip(old.errors.iter().zip(&new.errors)) {
+    for (row, (from, to)) in input_weight.chunks_exact_mut(gates).zip(old.inputs.iter().zip(&new.inputs)) {
         let (factor, offset) = ((to.std / from.std) as f32, ((to.mean - from.mean) / from.std) as f32);
         for (weight, shift) in row.iter_mut().zip(&mut shift) {
             *shift += offset * *weight;

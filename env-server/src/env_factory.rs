@@ -1,7 +1,6 @@
 //! Factories of the environments of a lease.
 
-use twinstep_effects::{ModelFile, ModelFileError};
-use twinstep_effects::{RobotSampler, SamplingError};
+use twinstep_effects::{ModelFile, ModelFileError, NetworkMode, RobotSampler, SamplingError};
 use twinstep_ensemble::{ActuatorNetworkRobot, EnsembleError};
 use twinstep_envs::{CounterEnv, GaitTask, Jump, TaskConfig, TaskEnv, TaskEnvConfig, Track, Walk};
 use twinstep_model::{Actuator, AutoresetMode, Backend, RobotModel, VecEnv};
@@ -125,17 +124,14 @@ fn check_actuators(config: &Config, learned: Option<&ActuatorNetworkRobot>) -> R
             (field, _) => reject(field, "it has no `[actuator]`, so there is no epistemic uncertainty; use 0"),
         };
     };
-    if config.sim.engine == Engine::Mujoco {
-        return reject("sim.engine", "its actuator network does not run in `mujoco`; use `batch` or `rapier`");
-    }
     let fixed_gains = "its actuator network is trained for one pair of gains; use [1, 1]";
-    if config.randomise.kp_scale != [1.0, 1.0] {
+    if learned.has_fixed_gains() && config.randomise.kp_scale != [1.0, 1.0] {
         return reject("randomise.kp_scale", fixed_gains);
     }
-    if config.randomise.kd_scale != [1.0, 1.0] {
+    if learned.has_fixed_gains() && config.randomise.kd_scale != [1.0, 1.0] {
         return reject("randomise.kd_scale", fixed_gains);
     }
-    if config.randomise.command_delay_ms != [0.0, 0.0] {
+    if learned.mode() == NetworkMode::Replace && config.randomise.command_delay_ms != [0.0, 0.0] {
         let reason = "its actuator network includes the delay of the robot it was trained with; use [0, 0]";
         return reject("randomise.command_delay_ms", reason);
     }
@@ -177,10 +173,14 @@ impl EnvFactory for SimEnvFactory {
                 let backend = if let Some(actuators) = actuators { backend.with_actuator(actuators) } else { backend };
                 task_env(&self.config.task, backend, settings)
             }
-            Engine::Mujoco if MujocoBackend::simulates(&robot) => {
+            Engine::Mujoco if actuators.is_none() && MujocoBackend::simulates(&robot) => {
                 task_env(&self.config.task, MujocoBackend::new(robot, sim, num_envs)?, settings)
             }
-            Engine::Mujoco => task_env(&self.config.task, MujocoPlant::new(robot, sim, num_envs)?, settings),
+            Engine::Mujoco => {
+                let backend = MujocoPlant::new(robot, sim, num_envs)?;
+                let backend = if let Some(actuators) = actuators { backend.with_actuator(actuators) } else { backend };
+                task_env(&self.config.task, backend, settings)
+            }
         }?;
         match (&self.config.task, &self.base) {
             (TaskConfig::Explore(explore), Some(base)) => {

@@ -89,7 +89,7 @@ fn ensemble_predicts_delay_and_saturation_and_is_more_uncertain_on_unseen_motion
         let (mut error, mut ideal, mut sum, mut count) = (0.0, 0.0, 0.0, 0.0);
         for (run, rows) in data.runs(Split::Test).zip(ensemble.predict(data.runs(Split::Test))) {
             let first = run.torques.len() - rows.len();
-            for ((members, torque), [dq, ddq]) in rows.iter().zip(&run.torques[first..]).zip(&run.errors[first..]) {
+            for ((members, torque), [dq, ddq]) in rows.iter().zip(&run.torques[first..]).zip(&run.inputs[first..]) {
                 let (means, variances): (Vec<_>, Vec<_>) =
                     members.iter().map(|member| (member.mean, member.variance)).unzip();
                 error += (means.iter().sum::<f64>() / means.len() as f64 - torque).powi(2);

@@ -12,7 +12,7 @@ use twinstep_identify::{
 };
 use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{
-    Backend, BaseMount, Command, FIXED_BASE_HEIGHT, InitialState, JOINT_NAMES, RobotModel, go2, stream,
+    Actuator, Backend, BaseMount, Command, FIXED_BASE_HEIGHT, InitialState, JOINT_NAMES, RobotModel, go2, stream,
 };
 use twinstep_sim::{BatchBackend, BatchRollout, Engine, RapierBackend, SimConfig};
 use twinstep_tests::python::{Programs, root};
@@ -51,6 +51,11 @@ pub fn log_of(robot: &RobotModel) -> Log {
 
 /// Returns the log of a robot with a fixed base whose joints follow a chirp over this number of rows of 5 ms.
 pub fn chirp_log(robot: &RobotModel, rows: u32) -> Log {
+    chirp_log_with(robot, rows, None, 0.4)
+}
+
+/// Returns a log like [`chirp_log`] that starts at this frequency [Hz], of a robot with an external actuator.
+pub fn chirp_log_with(robot: &RobotModel, rows: u32, external: Option<Box<dyn Actuator>>, from_hz: f64) -> Log {
     let config = SimConfig {
         engine: Engine::Rapier,
         base: BaseMount::Fixed,
@@ -58,14 +63,15 @@ pub fn chirp_log(robot: &RobotModel, rows: u32) -> Log {
         threads: 1,
         ..SimConfig::default()
     };
-    let mut backend = RapierBackend::new(robot.clone(), config, 1).unwrap();
+    let backend = RapierBackend::new(robot.clone(), config, 1).unwrap();
+    let mut backend = if let Some(external) = external { backend.with_actuator(external) } else { backend };
     let pose = go2().control.default_pose_f32();
     backend.reset(&[(0, InitialState::at_rest(FIXED_BASE_HEIGHT as f32, pose))]).unwrap();
     let mut columns = BTreeMap::<String, Vec<f64>>::new();
     let mut random = stream(5, "noise", 0);
     for row in 0..rows {
         let t = f64::from(row) * 0.005;
-        let phase = std::f64::consts::TAU * (0.4 + 0.15 * t) * t;
+        let phase = std::f64::consts::TAU * (from_hz + 0.15 * t) * t;
         let mut command = Command::hold(pose, 25.0, 0.6);
         columns.entry("t".to_owned()).or_default().push(t);
         for (joint, name) in JOINT_NAMES.iter().enumerate() {

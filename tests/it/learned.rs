@@ -8,7 +8,10 @@ use rand::RngExt;
 use tempfile::TempDir;
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_effects::{ActuatorNetworkConfig, MemberSampling, ModelFile};
-use twinstep_ensemble::{ActuatorNetworkRobot, Ensemble, EnsembleMetadata, JointEncoding, Normaliser, Normalisers};
+use twinstep_ensemble::{
+    ActuatorNetworkRobot, Ensemble, EnsembleMetadata, JointEncoding, NetworkInput, NetworkTarget, Normaliser,
+    Normalisers,
+};
 use twinstep_env_server::{Config, EnvFactory, EnvFactoryError, SimEnvFactory};
 use twinstep_envs::{TaskConfig, base_spec};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
@@ -34,7 +37,9 @@ fn description() -> EnsembleMetadata {
         dt: 0.005,
         joints: JOINT_NAMES.map(str::to_owned).to_vec(),
         joint_input: JointEncoding::Kind,
-        scales: Normalisers { errors: [scale(0.1), scale(2.0)], torque: scale(15.0) },
+        input: NetworkInput::default(),
+        target: NetworkTarget::default(),
+        scales: Normalisers { inputs: [scale(0.1), scale(2.0)], torque: scale(15.0) },
         tau_sensor: TorqueSensor::MotorCurrent,
         gains: vec![[30.0, 0.75]; 12],
         variance_scale: 0.05,
@@ -118,7 +123,7 @@ fn epistemic_uncertainty_reward_does_not_change_the_motion() {
 /// The robot stands on a network that was set up as a linear PD controller.
 fn difference_from_analytic_actuators(tau_sensor: TorqueSensor) -> [f32; 2] {
     let description = EnsembleMetadata { tau_sensor, ..description() };
-    let settings = ActuatorNetworkConfig { ensemble: PathBuf::new(), draw: MemberSampling::PerStep, sample: false };
+    let settings = ActuatorNetworkConfig { draw: MemberSampling::PerStep, ..ActuatorNetworkConfig::default() };
     let learned = ActuatorNetworkRobot::new(&ModelFile::default(), Ensemble::linear_pd(description), settings).unwrap();
     let sim = SimConfig { engine: Engine::Batch, threads: 1, ..SimConfig::default() };
     let analytic = BatchBackend::new(go2(), sim, 1).unwrap();
@@ -302,7 +307,8 @@ fn ensembles_that_do_not_fit_the_robot_are_rejected_with_the_reason() {
     let serve = ["serve", "--listen", "tcp/127.0.0.1:0"];
     let lag = "[[effect]]\nname = \"drive_lag\"\nscope = \"all\"\ntime_constant_s = 0.01";
     let friction = "[[effect]]\nname = \"coulomb_friction\"\nscope = \"calf\"\ntorque_nm = 0.2";
-    let slow = EnsembleMetadata { dt: 0.02, ..description() };
+    let fast = EnsembleMetadata { dt: 0.002, ..description() };
+    let residual = EnsembleMetadata { target: NetworkTarget::Residual, ..description() };
     let mut uneven = description();
     uneven.gains[4] = [20.0, 0.5];
     let output = EnsembleMetadata { tau_sensor: TorqueSensor::JointOutput, ..description() };
@@ -313,7 +319,8 @@ fn ensembles_that_do_not_fit_the_robot_are_rejected_with_the_reason() {
         ..description()
     };
     for (description, effects, reason) in [
-        (slow, "", "`actuator.ensemble`: the robot's actuator has a time step of 0.005 s, the model one of 0.02 s"),
+        (fast, "", "`actuator.ensemble`: the ensemble computes a torque at 500 Hz, the robot's actuator at 200 Hz"),
+        (residual, "", "`actuator.mode`: the ensemble predicts the torque that a model lacks; use mode = \"residual\""),
         (uneven, "", "trained for FL_hip with kp 30 and kd 0.75, for FR_thigh with kp 20 and kd 0.5; a robot has one"),
         (
             description(),
@@ -406,7 +413,7 @@ fn settings_that_actuator_networks_do_not_support_are_rejected_by_name() {
 }
 
 #[test]
-fn play_simulates_actuator_networks_and_identify_evaluate_and_diagnose_reject_them() {
+fn play_and_evaluate_simulate_actuator_networks_and_identify_and_diagnose_reject_them() {
     let (folder, model) = model_with(description(), "", "draw = \"step\"");
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
     let meta = Meta::new(50.0, TorqueSensor::None, vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }]);
@@ -422,8 +429,23 @@ fn play_simulates_actuator_networks_and_identify_evaluate_and_diagnose_reject_th
     assert_ne!(with_networks.q("FL_calf"), play(&path("analytic"), &[]).q("FL_calf"));
 
     let (log, out) = (path("learned"), path("out"));
-    for command in [&["evaluate", &log][..], &["identify", &log, "--out", &out], &["diagnose", &log, "--out", &out]] {
-        let error = rejection(command, &model);
-        assert!(error.contains("robot.toml: `[actuator]` is for `twinstep serve` and `twinstep play`"), "{error}");
+    for command in ["identify", "diagnose"] {
+        let error = rejection(&[command, &log, "--out", &out], &model);
+        assert!(error.contains("robot.toml: this command does not simulate actuator networks"), "{error}");
     }
+    // The networks that moved the robot predict its motion, and the laws do not.
+    let error_of = |more: &[&str]| {
+        let output = twinstep(&[&["evaluate", "--json", &log], more].concat());
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        serde_json::from_slice::<serde_json::Value>(&output.stdout).unwrap()["q_rmse_rad"].as_f64().unwrap()
+    };
+    let [networks, laws] = [error_of(&["--model", model.to_str().unwrap()]), error_of(&[])];
+    assert!(networks < 0.5 * laws, "{networks} {laws} rad");
+    // Gains that the networks do not know.
+    let mut meta: serde_json::Value =
+        serde_json::from_str(&std::fs::read_to_string(path("learned/meta.json")).unwrap()).unwrap();
+    meta["kp"] = 21.0.into();
+    std::fs::write(path("learned/meta.json"), meta.to_string()).unwrap();
+    let error = rejection(&["evaluate", &log], &model);
+    assert!(error.contains("gains are not an input of this network"), "{error}");
 }

@@ -28,6 +28,7 @@ mod hunt;
 mod identify;
 mod layering;
 mod learned;
+mod learned_residual;
 mod leases;
 mod load;
 mod log;

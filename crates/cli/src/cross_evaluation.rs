@@ -5,7 +5,9 @@
 use std::fmt::Write;
 use std::path::Path;
 
-use twinstep_ensemble::{DataSet, Ensemble, EnsembleError, Gaussian, Sequence, Split, epistemic_uncertainty};
+use twinstep_ensemble::{
+    DataOptions, DataSet, Ensemble, EnsembleError, Gaussian, Sequence, Split, epistemic_uncertainty,
+};
 use twinstep_logs::Log;
 
 use crate::exit::{CommandResult, Failure, input, other};
@@ -30,10 +32,10 @@ struct Cell {
 
 /// Evaluates an ensemble of each stage on all stages, and writes the grid to the folder `out`.
 ///
-/// `train` returns the ensemble of a stage, which it stores in a file. `smooth` is the smoothing of the training data [Hz].
+/// `train` returns the ensemble of a stage, which it stores in a file.
 pub fn run(
     logs: &[(String, Log)],
-    smooth: Option<f64>,
+    options: DataOptions,
     out: &Path,
     train: impl Fn(&DataSet, &Path) -> Result<Ensemble, Failure>,
 ) -> CommandResult {
@@ -41,7 +43,7 @@ pub fn run(
     let [svg, csv] = ["cross.svg", "cross.csv"].map(|name| out.join(name));
     chart::check_writable(&svg).map_err(input)?;
     let names: Vec<&str> = logs.iter().map(|(name, _)| name.as_str()).collect();
-    let stages = logs.iter().map(|log| DataSet::smoothed(std::slice::from_ref(log), smooth).map_err(input));
+    let stages = logs.iter().map(|log| DataSet::with_options(std::slice::from_ref(log), options).map_err(input));
     let stages: Vec<DataSet> = stages.collect::<Result<_, _>>()?;
     if let Some(index) = stages.iter().position(|stage| stage.joints != stages[0].joints) {
         return Err(input(EnsembleError::JointsMismatch { log: names[index].to_owned() }));

@@ -4,12 +4,10 @@ use std::path::PathBuf;
 
 use twinstep_identify::{Evaluation, evaluate, position_errors};
 use twinstep_logs::Log;
-use twinstep_model::RobotModel;
-use twinstep_sim::{BatchRollout, SimConfig};
 
 use crate::exit::{CommandResult, Failure, input, other};
 use crate::open_log::open_log;
-use crate::robot_file::robot_model;
+use crate::robot_file::SimulatedRobot;
 use twinstep_report::{chart, evaluation_plot};
 
 /// Measure the error of a robot model on a measured log.
@@ -17,7 +15,8 @@ use twinstep_report::{chart, evaluation_plot};
 /// Torque: the model's actuators receive the measured positions and velocities and the log's commands. Their torque is
 /// compared at the location of the log's torque sensor. Position: the log's commands are simulated in closed loop. With
 /// a fixed base, each segment is simulated from its first measured state to its end. With a floating base, windows of
-/// 0.5 s are simulated from measured states. Errors are root mean squares over all selected rows and joints.
+/// 0.5 s are simulated from measured states. If the model file has a table `[actuator]`, the mean of its networks is the
+/// torque, or is added to that of the laws. Errors are root mean squares over all selected rows and joints.
 ///
 /// Example: `twinstep evaluate --model extended.toml data/go2_air_chirp --plot errors.svg`
 #[derive(clap::Args)]
@@ -69,20 +68,14 @@ impl Rows {
     }
 }
 
-/// Returns the simulator in which models are evaluated.
-pub fn simulator(robot: &RobotModel) -> Result<BatchRollout, Failure> {
-    BatchRollout::new(robot, &SimConfig::default()).map_err(input)
-}
-
 /// Evaluates the model and prints its errors.
 pub fn run(args: &Args) -> CommandResult {
-    let robot = robot_model(args.model.as_deref())?;
     let log = open_log(&args.log)?;
+    let SimulatedRobot { robot, mut simulator } = SimulatedRobot::load(args.model.as_deref(), &log, &args.log)?;
     let rows = args.rows.of(&log)?;
     if let Some(path) = &args.plot {
         chart::check_writable(path).map_err(input)?;
     }
-    let mut simulator = simulator(&robot)?;
     let evaluation = evaluate(&log, &robot, &mut simulator, |row| rows[row]).map_err(input)?;
     if let Some(path) = &args.plot {
         let errors = position_errors(&log, &robot, &mut simulator, |row| rows[row]).map_err(input)?;

@@ -17,10 +17,9 @@ use twinstep_model::VecEnv;
 use twinstep_policy::Policy;
 use twinstep_sim::{BatchBackend, SimConfig};
 
-use crate::evaluate::simulator;
 use crate::evaluate_policy::check_spec;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
-use crate::robot_file::analytic_model;
+use crate::robot_file::{analytic_model, simulator};
 
 /// Limits of a run unless others are given.
 pub const DEFAULT_LIMITS: Limits = Limits { room_m: 3.0, max_saturated: 0.05, max_rms_torque_nm: 15.0 };

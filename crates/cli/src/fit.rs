@@ -7,15 +7,17 @@ use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::{Deserialize, Serialize};
 use twinstep_ensemble::{
-    Calibration, Checkpoint, Coverage, DataSet, Ensemble, EnsembleError, Epoch, JointEncoding, Training, TrainingEvent,
-    TrainingOptions, TrainingResult as Ended,
+    Calibration, Checkpoint, Coverage, DataOptions, DataSet, Ensemble, EnsembleError, Epoch, JointEncoding,
+    NetworkInput, NetworkTarget, Training, TrainingEvent, TrainingOptions, TrainingResult as Ended,
 };
-
+use twinstep_identify::{residual_at_output, residual_at_sensor};
 use twinstep_logs::Log;
+use twinstep_model::RobotModel;
 
 use crate::cross_evaluation;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::open_log::open_log;
+use crate::robot_file::robot_model;
 use twinstep_report::chart::{self, GREY, HPos, Line, ORANGE, Panel, PlotError};
 
 /// Interval at which a running training is saved.
@@ -25,11 +27,11 @@ const SIZE: (u32, u32) = (900, 600);
 
 /// Train an ensemble of actuator networks on measured logs (U2E).
 ///
-/// Each network receives the position and velocity error of one joint, row after row, and predicts the mean and
-/// variance of its torque. The members start from different initial weights. They agree on motion like the training
+/// Each network receives two numbers of one joint, row after row, and predicts the mean and variance of its torque.
+/// The numbers are the position and velocity error or, with --input torque, the torque that was asked for and the velocity. The members start from different initial weights. They agree on motion like the training
 /// data and disagree elsewhere; this gives the epistemic uncertainty of each prediction. The logs need
-/// `tau_measured_*`, one rate and constant gains. A log with feed-forward torque (`tau_ff_*`) is refused. A velocity
-/// that was not measured is replaced by the central difference of the position.
+/// `tau_measured_*` and one rate. Without --input torque they also need constant gains and no feed-forward torque
+/// (`tau_ff_*`). A velocity that was not measured is replaced by the central difference of the position.
 ///
 /// Each log is cut into blocks. Of every ten blocks, eight are the training split, one is the validation split and one
 /// is the test split. The validation split is used for early stopping and for one factor that scales all variances. The
@@ -42,7 +44,8 @@ const SIZE: (u32, u32) = (900, 600);
 /// split of every stage (U2E, Fig. 2). OUT is then a folder with `1.safetensors` and so on, the grid of plots
 /// `cross.svg` and the table `cross.csv`.
 ///
-/// Example: `twinstep fit walk.parquet jump.parquet --out ensemble.safetensors --plot curves.svg`
+/// Examples: `twinstep fit walk.parquet jump.parquet --out ensemble.safetensors --plot curves.svg`, and
+/// `twinstep fit walk --residual extended.toml --input torque --rate-hz 200 --out residual.safetensors`
 #[derive(clap::Args)]
 pub struct Args {
     /// Measured logs: data files, or folders that contain one.
@@ -57,6 +60,17 @@ pub struct Args {
     /// Encoding of the joint in the input: none, as in U2E (pooled), the joint type (kind), or the joint (identity).
     #[arg(long, value_name = "WHAT", value_enum, default_value_t = JointEncodingArg::Pooled)]
     pub joint_input: JointEncodingArg,
+    /// Input of the networks: position and velocity error, as in U2E (errors), or the torque that was asked for and the
+    /// velocity (torque), which serves all gains and feed-forward torque.
+    #[arg(long, value_name = "WHAT", value_enum, default_value_t = NetworkInputArg::Errors)]
+    pub input: NetworkInputArg,
+    /// Learn only the torque that the robot of this model file lacks, for `[actuator] mode = "residual"`. Logs without
+    /// torque are enough if the base is fixed.
+    #[arg(long, value_name = "FILE")]
+    pub residual: Option<PathBuf>,
+    /// Resample the logs to this rate, at most theirs [Hz]. The ensemble is evaluated at this rate in every simulator.
+    #[arg(long, value_name = "HZ")]
+    pub rate_hz: Option<f64>,
     /// Maximum number of epochs. Most trainings end earlier, by early stopping on the validation split.
     #[arg(long, value_name = "N", default_value_t = TrainingOptions::default().epochs)]
     pub epochs: usize,
@@ -87,6 +101,15 @@ pub struct Args {
     pub out: PathBuf,
 }
 
+/// [`NetworkInput`] as a value of the command line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum NetworkInputArg {
+    /// Position and velocity error.
+    Errors,
+    /// The torque that was asked for, and the velocity.
+    Torque,
+}
+
 /// [`JointEncoding`] as a value of the command line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -104,7 +127,7 @@ pub fn run(args: &Args) -> CommandResult {
     let signals = Signals::listen()?;
     let result = if args.cross {
         let train = |stage: &DataSet, out: &Path| train_or_load(stage, args, out, &signals);
-        args.open_logs().and_then(|logs| cross_evaluation::run(&logs, args.smooth, &args.out, train))
+        args.open_logs().and_then(|logs| cross_evaluation::run(&logs, args.data_options(), &args.out, train))
     } else {
         write_ensemble(args, &signals)
     };
@@ -116,7 +139,7 @@ pub fn run(args: &Args) -> CommandResult {
 
 /// Trains and evaluates one ensemble of all logs, and writes it.
 pub fn write_ensemble(args: &Args, signals: &Signals) -> CommandResult {
-    let data = DataSet::smoothed(&args.open_logs()?, args.smooth).map_err(input)?;
+    let data = DataSet::with_options(&args.open_logs()?, args.data_options()).map_err(input)?;
     args.plot.as_deref().map_or(Ok(()), chart::check_writable).map_err(input)?;
     let resume = if args.resume { Some(Checkpoint::read(&training_file(&args.out)).map_err(input)?) } else { None };
     let (ensemble, curves) = train_and_save(&data, args, &args.out, (resume, signals))?;
@@ -184,6 +207,9 @@ impl Args {
             members,
             hidden,
             joint_input: JointEncodingArg::Pooled,
+            input: NetworkInputArg::Errors,
+            residual: None,
+            rate_hz: None,
             epochs,
             seed,
             smooth: None,
@@ -201,8 +227,31 @@ impl Args {
         Self { resume: training_file(&self.out).exists(), ..self }
     }
 
+    /// Opens the logs, with the torque that is learned, at the rate at which it is learned.
     fn open_logs(&self) -> Result<Vec<(String, Log)>, Failure> {
-        self.logs.iter().map(|path| Ok((path.display().to_string(), open_log(path)?))).collect()
+        let lacking = self.residual.as_deref().map(|path| robot_model(Some(path))).transpose()?;
+        let open = |path: &PathBuf| {
+            let (name, mut log) = (path.display().to_string(), open_log(path)?);
+            if let Some(robot) = &lacking {
+                log = residual_log(&log, robot)?.ok_or_else(|| input(NoResidual { log: name.clone() }))?;
+            }
+            if let Some(hz) = self.rate_hz {
+                log = log.resampled(hz).map_err(input)?;
+            }
+            Ok((name, log))
+        };
+        self.logs.iter().map(open).collect()
+    }
+
+    fn data_options(&self) -> DataOptions {
+        DataOptions {
+            smooth_hz: self.smooth,
+            input: match self.input {
+                NetworkInputArg::Errors => NetworkInput::Errors,
+                NetworkInputArg::Torque => NetworkInput::Torque,
+            },
+            target: if self.residual.is_some() { NetworkTarget::Residual } else { NetworkTarget::Torque },
+        }
     }
 
     fn options(&self) -> TrainingOptions {
@@ -219,6 +268,21 @@ impl Args {
             seed: self.seed,
         }
     }
+}
+
+/// A log does not show which torque a model lacks.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "{log} does not show which torque the model lacks: it needs `tau_measured_*` and `dq_*`, or rows with a fixed base"
+)]
+struct NoResidual {
+    log: String,
+}
+
+/// Returns the log of the torque that `robot` lacks: at the log's sensor or, without one, at the joint output.
+fn residual_log(log: &Log, robot: &RobotModel) -> Result<Option<Log>, Failure> {
+    let at_sensor = residual_at_sensor(log, robot).map_err(input)?;
+    if at_sensor.is_some() { Ok(at_sensor) } else { residual_at_output(log, robot).map_err(input) }
 }
 
 /// Returns the file in which an unfinished training is saved.

@@ -8,10 +8,10 @@ use twinstep_identify::{
     ParameterEstimate, Stage, WindowConfig, evaluate, identify,
 };
 
-use crate::evaluate::{Rows, simulator};
+use crate::evaluate::Rows;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::open_log::open_log;
-use crate::robot_file::analytic_model;
+use crate::robot_file::{analytic_model, simulator};
 
 /// Estimate the parameters of effects from measured logs (sampling-based parameter identification, SPI-Active).
 ///

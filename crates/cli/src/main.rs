@@ -19,6 +19,7 @@ mod frame_feed;
 mod hunt;
 mod identify;
 mod key_terminal;
+mod learned_residual;
 mod list;
 mod log;
 mod log_writer;

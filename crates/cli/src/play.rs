@@ -9,7 +9,7 @@ use twinstep_identify::{RecordError, record};
 use twinstep_logs::Log;
 use twinstep_logs::replay::at_log_rate;
 use twinstep_model::{Actuator, BaseMount, RobotModel};
-use twinstep_sim::{BatchBackend, Engine, MujocoBackend, RapierBackend, SimConfig};
+use twinstep_sim::{BatchBackend, Engine, MujocoBackend, MujocoPlant, RapierBackend, SimConfig};
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::serve::engine;
@@ -62,22 +62,6 @@ pub struct Args {
 #[error("`--out` = {} is the motion file itself\n  name another file or folder", .0.display())]
 struct SameFile(PathBuf);
 
-/// The ensemble was trained for another actuator rate.
-#[derive(Debug, thiserror::Error)]
-#[error(
-    "the motion is simulated with actuators at {motion_hz} Hz, but the ensemble of the model file was trained for \
-     {ensemble_hz} Hz\n  resample the motion to {ensemble_hz} Hz or a fraction of it"
-)]
-struct EnsembleRate {
-    motion_hz: f64,
-    ensemble_hz: f64,
-}
-
-/// The engine does not support the actuator network of the model file.
-#[derive(Debug, thiserror::Error)]
-#[error("the actuator network of the model file does not run in engine `mujoco`\n  use `--engine batch` or `rapier`")]
-struct NetworkInMujoco;
-
 /// Simulates the motion and writes the log.
 pub fn run(args: &Args) -> CommandResult {
     if args.motion.canonicalize().is_ok_and(|motion| args.out.canonicalize().is_ok_and(|out| out == motion)) {
@@ -89,18 +73,13 @@ pub fn run(args: &Args) -> CommandResult {
         Some(learned) => learned.robot.clone(),
         None => file.robot_model().map_err(input)?,
     };
-    let actuators = || learned.as_ref().map(|learned| Box::new(learned.actuators(1, false)) as Box<dyn Actuator>);
     let config = args.config();
     let motion = Log::open_commands(&args.motion).map_err(input)?;
     let replayed = at_log_rate(&motion, &robot).map_err(input)?;
     config.check(&replayed.control).map_err(input)?;
-    if learned.is_some() && replayed.control.actuator_hz != robot.control.actuator_hz {
-        let (motion_hz, ensemble_hz) = (replayed.control.actuator_hz, robot.control.actuator_hz);
-        return Err(input(EnsembleRate { motion_hz, ensemble_hz }));
-    }
-    if learned.is_some() && config.engine == Engine::Mujoco {
-        return Err(input(NetworkInMujoco));
-    }
+    let at_rate = |learned: ActuatorNetworkRobot| learned.at_rate(replayed.control.actuator_hz);
+    let learned = learned.map(at_rate).transpose().map_err(input)?;
+    let actuators = || learned.as_ref().map(|learned| Box::new(learned.actuators(1, false)) as Box<dyn Actuator>);
     let signals = Signals::listen()?;
     let bar = ProgressBar::new(motion.rows() as u64);
     let result = play(&motion, &robot, &actuators, config, args.base, &mut |row| {
@@ -166,11 +145,22 @@ pub fn play(
             source,
             progress,
         ),
-        Engine::Mujoco => record(
+        Engine::Mujoco if actuators().is_none() && MujocoBackend::simulates(robot) => record(
             motion,
             robot,
             base,
             |base, robot| MujocoBackend::new(robot.clone(), based(base), 1).map_err(failed),
+            source,
+            progress,
+        ),
+        Engine::Mujoco => record(
+            motion,
+            robot,
+            base,
+            |base, robot| {
+                let backend = MujocoPlant::new(robot.clone(), based(base), 1).map_err(failed)?;
+                Ok(if let Some(actuators) = actuators() { backend.with_actuator(actuators) } else { backend })
+            },
             source,
             progress,
         ),

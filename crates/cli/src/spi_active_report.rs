@@ -7,10 +7,9 @@ use serde::{Deserialize, Serialize};
 use twinstep_effects::{Effect, ModelFile, Scope};
 use twinstep_identify::{EffectAtScope, Evaluation, evaluate, free_parameters};
 
-use crate::evaluate::simulator;
 use crate::exit::{Failure, input};
 use crate::open_log::open_log;
-use crate::robot_file::analytic_model;
+use crate::robot_file::{analytic_model, simulator};
 use crate::spi_active_config::SpiActiveConfig;
 
 /// What a recording cost.

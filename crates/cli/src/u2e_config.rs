@@ -302,7 +302,7 @@ impl U2eConfig {
 
     /// Returns the model file of a robot with this ensemble.
     pub fn simulated_robot(&self, ensemble: PathBuf) -> Result<String, Failure> {
-        let actuator = Some(ActuatorNetworkConfig { ensemble, draw: self.draw, sample: false });
+        let actuator = Some(ActuatorNetworkConfig { ensemble, draw: self.draw, ..ActuatorNetworkConfig::default() });
         Ok(ModelFile { actuator, ..analytic_model(self.model.as_deref())? }.to_toml())
     }
 

@@ -6,12 +6,12 @@ use std::time::{Duration, Instant};
 use twinstep_identify::{Experiment, WindowConfig};
 use twinstep_logs::Log;
 use twinstep_model::{FIXED_BASE_HEIGHT, Ground, InitialState, Joint, PerJoint, Pose, RobotModel, Scene, frames};
+use twinstep_sim::BatchRollout;
 use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo, static_page};
 
-use crate::evaluate::simulator;
 use crate::exit::{CommandResult, Failure, Signals, input};
 use crate::open_log::open_log;
-use crate::robot_file::robot_model;
+use crate::robot_file::SimulatedRobot;
 use crate::web_view::PageArgs;
 
 /// Time between two looks at the requests.
@@ -35,18 +35,21 @@ pub fn motion(path: &Path, model: Option<&Path>, seconds: f64) -> Result<(SceneI
 }
 
 /// Returns a page that plays the first seconds of a log, with the simulation of `robot` as its ghost.
-pub fn page_with_ghost(log: Log, title: String, robot: RobotModel, seconds: f64) -> Result<String, Failure> {
+pub fn page_with_ghost(log: Log, title: String, robot: SimulatedRobot, seconds: f64) -> Result<String, Failure> {
     let (player, scene) = player(log, title, robot, true)?;
     Ok(static_page(&scene, &player.motion(seconds)))
 }
 
 fn open(path: &Path, model: Option<&Path>) -> Result<(Player, SceneInfo), Failure> {
-    player(open_log(path)?, path.display().to_string(), robot_model(model)?, model.is_some())
+    let log = open_log(path)?;
+    let robot = SimulatedRobot::load(model, &log, path)?;
+    player(log, path.display().to_string(), robot, model.is_some())
 }
 
-fn player(log: Log, title: String, robot: RobotModel, has_ghost: bool) -> Result<(Player, SceneInfo), Failure> {
+fn player(log: Log, title: String, robot: SimulatedRobot, has_ghost: bool) -> Result<(Player, SceneInfo), Failure> {
+    let SimulatedRobot { robot, mut simulator } = robot;
     let measured = measured_poses(&log, &robot);
-    let simulated = if has_ghost { simulated_poses(&log, &robot)? } else { Vec::new() };
+    let simulated = if has_ghost { simulated_poses(&log, &robot, &mut simulator)? } else { Vec::new() };
     let info = SceneInfo::new(title, &measured[0].scene(&robot), robot.torque_limits());
     let scene = SceneInfo { is_interactive: true, has_ghost, ..info };
     let duration = log.t()[log.rows() - 1] - log.t()[0];
@@ -93,10 +96,14 @@ fn measured_poses(log: &Log, robot: &RobotModel) -> Vec<RobotPose> {
 }
 
 /// Returns the simulated pose of each row; `None` for rows that are not simulated.
-fn simulated_poses(log: &Log, robot: &RobotModel) -> Result<Vec<Option<RobotPose>>, Failure> {
+fn simulated_poses(
+    log: &Log,
+    robot: &RobotModel,
+    simulator: &mut BatchRollout,
+) -> Result<Vec<Option<RobotPose>>, Failure> {
     let experiment = Experiment::new(log, robot, WindowConfig::EVALUATION).map_err(input)?;
     let mut poses = vec![None; log.rows()];
-    for pose in experiment.simulated_poses(&mut simulator(robot)?, robot) {
+    for pose in experiment.simulated_poses(simulator, robot) {
         let rotation = frames::world_from_base(pose.orientation);
         poses[pose.row] = Some(RobotPose { base: Pose { position: pose.position.into(), rotation }, q: pose.q });
     }

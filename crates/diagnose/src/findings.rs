@@ -19,12 +19,35 @@ pub struct Diagnosis {
     pub confusable: Vec<CorrelatedPair>,
     /// Unexplained residual.
     pub unexplained: Unexplained,
+    /// Networks that have learned what no cause explains; `None` if there is little of it, or they do not predict it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub learned_residual: Option<LearnedResidual>,
     /// Experiment that discriminates between ambiguous causes; `None` if there are none, or no trajectory
     /// discriminates.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next_experiment: Option<NextExperiment>,
     /// File name of the corrected model, in the same folder.
     pub extended_model: String,
+}
+
+/// Networks that have learned the torque that no cause explains. The extended model adds it to its laws.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LearnedResidual {
+    /// File name of the ensemble, in the same folder.
+    pub ensemble: String,
+    /// Place at which the torque is added: `current` or `output`.
+    pub tap: String,
+    /// Errors of the causes alone on held-out blocks.
+    pub before: RmsErrors,
+    /// Errors of the causes with the learned torque on held-out blocks, on which it was not trained.
+    pub after: RmsErrors,
+    /// Largest absolute torque that was asked for in the training data [N·m]. Beyond it nothing was learned.
+    pub max_torque_nm: f64,
+    /// Largest joint speed in the training data [rad/s].
+    pub max_speed_rad_s: f64,
+    /// Epistemic uncertainty on held-out rows, divided by that on rows of the training: how far the networks agree less
+    /// where they were not trained.
+    pub uncertainty_ratio: f64,
 }
 
 /// Root mean square errors; null if they were not measured.
@@ -56,6 +79,9 @@ pub struct Cause {
     /// The hypotheses that the log cannot tell apart, the cause first, with their posterior probabilities.
     #[serde(default)]
     pub posterior: Vec<WeightedHypothesis>,
+    /// What to do about it, as a sentence.
+    #[serde(default)]
+    pub remedy: String,
     /// Best alternative hypotheses.
     pub rivals: Vec<AlternativeCause>,
     /// Explanation of the cause, as text.

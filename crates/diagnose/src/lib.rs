@@ -50,12 +50,13 @@ use twinstep_logs::Log;
 use twinstep_model::{Precision, RobotModel, Rollout};
 
 use cross_validation::{CandidateFit, FitProblem};
+use data_split::DataSplit;
 pub use discrimination::HypothesisPair;
 pub use excitation::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
 pub use experiment_design::ProposedExperiment;
 pub use findings::{
-    AlternativeCause, Cause, CorrelatedPair, Diagnosis, DiscriminatedPair, Estimate, NextExperiment, ParameterValue,
-    RmsErrors, Unexplained, WeightedHypothesis,
+    AlternativeCause, Cause, CorrelatedPair, Diagnosis, DiscriminatedPair, Estimate, LearnedResidual, NextExperiment,
+    ParameterValue, RmsErrors, Unexplained, WeightedHypothesis,
 };
 use forward_selection::{Accepted, ForwardSelection, WindowedData, write_estimates};
 use hypothesis::Hypothesis;
@@ -102,6 +103,10 @@ pub struct DiagnosisOutput {
     pub diagnosis: Diagnosis,
     /// The given model with the causes and their intervals.
     pub extended: ModelFile,
+    /// The model before the last fit, which includes the held-out blocks: what [`Diagnosis::extended`] evaluates.
+    pub before_last_fit: ModelFile,
+    /// For each log, which rows are held out.
+    pub held_out: Vec<Vec<bool>>,
     /// Proposed experiment, if there are ambiguous causes.
     pub next: Option<ProposedExperiment>,
 }
@@ -144,7 +149,8 @@ pub fn diagnose(
     let left = evidence.residual_power(simulator, &named.robot_model()?);
     say("refitting all causes")?;
     refitted(&judged, &mut accepted, evidence, simulator);
-    let errors_of_fit = errors(evidence, &with_causes(model, &accepted).robot_model()?, simulator)?;
+    let before_last_fit = with_causes(model, &accepted);
+    let errors_of_fit = errors(evidence, &before_last_fit.robot_model()?, simulator)?;
     say("computing intervals")?;
     let (extended, confusable) = intervals(model, &judged, &mut accepted, evidence, simulator);
     say("choosing the next experiment")?;
@@ -158,10 +164,13 @@ pub fn diagnose(
         findings: causes,
         confusable,
         unexplained: unexplained::unexplained(evidence, &extended.robot_model()?, given, &left, simulator),
+        learned_residual: None,
         next_experiment: next.as_ref().map(|next| next.summary.clone()),
         extended_model: String::new(),
     };
-    Ok(DiagnosisOutput { diagnosis, extended, next })
+    let rows = |(log, split): (&Log, &DataSplit)| (0..log.rows()).map(|row| split.is_held_out(row)).collect();
+    let held_out = evidence.logs().iter().zip(evidence.splits()).map(rows).collect();
+    Ok(DiagnosisOutput { diagnosis, extended, before_last_fit, held_out, next })
 }
 
 /// Returns the model with the ground's time constant fitted to the log, if the change is too small for a cause.
@@ -281,6 +290,7 @@ fn cause(best: &CandidateFit, others: &[CandidateFit], extended: &ModelFile) -> 
         threshold_nats: best.threshold,
         ambiguous_with: ambiguous(best, others).map(|other| other.hypothesis.name()).collect(),
         posterior: posterior(std::iter::once(best).chain(ambiguous(best, others)).map(scored).collect()),
+        remedy: hypothesis.effect.remedy.to_owned(),
         rivals: others.iter().take(5).map(reporting::rival).collect(),
         evidence: reporting::explanation(best, others),
     }

@@ -52,6 +52,7 @@ pub fn diagnose_torques(logs: &[Log], progress: &mut DiagnoseProgress) -> Result
         unexplained: unexplained.max_by(|one, other| one.fraction.total_cmp(&other.fraction)).unwrap_or_default(),
         findings: all.into_iter().flat_map(|part| part.causes).collect(),
         confusable: Vec::new(),
+        learned_residual: None,
         next_experiment: None,
         extended_model: String::new(),
     })
@@ -233,6 +234,7 @@ fn cause(slots: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) ->
         threshold_nats: THRESHOLD,
         ambiguous_with: found.others.iter().filter(close).map(|other| name(&other.entry)).collect(),
         posterior: posterior(std::iter::once(found).chain(found.others.iter().filter(close)).map(scored).collect()),
+        remedy: effect.remedy.to_owned(),
         rivals: found.others.iter().map(rival).collect(),
         evidence: format!("{evidence} {}", effect.signature),
         scope,

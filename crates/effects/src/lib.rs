@@ -26,7 +26,8 @@ pub use data_requirement::{DataRequirement, LOW_SPEED};
 pub use demo::{DemoMotion, EffectDemo, PlotQuantity};
 pub use entry::{EffectEntry, EntryError, apply_effects};
 pub use model_file::{
-    ActuatorNetworkConfig, EffectEntryError, MemberSampling, ModelFile, ModelFileError, load_robot, parse_robot,
+    ActuatorNetworkConfig, EffectEntryError, MemberSampling, ModelFile, ModelFileError, NetworkMode, load_robot,
+    parse_robot,
 };
 pub use nominal::{ControlTable, JointsTable, NominalRobot, NominalRobotError};
 pub use sampler::{RobotSampler, SamplingError};
@@ -63,6 +64,8 @@ pub struct Effect {
     pub recommended: &'static [DataRequirement],
     /// Caveat to any conclusion about the effect; empty for none.
     pub caveat: &'static str,
+    /// What to do about it: change a number or add a law in the simulator, or mend or retune the robot.
+    pub remedy: &'static str,
     /// How diagnosis searches for it.
     pub search: Search,
     /// Residual in which it is visible.

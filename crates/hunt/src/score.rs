@@ -232,6 +232,7 @@ mod tests {
             threshold_nats: 10.0,
             ambiguous_with: Vec::new(),
             posterior: Vec::new(),
+            remedy: String::new(),
             rivals: Vec::new(),
             evidence: String::new(),
         }
@@ -245,6 +246,7 @@ mod tests {
             findings,
             confusable: Vec::new(),
             unexplained: Unexplained::default(),
+            learned_residual: None,
             next_experiment: None,
             extended_model: "extended.toml".to_owned(),
         }

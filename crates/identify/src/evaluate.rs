@@ -3,6 +3,7 @@
 use serde::Serialize;
 use std::collections::BTreeMap;
 use twinstep_logs::Log;
+use twinstep_logs::replay::at_log_rate;
 use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout};
 
 use crate::error::ExperimentError;
@@ -41,7 +42,7 @@ pub fn evaluate(
     let positions = experiment
         .position_errors(simulator, robot)
         .map(|errors| (errors.iter().map(|(_, error)| error * error).sum(), errors.len()));
-    let torques = torque_errors(log, robot, &keep)?;
+    let torques = torque_errors(log, robot, simulator.actuator(&at_log_rate(log, robot)?), &keep)?;
     let root = |(sum, count): (f64, usize)| (count > 0).then(|| (sum / count as f64).sqrt());
     let whole = |sums: &[(f64, usize)]| {
         root(sums.iter().fold((0.0, 0), |(sum, count), (more, others)| (sum + more, count + others)))

@@ -32,6 +32,7 @@ pub mod parameter;
 mod record;
 pub mod refine;
 pub mod replay;
+mod residual_torque;
 mod sensors;
 pub mod torque;
 pub mod window;
@@ -54,5 +55,6 @@ pub use inverse_dynamics::{InverseDynamicsResidual, JointSeries, JointTrajectory
 pub use nuisance::NuisanceModel;
 pub use parameter::{FreeParameter, candidate, free_parameters, initial_coordinate, with_values};
 pub use record::{RecordError, record};
+pub use residual_torque::{residual_at_output, residual_at_sensor};
 pub use sensors::{Sensor, apply_sensors};
 pub use window::WindowConfig;

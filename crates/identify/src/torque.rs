@@ -2,7 +2,8 @@
 
 use twinstep_logs::{Log, TorqueSensor};
 use twinstep_model::{
-    ActuatorParams, Command, JointSpring, NUM_JOINTS, RobotModel, Stribeck,
+    Actuator, ActuatorMode, ActuatorParams, ActuatorTap, Command, JointSpring, NUM_JOINTS, PerJoint, RobotModel,
+    RobotStates, Stribeck,
     dynamics::{SimdActuators, SimdCommands},
 };
 
@@ -11,19 +12,25 @@ use twinstep_logs::replay::{ActuatorClock, ReplayError, at_log_rate, command, de
 
 /// Returns the sum of squares [N²·m²] and the number of torque errors of each joint, at the log's torque sensor.
 ///
-/// Returns `None` if torque or velocity was not measured.
+/// Returns `None` if torque or velocity was not measured. `external` is the external actuator of the robot, if it has one.
 pub fn torque_errors(
     log: &Log,
     robot: &RobotModel,
+    external: Option<Box<dyn Actuator>>,
     keep: impl Fn(usize) -> bool,
 ) -> Result<Option<[(f64, usize); NUM_JOINTS]>, ReplayError> {
     let mut sums = [(0.0, 0); NUM_JOINTS];
-    MeasuredTorque::new(log, robot)?.differences(robot, |joint, row, difference| {
+    let mut add = |joint: usize, row: usize, difference: f64| {
         if keep(row) {
             sums[joint].0 += difference * difference;
             sums[joint].1 += 1;
         }
-    });
+    };
+    let measured = MeasuredTorque::new(log, robot)?;
+    match external {
+        Some(mut external) => measured.differences_with(robot, Some(&mut *external), &mut add),
+        None => measured.differences(robot, &mut add),
+    }
     Ok(sums.iter().any(|(_, count)| *count > 0).then_some(sums))
 }
 
@@ -109,7 +116,23 @@ impl MeasuredTorque {
     }
 
     /// Calls `each` with joint, row and torque error: torque of the actuators of `robot` minus measured torque [N·m].
-    pub fn differences(&self, robot: &RobotModel, mut each: impl FnMut(usize, usize, f64)) {
+    pub fn differences(&self, robot: &RobotModel, each: impl FnMut(usize, usize, f64)) {
+        self.differences_with(robot, None, each);
+    }
+
+    /// Like [`MeasuredTorque::differences`], with an external actuator that replaces the robot's or adds to them.
+    ///
+    /// One that replaces the torque at the joint output says nothing about the motor current, and is not compared with it.
+    fn differences_with(
+        &self,
+        robot: &RobotModel,
+        mut external: Option<&mut dyn Actuator>,
+        mut each: impl FnMut(usize, usize, f64),
+    ) {
+        let mode = external.as_deref().map(Actuator::mode);
+        if mode == Some(ActuatorMode::Replace(ActuatorTap::Output)) && self.sensor != TorqueSensor::JointOutput {
+            return;
+        }
         let mut robot = upstream_of_sensor(robot, self.sensor);
         robot.control.actuator_hz = self.actuator_hz;
         let robot = &robot;
@@ -130,6 +153,9 @@ impl MeasuredTorque {
                 actuator = SimdActuators::new(robot, dt);
                 actuator.set(0, robot, &at(0.0)[0].map(|q| q as f32), &[0.0; NUM_JOINTS]);
                 torques.clear();
+                if let Some(external) = &mut external {
+                    external.reset(0, 0);
+                }
             }
             actuator.set_derating(0, &self.conditions.derating_factors(&robot.derating, row.row));
             let commands = SimdCommands::new(&[row.command]);
@@ -137,7 +163,19 @@ impl MeasuredTorque {
             for step in 0..steps {
                 let [q, dq] = at(step as f64 * dt);
                 if step % self.substeps == 0 {
-                    actuator.update_command(&commands, &q, &dq);
+                    let replaced = external.as_deref_mut().map(|external| {
+                        let readings = std::array::from_fn(|joint| (q[joint] + offsets[joint]) as f32);
+                        (external.mode(), external_torque(external, row.command, readings, dq.map(|dq| dq as f32)))
+                    });
+                    match replaced {
+                        Some((ActuatorMode::Replace(_), tau)) => actuator.set_torque(tau),
+                        added => {
+                            actuator.update_command(&commands, &q, &dq);
+                            if let Some((ActuatorMode::AddAt(tap), tau)) = added {
+                                actuator.set_residual(tap, tau);
+                            }
+                        }
+                    }
                 }
                 let forces = actuator.step(step % self.substeps, &q, &dq);
                 torques.push(std::array::from_fn(|joint| match self.sensor {
@@ -159,6 +197,15 @@ impl MeasuredTorque {
             }
         }
     }
+}
+
+/// Returns the torques that an external actuator computes for one robot [N·m].
+fn external_torque(external: &mut dyn Actuator, command: Command, q: PerJoint, dq: PerJoint) -> [f64; NUM_JOINTS] {
+    let mut states = RobotStates::new(1);
+    (states.measured.q[0], states.measured.dq[0]) = (q, dq);
+    let mut tau = [[0.0; NUM_JOINTS]];
+    external.torques(&[command], &[true], &states.measured, &mut tau).expect("the commands of the log are supported");
+    tau[0].map(f64::from)
 }
 
 /// Returns the robot without the effects that act after the torque sensor, or that the measured position contains.

@@ -53,6 +53,7 @@ mod parquet_table;
 mod read;
 pub mod recording;
 pub mod replay;
+mod resample;
 mod statistics;
 mod summary;
 mod table;
@@ -66,6 +67,7 @@ pub use log::Log;
 pub use log_writer::LogWriter;
 pub use mcap_file::{McapRecorder, RecordedTopic};
 pub use meta::{Gain, Meta, Segment, TorqueSensor};
+pub use resample::ResampleError;
 pub use summary::{
     ChannelDescription, Identifiability, IdentifiabilityLevel, LogSummary, MissingChannel, SegmentDescription, Timing,
 };

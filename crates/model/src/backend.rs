@@ -111,10 +111,33 @@ pub trait Restorable: Simulator {
     fn restore(&mut self, robot: usize, snapshot: &Self::Snapshot);
 }
 
+/// How the torques of an [`Actuator`] enter the chain from command to motion.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ActuatorMode {
+    /// They replace the chain up to this tap.
+    Replace(ActuatorTap),
+    /// They are added to the torque of the analytic actuators at this tap.
+    AddAt(ActuatorTap),
+}
+
+/// Place in the chain from command to motion at which a torque is measured or added.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ActuatorTap {
+    /// Torque that the motor current shows, before torque constant, gear and friction.
+    Current,
+    /// Torque at the joint output, behind gear, friction and rotor.
+    Output,
+}
+
 /// Actuators of a batch of robots: computes joint torques from commands and measured states, once per actuator period.
 ///
 /// The interface is batched, so that an actuator network evaluates all robots in one forward pass.
 pub trait Actuator: Send {
+    /// Returns whether the torques replace those of the analytic actuators or are added to them.
+    fn mode(&self) -> ActuatorMode {
+        ActuatorMode::Replace(ActuatorTap::Current)
+    }
+
     /// Writes the torque of each joint [N·m] into `tau`, for every `active` robot.
     ///
     /// If it fails, nothing changes. A backend with a thread pool calls it on that pool.

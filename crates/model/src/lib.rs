@@ -44,7 +44,10 @@ mod stream;
 mod trajectory;
 mod vec_env;
 
-pub use backend::{Actuator, ActuatorSnapshot, Backend, BackendError, EpistemicUncertainty, Restorable, Simulator};
+pub use backend::{
+    Actuator, ActuatorMode, ActuatorSnapshot, ActuatorTap, Backend, BackendError, EpistemicUncertainty, Restorable,
+    Simulator,
+};
 pub use base_mount::BaseMount;
 pub use body::RigidBody;
 pub use command::Command;

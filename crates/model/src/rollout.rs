@@ -1,6 +1,6 @@
 //! Interface between identification and simulators: simulates command sequences with many candidate robots at once.
 
-use crate::{BaseMount, Command, InitialState, PerJoint, RobotModel, RobotStates};
+use crate::{Actuator, BaseMount, Command, InitialState, PerJoint, RobotModel, RobotStates};
 
 /// Simulation of one candidate robot.
 #[derive(Clone, Copy, Debug)]
@@ -47,4 +47,10 @@ pub trait Rollout {
     /// Each array has one entry for the initial state and one after each actuator period. If a simulation diverges, its
     /// values are not finite from then on.
     fn run(&mut self, jobs: &[RolloutRequest], precision: Precision) -> Vec<RobotStates>;
+
+    /// Returns the external actuator of one robot with the rates of `robot`, or `None` if the actuators are analytic.
+    fn actuator(&self, robot: &RobotModel) -> Option<Box<dyn Actuator>> {
+        let _ = robot;
+        None
+    }
 }

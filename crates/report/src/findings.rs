@@ -28,12 +28,25 @@ fn card(rank: usize, finding: &Cause, data: &ReportData) -> String {
     let effect = Effect::named(&finding.effect);
     format!(
         "<article>\n<h3>{rank}. {name} <span class=\"gain-badge\">error reduced by {}</span></h3>\n\
-         <div class=\"pair\">\n<div>\n<p class=\"evidence\">{}</p>\n{}{}</div>\n{}</div>\n</article>\n",
+         <div class=\"pair\">\n<div>\n<p class=\"evidence\">{}</p>\n{}{}{}</div>\n{}</div>\n</article>\n",
         percent(finding.held_out_gain),
         escape(&finding.evidence),
+        remedy(finding),
         effect.map_or(String::new(), catalogue),
         parameters(finding, effect),
         law(finding, data)
+    )
+}
+
+/// Returns what to do about a cause, with the gain that it promises.
+fn remedy(finding: &Cause) -> String {
+    if finding.remedy.is_empty() {
+        return String::new();
+    }
+    let gain = percent(finding.held_out_gain);
+    format!(
+        "<p><strong>What to do.</strong> {} It removes about {gain} of the error in the affected channels.</p>\n",
+        text::with_code(&finding.remedy)
     )
 }
 

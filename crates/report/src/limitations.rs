@@ -1,6 +1,6 @@
 //! Lower part of the page: ambiguous causes, unexplained residual and provenance.
 
-use twinstep_diagnose::{Cause, CorrelatedPair, Diagnosis, NextExperiment};
+use twinstep_diagnose::{Cause, CorrelatedPair, Diagnosis, NextExperiment, RmsErrors};
 use twinstep_effects::Effect;
 
 use crate::html::{escape, number, percent};
@@ -66,6 +66,32 @@ pub fn unexplained(diagnosis: &Diagnosis) -> String {
         "<section>\n<h2>Unexplained residual</h2>\n<p><strong>{}</strong> of the given model's residual power above \
          noise is unexplained.{depends}</p>\n{text}</section>\n",
         percent(residual.fraction)
+    )
+}
+
+/// Returns the section on the networks that have learned what no cause explains; empty without them.
+pub fn learned_residual(diagnosis: &Diagnosis) -> String {
+    let Some(learned) = &diagnosis.learned_residual else { return String::new() };
+    let line = |name: &str, of: fn(&RmsErrors) -> Option<f64>| match (of(&learned.before), of(&learned.after)) {
+        (Some(before), Some(after)) => {
+            format!("<li>{name}: {} before, <strong>{}</strong> after</li>\n", number(before), number(after))
+        }
+        _ => String::new(),
+    };
+    let (ensemble, tap) = (escape(&learned.ensemble), escape(&learned.tap));
+    let (torque, speed) = (number(learned.max_torque_nm), number(learned.max_speed_rad_s));
+    format!(
+        "<section>\n<h2>Learned residual</h2>\n<p>No law of the catalogue explains what is left. The networks of \
+         <code>{ensemble}</code> have learned the missing torque from the torque that was asked for and the joint \
+         velocity. The extended model adds it at <code>{tap}</code>, and every law stays.</p>\n<p>On held-out blocks, \
+         on which they were not trained:</p>\n<ul>\n{}{}</ul>\n<p><strong>Where it does not know.</strong> The training \
+         data contain torques up to {torque} N·m and speeds up to {speed} rad/s. On the held-out blocks the networks \
+         disagree {} times as much as on their training data. Beyond these limits do not rely on them.</p>\n\
+         <p><strong>What to do.</strong> Use the extended model for motions like these. A law that is missing from the \
+         catalogue generalises better: look at what the residual depends on.</p>\n</section>\n",
+        line("joint position [rad]", |errors| errors.q_rmse_rad),
+        line("torque [N·m]", |errors| errors.torque_rmse_nm),
+        number(learned.uncertainty_ratio),
     )
 }
 

@@ -37,6 +37,7 @@ pub(crate) fn page(diagnosis: &Diagnosis, data: &ReportData) -> String {
         findings::ranking(diagnosis),
         limitations::confusions(diagnosis),
         limitations::unexplained(diagnosis),
+        limitations::learned_residual(diagnosis),
         limitations::provenance(diagnosis, &data.provenance),
     ];
     format!(

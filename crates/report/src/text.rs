@@ -42,6 +42,14 @@ pub fn cause_at(text: &str) -> String {
     text.split_once('@').map_or_else(|| effect(text), |(name, about)| cause(name, about))
 }
 
+/// Returns text in which every second part between backticks is code.
+pub fn with_code(text: &str) -> String {
+    let part = |(index, part): (usize, &str)| {
+        if index % 2 == 1 { format!("<code>{}</code>", escape(part)) } else { escape(part) }
+    };
+    text.split('`').enumerate().map(part).collect()
+}
+
 /// Capitalises the first letter.
 pub fn sentence(text: &str) -> String {
     let mut letters = text.chars();

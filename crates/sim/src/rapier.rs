@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 use twinstep_model::{
-    Actuator, ActuatorSnapshot, Backend, BackendError, Command, Ground, GroundTruth, InitialState, Measured, PerJoint,
-    Restorable, RobotModel, RobotStates, Simulator,
+    Actuator, ActuatorMode, ActuatorSnapshot, Backend, BackendError, Command, Ground, GroundTruth, InitialState,
+    Measured, PerJoint, Restorable, RobotModel, RobotStates, Simulator,
 };
 
 use crate::ground_shapes::GroundShapes;
@@ -21,7 +21,7 @@ pub struct RapierBackend {
     ground_shapes: GroundShapes,
     worlds: Vec<RobotWorld>,
     states: RobotStates,
-    /// Replaces the actuators of the robot model. `None`: analytic actuators.
+    /// External actuator. `None`: analytic actuators only.
     actuator: Option<Box<dyn Actuator>>,
     pool: Arc<rayon::ThreadPool>,
 }
@@ -71,7 +71,7 @@ impl RapierBackend {
         Ok(this)
     }
 
-    /// Replaces the actuators of all robots. Reset every robot afterwards.
+    /// Adds an external actuator to all robots, which replaces theirs or adds to them. Reset every robot afterwards.
     #[must_use]
     pub fn with_actuator(self, actuator: Box<dyn Actuator>) -> Self {
         Self { actuator: Some(actuator), ..self }
@@ -112,12 +112,13 @@ impl RapierBackend {
             Some(actuator) => {
                 let mut tau = self.states.measured.tau.clone();
                 self.pool.install(|| actuator.torques(commands, active, &self.states.measured, &mut tau))?;
-                Some(tau)
+                Some((actuator.mode(), tau))
             }
             None => None,
         };
         let input = |robot: usize| match &external {
-            Some(tau) => ActuatorInputRef::Torques(&tau[robot]),
+            Some((ActuatorMode::Replace(_), tau)) => ActuatorInputRef::Torques(&tau[robot]),
+            Some((ActuatorMode::AddAt(tap), tau)) => ActuatorInputRef::Residual(&commands[robot], *tap, &tau[robot]),
             None => ActuatorInputRef::Command(&commands[robot]),
         };
         let measured = &mut self.states.measured;

@@ -125,7 +125,7 @@ fn fit(actuator: &HiddenDrive, args: &Args, bar: &ProgressBar) -> String {
         let skipped = run.torques.len() - predicted.len();
         let [kp, kd] = data.gains[run.joint];
         for row in HISTORY..run.torques.len() {
-            let [dq, ddq] = run.errors[row];
+            let [dq, ddq] = run.inputs[row];
             let members = &predicted[row - skipped];
             let predictions = [kp * dq + kd * ddq, filter.torque(run, row), members[0].mean, mean(members)];
             for (sum, prediction) in squares.iter_mut().zip(predictions) {
@@ -152,7 +152,7 @@ impl Filter {
     const INPUTS: usize = 2 * HISTORY + 1;
 
     fn inputs(run: &Sequence, row: usize) -> Vec<f64> {
-        let past = run.errors[row + 1 - HISTORY..=row].iter().flatten().copied();
+        let past = run.inputs[row + 1 - HISTORY..=row].iter().flatten().copied();
         past.chain([1.0]).collect()
     }
 

@@ -1,8 +1,10 @@
 //! Small ensembles of actuator networks and an interrupted training, as safetensors files.
 
 use serde_json::{Map, Value, json};
-use twinstep_effects::{ActuatorNetworkConfig, MemberSampling};
-use twinstep_ensemble::{Ensemble, EnsembleMetadata, JointEncoding, Normaliser, Normalisers};
+use twinstep_effects::ActuatorNetworkConfig;
+use twinstep_ensemble::{
+    Ensemble, EnsembleMetadata, JointEncoding, NetworkInput, NetworkTarget, Normaliser, Normalisers,
+};
 use twinstep_logs::TorqueSensor;
 use twinstep_model::JOINT_NAMES;
 
@@ -11,7 +13,7 @@ const HIDDEN: usize = 2;
 
 /// Returns the settings with which the ensemble is loaded.
 pub fn settings() -> ActuatorNetworkConfig {
-    ActuatorNetworkConfig { ensemble: "ensemble".into(), draw: MemberSampling::PerEpisode, sample: true }
+    ActuatorNetworkConfig { ensemble: "ensemble".into(), sample: true, ..ActuatorNetworkConfig::default() }
 }
 
 /// Returns an ensemble of two members.
@@ -23,7 +25,9 @@ pub fn ensemble() -> Vec<u8> {
         dt: 0.005,
         joints: JOINT_NAMES.map(str::to_owned).to_vec(),
         joint_input: JointEncoding::Kind,
-        scales: Normalisers { errors: [scale, scale], torque: scale },
+        input: NetworkInput::default(),
+        target: NetworkTarget::default(),
+        scales: Normalisers { inputs: [scale, scale], torque: scale },
         tau_sensor: TorqueSensor::JointOutput,
         gains: vec![[20.0, 0.5]; 12],
         variance_scale: 1.25,

@@ -3,7 +3,8 @@
 The graph evaluates all members. The caller passes their LSTM state from row to row, beginning with zeros. It has
 
 - inputs ``xi`` (batch, 2 + one-hot inputs): position error [rad] and velocity error [rad/s], command minus
-  measurement, and the one-hot encoding of the joint, if any; ``h`` and ``c`` (members, batch, hidden);
+  measurement, or the torque that was asked for [N·m] and the velocity [rad/s] if the ensemble has that input, and the
+  one-hot encoding of the joint, if any; ``h`` and ``c`` (members, batch, hidden);
 - outputs ``mean`` [N·m] and ``variance`` [N²·m²], scaled as calibrated, (members, batch); ``next_h`` and ``next_c``;
 - the metadata ``dt`` [s], ``joints``, ``joint_input``, ``inputs`` (names of the columns of ``xi``), ``gains`` (kp and
   kd of each joint) and ``tau_sensor``, all but the last as JSON.
@@ -32,6 +33,8 @@ OPSET = 17
 IR_VERSION = 8
 VARIANCE_FLOOR = 1e-6
 KINDS = ["hip", "thigh", "calf"]
+# Names of the first two columns, by the input of the networks.
+INPUTS = {"errors": ("position_error", "velocity_error"), "torque": ("asked_torque", "velocity")}
 
 Array = NDArray[np.float32]
 
@@ -78,7 +81,8 @@ class EnsembleFile:
     def columns(self) -> list[str]:
         """Return the names of the columns of ``xi``."""
         one_hot = {"pooled": list[str](), "kind": KINDS, "identity": self.description["joints"]}
-        return ["position_error", "velocity_error", *one_hot[self.description["joint_input"]]]
+        first = INPUTS[self.description.get("input", "errors")]
+        return [*first, *one_hot[self.description["joint_input"]]]
 
 
 def array(content: bytes, entry: dict[str, Any]) -> Array:
@@ -181,6 +185,7 @@ def step_model(ensemble: EnsembleFile) -> ModelProto:
         made, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="twinstep"
     )
     properties = {name: json.dumps(description[name]) for name in ("dt", "joints", "joint_input", "gains")}
+    properties |= {name: description[name] for name in ("input", "target") if name in description}
     properties |= {"inputs": json.dumps(columns), "tau_sensor": description["tau_sensor"]}
     helper.set_model_props(model, properties)
     checker.check_model(model, full_check=True)

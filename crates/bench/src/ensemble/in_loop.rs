@@ -67,7 +67,7 @@ fn walking(actuators: ActuatorKind, robots: usize) -> Result<impl FnMut() -> Res
         ActuatorKind::Analytic | ActuatorKind::NetworkPerEpisode => MemberSampling::PerEpisode,
         ActuatorKind::NetworkPerStep => MemberSampling::PerStep,
     };
-    let settings = ActuatorNetworkConfig { ensemble: "measured".into(), draw, sample: false };
+    let settings = ActuatorNetworkConfig { ensemble: "measured".into(), draw, ..ActuatorNetworkConfig::default() };
     let learned = ActuatorNetworkRobot::new(&ModelFile::default(), ensemble(MEMBERS), settings).map_err(failed)?;
     let backend = match actuators {
         ActuatorKind::Analytic => backend,

@@ -7,7 +7,9 @@ mod training;
 
 use std::path::Path;
 
-use twinstep_ensemble::{Ensemble, EnsembleMetadata, JointEncoding, Normaliser, Normalisers};
+use twinstep_ensemble::{
+    Ensemble, EnsembleMetadata, JointEncoding, NetworkInput, NetworkTarget, Normaliser, Normalisers,
+};
 use twinstep_logs::TorqueSensor;
 use twinstep_model::{JOINT_NAMES, go2};
 
@@ -36,7 +38,9 @@ fn ensemble(members: usize) -> Ensemble {
         dt: control.actuator_dt(),
         joints: JOINT_NAMES.map(str::to_owned).to_vec(),
         joint_input: JointEncoding::Pooled,
-        scales: Normalisers { errors: [scale(0.2), scale(4.0)], torque: scale(8.0) },
+        input: NetworkInput::default(),
+        target: NetworkTarget::default(),
+        scales: Normalisers { inputs: [scale(0.2), scale(4.0)], torque: scale(8.0) },
         tau_sensor: TorqueSensor::MotorCurrent,
         gains: vec![[control.kp, control.kd]; JOINT_NAMES.len()],
         variance_scale: 1.0,

@@ -37,6 +37,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::Rate(100.0), DataRequirement::Bandwidth(1.0)],
     recommended: &[DataRequirement::Bandwidth(3.0)],
     caveat: "confounded with a delay: two spectra, or the first 10 ms of a step, discriminate",
+    remedy: "Change a number: set the rotor inertia (`armature` in MJCF) of these joints in the simulator.",
     search: Search::DEFAULT,
     visibility: Visibility::OutputTorque,
     explained_by: Variable::Acceleration,

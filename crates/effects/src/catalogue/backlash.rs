@@ -39,6 +39,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::Rate(200.0)],
     recommended: &[DataRequirement::LowSpeed, DataRequirement::TorqueMeasured],
     caveat: "visible where the load changes sign",
+    remedy: "Mend the robot: check the gear for wear and the joint's screws. Until then add the law to the simulator.",
     search: Search::DEFAULT,
     visibility: Visibility::Position,
     explained_by: Variable::CommandedTorque,

@@ -35,6 +35,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Floating],
     recommended: &[DataRequirement::Orientation, DataRequirement::TorqueMeasured],
     caveat: "",
+    remedy: "Change a number: move the centre of mass of this link in the simulator, or check what is mounted on it.",
     search: Search {
         probes: Probes::None,
         whole_log_probes: Probes::Values(|| probes_along_axes(0.05)),

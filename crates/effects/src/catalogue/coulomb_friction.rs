@@ -45,6 +45,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    remedy: "Add the law: dry friction (`frictionloss` in MJCF) at these joints. One joint alone: check its bearing.",
     search: Search::DEFAULT,
     visibility: Visibility::OutputTorque,
     explained_by: Variable::Velocity,

@@ -41,6 +41,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::Rate(200.0), DataRequirement::Bandwidth(2.0)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "its gain falls with frequency, that of a delay does not",
+    remedy: "Add the law: a first-order lag between commanded and actual torque. Or raise the current loop's bandwidth.",
     search: Search { oscillates: true, ..Search::DEFAULT },
     visibility: Visibility::MotorTorque,
     explained_by: Variable::CommandedTorqueRate,

@@ -38,6 +38,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals],
     recommended: &[DataRequirement::KpVaries],
     caveat: "confounded with a constant load at a single kp",
+    remedy: "Mend the robot: calibrate the zero of these encoders. Or subtract the offset from the readings.",
     search: Search {
         whole_log_probes: Probes::Values(|| vec![vec![-0.02], vec![0.02]]),
         min_share: 0.45,

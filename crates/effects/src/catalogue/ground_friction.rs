@@ -29,6 +29,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Floating],
     recommended: &[DataRequirement::BasePose],
     caveat: "only slipping feet determine its value",
+    remedy: "Change a number: set the friction coefficient of the ground in the simulator.",
     search: Search {
         probes: Probes::None,
         whole_log_probes: Probes::Values(|| [0.3, 0.5, 0.65, 1.1].map(|friction| vec![friction]).to_vec()),

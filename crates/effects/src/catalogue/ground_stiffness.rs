@@ -31,6 +31,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Floating, DataRequirement::Rate(200.0)],
     recommended: &[DataRequirement::FootContact],
     caveat: "",
+    remedy: "Change a number: set the time constant of contacts (`solref` in MJCF) in the simulator.",
     search: Search {
         probes: Probes::None,
         whole_log_probes: Probes::Values(|| [0.005, 0.01, 0.02, 0.04].map(|time| vec![time]).to_vec()),

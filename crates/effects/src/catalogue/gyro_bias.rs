@@ -28,6 +28,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::BaseRotation(0.0)],
     recommended: &[DataRequirement::Orientation],
     caveat: "",
+    remedy: "Retune the robot: average the gyroscope at rest and subtract the bias.",
     search: Search {
         probes: Probes::None,
         whole_log_probes: Probes::Values(|| probes_along_axes(0.02)),

@@ -37,6 +37,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Floating, DataRequirement::BaseRotation(1.0)],
     recommended: &[DataRequirement::Orientation],
     caveat: "",
+    remedy: "Change a number: set the mass, centre of mass and inertia of this link in the simulator.",
     search: Search { probes: Probes::None, ..Search::DEFAULT },
     visibility: Visibility::Position,
     explained_by: Variable::Time,

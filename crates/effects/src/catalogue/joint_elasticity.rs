@@ -36,6 +36,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Rate(500.0), DataRequirement::Bandwidth(5.0)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    remedy: "Add the law: a spring between rotor and link. One joint alone: check its mounting and its gear.",
     // Other contact laws, and legs that bend, imitate small values.
     search: Search { min_share: 0.15, ..Search::DEFAULT },
     visibility: Visibility::Position,

@@ -48,6 +48,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Range(0.5)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    remedy: "Add the law: a spring at these joints (`stiffness` and `springref` in MJCF). Or reroute the cable that pulls.",
     search: Search { probes: Probes::FirstParameter(&[&[-1.2], &[0.0], &[1.2]]), ..Search::DEFAULT },
     visibility: Visibility::LinkTorque,
     explained_by: Variable::Position,

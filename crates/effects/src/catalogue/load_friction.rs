@@ -37,6 +37,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::Torque(0.15)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "differs from coulomb_friction only under different loads",
+    remedy: "Add the law: friction proportional to the transmitted torque at these joints.",
     search: Search::DEFAULT,
     visibility: Visibility::OutputTorque,
     explained_by: Variable::Load,

@@ -49,6 +49,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Floating],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "a load on a leg is also identifiable with a fixed base",
+    remedy: "Change a number: add this mass at this position in the simulator, or remove it from the robot.",
     search: Search {
         probes: Probes::None,
         whole_log_probes: Probes::Values(|| [-0.5, 0.3, 0.8, 2.0].map(|mass| vec![mass, 0.0, 0.0, 0.0]).to_vec()),

@@ -56,6 +56,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::TorqueMeasured, DataRequirement::Reversals],
     recommended: &[DataRequirement::KdVaries],
     caveat: "",
+    remedy: "Retune the robot: set the gains that the log states, or state the gains that the motors have.",
     search: Search { probes: Probes::Values(probes), ..Search::DEFAULT },
     visibility: Visibility::MotorTorque,
     explained_by: Variable::CommandedTorque,

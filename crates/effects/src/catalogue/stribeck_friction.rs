@@ -40,6 +40,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::LowSpeed],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    remedy: "Add the law: friction that falls with speed at these joints. Slow motion needs it.",
     search: Search { probes: Probes::FirstParameter(&[&[0.15], &[0.6], &[2.0]]), ..Search::DEFAULT },
     visibility: Visibility::OutputTorque,
     explained_by: Variable::Velocity,

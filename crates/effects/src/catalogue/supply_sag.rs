@@ -37,6 +37,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Torque(0.4), DataRequirement::Voltage(0.5)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    remedy: "Retune the robot: use a charged battery, or compensate the voltage. Or add the law to the simulator.",
     search: Search { predictable: false, ..Search::DEFAULT },
     visibility: Visibility::MotorTorque,
     explained_by: Variable::Voltage,

@@ -47,6 +47,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Torque(0.1), DataRequirement::Temperature(10.0)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    remedy: "Retune the robot: cool the motors or lower their load. Or add the law to the simulator.",
     search: Search { probes: Probes::FirstParameter(&[&[35.0]]), predictable: false, ..Search::DEFAULT },
     visibility: Visibility::MotorTorque,
     explained_by: Variable::Temperature,

@@ -40,6 +40,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::TorqueMeasured, DataRequirement::Reversals],
     recommended: &[],
     caveat: "",
+    remedy: "Retune the robot: compensate the dead zone in the motor driver. Or add the law to the simulator.",
     search: Search::DEFAULT,
     visibility: Visibility::MotorTorque,
     explained_by: Variable::CommandedTorque,

@@ -40,6 +40,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals],
     recommended: &[DataRequirement::TorqueMeasured, DataRequirement::Torque(0.1)],
     caveat: "confounded with a wrong kp or mass",
+    remedy: "Change a number: scale the torque of these motors in the simulator. Or correct the torque constant in the driver.",
     search: Search::DEFAULT,
     visibility: Visibility::OutputTorque,
     explained_by: Variable::CommandedTorque,

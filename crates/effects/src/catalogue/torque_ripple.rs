@@ -50,6 +50,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Range(0.5), DataRequirement::Rate(100.0)],
     recommended: &[DataRequirement::LowSpeed, DataRequirement::TorqueMeasured],
     caveat: "",
+    remedy: "Mend the robot: calibrate the commutation of the motor. Or add the law to the simulator.",
     search: Search { probes: Probes::Values(probes), ..Search::DEFAULT },
     visibility: Visibility::OutputTorque,
     explained_by: Variable::Position,

@@ -40,6 +40,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Torque(0.6)],
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
+    remedy: "Add the law: soft saturation of the torque in the simulator, and keep commands below it.",
     search: Search::DEFAULT,
     visibility: Visibility::MotorTorque,
     explained_by: Variable::CommandedTorque,

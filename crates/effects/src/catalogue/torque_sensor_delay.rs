@@ -29,6 +29,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::TorqueMeasured, DataRequirement::Reversals, DataRequirement::Rate(200.0)],
     recommended: &[DataRequirement::Bandwidth(2.0)],
     caveat: "",
+    remedy: "Change a number: read the torque estimate this much later. The motion is not affected.",
     search: Search::DEFAULT,
     visibility: Visibility::MotorTorque,
     explained_by: Variable::CommandedTorqueRate,

@@ -35,6 +35,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Speed(0.5)],
     recommended: &[DataRequirement::Torque(0.5)],
     caveat: "",
+    remedy: "Add the law: torque that falls with speed in the simulator. Or limit speed and torque in the controller.",
     search: Search::DEFAULT,
     visibility: Visibility::MotorTorque,
     explained_by: Variable::Velocity,

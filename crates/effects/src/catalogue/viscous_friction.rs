@@ -35,6 +35,7 @@ pub const EFFECT: Effect = Effect {
     needs: &[DataRequirement::Reversals, DataRequirement::Speed(0.03)],
     recommended: &[DataRequirement::KdVaries],
     caveat: "confounded with a wrong kd at a single kd",
+    remedy: "Add the law: damping (`damping` in MJCF) at these joints. One joint alone: check its lubrication.",
     search: Search::DEFAULT,
     visibility: Visibility::OutputTorque,
     explained_by: Variable::Velocity,

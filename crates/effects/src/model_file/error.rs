@@ -44,8 +44,8 @@ pub enum ModelFileError {
     },
     /// The robot has an actuator network, but the caller needs analytic actuators.
     #[error(
-        "{name}: `[actuator]` is for `twinstep serve` and `twinstep play`; no other command simulates actuator \
-         networks. Remove the table to use the analytic actuators with the effects of the file"
+        "{name}: this command does not simulate actuator networks; `serve`, `play`, `evaluate`, `train` and `view` do. \
+         Remove the table `[actuator]` to use the analytic actuators with the effects of the file"
     )]
     ActuatorNetwork {
         /// The file, or another source of the text.

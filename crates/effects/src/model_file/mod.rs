@@ -16,7 +16,7 @@ use serde::Deserialize;
 use toml::{Table, Value};
 use twinstep_model::RobotModel;
 
-pub use actuator_network::{ActuatorNetworkConfig, MemberSampling};
+pub use actuator_network::{ActuatorNetworkConfig, MemberSampling, NetworkMode};
 pub use error::{EffectEntryError, ModelFileError};
 
 use crate::nominal::{ControlTable, JointsTable, NominalRobot, is_robot_file};

@@ -49,11 +49,14 @@ fn path_of_an_ensemble_is_relative_to_the_model_file_and_becomes_absolute() {
         .expect("written");
     let file = ModelFile::load(&path).expect("valid");
     let ensemble = folder.path().join("e.safetensors");
-    assert_eq!(file.actuator, Some(ActuatorNetworkConfig { ensemble, draw: MemberSampling::PerStep, sample: false }));
+    assert_eq!(
+        file.actuator,
+        Some(ActuatorNetworkConfig { ensemble, draw: MemberSampling::PerStep, ..ActuatorNetworkConfig::default() })
+    );
     assert_eq!(ModelFile::parse(&file.to_toml(), "again").expect("valid"), file);
     for refusal in [load_robot(&path).map(drop), ModelFile::load_without_actuator_network(&path).map(drop)] {
         let error = refusal.expect_err("refused").to_string();
-        assert!(error.contains("robot.toml: `[actuator]` is for `twinstep serve`"), "{error}");
+        assert!(error.contains("robot.toml: this command does not simulate actuator networks"), "{error}");
     }
 }
 

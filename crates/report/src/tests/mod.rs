@@ -51,6 +51,7 @@ fn nothing() -> Diagnosis {
         findings: Vec::new(),
         confusable: Vec::new(),
         unexplained: Unexplained::default(),
+        learned_residual: None,
         next_experiment: None,
         extended_model: "extended.toml".to_owned(),
     }

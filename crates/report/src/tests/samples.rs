@@ -6,7 +6,7 @@ use twinstep_diagnose::{
     AlternativeCause, Cause, CorrelatedPair, Diagnosis, DiscriminatedPair, Estimate, NextExperiment, ParameterValue,
     RmsErrors, Unexplained,
 };
-use twinstep_effects::ModelFile;
+use twinstep_effects::{Effect, ModelFile};
 use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{BaseMount, JOINT_NAMES, go2};
 use twinstep_sim::{BatchBackend, BatchRollout, SimConfig};
@@ -79,6 +79,7 @@ pub fn findings() -> (Diagnosis, ModelFile) {
             depends_on: vec!["q_FR_hip".to_owned()],
             text: "The residual is above the noise at the front right hip, near its joint limit.".to_owned(),
         },
+        learned_residual: None,
         next_experiment: Some(NextExperiment {
             motion: "next_experiment".to_owned(),
             parts: vec![DiscriminatedPair {
@@ -109,6 +110,7 @@ fn cause(effect: &str, scope: &str, parameter: &str, [value, low, high]: [f64; 3
         threshold_nats: 14.2,
         ambiguous_with: Vec::new(),
         posterior: Vec::new(),
+        remedy: Effect::named(effect).expect("known").remedy.to_owned(),
         rivals: Vec::new(),
         evidence: String::new(),
     }

@@ -3,6 +3,7 @@
 //! All robots have the kinematic tree of the Go2, whose mass matrix has arrow structure ([`twinstep_model::dynamics`]),
 //! and differ only in parameter values. One SIMD register therefore holds eight or sixteen robots.
 //!
+//! - [`actuator_input`]: commands and torques of a step.
 //! - [`contact`], [`rows`] and [`ground`]: contacts, joint limits and joint friction as MuJoCo's soft constraints.
 //! - [`group`]: a [`robot_batch::RobotBatch`] is the state of the robots in one register.
 //! - [`simulator`]: steps batches on all cores, in the widest registers of the processor.
@@ -14,6 +15,7 @@
 #![allow(clippy::inline_always, reason = "a function that is not inlined is compiled for the baseline instruction set")]
 #![allow(clippy::needless_range_loop, reason = "matrix indices as in the textbook")]
 
+mod actuator_input;
 mod contact;
 mod ground;
 mod robot_batch;
@@ -33,9 +35,10 @@ pub use simulator::SimdPrecision;
 use crate::BackendBuildError;
 use crate::rapier::{check_floating, check_lengths};
 use crate::{SimConfig, SimConfigError};
-use robot_batch::{LaneSnapshot, StepCount};
-pub(crate) use simulator::batch_simulator;
-use simulator::{ActuatorInputs, BatchSimulator};
+pub(crate) use actuator_input::ActuatorInputs;
+use robot_batch::LaneSnapshot;
+pub(crate) use robot_batch::StepCount;
+pub(crate) use simulator::{BatchSimulator, batch_simulator};
 
 /// Backend that simulates one robot per SIMD lane.
 pub struct BatchBackend {
@@ -44,7 +47,7 @@ pub struct BatchBackend {
     ground: Ground,
     robots: Box<dyn BatchSimulator>,
     states: RobotStates,
-    /// Replaces the actuators of the robot model. `None`: analytic actuators.
+    /// External actuator. `None`: analytic actuators only.
     actuator: Option<Box<dyn Actuator>>,
     /// `None` if there is one thread: the caller's.
     pool: Option<Arc<rayon::ThreadPool>>,
@@ -85,7 +88,7 @@ impl BatchBackend {
         Ok(Self { robot, config, ground, robots, states, actuator: None, pool })
     }
 
-    /// Replaces the actuators of all robots. Reset every robot afterwards.
+    /// Adds an external actuator to all robots, which replaces theirs or adds to them. Reset every robot afterwards.
     #[must_use]
     pub fn with_actuator(self, actuator: Box<dyn Actuator>) -> Self {
         Self { actuator: Some(actuator), ..self }
@@ -192,7 +195,8 @@ impl Backend for BatchBackend {
             for _ in 0..actuator_periods {
                 on(pool, || actuator.torques(commands, active, &states.measured, &mut tau))?;
                 let period = StepCount { actuator_periods: 1, steps };
-                finite &= robots.advance(pool, ActuatorInputs::Torques(&tau), active, period, states);
+                let inputs = ActuatorInputs::of(actuator.mode(), commands, &tau);
+                finite &= robots.advance(pool, inputs, active, period, states);
             }
             if let Some(evaluator) = actuator.uncertainty() {
                 on(pool, || evaluator.evaluate(active, &mut states.truth.epistemic_uncertainty));

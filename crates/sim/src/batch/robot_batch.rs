@@ -7,6 +7,7 @@ use twinstep_model::{
 };
 use twinstep_simd::SimdFloat;
 
+use super::actuator_input::ActuatorInput;
 use super::contact::{Constraints, ContactParams, Impulses, LEG_POINTS, POINTS};
 use super::ground::SimdTerrain;
 use crate::SimConfig;
@@ -37,26 +38,6 @@ pub struct StepCount {
     pub actuator_periods: usize,
     /// Physics steps per actuator period.
     pub steps: usize,
-}
-
-/// Input of the actuators of one batch.
-#[allow(clippy::large_enum_variant, reason = "created once per step and never moved")]
-pub enum ActuatorInput<T> {
-    /// Commands to the actuators of the robot model.
-    Commands(SimdCommands<T>),
-    /// Joint torques of an external actuator [N·m].
-    Torques([T; 12]),
-}
-
-impl<T: SimdFloat> ActuatorInput<T> {
-    /// Creates the input from the torques of an external actuator, one entry per robot [N·m].
-    pub fn torques(tau: &[PerJoint]) -> Self {
-        let mut given = [T::splat(0.0); 12];
-        for (lane, tau) in tau.iter().enumerate() {
-            set(&mut given, lane, tau.map(f64::from));
-        }
-        Self::Torques(given)
-    }
 }
 
 /// Memory for the equations of one step. It is large, so batches and steps share it.
@@ -198,6 +179,10 @@ impl<T: SimdFloat> RobotBatch<T> {
                     self.actuator.update_command(commands, &self.sampled_q(), &self.state.dq);
                 }
                 ActuatorInput::Torques(tau) => self.actuator.set_torque(*tau),
+                ActuatorInput::Residual(commands, tap, tau) => {
+                    self.actuator.update_command(commands, &self.sampled_q(), &self.state.dq);
+                    self.actuator.set_residual(*tap, *tau);
+                }
             }
             self.tau = [T::splat(0.0); 12];
             for index in 0..steps {

@@ -4,11 +4,12 @@ use rayon::ThreadPool;
 use rayon::prelude::*;
 use twinstep_model::dynamics::SimdCommands;
 use twinstep_model::{
-    Command, Ground, HistoryStep, InitialState, PerJoint, RobotModel, RobotStates, RobotStatesMut, RolloutRequest,
+    Ground, HistoryStep, InitialState, PerJoint, RobotModel, RobotStates, RobotStatesMut, RolloutRequest,
 };
 use twinstep_simd::{InstructionSet, SimdFloat, SimdKernel, SimdTask, with_f32, with_f64};
 
-use super::robot_batch::{ActuatorInput, LaneSnapshot, RobotBatch, SensorReadings, StepCount, Workspace};
+use super::actuator_input::{ActuatorInput, ActuatorInputs};
+use super::robot_batch::{LaneSnapshot, RobotBatch, SensorReadings, StepCount, Workspace};
 use crate::SimConfig;
 
 /// Precision of the simulation.
@@ -18,15 +19,6 @@ pub enum SimdPrecision {
     Single(InstructionSet),
     /// Double precision in the widest registers of the processor, for system identification.
     Double,
-}
-
-/// Input of the actuators of all robots.
-#[derive(Clone, Copy)]
-pub enum ActuatorInputs<'a> {
-    /// Commands to the actuators of the robot model, one per robot.
-    Commands(&'a [Command]),
-    /// Joint torques of an external actuator, one entry per robot [N·m].
-    Torques(&'a [PerJoint]),
 }
 
 /// Robots in batches of any register type.
@@ -152,12 +144,7 @@ impl<T: SimdFloat> BatchSimulator for RobotBatches<T> {
         let one = |scratch: &mut Workspace<T>,
                    (index, (group, states)): (usize, (&mut RobotBatch<T>, &mut RobotStatesMut))| {
             let robots = index * lanes..(index * lanes + lanes).min(active.len());
-            let input = match inputs {
-                ActuatorInputs::Commands(commands) => {
-                    ActuatorInput::Commands(SimdCommands::new(&commands[robots.clone()]))
-                }
-                ActuatorInputs::Torques(tau) => ActuatorInput::torques(&tau[robots.clone()]),
-            };
+            let input = ActuatorInput::of(inputs.range(robots.clone()));
             advance_active(group, &input, &active[robots], time, scratch, states)
         };
         match pool {

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use twinstep_model::{
-    ActuatorParams, Backend, BackendError, Command, Ground, GroundTruth, InitialState, JointSpring, Measured,
+    Actuator, ActuatorParams, Backend, BackendError, Command, Ground, GroundTruth, InitialState, JointSpring, Measured,
     NUM_JOINTS, PerJoint, RobotModel, RobotStates, Simulator, Stribeck,
 };
 
@@ -21,6 +21,8 @@ pub struct MujocoPlant {
     /// The robots without what [`PlantActuator`] computes.
     bodies: MujocoBackend,
     actuators: Vec<PlantActuator>,
+    /// External actuator. `None`: [`PlantActuator`] only.
+    external: Option<Box<dyn Actuator>>,
     /// Steps per actuator period.
     steps: usize,
     /// States as the sensors measure them.
@@ -58,7 +60,13 @@ impl MujocoPlant {
         let bodies = create(bodies, config, num_robots)?;
         let states = bodies.states().clone();
         let actuators = states.measured.q.iter().map(|q| PlantActuator::new(&robot, steps, &widened(q))).collect();
-        Ok(Self { robot, bodies, actuators, steps, states })
+        Ok(Self { robot, bodies, actuators, external: None, steps, states })
+    }
+
+    /// Adds an external actuator to all robots, which replaces theirs or adds to them. Reset every robot afterwards.
+    #[must_use]
+    pub fn with_actuator(self, actuator: Box<dyn Actuator>) -> Self {
+        Self { external: Some(actuator), ..self }
     }
 
     /// Returns positions [rad] and velocities [rad/s] of the links of a robot.
@@ -70,8 +78,9 @@ impl MujocoPlant {
     /// Reads the states of all robots, with the readings of their encoders.
     fn update_states(&mut self) {
         let tau = std::mem::take(&mut self.states.measured.tau);
+        let uncertainty = std::mem::take(&mut self.states.truth.epistemic_uncertainty);
         self.states.clone_from(self.bodies.states());
-        self.states.measured.tau = tau;
+        (self.states.measured.tau, self.states.truth.epistemic_uncertainty) = (tau, uncertainty);
         for robot in 0..self.actuators.len() {
             let (q, dq) = self.links(robot);
             for joint in 0..NUM_JOINTS {
@@ -83,7 +92,11 @@ impl MujocoPlant {
     }
 
     /// Replaces the actuators of a robot after its reset.
-    fn rest(&mut self, robot: usize, model: &RobotModel) {
+    fn rest(&mut self, robot: usize, model: &RobotModel, seed: u64) {
+        if let Some(external) = &mut self.external {
+            external.reset(robot, seed);
+        }
+        self.states.truth.epistemic_uncertainty[robot] = 0.0;
         self.actuators[robot] = PlantActuator::new(model, self.steps, &self.links(robot).0);
         self.states.measured.tau[robot] = PerJoint::default();
     }
@@ -100,6 +113,13 @@ impl MujocoPlant {
         for robot in (0..active.len()).filter(|robot| active[*robot]) {
             let (q, dq) = self.links(robot);
             self.actuators[robot].sample(&commands[robot], &q, &dq);
+        }
+        if let Some(external) = &mut self.external {
+            let mut tau = self.states.measured.tau.clone();
+            external.torques(commands, active, &self.states.measured, &mut tau)?;
+            for robot in (0..active.len()).filter(|robot| active[*robot]) {
+                self.actuators[robot].set_external(external.mode(), widened(&tau[robot]));
+            }
         }
         let mut torques = vec![Command::hold([0.0; NUM_JOINTS], 0.0, 0.0); active.len()];
         for _ in 0..self.steps {
@@ -162,8 +182,8 @@ impl Backend for MujocoPlant {
     fn reset(&mut self, initial_states: &[(usize, InitialState)]) -> Result<(), BackendError> {
         self.bodies.reset(initial_states)?;
         let nominal = self.robot.clone();
-        for (robot, _) in initial_states {
-            self.rest(*robot, &nominal);
+        for (robot, initial_state) in initial_states {
+            self.rest(*robot, &nominal, initial_state.actuator_seed);
         }
         self.update_states();
         Ok(())
@@ -176,7 +196,7 @@ impl Backend for MujocoPlant {
         initial_state: &InitialState,
     ) -> Result<(), BackendError> {
         self.bodies.reset_with_model(robot, &bodies(model, self.steps), initial_state)?;
-        self.rest(robot, model);
+        self.rest(robot, model, initial_state.actuator_seed);
         self.update_states();
         Ok(())
     }
@@ -195,11 +215,18 @@ impl Backend for MujocoPlant {
             // The sensor has the mean of the last actuator period.
             sums.fill([0.0; NUM_JOINTS]);
             self.period(commands, &mut running, &mut sums, &mut diverged)?;
+            if self.external.is_some() {
+                // The next period samples the readings.
+                self.update_states();
+            }
         }
         for robot in (0..active.len()).filter(|robot| active[*robot]) {
             self.states.measured.tau[robot] = sums[robot].map(|sum| (sum / self.steps as f64) as f32);
         }
         self.update_states();
+        if let Some(evaluator) = self.external.as_deref_mut().and_then(Actuator::uncertainty) {
+            evaluator.evaluate(active, &mut self.states.truth.epistemic_uncertainty);
+        }
         if diverged.is_empty() { Ok(()) } else { Err(BackendError::Diverged { robots: diverged }) }
     }
 }

@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use twinstep_model::{Command, JointModel, NUM_JOINTS, RobotModel};
+use twinstep_model::{ActuatorMode, ActuatorTap, Command, JointModel, NUM_JOINTS, RobotModel};
 
 /// Stiffness of a gear with backlash for which the robot gives none [N·m/rad].
 const RIGID_GEAR: f64 = 2000.0;
@@ -45,6 +45,8 @@ pub struct PlantActuator {
     wanted: Joints,
     /// Torque after the lag [N·m].
     current: Joints,
+    /// Torque that is added at a tap in this actuator period [N·m].
+    residual: Option<(ActuatorTap, Joints)>,
     rotors: [Rotor; NUM_JOINTS],
     /// Factor on the torque for supply voltage and motor temperature.
     pub derating: Joints,
@@ -62,6 +64,7 @@ impl PlantActuator {
             torques: VecDeque::new(),
             wanted: [0.0; NUM_JOINTS],
             current: [0.0; NUM_JOINTS],
+            residual: None,
             rotors,
             derating: [1.0; NUM_JOINTS],
         }
@@ -103,6 +106,14 @@ impl PlantActuator {
         }
     }
 
+    /// Takes over the torques of an external actuator for an actuator period [N·m].
+    pub fn set_external(&mut self, mode: ActuatorMode, tau: Joints) {
+        match mode {
+            ActuatorMode::Replace(_) => self.wanted = tau,
+            ActuatorMode::AddAt(tap) => self.residual = Some((tap, tau)),
+        }
+    }
+
     /// Advances the actuators by a step in which the links move from `q` [rad] with `dq` [rad/s].
     pub fn step(&mut self, q: &Joints, dq: &Joints) -> PlantTorques {
         self.torques.push_front(self.wanted);
@@ -128,15 +139,21 @@ impl PlantActuator {
                 1.0
             };
             self.current[joint] += share * (torque - self.current[joint]);
-            torques.sensed[joint] = self.current[joint];
+            let residual_at = |tap: ActuatorTap| match &self.residual {
+                Some((at, residual)) if *at == tap => residual[joint],
+                _ => 0.0,
+            };
+            let output_residual = residual_at(ActuatorTap::Output);
+            torques.sensed[joint] = self.current[joint] + residual_at(ActuatorTap::Current);
             let ripple = actuator.ripple;
-            let motor =
-                actuator.gain * self.current[joint] + ripple.amplitude * (ripple.cycles * rotor.q + ripple.phase).sin();
+            let motor = actuator.gain * torques.sensed[joint]
+                + ripple.amplitude * (ripple.cycles * rotor.q + ripple.phase).sin();
             let gear = if has_rotor { self.gear_torque(joint, motor, q[joint], dq[joint]) } else { motor };
             let stribeck = model.stribeck_friction;
             let slow = (dq[joint] / stribeck.stribeck_velocity).powi(2);
             let friction = stribeck.breakaway_torque * (-slow).exp() + model.load_friction * motor.abs();
-            torques.applied[joint] = gear - friction * (dq[joint] / REVERSAL_SPEED).tanh() + model.spring.torque_offset
+            torques.applied[joint] = gear + output_residual - friction * (dq[joint] / REVERSAL_SPEED).tanh()
+                + model.spring.torque_offset
                 - model.spring.stiffness * q[joint];
         }
         torques

@@ -21,7 +21,7 @@ mod snapshot;
 use glam::{Quat, Vec3};
 use rapier3d::prelude::*;
 use twinstep_model::{
-    Command, NUM_JOINTS, PerJoint, PerLeg,
+    ActuatorTap, Command, NUM_JOINTS, PerJoint, PerLeg,
     dynamics::{JointForces, SimdActuators, SimdCommands},
     frames,
 };
@@ -56,6 +56,8 @@ pub enum ActuatorInputRef<'a> {
     Command(&'a Command),
     /// Joint torques of an external actuator [N·m].
     Torques(&'a PerJoint),
+    /// A command, and joint torques of an external actuator that are added at a tap [N·m].
+    Residual(&'a Command, ActuatorTap, &'a PerJoint),
 }
 
 impl RobotWorld {
@@ -76,10 +78,13 @@ impl RobotWorld {
     pub fn actuator_period(&mut self, input: ActuatorInputRef, steps: usize) -> PerJoint {
         let (mut q, mut dq) = self.joints();
         match input {
-            ActuatorInputRef::Command(command) => {
+            ActuatorInputRef::Command(command) | ActuatorInputRef::Residual(command, ..) => {
                 self.actuator.update_command(&SimdCommands::new(std::slice::from_ref(command)), &q, &dq);
             }
             ActuatorInputRef::Torques(tau) => self.actuator.set_torque(tau.map(f64::from)),
+        }
+        if let ActuatorInputRef::Residual(_, tap, tau) = input {
+            self.actuator.set_residual(tap, tau.map(f64::from));
         }
         let mut estimated = [0.0; NUM_JOINTS];
         for index in 0..steps {

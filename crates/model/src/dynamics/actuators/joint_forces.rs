@@ -3,6 +3,7 @@
 
 use super::SimdActuators;
 use super::coefficients::Coefficients;
+use crate::ActuatorTap;
 use twinstep_simd::{SimdFloat, exponential};
 
 /// Integration steps of a rotor with an elastic gear per physics step.
@@ -49,6 +50,9 @@ impl<T: SimdFloat> SimdActuators<T> {
             let (current, input) = (&mut self.state.current[joint], tau);
             self.estimated_torque[joint] = input + n.lag_mean * (*current - input);
             *current += n.lag * (input - *current);
+            if let Some((ActuatorTap::Current, residual)) = &self.residual {
+                self.estimated_torque[joint] += residual[joint];
+            }
             tau = n.gain * self.estimated_torque[joint];
             if active.ripple {
                 let (sin, _) = (n.ripple_cycles * rotor_q + n.ripple_phase).sin_cos();
@@ -63,6 +67,11 @@ impl<T: SimdFloat> SimdActuators<T> {
         }
         if active.elastic {
             self.integrate_gear(&mut forces.tau, q, dq);
+        }
+        if let Some((ActuatorTap::Output, residual)) = &self.residual {
+            for joint in 0..12 {
+                forces.tau[joint] += residual[joint];
+            }
         }
         if active.spring {
             for joint in 0..12 {

@@ -14,7 +14,7 @@ mod commands;
 mod joint_forces;
 mod pd_loop;
 
-use crate::{ActuatorParams, PerJoint, RobotModel};
+use crate::{ActuatorParams, ActuatorTap, PerJoint, RobotModel};
 use twinstep_simd::SimdFloat;
 
 use coefficients::{ActiveEffects, Coefficients, gear_stiffness};
@@ -43,6 +43,8 @@ pub struct SimdActuators<T> {
     estimated_torque: [T; 12],
     /// Factor on the torque for supply voltage and motor temperature.
     derating: [T; 12],
+    /// Torque that is added at a tap in the current actuator period [N·m].
+    residual: Option<(ActuatorTap, [T; 12])>,
     active: ActiveEffects,
     /// Physics step [actuator periods].
     step_fraction: T,
@@ -68,6 +70,7 @@ impl<T: SimdFloat> SimdActuators<T> {
             state,
             estimated_torque: zero,
             derating: [T::splat(1.0); 12],
+            residual: None,
             active: ActiveEffects::default(),
             step_fraction: T::splat(dt / actuator_dt),
             dt,

@@ -1,6 +1,7 @@
 //! Torque of the PD loop, once per actuator period: command delay, gain errors, saturation, derating and limits.
 
 use super::{SimdActuators, SimdCommands};
+use crate::ActuatorTap;
 use twinstep_simd::{SimdFloat, exponential};
 
 impl<T: SimdFloat> SimdActuators<T> {
@@ -36,6 +37,12 @@ impl<T: SimdFloat> SimdActuators<T> {
             self.state.torque_history.copy_within(0..last, 1);
         }
         self.state.torque_history[0] = torque;
+    }
+
+    /// Adds a torque [N·m] at a tap until the next call.
+    #[inline(always)]
+    pub fn set_residual(&mut self, tap: ActuatorTap, torque: [T; 12]) {
+        self.residual = Some((tap, torque));
     }
 
     /// Appends the commands to the history and returns those that arrive now.
