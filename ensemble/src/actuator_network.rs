@@ -319,7 +319,8 @@ mod tests {
 
     use super::*;
     use crate::inference::Inference;
-    use crate::metadata::{EnsembleMetadata, JointEncoding, NetworkInput, NetworkTarget};
+    use crate::metadata::{EnsembleMetadata, JointEncoding};
+    use crate::network_input::{NetworkInput, NetworkTarget};
     use crate::normaliser::Normaliser;
 
     fn ensemble(members: usize) -> Ensemble {

@@ -10,7 +10,8 @@ use twinstep_simd::InstructionSet;
 use crate::EnsembleError;
 use crate::actuator_network::{ActuatorNetwork, Combination, NetworkUse};
 use crate::ensemble::Ensemble;
-use crate::metadata::{JointEncoding, NetworkInput};
+use crate::metadata::JointEncoding;
+use crate::network_input::NetworkInput;
 
 /// Last stage of the actuator chain that an ensemble replaces, for a motor-current sensor and a joint-output sensor.
 const LAST_REPLACED_STAGE: [u32; 2] = [9, 14];

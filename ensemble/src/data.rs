@@ -6,7 +6,7 @@ use sha2::{Digest, Sha256};
 use twinstep_logs::{Log, TorqueSensor};
 
 use crate::EnsembleError;
-use crate::metadata::{NetworkInput, NetworkTarget};
+use crate::network_input::{NetworkInput, NetworkTarget};
 use crate::smooth::smoothed;
 
 /// Maximum length of a block [s]: long compared with an actuator's time constants, short compared with a motion.

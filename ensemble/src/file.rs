@@ -9,7 +9,8 @@ use serde::de::DeserializeOwned;
 
 use crate::EnsembleError;
 use crate::ensemble::Ensemble;
-use crate::metadata::{EnsembleMetadata, NetworkInput};
+use crate::metadata::EnsembleMetadata;
+use crate::network_input::NetworkInput;
 use crate::weights::{Shape, Weights};
 
 /// An array of a file.

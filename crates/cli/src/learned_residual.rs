@@ -21,7 +21,7 @@ use crate::robot_file::SimulatedRobot;
 /// File of the ensemble, in the folder of a diagnosis.
 pub const FILE: &str = "residual.safetensors";
 /// Unexplained fraction of the residual power above which a network is trained.
-const MIN_FRACTION: f64 = 0.1;
+const MIN_FRACTION: f64 = 0.05;
 /// Least reduction of the closed-loop error on held-out blocks for which it is kept.
 const MIN_GAIN: f64 = 0.2;
 /// Highest rate of the networks [Hz]: that of the actuators in simulation.
