@@ -17,6 +17,8 @@ use crate::robot_pair::RobotPair;
 
 /// Sequences are cut after this time [ms].
 const MAX_MS: u64 = 10_000;
+/// Time in which the robot's process finds the robot.
+const DISCOVERY: Duration = Duration::from_secs(20);
 /// Interval at which the states of the robot are looked at.
 const LOOK: Duration = Duration::from_millis(10);
 /// Time in which the last messages of a robot that is not armed any more arrive.
@@ -49,6 +51,8 @@ pub fn run(program: &Path, seed: u64, index: u64) -> Result<WireRun, String> {
     let stopper = Connection::open(&ConnectOptions::new(&pair.endpoint, 1), Secret::random());
     let stopper = stopper.map_err(|error| error.to_string())?;
     let mut watcher = Watcher::default();
+    // The first request of a sequence is for a robot that is observed, which it is here after the discovery.
+    watcher.wait_for_states(&mut pair)?;
     let (start, mut done) = (Instant::now(), 0);
     for (at, event) in events(seed, index).into_iter().take_while(|(at, _)| *at < MAX_MS) {
         while start.elapsed() < Duration::from_millis(at) {
@@ -136,6 +140,19 @@ impl Watcher {
         self.has_power &= line != "power cut";
         self.has_stranger = line == "foreign writer on" || (self.has_stranger && line != "clear");
         self.had_stranger |= self.has_stranger;
+    }
+
+    /// Waits until states of the robot arrive.
+    fn wait_for_states(&mut self, pair: &mut RobotPair) -> Result<(), String> {
+        let end = Instant::now() + DISCOVERY;
+        while self.state != "observe" {
+            if Instant::now() > end {
+                return Err(format!("no states arrived within {DISCOVERY:?}; last state `{}`", self.state));
+            }
+            std::thread::sleep(LOOK);
+            self.look(pair)?;
+        }
+        Ok(())
     }
 
     fn look(&mut self, pair: &mut RobotPair) -> Result<(), String> {
