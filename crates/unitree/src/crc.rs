@@ -192,7 +192,8 @@ mod tests {
     fn any_number_of_words_has_the_remainder_of_the_polynomial_division() {
         let image: Vec<u8> = (0..44_u32).map(|index| (index * index * 37 + 11) as u8).collect();
         for len in (0..=image.len()).step_by(4) {
-            let words = image[..len].chunks_exact(4).map(|word| u32::from_le_bytes(word.try_into().expect("four bytes")));
+            let words =
+                image[..len].chunks_exact(4).map(|word| u32::from_le_bytes(word.try_into().expect("four bytes")));
             let divided = words.fold(u32::MAX, |crc, word| {
                 (0..32).fold(crc ^ word, |crc, _| if crc >> 31 == 1 { (crc << 1) ^ POLYNOMIAL } else { crc << 1 })
             });
