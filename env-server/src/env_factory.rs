@@ -78,6 +78,8 @@ pub struct SimEnvFactory {
     seed: u64,
     /// Base policy of the task `explore`.
     base: Option<Policy>,
+    /// True if actuator networks estimate their epistemic uncertainty.
+    estimates_uncertainty: bool,
 }
 
 impl SimEnvFactory {
@@ -100,7 +102,13 @@ impl SimEnvFactory {
             TaskConfig::Explore(explore) => Some(Policy::read(&explore.base)?.0),
             _ => None,
         };
-        Ok(Self { config, robot, learned, robots, seed, base })
+        let estimates_uncertainty = config.task.epistemic_uncertainty_weight().1 != 0.0;
+        Ok(Self { config, robot, learned, robots, seed, base, estimates_uncertainty })
+    }
+
+    /// Lets actuator networks estimate their epistemic uncertainty also where it is no reward.
+    pub fn estimating_uncertainty(self) -> Self {
+        Self { estimates_uncertainty: true, ..self }
     }
 
     /// Returns the nominal robot.
@@ -110,8 +118,8 @@ impl SimEnvFactory {
 
     /// Returns the actuator networks of `num_envs` robots, or `None` if the actuators are analytic.
     fn actuators(&self, num_envs: usize) -> Option<Box<dyn Actuator>> {
-        let uncertain = self.config.task.epistemic_uncertainty_weight().1 != 0.0;
-        self.learned.as_ref().map(|learned| Box::new(learned.actuators(num_envs, uncertain)) as Box<dyn Actuator>)
+        let networks = |learned: &ActuatorNetworkRobot| learned.actuators(num_envs, self.estimates_uncertainty);
+        self.learned.as_ref().map(|learned| Box::new(networks(learned)) as Box<dyn Actuator>)
     }
 }
 

@@ -419,7 +419,18 @@ pub fn decode_scene(reply: message::RenderReply<'_>) -> Result<Scene, ErrorReply
         return Err(ErrorReply::new(ErrorCode::OutOfRange, "shapes", message));
     }
     let ground = decode_ground(ground)?;
-    Ok(Scene { bodies, pose, shapes, ground, command, velocity: None, torque: None, foot_force: None })
+    Ok(Scene {
+        bodies,
+        pose,
+        shapes,
+        ground,
+        command,
+        velocity: None,
+        torque: None,
+        foot_force: None,
+        reward_terms: Vec::new(),
+        uncertainty: None,
+    })
 }
 
 fn decode_ground(ground: message::Ground<'_>) -> Result<Ground, ErrorReply> {

@@ -68,8 +68,8 @@ fn errors(log: &Log, estimate: &BaseEstimate, rows: std::ops::Range<usize>) -> [
 #[test]
 fn height_and_velocity_of_a_trotting_and_hopping_robot_are_estimated_from_its_legs() {
     let forces = log(&go2(), ROWS);
-    let accelerometer = with_accelerometer(&forces);
-    for (sensor, log) in [("forces", forces), ("accelerometer", accelerometer)] {
+    let (accelerometer, counts) = (with_accelerometer(&forces), with_counts(&forces));
+    for (sensor, log) in [("forces", forces), ("accelerometer", accelerometer), ("raw counts", counts)] {
         let estimate = BaseEstimate::of(&log, &go2());
         for (name, rows, most) in [("trot", 0..800, [0.002, 0.06]), ("hop", 800..ROWS, [0.012, 0.2])] {
             let [height, velocity] = errors(&log, &estimate, rows);
@@ -79,6 +79,16 @@ fn height_and_velocity_of_a_trotting_and_hopping_robot_are_estimated_from_its_le
             assert!(height < 4.0 * estimate.height_sigma && velocity < 4.0 * estimate.velocity_sigma, "{text}");
         }
     }
+}
+
+/// Returns the log with the raw counts of force sensors that have an offset, as those of a Go2.
+fn with_counts(log: &Log) -> Log {
+    let counts = |(name, cells): (&str, &[f64])| {
+        let is_force = name.starts_with("foot_force_");
+        (name.to_owned(), cells.iter().map(|cell| if is_force { (15.0 + 0.8 * cell).floor() } else { *cell }).collect())
+    };
+    let time = [("t".to_owned(), log.t().to_vec())];
+    Log::new(log.meta().clone(), log.channels().map(counts).chain(time)).unwrap()
 }
 
 /// Returns the log with an accelerometer of 0.2 m/s² noise in place of force sensors.

@@ -293,11 +293,13 @@ fn program_and_tests_share_one_build_of_every_dependency() {
 }
 
 #[test]
-fn lock_file_has_the_corrected_crate_of_zenoh() {
+fn lock_file_has_the_corrected_crates() {
     // Cargo ignores a patch with another version than the dependency, with a warning only.
     let lock: toml::Table = std::fs::read_to_string(root().join("Cargo.lock")).unwrap().parse().unwrap();
     let packages = lock["package"].as_array().unwrap();
-    let copies: Vec<_> = packages.iter().filter(|package| package["name"].as_str() == Some("zenoh-link-tls")).collect();
-    assert_eq!(copies.len(), 1, "{copies:?}");
-    assert!(copies[0].get("source").is_none(), "not from third_party: {:?}", copies[0]);
+    for name in ["zenoh-link-tls", "rustdds"] {
+        let copies: Vec<_> = packages.iter().filter(|package| package["name"].as_str() == Some(name)).collect();
+        assert_eq!(copies.len(), 1, "{copies:?}");
+        assert!(copies[0].get("source").is_none(), "not from third_party: {:?}", copies[0]);
+    }
 }

@@ -12,12 +12,21 @@ use twinstep_tests::robot_rig::{backend, released, robot_at_500_hz};
 use twinstep_unitree::encode;
 
 /// Runs preflight on a robot. `change` is called before each step with the time [s].
-fn run_with(mut robot: FakeRobot, mut change: impl FnMut(&mut FakeRobot, f64, &mut PreflightInput)) -> PreflightReport {
+fn run_with(robot: FakeRobot, change: impl FnMut(&mut FakeRobot, f64, &mut PreflightInput)) -> PreflightReport {
+    run_with_gaps(robot, 2, change)
+}
+
+/// The same, on a computer that makes gaps of up to `max_gap_ms` between commands.
+fn run_with_gaps(
+    mut robot: FakeRobot,
+    max_gap_ms: u64,
+    mut change: impl FnMut(&mut FakeRobot, f64, &mut PreflightInput),
+) -> PreflightReport {
     let model = robot_at_500_hz();
     let limits = CommandLimits::new(&model, &SafetyConfig::default());
     let mut preflight = Preflight::new(&model, SafetyConfig::default()).unwrap();
     let mut input = PreflightInput::default();
-    for step in 1..20_000_u64 {
+    for step in 1..50_000_u64 {
         input.now = Duration::from_millis(2 * step);
         input.states = robot.step().unwrap();
         input.foreign_writers = usize::from(robot.wants_foreign_writer());
@@ -29,7 +38,7 @@ fn run_with(mut robot: FakeRobot, mut change: impl FnMut(&mut FakeRobot, f64, &m
             robot.receive(&encode(&command.to_low_cmd())).unwrap();
         }
         if let Some(report) = output.report {
-            assert!(robot.statistics().largest_gap_ms <= 2 && robot.statistics().refused == 0);
+            assert!(robot.statistics().largest_gap_ms <= max_gap_ms && robot.statistics().refused == 0);
             return report;
         }
     }
@@ -47,6 +56,38 @@ fn robot_with(lines: &[&str]) -> FakeRobot {
         robot.inject(line.parse::<FakeFault>().unwrap()).unwrap();
     }
     robot
+}
+
+/// Runs preflight on a healthy robot, on a computer that stands still for `pause_ms` every `every_ms`. `robot_too`: the robot is
+/// simulated on the same computer.
+fn run_with_pauses(every_ms: u64, pause_ms: u64, robot_too: bool) -> PreflightReport {
+    let (mut stood_still_ms, mut count) = (0, 0);
+    run_with_gaps(robot_with(&[]), pause_ms + 2, move |robot, time, input| {
+        if (1000.0 * time) as u64 / every_ms > count {
+            count += 1;
+            stood_still_ms += pause_ms;
+            for _ in 0..if robot_too { 0 } else { pause_ms / 2 } {
+                input.states.extend(robot.step().unwrap());
+            }
+        }
+        input.now += Duration::from_millis(stood_still_ms);
+    })
+}
+
+#[test]
+fn pauses_of_the_computer_are_no_finding() {
+    for (every_ms, pause_ms, robot_too) in
+        [(300, 15, false), (300, 15, true), (150, 10, true), (97, 8, false), (400, 18, false), (400, 18, true)]
+    {
+        let report = run_with_pauses(every_ms, pause_ms, robot_too);
+        let what = format!("{pause_ms} ms every {every_ms} ms, robot too: {robot_too}");
+        assert!(report.findings.is_empty() && report.stopped_by.is_none(), "{what}: {report:#?}");
+    }
+    // So often that nothing can be measured: each test is repeated, left out, and noted.
+    let report = run_with_pauses(20, 10, true);
+    assert!(report.findings.is_empty() && report.stopped_by.is_none(), "{report:#?}");
+    let left_out: Vec<_> = report.left_out.iter().map(|left_out| left_out.check).collect();
+    assert!(left_out.contains(&"rate of the states") && left_out.contains(&"legs against the trunk"), "{left_out:?}");
 }
 
 /// Mistakes as lines of the fake robot, each with the finding that names it and the part that it must name.

@@ -1,7 +1,7 @@
 //! `twinstep train` and `twinstep evaluate-policy` as processes.
 
 use std::io::{BufRead, BufReader};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Child, ChildStdout, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use twinstep_policy::Policy;
@@ -72,6 +72,8 @@ fn equal_seeds_give_equal_policies() {
 struct ServerChild {
     child: Child,
     endpoint: String,
+    /// Open as long as the server runs: a program may not find its output closed.
+    _output: BufReader<ChildStdout>,
 }
 
 impl ServerChild {
@@ -86,9 +88,10 @@ impl ServerChild {
             .spawn()
             .unwrap();
         let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let mut output = BufReader::new(child.stdout.take().unwrap());
+        output.read_line(&mut line).unwrap();
         let endpoint = line.trim().strip_prefix("listening ").unwrap().to_owned();
-        Self { child, endpoint }
+        Self { child, endpoint, _output: output }
     }
 }
 

@@ -95,6 +95,26 @@ impl ChromePage {
         }
     }
 
+    /// Presses the mouse at the first point, and moves it over the others [px]. It stays pressed.
+    pub fn press_and_move(&mut self, points: &[[f64; 2]]) {
+        for (index, [x, y]) in points.iter().enumerate() {
+            let kind = if index == 0 { "mousePressed" } else { "mouseMoved" };
+            let event = json!({ "type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1 });
+            self.call("Input.dispatchMouseEvent", event);
+        }
+    }
+
+    /// Releases the mouse at a point [px].
+    pub fn release(&mut self, [x, y]: [f64; 2]) {
+        let event = json!({ "type": "mouseReleased", "x": x, "y": y, "button": "left", "clickCount": 1 });
+        self.call("Input.dispatchMouseEvent", event);
+    }
+
+    /// Loads the page again.
+    pub fn reload(&mut self) {
+        self.call("Page.reload", json!({}));
+    }
+
     /// Returns a picture of the page as base64 of a PNG.
     pub fn screenshot(&mut self) -> String {
         let picture = self.call("Page.captureScreenshot", json!({ "format": "png" }));

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use twinstep_session::SERVER_THREADS;
 
 /// Maximum time for the start of a server.
-const STARTUP: Duration = Duration::from_secs(20);
+const STARTUP: Duration = Duration::from_mins(1);
 
 /// A child process. It is killed when dropped.
 pub struct Process {

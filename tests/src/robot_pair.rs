@@ -9,9 +9,9 @@ use serde_json::Value;
 use crate::process::Process;
 
 /// Time in which a robot starts.
-const START: Duration = Duration::from_secs(20);
+const START: Duration = Duration::from_mins(1);
 /// Time in which a process answers a line.
-const ANSWER: Duration = Duration::from_secs(5);
+const ANSWER: Duration = Duration::from_secs(20);
 /// Domains of the pairs of one test process.
 static NEXT_DOMAIN: AtomicU16 = AtomicU16::new(210);
 /// Config of the robot. Virtual machines stand still for tens of milliseconds.
@@ -119,7 +119,7 @@ impl RobotPair {
 
     /// Releases the built-in controller, arms, and begins to stand up.
     pub fn rise(&mut self) -> Result<(), String> {
-        self.wait_for("observe", Duration::from_secs(15))?;
+        self.wait_for("observe", START)?;
         self.operator("release")?;
         self.insist("arm")?;
         self.insist("stand")
@@ -133,7 +133,7 @@ impl RobotPair {
 
     /// Types a line at the robot until it is executed.
     pub fn insist(&mut self, request: &str) -> Result<(), String> {
-        let end = Instant::now() + Duration::from_secs(15);
+        let end = Instant::now() + ANSWER;
         loop {
             let answer = self.operator(request)?;
             if answer.starts_with("ok") {

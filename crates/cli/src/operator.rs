@@ -100,6 +100,7 @@ fn timing_json(timing: &Timing) -> serde_json::Value {
     serde_json::json!({
         "state_to_command": times(&timing.latency),
         "lateness": times(&timing.lateness),
+        "timer_lateness": times(&timing.timer_lateness),
         "tick_jitter": times(&timing.tick_jitter),
         "gaps": times(&timing.gaps),
         "bad_states": timing.bad_states,

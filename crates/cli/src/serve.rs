@@ -8,11 +8,11 @@ use std::time::{Duration, Instant};
 
 use glam::Quat;
 use indicatif::{ProgressBar, ProgressStyle};
-use twinstep_env_server::{Config, Server, ServerError, SimEnvFactory};
+use twinstep_env_server::{Config, EnvFactory, Server, ServerError, SimEnvFactory};
 use twinstep_envs::TaskConfig;
-use twinstep_model::{InitialState, Pose, RobotModel, Scene};
+use twinstep_model::{AutoresetMode, InitialState, Pose, ResetRequest, RobotModel, Scene};
 use twinstep_session::SERVER_THREADS;
-use twinstep_sim::Engine;
+use twinstep_sim::{Engine, SimConfig};
 use twinstep_viewer::{Hub, SceneInfo};
 
 use crate::exit::{CommandResult, Signals, input, other};
@@ -129,13 +129,24 @@ pub fn run(args: &Args) -> CommandResult {
     outcome
 }
 
-/// Returns a robot that stands at the origin.
+/// Returns a robot that stands at the origin, with the reward terms of its task.
 fn scene(config: &Config, robot: &RobotModel) -> SceneInfo {
     let (q, ground) = (robot.control.default_pose_f32(), config.sim.terrain.ground());
     let position = InitialState::standing_on(&ground, robot, q, 0.0).base_position;
     let pose = Pose { position: position.into(), rotation: Quat::IDENTITY };
     let scene = Scene::new(robot, pose, &q, &ground.crop(0.0, 0.0));
-    SceneInfo::new(format!("twinstep serve, robot {}", config.server.name), &scene, robot.torque_limits())
+    let info = SceneInfo::new(format!("twinstep serve, robot {}", config.server.name), &scene, robot.torque_limits());
+    reward_terms(config).map_or(info.clone(), |names| info.with_reward_terms(&names))
+}
+
+/// Returns the reward terms of the task; `None` if it has no robots to show. The engine makes no difference.
+fn reward_terms(config: &Config) -> Option<Vec<String>> {
+    let sim = SimConfig { engine: Engine::Batch, threads: 1, ..config.sim };
+    let example = SimEnvFactory::new(Config { sim, ..config.clone() }).ok()?;
+    let mut env = example.build(1, AutoresetMode::Disabled, None).ok()?;
+    env.reset(&ResetRequest::default()).ok()?;
+    env.scene(0).ok()?;
+    Some(env.spec().reward_terms.clone())
 }
 
 /// Gives Zenoh several threads that send, unless the user has chosen their number.

@@ -8,6 +8,7 @@ use twinstep_envs::TaskConfig;
 use twinstep_learning::{Checkpoint, EvaluationError, Learner, LearningError, PpoConfig, Trainer};
 use twinstep_model::EnvSpec;
 use twinstep_policy::{Collector, CurvePoint, Mlp, Policy, PolicyOrigin, StepCollector, with_residual};
+use twinstep_viewer::LearningPoint;
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::train_config::TrainConfig;
@@ -253,8 +254,8 @@ struct TrainSession {
     /// Base policy of the task `explore`.
     base: Option<Policy>,
     log: TrainLog,
-    /// Serves the robots of the first group.
-    _page: Option<Page>,
+    /// Shows the robots of the first group.
+    page: Option<Page>,
 }
 
 /// Serves a page of the robots, if there is to be one. The robots of the training stay untouched.
@@ -265,6 +266,12 @@ fn open_page(args: &Args, config: &TrainConfig) -> Result<Option<Page>, Failure>
     let mut example = config.envs(1, 1, 1)?.remove(0);
     let limits = config.robot()?.torque_limits();
     args.view.open(&format!("twinstep train {}", config.task.name()), example.as_mut(), limits)
+}
+
+/// Returns a point of the learning curve as a page shows it.
+fn learning_point(point: &CurvePoint) -> LearningPoint {
+    let CurvePoint { env_steps, reward, velocity_rms, falls_per_minute, .. } = *point;
+    LearningPoint { env_steps, reward, falls_per_minute, velocity_error: velocity_rms }
 }
 
 impl TrainSession {
@@ -305,12 +312,15 @@ impl TrainSession {
             }
             (None, None) => (None, Vec::new()),
         };
+        if let Some(page) = &page {
+            page.hub().add_learning(curve.iter().map(learning_point));
+        }
         let trainer = Trainer::new(config.train.clone(), collectors, learner, seed).map_err(input)?;
         let log = TrainLog::open(&args.out, &trainer.spec().reward_terms, resumed_at)
             .map_err(|cause| folder_error(&args.out, cause))?;
         let (out, policy) = (args.out.clone(), args.policy());
         let (endpoints, minutes) = (args.endpoint.clone(), args.minutes);
-        Ok(Self { config, text, seed, out, policy, endpoints, minutes, trainer, curve, base, log, _page: page })
+        Ok(Self { config, text, seed, out, policy, endpoints, minutes, trainer, curve, base, log, page })
     }
 
     /// Trains until all steps are done, the time is over, or the user interrupts.
@@ -334,6 +344,9 @@ impl TrainSession {
             let point = curve_point(&iteration, self.trainer.spec().policy_dt, seconds);
             self.log.write(&iteration, &point).map_err(other)?;
             self.curve.push(point);
+            if let Some(page) = &self.page {
+                page.hub().add_learning([learning_point(&point)]);
+            }
             bar.set_position(iteration.env_steps);
             bar.set_message(progress_text(&point));
             if saved.elapsed() > SAVE_EVERY {

@@ -27,7 +27,8 @@ pub fn run(options: &ConnectOptions, page: &PageArgs, signals: &Signals) -> Comm
     let scene: SceneInfo = serde_json::from_slice(&watch.scene().map_err(other)?)
         .map_err(|error| text(&format!("the scene of `{}` is not valid: {error}", watch.robot())))?;
     let title = format!("{} at {}", scene.title, options.endpoint);
-    let page = page.open(SceneInfo { title, is_interactive: false, velocity_bounds: None, ..scene })?;
+    let page =
+        page.open(SceneInfo { title, is_interactive: false, is_learning: false, velocity_bounds: None, ..scene })?;
     let (mut frames, mut checked) = (None, Instant::now());
     while !signals.check()? {
         if page.hub().pages() == 0 {

@@ -82,6 +82,7 @@ fn start(path: &Path, model: Option<&Path>, args: &WalkArgs) -> Result<(PolicyWa
         velocity_bounds: env.spec().observation_field("velocity_command").map(|_| velocity_input::limits()),
         ..SceneInfo::new(path.display().to_string(), &env.scene(0).map_err(other)?, limits)
     };
+    let scene = scene.with_reward_terms(&env.spec().reward_terms);
     let walk = PolicyWalk { env, policies, command: None, is_paused: false, speed: 1.0, steps: 0, falls: 0 };
     Ok((walk, scene))
 }
@@ -101,7 +102,7 @@ fn factory(
         ..Config::default()
     };
     config.check().map_err(input)?;
-    SimEnvFactory::new(config).map_err(input)
+    SimEnvFactory::new(config).map(SimEnvFactory::estimating_uncertainty).map_err(input)
 }
 
 struct PolicyWalk {
@@ -192,18 +193,7 @@ impl PolicyWalk {
     fn frame(&self) -> Result<Frame, Failure> {
         let scene = |robot| self.env.scene(robot).map(|scene| RobotFrame::of_scene(&scene));
         let robots = (0..self.policies.len()).map(scene).collect::<Result<Vec<_>, _>>().map_err(other)?;
-        let first = &robots[0];
-        let mut curves = Vec::new();
-        if let (Some(command), Some(velocity)) = (first.command, first.velocity) {
-            curves.push(("forward [m/s]".to_owned(), f64::from(velocity[0])));
-            curves.push(("error, forward [m/s]".to_owned(), f64::from(command[0] - velocity[0])));
-        }
-        if let Some(torque) = first.torque {
-            let largest = torque.iter().fold(0.0_f32, |largest, tau| largest.max(tau.abs()));
-            curves.push(("largest torque [N·m]".to_owned(), f64::from(largest)));
-        }
-        curves.push(("height of the trunk [m]".to_owned(), f64::from(first.poses[0][2])));
-        curves.push(("falls".to_owned(), self.falls as f64));
+        let curves = vec![("falls".to_owned(), self.falls as f64)];
         let time = self.steps as f64 * self.env.spec().policy_dt;
         let playback = Some(Playback { duration: None, is_paused: self.is_paused, speed: self.speed });
         Ok(Frame { time, robots, curves, playback })

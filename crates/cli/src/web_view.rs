@@ -56,13 +56,14 @@ impl ViewArgs {
         if page.check().is_ok() { page } else { Self::default() }
     }
 
-    /// Serves the page of robots like that of `env`, if there is to be one. `env` is reset.
+    /// Serves the page of robots like that of `env`, which learn, if there is to be one. `env` is reset.
     pub fn open(&self, title: &str, env: &mut dyn VecEnv, torque_limits: PerJoint) -> Result<Option<Page>, Failure> {
         if !self.is_wanted() {
             return Ok(None);
         }
         env.reset(&ResetRequest::default()).map_err(other)?;
         let scene = SceneInfo::new(title, &env.scene(0).map_err(other)?, torque_limits);
+        let scene = SceneInfo { is_learning: true, ..scene }.with_reward_terms(&env.spec().reward_terms);
         self.serve(&Arc::new(Hub::new(scene)))
     }
 

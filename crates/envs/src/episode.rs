@@ -30,6 +30,8 @@ pub struct Episode<S> {
     pub length: u32,
     /// Sum of rewards so far.
     pub episode_return: f32,
+    /// Weighted reward terms of the last step.
+    pub terms: Vec<f32>,
     /// Sum of each weighted reward term so far.
     pub term_sums: Vec<f32>,
     /// Last action, clipped.
@@ -75,6 +77,7 @@ impl<S: Default> Episode<S> {
             diverged: false,
             length: 0,
             episode_return: 0.0,
+            terms: vec![0.0; spec.reward_terms.len()],
             term_sums: vec![0.0; spec.reward_terms.len()],
             action: [0.0; NUM_JOINTS],
             previous_action: [0.0; NUM_JOINTS],
@@ -128,6 +131,7 @@ impl<S: Default> Episode<S> {
         (self.running, self.diverged) = (true, false);
         self.length = 0;
         self.episode_return = 0.0;
+        self.terms.fill(0.0);
         self.term_sums.fill(0.0);
         self.action = [0.0; NUM_JOINTS];
         EpisodeStart { robot, actuator_seed, q }
@@ -153,16 +157,13 @@ impl<S: Default> Episode<S> {
     }
 
     /// Returns the reward and the end flags after a step of `robot`.
-    ///
-    /// `terms` is scratch memory, one entry per reward term.
     pub fn evaluate_step(
         &mut self,
         task: &impl Task<State = S>,
         robot: RobotView,
         max_episode_steps: u32,
-        terms: &mut [f32],
     ) -> StepOutcome {
-        let Self { state, random, action, previous_action, previous_dq, .. } = self;
+        let Self { state, random, action, previous_action, previous_dq, terms, .. } = self;
         self.length += 1;
         let step = Step { robot, action, previous_action, previous_dq, length: self.length };
         let terminated = task.evaluate(state, &step, random, terms);

@@ -48,8 +48,6 @@ pub struct TaskEnv<B: Backend, T: Task> {
     /// Velocity commands that were set since the last step.
     next_velocity_commands: Option<Vec<[f32; 3]>>,
     batch: StepBatch,
-    /// Weighted reward terms of one step.
-    terms: Vec<f32>,
     /// Samples of each environment in the last step; `None` until somebody asks for them.
     samples: Option<Vec<Vec<RobotSample>>>,
     /// Random numbers of the noise of samples. Those of the episodes do not depend on sampling.
@@ -80,7 +78,6 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             velocity_commands: None,
             next_velocity_commands: None,
             batch: StepBatch::new(num_envs, &spec),
-            terms: vec![0.0; spec.reward_terms.len()],
             samples: None,
             sample_noise: stream(seed, "noise of samples", 0),
             spec,
@@ -254,9 +251,9 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             let mut outcome = StepOutcome { truncated: self.episodes[env].diverged, ..StepOutcome::default() };
             if self.active[env] {
                 self.follow_robot(env);
-                let Self { backend, task, spec, ground, episodes, terms, .. } = self;
+                let Self { backend, task, spec, ground, episodes, .. } = self;
                 let robot = view(backend, ground, env);
-                outcome = episodes[env].evaluate_step(task, robot, spec.max_episode_steps, terms);
+                outcome = episodes[env].evaluate_step(task, robot, spec.max_episode_steps);
                 if let Some(stop) = backend.real_time().and_then(|report| report.stop.as_ref()) {
                     outcome = episodes[env].stop(outcome, stop.terminates);
                 }
@@ -408,6 +405,9 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
             velocity,
             torque: Some(robot.measured.tau[env]),
             foot_force: robot.truth.map(|truth| truth.foot_force[env]),
+            reward_terms: episode.terms.clone(),
+            // Zero is that of actuators that do not estimate it.
+            uncertainty: robot.truth.map(|truth| truth.epistemic_uncertainty[env]).filter(|value| *value != 0.0),
             ..scene
         })
     }

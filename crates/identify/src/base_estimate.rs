@@ -33,6 +33,8 @@ const MEASURED_ACCELERATION_DENSITY: f64 = 0.1;
 const UNKNOWN_ACCELERATION_DENSITY: f64 = 5.0;
 /// Share of a foot's highest force below which it is in the air; feet that never fall below it always stand.
 const CONTACT_SHARE: f64 = 0.15;
+/// Share of a foot's highest force up to which its lowest one is that of a foot in the air.
+const MAX_OFFSET_SHARE: f64 = 0.5;
 
 /// Estimated position and velocity of the base in the world frame.
 #[derive(Clone, Debug)]
@@ -159,8 +161,11 @@ fn contacts(log: &Log, leg: Leg) -> Option<Vec<Option<bool>>> {
     let forces = log.channel(&format!("foot_force_{leg:?}"))?;
     let mut sorted: Vec<f64> = forces.iter().copied().filter(|force| force.is_finite()).collect();
     sorted.sort_by(f64::total_cmp);
-    let highest = *sorted.get(sorted.len().saturating_sub(1) * 9 / 10).filter(|force| **force > 0.0)?;
-    Some(known(forces, CONTACT_SHARE * highest))
+    let quantile = |share: f64| sorted.get((sorted.len().saturating_sub(1) as f64 * share) as usize).copied();
+    let (low, high) = (quantile(0.05)?, quantile(0.9).filter(|force| *force > 0.0)?);
+    // Raw counts of a robot have an offset: those of a foot in the air. The force of a foot that always stands varies less.
+    let offset = if low < MAX_OFFSET_SHARE * high { low } else { 0.0 };
+    Some(known(forces, offset + CONTACT_SHARE * (high - offset)))
 }
 
 /// Returns central differences of `cells` within contiguous ranges of rows.

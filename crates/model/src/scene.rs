@@ -25,6 +25,10 @@ pub struct Scene {
     pub torque: Option<PerJoint>,
     /// Normal force on each foot [N]. `None` if it is not known; a server does not send it.
     pub foot_force: Option<PerLeg>,
+    /// Weighted reward terms of the last step. Empty if they are not known; a server does not send them.
+    pub reward_terms: Vec<f32>,
+    /// Epistemic uncertainty of the actuators [nat]. `None` if it is not known; a server does not send it.
+    pub uncertainty: Option<f32>,
 }
 
 /// Shape of a body.
@@ -66,6 +70,8 @@ impl Scene {
             velocity: None,
             torque: None,
             foot_force: None,
+            reward_terms: Vec::new(),
+            uncertainty: None,
         }
     }
 }

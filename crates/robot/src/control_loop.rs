@@ -25,7 +25,7 @@ use crate::timing::Timing;
 
 /// Time after the last step at which the timer steps. States arrive every 2 ms; a step must not come just before one.
 const TIMER: Duration = Duration::from_micros(2500);
-/// Period of the commands after a panic.
+/// Period of the robot's states, and of the commands after a panic.
 const PERIOD: Duration = Duration::from_millis(2);
 /// Time for which an armed robot is damped before the loop ends, so that it lies when its commands cease.
 const FINAL_DAMPING: Duration = Duration::from_millis(1500);
@@ -76,6 +76,7 @@ pub fn start(
             start,
             timing: Timing::default(),
             due: Duration::ZERO,
+            last_step: None,
             last_command: None,
             last_tick: None,
             damping: None,
@@ -121,6 +122,8 @@ struct ControlLoop {
     timing: Timing,
     /// Time at which the timer steps.
     due: Duration,
+    /// Time of the last step.
+    last_step: Option<Duration>,
     /// Time of the last command; `None` if none was sent since the robot was armed.
     last_command: Option<Duration>,
     /// Last tick, with the time of its first step.
@@ -138,11 +141,14 @@ impl ControlLoop {
                 std::thread::park_timeout(self.due.saturating_sub(now));
                 continue;
             }
+            if let Some(last) = self.last_step {
+                self.timing.lateness.add(now.saturating_sub(last + PERIOD));
+            }
             if received.is_none() {
-                self.timing.lateness.add(now.saturating_sub(self.due));
+                self.timing.timer_lateness.add(now.saturating_sub(self.due));
             }
             self.step(now, received);
-            self.due = now + TIMER;
+            (self.last_step, self.due) = (Some(now), now + TIMER);
         }
     }
 

@@ -18,8 +18,10 @@ pub struct Timing {
     pub unrecorded: u64,
     /// Time between two commands while armed.
     pub gaps: Histogram,
-    /// How long after it was due the loop woke up.
+    /// How much longer than the period of 2 ms it was since the step before.
     pub lateness: Histogram,
+    /// How long after it was due the timer woke the loop: only the steps before which no state arrived in time.
+    pub timer_lateness: Histogram,
     /// Time from the arrival of a state to the sending of its command.
     pub latency: Histogram,
     /// Deviation of the time between two ticks from the policy period.

@@ -18,28 +18,52 @@ pub struct ChecksumError {
     pub computed: u32,
 }
 
-/// Remainder of each value of the most significant byte.
-const TABLE: [u32; 256] = {
-    let mut table = [0; 256];
+/// Words that are taken in at once.
+const WORDS: usize = 2;
+
+/// `TABLES[n][byte]`: remainder of a byte that is followed by `n` bytes of zero.
+const TABLES: [[u32; 256]; 4 * WORDS] = {
+    let mut tables = [[0; 256]; 4 * WORDS];
     let mut byte = 0;
     while byte < 256 {
         let mut remainder = (byte as u32) << 24;
-        let mut bit = 0;
-        while bit < 8 {
-            remainder = if remainder >> 31 == 1 { (remainder << 1) ^ POLYNOMIAL } else { remainder << 1 };
-            bit += 1;
+        let mut zeros = 0;
+        while zeros < tables.len() {
+            let mut bit = 0;
+            while bit < 8 {
+                remainder = if remainder >> 31 == 1 { (remainder << 1) ^ POLYNOMIAL } else { remainder << 1 };
+                bit += 1;
+            }
+            tables[zeros][byte] = remainder;
+            zeros += 1;
         }
-        table[byte] = remainder;
         byte += 1;
     }
-    table
+    tables
 };
 
 /// Returns the CRC-32/MPEG-2 of little-endian words; `image` has a multiple of four bytes.
 pub fn crc32(image: &[u8]) -> u32 {
-    // The most significant byte of a word comes first, which is the last of its four bytes.
-    let bytes = image.chunks_exact(4).flat_map(|word| word.iter().rev());
-    bytes.fold(u32::MAX, |crc, byte| (crc << 8) ^ TABLE[((crc >> 24) as u8 ^ byte) as usize])
+    // The tables of several words are looked up independently of each other, which a processor does at the same time.
+    let mut blocks = image.chunks_exact(4 * WORDS);
+    let crc = blocks.by_ref().fold(u32::MAX, take_in);
+    take_in(crc, blocks.remainder())
+}
+
+/// Takes in up to [`WORDS`] words.
+fn take_in(crc: u32, words: &[u8]) -> u32 {
+    let mut carried = crc;
+    let mut remainder = 0;
+    for (index, word) in words.chunks_exact(4).enumerate() {
+        // The most significant byte of a word comes first, which is the last of its four bytes.
+        let word = u32::from_le_bytes([word[0], word[1], word[2], word[3]]) ^ std::mem::take(&mut carried);
+        let follow = words.len() - 4 * index - 4;
+        for (byte, value) in word.to_le_bytes().into_iter().enumerate() {
+            remainder ^= TABLES[follow + byte][usize::from(value)];
+        }
+    }
+    // Without words nothing was taken in.
+    remainder ^ carried
 }
 
 impl LowCmd {
@@ -162,6 +186,19 @@ mod tests {
         assert_eq!(image[804..808], command.reserve.to_le_bytes());
         assert_eq!(image[808..812], command.crc.to_le_bytes());
         assert_eq!(c_image(&LowState::default()).len(), 1180);
+    }
+
+    #[test]
+    fn any_number_of_words_has_the_remainder_of_the_polynomial_division() {
+        let image: Vec<u8> = (0..44_u32).map(|index| (index * index * 37 + 11) as u8).collect();
+        for len in (0..=image.len()).step_by(4) {
+            let words =
+                image[..len].chunks_exact(4).map(|word| u32::from_le_bytes(word.try_into().expect("four bytes")));
+            let divided = words.fold(u32::MAX, |crc, word| {
+                (0..32).fold(crc ^ word, |crc, _| if crc >> 31 == 1 { (crc << 1) ^ POLYNOMIAL } else { crc << 1 })
+            });
+            assert_eq!(crc32(&image[..len]), divided, "{len} bytes");
+        }
     }
 
     #[test]

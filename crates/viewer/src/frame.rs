@@ -17,10 +17,16 @@ pub struct SceneInfo {
     pub heights: Option<Heights>,
     /// Largest torque of each joint [N·m], for its colour.
     pub torque_limits: PerJoint,
+    /// Names of the curves that each robot has: velocity, torque, height, uncertainty of its actuators, reward terms.
+    #[serde(default)]
+    pub robot_curves: Vec<String>,
     /// True if every robot has a second pose, that of a simulation under the same commands.
     pub has_ghost: bool,
     /// True if the page may pause, change the speed and, with a velocity command, push the robots and begin a new episode.
     pub is_interactive: bool,
+    /// True if the page has the learning curve of the policy.
+    #[serde(default)]
+    pub is_learning: bool,
     /// Bounds of the velocity command of the page: forward [m/s], left [m/s], yaw rate [rad/s]. `None` if it has none.
     pub velocity_bounds: Option<[[f32; 2]; 3]>,
 }
@@ -47,11 +53,38 @@ impl SceneInfo {
             shapes: scene.shapes.clone(),
             heights: heights(&scene.ground),
             torque_limits,
+            robot_curves: Vec::new(),
             has_ghost: false,
             is_interactive: false,
+            is_learning: false,
             velocity_bounds: None,
         }
     }
+
+    /// Returns the description of a scene of robots with these reward terms.
+    pub fn with_reward_terms(self, names: &[String]) -> Self {
+        let quantities = QUANTITIES.iter().map(ToString::to_string);
+        let terms = names.iter().map(|name| format!("reward {name}"));
+        Self { robot_curves: quantities.chain(terms).collect(), ..self }
+    }
+}
+
+/// Curves of a robot before its reward terms.
+const QUANTITIES: [&str; 5] =
+    ["forward [m/s]", "error, forward [m/s]", "largest torque [N·m]", "height of the trunk [m]", "uncertainty [nat]"];
+
+/// Returns the values of the curves of the robot of a scene; none if its reward terms are not known.
+fn robot_curves(scene: &Scene) -> Vec<f32> {
+    if scene.reward_terms.is_empty() {
+        return Vec::new();
+    }
+    let forward = scene.velocity.map(|velocity| velocity[0]);
+    let error = scene.command.zip(forward).map(|(command, forward)| command[0] - forward);
+    let torque = scene.torque.map(|torque| torque.iter().fold(0.0_f32, |largest, tau| largest.max(tau.abs())));
+    let height = scene.pose.first().map(|trunk| trunk[2]);
+    let quantities: [_; QUANTITIES.len()] = [forward, error, torque, height, scene.uncertainty];
+    let quantities = quantities.map(|value| value.unwrap_or(f32::NAN));
+    quantities.into_iter().chain(scene.reward_terms.iter().copied()).collect()
 }
 
 fn heights(ground: &Ground) -> Option<Heights> {
@@ -79,6 +112,8 @@ pub struct RobotFrame {
     pub command: Option<[f32; 3]>,
     /// Velocity in the base frame: forward [m/s], left [m/s], yaw rate [rad/s].
     pub velocity: Option<[f32; 3]>,
+    /// Values of [`SceneInfo::robot_curves`].
+    pub curves: Vec<f32>,
 }
 
 impl RobotFrame {
@@ -91,6 +126,7 @@ impl RobotFrame {
             foot_force: scene.foot_force,
             command: scene.command,
             velocity: scene.velocity,
+            curves: robot_curves(scene),
         }
     }
 }
@@ -104,6 +140,19 @@ pub struct Playback {
     pub is_paused: bool,
     /// Speed, 1 for real time.
     pub speed: f64,
+}
+
+/// A policy that learns, after one iteration.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct LearningPoint {
+    /// Number of environment steps so far.
+    pub env_steps: u64,
+    /// Mean reward per step.
+    pub reward: f64,
+    /// Falls per robot and minute of simulated time [1/min].
+    pub falls_per_minute: f64,
+    /// Root mean square error of the horizontal velocity [m/s]; `None` if it is not observed.
+    pub velocity_error: Option<f64>,
 }
 
 /// All robots at one time.
@@ -129,7 +178,8 @@ struct Header<'a> {
 
 impl Frame {
     /// Returns the bytes of the frame: its length and that of its header (u32 each), the header as JSON, padding to a multiple
-    /// of four, then numbers (f32): for every robot the poses, the ghost's poses, 12 torques, 4 foot forces, 3 + 3 velocities.
+    /// of four, then numbers (f32): for every robot the poses, the ghost's poses, 12 torques, 4 foot forces, 3 + 3 velocities, and
+    /// the robot's curves.
     /// All little-endian; a number that is not known is NaN.
     pub fn to_bytes(&self) -> Bytes {
         let curves = self.curves.iter().map(|(name, value)| (name.as_str(), *value)).collect();
@@ -144,6 +194,7 @@ impl Frame {
             numbers.extend(robot.foot_force.unwrap_or([f32::NAN; 4]));
             numbers.extend(robot.command.unwrap_or([f32::NAN; 3]));
             numbers.extend(robot.velocity.unwrap_or([f32::NAN; 3]));
+            numbers.extend(&robot.curves);
         }
         let mut bytes = BytesMut::with_capacity(8 + header.len() + 4 * numbers.len());
         bytes.put_u32_le((header.len() + 4 * numbers.len()) as u32);
@@ -163,7 +214,7 @@ mod tests {
     #[test]
     fn bytes_have_lengths_header_and_numbers() {
         let robot = RobotFrame { poses: vec![[1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]; 2], ..RobotFrame::default() };
-        let robot = RobotFrame { torque: Some([7.0; 12]), ..robot };
+        let robot = RobotFrame { torque: Some([7.0; 12]), curves: vec![0.25, 0.5], ..robot };
         let frame = Frame { time: 0.5, robots: vec![robot.clone(), robot], ..Frame::default() };
         let bytes = frame.to_bytes();
         let word = |at: usize| u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
@@ -171,10 +222,11 @@ mod tests {
         assert_eq!(bytes.len(), 8 + all);
         let text: serde_json::Value = serde_json::from_slice(&bytes[8..8 + header]).expect("JSON");
         assert_eq!((&text["time"], &text["robots"]), (&0.5.into(), &2.into()));
-        // Two bodies with seven numbers, torques, forces, two velocities.
-        assert_eq!(all - header, 2 * 4 * (14 + 12 + 4 + 6));
+        // Two bodies with seven numbers, torques, forces, two velocities, two curves.
+        assert_eq!(all - header, 2 * 4 * (14 + 12 + 4 + 6 + 2));
         let number = |index: usize| f32::from_bits(word(8 + header + 4 * index));
         assert_eq!((number(0), number(2), number(14)), (1.0, 3.0, 7.0));
         assert!(number(26).is_nan(), "foot forces are not known");
+        assert_eq!((number(36), number(37), number(38)), (0.25, 0.5, 1.0));
     }
 }

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use serde::Deserialize;
 use tokio::sync::watch;
 
-use crate::frame::{Frame, SceneInfo};
+use crate::frame::{Frame, LearningPoint, SceneInfo};
 
 /// Time between two frames.
 const PERIOD: Duration = Duration::from_micros(33_333);
@@ -49,6 +49,8 @@ pub struct Hub {
     requests: Mutex<VecDeque<PageRequest>>,
     /// Newest velocity that a page asked for, with the time when it came.
     velocity: Mutex<Option<(Instant, [f32; 3])>>,
+    /// The learning curve since the beginning of the training.
+    learning: Mutex<Vec<LearningPoint>>,
 }
 
 impl Hub {
@@ -62,6 +64,7 @@ impl Hub {
             shown: AtomicU64::new(0),
             requests: Mutex::default(),
             velocity: Mutex::default(),
+            learning: Mutex::default(),
         }
     }
 
@@ -109,6 +112,17 @@ impl Hub {
             self.latest.send_replace(Bytes::copy_from_slice(frame));
         }
         is_valid
+    }
+
+    /// Adds points to the learning curve.
+    pub fn add_learning(&self, points: impl IntoIterator<Item = LearningPoint>) {
+        self.learning.lock().unwrap_or_else(PoisonError::into_inner).extend(points);
+    }
+
+    /// Returns the points of the learning curve from this index on.
+    pub(crate) fn learning_from(&self, index: usize) -> Vec<LearningPoint> {
+        let points = self.learning.lock().unwrap_or_else(PoisonError::into_inner);
+        points.get(index..).unwrap_or_default().to_vec()
     }
 
     /// Returns the newest velocity that a page asked for since the last call, with the time when it came.

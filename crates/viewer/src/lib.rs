@@ -18,7 +18,7 @@ mod watched_env;
 mod web_server;
 
 pub use foxglove::write_mcap;
-pub use frame::{Frame, Playback, RobotFrame, SceneInfo};
+pub use frame::{Frame, LearningPoint, Playback, RobotFrame, SceneInfo};
 pub use hub::{Hub, PageRequest};
 pub use static_page::static_page;
 pub use watched_env::{MAX_ROBOTS, WatchedVecEnv};

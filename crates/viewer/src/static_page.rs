@@ -11,7 +11,7 @@ use crate::web_server::{INDEX, RECORDING_SCRIPT, STYLE, THREE, VIEW_SCRIPT};
 /// It has some 0.8 MB and 1.3 times the bytes of the frames.
 pub fn static_page(scene: &SceneInfo, frames: &[Frame]) -> String {
     let bytes: Vec<u8> = frames.iter().flat_map(Frame::to_bytes).collect();
-    let scene = SceneInfo { is_interactive: true, velocity_bounds: None, ..scene.clone() };
+    let scene = SceneInfo { is_interactive: true, is_learning: false, velocity_bounds: None, ..scene.clone() };
     // Numbers and names are always JSON. In a script `<` could begin the tag that ends it.
     let scene = serde_json::to_string(&scene).unwrap_or_default().replace('<', "\\u003c");
     let script = |text: &str| format!("data:text/javascript;base64,{}", BASE64.encode(text));
@@ -24,6 +24,8 @@ pub fn static_page(scene: &SceneInfo, frames: &[Frame]) -> String {
         BASE64.encode(bytes),
     );
     INDEX
+        .replace("<link rel=\"modulepreload\" href=\"three.min.js\">\n", "")
+        .replace("<link rel=\"modulepreload\" href=\"recording.js\">\n", "")
         .replace(r#"<link rel="stylesheet" href="view.css">"#, &format!("<style>{STYLE}</style>"))
         .replace(r#"<script type="module" src="view.js"></script>"#, &scripts)
 }

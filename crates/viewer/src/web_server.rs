@@ -134,6 +134,7 @@ fn router(site: Arc<Site>) -> Router {
     router
         .route("/scene", get(scene))
         .route("/frames", get(frames))
+        .route("/learning", get(learning))
         .route("/request", post(request))
         .layer(axum::middleware::from_fn_with_state(Arc::clone(&site), check_origin))
         .with_state(site)
@@ -173,6 +174,18 @@ async fn check_origin(
 
 async fn scene(State(site): State<Arc<Site>>) -> Response {
     Json(site.hub.scene()).into_response()
+}
+
+#[derive(Deserialize)]
+struct LearningQuery {
+    /// Index of the first point.
+    #[serde(default)]
+    from: usize,
+}
+
+/// Answers with the learning curve, or with the points that a page does not have yet.
+async fn learning(State(site): State<Arc<Site>>, Query(query): Query<LearningQuery>) -> Response {
+    Json(site.hub.learning_from(query.from)).into_response()
 }
 
 /// Answers with frames without an end. One that reads slowly gets the newest frame when it reads again.

@@ -1,8 +1,8 @@
 // The page: draws the robots of the newest frame, shows their numbers, and sends the requests of its controls.
 import {
-  ArrowHelper, BoxGeometry, BufferAttribute, BufferGeometry, CapsuleGeometry, Color, DirectionalLight, Fog, GridHelper,
-  Group, HemisphereLight, Mesh, MeshStandardMaterial, OrbitControls, PerspectiveCamera, PlaneGeometry, Raycaster, Scene,
-  SphereGeometry, Vector2, Vector3, WebGLRenderer,
+  ArrowHelper, BoxGeometry, BufferAttribute, BufferGeometry, CapsuleGeometry, Color, DirectionalLight, Fog, Group,
+  HemisphereLight, LineBasicMaterial, LineSegments, Mesh, MeshLambertMaterial, OrbitControls, PerspectiveCamera, Plane,
+  PlaneGeometry, Raycaster, Scene, SphereGeometry, Vector2, Vector3, WebGLRenderer,
 } from './three.min.js';
 import { Recording } from './recording.js';
 
@@ -15,6 +15,9 @@ const CURVE_POINTS = 600;
 const SPACING = 1.5;
 // Newtons that an arrow of one metre stands for.
 const FORCE_SCALE = 250;
+// Velocity that a push adds for each metre of its arrow [1/s], and the largest one [m/s].
+const PUSH_SCALE = 3;
+const MAX_PUSH = 3;
 const IDLE = new Color(0x9aa3ad);
 const FULL = new Color(0xff7a1a);
 
@@ -24,8 +27,17 @@ const url = (path) => (token ? `${path}?token=${encodeURIComponent(token)}` : pa
 // A page that is a file has scene and frames inside.
 const recording = globalThis.recordedFrames ? new Recording(globalThis.recordedFrames) : null;
 
+// The answers arrive while the graphics start.
+const sceneAnswer = recording ? null : fetch(url('scene'));
+let framesAnswer = recording ? null : fetch(url('frames'));
+// Either may be wanted only after it has failed.
+for (const answer of [sceneAnswer, framesAnswer]) answer?.catch(() => {});
+
+// A canvas that has its size from the start is not allocated twice.
+const pixelRatio = Math.min(devicePixelRatio, 2);
+[$('scene').width, $('scene').height] = [Math.floor(innerWidth * pixelRatio), Math.floor(innerHeight * pixelRatio)];
 const renderer = new WebGLRenderer({ canvas: $('scene'), antialias: true });
-renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+renderer.setPixelRatio(pixelRatio);
 const scene = new Scene();
 scene.background = new Color(0x20242b);
 scene.fog = new Fog(0x20242b, 12, 40);
@@ -67,9 +79,9 @@ function build(isGhost) {
   const root = new Group();
   const bodies = info.bodies.map(() => new Group());
   bodies.forEach((body) => root.add(body));
-  const materials = info.bodies.map((_, body) => new MeshStandardMaterial(isGhost
-    ? { color: 0x4fa3ff, transparent: true, opacity: 0.45, roughness: 0.8, depthWrite: false }
-    : { color: body === 0 ? 0x3c424b : 0x9aa3ad, roughness: 0.65 }));
+  const materials = info.bodies.map((_, body) => new MeshLambertMaterial(isGhost
+    ? { color: 0x4fa3ff, transparent: true, opacity: 0.45, depthWrite: false }
+    : { color: body === 0 ? 0x5a626e : 0x9aa3ad }));
   for (const shape of info.shapes) {
     const mesh = new Mesh(geometry(shape), materials[shape.body]);
     place(mesh, shape.offset, 0);
@@ -109,16 +121,25 @@ function makeRobots(count) {
   });
 }
 
+// Lines on the ground from -size to size [m], of pieces of 1 m: renderers in software drop lines that begin behind the camera.
+function grid(size, cell) {
+  const points = [];
+  for (let at = -size; at <= size; at += cell) {
+    for (let from = -size; from < size; from += 1) points.push(at, from, 0, at, from + 1, 0, from, at, 0, from + 1, at, 0);
+  }
+  const lines = new BufferGeometry();
+  lines.setAttribute('position', new BufferAttribute(new Float32Array(points), 3));
+  return new LineSegments(lines, new LineBasicMaterial({ color: 0x59626e }));
+}
+
 function makeGround() {
   const field = info.heights;
   if (!field) {
-    const grid = new GridHelper(60, 120, 0x8a95a3, 0x59626e);
-    grid.rotation.x = Math.PI / 2;
-    const floor = new Mesh(new PlaneGeometry(60, 60), new MeshStandardMaterial({
-      color: 0x2a2f37, roughness: 1, polygonOffset: true, polygonOffsetFactor: 4, polygonOffsetUnits: 4,
+    const floor = new Mesh(new PlaneGeometry(60, 60), new MeshLambertMaterial({
+      color: 0x2a2f37, polygonOffset: true, polygonOffsetFactor: 4, polygonOffsetUnits: 4,
     }));
     floor.position.z = -0.004;
-    scene.add(grid, floor);
+    scene.add(grid(20, 0.5), floor);
     return;
   }
   const [nx, ny] = field.shape;
@@ -135,7 +156,7 @@ function makeGround() {
   ground.setAttribute('position', new BufferAttribute(points, 3));
   ground.setIndex(faces);
   ground.computeVertexNormals();
-  scene.add(new Mesh(ground, new MeshStandardMaterial({ color: 0x4a525d, roughness: 1, flatShading: true })));
+  scene.add(new Mesh(ground, new MeshLambertMaterial({ color: 0x4a525d, flatShading: true })));
 }
 
 // Splits a frame into its parts. crates/viewer/src/frame.rs has the layout.
@@ -145,7 +166,7 @@ function decode(payload) {
   const header = JSON.parse(new TextDecoder().decode(payload.subarray(4, 4 + length)));
   const numbers = new Float32Array(payload.slice(4 + length).buffer);
   const poses = 7 * info.bodies.length;
-  const stride = poses * (info.has_ghost ? 2 : 1) + JOINTS + LEGS + 6;
+  const stride = poses * (info.has_ghost ? 2 : 1) + JOINTS + LEGS + 6 + info.robot_curves.length;
   header.robots = Math.min(header.robots, MAX_ROBOTS);
   header.states = Array.from({ length: header.robots }, (_, robot) => {
     let at = robot * stride;
@@ -157,6 +178,7 @@ function decode(payload) {
       force: take(LEGS),
       command: take(3),
       velocity: take(3),
+      curves: take(info.robot_curves.length),
     };
   });
   return header;
@@ -242,24 +264,54 @@ function showFacts(frame) {
   $('facts').replaceChildren(table);
 }
 
+// A figure with a name, a number and a line.
+function makeCurve(section, name) {
+  const figure = document.createElement('figure');
+  const caption = document.createElement('figcaption');
+  const label = document.createElement('span');
+  label.textContent = name;
+  const shown = document.createElement('span');
+  caption.append(label, shown);
+  const canvas = document.createElement('canvas');
+  canvas.width = 460;
+  canvas.height = name.startsWith('reward ') ? 48 : 96;
+  figure.append(caption, canvas);
+  section.append(figure);
+  return { values: [], canvas, shown };
+}
+
+// Draws values over places from 0 to 1.
+function plot({ values, canvas, shown }, places, shownValue, mark) {
+  const known = values.filter(Number.isFinite);
+  const [low, high] = [Math.min(...known), Math.max(...known)];
+  const span = high - low || 1;
+  const context = canvas.getContext('2d');
+  context.clearRect(0, 0, canvas.width, canvas.height);
+  context.strokeStyle = '#ffd866';
+  context.lineWidth = 2;
+  context.beginPath();
+  values.forEach((value, index) => {
+    if (!Number.isFinite(value)) return;
+    context.lineTo(places(index) * canvas.width, canvas.height - 6 - ((value - low) / span) * (canvas.height - 12));
+  });
+  context.stroke();
+  if (mark !== null) {
+    context.fillStyle = '#e8eaed';
+    context.fillRect(mark * canvas.width - 1, 0, 2, canvas.height);
+  }
+  shown.textContent = Number.isFinite(shownValue) ? String(Number(shownValue.toPrecision(3))) : '–';
+}
+
 function addCurves(frame) {
-  for (const [name, value] of Object.entries(frame.curves)) {
+  const ofRobot = frame.states[chosen]?.curves ?? [];
+  const values = [...Object.entries(frame.curves), ...info.robot_curves.map((name, index) => [name, ofRobot[index]])];
+  for (const [name, value] of values) {
     if (!curves.has(name)) {
-      const figure = document.createElement('figure');
-      const caption = document.createElement('figcaption');
-      const label = document.createElement('span');
-      label.textContent = name;
-      const shown = document.createElement('span');
-      caption.append(label, shown);
-      const canvas = document.createElement('canvas');
-      canvas.width = 460;
-      canvas.height = 96;
-      figure.append(caption, canvas);
-      $('curves').append(figure);
-      curves.set(name, { values: [], canvas, shown });
+      if (!Number.isFinite(value)) continue;
+      curves.set(name, makeCurve($('curves'), name));
     }
     const curve = curves.get(name);
-    curve.values.push(value);
+    curve.values.push(value ?? NaN);
     if (!recording && curve.values.length > CURVE_POINTS) curve.values.shift();
   }
 }
@@ -267,30 +319,52 @@ function addCurves(frame) {
 // The last 20 s, or everything that was recorded with a line at the time that is shown.
 function drawCurves() {
   const share = recording ? recording.time / (recording.duration || 1) : null;
-  for (const { values, canvas, shown } of curves.values()) {
-    const points = recording ? values.length - 1 || 1 : CURVE_POINTS;
-    const known = values.filter(Number.isFinite);
-    const [low, high] = [Math.min(...known), Math.max(...known)];
-    const span = high - low || 1;
-    const context = canvas.getContext('2d');
-    context.clearRect(0, 0, canvas.width, canvas.height);
-    context.strokeStyle = '#ffd866';
-    context.lineWidth = 2;
-    context.beginPath();
-    values.forEach((value, index) => {
-      context.lineTo((index / points) * canvas.width, canvas.height - 6 - ((value - low) / span) * (canvas.height - 12));
-    });
-    context.stroke();
-    if (recording) {
-      context.fillStyle = '#e8eaed';
-      context.fillRect(share * canvas.width - 1, 0, 2, canvas.height);
-    }
-    shown.textContent = number(values[recording ? Math.round(share * points) : values.length - 1], 3);
+  for (const curve of curves.values()) {
+    const points = recording ? curve.values.length - 1 || 1 : CURVE_POINTS;
+    const shown = curve.values[recording ? Math.round(share * points) : curve.values.length - 1];
+    plot(curve, (index) => index / points, shown, share);
+  }
+}
+
+// Follows a robot: its curves begin anew, those of all robots go on.
+function follow(robot) {
+  follows = true;
+  if (robot === chosen) return;
+  chosen = robot;
+  for (const name of info.robot_curves) if (curves.has(name)) curves.get(name).values = [];
+  if (recording) {
+    curves.forEach((curve) => { curve.values = []; });
+    recording.frames.forEach((frame) => addCurves(decode(frame)));
+  }
+}
+
+// The learning curve since the beginning of the training, over environment steps.
+const learning = { points: [], curves: null };
+
+async function showLearning() {
+  const query = `from=${learning.points.length}`;
+  const response = await fetch(token ? `${url('learning')}&${query}` : `learning?${query}`);
+  if (!response.ok) return;
+  learning.points.push(...await response.json());
+  const { points } = learning;
+  if (points.length === 0) return;
+  $('learning').hidden = false;
+  learning.curves ??= [
+    ['reward per step', (point) => point.reward],
+    ['falls per minute and robot', (point) => point.falls_per_minute],
+    ['velocity error [m/s]', (point) => point.velocity_error ?? NaN],
+  ].map(([name, value]) => ({ value, curve: makeCurve($('learning'), name) }));
+  const last = points[points.length - 1].env_steps;
+  $('learning-steps').textContent = `${(last / 1e6).toFixed(1)} million steps`;
+  for (const { value, curve } of learning.curves) {
+    curve.values = points.map(value);
+    plot(curve, (index) => points[index].env_steps / last, curve.values[points.length - 1], null);
   }
 }
 
 function resize() {
-  renderer.setSize(innerWidth, innerHeight, false);
+  const size = renderer.getSize(new Vector2());
+  if (size.x !== innerWidth || size.y !== innerHeight) renderer.setSize(innerWidth, innerHeight, false);
   camera.aspect = innerWidth / innerHeight;
   camera.updateProjectionMatrix();
 }
@@ -302,11 +376,15 @@ function animate() {
     showPlayback(newest.playback, newest.time);
     newest = null;
     drawn += 1;
+    document.body.dataset.learningPoints = learning.points.length;
     if (drawn === 1) document.body.dataset.firstFrameMs = performance.now();
     document.body.dataset.frames = drawn;
   }
-  orbit.update();
-  renderer.render(scene, camera);
+  // Without a frame there is nothing to see, and drawing it would delay the first one.
+  if (drawn > 0) {
+    orbit.update();
+    renderer.render(scene, camera);
+  }
   requestAnimationFrame(animate);
 }
 
@@ -369,6 +447,13 @@ function connectControls() {
     if (!info.is_interactive) heartbeat ??= setInterval(send, 500);
   };
   $('stop').onclick = () => { sliders.forEach((slider) => { slider.value = 0; }); send(); };
+  connectStick(([left, forward]) => {
+    const part = ([low, high], share) => (share < 0 ? -share * low : share * high);
+    sliders[0].value = part(info.velocity_bounds[0], forward);
+    sliders[1].value = part(info.velocity_bounds[1], left);
+    send();
+  });
+  $('push-help').hidden = !info.is_interactive;
   $('push').onclick = () => {
     const angle = 2 * Math.PI * Math.random();
     ask({ push: { robot: chosen, velocity: [Math.cos(angle), Math.sin(angle), 0] } });
@@ -376,25 +461,79 @@ function connectControls() {
   $('reset').onclick = () => ask({ reset: null });
 }
 
-function choose(event) {
-  const point = new Vector2((2 * event.clientX) / innerWidth - 1, 1 - (2 * event.clientY) / innerHeight);
+// A stick that springs back: how far to the left and forward it is held, from -1 to 1.
+function connectStick(moved) {
+  const stick = $('stick');
+  stick.hidden = false;
+  const show = (left, forward) => {
+    $('knob').style.transform = `translate(${-left * 28}px, ${-forward * 28}px)`;
+    moved([left, forward]);
+  };
+  const hold = (event) => {
+    const box = stick.getBoundingClientRect();
+    const radius = box.width / 2;
+    const [x, y] = [(event.clientX - box.left) / radius - 1, (event.clientY - box.top) / radius - 1];
+    const scale = Math.max(1, Math.hypot(x, y));
+    show(-x / scale, -y / scale);
+  };
+  stick.onpointerdown = (event) => { stick.setPointerCapture(event.pointerId); hold(event); };
+  stick.onpointermove = (event) => { if (stick.hasPointerCapture(event.pointerId)) hold(event); };
+  stick.onlostpointercapture = () => show(0, 0);
+}
+
+function rayAt(event) {
   const ray = new Raycaster();
-  ray.setFromCamera(point, camera);
-  const hit = ray.intersectObjects(robots.map((robot) => robot.root), true)[0];
-  if (hit) { chosen = hit.object.userData.robot; follows = true; }
+  ray.setFromCamera(new Vector2((2 * event.clientX) / innerWidth - 1, 1 - (2 * event.clientY) / innerHeight), camera);
+  return ray;
+}
+
+function robotAt(event) {
+  return rayAt(event).intersectObjects(robots.map((robot) => robot.root), true)[0]?.object.userData.robot;
+}
+
+// A push: dragged from a robot, it points from its trunk to the pointer.
+let push = null;
+const pushArrow = arrow(0xff6188);
+
+function dragPush(event) {
+  const trunk = robots[push.robot].bodies[0].getWorldPosition(new Vector3());
+  const point = rayAt(event).ray.intersectPlane(new Plane(new Vector3(0, 0, 1), -trunk.z), new Vector3());
+  const velocity = (point ? point.sub(trunk) : new Vector3()).multiplyScalar(PUSH_SCALE).clampLength(0, MAX_PUSH);
+  showArrow(pushArrow, trunk, velocity.clone(), velocity.length() / PUSH_SCALE);
+  $('status').textContent = `push: ${velocity.length().toFixed(1)} m/s`;
+  push.velocity = [velocity.x, velocity.y, 0];
 }
 
 let pressed = [0, 0];
-renderer.domElement.addEventListener('pointerdown', (event) => { pressed = [event.clientX, event.clientY]; });
-renderer.domElement.addEventListener('pointerup', (event) => {
-  if (Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) < 4) choose(event);
+const canvas = renderer.domElement;
+const isDragged = (event) => Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) >= 4;
+// Before the camera turns.
+canvas.addEventListener('pointerdown', (event) => {
+  pressed = [event.clientX, event.clientY];
+  const robot = info?.is_interactive && info.velocity_bounds ? robotAt(event) : undefined;
+  if (robot === undefined) return;
+  push = { robot, velocity: null };
+  orbit.enabled = false;
+  canvas.setPointerCapture(event.pointerId);
+}, { capture: true });
+canvas.addEventListener('pointermove', (event) => { if (push && isDragged(event)) dragPush(event); });
+canvas.addEventListener('pointerup', (event) => {
+  if (push?.velocity) ask({ push: { robot: push.robot, velocity: push.velocity } });
+  if (!isDragged(event)) {
+    const robot = robotAt(event);
+    if (robot !== undefined) follow(robot);
+  }
+});
+canvas.addEventListener('lostpointercapture', () => {
+  [push, orbit.enabled, pushArrow.visible] = [null, true, false];
 });
 addEventListener('keydown', (event) => { if (event.key === 'f') follows = !follows; });
 addEventListener('resize', resize);
 
 // Reads the endless response, and keeps the newest frame.
 async function read() {
-  const response = await fetch(url('frames'));
+  const response = await (framesAnswer ?? fetch(url('frames')));
+  framesAnswer = null;
   if (!response.ok) throw new Error(await response.text());
   const reader = response.body.getReader();
   let rest = new Uint8Array(0);
@@ -447,10 +586,12 @@ async function start() {
   if (recording) {
     info = globalThis.recordedScene;
   } else {
-    const response = await fetch(url('scene'));
+    const response = await sceneAnswer;
     if (!response.ok) { $('status').textContent = await response.text(); return; }
     info = await response.json();
   }
+  // A server of another version may not have it.
+  info.robot_curves ??= [];
   $('title').textContent = info.title;
   document.title = info.title;
   $('ghost-legend').hidden = !info.has_ghost;
@@ -460,11 +601,15 @@ async function start() {
   animate();
   let [lastReceived, lastDrawn] = [0, 0];
   setInterval(() => {
-    if (received > lastReceived) $('status').textContent = `${drawn - lastDrawn} frames/s`;
-    else if (received > 0) $('status').textContent = 'waits for the next frame';
+    const status = received > lastReceived ? `${drawn - lastDrawn} frames/s` : 'waits for the next frame';
+    if (received > 0 && !push) $('status').textContent = status;
     [lastReceived, lastDrawn] = [received, drawn];
     if (!recording) drawCurves();
   }, 1000);
+  if (info.is_learning) {
+    showLearning();
+    setInterval(showLearning, 2000);
+  }
   if (recording) play(); else connect();
 }
 

@@ -349,6 +349,8 @@ pub fn small_scene() -> Scene {
         velocity: None,
         torque: None,
         foot_force: None,
+        reward_terms: Vec::new(),
+        uncertainty: None,
     }
 }
 

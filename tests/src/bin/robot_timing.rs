@@ -215,7 +215,8 @@ fn document(walk: &Part, disturbed: &Part) -> String {
     for (name, key) in [
         ("state to command, p50 / p99 / largest [ms]", "state_to_command"),
         ("jitter of the ticks", "tick_jitter"),
-        ("lateness of the loop's timer", "lateness"),
+        ("lateness of the loop: time since the step before, less 2 ms", "lateness"),
+        ("lateness of its timer, where no state arrived in time", "timer_lateness"),
         ("time between two commands", "gaps"),
     ] {
         row(name, &|part| {
@@ -223,6 +224,7 @@ fn document(walk: &Part, disturbed: &Part) -> String {
             format!("{:.2} / {:.2} / {:.1}", entry("p50_ms"), entry("p99_ms"), entry("max_ms"))
         });
     }
+    row("steps of the timer", &|part| part.robot["timer_lateness"]["count"].to_string());
     row("times above 10 ms between two commands, of", &|part| {
         format!("{} of {}", part.robot["gaps"]["above_10_ms"], part.robot["gaps"]["count"])
     });

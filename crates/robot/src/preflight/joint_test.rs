@@ -6,7 +6,7 @@ use twinstep_model::{Command, Joint, PerJoint};
 
 use super::finding::{Blocks, Finding};
 use super::least_squares::{Estimate, centred, least_squares};
-use super::sample::{Sample, without_gaps};
+use super::sample::{Sample, is_disturbed, without_gaps};
 
 /// Amplitude of the motion [rad].
 pub(super) const AMPLITUDE: f32 = 0.1;
@@ -28,10 +28,6 @@ const MIN_VELOCITY_MOTION: f32 = 0.006;
 /// Smallest part of the motion that follows neither from the command nor from the velocity [rad]. Below it the noise of
 /// the encoder makes its scale look wrong.
 const MIN_INDEPENDENT_MOTION: f64 = 0.005;
-/// States of the robot [Hz].
-const STATES_HZ: f64 = 500.0;
-/// Smallest share of a part's states that must be usable.
-const MIN_USED: f64 = 0.6;
 /// Longest delay of the states that is tried, in states.
 const MAX_DELAY: usize = 6;
 /// Largest relative standard error of a law that is judged.
@@ -113,8 +109,7 @@ impl JointTest {
 
     /// Returns true if this computer stood still during so much of the test that it has to be repeated.
     pub fn is_disturbed(&self) -> bool {
-        let used = |part: &Vec<Sample>| without_gaps(part).iter().map(|samples| samples.len()).sum::<usize>();
-        self.parts.iter().any(|part| (used(part) as f64) < MIN_USED * PART_S * STATES_HZ)
+        self.parts.iter().any(|part| is_disturbed(part, PART_S))
     }
 
     /// Returns the index of the last part, with the highest gains.

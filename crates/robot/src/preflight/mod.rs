@@ -45,7 +45,7 @@ use crate::state::State;
 use crate::trajectory::Trajectory;
 use joint_test::JointTest;
 use passive::Observation;
-use sample::Sample;
+use sample::{Sample, is_disturbed};
 
 /// Time without commands [s].
 const OBSERVE_S: f64 = 1.2;
@@ -53,8 +53,10 @@ const OBSERVE_S: f64 = 1.2;
 const CONNECT_S: f64 = 0.2;
 /// Time in damping before and after motions [s].
 const DAMP_S: f64 = 0.2;
-/// Number of tests of a joint, if this computer disturbs them.
+/// Number of times that each test is made, if this computer disturbs it.
 const MAX_TESTS: usize = 5;
+/// Why a test was left out that this computer disturbed each time.
+const STOOD_STILL: &str = "this computer stood still meanwhile, each time: close other programs";
 /// Time to the low stance and from it [s].
 const RISE_S: f64 = 1.2;
 
@@ -127,7 +129,7 @@ pub struct Preflight {
     q_command: PerJoint,
     /// Joints that moved too little: they are tested again on the feet.
     blocked: Vec<Joint>,
-    /// Number of tests of the present joint that this computer disturbed.
+    /// Number of times that this computer disturbed the present test.
     disturbed_tests: usize,
     /// Pose in which the joints are tested [rad].
     pose: PerJoint,
@@ -310,6 +312,7 @@ impl Preflight {
         if elapsed < CONNECT_S {
             return;
         }
+        observation.count(input.states.len(), elapsed - CONNECT_S - observation.seconds);
         observation.seconds = elapsed - CONNECT_S;
         observation.controller = input.controller.clone();
         for state in &input.states {
@@ -319,6 +322,14 @@ impl Preflight {
         if elapsed < OBSERVE_S {
             return;
         }
+        if !observation.has_rate() {
+            if self.repeats() {
+                self.observation = Observation::default();
+                return self.enter(Phase::Observe, input.now);
+            }
+            self.leave_out("rate of the states", STOOD_STILL.to_owned());
+        }
+        self.disturbed_tests = 0;
         self.report.findings = self.observation.findings(&self.robot, &self.config);
         match self.blocking() {
             Some((id, Blocks::Motion)) => {
@@ -353,12 +364,10 @@ impl Preflight {
         let Phase::TestJoint(test) = &self.phase else { return };
         let joint = test.joint;
         if test.is_disturbed() {
-            self.disturbed_tests += 1;
-            if self.disturbed_tests < MAX_TESTS {
+            if self.repeats() {
                 return self.enter(Phase::TestJoint(JointTest::new(joint)), now);
             }
-            let reason = format!("this computer stood still while {joint} moved: close other programs");
-            self.leave_out("motor, encoder and velocity of a joint", reason);
+            self.leave_out("motor, encoder and velocity of a joint", format!("{STOOD_STILL}; it was {joint}"));
         } else {
             let result = test.findings();
             if !result.moved {
@@ -403,12 +412,32 @@ impl Preflight {
 
     fn end_stance(&mut self, now: Duration) {
         let Phase::TestStance(samples) = &self.phase else { return };
+        if is_disturbed(samples, stance::DURATION_S) {
+            if self.repeats() {
+                return self.enter(Phase::TestStance(Vec::new()), now);
+            }
+            for check in ["inertial measurement unit in motion", "legs against the trunk"] {
+                self.leave_out(check, STOOD_STILL.to_owned());
+            }
+            return self.lower(now);
+        }
         let of_joints = stance::joint_findings(samples, &self.blocked, &self.config);
         let of_trunk = stance::findings(samples, &self.robot);
         for (findings, left_out) in [of_joints, of_trunk] {
             self.report.findings.extend(findings);
             self.report.left_out.extend(left_out);
         }
+        self.lower(now);
+    }
+
+    /// Returns true if a test that this computer disturbed is to be repeated.
+    fn repeats(&mut self) -> bool {
+        self.disturbed_tests += 1;
+        self.disturbed_tests < MAX_TESTS
+    }
+
+    /// Lies down.
+    fn lower(&mut self, now: Duration) {
         let crouch = self.limits.clamp(Joint::map_kinds(0.0, 1.36, -2.65));
         let lower = Trajectory::new(stance::pose(stance::DURATION_S), vec![(crouch, Duration::from_secs_f64(RISE_S))]);
         self.enter(Phase::Lower(lower), now);

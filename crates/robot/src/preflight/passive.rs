@@ -5,7 +5,7 @@ use twinstep_model::{FootKinematics, Joint, JointKind, Leg, PerJoint, RobotModel
 use twinstep_unitree::LowState;
 
 use super::finding::{Blocks, Finding};
-use super::sample::{Sample, joint_mean, mean};
+use super::sample::{MAX_GAP_S, MIN_USED, Sample, joint_mean, mean};
 use crate::SafetyConfig;
 use crate::command::scaled_range;
 
@@ -28,6 +28,8 @@ pub(super) struct Observation {
     pub damaged: u32,
     /// Time of the observation [s].
     pub seconds: f64,
+    /// Number of states, and time [s], without those in which this computer stood still.
+    pub counted: (u32, f64),
     /// First and last value of the robot's clock.
     pub ticks: Option<[u32; 2]>,
     /// Lost messages of all motors, at the start and now.
@@ -54,6 +56,18 @@ impl Observation {
         self.lost = Some([self.lost.map_or(lost, |[first, _]| first), lost]);
         self.remote_received |= twinstep_unitree::Remote::decode(&state.wireless_remote).is_some();
         self.last = Some(state.clone());
+    }
+
+    /// Counts the states that arrived `seconds` after the step before.
+    pub fn count(&mut self, states: usize, seconds: f64) {
+        if seconds <= MAX_GAP_S {
+            self.counted = (self.counted.0 + states as u32, self.counted.1 + seconds);
+        }
+    }
+
+    /// Returns true if this computer stood still for so little of the time that the rate of the states is known.
+    pub fn has_rate(&self) -> bool {
+        self.counted.1 >= MIN_USED * self.seconds
     }
 
     /// Returns everything that is wrong.
@@ -113,8 +127,8 @@ impl Observation {
             let remedy = "check cable and message definition: the checksum is over the C structure, not over the CDR";
             findings.push(Finding::new("checksum", "states are damaged".to_owned(), evidence, remedy));
         }
-        let rate = f64::from(self.states) / self.seconds;
-        if rate < f64::from(config.min_state_hz) {
+        let rate = f64::from(self.counted.0) / self.counted.1;
+        if self.has_rate() && rate < f64::from(config.min_state_hz) {
             let evidence = format!("{rate:.0} states per second, at least {} are needed", config.min_state_hz);
             let remedy = "read `rt/lowstate`, not `rt/lf/lowstate`; use the cable, not the wireless network";
             findings.push(Finding::new("state_rate", "states arrive too rarely".to_owned(), evidence, remedy));

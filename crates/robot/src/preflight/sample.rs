@@ -41,10 +41,21 @@ impl Sample {
     }
 }
 
-/// Longest time between two states that follow each other [s].
-const MAX_GAP_S: f64 = 0.005;
+/// Longest time between two states that follow each other, and between two steps [s].
+pub(super) const MAX_GAP_S: f64 = 0.005;
 /// States after a longer time that are not used: those that waited meanwhile arrive faster than they were sent.
 const SETTLING: usize = 15;
+
+/// Smallest share of the states of a motion that must be usable.
+pub(super) const MIN_USED: f64 = 0.6;
+/// States of the robot [Hz].
+const STATES_HZ: f64 = 500.0;
+
+/// Returns true if this computer stood still during so much of a motion of `seconds` that the motion has to be repeated.
+pub(super) fn is_disturbed(samples: &[Sample], seconds: f64) -> bool {
+    let used = without_gaps(samples).iter().map(|samples| samples.len()).sum::<usize>();
+    (used as f64) < MIN_USED * seconds * STATES_HZ
+}
 
 /// Returns the parts of samples in which states follow each other without a gap.
 ///

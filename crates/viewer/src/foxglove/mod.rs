@@ -54,7 +54,7 @@ pub fn write_mcap(target: impl Write + Seek, scene: &SceneInfo, frames: &[Frame]
         }
         write(transforms, frame.time, &messages::transforms(scene, frame))?;
         for (channel, robot) in robots.iter().zip(&frame.robots) {
-            write(*channel, frame.time, Value::Object(quantities(robot)).to_string().as_bytes())?;
+            write(*channel, frame.time, Value::Object(quantities(scene, robot)).to_string().as_bytes())?;
         }
         let values: Map<String, Value> =
             frame.curves.iter().map(|(name, value)| (name.clone(), (*value).into())).collect();
@@ -64,17 +64,19 @@ pub fn write_mcap(target: impl Write + Seek, scene: &SceneInfo, frames: &[Frame]
 }
 
 /// Returns the known quantities of a robot.
-fn quantities(robot: &RobotFrame) -> Map<String, Value> {
+fn quantities(scene: &SceneInfo, robot: &RobotFrame) -> Map<String, Value> {
     let object = |names: &[&str], values: &[f32]| {
-        let entries = names.iter().zip(values).map(|(name, value)| ((*name).to_owned(), f64::from(*value).into()));
-        Value::Object(entries.collect())
+        let known = names.iter().zip(values).filter(|(_, value)| value.is_finite());
+        Value::Object(known.map(|(name, value)| ((*name).to_owned(), f64::from(*value).into())).collect())
     };
+    let curves: Vec<&str> = scene.robot_curves.iter().map(String::as_str).collect();
     let axes = ["forward", "left", "yaw_rate"];
     let known = [
         ("torque", robot.torque.map(|values| object(&JOINT_NAMES, &values))),
         ("foot_force", robot.foot_force.map(|values| object(&Leg::ALL.map(Leg::name), &values))),
         ("velocity_command", robot.command.map(|values| object(&axes, &values))),
         ("velocity", robot.velocity.map(|values| object(&axes, &values))),
+        ("curves", (!robot.curves.is_empty()).then(|| object(&curves, &robot.curves))),
     ];
     known.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect()
 }
