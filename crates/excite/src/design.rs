@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::DMatrix;
 use twinstep_identify::CmaEs;
+use twinstep_identify::least_squares::Differences;
 use twinstep_model::{Rollout, stream};
 
 use crate::criterion::{Criterion, posterior_std};
@@ -172,7 +173,9 @@ impl Evaluation<'_> {
         }
         // A log of one row has no window.
         let Some(log) = trial.log else { return Ok(Err(1.0)) };
-        let Some(information): Option<DMatrix<f64>> = self.unknowns.information(&log, self.simulator)? else {
+        let information: Option<DMatrix<f64>> =
+            self.unknowns.information(&log, Differences::OneSided, self.simulator)?;
+        let Some(information) = information else {
             *self.rejected.entry("diverged").or_default() += 1;
             return Ok(Err(1.0));
         };

@@ -1,9 +1,7 @@
 //! Random velocity commands that keep the limits of a run.
 
-use rand::SeedableRng;
-use rand::rngs::StdRng;
 use twinstep_envs::{Task, TaskEnv};
-use twinstep_model::{Simulator, VecEnv};
+use twinstep_model::{Simulator, VecEnv, stream};
 use twinstep_policy::Policy;
 
 use crate::sequence::{CommandSequence, VelocityRanges};
@@ -23,7 +21,7 @@ pub fn random_within_limits<B: Simulator, T: Task>(
     seed: u64,
     proceed: &mut dyn FnMut() -> bool,
 ) -> Result<Option<CommandSequence>, TrialError> {
-    let mut random = StdRng::seed_from_u64(seed);
+    let mut random = stream(seed, "random commands", 0);
     for _ in 0..ATTEMPTS {
         if !proceed() {
             return Ok(None);

@@ -3,6 +3,7 @@
 use twinstep_effects::ModelFile;
 use twinstep_envs::{TaskEnv, Walk};
 use twinstep_identify::EffectAtScope;
+use twinstep_identify::least_squares::Differences;
 use twinstep_model::go2;
 use twinstep_policy::Policy;
 use twinstep_sim::{BatchBackend, BatchRollout, SimConfig};
@@ -101,7 +102,10 @@ fn walking_tells_more_of_viscous_friction_than_standing() {
     let unknowns = unknowns(&["viscous_friction@calf"]);
     let information = trials(&commands, 1).into_iter().map(|trial| {
         let log = trial.log.expect("no fall");
-        let information = unknowns.information(&log, &mut rollouts).expect("a log").expect("a finite simulation");
+        let information = unknowns
+            .information(&log, Differences::Central, &mut rollouts)
+            .expect("a log")
+            .expect("a finite simulation");
         information[(0, 0)]
     });
     let [walking, standing] = information.collect::<Vec<_>>().try_into().expect("two logs");

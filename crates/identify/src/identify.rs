@@ -7,7 +7,7 @@ use twinstep_model::{Precision, Rollout};
 
 use crate::experiment::{Experiment, Regime};
 use crate::global_search::GlobalSearch;
-use crate::least_squares::LeastSquaresProblem;
+use crate::least_squares::{Differences, LeastSquaresProblem};
 use crate::parameter::{
     FreeParameter, drop_unidentifiable, free_parameters, initial_coordinate, set_intervals, with_values,
 };
@@ -246,7 +246,7 @@ pub fn blocks(experiments: &[Experiment]) -> Vec<usize> {
 /// It is evaluated at the prior means, where every effect acts.
 fn predicted(task: &LeastSquaresProblem, simulator: &mut dyn Rollout) -> Vec<f64> {
     let prior_mean = task.from_prior_units(&vec![0.0; task.unknowns.len()]);
-    let factor = predicted_information(task, simulator, &prior_mean).and_then(DMatrix::cholesky);
+    let factor = predicted_information(task, Differences::Central, simulator, &prior_mean).and_then(DMatrix::cholesky);
     factor.map_or_else(
         || vec![0.0; task.unknowns.len()],
         |factor| {
@@ -260,6 +260,7 @@ fn predicted(task: &LeastSquaresProblem, simulator: &mut dyn Rollout) -> Vec<f64
 /// Returns `None` if a simulation diverges.
 pub fn predicted_information(
     task: &LeastSquaresProblem,
+    differences: Differences,
     simulator: &mut dyn Rollout,
     point: &[f64],
 ) -> Option<DMatrix<f64>> {
@@ -269,7 +270,8 @@ pub fn predicted_information(
         |group: &usize| if Experiment::regime(*group) == Regime::Fixed { 30f64.sqrt() } else { 200f64.sqrt() };
     let groups: Vec<usize> = task.experiments.iter().flat_map(Experiment::groups).collect();
     let spread: Vec<f64> = groups.iter().map(independent).collect();
-    let here = LeastSquaresProblem { residual_scale: &spread, ..*task }.linearise(simulator, point)?;
+    let task = LeastSquaresProblem { residual_scale: &spread, ..*task };
+    let here = task.linearise_by(differences, simulator, point)?;
     Some(information(&here))
 }
 

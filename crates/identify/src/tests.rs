@@ -8,7 +8,7 @@ use twinstep_model::{BaseMount, Precision, RobotStates, Rollout, RolloutRequest,
 
 use crate::experiment::Experiment;
 use crate::global_search::GlobalSearch;
-use crate::least_squares::LeastSquaresProblem;
+use crate::least_squares::{Differences, LeastSquaresProblem};
 use crate::parameter::{FreeParameter, drop_unidentifiable, free_parameters, initial_coordinate, with_values};
 use crate::refine::{DAMPING_FACTORS, SIMULATOR_MISMATCH_STD, covariance, information, refine};
 use crate::window::WindowConfig;
@@ -83,6 +83,19 @@ fn refinement_converges_to_the_truth_up_to_the_pull_of_the_prior() {
             // A linear problem: the estimate is the mean of truth and prior mean, weighted by their information.
             let pull = (unknown.prior[0] - truth) / information[(index, index)];
             assert!((found[index] - truth - pull).abs() < 0.01 * unknown.prior[1], "{} for {truth}", found[index]);
+        }
+    });
+}
+
+#[test]
+fn one_sided_differences_agree_with_central_ones_and_step_inwards_from_a_bound() {
+    with_problem(|task, begin| {
+        let high = task.unknowns[0].coordinate_bounds()[1];
+        for point in [begin.clone(), vec![high, begin[1]]] {
+            let central = task.linearise(&mut Linear, &point).expect("finite").jacobian;
+            let found = task.linearise_by(Differences::OneSided, &mut Linear, &point).expect("finite").jacobian;
+            let error = (&found - &central).norm() / central.norm();
+            assert!(error < 1e-6, "{error} at {point:?}: the robot of this test is linear");
         }
     });
 }
