@@ -71,7 +71,10 @@ fn main() {
         let (seconds, processor_s) = timed(&args, &policy, physics_hz);
         println!("| {physics_hz} | {} | {seconds:.1} | {processor_s:.1} |", args.candidates);
     }
-    println!("\nSpearman's rank correlation of {} random sequences with central differences at 1000 Hz:\n", args.ranked);
+    println!(
+        "\nSpearman's rank correlation of {} random sequences with central differences at 1000 Hz:\n",
+        args.ranked
+    );
     println!("| runs [Hz] | derivatives [Hz] | trace | d-optimal | sequences without a fall |\n|---|---|---|---|---|");
     let reference = values(&args, &policy, [1000; 2], args.seed, Differences::Central);
     let pairs = RATES_HZ.map(|rate_hz| [rate_hz; 2]).into_iter().chain([[1000, 400], [1000, 600]]);
