@@ -2,7 +2,7 @@
 
 use nalgebra::DMatrix;
 use proptest::prelude::*;
-use twinstep_effects::{CATALOGUE, Effect, ModelFile, Scope, Target};
+use twinstep_effects::{CATALOGUE, Effect, EffectEntry, ModelFile, Scope, Target};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{BaseMount, Precision, RobotStates, Rollout, RolloutRequest, go2};
 
@@ -184,6 +184,22 @@ fn added_entries_without_an_identifiable_parameter_are_dropped() {
     drop_unidentifiable(&mut file, &ModelFile::default(), &unknowns, &[false, true]);
     let left: Vec<_> = file.effects.iter().map(|entry| entry.effect.name).collect();
     assert_eq!(left, ["coulomb_friction"]);
+}
+
+#[test]
+fn parameters_of_effects_that_a_model_already_has_belong_to_their_own_entries() {
+    let (payload, saturation) = (named("payload"), named("torque_saturation"));
+    let known = [("hip", 20.0), ("thigh", 25.0), ("calf", 30.0)].map(|(scope, kappa)| {
+        let scope: Scope = scope.parse().expect("a scope");
+        EffectEntry::new(saturation, scope, vec![kappa]).expect("an allowed value")
+    });
+    let effects: Vec<_> =
+        std::iter::once((payload, Scope::Base)).chain(known.iter().map(|entry| (saturation, entry.scope))).collect();
+    let model = ModelFile { effects: known.to_vec(), ..ModelFile::default() };
+    let (file, unknowns) = free_parameters(&model, &effects).expect("no conflict");
+    let found: Vec<f64> =
+        unknowns.iter().map(|unknown| unknown.value(initial_coordinate(&file, unknown)).round()).collect();
+    assert_eq!(found, [0.0, 0.0, 0.0, 0.0, 20.0, 25.0, 30.0]);
 }
 
 /// Returns the free parameters of an effect on its widest scope.

@@ -51,8 +51,8 @@ struct Args {
 const COLLECTIONS: [&str; 3] = ["random", "trace", "d-optimal"];
 /// Methods whose policies are compared. `truth` learns on the hidden robot, in the batch engine.
 const METHODS: [&str; 7] = ["vanilla", "heavy", "spi", "spi-random", "spi-trace", "spi-d-optimal", "truth"];
-/// Effects that are hidden and identified.
-const UNKNOWNS: [&str; 7] = [
+/// Effects that are hidden.
+const HIDDEN: [&str; 7] = [
     "payload@base",
     "torque_saturation@hip",
     "torque_saturation@thigh",
@@ -61,6 +61,8 @@ const UNKNOWNS: [&str; 7] = [
     "coulomb_friction@thigh",
     "coulomb_friction@calf",
 ];
+/// Effects that are identified with them: MuJoCo's ground differs from that of the batch engine.
+const GROUND: [&str; 2] = ["ground_stiffness@ground", "ground_friction@ground"];
 /// Noise of the robot's sensors.
 const SENSORS: &str = "[randomise.noise]\njoint_position_rad = 0.0005\njoint_velocity_rad_s = 0.1\n\
                        joint_torque_nm = 0.35\nangular_velocity_rad_s = 0.02\n";
@@ -160,8 +162,9 @@ impl<'a> Robot<'a> {
             }
             let config = self.commands.path(&format!("{method}.toml"));
             let (Args { candidates, .. }, seed) = (self.args, self.seed);
+            let unknowns: Vec<&str> = HIDDEN.into_iter().chain(GROUND).collect();
             let settings = format!(
-                "policy = \"data/policies/walk.safetensors\"\nunknowns = {UNKNOWNS:?}\nendpoint = \"{endpoint}\"\n\
+                "policy = \"data/policies/walk.safetensors\"\nunknowns = {unknowns:?}\nendpoint = \"{endpoint}\"\n\
                  method = \"{method}\"\ncandidates = {candidates}\nfast = true\nseed = {seed}\n"
             );
             std::fs::write(&config, settings).map_err(text)?;
@@ -236,7 +239,7 @@ impl<'a> Robot<'a> {
 fn hidden(seed: u64) -> ModelFile {
     let mut random = stream(seed, "spi_table", 0);
     let mut draw = |low: f64, high: f64| random.random_range(low..high);
-    let entries = UNKNOWNS.map(|name| {
+    let entries = HIDDEN.map(|name| {
         let (name, scope) = name.split_once('@').expect("an effect with its scope");
         let values = match (name, scope) {
             ("payload", _) => vec![draw(0.5, 2.5), draw(-0.08, 0.08), draw(-0.04, 0.04), draw(0.0, 0.08)],
