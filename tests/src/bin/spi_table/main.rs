@@ -42,15 +42,15 @@ struct Args {
     /// Tasks: walk, jump, track.
     #[arg(long, value_delimiter = ',', default_value = "walk,jump")]
     tasks: Vec<String>,
+    /// Methods: vanilla, heavy, spi, truth, and spi- with random or a criterion, such as spi-d-optimal. `truth` learns on
+    /// the hidden robot, in the batch engine.
+    #[arg(long, value_delimiter = ',', default_value = "vanilla,heavy,spi,spi-random,spi-trace,spi-d-optimal,truth")]
+    methods: Vec<String>,
     /// Print the table of what is complete, and run nothing.
     #[arg(long)]
     table: bool,
 }
 
-/// Ways of choosing the commands of the second log.
-const COLLECTIONS: [&str; 3] = ["random", "trace", "d-optimal"];
-/// Methods whose policies are compared. `truth` learns on the hidden robot, in the batch engine.
-const METHODS: [&str; 7] = ["vanilla", "heavy", "spi", "spi-random", "spi-trace", "spi-d-optimal", "truth"];
 /// Effects that are hidden.
 const HIDDEN: [&str; 7] = [
     "payload@base",
@@ -66,6 +66,14 @@ const GROUND: [&str; 2] = ["ground_stiffness@ground", "ground_friction@ground"];
 /// Noise of the robot's sensors.
 const SENSORS: &str = "[randomise.noise]\njoint_position_rad = 0.0005\njoint_velocity_rad_s = 0.1\n\
                        joint_torque_nm = 0.35\nangular_velocity_rad_s = 0.02\n";
+impl Args {
+    /// Returns the ways of choosing the commands of the second log, `random` first.
+    fn collections(&self) -> Vec<&str> {
+        let designed = self.methods.iter().filter_map(|method| method.strip_prefix("spi-"));
+        std::iter::once("random").chain(designed.filter(|method| *method != "random")).collect()
+    }
+}
+
 /// A task and its error.
 struct Task {
     name: &'static str,
@@ -126,7 +134,7 @@ fn campaign(args: &Args) -> Step<String> {
         let robot = Robot::new(args, seed)?;
         robot.collect()?;
         for task in TASKS.iter().filter(|task| args.tasks.iter().any(|name| name == task.name)) {
-            METHODS.iter().try_for_each(|method| robot.tune_and_evaluate(task, method))?;
+            args.methods.iter().try_for_each(|method| robot.tune_and_evaluate(task, method))?;
             robot.evaluate(task, "start", &start(task.name))?;
         }
         std::fs::write(args.out.join("table.md"), table::text(args)?).map_err(text)?;
@@ -150,15 +158,16 @@ impl<'a> Robot<'a> {
 
     /// Identifies the robot from logs of random and of designed commands. The first log is the same for all.
     fn collect(&self) -> Step {
-        let last = COLLECTIONS[COLLECTIONS.len() - 1];
-        if self.commands.path(&format!("{last}/report.md")).exists() {
+        let done = |method: &str| self.commands.path(method).join("report.md").exists();
+        let missing: Vec<_> = self.args.collections().into_iter().filter(|method| !done(method)).collect();
+        if missing.is_empty() {
             return Ok(());
         }
         let (_server, endpoint) = self.server()?;
-        for method in COLLECTIONS {
-            for stage in ["1-random", "held-out"].iter().filter(|_| method != COLLECTIONS[0]) {
+        for method in missing {
+            for stage in ["1-random", "held-out"].iter().filter(|_| method != "random") {
                 let of = |method: &str| self.commands.path(method).join(stage);
-                copy(&of(COLLECTIONS[0]), &of(method))?;
+                copy(&of("random"), &of(method))?;
             }
             let config = self.commands.path(&format!("{method}.toml"));
             let (Args { candidates, .. }, seed) = (self.args, self.seed);

@@ -6,7 +6,7 @@ use std::path::Path;
 use twinstep_effects::ModelFile;
 use twinstep_tests::resumable::{Step, number, read};
 
-use crate::{Args, COLLECTIONS, METHODS, TASKS, Task};
+use crate::{Args, TASKS, Task};
 
 /// Two-sided 95 % quantile of Student's distribution by degrees of freedom, from 1.
 const T_95: [f64; 9] = [12.71, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262];
@@ -17,7 +17,9 @@ pub fn text(args: &Args) -> Step<String> {
         "| robot | commands of the second log | robot time [s] | error of the trunk's mass | joint position on a \
                     held-out log, RMSE [rad] | falls |\n|---|---|---|---|---|---|\n"
             .to_owned();
-    for seed in seeds(args).filter(|seed| exists(args, *seed, "d-optimal/report.md")) {
+    let collections = args.collections();
+    let is_complete = |seed: &u64| collections.iter().all(|method| exists(args, *seed, &format!("{method}/report.md")));
+    for seed in seeds(args).filter(is_complete) {
         identification(args, seed, &mut text)?;
     }
     for task in TASKS {
@@ -42,11 +44,11 @@ fn exists(args: &Args, seed: u64, name: &str) -> bool {
 fn identification(args: &Args, seed: u64, text: &mut String) -> Step {
     let folder = args.out.join(seed.to_string());
     let truth = trunk_kg(&folder.join("hidden.toml"))?;
-    for (index, method) in COLLECTIONS.iter().enumerate() {
+    for (index, method) in args.collections().into_iter().enumerate() {
         let report =
             std::fs::read_to_string(folder.join(method).join("report.md")).map_err(|error| error.to_string())?;
         let second = if index == 0 { "2-random" } else { "2-active" };
-        for (name, stage) in [("none", "1-random"), (*method, second)].iter().skip(usize::from(index > 0)) {
+        for (name, stage) in [("none", "1-random"), (method, second)].iter().skip(usize::from(index > 0)) {
             let row = report.lines().find(|line| line.starts_with(&format!("| {stage} |")));
             let cells: Vec<&str> = row.map_or(Vec::new(), |row| row.split('|').map(str::trim).collect());
             let [_, _, seconds, falls, rmse, ..] = cells[..] else { return Err(format!("{method} has no {stage}")) };
@@ -82,7 +84,7 @@ fn downstream(args: &Args, task: &Task, seeds: &[u64], text: &mut String) -> Ste
         task.error,
         seeds.len()
     );
-    for method in ["start"].iter().chain(&METHODS) {
+    for method in std::iter::once("start").chain(args.methods.iter().map(String::as_str)) {
         let found = errors(method)?;
         let cells: Vec<String> = found.iter().map(|[error, _]| format!("{error:.3}")).collect();
         let up = mean(found.iter().map(|[_, up]| *up));
