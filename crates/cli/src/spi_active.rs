@@ -26,7 +26,8 @@ use crate::{excite, identify, run};
 ///   policy = "data/policies/walk.safetensors"
 ///   unknowns = ["payload@base", "coulomb_friction@calf"]   as of `twinstep identify --effects`
 ///   endpoint = "tcp/127.0.0.1:7447"
-///   method = "d-optimal"      trace, d-optimal, or random: the later stages are like the first (SPI-Random)
+///   method = "d-optimal"      trace, d-optimal, qoed, or random: the later stages are like the first (SPI-Random)
+///   of_interest = []          unknowns that matter for qoed; default: what random commands identify
 ///   rounds = 1                number of stages after the first
 ///   seconds = 25.0            duration of each log
 ///   segment_s = 5.0           duration of a command

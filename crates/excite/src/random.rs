@@ -4,7 +4,7 @@ use twinstep_envs::{Task, TaskEnv};
 use twinstep_model::{Simulator, VecEnv, stream};
 use twinstep_policy::Policy;
 
-use crate::sequence::{CommandSequence, VelocityRanges};
+use crate::sequence::{CommandRanges, CommandSequence};
 use crate::trial::{Limits, TrialError, simulate};
 
 /// How often every robot of the environment tries a sequence.
@@ -16,7 +16,7 @@ pub fn random_within_limits<B: Simulator, T: Task>(
     env: &mut TaskEnv<B, T>,
     policy: &Policy,
     (segment_s, segments): (f64, usize),
-    ranges: &VelocityRanges,
+    ranges: &CommandRanges,
     limits: &Limits,
     seed: u64,
     proceed: &mut dyn FnMut() -> bool,

@@ -17,6 +17,7 @@
 //! SI units, radians, seconds. The docs of each vector give its frame, world or base. The base frame is fixed to the
 //! trunk: x forward, y left, z up. Quaternions in arrays are `[w, x, y, z]` and rotate from base to world.
 
+mod agent_commands;
 mod backend;
 mod base_mount;
 mod body;
@@ -44,6 +45,7 @@ mod stream;
 mod trajectory;
 mod vec_env;
 
+pub use agent_commands::{AgentCommands, GaitCommand, VelocityCommand};
 pub use backend::{Actuator, ActuatorSnapshot, Backend, BackendError, EpistemicUncertainty, Restorable, Simulator};
 pub use base_mount::BaseMount;
 pub use body::RigidBody;

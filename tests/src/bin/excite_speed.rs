@@ -9,7 +9,7 @@ use indicatif::ProgressBar;
 use twinstep_effects::ModelFile;
 use twinstep_envs::WalkConfig;
 use twinstep_excite::{
-    CommandSequence, Criterion, DesignOptions, Limits, Unknowns, VelocityRanges, design, simulate, walking_env,
+    CommandRanges, CommandSequence, Criterion, DesignOptions, Limits, Unknowns, design, simulate, walking_env,
 };
 use twinstep_identify::least_squares::Differences;
 use twinstep_identify::{CmaEs, EffectAtScope};
@@ -100,9 +100,10 @@ fn unknowns() -> Unknowns {
     Unknowns::new(&ModelFile::default(), &effects).expect("effects of the catalogue")
 }
 
-fn ranges() -> VelocityRanges {
+fn ranges() -> CommandRanges {
     let command = WalkConfig::default().command;
-    [command.linear_velocity_x, command.linear_velocity_y, command.angular_velocity_z]
+    let velocity = [command.linear_velocity_x, command.linear_velocity_y, command.angular_velocity_z];
+    CommandRanges { velocity, step_frequency: None }
 }
 
 fn sim(physics_hz: u32) -> SimConfig {
