@@ -18,7 +18,7 @@ use twinstep_protocol::tensor::as_bytes;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, decode, encode};
 
 /// Name of every golden file, without `.msgpack`.
-pub const NAMES: [&str; 32] = [
+pub const NAMES: [&str; 33] = [
     "hello_request",
     "hello_reply",
     "hello_reply_real_time",

@@ -167,7 +167,8 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
         ----------
         commands : (num_envs, 4) float32
             Step frequency [Hz], phases of FR, RL and RR relative to FL [cycles], within the bounds of
-            ``step_frequency`` and ``phase_offset`` in the spec. A server that is older than these commands ignores them.
+            ``step_frequency`` and ``phase_offset`` in the spec. A server that is older than these commands ignores
+            them.
         """
         self._remote.set_gait_commands(commands)
 

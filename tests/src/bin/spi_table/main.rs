@@ -44,7 +44,7 @@ struct Args {
     tasks: Vec<String>,
     /// Methods: vanilla, heavy, spi, truth, and spi- with random or a criterion, such as spi-d-optimal. `truth` learns on
     /// the hidden robot, in the batch engine.
-    #[arg(long, value_delimiter = ',', default_value = "vanilla,heavy,spi,spi-random,spi-trace,spi-d-optimal,truth")]
+    #[arg(long, value_delimiter = ',', default_value = "vanilla,heavy,spi,spi-random,spi-trace,spi-d-optimal,spi-qoed,truth")]
     methods: Vec<String>,
     /// Print the table of what is complete, and run nothing.
     #[arg(long)]
@@ -171,10 +171,12 @@ impl<'a> Robot<'a> {
             }
             let config = self.commands.path(&format!("{method}.toml"));
             let (Args { candidates, .. }, seed) = (self.args, self.seed);
+            // What differs between the engines does not matter.
+            let of_interest: &[&str] = if method == "qoed" { &HIDDEN } else { &[] };
             let unknowns: Vec<&str> = HIDDEN.into_iter().chain(GROUND).collect();
             let settings = format!(
                 "policy = \"data/policies/walk.safetensors\"\nunknowns = {unknowns:?}\nendpoint = \"{endpoint}\"\n\
-                 method = \"{method}\"\ncandidates = {candidates}\nfast = true\nseed = {seed}\n"
+                 method = \"{method}\"\ncandidates = {candidates}\nof_interest = {of_interest:?}\nfast = true\nseed = {seed}\n"
             );
             std::fs::write(&config, settings).map_err(text)?;
             self.commands.run(&["spi-active", &config.display().to_string()])?;
