@@ -246,10 +246,13 @@ impl SpiActiveConfig {
     }
 
     /// Returns the arguments of `twinstep identify`, which writes the model file `out`.
-    pub fn identification(&self, logs: &[PathBuf], out: &Path, resume: bool) -> identify::Args {
+    ///
+    /// The search starts from `earlier`, the model of the stage before.
+    pub fn identification(&self, logs: &[PathBuf], earlier: Option<&Path>, out: &Path, resume: bool) -> identify::Args {
         identify::Args {
             logs: logs.to_vec(),
             model: self.model.clone(),
+            start: earlier.map(Path::to_owned),
             effects: self.unknowns(),
             seed: self.seed,
             resume,

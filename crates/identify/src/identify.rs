@@ -9,7 +9,7 @@ use crate::experiment::{Experiment, Regime};
 use crate::global_search::GlobalSearch;
 use crate::least_squares::{Differences, LeastSquaresProblem};
 use crate::parameter::{
-    FreeParameter, drop_unidentifiable, free_parameters, initial_coordinate, set_intervals, with_values,
+    FreeParameter, coordinate_in, drop_unidentifiable, free_parameters, initial_coordinate, set_intervals, with_values,
 };
 use crate::refine::{DAMPING_FACTORS, SIMULATOR_MISMATCH_STD, covariance, information, refine};
 
@@ -31,11 +31,16 @@ pub struct IdentifyOptions {
     pub force: bool,
     /// Checkpoint of an interrupted search to resume.
     pub resume: Option<GlobalSearch>,
+    /// Model from whose values of the effects the search starts. Default: the given model, where an effect that it does
+    /// not have does nothing.
+    ///
+    /// From far away, the search may end in a local minimum on a log of fast walking.
+    pub start: Option<ModelFile>,
 }
 
 impl Default for IdentifyOptions {
     fn default() -> Self {
-        Self { generations: 60, seed: 1, force: false, resume: None }
+        Self { generations: 60, seed: 1, force: false, resume: None, start: None }
     }
 }
 
@@ -132,6 +137,7 @@ pub fn identify(
     progress: &mut IdentifyProgress,
 ) -> Result<Identification, IdentifyError> {
     let (file, all) = free_parameters(model, effects)?;
+    let (file, begin) = starting_point(file, &all, options.start.as_ref());
     let whole = LeastSquaresProblem {
         file: &file,
         unknowns: &all,
@@ -152,7 +158,6 @@ pub fn identify(
     if first.is_empty() {
         return Err(IdentifyError::NothingToCompare);
     }
-    let begin: Vec<f64> = all.iter().map(|unknown| initial_coordinate(&file, unknown)).collect();
     let predicted = predicted(&whole, simulator);
     let identifiable: Vec<bool> = predicted.iter().map(|std| options.force || *std < MAX_POSTERIOR_TO_PRIOR).collect();
     // Parameters that are not identifiable keep their initial value.
@@ -208,6 +213,17 @@ pub fn identify(
     drop_unidentifiable(&mut found, model, &all, &identifiable);
     let interrupted = interrupted.then_some(search);
     Ok(Identification { model: found, findings, rms: [rms(&first), rms(&last)], correlated, checkpoint: interrupted })
+}
+
+/// Returns the file and the coordinates of the parameters with the values of `start`, if there is one.
+fn starting_point(file: ModelFile, all: &[FreeParameter], start: Option<&ModelFile>) -> (ModelFile, Vec<f64>) {
+    let coordinate = |unknown: &FreeParameter| {
+        let in_start = start.and_then(|start| coordinate_in(start, unknown));
+        in_start.unwrap_or_else(|| initial_coordinate(&file, unknown))
+    };
+    let begin: Vec<f64> = all.iter().map(coordinate).collect();
+    let file = if start.is_some() { with_values(&file, all, &begin) } else { file };
+    (file, begin)
 }
 
 fn select<T: Clone>(all: &[T], identifiable: &[bool]) -> Vec<T> {

@@ -152,6 +152,14 @@ pub fn initial_coordinate(file: &ModelFile, unknown: &FreeParameter) -> f64 {
     unknown.coordinate(file.effects[entry].values[value])
 }
 
+/// Returns the coordinate of a free parameter in the last entry of its effect at its scope. Returns `None` without one.
+pub fn coordinate_in(model: &ModelFile, unknown: &FreeParameter) -> Option<f64> {
+    let own = |entry: &&EffectEntry| entry.effect == unknown.effect && entry.scope == unknown.scope;
+    let entry = model.effects.iter().rfind(own)?;
+    let [low, high] = unknown.coordinate_bounds();
+    Some(unknown.coordinate(entry.values[unknown.location.1]).clamp(low, high))
+}
+
 /// Removes entries from the file that were added to `model` and have no identifiable parameter.
 ///
 /// `identifiable` has one entry per free parameter.

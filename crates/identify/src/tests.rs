@@ -8,6 +8,7 @@ use twinstep_model::{BaseMount, Precision, RobotStates, Rollout, RolloutRequest,
 
 use crate::experiment::Experiment;
 use crate::global_search::GlobalSearch;
+use crate::identify::{IdentifyOptions, identify};
 use crate::least_squares::{Differences, LeastSquaresProblem};
 use crate::parameter::{FreeParameter, drop_unidentifiable, free_parameters, initial_coordinate, with_values};
 use crate::refine::{DAMPING_FACTORS, SIMULATOR_MISMATCH_STD, covariance, information, refine};
@@ -200,6 +201,24 @@ fn parameters_of_effects_that_a_model_already_has_belong_to_their_own_entries() 
     let found: Vec<f64> =
         unknowns.iter().map(|unknown| unknown.value(initial_coordinate(&file, unknown)).round()).collect();
     assert_eq!(found, [0.0, 0.0, 0.0, 0.0, 20.0, 25.0, 30.0]);
+}
+
+#[test]
+fn search_starts_from_the_values_of_an_earlier_model() {
+    let scope = "FL_hip".parse::<Scope>().expect("a scope");
+    let effects = [(named("viscous_friction"), scope), (named("coulomb_friction"), scope)];
+    let entry = |index: usize, value: f64| EffectEntry::new(effects[index].0, scope, vec![value]).expect("allowed");
+    let earlier = ModelFile { effects: vec![entry(0, 0.2), entry(1, 0.5)], ..ModelFile::default() };
+    let values = |start: Option<ModelFile>| {
+        let options = IdentifyOptions { start, ..IdentifyOptions::default() };
+        // Interrupted before the search.
+        let mut stop = |_, _, _| false;
+        let found = identify(&ModelFile::default(), &effects, &[experiment()], &mut Linear, &options, &mut stop);
+        found.expect("a linear robot").findings.iter().map(|finding| finding.value).collect::<Vec<_>>()
+    };
+    let found = values(Some(earlier));
+    assert!((found[0] - 0.2).abs() < 1e-9 && (found[1] - 0.5).abs() < 1e-9, "{found:?}");
+    assert_eq!(values(None), [0.0, 0.0]);
 }
 
 /// Returns the free parameters of an effect on its widest scope.

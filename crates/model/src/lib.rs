@@ -22,6 +22,7 @@ mod backend;
 mod base_mount;
 mod body;
 mod command;
+mod command_bounds;
 pub mod dynamics;
 mod foot_kinematics;
 pub mod frames;

@@ -44,7 +44,11 @@ struct Args {
     tasks: Vec<String>,
     /// Methods: vanilla, heavy, spi, truth, and spi- with random or a criterion, such as spi-d-optimal. `truth` learns on
     /// the hidden robot, in the batch engine.
-    #[arg(long, value_delimiter = ',', default_value = "vanilla,heavy,spi,spi-random,spi-trace,spi-d-optimal,spi-qoed,truth")]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        default_value = "vanilla,heavy,spi,spi-random,spi-trace,spi-d-optimal,spi-qoed,truth"
+    )]
     methods: Vec<String>,
     /// Print the table of what is complete, and run nothing.
     #[arg(long)]
