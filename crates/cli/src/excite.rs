@@ -80,7 +80,7 @@ pub struct Args {
     /// Largest root mean square of a motor's torque, which heats it [N·m].
     #[arg(long, value_name = "NM", default_value_t = DEFAULT_LIMITS.max_rms_torque_nm)]
     pub max_rms_torque: f64,
-    /// Rate of the physics [Hz]. At 400 Hz a search takes half of the time, but the order of candidates correlates with that
+    /// Rate of the physics [Hz]. At 400 Hz a search takes 0.6 times the time, but the order of candidates correlates with that
     /// at 1000 Hz by 0.8 only. Default: 1000.
     #[arg(long, value_name = "HZ")]
     pub physics_hz: Option<u32>,

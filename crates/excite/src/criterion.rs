@@ -112,6 +112,10 @@ mod tests {
         DMatrix::from_row_slice(2, 2, &[1.0 + size, size, size, 1.0 + size])
     }
 
+    fn diagonal([one, other]: [f64; 2]) -> DMatrix<f64> {
+        DMatrix::from_row_slice(2, 2, &[one, 0.0, 0.0, other])
+    }
+
     #[test]
     fn a_log_without_information_has_the_value_of_the_prior() {
         let prior = DMatrix::identity(2, 2);
@@ -135,7 +139,7 @@ mod tests {
     #[test]
     fn qoed_ignores_what_cannot_be_identified_and_what_does_not_matter() {
         // The first log tells most of the second parameter alone, which does not matter.
-        let (one, other) = (DMatrix::from_diagonal(&[2.0, 1e6].into()), DMatrix::from_diagonal(&[50.0, 2.0].into()));
+        let (one, other) = (diagonal([2.0, 1e6]), diagonal([50.0, 2.0]));
         assert!(Criterion::DOptimal.value(&one) > Criterion::DOptimal.value(&other));
         let of_first = Criterion::Qoed(vec![0]);
         assert!(of_first.value(&one) < of_first.value(&other));

@@ -145,7 +145,7 @@ impl CommandSequence {
     pub fn to_csv(&self) -> String {
         let starts = std::iter::once(0.0).chain(self.segments.iter().map(|segment| segment.end_s));
         let lines = starts.zip(&self.segments).map(|(start, Segment { end_s, velocity: [vx, vy, wz], gait })| {
-            let gait: String = gait.iter().flatten().map(|value| format!(",{value}")).collect();
+            let gait = gait.map_or_else(String::new, |[f, fr, rl, rr]| format!(",{f},{fr},{rl},{rr}"));
             format!("{start},{end_s},{vx},{vy},{wz}{gait}\n")
         });
         let gait = if self.has_gaits() { GAIT_HEADER } else { "" };

@@ -10,7 +10,7 @@ use twinstep_sim::{BatchBackend, BatchRollout, SimConfig};
 
 use crate::{
     CommandRanges, CommandSequence, Criterion, Design, DesignError, DesignOptions, Limits, Motion, Trial, Unknowns,
-    Violation, design, simulate, walking_env,
+    Violation, design, gait_env, simulate, walking_env,
 };
 
 const NO_LIMITS: Limits = Limits { room_m: 100.0, max_saturated: 1.0, max_rms_torque_nm: 100.0 };
