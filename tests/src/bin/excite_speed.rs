@@ -121,7 +121,7 @@ fn timed(args: &Args, policy: &Policy, physics_hz: u32) -> (f64, f64) {
         candidates: args.candidates,
         seed: args.seed,
     };
-    let population = CmaEs::new(&vec![0.0; 3 * SEGMENTS], 1.0).population();
+    let population = CmaEs::new(&[0.0; 3 * SEGMENTS], 1.0).population();
     let backend = BatchBackend::new(go2(), sim(physics_hz), population).expect("a backend");
     let mut env = walking_env(backend, args.seed).expect("the default task");
     let mut rollouts = BatchRollout::new(&go2(), &sim(physics_hz)).expect("a simulator");
