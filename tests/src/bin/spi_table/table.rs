@@ -23,8 +23,10 @@ pub fn text(args: &Args) -> Step<String> {
         identification(args, seed, &mut text)?;
     }
     for task in TASKS {
-        let done: Vec<u64> =
-            seeds(args).filter(|seed| exists(args, *seed, &format!("start-{}.json", task.name))).collect();
+        let methods = || std::iter::once("start").chain(args.methods.iter().map(String::as_str));
+        let is_complete =
+            |seed: &u64| methods().all(|method| exists(args, *seed, &format!("{method}-{}.json", task.name)));
+        let done: Vec<u64> = seeds(args).filter(is_complete).collect();
         if !done.is_empty() {
             downstream(args, &task, &done, &mut text)?;
         }
