@@ -10,7 +10,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use twinstep_model::{BackendError, EnvError, Trajectory, VecEnv};
+use twinstep_model::{AgentCommands, BackendError, EnvError, Trajectory, VecEnv};
 use twinstep_policy::BehaviourPolicy;
 use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, message, tensor};
@@ -244,10 +244,8 @@ impl Worker {
                 let request: message::StepRequest<'_> = decode(payload)?;
                 let env = self.env.as_deref_mut().expect("a worker without environments has a failure");
                 read_actions(request.actions, env.num_envs() * env.spec().action_len(), &mut self.actions)?;
-                if let Some(bytes) = request.command {
-                    let commands = convert::read_commands(bytes, env.num_envs())?;
-                    env.set_velocity_commands(&commands).map_err(|error| convert::wire_error(&error))?;
-                }
+                let commands = convert::read_commands(&request, env.num_envs())?;
+                set_commands(env, commands).map_err(|error| convert::wire_error(&error))?;
                 if let Some(tick) = request.for_tick {
                     env.set_action_tick(tick);
                 }
@@ -274,6 +272,17 @@ impl Worker {
             EnvMethod::Samples => self.samples(payload),
         }
     }
+}
+
+/// Sets the commands of a step request.
+fn set_commands(env: &mut dyn VecEnv, commands: AgentCommands) -> Result<(), EnvError> {
+    if let Some(velocity) = commands.velocity {
+        env.set_velocity_commands(&velocity)?;
+    }
+    if let Some(gait) = commands.gait {
+        env.set_gait_commands(&gait)?;
+    }
+    Ok(())
 }
 
 /// Decodes `expected` actions into `actions`.

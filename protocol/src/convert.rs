@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use twinstep_model::{
-    BackendError, EndedEpisode, EnvError, EnvSpec, Ground, HeightField, NUM_JOINTS, PerJoint, RealTimeReport,
-    ResetRequest, RobotSample, RobotStop, Scene, StepBatch, Trajectory,
+    AgentCommands, BackendError, EndedEpisode, EnvError, EnvSpec, Ground, HeightField, NUM_JOINTS, PerJoint,
+    RealTimeReport, ResetRequest, RobotSample, RobotStop, Scene, StepBatch, Trajectory,
 };
 
 use crate::codec::encode_with_capacity;
@@ -13,8 +13,8 @@ use crate::{ErrorCode, ErrorReply, PROTOCOL, encode, message, tensor};
 /// Upper bound on the size of a message without its tensors [bytes].
 const MAP_OVERHEAD: usize = 256;
 
-/// Entries of a velocity command: forward, left, yaw rate.
-const VELOCITY_COMMAND_LEN: usize = 3;
+/// Entries of a velocity command and of a gait command.
+const COMMANDS_LEN: usize = 3 + 4;
 /// Maximum size of a rollout request [bytes]: a policy with a million weights.
 pub const MAX_ROLLOUT_REQUEST_BYTES: usize = 4 << 20;
 
@@ -58,7 +58,7 @@ pub fn encode_reset(request: &ResetRequest, epoch: u64, seq: u64) -> Vec<u8> {
 /// [`MAX_ROLLOUT_REQUEST_BYTES`].
 pub fn max_request_bytes(num_envs: usize, spec: &EnvSpec) -> usize {
     let reset = size_of::<u64>() + size_of::<u8>();
-    let step = (spec.action_len() + VELOCITY_COMMAND_LEN) * size_of::<f32>();
+    let step = (spec.action_len() + COMMANDS_LEN) * size_of::<f32>();
     4 * MAP_OVERHEAD + num_envs * reset.max(step)
 }
 
@@ -233,24 +233,39 @@ impl EndedArrays {
     }
 }
 
-/// Encodes a step request. `commands` are the velocity commands, if the client gives them. `for_tick` is the policy
-/// period of the actions, if it is not that of the last observation.
+/// Encodes a step request. `commands` are those that the client gives. `for_tick` is the policy period of the actions, if
+/// it is not that of the last observation.
 pub fn encode_actions(
     actions: &[f32],
-    commands: Option<&[[f32; 3]]>,
+    commands: &AgentCommands,
     for_tick: Option<u64>,
     epoch: u64,
     seq: u64,
 ) -> Vec<u8> {
-    let (actions, command) = (tensor::as_bytes(actions), commands.map(tensor::as_bytes));
-    let request = message::StepRequest { protocol: PROTOCOL, epoch, seq, actions, command, for_tick };
-    encode_with_capacity(&request, MAP_OVERHEAD + actions.len() + command.map_or(0, <[u8]>::len))
+    let actions = tensor::as_bytes(actions);
+    let command = commands.velocity.as_deref().map(tensor::as_bytes);
+    let gait_command = commands.gait.as_deref().map(tensor::as_bytes);
+    let request = message::StepRequest { protocol: PROTOCOL, epoch, seq, actions, command, gait_command, for_tick };
+    let len = |bytes: Option<&[u8]>| bytes.map_or(0, <[u8]>::len);
+    encode_with_capacity(&request, MAP_OVERHEAD + actions.len() + len(command) + len(gait_command))
 }
 
-/// Decodes the velocity commands of a step request for `num_envs` environments. Checks the length before it copies.
-pub fn read_commands(bytes: &[u8], num_envs: usize) -> Result<Vec<[f32; 3]>, ErrorReply> {
-    check_length("command", bytes.len() / size_of::<f32>(), num_envs * VELOCITY_COMMAND_LEN)?;
-    tensor::read(bytes, "command")
+/// Decodes the commands of a step request for `num_envs` environments. Checks the lengths before it copies.
+pub fn read_commands(request: &message::StepRequest<'_>, num_envs: usize) -> Result<AgentCommands, ErrorReply> {
+    let (velocity, gait) = (request.command, request.gait_command);
+    Ok(AgentCommands {
+        velocity: velocity.map(|bytes| read_command_rows(bytes, num_envs, "command")).transpose()?,
+        gait: gait.map(|bytes| read_command_rows(bytes, num_envs, "gait_command")).transpose()?,
+    })
+}
+
+fn read_command_rows<const N: usize>(
+    bytes: &[u8],
+    num_envs: usize,
+    field: &'static str,
+) -> Result<Vec<[f32; N]>, ErrorReply> {
+    check_length(field, bytes.len() / size_of::<f32>(), num_envs * N)?;
+    tensor::read(bytes, field)
 }
 
 /// Decodes the reply to a step into `batch`. Fails if a length does not match `num_envs` environments of `spec`.
@@ -470,9 +485,14 @@ pub fn wire_error(error: &EnvError) -> ErrorReply {
             "command",
             "leave the field out, or use a task with a velocity command, such as `walk`",
         ),
-        EnvError::VelocityCommand { value, .. } => {
+        EnvError::NoGaitCommand { .. } => (
+            ErrorCode::OutOfRange,
+            "gait_command",
+            "leave the field out, or use a task with a gait command, such as `gait`",
+        ),
+        EnvError::CommandOutOfRange { value, field, .. } => {
             let code = if value.is_finite() { ErrorCode::OutOfRange } else { ErrorCode::NotFinite };
-            (code, "command", "the bounds are those of `velocity_command` in the spec")
+            (code, *field, "the bounds are those of the entries of the observation in the spec")
         }
         EnvError::NeedsReset { .. } => (ErrorCode::NeedsReset, "", "send `reset`, with `mask` for some environments"),
         EnvError::EnvOutOfRange { .. } => (ErrorCode::OutOfRange, "env", "environments are numbered from 0"),

@@ -173,6 +173,10 @@ pub struct StepRequest<'a> {
     /// yaw rate [rad/s]. Default: unchanged.
     #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "Option::is_none")]
     pub command: Option<&'a [u8]>,
+    /// Gait commands from this step on, in place of the task's own, `num_envs × 4` × f32: step frequency [Hz], phases of
+    /// FR, RL and RR relative to FL [cycles]. Default: unchanged.
+    #[serde(default, borrow, with = "serde_bytes", skip_serializing_if = "Option::is_none")]
+    pub gait_command: Option<&'a [u8]>,
     /// Policy period for which the actions are, on a robot in real time. Default: `tick` of the last reply.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub for_tick: Option<u64>,

@@ -183,6 +183,7 @@ pub fn step_with(lease: &LeaseReply, seq: u64, actions: &[f32]) -> Vec<u8> {
         seq,
         actions: as_bytes(actions),
         command: None,
+        gait_command: None,
         for_tick: None,
     })
 }

@@ -1,9 +1,9 @@
-//! Velocity commands of the agent in place of the task's own: the field `command` of the step request.
+//! Commands of the agent in place of the task's own: the fields `command` and `gait_command` of the step request.
 
-use twinstep_client::{ConnectOptions, GroupedVecEnv, RemoteVecEnv};
+use twinstep_client::{ConnectOptions, GroupedVecEnv, RemoteVecEnv, ShardedVecEnv};
 use twinstep_env_server::{EnvFactory, SimEnvFactory};
 use twinstep_envs::TaskConfig;
-use twinstep_model::{AutoresetMode, EnvError, ResetRequest, StepBatch, VecEnv};
+use twinstep_model::{AutoresetMode, EnvError, GaitCommand, ResetRequest, StepBatch, VecEnv};
 use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::message::{LeaseReply, StepReply, StepRequest};
 use twinstep_protocol::tensor::{self, as_bytes};
@@ -44,6 +44,37 @@ fn commands_stay_in_force_through_resets_until_they_are_set_again() {
         let batch = local.step(&[0.1; 24]).unwrap().clone();
         assert_eq!(commands_in(&batch.obs), wanted, "step {step}");
         assert!(same(remote.step(&[0.1; 24]).unwrap(), &batch) && same(grouped.step(&[0.1; 24]).unwrap(), &batch));
+    }
+    remote.close().unwrap();
+    grouped.close().unwrap();
+    server.shutdown();
+}
+
+#[test]
+fn gait_commands_stay_in_force_and_have_the_bounds_of_the_spec() {
+    const GAITS: [GaitCommand; 2] = [[2.5, 0.5, 0.5, 0.0], [3.5, 0.0, 0.5, 0.5]];
+    let config = config(TaskConfig::named("gait").unwrap());
+    let (server, endpoint) = start(&config);
+    let mut local = SimEnvFactory::new(config).unwrap().build(2, AutoresetMode::SameStep, Some(4)).unwrap();
+    let options = ConnectOptions {
+        autoreset: AutoresetMode::SameStep,
+        max_episode_steps: Some(4),
+        ..ConnectOptions::new(&endpoint, 2)
+    };
+    let mut remote = RemoteVecEnv::connect(&options).unwrap();
+    let mut grouped = GroupedVecEnv::connect(&options, 2).unwrap();
+    let mut sharded = ShardedVecEnv::connect(&options, std::slice::from_ref(&endpoint)).unwrap();
+    for env in [&mut *local, &mut remote, &mut grouped, &mut sharded] {
+        env.reset(&ResetRequest::seeded(3, 2)).unwrap();
+        let error = env.set_gait_commands(&[GAITS[0], [2.0, 0.0, 0.0, 1.5]]).unwrap_err().to_string();
+        assert!(error.starts_with("`gait_command` of environment 1: phase_offset[2] is 1.5; 0 to 1"), "{error}");
+        env.set_gait_commands(&GAITS).unwrap();
+        env.set_velocity_commands(&COMMANDS).unwrap();
+        for step in 0..10 {
+            let obs = env.step(&[0.1; 24]).unwrap().obs.clone();
+            let found: Vec<_> = obs.chunks_exact(57).map(|row| [row[45], row[46], row[47], row[48]]).collect();
+            assert_eq!(found, GAITS, "step {step}");
+        }
     }
     remote.close().unwrap();
     grouped.close().unwrap();
@@ -106,6 +137,7 @@ fn step(client: &RawClient, lease: &LeaseReply, seq: u64, action: f32, command: 
         seq,
         actions: as_bytes(&actions),
         command,
+        gait_command: None,
         for_tick: None,
     };
     client.ask_env(lease, EnvMethod::Step, &encode(&request))
@@ -147,6 +179,12 @@ fn tasks_without_a_velocity_command_refuse_it() {
     let error = step(&client, &lease, 2, 0.0, Some(&[0.0; 6])).unwrap_err();
     assert_eq!((error.code, error.field.as_str()), (ErrorCode::OutOfRange, "command"));
     assert!(error.message.contains("the task `counter` has no velocity command"), "{error}");
+    let gait_command = Some(as_bytes(&[0.0f32; 8]));
+    let (actions, command, for_tick) = (as_bytes(&[0.0f32; 24]), None, None);
+    let request =
+        StepRequest { protocol: PROTOCOL, epoch: lease.epoch, seq: 2, actions, command, gait_command, for_tick };
+    let error = client.ask_env(&lease, EnvMethod::Step, &encode(&request)).unwrap_err();
+    assert_eq!((error.code, error.field.as_str()), (ErrorCode::OutOfRange, "gait_command"));
     step(&client, &lease, 2, 0.0, None).unwrap();
     server.shutdown();
 }

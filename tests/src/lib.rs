@@ -13,6 +13,7 @@
 //! - [`confounded_pairs`]: pairs of confounded effects, for experiment design
 //! - [`foreign_policy`]: policies with the conventions of other programs
 //! - [`fuzz`]: random changes to messages and files
+//! - [`resumable`]: commands whose results are kept
 //! - [`robot_rig`]: a fake Go2 under the safety state machine, on an accelerated clock
 //! - [`robot_campaign`]: faults of this robot in each state, and random sequences of events
 //! - [`soak`]: many clients that end in different ways
@@ -34,6 +35,7 @@ pub mod process;
 pub mod proxy;
 pub mod python;
 pub mod repeats;
+pub mod resumable;
 pub mod robot_campaign;
 pub mod robot_pair;
 pub mod robot_rig;

@@ -43,7 +43,15 @@ pub fn three_times(endpoint: &str) -> Result<(), String> {
     for step in 1..=STEPS {
         let action = [step as f32; 12];
         let actions = tensor::as_bytes(&action);
-        let request = message::StepRequest { protocol, epoch, seq: step + 1, actions, command: None, for_tick: None };
+        let request = message::StepRequest {
+            protocol,
+            epoch,
+            seq: step + 1,
+            actions,
+            command: None,
+            gait_command: None,
+            for_tick: None,
+        };
         let payload = request_three_times(&key(EnvMethod::Step), encode(&request))?;
         let reply: message::StepReply<'_> = decode(&payload).map_err(text)?;
         let obs: Vec<f32> = tensor::read(reply.obs, "obs").map_err(text)?;

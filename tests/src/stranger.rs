@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use twinstep_client::{ClientError, ConnectOptions, Connection, RemoteVecEnv};
-use twinstep_model::{ResetRequest, VecEnv};
+use twinstep_model::{AgentCommands, ResetRequest, VecEnv};
 use twinstep_protocol::keys::{self, EnvMethod};
 use twinstep_protocol::message::{CloseRequest, LeaseRequest, Reclaim};
 use twinstep_protocol::{ErrorCode, PROTOCOL, Secret, convert, encode};
@@ -26,7 +26,10 @@ pub fn use_foreign_lease(endpoint: &str, lease: &str, epoch: u64, last_seq: u64)
     };
     let key = |method| keys::env(connection.sid(), lease, method);
     for seq in [last_seq, last_seq + 1] {
-        refused(key(EnvMethod::Step), convert::encode_actions(&[0.9; 24], None, None, epoch, seq))?;
+        refused(
+            key(EnvMethod::Step),
+            convert::encode_actions(&[0.9; 24], &AgentCommands::default(), None, epoch, seq),
+        )?;
         refused(key(EnvMethod::Reset), convert::encode_reset(&ResetRequest::default(), epoch, seq))?;
         refused(key(EnvMethod::Close), encode(&CloseRequest { protocol: PROTOCOL, epoch, seq }))?;
     }

@@ -65,6 +65,20 @@ def test_velocity_commands_of_the_agent_replace_those_of_the_task() -> None:
         np.testing.assert_array_equal(env.step(np.zeros(12, np.float32))[0][6:9], commands[1])
 
 
+def test_gait_commands_of_the_agent_replace_those_of_the_task() -> None:
+    gaits = np.array([[2.5, 0.5, 0.5, 0.0], [3.5, 0.0, 0.5, 0.5]], np.float32)
+    envs = Go2VectorEnv(2, task="gait", max_episode_steps=3)
+    envs.reset(seed=1)
+    envs.set_gait_commands(gaits)
+    for _ in range(5):
+        np.testing.assert_array_equal(envs.step(np.zeros((2, 12), np.float32))[0][:, 45:49], gaits)
+    with pytest.raises(twinstep.InvalidOptionError, match=r"environment 1: phase_offset\[2\] is 1.5; 0 to 1"):
+        envs.set_gait_commands(np.array([[2, 0, 0, 0], [2, 0, 0, 1.5]], np.float32))
+    envs.close()
+    with Go2Env() as walker, pytest.raises(twinstep.InvalidOptionError, match="`walk` has no gait command"):
+        walker.set_gait_command(gaits[0])
+
+
 def test_a_task_without_velocity_commands_refuses_them(counters: Go2VectorEnv) -> None:
     counters.set_velocity_commands(np.zeros((3, 3), np.float32))
     with pytest.raises(twinstep.RequestRejectedError, match="the task `counter` has no velocity command"):

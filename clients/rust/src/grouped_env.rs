@@ -2,7 +2,9 @@
 
 use std::ops::Range;
 
-use twinstep_model::{AutoresetMode, EnvError, EnvSpec, ResetRequest, RobotSample, Scene, StepBatch, VecEnv};
+use twinstep_model::{
+    AutoresetMode, EnvError, EnvSpec, GaitCommand, ResetRequest, RobotSample, Scene, StepBatch, VecEnv, VelocityCommand,
+};
 
 use twinstep_protocol::random_u64;
 
@@ -141,11 +143,20 @@ impl VecEnv for GroupedVecEnv {
         &self.batch.critic_obs
     }
 
-    fn set_velocity_commands(&mut self, commands: &[[f32; 3]]) -> Result<(), EnvError> {
+    fn set_velocity_commands(&mut self, commands: &[VelocityCommand]) -> Result<(), EnvError> {
         self.spec().check_velocity_commands(commands, self.num_envs())?;
         for group in 0..self.groups.len() {
             let range = self.range(group);
             self.groups[group].set_velocity_commands(&commands[range])?;
+        }
+        Ok(())
+    }
+
+    fn set_gait_commands(&mut self, commands: &[GaitCommand]) -> Result<(), EnvError> {
+        self.spec().check_gait_commands(commands, self.num_envs())?;
+        for group in 0..self.groups.len() {
+            let range = self.range(group);
+            self.groups[group].set_gait_commands(&commands[range])?;
         }
         Ok(())
     }

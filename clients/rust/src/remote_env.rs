@@ -3,7 +3,8 @@
 use std::time::Duration;
 
 use twinstep_model::{
-    AutoresetMode, EnvError, EnvSpec, RealTimeReport, ResetRequest, RobotSample, Scene, StepBatch, Trajectory, VecEnv,
+    AgentCommands, AutoresetMode, EnvError, EnvSpec, GaitCommand, RealTimeReport, ResetRequest, RobotSample, Scene,
+    StepBatch, Trajectory, VecEnv, VelocityCommand,
 };
 use twinstep_policy::BehaviourPolicy;
 use twinstep_protocol::keys::EnvMethod;
@@ -42,8 +43,8 @@ pub struct RemoteVecEnv {
     pending: Option<(EnvMethod, Pending)>,
     /// True if a reply could not be read, so that the state of the environments is unknown. A reset heals it.
     is_unknown: bool,
-    /// Velocity commands, which every step request repeats.
-    velocity_commands: Option<Vec<[f32; 3]>>,
+    /// Commands, which every step request repeats.
+    commands: AgentCommands,
     /// Policy period of the next actions, if the agent has set it.
     action_tick: Option<u64>,
     batch: StepBatch,
@@ -89,7 +90,7 @@ impl RemoteVecEnv {
             held_policy: None,
             pending: None,
             is_unknown: false,
-            velocity_commands: None,
+            commands: AgentCommands::default(),
             action_tick: None,
             connection,
         })
@@ -114,7 +115,7 @@ impl RemoteVecEnv {
         }
         let (epoch, seq) = (self.ticket.epoch, self.last_seq + 1);
         let for_tick = self.action_tick.take();
-        let request = convert::encode_actions(actions, self.velocity_commands.as_deref(), for_tick, epoch, seq);
+        let request = convert::encode_actions(actions, &self.commands, for_tick, epoch, seq);
         self.send_request(EnvMethod::Step, request)?;
         Ok(())
     }
@@ -363,9 +364,16 @@ impl VecEnv for RemoteVecEnv {
     }
 
     /// Every later step request contains the commands. A server that is older than the field ignores it.
-    fn set_velocity_commands(&mut self, commands: &[[f32; 3]]) -> Result<(), EnvError> {
+    fn set_velocity_commands(&mut self, commands: &[VelocityCommand]) -> Result<(), EnvError> {
         self.spec.check_velocity_commands(commands, self.num_envs)?;
-        self.velocity_commands = Some(commands.to_vec());
+        self.commands.velocity = Some(commands.to_vec());
+        Ok(())
+    }
+
+    /// Every later step request contains the commands. A server that is older than the field ignores it.
+    fn set_gait_commands(&mut self, commands: &[GaitCommand]) -> Result<(), EnvError> {
+        self.spec.check_gait_commands(commands, self.num_envs)?;
+        self.commands.gait = Some(commands.to_vec());
         Ok(())
     }
 

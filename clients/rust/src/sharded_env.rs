@@ -2,7 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-use twinstep_model::{AutoresetMode, EndedEpisode, EnvError, EnvSpec, ResetRequest, Scene, StepBatch, VecEnv};
+use twinstep_model::{
+    AgentCommands, AutoresetMode, EndedEpisode, EnvError, EnvSpec, GaitCommand, ResetRequest, Scene, StepBatch, VecEnv,
+    VelocityCommand,
+};
 use twinstep_protocol::random_u64;
 
 use crate::merge::{copy_rows, merge};
@@ -30,7 +33,7 @@ pub struct ShardedVecEnv {
     shards: Vec<Shard>,
     spec: EnvSpec,
     batch: StepBatch,
-    velocity_commands: Option<Vec<[f32; 3]>>,
+    commands: AgentCommands,
     rows: Vec<Row>,
     held: Vec<bool>,
 }
@@ -90,7 +93,7 @@ impl ShardedVecEnv {
             rows: (0..num_envs).map(|_| row()).collect(),
             held: vec![false; num_envs],
             options: options.clone(),
-            velocity_commands: None,
+            commands: AgentCommands::default(),
             shards,
             spec,
         })
@@ -132,10 +135,13 @@ impl ShardedVecEnv {
     /// Sends a step to a shard.
     fn send(&mut self, shard: usize, actions: &[f32]) -> Result<(), EnvError> {
         let (rows, action_len) = (self.shards[shard].rows.clone(), self.spec.action_len());
-        let commands = self.velocity_commands.as_ref().map(|commands| &commands[rows.clone()]);
+        let (velocity, gait) = (self.commands.velocity.as_ref(), self.commands.gait.as_ref());
+        let velocity = velocity.map(|commands| &commands[rows.clone()]);
+        let gait = gait.map(|commands| &commands[rows.clone()]);
         let Some(env) = self.shards[shard].env_mut() else { return Ok(()) };
         // Another server may have taken over the environments since they were set.
-        let sent = commands.map_or(Ok(()), |commands| env.set_velocity_commands(commands));
+        let sent = velocity.map_or(Ok(()), |commands| env.set_velocity_commands(commands));
+        let sent = sent.and_then(|()| gait.map_or(Ok(()), |commands| env.set_gait_commands(commands)));
         let sent = sent.and_then(|()| env.send(&actions[rows.start * action_len..rows.end * action_len]));
         sent.or_else(|error| self.lose(shard, &error))
     }
@@ -312,9 +318,15 @@ impl VecEnv for ShardedVecEnv {
         &self.batch.critic_obs
     }
 
-    fn set_velocity_commands(&mut self, commands: &[[f32; 3]]) -> Result<(), EnvError> {
+    fn set_velocity_commands(&mut self, commands: &[VelocityCommand]) -> Result<(), EnvError> {
         self.spec.check_velocity_commands(commands, self.num_envs())?;
-        self.velocity_commands = Some(commands.to_vec());
+        self.commands.velocity = Some(commands.to_vec());
+        Ok(())
+    }
+
+    fn set_gait_commands(&mut self, commands: &[GaitCommand]) -> Result<(), EnvError> {
+        self.spec.check_gait_commands(commands, self.num_envs())?;
+        self.commands.gait = Some(commands.to_vec());
         Ok(())
     }
 

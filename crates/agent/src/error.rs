@@ -108,6 +108,17 @@ pub enum AgentError {
         /// Velocity command that was sent.
         wanted: [f32; 3],
     },
+    /// The server is older than gait commands.
+    #[error(
+        "the endpoint ignores gait commands: it observes a step frequency of {observed} Hz instead of {wanted}\n  its server \
+         is older than the field `gait_command`; run without gaits, or install the same Twinstep at both ends"
+    )]
+    GaitCommandIgnored {
+        /// Step frequency in the observation [Hz].
+        observed: f32,
+        /// Step frequency that was sent [Hz].
+        wanted: f32,
+    },
     /// The log cannot be written.
     #[error(transparent)]
     Log(#[from] LogError),

@@ -29,5 +29,5 @@ pub use onnx::{OnnxError, OnnxNetwork};
 pub use policy::{BoundPolicy, LoadedPolicy};
 pub use policy_input::PolicyInput;
 pub use recorder::Recorder;
-pub use run::{Control, Recorders, RunPlan, Status, run};
+pub use run::{Control, Recorders, RunPlan, Status, WantedCommands, run};
 pub use summary::{RunSummary, Spread};

@@ -2,7 +2,9 @@
 
 use std::time::{Duration, Instant};
 
-use twinstep_model::{EnvError, EnvSpec, ResetRequest, Stream, VecEnv, standard_normal, stream};
+use twinstep_model::{
+    EnvError, EnvSpec, GaitCommand, ResetRequest, Stream, VecEnv, VelocityCommand, standard_normal, stream,
+};
 
 use crate::error::AgentError;
 use crate::joint_recorder::JointRecorder;
@@ -37,10 +39,26 @@ pub struct Recorders<'a> {
 /// What to do in the next step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Control {
-    /// Step with this velocity command: forward [m/s], left [m/s], yaw rate [rad/s]. `None`: the endpoint's own.
-    Step(Option<[f32; 3]>),
+    /// Step with these commands.
+    Step(WantedCommands),
     /// End the run.
     End,
+}
+
+/// Commands of a step; `None` for those of the endpoint.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct WantedCommands {
+    /// Velocity command.
+    pub velocity: Option<VelocityCommand>,
+    /// Gait command.
+    pub gait: Option<GaitCommand>,
+}
+
+impl WantedCommands {
+    /// Returns a velocity command alone.
+    pub fn velocity(velocity: Option<VelocityCommand>) -> Self {
+        Self { velocity, gait: None }
+    }
 }
 
 /// State of a run before a step.
@@ -64,6 +82,7 @@ pub struct Status {
 #[derive(Clone, Copy)]
 struct Layout {
     command: Option<usize>,
+    step_frequency: Option<usize>,
     yaw_rate: Option<usize>,
     /// In group `critic`.
     velocity: Option<usize>,
@@ -76,6 +95,7 @@ impl Layout {
         };
         Self {
             command: vector(spec.observation_field("velocity_command")),
+            step_frequency: spec.observation_field("step_frequency").map(|(start, _)| start),
             yaw_rate: vector(spec.observation_field("base_angular_velocity")).map(|start| start + 2),
             velocity: vector(spec.critic_field("true_linear_velocity")),
         }
@@ -126,7 +146,7 @@ pub fn run(
         if let Some(recorder) = &mut recorders.steps {
             agent.observe(env, recorder, &spec)?;
         }
-        let action = agent.action(policy, wanted, &spec, &mut sums)?;
+        let action = agent.action(policy, wanted.velocity, &spec, &mut sums)?;
         if plan.real_time {
             lateness = pacer.wait().as_secs_f64();
         }
@@ -186,6 +206,11 @@ impl Agent {
         self.layout.command.map(|start| [self.obs[start], self.obs[start + 1], self.obs[start + 2]])
     }
 
+    /// Returns the step frequency in the observation [Hz].
+    fn step_frequency(&self) -> Option<f32> {
+        self.layout.step_frequency.map(|entry| self.obs[entry])
+    }
+
     /// Gives the measurements of this moment to the recorder.
     fn observe(&self, env: &dyn VecEnv, recorder: &mut Recorder, spec: &EnvSpec) -> Result<(), EnvError> {
         let pose = if recorder.has_orientation() { env.scene(0)?.pose.first().copied() } else { None };
@@ -225,12 +250,15 @@ impl Agent {
     fn step(
         &mut self,
         env: &mut dyn VecEnv,
-        wanted: Option<[f32; 3]>,
+        wanted: WantedCommands,
         action: &[f32],
         sums: &mut Sums,
     ) -> Result<bool, AgentError> {
-        if let Some(wanted) = wanted {
-            env.set_velocity_commands(&[wanted])?;
+        if let Some(velocity) = wanted.velocity {
+            env.set_velocity_commands(&[velocity])?;
+        }
+        if let Some(gait) = wanted.gait {
+            env.set_gait_commands(&[gait])?;
         }
         let command = self.command();
         let batch = env.step(action)?;
@@ -251,8 +279,14 @@ impl Agent {
     }
 
     /// Checks after the first step with a command that the endpoint uses it.
-    fn check_command(&mut self, wanted: Option<[f32; 3]>) -> Result<(), AgentError> {
-        match (self.command(), wanted) {
+    fn check_command(&mut self, wanted: WantedCommands) -> Result<(), AgentError> {
+        if let (Some(observed), Some([wanted, ..])) = (self.step_frequency(), wanted.gait)
+            && !self.uses_commands
+            && (observed - wanted).abs() > 1e-6
+        {
+            return Err(AgentError::GaitCommandIgnored { observed, wanted });
+        }
+        match (self.command(), wanted.velocity) {
             (Some(observed), Some(wanted)) if !self.uses_commands && observed != wanted => {
                 Err(AgentError::CommandIgnored { observed, wanted })
             }

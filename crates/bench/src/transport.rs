@@ -1,7 +1,7 @@
 //! Round trips without physics: the task `counter`, compared with a raw TCP ping-pong.
 
 use twinstep_client::RemoteVecEnv;
-use twinstep_model::{ResetRequest, StepBatch, VecEnv};
+use twinstep_model::{AgentCommands, ResetRequest, StepBatch, VecEnv};
 use twinstep_protocol::convert;
 
 use crate::Measurement;
@@ -58,7 +58,7 @@ fn compare(
     env.reset(&ResetRequest::default()).map_err(failed)?;
     let actions = vec![0.1; num_envs * env.spec().action_len()];
     let mut tcp = {
-        let request = convert::encode_actions(&actions, None, None, 1, 1);
+        let request = convert::encode_actions(&actions, &AgentCommands::default(), None, 1, 1);
         let reply = convert::encode_step(&StepBatch::new(num_envs, env.spec()), 1, false);
         PingPong::start(request.len(), reply.len())?
     };

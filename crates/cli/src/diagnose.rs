@@ -10,6 +10,7 @@ use twinstep_diagnose::{
 use twinstep_logs::Log;
 use twinstep_model::Joint;
 
+use crate::ambiguous_effects;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::learned_residual;
 use crate::open_log::open_log;
@@ -242,6 +243,12 @@ fn text(diagnosis: &Diagnosis, out: &Path) -> String {
     if let Some(next) = &diagnosis.next_experiment {
         lines.push(format!("next experiment: {}", out.join(&next.motion).display()));
         lines.push(format!("    {}", next.text));
+    }
+    let unknowns = ambiguous_effects::names(diagnosis);
+    if !unknowns.is_empty() && diagnosis.findings.iter().any(|cause| !cause.ambiguous_with.is_empty()) {
+        let command =
+            format!("twinstep excite data/policies/walk.safetensors --findings {} --out design", out.display());
+        lines.push(format!("next experiment of a walking robot, about {}: {command}", unknowns.join(", ")));
     }
     lines.push(error_line("closed-loop joint RMSE [rad]", diagnosis, |errors| errors.q_rmse_rad));
     lines.push(error_line("torque RMSE [N·m]", diagnosis, |errors| errors.torque_rmse_nm));

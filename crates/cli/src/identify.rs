@@ -34,6 +34,9 @@ pub struct Args {
     /// Model file to start from. Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     pub model: Option<PathBuf>,
+    /// Model file of an earlier identification of the same effects, from whose values the search starts.
+    #[arg(long, value_name = "FILE")]
+    pub start: Option<PathBuf>,
     /// Effects to estimate, with scopes, as in `coulomb_friction@calf,payload@base`. `twinstep effects` lists them.
     /// Default: armature, Coulomb and viscous friction by joint type, and the command delay.
     #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = DEFAULT_EFFECTS, hide_default_value = true)]
@@ -64,6 +67,7 @@ impl Args {
         Self {
             logs: Vec::new(),
             model: None,
+            start: None,
             effects: Vec::new(),
             rows: Rows::default(),
             force: false,
@@ -136,7 +140,9 @@ pub fn write_model(args: &Args, signals: &Signals) -> CommandResult {
     let effects: Vec<_> = args.effects.iter().map(|EffectAtScope(effect, scope)| (*effect, *scope)).collect();
     let search = search_file(&args.out);
     let resume = if args.resume { Some(resumed(&search).map_err(input)?) } else { None };
-    let options = IdentifyOptions { generations: args.generations, seed: args.seed, force: args.force, resume };
+    let start = args.start.as_deref().map(|path| analytic_model(Some(path))).transpose()?;
+    let (generations, seed, force) = (args.generations, args.seed, args.force);
+    let options = IdentifyOptions { generations, seed, force, resume, start };
     let bar = progress_bar(args.generations);
     let found = identify(&model, &effects, &experiments, &mut simulator, &options, &mut |stage, step, cost| {
         bar.set_message(match stage {

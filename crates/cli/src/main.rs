@@ -1,6 +1,8 @@
 //! Command line `twinstep`, with one file per subcommand.
 
+mod ambiguous_effects;
 mod bench;
+mod command_env;
 mod cross_evaluation;
 mod demo;
 mod diagnose;

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use twinstep_agent::{BoundPolicy, Control, LoadedPolicy, Recorders, RunPlan, Status, run};
+use twinstep_agent::{BoundPolicy, Control, LoadedPolicy, Recorders, RunPlan, Status, WantedCommands, run};
 use twinstep_env_server::EnvFactory;
 use twinstep_model::{AutoresetMode, VecEnv};
 use twinstep_robot::{RobotHandle, State};
@@ -41,8 +41,9 @@ fn run_when_ready(mut env: Box<dyn VecEnv>, mut policy: BoundPolicy, handle: &Ro
         if handle.wait_until(PATIENCE, |board| board.state == Some(State::Ready)).state != Some(State::Ready) {
             continue;
         }
-        let mut control =
-            |_: &Status, _: &dyn VecEnv| if handle.is_ending() { Control::End } else { Control::Step(None) };
+        let mut control = |_: &Status, _: &dyn VecEnv| {
+            if handle.is_ending() { Control::End } else { Control::Step(WantedCommands::default()) }
+        };
         if let Err(error) = run(&mut *env, &mut policy, Recorders::default(), plan, &mut control) {
             tracing::warn!("the policy stopped: {error}");
         }

@@ -1,14 +1,12 @@
-//! Random velocity commands for `twinstep spi-active` and `twinstep u2e`.
+//! Random commands for `twinstep spi-active` and `twinstep u2e`.
 
 use std::path::Path;
 
-use twinstep_excite::{Limits, random_within_limits, walking_env};
-use twinstep_model::VecEnv;
+use twinstep_excite::Limits;
 use twinstep_policy::Policy;
-use twinstep_sim::{BatchBackend, SimConfig};
+use twinstep_sim::SimConfig;
 
-use crate::evaluate_policy::check_spec;
-use crate::excite::velocity_ranges;
+use crate::command_env::CommandEnv;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::robot_file::analytic_model;
 
@@ -36,13 +34,11 @@ impl RandomCommands<'_> {
     pub fn write(&self, path: &Path, signals: &Signals) -> CommandResult {
         let robot = analytic_model(self.model)?.robot_model().map_err(input)?;
         let (policy, _) = Policy::read(self.policy).map_err(input)?;
-        let backend = BatchBackend::new(robot, SimConfig::default(), BATCH).map_err(input)?;
-        let mut env = walking_env(backend, self.seed).map_err(input)?;
-        check_spec(&policy, env.spec())?;
+        let mut env = CommandEnv::new(&policy, &robot, SimConfig::default(), BATCH, self.seed)?;
         let segments = (self.segment_s, (self.seconds / self.segment_s).round() as usize);
         let mut proceed = || matches!(signals.check(), Ok(false));
-        let (ranges, limits) = (velocity_ranges(), &self.limits);
-        let found = random_within_limits(&mut env, &policy, segments, &ranges, limits, self.seed, &mut proceed);
+        let limits = &self.limits;
+        let found = env.random_within_limits(&policy, segments, limits, self.seed, &mut proceed);
         let found = found.map_err(input)?;
         if !proceed() {
             return Err(Failure::Interrupted);

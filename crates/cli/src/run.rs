@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use twinstep_agent::{
     AgentError, BoundPolicy, Control, JointRecorder, LoadedPolicy, Recorder, Recorders, RunPlan, RunSummary, Status,
-    run as run_policy,
+    WantedCommands, run as run_policy,
 };
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_excite::CommandSequence;
@@ -59,8 +59,8 @@ pub struct Args {
     /// Constant velocity command: forward [m/s], left [m/s], yaw rate [rad/s]. Default: the endpoint's own commands.
     #[arg(long, value_name = "VX,VY,WZ", value_parser = velocity, allow_hyphen_values = true)]
     pub velocity: Option<[f32; 3]>,
-    /// Follow the velocity commands in this file (CSV: start_s,end_s,vx,vy,wz), as `twinstep excite` writes it. The run
-    /// ends with the last one.
+    /// Follow the commands in this file (CSV: start_s,end_s,vx,vy,wz), as `twinstep excite` writes it. For a policy of
+    /// `gait` it may also have the columns step_frequency,phase_fr,phase_rl,phase_rr. The run ends with the last one.
     #[arg(long, value_name = "FILE", conflicts_with = "velocity")]
     pub commands: Option<PathBuf>,
     /// Take the velocity command from the keyboard.
@@ -250,14 +250,16 @@ impl Args {
             if !matches!(signals.check(), Ok(false)) {
                 return Control::End;
             }
+            let step = |velocity| Control::Step(WantedCommands::velocity(velocity));
             match velocity {
-                Velocity::Endpoint => Control::Step(view.and_then(RunView::velocity)),
-                Velocity::Constant(command) => Control::Step(Some(*command)),
+                Velocity::Endpoint => step(view.and_then(RunView::velocity)),
+                Velocity::Constant(command) => step(Some(*command)),
                 Velocity::Sequence(sequence) if status.seconds > sequence.duration_s() - 1e-6 => Control::End,
-                Velocity::Sequence(sequence) => Control::Step(Some(sequence.at(status.seconds))),
-                Velocity::Person(device) => {
-                    device.command().map_or(Control::End, |command| Control::Step(Some(command)))
-                }
+                Velocity::Sequence(sequence) => Control::Step(WantedCommands {
+                    velocity: Some(sequence.at(status.seconds)),
+                    gait: sequence.gait_at(status.seconds),
+                }),
+                Velocity::Person(device) => device.command().map_or(Control::End, |command| step(Some(command))),
             }
         };
         let result = run_policy(env, policy, recorders, plan, &mut control);

@@ -12,7 +12,8 @@ use crate::{excite, identify, run};
 /// The policy walks the robot at the endpoint, simulated or real. The folder of CONFIG, without its extension, receives:
 ///
 ///   1-random    random velocity commands, their log, and the model that is identified from it
-///   2-active    commands designed with that model, their log, and the model that is identified from both logs
+///   2-active    commands designed with that model, their log, and the model that is identified from both logs,
+///               starting from the model before
 ///   3-active    and so on, as often as `rounds` says
 ///   held-out    random commands whose log is not used for identification: the models are compared on it
 ///   report.md   parameters with intervals, errors on the held-out log, robot time and falls
@@ -26,7 +27,8 @@ use crate::{excite, identify, run};
 ///   policy = "data/policies/walk.safetensors"
 ///   unknowns = ["payload@base", "coulomb_friction@calf"]   as of `twinstep identify --effects`
 ///   endpoint = "tcp/127.0.0.1:7447"
-///   method = "d-optimal"      trace, d-optimal, or random: the later stages are like the first (SPI-Random)
+///   method = "d-optimal"      trace, d-optimal, qoed, or random: the later stages are like the first (SPI-Random)
+///   of_interest = []          unknowns that matter for qoed; default: what random commands identify
 ///   rounds = 1                number of stages after the first
 ///   seconds = 25.0            duration of each log
 ///   segment_s = 5.0           duration of a command
@@ -83,7 +85,7 @@ fn stages(config: &SpiActiveConfig, out: &Path, signals: &Signals) -> CommandRes
         })?;
         let robot_time = stage.collect(config, signals)?;
         logs.push(stage.log());
-        stage.identify(config, &logs, signals)?;
+        stage.identify(config, &logs, results.last().map(|last: &StageResult| last.model.as_path()), signals)?;
         model = Some(stage.model());
         results.push(StageResult { name: stage.name.clone(), robot_time, model: stage.model() });
     }
@@ -181,13 +183,19 @@ impl Stage {
     }
 
     /// Identifies the model from `logs`, unless it is there.
-    fn identify(&self, config: &SpiActiveConfig, logs: &[PathBuf], signals: &Signals) -> CommandResult {
+    fn identify(
+        &self,
+        config: &SpiActiveConfig,
+        logs: &[PathBuf],
+        earlier: Option<&Path>,
+        signals: &Signals,
+    ) -> CommandResult {
         let (model, partial) = (self.model(), self.folder.join("model.partial.toml"));
         if model.exists() {
             return Ok(());
         }
         let search = identify::search_file(&partial);
-        identify::write_model(&config.identification(logs, &partial, search.exists()), signals)?;
+        identify::write_model(&config.identification(logs, earlier, &partial, search.exists()), signals)?;
         std::fs::rename(&partial, &model).map_err(|cause| unwritable(&model, &cause))
     }
 }

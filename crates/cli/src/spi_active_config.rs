@@ -21,6 +21,8 @@ pub enum Method {
     Trace,
     /// Largest gain in information.
     DOptimal,
+    /// Largest gain in information about the effects `of_interest`.
+    Qoed,
     /// Random, as in the first stage (SPI-Random).
     Random,
 }
@@ -31,6 +33,7 @@ impl Method {
         match self {
             Self::Trace => Some(Criterion::Trace),
             Self::DOptimal => Some(Criterion::DOptimal),
+            Self::Qoed => Some(Criterion::Qoed(Vec::new())),
             Self::Random => None,
         }
     }
@@ -40,7 +43,7 @@ impl Method {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SpiActiveConfig {
-    /// Policy of `walk`.
+    /// Policy of `walk` or `gait`.
     #[serde(skip_serializing)]
     pub policy: PathBuf,
     /// Effects with scopes whose parameters are sought.
@@ -57,6 +60,9 @@ pub struct SpiActiveConfig {
     /// How the commands after the first stage are chosen.
     #[serde(default = "default_method")]
     pub method: Method,
+    /// Effects that matter for `method = "qoed"`; the others are nuisance. Default: what random commands identify.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    of_interest: Vec<String>,
     /// Number of stages after the first.
     #[serde(default = "default_rounds")]
     pub rounds: usize,
@@ -81,6 +87,11 @@ pub struct SpiActiveConfig {
     /// Model to start from. Default: the ideal Go2.
     #[serde(skip_serializing)]
     pub model: Option<PathBuf>,
+}
+
+/// Returns effects whose names were checked.
+fn parsed(effects: &[String]) -> Vec<EffectAtScope> {
+    effects.iter().map(|text| text.parse().expect("the config was checked")).collect()
 }
 
 fn default_endpoint() -> String {
@@ -136,6 +147,9 @@ impl SpiActiveConfig {
         for unknown in &self.unknowns {
             unknown.parse::<EffectAtScope>().map_err(|error| format!("`unknowns`: {error}"))?;
         }
+        if let Some(other) = self.of_interest.iter().find(|effect| !self.unknowns.contains(effect)) {
+            return Err(format!("`of_interest`: `{other}` is not one of the unknowns: {}", self.unknowns.join(", ")));
+        }
         let effects = self.unknowns();
         if let Some(index) = (1..effects.len()).find(|index| effects[..*index].contains(&effects[*index])) {
             return Err(format!("`unknowns`: `{}` is named twice", self.unknowns[index]));
@@ -172,7 +186,7 @@ impl SpiActiveConfig {
 
     /// Returns the effects that are sought.
     pub fn unknowns(&self) -> Vec<EffectAtScope> {
-        self.unknowns.iter().map(|text| text.parse().expect("the config was checked")).collect()
+        parsed(&self.unknowns)
     }
 
     /// Returns the limits of a run.
@@ -186,9 +200,10 @@ impl SpiActiveConfig {
         excite::Args {
             policy: self.policy.clone(),
             unknowns: self.unknowns(),
+            findings: None,
             model: model.map(Path::to_owned),
             criterion,
-            of_interest: Vec::new(),
+            of_interest: parsed(&self.of_interest),
             seconds: self.seconds,
             segment_s: self.segment_s,
             candidates: self.candidates,
@@ -231,10 +246,13 @@ impl SpiActiveConfig {
     }
 
     /// Returns the arguments of `twinstep identify`, which writes the model file `out`.
-    pub fn identification(&self, logs: &[PathBuf], out: &Path, resume: bool) -> identify::Args {
+    ///
+    /// The search starts from `earlier`, the model of the stage before.
+    pub fn identification(&self, logs: &[PathBuf], earlier: Option<&Path>, out: &Path, resume: bool) -> identify::Args {
         identify::Args {
             logs: logs.to_vec(),
             model: self.model.clone(),
+            start: earlier.map(Path::to_owned),
             effects: self.unknowns(),
             seed: self.seed,
             resume,

@@ -1,6 +1,6 @@
 //! Interface of a task: observations, reward terms and the end of an episode.
 
-use twinstep_model::{EnvSpec, Ground, GroundTruth, Measured, PerJoint, Stream};
+use twinstep_model::{EnvSpec, GaitCommand, Ground, GroundTruth, Measured, PerJoint, Stream, VelocityCommand};
 
 /// A task on one robot. [`crate::TaskEnv`] runs it on many.
 ///
@@ -33,7 +33,11 @@ pub trait Task: Send {
     }
 
     /// Sets the velocity command for the rest of the episode. A task with `velocity_command` in its observation has one.
-    fn set_velocity_command(&self, _state: &mut Self::State, _command: [f32; 3]) {}
+    fn set_velocity_command(&self, _state: &mut Self::State, _command: VelocityCommand) {}
+
+    /// Sets the gait command for the rest of the episode. A task with `step_frequency` and `phase_offset` in its
+    /// observation has one.
+    fn set_gait_command(&self, _state: &mut Self::State, _command: GaitCommand) {}
 }
 
 /// One robot after a reset or a step.

@@ -3,8 +3,9 @@
 use glam::Vec3;
 use twinstep_effects::RobotSampler;
 use twinstep_model::{
-    AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, Ground, InitialState, Pose,
-    RealTimeReport, ResetCause, ResetRequest, RobotSample, Scene, StepBatch, Stream, VecEnv, frames, stream,
+    AgentCommands, AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, GaitCommand, Ground,
+    InitialState, Pose, RealTimeReport, ResetCause, ResetRequest, RobotSample, Scene, StepBatch, Stream, VecEnv,
+    VelocityCommand, frames, stream,
 };
 
 use crate::episode::{Episode, StepOutcome};
@@ -43,10 +44,10 @@ pub struct TaskEnv<B: Backend, T: Task> {
     episodes: Vec<Episode<T::State>>,
     commands: Vec<Command>,
     active: Vec<bool>,
-    /// Velocity commands of the agent; `None` while the task has its own.
-    velocity_commands: Option<Vec<[f32; 3]>>,
-    /// Velocity commands that were set since the last step.
-    next_velocity_commands: Option<Vec<[f32; 3]>>,
+    /// Commands of the agent.
+    agent_commands: AgentCommands,
+    /// Commands of the agent that were set since the last step.
+    next_agent_commands: AgentCommands,
     batch: StepBatch,
     /// Samples of each environment in the last step; `None` until somebody asks for them.
     samples: Option<Vec<Vec<RobotSample>>>,
@@ -75,8 +76,8 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             episodes: (0..num_envs as u64).map(not_started).collect(),
             commands: vec![command; num_envs],
             active: vec![true; num_envs],
-            velocity_commands: None,
-            next_velocity_commands: None,
+            agent_commands: AgentCommands::default(),
+            next_agent_commands: AgentCommands::default(),
             batch: StepBatch::new(num_envs, &spec),
             samples: None,
             sample_noise: stream(seed, "noise of samples", 0),
@@ -115,9 +116,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
         for env in envs {
             let Self { task, backend, randomise, robots, .. } = self;
             let start = self.episodes[*env].start(task, backend.robot(), randomise, robots.as_ref());
-            if let Some(commands) = &self.velocity_commands {
-                task.set_velocity_command(&mut self.episodes[*env].state, commands[*env]);
-            }
+            set_commands(task, &self.agent_commands, *env, &mut self.episodes[*env].state);
             self.commands[*env].q = start.q;
             let initial_state = InitialState {
                 actuator_seed: start.actuator_seed,
@@ -185,7 +184,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
     fn follow_robot(&mut self, env: usize) {
         let Self { backend, task, episodes, .. } = self;
         let episode = &mut episodes[env];
-        if let Some(command) = backend.velocity_command().filter(|_| self.velocity_commands.is_none()) {
+        if let Some(command) = backend.velocity_command().filter(|_| self.agent_commands.velocity.is_none()) {
             task.set_velocity_command(&mut episode.state, command);
         }
         if let Some(report) = backend.real_time() {
@@ -206,12 +205,12 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
         }
     }
 
-    /// Puts velocity commands of the agent into force.
-    fn apply_velocity_commands(&mut self, commands: Vec<[f32; 3]>) {
-        for (episode, command) in self.episodes.iter_mut().zip(&commands) {
-            self.task.set_velocity_command(&mut episode.state, *command);
+    /// Puts new commands of the agent into force.
+    fn apply_commands(&mut self, commands: AgentCommands) {
+        for (env, episode) in self.episodes.iter_mut().enumerate() {
+            set_commands(&self.task, &commands, env, &mut episode.state);
         }
-        self.velocity_commands = Some(commands);
+        self.agent_commands.update(commands);
     }
 
     /// Sets the commands of all running environments, and resets those whose episode has ended (NextStep).
@@ -294,6 +293,16 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
     }
 }
 
+/// Sets the agent's commands of environment `env` in the state of its episode.
+fn set_commands<T: Task>(task: &T, commands: &AgentCommands, env: usize, state: &mut T::State) {
+    if let Some(commands) = &commands.velocity {
+        task.set_velocity_command(state, commands[env]);
+    }
+    if let Some(commands) = &commands.gait {
+        task.set_gait_command(state, commands[env]);
+    }
+}
+
 /// Returns entries of environment `env` in an array with `len` entries per environment.
 fn row(array: &mut [f32], env: usize, len: usize) -> &mut [f32] {
     &mut array[env * len..(env + 1) * len]
@@ -337,9 +346,15 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
         &self.batch.critic_obs
     }
 
-    fn set_velocity_commands(&mut self, commands: &[[f32; 3]]) -> Result<(), EnvError> {
+    fn set_velocity_commands(&mut self, commands: &[VelocityCommand]) -> Result<(), EnvError> {
         self.spec.check_velocity_commands(commands, self.num_envs())?;
-        self.next_velocity_commands = Some(commands.to_vec());
+        self.next_agent_commands.velocity = Some(commands.to_vec());
+        Ok(())
+    }
+
+    fn set_gait_commands(&mut self, commands: &[GaitCommand]) -> Result<(), EnvError> {
+        self.spec.check_gait_commands(commands, self.num_envs())?;
+        self.next_agent_commands.gait = Some(commands.to_vec());
         Ok(())
     }
 
@@ -352,11 +367,9 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
     }
 
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
-        let velocity_commands = self.next_velocity_commands.take();
+        let commands = std::mem::take(&mut self.next_agent_commands);
         self.check_actions(actions)?;
-        if let Some(commands) = velocity_commands {
-            self.apply_velocity_commands(commands);
-        }
+        self.apply_commands(commands);
         self.prepare(actions)?;
         self.push()?;
         let diverged = match self.advance() {

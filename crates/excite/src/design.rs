@@ -4,10 +4,11 @@ use std::collections::BTreeMap;
 
 use nalgebra::DMatrix;
 use twinstep_identify::CmaEs;
+use twinstep_identify::least_squares::Differences;
 use twinstep_model::{Rollout, stream};
 
-use crate::criterion::{Criterion, posterior_std};
-use crate::sequence::{CommandSequence, VelocityRanges};
+use crate::criterion::{Criterion, identifiable, posterior_std};
+use crate::sequence::{CommandRanges, CommandSequence};
 use crate::trial::{Limits, Motion, Trial, TrialError};
 use crate::unknowns::{InformationError, Unknowns};
 
@@ -23,8 +24,8 @@ pub struct DesignOptions {
     pub segment_s: f64,
     /// Number of segments.
     pub segments: usize,
-    /// Lowest and highest velocity commands.
-    pub ranges: VelocityRanges,
+    /// Commands that a sequence may have.
+    pub ranges: CommandRanges,
     /// What a run may do.
     pub limits: Limits,
     /// Number that is maximised.
@@ -98,9 +99,11 @@ pub fn design(
     progress: &mut dyn FnMut(usize, f64) -> bool,
 ) -> Result<Design, DesignError> {
     let mut random = stream(options.seed, "excite", 0);
-    let mut search = CmaEs::new(&vec![0.0; 3 * options.segments], FIRST_SPREAD);
+    let mut search = CmaEs::new(&vec![0.0; options.ranges.dim() * options.segments], FIRST_SPREAD);
     let population = search.population();
-    let mut evaluation = Evaluation { unknowns, options, run, simulator, simulated: 0, rejected: BTreeMap::new() };
+    let criterion = options.criterion.clone();
+    let mut evaluation =
+        Evaluation { unknowns, options, criterion, run, simulator, simulated: 0, rejected: BTreeMap::new() };
     let first: Vec<_> = (0..population)
         .map(|_| CommandSequence::random(options.segment_s, options.segments, &options.ranges, &mut random))
         .collect();
@@ -145,6 +148,7 @@ fn cost(score: &Result<Score, f64>, point: &[f64]) -> f64 {
 struct Evaluation<'a> {
     unknowns: &'a Unknowns,
     options: &'a DesignOptions,
+    criterion: Criterion,
     run: &'a mut RunSequences<'a>,
     simulator: &'a mut dyn Rollout,
     simulated: usize,
@@ -172,11 +176,16 @@ impl Evaluation<'_> {
         }
         // A log of one row has no window.
         let Some(log) = trial.log else { return Ok(Err(1.0)) };
-        let Some(information): Option<DMatrix<f64>> = self.unknowns.information(&log, self.simulator)? else {
+        let information: Option<DMatrix<f64>> =
+            self.unknowns.information(&log, Differences::OneSided, self.simulator)?;
+        let Some(information) = information else {
             *self.rejected.entry("diverged").or_default() += 1;
             return Ok(Err(1.0));
         };
-        let value = self.options.criterion.value(&information);
+        if matches!(&self.criterion, Criterion::Qoed(of_interest) if of_interest.is_empty()) {
+            self.criterion = Criterion::Qoed(identifiable(&information));
+        }
+        let value = self.criterion.value(&information);
         let std = posterior_std(&information);
         Ok(Ok(Score { sequence: sequence.clone(), value, std, motion: trial.motion }))
     }

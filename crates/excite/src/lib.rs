@@ -26,6 +26,6 @@ mod unknowns;
 pub use criterion::{Criterion, UnknownCriterion};
 pub use design::{Design, DesignError, DesignOptions, RunSequences, Score, design};
 pub use random::random_within_limits;
-pub use sequence::{CommandSequence, Segment, SequenceError, VelocityRanges};
-pub use trial::{Limits, Motion, Trial, TrialError, Violation, simulate, walking_env};
+pub use sequence::{CommandRanges, CommandSequence, Segment, SequenceError};
+pub use trial::{Limits, Motion, Trial, TrialError, Violation, gait_env, simulate, walking_env};
 pub use unknowns::{InformationError, Unknowns};

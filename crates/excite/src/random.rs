@@ -1,12 +1,10 @@
 //! Random velocity commands that keep the limits of a run.
 
-use rand::SeedableRng;
-use rand::rngs::StdRng;
 use twinstep_envs::{Task, TaskEnv};
-use twinstep_model::{Simulator, VecEnv};
+use twinstep_model::{Simulator, VecEnv, stream};
 use twinstep_policy::Policy;
 
-use crate::sequence::{CommandSequence, VelocityRanges};
+use crate::sequence::{CommandRanges, CommandSequence};
 use crate::trial::{Limits, TrialError, simulate};
 
 /// How often every robot of the environment tries a sequence.
@@ -18,12 +16,12 @@ pub fn random_within_limits<B: Simulator, T: Task>(
     env: &mut TaskEnv<B, T>,
     policy: &Policy,
     (segment_s, segments): (f64, usize),
-    ranges: &VelocityRanges,
+    ranges: &CommandRanges,
     limits: &Limits,
     seed: u64,
     proceed: &mut dyn FnMut() -> bool,
 ) -> Result<Option<CommandSequence>, TrialError> {
-    let mut random = StdRng::seed_from_u64(seed);
+    let mut random = stream(seed, "random commands", 0);
     for _ in 0..ATTEMPTS {
         if !proceed() {
             return Ok(None);

@@ -1,25 +1,40 @@
-//! Velocity commands, one after the other, and their file.
+//! Commands, one after the other, and their file.
 
 use rand::{Rng, RngExt};
+use twinstep_envs::Gait;
+use twinstep_model::{GaitCommand, VelocityCommand};
 
-/// First line of the file.
+/// Columns of velocity commands.
 const HEADER: &str = "start_s,end_s,vx,vy,wz";
+/// Columns of gait commands, after them.
+const GAIT_HEADER: &str = ",step_frequency,phase_fr,phase_rl,phase_rr";
 /// Largest absolute velocity in a file [m/s, rad/s].
 const MAX_VELOCITY: f32 = 5.0;
 
-/// Lowest and highest velocity command: forward [m/s], left [m/s], yaw rate [rad/s].
-pub type VelocityRanges = [[f32; 2]; 3];
+/// Highest step frequency in a file [Hz].
+const MAX_STEP_FREQUENCY: f32 = 10.0;
 
-/// A velocity command and the time until which it is in force.
+/// Commands that a design may use.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CommandRanges {
+    /// Lowest and highest velocity command: forward [m/s], left [m/s], yaw rate [rad/s].
+    pub velocity: [[f32; 2]; 3],
+    /// Lowest and highest step frequency [Hz], for a policy of `gait`; it may have each of the four gaits.
+    pub step_frequency: Option<[f32; 2]>,
+}
+
+/// Commands and the time until which they are in force.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Segment {
     /// End, from the start of the sequence [s].
     pub end_s: f64,
     /// Forward [m/s], left [m/s], yaw rate [rad/s], in the base frame.
-    pub velocity: [f32; 3],
+    pub velocity: VelocityCommand,
+    /// Step frequency [Hz], phases of FR, RL and RR relative to FL [cycles]. All segments of a sequence have one, or none.
+    pub gait: Option<GaitCommand>,
 }
 
-/// Velocity commands, one after the other.
+/// Commands, one after the other.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CommandSequence {
     /// At least one, with increasing ends.
@@ -36,35 +51,69 @@ pub struct SequenceError {
     pub reason: String,
 }
 
-impl CommandSequence {
-    /// Returns segments of equal duration with these velocities.
-    pub fn new(segment_s: f64, velocities: impl IntoIterator<Item = [f32; 3]>) -> Self {
-        let segment = |(index, velocity)| Segment { end_s: segment_s * (index + 1) as f64, velocity };
-        Self { segments: velocities.into_iter().enumerate().map(segment).collect() }
+impl CommandRanges {
+    /// Returns the number of coordinates of a segment.
+    pub fn dim(&self) -> usize {
+        if self.step_frequency.is_some() { 5 } else { 3 }
     }
 
-    /// Returns velocities that are uniform in `ranges`.
-    pub fn random(segment_s: f64, segments: usize, ranges: &VelocityRanges, random: &mut impl Rng) -> Self {
-        let coordinates: Vec<f64> = (0..3 * segments).map(|_| random.random_range(-1.0..=1.0)).collect();
+    /// Returns the commands at a point: forward, left, yaw rate, and step frequency and gait if there are any. −1 and 1
+    /// are the ends of the ranges; coordinates beyond are clipped. Each gait has a quarter of its coordinate.
+    fn commands(&self, point: &[f64]) -> (VelocityCommand, Option<GaitCommand>) {
+        let clipped = |index: usize| point[index].clamp(-1.0, 1.0) as f32;
+        let within = |[low, high]: [f32; 2], share: f32| 0.5 * (low + high) + 0.5 * (high - low) * share;
+        let gait = self.step_frequency.map(|range| {
+            let number = (0.5 * (clipped(4) + 1.0) * Gait::ALL.len() as f32) as usize;
+            let [fr, rl, rr] = Gait::ALL[number.min(Gait::ALL.len() - 1)].phase_offset();
+            [within(range, clipped(3)), fr, rl, rr]
+        });
+        (std::array::from_fn(|axis| within(self.velocity[axis], clipped(axis))), gait)
+    }
+
+    /// Inverts [`CommandRanges::commands`]. A gait gives the middle of its part, a range of one value gives 0.
+    fn coordinates(&self, segment: &Segment) -> Vec<f64> {
+        let share = |value: f32, [low, high]: [f32; 2]| {
+            if high > low { f64::from((2.0 * value - low - high) / (high - low)) } else { 0.0 }
+        };
+        let velocity = segment.velocity.iter().zip(self.velocity).map(|(value, range)| share(*value, range));
+        let gait = self.step_frequency.zip(segment.gait).map(|(range, [frequency, phase_offset @ ..])| {
+            let number = Gait::ALL.iter().position(|gait| gait.phase_offset() == phase_offset).unwrap_or(0);
+            [share(frequency, range), (2.0 * number as f64 + 1.0) / Gait::ALL.len() as f64 - 1.0]
+        });
+        velocity.chain(gait.into_iter().flatten()).collect()
+    }
+}
+
+impl CommandSequence {
+    /// Returns segments of equal duration with these velocities.
+    pub fn new(segment_s: f64, velocities: impl IntoIterator<Item = VelocityCommand>) -> Self {
+        Self::with_gaits(segment_s, velocities.into_iter().map(|velocity| (velocity, None)))
+    }
+
+    fn with_gaits(segment_s: f64, commands: impl Iterator<Item = (VelocityCommand, Option<GaitCommand>)>) -> Self {
+        let segment = |(index, (velocity, gait))| Segment { end_s: segment_s * (index + 1) as f64, velocity, gait };
+        Self { segments: commands.enumerate().map(segment).collect() }
+    }
+
+    /// Returns commands that are uniform in `ranges`.
+    pub fn random(segment_s: f64, segments: usize, ranges: &CommandRanges, random: &mut impl Rng) -> Self {
+        let coordinates: Vec<f64> = (0..ranges.dim() * segments).map(|_| random.random_range(-1.0..=1.0)).collect();
         Self::from_coordinates(segment_s, &coordinates, ranges)
     }
 
-    /// Returns the sequence of three coordinates for each segment. −1 and 1 are the ends of the ranges; coordinates
-    /// beyond are clipped.
-    pub fn from_coordinates(segment_s: f64, coordinates: &[f64], ranges: &VelocityRanges) -> Self {
-        let velocity = |point: &[f64]| {
-            std::array::from_fn(|axis| {
-                let [low, high] = ranges[axis];
-                0.5 * (low + high) + 0.5 * (high - low) * point[axis].clamp(-1.0, 1.0) as f32
-            })
-        };
-        Self::new(segment_s, coordinates.chunks_exact(3).map(velocity))
+    /// Returns the sequence of [`CommandRanges::dim`] coordinates for each segment, each from −1 to 1.
+    pub fn from_coordinates(segment_s: f64, coordinates: &[f64], ranges: &CommandRanges) -> Self {
+        Self::with_gaits(segment_s, coordinates.chunks_exact(ranges.dim()).map(|point| ranges.commands(point)))
     }
 
     /// Inverts [`CommandSequence::from_coordinates`].
-    pub fn coordinates(&self, ranges: &VelocityRanges) -> Vec<f64> {
-        let axis = |(value, [low, high]): (&f32, &[f32; 2])| f64::from((2.0 * value - low - high) / (high - low));
-        self.segments.iter().flat_map(|segment| segment.velocity.iter().zip(ranges).map(axis)).collect()
+    pub fn coordinates(&self, ranges: &CommandRanges) -> Vec<f64> {
+        self.segments.iter().flat_map(|segment| ranges.coordinates(segment)).collect()
+    }
+
+    /// Returns true if the sequence has gait commands.
+    pub fn has_gaits(&self) -> bool {
+        self.segments.iter().any(|segment| segment.gait.is_some())
     }
 
     /// Returns the segments.
@@ -79,35 +128,49 @@ impl CommandSequence {
 
     /// Returns the velocity command at a time [s]. After the end the robot stands.
     pub fn at(&self, t: f64) -> [f32; 3] {
+        self.segment(t).map_or([0.0; 3], |segment| segment.velocity)
+    }
+
+    /// Returns the gait command at a time [s]. After the end it is the last one.
+    pub fn gait_at(&self, t: f64) -> Option<GaitCommand> {
+        self.segment(t).or(self.segments.last())?.gait
+    }
+
+    fn segment(&self, t: f64) -> Option<&Segment> {
         // Times are multiples of the policy's period, which is not exact in binary.
-        let is_before = |segment: &&Segment| t < segment.end_s - 1e-6;
-        self.segments.iter().find(is_before).map_or([0.0; 3], |segment| segment.velocity)
+        self.segments.iter().find(|segment| t < segment.end_s - 1e-6)
     }
 
     /// Returns the file: CSV with a line for each segment.
     pub fn to_csv(&self) -> String {
         let starts = std::iter::once(0.0).chain(self.segments.iter().map(|segment| segment.end_s));
-        let lines = starts
-            .zip(&self.segments)
-            .map(|(start, Segment { end_s, velocity: [vx, vy, wz] })| format!("{start},{end_s},{vx},{vy},{wz}\n"));
-        format!("{HEADER}\n{}", lines.collect::<String>())
+        let lines = starts.zip(&self.segments).map(|(start, Segment { end_s, velocity: [vx, vy, wz], gait })| {
+            let gait = gait.map_or_else(String::new, |[f, fr, rl, rr]| format!(",{f},{fr},{rl},{rr}"));
+            format!("{start},{end_s},{vx},{vy},{wz}{gait}\n")
+        });
+        let gait = if self.has_gaits() { GAIT_HEADER } else { "" };
+        format!("{HEADER}{gait}\n{}", lines.collect::<String>())
     }
 
     /// Reads a file.
     pub fn parse(text: &str) -> Result<Self, SequenceError> {
         let mut lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
         let wrong = |line: usize, reason: String| Err(SequenceError { line: line + 1, reason });
-        match lines.next() {
-            Some((_, header)) if header.trim() == HEADER => {}
+        let header = match lines.next() {
+            Some((_, header))
+                if [HEADER.to_owned(), format!("{HEADER}{GAIT_HEADER}")].contains(&header.trim().into()) =>
+            {
+                header.trim()
+            }
             other => {
                 let found = other.map_or("nothing".to_owned(), |(_, header)| format!("`{}`", header.trim()));
-                return wrong(0, format!("the header is {found}; it must be `{HEADER}`"));
+                return wrong(0, format!("the header is {found}; it must be `{HEADER}` or `{HEADER}{GAIT_HEADER}`"));
             }
-        }
+        };
         let mut segments: Vec<Segment> = Vec::new();
         for (line, cells) in lines {
             let start = segments.last().map_or(0.0, |segment| segment.end_s);
-            match segment(cells, start) {
+            match segment(header, cells, start) {
                 Ok(segment) => segments.push(segment),
                 Err(reason) => return wrong(line, reason),
             }
@@ -119,34 +182,38 @@ impl CommandSequence {
     }
 }
 
-/// Reads a line. `expected` is the end of the segment before [s].
-fn segment(line: &str, expected: f64) -> Result<Segment, String> {
+/// Reads a line of a file with this header. `expected` is the end of the segment before [s].
+fn segment(header: &str, line: &str, expected: f64) -> Result<Segment, String> {
+    let names: Vec<&str> = header.split(',').collect();
     let cells: Vec<&str> = line.split(',').map(str::trim).collect();
-    let [start, end, velocity @ ..] = cells.as_slice() else {
-        return Err(format!("`{line}` has {} cells; 5 are expected: {HEADER}", cells.len()));
+    if cells.len() != names.len() {
+        return Err(format!("`{line}` has {} cells; {} are expected: {header}", cells.len(), names.len()));
+    }
+    let number = |index: usize| {
+        let value = cells[index].parse::<f64>().ok().filter(|value| value.is_finite());
+        value.ok_or_else(|| format!("`{}` = `{}` is not a finite number", names[index], cells[index]))
     };
-    let [vx, vy, wz] = velocity else {
-        return Err(format!("`{line}` has {} cells; 5 are expected: {HEADER}", cells.len()));
-    };
-    let number = |name: &str, cell: &str| {
-        let value = cell.parse::<f64>().ok().filter(|value| value.is_finite());
-        value.ok_or_else(|| format!("`{name}` = `{cell}` is not a finite number"))
-    };
-    let (start, end_s) = (number("start_s", start)?, number("end_s", end)?);
+    let (start, end_s) = (number(0)?, number(1)?);
     if (start - expected).abs() > 1e-6 {
         return Err(format!("`start_s` = {start} is not {expected}, where the segment before ends"));
     }
     if end_s <= start {
         return Err(format!("`end_s` = {end_s} is not greater than `start_s` = {start}"));
     }
-    let mut command = [0.0; 3];
-    for ((value, cell), name) in command.iter_mut().zip([vx, vy, wz]).zip(["vx", "vy", "wz"]) {
-        *value = number(name, cell)? as f32;
-        if value.abs() > MAX_VELOCITY {
-            return Err(format!("`{name}` = {value} is outside -{MAX_VELOCITY} to {MAX_VELOCITY}"));
-        }
-    }
-    Ok(Segment { end_s, velocity: command })
+    let bounded = |index: usize, [low, high]: [f32; 2]| {
+        let value = number(index)? as f32;
+        let is_allowed = (low..=high).contains(&value);
+        if is_allowed { Ok(value) } else { Err(format!("`{}` = {value} is outside {low} to {high}", names[index])) }
+    };
+    let velocity = |index: usize| bounded(index, [-MAX_VELOCITY, MAX_VELOCITY]);
+    let velocity = [velocity(2)?, velocity(3)?, velocity(4)?];
+    let phase = |index: usize| bounded(index, [0.0, 1.0]);
+    let gait = if names.len() > 5 {
+        Some([bounded(5, [0.0, MAX_STEP_FREQUENCY])?, phase(6)?, phase(7)?, phase(8)?])
+    } else {
+        None
+    };
+    Ok(Segment { end_s, velocity, gait })
 }
 
 #[cfg(test)]
@@ -155,7 +222,10 @@ mod tests {
 
     use super::*;
 
-    const RANGES: VelocityRanges = [[-1.0, 1.0], [-0.5, 0.5], [-1.0, 1.0]];
+    const RANGES: CommandRanges =
+        CommandRanges { velocity: [[-1.0, 1.0], [-0.5, 0.5], [-1.0, 1.0]], step_frequency: None };
+    const GAIT_RANGES: CommandRanges =
+        CommandRanges { velocity: [[-1.0, 1.0], [0.0, 0.0], [-1.0, 1.0]], step_frequency: Some([2.0, 4.0]) };
 
     #[test]
     fn command_is_in_force_until_the_end_of_its_segment() {
@@ -176,6 +246,10 @@ mod tests {
             ("start_s,end_s,vx,vy,wz\n0,5,1,0,9\n", "line 2: `wz` = 9 is outside -5 to 5"),
             ("start_s,end_s,vx,vy,wz\n0,5,1,0,0\n6,9,1,0,0\n", "line 3: `start_s` = 6 is not 5"),
             ("start_s,end_s,vx,vy,wz\n0,0,1,0,0\n", "line 2: `end_s` = 0 is not greater"),
+            (
+                "start_s,end_s,vx,vy,wz,step_frequency,phase_fr,phase_rl,phase_rr\n0,5,1,0,0,3,0.5,0.5,2\n",
+                "line 2: `phase_rr` = 2 is outside 0 to 1",
+            ),
         ];
         for (text, expected) in cases {
             let error = CommandSequence::parse(text).expect_err(expected).to_string();
@@ -183,7 +257,33 @@ mod tests {
         }
     }
 
+    #[test]
+    fn gaits_are_the_four_quarters_of_their_coordinate() {
+        let gaits: Vec<_> = [-1.0, -0.3, 0.3, 1.0]
+            .map(|gait| CommandSequence::from_coordinates(1.0, &[0.0, 0.7, 0.0, 0.0, gait], &GAIT_RANGES).gait_at(0.0))
+            .to_vec();
+        let expected = Gait::ALL.map(|gait| {
+            let [fr, rl, rr] = gait.phase_offset();
+            Some([3.0, fr, rl, rr])
+        });
+        assert_eq!(gaits, expected);
+    }
+
     proptest! {
+        #[test]
+        fn file_and_coordinates_return_a_sequence_with_gaits(
+            coordinates in prop::collection::vec(-1.0..1.0f64, 5..30),
+            segment_s in 0.1..10.0f64,
+        ) {
+            let sequence = CommandSequence::from_coordinates(segment_s, &coordinates, &GAIT_RANGES);
+            prop_assert_eq!(&CommandSequence::parse(&sequence.to_csv()).expect("a valid file"), &sequence);
+            let again = CommandSequence::from_coordinates(segment_s, &sequence.coordinates(&GAIT_RANGES), &GAIT_RANGES);
+            for (one, other) in again.segments().iter().zip(sequence.segments()) {
+                prop_assert_eq!(one.gait.map(|gait| [gait[1], gait[2], gait[3]]), other.gait.map(|gait| [gait[1], gait[2], gait[3]]));
+                prop_assert!((one.velocity[0] - other.velocity[0]).abs() < 1e-5);
+            }
+        }
+
         #[test]
         fn file_and_coordinates_return_the_sequence(
             coordinates in prop::collection::vec(-1.0..1.0f64, 3..30),

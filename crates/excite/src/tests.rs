@@ -3,13 +3,14 @@
 use twinstep_effects::ModelFile;
 use twinstep_envs::{TaskEnv, Walk};
 use twinstep_identify::EffectAtScope;
+use twinstep_identify::least_squares::Differences;
 use twinstep_model::go2;
 use twinstep_policy::Policy;
 use twinstep_sim::{BatchBackend, BatchRollout, SimConfig};
 
 use crate::{
-    CommandSequence, Criterion, Design, DesignError, DesignOptions, Limits, Motion, Trial, Unknowns, Violation, design,
-    simulate, walking_env,
+    CommandRanges, CommandSequence, Criterion, Design, DesignError, DesignOptions, Limits, Motion, Trial, Unknowns,
+    Violation, design, gait_env, simulate, walking_env,
 };
 
 const NO_LIMITS: Limits = Limits { room_m: 100.0, max_saturated: 1.0, max_rms_torque_nm: 100.0 };
@@ -42,7 +43,7 @@ fn designed(limits: Limits, candidates: usize) -> Result<Design, DesignError> {
     let options = DesignOptions {
         segment_s: 1.0,
         segments: 2,
-        ranges: [[-1.0, 1.0], [-0.5, 0.5], [-1.0, 1.0]],
+        ranges: CommandRanges { velocity: [[-1.0, 1.0], [-0.5, 0.5], [-1.0, 1.0]], step_frequency: None },
         limits,
         criterion: Criterion::DOptimal,
         candidates,
@@ -94,6 +95,32 @@ fn log_has_the_commands_in_force_and_rows_do_not_depend_on_other_robots() {
 }
 
 #[test]
+fn gaits_of_a_sequence_are_walked() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../data/policies/gait.safetensors");
+    let policy = Policy::read(path).expect("the shipped policy").0;
+    let ranges = CommandRanges { velocity: [[-1.0, 1.0], [0.0, 0.0], [-1.0, 1.0]], step_frequency: Some([2.0, 4.0]) };
+    // A trot and a pronk at 3 Hz, forward at 0.3 m/s.
+    let sequences: Vec<_> =
+        [-1.0, 1.0].map(|gait| CommandSequence::from_coordinates(3.0, &[0.3, 0.0, 0.0, 0.0, gait], &ranges)).to_vec();
+    let backend = BatchBackend::new(go2(), SimConfig::default(), 2).expect("a backend");
+    let mut env = gait_env(backend, 1).expect("the default task");
+    let trials = simulate(&mut env, &policy, &sequences, 1).expect("runs");
+    // Correlation of the calves of FL and FR after the first second: opposite in a trot, equal in a pronk.
+    let correlations = trials.iter().map(|trial| {
+        let log = trial.log.as_ref().expect("no fall");
+        let [left, right] = ["q_FL_calf", "q_FR_calf"].map(|name| {
+            let cells = &log.channel(name).expect("a column")[50..];
+            let mean = cells.iter().sum::<f64>() / cells.len() as f64;
+            cells.iter().map(|cell| cell - mean).collect::<Vec<_>>()
+        });
+        let product = |one: &[f64], other: &[f64]| one.iter().zip(other).map(|(one, other)| one * other).sum::<f64>();
+        product(&left, &right) / (product(&left, &left) * product(&right, &right)).sqrt()
+    });
+    let [trot, pronk] = correlations.collect::<Vec<_>>().try_into().expect("two runs");
+    assert!(trot < -0.3 && pronk > 0.7, "{trot} and {pronk}");
+}
+
+#[test]
 fn walking_tells_more_of_viscous_friction_than_standing() {
     // Dry friction also shows at rest: it holds a joint away from its target.
     let commands = [[[0.8, 0.0, 0.0]; 2], [[0.0; 3]; 2]].map(|velocities| CommandSequence::new(1.0, velocities));
@@ -101,7 +128,10 @@ fn walking_tells_more_of_viscous_friction_than_standing() {
     let unknowns = unknowns(&["viscous_friction@calf"]);
     let information = trials(&commands, 1).into_iter().map(|trial| {
         let log = trial.log.expect("no fall");
-        let information = unknowns.information(&log, &mut rollouts).expect("a log").expect("a finite simulation");
+        let information = unknowns
+            .information(&log, Differences::Central, &mut rollouts)
+            .expect("a log")
+            .expect("a finite simulation");
         information[(0, 0)]
     });
     let [walking, standing] = information.collect::<Vec<_>>().try_into().expect("two logs");

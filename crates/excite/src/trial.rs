@@ -1,6 +1,6 @@
 //! A policy that follows command sequences in a simulator, recorded as logs.
 
-use twinstep_envs::{ConfigError, Randomisation, Task, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
+use twinstep_envs::{ConfigError, GaitConfig, GaitTask, Randomisation, Task, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
 use twinstep_logs::{Gain, Log, LogError, Meta, Segment, TorqueSensor};
 use twinstep_model::{
     AutoresetMode, Backend, BaseMount, EnvError, EnvSpec, JOINT_NAMES, NUM_JOINTS, PerJoint, ResetRequest, RobotStates,
@@ -117,20 +117,29 @@ struct Recording {
 
 /// Returns the environments of the task `walk` without noise, randomisation and time limit, one for each robot.
 pub fn walking_env<B: Backend>(backend: B, seed: u64) -> Result<TaskEnv<B, Walk>, ConfigError> {
-    let settings = TaskEnvConfig {
+    let walk = Walk::new(WalkConfig::default(), backend.robot(), true)?;
+    TaskEnv::new(backend, walk, calm(seed))
+}
+
+/// Returns the environments of the task `gait` without noise, randomisation and time limit, one for each robot.
+pub fn gait_env<B: Backend>(backend: B, seed: u64) -> Result<TaskEnv<B, GaitTask>, ConfigError> {
+    let gait = GaitTask::new(GaitConfig::default(), backend.robot(), true)?;
+    TaskEnv::new(backend, gait, calm(seed))
+}
+
+fn calm(seed: u64) -> TaskEnvConfig {
+    TaskEnvConfig {
         randomise: Randomisation::default(),
         robot_sampler: None,
         autoreset: AutoresetMode::NextStep,
         max_episode_steps: Some(u32::MAX),
         seed,
-    };
-    let walk = Walk::new(WalkConfig::default(), backend.robot(), true)?;
-    TaskEnv::new(backend, walk, settings)
+    }
 }
 
 /// Lets `policy` follow one sequence on each robot of `env`, all of which start in the same state, drawn from `seed`.
 ///
-/// The sequences must have one duration, and `env` one robot for each. `policy` must be one of the environment's task.
+/// The sequences must have one duration, all of them gait commands or none, and `env` one robot for each. `policy` must be one of the environment's task.
 pub fn simulate<B: Simulator, T: Task>(
     env: &mut TaskEnv<B, T>,
     policy: &Policy,
@@ -151,6 +160,11 @@ pub fn simulate<B: Simulator, T: Task>(
         let t = step as f64 * spec.policy_dt;
         let commands: Vec<[f32; 3]> = sequences.iter().map(|sequence| sequence.at(t)).collect();
         env.set_velocity_commands(&commands)?;
+        // The policy observes a new gait one period later, with the phases of the feet that belong to it.
+        let gaits: Vec<_> = sequences.iter().filter_map(|sequence| sequence.gait_at(t)).collect();
+        if !gaits.is_empty() {
+            env.set_gait_commands(&gaits)?;
+        }
         obs.clear();
         obs.extend_from_slice(env.obs());
         // As in `twinstep run`, the policy observes the command that is wanted now.

@@ -7,9 +7,9 @@ use twinstep_model::{Precision, Rollout};
 
 use crate::experiment::{Experiment, Regime};
 use crate::global_search::GlobalSearch;
-use crate::least_squares::LeastSquaresProblem;
+use crate::least_squares::{Differences, LeastSquaresProblem};
 use crate::parameter::{
-    FreeParameter, drop_unidentifiable, free_parameters, initial_coordinate, set_intervals, with_values,
+    FreeParameter, coordinate_in, drop_unidentifiable, free_parameters, initial_coordinate, set_intervals, with_values,
 };
 use crate::refine::{DAMPING_FACTORS, SIMULATOR_MISMATCH_STD, covariance, information, refine};
 
@@ -31,11 +31,16 @@ pub struct IdentifyOptions {
     pub force: bool,
     /// Checkpoint of an interrupted search to resume.
     pub resume: Option<GlobalSearch>,
+    /// Model from whose values of the effects the search starts. Default: the given model, where an effect that it does
+    /// not have does nothing.
+    ///
+    /// From far away, the search may end in a local minimum on a log of fast walking.
+    pub start: Option<ModelFile>,
 }
 
 impl Default for IdentifyOptions {
     fn default() -> Self {
-        Self { generations: 60, seed: 1, force: false, resume: None }
+        Self { generations: 60, seed: 1, force: false, resume: None, start: None }
     }
 }
 
@@ -132,6 +137,7 @@ pub fn identify(
     progress: &mut IdentifyProgress,
 ) -> Result<Identification, IdentifyError> {
     let (file, all) = free_parameters(model, effects)?;
+    let (file, begin) = starting_point(file, &all, options.start.as_ref());
     let whole = LeastSquaresProblem {
         file: &file,
         unknowns: &all,
@@ -152,7 +158,6 @@ pub fn identify(
     if first.is_empty() {
         return Err(IdentifyError::NothingToCompare);
     }
-    let begin: Vec<f64> = all.iter().map(|unknown| initial_coordinate(&file, unknown)).collect();
     let predicted = predicted(&whole, simulator);
     let identifiable: Vec<bool> = predicted.iter().map(|std| options.force || *std < MAX_POSTERIOR_TO_PRIOR).collect();
     // Parameters that are not identifiable keep their initial value.
@@ -210,6 +215,17 @@ pub fn identify(
     Ok(Identification { model: found, findings, rms: [rms(&first), rms(&last)], correlated, checkpoint: interrupted })
 }
 
+/// Returns the file and the coordinates of the parameters with the values of `start`, if there is one.
+fn starting_point(file: ModelFile, all: &[FreeParameter], start: Option<&ModelFile>) -> (ModelFile, Vec<f64>) {
+    let coordinate = |unknown: &FreeParameter| {
+        let in_start = start.and_then(|start| coordinate_in(start, unknown));
+        in_start.unwrap_or_else(|| initial_coordinate(&file, unknown))
+    };
+    let begin: Vec<f64> = all.iter().map(coordinate).collect();
+    let file = if start.is_some() { with_values(&file, all, &begin) } else { file };
+    (file, begin)
+}
+
 fn select<T: Clone>(all: &[T], identifiable: &[bool]) -> Vec<T> {
     all.iter().zip(identifiable).filter(|(_, identifiable)| **identifiable).map(|(one, _)| one.clone()).collect()
 }
@@ -246,7 +262,7 @@ pub fn blocks(experiments: &[Experiment]) -> Vec<usize> {
 /// It is evaluated at the prior means, where every effect acts.
 fn predicted(task: &LeastSquaresProblem, simulator: &mut dyn Rollout) -> Vec<f64> {
     let prior_mean = task.from_prior_units(&vec![0.0; task.unknowns.len()]);
-    let factor = predicted_information(task, simulator, &prior_mean).and_then(DMatrix::cholesky);
+    let factor = predicted_information(task, Differences::Central, simulator, &prior_mean).and_then(DMatrix::cholesky);
     factor.map_or_else(
         || vec![0.0; task.unknowns.len()],
         |factor| {
@@ -260,6 +276,7 @@ fn predicted(task: &LeastSquaresProblem, simulator: &mut dyn Rollout) -> Vec<f64
 /// Returns `None` if a simulation diverges.
 pub fn predicted_information(
     task: &LeastSquaresProblem,
+    differences: Differences,
     simulator: &mut dyn Rollout,
     point: &[f64],
 ) -> Option<DMatrix<f64>> {
@@ -269,7 +286,8 @@ pub fn predicted_information(
         |group: &usize| if Experiment::regime(*group) == Regime::Fixed { 30f64.sqrt() } else { 200f64.sqrt() };
     let groups: Vec<usize> = task.experiments.iter().flat_map(Experiment::groups).collect();
     let spread: Vec<f64> = groups.iter().map(independent).collect();
-    let here = LeastSquaresProblem { residual_scale: &spread, ..*task }.linearise(simulator, point)?;
+    let task = LeastSquaresProblem { residual_scale: &spread, ..*task };
+    let here = task.linearise_by(differences, simulator, point)?;
     Some(information(&here))
 }
 

@@ -14,6 +14,28 @@ use crate::parameter::{FreeParameter, candidate};
 /// its distance from the trunk's centre.
 const STEP: f64 = 0.1;
 
+/// Differences that approximate derivatives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Differences {
+    /// A step to either side: one point and two for each parameter.
+    Central,
+    /// A step to one side: one point and one for each parameter. The error is of first order in the step.
+    OneSided,
+}
+
+impl Differences {
+    /// Returns the values that are simulated beside `value`: the lower and the upper end, or one of them.
+    ///
+    /// A one-sided step that would leave the bounds is to the other side; a central difference becomes narrower.
+    fn ends(self, value: f64, step: f64, [low, high]: [f64; 2]) -> Vec<f64> {
+        match self {
+            Self::Central => vec![(value - step).clamp(low, high), (value + step).clamp(low, high)],
+            Self::OneSided if value + step <= high => vec![value + step],
+            Self::OneSided => vec![value - step],
+        }
+    }
+}
+
 /// Least-squares problem. A point consists of the coordinates of the free parameters.
 #[derive(Clone, Copy)]
 pub struct LeastSquaresProblem<'a> {
@@ -73,25 +95,39 @@ impl LeastSquaresProblem<'_> {
     ///
     /// Returns `None` if a simulation diverges.
     pub fn linearise(&self, simulator: &mut dyn Rollout, point: &[f64]) -> Option<Linearisation> {
-        let mut points = vec![point.to_vec()];
-        let mut widths = Vec::new();
-        for (index, unknown) in self.unknowns.iter().enumerate() {
-            let [low, high] = unknown.coordinate_bounds();
-            let ends = [-1.0, 1.0].map(|side| (point[index] + side * STEP * unknown.prior[1]).clamp(low, high));
-            widths.push((ends[1] - ends[0]) / unknown.prior[1]);
-            for end in ends {
-                let mut moved = point.to_vec();
-                moved[index] = end;
-                points.push(moved);
-            }
-        }
+        self.linearise_by(Differences::Central, simulator, point)
+    }
+
+    /// Computes residuals and Jacobian at `point` in one batch.
+    ///
+    /// Returns `None` if a simulation diverges.
+    pub fn linearise_by(
+        &self,
+        differences: Differences,
+        simulator: &mut dyn Rollout,
+        point: &[f64],
+    ) -> Option<Linearisation> {
+        let bounds_and_scales = self.unknowns.iter().map(|unknown| (unknown.coordinate_bounds(), unknown.prior[1]));
+        let ends: Vec<Vec<f64>> = bounds_and_scales
+            .zip(point)
+            .map(|((bounds, std), value)| differences.ends(*value, STEP * std, bounds))
+            .collect();
+        let moved = ends.iter().enumerate().flat_map(|(index, ends)| {
+            ends.iter()
+                .map(move |end| point.iter().enumerate().map(|(i, x)| if i == index { *end } else { *x }).collect())
+        });
+        let points: Vec<Vec<f64>> = std::iter::once(point.to_vec()).chain(moved).collect();
         let mut all = self.residuals(simulator, &points).into_iter();
         let here = DVector::from_vec(all.next()??);
         let mut jacobian = DMatrix::zeros(here.len(), self.unknowns.len());
-        for (index, width) in widths.into_iter().enumerate() {
-            let (below, above) = (all.next()??, all.next()??);
-            let derivative = above.iter().zip(&below).map(|(above, below)| (above - below) / width);
-            jacobian.set_column(index, &DVector::from_iterator(here.len(), derivative));
+        for (index, (ends, unknown)) in ends.iter().zip(self.unknowns).enumerate() {
+            let first = DVector::from_vec(all.next()??);
+            let (difference, width) = match ends[..] {
+                [end] => (first - &here, end - point[index]),
+                [below, above, ..] => (DVector::from_vec(all.next()??) - first, above - below),
+                [] => unreachable!("every difference has an end"),
+            };
+            jacobian.set_column(index, &(difference * (unknown.prior[1] / width)));
         }
         Some(Linearisation { residuals: here, jacobian })
     }

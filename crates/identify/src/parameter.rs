@@ -66,6 +66,11 @@ pub fn free_parameters(
     effects: &[(&'static Effect, Scope)],
 ) -> Result<(ModelFile, Vec<FreeParameter>), EntryError> {
     let (mut file, mut unknowns) = (model.clone(), Vec::new());
+    // Before an entry is added, so that the index of each stays valid.
+    let is_replaced = |entry: &EffectEntry| {
+        entry.effect.composition == Composition::Replace && effects.contains(&(entry.effect, entry.scope))
+    };
+    file.effects.retain(|entry| !is_replaced(entry));
     for (effect, scope) in effects {
         let start: Vec<f64> = effect
             .parameters
@@ -77,15 +82,12 @@ pub fn free_parameters(
                 std::iter::repeat_n(value, parameter.count)
             })
             .collect();
-        let own = file.effects.iter().rfind(|entry| entry.effect == *effect && entry.scope == *scope);
+        let own = model.effects.iter().rfind(|entry| entry.effect == *effect && entry.scope == *scope);
         let start = match own {
             Some(entry) if effect.composition == Composition::Replace => entry.values.clone(),
             _ if effect.replaces_body() => nominal_inertia(model, *scope)?,
             _ => start,
         };
-        if effect.composition == Composition::Replace {
-            file.effects.retain(|entry| entry.effect != *effect || entry.scope != *scope);
-        }
         file.effects.push(EffectEntry::new(effect, *scope, start.clone())?);
         let index = file.effects.len() - 1;
         let mut component_index = 0;
@@ -148,6 +150,14 @@ pub fn candidate(file: &ModelFile, unknowns: &[FreeParameter], coordinates: &[f6
 pub fn initial_coordinate(file: &ModelFile, unknown: &FreeParameter) -> f64 {
     let (entry, value) = unknown.location;
     unknown.coordinate(file.effects[entry].values[value])
+}
+
+/// Returns the coordinate of a free parameter in the last entry of its effect at its scope. Returns `None` without one.
+pub fn coordinate_in(model: &ModelFile, unknown: &FreeParameter) -> Option<f64> {
+    let own = |entry: &&EffectEntry| entry.effect == unknown.effect && entry.scope == unknown.scope;
+    let entry = model.effects.iter().rfind(own)?;
+    let [low, high] = unknown.coordinate_bounds();
+    Some(unknown.coordinate(entry.values[unknown.location.1]).clamp(low, high))
 }
 
 /// Removes entries from the file that were added to `model` and have no identifiable parameter.

@@ -2,13 +2,14 @@
 
 use nalgebra::DMatrix;
 use proptest::prelude::*;
-use twinstep_effects::{CATALOGUE, Effect, ModelFile, Scope, Target};
+use twinstep_effects::{CATALOGUE, Effect, EffectEntry, ModelFile, Scope, Target};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{BaseMount, Precision, RobotStates, Rollout, RolloutRequest, go2};
 
 use crate::experiment::Experiment;
 use crate::global_search::GlobalSearch;
-use crate::least_squares::LeastSquaresProblem;
+use crate::identify::{IdentifyOptions, identify};
+use crate::least_squares::{Differences, LeastSquaresProblem};
 use crate::parameter::{FreeParameter, drop_unidentifiable, free_parameters, initial_coordinate, with_values};
 use crate::refine::{DAMPING_FACTORS, SIMULATOR_MISMATCH_STD, covariance, information, refine};
 use crate::window::WindowConfig;
@@ -83,6 +84,19 @@ fn refinement_converges_to_the_truth_up_to_the_pull_of_the_prior() {
             // A linear problem: the estimate is the mean of truth and prior mean, weighted by their information.
             let pull = (unknown.prior[0] - truth) / information[(index, index)];
             assert!((found[index] - truth - pull).abs() < 0.01 * unknown.prior[1], "{} for {truth}", found[index]);
+        }
+    });
+}
+
+#[test]
+fn one_sided_differences_agree_with_central_ones_and_step_inwards_from_a_bound() {
+    with_problem(|task, begin| {
+        let high = task.unknowns[0].coordinate_bounds()[1];
+        for point in [begin.clone(), vec![high, begin[1]]] {
+            let central = task.linearise(&mut Linear, &point).expect("finite").jacobian;
+            let found = task.linearise_by(Differences::OneSided, &mut Linear, &point).expect("finite").jacobian;
+            let error = (&found - &central).norm() / central.norm();
+            assert!(error < 1e-6, "{error} at {point:?}: the robot of this test is linear");
         }
     });
 }
@@ -171,6 +185,40 @@ fn added_entries_without_an_identifiable_parameter_are_dropped() {
     drop_unidentifiable(&mut file, &ModelFile::default(), &unknowns, &[false, true]);
     let left: Vec<_> = file.effects.iter().map(|entry| entry.effect.name).collect();
     assert_eq!(left, ["coulomb_friction"]);
+}
+
+#[test]
+fn parameters_of_effects_that_a_model_already_has_belong_to_their_own_entries() {
+    let (payload, saturation) = (named("payload"), named("torque_saturation"));
+    let known = [("hip", 20.0), ("thigh", 25.0), ("calf", 30.0)].map(|(scope, kappa)| {
+        let scope: Scope = scope.parse().expect("a scope");
+        EffectEntry::new(saturation, scope, vec![kappa]).expect("an allowed value")
+    });
+    let effects: Vec<_> =
+        std::iter::once((payload, Scope::Base)).chain(known.iter().map(|entry| (saturation, entry.scope))).collect();
+    let model = ModelFile { effects: known.to_vec(), ..ModelFile::default() };
+    let (file, unknowns) = free_parameters(&model, &effects).expect("no conflict");
+    let found: Vec<f64> =
+        unknowns.iter().map(|unknown| unknown.value(initial_coordinate(&file, unknown)).round()).collect();
+    assert_eq!(found, [0.0, 0.0, 0.0, 0.0, 20.0, 25.0, 30.0]);
+}
+
+#[test]
+fn search_starts_from_the_values_of_an_earlier_model() {
+    let scope = "FL_hip".parse::<Scope>().expect("a scope");
+    let effects = [(named("viscous_friction"), scope), (named("coulomb_friction"), scope)];
+    let entry = |index: usize, value: f64| EffectEntry::new(effects[index].0, scope, vec![value]).expect("allowed");
+    let earlier = ModelFile { effects: vec![entry(0, 0.2), entry(1, 0.5)], ..ModelFile::default() };
+    let values = |start: Option<ModelFile>| {
+        let options = IdentifyOptions { start, ..IdentifyOptions::default() };
+        // Interrupted before the search.
+        let mut stop = |_, _, _| false;
+        let found = identify(&ModelFile::default(), &effects, &[experiment()], &mut Linear, &options, &mut stop);
+        found.expect("a linear robot").findings.iter().map(|finding| finding.value).collect::<Vec<_>>()
+    };
+    let found = values(Some(earlier));
+    assert!((found[0] - 0.2).abs() < 1e-9 && (found[1] - 0.5).abs() < 1e-9, "{found:?}");
+    assert_eq!(values(None), [0.0, 0.0]);
 }
 
 /// Returns the free parameters of an effect on its widest scope.

@@ -17,10 +17,12 @@
 //! SI units, radians, seconds. The docs of each vector give its frame, world or base. The base frame is fixed to the
 //! trunk: x forward, y left, z up. Quaternions in arrays are `[w, x, y, z]` and rotate from base to world.
 
+mod agent_commands;
 mod backend;
 mod base_mount;
 mod body;
 mod command;
+mod command_bounds;
 pub mod dynamics;
 mod foot_kinematics;
 pub mod frames;
@@ -44,6 +46,7 @@ mod stream;
 mod trajectory;
 mod vec_env;
 
+pub use agent_commands::{AgentCommands, GaitCommand, VelocityCommand};
 pub use backend::{
     Actuator, ActuatorMode, ActuatorSnapshot, ActuatorTap, Backend, BackendError, EpistemicUncertainty, Restorable,
     Simulator,

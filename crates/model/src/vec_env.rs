@@ -2,10 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{BackendError, EnvSpec, RealTimeReport, RobotSample, Scene, SpecField};
-
-/// Name of the part of the observation that a client may set.
-const VELOCITY_COMMAND: &str = "velocity_command";
+use crate::{BackendError, EnvSpec, GaitCommand, RealTimeReport, RobotSample, Scene, VelocityCommand};
 
 /// Batch of environments of one task, in this process or on a server.
 ///
@@ -38,8 +35,17 @@ pub trait VecEnv: Send {
     /// They are in force from the next step on, also in later episodes, until they are set again. A step that is rejected
     /// discards those that were set since the last step. Fails if the task has no velocity command, or if one is not
     /// finite or outside the bounds of `velocity_command` in the spec.
-    fn set_velocity_commands(&mut self, _commands: &[[f32; 3]]) -> Result<(), EnvError> {
+    fn set_velocity_commands(&mut self, _commands: &[VelocityCommand]) -> Result<(), EnvError> {
         Err(EnvError::NoVelocityCommand { task: self.spec().task.clone() })
+    }
+
+    /// Replaces the gait commands of the task: step frequency [Hz], phases of FR, RL and RR relative to FL [cycles], one
+    /// per environment.
+    ///
+    /// They are in force as velocity commands are. Fails if the task has no gait command, or if one is not finite or
+    /// outside the bounds of `step_frequency` and `phase_offset` in the spec.
+    fn set_gait_commands(&mut self, _commands: &[GaitCommand]) -> Result<(), EnvError> {
+        Err(EnvError::NoGaitCommand { task: self.spec().task.clone() })
     }
 
     /// Sets the policy period for which the actions of the next step are. Default: that of the last observation.
@@ -75,27 +81,6 @@ pub trait VecEnv: Send {
     /// Sampling begins with the first call, which returns no sample. A reset removes the samples.
     fn samples(&mut self, _env: usize) -> Result<Vec<RobotSample>, EnvError> {
         Err(EnvError::SamplesUnsupported { task: self.spec().task.clone() })
-    }
-}
-
-impl EnvSpec {
-    /// Checks velocity commands, one per environment, against the bounds of `velocity_command`.
-    pub fn check_velocity_commands(&self, commands: &[[f32; 3]], num_envs: usize) -> Result<(), EnvError> {
-        let field = self.observation_field(VELOCITY_COMMAND).map(|(_, field)| field).filter(|field| field.size == 3);
-        let Some(SpecField { low, high, .. }) = field else {
-            return Err(EnvError::NoVelocityCommand { task: self.task.clone() });
-        };
-        if commands.len() != num_envs {
-            let (given, expected) = (3 * commands.len(), 3 * num_envs);
-            return Err(EnvError::WrongLength { field: "command", given, expected });
-        }
-        match commands.iter().flatten().enumerate().find(|(_, value)| !(*low..=*high).contains(value)) {
-            Some((index, &value)) => {
-                let (env, entry) = (index / 3, format!("{VELOCITY_COMMAND}[{}]", index % 3));
-                Err(EnvError::VelocityCommand { env, entry, value, low: *low, high: *high })
-            }
-            None => Ok(()),
-        }
     }
 }
 
@@ -241,11 +226,19 @@ pub enum EnvError {
         /// The task.
         task: String,
     },
-    /// A velocity command is not finite or too large. No environment was stepped.
+    /// The task has no gait command.
+    #[error("the task `{task}` has no gait command")]
+    NoGaitCommand {
+        /// The task.
+        task: String,
+    },
+    /// A command is not finite, or outside its bounds. No environment was stepped.
     #[error(
-        "`command` of environment {env}: {entry} is {value}; {low} to {high} is allowed; no environment was stepped"
+        "`{field}` of environment {env}: {entry} is {value}; {low} to {high} is allowed; no environment was stepped"
     )]
-    VelocityCommand {
+    CommandOutOfRange {
+        /// The field of the step request: `command` or `gait_command`.
+        field: &'static str,
         /// The environment.
         env: usize,
         /// Name of the entry, such as `velocity_command[0]`.

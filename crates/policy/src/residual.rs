@@ -1,6 +1,9 @@
 //! A residual on the actions of a frozen base policy (U2E, eq. 12): its environments, and both as one policy.
 
-use twinstep_model::{EnvError, EnvSpec, RealTimeReport, ResetRequest, RobotSample, Scene, StepBatch, VecEnv};
+use twinstep_model::{
+    AgentCommands, EnvError, EnvSpec, GaitCommand, RealTimeReport, ResetRequest, RobotSample, Scene, StepBatch, VecEnv,
+    VelocityCommand,
+};
 
 use crate::mlp::Mlp;
 use crate::policy::{Policy, PolicyRunner};
@@ -26,8 +29,8 @@ pub struct ResidualEnv {
     max_residual: f32,
     /// Action of the base policy in each environment.
     base_actions: Vec<f32>,
-    /// Velocity commands that were set since the last step.
-    next_velocity_commands: Option<Vec<[f32; 3]>>,
+    /// Commands that were set since the last step.
+    next_commands: AgentCommands,
 }
 
 impl ResidualEnv {
@@ -44,7 +47,7 @@ impl ResidualEnv {
         }
         let base_actions = vec![0.0; env.num_envs() * spec.action_len()];
         let base = PolicyRunner::new(base);
-        Ok(Self { base, env, spec, max_residual, base_actions, next_velocity_commands: None })
+        Ok(Self { base, env, spec, max_residual, base_actions, next_commands: AgentCommands::default() })
     }
 }
 
@@ -73,9 +76,15 @@ impl VecEnv for ResidualEnv {
         self.env.critic_obs()
     }
 
-    fn set_velocity_commands(&mut self, commands: &[[f32; 3]]) -> Result<(), EnvError> {
+    fn set_velocity_commands(&mut self, commands: &[VelocityCommand]) -> Result<(), EnvError> {
         self.spec.check_velocity_commands(commands, self.num_envs())?;
-        self.next_velocity_commands = Some(commands.to_vec());
+        self.next_commands.velocity = Some(commands.to_vec());
+        Ok(())
+    }
+
+    fn set_gait_commands(&mut self, commands: &[GaitCommand]) -> Result<(), EnvError> {
+        self.spec.check_gait_commands(commands, self.num_envs())?;
+        self.next_commands.gait = Some(commands.to_vec());
         Ok(())
     }
 
@@ -88,7 +97,7 @@ impl VecEnv for ResidualEnv {
     }
 
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
-        let velocity_commands = self.next_velocity_commands.take();
+        let commands = std::mem::take(&mut self.next_commands);
         let expected = self.base_actions.len();
         if actions.len() != expected {
             return Err(EnvError::WrongLength { field: "actions", given: actions.len(), expected });
@@ -98,8 +107,11 @@ impl VecEnv for ResidualEnv {
             let entry = self.spec.action_entry(entry);
             return Err(EnvError::ActionNotFinite { env, entry, value: actions[index] });
         }
-        if let Some(commands) = velocity_commands {
+        if let Some(commands) = commands.velocity {
             self.env.set_velocity_commands(&commands)?;
+        }
+        if let Some(commands) = commands.gait {
+            self.env.set_gait_commands(&commands)?;
         }
         self.base.run(self.env.obs(), &mut self.base_actions);
         for (action, residual) in self.base_actions.iter_mut().zip(actions) {

@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use twinstep_model::{
-    AutoresetMode, EnvError, EnvSpec, RealTimeReport, ResetRequest, RobotSample, Scene, StepBatch, VecEnv,
+    AutoresetMode, EnvError, EnvSpec, GaitCommand, RealTimeReport, ResetRequest, RobotSample, Scene, StepBatch, VecEnv,
+    VelocityCommand,
 };
 
 use crate::frame::{Frame, RobotFrame};
@@ -85,8 +86,12 @@ impl VecEnv for WatchedVecEnv {
         self.env.critic_obs()
     }
 
-    fn set_velocity_commands(&mut self, commands: &[[f32; 3]]) -> Result<(), EnvError> {
+    fn set_velocity_commands(&mut self, commands: &[VelocityCommand]) -> Result<(), EnvError> {
         self.env.set_velocity_commands(commands)
+    }
+
+    fn set_gait_commands(&mut self, commands: &[GaitCommand]) -> Result<(), EnvError> {
+        self.env.set_gait_commands(commands)
     }
 
     fn set_action_tick(&mut self, tick: u64) {

@@ -112,7 +112,7 @@ proptest! {
         let (seeds, mask) = (seeds.as_deref(), mask.as_deref());
         round_trips(&ResetRequest { protocol, epoch, seq, seeds, mask }, &mut Vec::new());
         round_trips(&ResetReply { protocol, seq, obs: &bytes, critic_obs: &bytes, tick, stamp_ns: tick }, &mut Vec::new());
-        round_trips(&StepRequest { protocol, epoch, seq, actions: &bytes, command: None, for_tick: tick }, &mut Vec::new());
+        round_trips(&StepRequest { protocol, epoch, seq, actions: &bytes, command: None, gait_command: None, for_tick: tick }, &mut Vec::new());
         let policy = RolloutPolicy { sizes: vec![epoch, seq], weights: &bytes, mean: &bytes, std: &bytes, log_std: &bytes };
         for (policy, policy_id) in [(Some(policy), None), (None, Some(epoch))] {
             let request = RolloutRequest { protocol, epoch, seq, steps: seq, noise_seed: epoch, policy, policy_id };

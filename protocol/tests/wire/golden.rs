@@ -18,7 +18,7 @@ use twinstep_protocol::tensor::as_bytes;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, decode, encode};
 
 /// Name of every golden file, without `.msgpack`.
-pub const NAMES: [&str; 32] = [
+pub const NAMES: [&str; 33] = [
     "hello_request",
     "hello_reply",
     "hello_reply_real_time",
@@ -34,6 +34,7 @@ pub const NAMES: [&str; 32] = [
     "reset_reply_real_time",
     "step_request",
     "step_request_command",
+    "step_request_gait",
     "step_request_real_time",
     "step_reply",
     "step_reply_ended",
@@ -205,10 +206,13 @@ fn reset_has_its_golden_bytes() {
 fn step_has_its_golden_bytes() {
     let actions = [0.5f32, -0.5, 1.0, -1.0];
     let (actions, command, for_tick) = (as_bytes(&actions), None, None);
-    let request = StepRequest { protocol: PROTOCOL, epoch: 1, seq: 2, actions, command, for_tick };
+    let gait_command = None;
+    let request = StepRequest { protocol: PROTOCOL, epoch: 1, seq: 2, actions, command, gait_command, for_tick };
     check("step_request", &request);
     let commands = [0.5f32, 0.0, -0.25, 0.0, 0.125, 1.0];
     check("step_request_command", &StepRequest { command: Some(as_bytes(&commands)), ..request.clone() });
+    let gaits = [2.5f32, 0.5, 0.5, 0.0, 3.5, 0.0, 0.5, 0.5];
+    check("step_request_gait", &StepRequest { gait_command: Some(as_bytes(&gaits)), ..request.clone() });
     check("step_request_real_time", &StepRequest { for_tick: Some(70), ..request });
     let obs = [0.0f32, 0.0, -1.0, 0.25, -0.5, 0.0, 0.0, -1.0, 0.0, 0.125];
     let running = StepReply {

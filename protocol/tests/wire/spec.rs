@@ -60,7 +60,7 @@ fn tables_have_exactly_the_fields_of_the_messages() {
         ("### lease reply", &["lease_reply"]),
         ("### reset request", &["reset_request"]),
         ("### reset reply", &["reset_reply_critic", "reset_reply_real_time"]),
-        ("### step request", &["step_request_command", "step_request_real_time"]),
+        ("### step request", &["step_request_command", "step_request_gait", "step_request_real_time"]),
         ("### step reply", &["step_reply_critic", "step_reply_real_time"]),
         ("### rollout request", &["rollout_request", "rollout_request_held"]),
         ("### rollout reply", &["rollout_reply_critic"]),

@@ -10,7 +10,9 @@ use clap::Parser;
 use indicatif::ProgressBar;
 use twinstep_effects::{Effect, ModelFile, Scope};
 use twinstep_envs::{TaskEnv, Walk, WalkConfig};
-use twinstep_excite::{CommandSequence, Criterion, DesignOptions, Limits, Unknowns, design, simulate, walking_env};
+use twinstep_excite::{
+    CommandRanges, CommandSequence, Criterion, DesignOptions, Limits, Unknowns, design, simulate, walking_env,
+};
 use twinstep_identify::{CmaEs, Experiment, Identification, IdentifyOptions, WindowConfig, apply_sensors, identify};
 use twinstep_logs::Log;
 use twinstep_model::{RobotModel, Simulator, go2};
@@ -106,7 +108,10 @@ fn sequence(method: &str, args: &Args, policy: &Policy, rollouts: &mut BatchRoll
     let options = DesignOptions {
         segment_s: SEGMENT_S,
         segments,
-        ranges: [command.linear_velocity_x, command.linear_velocity_y, command.angular_velocity_z],
+        ranges: CommandRanges {
+            velocity: [command.linear_velocity_x, command.linear_velocity_y, command.angular_velocity_z],
+            step_frequency: None,
+        },
         limits: Limits { room_m: 3.0, max_saturated: 0.05, max_rms_torque_nm: 15.0 },
         criterion: method.parse().unwrap_or(Criterion::DOptimal),
         candidates: if method == "random" { 0 } else { args.candidates },

@@ -162,8 +162,15 @@ fn query_echo(
     let querier = declare_querier(&session, ECHO_KEY, case != Case::Batched)?;
     let actions = vec![0.1f32; envs * ACTION_LEN];
     let actions = tensor::as_bytes(&actions);
-    let request =
-        encode(&message::StepRequest { protocol: PROTOCOL, epoch: 1, seq: 1, actions, command: None, for_tick: None });
+    let request = encode(&message::StepRequest {
+        protocol: PROTOCOL,
+        epoch: 1,
+        seq: 1,
+        actions,
+        command: None,
+        gait_command: None,
+        for_tick: None,
+    });
     run_queries(&querier, Secret::random(), round_trips, case, envs, |_| request.clone())
 }
 
@@ -200,6 +207,7 @@ fn query_twinstep(round_trips: usize, folder: &SecurityFolder, endpoint: &str, e
             seq: 2 + answered as u64,
             actions,
             command: None,
+            gait_command: None,
             for_tick: None,
         })
     })

@@ -5,18 +5,16 @@
 //! same command continues after an interruption. `ledger.csv` has the command and the time of each step.
 
 use std::fmt::Write as _;
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
-use std::process::{Command, ExitCode};
-use std::time::Instant;
+use std::process::ExitCode;
 
 use clap::Parser;
-use serde_json::Value;
 use twinstep_effects::ModelFile;
 use twinstep_ensemble::check_effects;
 use twinstep_logs::TorqueSensor;
 use twinstep_tests::process::Process;
 use twinstep_tests::python::root;
+use twinstep_tests::resumable::{Resumable, Step, number, read, start, text};
 
 /// Compare methods on a hidden robot, for one seed.
 #[derive(Parser)]
@@ -77,9 +75,6 @@ const LAWS: &str = "command_delay@all,drive_lag@all,torque_saturation@all,torque
 /// Rows from which they are identified [s].
 const LAWS_UNTIL: &str = "12";
 
-/// Result of a step; the error says which command failed.
-type Step<T = ()> = Result<T, String>;
-
 fn main() -> ExitCode {
     let args = Args::parse();
     match Campaign::new(args).and_then(|campaign| campaign.run()) {
@@ -97,20 +92,16 @@ fn main() -> ExitCode {
 /// The steps and their folder.
 struct Campaign {
     args: Args,
-    twinstep: PathBuf,
+    commands: Resumable,
     hidden: PathBuf,
 }
 
 impl Campaign {
     fn new(mut args: Args) -> Step<Self> {
-        // The commands run in the folder of the repository.
-        args.out = std::path::absolute(&args.out).map_err(text)?;
         args.hidden = args.hidden.map(std::path::absolute).transpose().map_err(text)?;
-        std::fs::create_dir_all(&args.out).map_err(text)?;
-        let program = std::env::current_exe().map_err(text)?;
-        let twinstep = program.with_file_name("twinstep");
+        let commands = Resumable::new(&args.out)?;
         let hidden = args.hidden.clone().unwrap_or_else(|| root().join("examples/u2e/hidden.toml"));
-        Ok(Self { args, twinstep, hidden })
+        Ok(Self { args, commands, hidden })
     }
 
     fn run(&self) -> Step<String> {
@@ -128,37 +119,11 @@ impl Campaign {
     }
 
     fn path(&self, name: &str) -> PathBuf {
-        self.args.out.join(name)
+        self.commands.path(name)
     }
 
     fn seed(&self) -> String {
         self.args.seed.to_string()
-    }
-
-    /// Runs `twinstep` with `--out`, unless its result exists. A training that was interrupted continues.
-    fn step(&self, result: &Path, arguments: &[&str], out: &Path) -> Step {
-        if result.exists() {
-            return Ok(());
-        }
-        let out = out.display().to_string();
-        if Path::new(&out).join("checkpoint.safetensors").exists() {
-            return self.twinstep(&["train", "--resume", "--out", &out]).map(drop);
-        }
-        self.twinstep(&[arguments, &["--out", &out]].concat()).map(drop)
-    }
-
-    /// Runs `twinstep` and returns its stdout. Adds its time to the ledger.
-    fn twinstep(&self, arguments: &[&str]) -> Step<String> {
-        let (start, line) = (Instant::now(), arguments.join(" "));
-        eprintln!("twinstep {line}");
-        let output = Command::new(&self.twinstep).args(arguments).current_dir(root()).output().map_err(text)?;
-        if !output.status.success() {
-            return Err(format!("twinstep {line}: {}", String::from_utf8_lossy(&output.stderr)));
-        }
-        let mut ledger =
-            std::fs::OpenOptions::new().append(true).create(true).open(self.path("ledger.csv")).map_err(text)?;
-        writeln!(ledger, "{:.1},twinstep {line}", start.elapsed().as_secs_f64()).map_err(text)?;
-        Ok(String::from_utf8_lossy(&output.stdout).into_owned())
     }
 
     /// Starts the hidden robot with a task. Returns its endpoint.
@@ -174,7 +139,7 @@ impl Campaign {
             .chain(&["--lease-grace-s", "0.1", "--until-stdin-closes"])
             .map(ToString::to_string)
             .collect();
-        Process::listening(&self.twinstep, &arguments)
+        Process::listening(&self.commands.twinstep, &arguments)
     }
 
     /// Records the held-out jumps, then runs the loop for each way of collecting logs.
@@ -187,7 +152,7 @@ impl Campaign {
             for jump in 0..JUMPS {
                 let (log, seed) = (partial.join(jump.to_string()).display().to_string(), (1000 + jump).to_string());
                 let run = ["run", "data/policies/jump.safetensors", "--endpoint", &endpoint, "--torque", "--fast"];
-                self.twinstep(&[&run[..], &["--seconds", JUMP_S, "--seed", &seed, "--log", &log]].concat())?;
+                self.commands.run(&[&run[..], &["--seconds", JUMP_S, "--seed", &seed, "--log", &log]].concat())?;
             }
             merge_logs(&partial, JUMPS)?;
             std::fs::rename(&partial, &held_out).map_err(text)?;
@@ -196,7 +161,7 @@ impl Campaign {
         for method in COLLECTIONS {
             let config = self.path(&format!("{method}.toml"));
             std::fs::write(&config, self.config(method, &endpoint)).map_err(text)?;
-            self.twinstep(&["u2e", &config.display().to_string()])?;
+            self.commands.run(&["u2e", &config.display().to_string()])?;
         }
         Ok(())
     }
@@ -226,7 +191,7 @@ impl Campaign {
         fit.extend(logs_of_random.iter().map(String::as_str));
         let seed = self.seed();
         fit.extend(["--members", "1", "--epochs", &epochs, "--seed", &seed]);
-        self.step(&single, &fit, &single)?;
+        self.commands.step(&single, &fit, &single)?;
         std::fs::write(self.path("single.toml"), "robot = \"go2\"\n[actuator]\nensemble = \"single.safetensors\"\n")
             .map_err(text)?;
         let (laws, partial) = (self.path("laws.toml"), self.path("laws.partial.toml"));
@@ -234,7 +199,7 @@ impl Campaign {
             let log = logs("explore").pop().ok_or("there is a log")?;
             let out = partial.display().to_string();
             let seed = self.seed();
-            self.twinstep(&[
+            self.commands.run(&[
                 "identify",
                 &log,
                 "--until",
@@ -276,7 +241,7 @@ impl Campaign {
             vec!["train", task, "--config", &config, "--from", &from, "--steps", &steps, "--seed", &seed];
         let model = model.map(|path| path.display().to_string());
         arguments.extend(model.iter().flat_map(|model| ["--model", model.as_str()]));
-        self.step(&out.join("evaluation.json"), &arguments, &out)
+        self.commands.step(&out.join("evaluation.json"), &arguments, &out)
     }
 
     /// Evaluates a policy on the hidden robot.
@@ -291,7 +256,7 @@ impl Campaign {
             _ => ("mujoco", 3),
         };
         let (robots, seconds) = (self.args.robots.to_string(), seconds.to_string());
-        let json = self.twinstep(&[
+        let json = self.commands.run(&[
             "evaluate-policy",
             &policy,
             "--engine",
@@ -352,11 +317,6 @@ impl Campaign {
     }
 }
 
-/// Returns the policy from which every method trains a task.
-fn start(task: &str) -> PathBuf {
-    root().join(format!("data/policies/{task}.safetensors"))
-}
-
 /// Merges the logs `0` to `count − 1` in `folder` into one log there: each is an episode.
 fn merge_logs(folder: &Path, count: u64) -> Step {
     let (mut merged, mut start) = (String::new(), 0.0);
@@ -380,17 +340,4 @@ fn merge_logs(folder: &Path, count: u64) -> Step {
         std::fs::remove_dir_all(&path).map_err(text)?;
     }
     std::fs::write(folder.join("data.csv"), merged).map_err(text)
-}
-
-fn read(path: &Path) -> Step<Value> {
-    let content = std::fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))?;
-    serde_json::from_str(&content).map_err(|error| format!("{}: {error}", path.display()))
-}
-
-fn number(value: &Value) -> f64 {
-    value.as_f64().unwrap_or(f64::NAN)
-}
-
-fn text(error: impl std::fmt::Display) -> String {
-    error.to_string()
 }

@@ -60,7 +60,7 @@ impl Message {
                     let expected = NUM_ENVS * GOLDEN_SPEC.action_len();
                     convert::check_length("actions", request.actions.len() / size_of::<f32>(), expected).is_ok()
                         && tensor::read::<f32>(request.actions, "actions").is_ok()
-                        && request.command.is_none_or(|bytes| convert::read_commands(bytes, NUM_ENVS).is_ok())
+                        && convert::read_commands(&request, NUM_ENVS).is_ok()
                 })
             }
             Message::StepReply => then::<StepReply<'_>>(bytes, |reply| {

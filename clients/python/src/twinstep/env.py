@@ -150,6 +150,17 @@ class Go2Env(NotPicklable, gymnasium.Env[NDArray[np.float32], NDArray[np.float32
         """
         self._remote.set_velocity_commands(np.asarray(command)[None])
 
+    def set_gait_command(self, command: NDArray[np.float32]) -> None:
+        """Set the gait command of every later step and episode of the task ``gait``, in place of the task's own.
+
+        Parameters
+        ----------
+        command : (4,) float32
+            Step frequency [Hz], phases of FR, RL and RR relative to FL [cycles], within the bounds of
+            ``step_frequency`` and ``phase_offset`` in the spec. A server that is older than this command ignores it.
+        """
+        self._remote.set_gait_commands(np.asarray(command)[None])
+
     def send(self, action: NDArray[np.float32]) -> None:
         """Send an action without waiting. Call :meth:`recv` next."""
         given = np.asarray(action)

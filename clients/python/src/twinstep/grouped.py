@@ -11,7 +11,7 @@ from .options import ConnectOptions
 from .pickling import NotPicklable
 from .remote import RemoteVecEnv
 from .shard_merge import divide, merge
-from .step import StepBatch, checked_actions, checked_velocity_commands
+from .step import StepBatch, checked_actions, checked_gait_commands, checked_velocity_commands
 
 
 class GroupedVecEnv(NotPicklable):
@@ -135,6 +135,12 @@ class GroupedVecEnv(NotPicklable):
         for group, rows in zip(self._groups, self._rows, strict=True):
             group.set_velocity_commands(checked[rows])
 
+    def set_gait_commands(self, commands: NDArray[Any]) -> None:
+        """Set the gait commands of every later step, (num_envs, 4), in place of the task's own."""
+        checked = checked_gait_commands(commands, self.num_envs, self.spec)
+        for group, rows in zip(self._groups, self._rows, strict=True):
+            group.set_gait_commands(checked[rows])
+
     def send(self, group: int, actions: NDArray[Any]) -> None:
         """Send the actions of a group, (rows of the group, action_len), without waiting. Call :meth:`recv` next."""
         if group in self._received:
@@ -228,6 +234,7 @@ class AllGroups:
         self.spec = self._envs.spec
         self.reset = self._envs.reset
         self.set_velocity_commands = self._envs.set_velocity_commands
+        self.set_gait_commands = self._envs.set_gait_commands
         self.send = self._envs.send_all
         self.recv = self._envs.recv_all
         self.scene = self._envs.scene

@@ -21,7 +21,14 @@ from .pickling import NotPicklable
 from .query import Pending
 from .rollout import GaussianPolicy, Trajectory, encode_policy, read_trajectory
 from .server import EmbeddedServer
-from .step import StepBatch, checked_actions, checked_velocity_commands, read_critic, read_step
+from .step import (
+    StepBatch,
+    checked_actions,
+    checked_gait_commands,
+    checked_velocity_commands,
+    read_critic,
+    read_step,
+)
 
 _CONSUMES_SEQ = ("internal", "rollout_failed")
 
@@ -109,7 +116,8 @@ class RemoteVecEnv(NotPicklable):
         self._pending: tuple[str, int, Pending, float] | None = None
         # Why the state of the environments is unknown: a reply was lost. A reset of all of them heals it.
         self._unknown: str | None = None
-        self._commands: bytes | None = None
+        # Fields of every step request: commands in place of the task's own.
+        self._commands: dict[str, object] = {}
         # Encoded policy that the server holds, and its id.
         self._held_policy: tuple[dict[str, object], int] | None = None
         # Request of the rollout in progress.
@@ -172,7 +180,11 @@ class RemoteVecEnv(NotPicklable):
 
     def set_velocity_commands(self, commands: NDArray[Any]) -> None:
         """Set the velocity commands of every later step, (num_envs, 3), in place of the task's own."""
-        self._commands = checked_velocity_commands(commands, self.num_envs, self.spec).tobytes()
+        self._commands["command"] = checked_velocity_commands(commands, self.num_envs, self.spec).tobytes()
+
+    def set_gait_commands(self, commands: NDArray[Any]) -> None:
+        """Set the gait commands of every later step, (num_envs, 4), in place of the task's own."""
+        self._commands["gait_command"] = checked_gait_commands(commands, self.num_envs, self.spec).tobytes()
 
     def send(self, actions: NDArray[Any]) -> None:
         """Send actions without waiting, so that the caller can compute during the step. Call :meth:`recv` next."""
@@ -183,9 +195,7 @@ class RemoteVecEnv(NotPicklable):
             )
         self._check_known()
         request: dict[str, object] = {"actions": checked_actions(actions, self.num_envs, self.spec).tobytes()}
-        if self._commands is not None:
-            request["command"] = self._commands
-        self._send("step", request)
+        self._send("step", request | self._commands)
 
     def recv(self, timeout_s: float | None = None) -> StepBatch:
         """Wait for the result of the actions. May be called again after a :class:`RequestTimeoutError`.

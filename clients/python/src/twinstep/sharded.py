@@ -18,7 +18,7 @@ from .remote import RemoteVecEnv
 from .session import QUERY_TIMEOUT_S, check_process
 from .shard import Shard, same_spec, server_options, stop_recoveries
 from .shard_merge import divide, merge
-from .step import StepBatch, checked_actions, checked_velocity_commands
+from .step import StepBatch, checked_actions, checked_gait_commands, checked_velocity_commands
 
 _LOG = logging.getLogger(__name__)
 
@@ -83,6 +83,7 @@ class ShardedVecEnv(NotPicklable):
             raise
         self._actions: NDArray[np.float32] | None = None
         self._commands: NDArray[np.float32] | None = None
+        self._gait_commands: NDArray[np.float32] | None = None
         self._sent_at = 0.0
         self._obs = np.zeros((num_envs, self.spec.obs_len), np.float32)
         self.critic_obs = np.zeros((num_envs, self.spec.critic_len), np.float32)
@@ -132,6 +133,10 @@ class ShardedVecEnv(NotPicklable):
     def set_velocity_commands(self, commands: NDArray[Any]) -> None:
         """Set the velocity commands of every later step, (num_envs, 3), in place of the task's own."""
         self._commands = checked_velocity_commands(commands, self.num_envs, self.spec)
+
+    def set_gait_commands(self, commands: NDArray[Any]) -> None:
+        """Set the gait commands of every later step, (num_envs, 4), in place of the task's own."""
+        self._gait_commands = checked_gait_commands(commands, self.num_envs, self.spec)
 
     def send(self, actions: NDArray[Any]) -> None:
         """Send actions to all servers without waiting. Call :meth:`recv` next."""
@@ -212,6 +217,8 @@ class ShardedVecEnv(NotPicklable):
                     # Another server may have taken over the environments since they were set.
                     if self._commands is not None:
                         shard.remote.set_velocity_commands(self._commands[shard.rows])
+                    if self._gait_commands is not None:
+                        shard.remote.set_gait_commands(self._gait_commands[shard.rows])
                     shard.remote.send(self._actions[shard.rows])
                 except ForkedProcessError:
                     raise

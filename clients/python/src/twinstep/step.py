@@ -82,19 +82,35 @@ def checked_actions(actions: NDArray[Any], num_envs: int, spec: codec.Spec) -> N
 
 def checked_velocity_commands(commands: NDArray[Any], num_envs: int, spec: codec.Spec) -> NDArray[np.float32]:
     """Return velocity commands, (num_envs, 3) within the bounds of the spec, as contiguous little-endian float32."""
-    parts = [part for part in spec.observation if part.name == "velocity_command" and part.size == 3]
-    if not parts:
-        raise InvalidOptionError(f"the task `{spec.task}` has no velocity command")
+    return _checked_commands(commands, num_envs, spec, "velocity", {"velocity_command": 3})
+
+
+def checked_gait_commands(commands: NDArray[Any], num_envs: int, spec: codec.Spec) -> NDArray[np.float32]:
+    """Return gait commands, (num_envs, 4) within the bounds of the spec, as contiguous little-endian float32."""
+    return _checked_commands(commands, num_envs, spec, "gait", {"step_frequency": 1, "phase_offset": 3})
+
+
+def _checked_commands(
+    commands: NDArray[Any], num_envs: int, spec: codec.Spec, kind: str, sizes: dict[str, int]
+) -> NDArray[np.float32]:
+    """Return commands whose entries are the parts of the observation with these names and sizes."""
+    parts = [part for part in spec.observation if sizes.get(part.name) == part.size]
+    if len(parts) != len(sizes):
+        raise InvalidOptionError(f"the task `{spec.task}` has no {kind} command")
+    entries = [
+        (part.name if part.size == 1 else f"{part.name}[{index}]", part.low, part.high)
+        for part in parts
+        for index in range(part.size)
+    ]
     checked = np.ascontiguousarray(commands, dtype="<f4")
-    if checked.shape != (num_envs, 3):
-        raise InvalidOptionError(f"`commands` has shape {checked.shape}; {(num_envs, 3)} is expected")
-    low, high = parts[0].low, parts[0].high
-    allowed = (checked >= low) & (checked <= high)
+    if checked.shape != (num_envs, len(entries)):
+        raise InvalidOptionError(f"`commands` has shape {checked.shape}; {(num_envs, len(entries))} is expected")
+    allowed = (checked >= [low for _, low, _ in entries]) & (checked <= [high for _, _, high in entries])
     if not allowed.all():
         env, entry = (int(index) for index in np.argwhere(~allowed)[0])
+        name, low, high = entries[entry]
         raise InvalidOptionError(
-            f"`commands` of environment {env}: velocity_command[{entry}] is {checked[env, entry]}; "
-            f"{low:g} to {high:g} is allowed"
+            f"`commands` of environment {env}: {name} is {checked[env, entry]}; {low:g} to {high:g} is allowed"
         )
     return checked
 

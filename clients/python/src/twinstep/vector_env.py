@@ -160,6 +160,18 @@ class Go2VectorEnv(NotPicklable, VectorEnv[NDArray[np.float32], NDArray[np.float
         """
         self._remote.set_velocity_commands(commands)
 
+    def set_gait_commands(self, commands: NDArray[np.float32]) -> None:
+        """Set the gait commands of every later step and episode of the task ``gait``, in place of the task's own.
+
+        Parameters
+        ----------
+        commands : (num_envs, 4) float32
+            Step frequency [Hz], phases of FR, RL and RR relative to FL [cycles], within the bounds of
+            ``step_frequency`` and ``phase_offset`` in the spec. A server that is older than these commands ignores
+            them.
+        """
+        self._remote.set_gait_commands(commands)
+
     def send(self, actions: NDArray[np.float32]) -> None:
         """Send actions without waiting, so that the caller can compute during the step. Call :meth:`recv` next."""
         self._remote.send(actions)

@@ -4,7 +4,7 @@
 //! it needs motion capture.
 
 use rand::RngExt;
-use twinstep_model::{EnvSpec, FootKinematics, GroundTruth, PerJoint, RobotModel, SpecField, Stream};
+use twinstep_model::{EnvSpec, FootKinematics, GaitCommand, GroundTruth, PerJoint, RobotModel, SpecField, Stream};
 
 use super::gait_clock::GaitClock;
 use super::gait_config::{GaitConfig, RewardWeights};
@@ -32,8 +32,8 @@ pub struct GaitTask {
 pub struct GaitState {
     walk: WalkState,
     clock: GaitClock,
-    /// Policy steps until the next gait.
-    steps_to_gait: u32,
+    /// Policy steps until the next gait; `None` while the agent sets it.
+    steps_to_gait: Option<u32>,
 }
 
 impl GaitTask {
@@ -109,7 +109,7 @@ impl Task for GaitTask {
         let (q, walk) = self.walk.start(random);
         let mut clock = GaitClock { phase: random.random(), ..GaitClock::default() };
         self.draw_gait(&mut clock, random);
-        (q, GaitState { walk, clock, steps_to_gait: random.random_range(1..=self.resample_steps) })
+        (q, GaitState { walk, clock, steps_to_gait: Some(random.random_range(1..=self.resample_steps)) })
     }
 
     fn observe(&self, state: &GaitState, robot: &RobotView, action: &PerJoint, obs: &mut [f32]) {
@@ -132,9 +132,9 @@ impl Task for GaitTask {
             let input = self.reward_input(&state.clock, &step.robot, truth);
             own.copy_from_slice(&self.config.reward.evaluate(&input));
         }
-        state.steps_to_gait -= 1;
-        if state.steps_to_gait == 0 {
-            state.steps_to_gait = self.resample_steps;
+        state.steps_to_gait = state.steps_to_gait.map(|steps| steps.saturating_sub(1));
+        if state.steps_to_gait == Some(0) {
+            state.steps_to_gait = Some(self.resample_steps);
             self.draw_gait(&mut state.clock, random);
         }
         has_fallen
@@ -146,6 +146,11 @@ impl Task for GaitTask {
 
     fn set_velocity_command(&self, state: &mut GaitState, command: [f32; 3]) {
         self.walk.set_velocity_command(&mut state.walk, command);
+    }
+
+    fn set_gait_command(&self, state: &mut GaitState, [step_frequency, phase_offset @ ..]: GaitCommand) {
+        state.clock = GaitClock { step_frequency, phase_offset, ..state.clock };
+        state.steps_to_gait = None;
     }
 }
 
