@@ -86,8 +86,9 @@ pub struct ForwardSelection<'a> {
 impl<'a> ForwardSelection<'a> {
     /// Runs forward selection with backward elimination.
     ///
-    /// Each round adds the best candidate and refits all causes. If none reaches the threshold, a cause that is too
-    /// small, implausible, or leaves much of the error of its own channels is removed and excluded.
+    /// Each round adds the best candidate and refits all causes. If none reaches the threshold, a cause that is
+    /// implausible or leaves much of the error of its own channels is removed and excluded. Causes that are too small are
+    /// removed at the end.
     pub fn run(&mut self) -> Result<(), DiagnoseError> {
         let mut excluded = Vec::new();
         for _ in 0..MOST_SEARCHES {
@@ -105,6 +106,12 @@ impl<'a> ForwardSelection<'a> {
             self.accepted.remove(place);
             self.refit();
         }
+        // Too small to report. They stay until here, because without them the others explain less.
+        let found = self.accepted.len();
+        self.accepted.retain(|(best, _)| best.hypothesis.exceeds_min_size());
+        if self.accepted.len() < found {
+            self.refit();
+        }
         Ok(())
     }
 
@@ -113,11 +120,8 @@ impl<'a> ForwardSelection<'a> {
         let WindowedData { evidence, given } = self.looked_at();
         let robot = self.model.robot_model().expect("fitted within its bounds");
         let left = evidence.residual_power(self.simulator, &robot);
-        let stands = |hypothesis: &Hypothesis| {
-            hypothesis.exceeds_min_size()
-                && hypothesis.is_plausible()
-                && explains_affected_channels(hypothesis, given, &left)
-        };
+        let stands =
+            |hypothesis: &Hypothesis| hypothesis.is_plausible() && explains_affected_channels(hypothesis, given, &left);
         self.accepted.iter().position(|(best, _)| !stands(&best.hypothesis))
     }
 
