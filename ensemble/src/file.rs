@@ -160,10 +160,14 @@ impl Ensemble {
 
 /// Returns what is wrong with the gains, or `None` if they are valid.
 fn bad_gains(EnsembleMetadata { joints, gains, input, .. }: &EnsembleMetadata) -> Option<String> {
-    let serves_all = *input == NetworkInput::Torque;
-    if joints.is_empty() || gains.len() != if serves_all { 0 } else { joints.len() } {
+    if *input == NetworkInput::Torque && !joints.is_empty() {
+        let given = gains.len();
+        return (given > 0)
+            .then(|| format!("has `gains` of {given} joints; none are expected with `input` = \"torque\""));
+    }
+    if joints.is_empty() || joints.len() != gains.len() {
         return Some(format!(
-            "has `gains` of {} joints, but {} joints; one pair per joint is expected, and none with input \"torque\"",
+            "has `gains` of {} joints, but {} joints; one pair per joint is expected",
             gains.len(),
             joints.len()
         ));

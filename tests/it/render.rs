@@ -33,7 +33,8 @@ fn remote_and_local_scenes_are_equal_and_rendering_does_not_change_the_episode()
             // What a server does not send is known in process only.
             let local = local.scene(env).unwrap();
             assert!(local.velocity.is_some() && local.torque.is_some() && local.foot_force.is_some());
-            let sent = Scene { velocity: None, torque: None, foot_force: None, ..local };
+            assert!(!local.reward_terms.is_empty());
+            let sent = Scene { velocity: None, torque: None, foot_force: None, reward_terms: Vec::new(), ..local };
             assert_eq!(remote.scene(env).unwrap(), sent, "step {step}, environment {env}");
         }
         let actions: Vec<f32> = (0..24).map(|index| ((step * 7 + index) as f32).sin()).collect();

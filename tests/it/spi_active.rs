@@ -101,7 +101,7 @@ fn invalid_settings_are_named_before_a_robot_moves() {
     let config = folder.path().join("spi.toml");
     let cases = [
         ("rounds = 1000\n", "`rounds` = 1000 is outside 0 to 100"),
-        ("method = \"best\"\n", "unknown variant `best`, expected one of `trace`, `d-optimal`, `random`"),
+        ("method = \"best\"\n", "unknown variant `best`, expected one of `trace`, `d-optimal`, `qoed`, `random`"),
         ("robots = 2\n", "unknown field `robots`"),
         ("room_m = nan\n", "`room_m` = NaN is outside 0.1 to 1000"),
         ("model = \"missing.toml\"\n", "missing.toml"),

@@ -78,8 +78,9 @@ impl Log {
                 row += 1;
             }
             let last = (row..rows.end - 1).find(|row| self.t[row + 1] >= t + dt - 1e-9).unwrap_or(rows.end - 1);
-            let has_gap = (row..last).any(|row| self.t[row + 1] - self.t[row] > longest);
-            if !has_gap {
+            let is_gap = |row: usize| row + 1 < rows.end && self.t[row + 1] - self.t[row] > longest;
+            let is_between_rows = t > self.t[row] + 1e-9;
+            if !(row..last).any(is_gap) && !(is_between_rows && is_gap(row)) {
                 samples.push(Sample { t, dt, row, last, next: (row + 1).min(rows.end - 1) });
             }
         }

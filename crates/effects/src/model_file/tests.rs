@@ -63,7 +63,7 @@ fn path_of_an_ensemble_is_relative_to_the_model_file_and_becomes_absolute() {
 #[test]
 fn errors_in_the_actuator_table_list_the_allowed_keys_and_values() {
     for (table, expected) in [
-        ("ensembles = \"e\"", "unknown field `ensembles`, expected one of `ensemble`, `draw`, `sample`"),
+        ("ensembles = \"e\"", "unknown field `ensembles`, expected one of `ensemble`, `mode`, `draw`, `sample`"),
         ("ensemble = \"e\"\ndraw = \"row\"", "unknown variant `row`, expected `episode` or `step`"),
         ("ensemble = \"e\"\nsample = 1", "invalid type: integer `1`, expected a boolean"),
         ("draw = \"step\"", "missing field `ensemble`"),
