@@ -69,7 +69,7 @@ pub fn learn(
             continue;
         }
         let held_out = data_set(logs, model, tap, &masks, true)?;
-        best = Some((q_after, tap, summary(&ensemble, [&data, held_out.as_ref().unwrap_or(&data)], [before, after])));
+        best = Some((q_after, tap, summary(&ensemble, &data, held_out.as_ref(), [before, after])));
     }
     let Some((_, tap, summary)) = best else { return Ok(None) };
     let all: Vec<Vec<bool>> = logs.iter().map(|log| vec![false; log.rows()]).collect();
@@ -160,7 +160,8 @@ fn errors_with(
 
 fn summary(
     ensemble: &Ensemble,
-    [training, held_out]: [&DataSet; 2],
+    training: &DataSet,
+    held_out: Option<&DataSet>,
     [before, after]: [RmsErrors; 2],
 ) -> LearnedResidual {
     let largest = |entry: usize| {
@@ -178,7 +179,8 @@ fn summary(
         after,
         max_torque_nm: largest(0),
         max_speed_rad_s: largest(1),
-        uncertainty_ratio: uncertainty(ensemble, held_out) / uncertainty(ensemble, training).max(f64::MIN_POSITIVE),
+        uncertainty_ratio: held_out
+            .map(|held_out| uncertainty(ensemble, held_out) / uncertainty(ensemble, training).max(f64::MIN_POSITIVE)),
     }
 }
 

@@ -46,8 +46,9 @@ pub struct LearnedResidual {
     /// Largest joint speed in the training data [rad/s].
     pub max_speed_rad_s: f64,
     /// Epistemic uncertainty on held-out rows, divided by that on rows of the training: how far the networks agree less
-    /// where they were not trained.
-    pub uncertainty_ratio: f64,
+    /// where they were not trained. `None` if the held-out rows are too few.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub uncertainty_ratio: Option<f64>,
 }
 
 /// Root mean square errors; null if they were not measured.

@@ -80,7 +80,8 @@ impl Log {
             let last = (row..rows.end - 1).find(|row| self.t[row + 1] >= t + dt - 1e-9).unwrap_or(rows.end - 1);
             let is_gap = |row: usize| row + 1 < rows.end && self.t[row + 1] - self.t[row] > longest;
             let is_between_rows = t > self.t[row] + 1e-9;
-            if !(row..last).any(is_gap) && !(is_between_rows && is_gap(row)) {
+            let has_gap = (row..last).any(is_gap) || (is_between_rows && is_gap(row));
+            if !has_gap {
                 samples.push(Sample { t, dt, row, last, next: (row + 1).min(rows.end - 1) });
             }
         }

@@ -85,13 +85,16 @@ pub fn learned_residual(diagnosis: &Diagnosis) -> String {
          <code>{ensemble}</code> have learned the missing torque from the torque that was asked for and the joint \
          velocity. The extended model adds it at <code>{tap}</code>, and every law stays.</p>\n<p>On held-out blocks, \
          on which they were not trained:</p>\n<ul>\n{}{}</ul>\n<p><strong>Where it does not know.</strong> The training \
-         data contain torques up to {torque} N·m and speeds up to {speed} rad/s. On the held-out blocks the networks \
-         disagree {} times as much as on their training data. Beyond these limits do not rely on them.</p>\n\
+         data contain torques up to {torque} N·m and speeds up to {speed} rad/s.{} Beyond these limits do not rely on \
+         them.</p>\n\
          <p><strong>What to do.</strong> Use the extended model for motions like these. A law that is missing from the \
          catalogue generalises better: look at what the residual depends on.</p>\n</section>\n",
         line("joint position [rad]", |errors| errors.q_rmse_rad),
         line("torque [N·m]", |errors| errors.torque_rmse_nm),
-        number(learned.uncertainty_ratio),
+        learned.uncertainty_ratio.map_or(String::new(), |ratio| format!(
+            " On the held-out blocks the networks disagree {} times as much as on their training data.",
+            number(ratio)
+        )),
     )
 }
 
