@@ -127,7 +127,7 @@ pub fn ranking(diagnosis: &Diagnosis) -> String {
          <tbody>\n{rows}</tbody></table></div>\n\
          <p class=\"note\">Error reduction: relative reduction of the RMSE in the channels that the effect acts on, \
          cross-validated. Each cause is added to those above it; its alternatives take its place. The log-likelihood \
-         gain of a cause must exceed a threshold that is the same for every log.</p>\n</section>\n"
+         gain of a cause must exceed a threshold that is computed for each log.</p>\n</section>\n"
     )
 }
 
