@@ -136,6 +136,12 @@ fn what_no_law_explains_is_learned_and_improves_the_prediction_of_another_motion
     let fitted = twinstep(&[&fit[..], &["--members", "2", "--hidden", "12", "--joint-input", "kind"]].concat());
     assert!(fitted.status.success(), "{}", String::from_utf8_lossy(&fitted.stderr));
     let by_hand = "robot = \"go2\"\n[actuator]\nmode = \"residual\"\nensemble = \"hand.safetensors\"\n";
+    let too_fast = twinstep(&["fit", &log, "--residual", &nominal, "--rate-hz", "900", "--out", &out]);
+    let refusal = String::from_utf8_lossy(&too_fast.stderr).into_owned();
+    assert!(
+        too_fast.status.code() == Some(2) && refusal.contains("`--rate-hz`") && refusal.contains("200 Hz"),
+        "{refusal}"
+    );
     std::fs::write(file("by_hand.toml"), by_hand).unwrap();
     let [before, after] = ["nominal.toml", "by_hand.toml"].map(|model| error(&file(model), &file("other.parquet")));
     assert!(after < 0.8 * before, "{before} -> {after} rad");

@@ -121,6 +121,8 @@ pub fn run(args: &Args) -> CommandResult {
         next.motion.write(&motion).map_err(input)?;
         NEXT_EXPERIMENT.clone_into(&mut entry.motion);
     }
+    // The networks of an earlier diagnosis must not be mistaken for the result of this one.
+    let _ = std::fs::remove_file(args.out.join(learned_residual::FILE));
     let laws = extended.clone();
     let corrected = match &learned {
         Some(learned) => {

@@ -11,7 +11,7 @@ use twinstep_ensemble::{
     NetworkInput, NetworkTarget, Training, TrainingEvent, TrainingOptions, TrainingResult as Ended,
 };
 use twinstep_identify::{residual_at_output, residual_at_sensor};
-use twinstep_logs::Log;
+use twinstep_logs::{Log, ResampleError};
 use twinstep_model::RobotModel;
 
 use crate::cross_evaluation;
@@ -236,7 +236,7 @@ impl Args {
                 log = residual_log(&log, robot)?.ok_or_else(|| input(NoResidual { log: name.clone() }))?;
             }
             if let Some(hz) = self.rate_hz {
-                log = log.resampled(hz).map_err(input)?;
+                log = log.resampled(hz).map_err(|error| input(WrongRate { log: name.clone(), error }))?;
             }
             Ok((name, log))
         };
@@ -277,6 +277,14 @@ impl Args {
 )]
 struct NoResidual {
     log: String,
+}
+
+/// A log cannot be resampled to the rate.
+#[derive(Debug, thiserror::Error)]
+#[error("`--rate-hz` for {log}: {error}")]
+struct WrongRate {
+    log: String,
+    error: ResampleError,
 }
 
 /// Returns the log of the torque that `robot` lacks: at the log's sensor or, without one, at the joint output.
