@@ -136,6 +136,16 @@ fn ideal_robot_has_no_finding() {
     assert!(!folder.path().join("diagnosis/next_experiment").exists());
 }
 
+/// A delay of the torque in the loop would explain the same torques.
+#[test]
+fn delay_of_the_torque_sensor_that_is_too_small_to_report_is_not_reported_as_another_cause() {
+    let folder = tempfile::tempdir().unwrap();
+    let effect = Effect::named("torque_sensor_delay").unwrap();
+    let entry = EffectEntry::new(effect, "all".parse().unwrap(), vec![0.0018]).unwrap();
+    let diagnosis = diagnosed(&apply_effects(&go2(), &[entry]).unwrap(), folder.path());
+    assert!(diagnosis.findings.is_empty(), "{diagnosis:#?}");
+}
+
 #[test]
 fn bad_input_is_rejected_before_the_computation() {
     let output = twinstep(&["diagnose", "data/go2_air_chirp", "--out", "/proc/nowhere"]);

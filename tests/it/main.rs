@@ -49,6 +49,7 @@ mod remote_rollout;
 mod render;
 mod robot;
 mod robot_campaign;
+mod robot_to_model;
 mod robots;
 mod rollout;
 mod run;

@@ -497,40 +497,6 @@ fn simulator_predicts_the_next_step_of_the_robot_within_the_noise_of_its_sensors
     assert!(error < 0.0008 && error_of_other > 1.3 * error, "{error} rad, with friction {error_of_other} rad");
 }
 
-/// Returns the error of a model's left front calf on a recording [rad].
-fn calf_error(model: &Path, recording: &Path) -> f64 {
-    let output = Command::new(program()).args(["evaluate", "--json", "--model"]).arg(model).arg(recording).output();
-    let report: Value = serde_json::from_slice(&output.unwrap().stdout).unwrap();
-    report["per_joint"]["FL_calf"]["q_rmse_rad"].as_f64().unwrap()
-}
-
-#[test]
-fn friction_that_is_hidden_in_the_robot_is_measured_and_its_model_has_the_smaller_error_on_another_walk() {
-    let folder = tempfile::tempdir().unwrap();
-    let file = |name: &str| folder.path().join(name);
-    let hidden = "[[effect]]\nname = \"coulomb_friction\"\nscope = \"FL_calf\"\ntorque_nm = 0.8\n";
-    std::fs::write(file("hidden.toml"), format!("robot = \"go2\"\n{hidden}")).unwrap();
-    std::fs::write(file("nominal.toml"), "robot = \"go2\"\n").unwrap();
-    record_walk(&file("hidden.toml"), "0.5,0,0", &file("first.mcap"));
-    record_walk(&file("hidden.toml"), "0.2,0.2,0.4", &file("second.mcap"));
-    let extended = file("extended.toml");
-    let status = Command::new(program())
-        .arg("identify")
-        .arg(file("first.mcap"))
-        .args(["--effects", "coulomb_friction@FL_calf", "--out", extended.to_str().unwrap()])
-        .status()
-        .unwrap();
-    assert!(status.success());
-    let model: toml::Table = std::fs::read_to_string(&extended).unwrap().parse().unwrap();
-    let torque = model["effect"][0]["torque_nm"].as_float().unwrap();
-    assert!((0.5..1.1).contains(&torque), "{torque} N·m");
-    let second = file("second.mcap");
-    let (after, before) = (calf_error(&extended, &second), calf_error(&file("nominal.toml"), &second));
-    assert!(after < 0.8 * before, "{before} -> {after} rad");
-    let serve = ["serve", "--listen", "tcp/127.0.0.1:0", "--until-stdin-closes", "--model", extended.to_str().unwrap()];
-    Process::listening(&program(), &serve.map(str::to_owned)).unwrap();
-}
-
 #[test]
 fn run_that_waits_for_the_operator_ends_with_the_first_interrupt() {
     test_in_real_time(|| {

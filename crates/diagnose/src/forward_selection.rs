@@ -1,5 +1,7 @@
 //! Forward selection of causes with backward elimination.
 
+use std::ops::Range;
+
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Probes, Target};
 use twinstep_model::{Joint, RobotModel, Rollout};
@@ -34,6 +36,10 @@ const MAX_JOINT_CANDIDATES: usize = 5;
 const MAX_BODY_CANDIDATES: usize = 2;
 /// Fraction of the power above noise that a cause must explain.
 pub const MIN_EXPLAINED_FRACTION: f64 = 0.3;
+/// The same fraction, for a cause that is too small to report. It is added until the end of the search.
+///
+/// What explains nearly everything is the true cause. Without it, others that imitate it would be added in its place.
+const EXPLAINED_BY_SMALL_CAUSE: f64 = 0.9;
 /// Fraction of the power above noise that may remain in the channels that a cause affects, after the joint refit.
 ///
 /// A wrong law imitates the true one in part: Coulomb friction explains 57 % of the power of friction that acts in one
@@ -120,8 +126,10 @@ impl<'a> ForwardSelection<'a> {
         let WindowedData { evidence, given } = self.looked_at();
         let robot = self.model.robot_model().expect("fitted within its bounds");
         let left = evidence.residual_power(self.simulator, &robot);
-        let stands =
-            |hypothesis: &Hypothesis| hypothesis.is_plausible() && explains_affected_channels(hypothesis, given, &left);
+        let stands = |hypothesis: &Hypothesis| {
+            let at_sensor = evidence.torque_sensor_shows(&self.baseline, hypothesis);
+            hypothesis.is_plausible() && explains_affected_channels(hypothesis, at_sensor, given, &left)
+        };
         self.accepted.iter().position(|(best, _)| !stands(&best.hypothesis))
     }
 
@@ -150,12 +158,11 @@ impl<'a> ForwardSelection<'a> {
         }
         let largest = self.accepted.iter().map(|(best, _)| best.score).fold(0.0, f64::max);
         let least = |trial: &CandidateFit| thresholds.of(trial.hypothesis.effect).max(MIN_SHARE_OF_LARGEST * largest);
-        let earns_name = |trial: &CandidateFit| {
-            trial.score >= least(trial)
-                && trial.explained_fraction >= MIN_EXPLAINED_FRACTION
-                && trial.hypothesis.exceeds_min_size()
+        let explains = |trial: &CandidateFit| {
+            let small = !trial.hypothesis.exceeds_min_size();
+            trial.explained_fraction >= if small { EXPLAINED_BY_SMALL_CAUSE } else { MIN_EXPLAINED_FRACTION }
         };
-        let place = trials.iter().position(earns_name);
+        let place = trials.iter().position(|trial| trial.score >= least(trial) && explains(trial));
         let accepted = place.map(|place| {
             let trial = trials.remove(place);
             // What was rejected although it scores more is no alternative.
@@ -221,10 +228,15 @@ fn best_first(one: &CandidateFit, other: &CandidateFit) -> std::cmp::Ordering {
 }
 
 /// Returns true if a cause leaves at most [`MAX_REMAINING_FRACTION`] of the excess power in the channels that it affects.
-fn explains_affected_channels(hypothesis: &Hypothesis, given: &ResidualPower, left: &ResidualPower) -> bool {
-    let [held, walks] = [0..TORQUE, DYNAMIC..CHANNELS]
-        .map(|channels| given.counts[channels].iter().flatten().any(|count| *count > 0.0));
-    affected_channels(hypothesis, held, walks).into_iter().all(|channels| {
+///
+/// `at_sensor` tells whether it changes the torque at the sensor.
+fn explains_affected_channels(
+    hypothesis: &Hypothesis,
+    at_sensor: bool,
+    given: &ResidualPower,
+    left: &ResidualPower,
+) -> bool {
+    affected_channels(hypothesis, at_sensor, given).into_iter().all(|channels| {
         let excess = |left: &ResidualPower| channels.iter().map(|channel| left.channel_excess(*channel)).sum::<f64>();
         let rows: f64 = channels.iter().flat_map(|channel| left.counts[*channel]).sum();
         excess(left) <= NEGLIGIBLE_EXCESS * rows || excess(left) <= MAX_REMAINING_FRACTION * excess(given)
@@ -233,19 +245,22 @@ fn explains_affected_channels(hypothesis: &Hypothesis, given: &ResidualPower, le
 
 /// Returns the groups of channels that a cause must explain, each separately.
 ///
-/// For joints, positions and torques are separate groups: positions with a fixed base, if there are any (`held`). For
-/// the base, the group is all motion channels with a floating base; for the ground, those of a robot that walks or jumps,
-/// if it does (`walks`).
-fn affected_channels(hypothesis: &Hypothesis, held: bool, walks: bool) -> Vec<Vec<usize>> {
+/// For joints, these are the positions with a fixed base, and the torques. If the base never is fixed, positions have the
+/// errors of the contact model, too: a cause that the torque sensor shows must explain the torques, another the
+/// positions. For the base, the group is all motion channels with a floating base; for the ground, those of a robot that
+/// walks or jumps, if it does.
+fn affected_channels(hypothesis: &Hypothesis, at_sensor: bool, given: &ResidualPower) -> Vec<Vec<usize>> {
+    let has = |channels: Range<usize>| given.counts[channels].iter().flatten().any(|count| *count > 0.0);
+    let joints = |first: usize| {
+        let all = Joint::ALL.into_iter().filter(|joint| hypothesis.scope.contains(*joint));
+        all.map(|joint| first + joint.index()).collect()
+    };
     match hypothesis.effect.target {
-        Target::Joints => {
-            let joints = || Joint::ALL.into_iter().filter(|joint| hypothesis.scope.contains(*joint));
-            [if held { 0 } else { STANCE }, TORQUE]
-                .map(|first| joints().map(|joint| first + joint.index()).collect())
-                .to_vec()
-        }
+        Target::Joints if has(0..TORQUE) => vec![joints(0), joints(TORQUE)],
+        Target::Joints if at_sensor => vec![joints(TORQUE)],
+        Target::Joints => vec![joints(STANCE)],
         Target::Imu => vec![(GYRO..STANCE).collect()],
-        Target::Ground if walks => vec![(DYNAMIC..CHANNELS).collect()],
+        Target::Ground if has(DYNAMIC..CHANNELS) => vec![(DYNAMIC..CHANNELS).collect()],
         Target::Bodies | Target::Ground => vec![(TRUNK..GYRO).chain(STANCE..DYNAMIC).collect()],
         Target::Supply => Vec::new(),
     }
@@ -309,7 +324,7 @@ mod tests {
         let (hip, calf) = (Joint::ALL[0], Joint::ALL[2]);
         let given = residual_power(|channel| if channel == hip.index() { 20.0 } else { 10.0 });
         let only_hip = residual_power(|channel| if channel == hip.index() { 1.0 } else { 9.9 });
-        let explains = |effect, scope| explains_affected_channels(&hypothesis(effect, scope), &given, &only_hip);
+        let explains = |effect, scope| explains_affected_channels(&hypothesis(effect, scope), true, &given, &only_hip);
         assert!(!explains("backlash", Scope::Joint(hip)), "the torque of the hip is not explained");
         assert!(!explains("backlash", Scope::Joint(calf)));
         assert!(!explains("com_shift", Scope::Base), "an effect on the base affects all joints");
@@ -317,7 +332,25 @@ mod tests {
         let noise = residual_power(|_| 1.0);
         for (effect, scope) in [("backlash", Scope::Joint(hip)), ("com_shift", Scope::Base), ("gyro_bias", Scope::Base)]
         {
-            assert!(explains_affected_channels(&hypothesis(effect, scope), &given, &noise));
+            assert!(explains_affected_channels(&hypothesis(effect, scope), true, &given, &noise));
         }
+    }
+    /// Contact adds to the position error of every joint. A delay is seen in the torques, friction in the positions.
+    #[test]
+    fn cause_of_a_robot_that_never_hangs_must_explain_the_channel_that_shows_it() {
+        let scope = Scope::Joint(Joint::ALL[2]);
+        let floating = |power: [f64; 2]| {
+            let mut left = residual_power(|channel| if channel >= STANCE { power[0] } else { power[1] });
+            left.counts[..TORQUE].fill([0.0; 2]);
+            left.sums[..TORQUE].fill([0.0; 2]);
+            left
+        };
+        let [given, torque_explained, position_explained] = [[5.0, 13.0], [5.0, 1.0], [1.0, 13.0]].map(floating);
+        let explains =
+            |effect, at_sensor, left| explains_affected_channels(&hypothesis(effect, scope), at_sensor, &given, left);
+        assert!(explains("torque_delay", true, &torque_explained));
+        assert!(!explains("torque_delay", true, &position_explained));
+        assert!(explains("coulomb_friction", false, &position_explained));
+        assert!(!explains("coulomb_friction", false, &torque_explained));
     }
 }

@@ -1,11 +1,12 @@
 //! Residuals of motion and torque of logs, in two folds; the rest is held out ([`DataSplit`]).
 
 use rayon::prelude::*;
-use twinstep_effects::{DataRequirement, Effect, ModelFile};
+use twinstep_effects::{DataRequirement, Effect, EffectEntry, ModelFile};
 use twinstep_logs::Log;
 use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout};
 
 use super::data_split::DataSplit;
+use super::hypothesis::Hypothesis;
 use super::residual_power::{CHANNELS, DYNAMIC, GYRO, ResidualPower, STANCE, TORQUE, TRUNK};
 use super::residual_rows::ResidualRows;
 use twinstep_identify::ExperimentError;
@@ -199,11 +200,20 @@ impl ResidualData {
         products
     }
 
+    /// Returns true if `hypothesis`, added to `model`, changes the torque at a sensor of the logs.
+    pub fn torque_sensor_shows(&self, model: &ModelFile, hypothesis: &Hypothesis) -> bool {
+        let mut changed = model.clone();
+        let entry = EffectEntry::new(hypothesis.effect, hypothesis.scope, hypothesis.values.clone());
+        changed.effects.extend(entry.ok());
+        let (Ok(before), Ok(after)) = (model.robot_model(), changed.robot_model()) else { return false };
+        let mut logs = self.logs.iter().zip(&self.torques).filter(|(log, _)| has_torque(log));
+        logs.any(|(_, torques)| !torques.predict_same_torque(&before, &after))
+    }
+
     /// Returns false if the effect is not identifiable without a torque sensor and the logs have none.
     ///
     /// Such effects imitate others in the motion: at one kd, a wrong velocity gain is viscous friction.
     pub fn has_required_torque(&self, effect: &Effect) -> bool {
-        let has_torque = |log: &Log| log.joints().iter().any(|joint| log.tau_measured(joint).is_some());
         !effect.needs.contains(&DataRequirement::TorqueMeasured) || self.logs.iter().any(has_torque)
     }
 
@@ -269,6 +279,11 @@ fn with_dynamic_windows_apart(logs: &[Log], experiments: Vec<Experiment>) -> (Ve
     }
     let is_dynamic = experiments.iter().zip(&marked).any(|(all, marked)| marked.num_quiet_rows() < all.num_rows());
     (experiments, is_dynamic)
+}
+
+/// Returns true if a log has the measured torque of a joint.
+fn has_torque(log: &Log) -> bool {
+    log.joints().iter().any(|joint| log.tau_measured(joint).is_some())
 }
 
 fn variance(values: &[f64]) -> f64 {

@@ -38,6 +38,7 @@ pub fn torque_errors(
 const MIN_SUBSTEP_HZ: f64 = 1000.0;
 
 /// Measured torques, with the states and commands from which actuators compute them.
+#[derive(Debug)]
 pub struct MeasuredTorque {
     /// Rate at which the actuators are replayed [Hz].
     actuator_hz: f64,
@@ -49,6 +50,7 @@ pub struct MeasuredTorque {
 }
 
 /// One row of a log, until the next.
+#[derive(Debug)]
 struct TorqueSample {
     row: usize,
     /// True for the first row of a contiguous range, at which the actuator state is reset.
@@ -118,6 +120,14 @@ impl MeasuredTorque {
     /// Calls `each` with joint, row and torque error: torque of the actuators of `robot` minus measured torque [N·m].
     pub fn differences(&self, robot: &RobotModel, each: impl FnMut(usize, usize, f64)) {
         self.differences_with(robot, None, each);
+    }
+
+    /// Returns the torque errors of `robot` by row of the log, up to the last sample; NaN where there are none [N·m].
+    pub fn error_table(&self, robot: &RobotModel) -> Vec<[f64; NUM_JOINTS]> {
+        let rows = self.rows.last().map_or(0, |sample| sample.row + 1);
+        let mut table = vec![[f64::NAN; NUM_JOINTS]; rows];
+        self.differences(robot, |joint, row, difference| table[row][joint] = difference);
+        table
     }
 
     /// Like [`MeasuredTorque::differences`], with an external actuator that replaces the robot's or adds to them.

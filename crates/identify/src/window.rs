@@ -5,7 +5,9 @@ use std::ops::Range;
 use glam::{DQuat, DVec3};
 use nalgebra::{DMatrix, DVector};
 use twinstep_logs::Log;
-use twinstep_model::{ActuatorParams, BaseMount, Command, Ground, HistoryStep, InitialState, Joint, RobotModel};
+use twinstep_model::{
+    ActuatorParams, BaseMount, Command, Ground, HistoryStep, InitialState, Joint, NUM_JOINTS, RobotModel,
+};
 
 use crate::base_estimate::BaseEstimate;
 use crate::error::ExperimentError;
@@ -63,7 +65,9 @@ pub struct Window {
     pub commands: Vec<Command>,
     /// Number of rows of the burn-in.
     pub settling: usize,
-    /// True if the robot walks, trots or jumps.
+    /// True if the base floats and the joints move fast: the robot walks, trots or jumps.
+    pub fast: bool,
+    /// True if the window is fast, and its residuals are a regime of their own.
     pub dynamic: bool,
     /// Actuator period at whose start each row was sampled.
     pub period: Vec<usize>,
@@ -96,6 +100,8 @@ impl Window {
 }
 
 /// Splits `log` into windows.
+///
+/// Rows in which a robot on the ground only brakes its motors have no window: see [`WindowBuilder::is_limp`].
 pub fn windows(log: &Log, robot: &RobotModel, horizon: WindowConfig) -> Result<Vec<Window>, ExperimentError> {
     let builder = WindowBuilder {
         log,
@@ -119,11 +125,13 @@ pub fn windows(log: &Log, robot: &RobotModel, horizon: WindowConfig) -> Result<V
         } else {
             in_rows(if held { horizon.fixed_burn_in_s } else { horizon.floating_burn_in_s }).max(1)
         };
-        let mut first = rows.start;
-        while first + 1 < rows.end {
-            let end = (first + length + 1).min(rows.end);
-            windows.push(Window { settling, ..builder.window(&rows, first..end, base) });
-            first = end - 1;
+        for part in builder.simulated_parts(&rows, base) {
+            let mut first = part.start;
+            while first + 1 < part.end {
+                let end = (first + length + 1).min(part.end);
+                windows.push(Window { settling, ..builder.window(&rows, first..end, base) });
+                first = end - 1;
+            }
         }
     }
     Ok(windows)
@@ -155,6 +163,23 @@ struct WindowBuilder<'a> {
 }
 
 impl WindowBuilder<'_> {
+    /// Returns the parts of a contiguous range that are simulated.
+    fn simulated_parts(&self, rows: &Range<usize>, base: BaseMount) -> Vec<Range<usize>> {
+        if base.is_fixed() {
+            return vec![rows.clone()];
+        }
+        let all: Vec<usize> = rows.clone().filter(|row| !self.is_limp(*row)).collect();
+        all.chunk_by(|one, next| one + 1 == *next).map(|part| part[0]..part[part.len() - 1] + 1).collect()
+    }
+
+    /// Returns true if no motor holds a position or has a feed-forward torque.
+    ///
+    /// Then a robot on the ground slowly folds its legs. The speed depends on how the feet stick, which is not measured.
+    fn is_limp(&self, row: usize) -> bool {
+        let Command { kp, tau_ff, .. } = command(self.robot, &self.commands, row);
+        kp == [0.0; NUM_JOINTS] && tau_ff == [0.0; NUM_JOINTS]
+    }
+
     fn window(&self, range: &Range<usize>, rows: Range<usize>, base: BaseMount) -> Window {
         let t = &self.log.t()[rows.clone()];
         let (mut commands, mut period) = (Vec::new(), Vec::new());
@@ -166,7 +191,7 @@ impl WindowBuilder<'_> {
             }
         }
         let (start, history) = (self.start(range, rows.start, base), self.history(range, rows.start, base));
-        Window { base, settling: 1, dynamic: false, start, history, rows, commands, period }
+        Window { base, settling: 1, fast: false, dynamic: false, start, history, rows, commands, period }
     }
 
     /// Returns the actuator periods before `first`, at most to the start of the contiguous range.
@@ -298,6 +323,28 @@ mod tests {
                 prop_assert!((f64::from(window.start.dq[0]) - (b + c * t)).abs() < 1e-4);
             }
         }
+    }
+
+    #[test]
+    fn robot_on_the_ground_is_not_simulated_while_its_motors_only_brake() {
+        let segments = vec![Segment { name: "all".to_owned(), base: BaseMount::Floating }];
+        let column = |name: &str, of: &dyn Fn(usize) -> f64| (name.to_owned(), (0..100).map(of).collect::<Vec<_>>());
+        let mut columns = vec![column("t", &|row| row as f64 / RATE_HZ)];
+        for joint in Joint::ALL {
+            columns.push(column(&format!("q_{joint}"), &|_| 0.0));
+            columns.push(column(&format!("q_cmd_{joint}"), &|_| 0.0));
+        }
+        for name in ["quat_x", "quat_y", "quat_z", "pos_x", "pos_y", "pos_z", "vel_x", "vel_y", "vel_z"] {
+            columns.push(column(name, &|_| 0.0));
+        }
+        columns.push(column("quat_w", &|_| 1.0));
+        columns.push(column("kp", &|row| if (40..70).contains(&row) { 0.0 } else { 30.0 }));
+        columns.push(column("kd", &|_| 3.0));
+        columns.push(column("tau_ff_FL_hip", &|row| if row >= 60 { 1.0 } else { 0.0 }));
+        let log = Log::new(Meta::new(RATE_HZ, TorqueSensor::None, segments), columns).expect("a log");
+        let windows = windows(&log, &go2(), WindowConfig::EVALUATION).expect("a measured base");
+        let rows: Vec<_> = windows.iter().map(|window| window.rows.clone()).collect();
+        assert_eq!(rows, [0..40, 60..100]);
     }
 
     #[test]

@@ -39,6 +39,16 @@ pub enum ResidualChannel {
 }
 
 impl Channel {
+    /// Returns the joint whose torque is compared on measured states: of a robot that walks, trots or jumps.
+    ///
+    /// In closed loop it would have the errors of the contact model. Of a robot that stands, it shows the mass.
+    pub fn torque_joint(&self, window: &Window) -> Option<usize> {
+        match self.quantity {
+            ResidualChannel::Torque(joint) if window.fast => Some(joint),
+            _ => None,
+        }
+    }
+
     /// Returns the compared rows of `window`, each with its index in the window. Rows of the burn-in are excluded.
     pub fn rows<'a>(&'a self, window: &'a Window) -> impl Iterator<Item = (usize, usize)> + 'a {
         let of_base = matches!(

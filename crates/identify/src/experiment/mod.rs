@@ -8,6 +8,8 @@ mod channel;
 mod residual_index;
 mod residuals;
 
+use std::sync::Arc;
+
 use glam::DQuat;
 use twinstep_logs::Log;
 use twinstep_logs::operating_conditions::OperatingConditions;
@@ -20,6 +22,7 @@ pub use residuals::{SimulatedPose, estimated_torque};
 
 use crate::error::ExperimentError;
 use crate::orientation::orientation;
+use crate::torque::MeasuredTorque;
 use crate::window::{Window, WindowConfig, base_estimate, windows};
 use channel::{Channel, channels};
 
@@ -51,6 +54,8 @@ pub struct Experiment {
     conditions: OperatingConditions,
     /// Standard deviations of position and velocity of the initial states, where they are estimated [m], [m/s].
     estimated_start: Option<[f64; 2]>,
+    /// Torques, for windows in which they are compared on measured states; `None` if there are none.
+    torques: Option<Arc<MeasuredTorque>>,
 }
 
 impl Experiment {
@@ -58,18 +63,25 @@ impl Experiment {
     pub fn new(log: &Log, robot: &RobotModel, horizon: WindowConfig) -> Result<Self, ExperimentError> {
         let joints: Vec<_> = joint_commands(log)?.iter().map(|joint| joint.joint).collect();
         let robot = &at_log_rate(log, robot)?;
-        let windows = windows(log, robot, horizon)?;
+        let mut windows = windows(log, robot, horizon)?;
+        let channels = channels(log, &joints);
+        let rows_per_block = ((BLOCK_S * log.meta().rate_hz).round() as usize).max(1);
+        for window in windows.iter_mut().filter(|window| !window.base.is_fixed()) {
+            window.fast = joint_speed(&channels, rows_per_block, window) > DYNAMIC_SPEED;
+        }
         let floating = windows.iter().any(|window| !window.base.is_fixed());
+        let fast = windows.iter().any(|window| window.fast);
         let orientations =
             if floating { (0..log.rows()).map(|row| orientation(log, row)).collect() } else { Vec::new() };
         Ok(Self {
             actuator_hz: robot.control.actuator_hz,
             windows,
-            channels: channels(log, &joints),
+            channels,
             orientations,
             joints,
-            rows_per_block: ((BLOCK_S * log.meta().rate_hz).round() as usize).max(1),
+            rows_per_block,
             conditions: OperatingConditions::of(log),
+            torques: if fast { Some(Arc::new(MeasuredTorque::new(log, robot)?)) } else { None },
             estimated_start: base_estimate(log, robot)?
                 .map(|estimate| [estimate.height_sigma, estimate.velocity_sigma]),
         })
@@ -125,13 +137,10 @@ impl Experiment {
     /// the error of the contact model as their scale. Errors grow less in short windows.
     #[must_use]
     pub fn mark_dynamic_windows(mut self) -> Self {
-        let fast: Vec<bool> = self.windows.iter().map(|window| self.joint_speed(window) > DYNAMIC_SPEED).collect();
         let most = ((DYNAMIC_S * self.rows_per_block as f64 / BLOCK_S).round() as usize).max(2);
-        for (window, fast) in self.windows.iter_mut().zip(fast) {
-            window.dynamic = fast && !window.base.is_fixed();
-            if window.dynamic {
-                window.truncate(most.min(window.rows.len()));
-            }
+        for window in self.windows.iter_mut().filter(|window| window.fast) {
+            window.dynamic = true;
+            window.truncate(most.min(window.rows.len()));
         }
         self
     }
@@ -144,19 +153,6 @@ impl Experiment {
     /// Returns the number of rows in all windows.
     pub fn num_rows(&self) -> usize {
         self.windows.iter().map(|window| window.rows.len()).sum()
-    }
-
-    /// Returns the root mean square of the joint speeds in a window [rad/s].
-    fn joint_speed(&self, window: &Window) -> f64 {
-        let rate_hz = self.rows_per_block as f64 / BLOCK_S;
-        let stride = ((SPEED_S * rate_hz).round() as usize).max(1);
-        let positions = self.channels.iter().filter(|channel| matches!(channel.quantity, ResidualChannel::Position(_)));
-        let squares = positions.flat_map(|channel| {
-            let rows = window.rows.start..window.rows.end.saturating_sub(stride);
-            rows.map(|row| (channel.measured[row + stride] - channel.measured[row]) * rate_hz / stride as f64)
-        });
-        let speeds: Vec<f64> = squares.filter(|speed| speed.is_finite()).collect();
-        (speeds.iter().map(|speed| speed * speed).sum::<f64>() / speeds.len().max(1) as f64).sqrt()
     }
 
     /// Returns true if a window has a floating base.
@@ -202,6 +198,19 @@ impl Experiment {
     pub fn sigma(&self, quantity: ResidualChannel) -> f64 {
         self.channels.iter().find(|channel| channel.quantity == quantity).map_or(1.0, |channel| channel.sigma)
     }
+}
+
+/// Returns the root mean square of the joint speeds in a window [rad/s].
+fn joint_speed(channels: &[Channel], rows_per_block: usize, window: &Window) -> f64 {
+    let rate_hz = rows_per_block as f64 / BLOCK_S;
+    let stride = ((SPEED_S * rate_hz).round() as usize).max(1);
+    let positions = channels.iter().filter(|channel| matches!(channel.quantity, ResidualChannel::Position(_)));
+    let squares = positions.flat_map(|channel| {
+        let rows = window.rows.start..window.rows.end.saturating_sub(stride);
+        rows.map(|row| (channel.measured[row + stride] - channel.measured[row]) * rate_hz / stride as f64)
+    });
+    let speeds: Vec<f64> = squares.filter(|speed| speed.is_finite()).collect();
+    (speeds.iter().map(|speed| speed * speed).sum::<f64>() / speeds.len().max(1) as f64).sqrt()
 }
 
 #[cfg(test)]

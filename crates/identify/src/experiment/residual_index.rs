@@ -40,9 +40,13 @@ impl Experiment {
         pairs.filter(|(window, own)| !window.base.is_fixed() && !own.is_empty()).map(|(_, own)| own).collect()
     }
 
-    /// Returns for every residual whether the robot walks, trots or jumps in a window that is marked as such.
+    /// Returns for every residual whether it has the errors of contact: the robot walks, trots or jumps in a window that is
+    /// marked as such, and the residual is not a torque on measured states.
     pub fn dynamic_residuals(&self) -> Vec<bool> {
-        self.groups().into_iter().map(|group| Self::regime(group) == Regime::Dynamic).collect()
+        let is_dynamic = |channel: &Channel, window: &Window| window.dynamic && channel.torque_joint(window).is_none();
+        let windows = self.channels.iter().flat_map(|channel| self.windows.iter().map(move |window| (channel, window)));
+        let same = windows.flat_map(|(channel, window)| channel.rows(window).map(move |_| is_dynamic(channel, window)));
+        same.collect()
     }
 
     /// Upper bound of the values of [`Experiment::groups`].

@@ -1,5 +1,7 @@
 //! Residuals: simulation of the windows, and comparison with the log.
 
+use std::sync::Arc;
+
 use glam::DQuat;
 use rayon::prelude::*;
 use twinstep_logs::replay::delayed_mean;
@@ -35,19 +37,35 @@ impl Experiment {
     ) -> Vec<Vec<f64>> {
         let candidates = &self.at_rate(candidates);
         let trajectories = self.simulate(simulator, candidates, precision);
+        let torques = self.torque_errors(candidates);
         candidates
             .par_iter()
             .zip(trajectories.par_chunks(self.windows.len().max(1)))
-            .map(|(robot, windows)| {
+            .enumerate()
+            .map(|(index, (robot, windows))| {
+                let on_measured = torques.get(index).map_or(&[][..], |errors| &errors[..]);
                 let mut residuals = Vec::new();
                 for (channel, window, states) in self.compared(windows) {
-                    self.compare(channel, window, states, robot, |_, difference| {
-                        residuals.push(difference / channel.sigma);
+                    self.compare(channel, window, states, robot, |row, difference| {
+                        let known = channel.torque_joint(window).zip(on_measured.get(row));
+                        let on_measured = known.map(|(joint, errors)| errors[joint]).filter(|error| error.is_finite());
+                        residuals.push(on_measured.unwrap_or(difference) / channel.sigma);
                     });
                 }
                 residuals
             })
             .collect()
+    }
+
+    /// Returns the torque errors of each candidate on measured states, by row; NaN where there are none [N·m].
+    ///
+    /// Candidates that predict the same torque share them. Empty if the robot does not walk, trot or jump.
+    fn torque_errors(&self, candidates: &[RobotModel]) -> Vec<Arc<Vec<[f64; NUM_JOINTS]>>> {
+        let Some(torques) = &self.torques else { return Vec::new() };
+        let alike: Vec<&[RobotModel]> =
+            candidates.chunk_by(|one, other| torques.predict_same_torque(one, other)).collect();
+        let of_first: Vec<_> = alike.par_iter().map(|robots| Arc::new(torques.error_table(&robots[0]))).collect();
+        alike.iter().zip(of_first).flat_map(|(robots, errors)| vec![errors; robots.len()]).collect()
     }
 
     /// Returns rows and position errors of each joint, simulated minus measured [rad].
@@ -185,4 +203,59 @@ pub fn estimated_torque(states: &RobotStates, robot: &RobotModel, joint: usize, 
         from..until.max(from + 1),
         delay,
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+    use twinstep_model::{BaseMount, Joint, go2};
+
+    use super::*;
+    use crate::window::WindowConfig;
+
+    /// A simulator that cannot follow the robot: its joints do not move.
+    struct Standstill;
+
+    impl Rollout for Standstill {
+        fn run(&mut self, jobs: &[RolloutRequest], _: Precision) -> Vec<RobotStates> {
+            jobs.iter().map(|job| RobotStates::new(job.commands.len() + 1)).collect()
+        }
+    }
+
+    /// Returns the largest torque residual [noise std] of a swinging robot whose motors are ideal.
+    fn largest_torque_residual(base: BaseMount, hz: f64) -> f64 {
+        let [kp, kd, lead] = [30.0, 0.8, 0.1];
+        let phase = |row: usize| std::f64::consts::TAU * hz * row as f64 / 200.0;
+        let (q, dq) = (|row| 0.2 * f64::sin(phase(row)), |row| 0.2 * std::f64::consts::TAU * hz * f64::cos(phase(row)));
+        let column = |name: &str, of: &dyn Fn(usize) -> f64| (name.to_owned(), (0..400).map(of).collect::<Vec<f64>>());
+        let mut columns = vec![
+            column("t", &|row| row as f64 / 200.0),
+            column("kp", &|_| kp),
+            column("kd", &|_| kd),
+            column("pos_z", &|_| 0.3),
+            column("quat_w", &|_| 1.0),
+            column("vel_x", &|_| 0.0),
+        ];
+        for joint in Joint::ALL {
+            columns.push(column(&format!("q_{joint}"), &q));
+            columns.push(column(&format!("dq_{joint}"), &dq));
+            columns.push(column(&format!("q_cmd_{joint}"), &|row| q(row) + lead));
+            columns.push(column(&format!("tau_measured_{joint}"), &|row| kp * lead - kd * dq(row)));
+        }
+        let segments = vec![Segment { name: "all".to_owned(), base }];
+        let log = Log::new(Meta::new(200.0, TorqueSensor::MotorCurrent, segments), columns).expect("a log");
+        let experiment = Experiment::new(&log, &go2(), WindowConfig::DIAGNOSIS).expect("an experiment");
+        let residuals = experiment.residuals(&mut Standstill, &[go2()], Precision::Double).remove(0);
+        let torques = experiment.residual_index().zip(residuals);
+        let torques = torques.filter(|((channel, _), _)| matches!(channel, ResidualChannel::Torque(_)));
+        torques.map(|(_, residual)| residual.abs()).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn torques_of_a_walking_robot_do_not_depend_on_what_the_simulator_can_follow() {
+        let walks = largest_torque_residual(BaseMount::Floating, 2.0);
+        assert!(walks < 1.0, "{walks} of the noise of the sensor");
+        assert!(largest_torque_residual(BaseMount::Floating, 0.4) > 10.0, "sways: compared in closed loop");
+        assert!(largest_torque_residual(BaseMount::Fixed, 2.0) > 10.0, "hangs: compared in closed loop");
+    }
 }
