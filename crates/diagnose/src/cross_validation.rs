@@ -236,86 +236,11 @@ pub fn parameter_penalty(parameters: usize) -> f64 {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
-    use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
-    use twinstep_model::{BaseMount, Joint, RobotStates, RolloutRequest, go2};
+    use twinstep_model::{Joint, go2};
 
     use super::*;
     use crate::forward_selection::THRESHOLD;
-    use twinstep_identify::window::WindowConfig;
-
-    /// Standard deviation of the measured positions [rad].
-    const NOISE: f64 = 0.001;
-
-    /// Positions that are proportional to the viscous friction of the first joint, with another shape for Coulomb
-    /// friction.
-    struct Linear;
-
-    fn position(viscous: f64, coulomb: f64, row: usize) -> f64 {
-        0.05 * viscous * (0.11 * row as f64).sin() + 0.02 * coulomb * (0.11 * row as f64).sin().signum()
-    }
-
-    impl Rollout for Linear {
-        fn run(&mut self, jobs: &[RolloutRequest], _: Precision) -> Vec<RobotStates> {
-            let play = |job: &RolloutRequest| {
-                let joint = &job.robot.joints[0];
-                let mut states = RobotStates::new(job.commands.len() + 1);
-                for (row, q) in states.measured.q.iter_mut().enumerate() {
-                    q[0] = position(joint.viscous_friction, joint.coulomb_friction, row) as f32;
-                }
-                states
-            };
-            jobs.iter().map(play).collect()
-        }
-    }
-
-    /// Rows of a robot on the ground, which the simulator cannot follow.
-    #[derive(Clone, Copy, Debug)]
-    struct Contact {
-        seconds: usize,
-        /// Amplitude of the error [rad], its frequency [Hz], and the seed of its phases.
-        amplitude: f64,
-        hz: f64,
-        seed: u32,
-    }
-
-    /// Returns the data of a robot with this viscous friction and measurement noise: 20 s in the air, and then on the ground.
-    fn data(viscous: f64, contact: Option<Contact>) -> ResidualData {
-        const AIR: usize = 4000;
-        const WINDOW_IN_AIR: usize = 400;
-        const WINDOW: usize = 200;
-        let rows = AIR + contact.map_or(0, |contact| contact.seconds * WINDOW);
-        let column = |name: &str, of: &dyn Fn(usize) -> f64| (name.to_owned(), (0..rows).map(of).collect());
-        let noise = |row: usize| 3.46 * NOISE * ((row * 7919 % 1009) as f64 / 1009.0 - 0.5);
-        // The first row of a window is the last row of the previous one.
-        let in_window = |row: usize, length: usize| if row == 0 { 0 } else { (row - 1) % length + 1 };
-        let measured = |row: usize| match contact {
-            Some(Contact { amplitude, hz, seed, .. }) if row >= AIR => {
-                let (window, row) = ((row - AIR) / WINDOW, row - AIR);
-                let phase = f64::from(seed) * (window * 6151 % 97) as f64;
-                let error = amplitude * (std::f64::consts::TAU * hz * row as f64 / 200.0 + phase).sin();
-                position(viscous, 0.0, in_window(row, WINDOW)) + error
-            }
-            _ => position(viscous, 0.0, in_window(row, WINDOW_IN_AIR)),
-        };
-        let columns = [
-            column("t", &|row| row as f64 / 200.0),
-            column("segment", &|row| f64::from(row >= AIR)),
-            column("q_FL_hip", &|row| measured(row) + noise(row)),
-            column("q_cmd_FL_hip", &|_| 0.0),
-            column("kp", &|_| 25.0),
-            column("kd", &|_| 0.6),
-            column("quat_w", &|_| 1.0),
-            column("pos_z", &|_| 0.0),
-            column("vel_x", &|_| 0.0),
-        ];
-        let segment = |name: &str, base| Segment { name: name.to_owned(), base };
-        let mut segments = vec![segment("air", BaseMount::Fixed)];
-        segments.extend(contact.map(|_| segment("ground", BaseMount::Floating)));
-        let mut meta = Meta::new(200.0, TorqueSensor::None, segments);
-        meta.noise.insert("q_FL_hip".to_owned(), NOISE);
-        let log = Log::new(meta, columns).expect("a log");
-        ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
-    }
+    use crate::test_data::{Contact, Linear, data};
 
     fn fit(data: &ResidualData, name: &str) -> CandidateFit {
         let effect = Effect::named(name).expect("in the catalogue");
@@ -326,7 +251,7 @@ mod tests {
 
     #[test]
     fn true_effect_is_accepted_with_its_size_and_explains_the_excess() {
-        let data = data(0.4, None);
+        let data = data(|_| 0.4, None);
         let found = fit(&data, "viscous_friction");
         assert!((found.hypothesis.values[0] - 0.4).abs() < 0.01, "{:?}", found.hypothesis);
         assert!(found.score > THRESHOLD && found.explained_fraction > 0.99, "{found:?}");
@@ -336,10 +261,11 @@ mod tests {
 
     #[test]
     fn effect_that_is_not_there_scores_below_zero() {
-        let found = fit(&data(0.0, None), "viscous_friction");
+        let found = fit(&data(|_| 0.0, None), "viscous_friction");
         assert!(found.score < 0.0, "{found:?}");
         assert!(!found.hypothesis.exceeds_min_size(), "{found:?}");
     }
+
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(24))]
 
@@ -349,7 +275,7 @@ mod tests {
             seconds in 5usize..60, amplitude in 0.0f64..0.1, hz in 0.5f64..6.0, seed in 1u32..1000,
         ) {
             let contact = Contact { seconds, amplitude, hz, seed };
-            let [air, both] = [None, Some(contact)].map(|contact| fit(&data(0.2, contact), "viscous_friction"));
+            let [air, both] = [None, Some(contact)].map(|contact| fit(&data(|_| 0.2, contact), "viscous_friction"));
             prop_assert!(both.score > 0.9 * air.score, "{} -> {} nat", air.score, both.score);
             prop_assert!(both.explained_fraction > 0.3, "{both:?}");
             prop_assert!((both.hypothesis.values[0] - 0.2).abs() < 0.02, "{:?}", both.hypothesis);

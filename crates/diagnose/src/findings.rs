@@ -80,6 +80,10 @@ pub struct Cause {
     /// The hypotheses that the log cannot tell apart, the cause first, with their posterior probabilities.
     #[serde(default)]
     pub posterior: Vec<WeightedHypothesis>,
+    /// Values of the first parameter in the first and in the second half of the log, if they differ by more than the law
+    /// allows: then the law is not the true one, or the robot changes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub drifts: Option<[f64; 2]>,
     /// What to do about it, as a sentence.
     #[serde(default)]
     pub remedy: String,

@@ -11,6 +11,7 @@
 //! - [`cross_validation`]: fits a hypothesis to one fold and evaluates it on the other, in full simulation.
 //! - [`null_distribution`]: the threshold of the evidence, from the log itself.
 //! - [`profile_likelihood`]: restarts from other local minima, and profile-likelihood intervals.
+//! - [`size_drift`]: causes whose size differs between the two halves of the rows.
 //! - [`discrimination`], [`experiment_design`]: choose an experiment that discriminates between ambiguous causes.
 //! - [`unexplained`]: describes the unexplained residual; [`spectral_line`]: its strongest frequency.
 //!
@@ -39,7 +40,10 @@ mod residual_data;
 mod residual_power;
 mod residual_rows;
 mod scan;
+mod size_drift;
 mod spectral_line;
+#[cfg(test)]
+mod test_data;
 mod torque_fit;
 mod torque_only;
 mod unexplained;
@@ -152,11 +156,12 @@ pub fn diagnose(
     let before_last_fit = with_causes(model, &accepted);
     let errors_of_fit = errors(evidence, &before_last_fit.robot_model()?, simulator)?;
     say("computing intervals")?;
-    let (extended, confusable) = intervals(model, &judged, &mut accepted, evidence, simulator);
+    let (extended, confusable, drifts) = intervals(model, &judged, &mut accepted, evidence, simulator);
     say("choosing the next experiment")?;
     let pairs = experiment_design::pairs(&extended, &accepted, &confusable);
     let next = experiment_design::next_motion(&pairs, evidence, &robot, simulator);
-    let causes = accepted.iter().map(|(best, others)| cause(best, others, &extended)).collect();
+    let causes =
+        accepted.iter().zip(drifts).map(|((best, others), drifts)| cause(best, others, drifts, &extended)).collect();
     let diagnosis = Diagnosis {
         baseline: errors(evidence, &robot, simulator)?,
         extended: errors_of_fit,
@@ -209,8 +214,8 @@ fn refitted(judged: &ModelFile, accepted: &mut Accepted, evidence: &ResidualData
     write_estimates(accepted, &fit, &point);
 }
 
-/// Fits the causes to all rows. Returns the model with the causes and their 95 % intervals, and the pairs of highly
-/// correlated causes.
+/// Fits the causes to all rows. Returns the model with the causes and their 95 % intervals, the pairs of highly correlated
+/// causes, and the values of the first parameter of each cause that drifts.
 ///
 /// The held-out blocks have measured the errors by now. They contain what the other rows lack, such as fast motion.
 fn intervals(
@@ -219,9 +224,9 @@ fn intervals(
     accepted: &mut Accepted,
     evidence: &ResidualData,
     simulator: &mut dyn Rollout,
-) -> (ModelFile, Vec<CorrelatedPair>) {
+) -> (ModelFile, Vec<CorrelatedPair>, Vec<Option<[f64; 2]>>) {
     let fits = [judged, model].map(|model| joint_fit(model, accepted));
-    let [Some(on_ground), Some(mut fit)] = fits else { return (model.clone(), Vec::new()) };
+    let [Some(on_ground), Some(mut fit)] = fits else { return (model.clone(), Vec::new(), Vec::new()) };
     let all_rows = evidence.all_rows(&on_ground.model(&on_ground.initial_point), simulator);
     fit.initial_point = on_ground.solve(&all_rows, simulator);
     write_estimates(accepted, &fit, &fit.initial_point);
@@ -236,7 +241,15 @@ fn intervals(
         covariance(&task.linearise(simulator, &fit.initial_point)?, &blocks(experiments), &errors)
     });
     let near = profile_likelihood::profile_intervals(&fit, evidence, simulator);
-    reporting::with_intervals(&fit, covariance.as_ref(), SIMULATOR_MISMATCH_STD, &near)
+    let (extended, confusable) = reporting::with_intervals(&fit, covariance.as_ref(), SIMULATOR_MISMATCH_STD, &near);
+    let values = size_drift::drifting_values(&fit, evidence, simulator);
+    let mut first = 0;
+    let of_first = |(best, _): &(CandidateFit, Vec<CandidateFit>)| {
+        let own = values[first];
+        first += best.hypothesis.values.len();
+        own
+    };
+    (extended, confusable, accepted.iter().map(of_first).collect())
 }
 
 /// Returns the RMS errors on held-out blocks.
@@ -277,7 +290,7 @@ fn posterior(hypotheses: Vec<(String, String, f64)>) -> Vec<WeightedHypothesis> 
     hypotheses.into_iter().map(weighted).collect()
 }
 
-fn cause(best: &CandidateFit, others: &[CandidateFit], extended: &ModelFile) -> Cause {
+fn cause(best: &CandidateFit, others: &[CandidateFit], drifts: Option<[f64; 2]>, extended: &ModelFile) -> Cause {
     let hypothesis = &best.hypothesis;
     let scored =
         |one: &CandidateFit| (one.hypothesis.effect.name.to_owned(), one.hypothesis.scope.to_string(), one.score);
@@ -290,8 +303,9 @@ fn cause(best: &CandidateFit, others: &[CandidateFit], extended: &ModelFile) -> 
         threshold_nats: best.threshold,
         ambiguous_with: ambiguous(best, others).map(|other| other.hypothesis.name()).collect(),
         posterior: posterior(std::iter::once(best).chain(ambiguous(best, others)).map(scored).collect()),
+        drifts,
         remedy: hypothesis.effect.remedy.to_owned(),
         rivals: others.iter().take(5).map(reporting::rival).collect(),
-        evidence: reporting::explanation(best, others),
+        evidence: reporting::explanation(best, others) + &reporting::drift(hypothesis, drifts),
     }
 }

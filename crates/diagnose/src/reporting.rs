@@ -131,6 +131,15 @@ pub fn explanation(best: &CandidateFit, others: &[CandidateFit]) -> String {
     text + " " + hypothesis.effect.signature
 }
 
+/// Returns a sentence about a size that differs between the halves of the rows; empty if it does not.
+pub fn drift(hypothesis: &Hypothesis, values: Option<[f64; 2]>) -> String {
+    let Some([first, second]) = values else { return String::new() };
+    let unit = hypothesis.effect.parameters[0].unit;
+    format!(
+        " The size drifts: {first:.4} {unit} in the first half of the log, {second:.4} {unit} in the second. Either the law is not the true one, or the robot changes, as by warming up."
+    )
+}
+
 /// Returns the RMS errors due to sensor noise alone.
 pub fn noise_floor(evidence: &ResidualData) -> RmsErrors {
     let experiments = &evidence.fit_rows.experiments;

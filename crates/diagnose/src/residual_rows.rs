@@ -1,10 +1,12 @@
 //! Residuals of rows of logs, with the channel and fold of each.
 
+use std::collections::BTreeSet;
+
 use rayon::prelude::*;
 use twinstep_model::{NUM_JOINTS, Precision, RobotModel, Rollout};
 
 use super::data_split::DataSplit;
-use super::residual_power::{DYNAMIC, ResidualPower, STANCE, TRUNK};
+use super::residual_power::{DYNAMIC, ResidualPower, STANCE, TORQUE, TRUNK};
 use twinstep_identify::experiment::{Experiment, Regime, ResidualChannel};
 use twinstep_identify::nuisance::NuisanceModel;
 
@@ -86,6 +88,21 @@ impl ResidualRows {
     /// penalty of a nuisance parameter, which follows the rows and belongs to both folds.
     pub fn weight_in_fold(&self, residual: usize, fold: usize) -> f64 {
         self.folds.get(residual).map_or(0.5, |of| f64::from(*of == Some(fold)))
+    }
+
+    /// Returns the residuals of joint positions with a fixed base in the first and in the second half of their blocks.
+    pub fn halves_in_air(&self) -> [Vec<usize>; 2] {
+        let blocks = self
+            .cells
+            .iter()
+            .zip(&self.blocks)
+            .map(|((channel, fold, _), block)| block.filter(|_| fold.is_some() && *channel < TORQUE));
+        let shown: Vec<(usize, usize)> =
+            blocks.enumerate().filter_map(|(residual, block)| Some((residual, block?))).collect();
+        let numbers: BTreeSet<usize> = shown.iter().map(|(_, block)| *block).collect();
+        let middle = numbers.iter().nth(numbers.len() / 2).copied().unwrap_or(0);
+        let (first, second): (Vec<_>, Vec<_>) = shown.into_iter().partition(|(_, block)| *block < middle);
+        [first, second].map(|half| half.into_iter().map(|(residual, _)| residual).collect())
     }
 
     /// Returns the standard deviation of noise and model error of a joint's position [rad].

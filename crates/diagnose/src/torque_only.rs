@@ -234,6 +234,7 @@ fn cause(slots: &JointSlots, found: &TorqueCandidate, others: &[EffectEntry]) ->
         threshold_nats: THRESHOLD,
         ambiguous_with: found.others.iter().filter(close).map(|other| name(&other.entry)).collect(),
         posterior: posterior(std::iter::once(found).chain(found.others.iter().filter(close)).map(scored).collect()),
+        drifts: None,
         remedy: effect.remedy.to_owned(),
         rivals: found.others.iter().map(rival).collect(),
         evidence: format!("{evidence} {}", effect.signature),

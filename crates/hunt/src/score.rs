@@ -232,6 +232,7 @@ mod tests {
             threshold_nats: 10.0,
             ambiguous_with: Vec::new(),
             posterior: Vec::new(),
+            drifts: None,
             remedy: String::new(),
             rivals: Vec::new(),
             evidence: String::new(),

@@ -110,6 +110,7 @@ fn cause(effect: &str, scope: &str, parameter: &str, [value, low, high]: [f64; 3
         threshold_nats: 14.2,
         ambiguous_with: Vec::new(),
         posterior: Vec::new(),
+        drifts: None,
         remedy: Effect::named(effect).expect("known").remedy.to_owned(),
         rivals: Vec::new(),
         evidence: String::new(),
