@@ -11,6 +11,7 @@
 //! - [`cross_validation`]: fits a hypothesis to one fold and evaluates it on the other, in full simulation.
 //! - [`null_distribution`]: the threshold of the evidence, from the log itself.
 //! - [`profile_likelihood`]: restarts from other local minima, and profile-likelihood intervals.
+//! - [`final_fit`]: the fit to all rows, with intervals.
 //! - [`size_drift`]: causes whose size differs between the two halves of the rows.
 //! - [`discrimination`], [`experiment_design`]: choose an experiment that discriminates between ambiguous causes.
 //! - [`unexplained`]: describes the unexplained residual; [`spectral_line`]: its strongest frequency.
@@ -28,6 +29,7 @@ mod data_split;
 mod discrimination;
 mod excitation;
 mod experiment_design;
+mod final_fit;
 mod findings;
 mod forward_selection;
 mod friction_family;
@@ -51,13 +53,14 @@ mod unexplained;
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, Scope};
 use twinstep_logs::Log;
-use twinstep_model::{Precision, RobotModel, Rollout};
+use twinstep_model::{RobotModel, Rollout};
 
 use cross_validation::{CandidateFit, FitProblem};
 use data_split::DataSplit;
 pub use discrimination::HypothesisPair;
 pub use excitation::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
 pub use experiment_design::ProposedExperiment;
+use final_fit::FinalFit;
 pub use findings::{
     AlternativeCause, Cause, CorrelatedPair, Diagnosis, DiscriminatedPair, Estimate, LearnedResidual, NextExperiment,
     ParameterValue, RmsErrors, Unexplained, WeightedHypothesis,
@@ -68,9 +71,6 @@ use residual_data::ResidualData;
 pub use torque_only::diagnose_torques;
 use twinstep_identify::ExperimentError;
 use twinstep_identify::evaluate::evaluate;
-use twinstep_identify::identify::blocks;
-use twinstep_identify::nuisance::NuisanceModel;
-use twinstep_identify::refine::{SIMULATOR_MISMATCH_STD, covariance};
 use twinstep_identify::window::WindowConfig;
 
 /// Difference of the log-likelihood gain from that of a cause within which an alternative is ambiguous [nat].
@@ -156,7 +156,7 @@ pub fn diagnose(
     let before_last_fit = with_causes(model, &accepted);
     let errors_of_fit = errors(evidence, &before_last_fit.robot_model()?, simulator)?;
     say("computing intervals")?;
-    let (extended, confusable, drifts) = intervals(model, &judged, &mut accepted, evidence, simulator);
+    let FinalFit { extended, confusable, drifts } = FinalFit::new(model, &judged, &mut accepted, evidence, simulator);
     say("choosing the next experiment")?;
     let pairs = experiment_design::pairs(&extended, &accepted, &confusable);
     let next = experiment_design::next_motion(&pairs, evidence, &robot, simulator);
@@ -212,44 +212,6 @@ fn refitted(judged: &ModelFile, accepted: &mut Accepted, evidence: &ResidualData
     let Some(fit) = joint_fit(judged, accepted) else { return };
     let point = profile_likelihood::refine_with_restarts(&fit, evidence, simulator);
     write_estimates(accepted, &fit, &point);
-}
-
-/// Fits the causes to all rows. Returns the model with the causes and their 95 % intervals, the pairs of highly correlated
-/// causes, and the values of the first parameter of each cause that drifts.
-///
-/// The held-out blocks have measured the errors by now. They contain what the other rows lack, such as fast motion.
-fn intervals(
-    model: &ModelFile,
-    judged: &ModelFile,
-    accepted: &mut Accepted,
-    evidence: &ResidualData,
-    simulator: &mut dyn Rollout,
-) -> (ModelFile, Vec<CorrelatedPair>, Vec<Option<[f64; 2]>>) {
-    let fits = [judged, model].map(|model| joint_fit(model, accepted));
-    let [Some(on_ground), Some(mut fit)] = fits else { return (model.clone(), Vec::new(), Vec::new()) };
-    let all_rows = evidence.all_rows(&on_ground.model(&on_ground.initial_point), simulator);
-    fit.initial_point = on_ground.solve(&all_rows, simulator);
-    write_estimates(accepted, &fit, &fit.initial_point);
-    let experiments = &all_rows.experiments;
-    let tolerances = fit
-        .model(&fit.initial_point)
-        .robot_model()
-        .ok()
-        .and_then(|robot| NuisanceModel::new(experiments, &robot, simulator));
-    let covariance = fit.with_problem(&all_rows, simulator, Precision::Double, |task, simulator| {
-        let errors = tolerances.map_or(Vec::new(), |all| all.robot_errors(task.residual_scale, task.tolerances));
-        covariance(&task.linearise(simulator, &fit.initial_point)?, &blocks(experiments), &errors)
-    });
-    let near = profile_likelihood::profile_intervals(&fit, evidence, simulator);
-    let (extended, confusable) = reporting::with_intervals(&fit, covariance.as_ref(), SIMULATOR_MISMATCH_STD, &near);
-    let values = size_drift::drifting_values(&fit, evidence, simulator);
-    let mut first = 0;
-    let of_first = |(best, _): &(CandidateFit, Vec<CandidateFit>)| {
-        let own = values[first];
-        first += best.hypothesis.values.len();
-        own
-    };
-    (extended, confusable, accepted.iter().map(of_first).collect())
 }
 
 /// Returns the RMS errors on held-out blocks.
