@@ -20,4 +20,13 @@ pub enum ExperimentError {
         /// The missing channel.
         missing: String,
     },
+    /// No row of the log can be simulated.
+    #[error(
+        "none of the {rows} rows of the log can be simulated: a contiguous range of rows has at least two, and where base is \
+         \"floating\" some motor has kp above 0 or a tau_ff; log rows in which the motors hold or move the robot"
+    )]
+    NothingToSimulate {
+        /// Number of rows of the log.
+        rows: usize,
+    },
 }

@@ -134,6 +134,9 @@ pub fn windows(log: &Log, robot: &RobotModel, horizon: WindowConfig) -> Result<V
             }
         }
     }
+    if windows.is_empty() {
+        return Err(ExperimentError::NothingToSimulate { rows: log.rows() });
+    }
     Ok(windows)
 }
 
@@ -325,8 +328,8 @@ mod tests {
         }
     }
 
-    #[test]
-    fn robot_on_the_ground_is_not_simulated_while_its_motors_only_brake() {
+    /// Returns a log of a floating robot with this kp and feed-forward torque [N·m] in each row.
+    fn floating(kp: impl Fn(usize) -> f64, tau_ff: impl Fn(usize) -> f64) -> Log {
         let segments = vec![Segment { name: "all".to_owned(), base: BaseMount::Floating }];
         let column = |name: &str, of: &dyn Fn(usize) -> f64| (name.to_owned(), (0..100).map(of).collect::<Vec<_>>());
         let mut columns = vec![column("t", &|row| row as f64 / RATE_HZ)];
@@ -338,13 +341,25 @@ mod tests {
             columns.push(column(name, &|_| 0.0));
         }
         columns.push(column("quat_w", &|_| 1.0));
-        columns.push(column("kp", &|row| if (40..70).contains(&row) { 0.0 } else { 30.0 }));
+        columns.push(column("kp", &kp));
         columns.push(column("kd", &|_| 3.0));
-        columns.push(column("tau_ff_FL_hip", &|row| if row >= 60 { 1.0 } else { 0.0 }));
-        let log = Log::new(Meta::new(RATE_HZ, TorqueSensor::None, segments), columns).expect("a log");
+        columns.push(column("tau_ff_FL_hip", &tau_ff));
+        Log::new(Meta::new(RATE_HZ, TorqueSensor::None, segments), columns).expect("a log")
+    }
+
+    #[test]
+    fn robot_on_the_ground_is_not_simulated_while_its_motors_only_brake() {
+        let log =
+            floating(|row| if (40..70).contains(&row) { 0.0 } else { 30.0 }, |row| if row >= 60 { 1.0 } else { 0.0 });
         let windows = windows(&log, &go2(), WindowConfig::EVALUATION).expect("a measured base");
         let rows: Vec<_> = windows.iter().map(|window| window.rows.clone()).collect();
         assert_eq!(rows, [0..40, 60..100]);
+    }
+
+    #[test]
+    fn log_without_a_row_to_simulate_is_refused() {
+        let error = windows(&floating(|_| 0.0, |_| 0.0), &go2(), WindowConfig::EVALUATION).expect_err("refused");
+        assert!(error.to_string().starts_with("none of the 100 rows"), "{error}");
     }
 
     #[test]
