@@ -82,6 +82,21 @@ impl Group {
         })
     }
 
+    /// Runs `policy` for this number of steps, from which nothing is learnt.
+    pub fn advance(&mut self, policy: &BehaviourPolicy, noise_seed: u64, steps: usize) -> Result<(), EnvError> {
+        let noise_seed = noise_seed.wrapping_add(self.first_robot);
+        let mut left = steps;
+        while left > 0 {
+            let steps = left.min(self.horizon);
+            self.collector.send(policy, noise_seed, steps)?;
+            if !self.collector.collect(policy, noise_seed, steps, &mut self.trajectory)? {
+                break;
+            }
+            left -= steps;
+        }
+        Ok(())
+    }
+
     /// Sends the request for a rollout, if the robots are on a server. [`Group::collect`] follows.
     pub fn send(&mut self, behaviour: &Behaviour) -> Result<(), EnvError> {
         self.collector.send(behaviour.policy, behaviour.noise_seed.wrapping_add(self.first_robot), self.horizon)

@@ -290,6 +290,31 @@ fn resumed_learner_is_the_one_that_was_saved() {
     assert_eq!((iteration.iteration, iteration.env_steps), (4, 4 * config.batch_len() as u64));
 }
 
+/// With the learning rate of untrained networks, the first update diverges by more than 0.1 nat.
+#[test]
+fn fine_tuning_starts_near_the_earlier_policy() {
+    let config = PpoConfig { horizon: 128, epochs: 5, gamma: 0.95, initial_std: 0.02, ..config() };
+    let mut trainer = Trainer::new(config.clone(), envs::<Pendulum>(&config), None, 1).expect("valid");
+    (0..5).for_each(|_| drop(trainer.iterate().expect("finite")));
+    let start = trainer.learner().clone().fine_tuned(&config);
+    assert!(start.actor == trainer.learner().actor && start.critic == trainer.learner().critic);
+    let mut tuned = Trainer::new(config.clone(), envs::<Pendulum>(&config), Some(start), 1).expect("valid");
+    let kl = tuned.iterate().expect("finite").kl;
+    assert!(kl < 0.03, "{kl}");
+}
+
+#[test]
+fn groups_of_a_given_learner_are_in_different_parts_of_their_episodes() {
+    let config = PpoConfig { horizon: 110, ..config() };
+    let ended = |learner: Option<Learner>| {
+        let mut trainer = Trainer::new(config.clone(), envs::<Pendulum>(&config), learner, 1).expect("valid");
+        (trainer.iterate().expect("finite").statistics.episodes, trainer.learner().clone())
+    };
+    let (at_once, learner) = ended(None);
+    // Episodes have 200 steps. One of the two groups begins in their middle.
+    assert_eq!((at_once, ended(Some(learner)).0), (0, config.num_envs as u64 / 2));
+}
+
 /// Robots that cannot be reached in their second rollout.
 struct Unreliable(StepCollector, u32);
 
