@@ -48,6 +48,19 @@ impl Resumable {
         self.run(&[arguments, &["--out", &out]].concat()).map(drop)
     }
 
+    /// Trains a task on the nominal Go2, by the command of `data/policies`. Returns the folder of the training, whose
+    /// checkpoint has the critic that fine-tuning needs.
+    pub fn nominal(&self, task: &str) -> Step<PathBuf> {
+        let out = self.path("nominal").join(task);
+        let options: &[&str] = match task {
+            "walk" => &["--seed", "4"],
+            "jump" => &["--seed", "1", "--steps", "20000000"],
+            _ => &["--seed", "1", "--steps", "30000000"],
+        };
+        self.step(&out.join("evaluation.json"), &[&["train", task], options].concat(), &out)?;
+        Ok(out)
+    }
+
     /// Runs `twinstep` and returns its stdout. Adds its time to the ledger.
     pub fn run(&self, arguments: &[&str]) -> Step<String> {
         let (start, line) = (Instant::now(), arguments.join(" "));
@@ -61,11 +74,6 @@ impl Resumable {
         writeln!(ledger, "{:.1},twinstep {line}", start.elapsed().as_secs_f64()).map_err(text)?;
         Ok(String::from_utf8_lossy(&output.stdout).into_owned())
     }
-}
-
-/// Returns the policy of this repository from which every method trains a task.
-pub fn start(task: &str) -> PathBuf {
-    root().join(format!("data/policies/{task}.safetensors"))
 }
 
 /// Reads a JSON file.

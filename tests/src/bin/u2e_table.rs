@@ -14,7 +14,7 @@ use twinstep_ensemble::check_effects;
 use twinstep_logs::TorqueSensor;
 use twinstep_tests::process::Process;
 use twinstep_tests::python::root;
-use twinstep_tests::resumable::{Resumable, Step, number, read, start, text};
+use twinstep_tests::resumable::{Resumable, Step, number, read, text};
 
 /// Compare methods on a hidden robot, for one seed.
 #[derive(Parser)]
@@ -108,12 +108,13 @@ impl Campaign {
         self.collect()?;
         self.models()?;
         for (task, settings) in TASKS {
+            let start = self.commands.nominal(task)?;
+            self.evaluate(task, "start", &start.join("policy.safetensors"))?;
             for method in METHODS {
-                self.tune(task, settings, method)?;
+                self.tune(task, settings, method, &start)?;
                 let policy = self.path(&format!("{method}-{task}/policy.safetensors"));
                 self.evaluate(task, method, &policy)?;
             }
-            self.evaluate(task, "start", &start(task))?;
         }
         self.table()
     }
@@ -222,8 +223,8 @@ impl Campaign {
         std::fs::write(self.path("ours.toml"), ours.to_toml()).map_err(text)
     }
 
-    /// Trains a task from its start on the model of a method.
-    fn tune(&self, task: &str, settings: &str, method: &str) -> Step {
+    /// Continues a training on the model of a method.
+    fn tune(&self, task: &str, settings: &str, method: &str, start: &Path) -> Step {
         let out = self.path(&format!("{method}-{task}"));
         let config = self.path(&format!("{method}-{task}.toml"));
         let vanilla = std::fs::read_to_string(root().join("examples/u2e/vanilla.toml")).map_err(text)?;
@@ -235,7 +236,7 @@ impl Campaign {
             "laws" | "ours" => Some(self.path(&format!("{method}.toml"))),
             _ => None,
         };
-        let from = start(task).display().to_string();
+        let from = start.join("checkpoint.safetensors").display().to_string();
         let (config, steps, seed) = (config.display().to_string(), self.args.tune_steps.to_string(), self.seed());
         let mut arguments =
             vec!["train", task, "--config", &config, "--from", &from, "--steps", &steps, "--seed", &seed];

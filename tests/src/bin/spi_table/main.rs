@@ -16,7 +16,7 @@ use twinstep_model::stream;
 use twinstep_tests::ground_truth_robot::effect;
 use twinstep_tests::process::Process;
 use twinstep_tests::python::root;
-use twinstep_tests::resumable::{Resumable, Step, start, text};
+use twinstep_tests::resumable::{Resumable, Step, text};
 
 /// Compare methods on hidden robots.
 #[derive(Parser)]
@@ -92,6 +92,13 @@ struct Task {
     seconds: u32,
 }
 
+impl Task {
+    /// Returns true if the policy from which the methods start is evaluated on the same targets.
+    fn has_start(&self) -> bool {
+        self.settings.is_empty()
+    }
+}
+
 const TASKS: [Task; 3] = [
     Task {
         name: "walk",
@@ -138,8 +145,11 @@ fn campaign(args: &Args) -> Step<String> {
         let robot = Robot::new(args, seed)?;
         robot.collect()?;
         for task in TASKS.iter().filter(|task| args.tasks.iter().any(|name| name == task.name)) {
-            args.methods.iter().try_for_each(|method| robot.tune_and_evaluate(task, method))?;
-            robot.evaluate(task, "start", &start(task.name))?;
+            let start = Resumable::new(&args.out)?.nominal(task.name)?;
+            if task.has_start() {
+                robot.evaluate(task, "start", &start.join("policy.safetensors"))?;
+            }
+            args.methods.iter().try_for_each(|method| robot.tune_and_evaluate(task, method, &start))?;
         }
         std::fs::write(args.out.join("table.md"), table::text(args)?).map_err(text)?;
     }
@@ -201,15 +211,15 @@ impl<'a> Robot<'a> {
         Process::listening(&self.commands.twinstep, &arguments)
     }
 
-    /// Trains a task on the model of a method, and evaluates the policy.
-    fn tune_and_evaluate(&self, task: &Task, method: &str) -> Step {
+    /// Continues a training on the model of a method, and evaluates the policy.
+    fn tune_and_evaluate(&self, task: &Task, method: &str, start: &Path) -> Step {
         let out = self.commands.path(&format!("{method}-{}", task.name));
         let config = self.commands.path(&format!("{method}-{}.toml", task.name));
         let heavy = std::fs::read_to_string(root().join("examples/spi-active/heavy.toml")).map_err(text)?;
         let randomise = if method == "heavy" { heavy } else { String::new() };
         let settings = format!("[task]\nname = \"{}\"\n{}{randomise}", task.name, task.settings);
         std::fs::write(&config, settings).map_err(text)?;
-        let (from, config) = (start(task.name).display().to_string(), config.display().to_string());
+        let [from, config] = [start.join("checkpoint.safetensors"), config].map(|path| path.display().to_string());
         let (steps, seed) = (self.args.tune_steps.to_string(), self.seed.to_string());
         let mut arguments =
             vec!["train", task.name, "--config", &config, "--from", &from, "--steps", &steps, "--seed", &seed];

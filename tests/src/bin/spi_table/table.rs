@@ -23,15 +23,20 @@ pub fn text(args: &Args) -> Step<String> {
         identification(args, seed, &mut text)?;
     }
     for task in TASKS {
-        let methods = || std::iter::once("start").chain(args.methods.iter().map(String::as_str));
-        let is_complete =
-            |seed: &u64| methods().all(|method| exists(args, *seed, &format!("{method}-{}.json", task.name)));
+        let is_complete = |seed: &u64| {
+            methods(args, &task).all(|method| exists(args, *seed, &format!("{method}-{}.json", task.name)))
+        };
         let done: Vec<u64> = seeds(args).filter(is_complete).collect();
         if !done.is_empty() {
             downstream(args, &task, &done, &mut text)?;
         }
     }
     Ok(text)
+}
+
+/// Returns the rows of a task's table.
+fn methods<'a>(args: &'a Args, task: &Task) -> impl Iterator<Item = &'a str> {
+    task.has_start().then_some("start").into_iter().chain(args.methods.iter().map(String::as_str))
 }
 
 fn seeds(args: &Args) -> std::ops::Range<u64> {
@@ -86,7 +91,7 @@ fn downstream(args: &Args, task: &Task, seeds: &[u64], text: &mut String) -> Ste
         task.error,
         seeds.len()
     );
-    for method in std::iter::once("start").chain(args.methods.iter().map(String::as_str)) {
+    for method in methods(args, task) {
         let found = errors(method)?;
         let cells: Vec<String> = found.iter().map(|[error, _]| format!("{error:.3}")).collect();
         let up = mean(found.iter().map(|[_, up]| *up));
