@@ -62,7 +62,7 @@ const COLLECTIONS: [&str; 3] = ["explore", "random", "base"];
 /// Methods whose policies are compared.
 const METHODS: [&str; 5] = ["vanilla", "single", "u2e", "laws", "ours"];
 /// Tasks, with the settings of their fine-tuning.
-const TASKS: [(&str, &str); 2] = [("track", ""), ("jump", "target_x_m = [0.6, 0.6]\n")];
+const TASKS: [(&str, &str); 2] = [("jump", "target_x_m = [0.6, 0.6]\n"), ("track", "")];
 /// Jumps in the held-out log, and the duration of each [s].
 const JUMPS: u64 = 12;
 const JUMP_S: &str = "1.4";
