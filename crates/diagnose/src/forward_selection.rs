@@ -335,7 +335,6 @@ mod tests {
             assert!(explains_affected_channels(&hypothesis(effect, scope), true, &given, &noise));
         }
     }
-
     /// Contact adds to the position error of every joint. A delay is seen in the torques, friction in the positions.
     #[test]
     fn cause_of_a_robot_that_never_hangs_must_explain_the_channel_that_shows_it() {

@@ -1,5 +1,4 @@
-//! Nuisance parameters: errors of mass, leg mounting, ground contact, clocks and initial state that any robot and its log
-//! have.
+//! Nuisance parameters: errors of mass, leg mounting, ground contact and initial state that any robot has.
 //!
 //! Left in the residuals, they are attributed to a payload or an encoder offset. A leg that is mounted 2 mm too low
 //! changes the joint positions of a standing robot by 10 mrad. An initial velocity that is 20 mm/s too high lets the
@@ -12,26 +11,22 @@
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use twinstep_model::{Precision, RobotModel, Rollout};
 
-use crate::experiment::{Clock, Experiment};
+use crate::experiment::Experiment;
 
 /// Relative standard deviation of the trunk's mass.
 const TRUNK_MASS_STD: f64 = 0.006;
 /// Relative standard deviation of the mass of a link of a leg: cables, covers, feet that were replaced.
-const LINK_MASS_STD: f64 = 0.05;
+const LINK_MASS_STD: f64 = 0.03;
 /// Standard deviation of the trunk's centre of mass along each axis [m].
-const CENTRE_STD_M: f64 = 0.002;
+const CENTRE_STD_M: f64 = 0.001;
 /// Standard deviation of the mounting position of a leg along each axis [m].
 const MOUNT_OFFSET_STD_M: f64 = 0.0012;
 /// Standard deviation of the length of a thigh, and of all calves [m].
 const LENGTH_STD_M: f64 = 0.001;
 /// Relative standard deviations of ground friction and of the contact's time constant.
 const GROUND_STD: [f64; 2] = [0.03, 0.15];
-/// Standard deviation of the delay of motion capture, and of the IMU, relative to the joints [s].
-const CLOCK_STD_S: f64 = 0.003;
 /// Number of nuisance parameters of the robot: [`perturbed_robot`] has the list.
-const NUM_ROBOT_ERRORS: usize = 36;
-/// Number of nuisance parameters of robot and log.
-const NUM_NUISANCE: usize = NUM_ROBOT_ERRORS + Clock::ALL.len();
+const NUM_NUISANCE: usize = 36;
 /// Largest size of a nuisance parameter [prior std]: what is larger is an error of the model.
 const LARGEST: f64 = 3.0;
 /// Correlation length of the residuals [rows].
@@ -94,12 +89,11 @@ impl NuisanceModel {
     pub fn new(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Rollout) -> Option<Self> {
         let starts = starts(experiments, robot, simulator)?;
         let sides = |error: usize| [-1.0, 1.0].map(|side| perturbed_robot(robot, error, side));
-        let robots: Vec<RobotModel> = (0..NUM_ROBOT_ERRORS).flat_map(sides).collect();
+        let robots: Vec<RobotModel> = (0..NUM_NUISANCE).flat_map(sides).collect();
         let mut columns = vec![Vec::new(); NUM_NUISANCE];
         for experiment in experiments {
             let residuals = experiment.residuals(simulator, &robots, Precision::Single);
-            let late = Clock::ALL.map(|clock| late_residuals(experiment, clock, robot, simulator));
-            for (column, ends) in columns.iter_mut().zip(residuals.chunks(2).chain(late.iter().map(|ends| &ends[..]))) {
+            for (column, ends) in columns.iter_mut().zip(residuals.chunks(2)) {
                 column.extend(half_difference(&ends[0], &ends[1]));
             }
         }
@@ -134,7 +128,7 @@ impl NuisanceModel {
         Self::of(self.starts.iter().map(|start| start.rescaled(spread)).collect::<Option<_>>()?, jacobian)
     }
 
-    /// Returns the effect of each error of robot and log, of one standard deviation, on residuals divided by `spread`.
+    /// Returns the effect of each error of the robot, of one standard deviation, on residuals divided by `spread`.
     ///
     /// The nuisance parameters of `taken` are eliminated from the effects.
     pub fn robot_errors(&self, spread: &[f64], taken: Option<&Self>) -> Vec<Vec<f64>> {
@@ -198,19 +192,6 @@ fn starts(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Ro
         first += columns[0].len();
     }
     Some(starts)
-}
-
-/// Returns the residuals if a clock is early and if it is late, by one standard deviation.
-fn late_residuals(
-    experiment: &Experiment,
-    clock: Clock,
-    robot: &RobotModel,
-    simulator: &mut dyn Rollout,
-) -> [Vec<f64>; 2] {
-    [-1.0, 1.0].map(|side| {
-        let late = experiment.with_late_base(clock, side * CLOCK_STD_S);
-        late.residuals(simulator, std::slice::from_ref(robot), Precision::Single).remove(0)
-    })
 }
 
 fn half_difference<'a>(below: &'a [f64], above: &'a [f64]) -> impl Iterator<Item = f64> + 'a {

@@ -1,12 +1,10 @@
 //! Experiment: windows of a log that are simulated from measured states, and the channels that are compared.
 //!
 //! - [`channel`]: the channels that are compared, and their noise.
-//! - [`late_base`]: base channels that are recorded late.
 //! - [`residuals`]: simulation of the windows, and comparison with the log.
 //! - [`residual_index`]: channel and row, window, group and block of each residual.
 
 mod channel;
-mod late_base;
 mod residual_index;
 mod residuals;
 
@@ -19,7 +17,6 @@ use twinstep_logs::replay::{at_log_rate, joint_commands};
 use twinstep_model::{Joint, RobotModel};
 
 pub use channel::ResidualChannel;
-pub use late_base::Clock;
 pub use residual_index::Regime;
 pub use residuals::{SimulatedPose, estimated_torque};
 
