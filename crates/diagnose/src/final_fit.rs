@@ -82,3 +82,34 @@ fn fit_to_all_rows(
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use twinstep_effects::{Effect, Scope};
+    use twinstep_model::Joint;
+
+    use super::*;
+    use crate::cross_validation::CandidateFit;
+    use crate::hypothesis::Hypothesis;
+    use crate::test_data::{Linear, data};
+
+    /// Returns the values of viscous friction that the final fit reports for a joint with this friction [N·m·s/rad].
+    fn reported(viscous: f64) -> Vec<f64> {
+        let effect = Effect::named("viscous_friction").expect("in the catalogue");
+        let hypothesis = Hypothesis { effect, scope: Scope::Joint(Joint::ALL[0]), values: vec![0.1] };
+        let found = CandidateFit { hypothesis, score: 50.0, gain: 0.5, explained_fraction: 1.0, threshold: 10.0 };
+        let (model, mut accepted) = (ModelFile::default(), vec![(found, Vec::new())]);
+        let fit = FinalFit::new(&model, &model, &mut accepted, &data(|_| viscous, None), &mut Linear);
+        assert_eq!(fit.extended.effects.len(), accepted.len());
+        assert_eq!(fit.drifts.len(), accepted.len());
+        accepted.iter().map(|(best, _)| best.hypothesis.values[0]).collect()
+    }
+
+    /// The minimum size is 0.06 N·m·s/rad.
+    #[test]
+    fn cause_that_all_rows_make_too_small_is_not_reported() {
+        let [value] = reported(0.1)[..] else { panic!("it is reported") };
+        assert!((value - 0.1).abs() < 0.01, "{value}");
+        assert!(reported(0.03).is_empty());
+    }
+}

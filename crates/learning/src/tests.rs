@@ -290,10 +290,10 @@ fn resumed_learner_is_the_one_that_was_saved() {
     assert_eq!((iteration.iteration, iteration.env_steps), (4, 4 * config.batch_len() as u64));
 }
 
-/// With the learning rate of untrained networks, the first update diverges by more than 0.1 nat.
+/// With the learning rate of untrained networks, the first update has a divergence of 0.12 nat.
 #[test]
 fn fine_tuning_starts_near_the_earlier_policy() {
-    let config = PpoConfig { horizon: 128, epochs: 5, gamma: 0.95, initial_std: 0.02, ..config() };
+    let config = PpoConfig { horizon: 128, epochs: 5, gamma: 0.95, initial_std: 0.005, ..config() };
     let mut trainer = Trainer::new(config.clone(), envs::<Pendulum>(&config), None, 1).expect("valid");
     (0..5).for_each(|_| drop(trainer.iterate().expect("finite")));
     let start = trainer.learner().clone().fine_tuned(&config);
