@@ -115,7 +115,10 @@ impl FitProblem {
         let tolerances = rows.tolerances.as_ref();
         let task = LeastSquaresProblem { file, unknowns, experiments, residual_scale: &[], tolerances, precision };
         let mut spread = task.estimate_residual_scale(simulator, &self.initial_point);
-        rows.ignore_dynamic(&mut spread, unknowns.iter().any(|unknown| unknown.effect.target == Target::Ground));
+        rows.raise_scales_on_ground(
+            &mut spread,
+            unknowns.iter().any(|unknown| unknown.effect.target == Target::Ground),
+        );
         let tolerances = tolerances.and_then(|tolerances| tolerances.rescaled(&spread));
         ask(&LeastSquaresProblem { residual_scale: &spread, tolerances: tolerances.as_ref(), ..task }, simulator)
     }

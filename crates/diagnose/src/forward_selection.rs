@@ -12,7 +12,7 @@ use super::hypothesis::Hypothesis;
 use super::null_distribution::{self, LOWEST_THRESHOLD};
 use super::profile_likelihood::refine_with_restarts;
 use super::residual_data::ResidualData;
-use super::residual_power::{CHANNELS, DYNAMIC, GYRO, ResidualPower, STANCE, TORQUE, TRUNK};
+use super::residual_power::{CHANNELS, DYNAMIC, GYRO, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
 use super::scan::{self, ScoredHypothesis, scan};
 
 /// Log-likelihood gain that a cause must reach where no null distribution is computed: torques of other robots, and the
@@ -247,8 +247,8 @@ fn explains_affected_channels(
 ///
 /// For joints, these are the positions with a fixed base, and the torques. If the base never is fixed, positions have the
 /// errors of the contact model, too: a cause that the torque sensor shows must explain the torques, another the
-/// positions. For the base, the group is all motion channels with a floating base; for the ground, those of a robot that
-/// walks or jumps, if it does.
+/// positions. For bodies, the group is force and moment on the base; where they are not known, and for the ground, all motion
+/// channels with a floating base; for the ground of a robot that walks or jumps, those of that.
 fn affected_channels(hypothesis: &Hypothesis, at_sensor: bool, given: &ResidualPower) -> Vec<Vec<usize>> {
     let has = |channels: Range<usize>| given.counts[channels].iter().flatten().any(|count| *count > 0.0);
     let joints = |first: usize| {
@@ -261,6 +261,7 @@ fn affected_channels(hypothesis: &Hypothesis, at_sensor: bool, given: &ResidualP
         Target::Joints => vec![joints(STANCE)],
         Target::Imu => vec![(GYRO..STANCE).collect()],
         Target::Ground if has(DYNAMIC..CHANNELS) => vec![(DYNAMIC..CHANNELS).collect()],
+        Target::Bodies if has(WRENCH..DYNAMIC) => vec![(WRENCH..DYNAMIC).collect()],
         Target::Bodies | Target::Ground => vec![(TRUNK..GYRO).chain(STANCE..DYNAMIC).collect()],
         Target::Supply => Vec::new(),
     }
@@ -335,6 +336,7 @@ mod tests {
             assert!(explains_affected_channels(&hypothesis(effect, scope), true, &given, &noise));
         }
     }
+
     /// Contact adds to the position error of every joint. A delay is seen in the torques, friction in the positions.
     #[test]
     fn cause_of_a_robot_that_never_hangs_must_explain_the_channel_that_shows_it() {

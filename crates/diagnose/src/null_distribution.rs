@@ -20,7 +20,7 @@ use twinstep_model::{Joint, Rollout, stream};
 use super::cross_validation::parameter_penalty;
 use super::hypothesis::{relative_size, selection_penalty, with_effect};
 use super::residual_data::{BlockProducts, ResidualData};
-use super::residual_power::{CHANNELS, DYNAMIC, STANCE, TORQUE, evident_channels};
+use super::residual_power::{CHANNELS, STANCE, TORQUE, WRENCH, evident_channels};
 
 /// Number of draws.
 const DRAWS: u64 = 499;
@@ -214,7 +214,7 @@ impl<'a> FlippedSums<'a> {
 fn shows(scope: Scope, channel: usize) -> bool {
     let joint = match channel {
         channel if channel < 2 * TORQUE => channel % TORQUE,
-        channel if (STANCE..DYNAMIC).contains(&channel) => channel - STANCE,
+        channel if (STANCE..WRENCH).contains(&channel) => channel - STANCE,
         _ => return scope.joints() == 0,
     };
     scope.joints() == 0 || scope.contains(Joint::ALL[joint])

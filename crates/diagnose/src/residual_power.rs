@@ -8,7 +8,8 @@ use twinstep_model::NUM_JOINTS;
 use twinstep_identify::nuisance;
 
 /// Number of channels: joint positions with a fixed base, torques, base position, orientation, velocity and angular
-/// velocity, joint positions with a floating base, and joint positions and base motion of a robot that walks or jumps.
+/// velocity, joint positions with a floating base, force and moment on the base of a standing robot, and joint positions
+/// and base motion of a robot that walks or jumps.
 ///
 /// Positions with a floating base are channels of their own, because they have the errors of the contact model, too. A
 /// robot that walks or jumps shows little else: its channels are evidence only about the ground.
@@ -21,9 +22,11 @@ pub const TRUNK: usize = 2 * NUM_JOINTS;
 pub const GYRO: usize = TRUNK + 9;
 /// First channel of the joint positions with a floating base.
 pub const STANCE: usize = TRUNK + 12;
+/// First channel of force and moment on the base of a standing robot.
+pub const WRENCH: usize = STANCE + NUM_JOINTS;
 /// First channel of a robot that walks or jumps: joint positions, then base position, orientation, velocity and angular
 /// velocity.
-pub const DYNAMIC: usize = STANCE + NUM_JOINTS;
+pub const DYNAMIC: usize = WRENCH + 6;
 
 /// Returns the channels that are evidence about effects on these targets.
 pub fn evident_channels(targets: impl IntoIterator<Item = Target>) -> Range<usize> {

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use twinstep_model::{NUM_JOINTS, Precision, RobotModel, Rollout};
 
 use super::data_split::DataSplit;
-use super::residual_power::{DYNAMIC, ResidualPower, STANCE, TORQUE, TRUNK};
+use super::residual_power::{DYNAMIC, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
 use twinstep_identify::experiment::{Experiment, Regime, ResidualChannel};
 use twinstep_identify::nuisance::NuisanceModel;
 
@@ -20,6 +20,12 @@ const MODEL_ERROR_RAD: f64 = 0.001;
 const MODEL_ERROR_BASE: f64 = 1.0;
 /// Standard deviation of the model error of the gyroscope [noise std].
 const MISFIT_OF_GYRO: f64 = 1.0 / 3.0;
+/// Standard deviation of the model error of joint positions of a standing robot whose wrench on the base is known [rad].
+///
+/// Two engines differ by as much, in the same direction for a whole window. The wrench has no error of contact.
+const STANCE_ERROR_RAD: f64 = 0.003;
+/// Factor on the scale of all simulated residuals of such a robot: their errors last about ten times as long as others.
+const STANCE_SCALE: f64 = 3.0;
 /// Scale of a residual that takes no part in a fit.
 const IGNORED: f64 = 1e6;
 
@@ -37,15 +43,23 @@ pub struct ResidualRows {
     blocks: Vec<Option<usize>>,
     /// True for the residuals of a robot that walks or jumps.
     dynamic: Vec<bool>,
+    /// True for the simulated residuals of a standing robot whose wrench on the base is known.
+    stance: Vec<bool>,
 }
 
 impl ResidualRows {
     /// Creates the residuals of `experiments`, one for each log, which is divided as in `splits`.
     pub fn new(splits: &[DataSplit], experiments: Vec<Experiment>) -> Self {
         let (mut cells, mut folds, mut blocks, mut dynamic) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        let mut stance = Vec::new();
         let mut first_block = 0;
         for (split, experiment) in splits.iter().zip(&experiments) {
             dynamic.extend(experiment.dynamic_residuals());
+            let is_wrench = |quantity| matches!(quantity, ResidualChannel::BaseWrench(_));
+            let balanced = experiment.residual_index().any(|(quantity, _)| is_wrench(quantity));
+            stance.extend(experiment.residual_index().zip(experiment.groups()).map(|((quantity, _), group)| {
+                balanced && !is_wrench(quantity) && Experiment::regime(group) == Regime::Floating
+            }));
             let block = |row: usize| split.block(row).map(|block| first_block + block);
             blocks.extend(experiment.residual_index().map(|(_, row)| block(row)));
             folds.extend(experiment.residual_index().map(|(_, row)| split.fold(row)));
@@ -60,28 +74,33 @@ impl ResidualRows {
                             Regime::Floating => STANCE,
                             Regime::Dynamic => DYNAMIC,
                         };
-                        (first + joint, MODEL_ERROR_RAD / experiment.sigma(quantity))
+                        let error =
+                            if balanced && regime == Regime::Floating { STANCE_ERROR_RAD } else { MODEL_ERROR_RAD };
+                        (first + joint, error / experiment.sigma(quantity))
                     }
                     ResidualChannel::Velocity(_) | ResidualChannel::Torque(_) => return (0, None, 0.0),
                     ResidualChannel::BasePosition(axis) => (base + axis, MODEL_ERROR_BASE),
                     ResidualChannel::BaseOrientation(axis) => (base + 3 + axis, MODEL_ERROR_BASE),
                     ResidualChannel::BaseVelocity(axis) => (base + 6 + axis, MODEL_ERROR_BASE),
                     ResidualChannel::BaseRate(axis) => (base + 9 + axis, MISFIT_OF_GYRO),
+                    ResidualChannel::BaseWrench(axis) => (WRENCH + axis, MODEL_ERROR_BASE),
                 };
                 (channel, split.fold(row), 1.0 / misfit.hypot(1.0))
             }));
             first_block += split.num_blocks();
         }
-        Self { experiments, tolerances: None, cells, folds, blocks, dynamic }
+        Self { experiments, tolerances: None, cells, folds, blocks, dynamic, stance }
     }
 
-    /// Takes the rows of a robot that walks or jumps out of a fit, by a huge scale, unless it is `on_ground`: a fit of the
-    /// ground.
+    /// Raises the scales of residuals with errors of contact.
     ///
-    /// Their derivatives are those of contact events: large, local, and of no use for a step.
-    pub fn ignore_dynamic(&self, scale: &mut [f64], on_ground: bool) {
+    /// The rows of a robot that walks or jumps take no part in a fit, unless it is `on_ground`: a fit of the ground. Their
+    /// derivatives are those of contact events: large, local, and of no use for a step.
+    pub fn raise_scales_on_ground(&self, scale: &mut [f64], on_ground: bool) {
         let ignored = scale.iter_mut().zip(&self.dynamic).filter(|(_, dynamic)| **dynamic && !on_ground);
         ignored.for_each(|(scale, _)| *scale = IGNORED);
+        let stance = scale.iter_mut().zip(&self.stance).filter(|(_, stance)| **stance);
+        stance.for_each(|(scale, _)| *scale *= STANCE_SCALE);
     }
 
     /// Returns the weight of a residual in a fit to one fold: 1 for a row of the fold, 0 for another, and one half for the

@@ -5,7 +5,7 @@ use twinstep_model::{JOINT_NAMES, RobotModel, Rollout};
 
 use super::data_split::DataSplit;
 use super::residual_data::ResidualData;
-use super::residual_power::{DYNAMIC, ResidualPower, STANCE, TORQUE, TRUNK};
+use super::residual_power::{ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
 use super::spectral_line::spectral_line;
 use crate::findings::Unexplained;
 use twinstep_identify::experiment::{Experiment, Regime, ResidualChannel};
@@ -30,7 +30,7 @@ pub fn unexplained(
     let fraction = if before > 0.0 { (after / before).min(1.0) } else { 0.0 };
     let count = |channel: usize| left.counts[channel].iter().sum::<f64>();
     let worst = (0..TRUNK)
-        .chain(STANCE..DYNAMIC)
+        .chain(STANCE..WRENCH)
         .filter(|channel| count(*channel) > 0.0)
         .max_by(|one, other| {
             let of = |channel: usize| left.channel_excess(channel) / count(channel);

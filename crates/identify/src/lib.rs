@@ -5,6 +5,7 @@
 //! - [`Experiment`]: a log split into windows that are simulated from measured states, with residuals in units of
 //!   noise.
 //! - [`BaseEstimate`]: motion of a floating base without motion capture, from legs and IMU.
+//! - [`MeasuredStance`]: the wrench on the base of a standing robot that its feet do not exert.
 //! - [`EffectAtScope`]: an effect to estimate, as in `coulomb_friction@calf`.
 //! - [`replay`]: measured and simulated positions joint by joint.
 //! - [`evaluate()`]: the errors of a model on a log; [`position_errors`]: the same over time.
@@ -17,6 +18,7 @@
 //! Simulators implement [`twinstep_model::Rollout`]; this crate does not depend on an engine.
 
 mod base_estimate;
+mod base_wrench;
 mod cmaes;
 mod effect_list;
 mod error;
@@ -41,6 +43,7 @@ pub mod window;
 mod tests;
 
 pub use base_estimate::BaseEstimate;
+pub use base_wrench::MeasuredStance;
 pub use cmaes::CmaEs;
 pub use effect_list::{DEFAULT_EFFECTS, EffectAtScope, EffectAtScopeError, UnknownEffect, default_effects, named};
 pub use error::ExperimentError;

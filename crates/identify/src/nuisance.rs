@@ -1,4 +1,5 @@
-//! Nuisance parameters: errors of mass, leg mounting, ground contact and initial state that any robot has.
+//! Nuisance parameters: errors of mass, leg mounting, ground contact, measured torques and initial state that any robot
+//! has.
 //!
 //! Left in the residuals, they are attributed to a payload or an encoder offset. A leg that is mounted 2 mm too low
 //! changes the joint positions of a standing robot by 10 mrad. An initial velocity that is 20 mm/s too high lets the
@@ -9,7 +10,7 @@
 //! the robot.
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use twinstep_model::{Precision, RobotModel, Rollout};
+use twinstep_model::{NUM_JOINTS, Precision, RobotModel, Rollout};
 
 use crate::experiment::Experiment;
 
@@ -25,8 +26,12 @@ const MOUNT_OFFSET_STD_M: f64 = 0.0012;
 const LENGTH_STD_M: f64 = 0.001;
 /// Relative standard deviations of ground friction and of the contact's time constant.
 const GROUND_STD: [f64; 2] = [0.03, 0.15];
+/// Standard deviation of the error of each measured torque of a standing robot, such as friction at rest [N·m].
+const TORQUE_STD_NM: f64 = 0.05;
 /// Number of nuisance parameters of the robot: [`perturbed_robot`] has the list.
-const NUM_NUISANCE: usize = 36;
+const NUM_ROBOT_ERRORS: usize = 36;
+/// Number of nuisance parameters of robot and torques.
+const NUM_NUISANCE: usize = NUM_ROBOT_ERRORS + NUM_JOINTS;
 /// Largest size of a nuisance parameter [prior std]: what is larger is an error of the model.
 const LARGEST: f64 = 3.0;
 /// Correlation length of the residuals [rows].
@@ -89,12 +94,15 @@ impl NuisanceModel {
     pub fn new(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Rollout) -> Option<Self> {
         let starts = starts(experiments, robot, simulator)?;
         let sides = |error: usize| [-1.0, 1.0].map(|side| perturbed_robot(robot, error, side));
-        let robots: Vec<RobotModel> = (0..NUM_NUISANCE).flat_map(sides).collect();
+        let robots: Vec<RobotModel> = (0..NUM_ROBOT_ERRORS).flat_map(sides).collect();
         let mut columns = vec![Vec::new(); NUM_NUISANCE];
         for experiment in experiments {
             let residuals = experiment.residuals(simulator, &robots, Precision::Single);
             for (column, ends) in columns.iter_mut().zip(residuals.chunks(2)) {
                 column.extend(half_difference(&ends[0], &ends[1]));
+            }
+            for (joint, column) in columns[NUM_ROBOT_ERRORS..].iter_mut().enumerate() {
+                column.extend(experiment.change_with_torque_error(robot, joint, TORQUE_STD_NM));
             }
         }
         // Where the robot walks, contact events would decide the sizes.

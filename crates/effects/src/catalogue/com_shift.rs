@@ -39,7 +39,7 @@ pub const EFFECT: Effect = Effect {
     search: Search {
         probes: Probes::None,
         whole_log_probes: Probes::Values(|| probes_along_axes(0.05)),
-        min_share: 0.12,
+        min_share: 0.15,
         ..Search::DEFAULT
     },
     visibility: Visibility::Position,

@@ -3,11 +3,16 @@
 use twinstep_logs::{Log, TorqueSensor};
 use twinstep_model::{BaseMount, Joint};
 
+use crate::base_wrench::MeasuredStance;
 use crate::window::Window;
 
 /// Standard deviation of the noise of each quantity, for channels whose metadata do not state it.
 const ASSUMED_NOISE: [(&str, f64); 7] =
     [("q", 0.002), ("dq", 0.05), ("tau_measured", 0.2), ("pos", 0.005), ("quat", 0.01), ("vel", 0.05), ("gyro", 0.02)];
+
+/// Standard deviation of force and moment on the base: errors of the torque sensors, of leg lengths and of friction [N],
+/// [N·m].
+const WRENCH_SIGMA: [f64; 2] = [1.0, 0.1];
 
 /// Channel that is compared in every row.
 #[derive(Clone, Debug)]
@@ -36,6 +41,8 @@ pub enum ResidualChannel {
     BaseVelocity(usize),
     /// Angular velocity about a base axis.
     BaseRate(usize),
+    /// Force along, or moment about, a base axis that the feet of a standing robot do not exert, on measured states.
+    BaseWrench(usize),
 }
 
 impl Channel {
@@ -57,6 +64,7 @@ impl Channel {
                 | ResidualChannel::BaseOrientation(_)
                 | ResidualChannel::BaseVelocity(_)
                 | ResidualChannel::BaseRate(_)
+                | ResidualChannel::BaseWrench(_)
         );
         // A torque is the mean to the next row, so the last row has none.
         let end = window.rows.len() - usize::from(matches!(self.quantity, ResidualChannel::Torque(_)));
@@ -99,4 +107,23 @@ pub fn channels(log: &Log, joints: &[Joint]) -> Vec<Channel> {
         }
     }
     channels
+}
+
+/// Returns the channels of the wrench on the base, if `stance` has samples in windows with a floating base.
+///
+/// The measured value is 0 at the samples in which the robot does not walk: feet that touch down are not in balance.
+pub fn wrench_channels(rows: usize, stance: &MeasuredStance, windows: &[Window]) -> Vec<Channel> {
+    let mut measured = vec![f64::NAN; rows];
+    let quiet =
+        |row: &usize| windows.iter().any(|window| !window.fast && !window.base.is_fixed() && window.rows.contains(row));
+    stance.rows().filter(quiet).for_each(|row| measured[row] = 0.0);
+    if measured.iter().all(|cell| cell.is_nan()) {
+        return Vec::new();
+    }
+    let channel = |axis: usize| Channel {
+        quantity: ResidualChannel::BaseWrench(axis),
+        sigma: WRENCH_SIGMA[axis / 3],
+        measured: measured.clone(),
+    };
+    (0..6).map(channel).collect()
 }

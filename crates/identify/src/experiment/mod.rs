@@ -20,11 +20,12 @@ pub use channel::ResidualChannel;
 pub use residual_index::Regime;
 pub use residuals::{SimulatedPose, estimated_torque};
 
+use crate::base_wrench::MeasuredStance;
 use crate::error::ExperimentError;
 use crate::orientation::orientation;
 use crate::torque::MeasuredTorque;
 use crate::window::{Window, WindowConfig, base_estimate, windows};
-use channel::{Channel, channels};
+use channel::{Channel, channels, wrench_channels};
 
 /// Length of a block [s]; residuals of different blocks are treated as independent.
 const BLOCK_S: f64 = 0.5;
@@ -56,6 +57,8 @@ pub struct Experiment {
     estimated_start: Option<[f64; 2]>,
     /// Torques, for windows in which they are compared on measured states; `None` if there are none.
     torques: Option<Arc<MeasuredTorque>>,
+    /// States and torques of the robot where it stands.
+    stance: Arc<MeasuredStance>,
 }
 
 impl Experiment {
@@ -64,11 +67,13 @@ impl Experiment {
         let joints: Vec<_> = joint_commands(log)?.iter().map(|joint| joint.joint).collect();
         let robot = &at_log_rate(log, robot)?;
         let mut windows = windows(log, robot, horizon)?;
-        let channels = channels(log, &joints);
+        let mut channels = channels(log, &joints);
         let rows_per_block = ((BLOCK_S * log.meta().rate_hz).round() as usize).max(1);
         for window in windows.iter_mut().filter(|window| !window.base.is_fixed()) {
             window.fast = joint_speed(&channels, rows_per_block, window) > DYNAMIC_SPEED;
         }
+        let stance = MeasuredStance::new(log, robot);
+        channels.extend(wrench_channels(log.rows(), &stance, &windows));
         let floating = windows.iter().any(|window| !window.base.is_fixed());
         let fast = windows.iter().any(|window| window.fast);
         let orientations =
@@ -82,6 +87,7 @@ impl Experiment {
             rows_per_block,
             conditions: OperatingConditions::of(log),
             torques: if fast { Some(Arc::new(MeasuredTorque::new(log, robot)?)) } else { None },
+            stance: Arc::new(stance),
             estimated_start: base_estimate(log, robot)?
                 .map(|estimate| [estimate.height_sigma, estimate.velocity_sigma]),
         })

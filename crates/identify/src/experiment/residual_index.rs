@@ -50,7 +50,7 @@ impl Experiment {
     }
 
     /// Upper bound of the values of [`Experiment::groups`].
-    pub const GROUPS: usize = 7 * REGIMES;
+    pub const GROUPS: usize = 9 * REGIMES;
 
     /// Returns the regime of a group.
     pub fn regime(group: usize) -> Regime {
@@ -68,6 +68,8 @@ impl Experiment {
                 ResidualChannel::BaseOrientation(_) => 4,
                 ResidualChannel::BaseVelocity(_) => 5,
                 ResidualChannel::BaseRate(_) => 6,
+                ResidualChannel::BaseWrench(0..3) => 7,
+                ResidualChannel::BaseWrench(_) => 8,
             };
             let regime = match (window.base.is_fixed(), window.dynamic) {
                 (true, _) => Regime::Fixed,

@@ -38,6 +38,7 @@ impl Experiment {
         let candidates = &self.at_rate(candidates);
         let trajectories = self.simulate(simulator, candidates, precision);
         let torques = self.torque_errors(candidates);
+        let wrenches = self.wrench_errors(candidates, &[0.0; NUM_JOINTS]);
         candidates
             .par_iter()
             .zip(trajectories.par_chunks(self.windows.len().max(1)))
@@ -47,9 +48,14 @@ impl Experiment {
                 let mut residuals = Vec::new();
                 for (channel, window, states) in self.compared(windows) {
                     self.compare(channel, window, states, robot, |row, difference| {
-                        let known = channel.torque_joint(window).zip(on_measured.get(row));
-                        let on_measured = known.map(|(joint, errors)| errors[joint]).filter(|error| error.is_finite());
-                        residuals.push(on_measured.unwrap_or(difference) / channel.sigma);
+                        let on_measured = match channel.quantity {
+                            ResidualChannel::BaseWrench(axis) => {
+                                self.stance.sample_of(row).map(|sample| wrenches[index][sample][axis])
+                            }
+                            _ => channel.torque_joint(window).zip(on_measured.get(row)).map(|(joint, all)| all[joint]),
+                        };
+                        let error = on_measured.filter(|error| error.is_finite()).unwrap_or(difference);
+                        residuals.push(error / channel.sigma);
                     });
                 }
                 residuals
@@ -66,6 +72,29 @@ impl Experiment {
             candidates.chunk_by(|one, other| torques.predict_same_torque(one, other)).collect();
         let of_first: Vec<_> = alike.par_iter().map(|robots| Arc::new(torques.error_table(&robots[0]))).collect();
         alike.iter().zip(of_first).flat_map(|(robots, errors)| vec![errors; robots.len()]).collect()
+    }
+
+    /// Returns the errors of the wrench on the base of each candidate, by sample, if `torque_errors` [N·m] are added to the
+    /// measured torques.
+    fn wrench_errors(&self, candidates: &[RobotModel], torque_errors: &[f64; NUM_JOINTS]) -> Vec<Vec<[f64; 6]>> {
+        candidates.par_iter().map(|robot| self.stance.errors(robot, torque_errors)).collect()
+    }
+
+    /// Returns the change of the residuals of `robot` if `error` [N·m] is added to the measured torque of a joint of a
+    /// standing robot.
+    pub fn change_with_torque_error(&self, robot: &RobotModel, joint: usize, error: f64) -> Vec<f64> {
+        let errors = |size: f64| {
+            let torques = std::array::from_fn(|other| if other == joint { size } else { 0.0 });
+            self.wrench_errors(std::slice::from_ref(robot), &torques).remove(0)
+        };
+        let [before, after] = [0.0, error].map(errors);
+        let change = |(quantity, row): (ResidualChannel, usize)| match (quantity, self.stance.sample_of(row)) {
+            (ResidualChannel::BaseWrench(axis), Some(sample)) => {
+                (after[sample][axis] - before[sample][axis]) / self.sigma(quantity)
+            }
+            _ => 0.0,
+        };
+        self.residual_index().map(change).collect()
     }
 
     /// Returns rows and position errors of each joint, simulated minus measured [rad].
@@ -187,6 +216,8 @@ impl Experiment {
                 }
                 ResidualChannel::BaseVelocity(axis) => f64::from(states.truth.base_linear_velocity[period][axis]),
                 ResidualChannel::BaseRate(axis) => f64::from(states.measured.gyro[period][axis]),
+                // Computed from measured states instead.
+                ResidualChannel::BaseWrench(_) => 0.0,
             };
             each(row, simulated - channel.measured[row]);
         }
