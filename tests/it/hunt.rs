@@ -20,6 +20,8 @@ fn hidden_effects_of_six_cases_are_found_first_and_nothing_else_is() {
     let hits: Vec<&Value> = scores.iter().flat_map(|score| score["hits"].as_array().unwrap()).collect();
     let right = hits.iter().filter(|hit| hit["first"] == true && hit["scope_right"] == true).count();
     assert_eq!((right, hits.len()), (4, 4), "{scores:#?}");
+    let covered = hits.iter().filter(|hit| hit["size"]["covered"] == true).count();
+    assert_eq!(covered, 4, "95 % intervals: {scores:#?}");
     let wrong: u64 = scores.iter().map(|score| score["wrong_names"].as_u64().unwrap()).sum();
     assert_eq!(wrong, 0, "{scores:#?}");
 }

@@ -337,6 +337,23 @@ mod tests {
         }
     }
 
+    #[test]
+    fn cause_on_the_base_must_explain_force_and_moment_where_they_are_known() {
+        let shift = hypothesis("com_shift", Scope::Base);
+        let explains =
+            |given: &ResidualPower, left: &ResidualPower| explains_affected_channels(&shift, false, given, left);
+        let is_wrench = |channel: usize| (WRENCH..DYNAMIC).contains(&channel);
+        let given = residual_power(|_| 20.0);
+        assert!(explains(&given, &residual_power(|channel| if is_wrench(channel) { 1.0 } else { 20.0 })));
+        assert!(!explains(&given, &residual_power(|channel| if is_wrench(channel) { 20.0 } else { 1.0 })));
+        let unknown = |mut left: ResidualPower| {
+            left.counts[WRENCH..DYNAMIC].fill([0.0; 2]);
+            left.sums[WRENCH..DYNAMIC].fill([0.0; 2]);
+            left
+        };
+        assert!(!explains(&unknown(given), &unknown(residual_power(|_| 19.0))), "positions are not explained");
+    }
+
     /// Contact adds to the position error of every joint. A delay is seen in the torques, friction in the positions.
     #[test]
     fn cause_of_a_robot_that_never_hangs_must_explain_the_channel_that_shows_it() {
