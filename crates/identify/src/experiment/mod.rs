@@ -72,7 +72,8 @@ impl Experiment {
         for window in windows.iter_mut().filter(|window| !window.base.is_fixed()) {
             window.fast = joint_speed(&channels, rows_per_block, window) > DYNAMIC_SPEED;
         }
-        let stance = MeasuredStance::new(log, robot);
+        let estimate = base_estimate(log, robot)?;
+        let stance = MeasuredStance::new(log, robot, estimate.as_ref());
         channels.extend(wrench_channels(log.rows(), &stance, &windows));
         let floating = windows.iter().any(|window| !window.base.is_fixed());
         let fast = windows.iter().any(|window| window.fast);
@@ -88,8 +89,7 @@ impl Experiment {
             conditions: OperatingConditions::of(log),
             torques: if fast { Some(Arc::new(MeasuredTorque::new(log, robot)?)) } else { None },
             stance: Arc::new(stance),
-            estimated_start: base_estimate(log, robot)?
-                .map(|estimate| [estimate.height_sigma, estimate.velocity_sigma]),
+            estimated_start: estimate.map(|estimate| [estimate.height_sigma, estimate.velocity_sigma]),
         })
     }
 
