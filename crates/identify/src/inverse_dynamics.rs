@@ -17,7 +17,7 @@ use twinstep_logs::replay::{
 };
 
 /// Gravitational acceleration [m/s²].
-const GRAVITY: f64 = 9.81;
+pub(crate) const GRAVITY: f64 = 9.81;
 /// Number of rows on either side for a derivative.
 const HALF_WINDOW: usize = 3;
 

@@ -17,10 +17,9 @@ use twinstep_model::dynamics::{
 use twinstep_model::{ActuatorParams, BaseMount, JOINT_NAMES, NUM_JOINTS, RobotModel};
 
 use crate::base_estimate::BaseEstimate;
+use crate::inverse_dynamics::GRAVITY;
 use crate::orientation::orientation;
 
-/// Gravitational acceleration [m/s²].
-const GRAVITY: f64 = 9.81;
 /// Time between samples, and half of the time over which measurements are averaged [s].
 const SAMPLE_S: f64 = 0.05;
 /// Least mean height of the base above the feet [m]: a robot that lies is carried by its trunk.
