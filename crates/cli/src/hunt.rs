@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use twinstep_hunt::{HuntConfig, HuntError, Plant, hunt};
+use twinstep_hunt::{HuntConfig, HuntError, Plant, Suite, hunt};
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 
@@ -15,6 +15,10 @@ use crate::exit::{CommandResult, Failure, Signals, input, other};
 /// prior range, half from one half to all of the range. The robot's masses have errors of up to 1 %, its leg mounts of up
 /// to 2 mm, and its sensors have noise. The diagnosis runs in another process, which receives only the log and the model
 /// of the ideal Go2.
+///
+/// --suite selects other cases: healthy robots with eight families of errors, in logs of three lengths; walking robots
+/// without motion capture, with a payload of a tenth of the trunk's mass, Coulomb friction or a delay; effects with
+/// confounders in logs without torques.
 ///
 /// With --plant mujoco the robot runs in MuJoCo, with actuators by equations of their own. It hangs, stands, sways, trots
 /// and hops for a minute. Set TWINSTEP_PYTHON to a Python interpreter with the packages twinstep and mujoco.
@@ -34,6 +38,9 @@ pub struct Args {
     /// Simulation that takes the place of the robot.
     #[arg(long, value_enum, default_value_t = PlantName::Rapier)]
     plant: PlantName,
+    /// What the cases hide.
+    #[arg(long, value_enum, default_value_t = SuiteName::Mixed)]
+    suite: SuiteName,
     /// Seed of the cases.
     #[arg(long, value_name = "S")]
     seed: u64,
@@ -54,6 +61,19 @@ enum PlantName {
     Mujoco,
 }
 
+/// Value of `--suite`.
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum SuiteName {
+    /// One effect, several, one outside the catalogue, or none.
+    Mixed,
+    /// Nothing; multiples of 72 cases have all families and lengths.
+    Healthy,
+    /// One effect of a walking robot without motion capture; multiples of 3 cases have all effects.
+    Walking,
+    /// One effect with confounders, positions only.
+    Confusable,
+}
+
 /// Runs all cases and prints the table.
 pub fn run(args: &Args) -> CommandResult {
     let program = std::env::current_exe().map_err(other)?;
@@ -69,7 +89,14 @@ pub fn run(args: &Args) -> CommandResult {
         PlantName::Rapier => Plant::Rapier,
         PlantName::Mujoco => Plant::Mujoco,
     };
-    let config = HuntConfig { plant, cases: args.cases, seed: args.seed, out: args.out.clone(), resume: args.resume };
+    let suite = match args.suite {
+        SuiteName::Mixed => Suite::Mixed,
+        SuiteName::Healthy => Suite::Healthy,
+        SuiteName::Walking => Suite::Walking,
+        SuiteName::Confusable => Suite::Confusable,
+    };
+    let (cases, seed, out, resume) = (args.cases, args.seed, args.out.clone(), args.resume);
+    let config = HuntConfig { plant, suite, cases, seed, out, resume };
     let interrupted = || signals.check().unwrap_or(true);
     let table = hunt(&config, &diagnose, &interrupted, &mut |cases| bar.set_position(cases));
     bar.finish_and_clear();

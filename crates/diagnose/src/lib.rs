@@ -109,6 +109,8 @@ pub struct DiagnosisOutput {
     pub extended: ModelFile,
     /// The model before the last fit, which includes the held-out blocks: what [`Diagnosis::extended`] evaluates.
     pub before_last_fit: ModelFile,
+    /// True if torques, or positions with a fixed base, have a residual above noise that the causes leave.
+    pub lacks_torque: bool,
     /// For each log, which rows are held out.
     pub held_out: Vec<Vec<bool>>,
     /// Proposed experiment, if there are ambiguous causes.
@@ -175,7 +177,8 @@ pub fn diagnose(
     };
     let rows = |(log, split): (&Log, &DataSplit)| (0..log.rows()).map(|row| split.is_held_out(row)).collect();
     let held_out = evidence.logs().iter().zip(evidence.splits()).map(rows).collect();
-    Ok(DiagnosisOutput { diagnosis, extended, before_last_fit, held_out, next })
+    let lacks_torque = left.shows_missing_torque(unexplained::LEAST_EXCESS);
+    Ok(DiagnosisOutput { diagnosis, extended, before_last_fit, lacks_torque, held_out, next })
 }
 
 /// Returns the model with the ground's time constant fitted to the log, if the change is too small for a cause.

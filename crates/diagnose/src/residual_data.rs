@@ -183,17 +183,18 @@ impl ResidualData {
         first_block = 0;
         for ((log, split), torques) in self.logs.iter().zip(&self.splits).zip(&self.torques) {
             let sigma = torque_sigma(log, robot);
-            let mut reference = vec![[0.0; NUM_JOINTS]; log.rows()];
-            torques.differences(robot, |joint, row, difference| reference[row][joint] = difference);
-            let changed = candidates.iter().enumerate();
-            for (index, candidate) in changed.filter(|(_, one)| !torques.predict_same_torque(robot, one)) {
-                torques.differences(candidate, |joint, row, difference| {
-                    if let Some(block) = split.block(row) {
-                        let before = reference[row][joint];
-                        let pair = [before, difference - before].map(|one| one / sigma[joint]);
+            let reference = torques.error_table(robot);
+            let changed = candidates.par_iter().enumerate();
+            let changed = changed.filter(|(_, one)| !torques.predict_same_torque(robot, one));
+            let tables: Vec<_> = changed.map(|(index, one)| (index, torques.error_table(one))).collect();
+            for (index, table) in tables {
+                for (row, (before, after)) in reference.iter().zip(&table).enumerate() {
+                    let Some(block) = split.block(row) else { continue };
+                    for joint in (0..NUM_JOINTS).filter(|joint| before[*joint].is_finite()) {
+                        let pair = [before[joint], after[joint] - before[joint]].map(|one| one / sigma[joint]);
                         products.add(index, TORQUE + joint, first_block + block, pair);
                     }
-                });
+                }
             }
             first_block += split.num_blocks();
         }

@@ -105,6 +105,12 @@ impl ResidualPower {
         (0..DYNAMIC).map(|channel| self.channel_excess(channel)).sum::<f64>() + self.tolerated_excess()
     }
 
+    /// Returns true if a torque or a position with a fixed base has more than `least` times the power of noise above it.
+    pub fn shows_missing_torque(&self, least: f64) -> bool {
+        let count = |channel: usize| self.counts[channel].iter().sum::<f64>();
+        (0..TRUNK).any(|channel| self.channel_excess(channel) > least * count(channel))
+    }
+
     /// Returns the power by which the robot's nuisance parameters exceed their expectation.
     pub fn tolerated_excess(&self) -> f64 {
         nuisance::excess(self.nuisance_cost[1])

@@ -8,12 +8,13 @@ use twinstep_model::{NUM_JOINTS, Precision, RobotModel, Rollout};
 use super::data_split::DataSplit;
 use super::residual_power::{DYNAMIC, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
 use twinstep_identify::experiment::{Experiment, Regime, ResidualChannel};
+use twinstep_identify::least_squares::append;
 use twinstep_identify::nuisance::NuisanceModel;
 
 /// Precision of the simulations.
 pub const PRECISION: Precision = Precision::Single;
 /// Number of candidates that are simulated at once, which limits memory.
-const BATCH_SIZE: usize = 64;
+const BATCH_SIZE: usize = 32;
 /// Standard deviation of the model error of joint positions [rad].
 const MODEL_ERROR_RAD: f64 = 0.001;
 /// Standard deviation of the model error of base motion [noise std].
@@ -131,23 +132,28 @@ impl ResidualRows {
 
     /// Returns the residual power of the motion of each candidate.
     pub fn residual_powers(&self, simulator: &mut dyn Rollout, robots: &[RobotModel]) -> Vec<ResidualPower> {
-        let mut whole = vec![Vec::new(); robots.len()];
-        for experiment in &self.experiments {
-            for (robots, whole) in robots.chunks(BATCH_SIZE).zip(whole.chunks_mut(BATCH_SIZE)) {
-                let residuals = experiment.residuals(simulator, robots, PRECISION);
-                whole.iter_mut().zip(residuals).for_each(|(whole, residuals)| whole.extend(residuals));
-            }
-        }
-        whole.into_par_iter().map(|residuals| self.residual_power(residuals)).collect()
+        let of_batch = |robots: &[RobotModel]| -> Vec<ResidualPower> {
+            let residuals = self.residuals(simulator, robots);
+            residuals.into_par_iter().map(|residuals| self.residual_power(residuals)).collect()
+        };
+        robots.chunks(BATCH_SIZE).flat_map(of_batch).collect()
     }
 
-    /// Returns the residuals of a candidate after elimination of the nuisance parameters.
-    pub fn nuisance_corrected(&self, simulator: &mut dyn Rollout, robot: &RobotModel) -> Vec<f64> {
-        let one = std::slice::from_ref(robot);
-        let parts = self.experiments.iter().flat_map(|experiment| experiment.residuals(simulator, one, PRECISION));
-        let mut residuals: Vec<f64> = parts.flatten().collect();
+    /// Returns the residuals of each candidate, before elimination of the nuisance parameters.
+    fn residuals(&self, simulator: &mut dyn Rollout, robots: &[RobotModel]) -> Vec<Vec<f64>> {
+        let mut whole = vec![Vec::new(); robots.len()];
+        for experiment in &self.experiments {
+            let residuals = experiment.residuals(simulator, robots, PRECISION);
+            whole.iter_mut().zip(residuals).for_each(|(whole, residuals)| append(whole, residuals));
+        }
+        whole
+    }
+
+    /// Returns the residuals of each candidate after elimination of the nuisance parameters.
+    pub fn nuisance_corrected(&self, simulator: &mut dyn Rollout, robots: &[RobotModel]) -> Vec<Vec<f64>> {
+        let mut residuals = self.residuals(simulator, robots);
         if let Some(tolerances) = &self.tolerances {
-            tolerances.project_out(&mut residuals);
+            residuals.par_iter_mut().for_each(|residuals| tolerances.project_out(residuals));
         }
         residuals
     }
@@ -161,13 +167,15 @@ impl ResidualRows {
         candidates: &[RobotModel],
         mut each: impl FnMut(usize, usize, usize, [f64; 2]),
     ) {
-        let reference = self.nuisance_corrected(simulator, robot);
-        for (index, candidate) in candidates.iter().enumerate() {
-            let residuals = self.nuisance_corrected(simulator, candidate);
-            let pairs = reference.iter().zip(&residuals).zip(self.cells.iter().zip(&self.blocks));
-            for ((reference, residual), ((channel, fold, weight), block)) in pairs {
-                if let (Some(_), Some(block)) = (fold, block) {
-                    each(index, *channel, *block, [weight * reference, weight * (residual - reference)]);
+        let reference = self.nuisance_corrected(simulator, std::slice::from_ref(robot)).remove(0);
+        for (batch, candidates) in candidates.chunks(BATCH_SIZE).enumerate() {
+            for (index, residuals) in self.nuisance_corrected(simulator, candidates).iter().enumerate() {
+                let pairs = reference.iter().zip(residuals).zip(self.cells.iter().zip(&self.blocks));
+                for ((reference, residual), ((channel, fold, weight), block)) in pairs {
+                    if let (Some(_), Some(block)) = (fold, block) {
+                        let pair = [weight * reference, weight * (residual - reference)];
+                        each(batch * BATCH_SIZE + index, *channel, *block, pair);
+                    }
                 }
             }
         }

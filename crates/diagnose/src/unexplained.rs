@@ -108,7 +108,7 @@ fn residual(evidence: &ResidualData, robot: &RobotModel, channel: usize, simulat
         };
         evidence.torques().differences(robot, each);
     } else {
-        let corrected = evidence.fit_rows.nuisance_corrected(simulator, robot);
+        let corrected = evidence.fit_rows.nuisance_corrected(simulator, std::slice::from_ref(robot)).remove(0);
         let experiment = &evidence.fit_rows.experiments[0];
         let (joint, regime) =
             if channel < STANCE { (channel, Regime::Fixed) } else { (channel - STANCE, Regime::Floating) };

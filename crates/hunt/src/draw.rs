@@ -4,11 +4,11 @@ use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
 use twinstep_effects::ModelFile;
 use twinstep_effects::{BlindTestCondition, CATALOGUE, Effect, EffectEntry, Scope, Target};
-use twinstep_model::{Joint, JointKind, Leg, Stream, standard_normal, stream};
+use twinstep_model::{Joint, JointKind, Leg, Stream, go2, standard_normal, stream};
 
-use crate::Plant;
-use crate::base_schedule::BaseSchedule;
+use crate::base_schedule::{BaseSchedule, LogLength};
 use crate::mismatch::Mismatch;
+use crate::{Plant, Suite};
 use crate::unmodelled::UnmodelledEffect;
 
 /// Kind of a case: what it hides.
@@ -27,6 +27,10 @@ pub enum CaseKind {
     TwoEffects,
     /// Four effects, each of half its prior range or more, which may act on the same joints.
     FourEffects,
+    /// One effect of a walking robot without motion capture.
+    WalkingEffect,
+    /// One effect of half its prior range or more that the catalogue lists as a confounder, in a log of positions only.
+    ConfusableEffect,
 }
 
 /// Number of cases of each kind among 28 cases, which are then shuffled. Cases 28 k to 28 k + 27 have this mix.
@@ -60,6 +64,16 @@ pub struct LogSetup {
     pub battery: bool,
     /// True if the motor temperatures are measured.
     pub temperature: bool,
+    /// True if position and velocity of a floating base are measured.
+    #[serde(default = "measured")]
+    pub motion_capture: bool,
+    /// Length of the log.
+    #[serde(default)]
+    pub length: LogLength,
+}
+
+fn measured() -> bool {
+    true
 }
 
 /// One case of a blind test.
@@ -83,12 +97,14 @@ pub struct Case {
 
 impl Case {
     /// Samples case `number` of the blind test with this seed.
-    pub fn draw(seed: u64, number: u64, plant: Plant) -> Self {
-        let kind = kind(seed, number, plant);
-        let mut setting = setting(&mut stream(seed, "hunt setting", number));
-        if plant == Plant::Mujoco {
-            setting = LogSetup { place: BaseSchedule::Whole, torque: true, ..setting };
-        }
+    pub fn draw(seed: u64, number: u64, plant: Plant, suite: Suite) -> Self {
+        let kind = match suite {
+            Suite::Mixed => kind(seed, number, plant),
+            Suite::Healthy => CaseKind::Healthy,
+            Suite::Walking => CaseKind::WalkingEffect,
+            Suite::Confusable => CaseKind::ConfusableEffect,
+        };
+        let setting = setting_of(seed, number, plant, suite);
         let random = &mut stream(seed, "hunt hidden", number);
         let hidden = match kind {
             CaseKind::LargeEffect => vec![from_half(setting, random)],
@@ -96,9 +112,15 @@ impl Case {
             CaseKind::TwoEffects => two(setting, random),
             CaseKind::FourEffects => four(setting, random),
             CaseKind::Healthy | CaseKind::UnmodelledEffect => Vec::new(),
+            CaseKind::WalkingEffect => vec![walking_effect(number, random)],
+            CaseKind::ConfusableEffect => vec![confusable(setting, random)],
         };
         let outside = (kind == CaseKind::UnmodelledEffect).then(|| UnmodelledEffect::draw(setting.place, random));
-        let mismatch = (kind == CaseKind::Healthy && plant == Plant::Mujoco).then(|| mismatch(seed, number));
+        let mismatch = match suite {
+            Suite::Healthy => Some(Mismatch::ALL[(number % Mismatch::ALL.len() as u64) as usize]),
+            _ if kind == CaseKind::Healthy && plant == Plant::Mujoco => Some(mismatch(seed, number)),
+            _ => None,
+        };
         Self { seed, number, kind, setting, hidden, outside, mismatch }
     }
 
@@ -132,6 +154,29 @@ fn kind(seed: u64, number: u64, plant: Plant) -> CaseKind {
     kinds[(number % size) as usize]
 }
 
+/// Returns base mounting, channels and length of the log of a case.
+fn setting_of(seed: u64, number: u64, plant: Plant, suite: Suite) -> LogSetup {
+    let drawn = setting(&mut stream(seed, "hunt setting", number));
+    match suite {
+        Suite::Mixed if plant == Plant::Mujoco => LogSetup { place: BaseSchedule::Whole, torque: true, ..drawn },
+        Suite::Mixed => drawn,
+        Suite::Healthy => {
+            // Of nine robots of each family, six have logs of a minute, two of 10 s and one of five minutes.
+            let round = (number / Mismatch::ALL.len() as u64) % 9;
+            let length = match round {
+                1 | 6 => LogLength::TenSeconds,
+                4 => LogLength::FiveMinutes,
+                _ => LogLength::Standard,
+            };
+            LogSetup { place: BaseSchedule::Whole, torque: true, length, ..drawn }
+        }
+        Suite::Walking => LogSetup { place: BaseSchedule::Walking, motion_capture: false, ..drawn },
+        Suite::Confusable => {
+            LogSetup { place: BaseSchedule::Fixed, torque: false, battery: false, temperature: false, ..drawn }
+        }
+    }
+}
+
 fn setting(random: &mut impl Rng) -> LogSetup {
     let place = match random.random_range(0.0..1.0) {
         share if share < 0.35 => BaseSchedule::Fixed,
@@ -143,10 +188,19 @@ fn setting(random: &mut impl Rng) -> LogSetup {
         torque: random.random_bool(0.7),
         battery: random.random_bool(0.5),
         temperature: random.random_bool(0.5),
+        motion_capture: true,
+        length: LogLength::Standard,
     }
 }
 
 impl LogSetup {
+    /// Returns the setup of a log with motor currents.
+    #[cfg(test)]
+    pub fn with_torque(place: BaseSchedule) -> Self {
+        let length = LogLength::Standard;
+        Self { place, torque: true, battery: false, temperature: false, motion_capture: true, length }
+    }
+
     fn has(self, condition: BlindTestCondition) -> bool {
         match condition {
             BlindTestCondition::FixedBase => self.place != BaseSchedule::Floating,
@@ -202,6 +256,29 @@ fn four(setting: LogSetup, random: &mut impl Rng) -> Vec<EffectEntry> {
         }
     }
     entries
+}
+
+/// Returns the effect of a walking robot: in turn a payload of a tenth of the trunk's mass, added or missing, Coulomb
+/// friction, and a delay.
+fn walking_effect(number: u64, random: &mut impl Rng) -> EffectEntry {
+    let name = ["payload", "coulomb_friction", "command_delay"][(number % 3) as usize];
+    let effect = Effect::named(name).expect("an effect of the catalogue");
+    let share = random.random_range(0.5..1.0);
+    let mut sizes = values(effect, share, random);
+    if name == "payload" {
+        sizes[0] = 0.1 * go2().trunk.mass * if random.random_bool(0.5) { 1.0 } else { -1.0 };
+    }
+    EffectEntry::new(effect, scope(effect.target, random), sizes).expect("values of the prior range are allowed")
+}
+
+/// Samples an effect that the catalogue lists as a confounder of another.
+fn confusable(setting: LogSetup, random: &mut impl Rng) -> EffectEntry {
+    loop {
+        let entry = from_half(setting, random);
+        if CATALOGUE.into_iter().any(|other| other != entry.effect && confounded(entry.effect, other)) {
+            return entry;
+        }
+    }
 }
 
 /// Returns true if the effects are equal, or the catalogue lists one as a confounder of the other.
@@ -281,28 +358,63 @@ mod tests {
 
     #[test]
     fn each_family_of_healthy_robots_occurs_once_in_28_cases() {
-        let cases = (28..56).map(|number| Case::draw(3, number, Plant::Mujoco));
+        let cases = (28..56).map(|number| Case::draw(3, number, Plant::Mujoco, Suite::Mixed));
         let mut families: Vec<_> = cases.filter_map(|case| case.mismatch).collect();
         families.sort();
         assert_eq!(families, Mismatch::ALL);
     }
 
     #[test]
+    fn healthy_robots_of_each_family_have_logs_of_every_length() {
+        let cases: Vec<Case> = (0..72).map(|number| Case::draw(3, number, Plant::Mujoco, Suite::Healthy)).collect();
+        for family in Mismatch::ALL {
+            let of = |length| {
+                cases.iter().filter(|case| case.mismatch == Some(family) && case.setting.length == length).count()
+            };
+            assert_eq!([LogLength::TenSeconds, LogLength::Standard, LogLength::FiveMinutes].map(of), [2, 6, 1]);
+        }
+    }
+
+    #[test]
+    fn walking_robots_have_each_effect_in_turn_and_no_motion_capture() {
+        for number in 0..30 {
+            let case = Case::draw(5, number, Plant::Mujoco, Suite::Walking);
+            assert!(!case.setting.motion_capture && case.setting.place == BaseSchedule::Walking);
+            let entry = &case.hidden[0];
+            let names = ["payload", "coulomb_friction", "command_delay"];
+            assert_eq!(entry.effect.name, names[(number % 3) as usize]);
+            if entry.effect.name == "payload" {
+                assert!((entry.values[0].abs() - 0.1 * go2().trunk.mass).abs() < 1e-9);
+            }
+        }
+    }
+
+    #[test]
     fn seed_and_number_determine_the_case() {
-        let cases = |seed| (0..20).map(|number| Case::draw(seed, number, Plant::Rapier)).collect::<Vec<_>>();
+        let cases = |seed| (0..20).map(|number| Case::draw(seed, number, Plant::Rapier, Suite::Mixed)).collect::<Vec<_>>();
         assert_eq!(cases(5), cases(5));
         assert_ne!(cases(5), cases(6));
     }
 
     #[test]
     fn every_case_is_a_valid_robot_with_visible_effects() {
-        for (number, plant) in (0..300).flat_map(|number| [(number, Plant::Rapier), (number, Plant::Mujoco)]) {
-            let case = Case::draw(1, number, plant);
+        let kinds = [
+            (Plant::Rapier, Suite::Mixed),
+            (Plant::Mujoco, Suite::Mixed),
+            (Plant::Mujoco, Suite::Healthy),
+            (Plant::Mujoco, Suite::Walking),
+            (Plant::Mujoco, Suite::Confusable),
+        ];
+        for (number, (plant, suite)) in (0..300).flat_map(|number| kinds.map(|kind| (number, kind))) {
+            let case = Case::draw(1, number, plant, suite);
             apply_effects(&go2(), &case.hidden).expect("a valid robot");
             let visible = case.setting.visible_effects();
             assert!(case.hidden.iter().all(|entry| visible.contains(&entry.effect)), "{case:?}");
             let hidden = match case.kind {
-                CaseKind::LargeEffect | CaseKind::SmallEffect => 1,
+                CaseKind::LargeEffect
+                | CaseKind::SmallEffect
+                | CaseKind::WalkingEffect
+                | CaseKind::ConfusableEffect => 1,
                 CaseKind::TwoEffects => 2,
                 CaseKind::FourEffects => 4,
                 CaseKind::Healthy | CaseKind::UnmodelledEffect => 0,

@@ -12,6 +12,7 @@ use twinstep_sim::{BackendBuildError, Engine, MujocoPlant, RapierBackend, SimCon
 
 use crate::Plant;
 use crate::draw::Case;
+use crate::mismatch::columns;
 use crate::motion::{RATE_HZ, motion};
 use crate::unmodelled::PerturbedBackend;
 
@@ -48,6 +49,7 @@ pub fn log_of(case: &Case, plant: Plant, progress: &mut dyn FnMut(usize) -> bool
     let sensors = sensors(random);
     let delayed = torque_sensor(&exact, &robot, case.setting.torque)?;
     let noisy = apply_sensors(&delayed, &sensors, random.random())?;
+    let noisy = if case.setting.motion_capture { noisy } else { without_motion_capture(&noisy)? };
     Ok(case.mismatch.map_or(Ok(noisy.clone()), |mismatch| mismatch.change_log(noisy, errors))?)
 }
 
@@ -128,6 +130,16 @@ fn torque_sensor(log: &Log, robot: &RobotModel, measured: bool) -> Result<Log, L
     Log::new(meta, columns)
 }
 
+/// Removes position and velocity of the base.
+fn without_motion_capture(log: &Log) -> Result<Log, LogError> {
+    let of_base = |name: &str| name.starts_with("pos_") || name.starts_with("vel_");
+    let mut columns = columns(log);
+    columns.retain(|(name, _)| !of_base(name));
+    let mut meta = log.meta().clone();
+    meta.noise.retain(|name, _| !of_base(name) && name != "pos" && name != "vel");
+    Log::new(meta, columns)
+}
+
 /// Returns `cells` of one contiguous range with a delay of `delay` rows, interpolated linearly.
 fn delayed(cells: &[f64], delay: f64) -> Vec<f64> {
     let value = |row: usize| {
@@ -151,7 +163,7 @@ mod tests {
     use crate::draw::{CaseKind, LogSetup};
 
     fn case(place: BaseSchedule, seed: u64, hidden: Vec<EffectEntry>) -> Case {
-        let setting = LogSetup { place, torque: true, battery: true, temperature: false };
+        let setting = LogSetup { battery: true, ..LogSetup::with_torque(place) };
         Case { seed, number: 0, kind: CaseKind::Healthy, setting, hidden, outside: None, mismatch: None }
     }
 

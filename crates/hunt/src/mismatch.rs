@@ -116,7 +116,7 @@ impl Mismatch {
 }
 
 /// Returns all columns of a log.
-fn columns(log: &Log) -> Vec<(String, Vec<f64>)> {
+pub fn columns(log: &Log) -> Vec<(String, Vec<f64>)> {
     let index = |cells: &[u32]| cells.iter().map(|cell| f64::from(*cell)).collect();
     let own = [
         ("t".to_owned(), log.t().to_vec()),

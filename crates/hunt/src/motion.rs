@@ -1,4 +1,5 @@
-//! Motions of a case: with a fixed base, standing, or both in turn, 20 to 25 s; with trot and hops, a minute.
+//! Motions of a case: with a fixed base, standing, or both in turn, 20 to 25 s; walking, half a minute; with trot and hops,
+//! a minute.
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
@@ -22,6 +23,8 @@ const WAY_S: f64 = 0.35;
 const SWAY_S: f64 = 3.0;
 /// Part of the period of [`Phase::Sway`] in which the robot moves [s].
 const SWAYING_S: f64 = 2.2;
+/// Periods of the strides of [`Phase::Walk`]: forwards and backwards, and left and right [s].
+const STRIDE_S: [f64; 2] = [9.0, 5.0];
 
 /// Phase of a motion, and what it makes visible.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -42,6 +45,8 @@ enum Phase {
     Trot,
     /// Hops on all legs.
     Hop,
+    /// Trot with strides that change their length and direction.
+    Walk,
 }
 
 /// Random parameters of a motion.
@@ -73,7 +78,7 @@ impl Style {
     fn kp(&self, phase: Phase) -> f64 {
         match phase {
             Phase::Steps => self.kp[1],
-            Phase::Sway | Phase::Stand | Phase::Trot | Phase::Hop => self.kp[2],
+            Phase::Sway | Phase::Stand | Phase::Trot | Phase::Hop | Phase::Walk => self.kp[2],
             Phase::Chirp | Phase::Creep | Phase::Holds => self.kp[0],
         }
     }
@@ -97,24 +102,33 @@ impl Style {
                     middle + 0.34 * (TAU * 1.4 * pace * time + shift).sin().signum()
                 }
                 Phase::Holds => {
-                    let pose = ((time / POSE_S) as usize).min(POSES - 1);
-                    let before = if pose == 0 { 0.0 } else { self.poses[pose - 1][index] };
+                    let pose = (time / POSE_S) as usize;
+                    let before = if pose == 0 { 0.0 } else { self.poses[(pose - 1) % POSES][index] };
                     let way = ((time - pose as f64 * POSE_S) / WAY_S).min(1.0);
-                    before + (self.poses[pose][index] - before) * way * way * (3.0 - 2.0 * way)
+                    before + (self.poses[pose % POSES][index] - before) * way * way * (3.0 - 2.0 * way)
                 }
                 Phase::Sway => self.sway(joint, time) / reach,
                 Phase::Stand => 0.0,
-                Phase::Trot => {
-                    let first = joint.leg.front_sign() * joint.leg.left_sign() > 0.0;
-                    let half = if first { 0.0 } else { 0.5 };
-                    let swing = (TAU * (1.8 * self.pace[0] * time + half)).sin().max(0.0);
-                    ease * fold(joint.kind, 0.25 * swing)
+                Phase::Trot => ease * fold(joint.kind, 0.25 * self.swing(joint, time).sin().max(0.0)),
+                Phase::Walk => {
+                    let swing = self.swing(joint, time);
+                    let [ahead, turn] = STRIDE_S.map(|period| (TAU * time / period + self.shift[1]).sin());
+                    let stride = 0.14 * ahead + 0.05 * joint.leg.left_sign() * turn;
+                    let way = if joint.kind == JointKind::Thigh { stride * swing.cos() } else { 0.0 };
+                    ease * (fold(joint.kind, 0.25 * swing.sin().max(0.0)) + way)
                 }
                 Phase::Hop => {
                     let crouch = 0.5 - 0.5 * (TAU * 2.0 * self.pace[1] * time).cos();
                     ease * fold(joint.kind, 0.3 * crouch)
                 }
             }
+    }
+
+    /// Returns the phase of a leg in a trot [rad]: it swings in the first half.
+    fn swing(&self, joint: Joint, time: f64) -> f64 {
+        let first = joint.leg.front_sign() * joint.leg.left_sign() > 0.0;
+        let half = if first { 0.0 } else { 0.5 };
+        TAU * (1.8 * self.pace[0] * time + half).fract()
     }
 
     /// Returns the offset [rad] of a joint that lifts, pitches, rolls and shifts the base over fixed feet, with pauses.
@@ -169,6 +183,7 @@ fn phases(place: BaseSchedule) -> &'static [(Phase, f64)] {
             (Phase::Trot, 12.0),
             (Phase::Hop, 8.0),
         ],
+        BaseSchedule::Walking => &[(Phase::Stand, 2.0), (Phase::Walk, 28.0)],
     }
 }
 
@@ -177,7 +192,8 @@ pub fn motion(setting: LogSetup, random: &mut impl Rng) -> Log {
     let style = Style::draw(random);
     let mut columns = BTreeMap::<String, Vec<f64>>::new();
     for (phase, length) in phases(setting.place) {
-        for row in 0..(length * RATE_HZ) as usize {
+        let length = &(length * setting.length.factor());
+        for row in 0..(length * RATE_HZ).round() as usize {
             let time = row as f64 / RATE_HZ;
             let t = columns.get("t").map_or(0, Vec::len) as f64 / RATE_HZ;
             let mut cell = |name: String, value: f64| columns.entry(name).or_default().push(value);
@@ -204,6 +220,7 @@ pub fn motion(setting: LogSetup, random: &mut impl Rng) -> Log {
     let segments = match setting.place {
         BaseSchedule::Fixed => vec![air],
         BaseSchedule::Floating => vec![stance],
+        BaseSchedule::Walking => vec![segment("walk", BaseMount::Floating)],
         BaseSchedule::FixedThenFloating => vec![air, stance],
         BaseSchedule::Whole => {
             vec![air, stance, segment("trot", BaseMount::Floating), segment("hop", BaseMount::Floating)]
@@ -216,13 +233,13 @@ pub fn motion(setting: LogSetup, random: &mut impl Rng) -> Log {
 
 /// Returns the index of the segment of a phase.
 fn segment_index(place: BaseSchedule, phase: Phase) -> f64 {
-    if matches!(place, BaseSchedule::Fixed | BaseSchedule::Floating) {
+    if matches!(place, BaseSchedule::Fixed | BaseSchedule::Floating | BaseSchedule::Walking) {
         return 0.0;
     }
     match phase {
         Phase::Chirp | Phase::Creep | Phase::Steps | Phase::Holds => 0.0,
         Phase::Sway | Phase::Stand => 1.0,
-        Phase::Trot => 2.0,
+        Phase::Trot | Phase::Walk => 2.0,
         Phase::Hop => 3.0,
     }
 }
@@ -243,16 +260,20 @@ mod tests {
     use twinstep_model::stream;
 
     use super::*;
+    use crate::base_schedule::LogLength;
 
     #[test]
     fn commands_stay_within_the_joint_ranges() {
-        for (place, seconds, seed) in [
-            (BaseSchedule::Fixed, 20.0..25.0, 0),
-            (BaseSchedule::Floating, 20.0..25.0, 1),
-            (BaseSchedule::FixedThenFloating, 20.0..25.0, 2),
-            (BaseSchedule::Whole, 60.0..61.0, 3),
+        for (place, length, seconds, seed) in [
+            (BaseSchedule::Fixed, LogLength::Standard, 20.0..25.0, 0),
+            (BaseSchedule::Floating, LogLength::Standard, 20.0..25.0, 1),
+            (BaseSchedule::FixedThenFloating, LogLength::Standard, 20.0..25.0, 2),
+            (BaseSchedule::Whole, LogLength::Standard, 60.0..61.0, 3),
+            (BaseSchedule::Walking, LogLength::Standard, 30.0..31.0, 4),
+            (BaseSchedule::Whole, LogLength::TenSeconds, 9.9..10.1, 5),
+            (BaseSchedule::Whole, LogLength::FiveMinutes, 300.0..301.0, 6),
         ] {
-            let setting = LogSetup { place, torque: true, battery: true, temperature: true };
+            let setting = LogSetup { battery: true, temperature: true, length, ..LogSetup::with_torque(place) };
             let motion = motion(setting, &mut stream(seed, "test", 0));
             assert!(seconds.contains(&(motion.rows() as f64 / RATE_HZ)), "{place:?}");
             for joint in Joint::ALL {

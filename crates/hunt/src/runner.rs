@@ -13,7 +13,7 @@ use twinstep_sim::BatchRollout;
 
 use crate::draw::Case;
 use crate::score::judge;
-use crate::{CaseResult, Diagnose, HuntError, Plant, at, failed, ground_truth};
+use crate::{CaseResult, Diagnose, HuntError, Plant, Suite, at, failed, ground_truth};
 
 /// Interval at which a running diagnosis is polled.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
@@ -24,6 +24,8 @@ const BAD_INPUT: i32 = 2;
 pub struct BlindTest<'a> {
     /// The robot of the cases.
     pub plant: Plant,
+    /// What the cases hide.
+    pub suite: Suite,
     /// Folder of the results.
     pub out: &'a Path,
     /// Diagnosing program.
@@ -67,6 +69,7 @@ impl BlindTest<'_> {
             seed: case.seed,
             case: case.number,
             plant: self.plant,
+            suite: self.suite,
             kind: case.kind,
             setting: case.setting,
             outside: case.outside,

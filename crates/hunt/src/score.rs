@@ -215,7 +215,7 @@ mod tests {
             let effect = Effect::named(name).expect("known");
             EffectEntry::new(effect, scope.parse().expect("a scope"), vec![*value]).expect("allowed")
         };
-        let setting = LogSetup { place: BaseSchedule::Fixed, torque: true, battery: false, temperature: false };
+        let setting = LogSetup::with_torque(BaseSchedule::Fixed);
         let hidden = hidden.iter().map(entry).collect();
         Case { seed: 0, number: 0, kind: CaseKind::LargeEffect, setting, hidden, outside: None, mismatch: None }
     }

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 
 use crate::CaseResult;
+use crate::base_schedule::LogLength;
 use crate::draw::CaseKind;
 use crate::mismatch::Mismatch;
 use crate::score::{EffectScore, ErrorReduction};
@@ -44,56 +45,138 @@ fn wilson(hits: usize, count: usize) -> [f64; 2] {
 }
 
 fn rates(results: &[CaseResult]) -> String {
-    let of = |kind: CaseKind| results.iter().filter(move |result| result.kind == kind);
-    let hits = |kind: CaseKind| of(kind).flat_map(|result| &result.verdict.hits);
+    let parts = [single_effects, healthy_robots, unmodelled_effects, several_effects, walking_robots, confusable_effects];
     let mut text = "| | goal | rate | 95 % interval |\n|---|---|---|---|\n".to_owned();
-    for (kind, size, first, three, scope) in [
-        (CaseKind::LargeEffect, "half the range or more", ">= 90 %", ">= 97 %", ">= 92 %"),
-        (CaseKind::SmallEffect, "a fifth of the range", ">= 70 %", "", ""),
-    ] {
-        text += &rate(&format!("{size}: top-1 correct"), first, hits(kind).map(|hit| hit.first));
-        text += &rate(&format!("{size}: listed as indistinguishable"), "", hits(kind).map(|hit| hit.ambiguous));
-        text += &rate(&format!("{size}: top-3 correct"), three, hits(kind).map(|hit| hit.in_top_3));
-        text += &rate(&format!("{size}: scope correct"), scope, hits(kind).map(|hit| hit.scope_right));
-        text += &rate(
-            &format!("{size}: additional false positive"),
-            "",
-            of(kind).map(|result| result.verdict.wrong_names > 0),
-        );
-    }
-    let single = || [CaseKind::LargeEffect, CaseKind::SmallEffect].into_iter().flat_map(hits);
-    text += &rate("one effect: within the set of names", ">= 90 %", single().map(|hit| hit.in_set));
-    let sizes: Vec<usize> = single().map(|hit| hit.set_size).filter(|size| *size > 0).collect();
-    let mean = sizes.iter().sum::<usize>() as f64 / sizes.len().max(1) as f64;
-    let _ = writeln!(text, "| one effect: mean size of the set | <= 2.5 | {mean:.1} | |");
-    let named = |kind: CaseKind| of(kind).map(|result| result.verdict.wrong_names > 0);
-    text += &rate("nothing hidden: false positive", "<= 3 %", named(CaseKind::Healthy));
-    for family in Mismatch::ALL {
-        let cases = of(CaseKind::Healthy).filter(|result| result.mismatch == Some(family));
-        let mut outcomes = cases.map(|result| result.verdict.wrong_names > 0).peekable();
-        if outcomes.peek().is_some() {
-            text += &rate(&format!("nothing hidden, {}: false positive", family.name()), "", outcomes);
-        }
-    }
-    text += &rate("outside the catalogue: false positive", "<= 10 %", named(CaseKind::UnmodelledEffect));
-    let depends_on = of(CaseKind::UnmodelledEffect).filter_map(|result| result.verdict.depends_on);
-    text += &rate("outside the catalogue: what it depends on is correct", ">= 50 %", depends_on);
-    let both = |good: fn(&EffectScore) -> bool| {
-        of(CaseKind::TwoEffects).map(move |result| result.verdict.hits.iter().all(good))
-    };
-    text += &rate("two effects: both reported", ">= 65 %", both(|hit| hit.named));
-    text += &rate("two effects: both reported, scopes correct", "", both(|hit| hit.named && hit.scope_right));
-    let four = || of(CaseKind::FourEffects);
-    if four().next().is_some() {
-        let all = four().map(|result| result.verdict.hits.iter().all(|hit| hit.named));
-        text += &rate("four effects: all reported", ">= 60 %", all);
-        text += &rate("four effects: each", "", hits(CaseKind::FourEffects).map(|hit| hit.named));
-        let wrong = four().map(|result| result.verdict.wrong_names > 0);
-        text += &rate("four effects: false positive", "<= 10 %", wrong);
-    }
+    text.extend(parts.map(|rows| rows(results)));
     let sizes = results.iter().flat_map(|result| &result.verdict.hits).filter_map(|hit| hit.size);
     text += &rate("size within its 95 % interval", "88 to 99 %", sizes.map(|size| size.covered));
     text + &rate("diagnosis failed", "none", results.iter().map(|result| result.error.is_some()))
+}
+
+fn of(results: &[CaseResult], kind: CaseKind) -> impl Iterator<Item = &CaseResult> {
+    results.iter().filter(move |result| result.kind == kind)
+}
+
+fn hits(results: &[CaseResult], kind: CaseKind) -> impl Iterator<Item = &EffectScore> {
+    of(results, kind).flat_map(|result| &result.verdict.hits)
+}
+
+fn has_wrong_name(result: &CaseResult) -> bool {
+    result.verdict.wrong_names > 0
+}
+
+fn has(results: &[CaseResult], kind: CaseKind) -> bool {
+    of(results, kind).next().is_some()
+}
+
+fn single_effects(results: &[CaseResult]) -> String {
+    let mut text = String::new();
+    for (kind, size, first, three, scope) in [
+        (CaseKind::LargeEffect, "half the range or more", ">= 90 %", ">= 97 %", ">= 90 %"),
+        (CaseKind::SmallEffect, "a fifth of the range", ">= 70 %", "", ""),
+    ] {
+        if !has(results, kind) {
+            continue;
+        }
+        let of_hits = |good: fn(&EffectScore) -> bool| hits(results, kind).map(good);
+        text += &rate(&format!("{size}: top-1 correct"), first, of_hits(|hit| hit.first));
+        text += &rate(&format!("{size}: listed as indistinguishable"), "", of_hits(|hit| hit.ambiguous));
+        text += &rate(&format!("{size}: top-3 correct"), three, of_hits(|hit| hit.in_top_3));
+        text += &rate(&format!("{size}: scope correct"), scope, of_hits(|hit| hit.scope_right));
+        text += &rate(&format!("{size}: additional false positive"), "", of(results, kind).map(has_wrong_name));
+    }
+    let single = || [CaseKind::LargeEffect, CaseKind::SmallEffect].into_iter().flat_map(|kind| hits(results, kind));
+    text + &name_set("one effect", single())
+}
+
+/// Returns the rows about the set of names of a cause: the cause, and what the log cannot tell apart from it.
+fn name_set<'a>(label: &str, hits: impl Iterator<Item = &'a EffectScore>) -> String {
+    let hits: Vec<&EffectScore> = hits.collect();
+    if hits.is_empty() {
+        return String::new();
+    }
+    let sizes: Vec<usize> = hits.iter().map(|hit| hit.set_size).filter(|size| *size > 0).collect();
+    let mean = sizes.iter().sum::<usize>() as f64 / sizes.len().max(1) as f64;
+    rate(&format!("{label}: within the set of names"), ">= 90 %", hits.iter().map(|hit| hit.in_set))
+        + &format!("| {label}: mean size of the set | <= 2.5 | {mean:.1} | |\n")
+}
+
+fn healthy_robots(results: &[CaseResult]) -> String {
+    if !has(results, CaseKind::Healthy) {
+        return String::new();
+    }
+    let healthy = || of(results, CaseKind::Healthy);
+    let mut text = rate("nothing hidden: false positive", "<= 7 %", healthy().map(has_wrong_name));
+    let mut add = |name: &str, outcomes: &mut dyn Iterator<Item = bool>| {
+        let outcomes: Vec<bool> = outcomes.collect();
+        if !outcomes.is_empty() {
+            text += &rate(&format!("nothing hidden, {name}: false positive"), "", outcomes.into_iter());
+        }
+    };
+    for family in Mismatch::ALL {
+        add(family.name(), &mut healthy().filter(|result| result.mismatch == Some(family)).map(has_wrong_name));
+    }
+    if healthy().any(|result| result.setting.length != LogLength::Standard) {
+        for length in LogLength::ALL {
+            add(length.name(), &mut healthy().filter(|result| result.setting.length == length).map(has_wrong_name));
+        }
+    }
+    text
+}
+
+fn unmodelled_effects(results: &[CaseResult]) -> String {
+    let kind = CaseKind::UnmodelledEffect;
+    if !has(results, kind) {
+        return String::new();
+    }
+    let depends_on = of(results, kind).filter_map(|result| result.verdict.depends_on);
+    rate("outside the catalogue: false positive", "<= 10 %", of(results, kind).map(has_wrong_name))
+        + &rate("outside the catalogue: what it depends on is correct", ">= 60 %", depends_on)
+}
+
+fn several_effects(results: &[CaseResult]) -> String {
+    let mut text = String::new();
+    let all = |kind: CaseKind, good: fn(&EffectScore) -> bool| {
+        of(results, kind).map(move |result| result.verdict.hits.iter().all(good))
+    };
+    if has(results, CaseKind::TwoEffects) {
+        text += &rate("two effects: both reported", ">= 65 %", all(CaseKind::TwoEffects, |hit| hit.named));
+        let scopes = all(CaseKind::TwoEffects, |hit| hit.named && hit.scope_right);
+        text += &rate("two effects: both reported, scopes correct", "", scopes);
+    }
+    if has(results, CaseKind::FourEffects) {
+        let kind = CaseKind::FourEffects;
+        text += &rate("four effects: all reported", ">= 60 %", all(kind, |hit| hit.named));
+        text += &rate("four effects: each", "", hits(results, kind).map(|hit| hit.named));
+        text += &rate("four effects: false positive", "<= 10 %", of(results, kind).map(has_wrong_name));
+    }
+    text
+}
+
+fn walking_robots(results: &[CaseResult]) -> String {
+    let kind = CaseKind::WalkingEffect;
+    if !has(results, kind) {
+        return String::new();
+    }
+    let label = "walking without motion capture";
+    let mut text = rate(&format!("{label}: top-1 correct"), ">= 70 %", hits(results, kind).map(|hit| hit.first));
+    let effects: BTreeSet<&str> = hits(results, kind).map(|hit| hit.effect.as_str()).collect();
+    for effect in effects {
+        let outcomes = hits(results, kind).filter(|hit| hit.effect == effect).map(|hit| hit.first);
+        text += &rate(&format!("{label}, {effect}: top-1 correct"), "", outcomes);
+    }
+    text += &rate(&format!("{label}: scope correct"), "", hits(results, kind).map(|hit| hit.scope_right));
+    text + &rate(&format!("{label}: additional false positive"), "", of(results, kind).map(has_wrong_name))
+}
+
+fn confusable_effects(results: &[CaseResult]) -> String {
+    let (kind, label) = (CaseKind::ConfusableEffect, "one effect with confounders, positions only");
+    if !has(results, kind) {
+        return String::new();
+    }
+    rate(&format!("{label}: top-1 correct"), "", hits(results, kind).map(|hit| hit.first))
+        + &rate(&format!("{label}: additional false positive"), "", of(results, kind).map(has_wrong_name))
+        + &name_set(label, hits(results, kind))
 }
 
 fn numbers(results: &[CaseResult]) -> String {
@@ -141,9 +224,7 @@ fn matrix(results: &[CaseResult]) -> String {
         let hidden = match result.kind {
             CaseKind::Healthy => NONE,
             CaseKind::UnmodelledEffect => "(outside)",
-            CaseKind::LargeEffect | CaseKind::SmallEffect | CaseKind::TwoEffects | CaseKind::FourEffects => {
-                result.verdict.hits.first().map_or(NONE, |hit| &hit.effect)
-            }
+            _ => result.verdict.hits.first().map_or(NONE, |hit| &hit.effect),
         };
         let named = result.verdict.named.first().and_then(|named| named.split('@').next()).unwrap_or(NONE);
         *counts.entry((hidden, named)).or_default() += 1;
@@ -196,10 +277,11 @@ mod tests {
             depends_on: (kind == CaseKind::UnmodelledEffect).then_some(true),
             removed: ErrorReduction { torque: None, motion: Some(0.9) },
         };
-        let setting = LogSetup { place: BaseSchedule::Fixed, torque: true, battery: false, temperature: false };
+        let setting = LogSetup::with_torque(BaseSchedule::Fixed);
         let (nominal, truth) = (RmsErrors::default(), RmsErrors::default());
         CaseResult {
             plant: crate::Plant::Rapier,
+            suite: crate::Suite::Mixed,
             seed: 0,
             case: 0,
             kind,
@@ -238,18 +320,13 @@ mod tests {
             | half the range or more: top-1 correct | >= 90 % | 1 of 2: 50 % | 9 to 91 % |
             | half the range or more: listed as indistinguishable |  | 0 of 2: 0 % | 0 to 66 % |
             | half the range or more: top-3 correct | >= 97 % | 1 of 2: 50 % | 9 to 91 % |
-            | half the range or more: scope correct | >= 92 % | 1 of 2: 50 % | 9 to 91 % |
+            | half the range or more: scope correct | >= 90 % | 1 of 2: 50 % | 9 to 91 % |
             | half the range or more: additional false positive |  | 1 of 2: 50 % | 9 to 91 % |
-            | a fifth of the range: top-1 correct | >= 70 % | no case | |
-            | a fifth of the range: listed as indistinguishable |  | no case | |
-            | a fifth of the range: top-3 correct |  | no case | |
-            | a fifth of the range: scope correct |  | no case | |
-            | a fifth of the range: additional false positive |  | no case | |
             | one effect: within the set of names | >= 90 % | 1 of 2: 50 % | 9 to 91 % |
             | one effect: mean size of the set | <= 2.5 | 1.0 | |
-            | nothing hidden: false positive | <= 3 % | 0 of 1: 0 % | 0 to 79 % |
+            | nothing hidden: false positive | <= 7 % | 0 of 1: 0 % | 0 to 79 % |
             | outside the catalogue: false positive | <= 10 % | 0 of 1: 0 % | 0 to 79 % |
-            | outside the catalogue: what it depends on is correct | >= 50 % | 1 of 1: 100 % | 21 to 100 % |
+            | outside the catalogue: what it depends on is correct | >= 60 % | 1 of 1: 100 % | 21 to 100 % |
             | two effects: both reported | >= 65 % | 0 of 1: 0 % | 0 to 79 % |
             | two effects: both reported, scopes correct |  | 0 of 1: 0 % | 0 to 79 % |
             | size within its 95 % interval | 88 to 99 % | 2 of 2: 100 % | 34 to 100 % |

@@ -1,6 +1,7 @@
 //! Least-squares problem: free parameters of a model, and experiments whose residuals are minimised.
 
 use nalgebra::{DMatrix, DVector};
+use rayon::prelude::*;
 use twinstep_effects::ModelFile;
 use twinstep_model::{Precision, Rollout};
 
@@ -36,6 +37,11 @@ impl Differences {
     }
 }
 
+/// Appends `part` to `whole`, without a copy if that is empty.
+pub fn append(whole: &mut Vec<f64>, part: Vec<f64>) {
+    if whole.is_empty() { *whole = part } else { whole.extend(part) }
+}
+
 /// Least-squares problem. A point consists of the coordinates of the free parameters.
 #[derive(Clone, Copy)]
 pub struct LeastSquaresProblem<'a> {
@@ -69,26 +75,21 @@ impl LeastSquaresProblem<'_> {
     pub fn residuals(&self, simulator: &mut dyn Rollout, points: &[Vec<f64>]) -> Vec<Option<Vec<f64>>> {
         let robots: Vec<_> = points.iter().map(|point| candidate(self.file, self.unknowns, point)).collect();
         let built: Vec<_> = robots.iter().flatten().cloned().collect();
-        let mut parts: Vec<std::vec::IntoIter<Vec<f64>>> = self
-            .experiments
-            .iter()
-            .map(|experiment| experiment.residuals(simulator, &built, self.precision).into_iter())
-            .collect();
-        robots
-            .iter()
-            .map(|robot| {
-                robot.as_ref()?;
-                let mut whole: Vec<f64> = parts.iter_mut().flat_map(|part| part.next().unwrap_or_default()).collect();
-                whole.iter_mut().zip(self.residual_scale).for_each(|(residual, spread)| *residual /= spread);
-                if whole.iter().any(|residual| !residual.is_finite()) {
-                    return None;
-                }
-                if let Some(tolerances) = self.tolerances {
-                    tolerances.project_out(&mut whole);
-                }
-                Some(whole)
-            })
-            .collect()
+        let mut found = vec![Vec::new(); built.len()];
+        for experiment in self.experiments {
+            let parts = experiment.residuals(simulator, &built, self.precision);
+            found.iter_mut().zip(parts).for_each(|(whole, part)| append(whole, part));
+        }
+        let complete = |mut whole: Vec<f64>| {
+            whole.iter_mut().zip(self.residual_scale).for_each(|(residual, spread)| *residual /= spread);
+            let is_finite = whole.iter().all(|residual| residual.is_finite());
+            if let Some(tolerances) = self.tolerances.filter(|_| is_finite) {
+                tolerances.project_out(&mut whole);
+            }
+            is_finite.then_some(whole)
+        };
+        let mut found = found.into_par_iter().map(complete).collect::<Vec<_>>().into_iter();
+        robots.iter().map(|robot| robot.as_ref().and_then(|_| found.next().flatten())).collect()
     }
 
     /// Computes residuals and Jacobian at `point`, by central differences in one batch.

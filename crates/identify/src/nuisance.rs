@@ -10,6 +10,7 @@
 //! the robot.
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use rayon::prelude::*;
 use twinstep_model::{NUM_JOINTS, Precision, RobotModel, Rollout};
 
 use crate::experiment::Experiment;
@@ -36,6 +37,8 @@ const NUM_NUISANCE: usize = NUM_ROBOT_ERRORS + NUM_JOINTS;
 const LARGEST: f64 = 3.0;
 /// Correlation length of the residuals [rows].
 const CORRELATION_ROWS: f64 = 40.0;
+/// Number of rows of a Jacobian whose products are summed by one thread at a time.
+const ROWS_AT_ONCE: usize = 8192;
 
 /// Linear model of the effect of nuisance parameters on residuals.
 #[derive(Clone)]
@@ -62,7 +65,7 @@ struct NuisanceBlock {
 impl NuisanceBlock {
     fn new(rows: Vec<usize>, jacobian: DMatrix<f64>) -> Option<Self> {
         let prior = DMatrix::identity(jacobian.ncols(), jacobian.ncols()) * CORRELATION_ROWS;
-        let factor = (jacobian.tr_mul(&jacobian) + prior).cholesky()?;
+        let factor = (gram(&jacobian) + prior).cholesky()?;
         Some(Self { rows, jacobian: jacobian.map(|slope| slope as f32), factor, costs: true })
     }
 
@@ -115,25 +118,29 @@ impl NuisanceModel {
     }
 
     fn of(starts: Vec<NuisanceBlock>, jacobian: DMatrix<f64>) -> Option<Self> {
-        let corrected = jacobian.column_iter().map(|column| {
-            let mut column = column.iter().copied().collect();
+        let columns = jacobian.as_slice().par_chunks(jacobian.nrows().max(1)).map(|column| {
+            let mut column = column.to_vec();
             for start in &starts {
                 start.eliminate(&mut column, f64::INFINITY);
             }
-            DVector::from_vec(column)
+            column
         });
-        let corrected = DMatrix::from_columns(&corrected.collect::<Vec<_>>());
-        let robot = NuisanceBlock::new((0..corrected.nrows()).collect(), corrected)?;
+        let columns: Vec<Vec<f64>> = columns.collect();
+        // The residuals of a robot that walks or jumps do not depend on them.
+        let is_affected = |row: &usize| columns.iter().any(|column| column[*row] != 0.0);
+        let rows: Vec<usize> = (0..columns[0].len()).filter(is_affected).collect();
+        let slopes = columns.iter().flat_map(|column| rows.iter().map(|row| column[*row]));
+        let corrected = DMatrix::from_iterator(rows.len(), columns.len(), slopes);
+        let robot = NuisanceBlock::new(rows, corrected)?;
         Some(Self { starts, robot, jacobian })
     }
 
     /// Returns the model for residuals that are divided by `spread`, with one entry per residual.
     pub fn rescaled(&self, spread: &[f64]) -> Option<Self> {
         let mut jacobian = self.jacobian.clone();
-        for (mut derivative, spread) in jacobian.row_iter_mut().zip(spread) {
-            derivative /= *spread;
-        }
-        Self::of(self.starts.iter().map(|start| start.rescaled(spread)).collect::<Option<_>>()?, jacobian)
+        let columns = jacobian.as_mut_slice().par_chunks_mut(spread.len().max(1));
+        columns.for_each(|column| column.iter_mut().zip(spread).for_each(|(slope, spread)| *slope /= spread));
+        Self::of(self.starts.par_iter().map(|start| start.rescaled(spread)).collect::<Option<_>>()?, jacobian)
     }
 
     /// Returns the effect of each error of the robot, of one standard deviation, on residuals divided by `spread`.
@@ -167,6 +174,17 @@ impl NuisanceModel {
         let (starts, robot) = costs.split_at(costs.len().saturating_sub(NUM_NUISANCE));
         [starts, robot].map(|costs| 0.5 * costs.iter().map(|cost| cost * cost).sum::<f64>() / CORRELATION_ROWS)
     }
+}
+
+/// Returns `JᵀJ`.
+fn gram(jacobian: &DMatrix<f64>) -> DMatrix<f64> {
+    let (rows, columns) = jacobian.shape();
+    let of_rows = |first: usize| {
+        let part = jacobian.rows(first, ROWS_AT_ONCE.min(rows - first));
+        part.transpose() * part
+    };
+    let parts: Vec<_> = (0..rows).into_par_iter().step_by(ROWS_AT_ONCE).map(of_rows).collect();
+    parts.into_iter().fold(DMatrix::zeros(columns, columns), |sum, part| sum + part)
 }
 
 /// Returns the power [noise variance of a row] by which the robot's errors exceed their expectation.

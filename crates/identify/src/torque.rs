@@ -50,7 +50,7 @@ pub struct MeasuredTorque {
 }
 
 /// One row of a log, until the next.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct TorqueSample {
     row: usize,
     /// True for the first row of a contiguous range, at which the actuator state is reset.
@@ -109,6 +109,15 @@ impl MeasuredTorque {
             conditions: OperatingConditions::of(log),
             rows: all,
         })
+    }
+
+    /// Returns the contiguous ranges that contain a row for which `is_compared` is true.
+    #[must_use]
+    pub fn only_ranges_with(mut self, is_compared: impl Fn(usize) -> bool) -> Self {
+        let ranges = self.rows.chunk_by(|_, next| !next.after_reset);
+        let kept = ranges.filter(|range| range.iter().any(|sample| is_compared(sample.row)));
+        self.rows = kept.flatten().cloned().collect();
+        self
     }
 
     /// Returns true if two robots predict the same torque for the same states.

@@ -120,13 +120,13 @@ fn torque(log: &Log, joint: &str) -> (Vec<f64>, TorqueSource) {
     let (Some(q), Some(q_cmd)) = (log.q(joint), log.q_cmd(joint)) else { return (Vec::new(), TorqueSource::Commanded) };
     let (dq, dq_cmd, tau_ff) = (log.dq(joint), log.dq_cmd(joint), log.tau_ff(joint));
     let cell = |column: Option<&[f64]>, row: usize| column.map_or(0.0, |cells| cells[row]);
+    let [Some(kp), Some(kd)] = log.gains(joint) else { return (Vec::new(), TorqueSource::Commanded) };
     let commanded = |row: usize| {
-        let (kp, kd) = (log.kp(joint, row)?, log.kd(joint, row)?);
         // Without measured velocity the damping term is omitted; it is small if the joint tracks its command.
-        let damping = if dq.is_some() { kd * (cell(dq_cmd, row) - cell(dq, row)) } else { 0.0 };
-        Some(kp * (q_cmd[row] - q[row]) + damping + cell(tau_ff, row))
+        let damping = if dq.is_some() { kd[row] * (cell(dq_cmd, row) - cell(dq, row)) } else { 0.0 };
+        kp[row] * (q_cmd[row] - q[row]) + damping + cell(tau_ff, row)
     };
-    ((0..log.rows()).filter_map(commanded).collect(), TorqueSource::Commanded)
+    ((0..log.rows()).map(commanded).collect(), TorqueSource::Commanded)
 }
 
 /// Returns the times [s] of sign changes among velocities above `threshold`, for each contiguous range of rows.

@@ -132,6 +132,17 @@ impl Log {
         self.gain("kd", self.meta.kd.as_ref(), joint, row)
     }
 
+    /// Returns position gain [N·m/rad] and velocity gain [N·m·s/rad] in force from each row to the next.
+    pub fn gains(&self, joint: &str) -> [Option<Vec<f64>>; 2] {
+        [("kp", &self.meta.kp), ("kd", &self.meta.kd)].map(|(quantity, constant)| {
+            let index = self.joints.iter().position(|name| name == joint)?;
+            match self.of_joint(quantity, joint).or_else(|| self.channel(quantity)) {
+                Some(column) => Some(column.to_vec()),
+                None => Some(vec![constant.as_ref()?.of(index)?; self.rows()]),
+            }
+        })
+    }
+
     /// Returns the standard deviation of a channel's noise in the channel's unit, if the metadata state it.
     pub fn noise(&self, channel: &str) -> Option<f64> {
         let quantity = Column::parse(channel)?.quantity.name;

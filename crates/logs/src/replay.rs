@@ -97,16 +97,15 @@ pub struct JointCommands<'a> {
 
 impl<'a> JointCommands<'a> {
     fn of(log: &'a Log, name: &str) -> Result<Self, ReplayError> {
-        let gains =
-            |gain: fn(&Log, &str, usize) -> Option<f64>| (0..log.rows()).map(|row| gain(log, name, row)).collect();
+        let [kp, kd] = log.gains(name);
         let missing = || ReplayError::Missing { joint: name.to_owned(), quantity: "q_cmd" };
         Ok(Self {
             joint: name.parse().map_err(|_| ReplayError::UnknownJoint { joint: name.to_owned() })?,
             q_cmd: log.q_cmd(name).ok_or_else(missing)?,
             dq_cmd: log.dq_cmd(name),
             tau_ff: log.tau_ff(name),
-            kp: gains(Log::kp),
-            kd: gains(Log::kd),
+            kp,
+            kd,
         })
     }
 }
@@ -175,6 +174,9 @@ pub fn at_log_rate(log: &Log, robot: &RobotModel) -> Result<RobotModel, ReplayEr
 /// Values between samples are interpolated linearly. Before sample 0 the signal has the value of sample 0.
 pub fn delayed_mean(signal: impl Fn(usize) -> f64, samples: Range<usize>, delay: f64) -> f64 {
     let (last, count) = (samples.end - 1, samples.len());
+    if delay == 0.0 {
+        return samples.map(signal).sum::<f64>() / count as f64;
+    }
     let at = |sample: usize| {
         let position = (sample as f64 - delay).max(0.0);
         let (before, fraction) = (position as usize, position.fract());

@@ -76,18 +76,23 @@ impl Experiment {
         let stance = MeasuredStance::new(log, robot, estimate.as_ref());
         channels.extend(wrench_channels(log.rows(), &stance, &windows));
         let floating = windows.iter().any(|window| !window.base.is_fixed());
-        let fast = windows.iter().any(|window| window.fast);
+        let is_fast = |row: usize| windows.iter().any(|window| window.fast && window.rows.contains(&row));
+        let torques = if windows.iter().any(|window| window.fast) {
+            Some(Arc::new(MeasuredTorque::new(log, robot)?.only_ranges_with(is_fast)))
+        } else {
+            None
+        };
         let orientations =
             if floating { (0..log.rows()).map(|row| orientation(log, row)).collect() } else { Vec::new() };
         Ok(Self {
             actuator_hz: robot.control.actuator_hz,
+            torques,
             windows,
             channels,
             orientations,
             joints,
             rows_per_block,
             conditions: OperatingConditions::of(log),
-            torques: if fast { Some(Arc::new(MeasuredTorque::new(log, robot)?)) } else { None },
             stance: Arc::new(stance),
             estimated_start: estimate.map(|estimate| [estimate.height_sigma, estimate.velocity_sigma]),
         })

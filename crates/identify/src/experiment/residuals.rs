@@ -39,28 +39,28 @@ impl Experiment {
         let trajectories = self.simulate(simulator, candidates, precision);
         let torques = self.torque_errors(candidates);
         let wrenches = self.wrench_errors(candidates, &[0.0; NUM_JOINTS]);
-        candidates
-            .par_iter()
-            .zip(trajectories.par_chunks(self.windows.len().max(1)))
-            .enumerate()
-            .map(|(index, (robot, windows))| {
-                let on_measured = torques.get(index).map_or(&[][..], |errors| &errors[..]);
-                let mut residuals = Vec::new();
-                for (channel, window, states) in self.compared(windows) {
-                    self.compare(channel, window, states, robot, |row, difference| {
-                        let on_measured = match channel.quantity {
-                            ResidualChannel::BaseWrench(axis) => {
-                                self.stance.sample_of(row).map(|sample| wrenches[index][sample][axis])
-                            }
-                            _ => channel.torque_joint(window).zip(on_measured.get(row)).map(|(joint, all)| all[joint]),
-                        };
-                        let error = on_measured.filter(|error| error.is_finite()).unwrap_or(difference);
-                        residuals.push(error / channel.sigma);
-                    });
-                }
-                residuals
-            })
-            .collect()
+        let (windows, channels) = (self.windows.len(), self.channels.len());
+        let of_channel = |place: usize| {
+            let (index, channel) = (place / channels, &self.channels[place % channels]);
+            let (robot, states) = (&candidates[index], &trajectories[index * windows..(index + 1) * windows]);
+            let on_measured = torques.get(index).map_or(&[][..], |errors| &errors[..]);
+            let mut residuals = Vec::new();
+            for (window, states) in self.windows.iter().zip(states) {
+                self.compare(channel, window, states, robot, |row, difference| {
+                    let on_measured = match channel.quantity {
+                        ResidualChannel::BaseWrench(axis) => {
+                            self.stance.sample_of(row).map(|sample| wrenches[index][sample][axis])
+                        }
+                        _ => channel.torque_joint(window).zip(on_measured.get(row)).map(|(joint, all)| all[joint]),
+                    };
+                    let error = on_measured.filter(|error| error.is_finite()).unwrap_or(difference);
+                    residuals.push(error / channel.sigma);
+                });
+            }
+            residuals
+        };
+        let parts: Vec<Vec<f64>> = (0..candidates.len() * channels).into_par_iter().map(of_channel).collect();
+        parts.par_chunks(channels.max(1)).map(<[Vec<f64>]>::concat).collect()
     }
 
     /// Returns the torque errors of each candidate on measured states, by row; NaN where there are none [N·m].
@@ -102,8 +102,9 @@ impl Experiment {
         let robot = &self.at_rate(std::slice::from_ref(robot))[0];
         let windows = self.simulate(simulator, std::slice::from_ref(robot), Precision::Double);
         let mut errors = [const { Vec::new() }; NUM_JOINTS];
-        for (channel, window, states) in self.compared(&windows) {
-            if let ResidualChannel::Position(joint) = channel.quantity {
+        for channel in &self.channels {
+            let ResidualChannel::Position(joint) = channel.quantity else { continue };
+            for (window, states) in self.windows.iter().zip(&windows) {
                 self.compare(channel, window, states, robot, |row, difference| errors[joint].push((row, difference)));
             }
         }
@@ -178,15 +179,6 @@ impl Experiment {
             factors
         };
         self.windows.iter().map(of).collect()
-    }
-
-    fn compared<'a>(
-        &'a self,
-        windows: &'a [RobotStates],
-    ) -> impl Iterator<Item = (&'a Channel, &'a Window, &'a RobotStates)> {
-        self.channels.iter().flat_map(move |channel| {
-            self.windows.iter().zip(windows).map(move |(window, states)| (channel, window, states))
-        })
     }
 
     /// Calls `each` with every compared row and its difference, simulated minus measured.
