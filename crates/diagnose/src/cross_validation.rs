@@ -71,12 +71,21 @@ impl FitProblem {
 
     /// Returns the points with the least cost on either fold of `rows` [coordinates].
     ///
-    /// Both are steps of the model that is linearised at the fit to all rows. Returns `None` if the simulation diverges
-    /// there.
-    pub fn solve_folds(&self, rows: &ResidualRows, simulator: &mut dyn Rollout) -> Option<[Vec<f64>; 2]> {
+    /// Both are steps of the model that is linearised at the fit to all rows, or to those of `fewer`. Returns `None` if the
+    /// simulation diverges there.
+    pub fn solve_folds(
+        &self,
+        rows: &ResidualRows,
+        fewer: Option<&ResidualRows>,
+        simulator: &mut dyn Rollout,
+    ) -> Option<[Vec<f64>; 2]> {
+        let steps = if self.unknowns.len() > 2 { STEPS } else { TRIAL_STEPS };
+        let refined = |task: &LeastSquaresProblem, simulator: &mut dyn Rollout| {
+            self.refined(task, simulator, &TRIAL_DAMPING, steps)
+        };
+        let of_fewer = fewer.map(|rows| self.with_problem(rows, simulator, PRECISION, refined));
         self.with_problem(rows, simulator, PRECISION, |task, simulator| {
-            let steps = if self.unknowns.len() > 2 { STEPS } else { TRIAL_STEPS };
-            let whole = self.refined(task, simulator, &TRIAL_DAMPING, steps);
+            let whole = of_fewer.unwrap_or_else(|| refined(task, simulator));
             let here = task.linearise(simulator, &whole)?;
             let points = [0, 1].map(|fold| {
                 let weight = |row: usize| rows.weight_in_fold(row, fold);
@@ -140,7 +149,10 @@ pub fn cross_validate(
     simulator: &mut dyn Rollout,
 ) -> Option<CandidateFit> {
     let fit = FitProblem::new(model, std::slice::from_ref(hypothesis))?;
-    let points = fit.solve_folds(&evidence.fit_rows, simulator)?;
+    let effect = hypothesis.effect;
+    let shown_in_air = effect.target == Target::Joints && matches!(effect.search.whole_log_probes, Probes::None);
+    let fewer = evidence.fixed_base_rows().filter(|_| shown_in_air);
+    let points = fit.solve_folds(&evidence.fit_rows, fewer, simulator)?;
     let whole: Vec<f64> = points[0].iter().zip(&points[1]).map(|(one, other)| 0.5 * (one + other)).collect();
     let models = [fit.model(&points[0]), fit.model(&points[1]), fit.model(&whole)];
     let robots: Vec<RobotModel> = models.iter().map(|model| model.robot_model().ok()).collect::<Option<_>>()?;
@@ -162,9 +174,7 @@ pub fn cross_validate(
     ];
     // What the simulator cannot follow on the ground hides nothing that rows in the air show.
     let in_air: Vec<usize> = acts.iter().copied().filter(|channel| *channel < TRUNK).collect();
-    let effect = hypothesis.effect;
-    let judged_in_air = effect.target == Target::Joints && matches!(effect.search.whole_log_probes, Probes::None);
-    let shown_in_air = judged_in_air && in_air.iter().any(|channel| *channel < TORQUE);
+    let shown_in_air = shown_in_air && in_air.iter().any(|channel| *channel < TORQUE);
     let above = |left: &ResidualPower| {
         let excess = |channels: &[usize]| channels.iter().map(|channel| left.channel_excess(*channel)).sum::<f64>();
         let tolerated = if tolerated > 1.0 { left.tolerated_excess() } else { 0.0 };
@@ -190,7 +200,7 @@ pub fn cross_validate_together(
     simulator: &mut dyn Rollout,
 ) -> f64 {
     let Some(fit) = FitProblem::new(model, hypotheses).filter(|_| !hypotheses.is_empty()) else { return 0.0 };
-    let Some(points) = fit.solve_folds(&evidence.fit_rows, simulator) else { return f64::NEG_INFINITY };
+    let Some(points) = fit.solve_folds(&evidence.fit_rows, None, simulator) else { return f64::NEG_INFINITY };
     let models = [model.clone(), fit.model(&points[0]), fit.model(&points[1])];
     let robots: Option<Vec<RobotModel>> = models.iter().map(|model| model.robot_model().ok()).collect();
     let Some(robots) = robots else { return f64::NEG_INFINITY };

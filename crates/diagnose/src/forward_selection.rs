@@ -1,5 +1,6 @@
 //! Forward selection of causes with backward elimination.
 
+use std::collections::BTreeMap;
 use std::ops::Range;
 
 use twinstep_effects::ModelFile;
@@ -85,6 +86,8 @@ pub struct ForwardSelection<'a> {
     pub accepted: Accepted,
     /// [`ForwardSelection::baseline`] with all accepted causes, fitted jointly to both folds.
     pub model: ModelFile,
+    /// Scan's scores of hypotheses by name when a fit did not support them [nat].
+    pub unsupported: BTreeMap<String, f64>,
     pub simulator: &'a mut dyn Rollout,
     pub progress: &'a mut dyn FnMut(&str) -> Result<(), DiagnoseError>,
 }
@@ -142,8 +145,18 @@ impl<'a> ForwardSelection<'a> {
         let left = evidence.residual_power(self.simulator, &self.model.robot_model()?);
         let named = self.accepted.len();
         (self.progress)(&format!("scanning the catalogue; causes: {named}"))?;
-        let candidates = candidates(evidence, &self.model, self.simulator);
-        let mut trials = self.evaluate(candidates, excluded, &left)?;
+        let mut candidates = candidates(evidence, &self.model, self.simulator);
+        // With more causes in the model, a hypothesis is fitted again only if the scan supports it more.
+        let unsupported = &self.unsupported;
+        candidates
+            .retain(|scored| unsupported.get(&scored.hypothesis.name()).is_none_or(|score| scored.score > *score));
+        let hypotheses = candidates.iter().map(|scored| scored.hypothesis.clone()).collect();
+        let mut trials = self.evaluate(hypotheses, excluded, &left)?;
+        for trial in trials.iter().filter(|trial| trial.score < LOWEST_THRESHOLD) {
+            let name = trial.hypothesis.name();
+            let score = candidates.iter().find(|scored| scored.hypothesis.name() == name).map(|scored| scored.score);
+            self.unsupported.extend(score.map(|score| (name, score)));
+        }
         let Some(best) = trials.first().filter(|best| best.score >= LOWEST_THRESHOLD) else { return Ok(None) };
         (self.progress)(&format!("computing the threshold; causes: {named}"))?;
         let with_best = FitProblem::new(&self.model, std::slice::from_ref(&best.hypothesis));
@@ -279,7 +292,7 @@ pub fn write_estimates(accepted: &mut Accepted, fit: &FitProblem, point: &[f64])
 ///
 /// Joints, bodies, the ground and encoder offsets are ranked separately, because the scan evaluates them on different rows. Encoder
 /// offsets are left out where the robot walks: feet that touch down at other times in the model imitate them.
-fn candidates(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<Hypothesis> {
+fn candidates(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<ScoredHypothesis> {
     let scored = scan(evidence, model, simulator).into_iter().filter(|scored| scored.score > 0.0);
     let of_joints =
         |scored: &ScoredHypothesis| matches!(scored.hypothesis.effect.target, Target::Joints | Target::Supply);
@@ -291,7 +304,7 @@ fn candidates(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Ro
         whole.into_iter().partition(|scored| scored.hypothesis.effect.target == Target::Ground);
     let tried = |scored: Vec<ScoredHypothesis>, most: usize| {
         let least = 0.3 * scored.first().map_or(0.0, |best| best.score);
-        scored.into_iter().filter(move |scored| scored.score >= least).take(most).map(|scored| scored.hypothesis)
+        scored.into_iter().filter(move |scored| scored.score >= least).take(most)
     };
     tried(joints, MAX_JOINT_CANDIDATES)
         .chain(tried(bodies, MAX_BODY_CANDIDATES))

@@ -50,6 +50,8 @@ mod torque_fit;
 mod torque_only;
 mod unexplained;
 
+use std::collections::BTreeMap;
+
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, Scope};
 use twinstep_logs::Log;
@@ -144,6 +146,7 @@ pub fn diagnose(
         baseline: judged.clone(),
         accepted: Accepted::new(),
         model: judged.clone(),
+        unsupported: BTreeMap::new(),
         simulator,
         progress: &mut say,
     };

@@ -10,8 +10,6 @@
 //! Sign changes of blocks: the wild cluster bootstrap (Cameron, Gelbach and Miller 2008). Residuals of the full model:
 //! ter Braak 1992.
 
-use std::ops::Range;
-
 use rand::RngExt;
 use rayon::prelude::*;
 use twinstep_effects::{CATALOGUE, Effect, ModelFile, Probes, Scope, Target};
@@ -40,13 +38,12 @@ const SEED: u64 = 1;
 /// Number of classes of effects.
 const CLASSES: usize = 3;
 
-/// Derivative of the residuals in one direction, with the channels in which a scope shows it.
+/// Derivative of the residuals in one direction.
 struct Direction {
     products: usize,
     class: usize,
-    scopes: Vec<Scope>,
-    /// Channels that are evidence about the effect.
-    channels: Range<usize>,
+    /// Each scope with the channels in which it shows the effect.
+    scopes: Vec<(Scope, Vec<usize>)>,
     num_values: usize,
     /// Least size of a cause, in units of the difference.
     least: f64,
@@ -81,11 +78,13 @@ pub fn thresholds(evidence: &ResidualData, model: &ModelFile, simulator: &mut dy
         let scopes = scopes(effect, evidence);
         for values in small_probes(effect).into_iter().filter(|_| !scopes.is_empty()) {
             if let Some(probe) = with_effect(model, effect, &values).ok().and_then(|file| file.robot_model().ok()) {
+                let channels = |scope: Scope| {
+                    evident_channels([effect.target]).filter(|channel| shows(scope, *channel)).collect()
+                };
                 directions.push(Direction {
                     products: robots.len(),
                     class: class(effect.target),
-                    scopes: scopes.clone(),
-                    channels: evident_channels([effect.target]),
+                    scopes: scopes.iter().map(|scope| (*scope, channels(*scope))).collect(),
                     num_values: effect.num_values(),
                     least: effect.search.min_share / relative_size(effect, &values).max(f64::MIN_POSITIVE),
                     two_sided: is_two_sided(effect),
@@ -102,8 +101,8 @@ pub fn thresholds(evidence: &ResidualData, model: &ModelFile, simulator: &mut dy
         let flipped = FlippedSums::new(&products, &signs);
         let mut gains = [0.0; CLASSES];
         for direction in &directions {
-            for scope in &direction.scopes {
-                let gain = flipped.score(evidence, direction, *scope);
+            for (scope, channels) in &direction.scopes {
+                let gain = flipped.score(evidence, direction, *scope, channels);
                 gains[direction.class] = gain.max(gains[direction.class]);
             }
         }
@@ -175,14 +174,13 @@ impl<'a> FlippedSums<'a> {
     }
 
     /// Returns the cross-validated log-likelihood gain of a direction on a scope, minus its penalties [nat].
-    fn score(&self, evidence: &ResidualData, direction: &Direction, scope: Scope) -> f64 {
+    fn score(&self, evidence: &ResidualData, direction: &Direction, scope: Scope, channels: &[usize]) -> f64 {
         let index = direction.products;
-        let channels = || direction.channels.clone().filter(|channel| shows(scope, *channel));
         let power = |channel: usize, fold: usize| self.products.reference[channel][fold];
         let slope = |channel: usize, fold: usize| self.products.slopes[index][channel][fold];
         let size = |fold: usize| {
             let (mut cross, mut squares) = (0.0, 0.0);
-            for channel in channels() {
+            for channel in channels.iter().copied() {
                 let [count, sum] = power(channel, fold);
                 let variance = (sum / count.max(1.0)).max(1.0);
                 cross += self.cross[index][channel][fold] / variance;
@@ -205,7 +203,7 @@ impl<'a> FlippedSums<'a> {
             }
             0.5 * count / evidence.correlation_rows(channel) * ((before + 1e-9) / (after.max(0.0) + 1e-9)).ln()
         };
-        let nats: f64 = channels().map(|channel| gain(channel, 0) + gain(channel, 1)).sum();
+        let nats: f64 = channels.iter().map(|channel| gain(*channel, 0) + gain(*channel, 1)).sum();
         nats - selection_penalty(scope) - parameter_penalty(direction.num_values)
     }
 }

@@ -37,8 +37,8 @@ pub struct ResidualData {
     experiments: Vec<Experiment>,
     /// All rows except held-out blocks.
     pub fit_rows: ResidualRows,
-    /// Rows of `fit_rows` with a fixed base, in which the joints are nearly decoupled; all rows if there are none.
-    fixed_base_rows: ResidualRows,
+    /// Rows of `fit_rows` with a fixed base, in which the joints are nearly decoupled; `None` if these are all, or none.
+    fixed_base_rows: Option<ResidualRows>,
     torques: Vec<MeasuredTorque>,
     /// True if the robot walks, trots or jumps in windows that are compared.
     pub is_dynamic: bool,
@@ -55,15 +55,15 @@ impl ResidualData {
             experiment.clone().filter_rows(|row| split.fold(row).is_some())
         };
         let whole: Vec<Experiment> = splits.iter().zip(&experiments).map(of_folds).collect();
-        let quick = if whole.iter().any(Experiment::has_fixed_base) {
-            whole.iter().cloned().map(Experiment::only_fixed_base).collect()
-        } else {
-            whole.clone()
-        };
+        let has_both =
+            whole.iter().any(Experiment::has_fixed_base) && whole.iter().any(Experiment::has_floating_base);
+        let fixed_base_rows = has_both.then(|| {
+            ResidualRows::new(&splits, whole.iter().cloned().map(Experiment::only_fixed_base).collect())
+        });
         Ok(Self {
             torques: logs.iter().map(|log| MeasuredTorque::new(log, robot)).collect::<Result<_, _>>()?,
             fit_rows: ResidualRows::new(&splits, whole),
-            fixed_base_rows: ResidualRows::new(&splits, quick),
+            fixed_base_rows,
             is_dynamic,
             experiments,
             splits,
@@ -79,10 +79,13 @@ impl ResidualData {
             return;
         }
         self.fit_rows.tolerances = NuisanceModel::new(&self.fit_rows.experiments, robot, simulator);
-        // The scan of rows with a fixed base ranks candidates by joint, for which penalties of links have no share.
-        if self.fixed_base_rows.experiments.iter().any(Experiment::has_floating_base) {
-            self.fixed_base_rows.tolerances.clone_from(&self.fit_rows.tolerances);
-        }
+    }
+
+    /// Returns the rows with a fixed base, without nuisance parameters, if there are others, too.
+    ///
+    /// They rank candidates by joint, for which penalties of links have no share.
+    pub fn fixed_base_rows(&self) -> Option<&ResidualRows> {
+        self.fixed_base_rows.as_ref()
     }
 
     /// Returns all rows, held-out blocks included, with the nuisance parameters of `model`.
@@ -130,7 +133,7 @@ impl ResidualData {
         robots: &[RobotModel],
         quick: bool,
     ) -> Vec<ResidualPower> {
-        let rows = if quick { &self.fixed_base_rows } else { &self.fit_rows };
+        let rows = self.fixed_base_rows().filter(|_| quick).unwrap_or(&self.fit_rows);
         let mut residual_powers = rows.residual_powers(simulator, robots);
         for ((log, split), torques) in self.logs.iter().zip(&self.splits).zip(&self.torques) {
             // Most effects act after the torque sensor, so consecutive candidates often predict the same torque.

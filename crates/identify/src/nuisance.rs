@@ -9,6 +9,8 @@
 //! r`, where P is their prior covariance. The initial states are eliminated first, window by window, then the errors of
 //! the robot.
 
+use std::ops::Range;
+
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use rayon::prelude::*;
 use twinstep_model::{NUM_JOINTS, Precision, RobotModel, Rollout};
@@ -39,6 +41,10 @@ const LARGEST: f64 = 3.0;
 const CORRELATION_ROWS: f64 = 40.0;
 /// Number of rows of a Jacobian whose products are summed by one thread at a time.
 const ROWS_AT_ONCE: usize = 8192;
+/// Number of zeros after which a range of nonzero cells ends.
+const SHORTEST_GAP: usize = 64;
+/// Number of partial sums of an inner product.
+const LANES: usize = 32;
 
 /// Linear model of the effect of nuisance parameters on residuals.
 #[derive(Clone)]
@@ -57,6 +63,8 @@ struct NuisanceBlock {
     /// Jacobian: one row per residual, one column per nuisance parameter [prior std]. Single precision halves the time of
     /// an elimination, which reads it twice.
     jacobian: DMatrix<f32>,
+    /// Ranges of the rows in which a column is not zero: a link has no effect on the other legs of a robot that hangs.
+    affected: Vec<Vec<Range<usize>>>,
     factor: Cholesky<f64, Dyn>,
     /// False if sizes have no penalty.
     costs: bool,
@@ -66,16 +74,29 @@ impl NuisanceBlock {
     fn new(rows: Vec<usize>, jacobian: DMatrix<f64>) -> Option<Self> {
         let prior = DMatrix::identity(jacobian.ncols(), jacobian.ncols()) * CORRELATION_ROWS;
         let factor = (gram(&jacobian) + prior).cholesky()?;
-        Some(Self { rows, jacobian: jacobian.map(|slope| slope as f32), factor, costs: true })
+        let jacobian = jacobian.map(|slope| slope as f32);
+        let affected = jacobian.column_iter().map(|column| nonzero_ranges(column.as_slice())).collect();
+        Some(Self { rows, jacobian, affected, factor, costs: true })
     }
 
     /// Subtracts the effect of the estimated nuisance parameters, each at most `largest` [prior std], and appends their
     /// penalties to the residuals.
     fn eliminate(&self, residuals: &mut Vec<f64>, largest: f64) {
-        let own = DVector::from_iterator(self.rows.len(), self.rows.iter().map(|row| residuals[*row] as f32));
-        let sizes = self.factor.solve(&self.jacobian.tr_mul(&own).map(f64::from));
+        let own: Vec<f32> = self.rows.iter().map(|row| residuals[*row] as f32).collect();
+        let columns = || self.jacobian.as_slice().chunks(self.rows.len().max(1)).zip(&self.affected);
+        let products = columns().map(|(column, affected)| {
+            affected.iter().map(|range| f64::from(dot(&column[range.clone()], &own[range.clone()]))).sum::<f64>()
+        });
+        let sizes = self.factor.solve(&DVector::from_iterator(self.affected.len(), products));
         let sizes = sizes.map(|size| size.clamp(-largest, largest));
-        let explained = &self.jacobian * sizes.map(|size| size as f32);
+        let mut explained = own;
+        explained.fill(0.0);
+        for ((column, affected), size) in columns().zip(&sizes) {
+            for range in affected {
+                let part = explained[range.clone()].iter_mut().zip(&column[range.clone()]);
+                part.for_each(|(sum, slope)| *sum += *size as f32 * slope);
+            }
+        }
         for (row, value) in self.rows.iter().zip(&explained) {
             residuals[*row] -= f64::from(*value);
         }
@@ -174,6 +195,31 @@ impl NuisanceModel {
         let (starts, robot) = costs.split_at(costs.len().saturating_sub(NUM_NUISANCE));
         [starts, robot].map(|costs| 0.5 * costs.iter().map(|cost| cost * cost).sum::<f64>() / CORRELATION_ROWS)
     }
+}
+
+/// Returns the ranges of nonzero cells; shorter runs of zeros than [`SHORTEST_GAP`] do not divide a range.
+fn nonzero_ranges(cells: &[f32]) -> Vec<Range<usize>> {
+    let mut ranges = Vec::<Range<usize>>::new();
+    for row in (0..cells.len()).filter(|row| cells[*row] != 0.0) {
+        match ranges.last_mut() {
+            Some(last) if row < last.end + SHORTEST_GAP => last.end = row + 1,
+            _ => ranges.push(row..row + 1),
+        }
+    }
+    ranges
+}
+
+/// Returns the inner product, in sums that a compiler can compute at once.
+fn dot(one: &[f32], other: &[f32]) -> f32 {
+    let mut sums = [0.0f32; LANES];
+    let (one, other) = (one.chunks_exact(LANES), other.chunks_exact(LANES));
+    let rest: f32 = one.remainder().iter().zip(other.remainder()).map(|(a, b)| a * b).sum();
+    for (one, other) in one.zip(other) {
+        for lane in 0..LANES {
+            sums[lane] += one[lane] * other[lane];
+        }
+    }
+    sums.iter().sum::<f32>() + rest
 }
 
 /// Returns `JᵀJ`.
