@@ -149,8 +149,7 @@ pub fn cross_validate(
     simulator: &mut dyn Rollout,
 ) -> Option<CandidateFit> {
     let fit = FitProblem::new(model, std::slice::from_ref(hypothesis))?;
-    let effect = hypothesis.effect;
-    let shown_in_air = effect.target == Target::Joints && matches!(effect.search.whole_log_probes, Probes::None);
+    let shown_in_air = is_shown_in_air(hypothesis);
     let fewer = evidence.fixed_base_rows().filter(|_| shown_in_air);
     let points = fit.solve_folds(&evidence.fit_rows, fewer, simulator)?;
     let whole: Vec<f64> = points[0].iter().zip(&points[1]).map(|(one, other)| 0.5 * (one + other)).collect();
@@ -191,6 +190,11 @@ pub fn cross_validate(
     })
 }
 
+/// Returns true if a hanging robot shows the effect.
+fn is_shown_in_air(hypothesis: &Hypothesis) -> bool {
+    hypothesis.effect.target == Target::Joints && matches!(hypothesis.effect.search.whole_log_probes, Probes::None)
+}
+
 /// Returns the cross-validated log-likelihood gain of `hypotheses` over `model`, minus the penalties for their scopes and
 /// parameters [nat]: all are fitted together to one fold and evaluated on the other.
 pub fn cross_validate_together(
@@ -200,7 +204,8 @@ pub fn cross_validate_together(
     simulator: &mut dyn Rollout,
 ) -> f64 {
     let Some(fit) = FitProblem::new(model, hypotheses).filter(|_| !hypotheses.is_empty()) else { return 0.0 };
-    let Some(points) = fit.solve_folds(&evidence.fit_rows, None, simulator) else { return f64::NEG_INFINITY };
+    let fewer = evidence.fixed_base_rows().filter(|_| hypotheses.iter().all(is_shown_in_air));
+    let Some(points) = fit.solve_folds(&evidence.fit_rows, fewer, simulator) else { return f64::NEG_INFINITY };
     let models = [model.clone(), fit.model(&points[0]), fit.model(&points[1])];
     let robots: Option<Vec<RobotModel>> = models.iter().map(|model| model.robot_model().ok()).collect();
     let Some(robots) = robots else { return f64::NEG_INFINITY };

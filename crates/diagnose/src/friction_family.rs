@@ -48,8 +48,8 @@ pub fn extend(search: &mut ForwardSelection) -> Result<(), DiagnoseError> {
     let before = together(search);
     let laws = JointKind::ALL.into_iter().flat_map(|kind| of_scope(Scope::Kind(kind)));
     search.accepted = laws.map(|hypothesis| (unscored(hypothesis), Vec::new())).collect();
-    search.refit();
     if together(search) > LEAST_SHARE * before {
+        search.refit();
         eliminate_without_evidence(search);
         add_joints_that_differ(search)?;
         search.run()?;
