@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use twinstep_model::{BaseMount, Ground, MjcfActuator, MjcfOptions, mjcf};
+use twinstep_model::{BaseMount, MjcfOptions, mjcf};
 
 use crate::exit::{CommandResult, input, other};
 use crate::robot_file::robot_model;
@@ -55,7 +55,7 @@ pub fn run(args: &Args) -> CommandResult {
     }
     let robot = robot_model(args.model.as_deref())?;
     let options =
-        MjcfOptions { base: args.base, timestep: args.timestep, actuator: MjcfActuator::Torque, ground: Ground::FLAT };
+        MjcfOptions { base: args.base, timestep: args.timestep, ..MjcfOptions::default() };
     let text = mjcf(&robot, &options);
     match &args.out {
         Some(path) => std::fs::write(path, text).map_err(|cause| input(WriteError { path: path.clone(), cause })),

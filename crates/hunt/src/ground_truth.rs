@@ -31,6 +31,7 @@ pub fn log_of(case: &Case, plant: Plant, progress: &mut dyn FnMut(usize) -> bool
     if let Some(mismatch) = case.mismatch {
         mismatch.change_robot(&mut robot, errors);
     }
+    let stand = case.mismatch.and_then(|mismatch| mismatch.stand(errors));
     let robot = apply_effects(&robot, &case.hidden).expect("cases are sampled as valid robots");
     let motion = motion(case.setting, &mut case.stream("hunt motion"));
     // The source of the log does not reveal the hidden effects.
@@ -42,7 +43,7 @@ pub fn log_of(case: &Case, plant: Plant, progress: &mut dyn FnMut(usize) -> bool
         }),
         Plant::Mujoco => played(&motion, &robot, progress, |base, robot| {
             let config = SimConfig { base, threads: 1, ..SimConfig::default() };
-            Ok(PerturbedBackend::new(MujocoPlant::new(robot.clone(), config, 1)?, case.outside))
+            Ok(PerturbedBackend::new(MujocoPlant::on_stand(robot.clone(), config, 1, stand)?, case.outside))
         }),
     }?;
     let random = &mut case.stream("hunt sensors");

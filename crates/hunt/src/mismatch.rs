@@ -1,9 +1,9 @@
-//! Errors of a healthy robot and of its recording that no effect of the catalogue describes, in seven families.
+//! Errors of a healthy robot and of its recording that no effect of the catalogue describes, in eight families.
 
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use twinstep_logs::{Log, LogError, Meta};
-use twinstep_model::{RobotModel, Stream, standard_normal};
+use twinstep_model::{CompliantStand, RobotModel, Stream, standard_normal};
 
 /// Error of a thigh's length [m].
 const THIGH_ERROR_M: f64 = 0.005;
@@ -13,6 +13,10 @@ const LINK_MASS_ERROR: f64 = 0.1;
 const CENTRE_ERROR_M: f64 = 0.006;
 /// Relative error of the gains.
 const GAIN_ERROR: f64 = 0.05;
+/// Range of the natural frequency of a stand that gives way [Hz].
+const STAND_HZ: [f64; 2] = [6.0, 15.0];
+/// Range of its damping ratio.
+const STAND_DAMPING: [f64; 2] = [0.1, 0.3];
 /// Range of the delay of motion capture, IMU and foot forces [s].
 const CLOCK_OFFSET_S: [f64; 2] = [0.002, 0.008];
 /// Fraction of the rows that are lost.
@@ -32,6 +36,8 @@ pub enum Mismatch {
     CentreOfMass,
     /// Gains that are up to 5 % off, each joint by its own error.
     Gains,
+    /// A stand that gives way, for a robot that hangs.
+    CompliantStand,
     /// Motion capture, IMU and foot forces that are recorded 2 to 8 ms late.
     Clocks,
     /// Rows that are lost, and times with errors.
@@ -42,11 +48,12 @@ pub enum Mismatch {
 
 impl Mismatch {
     /// All families.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 8] = [
         Self::ThighLength,
         Self::LinkMass,
         Self::CentreOfMass,
         Self::Gains,
+        Self::CompliantStand,
         Self::Clocks,
         Self::DropsAndJitter,
         Self::NoiseMisstated,
@@ -59,6 +66,7 @@ impl Mismatch {
             Self::LinkMass => "link masses up to 10 % off",
             Self::CentreOfMass => "centre of mass up to 6 mm off",
             Self::Gains => "gains up to 5 % off",
+            Self::CompliantStand => "a stand that gives way",
             Self::Clocks => "clocks 2 to 8 ms apart",
             Self::DropsAndJitter => "lost rows and jitter",
             Self::NoiseMisstated => "noise misstated by a factor of 2",
@@ -90,8 +98,16 @@ impl Mismatch {
                     joint.actuator.kd_scale *= 1.0 + error(GAIN_ERROR);
                 }
             }
-            Self::Clocks | Self::DropsAndJitter | Self::NoiseMisstated => {}
+            Self::CompliantStand | Self::Clocks | Self::DropsAndJitter | Self::NoiseMisstated => {}
         }
+    }
+
+    /// Returns the stand that holds the robot in MuJoCo; `None` for a rigid one.
+    pub fn stand(self, random: &mut Stream) -> Option<CompliantStand> {
+        (self == Self::CompliantStand).then(|| CompliantStand {
+            frequency_hz: random.random_range(STAND_HZ[0]..STAND_HZ[1]),
+            damping_ratio: random.random_range(STAND_DAMPING[0]..STAND_DAMPING[1]),
+        })
     }
 
     /// Changes the log as this family does.
@@ -220,7 +236,8 @@ mod tests {
             let same_log = changed.t() == log().t()
                 && changed.meta() == log().meta()
                 && changed.channel("gyro_x") == log().channel("gyro_x");
-            assert!(robot != go2() || !same_log, "{family:?}");
+            let has_stand = family.stand(&mut stream(3, "test", 0)).is_some();
+            assert!(robot != go2() || !same_log || has_stand, "{family:?}");
         }
     }
 }

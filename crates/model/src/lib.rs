@@ -62,7 +62,7 @@ pub use import::{ImportError, ImportNames, import_robot};
 pub use initial_state::InitialState;
 pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};
 pub use kinematics::{FIXED_BASE_HEIGHT, NUM_BODIES, Pose, body_poses};
-pub use mjcf::{MjcfActuator, MjcfOptions, mjcf};
+pub use mjcf::{CompliantStand, MjcfActuator, MjcfOptions, mjcf};
 pub use real_time::{RealTimeReport, ResetCause, RobotStop};
 pub use robot::{
     ActuatorParams, Contact, ControlConfig, Derating, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes,

@@ -22,6 +22,8 @@ const PLANE_BELOW_FIELD: f64 = 0.001;
 pub struct MjcfOptions {
     /// Mount of the base.
     pub base: BaseMount,
+    /// Stand that holds a fixed base; `None` for a rigid one.
+    pub stand: Option<CompliantStand>,
     /// Physics step [s].
     pub timestep: f64,
     /// Type of the twelve actuators, which determines the meaning of `ctrl`.
@@ -33,8 +35,17 @@ pub struct MjcfOptions {
 impl Default for MjcfOptions {
     /// Floating base, torque control, 1 kHz, level ground.
     fn default() -> Self {
-        Self { base: BaseMount::Floating, timestep: 0.001, actuator: MjcfActuator::Torque, ground: Ground::FLAT }
+        Self { base: BaseMount::Floating, stand: None, timestep: 0.001, actuator: MjcfActuator::Torque, ground: Ground::FLAT }
     }
+}
+
+/// Stand that gives way: the base swings about its place, along and about all axes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CompliantStand {
+    /// Natural frequency [Hz].
+    pub frequency_hz: f64,
+    /// Damping ratio.
+    pub damping_ratio: f64,
 }
 
 /// Type of the actuators of a MuJoCo model, which are in the order of [`Joint::ALL`].
@@ -82,10 +93,14 @@ pub fn mjcf(robot: &RobotModel, options: &MjcfOptions) -> String {
     xml.open("worldbody", &[]);
     xml.leaf("light", &[("pos", numbers([0.0, 0.0, 3.0])), ("directional", "true".to_owned())]);
     ground(&mut xml, &options.ground);
-    trunk(&mut xml, robot, options.base, height);
+    let moves = options.base == BaseMount::Floating || options.stand.is_some();
+    trunk(&mut xml, robot, moves, height);
     xml.close("worldbody");
+    if let Some(stand) = options.stand.filter(|_| options.base.is_fixed()) {
+        compliant_stand(&mut xml, stand);
+    }
     actuators(&mut xml, robot, options.actuator);
-    keyframe(&mut xml, robot, options.base, height);
+    keyframe(&mut xml, robot, moves, height);
     xml.close("mujoco");
     xml.text
 }
@@ -171,9 +186,19 @@ fn defaults(xml: &mut Xml, robot: &RobotModel, timestep: f64) {
     xml.close("default");
 }
 
-fn trunk(xml: &mut Xml, robot: &RobotModel, base: BaseMount, height: f64) {
+/// Adds a soft weld, which holds the base where the model has it.
+fn compliant_stand(xml: &mut Xml, stand: CompliantStand) {
+    // MuJoCo's time constant of a spring with natural frequency ω and damping ratio ζ is 1 / (ω ζ).
+    let time_constant = 1.0 / (std::f64::consts::TAU * stand.frequency_hz * stand.damping_ratio);
+    let solref = numbers([time_constant, stand.damping_ratio]);
+    xml.open("equality", &[]);
+    xml.leaf("weld", &[("name", "stand".to_owned()), ("body1", "trunk".to_owned()), ("solref", solref)]);
+    xml.close("equality");
+}
+
+fn trunk(xml: &mut Xml, robot: &RobotModel, moves: bool, height: f64) {
     xml.open("body", &[("name", "trunk".to_owned()), ("pos", numbers([0.0, 0.0, height]))]);
-    if base == BaseMount::Floating {
+    if moves {
         xml.leaf("freejoint", &[("name", "base".to_owned())]);
     }
     inertial(xml, &robot.trunk);
@@ -260,9 +285,9 @@ fn actuators(xml: &mut Xml, robot: &RobotModel, actuator: MjcfActuator) {
     xml.close("actuator");
 }
 
-fn keyframe(xml: &mut Xml, robot: &RobotModel, base: BaseMount, height: f64) {
+fn keyframe(xml: &mut Xml, robot: &RobotModel, moves: bool, height: f64) {
     let free = [0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0];
-    let free = if base == BaseMount::Floating { &free[..] } else { &[] };
+    let free = if moves { &free[..] } else { &[] };
     let qpos = numbers(free.iter().copied().chain(robot.control.default_pose));
     xml.open("keyframe", &[]);
     xml.leaf("key", &[("name", "default_pose".to_owned()), ("qpos", qpos)]);
@@ -391,6 +416,18 @@ mod tests {
         assert_eq!(fixed.matches("<freejoint").count(), 0);
         let positions = |xml: &str| values(xml, "key", "qpos")[0].split(' ').count();
         assert_eq!((positions(&floating), positions(&fixed)), (7 + NUM_JOINTS, NUM_JOINTS));
+    }
+
+    #[test]
+    fn compliant_stand_holds_a_free_base_by_a_soft_weld() {
+        let stand = Some(CompliantStand { frequency_hz: 10.0, damping_ratio: 0.2 });
+        let xml = model(MjcfOptions { base: BaseMount::Fixed, stand, ..MjcfOptions::default() });
+        assert_eq!((xml.matches("<freejoint").count(), xml.matches("<weld").count()), (1, 1));
+        let solref: Vec<f64> =
+            values(&xml, "weld", "solref")[0].split(' ').map(|number| number.parse().expect("a number")).collect();
+        assert!((solref[0] - 0.0796).abs() < 1e-4 && solref[1] == 0.2, "{solref:?}");
+        let floating = model(MjcfOptions { stand, ..MjcfOptions::default() });
+        assert_eq!(floating.matches("<weld").count(), 0, "a floating base has no stand");
     }
 
     #[test]

@@ -15,8 +15,8 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use twinstep_model::{
-    Backend, BackendError, Command, Ground, GroundTruth, InitialState, Measured, MjcfActuator, MjcfOptions, PerJoint,
-    RobotModel, RobotStates, Simulator, mjcf,
+    Backend, BackendError, Command, CompliantStand, Ground, GroundTruth, InitialState, Measured, MjcfActuator,
+    MjcfOptions, PerJoint, RobotModel, RobotStates, Simulator, mjcf,
 };
 
 use crate::rapier::check_lengths;
@@ -50,8 +50,7 @@ impl MujocoBackend {
     ///
     /// The interpreter is that of the environment variable `TWINSTEP_PYTHON`, or else `python3`.
     pub fn new(robot: RobotModel, config: SimConfig, num_robots: usize) -> Result<Self, BackendBuildError> {
-        let python = std::env::var_os(PYTHON).filter(|python| !python.is_empty());
-        Self::with_python(robot, config, num_robots, Path::new(&python.unwrap_or(OsString::from("python3"))))
+        Self::with_python(robot, config, num_robots, &default_python())
     }
 
     /// Creates robots like [`MujocoBackend::new`], with the Python interpreter `python`.
@@ -61,6 +60,17 @@ impl MujocoBackend {
         num_robots: usize,
         python: &Path,
     ) -> Result<Self, BackendBuildError> {
+        Self::on_stand(robot, config, num_robots, python, None)
+    }
+
+    /// Creates robots like [`MujocoBackend::with_python`], with a `stand` that gives way if their base is fixed.
+    fn on_stand(
+        robot: RobotModel,
+        config: SimConfig,
+        num_robots: usize,
+        python: &Path,
+        stand: Option<CompliantStand>,
+    ) -> Result<Self, BackendBuildError> {
         config.check(&robot.control)?;
         let config = config.at_actuator_rate(&robot.control);
         if let Some(effect) = unsupported(&robot) {
@@ -69,7 +79,7 @@ impl MujocoBackend {
         let timestep = 1.0 / f64::from(config.physics_hz());
         let ground = config.terrain.ground();
         let initial_state = InitialState::standing_on(&ground, &robot, robot.control.default_pose_f32(), 0.0);
-        let options = MjcfOptions { base: config.base, timestep, actuator: MjcfActuator::Torque, ground };
+        let options = MjcfOptions { base: config.base, stand, timestep, actuator: MjcfActuator::Torque, ground };
         let settings = Settings {
             robots: num_robots,
             threads: config.threads,
@@ -227,4 +237,10 @@ impl Simulator for MujocoBackend {
     fn set_derating(&mut self, robot: usize, factors: &PerJoint) {
         self.adjustments[robot].derating = *factors;
     }
+}
+
+/// Returns the interpreter of the environment variable [`PYTHON`], or else `python3`.
+fn default_python() -> PathBuf {
+    let python = std::env::var_os(PYTHON).filter(|python| !python.is_empty());
+    PathBuf::from(python.unwrap_or(OsString::from("python3")))
 }

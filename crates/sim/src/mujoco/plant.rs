@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use twinstep_model::{
-    Actuator, ActuatorParams, Backend, BackendError, Command, Ground, GroundTruth, InitialState, JointSpring, Measured,
+    Actuator, ActuatorParams, Backend, BackendError, Command, CompliantStand, Ground, GroundTruth, InitialState, JointSpring, Measured,
     NUM_JOINTS, PerJoint, RobotModel, RobotStates, Simulator, Stribeck,
 };
 
@@ -33,6 +33,18 @@ impl MujocoPlant {
     /// Creates `num_robots` robots, with the base as in `config`. The interpreter is that of [`MujocoBackend::new`].
     pub fn new(robot: RobotModel, config: SimConfig, num_robots: usize) -> Result<Self, BackendBuildError> {
         Self::with_bodies(robot, config, num_robots, MujocoBackend::new)
+    }
+
+    /// Creates robots like [`MujocoPlant::new`], with a `stand` that gives way if their base is fixed.
+    pub fn on_stand(
+        robot: RobotModel,
+        config: SimConfig,
+        num_robots: usize,
+        stand: Option<CompliantStand>,
+    ) -> Result<Self, BackendBuildError> {
+        Self::with_bodies(robot, config, num_robots, |robot, config, count| {
+            MujocoBackend::on_stand(robot, config, count, &super::default_python(), stand)
+        })
     }
 
     /// Creates robots like [`MujocoPlant::new`], with the interpreter `python`.
