@@ -54,8 +54,7 @@ pub fn run(args: &Args) -> CommandResult {
         return Err(input(TimestepError(args.timestep)));
     }
     let robot = robot_model(args.model.as_deref())?;
-    let options =
-        MjcfOptions { base: args.base, timestep: args.timestep, ..MjcfOptions::default() };
+    let options = MjcfOptions { base: args.base, timestep: args.timestep, ..MjcfOptions::default() };
     let text = mjcf(&robot, &options);
     match &args.out {
         Some(path) => std::fs::write(path, text).map_err(|cause| input(WriteError { path: path.clone(), cause })),

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 use twinstep_effects::ModelFile;
-use twinstep_effects::{Probes, Target};
+use twinstep_effects::{Effect, Probes, Search, Target};
 use twinstep_model::{Joint, RobotModel, Rollout};
 
 use super::DiagnoseError;
@@ -15,6 +15,7 @@ use super::profile_likelihood::refine_with_restarts;
 use super::residual_data::ResidualData;
 use super::residual_power::{CHANNELS, DYNAMIC, GYRO, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
 use super::scan::{self, ScoredHypothesis, scan};
+use super::scope_merging;
 
 /// Log-likelihood gain that a cause must reach where no null distribution is computed: torques of other robots, and the
 /// friction family [nat].
@@ -24,7 +25,7 @@ pub const THRESHOLD: f64 = 30.0;
 /// Share of the largest log-likelihood gain that a further cause must reach.
 ///
 /// The laws of the catalogue are approximations, and what a large effect leaves imitates small ones.
-const MIN_SHARE_OF_LARGEST: f64 = 0.01;
+pub const MIN_SHARE_OF_LARGEST: f64 = 0.01;
 /// Maximum number of causes.
 const MOST_CAUSES: usize = 12;
 /// Maximum number of rounds of selection and elimination.
@@ -33,7 +34,7 @@ const MOST_SEARCHES: usize = 24;
 const MOST_ELIMINATIONS: usize = 3;
 /// Maximum number of hypotheses about joints that are fitted in full simulation.
 const MAX_JOINT_CANDIDATES: usize = 5;
-/// Maximum number of hypotheses about base and gyroscope, about the ground, and about encoders.
+/// Maximum number of hypotheses about bodies, about the gyroscope, about the ground, and about encoders.
 const MAX_BODY_CANDIDATES: usize = 2;
 /// Fraction of the power above noise that a cause must explain.
 pub const MIN_EXPLAINED_FRACTION: f64 = 0.3;
@@ -102,6 +103,7 @@ impl<'a> ForwardSelection<'a> {
         let mut excluded = Vec::new();
         for _ in 0..MOST_SEARCHES {
             let next = if self.accepted.len() < MOST_CAUSES { self.best_addition(&excluded)? } else { None };
+            let added = next.as_ref().map(|(best, _)| best.hypothesis.effect);
             if let Some(next) = next {
                 self.accepted.push(next);
             } else {
@@ -110,6 +112,9 @@ impl<'a> ForwardSelection<'a> {
                 excluded.push(self.accepted.remove(place).0.hypothesis.name());
             }
             self.refit();
+            if let Some(effect) = added {
+                scope_merging::merge(self, effect);
+            }
         }
         while let Some(place) = self.find_cause_to_eliminate() {
             self.accepted.remove(place);
@@ -145,13 +150,30 @@ impl<'a> ForwardSelection<'a> {
         let left = evidence.residual_power(self.simulator, &self.model.robot_model()?);
         let named = self.accepted.len();
         (self.progress)(&format!("scanning the catalogue; causes: {named}"))?;
-        let mut candidates = candidates(evidence, &self.model, self.simulator);
+        for candidates in candidates(evidence, &self.model, self.simulator) {
+            let found = self.best_of(candidates, excluded, &left)?;
+            if found.is_some() {
+                return Ok(found);
+            }
+        }
+        Ok(None)
+    }
+
+    /// Returns the best of `candidates` on top of the model with residual power `left`, with its alternatives, if it reaches
+    /// the threshold.
+    fn best_of(
+        &mut self,
+        mut candidates: Vec<ScoredHypothesis>,
+        excluded: &[String],
+        left: &ResidualPower,
+    ) -> Result<Option<(CandidateFit, Vec<CandidateFit>)>, DiagnoseError> {
+        let (evidence, named) = (&self.looked_at().evidence, self.accepted.len());
         // With more causes in the model, a hypothesis is fitted again only if the scan supports it more.
         let unsupported = &self.unsupported;
         candidates
             .retain(|scored| unsupported.get(&scored.hypothesis.name()).is_none_or(|score| scored.score > *score));
         let hypotheses = candidates.iter().map(|scored| scored.hypothesis.clone()).collect();
-        let mut trials = self.evaluate(hypotheses, excluded, &left)?;
+        let mut trials = self.evaluate(hypotheses, excluded, left)?;
         for trial in trials.iter().filter(|trial| trial.score < LOWEST_THRESHOLD) {
             let name = trial.hypothesis.name();
             let score = candidates.iter().find(|scored| scored.hypothesis.name() == name).map(|scored| scored.score);
@@ -165,8 +187,8 @@ impl<'a> ForwardSelection<'a> {
         if let Some(best) = trials.first().filter(|best| best.score >= thresholds.of(best.hypothesis.effect)) {
             // Confounders of the best candidate, which the scan of all joints at once may have missed.
             let names: Vec<String> = trials.iter().map(|trial| trial.hypothesis.name()).collect();
-            let alike = scan::confounders_of(evidence, &self.model, &best.hypothesis, &names, &left, self.simulator);
-            trials.extend(self.evaluate(alike, excluded, &left)?);
+            let alike = scan::confounders_of(evidence, &self.model, &best.hypothesis, &names, left, self.simulator);
+            trials.extend(self.evaluate(alike, excluded, left)?);
             trials.sort_by(best_first);
         }
         let largest = self.accepted.iter().map(|(best, _)| best.score).fold(0.0, f64::max);
@@ -288,34 +310,40 @@ pub fn write_estimates(accepted: &mut Accepted, fit: &FitProblem, point: &[f64])
     }
 }
 
-/// Returns the hypotheses of the scan to fit in full simulation.
+/// Returns the hypotheses of the scan to fit in full simulation, and more about joints to fit if none of them is a cause: what
+/// imitates the error of a large effect at many joints outranks a small effect at one.
 ///
-/// Joints, bodies, the ground and encoder offsets are ranked separately, because the scan evaluates them on different rows. Encoder
-/// offsets are left out where the robot walks: feet that touch down at other times in the model imitate them.
-fn candidates(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<ScoredHypothesis> {
-    let scored = scan(evidence, model, simulator).into_iter().filter(|scored| scored.score > 0.0);
-    let of_joints =
-        |scored: &ScoredHypothesis| matches!(scored.hypothesis.effect.target, Target::Joints | Target::Supply);
-    let (offsets, others): (Vec<_>, Vec<_>) = scored.partition(|scored| {
-        of_joints(scored) && !matches!(scored.hypothesis.effect.search.whole_log_probes, Probes::None)
-    });
-    let (joints, whole): (Vec<_>, Vec<_>) = others.into_iter().partition(of_joints);
-    let (ground, bodies): (Vec<_>, Vec<_>) =
-        whole.into_iter().partition(|scored| scored.hypothesis.effect.target == Target::Ground);
-    let tried = |scored: Vec<ScoredHypothesis>, most: usize| {
+/// Joints, bodies, the gyroscope, the ground and encoder offsets are ranked separately, because the scan evaluates them on
+/// different rows or channels. Encoder offsets are left out where the robot walks: feet that touch down at other times in the
+/// model imitate them.
+fn candidates(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> [Vec<ScoredHypothesis>; 2] {
+    let mut lists: [Vec<ScoredHypothesis>; 5] = Default::default();
+    for scored in scan(evidence, model, simulator).into_iter().filter(|scored| scored.score > 0.0) {
+        let list = match scored.hypothesis.effect {
+            Effect { target: Target::Bodies, .. } => 1,
+            Effect { target: Target::Imu, .. } => 2,
+            Effect { target: Target::Ground, .. } => 3,
+            Effect { search: Search { whole_log_probes: Probes::None, .. }, .. } => 0,
+            _ => 4,
+        };
+        lists[list].push(scored);
+    }
+    let of_encoders = if evidence.is_dynamic { 0 } else { MAX_BODY_CANDIDATES };
+    let most = [MAX_JOINT_CANDIDATES, MAX_BODY_CANDIDATES, MAX_BODY_CANDIDATES, MAX_BODY_CANDIDATES, of_encoders];
+    let tried = |(scored, most): (&Vec<ScoredHypothesis>, usize)| {
         let least = 0.3 * scored.first().map_or(0.0, |best| best.score);
-        scored.into_iter().filter(move |scored| scored.score >= least).take(most)
+        scored.iter().filter(|scored| scored.score >= least).take(most).cloned().collect::<Vec<_>>()
     };
-    tried(joints, MAX_JOINT_CANDIDATES)
-        .chain(tried(bodies, MAX_BODY_CANDIDATES))
-        .chain(tried(ground, MAX_BODY_CANDIDATES))
-        .chain(tried(offsets, if evidence.is_dynamic { 0 } else { MAX_BODY_CANDIDATES }))
-        .collect()
+    let first: Vec<ScoredHypothesis> = lists.iter().zip(most).flat_map(tried).collect();
+    let is_new = |other: &ScoredHypothesis| first.iter().all(|one| one.hypothesis.name() != other.hypothesis.name());
+    let others = lists[0].iter().filter(|scored| scored.score >= LOWEST_THRESHOLD && is_new(scored));
+    let second = others.take(MAX_JOINT_CANDIDATES).cloned().collect();
+    [first, second]
 }
 
 #[cfg(test)]
 mod tests {
-    use twinstep_effects::{Effect, Scope};
+    use twinstep_effects::Scope;
 
     use super::*;
 

@@ -14,8 +14,9 @@ use super::cross_validation::{CandidateFit, FitProblem, cross_validate, cross_va
 use super::forward_selection::{Accepted, ForwardSelection, THRESHOLD};
 use super::hypothesis::Hypothesis;
 use super::residual_data::ResidualData;
-use super::residual_power::STANCE;
+use super::residual_power::{STANCE, TORQUE};
 use super::residual_rows::PRECISION;
+use super::scope_merging;
 
 /// Laws that every joint has.
 const LAWS: [&str; 3] = ["viscous_friction", "coulomb_friction", "armature"];
@@ -33,9 +34,9 @@ const LEAST_SHARE: f64 = 0.5;
 const TRIED_JOINTS: usize = 4;
 /// Power above noise that single causes may leave, relative to that of the given model, without a fit of the family.
 const UNEXPLAINED_FRACTION: f64 = 0.05;
-/// Root mean square of the positions' residuals that single causes may leave [rad]: two engines with the same laws differ
-/// by less.
-const UNEXPLAINED_RAD: f64 = 0.004;
+/// Root mean square of the positions' residuals that single causes may leave [rad], of robots that hang and of others: two
+/// engines with the same laws differ by less.
+const UNEXPLAINED_RAD: [f64; 2] = [0.004, 0.008];
 
 /// Replaces the causes of a search by those of a search that begins with the friction family, if the first leaves much
 /// unexplained and the second has the higher cross-validated likelihood.
@@ -51,7 +52,9 @@ pub fn extend(search: &mut ForwardSelection) -> Result<(), DiagnoseError> {
     if together(search) > LEAST_SHARE * before {
         search.refit();
         eliminate_without_evidence(search);
+        scope_merging::merge_all(search);
         add_joints_that_differ(search)?;
+        scope_merging::merge_all(search);
         search.run()?;
         backward_elimination::eliminate(search)?;
         eliminate_without_evidence(search);
@@ -91,7 +94,8 @@ fn leaves_much(search: &mut ForwardSelection) -> bool {
         };
         (0..NUM_JOINTS).filter_map(of).collect::<Vec<f64>>()
     });
-    let least = UNEXPLAINED_RAD * UNEXPLAINED_RAD;
+    let hangs = left[0].counts[..TORQUE].iter().flatten().any(|count| *count > 0.0);
+    let least = UNEXPLAINED_RAD[usize::from(!hangs)].powi(2);
     let affected = given.iter().filter(|square| **square > least).count();
     let [before, after] = [&given, &now].map(|squares| squares.iter().sum::<f64>() / squares.len().max(1) as f64);
     4 * affected >= 3 * given.len() && after > least && after > UNEXPLAINED_FRACTION * before

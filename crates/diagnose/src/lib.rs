@@ -5,6 +5,7 @@
 //!   together.
 //! - [`hypothesis`]: an effect on a scope, with values.
 //! - [`forward_selection`]: forward selection with backward elimination, which uses the following modules in turn.
+//! - [`scope_merging`]: one cause on a wider scope in place of several.
 //! - [`backward_elimination`]: evidence of each cause beside all others.
 //! - [`friction_family`]: a search that begins with the friction and inertia of all joints, fitted together.
 //! - [`scan`]: evaluates every effect on all joints at once, and returns the best candidates.
@@ -42,6 +43,7 @@ mod residual_data;
 mod residual_power;
 mod residual_rows;
 mod scan;
+mod scope_merging;
 mod size_drift;
 mod spectral_line;
 #[cfg(test)]

@@ -78,9 +78,8 @@ pub fn thresholds(evidence: &ResidualData, model: &ModelFile, simulator: &mut dy
         let scopes = scopes(effect, evidence);
         for values in small_probes(effect).into_iter().filter(|_| !scopes.is_empty()) {
             if let Some(probe) = with_effect(model, effect, &values).ok().and_then(|file| file.robot_model().ok()) {
-                let channels = |scope: Scope| {
-                    evident_channels([effect.target]).filter(|channel| shows(scope, *channel)).collect()
-                };
+                let channels =
+                    |scope: Scope| evident_channels([effect.target]).filter(|channel| shows(scope, *channel)).collect();
                 directions.push(Direction {
                     products: robots.len(),
                     class: class(effect.target),

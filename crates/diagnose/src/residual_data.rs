@@ -55,11 +55,9 @@ impl ResidualData {
             experiment.clone().filter_rows(|row| split.fold(row).is_some())
         };
         let whole: Vec<Experiment> = splits.iter().zip(&experiments).map(of_folds).collect();
-        let has_both =
-            whole.iter().any(Experiment::has_fixed_base) && whole.iter().any(Experiment::has_floating_base);
-        let fixed_base_rows = has_both.then(|| {
-            ResidualRows::new(&splits, whole.iter().cloned().map(Experiment::only_fixed_base).collect())
-        });
+        let has_both = whole.iter().any(Experiment::has_fixed_base) && whole.iter().any(Experiment::has_floating_base);
+        let fixed_base_rows = has_both
+            .then(|| ResidualRows::new(&splits, whole.iter().cloned().map(Experiment::only_fixed_base).collect()));
         Ok(Self {
             torques: logs.iter().map(|log| MeasuredTorque::new(log, robot)).collect::<Result<_, _>>()?,
             fit_rows: ResidualRows::new(&splits, whole),

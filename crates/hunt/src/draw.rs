@@ -8,8 +8,8 @@ use twinstep_model::{Joint, JointKind, Leg, Stream, go2, standard_normal, stream
 
 use crate::base_schedule::{BaseSchedule, LogLength};
 use crate::mismatch::Mismatch;
-use crate::{Plant, Suite};
 use crate::unmodelled::UnmodelledEffect;
+use crate::{Plant, Suite};
 
 /// Kind of a case: what it hides.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -373,7 +373,8 @@ mod tests {
 
     #[test]
     fn seed_and_number_determine_the_case() {
-        let cases = |seed| (0..20).map(|number| Case::draw(seed, number, Plant::Rapier, Suite::Mixed)).collect::<Vec<_>>();
+        let cases =
+            |seed| (0..20).map(|number| Case::draw(seed, number, Plant::Rapier, Suite::Mixed)).collect::<Vec<_>>();
         assert_eq!(cases(5), cases(5));
         assert_ne!(cases(5), cases(6));
     }

@@ -309,7 +309,8 @@ mod tests {
     fn hidden_effects_are_visible_in_the_log_and_the_true_model_explains_them() {
         let folder = tempfile::tempdir().expect("a folder");
         run(&config(28, 100, folder.path(), false), &nothing).expect("completed");
-        let results = read_results(&folder.path().join("cases.jsonl"), &config(28, 100, folder.path(), true)).expect("lines");
+        let results =
+            read_results(&folder.path().join("cases.jsonl"), &config(28, 100, folder.path(), true)).expect("lines");
         for CaseResult { case, kind, setting, outside, nominal, truth, verdict, .. } in &results {
             let hidden: Vec<_> = verdict.hits.iter().map(|hit| format!("{}@{}", hit.effect, hit.scope)).collect();
             println!("{case} {kind:?} {:?} {hidden:?} {outside:?} {nominal:?} {truth:?}", setting.place);

@@ -45,7 +45,8 @@ fn wilson(hits: usize, count: usize) -> [f64; 2] {
 }
 
 fn rates(results: &[CaseResult]) -> String {
-    let parts = [single_effects, healthy_robots, unmodelled_effects, several_effects, walking_robots, confusable_effects];
+    let parts =
+        [single_effects, healthy_robots, unmodelled_effects, several_effects, walking_robots, confusable_effects];
     let mut text = "| | goal | rate | 95 % interval |\n|---|---|---|---|\n".to_owned();
     text.extend(parts.map(|rows| rows(results)));
     let sizes = results.iter().flat_map(|result| &result.verdict.hits).filter_map(|hit| hit.size);

@@ -35,7 +35,13 @@ pub struct MjcfOptions {
 impl Default for MjcfOptions {
     /// Floating base, torque control, 1 kHz, level ground.
     fn default() -> Self {
-        Self { base: BaseMount::Floating, stand: None, timestep: 0.001, actuator: MjcfActuator::Torque, ground: Ground::FLAT }
+        Self {
+            base: BaseMount::Floating,
+            stand: None,
+            timestep: 0.001,
+            actuator: MjcfActuator::Torque,
+            ground: Ground::FLAT,
+        }
     }
 }
 

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use twinstep_model::{
-    Actuator, ActuatorParams, Backend, BackendError, Command, CompliantStand, Ground, GroundTruth, InitialState, JointSpring, Measured,
-    NUM_JOINTS, PerJoint, RobotModel, RobotStates, Simulator, Stribeck,
+    Actuator, ActuatorParams, Backend, BackendError, Command, CompliantStand, Ground, GroundTruth, InitialState,
+    JointSpring, Measured, NUM_JOINTS, PerJoint, RobotModel, RobotStates, Simulator, Stribeck,
 };
 
 use super::MujocoBackend;
