@@ -24,12 +24,12 @@ pub const FILE: &str = "residual.safetensors";
 const MIN_FRACTION: f64 = 0.05;
 /// Least reduction of the closed-loop error on held-out blocks for which it is kept.
 const MIN_GAIN: f64 = 0.2;
-/// Members and epochs of the networks that are kept.
-const TRAINING: [usize; 2] = [3, 60];
-/// Members and epochs of the first attempt.
-const ATTEMPT: [usize; 2] = [1, 20];
-/// Least reduction of the error by the first attempt for which the others are trained.
-const LEAST_OF_ATTEMPT: f64 = 0.05;
+/// Epochs of a training.
+const EPOCHS: usize = 60;
+/// Number of networks of the ensemble that is kept.
+const MEMBERS: usize = 3;
+/// Least reduction of the error by one network for which the others are trained.
+const LEAST_OF_ONE: f64 = 0.5 * MIN_GAIN;
 /// Highest rate of the networks [Hz]: that of the actuators in simulation.
 const MAX_RATE_HZ: f64 = 200.0;
 
@@ -69,11 +69,11 @@ pub fn learn(
         let Some(data) = data_set(logs, model, tap, &masks, false)? else { continue };
         let before = output.diagnosis.extended;
         let Some(q_before) = before.q_rmse_rad else { continue };
-        let attempt = errors_with(logs, model, &trained(&data, ATTEMPT, progress)?, &masks)?;
-        if attempt.q_rmse_rad.is_none_or(|q| q > (1.0 - LEAST_OF_ATTEMPT) * q_before) {
+        let of_one = errors_with(logs, model, &trained(&data, 1, progress)?, &masks)?;
+        if of_one.q_rmse_rad.is_none_or(|q| q > (1.0 - LEAST_OF_ONE) * q_before) {
             continue;
         }
-        let ensemble = trained(&data, TRAINING, progress)?;
+        let ensemble = trained(&data, MEMBERS, progress)?;
         let after = errors_with(logs, model, &ensemble, &masks)?;
         let Some(q_after) = after.q_rmse_rad else { continue };
         if q_after > (1.0 - MIN_GAIN) * q_before || best.as_ref().is_some_and(|(q, ..)| *q <= q_after) {
@@ -86,7 +86,7 @@ pub fn learn(
     let all: Vec<Vec<bool>> = logs.iter().map(|log| vec![false; log.rows()]).collect();
     let all: Vec<&[bool]> = all.iter().map(Vec::as_slice).collect();
     let Some(data) = data_set(logs, &output.extended, tap, &all, false)? else { return Ok(None) };
-    Ok(Some(LearnedTorque { summary, ensemble: trained(&data, TRAINING, progress)? }))
+    Ok(Some(LearnedTorque { summary, ensemble: trained(&data, MEMBERS, progress)? }))
 }
 
 /// Returns the torque that `model` lacks at `tap`, in the rows whose mask is `masked`. `None` if the logs do not show it
@@ -134,14 +134,10 @@ fn data_set(
     }
 }
 
-fn trained(
-    data: &DataSet,
-    [members, epochs]: [usize; 2],
-    progress: &mut dyn FnMut(&str) -> bool,
-) -> Result<Ensemble, Failure> {
+fn trained(data: &DataSet, members: usize, progress: &mut dyn FnMut(&str) -> bool) -> Result<Ensemble, Failure> {
     // A network must know the joint, because causes that are left are rarely the same at all joints.
     let joint_input = if data.joints.len() == NUM_JOINTS { JointEncoding::Identity } else { JointEncoding::Pooled };
-    let options = TrainingOptions { members, hidden: 16, epochs, joint_input, ..TrainingOptions::default() };
+    let options = TrainingOptions { members, hidden: 16, epochs: EPOCHS, joint_input, ..TrainingOptions::default() };
     let training = Training::new(data, options).map_err(other)?;
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let result = training.run(threads, None, &mut |_| progress("learning the torque that no cause explains"));

@@ -268,7 +268,7 @@ mod tests {
 
     use super::*;
     use crate::forward_selection::THRESHOLD;
-    use crate::test_data::{Contact, Linear, data};
+    use crate::test_data::{AtRest, Contact, Linear, data, data_at_rest};
 
     fn fit(data: &ResidualData, name: &str) -> CandidateFit {
         let effect = Effect::named(name).expect("in the catalogue");
@@ -292,6 +292,21 @@ mod tests {
         let found = fit(&data(|_| 0.0, None), "viscous_friction");
         assert!(found.score < 0.0, "{found:?}");
         assert!(!found.hypothesis.exceeds_min_size(), "{found:?}");
+    }
+
+    #[test]
+    fn gyroscope_bias_below_the_noise_of_a_row_is_evident_and_explains_what_is_above_the_fitted_model() {
+        let found = |bias: [f64; 3]| {
+            let (data, effect) = (data_at_rest(bias), Effect::named("gyro_bias").expect("in the catalogue"));
+            let hypothesis = Hypothesis { effect, scope: Scope::Base, values: vec![0.001; 3] };
+            let before = data.residual_power(&mut AtRest, &go2());
+            cross_validate(&data, &ModelFile::default(), &before, &hypothesis, &mut AtRest).expect("a robot")
+        };
+        let biased = found([0.006, -0.006, 0.005]);
+        assert!((biased.hypothesis.values[1] + 0.006).abs() < 0.001, "{biased:?}");
+        assert!(biased.score > THRESHOLD && biased.explained_fraction > 0.9, "{biased:?}");
+        let healthy = found([0.0; 3]);
+        assert!(healthy.score < 0.0, "{healthy:?}");
     }
 
     proptest! {

@@ -9,6 +9,7 @@
 //! - [`backward_elimination`]: evidence of each cause beside all others.
 //! - [`friction_family`]: a search that begins with the friction and inertia of all joints, fitted together.
 //! - [`scan`]: evaluates every effect on all joints at once, and returns the best candidates.
+//! - [`candidates`]: which hypotheses of a scan are fitted; [`affected_channels`]: what a cause must explain.
 //! - [`cross_validation`]: fits a hypothesis to one fold and evaluates it on the other, in full simulation.
 //! - [`null_distribution`]: the threshold of the evidence, from the log itself.
 //! - [`profile_likelihood`]: restarts from other local minima, and profile-likelihood intervals.
@@ -24,7 +25,9 @@
 //! at least [`forward_selection::MIN_EXPLAINED_FRACTION`] of the residual power above noise, and it exceeds a minimum
 //! size. All accepted causes are then refitted together, and the search continues.
 
+mod affected_channels;
 mod backward_elimination;
+mod candidates;
 mod cross_validation;
 mod data_split;
 mod discrimination;

@@ -2,7 +2,7 @@
 
 use twinstep_identify::window::WindowConfig;
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
-use twinstep_model::{BaseMount, Precision, RobotStates, Rollout, RolloutRequest, go2};
+use twinstep_model::{BaseMount, JOINT_NAMES, Precision, RobotStates, Rollout, RolloutRequest, go2};
 
 use super::residual_data::ResidualData;
 
@@ -78,6 +78,42 @@ pub fn data(viscous: impl Fn(usize) -> f64, contact: Option<Contact>) -> Residua
     segments.extend(contact.map(|_| segment("ground", BaseMount::Floating)));
     let mut meta = Meta::new(200.0, TorqueSensor::None, segments);
     meta.noise.insert("q_FL_hip".to_owned(), NOISE);
+    let log = Log::new(meta, columns).expect("a log");
+    ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
+}
+
+/// Robot that stands still, with a gyroscope whose reading is its bias.
+pub struct AtRest;
+
+impl Rollout for AtRest {
+    fn run(&mut self, jobs: &[RolloutRequest], _: Precision) -> Vec<RobotStates> {
+        let play = |job: &RolloutRequest| {
+            let mut states = RobotStates::new(job.commands.len() + 1);
+            states.measured.gyro.fill(job.robot.gyro_bias.to_array().map(|bias| bias as f32));
+            states
+        };
+        jobs.iter().map(play).collect()
+    }
+}
+
+/// Returns the data of a robot that stands for 20 s, with noise of 0.02 rad/s and this bias of its gyroscope [rad/s].
+pub fn data_at_rest(bias: [f64; 3]) -> ResidualData {
+    const ROWS: usize = 4000;
+    const NOISE: f64 = 0.02;
+    let column = |name: String, of: &dyn Fn(usize) -> f64| (name, (0..ROWS).map(of).collect::<Vec<f64>>());
+    let constants = [("kp", 25.0), ("kd", 0.6), ("quat_w", 1.0), ("pos_z", 0.0), ("vel_x", 0.0)];
+    let mut columns = vec![column("t".to_owned(), &|row| row as f64 / 200.0)];
+    columns.extend(constants.map(|(name, value)| column(name.to_owned(), &|_| value)));
+    for joint in JOINT_NAMES {
+        columns.extend(["q", "q_cmd"].map(|quantity| column(format!("{quantity}_{joint}"), &|_| 0.0)));
+    }
+    for (axis, name) in ["gyro_x", "gyro_y", "gyro_z"].into_iter().enumerate() {
+        let noise = |row: usize| 3.46 * NOISE * (((row + 50 * axis) * 7919 % 1009) as f64 / 1009.0 - 0.5);
+        columns.push(column(name.to_owned(), &|row| bias[axis] + noise(row)));
+    }
+    let segments = vec![Segment { name: "stand".to_owned(), base: BaseMount::Floating }];
+    let mut meta = Meta::new(200.0, TorqueSensor::None, segments);
+    meta.noise.insert("gyro".to_owned(), NOISE);
     let log = Log::new(meta, columns).expect("a log");
     ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
 }

@@ -10,7 +10,8 @@ use twinstep_effects::{CATALOGUE, EffectEntry, Parameter, Scope, Target};
 use twinstep_logs::Log;
 use twinstep_model::RobotModel;
 
-use super::forward_selection::{MAX_REMAINING_FRACTION, MIN_EXPLAINED_FRACTION, NEGLIGIBLE_EXCESS, THRESHOLD};
+use super::affected_channels::{MAX_REMAINING_FRACTION, NEGLIGIBLE_EXCESS};
+use super::forward_selection::{MIN_EXPLAINED_FRACTION, THRESHOLD};
 use super::hypothesis::{Hypothesis, selection_penalty};
 use super::joint_slots::JointSlots;
 use super::residual_power::{ResidualPower, TORQUE};

@@ -3,10 +3,10 @@
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
 use twinstep_effects::ModelFile;
-use twinstep_effects::{BlindTestCondition, CATALOGUE, Effect, EffectEntry, Scope, Target};
+use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Scope, Target};
 use twinstep_model::{Joint, JointKind, Leg, Stream, go2, standard_normal, stream};
 
-use crate::base_schedule::{BaseSchedule, LogLength};
+use crate::log_setup::LogSetup;
 use crate::mismatch::Mismatch;
 use crate::unmodelled::UnmodelledEffect;
 use crate::{Plant, Suite};
@@ -53,29 +53,6 @@ fn case_mix(plant: Plant) -> &'static [(CaseKind, usize)] {
     }
 }
 
-/// Base mounting and channels of a case's log; independent of the hidden effects.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct LogSetup {
-    /// Mounting of the base.
-    pub place: BaseSchedule,
-    /// True if the motor currents are measured.
-    pub torque: bool,
-    /// True if the supply voltage is measured.
-    pub battery: bool,
-    /// True if the motor temperatures are measured.
-    pub temperature: bool,
-    /// True if position and velocity of a floating base are measured.
-    #[serde(default = "measured")]
-    pub motion_capture: bool,
-    /// Length of the log.
-    #[serde(default)]
-    pub length: LogLength,
-}
-
-fn measured() -> bool {
-    true
-}
-
 /// One case of a blind test.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Case {
@@ -104,7 +81,7 @@ impl Case {
             Suite::Walking => CaseKind::WalkingEffect,
             Suite::Confusable => CaseKind::ConfusableEffect,
         };
-        let setting = setting_of(seed, number, plant, suite);
+        let setting = LogSetup::draw(seed, number, plant, suite);
         let random = &mut stream(seed, "hunt hidden", number);
         let hidden = match kind {
             CaseKind::LargeEffect => vec![from_half(setting, random)],
@@ -142,72 +119,6 @@ fn kind(seed: u64, number: u64, plant: Plant) -> CaseKind {
         kinds.swap(last, random.random_range(0..=last));
     }
     kinds[(number % size) as usize]
-}
-
-/// Returns base mounting, channels and length of the log of a case.
-fn setting_of(seed: u64, number: u64, plant: Plant, suite: Suite) -> LogSetup {
-    let drawn = setting(&mut stream(seed, "hunt setting", number));
-    match suite {
-        Suite::Mixed if plant == Plant::Mujoco => LogSetup { place: BaseSchedule::Whole, torque: true, ..drawn },
-        Suite::Mixed => drawn,
-        Suite::Healthy => {
-            // Of nine robots of each family, six have logs of a minute, two of 10 s and one of five minutes.
-            let round = (number / Mismatch::ALL.len() as u64) % 9;
-            let length = match round {
-                1 | 6 => LogLength::TenSeconds,
-                4 => LogLength::FiveMinutes,
-                _ => LogLength::Standard,
-            };
-            LogSetup { place: BaseSchedule::Whole, torque: true, length, ..drawn }
-        }
-        Suite::Walking => LogSetup { place: BaseSchedule::Walking, motion_capture: false, ..drawn },
-        Suite::Confusable => {
-            LogSetup { place: BaseSchedule::Fixed, torque: false, battery: false, temperature: false, ..drawn }
-        }
-    }
-}
-
-fn setting(random: &mut impl Rng) -> LogSetup {
-    let place = match random.random_range(0.0..1.0) {
-        share if share < 0.35 => BaseSchedule::Fixed,
-        share if share < 0.45 => BaseSchedule::Floating,
-        _ => BaseSchedule::FixedThenFloating,
-    };
-    LogSetup {
-        place,
-        torque: random.random_bool(0.7),
-        battery: random.random_bool(0.5),
-        temperature: random.random_bool(0.5),
-        motion_capture: true,
-        length: LogLength::Standard,
-    }
-}
-
-impl LogSetup {
-    /// Returns the setup of a log with motor currents.
-    #[cfg(test)]
-    pub fn with_torque(place: BaseSchedule) -> Self {
-        let length = LogLength::Standard;
-        Self { place, torque: true, battery: false, temperature: false, motion_capture: true, length }
-    }
-
-    fn has(self, condition: BlindTestCondition) -> bool {
-        match condition {
-            BlindTestCondition::FixedBase => self.place != BaseSchedule::Floating,
-            BlindTestCondition::FloatingBase => self.place != BaseSchedule::Fixed,
-            BlindTestCondition::Torque => self.torque,
-            BlindTestCondition::Voltage => self.battery,
-            BlindTestCondition::Temperature => self.temperature,
-        }
-    }
-
-    /// Returns the effects that the blind test hides in such a log.
-    fn visible_effects(self) -> Vec<&'static Effect> {
-        let is_visible = |effect: &&Effect| {
-            effect.blind_test.is_some_and(|conditions| conditions.iter().all(|condition| self.has(*condition)))
-        };
-        CATALOGUE.into_iter().filter(is_visible).collect()
-    }
 }
 
 /// Samples an effect with a size of half its prior range to all of it.
@@ -331,6 +242,7 @@ mod tests {
     use twinstep_model::go2;
 
     use super::*;
+    use crate::base_schedule::{BaseSchedule, LogLength};
 
     #[test]
     fn every_effect_but_four_can_be_hidden() {

@@ -161,7 +161,8 @@ mod tests {
 
     use super::*;
     use crate::base_schedule::BaseSchedule;
-    use crate::draw::{CaseKind, LogSetup};
+    use crate::draw::CaseKind;
+    use crate::log_setup::LogSetup;
 
     fn case(place: BaseSchedule, seed: u64, hidden: Vec<EffectEntry>) -> Case {
         let setting = LogSetup { battery: true, ..LogSetup::with_torque(place) };

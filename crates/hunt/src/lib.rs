@@ -3,8 +3,10 @@
 mod base_schedule;
 mod draw;
 mod ground_truth;
+mod log_setup;
 mod mismatch;
 mod motion;
+mod rates;
 mod runner;
 mod score;
 mod table;
@@ -21,7 +23,8 @@ use twinstep_model::go2;
 
 use twinstep_sim::{BatchRollout, SimConfig};
 
-use draw::{Case, CaseKind, LogSetup};
+use draw::{Case, CaseKind};
+use log_setup::LogSetup;
 use mismatch::Mismatch;
 use runner::BlindTest;
 use score::Score;

@@ -9,7 +9,7 @@ use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{BaseMount, JOINT_NAMES, Joint, JointKind, NUM_JOINTS, go2};
 
 use crate::base_schedule::BaseSchedule;
-use crate::draw::LogSetup;
+use crate::log_setup::LogSetup;
 
 /// Rate of the log [Hz].
 pub const RATE_HZ: f64 = 200.0;

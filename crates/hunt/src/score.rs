@@ -207,7 +207,8 @@ mod tests {
 
     use super::*;
     use crate::base_schedule::BaseSchedule;
-    use crate::draw::{CaseKind, LogSetup};
+    use crate::draw::CaseKind;
+    use crate::log_setup::LogSetup;
     use crate::unmodelled::UnmodelledEffect;
 
     fn case(hidden: &[(&str, &str, f64)]) -> Case {

@@ -293,6 +293,8 @@ fn perturbed_robot(robot: &RobotModel, error: usize, size: f64) -> RobotModel {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     const ROWS: usize = 18_000;
@@ -331,5 +333,31 @@ mod tests {
         nuisance.project_out(&mut residuals);
         assert!(residuals[..ROWS].iter().all(|residual| residual.abs() < 0.02));
         assert_eq!(residuals.len(), ROWS + 2 + NUM_NUISANCE);
+    }
+
+    proptest! {
+        #[test]
+        fn elimination_of_a_sparse_jacobian_is_that_of_the_dense_one(
+            first in 0usize..700, length in 1usize..200, gap in 1usize..200, slope in 0.1f64..3.0, residual in -3.0f64..3.0,
+        ) {
+            const COUNT: usize = 1000;
+            let is_zero = |row: usize| row < first || row >= first + length || (row - first) % (gap + 20) < gap;
+            let cell = |row: usize, column: usize| match column {
+                0 if is_zero(row) => 0.0,
+                0 => slope,
+                _ => (0.37 * row as f64).sin(),
+            };
+            let jacobian = DMatrix::from_fn(COUNT, 2, cell);
+            let given = DVector::from_fn(COUNT, |row, _| residual * (0.1 * row as f64).cos());
+            let prior = DMatrix::identity(2, 2) * CORRELATION_ROWS;
+            let sizes = (jacobian.tr_mul(&jacobian) + prior).lu().solve(&jacobian.tr_mul(&given)).expect("definite");
+            let expected = &given - &jacobian * &sizes;
+            let block = NuisanceBlock::new((0..COUNT).collect(), jacobian).expect("positive definite");
+            let mut residuals: Vec<f64> = given.iter().copied().collect();
+            block.eliminate(&mut residuals, f64::INFINITY);
+            for (found, expected) in residuals.iter().zip(&expected) {
+                prop_assert!((found - expected).abs() < 1e-4, "{found} {expected}");
+            }
+        }
     }
 }
