@@ -322,7 +322,7 @@ mod tests {
 
     #[test]
     fn initial_state_affects_only_its_own_window() {
-        let window = |rows: std::ops::Range<usize>| {
+        let window = |rows: Range<usize>| {
             let jacobian = DMatrix::from_element(rows.len(), 1, 1.0);
             NuisanceBlock::new(rows.collect(), jacobian).expect("positive definite")
         };
