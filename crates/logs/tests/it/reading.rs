@@ -81,6 +81,8 @@ fn gain_of_a_joint_overrides_the_common_one_which_overrides_the_metadata() {
     assert_eq!((log.kp("a", 1), log.kp("b", 1)), (Some(2.0), Some(4.0)));
     assert_eq!((log.kd("a", 1), log.kd("b", 1)), (Some(0.25), Some(0.75)));
     assert_eq!((log.kp("a", 2), log.kd("a", 2), log.kp("c", 0)), (None, None, None));
+    assert_eq!(log.gains("a"), [Some(cells(2.0)), Some(cells(0.25))]);
+    assert_eq!((log.gains("b"), log.gains("c")), ([Some(vec![3.0, 4.0]), Some(cells(0.75))], [None, None]));
 }
 
 #[test]
