@@ -67,7 +67,7 @@ mod tests {
             false,
         );
         assert_eq!(first.len(), MAX_JOINT_CANDIDATES);
-        assert_eq!(names(&second), ["backlash@RL_hip", "stribeck_friction@RL_thigh"], "5 nat are noise");
+        assert_eq!(names(&second), ["backlash@FR_calf", "stribeck_friction@RL_thigh"], "5 nat are noise");
     }
 
     #[test]
