@@ -38,6 +38,9 @@ pub struct CandidateFit {
     pub threshold: f64,
 }
 
+/// Accepted causes, each with its alternative hypotheses.
+pub type Accepted = Vec<(CandidateFit, Vec<CandidateFit>)>;
+
 /// Fit of effects on top of a model.
 #[derive(Clone)]
 pub struct FitProblem {

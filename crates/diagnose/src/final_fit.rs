@@ -8,9 +8,9 @@ use twinstep_identify::nuisance::NuisanceModel;
 use twinstep_identify::refine::{SIMULATOR_MISMATCH_STD, covariance};
 use twinstep_model::{Precision, Rollout};
 
-use super::cross_validation::{CandidateFit, FitProblem};
+use super::cross_validation::{Accepted, CandidateFit, FitProblem};
 use super::findings::CorrelatedPair;
-use super::forward_selection::{Accepted, write_estimates};
+use super::forward_selection::write_estimates;
 use super::hypothesis::Hypothesis;
 use super::reporting::TWO_SIDED_95;
 use super::residual_data::ResidualData;

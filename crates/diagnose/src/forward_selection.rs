@@ -1,14 +1,14 @@
 //! Forward selection of causes with backward elimination.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
-use twinstep_effects::ModelFile;
+use twinstep_effects::{Effect, ModelFile};
 use twinstep_model::{RobotModel, Rollout};
 
 use super::DiagnoseError;
 use super::affected_channels::explains_affected_channels;
 use super::candidates::candidates;
-use super::cross_validation::{CandidateFit, FitProblem, cross_validate};
+use super::cross_validation::{Accepted, CandidateFit, FitProblem, cross_validate, cross_validate_together};
 use super::hypothesis::Hypothesis;
 use super::null_distribution::{self, LOWEST_THRESHOLD};
 use super::profile_likelihood::refine_with_restarts;
@@ -25,7 +25,7 @@ pub const THRESHOLD: f64 = 30.0;
 /// Share of the largest log-likelihood gain that a further cause must reach.
 ///
 /// The laws of the catalogue are approximations, and what a large effect leaves imitates small ones.
-pub const MIN_SHARE_OF_LARGEST: f64 = 0.01;
+const MIN_SHARE_OF_LARGEST: f64 = 0.01;
 /// Maximum number of causes.
 const MOST_CAUSES: usize = 12;
 /// Maximum number of rounds of selection and elimination.
@@ -38,9 +38,6 @@ pub const MIN_EXPLAINED_FRACTION: f64 = 0.3;
 ///
 /// What explains nearly everything is the true cause. Without it, others that imitate it would be added in its place.
 const EXPLAINED_BY_SMALL_CAUSE: f64 = 0.9;
-
-/// Accepted causes, each with its alternative hypotheses.
-pub type Accepted = Vec<(CandidateFit, Vec<CandidateFit>)>;
 
 /// Residuals of logs in windows of one length.
 pub struct WindowedData {
@@ -101,7 +98,7 @@ impl<'a> ForwardSelection<'a> {
             }
             self.refit();
             if let Some(effect) = added {
-                scope_merging::merge(self, effect);
+                self.merge_scopes(effect);
             }
         }
         while let Some(place) = self.find_cause_to_eliminate() {
@@ -115,6 +112,35 @@ impl<'a> ForwardSelection<'a> {
             self.refit();
         }
         Ok(())
+    }
+
+    /// Merges the causes of each effect as [`ForwardSelection::merge_scopes`] does.
+    pub fn merge_all_scopes(&mut self) {
+        let effects: BTreeSet<&str> = self.accepted.iter().map(|(cause, _)| cause.hypothesis.effect.name).collect();
+        effects.into_iter().filter_map(Effect::named).for_each(|effect| self.merge_scopes(effect));
+    }
+
+    /// Replaces the causes with this effect by one on a wider scope, and refits all, if that loses less than
+    /// [`MIN_SHARE_OF_LARGEST`] of the largest log-likelihood gain.
+    fn merge_scopes(&mut self, effect: &Effect) {
+        let wider = scope_merging::with_wider_scopes(&self.accepted, effect);
+        if wider.is_empty() {
+            return;
+        }
+        let before = self.gain_of(&self.accepted.clone());
+        let largest = self.accepted.iter().map(|(cause, _)| cause.score).fold(0.0, f64::max);
+        let gains: Vec<f64> = wider.iter().map(|causes| self.gain_of(causes)).collect();
+        let best = gains.iter().zip(wider).max_by(|(one, _), (other, _)| one.total_cmp(other));
+        if let Some((_, causes)) = best.filter(|(gain, _)| **gain >= before - MIN_SHARE_OF_LARGEST * largest) {
+            self.accepted = causes;
+            self.refit();
+        }
+    }
+
+    /// Returns the cross-validated log-likelihood gain of causes [nat].
+    fn gain_of(&mut self, causes: &Accepted) -> f64 {
+        let hypotheses: Vec<Hypothesis> = causes.iter().map(|(cause, _)| cause.hypothesis.clone()).collect();
+        cross_validate_together(&self.looked_at().evidence, &self.baseline, &hypotheses, self.simulator)
     }
 
     /// Returns the index of a cause to eliminate after the joint refit, if any.

@@ -10,13 +10,12 @@ use twinstep_model::{Joint, JointKind, NUM_JOINTS, Rollout};
 
 use super::DiagnoseError;
 use super::backward_elimination::{self, evidence_beside_others};
-use super::cross_validation::{CandidateFit, FitProblem, cross_validate, cross_validate_together};
-use super::forward_selection::{Accepted, ForwardSelection, THRESHOLD};
+use super::cross_validation::{Accepted, CandidateFit, FitProblem, cross_validate, cross_validate_together};
+use super::forward_selection::{ForwardSelection, THRESHOLD};
 use super::hypothesis::Hypothesis;
 use super::residual_data::ResidualData;
 use super::residual_power::{STANCE, TORQUE};
 use super::residual_rows::PRECISION;
-use super::scope_merging;
 
 /// Laws that every joint has.
 const LAWS: [&str; 3] = ["viscous_friction", "coulomb_friction", "armature"];
@@ -52,9 +51,9 @@ pub fn extend(search: &mut ForwardSelection) -> Result<(), DiagnoseError> {
     if together(search) > LEAST_SHARE * before {
         search.refit();
         eliminate_without_evidence(search);
-        scope_merging::merge_all(search);
+        search.merge_all_scopes();
         add_joints_that_differ(search)?;
-        scope_merging::merge_all(search);
+        search.merge_all_scopes();
         search.run()?;
         backward_elimination::eliminate(search)?;
         eliminate_without_evidence(search);

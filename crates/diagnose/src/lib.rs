@@ -62,7 +62,7 @@ use twinstep_effects::{Effect, Scope};
 use twinstep_logs::Log;
 use twinstep_model::{RobotModel, Rollout};
 
-use cross_validation::{CandidateFit, FitProblem};
+use cross_validation::{Accepted, CandidateFit, FitProblem};
 use data_split::DataSplit;
 pub use discrimination::HypothesisPair;
 pub use excitation::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
@@ -72,7 +72,7 @@ pub use findings::{
     AlternativeCause, Cause, CorrelatedPair, Diagnosis, DiscriminatedPair, Estimate, LearnedResidual, NextExperiment,
     ParameterValue, RmsErrors, Unexplained, WeightedHypothesis,
 };
-use forward_selection::{Accepted, ForwardSelection, WindowedData, write_estimates};
+use forward_selection::{ForwardSelection, WindowedData, write_estimates};
 use hypothesis::Hypothesis;
 use residual_data::ResidualData;
 pub use torque_only::diagnose_torques;

@@ -2,54 +2,25 @@
 //!
 //! Another effect at some joints hides them from the scan, so that an effect on all joints is found on a part of them first.
 
-use std::collections::BTreeSet;
-
 use twinstep_effects::{Effect, Scope, Target};
-use twinstep_model::{Joint, Rollout};
+use twinstep_model::Joint;
 
-use super::cross_validation::{CandidateFit, cross_validate_together};
-use super::forward_selection::{Accepted, ForwardSelection, MIN_SHARE_OF_LARGEST};
+use super::cross_validation::{Accepted, CandidateFit};
 use super::hypothesis::Hypothesis;
 
 /// Largest difference of the sizes of causes that may be one, from their mean, relative to its distance from no effect.
 const LARGEST_DIFFERENCE: f64 = 0.25;
 
-/// Merges the causes of each effect as [`merge`] does.
-pub fn merge_all(search: &mut ForwardSelection) {
-    let effects: BTreeSet<&str> = search.accepted.iter().map(|(cause, _)| cause.hypothesis.effect.name).collect();
-    for name in effects {
-        merge(search, Effect::named(name).expect("an effect of the catalogue"));
-    }
-}
-
-/// Merges the causes with this effect, and refits all, if a wider scope loses less than [`MIN_SHARE_OF_LARGEST`] of the
-/// largest log-likelihood gain.
-pub fn merge(search: &mut ForwardSelection, effect: &'static Effect) {
+/// Returns lists of causes in which one cause on a wider scope takes the place of all with this effect; none if these are
+/// not alike.
+pub fn with_wider_scopes(causes: &Accepted, effect: &Effect) -> Vec<Accepted> {
     let (alike, others): (Accepted, Accepted) =
-        search.accepted.iter().cloned().partition(|(cause, _)| cause.hypothesis.effect == effect);
+        causes.iter().cloned().partition(|(cause, _)| cause.hypothesis.effect == effect);
     if alike.len() < 2 || effect.target != Target::Joints || !agree(&alike) {
-        return;
+        return Vec::new();
     }
-    let evidence = &search.views[search.view].evidence;
-    let gain_of = |causes: &Accepted, simulator: &mut dyn Rollout| {
-        let hypotheses: Vec<Hypothesis> = causes.iter().map(|(cause, _)| cause.hypothesis.clone()).collect();
-        cross_validate_together(evidence, &search.baseline, &hypotheses, simulator)
-    };
-    let before = gain_of(&search.accepted, search.simulator);
-    let largest = search.accepted.iter().map(|(cause, _)| cause.score).fold(0.0, f64::max);
-    let mut best: Option<(f64, Accepted)> = None;
-    for scope in wider_scopes(&alike) {
-        let mut causes = others.clone();
-        causes.push(merged(&alike, scope));
-        let gain = gain_of(&causes, search.simulator);
-        if gain >= before - MIN_SHARE_OF_LARGEST * largest && best.as_ref().is_none_or(|(most, _)| gain > *most) {
-            best = Some((gain, causes));
-        }
-    }
-    if let Some((_, causes)) = best {
-        search.accepted = causes;
-        search.refit();
-    }
+    let with = |scope| others.iter().cloned().chain([merged(&alike, scope)]).collect();
+    wider_scopes(&alike).into_iter().map(with).collect()
 }
 
 /// Returns true if the causes have no joint in common and similar sizes.
@@ -115,7 +86,10 @@ mod tests {
         };
         assert_eq!(of(&[joint(0), joint(1)]), [Scope::All, Scope::Left, Scope::Leg(Leg::FL)]);
         assert_eq!(of(&[joint(0), joint(3)]), [Scope::All, Scope::Kind(JointKind::Hip)]);
-        let merged = merged(&causes("armature", &[(joint(0), 0.01), (joint(3), 0.01)]), Scope::All).0;
-        assert_eq!((merged.hypothesis.name().as_str(), merged.score), ("armature@all", 100.0));
+        let found = causes("armature", &[(joint(0), 0.01), (joint(3), 0.01)]);
+        let wider = with_wider_scopes(&found, found[0].0.hypothesis.effect);
+        let names = wider.iter().map(|causes| (causes.len(), causes[0].0.hypothesis.name(), causes[0].0.score));
+        let [all, hip] = ["armature@all", "armature@hip"].map(|name| (1, name.to_owned(), 100.0));
+        assert_eq!(names.collect::<Vec<_>>(), [all, hip]);
     }
 }

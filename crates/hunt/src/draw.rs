@@ -11,6 +11,9 @@ use crate::mismatch::Mismatch;
 use crate::unmodelled::UnmodelledEffect;
 use crate::{Plant, Suite};
 
+/// Distance of a missing mass from the trunk's centre, relative to that of an added one: it is missing within the trunk.
+const MISSING_MASS_REACH: f64 = 0.25;
+
 /// Kind of a case: what it hides.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -167,7 +170,12 @@ fn walking_effect(number: u64, random: &mut impl Rng) -> EffectEntry {
     let share = random.random_range(0.5..1.0);
     let mut sizes = values(effect, share, random);
     if name == "payload" {
-        sizes[0] = 0.1 * go2().trunk.mass * if random.random_bool(0.5) { 1.0 } else { -1.0 };
+        let is_added = random.random_bool(0.5);
+        sizes[0] = 0.1 * go2().trunk.mass * if is_added { 1.0 } else { -1.0 };
+        if !is_added {
+            // Without mass outside the trunk, its inertia would not be positive.
+            sizes[1..].iter_mut().for_each(|length| *length *= MISSING_MASS_REACH);
+        }
     }
     EffectEntry::new(effect, scope(effect.target, random), sizes).expect("values of the prior range are allowed")
 }
