@@ -4,10 +4,10 @@ use std::path::Path;
 
 use twinstep_diagnose::{Diagnosis, ParameterValue};
 use twinstep_effects::ModelFile;
-use twinstep_effects::{Effect, EffectEntry, apply_effects};
+use twinstep_effects::{Effect, EffectEntry, Scope, apply_effects};
 use twinstep_identify::evaluate;
-use twinstep_logs::{Log, Meta};
-use twinstep_model::{RobotModel, go2};
+use twinstep_logs::{Log, Meta, TorqueSensor};
+use twinstep_model::{JOINT_NAMES, Joint, RobotModel, go2, standard_normal, stream};
 use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_tests::browser::{browser, layout};
 use twinstep_tests::ground_truth_actuator::{DRIVES, Motion, NOISE_NM};
@@ -134,6 +134,49 @@ fn ideal_robot_has_no_finding() {
     assert!(page.contains("No model error above the noise"));
     assert_eq!(diagnosis.next_experiment, None);
     assert!(!folder.path().join("diagnosis/next_experiment").exists());
+}
+
+/// Returns a log of [`log_of`] with the torques of PD loops whose position gains have these scales, and noise.
+fn with_motor_torques(log: &Log, kp_scale: [f64; 12]) -> Log {
+    let mut meta = log.meta().clone();
+    meta.tau_sensor = TorqueSensor::MotorCurrent;
+    meta.noise.insert("tau_measured".to_owned(), NOISE_NM);
+    let mut random = stream(6, "torque noise", 0);
+    let torques = JOINT_NAMES.iter().zip(kp_scale).map(|(joint, scale)| {
+        let [q, dq, q_cmd] = ["q", "dq", "q_cmd"].map(|quantity| log.channel(&format!("{quantity}_{joint}")).unwrap());
+        let torque = |row: usize| scale * 25.0 * (q_cmd[row] - q[row]) - 0.6 * dq[row];
+        let measured = (0..log.rows()).map(|row| torque(row) + NOISE_NM * standard_normal(&mut random));
+        (format!("tau_measured_{joint}"), measured.collect())
+    });
+    let others = log.channels().map(|(name, cells)| (name.to_owned(), cells.to_vec()));
+    let columns = [("t".to_owned(), log.t().to_vec())].into_iter().chain(others).chain(torques);
+    Log::new(meta, columns).unwrap()
+}
+
+/// One at a time, the gains of a few joints would be reported.
+#[test]
+fn gains_that_differ_from_joint_to_joint_are_in_the_extended_model_and_no_cause() {
+    let folder = tempfile::tempdir().unwrap();
+    let kp = [1.04, 0.97, 1.02, 0.96, 1.03, 0.98, 1.05, 1.0, 0.97, 1.02, 0.95, 1.03];
+    let effect = Effect::named("pd_gain").unwrap();
+    let entry = |(joint, scale): (Joint, f64)| EffectEntry::new(effect, Scope::Joint(joint), vec![scale, 1.0]).unwrap();
+    let robot = apply_effects(&go2(), &Joint::ALL.into_iter().zip(kp).map(entry).collect::<Vec<_>>()).unwrap();
+    let log = folder.path().join("log.parquet");
+    with_motor_torques(&log_of(&robot), kp).write(&log).unwrap();
+    let out = folder.path().join("diagnosis");
+    let output = twinstep(&["diagnose", log.to_str().unwrap(), "--out", out.to_str().unwrap()]);
+    let printed = String::from_utf8_lossy(&output.stdout);
+    assert!(
+        output.status.success() && printed.contains("the gains of the joints differ, kp by factors of 0.9"),
+        "{printed}"
+    );
+    let findings = std::fs::read_to_string(out.join("findings.json")).unwrap();
+    let diagnosis: Diagnosis = serde_json::from_str(&findings).unwrap();
+    assert!(diagnosis.findings.is_empty(), "{diagnosis:#?}");
+    let extended = ModelFile::load(out.join(&diagnosis.extended_model)).unwrap().robot_model().unwrap();
+    for (joint, scale) in extended.joints.iter().zip(kp) {
+        assert!((joint.actuator.kp_scale - scale).abs() < 0.01, "{:?}", diagnosis.joint_gains);
+    }
 }
 
 /// A delay of the torque in the loop would explain the same torques.

@@ -235,6 +235,7 @@ fn text(diagnosis: &Diagnosis, out: &Path) -> String {
     if diagnosis.findings.is_empty() {
         lines.push("no cause identified".to_owned());
     }
+    lines.extend(joint_gains(diagnosis));
     lines.push(diagnosis.unexplained.text.clone());
     if let Some(learned) = &diagnosis.learned_residual {
         lines.push(format!(
@@ -255,6 +256,15 @@ fn text(diagnosis: &Diagnosis, out: &Path) -> String {
     lines.push(error_line("closed-loop joint RMSE [rad]", diagnosis, |errors| errors.q_rmse_rad));
     lines.push(error_line("torque RMSE [N·m]", diagnosis, |errors| errors.torque_rmse_nm));
     lines.join("\n") + "\n"
+}
+
+/// Returns the line on gains that differ from joint to joint, if they do.
+fn joint_gains(diagnosis: &Diagnosis) -> Option<String> {
+    let [kp, kd] = diagnosis.joint_gain_ranges()?.map(|[low, high]| format!("{low:.3} to {high:.3}"));
+    Some(format!(
+        "the gains of the joints differ, kp by factors of {kp} and kd of {kd}: as those of equal motors, so no cause; \
+         `extended.toml` has them"
+    ))
 }
 
 fn error_line(name: &str, diagnosis: &Diagnosis, of: fn(&RmsErrors) -> Option<f64>) -> String {

@@ -216,12 +216,26 @@ pub fn cross_validate_together(
     hypotheses: &[Hypothesis],
     simulator: &mut dyn Rollout,
 ) -> f64 {
-    let Some(fit) = FitProblem::new(model, hypotheses).filter(|_| !hypotheses.is_empty()) else { return 0.0 };
+    if hypotheses.is_empty() {
+        return 0.0;
+    }
+    fit_together(evidence, model, hypotheses, simulator).map_or(f64::NEG_INFINITY, |(score, _)| score)
+}
+
+/// Returns the log-likelihood gain of [`cross_validate_together`] and the mean of the values fitted to either fold.
+///
+/// Returns `None` if a fitted model is not a valid robot.
+pub fn fit_together(
+    evidence: &ResidualData,
+    model: &ModelFile,
+    hypotheses: &[Hypothesis],
+    simulator: &mut dyn Rollout,
+) -> Option<(f64, Vec<f64>)> {
+    let fit = FitProblem::new(model, hypotheses)?;
     let fewer = evidence.fixed_base_rows().filter(|_| hypotheses.iter().all(is_shown_in_air));
-    let Some(points) = fit.solve_folds(&evidence.fit_rows, fewer, simulator) else { return f64::NEG_INFINITY };
+    let points = fit.solve_folds(&evidence.fit_rows, fewer, simulator)?;
     let models = [model.clone(), fit.model(&points[0]), fit.model(&points[1])];
-    let robots: Option<Vec<RobotModel>> = models.iter().map(|model| model.robot_model().ok()).collect();
-    let Some(robots) = robots else { return f64::NEG_INFINITY };
+    let robots: Vec<RobotModel> = models.iter().map(|model| model.robot_model().ok()).collect::<Option<_>>()?;
     let left = evidence.residual_powers(simulator, &robots, false);
     let judged = |channel: usize| {
         let rows = evidence.correlation_rows(channel);
@@ -231,7 +245,9 @@ pub fn cross_validate_together(
     let tolerated: f64 = left[1..].iter().map(|now| 0.5 * now.tolerated_gain(&left[0])).sum();
     let penalties: f64 = hypotheses.iter().map(|hypothesis| selection_penalty(hypothesis.scope)).sum();
     let channels = evident_channels(hypotheses.iter().map(|hypothesis| hypothesis.effect.target));
-    channels.map(judged).sum::<f64>() + tolerated - penalties - parameter_penalty(fit.unknowns.len())
+    let score = channels.map(judged).sum::<f64>() + tolerated - penalties - parameter_penalty(fit.unknowns.len());
+    let middle = points[0].iter().zip(&points[1]).map(|(one, other)| 0.5 * (one + other));
+    Some((score, fit.unknowns.iter().zip(middle).map(|(unknown, coordinate)| unknown.value(coordinate)).collect()))
 }
 
 /// Returns the point with the least cost of the linearised model, with weights of the residuals [coordinates].

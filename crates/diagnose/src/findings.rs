@@ -15,6 +15,10 @@ pub struct Diagnosis {
     pub noise_floor: RmsErrors,
     /// Causes, in the order in which they were found; empty if no candidate reaches the threshold.
     pub findings: Vec<Cause>,
+    /// Scale of the position gain and of the velocity gain by joint, if the gains differ from joint to joint by as little as
+    /// those of equal motors. They are no cause; the extended model has them. Empty if they do not differ.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub joint_gains: BTreeMap<String, [f64; 2]>,
     /// Pairs of causes with highly correlated estimates.
     pub confusable: Vec<CorrelatedPair>,
     /// Unexplained residual.
@@ -28,6 +32,18 @@ pub struct Diagnosis {
     pub next_experiment: Option<NextExperiment>,
     /// File name of the corrected model, in the same folder.
     pub extended_model: String,
+}
+
+impl Diagnosis {
+    /// Returns the smallest and the largest scale of the position gain, and of the velocity gain, if the gains of the joints
+    /// differ.
+    pub fn joint_gain_ranges(&self) -> Option<[[f64; 2]; 2]> {
+        let range = |gain: usize| {
+            let scales = || self.joint_gains.values().map(|scales| scales[gain]);
+            [scales().fold(f64::INFINITY, f64::min), scales().fold(0.0, f64::max)]
+        };
+        (!self.joint_gains.is_empty()).then(|| [0, 1].map(range))
+    }
 }
 
 /// Networks that have learned the torque that no cause explains. The extended model adds it to its laws.

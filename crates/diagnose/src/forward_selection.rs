@@ -10,6 +10,7 @@ use super::affected_channels::explains_affected_channels;
 use super::candidates::candidates;
 use super::cross_validation::{Accepted, CandidateFit, FitProblem, cross_validate, cross_validate_together};
 use super::hypothesis::Hypothesis;
+use super::joint_gains::{self, JointGains};
 use super::null_distribution::{self, LOWEST_THRESHOLD};
 use super::profile_likelihood::refine_with_restarts;
 use super::residual_data::ResidualData;
@@ -74,6 +75,8 @@ pub struct ForwardSelection<'a> {
     pub model: ModelFile,
     /// Scan's scores of hypotheses by name when a fit did not support them [nat].
     pub unsupported: BTreeMap<String, f64>,
+    /// Gains of the joints that are in [`ForwardSelection::baseline`], if they differ.
+    pub joint_gains: Option<JointGains>,
     pub simulator: &'a mut dyn Rollout,
     pub progress: &'a mut dyn FnMut(&str) -> Result<(), DiagnoseError>,
 }
@@ -81,13 +84,16 @@ pub struct ForwardSelection<'a> {
 impl<'a> ForwardSelection<'a> {
     /// Runs forward selection with backward elimination.
     ///
-    /// Each round adds the best candidate and refits all causes. If none reaches the threshold, a cause that is
+    /// Each round adds the best candidate, or the gains of all joints, and refits all causes. If none reaches the threshold, a cause that is
     /// implausible or leaves much of the error of its own channels is removed and excluded. Causes that are too small are
     /// removed at the end.
     pub fn run(&mut self) -> Result<(), DiagnoseError> {
         let mut excluded = Vec::new();
         for _ in 0..MOST_SEARCHES {
             let next = if self.accepted.len() < MOST_CAUSES { self.best_addition(&excluded)? } else { None };
+            if next.as_ref().is_some_and(|(best, _)| self.joint_gains_explain_more(best)) {
+                continue;
+            }
             let added = next.as_ref().map(|(best, _)| best.hypothesis.effect);
             if let Some(next) = next {
                 self.accepted.push(next);
@@ -112,6 +118,20 @@ impl<'a> ForwardSelection<'a> {
             self.refit();
         }
         Ok(())
+    }
+
+    /// Adds the gains of the joints to the model if they are more likely than `best`. Returns true if so.
+    fn joint_gains_explain_more(&mut self, best: &CandidateFit) -> bool {
+        if self.joint_gains.is_some() {
+            return false;
+        }
+        let evidence = &self.looked_at().evidence;
+        let gains = JointGains::fit(evidence, &self.model, best.score, self.simulator);
+        let Some(gains) = gains.filter(|gains| gains.score > best.score) else { return false };
+        self.baseline = gains.added_to(&self.baseline);
+        self.joint_gains = Some(gains);
+        self.refit();
+        true
     }
 
     /// Merges the causes of each effect as [`ForwardSelection::merge_scopes`] does.
@@ -248,7 +268,10 @@ impl<'a> ForwardSelection<'a> {
     /// Returns true if a hypothesis was eliminated or is accepted.
     fn is_excluded(&self, hypothesis: &Hypothesis, excluded: &[String]) -> bool {
         let named = |accepted: &CandidateFit| accepted.hypothesis.name() == hypothesis.name();
-        excluded.contains(&hypothesis.name()) || self.accepted.iter().any(|(accepted, _)| named(accepted))
+        let is_in_baseline = self.joint_gains.is_some() && hypothesis.effect.name == joint_gains::EFFECT;
+        is_in_baseline
+            || excluded.contains(&hypothesis.name())
+            || self.accepted.iter().any(|(accepted, _)| named(accepted))
     }
 
     /// Refits all accepted causes jointly.

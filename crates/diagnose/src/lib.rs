@@ -8,6 +8,7 @@
 //! - [`scope_merging`]: one cause on a wider scope in place of several.
 //! - [`backward_elimination`]: evidence of each cause beside all others.
 //! - [`friction_family`]: a search that begins with the friction and inertia of all joints, fitted together.
+//! - [`joint_gains`]: gains that differ from joint to joint by a few percent, which are no cause.
 //! - [`scan`]: evaluates every effect on all joints at once, and returns the best candidates.
 //! - [`candidates`]: which hypotheses of a scan are fitted; [`affected_channels`]: what a cause must explain.
 //! - [`cross_validation`]: fits a hypothesis to one fold and evaluates it on the other, in full simulation.
@@ -38,6 +39,7 @@ mod findings;
 mod forward_selection;
 mod friction_family;
 mod hypothesis;
+mod joint_gains;
 mod joint_slots;
 mod null_distribution;
 mod profile_likelihood;
@@ -152,21 +154,29 @@ pub fn diagnose(
         accepted: Accepted::new(),
         model: judged.clone(),
         unsupported: BTreeMap::new(),
+        joint_gains: None,
         simulator,
         progress: &mut say,
     };
     search.run()?;
     backward_elimination::eliminate(&mut search)?;
     friction_family::extend(&mut search)?;
-    let ForwardSelection { view, mut accepted, model: named, .. } = search;
+    let ForwardSelection { view, mut accepted, baseline: judged, joint_gains, .. } = search;
+    let model = &joint_gains.as_ref().map_or(model.clone(), |gains| gains.added_to(model));
     let WindowedData { evidence, given } = &views[view];
-    let left = evidence.residual_power(simulator, &named.robot_model()?);
     say("refitting all causes")?;
     refitted(&judged, &mut accepted, evidence, simulator);
-    let before_last_fit = with_causes(model, &accepted);
-    let errors_of_fit = errors(evidence, &before_last_fit.robot_model()?, simulator)?;
+    let mut before_last = accepted.clone();
     say("computing intervals")?;
     let FinalFit { extended, confusable, drifts } = FinalFit::new(model, &judged, &mut accepted, evidence, simulator);
+    if accepted.len() < before_last.len() {
+        let is_cause = |name: String| accepted.iter().any(|(cause, _)| cause.hypothesis.name() == name);
+        before_last.retain(|(cause, _)| is_cause(cause.hypothesis.name()));
+        refitted(&judged, &mut before_last, evidence, simulator);
+    }
+    let before_last_fit = with_causes(model, &before_last);
+    let errors_of_fit = errors(evidence, &before_last_fit.robot_model()?, simulator)?;
+    let left = evidence.residual_power(simulator, &with_causes(&judged, &before_last).robot_model()?);
     say("choosing the next experiment")?;
     let pairs = experiment_design::pairs(&extended, &accepted, &confusable);
     let next = experiment_design::next_motion(&pairs, evidence, &robot, simulator);
@@ -177,6 +187,7 @@ pub fn diagnose(
         extended: errors_of_fit,
         noise_floor: reporting::noise_floor(evidence),
         findings: causes,
+        joint_gains: joint_gains.map_or(BTreeMap::new(), |gains| gains.by_joint()),
         confusable,
         unexplained: unexplained::unexplained(evidence, &extended.robot_model()?, given, &left, simulator),
         learned_residual: None,

@@ -6,6 +6,8 @@
 //! if its log-likelihood gain exceeds the threshold, it explains enough of the power above noise, and it is large
 //! enough.
 
+use std::collections::BTreeMap;
+
 use twinstep_effects::{CATALOGUE, EffectEntry, Parameter, Scope, Target};
 use twinstep_logs::Log;
 use twinstep_model::RobotModel;
@@ -52,6 +54,7 @@ pub fn diagnose_torques(logs: &[Log], progress: &mut DiagnoseProgress) -> Result
         noise_floor,
         unexplained: unexplained.max_by(|one, other| one.fraction.total_cmp(&other.fraction)).unwrap_or_default(),
         findings: all.into_iter().flat_map(|part| part.causes).collect(),
+        joint_gains: BTreeMap::new(),
         confusable: Vec::new(),
         learned_residual: None,
         next_experiment: None,

@@ -246,6 +246,7 @@ mod tests {
             extended: RmsErrors { torque_rmse_nm: Some(0.6), q_rmse_rad: Some(0.008) },
             noise_floor: RmsErrors::default(),
             findings,
+            joint_gains: BTreeMap::new(),
             confusable: Vec::new(),
             unexplained: Unexplained::default(),
             learned_residual: None,

@@ -1,4 +1,4 @@
-//! Lower part of the page: ambiguous causes, unexplained residual and provenance.
+//! Lower part of the page: ambiguous causes, gains of the joints, unexplained residual and provenance.
 
 use twinstep_diagnose::{Cause, CorrelatedPair, Diagnosis, NextExperiment, RmsErrors};
 use twinstep_effects::Effect;
@@ -54,6 +54,23 @@ fn experiments(effect: &str, others: &[String]) -> String {
     let confounders = Effect::named(effect).map_or(&[][..], |effect| effect.confounders);
     let known = confounders.iter().filter(|confounder| among(confounder.effect));
     known.map(|confounder| escape(confounder.discriminating_experiment)).collect::<Vec<_>>().join(" ")
+}
+
+/// Returns the section on gains that differ from joint to joint; empty if they do not.
+pub fn joint_gains(diagnosis: &Diagnosis) -> String {
+    let Some([kp, kd]) = diagnosis.joint_gain_ranges() else { return String::new() };
+    let range = |[low, high]: [f64; 2]| format!("{} to {}", number(low), number(high));
+    let row = |(joint, [kp, kd]): (&String, &[f64; 2])| {
+        format!("<tr><td>{}</td><td>{}</td><td>{}</td></tr>\n", escape(joint), number(*kp), number(*kd))
+    };
+    format!(
+        "<section>\n<h2>Gains of the joints</h2>\n<p>The position gains are {} times the commanded ones, the velocity gains \
+         {} times. Gains of equal motors differ by as much, so this is no cause. The extended model has these gains.</p>\n\
+         <div class=\"wide\"><table class=\"numbers\">\n<thead><tr><th>joint</th><th>kp</th><th>kd</th></tr></thead>\n{}</table></div>\n</section>\n",
+        range(kp),
+        range(kd),
+        diagnosis.joint_gains.iter().map(row).collect::<String>()
+    )
 }
 
 /// Returns the section on the residual that no cause explains.

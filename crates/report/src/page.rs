@@ -36,6 +36,7 @@ pub(crate) fn page(diagnosis: &Diagnosis, data: &ReportData) -> String {
         findings::cards(diagnosis, data),
         findings::ranking(diagnosis),
         limitations::confusions(diagnosis),
+        limitations::joint_gains(diagnosis),
         limitations::unexplained(diagnosis),
         limitations::learned_residual(diagnosis),
         limitations::provenance(diagnosis, &data.provenance),

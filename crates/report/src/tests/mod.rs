@@ -5,6 +5,8 @@
 mod browser;
 mod samples;
 
+use std::collections::BTreeMap;
+
 use twinstep_diagnose::{Diagnosis, RmsErrors, Unexplained};
 use twinstep_effects::ModelFile;
 use twinstep_logs::Log;
@@ -49,6 +51,7 @@ fn nothing() -> Diagnosis {
         extended: errors,
         noise_floor: errors,
         findings: Vec::new(),
+        joint_gains: BTreeMap::new(),
         confusable: Vec::new(),
         unexplained: Unexplained::default(),
         learned_residual: None,
@@ -173,4 +176,14 @@ fn error_names_a_path_that_cannot_be_written() {
         .unwrap_err()
         .to_string();
     assert!(error.starts_with("cannot write the report `/no/such/report.html`: "), "{error}");
+}
+
+#[test]
+fn gains_that_differ_from_joint_to_joint_are_in_a_section_of_their_own() {
+    let data = evidence(&chirp(&ModelFile::default(), BaseMount::Fixed), &ModelFile::default());
+    let gains = BTreeMap::from([("FL_calf".to_owned(), [0.962, 1.04]), ("RR_hip".to_owned(), [1.031, 0.97])]);
+    let shown = page(&Diagnosis { joint_gains: gains, ..nothing() }, &data);
+    check(&shown);
+    assert!(shown.contains("are 0.962 to 1.03 times") && shown.contains("<td>FL_calf</td>"));
+    assert!(!page(&nothing(), &data).contains("Gains of the joints"));
 }

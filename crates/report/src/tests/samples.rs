@@ -1,5 +1,6 @@
 //! Logs and constructed diagnoses for the tests of the report.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use twinstep_diagnose::{
@@ -69,6 +70,7 @@ pub fn findings() -> (Diagnosis, ModelFile) {
         extended: errors(0.014),
         noise_floor: errors(0.002),
         findings: vec![friction, armature, viscous],
+        joint_gains: BTreeMap::new(),
         confusable: vec![CorrelatedPair {
             effects: ["command_delay".to_owned(), "armature".to_owned()],
             correlation: -0.97,
@@ -155,6 +157,7 @@ pub fn simulated() -> (Log, Diagnosis, ModelFile) {
         ],
         baseline: RmsErrors { torque_rmse_nm: Some(0.84), q_rmse_rad: Some(0.03) },
         extended: RmsErrors { torque_rmse_nm: Some(0.07), q_rmse_rad: Some(0.003) },
+        joint_gains: BTreeMap::new(),
         confusable: Vec::new(),
         unexplained: Unexplained::default(),
         ..findings().0
