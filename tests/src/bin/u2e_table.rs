@@ -12,7 +12,7 @@ use clap::Parser;
 use twinstep_effects::ModelFile;
 use twinstep_ensemble::check_effects;
 use twinstep_logs::TorqueSensor;
-use twinstep_tests::process::Process;
+use twinstep_tests::hidden_robot::{record_jumps, serve};
 use twinstep_tests::python::root;
 use twinstep_tests::resumable::{Resumable, Step, number, read, text};
 
@@ -63,12 +63,8 @@ const COLLECTIONS: [&str; 3] = ["explore", "random", "base"];
 const METHODS: [&str; 5] = ["vanilla", "single", "u2e", "laws", "ours"];
 /// Tasks, with the settings of their fine-tuning.
 const TASKS: [(&str, &str); 2] = [("jump", "target_x_m = [0.6, 0.6]\n"), ("track", "")];
-/// Jumps in the held-out log, and the duration of each [s].
+/// Jumps in the held-out log.
 const JUMPS: u64 = 12;
-const JUMP_S: &str = "1.4";
-/// Noise of the robot's sensors.
-const SENSORS: &str = "[randomise.noise]\njoint_position_rad = 0.0005\njoint_velocity_rad_s = 0.1\n\
-                       joint_torque_nm = 0.35\nangular_velocity_rad_s = 0.02\n";
 /// Effects that the method `laws` identifies.
 const LAWS: &str = "command_delay@all,drive_lag@all,torque_saturation@all,torque_speed_limit@all,torque_gain@all,\
                     viscous_friction@all,coulomb_friction@all,payload@base";
@@ -127,38 +123,13 @@ impl Campaign {
         self.args.seed.to_string()
     }
 
-    /// Starts the hidden robot with a task. Returns its endpoint.
-    fn robot(&self, task: &str) -> Step<(Process, String)> {
-        let config = self.path(&format!("{task}-server.toml"));
-        std::fs::write(&config, format!("[task]\nname = \"{task}\"\n[sim]\nengine = \"mujoco\"\n{SENSORS}"))
-            .map_err(text)?;
-        let [config, hidden] = [&config, &self.hidden].map(|path| path.display().to_string());
-        let arguments =
-            ["serve", "--config", &config, "--model", &hidden, "--envs", "2", "--listen", "tcp/127.0.0.1:0"];
-        let arguments: Vec<String> = arguments
-            .iter()
-            .chain(&["--lease-grace-s", "0.1", "--until-stdin-closes"])
-            .map(ToString::to_string)
-            .collect();
-        Process::listening(&self.commands.twinstep, &arguments)
-    }
-
     /// Records the held-out jumps, then runs the loop for each way of collecting logs.
     fn collect(&self) -> Step {
-        let held_out = self.path("held-out");
-        if !held_out.exists() {
-            let (_server, endpoint) = self.robot("jump")?;
-            let partial = self.path("held-out.partial");
-            let _ = std::fs::remove_dir_all(&partial);
-            for jump in 0..JUMPS {
-                let (log, seed) = (partial.join(jump.to_string()).display().to_string(), (1000 + jump).to_string());
-                let run = ["run", "data/policies/jump.safetensors", "--endpoint", &endpoint, "--torque", "--fast"];
-                self.commands.run(&[&run[..], &["--seconds", JUMP_S, "--seed", &seed, "--log", &log]].concat())?;
-            }
-            merge_logs(&partial, JUMPS)?;
-            std::fs::rename(&partial, &held_out).map_err(text)?;
+        if !self.path("held-out").exists() {
+            let (_server, endpoint) = serve(&self.commands, "jump", &self.hidden)?;
+            record_jumps(&self.commands, &endpoint, JUMPS)?;
         }
-        let (_server, endpoint) = self.robot("walk")?;
+        let (_server, endpoint) = serve(&self.commands, "walk", &self.hidden)?;
         for method in COLLECTIONS {
             let config = self.path(&format!("{method}.toml"));
             std::fs::write(&config, self.config(method, &endpoint)).map_err(text)?;
@@ -316,29 +287,4 @@ impl Campaign {
         }
         Ok(table)
     }
-}
-
-/// Merges the logs `0` to `count − 1` in `folder` into one log there: each is an episode.
-fn merge_logs(folder: &Path, count: u64) -> Step {
-    let (mut merged, mut start) = (String::new(), 0.0);
-    for log in 0..count {
-        let path = folder.join(log.to_string());
-        let table = std::fs::read_to_string(path.join("data.csv")).map_err(text)?;
-        let mut lines = table.lines();
-        let header = lines.next().ok_or("a log has a header")?;
-        if log == 0 {
-            merged = header.to_owned() + "\n";
-            std::fs::copy(path.join("meta.json"), folder.join("meta.json")).map_err(text)?;
-        }
-        let mut end = start;
-        for line in lines {
-            let (time, rest) = line.split_once(',').ok_or("a row has columns")?;
-            let (_, rest) = rest.split_once(',').ok_or("a row has columns")?;
-            end = start + time.parse::<f64>().map_err(text)?;
-            let _ = writeln!(merged, "{end:.3},{log},{rest}");
-        }
-        start = end + 0.5;
-        std::fs::remove_dir_all(&path).map_err(text)?;
-    }
-    std::fs::write(folder.join("data.csv"), merged).map_err(text)
 }

@@ -10,11 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Parser;
-use rand::RngExt;
-use twinstep_effects::{EffectEntry, ModelFile};
-use twinstep_model::stream;
-use twinstep_tests::ground_truth_robot::effect;
-use twinstep_tests::process::Process;
+use twinstep_tests::hidden_robot::{Collection, HiddenRobot};
 use twinstep_tests::python::root;
 use twinstep_tests::resumable::{Resumable, Step, text};
 
@@ -55,21 +51,6 @@ struct Args {
     table: bool,
 }
 
-/// Effects that are hidden.
-const HIDDEN: [&str; 7] = [
-    "payload@base",
-    "torque_saturation@hip",
-    "torque_saturation@thigh",
-    "torque_saturation@calf",
-    "coulomb_friction@hip",
-    "coulomb_friction@thigh",
-    "coulomb_friction@calf",
-];
-/// Effects that are identified with them: MuJoCo's ground differs from that of the batch engine.
-const GROUND: [&str; 2] = ["ground_stiffness@ground", "ground_friction@ground"];
-/// Noise of the robot's sensors.
-const SENSORS: &str = "[randomise.noise]\njoint_position_rad = 0.0005\njoint_velocity_rad_s = 0.1\n\
-                       joint_torque_nm = 0.35\nangular_velocity_rad_s = 0.02\n";
 impl Args {
     /// Returns the ways of choosing the commands of the second log, `random` first.
     fn collections(&self) -> Vec<&str> {
@@ -159,62 +140,35 @@ fn campaign(args: &Args) -> Step<String> {
 /// A hidden robot and the folder of its results.
 struct Robot<'a> {
     args: &'a Args,
-    commands: Resumable,
+    hidden: HiddenRobot,
     seed: u64,
 }
 
 impl<'a> Robot<'a> {
     fn new(args: &'a Args, seed: u64) -> Step<Self> {
-        let commands = Resumable::new(&args.out.join(seed.to_string()))?;
-        std::fs::write(commands.path("hidden.toml"), hidden(seed).to_toml()).map_err(text)?;
-        Ok(Self { args, commands, seed })
+        Ok(Self { args, hidden: HiddenRobot::new(&args.out, seed)?, seed })
     }
 
     /// Identifies the robot from logs of random and of designed commands. The first log is the same for all.
     fn collect(&self) -> Step {
-        let done = |method: &str| self.commands.path(method).join("report.md").exists();
+        let done = |method: &str| self.commands().path(method).join("report.md").exists();
         let missing: Vec<_> = self.args.collections().into_iter().filter(|method| !done(method)).collect();
         if missing.is_empty() {
             return Ok(());
         }
-        let (_server, endpoint) = self.server()?;
-        for method in missing {
-            for stage in ["1-random", "held-out"].iter().filter(|_| method != "random") {
-                let of = |method: &str| self.commands.path(method).join(stage);
-                copy(&of("random"), &of(method))?;
-            }
-            let config = self.commands.path(&format!("{method}.toml"));
-            let (Args { candidates, .. }, seed) = (self.args, self.seed);
-            // What differs between the engines does not matter.
-            let of_interest: &[&str] = if method == "qoed" { &HIDDEN } else { &[] };
-            let unknowns: Vec<&str> = HIDDEN.into_iter().chain(GROUND).collect();
-            let settings = format!(
-                "policy = \"data/policies/walk.safetensors\"\nunknowns = {unknowns:?}\nendpoint = \"{endpoint}\"\n\
-                 method = \"{method}\"\ncandidates = {candidates}\nof_interest = {of_interest:?}\nfast = true\nseed = {seed}\n"
-            );
-            std::fs::write(&config, settings).map_err(text)?;
-            self.commands.run(&["spi-active", &config.display().to_string()])?;
-        }
-        Ok(())
+        let (_server, endpoint) = self.hidden.serve("walk")?;
+        let collection = Collection { rounds: 1, seconds: 25.0, segment_s: 5.0, candidates: self.args.candidates };
+        missing.iter().try_for_each(|method| self.hidden.identify(method, collection, self.seed, &endpoint))
     }
 
-    /// Starts the hidden robot. Returns its endpoint.
-    fn server(&self) -> Step<(Process, String)> {
-        let (config, hidden) = (self.commands.path("server.toml"), self.commands.path("hidden.toml"));
-        std::fs::write(&config, format!("[task]\nname = \"walk\"\n[sim]\nengine = \"mujoco\"\n{SENSORS}"))
-            .map_err(text)?;
-        let [config, hidden] = [config, hidden].map(|path| path.display().to_string());
-        let arguments =
-            ["serve", "--config", &config, "--model", &hidden, "--envs", "2", "--listen", "tcp/127.0.0.1:0"];
-        let ends = ["--lease-grace-s", "0.1", "--until-stdin-closes"];
-        let arguments: Vec<String> = arguments.iter().chain(&ends).map(ToString::to_string).collect();
-        Process::listening(&self.commands.twinstep, &arguments)
+    fn commands(&self) -> &Resumable {
+        &self.hidden.commands
     }
 
     /// Continues a training on the model of a method, and evaluates the policy.
     fn tune_and_evaluate(&self, task: &Task, method: &str, start: &Path) -> Step {
-        let out = self.commands.path(&format!("{method}-{}", task.name));
-        let config = self.commands.path(&format!("{method}-{}.toml", task.name));
+        let out = self.commands().path(&format!("{method}-{}", task.name));
+        let config = self.commands().path(&format!("{method}-{}.toml", task.name));
         let heavy = std::fs::read_to_string(root().join("examples/spi-active/heavy.toml")).map_err(text)?;
         let randomise = if method == "heavy" { heavy } else { String::new() };
         let settings = format!("[task]\nname = \"{}\"\n{}{randomise}", task.name, task.settings);
@@ -225,7 +179,7 @@ impl<'a> Robot<'a> {
             vec!["train", task.name, "--config", &config, "--from", &from, "--steps", &steps, "--seed", &seed];
         let model = self.model(method).map(|path| path.display().to_string());
         arguments.extend(model.iter().flat_map(|model| ["--model", model.as_str()]));
-        self.commands.step(&out.join("evaluation.json"), &arguments, &out)?;
+        self.commands().step(&out.join("evaluation.json"), &arguments, &out)?;
         self.evaluate(task, method, &out.join("policy.safetensors"))
     }
 
@@ -237,19 +191,19 @@ impl<'a> Robot<'a> {
             "truth" => "hidden.toml".to_owned(),
             _ => format!("{}/2-active/model.toml", method.strip_prefix("spi-")?),
         };
-        Some(self.commands.path(&path))
+        Some(self.commands().path(&path))
     }
 
     /// Evaluates a policy on the hidden robot in MuJoCo.
     fn evaluate(&self, task: &Task, method: &str, policy: &Path) -> Step {
-        let result = self.commands.path(&format!("{method}-{}.json", task.name));
+        let result = self.commands().path(&format!("{method}-{}.json", task.name));
         if result.exists() {
             return Ok(());
         }
-        let hidden = self.commands.path("hidden.toml").display().to_string();
+        let hidden = self.hidden.model.display().to_string();
         let (policy, robots) = (policy.display().to_string(), self.args.evaluated.to_string());
         let seconds = task.seconds.to_string();
-        let json = self.commands.run(
+        let json = self.commands().run(
             &[
                 &["evaluate-policy", &policy, "--engine", "mujoco", "--model", &hidden, "--condition", "nominal"][..],
                 &["--robots", &robots, "--seconds", &seconds, "--json"],
@@ -258,46 +212,4 @@ impl<'a> Robot<'a> {
         )?;
         std::fs::write(&result, json).map_err(text)
     }
-}
-
-/// Returns the hidden robot of a seed: a payload, and for each joint type a saturation and a dry friction.
-fn hidden(seed: u64) -> ModelFile {
-    let mut random = stream(seed, "spi_table", 0);
-    let mut draw = |low: f64, high: f64| random.random_range(low..high);
-    let entries = HIDDEN.map(|name| {
-        let (name, scope) = name.split_once('@').expect("an effect with its scope");
-        let values = match (name, scope) {
-            ("payload", _) => vec![draw(0.5, 2.5), draw(-0.08, 0.08), draw(-0.04, 0.04), draw(0.0, 0.08)],
-            ("torque_saturation", _) => vec![draw(18.0, 30.0)],
-            (_, "calf") => vec![draw(0.2, 0.8)],
-            _ => vec![draw(0.1, 0.5)],
-        };
-        let (effect, scope) = effect(name, scope);
-        EffectEntry::new(effect, scope, values).expect("values within the allowed range")
-    });
-    ModelFile { effects: entries.to_vec(), ..ModelFile::default() }
-}
-
-/// Copies a folder, unless it is there.
-fn copy(from: &Path, to: &Path) -> Step {
-    if to.exists() {
-        return Ok(());
-    }
-    let partial = to.with_extension("partial");
-    copy_into(from, &partial)?;
-    std::fs::rename(&partial, to).map_err(text)
-}
-
-fn copy_into(from: &Path, to: &Path) -> Step {
-    std::fs::create_dir_all(to).map_err(text)?;
-    for entry in std::fs::read_dir(from).map_err(text)? {
-        let path = entry.map_err(text)?.path();
-        let target = to.join(path.file_name().ok_or("an entry has a name")?);
-        if path.is_dir() {
-            copy_into(&path, &target)?;
-        } else {
-            std::fs::copy(&path, &target).map(drop).map_err(text)?;
-        }
-    }
-    Ok(())
 }
