@@ -43,6 +43,11 @@ impl CmaEs {
         }
     }
 
+    /// Returns the mean.
+    pub fn mean(&self) -> &[f64] {
+        self.mean.as_slice()
+    }
+
     /// Returns the number of points of a generation.
     pub fn population(&self) -> usize {
         2 * self.weights.len()

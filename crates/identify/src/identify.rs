@@ -8,6 +8,7 @@ use twinstep_model::{Precision, Rollout};
 use crate::experiment::{Experiment, Regime};
 use crate::global_search::GlobalSearch;
 use crate::least_squares::{Differences, LeastSquaresProblem};
+use crate::local_search::local_search;
 use crate::parameter::{
     FreeParameter, coordinate_in, drop_unidentifiable, free_parameters, initial_coordinate, set_intervals, with_values,
 };
@@ -202,6 +203,19 @@ pub fn identify(
             !interrupted
         });
         spread = task.estimate_residual_scale(simulator, &point);
+    }
+    if !free.is_empty() && !interrupted && experiments.iter().any(Experiment::has_floating_base) {
+        let scaled = LeastSquaresProblem { residual_scale: &spread, ..task };
+        let here = scaled.linearise(simulator, &point);
+        if let Some(covariance) = here.and_then(|here| covariance(&here, &blocks(experiments), &[])) {
+            let single = LeastSquaresProblem { precision: Precision::Single, ..scaled };
+            point = local_search(&single, simulator, &point, &covariance, options.seed, |cost| {
+                steps += 1;
+                interrupted = !progress(Stage::Refinement, steps, cost);
+                !interrupted
+            });
+            spread = task.estimate_residual_scale(simulator, &point);
+        }
     }
     let last = task.residuals(simulator, std::slice::from_ref(&point)).remove(0).unwrap_or_else(|| first.clone());
     let here = LeastSquaresProblem { residual_scale: &spread, ..task }.linearise(simulator, &point);

@@ -12,8 +12,10 @@
 //! - [`InverseDynamicsResidual`]: torque of the model's actuators minus the inverse dynamics, row by row.
 //! - [`FreeParameter`]: a parameter of a model file that is estimated, with bounds and prior.
 //! - [`CmaEs`]: the search distribution; [`GlobalSearch`]: CMA-ES on a least-squares problem, which can be interrupted and resumed.
+//! - `local_search`: CMA-ES within the uncertainty of an estimate, where contacts make the cost rough.
 //! - [`NuisanceModel`]: nuisance parameters, eliminated by generalised least squares.
-//! - [`identify()`]: predicted identifiability, CMA-ES, Levenberg–Marquardt, then intervals and correlations.
+//! - [`identify()`]: predicted identifiability, CMA-ES, Levenberg–Marquardt, `local_search`, then intervals and
+//!   correlations.
 //!
 //! Simulators implement [`twinstep_model::Rollout`]; this crate does not depend on an engine.
 
@@ -28,6 +30,7 @@ mod global_search;
 pub mod identify;
 mod inverse_dynamics;
 pub mod least_squares;
+mod local_search;
 pub mod nuisance;
 pub mod orientation;
 pub mod parameter;

@@ -4,12 +4,13 @@ use nalgebra::DMatrix;
 use proptest::prelude::*;
 use twinstep_effects::{CATALOGUE, Effect, EffectEntry, ModelFile, Scope, Target};
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
-use twinstep_model::{BaseMount, Precision, RobotStates, Rollout, RolloutRequest, go2};
+use twinstep_model::{BaseMount, Precision, RobotModel, RobotStates, Rollout, RolloutRequest, go2};
 
 use crate::experiment::Experiment;
 use crate::global_search::GlobalSearch;
 use crate::identify::{IdentifyOptions, identify};
 use crate::least_squares::{Differences, LeastSquaresProblem};
+use crate::local_search::local_search;
 use crate::parameter::{FreeParameter, drop_unidentifiable, free_parameters, initial_coordinate, with_values};
 use crate::refine::{DAMPING_FACTORS, SIMULATOR_MISMATCH_STD, covariance, information, refine};
 use crate::window::WindowConfig;
@@ -38,6 +39,24 @@ impl Rollout for Linear {
             states
         };
         jobs.iter().map(play).collect()
+    }
+}
+
+/// As [`Linear`], with a ripple of the friction: contact events make a cost as rough.
+struct Rough;
+
+impl Rollout for Rough {
+    fn run(&mut self, jobs: &[RolloutRequest], precision: Precision) -> Vec<RobotStates> {
+        let rough = |job: &RolloutRequest| {
+            let mut robot = job.robot.clone();
+            let joint = &mut robot.joints[0];
+            joint.viscous_friction += 0.02 * (300.0 * joint.viscous_friction).sin();
+            joint.coulomb_friction += 0.05 * (110.0 * joint.coulomb_friction).sin();
+            robot
+        };
+        let robots: Vec<RobotModel> = jobs.iter().map(rough).collect();
+        let jobs: Vec<_> = jobs.iter().zip(&robots).map(|(job, robot)| RolloutRequest { robot, ..*job }).collect();
+        Linear.run(&jobs, precision)
     }
 }
 
@@ -85,6 +104,22 @@ fn refinement_converges_to_the_truth_up_to_the_pull_of_the_prior() {
             let pull = (unknown.prior[0] - truth) / information[(index, index)];
             assert!((found[index] - truth - pull).abs() < 0.01 * unknown.prior[1], "{} for {truth}", found[index]);
         }
+    });
+}
+
+#[test]
+fn local_search_finds_a_lower_cost_where_a_refinement_of_a_rough_cost_has_stopped() {
+    with_problem(|task, _| {
+        let begin = vec![TRUTH[0] + 0.06, TRUTH[1] - 0.2];
+        let cost = |point: &[f64]| {
+            let residuals = task.residuals(&mut Rough, &[point.to_vec()]).remove(0).expect("finite");
+            task.cost(&residuals, point)
+        };
+        let refined = refine(task, &mut Rough, &DAMPING_FACTORS, begin, |_| true);
+        let uncertainty = DMatrix::from_diagonal_element(2, 2, 0.25);
+        let found = local_search(task, &mut Rough, &refined, &uncertainty, 1, |_| true);
+        let [before, after] = [&refined, &found].map(|point| cost(point));
+        assert!(after < 0.2 * before, "{before} at {refined:?}, {after} at {found:?}");
     });
 }
 
