@@ -24,6 +24,7 @@ mod base_wrench;
 mod cmaes;
 mod effect_list;
 mod error;
+mod estimates;
 pub mod evaluate;
 pub mod experiment;
 mod global_search;
@@ -50,12 +51,12 @@ pub use base_wrench::MeasuredStance;
 pub use cmaes::CmaEs;
 pub use effect_list::{DEFAULT_EFFECTS, EffectAtScope, EffectAtScopeError, UnknownEffect, default_effects, named};
 pub use error::ExperimentError;
+pub use estimates::{CorrelatedPairs, EstimateStatus, ParameterEstimate};
 pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};
 pub use experiment::{Experiment, SimulatedPose};
 pub use global_search::GlobalSearch;
 pub use identify::{
-    EstimateStatus, Identification, IdentifyError, IdentifyOptions, IdentifyProgress, ParameterEstimate, Stage,
-    identify, predicted_information,
+    Identification, IdentifyError, IdentifyOptions, IdentifyProgress, Stage, identify, predicted_information,
 };
 pub use inverse_dynamics::{InverseDynamicsResidual, JointSeries, JointTrajectory};
 pub use nuisance::NuisanceModel;
