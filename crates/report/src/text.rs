@@ -61,6 +61,9 @@ pub fn verdict(diagnosis: &Diagnosis) -> String {
     let Diagnosis { findings, unexplained, baseline, extended, .. } = diagnosis;
     if findings.is_empty() {
         return match unexplained.depends_on.split_first() {
+            None if unexplained.fraction < NEGLIGIBLE_FRACTION && !diagnosis.joint_gains.is_empty() => {
+                "No cause: the gains differ from joint to joint by a few percent, as those of equal motors.".to_owned()
+            }
             None if unexplained.fraction < NEGLIGIBLE_FRACTION => "No model error above the noise.".to_owned(),
             None => format!(
                 "The model has an error, but no cause reaches the threshold: {} of the residual power is unexplained.",
