@@ -13,7 +13,7 @@
 //! - [`confounded_pairs`]: pairs of confounded effects, for experiment design
 //! - [`foreign_policy`]: policies with the conventions of other programs
 //! - [`fuzz`]: random changes to messages and files
-//! - [`hidden_robot`]: robots that the methods of a comparison do not know
+//! - [`mujoco_ground_truth`]: robots in MuJoCo with hidden effects, on which methods are compared
 //! - [`resumable`]: commands whose results are kept
 //! - [`robot_rig`]: a fake Go2 under the safety state machine, on an accelerated clock
 //! - [`robot_campaign`]: faults of this robot in each state, and random sequences of events
@@ -32,7 +32,7 @@ pub mod foreign_policy;
 pub mod fuzz;
 pub mod ground_truth_actuator;
 pub mod ground_truth_robot;
-pub mod hidden_robot;
+pub mod mujoco_ground_truth;
 pub mod process;
 pub mod proxy;
 pub mod python;

@@ -17,8 +17,8 @@ use crate::robot_file::{analytic_model, simulator};
 ///
 /// The log's commands are simulated with thousands of candidate parameter sets in the batch engine. The simulations are
 /// compared with the measurements, each channel in units of its noise. CMA-ES performs the global search;
-/// Levenberg–Marquardt refines its result. Of a robot with a floating base, CMA-ES then searches within the uncertainty of the
-/// estimate. Every estimate has a 95 % interval. Before the search, the identifiability
+/// Levenberg–Marquardt refines its result. If a segment has a floating base, CMA-ES then searches within the uncertainty
+/// of the estimate. Every estimate has a 95 % interval. Before the search, the identifiability
 /// of each parameter from the logs is predicted. A parameter that is not identifiable keeps its initial value and is
 /// reported, unless --force is given. Highly correlated parameters are reported with an experiment that separates them.
 ///
@@ -150,6 +150,7 @@ pub fn write_model(args: &Args, signals: &Signals) -> CommandResult {
             Stage::Identifiability => "identifiability".to_owned(),
             Stage::GlobalSearch => format!("global search, cost {cost:.4e}"),
             Stage::Refinement => format!("refinement {step}, cost {cost:.4e}"),
+            Stage::LocalSearch => format!("local search {step}, cost {cost:.4e}"),
         });
         if stage == Stage::GlobalSearch {
             bar.set_position(step as u64);

@@ -68,7 +68,7 @@ pub struct ForwardSelection<'a> {
     pub views: &'a [WindowedData],
     /// Index of the data in use.
     pub view: usize,
-    /// The given model with fitted ground.
+    /// The given model with fitted ground, and with the gains of the joints, if they differ.
     pub baseline: ModelFile,
     pub accepted: Accepted,
     /// [`ForwardSelection::baseline`] with all accepted causes, fitted jointly to both folds.
@@ -84,14 +84,16 @@ pub struct ForwardSelection<'a> {
 impl<'a> ForwardSelection<'a> {
     /// Runs forward selection with backward elimination.
     ///
-    /// Each round adds the best candidate, or the gains of all joints, and refits all causes. If none reaches the threshold, a cause that is
-    /// implausible or leaves much of the error of its own channels is removed and excluded. Causes that are too small are
-    /// removed at the end.
+    /// Each round adds the best candidate, or the gains of all joints, and refits all causes. If none reaches the threshold, a
+    /// cause that is implausible or leaves much of the error of its own channels is removed and excluded. Causes that are too
+    /// small are removed at the end.
     pub fn run(&mut self) -> Result<(), DiagnoseError> {
         let mut excluded = Vec::new();
         for _ in 0..MOST_SEARCHES {
             let next = if self.accepted.len() < MOST_CAUSES { self.best_addition(&excluded)? } else { None };
-            if next.as_ref().is_some_and(|(best, _)| self.joint_gains_explain_more(best)) {
+            if let Some((best, _)) = &next
+                && self.joint_gains_explain_more(best)?
+            {
                 continue;
             }
             let added = next.as_ref().map(|(best, _)| best.hypothesis.effect);
@@ -121,17 +123,18 @@ impl<'a> ForwardSelection<'a> {
     }
 
     /// Adds the gains of the joints to the model if they are more likely than `best`. Returns true if so.
-    fn joint_gains_explain_more(&mut self, best: &CandidateFit) -> bool {
+    fn joint_gains_explain_more(&mut self, best: &CandidateFit) -> Result<bool, DiagnoseError> {
         if self.joint_gains.is_some() {
-            return false;
+            return Ok(false);
         }
+        (self.progress)(&format!("fitting the gains of all joints; causes: {}", self.accepted.len()))?;
         let evidence = &self.looked_at().evidence;
         let gains = JointGains::fit(evidence, &self.model, best.score, self.simulator);
-        let Some(gains) = gains.filter(|gains| gains.score > best.score) else { return false };
+        let Some(gains) = gains.filter(|gains| gains.score > best.score) else { return Ok(false) };
         self.baseline = gains.added_to(&self.baseline);
         self.joint_gains = Some(gains);
         self.refit();
-        true
+        Ok(true)
     }
 
     /// Merges the causes of each effect as [`ForwardSelection::merge_scopes`] does.
@@ -168,6 +171,12 @@ impl<'a> ForwardSelection<'a> {
         let WindowedData { evidence, given } = self.looked_at();
         let robot = self.model.robot_model().expect("fitted within its bounds");
         let left = evidence.residual_power(self.simulator, &robot);
+        // What the gains of the joints explain, a cause does not.
+        let with_gains = self.joint_gains.is_some().then(|| {
+            let baseline = self.baseline.robot_model().expect("fitted within its bounds");
+            evidence.residual_power(self.simulator, &baseline)
+        });
+        let given = with_gains.as_ref().unwrap_or(given);
         let stands = |hypothesis: &Hypothesis| {
             let at_sensor = evidence.torque_sensor_shows(&self.baseline, hypothesis);
             hypothesis.is_plausible() && explains_affected_channels(hypothesis, at_sensor, given, &left)
@@ -278,7 +287,9 @@ impl<'a> ForwardSelection<'a> {
     pub fn refit(&mut self) {
         let hypotheses: Vec<_> = self.accepted.iter().map(|(best, _)| best.hypothesis.clone()).collect();
         self.model = self.baseline.clone();
-        let Some(fit) = FitProblem::new(&self.baseline, &hypotheses).filter(|_| !hypotheses.is_empty()) else { return };
+        let Some(fit) = FitProblem::new(&self.baseline, &hypotheses).filter(|_| !hypotheses.is_empty()) else {
+            return self.choose_windows();
+        };
         let point = refine_with_restarts(&fit, &self.looked_at().evidence, self.simulator);
         self.model = fit.model(&point);
         write_estimates(&mut self.accepted, &fit, &point);

@@ -45,6 +45,7 @@ pub fn extend(search: &mut ForwardSelection) -> Result<(), DiagnoseError> {
     }
     (search.progress)("fitting the friction of all joints together")?;
     let (single, model, view) = (search.accepted.clone(), search.model.clone(), search.view);
+    let (baseline, gains) = (search.baseline.clone(), search.joint_gains.clone());
     let before = together(search);
     let laws = JointKind::ALL.into_iter().flat_map(|kind| of_scope(Scope::Kind(kind)));
     search.accepted = laws.map(|hypothesis| (unscored(hypothesis), Vec::new())).collect();
@@ -59,8 +60,11 @@ pub fn extend(search: &mut ForwardSelection) -> Result<(), DiagnoseError> {
         eliminate_without_evidence(search);
         evidence_beside_others(search)?;
     }
-    if together(search) <= before {
+    // Gains that were added since are part of the model with which `together` compares.
+    let added = search.joint_gains.as_ref().filter(|_| gains.is_none()).map_or(0.0, |gains| gains.score);
+    if together(search) + added <= before {
         (search.accepted, search.model, search.view) = (single, model, view);
+        (search.baseline, search.joint_gains) = (baseline, gains);
     }
     Ok(())
 }

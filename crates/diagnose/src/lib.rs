@@ -114,7 +114,7 @@ pub type DiagnoseProgress<'a> = dyn FnMut(&str) -> bool + 'a;
 pub struct DiagnosisOutput {
     /// The findings. The caller that writes the files sets `extended_model`.
     pub diagnosis: Diagnosis,
-    /// The given model with the causes and their intervals.
+    /// The given model with the gains of the joints, if they differ, the causes and their intervals.
     pub extended: ModelFile,
     /// The model before the last fit, which includes the held-out blocks: what [`Diagnosis::extended`] evaluates.
     pub before_last_fit: ModelFile,

@@ -50,6 +50,8 @@ pub enum Stage {
     GlobalSearch,
     /// Levenberg–Marquardt.
     Refinement,
+    /// CMA-ES within the uncertainty of the estimate.
+    LocalSearch,
 }
 
 /// Progress callback with stage, step and value: the RMS residual in the first stage, then the cost.
@@ -179,9 +181,10 @@ pub fn identify(
         let here = scaled.linearise(simulator, &point);
         if let Some(covariance) = here.and_then(|here| covariance(&here, &blocks(experiments), &[])) {
             let single = LeastSquaresProblem { precision: Precision::Single, ..scaled };
+            steps = 0;
             point = local_search(&single, simulator, &point, &covariance, options.seed, |cost| {
                 steps += 1;
-                interrupted = !progress(Stage::Refinement, steps, cost);
+                interrupted = !progress(Stage::LocalSearch, steps, cost);
                 !interrupted
             });
             spread = task.estimate_residual_scale(simulator, &point);

@@ -2,6 +2,7 @@
 
 use twinstep_diagnose::{Cause, CorrelatedPair, Diagnosis, NextExperiment, RmsErrors};
 use twinstep_effects::Effect;
+use twinstep_model::Joint;
 
 use crate::html::{escape, number, percent};
 use crate::report_data::{LogFacts, Provenance};
@@ -60,16 +61,23 @@ fn experiments(effect: &str, others: &[String]) -> String {
 pub fn joint_gains(diagnosis: &Diagnosis) -> String {
     let Some([kp, kd]) = diagnosis.joint_gain_ranges() else { return String::new() };
     let range = |[low, high]: [f64; 2]| format!("{} to {}", number(low), number(high));
-    let row = |(joint, [kp, kd]): (&String, &[f64; 2])| {
-        format!("<tr><th scope=\"row\">{}</th><td>{}</td><td>{}</td></tr>\n", escape(joint), number(*kp), number(*kd))
+    let row = |joint: Joint| {
+        let [kp, kd] = diagnosis.joint_gains.get(joint.name())?;
+        Some(format!(
+            "<tr><th scope=\"row\">{}</th><td>{}</td><td>{}</td></tr>\n",
+            joint.name(),
+            number(*kp),
+            number(*kd)
+        ))
     };
     format!(
-        "<section>\n<h2>Gains of the joints</h2>\n<p>The position gains are {} times the commanded ones, the velocity gains \
-         {} times. Gains of equal motors differ by as much, so this is no cause. The extended model has these gains.</p>\n\
+        "<section>\n<h2>Gains of the joints</h2>\n<p>The position gains are {} times those that the given model and the \
+         causes have, the velocity gains {} times. Gains of equal motors differ by as much, so this is no cause. The \
+         extended model has these gains.</p>\n\
          <div class=\"wide\"><table class=\"numbers\">\n<thead><tr><th></th><th>kp</th><th>kd</th></tr></thead>\n{}</table></div>\n</section>\n",
         range(kp),
         range(kd),
-        diagnosis.joint_gains.iter().map(row).collect::<String>()
+        Joint::ALL.into_iter().filter_map(row).collect::<String>()
     )
 }
 

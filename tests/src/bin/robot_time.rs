@@ -9,8 +9,9 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Parser;
+use twinstep_logs::{Log, Meta, TorqueSensor};
 use twinstep_report::chart::{self, Line, Panel, RGBColor};
-use twinstep_tests::hidden_robot::{Collection, HiddenRobot, record_jumps, unknowns};
+use twinstep_tests::mujoco_ground_truth::{Collection, MujocoGroundTruth, record_jumps, unknowns};
 use twinstep_tests::resumable::{Step, number, read, text};
 
 /// Compare ways of collecting data on hidden robots, by the error of the models on two held-out logs.
@@ -34,6 +35,13 @@ struct Args {
     /// Methods: `random`, a criterion of `twinstep excite`, and `uncertainty`: the exploration policy of U2E.
     #[arg(long, value_delimiter = ',', default_value = "random,trace,d-optimal,qoed,uncertainty")]
     methods: Vec<String>,
+}
+
+impl Args {
+    fn collection(&self) -> Collection {
+        let Self { rounds, seconds, candidates, .. } = *self;
+        Collection { rounds, seconds, segment_s: SEGMENT_S, candidates }
+    }
 }
 
 /// Duration of a velocity command [s].
@@ -71,12 +79,14 @@ fn main() -> ExitCode {
 fn campaign(args: &Args) -> Step<String> {
     let mut errors = Vec::new();
     for seed in 1..=args.robots {
-        let hidden = HiddenRobot::new(&args.out, seed)?;
+        let hidden = MujocoGroundTruth::new(&args.out, seed)?;
         if !hidden.commands.path("held-out").exists() {
             let (_server, endpoint) = hidden.serve("jump")?;
             record_jumps(&hidden.commands, &endpoint, JUMPS)?;
         }
         let (_server, endpoint) = hidden.serve("walk")?;
+        // The other methods use its first log and its held-out log.
+        hidden.identify("random", args.collection(), seed, &endpoint)?;
         let of_method = |method: &String| robot_errors(args, &hidden, method, seed, &endpoint);
         errors.push(args.methods.iter().map(of_method).collect::<Step<Vec<_>>>()?);
         std::fs::write(args.out.join("robot-time.svg"), figure(args, &errors)?).map_err(text)?;
@@ -88,21 +98,16 @@ fn campaign(args: &Args) -> Step<String> {
 type Errors = Vec<[f64; 2]>;
 
 /// Collects logs with a method and identifies the robot after each of them. Returns the errors of the models.
-fn robot_errors(args: &Args, hidden: &HiddenRobot, method: &str, seed: u64, endpoint: &str) -> Step<Errors> {
-    let models = match method {
-        "uncertainty" => explored(args, hidden, seed, endpoint)?,
-        _ => {
-            let Args { rounds, seconds, candidates, .. } = *args;
-            hidden.identify(
-                method,
-                Collection { rounds, seconds, segment_s: SEGMENT_S, candidates },
-                seed,
-                endpoint,
-            )?;
-            let later = if method == "random" { "random" } else { "active" };
-            let stage = |number: u32| format!("{number}-{}", if number == 1 { "random" } else { later });
-            (1..=rounds + 1).map(|number| hidden.commands.path(method).join(stage(number)).join("model.toml")).collect()
-        }
+fn robot_errors(args: &Args, hidden: &MujocoGroundTruth, method: &str, seed: u64, endpoint: &str) -> Step<Errors> {
+    let models = if method == "uncertainty" {
+        explored(args, hidden, seed, endpoint)?
+    } else {
+        hidden.identify(method, args.collection(), seed, endpoint)?;
+        let later = if method == "random" { "random" } else { "active" };
+        let stage = |number: u32| format!("{number}-{}", if number == 1 { "random" } else { later });
+        (1..=args.rounds + 1)
+            .map(|number| hidden.commands.path(method).join(stage(number)).join("model.toml"))
+            .collect()
     };
     let logs = [hidden.commands.path("random/held-out/log"), hidden.commands.path("held-out")];
     let error = |model: &Path, log: usize| -> Step<f64> {
@@ -118,7 +123,7 @@ fn robot_errors(args: &Args, hidden: &HiddenRobot, method: &str, seed: u64, endp
 }
 
 /// Collects logs with exploration policies of U2E, and identifies the same unknowns from them. Returns the models.
-fn explored(args: &Args, hidden: &HiddenRobot, seed: u64, endpoint: &str) -> Step<Vec<PathBuf>> {
+fn explored(args: &Args, hidden: &MujocoGroundTruth, seed: u64, endpoint: &str) -> Step<Vec<PathBuf>> {
     let config = hidden.commands.path("uncertainty.toml");
     let Args { rounds, seconds, .. } = args;
     let settings = format!(
@@ -131,20 +136,39 @@ fn explored(args: &Args, hidden: &HiddenRobot, seed: u64, endpoint: &str) -> Ste
     let (mut logs, mut models) = (Vec::new(), Vec::<PathBuf>::new());
     for log in 0..=*rounds {
         let name = if log == 0 { "base" } else { "explore" };
-        logs.push(folder.join(format!("{log}-{name}/log")).display().to_string());
+        let without = folder.join(format!("log-{log}-without-torques.parquet"));
+        write_without_torques(&folder.join(format!("{log}-{name}/log")), &without)?;
+        logs.push(without.display().to_string());
         let model = folder.join(format!("model-{log}.toml"));
         if !model.exists() {
-            let (effects, out, seed) = (unknowns().join(","), model.display().to_string(), seed.to_string());
+            let partial = folder.join(format!("model-{log}.partial.toml"));
+            let (effects, out, seed) = (unknowns().join(","), partial.display().to_string(), seed.to_string());
             let mut arguments = vec!["identify"];
             arguments.extend(logs.iter().map(String::as_str));
             arguments.extend(["--effects", &effects, "--seed", &seed, "--out", &out]);
             let start = models.last().map(|model| model.display().to_string());
             arguments.extend(start.iter().flat_map(|start| ["--start", start]));
             hidden.commands.run(&arguments)?;
+            std::fs::rename(&partial, &model).map_err(text)?;
         }
         models.push(model);
     }
     Ok(models)
+}
+
+/// Writes a log without its torques, which the logs of the other methods do not have.
+fn write_without_torques(from: &Path, to: &Path) -> Step {
+    if to.exists() {
+        return Ok(());
+    }
+    let log = Log::open(from).map_err(text)?;
+    let meta = Meta { tau_sensor: TorqueSensor::None, ..log.meta().clone() };
+    let column = |name: &str, cells: Vec<f64>| (name.to_owned(), cells);
+    let segment = log.segment().iter().map(|segment| f64::from(*segment)).collect();
+    let times = [column("t", log.t().to_vec()), column("segment", segment)];
+    let others = log.channels().filter(|(name, _)| !name.starts_with("tau_measured"));
+    let columns = times.into_iter().chain(others.map(|(name, cells)| column(name, cells.to_vec())));
+    Log::new(meta, columns).map_err(text)?.write(to).map_err(text)
 }
 
 /// Returns the errors of a method after a log, by robot [rad].
@@ -169,10 +193,10 @@ fn table(args: &Args, errors: &[Vec<Errors>]) -> String {
         let _ = writeln!(table, "|---|{}---|", "---|".repeat(args.rounds as usize + 1));
         for (method, name) in args.methods.iter().enumerate() {
             let stages = (0..=args.rounds as usize).map(|stage| by_robot(errors, method, stage, log));
-            let cells: String = stages.map(|values| format!(" {:.1} |", 1e3 * mean(&values))).collect();
+            let cells: Vec<String> = stages.map(|values| format!("{:.1}", 1e3 * mean(&values))).collect();
             let last = by_robot(errors, method, args.rounds as usize, log);
             let last: Vec<String> = last.iter().map(|error| format!("{:.1}", 1e3 * error)).collect();
-            let _ = writeln!(table, "| {name} |{cells} {} |", last.join(", "));
+            let _ = writeln!(table, "| {name} | {} | {} |", cells.join(" | "), last.join(", "));
         }
     }
     table

@@ -12,7 +12,7 @@ use clap::Parser;
 use twinstep_effects::ModelFile;
 use twinstep_ensemble::check_effects;
 use twinstep_logs::TorqueSensor;
-use twinstep_tests::hidden_robot::{record_jumps, serve};
+use twinstep_tests::mujoco_ground_truth::{record_jumps, serve};
 use twinstep_tests::python::root;
 use twinstep_tests::resumable::{Resumable, Step, number, read, text};
 

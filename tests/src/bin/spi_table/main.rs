@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Parser;
-use twinstep_tests::hidden_robot::{Collection, HiddenRobot};
+use twinstep_tests::mujoco_ground_truth::{Collection, MujocoGroundTruth};
 use twinstep_tests::python::root;
 use twinstep_tests::resumable::{Resumable, Step, text};
 
@@ -140,13 +140,13 @@ fn campaign(args: &Args) -> Step<String> {
 /// A hidden robot and the folder of its results.
 struct Robot<'a> {
     args: &'a Args,
-    hidden: HiddenRobot,
+    hidden: MujocoGroundTruth,
     seed: u64,
 }
 
 impl<'a> Robot<'a> {
     fn new(args: &'a Args, seed: u64) -> Step<Self> {
-        Ok(Self { args, hidden: HiddenRobot::new(&args.out, seed)?, seed })
+        Ok(Self { args, hidden: MujocoGroundTruth::new(&args.out, seed)?, seed })
     }
 
     /// Identifies the robot from logs of random and of designed commands. The first log is the same for all.

@@ -1,4 +1,4 @@
-//! Robots in MuJoCo that the methods of a comparison do not know, and their identification by `twinstep spi-active`.
+//! Ground truth in MuJoCo: robots with hidden effects, and their identification by `twinstep spi-active`.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -29,8 +29,8 @@ const SENSORS: &str = "[randomise.noise]\njoint_position_rad = 0.0005\njoint_vel
 /// Duration of a jump in a log of jumps [s].
 const JUMP_S: &str = "1.4";
 
-/// A hidden robot and the folder of its results.
-pub struct HiddenRobot {
+/// A robot with hidden effects, and the folder of its results.
+pub struct MujocoGroundTruth {
     /// Commands whose results are in the folder of the robot.
     pub commands: Resumable,
     /// Model file of the robot.
@@ -50,7 +50,7 @@ pub struct Collection {
     pub candidates: u32,
 }
 
-impl HiddenRobot {
+impl MujocoGroundTruth {
     /// Creates the robot of a seed, with a payload, and for each joint type a saturation and a dry friction. Its results are in a
     /// folder of that name in `out`.
     pub fn new(out: &Path, seed: u64) -> Step<Self> {
@@ -74,7 +74,7 @@ impl HiddenRobot {
         }
         let config = self.commands.path(&format!("{method}.toml"));
         let Collection { rounds, seconds, segment_s, candidates } = collection;
-        // What differs between the engines does not matter.
+        // The ground is an unknown because the contact laws of both engines differ; its values are of no use.
         let of_interest: &[&str] = if method == "qoed" { &HIDDEN } else { &[] };
         let unknowns = unknowns();
         let settings = format!(
