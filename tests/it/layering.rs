@@ -102,6 +102,7 @@ const MAY_USE: [(&str, &[&str]); 26] = [
             "robot",
             "excite",
             "hunt",
+            "report",
         ],
     ),
 ];
