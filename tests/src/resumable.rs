@@ -2,7 +2,7 @@
 
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, ExitCode};
 use std::time::Instant;
 
 use serde_json::Value;
@@ -73,6 +73,20 @@ impl Resumable {
             std::fs::OpenOptions::new().append(true).create(true).open(self.path("ledger.csv")).map_err(text)?;
         writeln!(ledger, "{:.1},twinstep {line}", start.elapsed().as_secs_f64()).map_err(text)?;
         Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+    }
+}
+
+/// Prints the table of a campaign, or its error.
+pub fn print_result(result: Step<String>) -> ExitCode {
+    match result {
+        Ok(table) => {
+            print!("{table}");
+            ExitCode::SUCCESS
+        }
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::FAILURE
+        }
     }
 }
 

@@ -12,7 +12,7 @@ use clap::Parser;
 use twinstep_logs::{Log, Meta, TorqueSensor};
 use twinstep_report::chart::{self, Line, Panel, RGBColor};
 use twinstep_tests::mujoco_ground_truth::{Collection, MujocoGroundTruth, record_jumps, unknowns};
-use twinstep_tests::resumable::{Step, number, read, text};
+use twinstep_tests::resumable::{Step, number, print_result, read, text};
 
 /// Compare ways of collecting data on hidden robots, by the error of the models on two held-out logs.
 #[derive(Parser)]
@@ -64,16 +64,7 @@ const COLOURS: [RGBColor; 5] = [
 ];
 
 fn main() -> ExitCode {
-    match campaign(&Args::parse()) {
-        Ok(table) => {
-            print!("{table}");
-            ExitCode::SUCCESS
-        }
-        Err(error) => {
-            eprintln!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    print_result(campaign(&Args::parse()))
 }
 
 fn campaign(args: &Args) -> Step<String> {

@@ -14,7 +14,7 @@ use twinstep_ensemble::check_effects;
 use twinstep_logs::TorqueSensor;
 use twinstep_tests::mujoco_ground_truth::{record_jumps, serve};
 use twinstep_tests::python::root;
-use twinstep_tests::resumable::{Resumable, Step, number, read, text};
+use twinstep_tests::resumable::{Resumable, Step, number, print_result, read, text};
 
 /// Compare methods on a hidden robot, for one seed.
 #[derive(Parser)]
@@ -72,17 +72,7 @@ const LAWS: &str = "command_delay@all,drive_lag@all,torque_saturation@all,torque
 const LAWS_UNTIL: &str = "12";
 
 fn main() -> ExitCode {
-    let args = Args::parse();
-    match Campaign::new(args).and_then(|campaign| campaign.run()) {
-        Ok(table) => {
-            print!("{table}");
-            ExitCode::SUCCESS
-        }
-        Err(error) => {
-            eprintln!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    print_result(Campaign::new(Args::parse()).and_then(|campaign| campaign.run()))
 }
 
 /// The steps and their folder.

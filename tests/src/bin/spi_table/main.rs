@@ -12,7 +12,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use twinstep_tests::mujoco_ground_truth::{Collection, MujocoGroundTruth};
 use twinstep_tests::python::root;
-use twinstep_tests::resumable::{Resumable, Step, text};
+use twinstep_tests::resumable::{Resumable, Step, print_result, text};
 
 /// Compare methods on hidden robots.
 #[derive(Parser)]
@@ -108,17 +108,7 @@ const TASKS: [Task; 3] = [
 ];
 
 fn main() -> ExitCode {
-    let args = Args::parse();
-    match campaign(&args) {
-        Ok(table) => {
-            print!("{table}");
-            ExitCode::SUCCESS
-        }
-        Err(error) => {
-            eprintln!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    print_result(campaign(&Args::parse()))
 }
 
 fn campaign(args: &Args) -> Step<String> {
