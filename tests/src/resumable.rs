@@ -26,7 +26,7 @@ impl Resumable {
     pub fn new(folder: &Path) -> Step<Self> {
         // The commands run in the folder of the repository.
         let folder = std::path::absolute(folder).map_err(text)?;
-        std::fs::create_dir_all(&folder).map_err(text)?;
+        std::fs::create_dir_all(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
         let twinstep = std::env::current_exe().map_err(text)?.with_file_name("twinstep");
         Ok(Self { twinstep, folder })
     }

@@ -24,7 +24,7 @@ use crate::robot_file::{analytic_model, simulator};
 ///
 /// `twinstep serve --model` and `twinstep evaluate --model` load the model file. Ctrl-C interrupts the search, writes
 /// the best estimates so far and saves the search in OUT.search.json. The same command with --resume continues from
-/// there.
+/// there; the refinement and the local search begin again.
 ///
 /// Example: `twinstep identify data/go2_air_chirp --until 10 --out fitted.toml`
 #[derive(clap::Args)]

@@ -20,7 +20,7 @@ pub const EFFECT: &str = "pd_gain";
 const LARGEST_ERROR: [f64; 2] = [0.1, 0.2];
 /// The same of their means over the joints: what all joints have in common is a cause.
 const LARGEST_MEAN_ERROR: [f64; 2] = [0.03, 0.06];
-/// Relative error of the gains at which the torques are compared.
+/// Relative error of the gains in the simulations of [`estimated_gain`].
 const PROBE: f64 = 0.05;
 
 /// Gains of all joints.
