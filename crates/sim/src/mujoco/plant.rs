@@ -14,6 +14,8 @@ use crate::{BackendBuildError, Engine, SimConfig};
 
 /// Lowest rate of actuators and physics [Hz].
 const STEP_HZ: f64 = 2000.0;
+/// Torque limit of a joint behind its gear [N·m]: more than any gear transmits.
+const NO_TORQUE_LIMIT: f64 = 1e5;
 
 /// Robots in MuJoCo with every effect of the catalogue, by equations that share no code with the model's.
 pub struct MujocoPlant {
@@ -156,6 +158,8 @@ impl MujocoPlant {
 }
 
 /// Returns the robot without what [`PlantActuator`] computes, with `steps` actuator periods in one of the robot's.
+///
+/// That includes the torque limit, which is the motor's: where backlash closes, a gear transmits more.
 fn bodies(robot: &RobotModel, steps: usize) -> RobotModel {
     let mut bodies = robot.clone();
     bodies.control.actuator_hz *= steps as f64;
@@ -164,6 +168,7 @@ fn bodies(robot: &RobotModel, steps: usize) -> RobotModel {
             // The rotor is not part of the link.
             joint.armature = 0.0;
         }
+        joint.torque_limit = NO_TORQUE_LIMIT;
         (joint.stribeck_friction, joint.load_friction) = (Stribeck::NONE, 0.0);
         (joint.spring, joint.actuator) = (JointSpring::NONE, ActuatorParams::IDEAL);
     }
