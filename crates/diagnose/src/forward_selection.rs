@@ -230,7 +230,7 @@ impl<'a> ForwardSelection<'a> {
         if let Some(best) = trials.first().filter(|best| best.score >= thresholds.of(best.hypothesis.effect)) {
             // Confounders of the best candidate, which the scan of all joints at once may have missed.
             let names: Vec<String> = trials.iter().map(|trial| trial.hypothesis.name()).collect();
-            let alike = scan::confounders_of(evidence, &self.model, &best.hypothesis, &names, left, self.simulator);
+            let alike = scan::confounders_of(evidence, &self.model, &best.hypothesis, &names, self.simulator);
             trials.extend(self.evaluate(alike, excluded, left)?);
             trials.sort_by(best_first);
         }
@@ -262,7 +262,7 @@ impl<'a> ForwardSelection<'a> {
         for hypothesis in hypotheses {
             if !self.is_excluded(&hypothesis, excluded) {
                 (self.progress)(&format!("fitting {}; causes: {}", hypothesis.name(), self.accepted.len()))?;
-                let hypothesis = scan::refine_delay_grid(evidence, &self.model, hypothesis, left, self.simulator);
+                let hypothesis = scan::refine_grid(evidence, &self.model, hypothesis, self.simulator);
                 trials.extend(cross_validate(evidence, &self.model, left, &hypothesis, self.simulator));
             }
         }

@@ -69,17 +69,18 @@ impl ResidualData {
         })
     }
 
-    /// Sets the nuisance parameters, linearised at `robot`, if a log has a floating base.
+    /// Sets the nuisance parameters, linearised at `robot`.
     ///
-    /// With a fixed base alone, a wrong mass imitates friction that acts in one direction only.
+    /// With a fixed base alone, these are the clocks of the encoders.
     pub fn set_nuisance_model(&mut self, robot: &RobotModel, simulator: &mut dyn Rollout) {
-        if !self.has_free_parts() {
-            return;
+        let all = if self.has_free_parts() { NuisanceModel::new } else { NuisanceModel::of_encoders };
+        self.fit_rows.tolerances = all(&self.fit_rows.experiments, robot, simulator);
+        if let Some(rows) = &mut self.fixed_base_rows {
+            rows.tolerances = NuisanceModel::of_encoders(&rows.experiments, robot, simulator);
         }
-        self.fit_rows.tolerances = NuisanceModel::new(&self.fit_rows.experiments, robot, simulator);
     }
 
-    /// Returns the rows with a fixed base, without nuisance parameters, if there are others, too.
+    /// Returns the rows with a fixed base, with the clocks of the encoders as nuisance parameters, if there are others, too.
     ///
     /// They rank candidates by joint, for which penalties of links have no share.
     pub fn fixed_base_rows(&self) -> Option<&ResidualRows> {
@@ -89,9 +90,8 @@ impl ResidualData {
     /// Returns all rows, held-out blocks included, with the nuisance parameters of `model`.
     pub fn all_rows(&self, model: &ModelFile, simulator: &mut dyn Rollout) -> ResidualRows {
         let mut rows = ResidualRows::new(&self.splits, self.experiments.clone());
-        if let Some(robot) = model.robot_model().ok().filter(|_| self.has_free_parts()) {
-            rows.tolerances = NuisanceModel::new(&rows.experiments, &robot, simulator);
-        }
+        let all = if self.has_free_parts() { NuisanceModel::new } else { NuisanceModel::of_encoders };
+        rows.tolerances = model.robot_model().ok().and_then(|robot| all(&rows.experiments, &robot, simulator));
         rows
     }
 

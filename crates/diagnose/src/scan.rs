@@ -92,7 +92,6 @@ pub fn confounders_of(
     model: &ModelFile,
     best: &Hypothesis,
     tried: &[String],
-    before: &ResidualPower,
     simulator: &mut dyn Rollout,
 ) -> Vec<Hypothesis> {
     let confused =
@@ -107,23 +106,26 @@ pub fn confounders_of(
         Some(Hypothesis {
             effect,
             scope: best.scope,
-            values: best_values(evidence, model, effect, best.scope, at, before, simulator)?,
+            values: best_values(evidence, model, effect, best.scope, at, false, simulator)?,
         })
     };
     effects.filter_map(first).collect()
 }
 
-/// Refines a delay or lag on successively finer grids; returns other hypotheses unchanged.
+/// Refines effects with many local minima on finer grids; returns other hypotheses unchanged.
 ///
 /// If the loop oscillates, the residual has a narrow minimum, which a gradient step cannot reach from far away.
-pub fn refine_delay_grid(
+pub fn refine_grid(
     evidence: &ResidualData,
     model: &ModelFile,
     hypothesis: Hypothesis,
-    before: &ResidualPower,
     simulator: &mut dyn Rollout,
 ) -> Hypothesis {
     let Hypothesis { effect, scope, mut values } = hypothesis;
+    if let Some(near) = effect.search.near {
+        let tried = near(&values);
+        values = best_values(evidence, model, effect, scope, tried, true, simulator).unwrap_or(values);
+    }
     if !effect.search.oscillates {
         return Hypothesis { effect, scope, values };
     }
@@ -131,7 +133,7 @@ pub fn refine_delay_grid(
     let mut tried = fine_probes(effect);
     tried.push(values.clone());
     for around in [[0.88, 0.94, 1.06, 1.12], [0.97, 0.985, 1.015, 1.03]] {
-        let Some(best) = best_values(evidence, model, effect, scope, tried, before, simulator) else { break };
+        let Some(best) = best_values(evidence, model, effect, scope, tried, false, simulator) else { break };
         values = best;
         let near = around.map(|factor| vec![(factor * values[0]).clamp(least, most)]);
         tried = near.into_iter().chain([values.clone()]).collect();
@@ -139,14 +141,14 @@ pub fn refine_delay_grid(
     Hypothesis { effect, scope, values }
 }
 
-/// Returns the values with the largest log-likelihood gain on all rows.
+/// Returns the values with the largest log-likelihood gain; with `quick` on rows with a fixed base, if there are any.
 fn best_values(
     evidence: &ResidualData,
     model: &ModelFile,
     effect: &'static Effect,
     scope: Scope,
     values: Vec<Vec<f64>>,
-    before: &ResidualPower,
+    quick: bool,
     simulator: &mut dyn Rollout,
 ) -> Option<Vec<f64>> {
     let built = |values: Vec<f64>| {
@@ -154,11 +156,12 @@ fn best_values(
         file.effects.push(EffectEntry::new(effect, scope, values.clone()).ok()?);
         Some((values, file.robot_model().ok()?))
     };
+    let before = evidence.residual_powers(simulator, &[model.robot_model().ok()?], quick).remove(0);
     let (values, robots): (Vec<_>, Vec<_>) = values.into_iter().filter_map(built).unzip();
     let scores = evidence
-        .residual_powers(simulator, &robots, false)
+        .residual_powers(simulator, &robots, quick)
         .into_iter()
-        .map(|now| log_likelihood_gain(evidence, &now, before, evident_channels([effect.target])));
+        .map(|now| log_likelihood_gain(evidence, &now, &before, evident_channels([effect.target])));
     scores.zip(values).max_by(|one, other| one.0.total_cmp(&other.0)).map(|(_, values)| values)
 }
 

@@ -9,12 +9,6 @@ use crate::experiment::Experiment;
 use crate::nuisance::NuisanceModel;
 use crate::parameter::{FreeParameter, candidate};
 
-/// Step of the central differences, on either side [prior std].
-///
-/// A smaller one has the derivatives of contact events where a robot walks: with 0.02 the fit of a payload stops at half of
-/// its distance from the trunk's centre.
-const STEP: f64 = 0.1;
-
 /// Differences that approximate derivatives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Differences {
@@ -108,11 +102,11 @@ impl LeastSquaresProblem<'_> {
         simulator: &mut dyn Rollout,
         point: &[f64],
     ) -> Option<Linearisation> {
-        let bounds_and_scales = self.unknowns.iter().map(|unknown| (unknown.coordinate_bounds(), unknown.prior[1]));
-        let ends: Vec<Vec<f64>> = bounds_and_scales
-            .zip(point)
-            .map(|((bounds, std), value)| differences.ends(*value, STEP * std, bounds))
-            .collect();
+        let ends = |(unknown, value): (&FreeParameter, &f64)| {
+            let step = unknown.effect.search.derivative_step * unknown.prior[1];
+            differences.ends(*value, step, unknown.coordinate_bounds())
+        };
+        let ends: Vec<Vec<f64>> = self.unknowns.iter().zip(point).map(ends).collect();
         let moved = ends.iter().enumerate().flat_map(|(index, ends)| {
             ends.iter()
                 .map(move |end| point.iter().enumerate().map(|(i, x)| if i == index { *end } else { *x }).collect())

@@ -1,5 +1,5 @@
-//! Nuisance parameters: errors of mass, leg mounting, ground contact, measured torques and initial state that any robot
-//! has.
+//! Nuisance parameters: errors of mass, leg mounting, ground contact, measured torques, clocks of the encoders and initial
+//! state that any robot has.
 //!
 //! Left in the residuals, they are attributed to a payload or an encoder offset. A leg that is mounted 2 mm too low
 //! changes the joint positions of a standing robot by 10 mrad. An initial velocity that is 20 mm/s too high lets the
@@ -27,12 +27,18 @@ const CENTRE_STD_M: f64 = 0.001;
 const MOUNT_OFFSET_STD_M: f64 = 0.0012;
 /// Standard deviation of the length of a thigh, and of all calves [m].
 const LENGTH_STD_M: f64 = 0.001;
+/// Standard deviation of the time by which positions of the encoders are ahead of their velocities [s].
+///
+/// Drives filter the velocity. A simulator that updates positions with the new velocity is ahead by half of its time step.
+const ENCODER_LEAD_STD_S: f64 = 0.0004;
 /// Relative standard deviations of ground friction and of the contact's time constant.
 const GROUND_STD: [f64; 2] = [0.03, 0.15];
 /// Standard deviation of the error of each measured torque of a standing robot, such as friction at rest [N·m].
 const TORQUE_STD_NM: f64 = 0.05;
 /// Number of nuisance parameters of the robot: [`perturbed_robot`] has the list.
-const NUM_ROBOT_ERRORS: usize = 36;
+const NUM_ROBOT_ERRORS: usize = 37;
+/// Index of the time by which positions of the encoders are ahead.
+const ENCODER_LEAD: usize = 35;
 /// Number of nuisance parameters of robot and torques.
 const NUM_NUISANCE: usize = NUM_ROBOT_ERRORS + NUM_JOINTS;
 /// Largest size of a nuisance parameter [prior std]: what is larger is an error of the model.
@@ -117,24 +123,35 @@ impl NuisanceModel {
     /// Linearises at `robot`. Returns `None` if a simulation diverges.
     pub fn new(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Rollout) -> Option<Self> {
         let starts = starts(experiments, robot, simulator)?;
-        let sides = |error: usize| [-1.0, 1.0].map(|side| perturbed_robot(robot, error, side));
-        let robots: Vec<RobotModel> = (0..NUM_ROBOT_ERRORS).flat_map(sides).collect();
-        let mut columns = vec![Vec::new(); NUM_NUISANCE];
+        let mut columns = slopes(experiments, robot, 0..NUM_ROBOT_ERRORS, simulator);
+        // Only a robot that hangs moves fast without errors of contact that are larger.
+        let mut first = 0;
         for experiment in experiments {
-            let residuals = experiment.residuals(simulator, &robots, Precision::Single);
-            for (column, ends) in columns.iter_mut().zip(residuals.chunks(2)) {
-                column.extend(half_difference(&ends[0], &ends[1]));
-            }
-            for (joint, column) in columns[NUM_ROBOT_ERRORS..].iter_mut().enumerate() {
-                column.extend(experiment.change_with_torque_error(robot, joint, TORQUE_STD_NM));
-            }
+            let on_ground = experiment.free_windows().into_iter().flatten();
+            on_ground.for_each(|row| columns[ENCODER_LEAD][first + row] = 0.0);
+            first += experiment.dynamic_residuals().len();
         }
+        columns.extend((0..NUM_JOINTS).map(|joint| {
+            let change = |one: &Experiment| one.change_with_torque_error(robot, joint, TORQUE_STD_NM);
+            experiments.iter().flat_map(change).collect()
+        }));
+        Self::of_columns(experiments, starts, columns)
+    }
+
+    /// Linearises only the clocks of the encoders, for logs or rows with a fixed base: there, wrong masses of the links
+    /// imitate friction that acts in one direction.
+    pub fn of_encoders(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Rollout) -> Option<Self> {
+        let columns = slopes(experiments, robot, ENCODER_LEAD..ENCODER_LEAD + 1, simulator);
+        Self::of_columns(experiments, Vec::new(), columns)
+    }
+
+    fn of_columns(experiments: &[Experiment], starts: Vec<NuisanceBlock>, mut columns: Vec<Vec<f64>>) -> Option<Self> {
         // Where the robot walks, contact events would decide the sizes.
         let dynamic: Vec<bool> = experiments.iter().flat_map(Experiment::dynamic_residuals).collect();
         for column in &mut columns {
             column.iter_mut().zip(&dynamic).filter(|(_, dynamic)| **dynamic).for_each(|(slope, _)| *slope = 0.0);
         }
-        let jacobian = DMatrix::from_iterator(columns[0].len(), NUM_NUISANCE, columns.into_iter().flatten());
+        let jacobian = DMatrix::from_iterator(columns[0].len(), columns.len(), columns.into_iter().flatten());
         jacobian.iter().all(|derivative| derivative.is_finite()).then(|| Self::of(starts, jacobian)).flatten()
     }
 
@@ -240,6 +257,25 @@ pub fn excess(nats: f64) -> f64 {
     (2.0 * nats - NUM_NUISANCE as f64).max(0.0) * CORRELATION_ROWS
 }
 
+/// Returns the effect of each error in `errors`, of one standard deviation, on the residuals of all experiments.
+fn slopes(
+    experiments: &[Experiment],
+    robot: &RobotModel,
+    errors: Range<usize>,
+    simulator: &mut dyn Rollout,
+) -> Vec<Vec<f64>> {
+    let sides = |error: usize| [-1.0, 1.0].map(|side| perturbed_robot(robot, error, side));
+    let mut columns = vec![Vec::new(); errors.len()];
+    let robots: Vec<RobotModel> = errors.flat_map(sides).collect();
+    for experiment in experiments {
+        let residuals = experiment.residuals(simulator, &robots, Precision::Single);
+        for (column, ends) in columns.iter_mut().zip(residuals.chunks(2)) {
+            column.extend(half_difference(&ends[0], &ends[1]));
+        }
+    }
+    columns
+}
+
 /// Returns the nuisance parameters of the initial state of every window.
 fn starts(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Rollout) -> Option<Vec<NuisanceBlock>> {
     let (mut starts, mut first) = (Vec::new(), 0);
@@ -285,6 +321,9 @@ fn perturbed_robot(robot: &RobotModel, error: usize, size: f64) -> RobotModel {
         30..33 => robot.trunk.com[error - 30] += size * CENTRE_STD_M,
         33 => robot.contact.friction *= 1.0 + size * GROUND_STD[0],
         34 => robot.contact.time_constant *= 1.0 + size * GROUND_STD[1],
+        ENCODER_LEAD => {
+            robot.joints.iter_mut().for_each(|joint| joint.actuator.encoder_lead += size * ENCODER_LEAD_STD_S)
+        }
         // The trunk's moments of inertia, at the same mass.
         _ => robot.trunk.inertia *= 1.0 + size * LINK_MASS_STD,
     }

@@ -154,6 +154,9 @@ pub struct ActuatorParams {
     pub command_delay: f64,
     /// Encoder reading minus joint position [rad]. PD loop and log use the reading.
     pub encoder_offset: f64,
+    /// Time by which the encoder's position is ahead of its velocity [s]. No effect of the catalogue: identification allows for
+    /// it, because drives filter the velocity, and simulators update positions with the new velocity.
+    pub encoder_lead: f64,
     /// Position gain of the PD loop divided by the commanded gain.
     pub kp_scale: f64,
     /// Velocity gain of the PD loop divided by the commanded gain.
@@ -192,6 +195,11 @@ pub struct Ripple {
 }
 
 impl ActuatorParams {
+    /// Returns the encoder reading minus the joint position at a velocity [rad].
+    pub fn encoder_error(&self, dq: f64) -> f64 {
+        self.encoder_offset + self.encoder_lead * dq
+    }
+
     /// Longest delay [s].
     pub const MAX_DELAY: f64 = 0.04;
 
@@ -199,6 +207,7 @@ impl ActuatorParams {
     pub const IDEAL: ActuatorParams = ActuatorParams {
         command_delay: 0.0,
         encoder_offset: 0.0,
+        encoder_lead: 0.0,
         kp_scale: 1.0,
         kd_scale: 1.0,
         saturation: f64::INFINITY,

@@ -94,8 +94,10 @@ impl<T: SimdFloat> RobotBatch<T> {
     pub fn place(&mut self, lane: usize, robot: &RobotModel, initial_state: &InitialState) {
         self.tree.set(lane, robot);
         // An initial state contains encoder readings.
-        let offsets = robot.joints.map(|joint| joint.actuator.encoder_offset as f32);
-        let q: PerJoint = std::array::from_fn(|joint| initial_state.q[joint] - offsets[joint]);
+        let q: PerJoint = std::array::from_fn(|joint| {
+            let dq = f64::from(initial_state.dq[joint]);
+            initial_state.q[joint] - robot.joints[joint].actuator.encoder_error(dq) as f32
+        });
         let rotors = self.actuator.set(lane, robot, &q, &initial_state.dq);
         for (armature, rotor) in self.tree.armature.iter_mut().zip(rotors) {
             armature.set(lane, rotor);

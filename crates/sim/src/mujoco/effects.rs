@@ -21,6 +21,8 @@ pub fn unsupported(robot: &RobotModel) -> Option<&'static str> {
             // In the model, in `CommandDelay` or in `Adjustments`. The delay of the logged torque acts where a log is replayed.
             command_delay: _,
             encoder_offset: _,
+            // No effect that a model file has.
+            encoder_lead: _,
             kp_scale: _,
             kd_scale: _,
             gain: _,

@@ -79,7 +79,7 @@ impl PlantActuator {
     pub fn reading(&self, joint: usize, q: f64, dq: f64) -> (f64, f64) {
         let model = &self.joints[joint];
         let rotor = if Self::has_rotor(model) { self.rotors[joint] } else { Rotor { q, dq } };
-        (rotor.q + model.actuator.encoder_offset, rotor.dq)
+        (rotor.q + model.actuator.encoder_error(rotor.dq), rotor.dq)
     }
 
     /// Samples the links at `q` [rad] and `dq` [rad/s] and computes the torque of the PD loop for an actuator period.

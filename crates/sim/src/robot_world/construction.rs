@@ -70,8 +70,10 @@ impl RobotWorld {
     fn reset_joints(&mut self, robot: &RobotModel, initial_state: &InitialState) {
         let root_dofs = self.root_dofs;
         // An initial state contains encoder readings.
-        let q: PerJoint =
-            std::array::from_fn(|joint| initial_state.q[joint] - robot.joints[joint].actuator.encoder_offset as f32);
+        let q: PerJoint = std::array::from_fn(|joint| {
+            let dq = f64::from(initial_state.dq[joint]);
+            initial_state.q[joint] - robot.joints[joint].actuator.encoder_error(dq) as f32
+        });
         let rotors = self.actuator.set(0, robot, &q, &initial_state.dq);
         let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
         // Sets the pose of the root, and removes its six degrees of freedom if the base is fixed.

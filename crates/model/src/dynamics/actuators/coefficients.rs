@@ -38,6 +38,7 @@ macro_rules! coefficients {
 coefficients! { |joint, dt, actuator_dt|
     torque_limit = joint.torque_limit;
     encoder_offset = joint.actuator.encoder_offset;
+    encoder_lead = joint.actuator.encoder_lead;
     /// Command delay [actuator periods].
     command_delay = joint.actuator.command_delay / actuator_dt;
     kp_scale = joint.actuator.kp_scale;

@@ -89,7 +89,7 @@ impl<T: SimdFloat> SimdActuators<T> {
             let state = &mut self.state;
             // The command history is the initial position, so a delayed first command starts from rest.
             for command in &mut state.commands {
-                command[0][index].set(lane, f64::from(q[index]) + joint.actuator.encoder_offset);
+                command[0][index].set(lane, f64::from(q[index]) + joint.actuator.encoder_error(f64::from(dq[index])));
                 command[1][index].set(lane, 0.0);
                 command[2][index].set(lane, 0.0);
             }
@@ -123,7 +123,10 @@ impl<T: SimdFloat> SimdActuators<T> {
     /// Positions do not change. `q` [rad] and `dq` [rad/s] are the encoder readings at the start of the period.
     pub fn replay_history(&mut self, commands: &SimdCommands<T>, q: &[T; 12], dq: &[T; 12], steps: usize) {
         let rotors = self.state.rotor;
-        let link: [T; 12] = std::array::from_fn(|joint| q[joint] - self.coefficients[joint].encoder_offset);
+        let link: [T; 12] = std::array::from_fn(|joint| {
+            let n = &self.coefficients[joint];
+            q[joint] - n.encoder_offset - n.encoder_lead * dq[joint]
+        });
         self.state.rotor = [link, *dq];
         self.update_command(commands, &link, dq);
         for index in 0..steps {
@@ -144,7 +147,8 @@ impl<T: SimdFloat> SimdActuators<T> {
     pub fn encoder_reading(&self, joint: usize, q: T, dq: T) -> (T, T) {
         let (n, zero, [angle, speed]) = (&self.coefficients[joint], T::splat(0.0), &self.state.rotor);
         let q = zero.select_lt(n.gear, angle[joint], q);
-        (q + n.encoder_offset, zero.select_lt(n.gear, speed[joint], dq))
+        let dq = zero.select_lt(n.gear, speed[joint], dq);
+        (q + n.encoder_offset + n.encoder_lead * dq, dq)
     }
 
     /// Returns the torque that the current sensors measure, mean over the last physics step [N·m].
