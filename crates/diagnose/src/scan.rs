@@ -122,10 +122,8 @@ pub fn refine_grid(
     simulator: &mut dyn Rollout,
 ) -> Hypothesis {
     let Hypothesis { effect, scope, mut values } = hypothesis;
-    if let Some(near) = effect.search.near {
-        let tried = near(&values);
-        values = best_values(evidence, model, effect, scope, tried, true, simulator).unwrap_or(values);
-    }
+    let near = (effect.search.near)(&values);
+    values = best_values(evidence, model, effect, scope, near, true, simulator).unwrap_or(values);
     if !effect.search.oscillates {
         return Hypothesis { effect, scope, values };
     }
@@ -156,6 +154,9 @@ fn best_values(
         file.effects.push(EffectEntry::new(effect, scope, values.clone()).ok()?);
         Some((values, file.robot_model().ok()?))
     };
+    if values.is_empty() {
+        return None;
+    }
     let before = evidence.residual_powers(simulator, &[model.robot_model().ok()?], quick).remove(0);
     let (values, robots): (Vec<_>, Vec<_>) = values.into_iter().filter_map(built).unzip();
     let scores = evidence

@@ -12,8 +12,8 @@ pub struct Search {
     pub whole_log_probes: Probes,
     /// True if the loop may oscillate: probes close to each other are then needed to stay in phase.
     pub oscillates: bool,
-    /// Returns values close to a probe, the best of which the fit starts from, for effects with many local minima.
-    pub near: Option<fn(&[f64]) -> Vec<Vec<f64>>>,
+    /// Returns values close to a probe, the best of which the fit starts from; none for effects without many local minima.
+    pub near: fn(&[f64]) -> Vec<Vec<f64>>,
     /// Step of the differences that approximate derivatives of a fit, on either side [prior std].
     ///
     /// A small one has the derivatives of contact events where a robot walks: with 0.02 the fit of a payload stops at half of
@@ -31,7 +31,7 @@ impl Search {
         probes: Probes::FirstParameter(&[&[]]),
         whole_log_probes: Probes::None,
         oscillates: false,
-        near: None,
+        near: |_| Vec::new(),
         derivative_step: 0.1,
         min_share: 0.1,
         predictable: true,

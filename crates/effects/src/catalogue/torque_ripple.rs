@@ -53,7 +53,7 @@ pub const EFFECT: Effect = Effect {
     caveat: "",
     remedy: "Mend the robot: calibrate the commutation of the motor. Or add the law to the simulator.",
     // A tenth of the standard deviation of the number of cycles would turn the phase by half a period.
-    search: Search { probes: Probes::Values(probes), near: Some(near), derivative_step: 0.01, ..Search::DEFAULT },
+    search: Search { probes: Probes::Values(probes), near, derivative_step: 0.01, ..Search::DEFAULT },
     visibility: Visibility::OutputTorque,
     explained_by: Variable::Position,
     demo: EffectDemo {
