@@ -123,7 +123,7 @@ fn torque_delay_of_an_oscillating_loop_is_found() {
     assert!((delay / 0.0085 - 1.0).abs() < 0.05, "{delay} s");
 }
 
-/// The clocks of the encoders change the positions of all joints by more than the ripple changes those of one, and a fit of a
+/// The lead of the encoder positions changes the positions of all joints by more than the ripple changes those of one, and a fit of a
 /// ripple ends at the nearest of many minima.
 #[test]
 fn torque_ripple_of_one_joint_is_found_on_a_robot_whose_encoder_positions_are_ahead_of_their_velocities() {

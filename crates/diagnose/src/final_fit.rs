@@ -79,11 +79,11 @@ fn with_intervals(
     simulator: &mut dyn Rollout,
 ) -> (ModelFile, Vec<CorrelatedPair>) {
     let experiments = &all_rows.experiments;
-    // Without a floating base the fit has none, but an interval has.
-    let robot = fit.model(&fit.initial_point).robot_model().ok().filter(|_| all_rows.tolerances.is_none());
+    // Without a floating base the fit has no masses and lengths, but an interval has.
+    let robot = fit.model(&fit.initial_point).robot_model().ok().filter(|_| !evidence.has_free_parts());
     let of_fixed_base = robot.and_then(|robot| NuisanceModel::new(experiments, &robot, simulator));
     let covariance = fit.with_problem(all_rows, simulator, Precision::Double, |task, simulator| {
-        let tolerances = all_rows.tolerances.as_ref().or(of_fixed_base.as_ref());
+        let tolerances = of_fixed_base.as_ref().or(all_rows.tolerances.as_ref());
         let errors = tolerances.map_or(Vec::new(), |all| all.robot_errors(task.residual_scale, task.tolerances));
         covariance(&task.linearise(simulator, &fit.initial_point)?, &blocks(experiments), &errors)
     });

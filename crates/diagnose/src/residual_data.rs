@@ -71,16 +71,15 @@ impl ResidualData {
 
     /// Sets the nuisance parameters, linearised at `robot`.
     ///
-    /// With a fixed base alone, these are the clocks of the encoders.
+    /// With a fixed base alone, it is the lead of the encoder positions.
     pub fn set_nuisance_model(&mut self, robot: &RobotModel, simulator: &mut dyn Rollout) {
-        let all = if self.has_free_parts() { NuisanceModel::new } else { NuisanceModel::of_encoders };
-        self.fit_rows.tolerances = all(&self.fit_rows.experiments, robot, simulator);
+        self.fit_rows.tolerances = self.nuisance_model(&self.fit_rows.experiments, robot, simulator);
         if let Some(rows) = &mut self.fixed_base_rows {
-            rows.tolerances = NuisanceModel::of_encoders(&rows.experiments, robot, simulator);
+            rows.tolerances = NuisanceModel::of_encoder_lead(&rows.experiments, robot, simulator);
         }
     }
 
-    /// Returns the rows with a fixed base, with the clocks of the encoders as nuisance parameters, if there are others, too.
+    /// Returns the rows with a fixed base, with the lead of the encoder positions as nuisance parameter, if there are others, too.
     ///
     /// They rank candidates by joint, for which penalties of links have no share.
     pub fn fixed_base_rows(&self) -> Option<&ResidualRows> {
@@ -90,9 +89,20 @@ impl ResidualData {
     /// Returns all rows, held-out blocks included, with the nuisance parameters of `model`.
     pub fn all_rows(&self, model: &ModelFile, simulator: &mut dyn Rollout) -> ResidualRows {
         let mut rows = ResidualRows::new(&self.splits, self.experiments.clone());
-        let all = if self.has_free_parts() { NuisanceModel::new } else { NuisanceModel::of_encoders };
-        rows.tolerances = model.robot_model().ok().and_then(|robot| all(&rows.experiments, &robot, simulator));
+        let robot = model.robot_model().ok();
+        rows.tolerances = robot.and_then(|robot| self.nuisance_model(&rows.experiments, &robot, simulator));
         rows
+    }
+
+    /// Returns the nuisance parameters of these rows of the logs.
+    fn nuisance_model(
+        &self,
+        experiments: &[Experiment],
+        robot: &RobotModel,
+        simulator: &mut dyn Rollout,
+    ) -> Option<NuisanceModel> {
+        let new = if self.has_free_parts() { NuisanceModel::new } else { NuisanceModel::of_encoder_lead };
+        new(experiments, robot, simulator)
     }
 
     /// Returns true if the mean squared position error of any joint exceeds 10 % of the variance of its measured

@@ -114,7 +114,8 @@ pub fn confounders_of(
 
 /// Refines effects with many local minima on finer grids; returns other hypotheses unchanged.
 ///
-/// If the loop oscillates, the residual has a narrow minimum, which a gradient step cannot reach from far away.
+/// If the loop oscillates, or the phase of a ripple is unknown, the residual has narrow minima, which a gradient step cannot
+/// reach from far away.
 pub fn refine_grid(
     evidence: &ResidualData,
     model: &ModelFile,

@@ -1,5 +1,5 @@
-//! Nuisance parameters: errors of mass, leg mounting, ground contact, measured torques, clocks of the encoders and initial
-//! state that any robot has.
+//! Nuisance parameters: errors of mass, leg mounting, ground contact, measured torques, lead of the encoder positions and
+//! initial state that any robot has.
 //!
 //! Left in the residuals, they are attributed to a payload or an encoder offset. A leg that is mounted 2 mm too low
 //! changes the joint positions of a standing robot by 10 mrad. An initial velocity that is 20 mm/s too high lets the
@@ -88,6 +88,10 @@ impl NuisanceBlock {
     /// Subtracts the effect of the estimated nuisance parameters, each at most `largest` [prior std], and appends their
     /// penalties to the residuals.
     fn eliminate(&self, residuals: &mut Vec<f64>, largest: f64) {
+        if self.rows.is_empty() {
+            residuals.extend(vec![0.0; self.affected.len()]);
+            return;
+        }
         let own: Vec<f32> = self.rows.iter().map(|row| residuals[*row] as f32).collect();
         let columns = || self.jacobian.as_slice().chunks(self.rows.len().max(1)).zip(&self.affected);
         let products = columns().map(|(column, affected)| {
@@ -124,7 +128,7 @@ impl NuisanceModel {
     pub fn new(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Rollout) -> Option<Self> {
         let starts = starts(experiments, robot, simulator)?;
         let mut columns = slopes(experiments, robot, 0..NUM_ROBOT_ERRORS, simulator);
-        // Only a robot that hangs moves fast without errors of contact that are larger.
+        // On the ground, errors of contact exceed the effect of the lead.
         let mut first = 0;
         for experiment in experiments {
             let on_ground = experiment.free_windows().into_iter().flatten();
@@ -138,9 +142,13 @@ impl NuisanceModel {
         Self::of_columns(experiments, starts, columns)
     }
 
-    /// Linearises only the clocks of the encoders, for logs or rows with a fixed base: there, wrong masses of the links
+    /// Linearises only the lead of the encoder positions, for logs or rows with a fixed base: there, wrong masses of the links
     /// imitate friction that acts in one direction.
-    pub fn of_encoders(experiments: &[Experiment], robot: &RobotModel, simulator: &mut dyn Rollout) -> Option<Self> {
+    pub fn of_encoder_lead(
+        experiments: &[Experiment],
+        robot: &RobotModel,
+        simulator: &mut dyn Rollout,
+    ) -> Option<Self> {
         let columns = slopes(experiments, robot, ENCODER_LEAD..ENCODER_LEAD + 1, simulator);
         Self::of_columns(experiments, Vec::new(), columns)
     }
@@ -148,10 +156,13 @@ impl NuisanceModel {
     fn of_columns(experiments: &[Experiment], starts: Vec<NuisanceBlock>, mut columns: Vec<Vec<f64>>) -> Option<Self> {
         // Where the robot walks, contact events would decide the sizes.
         let dynamic: Vec<bool> = experiments.iter().flat_map(Experiment::dynamic_residuals).collect();
+        if dynamic.is_empty() {
+            return None;
+        }
         for column in &mut columns {
             column.iter_mut().zip(&dynamic).filter(|(_, dynamic)| **dynamic).for_each(|(slope, _)| *slope = 0.0);
         }
-        let jacobian = DMatrix::from_iterator(columns[0].len(), columns.len(), columns.into_iter().flatten());
+        let jacobian = DMatrix::from_iterator(dynamic.len(), columns.len(), columns.into_iter().flatten());
         jacobian.iter().all(|derivative| derivative.is_finite()).then(|| Self::of(starts, jacobian)).flatten()
     }
 
@@ -252,7 +263,7 @@ fn gram(jacobian: &DMatrix<f64>) -> DMatrix<f64> {
 
 /// Returns the power [noise variance of a row] by which the robot's errors exceed their expectation.
 ///
-/// `nats` is the decrease of the log-likelihood by their penalties [nat].
+/// `nats` is the decrease of the log-likelihood by their penalties [nat]. The lead of the encoder positions alone has none.
 pub fn excess(nats: f64) -> f64 {
     (2.0 * nats - NUM_NUISANCE as f64).max(0.0) * CORRELATION_ROWS
 }
@@ -322,7 +333,7 @@ fn perturbed_robot(robot: &RobotModel, error: usize, size: f64) -> RobotModel {
         33 => robot.contact.friction *= 1.0 + size * GROUND_STD[0],
         34 => robot.contact.time_constant *= 1.0 + size * GROUND_STD[1],
         ENCODER_LEAD => {
-            robot.joints.iter_mut().for_each(|joint| joint.actuator.encoder_lead += size * ENCODER_LEAD_STD_S)
+            robot.joints.iter_mut().for_each(|joint| joint.actuator.encoder_lead += size * ENCODER_LEAD_STD_S);
         }
         // The trunk's moments of inertia, at the same mass.
         _ => robot.trunk.inertia *= 1.0 + size * LINK_MASS_STD,
@@ -357,6 +368,14 @@ mod tests {
         others[1] = 5.0;
         nuisance.project_out(&mut others);
         assert!(others[1] > 4.9, "an error in a single row is not due to the robot");
+    }
+
+    #[test]
+    fn parameter_without_any_effect_changes_no_residual() {
+        let nuisance = NuisanceModel::of(Vec::new(), DMatrix::zeros(3, 1)).expect("positive definite");
+        let mut residuals = vec![1.0, -2.0, 3.0];
+        nuisance.project_out(&mut residuals);
+        assert_eq!(residuals, [1.0, -2.0, 3.0, 0.0]);
     }
 
     #[test]

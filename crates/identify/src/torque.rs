@@ -236,6 +236,8 @@ fn upstream_of_sensor(robot: &RobotModel, sensor: TorqueSensor) -> RobotModel {
     for joint in &mut robot.joints {
         joint.spring = JointSpring::NONE;
         (joint.actuator.backlash, joint.actuator.gear_stiffness) = (ideal.backlash, ideal.gear_stiffness);
+        // The measured positions contain it.
+        joint.actuator.encoder_lead = ideal.encoder_lead;
         if sensor == TorqueSensor::MotorCurrent {
             (joint.actuator.gain, joint.actuator.ripple) = (ideal.gain, ideal.ripple);
             (joint.viscous_friction, joint.coulomb_friction, joint.load_friction) = (0.0, 0.0, 0.0);

@@ -154,8 +154,8 @@ pub struct ActuatorParams {
     pub command_delay: f64,
     /// Encoder reading minus joint position [rad]. PD loop and log use the reading.
     pub encoder_offset: f64,
-    /// Time by which the encoder's position is ahead of its velocity [s]. No effect of the catalogue: identification allows for
-    /// it, because drives filter the velocity, and simulators update positions with the new velocity.
+    /// Time by which the encoder's position is ahead of its velocity [s]. No effect of the catalogue, but a nuisance parameter of the
+    /// identification: drives filter the velocity, and simulators update positions with the new velocity.
     pub encoder_lead: f64,
     /// Position gain of the PD loop divided by the commanded gain.
     pub kp_scale: f64,

@@ -21,8 +21,7 @@ pub fn unsupported(robot: &RobotModel) -> Option<&'static str> {
             // In the model, in `CommandDelay` or in `Adjustments`. The delay of the logged torque acts where a log is replayed.
             command_delay: _,
             encoder_offset: _,
-            // No effect that a model file has.
-            encoder_lead: _,
+            encoder_lead,
             kp_scale: _,
             kd_scale: _,
             gain: _,
@@ -36,6 +35,7 @@ pub fn unsupported(robot: &RobotModel) -> Option<&'static str> {
             ("drive_lag", torque_time_constant != 0.0),
             ("torque_ripple", ripple.amplitude != 0.0),
             ("backlash", backlash != 0.0),
+            ("encoder_lead", encoder_lead != 0.0),
             ("joint_elasticity", gear_stiffness.is_finite()),
             ("stribeck_friction", joint.stribeck_friction.breakaway_torque != 0.0),
             ("load_friction", joint.load_friction != 0.0),
