@@ -6,13 +6,15 @@ use std::process::Command as Process;
 use rand::RngExt;
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, EffectEntry, Scope, apply_effects};
+use twinstep_identify::nuisance::NuisanceModel;
 use twinstep_identify::{
     EstimateStatus, Experiment, GlobalSearch, Identification, IdentifyError, IdentifyOptions, RecordError, Stage,
     WindowConfig, evaluate, identify, record,
 };
 use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{
-    Actuator, Backend, BaseMount, Command, FIXED_BASE_HEIGHT, InitialState, JOINT_NAMES, RobotModel, go2, stream,
+    Actuator, Backend, BaseMount, Command, FIXED_BASE_HEIGHT, InitialState, JOINT_NAMES, Precision, RobotModel, go2,
+    stream,
 };
 use twinstep_sim::{BatchBackend, BatchRollout, Engine, RapierBackend, SimConfig};
 use twinstep_tests::python::{Programs, root};
@@ -90,6 +92,25 @@ pub fn chirp_log_with(robot: &RobotModel, rows: u32, external: Option<Box<dyn Ac
     (meta.kp, meta.kd) = (Some(Gain::Uniform(25.0)), Some(Gain::Uniform(0.6)));
     meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
     Log::new(meta, columns).unwrap()
+}
+
+#[test]
+fn lead_of_the_encoder_positions_is_eliminated_from_the_residuals_of_a_hanging_robot() {
+    let mut robot = go2();
+    robot.joints.iter_mut().for_each(|joint| joint.actuator.encoder_lead = 0.001);
+    let experiments = [Experiment::new(&log_of(&robot), &go2(), WindowConfig::DIAGNOSIS).unwrap()];
+    let mut simulator = simulator();
+    let mut residuals = experiments[0].residuals(&mut simulator, &[go2()], Precision::Single).remove(0);
+    let (count, before) = (residuals.len(), mean_square(&residuals));
+    let nuisance = NuisanceModel::of_encoder_lead(&experiments, &go2(), &mut simulator).unwrap();
+    nuisance.project_out(&mut residuals);
+    let after = mean_square(&residuals[..count]);
+    println!("{before} -> {after} noise variances");
+    assert!(after < 0.5 * before, "{before} -> {after} noise variances");
+}
+
+fn mean_square(residuals: &[f64]) -> f64 {
+    residuals.iter().map(|residual| residual * residual).sum::<f64>() / residuals.len() as f64
 }
 
 fn simulator() -> BatchRollout {

@@ -442,7 +442,7 @@ fn plant_of_the_blind_test_moves_like_the_model_with_the_same_effects() {
 #[test]
 fn gear_of_the_plant_is_not_limited_to_the_torque_of_the_motor() {
     let Some(interpreter) = Interpreter::of_tests() else { return };
-    let square_wave = |period: usize| if period / 60 % 2 == 0 { 0.25 } else { -0.25 };
+    let square_wave = |period: usize| if (period / 60).is_multiple_of(2) { 0.25 } else { -0.25 };
     let hidden: [(&str, &str, &[f64]); 1] = [("backlash", "hip", &[0.017])];
     let [error, moved] = difference_of_plant_and_model(&interpreter, &hidden, 67.0, square_wave);
     assert!(error < 0.005 && moved > 0.1, "difference {error} rad of {moved} rad");

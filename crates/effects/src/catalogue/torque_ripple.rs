@@ -105,6 +105,14 @@ mod tests {
 
     use super::*;
 
+    /// Derivatives over half a period have the wrong sign.
+    #[test]
+    fn derivatives_of_a_fit_turn_the_phase_by_less_than_half_a_radian() {
+        let [low, high] = EFFECT.parameters[1].prior_range;
+        let step = EFFECT.search.derivative_step * (high - low) / (2.0 * 1.96);
+        assert!(step * 1.3 < 0.5, "{step} cycles per revolution at 1.3 rad");
+    }
+
     proptest! {
         /// The fit starts within a quarter of a period of the truth everywhere in the motion.
         #[test]
