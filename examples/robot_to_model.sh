@@ -58,7 +58,9 @@ walk() {
     request arm
     request stand
     await "state ready"
-    "$twinstep" run "$policy" --endpoint "$endpoint" --velocity "$1" --seconds 8 >"$folder/run.txt" || result=$?
+    # After a fault, the robot waits for its operator, and the agent for the robot.
+    timeout --signal=INT 30 "$twinstep" run "$policy" --endpoint "$endpoint" --velocity "$1" --seconds 8 >"$folder/run.txt" ||
+        result=$?
     echo quit >&"${ROBOT[1]}"
     cat <&"${ROBOT[0]}" >/dev/null
     wait "$robot" || true

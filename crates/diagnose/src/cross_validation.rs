@@ -328,6 +328,13 @@ mod tests {
         assert!(healthy.score < 0.0, "{healthy:?}");
     }
 
+    #[test]
+    fn contact_that_cancels_the_trace_of_a_cause_does_not_refute_it() {
+        let contact = Contact { seconds: 22, amplitude: 0.01624, hz: 2.788, seed: 443 };
+        let [air, both] = [None, Some(contact)].map(|contact| fit(&data(|_| 0.2, contact), "viscous_friction"));
+        assert!(both.score > 0.95 * air.score, "{} -> {} nat", air.score, both.score);
+    }
+
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(24))]
 

@@ -8,6 +8,7 @@ use twinstep_model::{RobotModel, Rollout};
 use super::DiagnoseError;
 use super::affected_channels::explains_affected_channels;
 use super::candidates::candidates;
+use super::confounders::{confounders_of, on_single_joints};
 use super::cross_validation::{Accepted, CandidateFit, FitProblem, cross_validate, cross_validate_together};
 use super::hypothesis::Hypothesis;
 use super::joint_gains::{self, JointGains};
@@ -230,7 +231,8 @@ impl<'a> ForwardSelection<'a> {
         if let Some(best) = trials.first().filter(|best| best.score >= thresholds.of(best.hypothesis.effect)) {
             // Confounders of the best candidate, which the scan of all joints at once may have missed.
             let names: Vec<String> = trials.iter().map(|trial| trial.hypothesis.name()).collect();
-            let alike = scan::confounders_of(evidence, &self.model, &best.hypothesis, &names, self.simulator);
+            let mut alike = confounders_of(evidence, &self.model, &best.hypothesis, &names, self.simulator);
+            alike.extend(on_single_joints(evidence, &self.model, &best.hypothesis, &names, self.simulator));
             trials.extend(self.evaluate(alike, excluded, left)?);
             trials.sort_by(best_first);
         }

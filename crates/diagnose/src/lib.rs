@@ -10,6 +10,7 @@
 //! - [`friction_family`]: a search that begins with the friction and inertia of all joints, fitted together.
 //! - [`joint_gains`]: gains that differ from joint to joint by a few percent, which are no cause.
 //! - [`scan`]: evaluates every effect on all joints at once, and returns the best candidates.
+//! - [`confounders`]: hypotheses that the scan may have missed.
 //! - [`candidates`]: which hypotheses of a scan are fitted; [`affected_channels`]: what a cause must explain.
 //! - [`cross_validation`]: fits a hypothesis to one fold and evaluates it on the other, in full simulation.
 //! - [`null_distribution`]: the threshold of the evidence, from the log itself.
@@ -29,6 +30,7 @@
 mod affected_channels;
 mod backward_elimination;
 mod candidates;
+mod confounders;
 mod cross_validation;
 mod data_split;
 mod discrimination;

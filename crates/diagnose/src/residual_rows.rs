@@ -25,7 +25,8 @@ const MISFIT_OF_GYRO: f64 = 1.0 / 3.0;
 ///
 /// Two engines differ by as much, in the same direction for a whole window. The wrench has no error of contact.
 const STANCE_ERROR_RAD: f64 = 0.003;
-/// Factor on the scale of all simulated residuals of such a robot: their errors last about ten times as long as others.
+/// Factor on the scale of all simulated residuals of a standing robot beside residuals without errors of contact: the wrench,
+/// or positions with a fixed base. Its errors last about ten times as long as theirs.
 const STANCE_SCALE: f64 = 3.0;
 /// Scale of a residual that takes no part in a fit.
 const IGNORED: f64 = 1e6;
@@ -44,7 +45,7 @@ pub struct ResidualRows {
     blocks: Vec<Option<usize>>,
     /// True for the residuals of a robot that walks or jumps.
     dynamic: Vec<bool>,
-    /// True for the simulated residuals of a standing robot whose wrench on the base is known.
+    /// True for the simulated residuals of a standing robot beside residuals without errors of contact.
     stance: Vec<bool>,
 }
 
@@ -54,12 +55,13 @@ impl ResidualRows {
         let (mut cells, mut folds, mut blocks, mut dynamic) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         let mut stance = Vec::new();
         let mut first_block = 0;
+        let hangs = experiments.iter().any(Experiment::has_fixed_base);
         for (split, experiment) in splits.iter().zip(&experiments) {
             dynamic.extend(experiment.dynamic_residuals());
             let is_wrench = |quantity| matches!(quantity, ResidualChannel::BaseWrench(_));
             let balanced = experiment.residual_index().any(|(quantity, _)| is_wrench(quantity));
             stance.extend(experiment.residual_index().zip(experiment.groups()).map(|((quantity, _), group)| {
-                balanced && !is_wrench(quantity) && Experiment::regime(group) == Regime::Floating
+                (balanced || hangs) && !is_wrench(quantity) && Experiment::regime(group) == Regime::Floating
             }));
             let block = |row: usize| split.block(row).map(|block| first_block + block);
             blocks.extend(experiment.residual_index().map(|(_, row)| block(row)));

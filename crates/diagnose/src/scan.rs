@@ -84,34 +84,6 @@ fn scan_effect(
     scored
 }
 
-/// Returns the confounders of `best` on the same scope, in either direction of the catalogue's list.
-///
-/// Each has its best grid value. Skips those in `tried`.
-pub fn confounders_of(
-    evidence: &ResidualData,
-    model: &ModelFile,
-    best: &Hypothesis,
-    tried: &[String],
-    simulator: &mut dyn Rollout,
-) -> Vec<Hypothesis> {
-    let confused =
-        |one: &Effect, other: &Effect| one.confounders.iter().any(|confusion| confusion.effect == other.name);
-    let is_new = |effect: &Effect| !tried.contains(&format!("{}@{}", effect.name, best.scope));
-    let effects = CATALOGUE.into_iter().filter(|effect| {
-        let alike = confused(effect, best.effect) || confused(best.effect, effect);
-        alike && effect.target == best.effect.target && is_new(effect) && evidence.has_required_torque(effect)
-    });
-    let first = |effect: &'static Effect| {
-        let at = fine_probes(effect);
-        Some(Hypothesis {
-            effect,
-            scope: best.scope,
-            values: best_values(evidence, model, effect, best.scope, at, false, simulator)?,
-        })
-    };
-    effects.filter_map(first).collect()
-}
-
 /// Refines effects with many local minima on finer grids; returns other hypotheses unchanged.
 ///
 /// If the loop oscillates, or the phase of a ripple is unknown, the residual has narrow minima, which a gradient step cannot
@@ -124,7 +96,9 @@ pub fn refine_grid(
 ) -> Hypothesis {
     let Hypothesis { effect, scope, mut values } = hypothesis;
     let near = (effect.search.near)(&values);
-    values = best_values(evidence, model, effect, scope, near, true, simulator).unwrap_or(values);
+    if let Some((_, best)) = best_values(evidence, model, effect, scope, near, true, simulator) {
+        values = best;
+    }
     if !effect.search.oscillates {
         return Hypothesis { effect, scope, values };
     }
@@ -132,7 +106,7 @@ pub fn refine_grid(
     let mut tried = fine_probes(effect);
     tried.push(values.clone());
     for around in [[0.88, 0.94, 1.06, 1.12], [0.97, 0.985, 1.015, 1.03]] {
-        let Some(best) = best_values(evidence, model, effect, scope, tried, false, simulator) else { break };
+        let Some((_, best)) = best_values(evidence, model, effect, scope, tried, false, simulator) else { break };
         values = best;
         let near = around.map(|factor| vec![(factor * values[0]).clamp(least, most)]);
         tried = near.into_iter().chain([values.clone()]).collect();
@@ -140,8 +114,8 @@ pub fn refine_grid(
     Hypothesis { effect, scope, values }
 }
 
-/// Returns the values with the largest log-likelihood gain; with `quick` on rows with a fixed base, if there are any.
-fn best_values(
+/// Returns the largest log-likelihood gain [nat] and its values; with `quick` on rows with a fixed base, if there are any.
+pub fn best_values(
     evidence: &ResidualData,
     model: &ModelFile,
     effect: &'static Effect,
@@ -149,7 +123,7 @@ fn best_values(
     values: Vec<Vec<f64>>,
     quick: bool,
     simulator: &mut dyn Rollout,
-) -> Option<Vec<f64>> {
+) -> Option<(f64, Vec<f64>)> {
     let built = |values: Vec<f64>| {
         let mut file = model.clone();
         file.effects.push(EffectEntry::new(effect, scope, values.clone()).ok()?);
@@ -164,7 +138,7 @@ fn best_values(
         .residual_powers(simulator, &robots, quick)
         .into_iter()
         .map(|now| log_likelihood_gain(evidence, &now, &before, evident_channels([effect.target])));
-    scores.zip(values).max_by(|one, other| one.0.total_cmp(&other.0)).map(|(_, values)| values)
+    scores.zip(values).max_by(|one, other| one.0.total_cmp(&other.0))
 }
 
 /// Returns the log-likelihood gain of `channels`, including the penalties of nuisance parameters [nat].

@@ -82,6 +82,53 @@ pub fn data(viscous: impl Fn(usize) -> f64, contact: Option<Contact>) -> Residua
     ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
 }
 
+/// Robot of which each joint of a leg moves by its Coulomb friction minus the mean of those of all joints.
+pub struct Coupled;
+
+impl Coupled {
+    /// Returns the positions of a leg with these Coulomb frictions [rad], by row.
+    pub fn position(friction: [f64; 3]) -> impl Fn(usize, usize) -> f64 {
+        let mean = friction.iter().sum::<f64>() / 3.0;
+        move |joint, row| if joint < 3 { position(0.0, friction[joint] - mean, row) } else { 0.0 }
+    }
+}
+
+impl Rollout for Coupled {
+    fn run(&mut self, jobs: &[RolloutRequest], _: Precision) -> Vec<RobotStates> {
+        let play = |job: &RolloutRequest| {
+            let moved = Self::position(std::array::from_fn(|joint| job.robot.joints[joint].coulomb_friction));
+            let mut states = RobotStates::new(job.commands.len() + 1);
+            for (row, q) in states.measured.q.iter_mut().enumerate() {
+                *q = std::array::from_fn(|joint| moved(joint, row) as f32);
+            }
+            states
+        };
+        jobs.iter().map(play).collect()
+    }
+}
+
+/// Returns the data of a robot that stands for 20 s, with these joint positions [rad] by joint and row of a window.
+pub fn standing(q: &dyn Fn(usize, usize) -> f64) -> ResidualData {
+    const ROWS: usize = 4000;
+    const WINDOW: usize = 200;
+    let column = |name: String, of: &dyn Fn(usize) -> f64| (name, (0..ROWS).map(of).collect::<Vec<f64>>());
+    let constants = [("kp", 25.0), ("kd", 0.6), ("quat_w", 1.0), ("pos_z", 0.0), ("vel_x", 0.0)];
+    let mut columns = vec![column("t".to_owned(), &|row| row as f64 / 200.0)];
+    columns.extend(constants.map(|(name, value)| column(name.to_owned(), &|_| value)));
+    let noise = |row: usize| 3.46 * NOISE * ((row * 7919 % 1009) as f64 / 1009.0 - 0.5);
+    for (joint, name) in JOINT_NAMES.into_iter().enumerate() {
+        // The first row of a window is the last row of the previous one.
+        let in_window = |row: usize| if row == 0 { 0 } else { (row - 1) % WINDOW + 1 };
+        columns.push(column(format!("q_{name}"), &|row| q(joint, in_window(row)) + noise(row)));
+        columns.push(column(format!("q_cmd_{name}"), &|_| 0.0));
+    }
+    let segments = vec![Segment { name: "stand".to_owned(), base: BaseMount::Floating }];
+    let mut meta = Meta::new(200.0, TorqueSensor::None, segments);
+    meta.noise.extend(JOINT_NAMES.map(|joint| (format!("q_{joint}"), NOISE)));
+    let log = Log::new(meta, columns).expect("a log");
+    ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
+}
+
 /// Robot that stands still, with a gyroscope whose reading is its bias.
 pub struct AtRest;
 
