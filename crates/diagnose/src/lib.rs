@@ -10,6 +10,7 @@
 //! - [`friction_family`]: a search that begins with the friction and inertia of all joints, fitted together.
 //! - [`joint_gains`]: gains that differ from joint to joint by a few percent, which are no cause.
 //! - [`scan`]: evaluates every effect on all joints at once, and returns the best candidates.
+//! - [`ripple_scan`]: the same for torque ripple, without simulations of it.
 //! - [`confounders`]: hypotheses that the scan may have missed.
 //! - [`candidates`]: which hypotheses of a scan are fitted; [`affected_channels`]: what a cause must explain.
 //! - [`cross_validation`]: fits a hypothesis to one fold and evaluates it on the other, in full simulation.
@@ -49,6 +50,7 @@ mod reporting;
 mod residual_data;
 mod residual_power;
 mod residual_rows;
+mod ripple_scan;
 mod scan;
 mod scope_merging;
 mod size_drift;

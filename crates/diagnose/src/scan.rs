@@ -12,9 +12,10 @@ use twinstep_model::{Joint, RobotModel, Rollout};
 use super::hypothesis::{Hypothesis, fine_probes, selection_penalty, with_effect};
 use super::residual_data::ResidualData;
 use super::residual_power::{ResidualPower, STANCE, TORQUE, evident_channels};
+use super::ripple_scan::{self, scan_ripples};
 
 /// Maximum number of scopes per effect in the result.
-const OF_ONE_EFFECT: usize = 2;
+pub const OF_ONE_EFFECT: usize = 2;
 
 /// Hypothesis with its score.
 #[derive(Clone, Debug)]
@@ -30,10 +31,12 @@ pub fn scan(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Roll
     let Ok(robot) = model.robot_model() else { return Vec::new() };
     let before = evidence.residual_powers(simulator, std::slice::from_ref(&robot), true).remove(0);
     let effects = CATALOGUE.into_iter().filter(|effect| {
-        matches!(effect.target, Target::Joints | Target::Supply) && evidence.has_required_torque(effect)
+        let is_scanned = matches!(effect.target, Target::Joints | Target::Supply) && effect.name != ripple_scan::EFFECT;
+        is_scanned && evidence.has_required_torque(effect)
     });
     let mut scored: Vec<ScoredHypothesis> =
         effects.flat_map(|effect| scan_effect(evidence, model, effect, &before, simulator)).collect();
+    scored.extend(scan_ripples(evidence, model, simulator));
     if evidence.has_free_parts() {
         scored.extend(scan_whole(evidence, model, &robot, simulator));
     }
