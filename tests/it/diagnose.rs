@@ -146,7 +146,9 @@ fn ripples_found(scope: &str, values: [f64; 3], lead: f64) -> Vec<(String, [f64;
 /// A fit of a ripple ends at the nearest of many minima. The second ripple is stiffer than its loop.
 #[test]
 fn torque_ripple_of_one_joint_is_found_on_a_robot_whose_encoder_positions_are_ahead_of_their_velocities() {
-    for (scope, truth) in [("FL_thigh", [0.37, 41.5, 0.14]), ("RL_calf", [0.36, 108.77, -2.59]), ("FL_thigh", [0.37, 55.6, 0.14])] {
+    for (scope, truth) in
+        [("FL_thigh", [0.37, 41.5, 0.14]), ("RL_calf", [0.36, 108.77, -2.59]), ("FL_thigh", [0.37, 55.6, 0.14])]
+    {
         let found = ripples_found(scope, truth, 0.0005);
         assert_eq!(found.len(), 1, "{found:?}");
         let (name, [amplitude, cycles]) = &found[0];
