@@ -78,12 +78,14 @@ fn best_of_grids(
 
 #[cfg(test)]
 mod tests {
+    use twinstep_model::BaseMount;
+
     use super::*;
-    use crate::test_data::{Coupled, standing};
+    use crate::test_data::{Coupled, coupled_with_calf_friction};
 
     #[test]
     fn friction_of_one_joint_of_a_standing_robot_is_tried_where_the_scan_found_friction_of_its_leg() {
-        let data = standing(&Coupled::position([0.0, 0.0, 0.3]));
+        let data = coupled_with_calf_friction(BaseMount::Floating, 0.3);
         let effect = |name| Effect::named(name).expect("in the catalogue");
         let joint = Joint::ALL[0];
         let best = Hypothesis { effect: effect("viscous_friction"), scope: Scope::Leg(joint.leg), values: vec![0.1] };

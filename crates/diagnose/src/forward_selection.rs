@@ -2,8 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use twinstep_effects::{Effect, ModelFile};
-use twinstep_model::{RobotModel, Rollout};
+use twinstep_effects::{Effect, ModelFile, Scope};
+use twinstep_model::{Joint, RobotModel, Rollout};
 
 use super::DiagnoseError;
 use super::affected_channels::explains_affected_channels;
@@ -24,10 +24,12 @@ use super::scope_merging;
 ///
 /// Set by hand after a false positive with 22 nat in a case of `twinstep hunt` that is not in a published table.
 pub const THRESHOLD: f64 = 30.0;
-/// Share of the largest log-likelihood gain that a further cause must reach.
+/// Share of the log-likelihood gain of another cause, on the joints that both affect, that a further cause must reach.
 ///
-/// The laws of the catalogue are approximations, and what a large effect leaves imitates small ones.
+/// The laws of the catalogue are approximations, and what a large effect leaves imitates small ones at the same joints.
 const MIN_SHARE_OF_LARGEST: f64 = 0.01;
+/// Gain of a cause at one of its joints relative to the mean of its joints, at most.
+const LARGEST_OF_MEAN: f64 = 3.0;
 /// Maximum number of causes.
 const MOST_CAUSES: usize = 12;
 /// Maximum number of rounds of selection and elimination.
@@ -236,8 +238,13 @@ impl<'a> ForwardSelection<'a> {
             trials.extend(self.evaluate(alike, excluded, left)?);
             trials.sort_by(best_first);
         }
-        let largest = self.accepted.iter().map(|(best, _)| best.score).fold(0.0, f64::max);
-        let least = |trial: &CandidateFit| thresholds.of(trial.hypothesis.effect).max(MIN_SHARE_OF_LARGEST * largest);
+        let gains_there = |trial: &CandidateFit| {
+            let there = |cause: &CandidateFit| cause.score * share_at(cause.hypothesis.scope, trial.hypothesis.scope);
+            self.accepted.iter().map(|(cause, _)| there(cause)).fold(0.0, f64::max)
+        };
+        let least = |trial: &CandidateFit| {
+            thresholds.of(trial.hypothesis.effect).max(MIN_SHARE_OF_LARGEST * gains_there(trial))
+        };
         let explains = |trial: &CandidateFit| {
             let small = !trial.hypothesis.exceeds_min_size();
             trial.explained_fraction >= if small { EXPLAINED_BY_SMALL_CAUSE } else { MIN_EXPLAINED_FRACTION }
@@ -306,6 +313,16 @@ impl<'a> ForwardSelection<'a> {
             self.view = usize::from(evidence.fails_to_track(&evidence.residual_power(self.simulator, &robot)));
         }
     }
+}
+
+/// Returns the largest share of the gain of a cause on scope `of` that may come from the joints of the scope `at`: 1 for effects
+/// on the base, the ground or the supply.
+fn share_at(of: Scope, at: Scope) -> f64 {
+    if of.joints() == 0 || at.joints() == 0 {
+        return 1.0;
+    }
+    let both = Joint::ALL.into_iter().filter(|joint| of.contains(*joint) && at.contains(*joint)).count();
+    (LARGEST_OF_MEAN * both as f64 / of.joints() as f64).min(1.0)
 }
 
 fn best_first(one: &CandidateFit, other: &CandidateFit) -> std::cmp::Ordering {

@@ -62,12 +62,17 @@ pub fn relative_size(effect: &Effect, values: &[f64]) -> f64 {
     values[..parameter.count].iter().map(of).fold(0.0, f64::max)
 }
 
-/// Returns the model with an effect of these values on every joint, or on supply, base or ground.
-pub fn with_effect(model: &ModelFile, effect: &'static Effect, values: &[f64]) -> Result<ModelFile, EntryError> {
+/// Returns the model with an effect of these values on every joint of `joints`, or on supply, base or ground.
+pub fn with_effect(
+    model: &ModelFile,
+    effect: &'static Effect,
+    joints: Scope,
+    values: &[f64],
+) -> Result<ModelFile, EntryError> {
     let mut file = model.clone();
     // One entry per joint: if the effect replaces, the entry with the narrowest scope applies.
     let scopes: Vec<Scope> = match effect.target {
-        Target::Joints => Joint::ALL.map(Scope::Joint).to_vec(),
+        Target::Joints => Joint::ALL.into_iter().filter(|joint| joints.contains(*joint)).map(Scope::Joint).collect(),
         Target::Supply => vec![Scope::All],
         Target::Bodies | Target::Imu => vec![Scope::Base],
         Target::Ground => vec![Scope::Ground],
@@ -147,8 +152,8 @@ mod tests {
     #[test]
     fn effect_on_every_joint_replaces_the_entries_of_the_model() {
         let effect = Effect::named("viscous_friction").expect("known");
-        let file = with_effect(&ModelFile::default(), effect, &[0.2]).expect("allowed");
-        let twice = with_effect(&file, effect, &[0.3]).expect("allowed").robot_model().expect("a robot");
+        let file = with_effect(&ModelFile::default(), effect, Scope::All, &[0.2]).expect("allowed");
+        let twice = with_effect(&file, effect, Scope::All, &[0.3]).expect("allowed").robot_model().expect("a robot");
         let expected = if effect.composition == Composition::Replace { 0.3 } else { 0.5 };
         assert!(twice.joints.iter().all(|joint| (joint.viscous_friction - expected).abs() < 1e-12));
     }

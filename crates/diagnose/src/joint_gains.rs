@@ -91,7 +91,7 @@ fn estimated_gain(
     simulator: &mut dyn Rollout,
 ) -> Option<f64> {
     let values = [[1.0, 1.0], [1.0 - PROBE, 1.0], [1.0 + PROBE, 1.0], [1.0, 1.0 - PROBE], [1.0, 1.0 + PROBE]];
-    let robot = |values: [f64; 2]| with_effect(model, effect, &values).ok()?.robot_model().ok();
+    let robot = |values: [f64; 2]| with_effect(model, effect, Scope::All, &values).ok()?.robot_model().ok();
     let robots: Vec<RobotModel> = values.into_iter().map(robot).collect::<Option<_>>()?;
     let left = evidence.residual_powers(simulator, &robots, true);
     let sum = |candidate: usize, channel: usize| left[candidate].sums[channel].iter().sum::<f64>();

@@ -77,7 +77,9 @@ pub fn thresholds(evidence: &ResidualData, model: &ModelFile, simulator: &mut dy
     for effect in CATALOGUE.into_iter().filter(|effect| evidence.has_required_torque(effect)) {
         let scopes = scopes(effect, evidence);
         for values in small_probes(effect).into_iter().filter(|_| !scopes.is_empty()) {
-            if let Some(probe) = with_effect(model, effect, &values).ok().and_then(|file| file.robot_model().ok()) {
+            if let Some(probe) =
+                with_effect(model, effect, Scope::All, &values).ok().and_then(|file| file.robot_model().ok())
+            {
                 let channels =
                     |scope: Scope| evident_channels([effect.target]).filter(|channel| shows(scope, *channel)).collect();
                 directions.push(Direction {
@@ -277,7 +279,7 @@ mod tests {
         let before = data.residual_power(&mut Linear, &go2());
         let model = ModelFile::default();
         let found = cross_validate(data, &model, &before, &hypothesis, &mut Linear).expect("a robot");
-        let with_best = with_effect(&model, effect, &found.hypothesis.values).expect("allowed");
+        let with_best = with_effect(&model, effect, Scope::All, &found.hypothesis.values).expect("allowed");
         [found.score, thresholds(data, &with_best, &mut Linear).of(effect)]
     }
 

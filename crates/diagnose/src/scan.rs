@@ -1,13 +1,13 @@
-//! Scan: evaluates every effect on all joints at once, with a few simulations per effect.
+//! Scan: evaluates every effect on all scopes, with a few simulations per effect.
 //!
-//! With a fixed base the joints are nearly decoupled. One simulation therefore evaluates all twelve joints, and the
-//! score of a scope is the sum over its joints. Effects on base, ground and gyroscope are evaluated on the whole log.
+//! With a fixed base the legs are decoupled. One simulation of an effect on a joint type therefore evaluates the four joints of
+//! that type, and one on all joints the wider scopes. Effects on base, ground and gyroscope are evaluated on the whole log.
 
 use std::ops::Range;
 
 use twinstep_effects::ModelFile;
 use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Probes, Scope, Target};
-use twinstep_model::{Joint, RobotModel, Rollout};
+use twinstep_model::{Joint, JointKind, RobotModel, Rollout};
 
 use super::hypothesis::{Hypothesis, fine_probes, selection_penalty, with_effect};
 use super::residual_data::ResidualData;
@@ -51,8 +51,39 @@ fn scan_effect(
     before: &ResidualPower,
     simulator: &mut dyn Rollout,
 ) -> Vec<ScoredHypothesis> {
+    let kinds = JointKind::ALL.into_iter().map(Scope::Kind).filter(|_| effect.target != Target::Supply);
+    let simulated = [Scope::All].into_iter().chain(kinds);
+    let mut scored: Vec<ScoredHypothesis> =
+        simulated.flat_map(|simulated| scan_simulated(evidence, model, effect, simulated, before, simulator)).collect();
+    scored.sort_by(|one, other| other.score.total_cmp(&one.score));
+    scored.truncate(OF_ONE_EFFECT);
+    scored
+}
+
+/// Returns the scopes that simulations of an effect on all joints or on those of one type evaluate.
+fn evaluated_scopes(effect: &Effect, simulated: Scope) -> Vec<Scope> {
+    let of_kind = |scope: &Scope| match (simulated, scope) {
+        (Scope::Kind(kind), Scope::Joint(joint)) => joint.kind == kind,
+        (Scope::Kind(_), scope) => *scope == simulated,
+        (_, scope) => !matches!(scope, Scope::Kind(_) | Scope::Joint(_)),
+    };
+    if effect.target == Target::Supply {
+        return vec![Scope::All];
+    }
+    Scope::of_joints().into_iter().filter(of_kind).collect()
+}
+
+/// Scores the scopes that simulations of an effect on the joints `simulated` evaluate: all, or those of one type.
+fn scan_simulated(
+    evidence: &ResidualData,
+    model: &ModelFile,
+    effect: &'static Effect,
+    simulated: Scope,
+    before: &ResidualPower,
+    simulator: &mut dyn Rollout,
+) -> Vec<ScoredHypothesis> {
     let built = |values: Vec<f64>| -> Option<(Vec<f64>, RobotModel)> {
-        let robot = with_effect(model, effect, &values).ok()?.robot_model().ok()?;
+        let robot = with_effect(model, effect, simulated, &values).ok()?.robot_model().ok()?;
         Some((values, robot))
     };
     let (values, robots): (Vec<_>, Vec<_>) =
@@ -62,29 +93,20 @@ fn scan_effect(
         .iter()
         .map(|now| joint_gains(evidence, now, before))
         .collect();
-    let scopes = if effect.target == Target::Supply { vec![Scope::All] } else { Scope::of_joints() };
-    let mut scored: Vec<ScoredHypothesis> = scopes
-        .into_iter()
-        .filter_map(|scope| {
-            let of = |size: usize, fold: usize| -> f64 {
-                Joint::ALL
-                    .iter()
-                    .filter(|joint| scope.contains(**joint))
-                    .map(|joint| gains[size][joint.index()][fold])
-                    .sum()
-            };
-            let best =
-                |of: &dyn Fn(usize) -> f64| (0..values.len()).max_by(|one, other| of(*one).total_cmp(&of(*other)));
-            // Selected on one fold, evaluated on the other.
-            let judged = of(best(&|size| of(size, 0))?, 1) + of(best(&|size| of(size, 1))?, 0);
-            let whole = best(&|size| of(size, 0) + of(size, 1))?;
-            let hypothesis = Hypothesis { effect, scope, values: values[whole].clone() };
-            Some(ScoredHypothesis { hypothesis, score: judged - selection_penalty(scope) })
-        })
-        .collect();
-    scored.sort_by(|one, other| other.score.total_cmp(&one.score));
-    scored.truncate(OF_ONE_EFFECT);
-    scored
+    let score = |scope: Scope| {
+        // An effect on one joint moves the others of its leg, too.
+        let in_its_legs = |joint: Joint| Joint::ALL.into_iter().any(|of| of.leg == joint.leg && scope.contains(of));
+        let shows = |joint: &Joint| if simulated == Scope::All { scope.contains(*joint) } else { in_its_legs(*joint) };
+        let joints: Vec<usize> = Joint::ALL.into_iter().filter(shows).map(Joint::index).collect();
+        let of = |size: usize, fold: usize| -> f64 { joints.iter().map(|joint| gains[size][*joint][fold]).sum() };
+        let best = |of: &dyn Fn(usize) -> f64| (0..values.len()).max_by(|one, other| of(*one).total_cmp(&of(*other)));
+        // Selected on one fold, evaluated on the other.
+        let judged = of(best(&|size| of(size, 0))?, 1) + of(best(&|size| of(size, 1))?, 0);
+        let whole = best(&|size| of(size, 0) + of(size, 1))?;
+        let hypothesis = Hypothesis { effect, scope, values: values[whole].clone() };
+        Some(ScoredHypothesis { hypothesis, score: judged - selection_penalty(scope) })
+    };
+    evaluated_scopes(effect, simulated).into_iter().filter_map(score).collect()
 }
 
 /// Refines effects with many local minima on finer grids; returns other hypotheses unchanged.
@@ -213,4 +235,21 @@ fn joint_gains(evidence: &ResidualData, now: &ResidualPower, before: &ResidualPo
             .sum::<f64>()
     };
     (0..twinstep_model::NUM_JOINTS).map(|joint| [of(joint, 0), of(joint, 1)]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use twinstep_model::BaseMount;
+
+    use super::*;
+    use crate::test_data::{Coupled, coupled_with_calf_friction};
+
+    /// The same friction at all joints of a leg moves none of them.
+    #[test]
+    fn friction_of_one_joint_is_found_although_the_joints_of_a_leg_move_each_other() {
+        let data = coupled_with_calf_friction(BaseMount::Fixed, 0.3);
+        let best = scan(&data, &ModelFile::default(), &mut Coupled).remove(0);
+        assert_eq!(best.hypothesis.name(), "coulomb_friction@FL_calf");
+        assert!(best.score > 30.0, "{best:?}");
+    }
 }

@@ -2,7 +2,7 @@
 
 use twinstep_identify::window::WindowConfig;
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
-use twinstep_model::{BaseMount, JOINT_NAMES, Precision, RobotStates, Rollout, RolloutRequest, go2};
+use twinstep_model::{BaseMount, JOINT_NAMES, NUM_JOINTS, Precision, RobotStates, Rollout, RolloutRequest, go2};
 
 use super::residual_data::ResidualData;
 
@@ -82,21 +82,22 @@ pub fn data(viscous: impl Fn(usize) -> f64, contact: Option<Contact>) -> Residua
     ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
 }
 
-/// Robot of which each joint of a leg moves by its Coulomb friction minus the mean of those of all joints.
+/// Robot of which each joint moves by its Coulomb friction minus the mean of those of its leg.
 pub struct Coupled;
 
 impl Coupled {
-    /// Returns the positions of a leg with these Coulomb frictions [rad], by row.
-    pub fn position(friction: [f64; 3]) -> impl Fn(usize, usize) -> f64 {
-        let mean = friction.iter().sum::<f64>() / 3.0;
-        move |joint, row| if joint < 3 { position(0.0, friction[joint] - mean, row) } else { 0.0 }
+    /// Returns the position of a joint [rad] with these Coulomb frictions, by joint and row.
+    pub fn position(friction: [f64; NUM_JOINTS]) -> impl Fn(usize, usize) -> f64 {
+        let mean = |joint: usize| friction[joint / 3 * 3..][..3].iter().sum::<f64>() / 3.0;
+        let moving: [f64; NUM_JOINTS] = std::array::from_fn(|joint| friction[joint] - mean(joint));
+        move |joint, row| position(0.0, moving[joint], row)
     }
 }
 
 impl Rollout for Coupled {
     fn run(&mut self, jobs: &[RolloutRequest], _: Precision) -> Vec<RobotStates> {
         let play = |job: &RolloutRequest| {
-            let moved = Self::position(std::array::from_fn(|joint| job.robot.joints[joint].coulomb_friction));
+            let moved = Self::position(job.robot.joints.each_ref().map(|joint| joint.coulomb_friction));
             let mut states = RobotStates::new(job.commands.len() + 1);
             for (row, q) in states.measured.q.iter_mut().enumerate() {
                 *q = std::array::from_fn(|joint| moved(joint, row) as f32);
@@ -107,10 +108,16 @@ impl Rollout for Coupled {
     }
 }
 
-/// Returns the data of a robot that stands for 20 s, with these joint positions [rad] by joint and row of a window.
-pub fn standing(q: &dyn Fn(usize, usize) -> f64) -> ResidualData {
+/// Returns the data of a robot with this Coulomb friction at its left front calf [N·m], where the joints of a leg move each other.
+pub fn coupled_with_calf_friction(base: BaseMount, friction: f64) -> ResidualData {
+    let calf = std::array::from_fn(|joint| if joint == 2 { friction } else { 0.0 });
+    moving(base, &Coupled::position(calf))
+}
+
+/// Returns the data of a robot that moves for 20 s, with these joint positions [rad] by joint and row of a window.
+fn moving(base: BaseMount, q: &dyn Fn(usize, usize) -> f64) -> ResidualData {
     const ROWS: usize = 4000;
-    const WINDOW: usize = 200;
+    let window = if base == BaseMount::Fixed { 400 } else { 200 };
     let column = |name: String, of: &dyn Fn(usize) -> f64| (name, (0..ROWS).map(of).collect::<Vec<f64>>());
     let constants = [("kp", 25.0), ("kd", 0.6), ("quat_w", 1.0), ("pos_z", 0.0), ("vel_x", 0.0)];
     let mut columns = vec![column("t".to_owned(), &|row| row as f64 / 200.0)];
@@ -118,11 +125,11 @@ pub fn standing(q: &dyn Fn(usize, usize) -> f64) -> ResidualData {
     let noise = |row: usize| 3.46 * NOISE * ((row * 7919 % 1009) as f64 / 1009.0 - 0.5);
     for (joint, name) in JOINT_NAMES.into_iter().enumerate() {
         // The first row of a window is the last row of the previous one.
-        let in_window = |row: usize| if row == 0 { 0 } else { (row - 1) % WINDOW + 1 };
+        let in_window = |row: usize| if row == 0 { 0 } else { (row - 1) % window + 1 };
         columns.push(column(format!("q_{name}"), &|row| q(joint, in_window(row)) + noise(row)));
         columns.push(column(format!("q_cmd_{name}"), &|_| 0.0));
     }
-    let segments = vec![Segment { name: "stand".to_owned(), base: BaseMount::Floating }];
+    let segments = vec![Segment { name: "motion".to_owned(), base }];
     let mut meta = Meta::new(200.0, TorqueSensor::None, segments);
     meta.noise.extend(JOINT_NAMES.map(|joint| (format!("q_{joint}"), NOISE)));
     let log = Log::new(meta, columns).expect("a log");
