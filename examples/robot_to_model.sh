@@ -59,7 +59,7 @@ walk() {
     request stand
     await "state ready"
     # After a fault, the robot waits for its operator, and the agent for the robot.
-    timeout --signal=INT 30 "$twinstep" run "$policy" --endpoint "$endpoint" --velocity "$1" --seconds 8 >"$folder/run.txt" ||
+    timeout --foreground --signal=INT 30 "$twinstep" run "$policy" --endpoint "$endpoint" --velocity "$1" --seconds 8 >"$folder/run.txt" ||
         result=$?
     echo quit >&"${ROBOT[1]}"
     cat <&"${ROBOT[0]}" >/dev/null

@@ -1,4 +1,4 @@
-//! Hypotheses that the scan of all joints at once may have missed: confounders of its best candidate.
+//! Hypotheses that the scan may have missed: confounders of its best candidate.
 
 use twinstep_effects::{CATALOGUE, Effect, ModelFile, Scope};
 use twinstep_model::{Joint, Rollout};
@@ -27,10 +27,9 @@ pub fn confounders_of(
     best_of_grids(evidence, model, on_same_scope, tried, simulator).into_iter().map(|(_, found)| found).collect()
 }
 
-/// Returns the effect of `best` and its confounders on single joints of its scope: the [`SINGLE_JOINTS`] that gain most, each
-/// with its best grid value. Skips those in `tried`.
+/// Returns the effect of `best` and its confounders on single joints of its scope, without those in `tried`.
 ///
-/// On the ground, one simulation of an effect on all joints does not show what it does at one of them.
+/// They are the [`SINGLE_JOINTS`] that gain most, each with its best grid value. On the ground, one simulation of an effect on all joints does not show what it does at one of them.
 pub fn on_single_joints(
     evidence: &ResidualData,
     model: &ModelFile,

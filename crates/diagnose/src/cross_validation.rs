@@ -127,10 +127,8 @@ impl FitProblem {
         let tolerances = rows.tolerances.as_ref();
         let task = LeastSquaresProblem { file, unknowns, experiments, residual_scale: &[], tolerances, precision };
         let mut spread = task.estimate_residual_scale(simulator, &self.initial_point);
-        rows.raise_scales_on_ground(
-            &mut spread,
-            unknowns.iter().any(|unknown| unknown.effect.target == Target::Ground),
-        );
+        let targets: Vec<Target> = unknowns.iter().map(|unknown| unknown.effect.target).collect();
+        rows.raise_scales_on_ground(&mut spread, &targets);
         let tolerances = tolerances.and_then(|tolerances| tolerances.rescaled(&spread));
         ask(&LeastSquaresProblem { residual_scale: &spread, tolerances: tolerances.as_ref(), ..task }, simulator)
     }

@@ -16,6 +16,7 @@ use super::null_distribution::{self, LOWEST_THRESHOLD};
 use super::profile_likelihood::refine_with_restarts;
 use super::residual_data::ResidualData;
 use super::residual_power::ResidualPower;
+use super::ripple_scan::repeats;
 use super::scan::{self, ScoredHypothesis, scan};
 use super::scope_merging;
 
@@ -24,12 +25,11 @@ use super::scope_merging;
 ///
 /// Set by hand after a false positive with 22 nat in a case of `twinstep hunt` that is not in a published table.
 pub const THRESHOLD: f64 = 30.0;
-/// Share of the log-likelihood gain of another cause, on the joints that both affect, that a further cause must reach.
+/// Share of a log-likelihood gain that errors of its law may be: what another cause gains in the legs of a further cause, of which
+/// that must gain as much, and the largest gain, for causes that are merged.
 ///
-/// The laws of the catalogue are approximations, and what a large effect leaves imitates small ones at the same joints.
+/// The laws of the catalogue are approximations, and what a large effect leaves imitates small ones in the same legs.
 const MIN_SHARE_OF_LARGEST: f64 = 0.01;
-/// Gain of a cause at one of its joints relative to the mean of its joints, at most.
-const LARGEST_OF_MEAN: f64 = 3.0;
 /// Maximum number of causes.
 const MOST_CAUSES: usize = 12;
 /// Maximum number of rounds of selection and elimination.
@@ -182,7 +182,8 @@ impl<'a> ForwardSelection<'a> {
         let given = with_gains.as_ref().unwrap_or(given);
         let stands = |hypothesis: &Hypothesis| {
             let at_sensor = evidence.torque_sensor_shows(&self.baseline, hypothesis);
-            hypothesis.is_plausible() && explains_affected_channels(hypothesis, at_sensor, given, &left)
+            let is_plausible = hypothesis.is_plausible() && repeats(evidence.logs(), hypothesis);
+            is_plausible && explains_affected_channels(hypothesis, at_sensor, given, &left)
         };
         self.accepted.iter().position(|(best, _)| !stands(&best.hypothesis))
     }
@@ -231,8 +232,10 @@ impl<'a> ForwardSelection<'a> {
         let with_best = with_best.map_or(self.model.clone(), |fit| fit.model(&fit.initial_point));
         let thresholds = null_distribution::thresholds(evidence, &with_best, self.simulator);
         if let Some(best) = trials.first().filter(|best| best.score >= thresholds.of(best.hypothesis.effect)) {
-            // Confounders of the best candidate, which the scan of all joints at once may have missed.
-            let names: Vec<String> = trials.iter().map(|trial| trial.hypothesis.name()).collect();
+            // Confounders of the best candidate, which the scan may have missed.
+            let accepted = self.accepted.iter().map(|(cause, _)| cause);
+            let names = accepted.chain(&trials).map(|trial| trial.hypothesis.name());
+            let names: Vec<String> = names.chain(excluded.iter().cloned()).collect();
             let mut alike = confounders_of(evidence, &self.model, &best.hypothesis, &names, self.simulator);
             alike.extend(on_single_joints(evidence, &self.model, &best.hypothesis, &names, self.simulator));
             trials.extend(self.evaluate(alike, excluded, left)?);
@@ -275,6 +278,7 @@ impl<'a> ForwardSelection<'a> {
                 trials.extend(cross_validate(evidence, &self.model, left, &hypothesis, self.simulator));
             }
         }
+        trials.retain(|trial| repeats(evidence.logs(), &trial.hypothesis));
         trials.sort_by(best_first);
         Ok(trials)
     }
@@ -315,14 +319,14 @@ impl<'a> ForwardSelection<'a> {
     }
 }
 
-/// Returns the largest share of the gain of a cause on scope `of` that may come from the joints of the scope `at`: 1 for effects
-/// on the base, the ground or the supply.
+/// Returns the share of a cause's joints that are in the legs of `at`; 1 without joints, as for the base or the ground.
 fn share_at(of: Scope, at: Scope) -> f64 {
     if of.joints() == 0 || at.joints() == 0 {
         return 1.0;
     }
-    let both = Joint::ALL.into_iter().filter(|joint| of.contains(*joint) && at.contains(*joint)).count();
-    (LARGEST_OF_MEAN * both as f64 / of.joints() as f64).min(1.0)
+    let in_legs_of_at = |joint: Joint| Joint::ALL.into_iter().any(|other| other.leg == joint.leg && at.contains(other));
+    let shared = Joint::ALL.into_iter().filter(|joint| of.contains(*joint) && in_legs_of_at(*joint)).count();
+    shared as f64 / of.joints() as f64
 }
 
 fn best_first(one: &CandidateFit, other: &CandidateFit) -> std::cmp::Ordering {

@@ -9,7 +9,7 @@
 //! - [`backward_elimination`]: evidence of each cause beside all others.
 //! - [`friction_family`]: a search that begins with the friction and inertia of all joints, fitted together.
 //! - [`joint_gains`]: gains that differ from joint to joint by a few percent, which are no cause.
-//! - [`scan`]: evaluates every effect on all joints at once, and returns the best candidates.
+//! - [`scan`]: evaluates every effect on all scopes with a few simulations, and returns the best candidates.
 //! - [`ripple_scan`]: the same for torque ripple, without simulations of it.
 //! - [`confounders`]: hypotheses that the scan may have missed.
 //! - [`candidates`]: which hypotheses of a scan are fitted; [`affected_channels`]: what a cause must explain.

@@ -18,7 +18,7 @@ use twinstep_model::{Joint, Rollout, stream};
 use super::cross_validation::parameter_penalty;
 use super::hypothesis::{relative_size, selection_penalty, with_effect};
 use super::residual_data::{BlockProducts, ResidualData};
-use super::residual_power::{CHANNELS, STANCE, TORQUE, WRENCH, evident_channels, log_likelihood_gain};
+use super::residual_power::{CHANNELS, STANCE, TORQUE, WRENCH, evident_channels};
 
 /// Number of draws.
 const DRAWS: u64 = 499;
@@ -196,10 +196,13 @@ impl<'a> FlippedSums<'a> {
             return 0.0;
         }
         let gain = |channel: usize, fold: usize| {
-            let before = power(channel, fold);
+            let [count, before] = power(channel, fold);
             let size = sizes[1 - fold];
-            let after = before[1] + 2.0 * size * self.cross[index][channel][fold] + size * size * slope(channel, fold);
-            log_likelihood_gain(channel, before, after.max(0.0), evidence.correlation_rows(channel))
+            let after = before + 2.0 * size * self.cross[index][channel][fold] + size * size * slope(channel, fold);
+            if count == 0.0 {
+                return 0.0;
+            }
+            0.5 * count / evidence.correlation_rows(channel) * ((before + 1e-9) / (after.max(0.0) + 1e-9)).ln()
         };
         let nats: f64 = channels.iter().map(|channel| gain(*channel, 0) + gain(*channel, 1)).sum();
         nats - selection_penalty(scope) - parameter_penalty(direction.num_values)

@@ -34,24 +34,6 @@ pub fn evident_channels(targets: impl IntoIterator<Item = Target>) -> Range<usiz
     0..if on_ground { CHANNELS } else { DYNAMIC }
 }
 
-/// Returns the log-likelihood gain of one channel: ½ n ln(SSR_before / SSR), with n = row count / `rows` [nat].
-///
-/// `before` is the number of rows and their sum of squares, `now` is the new sum, `rows` is the correlation length. What
-/// the contact model gets wrong can cancel the trace of a cause. A loss in the positions of a standing robot is therefore
-/// divided by their residual power, if that exceeds noise.
-pub fn log_likelihood_gain(channel: usize, before: [f64; 2], now: f64, rows: f64) -> f64 {
-    let [count, then] = before;
-    if count == 0.0 {
-        return 0.0;
-    }
-    if !now.is_finite() {
-        return f64::NEG_INFINITY;
-    }
-    let nats = 0.5 * count / rows * ((then + 1e-9) / (now + 1e-9)).ln();
-    let of_stance = (STANCE..WRENCH).contains(&channel);
-    if of_stance && nats < 0.0 { nats / (then / count).max(1.0) } else { nats }
-}
-
 /// Sums of squared residuals and numbers of rows by channel and fold, in units of the variance of noise and model
 /// error.
 #[derive(Clone, Debug)]
@@ -104,10 +86,18 @@ impl ResidualPower {
         self.sums.iter().flatten().any(|sum| !sum.is_finite())
     }
 
-    /// Returns the log-likelihood gain over `before` for one channel and fold [nat], with a correlation length in rows.
+    /// Returns the log-likelihood gain over `before` for one channel and fold [nat].
+    ///
+    /// ½ n ln(SSR_before / SSR), with n = row count / `rows`, where `rows` is the correlation length.
     pub fn log_likelihood_gain(&self, before: &Self, channel: usize, fold: usize, rows: f64) -> f64 {
         let (now, then, count) = (self.sums[channel][fold], before.sums[channel][fold], before.counts[channel][fold]);
-        log_likelihood_gain(channel, [count, then], now, rows)
+        if count == 0.0 {
+            return 0.0;
+        }
+        if !now.is_finite() {
+            return f64::NEG_INFINITY;
+        }
+        0.5 * count / rows * ((then + 1e-9) / (now + 1e-9)).ln()
     }
 
     /// Returns the power above noise and model error of all channels, and of the robot's nuisance parameters.

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use rayon::prelude::*;
+use twinstep_effects::Target;
 use twinstep_model::{NUM_JOINTS, Precision, RobotModel, Rollout};
 
 use super::data_split::DataSplit;
@@ -16,7 +17,7 @@ pub const PRECISION: Precision = Precision::Single;
 /// Number of candidates that are simulated at once, which limits memory.
 const BATCH_SIZE: usize = 32;
 /// Standard deviation of the model error of joint positions [rad].
-const MODEL_ERROR_RAD: f64 = 0.001;
+pub const MODEL_ERROR_RAD: f64 = 0.001;
 /// Standard deviation of the model error of base motion [noise std].
 const MODEL_ERROR_BASE: f64 = 1.0;
 /// Standard deviation of the model error of the gyroscope [noise std].
@@ -45,24 +46,31 @@ pub struct ResidualRows {
     blocks: Vec<Option<usize>>,
     /// True for the residuals of a robot that walks or jumps.
     dynamic: Vec<bool>,
-    /// True for the simulated residuals of a standing robot beside residuals without errors of contact.
+    /// True for the simulated residuals of a standing robot.
     stance: Vec<bool>,
+    /// True for the residuals of logs in which the wrench on the base is known.
+    balanced: Vec<bool>,
+    /// True if there are residuals of a robot with a fixed base.
+    hangs: bool,
 }
 
 impl ResidualRows {
     /// Creates the residuals of `experiments`, one for each log, which is divided as in `splits`.
     pub fn new(splits: &[DataSplit], experiments: Vec<Experiment>) -> Self {
         let (mut cells, mut folds, mut blocks, mut dynamic) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        let mut stance = Vec::new();
+        let (mut stance, mut balanced) = (Vec::new(), Vec::new());
         let mut first_block = 0;
         let hangs = experiments.iter().any(Experiment::has_fixed_base);
         for (split, experiment) in splits.iter().zip(&experiments) {
             dynamic.extend(experiment.dynamic_residuals());
             let is_wrench = |quantity| matches!(quantity, ResidualChannel::BaseWrench(_));
-            let balanced = experiment.residual_index().any(|(quantity, _)| is_wrench(quantity));
-            stance.extend(experiment.residual_index().zip(experiment.groups()).map(|((quantity, _), group)| {
-                (balanced || hangs) && !is_wrench(quantity) && Experiment::regime(group) == Regime::Floating
-            }));
+            let has_wrench = experiment.residual_index().any(|(quantity, _)| is_wrench(quantity));
+            stance.extend(
+                experiment.residual_index().zip(experiment.groups()).map(|((quantity, _), group)| {
+                    !is_wrench(quantity) && Experiment::regime(group) == Regime::Floating
+                }),
+            );
+            balanced.resize(stance.len(), has_wrench);
             let block = |row: usize| split.block(row).map(|block| first_block + block);
             blocks.extend(experiment.residual_index().map(|(_, row)| block(row)));
             folds.extend(experiment.residual_index().map(|(_, row)| split.fold(row)));
@@ -78,7 +86,7 @@ impl ResidualRows {
                             Regime::Dynamic => DYNAMIC,
                         };
                         let error =
-                            if balanced && regime == Regime::Floating { STANCE_ERROR_RAD } else { MODEL_ERROR_RAD };
+                            if has_wrench && regime == Regime::Floating { STANCE_ERROR_RAD } else { MODEL_ERROR_RAD };
                         (first + joint, error / experiment.sigma(quantity))
                     }
                     ResidualChannel::Velocity(_) | ResidualChannel::Torque(_) => return (0, None, 0.0),
@@ -92,17 +100,21 @@ impl ResidualRows {
             }));
             first_block += split.num_blocks();
         }
-        Self { experiments, tolerances: None, cells, folds, blocks, dynamic, stance }
+        Self { experiments, tolerances: None, cells, folds, blocks, dynamic, stance, balanced, hangs }
     }
 
-    /// Raises the scales of residuals with errors of contact.
+    /// Raises the scales of residuals with errors of contact in a fit of effects on `targets`.
     ///
-    /// The rows of a robot that walks or jumps take no part in a fit, unless it is `on_ground`: a fit of the ground. Their
-    /// derivatives are those of contact events: large, local, and of no use for a step.
-    pub fn raise_scales_on_ground(&self, scale: &mut [f64], on_ground: bool) {
+    /// The rows of a robot that walks or jumps take no part in a fit, unless it is one of the ground. Their derivatives are
+    /// those of contact events: large, local, and of no use for a step. Positions with a fixed base show effects on joints only.
+    pub fn raise_scales_on_ground(&self, scale: &mut [f64], targets: &[Target]) {
+        let on_ground = targets.contains(&Target::Ground);
+        let of_joints = targets.iter().all(|target| matches!(target, Target::Joints | Target::Supply));
         let ignored = scale.iter_mut().zip(&self.dynamic).filter(|(_, dynamic)| **dynamic && !on_ground);
         ignored.for_each(|(scale, _)| *scale = IGNORED);
-        let stance = scale.iter_mut().zip(&self.stance).filter(|(_, stance)| **stance);
+        let uncertain = |balanced: bool| balanced || (self.hangs && of_joints);
+        let stance = scale.iter_mut().zip(self.stance.iter().zip(&self.balanced));
+        let stance = stance.filter(|(_, (stance, balanced))| **stance && uncertain(**balanced));
         stance.for_each(|(scale, _)| *scale *= STANCE_SCALE);
     }
 

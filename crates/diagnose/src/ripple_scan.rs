@@ -4,16 +4,19 @@
 //! one, and a simulation of nearly the true ripple gains nothing. Here the ripple's torque follows from the measured position.
 //! The position error is the response of the loop to this torque, which is linear in the sine and cosine of the phase.
 
+use std::f64::consts::TAU;
+
 use nalgebra::{Matrix2, Vector2};
 use rayon::prelude::*;
 use twinstep_effects::{Effect, ModelFile, Scope};
+use twinstep_identify::experiment::ResidualChannel;
 use twinstep_logs::Log;
 use twinstep_model::dynamics::{KinematicTree, mass_matrix};
 use twinstep_model::{JOINT_NAMES, Joint, NUM_JOINTS, RobotModel, Rollout};
 
 use super::hypothesis::{Hypothesis, selection_penalty};
 use super::residual_data::ResidualData;
-use super::residual_power::log_likelihood_gain;
+use super::residual_rows::MODEL_ERROR_RAD;
 use super::scan::{OF_ONE_EFFECT, ScoredHypothesis};
 
 /// The effect that is scanned here.
@@ -21,26 +24,44 @@ pub const EFFECT: &str = "torque_ripple";
 /// Numbers of cycles per revolution. Joints move within 0.6 rad of their mean position, so the phase error is at most 0.3 rad.
 const FIRST_CYCLES: usize = 6;
 const NUM_CYCLES: usize = 145;
+/// Least number of periods within the motion of a joint: a part of one may be any constant torque or spring.
+const LEAST_PERIODS: f64 = 1.5;
 /// Longest time step of the loop's response [s].
 const TIME_STEP: f64 = 0.00125;
 /// Standard deviation of the sine and cosine amplitudes: half the prior range [N·m].
 const AMPLITUDE_STD: f64 = 0.2;
 
-/// Scans the rows with a fixed base, or all if there are none. Returns the best hypotheses with the best first.
+/// Returns true for other effects, and for a ripple with [`LEAST_PERIODS`] periods within the motion of each of its joints.
+pub fn repeats(logs: &[Log], hypothesis: &Hypothesis) -> bool {
+    let joints = Joint::ALL.into_iter().filter(|joint| hypothesis.scope.contains(*joint)).map(Joint::index);
+    hypothesis.effect.name != EFFECT || hypothesis.values[1] >= least_cycles(logs, joints)
+}
+
+/// Returns the number of cycles per revolution with [`LEAST_PERIODS`] periods within the motion of each of these joints.
+fn least_cycles(logs: &[Log], joints: impl Iterator<Item = usize>) -> f64 {
+    let range = |joint: usize| {
+        let q = logs.iter().filter_map(|log| log.q(JOINT_NAMES[joint])).flatten();
+        let [low, high] =
+            q.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], q| [f64::min(low, *q), f64::max(high, *q)]);
+        (high - low).max(0.0)
+    };
+    LEAST_PERIODS * TAU / joints.map(range).fold(f64::INFINITY, f64::min)
+}
+
+/// Scans the rows with a fixed base, if there are any. Returns the best hypotheses with the best first.
 pub fn scan_ripples(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<ScoredHypothesis> {
     let (Some(effect), Ok(robot)) = (Effect::named(EFFECT), model.robot_model()) else { return Vec::new() };
-    if !evidence.has_required_torque(effect) {
-        return Vec::new();
-    }
-    let rows = evidence.fixed_base_rows().unwrap_or(&evidence.fit_rows);
+    let rows = evidence.fixed_base_rows().or((!evidence.has_free_parts()).then_some(&evidence.fit_rows));
+    let Some(rows) = rows.filter(|_| evidence.has_required_torque(effect)) else { return Vec::new() };
     let mut sums = vec![JointSums::default(); NUM_JOINTS];
     for ((log, split), experiment) in evidence.logs().iter().zip(evidence.splits()).zip(&rows.experiments) {
-        let errors = experiment.position_errors(simulator, &robot);
+        let (errors, starts) = (experiment.position_errors(simulator, &robot), experiment.window_starts());
         let of_joint = |(joint, sums): (usize, &mut JointSums)| {
             let Some(motion) = Motion::new(log, &robot, joint) else { return };
             // The error is that of the simulation; the ripple is the robot's.
             let measured = errors[joint].iter().filter_map(|(row, error)| Some((*row, split.fold(*row)?, -error)));
-            sums.add(&motion, measured, evidence.fit_rows.position_std(joint));
+            let sigma = experiment.sigma(ResidualChannel::Position(joint)).hypot(MODEL_ERROR_RAD);
+            sums.add(&motion, &starts, measured.filter(|(_, _, error)| error.is_finite()), sigma);
         };
         sums.par_iter_mut().enumerate().for_each(|(joint, sums)| of_joint((joint, sums)));
     }
@@ -48,13 +69,19 @@ pub fn scan_ripples(evidence: &ResidualData, model: &ModelFile, simulator: &mut 
     let mut scored: Vec<ScoredHypothesis> = Scope::of_joints()
         .into_par_iter()
         .filter_map(|scope| {
-            let joints: Vec<usize> =
-                Joint::ALL.into_iter().filter(|joint| scope.contains(*joint)).map(Joint::index).collect();
-            let (score, values) = best_ripple(&sums, &joints, &length)?;
+            let joints = Joint::ALL.into_iter().filter(|joint| scope.contains(*joint));
+            let joints: Vec<usize> = joints.map(Joint::index).collect();
+            // A joint has one ripple.
+            if joints.iter().any(|joint| robot.joints[*joint].actuator.ripple.amplitude > 0.0) {
+                return None;
+            }
+            let least = least_cycles(evidence.logs(), joints.iter().copied());
+            let (score, values) = best_ripple(&sums, &joints, least, &length)?;
             let hypothesis = Hypothesis { effect, scope, values };
             Some(ScoredHypothesis { hypothesis, score: score - selection_penalty(scope) })
         })
         .collect();
+    scored.retain(|scored| scored.score.is_finite());
     scored.sort_by(|one, other| other.score.total_cmp(&one.score));
     scored.truncate(OF_ONE_EFFECT);
     scored
@@ -82,10 +109,21 @@ impl Motion {
         let kd = kd?.into_iter().map(|kd| kd + damping).collect();
         Some(Self { q, kp: kp?, kd, inertia: matrix[6 + joint][6 + joint], period: 1.0 / log.meta().rate_hz })
     }
+
+    /// Advances the responses from a row to the next.
+    fn advance(&self, responses: &mut [Response], row: usize) {
+        let steps = (self.period / TIME_STEP).ceil().max(1.0);
+        let [from, to] = [self.q[row], self.q[row + 1]];
+        let loop_gains = [self.kp[row], self.kd[row]].map(|gain| gain / self.inertia);
+        for step in 0..steps as usize {
+            let q = from + (step as f64 + 0.5) / steps * (to - from);
+            advance(responses, q, loop_gains, self.inertia, self.period / steps);
+        }
+    }
 }
 
-/// Sums over the rows of a fold: products of the responses to sine and cosine, of these with the error, and the error's
-/// square, in units of the variance of noise and model error.
+/// Sums over the rows of a fold: products of the responses to sine and cosine, and of these with the error, in units of the
+/// variance of noise and model error.
 #[derive(Clone, Copy, Default)]
 struct Sums {
     products: Matrix2<f64>,
@@ -115,25 +153,23 @@ struct Response {
 }
 
 impl JointSums {
-    /// Adds rows, each with its fold and position error [rad]. The response starts at rest wherever a row is missing.
-    fn add(&mut self, motion: &Motion, rows: impl Iterator<Item = (usize, usize, f64)>, sigma: f64) {
-        let steps = (motion.period / TIME_STEP).ceil().max(1.0);
-        let dt = motion.period / steps;
+    /// Adds rows, each with its fold and position error [rad]. As the simulation, the response starts at rest in the first row of
+    /// each window. Rows after a row without position gain are left out until the next window.
+    fn add(&mut self, motion: &Motion, starts: &[usize], rows: impl Iterator<Item = (usize, usize, f64)>, sigma: f64) {
         let mut responses = vec![Response::default(); NUM_CYCLES];
-        let mut last = None;
+        let (mut window, mut last, mut is_held) = (usize::MAX, 0, true);
         for (row, fold, error) in rows {
-            match last {
-                Some(last) if last + 1 == row => {
-                    let [from, to] = [motion.q[last], motion.q[row]];
-                    let loop_gains = [motion.kp[last], motion.kd[last]].map(|gain| gain / motion.inertia);
-                    (0..steps as usize).for_each(|step| {
-                        let q = from + (step as f64 + 0.5) / steps * (to - from);
-                        advance(&mut responses, q, loop_gains, motion.inertia, dt);
-                    });
-                }
-                _ => responses.fill(Response::default()),
+            let start = starts[..starts.partition_point(|start| *start < row)].last().copied().unwrap_or(row);
+            if start != window {
+                responses.fill(Response::default());
+                (window, last, is_held) = (start, start, true);
             }
-            last = Some(row);
+            is_held &= motion.kp[last..row].iter().all(|kp| *kp > 0.0);
+            if !is_held {
+                continue;
+            }
+            (last..row).for_each(|row| motion.advance(&mut responses, row));
+            last = row;
             for (sums, response) in self.of_cycles.iter_mut().zip(&responses) {
                 let x = response.x / sigma;
                 sums[fold].products += x * x.transpose();
@@ -146,10 +182,11 @@ impl JointSums {
     }
 
     /// Returns the log-likelihood gain of a ripple in a fold [nat].
-    fn gain(&self, cycles: usize, fold: usize, ripple: &Vector2<f64>, channel: usize, length: f64) -> f64 {
+    fn gain(&self, cycles: usize, fold: usize, ripple: &Vector2<f64>, length: f64) -> f64 {
         let Sums { products, cross } = &self.of_cycles[cycles][fold];
-        let after = self.before[fold][1] - 2.0 * ripple.dot(cross) + ripple.dot(&(products * ripple));
-        log_likelihood_gain(channel, self.before[fold], after.max(0.0), length)
+        let [count, before] = self.before[fold];
+        let after = before - 2.0 * ripple.dot(cross) + ripple.dot(&(products * ripple));
+        if count > 0.0 { 0.5 * count / length * ((before + 1e-9) / (after.max(0.0) + 1e-9)).ln() } else { 0.0 }
     }
 }
 
@@ -171,6 +208,7 @@ fn advance(responses: &mut [Response], q: f64, [kp, kd]: [f64; 2], inertia: f64,
 fn best_ripple(
     sums: &[JointSums],
     joints: &[usize],
+    least_cycles: f64,
     length: &(dyn Fn(usize) -> f64 + Sync),
 ) -> Option<(f64, Vec<f64>)> {
     let fitted = |cycles: usize, folds: &[usize]| -> Option<Vector2<f64>> {
@@ -186,10 +224,11 @@ fn best_ripple(
         Some(products.cholesky()?.solve(&cross))
     };
     let gain = |cycles: usize, fold: usize, ripple: &Vector2<f64>| -> f64 {
-        joints.iter().map(|joint| sums[*joint].gain(cycles, fold, ripple, *joint, length(*joint))).sum()
+        joints.iter().map(|joint| sums[*joint].gain(cycles, fold, ripple, length(*joint))).sum()
     };
     let best = |folds: &[usize]| {
-        let ripples = (0..NUM_CYCLES).filter_map(|cycles| Some((cycles, fitted(cycles, folds)?)));
+        let periodic = (0..NUM_CYCLES).filter(|cycles| (FIRST_CYCLES + cycles) as f64 >= least_cycles);
+        let ripples = periodic.filter_map(|cycles| Some((cycles, fitted(cycles, folds)?)));
         let gains = ripples
             .map(|(cycles, ripple)| (folds.iter().map(|fold| gain(cycles, *fold, &ripple)).sum(), cycles, ripple));
         gains.max_by(|one: &(f64, _, _), other| one.0.total_cmp(&other.0))
@@ -210,29 +249,39 @@ mod tests {
     const GAINS: [f64; 2] = [25.0, 0.6];
     const NOISE: f64 = 0.001;
 
-    /// Returns the positions of a joint with a ripple, at the rate of the log [rad].
-    fn positions([amplitude, cycles, phase]: [f64; 3], rows: usize) -> Vec<f64> {
-        let (mut q, mut dq, dt) = (-1.8, 0.0, 0.1 / RATE);
+    /// Rows of a window, and those before the first that is compared.
+    const WINDOW: usize = 1000;
+    const SETTLING: usize = 100;
+
+    /// Returns positions [rad] and velocities [rad/s] of a joint with a ripple by row, from its state in the row `first`.
+    fn states([amplitude, cycles, phase]: [f64; 3], first: usize, state: [f64; 2], rows: usize) -> Vec<[f64; 2]> {
+        let ([mut q, mut dq], dt) = (state, 0.1 / RATE);
         let step = |step: usize| {
-            let target = -1.8 + 0.5 * (2.0 * step as f64 * dt).sin();
+            let state = [q, dq];
+            let target = -1.8 + 0.5 * (2.0 * (10 * first + step) as f64 * dt).sin();
             let torque = GAINS[0] * (target - q) - GAINS[1] * dq + amplitude * (cycles * q + phase).sin();
             dq += dt * torque / INERTIA;
             q += dt * dq;
-            q
+            state
         };
-        (0..10 * rows).map(step).collect::<Vec<f64>>().into_iter().step_by(10).collect()
+        (0..10 * rows).map(step).collect::<Vec<_>>().into_iter().step_by(10).collect()
     }
 
+    /// Scans 12 s of a joint with this ripple, in windows that are simulated from their first measured state.
     fn found(ripple: [f64; 3]) -> (f64, Vec<f64>) {
-        let rows = 6000;
+        let rows = 6 * WINDOW;
         let noise = |row: usize| 3.46 * NOISE * ((row * 7919 % 1009) as f64 / 1009.0 - 0.5);
-        let measured: Vec<f64> = positions(ripple, rows).iter().enumerate().map(|(row, q)| q + noise(row)).collect();
-        let errors: Vec<f64> = measured.iter().zip(positions([0.0; 3], rows)).map(|(one, other)| one - other).collect();
+        let truth = states(ripple, 0, [-1.8, 0.0], rows);
+        let measured: Vec<f64> = truth.iter().enumerate().map(|(row, [q, _])| q + noise(row)).collect();
+        let starts: Vec<usize> = (0..rows).step_by(WINDOW).collect();
+        let simulated = starts.iter().flat_map(|start| states([0.0; 3], *start, truth[*start], WINDOW));
+        let errors: Vec<f64> = measured.iter().zip(simulated).map(|(measured, [q, _])| measured - q).collect();
         let [kp, kd] = GAINS.map(|gain| vec![gain; rows]);
         let motion = Motion { q: measured, kp, kd, inertia: INERTIA, period: 1.0 / RATE };
+        let compared = errors.iter().enumerate().filter(|(row, _)| row % WINDOW >= SETTLING);
         let mut sums = JointSums::default();
-        sums.add(&motion, errors.iter().enumerate().map(|(row, error)| (row, row / 1000 % 2, *error)), NOISE);
-        best_ripple(&[sums], &[0], &|_| 0.2 * RATE).expect("a ripple")
+        sums.add(&motion, &starts, compared.map(|(row, error)| (row, row / WINDOW % 2, *error)), NOISE);
+        best_ripple(&[sums], &[0], 6.0, &|_| 0.2 * RATE).expect("a ripple")
     }
 
     /// The stiffness of the ripple is 39 N·m/rad, that of the loop 25 N·m/rad.
@@ -252,5 +301,15 @@ mod tests {
     fn joint_without_ripple_has_none() {
         let (score, values) = found([0.0, 42.0, 0.0]);
         assert!(score < 5.0, "{score} nat, {values:?}");
+    }
+
+    #[test]
+    fn part_of_a_period_is_no_ripple() {
+        let log = crate::test_data::data(|_| 0.4, None).logs()[0].clone();
+        let effect = Effect::named(EFFECT).expect("in the catalogue");
+        let ripple = |cycles| Hypothesis { effect, scope: Scope::Joint(Joint::ALL[0]), values: vec![0.3, cycles, 0.0] };
+        // The joint moves within 0.04 rad and noise.
+        assert!(!repeats(std::slice::from_ref(&log), &ripple(100.0)));
+        assert!(repeats(std::slice::from_ref(&log), &ripple(300.0)));
     }
 }

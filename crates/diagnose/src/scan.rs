@@ -120,7 +120,10 @@ pub fn refine_grid(
     simulator: &mut dyn Rollout,
 ) -> Hypothesis {
     let Hypothesis { effect, scope, mut values } = hypothesis;
-    let near = (effect.search.near)(&values);
+    let mut near = (effect.search.near)(&values);
+    if !near.is_empty() {
+        near.push(values.clone());
+    }
     if let Some((_, best)) = best_values(evidence, model, effect, scope, near, true, simulator) {
         values = best;
     }

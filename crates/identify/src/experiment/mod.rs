@@ -129,6 +129,13 @@ impl Experiment {
         self
     }
 
+    /// Returns the first row of each window, from whose measured state its simulation starts, in order.
+    pub fn window_starts(&self) -> Vec<usize> {
+        let mut starts: Vec<usize> = self.windows.iter().map(|window| window.rows.start).collect();
+        starts.sort_unstable();
+        starts
+    }
+
     /// Returns true if a window has a fixed base.
     pub fn has_fixed_base(&self) -> bool {
         self.windows.iter().any(|window| window.base.is_fixed())

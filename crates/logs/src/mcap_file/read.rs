@@ -6,7 +6,7 @@ use twinstep_model::BaseMount;
 
 use super::NANOSECONDS;
 use super::base_state::base_columns;
-use super::clock::{sender_times, undelayed_arrivals};
+use super::clock::sender_times;
 use super::columns::columns;
 use super::messages::{Content, Recording};
 use super::rows::{StateWithCommand, commands_in_force, median_step};
@@ -63,8 +63,8 @@ fn table(mut recording: Recording, file: &Path, written: Option<&[String]>) -> R
         same
     });
     note_count(&mut notes, states - recording.states.len(), "with the same time as a later one");
-    let StateTimes { sensed, undelayed } = StateTimes::new(&recording, written);
-    let in_force = commands_in_force(&undelayed, &recording.commands, median_step(&undelayed));
+    let arrivals = recording.states.iter().map(|(time, _)| *time);
+    let in_force = commands_in_force(&recording.states, &recording.commands, median_step(arrivals));
     let start = in_force.iter().position(Option::is_some).unwrap_or(recording.states.len());
     if start == recording.states.len() {
         return Err(LogError::McapTopic {
@@ -74,11 +74,12 @@ fn table(mut recording: Recording, file: &Path, written: Option<&[String]>) -> R
         });
     }
     note_count(&mut notes, start, "before the first command");
-    let median = median_step(&sensed);
+    let times = state_times(&recording, written);
+    let median = median_step(times.iter().copied());
     let mut rows: Vec<StateWithCommand> = (start..recording.states.len())
         .filter_map(|row| {
             Some(StateWithCommand {
-                time: sensed[row],
+                time: times[row],
                 state: &recording.states[row].1,
                 command: recording.commands[in_force[row]?].1.clone(),
             })
@@ -96,7 +97,7 @@ fn table(mut recording: Recording, file: &Path, written: Option<&[String]>) -> R
         );
     }
     let mut columns = columns(&rows, &recording.parts, written);
-    columns.extend(base_columns(&sensed[start..], &recording.base_states));
+    columns.extend(base_columns(&times[start..], &recording.base_states));
     let ignored = recording.channels.values().filter(|channel| channel.content == Content::Other);
     let ignored = ignored.map(|channel| format!("topic {} ({} messages)", channel.topic, channel.messages)).collect();
     Ok((
@@ -105,25 +106,11 @@ fn table(mut recording: Recording, file: &Path, written: Option<&[String]>) -> R
     ))
 }
 
-/// Times of the states [ns].
-struct StateTimes {
-    /// Times by the robot's clock.
-    sensed: Vec<u64>,
-    /// Times of arrival without the delays of single messages.
-    undelayed: Vec<u64>,
-}
-
-impl StateTimes {
-    /// Both are the times of arrival in a file that `Log::write` wrote.
-    fn new(recording: &Recording, written: Option<&[String]>) -> Self {
-        let arrivals: Vec<u64> = recording.states.iter().map(|(time, _)| *time).collect();
-        let clock = recording.states.iter().map(|(_, state)| u64::from(state.tick) * 1_000_000);
-        let clock: Vec<u64> = clock.collect();
-        if written.is_some() {
-            return Self { undelayed: arrivals.clone(), sensed: arrivals };
-        }
-        Self { sensed: sender_times(&arrivals, &clock), undelayed: undelayed_arrivals(&arrivals, &clock) }
-    }
+/// Returns the time of each state by the robot's clock, or its arrival in a file that `Log::write` wrote.
+fn state_times(recording: &Recording, written: Option<&[String]>) -> Vec<u64> {
+    let arrivals: Vec<u64> = recording.states.iter().map(|(time, _)| *time).collect();
+    let clock = recording.states.iter().map(|(_, state)| u64::from(state.tick) * 1_000_000);
+    if written.is_some() { arrivals } else { sender_times(&arrivals, &clock.collect::<Vec<_>>()) }
 }
 
 fn note_count(notes: &mut Vec<String>, count: usize, what: &str) {
