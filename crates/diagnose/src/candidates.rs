@@ -2,8 +2,8 @@
 
 use twinstep_effects::{Effect, Probes, Search, Target};
 
+use super::hypothesis::ScoredHypothesis;
 use super::null_distribution::LOWEST_THRESHOLD;
-use super::scan::ScoredHypothesis;
 
 /// Maximum number of hypotheses about joints that are fitted in full simulation.
 const MAX_JOINT_CANDIDATES: usize = 5;

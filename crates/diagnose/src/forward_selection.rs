@@ -10,14 +10,14 @@ use super::affected_channels::explains_affected_channels;
 use super::candidates::candidates;
 use super::confounders::{confounders_of, on_single_joints};
 use super::cross_validation::{Accepted, CandidateFit, FitProblem, cross_validate, cross_validate_together};
-use super::hypothesis::Hypothesis;
+use super::hypothesis::{Hypothesis, ScoredHypothesis};
 use super::joint_gains::{self, JointGains};
 use super::null_distribution::{self, LOWEST_THRESHOLD};
 use super::profile_likelihood::refine_with_restarts;
 use super::residual_data::ResidualData;
 use super::residual_power::ResidualPower;
 use super::ripple_scan::repeats;
-use super::scan::{self, ScoredHypothesis, scan};
+use super::scan::{self, scan};
 use super::scope_merging;
 
 /// Log-likelihood gain that a cause must reach where no null distribution is computed: torques of other robots, and the

@@ -42,6 +42,18 @@ impl Hypothesis {
     }
 }
 
+/// Maximum number of scopes per effect in the result of a scan.
+pub const OF_ONE_EFFECT: usize = 2;
+
+/// Hypothesis with its score.
+#[derive(Clone, Debug)]
+pub struct ScoredHypothesis {
+    /// The hypothesis, with the best values of the grid.
+    pub hypothesis: Hypothesis,
+    /// Log-likelihood gain minus the penalty of its scope [nat].
+    pub score: f64,
+}
+
 /// Returns the size of an effect, relative to the distance from no effect to the end of the prior range.
 ///
 /// It is the largest of the components of the first parameter.

@@ -14,10 +14,9 @@ use twinstep_logs::Log;
 use twinstep_model::dynamics::{KinematicTree, mass_matrix};
 use twinstep_model::{JOINT_NAMES, Joint, NUM_JOINTS, RobotModel, Rollout};
 
-use super::hypothesis::{Hypothesis, selection_penalty};
+use super::hypothesis::{Hypothesis, OF_ONE_EFFECT, ScoredHypothesis, selection_penalty};
 use super::residual_data::ResidualData;
 use super::residual_rows::MODEL_ERROR_RAD;
-use super::scan::{OF_ONE_EFFECT, ScoredHypothesis};
 
 /// The effect that is scanned here.
 pub const EFFECT: &str = "torque_ripple";

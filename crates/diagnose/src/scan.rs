@@ -9,22 +9,10 @@ use twinstep_effects::ModelFile;
 use twinstep_effects::{CATALOGUE, Effect, EffectEntry, Probes, Scope, Target};
 use twinstep_model::{Joint, JointKind, RobotModel, Rollout};
 
-use super::hypothesis::{Hypothesis, fine_probes, selection_penalty, with_effect};
+use super::hypothesis::{Hypothesis, OF_ONE_EFFECT, ScoredHypothesis, fine_probes, selection_penalty, with_effect};
 use super::residual_data::ResidualData;
 use super::residual_power::{ResidualPower, STANCE, TORQUE, evident_channels};
 use super::ripple_scan::{self, scan_ripples};
-
-/// Maximum number of scopes per effect in the result.
-pub const OF_ONE_EFFECT: usize = 2;
-
-/// Hypothesis with its score.
-#[derive(Clone, Debug)]
-pub struct ScoredHypothesis {
-    /// The hypothesis, with the best values of the grid.
-    pub hypothesis: Hypothesis,
-    /// Log-likelihood gain minus the penalty of its scope [nat].
-    pub score: f64,
-}
 
 /// Scans all effects of the catalogue. Returns the hypotheses with the best first.
 pub fn scan(evidence: &ResidualData, model: &ModelFile, simulator: &mut dyn Rollout) -> Vec<ScoredHypothesis> {
