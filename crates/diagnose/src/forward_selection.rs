@@ -340,3 +340,17 @@ pub fn write_estimates(accepted: &mut Accepted, fit: &FitProblem, point: &[f64])
         best.hypothesis.values = values.by_ref().take(best.hypothesis.values.len()).collect();
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_cause_of_all_joints_leaves_in_one_leg_is_a_quarter_and_a_joint_is_compared_with_its_leg() {
+        let share = |of: &str, at: &str| share_at(of.parse().expect("a scope"), at.parse().expect("a scope"));
+        assert_eq!(share("all", "FL_thigh"), 0.25);
+        assert_eq!(share("FL_calf", "FL_thigh"), 1.0);
+        assert_eq!(share("FR_calf", "FL_thigh"), 0.0);
+        assert_eq!(share("base", "FL_thigh"), 1.0);
+    }
+}

@@ -42,9 +42,10 @@ fn least_cycles(logs: &[Log], joints: impl Iterator<Item = usize>) -> f64 {
         let q = logs.iter().filter_map(|log| log.q(JOINT_NAMES[joint])).flatten();
         let [low, high] =
             q.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], q| [f64::min(low, *q), f64::max(high, *q)]);
-        (high - low).max(0.0)
+        high - low
     };
-    LEAST_PERIODS * TAU / joints.map(range).fold(f64::INFINITY, f64::min)
+    // The range of a joint that is in no log is not finite.
+    LEAST_PERIODS * TAU / joints.map(range).filter(|range| range.is_finite()).fold(f64::INFINITY, f64::min)
 }
 
 /// Scans the rows with a fixed base, if there are any. Returns the best hypotheses with the best first.
@@ -310,5 +311,8 @@ mod tests {
         // The joint moves within 0.04 rad and noise.
         assert!(!repeats(std::slice::from_ref(&log), &ripple(100.0)));
         assert!(repeats(std::slice::from_ref(&log), &ripple(300.0)));
+        // The log has no other joint.
+        let of_all = Hypothesis { scope: Scope::All, ..ripple(300.0) };
+        assert!(repeats(std::slice::from_ref(&log), &of_all));
     }
 }
