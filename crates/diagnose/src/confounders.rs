@@ -50,7 +50,7 @@ pub fn on_single_joints(
 }
 
 /// Returns an effect and its confounders that act on the same part of the robot.
-fn alike(evidence: &ResidualData, effect: &'static Effect) -> impl Iterator<Item = &'static Effect> {
+pub fn alike(evidence: &ResidualData, effect: &'static Effect) -> impl Iterator<Item = &'static Effect> {
     let confused =
         |one: &Effect, other: &Effect| one.confounders.iter().any(|confusion| confusion.effect == other.name);
     CATALOGUE.into_iter().filter(move |other| {

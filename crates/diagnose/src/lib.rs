@@ -60,6 +60,7 @@ mod test_data;
 mod torque_fit;
 mod torque_only;
 mod unexplained;
+mod unreported_effects;
 
 use std::collections::BTreeMap;
 
