@@ -109,7 +109,7 @@ impl<'a> ForwardSelection<'a> {
             }
             self.refit();
             if let Some(effect) = added {
-                self.merge_scopes(effect);
+                self.merge_scopes(effect, &excluded);
             }
         }
         while let Some(place) = self.find_cause_to_eliminate() {
@@ -143,13 +143,14 @@ impl<'a> ForwardSelection<'a> {
     /// Merges the causes of each effect as [`ForwardSelection::merge_scopes`] does.
     pub fn merge_all_scopes(&mut self) {
         let effects: BTreeSet<&str> = self.accepted.iter().map(|(cause, _)| cause.hypothesis.effect.name).collect();
-        effects.into_iter().filter_map(Effect::named).for_each(|effect| self.merge_scopes(effect));
+        effects.into_iter().filter_map(Effect::named).for_each(|effect| self.merge_scopes(effect, &[]));
     }
 
-    /// Replaces the causes with this effect by one on a wider scope, and refits all, if that loses less than
-    /// [`MIN_SHARE_OF_LARGEST`] of the largest log-likelihood gain.
-    fn merge_scopes(&mut self, effect: &Effect) {
-        let wider = scope_merging::with_wider_scopes(&self.accepted, effect);
+    /// Replaces the causes with this effect by one on a wider scope that is not `excluded`, and refits all, if that loses less
+    /// than [`MIN_SHARE_OF_LARGEST`] of the largest log-likelihood gain.
+    fn merge_scopes(&mut self, effect: &Effect, excluded: &[String]) {
+        let mut wider = scope_merging::with_wider_scopes(&self.accepted, effect);
+        wider.retain(|causes| causes.iter().all(|(cause, _)| !excluded.contains(&cause.hypothesis.name())));
         if wider.is_empty() {
             return;
         }

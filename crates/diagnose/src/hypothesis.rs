@@ -43,7 +43,7 @@ impl Hypothesis {
 }
 
 /// Maximum number of scopes per effect in the result of a scan.
-pub const OF_ONE_EFFECT: usize = 2;
+pub const OF_ONE_EFFECT: usize = 3;
 
 /// Hypothesis with its score.
 #[derive(Clone, Debug)]

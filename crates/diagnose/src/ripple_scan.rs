@@ -23,20 +23,20 @@ pub const EFFECT: &str = "torque_ripple";
 /// Numbers of cycles per revolution. Joints move within 0.6 rad of their mean position, so the phase error is at most 0.3 rad.
 const FIRST_CYCLES: usize = 6;
 const NUM_CYCLES: usize = 145;
-/// Least number of periods within the motion of a joint: a part of one may be any constant torque or spring.
+/// Least number of periods within the motion of one of its joints: a part of one may be any constant torque or spring.
 const LEAST_PERIODS: f64 = 1.5;
 /// Longest time step of the loop's response [s].
 const TIME_STEP: f64 = 0.00125;
 /// Standard deviation of the sine and cosine amplitudes: half the prior range [N·m].
 const AMPLITUDE_STD: f64 = 0.2;
 
-/// Returns true for other effects, and for a ripple with [`LEAST_PERIODS`] periods within the motion of each of its joints.
+/// Returns true for other effects, and for a ripple with [`LEAST_PERIODS`] periods within the motion of one of its joints.
 pub fn repeats(logs: &[Log], hypothesis: &Hypothesis) -> bool {
     let joints = Joint::ALL.into_iter().filter(|joint| hypothesis.scope.contains(*joint)).map(Joint::index);
     hypothesis.effect.name != EFFECT || hypothesis.values[1] >= least_cycles(logs, joints)
 }
 
-/// Returns the number of cycles per revolution with [`LEAST_PERIODS`] periods within the motion of each of these joints.
+/// Returns the number of cycles per revolution with [`LEAST_PERIODS`] periods within the widest motion of these joints.
 fn least_cycles(logs: &[Log], joints: impl Iterator<Item = usize>) -> f64 {
     let range = |joint: usize| {
         let q = logs.iter().filter_map(|log| log.q(JOINT_NAMES[joint])).flatten();
@@ -45,7 +45,7 @@ fn least_cycles(logs: &[Log], joints: impl Iterator<Item = usize>) -> f64 {
         high - low
     };
     // The range of a joint that is in no log is not finite.
-    LEAST_PERIODS * TAU / joints.map(range).filter(|range| range.is_finite()).fold(f64::INFINITY, f64::min)
+    LEAST_PERIODS * TAU / joints.map(range).filter(|range| range.is_finite()).fold(0.0, f64::max)
 }
 
 /// Scans the rows with a fixed base, if there are any. Returns the best hypotheses with the best first.
@@ -242,6 +242,8 @@ fn best_ripple(
 
 #[cfg(test)]
 mod tests {
+    use twinstep_model::{BaseMount, Leg};
+
     use super::*;
 
     const RATE: f64 = 500.0;
@@ -311,6 +313,14 @@ mod tests {
         // The joint moves within 0.04 rad and noise.
         assert!(!repeats(std::slice::from_ref(&log), &ripple(100.0)));
         assert!(repeats(std::slice::from_ref(&log), &ripple(300.0)));
+        // The calf moves twice as far as the hip. A ripple of the leg repeats if it does at one of its joints.
+        let coupled = crate::test_data::coupled_with_calf_friction(BaseMount::Fixed, 3.0);
+        let calf = coupled.logs()[0].q("FL_calf").expect("a joint of the log");
+        let range =
+            calf.iter().fold(f64::MIN, |most, q| most.max(*q)) - calf.iter().fold(f64::MAX, |least, q| least.min(*q));
+        let cycles = 1.4 * LEAST_PERIODS * TAU / range;
+        assert!(!repeats(coupled.logs(), &ripple(cycles)));
+        assert!(repeats(coupled.logs(), &Hypothesis { scope: Scope::Leg(Leg::FL), ..ripple(cycles) }));
         // The log has no other joint.
         let of_all = Hypothesis { scope: Scope::All, ..ripple(300.0) };
         assert!(repeats(std::slice::from_ref(&log), &of_all));
