@@ -6,7 +6,7 @@ use twinstep_effects::Target;
 use twinstep_model::Joint;
 
 use super::hypothesis::Hypothesis;
-use super::residual_power::{CHANNELS, DYNAMIC, GYRO, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
+use super::residual_power::{CHANNELS, DYNAMIC, GYRO, GYRO_AT_REST, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
 
 /// Fraction of the power above noise that may remain in the channels that a cause affects, after the joint refit.
 ///
@@ -38,7 +38,7 @@ pub fn explains_affected_channels(
 ///
 /// For joints, these are the positions with a fixed base, and the torques. If the base never is fixed, positions have the
 /// errors of the contact model, too: a cause that the torque sensor shows must explain the torques, another the
-/// positions. For bodies, the group is force and moment on the base; where they are not known, and for the ground, all motion
+/// positions. For the gyroscope, it is that with a fixed base, if there is one. For bodies, the group is force and moment on the base; where they are not known, and for the ground, all motion
 /// channels with a floating base; for the ground of a robot that walks or jumps, those of that.
 fn affected_channels(hypothesis: &Hypothesis, at_sensor: bool, given: &ResidualPower) -> Vec<Vec<usize>> {
     let has = |channels: Range<usize>| given.counts[channels].iter().flatten().any(|count| *count > 0.0);
@@ -50,10 +50,11 @@ fn affected_channels(hypothesis: &Hypothesis, at_sensor: bool, given: &ResidualP
         Target::Joints if has(0..TORQUE) => vec![joints(0), joints(TORQUE)],
         Target::Joints if at_sensor => vec![joints(TORQUE)],
         Target::Joints => vec![joints(STANCE)],
+        Target::Imu if has(GYRO_AT_REST..DYNAMIC) => vec![(GYRO_AT_REST..DYNAMIC).collect()],
         Target::Imu => vec![(GYRO..STANCE).collect()],
         Target::Ground if has(DYNAMIC..CHANNELS) => vec![(DYNAMIC..CHANNELS).collect()],
-        Target::Bodies if has(WRENCH..DYNAMIC) => vec![(WRENCH..DYNAMIC).collect()],
-        Target::Bodies | Target::Ground => vec![(TRUNK..GYRO).chain(STANCE..DYNAMIC).collect()],
+        Target::Bodies if has(WRENCH..GYRO_AT_REST) => vec![(WRENCH..GYRO_AT_REST).collect()],
+        Target::Bodies | Target::Ground => vec![(TRUNK..GYRO).chain(STANCE..GYRO_AT_REST).collect()],
         Target::Supply => Vec::new(),
     }
 }
@@ -100,13 +101,13 @@ mod tests {
         let shift = hypothesis("com_shift", Scope::Base);
         let explains =
             |given: &ResidualPower, left: &ResidualPower| explains_affected_channels(&shift, false, given, left);
-        let is_wrench = |channel: usize| (WRENCH..DYNAMIC).contains(&channel);
+        let is_wrench = |channel: usize| (WRENCH..GYRO_AT_REST).contains(&channel);
         let given = residual_power(|_| 20.0);
         assert!(explains(&given, &residual_power(|channel| if is_wrench(channel) { 1.0 } else { 20.0 })));
         assert!(!explains(&given, &residual_power(|channel| if is_wrench(channel) { 20.0 } else { 1.0 })));
         let unknown = |mut left: ResidualPower| {
-            left.counts[WRENCH..DYNAMIC].fill([0.0; 2]);
-            left.sums[WRENCH..DYNAMIC].fill([0.0; 2]);
+            left.counts[WRENCH..GYRO_AT_REST].fill([0.0; 2]);
+            left.sums[WRENCH..GYRO_AT_REST].fill([0.0; 2]);
             left
         };
         assert!(!explains(&unknown(given), &unknown(residual_power(|_| 19.0))), "positions are not explained");

@@ -7,7 +7,7 @@ use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout};
 
 use super::data_split::DataSplit;
 use super::hypothesis::Hypothesis;
-use super::residual_power::{CHANNELS, DYNAMIC, GYRO, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
+use super::residual_power::{CHANNELS, DYNAMIC, GYRO, GYRO_AT_REST, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
 use super::residual_rows::ResidualRows;
 use twinstep_identify::ExperimentError;
 use twinstep_identify::experiment::Experiment;
@@ -20,10 +20,11 @@ const MISFIT_NM: f64 = 0.02;
 /// Mean squared position error, divided by the variance of the measured position, above which a joint is not tracked.
 const MAX_UNTRACKED_VARIANCE: f64 = 0.1;
 /// Correlation time of residuals [s]: positions with a fixed base, torques, base motion, gyroscope, whose noise exceeds
-/// its model error, positions with a floating base, force and moment on the base, and a robot that walks or jumps.
+/// its model error, positions with a floating base, force and moment on the base, gyroscope with a fixed base, which has
+/// white noise, and a robot that walks or jumps.
 ///
 /// An error of contact or geometry moves the joints of a standing robot by the same angle in a whole window.
-const INDEPENDENT_S: [f64; 7] = [0.2, 0.1, 0.5, 0.05, 1.0, 1.0, 0.3];
+const INDEPENDENT_S: [f64; 8] = [0.2, 0.1, 0.5, 0.05, 1.0, 1.0, 0.0, 0.3];
 
 /// Duration of fixed, standing and slowly moving parts of the logs from which on the other parts have channels of their
 /// own [s].
@@ -236,7 +237,10 @@ impl ResidualData {
 
     /// Returns the correlation length of a channel [rows].
     pub fn correlation_rows(&self, channel: usize) -> f64 {
-        let kind = [TORQUE, TRUNK, GYRO, STANCE, WRENCH, DYNAMIC].into_iter().filter(|first| channel >= *first).count();
+        let kind = [TORQUE, TRUNK, GYRO, STANCE, WRENCH, GYRO_AT_REST, DYNAMIC]
+            .into_iter()
+            .filter(|first| channel >= *first)
+            .count();
         (INDEPENDENT_S[kind] * self.max_rate_hz()).max(1.0)
     }
 

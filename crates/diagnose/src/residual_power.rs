@@ -24,9 +24,11 @@ pub const GYRO: usize = TRUNK + 9;
 pub const STANCE: usize = TRUNK + 12;
 /// First channel of force and moment on the base of a standing robot.
 pub const WRENCH: usize = STANCE + NUM_JOINTS;
+/// First channel of the gyroscope with a fixed base, where it reads its bias.
+pub const GYRO_AT_REST: usize = WRENCH + 6;
 /// First channel of a robot that walks or jumps: joint positions, then base position, orientation, velocity and angular
 /// velocity.
-pub const DYNAMIC: usize = WRENCH + 6;
+pub const DYNAMIC: usize = GYRO_AT_REST + 3;
 
 /// Returns the channels that are evidence about effects on these targets.
 pub fn evident_channels(targets: impl IntoIterator<Item = Target>) -> Range<usize> {

@@ -7,7 +7,7 @@ use twinstep_effects::Target;
 use twinstep_model::{NUM_JOINTS, Precision, RobotModel, Rollout};
 
 use super::data_split::DataSplit;
-use super::residual_power::{DYNAMIC, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
+use super::residual_power::{DYNAMIC, GYRO_AT_REST, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
 use twinstep_identify::experiment::{Experiment, Regime, ResidualChannel};
 use twinstep_identify::least_squares::append;
 use twinstep_identify::nuisance::NuisanceModel;
@@ -93,6 +93,7 @@ impl ResidualRows {
                     ResidualChannel::BasePosition(axis) => (base + axis, MODEL_ERROR_BASE),
                     ResidualChannel::BaseOrientation(axis) => (base + 3 + axis, MODEL_ERROR_BASE),
                     ResidualChannel::BaseVelocity(axis) => (base + 6 + axis, MODEL_ERROR_BASE),
+                    ResidualChannel::BaseRate(axis) if regime == Regime::Fixed => (GYRO_AT_REST + axis, MISFIT_OF_GYRO),
                     ResidualChannel::BaseRate(axis) => (base + 9 + axis, MISFIT_OF_GYRO),
                     ResidualChannel::BaseWrench(axis) => (WRENCH + axis, MODEL_ERROR_BASE),
                 };

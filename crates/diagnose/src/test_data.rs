@@ -151,10 +151,14 @@ impl Rollout for AtRest {
 }
 
 /// Returns the data of a robot that stands for 20 s, with noise of 0.02 rad/s and this bias of its gyroscope [rad/s].
-pub fn data_at_rest(bias: [f64; 3]) -> ResidualData {
+///
+/// If it `hangs` before, for 20 s, its feet shake the base later, which the simulator does not follow.
+pub fn data_at_rest(bias: [f64; 3], hangs: bool) -> ResidualData {
     const ROWS: usize = 4000;
     const NOISE: f64 = 0.02;
-    let column = |name: String, of: &dyn Fn(usize) -> f64| (name, (0..ROWS).map(of).collect::<Vec<f64>>());
+    let rows = if hangs { 2 * ROWS } else { ROWS };
+    let column = |name: String, of: &dyn Fn(usize) -> f64| (name, (0..rows).map(of).collect::<Vec<f64>>());
+    let shaking = |row: usize| if hangs && row >= ROWS { 0.3 * (0.05 * row as f64).sin() } else { 0.0 };
     let constants = [("kp", 25.0), ("kd", 0.6), ("quat_w", 1.0), ("pos_z", 0.0), ("vel_x", 0.0)];
     let mut columns = vec![column("t".to_owned(), &|row| row as f64 / 200.0)];
     columns.extend(constants.map(|(name, value)| column(name.to_owned(), &|_| value)));
@@ -163,10 +167,12 @@ pub fn data_at_rest(bias: [f64; 3]) -> ResidualData {
     }
     for (axis, name) in ["gyro_x", "gyro_y", "gyro_z"].into_iter().enumerate() {
         let noise = |row: usize| 3.46 * NOISE * (((row + 50 * axis) * 7919 % 1009) as f64 / 1009.0 - 0.5);
-        columns.push(column(name.to_owned(), &|row| bias[axis] + noise(row)));
+        columns.push(column(name.to_owned(), &|row| bias[axis] + noise(row) + shaking(row)));
     }
-    let segments = vec![Segment { name: "stand".to_owned(), base: BaseMount::Floating }];
-    let mut meta = Meta::new(200.0, TorqueSensor::None, segments);
+    columns.push(column("segment".to_owned(), &|row| f64::from(hangs && row >= ROWS)));
+    let stand = Segment { name: "stand".to_owned(), base: BaseMount::Floating };
+    let hang = hangs.then(|| Segment { name: "hang".to_owned(), base: BaseMount::Fixed });
+    let mut meta = Meta::new(200.0, TorqueSensor::None, hang.into_iter().chain([stand]).collect());
     meta.noise.insert("gyro".to_owned(), NOISE);
     let log = Log::new(meta, columns).expect("a log");
     ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")

@@ -57,13 +57,14 @@ impl Channel {
     }
 
     /// Returns the compared rows of `window`, each with its index in the window. Rows of the burn-in are excluded.
+    ///
+    /// With a fixed base, of the base only the gyroscope is compared, which then reads its bias.
     pub fn rows<'a>(&'a self, window: &'a Window) -> impl Iterator<Item = (usize, usize)> + 'a {
         let of_base = matches!(
             self.quantity,
             ResidualChannel::BasePosition(_)
                 | ResidualChannel::BaseOrientation(_)
                 | ResidualChannel::BaseVelocity(_)
-                | ResidualChannel::BaseRate(_)
                 | ResidualChannel::BaseWrench(_)
         );
         // A torque is the mean to the next row, so the last row has none.
