@@ -16,7 +16,7 @@
 //! - [`cross_validation`]: fits a hypothesis to one fold and evaluates it on the other, in full simulation.
 //! - [`null_distribution`]: the threshold of the evidence, from the log itself.
 //! - [`profile_likelihood`]: restarts from other local minima, and profile-likelihood intervals.
-//! - [`final_fit`]: the fit to all rows, with intervals.
+//! - [`final_fit`]: the fit to all rows, with intervals; [`unreported_effects`]: what causes too small to be reported add to them.
 //! - [`size_drift`]: causes whose size differs between the two halves of the rows.
 //! - [`discrimination`], [`experiment_design`]: choose an experiment that discriminates between ambiguous causes.
 //! - [`unexplained`]: describes the unexplained residual; [`spectral_line`]: its strongest frequency.
