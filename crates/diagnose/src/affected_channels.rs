@@ -38,8 +38,9 @@ pub fn explains_affected_channels(
 ///
 /// For joints, these are the positions with a fixed base, and the torques. If the base never is fixed, positions have the
 /// errors of the contact model, too: a cause that the torque sensor shows must explain the torques, another the
-/// positions. For the gyroscope, it is that with a fixed base, if there is one. For bodies, the group is force and moment on the base; where they are not known, and for the ground, all motion
-/// channels with a floating base; for the ground of a robot that walks or jumps, those of that.
+/// positions. For the gyroscope, it is that with a fixed base, if there is one. For bodies, the group is force and moment on
+/// the base; where they are not known, and for the ground, all motion channels with a floating base; for the ground of a
+/// robot that walks or jumps, those of that.
 fn affected_channels(hypothesis: &Hypothesis, at_sensor: bool, given: &ResidualPower) -> Vec<Vec<usize>> {
     let has = |channels: Range<usize>| given.counts[channels].iter().flatten().any(|count| *count > 0.0);
     let joints = |first: usize| {

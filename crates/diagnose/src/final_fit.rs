@@ -52,21 +52,22 @@ impl FinalFit {
         evidence: &ResidualData,
         simulator: &mut dyn Rollout,
     ) -> Self {
-        let (fit, extended, confusable) = loop {
+        let (fit, all_rows) = loop {
             let fitted = fit_to_all_rows(judged, accepted, evidence, simulator);
             let fit = joint_fit(model, accepted);
             let (Some((point, all_rows)), Some(fit)) = (fitted, fit) else {
                 return Self { extended: model.clone(), confusable: Vec::new(), drifts: Vec::new() };
             };
             let fit = FitProblem { initial_point: point, ..fit };
-            let (extended, confusable) = with_intervals(&fit, &all_rows, evidence, simulator);
+            let (extended, _) = with_intervals(&fit, &all_rows, evidence, Uncertainty::OfFit, simulator);
             let errors = standard_errors(accepted, &fit, &extended);
             let least = (0..errors.len()).min_by(|one, other| errors[*one].total_cmp(&errors[*other]));
             match least.filter(|place| errors[*place] < LEAST_STANDARD_ERRORS) {
                 Some(place) => drop(accepted.remove(place)),
-                None => break (fit, extended, confusable),
+                None => break (fit, all_rows),
             }
         };
+        let (extended, confusable) = with_intervals(&fit, &all_rows, evidence, Uncertainty::OfLaws, simulator);
         let values = size_drift::drifting_values(&fit, evidence, simulator);
         let mut first = 0;
         let drifts = accepted.iter().map(|(best, _)| {
@@ -78,11 +79,21 @@ impl FinalFit {
     }
 }
 
+/// What the intervals of a fit include.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Uncertainty {
+    /// Noise and nuisance parameters, with independent blocks: whether there is a cause at all.
+    OfFit,
+    /// The same with errors of the laws: common to neighbouring blocks, and of causes that are too small to be reported.
+    OfLaws,
+}
+
 /// Returns the model of a fit with 95 % intervals, and pairs of highly correlated causes.
 fn with_intervals(
     fit: &FitProblem,
     all_rows: &ResidualRows,
     evidence: &ResidualData,
+    includes: Uncertainty,
     simulator: &mut dyn Rollout,
 ) -> (ModelFile, Vec<CorrelatedPair>) {
     let experiments = &all_rows.experiments;
@@ -92,8 +103,12 @@ fn with_intervals(
     let covariance = fit.with_problem(all_rows, simulator, Precision::Double, |task, simulator| {
         let tolerances = of_fixed_base.as_ref().or(all_rows.tolerances.as_ref());
         let mut errors = tolerances.map_or(Vec::new(), |all| all.robot_errors(task.residual_scale, task.tolerances));
-        errors.extend(unreported_effects::residual_changes(fit, task, evidence, simulator));
-        covariance(&task.linearise(simulator, &fit.initial_point)?, &in_parts(&blocks(experiments)), &errors)
+        let mut blocks = blocks(experiments);
+        if includes == Uncertainty::OfLaws {
+            errors.extend(unreported_effects::residual_changes(fit, task, evidence, simulator));
+            blocks = in_parts(&blocks);
+        }
+        covariance(&task.linearise(simulator, &fit.initial_point)?, &blocks, &errors)
     });
     let near = profile_likelihood::profile_intervals(fit, evidence, simulator);
     reporting::with_intervals(fit, covariance.as_ref(), SIMULATOR_MISMATCH_STD, &near)
@@ -190,8 +205,8 @@ mod tests {
         assert_eq!(in_parts(&[7, 7, 3, 9]), [1, 1, 0, 2], "few blocks stay apart");
     }
 
-    /// The robot has a viscous friction with an uncertainty of its own. An unreported Coulomb friction, whose shape differs from it by an
-    /// eighth, widens the interval by its size.
+    /// An unreported Coulomb friction, which moves the joint much like the viscous one, widens the interval by its size. It does not
+    /// question that there is viscous friction.
     #[test]
     fn interval_of_a_friction_allows_for_a_small_one_of_another_law() {
         let effect = Effect::named("viscous_friction").expect("in the catalogue");
@@ -200,8 +215,11 @@ mod tests {
         let data = data(|_| 0.3, None);
         let all_rows = data.all_rows(&fit.model(&fit.initial_point), &mut Linear);
         fit.initial_point = fit.solve(&all_rows, &mut Linear);
-        let (model, _) = with_intervals(&fit, &all_rows, &data, &mut Linear);
+        let (model, _) = with_intervals(&fit, &all_rows, &data, Uncertainty::OfLaws, &mut Linear);
         let [low, high] = model.effects[0].intervals[0].expect("an interval");
+        let (of_fit, _) = with_intervals(&fit, &all_rows, &data, Uncertainty::OfFit, &mut Linear);
+        let [least, most] = of_fit.effects[0].intervals[0].expect("an interval");
+        assert!(most - least < 0.7 * (high - low), "{least} to {most}, {low} to {high}");
         // A quarter of 0.15 N·m moves the joint as 0.4 * 4 / pi times as much viscous friction.
         let expected = 1.96 * 0.25 * 0.15 * 0.4 * 4.0 / std::f64::consts::PI;
         assert!(((high - low) / 2.0 / expected - 1.0).abs() < 0.15, "{low} to {high}, half of it {expected} expected");
