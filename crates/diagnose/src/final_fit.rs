@@ -4,6 +4,7 @@
 
 use std::collections::BTreeSet;
 
+use nalgebra::DMatrix;
 use twinstep_effects::{ModelFile, Target};
 use twinstep_identify::identify::blocks;
 use twinstep_identify::nuisance::NuisanceModel;
@@ -52,22 +53,21 @@ impl FinalFit {
         evidence: &ResidualData,
         simulator: &mut dyn Rollout,
     ) -> Self {
-        let (fit, all_rows) = loop {
+        let (fit, (extended, confusable)) = loop {
             let fitted = fit_to_all_rows(judged, accepted, evidence, simulator);
             let fit = joint_fit(model, accepted);
             let (Some((point, all_rows)), Some(fit)) = (fitted, fit) else {
                 return Self { extended: model.clone(), confusable: Vec::new(), drifts: Vec::new() };
             };
             let fit = FitProblem { initial_point: point, ..fit };
-            let (extended, _) = with_intervals(&fit, &all_rows, evidence, Uncertainty::OfFit, simulator);
-            let errors = standard_errors(accepted, &fit, &extended);
+            let Intervals { of_fit, of_laws } = Intervals::new(&fit, &all_rows, evidence, simulator);
+            let errors = standard_errors(accepted, &fit, &of_fit);
             let least = (0..errors.len()).min_by(|one, other| errors[*one].total_cmp(&errors[*other]));
             match least.filter(|place| errors[*place] < LEAST_STANDARD_ERRORS) {
                 Some(place) => drop(accepted.remove(place)),
-                None => break (fit, all_rows),
+                None => break (fit, of_laws),
             }
         };
-        let (extended, confusable) = with_intervals(&fit, &all_rows, evidence, Uncertainty::OfLaws, simulator);
         let values = size_drift::drifting_values(&fit, evidence, simulator);
         let mut first = 0;
         let drifts = accepted.iter().map(|(best, _)| {
@@ -79,39 +79,37 @@ impl FinalFit {
     }
 }
 
-/// What the intervals of a fit include.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Uncertainty {
-    /// Noise and nuisance parameters, with independent blocks: whether there is a cause at all.
-    OfFit,
-    /// The same with errors of the laws: common to neighbouring blocks, and of causes that are too small to be reported.
-    OfLaws,
+/// Model of a fit with 95 % intervals.
+struct Intervals {
+    /// Intervals that include noise and nuisance parameters, with independent blocks: whether there is a cause at all.
+    of_fit: ModelFile,
+    /// Intervals that also include errors of the laws: common to neighbouring blocks, and of causes that are too small to be
+    /// reported. With pairs of highly correlated causes.
+    of_laws: (ModelFile, Vec<CorrelatedPair>),
 }
 
-/// Returns the model of a fit with 95 % intervals, and pairs of highly correlated causes.
-fn with_intervals(
-    fit: &FitProblem,
-    all_rows: &ResidualRows,
-    evidence: &ResidualData,
-    includes: Uncertainty,
-    simulator: &mut dyn Rollout,
-) -> (ModelFile, Vec<CorrelatedPair>) {
-    let experiments = &all_rows.experiments;
-    // Without a floating base the fit has no masses and lengths, but an interval has.
-    let robot = fit.model(&fit.initial_point).robot_model().ok().filter(|_| !evidence.has_free_parts());
-    let of_fixed_base = robot.and_then(|robot| NuisanceModel::new(experiments, &robot, simulator));
-    let covariance = fit.with_problem(all_rows, simulator, Precision::Double, |task, simulator| {
-        let tolerances = of_fixed_base.as_ref().or(all_rows.tolerances.as_ref());
-        let mut errors = tolerances.map_or(Vec::new(), |all| all.robot_errors(task.residual_scale, task.tolerances));
-        let mut blocks = blocks(experiments);
-        if includes == Uncertainty::OfLaws {
+impl Intervals {
+    fn new(fit: &FitProblem, all_rows: &ResidualRows, evidence: &ResidualData, simulator: &mut dyn Rollout) -> Self {
+        let experiments = &all_rows.experiments;
+        // Without a floating base the fit has no masses and lengths, but an interval has.
+        let robot = fit.model(&fit.initial_point).robot_model().ok().filter(|_| !evidence.has_free_parts());
+        let of_fixed_base = robot.and_then(|robot| NuisanceModel::new(experiments, &robot, simulator));
+        let [of_fit, of_laws] = fit.with_problem(all_rows, simulator, Precision::Double, |task, simulator| {
+            let Some(here) = task.linearise(simulator, &fit.initial_point) else { return [None, None] };
+            let tolerances = of_fixed_base.as_ref().or(all_rows.tolerances.as_ref());
+            let mut errors =
+                tolerances.map_or(Vec::new(), |all| all.robot_errors(task.residual_scale, task.tolerances));
+            let blocks = blocks(experiments);
+            let of_fit = covariance(&here, &blocks, &errors);
             errors.extend(unreported_effects::residual_changes(fit, task, evidence, simulator));
-            blocks = in_parts(&blocks);
-        }
-        covariance(&task.linearise(simulator, &fit.initial_point)?, &blocks, &errors)
-    });
-    let near = profile_likelihood::profile_intervals(fit, evidence, simulator);
-    reporting::with_intervals(fit, covariance.as_ref(), SIMULATOR_MISMATCH_STD, &near)
+            [of_fit, covariance(&here, &in_parts(&blocks), &errors)]
+        });
+        let near = profile_likelihood::profile_intervals(fit, evidence, simulator);
+        let with = |covariance: Option<DMatrix<f64>>| {
+            reporting::with_intervals(fit, covariance.as_ref(), SIMULATOR_MISMATCH_STD, &near)
+        };
+        Self { of_fit: with(of_fit).0, of_laws: with(of_laws) }
+    }
 }
 
 /// Joins neighbouring blocks to at most [`PARTS`] parts, and returns the part of each row.
@@ -215,9 +213,8 @@ mod tests {
         let data = data(|_| 0.3, None);
         let all_rows = data.all_rows(&fit.model(&fit.initial_point), &mut Linear);
         fit.initial_point = fit.solve(&all_rows, &mut Linear);
-        let (model, _) = with_intervals(&fit, &all_rows, &data, Uncertainty::OfLaws, &mut Linear);
-        let [low, high] = model.effects[0].intervals[0].expect("an interval");
-        let (of_fit, _) = with_intervals(&fit, &all_rows, &data, Uncertainty::OfFit, &mut Linear);
+        let Intervals { of_fit, of_laws } = Intervals::new(&fit, &all_rows, &data, &mut Linear);
+        let [low, high] = of_laws.0.effects[0].intervals[0].expect("an interval");
         let [least, most] = of_fit.effects[0].intervals[0].expect("an interval");
         assert!(most - least < 0.7 * (high - low), "{least} to {most}, {low} to {high}");
         // A quarter of 0.15 N·m moves the joint as 0.4 * 4 / pi times as much viscous friction.
