@@ -19,6 +19,7 @@
 //! - [`final_fit`]: the fit to all rows, with intervals; [`unreported_effects`]: what causes too small to be reported add to them.
 //! - [`size_drift`]: causes whose size differs between the two halves of the rows.
 //! - [`discrimination`], [`experiment_design`]: choose an experiment that discriminates between ambiguous causes.
+//! - [`true_law`]: how evident a known effect is in a log.
 //! - [`unexplained`]: describes the unexplained residual; [`spectral_line`]: its strongest frequency.
 //!
 //! Joints that are not a Go2's are diagnosed by their torques only: [`torque_only`], with [`joint_slots`] and
@@ -59,6 +60,7 @@ mod spectral_line;
 mod test_data;
 mod torque_fit;
 mod torque_only;
+mod true_law;
 mod unexplained;
 mod unreported_effects;
 
@@ -83,6 +85,7 @@ use forward_selection::{ForwardSelection, WindowedData, write_estimates};
 use hypothesis::Hypothesis;
 use residual_data::ResidualData;
 pub use torque_only::diagnose_torques;
+pub use true_law::true_law_gain;
 use twinstep_identify::ExperimentError;
 use twinstep_identify::evaluate::evaluate;
 use twinstep_identify::window::WindowConfig;
@@ -138,20 +141,9 @@ pub fn diagnose(
     simulator: &mut dyn Rollout,
     progress: &mut DiagnoseProgress,
 ) -> Result<DiagnosisOutput, DiagnoseError> {
-    let robot = model.robot_model()?;
     let mut say = |text: &str| if progress(text) { Ok(()) } else { Err(DiagnoseError::Interrupted) };
     say("fitting the ground and the nuisance parameters")?;
-    let mut evidence = ResidualData::new(logs.clone(), &robot, WindowConfig::DIAGNOSIS)?;
-    let left = evidence.residual_power(simulator, &robot);
-    if left.diverged() {
-        return Err(DiagnoseError::Diverges);
-    }
-    let judged = with_fitted_ground(&evidence, model, simulator);
-    let mut views = vec![WindowedData::new(evidence, &judged, &robot, simulator)?];
-    if views[0].evidence.fails_to_track(&left) {
-        evidence = ResidualData::new(logs, &robot, WindowConfig::SHORT)?;
-        views.push(WindowedData::new(evidence, &judged, &robot, simulator)?);
-    }
+    let Views { robot, judged, views } = Views::new(logs, model, simulator)?;
     let mut search = ForwardSelection {
         view: views.len() - 1,
         views: &views,
@@ -203,6 +195,34 @@ pub fn diagnose(
     let held_out = evidence.logs().iter().zip(evidence.splits()).map(rows).collect();
     let lacks_torque = left.shows_missing_torque(unexplained::LEAST_EXCESS);
     Ok(DiagnosisOutput { diagnosis, extended, before_last_fit, lacks_torque, held_out, next })
+}
+
+/// Residuals of logs in windows of all lengths that are needed, and the models with which they are computed.
+struct Views {
+    /// Robot of the given model.
+    robot: RobotModel,
+    /// The given model with fitted ground.
+    judged: ModelFile,
+    /// Data in long windows, and in short ones if the given model fails to track the joints in the long ones.
+    views: Vec<WindowedData>,
+}
+
+impl Views {
+    fn new(logs: Vec<Log>, model: &ModelFile, simulator: &mut dyn Rollout) -> Result<Self, DiagnoseError> {
+        let robot = model.robot_model()?;
+        let mut evidence = ResidualData::new(logs.clone(), &robot, WindowConfig::DIAGNOSIS)?;
+        let left = evidence.residual_power(simulator, &robot);
+        if left.diverged() {
+            return Err(DiagnoseError::Diverges);
+        }
+        let judged = with_fitted_ground(&evidence, model, simulator);
+        let mut views = vec![WindowedData::new(evidence, &judged, &robot, simulator)?];
+        if views[0].evidence.fails_to_track(&left) {
+            evidence = ResidualData::new(logs, &robot, WindowConfig::SHORT)?;
+            views.push(WindowedData::new(evidence, &judged, &robot, simulator)?);
+        }
+        Ok(Self { robot, judged, views })
+    }
 }
 
 /// Returns the model with the ground's time constant fitted to the log, if the change is too small for a cause.

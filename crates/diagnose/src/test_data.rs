@@ -45,6 +45,11 @@ pub struct Contact {
 /// Returns the data of a robot with this viscous friction by row, and measurement noise: 20 s in the air, and then on the
 /// ground.
 pub fn data(viscous: impl Fn(usize) -> f64, contact: Option<Contact>) -> ResidualData {
+    ResidualData::new(vec![log(viscous, contact)], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
+}
+
+/// Returns the log of [`data`].
+pub fn log(viscous: impl Fn(usize) -> f64, contact: Option<Contact>) -> Log {
     const AIR: usize = 4000;
     const WINDOW_IN_AIR: usize = 400;
     const WINDOW: usize = 200;
@@ -78,8 +83,7 @@ pub fn data(viscous: impl Fn(usize) -> f64, contact: Option<Contact>) -> Residua
     segments.extend(contact.map(|_| segment("ground", BaseMount::Floating)));
     let mut meta = Meta::new(200.0, TorqueSensor::None, segments);
     meta.noise.insert("q_FL_hip".to_owned(), NOISE);
-    let log = Log::new(meta, columns).expect("a log");
-    ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
+    Log::new(meta, columns).expect("a log")
 }
 
 /// Robot of which each joint moves by its Coulomb friction minus the mean of those of its leg.

@@ -5,9 +5,10 @@ use std::path::Path;
 use std::process::{Child, ExitStatus};
 use std::time::{Duration, Instant};
 
-use twinstep_diagnose::{Diagnosis, RmsErrors};
+use twinstep_diagnose::{Diagnosis, RmsErrors, true_law_gain};
 use twinstep_effects::ModelFile;
 use twinstep_identify::{RecordError, evaluate};
+use twinstep_logs::Log;
 use twinstep_model::{RobotModel, go2};
 use twinstep_sim::BatchRollout;
 
@@ -65,6 +66,7 @@ impl BlindTest<'_> {
         };
         let nominal = errors(&go2())?;
         let truth = errors(&case.truth().robot_model().map_err(failed)?)?;
+        let gains = self.true_law_gains(case, &log)?;
         Ok(CaseResult {
             seed: case.seed,
             case: case.number,
@@ -76,10 +78,20 @@ impl BlindTest<'_> {
             mismatch: case.mismatch,
             nominal,
             truth,
-            verdict: judge(case, findings.as_ref().ok(), [nominal, truth]),
+            verdict: judge(case, findings.as_ref().ok(), [nominal, truth], &gains),
             error: findings.err(),
             seconds,
         })
+    }
+
+    /// Returns the log-likelihood gain of the true law of each hidden effect, with the others known [nat].
+    fn true_law_gains(&mut self, case: &Case, log: &Log) -> Result<Vec<f64>, HuntError> {
+        let of_effect = |index: usize| {
+            let mut others = case.truth();
+            let law = others.effects.remove(index);
+            true_law_gain(vec![log.clone()], &others, &law, &mut self.simulator).map_err(failed)
+        };
+        (0..case.hidden.len()).map(of_effect).collect()
     }
 
     /// Runs the diagnosis. Keeps its output in the folder of the case.

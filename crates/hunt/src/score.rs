@@ -10,6 +10,8 @@ use crate::draw::Case;
 /// Minimum relative error reduction by the true model. Below it, the reduction by a diagnosis is not scored: noise
 /// dominates.
 const MIN_REDUCTION: f64 = 0.1;
+/// Log-likelihood gain of its true law from which a hidden effect is evident [nat].
+pub const LEAST_GAIN: f64 = 10.0;
 /// Number of channels of the unexplained residual that are scored, the strongest first.
 const STRONGEST: usize = 3;
 
@@ -54,6 +56,17 @@ pub struct EffectScore {
     pub scope_right: bool,
     /// Score of the first parameter, if effect and scope are correct.
     pub size: Option<Size>,
+    /// Log-likelihood gain of its true law, refitted with everything else known [nat]; `None` if the simulation diverges
+    /// without it.
+    #[serde(default)]
+    pub true_law_gain: Option<f64>,
+}
+
+impl EffectScore {
+    /// Returns true if the effect is evident in its log. Others are listed, but not counted.
+    pub fn counts(&self) -> bool {
+        self.true_law_gain.is_none_or(|gain| gain >= LEAST_GAIN)
+    }
 }
 
 /// Score of an estimated size.
@@ -74,10 +87,11 @@ pub struct ErrorReduction {
     pub motion: Option<f64>,
 }
 
-/// Scores `diagnosis` on `case`. `nominal` and `truth` are the errors of the given and of the true model on the log.
+/// Scores `diagnosis` on `case`. `nominal` and `truth` are the errors of the given and of the true model on the log, `gains`
+/// the log-likelihood gains of the true laws of the hidden effects [nat].
 ///
 /// A failed diagnosis has reported no cause.
-pub fn judge(case: &Case, diagnosis: Option<&Diagnosis>, [nominal, truth]: [RmsErrors; 2]) -> Score {
+pub fn judge(case: &Case, diagnosis: Option<&Diagnosis>, [nominal, truth]: [RmsErrors; 2], gains: &[f64]) -> Score {
     let findings = diagnosis.map_or(&[][..], |diagnosis| &diagnosis.findings);
     let hidden = |name: &str| case.hidden.iter().any(|entry| entry.effect.name == name);
     let describes = |name: &str| case.mismatch.is_some_and(|mismatch| mismatch.describes(name));
@@ -89,14 +103,14 @@ pub fn judge(case: &Case, diagnosis: Option<&Diagnosis>, [nominal, truth]: [RmsE
     });
     Score {
         named: findings.iter().map(|cause| format!("{}@{}", cause.effect, cause.scope)).collect(),
-        hits: case.hidden.iter().map(|entry| hit(entry, findings)).collect(),
+        hits: case.hidden.iter().zip(gains).map(|(entry, gain)| hit(entry, *gain, findings)).collect(),
         wrong_names: findings.iter().filter(|cause| !hidden(&cause.effect) && !describes(&cause.effect)).count(),
         depends_on,
         removed: diagnosis.map(|diagnosis| removed(diagnosis, [nominal, truth])).unwrap_or_default(),
     }
 }
 
-fn hit(entry: &EffectEntry, findings: &[Cause]) -> EffectScore {
+fn hit(entry: &EffectEntry, gain: f64, findings: &[Cause]) -> EffectScore {
     let name = entry.effect.name;
     let of_name: Vec<_> = findings.iter().filter(|cause| cause.effect == name).collect();
     let first = findings.first().is_some_and(|cause| cause.effect == name);
@@ -117,6 +131,7 @@ fn hit(entry: &EffectEntry, findings: &[Cause]) -> EffectScore {
         in_top_3: ranking(findings).iter().take(3).any(|effect| *effect == name),
         scope_right,
         size: exact.and_then(|cause| size(entry, cause.parameters.get(entry.effect.parameters[0].name)?)),
+        true_law_gain: Some(gain).filter(|gain| gain.is_finite()),
     }
 }
 
@@ -260,7 +275,7 @@ mod tests {
     }
 
     fn scored(case: &Case, findings: Vec<Cause>) -> Score {
-        judge(case, Some(&diagnosis(findings)), [errors(1.0, 0.04), errors(0.95, 0.01)])
+        judge(case, Some(&diagnosis(findings)), [errors(1.0, 0.04), errors(0.95, 0.01)], &vec![50.0; case.hidden.len()])
     }
 
     #[test]
@@ -304,7 +319,7 @@ mod tests {
         assert_eq!(scored(&other, vec![cause("armature", "all", [0.0; 3])]).wrong_names, 1);
         other.outside = Some(UnmodelledEffect::OneWayFriction { joint: 0, torque: 1.0 });
         let mut diagnosis = diagnosis(Vec::new());
-        let scored = |diagnosis: &Diagnosis| judge(&other, Some(diagnosis), [errors(1.0, 0.04); 2]);
+        let scored = |diagnosis: &Diagnosis| judge(&other, Some(diagnosis), [errors(1.0, 0.04); 2], &[]);
         assert_eq!(scored(&diagnosis).depends_on, Some(false));
         diagnosis.unexplained.depends_on = vec!["q_cmd_FL_hip".to_owned()];
         assert_eq!(scored(&diagnosis).depends_on, Some(true));

@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 use crate::CaseResult;
 use crate::draw::CaseKind;
 use crate::rates::rates;
-use crate::score::ErrorReduction;
+use crate::score::{ErrorReduction, LEAST_GAIN};
 
 /// Label in the matrix for no hidden effect and for no reported cause.
 const NONE: &str = "(none)";
@@ -18,7 +18,26 @@ pub fn text(results: &[CaseResult]) -> String {
     text += &numbers(results);
     text += "\nFirst cause reported (columns) by hidden effect (rows), number of cases; \"(outside)\" is an effect \
              outside the\ncatalogue:\n\n";
-    text + &matrix(results)
+    text += &matrix(results);
+    text + &not_counted(results)
+}
+
+/// Returns the list of hidden effects that are not evident in their logs.
+fn not_counted(results: &[CaseResult]) -> String {
+    let mut text = String::new();
+    for result in results {
+        for hit in result.verdict.hits.iter().filter(|hit| !hit.counts()) {
+            let _ = write!(text, "\n- case {}: {}@{}", result.case, hit.effect, hit.scope);
+            let reported = if hit.named { "reported" } else { "not reported" };
+            let _ = write!(text, ", {:.1} nat, {reported}", hit.true_law_gain.unwrap_or(f64::NAN));
+        }
+    }
+    if text.is_empty() {
+        return text;
+    }
+    format!(
+        "\nNot evident: the true law, refitted with everything else known, gains less than {LEAST_GAIN:.0} nat:\n{text}\n"
+    )
 }
 
 fn numbers(results: &[CaseResult]) -> String {
@@ -112,6 +131,7 @@ mod tests {
             set_size: usize::from(!named.is_empty()),
             scope_right: named.contains(name),
             size: named.contains(name).then_some(Size { covered: true, error: 0.04 }),
+            true_law_gain: Some(if *name == "encoder_offset" { 3.0 } else { 80.0 }),
         };
         let verdict = Score {
             named: named.iter().map(|name| format!("{name}@all")).collect(),
@@ -147,16 +167,17 @@ mod tests {
     }
 
     #[test]
-    fn five_cases_give_this_table() {
+    fn six_cases_give_this_table() {
         let results = [
             result(CaseKind::LargeEffect, &["armature"], &["armature"]),
             result(CaseKind::LargeEffect, &["drive_lag"], &["torque_delay"]),
+            result(CaseKind::LargeEffect, &["encoder_offset"], &[]),
             result(CaseKind::Healthy, &[], &[]),
             result(CaseKind::UnmodelledEffect, &[], &[]),
             result(CaseKind::TwoEffects, &["armature", "payload"], &["payload"]),
         ];
         expect![[r#"
-            5 cases
+            6 cases
 
             | | goal | rate | 95 % interval |
             |---|---|---|---|
@@ -164,7 +185,7 @@ mod tests {
             | half the range or more: listed as indistinguishable |  | 0 of 2: 0 % | 0 to 66 % |
             | half the range or more: top-3 correct | >= 97 % | 1 of 2: 50 % | 9 to 91 % |
             | half the range or more: scope correct | >= 90 % | 1 of 2: 50 % | 9 to 91 % |
-            | half the range or more: additional false positive |  | 1 of 2: 50 % | 9 to 91 % |
+            | half the range or more: additional false positive |  | 1 of 3: 33 % | 6 to 79 % |
             | one effect: within the set of names | >= 90 % | 1 of 2: 50 % | 9 to 91 % |
             | one effect: mean size of the set | <= 2.5 | 1.0 | |
             | nothing hidden: false positive | <= 7 % | 0 of 1: 0 % | 0 to 79 % |
@@ -172,8 +193,9 @@ mod tests {
             | outside the catalogue: what it depends on is correct | >= 60 % | 1 of 1: 100 % | 21 to 100 % |
             | two effects: both reported | >= 65 % | 0 of 1: 0 % | 0 to 79 % |
             | two effects: both reported, scopes correct |  | 0 of 1: 0 % | 0 to 79 % |
+            | hidden effect not evident in its log, not counted above | <= 15 % | 1 of 5: 20 % | 4 to 62 % |
             | size within its 95 % interval | 88 to 99 % | 2 of 2: 100 % | 34 to 100 % |
-            | diagnosis failed | none | 0 of 5: 0 % | 0 to 43 % |
+            | diagnosis failed | none | 0 of 6: 0 % | 0 to 39 % |
             | median error of size | <= 10 % | 4.0 % | |
             | held-out torque error removed, median | >= 85 % | no case | |
             | held-out motion error removed, median | >= 85 % | 90.0 % of the true model's reduction | |
@@ -190,6 +212,11 @@ mod tests {
             | (outside) | 1 |  |  |
             | armature |  | 1 |  |
             | drive_lag |  |  | 1 |
+            | encoder_offset | 1 |  |  |
+
+            Not evident: the true law, refitted with everything else known, gains less than 10 nat:
+
+            - case 0: encoder_offset@all, 3.0 nat, not reported
         "#]]
         .assert_eq(&text(&results));
     }
