@@ -12,17 +12,48 @@ use crate::process::Process;
 use crate::resumable::{Resumable, Step, text};
 
 /// Effects that are hidden.
-pub const HIDDEN: [&str; 7] = [
-    "payload@base",
-    "torque_saturation@hip",
-    "torque_saturation@thigh",
-    "torque_saturation@calf",
-    "coulomb_friction@hip",
-    "coulomb_friction@thigh",
-    "coulomb_friction@calf",
-];
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum EffectSet {
+    /// A payload, and for each joint type a saturation and a dry friction.
+    A,
+    /// A shifted centre of mass, a delay of the commands, and for each joint type a rotor inertia and a viscous friction.
+    B,
+}
+
+impl EffectSet {
+    /// Returns the effects with their scopes.
+    fn effects(self) -> &'static [&'static str] {
+        match self {
+            Self::A => &[
+                "payload@base",
+                "torque_saturation@hip",
+                "torque_saturation@thigh",
+                "torque_saturation@calf",
+                "coulomb_friction@hip",
+                "coulomb_friction@thigh",
+                "coulomb_friction@calf",
+            ],
+            Self::B => &[
+                "com_shift@base",
+                "command_delay@all",
+                "armature@hip",
+                "armature@thigh",
+                "armature@calf",
+                "viscous_friction@hip",
+                "viscous_friction@thigh",
+                "viscous_friction@calf",
+            ],
+        }
+    }
+
+    /// Returns the effects that are identified.
+    pub fn unknowns(self) -> Vec<&'static str> {
+        self.effects().iter().copied().chain(GROUND).collect()
+    }
+}
+
 /// Effects that are identified with them: MuJoCo's ground differs from that of the batch engine.
-pub const GROUND: [&str; 2] = ["ground_stiffness@ground", "ground_friction@ground"];
+const GROUND: [&str; 2] = ["ground_stiffness@ground", "ground_friction@ground"];
 /// Noise of the robot's sensors.
 const SENSORS: &str = "[randomise.noise]\njoint_position_rad = 0.0005\njoint_velocity_rad_s = 0.1\n\
                        joint_torque_nm = 0.35\nangular_velocity_rad_s = 0.02\n";
@@ -35,6 +66,7 @@ pub struct MujocoGroundTruth {
     pub commands: Resumable,
     /// Model file of the robot.
     pub model: PathBuf,
+    set: EffectSet,
 }
 
 /// Settings of the identification with `twinstep spi-active`.
@@ -51,13 +83,12 @@ pub struct Collection {
 }
 
 impl MujocoGroundTruth {
-    /// Creates the robot of a seed, with a payload, and for each joint type a saturation and a dry friction. Its results are in a
-    /// folder of that name in `out`.
-    pub fn new(out: &Path, seed: u64) -> Step<Self> {
+    /// Creates the robot of a seed with effects of a set. Its results are in a folder of that name in `out`.
+    pub fn new(out: &Path, seed: u64, set: EffectSet) -> Step<Self> {
         let commands = Resumable::new(&out.join(seed.to_string()))?;
         let model = commands.path("hidden.toml");
-        std::fs::write(&model, hidden(seed).to_toml()).map_err(text)?;
-        Ok(Self { commands, model })
+        std::fs::write(&model, hidden(seed, set).to_toml()).map_err(text)?;
+        Ok(Self { commands, model, set })
     }
 
     /// Starts the robot with a task. Returns its endpoint.
@@ -75,8 +106,8 @@ impl MujocoGroundTruth {
         let config = self.commands.path(&format!("{method}.toml"));
         let Collection { rounds, seconds, segment_s, candidates } = collection;
         // The ground is an unknown because the contact laws of both engines differ; its values are of no use.
-        let of_interest: &[&str] = if method == "qoed" { &HIDDEN } else { &[] };
-        let unknowns = unknowns();
+        let of_interest: &[&str] = if method == "qoed" { self.set.effects() } else { &[] };
+        let unknowns = self.set.unknowns();
         let settings = format!(
             "policy = \"data/policies/walk.safetensors\"\nunknowns = {unknowns:?}\nendpoint = \"{endpoint}\"\n\
              method = \"{method}\"\nrounds = {rounds}\nseconds = {seconds:?}\nsegment_s = {segment_s:?}\n\
@@ -85,11 +116,6 @@ impl MujocoGroundTruth {
         std::fs::write(&config, settings).map_err(text)?;
         self.commands.run(&["spi-active", &config.display().to_string()]).map(drop)
     }
-}
-
-/// Effects that are identified.
-pub fn unknowns() -> Vec<&'static str> {
-    HIDDEN.into_iter().chain(GROUND).collect()
 }
 
 /// Starts a robot in MuJoCo with a task and with noise of the sensors. Returns its endpoint.
@@ -120,22 +146,26 @@ pub fn record_jumps(commands: &Resumable, endpoint: &str, jumps: u64) -> Step<Pa
     Ok(log)
 }
 
-/// Returns the hidden robot of a seed: a payload, and for each joint type a saturation and a dry friction.
-fn hidden(seed: u64) -> ModelFile {
+/// Returns the hidden robot of a seed with effects of a set.
+fn hidden(seed: u64, set: EffectSet) -> ModelFile {
     let mut random = stream(seed, "spi_table", 0);
     let mut draw = |low: f64, high: f64| random.random_range(low..high);
-    let entries = HIDDEN.map(|name| {
+    let entries = set.effects().iter().map(|name| {
         let (name, scope) = name.split_once('@').expect("an effect with its scope");
         let values = match (name, scope) {
             ("payload", _) => vec![draw(0.5, 2.5), draw(-0.08, 0.08), draw(-0.04, 0.04), draw(0.0, 0.08)],
+            ("com_shift", _) => vec![draw(-0.03, 0.03), draw(-0.02, 0.02), draw(-0.02, 0.02)],
             ("torque_saturation", _) => vec![draw(18.0, 30.0)],
+            ("command_delay", _) => vec![draw(0.002, 0.01)],
+            ("armature", _) => vec![draw(0.005, 0.03)],
+            ("viscous_friction", _) => vec![draw(0.1, 0.5)],
             (_, "calf") => vec![draw(0.2, 0.8)],
             _ => vec![draw(0.1, 0.5)],
         };
         let (effect, scope) = effect(name, scope);
         EffectEntry::new(effect, scope, values).expect("values within the allowed range")
     });
-    ModelFile { effects: entries.to_vec(), ..ModelFile::default() }
+    ModelFile { effects: entries.collect(), ..ModelFile::default() }
 }
 
 /// Copies a folder, unless it is there.

@@ -20,7 +20,8 @@ const MAX_POSTERIOR_TO_PRIOR: f64 = 0.7;
 /// Options of an identification.
 #[derive(Clone, Debug)]
 pub struct IdentifyOptions {
-    /// Maximum number of generations of the global search.
+    /// Maximum number of generations of the global search. With 0 there is no local search either: the estimate is that of
+    /// gradient steps.
     pub generations: usize,
     /// Random seed of the global search.
     pub seed: u64,
@@ -176,7 +177,8 @@ pub fn identify(
         });
         spread = task.estimate_residual_scale(simulator, &point);
     }
-    if !free.is_empty() && !interrupted && experiments.iter().any(Experiment::has_floating_base) {
+    let searches = options.generations > 0 && experiments.iter().any(Experiment::has_floating_base);
+    if !free.is_empty() && !interrupted && searches {
         let scaled = LeastSquaresProblem { residual_scale: &spread, ..task };
         let here = scaled.linearise(simulator, &point);
         if let Some(covariance) = here.and_then(|here| covariance(&here, &blocks(experiments), &[])) {

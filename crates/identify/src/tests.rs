@@ -8,7 +8,7 @@ use twinstep_model::{BaseMount, Precision, RobotModel, RobotStates, Rollout, Rol
 
 use crate::experiment::Experiment;
 use crate::global_search::GlobalSearch;
-use crate::identify::{IdentifyOptions, identify};
+use crate::identify::{IdentifyOptions, Stage, identify};
 use crate::least_squares::{Differences, LeastSquaresProblem};
 use crate::local_search::local_search;
 use crate::parameter::{FreeParameter, drop_unidentifiable, free_parameters, initial_coordinate, with_values};
@@ -65,6 +65,10 @@ fn named(name: &str) -> &'static Effect {
 }
 
 fn experiment() -> Experiment {
+    experiment_with_base(BaseMount::Fixed)
+}
+
+fn experiment_with_base(base: BaseMount) -> Experiment {
     let column = |name: &str, of: &dyn Fn(usize) -> f64| (name.to_owned(), (0..ROWS).map(of).collect());
     let columns = [
         column("t", &|row| row as f64 / RATE_HZ),
@@ -72,9 +76,11 @@ fn experiment() -> Experiment {
         column("q_cmd_FL_hip", &|_| 0.0),
         column("kp", &|_| 25.0),
         column("kd", &|_| 0.6),
+        column("quat_w", &|_| 1.0),
+        column("pos_z", &|_| 0.0),
+        column("vel_x", &|_| 0.0),
     ];
-    let mut meta =
-        Meta::new(RATE_HZ, TorqueSensor::None, vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }]);
+    let mut meta = Meta::new(RATE_HZ, TorqueSensor::None, vec![Segment { name: "one".to_owned(), base }]);
     meta.noise.insert("q_FL_hip".to_owned(), 1e-4);
     let log = Log::new(meta, columns).expect("a log");
     Experiment::new(&log, &go2(), WindowConfig::IDENTIFICATION).expect("an experiment")
@@ -181,6 +187,26 @@ fn covariance_includes_the_effect_of_nuisance_parameters() {
         // The error moves the estimate by one standard deviation of the prior, less the pull of the prior.
         assert!((with[(0, 0)] - without[(0, 0)] - 1.0).abs() < 0.1, "{} {}", with[(0, 0)], without[(0, 0)]);
     });
+}
+
+#[test]
+fn without_generations_there_are_gradient_steps_only() {
+    let scope = "FL_hip".parse::<Scope>().expect("a scope");
+    let effects = [(named("viscous_friction"), scope), (named("coulomb_friction"), scope)];
+    let stages = |generations: usize| {
+        let mut stages = Vec::new();
+        let options = IdentifyOptions { generations, force: true, ..IdentifyOptions::default() };
+        let experiments = [experiment_with_base(BaseMount::Floating)];
+        identify(&ModelFile::default(), &effects, &experiments, &mut Linear, &options, &mut |stage, _, _| {
+            stages.push(stage);
+            true
+        })
+        .expect("identified");
+        stages.dedup();
+        stages
+    };
+    assert_eq!(stages(0), [Stage::Identifiability, Stage::Refinement]);
+    assert_eq!(stages(30), [Stage::Identifiability, Stage::GlobalSearch, Stage::Refinement, Stage::LocalSearch]);
 }
 
 #[test]

@@ -11,7 +11,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use twinstep_logs::{Log, Meta, TorqueSensor};
 use twinstep_report::chart::{self, Line, Panel, RGBColor};
-use twinstep_tests::mujoco_ground_truth::{Collection, MujocoGroundTruth, record_jumps, unknowns};
+use twinstep_tests::mujoco_ground_truth::{Collection, EffectSet, MujocoGroundTruth, record_jumps};
 use twinstep_tests::resumable::{Step, number, print_result, read, text};
 
 /// Compare ways of collecting data on hidden robots, by the error of the models on two held-out logs.
@@ -70,7 +70,7 @@ fn main() -> ExitCode {
 fn campaign(args: &Args) -> Step<String> {
     let mut errors = Vec::new();
     for seed in 1..=args.robots {
-        let hidden = MujocoGroundTruth::new(&args.out, seed)?;
+        let hidden = MujocoGroundTruth::new(&args.out, seed, EffectSet::A)?;
         if !hidden.commands.path("held-out").exists() {
             let (_server, endpoint) = hidden.serve("jump")?;
             record_jumps(&hidden.commands, &endpoint, JUMPS)?;
@@ -133,7 +133,8 @@ fn explored(args: &Args, hidden: &MujocoGroundTruth, seed: u64, endpoint: &str) 
         let model = folder.join(format!("model-{log}.toml"));
         if !model.exists() {
             let partial = folder.join(format!("model-{log}.partial.toml"));
-            let (effects, out, seed) = (unknowns().join(","), partial.display().to_string(), seed.to_string());
+            let (effects, out, seed) =
+                (EffectSet::A.unknowns().join(","), partial.display().to_string(), seed.to_string());
             let mut arguments = vec!["identify"];
             arguments.extend(logs.iter().map(String::as_str));
             arguments.extend(["--effects", &effects, "--seed", &seed, "--out", &out]);

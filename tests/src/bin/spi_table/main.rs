@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Parser;
-use twinstep_tests::mujoco_ground_truth::{Collection, MujocoGroundTruth};
+use twinstep_tests::mujoco_ground_truth::{Collection, EffectSet, MujocoGroundTruth};
 use twinstep_tests::python::root;
 use twinstep_tests::resumable::{Resumable, Step, print_result, text};
 
@@ -26,6 +26,9 @@ struct Args {
     /// Seed of the first robot.
     #[arg(long, default_value_t = 1)]
     first: u64,
+    /// Effects that are hidden: `a` or `b`.
+    #[arg(long, value_enum, default_value_t = EffectSet::A)]
+    set: EffectSet,
     /// Command sequences that each design simulates.
     #[arg(long, default_value_t = 1000)]
     candidates: u32,
@@ -39,7 +42,8 @@ struct Args {
     #[arg(long, value_delimiter = ',', default_value = "walk,jump")]
     tasks: Vec<String>,
     /// Methods: vanilla, heavy, spi, truth, and spi- with random or a criterion, such as spi-d-optimal. `truth` learns on
-    /// the hidden robot, in the batch engine.
+    /// the hidden robot, in the batch engine; `gradient` on the model that gradient steps alone identify from the logs of
+    /// spi-random.
     #[arg(
         long,
         value_delimiter = ',',
@@ -115,6 +119,9 @@ fn campaign(args: &Args) -> Step<String> {
     for seed in (args.first..args.first + args.robots).filter(|_| !args.table) {
         let robot = Robot::new(args, seed)?;
         robot.collect()?;
+        if let Some(model) = robot.model("gradient").filter(|model| robot.trains("gradient") && !model.exists()) {
+            robot.descend(&model)?;
+        }
         for task in TASKS.iter().filter(|task| args.tasks.iter().any(|name| name == task.name)) {
             let start = Resumable::new(&args.out)?.nominal(task.name)?;
             if task.has_start() {
@@ -136,7 +143,7 @@ struct Robot<'a> {
 
 impl<'a> Robot<'a> {
     fn new(args: &'a Args, seed: u64) -> Step<Self> {
-        Ok(Self { args, hidden: MujocoGroundTruth::new(&args.out, seed)?, seed })
+        Ok(Self { args, hidden: MujocoGroundTruth::new(&args.out, seed, args.set)?, seed })
     }
 
     /// Identifies the robot from logs of random and of designed commands. The first log is the same for all.
@@ -149,6 +156,20 @@ impl<'a> Robot<'a> {
         let (_server, endpoint) = self.hidden.serve("walk")?;
         let collection = Collection { rounds: 1, seconds: 25.0, segment_s: 5.0, candidates: self.args.candidates };
         missing.iter().try_for_each(|method| self.hidden.identify(method, collection, self.seed, &endpoint))
+    }
+
+    /// Identifies the robot from the logs of random commands by gradient steps from the ideal Go2, without CMA-ES.
+    fn descend(&self, model: &Path) -> Step {
+        let logs = ["1-random", "2-random"].map(|stage| self.commands().path("random").join(stage).join("log"));
+        let [one, other, model] = [&logs[0], &logs[1], model].map(|path| path.display().to_string());
+        let (effects, seed) = (self.args.set.unknowns().join(","), self.seed.to_string());
+        let options = ["--effects", &effects, "--generations", "0", "--seed", &seed, "--out", &model];
+        self.commands().run(&[&["identify", &one, &other][..], &options].concat()).map(drop)
+    }
+
+    /// Returns true if a method is compared.
+    fn trains(&self, method: &str) -> bool {
+        self.args.methods.iter().any(|other| other == method)
     }
 
     fn commands(&self) -> &Resumable {
@@ -179,6 +200,7 @@ impl<'a> Robot<'a> {
             "spi" => "random/1-random/model.toml".to_owned(),
             "spi-random" => "random/2-random/model.toml".to_owned(),
             "truth" => "hidden.toml".to_owned(),
+            "gradient" => "gradient.toml".to_owned(),
             _ => format!("{}/2-active/model.toml", method.strip_prefix("spi-")?),
         };
         Some(self.commands().path(&path))
