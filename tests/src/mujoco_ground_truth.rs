@@ -87,7 +87,11 @@ impl MujocoGroundTruth {
     pub fn new(out: &Path, seed: u64, set: EffectSet) -> Step<Self> {
         let commands = Resumable::new(&out.join(seed.to_string()))?;
         let model = commands.path("hidden.toml");
-        std::fs::write(&model, hidden(seed, set).to_toml()).map_err(text)?;
+        let hidden = hidden(seed, set).to_toml();
+        if std::fs::read_to_string(&model).is_ok_and(|other| other != hidden) {
+            return Err(format!("{}: another robot has results in this folder; choose another --out", model.display()));
+        }
+        std::fs::write(&model, hidden).map_err(text)?;
         Ok(Self { commands, model, set })
     }
 

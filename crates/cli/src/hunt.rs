@@ -24,6 +24,10 @@ use crate::exit::{CommandResult, Failure, Signals, input, other};
 /// and hops for a minute. Of 24 cases, 10 hide one effect of half its range or more, 6 one of a fifth, 4 four effects, and 4
 /// an effect outside the catalogue. Set TWINSTEP_PYTHON to a Python interpreter with the packages twinstep and mujoco.
 ///
+/// A hidden effect is evident if its true law, refitted with everything else known, gains at least 10 nat on the log. Others
+/// are listed below the tables, and left out of the rates of names and scopes. A case of several effects is left out of "all
+/// reported" if one of them is not evident.
+///
 /// Prints a table of rates with 95 % intervals (Wilson) and the confusion matrix, and writes both to OUT/hunt.md. Each
 /// case is scored and appended to OUT/cases.jsonl as soon as it is complete. The same command with --resume continues
 /// from there, also with more cases. OUT/<case> has the log, the diagnosis, and the ground truth in truth.toml.

@@ -47,8 +47,8 @@ pub struct Args {
     /// Estimate parameters that are not identifiable from the logs, too.
     #[arg(long)]
     pub force: bool,
-    /// Maximum number of generations of CMA-ES. With 0 there is no local search either: Levenberg–Marquardt alone, from the
-    /// given model.
+    /// Maximum number of generations of CMA-ES. With 0 there is no local search either: gradient steps alone
+    /// (Levenberg–Marquardt), from the values of --start or of the model.
     #[arg(long, value_name = "N", default_value_t = IdentifyOptions::default().generations)]
     pub generations: usize,
     /// Seed of the search.

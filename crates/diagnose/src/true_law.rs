@@ -1,6 +1,6 @@
 //! How evident a known effect is in a log: the log-likelihood gain of its true law.
 
-use twinstep_effects::{EffectEntry, ModelFile};
+use twinstep_effects::{EffectEntry, ModelFile, Target};
 use twinstep_logs::Log;
 use twinstep_model::{RobotModel, Rollout};
 
@@ -11,10 +11,11 @@ use super::scan::log_likelihood_gain;
 use super::{DiagnoseError, Views};
 
 /// Returns the log-likelihood gain of `law` on top of `known`, which is everything else that is known about the robot: the larger
-/// of that with its true values and that with values fitted to the logs [nat].
+/// of that with its true values and that with values fitted to the logs, at least 0 [nat].
 ///
-/// The rows and the likelihood are those of [`crate::diagnose`], without penalties for a choice among hypotheses. The gain is
-/// infinite if the simulation diverges without the law.
+/// Rows and likelihood are those of [`crate::diagnose`] with `known` as the given model. There is no cross-validation, and no
+/// penalty for a choice among hypotheses. The gain is infinite if the simulation diverges without the law, or the law cannot be
+/// fitted.
 pub fn true_law_gain(
     logs: Vec<Log>,
     known: &ModelFile,
@@ -27,13 +28,15 @@ pub fn true_law_gain(
     };
     let evidence = &views[views.len() - 1].evidence;
     let hypothesis = Hypothesis { effect: law.effect, scope: law.scope, values: law.values.clone() };
-    let Some(fit) = FitProblem::new(&judged, std::slice::from_ref(&hypothesis)) else { return Ok(0.0) };
+    // The fitted ground would stand for the law.
+    let without = if law.effect.target == Target::Ground { known } else { &judged };
+    let Some(fit) = FitProblem::new(without, std::slice::from_ref(&hypothesis)) else { return Ok(f64::INFINITY) };
     let fitted = fit.solve(&evidence.fit_rows, simulator);
-    let models = [judged.clone(), fit.model(&fit.initial_point), fit.model(&fitted)];
+    let models = [without.clone(), fit.model(&fit.initial_point), fit.model(&fitted)];
     let robots = models.iter().map(ModelFile::robot_model).collect::<Result<Vec<RobotModel>, _>>()?;
     let left = evidence.residual_powers(simulator, &robots, false);
     let gain = |now| log_likelihood_gain(evidence, now, &left[0], evident_channels([law.effect.target]));
-    Ok(left[1..].iter().map(gain).fold(f64::NEG_INFINITY, f64::max))
+    Ok(left[1..].iter().map(gain).fold(0.0, f64::max))
 }
 
 #[cfg(test)]

@@ -38,11 +38,8 @@ pub fn rates(results: &[CaseResult]) -> String {
     text.extend(parts.map(|rows| rows(results)));
     let hidden = || results.iter().flat_map(|result| &result.verdict.hits);
     if hidden().next().is_some() {
-        text += &rate(
-            "hidden effect not evident in its log, not counted above",
-            "<= 15 %",
-            hidden().map(|hit| !hit.counts()),
-        );
+        text +=
+            &rate("hidden effect not evident in its log, left out above", "<= 15 %", hidden().map(|hit| !hit.counts()));
     }
     let sizes = hidden().filter_map(|hit| hit.size);
     text += &rate("size within its 95 % interval", "88 to 99 %", sizes.map(|size| size.covered));

@@ -84,12 +84,16 @@ impl BlindTest<'_> {
         })
     }
 
-    /// Returns the log-likelihood gain of the true law of each hidden effect, with the others known [nat].
+    /// Returns the log-likelihood gain of the true law of each hidden effect, with the others known [nat]; infinite if it cannot
+    /// be computed.
     fn true_law_gains(&mut self, case: &Case, log: &Log) -> Result<Vec<f64>, HuntError> {
         let of_effect = |index: usize| {
+            if (self.interrupted)() {
+                return Err(HuntError::Interrupted);
+            }
             let mut others = case.truth();
             let law = others.effects.remove(index);
-            true_law_gain(vec![log.clone()], &others, &law, &mut self.simulator).map_err(failed)
+            Ok(true_law_gain(vec![log.clone()], &others, &law, &mut self.simulator).unwrap_or(f64::INFINITY))
         };
         (0..case.hidden.len()).map(of_effect).collect()
     }

@@ -56,16 +56,15 @@ pub struct EffectScore {
     pub scope_right: bool,
     /// Score of the first parameter, if effect and scope are correct.
     pub size: Option<Size>,
-    /// Log-likelihood gain of its true law, refitted with everything else known [nat]; `None` if the simulation diverges
-    /// without it.
-    #[serde(default)]
-    pub true_law_gain: Option<f64>,
+    /// Log-likelihood gain of its true law, refitted with everything else known [nat]. The largest number if the simulation
+    /// diverges without it, or the gain cannot be computed.
+    pub true_law_gain: f64,
 }
 
 impl EffectScore {
-    /// Returns true if the effect is evident in its log. Others are listed, but not counted.
+    /// Returns true if the effect is evident in its log. Others are listed, and left out of the rates of names and scopes.
     pub fn counts(&self) -> bool {
-        self.true_law_gain.is_none_or(|gain| gain >= LEAST_GAIN)
+        self.true_law_gain >= LEAST_GAIN
     }
 }
 
@@ -92,6 +91,7 @@ pub struct ErrorReduction {
 ///
 /// A failed diagnosis has reported no cause.
 pub fn judge(case: &Case, diagnosis: Option<&Diagnosis>, [nominal, truth]: [RmsErrors; 2], gains: &[f64]) -> Score {
+    assert_eq!(case.hidden.len(), gains.len(), "a gain for each hidden effect");
     let findings = diagnosis.map_or(&[][..], |diagnosis| &diagnosis.findings);
     let hidden = |name: &str| case.hidden.iter().any(|entry| entry.effect.name == name);
     let describes = |name: &str| case.mismatch.is_some_and(|mismatch| mismatch.describes(name));
@@ -131,7 +131,7 @@ fn hit(entry: &EffectEntry, gain: f64, findings: &[Cause]) -> EffectScore {
         in_top_3: ranking(findings).iter().take(3).any(|effect| *effect == name),
         scope_right,
         size: exact.and_then(|cause| size(entry, cause.parameters.get(entry.effect.parameters[0].name)?)),
-        true_law_gain: Some(gain).filter(|gain| gain.is_finite()),
+        true_law_gain: gain.min(f64::MAX),
     }
 }
 
@@ -287,6 +287,18 @@ mod tests {
         let size = hit.size.expect("compared");
         assert!(size.covered && (size.error - 0.1).abs() < 1e-9, "the size of a gain is its distance from one");
         assert_eq!((verdict.named[0].as_str(), verdict.wrong_names), ("torque_gain@RR_calf", 0));
+    }
+
+    #[test]
+    fn effect_counts_from_ten_nat() {
+        let case = case(&[("torque_gain", "RR_calf", 1.2)]);
+        let counts = |gain: f64| {
+            let hit = &judge(&case, None, [errors(1.0, 0.04); 2], &[gain]).hits[0];
+            let line = serde_json::to_string(hit).expect("a line");
+            assert_eq!(serde_json::from_str::<EffectScore>(&line).expect("read again"), *hit);
+            hit.counts()
+        };
+        assert_eq!([0.0, 9.99, 10.0, f64::INFINITY].map(counts), [false, false, true, true]);
     }
 
     #[test]

@@ -161,10 +161,13 @@ impl<'a> Robot<'a> {
     /// Identifies the robot from the logs of random commands by gradient steps from the ideal Go2, without CMA-ES.
     fn descend(&self, model: &Path) -> Step {
         let logs = ["1-random", "2-random"].map(|stage| self.commands().path("random").join(stage).join("log"));
-        let [one, other, model] = [&logs[0], &logs[1], model].map(|path| path.display().to_string());
+        let partial = model.with_extension("partial.toml");
+        let [one, other, out] = [&logs[0], &logs[1], &partial].map(|path| path.display().to_string());
         let (effects, seed) = (self.args.set.unknowns().join(","), self.seed.to_string());
-        let options = ["--effects", &effects, "--generations", "0", "--seed", &seed, "--out", &model];
-        self.commands().run(&[&["identify", &one, &other][..], &options].concat()).map(drop)
+        let options = ["--effects", &effects, "--generations", "0", "--seed", &seed, "--out", &out];
+        let _ = std::fs::remove_file(&partial);
+        self.commands().run(&[&["identify", &one, &other][..], &options].concat())?;
+        std::fs::rename(partial, model).map_err(text)
     }
 
     /// Returns true if a method is compared.
