@@ -17,6 +17,10 @@ use super::residual_power::{CHANNELS, DYNAMIC, GYRO, GYRO_AT_REST, ResidualPower
 pub const MAX_REMAINING_FRACTION: f64 = 1.0 / 3.0;
 /// Power above noise per row that is negligible [noise variance].
 pub const NEGLIGIBLE_EXCESS: f64 = 1.0;
+/// Share of the rows with a floating base in which force and moment on it must be known to stand for all of them.
+///
+/// A robot that walks and pauses has a quarter, in which its feet still move: a payload does not explain them.
+const MIN_SHARE_OF_WRENCH: f64 = 0.5;
 
 /// Returns true if a cause leaves at most [`MAX_REMAINING_FRACTION`] of the excess power in the channels that it affects.
 ///
@@ -39,10 +43,11 @@ pub fn explains_affected_channels(
 /// For joints, these are the positions with a fixed base, and the torques. If the base never is fixed, positions have the
 /// errors of the contact model, too: a cause that the torque sensor shows must explain the torques, another the
 /// positions. For the gyroscope, it is that with a fixed base, if there is one. For bodies, the group is force and moment on
-/// the base; where they are not known, and for the ground, all motion channels with a floating base; for the ground of a
-/// robot that walks or jumps, those of that.
+/// the base; where they are known in less than [`MIN_SHARE_OF_WRENCH`] of the rows, and for the ground, all motion channels
+/// with a floating base; for the ground of a robot that walks or jumps, those of that.
 fn affected_channels(hypothesis: &Hypothesis, at_sensor: bool, given: &ResidualPower) -> Vec<Vec<usize>> {
-    let has = |channels: Range<usize>| given.counts[channels].iter().flatten().any(|count| *count > 0.0);
+    let rows = |channel: usize| given.counts[channel].iter().sum::<f64>();
+    let has = |mut channels: Range<usize>| channels.any(|channel| rows(channel) > 0.0);
     let joints = |first: usize| {
         let all = Joint::ALL.into_iter().filter(|joint| hypothesis.scope.contains(*joint));
         all.map(|joint| first + joint.index()).collect()
@@ -54,7 +59,7 @@ fn affected_channels(hypothesis: &Hypothesis, at_sensor: bool, given: &ResidualP
         Target::Imu if has(GYRO_AT_REST..DYNAMIC) => vec![(GYRO_AT_REST..DYNAMIC).collect()],
         Target::Imu => vec![(GYRO..STANCE).collect()],
         Target::Ground if has(DYNAMIC..CHANNELS) => vec![(DYNAMIC..CHANNELS).collect()],
-        Target::Bodies if has(WRENCH..GYRO_AT_REST) => vec![(WRENCH..GYRO_AT_REST).collect()],
+        Target::Bodies if rows(WRENCH) > MIN_SHARE_OF_WRENCH * rows(STANCE) => vec![(WRENCH..GYRO_AT_REST).collect()],
         Target::Bodies | Target::Ground => vec![(TRUNK..GYRO).chain(STANCE..GYRO_AT_REST).collect()],
         Target::Supply => Vec::new(),
     }
@@ -112,6 +117,27 @@ mod tests {
             left
         };
         assert!(!explains(&unknown(given), &unknown(residual_power(|_| 19.0))), "positions are not explained");
+    }
+
+    /// A robot that walks pauses at times. What its feet do then is not what its payload does to its steps.
+    #[test]
+    fn cause_on_the_base_must_explain_the_motion_if_the_robot_seldom_stands() {
+        let payload = hypothesis("payload", Scope::Base);
+        let is_wrench = |channel: usize| (WRENCH..GYRO_AT_REST).contains(&channel);
+        let standing = |share: f64, power: [f64; 2]| {
+            let mut left = residual_power(|channel| power[usize::from(is_wrench(channel))]);
+            for channel in WRENCH..GYRO_AT_REST {
+                left.sums[channel][0] *= share;
+                left.counts[channel][0] *= share;
+            }
+            left
+        };
+        let explains = |share: f64, left: [f64; 2]| {
+            explains_affected_channels(&payload, false, &standing(share, [20.0, 20.0]), &standing(share, left))
+        };
+        let (motion, wrench) = ([1.0, 20.0], [20.0, 1.0]);
+        assert!(explains(0.25, motion) && !explains(0.25, wrench));
+        assert!(!explains(1.0, motion) && explains(1.0, wrench));
     }
 
     /// Contact adds to the position error of every joint. A delay is seen in the torques, friction in the positions.

@@ -23,7 +23,7 @@ use super::{joint_fit, profile_likelihood, reporting, size_drift, unreported_eff
 /// Least distance of the size of a cause on joints from no effect, in standard errors.
 ///
 /// There are some 400 hypotheses about joints. Of as many normal estimates without an effect, one exceeds 4 standard errors
-/// with a probability of 3 %. There are few about bodies, IMU and ground, whose errors are those of lengths and masses.
+/// with a probability of 3 %. There are few about bodies, IMU and ground: their reported interval must exclude no effect.
 const LEAST_STANDARD_ERRORS: f64 = 4.0;
 /// Maximum number of parts of the rows whose errors are independent.
 ///
@@ -60,12 +60,12 @@ impl FinalFit {
                 return Self { extended: model.clone(), confusable: Vec::new(), drifts: Vec::new() };
             };
             let fit = FitProblem { initial_point: point, ..fit };
-            let Intervals { of_fit, of_laws } = Intervals::new(&fit, &all_rows, evidence, simulator);
-            let errors = standard_errors(accepted, &fit, &of_fit);
-            let least = (0..errors.len()).min_by(|one, other| errors[*one].total_cmp(&errors[*other]));
-            match least.filter(|place| errors[*place] < LEAST_STANDARD_ERRORS) {
+            let intervals = Intervals::new(&fit, &all_rows, evidence, simulator);
+            let distances = intervals.distances_from_no_effect(accepted, &fit);
+            let least = (0..distances.len()).min_by(|one, other| distances[*one].total_cmp(&distances[*other]));
+            match least.filter(|place| distances[*place] < 1.0) {
                 Some(place) => drop(accepted.remove(place)),
-                None => break (fit, of_laws),
+                None => break (fit, intervals.of_laws),
             }
         };
         let values = size_drift::drifting_values(&fit, evidence, simulator);
@@ -110,6 +110,33 @@ impl Intervals {
         };
         Self { of_fit: with(of_fit).0, of_laws: with(of_laws) }
     }
+
+    /// Returns the distance of each cause's size from no effect, in units of the least with which it is reported.
+    ///
+    /// With several components, that of the most distant one.
+    fn distances_from_no_effect(&self, accepted: &Accepted, fit: &FitProblem) -> Vec<f64> {
+        let mut first = 0;
+        let of_cause = |(best, _): &(CandidateFit, _)| {
+            let Hypothesis { effect, scope, values } = &best.hypothesis;
+            let (model, least) = match effect.target {
+                Target::Joints | Target::Supply => (&self.of_fit, LEAST_STANDARD_ERRORS / TWO_SIDED_95),
+                Target::Bodies | Target::Imu | Target::Ground => (&self.of_laws.0, 1.0),
+            };
+            let entry = model.effects.iter().rfind(|entry| entry.effect == *effect && entry.scope == *scope);
+            let place = first;
+            first += values.len();
+            let of_component = |component: usize| {
+                let (unknown, size) = (&fit.unknowns[place + component], fit.initial_point[place + component]);
+                let none = unknown.coordinate(unknown.neutral);
+                // The half of the interval on the side of no effect.
+                let ends = entry?.intervals[component]?.map(|end| unknown.coordinate(end));
+                let end = ends.into_iter().find(|end| (end - size) * (none - size) > 0.0)?;
+                Some((size - none).abs() / (size - end).abs() / least)
+            };
+            (0..effect.parameters[0].count).filter_map(of_component).max_by(f64::total_cmp).unwrap_or(f64::INFINITY)
+        };
+        accepted.iter().map(of_cause).collect()
+    }
 }
 
 /// Joins neighbouring blocks to at most [`PARTS`] parts, and returns the part of each row.
@@ -118,28 +145,6 @@ fn in_parts(blocks: &[usize]) -> Vec<usize> {
     let parts = distinct.len().min(PARTS);
     let part = |block: &usize| distinct.partition_point(|other| other < block) * parts / distinct.len();
     blocks.iter().map(part).collect()
-}
-
-/// Returns the distance of each cause's size from no effect, in standard errors; infinite for causes that are not on joints.
-fn standard_errors(accepted: &Accepted, fit: &FitProblem, extended: &ModelFile) -> Vec<f64> {
-    let mut first = 0;
-    let of_cause = |(best, _): &(CandidateFit, _)| {
-        let Hypothesis { effect, scope, values } = &best.hypothesis;
-        let entry = extended.effects.iter().rfind(|entry| entry.effect == *effect && entry.scope == *scope);
-        let (unknown, size) = (&fit.unknowns[first], fit.initial_point[first]);
-        first += values.len();
-        let none = unknown.coordinate(unknown.neutral);
-        // The half of the interval on the side of no effect.
-        let ends = entry.and_then(|entry| entry.intervals[0]).map(|ends| ends.map(|end| unknown.coordinate(end)));
-        let end = ends.and_then(|ends| ends.into_iter().find(|end| (end - size) * (none - size) > 0.0));
-        match end {
-            Some(end) if matches!(effect.target, Target::Joints | Target::Supply) => {
-                TWO_SIDED_95 * (size - none).abs() / (size - end).abs()
-            }
-            _ => f64::INFINITY,
-        }
-    };
-    accepted.iter().map(of_cause).collect()
 }
 
 /// Fits the causes to all rows until none of them is too small. Returns the point and the rows; `None` without causes.
@@ -222,7 +227,31 @@ mod tests {
         assert!(((high - low) / 2.0 / expected - 1.0).abs() < 0.15, "{low} to {high}, half of it {expected} expected");
     }
 
-    /// The mean over all blocks is that of the test above, but the blocks contradict each other.
+    /// Masses of 1 kg and of 0.1 kg with the same interval half of 0.4 kg; and a shift of which one component is certain.
+    #[test]
+    fn cause_on_a_body_differs_from_no_effect_if_the_reported_interval_of_one_component_does() {
+        let distance = |name: &str, values: Vec<f64>, halves: [f64; 3]| {
+            let effect = Effect::named(name).expect("in the catalogue");
+            let hypothesis = Hypothesis { effect, scope: Scope::Base, values };
+            let fit = FitProblem::new(&ModelFile::default(), &[hypothesis.clone()]).expect("a fit");
+            let mut model = fit.model(&fit.initial_point);
+            for (component, half) in halves.into_iter().enumerate().take(effect.parameters[0].count) {
+                let value = hypothesis.values[component];
+                model.effects[0].intervals[component] = Some([value - half, value + half]);
+            }
+            let intervals = Intervals { of_fit: ModelFile::default(), of_laws: (model, Vec::new()) };
+            let found = CandidateFit { hypothesis, score: 50.0, gain: 0.5, explained_fraction: 1.0, threshold: 10.0 };
+            intervals.distances_from_no_effect(&vec![(found, Vec::new())], &fit)[0]
+        };
+        let payload = |mass: f64| distance("payload", vec![mass, 0.1, 0.0, 0.0], [0.4; 3]);
+        assert!((payload(1.0) - 2.5).abs() < 1e-9, "{}", payload(1.0));
+        assert!((payload(-0.1) - 0.25).abs() < 1e-9, "{}", payload(-0.1));
+        let shift = |half: f64| distance("com_shift", vec![0.001, -0.02, 0.0], [0.01, half, 0.01]);
+        assert!((shift(0.005) - 4.0).abs() < 1e-9, "{}", shift(0.005));
+        assert!(shift(0.03) < 1.0, "{}", shift(0.03));
+    }
+
+    /// The mean over all blocks is that of a cause that is reported, but the blocks contradict each other.
     #[test]
     fn cause_whose_size_is_uncertain_is_not_reported() {
         let signs = [1.0, -1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0];
