@@ -8,7 +8,7 @@ use twinstep_model::{Joint, RobotModel, Rollout};
 use super::DiagnoseError;
 use super::affected_channels::explains_affected_channels;
 use super::candidates::candidates;
-use super::confounders::{confounders_of, on_single_joints};
+use super::confounders::{confounders_of, on_parts};
 use super::cross_validation::{Accepted, CandidateFit, FitProblem, cross_validate, cross_validate_together};
 use super::hypothesis::{Hypothesis, ScoredHypothesis};
 use super::joint_gains::{self, JointGains};
@@ -232,15 +232,21 @@ impl<'a> ForwardSelection<'a> {
         let with_best = FitProblem::new(&self.model, std::slice::from_ref(&best.hypothesis));
         let with_best = with_best.map_or(self.model.clone(), |fit| fit.model(&fit.initial_point));
         let thresholds = null_distribution::thresholds(evidence, &with_best, self.simulator);
-        if let Some(best) = trials.first().filter(|best| best.score >= thresholds.of(best.hypothesis.effect)) {
-            // Confounders of the best candidate, which the scan may have missed.
-            let accepted = self.accepted.iter().map(|(cause, _)| cause);
-            let names = accepted.chain(&trials).map(|trial| trial.hypothesis.name());
-            let names: Vec<String> = names.chain(excluded.iter().cloned()).collect();
-            let mut alike = confounders_of(evidence, &self.model, &best.hypothesis, &names, self.simulator);
-            alike.extend(on_single_joints(evidence, &self.model, &best.hypothesis, &names, self.simulator));
+        if best.score >= thresholds.of(best.hypothesis.effect) {
+            // Confounders of the best candidate, and its parts, which the scan may have missed.
+            let best = best.hypothesis.clone();
+            let tried = self.tried(&trials, excluded);
+            let mut alike = confounders_of(evidence, &self.model, &best, &tried, self.simulator);
+            alike.extend(on_parts(evidence, &self.model, &best, &tried, self.simulator));
             trials.extend(self.evaluate(alike, excluded, left)?);
             trials.sort_by(best_first);
+            let now = trials[0].hypothesis.clone();
+            if now.scope != best.scope {
+                let tried = self.tried(&trials, excluded);
+                let parts = on_parts(evidence, &self.model, &now, &tried, self.simulator);
+                trials.extend(self.evaluate(parts, excluded, left)?);
+                trials.sort_by(best_first);
+            }
         }
         let gains_there = |trial: &CandidateFit| {
             let there = |cause: &CandidateFit| cause.score * share_at(cause.hypothesis.scope, trial.hypothesis.scope);
@@ -282,6 +288,13 @@ impl<'a> ForwardSelection<'a> {
         trials.retain(|trial| repeats(evidence.logs(), &trial.hypothesis));
         trials.sort_by(best_first);
         Ok(trials)
+    }
+
+    /// Returns the names of the accepted causes, the trials and the excluded hypotheses.
+    fn tried(&self, trials: &[CandidateFit], excluded: &[String]) -> Vec<String> {
+        let accepted = self.accepted.iter().map(|(cause, _)| cause);
+        let names = accepted.chain(trials).map(|trial| trial.hypothesis.name());
+        names.chain(excluded.iter().cloned()).collect()
     }
 
     fn looked_at(&self) -> &'a WindowedData {

@@ -196,7 +196,8 @@ impl MeasuredTorque {
                         }
                     }
                 }
-                let forces = actuator.step(step % self.substeps, &q, &dq);
+                let middle = at((step as f64 + 0.5) * dt)[0];
+                let forces = actuator.step(step % self.substeps, &middle, &dq);
                 torques.push(std::array::from_fn(|joint| match self.sensor {
                     TorqueSensor::JointOutput => {
                         let dry = forces.dry_friction[joint] * smooth_sign(dq[joint]);

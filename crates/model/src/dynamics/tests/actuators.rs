@@ -199,6 +199,22 @@ fn rotor_with_an_elastic_gear_oscillates_at_its_natural_frequency() {
     assert!((amplitude / (300.0 * robot.joints[0].armature).sqrt() - 1.0).abs() < 0.02, "{amplitude} N·m");
 }
 
+/// Positions of the links are those of the middle of each step.
+#[test]
+fn rotor_moves_with_a_link_of_constant_speed() {
+    let robot = with_actuator(ActuatorParams { gear_stiffness: 300.0, ..ActuatorParams::IDEAL });
+    let mut actuator = actuator(&robot);
+    let speed = 5.0;
+    actuator.set(0, &robot, &[0.0; NUM_JOINTS], &[speed as f32; NUM_JOINTS]);
+    for step in 0..100 {
+        let middle = speed * DT * (f64::from(step) + 0.5);
+        let transmitted = actuator.step(0, &[middle; NUM_JOINTS], &[speed; NUM_JOINTS]).tau[0];
+        assert!(transmitted.abs() < 1e-9, "{transmitted} N·m");
+    }
+    let (q, dq) = actuator.encoder_reading(0, f64::NAN, f64::NAN);
+    assert!((q - 100.0 * speed * DT).abs() < 1e-9 && (dq - speed).abs() < 1e-9, "{q} rad, {dq} rad/s");
+}
+
 #[test]
 fn gear_transmits_no_torque_inside_its_backlash() {
     let robot = with_actuator(ActuatorParams { backlash: 0.02, ..ActuatorParams::IDEAL });
