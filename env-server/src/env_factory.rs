@@ -2,7 +2,7 @@
 
 use twinstep_effects::{ModelFile, ModelFileError, NetworkMode, RobotSampler, SamplingError};
 use twinstep_ensemble::{ActuatorNetworkRobot, EnsembleError};
-use twinstep_envs::{CounterEnv, GaitTask, Jump, TaskConfig, TaskEnv, TaskEnvConfig, Track, Walk};
+use twinstep_envs::{Attitude, CounterEnv, GaitTask, Jump, TaskConfig, TaskEnv, TaskEnvConfig, Track, Walk};
 use twinstep_model::{Actuator, AutoresetMode, Backend, RobotModel, VecEnv};
 use twinstep_policy::array_file::ArrayFileError;
 use twinstep_policy::{OtherBase, Policy, ResidualEnv};
@@ -222,6 +222,10 @@ fn task_env(
         TaskConfig::Gait(config) => {
             let gait = GaitTask::new(config.clone(), robot, has_ground_truth)?;
             Ok(Box::new(TaskEnv::new(backend, gait, settings)?))
+        }
+        TaskConfig::Attitude(config) => {
+            let attitude = Attitude::new(config.clone(), robot, has_ground_truth)?;
+            Ok(Box::new(TaskEnv::new(backend, attitude, settings)?))
         }
         // The environments of the base policy; the residual is added to its actions by `ResidualEnv`.
         TaskConfig::Explore(config) => {

@@ -256,6 +256,26 @@ fn shipped_policy_follows_a_circle_a_figure_of_eight_and_a_square() {
 }
 
 #[test]
+fn shipped_policy_follows_roll_and_pitch_in_two_engines() {
+    let policy = root().join("data/policies/attitude.safetensors");
+    let options = ["--robots", "16", "--seconds", "10", "--condition", "nominal", "--condition", "delay", "--json"];
+    let evaluated = twinstep(&[&["evaluate-policy", policy.to_str().unwrap()][..], &options].concat());
+    assert!(evaluated.status.success(), "{}", text(&evaluated.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&evaluated.stdout).unwrap();
+    let rows = report["rows"].as_array().unwrap();
+    assert_eq!(
+        rows.iter().map(|row| row["engine"].as_str().unwrap()).collect::<Vec<_>>(),
+        ["batch", "rapier", "batch"]
+    );
+    for row in rows {
+        let l_attitude = row["l_attitude"].as_f64().unwrap();
+        // A robot that stands still has the mean of its references, 0.18 rad.
+        let limit = if row["condition"] == "nominal" { 0.03 } else { 0.08 };
+        assert!(row["up"] == 1.0 && l_attitude < limit && row["height_rms"].as_f64().unwrap() < 0.02, "{row}");
+    }
+}
+
+#[test]
 fn shipped_policy_jumps_to_its_target_in_two_engines() {
     let policy = root().join("data/policies/jump.safetensors");
     let evaluated = twinstep(&["evaluate-policy", policy.to_str().unwrap(), "--robots", "8", "--json"]);

@@ -55,6 +55,7 @@ impl Resumable {
         let options: &[&str] = match task {
             "walk" => &["--seed", "4"],
             "jump" => &["--seed", "1", "--steps", "20000000"],
+            "attitude" => &["--seed", "1", "--steps", "10000000"],
             _ => &["--seed", "1", "--steps", "30000000"],
         };
         self.step(&out.join("evaluation.json"), &[&["train", task], options].concat(), &out)?;

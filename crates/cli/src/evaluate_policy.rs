@@ -12,6 +12,7 @@ use twinstep_policy::{Policy, PolicyRunner};
 use twinstep_report::film_strip;
 use twinstep_sim::{Engine, RoughTerrain, SimConfig, StepTerrain, Terrain};
 
+use crate::evaluate_attitude::{self, AttitudeRow};
 use crate::evaluate_gait::{self, GaitRow};
 use crate::evaluate_jump::{self, JumpRow};
 use crate::evaluate_tracking::{self, TrackingRow};
@@ -27,8 +28,8 @@ const FILM_STEPS: usize = 4;
 ///
 /// The mean action of the policy steps fresh robots with the default commands of `walk`: a new one every 5 s. A policy of
 /// `track` follows a circle, a figure of eight and a square, with and without motion capture. A policy of `gait` is
-/// commanded a trot, a pace, a bound and a pronk, under nominal, robots, pushes and delay. A policy of `jump` jumps
-/// once to both ends and the middle of the ranges of its targets. A robot that has fallen no longer counts for the errors,
+/// commanded a trot, a pace, a bound and a pronk, under nominal, robots, pushes and delay. A policy of `attitude` follows
+/// sines of roll, pitch and height. A policy of `jump` jumps once to both ends and the middle of the ranges of its targets. A robot that has fallen no longer counts for the errors,
 /// but its landing before the fall does. Conditions:
 ///
 ///   nominal   the robot of the model file on flat ground
@@ -184,6 +185,10 @@ pub fn run(args: &Args) -> CommandResult {
             let rows = gaits(args, &policy, &signals)?;
             if args.json { json(args, &rows) } else { evaluate_gait::table(args.robots, args.seconds, &rows) }
         }
+        TaskConfig::Attitude(_) => {
+            let rows = attitudes(args, &policy, &signals)?;
+            if args.json { json(args, &rows) } else { evaluate_attitude::table(args.robots, args.seconds, &rows) }
+        }
         _ => {
             let rows = walking(args, &policy, &signals)?;
             if args.json {
@@ -272,6 +277,23 @@ fn gaits(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<GaitRow>
         }
         bar.finish_and_clear();
         rows.push(GaitRow { condition: name, engine, gaits });
+    }
+    Ok(rows)
+}
+
+/// Evaluates the attitude of the base under each condition. On steps the robots start with their feet at different heights.
+fn attitudes(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<AttitudeRow>, Failure> {
+    let mut rows = Vec::new();
+    for condition in args.conditions() {
+        let mut env = condition.env(args, TaskConfig::Attitude(evaluate_attitude::task()), args.robots as usize)?;
+        check_spec(policy, env.spec())?;
+        let Condition { name, engine, .. } = condition;
+        let bar = progress_bar(name);
+        let proceed = |share: f64| show(&bar, share, signals);
+        let errors = evaluate_attitude::evaluate(policy, env.as_mut(), (args.seconds, args.seed), proceed);
+        let errors = errors.map_err(input)?.ok_or(Failure::Interrupted)?;
+        bar.finish_and_clear();
+        rows.push(AttitudeRow { condition: name, engine, errors });
     }
     Ok(rows)
 }

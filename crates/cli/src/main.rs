@@ -8,6 +8,7 @@ mod demo;
 mod diagnose;
 mod effects;
 mod evaluate;
+mod evaluate_attitude;
 mod evaluate_gait;
 mod evaluate_jump;
 mod evaluate_policy;

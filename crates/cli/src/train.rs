@@ -27,7 +27,7 @@ const SAVE_EVERY: Duration = Duration::from_secs(10);
 ///
 ///   policy.safetensors     the policy, with the spec of its environment
 ///   policy.onnx            the same for other runtimes: input `obs` [batch, N] in SI units, output `action` [batch, 12]
-///   evaluation.json        velocity errors and falls of 256 fresh robots; task `jump`: where they land
+///   evaluation.json        velocity errors and falls of 256 fresh robots; task `jump`: where they land; `attitude`: its errors
 ///   config.toml            all settings; --config config.toml repeats the training
 ///   progress.csv           errors, falls, reward terms and times of every update; TensorBoard reads events.out.*
 ///   curve.svg              learning curve
@@ -42,7 +42,7 @@ const SAVE_EVERY: Duration = Duration::from_secs(10);
 #[derive(clap::Args)]
 pub struct Args {
     /// Task to learn. Default: that of the config file, else walk.
-    #[arg(value_parser = ["walk", "track", "jump", "gait", "explore"])]
+    #[arg(value_parser = ["walk", "track", "jump", "gait", "attitude", "explore"])]
     task: Option<String>,
     /// Folder to write.
     #[arg(long, value_name = "DIR")]

@@ -2,9 +2,11 @@
 
 use twinstep_envs::{JumpConfig, TaskConfig};
 use twinstep_learning::{Evaluation, EvaluationError, EvaluationPlan, evaluate};
+use twinstep_model::VecEnv;
 use twinstep_policy::Policy;
 use twinstep_sim::{Engine, SimConfig};
 
+use crate::evaluate_attitude::{self, AttitudeErrors, AttitudeRow};
 use crate::evaluate_jump::{self, JumpRow};
 use crate::evaluate_policy::check_spec;
 use crate::exit::{Failure, Signals, other};
@@ -34,6 +36,12 @@ pub fn evaluate_policy(
         let of = "Simulated here, with the model and the targets of this command; those of the servers may differ.\n";
         let text = if endpoints.is_empty() { "" } else { of }.to_owned() + &evaluate_jump::table(ROBOTS as u32, &rows);
         return Ok((json(serde_json::to_string_pretty(&rows[0].targets)), text));
+    }
+    if let TaskConfig::Attitude(_) = &config.task {
+        let errors = attitude(policy, config, endpoints, signals)?;
+        let rows = [AttitudeRow { condition: "nominal", engine: Engine::Batch, errors }];
+        let text = evaluate_attitude::table(ROBOTS as u32, SECONDS, &rows);
+        return Ok((json(serde_json::to_string_pretty(&rows[0].errors)), text));
     }
     let evaluation = walking(policy, config, endpoints, signals)?;
     Ok((json(serde_json::to_string_pretty(&evaluation)), evaluation_text(&evaluation)))
@@ -79,6 +87,24 @@ fn jumps(
         targets.push(landings.map_err(other)?.ok_or(Failure::Interrupted)?);
     }
     Ok(targets)
+}
+
+/// Evaluates a policy of `attitude` in this process, or on the robots of these servers.
+fn attitude(
+    policy: &Policy,
+    config: &TrainConfig,
+    endpoints: &[String],
+    signals: &Signals,
+) -> Result<AttitudeErrors, Failure> {
+    let proceed = |_: f64| signals.check().is_ok();
+    let mut env: Box<dyn VecEnv> = if endpoints.is_empty() {
+        fresh(config, TaskConfig::Attitude(evaluate_attitude::task())).envs(ROBOTS, 1, 0)?.remove(0)
+    } else {
+        Box::new(remote_env(endpoints, ROBOTS)?)
+    };
+    check_spec(policy, env.spec())?;
+    let errors = evaluate_attitude::evaluate(policy, env.as_mut(), (SECONDS, SEED), proceed);
+    errors.map_err(other)?.ok_or(Failure::Interrupted)
 }
 
 /// Returns the training's robot with default physics.

@@ -36,5 +36,6 @@ pub use randomise::Randomisation;
 pub use task::{RobotView, Step, Task};
 pub use task_env::{TaskEnv, TaskEnvConfig};
 pub use tasks::{
-    ExploreConfig, Gait, GaitConfig, GaitTask, Jump, JumpConfig, TaskConfig, Track, TrackConfig, Walk, WalkConfig,
+    Attitude, AttitudeConfig, ExploreConfig, Gait, GaitConfig, GaitTask, Jump, JumpConfig, TaskConfig, Track,
+    TrackConfig, Walk, WalkConfig, roll_and_pitch,
 };

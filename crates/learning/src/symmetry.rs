@@ -72,6 +72,7 @@ fn entries(field: &SpecField) -> Option<Vec<(usize, f32)>> {
         "velocity_command" | "no_velocity_command" | "path_velocity" | "pose_error" | "landing_target" => {
             signs([1.0, -1.0, -1.0])
         }
+        "attitude_command" => signs([-1.0, 1.0, 1.0]),
         "base_height" | "phase" => Some(vec![(0, 1.0)]),
         // Stages and errors without a sign.
         "jump_stage" | "landing_error" => Some(vec![(0, 1.0), (1, 1.0)]),

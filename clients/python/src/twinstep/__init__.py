@@ -88,7 +88,8 @@ __all__ = [
 ]
 
 # With the number of policy steps of an episode: 20 s, a jump 3 s.
-for _task, _max_episode_steps in {"walk": 1000, "track": 1000, "jump": 150, "gait": 1000, "explore": 1000}.items():
+_MAX_EPISODE_STEPS = {"walk": 1000, "track": 1000, "jump": 150, "gait": 1000, "attitude": 1000, "explore": 1000}
+for _task, _max_episode_steps in _MAX_EPISODE_STEPS.items():
     gymnasium.register(
         id=f"twinstep/Go2-{_task.capitalize()}-v0",
         entry_point="twinstep.env:Go2Env",

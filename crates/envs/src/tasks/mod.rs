@@ -4,6 +4,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::ConfigError;
 
+pub mod attitude;
+pub mod attitude_config;
 pub mod explore_config;
 pub mod gait;
 pub mod gait_clock;
@@ -18,6 +20,8 @@ pub mod track_config;
 pub mod walk;
 pub mod walk_config;
 
+pub use attitude::{Attitude, roll_and_pitch};
+pub use attitude_config::AttitudeConfig;
 pub use explore_config::ExploreConfig;
 pub use gait::GaitTask;
 pub use gait_clock::Gait;
@@ -41,6 +45,8 @@ pub enum TaskConfig {
     Jump(JumpConfig),
     /// Locomotion with velocity commands and a commanded gait.
     Gait(GaitConfig),
+    /// Standing with a commanded roll, pitch and height of the base.
+    Attitude(AttitudeConfig),
     /// A residual on a frozen policy of `walk`, rewarded for the uncertainty of the actuator networks.
     Explore(ExploreConfig),
     /// Counts steps without physics, to verify and measure the transport. It has no settings.
@@ -55,7 +61,7 @@ impl Default for TaskConfig {
 
 impl TaskConfig {
     /// Names of all tasks.
-    pub const NAMES: [&str; 6] = ["walk", "track", "jump", "gait", "explore", "counter"];
+    pub const NAMES: [&str; 7] = ["walk", "track", "jump", "gait", "attitude", "explore", "counter"];
 
     /// Returns the task of this name with default settings. Returns `None` if there is no such task.
     pub fn named(name: &str) -> Option<Self> {
@@ -64,6 +70,7 @@ impl TaskConfig {
             "track" => Some(Self::Track(TrackConfig::default())),
             "jump" => Some(Self::Jump(JumpConfig::default())),
             "gait" => Some(Self::Gait(GaitConfig::default())),
+            "attitude" => Some(Self::Attitude(AttitudeConfig::default())),
             "explore" => Some(Self::Explore(ExploreConfig::default())),
             "counter" => Some(Self::Counter),
             _ => None,
@@ -77,6 +84,7 @@ impl TaskConfig {
             Self::Track(_) => "track",
             Self::Jump(_) => "jump",
             Self::Gait(_) => "gait",
+            Self::Attitude(_) => "attitude",
             Self::Explore(_) => "explore",
             Self::Counter => "counter",
         }
@@ -89,6 +97,7 @@ impl TaskConfig {
             Self::Track(config) => config.check(),
             Self::Jump(config) => config.check(),
             Self::Gait(config) => config.check(),
+            Self::Attitude(config) => config.check(),
             Self::Explore(config) => config.check(),
             Self::Counter => Ok(()),
         }
@@ -112,6 +121,9 @@ impl TaskConfig {
             Self::Track(config) => ("task.walk.reward.epistemic_uncertainty", config.walk.reward.epistemic_uncertainty),
             Self::Jump(config) => ("task.walk.reward.epistemic_uncertainty", config.walk.reward.epistemic_uncertainty),
             Self::Gait(config) => ("task.walk.reward.epistemic_uncertainty", config.walk.reward.epistemic_uncertainty),
+            Self::Attitude(config) => {
+                ("task.walk.reward.epistemic_uncertainty", config.walk.reward.epistemic_uncertainty)
+            }
             Self::Explore(config) => ("task.uncertainty_weight", config.uncertainty_weight),
             Self::Counter => ("task", 0.0),
         }
@@ -129,6 +141,7 @@ impl TryFrom<toml::Table> for TaskConfig {
             Some("track") => table.try_into().map(Self::Track).map_err(text),
             Some("jump") => table.try_into().map(Self::Jump).map_err(text),
             Some("gait") => table.try_into().map(Self::Gait).map_err(text),
+            Some("attitude") => table.try_into().map(Self::Attitude).map_err(text),
             Some("explore") => table.try_into().map(Self::Explore).map_err(text),
             Some("counter") if table.is_empty() => Ok(Self::Counter),
             Some("counter") => Err("the task `counter` has no settings besides `name`".to_owned()),
@@ -169,7 +182,7 @@ mod tests {
             in `reward`
         "#]].assert_eq(&error("[reward]\ntorques = -1.0"));
         expect![[r#"
-            `name` = "fly" is not a task; possible: walk, track, jump, gait, explore, counter
+            `name` = "fly" is not a task; possible: walk, track, jump, gait, attitude, explore, counter
         "#]]
         .assert_eq(&error("name = \"fly\""));
         expect![[r#"
@@ -180,7 +193,7 @@ mod tests {
 
     #[test]
     fn defaults_are_valid() {
-        for name in ["walk", "track", "jump", "gait", "counter"] {
+        for name in ["walk", "track", "jump", "gait", "attitude", "counter"] {
             assert_eq!(TaskConfig::named(name).expect("a task").check(), Ok(()), "{name}");
         }
         let explore = ExploreConfig::default();

@@ -38,12 +38,12 @@ struct Args {
     /// Simulated robots of each evaluation.
     #[arg(long, default_value_t = 16)]
     evaluated: u32,
-    /// Tasks: walk, jump, track.
+    /// Tasks: walk, jump, track, attitude.
     #[arg(long, value_delimiter = ',', default_value = "walk,jump")]
     tasks: Vec<String>,
     /// Methods: vanilla, heavy, spi, truth, and spi- with random or a criterion, such as spi-d-optimal. `truth` learns on
-    /// the hidden robot, in the batch engine; `gradient` on the model that gradient steps alone identify from the logs of
-    /// spi-random.
+    /// the hidden robot, in the batch engine. Two learn on models that are identified from the logs of spi-random: `gradient`
+    /// by gradient steps alone, `ours` with further effects among the unknowns.
     #[arg(
         long,
         value_delimiter = ',',
@@ -84,7 +84,26 @@ impl Task {
     }
 }
 
-const TASKS: [Task; 3] = [
+/// Effects that the method `ours` identifies besides the unknowns of the others: what a Go2 may have, by joint type or for all.
+const OURS: [&str; 15] = [
+    "command_delay@all",
+    "drive_lag@all",
+    "torque_speed_limit@all",
+    "torque_gain@all",
+    "armature@hip",
+    "armature@thigh",
+    "armature@calf",
+    "viscous_friction@hip",
+    "viscous_friction@thigh",
+    "viscous_friction@calf",
+    "coulomb_friction@hip",
+    "coulomb_friction@thigh",
+    "coulomb_friction@calf",
+    "joint_elasticity@all",
+    "load_friction@all",
+];
+
+const TASKS: [Task; 4] = [
     Task {
         name: "walk",
         settings: "",
@@ -109,6 +128,14 @@ const TASKS: [Task; 3] = [
         up: "/rows/0/paths/0/up",
         seconds: 20,
     },
+    Task {
+        name: "attitude",
+        settings: "",
+        error: "L_attitude [rad]",
+        pointer: "/rows/0/l_attitude",
+        up: "/rows/0/up",
+        seconds: 20,
+    },
 ];
 
 fn main() -> ExitCode {
@@ -119,9 +146,7 @@ fn campaign(args: &Args) -> Step<String> {
     for seed in (args.first..args.first + args.robots).filter(|_| !args.table) {
         let robot = Robot::new(args, seed)?;
         robot.collect()?;
-        if let Some(model) = robot.model("gradient").filter(|model| robot.trains("gradient") && !model.exists()) {
-            robot.descend(&model)?;
-        }
+        ["gradient", "ours"].into_iter().try_for_each(|method| robot.identify(method))?;
         for task in TASKS.iter().filter(|task| args.tasks.iter().any(|name| name == task.name)) {
             let start = Resumable::new(&args.out)?.nominal(task.name)?;
             if task.has_start() {
@@ -158,13 +183,25 @@ impl<'a> Robot<'a> {
         missing.iter().try_for_each(|method| self.hidden.identify(method, collection, self.seed, &endpoint))
     }
 
-    /// Identifies the robot from the logs of random commands by gradient steps from the ideal Go2, without CMA-ES.
-    fn descend(&self, model: &Path) -> Step {
+    /// Identifies the robot from both logs of random commands, unless the model of the method is there.
+    ///
+    /// `gradient` has the unknowns of the other methods, and gradient steps from the ideal Go2 without CMA-ES; `ours` has all
+    /// effects of [`OURS`], too.
+    fn identify(&self, method: &str) -> Step {
+        let Some(model) = self.model(method).filter(|model| self.trains(method) && !model.exists()) else {
+            return Ok(());
+        };
         let logs = ["1-random", "2-random"].map(|stage| self.commands().path("random").join(stage).join("log"));
         let partial = model.with_extension("partial.toml");
         let [one, other, out] = [&logs[0], &logs[1], &partial].map(|path| path.display().to_string());
-        let (effects, seed) = (self.args.set.unknowns().join(","), self.seed.to_string());
-        let options = ["--effects", &effects, "--generations", "0", "--seed", &seed, "--out", &out];
+        let mut effects = self.args.set.unknowns();
+        let own: &[&str] = if method == "ours" { &OURS } else { &[] };
+        effects.extend(own.iter().filter(|effect| !self.args.set.unknowns().contains(effect)));
+        let (effects, seed) = (effects.join(","), self.seed.to_string());
+        let mut options = vec!["--effects", &effects, "--seed", &seed, "--out", &out];
+        if method == "gradient" {
+            options.extend(["--generations", "0"]);
+        }
         let _ = std::fs::remove_file(&partial);
         self.commands().run(&[&["identify", &one, &other][..], &options].concat())?;
         std::fs::rename(partial, model).map_err(text)
@@ -203,7 +240,7 @@ impl<'a> Robot<'a> {
             "spi" => "random/1-random/model.toml".to_owned(),
             "spi-random" => "random/2-random/model.toml".to_owned(),
             "truth" => "hidden.toml".to_owned(),
-            "gradient" => "gradient.toml".to_owned(),
+            "gradient" | "ours" => format!("{method}.toml"),
             _ => format!("{}/2-active/model.toml", method.strip_prefix("spi-")?),
         };
         Some(self.commands().path(&path))
