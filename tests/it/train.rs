@@ -270,8 +270,9 @@ fn shipped_policy_follows_roll_and_pitch_in_two_engines() {
     for row in rows {
         let l_attitude = row["l_attitude"].as_f64().unwrap();
         // A robot that stands still has the mean of its references, 0.18 rad.
+        // One that ignores the commanded height has an error of 0.012 m.
         let limit = if row["condition"] == "nominal" { 0.03 } else { 0.08 };
-        assert!(row["up"] == 1.0 && l_attitude < limit && row["height_rms"].as_f64().unwrap() < 0.02, "{row}");
+        assert!(row["up"] == 1.0 && l_attitude < limit && row["height_rms"].as_f64().unwrap() < 0.009, "{row}");
     }
 }
 

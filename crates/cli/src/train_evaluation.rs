@@ -2,7 +2,6 @@
 
 use twinstep_envs::{JumpConfig, TaskConfig};
 use twinstep_learning::{Evaluation, EvaluationError, EvaluationPlan, evaluate};
-use twinstep_model::VecEnv;
 use twinstep_policy::Policy;
 use twinstep_sim::{Engine, SimConfig};
 
@@ -21,8 +20,8 @@ const SEED: u64 = 1_000_000;
 /// Evaluates `policy`, which was trained with `config` on the robots of these servers, or in this process if there are
 /// none. Returns the evaluation as JSON and as a table.
 ///
-/// The robots are fresh ones of the server, or of the training's model with default commands and physics. Jumps are
-/// evaluated in this process only.
+/// The robots are fresh ones of the server, or of the training's model with default commands and physics. Jumps and the
+/// attitude are evaluated in this process only.
 pub fn evaluate_policy(
     policy: &Policy,
     config: &TrainConfig,
@@ -30,18 +29,21 @@ pub fn evaluate_policy(
     signals: &Signals,
 ) -> Result<(String, String), Failure> {
     let json = |evaluation: serde_json::Result<String>| evaluation.expect("an evaluation is plain data");
+    let text = |table: String| {
+        let of = "Simulated here, with the model and the targets of this command; those of the servers may differ.\n";
+        if endpoints.is_empty() { table } else { of.to_owned() + &table }
+    };
     if let TaskConfig::Jump(task) = &config.task {
         let targets = jumps(policy, config, task, signals)?;
         let rows = [JumpRow { condition: "nominal", engine: Engine::Batch, targets }];
-        let of = "Simulated here, with the model and the targets of this command; those of the servers may differ.\n";
-        let text = if endpoints.is_empty() { "" } else { of }.to_owned() + &evaluate_jump::table(ROBOTS as u32, &rows);
-        return Ok((json(serde_json::to_string_pretty(&rows[0].targets)), text));
+        let table = evaluate_jump::table(ROBOTS as u32, &rows);
+        return Ok((json(serde_json::to_string_pretty(&rows[0].targets)), text(table)));
     }
     if let TaskConfig::Attitude(_) = &config.task {
-        let errors = attitude(policy, config, endpoints, signals)?;
+        let errors = attitude(policy, config, signals)?;
         let rows = [AttitudeRow { condition: "nominal", engine: Engine::Batch, errors }];
-        let text = evaluate_attitude::table(ROBOTS as u32, SECONDS, &rows);
-        return Ok((json(serde_json::to_string_pretty(&rows[0].errors)), text));
+        let table = evaluate_attitude::table(ROBOTS as u32, SECONDS, &rows);
+        return Ok((json(serde_json::to_string_pretty(&rows[0].errors)), text(table)));
     }
     let evaluation = walking(policy, config, endpoints, signals)?;
     Ok((json(serde_json::to_string_pretty(&evaluation)), evaluation_text(&evaluation)))
@@ -89,20 +91,10 @@ fn jumps(
     Ok(targets)
 }
 
-/// Evaluates a policy of `attitude` in this process, or on the robots of these servers.
-fn attitude(
-    policy: &Policy,
-    config: &TrainConfig,
-    endpoints: &[String],
-    signals: &Signals,
-) -> Result<AttitudeErrors, Failure> {
-    let proceed = |_: f64| signals.check().is_ok();
-    let mut env: Box<dyn VecEnv> = if endpoints.is_empty() {
-        fresh(config, TaskConfig::Attitude(evaluate_attitude::task())).envs(ROBOTS, 1, 0)?.remove(0)
-    } else {
-        Box::new(remote_env(endpoints, ROBOTS)?)
-    };
+fn attitude(policy: &Policy, config: &TrainConfig, signals: &Signals) -> Result<AttitudeErrors, Failure> {
+    let mut env = fresh(config, TaskConfig::Attitude(evaluate_attitude::task())).envs(ROBOTS, 1, 0)?.remove(0);
     check_spec(policy, env.spec())?;
+    let proceed = |_: f64| signals.check().is_ok();
     let errors = evaluate_attitude::evaluate(policy, env.as_mut(), (SECONDS, SEED), proceed);
     errors.map_err(other)?.ok_or(Failure::Interrupted)
 }

@@ -47,6 +47,8 @@ pub fn on_parts(
 }
 
 /// Returns the scopes into which a scope is divided: sides and legs of all joints, legs of a side, joints of a leg or type.
+///
+/// The scan simulates each joint type by itself.
 fn parts(scope: Scope) -> Vec<Scope> {
     let legs = Leg::ALL.into_iter().map(Scope::Leg);
     let joints = Joint::ALL.into_iter().filter(|joint| scope.contains(*joint));

@@ -53,7 +53,7 @@ impl RobotWorld {
             }
         }
         let mut this = Self {
-            actuator: SimdActuators::new(robot, 1.0 / f64::from(config.physics_hz())),
+            actuator: SimdActuators::new(robot, 1.0 / f64::from(config.physics_hz())).with_sampled_positions(),
             gyro_bias: robot.gyro_bias.as_vec3(),
             world,
             trunk,

@@ -93,14 +93,14 @@ fn downstream(args: &Args, task: &Task, seeds: &[u64], text: &mut String) -> Ste
     );
     for method in methods(args, task) {
         let found = errors(method)?;
-        let cells: Vec<String> = found.iter().map(|[error, _]| format!("{error:.3}")).collect();
+        let cells: Vec<String> = found.iter().map(|[error, _]| format!("{error:.4}")).collect();
         let up = mean(found.iter().map(|[_, up]| *up));
         let minus = |other: &[[f64; 2]]| {
             interval(&found.iter().zip(other).map(|(one, other)| one[0] - other[0]).collect::<Vec<_>>())
         };
         let _ = writeln!(
             text,
-            "| {method} | {:.3} | {} | {:.0} % | {} | {} |",
+            "| {method} | {:.4} | {} | {:.0} % | {} | {} |",
             mean(found.iter().map(|[error, _]| *error)),
             cells.join(", "),
             100.0 * up,
@@ -120,8 +120,8 @@ fn mean(values: impl ExactSizeIterator<Item = f64>) -> f64 {
 fn interval(differences: &[f64]) -> String {
     let mean = mean(differences.iter().copied());
     let count = differences.len();
-    let Some(quantile) = T_95.get(count.wrapping_sub(2)).filter(|_| count > 2) else { return format!("{mean:+.3}") };
+    let Some(quantile) = T_95.get(count.wrapping_sub(2)).filter(|_| count > 2) else { return format!("{mean:+.4}") };
     let variance = differences.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / (count - 1) as f64;
     let half = quantile * (variance / count as f64).sqrt();
-    format!("{mean:+.3} ({:+.3} to {:+.3})", mean - half, mean + half)
+    format!("{mean:+.4} ({:+.4} to {:+.4})", mean - half, mean + half)
 }

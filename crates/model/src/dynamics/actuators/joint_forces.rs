@@ -23,7 +23,8 @@ pub struct JointForces<T> {
 impl<T: SimdFloat> SimdActuators<T> {
     /// Advances the actuators by physics step `index` of the actuator period and returns torque and friction.
     ///
-    /// `q` [rad] and `dq` [rad/s] are the joint positions and velocities.
+    /// `q` [rad] are the joint positions in the middle of the step, or those of [`SimdActuators::with_sampled_positions`], and
+    /// `dq` [rad/s] the velocities.
     #[inline(always)]
     pub fn step(&mut self, index: usize, q: &[T; 12], dq: &[T; 12]) -> JointForces<T> {
         let active = self.active;

@@ -30,8 +30,8 @@ struct ActuatorState<T> {
     torque_history: Vec<[T; 12]>,
     /// Torque after the first-order lag, proportional to the motor current [N·m].
     current: [T; 12],
-    /// Position [rad], half a physics step ahead as that of the link in the simulator, and velocity [rad/s] of the rotor of an
-    /// elastic gear.
+    /// Position [rad] at the time of the link positions of [`SimdActuators::step`], and velocity [rad/s] of the rotor of an elastic
+    /// gear.
     rotor: [[T; 12]; 2],
 }
 
@@ -51,11 +51,15 @@ pub struct SimdActuators<T> {
     step_fraction: T,
     /// Physics step [s].
     dt: f64,
+    /// Time from a sample to the link positions of [`SimdActuators::step`] after it [s].
+    lead: f64,
     actuator_dt: f64,
 }
 
 impl<T: SimdFloat> SimdActuators<T> {
     /// Creates the actuators of `robot` in every lane, with zero torque, for physics steps of `dt` [s].
+    ///
+    /// Link positions of a step are those of its middle, half a step after a sample.
     pub fn new(robot: &RobotModel, dt: f64) -> Self {
         let (zero, actuator_dt) = ([T::splat(0.0); 12], robot.control.actuator_dt());
         let coefficients = robot.joints.map(|joint| Coefficients::splat(&joint, dt, actuator_dt));
@@ -75,8 +79,14 @@ impl<T: SimdFloat> SimdActuators<T> {
             active: ActiveEffects::default(),
             step_fraction: T::splat(dt / actuator_dt),
             dt,
+            lead: 0.5 * dt,
             actuator_dt,
         }
+    }
+
+    /// Returns the actuators for a simulator whose samples are the link positions of its steps.
+    pub fn with_sampled_positions(self) -> Self {
+        Self { lead: 0.0, ..self }
     }
 
     /// Resets the actuators of one lane to those of `robot`, with joints at `q` [rad] and `dq` [rad/s] and zero torque.
@@ -98,7 +108,7 @@ impl<T: SimdFloat> SimdActuators<T> {
                 torque[index].set(lane, 0.0);
             }
             state.current[index].set(lane, 0.0);
-            state.rotor[0][index].set(lane, f64::from(q[index]) + 0.5 * self.dt * f64::from(dq[index]));
+            state.rotor[0][index].set(lane, f64::from(q[index]) + self.lead * f64::from(dq[index]));
             state.rotor[1][index].set(lane, f64::from(dq[index]));
         }
         self.set_derating(lane, &[1.0; 12]);
@@ -128,8 +138,8 @@ impl<T: SimdFloat> SimdActuators<T> {
             let n = &self.coefficients[joint];
             q[joint] - n.encoder_offset - n.encoder_lead * dq[joint]
         });
-        let half_step = T::splat(0.5 * self.dt);
-        let rotor = [std::array::from_fn(|joint| link[joint] + half_step * dq[joint]), *dq];
+        let lead = T::splat(self.lead);
+        let rotor = [std::array::from_fn(|joint| link[joint] + lead * dq[joint]), *dq];
         self.state.rotor = rotor;
         self.update_command(commands, &link, dq);
         for index in 0..steps {
@@ -149,8 +159,7 @@ impl<T: SimdFloat> SimdActuators<T> {
     #[inline(always)]
     pub fn encoder_reading(&self, joint: usize, q: T, dq: T) -> (T, T) {
         let (n, zero, [angle, speed]) = (&self.coefficients[joint], T::splat(0.0), &self.state.rotor);
-        let half_step = T::splat(0.5 * self.dt);
-        let q = zero.select_lt(n.gear, angle[joint] - half_step * speed[joint], q);
+        let q = zero.select_lt(n.gear, angle[joint] - T::splat(self.lead) * speed[joint], q);
         let dq = zero.select_lt(n.gear, speed[joint], dq);
         (q + n.encoder_offset + n.encoder_lead * dq, dq)
     }

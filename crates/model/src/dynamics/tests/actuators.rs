@@ -199,20 +199,21 @@ fn rotor_with_an_elastic_gear_oscillates_at_its_natural_frequency() {
     assert!((amplitude / (300.0 * robot.joints[0].armature).sqrt() - 1.0).abs() < 0.02, "{amplitude} N·m");
 }
 
-/// Positions of the links are those of the middle of each step.
+/// Positions of the links are those of the middle of each step, or of the sample before it.
 #[test]
 fn rotor_moves_with_a_link_of_constant_speed() {
     let robot = with_actuator(ActuatorParams { gear_stiffness: 300.0, ..ActuatorParams::IDEAL });
-    let mut actuator = actuator(&robot);
     let speed = 5.0;
-    actuator.set(0, &robot, &[0.0; NUM_JOINTS], &[speed as f32; NUM_JOINTS]);
-    for step in 0..100 {
-        let middle = speed * DT * (f64::from(step) + 0.5);
-        let transmitted = actuator.step(0, &[middle; NUM_JOINTS], &[speed; NUM_JOINTS]).tau[0];
-        assert!(transmitted.abs() < 1e-9, "{transmitted} N·m");
+    for (mut actuator, lead) in [(actuator(&robot), 0.5 * DT), (actuator(&robot).with_sampled_positions(), 0.0)] {
+        actuator.set(0, &robot, &[0.0; NUM_JOINTS], &[speed as f32; NUM_JOINTS]);
+        for step in 0..100 {
+            let link = speed * (DT * f64::from(step) + lead);
+            let transmitted = actuator.step(0, &[link; NUM_JOINTS], &[speed; NUM_JOINTS]).tau[0];
+            assert!(transmitted.abs() < 1e-9, "{transmitted} N·m");
+        }
+        let (q, dq) = actuator.encoder_reading(0, f64::NAN, f64::NAN);
+        assert!((q - 100.0 * speed * DT).abs() < 1e-9 && (dq - speed).abs() < 1e-9, "{q} rad, {dq} rad/s");
     }
-    let (q, dq) = actuator.encoder_reading(0, f64::NAN, f64::NAN);
-    assert!((q - 100.0 * speed * DT).abs() < 1e-9 && (dq - speed).abs() < 1e-9, "{q} rad, {dq} rad/s");
 }
 
 #[test]
