@@ -8,6 +8,8 @@ use twinstep_simd::{SimdFloat, exponential};
 
 /// Integration steps of a rotor with an elastic gear per physics step.
 const GEAR_SUBSTEPS: usize = 8;
+/// Damping of an elastic gear, relative to its stiffness [physics steps].
+const GEAR_DAMPING: f64 = 0.125;
 
 /// Torque and friction at the joints in one physics step.
 #[derive(Clone, Copy, Debug)]
@@ -109,20 +111,28 @@ impl<T: SimdFloat> SimdActuators<T> {
 
     /// Integrates the rotors of elastic gears in substeps with constant link velocities.
     ///
-    /// Replaces `tau` by the mean torque that the gear transmits to the link [N·m].
+    /// Each substep evaluates the torque in its middle, so that rotor and link are at the same time. Without damping, a stiff
+    /// gear between rotor and link would vibrate at a frequency that the physics step does not resolve. Replaces `tau` by the
+    /// mean torque that the gear transmits to the link [N·m].
     #[inline(always)]
     fn integrate_gear(&mut self, tau: &mut [T; 12], q: &[T; 12], dq: &[T; 12]) {
         let (zero, dt) = (T::splat(0.0), T::splat(self.dt / GEAR_SUBSTEPS as f64));
+        let (half, lead) = (T::splat(0.5) * dt, T::splat(self.lead));
+        let damping_time = T::splat(GEAR_DAMPING * self.dt);
         let [angle, speed] = &mut self.state.rotor;
         for joint in 0..12 {
             let Coefficients { half_backlash, gear: stiffness, rotor, .. } = self.coefficients[joint];
-            let (mut link, mut mean) = (q[joint], zero);
+            let (mut link, mut mean) = (q[joint] - lead * dq[joint], zero);
             for _ in 0..GEAR_SUBSTEPS {
+                angle[joint] += half * speed[joint];
+                link += half * dq[joint];
                 let twist = angle[joint] - link;
-                let transmitted = stiffness * ((twist - half_backlash).max(zero) + (twist + half_backlash).min(zero));
+                let spring = (twist - half_backlash).max(zero) + (twist + half_backlash).min(zero);
+                let damper = damping_time * (speed[joint] - dq[joint]);
+                let transmitted = stiffness * (spring + half_backlash.select_lt(twist.abs(), damper, zero));
                 speed[joint] += dt * (tau[joint] - transmitted) / rotor;
-                angle[joint] += dt * speed[joint];
-                link += dt * dq[joint];
+                angle[joint] += half * speed[joint];
+                link += half * dq[joint];
                 mean += transmitted * T::splat(1.0 / GEAR_SUBSTEPS as f64);
             }
             tau[joint] = zero.select_lt(stiffness, mean, tau[joint]);

@@ -30,8 +30,7 @@ struct ActuatorState<T> {
     torque_history: Vec<[T; 12]>,
     /// Torque after the first-order lag, proportional to the motor current [N·m].
     current: [T; 12],
-    /// Position [rad] at the time of the link positions of [`SimdActuators::step`], and velocity [rad/s] of the rotor of an elastic
-    /// gear.
+    /// Position [rad] and velocity [rad/s] of the rotor of an elastic gear.
     rotor: [[T; 12]; 2],
 }
 
@@ -108,7 +107,7 @@ impl<T: SimdFloat> SimdActuators<T> {
                 torque[index].set(lane, 0.0);
             }
             state.current[index].set(lane, 0.0);
-            state.rotor[0][index].set(lane, f64::from(q[index]) + self.lead * f64::from(dq[index]));
+            state.rotor[0][index].set(lane, f64::from(q[index]));
             state.rotor[1][index].set(lane, f64::from(dq[index]));
         }
         self.set_derating(lane, &[1.0; 12]);
@@ -138,13 +137,11 @@ impl<T: SimdFloat> SimdActuators<T> {
             let n = &self.coefficients[joint];
             q[joint] - n.encoder_offset - n.encoder_lead * dq[joint]
         });
-        let lead = T::splat(self.lead);
-        let rotor = [std::array::from_fn(|joint| link[joint] + lead * dq[joint]), *dq];
-        self.state.rotor = rotor;
+        self.state.rotor = [link, *dq];
         self.update_command(commands, &link, dq);
         for index in 0..steps {
             self.step(index, &link, dq);
-            self.state.rotor = rotor;
+            self.state.rotor = [link, *dq];
         }
         self.state.rotor = rotors;
     }
@@ -159,7 +156,7 @@ impl<T: SimdFloat> SimdActuators<T> {
     #[inline(always)]
     pub fn encoder_reading(&self, joint: usize, q: T, dq: T) -> (T, T) {
         let (n, zero, [angle, speed]) = (&self.coefficients[joint], T::splat(0.0), &self.state.rotor);
-        let q = zero.select_lt(n.gear, angle[joint] - T::splat(self.lead) * speed[joint], q);
+        let q = zero.select_lt(n.gear, angle[joint], q);
         let dq = zero.select_lt(n.gear, speed[joint], dq);
         (q + n.encoder_offset + n.encoder_lead * dq, dq)
     }

@@ -182,7 +182,7 @@ fn spring_torque_is_proportional_to_the_distance_from_rest() {
     assert!((once(&robot, 0.0, 0.2, 0.0) - 3.0 * (0.5 - 0.2)).abs() < 1e-9);
 }
 
-/// With a fixed link, the rotor oscillates at √(k/J).
+/// With a fixed link, the rotor oscillates at √(k/J). Its damping is k dt / 8, so that the amplitude decays with k dt / (16 J).
 #[test]
 fn rotor_with_an_elastic_gear_oscillates_at_its_natural_frequency() {
     let robot = with_actuator(ActuatorParams { gear_stiffness: 300.0, ..ActuatorParams::IDEAL });
@@ -195,8 +195,12 @@ fn rotor_with_an_elastic_gear_oscillates_at_its_natural_frequency() {
     let expected = (300.0 / robot.joints[0].armature).sqrt() / std::f64::consts::TAU * 2.0;
     assert!((crossings as f64 - expected).abs() <= 1.0, "{crossings} periods in 2 s, {expected} expected");
     // Amplitude of the torque: v √(k J).
-    let amplitude = transmitted.iter().copied().fold(0.0, f64::max);
-    assert!((amplitude / (300.0 * robot.joints[0].armature).sqrt() - 1.0).abs() < 0.02, "{amplitude} N·m");
+    let amplitude = |from: usize| transmitted[from..from + 100].iter().copied().fold(0.0, f64::max);
+    let first = amplitude(0);
+    assert!((first / (300.0 * robot.joints[0].armature).sqrt() - 1.0).abs() < 0.02, "{first} N·m");
+    let decay = 300.0 * DT / (16.0 * robot.joints[0].armature);
+    let left = amplitude(500) / first;
+    assert!((left / (-0.5 * decay).exp() - 1.0).abs() < 0.05, "{left} of the amplitude after 0.5 s");
 }
 
 /// Positions of the links are those of the middle of each step, or of the sample before it.
@@ -214,6 +218,23 @@ fn rotor_moves_with_a_link_of_constant_speed() {
         let (q, dq) = actuator.encoder_reading(0, f64::NAN, f64::NAN);
         assert!((q - 100.0 * speed * DT).abs() < 1e-9 && (dq - speed).abs() < 1e-9, "{q} rad, {dq} rad/s");
     }
+}
+
+/// Inside the gap nothing holds the rotor: its reading is that of a constant acceleration.
+#[test]
+fn rotor_accelerates_freely_inside_the_backlash() {
+    let robot = with_actuator(ActuatorParams { backlash: 0.2, ..ActuatorParams::IDEAL });
+    let mut actuator = actuator(&robot);
+    let zero = [0.0; NUM_JOINTS];
+    let torque = [1.0; NUM_JOINTS];
+    actuator.set_torque(torque);
+    for index in 0..20 {
+        assert_eq!(actuator.step(index % STEPS, &zero, &zero).tau[0], 0.0);
+    }
+    let (q, dq) = actuator.encoder_reading(0, 0.0, 0.0);
+    let (time, acceleration) = (20.0 * DT, 1.0 / robot.joints[0].armature);
+    assert!((dq / (acceleration * time) - 1.0).abs() < 1e-9, "{dq} rad/s");
+    assert!((q / (0.5 * acceleration * time * time) - 1.0).abs() < 1e-3, "{q} rad");
 }
 
 #[test]
