@@ -64,7 +64,7 @@ pub fn evaluate(
         runner.run(&obs, &mut actions);
         let batch = env.step(&actions)?;
         let heights: Vec<f32> = batch.critic_obs.iter().skip(height).step_by(spec.critic_obs_len()).copied().collect();
-        let next_obs = batch.obs.to_vec();
+        let next_obs = batch.obs.clone();
         for (robot, is_up) in is_up.iter_mut().enumerate() {
             *is_up &= !batch.done(robot);
         }

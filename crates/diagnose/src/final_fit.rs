@@ -233,7 +233,7 @@ mod tests {
         let distance = |name: &str, values: Vec<f64>, halves: [f64; 3]| {
             let effect = Effect::named(name).expect("in the catalogue");
             let hypothesis = Hypothesis { effect, scope: Scope::Base, values };
-            let fit = FitProblem::new(&ModelFile::default(), &[hypothesis.clone()]).expect("a fit");
+            let fit = FitProblem::new(&ModelFile::default(), std::slice::from_ref(&hypothesis)).expect("a fit");
             let mut model = fit.model(&fit.initial_point);
             for (component, half) in halves.into_iter().enumerate().take(effect.parameters[0].count) {
                 let value = hypothesis.values[component];
