@@ -281,7 +281,7 @@ fn gaits(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<GaitRow>
     Ok(rows)
 }
 
-/// Evaluates the attitude of the base under each condition. On steps the robots start with their feet at different heights.
+/// Evaluates the attitude of the base under each condition.
 fn attitudes(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<AttitudeRow>, Failure> {
     let mut rows = Vec::new();
     for condition in args.conditions() {
