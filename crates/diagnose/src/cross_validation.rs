@@ -207,7 +207,7 @@ pub fn cross_validate(
 }
 
 /// Returns true if a hanging robot shows the effect.
-fn is_shown_in_air(hypothesis: &Hypothesis) -> bool {
+pub fn is_shown_in_air(hypothesis: &Hypothesis) -> bool {
     hypothesis.effect.target == Target::Joints && matches!(hypothesis.effect.search.whole_log_probes, Probes::None)
 }
 

@@ -45,7 +45,7 @@ impl FinalFit {
     /// Fits `accepted` on top of `model`, whose ground is fitted in `judged`, and writes their values.
     ///
     /// Causes that the other rows have made larger than they are, so that they are now too small to report, are removed. So
-    /// are those whose size is too uncertain to differ from no effect.
+    /// are those whose size is too uncertain to differ from no effect, and offsets of encoders that slip.
     pub fn new(
         model: &ModelFile,
         judged: &ModelFile,
@@ -60,6 +60,12 @@ impl FinalFit {
                 return Self { extended: model.clone(), confusable: Vec::new(), drifts: Vec::new() };
             };
             let fit = FitProblem { initial_point: point, ..fit };
+            let robot = fit.model(&fit.initial_point).robot_model().expect("fitted within its bounds");
+            let slips = |(best, _): &(CandidateFit, _)| size_drift::slips(&best.hypothesis, evidence, &robot);
+            if let Some(place) = accepted.iter().position(slips) {
+                accepted.remove(place);
+                continue;
+            }
             let intervals = Intervals::new(&fit, &all_rows, evidence, simulator);
             let distances = intervals.distances_from_no_effect(accepted, &fit);
             let least = (0..distances.len()).min_by(|one, other| distances[*one].total_cmp(&distances[*other]));

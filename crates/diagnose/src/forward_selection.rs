@@ -65,6 +65,13 @@ impl WindowedData {
     }
 }
 
+/// Scan of the catalogue on top of a model.
+pub struct Scan {
+    view: usize,
+    model: ModelFile,
+    found: Vec<ScoredHypothesis>,
+}
+
 /// State of the forward selection.
 pub struct ForwardSelection<'a> {
     /// Data in long windows, and in short ones if the given model fails to track the joints in the long ones.
@@ -78,6 +85,8 @@ pub struct ForwardSelection<'a> {
     pub model: ModelFile,
     /// Scan's scores of hypotheses by name when a fit did not support them [nat].
     pub unsupported: BTreeMap<String, f64>,
+    /// Last scan without causes.
+    pub scan_without_causes: Option<Scan>,
     /// Gains of the joints that are in [`ForwardSelection::baseline`], if they differ.
     pub joint_gains: Option<JointGains>,
     pub simulator: &'a mut dyn Rollout,
@@ -198,13 +207,28 @@ impl<'a> ForwardSelection<'a> {
         let left = evidence.residual_power(self.simulator, &self.model.robot_model()?);
         let named = self.accepted.len();
         (self.progress)(&format!("scanning the catalogue; causes: {named}"))?;
-        for candidates in candidates(scan(evidence, &self.model, self.simulator), evidence.is_dynamic) {
+        for candidates in candidates(self.scanned(), evidence.is_dynamic) {
             let found = self.best_of(candidates, excluded, &left)?;
             if found.is_some() {
                 return Ok(found);
             }
         }
         Ok(None)
+    }
+
+    /// Scans the catalogue on top of the model. The search returns to the model without causes whenever it eliminates the only
+    /// one; that scan is kept.
+    fn scanned(&mut self) -> Vec<ScoredHypothesis> {
+        let evidence = &self.looked_at().evidence;
+        let is_known = |known: &Scan| known.view == self.view && known.model == self.model;
+        if let Some(known) = self.scan_without_causes.as_ref().filter(|known| is_known(known)) {
+            return known.found.clone();
+        }
+        let found = scan(evidence, &self.model, self.simulator);
+        if self.accepted.is_empty() {
+            self.scan_without_causes = Some(Scan { view: self.view, model: self.model.clone(), found: found.clone() });
+        }
+        found
     }
 
     /// Returns the best of `candidates` on top of the model with residual power `left`, with its alternatives, if it reaches
@@ -241,7 +265,7 @@ impl<'a> ForwardSelection<'a> {
             trials.extend(self.evaluate(alike, excluded, left)?);
             trials.sort_by(best_first);
             let now = trials[0].hypothesis.clone();
-            if now.scope != best.scope {
+            if now.name() != best.name() {
                 let tried = self.tried(&trials, excluded);
                 let parts = on_parts(evidence, &self.model, &now, &tried, self.simulator);
                 trials.extend(self.evaluate(parts, excluded, left)?);

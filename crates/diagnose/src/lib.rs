@@ -20,7 +20,8 @@
 //! - [`size_drift`]: causes whose size differs between the two halves of the rows.
 //! - [`discrimination`], [`experiment_design`]: choose an experiment that discriminates between ambiguous causes.
 //! - [`true_law`]: how evident a known effect is in a log.
-//! - [`unexplained`]: describes the unexplained residual; [`spectral_line`]: its strongest frequency.
+//! - [`unexplained`]: describes the unexplained residual; [`explained_variance`]: how much of it depends on a variable;
+//!   [`spectral_line`]: its strongest frequency.
 //!
 //! Joints that are not a Go2's are diagnosed by their torques only: [`torque_only`], with [`joint_slots`] and
 //! [`torque_fit`].
@@ -38,6 +39,7 @@ mod data_split;
 mod discrimination;
 mod excitation;
 mod experiment_design;
+mod explained_variance;
 mod final_fit;
 mod findings;
 mod forward_selection;
@@ -151,6 +153,7 @@ pub fn diagnose(
         accepted: Accepted::new(),
         model: judged.clone(),
         unsupported: BTreeMap::new(),
+        scan_without_causes: None,
         joint_gains: None,
         simulator,
         progress: &mut say,
@@ -191,10 +194,16 @@ pub fn diagnose(
         next_experiment: next.as_ref().map(|next| next.summary.clone()),
         extended_model: String::new(),
     };
-    let rows = |(log, split): (&Log, &DataSplit)| (0..log.rows()).map(|row| split.is_held_out(row)).collect();
-    let held_out = evidence.logs().iter().zip(evidence.splits()).map(rows).collect();
+    let held_out = evidence.logs().iter().map(held_out_rows).collect();
     let lacks_torque = left.shows_missing_torque(unexplained::LEAST_EXCESS);
     Ok(DiagnosisOutput { diagnosis, extended, before_last_fit, lacks_torque, held_out, next })
+}
+
+/// Returns for each row of a log whether it takes no part in the selections and fits of [`diagnose`], which measures its
+/// errors on these rows.
+pub fn held_out_rows(log: &Log) -> Vec<bool> {
+    let split = DataSplit::new(log);
+    (0..log.rows()).map(|row| split.is_held_out(row)).collect()
 }
 
 /// Residuals of logs in windows of all lengths that are needed, and the models with which they are computed.

@@ -302,7 +302,8 @@ fn has_torque(log: &Log) -> bool {
     log.joints().iter().any(|joint| log.tau_measured(joint).is_some())
 }
 
-fn variance(values: &[f64]) -> f64 {
+/// Returns the variance of the finite values.
+pub fn variance(values: &[f64]) -> f64 {
     let finite = || values.iter().filter(|value| value.is_finite());
     let count = finite().count().max(1) as f64;
     let mean = finite().sum::<f64>() / count;

@@ -7,7 +7,7 @@ use twinstep_effects::Target;
 use twinstep_model::{NUM_JOINTS, Precision, RobotModel, Rollout};
 
 use super::data_split::DataSplit;
-use super::residual_power::{DYNAMIC, GYRO_AT_REST, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
+use super::residual_power::{CHANNELS, DYNAMIC, GYRO_AT_REST, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
 use twinstep_identify::experiment::{Experiment, Regime, ResidualChannel};
 use twinstep_identify::least_squares::append;
 use twinstep_identify::nuisance::NuisanceModel;
@@ -194,6 +194,20 @@ impl ResidualRows {
                 }
             }
         }
+    }
+
+    /// Returns the residuals of the first log in the two folds after elimination of the nuisance parameters, by channel and
+    /// row, in units of noise and model error; NaN where there is none.
+    pub fn tables(&self, simulator: &mut dyn Rollout, robot: &RobotModel, rows: usize) -> Vec<Vec<f64>> {
+        let mut tables = vec![vec![f64::NAN; rows]; CHANNELS];
+        let corrected = self.nuisance_corrected(simulator, std::slice::from_ref(robot)).remove(0);
+        let index = self.experiments[0].residual_index();
+        for (((_, row), residual), (channel, fold, weight)) in index.zip(corrected).zip(&self.cells) {
+            if fold.is_some() {
+                tables[*channel][row] = residual * weight;
+            }
+        }
+        tables
     }
 
     fn residual_power(&self, mut residuals: Vec<f64>) -> ResidualPower {

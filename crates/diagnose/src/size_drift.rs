@@ -2,13 +2,17 @@
 //!
 //! At the joint fit the model is linear. All causes are fitted to the positions in the first and in the second half of the rows
 //! with a fixed base, which have other motions: a chirp becomes faster, a motor becomes warm. Rows on the ground are left
-//! out, because errors of contact differ between any two motions.
+//! out, because errors of contact differ between any two motions. An encoder offset, which only the ground shows, is compared by the
+//! heights of the feet in the two halves of the rows in which the robot stands.
 
 use nalgebra::{DMatrix, DVector};
+use twinstep_effects::{Scope, Target};
 use twinstep_identify::least_squares::{LeastSquaresProblem, Linearisation};
-use twinstep_model::Rollout;
+use twinstep_identify::{FootHeights, OffsetChange};
+use twinstep_model::{RobotModel, Rollout};
 
-use super::cross_validation::FitProblem;
+use super::cross_validation::{FitProblem, is_shown_in_air};
+use super::hypothesis::Hypothesis;
 use super::reporting::SIMULATOR_MISMATCH_REL_STD;
 use super::residual_data::ResidualData;
 use super::residual_rows::PRECISION;
@@ -39,6 +43,16 @@ pub fn drifting_values(
         Some((0..fit.unknowns.len()).map(|index| drifting_value(fit, index, &halves)).collect())
     });
     found.unwrap_or_else(|| vec![None; fit.unknowns.len()])
+}
+
+/// Returns true if an encoder offset of one joint drifts: the encoder slips, which is another law.
+pub fn slips(hypothesis: &Hypothesis, evidence: &ResidualData, robot: &RobotModel) -> bool {
+    let Scope::Joint(joint) = hypothesis.scope else { return false };
+    let is_offset = hypothesis.effect.target == Target::Joints && !is_shown_in_air(hypothesis);
+    let drifts = |change: OffsetChange| {
+        change.value.abs() > EVIDENT * change.std && change.value.abs() > RELATIVE * hypothesis.values[0].abs()
+    };
+    is_offset && evidence.logs().iter().filter_map(|log| FootHeights::new(log, robot).offset_change(joint)).any(drifts)
 }
 
 /// Returns the values of a free parameter in both halves if they differ.
@@ -79,11 +93,10 @@ fn half_fit(
 
 #[cfg(test)]
 mod tests {
-    use twinstep_effects::{Effect, ModelFile, Scope};
+    use twinstep_effects::{Effect, ModelFile};
     use twinstep_model::Joint;
 
     use super::*;
-    use crate::hypothesis::Hypothesis;
     use crate::test_data::{Linear, data};
 
     fn drift(viscous: impl Fn(usize) -> f64) -> Option<[f64; 2]> {

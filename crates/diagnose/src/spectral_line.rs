@@ -15,30 +15,49 @@ pub fn spectral_line(t: &[f64], values: &[f64], folds: &[usize]) -> Option<(f64,
     let length = t.last()? - t.first()?;
     // Four frequencies per line width.
     let step = 0.25 / length.max(1.0);
-    let count = ((high - low) / step) as usize;
-    let tried = (0..count).map(|index| low + step * index as f64);
-    let shares = tried.map(|frequency| (frequency, share(t, values, folds, frequency)));
+    let mut waves = vec![Wave::default(); ((high - low) / step) as usize];
+    let (mut power, mean) = ([0.0; 2], values.iter().sum::<f64>() / values.len().max(1) as f64);
+    for ((t, value), fold) in t.iter().zip(values).zip(folds) {
+        power[*fold] += (value - mean).powi(2);
+        // The phase of one row grows by the same angle from frequency to frequency.
+        let (mut sine, mut cosine) = (TAU * low * t).sin_cos();
+        let (turn_sine, turn_cosine) = (TAU * step * t).sin_cos();
+        for wave in &mut waves {
+            wave.add(*fold, [sine, cosine], value - mean);
+            (sine, cosine) = (sine * turn_cosine + cosine * turn_sine, cosine * turn_cosine - sine * turn_sine);
+        }
+    }
+    let shares = waves.iter().enumerate().map(|(index, wave)| (low + step * index as f64, wave.share(power)));
     shares.max_by(|one, other| one.1.total_cmp(&other.1))
 }
 
-fn share(t: &[f64], values: &[f64], folds: &[usize], frequency: f64) -> f64 {
-    let (mut normal, mut moment) = ([Matrix2::zeros(); 2], [Vector2::zeros(); 2]);
-    let (mut power, mut count) = ([0.0; 2], [0.0; 2]);
-    let mean = values.iter().sum::<f64>() / values.len().max(1) as f64;
-    for ((t, value), fold) in t.iter().zip(values).zip(folds) {
-        let (sine, cosine) = (TAU * frequency * t).sin_cos();
-        let wave = Vector2::new(sine, cosine);
-        normal[*fold] += wave * wave.transpose();
-        moment[*fold] += wave * (value - mean);
-        power[*fold] += (value - mean).powi(2);
-        count[*fold] += 1.0;
+/// Sums of a sine and cosine of one frequency, by fold.
+#[derive(Clone, Copy, Default)]
+struct Wave {
+    /// Sums of sin², sin·cos and cos².
+    normal: [[f64; 3]; 2],
+    /// Products with the values.
+    moment: [[f64; 2]; 2],
+}
+
+impl Wave {
+    fn add(&mut self, fold: usize, [sine, cosine]: [f64; 2], value: f64) {
+        let (normal, moment) = (&mut self.normal[fold], &mut self.moment[fold]);
+        *normal = [normal[0] + sine * sine, normal[1] + sine * cosine, normal[2] + cosine * cosine];
+        *moment = [moment[0] + sine * value, moment[1] + cosine * value];
     }
-    // |v − w·a|² = |v|² − 2 a·m + a·N a, with a from the other fold.
-    let rest = |fold: usize| {
-        let fitted = normal[1 - fold].cholesky().map_or(Vector2::zeros(), |factor| factor.solve(&moment[1 - fold]));
-        power[fold] - 2.0 * fitted.dot(&moment[fold]) + fitted.dot(&(normal[fold] * fitted))
-    };
-    1.0 - (rest(0) + rest(1)) / (power[0] + power[1]).max(1e-30)
+
+    /// Returns the fraction of the values' power that amplitudes from the other fold explain.
+    fn share(&self, power: [f64; 2]) -> f64 {
+        let normal = self.normal.map(|[a, b, c]| Matrix2::new(a, b, b, c));
+        let moment = self.moment.map(Vector2::from);
+        // |v − w·a|² = |v|² − 2 a·m + a·N a, with a from the other fold.
+        let rest = |fold: usize| {
+            let fitted = normal[1 - fold].cholesky().map_or(Vector2::zeros(), |factor| factor.solve(&moment[1 - fold]));
+            power[fold] - 2.0 * fitted.dot(&moment[fold]) + fitted.dot(&(normal[fold] * fitted))
+        };
+        1.0 - (rest(0) + rest(1)) / (power[0] + power[1]).max(1e-30)
+    }
 }
 
 #[cfg(test)]

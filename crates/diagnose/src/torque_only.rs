@@ -258,7 +258,7 @@ fn left(slots: &JointSlots, [given, named]: [&RobotModel; 2], log: &Log) -> Unex
     let Some(seat) = worst.filter(|seat| share(*seat) > LEAST_EXCESS) else { return unexplained::only_noise() };
     let fraction = if before > 0.0 { (after / before).min(1.0) } else { 0.0 };
     let whose = format!("The torque of {}", slots.name(seat));
-    unexplained::describe_residual(log, &slots.residual(named, seat), unexplained::measured(log), fraction, &whose)
+    unexplained::describe_residual(log, &slots.residual(named, seat), &unexplained::measured(log), fraction, &whose)
 }
 
 #[cfg(test)]

@@ -1,24 +1,33 @@
-//! Unexplained residual: the worst channel, and what its residual depends on.
+//! Unexplained residual: the one that depends most clearly on a variable, and which variable that is.
 
+use rayon::prelude::*;
+use twinstep_identify::FootHeights;
 use twinstep_logs::Log;
-use twinstep_model::{JOINT_NAMES, RobotModel, Rollout};
+use twinstep_model::{JOINT_NAMES, Leg, RobotModel, Rollout};
 
 use super::data_split::DataSplit;
-use super::residual_data::ResidualData;
-use super::residual_power::{ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
+use super::explained_variance::r_squared;
+use super::residual_data::{ResidualData, torque_sigma, variance};
+use super::residual_power::{GYRO, GYRO_AT_REST, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
 use super::spectral_line::spectral_line;
 use crate::findings::Unexplained;
-use twinstep_identify::experiment::{Experiment, Regime, ResidualChannel};
 use twinstep_logs::replay::{JointCommands, command, joint_commands};
 
-/// Number of bins of a variable that may explain a residual.
-const BINS: usize = 12;
 /// Cross-validated R² from which a variable is reported.
 const MIN_R_SQUARED: f64 = 0.3;
 /// Power above noise from which an unexplained residual is reported [noise variance].
 pub const LEAST_EXCESS: f64 = 0.3;
+/// Change of the height of a standing foot that contact explains [m].
+const HEIGHT_STD_M: f64 = 0.002;
+/// Number of torques, and of other channels, that are examined: those with the largest power above noise.
+const EXAMINED: usize = 6;
+/// Number of variables that are reported, the strongest first.
+const REPORTED: usize = 3;
 
 /// Describes the unexplained residual of `robot`, relative to the residual power `given` of the given model.
+///
+/// It is that of a channel with power above noise, or the height of a standing foot, whatever a variable explains with the
+/// largest log-likelihood gain.
 pub fn unexplained(
     evidence: &ResidualData,
     robot: &RobotModel,
@@ -28,43 +37,119 @@ pub fn unexplained(
 ) -> Unexplained {
     let (before, after) = (given.power_above_noise(), left.power_above_noise());
     let fraction = if before > 0.0 { (after / before).min(1.0) } else { 0.0 };
-    let count = |channel: usize| left.counts[channel].iter().sum::<f64>();
-    let worst = (0..TRUNK)
-        .chain(STANCE..WRENCH)
-        .filter(|channel| count(*channel) > 0.0)
-        .max_by(|one, other| {
-            let of = |channel: usize| left.channel_excess(channel) / count(channel);
-            of(*one).total_cmp(&of(*other))
-        })
-        .filter(|channel| left.channel_excess(*channel) > LEAST_EXCESS * count(*channel));
-    let Some(channel) = worst else { return only_noise() };
+    let channels = largest_excesses(left);
     let log = &evidence.logs()[0];
-    let residual = residual(evidence, robot, channel, simulator);
-    let kind = if (TORQUE..TRUNK).contains(&channel) { "torque" } else { "position" };
-    let whose = format!("The {kind} of {}", JOINT_NAMES[channel % 12]);
-    describe_residual(log, &residual, variables(log, robot), fraction, &whose)
+    let worst = channels.first().copied();
+    let residuals = if worst.is_some() { residuals(evidence, robot, simulator) } else { Vec::new() };
+    let of_channel = |channel: usize| (channel_name(channel), residuals[channel].clone(), channel);
+    let mut shown: Vec<(String, Vec<f64>, usize)> = channels.into_iter().map(of_channel).collect();
+    shown.extend(heights_of_feet(log, robot).map(|(name, heights)| (name, heights, STANCE)));
+    let (split, variables) = (&evidence.splits()[0], variables(log, robot));
+    let dependence = |(name, residual, channel): (String, Vec<f64>, usize)| {
+        let rows = residual.iter().filter(|value| value.is_finite()).count() as f64;
+        let independent = rows / evidence.correlation_rows(channel);
+        Dependence { name, independent, variables: dependences(log, split, &residual, &variables) }
+    };
+    match (clearest(shown.into_par_iter().map(dependence).collect()), worst) {
+        (Some(found), _) => described(found.variables, fraction, &found.name),
+        (None, Some(worst)) => described(Vec::new(), fraction, &channel_name(worst)),
+        (None, None) => only_noise(),
+    }
+}
+
+/// Returns the torques and the other channels with the largest power above noise, the largest first.
+///
+/// What a simulator cannot follow, such as contact, does not hide what torques on measured states show.
+fn largest_excesses(left: &ResidualPower) -> Vec<usize> {
+    let count = |channel: usize| left.counts[channel].iter().sum::<f64>();
+    let excess = |channel: &usize| left.channel_excess(*channel) / count(*channel);
+    let mut channels: Vec<usize> =
+        (0..GYRO_AT_REST).filter(|channel| count(*channel) > 0.0 && excess(channel) > LEAST_EXCESS).collect();
+    channels.sort_by(|one, other| excess(other).total_cmp(&excess(one)));
+    let is_torque = |channel: &usize| (TORQUE..TRUNK).contains(channel);
+    let torques = channels.iter().filter(|channel| is_torque(channel)).take(EXAMINED);
+    let others = channels.iter().filter(|channel| !is_torque(channel)).take(EXAMINED);
+    let chosen: Vec<usize> = torques.chain(others).copied().collect();
+    channels.retain(|channel| chosen.contains(channel));
+    channels
+}
+
+/// What a residual depends on.
+#[derive(Debug)]
+struct Dependence {
+    /// Name of the residual, as the start of a sentence.
+    name: String,
+    /// Number of its rows, divided by their correlation length.
+    independent: f64,
+    /// Variables with the fraction of the variance that they explain, the strongest first.
+    variables: Vec<(f64, String)>,
+}
+
+/// Returns the residual that a variable explains with the largest log-likelihood gain, if a variable explains any.
+fn clearest(all: Vec<Dependence>) -> Option<Dependence> {
+    let gain = |one: &Dependence| one.variables.first().map(|(share, _)| -0.5 * one.independent * (1.0 - share).ln());
+    let gains = all.into_iter().filter_map(|one| Some((gain(&one)?, one)));
+    gains.max_by(|(one, _), (other, _)| one.total_cmp(other)).map(|(_, dependence)| dependence)
+}
+
+/// Returns the heights of the feet of a standing robot [m] that change by more than contact lets them, with their names.
+fn heights_of_feet(log: &Log, robot: &RobotModel) -> impl Iterator<Item = (String, Vec<f64>)> {
+    let heights = FootHeights::new(log, robot);
+    let feet = Leg::ALL.into_iter().map(move |leg| (leg, heights.table(leg as usize, log.rows())));
+    let changing = feet.filter(|(_, heights)| variance(heights) > HEIGHT_STD_M * HEIGHT_STD_M);
+    changing.map(|(leg, heights)| (format!("The height of the foot {leg:?}"), heights))
+}
+
+/// Returns the name of a channel of a Go2, as the start of a sentence.
+fn channel_name(channel: usize) -> String {
+    let axis = ["x", "y", "z"][channel % 3];
+    match channel {
+        TORQUE..TRUNK => format!("The torque of {}", JOINT_NAMES[channel - TORQUE]),
+        TRUNK..GYRO => {
+            let quantity = ["position", "orientation", "velocity"][(channel - TRUNK) / 3];
+            format!("The {quantity} of the base ({axis})")
+        }
+        GYRO..STANCE => format!("The angular velocity of the base ({axis})"),
+        WRENCH..GYRO_AT_REST => {
+            format!("The {} on the base ({axis})", if channel < WRENCH + 3 { "force" } else { "moment" })
+        }
+        _ => format!("The position of {}", JOINT_NAMES[channel % 12]),
+    }
 }
 
 /// Describes what a residual of a log depends on. The text starts with `whose`.
 pub fn describe_residual(
     log: &Log,
     residual: &[f64],
-    variables: Vec<(String, Vec<f64>)>,
+    variables: &[(String, Vec<f64>)],
     fraction: f64,
     whose: &str,
 ) -> Unexplained {
-    let split = DataSplit::new(log);
+    described(dependences(log, &DataSplit::new(log), residual, variables), fraction, whose)
+}
+
+/// Returns what explains a residual, with the explained fraction of its variance, the strongest first.
+fn dependences(log: &Log, split: &DataSplit, residual: &[f64], variables: &[(String, Vec<f64>)]) -> Vec<(f64, String)> {
+    let line = line_of(log, split, residual);
     let mut found: Vec<(f64, String)> = variables
-        .into_iter()
-        .map(|(name, cells)| (binned_r_squared(&split, residual, &cells), name))
-        .chain(
-            line_of(log, &split, residual)
-                .map(|(frequency, share)| (share, format!("a spectral line at {frequency:.2} Hz"))),
-        )
+        .iter()
+        .map(|(name, cells)| (r_squared(split, residual, cells), name.clone()))
+        .chain(line.map(|(frequency, share)| (share, format!("a spectral line at {frequency:.2} Hz"))))
         .filter(|(share, _)| *share > MIN_R_SQUARED)
         .collect();
     found.sort_by(|one, other| other.0.total_cmp(&one.0));
-    found.truncate(3);
+    // All motors become warm together.
+    let mut temperatures = 0;
+    found.retain(|(_, name)| {
+        temperatures += usize::from(name.starts_with("temp_"));
+        temperatures < 2 || !name.starts_with("temp_")
+    });
+    found.truncate(REPORTED);
+    found
+}
+
+/// Describes a residual that these variables explain.
+fn described(found: Vec<(f64, String)>, fraction: f64, whose: &str) -> Unexplained {
     let dependence = found.first().map_or("it depends on none of the channels".to_owned(), |(share, variable)| {
         format!("{:.0} % of its variance is explained by {variable}", 100.0 * share)
     });
@@ -77,11 +162,16 @@ pub fn only_noise() -> Unexplained {
     Unexplained { fraction: 0.0, depends_on: Vec::new(), text: "The residual is noise.".to_owned() }
 }
 
-/// Returns the measured channels of a log, and time.
+/// Returns the measured channels of a log, the position errors `q_error_<joint>` of its joints, and time.
 pub fn measured(log: &Log) -> Vec<(String, Vec<f64>)> {
     let starts = ["q_", "dq_", "tau_measured_", "battery_V", "temp_"];
     let measured = log.channels().filter(|(name, _)| starts.iter().any(|start| name.starts_with(start)));
     let mut all: Vec<(String, Vec<f64>)> = measured.map(|(name, cells)| (name.to_owned(), cells.to_vec())).collect();
+    let errors = log.joints().iter().filter_map(|joint| {
+        let errors = log.q_cmd(joint)?.iter().zip(log.q(joint)?).map(|(to, q)| to - q);
+        Some((format!("q_error_{joint}"), errors.collect()))
+    });
+    all.extend(errors);
     all.push(("t".to_owned(), log.t().to_vec()));
     all
 }
@@ -96,30 +186,15 @@ fn line_of(log: &Log, split: &DataSplit, residual: &[f64]) -> Option<(f64, f64)>
     spectral_line(&t, &values, &folds)
 }
 
-/// Returns the residual of a joint's position or torque, by row of the first log; NaN if it was not measured.
-fn residual(evidence: &ResidualData, robot: &RobotModel, channel: usize, simulator: &mut dyn Rollout) -> Vec<f64> {
+/// Returns the residuals of the first log by channel and row, in units of noise and model error; NaN where there is none.
+fn residuals(evidence: &ResidualData, robot: &RobotModel, simulator: &mut dyn Rollout) -> Vec<Vec<f64>> {
     let log = &evidence.logs()[0];
-    let mut residual = vec![f64::NAN; log.rows()];
-    if (TORQUE..TRUNK).contains(&channel) {
-        let each = |joint: usize, row: usize, difference: f64| {
-            if TORQUE + joint == channel {
-                residual[row] = difference;
-            }
-        };
-        evidence.torques().differences(robot, each);
-    } else {
-        let corrected = evidence.fit_rows.nuisance_corrected(simulator, std::slice::from_ref(robot)).remove(0);
-        let experiment = &evidence.fit_rows.experiments[0];
-        let (joint, regime) =
-            if channel < STANCE { (channel, Regime::Fixed) } else { (channel - STANCE, Regime::Floating) };
-        let cells = experiment.residual_index().zip(experiment.groups());
-        for (corrected, ((quantity, row), group)) in corrected.into_iter().zip(cells) {
-            if quantity == ResidualChannel::Position(joint) && Experiment::regime(group) == regime {
-                residual[row] = corrected;
-            }
-        }
-    }
-    residual
+    let mut residuals = evidence.fit_rows.tables(simulator, robot, log.rows());
+    let sigma = torque_sigma(log, robot);
+    evidence.torques().differences(robot, |joint, row, difference| {
+        residuals[TORQUE + joint][row] = difference / sigma[joint];
+    });
+    residuals
 }
 
 /// Returns the variables that may explain a residual: measured channels and commanded torques of all joints, and time.
@@ -144,38 +219,6 @@ fn wanted_torques(log: &Log, robot: &RobotModel) -> Vec<(String, Vec<f64>)> {
         Some((format!("tau_cmd_{name}"), (0..log.rows()).map(wanted).collect()))
     };
     joints.iter().filter_map(of).collect()
-}
-
-/// Returns the R² of binned means: bins of `cells`, means from one fold, evaluated on the other.
-fn binned_r_squared(split: &DataSplit, residual: &[f64], cells: &[f64]) -> f64 {
-    let rows: Vec<usize> =
-        (0..residual.len()).filter(|row| residual[*row].is_finite() && cells[*row].is_finite()).collect();
-    if rows.len() < 10 * BINS {
-        return 0.0;
-    }
-    let mut sorted: Vec<f64> = rows.iter().map(|row| cells[*row]).collect();
-    sorted.sort_by(f64::total_cmp);
-    let bin = |value: f64| {
-        let below = sorted.partition_point(|other| *other < value);
-        (below * BINS / sorted.len()).min(BINS - 1)
-    };
-    let (mut rest, mut total) = (0.0, 0.0);
-    for fold in [0, 1] {
-        let (mut sums, mut counts) = ([0.0; BINS], [0.0; BINS]);
-        let of_fold = |fold: usize| rows.iter().copied().filter(move |row| split.fold(*row) == Some(fold));
-        for row in of_fold(fold) {
-            sums[bin(cells[row])] += residual[row];
-            counts[bin(cells[row])] += 1.0;
-        }
-        let mean = sums.iter().sum::<f64>() / counts.iter().sum::<f64>().max(1.0);
-        for row in of_fold(1 - fold) {
-            let bin = bin(cells[row]);
-            let expected = if counts[bin] > 0.0 { sums[bin] / counts[bin] } else { mean };
-            rest += (residual[row] - expected).powi(2);
-            total += (residual[row] - mean).powi(2);
-        }
-    }
-    if total > 0.0 { 1.0 - rest / total } else { 0.0 }
 }
 
 #[cfg(test)]
@@ -208,7 +251,7 @@ mod tests {
     fn described(residual: impl Fn(f64) -> f64) -> Unexplained {
         let log = log();
         let residual: Vec<f64> = log.t().iter().map(|t| residual(*t)).collect();
-        describe_residual(&log, &residual, measured(&log), 0.5, "The position")
+        describe_residual(&log, &residual, &measured(&log), 0.5, "The position")
     }
 
     #[test]
@@ -229,5 +272,22 @@ mod tests {
         let unexplained = described(|t| ((t * 200.0) as usize * 7919 % 1009) as f64 / 1009.0 - 0.5);
         assert!(unexplained.depends_on.is_empty(), "{unexplained:?}");
         assert!(unexplained.text.contains("depends on none"), "{}", unexplained.text);
+    }
+
+    #[test]
+    fn residual_of_which_a_variable_explains_most_is_described() {
+        let dependence = |name: &str, independent: f64, shares: &[f64]| Dependence {
+            name: name.to_owned(),
+            independent,
+            variables: shares.iter().map(|share| (*share, "t".to_owned())).collect(),
+        };
+        let chosen = |all: Vec<Dependence>| clearest(all).map(|one| one.name);
+        let all = || vec![dependence("position", 90.0, &[0.4]), dependence("height", 30.0, &[0.9, 0.4])];
+        assert_eq!(chosen(all()), Some("height".to_owned()), "23 nat for 35");
+        assert_eq!(chosen(vec![dependence("position", 90.0, &[])]), None);
+        assert_eq!(channel_name(14), "The torque of FL_calf");
+        assert_eq!(channel_name(STANCE + 3), "The position of FR_hip");
+        assert_eq!(channel_name(WRENCH + 4), "The moment on the base (y)");
+        assert_eq!(channel_name(TRUNK + 5), "The orientation of the base (z)");
     }
 }

@@ -93,9 +93,9 @@ pub struct CaseResult {
     outside: Option<UnmodelledEffect>,
     #[serde(default)]
     mismatch: Option<Mismatch>,
-    /// Errors of the given model on the log.
+    /// Errors of the given model on the rows that diagnosis holds out.
     nominal: RmsErrors,
-    /// Errors of the true model on the log.
+    /// Errors of the true model on these rows.
     truth: RmsErrors,
     verdict: Score,
     /// Error message of a failed diagnosis.

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Child, ExitStatus};
 use std::time::{Duration, Instant};
 
-use twinstep_diagnose::{Diagnosis, RmsErrors, true_law_gain};
+use twinstep_diagnose::{Diagnosis, RmsErrors, held_out_rows, true_law_gain};
 use twinstep_effects::ModelFile;
 use twinstep_identify::{RecordError, evaluate};
 use twinstep_logs::Log;
@@ -60,8 +60,9 @@ impl BlindTest<'_> {
         // Written after the diagnosis, so that it cannot have read the file.
         let truth = folder.join("truth.toml");
         std::fs::write(&truth, case.truth().to_toml()).map_err(at(&truth))?;
+        let held_out = held_out_rows(&log);
         let mut errors = |robot: &RobotModel| {
-            let found = evaluate(&log, robot, &mut self.simulator, |_| true).map_err(failed)?;
+            let found = evaluate(&log, robot, &mut self.simulator, |row| held_out[row]).map_err(failed)?;
             Ok(RmsErrors { torque_rmse_nm: found.torque_rmse_nm, q_rmse_rad: found.q_rmse_rad })
         };
         let nominal = errors(&go2())?;

@@ -26,7 +26,7 @@ pub struct Score {
     pub wrong_names: usize,
     /// For an effect outside the catalogue: true if the report states what its residual depends on.
     pub depends_on: Option<bool>,
-    /// Error reductions on held-out blocks, divided by those of the true model on the log.
+    /// Error reductions on held-out blocks, divided by those of the true model.
     pub removed: ErrorReduction,
 }
 
@@ -86,7 +86,7 @@ pub struct ErrorReduction {
     pub motion: Option<f64>,
 }
 
-/// Scores `diagnosis` on `case`. `nominal` and `truth` are the errors of the given and of the true model on the log, `gains`
+/// Scores `diagnosis` on `case`. `nominal` and `truth` are the errors of the given and of the true model on its held-out blocks, `gains`
 /// the log-likelihood gains of the true laws of the hidden effects [nat].
 ///
 /// A failed diagnosis has reported no cause.

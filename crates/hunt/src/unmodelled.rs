@@ -58,7 +58,7 @@ impl UnmodelledEffect {
         let of = |joint: usize, quantities: &[&str]| {
             quantities.iter().any(|quantity| text == format!("{quantity}_{}", Joint::ALL[joint].name()))
         };
-        let all = ["q", "dq", "q_cmd", "dq_cmd", "tau", "tau_measured", "tau_cmd"];
+        let all = ["q", "dq", "q_cmd", "dq_cmd", "q_error", "tau", "tau_measured", "tau_cmd"];
         match self {
             UnmodelledEffect::CrossTalk { from, .. } => of(from, &all),
             UnmodelledEffect::OneWayFriction { joint, .. } | UnmodelledEffect::HardeningGain { joint, .. } => {

@@ -27,6 +27,7 @@ mod error;
 mod estimates;
 pub mod evaluate;
 pub mod experiment;
+mod foot_heights;
 mod global_search;
 pub mod identify;
 mod inverse_dynamics;
@@ -54,6 +55,7 @@ pub use error::ExperimentError;
 pub use estimates::{CorrelatedPairs, EstimateStatus, ParameterEstimate};
 pub use evaluate::{Evaluation, JointEvaluation, evaluate, position_errors};
 pub use experiment::{Experiment, SimulatedPose};
+pub use foot_heights::{FootHeights, OffsetChange};
 pub use global_search::GlobalSearch;
 pub use identify::{
     Identification, IdentifyError, IdentifyOptions, IdentifyProgress, Stage, identify, predicted_information,
