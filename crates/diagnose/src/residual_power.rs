@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use twinstep_effects::Target;
-use twinstep_model::NUM_JOINTS;
+use twinstep_model::{JOINT_NAMES, NUM_JOINTS};
 
 use twinstep_identify::nuisance;
 
@@ -29,6 +29,23 @@ pub const GYRO_AT_REST: usize = WRENCH + 6;
 /// First channel of a robot that walks or jumps: joint positions, then base position, orientation, velocity and angular
 /// velocity.
 pub const DYNAMIC: usize = GYRO_AT_REST + 3;
+
+/// Returns the name of a channel of a Go2, as the start of a sentence.
+pub fn channel_name(channel: usize) -> String {
+    let axis = ["x", "y", "z"][channel % 3];
+    match channel {
+        TORQUE..TRUNK => format!("The torque of {}", JOINT_NAMES[channel - TORQUE]),
+        TRUNK..GYRO => {
+            let quantity = ["position", "orientation", "velocity"][(channel - TRUNK) / 3];
+            format!("The {quantity} of the base ({axis})")
+        }
+        GYRO..STANCE => format!("The angular velocity of the base ({axis})"),
+        WRENCH..GYRO_AT_REST => {
+            format!("The {} on the base ({axis})", if channel < WRENCH + 3 { "force" } else { "moment" })
+        }
+        _ => format!("The position of {}", JOINT_NAMES[channel % 12]),
+    }
+}
 
 /// Returns the channels that are evidence about effects on these targets.
 pub fn evident_channels(targets: impl IntoIterator<Item = Target>) -> Range<usize> {
@@ -122,5 +139,18 @@ impl ResidualPower {
     pub fn channel_excess(&self, channel: usize) -> f64 {
         let sum: f64 = self.sums[channel].iter().sum();
         (sum - self.counts[channel].iter().sum::<f64>()).max(0.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn channels_have_the_names_of_their_quantities() {
+        assert_eq!(channel_name(14), "The torque of FL_calf");
+        assert_eq!(channel_name(STANCE + 3), "The position of FR_hip");
+        assert_eq!(channel_name(WRENCH + 4), "The moment on the base (y)");
+        assert_eq!(channel_name(TRUNK + 5), "The orientation of the base (z)");
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! At the joint fit the model is linear. All causes are fitted to the positions in the first and in the second half of the rows
 //! with a fixed base, which have other motions: a chirp becomes faster, a motor becomes warm. Rows on the ground are left
-//! out, because errors of contact differ between any two motions. An encoder offset, which only the ground shows, is compared by the
+//! out, because errors of contact differ between any two motions. An encoder offset, which the ground shows, is compared by the
 //! heights of the feet in the two halves of the rows in which the robot stands.
 
 use nalgebra::{DMatrix, DVector};
@@ -45,7 +45,7 @@ pub fn drifting_values(
     found.unwrap_or_else(|| vec![None; fit.unknowns.len()])
 }
 
-/// Returns true if an encoder offset of one joint drifts: the encoder slips, which is another law.
+/// Returns true if an encoder offset of one joint drifts: the encoder slips, which is another law. `robot` has the fitted offset.
 pub fn slips(hypothesis: &Hypothesis, evidence: &ResidualData, robot: &RobotModel) -> bool {
     let Scope::Joint(joint) = hypothesis.scope else { return false };
     let is_offset = hypothesis.effect.target == Target::Joints && !is_shown_in_air(hypothesis);
@@ -97,7 +97,7 @@ mod tests {
     use twinstep_model::Joint;
 
     use super::*;
-    use crate::test_data::{Linear, data};
+    use crate::test_data::{Linear, data, standing};
 
     fn drift(viscous: impl Fn(usize) -> f64) -> Option<[f64; 2]> {
         let data = data(viscous, None);
@@ -113,5 +113,19 @@ mod tests {
         assert_eq!(drift(|_| 0.3), None);
         let [first, second] = drift(|row| if row < 1600 { 0.2 } else { 0.4 }).expect("it drifts");
         assert!((first - 0.2).abs() < 0.02 && (second - 0.4).abs() < 0.02, "{first}, {second}");
+    }
+
+    #[test]
+    fn offset_of_an_encoder_that_slips_drifts_and_a_constant_one_does_not() {
+        let slips = |name: &str, value: f64, offset: &dyn Fn(f64) -> f64| {
+            let effect = Effect::named(name).expect("in the catalogue");
+            let hypothesis = Hypothesis { effect, scope: Scope::Joint(Joint::ALL[2]), values: vec![value] };
+            let fit = FitProblem::new(&ModelFile::default(), std::slice::from_ref(&hypothesis)).expect("a fit");
+            let robot = fit.model(&fit.initial_point).robot_model().expect("a robot");
+            super::slips(&hypothesis, &standing(offset), &robot)
+        };
+        assert!(slips("encoder_offset", 0.04, &|t| 0.002 * t));
+        assert!(!slips("encoder_offset", 0.04, &|_| 0.04));
+        assert!(!slips("viscous_friction", 0.04, &|t| 0.002 * t), "another law");
     }
 }

@@ -7,12 +7,18 @@ use nalgebra::{Matrix2, Vector2};
 /// Range of frequencies [Hz].
 const FREQUENCIES_HZ: [f64; 2] = [0.5, 25.0];
 
+/// Time from the first value on in which a line is looked for [s]. The number of frequencies and that of rows both grow with it.
+const LONGEST_S: f64 = 60.0;
+
 /// Returns the frequency [Hz] of the sine that explains most of `values` at times `t` [s], and the explained fraction.
 ///
 /// The sine is fitted to one fold and evaluated on the other. Returns `None` without values.
 pub fn spectral_line(t: &[f64], values: &[f64], folds: &[usize]) -> Option<(f64, f64)> {
     let [low, high] = FREQUENCIES_HZ;
-    let length = t.last()? - t.first()?;
+    let start = *t.first()?;
+    let count = t.partition_point(|t| *t <= start + LONGEST_S);
+    let (t, values, folds) = (&t[..count], &values[..count], &folds[..count]);
+    let length = t.last()? - start;
     // Four frequencies per line width.
     let step = 0.25 / length.max(1.0);
     let mut waves = vec![Wave::default(); ((high - low) / step) as usize];

@@ -181,3 +181,25 @@ pub fn data_at_rest(bias: [f64; 3], hangs: bool) -> ResidualData {
     let log = Log::new(meta, columns).expect("a log");
     ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
 }
+
+/// Returns the data of a robot that stands for 40 s, whose left front calf has this encoder offset [rad] at each time [s].
+pub fn standing(offset: impl Fn(f64) -> f64) -> ResidualData {
+    const ROWS: usize = 8000;
+    let column = |name: String, of: &dyn Fn(f64) -> f64| {
+        (name, (0..ROWS).map(|row| of(row as f64 / 200.0)).collect::<Vec<f64>>())
+    };
+    let mut columns = vec![column("t".to_owned(), &|t| t)];
+    let zeros = ["quat_x", "quat_y", "quat_z", "vel_x"].map(|name| (name, 0.0));
+    for (name, value) in [("kp", 25.0), ("kd", 0.6), ("quat_w", 1.0), ("pos_z", 0.3)].into_iter().chain(zeros) {
+        columns.push(column(name.to_owned(), &|_| value));
+    }
+    for (joint, name) in JOINT_NAMES.into_iter().enumerate() {
+        let pose = go2().control.default_pose[joint];
+        columns.push(column(format!("q_{name}"), &|t| pose + if name == "FL_calf" { offset(t) } else { 0.0 }));
+        columns.push(column(format!("q_cmd_{name}"), &|_| pose));
+        columns.push(column(format!("dq_{name}"), &|_| 0.0));
+    }
+    let segments = vec![Segment { name: "stance".to_owned(), base: BaseMount::Floating }];
+    let log = Log::new(Meta::new(200.0, TorqueSensor::None, segments), columns).expect("a log");
+    ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
+}

@@ -8,7 +8,7 @@ use twinstep_model::{JOINT_NAMES, Leg, RobotModel, Rollout};
 use super::data_split::DataSplit;
 use super::explained_variance::r_squared;
 use super::residual_data::{ResidualData, torque_sigma, variance};
-use super::residual_power::{GYRO, GYRO_AT_REST, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
+use super::residual_power::{GYRO_AT_REST, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH, channel_name};
 use super::spectral_line::spectral_line;
 use crate::findings::Unexplained;
 use twinstep_logs::replay::{JointCommands, command, joint_commands};
@@ -17,17 +17,22 @@ use twinstep_logs::replay::{JointCommands, command, joint_commands};
 const MIN_R_SQUARED: f64 = 0.3;
 /// Power above noise from which an unexplained residual is reported [noise variance].
 pub const LEAST_EXCESS: f64 = 0.3;
-/// Change of the height of a standing foot that contact explains [m].
-const HEIGHT_STD_M: f64 = 0.002;
+/// Standard deviation of the height of a standing foot that contact explains [m].
+const HEIGHT_STD_M: f64 = 0.001;
+/// Least log-likelihood gain of a variable that is reported, beside the logarithm of the number of variables and residuals that are
+/// tried [nat].
+const LEAST_GAIN: f64 = 5.0;
 /// Number of torques, and of other channels, that are examined: those with the largest power above noise.
 const EXAMINED: usize = 6;
 /// Number of variables that are reported, the strongest first.
 const REPORTED: usize = 3;
+/// Start of the name of a spectral line.
+const LINE: &str = "a spectral line at";
 
 /// Describes the unexplained residual of `robot`, relative to the residual power `given` of the given model.
 ///
-/// It is that of a channel with power above noise, or the height of a standing foot, whatever a variable explains with the
-/// largest log-likelihood gain.
+/// It is that of a channel with power above noise, or the height of a standing foot, in the first log: whatever a variable explains
+/// with the largest log-likelihood gain.
 pub fn unexplained(
     evidence: &ResidualData,
     robot: &RobotModel,
@@ -37,23 +42,53 @@ pub fn unexplained(
 ) -> Unexplained {
     let (before, after) = (given.power_above_noise(), left.power_above_noise());
     let fraction = if before > 0.0 { (after / before).min(1.0) } else { 0.0 };
+    let (log, split) = (&evidence.logs()[0], &evidence.splits()[0]);
     let channels = largest_excesses(left);
-    let log = &evidence.logs()[0];
-    let worst = channels.first().copied();
-    let residuals = if worst.is_some() { residuals(evidence, robot, simulator) } else { Vec::new() };
-    let of_channel = |channel: usize| (channel_name(channel), residuals[channel].clone(), channel);
-    let mut shown: Vec<(String, Vec<f64>, usize)> = channels.into_iter().map(of_channel).collect();
-    shown.extend(heights_of_feet(log, robot).map(|(name, heights)| (name, heights, STANCE)));
-    let (split, variables) = (&evidence.splits()[0], variables(log, robot));
-    let dependence = |(name, residual, channel): (String, Vec<f64>, usize)| {
-        let rows = residual.iter().filter(|value| value.is_finite()).count() as f64;
-        let independent = rows / evidence.correlation_rows(channel);
-        Dependence { name, independent, variables: dependences(log, split, &residual, &variables) }
+    let worst = channels.first().map(|channel| channel_name(*channel));
+    let mut residuals = heights_of_feet(evidence, robot);
+    if worst.is_some() {
+        let tables = residuals_of_channels(evidence, robot, simulator);
+        residuals.extend(channels.into_iter().map(|channel| Residual::of_channel(evidence, channel, &tables[channel])));
+    }
+    let variables = variables(log, robot);
+    let least = LEAST_GAIN + ((residuals.len() * variables.len()).max(1) as f64).ln();
+    let dependence = |mut residual: Residual| {
+        // Held-out rows are no evidence.
+        let out = residual.values.iter_mut().enumerate().filter(|(row, _)| split.fold(*row).is_none());
+        out.for_each(|(_, value)| *value = f64::NAN);
+        let rows = residual.values.iter().filter(|value| value.is_finite()).count() as f64;
+        let mut found = dependences(log, split, &residual.values, &variables);
+        found.retain(|(_, name)| residual.own_error.as_ref() != Some(name));
+        Dependence { name: residual.name, independent: rows / residual.correlation_rows, variables: found }
     };
-    match (clearest(shown.into_par_iter().map(dependence).collect()), worst) {
+    match (clearest(residuals.into_par_iter().map(dependence).collect(), least), worst) {
         (Some(found), _) => described(found.variables, fraction, &found.name),
-        (None, Some(worst)) => described(Vec::new(), fraction, &channel_name(worst)),
+        (None, Some(worst)) => described(Vec::new(), fraction, &worst),
         (None, None) => only_noise(),
+    }
+}
+
+/// Residual in the first log.
+struct Residual {
+    /// Its name, as the start of a sentence.
+    name: String,
+    /// Values by row; NaN where there is none.
+    values: Vec<f64>,
+    /// Correlation length [rows].
+    correlation_rows: f64,
+    /// Position error of the same joint, which the residual of its position resembles whatever moves it.
+    own_error: Option<String>,
+}
+
+impl Residual {
+    fn of_channel(evidence: &ResidualData, channel: usize, values: &[f64]) -> Self {
+        let is_position = channel < TORQUE || (STANCE..WRENCH).contains(&channel);
+        Self {
+            name: channel_name(channel),
+            values: values.to_vec(),
+            correlation_rows: evidence.correlation_rows(channel),
+            own_error: is_position.then(|| format!("q_error_{}", JOINT_NAMES[channel % 12])),
+        }
     }
 }
 
@@ -85,36 +120,26 @@ struct Dependence {
     variables: Vec<(f64, String)>,
 }
 
-/// Returns the residual that a variable explains with the largest log-likelihood gain, if a variable explains any.
-fn clearest(all: Vec<Dependence>) -> Option<Dependence> {
+/// Returns the residual that a variable explains with the largest log-likelihood gain, if that is at least `least` [nat].
+fn clearest(all: Vec<Dependence>, least: f64) -> Option<Dependence> {
     let gain = |one: &Dependence| one.variables.first().map(|(share, _)| -0.5 * one.independent * (1.0 - share).ln());
-    let gains = all.into_iter().filter_map(|one| Some((gain(&one)?, one)));
+    let gains = all.into_iter().filter_map(|one| Some((gain(&one)?, one))).filter(|(gain, _)| *gain >= least);
     gains.max_by(|(one, _), (other, _)| one.total_cmp(other)).map(|(_, dependence)| dependence)
 }
 
-/// Returns the heights of the feet of a standing robot [m] that change by more than contact lets them, with their names.
-fn heights_of_feet(log: &Log, robot: &RobotModel) -> impl Iterator<Item = (String, Vec<f64>)> {
+/// Returns the heights of the feet of a standing robot [m] that change by more than contact lets them.
+fn heights_of_feet(evidence: &ResidualData, robot: &RobotModel) -> Vec<Residual> {
+    let log = &evidence.logs()[0];
     let heights = FootHeights::new(log, robot);
-    let feet = Leg::ALL.into_iter().map(move |leg| (leg, heights.table(leg as usize, log.rows())));
+    let feet = Leg::ALL.into_iter().map(|leg| (leg, heights.table(leg as usize, log.rows())));
     let changing = feet.filter(|(_, heights)| variance(heights) > HEIGHT_STD_M * HEIGHT_STD_M);
-    changing.map(|(leg, heights)| (format!("The height of the foot {leg:?}"), heights))
-}
-
-/// Returns the name of a channel of a Go2, as the start of a sentence.
-fn channel_name(channel: usize) -> String {
-    let axis = ["x", "y", "z"][channel % 3];
-    match channel {
-        TORQUE..TRUNK => format!("The torque of {}", JOINT_NAMES[channel - TORQUE]),
-        TRUNK..GYRO => {
-            let quantity = ["position", "orientation", "velocity"][(channel - TRUNK) / 3];
-            format!("The {quantity} of the base ({axis})")
-        }
-        GYRO..STANCE => format!("The angular velocity of the base ({axis})"),
-        WRENCH..GYRO_AT_REST => {
-            format!("The {} on the base ({axis})", if channel < WRENCH + 3 { "force" } else { "moment" })
-        }
-        _ => format!("The position of {}", JOINT_NAMES[channel % 12]),
-    }
+    let residual = |(leg, values): (Leg, Vec<f64>)| Residual {
+        name: format!("The height of the foot {}", leg.name()),
+        values,
+        correlation_rows: evidence.correlation_rows(STANCE),
+        own_error: None,
+    };
+    changing.map(residual).collect()
 }
 
 /// Describes what a residual of a log depends on. The text starts with `whose`.
@@ -130,11 +155,11 @@ pub fn describe_residual(
 
 /// Returns what explains a residual, with the explained fraction of its variance, the strongest first.
 fn dependences(log: &Log, split: &DataSplit, residual: &[f64], variables: &[(String, Vec<f64>)]) -> Vec<(f64, String)> {
-    let line = line_of(log, split, residual);
+    let line = line_of(log, split, residual).map(|(frequency, share)| (share, format!("{LINE} {frequency:.2} Hz")));
     let mut found: Vec<(f64, String)> = variables
         .iter()
         .map(|(name, cells)| (r_squared(split, residual, cells), name.clone()))
-        .chain(line.map(|(frequency, share)| (share, format!("a spectral line at {frequency:.2} Hz"))))
+        .chain(line)
         .filter(|(share, _)| *share > MIN_R_SQUARED)
         .collect();
     found.sort_by(|one, other| other.0.total_cmp(&one.0));
@@ -144,6 +169,10 @@ fn dependences(log: &Log, split: &DataSplit, residual: &[f64], variables: &[(Str
         temperatures += usize::from(name.starts_with("temp_"));
         temperatures < 2 || !name.starts_with("temp_")
     });
+    // Variables of the joint itself follow whatever moves it. A line names a cause that they do not.
+    if let Some(place) = found.iter().position(|(_, name)| name.starts_with(LINE)).filter(|place| *place >= REPORTED) {
+        found.swap(place, REPORTED - 1);
+    }
     found.truncate(REPORTED);
     found
 }
@@ -153,7 +182,7 @@ fn described(found: Vec<(f64, String)>, fraction: f64, whose: &str) -> Unexplain
     let dependence = found.first().map_or("it depends on none of the channels".to_owned(), |(share, variable)| {
         format!("{:.0} % of its variance is explained by {variable}", 100.0 * share)
     });
-    let text = format!("{whose} has a residual above noise that no cause explains: {dependence}.");
+    let text = format!("{whose} differs from the model by more than noise, and no cause explains it: {dependence}.");
     Unexplained { fraction, depends_on: found.into_iter().map(|(_, name)| name).collect(), text }
 }
 
@@ -187,7 +216,7 @@ fn line_of(log: &Log, split: &DataSplit, residual: &[f64]) -> Option<(f64, f64)>
 }
 
 /// Returns the residuals of the first log by channel and row, in units of noise and model error; NaN where there is none.
-fn residuals(evidence: &ResidualData, robot: &RobotModel, simulator: &mut dyn Rollout) -> Vec<Vec<f64>> {
+fn residuals_of_channels(evidence: &ResidualData, robot: &RobotModel, simulator: &mut dyn Rollout) -> Vec<Vec<f64>> {
     let log = &evidence.logs()[0];
     let mut residuals = evidence.fit_rows.tables(simulator, robot, log.rows());
     let sigma = torque_sigma(log, robot);
@@ -281,13 +310,10 @@ mod tests {
             independent,
             variables: shares.iter().map(|share| (*share, "t".to_owned())).collect(),
         };
-        let chosen = |all: Vec<Dependence>| clearest(all).map(|one| one.name);
+        let chosen = |all: Vec<Dependence>| clearest(all, 12.0).map(|one| one.name);
         let all = || vec![dependence("position", 90.0, &[0.4]), dependence("height", 30.0, &[0.9, 0.4])];
         assert_eq!(chosen(all()), Some("height".to_owned()), "23 nat for 35");
         assert_eq!(chosen(vec![dependence("position", 90.0, &[])]), None);
-        assert_eq!(channel_name(14), "The torque of FL_calf");
-        assert_eq!(channel_name(STANCE + 3), "The position of FR_hip");
-        assert_eq!(channel_name(WRENCH + 4), "The moment on the base (y)");
-        assert_eq!(channel_name(TRUNK + 5), "The orientation of the base (z)");
+        assert_eq!(chosen(vec![dependence("position", 9.0, &[0.9])]), None, "10 nat");
     }
 }

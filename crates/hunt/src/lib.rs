@@ -111,7 +111,10 @@ pub enum HuntError {
     #[error("{} has a blind test already\n  continue it with --resume, or choose another --out", .0.display())]
     Exists(PathBuf),
     /// A line of `cases.jsonl` is not a result.
-    #[error("{}:{line}: {cause}", path.display())]
+    #[error(
+        "{}:{line}: not a result of this program: {cause}\n  delete the line to run its case again, or choose another --out",
+        path.display()
+    )]
     Line {
         /// The file.
         path: PathBuf,

@@ -42,8 +42,9 @@ struct Args {
     #[arg(long, value_delimiter = ',', default_value = "walk,jump")]
     tasks: Vec<String>,
     /// Methods: vanilla, heavy, spi, truth, and spi- with random or a criterion, such as spi-d-optimal. `truth` learns on
-    /// the hidden robot, in the batch engine. Two learn on models that are identified from the logs of spi-random: `gradient`
-    /// by gradient steps alone, `ours` with further effects among the unknowns.
+    /// the hidden robot, in the batch engine. Four learn on models that are identified from the logs of spi-random: `gradient`
+    /// by gradient steps alone, `ours` with further effects among the unknowns, `one-gain` and `one-tanh` with another motor
+    /// model in place of a saturation for each joint type: one gain, or one saturation, for all joints.
     #[arg(
         long,
         value_delimiter = ',',
@@ -103,6 +104,9 @@ const OURS: [&str; 15] = [
     "load_friction@all",
 ];
 
+/// Methods whose models are identified from the logs of `spi-random`.
+const FROM_RANDOM_LOGS: [&str; 4] = ["gradient", "ours", "one-gain", "one-tanh"];
+
 const TASKS: [Task; 4] = [
     Task {
         name: "walk",
@@ -143,10 +147,13 @@ fn main() -> ExitCode {
 }
 
 fn campaign(args: &Args) -> Step<String> {
+    if args.set == EffectSet::B && args.methods.iter().any(|method| method == "one-gain" || method == "one-tanh") {
+        return Err("--methods: one-gain and one-tanh replace the saturations of set a; set b has none".to_owned());
+    }
     for seed in (args.first..args.first + args.robots).filter(|_| !args.table) {
         let robot = Robot::new(args, seed)?;
         robot.collect()?;
-        ["gradient", "ours"].into_iter().try_for_each(|method| robot.identify(method))?;
+        FROM_RANDOM_LOGS.into_iter().try_for_each(|method| robot.identify(method))?;
         for task in TASKS.iter().filter(|task| args.tasks.iter().any(|name| name == task.name)) {
             let start = Resumable::new(&args.out)?.nominal(task.name)?;
             if task.has_start() {
@@ -183,28 +190,48 @@ impl<'a> Robot<'a> {
         missing.iter().try_for_each(|method| self.hidden.identify(method, collection, self.seed, &endpoint))
     }
 
-    /// Identifies the robot from both logs of random commands, unless the model of the method is there.
-    ///
-    /// `gradient` has the unknowns of the other methods, and gradient steps from the ideal Go2 without CMA-ES; `ours` has all
-    /// effects of [`OURS`], too.
+    /// Identifies the robot from both logs of random commands, unless the model of the method is there, and evaluates the model on
+    /// the held-out log.
     fn identify(&self, method: &str) -> Step {
-        let Some(model) = self.model(method).filter(|model| self.trains(method) && !model.exists()) else {
-            return Ok(());
-        };
-        let logs = ["1-random", "2-random"].map(|stage| self.commands().path("random").join(stage).join("log"));
-        let partial = model.with_extension("partial.toml");
-        let [one, other, out] = [&logs[0], &logs[1], &partial].map(|path| path.display().to_string());
-        let mut effects = self.args.set.unknowns();
-        let own: &[&str] = if method == "ours" { &OURS } else { &[] };
-        effects.extend(own.iter().filter(|effect| !self.args.set.unknowns().contains(effect)));
-        let (effects, seed) = (effects.join(","), self.seed.to_string());
-        let mut options = vec!["--effects", &effects, "--seed", &seed, "--out", &out];
-        if method == "gradient" {
-            options.extend(["--generations", "0"]);
+        let Some(model) = self.model(method).filter(|_| self.trains(method)) else { return Ok(()) };
+        if !model.exists() {
+            let logs = ["1-random", "2-random"].map(|stage| self.commands().path("random").join(stage).join("log"));
+            let partial = model.with_extension("partial.toml");
+            let [one, other, out] = [&logs[0], &logs[1], &partial].map(|path| path.display().to_string());
+            let (effects, seed) = (self.unknowns(method).join(","), self.seed.to_string());
+            let mut options = vec!["--effects", &effects, "--seed", &seed, "--out", &out];
+            if method == "gradient" {
+                options.extend(["--generations", "0"]);
+            }
+            let _ = std::fs::remove_file(&partial);
+            self.commands().run(&[&["identify", &one, &other][..], &options].concat())?;
+            std::fs::rename(partial, &model).map_err(text)?;
         }
-        let _ = std::fs::remove_file(&partial);
-        self.commands().run(&[&["identify", &one, &other][..], &options].concat())?;
-        std::fs::rename(partial, model).map_err(text)
+        let errors = self.commands().path(&format!("{method}-held-out.json"));
+        if errors.exists() {
+            return Ok(());
+        }
+        let log = self.commands().path("random/held-out/log");
+        let [model, log] = [model, log].map(|path| path.display().to_string());
+        std::fs::write(errors, self.commands().run(&["evaluate", &log, "--model", &model, "--json"])?).map_err(text)
+    }
+
+    /// Returns the effects that a method of [`FROM_RANDOM_LOGS`] identifies. `gradient` differs from `spi-random` in the search alone.
+    fn unknowns(&self, method: &str) -> Vec<&'static str> {
+        let mut effects = self.args.set.unknowns();
+        let motor = match method {
+            "one-gain" => Some("torque_gain@all"),
+            "one-tanh" => Some("torque_saturation@all"),
+            _ => None,
+        };
+        if let Some(motor) = motor {
+            effects.retain(|effect| !effect.starts_with("torque_saturation"));
+            effects.push(motor);
+        }
+        if method == "ours" {
+            effects.extend(OURS.iter().filter(|effect| !self.args.set.unknowns().contains(effect)));
+        }
+        effects
     }
 
     /// Returns true if a method is compared.
@@ -240,7 +267,7 @@ impl<'a> Robot<'a> {
             "spi" => "random/1-random/model.toml".to_owned(),
             "spi-random" => "random/2-random/model.toml".to_owned(),
             "truth" => "hidden.toml".to_owned(),
-            "gradient" | "ours" => format!("{method}.toml"),
+            _ if FROM_RANDOM_LOGS.contains(&method) => format!("{method}.toml"),
             _ => format!("{}/2-active/model.toml", method.strip_prefix("spi-")?),
         };
         Some(self.commands().path(&path))

@@ -6,7 +6,7 @@ use std::path::Path;
 use twinstep_effects::ModelFile;
 use twinstep_tests::resumable::{Step, number, read};
 
-use crate::{Args, TASKS, Task};
+use crate::{Args, FROM_RANDOM_LOGS, TASKS, Task};
 
 /// Two-sided 95 % quantile of Student's distribution by degrees of freedom, from 1.
 const T_95: [f64; 9] = [12.71, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262];
@@ -63,6 +63,12 @@ fn identification(args: &Args, seed: u64, text: &mut String) -> Step {
             let _ = writeln!(text, "| {seed} | {name} | {seconds} | {:+.2} % | {rmse} | {falls} |", 100.0 * mass);
         }
     }
+    let identified = FROM_RANDOM_LOGS.iter().filter(|method| args.methods.iter().any(|one| one == *method));
+    for method in identified.filter(|method| exists(args, seed, &format!("{method}-held-out.json"))) {
+        let mass = trunk_kg(&folder.join(format!("{method}.toml")))? / truth - 1.0;
+        let rmse = read(&folder.join(format!("{method}-held-out.json")))?["q_rmse_rad"].as_f64().unwrap_or(f64::NAN);
+        let _ = writeln!(text, "| {seed} | random, {method} | | {:+.2} % | {rmse:.4} | |", 100.0 * mass);
+    }
     Ok(())
 }
 
@@ -82,7 +88,8 @@ fn downstream(args: &Args, task: &Task, seeds: &[u64], text: &mut String) -> Ste
         };
         seeds.iter().map(of).collect()
     };
-    let (vanilla, random) = (errors("vanilla")?, errors("spi-random")?);
+    let compared = |method: &str| args.methods.iter().any(|other| other == method).then(|| errors(method)).transpose();
+    let (vanilla, random) = (compared("vanilla")?, compared("spi-random")?);
     let _ = writeln!(
         text,
         "\n{}: {}, on {} robots\n\n| method | mean | by robot | did not fall | minus vanilla | minus spi-random |\n\
@@ -95,8 +102,11 @@ fn downstream(args: &Args, task: &Task, seeds: &[u64], text: &mut String) -> Ste
         let found = errors(method)?;
         let cells: Vec<String> = found.iter().map(|[error, _]| format!("{error:.4}")).collect();
         let up = mean(found.iter().map(|[_, up]| *up));
-        let minus = |other: &[[f64; 2]]| {
-            interval(&found.iter().zip(other).map(|(one, other)| one[0] - other[0]).collect::<Vec<_>>())
+        let minus = |other: &Option<Vec<[f64; 2]>>| {
+            let differences = |other: &Vec<[f64; 2]>| {
+                found.iter().zip(other).map(|(one, other)| one[0] - other[0]).collect::<Vec<_>>()
+            };
+            other.as_ref().map_or("–".to_owned(), |other| interval(&differences(other)))
         };
         let _ = writeln!(
             text,
