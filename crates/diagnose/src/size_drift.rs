@@ -117,15 +117,15 @@ mod tests {
 
     #[test]
     fn offset_of_an_encoder_that_slips_drifts_and_a_constant_one_does_not() {
-        let slips = |name: &str, value: f64, offset: &dyn Fn(f64) -> f64| {
+        let is_slip = |name: &str, value: f64, offset: &dyn Fn(f64) -> f64| {
             let effect = Effect::named(name).expect("in the catalogue");
             let hypothesis = Hypothesis { effect, scope: Scope::Joint(Joint::ALL[2]), values: vec![value] };
             let fit = FitProblem::new(&ModelFile::default(), std::slice::from_ref(&hypothesis)).expect("a fit");
             let robot = fit.model(&fit.initial_point).robot_model().expect("a robot");
-            super::slips(&hypothesis, &standing(offset), &robot)
+            slips(&hypothesis, &standing(offset), &robot)
         };
-        assert!(slips("encoder_offset", 0.04, &|t| 0.002 * t));
-        assert!(!slips("encoder_offset", 0.04, &|_| 0.04));
-        assert!(!slips("viscous_friction", 0.04, &|t| 0.002 * t), "another law");
+        assert!(is_slip("encoder_offset", 0.04, &|t| 0.002 * t));
+        assert!(!is_slip("encoder_offset", 0.04, &|_| 0.04));
+        assert!(!is_slip("viscous_friction", 0.04, &|t| 0.002 * t), "another law");
     }
 }
