@@ -18,7 +18,7 @@ use crate::exit::{CommandResult, Failure, Signals, input, other};
 ///
 /// --suite selects other cases: healthy robots with eight families of errors, in logs of three lengths; walking robots
 /// without motion capture, with a payload of a tenth of the trunk's mass, Coulomb friction or a delay; effects with
-/// confounders in logs without torques.
+/// confounders in logs without torques; effects outside the catalogue.
 ///
 /// With --plant mujoco the robot runs in MuJoCo, with actuators by equations of their own. It hangs, stands, sways, trots
 /// and hops for a minute. Of 24 cases, 10 hide one effect of half its range or more, 6 one of a fifth, 4 four effects, and 4
@@ -77,6 +77,8 @@ enum SuiteName {
     Walking,
     /// One effect with confounders, positions only.
     Confusable,
+    /// One effect outside the catalogue.
+    Unmodelled,
 }
 
 /// Runs all cases and prints the table.
@@ -99,6 +101,7 @@ pub fn run(args: &Args) -> CommandResult {
         SuiteName::Healthy => Suite::Healthy,
         SuiteName::Walking => Suite::Walking,
         SuiteName::Confusable => Suite::Confusable,
+        SuiteName::Unmodelled => Suite::Unmodelled,
     };
     let (cases, seed, out, resume) = (args.cases, args.seed, args.out.clone(), args.resume);
     let config = HuntConfig { plant, suite, cases, seed, out, resume };

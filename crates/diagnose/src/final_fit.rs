@@ -18,7 +18,7 @@ use super::hypothesis::Hypothesis;
 use super::reporting::TWO_SIDED_95;
 use super::residual_data::ResidualData;
 use super::residual_rows::ResidualRows;
-use super::{joint_fit, profile_likelihood, reporting, size_drift, unreported_effects};
+use super::{joint_fit, law_shape, profile_likelihood, reporting, size_drift, unreported_effects};
 
 /// Least distance of the size of a cause on joints from no effect, in standard errors.
 ///
@@ -39,13 +39,16 @@ pub struct FinalFit {
     pub confusable: Vec<CorrelatedPair>,
     /// Values of the first parameter of each cause in the two halves of the rows, if it drifts.
     pub drifts: Vec<Option<[f64; 2]>>,
+    /// Sentences about causes that are another law than the one of the catalogue that resembles it most.
+    pub other_laws: String,
 }
 
 impl FinalFit {
     /// Fits `accepted` on top of `model`, whose ground is fitted in `judged`, and writes their values.
     ///
     /// Causes that the other rows have made larger than they are, so that they are now too small to report, are removed. So
-    /// are those whose size is too uncertain to differ from no effect, and offsets of encoders that slip.
+    /// are those whose size is too uncertain to differ from no effect, offsets of encoders that slip, and causes whose size
+    /// depends on the state of the joint.
     pub fn new(
         model: &ModelFile,
         judged: &ModelFile,
@@ -53,11 +56,12 @@ impl FinalFit {
         evidence: &ResidualData,
         simulator: &mut dyn Rollout,
     ) -> Self {
+        let (mut other_laws, mut removed) = (String::new(), Vec::new());
         let (fit, (extended, confusable)) = loop {
             let fitted = fit_to_all_rows(judged, accepted, evidence, simulator);
             let fit = joint_fit(model, accepted);
             let (Some((point, all_rows)), Some(fit)) = (fitted, fit) else {
-                return Self { extended: model.clone(), confusable: Vec::new(), drifts: Vec::new() };
+                return Self { extended: model.clone(), confusable: Vec::new(), drifts: Vec::new(), other_laws };
             };
             let fit = FitProblem { initial_point: point, ..fit };
             let robot = fit.model(&fit.initial_point).robot_model().expect("fitted within its bounds");
@@ -69,8 +73,17 @@ impl FinalFit {
             let intervals = Intervals::new(&fit, &all_rows, evidence, simulator);
             let distances = intervals.distances_from_no_effect(accepted, &fit);
             let least = (0..distances.len()).min_by(|one, other| distances[*one].total_cmp(&distances[*other]));
-            match least.filter(|place| distances[*place] < 1.0) {
-                Some(place) => drop(accepted.remove(place)),
+            if let Some(place) = least.filter(|place| distances[*place] < 1.0) {
+                accepted.remove(place);
+                continue;
+            }
+            let hypotheses: Vec<&Hypothesis> = accepted.iter().map(|(best, _)| &best.hypothesis).collect();
+            match law_shape::clearest_contradiction(&hypotheses, &removed, &fit, evidence, simulator) {
+                Some((place, contradiction)) => {
+                    other_laws += &contradiction.sentence(hypotheses[place]);
+                    removed.push(hypotheses[place].scope);
+                    accepted.remove(place);
+                }
                 None => break (fit, intervals.of_laws),
             }
         };
@@ -81,7 +94,7 @@ impl FinalFit {
             first += best.hypothesis.values.len();
             own
         });
-        Self { extended, confusable, drifts: drifts.collect() }
+        Self { extended, confusable, drifts: drifts.collect(), other_laws }
     }
 }
 
@@ -184,6 +197,11 @@ mod tests {
     /// Returns the values of viscous friction that the final fit reports for a joint with this friction in each block
     /// [N·m·s/rad].
     fn reported(viscous: impl Fn(usize) -> f64) -> Vec<f64> {
+        fitted(viscous).0
+    }
+
+    /// Also returns the sentences about other laws.
+    fn fitted(viscous: impl Fn(usize) -> f64) -> (Vec<f64>, String) {
         let effect = Effect::named("viscous_friction").expect("in the catalogue");
         let hypothesis = Hypothesis { effect, scope: Scope::Joint(Joint::ALL[0]), values: vec![0.1] };
         let found = CandidateFit { hypothesis, score: 50.0, gain: 0.5, explained_fraction: 1.0, threshold: 10.0 };
@@ -191,7 +209,7 @@ mod tests {
         let fit = FinalFit::new(&model, &model, &mut accepted, &data(viscous, None), &mut Linear);
         assert_eq!(fit.extended.effects.len(), accepted.len());
         assert_eq!(fit.drifts.len(), accepted.len());
-        accepted.iter().map(|(best, _)| best.hypothesis.values[0]).collect()
+        (accepted.iter().map(|(best, _)| best.hypothesis.values[0]).collect(), fit.other_laws)
     }
 
     /// The minimum size is 0.06 N·m·s/rad.
@@ -200,6 +218,17 @@ mod tests {
         let [value] = reported(|_| 0.1)[..] else { panic!("it is reported") };
         assert!((value - 0.1).abs() < 0.01, "{value}");
         assert!(reported(|_| 0.03).is_empty());
+    }
+
+    #[test]
+    fn friction_in_one_direction_only_is_not_reported_and_a_sentence_says_why() {
+        let is_forward = |row: usize| row > 0 && (0.11 * ((row - 1) % 400 + 1) as f64).cos() > 0.0;
+        let (values, other_laws) = fitted(|row| if is_forward(row) { 0.6 } else { 0.0 });
+        assert!(
+            values.is_empty() && other_laws.starts_with(" viscous_friction@FL_hip is not reported"),
+            "{other_laws}"
+        );
+        assert_eq!(fitted(|_| 0.3).1, "");
     }
 
     #[test]

@@ -17,6 +17,8 @@
 //! - [`null_distribution`]: the threshold of the evidence, from the log itself.
 //! - [`profile_likelihood`]: restarts from other local minima, and profile-likelihood intervals.
 //! - [`final_fit`]: the fit to all rows, with intervals; [`unreported_effects`]: what causes too small to be reported add to them.
+//! - [`law_shape`]: causes whose size depends on the state of the joint, which are another law; [`joint_samples`]: residuals by
+//!   that state.
 //! - [`size_drift`]: causes whose size differs between the two halves of the rows.
 //! - [`discrimination`], [`experiment_design`]: choose an experiment that discriminates between ambiguous causes.
 //! - [`true_law`]: how evident a known effect is in a log.
@@ -46,7 +48,9 @@ mod forward_selection;
 mod friction_family;
 mod hypothesis;
 mod joint_gains;
+mod joint_samples;
 mod joint_slots;
+mod law_shape;
 mod null_distribution;
 mod profile_likelihood;
 mod reporting;
@@ -168,7 +172,8 @@ pub fn diagnose(
     refitted(&judged, &mut accepted, evidence, simulator);
     let mut before_last = accepted.clone();
     say("computing intervals")?;
-    let FinalFit { extended, confusable, drifts } = FinalFit::new(model, &judged, &mut accepted, evidence, simulator);
+    let FinalFit { extended, confusable, drifts, other_laws } =
+        FinalFit::new(model, &judged, &mut accepted, evidence, simulator);
     if accepted.len() < before_last.len() {
         let is_cause = |name: String| accepted.iter().any(|(cause, _)| cause.hypothesis.name() == name);
         before_last.retain(|(cause, _)| is_cause(cause.hypothesis.name()));
@@ -182,6 +187,8 @@ pub fn diagnose(
     let next = experiment_design::next_motion(&pairs, evidence, &robot, simulator);
     let causes =
         accepted.iter().zip(drifts).map(|((best, others), drifts)| cause(best, others, drifts, &extended)).collect();
+    let mut unexplained = unexplained::unexplained(evidence, &extended.robot_model()?, given, &left, simulator);
+    unexplained.text += &other_laws;
     let diagnosis = Diagnosis {
         baseline: errors(evidence, &robot, simulator)?,
         extended: errors_of_fit,
@@ -189,7 +196,7 @@ pub fn diagnose(
         findings: causes,
         joint_gains: joint_gains.map_or(BTreeMap::new(), |gains| gains.by_joint()),
         confusable,
-        unexplained: unexplained::unexplained(evidence, &extended.robot_model()?, given, &left, simulator),
+        unexplained,
         learned_residual: None,
         next_experiment: next.as_ref().map(|next| next.summary.clone()),
         extended_model: String::new(),

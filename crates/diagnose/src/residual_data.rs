@@ -244,6 +244,11 @@ impl ResidualData {
         (INDEPENDENT_S[kind] * self.max_rate_hz()).max(1.0)
     }
 
+    /// Returns the measured torques of each log.
+    pub fn measured_torques(&self) -> &[MeasuredTorque] {
+        &self.torques
+    }
+
     /// Returns the measured torques of the first log.
     pub fn torques(&self) -> &MeasuredTorque {
         &self.torques[0]

@@ -140,6 +140,17 @@ impl ResidualRows {
         [first, second].map(|half| half.into_iter().map(|(residual, _)| residual).collect())
     }
 
+    /// Returns the residuals of joint positions with a fixed base, outside held-out blocks: number of the residual, log, joint
+    /// and row.
+    pub fn positions_in_air(&self) -> Vec<(usize, usize, usize, usize)> {
+        let experiments = self.experiments.iter().enumerate();
+        let rows =
+            experiments.flat_map(|(log, experiment)| experiment.residual_index().map(move |(_, row)| (log, row)));
+        let cells = self.cells.iter().zip(rows).enumerate();
+        let shown = cells.filter(|(_, ((channel, fold, _), _))| fold.is_some() && *channel < TORQUE);
+        shown.map(|(residual, ((channel, ..), (log, row)))| (residual, log, *channel, row)).collect()
+    }
+
     /// Returns the standard deviation of noise and model error of a joint's position [rad].
     pub fn position_std(&self, joint: usize) -> f64 {
         MODEL_ERROR_RAD.hypot(self.experiments[0].sigma(ResidualChannel::Position(joint)))

@@ -71,6 +71,7 @@ pub fn log(viscous: impl Fn(usize) -> f64, contact: Option<Contact>) -> Log {
         column("t", &|row| row as f64 / 200.0),
         column("segment", &|row| f64::from(row >= AIR)),
         column("q_FL_hip", &|row| measured(row) + noise(row)),
+        column("dq_FL_hip", &|row| 0.3 * (0.11 * in_window(row, WINDOW_IN_AIR) as f64).cos()),
         column("q_cmd_FL_hip", &|_| 0.0),
         column("kp", &|_| 25.0),
         column("kd", &|_| 0.6),
@@ -201,5 +202,26 @@ pub fn standing(offset: impl Fn(f64) -> f64) -> ResidualData {
     }
     let segments = vec![Segment { name: "stance".to_owned(), base: BaseMount::Floating }];
     let log = Log::new(Meta::new(200.0, TorqueSensor::None, segments), columns).expect("a log");
+    ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
+}
+
+/// Returns the data of a joint that does not move while its command swings by up to 0.3 rad, with this measured torque [N·m]
+/// for each position error [rad].
+pub fn held(torque: impl Fn(f64) -> f64) -> ResidualData {
+    const ROWS: usize = 4000;
+    let column = |name: &str, of: &dyn Fn(usize) -> f64| (name.to_owned(), (0..ROWS).map(of).collect::<Vec<f64>>());
+    let error = |row: usize| 0.3 * (0.0031 * row as f64).sin() * (0.03 * row as f64).sin();
+    let noise = |row: usize| 0.5 * ((row * 7919 % 1009) as f64 / 1009.0 - 0.5);
+    let columns = [
+        column("t", &|row| row as f64 / 200.0),
+        column("q_FL_hip", &|_| 0.0),
+        column("dq_FL_hip", &|_| 0.0),
+        column("q_cmd_FL_hip", &error),
+        column("tau_measured_FL_hip", &|row| torque(error(row)) + noise(row)),
+        column("kp", &|_| 25.0),
+        column("kd", &|_| 0.6),
+    ];
+    let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
+    let log = Log::new(Meta::new(200.0, TorqueSensor::MotorCurrent, segments), columns).expect("a log");
     ResidualData::new(vec![log], &go2(), WindowConfig::DIAGNOSIS).expect("an experiment")
 }

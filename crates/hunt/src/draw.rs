@@ -83,6 +83,7 @@ impl Case {
             Suite::Healthy => CaseKind::Healthy,
             Suite::Walking => CaseKind::WalkingEffect,
             Suite::Confusable => CaseKind::ConfusableEffect,
+            Suite::Unmodelled => CaseKind::UnmodelledEffect,
         };
         let setting = LogSetup::draw(seed, number, plant, suite);
         let random = &mut stream(seed, "hunt hidden", number);
@@ -307,6 +308,7 @@ mod tests {
             (Plant::Mujoco, Suite::Healthy),
             (Plant::Mujoco, Suite::Walking),
             (Plant::Mujoco, Suite::Confusable),
+            (Plant::Mujoco, Suite::Unmodelled),
         ];
         for (number, (plant, suite)) in (0..300).flat_map(|number| kinds.map(|kind| (number, kind))) {
             let case = Case::draw(1, number, plant, suite);

@@ -55,6 +55,8 @@ pub enum Suite {
     Walking,
     /// One effect that the catalogue lists as a confounder of another, in a log without torques.
     Confusable,
+    /// One effect outside the catalogue, in a log as in [`Suite::Mixed`].
+    Unmodelled,
 }
 
 /// Settings of a blind test.

@@ -38,8 +38,10 @@ impl LogSetup {
     pub fn draw(seed: u64, number: u64, plant: Plant, suite: Suite) -> Self {
         let drawn = Self::drawn(&mut stream(seed, "hunt setting", number));
         match suite {
-            Suite::Mixed if plant == Plant::Mujoco => Self { place: BaseSchedule::Whole, torque: true, ..drawn },
-            Suite::Mixed => drawn,
+            Suite::Mixed | Suite::Unmodelled if plant == Plant::Mujoco => {
+                Self { place: BaseSchedule::Whole, torque: true, ..drawn }
+            }
+            Suite::Mixed | Suite::Unmodelled => drawn,
             Suite::Healthy => {
                 // Of nine robots of each family, six have logs of a minute, two of 10 s and one of five minutes.
                 let round = (number / Mismatch::ALL.len() as u64) % 9;
