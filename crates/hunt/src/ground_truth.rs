@@ -23,9 +23,23 @@ const MASS_ERROR: f64 = 0.01;
 /// Maximum error of the leg mounting positions [m], too small to be reported as a cause.
 const LENGTH_ERROR: f64 = 0.002;
 
-/// Simulates the log of a case on `plant`. `progress` receives the number of completed rows and returns false to
+/// One of the two logs of a case's robot: the same phases with other random motions, gains and noise.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Take {
+    /// The log that is diagnosed.
+    First,
+    /// A log for the corrected model.
+    Second,
+}
+
+/// Simulates a log of a case on `plant`. `progress` receives the number of completed rows and returns false to
 /// interrupt.
-pub fn log_of(case: &Case, plant: Plant, progress: &mut dyn FnMut(usize) -> bool) -> Result<Log, RecordError> {
+pub fn log_of(
+    case: &Case,
+    plant: Plant,
+    take: Take,
+    progress: &mut dyn FnMut(usize) -> bool,
+) -> Result<Log, RecordError> {
     let mut robot = perturbed(&mut case.stream("hunt body"));
     let errors = &mut case.stream("hunt mismatch");
     if let Some(mismatch) = case.mismatch {
@@ -33,7 +47,8 @@ pub fn log_of(case: &Case, plant: Plant, progress: &mut dyn FnMut(usize) -> bool
     }
     let stand = case.mismatch.and_then(|mismatch| mismatch.stand(errors));
     let robot = apply_effects(&robot, &case.hidden).expect("cases are sampled as valid robots");
-    let motion = motion(case.setting, &mut case.stream("hunt motion"));
+    let of_motion = if take == Take::First { "hunt motion" } else { "hunt second motion" };
+    let motion = motion(case.setting, &mut case.stream(of_motion));
     // The source of the log does not reveal the hidden effects.
     let exact = match plant {
         Plant::Rapier => played(&motion, &robot, progress, |base, robot| {
@@ -49,7 +64,8 @@ pub fn log_of(case: &Case, plant: Plant, progress: &mut dyn FnMut(usize) -> bool
     let random = &mut case.stream("hunt sensors");
     let sensors = sensors(random);
     let delayed = torque_sensor(&exact, &robot, case.setting.torque)?;
-    let noisy = apply_sensors(&delayed, &sensors, random.random())?;
+    let seeds: [u64; 2] = [random.random(), random.random()];
+    let noisy = apply_sensors(&delayed, &sensors, seeds[take as usize])?;
     let noisy = if case.setting.motion_capture { noisy } else { without_motion_capture(&noisy)? };
     Ok(case.mismatch.map_or(Ok(noisy.clone()), |mismatch| mismatch.change_log(noisy, errors))?)
 }
@@ -175,8 +191,8 @@ mod tests {
             [(BaseSchedule::Fixed, 1), (BaseSchedule::Floating, 2), (BaseSchedule::FixedThenFloating, 3)]
         {
             let folder = tempfile::tempdir().expect("a folder");
-            let log =
-                log_of(&case(place, seed, Vec::new()), Plant::Rapier, &mut |_| true).expect("the simulation succeeds");
+            let log = log_of(&case(place, seed, Vec::new()), Plant::Rapier, Take::First, &mut |_| true)
+                .expect("the simulation succeeds");
             log.write(folder.path()).expect("written");
             let log = Log::open(folder.path()).expect("a log");
             for channel in ["dq_RR_calf", "tau_measured_FL_hip", "battery_V", "kp"] {
@@ -203,11 +219,26 @@ mod tests {
         let delay = EffectEntry::new(effect, Scope::All, vec![0.0125]).expect("allowed");
         let [healthy, delayed] = [vec![], vec![delay]].map(|hidden| {
             let case = case(BaseSchedule::Fixed, 1, hidden);
-            log_of(&case, Plant::Rapier, &mut |_| true).expect("the simulation succeeds")
+            log_of(&case, Plant::Rapier, Take::First, &mut |_| true).expect("the simulation succeeds")
         });
         assert_eq!(healthy.q("FL_calf"), delayed.q("FL_calf"));
         let [healthy, delayed] = [&healthy, &delayed].map(|log| log.tau_measured("FL_calf").expect("measured"));
         assert_ne!(healthy, delayed);
+    }
+
+    #[test]
+    fn second_log_of_a_robot_has_the_same_channels_and_noise_and_another_motion() {
+        let case = case(BaseSchedule::Fixed, 1, Vec::new());
+        let log = |take| log_of(&case, Plant::Rapier, take, &mut |_| true).expect("the simulation succeeds");
+        let [first, second] = [Take::First, Take::Second].map(log);
+        assert_eq!(first.meta().noise, second.meta().noise);
+        assert_eq!(first.rows(), second.rows());
+        assert_ne!(first.q_cmd("FL_hip"), second.q_cmd("FL_hip"));
+        let error = |log: &Log| {
+            let mut simulator = BatchRollout::new(&go2(), &SimConfig::default()).expect("a simulator");
+            evaluate(log, &go2(), &mut simulator, |_| true).expect("evaluated").q_rmse_rad.expect("measured")
+        };
+        assert!((error(&second) / error(&first) - 1.0).abs() < 0.5, "the same robot");
     }
 
     #[test]

@@ -19,11 +19,13 @@ use std::process::Command;
 
 use serde::{Deserialize, Serialize};
 use twinstep_diagnose::RmsErrors;
+use twinstep_identify::RecordError;
+use twinstep_logs::Log;
 use twinstep_model::go2;
-
 use twinstep_sim::{BatchRollout, SimConfig};
 
 use draw::{Case, CaseKind};
+use ground_truth::Take;
 use log_setup::LogSetup;
 use mismatch::Mismatch;
 use runner::BlindTest;
@@ -186,6 +188,11 @@ pub enum HuntError {
     /// A simulation failed.
     #[error(transparent)]
     Failed(Box<dyn std::error::Error + Send + Sync>),
+}
+
+/// Simulates a second log of the robot of a case: the same phases with other random motions, gains and noise.
+pub fn second_log(seed: u64, number: u64, plant: Plant, suite: Suite) -> Result<Log, RecordError> {
+    ground_truth::log_of(&Case::draw(seed, number, plant, suite), plant, Take::Second, &mut |_| true)
 }
 
 /// Wraps an error of the file at `path`.

@@ -13,6 +13,7 @@ use twinstep_model::{RobotModel, go2};
 use twinstep_sim::BatchRollout;
 
 use crate::draw::Case;
+use crate::ground_truth::Take;
 use crate::score::judge;
 use crate::{CaseResult, Diagnose, HuntError, Plant, Suite, at, failed, ground_truth};
 
@@ -50,9 +51,11 @@ impl BlindTest<'_> {
         let model = self.out.join("nominal.toml");
         std::fs::write(&model, ModelFile::default().to_toml()).map_err(at(&model))?;
         let log =
-            ground_truth::log_of(case, self.plant, &mut |_| !(self.interrupted)()).map_err(|error| match error {
-                RecordError::Interrupted => HuntError::Interrupted,
-                error => failed(error),
+            ground_truth::log_of(case, self.plant, Take::First, &mut |_| !(self.interrupted)()).map_err(|error| {
+                match error {
+                    RecordError::Interrupted => HuntError::Interrupted,
+                    error => failed(error),
+                }
             })?;
         let path = folder.join("log");
         log.write(&path).map_err(failed)?;
