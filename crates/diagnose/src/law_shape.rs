@@ -2,10 +2,10 @@
 //!
 //! At the joint fit the model is linear. The residuals of positions with a fixed base, and those of torques, are divided into
 //! two halves by the state of their joint: the direction of its motion, its speed, its position error, or its commanded
-//! position. The size of a cause is fitted to each half, with the other causes unchanged. Friction in one direction resembles dry friction
-//! of half its size, but that is twice as large in this direction and zero in the other; a gain that grows with the
-//! position error has different sizes at small and at large errors. Such a cause is another law than the one of the
-//! catalogue that resembles it most.
+//! position. The size of a cause is fitted to each half, with the other causes unchanged. Friction in one direction
+//! resembles dry friction of half its size, but that is twice as large in this direction and zero in the other; a gain
+//! that grows with the position error has different sizes at small and at large errors. Such a cause is another law than
+//! the one of the catalogue that resembles it most.
 
 use twinstep_effects::Scope;
 use twinstep_model::{Joint, NUM_JOINTS, Rollout};
