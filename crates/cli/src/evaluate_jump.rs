@@ -51,6 +51,8 @@ pub struct Landings {
     pub yaw_error: f64,
     /// Share of the robots that landed within 5 cm of the target.
     pub within_5_cm: f64,
+    /// Mean of the angle that the base turns in flight, positive to the left [rad].
+    pub flight_turn: f64,
     /// Mean of the time in flight [s].
     pub flight_s: f64,
     /// Mean of the highest clearance of the lowest foot [m].
@@ -126,6 +128,8 @@ struct Jumper {
 #[derive(Clone, Copy, Debug)]
 struct Landing {
     pose: GroundPose,
+    /// Angle that the base turns in flight, positive to the left [rad].
+    flight_turn: f32,
     /// Time in flight [s].
     flight_s: f32,
     /// Highest clearance of the lowest foot [m].
@@ -159,7 +163,9 @@ impl Jumper {
         {
             let lowest = |sample: &Sample| sample.clearance.iter().copied().fold(f32::INFINITY, f32::min);
             let clearance = self.in_air.iter().map(lowest).fold(0.0, f32::max);
-            self.landing = Some(Landing { pose: touchdown(before, last, dt), flight_s: air_time, clearance });
+            let pose = touchdown(before, last, dt);
+            let [_, _, flight_turn] = pose.relative_to(self.in_air[0].base);
+            self.landing = Some(Landing { pose, flight_turn, flight_s: air_time, clearance });
         }
         self.in_air.clear();
     }
@@ -209,6 +215,7 @@ fn landings(target: [f32; 3], jumpers: &[Jumper]) -> Landings {
         distance: mean(&|landing| distance(&landing.pose)),
         yaw_error: mean(&|landing| landing.pose.relative_to(goal)[2].abs()),
         within_5_cm: share(landed.iter().filter(|landing| is_near(&landing.pose)).count()),
+        flight_turn: mean(&|landing| landing.flight_turn),
         flight_s: mean(&|landing| landing.flight_s),
         clearance: mean(&|landing| landing.clearance),
     }
@@ -218,7 +225,7 @@ fn landings(target: [f32; 3], jumpers: &[Jumper]) -> Landings {
 pub fn table(robots: u32, rows: &[JumpRow]) -> String {
     let mut text = format!(
         "{robots} robots, one jump from standing, {JUMP_S} s. L_jump: mean |x_land - x_target|\n\n\
-         condition  engine   target [m, m, rad]  landed  up       L_jump    mean error  yaw error  flight  clearance\n"
+         condition  engine   target [m, m, rad]  landed  up       L_jump    mean error  yaw error  turn in flight  flight  clearance\n"
     );
     for JumpRow { condition, engine, targets } in rows {
         let engine = format!("{engine:?}").to_lowercase();
@@ -230,12 +237,15 @@ pub fn table(robots: u32, rows: &[JumpRow]) -> String {
                 100.0 * landings.landed,
                 100.0 * landings.up
             );
-            let Landings { l_jump, mean_error, yaw_error, flight_s, clearance, .. } = landings;
+            let Landings { l_jump, mean_error, yaw_error, flight_turn, flight_s, clearance, .. } = landings;
             let _ = if landings.landed == 0.0 {
                 writeln!(text, "no robot has jumped and landed")
             } else {
                 let cm = 100.0 * clearance;
-                writeln!(text, "{l_jump:6.3} m  {mean_error:+7.3} m   {yaw_error:.3} rad  {flight_s:.2} s  {cm:4.1} cm")
+                writeln!(
+                    text,
+                    "{l_jump:6.3} m  {mean_error:+7.3} m   {yaw_error:.3} rad  {flight_turn:+.3} rad      {flight_s:.2} s  {cm:4.1} cm"
+                )
             };
         }
     }
@@ -244,6 +254,8 @@ pub fn table(robots: u32, rows: &[JumpRow]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use twinstep_model::{Ground, Pose, go2};
+
     use super::*;
 
     #[test]
@@ -259,9 +271,29 @@ mod tests {
     }
 
     #[test]
+    fn turn_in_flight_is_that_since_the_last_contact() {
+        let robot = go2();
+        let q = robot.control.default_pose_f32();
+        let scene = |yaw: f32, height: f32, force: f32| {
+            let base = Pose { position: Vec3::new(0.0, 0.0, 0.3 + height), rotation: Quat::from_rotation_z(yaw) };
+            Scene { foot_force: Some([force; 4]), ..Scene::new(&robot, base, &q, &Ground::FLAT) }
+        };
+        let mut jumper = Jumper::default();
+        // 2.5 rad on the ground, then 0.1 rad in each step in the air, beyond an angle of π.
+        jumper.add(&scene(0.0, 0.0, 40.0), &robot, 0.02);
+        jumper.add(&scene(2.5, 0.0, 40.0), &robot, 0.02);
+        for step in 0_u8..10 {
+            jumper.add(&scene(2.5 + 0.1 * f32::from(step), 0.3, 0.0), &robot, 0.02);
+        }
+        jumper.add(&scene(3.5, 0.0, 80.0), &robot, 0.02);
+        let landing = jumper.landing.expect("landed");
+        assert!((landing.flight_turn - 1.0).abs() < 1e-4 && (landing.flight_s - 0.2).abs() < 1e-4, "{landing:?}");
+    }
+
+    #[test]
     fn robots_that_never_jump_or_fall_are_counted() {
         let pose = GroundPose { x: 0.55, y: 0.0, yaw: 0.1 };
-        let landing = |pose| Some(Landing { pose, flight_s: 0.3, clearance: 0.1 });
+        let landing = |pose| Some(Landing { pose, flight_turn: 0.0, flight_s: 0.3, clearance: 0.1 });
         let jumpers = [
             Jumper { landing: landing(pose), ..Jumper::default() },
             Jumper::default(),

@@ -1,5 +1,6 @@
 //! The tasks, one file each, and the `[task]` table of a config file.
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::ConfigError;
@@ -135,17 +136,36 @@ impl TryFrom<toml::Table> for TaskConfig {
 
     fn try_from(mut table: toml::Table) -> Result<Self, String> {
         let name = table.remove("name").unwrap_or_else(|| "walk".into());
-        let text = |error: toml::de::Error| error.to_string().trim_end().to_owned();
         match name.as_str() {
-            Some("walk") => table.try_into().map(Self::Walk).map_err(text),
-            Some("track") => table.try_into().map(Self::Track).map_err(text),
-            Some("jump") => table.try_into().map(Self::Jump).map_err(text),
-            Some("gait") => table.try_into().map(Self::Gait).map_err(text),
-            Some("attitude") => table.try_into().map(Self::Attitude).map_err(text),
-            Some("explore") => table.try_into().map(Self::Explore).map_err(text),
+            Some("walk") => over_defaults(table).map(Self::Walk),
+            Some("track") => over_defaults(table).map(Self::Track),
+            Some("jump") => over_defaults(table).map(Self::Jump),
+            Some("gait") => over_defaults(table).map(Self::Gait),
+            Some("attitude") => over_defaults(table).map(Self::Attitude),
+            Some("explore") => over_defaults(table).map(Self::Explore),
             Some("counter") if table.is_empty() => Ok(Self::Counter),
             Some("counter") => Err("the task `counter` has no settings besides `name`".to_owned()),
             _ => Err(format!("`name` = {name} is not a task; possible: {}", Self::NAMES.join(", "))),
+        }
+    }
+}
+
+/// Returns the default settings of a task with the values of `table`.
+///
+/// A table within it, such as `walk.reward`, replaces only the keys that it has: the defaults of the others are those of the
+/// task, which may differ from those of `walk`.
+fn over_defaults<T: Default + Serialize + DeserializeOwned>(table: toml::Table) -> Result<T, String> {
+    let mut settings = toml::Table::try_from(T::default()).map_err(|error| error.to_string())?;
+    replace(&mut settings, table);
+    settings.try_into().map_err(|error: toml::de::Error| error.to_string().trim_end().to_owned())
+}
+
+/// Replaces the values of `settings` that `table` has, table by table.
+fn replace(settings: &mut toml::Table, table: toml::Table) {
+    for (key, value) in table {
+        match (settings.get_mut(&key), value) {
+            (Some(toml::Value::Table(settings)), toml::Value::Table(table)) => replace(settings, table),
+            (_, value) => drop(settings.insert(key, value)),
         }
     }
 }
@@ -172,6 +192,19 @@ mod tests {
         for name in TaskConfig::NAMES {
             assert_eq!(TaskConfig::named(name).expect("a task").name(), name);
         }
+    }
+
+    #[test]
+    fn one_key_of_a_table_leaves_the_other_settings_of_the_task() {
+        let parse = |text: &str| toml::from_str::<TaskConfig>(text).expect("valid");
+        let jump = parse("name = \"jump\"\nwalk.reward.hip_deviation = 0.0");
+        let mut expected = JumpConfig::default();
+        expected.walk.reward.hip_deviation = 0.0;
+        assert_eq!(jump, TaskConfig::Jump(expected), "no term of walking, 3 s");
+        let gait = parse("name = \"gait\"\n[walk.command]\nlinear_velocity_x = [0.0, 0.5]");
+        let mut expected = GaitConfig::default();
+        expected.walk.command.linear_velocity_x = [0.0, 0.5];
+        assert_eq!(gait, TaskConfig::Gait(expected), "no sideways commands");
     }
 
     #[test]
