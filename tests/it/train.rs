@@ -296,6 +296,24 @@ fn shipped_policy_jumps_to_its_target_in_two_engines() {
 }
 
 #[test]
+fn shipped_policy_turns_by_135_degrees_in_flight_in_two_engines() {
+    let policy = root().join("data/policies/jump_turn.safetensors");
+    let evaluated = twinstep(&["evaluate-policy", policy.to_str().unwrap(), "--robots", "8", "--json"]);
+    assert!(evaluated.status.success(), "{}", text(&evaluated.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&evaluated.stdout).unwrap();
+    let nominal: Vec<_> =
+        report["rows"].as_array().unwrap().iter().filter(|row| row["condition"] == "nominal").collect();
+    assert_eq!(nominal.len(), 2, "batch and rapier");
+    for landings in nominal.iter().flat_map(|row| row["targets"].as_array().unwrap()) {
+        let number = |name: &str| landings[name].as_f64().unwrap();
+        let target = landings["target"][2].as_f64().unwrap();
+        assert!(landings["landed"] == 1.0 && landings["up"] == 1.0 && number("yaw_error") < 0.2, "{landings}");
+        // The rest is turned while the feet push.
+        assert!((number("flight_turn") - target).abs() < 0.3 * target.abs() + 0.05, "{landings}");
+    }
+}
+
+#[test]
 fn shipped_policy_follows_each_gait_in_two_engines() {
     let policy = root().join("data/policies/gait.safetensors");
     let evaluated =

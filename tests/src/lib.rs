@@ -14,6 +14,7 @@
 //! - [`foreign_policy`]: policies with the conventions of other programs
 //! - [`fuzz`]: random changes to messages and files
 //! - [`mujoco_ground_truth`]: robots in MuJoCo with hidden effects, on which methods are compared
+//! - [`fine_tuning`]: policies that are fine-tuned on models of these robots
 //! - [`resumable`]: commands whose results are kept
 //! - [`robot_rig`]: a fake Go2 under the safety state machine, on an accelerated clock
 //! - [`robot_campaign`]: faults of this robot in each state, and random sequences of events
@@ -28,6 +29,7 @@ pub mod chrome_page;
 pub mod confounded_pairs;
 pub mod fault;
 pub mod fault_injection;
+pub mod fine_tuning;
 pub mod foreign_policy;
 pub mod fuzz;
 pub mod ground_truth_actuator;

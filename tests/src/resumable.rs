@@ -48,17 +48,18 @@ impl Resumable {
         self.run(&[arguments, &["--out", &out]].concat()).map(drop)
     }
 
-    /// Trains a task on the nominal Go2, by the command of `data/policies`. Returns the folder of the training, whose
+    /// Trains a task on the nominal Go2, by the command of `data/policies`; `turn` is that of `jump_turn`. Returns the folder of the training, whose
     /// checkpoint has the critic that fine-tuning needs.
     pub fn nominal(&self, task: &str) -> Step<PathBuf> {
         let out = self.path("nominal").join(task);
-        let options: &[&str] = match task {
-            "walk" => &["--seed", "4"],
-            "jump" => &["--seed", "1", "--steps", "20000000"],
-            "attitude" => &["--seed", "1", "--steps", "10000000"],
-            _ => &["--seed", "1", "--steps", "30000000"],
+        let arguments: &[&str] = match task {
+            "walk" => &["walk", "--seed", "4"],
+            "jump" => &["jump", "--seed", "1", "--steps", "20000000"],
+            "turn" => &["jump", "--config", "data/policies/jump_turn.toml", "--seed", "1", "--steps", "20000000"],
+            "attitude" => &["attitude", "--seed", "1", "--steps", "10000000"],
+            _ => &[task, "--seed", "1", "--steps", "30000000"],
         };
-        self.step(&out.join("evaluation.json"), &[&["train", task], options].concat(), &out)?;
+        self.step(&out.join("evaluation.json"), &[&["train"], arguments].concat(), &out)?;
         Ok(out)
     }
 

@@ -59,10 +59,10 @@ pub struct Landings {
     pub clearance: f64,
 }
 
-/// Returns the settings of the task at both ends and in the middle of the ranges of its targets. Episodes end by falls
-/// only.
-pub fn tasks(trained: &JumpConfig) -> [JumpConfig; 3] {
-    [0.0, 0.5, 1.0].map(|share| {
+/// Returns the settings of the task at both ends and in the middle of the ranges of its targets, once if all are one target.
+/// Episodes end by falls only.
+pub fn tasks(trained: &JumpConfig) -> Vec<JumpConfig> {
+    let at = |share: f32| {
         let at = |[low, high]: [f32; 2]| [low + share * (high - low); 2];
         JumpConfig {
             target_x_m: at(trained.target_x_m),
@@ -72,7 +72,10 @@ pub fn tasks(trained: &JumpConfig) -> [JumpConfig; 3] {
             walk: WalkConfig { max_episode_s: 1e6, ..JumpConfig::default().walk },
             ..JumpConfig::default()
         }
-    })
+    };
+    let mut tasks = [0.0, 0.5, 1.0].map(at).to_vec();
+    tasks.dedup();
+    tasks
 }
 
 /// Lets all robots of `env` jump once with the mean action of `policy`, and measures where they land.
@@ -268,6 +271,15 @@ mod tests {
         let landing = touchdown(&sample(0.0, 0.035), &sample(0.02, 0.015), 0.02);
         // 0.015 = 1.0981 t + 4.905 t², so t = 0.01289 s.
         assert!((landing.x - 1.5 * 0.03289).abs() < 1e-4 && (landing.yaw - 2.0 * 0.03289).abs() < 1e-4, "{landing:?}");
+    }
+
+    #[test]
+    fn targets_are_both_ends_and_the_middle_of_the_ranges_or_the_only_target() {
+        let yaw =
+            |target_yaw_rad| tasks(&JumpConfig { target_yaw_rad, target_x_m: [0.0, 0.0], ..JumpConfig::default() });
+        let turns: Vec<f32> = yaw([-2.0, 1.0]).iter().map(|task| task.target_yaw_rad[0]).collect();
+        assert_eq!(turns, [-2.0, -0.5, 1.0]);
+        assert_eq!(yaw([2.356, 2.356]).len(), 1);
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Error of identified models against robot time, for several ways of choosing the motions.
+//! Error of identified models, and of policies that are fine-tuned on them, against robot time, for several ways of choosing the motions.
 //!
 //! `cargo build --release --workspace && target/release/robot_time --out robot-time`. Needs Python with the package's extra
 //! `mujoco`; `TWINSTEP_PYTHON` is its interpreter. Each step is a command of `twinstep` whose result is kept, so that the
@@ -11,8 +11,9 @@ use std::process::ExitCode;
 use clap::Parser;
 use twinstep_logs::{Log, Meta, TorqueSensor};
 use twinstep_report::chart::{self, Line, Panel, RGBColor};
+use twinstep_tests::fine_tuning::{FineTuning, TASKS};
 use twinstep_tests::mujoco_ground_truth::{Collection, EffectSet, MujocoGroundTruth, record_jumps};
-use twinstep_tests::resumable::{Step, number, print_result, read, text};
+use twinstep_tests::resumable::{Resumable, Step, number, print_result, read, text};
 
 /// Compare ways of collecting data on hidden robots, by the error of the models on two held-out logs.
 #[derive(Parser)]
@@ -32,6 +33,9 @@ struct Args {
     /// Command sequences that each design simulates.
     #[arg(long, default_value_t = 300)]
     candidates: u32,
+    /// Environment steps of the fine-tuning of the policy `jump` on the first and the last model of each method; 0: none.
+    #[arg(long, default_value_t = 5_000_000)]
+    tune_steps: u64,
     /// Methods: `random`, a criterion of `twinstep excite`, and `uncertainty`: the exploration policy of U2E.
     #[arg(long, value_delimiter = ',', default_value = "random,trace,d-optimal,qoed,uncertainty")]
     methods: Vec<String>,
@@ -53,8 +57,8 @@ const LOGS: [&str; 2] = ["walking", "jumps"];
 /// Settings of the ensembles and exploration policies of `uncertainty`.
 const U2E: &str = "[fit]\nmembers = 4\nepochs = 20\n[explore]\nmax_residual = 0.5\nuncertainty_weight = 40.0\n\
                    [train]\ntotal_steps = 1000000\n";
-/// Width and height of the figure [px].
-const SIZE: (u32, u32) = (1200, 480);
+/// Simulated robots of the evaluation of a policy.
+const EVALUATED: u32 = 8;
 const COLOURS: [RGBColor; 5] = [
     RGBColor(0x26, 0x26, 0x26),
     RGBColor(0xff, 0x6a, 0x13),
@@ -78,30 +82,43 @@ fn campaign(args: &Args) -> Step<String> {
         let (_server, endpoint) = hidden.serve("walk")?;
         // The other methods use its first log and its held-out log.
         hidden.identify("random", args.collection(), seed, &endpoint)?;
-        let of_method = |method: &String| robot_errors(args, &hidden, method, seed, &endpoint);
+        let of_method = |method: &String| {
+            let models = models(args, &hidden, method, seed, &endpoint)?;
+            Ok(Errors {
+                q_rmse: models.iter().map(|model| held_out_errors(&hidden, model)).collect::<Step<_>>()?,
+                landing: landing_errors(args, &hidden, method, seed, &models)?,
+            })
+        };
         errors.push(args.methods.iter().map(of_method).collect::<Step<Vec<_>>>()?);
         std::fs::write(args.out.join("robot-time.svg"), figure(args, &errors)?).map_err(text)?;
     }
     Ok(table(args, &errors))
 }
 
-/// Errors of the models after each log, by held-out log [rad].
-type Errors = Vec<[f64; 2]>;
+/// Errors of a method on a robot.
+struct Errors {
+    /// Error of the joint position of the model after each log, by held-out log [rad].
+    q_rmse: Vec<[f64; 2]>,
+    /// Landing error of the policies that were fine-tuned on the first and the last model [m]; empty without fine-tuning.
+    landing: Vec<f64>,
+}
 
-/// Collects logs with a method and identifies the robot after each of them. Returns the errors of the models.
-fn robot_errors(args: &Args, hidden: &MujocoGroundTruth, method: &str, seed: u64, endpoint: &str) -> Step<Errors> {
-    let models = if method == "uncertainty" {
-        explored(args, hidden, seed, endpoint)?
-    } else {
-        hidden.identify(method, args.collection(), seed, endpoint)?;
-        let later = if method == "random" { "random" } else { "active" };
-        let stage = |number: u32| format!("{number}-{}", if number == 1 { "random" } else { later });
-        (1..=args.rounds + 1)
-            .map(|number| hidden.commands.path(method).join(stage(number)).join("model.toml"))
-            .collect()
-    };
+/// Collects logs with a method and identifies the robot after each of them. Returns the models.
+fn models(args: &Args, hidden: &MujocoGroundTruth, method: &str, seed: u64, endpoint: &str) -> Step<Vec<PathBuf>> {
+    if method == "uncertainty" {
+        return explored(args, hidden, seed, endpoint);
+    }
+    hidden.identify(method, args.collection(), seed, endpoint)?;
+    let later = if method == "random" { "random" } else { "active" };
+    let stage = |number: u32| format!("{number}-{}", if number == 1 { "random" } else { later });
+    let model = |number| hidden.commands.path(method).join(stage(number)).join("model.toml");
+    Ok((1..=args.rounds + 1).map(model).collect())
+}
+
+/// Returns the error of the joint position on both held-out logs [rad].
+fn held_out_errors(hidden: &MujocoGroundTruth, model: &Path) -> Step<[f64; 2]> {
     let logs = [hidden.commands.path("random/held-out/log"), hidden.commands.path("held-out")];
-    let error = |model: &Path, log: usize| -> Step<f64> {
+    let error = |log: usize| -> Step<f64> {
         let result = model.with_extension(format!("{}.json", LOGS[log]));
         if !result.exists() {
             let [model, log] = [model, &logs[log]].map(|path| path.display().to_string());
@@ -110,7 +127,29 @@ fn robot_errors(args: &Args, hidden: &MujocoGroundTruth, method: &str, seed: u64
         }
         Ok(number(&read(&result)?["q_rmse_rad"]))
     };
-    models.iter().map(|model| Ok([error(model, 0)?, error(model, 1)?])).collect()
+    Ok([error(0)?, error(1)?])
+}
+
+/// Continues the training of the nominal policy `jump` on the first and the last model. Returns the landing errors on the robot [m].
+fn landing_errors(
+    args: &Args,
+    hidden: &MujocoGroundTruth,
+    method: &str,
+    seed: u64,
+    models: &[PathBuf],
+) -> Step<Vec<f64>> {
+    let task = TASKS.iter().find(|task| task.name == "jump").expect("a task");
+    let ([first, .., last], 1..) = (models, args.tune_steps) else { return Ok(Vec::new()) };
+    // All but `uncertainty` have the first log of `random`, and its model.
+    let of_first = if method == "uncertainty" { method } else { "random" };
+    let tuning = FineTuning { robot: hidden, steps: args.tune_steps, evaluated: EVALUATED, seed };
+    let start = Resumable::new(&args.out)?.nominal(task.name)?;
+    let [(_, pointer), ..] = task.errors else { return Ok(Vec::new()) };
+    let error = |name: &str, model: &Path| -> Step<f64> {
+        let policy = tuning.train(task, name, Some(model), "", &start)?;
+        Ok(tuning.evaluate(task, name, &policy)?.pointer(pointer).map_or(f64::NAN, number))
+    };
+    Ok(vec![error(&format!("{of_first}-first-jump"), first)?, error(&format!("{method}-last-jump"), last)?])
 }
 
 /// Collects logs with exploration policies of U2E, and identifies the same unknowns from them. Returns the models.
@@ -163,64 +202,90 @@ fn write_without_torques(from: &Path, to: &Path) -> Step {
     Log::new(meta, columns).map_err(text)?.write(to).map_err(text)
 }
 
-/// Returns the errors of a method after a log, by robot [rad].
-fn by_robot(errors: &[Vec<Errors>], method: usize, stage: usize, log: usize) -> Vec<f64> {
-    errors.iter().map(|robot| robot[method][stage][log]).collect()
+/// Returns an error of a method by robot.
+fn by_robot(errors: &[Vec<Errors>], method: usize, error: impl Fn(&Errors) -> f64) -> Vec<f64> {
+    errors.iter().map(|robot| error(&robot[method])).collect()
 }
 
 fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 
-/// Returns the table: for each held-out log, the mean error by method and robot time, with the errors by robot at the end.
+/// Returns the tables: for each held-out log, the mean error by method and robot time, with the errors by robot at the end, and the
+/// landing errors of the policies.
 fn table(args: &Args, errors: &[Vec<Errors>]) -> String {
     let mut table = String::new();
     for (log, name) in LOGS.iter().enumerate() {
-        let times = (1..=args.rounds + 1).map(|stage| format!(" {:.0} s |", f64::from(stage) * args.seconds));
-        let _ = writeln!(
-            table,
-            "\nHeld-out {name}, joint position, RMSE [mrad]\n\n| method |{} by robot, at the end |",
-            times.collect::<String>()
-        );
-        let _ = writeln!(table, "|---|{}---|", "---|".repeat(args.rounds as usize + 1));
-        for (method, name) in args.methods.iter().enumerate() {
-            let stages = (0..=args.rounds as usize).map(|stage| by_robot(errors, method, stage, log));
-            let cells: Vec<String> = stages.map(|values| format!("{:.1}", 1e3 * mean(&values))).collect();
-            let last = by_robot(errors, method, args.rounds as usize, log);
-            let last: Vec<String> = last.iter().map(|error| format!("{:.1}", 1e3 * error)).collect();
-            let _ = writeln!(table, "| {name} | {} | {} |", cells.join(" | "), last.join(", "));
-        }
+        let times: Vec<String> =
+            (1..=args.rounds + 1).map(|stage| format!("{:.0} s", f64::from(stage) * args.seconds)).collect();
+        let _ = writeln!(table, "\nHeld-out {name}, joint position, RMSE [mrad]");
+        rows(args, errors, &times, &mut table, |errors, stage| 1e3 * errors.q_rmse[stage][log]);
+    }
+    if args.tune_steps > 0 {
+        let ends = ["first model", "last model"].map(str::to_owned);
+        let _ = writeln!(table, "\nLanding error of a jump of 0.85 m after fine-tuning [mm]");
+        rows(args, errors, &ends, &mut table, |errors, end| 1e3 * errors.landing[end]);
     }
     table
 }
 
-/// Returns the figure: the mean error over robot time, a panel for each held-out log and a line for each method.
+/// Adds a table with a row for each method: the mean error in each column, and the errors by robot in the last one.
+fn rows(
+    args: &Args,
+    errors: &[Vec<Errors>],
+    columns: &[String],
+    table: &mut String,
+    error: impl Fn(&Errors, usize) -> f64,
+) {
+    let _ = writeln!(table, "\n| method | {} | by robot, at the end |", columns.join(" | "));
+    let _ = writeln!(table, "|---|{}---|", "---|".repeat(columns.len()));
+    let list = |values: &[f64], separator: &str| {
+        values.iter().map(|value| format!("{value:.1}")).collect::<Vec<_>>().join(separator)
+    };
+    for (method, name) in args.methods.iter().enumerate() {
+        let columns: Vec<Vec<f64>> =
+            (0..columns.len()).map(|column| by_robot(errors, method, |errors| error(errors, column))).collect();
+        let means: Vec<f64> = columns.iter().map(|values| mean(values)).collect();
+        let _ = writeln!(table, "| {name} | {} | {} |", list(&means, " | "), list(&columns[columns.len() - 1], ", "));
+    }
+}
+
+/// Returns the figure: the mean errors over robot time, a panel for each held-out log and one for the policies, and a line for each
+/// method.
 fn figure(args: &Args, errors: &[Vec<Errors>]) -> Step<String> {
     let stages = args.rounds as usize + 1;
-    let panel = |log: usize| {
+    let panel = |caption: String, y_label, columns: &[usize], error: &dyn Fn(&Errors, usize) -> f64| {
         let line = |method: usize| {
-            let point =
-                |stage: usize| ((stage + 1) as f64 * args.seconds, 1e3 * mean(&by_robot(errors, method, stage, log)));
-            Line { colour: COLOURS[method % COLOURS.len()], width: 5, pieces: vec![(0..stages).map(point).collect()] }
+            let point = |(index, stage): (usize, &usize)| {
+                let values = by_robot(errors, method, |errors| error(errors, index));
+                ((stage + 1) as f64 * args.seconds, 1e3 * mean(&values))
+            };
+            let pieces = vec![columns.iter().enumerate().map(point).collect()];
+            Line { colour: COLOURS[method % COLOURS.len()], width: 5, pieces }
         };
         let lines: Vec<Line> = (0..args.methods.len()).map(line).collect();
         let highest = lines.iter().flat_map(|line| &line.pieces[0]).map(|(_, error)| *error).fold(0.0, f64::max);
-        Panel {
-            caption: format!("held-out {}", LOGS[log]),
-            x_label: "robot time [s]",
-            y_label: "joint position, RMSE [mrad]",
-            x: 0.0..stages as f64 * args.seconds,
-            y: 0.0..1.1 * highest,
-            lines,
-        }
+        let (x, y) = (0.0..stages as f64 * args.seconds, 0.0..1.1 * highest);
+        Panel { caption, x_label: "robot time [s]", y_label, x, y, lines }
     };
+    let all: Vec<usize> = (0..stages).collect();
+    let mut panels: Vec<Panel> = (0..LOGS.len())
+        .map(|log| {
+            let caption = format!("held-out {}", LOGS[log]);
+            panel(caption, "joint position, RMSE [mrad]", &all, &|errors, stage| errors.q_rmse[stage][log])
+        })
+        .collect();
+    if args.tune_steps > 0 {
+        let caption = "jump of 0.85 m, fine-tuned policy".to_owned();
+        panels.push(panel(caption, "landing error [mm]", &[0, stages - 1], &|errors, end| errors.landing[end]));
+    }
     let names: Vec<(&str, RGBColor)> =
         args.methods.iter().map(String::as_str).zip(COLOURS.into_iter().cycle()).collect();
-    let svg = chart::picture(SIZE, |root| {
+    let svg = chart::picture((600 * panels.len() as u32, 480), |root| {
         let (header, rest) = root.split_vertically(90);
         chart::legend(&header, &names, 440, (160, 50))?;
-        for (log, area) in rest.split_evenly((1, LOGS.len())).iter().enumerate() {
-            panel(log).draw(area)?;
+        for (panel, area) in panels.iter().zip(rest.split_evenly((1, panels.len()))) {
+            panel.draw(&area)?;
         }
         Ok(())
     });

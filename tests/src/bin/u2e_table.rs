@@ -276,7 +276,7 @@ impl Campaign {
         for method in ["start"].iter().chain(&METHODS) {
             let track = read(&self.path(&format!("{method}-track.json")))?;
             let jump = read(&self.path(&format!("{method}-jump.json")))?;
-            let (paths, jumps) = (&track["rows"][0]["paths"], &jump["rows"][0]["targets"][1]);
+            let (paths, jumps) = (&track["rows"][0]["paths"], &jump["rows"][0]["targets"][0]);
             let _ = writeln!(
                 table,
                 "| {method} | {:.3} | {:.3} | {:.0} % | {:.3} | {:+.3} | {:.0} % |",

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Parser;
+use twinstep_tests::fine_tuning::{FineTuning, TASKS, Task};
 use twinstep_tests::mujoco_ground_truth::{Collection, EffectSet, MujocoGroundTruth};
 use twinstep_tests::python::root;
 use twinstep_tests::resumable::{Resumable, Step, print_result, text};
@@ -38,7 +39,7 @@ struct Args {
     /// Simulated robots of each evaluation.
     #[arg(long, default_value_t = 16)]
     evaluated: u32,
-    /// Tasks: walk, jump, track, attitude.
+    /// Tasks: walk, jump (0.85 m forward), turn (a jump with a turn of 135°), track, attitude.
     #[arg(long, value_delimiter = ',', default_value = "walk,jump")]
     tasks: Vec<String>,
     /// Methods: vanilla, heavy, spi, truth, and spi- with random or a criterion, such as spi-d-optimal. `truth` learns on
@@ -64,27 +65,6 @@ impl Args {
     }
 }
 
-/// A task and its error.
-struct Task {
-    name: &'static str,
-    settings: &'static str,
-    /// Name of the error in the table.
-    error: &'static str,
-    /// JSON pointer to it in the evaluation.
-    pointer: &'static str,
-    /// JSON pointer to the share of the robots that did not fall.
-    up: &'static str,
-    /// Duration of the evaluation [s].
-    seconds: u32,
-}
-
-impl Task {
-    /// Returns true if the policy from which the methods start is evaluated on the same targets.
-    fn has_start(&self) -> bool {
-        self.settings.is_empty()
-    }
-}
-
 /// Effects that the method `ours` identifies besides the unknowns of the others: what a Go2 may have, by joint type or for all.
 const OURS: [&str; 15] = [
     "command_delay@all",
@@ -107,41 +87,6 @@ const OURS: [&str; 15] = [
 /// Methods whose models are identified from the logs of `spi-random`.
 const FROM_RANDOM_LOGS: [&str; 4] = ["gradient", "ours", "one-gain", "one-tanh"];
 
-const TASKS: [Task; 4] = [
-    Task {
-        name: "walk",
-        settings: "",
-        error: "velocity RMS [m/s]",
-        pointer: "/rows/0/velocity_rms",
-        up: "/rows/0/up",
-        seconds: 20,
-    },
-    Task {
-        name: "jump",
-        settings: "target_x_m = [0.85, 0.85]\n",
-        error: "landing error of a jump of 0.85 m [m]",
-        pointer: "/rows/0/targets/1/l_jump",
-        up: "/rows/0/targets/1/up",
-        seconds: 3,
-    },
-    Task {
-        name: "track",
-        settings: "",
-        error: "L_track, circle [m + rad]",
-        pointer: "/rows/0/paths/0/l_track",
-        up: "/rows/0/paths/0/up",
-        seconds: 20,
-    },
-    Task {
-        name: "attitude",
-        settings: "",
-        error: "L_attitude [rad]",
-        pointer: "/rows/0/l_attitude",
-        up: "/rows/0/up",
-        seconds: 20,
-    },
-];
-
 fn main() -> ExitCode {
     print_result(campaign(&Args::parse()))
 }
@@ -157,7 +102,8 @@ fn campaign(args: &Args) -> Step<String> {
         for task in TASKS.iter().filter(|task| args.tasks.iter().any(|name| name == task.name)) {
             let start = Resumable::new(&args.out)?.nominal(task.name)?;
             if task.has_start() {
-                robot.evaluate(task, "start", &start.join("policy.safetensors"))?;
+                let name = format!("start-{}", task.name);
+                robot.tuning().evaluate(task, &name, &start.join("policy.safetensors"))?;
             }
             args.methods.iter().try_for_each(|method| robot.tune_and_evaluate(task, method, &start))?;
         }
@@ -245,20 +191,16 @@ impl<'a> Robot<'a> {
 
     /// Continues a training on the model of a method, and evaluates the policy.
     fn tune_and_evaluate(&self, task: &Task, method: &str, start: &Path) -> Step {
-        let out = self.commands().path(&format!("{method}-{}", task.name));
-        let config = self.commands().path(&format!("{method}-{}.toml", task.name));
         let heavy = std::fs::read_to_string(root().join("examples/spi-active/heavy.toml")).map_err(text)?;
-        let randomise = if method == "heavy" { heavy } else { String::new() };
-        let settings = format!("[task]\nname = \"{}\"\n{}{randomise}", task.name, task.settings);
-        std::fs::write(&config, settings).map_err(text)?;
-        let [from, config] = [start.join("checkpoint.safetensors"), config].map(|path| path.display().to_string());
-        let (steps, seed) = (self.args.tune_steps.to_string(), self.seed.to_string());
-        let mut arguments =
-            vec!["train", task.name, "--config", &config, "--from", &from, "--steps", &steps, "--seed", &seed];
-        let model = self.model(method).map(|path| path.display().to_string());
-        arguments.extend(model.iter().flat_map(|model| ["--model", model.as_str()]));
-        self.commands().step(&out.join("evaluation.json"), &arguments, &out)?;
-        self.evaluate(task, method, &out.join("policy.safetensors"))
+        let randomise = if method == "heavy" { heavy.as_str() } else { "" };
+        let name = format!("{method}-{}", task.name);
+        let policy = self.tuning().train(task, &name, self.model(method).as_deref(), randomise, start)?;
+        self.tuning().evaluate(task, &name, &policy).map(drop)
+    }
+
+    fn tuning(&self) -> FineTuning<'_> {
+        let Args { tune_steps, evaluated, .. } = *self.args;
+        FineTuning { robot: &self.hidden, steps: tune_steps, evaluated, seed: self.seed }
     }
 
     /// Returns the model on which a method trains; `None` for the ideal Go2.
@@ -271,24 +213,5 @@ impl<'a> Robot<'a> {
             _ => format!("{}/2-active/model.toml", method.strip_prefix("spi-")?),
         };
         Some(self.commands().path(&path))
-    }
-
-    /// Evaluates a policy on the hidden robot in MuJoCo.
-    fn evaluate(&self, task: &Task, method: &str, policy: &Path) -> Step {
-        let result = self.commands().path(&format!("{method}-{}.json", task.name));
-        if result.exists() {
-            return Ok(());
-        }
-        let hidden = self.hidden.model.display().to_string();
-        let (policy, robots) = (policy.display().to_string(), self.args.evaluated.to_string());
-        let seconds = task.seconds.to_string();
-        let json = self.commands().run(
-            &[
-                &["evaluate-policy", &policy, "--engine", "mujoco", "--model", &hidden, "--condition", "nominal"][..],
-                &["--robots", &robots, "--seconds", &seconds, "--json"],
-            ]
-            .concat(),
-        )?;
-        std::fs::write(&result, json).map_err(text)
     }
 }

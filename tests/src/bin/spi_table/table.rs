@@ -4,9 +4,10 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use twinstep_effects::ModelFile;
+use twinstep_tests::fine_tuning::{TASKS, Task};
 use twinstep_tests::resumable::{Step, number, read};
 
-use crate::{Args, FROM_RANDOM_LOGS, TASKS, Task};
+use crate::{Args, FROM_RANDOM_LOGS};
 
 /// Two-sided 95 % quantile of Student's distribution by degrees of freedom, from 1.
 const T_95: [f64; 9] = [12.71, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262];
@@ -27,8 +28,8 @@ pub fn text(args: &Args) -> Step<String> {
             methods(args, &task).all(|method| exists(args, *seed, &format!("{method}-{}.json", task.name)))
         };
         let done: Vec<u64> = seeds(args).filter(is_complete).collect();
-        if !done.is_empty() {
-            downstream(args, &task, &done, &mut text)?;
+        for error in task.errors.iter().filter(|_| !done.is_empty()) {
+            downstream(args, &task, *error, &done, &mut text)?;
         }
     }
     Ok(text)
@@ -78,12 +79,12 @@ fn trunk_kg(model: &Path) -> Step<f64> {
     Ok(model.robot_model().map_err(|error| error.to_string())?.trunk.mass)
 }
 
-/// Adds the table of a task.
-fn downstream(args: &Args, task: &Task, seeds: &[u64], text: &mut String) -> Step {
+/// Adds the table of an error of a task.
+fn downstream(args: &Args, task: &Task, (error, pointer): (&str, &str), seeds: &[u64], text: &mut String) -> Step {
     let errors = |method: &str| -> Step<Vec<[f64; 2]>> {
         let of = |seed: &u64| {
             let found = read(&args.out.join(seed.to_string()).join(format!("{method}-{}.json", task.name)))?;
-            let value = found.pointer(task.pointer).map_or(f64::NAN, number);
+            let value = found.pointer(pointer).map_or(f64::NAN, number);
             Ok([value, found.pointer(task.up).map_or(f64::NAN, number)])
         };
         seeds.iter().map(of).collect()
@@ -95,7 +96,7 @@ fn downstream(args: &Args, task: &Task, seeds: &[u64], text: &mut String) -> Ste
         "\n{}: {}, on {} robots\n\n| method | mean | by robot | did not fall | minus vanilla | minus spi-random |\n\
          |---|---|---|---|---|---|",
         task.name,
-        task.error,
+        error,
         seeds.len()
     );
     for method in methods(args, task) {
