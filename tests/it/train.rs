@@ -296,7 +296,7 @@ fn shipped_policy_jumps_to_its_target_in_two_engines() {
 }
 
 #[test]
-fn shipped_policy_turns_by_135_degrees_in_flight_in_two_engines() {
+fn shipped_policy_turns_by_135_degrees_mostly_in_flight_in_two_engines() {
     let policy = root().join("data/policies/jump_turn.safetensors");
     let evaluated = twinstep(&["evaluate-policy", policy.to_str().unwrap(), "--robots", "8", "--json"]);
     assert!(evaluated.status.success(), "{}", text(&evaluated.stderr));
@@ -304,6 +304,7 @@ fn shipped_policy_turns_by_135_degrees_in_flight_in_two_engines() {
     let nominal: Vec<_> =
         report["rows"].as_array().unwrap().iter().filter(|row| row["condition"] == "nominal").collect();
     assert_eq!(nominal.len(), 2, "batch and rapier");
+    assert!(nominal.iter().all(|row| row["targets"].as_array().unwrap().len() == 3));
     for landings in nominal.iter().flat_map(|row| row["targets"].as_array().unwrap()) {
         let number = |name: &str| landings[name].as_f64().unwrap();
         let target = landings["target"][2].as_f64().unwrap();

@@ -11,8 +11,8 @@ use crate::resumable::{Step, read, text};
 pub struct Task {
     /// Name in tables and files.
     pub name: &'static str,
-    /// Name of the task in a config file.
-    trained: &'static str,
+    /// The task in a config file.
+    task: &'static str,
     /// Settings of its fine-tuning.
     settings: &'static str,
     /// Names of the errors in the table, with JSON pointers to them in the evaluation.
@@ -34,7 +34,7 @@ impl Task {
 pub const TASKS: [Task; 5] = [
     Task {
         name: "walk",
-        trained: "walk",
+        task: "walk",
         settings: "",
         errors: &[("velocity RMS [m/s]", "/rows/0/velocity_rms")],
         up: "/rows/0/up",
@@ -42,7 +42,7 @@ pub const TASKS: [Task; 5] = [
     },
     Task {
         name: "jump",
-        trained: "jump",
+        task: "jump",
         settings: "target_x_m = [0.85, 0.85]\n",
         errors: &[("landing error of a jump of 0.85 m [m]", "/rows/0/targets/0/l_jump")],
         up: "/rows/0/targets/0/up",
@@ -50,7 +50,7 @@ pub const TASKS: [Task; 5] = [
     },
     Task {
         name: "turn",
-        trained: "jump",
+        task: "jump",
         settings: "target_x_m = [0.0, 0.0]\ntarget_yaw_rad = [2.356, 2.356]\nreward.symmetry = 0.0\n\
                    walk.reward.hip_deviation = 0.0\n",
         errors: &[
@@ -62,7 +62,7 @@ pub const TASKS: [Task; 5] = [
     },
     Task {
         name: "track",
-        trained: "track",
+        task: "track",
         settings: "",
         errors: &[("L_track, circle [m + rad]", "/rows/0/paths/0/l_track")],
         up: "/rows/0/paths/0/up",
@@ -70,7 +70,7 @@ pub const TASKS: [Task; 5] = [
     },
     Task {
         name: "attitude",
-        trained: "attitude",
+        task: "attitude",
         settings: "",
         errors: &[("L_attitude [rad]", "/rows/0/l_attitude")],
         up: "/rows/0/up",
@@ -93,16 +93,16 @@ pub struct FineTuning<'a> {
 impl FineTuning<'_> {
     /// Continues the training in the folder `start` on a model; `None`: the ideal Go2. Returns the policy.
     ///
-    /// `name` is that of its folder, and `settings` are further tables of the config file.
+    /// A policy that is there is kept. `name` is that of its folder, and `settings` are further tables of the config file.
     pub fn train(&self, task: &Task, name: &str, model: Option<&Path>, settings: &str, start: &Path) -> Step<PathBuf> {
         let commands = &self.robot.commands;
         let (out, config) = (commands.path(name), commands.path(&format!("{name}.toml")));
-        let task_table = format!("[task]\nname = \"{}\"\n{}{settings}", task.trained, task.settings);
+        let task_table = format!("[task]\nname = \"{}\"\n{}{settings}", task.task, task.settings);
         std::fs::write(&config, task_table).map_err(text)?;
         let [from, config] = [start.join("checkpoint.safetensors"), config].map(|path| path.display().to_string());
         let (steps, seed) = (self.steps.to_string(), self.seed.to_string());
         let mut arguments =
-            vec!["train", task.trained, "--config", &config, "--from", &from, "--steps", &steps, "--seed", &seed];
+            vec!["train", task.task, "--config", &config, "--from", &from, "--steps", &steps, "--seed", &seed];
         let model = model.map(|path| path.display().to_string());
         arguments.extend(model.iter().flat_map(|model| ["--model", model.as_str()]));
         commands.step(&out.join("evaluation.json"), &arguments, &out)?;

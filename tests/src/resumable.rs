@@ -48,8 +48,8 @@ impl Resumable {
         self.run(&[arguments, &["--out", &out]].concat()).map(drop)
     }
 
-    /// Trains a task on the nominal Go2, by the command of `data/policies`; `turn` is that of `jump_turn`. Returns the folder of the training, whose
-    /// checkpoint has the critic that fine-tuning needs.
+    /// Trains a task on the nominal Go2, by the command of `data/policies`; `turn` is that of `jump_turn`. Returns the folder of
+    /// the training, whose checkpoint has the critic that fine-tuning needs.
     pub fn nominal(&self, task: &str) -> Step<PathBuf> {
         let out = self.path("nominal").join(task);
         let arguments: &[&str] = match task {

@@ -29,7 +29,7 @@ const FILM_STEPS: usize = 4;
 /// The mean action of the policy steps fresh robots with the default commands of `walk`: a new one every 5 s. A policy of
 /// `track` follows a circle, a figure of eight and a square, with and without motion capture. A policy of `gait` is
 /// commanded a trot, a pace, a bound and a pronk, under nominal, robots, pushes and delay. A policy of `attitude` follows
-/// sines of roll, pitch and height. A policy of `jump` jumps once to both ends and the middle of the ranges of its targets. A robot that has fallen no longer counts for the errors,
+/// sines of roll, pitch and height. A policy of `jump` jumps once to both ends and the middle of the ranges of its targets, or to its only target. A robot that has fallen no longer counts for the errors,
 /// but its landing before the fall does. Conditions:
 ///
 ///   nominal   the robot of the model file on flat ground

@@ -7,7 +7,7 @@ use twinstep_env_server::{Config, ConfigFileError, EnvFactory, ServerConfig, Sim
 use twinstep_envs::{Randomisation, TaskConfig};
 use twinstep_learning::PpoConfig;
 use twinstep_model::{AutoresetMode, RobotModel, VecEnv};
-use twinstep_sim::SimConfig;
+use twinstep_sim::{Engine, SimConfig};
 
 use crate::exit::{Failure, input};
 
@@ -46,11 +46,15 @@ impl Default for TrainConfig {
 }
 
 impl TrainConfig {
-    /// Reads a config file.
+    /// Reads a config file. Without a physics rate, that of the batch engine is 400 Hz.
     pub fn load(path: &Path) -> Result<Self, Failure> {
         let text = std::fs::read_to_string(path)
             .map_err(|source| input(ConfigFileError::Unreadable { path: path.to_owned(), source }))?;
-        Self::parse(&text, &path.display().to_string())
+        let mut config = Self::parse(&text, &path.display().to_string())?;
+        if config.sim.engine == Engine::Batch {
+            config.sim.physics_hz.get_or_insert(TRAINING_PHYSICS_HZ);
+        }
+        Ok(config)
     }
 
     /// Parses the text of a config file. Errors refer to the file as `name`.
@@ -89,5 +93,23 @@ impl TrainConfig {
         };
         config.check().map_err(input)?;
         SimEnvFactory::new(config).map_err(input)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_key_of_the_simulation_leaves_the_physics_rate_of_a_training() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("train.toml");
+        let physics_hz = |text: &str| {
+            std::fs::write(&path, text).expect("written");
+            TrainConfig::load(&path).expect("valid").sim.physics_hz
+        };
+        assert_eq!(physics_hz("[sim]\nterrain = { slope_rad = 0.1 }"), Some(TRAINING_PHYSICS_HZ));
+        assert_eq!(physics_hz("[sim]\nphysics_hz = 800"), Some(800));
+        assert_eq!(physics_hz("[sim]\nengine = \"rapier\""), None, "the rate that is recommended for rapier");
     }
 }

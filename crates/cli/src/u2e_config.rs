@@ -2,10 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
 use twinstep_effects::{ActuatorNetworkConfig, MemberSampling, ModelFile};
 use twinstep_ensemble::check_effects;
-use twinstep_envs::{ExploreConfig, Randomisation, TaskConfig};
+use twinstep_envs::{ExploreConfig, Randomisation, TaskConfig, over_defaults};
 use twinstep_excite::Limits;
 use twinstep_learning::PpoConfig;
 use twinstep_logs::TorqueSensor;
@@ -106,7 +107,7 @@ pub struct U2eConfig {
     #[serde(default)]
     randomise: Randomisation,
     /// Training of the exploration policies.
-    #[serde(default = "default_train")]
+    #[serde(default = "default_train", deserialize_with = "train_table")]
     train: PpoConfig,
 }
 
@@ -176,6 +177,11 @@ const fn default_seed() -> u64 {
 /// The residual is a correction, so that fewer steps than for walking are enough.
 fn default_train() -> PpoConfig {
     PpoConfig { total_steps: 2_000_000, ..PpoConfig::default() }
+}
+
+/// Returns the settings of `[train]`, of which every key is optional.
+fn train_table<'de, D: Deserializer<'de>>(deserializer: D) -> Result<PpoConfig, D::Error> {
+    over_defaults(&default_train(), toml::Table::deserialize(deserializer)?).map_err(D::Error::custom)
 }
 
 impl U2eConfig {
@@ -339,6 +345,14 @@ pub fn relative_decrease(uncertainties: &[f64]) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn one_key_of_the_training_leaves_its_other_defaults() {
+        let table = |text: &str| train_table(toml::Deserializer::parse(text).expect("a table"));
+        assert_eq!(table("epochs = 4").expect("valid"), PpoConfig { epochs: 4, ..default_train() });
+        let error = table("epoch = 4").expect_err("invalid").to_string();
+        assert!(error.starts_with("unknown field `epoch`, expected one of `num_envs`"), "{error}");
+    }
 
     #[test]
     fn iterations_end_when_the_uncertainty_of_new_data_no_longer_decreases_enough() {

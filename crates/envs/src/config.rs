@@ -1,4 +1,7 @@
-//! Checks of the values in a config file.
+//! Tables of a config file: their defaults, and checks of their values.
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 
 /// A closed range `[low, high]`.
 pub type Range = [f32; 2];
@@ -37,4 +40,23 @@ pub fn check_range(field: &str, range: Range, low: f32, high: f32) -> Result<(),
     }
     let allowed = format!("[low, high] with low <= high, both within {low} to {high}");
     Err(ConfigError { field: field.to_owned(), value: format!("{range:?}"), allowed })
+}
+
+/// Returns `defaults` with the values of `table`.
+///
+/// A table within it, such as `walk.reward` of a task, replaces only the keys that it has, whatever the defaults of its type are.
+pub fn over_defaults<T: Serialize + DeserializeOwned>(defaults: &T, table: toml::Table) -> Result<T, String> {
+    let mut settings = toml::Table::try_from(defaults).map_err(|error| error.to_string())?;
+    replace(&mut settings, table);
+    settings.try_into().map_err(|error: toml::de::Error| error.to_string().trim_end().to_owned())
+}
+
+/// Replaces the values of `settings` that `table` has, table by table.
+fn replace(settings: &mut toml::Table, table: toml::Table) {
+    for (key, value) in table {
+        match (settings.get_mut(&key), value) {
+            (Some(toml::Value::Table(settings)), toml::Value::Table(table)) => replace(settings, table),
+            (_, value) => drop(settings.insert(key, value)),
+        }
+    }
 }

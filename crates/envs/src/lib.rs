@@ -27,7 +27,7 @@ pub mod tasks;
 pub mod trot;
 
 pub use check::{CheckError, check_vec_env};
-pub use config::ConfigError;
+pub use config::{ConfigError, over_defaults};
 pub use counter::{Counter, CounterEnv};
 pub use observation::{CRITIC_OBS_LEN, OBS_LEN, base_spec, observe, observe_privileged, privileged_fields};
 pub use observation_noise::ObservationNoise;

@@ -1,4 +1,5 @@
-//! Error of identified models, and of policies that are fine-tuned on them, against robot time, for several ways of choosing the motions.
+//! Error of identified models, and of policies that are fine-tuned on them, against robot time, for several ways of choosing the
+//! motions.
 //!
 //! `cargo build --release --workspace && target/release/robot_time --out robot-time`. Needs Python with the package's extra
 //! `mujoco`; `TWINSTEP_PYTHON` is its interpreter. Each step is a command of `twinstep` whose result is kept, so that the
@@ -25,7 +26,7 @@ struct Args {
     #[arg(long, default_value_t = 3)]
     robots: u64,
     /// Number of logs after the first one.
-    #[arg(long, default_value_t = 4)]
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..))]
     rounds: u32,
     /// Duration of each log [s].
     #[arg(long, default_value_t = 10.0)]
@@ -86,7 +87,7 @@ fn campaign(args: &Args) -> Step<String> {
             let models = models(args, &hidden, method, seed, &endpoint)?;
             Ok(Errors {
                 q_rmse: models.iter().map(|model| held_out_errors(&hidden, model)).collect::<Step<_>>()?,
-                landing: landing_errors(args, &hidden, method, seed, &models)?,
+                landing: landings(args, &hidden, method, seed, &models)?,
             })
         };
         errors.push(args.methods.iter().map(of_method).collect::<Step<Vec<_>>>()?);
@@ -99,8 +100,16 @@ fn campaign(args: &Args) -> Step<String> {
 struct Errors {
     /// Error of the joint position of the model after each log, by held-out log [rad].
     q_rmse: Vec<[f64; 2]>,
-    /// Landing error of the policies that were fine-tuned on the first and the last model [m]; empty without fine-tuning.
-    landing: Vec<f64>,
+    /// Landings of the policies that were fine-tuned on the first and the last model; empty without fine-tuning.
+    landing: Vec<Landing>,
+}
+
+/// Landings of a policy on the robot.
+struct Landing {
+    /// Mean error of those that landed [m].
+    error: f64,
+    /// Share of the jumps that landed.
+    landed: f64,
 }
 
 /// Collects logs with a method and identifies the robot after each of them. Returns the models.
@@ -130,26 +139,29 @@ fn held_out_errors(hidden: &MujocoGroundTruth, model: &Path) -> Step<[f64; 2]> {
     Ok([error(0)?, error(1)?])
 }
 
-/// Continues the training of the nominal policy `jump` on the first and the last model. Returns the landing errors on the robot [m].
-fn landing_errors(
+/// Continues the training of the nominal policy `jump` on the first and the last model. Returns the landings on the robot.
+fn landings(
     args: &Args,
     hidden: &MujocoGroundTruth,
     method: &str,
     seed: u64,
     models: &[PathBuf],
-) -> Step<Vec<f64>> {
+) -> Step<Vec<Landing>> {
+    if args.tune_steps == 0 {
+        return Ok(Vec::new());
+    }
     let task = TASKS.iter().find(|task| task.name == "jump").expect("a task");
-    let ([first, .., last], 1..) = (models, args.tune_steps) else { return Ok(Vec::new()) };
-    // All but `uncertainty` have the first log of `random`, and its model.
-    let of_first = if method == "uncertainty" { method } else { "random" };
     let tuning = FineTuning { robot: hidden, steps: args.tune_steps, evaluated: EVALUATED, seed };
     let start = Resumable::new(&args.out)?.nominal(task.name)?;
-    let [(_, pointer), ..] = task.errors else { return Ok(Vec::new()) };
-    let error = |name: &str, model: &Path| -> Step<f64> {
+    let landing = |name: &str, model: &Path| -> Step<Landing> {
         let policy = tuning.train(task, name, Some(model), "", &start)?;
-        Ok(tuning.evaluate(task, name, &policy)?.pointer(pointer).map_or(f64::NAN, number))
+        let target = &tuning.evaluate(task, name, &policy)?["rows"][0]["targets"][0];
+        Ok(Landing { error: number(&target["l_jump"]), landed: number(&target["landed"]) })
     };
-    Ok(vec![error(&format!("{of_first}-first-jump"), first)?, error(&format!("{method}-last-jump"), last)?])
+    // All but `uncertainty` have the first log of `random`, and its model.
+    let of_first = if method == "uncertainty" { method } else { "random" };
+    let [first, last] = [&models[0], &models[models.len() - 1]];
+    Ok(vec![landing(&format!("{of_first}-first-jump"), first)?, landing(&format!("{method}-last-jump"), last)?])
 }
 
 /// Collects logs with exploration policies of U2E, and identifies the same unknowns from them. Returns the models.
@@ -224,7 +236,13 @@ fn table(args: &Args, errors: &[Vec<Errors>]) -> String {
     if args.tune_steps > 0 {
         let ends = ["first model", "last model"].map(str::to_owned);
         let _ = writeln!(table, "\nLanding error of a jump of 0.85 m after fine-tuning [mm]");
-        rows(args, errors, &ends, &mut table, |errors, end| 1e3 * errors.landing[end]);
+        rows(args, errors, &ends, &mut table, |errors, end| 1e3 * errors.landing[end].error);
+        let landed = errors.iter().flatten().flat_map(|errors| &errors.landing).map(|landing| landing.landed);
+        let _ = writeln!(
+            table,
+            "\nLanded: at least {:.0} % of the jumps of each policy",
+            100.0 * landed.fold(1.0, f64::min)
+        );
     }
     table
 }
@@ -250,8 +268,8 @@ fn rows(
     }
 }
 
-/// Returns the figure: the mean errors over robot time, a panel for each held-out log and one for the policies, and a line for each
-/// method.
+/// Returns the figure: the mean errors over robot time, a panel for each held-out log and one for the policies, and a line for
+/// each method.
 fn figure(args: &Args, errors: &[Vec<Errors>]) -> Step<String> {
     let stages = args.rounds as usize + 1;
     let panel = |caption: String, y_label, columns: &[usize], error: &dyn Fn(&Errors, usize) -> f64| {
@@ -260,7 +278,7 @@ fn figure(args: &Args, errors: &[Vec<Errors>]) -> Step<String> {
                 let values = by_robot(errors, method, |errors| error(errors, index));
                 ((stage + 1) as f64 * args.seconds, 1e3 * mean(&values))
             };
-            let pieces = vec![columns.iter().enumerate().map(point).collect()];
+            let pieces = vec![columns.iter().enumerate().map(point).filter(|(_, error)| error.is_finite()).collect()];
             Line { colour: COLOURS[method % COLOURS.len()], width: 5, pieces }
         };
         let lines: Vec<Line> = (0..args.methods.len()).map(line).collect();
@@ -277,7 +295,7 @@ fn figure(args: &Args, errors: &[Vec<Errors>]) -> Step<String> {
         .collect();
     if args.tune_steps > 0 {
         let caption = "jump of 0.85 m, fine-tuned policy".to_owned();
-        panels.push(panel(caption, "landing error [mm]", &[0, stages - 1], &|errors, end| errors.landing[end]));
+        panels.push(panel(caption, "landing error [mm]", &[0, stages - 1], &|errors, end| errors.landing[end].error));
     }
     let names: Vec<(&str, RGBColor)> =
         args.methods.iter().map(String::as_str).zip(COLOURS.into_iter().cycle()).collect();

@@ -276,7 +276,9 @@ impl Campaign {
         for method in ["start"].iter().chain(&METHODS) {
             let track = read(&self.path(&format!("{method}-track.json")))?;
             let jump = read(&self.path(&format!("{method}-jump.json")))?;
-            let (paths, jumps) = (&track["rows"][0]["paths"], &jump["rows"][0]["targets"][0]);
+            // The middle of the trained range of the start; the others have one target.
+            let targets = jump["rows"][0]["targets"].as_array().ok_or("an evaluation of jumps")?;
+            let (paths, jumps) = (&track["rows"][0]["paths"], &targets[targets.len() / 2]);
             let _ = writeln!(
                 table,
                 "| {method} | {:.3} | {:.3} | {:.0} % | {:.3} | {:+.3} | {:.0} % |",

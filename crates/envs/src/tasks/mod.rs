@@ -1,9 +1,8 @@
 //! The tasks, one file each, and the `[task]` table of a config file.
 
-use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use crate::ConfigError;
+use crate::config::{ConfigError, over_defaults};
 
 pub mod attitude;
 pub mod attitude_config;
@@ -137,35 +136,15 @@ impl TryFrom<toml::Table> for TaskConfig {
     fn try_from(mut table: toml::Table) -> Result<Self, String> {
         let name = table.remove("name").unwrap_or_else(|| "walk".into());
         match name.as_str() {
-            Some("walk") => over_defaults(table).map(Self::Walk),
-            Some("track") => over_defaults(table).map(Self::Track),
-            Some("jump") => over_defaults(table).map(Self::Jump),
-            Some("gait") => over_defaults(table).map(Self::Gait),
-            Some("attitude") => over_defaults(table).map(Self::Attitude),
-            Some("explore") => over_defaults(table).map(Self::Explore),
+            Some("walk") => over_defaults(&WalkConfig::default(), table).map(Self::Walk),
+            Some("track") => over_defaults(&TrackConfig::default(), table).map(Self::Track),
+            Some("jump") => over_defaults(&JumpConfig::default(), table).map(Self::Jump),
+            Some("gait") => over_defaults(&GaitConfig::default(), table).map(Self::Gait),
+            Some("attitude") => over_defaults(&AttitudeConfig::default(), table).map(Self::Attitude),
+            Some("explore") => over_defaults(&ExploreConfig::default(), table).map(Self::Explore),
             Some("counter") if table.is_empty() => Ok(Self::Counter),
             Some("counter") => Err("the task `counter` has no settings besides `name`".to_owned()),
             _ => Err(format!("`name` = {name} is not a task; possible: {}", Self::NAMES.join(", "))),
-        }
-    }
-}
-
-/// Returns the default settings of a task with the values of `table`.
-///
-/// A table within it, such as `walk.reward`, replaces only the keys that it has: the defaults of the others are those of the
-/// task, which may differ from those of `walk`.
-fn over_defaults<T: Default + Serialize + DeserializeOwned>(table: toml::Table) -> Result<T, String> {
-    let mut settings = toml::Table::try_from(T::default()).map_err(|error| error.to_string())?;
-    replace(&mut settings, table);
-    settings.try_into().map_err(|error: toml::de::Error| error.to_string().trim_end().to_owned())
-}
-
-/// Replaces the values of `settings` that `table` has, table by table.
-fn replace(settings: &mut toml::Table, table: toml::Table) {
-    for (key, value) in table {
-        match (settings.get_mut(&key), value) {
-            (Some(toml::Value::Table(settings)), toml::Value::Table(table)) => replace(settings, table),
-            (_, value) => drop(settings.insert(key, value)),
         }
     }
 }
@@ -186,7 +165,8 @@ mod tests {
         let common = WalkConfig { tracking_sigma: 0.5, ..WalkConfig::default() };
         assert_eq!(track, TaskConfig::Track(TrackConfig { walk: common, ..config }));
         assert_eq!(parse("name = \"counter\"").expect("valid"), TaskConfig::Counter);
-        for task in [walk, track, TaskConfig::Counter] {
+        let others = ["jump", "gait"].map(|name| TaskConfig::named(name).expect("a task"));
+        for task in [walk, track, TaskConfig::Counter].into_iter().chain(others) {
             assert_eq!(parse(&toml::to_string(&task).expect("serialised")).expect("valid"), task);
         }
         for name in TaskConfig::NAMES {
@@ -200,11 +180,11 @@ mod tests {
         let jump = parse("name = \"jump\"\nwalk.reward.hip_deviation = 0.0");
         let mut expected = JumpConfig::default();
         expected.walk.reward.hip_deviation = 0.0;
-        assert_eq!(jump, TaskConfig::Jump(expected), "no term of walking, 3 s");
+        assert_eq!(jump, TaskConfig::Jump(expected), "the other weights and the end of an episode are those of `jump`");
         let gait = parse("name = \"gait\"\n[walk.command]\nlinear_velocity_x = [0.0, 0.5]");
         let mut expected = GaitConfig::default();
         expected.walk.command.linear_velocity_x = [0.0, 0.5];
-        assert_eq!(gait, TaskConfig::Gait(expected), "no sideways commands");
+        assert_eq!(gait, TaskConfig::Gait(expected), "sideways commands stay zero");
     }
 
     #[test]

@@ -28,8 +28,8 @@ pub fn text(args: &Args) -> Step<String> {
             methods(args, &task).all(|method| exists(args, *seed, &format!("{method}-{}.json", task.name)))
         };
         let done: Vec<u64> = seeds(args).filter(is_complete).collect();
-        for error in task.errors.iter().filter(|_| !done.is_empty()) {
-            downstream(args, &task, *error, &done, &mut text)?;
+        if !done.is_empty() {
+            task.errors.iter().try_for_each(|error| downstream(args, &task, *error, &done, &mut text))?;
         }
     }
     Ok(text)
