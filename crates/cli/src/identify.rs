@@ -35,7 +35,8 @@ pub struct Args {
     /// Model file to start from. Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     pub model: Option<PathBuf>,
-    /// Model file of an earlier identification of the same effects, from whose values the search starts.
+    /// Model file of an earlier identification, from whose values the search starts. An effect that it lacks starts as in
+    /// --model, or with no effect.
     #[arg(long, value_name = "FILE")]
     pub start: Option<PathBuf>,
     /// Effects to estimate, with scopes, as in `coulomb_friction@calf,payload@base`. `twinstep effects` lists them.

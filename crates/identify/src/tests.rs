@@ -270,6 +270,7 @@ fn search_starts_from_the_values_of_an_earlier_model() {
     let effects = [(named("viscous_friction"), scope), (named("coulomb_friction"), scope)];
     let entry = |index: usize, value: f64| EffectEntry::new(effects[index].0, scope, vec![value]).expect("allowed");
     let earlier = ModelFile { effects: vec![entry(0, 0.2), entry(1, 0.5)], ..ModelFile::default() };
+    let with_one = ModelFile { effects: vec![entry(1, 0.5)], ..ModelFile::default() };
     let values = |start: Option<ModelFile>| {
         let options = IdentifyOptions { start, ..IdentifyOptions::default() };
         // Interrupted before the search.
@@ -279,6 +280,8 @@ fn search_starts_from_the_values_of_an_earlier_model() {
     };
     let found = values(Some(earlier));
     assert!((found[0] - 0.2).abs() < 1e-9 && (found[1] - 0.5).abs() < 1e-9, "{found:?}");
+    let found = values(Some(with_one));
+    assert!(found[0] == 0.0 && (found[1] - 0.5).abs() < 1e-9, "the other starts with no effect: {found:?}");
     assert_eq!(values(None), [0.0, 0.0]);
 }
 
