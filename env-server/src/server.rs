@@ -181,9 +181,10 @@ impl Server {
             .map_err(|error| ServerError::Declare { key: keys::frame(&self.sid), reason: error.to_string() })
     }
 
-    /// Returns the ids of the clients that have environments.
-    pub fn clients(&self) -> Vec<String> {
-        self.lease_manager.clients()
+    /// Returns what tells the ids of the clients that have environments.
+    pub fn client_ids(&self) -> impl Fn() -> Vec<String> + Send + 'static {
+        let lease_manager = Arc::clone(&self.lease_manager);
+        move || lease_manager.clients()
     }
 
     /// Finishes the steps in progress, notifies the clients, and closes the session.

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use twinstep_model::{Backend, BaseMount, PerJoint, RobotModel, go2};
 use twinstep_robot::fake::{FakeConfig, FakeRobot};
-use twinstep_robot::{Action, Client, Input, OperatorRequest, Output, Reading, SafetyConfig, SafetyMachine, State};
+use twinstep_robot::{Action, Input, OperatorRequest, Output, Reading, SafetyConfig, SafetyMachine, State};
 use twinstep_sim::{BatchBackend, SimConfig};
 use twinstep_unitree::{LowState, decode, encode};
 
@@ -69,16 +69,7 @@ impl Rig {
     pub fn new(config: FakeConfig) -> Self {
         let machine = SafetyMachine::new(&robot_at_500_hz(), SafetyConfig::default());
         let mut machine = machine.expect("the default settings are valid");
-        let input = Input {
-            now: Duration::ZERO,
-            reading: None,
-            foreign_writers: 0,
-            controller_released: true,
-            stop_requested: false,
-            request: None,
-            client: Client::Connected,
-            action: None,
-        };
+        let input = Input::quiet(Duration::ZERO);
         let output = machine.step(&input);
         Self { robot: fake_robot(config), machine, input, output, last_state: None, num_states: 0 }
     }
@@ -119,10 +110,10 @@ impl Rig {
     pub fn step(&mut self) {
         self.input.now += PERIOD;
         let states = self.robot.step().expect("the simulation has one robot");
-        self.input.reading = None;
+        self.input.readings.clear();
         for state in &states {
             let state: LowState = decode(&encode(state)).expect("an encoded message");
-            self.input.reading = Reading::new(&state).ok();
+            self.input.readings.extend(Reading::new(&state).ok());
             (self.last_state, self.num_states) = (Some(state), self.num_states + 1);
         }
         self.input.foreign_writers = usize::from(self.robot.wants_foreign_writer());
@@ -169,7 +160,7 @@ impl Rig {
 
     /// Sends an action for a tick with the next step [action scale].
     pub fn act_for(&mut self, tick: u64, values: PerJoint) {
-        self.input.action = Some(Action { tick: Some(tick), values });
+        self.input.action = Some(Action { tick, values });
     }
 
     /// Advances by 2 ms with a request of the operator, which must be accepted.

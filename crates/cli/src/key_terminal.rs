@@ -2,7 +2,7 @@
 
 use std::io::{Read, stdin};
 
-use rustix::termios::{LocalModes, OptionalActions, SpecialCodeIndex, Termios, tcgetattr, tcsetattr};
+use rustix::termios::{InputModes, LocalModes, OptionalActions, SpecialCodeIndex, Termios, tcgetattr, tcsetattr};
 
 /// Terminal that does not wait for whole lines and does not show the keys, until the value is dropped.
 pub struct KeyTerminal(Termios);
@@ -14,6 +14,8 @@ impl KeyTerminal {
         let mut modes = before.clone();
         // Ctrl-C stays a signal.
         modes.local_modes -= LocalModes::ICANON | LocalModes::ECHO;
+        // Ctrl-S must not stop what is shown: nobody would see that it does.
+        modes.input_modes -= InputModes::IXON;
         // A read returns after 0.1 s without a key.
         modes.special_codes[SpecialCodeIndex::VMIN] = 0;
         modes.special_codes[SpecialCodeIndex::VTIME] = 1;
@@ -32,9 +34,16 @@ impl KeyTerminal {
     }
 }
 
-impl Drop for KeyTerminal {
-    fn drop(&mut self) {
+impl KeyTerminal {
+    /// Gives the terminal its modes back.
+    pub fn close(&self) {
         // Nothing is left to do if it fails.
         let _ = tcsetattr(stdin(), OptionalActions::Now, &self.0);
+    }
+}
+
+impl Drop for KeyTerminal {
+    fn drop(&mut self) {
+        self.close();
     }
 }

@@ -4,6 +4,8 @@ use std::collections::VecDeque;
 use std::io::Write;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use crate::line_printer;
+
 /// Number of messages that are kept for the screen.
 const KEPT: usize = 100;
 
@@ -13,14 +15,14 @@ static SCREEN: Mutex<Option<VecDeque<String>>> = Mutex::new(None);
 /// Writer of log messages.
 pub struct LogWriter;
 
-/// Sends log messages to the screen until the value is dropped, which writes them to stderr.
+/// Sends log messages to the screen until [`ScreenLog::end`].
 pub struct ScreenLog(());
 
 fn screen() -> MutexGuard<'static, Option<VecDeque<String>>> {
     SCREEN.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-#[expect(clippy::unused_self, reason = "messages are kept only while the value exists")]
+#[expect(clippy::unused_self, reason = "messages are kept only between the beginning and the end of the value")]
 impl ScreenLog {
     /// Begins to keep the messages.
     pub fn begin() -> Self {
@@ -41,10 +43,13 @@ impl ScreenLog {
     }
 }
 
-impl Drop for ScreenLog {
-    fn drop(&mut self) {
-        for line in screen().take().into_iter().flatten() {
-            eprintln!("{line}");
+impl ScreenLog {
+    /// Writes the messages to stderr, and later ones too.
+    #[expect(clippy::unused_self, reason = "the messages were kept by this value")]
+    pub fn end(&self) {
+        let lines = screen().take();
+        for line in lines.into_iter().flatten() {
+            line_printer::print_log(format!("{line}\n").as_bytes());
         }
     }
 }
@@ -62,7 +67,8 @@ impl Write for LogWriter {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         let mut lines = screen();
         if lines.is_none() {
-            return std::io::stderr().write(bytes);
+            drop(lines);
+            return if line_printer::print_log(bytes) { Ok(bytes.len()) } else { std::io::stderr().write(bytes) };
         }
         for line in without_colours(&String::from_utf8_lossy(bytes)).lines() {
             keep(&mut lines, line);

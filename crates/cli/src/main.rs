@@ -23,6 +23,7 @@ mod hunt;
 mod identify;
 mod key_terminal;
 mod learned_residual;
+mod line_printer;
 mod list;
 mod log;
 mod log_writer;
@@ -46,6 +47,7 @@ mod spi_active_config;
 mod spi_active_report;
 mod stage_files;
 mod status_line;
+mod stop_signals;
 mod train;
 mod train_config;
 mod train_endpoints;
@@ -60,6 +62,7 @@ mod view;
 mod view_endpoint;
 mod view_log;
 mod view_policy;
+mod watchdog;
 mod web_view;
 
 use clap::{Parser, Subcommand};
@@ -99,10 +102,15 @@ enum CliCommand {
     #[command(name = "u2e")]
     U2e(u2e::Args),
     View(view::Args),
+    #[command(hide = true)]
+    Watchdog(watchdog::Args),
 }
 
 fn main() -> std::process::ExitCode {
     let command = Cli::parse().command;
+    if let CliCommand::Watchdog(args) = &command {
+        return exit::code(watchdog::run(args));
+    }
     let log = match &command {
         // Their errors have the reason; Zenoh would write two lines for each attempt to connect.
         CliCommand::List(_) | CliCommand::Run(_) | CliCommand::SpiActive(_) | CliCommand::U2e(_) => "warn,zenoh=off",
@@ -136,6 +144,7 @@ fn main() -> std::process::ExitCode {
         CliCommand::Train(args) => train::run(&args),
         CliCommand::U2e(args) => u2e::run(&args),
         CliCommand::View(args) => view::run(&args),
+        CliCommand::Watchdog(args) => watchdog::run(&args),
     });
     exit::code(result)
 }

@@ -1,9 +1,13 @@
 //! What the operator at the robot's host types, and what the robot answers.
 
-use std::io::{BufRead, Write};
+use std::io::BufRead;
+use std::sync::mpsc::channel;
 use std::time::Duration;
 
+use twinstep_robot::watchdog::Watchdog;
 use twinstep_robot::{Board, Histogram, OperatorRequest, RobotHandle, Timing};
+
+use crate::line_printer::print_line;
 
 /// Time in which the control loop takes in a request.
 const ANSWER_TIME: Duration = Duration::from_millis(500);
@@ -15,37 +19,45 @@ stand    move to the standing pose; clients may then act
 sit      move to the crouched pose, then damping
 damp     damping at once
 disarm   stop sending commands
+go       let the client act again after a fault
 release  release the robot's built-in controller
 stop     damping at once, as a fault
 status   state, temperatures, battery, timing
 timing   how punctual the control loop is, as JSON
 quit     damp, then end";
 
-/// Reads requests from stdin until it closes or `quit`. Returns the receiver of `quit`.
-pub fn listen(handle: &RobotHandle) -> std::sync::mpsc::Receiver<()> {
-    let (quit, quits) = std::sync::mpsc::channel();
-    let handle = handle.clone();
-    std::thread::spawn(move || {
+/// Reads requests from stdin until it closes or `quit`. `stop` and `quit` are executed by the thread that reads; the others
+/// are, and all answers are printed, by another one.
+pub fn listen(handle: &RobotHandle) -> std::io::Result<()> {
+    let (requests, received) = channel::<String>();
+    let (reader, worker) = (handle.clone(), handle.clone());
+    std::thread::Builder::new().name("requests".to_owned()).spawn(move || {
+        for request in received {
+            print_line(&answer(&worker, &request));
+        }
+    })?;
+    std::thread::Builder::new().name("stdin".to_owned()).spawn(move || {
+        // The robot stays as it is when stdin closes; signals still end it.
         for line in std::io::stdin().lock().lines().map_while(Result::ok) {
-            match line.trim() {
-                "" => {}
-                "quit" => {
-                    let _ = quit.send(());
-                    return;
-                }
-                request => print_line(&answer(&handle, request)),
+            stop_at_once(&reader, line.trim());
+            if !matches!(line.trim(), "" | "quit") {
+                let _ = requests.send(line.trim().to_owned());
             }
         }
-        // The robot stays as it is without an operator's terminal; signals still end it.
-        std::mem::forget(quit);
-    });
-    quits
+    })?;
+    Ok(())
 }
 
-/// Prints a line to stdout. A reader that is gone must not end the process, because the process holds the robot.
-pub fn print_line(line: &str) {
-    let mut stdout = std::io::stdout().lock();
-    let _ = writeln!(stdout, "{line}").and_then(|()| stdout.flush());
+/// Executes `stop` and `quit`, which wait for no answer.
+pub fn stop_at_once(handle: &RobotHandle, request: &str) {
+    match request {
+        "stop" => handle.stop(),
+        "quit" => {
+            handle.stop();
+            handle.end();
+        }
+        _ => {}
+    }
 }
 
 /// Executes a request and returns the answer, which begins with `ok` or `error`.
@@ -56,27 +68,22 @@ pub fn answer(handle: &RobotHandle, request: &str) -> String {
         "sit" => OperatorRequest::Sit,
         "damp" => OperatorRequest::Damp,
         "disarm" => OperatorRequest::Disarm,
+        "go" => OperatorRequest::Go,
         "release" => {
             handle.release_controller();
             return "ok release".to_owned();
         }
-        "stop" => {
-            handle.stop();
-            return "ok stop".to_owned();
-        }
+        // It was executed when it was read.
+        "stop" => return "ok stop".to_owned(),
         "status" => return status(handle),
         "timing" => return format!("ok {}", timing_json(&handle.timing())),
         "help" => return format!("ok help\n{HELP}"),
         _ => return format!("error `{request}` is not known; possible:\n{HELP}"),
     };
-    let before = handle.board().requests;
-    handle.request(request);
-    let board = handle.wait_until(ANSWER_TIME, |board| board.requests > before);
     let name = format!("{request:?}").to_lowercase();
-    match board.request_refused {
-        _ if board.requests == before => format!("error {name}: the control loop does not answer"),
-        Some(refusal) => format!("error {name}: {refusal}"),
-        None => format!("ok {name}"),
+    match handle.request(request, ANSWER_TIME) {
+        Ok(()) => format!("ok {name}"),
+        Err(refused) => format!("error {name}: {refused}"),
     }
 }
 
@@ -108,6 +115,25 @@ fn timing_json(timing: &Timing) -> serde_json::Value {
     })
 }
 
+/// Returns whether a client has the robot, and may act.
+fn client_text(board: &Board) -> &'static str {
+    match (board.has_client, board.is_permitted) {
+        (false, _) => "no",
+        (true, true) => "yes",
+        (true, false) => "waits for `go`",
+    }
+}
+
+/// Returns what the watchdog does, in a word.
+pub fn watchdog_text(watchdog: Watchdog) -> &'static str {
+    match watchdog {
+        Watchdog::Missing => "GONE",
+        Watchdog::Idle => "ready",
+        Watchdog::Guarding => "guards",
+        Watchdog::TookOver => "TOOK OVER",
+    }
+}
+
 fn status(handle: &RobotHandle) -> String {
     let (board, timing) = (handle.board(), handle.timing());
     let mut lines = vec![state_line(&board)];
@@ -122,9 +148,10 @@ fn status(handle: &RobotHandle) -> String {
     }
     let controller = if board.controller_released { "released" } else { "not released" };
     lines.push(format!(
-        "built-in controller {controller}; other writers {}; client {}",
+        "built-in controller {controller}; other writers {}; client {}; watchdog {}",
         board.foreign_writers,
-        if board.has_client { "yes" } else { "no" }
+        client_text(&board),
+        watchdog_text(board.watchdog),
     ));
     let ms = |time: Duration| 1e3 * time.as_secs_f64();
     lines.push(format!(

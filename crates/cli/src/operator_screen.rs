@@ -1,6 +1,8 @@
 //! The operator's screen: state, measurements and timing of the robot, and a key for each request.
 
 use std::io::IsTerminal;
+use std::sync::Arc;
+use std::sync::mpsc::{Sender, channel};
 use std::time::Duration;
 
 use ratatui::Frame;
@@ -14,25 +16,32 @@ use ratatui::widgets::{Paragraph, Row, Table};
 use twinstep_model::{Joint, PerJoint};
 use twinstep_robot::{Board, Reading, RobotHandle, State, Timing};
 
-use crate::exit::{CommandResult, Failure, Signals, other};
+use crate::exit::{CommandResult, Failure, other};
 use crate::key_terminal::KeyTerminal;
 use crate::log_writer::ScreenLog;
 use crate::operator;
 
 /// Keys with what they stand for.
-const KEYS: [(u8, &str); 7] = [
+const KEYS: [(u8, &str); 8] = [
     (b'r', "release"),
     (b'a', "arm"),
     (b's', "stand"),
     (b't', "sit"),
     (b'd', "damp"),
     (b'x', "disarm"),
+    (b'g', "go"),
     (b' ', "stop"),
 ];
 /// Width of the bar of a torque, for the limit of its joint.
 const BAR: usize = 20;
 /// Motor temperatures from which a number is yellow, and red [°C].
-const WARM: [i8; 2] = [60, 75];
+const WARM: [u8; 2] = [60, 75];
+/// Period of the pictures.
+const FRAME: Duration = Duration::from_millis(100);
+/// Interval at which the end is looked for.
+const TICK: Duration = Duration::from_millis(20);
+/// Longest time that the last picture may take.
+const LAST_FRAME: Duration = Duration::from_millis(300);
 
 /// What the screen shows.
 struct View<'a> {
@@ -54,40 +63,91 @@ pub fn is_possible() -> bool {
 }
 
 /// Shows the screen and executes the operator's keys until `q`, a signal or the end of the control loop.
+///
+/// One thread reads the keys and never writes; `stop` and `quit` take effect there. One executes the other requests, and one
+/// draws: it may wait for a terminal that stands still.
 pub fn run(
+    handle: &RobotHandle,
+    torque_limits: PerJoint,
+    place: &str,
+    clients: impl Fn() -> Vec<String> + Send + 'static,
+) -> CommandResult {
+    let keys = Arc::new(KeyTerminal::open().map_err(other)?);
+    let log = Arc::new(ScreenLog::begin());
+    let (requests, received) = channel();
+    start("keys", {
+        let (handle, keys) = (handle.clone(), Arc::clone(&keys));
+        move || read_keys(&handle, &keys, &requests)
+    })?;
+    start("requests", {
+        let (handle, log) = (handle.clone(), Arc::clone(&log));
+        move || {
+            for request in received {
+                log.add(&operator::answer(&handle, request));
+            }
+        }
+    })?;
+    let (drawn, has_drawn) = channel::<()>();
+    start("screen", {
+        let (handle, log, place) = (handle.clone(), Arc::clone(&log), place.to_owned());
+        move || {
+            let _drawn = drawn;
+            if let Err(error) = show(&handle, &torque_limits, &place, &clients, &log) {
+                tracing::warn!(%error, "the screen is not shown");
+            }
+        }
+    })?;
+    while !handle.is_ending() && !handle.has_ended() {
+        std::thread::sleep(TICK);
+    }
+    let has_failed = !handle.is_ending();
+    handle.stop();
+    // A screen that stands still is left as it is.
+    let _ = has_drawn.recv_timeout(LAST_FRAME);
+    keys.close();
+    log.end();
+    if has_failed {
+        return Err(Failure::Other(miette::miette!("the control loop failed; the watchdog damps the motors")));
+    }
+    Ok(())
+}
+
+fn start(name: &str, task: impl FnOnce() + Send + 'static) -> Result<(), Failure> {
+    std::thread::Builder::new().name(name.to_owned()).spawn(task).map(drop).map_err(other)
+}
+
+/// Reads keys until the end of the process.
+fn read_keys(handle: &RobotHandle, keys: &KeyTerminal, requests: &Sender<&'static str>) {
+    let mut bytes = [0; 16];
+    while let Ok(read) = keys.read(&mut bytes) {
+        for key in read {
+            let request = KEYS.iter().find(|(letter, _)| letter == key).map(|(_, request)| *request);
+            operator::stop_at_once(handle, if *key == b'q' { "quit" } else { request.unwrap_or_default() });
+            if let Some(request) = request {
+                let _ = requests.send(request);
+            }
+        }
+    }
+}
+
+/// Draws the screen until the robot is to end, or the control loop has ended.
+fn show(
     handle: &RobotHandle,
     torque_limits: &PerJoint,
     place: &str,
     clients: &dyn Fn() -> Vec<String>,
-    signals: &Signals,
-) -> CommandResult {
-    let keys = KeyTerminal::open().map_err(other)?;
-    // Dropped after the screen, which it follows.
-    let log = ScreenLog::begin();
-    let screen = std::io::stdout().into_alternate_screen().map_err(other)?;
-    let mut terminal = Terminal::new(TermionBackend::new(screen)).map_err(other)?;
-    terminal.clear().map_err(other)?;
-    loop {
+    log: &ScreenLog,
+) -> std::io::Result<()> {
+    let screen = std::io::stdout().into_alternate_screen()?;
+    let mut terminal = Terminal::new(TermionBackend::new(screen))?;
+    terminal.clear()?;
+    while !handle.is_ending() && !handle.has_ended() {
         let (board, timing, clients, messages) = (handle.board(), handle.timing(), clients(), log.lines());
-        let view =
-            View { place, board: &board, timing: &timing, clients: &clients, torque_limits, messages: &messages };
-        terminal.draw(|frame| draw(frame, &view)).map_err(other)?;
-        if signals.check()? {
-            return Ok(());
-        }
-        if board.has_ended {
-            return Err(Failure::Other(miette::miette!("the control loop failed; the motors are damped")));
-        }
-        let mut bytes = [0; 16];
-        for key in keys.read(&mut bytes).map_err(other)? {
-            if *key == b'q' {
-                return Ok(());
-            }
-            if let Some((_, request)) = KEYS.iter().find(|(letter, _)| letter == key) {
-                log.add(&operator::answer(handle, request));
-            }
-        }
+        let view = View { place, board: &board, timing: &timing, clients: &clients, torque_limits, messages: &messages };
+        terminal.draw(|frame| draw(frame, &view))?;
+        std::thread::sleep(FRAME);
     }
+    Ok(())
 }
 
 fn draw(frame: &mut Frame, view: &View) {
@@ -111,7 +171,8 @@ fn summary_lines(view: &View) -> Vec<Line<'static>> {
     let fault = board.fault.map_or_else(String::new, |fault| fault.to_string());
     let client = match view.clients {
         [] => "none".to_owned(),
-        clients => clients.join(", "),
+        clients if board.is_permitted => clients.join(", "),
+        clients => format!("{} waits for `go`", clients.join(", ")),
     };
     let controller = if board.controller_released { "released" } else { "ACTIVE" };
     let sensors = board.reading.as_ref().map_or_else(String::new, |(_, reading)| sensor_text(reading));
@@ -123,7 +184,11 @@ fn summary_lines(view: &View) -> Vec<Line<'static>> {
             Span::styled(format!("  {fault}"), Style::new().fg(Color::Red)),
         ]),
         Line::raw(format!("client {client}   {}   tick {}, missed {}", view.place, board.tick, board.missed_ticks)),
-        Line::raw(format!("built-in controller {controller}   other writers {}   {sensors}", board.foreign_writers)),
+        Line::raw(format!(
+            "watchdog {}   built-in controller {controller}   other writers {}   {sensors}",
+            operator::watchdog_text(board.watchdog),
+            board.foreign_writers
+        )),
         Line::raw(format!(
             "ms, p99: state to command {:.2}   loop late {:.2}   tick jitter {:.2}   longest gap {:.1}   bad states {}",
             ms(timing.latency.quantile(0.99)),

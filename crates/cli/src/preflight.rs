@@ -3,7 +3,7 @@
 use std::io::BufRead;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
-use std::sync::mpsc::RecvTimeoutError;
+use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
 use serde::Serialize;
@@ -15,9 +15,10 @@ use twinstep_robot::preflight::{Activity, Finding, PreflightReport, compare};
 use twinstep_robot::preflight_loop::{self, Event};
 use twinstep_robot::{RobotHandle, watch};
 
-use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::exit::{CommandResult, Failure, input, other};
 use crate::fake_process::FakeProcess;
-use crate::robot::{RobotConfig, checked_address};
+use crate::robot::{RobotConfig, checked_address, report_panics, start_motors};
+use crate::stop_signals::StopSignals;
 
 /// Time in which the service of the built-in controller answers.
 const ANSWER: Duration = Duration::from_secs(2);
@@ -76,7 +77,8 @@ struct JsonFinding<'a> {
 
 /// Makes the checks and prints the findings.
 pub fn run(args: &Args) -> CommandResult {
-    let signals = Signals::listen()?;
+    let handle = RobotHandle::default();
+    let signals = StopSignals::listen(&handle)?;
     let config = RobotConfig::load(args.config.as_deref())?;
     let robot = ModelFile::default().robot_model().map_err(input)?;
     let walk = Walk::new(config.walk()?, &robot, false).map_err(input)?;
@@ -90,21 +92,21 @@ pub fn run(args: &Args) -> CommandResult {
         (Some(fake), _) => (fake.domain, IpAddr::V4(Ipv4Addr::LOCALHOST)),
         (None, name) => (args.domain, checked_address(name.as_deref().unwrap_or_default(), &config.safety)?),
     };
-    confirm(&signals)?;
+    confirm(&handle, &signals)?;
     let dds = Dds::join(domain, address).map_err(input)?;
-    let handle = RobotHandle::default();
     let watch = watch::start(&dds, handle.clone()).map_err(other)?;
     let asked = Instant::now();
-    while !handle.controller_released() && asked.elapsed() < ANSWER {
+    while !handle.controller_released() && !handle.is_ending() && asked.elapsed() < ANSWER {
         std::thread::sleep(TICK);
     }
-    let events = preflight_loop::start(&robot, config.safety, &dds, handle.clone()).map_err(other)?;
+    report_panics(&handle);
+    let motors = start_motors(&dds, &config.safety)?;
+    let events = preflight_loop::start(&robot, config.safety, &dds, motors, handle.clone()).map_err(other)?;
     let report = loop {
-        if let Err(interrupted) = signals.check() {
-            handle.end();
+        if handle.is_ending() {
             // The motors are damped until the thread ends.
             while events.recv().is_ok() {}
-            return Err(interrupted);
+            return Err(Failure::Interrupted);
         }
         match events.recv_timeout(TICK) {
             Ok(Event::Activity(activity)) => eprintln!("{}", activity_text(activity)),
@@ -121,16 +123,27 @@ pub fn run(args: &Args) -> CommandResult {
     print_report(&findings, &report, args.json)
 }
 
-/// Waits for the operator's `yes`.
-fn confirm(signals: &Signals) -> CommandResult {
+/// Waits for the operator's `yes`, or a signal.
+fn confirm(handle: &RobotHandle, signals: &StopSignals) -> CommandResult {
     eprintln!("the robot will move its legs for 20 s: it lies on its belly, with 1 m of space; type yes");
-    let mut line = String::new();
-    std::io::stdin().lock().read_line(&mut line).map_err(other)?;
-    signals.check()?;
-    if line.trim() == "yes" {
-        return Ok(());
+    let (answer, answers) = channel();
+    std::thread::spawn(move || {
+        let mut line = String::new();
+        let _ = std::io::stdin().lock().read_line(&mut line);
+        let _ = answer.send(line);
+    });
+    loop {
+        match answers.recv_timeout(TICK) {
+            Ok(line) if line.trim() == "yes" => return Ok(()),
+            Err(RecvTimeoutError::Timeout) if handle.is_ending() => {
+                return signals.outcome().and(Err(Failure::Interrupted));
+            }
+            Err(RecvTimeoutError::Timeout) => {}
+            Ok(_) | Err(RecvTimeoutError::Disconnected) => {
+                return Err(Failure::Input(miette::miette!("not confirmed: nothing was sent")));
+            }
+        }
     }
-    Err(Failure::Input(miette::miette!("not confirmed: nothing was sent")))
 }
 
 fn activity_text(activity: Activity) -> String {

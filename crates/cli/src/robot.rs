@@ -5,27 +5,31 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use rustix::mm::MlockAllFlags;
 use serde::Deserialize;
 use twinstep_effects::ModelFile;
 use twinstep_env_server::{Server, ServerConfig, ServerError};
 use twinstep_envs::{TaskConfig, WalkConfig};
 use twinstep_model::{PerJoint, RobotModel};
 use twinstep_robot::dds::Dds;
-use twinstep_robot::{Recorder, RobotHandle, SafetyConfig, control_loop, interface_address, watch};
+use twinstep_robot::{MotorLink, Recorder, RobotHandle, SafetyConfig, control_loop, interface_address, watch};
 use twinstep_viewer::Hub;
 
-use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::exit::{CommandResult, Failure, input, other};
 use crate::fake_process::FakeProcess;
 use crate::frame_feed::FrameFeed;
 use crate::onboard_policy::OnboardPolicy;
 use crate::robot_env_factory::RobotEnvFactory;
 use crate::robot_view::RobotView;
+use crate::stop_signals::StopSignals;
 use crate::web_view::ViewArgs;
-use crate::{operator, operator_screen};
+use crate::{line_printer, operator, operator_screen};
 
-/// Largest `safety.state_timeout_ms` with a real robot.
+/// Largest times of `[safety]` with a real robot [ms].
 const MAX_STATE_TIMEOUT_MS: u64 = 30;
-/// Interval at which signals and the robot's state are looked at.
+const MAX_PAUSE_MS: u64 = 50;
+const MAX_WATCHDOG_TIMEOUT_MS: u64 = 20;
+/// Interval at which the robot's state is looked at.
 const TICK: Duration = Duration::from_millis(20);
 
 /// Put the real Go2, or a fake one, behind the protocol of `twinstep serve`.
@@ -34,8 +38,9 @@ const TICK: Duration = Duration::from_millis(20);
 /// damps the robot by itself when actions are missing, and keeps every command inside the limits. docs/robot.md has the
 /// first day with a real robot, step by step.
 ///
-/// The operator has a screen with a key for each request: release, arm, stand, sit, damp, disarm, stop. Nothing moves before
-/// `arm` and `stand`. Ctrl-C damps the motors and ends.
+/// The operator has a screen with a key for each request: release, arm, stand, sit, damp, disarm, go, stop. Nothing moves before
+/// `arm` and `stand`. Ctrl-C, a lost ssh link and a closed terminal damp the motors and end. A second process, the watchdog,
+/// damps them if this one stops for any reason.
 ///
 /// Without a terminal the same requests are read from stdin, one word a line, with `status`, `help` and `quit`. Then it prints
 /// one line to stdout when the server is ready: `listening ENDPOINT`; then a line for every change of state.
@@ -118,8 +123,11 @@ pub fn run(args: &Args) -> CommandResult {
     let config = args.config()?;
     let robot = ModelFile::default().robot_model().map_err(input)?;
     let task = config.walk()?;
-    let signals = Signals::listen()?;
     args.view.check()?;
+    let handle = RobotHandle::default();
+    let signals = StopSignals::listen(&handle)?;
+    line_printer::start().map_err(other)?;
+    lock_memory();
     let fake = if args.fake { Some(FakeProcess::start(args.model.as_deref(), &[])?) } else { None };
     let (domain, address) = match (&fake, &args.interface) {
         (Some(fake), _) => (fake.domain, IpAddr::V4(Ipv4Addr::LOCALHOST)),
@@ -128,14 +136,14 @@ pub fn run(args: &Args) -> CommandResult {
     };
     let recording = args.record.as_deref().map(Recorder::start).transpose().map_err(input)?;
     let (recorder, recorder_thread) = recording.unzip();
-    let handle = RobotHandle::default();
-    stop_on_panic(&handle);
+    report_panics(&handle);
     let dds = Dds::join(domain, address).map_err(input)?;
-    let control = control_loop::start(&robot, config.safety, &dds, handle.clone(), recorder).map_err(input)?;
+    let motors = start_motors(&dds, &config.safety)?;
+    let control = control_loop::start(&robot, config.safety, &dds, motors, handle.clone(), recorder).map_err(input)?;
     let watch = watch::start(&dds, handle.clone()).map_err(other)?;
     let view = RobotView::start(&args.view, &robot, &handle);
     let outcome = view.and_then(|view| {
-        let outcome = args.serve(&config.server, (robot, task), &handle, view.hub(), &signals);
+        let outcome = args.serve(&config.server, (robot, task), &handle, view.hub());
         handle.end();
         view.join();
         outcome
@@ -143,7 +151,23 @@ pub fn run(args: &Args) -> CommandResult {
     handle.end();
     let _ = (control.join(), watch.join());
     let recorded = recorder_thread.map_or(Ok(()), |thread| thread.join().unwrap_or(Ok(())));
-    outcome.and(recorded.map_err(other))
+    line_printer::flush();
+    outcome.and(recorded.map_err(other)).and(signals.outcome())
+}
+
+/// Keeps this process in memory: the control loop must not wait for a disk.
+fn lock_memory() {
+    let flags = MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT;
+    if let Err(error) = rustix::mm::mlockall(flags) {
+        tracing::info!(%error, "the memory of this process is not locked: run as root, or raise `ulimit -l`");
+    }
+}
+
+/// Starts the watchdog, and returns the way to the motors.
+pub fn start_motors(dds: &Dds, safety: &SafetyConfig) -> Result<MotorLink, Failure> {
+    let program = std::env::current_exe().map_err(other)?;
+    let timeout = Duration::from_millis(safety.watchdog_timeout_ms);
+    MotorLink::start(dds, &program, timeout).map_err(other)
 }
 
 impl Args {
@@ -167,14 +191,13 @@ impl Args {
         (robot, task): (RobotModel, WalkConfig),
         handle: &RobotHandle,
         hub: &Arc<Hub>,
-        signals: &Signals,
     ) -> CommandResult {
         let torque_limits = &robot.torque_limits();
         let factory = RobotEnvFactory { robot, task, handle: handle.clone() };
         if let Some(path) = &self.policy {
             let policy = OnboardPolicy::start(path, &factory)?;
             let place = format!("policy {}", path.display());
-            let result = watch_robot(handle, torque_limits, &place, &Vec::new, signals);
+            let result = watch_robot(handle, torque_limits, &place, Vec::new);
             handle.end();
             policy.join();
             return result;
@@ -185,14 +208,14 @@ impl Args {
         })?;
         let feed = FrameFeed::start(server.frame_publisher().map_err(other)?, Arc::clone(hub))?;
         let place = format!("listening {}", server.endpoints().first().cloned().unwrap_or_default());
-        let result = watch_robot(handle, torque_limits, &place, &|| server.clients(), signals);
+        let result = watch_robot(handle, torque_limits, &place, server.client_ids());
         feed.stop();
         server.shutdown();
         result
     }
 }
 
-/// Serves the operator at the terminal until a signal or `quit`. Then damps the motors.
+/// Serves the operator at the terminal until a signal or `quit`. Then the motors are damped.
 ///
 /// A person at a terminal has a screen with keys. Without one, requests are read from stdin and every change of state is
 /// printed to stdout.
@@ -200,47 +223,43 @@ fn watch_robot(
     handle: &RobotHandle,
     torque_limits: &PerJoint,
     place: &str,
-    clients: &dyn Fn() -> Vec<String>,
-    signals: &Signals,
+    clients: impl Fn() -> Vec<String> + Send + 'static,
 ) -> CommandResult {
     let result = if operator_screen::is_possible() {
-        operator_screen::run(handle, torque_limits, place, clients, signals)
+        operator_screen::run(handle, *torque_limits, place, clients)
     } else {
-        operator::print_line(place);
-        print_states(handle, signals)
+        line_printer::print_line(place);
+        print_states(handle)
     };
     handle.stop();
     result
 }
 
 /// Executes what is read from stdin and prints every change of state, until a signal or `quit`.
-fn print_states(handle: &RobotHandle, signals: &Signals) -> CommandResult {
-    eprintln!("type `help` for what the operator can do; Ctrl-C damps the motors and ends");
-    let quits = operator::listen(handle);
+fn print_states(handle: &RobotHandle) -> CommandResult {
+    line_printer::print_log(b"type `help` for what the operator can do; Ctrl-C damps the motors and ends\n");
+    operator::listen(handle).map_err(other)?;
     let mut shown = String::new();
-    loop {
+    while !handle.is_ending() {
         let board = handle.board();
         let line = operator::state_line(&board);
         if line != shown {
-            operator::print_line(&line);
+            line_printer::print_line(&line);
             shown = line;
         }
-        match signals.check() {
-            Ok(false) if board.has_ended => {
-                return Err(Failure::Other(miette::miette!("the control loop failed; the motors are damped")));
-            }
-            Ok(false) if quits.try_recv().is_ok() => return Ok(()),
-            Ok(false) => std::thread::sleep(TICK),
-            ended => return ended.map(drop),
+        if board.has_ended {
+            return Err(Failure::Other(miette::miette!("the control loop failed; the watchdog damps the motors")));
         }
+        std::thread::sleep(TICK);
     }
+    Ok(())
 }
 
-/// Damps the motors when any thread of this process panics.
-fn stop_on_panic(handle: &RobotHandle) {
+/// Lets the watchdog damp the motors when any thread of this process panics.
+pub fn report_panics(handle: &RobotHandle) {
     let (handle, report) = (handle.clone(), std::panic::take_hook());
     std::panic::set_hook(Box::new(move |panic| {
-        handle.stop();
+        handle.report_panic();
         report(panic);
     }));
 }
@@ -253,14 +272,17 @@ pub fn checked_address(name: &str, safety: &SafetyConfig) -> Result<IpAddr, Fail
 }
 
 fn check_timeout(name: &str, address: IpAddr, safety: &SafetyConfig) -> CommandResult {
-    let timeout = safety.state_timeout_ms;
-    if !address.is_loopback() && timeout > MAX_STATE_TIMEOUT_MS {
-        return Err(text(&format!(
-            "`safety.state_timeout_ms` = {timeout} is allowed on this machine alone, with a fake robot; on `{name}` at most \
-             {MAX_STATE_TIMEOUT_MS}"
-        )));
+    let times = [
+        ("state_timeout_ms", safety.state_timeout_ms, MAX_STATE_TIMEOUT_MS),
+        ("max_pause_ms", safety.max_pause_ms, MAX_PAUSE_MS),
+        ("watchdog_timeout_ms", safety.watchdog_timeout_ms, MAX_WATCHDOG_TIMEOUT_MS),
+    ];
+    match times.into_iter().find(|(_, value, max)| value > max) {
+        Some((key, value, max)) if !address.is_loopback() => Err(text(&format!(
+            "`safety.{key}` = {value} is allowed on this machine alone, with a fake robot; on `{name}` at most {max}"
+        ))),
+        _ => Ok(()),
     }
-    Ok(())
 }
 
 /// Returns the failure of invalid input.

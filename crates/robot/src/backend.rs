@@ -111,6 +111,7 @@ impl Backend for RobotBackend {
     fn prepare_reset(&mut self, cause: ResetCause) -> Result<(), BackendError> {
         let board = self.handle.board();
         let reason = match (board.state, cause) {
+            (Some(State::Ready), _) if !board.is_permitted => waits_for(&board),
             (Some(State::Ready), _) | (Some(State::Run | State::Hold), ResetCause::Autoreset) => return Ok(()),
             (Some(State::Run | State::Hold), ResetCause::Request) => {
                 self.handle.end_episode();
@@ -133,9 +134,7 @@ impl Backend for RobotBackend {
             return Ok(());
         }
         let before = self.handle.board();
-        // A robot at rest has no period that the action could be too late for.
-        let is_at_rest = before.state == Some(State::Ready);
-        let tick = explicit.or((!is_at_rest).then_some(self.report.tick));
+        let tick = explicit.unwrap_or(self.report.tick);
         let number = self.handle.act(Action { tick, values: self.action(&commands[0].q) });
         let next = before.tick + 1;
         let board = self.handle.wait_until(LOOP_TIMEOUT, |board| board.tick >= next && board.action_result.0 >= number);
@@ -172,6 +171,9 @@ impl Backend for RobotBackend {
 /// Returns why the robot follows no actions, or `None` if it does.
 fn stop(board: &Board) -> Option<RobotStop> {
     match board.state {
+        Some(State::Ready) if !board.is_permitted => {
+            Some(RobotStop { reason: waits_for(board), terminates: false })
+        }
         Some(State::Ready | State::Run | State::Hold) => None,
         _ => Some(RobotStop {
             reason: board.fault.map_or_else(|| waits_for(board), |fault| fault.to_string()),
@@ -182,6 +184,9 @@ fn stop(board: &Board) -> Option<RobotStop> {
 
 /// Returns what a robot waits for before it follows actions.
 fn waits_for(board: &Board) -> String {
+    if board.state == Some(State::Ready) && !board.is_permitted {
+        return "a fault has stopped it, and the operator has not said `go`".to_owned();
+    }
     if let Some(fault) = board.fault {
         return format!("{fault}; then the operator arms the robot again");
     }

@@ -57,8 +57,12 @@ pub struct SafetyConfig {
     /// Lowest rate of states at which the robot counts as connected [Hz].
     pub min_state_hz: u32,
     /// An older state is a fault, if it is found twice in a row [ms]. Above 30, only on a host that cannot keep time, with a
-    /// fake robot.
+    /// fake robot; as for `max_pause_ms` above 50 and `watchdog_timeout_ms` above 20.
     pub state_timeout_ms: u64,
+    /// A longer time between two steps of the control loop while the robot moves is a fault [ms].
+    pub max_pause_ms: u64,
+    /// The watchdog damps the motors after this time without a command of the control loop [ms].
+    pub watchdog_timeout_ms: u64,
     /// The remote control is lost after this time without it [ms].
     pub remote_timeout_ms: u64,
     /// True if the robot may move only while its remote control is received.
@@ -96,6 +100,8 @@ impl Default for SafetyConfig {
             max_lost_messages: 20,
             min_state_hz: 400,
             state_timeout_ms: 20,
+            max_pause_ms: 50,
+            watchdog_timeout_ms: 20,
             remote_timeout_ms: 1000,
             remote_required: true,
             hold_after_missed_ticks: 3,
@@ -158,6 +164,8 @@ impl SafetyConfig {
             ("max_lost_messages", f64::from(self.max_lost_messages), 1.0, 1000.0),
             ("min_state_hz", f64::from(self.min_state_hz), 100.0, 1000.0),
             ("state_timeout_ms", self.state_timeout_ms as f64, 4.0, 200.0),
+            ("max_pause_ms", self.max_pause_ms as f64, 10.0, 500.0),
+            ("watchdog_timeout_ms", self.watchdog_timeout_ms as f64, 10.0, 200.0),
             ("remote_timeout_ms", self.remote_timeout_ms as f64, 100.0, 5000.0),
             ("hold_after_missed_ticks", self.hold_after_missed_ticks as f64, 1.0, 50.0),
             (

@@ -1,8 +1,8 @@
 //! The real-time loop: the one thread that writes `rt/lowcmd`.
 //!
 //! A state of the robot triggers a step of the [`SafetyMachine`]; a timer does if none arrives in time. The thread waits
-//! for nothing else: what other threads ask of it is in a [`RobotHandle`], and what it tells them too. A panic in it
-//! ends in damping.
+//! for nothing else: what other threads ask of it is in a [`RobotHandle`], as is what it publishes for them. It sends the
+//! commands itself ([`MotorLink`]). After a panic the [watchdog](crate::watchdog) damps the motors.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::thread::JoinHandle;
@@ -12,16 +12,19 @@ use twinstep_logs::RecordedTopic;
 use twinstep_model::{Command, RobotModel};
 use twinstep_unitree::{LowState, decode, encode};
 
-use crate::command::SafeCommand;
 use crate::config::{ConfigError, SafetyConfig};
-use crate::dds::{Dds, DdsError, LOW_CMD, LOW_STATE, Reader, SPORT_MODE_STATE, Writer};
-use crate::input::{Action, Input, Output};
+use crate::command_datagram::WriterGuid;
+use crate::dds::{Dds, DdsError, LOW_STATE, Reader, SPORT_MODE_STATE};
+use crate::input::{Action, Client, Input, Output, RequestRefused};
 use crate::machine::SafetyMachine;
+use crate::motor_link::MotorLink;
 use crate::reading::Reading;
 use crate::real_time_thread;
 use crate::recorder::Recorder;
-use crate::robot_handle::{RobotHandle, Taken, TimedSample};
+use crate::robot_handle::{Board, RobotHandle, Taken, TimedSample};
+use crate::state::State;
 use crate::timing::Timing;
+use crate::watchdog::Watchdog;
 
 /// Time after the last step at which the timer steps. States arrive every 2 ms; a step must not come just before one.
 const TIMER: Duration = Duration::from_micros(2500);
@@ -29,6 +32,9 @@ const TIMER: Duration = Duration::from_micros(2500);
 const PERIOD: Duration = Duration::from_millis(2);
 /// Time for which an armed robot is damped before the loop ends, so that it lies when its commands cease.
 const FINAL_DAMPING: Duration = Duration::from_millis(1500);
+
+/// Silence of the robot after which another writer of `rt/lowstate` counts as the robot.
+const MAX_ROBOT_SILENCE: Duration = Duration::from_secs(1);
 
 /// Reasons why the loop cannot start.
 #[derive(Debug, thiserror::Error)]
@@ -49,6 +55,7 @@ pub fn start(
     robot: &RobotModel,
     config: SafetyConfig,
     dds: &Dds,
+    motors: MotorLink,
     handle: RobotHandle,
     recorder: Option<Recorder>,
 ) -> Result<JoinHandle<()>, StartError> {
@@ -66,10 +73,10 @@ pub fn start(
         let start = Instant::now();
         let mut control_loop = ControlLoop {
             machine,
-            dds,
+            motors,
             reader,
             base_reader,
-            writer: None,
+            robot: None,
             recorder,
             handle: handle.clone(),
             policy_dt,
@@ -80,10 +87,13 @@ pub fn start(
             last_command: None,
             last_tick: None,
             damping: None,
+            client: Client::Absent,
+            board: Board::default(),
         };
         if catch_unwind(AssertUnwindSafe(|| control_loop.run())).is_err() {
             control_loop.damp_after_panic();
         }
+        control_loop.motors.disarm();
         drop(control_loop);
         handle.publish_end();
     })?;
@@ -109,12 +119,12 @@ fn step_record(action: &Action, output: &Output) -> Vec<u8> {
 
 struct ControlLoop {
     machine: SafetyMachine,
-    dds: Dds,
+    motors: MotorLink,
     reader: Reader,
     /// Position and velocity of the base, from the built-in controller or a motion capture; only recorded.
     base_reader: Reader,
-    /// Exists while the robot is armed.
-    writer: Option<Writer>,
+    /// The writer of `rt/lowstate` that is the robot, with the time of its last state.
+    robot: Option<(WriterGuid, Duration)>,
     recorder: Option<Recorder>,
     handle: RobotHandle,
     policy_dt: Duration,
@@ -130,21 +140,33 @@ struct ControlLoop {
     last_tick: Option<(u64, Duration)>,
     /// Time at which the damping before the end began.
     damping: Option<Duration>,
+    /// The client at the last step at which it was known.
+    client: Client,
+    /// What is published next.
+    board: Board,
+}
+
+/// States that arrived since the last step.
+#[derive(Default)]
+struct Received {
+    states: Vec<LowState>,
+    other_robot: bool,
 }
 
 impl ControlLoop {
     fn run(&mut self) {
         while !self.has_ended() {
-            let received = self.newest_state();
+            let received = self.take_states();
             let now = self.start.elapsed();
-            if received.is_none() && now < self.due {
+            let is_from_state = !received.states.is_empty();
+            if !is_from_state && now < self.due {
                 std::thread::park_timeout(self.due.saturating_sub(now));
                 continue;
             }
             if let Some(last) = self.last_step {
                 self.timing.lateness.add(now.saturating_sub(last + PERIOD));
             }
-            if received.is_none() {
+            if !is_from_state {
                 self.timing.timer_lateness.add(now.saturating_sub(self.due));
             }
             self.step(now, received);
@@ -152,84 +174,125 @@ impl ControlLoop {
         }
     }
 
-    /// Returns the newest state of those that have arrived since the last call, or `None`.
-    fn newest_state(&mut self) -> Option<LowState> {
-        let mut newest = None;
-        while let Some(payload) = self.reader.take() {
+    /// Returns the states that have arrived since the last call, oldest first.
+    fn take_states(&mut self) -> Received {
+        let mut received = Received::default();
+        while let Some((payload, writer)) = self.reader.take_with_writer() {
+            let now = self.start.elapsed();
+            let is_silent = |at: Duration| now.saturating_sub(at) > MAX_ROBOT_SILENCE && !self.machine.state().is_moving();
+            if self.robot.is_none_or(|(robot, at)| robot == writer || is_silent(at)) {
+                self.robot = Some((writer, now));
+            } else {
+                received.other_robot = true;
+                continue;
+            }
             match decode::<LowState>(&payload) {
-                Ok(state) => newest = Some(state),
-                Err(error) => {
-                    self.timing.bad_states += 1;
-                    tracing::debug!(%error, "state dropped");
-                }
+                Ok(state) => received.states.push(state),
+                Err(error) => self.drop_state(&error),
             }
             self.record(RecordedTopic::State, payload);
         }
         while let Some(payload) = self.base_reader.take() {
             self.record(RecordedTopic::BaseState, payload);
         }
-        newest
+        received
     }
 
-    fn step(&mut self, now: Duration, state: Option<LowState>) {
-        let reading = state.and_then(|state| match Reading::new(&state) {
-            Ok(reading) => Some(reading),
-            Err(error) => {
-                self.timing.bad_states += 1;
-                tracing::debug!(%error, "state dropped");
-                None
+    fn drop_state(&mut self, error: &impl std::fmt::Display) {
+        self.timing.bad_states += 1;
+        tracing::debug!(%error, "state dropped");
+    }
+
+    fn step(&mut self, now: Duration, received: Received) {
+        let mut readings = Vec::with_capacity(received.states.len());
+        for state in &received.states {
+            match Reading::new(state) {
+                Ok(reading) => readings.push(reading),
+                Err(error) => self.drop_state(&error),
             }
-        });
+        }
         let Taken { request, action, client, has_client } = self.handle.take();
+        self.client = client.unwrap_or(self.client);
+        let watchdog = if self.handle.has_panicked() { Watchdog::Missing } else { self.motors.watchdog(now) };
         let input = Input {
             now,
-            reading,
+            readings,
+            other_robot: received.other_robot,
             foreign_writers: self.handle.foreign_writers(),
+            watchdog,
+            can_send: self.motors.can_send(),
             controller_released: self.handle.controller_released(),
             stop_requested: self.handle.take_stop() || self.damping.is_some(),
-            request,
-            client,
+            request: request.and_then(|(_, request)| request),
+            client: self.client,
             action: action.map(|(_, action)| action),
         };
+        // The end of an episode is an event.
+        if self.client == Client::EndsEpisode {
+            self.client = if has_client { Client::Connected } else { Client::Absent };
+        }
         let output = self.machine.step(&input);
-        let is_from_state = input.reading.is_some();
-        if let (Some(reading), Some(command)) = (&input.reading, &output.command) {
+        let reading = input.readings.last();
+        if let (Some(reading), Some(command)) = (reading, &output.command) {
             let Command { q, kp, .. } = *command.command();
             self.handle.add_sample(|| TimedSample { at: now, reading: reading.clone(), q_cmd: q, kp: kp[0] });
         }
-        self.send(output.command, now, is_from_state);
+        self.send(&output, watchdog, now, reading.is_some());
         self.note_tick(&output, now);
-        if let Some((_, action)) = action {
+        if let Some((number, action)) = action {
             self.record(RecordedTopic::Step, step_record(&action, &output));
+            self.board.action_result = (number, output.action_refused);
         }
-        self.handle.publish(now, &output, input.reading, |board| {
-            if let Some((number, _)) = action {
-                board.action_result = (number, output.action_refused);
-            }
-            if request.is_some() {
-                (board.requests, board.request_refused) = (board.requests + 1, output.request_refused);
-            }
-            board.has_client = has_client;
-        });
+        if let Some((number, request)) = request {
+            let refused = if request.is_none() { Some(RequestRefused::Expired) } else { output.request_refused };
+            self.board.request_result = (number, refused);
+        }
+        if client.is_some() {
+            self.board.has_client = has_client;
+        }
+        if let Some(reading) = input.readings.into_iter().next_back() {
+            self.board.reading = Some((now, reading));
+        }
+        self.publish(&output, watchdog, now);
     }
 
-    fn send(&mut self, command: Option<SafeCommand>, now: Duration, is_from_state: bool) {
-        let Some(command) = command else {
-            (self.writer, self.last_command) = (None, None);
+    /// Publishes the state after a step. What cannot be published now is published after the next one.
+    fn publish(&mut self, output: &Output, watchdog: Watchdog, now: Duration) {
+        let board = &mut self.board;
+        board.now = now;
+        board.state = Some(output.state);
+        board.fault = output.fault;
+        board.tick = output.tick;
+        board.missed_ticks = output.missed_ticks;
+        board.applied = output.applied.unwrap_or_default();
+        board.is_permitted = output.is_permitted;
+        board.watchdog = watchdog;
+        board.foreign_writers = self.handle.foreign_writers();
+        board.controller_released = self.handle.controller_released();
+        self.handle.publish(board);
+    }
+
+    /// Sends the command of a step. After a takeover the watchdog's commands alone count, until a new writer is armed.
+    fn send(&mut self, output: &Output, watchdog: Watchdog, now: Duration, is_from_state: bool) {
+        let Some(command) = output.command else {
+            self.motors.disarm();
+            self.last_command = None;
             return;
         };
-        if self.writer.is_none() {
-            match self.dds.writer(LOW_CMD, 1) {
-                Ok(writer) => self.writer = Some(writer),
-                Err(error) => tracing::error!(%error, "commands cannot be sent"),
-            }
+        let has_lost_the_motors = watchdog == Watchdog::TookOver && output.state != State::Fault;
+        if !self.motors.is_armed() || has_lost_the_motors {
+            self.motors.arm(encode(&self.machine.damping().to_low_cmd()));
+        }
+        let motors = &mut self.motors;
+        self.handle.with_readers(|readers| motors.set_readers(readers));
+        if self.handle.has_panicked() {
+            return;
         }
         let payload = encode(&command.to_low_cmd());
-        self.record(RecordedTopic::Command, payload.clone());
-        if let Some(writer) = &self.writer {
-            writer.write(payload);
-        }
+        self.motors.send(&payload);
+        self.motors.beat();
         let sent = self.start.elapsed();
+        self.record(RecordedTopic::Command, payload);
         if is_from_state {
             self.timing.latency.add(sent.saturating_sub(now));
         }
@@ -269,14 +332,12 @@ impl ControlLoop {
         !self.machine.state().is_armed() || now.saturating_sub(*self.damping.get_or_insert(now)) > FINAL_DAMPING
     }
 
-    /// Sends damping until the loop is to end. The state machine is not used any more: its panic may come again.
+    /// Waits until the loop is to end, while the watchdog damps the motors.
     fn damp_after_panic(&mut self) {
-        tracing::error!("the control loop failed: damping until the process ends");
+        tracing::error!("the control loop failed: the watchdog damps the motors until the process ends");
         self.handle.publish_end();
-        let Some(writer) = &self.writer else { return };
         let since = Instant::now();
         while !self.handle.is_ending() || since.elapsed() < FINAL_DAMPING {
-            writer.write(encode(&self.machine.damping().to_low_cmd()));
             std::thread::sleep(PERIOD);
         }
     }

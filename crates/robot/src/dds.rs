@@ -4,7 +4,7 @@
 //! recorded byte by byte. The quality of service is that of the vendor's SDK: readers are best-effort, writers reliable.
 
 use std::convert::Infallible;
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::task::{Wake, Waker};
 use std::thread::Thread;
@@ -13,10 +13,11 @@ use rustdds::bytes::Bytes;
 use rustdds::no_key::{DataWriter, Decode, DefaultDecoder, DeserializerAdapter, SerializerAdapter, SimpleDataReader};
 use rustdds::policy::{History, Reliability};
 use rustdds::{
-    DomainParticipant, DomainParticipantBuilder, Duration, Publisher, QosPolicies, QosPolicyBuilder,
+    DomainParticipant, DomainParticipantBuilder, Duration, Publisher, QosPolicies, QosPolicyBuilder, RTPSEntity,
     RepresentationIdentifier, Subscriber, TopicKind,
 };
 
+use crate::command_datagram::WriterGuid;
 use crate::real_time_thread;
 
 /// A topic and the type of its messages.
@@ -74,6 +75,8 @@ pub enum DdsError {
 /// Participant of a DDS domain. Clones are the same participant.
 #[derive(Clone)]
 pub struct Dds {
+    /// Address of the network interface.
+    address: IpAddr,
     participant: DomainParticipant,
     publisher: Publisher,
     subscriber: Subscriber,
@@ -100,7 +103,12 @@ impl Dds {
         let qos = QosPolicyBuilder::new().build();
         let publisher = participant.create_publisher(&qos).map_err(|error| failed(error.to_string()))?;
         let subscriber = participant.create_subscriber(&qos).map_err(|error| failed(error.to_string()))?;
-        Ok(Self { participant, publisher, subscriber })
+        Ok(Self { address, participant, publisher, subscriber })
+    }
+
+    /// Returns the address of the network interface.
+    pub fn address(&self) -> IpAddr {
+        self.address
     }
 
     /// Returns a reader of `topic`, which wakes `reader_thread` when a message arrives.
@@ -136,11 +144,42 @@ impl Dds {
         writers.iter().filter(|writer| writer.publication_topic_data.topic_name() == topic.name).count()
     }
 
+    /// Returns the addresses of the readers of `topic` in other participants, in a fixed order: for each reader those in the
+    /// network of the interface, or all that it announces if none is.
+    pub fn readers(&self, topic: Topic) -> Vec<SocketAddr> {
+        let readers = self.participant.discovered_readers();
+        let of_topic = readers.iter().filter(|reader| reader.subscription_topic_data.topic_name() == topic.name);
+        let foreign = of_topic.filter(|reader| reader.reader_proxy.remote_reader_guid.prefix != self.participant.guid().prefix);
+        let mut addresses: Vec<SocketAddr> = foreign
+            .flat_map(|reader| {
+                let of = |locators: &[_]| -> Vec<SocketAddr> { locators.iter().copied().map(SocketAddr::from).collect() };
+                let unicast: Vec<SocketAddr> = of(&reader.reader_proxy.unicast_locator_list);
+                let announced = if unicast.is_empty() { of(&reader.reader_proxy.multicast_locator_list) } else { unicast };
+                let usable = announced.into_iter().filter(|address| address.is_ipv4() && address.port() != 0);
+                nearest(usable.collect(), self.address)
+            })
+            .collect();
+        addresses.sort_unstable();
+        addresses.dedup();
+        addresses
+    }
+
     fn topic(&self, topic: Topic, qos: &QosPolicies) -> Result<rustdds::Topic, DdsError> {
         self.participant
             .create_topic(topic.name.to_owned(), topic.type_name.to_owned(), qos, TopicKind::NoKey)
             .map_err(|error| DdsError::Topic { topic: topic.name, reason: error.to_string() })
     }
+}
+
+/// Returns those addresses that share the first three bytes with `interface`, or all if none does.
+fn nearest(addresses: Vec<SocketAddr>, interface: IpAddr) -> Vec<SocketAddr> {
+    let network = |address: IpAddr| match address {
+        IpAddr::V4(address) => Some([address.octets()[0], address.octets()[1], address.octets()[2]]),
+        IpAddr::V6(_) => None,
+    };
+    let near: Vec<SocketAddr> =
+        addresses.iter().copied().filter(|address| network(address.ip()) == network(interface)).collect();
+    if near.is_empty() { addresses } else { near }
 }
 
 fn qos(reliability: Reliability, depth: i32) -> QosPolicies {
@@ -156,6 +195,11 @@ pub struct Reader {
 impl Reader {
     /// Returns the next payload, or `None` if there is none: then the next one to arrive wakes the reader's thread.
     pub fn take(&self) -> Option<Vec<u8>> {
+        self.take_with_writer().map(|(payload, _)| payload)
+    }
+
+    /// Returns the next payload with the id of its writer, as [`Reader::take`] does.
+    pub fn take_with_writer(&self) -> Option<(Vec<u8>, WriterGuid)> {
         self.reader.drain_read_notifications();
         // The waker is set before the last look, so that no message arrives in between unnoticed.
         self.next().or_else(|| {
@@ -164,10 +208,10 @@ impl Reader {
         })
     }
 
-    fn next(&self) -> Option<Vec<u8>> {
+    fn next(&self) -> Option<(Vec<u8>, WriterGuid)> {
         loop {
             match self.reader.try_take_one() {
-                Ok(message) => return message.map(|message| message.sample.0),
+                Ok(message) => return message.map(|message| (message.sample.0, message.writer_guid.to_bytes())),
                 // The message that cannot be decoded is gone; the next one may be whole.
                 Err(error) => tracing::debug!(%error, "message dropped"),
             }
@@ -182,6 +226,11 @@ pub struct Writer {
 }
 
 impl Writer {
+    /// Returns the id of the writer.
+    pub fn guid(&self) -> WriterGuid {
+        self.writer.guid().to_bytes()
+    }
+
     /// Sends a payload. Never waits.
     pub fn write(&self, payload: Vec<u8>) {
         if let Err(error) = self.writer.write(Payload(payload), None) {

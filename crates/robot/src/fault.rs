@@ -20,6 +20,30 @@ pub enum Fault {
         /// Number of other writers.
         writers: usize,
     },
+    /// States of another robot arrive on the same topic.
+    #[error("another writer of `rt/lowstate` exists, such as a second robot, a simulator or a replayed log: stop it")]
+    OtherRobot,
+    /// The robot's clock does not advance as time does.
+    #[error("the robot's clock jumped by {ticks} ticks: it was switched off and on, or states are replayed")]
+    ClockJump {
+        /// Change of the clock from one state to the next.
+        ticks: i64,
+    },
+    /// This process did not run for a while.
+    #[error("no command was sent for {ms} ms: this computer is too busy, or the process was suspended")]
+    Pause {
+        /// Time between two steps [ms].
+        ms: u64,
+    },
+    /// The watchdog damps the motors.
+    #[error("the watchdog damps the motors, because the control loop was silent")]
+    WatchdogTookOver,
+    /// The watchdog does not guard the motors.
+    #[error("the watchdog does not guard the motors: wait a second; if it does not come, end this program and start it again")]
+    WatchdogGone,
+    /// Commands cannot be sent.
+    #[error("commands cannot be sent: check cable and interface")]
+    CannotSend,
     /// The robot's built-in controller commands the motors.
     #[error("the robot's built-in controller is active: release it")]
     ControllerActive,
@@ -72,7 +96,7 @@ pub enum Fault {
         /// Joint.
         joint: Joint,
         /// Temperature [°C].
-        celsius: i8,
+        celsius: u8,
     },
     /// The battery is almost empty.
     #[error("the supply voltage is {volts:.1} V: charge the battery")]
@@ -117,6 +141,12 @@ impl Fault {
         match self {
             Fault::StateStale { .. }
             | Fault::ForeignWriter { .. }
+            | Fault::OtherRobot
+            | Fault::ClockJump { .. }
+            | Fault::Pause { .. }
+            | Fault::WatchdogTookOver
+            | Fault::WatchdogGone
+            | Fault::CannotSend
             | Fault::ControllerActive
             | Fault::RemoteStop
             | Fault::StopRequested
@@ -151,6 +181,11 @@ impl Fault {
                 self,
                 Fault::StateStale { .. }
                     | Fault::ForeignWriter { .. }
+                    | Fault::OtherRobot
+                    | Fault::ClockJump { .. }
+                    | Fault::WatchdogTookOver
+                    | Fault::WatchdogGone
+                    | Fault::CannotSend
                     | Fault::ControllerActive
                     | Fault::RemoteStop
                     | Fault::StopRequested

@@ -7,6 +7,7 @@ use twinstep_model::{Joint, PerJoint};
 use crate::command::SafeCommand;
 use crate::fault::Fault;
 use crate::reading::Reading;
+use crate::watchdog::Watchdog;
 use crate::state::State;
 
 /// What happened since the last step.
@@ -14,10 +15,16 @@ use crate::state::State;
 pub struct Input {
     /// Time on a monotonic clock, the one that policy ticks are counted on.
     pub now: Duration,
-    /// Newest state of the robot that arrived since the last step.
-    pub reading: Option<Reading>,
+    /// States of the robot that arrived since the last step, oldest first.
+    pub readings: Vec<Reading>,
+    /// True if a state of another robot arrived since the last step.
+    pub other_robot: bool,
     /// Number of other writers of `rt/lowcmd`.
     pub foreign_writers: usize,
+    /// What the watchdog does.
+    pub watchdog: Watchdog,
+    /// False if commands cannot be sent.
+    pub can_send: bool,
     /// True if the robot's built-in controller is released.
     pub controller_released: bool,
     /// True while a client asks for a stop or the process is ending.
@@ -28,6 +35,26 @@ pub struct Input {
     pub client: Client,
     /// Action of the client that arrived since the last step.
     pub action: Option<Action>,
+}
+
+impl Input {
+    /// Returns the input of a step at `now` in which nothing happened: no state arrived, the watchdog guards the motors, the
+    /// built-in controller is released, and a client has the robot.
+    pub fn quiet(now: Duration) -> Self {
+        Self {
+            now,
+            readings: Vec::new(),
+            other_robot: false,
+            foreign_writers: 0,
+            watchdog: Watchdog::Guarding,
+            can_send: true,
+            controller_released: true,
+            stop_requested: false,
+            request: None,
+            client: Client::Connected,
+            action: None,
+        }
+    }
 }
 
 /// Request of the operator.
@@ -43,6 +70,8 @@ pub enum OperatorRequest {
     Damp,
     /// Stop sending commands.
     Disarm,
+    /// Let the client act again after a fault.
+    Go,
 }
 
 /// The client that has the robot.
@@ -59,9 +88,8 @@ pub enum Client {
 /// Action of a client for one policy period.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Action {
-    /// Policy period for which the action is: [`Output::tick`] of the observation that it responds to. `None`: the present
-    /// one, for the first action of a robot at rest.
-    pub tick: Option<u64>,
+    /// Policy period for which the action is: [`Output::tick`] of the observation that it responds to.
+    pub tick: u64,
     /// Offsets from the default pose, in units of the action scale, −1 to 1; joints in the order of [`Joint::ALL`].
     pub values: PerJoint,
 }
@@ -86,6 +114,8 @@ pub struct Output {
     pub request_refused: Option<RequestRefused>,
     /// Reason why the action was not executed.
     pub action_refused: Option<ActionRefused>,
+    /// False after a fault, until the operator lets the client act again.
+    pub is_permitted: bool,
 }
 
 /// Reason why a request of the operator was not executed.
@@ -127,7 +157,7 @@ pub enum RequestRefused {
         /// Joint.
         joint: Joint,
         /// Temperature [°C].
-        celsius: i8,
+        celsius: u8,
         /// Highest allowed temperature [°C].
         max: i16,
     },
@@ -139,6 +169,12 @@ pub enum RequestRefused {
         /// Largest allowed angle [°].
         max: f32,
     },
+    /// The client may act already.
+    #[error("no fault has ended the client's permission: it may act")]
+    Permitted,
+    /// The control loop did not take the request in time.
+    #[error("the control loop did not take the request in time: it is not executed")]
+    Expired,
     /// A joint moves.
     #[error("{joint} moves with {speed:.1} rad/s: wait until the robot is at rest")]
     Moving {
@@ -161,6 +197,9 @@ pub enum ActionRefused {
     /// No client has the robot.
     #[error("no client has the robot")]
     NoClient,
+    /// A fault has ended the client's permission.
+    #[error("a fault stopped the robot: the operator lets the client act again with `go`")]
+    NotPermitted,
     /// The policy period of the action is over.
     #[error("the action is for tick {tick}, but {current} is the present one: act on the newest observation")]
     OldTick {

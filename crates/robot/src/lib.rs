@@ -65,7 +65,9 @@
 //! tick to the next and stays within 0.95 of the joint's range; [`Output::applied`] is the action that remains.
 
 mod backend;
+mod clock_check;
 mod command;
+mod command_datagram;
 mod config;
 pub mod control_loop;
 pub mod dds;
@@ -77,6 +79,7 @@ mod input;
 mod interface;
 mod machine;
 mod monitor;
+mod motor_link;
 pub mod preflight;
 pub mod preflight_loop;
 mod reading;
@@ -89,6 +92,7 @@ mod timing;
 mod trajectory;
 mod unsafe_command;
 pub mod watch;
+pub mod watchdog;
 
 #[cfg(test)]
 mod tests;
@@ -100,6 +104,7 @@ pub use fault::{Fault, Reaction};
 pub use input::{Action, ActionRefused, Client, Input, OperatorRequest, Output, RequestRefused};
 pub use interface::{InterfaceError, interface_address};
 pub use machine::SafetyMachine;
+pub use motor_link::MotorLink;
 pub use reading::{Reading, ReadingError};
 pub use recorder::Recorder;
 pub use robot_handle::{Board, RobotHandle};

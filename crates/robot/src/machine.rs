@@ -12,6 +12,7 @@ use crate::input::{Action, ActionRefused, Client, Input, OperatorRequest, Output
 use crate::monitor::Monitor;
 use crate::state::State;
 use crate::trajectory::Trajectory;
+use crate::watchdog::Watchdog;
 
 /// Crouched pose of every leg: hip, thigh, calf [rad]. Source: the vendor's example `go2_stand_example`.
 const CROUCH: [f32; 3] = [0.0, 1.36, -2.65];
@@ -40,6 +41,8 @@ pub struct SafetyMachine {
     monitor: Monitor,
     mode: Mode,
     fault: Option<Fault>,
+    /// False after a fault, until the operator lets the client act again.
+    is_permitted: bool,
     now: Duration,
     /// Since when damping has been sent.
     damping_since: Option<Duration>,
@@ -90,6 +93,7 @@ impl SafetyMachine {
             monitor: Monitor::new(robot, &config),
             mode: Mode::Disconnected,
             fault: None,
+            is_permitted: true,
             now: Duration::ZERO,
             damping_since: None,
             limits,
@@ -153,6 +157,7 @@ impl SafetyMachine {
             applied: target.map(|target| target.applied),
             request_refused,
             action_refused,
+            is_permitted: self.is_permitted,
         }
     }
 
@@ -167,6 +172,7 @@ impl SafetyMachine {
     fn react(&mut self, fault: Fault) {
         // The first fault is the cause; those after it may be its consequences.
         self.fault.get_or_insert(fault);
+        self.is_permitted = false;
         match (fault.reaction(), &self.mode) {
             (Reaction::Sit, Mode::Sit(_)) => {}
             (Reaction::Sit, _) => self.sit(),
@@ -188,6 +194,9 @@ impl SafetyMachine {
             (OperatorRequest::Damp, _) => return wrong_state("stand_up, ready, run, hold, sit"),
             (OperatorRequest::Disarm, State::Damp | State::Fault) => self.disarm()?,
             (OperatorRequest::Disarm, _) => return wrong_state("damp, fault"),
+            (OperatorRequest::Go, State::Ready) if self.is_permitted => return Err(RequestRefused::Permitted),
+            (OperatorRequest::Go, State::Ready) => self.is_permitted = true,
+            (OperatorRequest::Go, _) => return wrong_state("ready"),
         }
         Ok(())
     }
@@ -196,7 +205,9 @@ impl SafetyMachine {
         let Some(reading) = self.monitor.reading().filter(|_| self.monitor.is_connected()) else {
             return Err(RequestRefused::StateRate);
         };
-        if let Some(fault) = self.monitor.fault(State::Damp, input) {
+        // A new writer takes the motors back from the watchdog.
+        let watchdog = if input.watchdog == Watchdog::TookOver { Watchdog::Idle } else { input.watchdog };
+        if let Some(fault) = self.monitor.fault(State::Damp, &Input { watchdog, ..input.clone() }) {
             return Err(RequestRefused::Fault(fault));
         }
         if !self.monitor.is_quiet() {
@@ -265,12 +276,15 @@ impl SafetyMachine {
     /// Executes an action for the present policy period.
     fn act(&mut self, action: &Action, client: Client) -> Result<(), ActionRefused> {
         let (state, current) = (self.state(), self.tick());
-        let tick = action.tick.unwrap_or(current);
+        let tick = action.tick;
         if !matches!(state, State::Ready | State::Run | State::Hold) {
             return Err(ActionRefused::NotReady { state });
         }
         if client != Client::Connected {
             return Err(ActionRefused::NoClient);
+        }
+        if !self.is_permitted {
+            return Err(ActionRefused::NotPermitted);
         }
         // An action that waited in a queue responds to an observation that is not true any more.
         if tick < current {

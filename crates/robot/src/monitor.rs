@@ -6,12 +6,14 @@ use twinstep_model::{Joint, NUM_JOINTS, PerJoint, RobotModel};
 use twinstep_unitree::{Button, Remote};
 
 use crate::SafetyConfig;
+use crate::clock_check::ClockCheck;
 use crate::command::scaled_range;
 use crate::fault::Fault;
 use crate::imu_check::ImuCheck;
 use crate::input::{Client, Input};
 use crate::reading::Reading;
 use crate::state::State;
+use crate::watchdog::Watchdog;
 
 /// Interval in which states are counted.
 const RATE_INTERVAL: Duration = Duration::from_millis(500);
@@ -34,6 +36,15 @@ pub(crate) struct Monitor {
     /// Highest allowed lasting torque [N·m].
     max_torque: PerJoint,
     reading: Option<Reading>,
+    /// Measurements that arrived at the last step, oldest first. Each is looked at: a button may be released in the newest.
+    recent: Vec<Reading>,
+    clock: ClockCheck,
+    /// Jump of the robot's clock at the last step [ticks].
+    clock_jump: Option<i64>,
+    /// Time between the last two steps.
+    pause: Duration,
+    /// Time of the last state of another robot.
+    other_robot_at: Option<Duration>,
     /// True once the robot's clock has changed from one state to the next. That of the vendor's simulator never does.
     clock_runs: bool,
     imu: ImuCheck,
@@ -61,6 +72,11 @@ impl Monitor {
             max_torque: robot.torque_limits().map(|limit| limit * config.max_torque_factor),
             config: config.clone(),
             reading: None,
+            recent: Vec::new(),
+            clock: ClockCheck::default(),
+            clock_jump: None,
+            pause: Duration::ZERO,
+            other_robot_at: None,
             clock_runs: false,
             imu: ImuCheck::default(),
             now: Duration::ZERO,
@@ -77,12 +93,21 @@ impl Monitor {
 
     /// Takes in what happened since the last step.
     pub fn update(&mut self, input: &Input) {
-        self.silence += input.now.saturating_sub(self.now).min(MAX_SILENT_STEP);
+        self.pause = input.now.saturating_sub(self.now);
+        self.silence += self.pause.min(MAX_SILENT_STEP);
         self.now = input.now;
+        if input.other_robot {
+            self.other_robot_at = Some(self.now);
+        }
+        self.clock_jump = None;
+        self.recent.clear();
         self.quiet_since = if input.foreign_writers == 0 { self.quiet_since.or(Some(input.now)) } else { None };
-        if let Some(reading) = input.reading.as_ref().filter(|reading| self.is_new(reading)) {
-            self.add(reading.clone());
-        } else if self.silence > Duration::from_millis(self.config.state_timeout_ms) {
+        for reading in &input.readings {
+            if self.is_new(reading) {
+                self.add(reading.clone());
+            }
+        }
+        if self.recent.is_empty() && self.silence > Duration::from_millis(self.config.state_timeout_ms) {
             self.stale_checks = self.stale_checks.saturating_add(1);
             self.rate_is_met &= !self.is_stale();
         }
@@ -105,12 +130,15 @@ impl Monitor {
     fn add(&mut self, reading: Reading) {
         self.silence = Duration::ZERO;
         self.stale_checks = 0;
+        if self.clock_runs {
+            self.clock_jump = self.clock_jump.or(self.clock.add(self.now, reading.tick));
+        }
         self.interval.1 += 1;
         if reading.remote.is_some() {
             self.remote_at = Some(self.now);
         }
         for ((since, tau), limit) in self.overload_since.iter_mut().zip(reading.tau).zip(self.max_torque) {
-            *since = if tau.abs() > limit { since.or(Some(self.now)) } else { None };
+            *since = if tau.abs() <= limit { None } else { since.or(Some(self.now)) };
         }
         let is_over = |(start, count): &(Duration, u32)| {
             self.now.saturating_sub(*start) > LOSS_INTERVAL || reading.lost_messages < *count
@@ -118,6 +146,7 @@ impl Monitor {
         self.loss_interval =
             self.loss_interval.filter(|interval| !is_over(interval)).or(Some((self.now, reading.lost_messages)));
         self.imu.add(self.now, &reading);
+        self.recent.push(reading.clone());
         self.reading = Some(reading);
     }
 
@@ -141,6 +170,20 @@ impl Monitor {
         self.quiet_since.is_some_and(|since| self.now.saturating_sub(since) >= QUIET_TIME)
     }
 
+    fn has_other_robot(&self) -> bool {
+        self.other_robot_at.is_some_and(|at| self.now.saturating_sub(at) < QUIET_TIME)
+    }
+
+    /// Returns the fault of the watchdog. A robot that moves needs one that guards it.
+    fn watchdog_fault(&self, state: State, watchdog: Watchdog) -> Option<Fault> {
+        match watchdog {
+            Watchdog::Guarding => None,
+            Watchdog::Idle => state.is_moving().then_some(Fault::WatchdogGone),
+            Watchdog::Missing => Some(Fault::WatchdogGone),
+            Watchdog::TookOver => Some(Fault::WatchdogTookOver),
+        }
+    }
+
     fn remote_is_lost(&self) -> bool {
         let timeout = Duration::from_millis(self.config.remote_timeout_ms);
         self.config.remote_required && self.remote_at.is_none_or(|at| self.now.saturating_sub(at) > timeout)
@@ -151,11 +194,19 @@ impl Monitor {
         let writers = input.foreign_writers;
         let surroundings = [
             input.stop_requested.then_some(Fault::StopRequested),
+            self.watchdog_fault(state, input.watchdog),
+            (self.pause > Duration::from_millis(self.config.max_pause_ms))
+                .then_some(Fault::Pause { ms: self.pause.as_millis() as u64 }),
+            (!input.can_send).then_some(Fault::CannotSend),
             (writers > 0).then_some(Fault::ForeignWriter { writers }),
+            self.has_other_robot().then_some(Fault::OtherRobot),
+            self.clock_jump.map(|ticks| Fault::ClockJump { ticks }),
             (!input.controller_released).then_some(Fault::ControllerActive),
             self.is_stale().then_some(Fault::StateStale { age_ms: self.silence.as_millis() as u64 }),
         ];
-        let measured = self.reading.iter().flat_map(|reading| self.measured_faults(reading)).flatten();
+        let last = self.reading.as_ref().filter(|_| self.recent.is_empty());
+        let measured =
+            self.recent.iter().chain(last).flat_map(|reading| self.measured_faults(reading)).flatten();
         let missing = [
             self.remote_is_lost().then_some(Fault::RemoteLost),
             (input.client == Client::Absent).then_some(Fault::ClientLost),
@@ -171,7 +222,7 @@ impl Monitor {
     fn measured_faults(&self, reading: &Reading) -> [Option<Fault>; 8] {
         let config = &self.config;
         let is_stop = |remote: &Remote| remote.is_pressed(Button::L2) && remote.is_pressed(Button::B);
-        let lost = self.loss_interval.map_or(0, |(_, count)| reading.lost_messages - count);
+        let lost = self.loss_interval.map_or(0, |(_, count)| reading.lost_messages.saturating_sub(count));
         let outside = |joint: &Joint| {
             let [low, high] = self.position_limits[joint.index()];
             !(low..=high).contains(&reading.q[joint.index()])
@@ -186,12 +237,12 @@ impl Monitor {
         [
             reading.remote.as_ref().is_some_and(is_stop).then_some(Fault::RemoteStop),
             (lost > config.max_lost_messages).then_some(Fault::MessagesLost { count: lost }),
-            (degrees > config.max_tilt_deg).then_some(Fault::Tilt { degrees }),
-            (disagreement > config.max_imu_disagreement_deg).then_some(Fault::ImuDisagrees { degrees: disagreement }),
+            (!(degrees <= config.max_tilt_deg)).then_some(Fault::Tilt { degrees }),
+            (!(disagreement <= config.max_imu_disagreement_deg)).then_some(Fault::ImuDisagrees { degrees: disagreement }),
             first(&outside).map(|joint| Fault::JointLimit { joint, q: reading.q[joint.index()] }),
             first(&overloaded).map(|joint| Fault::Torque { joint, tau: reading.tau[joint.index()] }),
             first(&hot).map(|joint| Fault::Temperature { joint, celsius: reading.temperature[joint.index()] }),
-            (reading.voltage < config.min_voltage_v).then_some(Fault::Voltage { volts: reading.voltage }),
+            (!(reading.voltage >= config.min_voltage_v)).then_some(Fault::Voltage { volts: reading.voltage }),
         ]
     }
 }

@@ -6,12 +6,15 @@ use std::time::{Duration, Instant};
 use twinstep_model::RobotModel;
 use twinstep_unitree::{LowState, decode, encode};
 
+use crate::command::SafeCommand;
 use crate::config::SafetyConfig;
 use crate::control_loop::StartError;
-use crate::dds::{Dds, LOW_CMD, LOW_STATE, Reader, Writer};
+use crate::dds::{Dds, LOW_STATE, Reader};
+use crate::motor_link::MotorLink;
 use crate::preflight::{Activity, Preflight, PreflightInput, PreflightReport};
 use crate::real_time_thread;
 use crate::robot_handle::RobotHandle;
+use crate::watchdog::Watchdog;
 
 /// Time after the last step at which the next one is made if no state arrives.
 const TIMER: Duration = Duration::from_micros(2500);
@@ -21,6 +24,9 @@ const SETTLING: Duration = Duration::from_millis(500);
 const PATIENCE: Duration = Duration::from_secs(5);
 /// Time for which the robot is damped before its commands cease, so that it lies.
 const FINAL_DAMPING: Duration = Duration::from_millis(1500);
+
+/// Time after the first command, in which preflight only damps, from which the watchdog has to guard the motors.
+const MAX_ARMING: Duration = Duration::from_millis(150);
 
 /// What happens during preflight.
 #[derive(Debug)]
@@ -36,6 +42,7 @@ pub fn start(
     robot: &RobotModel,
     config: SafetyConfig,
     dds: &Dds,
+    mut motors: MotorLink,
     handle: RobotHandle,
 ) -> Result<Receiver<Event>, StartError> {
     let mut preflight = Preflight::new(robot, config)?;
@@ -50,7 +57,7 @@ pub fn start(
         let _ = ready.send(Ok(()));
         wait_for_states(&reader, &handle);
         let (start, mut due) = (Instant::now(), Duration::ZERO);
-        let (mut writer, mut activity, mut stopped_at) = (None, None, None);
+        let (mut activity, mut stopped_at, mut armed_at) = (None, None, None);
         loop {
             let mut states = Vec::new();
             while let Some(payload) = reader.take() {
@@ -62,7 +69,9 @@ pub fn start(
                 continue;
             }
             due = now + TIMER;
-            if handle.is_ending() {
+            let is_guarded = motors.watchdog(now) == Watchdog::Guarding && motors.can_send();
+            let is_late = armed_at.is_some_and(|at: Duration| now.saturating_sub(at) > MAX_ARMING);
+            if handle.is_ending() || handle.has_panicked() || (is_late && !is_guarded) {
                 stopped_at.get_or_insert(now);
             }
             let controller = (!handle.controller_released()).then(|| "the built-in controller".to_owned());
@@ -70,17 +79,22 @@ pub fn start(
             let stop_requested = stopped_at.is_some();
             let input = PreflightInput { now, states, foreign_writers, controller, stop_requested };
             let output = preflight.step(&input);
-            send(&dds, &mut writer, output.command.map(|command| encode(&command.to_low_cmd())));
+            if output.command.is_some() {
+                armed_at.get_or_insert(now);
+            }
+            send(&mut motors, output.command, preflight.damping(), &handle);
             if activity != Some(output.activity) {
                 activity = Some(output.activity);
                 let _ = events.send(Event::Activity(output.activity));
             }
             let is_over = stopped_at.is_some_and(|at| now.saturating_sub(at) > FINAL_DAMPING);
             if let Some(report) = output.report {
+                motors.disarm();
                 let _ = events.send(Event::Report(report));
                 return;
             }
             if is_over {
+                motors.disarm();
                 return;
             }
         }
@@ -103,19 +117,15 @@ fn wait_for_states(reader: &Reader, handle: &RobotHandle) {
     }
 }
 
-/// Sends a command. The writer exists while there are commands.
-fn send(dds: &Dds, writer: &mut Option<Writer>, payload: Option<Vec<u8>>) {
-    let Some(payload) = payload else {
-        *writer = None;
-        return;
-    };
-    if writer.is_none() {
-        match dds.writer(LOW_CMD, 1) {
-            Ok(new) => *writer = Some(new),
-            Err(error) => tracing::error!(%error, "commands cannot be sent"),
-        }
+/// Sends a command. The robot is armed while there are commands.
+fn send(motors: &mut MotorLink, command: Option<SafeCommand>, damping: SafeCommand, handle: &RobotHandle) {
+    let Some(command) = command else { return motors.disarm() };
+    if !motors.is_armed() {
+        motors.arm(encode(&damping.to_low_cmd()));
     }
-    if let Some(writer) = writer {
-        writer.write(payload);
+    handle.with_readers(|readers| motors.set_readers(readers));
+    if !handle.has_panicked() {
+        motors.send(&encode(&command.to_low_cmd()));
+        motors.beat();
     }
 }

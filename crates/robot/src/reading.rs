@@ -15,7 +15,10 @@ pub struct Reading {
     /// Torque estimated from the motor current [N·m].
     pub tau: PerJoint,
     /// Motor temperature [°C].
-    pub temperature: [i8; 12],
+    ///
+    /// The vendor's two definitions of the message disagree about its sign. It counts as unsigned: a motor that is too hot must
+    /// not count as cold.
+    pub temperature: [u8; 12],
     /// Rotation world-from-base, `[w, x, y, z]`.
     pub orientation: [f32; 4],
     /// Angular velocity of the base in the base frame [rad/s].
@@ -34,6 +37,9 @@ pub struct Reading {
     pub remote: Option<Remote>,
 }
 
+/// Largest number of an IMU that can be true [m/s², rad/s]. Sensors of robots end at 160 m/s² and 35 rad/s.
+const MAX_IMU: f32 = 1000.0;
+
 /// A message of the robot cannot be used.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum ReadingError {
@@ -50,8 +56,8 @@ pub enum ReadingError {
         /// Value of the field.
         value: f32,
     },
-    /// A number of the IMU is not finite.
-    #[error("`{quantity}` of the IMU is {value:?}, which is not finite")]
+    /// A number of the IMU is not finite, or beyond every sensor's range.
+    #[error("`{quantity}` of the IMU is {value:?}, which no sensor measures")]
     Imu {
         /// Field of the message.
         quantity: &'static str,
@@ -84,7 +90,7 @@ impl Reading {
         }
         let imu = [("gyroscope", state.imu_state.gyroscope), ("accelerometer", state.imu_state.accelerometer)];
         for (quantity, value) in imu {
-            if value.iter().any(|part| !part.is_finite()) {
+            if value.iter().any(|part| !(part.abs() <= MAX_IMU)) {
                 return Err(ReadingError::Imu { quantity, value });
             }
         }
@@ -96,7 +102,7 @@ impl Reading {
             q: motors.map(|motor| motor.q),
             dq: motors.map(|motor| motor.dq),
             tau: motors.map(|motor| motor.tau_est),
-            temperature: motors.map(|motor| motor.temperature as i8),
+            temperature: motors.map(|motor| motor.temperature),
             orientation: orientation.map(|part| part / length),
             gyro: state.imu_state.gyroscope,
             acc: state.imu_state.accelerometer,
@@ -141,12 +147,13 @@ mod tests {
     #[test]
     fn damaged_or_impossible_message_is_rejected() {
         assert!(matches!(Reading::new(&upright()), Err(ReadingError::Checksum(_))));
-        let change: [fn(&mut LowState); 5] = [
+        let change: [fn(&mut LowState); 6] = [
             |state| state.motor_state[4].dq = f32::NAN,
             |state| state.imu_state.quaternion = [0.0; 4],
             |state| state.imu_state.quaternion[2] = f32::NAN,
             |state| state.power_v = f32::INFINITY,
             |state| state.imu_state.gyroscope[1] = f32::NAN,
+            |state| state.imu_state.accelerometer[2] = 3e38,
         ];
         let errors = change.map(|change| {
             let mut state = upright();
@@ -156,5 +163,6 @@ mod tests {
         assert!(errors[0].starts_with("`dq` of FL_thigh is NaN"), "{}", errors[0]);
         assert!(errors[1].contains("orientation") && errors[2].contains("orientation"));
         assert!(errors[3].contains("voltage") && errors[4].contains("gyroscope"));
+        assert!(errors[5].contains("accelerometer"), "{}", errors[5]);
     }
 }

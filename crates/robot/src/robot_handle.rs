@@ -1,19 +1,23 @@
 //! What other threads see of the control loop, and what they ask of it.
 
 use std::collections::VecDeque;
+use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, TryLockError};
 use std::time::{Duration, Instant};
 
 use twinstep_model::PerJoint;
 
 use crate::fault::Fault;
-use crate::input::{Action, ActionRefused, Client, OperatorRequest, Output, RequestRefused};
+use crate::input::{Action, ActionRefused, Client, OperatorRequest, RequestRefused};
 use crate::reading::Reading;
 use crate::state::State;
 use crate::timing::Timing;
+use crate::watchdog::Watchdog;
 
 /// Access to a running control loop. Clones are the same loop.
+///
+/// The loop waits for none of the locks: what is locked by another thread it reads or writes at its next step.
 #[derive(Clone, Default)]
 pub struct RobotHandle(Arc<Shared>);
 
@@ -26,6 +30,9 @@ struct Shared {
     samples: Mutex<Option<VecDeque<TimedSample>>>,
     /// The board has a new tick or state.
     changed: Condvar,
+    /// Addresses of those who read the commands.
+    readers: Mutex<Vec<SocketAddr>>,
+    has_panicked: AtomicBool,
     stop_requested: AtomicBool,
     is_ending: AtomicBool,
     foreign_writers: AtomicUsize,
@@ -33,6 +40,8 @@ struct Shared {
     release_requested: AtomicBool,
 }
 
+/// Time in which the control loop answers a request that has expired.
+const ANSWER_TIME: Duration = Duration::from_millis(100);
 /// Largest number of samples that are kept: those of 2 s.
 const MAX_SAMPLES: usize = 1000;
 
@@ -52,7 +61,9 @@ pub(crate) struct TimedSample {
 /// What the loop takes in at its next step.
 #[derive(Default)]
 struct Inbox {
-    requests: VecDeque<OperatorRequest>,
+    requests: VecDeque<Request>,
+    /// Number of requests so far.
+    num_requests: u64,
     action: Option<(u64, Action)>,
     /// Number of clients that hold the robot: none or one.
     clients: usize,
@@ -61,12 +72,22 @@ struct Inbox {
     actions: u64,
 }
 
+/// A request of the operator.
+struct Request {
+    number: u64,
+    request: OperatorRequest,
+    /// Time after which it is not executed any more.
+    end: Instant,
+}
+
 /// What the loop takes in at one step.
+#[derive(Default)]
 pub(crate) struct Taken {
-    pub request: Option<OperatorRequest>,
+    /// The request with its number; `None` in place of one that has expired.
+    pub request: Option<(u64, Option<OperatorRequest>)>,
     /// The action with its number.
     pub action: Option<(u64, Action)>,
-    pub client: Client,
+    pub client: Option<Client>,
     pub has_client: bool,
 }
 
@@ -89,10 +110,12 @@ pub struct Board {
     pub reading: Option<(Duration, Reading)>,
     /// Number of the last action, and why it was not executed.
     pub action_result: (u64, Option<ActionRefused>),
-    /// Why the last request of the operator was not executed.
-    pub request_refused: Option<RequestRefused>,
-    /// Number of requests of the operator that were executed or refused.
-    pub requests: u64,
+    /// Number of the last request of the operator that was executed or refused, and why it was refused.
+    pub request_result: (u64, Option<RequestRefused>),
+    /// False after a fault, until the operator lets the client act again.
+    pub is_permitted: bool,
+    /// What the watchdog does.
+    pub watchdog: Watchdog,
     /// True while a client holds the robot.
     pub has_client: bool,
     /// Number of other writers of `rt/lowcmd`.
@@ -104,9 +127,24 @@ pub struct Board {
 }
 
 impl RobotHandle {
-    /// Asks the loop for something on behalf of the operator. [`Board::request_refused`] has the result.
-    pub fn request(&self, request: OperatorRequest) {
-        lock(&self.0.inbox).requests.push_back(request);
+    /// Asks the loop for something on behalf of the operator, and waits for the answer. A request that is not taken within
+    /// `timeout` is never executed.
+    pub fn request(&self, request: OperatorRequest, timeout: Duration) -> Result<(), RequestRefused> {
+        let number = self.enqueue(request, Instant::now() + timeout);
+        // The loop answers also a request that has expired.
+        let board = self.wait_until(timeout + ANSWER_TIME, |board| board.request_result.0 >= number);
+        match board.request_result {
+            (answered, refused) if answered == number => refused.map_or(Ok(()), Err),
+            _ => Err(RequestRefused::Expired),
+        }
+    }
+
+    fn enqueue(&self, request: OperatorRequest, end: Instant) -> u64 {
+        let mut inbox = lock(&self.0.inbox);
+        inbox.num_requests += 1;
+        let number = inbox.num_requests;
+        inbox.requests.push_back(Request { number, request, end });
+        number
     }
 
     /// Releases the robot's built-in controller, in the background.
@@ -170,43 +208,31 @@ impl RobotHandle {
         number
     }
 
+    /// Returns what other threads ask for; nothing if one of them has the lock.
     pub(crate) fn take(&self) -> Taken {
-        let mut inbox = lock(&self.0.inbox);
+        let Some(mut inbox) = try_lock(&self.0.inbox) else { return Taken::default() };
         let client = match (std::mem::take(&mut inbox.ends_episode), inbox.clients) {
             (true, _) => Client::EndsEpisode,
             (false, 0) => Client::Absent,
             (false, _) => Client::Connected,
         };
-        let has_client = inbox.clients > 0;
-        Taken { request: inbox.requests.pop_front(), action: inbox.action.take(), client, has_client }
+        let request = inbox.requests.pop_front();
+        let request = request.map(|Request { number, request, end }| (number, (Instant::now() < end).then_some(request)));
+        Taken { request, action: inbox.action.take(), client: Some(client), has_client: inbox.clients > 0 }
     }
 
-    /// Publishes the state after a step. Wakes those who wait for a tick or a state.
-    pub(crate) fn publish(
-        &self,
-        now: Duration,
-        output: &Output,
-        reading: Option<Reading>,
-        update: impl FnOnce(&mut Board),
-    ) {
-        let mut board = lock(&self.0.board);
-        let is_new = board.tick != output.tick || board.state != Some(output.state);
-        board.now = now;
-        board.state = Some(output.state);
-        board.fault = output.fault;
-        board.tick = output.tick;
-        board.missed_ticks = output.missed_ticks;
-        board.applied = output.applied.unwrap_or_default();
-        board.foreign_writers = self.foreign_writers();
-        board.controller_released = self.controller_released();
-        if let Some(reading) = reading {
-            board.reading = Some((now, reading));
-        }
-        update(&mut board);
-        drop(board);
-        if is_new {
+    /// Publishes the state after a step, and wakes those who wait for it. Returns false if another thread has the lock.
+    pub(crate) fn publish(&self, board: &Board) -> bool {
+        let Some(mut published) = try_lock(&self.0.board) else { return false };
+        let has_news = published.tick != board.tick
+            || published.state != board.state
+            || published.request_result.0 != board.request_result.0;
+        published.clone_from(board);
+        drop(published);
+        if has_news {
             self.0.changed.notify_all();
         }
+        true
     }
 
     /// Returns the samples since the last call, oldest first. Sampling begins with the first call.
@@ -216,7 +242,8 @@ impl RobotHandle {
 
     /// Keeps a sample, if somebody has asked for samples.
     pub(crate) fn add_sample(&self, sample: impl FnOnce() -> TimedSample) {
-        if let Some(samples) = lock(&self.0.samples).as_mut() {
+        let Some(mut samples) = try_lock(&self.0.samples) else { return };
+        if let Some(samples) = samples.as_mut() {
             if samples.len() == MAX_SAMPLES {
                 samples.pop_front();
             }
@@ -225,7 +252,9 @@ impl RobotHandle {
     }
 
     pub(crate) fn publish_timing(&self, timing: &Timing) {
-        lock(&self.0.timing).clone_from(timing);
+        if let Some(mut published) = try_lock(&self.0.timing) {
+            published.clone_from(timing);
+        }
     }
 
     pub(crate) fn publish_end(&self) {
@@ -235,6 +264,34 @@ impl RobotHandle {
 
     pub(crate) fn take_stop(&self) -> bool {
         self.0.stop_requested.swap(false, Ordering::AcqRel)
+    }
+
+    /// Reports that a thread of this process has panicked. The watchdog takes the motors over: nobody knows what the process
+    /// still does.
+    pub fn report_panic(&self) {
+        self.0.has_panicked.store(true, Ordering::Release);
+        self.stop();
+    }
+
+    pub(crate) fn has_panicked(&self) -> bool {
+        self.0.has_panicked.load(Ordering::Acquire)
+    }
+
+    /// Sets the addresses of those who read the commands.
+    pub(crate) fn set_readers(&self, readers: Vec<SocketAddr>) {
+        *lock(&self.0.readers) = readers;
+    }
+
+    /// Calls `use_readers` with the addresses of those who read the commands, unless another thread sets them.
+    pub(crate) fn with_readers(&self, use_readers: impl FnOnce(&[SocketAddr])) {
+        if let Some(readers) = try_lock(&self.0.readers) {
+            use_readers(&readers);
+        }
+    }
+
+    /// Returns true once the loop has ended.
+    pub fn has_ended(&self) -> bool {
+        lock(&self.0.board).has_ended
     }
 
     /// Returns true if the loop is to end.
@@ -261,6 +318,15 @@ impl RobotHandle {
 
     pub(crate) fn take_release_request(&self) -> bool {
         self.0.release_requested.swap(false, Ordering::AcqRel)
+    }
+}
+
+/// Locks a mutex unless another thread has it.
+fn try_lock<T>(mutex: &Mutex<T>) -> Option<MutexGuard<'_, T>> {
+    match mutex.try_lock() {
+        Ok(guard) => Some(guard),
+        Err(TryLockError::Poisoned(poisoned)) => Some(poisoned.into_inner()),
+        Err(TryLockError::WouldBlock) => None,
     }
 }
 

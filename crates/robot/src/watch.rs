@@ -1,4 +1,5 @@
-//! Watches what else commands the robot: other writers of `rt/lowcmd`, and the built-in controller.
+//! Watches what else commands the robot: other writers of `rt/lowcmd`, and the built-in controller. Finds the readers of the
+//! commands.
 //!
 //! Runs on its own thread, because a service may take long to answer.
 
@@ -60,7 +61,7 @@ impl Watch {
 
     fn run(&mut self) {
         while !self.handle.is_ending() {
-            self.handle.set_foreign_writers(self.dds.foreign_writers(LOW_CMD));
+            look(&self.dds, &self.handle);
             if self.handle.take_release_request() {
                 self.release();
             }
@@ -91,6 +92,12 @@ impl Watch {
         }
         self.next_check = Instant::now();
     }
+}
+
+/// Looks for those who write and those who read the commands to the motors.
+fn look(dds: &Dds, handle: &RobotHandle) {
+    handle.set_foreign_writers(dds.foreign_writers(LOW_CMD));
+    handle.set_readers(dds.readers(LOW_CMD));
 }
 
 /// Returns the name of the active controller in the answer to [`CHECK_MODE`].
@@ -130,7 +137,7 @@ impl Service {
                     return Some(response);
                 }
             }
-            handle.set_foreign_writers(dds.foreign_writers(LOW_CMD));
+            look(dds, handle);
             std::thread::park_timeout(PERIOD);
         }
         None

@@ -174,8 +174,6 @@
 
 mod polling;
 #[macro_use]
-mod serialization_test;
-#[macro_use]
 mod checked_impl;
 #[doc(hidden)]
 pub mod discovery; // to access some Discovered data in e.g. ros2-client crate
@@ -183,26 +181,17 @@ mod messages;
 mod network;
 mod rtps;
 
-#[cfg(feature = "security")]
-mod security;
-#[cfg(feature = "security")]
-pub use security::config::DomainParticipantSecurityConfigFiles;
 
-#[cfg(not(feature = "security"))]
 mod no_security;
 
 pub(crate) mod structure;
 
-#[cfg(test)]
-mod test;
 
 mod mio_source;
 
 // Public modules
 pub mod dds; // this is public, but not advertised
 
-#[deprecated(since = "0.8.5", note = "Use crate ros2-client instead.")]
-pub mod ros2;
 /// Helpers for (De)serialization and definitions of (De)serializer adapters
 pub mod serialization;
 

@@ -38,7 +38,7 @@ pub use finding::{Blocks, Finding, LeftOut};
 use crate::command::{CommandLimits, SafeCommand};
 use crate::config::{ConfigError, SafetyConfig};
 use crate::fault::Fault;
-use crate::input::{Client, Input};
+use crate::input::Input;
 use crate::monitor::Monitor;
 use crate::reading::Reading;
 use crate::state::State;
@@ -177,6 +177,11 @@ impl Preflight {
         })
     }
 
+    /// Returns the command that damps the motors.
+    pub(crate) fn damping(&self) -> SafeCommand {
+        self.damping
+    }
+
     /// Advances to `input.now`.
     pub fn step(&mut self, input: &PreflightInput) -> PreflightOutput {
         let since = *self.since.get_or_insert(input.now);
@@ -214,32 +219,23 @@ impl Preflight {
     /// Takes in the states, and returns the newest one that is not damaged.
     fn take_in(&mut self, input: &PreflightInput) -> Option<Sample> {
         let newest = input.states.iter().rev().find(|state| state.check_checksum().is_ok());
-        let reading = newest.and_then(|state| Reading::new(state).ok());
-        let monitored = Input {
-            now: input.now,
-            reading,
-            foreign_writers: input.foreign_writers,
-            controller_released: input.controller.is_none(),
-            stop_requested: input.stop_requested,
-            request: None,
-            client: Client::Connected,
-            action: None,
-        };
-        self.monitor.update(&monitored);
+        let readings = input.states.iter().filter_map(|state| Reading::new(state).ok()).collect();
+        self.monitor.update(&Input { readings, ..Self::surroundings(input) });
         newest.map(|state| Sample::new(state, input.now.as_secs_f64(), self.q_command))
     }
 
-    fn fault(&self, input: &PreflightInput) -> Option<Fault> {
-        let surroundings = Input {
-            now: input.now,
-            reading: None,
+    /// Returns the input of the monitor without measurements.
+    fn surroundings(input: &PreflightInput) -> Input {
+        Input {
             foreign_writers: input.foreign_writers,
             controller_released: input.controller.is_none(),
             stop_requested: input.stop_requested,
-            request: None,
-            client: Client::Connected,
-            action: None,
-        };
+            ..Input::quiet(input.now)
+        }
+    }
+
+    fn fault(&self, input: &PreflightInput) -> Option<Fault> {
+        let surroundings = Self::surroundings(input);
         let ending = matches!(self.phase, Phase::Damp { then: AfterDamping::Finish });
         let state = if ending { State::Fault } else { State::Ready };
         self.monitor.fault(state, &surroundings)

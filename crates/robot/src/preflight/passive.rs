@@ -332,7 +332,7 @@ fn power(state: &LowState, config: &SafetyConfig) -> Vec<Finding> {
         ));
     }
     let temperature: PerJoint =
-        Joint::ALL.map(|joint| f32::from(state.motor_state[twinstep_unitree::motor_index(joint)].temperature as i8));
+        Joint::ALL.map(|joint| f32::from(state.motor_state[twinstep_unitree::motor_index(joint)].temperature));
     for joint in Joint::ALL {
         let (celsius, max) = (temperature[joint.index()], config.arm_max_temperature_c);
         if celsius > f32::from(max) {

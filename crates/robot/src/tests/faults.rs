@@ -4,15 +4,22 @@ use twinstep_model::Joint;
 use twinstep_unitree::Button;
 
 use super::*;
-use crate::{Fault, Reaction};
+use crate::watchdog::Watchdog;
+use crate::{ActionRefused, Fault, Reaction, RequestRefused};
 
 /// What causes a fault, its name, and the longest time to the reaction [ms].
 type Case = (&'static str, fn(&mut Rig), fn(&Fault) -> bool, u64);
 
-const CASES: [Case; 16] = [
+const CASES: [Case; 22] = [
     ("stale state", |rig| rig.sends_states = false, |fault| matches!(fault, Fault::StateStale { .. }), 40),
     ("stopped clock", |rig| rig.clock_runs = false, |fault| matches!(fault, Fault::StateStale { .. }), 40),
     ("foreign writer", |rig| rig.input.foreign_writers = 1, |fault| *fault == Fault::ForeignWriter { writers: 1 }, 2),
+    ("other robot", |rig| rig.input.other_robot = true, |fault| *fault == Fault::OtherRobot, 2),
+    ("clock jump", |rig| rig.reading.tick -= 500, |fault| matches!(fault, Fault::ClockJump { .. }), 2),
+    ("takeover", |rig| rig.input.watchdog = Watchdog::TookOver, |fault| *fault == Fault::WatchdogTookOver, 2),
+    ("no watchdog", |rig| rig.input.watchdog = Watchdog::Missing, |fault| *fault == Fault::WatchdogGone, 2),
+    ("no guard", |rig| rig.input.watchdog = Watchdog::Idle, |fault| *fault == Fault::WatchdogGone, 2),
+    ("network", |rig| rig.input.can_send = false, |fault| *fault == Fault::CannotSend, 2),
     ("controller", |rig| rig.input.controller_released = false, |fault| *fault == Fault::ControllerActive, 2),
     ("remote stop", press_stop, |fault| *fault == Fault::RemoteStop, 2),
     ("stop request", |rig| rig.input.stop_requested = true, |fault| *fault == Fault::StopRequested, 2),
@@ -61,8 +68,9 @@ fn counts(name: &str, state: State) -> bool {
     match state {
         State::Disconnected | State::Observe | State::Fault => false,
         State::Damp => {
-            let surroundings = ["foreign writer", "controller", "remote stop", "stop request"];
-            ["stale state", "stopped clock", "lost messages"].iter().chain(&surroundings).any(|counts| *counts == name)
+            let surroundings = ["foreign writer", "other robot", "controller", "remote stop", "stop request", "network"];
+            let process = ["takeover", "no watchdog", "stale state", "stopped clock", "clock jump", "lost messages"];
+            process.iter().chain(&surroundings).any(|counts| *counts == name)
         }
         State::StandUp | State::Ready | State::Sit => !["client lost", "late actions"].contains(&name),
         State::Run | State::Hold => true,
@@ -194,4 +202,89 @@ fn graver_fault_interrupts_sitting_down_and_the_first_one_is_kept() {
     rig.reading.tilt = 2.0;
     rig.step();
     assert_eq!((rig.output.state, rig.output.fault), (State::Fault, Some(Fault::ClientLost)));
+}
+
+#[test]
+fn pause_of_the_process_while_the_robot_moves_is_a_fault() {
+    for state in State::ALL {
+        let mut rig = Rig::in_state(state);
+        rig.input.now += Duration::from_millis(49);
+        let fault_before = rig.output.fault;
+        rig.step();
+        let is_fault = matches!(rig.output.fault, Some(Fault::Pause { ms: 51 }));
+        assert_eq!(is_fault, state.is_moving(), "{state}: {:?}", rig.output.fault);
+        assert!(is_fault || rig.output.fault == fault_before, "{state}");
+    }
+}
+
+#[test]
+fn button_that_was_released_again_in_the_newest_state_stops_the_robot() {
+    let mut rig = Rig::in_state(State::Ready);
+    let pressed = Remote::default().with_pressed(Button::L2).with_pressed(Button::B);
+    let state = |rig: &Rig, remote, tick| Reading { remote: Some(remote), tick, ..rig.reading.clone() };
+    let tick = rig.reading.tick;
+    rig.input.readings = vec![state(&rig, pressed, tick + 2), state(&rig, Remote::default(), tick + 4)];
+    rig.input.now += DT;
+    let output = rig.machine.step(&rig.input);
+    assert_eq!((output.state, output.fault), (State::Fault, Some(Fault::RemoteStop)));
+}
+
+#[test]
+fn number_that_is_none_is_no_healthy_one() {
+    let cases: [fn(&mut Rig); 3] = [
+        |rig| rig.reading.tilt = f32::NAN,
+        |rig| rig.reading.voltage = f32::NAN,
+        |rig| rig.reading.acc = [f32::NAN, 0.0, 9.81],
+    ];
+    for cause in cases {
+        let mut rig = Rig::in_state(State::Ready);
+        cause(&mut rig);
+        rig.run(0.1);
+        assert!(rig.output.fault.is_some());
+    }
+}
+
+#[test]
+fn watchdog_has_to_guard_the_motors_before_the_robot_stands_up() {
+    let mut rig = Rig::in_state(State::Damp);
+    rig.input.watchdog = Watchdog::Idle;
+    rig.request(OperatorRequest::Stand);
+    assert_eq!(rig.output.request_refused, Some(RequestRefused::Fault(Fault::WatchdogGone)));
+    assert_eq!(rig.output.state, State::Damp);
+    rig.input.watchdog = Watchdog::Guarding;
+    rig.request(OperatorRequest::Stand);
+    assert_eq!(rig.output.state, State::StandUp);
+}
+
+#[test]
+fn motors_that_the_watchdog_took_over_are_taken_back_by_arming_again() {
+    let mut rig = Rig::in_state(State::Ready);
+    rig.input.watchdog = Watchdog::TookOver;
+    rig.run(0.2);
+    assert_eq!((rig.output.state, rig.output.fault), (State::Fault, Some(Fault::WatchdogTookOver)));
+    rig.request(OperatorRequest::Arm);
+    assert_eq!((rig.output.state, rig.output.request_refused), (State::Damp, None));
+    // The new writer has another generation, which the watchdog does not know yet.
+    rig.input.watchdog = Watchdog::Idle;
+    rig.run(0.1);
+    assert_eq!((rig.output.state, rig.output.fault), (State::Damp, None));
+}
+
+#[test]
+fn client_acts_again_after_a_fault_when_the_operator_says_go() {
+    let mut rig = Rig::in_state(State::Run);
+    rig.input.stop_requested = true;
+    rig.step();
+    rig.input.stop_requested = false;
+    for (request, seconds) in [(OperatorRequest::Arm, 0.1), (OperatorRequest::Stand, 4.0)] {
+        rig.request(request);
+        rig.run(seconds);
+    }
+    assert_eq!((rig.output.state, rig.output.is_permitted), (State::Ready, false));
+    rig.act([0.1; NUM_JOINTS]);
+    assert_eq!((rig.output.state, rig.output.action_refused), (State::Ready, Some(ActionRefused::NotPermitted)));
+    rig.request(OperatorRequest::Go);
+    assert_eq!(rig.output.request_refused, None);
+    rig.walk(0.1);
+    assert_eq!(rig.output.state, State::Run);
 }

@@ -35,16 +35,7 @@ struct Rig {
 impl Rig {
     fn new() -> Self {
         let mut machine = SafetyMachine::new(&go2(), SafetyConfig::default()).expect("the default config");
-        let input = Input {
-            now: Duration::ZERO,
-            reading: None,
-            foreign_writers: 0,
-            controller_released: true,
-            stop_requested: false,
-            request: None,
-            client: Client::Connected,
-            action: None,
-        };
+        let input = Input::quiet(Duration::ZERO);
         let reading = Reading {
             tick: 0,
             q: lying(),
@@ -104,7 +95,7 @@ impl Rig {
         let before = self.output.state;
         self.input.now += DT;
         self.reading.tick += if self.clock_runs { 2 } else { 0 };
-        self.input.reading = self.sends_states.then(|| self.reading.clone());
+        self.input.readings = if self.sends_states { vec![self.reading.clone()] } else { Vec::new() };
         self.output = self.machine.step(&self.input);
         (self.input.request, self.input.action) = (None, None);
         self.check(before);
@@ -152,7 +143,7 @@ impl Rig {
 
     /// Sends an action for the tick of the next step.
     fn act(&mut self, values: PerJoint) {
-        self.input.action = Some(Action { tick: Some(self.next_tick()), values });
+        self.input.action = Some(Action { tick: self.next_tick(), values });
         self.step();
     }
 

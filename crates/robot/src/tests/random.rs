@@ -5,6 +5,7 @@ use twinstep_model::{Stream, stream};
 use twinstep_unitree::Button;
 
 use super::*;
+use crate::watchdog::Watchdog;
 
 const SEQUENCES: u64 = 10_000;
 /// Steps of each sequence: 2 s.
@@ -13,7 +14,7 @@ const STEPS: usize = 1000;
 /// Changes one thing at random.
 fn disturb(rig: &mut Rig, random: &mut Stream) {
     let joint = random.random_range(0..NUM_JOINTS);
-    match random.random_range(0..16) {
+    match random.random_range(0..19) {
         0 => rig.sends_states = !rig.sends_states,
         1 => rig.input.foreign_writers = random.random_range(0..3),
         2 => rig.input.controller_released = !rig.input.controller_released,
@@ -23,7 +24,7 @@ fn disturb(rig: &mut Rig, random: &mut Stream) {
         6 => rig.reading.q[joint] = random.random_range(-5.0..5.0),
         7 => rig.reading.dq[joint] = random.random_range(-50.0..50.0),
         8 => rig.reading.tau[joint] = random.random_range(-60.0..60.0),
-        9 => rig.reading.temperature[joint] = random.random_range(-20..120),
+        9 => rig.reading.temperature[joint] = random.random_range(0..=255),
         10 => rig.reading.voltage = random.random_range(15.0..34.0),
         11 => rig.reading.lost_messages = rig.reading.lost_messages.wrapping_add(random.random_range(0..40)),
         12 => rig.reading.charge = random.random_range(0..=100),
@@ -32,6 +33,12 @@ fn disturb(rig: &mut Rig, random: &mut Stream) {
             rig.reading.remote = [None, Some(Remote::default()), Some(stop)][random.random_range(0..3)];
         }
         14 => rig.input.now += Duration::from_millis(random.random_range(0..100)),
+        15 => rig.input.other_robot = !rig.input.other_robot,
+        16 => rig.input.can_send = !rig.input.can_send,
+        17 => {
+            let states = [Watchdog::Missing, Watchdog::Idle, Watchdog::Guarding, Watchdog::TookOver];
+            rig.input.watchdog = states[random.random_range(0..4)];
+        }
         // All is well again.
         _ => {
             let healthy = Rig::new();
@@ -48,16 +55,16 @@ fn act(rig: &mut Rig, random: &mut Stream) {
     if random.random_bool(0.05) {
         values[random.random_range(0..NUM_JOINTS)] = [f32::NAN, f32::INFINITY, -1e30, 1e30][random.random_range(0..4)];
     }
-    rig.input.action = Some(Action { tick: Some(tick), values });
+    rig.input.action = Some(Action { tick, values });
 }
 
 fn request(random: &mut Stream) -> OperatorRequest {
-    use OperatorRequest::{Arm, Damp, Disarm, Sit, Stand};
-    [Arm, Arm, Stand, Stand, Sit, Damp, Disarm][random.random_range(0..7)]
+    use OperatorRequest::{Arm, Damp, Disarm, Go, Sit, Stand};
+    [Arm, Arm, Stand, Stand, Sit, Damp, Disarm, Go][random.random_range(0..8)]
 }
 
 /// Checks a step from `before`: commands are checked by [`Rig::step`].
-fn check(before: &Output, after: &Output, request: Option<OperatorRequest>) {
+fn check(before: &Output, after: &Output, request: Option<OperatorRequest>, watchdog: Watchdog) {
     let context = || format!("{} to {} with {request:?}: {before:?}", before.state, after.state);
     let done = request.filter(|_| after.request_refused.is_none());
     if before.state.is_armed() && !after.state.is_armed() {
@@ -72,6 +79,9 @@ fn check(before: &Output, after: &Output, request: Option<OperatorRequest>) {
     }
     if before.state == State::Fault && after.state != State::Fault {
         assert!(matches!(done, Some(OperatorRequest::Arm | OperatorRequest::Disarm)), "{}", context());
+    }
+    if after.state.is_moving() {
+        assert_eq!(watchdog, Watchdog::Guarding, "{}", context());
     }
     if before.state == State::Damp && after.state.is_moving() {
         assert_eq!((done, after.state), (Some(OperatorRequest::Stand), State::StandUp), "{}", context());
@@ -108,7 +118,7 @@ fn no_sequence_of_events_makes_the_robot_unsafe() {
             }
             let (before, asked) = (rig.output, rig.input.request);
             rig.step();
-            check(&before, &rig.output, asked);
+            check(&before, &rig.output, asked, rig.input.watchdog);
             visits[State::ALL.iter().position(|state| *state == rig.output.state).expect("a state")] += 1;
         }
     }

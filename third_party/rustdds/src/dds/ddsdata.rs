@@ -68,19 +68,7 @@ impl DDSData {
     }
   }
 
-  #[cfg(test)]
-  pub fn data(&self) -> Bytes {
-    self.payload_bytes()
-  }
 
-  #[cfg(test)]
-  fn payload_bytes(&self) -> Bytes {
-    match &self {
-      DDSData::Data { serialized_payload } => serialized_payload.value.clone(),
-      DDSData::DisposeByKey { key, .. } => key.value.clone(),
-      DDSData::DisposeByKeyHash { key_hash, .. } => Bytes::from(key_hash.to_vec()),
-    }
-  }
 
   pub fn bytes_slice(&self, from: usize, to: usize) -> Bytes {
     match &self {

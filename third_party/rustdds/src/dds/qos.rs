@@ -210,8 +210,6 @@ impl QosPolicyBuilder {
       // (drop glue) which is incompatible with `const fn`, and the built-in QoS
       // policies never need it. Set it via `QosPolicies::with_data_representation`.
       data_representation: None,
-      #[cfg(feature = "security")]
-      property: None,
     }
   }
 }
@@ -235,8 +233,6 @@ pub struct QosPolicies {
   pub(crate) resource_limits: Option<policy::ResourceLimits>,
   pub(crate) lifespan: Option<policy::Lifespan>,
   pub(crate) data_representation: Option<policy::DataRepresentation>,
-  #[cfg(feature = "security")]
-  pub(crate) property: Option<policy::Property>,
 }
 
 impl QosPolicies {
@@ -333,10 +329,6 @@ impl QosPolicies {
     self
   }
 
-  #[cfg(feature = "security")]
-  pub fn property(&self) -> Option<policy::Property> {
-    self.property.clone()
-  }
 
   /// Merge two QosPolicies
   ///
@@ -362,8 +354,6 @@ impl QosPolicies {
         .data_representation
         .clone()
         .or(self.data_representation.clone()),
-      #[cfg(feature = "security")]
-      property: other.property.clone().or(self.property.clone()),
     }
   }
 
@@ -566,8 +556,6 @@ impl QosPolicies {
       resource_limits,
       lifespan,
       data_representation,
-      #[cfg(feature = "security")]
-        property: _, // TODO: properties to parameter list?
     } = self;
 
     macro_rules! emit {
@@ -719,8 +707,6 @@ impl QosPolicies {
     let data_representation: Option<policy::DataRepresentation> =
       get_option!(PID_DATA_REPRESENTATION);
 
-    #[cfg(feature = "security")]
-    let property: Option<policy::Property> = None; // TODO: Should also properties be read?
 
     // We construct using the struct syntax directly rather than the builder,
     // so we cannot forget any field.
@@ -738,8 +724,6 @@ impl QosPolicies {
       resource_limits,
       lifespan,
       data_representation,
-      #[cfg(feature = "security")]
-      property,
     })
   }
 }
@@ -786,12 +770,8 @@ pub mod policy {
   use serde::{Deserialize, Serialize};
   #[allow(unused_imports)]
   use log::{debug, error, info, trace, warn};
-  #[cfg(feature = "security")]
-  use speedy::{Context, IsEof, Reader, Writer};
 
   use crate::structure::duration::Duration;
-  #[cfg(feature = "security")]
-  use crate::serialization::speedy_pl_cdr_helpers::*;
 
   /*
   pub struct UserData {
@@ -1105,109 +1085,15 @@ pub mod policy {
     pub max_samples_per_instance: i32,
   }
 
-  #[cfg(feature = "security")]
-  use crate::security;
   // DDS Security spec v1.1
   // Section 7.2.5 PropertyQosPolicy, DomainParticipantQos, DataWriterQos, and
   // DataReaderQos
-  #[cfg(feature = "security")]
-  #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-  pub struct Property {
-    pub value: Vec<security::types::Property>,
-    pub binary_value: Vec<security::types::BinaryProperty>,
-  }
 
-  #[cfg(feature = "security")]
-  impl<'a, C: Context> Readable<'a, C> for Property {
-    fn minimum_bytes_needed() -> usize {
-      4
-    }
-
-    fn read_from<R: Reader<'a, C>>(reader: &mut R) -> Result<Self, C::Error> {
-      let count = reader.read_u32()?;
-      let mut value = Vec::new();
-
-      let mut prev_len = 0;
-      for _ in 0..count {
-        read_pad(reader, prev_len, 4)?;
-        let s: security::types::Property = reader.read_value()?;
-        prev_len = s.serialized_len();
-        value.push(s);
-      }
-
-      // Depending on the RTPS version used by writer, PropertyQoSPolicy may end here,
-      // i.e. there is no "binary_value". Pad should still always exist.
-      read_pad(reader, prev_len, 4)?;
-      let mut binary_value = Vec::new();
-
-      match reader.read_u32() {
-        Ok(count) => {
-          prev_len = 0;
-          for _ in 0..count {
-            read_pad(reader, prev_len, 4)?;
-            let s: security::types::BinaryProperty = reader.read_value()?;
-            prev_len = s.serialized_len();
-            binary_value.push(s);
-          }
-        }
-        Err(e) => {
-          if e.is_eof() {
-            // This is ok. Only String properties, no binary.
-            debug!("Non-security PropertyQosPolicy");
-          } else {
-            return Err(e);
-          }
-        }
-      }
-
-      Ok(Property {
-        value,
-        binary_value,
-      })
-    }
-  }
 
   // Writing several strings is a bit complicated, because
   // we have to keep track of alignment.
   // Again, alignment comes BEFORE string length, or vector item count, not after
   // string.
-  #[cfg(feature = "security")]
-  impl<C: Context> Writable<C> for Property {
-    fn write_to<T: ?Sized + Writer<C>>(&self, writer: &mut T) -> Result<(), C::Error> {
-      // First self.value
-      // Only those properties with propagate=true are written
-      let propagate_value: Vec<&security::Property> =
-        self.value.iter().filter(|p| p.propagate).collect();
-
-      // propagate_value vector length
-      writer.write_u32(propagate_value.len() as u32)?;
-
-      let mut prev_len = 0;
-      for prop in propagate_value {
-        write_pad(writer, prev_len, 4)?;
-        writer.write_value(prop)?;
-        prev_len = prop.serialized_len();
-      }
-
-      // Then self.bin_value
-      // Only those binary properties with propagate=true are written
-      let propagate_bin_value: Vec<&security::BinaryProperty> =
-        self.binary_value.iter().filter(|p| p.propagate).collect();
-
-      // propagate_bin_value vector length
-      write_pad(writer, prev_len, 4)?;
-      writer.write_u32(propagate_bin_value.len() as u32)?;
-      // and the elements
-      let mut prev_len = 0;
-      for prop in propagate_bin_value {
-        write_pad(writer, prev_len, 4)?;
-        writer.write_value(prop)?;
-        prev_len = prop.serialized_len();
-      }
-
-      Ok(())
-    }
-  }
 
   // DDS Security spec v1.1
   // Section 7.2.5 PropertyQosPolicy, DomainParticipantQos, DataWriterQos, and
@@ -1215,49 +1101,10 @@ pub mod policy {
   //
   // so this is DataTagQosPolicy, which is an alias for "DataTags"
   // We call it qos::policy::DataTag
-  #[derive(Clone, Debug, PartialEq, Eq, Default)]
-  #[cfg(feature = "security")]
-  pub struct DataTag {
-    pub tags: Vec<security::types::Tag>,
-  }
 
-  #[cfg(feature = "security")]
-  impl<'a, C: Context> Readable<'a, C> for DataTag {
-    fn minimum_bytes_needed() -> usize {
-      4
-    }
-
-    fn read_from<R: Reader<'a, C>>(reader: &mut R) -> Result<Self, C::Error> {
-      let count = reader.read_u32()?;
-      let mut tags = Vec::new();
-
-      let mut prev_len = 0;
-      for _ in 0..count {
-        read_pad(reader, prev_len, 4)?;
-        let s: security::types::Tag = reader.read_value()?;
-        prev_len = s.serialized_len();
-        tags.push(s);
-      }
-      Ok(DataTag { tags })
-    }
-  }
 
   // Writing several strings is a bit complicated, because
   // we have to keep track of alignment.
   // Again, alignment comes BEFORE string length, or vector item count, not after
   // string.
-  #[cfg(feature = "security")]
-  impl<C: Context> Writable<C> for DataTag {
-    fn write_to<T: ?Sized + Writer<C>>(&self, writer: &mut T) -> Result<(), C::Error> {
-      writer.write_u32(self.tags.len() as u32)?;
-
-      let mut prev_len = 0;
-      for tag in &self.tags {
-        write_pad(writer, prev_len, 4)?;
-        writer.write_value(tag)?;
-        prev_len = tag.serialized_len();
-      }
-      Ok(())
-    }
-  }
 } // mod policy

@@ -31,8 +31,6 @@ use crate::{
   structure::guid::GuidPrefix,
   Duration, QosPolicies, GUID,
 };
-#[cfg(feature = "security")]
-use crate::discovery::secure_discovery::AuthenticationStatus;
 
 /// This trait corresponds to set_listener() of the Entity class in DDS spec.
 /// Types implementing this trait can be registered to a poll and
@@ -391,30 +389,6 @@ pub enum DomainParticipantStatusEvent {
     requested_qos: Box<QosPolicies>,
     offered_qos: Box<QosPolicies>,
   },
-  #[cfg(feature = "security")]
-  Authentication {
-    participant: GuidPrefix,
-    status: AuthenticationStatus,
-  },
-  /// The CA has revoked the identity of some Participant.
-  /// We may be currently communicating with the Participant, or it may be
-  /// unknown to us.
-  // TODO:
-  /// Not implemented, as we do not implement any identity revocation mechanism
-  /// yet.
-  #[cfg(feature = "security")]
-  IdentityRevoked {
-    participant: GuidPrefix,
-  },
-  /// Domain access permissions of some Participant have been revoked / changed.
-  // TODO:
-  /// Not implemented, as we do not implement any permissions revocation
-  /// mechanism yet.
-  #[cfg(feature = "security")]
-  PermissionsRevoked {
-    participant: GuidPrefix,
-    // TODO: How to get more details on what was revoked, or was something added?
-  },
 }
 
 /// Why some remote entity is considered to be no longer with us.
@@ -441,8 +415,6 @@ pub struct ParticipantDescription {
   pub guid: GUID,
   pub lease_duration: Option<Duration>,
   pub entity_name: Option<String>,
-  #[cfg(feature = "security")]
-  pub supports_security: bool,
 }
 
 impl From<&SpdpDiscoveredParticipantData> for ParticipantDescription {
@@ -454,8 +426,6 @@ impl From<&SpdpDiscoveredParticipantData> for ParticipantDescription {
       guid: dpd.participant_guid,
       lease_duration: dpd.lease_duration,
       entity_name: dpd.entity_name.clone(),
-      #[cfg(feature = "security")]
-      supports_security: dpd.supports_security(),
     }
   }
 }

@@ -29,16 +29,6 @@ use crate::{
   Key, Keyed, RepresentationIdentifier,
 };
 use super::builtin_endpoint::{BuiltinEndpointQos, BuiltinEndpointSet};
-#[cfg(feature = "security")]
-use crate::{
-  dds::qos,
-  security::{
-    access_control::PermissionsToken, authentication::IdentityToken, ParticipantSecurityInfo,
-  },
-};
-#[cfg(feature = "security")]
-use super::secure_discovery::SecureDiscovery;
-#[cfg(not(feature = "security"))]
 use crate::no_security::SecureDiscovery;
 
 // This type is used by Discovery to communicate the presence and properties
@@ -67,29 +57,12 @@ pub struct SpdpDiscoveredParticipantData {
   pub entity_name: Option<String>,         // where does this come from??
 
   // security
-  #[cfg(feature = "security")]
-  pub identity_token: Option<IdentityToken>,
 
-  #[cfg(feature = "security")]
-  pub permissions_token: Option<PermissionsToken>,
 
-  #[cfg(feature = "security")]
-  pub property: Option<qos::policy::Property>,
 
-  #[cfg(feature = "security")]
-  pub security_info: Option<ParticipantSecurityInfo>,
 }
 
 impl SpdpDiscoveredParticipantData {
-  #[cfg(feature = "security")]
-  pub(crate) fn supports_security(&self) -> bool {
-    // TODO: Is this logic correct? Or maybe we could come up with a more accurate
-    // version?
-    self.identity_token.is_some()
-      && self.permissions_token.is_some()
-      && self.property.is_some()
-      && self.security_info.is_some()
-  }
 
   pub(crate) fn get_builtin_reader_proxy(
     &self,
@@ -170,41 +143,7 @@ impl SpdpDiscoveredParticipantData {
       | BuiltinEndpointSet::TOPICS_DETECTOR;
 
     // Security-related items initially None
-    #[cfg(feature = "security")]
-    let mut identity_token = None;
-    #[cfg(feature = "security")]
-    let mut permissions_token = None;
-    #[cfg(feature = "security")]
-    let mut property = None;
-    #[cfg(feature = "security")]
-    let mut security_info = None;
 
-    #[cfg(feature = "security")]
-    if let Some(secure_discovery) = _secure_discovery_opt {
-      // Security enabled, add needed data
-      // Builtin security endpoints
-      builtin_endpoints = builtin_endpoints
-        | BuiltinEndpointSet::PUBLICATIONS_SECURE_WRITER
-        | BuiltinEndpointSet::PUBLICATIONS_SECURE_READER
-        | BuiltinEndpointSet::SUBSCRIPTIONS_SECURE_WRITER
-        | BuiltinEndpointSet::SUBSCRIPTIONS_SECURE_READER
-        | BuiltinEndpointSet::PARTICIPANT_MESSAGE_SECURE_WRITER
-        | BuiltinEndpointSet::PARTICIPANT_MESSAGE_SECURE_READER
-        | BuiltinEndpointSet::PARTICIPANT_STATELESS_MESSAGE_WRITER
-        | BuiltinEndpointSet::PARTICIPANT_STATELESS_MESSAGE_READER
-        | BuiltinEndpointSet::PARTICIPANT_VOLATILE_MESSAGE_SECURE_WRITER
-        | BuiltinEndpointSet::PARTICIPANT_VOLATILE_MESSAGE_SECURE_READER
-        | BuiltinEndpointSet::PARTICIPANT_SECURE_WRITER
-        | BuiltinEndpointSet::PARTICIPANT_SECURE_READER;
-
-      // Tokens and the rest
-      identity_token = Some(secure_discovery.local_dp_identity_token.clone());
-      permissions_token = Some(secure_discovery.local_dp_permissions_token.clone());
-      property = Some(secure_discovery.local_dp_property_qos.clone());
-      security_info = Some(ParticipantSecurityInfo::from(
-        secure_discovery.local_dp_sec_attributes.clone(),
-      ));
-    }
 
     Self {
       updated_time: Utc::now(),
@@ -223,14 +162,6 @@ impl SpdpDiscoveredParticipantData {
       entity_name: None,
 
       // DDS Security
-      #[cfg(feature = "security")]
-      identity_token,
-      #[cfg(feature = "security")]
-      permissions_token,
-      #[cfg(feature = "security")]
-      property,
-      #[cfg(feature = "security")]
-      security_info,
     }
   }
 }
@@ -313,35 +244,7 @@ impl PlCdrDeserialize for SpdpDiscoveredParticipantData {
       .map( String::from );
 
     // DDS security
-    #[cfg(feature = "security")]
-    let identity_token: Option<IdentityToken> = get_option_from_pl_map(
-      &pl_map,
-      ctx,
-      ParameterId::PID_IDENTITY_TOKEN,
-      "identity token",
-    )?;
-    #[cfg(feature = "security")]
-    let permissions_token: Option<PermissionsToken> = get_option_from_pl_map(
-      &pl_map,
-      ctx,
-      ParameterId::PID_PERMISSIONS_TOKEN,
-      "permissions token",
-    )?;
-    #[cfg(feature = "security")]
-    let property: Option<qos::policy::Property> = get_option_from_pl_map(
-      &pl_map,
-      ctx,
-      ParameterId::PID_PROPERTY_LIST,
-      "property list",
-    )?;
 
-    #[cfg(feature = "security")]
-    let security_info: Option<ParticipantSecurityInfo> = get_option_from_pl_map(
-      &pl_map,
-      ctx,
-      ParameterId::PID_PARTICIPANT_SECURITY_INFO,
-      "participant security info",
-    )?;
 
     Ok(Self {
       updated_time: Utc::now(),
@@ -358,14 +261,6 @@ impl PlCdrDeserialize for SpdpDiscoveredParticipantData {
       manual_liveliness_count,
       builtin_endpoint_qos,
       entity_name,
-      #[cfg(feature = "security")]
-      identity_token,
-      #[cfg(feature = "security")]
-      permissions_token,
-      #[cfg(feature = "security")]
-      property,
-      #[cfg(feature = "security")]
-      security_info,
     })
   }
 }
@@ -406,14 +301,6 @@ impl ParameterListable for SpdpDiscoveredParticipantData {
       entity_name,
 
       // DDS security
-      #[cfg(feature = "security")]
-      identity_token,
-      #[cfg(feature = "security")]
-      permissions_token,
-      #[cfg(feature = "security")]
-      property,
-      #[cfg(feature = "security")]
-      security_info,
     } = self;
 
     let mut pl = ParameterList::new();
@@ -489,17 +376,6 @@ impl ParameterListable for SpdpDiscoveredParticipantData {
     let entity_name_n: Option<StringWithNul> = entity_name.clone().map(|e| e.into());
     emit_option!(PID_ENTITY_NAME, &entity_name_n, StringWithNul);
 
-    #[cfg(feature = "security")] // DDS security
-    {
-      emit_option!(PID_IDENTITY_TOKEN, identity_token, IdentityToken);
-      emit_option!(PID_PERMISSIONS_TOKEN, permissions_token, PermissionsToken);
-      emit_option!(PID_PROPERTY_LIST, property, qos::policy::Property);
-      emit_option!(
-        PID_PARTICIPANT_SECURITY_INFO,
-        security_info,
-        ParticipantSecurityInfo
-      );
-    }
 
     Ok(pl)
   }
@@ -562,183 +438,3 @@ impl PlCdrSerialize for Participant_GUID {
   }
 }
 
-#[cfg(test)]
-mod tests {
-  use super::*;
-  use crate::{
-    dds::adapters::no_key::DeserializerAdapter,
-    messages::submessages::submessages::WriterSubmessage,
-    rtps::{submessage::*, Message},
-    test::test_data::*,
-  };
-
-  #[test]
-  fn pdata_deserialize_serialize() {
-    let data = spdp_participant_data_raw();
-
-    let rtpsmsg = Message::read_from_buffer(&data).unwrap();
-    let submsgs = rtpsmsg.submessages();
-
-    for submsg in &submsgs {
-      match &submsg.body {
-        SubmessageBody::Writer(WriterSubmessage::Data(d, _)) => {
-          let participant_data: SpdpDiscoveredParticipantData =
-            PlCdrDeserializerAdapter::from_bytes(
-              &d.unwrap_serialized_payload_value(),
-              RepresentationIdentifier::PL_CDR_LE,
-            )
-            .unwrap();
-          let sdata = participant_data
-            .to_pl_cdr_bytes(RepresentationIdentifier::PL_CDR_LE)
-            .unwrap();
-          eprintln!("message data = {:?}", data);
-          eprintln!(
-            "payload    = {:?}",
-            d.unwrap_serialized_payload_value().to_vec()
-          );
-          eprintln!("deserialized  = {:?}", participant_data);
-          eprintln!("serialized = {:?}", sdata);
-          // order cannot be known at this point
-          // assert_eq!(
-          //  sdata.len(),
-          //  d.serialized_payload.as_ref().unwrap().value.len()
-          //);
-
-          let mut participant_data_2: SpdpDiscoveredParticipantData =
-            PlCdrDeserializerAdapter::from_bytes(&sdata, RepresentationIdentifier::PL_CDR_LE)
-              .unwrap();
-          // force timestamps to be the same, as these are not serialized/deserialized,
-          // but stamped during deserialization
-          participant_data_2.updated_time = participant_data.updated_time;
-
-          eprintln!("again deserialized = {:?}", participant_data_2);
-          let _sdata_2 = participant_data
-            .to_pl_cdr_bytes(RepresentationIdentifier::PL_CDR_LE)
-            .unwrap();
-          // now the order of bytes should be the same
-          assert_eq!(&participant_data_2, &participant_data);
-        }
-        SubmessageBody::Interpreter(_) => (),
-        _ => continue,
-      }
-    }
-  }
-
-  #[test]
-  fn deserialize_evil_spdp_fuzz() {
-    use hex_literal::hex;
-    let data = Bytes::copy_from_slice(&hex!(
-      "
-    52 54 50 53
-    02 02 ff ff 01 0f 45 d2 b3 f5 58 b9 01 00 00 00
-    15 07 1e 00 00 00 10 00 00 00 00 00 00 01 00 c2
-    00 00 00 00 00 00 00 00 01 00 00 00 00 02 44 d5
-    cf 7a
-    "
-    ));
-
-    let rtpsmsg = Message::read_from_buffer(&data).unwrap();
-    let submsgs = rtpsmsg.submessages();
-
-    for submsg in &submsgs {
-      match &submsg.body {
-        SubmessageBody::Writer(WriterSubmessage::Data(d, _)) => {
-          let participant_data: Result<SpdpDiscoveredParticipantData, PlCdrDeserializeError> =
-            PlCdrDeserializerAdapter::from_bytes(
-              &d.unwrap_serialized_payload_value(),
-              RepresentationIdentifier::PL_CDR_LE,
-            );
-          eprintln!("message data = {:?}", data);
-          eprintln!(
-            "payload    = {:?}",
-            d.unwrap_serialized_payload_value().to_vec()
-          );
-          eprintln!("deserialized  = {:?}", participant_data);
-        }
-        SubmessageBody::Interpreter(_) => (),
-        _ => continue,
-      }
-    }
-  }
-  #[test]
-  fn deserialize_evil_spdp_fuzz_2() {
-    // https://github.com/jhelovuo/RustDDS/issues/279
-    use hex_literal::hex;
-    let data = Bytes::copy_from_slice(&hex!(
-      "
-      52 54 50 53
-      02 02 ff ff 01 0f 45 d2 b3 f5 58 b9 01 00 00 00
-      15 05 19 00 00 00 10 00 00 00 00 00 00 01 00 c2
-      00 00 00 00 02 00 00 00 00 03 90 fe c7
-    "
-    ));
-
-    let rtpsmsg = Message::read_from_buffer(&data).unwrap();
-    let submsgs = rtpsmsg.submessages();
-
-    for submsg in &submsgs {
-      match &submsg.body {
-        SubmessageBody::Writer(WriterSubmessage::Data(d, _)) => {
-          let participant_data: Result<SpdpDiscoveredParticipantData, PlCdrDeserializeError> =
-            PlCdrDeserializerAdapter::from_bytes(
-              &d.unwrap_serialized_payload_value(),
-              RepresentationIdentifier::PL_CDR_LE,
-            );
-          eprintln!("message data = {:?}", data);
-          eprintln!(
-            "payload    = {:?}",
-            d.unwrap_serialized_payload_value().to_vec()
-          );
-          eprintln!("deserialized  = {:?}", participant_data);
-        }
-
-        SubmessageBody::Interpreter(_) => (),
-        _ => continue,
-      }
-    }
-  }
-
-  #[test]
-  fn deserialize_evil_spdp_fuzz_3() {
-    // https://github.com/jhelovuo/RustDDS/issues/281
-    use hex_literal::hex;
-    let data = Bytes::copy_from_slice(&hex!(
-      "
-      52 54 50 53
-      02 02 ff ff 01 0f 45 d2 b3 f5 58 b9 01 00 00 00
-      15 05 00 00 00 00 32 00 00 00 00 00 00 01 00 c2
-      00 00 00 00 02 00 00 00 00 03 00 00 77 00 04 00
-      00 00 00 00
-    "
-    ));
-
-    let rtpsmsg = match Message::read_from_buffer(&data) {
-      Ok(m) => m,
-      Err(e) => {
-        eprintln!("{e}");
-        return;
-      }
-    };
-    let submsgs = rtpsmsg.submessages();
-
-    for submsg in &submsgs {
-      match &submsg.body {
-        SubmessageBody::Writer(WriterSubmessage::Data(d, _)) => {
-          let participant_data: Result<SpdpDiscoveredParticipantData, PlCdrDeserializeError> =
-            PlCdrDeserializerAdapter::from_bytes(
-              &d.unwrap_serialized_payload_value(),
-              RepresentationIdentifier::PL_CDR_LE,
-            );
-          eprintln!("message data = {:?}", data);
-          eprintln!(
-            "payload    = {:?}",
-            d.unwrap_serialized_payload_value().to_vec()
-          );
-          eprintln!("deserialized  = {:?}", participant_data);
-        }
-        SubmessageBody::Interpreter(_) => (),
-        _ => continue,
-      }
-    }
-  }
-}

@@ -51,35 +51,3 @@ impl<C: Context> Writable<C> for ProtocolId {
   }
 }
 
-#[cfg(test)]
-mod tests {
-  use speedy::Endianness;
-
-  use super::*;
-
-  #[test]
-  fn validity() {
-    let protocol_id = ProtocolId::PROTOCOL_RTPS;
-    assert!(protocol_id.valid());
-    let protocol_id = ProtocolId {
-      protocol_id: ['S', 'P', 'T', 'R'],
-    };
-    assert!(!protocol_id.valid());
-  }
-
-  #[test]
-  fn minimum_bytes_needed() {
-    assert_eq!(
-      4,
-      <ProtocolId as Readable<Endianness>>::minimum_bytes_needed()
-    );
-  }
-
-  serialization_test!( type = ProtocolId,
-  {
-      protocol_rtps,
-      ProtocolId::PROTOCOL_RTPS,
-      le = [0x52, 0x54, 0x50, 0x53],
-      be = [0x52, 0x54, 0x50, 0x53]
-  });
-}

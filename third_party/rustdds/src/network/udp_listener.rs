@@ -11,7 +11,7 @@ use bytes::{Bytes, BytesMut};
 use crate::{
   network::util::{
     build_ifindex_to_interface_map, get_local_multicast_ip_addrs_filtered,
-    get_local_multicast_locators, get_local_unicast_locators_filtered,
+    get_local_multicast_locators, get_local_unicast_locators_filtered, interface_indices,
   },
   rtps::transmit::InterfaceSelector,
   serialization::padding_needed_for_alignment_4,
@@ -43,6 +43,29 @@ const MAX_MESSAGE_SIZE: usize = 64 * 1024; // This is max we can get from UDP.
 const MESSAGE_BUFFER_ALLOCATION_CHUNK: usize = 256 * 1024; // must be >= MAX_MESSAGE_SIZE
 static_assertions::const_assert!(MESSAGE_BUFFER_ALLOCATION_CHUNK > MAX_MESSAGE_SIZE);
 
+/// Interfaces from which packets are accepted; the sockets receive from all. Twinstep.
+#[derive(Debug)]
+struct AcceptedInterfaces {
+  indices: Vec<u32>,
+  addresses: Vec<IpAddr>,
+}
+
+impl AcceptedInterfaces {
+  fn new(only_networks: Option<&[IpAddr]>) -> io::Result<Option<Self>> {
+    let accepted = |networks: &[IpAddr]| {
+      let indices = interface_indices(networks)?;
+      Ok(Self { indices, addresses: networks.to_vec() })
+    };
+    only_networks.map(accepted).transpose()
+  }
+
+  /// A packet from one of our own addresses was sent on this machine: the system drops those that
+  /// arrive from outside.
+  fn accepts(&self, index: u32, source: Option<SocketAddr>) -> bool {
+    self.indices.contains(&index) || source.is_some_and(|source| self.addresses.contains(&source.ip()))
+  }
+}
+
 /// Listens to messages coming to specified host port combination.
 /// Only messages from added listen addressed are read when get_all_messages is
 /// called.
@@ -55,6 +78,8 @@ pub struct UDPListener {
   // Cached OS interface-index -> local interface map, used to resolve the
   // receiving interface reported by IP_PKTINFO. Built once at construction.
   ifindex_map: HashMap<u32, InterfaceSelector>,
+  // `None`: all of them.
+  accepted: Option<AcceptedInterfaces>,
 }
 
 impl Drop for UDPListener {
@@ -179,15 +204,12 @@ impl UDPListener {
     }
   }
 
-  #[cfg(test)]
-  pub fn new_unicast(host: &str, port: u16) -> io::Result<Self> {
-    Self::new_unicast_with_buf_size(host, port, 0)
-  }
 
   pub fn new_unicast_with_buf_size(
     host: &str,
     port: u16,
     recv_buffer_size: usize,
+    only_networks: Option<&[IpAddr]>,
   ) -> io::Result<Self> {
     let mio_socket = Self::new_listening_socket(host, port, false, recv_buffer_size)?;
 
@@ -197,13 +219,10 @@ impl UDPListener {
       multicast_group: None,
       has_multicast_join: false,
       ifindex_map: build_ifindex_to_interface_map(),
+      accepted: AcceptedInterfaces::new(only_networks)?,
     })
   }
 
-  #[cfg(test)]
-  pub fn new_multicast(host: &str, port: u16, multicast_group: Ipv4Addr) -> io::Result<Self> {
-    Self::new_multicast_with_buf_size(host, port, multicast_group, 0, None)
-  }
 
   pub fn new_multicast_with_buf_size(
     host: &str,
@@ -262,6 +281,7 @@ impl UDPListener {
       multicast_group: Some(multicast_group),
       has_multicast_join: joined_multicast,
       ifindex_map: build_ifindex_to_interface_map(),
+      accepted: AcceptedInterfaces::new(only_networks)?,
     })
   }
 
@@ -269,60 +289,20 @@ impl UDPListener {
     &mut self.socket
   }
 
-  #[cfg(test)]
-  pub fn port(&self) -> u16 {
-    match self.socket.local_addr() {
-      Ok(add) => add.port(),
-      _ => 0,
-    }
-  }
 
   // TODO: remove this. It is used only for tests.
   // We cannot read a single packet only, because we use edge-triggered polls.
-  #[cfg(test)]
-  pub fn get_message(&self) -> Vec<u8> {
-    let mut buf: [u8; MAX_MESSAGE_SIZE] = [0; MAX_MESSAGE_SIZE];
 
-    // try getting the message several times
-    for _ in 0..10 {
-      match self.socket.recv(&mut buf) {
-        Ok(nbytes) => {
-          assert!(nbytes > 0, "tests should always read data");
-
-          return buf[..nbytes].to_vec();
-        }
-        Err(e) => {
-          // handle EAGAIN on UNIX platforms.
-          //
-          // this means we need to wait for the kernel to give us the data.
-          if e.kind() == io::ErrorKind::WouldBlock {
-            std::thread::sleep(core::time::Duration::from_millis(50));
-            continue;
-          }
-
-          panic!("test helper (`get_message`) failed! err: {e}");
-        }
-      }
-    }
-
-    panic!("test helper didn't recv message after ten attempts.");
-  }
-
-  /// Drain up to `max_messages` datagrams waiting in the socket, each paired
-  /// with its [`PacketOrigin`] (source address + receiving interface, when
-  /// available). Pass `usize::MAX` to read everything currently queued.
+  /// Reads up to `max_messages` datagrams, each paired with its
+  /// [`PacketOrigin`]. The flag is true if the socket is empty then.
   ///
-  /// The reactor registers listeners edge-triggered, so it must pass
-  /// `usize::MAX`: a datagram left unread does not produce another readiness
-  /// event. `Ok(None)` from [`recv_one`](Self::recv_one) (`WouldBlock`) ends
-  /// the drain.
-  pub fn messages_bounded(&mut self, max_messages: usize) -> Vec<(Bytes, PacketOrigin)> {
+  /// The reactor registers listeners edge-triggered: a datagram left unread
+  /// does not produce another readiness event, so the caller must come back.
+  /// Twinstep: datagrams of other interfaces count, and are dropped.
+  pub fn messages_bounded(&mut self, max_messages: usize) -> (Vec<(Bytes, PacketOrigin)>, bool) {
     let mut messages = Vec::with_capacity(4);
 
-    loop {
-      if messages.len() >= max_messages {
-        return messages;
-      }
+    for _ in 0..max_messages {
       // Loop invariant. Note that capacity() may be large, but .len() == 0.
       assert_eq!(self.receive_buffer.len(), 0);
 
@@ -343,16 +323,20 @@ impl UDPListener {
         self.receive_buffer.capacity()
       );
       let (nbytes, origin) = match self.recv_one() {
-        Ok(Some(received)) => received,
+        Ok(Some((nbytes, origin, true))) => (nbytes, origin),
+        Ok(Some((_, _, false))) => {
+          self.receive_buffer.clear();
+          continue;
+        }
         Ok(None) => {
           // WouldBlock: nothing (more) to read.
           self.receive_buffer.clear();
-          return messages;
+          return (messages, true);
         }
         Err(e) => {
           self.receive_buffer.clear();
           warn!("socket recv() error: {e:?}");
-          return messages;
+          return (messages, true);
         }
       };
       // Something was received.
@@ -384,16 +368,14 @@ impl UDPListener {
       let mut message = self.receive_buffer.split_to(self.receive_buffer.len());
       message.truncate(nbytes); // discard (hide) padding
       messages.push((Bytes::from(message), origin)); // freeze bytes and push
-    } // loop
-
-    // unreachable!(); // But why does this cause a warning? (rustc 1.66.0)
-    // Answer: https://github.com/rust-lang/rust/issues/46500
+    } // for
+    (messages, false)
   }
 
   /// Receive a single datagram into `self.receive_buffer`, capturing its
   /// [`PacketOrigin`]. Returns `Ok(None)` when the socket would block.
   #[cfg(unix)]
-  fn recv_one(&mut self) -> io::Result<Option<(usize, PacketOrigin)>> {
+  fn recv_one(&mut self) -> io::Result<Option<(usize, PacketOrigin, bool)>> {
     use std::{io::IoSliceMut, os::unix::io::AsRawFd};
 
     use nix::{
@@ -445,12 +427,14 @@ impl UDPListener {
       .map(InterfaceSelector::Ip)
       .or_else(|| self.ifindex_map.get(&ifindex).copied());
 
-    Ok(Some((nbytes, PacketOrigin { source, local_if })))
+    let is_accepted = self.accepted.as_ref().is_none_or(|accepted| accepted.accepts(ifindex, source));
+
+    Ok(Some((nbytes, PacketOrigin { source, local_if }, is_accepted)))
   }
 
   /// Non-Unix fallback: capture the source address only (no interface info).
   #[cfg(not(unix))]
-  fn recv_one(&mut self) -> io::Result<Option<(usize, PacketOrigin)>> {
+  fn recv_one(&mut self) -> io::Result<Option<(usize, PacketOrigin, bool)>> {
     match self
       .socket
       .recv_from(&mut self.receive_buffer[..MAX_MESSAGE_SIZE])
@@ -461,21 +445,13 @@ impl UDPListener {
           source: Some(source),
           local_if: None,
         },
+        self.accepted.is_none(),
       ))),
       Err(e) if e.kind() == io::ErrorKind::WouldBlock => Ok(None),
       Err(e) => Err(e),
     }
   }
 
-  #[cfg(test)] // normally done in .drop()
-  pub fn leave_multicast(&self, address: &Ipv4Addr) -> io::Result<()> {
-    if address.is_multicast() {
-      return self
-        .socket
-        .leave_multicast_v4(address, &Ipv4Addr::UNSPECIFIED);
-    }
-    io::Result::Err(io::Error::other("Not a multicast address"))
-  }
 }
 
 #[cfg(unix)]
@@ -495,56 +471,3 @@ fn sockaddr_storage_to_socketaddr(addr: nix::sys::socket::SockaddrStorage) -> Op
   }
 }
 
-#[cfg(test)]
-mod tests {
-  // use std::os::unix::io::AsRawFd;
-  // use nix::sys::socket::setsockopt;
-  // use nix::sys::socket::sockopt::IpMulticastLoop;
-  use std::{thread, time};
-
-  use super::*;
-  use crate::network::udp_sender::*;
-
-  #[test]
-  fn udpl_single_address() {
-    let listener = UDPListener::new_unicast("127.0.0.1", 10001).unwrap();
-    let sender = UDPSender::new_with_random_port().expect("failed to create UDPSender");
-
-    let data: Vec<u8> = vec![0, 1, 2, 3, 4];
-
-    let addrs = vec![SocketAddr::new("127.0.0.1".parse().unwrap(), 10001)];
-    sender.send_to_all(&data, &addrs);
-
-    let rec_data = listener.get_message();
-
-    assert_eq!(rec_data.len(), 5); // It appears that this test may randomly fail.
-    assert_eq!(rec_data, data);
-  }
-
-  #[test]
-  fn udpl_multicast_address() {
-    let listener =
-      UDPListener::new_multicast("0.0.0.0", 10002, Ipv4Addr::new(239, 255, 0, 1)).unwrap();
-    let sender = UDPSender::new_with_random_port().unwrap();
-
-    // setsockopt(sender.socket.as_raw_fd(), IpMulticastLoop, &true)
-    //  .expect("Unable set IpMulticastLoop option on socket");
-
-    let data: Vec<u8> = vec![2, 4, 6];
-
-    sender
-      .send_multicast(&data, Ipv4Addr::new(239, 255, 0, 1), 10002)
-      .expect("Failed to send multicast");
-
-    thread::sleep(time::Duration::from_secs(1));
-
-    let rec_data = listener.get_message();
-
-    listener
-      .leave_multicast(&Ipv4Addr::new(239, 255, 0, 1))
-      .unwrap();
-
-    assert_eq!(rec_data.len(), 3);
-    assert_eq!(rec_data, data);
-  }
-}

@@ -4,8 +4,6 @@ use std::{
   io,
   net::{IpAddr, SocketAddr, UdpSocket},
 };
-#[cfg(test)]
-use std::net::Ipv4Addr;
 #[cfg(unix)]
 use std::os::unix::io::{AsRawFd, RawFd};
 
@@ -41,10 +39,6 @@ pub struct UDPSender {
 }
 
 impl UDPSender {
-  #[cfg(test)]
-  pub fn new(sender_port: u16) -> io::Result<Self> {
-    Self::new_with_networks(sender_port, None, 0)
-  }
 
   // Request (and verify) SO_SNDBUF on a sender socket. `size == 0` leaves the
   // OS default in place. Like the receive path, the kernel silently clamps the
@@ -165,10 +159,6 @@ impl UDPSender {
     Ok(sender)
   }
 
-  #[cfg(test)]
-  pub fn new_with_random_port() -> io::Result<Self> {
-    Self::new(0)
-  }
 
   // --- nonblocking-transmit: socket enumeration & raw non-blocking send ------
 
@@ -301,20 +291,6 @@ impl UDPSender {
     self.control_queue_nonempty(id)
   }
 
-  /// Queue a datagram on socket `id` without sending, as if the socket had
-  /// returned WouldBlock.
-  #[cfg(test)]
-  pub(crate) fn inject_control_backlog(&self, id: SocketId) {
-    self
-      .control_queues
-      .borrow_mut()
-      .entry(id)
-      .or_default()
-      .push_back(Datagram {
-        addr: SocketAddr::from(([127, 0, 0, 1], 9)),
-        bytes: vec![0; 4],
-      });
-  }
 
   /// Sockets that currently have queued (undelivered) control datagrams.
   pub(crate) fn pending_control_sockets(&self) -> Vec<SocketId> {
@@ -499,107 +475,6 @@ impl UDPSender {
     blocked
   }
 
-  #[cfg(test)]
-  pub fn send_to_all(&self, buffer: &[u8], addresses: &[SocketAddr]) {
-    let buf_len = buffer.len();
 
-    for address in addresses.iter() {
-      // try sending the addr a message
-      match self.unicast_socket.send_to(buffer, *address) {
-        Ok(bytes_sent) => {
-          // error if we didn't send the whole buffer.
-          if bytes_sent != buffer.len() {
-            panic!("tried to send `{buf_len}` bytes, sent only `{bytes_sent}`!");
-          }
-        }
-
-        // it's a problem if we couldn't send anything - so we'll panic!
-        Err(e) => {
-          panic!("Unable to send to `{address}`. err: {e}");
-        }
-      }
-    }
-  }
-
-  #[cfg(test)]
-  pub fn send_multicast(self, buffer: &[u8], address: Ipv4Addr, port: u16) -> io::Result<usize> {
-    if address.is_multicast() {
-      let address = SocketAddr::new(IpAddr::V4(address), port);
-      let mut size = 0;
-      for (_iface, s) in self.multicast_sockets {
-        size = s.send_to(buffer, address)?;
-      }
-      Ok(size)
-    } else {
-      io::Result::Err(io::Error::other("Not a multicast address"))
-    }
-  }
 }
 
-#[cfg(test)]
-mod tests {
-  use super::*;
-  use crate::network::udp_listener::*;
-
-  #[test]
-  fn udps_single_send() {
-    let listener = UDPListener::new_unicast("127.0.0.1", 10201).unwrap();
-    let sender = UDPSender::new(11201).expect("failed to create UDPSender");
-
-    let data: Vec<u8> = vec![0, 1, 2, 3, 4];
-
-    let addrs = vec![SocketAddr::new("127.0.0.1".parse().unwrap(), 10201)];
-    sender.send_to_all(&data, &addrs);
-
-    let rec_data = listener.get_message();
-
-    assert_eq!(rec_data.len(), 5);
-    assert_eq!(rec_data, data);
-  }
-
-  #[test]
-  fn udps_multi_send() {
-    let listener_1 = UDPListener::new_unicast("127.0.0.1", 10301).unwrap();
-    let listener_2 = UDPListener::new_unicast("127.0.0.1", 10302).unwrap();
-    let sender = UDPSender::new(11301).expect("failed to create UDPSender");
-
-    let data: Vec<u8> = vec![5, 4, 3, 2, 1, 0];
-
-    let addrs = vec![
-      SocketAddr::new("127.0.0.1".parse().unwrap(), 10301),
-      SocketAddr::new("127.0.0.1".parse().unwrap(), 10302),
-    ];
-    sender.send_to_all(&data, &addrs);
-
-    let rec_data_1 = listener_1.get_message();
-    let rec_data_2 = listener_2.get_message();
-
-    assert_eq!(rec_data_1.len(), 6);
-    assert_eq!(rec_data_1, data);
-    assert_eq!(rec_data_2.len(), 6);
-    assert_eq!(rec_data_2, data);
-  }
-
-  // The unicast socket is IPv4-only, so an IPv6 destination is unreachable and
-  // must be dropped without attempting (and warning about) a send that can only
-  // ever fail with EAFNOSUPPORT.
-  #[test]
-  fn unicast_socket_rejects_ipv6_destination() {
-    let sender = UDPSender::new(11401).expect("failed to create UDPSender");
-
-    let v4_dest = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 10401);
-    let v6_dest = SocketAddr::new(
-      IpAddr::V6(std::net::Ipv6Addr::new(
-        0xfe80, 0, 0, 0, 0xd494, 0x8fff, 0xfe08, 0x3ce3,
-      )),
-      10401,
-    );
-
-    assert!(sender.socket_can_reach(SocketId::Unicast, v4_dest));
-    assert!(!sender.socket_can_reach(SocketId::Unicast, v6_dest));
-    assert_eq!(
-      sender.raw_send(SocketId::Unicast, v6_dest, &[0u8; 4]),
-      SendOutcome::Dropped
-    );
-  }
-}

@@ -202,121 +202,23 @@ pub const STANDARD_BUILTIN_WRITERS_INIT_LIST: &[(EntityId, EntityId, u32, QosPol
 ];
 
 // Helper list for initializing the authentication topic built-in reader
-#[cfg(feature = "security")]
-pub const AUTHENTICATION_BUILTIN_READERS_INIT_LIST: &[(EntityId, EntityId, u32, QosPolicies)] =
-  &[(
-    EntityId::P2P_BUILTIN_PARTICIPANT_STATELESS_WRITER,
-    EntityId::P2P_BUILTIN_PARTICIPANT_STATELESS_READER,
-    BuiltinEndpointSet::PARTICIPANT_STATELESS_MESSAGE_READER,
-    Discovery::create_participant_stateless_message_qos(),
-  )];
 
 // Helper list for initializing the authentication topic built-in writer
-#[cfg(feature = "security")]
-pub const AUTHENTICATION_BUILTIN_WRITERS_INIT_LIST: &[(EntityId, EntityId, u32, QosPolicies)] =
-  &[(
-    EntityId::P2P_BUILTIN_PARTICIPANT_STATELESS_WRITER,
-    EntityId::P2P_BUILTIN_PARTICIPANT_STATELESS_READER,
-    BuiltinEndpointSet::PARTICIPANT_STATELESS_MESSAGE_WRITER,
-    Discovery::create_participant_stateless_message_qos(),
-  )];
 
 // Helper list for initializing remote secure built-in readers
-#[cfg(feature = "security")]
-pub const SECURE_BUILTIN_READERS_INIT_LIST: &[(EntityId, EntityId, u32, QosPolicies)] = &[
-  (
-    EntityId::SPDP_RELIABLE_BUILTIN_PARTICIPANT_SECURE_WRITER, // SPDP
-    EntityId::SPDP_RELIABLE_BUILTIN_PARTICIPANT_SECURE_READER,
-    BuiltinEndpointSet::PARTICIPANT_SECURE_READER,
-    Discovery::builtin_subscriber_qos(),
-  ),
-  (
-    EntityId::SEDP_BUILTIN_PUBLICATIONS_SECURE_WRITER, // SEDP ...
-    EntityId::SEDP_BUILTIN_PUBLICATIONS_SECURE_READER,
-    BuiltinEndpointSet::PUBLICATIONS_SECURE_READER,
-    Discovery::builtin_subscriber_qos(),
-  ),
-  (
-    EntityId::SEDP_BUILTIN_SUBSCRIPTIONS_SECURE_WRITER,
-    EntityId::SEDP_BUILTIN_SUBSCRIPTIONS_SECURE_READER,
-    BuiltinEndpointSet::SUBSCRIPTIONS_SECURE_READER,
-    Discovery::builtin_subscriber_qos(),
-  ),
-  (
-    EntityId::P2P_BUILTIN_PARTICIPANT_MESSAGE_SECURE_WRITER,
-    EntityId::P2P_BUILTIN_PARTICIPANT_MESSAGE_SECURE_READER,
-    BuiltinEndpointSet::PARTICIPANT_MESSAGE_SECURE_READER,
-    Discovery::builtin_subscriber_qos(),
-  ),
-  (
-    EntityId::P2P_BUILTIN_PARTICIPANT_VOLATILE_SECURE_WRITER,
-    EntityId::P2P_BUILTIN_PARTICIPANT_VOLATILE_SECURE_READER,
-    BuiltinEndpointSet::PARTICIPANT_VOLATILE_MESSAGE_SECURE_READER,
-    Discovery::create_participant_volatile_message_secure_qos(),
-  ),
-];
 
 // Helper list for initializing remote secure built-in writers
-#[cfg(feature = "security")]
-pub const SECURE_BUILTIN_WRITERS_INIT_LIST: &[(EntityId, EntityId, u32, QosPolicies)] = &[
-  (
-    EntityId::SPDP_RELIABLE_BUILTIN_PARTICIPANT_SECURE_WRITER, // SPDP
-    EntityId::SPDP_RELIABLE_BUILTIN_PARTICIPANT_SECURE_READER,
-    BuiltinEndpointSet::PARTICIPANT_SECURE_WRITER,
-    Discovery::builtin_publisher_qos(),
-  ),
-  (
-    EntityId::SEDP_BUILTIN_PUBLICATIONS_SECURE_WRITER, // SEDP ...
-    EntityId::SEDP_BUILTIN_PUBLICATIONS_SECURE_READER,
-    BuiltinEndpointSet::PUBLICATIONS_SECURE_WRITER,
-    Discovery::builtin_publisher_qos(),
-  ),
-  (
-    EntityId::SEDP_BUILTIN_SUBSCRIPTIONS_SECURE_WRITER,
-    EntityId::SEDP_BUILTIN_SUBSCRIPTIONS_SECURE_READER,
-    BuiltinEndpointSet::SUBSCRIPTIONS_SECURE_WRITER,
-    Discovery::builtin_publisher_qos(),
-  ),
-  (
-    EntityId::P2P_BUILTIN_PARTICIPANT_MESSAGE_SECURE_WRITER,
-    EntityId::P2P_BUILTIN_PARTICIPANT_MESSAGE_SECURE_READER,
-    BuiltinEndpointSet::PARTICIPANT_MESSAGE_SECURE_WRITER,
-    Discovery::builtin_publisher_qos(),
-  ),
-  (
-    EntityId::P2P_BUILTIN_PARTICIPANT_VOLATILE_SECURE_WRITER,
-    EntityId::P2P_BUILTIN_PARTICIPANT_VOLATILE_SECURE_READER,
-    BuiltinEndpointSet::PARTICIPANT_VOLATILE_MESSAGE_SECURE_WRITER,
-    Discovery::create_participant_volatile_message_secure_qos(),
-  ),
-];
 
 // EntityIds for built-in readers with secured communication
 // See the definition of “Builtin Secure Endpoints” in the Security spec
 // This list is used for detecting if a built-in reader needs to be secure.
 // TODO: STANDARD_BUILTIN_READERS_INIT_LIST already contains these
 // EntityIds. Could we use that list directly and get rid of this one?
-#[cfg(feature = "security")]
-pub const SECURE_BUILTIN_READER_ENTITY_IDS: &[EntityId] = &[
-  EntityId::SPDP_RELIABLE_BUILTIN_PARTICIPANT_SECURE_READER,
-  EntityId::SEDP_BUILTIN_PUBLICATIONS_SECURE_READER,
-  EntityId::SEDP_BUILTIN_SUBSCRIPTIONS_SECURE_READER,
-  EntityId::P2P_BUILTIN_PARTICIPANT_MESSAGE_SECURE_READER,
-  EntityId::P2P_BUILTIN_PARTICIPANT_VOLATILE_SECURE_READER,
-];
 
 // EntityIds for built-in writers with secured communication
 // This list is used for detecting if a built-in writer needs to be secure.
 // TODO: STANDARD_BUILTIN_WRITERS_INIT_LIST already contains these
 // EntityIds. Could we use that list directly and get rid of this one?
-#[cfg(feature = "security")]
-pub const SECURE_BUILTIN_WRITER_ENTITY_IDS: &[EntityId] = &[
-  EntityId::SPDP_RELIABLE_BUILTIN_PARTICIPANT_SECURE_WRITER,
-  EntityId::SEDP_BUILTIN_PUBLICATIONS_SECURE_WRITER,
-  EntityId::SEDP_BUILTIN_SUBSCRIPTIONS_SECURE_WRITER,
-  EntityId::P2P_BUILTIN_PARTICIPANT_MESSAGE_SECURE_WRITER,
-  EntityId::P2P_BUILTIN_PARTICIPANT_VOLATILE_SECURE_WRITER,
-];
 
 // Poll token constants list.
 
@@ -451,26 +353,6 @@ pub fn discovery_reader_data_token(id: EntityId) -> Option<Token> {
     EntityId::SEDP_BUILTIN_PUBLICATIONS_READER => Some(DISCOVERY_WRITER_DATA_TOKEN),
     EntityId::SEDP_BUILTIN_TOPIC_READER => Some(DISCOVERY_TOPIC_DATA_TOKEN),
     EntityId::P2P_BUILTIN_PARTICIPANT_MESSAGE_READER => Some(DISCOVERY_PARTICIPANT_MESSAGE_TOKEN),
-    #[cfg(feature = "security")]
-    EntityId::SPDP_RELIABLE_BUILTIN_PARTICIPANT_SECURE_READER => {
-      Some(SECURE_DISCOVERY_PARTICIPANT_DATA_TOKEN)
-    }
-    #[cfg(feature = "security")]
-    EntityId::SEDP_BUILTIN_SUBSCRIPTIONS_SECURE_READER => Some(SECURE_DISCOVERY_READER_DATA_TOKEN),
-    #[cfg(feature = "security")]
-    EntityId::SEDP_BUILTIN_PUBLICATIONS_SECURE_READER => Some(SECURE_DISCOVERY_WRITER_DATA_TOKEN),
-    #[cfg(feature = "security")]
-    EntityId::P2P_BUILTIN_PARTICIPANT_MESSAGE_SECURE_READER => {
-      Some(P2P_SECURE_DISCOVERY_PARTICIPANT_MESSAGE_TOKEN)
-    }
-    #[cfg(feature = "security")]
-    EntityId::P2P_BUILTIN_PARTICIPANT_STATELESS_READER => {
-      Some(P2P_PARTICIPANT_STATELESS_MESSAGE_TOKEN)
-    }
-    #[cfg(feature = "security")]
-    EntityId::P2P_BUILTIN_PARTICIPANT_VOLATILE_SECURE_READER => {
-      Some(P2P_BUILTIN_PARTICIPANT_VOLATILE_SECURE_TOKEN)
-    }
     _ => None,
   }
 }
@@ -499,10 +381,6 @@ pub(crate) enum DiscoveryNotificationType {
   AssertTopicLiveliness {
     writer_guid: GUID,
     manual_assertion: bool,
-  },
-  #[cfg(feature = "security")]
-  ParticipantAuthenticationStatusChanged {
-    guid_prefix: GuidPrefix,
   },
 }
 

@@ -40,6 +40,13 @@ impl AssemblyBuffer {
     let fragment_size: u16 = datafrag.fragment_size;
     debug!("new AssemblyBuffer data_size={data_size} frag_size={fragment_size}");
 
+    // Twinstep: no message of a robot is larger than a datagram, and the buffer is allocated by the size
+    // that the first fragment claims.
+    if data_size > MAX_DATA_SIZE {
+      error!("Cannot create AssemblyBuffer: data_size={data_size} is above {MAX_DATA_SIZE}");
+      return None;
+    }
+
     if fragment_size == 0 || fragment_size as usize > data_size {
       error!("Cannot create AssemblyBuffer: fragment_size={fragment_size} data_size={data_size}");
       return None;
@@ -185,6 +192,9 @@ impl AssemblyBuffer {
 // under best effort is lost anyway and under reliable will be re-requested.
 const MAX_ASSEMBLY_BUFFERS: usize = 128;
 
+// Twinstep: maximum size of an assembled sample [bytes].
+const MAX_DATA_SIZE: usize = 64 * 1024;
+
 // Assembles fragments from a single (remote) Writer
 // So there is only one sequence of SNs
 pub(crate) struct FragmentAssembler {
@@ -241,6 +251,8 @@ impl FragmentAssembler {
 
     if !assembly_buffer.insert_frags(datafrag, frag_size) {
       error!("new_datafrag: rejected invalid DATAFRAG for {sn:?}");
+      // Twinstep: or every rejected one would leave its buffer.
+      self.assembly_buffers.remove(&sn);
       return None;
     }
 
@@ -336,94 +348,3 @@ impl FragmentAssembler {
   }
 }
 
-#[cfg(test)]
-mod tests {
-  use bytes::Bytes;
-
-  use super::AssemblyBuffer;
-  use crate::{
-    messages::submessages::submessages::DataFrag, structure::sequence_number::FragmentNumber,
-  };
-
-  // Build a DATAFRAG submessage carrying the contiguous run of `k` fragments
-  // starting at 1-based `start`, with the given payload bytes.
-  fn datafrag(start: u32, k: u16, frag_size: u16, data_size: u32, payload: Vec<u8>) -> DataFrag {
-    DataFrag {
-      fragment_starting_num: FragmentNumber::new(start),
-      fragments_in_submessage: k,
-      fragment_size: frag_size,
-      data_size,
-      serialized_payload: Bytes::from(payload),
-      ..Default::default()
-    }
-  }
-
-  // A DATAFRAG that packs K > 1 fragments in one submessage must reassemble the
-  // same bytes as one-fragment-per-submessage would. This exercises the
-  // adaptive-packing writer path against the (unchanged) receiver.
-  #[test]
-  fn reassemble_multi_fragment_datafrag() {
-    let frag_size = 1024u16;
-    let data_size = 2600u32; // 3 fragments: 1024, 1024, 552
-    let whole: Vec<u8> = (0..data_size as usize).map(|i| (i % 251) as u8).collect();
-
-    // First submessage packs fragments 1 and 2 (K = 2, 2048 payload bytes).
-    let first = datafrag(1, 2, frag_size, data_size, whole[0..2048].to_vec());
-    let mut ab = AssemblyBuffer::new(&first).expect("valid first fragment");
-    assert!(!ab.is_complete());
-    ab.insert_frags(&first, frag_size);
-    assert!(!ab.is_complete(), "still missing the tail fragment");
-
-    // Trailing submessage carries the shorter final fragment 3 (552 bytes).
-    let tail = datafrag(3, 1, frag_size, data_size, whole[2048..2600].to_vec());
-    ab.insert_frags(&tail, frag_size);
-    assert!(ab.is_complete(), "all fragments received");
-    assert_eq!(
-      &ab.buffer_bytes[..],
-      &whole[..],
-      "reassembled bytes must match the original sample"
-    );
-  }
-
-  // A single DATAFRAG carrying the whole sample in one multi-fragment run.
-  #[test]
-  fn reassemble_single_submessage_all_fragments() {
-    let frag_size = 512u16;
-    let data_size = 1500u32; // 3 fragments: 512, 512, 476
-    let whole: Vec<u8> = (0..data_size as usize).map(|i| (i % 97) as u8).collect();
-
-    let all = datafrag(1, 3, frag_size, data_size, whole.clone());
-    let mut ab = AssemblyBuffer::new(&all).expect("valid fragment set");
-    ab.insert_frags(&all, frag_size);
-    assert!(ab.is_complete());
-    assert_eq!(&ab.buffer_bytes[..], &whole[..]);
-  }
-
-  // Malformed span (starting at last fragment but claiming multiple fragments)
-  // must not panic and must not falsely complete reassembly.
-  #[test]
-  fn reject_fragment_span_beyond_total() {
-    let frag_size = 256u16;
-    let data_size = 512u32; // 2 fragments total
-    let bad = datafrag(2, 2, frag_size, data_size, vec![0u8; 256]);
-    let mut ab = AssemblyBuffer::new(&bad).expect("buffer for valid data_size");
-    assert!(!ab.insert_frags(&bad, frag_size));
-    assert!(!ab.is_complete());
-  }
-
-  #[test]
-  fn fragment_assembler_rejects_span_beyond_total() {
-    use enumflags2::BitFlags;
-
-    use super::FragmentAssembler;
-    use crate::messages::submessages::submessages::DATAFRAG_Flags;
-
-    let frag_size = 256u16;
-    let data_size = 512u32;
-    let bad = datafrag(2, 2, frag_size, data_size, vec![0u8; 256]);
-    let mut fa = FragmentAssembler::new(frag_size, true);
-    assert!(fa
-      .new_datafrag(&bad, BitFlags::<DATAFRAG_Flags>::empty())
-      .is_none());
-  }
-}

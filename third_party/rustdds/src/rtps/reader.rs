@@ -11,8 +11,6 @@ use mio1::Token;
 use log::{debug, error, info, trace, warn};
 use enumflags2::BitFlags;
 use speedy::Endianness;
-#[cfg(feature = "security")]
-use speedy::Writable;
 
 use crate::{
   dds::{
@@ -56,11 +54,6 @@ use crate::{
     time::Timestamp,
   },
 };
-#[cfg(feature = "security")]
-use super::Submessage;
-#[cfg(feature = "security")]
-use crate::security::{security_plugins::SecurityPluginsHandle, SecurityResult};
-#[cfg(not(feature = "security"))]
 use crate::no_security::SecurityPluginsHandle;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -117,8 +110,6 @@ pub(crate) struct Reader {
   // Reader stores a pointer to a mutex on the topic cache
   topic_cache: Arc<Mutex<TopicCache>>,
 
-  #[cfg(test)]
-  seqnum_instant_map: BTreeMap<SequenceNumber, Timestamp>,
 
   topic_name: String,
   qos_policy: QosPolicies,
@@ -159,6 +150,14 @@ const FRAGMENT_ASSEMBLY_TIMEOUT: Duration = Duration::from_secs(10);
 // minimum interval (max frequency) of AssemblyBuffer GC
 const MIN_FRAGMENT_GC_INTERVAL: Duration = Duration::from_secs(2);
 
+// Twinstep: matched writers of a reader, so that forged announcements have an end.
+const MAX_MATCHED_WRITERS: usize = 256;
+
+// Twinstep: no writer sends so many messages, and sums with such numbers overflow.
+fn is_beyond_reason(number: SequenceNumber) -> bool {
+  i64::from(number) > 1 << 62
+}
+
 impl Reader {
   pub(crate) fn new(
     i: ReaderIngredients,
@@ -193,8 +192,6 @@ impl Reader {
       topic_name: i.topic_name,
       qos_policy: i.qos_policy,
 
-      #[cfg(test)]
-      seqnum_instant_map: BTreeMap::new(),
       my_guid: i.guid,
 
       heartbeat_response_delay: StdDuration::new(0, 500_000_000), // 0,5sec
@@ -357,30 +354,8 @@ impl Reader {
   }
 
   // TODO Used for test/debugging purposes
-  #[cfg(test)]
-  pub fn history_cache_change_data(&self, sequence_number: SequenceNumber) -> Option<DDSData> {
-    let topic_cache = self.acquire_the_topic_cache_guard();
-    let cc = self
-      .seqnum_instant_map
-      .get(&sequence_number)
-      .and_then(|i| topic_cache.get_change(i));
-
-    debug!("history cache !!!! {cc:?}");
-
-    cc.map(|cc| cc.data_value.clone())
-  }
 
   // TODO Used for test/debugging purposes
-  #[cfg(test)]
-  pub fn history_cache_sequence_start_and_end_numbers(&self) -> Vec<SequenceNumber> {
-    if self.seqnum_instant_map.is_empty() {
-      vec![]
-    } else {
-      let start = self.seqnum_instant_map.iter().min().unwrap().0;
-      let end = self.seqnum_instant_map.iter().max().unwrap().0;
-      vec![*start, *end]
-    }
-  }
 
   // updates or adds a new writer proxy, doesn't touch changes
   pub fn update_writer_proxy(&mut self, proxy: RtpsWriterProxy, offered_qos: &QosPolicies) {
@@ -459,6 +434,8 @@ impl Reader {
     if let Some(op) = self.matched_writer_mut(proxy.remote_writer_guid) {
       op.update_contents(proxy);
       0
+    } else if self.matched_writers.len() >= MAX_MATCHED_WRITERS {
+      0
     } else {
       self.matched_writers.insert(proxy.remote_writer_guid, proxy);
       1
@@ -468,16 +445,11 @@ impl Reader {
   pub fn remove_writer_proxy(&mut self, writer_guid: GUID) {
     if self.matched_writers.contains_key(&writer_guid) {
       self.matched_writers.remove(&writer_guid);
+      // Twinstep: so many assemblers as matched writers.
+      self.fragment_assemblers.remove(&writer_guid);
       self
         .acquire_the_topic_cache_guard()
         .forget_reliable_writer(writer_guid);
-      #[cfg(feature = "security")]
-      if let Some(security_plugins_handle) = &self.security_plugins {
-        security_plugins_handle
-          .get_plugins()
-          .unregister_remote_writer(&self.my_guid, &writer_guid)
-          .unwrap_or_else(|e| error!("{e}"));
-      }
       self.send_status_change(DataReaderStatus::SubscriptionMatched {
         total: CountWithChange::new(self.writer_match_count_total, 0),
         current: CountWithChange::new(self.matched_writers.len() as i32, -1),
@@ -511,23 +483,6 @@ impl Reader {
     }
   }
 
-  #[cfg(test)]
-  pub(crate) fn matched_writer_add(
-    &mut self,
-    remote_writer_guid: GUID,
-    remote_group_entity_id: EntityId,
-    unicast_locator_list: Vec<Locator>,
-    multicast_locator_list: Vec<Locator>,
-    qos: &QosPolicies,
-  ) {
-    let proxy = RtpsWriterProxy::new(
-      remote_writer_guid,
-      unicast_locator_list,
-      multicast_locator_list,
-      remote_group_entity_id,
-    );
-    self.update_writer_proxy(proxy, qos);
-  }
 
   fn matched_writer(&self, remote_writer_guid: GUID) -> Option<&RtpsWriterProxy> {
     self.matched_writers.get(&remote_writer_guid)
@@ -569,6 +524,9 @@ impl Reader {
 
     let writer_guid = GUID::new_with_prefix_and_id(mr_state.source_guid_prefix, data.writer_id);
     let writer_seq_num = data.writer_sn; // for borrow checker
+    if is_beyond_reason(writer_seq_num) {
+      return;
+    }
 
     match self.data_to_dds_data(data, data_flags) {
       Ok(dds_data) => self.process_received_data(
@@ -590,6 +548,13 @@ impl Reader {
   ) {
     let writer_guid = GUID::new_with_prefix_and_id(mr_state.source_guid_prefix, datafrag.writer_id);
     let seq_num = datafrag.writer_sn;
+    if is_beyond_reason(seq_num) {
+      return;
+    }
+    // Twinstep: buffers exist for matched writers only, whose number is bounded.
+    if self.matched_writer(writer_guid).is_none() {
+      return;
+    }
     let receive_timestamp = Timestamp::now();
     //trace!("DATAFRAG received topic={:?}", self.topic_name);
 
@@ -769,8 +734,6 @@ impl Reader {
     );
 
     // Add to own track-keeping data structure
-    #[cfg(test)]
-    self.seqnum_instant_map.insert(writer_sn, receive_timestamp);
 
     self.notify_cache_change();
   }
@@ -905,6 +868,10 @@ impl Reader {
         "HEARTBEAT from {:?}, but no writer proxy available. topic={:?} reader={:?}",
         writer_guid, self.topic_name, self.my_guid
       );
+      return false;
+    }
+    // Twinstep: numbers whose successors would overflow.
+    if is_beyond_reason(heartbeat.first_sn) || is_beyond_reason(heartbeat.last_sn) {
       return false;
     }
     // sanity check
@@ -1081,9 +1048,15 @@ impl Reader {
 
     let writer_guid = GUID::new_with_prefix_and_id(mr_state.source_guid_prefix, gap.writer_id);
 
-    if self.like_stateless {
+    // Twinstep: a best-effort reader waits for nothing, so nothing has to be declared irrelevant. A GAP
+    // up to 2^60 would make it deaf.
+    if self.like_stateless
+      || self.reliability == policy::Reliability::BestEffort
+      || is_beyond_reason(gap.gap_start)
+      || is_beyond_reason(gap.gap_list.base())
+    {
       debug!(
-        "GAP from {:?}, but reader is stateless. Ignoring. topic={:?} reader={:?}",
+        "GAP from {:?}, but reader is stateless or best-effort. Ignoring. topic={:?} reader={:?}",
         writer_guid, self.topic_name, self.my_guid
       );
       return;
@@ -1258,7 +1231,6 @@ impl Reader {
     }
   }
 
-  #[cfg(not(feature = "security"))]
   fn encode_and_send(
     &self,
     message: Message,
@@ -1278,71 +1250,7 @@ impl Reader {
       .send_to_locator_list(&bytes, dst_locator_list);
   }
 
-  #[cfg(feature = "security")]
-  fn encode_and_send(
-    &self,
-    message: Message,
-    destination_guid: GUID,
-    dst_locator_list: &[Locator],
-  ) {
-    match self.security_encode(message, destination_guid) {
-      Ok(message) => {
-        let bytes = match message.write_to_vec_with_ctx(Endianness::LittleEndian) {
-          Ok(b) => b,
-          Err(e) => {
-            error!("Failed to serialize RTPS message for send: {e:?}");
-            return;
-          }
-        };
-        self
-          .udp_sender
-          .send_to_locator_list(&bytes, dst_locator_list);
-      }
-      Err(e) => error!("Failed to send message to writers. Encoding failed: {e:?}"),
-    }
-  }
 
-  #[cfg(feature = "security")]
-  fn security_encode(&self, message: Message, destination_guid: GUID) -> SecurityResult<Message> {
-    // If we have security plugins, use them, otherwise pass through
-    if let Some(security_plugins_handle) = &self.security_plugins {
-      // Get the source GUID
-      let source_guid = self.guid();
-      // Destructure
-      let Message {
-        header,
-        submessages,
-      } = message;
-
-      // Encode submessages
-      SecurityResult::<Vec<Vec<Submessage>>>::from_iter(submessages.iter().map(|submessage| {
-        security_plugins_handle
-          .get_plugins()
-          .encode_datareader_submessage(submessage.clone(), &source_guid, &[destination_guid])
-          // Convert each encoding output to a Vec of 1 or 3 submessages
-          .map(Vec::from)
-      }))
-      // Flatten and convert back to Message
-      .map(|encoded_submessages| Message {
-        header,
-        submessages: encoded_submessages.concat(),
-      })
-      // Encode message
-      .and_then(|message| {
-        // Convert GUIDs to GuidPrefixes
-        let source_guid_prefix = source_guid.prefix;
-        let destination_guid_prefix = destination_guid.prefix;
-        // Encode message
-        security_plugins_handle.get_plugins().encode_message(
-          message,
-          &source_guid_prefix,
-          &[destination_guid_prefix],
-        )
-      })
-    } else {
-      Ok(message)
-    }
-  }
 
   fn send_acknack_to(
     &self,
@@ -1483,537 +1391,3 @@ impl fmt::Debug for Reader {
   }
 }
 
-#[cfg(test)]
-mod tests {
-  use std::sync::RwLock;
-
-  use crate::{
-    dds::{qos::policy::Reliability, statusevents::sync_status_channel, typedesc::TypeDesc},
-    polling::{new_shared_timer, wake_channel, LoopWaker},
-    structure::{dds_cache::DDSCache, guid::EntityKind},
-    QosPolicyBuilder,
-  };
-  use super::*;
-
-  #[test]
-  fn reader_sends_notification_when_receiving_data() {
-    // 1. Create a reader
-    // Create the DDS cache and a topic
-    let dds_cache = Arc::new(RwLock::new(DDSCache::new()));
-    let topic_name = "test_name";
-    let qos_policy = QosPolicies::qos_none();
-
-    let topic_cache_handle = dds_cache.write().unwrap().add_new_topic(
-      topic_name.to_string(),
-      TypeDesc::new("test_type".to_string()),
-      &qos_policy,
-    );
-
-    // Create notification mechanisms
-    // mio-0.6 channel:
-    let (notification_sender, notification_receiver) = crate::mio_source::notification_channel(100);
-    // mio-0.8 event source and sender:
-    let (_notification_event_source, notification_event_sender) =
-      mio_source::make_poll_channel().unwrap();
-    // async notification waker
-    let data_reader_waker = Arc::new(Mutex::new(None));
-
-    // Create status channel
-    let (status_sender, _status_receiver) = sync_status_channel::<DataReaderStatus>(4).unwrap();
-    let (participant_status_sender, _participant_status_receiver) =
-      sync_status_channel(16).unwrap();
-
-    // Create reader command channel
-    let (_reader_command_sender, reader_command_receiver) =
-      wake_channel::<ReaderCommand>(10, &LoopWaker::new());
-
-    // Then finally create the reader
-    let reader_guid = GUID::dummy_test_guid(EntityKind::READER_NO_KEY_USER_DEFINED);
-    let reader_ing = ReaderIngredients {
-      guid: reader_guid,
-      notification_sender,
-      status_sender,
-      topic_name: topic_name.to_string(),
-      topic_cache_handle,
-      like_stateless: false,
-      qos_policy,
-      data_reader_command_receiver: reader_command_receiver,
-      data_reader_waker,
-      poll_event_sender: notification_event_sender,
-      security_plugins: None,
-      discovery_notify: None,
-    };
-    let mut reader = Reader::new(
-      reader_ing,
-      Rc::new(UDPSender::new(0).unwrap()),
-      new_shared_timer(),
-      participant_status_sender,
-    );
-
-    // 2. Add info of a matched writer to the reader
-    let writer_guid = GUID::dummy_test_guid(EntityKind::WRITER_NO_KEY_USER_DEFINED);
-
-    let mr_state = MessageReceiverState {
-      source_guid_prefix: writer_guid.prefix,
-      ..Default::default()
-    };
-
-    reader.matched_writer_add(
-      writer_guid,
-      EntityId::UNKNOWN,
-      mr_state.unicast_reply_locator_list.to_vec(),
-      mr_state.multicast_reply_locator_list.to_vec(),
-      &QosPolicies::qos_none(),
-    );
-
-    // 3. Create data that the matched writer supposedly sent to the reader
-    let data = Data {
-      reader_id: reader_guid.entity_id,
-      writer_id: writer_guid.entity_id,
-      ..Data::default()
-    };
-    let data_flags = BitFlags::<DATA_Flags>::from_flag(DATA_Flags::Data);
-
-    // 4. Feed the data for the reader to handle
-    reader.handle_data_msg(data, data_flags, &mr_state);
-
-    // 5. Verify that the reader sends a notification about the new data
-    assert!(
-      notification_receiver.try_recv().is_ok(),
-      "Reader did not send a notification through the mio-0.6 channel"
-    );
-    // TODO: Should the other notification mechanisms (mio-0.8 & async) be also
-    // checked?
-  }
-
-  #[test]
-  fn reader_sends_data_to_topic_cache() {
-    // 1. Create a reader
-    // Create the DDS cache and a topic
-    let dds_cache = Arc::new(RwLock::new(DDSCache::new()));
-    let topic_name = "test_name";
-    let qos_policy = QosPolicies::qos_none();
-
-    let topic_cache_handle = dds_cache.write().unwrap().add_new_topic(
-      topic_name.to_string(),
-      TypeDesc::new("test_type".to_string()),
-      &qos_policy,
-    );
-
-    // Create mechanisms for notifications, statuses & commands
-    let (notification_sender, _notification_receiver) =
-      crate::mio_source::notification_channel(100);
-    let (_notification_event_source, notification_event_sender) =
-      mio_source::make_poll_channel().unwrap();
-    let data_reader_waker = Arc::new(Mutex::new(None));
-
-    let (status_sender, _status_receiver) = sync_status_channel::<DataReaderStatus>(4).unwrap();
-    let (participant_status_sender, _participant_status_receiver) =
-      sync_status_channel(16).unwrap();
-
-    let (_reader_command_sender, reader_command_receiver) =
-      wake_channel::<ReaderCommand>(10, &LoopWaker::new());
-
-    // Then create the reader
-    let reader_guid = GUID::dummy_test_guid(EntityKind::READER_NO_KEY_USER_DEFINED);
-    let reader_ing = ReaderIngredients {
-      guid: reader_guid,
-      notification_sender,
-      status_sender,
-      topic_name: topic_name.to_string(),
-      topic_cache_handle: topic_cache_handle.clone(),
-      like_stateless: false,
-      qos_policy,
-      data_reader_command_receiver: reader_command_receiver,
-      data_reader_waker,
-      poll_event_sender: notification_event_sender,
-      security_plugins: None,
-      discovery_notify: None,
-    };
-    let mut reader = Reader::new(
-      reader_ing,
-      Rc::new(UDPSender::new(0).unwrap()),
-      new_shared_timer(),
-      participant_status_sender,
-    );
-
-    // 2. Add info of a matched writer to the reader
-    let writer_guid = GUID::dummy_test_guid(EntityKind::WRITER_NO_KEY_USER_DEFINED);
-
-    let source_timestamp = Timestamp::INVALID;
-    let mr_state = MessageReceiverState {
-      source_guid_prefix: writer_guid.prefix,
-      source_timestamp: Some(source_timestamp),
-      ..Default::default()
-    };
-
-    reader.matched_writer_add(
-      writer_guid,
-      EntityId::UNKNOWN,
-      mr_state.unicast_reply_locator_list.to_vec(),
-      mr_state.multicast_reply_locator_list.to_vec(),
-      &QosPolicies::qos_none(),
-    );
-
-    // 3. Create data that the matched writer supposedly sent to the reader
-    let data = Data {
-      reader_id: reader_guid.entity_id,
-      writer_id: writer_guid.entity_id,
-      ..Data::default()
-    };
-    let data_flags = BitFlags::<DATA_Flags>::from_flag(DATA_Flags::Data);
-    let sequence_num = data.writer_sn;
-
-    // 4. Feed the data for the reader to handle
-    reader.handle_data_msg(data.clone(), data_flags, &mr_state);
-
-    // 5. Verify that the reader sent the data to the topic cache
-    let topic_cache = topic_cache_handle.lock().unwrap();
-
-    let cc_from_cache = topic_cache
-      .get_change(reader.seqnum_instant_map.get(&sequence_num).unwrap())
-      .expect("No cache change in topic cache");
-
-    // 6. Verify that the content of the cache change is as expected
-    // Construct a cache change with the expected content
-    let dds_data = DDSData::new(data.unwrap_serialized_payload());
-    let cc_locally_built = CacheChange::new(
-      writer_guid,
-      sequence_num,
-      WriteOptions::from(Some(source_timestamp)),
-      dds_data,
-    );
-
-    assert_eq!(
-      cc_from_cache, &cc_locally_built,
-      "The content of the cache change in the topic cache not as expected"
-    );
-  }
-
-  #[test]
-  fn reader_handles_heartbeats() {
-    // 1. Create a reader for a topic with Reliable QoS
-    // Create the DDS cache and the topic
-    let dds_cache = Arc::new(RwLock::new(DDSCache::new()));
-    let topic_name = "test_name";
-    let reliable_qos = QosPolicyBuilder::new()
-      .reliability(Reliability::Reliable {
-        max_blocking_time: Duration::from_millis(100),
-      })
-      .build();
-
-    let topic_cache_handle = dds_cache.write().unwrap().add_new_topic(
-      topic_name.to_string(),
-      TypeDesc::new("test_type".to_string()),
-      &reliable_qos,
-    );
-
-    // Create mechanisms for notifications, statuses & commands
-    let (notification_sender, _notification_receiver) =
-      crate::mio_source::notification_channel(100);
-    let (_notification_event_source, notification_event_sender) =
-      mio_source::make_poll_channel().unwrap();
-    let data_reader_waker = Arc::new(Mutex::new(None));
-
-    let (status_sender, _status_receiver) = sync_status_channel::<DataReaderStatus>(4).unwrap();
-    let (participant_status_sender, _participant_status_receiver) =
-      sync_status_channel(16).unwrap();
-
-    let (_reader_command_sender, reader_command_receiver) =
-      wake_channel::<ReaderCommand>(10, &LoopWaker::new());
-
-    // Then create the reader
-    let reader_guid = GUID::dummy_test_guid(EntityKind::READER_NO_KEY_USER_DEFINED);
-    let reader_ing = ReaderIngredients {
-      guid: reader_guid,
-      notification_sender,
-      status_sender,
-      topic_name: topic_name.to_string(),
-      topic_cache_handle,
-      like_stateless: false,
-      qos_policy: reliable_qos.clone(),
-      data_reader_command_receiver: reader_command_receiver,
-      data_reader_waker,
-      poll_event_sender: notification_event_sender,
-      security_plugins: None,
-      discovery_notify: None,
-    };
-    let mut reader = Reader::new(
-      reader_ing,
-      Rc::new(UDPSender::new(0).unwrap()),
-      new_shared_timer(),
-      participant_status_sender,
-    );
-
-    // 2. Add info of a matched writer to the reader
-    let writer_guid = GUID::dummy_test_guid(EntityKind::WRITER_NO_KEY_USER_DEFINED);
-
-    let mr_state = MessageReceiverState {
-      source_guid_prefix: writer_guid.prefix,
-      ..Default::default()
-    };
-
-    reader.matched_writer_add(
-      writer_guid,
-      EntityId::UNKNOWN,
-      mr_state.unicast_reply_locator_list.to_vec(),
-      mr_state.multicast_reply_locator_list.to_vec(),
-      &reliable_qos,
-    );
-
-    // 3. Send an initial heartbeat from the new writer, reader should not respond
-    // with acknack first_sn: 1, last_sn: 0 to indicate no samples available
-    let hb_new = Heartbeat {
-      reader_id: reader.entity_id(),
-      writer_id: writer_guid.entity_id,
-      first_sn: SequenceNumber::new(1),
-      last_sn: SequenceNumber::new(0),
-      count: 1,
-    };
-    assert!(!reader.handle_heartbeat_msg(&hb_new, true, &mr_state)); // should be false, no ack
-
-    // 4. Send the first proper heartbeat, reader should respond with acknack
-    let hb_one = Heartbeat {
-      reader_id: reader.entity_id(),
-      writer_id: writer_guid.entity_id,
-      first_sn: SequenceNumber::new(1), // Only one in writers cache
-      last_sn: SequenceNumber::new(1),
-      count: 2,
-    };
-    assert!(reader.handle_heartbeat_msg(&hb_one, false, &mr_state)); // Should send an ack_nack
-
-    // 5. Send a duplicate of the first heartbeat, reader should not respond with
-    // acknack
-    let hb_one2 = hb_one.clone();
-    assert!(!reader.handle_heartbeat_msg(&hb_one2, false, &mr_state)); // No acknack
-
-    // 6. Send a second proper heartbeat, reader should respond with acknack
-    let hb_2 = Heartbeat {
-      reader_id: reader.entity_id(),
-      writer_id: writer_guid.entity_id,
-      first_sn: SequenceNumber::new(1), // writer has last 2 in cache
-      last_sn: SequenceNumber::new(3),  // writer has written 3 samples
-      count: 3,
-    };
-    assert!(reader.handle_heartbeat_msg(&hb_2, false, &mr_state)); // Should send an ack_nack
-
-    // 7. Count of acknack sent should be 3: the preemptive one on match and the
-    // two above. The count is verified from the writer proxy
-    let writer_proxy = reader
-      .matched_writer(writer_guid)
-      .expect("Did not find a matched writer");
-    assert_eq!(writer_proxy.sent_ack_nack_count, 3);
-  }
-
-  #[test]
-  fn reader_handles_gaps() {
-    // 1. Create a reader
-    // Create the DDS cache and a topic
-    let dds_cache = Arc::new(RwLock::new(DDSCache::new()));
-    let topic_name = "test_name";
-    let qos_policy = QosPolicies::qos_none();
-
-    let topic_cache_handle = dds_cache.write().unwrap().add_new_topic(
-      topic_name.to_string(),
-      TypeDesc::new("test_type".to_string()),
-      &qos_policy,
-    );
-
-    // Create mechanisms for notifications, statuses & commands
-    let (notification_sender, _notification_receiver) =
-      crate::mio_source::notification_channel(100);
-    let (_notification_event_source, notification_event_sender) =
-      mio_source::make_poll_channel().unwrap();
-    let data_reader_waker = Arc::new(Mutex::new(None));
-
-    let (status_sender, _status_receiver) = sync_status_channel::<DataReaderStatus>(4).unwrap();
-    let (participant_status_sender, _participant_status_receiver) =
-      sync_status_channel(16).unwrap();
-
-    let (_reader_command_sender, reader_command_receiver) =
-      wake_channel::<ReaderCommand>(10, &LoopWaker::new());
-
-    // Then create the reader
-    let reader_guid = GUID::dummy_test_guid(EntityKind::READER_NO_KEY_USER_DEFINED);
-    let reader_ing = ReaderIngredients {
-      guid: reader_guid,
-      notification_sender,
-      status_sender,
-      topic_name: topic_name.to_string(),
-      topic_cache_handle,
-      like_stateless: false,
-      qos_policy,
-      data_reader_command_receiver: reader_command_receiver,
-      data_reader_waker,
-      poll_event_sender: notification_event_sender,
-      security_plugins: None,
-      discovery_notify: None,
-    };
-    let mut reader = Reader::new(
-      reader_ing,
-      Rc::new(UDPSender::new(0).unwrap()),
-      new_shared_timer(),
-      participant_status_sender,
-    );
-
-    // 2. Add info of a matched writer to the reader
-    let writer_guid = GUID::dummy_test_guid(EntityKind::WRITER_NO_KEY_USER_DEFINED);
-
-    let mr_state = MessageReceiverState {
-      source_guid_prefix: writer_guid.prefix,
-      ..Default::default()
-    };
-
-    reader.matched_writer_add(
-      writer_guid,
-      EntityId::UNKNOWN,
-      mr_state.unicast_reply_locator_list.to_vec(),
-      mr_state.multicast_reply_locator_list.to_vec(),
-      &QosPolicies::qos_none(),
-    );
-
-    // 3. Feed the reader a gap message which marks sequence numbers 1-2 & 4 as
-    // irrelevant
-    let gap_start = SequenceNumber::new(1);
-    let gap_list_base = SequenceNumber::new(3);
-    let mut gap_list = SequenceNumberSet::new(gap_list_base, 7);
-    gap_list.test_insert(SequenceNumber::new(4));
-
-    let gap = Gap {
-      reader_id: reader.entity_id(),
-      writer_id: writer_guid.entity_id,
-      gap_start,
-      gap_list,
-    };
-    reader.handle_gap_msg(&gap, &mr_state);
-
-    // 4. Verify that the writer proxy reports seqnums below 3 as ackable
-    // This should be the case since seqnums 1-2 were marked as irrelevant
-    assert_eq!(
-      reader
-        .matched_writer(writer_guid)
-        .unwrap()
-        .all_ackable_before(),
-      SequenceNumber::new(3)
-    );
-
-    // 5. Feed the reader a data message with sequence number 3
-    let data = Data {
-      writer_id: writer_guid.entity_id,
-      writer_sn: SequenceNumber::new(3),
-      ..Default::default()
-    };
-    let data_flags = BitFlags::<DATA_Flags>::from_flag(DATA_Flags::Data);
-
-    reader.handle_data_msg(data, data_flags, &mr_state);
-
-    // 6. Verify that the writer proxy reports seqnums below 5 as ackable
-    // This should be the case since reader received data with seqnum 3 and seqnum 4
-    // was marked irrelevant before
-    assert_eq!(
-      reader
-        .matched_writer(writer_guid)
-        .unwrap()
-        .all_ackable_before(),
-      SequenceNumber::new(5)
-    );
-
-    // 7. Feed the reader a gap message which marks the sequence number 5 as
-    // irrelevant
-    let gap_start = SequenceNumber::new(5);
-    let gap_list_base = SequenceNumber::new(5);
-    let mut gap_list = SequenceNumberSet::new(gap_list_base, 7);
-    gap_list.test_insert(SequenceNumber::new(5));
-
-    let gap = Gap {
-      reader_id: reader.entity_id(),
-      writer_id: writer_guid.entity_id,
-      gap_start,
-      gap_list,
-    };
-    reader.handle_gap_msg(&gap, &mr_state);
-
-    // 8. Verify that the writer proxy reports seqnums below 6 as ackable
-    assert_eq!(
-      reader
-        .matched_writer(writer_guid)
-        .unwrap()
-        .all_ackable_before(),
-      SequenceNumber::new(6)
-    );
-  }
-
-  #[test]
-  fn stateless_reader_does_not_contain_writer_proxies() {
-    // 1. Create a stateless-like reader
-    // Create the DDS cache and a topic
-    let dds_cache = Arc::new(RwLock::new(DDSCache::new()));
-    let topic_name = "test_name";
-    let qos_policy = QosPolicies::builder()
-      .reliability(Reliability::BestEffort) // Stateless needs to be BestEffort
-      .build();
-
-    let topic_cache_handle = dds_cache.write().unwrap().add_new_topic(
-      topic_name.to_string(),
-      TypeDesc::new("test_type".to_string()),
-      &qos_policy,
-    );
-
-    // Create mechanisms for notifications, statuses & commands
-    let (notification_sender, _notification_receiver) =
-      crate::mio_source::notification_channel(100);
-    let (_notification_event_source, notification_event_sender) =
-      mio_source::make_poll_channel().unwrap();
-    let data_reader_waker = Arc::new(Mutex::new(None));
-
-    let (status_sender, _status_receiver) = sync_status_channel::<DataReaderStatus>(4).unwrap();
-    let (participant_status_sender, _participant_status_receiver) =
-      sync_status_channel(16).unwrap();
-
-    let (_reader_command_sender, reader_command_receiver) =
-      wake_channel::<ReaderCommand>(10, &LoopWaker::new());
-
-    let like_stateless = true;
-    let reader_guid = GUID::dummy_test_guid(EntityKind::READER_NO_KEY_USER_DEFINED);
-    let reader_ing = ReaderIngredients {
-      guid: reader_guid,
-      notification_sender,
-      status_sender,
-      topic_name: topic_name.to_string(),
-      topic_cache_handle,
-      like_stateless,
-      qos_policy,
-      data_reader_command_receiver: reader_command_receiver,
-      data_reader_waker,
-      poll_event_sender: notification_event_sender,
-      security_plugins: None,
-      discovery_notify: None,
-    };
-    let mut reader = Reader::new(
-      reader_ing,
-      Rc::new(UDPSender::new(0).unwrap()),
-      new_shared_timer(),
-      participant_status_sender,
-    );
-
-    // 2. Attempt to add info of a matched writer to the reader
-    let writer_guid = GUID::dummy_test_guid(EntityKind::WRITER_NO_KEY_USER_DEFINED);
-
-    let mr_state = MessageReceiverState {
-      source_guid_prefix: writer_guid.prefix,
-      ..Default::default()
-    };
-
-    reader.matched_writer_add(
-      writer_guid,
-      EntityId::UNKNOWN,
-      mr_state.unicast_reply_locator_list.to_vec(),
-      mr_state.multicast_reply_locator_list.to_vec(),
-      &QosPolicies::qos_none(),
-    );
-
-    // 3. Verify that the reader does not contain a writer proxy for the writer that
-    // we attempted to add
-    assert!(reader.matched_writer(writer_guid).is_none());
-  }
-}

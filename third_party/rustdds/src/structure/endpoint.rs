@@ -14,21 +14,3 @@ pub enum ReliabilityKind {
 //   pub const RELIABLE: Self = Self(2);
 // }
 
-#[cfg(test)]
-mod tests {
-  use super::*;
-
-  serialization_test!( type = ReliabilityKind,
-  {
-      reliability_kind_best_effort,
-      ReliabilityKind::BestEffort,
-      le = [0x01, 0x00, 0x00, 0x00],
-      be = [0x00, 0x00, 0x00, 0x01]
-  },
-  {
-      reliability_kind_reliable,
-      ReliabilityKind::Reliable,
-      le = [0x02, 0x00, 0x00, 0x00],
-      be = [0x00, 0x00, 0x00, 0x02]
-  });
-}

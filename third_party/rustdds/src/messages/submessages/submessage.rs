@@ -10,11 +10,6 @@ use crate::{
   },
   structure::guid::EntityId,
 };
-#[cfg(feature = "security")]
-use super::{
-  secure_body::SecureBody, secure_postfix::SecurePostfix, secure_prefix::SecurePrefix,
-  secure_rtps_postfix::SecureRTPSPostfix, secure_rtps_prefix::SecureRTPSPrefix,
-};
 
 // TODO: These messages are structured a bit oddly. Why is flags separate from
 // the submessage proper?
@@ -64,34 +59,11 @@ impl<C: Context> Writable<C> for ReaderSubmessage {
   }
 }
 
-/// New submessage types: section 7.3.6 of the Security specification (v. 1.1)
-#[cfg(feature = "security")]
-#[derive(Debug, PartialEq, Eq, Clone)]
-#[allow(clippy::enum_variant_names)] // We are using variant names from the spec
-pub enum SecuritySubmessage {
-  SecureBody(SecureBody, BitFlags<SECUREBODY_Flags>),
-  SecurePrefix(SecurePrefix, BitFlags<SECUREPREFIX_Flags>),
-  SecurePostfix(SecurePostfix, BitFlags<SECUREPOSTFIX_Flags>),
-  SecureRTPSPrefix(SecureRTPSPrefix, BitFlags<SECURERTPSPREFIX_Flags>),
-  SecureRTPSPostfix(SecureRTPSPostfix, BitFlags<SECURERTPSPOSTFIX_Flags>),
-}
 
 // we must write this manually, because
 // 1) we cannot implement Writable for *Flags defined using enumflags2, as they
 // are foreign types (coherence rules) 2) Writer should not use any enum variant
 // tag in this type, as we have SubmessageHeader already.
-#[cfg(feature = "security")]
-impl<C: Context> Writable<C> for SecuritySubmessage {
-  fn write_to<T: ?Sized + Writer<C>>(&self, writer: &mut T) -> Result<(), C::Error> {
-    match self {
-      SecuritySubmessage::SecureBody(s, _f) => writer.write_value(s),
-      SecuritySubmessage::SecurePrefix(s, _f) => writer.write_value(s),
-      SecuritySubmessage::SecurePostfix(s, _f) => writer.write_value(s),
-      SecuritySubmessage::SecureRTPSPrefix(s, _f) => writer.write_value(s),
-      SecuritySubmessage::SecureRTPSPostfix(s, _f) => writer.write_value(s),
-    }
-  }
-}
 
 #[derive(Debug, PartialEq, Eq, Clone)]
 #[allow(clippy::enum_variant_names)]

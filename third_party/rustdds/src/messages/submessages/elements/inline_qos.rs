@@ -1,6 +1,4 @@
 use enumflags2::{bitflags, BitFlags};
-#[cfg(test)]
-use byteorder::ByteOrder;
 use speedy::{Context, Endianness, Readable, Writable, Writer};
 use serde::{Deserialize, Serialize};
 #[allow(unused_imports)]
@@ -11,11 +9,6 @@ use crate::{
   messages::submessages::elements::{parameter_list::ParameterList, RepresentationIdentifier},
   serialization::{pl_cdr_adapters::PlCdrDeserializeError, speedy_pl_cdr_helpers::*},
   structure::{cache_change::ChangeKind, parameter_id::ParameterId, rpc::SampleIdentity},
-};
-#[cfg(test)]
-use crate::{
-  dds::adapters::no_key::*, serialization, serialization::to_vec,
-  serialization::CDRDeserializerAdapter,
 };
 
 // Utility for parsing RTPS inlineQoS parameters
@@ -179,66 +172,6 @@ impl StatusInfo {
     }
   }
 
-  #[cfg(test)]
-  pub fn into_cdr_bytes<BO: ByteOrder>(self) -> Result<Vec<u8>, serialization::Error> {
-    to_vec::<Self, BO>(&self)
-  }
 
-  #[cfg(test)]
-  pub fn from_cdr_bytes(
-    bytes: &[u8],
-    representation_id: RepresentationIdentifier,
-  ) -> Result<Self, serialization::Error> {
-    CDRDeserializerAdapter::from_bytes(bytes, representation_id)
-  }
 }
 
-#[cfg(test)]
-mod tests {
-  use byteorder::{BigEndian, LittleEndian};
-
-  use super::*;
-
-  #[test]
-  fn inline_qos_status_info() {
-    // Little endian
-    let si_bytes = StatusInfo {
-      em: [0; 3],
-      si: StatusInfoEnum::Disposed | StatusInfoEnum::Unregistered,
-    }
-    .into_cdr_bytes::<LittleEndian>()
-    .unwrap();
-
-    let bytes: Vec<u8> = vec![0x00, 0x00, 0x00, 0x03];
-    assert_eq!(si_bytes, bytes);
-
-    let status_info = StatusInfo::from_cdr_bytes(&bytes, RepresentationIdentifier::CDR_LE).unwrap();
-    assert_eq!(
-      status_info,
-      StatusInfo {
-        em: [0; 3],
-        si: StatusInfoEnum::Disposed | StatusInfoEnum::Unregistered
-      }
-    );
-
-    // Big endian
-    let si_bytes = StatusInfo {
-      em: [0; 3],
-      si: StatusInfoEnum::Disposed | StatusInfoEnum::Unregistered,
-    }
-    .into_cdr_bytes::<BigEndian>()
-    .unwrap();
-
-    let bytes: Vec<u8> = vec![0x00, 0x00, 0x00, 0x03];
-    assert_eq!(si_bytes, bytes);
-
-    let status_info = StatusInfo::from_cdr_bytes(&bytes, RepresentationIdentifier::CDR_BE).unwrap();
-    assert_eq!(
-      status_info,
-      StatusInfo {
-        em: [0; 3],
-        si: StatusInfoEnum::Disposed | StatusInfoEnum::Unregistered
-      }
-    );
-  }
-}
