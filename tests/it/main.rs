@@ -64,4 +64,5 @@ mod train;
 mod u2e;
 mod velocity_command;
 mod view;
+mod watchdog;
 mod wire;

@@ -95,7 +95,8 @@ impl Process {
         self.signal("CONT")
     }
 
-    fn signal(&self, name: &str) -> Result<(), String> {
+    /// Sends a signal by its name, such as `HUP`.
+    pub fn signal(&self, name: &str) -> Result<(), String> {
         let status = Command::new("kill").args([&format!("-{name}"), &self.child.id().to_string()]).status();
         match status {
             Ok(status) if status.success() => Ok(()),

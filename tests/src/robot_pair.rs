@@ -15,7 +15,7 @@ const ANSWER: Duration = Duration::from_secs(20);
 /// Domains of the pairs of one test process.
 static NEXT_DOMAIN: AtomicU16 = AtomicU16::new(210);
 /// Config of the robot. Virtual machines stand still for tens of milliseconds.
-pub const PATIENT: &str = "[safety]\nstate_timeout_ms = 150\n";
+pub const PATIENT: &str = "[safety]\nstate_timeout_ms = 150\nmax_pause_ms = 200\nwatchdog_timeout_ms = 100\n";
 /// Domains above are not valid.
 const LAST_DOMAIN: u16 = 232;
 

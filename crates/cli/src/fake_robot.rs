@@ -84,6 +84,8 @@ struct StatisticsReport {
     first_refused: Option<String>,
     largest_gap_ms: u64,
     largest_excess_rad: f32,
+    dampings: u64,
+    damping_delay_ms: u64,
 }
 
 /// Simulates until a signal.
@@ -162,8 +164,16 @@ fn read_lines() -> Receiver<Option<String>> {
 fn answer(robot: &mut FakeRobot, line: &str) -> String {
     match line.trim() {
         "statistics" => {
-            let FakeStatistics { accepted, ignored, refused, first_refused, largest_gap_ms, largest_excess_rad } =
-                robot.statistics();
+            let FakeStatistics {
+                accepted,
+                ignored,
+                refused,
+                first_refused,
+                largest_gap_ms,
+                largest_excess_rad,
+                dampings,
+                damping_delay_ms,
+            } = robot.statistics();
             let report = StatisticsReport {
                 accepted: *accepted,
                 ignored: *ignored,
@@ -171,6 +181,8 @@ fn answer(robot: &mut FakeRobot, line: &str) -> String {
                 first_refused: first_refused.as_ref().map(ToString::to_string),
                 largest_gap_ms: *largest_gap_ms,
                 largest_excess_rad: *largest_excess_rad,
+                dampings: *dampings,
+                damping_delay_ms: *damping_delay_ms,
             };
             serde_json::to_string(&report).unwrap_or_default()
         }

@@ -38,7 +38,7 @@ impl Checker {
         let accepted = rig.robot.statistics().accepted;
         rig.step();
         let executed = request.filter(|_| rig.output.request_refused.is_none());
-        if rig.input.reading.is_some() {
+        if !rig.input.readings.is_empty() {
             self.last_reading_at = rig.input.now;
         }
         self.check_command(rig, before.command.map(|command| command.command().q))?;

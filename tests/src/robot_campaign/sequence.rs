@@ -12,12 +12,13 @@ use super::table::{self, Injection};
 use crate::robot_rig::Rig;
 
 /// Requests of the operator.
-const REQUESTS: [OperatorRequest; 5] = [
+const REQUESTS: [OperatorRequest; 6] = [
     OperatorRequest::Arm,
     OperatorRequest::Stand,
     OperatorRequest::Sit,
     OperatorRequest::Damp,
     OperatorRequest::Disarm,
+    OperatorRequest::Go,
 ];
 /// Lines that end every fault that can end.
 const REPAIR: [&str; 4] = ["clear", "controller off", "battery 80", "heat FL_calf 30"];

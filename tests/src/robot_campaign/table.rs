@@ -205,6 +205,12 @@ pub fn fault_name(fault: &Fault) -> &'static str {
         Fault::ClientLost => CLIENT_LOST.0,
         Fault::ActionLate { .. } => LATE.0,
         Fault::StandFailed { .. } => "stand failed",
+        Fault::OtherRobot => "other robot",
+        Fault::ClockJump { .. } => "clock jump",
+        Fault::Pause { .. } => "pause",
+        Fault::WatchdogTookOver => "watchdog took over",
+        Fault::WatchdogGone => "no watchdog",
+        Fault::CannotSend => "commands cannot be sent",
     }
 }
 

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use twinstep_model::{Command, Joint, RobotModel};
 use twinstep_unitree::{
-    CdrError, ChecksumError, HEAD, LOW_LEVEL, LowCmd, NO_POSITION, NO_VELOCITY, SERVO, decode, motor_index,
+    CdrError, ChecksumError, HEAD, LOW_LEVEL, LowCmd, MotorCmd, NO_POSITION, NO_VELOCITY, SERVO, decode, motor_index,
 };
 
 /// Largest accepted position gain [N·m/rad]. The vendor's limit is not documented; its examples use up to 80.
@@ -99,6 +99,10 @@ pub struct FakeStatistics {
     pub largest_gap_ms: u64,
     /// Farthest commanded position outside a joint's range [rad]; 0 if all were inside.
     pub largest_excess_rad: f32,
+    /// Number of damping messages since the last one that moved or held a joint.
+    pub dampings: u64,
+    /// Time from the last message that moved or held a joint to the first damping message after it [ms].
+    pub damping_delay_ms: u64,
 }
 
 /// Receiver of `rt/lowcmd`.
@@ -145,6 +149,7 @@ impl Firmware {
                 let excess = Joint::ALL.into_iter().map(|joint| self.excess(joint, &message)).fold(0.0, f32::max);
                 self.statistics.largest_excess_rad = self.statistics.largest_excess_rad.max(excess);
                 let is_off = message.bms_cmd.off == POWER_OFF;
+                self.count_damping(&message, now_ms);
                 (self.last, self.last_at_ms) = (Some(message), now_ms);
                 Ok(is_off)
             }
@@ -169,6 +174,20 @@ impl Firmware {
             let gap = now_ms - self.last_at_ms;
             self.statistics.largest_gap_ms = self.statistics.largest_gap_ms.max(gap);
         }
+    }
+
+    /// Counts a message that replaces the one in force.
+    fn count_damping(&mut self, message: &LowCmd, now_ms: u64) {
+        let moves = |motor: &MotorCmd| motor.kp != 0.0 || motor.tau != 0.0;
+        let statistics = &mut self.statistics;
+        if message.motor_cmd.iter().any(moves) {
+            statistics.dampings = 0;
+            return;
+        }
+        if statistics.dampings == 0 {
+            statistics.damping_delay_ms = now_ms - self.last_at_ms;
+        }
+        statistics.dampings += 1;
     }
 
     /// Returns the command in force; without one the motors are limp.
