@@ -62,7 +62,8 @@ fn robot_whose_process_is_suspended_is_damped_and_taken_back_by_arming() {
 
 #[test]
 fn signal_of_a_lost_terminal_and_repeated_signals_damp_the_motors_before_the_end() {
-    for (signals, code) in [(&["HUP"][..], 0), (&["QUIT"], 130), (&["INT", "INT", "TERM"], 130), (&["TERM", "HUP"], 0)] {
+    for (signals, code) in [(&["HUP"][..], 0), (&["QUIT"], 130), (&["INT", "INT", "TERM"], 130), (&["TERM", "HUP"], 0)]
+    {
         let mut pair = standing();
         for signal in signals {
             pair.robot.signal(signal).unwrap();

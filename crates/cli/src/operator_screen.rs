@@ -143,7 +143,8 @@ fn show(
     terminal.clear()?;
     while !handle.is_ending() && !handle.has_ended() {
         let (board, timing, clients, messages) = (handle.board(), handle.timing(), clients(), log.lines());
-        let view = View { place, board: &board, timing: &timing, clients: &clients, torque_limits, messages: &messages };
+        let view =
+            View { place, board: &board, timing: &timing, clients: &clients, torque_limits, messages: &messages };
         terminal.draw(|frame| draw(frame, &view))?;
         std::thread::sleep(FRAME);
     }
@@ -176,7 +177,6 @@ fn summary_lines(view: &View) -> Vec<Line<'static>> {
     };
     let controller = if board.controller_released { "released" } else { "ACTIVE" };
     let sensors = board.reading.as_ref().map_or_else(String::new, |(_, reading)| sensor_text(reading));
-    let ms = |time: Duration| 1e3 * time.as_secs_f64();
     vec![
         Line::from(vec![
             Span::raw("state "),
@@ -189,15 +189,29 @@ fn summary_lines(view: &View) -> Vec<Line<'static>> {
             operator::watchdog_text(board.watchdog),
             board.foreign_writers
         )),
-        Line::raw(format!(
-            "ms, p99: state to command {:.2}   loop late {:.2}   tick jitter {:.2}   longest gap {:.1}   bad states {}",
-            ms(timing.latency.quantile(0.99)),
-            ms(timing.lateness.quantile(0.99)),
-            ms(timing.tick_jitter.quantile(0.99)),
-            ms(timing.gaps.max()),
-            timing.bad_states,
-        )),
+        Line::raw(timing_text(timing)),
+        Line::styled(recording_text(timing), Style::new().fg(Color::Red)),
     ]
+}
+
+/// Returns a warning if messages are missing in the recording.
+fn recording_text(timing: &Timing) -> String {
+    match timing.unrecorded {
+        0 => String::new(),
+        missing => format!("RECORDING INCOMPLETE: {missing} messages are missing; is the disk full?"),
+    }
+}
+
+fn timing_text(timing: &Timing) -> String {
+    let ms = |time: Duration| 1e3 * time.as_secs_f64();
+    format!(
+        "ms, p99: state to command {:.2}   loop late {:.2}   tick jitter {:.2}   longest gap {:.1}   bad states {}",
+        ms(timing.latency.quantile(0.99)),
+        ms(timing.lateness.quantile(0.99)),
+        ms(timing.tick_jitter.quantile(0.99)),
+        ms(timing.gaps.max()),
+        timing.bad_states,
+    )
 }
 
 fn sensor_text(reading: &Reading) -> String {

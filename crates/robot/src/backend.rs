@@ -171,9 +171,7 @@ impl Backend for RobotBackend {
 /// Returns why the robot follows no actions, or `None` if it does.
 fn stop(board: &Board) -> Option<RobotStop> {
     match board.state {
-        Some(State::Ready) if !board.is_permitted => {
-            Some(RobotStop { reason: waits_for(board), terminates: false })
-        }
+        Some(State::Ready) if !board.is_permitted => Some(RobotStop { reason: waits_for(board), terminates: false }),
         Some(State::Ready | State::Run | State::Hold) => None,
         _ => Some(RobotStop {
             reason: board.fault.map_or_else(|| waits_for(board), |fault| fault.to_string()),

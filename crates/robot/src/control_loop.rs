@@ -12,8 +12,8 @@ use twinstep_logs::RecordedTopic;
 use twinstep_model::{Command, RobotModel};
 use twinstep_unitree::{LowState, decode, encode};
 
-use crate::config::{ConfigError, SafetyConfig};
 use crate::command_datagram::WriterGuid;
+use crate::config::{ConfigError, SafetyConfig};
 use crate::dds::{Dds, DdsError, LOW_STATE, Reader, SPORT_MODE_STATE};
 use crate::input::{Action, Client, Input, Output, RequestRefused};
 use crate::machine::SafetyMachine;
@@ -179,7 +179,8 @@ impl ControlLoop {
         let mut received = Received::default();
         while let Some((payload, writer)) = self.reader.take_with_writer() {
             let now = self.start.elapsed();
-            let is_silent = |at: Duration| now.saturating_sub(at) > MAX_ROBOT_SILENCE && !self.machine.state().is_moving();
+            let is_silent =
+                |at: Duration| now.saturating_sub(at) > MAX_ROBOT_SILENCE && !self.machine.state().is_moving();
             if self.robot.is_none_or(|(robot, at)| robot == writer || is_silent(at)) {
                 self.robot = Some((writer, now));
             } else {

@@ -149,12 +149,15 @@ impl Dds {
     pub fn readers(&self, topic: Topic) -> Vec<SocketAddr> {
         let readers = self.participant.discovered_readers();
         let of_topic = readers.iter().filter(|reader| reader.subscription_topic_data.topic_name() == topic.name);
-        let foreign = of_topic.filter(|reader| reader.reader_proxy.remote_reader_guid.prefix != self.participant.guid().prefix);
+        let foreign =
+            of_topic.filter(|reader| reader.reader_proxy.remote_reader_guid.prefix != self.participant.guid().prefix);
         let mut addresses: Vec<SocketAddr> = foreign
             .flat_map(|reader| {
-                let of = |locators: &[_]| -> Vec<SocketAddr> { locators.iter().copied().map(SocketAddr::from).collect() };
+                let of =
+                    |locators: &[_]| -> Vec<SocketAddr> { locators.iter().copied().map(SocketAddr::from).collect() };
                 let unicast: Vec<SocketAddr> = of(&reader.reader_proxy.unicast_locator_list);
-                let announced = if unicast.is_empty() { of(&reader.reader_proxy.multicast_locator_list) } else { unicast };
+                let announced =
+                    if unicast.is_empty() { of(&reader.reader_proxy.multicast_locator_list) } else { unicast };
                 let usable = announced.into_iter().filter(|address| address.is_ipv4() && address.port() != 0);
                 nearest(usable.collect(), self.address)
             })

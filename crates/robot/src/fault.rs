@@ -39,7 +39,9 @@ pub enum Fault {
     #[error("the watchdog damps the motors, because the control loop was silent")]
     WatchdogTookOver,
     /// The watchdog does not guard the motors.
-    #[error("the watchdog does not guard the motors: wait a second; if it does not come, end this program and start it again")]
+    #[error(
+        "the watchdog does not guard the motors: wait a second; if it does not come, end this program and start it again"
+    )]
     WatchdogGone,
     /// Commands cannot be sent.
     #[error("commands cannot be sent: check cable and interface")]

@@ -7,8 +7,8 @@ use twinstep_model::{Joint, PerJoint};
 use crate::command::SafeCommand;
 use crate::fault::Fault;
 use crate::reading::Reading;
-use crate::watchdog::Watchdog;
 use crate::state::State;
+use crate::watchdog::Watchdog;
 
 /// What happened since the last step.
 #[derive(Clone, Debug, PartialEq)]

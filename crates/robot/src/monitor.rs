@@ -205,8 +205,7 @@ impl Monitor {
             self.is_stale().then_some(Fault::StateStale { age_ms: self.silence.as_millis() as u64 }),
         ];
         let last = self.reading.as_ref().filter(|_| self.recent.is_empty());
-        let measured =
-            self.recent.iter().chain(last).flat_map(|reading| self.measured_faults(reading)).flatten();
+        let measured = self.recent.iter().chain(last).flat_map(|reading| self.measured_faults(reading)).flatten();
         let missing = [
             self.remote_is_lost().then_some(Fault::RemoteLost),
             (input.client == Client::Absent).then_some(Fault::ClientLost),
@@ -238,7 +237,8 @@ impl Monitor {
             reading.remote.as_ref().is_some_and(is_stop).then_some(Fault::RemoteStop),
             (lost > config.max_lost_messages).then_some(Fault::MessagesLost { count: lost }),
             (!(degrees <= config.max_tilt_deg)).then_some(Fault::Tilt { degrees }),
-            (!(disagreement <= config.max_imu_disagreement_deg)).then_some(Fault::ImuDisagrees { degrees: disagreement }),
+            (!(disagreement <= config.max_imu_disagreement_deg))
+                .then_some(Fault::ImuDisagrees { degrees: disagreement }),
             first(&outside).map(|joint| Fault::JointLimit { joint, q: reading.q[joint.index()] }),
             first(&overloaded).map(|joint| Fault::Torque { joint, tau: reading.tau[joint.index()] }),
             first(&hot).map(|joint| Fault::Temperature { joint, celsius: reading.temperature[joint.index()] }),

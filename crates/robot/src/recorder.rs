@@ -2,7 +2,7 @@
 
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -10,6 +10,9 @@ use twinstep_logs::{LogError, McapRecorder, RecordedTopic};
 
 /// Number of messages that wait for the disk: 8 s of states and commands.
 const CAPACITY: usize = 8192;
+
+/// Time without a message after which those before are written.
+const MAX_SILENCE: Duration = Duration::from_millis(500);
 
 /// Hands messages to the thread that writes the file. Clones write the same file, which is complete once all are dropped.
 #[derive(Clone)]
@@ -45,11 +48,15 @@ impl Recorder {
 }
 
 fn write(mut file: McapRecorder, messages: &Receiver<Message>) -> Result<(), LogError> {
-    for Message { topic, time_ns, payload } in messages {
-        if let Err(error) = file.write(topic, time_ns, &payload) {
-            tracing::error!(%error, "recording stopped");
+    loop {
+        let written = match messages.recv_timeout(MAX_SILENCE) {
+            Ok(Message { topic, time_ns, payload }) => file.write(topic, time_ns, &payload),
+            Err(RecvTimeoutError::Timeout) => file.flush(),
+            Err(RecvTimeoutError::Disconnected) => return file.finish(),
+        };
+        if let Err(error) = written {
+            tracing::error!(%error, "the recording has stopped; the robot goes on");
             return Err(error);
         }
     }
-    file.finish()
 }

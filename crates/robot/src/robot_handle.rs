@@ -217,7 +217,8 @@ impl RobotHandle {
             (false, _) => Client::Connected,
         };
         let request = inbox.requests.pop_front();
-        let request = request.map(|Request { number, request, end }| (number, (Instant::now() < end).then_some(request)));
+        let request =
+            request.map(|Request { number, request, end }| (number, (Instant::now() < end).then_some(request)));
         Taken { request, action: inbox.action.take(), client: Some(client), has_client: inbox.clients > 0 }
     }
 

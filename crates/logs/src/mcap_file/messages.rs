@@ -71,8 +71,9 @@ impl Recording {
                     recording.add(file, record.map_err(damaged)?)?;
                 }
                 Ok(LinearReadEvent::Record { .. }) => {}
-                // A recorder that lost power wrote complete chunks up to that time.
-                Err(McapError::UnexpectedEof) if !recording.states.is_empty() => {
+                // A recorder that was killed or lost power wrote whole chunks up to that time. What follows them may be cut off,
+                // a length that was never written, or zeros.
+                Err(_) if !recording.states.is_empty() => {
                     recording.truncated = true;
                     break;
                 }

@@ -15,6 +15,7 @@ mod messages;
 mod read;
 mod recorder;
 mod rows;
+mod whole_records;
 mod write;
 
 use serde::{Deserialize, Serialize};

@@ -68,7 +68,8 @@ fn counts(name: &str, state: State) -> bool {
     match state {
         State::Disconnected | State::Observe | State::Fault => false,
         State::Damp => {
-            let surroundings = ["foreign writer", "other robot", "controller", "remote stop", "stop request", "network"];
+            let surroundings =
+                ["foreign writer", "other robot", "controller", "remote stop", "stop request", "network"];
             let process = ["takeover", "no watchdog", "stale state", "stopped clock", "clock jump", "lost messages"];
             process.iter().chain(&surroundings).any(|counts| *counts == name)
         }

@@ -90,7 +90,11 @@ impl WatchdogLink {
         match self.status {
             _ if self.is_closed || self.silence > MAX_SILENCE => Watchdog::Missing,
             Some(status) if self.is_guarding && status.generation == self.generation => {
-                if status.has_taken_over { Watchdog::TookOver } else { Watchdog::Guarding }
+                if status.has_taken_over {
+                    Watchdog::TookOver
+                } else {
+                    Watchdog::Guarding
+                }
             }
             _ => Watchdog::Idle,
         }
