@@ -16,6 +16,8 @@ use crate::raw_client::RawClient;
 const LEASES: usize = 200;
 /// Threads of a server with many leases: Zenoh's, those that answer requests, and one pool for the simulation.
 const MAX_THREADS: usize = 100;
+/// More than Zenoh has threads.
+const SILENT_CLIENTS: usize = 8;
 const UNREAD_REQUESTS: usize = 6000;
 const UNDISTURBED: Duration = Duration::from_secs(2);
 /// Time for which the silent client reads nothing.
@@ -26,7 +28,7 @@ const AFTERWARDS: Duration = Duration::from_secs(7);
 const LONGEST_STEP: Duration = Duration::from_secs(1);
 
 #[test]
-fn client_that_reads_no_replies_does_not_delay_the_steps_of_others() {
+fn clients_that_read_no_replies_do_not_delay_the_steps_of_others() {
     let (_server, endpoint) = serve(&["--task", "counter"]);
     let bystander = RawClient::connect_to_only_server(&endpoint, "bystander");
     let lease = bystander.lease(1);
@@ -35,12 +37,15 @@ fn client_that_reads_no_replies_does_not_delay_the_steps_of_others() {
     let since = Instant::now();
     let undisturbed = durations_of_steps(&bystander, &lease, &mut next_seq, || since.elapsed() < UNDISTURBED);
 
-    let proxy = Proxy::start(&endpoint).unwrap();
-    let mut silent = RawClient::connect_to_only_server(&proxy.endpoint, "silent");
-    silent.query_timeout = Duration::from_secs(20);
-    let own = silent.lease(1);
-    silent.hello();
-    proxy.hold_replies(SILENCE);
+    let silent = || {
+        let proxy = Proxy::start(&endpoint).unwrap();
+        let mut client = RawClient::connect_to_only_server(&proxy.endpoint, "silent");
+        client.query_timeout = Duration::from_secs(20);
+        client.hello();
+        proxy.hold_replies(SILENCE);
+        (proxy, client)
+    };
+    let silent: Vec<_> = (0..SILENT_CLIENTS).map(|_| silent()).collect();
     let is_finished = AtomicBool::new(false);
     let disturbed = scope(|scope| {
         let steps = scope
@@ -49,7 +54,9 @@ fn client_that_reads_no_replies_does_not_delay_the_steps_of_others() {
         // Most are answered, some are refused.
         let keys = [keys::hello(&bystander.sid), format!("twinstep/{}/nothing", bystander.sid)];
         let unread: Vec<_> =
-            (0..UNREAD_REQUESTS).map(|index| silent.send(&keys[usize::from(index % 10 == 9)], &request)).collect();
+            (0..UNREAD_REQUESTS * SILENT_CLIENTS)
+                .map(|index| silent[index % SILENT_CLIENTS].1.send(&keys[usize::from(index % 10 == 9)], &request))
+                .collect();
         sleep(AFTERWARDS);
         is_finished.store(true, Ordering::Relaxed);
         drop(unread);
@@ -62,7 +69,7 @@ fn client_that_reads_no_replies_does_not_delay_the_steps_of_others() {
     let longest = disturbed[disturbed.len() - 1];
     assert!(longest < LONGEST_STEP, "longest step: {longest:?}");
     bystander.hello();
-    drop((own, silent));
+    drop(silent);
 }
 
 /// Starts `twinstep serve`. Returns the process and its endpoint.

@@ -6,8 +6,6 @@ use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
-use twinstep_session::SERVER_THREADS;
-
 /// Maximum time for the start of a server.
 const STARTUP: Duration = Duration::from_mins(1);
 
@@ -22,7 +20,6 @@ impl Process {
     pub fn start(program: &Path, arguments: &[String]) -> Result<Self, String> {
         let mut child = Command::new(program)
             .args(arguments)
-            .env(SERVER_THREADS.0, SERVER_THREADS.1)
             // The pipe closes when this process exits; the child then exits too.
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())

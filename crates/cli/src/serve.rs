@@ -11,7 +11,6 @@ use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_env_server::{Config, EnvFactory, Server, ServerError, SimEnvFactory};
 use twinstep_envs::TaskConfig;
 use twinstep_model::{AutoresetMode, InitialState, Pose, ResetRequest, RobotModel, Scene};
-use twinstep_session::SERVER_THREADS;
 use twinstep_sim::{Engine, SimConfig};
 use twinstep_viewer::{Hub, SceneInfo};
 
@@ -101,7 +100,6 @@ pub struct Args {
 /// Serves until a signal or, with `--until-stdin-closes`, the end of stdin.
 pub fn run(args: &Args) -> CommandResult {
     let config = args.config()?;
-    set_zenoh_threads();
     let signals = Signals::listen()?;
     let factory = SimEnvFactory::new(config.clone()).map_err(input)?;
     let hub = Arc::new(Hub::new(scene(&config, factory.robot())));
@@ -147,18 +145,6 @@ fn reward_terms(config: &Config) -> Option<Vec<String>> {
     env.reset(&ResetRequest::default()).ok()?;
     env.scene(0).ok()?;
     Some(env.spec().reward_terms.clone())
-}
-
-/// Gives Zenoh several threads that send, unless the user has chosen their number.
-fn set_zenoh_threads() {
-    let (variable, threads) = SERVER_THREADS;
-    if std::env::var_os(variable).is_none() {
-        // SAFETY: the program has no other thread yet that could read the environment.
-        #[expect(unsafe_code, reason = "Zenoh reads the number of its threads from the environment only")]
-        unsafe {
-            std::env::set_var(variable, threads);
-        }
-    }
 }
 
 impl Args {

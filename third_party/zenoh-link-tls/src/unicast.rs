@@ -51,11 +51,15 @@ use zenoh_result::{zerror, ZResult};
 
 use crate::{
     utils::{get_tls_addr, get_tls_host, get_tls_server_name, TlsClientConfig, TlsServerConfig},
-    TLS_ACCEPT_THROTTLE_TIME, TLS_DEFAULT_MTU, TLS_LINGER_TIMEOUT, TLS_LOCATOR_PREFIX,
+    TLS_ACCEPT_THROTTLE_TIME, TLS_DEFAULT_MTU, TLS_LOCATOR_PREFIX,
 };
 
 #[derive(Default, Debug, PartialEq, Eq, Hash)]
 pub struct TlsCommonName(String);
+
+// Twinstep: time after which a connection is given up whose peer acknowledges or takes nothing.
+#[cfg(target_os = "linux")]
+const USER_TIMEOUT: Duration = Duration::from_secs(10);
 
 pub struct LinkUnicastTls {
     // The underlying socket. A TLS session is one state machine for both directions: reading takes parts of it out and
@@ -95,17 +99,12 @@ impl LinkUnicastTls {
             );
         }
 
-        // Set the TLS linger option
-        #[allow(deprecated)]
-        if let Err(err) = tcp_stream.set_linger(Some(Duration::from_secs(
-            (*TLS_LINGER_TIMEOUT).try_into().unwrap(),
-        ))) {
-            tracing::warn!(
-                "Unable to set LINGER option on TLS link {} => {}: {}",
-                src_addr,
-                dst_addr,
-                err
-            );
+        // Twinstep: with SO_LINGER, close(2) waits up to 10 s for a peer that does not read, and with it a
+        // thread of the runtime that serves other links. Without it the system sends the rest in the
+        // background, and gives up after the user timeout.
+        #[cfg(target_os = "linux")]
+        if let Err(err) = socket2::SockRef::from(&tcp_stream).set_tcp_user_timeout(Some(USER_TIMEOUT)) {
+            tracing::warn!("Unable to set TCP_USER_TIMEOUT on TLS link {} => {}: {}", src_addr, dst_addr, err);
         }
 
         // Compute the MTU
