@@ -12,11 +12,17 @@ use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
 use crate::EnvFactory;
-use crate::executor::{Executor, Handler, Mailbox, SendLock, lock};
+use crate::executor::{Executor, Handled, Handler, Mailbox, SendLock, lock};
 use crate::messages::{Reply, Request, RequestKind, ServerState};
 
 /// Maximum size of a `hello` or `lease` request [bytes].
-const MAX_CONTROL_BYTES: usize = 16 << 10;
+const MAX_CONTROL_BYTES: usize = 4 << 10;
+/// Maximum size of a key [bytes]; those of the protocol have at most 120.
+const MAX_KEY_BYTES: usize = 256;
+/// Size of a payload up to which it is copied. A larger one keeps the buffer in which it arrived.
+const MAX_COPIED_BYTES: usize = 32 << 10;
+/// Size of the refusals that wait to be sent [bytes].
+const MAX_REFUSALS_BYTES: usize = 64 << 10;
 
 /// Leases by id.
 pub type Routes = Arc<RwLock<HashMap<String, Arc<Route>>>>;
@@ -52,8 +58,12 @@ pub struct Dispatcher {
 }
 
 impl Dispatcher {
-    /// Enqueues a query. Never blocks.
-    pub fn dispatch(&self, query: Query) {
+    /// Enqueues a query. Never blocks. A query that no client sends gets no reply.
+    pub fn dispatch(&self, mut query: Query) {
+        if query.key_expr().len() > MAX_KEY_BYTES || !query.parameters().as_str().is_empty() {
+            return;
+        }
+        copy_out(&mut query);
         let (mailbox, kind) = match self.route(&query) {
             Ok(route) => route,
             Err(error) => return self.refuse(query, error),
@@ -126,24 +136,36 @@ impl Dispatcher {
         if let Some(payload) = query.payload_mut() {
             *payload = ZBytes::new();
         }
-        // The mailbox is never full.
+        // A refusal that has no room is dropped: a client repeats its request.
         let _ = self.refusals.push(Request { query, kind: RequestKind::Answered(Reply::Err(error)) });
     }
 }
 
-/// Creates the mailbox of refused requests. It is not bounded: a client that does not read its refusals loses its link
-/// when the oldest of them cannot be sent, and the others are dropped with it.
+/// Replaces payload and attachment by copies. As they arrive they are parts of a buffer, which they would keep.
+///
+/// An attachment that is no secret is dropped: it is not the right one.
+fn copy_out(query: &mut Query) {
+    if let Some(payload) = query.payload_mut().filter(|payload| payload.len() <= MAX_COPIED_BYTES) {
+        *payload = ZBytes::from(payload.to_bytes().into_owned());
+    }
+    let secret = attached_secret(query);
+    if let Some(attachment) = query.attachment_mut() {
+        *attachment = secret.map_or_else(ZBytes::new, |secret| ZBytes::from(secret.as_bytes().to_vec()));
+    }
+}
+
+/// Creates the mailbox of refused requests.
 pub fn refusals(executor: &Executor, send_lock: SendLock) -> Arc<Mailbox> {
-    Mailbox::new(executor, send_lock, usize::MAX, Refusals)
+    Mailbox::new(executor, "", send_lock, MAX_REFUSALS_BYTES, Refusals)
 }
 
 struct Refusals;
 
 impl Handler for Refusals {
-    fn handle(&mut self, kind: RequestKind, _query: &Query) -> Option<Reply> {
+    fn handle(&mut self, kind: &RequestKind, _query: &Query) -> Handled {
         match kind {
-            RequestKind::Answered(reply) => Some(reply),
-            _ => None,
+            RequestKind::Answered(reply) => Handled::Reply(reply.clone()),
+            _ => Handled::Forwarded,
         }
     }
 }

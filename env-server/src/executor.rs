@@ -4,6 +4,9 @@
 //! therefore does not count as running: another thread executes the next request. A mailbox has at most one request in
 //! execution or one reply being sent, so a client that does not read delays only the mailboxes that it writes to.
 //!
+//! A request that takes long is executed in slices: after each, the mailbox goes to the end of its client's queue. Clients take
+//! turns, however many leases each has, and one client never has all threads.
+//!
 //! The mailboxes that every client may fill share a [`SendLock`]: Zenoh's thread that closes a link waits for all threads
 //! that send to it, and serves no other link meanwhile.
 
@@ -34,13 +37,66 @@ struct Shared {
 
 #[derive(Default)]
 struct State {
-    /// Mailboxes with a request and without a thread.
-    ready: VecDeque<Arc<Mailbox>>,
+    /// Mailboxes with a request and without a thread, by client. The client at the front is next.
+    ready: VecDeque<ClientQueue>,
     threads: usize,
     /// Threads that execute a request; those that send a reply do not count.
     running: usize,
     waiting: usize,
     is_stopping: bool,
+}
+
+/// Mailboxes of one client.
+struct ClientQueue {
+    client: String,
+    mailboxes: VecDeque<Arc<Mailbox>>,
+    /// Threads that execute a request of the client.
+    running: usize,
+}
+
+impl State {
+    /// Appends a mailbox to the queue of its client.
+    fn push(&mut self, mailbox: Arc<Mailbox>) {
+        match self.ready.iter_mut().find(|queue| queue.client == mailbox.client) {
+            Some(queue) => queue.mailboxes.push_back(mailbox),
+            None => {
+                let client = mailbox.client.clone();
+                self.ready.push_back(ClientQueue { client, mailboxes: VecDeque::from([mailbox]), running: 0 });
+            }
+        }
+    }
+
+    /// Returns true if no mailbox waits for a thread.
+    fn is_idle(&self) -> bool {
+        self.ready.iter().all(|queue| queue.mailboxes.is_empty())
+    }
+
+    /// Returns the index of the first client that has a mailbox and may use another thread.
+    fn next_client(&self, max_running: usize) -> Option<usize> {
+        let max_of_client = max_running.saturating_sub(1).max(1);
+        let may_run = |queue: &ClientQueue| !queue.mailboxes.is_empty() && queue.running < max_of_client;
+        if self.running < max_running { self.ready.iter().position(may_run) } else { None }
+    }
+
+    /// Takes the next mailbox. Its client goes to the end.
+    fn pop(&mut self, max_running: usize) -> Option<Arc<Mailbox>> {
+        let index = self.next_client(max_running)?;
+        let mut queue = self.ready.remove(index)?;
+        let mailbox = queue.mailboxes.pop_front();
+        queue.running += 1;
+        self.running += 1;
+        self.ready.push_back(queue);
+        mailbox
+    }
+
+    /// Ends the execution of a request of a client.
+    fn finish(&mut self, client: &str) {
+        self.running -= 1;
+        if let Some(queue) = self.ready.iter_mut().find(|queue| queue.client == client) {
+            queue.running -= 1;
+        }
+        self.ready.retain(|queue| queue.running > 0 || !queue.mailboxes.is_empty());
+    }
 }
 
 impl Executor {
@@ -64,13 +120,13 @@ impl Executor {
 
     fn schedule(&self, mailbox: Arc<Mailbox>) {
         let mut state = lock(&self.0.state);
-        state.ready.push_back(mailbox);
+        state.push(mailbox);
         self.wake_a_thread(&mut state);
     }
 
     /// Wakes or starts a thread if there is a mailbox that it may execute.
     fn wake_a_thread(&self, state: &mut State) {
-        if state.ready.is_empty() || state.running >= self.0.max_running {
+        if state.next_client(self.0.max_running).is_none() {
             return;
         }
         if state.waiting > 0 {
@@ -93,22 +149,19 @@ impl Executor {
     fn run(&self) {
         let mut state = lock(&self.0.state);
         loop {
-            if state.running < self.0.max_running
-                && let Some(mailbox) = state.ready.pop_front()
-            {
-                state.running += 1;
+            if let Some(mailbox) = state.pop(self.0.max_running) {
                 // Two requests may have notified the same waiting thread.
                 self.wake_a_thread(&mut state);
                 drop(state);
                 let executed = mailbox.execute_next();
                 let mut finished = lock(&self.0.state);
-                finished.running -= 1;
+                finished.finish(&mailbox.client);
                 self.wake_a_thread(&mut finished);
                 drop(finished);
                 mailbox.send(executed);
                 mailbox.finish();
                 state = lock(&self.0.state);
-            } else if state.is_stopping && state.ready.is_empty() {
+            } else if state.is_stopping && state.is_idle() {
                 break;
             } else {
                 state.waiting += 1;
@@ -116,7 +169,7 @@ impl Executor {
                     self.0.changed.wait_timeout(state, KEEP_ALIVE).unwrap_or_else(PoisonError::into_inner);
                 state = awake;
                 state.waiting -= 1;
-                if wait.timed_out() && state.ready.is_empty() && state.threads > 1 {
+                if wait.timed_out() && state.is_idle() && state.threads > 1 {
                     break;
                 }
             }
@@ -128,8 +181,18 @@ impl Executor {
 
 /// Executes the requests of one mailbox.
 pub trait Handler: Send {
-    /// Returns the reply to a query, or `None` if another mailbox has received it.
-    fn handle(&mut self, kind: RequestKind, query: &Query) -> Option<Reply>;
+    /// Executes a request, or a slice of it.
+    fn handle(&mut self, kind: &RequestKind, query: &Query) -> Handled;
+}
+
+/// What became of a request.
+pub enum Handled {
+    /// It is executed; this is the reply.
+    Reply(Reply),
+    /// Another mailbox has received it.
+    Forwarded,
+    /// It is executed further when it is handled again.
+    Unfinished,
 }
 
 /// Held by the thread that sends a reply.
@@ -137,8 +200,11 @@ pub type SendLock = Arc<Mutex<()>>;
 
 /// Queue of requests that are executed in order, one at a time.
 pub struct Mailbox {
+    /// Client that the requests are from; empty if they are from all.
+    client: String,
     queue: Mutex<Queue>,
-    capacity: usize,
+    /// Maximum size of the requests that wait [bytes]. One request may wait whatever its size.
+    max_bytes: usize,
     handler: Mutex<Box<dyn Handler>>,
     send_lock: SendLock,
     executor: Executor,
@@ -147,28 +213,34 @@ pub struct Mailbox {
 #[derive(Default)]
 struct Queue {
     requests: VecDeque<Request>,
+    /// Size of these requests [bytes].
+    bytes: usize,
     /// True from the first request until the reply to the last one has been sent.
     is_busy: bool,
 }
 
 impl Mailbox {
-    /// Creates a mailbox in which at most `capacity` requests wait.
+    /// Creates a mailbox for the requests of `client`, in which `max_bytes` wait at most.
     pub fn new(
         executor: &Executor,
+        client: &str,
         send_lock: SendLock,
-        capacity: usize,
+        max_bytes: usize,
         handler: impl Handler + 'static,
     ) -> Arc<Self> {
+        let client = client.to_owned();
         let (queue, handler) = (Mutex::default(), Mutex::new(Box::new(handler) as Box<dyn Handler>));
-        Arc::new(Self { queue, capacity, handler, send_lock, executor: executor.clone() })
+        Arc::new(Self { client, queue, max_bytes, handler, send_lock, executor: executor.clone() })
     }
 
     /// Enqueues a request. Never blocks. Returns the request if the mailbox is full.
     pub fn push(self: &Arc<Self>, request: Request) -> Result<(), Box<Request>> {
         let mut queue = lock(&self.queue);
-        if queue.requests.len() >= self.capacity {
+        let bytes = request.bytes();
+        if queue.bytes + bytes > self.max_bytes && !queue.requests.is_empty() {
             return Err(Box::new(request));
         }
+        queue.bytes += bytes;
         queue.requests.push_back(request);
         let was_busy = std::mem::replace(&mut queue.is_busy, true);
         drop(queue);
@@ -183,16 +255,31 @@ impl Mailbox {
         lock(&self.queue).is_busy
     }
 
-    /// Executes the first request. Returns its query, and the reply if there is one.
+    /// Executes the first request. Returns its query, and the reply if there is one. An unfinished request stays the first.
     fn execute_next(&self) -> Option<(Query, Option<Reply>)> {
-        let Request { query, kind } = lock(&self.queue).requests.pop_front()?;
-        let outcome = catch_unwind(AssertUnwindSafe(|| lock(&self.handler).handle(kind, &query)));
-        let reply = outcome.unwrap_or_else(|panic| {
+        let request = {
+            let mut queue = lock(&self.queue);
+            let request = queue.requests.pop_front()?;
+            queue.bytes -= request.bytes();
+            request
+        };
+        let Request { query, kind } = &request;
+        let outcome = catch_unwind(AssertUnwindSafe(|| lock(&self.handler).handle(kind, query)));
+        let handled = outcome.unwrap_or_else(|panic| {
             let reason = panic_text(&panic);
             tracing::error!(reason, key = %query.key_expr(), "a request panicked");
-            Some(Reply::Err(ErrorReply::new(ErrorCode::Internal, "", reason)))
+            Handled::Reply(Reply::Err(ErrorReply::new(ErrorCode::Internal, "", reason)))
         });
-        Some((query, reply))
+        match handled {
+            Handled::Reply(reply) => Some((request.query, Some(reply))),
+            Handled::Forwarded => Some((request.query, None)),
+            Handled::Unfinished => {
+                let mut queue = lock(&self.queue);
+                queue.bytes += request.bytes();
+                queue.requests.push_front(request);
+                None
+            }
+        }
     }
 
     /// Sends the reply that [`Mailbox::execute_next`] returned.

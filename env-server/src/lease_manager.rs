@@ -12,12 +12,12 @@ use zenoh::query::Query;
 
 use crate::EnvFactory;
 use crate::dispatch::{Route, Routes, attached_secret, no_such_lease};
-use crate::executor::{Executor, Handler, Mailbox, SendLock, lock};
-use crate::messages::{LeaseParams, Reply, Request, RequestKind, ServerState};
+use crate::executor::{Executor, Handled, Handler, Mailbox, SendLock, lock};
+use crate::messages::{LeaseParams, MAX_POLICY_BYTES, Reply, Request, RequestKind, ServerState};
 use crate::worker::{Worker, stale_epoch};
 
-/// Capacity of a lease's mailbox. A client has one request in progress; the rest is for its repeats.
-const LEASE_CAPACITY: usize = 16;
+/// Size of the repeated requests that may wait in the mailbox of a lease, besides one request of the largest size [bytes].
+const MAX_REPEATS_BYTES: usize = 32 << 10;
 
 /// Properties of the server that `hello` reports and leases are granted by.
 pub struct ServerInfo {
@@ -37,6 +37,8 @@ pub struct ServerInfo {
     pub lease_grace: Duration,
     /// Time without a request after which a lease is released; `None` for never.
     pub lease_idle: Option<Duration>,
+    /// Port of the stop listener.
+    pub stop_port: Option<u16>,
 }
 
 /// Grants leases and releases those of disconnected or idle clients.
@@ -70,11 +72,11 @@ struct Lease {
 pub struct LeaseHandler(pub Arc<LeaseManager>);
 
 impl Handler for LeaseHandler {
-    fn handle(&mut self, kind: RequestKind, query: &Query) -> Option<Reply> {
+    fn handle(&mut self, kind: &RequestKind, query: &Query) -> Handled {
         match kind {
-            RequestKind::Hello => Some(self.0.hello(query).into()),
+            RequestKind::Hello => Handled::Reply(self.0.hello(query).into()),
             // The lease itself replies.
-            _ => self.0.lease(query).err().map(Reply::Err),
+            _ => self.0.lease(query).err().map_or(Handled::Forwarded, |error| Handled::Reply(Reply::Err(error))),
         }
     }
 }
@@ -121,7 +123,11 @@ impl LeaseManager {
             lease_idle_s: info.lease_idle.map(|idle| idle.as_secs_f64()),
             env_steps: self.state.env_steps.load(Ordering::Relaxed),
             max_rollout_steps: self.state.max_rollout_steps as u64,
-            real_time: self.factory.real_time(),
+            max_policy_bytes: if self.state.max_rollout_steps > 0 { MAX_POLICY_BYTES as u64 } else { 0 },
+            real_time: self
+                .factory
+                .real_time()
+                .map(|real_time| message::RealTime { stop_port: info.stop_port, ..real_time }),
         }))
     }
 
@@ -229,10 +235,18 @@ impl LeaseManager {
         let (manager, lease) = (Arc::clone(self), id.to_owned());
         let release = Box::new(move |reason: &str| manager.release(&lease, reason));
         let worker = Worker::new(params, Arc::clone(&self.factory), Arc::clone(&self.state), release);
+        let max_request_bytes = convert::max_request_bytes(num_envs, &self.info.spec);
         let route = Route {
             secret,
-            max_request_bytes: convert::max_request_bytes(num_envs, &self.info.spec),
-            mailbox: Mailbox::new(&self.executor, SendLock::default(), LEASE_CAPACITY, worker),
+            max_request_bytes,
+            // A client has one request in progress, and may repeat it.
+            mailbox: Mailbox::new(
+                &self.executor,
+                &request.client,
+                SendLock::default(),
+                max_request_bytes + MAX_REPEATS_BYTES,
+                worker,
+            ),
             last_request: Mutex::new(Instant::now()),
         };
         self.routes.write().unwrap_or_else(PoisonError::into_inner).insert(id.to_owned(), Arc::new(route));
@@ -308,22 +322,23 @@ impl LeaseManager {
             })
             .collect();
         drop(routes);
-        for (id, reason) in expired {
-            self.remove(&mut leases, &id, reason);
-        }
+        let released: Vec<_> = expired.iter().map(|(id, reason)| self.remove(&mut leases, id, reason)).collect();
+        // Environments may take seconds to end, and others wait for the lock of the leases.
+        drop(leases);
+        drop(released);
     }
 
     /// Releases a lease. Requests that are in its mailbox are still answered.
     pub fn release(&self, lease: &str, reason: &str) {
-        self.remove(&mut lock(&self.leases), lease, reason);
+        let released = self.remove(&mut lock(&self.leases), lease, reason);
+        drop(released);
     }
 
-    fn remove(&self, leases: &mut Leases, lease: &str, reason: &str) {
+    /// Removes a lease. The environments end when what is returned is dropped.
+    fn remove(&self, leases: &mut Leases, lease: &str, reason: &str) -> Option<Arc<Route>> {
         if leases.by_id.remove(lease).is_some() {
             tracing::info!(lease, reason, "lease released");
         }
-        // The environments are dropped after the lock of the routes is released.
-        let route = self.routes.write().unwrap_or_else(PoisonError::into_inner).remove(lease);
-        drop(route);
+        self.routes.write().unwrap_or_else(PoisonError::into_inner).remove(lease)
     }
 }

@@ -7,7 +7,7 @@
 //! - [`Config`]: the config file with the tables `[server]`, `[task]`, `[sim]` and `[randomise]`.
 //!
 //! Zenoh's threads only put requests into mailboxes (`dispatch`). Each lease has a mailbox; so have `hello`, `lease` and
-//! refused requests. The threads of one pool (`executor`) execute the requests of a mailbox in order, one at a time, and
+//! refused requests, which have threads of their own. The threads of one pool (`executor`) execute the requests of a mailbox in order, one at a time, and
 //! send the replies. A repeated request therefore waits for the one in progress and gets its reply. The *lease manager*
 //! grants leases, monitors the liveliness of clients and releases expired leases. The *worker* of a lease owns its
 //! environments.
@@ -19,8 +19,10 @@ mod executor;
 mod frame_publisher;
 mod lease_manager;
 mod messages;
+mod protection;
 mod rollout;
 mod server;
+mod stop_listener;
 mod worker;
 
 pub use config::{Config, ConfigFileError, ServerConfig};

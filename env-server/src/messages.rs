@@ -1,6 +1,6 @@
 //! Requests and replies inside the server, and the state that its threads share.
 
-use std::sync::atomic::{AtomicBool, AtomicU64};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize};
 
 use twinstep_model::AutoresetMode;
 use twinstep_protocol::keys::EnvMethod;
@@ -18,6 +18,16 @@ pub struct Request {
     pub query: Query,
     /// What it requests.
     pub kind: RequestKind,
+}
+
+/// Size that counts for a request besides its payload [bytes].
+const REQUEST_BYTES: usize = 512;
+
+impl Request {
+    /// Returns the size that counts while the request waits [bytes].
+    pub fn bytes(&self) -> usize {
+        REQUEST_BYTES + self.query.payload().map_or(0, ZBytes::len) + self.query.key_expr().len()
+    }
 }
 
 /// What a query requests.
@@ -89,4 +99,9 @@ pub struct ServerState {
     pub env_steps: AtomicU64,
     /// Maximum number of steps of a rollout; 0 for a server without rollouts.
     pub max_rollout_steps: usize,
+    /// Memory of the policies that the leases hold [bytes].
+    pub policy_bytes: AtomicUsize,
 }
+
+/// Memory for the policies of all leases [bytes].
+pub const MAX_POLICY_BYTES: usize = 256 << 20;

@@ -1,48 +1,94 @@
 //! Rollouts: a policy is run next to the environments.
 
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
 
 use twinstep_model::{AutoresetMode, EnvError, EnvSpec, Trajectory, VecEnv};
 use twinstep_policy::{ActionSampler, BehaviourPolicy, Mlp, Normaliser};
 use twinstep_protocol::{ErrorCode, ErrorReply, convert, message, tensor};
 
 use crate::dispatch::shutting_down;
-use crate::messages::ServerState;
+use crate::messages::{MAX_POLICY_BYTES, ServerState};
 
 /// Maximum number of layers, and of units of a layer, of a policy.
 const MAX_LAYERS: usize = 16;
 const MAX_UNITS: u64 = 65_536;
+/// Number of parameters up to which padding may be any share of a network.
+const MIN_PADDED: usize = 1 << 16;
 /// Limit of the logarithm of a standard deviation.
 const MAX_LOG_STD: f32 = 20.0;
 /// Maximum size of a trajectory without its ended episodes [bytes]. Zenoh refuses messages of more than 1 GiB.
 const MAX_TRAJECTORY_BYTES: u64 = 1 << 29;
 
-/// Runs the policy of `request`, or `held`, the last policy with its id. The steps are written to `trajectory`.
-///
-/// Returns the policy if it is a new one. An error after the first step is [`ErrorCode::RolloutFailed`].
-pub fn run(
-    request: &message::RolloutRequest<'_>,
-    held: Option<&(u64, BehaviourPolicy)>,
-    env: &mut dyn VecEnv,
-    state: &ServerState,
-    trajectory: &mut Trajectory,
-) -> Result<Option<BehaviourPolicy>, ErrorReply> {
-    let steps = check_steps(request.steps, env, state.max_rollout_steps)?;
-    let new = request.policy.as_ref().map(|policy| read_policy(policy, env.spec())).transpose()?;
-    let policy = match &new {
-        Some(policy) => policy,
-        None => held_policy(request.policy_id, held)?,
-    };
-    trajectory.start(steps, env.spec(), env.obs(), env.critic_obs());
-    let mut sampler = ActionSampler::new(policy, request.noise_seed, env.num_envs());
-    for step in 0..steps {
-        if state.shutting_down.load(Ordering::Acquire) {
-            return Err(shutting_down());
-        }
-        sampler.step(env, trajectory).map_err(|error| failed(step, steps, &error))?;
-        state.env_steps.fetch_add(env.num_envs() as u64, Ordering::Relaxed);
+/// Time after which a rollout lets other requests execute. A step is not divided.
+const SLICE: Duration = Duration::from_millis(20);
+
+/// A policy with the memory that it takes of the server's budget.
+pub struct HeldPolicy {
+    policy: Arc<BehaviourPolicy>,
+    state: Arc<ServerState>,
+    bytes: usize,
+}
+
+impl Drop for HeldPolicy {
+    fn drop(&mut self) {
+        self.state.policy_bytes.fetch_sub(self.bytes, Ordering::AcqRel);
     }
-    Ok(new)
+}
+
+/// A rollout in execution.
+pub struct Rollout {
+    sampler: ActionSampler<Arc<BehaviourPolicy>>,
+    step: usize,
+    steps: usize,
+    /// The policy, if the request has sent it.
+    pub policy: Option<HeldPolicy>,
+}
+
+impl Rollout {
+    /// Begins to run the policy of `request`, or `held`, the last policy with its id. The steps are written to `trajectory`.
+    pub fn start(
+        request: &message::RolloutRequest<'_>,
+        held: Option<&(u64, HeldPolicy)>,
+        env: &dyn VecEnv,
+        state: &Arc<ServerState>,
+        trajectory: &mut Trajectory,
+    ) -> Result<Self, ErrorReply> {
+        let steps = check_steps(request.steps, env, state.max_rollout_steps)?;
+        let new = request.policy.as_ref().map(|policy| read_policy(policy, env.spec(), state)).transpose()?;
+        let policy = match &new {
+            Some(new) => &new.policy,
+            None => &held_policy(request.policy_id, held)?.policy,
+        };
+        trajectory.start(steps, env.spec(), env.obs(), env.critic_obs());
+        let sampler = ActionSampler::new(Arc::clone(policy), request.noise_seed, env.num_envs());
+        Ok(Self { sampler, step: 0, steps, policy: new })
+    }
+
+    /// Executes steps for [`SLICE`]. Returns true after the last one.
+    ///
+    /// An error after the first step is [`ErrorCode::RolloutFailed`].
+    pub fn advance(
+        &mut self,
+        env: &mut dyn VecEnv,
+        state: &ServerState,
+        trajectory: &mut Trajectory,
+    ) -> Result<bool, ErrorReply> {
+        let start = Instant::now();
+        while self.step < self.steps {
+            if state.shutting_down.load(Ordering::Acquire) {
+                return Err(shutting_down());
+            }
+            self.sampler.step(env, trajectory).map_err(|error| failed(self.step, self.steps, &error))?;
+            state.env_steps.fetch_add(env.num_envs() as u64, Ordering::Relaxed);
+            self.step += 1;
+            if start.elapsed() >= SLICE {
+                break;
+            }
+        }
+        Ok(self.step == self.steps)
+    }
 }
 
 /// Checks the number of steps, and that episodes are restarted by the environments.
@@ -68,7 +114,7 @@ fn check_steps(steps: u64, env: &dyn VecEnv, limit: usize) -> Result<usize, Erro
     Ok(steps as usize)
 }
 
-fn held_policy(id: Option<u64>, held: Option<&(u64, BehaviourPolicy)>) -> Result<&BehaviourPolicy, ErrorReply> {
+fn held_policy(id: Option<u64>, held: Option<&(u64, HeldPolicy)>) -> Result<&HeldPolicy, ErrorReply> {
     let Some(id) = id else {
         return Err(ErrorReply::new(
             ErrorCode::Malformed,
@@ -84,8 +130,46 @@ fn held_policy(id: Option<u64>, held: Option<&(u64, BehaviourPolicy)>) -> Result
 }
 
 /// Decodes a policy for the observations and actions of `spec`.
-fn read_policy(policy: &message::RolloutPolicy<'_>, spec: &EnvSpec) -> Result<BehaviourPolicy, ErrorReply> {
+fn read_policy(
+    policy: &message::RolloutPolicy<'_>,
+    spec: &EnvSpec,
+    state: &Arc<ServerState>,
+) -> Result<HeldPolicy, ErrorReply> {
     let sizes = read_sizes(&policy.sizes, spec)?;
+    let bytes = reserve(&sizes, state)?;
+    // From here on, the reservation ends with the value.
+    let held = |policy| HeldPolicy { policy: Arc::new(policy), state: Arc::clone(state), bytes };
+    let decoded = decode_policy(policy, &sizes, spec);
+    decoded.map(held).inspect_err(|_| {
+        state.policy_bytes.fetch_sub(bytes, Ordering::AcqRel);
+    })
+}
+
+/// Reserves the memory of a network: its parameters, and their arrangement for the forward pass, with padding. Returns the
+/// size [bytes].
+fn reserve(sizes: &[usize], state: &ServerState) -> Result<usize, ErrorReply> {
+    let reject = |message: String, hint: &str| {
+        Err(ErrorReply::new(ErrorCode::TooLarge, "policy.sizes", message).with_hint(hint))
+    };
+    let (sent, padded) = (Mlp::num_weights(sizes).unwrap_or(usize::MAX), Mlp::num_padded(sizes).unwrap_or(usize::MAX));
+    if padded > (2 * sent).max(MIN_PADDED) {
+        let message = format!("`policy.sizes` = {sizes:?} needs {padded} numbers in memory for {sent} that are sent");
+        return reject(message, "use hidden layers of 16 or more units");
+    }
+    let bytes = 2 * size_of::<f32>() * padded;
+    if state.policy_bytes.fetch_add(bytes, Ordering::AcqRel) + bytes > MAX_POLICY_BYTES {
+        state.policy_bytes.fetch_sub(bytes, Ordering::AcqRel);
+        let message = format!("the policies of all rollouts would need more than {MAX_POLICY_BYTES} bytes");
+        return reject(message, "close leases that hold a policy, or send a smaller one");
+    }
+    Ok(bytes)
+}
+
+fn decode_policy(
+    policy: &message::RolloutPolicy<'_>,
+    sizes: &[usize],
+    spec: &EnvSpec,
+) -> Result<BehaviourPolicy, ErrorReply> {
     let mean = read_finite(policy.mean, "policy.mean", spec.obs_len())?;
     let std = read_finite(policy.std, "policy.std", spec.obs_len())?;
     let log_std = read_finite(policy.log_std, "policy.log_std", spec.action_len())?;
@@ -99,9 +183,9 @@ fn read_policy(policy: &message::RolloutPolicy<'_>, spec: &EnvSpec) -> Result<Be
             format!("`policy.log_std` has {value}; allowed: −{MAX_LOG_STD} to {MAX_LOG_STD}"),
         );
     }
-    let expected = Mlp::num_weights(&sizes).unwrap_or(usize::MAX);
+    let expected = Mlp::num_weights(sizes).unwrap_or(usize::MAX);
     let weights = read_finite(policy.weights, "policy.weights", expected)?;
-    let actor = Mlp::from_weights(&sizes, &weights).expect("sizes and number of weights were checked");
+    let actor = Mlp::from_weights(sizes, &weights).expect("sizes and number of weights were checked");
     Ok(BehaviourPolicy::new(actor, Normaliser::from_mean_and_std(&mean, &std), log_std))
 }
 

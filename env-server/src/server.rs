@@ -1,7 +1,6 @@
 //! One run of a server: its Zenoh session, its lease manager and its shutdown.
 
 use std::collections::HashMap;
-use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
@@ -21,16 +20,20 @@ use crate::executor::{Executor, Mailbox, SendLock};
 use crate::frame_publisher::FramePublisher;
 use crate::lease_manager::{LeaseHandler, LeaseManager, ServerInfo};
 use crate::messages::ServerState;
+use crate::protection::check_protection;
+use crate::stop_listener::StopListener;
 use crate::{EnvFactory, EnvFactoryError, ServerConfig};
 
-/// Capacity of the mailboxes of `hello` and `lease` requests.
-const CONTROL_CAPACITY: usize = 1024;
+/// Size of the `hello` and of the `lease` requests that wait [bytes].
+const MAX_CONTROL_BYTES: usize = 64 << 10;
 /// Period at which leases are checked for expiry.
 const EXPIRY_PERIOD: Duration = Duration::from_millis(100);
 /// Time between the start of a shutdown and the end of the session, in which requests get `shutting_down`.
 const SHUTDOWN_GRACE: Duration = Duration::from_millis(200);
 /// Minimum size of a message that Zenoh accepts [bytes]. Up to it, an oversized request gets an error reply.
 const MIN_ZENOH_MESSAGE: usize = 4 << 20;
+/// The same for a robot, whose requests are small.
+const MIN_ROBOT_MESSAGE: usize = 64 << 10;
 
 /// A running server.
 pub struct Server {
@@ -40,6 +43,9 @@ pub struct Server {
     token: LivelinessToken,
     routes: Routes,
     executor: Executor,
+    control_executor: Executor,
+    /// Stops a robot beside Zenoh.
+    stop_listener: Option<StopListener>,
     /// Ends the expiry thread when it is dropped.
     running: Sender<()>,
     expiry: JoinHandle<()>,
@@ -87,6 +93,14 @@ pub enum ServerError {
         /// Error of Zenoh.
         reason: String,
     },
+    /// The stop channel of a robot cannot listen.
+    #[error("cannot listen for stops beside {endpoint}: {reason}")]
+    StopListener {
+        /// Zenoh's endpoint.
+        endpoint: String,
+        /// Error of the operating system, or of a certificate.
+        reason: String,
+    },
     /// The environments cannot be built.
     #[error(transparent)]
     Host(#[from] EnvFactoryError),
@@ -100,17 +114,25 @@ impl Server {
     pub fn start(config: &ServerConfig, factory: Arc<dyn EnvFactory>) -> Result<Self, ServerError> {
         // One environment provides the spec, and shows before the first lease that the factory works.
         let spec = factory.build(1, AutoresetMode::NextStep, None)?.spec().clone();
-        let max_request_bytes = max_request_bytes(config, &spec);
+        let is_robot = factory.real_time().is_some();
+        // A robot does not wait for its client, and moves while a client runs: each action is the client's.
+        let max_rollout_steps = if is_robot { 0 } else { config.max_rollout_steps };
+        let max_request_bytes = max_request_bytes(config.envs, max_rollout_steps, &spec);
         let sid = random_id();
-        let zenoh = zenoh_config(config, max_request_bytes)?;
-        if factory.real_time().is_some() {
+        let min_message = if is_robot { MIN_ROBOT_MESSAGE } else { MIN_ZENOH_MESSAGE };
+        let zenoh = zenoh_config(config, (4 * max_request_bytes).max(min_message))?;
+        if is_robot {
             check_protection(config, &zenoh)?;
         }
+        let protected = zenoh.clone();
         let session = twinstep_session::open(zenoh)
             .map_err(|error| ServerError::Open { listen: config.listen.clone(), reason: error.to_string() })?;
+        let stop_listener = if is_robot { Some(start_stop_listener(&session, &protected, &factory)?) } else { None };
         let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
         let executor = Executor::start(2 * cores.max(2)).map_err(ServerError::Thread)?;
-        let state = ServerState { max_rollout_steps: config.max_rollout_steps, ..ServerState::default() };
+        // Its threads are for requests that take no time: they do not wait for environments.
+        let control_executor = Executor::start(1).map_err(ServerError::Thread)?;
+        let state = ServerState { max_rollout_steps, ..ServerState::default() };
         let (routes, state) = (Routes::new(RwLock::new(HashMap::new())), Arc::new(state));
         let info = ServerInfo {
             name: config.name.clone(),
@@ -121,6 +143,7 @@ impl Server {
             max_request_bytes,
             lease_grace: config.lease_grace(),
             lease_idle: config.lease_idle_s.map(Duration::from_secs_f64),
+            stop_port: stop_listener.as_ref().map(StopListener::port),
         };
         let lease_manager = Arc::new(LeaseManager::new(
             info,
@@ -133,13 +156,13 @@ impl Server {
         watch_clients(&session, &sid, Arc::clone(&lease_manager))?;
         let send_lock = SendLock::default();
         let handler = || LeaseHandler(Arc::clone(&lease_manager));
-        let control = || Mailbox::new(&executor, Arc::clone(&send_lock), CONTROL_CAPACITY, handler());
+        let control = || Mailbox::new(&control_executor, "", Arc::clone(&send_lock), MAX_CONTROL_BYTES, handler());
         let dispatcher = Dispatcher {
             sid: sid.clone(),
             routes: Arc::clone(&routes),
             hello: control(),
             lease: control(),
-            refusals: refusals(&executor, Arc::clone(&send_lock)),
+            refusals: refusals(&control_executor, Arc::clone(&send_lock)),
             state: Arc::clone(&state),
             factory,
         };
@@ -157,7 +180,20 @@ impl Server {
             .declare_token(&key)
             .wait()
             .map_err(|error| ServerError::Declare { key, reason: error.to_string() })?;
-        Ok(Self { sid, session, queryable, token, routes, executor, running, expiry, state, lease_manager })
+        Ok(Self {
+            sid,
+            session,
+            queryable,
+            token,
+            routes,
+            executor,
+            control_executor,
+            stop_listener,
+            running,
+            expiry,
+            state,
+            lease_manager,
+        })
     }
 
     /// Returns the id of the server, which is new at each start.
@@ -197,16 +233,31 @@ impl Server {
         drop(self.running);
         let _ = self.expiry.join();
         self.executor.stop();
+        self.control_executor.stop();
+        if let Some(listener) = self.stop_listener {
+            listener.end();
+        }
         // The leases and the lease manager refer to each other.
         self.routes.write().unwrap_or_else(PoisonError::into_inner).clear();
         let _ = self.session.close().wait();
     }
 }
 
+/// Listens for stops beside Zenoh's endpoint.
+fn start_stop_listener(
+    session: &Session,
+    zenoh: &zenoh::Config,
+    factory: &Arc<dyn EnvFactory>,
+) -> Result<StopListener, ServerError> {
+    let endpoint = session.info().locators().wait().first().map(ToString::to_string).unwrap_or_default();
+    StopListener::start(&endpoint, zenoh, Arc::clone(factory))
+        .map_err(|error| ServerError::StopListener { endpoint, reason: error.to_string() })
+}
+
 /// Returns the maximum size of a request [bytes].
-fn max_request_bytes(config: &ServerConfig, spec: &EnvSpec) -> usize {
-    let rollout = if config.max_rollout_steps == 0 { 0 } else { convert::MAX_ROLLOUT_REQUEST_BYTES };
-    convert::max_request_bytes(config.envs, spec).max(rollout)
+fn max_request_bytes(envs: usize, max_rollout_steps: usize, spec: &EnvSpec) -> usize {
+    let rollout = if max_rollout_steps == 0 { 0 } else { convert::MAX_ROLLOUT_REQUEST_BYTES };
+    convert::max_request_bytes(envs, spec).max(rollout)
 }
 
 /// Starts a thread that releases expired leases until the sender is dropped.
@@ -238,7 +289,7 @@ fn watch_clients(session: &Session, sid: &str, lease_manager: Arc<LeaseManager>)
 }
 
 /// Returns the Zenoh configuration: the user's file, overridden by the settings that Twinstep requires.
-fn zenoh_config(config: &ServerConfig, max_request_bytes: usize) -> Result<zenoh::Config, ServerError> {
+fn zenoh_config(config: &ServerConfig, max_message: usize) -> Result<zenoh::Config, ServerError> {
     let mut zenoh = match &config.zenoh {
         Some(path) => zenoh::Config::from_file(path)
             .map_err(|error| ServerError::ZenohConfig { path: path.clone(), reason: error.to_string() })?,
@@ -247,8 +298,8 @@ fn zenoh_config(config: &ServerConfig, max_request_bytes: usize) -> Result<zenoh
     check_users(config, &zenoh)?;
     let listen = serde_json::json!([config.listen]).to_string();
     let connect = serde_json::json!(config.connect).to_string();
-    let max_message = (4 * max_request_bytes).max(MIN_ZENOH_MESSAGE).to_string();
-    let settings: [(&'static str, &str, &str); 11] = [
+    let max_message = max_message.to_string();
+    let settings: [(&'static str, &str, &str); 13] = [
         ("listen", "listen/endpoints", &listen),
         ("connect", "connect/endpoints", &connect),
         ("zenoh", "mode", "\"peer\""),
@@ -262,6 +313,9 @@ fn zenoh_config(config: &ServerConfig, max_request_bytes: usize) -> Result<zenoh
         ("zenoh", "transport/link/rx/buffer_size", "2097152"),
         // Zenoh would collect messages of up to 1 GiB.
         ("envs", "transport/link/rx/max_message_size", &max_message),
+        // A connection that says nothing is closed after 1 s, and a hundred of them keep nobody out.
+        ("zenoh", "transport/unicast/accept_timeout", "1000"),
+        ("zenoh", "transport/unicast/accept_pending", "1000"),
         // A client that does not read loses its link after 2 s instead of Zenoh's 5 s [µs].
         ("zenoh", "transport/link/tx/queue/congestion_control/block/wait_before_close", "2000000"),
         // The connection to a restarted router is restored within 1 s instead of Zenoh's 4 s.
@@ -276,33 +330,6 @@ fn zenoh_config(config: &ServerConfig, max_request_bytes: usize) -> Result<zenoh
         })?;
     }
     Ok(zenoh)
-}
-
-/// Checks that only this machine, or somebody with a password or a certificate, can command a robot.
-fn check_protection(config: &ServerConfig, zenoh: &zenoh::Config) -> Result<(), ServerError> {
-    let setting = |key: &str| zenoh.get_json(key).unwrap_or_default();
-    let has_users = !matches!(setting("transport/auth/usrpwd/dictionary_file").as_str(), "" | "null");
-    let has_certificates = setting("transport/link/tls/enable_mtls") == "true";
-    let is_loopback = |endpoint: &str| {
-        let address = endpoint.split_once('/').map_or(endpoint, |(_, address)| address);
-        let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
-        host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
-    };
-    let endpoints = [("listen", vec![&config.listen]), ("connect", config.connect.iter().collect())];
-    let exposed = endpoints.iter().find_map(|(field, endpoints)| {
-        endpoints.iter().find(|endpoint| !is_loopback(endpoint)).map(|endpoint| (*field, (*endpoint).clone()))
-    });
-    match exposed {
-        Some((field, value)) if !has_users && !has_certificates => Err(ServerError::Setting {
-            field,
-            value,
-            reason:
-                "everybody in this network could move the robot: use a loopback address, or set users and passwords \
-                     or TLS with client certificates in a Zenoh file (`--zenoh`, examples/security)"
-                    .to_owned(),
-        }),
-        _ => Ok(()),
-    }
 }
 
 /// Checks that a dictionary file of users, if configured, is not empty. Zenoh would accept every client.

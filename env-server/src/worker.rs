@@ -11,7 +11,6 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use twinstep_model::{AgentCommands, BackendError, EnvError, Trajectory, VecEnv};
-use twinstep_policy::BehaviourPolicy;
 use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, convert, decode, encode, message, tensor};
 use zenoh::bytes::ZBytes;
@@ -19,9 +18,9 @@ use zenoh::query::Query;
 
 use crate::EnvFactory;
 use crate::dispatch::shutting_down;
-use crate::executor::{Handler, panic_text};
+use crate::executor::{Handled, Handler, panic_text};
 use crate::messages::{LeaseParams, Reply, RequestKind, ServerState};
-use crate::rollout;
+use crate::rollout::{HeldPolicy, Rollout};
 
 /// Releases the lease of a worker, for the given reason.
 pub type Release = Box<dyn Fn(&str) + Send>;
@@ -44,19 +43,21 @@ pub struct Worker {
     hasher: RandomState,
     actions: Vec<f32>,
     /// Policy of the last rollout that sent one, with its sequence number.
-    policy: Option<(u64, BehaviourPolicy)>,
+    policy: Option<(u64, HeldPolicy)>,
+    /// Rollout in execution; its request is the first in the mailbox.
+    rollout: Option<Rollout>,
     trajectory: Trajectory,
     /// Reason why the environments cannot be used any more; `None` while they can.
     failure: Option<String>,
 }
 
 impl Handler for Worker {
-    fn handle(&mut self, kind: RequestKind, query: &Query) -> Option<Reply> {
+    fn handle(&mut self, kind: &RequestKind, query: &Query) -> Handled {
         self.build();
         match kind {
-            RequestKind::Env(verb) => Some(self.answer(verb, query)),
-            RequestKind::Granted { epoch } => Some(self.transfer(epoch)),
-            RequestKind::Hello | RequestKind::Lease | RequestKind::Answered(_) => None,
+            RequestKind::Env(verb) => self.answer(*verb, query).map_or(Handled::Unfinished, Handled::Reply),
+            RequestKind::Granted { epoch } => Handled::Reply(self.transfer(*epoch)),
+            RequestKind::Hello | RequestKind::Lease | RequestKind::Answered(_) => Handled::Forwarded,
         }
     }
 }
@@ -77,6 +78,7 @@ impl Worker {
             hasher: RandomState::new(),
             actions: Vec::new(),
             policy: None,
+            rollout: None,
             trajectory: Trajectory::default(),
             failure: None,
         }
@@ -131,39 +133,24 @@ impl Worker {
         self.env.as_deref_mut().expect("a worker without environments has a failure")
     }
 
-    fn answer(&mut self, verb: EnvMethod, query: &Query) -> Reply {
+    /// Returns the reply to a request, or `None` if it is not executed completely.
+    fn answer(&mut self, verb: EnvMethod, query: &Query) -> Option<Reply> {
         let payload = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
-        if verb == EnvMethod::Render {
-            return self.render(&payload).into();
+        if self.rollout.is_none()
+            && let Some(reply) = self.answer_without_executing(verb, &payload)
+        {
+            return Some(reply);
         }
-        if verb == EnvMethod::Samples {
-            return self.samples(&payload).into();
-        }
-        let header = match decode::<message::RequestHeader>(&payload) {
-            Ok(header) => header,
-            Err(error) => return Reply::Err(error),
-        };
-        if let Err(error) = self.check_header(&header) {
-            return Reply::Err(error);
-        }
-        if header.seq == self.last_seq {
-            let is_repeat = self.last_request.is_none_or(|last| last == self.hasher.hash_one(&*payload));
-            return match &self.last_reply {
-                Some((answered, answer)) if *answered == verb && is_repeat => answer.clone(),
-                _ => Reply::Err(stale_sequence(header.seq, self.last_seq)),
-            };
-        }
-        if self.state.shutting_down.load(Ordering::Acquire) {
-            return Reply::Err(shutting_down());
-        }
-        if let Some(reason) = self.failure.as_ref().filter(|_| verb != EnvMethod::Close) {
-            return Reply::Err(lost_environments(reason));
-        }
+        let seq = self.last_seq + 1;
         let outcome = catch_unwind(AssertUnwindSafe(|| self.execute(verb, &payload)));
         let answer = match outcome {
-            Ok(Ok(bytes)) => Reply::Ok(ZBytes::from(bytes)),
+            Ok(Ok(Some(bytes))) => Reply::Ok(ZBytes::from(bytes)),
+            Ok(Ok(None)) => return None,
             // Rejected without effect: the number is not consumed.
-            Ok(Err(error)) if !error.code.consumes_seq() => return Reply::Err(error),
+            Ok(Err(error)) if !error.code.consumes_seq() => {
+                self.rollout = None;
+                return Some(Reply::Err(error));
+            }
             Ok(Err(error)) => Reply::Err(error),
             Err(panic) => {
                 let reason = panic_text(&panic);
@@ -172,10 +159,40 @@ impl Worker {
                 Reply::Err(lost_environments(&reason))
             }
         };
-        self.last_seq = header.seq;
+        self.rollout = None;
+        self.last_seq = seq;
         self.last_reply = Some((verb, answer.clone()));
         self.last_request = Some(self.hasher.hash_one(&*payload));
-        answer
+        Some(answer)
+    }
+
+    /// Answers a request that only reads, is refused or repeated. Returns `None` for one that has to be executed.
+    fn answer_without_executing(&mut self, verb: EnvMethod, payload: &[u8]) -> Option<Reply> {
+        if verb == EnvMethod::Render {
+            return Some(self.render(payload).into());
+        }
+        if verb == EnvMethod::Samples {
+            return Some(self.samples(payload).into());
+        }
+        let header = match decode::<message::RequestHeader>(payload) {
+            Ok(header) => header,
+            Err(error) => return Some(Reply::Err(error)),
+        };
+        if let Err(error) = self.check_header(&header) {
+            return Some(Reply::Err(error));
+        }
+        if header.seq == self.last_seq {
+            let is_repeat = self.last_request.is_none_or(|last| last == self.hasher.hash_one(payload));
+            return Some(match &self.last_reply {
+                Some((answered, answer)) if *answered == verb && is_repeat => answer.clone(),
+                _ => Reply::Err(stale_sequence(header.seq, self.last_seq)),
+            });
+        }
+        if self.state.shutting_down.load(Ordering::Acquire) {
+            return Some(Reply::Err(shutting_down()));
+        }
+        let failure = self.failure.as_ref().filter(|_| verb != EnvMethod::Close);
+        failure.map(|reason| Reply::Err(lost_environments(reason)))
     }
 
     fn check_header(&self, header: &message::RequestHeader) -> Result<(), ErrorReply> {
@@ -229,7 +246,33 @@ impl Worker {
         scene.map(convert::encode_scene).map_err(|error| convert::wire_error(&error))
     }
 
-    fn execute(&mut self, verb: EnvMethod, payload: &[u8]) -> Result<Vec<u8>, ErrorReply> {
+    /// Executes a request, or a slice of it. Returns `None` if more is left.
+    fn execute(&mut self, verb: EnvMethod, payload: &[u8]) -> Result<Option<Vec<u8>>, ErrorReply> {
+        if verb == EnvMethod::Rollout {
+            self.advance_rollout(payload)
+        } else {
+            self.execute_at_once(verb, payload).map(Some)
+        }
+    }
+
+    fn advance_rollout(&mut self, payload: &[u8]) -> Result<Option<Vec<u8>>, ErrorReply> {
+        let Self { env, policy, rollout, trajectory, state, params, last_seq, .. } = self;
+        let env = env.as_deref_mut().expect("a worker without environments has a failure");
+        if rollout.is_none() {
+            *rollout = Some(Rollout::start(&decode(payload)?, policy.as_ref(), env, state, trajectory)?);
+        }
+        let running = rollout.as_mut().expect("it was started");
+        if !running.advance(env, state, trajectory)? {
+            return Ok(None);
+        }
+        let seq = *last_seq + 1;
+        if let Some(new) = running.policy.take() {
+            *policy = Some((seq, new));
+        }
+        Ok(Some(convert::encode_trajectory(trajectory, seq, params.critic)))
+    }
+
+    fn execute_at_once(&mut self, verb: EnvMethod, payload: &[u8]) -> Result<Vec<u8>, ErrorReply> {
         match verb {
             EnvMethod::Reset => {
                 let request: message::ResetRequest<'_> = decode(payload)?;
@@ -253,15 +296,6 @@ impl Worker {
                 self.state.env_steps.fetch_add(batch.reward.len() as u64, Ordering::Relaxed);
                 Ok(convert::encode_step(batch, request.seq, self.params.critic))
             }
-            EnvMethod::Rollout => {
-                let request: message::RolloutRequest<'_> = decode(payload)?;
-                let Self { env, policy, trajectory, state, params, .. } = self;
-                let env = env.as_deref_mut().expect("a worker without environments has a failure");
-                if let Some(new) = rollout::run(&request, policy.as_ref(), env, state, trajectory)? {
-                    *policy = Some((request.seq, new));
-                }
-                Ok(convert::encode_trajectory(trajectory, request.seq, params.critic))
-            }
             EnvMethod::Close => {
                 let request: message::CloseRequest = decode(payload)?;
                 self.failure = Some("the client closed the lease".to_owned());
@@ -270,6 +304,7 @@ impl Worker {
             }
             EnvMethod::Render => self.render(payload),
             EnvMethod::Samples => self.samples(payload),
+            EnvMethod::Rollout => unreachable!("a rollout is executed in slices"),
         }
     }
 }

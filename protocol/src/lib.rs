@@ -6,6 +6,7 @@
 //! - [`ErrorReply`] and [`ErrorCode`]: error replies.
 //! - [`Secret`]: what a client attaches to its requests, so that no other client can use its environments.
 //! - [`encode`] and [`decode`]: messages to and from bytes. An unsupported protocol version is an error of its own.
+//! - [`stop_channel`]: how a robot is stopped beside Zenoh.
 //! - [`convert`]: conversions between messages and the types of `twinstep-model`.
 
 mod codec;
@@ -14,6 +15,7 @@ mod error;
 pub mod keys;
 pub mod message;
 mod random;
+pub mod stop_channel;
 pub mod tensor;
 mod version;
 

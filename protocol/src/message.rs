@@ -50,6 +50,9 @@ pub struct HelloReply {
     /// Maximum number of steps of a rollout. Default: 0, a server without rollouts.
     #[serde(default)]
     pub max_rollout_steps: u64,
+    /// Memory for the policies of all rollouts [bytes]. Default: 0, not stated.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub max_policy_bytes: u64,
     /// What differs from a simulation; absent if the server simulates.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub real_time: Option<RealTime>,
@@ -64,6 +67,14 @@ pub struct RealTime {
     pub absent_ends: Vec<String>,
     /// State of the robot, such as `observe` or `ready`.
     pub state: String,
+    /// Port of the stop listener, which waits for no other request. Absent if there is none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stop_port: Option<u16>,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+fn is_zero(value: &u64) -> bool {
+    *value == 0
 }
 
 /// Requests a lease of environments.

@@ -53,10 +53,9 @@ fn clients_that_read_no_replies_do_not_delay_the_steps_of_others() {
         let request = encode(&HelloRequest { protocol: PROTOCOL, client: String::new() });
         // Most are answered, some are refused.
         let keys = [keys::hello(&bystander.sid), format!("twinstep/{}/nothing", bystander.sid)];
-        let unread: Vec<_> =
-            (0..UNREAD_REQUESTS * SILENT_CLIENTS)
-                .map(|index| silent[index % SILENT_CLIENTS].1.send(&keys[usize::from(index % 10 == 9)], &request))
-                .collect();
+        let unread: Vec<_> = (0..UNREAD_REQUESTS * SILENT_CLIENTS)
+            .map(|index| silent[index % SILENT_CLIENTS].1.send(&keys[usize::from(index % 10 == 9)], &request))
+            .collect();
         sleep(AFTERWARDS);
         is_finished.store(true, Ordering::Relaxed);
         drop(unread);

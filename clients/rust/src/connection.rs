@@ -1,5 +1,6 @@
 //! Connection to one server: requests with retries, reasons of timeouts.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -14,6 +15,7 @@ use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 use zenoh::{Session, Wait};
 
 use crate::discovery::{choose_server, visible_servers};
+use crate::stop_channel::stop_robot;
 use crate::{ClientError, ConnectOptions, session};
 
 /// Timeout of one query, after which it is repeated.
@@ -43,6 +45,10 @@ pub struct Connection {
     max_rollout_steps: u64,
     /// True if the server fronts a robot, from `hello`.
     is_real_time: bool,
+    /// Port of the robot's stop channel, from `hello`.
+    stop_port: Option<u16>,
+    /// Zenoh configuration file.
+    zenoh: Option<PathBuf>,
     /// Set by the user to end the wait for a robot that is not ready.
     interrupted: Arc<AtomicBool>,
     /// Key of frequent requests.
@@ -96,6 +102,8 @@ impl Connection {
             max_request_bytes: usize::MAX,
             max_rollout_steps: 0,
             is_real_time: false,
+            stop_port: None,
+            zenoh: options.zenoh.clone(),
             interrupted: Arc::clone(&options.interrupted),
             declared: None,
             _token: token,
@@ -104,11 +112,15 @@ impl Connection {
         this.max_request_bytes = usize::try_from(hello.max_request_bytes).unwrap_or(usize::MAX);
         this.max_rollout_steps = hello.max_rollout_steps;
         this.is_real_time = hello.real_time.is_some();
+        this.stop_port = hello.real_time.and_then(|real_time| real_time.stop_port);
         Ok(this)
     }
 
-    /// Damps the motors of the robot at once, whoever controls it.
+    /// Damps the motors of the robot at once, whoever controls it: over its stop channel, or over Zenoh if that fails.
     pub fn stop_robot(&self) -> Result<(), ClientError> {
+        if self.stop_port.is_some() && stop_robot(&self.endpoint, self.stop_port, self.zenoh.as_deref()).is_ok() {
+            return Ok(());
+        }
         self.request(&keys::stop(&self.sid), encode(&message::StopRequest { protocol: PROTOCOL })).map(drop)
     }
 

@@ -39,6 +39,7 @@ mod server_process;
 mod session;
 mod shard;
 mod sharded_env;
+mod stop_channel;
 
 pub use connection::Connection;
 pub use discovery::{Discovery, ServerInfo};
@@ -50,4 +51,5 @@ pub use remote_env::{LeaseHandle, RemoteVecEnv};
 pub use robot_watch::{FrameSubscription, RobotWatch};
 pub use server_process::ServerProcess;
 pub use sharded_env::ShardedVecEnv;
+pub use stop_channel::stop_robot;
 pub use twinstep_protocol::Secret;

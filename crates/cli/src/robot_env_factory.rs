@@ -42,6 +42,7 @@ impl EnvFactory for RobotEnvFactory {
             absent_reward_terms: NEED_GROUND_TRUTH.map(str::to_owned).to_vec(),
             absent_ends: vec!["min_base_height_m".to_owned()],
             state: state.map_or_else(|| "starting".to_owned(), |state| state.to_string()),
+            stop_port: None,
         })
     }
 

@@ -1,5 +1,6 @@
 //! The policy that collects transitions: a normal distribution of actions around the output of a network.
 
+use std::borrow::Borrow;
 use std::hash::{DefaultHasher, Hasher};
 use std::sync::OnceLock;
 
@@ -32,7 +33,7 @@ impl BehaviourPolicy {
     /// Panics if the sizes do not fit each other.
     pub fn new(actor: Mlp, normaliser: Normaliser, log_std: Vec<f32>) -> Self {
         assert_eq!((actor.inputs(), actor.outputs()), (normaliser.len(), log_std.len()), "sizes of the policy");
-        Self { network: Network::new(&actor), actor, normaliser, log_std, sent: OnceLock::new() }
+        Self { network: Network::forward_only(&actor), actor, normaliser, log_std, sent: OnceLock::new() }
     }
 
     /// Returns a hash of everything that decides on the actions, the same within this process.
@@ -78,24 +79,25 @@ impl BehaviourPolicy {
     }
 }
 
-/// Samples the actions of consecutive steps.
-pub struct ActionSampler<'a> {
-    policy: &'a BehaviourPolicy,
+/// Samples the actions of consecutive steps, with a policy that it borrows or shares.
+pub struct ActionSampler<P> {
+    policy: P,
     random: Vec<Stream>,
     activations: Activations,
     std: Vec<f32>,
     noise: Vec<f32>,
 }
 
-impl<'a> ActionSampler<'a> {
+impl<P: Borrow<BehaviourPolicy>> ActionSampler<P> {
     /// Starts the noise of `num_envs` environments. That of environment `i` is a function of `noise_seed + i` alone.
-    pub fn new(policy: &'a BehaviourPolicy, noise_seed: u64, num_envs: usize) -> Self {
+    pub fn new(policy: P, noise_seed: u64, num_envs: usize) -> Self {
+        let BehaviourPolicy { actor, log_std, .. } = policy.borrow();
         let seeds = (0..num_envs as u64).map(|env| noise_seed.wrapping_add(env));
         Self {
             random: seeds.map(|seed| stream(seed, "action", 0)).collect(),
-            activations: Activations::new(&policy.actor, BLOCK),
-            std: policy.log_std.iter().map(|log_std| log_std.exp()).collect(),
-            noise: vec![0.0; policy.log_std.len()],
+            activations: Activations::forward_only(actor, BLOCK),
+            std: log_std.iter().map(|log_std| log_std.exp()).collect(),
+            noise: vec![0.0; log_std.len()],
             policy,
         }
     }
@@ -105,7 +107,7 @@ impl<'a> ActionSampler<'a> {
     /// If it fails, the trajectory is that before the step.
     pub fn step(&mut self, env: &mut dyn VecEnv, trajectory: &mut Trajectory) -> Result<(), EnvError> {
         let (step, num_envs, action_len) = (trajectory.steps, trajectory.num_envs, self.noise.len());
-        let obs_len = self.policy.normaliser.len();
+        let obs_len = self.policy.borrow().normaliser.len();
         let obs = &trajectory.obs[step * num_envs * obs_len..][..num_envs * obs_len];
         let actions = &mut trajectory.actions[step * num_envs * action_len..][..num_envs * action_len];
         let log_prob = &mut trajectory.log_prob[step * num_envs..][..num_envs];
@@ -117,6 +119,7 @@ impl<'a> ActionSampler<'a> {
 
     fn sample(&mut self, obs: &[f32], actions: &mut [f32], log_prob: &mut [f32]) {
         let Self { policy, random, activations, std, noise } = self;
+        let policy: &BehaviourPolicy = (*policy).borrow();
         let (obs_len, action_len) = (policy.normaliser.len(), noise.len());
         let blocks = obs.chunks(BLOCK * obs_len).zip(actions.chunks_mut(BLOCK * action_len));
         let blocks = blocks.zip(log_prob.chunks_mut(BLOCK)).zip(random.chunks_mut(BLOCK));

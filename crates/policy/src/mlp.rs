@@ -144,6 +144,17 @@ impl Mlp {
         sizes.windows(2).try_fold(0usize, |sum, pair| sum.checked_add(pair[0].checked_add(1)?.checked_mul(pair[1])?))
     }
 
+    /// Returns the number of parameters of a network of these sizes with their padding, which is what it keeps in memory.
+    /// Returns `None` if a size is zero, or the number overflows.
+    pub fn num_padded(sizes: &[usize]) -> Option<usize> {
+        Self::num_weights(sizes)?;
+        let padded = |size: &usize, step: usize| size.checked_next_multiple_of(step);
+        sizes.windows(2).enumerate().try_fold(0usize, |sum, (index, pair)| {
+            let rows = padded(&pair[0], if index == 0 { ROW_STEP } else { COLUMN_STEP })?;
+            sum.checked_add(rows.checked_add(1)?.checked_mul(padded(&pair[1], COLUMN_STEP)?)?)
+        })
+    }
+
     /// Sets weight (inputs × outputs, row-major) and bias of layer `index`.
     pub fn set_layer(&mut self, index: usize, weight: &[f32], bias: &[f32]) {
         let layer = self.layers()[index];
@@ -210,6 +221,9 @@ mod tests {
         assert_eq!(Mlp::from_weights(&[3, 5, 2], &weights), Some(network));
         for sizes in [&[3, 5, 3][..], &[37], &[0, 37], &[usize::MAX, usize::MAX]] {
             assert_eq!(Mlp::from_weights(sizes, &weights), None, "{sizes:?}");
+        }
+        for sizes in [&[3, 5, 2][..], &[45, 1, 700, 1, 12]] {
+            assert_eq!(Mlp::num_padded(sizes), Some(Mlp::zeros(sizes).parameters.len()), "{sizes:?}");
         }
     }
 

@@ -40,13 +40,21 @@ pub struct Activations {
 impl Activations {
     /// Allocates the activations of `rows` rows of `network`. The number is rounded up.
     pub fn new(network: &Mlp, rows: usize) -> Self {
+        let mut activations = Self::forward_only(network, rows);
+        let rows = activations.rows;
+        activations.gradients = activations.strides[1..].iter().map(|stride| vec![0.0; rows * stride]).collect();
+        activations
+    }
+
+    /// Allocates activations without gradients, for [`Network::forward`] alone.
+    pub fn forward_only(network: &Mlp, rows: usize) -> Self {
         let (layers, rows) = (network.layers(), rows.next_multiple_of(ROW_STEP));
         let strides: Vec<usize> =
             std::iter::once(layers[0].rows).chain(layers.iter().map(|layer| layer.columns)).collect();
         Self {
             rows,
             values: strides.iter().map(|stride| vec![0.0; rows * stride]).collect(),
-            gradients: strides[1..].iter().map(|stride| vec![0.0; rows * stride]).collect(),
+            gradients: Vec::new(),
             strides,
         }
     }
@@ -82,11 +90,20 @@ impl Network {
         Self::with_instructions(network, InstructionSet::best())
     }
 
+    /// Arranges the weights of `network` for [`Network::forward`] alone, in half of the memory.
+    pub fn forward_only(network: &Mlp) -> Self {
+        Self::arranged(network, InstructionSet::best(), false)
+    }
+
     /// Arranges the weights of `network` for an instruction set.
     pub fn with_instructions(network: &Mlp, instructions: InstructionSet) -> Self {
+        Self::arranged(network, instructions, true)
+    }
+
+    fn arranged(network: &Mlp, instructions: InstructionSet, has_backward: bool) -> Self {
         let layer = |layout: LayerLayout| PackedLayer {
             weight: vec![0.0; layout.weight().len()],
-            transposed: vec![0.0; layout.weight().len()],
+            transposed: vec![0.0; if has_backward { layout.weight().len() } else { 0 }],
             bias: vec![0.0; layout.columns],
             layout,
         };
@@ -103,7 +120,7 @@ impl Network {
             pack(weight, rows, columns, &mut layer.weight);
             layer.bias.copy_from_slice(&network.parameters[layer.layout.bias()]);
             // The gradient with respect to the inputs of the first layer is not needed.
-            if index > 0 {
+            if index > 0 && !layer.transposed.is_empty() {
                 let mut transposed = vec![0.0; weight.len()];
                 for (row, entries) in weight.chunks_exact(columns).enumerate() {
                     for (column, entry) in entries.iter().enumerate() {

@@ -94,7 +94,8 @@ proptest! {
         let hello = HelloReply {
             protocol: PROTOCOL, protocols, server_version: name.clone(), server_id: name.clone(), spec_hash: spec.hash(),
             spec: spec.clone(), max_envs, free_envs, lease_grace_s, max_envs_per_client: max_envs, max_request_bytes: free_envs,
-            lease_idle_s: Some(lease_grace_s), env_steps, max_rollout_steps: env_steps, name: name.clone(),
+            lease_idle_s: Some(lease_grace_s), env_steps, max_rollout_steps: env_steps, max_policy_bytes: max_envs,
+            name: name.clone(),
             real_time: Some(RealTime { absent_reward_terms: vec![name.clone()], state: name.clone(), ..RealTime::default() }),
         };
         round_trips(&hello, &mut Vec::new());

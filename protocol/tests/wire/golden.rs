@@ -141,6 +141,7 @@ fn hello_has_its_golden_bytes() {
         lease_idle_s: Some(600.0),
         env_steps: 1_000_000_007,
         max_rollout_steps: 128,
+        max_policy_bytes: 268_435_456,
         real_time: None,
     };
     check("hello_reply", &reply);
@@ -148,6 +149,7 @@ fn hello_has_its_golden_bytes() {
         absent_reward_terms: vec!["tracking".to_owned()],
         absent_ends: vec!["base_height".to_owned()],
         state: "ready".to_owned(),
+        stop_port: Some(7448),
     };
     check("hello_reply_real_time", &HelloReply { max_envs: 1, real_time: Some(real_time), ..reply });
 }

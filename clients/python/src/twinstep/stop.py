@@ -1,6 +1,7 @@
 """Stop of a robot, by anyone who sees it."""
 
 from .connection import Connection
+from .stop_channel import stop_over_channel
 
 
 def stop_robot(
@@ -12,7 +13,8 @@ def stop_robot(
 ) -> None:
     """Damp the motors of a robot at once, whoever controls it.
 
-    It needs no environment and passes every queue. The robot lies down, and its operator arms it again. A server that
+    It needs no environment and passes every queue: the stop goes over a connection of its own, and over Zenoh if that
+    does not confirm it. The robot lies down, and its operator arms it again. A server that
     simulates raises :class:`~twinstep.RequestRejectedError`.
 
     Parameters
@@ -26,6 +28,12 @@ def stop_robot(
     timeout_s
         Timeout of connecting, and of the reply [s].
     """
+    try:
+        stop_over_channel(endpoint, zenoh_config)
+    except OSError:
+        pass
+    else:
+        return
     connection = Connection(endpoint, robot=robot, zenoh_config=zenoh_config, server=None, connect_timeout_s=timeout_s)
     try:
         connection.request("stop", {}, timeout_s, "timeout_s")

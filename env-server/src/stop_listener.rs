@@ -1,0 +1,186 @@
+//! Stops a robot over a connection of its own, beside Zenoh: a stop waits for no other request and for no link of a client.
+//!
+//! Each connection has a thread for at most a second. Of too many, the oldest is closed: those who connect and say nothing
+//! keep nobody out.
+
+use std::collections::{HashMap, VecDeque};
+use std::io::{Read, Result, Write};
+use std::net::{IpAddr, Shutdown, SocketAddr, TcpListener, TcpStream};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::server::WebPkiClientVerifier;
+use rustls::{RootCertStore, ServerConfig, ServerConnection, StreamOwned};
+use twinstep_protocol::stop_channel::{Greeting, REFUSED, STOPPED, is_valid, rest_of_answer};
+
+use crate::EnvFactory;
+
+/// Time after which a connection is closed that says nothing.
+const TIMEOUT: Duration = Duration::from_secs(1);
+/// Maximum number of connections.
+const MAX_CONNECTIONS: usize = 64;
+
+/// Who may stop the robot.
+struct Access {
+    /// Password of each user; `None` if everybody who connects may.
+    users: Option<HashMap<String, String>>,
+    tls: Option<Arc<ServerConfig>>,
+}
+
+/// A listening stop channel.
+pub struct StopListener {
+    address: SocketAddr,
+    is_stopping: Arc<AtomicBool>,
+    thread: JoinHandle<()>,
+}
+
+impl StopListener {
+    /// Listens at the port after that of Zenoh's `endpoint`, or at a free one, with the users and certificates of `zenoh`.
+    pub fn start(endpoint: &str, zenoh: &zenoh::Config, factory: Arc<dyn EnvFactory>) -> Result<Self> {
+        let (protocol, address) = endpoint.split_once('/').unwrap_or(("tcp", endpoint));
+        let (host, port) = address.rsplit_once(':').unwrap_or((address, "0"));
+        let host: IpAddr = match host.trim_matches(['[', ']']) {
+            "localhost" => IpAddr::from([127, 0, 0, 1]),
+            host => host.parse().map_err(failed)?,
+        };
+        let next = port.parse().ok().and_then(|port: u16| port.checked_add(1)).unwrap_or(0);
+        let listener = TcpListener::bind((host, next)).or_else(|_| TcpListener::bind((host, 0)))?;
+        let access = Arc::new(Access::new(protocol, zenoh)?);
+        let (address, is_stopping) = (listener.local_addr()?, Arc::new(AtomicBool::new(false)));
+        let stopping = Arc::clone(&is_stopping);
+        let thread = std::thread::Builder::new().name("stop-listener".to_owned());
+        let thread = thread.spawn(move || listen(&listener, &access, &factory, &stopping))?;
+        Ok(Self { address, is_stopping, thread })
+    }
+
+    /// Returns the port.
+    pub fn port(&self) -> u16 {
+        self.address.port()
+    }
+
+    /// Ends the thread.
+    pub fn end(self) {
+        self.is_stopping.store(true, Ordering::Release);
+        // Wakes it.
+        let host = if self.address.ip().is_unspecified() { IpAddr::from([127, 0, 0, 1]) } else { self.address.ip() };
+        if TcpStream::connect_timeout(&(host, self.address.port()).into(), TIMEOUT).is_ok() {
+            let _ = self.thread.join();
+        }
+    }
+}
+
+fn listen(listener: &TcpListener, access: &Arc<Access>, factory: &Arc<dyn EnvFactory>, is_stopping: &AtomicBool) {
+    let mut connections: VecDeque<(TcpStream, JoinHandle<()>)> = VecDeque::new();
+    for stream in listener.incoming() {
+        if is_stopping.load(Ordering::Acquire) {
+            return;
+        }
+        connections.retain(|(_, thread)| !thread.is_finished());
+        while connections.len() >= MAX_CONNECTIONS
+            && let Some((oldest, _)) = connections.pop_front()
+        {
+            let _ = oldest.shutdown(Shutdown::Both);
+        }
+        let Ok(stream) = stream else { continue };
+        let Ok(kept) = stream.try_clone() else { continue };
+        let (access, factory) = (Arc::clone(access), Arc::clone(factory));
+        let serve = move || {
+            if let Err(error) = serve(stream, &access, &factory) {
+                tracing::debug!(%error, "a connection of the stop channel ended");
+            }
+        };
+        match std::thread::Builder::new().name("stop".to_owned()).spawn(serve) {
+            Ok(thread) => connections.push_back((kept, thread)),
+            Err(error) => tracing::warn!(%error, "cannot start a thread of the stop channel"),
+        }
+    }
+}
+
+fn serve(stream: TcpStream, access: &Access, factory: &Arc<dyn EnvFactory>) -> Result<()> {
+    stream.set_read_timeout(Some(TIMEOUT))?;
+    stream.set_write_timeout(Some(TIMEOUT))?;
+    stream.set_nodelay(true)?;
+    match &access.tls {
+        Some(config) => {
+            let connection = ServerConnection::new(Arc::clone(config)).map_err(failed)?;
+            converse(&mut StreamOwned::new(connection, stream), access, factory)
+        }
+        None => converse(&mut &stream, access, factory),
+    }
+}
+
+fn converse(stream: &mut (impl Read + Write), access: &Access, factory: &Arc<dyn EnvFactory>) -> Result<()> {
+    let greeting = Greeting::random();
+    stream.write_all(&greeting.encode())?;
+    stream.flush()?;
+    let mut first = [0];
+    stream.read_exact(&mut first)?;
+    let Some(len) = rest_of_answer(first[0]) else { return stream.write_all(&[REFUSED]) };
+    let mut rest = vec![0; len];
+    stream.read_exact(&mut rest)?;
+    let password = |user: &str| match &access.users {
+        Some(users) => users.get(user).cloned(),
+        None => Some(String::new()),
+    };
+    // Without users every code is accepted: nobody else can connect.
+    let is_stopped = (access.users.is_none() || is_valid(greeting, &rest, password)) && factory.stop();
+    stream.write_all(&[if is_stopped { STOPPED } else { REFUSED }])?;
+    stream.flush()
+}
+
+impl Access {
+    fn new(protocol: &str, zenoh: &zenoh::Config) -> Result<Self> {
+        let setting = |key: &str| {
+            let json = zenoh.get_json(key).unwrap_or_default();
+            serde_json::from_str::<Option<String>>(&json).ok().flatten().filter(|text| !text.is_empty())
+        };
+        let users = setting("transport/auth/usrpwd/dictionary_file").map(read_users).transpose()?;
+        let is_encrypted = matches!(protocol, "tls" | "quic");
+        let needs_certificate = zenoh.get_json("transport/link/tls/enable_mtls").is_ok_and(|value| value == "true");
+        let tls =
+            is_encrypted.then(|| tls_config(&|key| setting(&format!("transport/link/tls/{key}")), needs_certificate));
+        Ok(Self { users, tls: tls.transpose()? })
+    }
+}
+
+/// Reads lines `user:password`.
+fn read_users(path: String) -> Result<HashMap<String, String>> {
+    let text = std::fs::read_to_string(path)?;
+    let users = text.lines().filter_map(|line| line.trim().split_once(':'));
+    Ok(users.map(|(user, password)| (user.to_owned(), password.to_owned())).collect())
+}
+
+/// Returns the TLS settings of Zenoh's listener.
+fn tls_config(setting: &dyn Fn(&str) -> Option<String>, needs_certificate: bool) -> Result<Arc<ServerConfig>> {
+    let file = |key: &str| setting(key).ok_or_else(|| failed(format!("`transport/link/tls/{key}` is not set")));
+    let certificates = |path: &Path| {
+        let read = CertificateDer::pem_file_iter(path).map_err(failed)?;
+        read.collect::<std::result::Result<Vec<_>, _>>().map_err(failed)
+    };
+    let own = certificates(file("listen_certificate")?.as_ref())?;
+    let key = PrivateKeyDer::from_pem_file(file("listen_private_key")?).map_err(failed)?;
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let builder = ServerConfig::builder_with_provider(Arc::clone(&provider));
+    let builder = builder.with_safe_default_protocol_versions().map_err(failed)?;
+    let builder = if needs_certificate {
+        let mut roots = RootCertStore::empty();
+        for root in certificates(file("root_ca_certificate")?.as_ref())? {
+            roots.add(root).map_err(failed)?;
+        }
+        let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
+        builder.with_client_cert_verifier(verifier.map_err(failed)?)
+    } else {
+        builder.with_no_client_auth()
+    };
+    builder.with_single_cert(own, key).map(Arc::new).map_err(failed)
+}
+
+/// Returns an error of TLS, of a file or of the other side.
+fn failed(cause: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> std::io::Error {
+    std::io::Error::other(cause)
+}
