@@ -48,11 +48,11 @@ pub fn write(
     // Only one key: the order of several would be random, and equal ensembles would have different files.
     let metadata = HashMap::from([(key.to_owned(), header)]);
     let content = serialize(views, Some(metadata)).expect("the names are unique");
-    let mut temporary = path.as_os_str().to_owned();
-    temporary.push(".part");
-    std::fs::write(&temporary, content)
-        .and_then(|()| std::fs::rename(&temporary, path))
-        .map_err(|cause| EnsembleError::File { verb: "write", path: path.to_owned(), cause })
+    twinstep_files::write(path, content).map_err(|cause| EnsembleError::File {
+        verb: "write",
+        path: path.to_owned(),
+        cause,
+    })
 }
 
 /// The content of a file.

@@ -5,31 +5,32 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Crate folders and the workspace crates that each may use. Leaf crates use only the core; applications combine them.
-const MAY_USE: [(&str, &[&str]); 26] = [
+const MAY_USE: [(&str, &[&str]); 27] = [
     // Core.
+    ("crates/files", &[]),
     ("crates/simd", &[]),
     ("crates/model", &["simd"]),
     ("crates/effects", &["model"]),
     ("crates/unitree", &["model"]),
-    ("crates/logs", &["model", "effects", "unitree"]),
+    ("crates/logs", &["files", "model", "effects", "unitree"]),
     ("protocol", &["model"]),
     // Leaf crates.
     ("crates/sim", &["simd", "model"]),
     ("crates/envs", &["model", "effects"]),
     ("crates/identify", &["model", "effects", "logs"]),
     ("crates/diagnose", &["model", "effects", "logs", "identify"]),
-    ("crates/policy", &["simd", "model"]),
+    ("crates/policy", &["files", "simd", "model"]),
     ("crates/learning", &["model", "policy"]),
     ("crates/agent", &["model", "logs", "policy"]),
     ("crates/session", &[]),
     ("crates/viewer", &["model"]),
     ("crates/robot", &["model", "logs", "unitree"]),
-    ("ensemble", &["simd", "model", "effects", "logs"]),
+    ("ensemble", &["files", "simd", "model", "effects", "logs"]),
     // Applications.
     ("env-server", &["model", "effects", "protocol", "session", "sim", "envs", "ensemble", "policy"]),
     ("clients/rust", &["model", "protocol", "session", "policy"]),
-    ("crates/report", &["model", "effects", "logs", "sim", "identify", "diagnose"]),
-    ("crates/hunt", &["model", "effects", "logs", "sim", "identify", "diagnose"]),
+    ("crates/report", &["files", "model", "effects", "logs", "sim", "identify", "diagnose"]),
+    ("crates/hunt", &["files", "model", "effects", "logs", "sim", "identify", "diagnose"]),
     ("crates/excite", &["model", "effects", "logs", "identify", "policy", "envs", "sim"]),
     (
         "crates/bench",
@@ -53,6 +54,7 @@ const MAY_USE: [(&str, &[&str]); 26] = [
     (
         "crates/cli",
         &[
+            "files",
             "simd",
             "model",
             "effects",

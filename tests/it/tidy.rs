@@ -43,6 +43,22 @@ fn code_has_no_markers_of_unfinished_work() {
 }
 
 #[test]
+fn results_are_written_by_the_one_function_that_writes_them_whole() {
+    let home = root().join("crates/files");
+    for (path, text) in sources(&["rs"]) {
+        let is_test = path.components().any(|part| ["tests", "examples"].contains(&part.as_os_str().to_str().unwrap()));
+        if path.starts_with(&home) || is_test || path.ends_with("tests.rs") {
+            continue;
+        }
+        let code = text.split("#[cfg(test)]").next().unwrap();
+        for (line, content) in code.lines().enumerate() {
+            let is_own = content.contains("fs::write(") || content.contains("fs::rename(");
+            assert!(!is_own, "{}:{}: use `twinstep_files`: {content}", path.display(), line + 1);
+        }
+    }
+}
+
+#[test]
 fn every_rust_file_begins_with_a_module_comment() {
     for (path, text) in sources(&["rs"]) {
         assert!(text.starts_with("//! "), "{} starts without `//!`", path.display());

@@ -262,18 +262,66 @@ fn page_of_another_site_gets_nothing_and_cannot_move_the_robots() {
 }
 
 #[test]
-fn address_that_others_can_reach_needs_a_token() {
+fn page_that_others_can_reach_has_a_token_and_shows_its_robot() {
     let policy = root().join("data/policies/walk.safetensors");
-    // A run says so before it looks for its endpoint.
-    let (policy, nobody) = (policy.to_str().unwrap(), "tcp/127.0.0.1:9");
-    let run = ["run", policy, "--endpoint", nobody, "--view", "0.0.0.0:0"];
-    for arguments in [&["view", policy, "--listen", "0.0.0.0:0"][..], &run] {
-        let output = Command::new(program()).args(arguments).output().unwrap();
+    let viewed = Viewed::start(&["view", policy.to_str().unwrap(), "--listen", "0.0.0.0:0"]);
+    let (address, token) = viewed.url.trim_start_matches("http://").split_once("/?token=").expect("a token");
+    assert!(token.len() >= 32, "{}", viewed.url);
+    let port = address.rsplit_once(':').unwrap().1;
+    let ask = |path: &str| {
+        let mut stream = TcpStream::connect(format!("127.0.0.1:{port}")).unwrap();
+        stream
+            .write_all(format!("GET {path} HTTP/1.1\r\nHost: robot\r\nConnection: close\r\n\r\n").as_bytes())
+            .unwrap();
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).unwrap();
+        String::from_utf8_lossy(&answer).chars().take(12).collect::<String>()
+    };
+    for file in ["/", "/view.js", "/recording.js", "/view.css", "/three.min.js"] {
+        assert_eq!(ask(file), "HTTP/1.1 200", "{file}");
+    }
+    for path in ["/scene", "/learning"] {
+        assert_eq!(ask(path), "HTTP/1.1 403", "{path}");
+        assert_eq!(ask(&format!("{path}?token={token}")), "HTTP/1.1 200", "{path}");
+    }
+    let Some(browser) = browser() else { return };
+    let url = format!("http://127.0.0.1:{port}/?token={token}");
+    let mut page = ChromePage::open(&browser, &url, [1000, 700]);
+    page.wait_for("Number(document.body.dataset.frames) > 5", PATIENCE);
+}
+
+#[test]
+fn token_that_can_be_guessed_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("token");
+    let policy = root().join("data/policies/walk.safetensors");
+    for token in ["", "1234567\n"] {
+        std::fs::write(&file, token).unwrap();
+        let output = Command::new(program())
+            .args(["view", policy.to_str().unwrap(), "--listen", "0.0.0.0:0", "--token-file"])
+            .arg(&file)
+            .output()
+            .unwrap();
         let text = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.code() == Some(2) && text.contains("--token"), "{text}");
+        assert!(output.status.code() == Some(2) && text.contains("characters"), "{text}");
     }
     let missing = Command::new(program()).args(["view", "no/such/file"]).output().unwrap();
     assert!(missing.status.code() == Some(2) && String::from_utf8_lossy(&missing.stderr).contains("no/such/file"));
+}
+
+#[test]
+fn connections_that_ask_for_nothing_are_closed_and_few() {
+    let viewed = Viewed::policy();
+    let idle: Vec<TcpStream> = (0..300).map(|_| TcpStream::connect(viewed.address()).unwrap()).collect();
+    let files = || std::fs::read_dir(format!("/proc/{}/fd", viewed.child.id())).unwrap().count();
+    std::thread::sleep(Duration::from_millis(500));
+    assert!(files() < 120, "{} open files", files());
+    let since = Instant::now();
+    // Those that are open are closed after 5 s without a request.
+    std::thread::sleep(Duration::from_secs(6));
+    assert!(viewed.http("GET /scene HTTP/1.1\r\nHost: localhost\r\n\r\n").starts_with("HTTP/1.1 200"));
+    assert!(since.elapsed() < Duration::from_secs(30));
+    drop(idle);
 }
 
 #[test]

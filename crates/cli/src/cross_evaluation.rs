@@ -57,7 +57,7 @@ pub fn run(
         ensembles.iter().map(|ensemble| stages.iter().map(|stage| cell(ensemble, stage)).collect()).collect();
     chart::write(&picture(&cells, &names).map_err(other)?, &svg).map_err(other)?;
     let table = csv_text(&cells, &names);
-    std::fs::write(&csv, &table).map_err(other)?;
+    twinstep_files::write(&csv, &table).map_err(other)?;
     print!("{table}");
     println!("written to {}", out.display());
     Ok(())

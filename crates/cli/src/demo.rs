@@ -99,7 +99,7 @@ fn walk(args: &Args, policy: &Path, signals: &Signals) -> CommandResult {
     );
     println!("falls: {falls}");
     let film = args.out.join("walk.svg");
-    std::fs::write(&film, film_strip(&frames)).map_err(other)?;
+    twinstep_files::write(&film, film_strip(&frames)).map_err(other)?;
     println!("film strip of the first robot: {}", film.display());
     env.close().map_err(other)
 }

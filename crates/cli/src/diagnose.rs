@@ -214,7 +214,7 @@ fn print_findings(diagnosis: &Diagnosis, args: &Args) -> CommandResult {
 /// Writes a file into the output folder.
 fn write_file(args: &Args, name: &str, text: &str) -> CommandResult {
     let path = args.out.join(name);
-    std::fs::write(&path, text).map_err(|source| input(Unwritable { path, source }))
+    twinstep_files::write(&path, text).map_err(|source| input(Unwritable { path, source }))
 }
 
 /// Returns the summary for a terminal.

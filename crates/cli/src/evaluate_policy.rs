@@ -168,7 +168,7 @@ pub fn run(args: &Args) -> CommandResult {
         let mut env = args.conditions()[0].env(args, task.clone(), 1)?;
         check_spec(&policy, env.spec())?;
         let film = film(&policy, env.as_mut(), args.seed).map_err(input)?;
-        std::fs::write(path, film).map_err(|cause| {
+        twinstep_files::write(path, film).map_err(|cause| {
             Failure::Input(miette::miette!("`--film` = {}: cannot write the file: {cause}", path.display()))
         })?;
     }

@@ -175,7 +175,7 @@ pub fn write_design(args: &Args, signals: &Signals) -> CommandResult {
         ("design.json", serde_json::to_string_pretty(&report).map_err(other)?),
     ] {
         let path = args.out.join(name);
-        std::fs::write(&path, text)
+        twinstep_files::write(&path, text)
             .map_err(|cause| Failure::Input(miette::miette!("cannot write {}: {cause}", path.display())))?;
     }
     print!("{}", text(&report, &options));

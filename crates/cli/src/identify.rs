@@ -161,10 +161,10 @@ pub fn write_model(args: &Args, signals: &Signals) -> CommandResult {
     });
     bar.finish_and_clear();
     let found = found.map_err(input)?;
-    std::fs::write(&args.out, found.model.to_toml()).map_err(unwritable)?;
+    twinstep_files::write(&args.out, found.model.to_toml()).map_err(unwritable)?;
     match &found.checkpoint {
         Some(checkpoint) => {
-            std::fs::write(&search, serde_json::to_string(checkpoint).map_err(other)?).map_err(unwritable)?;
+            twinstep_files::write(&search, serde_json::to_string(checkpoint).map_err(other)?).map_err(unwritable)?;
         }
         None if search.exists() => std::fs::remove_file(&search).map_err(unwritable)?,
         None => {}

@@ -57,7 +57,9 @@ pub fn run(args: &Args) -> CommandResult {
     let options = MjcfOptions { base: args.base, timestep: args.timestep, ..MjcfOptions::default() };
     let text = mjcf(&robot, &options);
     match &args.out {
-        Some(path) => std::fs::write(path, text).map_err(|cause| input(WriteError { path: path.clone(), cause })),
+        Some(path) => {
+            twinstep_files::write(path, text).map_err(|cause| input(WriteError { path: path.clone(), cause }))
+        }
         None => std::io::stdout().write_all(text.as_bytes()).map_err(other),
     }
 }

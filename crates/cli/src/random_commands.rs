@@ -51,6 +51,6 @@ impl RandomCommands<'_> {
                 self.seconds
             )));
         };
-        std::fs::write(path, sequence.to_csv()).map_err(other)
+        twinstep_files::write(path, sequence.to_csv()).map_err(other)
     }
 }

@@ -116,7 +116,7 @@ fn open_folder(out: &Path, config: &SpiActiveConfig) -> CommandResult {
                 )));
             }
             Ok(_) => {}
-            Err(_) => std::fs::write(&copy, content).map_err(|cause| unwritable(&copy, &cause))?,
+            Err(_) => twinstep_files::write(&copy, content).map_err(|cause| unwritable(&copy, &cause))?,
         }
     }
     Ok(())
@@ -155,7 +155,7 @@ impl Stage {
         for name in ["design.json", "commands.csv"] {
             let (from, to) = (partial.join(name), self.folder.join(name));
             if from.exists() {
-                std::fs::rename(&from, &to).map_err(|cause| unwritable(&to, &cause))?;
+                twinstep_files::complete(&from, &to).map_err(|cause| unwritable(&to, &cause))?;
             }
         }
         std::fs::remove_dir_all(&partial).map_err(|cause| unwritable(&partial, &cause))
@@ -178,7 +178,7 @@ impl Stage {
         }
         let found = RobotTime { seconds: recorded.seconds, falls: recorded.falls };
         write(&summary, &serde_json::to_string_pretty(&found).map_err(other)?)?;
-        std::fs::rename(&partial, &log).map_err(|cause| unwritable(&log, &cause))?;
+        twinstep_files::complete(&partial, &log).map_err(|cause| unwritable(&log, &cause))?;
         Ok(found)
     }
 
@@ -196,7 +196,7 @@ impl Stage {
         }
         let search = identify::search_file(&partial);
         identify::write_model(&config.identification(logs, earlier, &partial, search.exists()), signals)?;
-        std::fs::rename(&partial, &model).map_err(|cause| unwritable(&model, &cause))
+        twinstep_files::complete(&partial, &model).map_err(|cause| unwritable(&model, &cause))
     }
 }
 
@@ -207,7 +207,7 @@ fn read_json(path: &Path) -> Result<RobotTime, Failure> {
 }
 
 fn write(path: &Path, text: &str) -> CommandResult {
-    std::fs::write(path, text).map_err(|cause| unwritable(path, &cause))
+    twinstep_files::write(path, text).map_err(|cause| unwritable(path, &cause))
 }
 
 fn unwritable(path: &Path, cause: &std::io::Error) -> Failure {

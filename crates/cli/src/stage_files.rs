@@ -1,34 +1,17 @@
 //! Files of a command with several stages: a file exists only when it is complete, also after a power failure.
 
-use std::fs::File;
 use std::path::Path;
 
 use crate::exit::{CommandResult, Failure};
 
-/// Writes a file under another name, and renames it once its content is stored.
+/// Writes a file as a whole.
 pub fn write(path: &Path, content: &[u8]) -> CommandResult {
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(".partial");
-    let partial = Path::new(&partial);
-    std::fs::write(partial, content).map_err(|cause| unwritable(partial, &cause))?;
-    complete(partial, path)
+    twinstep_files::write(path, content).map_err(|cause| unwritable(path, &cause))
 }
 
 /// Renames a file, or a folder of files, once its content is stored.
 pub fn complete(partial: &Path, path: &Path) -> CommandResult {
-    let stored = store(partial)
-        .and_then(|()| std::fs::rename(partial, path))
-        .and_then(|()| path.parent().map_or(Ok(()), |folder| File::open(folder)?.sync_all()));
-    stored.map_err(|cause| unwritable(path, &cause))
-}
-
-fn store(path: &Path) -> std::io::Result<()> {
-    if path.is_dir() {
-        for entry in std::fs::read_dir(path)? {
-            store(&entry?.path())?;
-        }
-    }
-    File::open(path)?.sync_all()
+    twinstep_files::complete(partial, path).map_err(|cause| unwritable(path, &cause))
 }
 
 /// Removes a file or folder that was not completed, if there is one.

@@ -17,6 +17,8 @@ use crate::train_evaluation;
 use crate::train_log::{TrainLog, curve_point, write_curve};
 use crate::web_view::{Page, ViewArgs};
 
+/// The checkpoint before the last one.
+const PREVIOUS: &str = "checkpoint.previous.safetensors";
 /// Interval at which a running training is saved.
 const SAVE_EVERY: Duration = Duration::from_secs(10);
 
@@ -31,7 +33,7 @@ const SAVE_EVERY: Duration = Duration::from_secs(10);
 ///   config.toml            all settings; --config config.toml repeats the training
 ///   progress.csv           errors, falls, reward terms and times of every update; TensorBoard reads events.out.*
 ///   curve.svg              learning curve
-///   checkpoint.safetensors state of the training, saved every 10 s
+///   checkpoint.safetensors state of the training, saved every 10 s; the one before is checkpoint.previous.safetensors
 ///   exploration.*          task `explore`: base policy and residual as one policy of `walk`
 ///
 /// Ctrl-C saves the training and ends it; --resume continues it. Equal seeds and settings give equal policies.
@@ -107,7 +109,7 @@ pub fn write_policy(args: &Args, signals: &Signals) -> CommandResult {
 
 fn train_policy(args: &Args, signals: &Signals, start: Instant) -> Result<TrainSession, Failure> {
     args.check()?;
-    let checkpoint = args.resume.then(|| Checkpoint::read(args.checkpoint())).transpose().map_err(input)?;
+    let checkpoint = if args.resume { Some(read_checkpoint(args)?) } else { None };
     let mut config = match &checkpoint {
         Some(checkpoint) => TrainConfig::parse(&checkpoint.config, "the checkpoint's config")?,
         None => args.config()?,
@@ -115,10 +117,15 @@ fn train_policy(args: &Args, signals: &Signals, start: Instant) -> Result<TrainS
     config.train.total_steps = args.steps.unwrap_or(config.train.total_steps);
     std::fs::create_dir_all(&args.out).map_err(|cause| folder_error(&args.out, cause))?;
     let text = toml::to_string(&config).expect("settings are plain data");
-    std::fs::write(args.out.join("config.toml"), &text).map_err(|cause| folder_error(&args.out, cause))?;
+    twinstep_files::write(args.out.join("config.toml"), &text).map_err(|cause| folder_error(&args.out, cause))?;
     let mut session = TrainSession::new(args, config, text, checkpoint)?;
     let ended = session.train(signals, start);
-    session.save()?;
+    let saved = session.save();
+    if ended.is_ok() {
+        saved?;
+    } else if let Err(Failure::Other(report) | Failure::Input(report)) = saved {
+        eprintln!("error: the checkpoint is not saved: {report}");
+    }
     match ended {
         Ok(()) => Ok(session),
         Err(Failure::Interrupted) => {
@@ -130,6 +137,18 @@ fn train_policy(args: &Args, signals: &Signals, start: Instant) -> Result<TrainS
             Err(failure)
         }
     }
+}
+
+/// Reads the checkpoint of a training. The error of one that is damaged names the one before.
+fn read_checkpoint(args: &Args) -> Result<Checkpoint, Failure> {
+    let previous = args.out.join(PREVIOUS);
+    Checkpoint::read(args.checkpoint()).map_err(|error| match previous.exists() {
+        true => Failure::Input(miette::miette!(
+            "{error}\n  the one before it is {}: rename it to continue",
+            previous.display()
+        )),
+        false => input(error),
+    })
 }
 
 fn folder_error(folder: &Path, cause: std::io::Error) -> Failure {
@@ -342,7 +361,8 @@ impl TrainSession {
             })?;
             let seconds = earlier + start.elapsed().as_secs_f64();
             let point = curve_point(&iteration, self.trainer.spec().policy_dt, seconds);
-            self.log.write(&iteration, &point).map_err(other)?;
+            // A full disk costs rows and checkpoints, not the training: there may be room again at its end.
+            let logged = self.log.write(&iteration, &point);
             self.curve.push(point);
             if let Some(page) = &self.page {
                 page.hub().add_learning([learning_point(&point)]);
@@ -350,7 +370,9 @@ impl TrainSession {
             bar.set_position(iteration.env_steps);
             bar.set_message(progress_text(&point));
             if saved.elapsed() > SAVE_EVERY {
-                self.save()?;
+                if let Err(Failure::Other(report) | Failure::Input(report)) = logged.map_err(other).and(self.save()) {
+                    bar.println(format!("not saved, the training goes on: {report}"));
+                }
                 saved = Instant::now();
             }
         }
@@ -368,7 +390,9 @@ impl TrainSession {
             config: self.text.clone(),
             curve: self.curve.clone(),
         };
-        checkpoint.write(self.out.join("checkpoint.safetensors")).map_err(other)?;
+        let path = self.out.join("checkpoint.safetensors");
+        twinstep_files::keep_previous(&path, &self.out.join(PREVIOUS)).map_err(other)?;
+        checkpoint.write(path).map_err(other)?;
         let policy = learner.policy(spec);
         policy.write(&self.policy, self.origin()).map_err(other)?;
         policy.write_onnx(self.out.join("policy.onnx")).map_err(other)?;
@@ -402,7 +426,7 @@ impl TrainSession {
         // Robots of servers that collected rollouts are free for the evaluation.
         drop(trainer);
         let (json, text) = train_evaluation::evaluate_policy(&policy, &config, &endpoints, signals)?;
-        std::fs::write(out.join("evaluation.json"), &json).map_err(other)?;
+        twinstep_files::write(out.join("evaluation.json"), &json).map_err(other)?;
         let seconds = start.elapsed().as_secs_f64();
         if args.json {
             println!("{json}");

@@ -51,10 +51,10 @@ pub struct Args {
     #[command(flatten)]
     page: PageArgs,
     /// Write the page with its motion into this file instead of serving it.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["listen", "token"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["listen", "token_file"])]
     html: Option<PathBuf>,
     /// Write the motion into this MCAP file with Foxglove's schemas instead of serving a page.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["listen", "token"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["listen", "token_file"])]
     mcap: Option<PathBuf>,
     /// Length of the motion in the file [s]; a log may be shorter.
     #[arg(long, value_name = "S", default_value_t = 20.0, value_parser = seconds)]
@@ -128,7 +128,7 @@ fn write_page(file: &Path, page: &str) -> CommandResult {
 }
 
 fn write_file(flag: &str, file: &Path, bytes: &[u8]) -> CommandResult {
-    std::fs::write(file, bytes).map_err(|cause| {
+    twinstep_files::write(file, bytes).map_err(|cause| {
         Failure::Input(miette::miette!("`{flag}` = {}: cannot write the file: {cause}", file.display()))
     })
 }

@@ -1,5 +1,6 @@
 //! `twinstep watchdog`: the process that damps the motors when the control loop of `twinstep robot` stops.
 
+use std::io::Write;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -23,6 +24,7 @@ pub fn run(args: &Args) -> CommandResult {
         signal_hook::flag::register(signal, Arc::default()).map_err(other)?;
     }
     // When memory runs out, the system ends another process. Only root may ask for it.
-    let _ = std::fs::write("/proc/self/oom_score_adj", "-1000");
+    let score = std::fs::File::options().write(true).open("/proc/self/oom_score_adj");
+    let _ = score.and_then(|mut score| score.write_all(b"-1000"));
     twinstep_robot::watchdog::run(args.address, Duration::from_millis(args.timeout_ms)).map_err(other)
 }

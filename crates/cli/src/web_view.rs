@@ -1,14 +1,17 @@
 //! Options and start of a browser view: `--view` of `serve`, `train`, `run` and `robot`, and `twinstep view`.
 
 use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use twinstep_env_server::{EnvFactory, EnvFactoryError};
 use twinstep_model::{AutoresetMode, PerJoint, ResetRequest, VecEnv};
 use twinstep_protocol::message::RealTime;
+use twinstep_protocol::random_id;
 use twinstep_viewer::{Hub, SceneInfo, WatchedVecEnv, WebServer};
 
 use crate::exit::{Failure, input, other};
+use crate::robot::text;
 
 /// Where the page is, if no address is given.
 const DEFAULT_ADDRESS: &str = "127.0.0.1:7480";
@@ -20,26 +23,28 @@ pub struct ViewArgs {
     /// `ssh -L 7480:localhost:7480 HOST`. Default address: 127.0.0.1:7480.
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = DEFAULT_ADDRESS)]
     view: Option<SocketAddr>,
-    /// Word without which the page is not shown. Needed at an address that others can reach.
-    #[arg(long, value_name = "WORD", requires = "view")]
-    view_token: Option<String>,
+    /// File with the word without which the page is not shown. Default at an address that others can reach: a random word,
+    /// which is part of the printed address.
+    #[arg(long, value_name = "FILE", requires = "view")]
+    view_token_file: Option<PathBuf>,
 }
 
 /// Options of `twinstep view` for its page.
 #[derive(clap::Args)]
 pub struct PageArgs {
-    /// Address of the page; port 0 selects a free port. One that others can reach needs --token.
+    /// Address of the page; port 0 selects a free port. One that others can reach has a token.
     #[arg(long, value_name = "ADDRESS", default_value = DEFAULT_ADDRESS)]
     listen: SocketAddr,
-    /// Word without which the page is not shown.
-    #[arg(long, value_name = "WORD")]
-    token: Option<String>,
+    /// File with the word without which the page is not shown. Default at an address that others can reach: a random word,
+    /// which is part of the printed address.
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
 }
 
 impl PageArgs {
     /// Serves a page and says where it is.
     pub fn open(&self, scene: SceneInfo) -> Result<Page, Failure> {
-        Page::open(self.listen, self.token.clone(), Arc::new(Hub::new(scene)))
+        Page::open(self.listen, self.token_file.as_deref(), Arc::new(Hub::new(scene)))
     }
 }
 
@@ -52,7 +57,7 @@ pub struct Page {
 impl ViewArgs {
     /// Returns the options of a page at the default address; without a page if it cannot be served there.
     pub fn default_page() -> Self {
-        let page = Self { view: DEFAULT_ADDRESS.parse().ok(), view_token: None };
+        let page = Self { view: DEFAULT_ADDRESS.parse().ok(), view_token_file: None };
         if page.check().is_ok() { page } else { Self::default() }
     }
 
@@ -69,12 +74,13 @@ impl ViewArgs {
 
     /// Serves a page of what `hub` shows, if there is to be one.
     pub fn serve(&self, hub: &Arc<Hub>) -> Result<Option<Page>, Failure> {
-        self.view.map(|address| Page::open(address, self.view_token.clone(), Arc::clone(hub))).transpose()
+        self.view.map(|address| Page::open(address, self.view_token_file.as_deref(), Arc::clone(hub))).transpose()
     }
 
     /// Checks that the page can be served.
     pub fn check(&self) -> Result<(), Failure> {
-        self.view.map_or(Ok(()), |address| WebServer::check(address, self.view_token.as_deref()).map_err(input))
+        let Some(address) = self.view else { return Ok(()) };
+        WebServer::check(address, token(address, self.view_token_file.as_deref())?.as_deref()).map_err(input)
     }
 
     /// Returns true if there is to be a page.
@@ -84,7 +90,8 @@ impl ViewArgs {
 }
 
 impl Page {
-    fn open(address: SocketAddr, token: Option<String>, hub: Arc<Hub>) -> Result<Self, Failure> {
+    fn open(address: SocketAddr, token_file: Option<&Path>, hub: Arc<Hub>) -> Result<Self, Failure> {
+        let token = token(address, token_file)?;
         let server = WebServer::start(address, token, Arc::clone(&hub)).map_err(input)?;
         eprintln!("the robots are at {}", server.url());
         Ok(Self { hub, _server: server })
@@ -98,6 +105,20 @@ impl Page {
     /// Lets the page see the robots of `env`.
     pub fn watch(&self, env: Box<dyn VecEnv>) -> Box<dyn VecEnv> {
         Box::new(WatchedVecEnv::new(env, Arc::clone(&self.hub)))
+    }
+}
+
+/// Returns the token of a page: that of the file, or a random one at an address that others can reach. It is not an argument
+/// because every user of this machine sees those.
+fn token(address: SocketAddr, file: Option<&Path>) -> Result<Option<String>, Failure> {
+    match file {
+        Some(file) => {
+            let read = std::fs::read_to_string(file);
+            let text =
+                read.map_err(|error| text(&format!("cannot read the token file {}: {error}", file.display())))?;
+            Ok(Some(text.trim().to_owned()))
+        }
+        None => Ok((!address.ip().is_loopback()).then(|| [random_id(), random_id()].concat())),
     }
 }
 

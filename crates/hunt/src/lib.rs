@@ -241,7 +241,7 @@ pub fn hunt(
     results.retain(|result| result.case < *cases);
     let text = table::text(&results);
     let report = out.join("hunt.md");
-    std::fs::write(&report, &text).map_err(at(&report))?;
+    twinstep_files::write(&report, &text).map_err(at(&report))?;
     Ok(text)
 }
 

@@ -49,7 +49,7 @@ impl BlindTest<'_> {
     pub fn run_case(&mut self, case: &Case) -> Result<CaseResult, HuntError> {
         let folder = self.out.join(format!("{:04}", case.number));
         let model = self.out.join("nominal.toml");
-        std::fs::write(&model, ModelFile::default().to_toml()).map_err(at(&model))?;
+        twinstep_files::write(&model, ModelFile::default().to_toml()).map_err(at(&model))?;
         let log =
             ground_truth::log_of(case, self.plant, Take::First, &mut |_| !(self.interrupted)()).map_err(|error| {
                 match error {
@@ -62,7 +62,7 @@ impl BlindTest<'_> {
         let DiagnosisRun { findings, seconds } = self.run_diagnosis(&path, &model, &folder)?;
         // Written after the diagnosis, so that it cannot have read the file.
         let truth = folder.join("truth.toml");
-        std::fs::write(&truth, case.truth().to_toml()).map_err(at(&truth))?;
+        twinstep_files::write(&truth, case.truth().to_toml()).map_err(at(&truth))?;
         let held_out = held_out_rows(&log);
         let mut errors = |robot: &RobotModel| {
             let found = evaluate(&log, robot, &mut self.simulator, |row| held_out[row]).map_err(failed)?;

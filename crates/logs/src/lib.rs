@@ -42,6 +42,7 @@ mod falls;
 mod files;
 mod go2_message;
 mod identifiability;
+mod limited;
 mod log;
 mod log_writer;
 mod mcap_file;

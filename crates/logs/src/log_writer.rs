@@ -40,7 +40,7 @@ impl LogWriter {
         }
         let (path, meta_path) = (folder.join("data.csv"), folder.join("meta.json"));
         let text = serde_json::to_string_pretty(meta).expect("metadata are plain data") + "\n";
-        std::fs::write(&meta_path, text).map_err(failed(&meta_path))?;
+        twinstep_files::write(&meta_path, text).map_err(failed(&meta_path))?;
         let mut file = OpenOptions::new().write(true).create_new(true).open(&path).map_err(failed(&path))?;
         let header = columns.join(",") + "\n";
         file.write_all(header.as_bytes()).map_err(failed(&path))?;

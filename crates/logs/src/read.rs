@@ -4,6 +4,7 @@ use std::path::Path;
 
 use crate::check::{self, LogKind};
 use crate::files::{Files, Format};
+use crate::limited::Limited;
 use crate::meta::KEYS;
 use crate::table::Table;
 use crate::{Log, LogError, Meta, csv_table, mcap_file, parquet_table};
@@ -49,7 +50,13 @@ fn read(path: &Path, need: LogKind) -> Result<Log, LogError> {
     let open = || std::fs::File::open(&files.data).map_err(|cause| LogError::Read { file: files.data.clone(), cause });
     let (mut table, meta) = match files.format {
         Format::Csv => (csv_table::read(&files.data, open()?)?, needed(meta)?),
-        Format::CsvGz => (csv_table::read(&files.data, flate2::read::MultiGzDecoder::new(open()?))?, needed(meta)?),
+        Format::CsvGz => {
+            let file = open()?;
+            let length = file.metadata().map_err(|cause| LogError::Read { file: files.data.clone(), cause })?.len();
+            let limit = mcap_file::length_limit(length) as u64;
+            let content = Limited::new(flate2::read::MultiGzDecoder::new(file), limit);
+            (csv_table::read(&files.data, content)?, needed(meta)?)
+        }
         Format::Parquet => (parquet_table::read(&files.data)?, needed(meta)?),
         Format::Mcap => mcap_file::read(&files.data, meta)?,
     };

@@ -15,7 +15,7 @@ pub fn unpack(folder: &Path) -> Result<Log, LogError> {
     std::fs::create_dir_all(folder).map_err(|cause| LogError::Write { file: folder.to_owned(), cause })?;
     for (name, bytes) in FILES {
         let file = folder.join(name);
-        std::fs::write(&file, bytes).map_err(|cause| LogError::Write { file, cause })?;
+        twinstep_files::write(&file, bytes).map_err(|cause| LogError::Write { file, cause })?;
     }
     Log::open(folder)
 }

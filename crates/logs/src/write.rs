@@ -1,9 +1,10 @@
 //! Writing logs. Files are written completely or not at all.
 
-use std::fs::{self, File};
+use std::fs;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
+
+use twinstep_files::PartialFile;
 
 use crate::files::{Files, Format};
 use crate::{Log, LogError, csv_table, mcap_file, parquet_table};
@@ -39,7 +40,7 @@ impl Log {
     fn write_data(&self, data: &Unfinished, format: Format) -> Result<(), LogError> {
         let refused = |cause| LogError::Write { file: data.target.clone(), cause };
         let columns = self.columns();
-        let mut target = BufWriter::new(&data.file);
+        let mut target = BufWriter::new(&data.file.file);
         match format {
             Format::Csv => csv_table::write(&columns, &mut target).map_err(refused)?,
             Format::CsvGz => {
@@ -56,41 +57,26 @@ impl Log {
     fn write_meta(&self, meta: &Unfinished) -> io::Result<()> {
         let mut text = serde_json::to_string_pretty(&self.meta)?;
         text.push('\n');
-        (&meta.file).write_all(text.as_bytes())
+        (&meta.file.file).write_all(text.as_bytes())
     }
 }
 
-/// File with a temporary name until it is complete. Dropping it removes an incomplete file.
+/// File of a log until it is complete.
 struct Unfinished {
-    file: File,
-    temporary: PathBuf,
+    file: PartialFile,
     target: PathBuf,
 }
 
 impl Unfinished {
     fn create(target: &Path) -> Result<Unfinished, LogError> {
-        static COUNT: AtomicU64 = AtomicU64::new(0);
         let refused = |cause| LogError::Write { file: target.into(), cause };
-        let name = target.file_name().unwrap_or_default().to_string_lossy();
-        let count = COUNT.fetch_add(1, Ordering::Relaxed);
-        let temporary = target.with_file_name(format!(".{name}.{}-{count}.part", std::process::id()));
         if let Some(folder) = target.parent() {
             fs::create_dir_all(folder).map_err(refused)?;
         }
-        let file = File::create(&temporary).map_err(refused)?;
-        Ok(Unfinished { file, temporary, target: target.into() })
+        Ok(Unfinished { file: PartialFile::create(target).map_err(refused)?, target: target.into() })
     }
 
     fn finish(self) -> Result<(), LogError> {
-        // Sync first: the new name must not reach the disk before the content.
-        let renamed = self.file.sync_all().and_then(|()| fs::rename(&self.temporary, &self.target));
-        renamed.map_err(|cause| LogError::Write { file: self.target.clone(), cause })
-    }
-}
-
-impl Drop for Unfinished {
-    fn drop(&mut self) {
-        // After a rename this file does not exist. Another failure cannot be handled here.
-        let _ = fs::remove_file(&self.temporary);
+        self.file.finish().map_err(|cause| LogError::Write { file: self.target, cause })
     }
 }

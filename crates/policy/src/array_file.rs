@@ -61,13 +61,13 @@ pub fn write(path: &Path, key: &str, header: &impl Serialize, arrays: &Arrays) -
     write_atomically(path, &content)
 }
 
-/// Writes a file under another name, then renames it.
+/// Writes a file as a whole.
 pub fn write_atomically(path: &Path, content: &[u8]) -> Result<(), ArrayFileError> {
-    let mut temporary = path.as_os_str().to_owned();
-    temporary.push(".part");
-    std::fs::write(&temporary, content)
-        .and_then(|()| std::fs::rename(&temporary, path))
-        .map_err(|cause| ArrayFileError::File { verb: "write", path: path.to_owned(), cause })
+    twinstep_files::write(path, content).map_err(|cause| ArrayFileError::File {
+        verb: "write",
+        path: path.to_owned(),
+        cause,
+    })
 }
 
 /// Reads all arrays, and the header under the metadata key `key`. All numbers are finite.

@@ -56,7 +56,7 @@ pub fn check_writable(path: &Path) -> Result<(), PlotError> {
 
 /// Writes a plot.
 pub fn write(svg: &str, path: &Path) -> Result<(), PlotError> {
-    std::fs::write(path, svg).map_err(|cause| PlotError::Write { path: path.into(), cause })
+    twinstep_files::write(path, svg).map_err(|cause| PlotError::Write { path: path.into(), cause })
 }
 
 /// Returns an SVG of `size` [px]. `draw` works in half pixels.

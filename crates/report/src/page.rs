@@ -19,7 +19,7 @@ pub struct ReportError {
 
 /// Writes the report of a diagnosis.
 pub fn write(diagnosis: &Diagnosis, data: &ReportData, path: &Path) -> Result<(), ReportError> {
-    std::fs::write(path, page(diagnosis, data)).map_err(|cause| ReportError { path: path.to_owned(), cause })
+    twinstep_files::write(path, page(diagnosis, data)).map_err(|cause| ReportError { path: path.to_owned(), cause })
 }
 
 /// Returns the page.

@@ -4,6 +4,7 @@ use std::convert::Infallible;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use axum::body::Body;
 use axum::extract::{Query, Request, State};
@@ -14,8 +15,10 @@ use axum::routing::{get, post};
 use axum::{Json, Router};
 use bytes::Bytes;
 use futures_util::stream;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
 use serde::Deserialize;
-use tokio::sync::{oneshot, watch};
+use tokio::sync::{Semaphore, oneshot, watch};
 
 use crate::hub::{Hub, PageRequest};
 
@@ -38,6 +41,14 @@ const FILES: [(&str, &str, &str); 5] = [
     ("/view.css", "text/css; charset=utf-8", STYLE),
     ("/three.min.js", "text/javascript; charset=utf-8", THREE),
 ];
+/// Minimum number of characters of a token.
+const MIN_TOKEN: usize = 8;
+/// Maximum number of connections. An open page has two or three.
+const MAX_CONNECTIONS: usize = 64;
+/// Time in which a connection has to send its request.
+const HEADER_TIMEOUT: Duration = Duration::from_secs(5);
+/// Pause after the system refused a connection, such as for want of files.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// Hosts of a page on this machine, also at the end of an `ssh -L` tunnel.
 const LOCAL_HOSTS: [&str; 3] = ["localhost", "127.0.0.1", "[::1]"];
 
@@ -53,10 +64,16 @@ pub enum ViewError {
         cause: std::io::Error,
     },
     /// Others could look at the robots and move them.
-    #[error(
-        "others can reach {0}\n  give them a token: `--token WORD` of `view`, `--view-token WORD` of the others; the page is then at http://{0}/?token=WORD"
-    )]
+    #[error("others can reach {0}: a page there needs a token")]
     NoToken(SocketAddr),
+    /// The token can be guessed.
+    #[error(
+        "the token has {len} characters; at least {MIN_TOKEN} are needed: `openssl rand -hex 16 > token` makes one"
+    )]
+    ShortToken {
+        /// Number of characters.
+        len: usize,
+    },
     /// The operating system could not start a thread.
     #[error("cannot start the thread of the web server: {0}")]
     Thread(std::io::Error),
@@ -90,7 +107,7 @@ impl WebServer {
             // Open pages have an endless response, so the server does not wait for them.
             tokio::select! {
                 _ = ended => {}
-                _ = async { axum::serve(listener, router).await } => {}
+                () = accept(listener, router) => {}
             }
         };
         let thread = std::thread::Builder::new().name("viewer".to_owned());
@@ -104,8 +121,10 @@ impl WebServer {
     }
 
     fn listen(address: SocketAddr, token: Option<&str>) -> Result<std::net::TcpListener, ViewError> {
-        if !address.ip().is_loopback() && token.is_none() {
-            return Err(ViewError::NoToken(address));
+        match token.map(|token| token.chars().count()) {
+            None if !address.ip().is_loopback() => return Err(ViewError::NoToken(address)),
+            Some(len) if len < MIN_TOKEN => return Err(ViewError::ShortToken { len }),
+            _ => {}
         }
         std::net::TcpListener::bind(address).map_err(|cause| ViewError::Listen { address, cause })
     }
@@ -126,18 +145,38 @@ impl Drop for WebServer {
     }
 }
 
-fn router(site: Arc<Site>) -> Router {
-    let mut router = Router::new();
-    for (path, kind, content) in FILES {
-        router = router.route(path, get(async move || ([(header::CONTENT_TYPE, kind)], content)));
+/// Serves connections. Those above the limit are closed, so that idle ones do not use up the files of this process.
+async fn accept(listener: tokio::net::TcpListener, router: Router) {
+    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    loop {
+        let Ok((stream, _)) = listener.accept().await else {
+            tokio::time::sleep(ACCEPT_PAUSE).await;
+            continue;
+        };
+        let Ok(place) = Arc::clone(&places).try_acquire_owned() else { continue };
+        let service = TowerToHyperService::new(router.clone());
+        tokio::spawn(async move {
+            let mut http = hyper::server::conn::http1::Builder::new();
+            http.timer(TokioTimer::new()).header_read_timeout(HEADER_TIMEOUT);
+            let _ = http.serve_connection(TokioIo::new(stream), service).await;
+            drop(place);
+        });
     }
-    router
+}
+
+fn router(site: Arc<Site>) -> Router {
+    let mut files = Router::new();
+    for (path, kind, content) in FILES {
+        files = files.route(path, get(async move || ([(header::CONTENT_TYPE, kind)], content)));
+    }
+    let protected = Router::new()
         .route("/scene", get(scene))
         .route("/frames", get(frames))
         .route("/learning", get(learning))
         .route("/request", post(request))
-        .layer(axum::middleware::from_fn_with_state(Arc::clone(&site), check_origin))
-        .with_state(site)
+        .layer(axum::middleware::from_fn_with_state(Arc::clone(&site), check_token));
+    // The files are the same for everybody; what they show is not.
+    files.merge(protected).layer(axum::middleware::from_fn_with_state(Arc::clone(&site), check_host)).with_state(site)
 }
 
 #[derive(Deserialize)]
@@ -145,31 +184,37 @@ struct TokenQuery {
     token: Option<String>,
 }
 
-/// Lets a request pass that has the token or, without one, that comes from this machine.
-async fn check_origin(
+/// Lets a request pass if there is a token, or if it is for this machine: a page of another site could have this address under
+/// a name of its own.
+async fn check_host(State(site): State<Arc<Site>>, request: Request, next: Next) -> Response {
+    let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
+    let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
+    if site.token.is_none() && !LOCAL_HOSTS.contains(&name) {
+        let message = "only http://localhost and http://127.0.0.1 are served without a token\n";
+        return (StatusCode::FORBIDDEN, message).into_response();
+    }
+    let mut response = next.run(request).await;
+    response.headers_mut().insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
+    response
+}
+
+/// Lets a request pass that has the token, if there is one.
+async fn check_token(
     State(site): State<Arc<Site>>,
     Query(query): Query<TokenQuery>,
     request: Request,
     next: Next,
 ) -> Response {
-    let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
-    let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
-    let is_allowed = match &site.token {
-        Some(token) => query.token.as_ref() == Some(token),
-        // A page of another site could have this address under a name of its own.
-        None => LOCAL_HOSTS.contains(&name),
-    };
-    if is_allowed {
-        let mut response = next.run(request).await;
-        response.headers_mut().insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
-        response
-    } else if site.token.is_some() {
-        (StatusCode::FORBIDDEN, "`token` is missing or wrong: open the address that the program printed\n")
-            .into_response()
-    } else {
-        (StatusCode::FORBIDDEN, "only http://localhost and http://127.0.0.1 are served without a token\n")
-            .into_response()
+    let given = query.token.unwrap_or_default();
+    if site.token.as_ref().is_none_or(|token| is_equal(token.as_bytes(), given.as_bytes())) {
+        return next.run(request).await;
     }
+    (StatusCode::FORBIDDEN, "`token` is missing or wrong: open the address that the program printed\n").into_response()
+}
+
+/// Compares two texts in a time that does not depend on where they differ.
+fn is_equal(one: &[u8], other: &[u8]) -> bool {
+    one.len() == other.len() && one.iter().zip(other).fold(0, |sum, (one, other)| sum | (one ^ other)) == 0
 }
 
 async fn scene(State(site): State<Arc<Site>>) -> Response {

@@ -16,6 +16,8 @@ use tensor::Tensor;
 
 /// Largest length of an observation.
 const MAX_INPUTS: i64 = 1 << 20;
+/// Maximum number of entries of all arrays that an evaluation computes.
+const MAX_ENTRIES: usize = 1 << 26;
 
 /// Network of an ONNX file. The first output is the action; others are ignored.
 #[derive(Clone, Debug)]
@@ -122,11 +124,19 @@ impl OnnxNetwork {
         action.as_floats().map(<[f32]>::to_vec).map_err(problem)
     }
 
+    /// Returns the index of the last operation that reads each value.
+    fn last_uses(&self) -> HashMap<&str, usize> {
+        let uses = self.nodes.iter().enumerate();
+        uses.flat_map(|(index, node)| node.inputs.iter().map(move |name| (name.as_str(), index))).collect()
+    }
+
     fn evaluate(&self, obs: &[f32]) -> Result<Tensor, OnnxError> {
         let content = |problem| OnnxError::Content { path: self.path.clone(), problem };
         let obs = Tensor::floats(vec![1, self.inputs], obs.to_vec()).map_err(content)?;
         let mut values: HashMap<&str, Tensor> = HashMap::from([(self.input.as_str(), obs)]);
-        for node in &self.nodes {
+        let last_uses = self.last_uses();
+        let mut entries = 0;
+        for (index, node) in self.nodes.iter().enumerate() {
             let operation =
                 |problem| OnnxError::Operation { path: self.path.clone(), operator: node.operator.clone(), problem };
             let value = |name: &String| {
@@ -136,9 +146,14 @@ impl OnnxNetwork {
             let inputs = node.inputs.iter().map(|name| if name.is_empty() { Ok(None) } else { value(name).map(Some) });
             let inputs = inputs.collect::<Result<Vec<_>, _>>()?;
             let result = operators::evaluate(node, &inputs).map_err(operation)?;
+            entries += result.shape.iter().product::<usize>();
+            if entries > MAX_ENTRIES {
+                return Err(operation(format!("makes the arrays of one evaluation longer than {MAX_ENTRIES} numbers")));
+            }
             if let Some(name) = node.outputs.first() {
                 values.insert(name, result);
             }
+            values.retain(|name, _| last_uses.get(name).is_some_and(|last| *last > index) || *name == self.output);
         }
         values
             .remove(self.output.as_str())

@@ -20,6 +20,7 @@ mod write;
 
 use serde::{Deserialize, Serialize};
 
+pub(crate) use lengths::length_limit;
 pub(crate) use read::read;
 pub use recorder::{McapRecorder, RecordedTopic};
 pub(crate) use write::{unsupported_columns, write};

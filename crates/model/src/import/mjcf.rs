@@ -13,6 +13,9 @@ use crate::RigidBody;
 /// Attributes by element, of one default class.
 type Class<'a> = BTreeMap<(&'a str, &'a str), &'a str>;
 
+/// Maximum number of attributes of a default class.
+const MAX_ATTRIBUTES: usize = 1000;
+
 /// Reads the element `<mujoco>`.
 pub fn read(root: Node) -> Result<Description, ImportError> {
     if let Some(include) = root.descendants().find(|node| node.has_tag_name("include")) {
@@ -22,7 +25,7 @@ pub fn read(root: Node) -> Result<Description, ImportError> {
     let mut classes = BTreeMap::from([("main", Class::new())]);
     for default in root.children().filter(|node| node.has_tag_name("default")) {
         let name = default.attribute("class").unwrap_or("main");
-        read_class(default, name, &Class::new(), &mut classes);
+        read_class(default, name, &Class::new(), &mut classes)?;
     }
     let compiler =
         |attribute: &str| root.children().filter(|n| n.has_tag_name("compiler")).find_map(|n| n.attribute(attribute));
@@ -43,7 +46,12 @@ pub fn read(root: Node) -> Result<Description, ImportError> {
 }
 
 /// Reads a default class and those below it, which inherit its attributes.
-fn read_class<'a>(node: Node<'a, 'a>, name: &'a str, parent: &Class<'a>, classes: &mut BTreeMap<&'a str, Class<'a>>) {
+fn read_class<'a>(
+    node: Node<'a, 'a>,
+    name: &'a str,
+    parent: &Class<'a>,
+    classes: &mut BTreeMap<&'a str, Class<'a>>,
+) -> Result<(), ImportError> {
     let mut class = parent.clone();
     for element in node.children().filter(|child| child.is_element() && !child.has_tag_name("default")) {
         for attribute in element.attributes() {
@@ -51,9 +59,15 @@ fn read_class<'a>(node: Node<'a, 'a>, name: &'a str, parent: &Class<'a>, classes
         }
     }
     for below in node.children().filter(|child| child.has_tag_name("default")) {
-        read_class(below, below.attribute("class").unwrap_or(""), &class, classes);
+        read_class(below, below.attribute("class").unwrap_or(""), &class, classes)?;
+    }
+    // Each class is a copy of the one above it.
+    if class.len() > MAX_ATTRIBUTES {
+        let problem = format!("a default class has {} attributes; at most {MAX_ATTRIBUTES} are read", class.len());
+        return Err(ImportError::Unsupported { line: line(node), problem });
     }
     classes.insert(name, class);
+    Ok(())
 }
 
 struct Reader<'a> {

@@ -12,6 +12,10 @@ mod xml;
 
 use crate::{ControlConfig, RobotModel, go2};
 
+/// Maximum depth of the elements of a robot file, and maximum number of its nodes.
+const MAX_DEPTH: usize = 256;
+const MAX_NODES: u32 = 1 << 20;
+
 /// Reason why a robot file was rejected.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ImportError {
@@ -68,12 +72,38 @@ pub struct ImportNames {
     pub feet: Option<[String; 4]>,
 }
 
+/// Fails if elements are nested too deep for the readers, which descend into them.
+fn check_depth(root: roxmltree::Node) -> Result<(), ImportError> {
+    let (mut node, mut depth) = (root, 0_usize);
+    loop {
+        if depth > MAX_DEPTH {
+            let problem = format!("elements are nested deeper than {MAX_DEPTH}: no robot has so many bodies in a row");
+            return Err(ImportError::Unsupported { line: xml::line(node), problem });
+        }
+        if let Some(child) = node.first_element_child() {
+            (node, depth) = (child, depth + 1);
+            continue;
+        }
+        while node.next_sibling_element().is_none() {
+            let Some(parent) = node.parent_element().filter(|_| node != root) else { return Ok(()) };
+            (node, depth) = (parent, depth - 1);
+        }
+        if node == root {
+            return Ok(());
+        }
+        node = node.next_sibling_element().expect("there is one");
+    }
+}
+
 /// Reads a robot from the text of a URDF or MJCF file. Its control settings are `control`.
 ///
 /// Damping and friction of the file's joints are viscous and Coulomb friction of the robot. Contact parameters are
 /// those of the built-in Go2. Fails if the tree is not that of the Go2.
 pub fn import_robot(text: &str, names: &ImportNames, control: ControlConfig) -> Result<RobotModel, ImportError> {
-    let document = roxmltree::Document::parse(text).map_err(|error| ImportError::Xml(error.to_string()))?;
+    let options = roxmltree::ParsingOptions { nodes_limit: MAX_NODES, ..roxmltree::ParsingOptions::default() };
+    let document =
+        roxmltree::Document::parse_with_options(text, options).map_err(|error| ImportError::Xml(error.to_string()))?;
+    check_depth(document.root_element())?;
     let root = document.root_element();
     let description = match root.tag_name().name() {
         "robot" => urdf::read(root)?,

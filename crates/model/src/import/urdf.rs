@@ -1,5 +1,7 @@
 //! Reader of URDF files.
 
+use std::collections::BTreeSet;
+
 use glam::{DMat3, DQuat, DVec3};
 use roxmltree::Node;
 
@@ -9,16 +11,27 @@ use super::xml::{attribute_error, child, line, number, optional, required, text,
 use crate::RigidBody;
 
 const THREE: &str = "three numbers";
+/// Maximum number of links of a file.
+const MAX_LINKS: usize = 1000;
 
 /// Reads the element `<robot>`.
 pub fn read(robot: Node) -> Result<Description, ImportError> {
     let links: Vec<Node> = robot.children().filter(|node| node.has_tag_name("link")).collect();
     let joints: Vec<Node> = robot.children().filter(|node| node.has_tag_name("joint")).collect();
-    let mut is_child = Vec::new();
-    for joint in &joints {
-        is_child.push(linked(*joint, "child")?);
+    if links.len() > MAX_LINKS {
+        let problem = format!("the file has {} links; at most {MAX_LINKS} are read", links.len());
+        return Err(ImportError::Unsupported { line: line(robot), problem });
     }
-    let mut roots = links.iter().filter(|link| link.attribute("name").is_some_and(|name| !is_child.contains(&name)));
+    let mut is_child = BTreeSet::new();
+    for joint in &joints {
+        let link = linked(*joint, "child")?;
+        // A link below two joints would be read once for each path to it: 2^n times after n such pairs.
+        if !is_child.insert(link) {
+            let problem = format!("link `{link}` is the child of two joints: the links are no tree");
+            return Err(ImportError::Unsupported { line: line(*joint), problem });
+        }
+    }
+    let mut roots = links.iter().filter(|link| link.attribute("name").is_some_and(|name| !is_child.contains(name)));
     let (Some(root), None) = (roots.next(), roots.next()) else {
         let problem = "the links are not one tree: exactly one link must be no joint's child".to_owned();
         return Err(ImportError::Unsupported { line: line(robot), problem });

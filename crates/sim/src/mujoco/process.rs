@@ -4,7 +4,7 @@ use std::io::BufReader;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
 use super::frames::{ERROR, Frame, HELLO, check_greeting, read_frame, write_frame};
@@ -18,8 +18,8 @@ const EXIT_TIMEOUT: Duration = Duration::from_secs(2);
 /// is killed.
 pub struct Process {
     child: Child,
-    /// `None` after the first failure.
-    stdin: Option<ChildStdin>,
+    /// Requests to the thread that writes them; `None` after the first failure.
+    requests: Option<Sender<(u8, Vec<u8>)>>,
     /// Replies, or the reason why there are no more.
     replies: Receiver<Result<Frame, String>>,
     /// Reason of the first failure, which is also that of all later requests.
@@ -31,15 +31,22 @@ impl Process {
     pub fn start(python: &Path, hello: &[u8]) -> Result<Self, String> {
         let mut child = Command::new(python)
             .args(["-m", "twinstep.mujoco"])
+            // Modules are not looked for in the current folder, which anybody may have filled.
+            .env("PYTHONSAFEPATH", "1")
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             // Ctrl-C in a terminal reaches this process only, which then closes the stdin of the child.
             .process_group(0)
             .spawn()
             .map_err(|error| format!("the interpreter does not start: {error}"))?;
-        let stdin = child.stdin.take();
+        let stdin = child.stdin.take().expect("stdin is a pipe");
         let stdout = child.stdout.take().expect("stdout is a pipe");
-        let mut process = Self { child, stdin, replies: read_replies(stdout), failure: String::new() };
+        let mut process = Self {
+            child,
+            requests: Some(write_requests(stdin)),
+            replies: read_replies(stdout),
+            failure: String::new(),
+        };
         let greeting = process.request(HELLO, hello, HELLO)?;
         check_greeting(&greeting)?;
         Ok(process)
@@ -61,15 +68,15 @@ impl Process {
 
     /// Ends the process because of `reason`, which is that of all later requests.
     pub fn fail(&mut self, reason: String) {
-        if self.stdin.take().is_some() {
+        if self.requests.take().is_some() {
             self.failure = reason;
         }
     }
 
     fn exchange(&mut self, kind: u8, body: &[u8], expected: u8) -> Result<Vec<u8>, String> {
-        let Some(stdin) = &mut self.stdin else { return Err(self.failure.clone()) };
+        let Some(requests) = &self.requests else { return Err(self.failure.clone()) };
         // A request that cannot be written has no reply: the process has exited, or explains itself in its last reply.
-        let _ = write_frame(stdin, kind, body);
+        let _ = requests.send((kind, body.to_vec()));
         match self.replies.recv_timeout(REPLY_TIMEOUT) {
             Ok(Ok((kind, body))) if kind == expected => Ok(body),
             Ok(Ok((ERROR, text))) => Err(String::from_utf8_lossy(&text).into_owned()),
@@ -105,13 +112,26 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
-        let failed = self.stdin.take().is_none();
+        let failed = self.requests.take().is_none();
         if failed || self.wait().is_none() {
             // Both fail only if the process has ended.
             let _ = self.child.kill();
             let _ = self.child.wait();
         }
     }
+}
+
+/// Writes frames on a thread, so that a process that does not read can be given up.
+fn write_requests(mut stdin: ChildStdin) -> Sender<(u8, Vec<u8>)> {
+    let (sender, requests) = channel::<(u8, Vec<u8>)>();
+    std::thread::spawn(move || {
+        for (kind, body) in requests {
+            if write_frame(&mut stdin, kind, &body).is_err() {
+                break;
+            }
+        }
+    });
+    sender
 }
 
 /// Reads frames on a thread, so that a process that hangs can be given up.
