@@ -2,21 +2,31 @@
 
 use std::net::IpAddr;
 
-use crate::{ServerConfig, ServerError};
+use crate::ServerConfig;
 
 /// Protocols that check passwords, and those that check certificates too.
 const PROTOCOLS: [&str; 3] = ["tcp", "tls", "quic"];
 const WITH_CERTIFICATES: [&str; 2] = ["tls", "quic"];
 
+/// An endpoint at which others could command a robot.
+pub struct Exposed {
+    /// Key of the config file.
+    pub field: &'static str,
+    /// The endpoint.
+    pub endpoint: String,
+    /// What is missing.
+    pub reason: &'static str,
+}
+
 /// Checks each endpoint: only this machine, or somebody with a password or a certificate, can command a robot.
-pub fn check_protection(config: &ServerConfig, zenoh: &zenoh::Config) -> Result<(), ServerError> {
+pub fn check_protection(config: &ServerConfig, zenoh: &zenoh::Config) -> Result<(), Exposed> {
     let setting = |key: &str| zenoh.get_json(key).unwrap_or_default();
     let has_users = !matches!(setting("transport/auth/usrpwd/dictionary_file").as_str(), "" | "null");
     let has_certificates = setting("transport/link/tls/enable_mtls") == "true";
     let endpoints = std::iter::once(("listen", &config.listen)).chain(config.connect.iter().map(|to| ("connect", to)));
     for (field, endpoint) in endpoints {
         if let Some(reason) = exposure(endpoint, has_users, has_certificates) {
-            return Err(ServerError::Setting { field, value: endpoint.clone(), reason: reason.to_owned() });
+            return Err(Exposed { field, endpoint: endpoint.clone(), reason });
         }
     }
     Ok(())

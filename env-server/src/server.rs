@@ -20,7 +20,7 @@ use crate::executor::{Executor, Mailbox, SendLock};
 use crate::frame_publisher::FramePublisher;
 use crate::lease_manager::{LeaseHandler, LeaseManager, ServerInfo};
 use crate::messages::ServerState;
-use crate::protection::check_protection;
+use crate::protection::{Exposed, check_protection};
 use crate::stop_listener::StopListener;
 use crate::{EnvFactory, EnvFactoryError, ServerConfig};
 
@@ -122,7 +122,11 @@ impl Server {
         let min_message = if is_robot { MIN_ROBOT_MESSAGE } else { MIN_ZENOH_MESSAGE };
         let zenoh = zenoh_config(config, (4 * max_request_bytes).max(min_message))?;
         if is_robot {
-            check_protection(config, &zenoh)?;
+            check_protection(config, &zenoh).map_err(|Exposed { field, endpoint, reason }| ServerError::Setting {
+                field,
+                value: endpoint,
+                reason: reason.to_owned(),
+            })?;
         }
         let protected = zenoh.clone();
         let session = twinstep_session::open(zenoh)

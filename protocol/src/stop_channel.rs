@@ -109,8 +109,7 @@ mod tests {
     #[test]
     fn bytes_of_an_answer_are_the_golden_ones() {
         let greeting = Greeting(std::array::from_fn(|index| index as u8));
-        let golden =
-            std::fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/golden/stop_channel/answer.bin")).expect("a file");
+        let golden = std::fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/golden/stop_channel.bin")).expect("a file");
         let bytes = [&greeting.encode()[..], &answer(greeting, "alice", "change-me-1").expect("a short name")].concat();
         assert_eq!(bytes, golden);
     }

@@ -18,7 +18,7 @@ const LEASES: usize = 200;
 const MAX_THREADS: usize = 100;
 /// More than Zenoh has threads.
 const SILENT_CLIENTS: usize = 8;
-const UNREAD_REQUESTS: usize = 6000;
+const UNREAD_REQUESTS: usize = 1500;
 const UNDISTURBED: Duration = Duration::from_secs(2);
 /// Time for which the silent client reads nothing.
 const SILENCE: Duration = Duration::from_hours(1);

@@ -19,6 +19,7 @@
 //! - [`robot_rig`]: a fake Go2 under the safety state machine, on an accelerated clock
 //! - [`robot_campaign`]: faults of this robot in each state, and random sequences of events
 //! - [`soak`]: many clients that end in different ways
+//! - [`mod@safety`]: attacks on the robot's process and on servers
 //! - [`chrome_page`]: a page in a real browser that a test clicks
 //! - [`browser`]: layout of an HTML report in a real browser
 //! - [`security`]: files and certificates for TLS, users and access control
@@ -44,6 +45,7 @@ pub mod robot_campaign;
 pub mod robot_pair;
 pub mod robot_rig;
 pub mod roles;
+pub mod safety;
 pub mod security;
 pub mod soak;
 pub mod step_oracle;

@@ -69,7 +69,9 @@ impl RobotPair {
         let own = ["robot", "--interface", "127.0.0.1", "--listen", "tcp/127.0.0.1:0", "--config", config];
         let domain_text = domain.to_string();
         let robot = [&["--domain", &domain_text], robot].concat();
-        let robot = Process::start(program, &arguments(&own, &robot))?;
+        // In a process group of its own, to which a test may send signals.
+        let own = [&[program.to_str().unwrap_or_default()], &own[..]].concat();
+        let robot = Process::start(Path::new("setsid"), &arguments(&own, &robot))?;
         let line = robot.line(START).ok_or("the robot did not start")?;
         // With a policy of its own it serves no clients.
         let endpoint = line.strip_prefix("listening ").unwrap_or_default().to_owned();

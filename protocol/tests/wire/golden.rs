@@ -390,6 +390,7 @@ fn every_golden_file_belongs_to_a_message() {
     for entry in std::fs::read_dir(folder()).expect("the folder is there") {
         let path = entry.expect("the folder can be read").path();
         let name = path.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
-        assert!(NAMES.contains(&name), "no test reads {}", path.display());
+        // Its test is in `stop_channel.rs`.
+        assert!(NAMES.contains(&name) || name == "stop_channel", "no test reads {}", path.display());
     }
 }
