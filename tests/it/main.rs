@@ -9,7 +9,9 @@ static ALLOCATOR: cap::Cap<std::alloc::System> = cap::Cap::new(std::alloc::Syste
 mod any_robot;
 mod base_estimate;
 mod batch;
+mod bombs;
 mod cyclone;
+mod dds_packets;
 mod diagnose;
 mod discovery;
 mod disturbances;

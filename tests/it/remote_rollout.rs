@@ -161,6 +161,16 @@ fn invalid_rollouts_are_rejected_with_the_field_and_without_effect() {
         check("policy.sizes", ErrorCode::OutOfRange, 1, &with(&|policy| policy.sizes[1] = 0));
         check("policy.sizes", ErrorCode::OutOfRange, 1, &with(&|policy| policy.sizes[1] = u64::MAX));
         check("policy.weights", ErrorCode::BadShape, 1, &with(&|policy| policy.sizes[1] = 65_536));
+        // Layers of one unit are padded to 16 times their size.
+        check(
+            "policy.sizes",
+            ErrorCode::TooLarge,
+            1,
+            &with(&|policy| {
+                policy.sizes =
+                    [&policy.sizes[..1], &[1, 65_536, 1, 65_536, 1], &policy.sizes[policy.sizes.len() - 1..]].concat();
+            }),
+        );
         check("policy.weights", ErrorCode::BadShape, 1, &with(&|policy| policy.weights = &policy.weights[4..]));
         check("policy.std", ErrorCode::BadShape, 1, &with(&|policy| policy.std = &[]));
         check("policy.weights", ErrorCode::NotFinite, 1, &|request| {

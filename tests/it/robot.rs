@@ -10,7 +10,7 @@ use twinstep_identify::{Experiment, WindowConfig};
 use twinstep_model::{AutoresetMode, RealTimeReport, ResetRequest, VecEnv};
 use twinstep_protocol::keys;
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_tests::process::Process;
+use twinstep_tests::process::{Process, interruptible};
 use twinstep_tests::python::{Programs, python, root};
 use twinstep_tests::robot_pair::{PATIENT, RobotPair, next_domain};
 
@@ -253,6 +253,96 @@ fn stop_needs_no_lease_and_damps_at_once() {
         assert!(Command::new(python).args(["-c", &script]).env("PYTHONPATH", client).status().unwrap().success());
         pair.wait_for("fault", Duration::from_secs(2)).unwrap();
     });
+}
+
+#[test]
+fn stop_channel_stops_the_robot_beside_connections_that_say_nothing() {
+    test_in_real_time(|| {
+        let mut pair = standing(&[]);
+        let hello = RawClient::connect_to_only_server(&pair.endpoint, "stranger").hello();
+        let port = hello.real_time.unwrap().stop_port.unwrap();
+        let _idle: Vec<_> = (0..200).map(|_| std::net::TcpStream::connect(("127.0.0.1", port)).unwrap()).collect();
+        let since = Instant::now();
+        twinstep_client::stop_robot(&pair.endpoint, Some(port), None).unwrap();
+        pair.wait_for("fault", Duration::from_secs(2)).unwrap();
+        assert!(since.elapsed() < Duration::from_millis(500), "{:?}", since.elapsed());
+        assert!(pair.state().contains("stopped on request"), "{}", pair.state());
+    });
+}
+
+#[test]
+fn stop_channel_asks_for_the_password_of_a_user() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str, text: &str| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        path
+    };
+    let users = file("users.txt", "alice:secret\n");
+    let dictionary = format!("{{transport: {{auth: {{usrpwd: {{dictionary_file: \"{}\"}}}}}}}}", users.display());
+    let server = file("server.json5", &dictionary);
+    let user =
+        |password: &str| format!("{{transport: {{auth: {{usrpwd: {{user: \"alice\", password: \"{password}\"}}}}}}}}");
+    let (right, wrong) = (file("right.json5", &user("secret")), file("wrong.json5", &user("Secret")));
+    let pair = pair(&["--zenoh", server.to_str().unwrap()]);
+    let stop = |zenoh: Option<&Path>| {
+        twinstep_client::stop_robot(&pair.endpoint, None, zenoh).map_err(|error| error.to_string())
+    };
+    assert_eq!(stop(Some(&right)), Ok(()));
+    for zenoh in [Some(&*wrong), None] {
+        assert!(stop(zenoh).unwrap_err().contains("refuses user or password"));
+    }
+}
+
+#[test]
+fn recording_of_a_killed_process_is_read_up_to_a_second_before_its_end() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.mcap");
+    let mut pair = pair(&["--record", path.to_str().unwrap()]);
+    pair.wait_for("observe", Duration::from_mins(1)).unwrap();
+    pair.operator("release").unwrap();
+    pair.insist("arm").unwrap();
+    let since = Instant::now();
+    std::thread::sleep(Duration::from_millis(2700));
+    pair.robot.kill();
+    let recorded = since.elapsed().as_secs_f64();
+    let log = twinstep_logs::Log::open(&path).unwrap();
+    let seconds = log.rows() as f64 / 500.0;
+    assert!(seconds > recorded - 1.2, "{seconds} s of {recorded} s");
+    assert!(log.read_warnings()[0].contains("truncated"), "{:?}", log.read_warnings());
+}
+
+#[test]
+fn agent_of_before_a_fault_ends_or_waits_for_the_word_of_the_operator() {
+    test_in_real_time(|| {
+        let mut pair = standing(&[]);
+        let policy = root().join("data/policies/walk.safetensors");
+        let run = |more: &[&str]| {
+            let own = ["run", policy.to_str().unwrap(), "--endpoint", &pair.endpoint, "--velocity", "0.2,0,0"];
+            let arguments: Vec<String> = own.iter().chain(more).map(ToString::to_string).collect();
+            Process::start(&program(), &arguments).unwrap()
+        };
+        let (mut ends, endpoint) = (run(&[]), pair.endpoint.clone());
+        pair.wait_for("run", Duration::from_secs(20)).unwrap();
+        twinstep_client::stop_robot(&endpoint, None, None).unwrap();
+        assert_eq!(ends.exit_code(Duration::from_secs(20)), Some(1), "it ends with the fault");
+        pair.insist("arm").unwrap();
+        pair.insist("stand").unwrap();
+        pair.wait_for("ready", Duration::from_secs(20)).unwrap();
+        let own = ["run", policy.to_str().unwrap(), "--endpoint", &endpoint, "--velocity", "0.2,0,0", "--go-on"];
+        let _waits = Process::start(&program(), &own.map(str::to_owned)).unwrap();
+        std::thread::sleep(Duration::from_secs(3));
+        assert!(pair.state().starts_with("ready"), "nobody has let it act: {}", pair.state());
+        pair.insist("go").unwrap();
+        pair.wait_for("run", Duration::from_secs(10)).unwrap();
+    });
+}
+
+#[test]
+fn robot_has_no_rollouts() {
+    let pair = pair(&[]);
+    let hello = RawClient::connect_to_only_server(&pair.endpoint, "stranger").hello();
+    assert_eq!((hello.max_rollout_steps, hello.max_policy_bytes), (0, 0));
 }
 
 #[test]
@@ -518,7 +608,7 @@ fn python_client_that_waits_for_the_operator_ends_with_an_interrupt() {
         "import gymnasium, twinstep\nenv = gymnasium.make('twinstep/Go2-Walk-v0', endpoint='{}')\ntry:\n    env.reset()\nfinally:\n    env.close()",
         pair.endpoint
     );
-    let mut agent = Command::new(python)
+    let mut agent = interruptible(&python)
         .args(["-c", &script])
         .env("PYTHONPATH", root().join("clients/python/src"))
         .stderr(Stdio::piped())

@@ -1,6 +1,7 @@
 //! A child process that can be killed, suspended and resumed, and whose output is read line by line.
 
 use std::io::{BufRead, BufReader, Write};
+use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
@@ -18,14 +19,22 @@ pub struct Process {
 impl Process {
     /// Starts `program` with `arguments` and reads its stdout line by line.
     pub fn start(program: &Path, arguments: &[String]) -> Result<Self, String> {
-        let mut child = Command::new(program)
-            .args(arguments)
+        Self::spawn(Command::new(program).args(arguments))
+    }
+
+    /// As [`Process::start`], in a process group of its own.
+    pub fn start_in_group(program: &Path, arguments: &[String]) -> Result<Self, String> {
+        Self::spawn(Command::new(program).args(arguments).process_group(0))
+    }
+
+    fn spawn(command: &mut Command) -> Result<Self, String> {
+        let mut child = command
             // The pipe closes when this process exits; the child then exits too.
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
             .spawn()
-            .map_err(|error| format!("{} {}: {error}", program.display(), arguments.join(" ")))?;
+            .map_err(|error| format!("{command:?}: {error}"))?;
         let (sender, lines) = channel();
         let stdout = child.stdout.take().ok_or("the child has no stdout")?;
         std::thread::spawn(move || {
@@ -118,4 +127,12 @@ impl Drop for Process {
     fn drop(&mut self) {
         self.kill();
     }
+}
+
+/// Returns a command of `program` whose SIGINT has its default effect, also if this process ignores the signal, as one that a
+/// shell has started in the background does.
+pub fn interruptible(program: &Path) -> Command {
+    let mut command = Command::new("env");
+    command.arg("--default-signal=INT").arg(program);
+    command
 }

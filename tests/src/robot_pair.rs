@@ -70,8 +70,7 @@ impl RobotPair {
         let domain_text = domain.to_string();
         let robot = [&["--domain", &domain_text], robot].concat();
         // In a process group of its own, to which a test may send signals.
-        let own = [&[program.to_str().unwrap_or_default()], &own[..]].concat();
-        let robot = Process::start(Path::new("setsid"), &arguments(&own, &robot))?;
+        let robot = Process::start_in_group(program, &arguments(&own, &robot))?;
         let line = robot.line(START).ok_or("the robot did not start")?;
         // With a policy of its own it serves no clients.
         let endpoint = line.strip_prefix("listening ").unwrap_or_default().to_owned();

@@ -11,7 +11,12 @@ from test_env import assert_ends
 
 pytest.importorskip("stable_baselines3", reason='Stable-Baselines3 is not installed: pip install "twinstep[sb3]"')
 
+# A shell starts programs in the background with SIGINT ignored, and Python keeps that.
 PROGRAM = textwrap.dedent("""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
     import torch
     from stable_baselines3 import PPO
     from stable_baselines3.common.callbacks import BaseCallback

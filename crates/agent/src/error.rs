@@ -11,6 +11,12 @@ use crate::onnx::OnnxError;
 /// Reasons why a policy cannot run.
 #[derive(Debug, thiserror::Error)]
 pub enum AgentError {
+    /// A real robot was stopped while it ran the policy.
+    #[error("the robot was stopped: {reason}\n  start again, or use `--go-on` to wait for the operator and continue")]
+    RobotStopped {
+        /// Its fault.
+        reason: String,
+    },
     /// The extension of the policy is unknown.
     #[error("`{}` is neither *.safetensors nor *.onnx", path.display())]
     UnknownFormat {

@@ -25,6 +25,8 @@ pub struct RunPlan {
     pub action_noise: f64,
     /// Seed of the robot's random numbers, and of the noise.
     pub seed: u64,
+    /// True to wait for the operator and go on after a real robot was stopped; false to end with an error.
+    pub goes_on: bool,
 }
 
 /// Logs of a run, at most one.
@@ -110,7 +112,8 @@ impl Layout {
 
 /// Steps robot 0 of `env`, which must have one robot and [`twinstep_model::AutoresetMode::Disabled`].
 ///
-/// `control` is called before every step, with the robot to look at. After a fall the robot is reset and the run goes on.
+/// `control` is called before every step, with the robot to look at. After a fall the robot is reset and the run goes on;
+/// one that was stopped by a fault ends the run unless the plan goes on.
 /// If it fails, the rows of all executed steps are in the log.
 pub fn run(
     env: &mut dyn VecEnv,
@@ -160,6 +163,9 @@ pub fn run(
         }
         if let Some(recorder) = &mut recorders.joints {
             recorder.write(env)?;
+        }
+        if let Some(stop) = env.real_time().and_then(|report| report.stop.as_ref()).filter(|_| ended && !plan.goes_on) {
+            return Err(AgentError::RobotStopped { reason: stop.reason.clone() });
         }
         if ended {
             agent.reset(env, policy, &ResetRequest::default())?;

@@ -90,7 +90,7 @@ struct StatisticsReport {
 
 /// Simulates until a signal.
 pub fn run(args: &Args) -> CommandResult {
-    let signals = Signals::listen()?;
+    let signals = Signals::listen_unhurried()?;
     let address = args.interface.as_deref().map_or(Ok(IpAddr::V4(Ipv4Addr::LOCALHOST)), interface_address);
     let dds = Dds::join(args.domain, address.map_err(input)?).map_err(input)?;
     let backend = args.backend()?;

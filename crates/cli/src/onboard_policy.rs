@@ -36,7 +36,7 @@ impl OnboardPolicy {
 }
 
 fn run_when_ready(mut env: Box<dyn VecEnv>, mut policy: BoundPolicy, handle: &RobotHandle) {
-    let plan = RunPlan { seconds: None, real_time: false, action_noise: 0.0, seed: 0 };
+    let plan = RunPlan { seconds: None, real_time: false, action_noise: 0.0, seed: 0, goes_on: false };
     while !handle.is_ending() {
         if handle.wait_until(PATIENCE, |board| board.state == Some(State::Ready)).state != Some(State::Ready) {
             continue;

@@ -76,6 +76,10 @@ pub struct Args {
     /// joints.
     #[arg(long, value_name = "STD", default_value_t = 0.0)]
     pub action_noise: f64,
+    /// After a fault of a real robot, wait until its operator makes it stand and says `go`, and continue. Default: the run
+    /// ends with the fault.
+    #[arg(long)]
+    pub go_on: bool,
     /// Step as fast as the endpoint answers. Default: in real time.
     #[arg(long)]
     pub fast: bool,
@@ -239,7 +243,13 @@ impl Args {
         let (mut line, mut falls) = (StatusLine::new(), 0);
         // A robot sets the pace itself.
         let real_time = !self.fast && !env.is_real_time();
-        let plan = RunPlan { seconds: self.seconds, real_time, action_noise: self.action_noise, seed: self.seed };
+        let plan = RunPlan {
+            seconds: self.seconds,
+            real_time,
+            action_noise: self.action_noise,
+            seed: self.seed,
+            goes_on: self.go_on,
+        };
         let mut control = |status: &Status, env: &dyn VecEnv| {
             if status.falls > falls {
                 falls = status.falls;

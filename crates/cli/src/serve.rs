@@ -100,7 +100,7 @@ pub struct Args {
 /// Serves until a signal or, with `--until-stdin-closes`, the end of stdin.
 pub fn run(args: &Args) -> CommandResult {
     let config = args.config()?;
-    let signals = Signals::listen()?;
+    let signals = Signals::listen_unhurried()?;
     let factory = SimEnvFactory::new(config.clone()).map_err(input)?;
     let hub = Arc::new(Hub::new(scene(&config, factory.robot())));
     let _page = args.view.serve(&hub)?;
@@ -121,7 +121,10 @@ pub fn run(args: &Args) -> CommandResult {
         server.sid()
     );
     let stdin_closed = if args.until_stdin_closes { watch_stdin() } else { Arc::default() };
-    let outcome = watch(&server, &signals, &stdin_closed);
+    let is_orphan = args.until_stdin_closes.then(OrphanCheck::new);
+    let outcome = watch(&server, &signals, &|| {
+        stdin_closed.load(Ordering::Acquire) || is_orphan.as_ref().is_some_and(OrphanCheck::is_orphan)
+    });
     feed.stop();
     server.shutdown();
     outcome
@@ -211,6 +214,19 @@ fn listening_endpoint(server: &Server, config: &Config) -> String {
     endpoints.iter().find(|endpoint| endpoint.starts_with(address)).unwrap_or(requested).clone()
 }
 
+/// Notices the end of the program that started this one. A child that it has forked may keep the pipe to stdin open.
+struct OrphanCheck(u32);
+
+impl OrphanCheck {
+    fn new() -> Self {
+        Self(std::os::unix::process::parent_id())
+    }
+
+    fn is_orphan(&self) -> bool {
+        std::os::unix::process::parent_id() != self.0
+    }
+}
+
 fn watch_stdin() -> Arc<AtomicBool> {
     let closed = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&closed);
@@ -223,11 +239,11 @@ fn watch_stdin() -> Arc<AtomicBool> {
 }
 
 /// Shows the step rate until the server has to stop.
-fn watch(server: &Server, signals: &Signals, stdin_closed: &AtomicBool) -> CommandResult {
+fn watch(server: &Server, signals: &Signals, is_over: &dyn Fn() -> bool) -> CommandResult {
     let style = ProgressStyle::with_template("{spinner} {msg}").expect("the template is valid");
     let line = ProgressBar::new_spinner().with_style(style);
     let mut mark = (Instant::now(), 0);
-    while !signals.check()? && !stdin_closed.load(Ordering::Acquire) {
+    while !signals.check()? && !is_over() {
         std::thread::sleep(TICK);
         if mark.0.elapsed() >= Duration::from_secs(1) {
             let steps = server.env_steps();

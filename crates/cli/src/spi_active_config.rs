@@ -239,6 +239,7 @@ impl SpiActiveConfig {
             seconds: Some(self.seconds),
             action_noise: 0.0,
             fast: self.fast,
+            go_on: false,
             seed: self.seed,
             json: false,
             view: ViewArgs::default(),

@@ -292,6 +292,7 @@ impl U2eConfig {
             seconds: Some(self.seconds),
             action_noise: if is_noisy { self.action_noise } else { 0.0 },
             fast: self.fast,
+            go_on: false,
             seed: self.seed + iteration as u64,
             json: false,
             view: ViewArgs::default(),

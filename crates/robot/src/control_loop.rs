@@ -182,6 +182,9 @@ impl ControlLoop {
             let is_silent =
                 |at: Duration| now.saturating_sub(at) > MAX_ROBOT_SILENCE && !self.machine.state().is_moving();
             if self.robot.is_none_or(|(robot, at)| robot == writer || is_silent(at)) {
+                if self.robot.is_none_or(|(robot, _)| robot != writer) {
+                    self.handle.set_robot(writer);
+                }
                 self.robot = Some((writer, now));
             } else {
                 received.other_robot = true;

@@ -145,26 +145,48 @@ impl Dds {
     }
 
     /// Returns the addresses of the readers of `topic` in other participants, in a fixed order: for each reader those in the
-    /// network of the interface, or all that it announces if none is.
-    pub fn readers(&self, topic: Topic) -> Vec<SocketAddr> {
+    /// network of the interface, or all that it announces if none is. Readers of robots other than `robot`, the writer of the
+    /// states, are left out: their participant writes states too, or one at their address does.
+    pub fn readers(&self, topic: Topic, robot: Option<WriterGuid>) -> Vec<SocketAddr> {
+        let own = self.participant.guid().prefix;
+        let others = self.other_robots(robot);
         let readers = self.participant.discovered_readers();
         let of_topic = readers.iter().filter(|reader| reader.subscription_topic_data.topic_name() == topic.name);
-        let foreign =
-            of_topic.filter(|reader| reader.reader_proxy.remote_reader_guid.prefix != self.participant.guid().prefix);
-        let mut addresses: Vec<SocketAddr> = foreign
+        let mut addresses: Vec<SocketAddr> = of_topic
+            .map(|reader| &reader.reader_proxy)
+            .filter(|reader| reader.remote_reader_guid.prefix != own)
+            .filter(|reader| !others.prefixes.contains(&reader.remote_reader_guid.to_bytes()[..12].to_vec()))
             .flat_map(|reader| {
-                let of =
-                    |locators: &[_]| -> Vec<SocketAddr> { locators.iter().copied().map(SocketAddr::from).collect() };
-                let unicast: Vec<SocketAddr> = of(&reader.reader_proxy.unicast_locator_list);
-                let announced =
-                    if unicast.is_empty() { of(&reader.reader_proxy.multicast_locator_list) } else { unicast };
-                let usable = announced.into_iter().filter(|address| address.is_ipv4() && address.port() != 0);
-                nearest(usable.collect(), self.address)
+                let unicast = addresses(&reader.unicast_locator_list);
+                let multicast = addresses(&reader.multicast_locator_list);
+                nearest(if unicast.is_empty() { multicast } else { unicast }, self.address)
             })
+            .filter(|address| !others.addresses.contains(&address.ip()))
             .collect();
         addresses.sort_unstable();
         addresses.dedup();
         addresses
+    }
+
+    /// Returns the participants that write states, except that of `robot`, and their addresses, except those of `robot`.
+    fn other_robots(&self, robot: Option<WriterGuid>) -> OtherRobots {
+        let Some(robot) = robot else { return OtherRobots::default() };
+        let writers = self.participant.discovered_writers();
+        let of_states = writers.iter().filter(|writer| writer.publication_topic_data.topic_name() == LOW_STATE.name);
+        let (own, others): (Vec<_>, Vec<_>) = of_states
+            .map(|writer| &writer.writer_proxy)
+            .map(|writer| {
+                (writer.remote_writer_guid.to_bytes()[..12].to_vec(), addresses(&writer.unicast_locator_list))
+            })
+            .partition(|(prefix, _)| prefix[..] == robot[..12]);
+        let ips = |writers: &[(Vec<u8>, Vec<SocketAddr>)]| -> Vec<IpAddr> {
+            writers.iter().flat_map(|(_, addresses)| addresses).map(SocketAddr::ip).collect()
+        };
+        let of_own = ips(&own);
+        OtherRobots {
+            addresses: ips(&others).into_iter().filter(|address| !of_own.contains(address)).collect(),
+            prefixes: others.into_iter().map(|(prefix, _)| prefix).collect(),
+        }
     }
 
     fn topic(&self, topic: Topic, qos: &QosPolicies) -> Result<rustdds::Topic, DdsError> {
@@ -172,6 +194,19 @@ impl Dds {
             .create_topic(topic.name.to_owned(), topic.type_name.to_owned(), qos, TopicKind::NoKey)
             .map_err(|error| DdsError::Topic { topic: topic.name, reason: error.to_string() })
     }
+}
+
+/// Participants and addresses of robots that are not the one that is commanded.
+#[derive(Default)]
+struct OtherRobots {
+    prefixes: Vec<Vec<u8>>,
+    addresses: Vec<IpAddr>,
+}
+
+/// Returns the IPv4 addresses of locators.
+fn addresses<L: Copy + Into<SocketAddr>>(locators: &[L]) -> Vec<SocketAddr> {
+    let all = locators.iter().map(|locator| (*locator).into());
+    all.filter(|address| address.is_ipv4() && address.port() != 0).collect()
 }
 
 /// Returns those addresses that share the first three bytes with `interface`, or all if none does.

@@ -2,12 +2,13 @@
 
 use std::collections::VecDeque;
 use std::net::SocketAddr;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, TryLockError};
 use std::time::{Duration, Instant};
 
 use twinstep_model::PerJoint;
 
+use crate::command_datagram::WriterGuid;
 use crate::fault::Fault;
 use crate::input::{Action, ActionRefused, Client, OperatorRequest, RequestRefused};
 use crate::reading::Reading;
@@ -32,6 +33,8 @@ struct Shared {
     changed: Condvar,
     /// Addresses of those who read the commands.
     readers: Mutex<Vec<SocketAddr>>,
+    /// Id of the writer of the robot's states; zero before it is known.
+    robot: [AtomicU64; 2],
     has_panicked: AtomicBool,
     stop_requested: AtomicBool,
     is_ending: AtomicBool,
@@ -276,6 +279,21 @@ impl RobotHandle {
 
     pub(crate) fn has_panicked(&self) -> bool {
         self.0.has_panicked.load(Ordering::Acquire)
+    }
+
+    /// Sets the writer of the states that is the robot.
+    pub(crate) fn set_robot(&self, robot: WriterGuid) {
+        let (halves, _) = robot.as_chunks::<8>();
+        for (stored, half) in self.0.robot.iter().zip(halves) {
+            stored.store(u64::from_be_bytes(*half), Ordering::Release);
+        }
+    }
+
+    /// Returns the writer of the states that is the robot.
+    pub(crate) fn robot(&self) -> Option<WriterGuid> {
+        let [first, second] = [0, 1].map(|half: usize| self.0.robot[half].load(Ordering::Acquire).to_be_bytes());
+        let guid: WriterGuid = std::array::from_fn(|index| if index < 8 { first[index] } else { second[index - 8] });
+        (guid != [0; 16]).then_some(guid)
     }
 
     /// Sets the addresses of those who read the commands.

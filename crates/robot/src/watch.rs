@@ -97,7 +97,7 @@ impl Watch {
 /// Looks for those who write and those who read the commands to the motors.
 fn look(dds: &Dds, handle: &RobotHandle) {
     handle.set_foreign_writers(dds.foreign_writers(LOW_CMD));
-    handle.set_readers(dds.readers(LOW_CMD));
+    handle.set_readers(dds.readers(LOW_CMD, handle.robot()));
 }
 
 /// Returns the name of the active controller in the answer to [`CHECK_MODE`].

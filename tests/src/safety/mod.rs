@@ -85,7 +85,10 @@ pub fn in_state(program: &Path, state: &str) -> Result<RobotPair, String> {
             pair.wait_for(if state == "sit" { "ready" } else { state }, Duration::from_secs(15))?;
         }
         match state {
-            "sit" => pair.insist("sit")?,
+            "sit" => {
+                pair.insist("sit")?;
+                pair.wait_for("sit", Duration::from_secs(1))?;
+            }
             "stand_up" => std::thread::sleep(Duration::from_millis(1500)),
             _ => std::thread::sleep(Duration::from_millis(300)),
         }

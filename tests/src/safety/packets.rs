@@ -20,7 +20,7 @@ pub fn run(program: &Path, count: usize, seed: u64) -> Result<Vec<Row>, String> 
     let mut pair = in_state(program, "ready")?;
     let id = pair.robot.id();
     let ports = udp_ports(&with_children(id));
-    let prefix = writer_prefix(pair.domain)?;
+    let prefix = writer_of_states(pair.domain)?;
     let probe = Probe::start(pair.domain)?;
     std::thread::sleep(Duration::from_millis(500));
     let socket = UdpSocket::bind("127.0.0.1:0").map_err(|error| error.to_string())?;
@@ -62,7 +62,7 @@ fn with_children(id: u32) -> Vec<u32> {
 }
 
 /// Returns the UDP ports of processes.
-fn udp_ports(ids: &[u32]) -> Vec<u16> {
+pub fn udp_ports(ids: &[u32]) -> Vec<u16> {
     let table = std::fs::read_to_string("/proc/net/udp").unwrap_or_default();
     let sockets: Vec<String> = ids
         .iter()
@@ -79,8 +79,8 @@ fn udp_ports(ids: &[u32]) -> Vec<u16> {
     table.lines().filter_map(port).collect()
 }
 
-/// Returns the prefix and the id of the writer of the robot's states, as everybody on the network sees them.
-fn writer_prefix(domain: u16) -> Result<[u8; 16], String> {
+/// Returns the id of the writer of the robot's states, as everybody on the network sees it.
+pub fn writer_of_states(domain: u16) -> Result<[u8; 16], String> {
     use twinstep_robot::dds::{Dds, LOW_STATE};
     let dds = Dds::join(domain, [127, 0, 0, 1].into()).map_err(|error| error.to_string())?;
     let reader = dds.reader(LOW_STATE, std::thread::current()).map_err(|error| error.to_string())?;
