@@ -7,14 +7,14 @@ use twinstep_tests::process::Process;
 use twinstep_tests::python::{Programs, cyclone_python, root};
 use twinstep_tests::robot_pair::{PATIENT, RobotPair, next_domain};
 
-#[test]
-fn robot_with_the_vendors_dds_is_observed_released_and_stands_up() {
+/// Starts a robot with the vendor's DDS library, and makes it stand. `None` without Python 3.10.
+fn standing() -> Option<RobotPair> {
     let python = match cyclone_python(&crate::python::target()) {
         Ok(python) => python,
         Err(reason) => {
             // Written directly to stderr: the test harness hides the output of passing tests.
             let _ = writeln!(std::io::stderr(), "\nSKIPPED the test with Cyclone DDS 0.10.2: {reason}");
-            return;
+            return None;
         }
     };
     let program = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep();
@@ -24,6 +24,30 @@ fn robot_with_the_vendors_dds_is_observed_released_and_stands_up() {
     let config = format!("{PATIENT}min_state_hz = 100\n");
     let mut pair = RobotPair::in_front_of(robot, domain, &config, &program, &[]).unwrap();
     pair.stand().unwrap();
+    Some(pair)
+}
+
+#[test]
+fn watchdog_damps_a_robot_with_the_vendors_dds() {
+    for signal in ["KILL", "STOP"] {
+        let Some(mut pair) = standing() else { return };
+        pair.robot.signal(signal).unwrap();
+        std::thread::sleep(Duration::from_millis(500));
+        let [before, after] = [0, 1].map(|_| {
+            std::thread::sleep(Duration::from_millis(500));
+            pair.ask("statistics").unwrap()
+        });
+        let is_damped = |gains: &serde_json::Value| gains[0] == 0.0 && gains[1] == 3.0;
+        assert!(after["last_gains"].as_array().unwrap().iter().all(is_damped), "{signal}: {after}");
+        let received = |report: &serde_json::Value| report["received"].as_u64().unwrap();
+        assert!(received(&after) > received(&before) + 20, "{signal}: {before}, then {after}");
+        assert_eq!(after["wrong_checksum"], 0, "{after}");
+    }
+}
+
+#[test]
+fn robot_with_the_vendors_dds_is_observed_released_and_stands_up() {
+    let Some(mut pair) = standing() else { return };
     let report = pair.ask("statistics").unwrap();
     assert_eq!(report["wrong_checksum"], 0, "by its own code: {report}");
     assert_eq!((&report["not_low_level"], &report["before_release"]), (&0.into(), &0.into()), "{report}");
