@@ -57,12 +57,11 @@ struct ClientQueue {
 impl State {
     /// Appends a mailbox to the queue of its client.
     fn push(&mut self, mailbox: Arc<Mailbox>) {
-        match self.ready.iter_mut().find(|queue| queue.client == mailbox.client) {
-            Some(queue) => queue.mailboxes.push_back(mailbox),
-            None => {
-                let client = mailbox.client.clone();
-                self.ready.push_back(ClientQueue { client, mailboxes: VecDeque::from([mailbox]), running: 0 });
-            }
+        if let Some(queue) = self.ready.iter_mut().find(|queue| queue.client == mailbox.client) {
+            queue.mailboxes.push_back(mailbox);
+        } else {
+            let client = mailbox.client.clone();
+            self.ready.push_back(ClientQueue { client, mailboxes: VecDeque::from([mailbox]), running: 0 });
         }
     }
 

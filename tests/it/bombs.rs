@@ -18,6 +18,10 @@ fn import(text: &str) -> String {
     error.to_string()
 }
 
+fn numbered(count: usize, part: impl Fn(usize) -> String) -> String {
+    (0..count).map(part).collect::<Vec<_>>().concat()
+}
+
 #[test]
 fn urdf_whose_links_have_two_parents_is_refused() {
     let joint = |index: usize, copy: char| {
@@ -26,11 +30,11 @@ fn urdf_whose_links_have_two_parents_is_refused() {
             index + 1
         )
     };
-    let links: String = (0..61).map(|index| format!("<link name=\"l{index}\"/>")).collect();
+    let links = numbered(61, |index| format!("<link name=\"l{index}\"/>"));
     let joints: String = (0..60).map(|index| joint(index, 'a') + &joint(index, 'b')).collect();
     let text = import(&format!("<robot name=\"bomb\">{links}{joints}</robot>"));
     assert!(text.contains("`l1` is the child of two joints"), "{text}");
-    let many: String = (0..1001).map(|index| format!("<link name=\"l{index}\"/>")).collect();
+    let many = numbered(1001, |index| format!("<link name=\"l{index}\"/>"));
     assert!(import(&format!("<robot name=\"bomb\">{many}</robot>")).contains("at most 1000"));
 }
 
@@ -39,7 +43,7 @@ fn mjcf_with_deep_bodies_or_classes_is_refused() {
     let bodies = "<body>".repeat(20_000) + &"</body>".repeat(20_000);
     let text = import(&format!("<mujoco><worldbody>{bodies}</worldbody></mujoco>"));
     assert!(text.contains("deeper than 256"), "{text}");
-    let attributes: String = (0..1001).map(|index| format!(" a{index}=\"1\"")).collect();
+    let attributes = numbered(1001, |index| format!(" a{index}=\"1\""));
     let text = import(&format!("<mujoco><default><geom{attributes}/></default><worldbody/></mujoco>"));
     assert!(text.contains("at most 1000"), "{text}");
 }
@@ -52,7 +56,7 @@ fn csv_that_is_compressed_too_well_is_refused() {
     file.write_all(b"t,q_FL_hip\n").unwrap();
     (0..64).for_each(|_| file.write_all(&vec![b'0'; 1 << 20]).unwrap());
     file.finish().unwrap();
-    std::fs::write(meta, r#"{"rate_hz": 200, "joints": ["FL_hip"], "tau_sensor": "none", "segments": []}"#).unwrap();
+    std::fs::write(meta, r#"{"rate_hz": 200, "joints": ["FL_hip"], "tau_sensor": "none", "segments": [{"name": "held", "base": "fixed"}]}"#).unwrap();
     let since = Instant::now();
     let error = twinstep_logs::Log::open(folder.path()).expect_err("a bomb").to_string();
     assert!(error.contains("1024 times") && since.elapsed() < AT_ONCE, "{error}");

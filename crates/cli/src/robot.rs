@@ -286,7 +286,7 @@ fn check_timeout(name: &str, address: IpAddr, safety: &SafetyConfig) -> CommandR
 }
 
 /// Returns the failure of invalid input.
-pub fn text(message: &str) -> Failure {
+fn text(message: &str) -> Failure {
     Failure::Input(miette::Report::msg(message.to_owned()))
 }
 

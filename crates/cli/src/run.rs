@@ -167,10 +167,13 @@ pub fn record(args: &Args, signals: &Signals) -> Result<Recording, Failure> {
         let rows = recorder.map_or(0, |recorder| recorder.rows()) + joints.map_or(0, |joints| joints.rows());
         eprintln!("{rows} rows in {}", folder.display());
     }
-    let summary = result.map_err(|error| interrupted(signals, error))?;
-    // Its error is of no interest any more: the run is complete.
     let (robot, task) = (env.spec().robot.clone(), env.spec().task.clone());
-    let _ = env.close();
+    // Otherwise the robot is taken until the grace period has passed. After another error the server may be gone.
+    if matches!(result, Ok(_) | Err(AgentError::RobotStopped { .. })) {
+        // Its error is of no interest any more: the run has ended.
+        let _ = env.close();
+    }
+    let summary = result.map_err(|error| interrupted(signals, error))?;
     if let Some(reason) = device_failure {
         return Err(Failure::Other(miette::Report::msg(reason)));
     }

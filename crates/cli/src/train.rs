@@ -142,12 +142,9 @@ fn train_policy(args: &Args, signals: &Signals, start: Instant) -> Result<TrainS
 /// Reads the checkpoint of a training. The error of one that is damaged names the one before.
 fn read_checkpoint(args: &Args) -> Result<Checkpoint, Failure> {
     let previous = args.out.join(PREVIOUS);
-    Checkpoint::read(args.checkpoint()).map_err(|error| match previous.exists() {
-        true => Failure::Input(miette::miette!(
-            "{error}\n  the one before it is {}: rename it to continue",
-            previous.display()
-        )),
-        false => input(error),
+    Checkpoint::read(args.checkpoint()).map_err(|error| {
+        let hint = || miette::miette!("{error}\n  the one before it is {}: rename it to continue", previous.display());
+        if previous.exists() { Failure::Input(hint()) } else { input(error) }
     })
 }
 

@@ -11,7 +11,6 @@ use twinstep_protocol::random_id;
 use twinstep_viewer::{Hub, SceneInfo, WatchedVecEnv, WebServer};
 
 use crate::exit::{Failure, input, other};
-use crate::robot::text;
 
 /// Where the page is, if no address is given.
 const DEFAULT_ADDRESS: &str = "127.0.0.1:7480";
@@ -114,9 +113,8 @@ fn token(address: SocketAddr, file: Option<&Path>) -> Result<Option<String>, Fai
     match file {
         Some(file) => {
             let read = std::fs::read_to_string(file);
-            let text =
-                read.map_err(|error| text(&format!("cannot read the token file {}: {error}", file.display())))?;
-            Ok(Some(text.trim().to_owned()))
+            let cause = |error| miette::miette!("cannot read the token file {}: {error}", file.display());
+            Ok(Some(read.map_err(|error| Failure::Input(cause(error)))?.trim().to_owned()))
         }
         None => Ok((!address.ip().is_loopback()).then(|| [random_id(), random_id()].concat())),
     }

@@ -12,6 +12,7 @@ use crate::watchdog::Watchdog;
 
 /// What happened since the last step.
 #[derive(Clone, Debug, PartialEq)]
+#[allow(clippy::struct_excessive_bools, reason = "the flags are independent")]
 pub struct Input {
     /// Time on a monotonic clock, the one that policy ticks are counted on.
     pub now: Duration,

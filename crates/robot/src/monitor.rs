@@ -174,16 +174,6 @@ impl Monitor {
         self.other_robot_at.is_some_and(|at| self.now.saturating_sub(at) < QUIET_TIME)
     }
 
-    /// Returns the fault of the watchdog. A robot that moves needs one that guards it.
-    fn watchdog_fault(&self, state: State, watchdog: Watchdog) -> Option<Fault> {
-        match watchdog {
-            Watchdog::Guarding => None,
-            Watchdog::Idle => state.is_moving().then_some(Fault::WatchdogGone),
-            Watchdog::Missing => Some(Fault::WatchdogGone),
-            Watchdog::TookOver => Some(Fault::WatchdogTookOver),
-        }
-    }
-
     fn remote_is_lost(&self) -> bool {
         let timeout = Duration::from_millis(self.config.remote_timeout_ms);
         self.config.remote_required && self.remote_at.is_none_or(|at| self.now.saturating_sub(at) > timeout)
@@ -194,7 +184,7 @@ impl Monitor {
         let writers = input.foreign_writers;
         let surroundings = [
             input.stop_requested.then_some(Fault::StopRequested),
-            self.watchdog_fault(state, input.watchdog),
+            watchdog_fault(state, input.watchdog),
             (self.pause > Duration::from_millis(self.config.max_pause_ms))
                 .then_some(Fault::Pause { ms: self.pause.as_millis() as u64 }),
             (!input.can_send).then_some(Fault::CannotSend),
@@ -236,13 +226,23 @@ impl Monitor {
         [
             reading.remote.as_ref().is_some_and(is_stop).then_some(Fault::RemoteStop),
             (lost > config.max_lost_messages).then_some(Fault::MessagesLost { count: lost }),
-            (!(degrees <= config.max_tilt_deg)).then_some(Fault::Tilt { degrees }),
-            (!(disagreement <= config.max_imu_disagreement_deg))
+            (!(..=config.max_tilt_deg).contains(&degrees)).then_some(Fault::Tilt { degrees }),
+            (!(..=config.max_imu_disagreement_deg).contains(&disagreement))
                 .then_some(Fault::ImuDisagrees { degrees: disagreement }),
             first(&outside).map(|joint| Fault::JointLimit { joint, q: reading.q[joint.index()] }),
             first(&overloaded).map(|joint| Fault::Torque { joint, tau: reading.tau[joint.index()] }),
             first(&hot).map(|joint| Fault::Temperature { joint, celsius: reading.temperature[joint.index()] }),
-            (!(reading.voltage >= config.min_voltage_v)).then_some(Fault::Voltage { volts: reading.voltage }),
+            (!(config.min_voltage_v..).contains(&reading.voltage)).then_some(Fault::Voltage { volts: reading.voltage }),
         ]
+    }
+}
+
+/// Returns the fault of the watchdog. A robot that moves needs one that guards it.
+fn watchdog_fault(state: State, watchdog: Watchdog) -> Option<Fault> {
+    match watchdog {
+        Watchdog::Guarding => None,
+        Watchdog::Idle => state.is_moving().then_some(Fault::WatchdogGone),
+        Watchdog::Missing => Some(Fault::WatchdogGone),
+        Watchdog::TookOver => Some(Fault::WatchdogTookOver),
     }
 }

@@ -90,7 +90,7 @@ impl Reading {
         }
         let imu = [("gyroscope", state.imu_state.gyroscope), ("accelerometer", state.imu_state.accelerometer)];
         for (quantity, value) in imu {
-            if value.iter().any(|part| !(part.abs() <= MAX_IMU)) {
+            if value.iter().any(|part| !(..=MAX_IMU).contains(&part.abs())) {
                 return Err(ReadingError::Imu { quantity, value });
             }
         }

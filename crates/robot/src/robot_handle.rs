@@ -96,6 +96,7 @@ pub(crate) struct Taken {
 
 /// State of the loop after its last step.
 #[derive(Clone, Debug, Default, PartialEq)]
+#[allow(clippy::struct_excessive_bools, reason = "the flags are independent")]
 pub struct Board {
     /// Time of the last step since the start of the loop's clock.
     pub now: Duration,

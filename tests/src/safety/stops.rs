@@ -176,8 +176,8 @@ fn measure(
 #[derive(Default)]
 struct Load {
     children: Vec<Child>,
-    _streams: Vec<TcpStream>,
-    _clients: Vec<(Proxy, Connection)>,
+    streams: Vec<TcpStream>,
+    clients: Vec<(Proxy, Connection)>,
 }
 
 impl Load {
@@ -190,11 +190,11 @@ impl Load {
                 std::thread::sleep(Duration::from_millis(500));
             }
             "300 page connections" => {
-                this._streams = (0..300).filter_map(|_| TcpStream::connect("127.0.0.1:7493").ok()).collect();
+                this.streams = (0..300).filter_map(|_| TcpStream::connect("127.0.0.1:7493").ok()).collect();
                 std::thread::sleep(Duration::from_millis(300));
             }
             "8 frozen clients" => {
-                this._clients = (0..8).map(|_| freeze(endpoint)).collect::<Result<_, _>>()?;
+                this.clients = (0..8).map(|_| freeze(endpoint)).collect::<Result<_, _>>()?;
                 std::thread::sleep(FREEZE);
             }
             _ => {}

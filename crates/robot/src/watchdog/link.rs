@@ -118,10 +118,8 @@ impl WatchdogLink {
 
     /// A watchdog that does not read has a full socket, and becomes [`Watchdog::Missing`] by its silence.
     fn send(&mut self, message: &[u8]) {
-        match send(self.socket.as_fd(), message, SendFlags::DONTWAIT | SendFlags::NOSIGNAL) {
-            Err(Errno::PIPE | Errno::CONNRESET) => self.is_closed = true,
-            _ => {}
-        }
+        let sent = send(self.socket.as_fd(), message, SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
+        self.is_closed |= matches!(sent, Err(Errno::PIPE | Errno::CONNRESET));
     }
 }
 
