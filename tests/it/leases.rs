@@ -1,5 +1,7 @@
 //! Ownership, expiry and reclaiming of leases.
 
+use std::io::{BufRead, BufReader};
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use twinstep_env_server::Server;
@@ -7,6 +9,7 @@ use twinstep_envs::TaskConfig;
 use twinstep_protocol::keys::EnvMethod;
 use twinstep_protocol::message::{LeaseReply, LeaseRequest};
 use twinstep_protocol::{ErrorCode, ErrorReply, Secret, keys};
+use twinstep_tests::python::Programs;
 
 use crate::raw_client::{RawClient, step_bytes, steps_in};
 use crate::remote::{config, start};
@@ -246,4 +249,22 @@ fn lease_of_a_client_without_liveliness_token_expires() {
     wait_until("the lease has expired", || client.hello().free_envs == 64);
     assert_eq!(client.step(&lease, 2).unwrap_err().code, ErrorCode::LeaseLost);
     server.shutdown();
+}
+
+#[test]
+fn server_ends_with_the_program_that_started_it_although_its_stdin_is_open() {
+    let program = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep();
+    // The shell is the program; its stdin, which the server inherits, stays open here as in a forked child.
+    let serve = "serve --task counter --envs 1 --listen tcp/127.0.0.1:0 --until-stdin-closes";
+    let commands = format!("exec 3<&0; {} {serve} <&3 & wait", program.display());
+    let mut shell =
+        Command::new("sh").args(["-c", &commands]).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    let _stdin = shell.stdin.take();
+    let mut lines = BufReader::new(shell.stdout.take().unwrap()).lines();
+    assert!(lines.next().unwrap().unwrap().starts_with("listening"));
+    shell.kill().unwrap();
+    shell.wait().unwrap();
+    let (sender, has_ended) = std::sync::mpsc::channel();
+    std::thread::spawn(move || sender.send(lines.count()));
+    assert!(has_ended.recv_timeout(Duration::from_secs(10)).is_ok(), "the server lives on");
 }

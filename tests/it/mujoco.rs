@@ -28,9 +28,14 @@ struct Interpreter(TempDir);
 impl Interpreter {
     /// Returns the interpreter of the tests. Returns `None` with a message on stderr if there is no Python.
     fn of_tests() -> Option<Self> {
+        Self::in_folder(Path::new("."))
+    }
+
+    /// Returns the interpreter of the tests with a current folder.
+    fn in_folder(folder: &Path) -> Option<Self> {
         let python = python(&crate::python::target()).unwrap()?;
-        let source = root().join("clients/python/src");
-        Some(Self::script(&format!("PYTHONPATH={} exec {} \"$@\"", source.display(), python.display())))
+        let (folder, source, python) = (folder.display(), root().join("clients/python/src"), python.display());
+        Some(Self::script(&format!("cd {folder} && PYTHONPATH={} exec {python} \"$@\"", source.display())))
     }
 
     /// Returns a shell script in place of an interpreter.
@@ -271,6 +276,16 @@ fn killed_process_is_an_error_of_every_later_request() {
     assert_eq!(reason, "it ended (signal: 9 (SIGKILL)); its messages are on stderr");
     let again = env.reset(&ResetRequest::seeded(7, 1)).unwrap_err();
     assert_eq!(again.to_string(), error.to_string());
+}
+
+#[test]
+fn modules_of_the_current_folder_are_not_run() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(python) = Interpreter::in_folder(folder.path()) else { return };
+    for module in ["twinstep.py", "mujoco.py", "numpy.py"] {
+        std::fs::write(folder.path().join(module), "raise SystemExit('a stranger is running')").unwrap();
+    }
+    python.backend(go2(), config(), 1);
 }
 
 fn check_error(python: &Path, robot: RobotModel, config: SimConfig, message: &Expect) {

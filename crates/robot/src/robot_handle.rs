@@ -354,3 +354,16 @@ fn try_lock<T>(mutex: &Mutex<T>) -> Option<MutexGuard<'_, T>> {
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn request_that_nobody_took_in_time_is_never_executed() {
+        let handle = RobotHandle::default();
+        let answer = handle.request(OperatorRequest::Stand, Duration::from_millis(1));
+        assert_eq!(answer, Err(RequestRefused::Expired));
+        assert_eq!(handle.take().request, Some((1, None)));
+    }
+}
