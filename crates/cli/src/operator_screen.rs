@@ -153,7 +153,7 @@ fn show(
 
 fn draw(frame: &mut Frame, view: &View) {
     let areas =
-        Layout::vertical([Constraint::Length(5), Constraint::Length(14), Constraint::Min(3), Constraint::Length(1)]);
+        Layout::vertical([Constraint::Length(6), Constraint::Length(14), Constraint::Min(3), Constraint::Length(1)]);
     let [summary, joints, messages, keys] = areas.areas(frame.area());
     frame.render_widget(Paragraph::new(summary_lines(view)), summary);
     match &view.board.reading {
@@ -185,10 +185,11 @@ fn summary_lines(view: &View) -> Vec<Line<'static>> {
         ]),
         Line::raw(format!("client {client}   {}   tick {}, missed {}", view.place, board.tick, board.missed_ticks)),
         Line::raw(format!(
-            "watchdog {}   built-in controller {controller}   other writers {}   {sensors}",
+            "watchdog {}   built-in controller {controller}   other writers {}",
             operator::watchdog_text(board.watchdog),
             board.foreign_writers
         )),
+        Line::raw(sensors),
         Line::raw(timing_text(timing)),
         Line::styled(recording_text(timing), Style::new().fg(Color::Red)),
     ]

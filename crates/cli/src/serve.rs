@@ -99,6 +99,8 @@ pub struct Args {
 
 /// Serves until a signal or, with `--until-stdin-closes`, the end of stdin.
 pub fn run(args: &Args) -> CommandResult {
+    // The parent may end at any time from now on.
+    let is_orphan = args.until_stdin_closes.then(OrphanCheck::new);
     let config = args.config()?;
     let signals = Signals::listen_unhurried()?;
     let factory = SimEnvFactory::new(config.clone()).map_err(input)?;
@@ -121,7 +123,6 @@ pub fn run(args: &Args) -> CommandResult {
         server.sid()
     );
     let stdin_closed = if args.until_stdin_closes { watch_stdin() } else { Arc::default() };
-    let is_orphan = args.until_stdin_closes.then(OrphanCheck::new);
     let outcome = watch(&server, &signals, &|| {
         stdin_closed.load(Ordering::Acquire) || is_orphan.as_ref().is_some_and(OrphanCheck::is_orphan)
     });
