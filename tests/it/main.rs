@@ -37,6 +37,7 @@ mod log;
 mod mirror;
 mod mujoco;
 mod next_experiment;
+mod other_robots;
 mod play;
 mod plots;
 mod policy;

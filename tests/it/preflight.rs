@@ -262,6 +262,17 @@ fn faults_end_the_motions_in_damping() {
 }
 
 #[test]
+fn second_robot_is_named_and_nothing_is_moved() {
+    let mut commands = 0;
+    let report = run_with(robot_with(&[]), |robot, _, input| {
+        input.other_robot = true;
+        commands = robot.statistics().accepted;
+    });
+    assert!(report.findings.iter().any(|finding| finding.id == "other_robot"), "{report:?}");
+    assert_eq!(commands, 0);
+}
+
+#[test]
 fn states_that_are_a_little_late_or_sometimes_lost_are_no_finding() {
     for lines in [&["delay 2"][..], &["delay 6"], &["loss 0.05"], &["reorder"], &["delay 4", "loss 0.02"]] {
         let report = run(robot_with(lines));

@@ -12,7 +12,6 @@ use twinstep_logs::RecordedTopic;
 use twinstep_model::{Command, RobotModel};
 use twinstep_unitree::{LowState, decode, encode};
 
-use crate::command_datagram::WriterGuid;
 use crate::config::{ConfigError, SafetyConfig};
 use crate::dds::{Dds, DdsError, LOW_STATE, Reader, SPORT_MODE_STATE};
 use crate::input::{Action, Client, Input, Output, RequestRefused};
@@ -22,6 +21,7 @@ use crate::reading::Reading;
 use crate::real_time_thread;
 use crate::recorder::Recorder;
 use crate::robot_handle::{Board, RobotHandle, Taken, TimedSample};
+use crate::robot_writer::RobotWriter;
 use crate::state::State;
 use crate::timing::Timing;
 use crate::watchdog::Watchdog;
@@ -32,9 +32,6 @@ const TIMER: Duration = Duration::from_micros(2500);
 const PERIOD: Duration = Duration::from_millis(2);
 /// Time for which an armed robot is damped before the loop ends, so that it lies when its commands cease.
 const FINAL_DAMPING: Duration = Duration::from_millis(1500);
-
-/// Silence of the robot after which another writer of `rt/lowstate` counts as the robot.
-const MAX_ROBOT_SILENCE: Duration = Duration::from_secs(1);
 
 /// Reasons why the loop cannot start.
 #[derive(Debug, thiserror::Error)]
@@ -76,7 +73,7 @@ pub fn start(
             motors,
             reader,
             base_reader,
-            robot: None,
+            robot: RobotWriter::default(),
             recorder,
             handle: handle.clone(),
             policy_dt,
@@ -123,8 +120,7 @@ struct ControlLoop {
     reader: Reader,
     /// Position and velocity of the base, from the built-in controller or a motion capture; only recorded.
     base_reader: Reader,
-    /// The writer of `rt/lowstate` that is the robot, with the time of its last state.
-    robot: Option<(WriterGuid, Duration)>,
+    robot: RobotWriter,
     recorder: Option<Recorder>,
     handle: RobotHandle,
     policy_dt: Duration,
@@ -146,19 +142,12 @@ struct ControlLoop {
     board: Board,
 }
 
-/// States that arrived since the last step.
-#[derive(Default)]
-struct Received {
-    states: Vec<LowState>,
-    other_robot: bool,
-}
-
 impl ControlLoop {
     fn run(&mut self) {
         while !self.has_ended() {
-            let received = self.take_states();
+            let states = self.take_states();
             let now = self.start.elapsed();
-            let is_from_state = !received.states.is_empty();
+            let is_from_state = !states.is_empty();
             if !is_from_state && now < self.due {
                 std::thread::park_timeout(self.due.saturating_sub(now));
                 continue;
@@ -169,29 +158,21 @@ impl ControlLoop {
             if !is_from_state {
                 self.timing.timer_lateness.add(now.saturating_sub(self.due));
             }
-            self.step(now, received);
+            self.step(now, &states);
             (self.last_step, self.due) = (Some(now), now + TIMER);
         }
     }
 
     /// Returns the states that have arrived since the last call, oldest first.
-    fn take_states(&mut self) -> Received {
-        let mut received = Received::default();
+    fn take_states(&mut self) -> Vec<LowState> {
+        let mut states = Vec::new();
         while let Some((payload, writer)) = self.reader.take_with_writer() {
             let now = self.start.elapsed();
-            let is_silent =
-                |at: Duration| now.saturating_sub(at) > MAX_ROBOT_SILENCE && !self.machine.state().is_moving();
-            if self.robot.is_none_or(|(robot, at)| robot == writer || is_silent(at)) {
-                if self.robot.is_none_or(|(robot, _)| robot != writer) {
-                    self.handle.set_robot(writer);
-                }
-                self.robot = Some((writer, now));
-            } else {
-                received.other_robot = true;
+            if !self.robot.accepts(writer, now, self.machine.state().is_moving()) {
                 continue;
             }
             match decode::<LowState>(&payload) {
-                Ok(state) => received.states.push(state),
+                Ok(state) => states.push(state),
                 Err(error) => self.drop_state(&error),
             }
             self.record(RecordedTopic::State, payload);
@@ -199,7 +180,10 @@ impl ControlLoop {
         while let Some(payload) = self.base_reader.take() {
             self.record(RecordedTopic::BaseState, payload);
         }
-        received
+        if let Some(robot) = self.robot.robot() {
+            self.handle.set_robot(robot);
+        }
+        states
     }
 
     fn drop_state(&mut self, error: &impl std::fmt::Display) {
@@ -207,9 +191,9 @@ impl ControlLoop {
         tracing::debug!(%error, "state dropped");
     }
 
-    fn step(&mut self, now: Duration, received: Received) {
-        let mut readings = Vec::with_capacity(received.states.len());
-        for state in &received.states {
+    fn step(&mut self, now: Duration, states: &[LowState]) {
+        let mut readings = Vec::with_capacity(states.len());
+        for state in states {
             match Reading::new(state) {
                 Ok(reading) => readings.push(reading),
                 Err(error) => self.drop_state(&error),
@@ -221,7 +205,7 @@ impl ControlLoop {
         let input = Input {
             now,
             readings,
-            other_robot: received.other_robot,
+            other_robot: self.robot.take_other(),
             foreign_writers: self.handle.foreign_writers(),
             watchdog,
             can_send: self.motors.can_send(),

@@ -87,6 +87,7 @@ pub mod real_time_thread;
 mod recorder;
 mod resampler;
 mod robot_handle;
+mod robot_writer;
 mod state;
 mod timing;
 mod trajectory;

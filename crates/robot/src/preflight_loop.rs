@@ -14,6 +14,7 @@ use crate::motor_link::MotorLink;
 use crate::preflight::{Activity, Preflight, PreflightInput, PreflightReport};
 use crate::real_time_thread;
 use crate::robot_handle::RobotHandle;
+use crate::robot_writer::RobotWriter;
 use crate::watchdog::Watchdog;
 
 /// Time after the last step at which the next one is made if no state arrives.
@@ -58,10 +59,16 @@ pub fn start(
         wait_for_states(&reader, &handle);
         let (start, mut due) = (Instant::now(), Duration::ZERO);
         let (mut activity, mut stopped_at, mut armed_at) = (None, None, None);
+        let mut robot = RobotWriter::default();
         loop {
             let mut states = Vec::new();
-            while let Some(payload) = reader.take() {
-                states.extend(decode::<LowState>(&payload).ok());
+            while let Some((payload, writer)) = reader.take_with_writer() {
+                if robot.accepts(writer, start.elapsed(), armed_at.is_some()) {
+                    states.extend(decode::<LowState>(&payload).ok());
+                }
+            }
+            if let Some(robot) = robot.robot() {
+                handle.set_robot(robot);
             }
             let now = start.elapsed();
             if states.is_empty() && now < due {
@@ -77,7 +84,8 @@ pub fn start(
             let controller = (!handle.controller_released()).then(|| "the built-in controller".to_owned());
             let foreign_writers = handle.foreign_writers();
             let stop_requested = stopped_at.is_some();
-            let input = PreflightInput { now, states, foreign_writers, controller, stop_requested };
+            let other_robot = robot.take_other();
+            let input = PreflightInput { now, states, other_robot, foreign_writers, controller, stop_requested };
             let output = preflight.step(&input);
             if output.command.is_some() {
                 armed_at.get_or_insert(now);

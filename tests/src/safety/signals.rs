@@ -16,6 +16,9 @@ const STATES: [&str; 5] = ["damp", "stand_up", "ready", "run", "sit"];
 /// Time for which the robot is watched afterwards.
 const WATCHED: Duration = Duration::from_millis(1900);
 
+/// Time after which commands show that the process goes on.
+const LATE: Duration = Duration::from_millis(1800);
+
 /// What became of a robot.
 struct Case {
     cause: &'static str,
@@ -95,11 +98,9 @@ fn case(program: &Path, cause: &'static str, state: &str, to_group: bool, twice:
     }
     std::thread::sleep(WATCHED);
     probe.end();
-    let end = Instant::now();
     let Some((damping, dampings)) = probe.damping_after(sent) else {
-        let (gap, lateness) = probe.gaps(sent, end);
-        let goes_on =
-            gap < lateness + Duration::from_millis(50) && probe.count_since(end - Duration::from_millis(100)) > 0;
+        let (gap, lateness) = probe.gaps(sent, sent + WATCHED);
+        let goes_on = gap < lateness + Duration::from_millis(50) && probe.count_since(sent + LATE) > 0;
         return Ok(Case { cause, delay_ms: None, lateness_ms: 0.0, dampings: 0, goes_on });
     };
     let last = probe.last_holding();

@@ -67,6 +67,8 @@ pub struct PreflightInput {
     pub now: Duration,
     /// States of the robot that arrived since the last step, in their order, also damaged ones.
     pub states: Vec<LowState>,
+    /// True if a state of another robot arrived since the last step.
+    pub other_robot: bool,
     /// Number of other writers of `rt/lowcmd`.
     pub foreign_writers: usize,
     /// Name of the active built-in controller; `None` if it is released.
@@ -227,6 +229,7 @@ impl Preflight {
     /// Returns the input of the monitor without measurements.
     fn surroundings(input: &PreflightInput) -> Input {
         Input {
+            other_robot: input.other_robot,
             foreign_writers: input.foreign_writers,
             controller_released: input.controller.is_none(),
             stop_requested: input.stop_requested,
@@ -305,6 +308,7 @@ impl Preflight {
     fn observe(&mut self, input: &PreflightInput, sample: Option<Sample>, elapsed: f64) {
         let observation = &mut self.observation;
         observation.foreign_writers = observation.foreign_writers.max(input.foreign_writers);
+        observation.other_robot |= input.other_robot;
         if elapsed < CONNECT_S {
             return;
         }

@@ -34,6 +34,8 @@ pub(super) struct Observation {
     pub ticks: Option<[u32; 2]>,
     /// Lost messages of all motors, at the start and now.
     pub lost: Option<[u32; 2]>,
+    /// States of another robot have arrived.
+    pub other_robot: bool,
     /// Largest number of other writers.
     pub foreign_writers: usize,
     /// Name of the active built-in controller.
@@ -109,6 +111,14 @@ impl Observation {
                 "stop the other process; its messages and yours would be executed in turn",
             )
         });
+        let other_robot = self.other_robot.then(|| {
+            Finding::new(
+                "other_robot",
+                "there is more than one robot on this domain".to_owned(),
+                "several writers of `rt/lowstate` send states".to_owned(),
+                "stop the second robot, the simulator or the replayed log, or use another domain",
+            )
+        });
         let controller = self.controller.as_ref().map(|name| {
             Finding::new(
                 "controller_active",
@@ -117,7 +127,12 @@ impl Observation {
                 "release it (procedure 1003 of `motion_switcher`) while the robot lies",
             )
         });
-        writer.into_iter().chain(controller).map(|finding| finding.blocking(Blocks::Motion)).collect()
+        writer
+            .into_iter()
+            .chain(other_robot)
+            .chain(controller)
+            .map(|finding| finding.blocking(Blocks::Motion))
+            .collect()
     }
 
     fn link(&self, config: &SafetyConfig) -> Vec<Finding> {
