@@ -25,7 +25,8 @@ pub fn check_protection(config: &ServerConfig, zenoh: &zenoh::Config) -> Result<
     let has_certificates = setting("transport/link/tls/enable_mtls") == "true";
     let endpoints = std::iter::once(("listen", &config.listen)).chain(config.connect.iter().map(|to| ("connect", to)));
     for (field, endpoint) in endpoints {
-        if let Some(reason) = exposure(endpoint, has_users, has_certificates) {
+        // Passwords are asked for by who accepts a connection: a router may let everybody in.
+        if let Some(reason) = exposure(endpoint, has_users && field == "listen", has_certificates) {
             return Err(Exposed { field, endpoint: endpoint.clone(), reason });
         }
     }

@@ -21,7 +21,7 @@ use crate::frame_publisher::FramePublisher;
 use crate::lease_manager::{LeaseHandler, LeaseManager, ServerInfo};
 use crate::messages::ServerState;
 use crate::protection::{Exposed, check_protection};
-use crate::stop_listener::StopListener;
+use crate::stop_listener::{StopListener, port};
 use crate::{EnvFactory, EnvFactoryError, ServerConfig};
 
 /// Size of the `hello` and of the `lease` requests that wait [bytes].
@@ -131,7 +131,8 @@ impl Server {
         let protected = zenoh.clone();
         let session = twinstep_session::open(zenoh)
             .map_err(|error| ServerError::Open { listen: config.listen.clone(), reason: error.to_string() })?;
-        let stop_listener = if is_robot { Some(start_stop_listener(&session, &protected, &factory)?) } else { None };
+        let stop_listener =
+            if is_robot { Some(start_stop_listener(&session, &config.listen, &protected, &factory)?) } else { None };
         let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
         let executor = Executor::start(2 * cores.max(2)).map_err(ServerError::Thread)?;
         // Its threads are for requests that take no time: they do not wait for environments.
@@ -250,12 +251,15 @@ impl Server {
 /// Listens for stops beside Zenoh's endpoint.
 fn start_stop_listener(
     session: &Session,
+    listen: &str,
     zenoh: &zenoh::Config,
     factory: &Arc<dyn EnvFactory>,
 ) -> Result<StopListener, ServerError> {
-    let endpoint = session.info().locators().wait().first().map(ToString::to_string).unwrap_or_default();
-    StopListener::start(&endpoint, zenoh, Arc::clone(factory))
-        .map_err(|error| ServerError::StopListener { endpoint, reason: error.to_string() })
+    // Zenoh replaces an address of all interfaces by one of each, and port 0 by the port that it has.
+    let locators = session.info().locators().wait();
+    let port = locators.first().and_then(|locator| port(&locator.to_string()));
+    let started = StopListener::start(listen, port, zenoh, Arc::clone(factory));
+    started.map_err(|error| ServerError::StopListener { endpoint: listen.to_owned(), reason: error.to_string() })
 }
 
 /// Returns the maximum size of a request [bytes].

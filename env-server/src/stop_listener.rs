@@ -1,7 +1,7 @@
 //! Stops a robot over a connection of its own, beside Zenoh: a stop waits for no other request and for no link of a client.
 //!
-//! Each connection has a thread for at most a second. Of too many, the oldest is closed: those who connect and say nothing
-//! keep nobody out.
+//! Each connection has a thread. Of too many, the oldest of the address that has most of them is closed: those who connect and
+//! say nothing, or say it slowly, keep nobody else out.
 
 use std::collections::{HashMap, VecDeque};
 use std::io::{Read, Result, Write};
@@ -40,15 +40,16 @@ pub struct StopListener {
 }
 
 impl StopListener {
-    /// Listens at the port after that of Zenoh's `endpoint`, or at a free one, with the users and certificates of `zenoh`.
-    pub fn start(endpoint: &str, zenoh: &zenoh::Config, factory: Arc<dyn EnvFactory>) -> Result<Self> {
-        let (protocol, address) = endpoint.split_once('/').unwrap_or(("tcp", endpoint));
-        let (host, port) = address.rsplit_once(':').unwrap_or((address, "0"));
-        let host: IpAddr = match host.trim_matches(['[', ']']) {
-            "localhost" => IpAddr::from([127, 0, 0, 1]),
-            host => host.parse().map_err(failed)?,
-        };
-        let next = port.parse().ok().and_then(|port: u16| port.checked_add(1)).unwrap_or(0);
+    /// Listens at the host of Zenoh's `endpoint`, at the port after `port`, which Zenoh has, or at a free one, with the
+    /// users and certificates of `zenoh`.
+    pub fn start(
+        endpoint: &str,
+        port: Option<u16>,
+        zenoh: &zenoh::Config,
+        factory: Arc<dyn EnvFactory>,
+    ) -> Result<Self> {
+        let (protocol, host) = protocol_and_host(endpoint);
+        let next = port.and_then(|port| port.checked_add(1)).unwrap_or(0);
         let listener = TcpListener::bind((host, next)).or_else(|_| TcpListener::bind((host, 0)))?;
         let access = Arc::new(Access::new(protocol, zenoh)?);
         let (address, is_stopping) = (listener.local_addr()?, Arc::new(AtomicBool::new(false)));
@@ -82,9 +83,9 @@ fn listen(listener: &TcpListener, access: &Arc<Access>, factory: &Arc<dyn EnvFac
         }
         connections.retain(|(_, thread)| !thread.is_finished());
         while connections.len() >= MAX_CONNECTIONS
-            && let Some((oldest, _)) = connections.pop_front()
+            && let Some((stream, _)) = most_frequent(&connections).and_then(|index| connections.remove(index))
         {
-            let _ = oldest.shutdown(Shutdown::Both);
+            let _ = stream.shutdown(Shutdown::Both);
         }
         let Ok(stream) = stream else { continue };
         let Ok(kept) = stream.try_clone() else { continue };
@@ -99,6 +100,33 @@ fn listen(listener: &TcpListener, access: &Arc<Access>, factory: &Arc<dyn EnvFac
             Err(error) => tracing::warn!(%error, "cannot start a thread of the stop channel"),
         }
     }
+}
+
+/// Returns the oldest connection of the address that has most of them.
+fn most_frequent(connections: &VecDeque<(TcpStream, JoinHandle<()>)>) -> Option<usize> {
+    let addresses: Vec<Option<IpAddr>> =
+        connections.iter().map(|(stream, _)| stream.peer_addr().ok().map(|address| address.ip())).collect();
+    oldest_of_most(&addresses)
+}
+
+/// Returns the first index of the entry that is there most often.
+fn oldest_of_most<T: PartialEq>(entries: &[T]) -> Option<usize> {
+    let count = |index: &usize| entries.iter().filter(|entry| **entry == entries[*index]).count();
+    (0..entries.len()).rev().max_by_key(count)
+}
+
+/// Returns protocol and host of a Zenoh endpoint, such as `tcp/[::]:7447`.
+fn protocol_and_host(endpoint: &str) -> (&str, &str) {
+    let endpoint = endpoint.split(['?', '#']).next().unwrap_or(endpoint);
+    let (protocol, address) = endpoint.split_once('/').unwrap_or(("tcp", endpoint));
+    let host = address.rsplit_once(':').map_or(address, |(host, _)| host);
+    (protocol, host.trim_matches(['[', ']']))
+}
+
+/// Returns the port of a Zenoh endpoint.
+pub fn port(endpoint: &str) -> Option<u16> {
+    let endpoint = endpoint.split(['?', '#']).next().unwrap_or(endpoint);
+    endpoint.rsplit_once(':').and_then(|(_, port)| port.parse().ok())
 }
 
 fn serve(stream: TcpStream, access: &Access, factory: &Arc<dyn EnvFactory>) -> Result<()> {
@@ -183,4 +211,29 @@ fn tls_config(setting: &dyn Fn(&str) -> Option<String>, needs_certificate: bool)
 /// Returns an error of TLS, of a file or of the other side.
 fn failed(cause: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> std::io::Error {
     std::io::Error::other(cause)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn endpoint_has_protocol_host_and_port() {
+        for (endpoint, expected) in [
+            ("tcp/0.0.0.0:7447", ("tcp", "0.0.0.0", Some(7447))),
+            ("tls/[::]:7450", ("tls", "::", Some(7450))),
+            ("tcp/robot.local:7447#iface=eth0", ("tcp", "robot.local", Some(7447))),
+            ("tcp/localhost", ("tcp", "localhost", None)),
+        ] {
+            let (protocol, host) = protocol_and_host(endpoint);
+            assert_eq!((protocol, host, port(endpoint)), expected);
+        }
+    }
+
+    #[test]
+    fn connection_of_who_has_most_is_closed_first_and_the_oldest_of_those() {
+        assert_eq!(oldest_of_most(&["a", "b", "b", "c", "b"]), Some(1));
+        assert_eq!(oldest_of_most(&["a", "b"]), Some(0));
+        assert_eq!(oldest_of_most::<u8>(&[]), None);
+    }
 }

@@ -7,8 +7,9 @@ use twinstep_tests::process::Process;
 use twinstep_tests::python::{Programs, cyclone_python, root};
 use twinstep_tests::robot_pair::{PATIENT, RobotPair, next_domain};
 
-/// Starts a robot with the vendor's DDS library, and makes it stand. `None` without Python 3.10.
-fn standing() -> Option<RobotPair> {
+/// Starts a robot with the vendor's DDS library, whose reader of commands is `reliable` or `best-effort`, and makes it stand.
+/// `None` without Python 3.10.
+fn standing(reader: &str) -> Option<RobotPair> {
     let python = match cyclone_python(&crate::python::target()) {
         Ok(python) => python,
         Err(reason) => {
@@ -19,7 +20,8 @@ fn standing() -> Option<RobotPair> {
     };
     let program = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep();
     let (script, domain) = (root().join("clients/python/tests/cyclone_robot.py"), next_domain());
-    let robot = Process::start(&python, &[script.display().to_string(), domain.to_string()]).unwrap();
+    let robot =
+        Process::start(&python, &[script.display().to_string(), domain.to_string(), reader.to_owned()]).unwrap();
     // Beside other tests, Python publishes its states more slowly than a real robot.
     let config = format!("{PATIENT}min_state_hz = 100\n");
     let mut pair = RobotPair::in_front_of(robot, domain, &config, &program, &[]).unwrap();
@@ -29,8 +31,10 @@ fn standing() -> Option<RobotPair> {
 
 #[test]
 fn watchdog_damps_a_robot_with_the_vendors_dds() {
-    for signal in ["KILL", "STOP"] {
-        let Some(mut pair) = standing() else { return };
+    for (signal, reader) in
+        [("KILL", "best-effort"), ("STOP", "best-effort"), ("KILL", "reliable"), ("STOP", "reliable")]
+    {
+        let Some(mut pair) = standing(reader) else { return };
         pair.robot.signal(signal).unwrap();
         std::thread::sleep(Duration::from_millis(500));
         let [before, after] = [0, 1].map(|_| {
@@ -38,16 +42,16 @@ fn watchdog_damps_a_robot_with_the_vendors_dds() {
             pair.ask("statistics").unwrap()
         });
         let is_damped = |gains: &serde_json::Value| gains[0] == 0.0 && gains[1] == 3.0;
-        assert!(after["last_gains"].as_array().unwrap().iter().all(is_damped), "{signal}: {after}");
+        assert!(after["last_gains"].as_array().unwrap().iter().all(is_damped), "{signal}, {reader}: {after}");
         let received = |report: &serde_json::Value| report["received"].as_u64().unwrap();
-        assert!(received(&after) > received(&before) + 20, "{signal}: {before}, then {after}");
+        assert!(received(&after) > received(&before) + 20, "{signal}, {reader}: {before}, then {after}");
         assert_eq!(after["wrong_checksum"], 0, "{after}");
     }
 }
 
 #[test]
 fn robot_with_the_vendors_dds_is_observed_released_and_stands_up() {
-    let Some(mut pair) = standing() else { return };
+    let Some(mut pair) = standing("best-effort") else { return };
     let report = pair.ask("statistics").unwrap();
     assert_eq!(report["wrong_checksum"], 0, "by its own code: {report}");
     assert_eq!((&report["not_low_level"], &report["before_release"]), (&0.into(), &0.into()), "{report}");

@@ -339,6 +339,15 @@ fn agent_of_before_a_fault_ends_or_waits_for_the_word_of_the_operator() {
 }
 
 #[test]
+fn line_that_is_no_text_is_an_error_and_the_next_stop_is_executed() {
+    let mut pair = pair(&[]);
+    pair.wait_for("observe", Duration::from_mins(1)).unwrap();
+    pair.robot.write(b"\xe4\xff\n").unwrap();
+    assert!(pair.operator("status").unwrap().starts_with("error"), "the answer to the first line");
+    assert_eq!(pair.operator("stop").unwrap(), "ok stop");
+}
+
+#[test]
 fn robot_has_no_rollouts() {
     let pair = pair(&[]);
     let hello = RawClient::connect_to_only_server(&pair.endpoint, "stranger").hello();

@@ -69,8 +69,13 @@ impl Process {
 
     /// Writes a line to the stdin of the process.
     pub fn write_line(&mut self, text: &str) -> Result<(), String> {
+        self.write(format!("{text}\n").as_bytes()).map_err(|error| format!("`{text}`: {error}"))
+    }
+
+    /// Writes bytes to the stdin of the process.
+    pub fn write(&mut self, bytes: &[u8]) -> Result<(), String> {
         let stdin = self.child.stdin.as_mut().ok_or("the child has no stdin")?;
-        writeln!(stdin, "{text}").and_then(|()| stdin.flush()).map_err(|error| format!("`{text}`: {error}"))
+        stdin.write_all(bytes).and_then(|()| stdin.flush()).map_err(|error| error.to_string())
     }
 
     /// Sends SIGINT.

@@ -4,8 +4,9 @@ It publishes ``rt/lowstate`` at 200 Hz, which a busy machine can keep up, answer
 and ``sport``, and its joints follow ``rt/lowcmd``. Its types and its checksum are written from the IDL of the vendor's
 SDK, not from the crate ``unitree``.
 
-Usage: ``cyclone_robot.py DOMAIN``. It prints ``ready`` and, for each line ``statistics`` on stdin, a line of JSON. It
-ends when stdin closes. Needs Python 3.10: Cyclone DDS 0.10.2 has no wheels for newer versions.
+Usage: ``cyclone_robot.py DOMAIN [reliable]``, for a reliable reader of commands. It prints ``ready`` and, for each line
+``statistics`` on stdin, a line of JSON. It ends when stdin closes. Needs Python 3.10: Cyclone DDS 0.10.2 has no wheels
+for newer versions.
 """
 
 import contextlib
@@ -28,8 +29,11 @@ from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, float32, int16, int32, int64, sequence, uint8, uint16, uint32
 from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy as QosPolicy
+from cyclonedds.qos import Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
+from cyclonedds.util import duration
 
 PERIOD_S = 0.005
 CROUCH = [0.0, 1.36, -2.65] * 4
@@ -273,11 +277,12 @@ class SerialisedState:
 class Robot:
     """The robot with its topics."""
 
-    def __init__(self, domain: int) -> None:
+    def __init__(self, domain: int, *, reliable: bool) -> None:
         participant = DomainParticipant(domain)
         topic = Topic(participant, "rt/lowstate", LowState)
         self.states = DataWriter(participant, topic)
-        self.commands = DataReader(participant, Topic(participant, "rt/lowcmd", LowCmd))
+        kind = QosPolicy.Reliability.Reliable(duration(seconds=1)) if reliable else QosPolicy.Reliability.BestEffort
+        self.commands = DataReader(participant, Topic(participant, "rt/lowcmd", LowCmd), qos=Qos(kind))
         self.services = [
             (
                 DataReader(participant, Topic(participant, f"rt/api/{service}/request", Request)),
@@ -347,7 +352,7 @@ def main() -> None:
     # As the robot's own computer: other processes do not delay it, where that is allowed.
     with contextlib.suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
-    robot = Robot(int(sys.argv[1]))
+    robot = Robot(int(sys.argv[1]), reliable="reliable" in sys.argv[2:])
     print("ready", flush=True)
     due = time.monotonic()
     while True:

@@ -29,19 +29,21 @@ quit     damp, then end";
 /// Reads requests from stdin until it closes or `quit`. `stop` and `quit` are executed by the thread that reads; the others
 /// are, and all answers are printed, by another one.
 pub fn listen(handle: &RobotHandle) -> std::io::Result<()> {
-    let (requests, received) = channel::<String>();
+    let (requests, received) = channel::<(String, u64)>();
     let (reader, worker) = (handle.clone(), handle.clone());
     std::thread::Builder::new().name("requests".to_owned()).spawn(move || {
-        for request in received {
-            print_line(&answer(&worker, &request));
+        for (request, stops) in received {
+            print_line(&answer(&worker, &request, stops));
         }
     })?;
     std::thread::Builder::new().name("stdin".to_owned()).spawn(move || {
         // The robot stays as it is when stdin closes; signals still end it.
-        for line in std::io::stdin().lock().lines().map_while(Result::ok) {
+        // A line that is no text is a request that is not known.
+        for line in std::io::stdin().lock().split(b'\n').map_while(Result::ok) {
+            let line = String::from_utf8_lossy(&line);
             stop_at_once(&reader, line.trim());
             if !matches!(line.trim(), "" | "quit") {
-                let _ = requests.send(line.trim().to_owned());
+                let _ = requests.send((line.trim().to_owned(), reader.num_stops()));
             }
         }
     })?;
@@ -60,8 +62,8 @@ pub fn stop_at_once(handle: &RobotHandle, request: &str) {
     }
 }
 
-/// Executes a request and returns the answer, which begins with `ok` or `error`.
-pub fn answer(handle: &RobotHandle, request: &str) -> String {
+/// Executes a request that was made after `stops` stops, and returns the answer, which begins with `ok` or `error`.
+pub fn answer(handle: &RobotHandle, request: &str, stops: u64) -> String {
     let request = match request {
         "arm" => OperatorRequest::Arm,
         "stand" => OperatorRequest::Stand,
@@ -81,7 +83,7 @@ pub fn answer(handle: &RobotHandle, request: &str) -> String {
         _ => return format!("error `{request}` is not known; possible:\n{HELP}"),
     };
     let name = format!("{request:?}").to_lowercase();
-    match handle.request(request, ANSWER_TIME) {
+    match handle.request(request, stops, ANSWER_TIME) {
         Ok(()) => format!("ok {name}"),
         Err(refused) => format!("error {name}: {refused}"),
     }

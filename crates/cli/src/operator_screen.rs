@@ -82,8 +82,8 @@ pub fn run(
     start("requests", {
         let (handle, log) = (handle.clone(), Arc::clone(&log));
         move || {
-            for request in received {
-                log.add(&operator::answer(&handle, request));
+            for (request, stops) in received {
+                log.add(&operator::answer(&handle, request, stops));
             }
         }
     })?;
@@ -117,14 +117,14 @@ fn start(name: &str, task: impl FnOnce() + Send + 'static) -> Result<(), Failure
 }
 
 /// Reads keys until the end of the process.
-fn read_keys(handle: &RobotHandle, keys: &KeyTerminal, requests: &Sender<&'static str>) {
+fn read_keys(handle: &RobotHandle, keys: &KeyTerminal, requests: &Sender<(&'static str, u64)>) {
     let mut bytes = [0; 16];
     while let Ok(read) = keys.read(&mut bytes) {
         for key in read {
             let request = KEYS.iter().find(|(letter, _)| letter == key).map(|(_, request)| *request);
             operator::stop_at_once(handle, if *key == b'q' { "quit" } else { request.unwrap_or_default() });
             if let Some(request) = request {
-                let _ = requests.send(request);
+                let _ = requests.send((request, handle.num_stops()));
             }
         }
     }

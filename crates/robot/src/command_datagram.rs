@@ -4,6 +4,8 @@
 //! between a decision and the network, and nothing that arrives from the network can delay it. RustDDS only announces
 //! the writer, so that the robot accepts what it sends.
 
+use crate::watchdog::FIRST_NUMBER;
+
 /// Size of the largest payload of a command [bytes].
 pub const MAX_PAYLOAD: usize = 1024;
 /// Size of header, DATA submessage before its payload, and HEARTBEAT submessage [bytes].
@@ -19,8 +21,6 @@ pub type WriterGuid = [u8; 16];
 pub struct CommandDatagram {
     bytes: [u8; MAX_DATAGRAM],
     len: usize,
-    /// Number of datagrams so far; counts the heartbeats.
-    count: u32,
 }
 
 impl CommandDatagram {
@@ -54,7 +54,7 @@ impl CommandDatagram {
         put(&[0; 4]);
         put(&writer[12..]);
         put(&[0; 20]);
-        Some(Self { bytes, len: end, count: 0 })
+        Some(Self { bytes, len: end })
     }
 
     /// Returns the datagram with its next sequence number and a payload of the size of the first one.
@@ -68,12 +68,11 @@ impl CommandDatagram {
 
     /// Returns the datagram with a sequence number.
     pub fn with_number(&mut self, number: u64) -> &[u8] {
-        self.count = self.count.wrapping_add(1);
         let heartbeat = self.len - 32;
         self.put_number(36, number);
         self.put_number(heartbeat + 12, number);
         self.put_number(heartbeat + 20, number);
-        self.bytes[heartbeat + 28..heartbeat + 32].copy_from_slice(&self.count.to_le_bytes());
+        self.bytes[heartbeat + 28..heartbeat + 32].copy_from_slice(&heartbeat_count(number).to_le_bytes());
         &self.bytes[..self.len]
     }
 
@@ -82,6 +81,14 @@ impl CommandDatagram {
         self.bytes[at..at + 4].copy_from_slice(&((number >> 32) as u32).to_le_bytes());
         self.bytes[at + 4..at + 8].copy_from_slice(&(number as u32).to_le_bytes());
     }
+}
+
+/// Returns the count of the heartbeat of a command. Readers ignore a heartbeat whose count is not larger than that of the last
+/// one (the count of a Heartbeat in RTPS 2.5, 8.3.8), so the watchdog's have to follow those of the control loop.
+fn heartbeat_count(number: u64) -> u32 {
+    const HALF: u64 = 1 << 30;
+    let half = if number < FIRST_NUMBER { 0 } else { HALF };
+    (half + number % HALF) as u32
 }
 
 #[cfg(test)]
@@ -98,7 +105,7 @@ mod tests {
         let expected = [
             b'R', b'T', b'P', b'S', 2, 4, 1, 18, 1, 18, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11,
             0x15, 5, 28, 0, 0, 0, 16, 0, 0, 0, 0, 0, 0, 0, 1, 3, 0, 1, 0, 0, 5, 0, 0, 0, 0, 1, 0, 0, 7, 7, 7, 7,
-            0x07, 3, 28, 0, 0, 0, 0, 0, 0, 0, 1, 3, 0, 1, 0, 0, 5, 0, 0, 0, 0, 1, 0, 0, 5, 0, 0, 0, 1, 0, 0, 0,
+            0x07, 3, 28, 0, 0, 0, 0, 0, 0, 0, 1, 3, 0, 1, 0, 0, 5, 0, 0, 0, 0, 1, 0, 0, 5, 0, 0, 0, 5, 0, 0, 64,
         ];
         assert_eq!(bytes, expected);
     }
@@ -110,6 +117,13 @@ mod tests {
         let bytes = datagram.with_payload(2, &[0, 1, 0, 0, 8, 8, 8, 8]).to_vec();
         assert_eq!((&bytes[40..44], &bytes[48..52]), (&[2, 0, 0, 0][..], &[8; 4][..]));
         assert_eq!(bytes[bytes.len() - 4..], [2, 0, 0, 0], "the second heartbeat");
+    }
+
+    #[test]
+    fn heartbeats_of_the_watchdog_are_counted_on_after_those_of_the_control_loop() {
+        let day = 24 * 3600 * 500;
+        assert!(heartbeat_count(1) < heartbeat_count(day) && heartbeat_count(day) < heartbeat_count(FIRST_NUMBER));
+        assert!(heartbeat_count(FIRST_NUMBER) < heartbeat_count(FIRST_NUMBER + 1));
     }
 
     #[test]

@@ -14,7 +14,7 @@ use twinstep_unitree::{LowState, decode, encode};
 
 use crate::config::{ConfigError, SafetyConfig};
 use crate::dds::{Dds, DdsError, LOW_STATE, Reader, SPORT_MODE_STATE};
-use crate::input::{Action, Client, Input, Output, RequestRefused};
+use crate::input::{Action, Client, Input, Output};
 use crate::machine::SafetyMachine;
 use crate::motor_link::MotorLink;
 use crate::reading::Reading;
@@ -211,7 +211,7 @@ impl ControlLoop {
             can_send: self.motors.can_send(),
             controller_released: self.handle.controller_released(),
             stop_requested: self.handle.take_stop() || self.damping.is_some(),
-            request: request.and_then(|(_, request)| request),
+            request: request.and_then(|(_, request)| request.ok()),
             client: self.client,
             action: action.map(|(_, action)| action),
         };
@@ -232,8 +232,7 @@ impl ControlLoop {
             self.board.action_result = (number, output.action_refused);
         }
         if let Some((number, request)) = request {
-            let refused = if request.is_none() { Some(RequestRefused::Expired) } else { output.request_refused };
-            self.board.request_result = (number, refused);
+            self.board.request_result = (number, request.err().or(output.request_refused));
         }
         if client.is_some() {
             self.board.has_client = has_client;
@@ -273,12 +272,14 @@ impl ControlLoop {
         }
         let motors = &mut self.motors;
         self.handle.with_readers(|readers| motors.set_readers(readers));
-        if self.handle.has_panicked() {
-            return;
-        }
+        // After a panic it only damps, until the watchdog, which misses its beats, takes over.
+        let has_panicked = self.handle.has_panicked();
+        let command = if has_panicked { self.machine.damping() } else { command };
         let payload = encode(&command.to_low_cmd());
         self.motors.send(&payload);
-        self.motors.beat();
+        if !has_panicked {
+            self.motors.beat();
+        }
         let sent = self.start.elapsed();
         self.record(RecordedTopic::Command, payload);
         if is_from_state {

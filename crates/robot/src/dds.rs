@@ -145,8 +145,9 @@ impl Dds {
     }
 
     /// Returns the addresses of the readers of `topic` in other participants, in a fixed order: for each reader those in the
-    /// network of the interface, or all that it announces if none is. Readers of robots other than `robot`, the writer of the
-    /// states, are left out: their participant writes states too, or one at their address does.
+    /// network of the interface, or all that it announces if none is. Those at an address of `robot`, the writer of the states,
+    /// are first: if the list is shortened, the motors stay in it. Readers of other robots are left out: their participant
+    /// writes states too, or one at their address does.
     pub fn readers(&self, topic: Topic, robot: Option<WriterGuid>) -> Vec<SocketAddr> {
         let own = self.participant.guid().prefix;
         let others = self.other_robots(robot);
@@ -163,7 +164,7 @@ impl Dds {
             })
             .filter(|address| !others.addresses.contains(&address.ip()))
             .collect();
-        addresses.sort_unstable();
+        addresses.sort_unstable_by_key(|address| (!others.of_robot.contains(&address.ip()), *address));
         addresses.dedup();
         addresses
     }
@@ -185,6 +186,7 @@ impl Dds {
         let of_own = ips(&own);
         OtherRobots {
             addresses: ips(&others).into_iter().filter(|address| !of_own.contains(address)).collect(),
+            of_robot: of_own,
             prefixes: others.into_iter().map(|(prefix, _)| prefix).collect(),
         }
     }
@@ -196,11 +198,13 @@ impl Dds {
     }
 }
 
-/// Participants and addresses of robots that are not the one that is commanded.
+/// Participants and addresses of robots that are not the one that is commanded, and its own addresses.
 #[derive(Default)]
 struct OtherRobots {
     prefixes: Vec<Vec<u8>>,
     addresses: Vec<IpAddr>,
+    /// Addresses of the one that is commanded.
+    of_robot: Vec<IpAddr>,
 }
 
 /// Returns the IPv4 addresses of locators.

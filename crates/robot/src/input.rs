@@ -173,6 +173,9 @@ pub enum RequestRefused {
     /// The client may act already.
     #[error("no fault has ended the client's permission: it may act")]
     Permitted,
+    /// A stop came after the request.
+    #[error("a stop came after the request: it is not executed")]
+    Stopped,
     /// The control loop did not take the request in time.
     #[error("the control loop did not take the request in time: it is not executed")]
     Expired,

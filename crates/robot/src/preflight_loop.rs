@@ -23,8 +23,8 @@ const TIMER: Duration = Duration::from_micros(2500);
 const SETTLING: Duration = Duration::from_millis(500);
 /// Time after which no state will arrive any more.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Time for which the robot is damped before its commands cease, so that it lies.
-const FINAL_DAMPING: Duration = Duration::from_millis(1500);
+/// Time after a stop in which preflight damps the robot and reports.
+const MAX_ENDING: Duration = Duration::from_millis(2500);
 
 /// Time after the first command, in which preflight only damps, from which the watchdog has to guard the motors.
 const MAX_ARMING: Duration = Duration::from_millis(150);
@@ -95,7 +95,7 @@ pub fn start(
                 activity = Some(output.activity);
                 let _ = events.send(Event::Activity(output.activity));
             }
-            let is_over = stopped_at.is_some_and(|at| now.saturating_sub(at) > FINAL_DAMPING);
+            let is_over = stopped_at.is_some_and(|at| now.saturating_sub(at) > MAX_ENDING);
             if let Some(report) = output.report {
                 motors.disarm();
                 let _ = events.send(Event::Report(report));
@@ -132,8 +132,10 @@ fn send(motors: &mut MotorLink, command: Option<SafeCommand>, damping: SafeComma
         motors.arm(encode(&damping.to_low_cmd()));
     }
     handle.with_readers(|readers| motors.set_readers(readers));
-    if !handle.has_panicked() {
-        motors.send(&encode(&command.to_low_cmd()));
+    // After a panic it only damps, until the watchdog, which misses its beats, takes over.
+    let has_panicked = handle.has_panicked();
+    motors.send(&encode(&if has_panicked { damping } else { command }.to_low_cmd()));
+    if !has_panicked {
         motors.beat();
     }
 }

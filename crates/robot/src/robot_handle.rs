@@ -37,6 +37,8 @@ struct Shared {
     robot: [AtomicU64; 2],
     has_panicked: AtomicBool,
     stop_requested: AtomicBool,
+    /// Number of stops so far.
+    stops: AtomicU64,
     is_ending: AtomicBool,
     foreign_writers: AtomicUsize,
     controller_released: AtomicBool,
@@ -81,13 +83,15 @@ struct Request {
     request: OperatorRequest,
     /// Time after which it is not executed any more.
     end: Instant,
+    /// Number of stops before it; it is not executed after a later one.
+    stops: u64,
 }
 
 /// What the loop takes in at one step.
 #[derive(Default)]
 pub(crate) struct Taken {
-    /// The request with its number; `None` in place of one that has expired.
-    pub request: Option<(u64, Option<OperatorRequest>)>,
+    /// The request with its number, or the reason why it is not executed any more.
+    pub request: Option<(u64, Result<OperatorRequest, RequestRefused>)>,
     /// The action with its number.
     pub action: Option<(u64, Action)>,
     pub client: Option<Client>,
@@ -131,10 +135,10 @@ pub struct Board {
 }
 
 impl RobotHandle {
-    /// Asks the loop for something on behalf of the operator, and waits for the answer. A request that is not taken within
-    /// `timeout` is never executed.
-    pub fn request(&self, request: OperatorRequest, timeout: Duration) -> Result<(), RequestRefused> {
-        let number = self.enqueue(request, Instant::now() + timeout);
+    /// Asks the loop for something on behalf of the operator, who did so after `stops` stops, and waits for the answer. A
+    /// request that is not taken within `timeout`, or before the next stop, is never executed.
+    pub fn request(&self, request: OperatorRequest, stops: u64, timeout: Duration) -> Result<(), RequestRefused> {
+        let number = self.enqueue(request, stops, Instant::now() + timeout);
         // The loop answers also a request that has expired.
         let board = self.wait_until(timeout + ANSWER_TIME, |board| board.request_result.0 >= number);
         match board.request_result {
@@ -143,11 +147,11 @@ impl RobotHandle {
         }
     }
 
-    fn enqueue(&self, request: OperatorRequest, end: Instant) -> u64 {
+    fn enqueue(&self, request: OperatorRequest, stops: u64, end: Instant) -> u64 {
         let mut inbox = lock(&self.0.inbox);
         inbox.num_requests += 1;
         let number = inbox.num_requests;
-        inbox.requests.push_back(Request { number, request, end });
+        inbox.requests.push_back(Request { number, request, end, stops });
         number
     }
 
@@ -158,7 +162,13 @@ impl RobotHandle {
 
     /// Damps the motors at the next step of the loop, until the operator arms again. Never waits.
     pub fn stop(&self) {
+        self.0.stops.fetch_add(1, Ordering::AcqRel);
         self.0.stop_requested.store(true, Ordering::Release);
+    }
+
+    /// Returns the number of stops so far.
+    pub fn num_stops(&self) -> u64 {
+        self.0.stops.load(Ordering::Acquire)
     }
 
     /// Ends the loop. An armed robot is damped first.
@@ -221,8 +231,12 @@ impl RobotHandle {
             (false, _) => Client::Connected,
         };
         let request = inbox.requests.pop_front();
-        let request =
-            request.map(|Request { number, request, end }| (number, (Instant::now() < end).then_some(request)));
+        let request = request.map(|Request { number, request, end, stops }| {
+            let is_stopped = stops != self.num_stops();
+            let refused = is_stopped.then_some(RequestRefused::Stopped);
+            let refused = refused.or((Instant::now() >= end).then_some(RequestRefused::Expired));
+            (number, refused.map_or(Ok(request), Err))
+        });
         Taken { request, action: inbox.action.take(), client: Some(client), has_client: inbox.clients > 0 }
     }
 
@@ -362,8 +376,18 @@ mod tests {
     #[test]
     fn request_that_nobody_took_in_time_is_never_executed() {
         let handle = RobotHandle::default();
-        let answer = handle.request(OperatorRequest::Stand, Duration::from_millis(1));
+        let answer = handle.request(OperatorRequest::Stand, 0, Duration::from_millis(1));
         assert_eq!(answer, Err(RequestRefused::Expired));
-        assert_eq!(handle.take().request, Some((1, None)));
+        assert_eq!(handle.take().request, Some((1, Err(RequestRefused::Expired))));
+    }
+
+    #[test]
+    fn request_of_before_a_stop_is_never_executed() {
+        let (handle, end) = (RobotHandle::default(), Instant::now() + Duration::from_mins(1));
+        handle.enqueue(OperatorRequest::Arm, handle.num_stops(), end);
+        handle.stop();
+        handle.enqueue(OperatorRequest::Arm, handle.num_stops(), end);
+        assert_eq!(handle.take().request, Some((1, Err(RequestRefused::Stopped))));
+        assert_eq!(handle.take().request, Some((2, Ok(OperatorRequest::Arm))));
     }
 }

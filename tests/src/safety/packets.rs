@@ -49,7 +49,7 @@ pub fn run(program: &Path, count: usize, seed: u64) -> Result<Vec<Row>, String> 
             ms(gap),
             ms(late)
         ),
-        is_met: excess <= 5.0 && memory - memory_before < 20.0,
+        is_met: excess <= 5.0 && memory - memory_before < 20.0 && state == "ready",
     }])
 }
 

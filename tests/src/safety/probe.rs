@@ -74,8 +74,9 @@ impl Probe {
     pub fn gaps(&self, from: Instant, to: Instant) -> (Duration, Duration) {
         let is_within = |at: &Instant| (from..=to).contains(at);
         let commands = lock(&self.commands);
-        let times: Vec<Instant> = commands.iter().map(|(at, _)| *at).filter(is_within).collect();
-        let gap = times.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap_or(to - from);
+        let times = commands.iter().map(|(at, _)| *at).filter(is_within);
+        let times: Vec<Instant> = std::iter::once(from).chain(times).chain([to]).collect();
+        let gap = times.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap_or_default();
         (gap, self.lateness(from, to))
     }
 

@@ -53,6 +53,8 @@ const OBSERVE_S: f64 = 1.2;
 const CONNECT_S: f64 = 0.2;
 /// Time in damping before and after motions [s].
 const DAMP_S: f64 = 0.2;
+/// Time for which the robot is damped at the end [s], so that it lies when its commands cease.
+const FINAL_DAMP_S: f64 = 1.5;
 /// Number of times that each test is made, if this computer disturbs it.
 const MAX_TESTS: usize = 5;
 /// Why a test was left out that this computer disturbed each time.
@@ -269,7 +271,8 @@ impl Preflight {
             }
             Phase::Damp { then } => {
                 let then = *then;
-                if elapsed >= DAMP_S {
+                let is_end = matches!(then, AfterDamping::Finish);
+                if elapsed >= if is_end { FINAL_DAMP_S } else { DAMP_S } {
                     self.after_damping(then, now);
                 }
                 (!matches!(self.phase, Phase::Finished)).then_some(self.damping)

@@ -27,6 +27,9 @@ pub struct WatchdogLink {
     is_closed: bool,
     now: Duration,
     silence: Duration,
+    /// Last message that must not be lost and did not fit into the socket.
+    undelivered: [u8; MAX_MESSAGE],
+    undelivered_len: usize,
 }
 
 impl WatchdogLink {
@@ -49,6 +52,8 @@ impl WatchdogLink {
             generation: 0,
             is_guarding: false,
             is_closed: false,
+            undelivered: [0; MAX_MESSAGE],
+            undelivered_len: 0,
             now: Duration::ZERO,
             silence: Duration::ZERO,
         })
@@ -64,7 +69,7 @@ impl WatchdogLink {
         let mut buffer = [0; MAX_MESSAGE];
         if let Some(len) = guard.encode(&mut buffer) {
             (self.generation, self.is_guarding) = (guard.generation, true);
-            self.send(&buffer[..len]);
+            self.deliver(&buffer[..len]);
         }
     }
 
@@ -78,7 +83,21 @@ impl WatchdogLink {
     /// Reports that the robot is not armed any more.
     pub fn release(&mut self) {
         if std::mem::take(&mut self.is_guarding) {
-            self.send(RELEASE);
+            self.deliver(RELEASE);
+        }
+    }
+
+    /// Sends a message that must not be lost: now, or when the socket is not full any more. A later one replaces it.
+    fn deliver(&mut self, message: &[u8]) {
+        self.undelivered[..message.len()].copy_from_slice(message);
+        self.undelivered_len = message.len();
+        self.deliver_again();
+    }
+
+    fn deliver_again(&mut self) {
+        let message = self.undelivered;
+        if self.undelivered_len > 0 && self.send(&message[..self.undelivered_len]) {
+            self.undelivered_len = 0;
         }
     }
 
@@ -86,6 +105,7 @@ impl WatchdogLink {
     pub fn state(&mut self, now: Duration) -> Watchdog {
         self.silence += now.saturating_sub(self.now).min(MAX_SILENT_STEP);
         self.now = now;
+        self.deliver_again();
         self.take_in();
         match self.status {
             _ if self.is_closed || self.silence > MAX_SILENCE => Watchdog::Missing,
@@ -116,10 +136,12 @@ impl WatchdogLink {
         }
     }
 
-    /// A watchdog that does not read has a full socket, and becomes [`Watchdog::Missing`] by its silence.
-    fn send(&mut self, message: &[u8]) {
+    /// Returns false if the socket is full, as that of a watchdog that does not read, which becomes [`Watchdog::Missing`] by its
+    /// silence.
+    fn send(&mut self, message: &[u8]) -> bool {
         let sent = send(self.socket.as_fd(), message, SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
         self.is_closed |= matches!(sent, Err(Errno::PIPE | Errno::CONNRESET));
+        !matches!(sent, Err(Errno::AGAIN | Errno::INTR))
     }
 }
 

@@ -52,7 +52,11 @@ impl WatchdogMachine {
         if self.mode == Mode::TakeOver && generation <= self.generation {
             return false;
         }
-        (self.mode, self.generation, self.silence) = (Mode::Guard, generation, Duration::ZERO);
+        // New addresses of the readers of the same writer are no sign that it commands the motors.
+        if self.mode != Mode::Guard || generation != self.generation {
+            self.silence = Duration::ZERO;
+        }
+        (self.mode, self.generation) = (Mode::Guard, generation);
         true
     }
 
@@ -124,6 +128,16 @@ mod tests {
             machine.beat(1);
             assert_eq!(machine.step(ms(2 * at)), Mode::Guard);
         }
+    }
+
+    #[test]
+    fn new_readers_of_a_silent_writer_are_no_beat() {
+        let mut machine = guarding();
+        for time in 101..=120 {
+            assert!(machine.guard(1));
+            assert_eq!(machine.step(ms(time)), Mode::Guard);
+        }
+        assert_eq!(machine.step(ms(121)), Mode::TakeOver);
     }
 
     #[test]
