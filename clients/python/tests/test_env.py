@@ -2,11 +2,13 @@
 
 import os
 import signal
+import stat
 import subprocess
 import sys
 import textwrap
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -246,6 +248,16 @@ def test_environments_of_one_process_share_a_server_until_the_last_is_closed() -
     assert not server.alive
 
 
+def test_server_of_a_program_can_be_reached_by_its_user_only() -> None:
+    envs = Go2VectorEnv(1, task="counter")
+    protocol, _, socket = envs._remote._connection._server.endpoint.partition("/")
+    folder = Path(socket).parent
+    assert protocol == "unixsock-stream"
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    envs.close()
+    assert not folder.exists()
+
+
 @pytest.mark.parametrize("cause", ["exit", "SIGKILL"])
 def test_server_terminates_with_its_parent(cause: str) -> None:
     program = textwrap.dedent("""
@@ -273,7 +285,7 @@ def assert_ends(server: int) -> None:
 
 def is_running(pid: int) -> bool:
     try:
-        with open(f"/proc/{pid}/stat") as stat:
-            return stat.read().split()[2] != "Z"
+        with open(f"/proc/{pid}/stat") as line:
+            return line.read().split()[2] != "Z"
     except FileNotFoundError:
         return False

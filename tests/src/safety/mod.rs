@@ -4,10 +4,11 @@
 //! - [`signals`]: the control process is ended or suspended in each state.
 //! - [`stops`]: stops by key, client, signal and remote control, while something else keeps the process busy.
 //! - [`packets`]: forged packets at the DDS sockets.
-//! - [`robots`]: another robot, a robot that restarts.
+//! - [`robots`]: another robot, also at another interface; a robot that restarts.
 //! - [`recordings`]: recordings of processes that are killed.
 //! - [`servers`]: clients that do not read, long rollouts, oversized requests.
 
+mod other_interface;
 pub mod packets;
 pub mod probe;
 pub mod recordings;

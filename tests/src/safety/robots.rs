@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use super::other_interface::robot_at_other_interface;
 use super::{Row, in_state, pair};
 use crate::process::Process;
 use crate::robot_pair::RobotPair;
@@ -10,7 +11,7 @@ use crate::robot_pair::RobotPair;
 /// Makes each case `repeats` times.
 pub fn run(program: &Path, repeats: usize) -> Vec<Row> {
     type Case = (&'static str, fn(&Path) -> Result<f64, String>, &'static str, f64);
-    let cases: [Case; 3] = [
+    let cases: [Case; 4] = [
         (
             "a second robot appears while the first one stands",
             second_robot,
@@ -18,6 +19,12 @@ pub fn run(program: &Path, repeats: usize) -> Vec<Row> {
             0.0,
         ),
         ("a second robot is there before arming", armed_beside_another, "commands that it executed", 0.0),
+        (
+            "a robot at another interface, whose states reach the computer",
+            robot_at_other_interface,
+            "commands that it executed",
+            0.0,
+        ),
         ("the robot restarts while it stands", restart, "ms to the fault", 100.0),
     ];
     cases
@@ -29,7 +36,7 @@ pub fn run(program: &Path, repeats: usize) -> Vec<Row> {
             let failures: Vec<&String> = results.iter().filter_map(|result| result.as_ref().err()).collect();
             Row {
                 what: (*what).to_owned(),
-                found: format!("{} of {repeats} named; {unit}: at most {worst:.0}; {failures:?}", times.len()),
+                found: format!("{} of {repeats} as it should be; {unit}: at most {worst:.0}; {failures:?}", times.len()),
                 is_met: times.len() == repeats && worst <= *limit,
             }
         })

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tempfile
 import threading
 from collections import deque
 from pathlib import Path
@@ -47,9 +48,10 @@ def find_program() -> str:
 
 
 class EmbeddedServer:
-    """A server on a free port of this machine, as a child process.
+    """A server for this user, as a child process.
 
-    It terminates when its stdin closes, which happens even if this process crashes. Environments with the same
+    It listens at a Unix socket in a folder that only this user can open: no port, and no password to keep. It
+    terminates when its stdin closes, which happens even if this process crashes. Environments with the same
     ``arguments`` share one server; :meth:`shared` and :meth:`release` count its users.
 
     Parameters
@@ -65,7 +67,10 @@ class EmbeddedServer:
         self._arguments = arguments
         self._owner = os.getpid()
         self._last_lines: deque[str] = deque(maxlen=_LOG_TAIL_LINES)
-        command = [find_program(), "serve", "--until-stdin-closes", "--listen", "tcp/127.0.0.1:0", *arguments]
+        program = find_program()
+        self._folder = tempfile.mkdtemp(prefix="twinstep-")
+        listen = f"unixsock-stream/{self._folder}/server"
+        command = [program, "serve", "--until-stdin-closes", "--listen", listen, *arguments]
         # A separate process group, so that Ctrl-C in a terminal reaches only the agent, which closes the environment.
         self._process = subprocess.Popen(
             command,
@@ -155,3 +160,4 @@ class EmbeddedServer:
             self._process.wait()
         self._process.stdout.close()
         self._reader.join(timeout=1.0)
+        shutil.rmtree(self._folder, ignore_errors=True)

@@ -183,9 +183,14 @@ def _open_session(config: zenoh.Config, endpoint: str, since: float) -> zenoh.Se
 
 
 def _port_open(endpoint: str) -> bool:
-    address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
+    protocol, _, address = endpoint.partition("/")
+    address = address.partition("?")[0].partition("#")[0]
     host, _, port = address.rpartition(":")
     try:
+        if protocol == "unixsock-stream":
+            with socket.socket(socket.AF_UNIX) as client:
+                client.connect(address)
+            return True
         socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
     except (OSError, ValueError):
         return False
