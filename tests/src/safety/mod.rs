@@ -4,7 +4,7 @@
 //! - [`signals`]: the control process is ended or suspended in each state.
 //! - [`stops`]: stops by key, client, signal and remote control, while something else keeps the process busy.
 //! - [`packets`]: forged packets at the DDS sockets.
-//! - [`robots`]: another robot, also at another interface; a robot that restarts.
+//! - [`robots`]: another robot, a robot that restarts, a state from another interface.
 //! - [`recordings`]: recordings of processes that are killed.
 //! - [`servers`]: clients that do not read, long rollouts, oversized requests.
 

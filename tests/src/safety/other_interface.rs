@@ -1,23 +1,20 @@
 //! A second interface of this computer, with a cable to another network namespace: as a robot's computer has one to the office.
 
+use std::net::UdpSocket;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use twinstep_robot::dds::{Dds, LOW_STATE};
 
-use super::pair;
-use crate::process::Process;
+use super::in_state;
+use super::packets::udp_ports;
 
 const NAMESPACE: &str = "twinstep-other";
 /// Address of this computer at the interface, and of the computer at the other end of the cable.
 const ADDRESSES: [&str; 2] = ["10.177.0.1", "10.177.0.2"];
-/// States of the robot at the other end that have to reach this computer before the case counts.
-const STATES: usize = 100;
-/// Time in which they do.
-const TIMEOUT: Duration = Duration::from_secs(20);
-/// Time for which the robot then stands beside them.
-const TOGETHER: Duration = Duration::from_secs(3);
+/// Time in which a state is looked at.
+const TAKEN: Duration = Duration::from_secs(1);
 
 /// The interface. Removed on drop.
 struct OtherInterface;
@@ -54,51 +51,50 @@ fn ip(arguments: &str) -> Result<(), String> {
     }
 }
 
-/// A robot at another interface, whose states reach this computer, is no second robot: it is not seen, and gets no commands. Returns
-/// the number that it executed.
-pub fn robot_at_other_interface(program: &Path) -> Result<f64, String> {
+/// An old state in the name of the robot changes nothing if it comes from another interface. From the robot's own interface it is a
+/// fault: the tick jumps. Returns the time to that fault [ms].
+pub fn state_from_other_interface(program: &Path) -> Result<f64, String> {
     let _interface = OtherInterface::create()?;
-    let mut pair = pair(program, &[])?;
-    pair.wait_for("observe", Duration::from_secs(20))?;
-    let domain = pair.domain.to_string();
-    let fake = ["fake-robot", "--until-stdin-closes", "--released", "--domain", &domain, "--interface", ADDRESSES[1]];
-    let program = program.to_str().ok_or("the path of the program is no text")?;
-    let arguments = [&["netns", "exec", NAMESPACE, program][..], &fake].concat();
-    let mut second = Process::start(Path::new("ip"), &arguments.iter().map(ToString::to_string).collect::<Vec<_>>())?;
-    second.line(TIMEOUT).ok_or("no second robot")?;
-    // This participant of the same computer joins the multicast groups at the interface: they are delivered to all sockets.
-    states_arrive(pair.domain)?;
-    pair.insist("arm")?;
-    pair.insist("stand")?;
-    pair.wait_for("ready", Duration::from_secs(15))?;
-    std::thread::sleep(TOGETHER);
-    if pair.state() != "ready" {
-        return Err(pair.state().to_owned());
+    let mut pair = in_state(program, "ready")?;
+    let packet = state_packet(pair.domain)?;
+    let file = tempfile::NamedTempFile::new().map_err(|error| error.to_string())?;
+    std::fs::write(file.path(), &packet).map_err(|error| error.to_string())?;
+    let ports = udp_ports(&[pair.robot.id()]);
+    std::thread::sleep(TAKEN);
+    for port in &ports {
+        let send = format!("cat {} > /dev/udp/{}/{port}", file.path().display(), ADDRESSES[0]);
+        let sent = Command::new("ip").args(["netns", "exec", NAMESPACE, "bash", "-c", &send]).status();
+        if !sent.is_ok_and(|status| status.success()) {
+            return Err(format!("`{send}` failed"));
+        }
     }
-    second.write_line("statistics")?;
-    let answer = second.line(Duration::from_secs(5)).ok_or("the second robot does not answer")?;
-    let statistics: serde_json::Value = serde_json::from_str(&answer).map_err(|error| error.to_string())?;
-    statistics["accepted"].as_f64().ok_or(answer)
+    std::thread::sleep(TAKEN);
+    if pair.state() != "ready" {
+        return Err(format!("after a state from another interface: {}", pair.state()));
+    }
+    let socket = UdpSocket::bind("127.0.0.1:0").map_err(|error| error.to_string())?;
+    let since = Instant::now();
+    for port in ports {
+        socket.send_to(&packet, ("127.0.0.1", port)).map_err(|error| error.to_string())?;
+    }
+    pair.wait_for("fault", TAKEN).map_err(|error| format!("a state from the own interface has no effect: {error}"))?;
+    Ok(1e3 * since.elapsed().as_secs_f64())
 }
 
-/// Waits until the states of the other robot arrive at this computer, and goes on receiving them.
-fn states_arrive(domain: u16) -> Result<(), String> {
-    let address = ADDRESSES[0].parse().map_err(|_| "no address")?;
-    let dds = Dds::join(domain, address).map_err(|error| error.to_string())?;
+/// Returns a packet with a state that the robot sends now, with a sequence number that it reaches much later.
+fn state_packet(domain: u16) -> Result<Vec<u8>, String> {
+    let dds = Dds::join(domain, [127, 0, 0, 1].into()).map_err(|error| error.to_string())?;
     let reader = dds.reader(LOW_STATE, std::thread::current()).map_err(|error| error.to_string())?;
-    let (since, mut states) = (Instant::now(), 0);
-    while states < STATES {
-        if since.elapsed() > TIMEOUT {
-            return Err(format!("{states} states of the other robot reached this computer"));
+    let since = Instant::now();
+    while since.elapsed() < Duration::from_secs(10) {
+        if let Some((payload, writer)) = reader.take_with_writer() {
+            let sequence = [0_u32.to_le_bytes(), 1_000_000_u32.to_le_bytes()].concat();
+            let body = [&[0, 0, 16, 0][..], &[0; 4], &writer[12..], &sequence, &payload].concat();
+            // Header, then DATA in little-endian order with a payload, to any reader.
+            let length = (body.len() as u16).to_le_bytes();
+            return Ok([&b"RTPS\x02\x04\x01\x12"[..], &writer[..12], &[0x15, 0b101], &length, &body].concat());
         }
-        while reader.take_with_writer().is_some() {
-            states += 1;
-        }
-        std::thread::park_timeout(Duration::from_millis(10));
+        std::thread::park_timeout(Duration::from_millis(50));
     }
-    std::thread::spawn(move || {
-        std::thread::sleep(Duration::from_secs(60));
-        drop((dds, reader));
-    });
-    Ok(())
+    Err("no state arrives".to_owned())
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use super::other_interface::robot_at_other_interface;
+use super::other_interface::state_from_other_interface;
 use super::{Row, in_state, pair};
 use crate::process::Process;
 use crate::robot_pair::RobotPair;
@@ -20,10 +20,10 @@ pub fn run(program: &Path, repeats: usize) -> Vec<Row> {
         ),
         ("a second robot is there before arming", armed_beside_another, "commands that it executed", 0.0),
         (
-            "a robot at another interface, whose states reach the computer",
-            robot_at_other_interface,
-            "commands that it executed",
-            0.0,
+            "an old state in the robot's name: nothing happens if it comes from another interface, a fault if from its own",
+            state_from_other_interface,
+            "ms to the fault",
+            100.0,
         ),
         ("the robot restarts while it stands", restart, "ms to the fault", 100.0),
     ];
