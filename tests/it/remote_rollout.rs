@@ -249,3 +249,33 @@ fn other_leases_and_hello_are_served_during_a_long_rollout_and_shutdown_ends_it(
     assert!(error.contains("is shutting down") || error.contains("no longer visible"), "{error}");
     stopper.join().unwrap();
 }
+
+#[test]
+fn policies_of_all_leases_share_one_budget_which_a_closed_lease_frees() {
+    let (server, endpoint) = start(&config(TaskConfig::default()));
+    let options = ConnectOptions::new(&endpoint, 1);
+    let lease = || {
+        let mut env = RemoteVecEnv::connect(&options).unwrap();
+        env.reset(&ResetRequest::seeded(5, 1)).unwrap();
+        env
+    };
+    let spec = lease().spec().clone();
+    // Some 4 MB of parameters, and as much for their arrangement.
+    let actor = Mlp::zeros(&[spec.obs_len(), 1000, 960, spec.action_len()]);
+    let normaliser = Normaliser::from_mean_and_std(&vec![0.0; spec.obs_len()], &vec![1.0; spec.obs_len()]);
+    let policy = BehaviourPolicy::new(actor, normaliser, vec![-1.0; spec.action_len()]);
+    let (mut leases, mut trajectory) = (Vec::new(), Trajectory::default());
+    let refusal = loop {
+        let mut env = lease();
+        match env.rollout(&policy, 0, 1, &mut trajectory) {
+            Ok(()) => leases.push(env),
+            Err(error) => break error.to_string(),
+        }
+        assert!(leases.len() < 40, "256 MiB are enough for 31");
+    };
+    assert!(refusal.contains("policies of all rollouts") && refusal.contains("268435456"), "{refusal}");
+    assert!(leases.len() >= 25, "{} policies", leases.len());
+    leases.pop().unwrap().close().unwrap();
+    lease().rollout(&policy, 0, 1, &mut trajectory).unwrap();
+    server.shutdown();
+}

@@ -53,6 +53,27 @@ fn training_writes_its_folder_and_is_resumed_in_it() {
     assert!(header.origin.env_steps == 9216 && longer.actor != policy.actor);
 }
 
+/// A limit of the file size fails as a full disk does: in the middle of a file.
+#[test]
+fn full_disk_costs_a_training_neither_its_steps_nor_the_last_checkpoint() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("walk");
+    let (out_text, checkpoint) = (out.to_str().unwrap(), out.join("checkpoint.safetensors"));
+    let trained = twinstep(&["train", "walk", "--out", out_text, "--envs", "64", "--steps", "3072", "--seed", "5"]);
+    assert!(trained.status.success(), "{}", text(&trained.stderr));
+    let before = std::fs::read(&checkpoint).unwrap();
+    let program = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep();
+    let script = "trap '' XFSZ; ulimit -f 4; exec \"$@\"";
+    let resume = ["train", "walk", "--out", out_text, "--resume", "--steps", "12288"];
+    let full = Command::new("sh").args(["-c", script, "sh"]).arg(program).args(resume).output().unwrap();
+    assert_eq!(full.status.code(), Some(1));
+    let error = text(&full.stderr);
+    assert!(error.contains("checkpoint.safetensors") && error.contains("too large"), "{error}");
+    assert_eq!(std::fs::read(&checkpoint).unwrap(), before, "the earlier checkpoint stays whole");
+    let resumed = twinstep(&["train", "walk", "--out", out_text, "--resume", "--steps", "4608"]);
+    assert!(resumed.status.success(), "{}", text(&resumed.stderr));
+}
+
 #[test]
 fn equal_seeds_give_equal_policies() {
     let folder = tempfile::tempdir().unwrap();

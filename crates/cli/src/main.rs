@@ -64,6 +64,7 @@ mod view_log;
 mod view_policy;
 mod watchdog;
 mod web_view;
+mod write_only_backend;
 
 use clap::{Parser, Subcommand};
 use twinstep_simd::InstructionSet;

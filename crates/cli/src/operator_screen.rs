@@ -7,7 +7,6 @@ use std::time::Duration;
 
 use ratatui::Frame;
 use ratatui::Terminal;
-use ratatui::backend::TermionBackend;
 use ratatui::layout::{Constraint, Layout};
 use ratatui::style::{Color, Style, Stylize};
 use ratatui::termion::screen::IntoAlternateScreen;
@@ -20,6 +19,7 @@ use crate::exit::{CommandResult, Failure, other};
 use crate::key_terminal::KeyTerminal;
 use crate::log_writer::ScreenLog;
 use crate::operator;
+use crate::write_only_backend::WriteOnlyBackend;
 
 /// Keys with what they stand for.
 const KEYS: [(u8, &str); 8] = [
@@ -139,7 +139,7 @@ fn show(
     log: &ScreenLog,
 ) -> std::io::Result<()> {
     let screen = std::io::stdout().into_alternate_screen()?;
-    let mut terminal = Terminal::new(TermionBackend::new(screen))?;
+    let mut terminal = Terminal::new(WriteOnlyBackend::new(screen))?;
     terminal.clear()?;
     while !handle.is_ending() && !handle.has_ended() {
         let (board, timing, clients, messages) = (handle.board(), handle.timing(), clients(), log.lines());

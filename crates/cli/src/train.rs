@@ -368,7 +368,8 @@ impl TrainSession {
             bar.set_message(progress_text(&point));
             if saved.elapsed() > SAVE_EVERY {
                 if let Err(Failure::Other(report) | Failure::Input(report)) = logged.map_err(other).and(self.save()) {
-                    bar.println(format!("not saved, the training goes on: {report}"));
+                    // `println` of the bar prints nothing without a terminal.
+                    bar.suspend(|| eprintln!("not saved, the training goes on: {report}"));
                 }
                 saved = Instant::now();
             }

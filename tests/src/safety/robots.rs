@@ -36,7 +36,10 @@ pub fn run(program: &Path, repeats: usize) -> Vec<Row> {
             let failures: Vec<&String> = results.iter().filter_map(|result| result.as_ref().err()).collect();
             Row {
                 what: (*what).to_owned(),
-                found: format!("{} of {repeats} as it should be; {unit}: at most {worst:.0}; {failures:?}", times.len()),
+                found: format!(
+                    "{} of {repeats} as it should be; {unit}: at most {worst:.0}; {failures:?}",
+                    times.len()
+                ),
                 is_met: times.len() == repeats && worst <= *limit,
             }
         })

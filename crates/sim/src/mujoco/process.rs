@@ -24,11 +24,16 @@ pub struct Process {
     replies: Receiver<Result<Frame, String>>,
     /// Reason of the first failure, which is also that of all later requests.
     failure: String,
+    reply_timeout: Duration,
 }
 
 impl Process {
     /// Starts the process with the interpreter `python` and sends the first request. Returns the reason if it fails.
     pub fn start(python: &Path, hello: &[u8]) -> Result<Self, String> {
+        Self::start_within(python, hello, REPLY_TIMEOUT)
+    }
+
+    fn start_within(python: &Path, hello: &[u8], reply_timeout: Duration) -> Result<Self, String> {
         let mut child = Command::new(python)
             .args(["-m", "twinstep.mujoco"])
             // Modules are not looked for in the current folder, which anybody may have filled.
@@ -46,6 +51,7 @@ impl Process {
             requests: Some(write_requests(stdin)),
             replies: read_replies(stdout),
             failure: String::new(),
+            reply_timeout,
         };
         let greeting = process.request(HELLO, hello, HELLO)?;
         check_greeting(&greeting)?;
@@ -77,7 +83,7 @@ impl Process {
         let Some(requests) = &self.requests else { return Err(self.failure.clone()) };
         // A request that cannot be written has no reply: the process has exited, or explains itself in its last reply.
         let _ = requests.send((kind, body.to_vec()));
-        match self.replies.recv_timeout(REPLY_TIMEOUT) {
+        match self.replies.recv_timeout(self.reply_timeout) {
             Ok(Ok((kind, body))) if kind == expected => Ok(body),
             Ok(Ok((ERROR, text))) => Err(String::from_utf8_lossy(&text).into_owned()),
             Ok(Ok((kind, body))) => {
@@ -85,7 +91,9 @@ impl Process {
                 Err(format!("it wrote a frame of kind {kind:?} with {} bytes as a reply", body.len()))
             }
             Ok(Err(reason)) => Err(reason),
-            Err(RecvTimeoutError::Timeout) => Err(format!("it did not reply within {} s", REPLY_TIMEOUT.as_secs())),
+            Err(RecvTimeoutError::Timeout) => {
+                Err(format!("it did not reply within {} s", self.reply_timeout.as_secs()))
+            }
             Err(RecvTimeoutError::Disconnected) => Err(self.exit_report()),
         }
     }
@@ -147,4 +155,25 @@ fn read_replies(stdout: ChildStdout) -> Receiver<Result<Frame, String>> {
         }
     });
     replies
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    #[test]
+    fn process_that_neither_reads_nor_replies_is_given_up_and_ended() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (program, id) = (folder.path().join("python"), folder.path().join("id"));
+        std::fs::write(&program, format!("#!/bin/sh\necho $$ > {}\nexec sleep 600\n", id.display())).expect("written");
+        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o700)).expect("permitted");
+        // More than a pipe holds.
+        let hello = vec![0; 1 << 20];
+        let reason = Process::start_within(&program, &hello, Duration::from_secs(1)).err();
+        assert_eq!(reason.as_deref(), Some("it did not reply within 1 s"));
+        let id = std::fs::read_to_string(id).expect("it was started");
+        assert!(!Path::new(&format!("/proc/{}", id.trim())).exists(), "it is ended and reaped");
+    }
 }
