@@ -4,16 +4,14 @@ use std::io::Write;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use twinstep_model::{ControlConfig, go2};
+use twinstep_robot_files::read_robot;
 
 /// Time in which a file is refused, on a busy machine.
 const AT_ONCE: Duration = Duration::from_secs(5);
 
 fn import(text: &str) -> String {
-    let control: ControlConfig = go2().control;
     let since = Instant::now();
-    let error =
-        twinstep_model::import_robot(text, &twinstep_model::ImportNames::default(), control).expect_err("a bomb");
+    let error = read_robot(text, None).expect_err("a bomb");
     assert!(since.elapsed() < AT_ONCE, "{:?}", since.elapsed());
     error.to_string()
 }
@@ -46,6 +44,13 @@ fn mjcf_with_deep_bodies_or_classes_is_refused() {
     let attributes = numbered(1001, |index| format!(" a{index}=\"1\""));
     let text = import(&format!("<mujoco><default><geom{attributes}/></default><worldbody/></mujoco>"));
     assert!(text.contains("at most 1000"), "{text}");
+    let attributes = numbered(900, |index| format!(" a{index}=\"1\""));
+    let classes = numbered(2000, |index| format!("<default class=\"c{index}\"/>"));
+    let text = import(&format!("<mujoco><default><geom{attributes}/>{classes}</default><worldbody/></mujoco>"));
+    assert!(text.contains("more than 1000 default classes"), "{text}");
+    let geoms = "<geom size=\"1\"/>".repeat(100_000);
+    let text = import(&format!("<mujoco><worldbody><body><freejoint/>{geoms}</body></worldbody></mujoco>"));
+    assert!(text.contains("more than 20000 elements"), "{text}");
 }
 
 #[test]

@@ -5,12 +5,14 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Crate folders and the workspace crates that each may use. Leaf crates use only the core; applications combine them.
-const MAY_USE: [(&str, &[&str]); 27] = [
+const MAY_USE: [(&str, &[&str]); 29] = [
     // Core.
     ("crates/files", &[]),
     ("crates/simd", &[]),
     ("crates/model", &["simd"]),
-    ("crates/effects", &["model"]),
+    ("crates/dynamics", &["simd", "model"]),
+    ("crates/robot-files", &["model"]),
+    ("crates/effects", &["model", "robot-files"]),
     ("crates/unitree", &["model"]),
     ("crates/logs", &["files", "model", "effects", "unitree"]),
     ("protocol", &["model"]),
@@ -57,6 +59,7 @@ const MAY_USE: [(&str, &[&str]); 27] = [
             "files",
             "simd",
             "model",
+            "robot-files",
             "effects",
             "logs",
             "protocol",
@@ -86,6 +89,8 @@ const MAY_USE: [(&str, &[&str]); 27] = [
         &[
             "simd",
             "model",
+            "robot-files",
+            "dynamics",
             "effects",
             "logs",
             "protocol",

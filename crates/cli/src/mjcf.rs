@@ -1,11 +1,13 @@
 //! `twinstep mjcf`: exports the robot as a MuJoCo model.
 
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use twinstep_model::{BaseMount, MjcfOptions, mjcf};
+use twinstep_effects::is_robot_file;
+use twinstep_model::{BaseMount, MjcfOptions, go2, mjcf};
+use twinstep_robot_files::{QuadrupedNames, quadruped, read_robot, write_mjcf};
 
-use crate::exit::{CommandResult, input, other};
+use crate::exit::{CommandResult, Failure, input, other};
 use crate::robot_file::robot_model;
 
 /// Allowed time steps [s].
@@ -13,7 +15,8 @@ const TIMESTEPS: std::ops::RangeInclusive<f64> = 1e-5..=0.02;
 
 /// Export the robot as a MuJoCo model (MJCF, XML), to compare the physics with MuJoCo.
 ///
-/// The model contains the kinematic tree, masses, inertias, armature, joint ranges and torque limits of the robot. Its
+/// Any robot of a URDF or MJCF file can be exported: what the file has and the model does not is told. For a quadruped like the Go2
+/// the model contains the kinematic tree, masses, inertias, armature, joint ranges and torque limits of the robot. Its
 /// contacts are those of `--engine batch`: feet, both ends of each calf, and the corners of the base against the
 /// ground. `ctrl` is torque [N·m] in the joint order FL, FR, RL, RR; hip, thigh, calf. The keyframe `default_pose` is
 /// the initial state.
@@ -48,20 +51,49 @@ struct WriteError {
     cause: std::io::Error,
 }
 
+/// The robot file cannot be read.
+#[derive(Debug, thiserror::Error)]
+#[error("`--model`: {}: {cause}", path.display())]
+struct RobotError {
+    path: PathBuf,
+    cause: String,
+}
+
 /// Exports the model.
 pub fn run(args: &Args) -> CommandResult {
     if !TIMESTEPS.contains(&args.timestep) {
         return Err(input(TimestepError(args.timestep)));
     }
-    let robot = robot_model(args.model.as_deref())?;
     let options = MjcfOptions { base: args.base, timestep: args.timestep, ..MjcfOptions::default() };
-    let text = mjcf(&robot, &options);
+    let text = match args.model.as_deref().filter(|path| is_robot_file(path)) {
+        Some(path) => of_robot_file(path, &options)?,
+        None => mjcf(&robot_model(args.model.as_deref())?, &options),
+    };
     match &args.out {
         Some(path) => {
             twinstep_files::write(path, text).map_err(|cause| input(WriteError { path: path.clone(), cause }))
         }
         None => std::io::stdout().write_all(text.as_bytes()).map_err(other),
     }
+}
+
+/// Returns the model of a robot file, as a tree if it has not the shape of the Go2. Prints what the file has and the model does not.
+fn of_robot_file(path: &Path, options: &MjcfOptions) -> Result<String, Failure> {
+    let failed = |cause: String| input(RobotError { path: path.to_owned(), cause });
+    let text = std::fs::read_to_string(path).map_err(|cause| failed(cause.to_string()))?;
+    let file = read_robot(&text, path.parent()).map_err(|cause| failed(cause.to_string()))?;
+    let (text, notes) = match quadruped(&file, &QuadrupedNames::default(), go2().control) {
+        Ok((robot, notes)) => (mjcf(&robot, options), notes),
+        Err(why) => {
+            let mut notes = file.notes.clone();
+            notes.push(format!("exported with its own shapes, because it is no quadruped like the Go2: {why}"));
+            (write_mjcf(&file.tree), notes)
+        }
+    };
+    for note in notes {
+        eprintln!("note: {note}");
+    }
+    Ok(text)
 }
 
 fn base(text: &str) -> Result<BaseMount, String> {

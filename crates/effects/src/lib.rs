@@ -29,7 +29,7 @@ pub use model_file::{
     ActuatorNetworkConfig, EffectEntryError, MemberSampling, ModelFile, ModelFileError, NetworkMode, load_robot,
     parse_robot,
 };
-pub use nominal::{ControlTable, JointsTable, NominalRobot, NominalRobotError};
+pub use nominal::{ControlTable, JointsTable, NominalRobot, NominalRobotError, is_robot_file};
 pub use sampler::{RobotSampler, SamplingError};
 pub use scope::{Scope, UnknownScope};
 pub use search::{BlindTestCondition, Probes, Search, Variable, Visibility};

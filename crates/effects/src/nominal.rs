@@ -4,7 +4,8 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::{ControlConfig, ImportError, ImportNames, NUM_JOINTS, RobotModel, go2, import_robot};
+use twinstep_model::{ControlConfig, NUM_JOINTS, RobotModel, go2};
+use twinstep_robot_files::{QuadrupedNames, RobotFileError, quadruped, read_robot};
 
 /// Name of the built-in robot.
 pub const BUILT_IN: &str = "go2";
@@ -81,7 +82,7 @@ pub enum NominalRobotError {
         /// The file.
         path: PathBuf,
         /// What is wrong.
-        cause: ImportError,
+        cause: RobotFileError,
     },
     /// A key of `[control]` is missing or not allowed.
     #[error("`control.{key}` is {found}; {expected} expected")]
@@ -129,8 +130,12 @@ impl NominalRobot {
             .map_err(|source| NominalRobotError::Unreadable { path: path.clone(), source })?;
         let JointsTable { names, feet } = joints.clone().unwrap_or_default();
         let config = table.config(names.is_none())?;
-        let model = import_robot(&text, &ImportNames { joints: names, feet }, config)
+        let (model, notes) = read_robot(&text, path.parent())
+            .and_then(|file| quadruped(&file, &QuadrupedNames { joints: names, feet }, config))
             .map_err(|cause| NominalRobotError::Import { path: path.clone(), cause })?;
+        for note in notes {
+            tracing::warn!("{}: {note}", path.display());
+        }
         Ok(Self { robot: path.display().to_string(), control, joints, model })
     }
 }

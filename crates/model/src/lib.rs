@@ -9,7 +9,7 @@
 //! - [`Scene`]: shapes and poses for rendering; [`body_poses`]: forward kinematics;
 //!   [`FootKinematics`]: position and velocity of the feet.
 //! - [`Ground`]: a plane, or a [`HeightField`] for uneven terrain.
-//! - [`import_robot`]: robots from URDF and MJCF files; [`mjcf()`]: the robot as a MuJoCo model.
+//! - [`RobotTree`]: a robot of any shape; [`mjcf()`]: the robot as a MuJoCo model.
 //! - [`dynamics`]: kinematics, dynamics and actuator laws, with one robot per SIMD lane.
 //! - [`Rollout`]: simulates command sequences with many candidate robots at once.
 //! - [`stream`]: reproducible random streams, one per consumer, from one seed.
@@ -29,7 +29,6 @@ pub mod frames;
 mod go2;
 mod ground;
 mod height_field;
-mod import;
 mod initial_state;
 mod joint;
 mod kinematics;
@@ -44,6 +43,7 @@ mod scene;
 mod spec;
 mod stream;
 mod trajectory;
+mod tree;
 mod vec_env;
 
 pub use agent_commands::{AgentCommands, GaitCommand, VelocityCommand};
@@ -58,7 +58,6 @@ pub use foot_kinematics::{FootKinematics, FootMotion};
 pub use go2::go2;
 pub use ground::Ground;
 pub use height_field::{HeightField, HeightFieldError};
-pub use import::{ImportError, ImportNames, import_robot};
 pub use initial_state::InitialState;
 pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};
 pub use kinematics::{FIXED_BASE_HEIGHT, NUM_BODIES, Pose, body_poses};
@@ -75,4 +74,5 @@ pub use scene::{Scene, SceneShape, ShapeKind};
 pub use spec::{EnvSpec, SpecDifference, SpecField};
 pub use stream::{Stream, standard_normal, stream};
 pub use trajectory::Trajectory;
+pub use tree::{RobotTree, TreeBody, TreeJoint, TreeJointKind, TreeShape, TreeShapeKind};
 pub use vec_env::{AutoresetMode, EndedEpisode, EnvError, ResetRequest, StepBatch, VecEnv};

@@ -228,10 +228,11 @@ fn link(xml: &mut Xml, robot: &RobotModel, joint: Joint) {
     let origin = leg.origins[joint.kind as usize];
     xml.open("body", &[("name", joint.name().to_owned()), ("pos", numbers(origin.to_array()))]);
     inertial(xml, &leg.bodies[joint.kind as usize]);
+    let has_limits = numbers_of.range.iter().all(|limit| limit.is_finite());
     let mut attributes = vec![
         ("name", joint.name().to_owned()),
         ("axis", numbers(RobotModel::axis(joint).to_array())),
-        ("range", numbers(numbers_of.range)),
+        if has_limits { ("range", numbers(numbers_of.range)) } else { ("limited", "false".to_owned()) },
         ("armature", numbers_of.armature.to_string()),
     ];
     let JointModel { viscous_friction, coulomb_friction, spring, .. } = numbers_of;

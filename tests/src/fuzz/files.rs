@@ -9,8 +9,9 @@ use twinstep_env_server::{Config, ConfigFileError, SimEnvFactory};
 use twinstep_excite::CommandSequence;
 use twinstep_identify::{EffectAtScope, GlobalSearch};
 use twinstep_logs::{Log, LogError};
-use twinstep_model::{BaseMount, ImportError, ImportNames, Joint, MjcfOptions, go2, import_robot, mjcf, stream};
+use twinstep_model::{BaseMount, Joint, MjcfOptions, go2, mjcf, stream};
 use twinstep_protocol::{Secret, keys};
+use twinstep_robot_files::{QuadrupedNames, RobotFileError, quadruped, read_robot, write_mjcf};
 
 use super::format::{Format, Outcome, examples_in};
 use super::{log_examples, policies, weights_examples};
@@ -174,12 +175,15 @@ fn read_text(format: Format, text: &str, folder: &Path) -> Outcome {
             copy_robots(folder);
             read_model(&write(folder, "model.toml", text.as_bytes()), text)
         }
-        Format::Urdf | Format::Mjcf => match import_robot(text, &ImportNames::default(), go2().control) {
-            Ok(robot) => {
-                assert!(mjcf(&robot, &MjcfOptions::default()).contains("<mujoco"), "the robot can be exported");
+        Format::Urdf | Format::Mjcf => match read_robot(text, None) {
+            Ok(file) => {
+                read_robot(&write_mjcf(&file.tree), None).expect("a robot that was read can be written and read");
+                if let Ok((robot, _)) = quadruped(&file, &QuadrupedNames::default(), go2().control) {
+                    assert!(mjcf(&robot, &MjcfOptions::default()).contains("<mujoco"), "the robot can be exported");
+                }
                 Outcome::Accepted
             }
-            Err(ImportError::Xml(_)) => Outcome::Refused,
+            Err(RobotFileError::Xml(_)) => Outcome::Refused,
             Err(error) => outcome(Err::<(), _>(error), |()| true).max_decoded(),
         },
         Format::Config => read_config(text),

@@ -55,7 +55,11 @@ impl Walk {
             spec.critic_observation = privileged_fields();
         }
         let (lower, upper) = (robot.lower_limits(), robot.upper_limits());
-        let margin = |j: usize| (1.0 - SOFT_JOINT_LIMIT_FACTOR) / 2.0 * (upper[j] - lower[j]);
+        let margin = |j: usize| {
+            let margin = (1.0 - SOFT_JOINT_LIMIT_FACTOR) / 2.0 * (upper[j] - lower[j]);
+            // A joint without limits has none within them.
+            if margin.is_finite() { margin } else { 0.0 }
+        };
         Ok(Self {
             terms,
             default_pose: robot.control.default_pose_f32(),

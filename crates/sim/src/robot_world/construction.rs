@@ -157,12 +157,11 @@ fn moving_body(builder: RigidBodyBuilder, body: &RigidBody, com: DVec3) -> Rigid
 
 fn revolute(robot: &RobotModel, joint: Joint, origin: DVec3) -> GenericJoint {
     let range = robot.joints[joint.index()].range.map(|limit| limit as f32);
-    RevoluteJointBuilder::new(RobotModel::axis(joint).as_vec3())
+    let revolute = RevoluteJointBuilder::new(RobotModel::axis(joint).as_vec3())
         .local_anchor1(origin.as_vec3())
-        .limits(range)
-        .contacts_enabled(false)
-        .build()
-        .into()
+        .contacts_enabled(false);
+    let has_limits = range.iter().all(|limit| limit.is_finite());
+    if has_limits { revolute.limits(range).build().into() } else { revolute.build().into() }
 }
 
 fn insert_shape(

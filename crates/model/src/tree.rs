@@ -1,0 +1,165 @@
+//! A robot of any shape: bodies in a tree, joined by joints with any axis and frame.
+
+use glam::{DAffine3, DMat3, DVec3};
+
+use crate::{BaseMount, JointSpring, RigidBody};
+
+/// Robot: bodies, joints and collision shapes. A body follows its parent.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RobotTree {
+    /// Name of the robot.
+    pub name: String,
+    /// Whether the base moves; `None` if nothing says so.
+    pub base: Option<BaseMount>,
+    /// World-from-base of a fixed base.
+    pub world_from_base: DAffine3,
+    /// Bodies. The first is the base; joint `i` moves body `i + 1`.
+    pub bodies: Vec<TreeBody>,
+    /// Joints.
+    pub joints: Vec<TreeJoint>,
+    /// Collision shapes.
+    pub shapes: Vec<TreeShape>,
+}
+
+/// Body with everything that is fixed to it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TreeBody {
+    /// Name of the body.
+    pub name: String,
+    /// Mass, in the frame of the body. Zero for a body between two joints at one place.
+    pub inertia: RigidBody,
+}
+
+/// Kind of a joint.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TreeJointKind {
+    /// Rotates about its axis; positions in rad.
+    Revolute,
+    /// Slides along its axis; positions in m.
+    Prismatic,
+}
+
+/// Joint between a body and its parent. Forces are in N·m for a revolute joint, in N for a prismatic one.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TreeJoint {
+    /// Name of the joint.
+    pub name: String,
+    /// Kind of the joint.
+    pub kind: TreeJointKind,
+    /// Index of the parent body.
+    pub parent: usize,
+    /// Pose of the child's frame in the parent's frame at position 0.
+    pub parent_from_child: DAffine3,
+    /// Unit vector of the axis in the child's frame.
+    pub axis: DVec3,
+    /// Lowest and highest position; infinite without limits.
+    pub range: [f64; 2],
+    /// Lowest and highest force of the actuators; `None` if the file states none.
+    pub effort: Option<[f64; 2]>,
+    /// Highest speed of the actuator; infinite if the file states none.
+    pub speed_limit: f64,
+    /// Rotor inertia reflected to the joint [kg·m² or kg].
+    pub armature: f64,
+    /// Coefficient of viscous friction [N·m·s/rad or N·s/m].
+    pub damping: f64,
+    /// Coulomb friction [N·m or N].
+    pub friction: f64,
+    /// Spring parallel to the joint.
+    pub spring: JointSpring,
+}
+
+/// Collision shape.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TreeShape {
+    /// Name of the shape, or of the link that it was defined in.
+    pub name: String,
+    /// Index of the body.
+    pub body: usize,
+    /// Kind and size.
+    pub kind: TreeShapeKind,
+    /// Pose in the frame of the body. Capsules and cylinders extend along z.
+    pub body_from_shape: DAffine3,
+}
+
+/// Kind and size of a shape [m].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum TreeShapeKind {
+    /// Box with these half sizes.
+    Box(DVec3),
+    /// Sphere with this radius.
+    Sphere(f64),
+    /// Ellipsoid with these radii.
+    Ellipsoid(DVec3),
+    /// Cylinder with half spheres at its ends.
+    Capsule {
+        /// Radius of cylinder and half spheres.
+        radius: f64,
+        /// Half of the length of the cylinder.
+        half_length: f64,
+    },
+    /// Cylinder.
+    Cylinder {
+        /// Radius.
+        radius: f64,
+        /// Half of the length.
+        half_length: f64,
+    },
+    /// Mesh, with the lowest and the highest coordinates of its vertices, if they were read.
+    Mesh(Option<[DVec3; 2]>),
+}
+
+impl RobotTree {
+    /// Returns the mass of all bodies [kg].
+    pub fn total_mass(&self) -> f64 {
+        self.bodies.iter().map(|body| body.inertia.mass).sum()
+    }
+
+    /// Returns the index of the joint with this name.
+    pub fn joint(&self, name: &str) -> Option<usize> {
+        self.joints.iter().position(|joint| joint.name == name)
+    }
+
+    /// Returns the pose of each body in the base frame at the joint positions `q`.
+    pub fn base_from_bodies(&self, q: &[f64]) -> Vec<DAffine3> {
+        let mut poses = vec![DAffine3::IDENTITY];
+        for (joint, q) in self.joints.iter().zip(q) {
+            poses.push(poses[joint.parent] * joint.parent_from_child * joint.motion(*q));
+        }
+        poses
+    }
+}
+
+impl TreeJoint {
+    /// Returns the pose of the child's frame at position `q` in that at position 0.
+    pub fn motion(&self, q: f64) -> DAffine3 {
+        match self.kind {
+            TreeJointKind::Revolute => DAffine3::from_axis_angle(self.axis, q),
+            TreeJointKind::Prismatic => DAffine3::from_translation(q * self.axis),
+        }
+    }
+}
+
+impl RobotTree {
+    /// Returns the same robot with frames that are parallel at the position 0 of all joints: each frame is turned, and what is in it
+    /// turned back.
+    #[must_use]
+    pub fn with_parallel_frames(&self) -> Self {
+        let mut tree = self.clone();
+        // Rotation from the frame of each body to its new frame.
+        let mut turns = vec![DMat3::IDENTITY];
+        for (index, joint) in tree.joints.iter_mut().enumerate() {
+            let parent = turns[joint.parent];
+            let turn = parent * joint.parent_from_child.matrix3;
+            joint.parent_from_child = DAffine3::from_translation(parent * joint.parent_from_child.translation);
+            joint.axis = turn * joint.axis;
+            turns.push(turn);
+            let RigidBody { mass, com, inertia } = tree.bodies[index + 1].inertia;
+            tree.bodies[index + 1].inertia =
+                RigidBody { mass, com: turn * com, inertia: turn * inertia * turn.transpose() };
+        }
+        for shape in &mut tree.shapes {
+            shape.body_from_shape = DAffine3::from_mat3(turns[shape.body]) * shape.body_from_shape;
+        }
+        tree
+    }
+}

@@ -1,0 +1,158 @@
+//! Forces that the actuators of MJCF files can exert on joints.
+
+use std::collections::BTreeMap;
+
+use roxmltree::Node;
+
+use super::compiler::Settings;
+use super::defaults::{ACTUATOR_ELEMENT, Classes};
+use super::element::Element;
+use super::joints::limits;
+use crate::RobotFileError;
+use crate::xml::unsupported;
+
+/// Names of the elements of actuators, of which each is a general actuator with some attributes set.
+pub const SHORTCUTS: [&str; 11] = [
+    "general",
+    "motor",
+    "position",
+    "velocity",
+    "intvelocity",
+    "damper",
+    "cylinder",
+    "muscle",
+    "adhesion",
+    "dcmotor",
+    "plugin",
+];
+
+const RESOLVED: [&str; 13] = [
+    "name",
+    "class",
+    "joint",
+    "gear",
+    "ctrlrange",
+    "ctrllimited",
+    "forcerange",
+    "forcelimited",
+    "kp",
+    "kv",
+    "gainprm",
+    "gaintype",
+    "biastype",
+];
+/// How a controller inside the actuator works; Twinstep's controller takes its place.
+const OF_THE_CONTROLLER: [&str; 13] = [
+    "biasprm",
+    "dampratio",
+    "timeconst",
+    "inheritrange",
+    "dyntype",
+    "dynprm",
+    "actlimited",
+    "actrange",
+    "actearly",
+    "actdim",
+    "group",
+    "user",
+    "lengthrange",
+];
+
+/// Lowest and highest force on each joint, and whether a controller was left out.
+#[derive(Debug, Default)]
+pub struct Actuators {
+    efforts: BTreeMap<String, [f64; 2]>,
+    /// True if an actuator has a controller inside.
+    pub has_controllers: bool,
+}
+
+impl Actuators {
+    /// Reads all actuators.
+    pub fn read<'a>(root: Node<'a, 'a>, classes: &Classes<'a>) -> Result<Self, RobotFileError> {
+        let settings = Settings::read(root)?;
+        let mut read = Self::default();
+        let all = root.children().filter(|node| node.has_tag_name("actuator")).flat_map(|node| node.children());
+        for node in all.filter(Node::is_element) {
+            let element = Element::new(node, "actuator", "main", classes)?;
+            read.add(&element, &settings)?;
+        }
+        Ok(read)
+    }
+
+    /// Returns the lowest and the highest force on a joint: the sum of its actuators. `None` if it has none.
+    pub fn effort(&self, joint: &str) -> Option<[f64; 2]> {
+        self.efforts.get(joint).copied()
+    }
+
+    /// Returns the names of the joints that have actuators.
+    pub fn joints(&self) -> impl Iterator<Item = &str> {
+        self.efforts.keys().map(String::as_str)
+    }
+
+    fn add(&mut self, element: &Element, settings: &Settings) -> Result<(), RobotFileError> {
+        let tag = element.node.tag_name().name();
+        if !matches!(tag, "general" | "motor" | "position" | "velocity" | "intvelocity" | "damper") {
+            return Err(unsupported(
+                element.node,
+                format!("<{tag}> is not supported: motors, position and velocity actuators are"),
+            ));
+        }
+        element.check(&[&RESOLVED, &OF_THE_CONTROLLER, &[ACTUATOR_ELEMENT.1]])?;
+        let Some(joint) = element.node.attribute("joint") else {
+            return Err(unsupported(
+                element.node,
+                format!("<{tag}> has no `joint`: other transmissions are not supported"),
+            ));
+        };
+        let [gear, ..] = element.up_to::<6>("gear", "up to six numbers")?.unwrap_or([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        let inner = self.force(element, tag, settings)?;
+        let [low, high] = match limits(element, "forcerange", "forcelimited", settings)? {
+            Some([low, high]) => [inner[0].clamp(low, high), inner[1].clamp(low, high)],
+            None => inner,
+        };
+        // No force times an infinite one is none.
+        let scaled = |force: f64| if gear == 0.0 { 0.0 } else { gear * force };
+        let (low, high) = (scaled(low).min(scaled(high)), scaled(low).max(scaled(high)));
+        let effort = self.efforts.entry(joint.to_owned()).or_insert([0.0; 2]);
+        *effort = [effort[0] + low, effort[1] + high];
+        Ok(())
+    }
+
+    /// Returns the force before `forcerange`.
+    fn force(&mut self, element: &Element, tag: &str, settings: &Settings) -> Result<[f64; 2], RobotFileError> {
+        let endless = [f64::NEG_INFINITY, f64::INFINITY];
+        let control = limits(element, "ctrlrange", "ctrllimited", settings)?.unwrap_or(endless);
+        match tag {
+            "motor" => Ok(control),
+            "position" | "velocity" | "intvelocity" | "damper" => {
+                self.has_controllers = true;
+                let gains = if tag == "position" || tag == "intvelocity" { ["kp", "kv"] } else { ["kv", "kv"] };
+                let default = if element.attribute("kp").is_none() && gains[0] == "kp" { 1.0 } else { 0.0 };
+                let without_gains = element.number(gains[0], default)? == 0.0
+                    && element.number(gains[1], if tag == "velocity" { 1.0 } else { 0.0 })? == 0.0
+                    && element.attribute("dampratio").is_none();
+                Ok(if without_gains { [0.0; 2] } else { endless })
+            }
+            _ => self.general(element, control),
+        }
+    }
+
+    /// Returns the force of a general actuator: its gain times its control, if that is all.
+    fn general(&mut self, element: &Element, control: [f64; 2]) -> Result<[f64; 2], RobotFileError> {
+        if let Some(shortcut) = element.class.get(&ACTUATOR_ELEMENT).filter(|tag| !matches!(**tag, "general" | "motor"))
+        {
+            let problem =
+                format!("<general> in a class with defaults of <{shortcut}> is not supported: use <{shortcut}>");
+            return Err(unsupported(element.node, problem));
+        }
+        let is = |name: &str, value: &str| element.attribute(name).is_none_or(|given| given == value);
+        let is_direct = is("gaintype", "fixed") && is("biastype", "none");
+        if !is_direct || !(is("dyntype", "none") || is("dyntype", "filter") || is("dyntype", "filterexact")) {
+            self.has_controllers = true;
+            return Ok([f64::NEG_INFINITY, f64::INFINITY]);
+        }
+        let [gain, ..] = element.up_to::<10>("gainprm", "up to ten numbers")?.unwrap_or([1.0; 10]);
+        let scaled = control.map(|control| if gain == 0.0 { 0.0 } else { gain * control });
+        Ok([scaled[0].min(scaled[1]), scaled[0].max(scaled[1])])
+    }
+}

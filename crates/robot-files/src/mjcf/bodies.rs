@@ -1,0 +1,319 @@
+//! Bodies and frames of MJCF files, from the base outwards.
+
+use glam::{DAffine3, DMat3, DVec3};
+use roxmltree::Node;
+use twinstep_model::{BaseMount, RigidBody, TreeShapeKind};
+
+use super::actuators::Actuators;
+use super::compiler::{MassSource, Settings};
+use super::defaults::Classes;
+use super::element::Element;
+use super::joints::BodyJoint;
+use super::meshes::Meshes;
+use super::{geoms, joints};
+use crate::orientation::ORIENTATIONS;
+use crate::tree_builder::TreeBuilder;
+use crate::xml::{child, unsupported, vector};
+use crate::{RobotFile, RobotFileError};
+
+const OF_BODY: [&str; 7] = ["name", "childclass", "pos", "user", "gravcomp", "mocap", "sleep"];
+const OF_INERTIAL: [&str; 4] = ["pos", "mass", "diaginertia", "fullinertia"];
+/// Elements of bodies that are not part of the robot's mechanics.
+const WITHOUT_EFFECT: [&str; 3] = ["site", "camera", "light"];
+
+/// Maximum number of elements of `<worldbody>`.
+const MAX_ELEMENTS: usize = 20_000;
+
+struct Reader<'a, 'b> {
+    settings: &'b Settings,
+    classes: &'b Classes<'a>,
+    actuators: &'b Actuators,
+    meshes: &'b Meshes<'b>,
+    tree: TreeBuilder,
+}
+
+/// A body or frame with what it inherits.
+#[derive(Clone, Copy)]
+struct Place<'a> {
+    node: Node<'a, 'a>,
+    /// Pose in the body of the tree that it belongs to.
+    pose: DAffine3,
+    /// Class of the elements in it.
+    class: &'a str,
+}
+
+/// Reads `<worldbody>`: the robot in it, without what never moves beside it.
+pub fn read<'a>(
+    root: Node<'a, 'a>,
+    settings: &Settings,
+    classes: &Classes<'a>,
+    actuators: &Actuators,
+    meshes: &Meshes,
+) -> Result<RobotFile, RobotFileError> {
+    let name = root.attribute("model").unwrap_or("robot");
+    let world = child(root, "worldbody").ok_or_else(|| unsupported(root, "<mujoco> has no <worldbody>"))?;
+    if world.descendants().nth(MAX_ELEMENTS).is_some() {
+        return Err(unsupported(world, format!("<worldbody> has more than {MAX_ELEMENTS} elements")));
+    }
+    let place = Place { node: world, pose: DAffine3::IDENTITY, class: "main" };
+    let tree = TreeBuilder::new(name, "world", None, DAffine3::IDENTITY);
+    let mut reader = Reader { settings, classes, actuators, meshes, tree };
+    let all = reader.bodies_of(place)?;
+    let (robots, furniture): (Vec<Place>, Vec<Place>) = all.into_iter().partition(|place| moves(place.node));
+    let free: Vec<&Place> = robots.iter().filter(|place| free_joint(place.node).is_some()).collect();
+    match (&robots[..], &free[..]) {
+        ([], _) => return Err(unsupported(world, "<worldbody> has no body with a joint")),
+        (_, [one, other, ..]) => {
+            let [one, other] = [one, other].map(|place| label(place.node));
+            return Err(unsupported(
+                world,
+                format!("bodies `{one}` and `{other}` both move freely: one robot expected"),
+            ));
+        }
+        ([robot], [_]) => reader.start(name, *robot, BaseMount::Floating)?,
+        ([robot], []) if joints_of(robot.node).is_empty() => reader.start(name, *robot, BaseMount::Fixed)?,
+        (_, [one]) => {
+            let problem =
+                format!("body `{}` moves freely, and others move beside it: one robot expected", label(one.node));
+            return Err(unsupported(world, problem));
+        }
+        _ => {
+            reader.tree = TreeBuilder::new(name, "world", Some(BaseMount::Fixed), DAffine3::IDENTITY);
+            for robot in &robots {
+                reader.body(*robot, 0)?;
+            }
+        }
+    }
+    for place in furniture {
+        reader.tree.note(format!("body `{}` never moves and is not part of the robot", label(place.node)));
+    }
+    if let Some(joint) = actuators.joints().find(|joint| !reader.tree.has_joint(joint)) {
+        return Err(unsupported(
+            root,
+            format!("<actuator> has an actuator of joint `{joint}`, which the robot does not have"),
+        ));
+    }
+    if let Some(total) = settings.total_mass {
+        reader.tree.set_total_mass(total);
+    }
+    if actuators.has_controllers {
+        reader.tree.note("controllers inside the actuators of the file are left out: their force limits are kept");
+    }
+    reader.tree.finish()
+}
+
+/// Returns true if a body or one below it has a joint.
+fn moves(body: Node) -> bool {
+    body.descendants().any(|node| node.has_tag_name("joint") || node.has_tag_name("freejoint"))
+}
+
+/// Returns the joints of a body, also those in frames, without those of bodies below it.
+fn joints_of<'a>(body: Node<'a, 'a>) -> Vec<Node<'a, 'a>> {
+    let mut joints = Vec::new();
+    for node in body.children() {
+        match node.tag_name().name() {
+            "joint" | "freejoint" => joints.push(node),
+            "frame" => joints.extend(joints_of(node)),
+            _ => {}
+        }
+    }
+    joints
+}
+
+fn free_joint<'a>(body: Node<'a, 'a>) -> Option<Node<'a, 'a>> {
+    joints_of(body).into_iter().find(|joint| joint.has_tag_name("freejoint") || joint.attribute("type") == Some("free"))
+}
+
+fn label<'a>(node: Node<'a, '_>) -> &'a str {
+    node.attribute("name").unwrap_or("without a name")
+}
+
+impl<'a> Reader<'a, '_> {
+    /// Reads the body that is the base.
+    fn start(&mut self, name: &str, robot: Place<'a>, mount: BaseMount) -> Result<(), RobotFileError> {
+        let base = Element { node: robot.node, kind: "body", class: &self.classes["main"] };
+        let world_from_base = robot.pose * base.pose(self.settings)?;
+        self.tree = TreeBuilder::new(name, label(robot.node), Some(mount), world_from_base);
+        let class = robot.node.attribute("childclass").unwrap_or(robot.class);
+        self.check_body(robot.node)?;
+        if let Some(joint) = free_joint(robot.node) {
+            self.check_free_joint(joint, class)?;
+        }
+        self.fill(Place { node: robot.node, pose: DAffine3::IDENTITY, class }, 0)
+    }
+
+    fn check_body(&self, node: Node<'a, 'a>) -> Result<(), RobotFileError> {
+        let body = Element { node, kind: "body", class: &self.classes["main"] };
+        body.check(&[&OF_BODY, &ORIENTATIONS])?;
+        body.check_value("gravcomp", &["0"])?;
+        body.check_value("mocap", &["false"])
+    }
+
+    /// Refuses a free joint with forces of its own, and one that turns the frame of its body.
+    fn check_free_joint(&self, node: Node<'a, 'a>, class: &str) -> Result<(), RobotFileError> {
+        if node.has_tag_name("freejoint") {
+            let joint = Element { node, kind: "freejoint", class: &self.classes["main"] };
+            joint.check(&[&["name", "group", "user", "align"]])?;
+            return joint.check_value("align", &["auto", "false"]);
+        }
+        let joint = Element::new(node, "joint", class, self.classes)?;
+        for name in ["armature", "damping", "frictionloss", "stiffness"] {
+            if joint.number(name, 0.0)? != 0.0 {
+                return Err(unsupported(node, format!("`{name}` of a free joint is not supported")));
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns the bodies directly in a body or the world, also those in frames.
+    fn bodies_of(&self, place: Place<'a>) -> Result<Vec<Place<'a>>, RobotFileError> {
+        let mut bodies = Vec::new();
+        for node in place.node.children().filter(Node::is_element) {
+            if node.has_tag_name("body") {
+                bodies.push(Place { node, ..place });
+            } else if node.has_tag_name("frame") {
+                bodies.extend(self.bodies_of(self.frame(node, place)?)?);
+            }
+        }
+        Ok(bodies)
+    }
+
+    /// Returns the place of a frame.
+    fn frame(&self, node: Node<'a, 'a>, outer: Place<'a>) -> Result<Place<'a>, RobotFileError> {
+        let frame = Element { node, kind: "frame", class: &self.classes["main"] };
+        frame.check(&[&["name", "childclass", "pos"], &ORIENTATIONS])?;
+        let pose = outer.pose * frame.pose(self.settings)?;
+        Ok(Place { node, pose, class: node.attribute("childclass").unwrap_or(outer.class) })
+    }
+
+    /// Reads a body that is in body `parent` of the tree: a body of the tree for each of its joints, or a part of the parent.
+    fn body(&mut self, outer: Place<'a>, parent: usize) -> Result<(), RobotFileError> {
+        let node = outer.node;
+        self.check_body(node)?;
+        let body = Element { node, kind: "body", class: &self.classes["main"] };
+        let mut pose = outer.pose * body.pose(self.settings)?;
+        let class = node.attribute("childclass").unwrap_or(outer.class);
+        if free_joint(node).is_some() {
+            return Err(unsupported(node, format!("body `{}` has a free joint below another body", label(node))));
+        }
+        let mut joints = Vec::new();
+        self.joints_in(Place { node, pose: DAffine3::IDENTITY, class }, &mut joints)?;
+        let mut index = parent;
+        for BodyJoint { joint, anchor, has_solver_settings } in joints {
+            if has_solver_settings {
+                self.tree.note("solver settings of joint limits and friction are left out");
+            }
+            // The frame of the new body is at the joint, with the axes of the body.
+            let at_joint = pose * DAffine3::from_translation(anchor);
+            let parent_from_child = at_joint * joint.parent_from_child;
+            let joint = twinstep_model::TreeJoint { parent: index, parent_from_child, ..joint };
+            index = self.tree.add_body(label(node), joint);
+            pose = DAffine3::from_translation(-anchor);
+        }
+        self.fill(Place { node, pose, class }, index)
+    }
+
+    /// Collects the joints of a body, also those in frames.
+    fn joints_in(&self, place: Place<'a>, joints: &mut Vec<BodyJoint>) -> Result<(), RobotFileError> {
+        for node in place.node.children().filter(Node::is_element) {
+            if node.has_tag_name("joint") {
+                let element = Element::new(node, "joint", place.class, self.classes)?;
+                joints.push(joints::read(&element, place.pose, self.settings, self.actuators)?);
+            } else if node.has_tag_name("frame") {
+                self.joints_in(self.frame(node, place)?, joints)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Adds mass, shapes and bodies of a place to body `index`.
+    fn fill(&mut self, place: Place<'a>, index: usize) -> Result<(), RobotFileError> {
+        let stated = child(place.node, "inertial");
+        let weighs_shapes = match self.settings.mass_source {
+            MassSource::Auto => stated.is_none(),
+            MassSource::Shapes => self.has_shapes(place)?,
+            MassSource::Inertial => false,
+        };
+        if let Some(inertial) = stated.filter(|_| !weighs_shapes) {
+            let body = self.inertial(inertial)?;
+            self.tree.add_mass(index, place.pose, body);
+        }
+        self.contents(place, index, weighs_shapes)
+    }
+
+    /// Returns true if a body has shapes in the groups that have mass, also in frames.
+    fn has_shapes(&self, place: Place<'a>) -> Result<bool, RobotFileError> {
+        for node in place.node.children() {
+            let found = match node.tag_name().name() {
+                "geom" => {
+                    let element = Element::new(node, "geom", place.class, self.classes)?;
+                    geoms::read(&element, self.settings)?.is_some_and(|geom| geom.is_weighed(self.settings))
+                }
+                "frame" => self.has_shapes(self.frame(node, place)?)?,
+                _ => false,
+            };
+            if found {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    fn contents(&mut self, place: Place<'a>, index: usize, weighs_shapes: bool) -> Result<(), RobotFileError> {
+        for node in place.node.children().filter(Node::is_element) {
+            match node.tag_name().name() {
+                "inertial" | "joint" | "freejoint" => {}
+                "geom" => self.geom(node, place, index, weighs_shapes)?,
+                "body" => self.body(Place { node, ..place }, index)?,
+                "frame" => {
+                    let inner = self.frame(node, place)?;
+                    self.contents(inner, index, weighs_shapes)?;
+                }
+                name if WITHOUT_EFFECT.contains(&name) => {}
+                name => return Err(unsupported(node, format!("<{name}> is not supported"))),
+            }
+        }
+        Ok(())
+    }
+
+    fn geom(&mut self, node: Node<'a, 'a>, place: Place<'a>, index: usize, weighs: bool) -> Result<(), RobotFileError> {
+        let element = Element::new(node, "geom", place.class, self.classes)?;
+        let Some(geom) = geoms::read(&element, self.settings)? else {
+            return Err(unsupported(node, "a plane that is part of the robot is not supported"));
+        };
+        if weighs && let Some(body) = geom.body(node, self.settings)? {
+            self.tree.add_mass(index, place.pose, body);
+        }
+        if geom.collides {
+            let name = geom.name.as_deref().unwrap_or_else(|| place.node.attribute("name").unwrap_or("geom"));
+            let kind = match (geom.kind, element.attribute("mesh")) {
+                // Only a mesh as it is has the bounds of its file.
+                (TreeShapeKind::Mesh(_), Some(mesh)) if element.attribute("type") == Some("mesh") => {
+                    TreeShapeKind::Mesh(self.meshes.bounds(mesh))
+                }
+                (kind, _) => kind,
+            };
+            self.tree.add_shape(name, index, kind, place.pose * geom.pose);
+        }
+        Ok(())
+    }
+
+    fn inertial(&self, node: Node<'a, 'a>) -> Result<RigidBody, RobotFileError> {
+        let element = Element { node, kind: "inertial", class: &self.classes["main"] };
+        element.check(&[&OF_INERTIAL, &ORIENTATIONS])?;
+        let mass = element.numbers::<1>("mass", "a number")?.map(|[mass]| mass);
+        let mass = mass.ok_or_else(|| element.error("mass", "a number"))?;
+        let inertia = if let Some([xx, yy, zz, xy, xz, yz]) = element.numbers("fullinertia", "six numbers")? {
+            if ORIENTATIONS.iter().any(|name| element.attribute(name).is_some()) {
+                return Err(unsupported(node, "`fullinertia` and an orientation: remove one"));
+            }
+            DMat3::from_cols(DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz))
+        } else if let Some(moments) = element.numbers("diaginertia", "three numbers")? {
+            DMat3::from_diagonal(vector(moments))
+        } else {
+            return Err(element.error("diaginertia", "three numbers, or six of `fullinertia`,"));
+        };
+        let own = RigidBody { mass, com: DVec3::ZERO, inertia };
+        Ok(crate::inertia::transformed(element.pose(self.settings)?, own))
+    }
+}

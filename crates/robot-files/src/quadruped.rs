@@ -1,0 +1,374 @@
+//! The tree of a quadruped as a [`RobotModel`]: a trunk and four legs whose first joint turns about +x, the other two about +y.
+
+use glam::DVec3;
+use twinstep_model::{
+    ActuatorParams, Contact, ControlConfig, Derating, Joint, JointKind, JointModel, Leg, LegModel, RobotModel,
+    RobotTree, Shapes, Stribeck, TreeJoint, TreeJointKind, TreeShape, TreeShapeKind, go2,
+};
+
+use crate::{RobotFile, RobotFileError};
+
+/// Largest component of the difference of two axes that counts as zero.
+const TOLERANCE: f64 = 1e-4;
+/// Lowest share of the distance of the legs' mounts that a box of the trunk has along x and y.
+const PLAUSIBLE_SHARE: f64 = 0.4;
+/// Distance from the origin at which a shape is off its centre [m].
+const OFF_CENTRE: f64 = 0.01;
+
+/// Names in a robot file that are not the Go2's.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct QuadrupedNames {
+    /// Joint names in the order of [`Joint::ALL`]. `None`: those of the Go2, with or without `_joint`.
+    pub joints: Option<[String; 12]>,
+    /// Names of the feet in the order of [`Leg::ALL`]: links of a URDF, geoms of an MJCF. `None`: the lowest sphere of each
+    /// calf.
+    pub feet: Option<[String; 4]>,
+}
+
+/// Returns the robot of a file, with notes about what it does not have. Its control settings are `control`, its contact
+/// parameters those of the Go2. Damping and friction of the file's joints are viscous and Coulomb friction.
+pub fn quadruped(
+    file: &RobotFile,
+    names: &QuadrupedNames,
+    control: ControlConfig,
+) -> Result<(RobotModel, Vec<String>), RobotFileError> {
+    let tree = file.tree.with_parallel_frames();
+    let mut notes = file.notes.clone();
+    let mut found = Vec::new();
+    for joint in Joint::ALL {
+        found.push(find(&tree, names, joint)?);
+    }
+    let trunk = tree.joints[found[0]].parent;
+    for joint in Joint::ALL {
+        let parent = if joint.kind == JointKind::Hip { trunk } else { 1 + found[joint.index() - 1] };
+        check(joint, &tree.joints[found[joint.index()]], parent)?;
+    }
+    if trunk != 0 || tree.bodies[0].inertia.mass == 0.0 {
+        let problem = "the legs hang in it without a trunk: a body with mass and a free joint expected".to_owned();
+        return Err(RobotFileError::Link { link: tree.bodies[trunk].name.clone(), problem });
+    }
+    if let Some(other) = (0..tree.joints.len()).find(|index| !found.contains(index)) {
+        let problem = "it is none of the twelve joints of the legs; make it `fixed`".to_owned();
+        return Err(RobotFileError::Joint { joint: tree.joints[other].name.clone(), problem });
+    }
+    let legs = Leg::ALL.map(|leg| {
+        let of = JointKind::ALL.map(|kind| found[Joint { leg, kind }.index()]);
+        LegModel {
+            bodies: of.map(|joint| tree.bodies[1 + joint].inertia),
+            origins: of.map(|joint| tree.joints[joint].parent_from_child.translation),
+        }
+    });
+    let mut joints = Vec::new();
+    for index in &found {
+        joints.push(joint_model(&tree.joints[*index])?);
+    }
+    let model = RobotModel {
+        name: tree.name.clone(),
+        trunk: tree.bodies[0].inertia,
+        legs,
+        joints: joints.try_into().expect("twelve joints"),
+        shapes: shapes(&tree, &found, names, &mut notes)?,
+        contact: contact(),
+        control,
+        gyro_bias: DVec3::ZERO,
+        derating: Derating::NONE,
+    };
+    Ok((model, notes))
+}
+
+fn contact() -> Contact {
+    go2().contact
+}
+
+/// Returns the index of a joint in the tree.
+fn find(tree: &RobotTree, names: &QuadrupedNames, joint: Joint) -> Result<usize, RobotFileError> {
+    let own = joint.name();
+    let wanted = names
+        .joints
+        .as_ref()
+        .map_or_else(|| vec![own.to_owned(), format!("{own}_joint")], |names| vec![names[joint.index()].clone()]);
+    tree.joints.iter().position(|joint| wanted.contains(&joint.name)).ok_or_else(|| {
+        let known: Vec<&str> = tree.joints.iter().map(|joint| joint.name.as_str()).collect();
+        let problem = format!(
+            "missing; the moving joints are {}. `[joints] names` of the model file lists twelve in the order FL, FR, RL, RR; \
+             hip, thigh, calf",
+            known.join(", ")
+        );
+        RobotFileError::Joint { joint: wanted[0].clone(), problem }
+    })
+}
+
+/// Checks kind, parent and axis of a joint.
+fn check(joint: Joint, found: &TreeJoint, parent: usize) -> Result<(), RobotFileError> {
+    let error = |problem: String| Err(RobotFileError::Joint { joint: found.name.clone(), problem });
+    if found.kind != TreeJointKind::Revolute {
+        return error("it slides; the joints of the legs turn".to_owned());
+    }
+    if found.parent != parent {
+        return error("its parent is not the trunk (hip) or the previous link of its leg (thigh, calf)".to_owned());
+    }
+    let axis = RobotModel::axis(joint);
+    if (found.axis - axis).abs().max_element() > TOLERANCE {
+        let name = if joint.kind == JointKind::Hip { "x" } else { "y" };
+        return error(format!("its axis is {}; +{name} expected", found.axis));
+    }
+    Ok(())
+}
+
+fn joint_model(joint: &TreeJoint) -> Result<JointModel, RobotFileError> {
+    let error = |problem: String| Err(RobotFileError::Joint { joint: joint.name.clone(), problem });
+    let torque_limit = match joint.effort {
+        Some([low, high]) if high > 0.0 && high.is_finite() && (low + high).abs() <= 1e-9 * high => high,
+        Some([low, high]) if high > 0.0 && high.is_finite() => {
+            return error(format!(
+                "its torque is {low} to {high} N·m, by `ctrlrange`, `forcerange`, `actuatorfrcrange` and `gear`; as much in \
+                 both directions expected"
+            ));
+        }
+        _ => {
+            return error(
+                "it has no torque limit above 0: `effort` of <limit> (URDF), `forcerange` of its actuator (MJCF)"
+                    .to_owned(),
+            );
+        }
+    };
+    Ok(JointModel {
+        range: joint.range,
+        torque_limit,
+        speed_limit: joint.speed_limit,
+        armature: joint.armature,
+        viscous_friction: joint.damping,
+        coulomb_friction: joint.friction,
+        stribeck_friction: Stribeck::NONE,
+        load_friction: 0.0,
+        spring: joint.spring,
+        actuator: ActuatorParams::IDEAL,
+    })
+}
+
+/// Returns the collision shapes: a box of the trunk, and a box, a capsule and a sphere of the front left leg.
+fn shapes(
+    tree: &RobotTree,
+    found: &[usize],
+    names: &QuadrupedNames,
+    notes: &mut Vec<String>,
+) -> Result<Shapes, RobotFileError> {
+    let of = |body: usize| tree.shapes.iter().filter(move |shape| shape.body == body);
+    let (thigh, calf) = (1 + found[1], 1 + found[2]);
+    let mounts = Leg::ALL.map(|leg| tree.joints[found[3 * leg as usize]].parent_from_child.translation);
+    let trunk_half_size = trunk_box(of(0), mounts, notes);
+    let (foot_centre, foot_radius) = foot(of(calf), names, &tree.bodies[calf].name)?;
+    let (calf_ends, calf_radius) = match capsule(of(calf)) {
+        Some(([one, other], radius)) if one.z < other.z => ([other, one], radius),
+        Some((ends, radius)) => (ends, radius),
+        None => {
+            notes.push("the calves have no long shape: thin capsules over their upper part collide".to_owned());
+            ([DVec3::ZERO, 0.6 * foot_centre], 0.5 * foot_radius)
+        }
+    };
+    let knee = tree.joints[found[2]].parent_from_child.translation;
+    let thigh_radius = capsule(of(thigh)).map_or(calf_radius, |(_, radius)| radius);
+    Ok(Shapes {
+        trunk_half_size,
+        thigh_half_size: DVec3::new(thigh_radius, thigh_radius, 0.5 * knee.z.abs()),
+        thigh_centre: 0.5 * knee,
+        calf_radius,
+        calf_ends,
+        foot_radius,
+        foot_centre,
+    })
+}
+
+/// Returns the half sizes of the largest box, or of the bounds of a mesh, that can be the trunk: it reaches towards the mounts of the legs. Without one, that of a box
+/// between the mounts.
+fn trunk_box<'a>(shapes: impl Iterator<Item = &'a TreeShape>, mounts: [DVec3; 4], notes: &mut Vec<String>) -> DVec3 {
+    let reach = mounts.iter().fold(DVec3::ZERO, |reach, mount| reach.max(mount.abs()));
+    let volume = |half: &DVec3| half.x * half.y * half.z;
+    let boxes = shapes.filter_map(|shape| {
+        let (half, centre) = match shape.kind {
+            TreeShapeKind::Box(half) => (half, DVec3::ZERO),
+            TreeShapeKind::Mesh(Some([low, high])) => (0.5 * (high - low), 0.5 * (high + low)),
+            _ => return None,
+        };
+        let pose = shape.body_from_shape;
+        // The box along the axes of the trunk that contains this one.
+        let columns = pose.matrix3.to_cols_array_2d().map(|column| DVec3::from_array(column).abs());
+        let half = half.x * columns[0] + half.y * columns[1] + half.z * columns[2];
+        Some((half, pose.transform_point3(centre)))
+    });
+    let plausible = boxes.filter(|(half, _)| half.x > PLAUSIBLE_SHARE * reach.x && half.y > PLAUSIBLE_SHARE * reach.y);
+    match plausible.max_by(|one, other| volume(&one.0).total_cmp(&volume(&other.0))) {
+        Some((half, centre)) => {
+            if centre.length() > OFF_CENTRE {
+                notes.push(format!(
+                    "the box of the trunk is {:.3} m off its origin; it collides as if it were not",
+                    centre.length()
+                ));
+            }
+            half
+        }
+        None => {
+            let half = DVec3::new(reach.x, reach.y, reach.y);
+            notes.push(format!(
+                "the trunk has no box or readable mesh of plausible size: it collides as a box between the mounts of the legs, {:.3} x {:.3} x {:.3} m",
+                2.0 * half.x,
+                2.0 * half.y,
+                2.0 * half.z
+            ));
+            half
+        }
+    }
+}
+
+/// Returns centre and radius of the front left foot.
+fn foot<'a>(
+    shapes: impl Iterator<Item = &'a TreeShape>,
+    names: &QuadrupedNames,
+    calf: &str,
+) -> Result<(DVec3, f64), RobotFileError> {
+    let named = names.feet.as_ref().map(|feet| &feet[0]);
+    let spheres = shapes.filter(|shape| named.is_none_or(|name| *name == shape.name));
+    let spheres = spheres.filter_map(|shape| match shape.kind {
+        TreeShapeKind::Sphere(radius) => Some((shape.body_from_shape.translation, radius)),
+        _ => None,
+    });
+    spheres.min_by(|one, other| one.0.z.total_cmp(&other.0.z)).ok_or_else(|| {
+        let problem = named.map_or("it has no foot: a collision sphere, in it or fixed to it".to_owned(), |name| {
+            format!("the foot `{name}` of `[joints] feet` is not a collision sphere in it or fixed to it")
+        });
+        RobotFileError::Link { link: calf.to_owned(), problem }
+    })
+}
+
+/// Returns ends and radius of the longest shape that is not a sphere.
+fn capsule<'a>(shapes: impl Iterator<Item = &'a TreeShape>) -> Option<([DVec3; 2], f64)> {
+    let capsules = shapes.filter_map(|shape| {
+        let (axis, half_length, radius) = match shape.kind {
+            TreeShapeKind::Sphere(_) | TreeShapeKind::Mesh(_) => return None,
+            TreeShapeKind::Capsule { radius, half_length } | TreeShapeKind::Cylinder { radius, half_length } => {
+                (DVec3::Z, half_length, radius)
+            }
+            TreeShapeKind::Box(half) | TreeShapeKind::Ellipsoid(half) => {
+                let longest = half.max_element();
+                let axis = [DVec3::X, DVec3::Y, DVec3::Z].into_iter().find(|axis| half.dot(*axis) == longest);
+                (axis.unwrap_or(DVec3::Z), longest, half.min_element())
+            }
+        };
+        let ends = [-half_length, half_length].map(|along| shape.body_from_shape.transform_point3(along * axis));
+        Some((ends, radius))
+    });
+    let length = |ends: &[DVec3; 2]| (ends[1] - ends[0]).length();
+    capsules.max_by(|one, other| length(&one.0).total_cmp(&length(&other.0)))
+}
+
+#[cfg(test)]
+mod tests {
+    use expect_test::{Expect, expect};
+    use twinstep_model::{MjcfOptions, RobotModel, go2, mjcf};
+
+    use super::*;
+    use crate::read_robot;
+
+    fn import(text: &str) -> Result<(RobotModel, Vec<String>), RobotFileError> {
+        quadruped(&read_robot(text, None)?, &QuadrupedNames::default(), go2().control)
+    }
+
+    fn exported() -> String {
+        mjcf(&go2(), &MjcfOptions::default())
+    }
+
+    fn near(one: &RobotModel, other: &RobotModel) {
+        assert!((one.total_mass() - other.total_mass()).abs() < 1e-9);
+        for (one, other) in one.legs.iter().zip(&other.legs) {
+            for (one, other) in one.origins.iter().zip(&other.origins) {
+                assert!((*one - *other).length() < 1e-12);
+            }
+            for (one, other) in one.bodies.iter().zip(&other.bodies) {
+                assert!((one.com - other.com).length() < 1e-12);
+                assert!((one.inertia - other.inertia).to_cols_array().iter().all(|entry| entry.abs() < 1e-12));
+            }
+        }
+        for (one, other) in one.joints.iter().zip(&other.joints) {
+            assert_eq!((one.range, one.torque_limit, one.armature), (other.range, other.torque_limit, other.armature));
+        }
+        assert!((one.shapes.trunk_half_size - other.shapes.trunk_half_size).length() < 1e-12);
+        assert!((one.shapes.foot_centre - other.shapes.foot_centre).length() < 1e-12);
+    }
+
+    #[test]
+    fn exported_go2_is_read_back() {
+        near(&import(&exported()).expect("valid").0, &go2());
+    }
+
+    /// The frame of a thigh is turned, and everything in it turned back.
+    #[test]
+    fn turned_frames_are_the_same_robot() {
+        let mut file = read_robot(&exported(), None).expect("valid");
+        let turn = glam::DAffine3::from_rotation_y(0.7) * glam::DAffine3::from_rotation_x(-0.4);
+        let joint = file.tree.joint("RL_thigh").expect("a joint");
+        let (tree, back) = (&mut file.tree, turn.inverse());
+        tree.joints[joint].parent_from_child = tree.joints[joint].parent_from_child * turn;
+        tree.joints[joint].axis = back.transform_vector3(tree.joints[joint].axis);
+        tree.bodies[joint + 1].inertia = crate::inertia::transformed(back, tree.bodies[joint + 1].inertia);
+        for below in tree.joints.iter_mut().filter(|below| below.parent == joint + 1) {
+            below.parent_from_child = back * below.parent_from_child;
+        }
+        let (robot, _) = quadruped(&file, &QuadrupedNames::default(), go2().control).expect("valid");
+        near(&robot, &go2());
+    }
+
+    #[test]
+    fn trunk_without_a_box_of_its_size_collides_between_the_legs() {
+        let text = exported().replace("size=\"0.1881 0.04675 0.057\"", "size=\"0.001 0.001 0.001\"");
+        let (robot, notes) = import(&text).expect("valid");
+        assert!((robot.shapes.trunk_half_size - DVec3::new(0.1934, 0.0465, 0.0465)).length() < 1e-9);
+        assert!(notes.iter().any(|note| note.contains("plausible size")), "{notes:?}");
+    }
+
+    #[test]
+    fn errors_name_what_is_wrong_and_what_is_expected() {
+        let go2 = exported();
+        let check = |text: &str, expected: Expect| expected.assert_eq(&import(text).expect_err("invalid").to_string());
+        check("<mujoco", expect!["the document does not have a root node"]);
+        check("<sdf/>", expect!["the root is <sdf>; <robot> (URDF) or <mujoco> (MJCF) expected"]);
+        check(
+            &go2.replace("joint name=\"FR_calf\" axis=\"0 1 0\"", "joint name=\"FR_calf\" axis=\"0 -1 0\""),
+            expect!["joint `FR_calf`: its axis is [0, -1, 0]; +y expected"],
+        );
+        check(
+            &go2.replace("joint name=\"RL_hip\"", "joint name=\"knee\"").replace("joint=\"RL_hip\"", "joint=\"knee\""),
+            expect![
+                "joint `RL_hip`: missing; the moving joints are FL_hip, FL_thigh, FL_calf, FR_hip, FR_thigh, FR_calf, knee, RL_thigh, RL_calf, RR_hip, RR_thigh, RR_calf. `[joints] names` of the model file lists twelve in the order FL, FR, RL, RR; hip, thigh, calf"
+            ],
+        );
+        check(
+            &go2.replace("mass=\"6.921\"", "mass=\"heavy\""),
+            expect![[r#"line 13: `mass` of <inertial> is "heavy"; a number expected"#]],
+        );
+        check(
+            &go2.replace("ctrlrange=\"-23.7 23.7\"", "ctrlrange=\"-20 40\""),
+            expect![
+                "joint `FL_hip`: its torque is -20 to 40 N·m, by `ctrlrange`, `forcerange`, `actuatorfrcrange` and `gear`; as much in both directions expected"
+            ],
+        );
+        check(
+            &go2.replace("<freejoint name=\"base\"/>", "")
+                .replace("<body name=\"trunk\"", "<body name=\"trunk\" gravcomp=\"1\""),
+            expect![[r#"line 11: `gravcomp="1"` of <body> is not supported"#]],
+        );
+    }
+
+    #[test]
+    fn legs_that_hang_in_the_world_have_no_trunk() {
+        let text = exported();
+        let trunk = text.lines().find(|line| line.contains("<body name=\"trunk\"")).expect("a trunk");
+        // The trunk's frame instead of its body: the legs are bodies of the world.
+        let text = text.replace(trunk, "<frame>").replace("<freejoint name=\"base\"/>", "");
+        let inertial = text.lines().find(|line| line.contains("mass=\"6.921\"")).expect("a mass").to_owned();
+        let text = text.replace(&inertial, "");
+        let end = text.rfind("</body>").expect("an end");
+        let text = format!("{}</frame>{}", &text[..end], &text[end + "</body>".len()..]);
+        let error = import(&text).expect_err("no trunk").to_string();
+        assert!(error.contains("hang in it without a trunk"), "{error}");
+    }
+}

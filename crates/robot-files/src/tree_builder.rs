@@ -1,0 +1,102 @@
+//! Collects bodies, joints and shapes while a reader descends into a file, and checks the whole.
+
+use std::collections::BTreeSet;
+
+use glam::{DAffine3, DMat3, DVec3};
+use twinstep_model::{BaseMount, RigidBody, RobotTree, TreeBody, TreeJoint, TreeShape, TreeShapeKind};
+
+use crate::inertia::{is_real, transformed};
+use crate::{RobotFile, RobotFileError};
+
+/// A tree that grows.
+pub struct TreeBuilder {
+    tree: RobotTree,
+    notes: Vec<String>,
+}
+
+const NO_BODY: RigidBody = RigidBody { mass: 0.0, com: DVec3::ZERO, inertia: DMat3::ZERO };
+
+impl TreeBuilder {
+    /// Creates a tree with its base.
+    pub fn new(name: &str, base_name: &str, base: Option<BaseMount>, world_from_base: DAffine3) -> Self {
+        let bodies = vec![TreeBody { name: base_name.to_owned(), inertia: NO_BODY }];
+        let name = name.to_owned();
+        let tree = RobotTree { name, base, world_from_base, bodies, joints: Vec::new(), shapes: Vec::new() };
+        Self { tree, notes: Vec::new() }
+    }
+
+    /// Adds the body that a joint moves. Returns its index.
+    pub fn add_body(&mut self, name: &str, joint: TreeJoint) -> usize {
+        self.tree.joints.push(joint);
+        self.tree.bodies.push(TreeBody { name: name.to_owned(), inertia: NO_BODY });
+        self.tree.bodies.len() - 1
+    }
+
+    /// Adds mass to a body, in whose frame that of the mass has this pose.
+    pub fn add_mass(&mut self, body: usize, pose: DAffine3, mass: RigidBody) {
+        let whole = &mut self.tree.bodies[body].inertia;
+        *whole = whole.combined(transformed(pose, mass));
+    }
+
+    /// Adds a collision shape to a body.
+    pub fn add_shape(&mut self, name: &str, body: usize, kind: TreeShapeKind, body_from_shape: DAffine3) {
+        self.tree.shapes.push(TreeShape { name: name.to_owned(), body, kind, body_from_shape });
+    }
+
+    /// Returns true if there is a joint with this name.
+    pub fn has_joint(&self, name: &str) -> bool {
+        self.tree.joint(name).is_some()
+    }
+
+    /// Adds a note, once.
+    pub fn note(&mut self, note: impl Into<String>) {
+        let note = note.into();
+        if !self.notes.contains(&note) {
+            self.notes.push(note);
+        }
+    }
+
+    /// Multiplies all masses and inertias by the same factor, so that they have this sum [kg].
+    pub fn set_total_mass(&mut self, total: f64) {
+        let factor = total / self.tree.total_mass();
+        for body in &mut self.tree.bodies {
+            body.inertia.mass *= factor;
+            body.inertia.inertia *= factor;
+        }
+    }
+
+    /// Checks the tree.
+    pub fn finish(self) -> Result<RobotFile, RobotFileError> {
+        let Self { tree, notes } = self;
+        let mut names = BTreeSet::new();
+        for joint in &tree.joints {
+            let error = |problem: String| Err(RobotFileError::Joint { joint: joint.name.clone(), problem });
+            if !names.insert(&joint.name) {
+                return error("two joints have this name".to_owned());
+            }
+            let [low, high] = joint.range;
+            if low >= high {
+                return error(format!("its range is {low} to {high}; low < high expected"));
+            }
+            for (name, value) in
+                [("damping", joint.damping), ("friction", joint.friction), ("armature", joint.armature)]
+            {
+                if value < 0.0 {
+                    return error(format!("`{name}` is {value}; 0 or more expected"));
+                }
+            }
+        }
+        for (index, TreeBody { name, inertia }) in tree.bodies.iter().enumerate() {
+            let error = |problem: &str| Err(RobotFileError::Link { link: name.clone(), problem: problem.to_owned() });
+            let is_fixed_base = index == 0 && tree.base != Some(BaseMount::Floating);
+            let has_children = tree.joints.iter().any(|joint| joint.parent == index);
+            if inertia.mass == 0.0 && !is_fixed_base && (index == 0 || !has_children) {
+                return error("it has no mass and inertia; <inertial> expected");
+            }
+            if inertia.mass != 0.0 && !is_real(inertia) {
+                return error("its mass or inertia is not positive");
+            }
+        }
+        Ok(RobotFile { tree, notes })
+    }
+}
