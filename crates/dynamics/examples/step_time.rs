@@ -5,8 +5,7 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use glam::DAffine3;
-use glam::DMat3;
+use glam::{DAffine3, DMat3};
 use twinstep_dynamics::{FactoredTree, TreeLoad, TreeMotion, TreeParameters, TreeState, TreeStructure};
 use twinstep_model::dynamics::{FactoredDynamics, JointLoad, KinematicTree, State};
 use twinstep_model::{BaseMount, JointSpring, RobotTree, TreeBody, TreeJoint, TreeJointKind, go2};
@@ -67,9 +66,9 @@ impl<T: SimdFloat> SimdKernel for Any<'_, T> {
 
     #[inline(always)]
     fn run(self) {
-        let (dt, gravity) = (T::splat(0.001), T::splat(9.81));
+        let dt = T::splat(0.001);
         self.motion.set(self.structure, self.parameters, self.state);
-        self.factored.set_up(self.structure, self.parameters, self.motion, self.state, self.load, dt, gravity);
+        self.factored.set_up(self.structure, self.parameters, self.motion, self.state, self.load, dt);
         black_box(self.factored.solution(self.structure, self.joints));
     }
 }
@@ -106,7 +105,7 @@ impl SimdTask for Compare {
         for (q, value) in state.q.iter_mut().zip(go2().control.default_pose) {
             *q = T::splat(value);
         }
-        let load = TreeLoad { tau: vec![zero; 12], damping: vec![zero; 12] };
+        let load = TreeLoad { gravity: T::splat(9.81), tau: vec![zero; 12], damping: vec![zero; 12] };
         let mut motion = TreeMotion::empty(&structure, &parameters);
         let mut factored = FactoredTree::empty(&structure, &parameters);
         let mut joints = vec![zero; 12];

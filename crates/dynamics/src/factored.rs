@@ -12,9 +12,11 @@ use crate::equations::{force, spatial_matrix};
 use crate::motion::{Spatial, TreeMotion, times};
 use crate::{TreeParameters, TreeState, TreeStructure};
 
-/// Force and viscous friction at the joints.
+/// Forces on a robot: of its joints, their viscous friction, and gravity.
 #[derive(Clone, Debug)]
 pub struct TreeLoad<T> {
+    /// Gravity along −z of the world frame [m/s²].
+    pub gravity: T,
     /// Force of each joint [N·m or N].
     pub tau: Vec<T>,
     /// Coefficient of viscous friction. It is integrated implicitly, so any value is stable.
@@ -64,7 +66,7 @@ impl<T: SimdFloat> FactoredTree<T> {
         }
     }
 
-    /// Sets up a step of `dt` [s] under gravity `gravity` [m/s²]. [`FactoredTree::u`] is then the solution without constraints.
+    /// Sets up a step of `dt` [s]. [`FactoredTree::u`] is then the solution without constraints.
     #[inline(always)]
     pub fn set_up(
         &mut self,
@@ -74,9 +76,8 @@ impl<T: SimdFloat> FactoredTree<T> {
         state: &TreeState<T>,
         load: &TreeLoad<T>,
         dt: T,
-        gravity: T,
     ) {
-        self.set_bias(structure, motion, state, gravity);
+        self.set_bias(structure, motion, state, load.gravity);
         self.composites.copy_from_slice(&motion.inertias);
         for joint in (0..structure.num_joints()).rev() {
             let unit = times(&self.composites[joint + 1], motion.axes[joint]);

@@ -135,9 +135,9 @@ proptest! {
         let case = Case::new(&tree, seed);
         let Case { structure, parameters, motion, state } = &case;
         let joints = structure.num_joints();
-        let load = TreeLoad { tau: numbers(seed + 1, joints), damping: vec![0.0; joints] };
+        let load = TreeLoad { gravity: GRAVITY, tau: numbers(seed + 1, joints), damping: vec![0.0; joints] };
         let mut factored = FactoredTree::empty(structure, parameters);
-        factored.set_up(structure, parameters, motion, state, &load, 1.0, GRAVITY);
+        factored.set_up(structure, parameters, motion, state, &load, 1.0);
         let mut ddq = vec![0.0; joints];
         let base = factored.solution(structure, &mut ddq);
         let acceleration: Vec<f64> = base.into_iter().take(structure.num_base_velocities()).chain(ddq).collect();
@@ -153,9 +153,9 @@ proptest! {
         let case = Case::new(&tree, seed);
         let Case { structure, parameters, motion, state } = &case;
         let joints = structure.num_joints();
-        let load = TreeLoad { tau: vec![0.0; joints], damping: vec![0.0; joints] };
+        let load = TreeLoad { gravity: GRAVITY, tau: vec![0.0; joints], damping: vec![0.0; joints] };
         let mut factored = FactoredTree::empty(structure, parameters);
-        factored.set_up(structure, parameters, motion, state, &load, 1.0, GRAVITY);
+        factored.set_up(structure, parameters, motion, state, &load, 1.0);
         let body = seed as usize % (joints + 1);
         let branch = &structure.branches[body];
         let (base, mut along) = ([0.3, -0.2, 0.5, 0.1, 0.7, -0.4], numbers(seed, branch.len()));

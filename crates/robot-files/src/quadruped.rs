@@ -197,27 +197,23 @@ fn trunk_box<'a>(shapes: impl Iterator<Item = &'a TreeShape>, mounts: [DVec3; 4]
         Some((half, pose.transform_point3(centre)))
     });
     let plausible = boxes.filter(|(half, _)| half.x > PLAUSIBLE_SHARE * reach.x && half.y > PLAUSIBLE_SHARE * reach.y);
-    match plausible.max_by(|one, other| volume(&one.0).total_cmp(&volume(&other.0))) {
-        Some((half, centre)) => {
-            if centre.length() > OFF_CENTRE {
-                notes.push(format!(
-                    "the box of the trunk is {:.3} m off its origin; it collides as if it were not",
-                    centre.length()
-                ));
-            }
-            half
-        }
-        None => {
-            let half = DVec3::new(reach.x, reach.y, reach.y);
-            notes.push(format!(
-                "the trunk has no box or readable mesh of plausible size: it collides as a box between the mounts of the legs, {:.3} x {:.3} x {:.3} m",
-                2.0 * half.x,
-                2.0 * half.y,
-                2.0 * half.z
-            ));
-            half
-        }
+    let Some((half, centre)) = plausible.max_by(|one, other| volume(&one.0).total_cmp(&volume(&other.0))) else {
+        let half = DVec3::new(reach.x, reach.y, reach.y);
+        let size = 2.0 * half;
+        notes.push(format!(
+            "the trunk has no box or readable mesh of plausible size: it collides as a box between the mounts of the legs, \
+             {:.3} x {:.3} x {:.3} m",
+            size.x, size.y, size.z
+        ));
+        return half;
+    };
+    if centre.length() > OFF_CENTRE {
+        notes.push(format!(
+            "the box of the trunk is {:.3} m off its origin; it collides as if it were not",
+            centre.length()
+        ));
     }
+    half
 }
 
 /// Returns centre and radius of the front left foot.

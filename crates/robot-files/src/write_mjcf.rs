@@ -157,11 +157,12 @@ impl Writer<'_> {
 fn placed(pose: DAffine3) -> String {
     let mut text = String::new();
     if pose.translation != DVec3::ZERO {
-        text += &format!(" pos=\"{}\"", numbers(&pose.translation.to_array()));
+        write!(text, " pos=\"{}\"", numbers(&pose.translation.to_array())).expect("a String takes every text");
     }
     if pose.matrix3 != DMat3::IDENTITY {
         let rotation = DQuat::from_mat3(&pose.matrix3);
-        text += &format!(" quat=\"{}\"", numbers(&[rotation.w, rotation.x, rotation.y, rotation.z]));
+        let quaternion = numbers(&[rotation.w, rotation.x, rotation.y, rotation.z]);
+        write!(text, " quat=\"{quaternion}\"").expect("a String takes every text");
     }
     text
 }

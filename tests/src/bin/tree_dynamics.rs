@@ -78,9 +78,9 @@ fn equations<T: SimdFloat>(tree: &RobotTree, request: &Request) -> Equations {
     let mut motion = TreeMotion::empty(&structure, &parameters);
     motion.set(&structure, &parameters, &state);
     let damping: Vec<f64> = tree.joints.iter().map(|joint| joint.damping).collect();
-    let load = TreeLoad { tau: splat(&request.tau), damping: splat(&damping) };
+    let load = TreeLoad { gravity: T::splat(GRAVITY), tau: splat(&request.tau), damping: splat(&damping) };
     let mut factored = FactoredTree::empty(&structure, &parameters);
-    factored.set_up(&structure, &parameters, &motion, &state, &load, T::splat(request.dt), T::splat(GRAVITY));
+    factored.set_up(&structure, &parameters, &motion, &state, &load, T::splat(request.dt));
     let mut joints = vec![T::splat(0.0); structure.num_joints()];
     let base = factored.solution(&structure, &mut joints);
     let get = |values: &[T]| values.iter().map(|value| value.get(0)).collect::<Vec<f64>>();

@@ -7,24 +7,8 @@ use roxmltree::Node;
 use super::compiler::Settings;
 use super::defaults::{ACTUATOR_ELEMENT, Classes};
 use super::element::Element;
-use super::joints::limits;
 use crate::RobotFileError;
 use crate::xml::unsupported;
-
-/// Names of the elements of actuators, of which each is a general actuator with some attributes set.
-pub const SHORTCUTS: [&str; 11] = [
-    "general",
-    "motor",
-    "position",
-    "velocity",
-    "intvelocity",
-    "damper",
-    "cylinder",
-    "muscle",
-    "adhesion",
-    "dcmotor",
-    "plugin",
-];
 
 const RESOLVED: [&str; 13] = [
     "name",
@@ -106,7 +90,7 @@ impl Actuators {
         };
         let [gear, ..] = element.up_to::<6>("gear", "up to six numbers")?.unwrap_or([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
         let inner = self.force(element, tag, settings)?;
-        let [low, high] = match limits(element, "forcerange", "forcelimited", settings)? {
+        let [low, high] = match element.limits("forcerange", "forcelimited", settings)? {
             Some([low, high]) => [inner[0].clamp(low, high), inner[1].clamp(low, high)],
             None => inner,
         };
@@ -121,7 +105,7 @@ impl Actuators {
     /// Returns the force before `forcerange`.
     fn force(&mut self, element: &Element, tag: &str, settings: &Settings) -> Result<[f64; 2], RobotFileError> {
         let endless = [f64::NEG_INFINITY, f64::INFINITY];
-        let control = limits(element, "ctrlrange", "ctrllimited", settings)?.unwrap_or(endless);
+        let control = element.limits("ctrlrange", "ctrllimited", settings)?.unwrap_or(endless);
         match tag {
             "motor" => Ok(control),
             "position" | "velocity" | "intvelocity" | "damper" => {

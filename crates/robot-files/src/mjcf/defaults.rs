@@ -4,13 +4,29 @@ use std::collections::BTreeMap;
 
 use roxmltree::Node;
 
-use super::actuators::SHORTCUTS;
-use super::element::Class;
 use crate::RobotFileError;
 use crate::xml::unsupported;
 
+/// Attributes of one default class, by kind of element and name.
+pub type Class<'a> = BTreeMap<(&'a str, &'a str), &'a str>;
+
 /// Classes by name; `main` is that of elements without a class.
 pub type Classes<'a> = BTreeMap<&'a str, Class<'a>>;
+
+/// Names of the elements of actuators, of which each is a general actuator with some attributes set.
+const SHORTCUTS: [&str; 11] = [
+    "general",
+    "motor",
+    "position",
+    "velocity",
+    "intvelocity",
+    "damper",
+    "cylinder",
+    "muscle",
+    "adhesion",
+    "dcmotor",
+    "plugin",
+];
 
 /// Key under which a class has the name of the last element of an actuator, such as `position`.
 pub const ACTUATOR_ELEMENT: (&str, &str) = ("actuator", "");

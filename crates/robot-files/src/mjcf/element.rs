@@ -1,18 +1,13 @@
 //! An element with the attributes of its default class.
 
-use std::collections::BTreeMap;
-
 use glam::DAffine3;
 use roxmltree::Node;
 
 use super::compiler::Settings;
-use super::defaults::Classes;
+use super::defaults::{Class, Classes};
 use crate::RobotFileError;
 use crate::orientation::rotation;
 use crate::xml::{attribute_error, parse_numbers, unsupported, vector};
-
-/// Attributes of one default class, by kind of element and name.
-pub type Class<'a> = BTreeMap<(&'a str, &'a str), &'a str>;
 
 /// Element with its default class.
 #[derive(Clone, Copy)]
@@ -115,6 +110,29 @@ impl<'a, 'b> Element<'a, 'b> {
             Some("true") => Ok(true),
             Some("false") => Ok(false),
             Some(_) => Err(self.error(name, "true, false or auto")),
+        }
+    }
+
+    /// Returns the attribute `range`, if `limited` says that it limits, or if it is there and `autolimits` says so.
+    pub fn limits(
+        &self,
+        range: &'static str,
+        limited: &'static str,
+        settings: &Settings,
+    ) -> Result<Option<[f64; 2]>, RobotFileError> {
+        let given = self.numbers::<2>(range, "two numbers")?;
+        let is_auto = matches!(self.attribute(limited), None | Some("auto"));
+        if is_auto && given.is_some() && !settings.autolimits {
+            let problem =
+                format!("`{range}` without `{limited}`, and `autolimits` of <compiler> is false: state `{limited}`");
+            return Err(unsupported(self.node, problem));
+        }
+        if !self.flag(limited, given.is_some())? {
+            return Ok(None);
+        }
+        match given {
+            Some([low, high]) if low < high => Ok(Some([low, high])),
+            _ => Err(self.error(range, "two numbers, the lower one first")),
         }
     }
 

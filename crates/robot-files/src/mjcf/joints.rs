@@ -7,7 +7,7 @@ use super::actuators::Actuators;
 use super::compiler::Settings;
 use super::element::Element;
 use crate::RobotFileError;
-use crate::xml::{unsupported, vector};
+use crate::xml::vector;
 
 const RESOLVED: [&str; 16] = [
     "name",
@@ -61,10 +61,10 @@ pub fn read(
     let unit = if kind == TreeJointKind::Revolute { settings.angles().unit } else { 1.0 };
     let axis = vector(element.numbers("axis", "three numbers")?.unwrap_or([0.0, 0.0, 1.0]));
     let axis = axis.try_normalize().ok_or_else(|| element.error("axis", "three numbers that are not all zero"))?;
-    let range = limits(element, "range", "limited", settings)?.map(|range| range.map(|limit| unit * limit));
+    let range = element.limits("range", "limited", settings)?.map(|range| range.map(|limit| unit * limit));
     let stiffness = element.number("stiffness", 0.0)?;
     let rest = unit * element.number("springref", 0.0)?;
-    let of_joint = limits(element, "actuatorfrcrange", "actuatorfrclimited", settings)?;
+    let of_joint = element.limits("actuatorfrcrange", "actuatorfrclimited", settings)?;
     let effort = match (actuators.effort(&name), of_joint) {
         (Some([low, high]), Some([lowest, highest])) => Some([low.max(lowest), high.min(highest)]),
         (one, other) => one.or(other),
@@ -89,27 +89,4 @@ pub fn read(
     // The body is in its place at the position `ref`.
     let parent_from_child = joint.motion(-reference);
     Ok(BodyJoint { joint: TreeJoint { parent_from_child, ..joint }, anchor, has_solver_settings })
-}
-
-/// Returns a range, if it limits.
-pub fn limits(
-    element: &Element,
-    range: &'static str,
-    limited: &'static str,
-    settings: &Settings,
-) -> Result<Option<[f64; 2]>, RobotFileError> {
-    let given = element.numbers::<2>(range, "two numbers")?;
-    let is_auto = matches!(element.attribute(limited), None | Some("auto"));
-    if is_auto && given.is_some() && !settings.autolimits {
-        let problem =
-            format!("`{range}` without `{limited}`, and `autolimits` of <compiler> is false: state `{limited}`");
-        return Err(unsupported(element.node, problem));
-    }
-    if !element.flag(limited, given.is_some())? {
-        return Ok(None);
-    }
-    match given {
-        Some([low, high]) if low < high => Ok(Some([low, high])),
-        _ => Err(element.error(range, "two numbers, the lower one first")),
-    }
 }

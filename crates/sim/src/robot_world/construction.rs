@@ -160,7 +160,7 @@ fn revolute(robot: &RobotModel, joint: Joint, origin: DVec3) -> GenericJoint {
     let revolute = RevoluteJointBuilder::new(RobotModel::axis(joint).as_vec3())
         .local_anchor1(origin.as_vec3())
         .contacts_enabled(false);
-    let has_limits = range.iter().all(|limit| limit.is_finite());
+    let has_limits = range[0].is_finite() && range[1].is_finite();
     if has_limits { revolute.limits(range).build().into() } else { revolute.build().into() }
 }
 
