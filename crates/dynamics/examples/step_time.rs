@@ -2,6 +2,8 @@
 //!
 //! `cargo run --release -p twinstep-dynamics --example step_time`
 
+#![allow(clippy::inline_always, reason = "a function that is not inlined is compiled for the baseline instruction set")]
+
 use std::hint::black_box;
 use std::time::Instant;
 

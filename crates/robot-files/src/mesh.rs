@@ -106,11 +106,13 @@ mod tests {
         binary.extend([0; 12]);
         vertices.iter().flatten().for_each(|value| binary.extend(value.to_le_bytes()));
         binary.extend([0; 2]);
-        let lines =
-            |word: &str| -> String { vertices.iter().map(|[x, y, z]| format!("  {word} {x} {y} {z}\n")).collect() };
+        let lines = |word: &str| {
+            let line = |[x, y, z]: &[f32; 3]| format!("  {word} {x} {y} {z}");
+            vertices.iter().map(line).collect::<Vec<_>>().join("\n")
+        };
         std::fs::write(folder.path().join("meshes/b.STL"), binary).expect("written");
-        std::fs::write(robot.join("t.stl"), format!("solid t\n{}endsolid", lines("vertex"))).expect("written");
-        std::fs::write(robot.join("o.obj"), format!("# a mesh\n{}f 1 2 3\n", lines("v"))).expect("written");
+        std::fs::write(robot.join("t.stl"), format!("solid t\n{}\nendsolid", lines("vertex"))).expect("written");
+        std::fs::write(robot.join("o.obj"), format!("# a mesh\n{}\nf 1 2 3\n", lines("v"))).expect("written");
         let expected = Some([DVec3::new(-2.0, -2.0, 0.0), DVec3::new(4.0, 6.0, 1.0)]);
         for file in ["package://robot/meshes/b.STL", "t.stl", "/elsewhere/o.obj"] {
             assert_eq!(MeshFolder::new(Some(&robot)).bounds(file, DVec3::splat(2.0)), expected, "{file}");

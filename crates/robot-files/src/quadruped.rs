@@ -303,7 +303,7 @@ mod tests {
         let turn = glam::DAffine3::from_rotation_y(0.7) * glam::DAffine3::from_rotation_x(-0.4);
         let joint = file.tree.joint("RL_thigh").expect("a joint");
         let (tree, back) = (&mut file.tree, turn.inverse());
-        tree.joints[joint].parent_from_child = tree.joints[joint].parent_from_child * turn;
+        tree.joints[joint].parent_from_child *= turn;
         tree.joints[joint].axis = back.transform_vector3(tree.joints[joint].axis);
         tree.bodies[joint + 1].inertia = crate::inertia::transformed(back, tree.bodies[joint + 1].inertia);
         for below in tree.joints.iter_mut().filter(|below| below.parent == joint + 1) {
