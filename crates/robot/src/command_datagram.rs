@@ -4,8 +4,8 @@
 //! between a decision and the network, and nothing that arrives from the network can delay it. RustDDS only announces
 //! the writer, so that the robot accepts what it sends.
 
-use crate::watchdog::FIRST_NUMBER;
-
+/// First sequence number of the watchdog. The control loop would need 70 years to reach it.
+pub const FIRST_NUMBER: u64 = 1 << 40;
 /// Size of the largest payload of a command [bytes].
 pub const MAX_PAYLOAD: usize = 1024;
 /// Size of header, DATA submessage before its payload, and HEARTBEAT submessage [bytes].

@@ -33,8 +33,7 @@ pub use machine::{Mode, WatchdogMachine};
 pub use message::{Guard, MAX_READERS, Message, Status};
 pub use process::run;
 
-/// First sequence number of the watchdog. The control loop would need 70 years to reach it.
-pub const FIRST_NUMBER: u64 = 1 << 40;
+pub use crate::command_datagram::FIRST_NUMBER;
 
 /// What the control loop knows of the watchdog.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
