@@ -94,7 +94,9 @@ pub enum ServerError {
         reason: String,
     },
     /// The stop channel of a robot cannot listen.
-    #[error("cannot listen for stops beside {endpoint}: {reason}")]
+    #[error(
+        "cannot listen for stops beside {endpoint}: {reason}\n  they need the port after that of the endpoint: choose another"
+    )]
     StopListener {
         /// Zenoh's endpoint.
         endpoint: String,

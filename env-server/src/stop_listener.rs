@@ -40,8 +40,8 @@ pub struct StopListener {
 }
 
 impl StopListener {
-    /// Listens at the host of Zenoh's `endpoint`, at the port after `port`, which Zenoh has, or at a free one, with the
-    /// users and certificates of `zenoh`.
+    /// Listens at the host of Zenoh's `endpoint`, at the port after `port`, which Zenoh has, with the users and certificates of
+    /// `zenoh`. If the endpoint leaves the port to the system, so may this one: then only `hello` says where it listens.
     pub fn start(
         endpoint: &str,
         port: Option<u16>,
@@ -50,7 +50,11 @@ impl StopListener {
     ) -> Result<Self> {
         let (protocol, host) = protocol_and_host(endpoint);
         let next = port.and_then(|port| port.checked_add(1)).unwrap_or(0);
-        let listener = TcpListener::bind((host, next)).or_else(|_| TcpListener::bind((host, 0)))?;
+        let is_free = self::port(endpoint).is_none_or(|port| port == 0);
+        let listener = match TcpListener::bind((host, next)) {
+            Err(_) if is_free => TcpListener::bind((host, 0))?,
+            result => result.map_err(|error| failed(format!("port {next}: {error}")))?,
+        };
         let access = Arc::new(Access::new(protocol, zenoh)?);
         let (address, is_stopping) = (listener.local_addr()?, Arc::new(AtomicBool::new(false)));
         let stopping = Arc::clone(&is_stopping);

@@ -52,6 +52,7 @@ mod remote_rollout;
 mod render;
 mod robot;
 mod robot_campaign;
+mod robot_stops;
 mod robot_to_model;
 mod robots;
 mod rollout;

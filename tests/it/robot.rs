@@ -8,23 +8,22 @@ use serde_json::Value;
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_identify::{Experiment, WindowConfig};
 use twinstep_model::{AutoresetMode, RealTimeReport, ResetRequest, VecEnv};
-use twinstep_protocol::keys;
 use twinstep_sim::{BatchRollout, SimConfig};
-use twinstep_tests::process::{Process, interruptible};
+use twinstep_tests::process::Process;
 use twinstep_tests::python::{Programs, python, root};
 use twinstep_tests::robot_pair::{PATIENT, RobotPair, next_domain};
 
 use crate::raw_client::RawClient;
 
-fn program() -> PathBuf {
+pub fn program() -> PathBuf {
     Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep()
 }
 
-fn pair(robot: &[&str]) -> RobotPair {
+pub fn pair(robot: &[&str]) -> RobotPair {
     RobotPair::start(&program(), &[], robot).unwrap()
 }
 
-fn standing(robot: &[&str]) -> RobotPair {
+pub fn standing(robot: &[&str]) -> RobotPair {
     in_three_attempts(|| {
         let mut pair = RobotPair::start(&program(), &[], robot)?;
         pair.stand()?;
@@ -32,7 +31,7 @@ fn standing(robot: &[&str]) -> RobotPair {
     })
 }
 
-fn client(pair: &RobotPair) -> RemoteVecEnv {
+pub fn client(pair: &RobotPair) -> RemoteVecEnv {
     let options = ConnectOptions { autoreset: AutoresetMode::Disabled, ..ConnectOptions::new(&pair.endpoint, 1) };
     RemoteVecEnv::connect(&options).unwrap()
 }
@@ -58,7 +57,7 @@ fn in_three_attempts<T>(mut attempt: impl FnMut() -> Result<T, String>) -> T {
 }
 
 /// Runs a test that needs a computer which keeps time, up to three times.
-fn test_in_real_time(test: impl Fn()) {
+pub fn test_in_real_time(test: impl Fn()) {
     let text = |panic: Box<dyn std::any::Any + Send>| match panic.downcast::<String>() {
         Ok(text) => *text,
         Err(other) => format!("{:?}", other.downcast_ref::<&str>()),
@@ -233,68 +232,6 @@ fn late_action_is_refused_and_a_silent_client_makes_the_robot_hold_then_sit() {
 }
 
 #[test]
-fn stop_needs_no_lease_and_damps_at_once() {
-    test_in_real_time(|| {
-        let mut pair = standing(&[]);
-        let mut env = client(&pair);
-        env.reset(&ResetRequest::default()).unwrap();
-        let stranger = RawClient::connect_to_only_server(&pair.endpoint, "stranger");
-        let since = Instant::now();
-        stranger.ask(&keys::stop(&stranger.sid), &[]).unwrap();
-        pair.wait_for("fault", Duration::from_secs(2)).unwrap();
-        assert!(since.elapsed() < Duration::from_millis(500), "{:?}", since.elapsed());
-        assert!(pair.state().contains("stopped on request"), "{}", pair.state());
-        // The operator arms again; the fault is forgotten.
-        pair.insist("arm").unwrap();
-        pair.wait_for("damp", Duration::from_secs(2)).unwrap();
-        let Some(python) = python(&crate::python::target()).unwrap() else { return };
-        let script = format!("import twinstep; twinstep.stop_robot('{}')", pair.endpoint);
-        let client = root().join("clients/python/src");
-        assert!(Command::new(python).args(["-c", &script]).env("PYTHONPATH", client).status().unwrap().success());
-        pair.wait_for("fault", Duration::from_secs(2)).unwrap();
-    });
-}
-
-#[test]
-fn stop_channel_stops_the_robot_beside_connections_that_say_nothing() {
-    test_in_real_time(|| {
-        let mut pair = standing(&[]);
-        let hello = RawClient::connect_to_only_server(&pair.endpoint, "stranger").hello();
-        let port = hello.real_time.unwrap().stop_port.unwrap();
-        let _idle: Vec<_> = (0..200).map(|_| std::net::TcpStream::connect(("127.0.0.1", port)).unwrap()).collect();
-        let since = Instant::now();
-        twinstep_client::stop_robot(&pair.endpoint, Some(port), None).unwrap();
-        pair.wait_for("fault", Duration::from_secs(2)).unwrap();
-        assert!(since.elapsed() < Duration::from_millis(500), "{:?}", since.elapsed());
-        assert!(pair.state().contains("stopped on request"), "{}", pair.state());
-    });
-}
-
-#[test]
-fn stop_channel_asks_for_the_password_of_a_user() {
-    let folder = tempfile::tempdir().unwrap();
-    let file = |name: &str, text: &str| {
-        let path = folder.path().join(name);
-        std::fs::write(&path, text).unwrap();
-        path
-    };
-    let users = file("users.txt", "alice:secret\n");
-    let dictionary = format!("{{transport: {{auth: {{usrpwd: {{dictionary_file: \"{}\"}}}}}}}}", users.display());
-    let server = file("server.json5", &dictionary);
-    let user =
-        |password: &str| format!("{{transport: {{auth: {{usrpwd: {{user: \"alice\", password: \"{password}\"}}}}}}}}");
-    let (right, wrong) = (file("right.json5", &user("secret")), file("wrong.json5", &user("Secret")));
-    let pair = pair(&["--zenoh", server.to_str().unwrap()]);
-    let stop = |zenoh: Option<&Path>| {
-        twinstep_client::stop_robot(&pair.endpoint, None, zenoh).map_err(|error| error.to_string())
-    };
-    assert_eq!(stop(Some(&right)), Ok(()));
-    for zenoh in [Some(&*wrong), None] {
-        assert!(stop(zenoh).unwrap_err().contains("refuses user or password"));
-    }
-}
-
-#[test]
 fn recording_of_a_killed_process_is_read_up_to_a_second_before_its_end() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run.mcap");
@@ -310,41 +247,6 @@ fn recording_of_a_killed_process_is_read_up_to_a_second_before_its_end() {
     let seconds = log.rows() as f64 / 500.0;
     assert!(seconds > recorded - 1.2, "{seconds} s of {recorded} s");
     assert!(log.read_warnings()[0].contains("truncated"), "{:?}", log.read_warnings());
-}
-
-#[test]
-fn agent_of_before_a_fault_ends_or_waits_for_the_word_of_the_operator() {
-    test_in_real_time(|| {
-        let mut pair = standing(&[]);
-        let policy = root().join("data/policies/walk.safetensors");
-        let run = |more: &[&str]| {
-            let own = ["run", policy.to_str().unwrap(), "--endpoint", &pair.endpoint, "--velocity", "0.2,0,0"];
-            let arguments: Vec<String> = own.iter().chain(more).map(ToString::to_string).collect();
-            Process::start(&program(), &arguments).unwrap()
-        };
-        let (mut ends, endpoint) = (run(&[]), pair.endpoint.clone());
-        pair.wait_for("run", Duration::from_secs(20)).unwrap();
-        twinstep_client::stop_robot(&endpoint, None, None).unwrap();
-        assert_eq!(ends.exit_code(Duration::from_secs(20)), Some(1), "it ends with the fault");
-        pair.insist("arm").unwrap();
-        pair.insist("stand").unwrap();
-        pair.wait_for("ready", Duration::from_secs(20)).unwrap();
-        let own = ["run", policy.to_str().unwrap(), "--endpoint", &endpoint, "--velocity", "0.2,0,0", "--go-on"];
-        let _waits = Process::start(&program(), &own.map(str::to_owned)).unwrap();
-        std::thread::sleep(Duration::from_secs(3));
-        assert!(pair.state().starts_with("ready"), "nobody has let it act: {}", pair.state());
-        pair.insist("go").unwrap();
-        pair.wait_for("run", Duration::from_secs(10)).unwrap();
-    });
-}
-
-#[test]
-fn line_that_is_no_text_is_an_error_and_the_next_stop_is_executed() {
-    let mut pair = pair(&[]);
-    pair.wait_for("observe", Duration::from_mins(1)).unwrap();
-    pair.robot.write(b"\xe4\xff\n").unwrap();
-    assert!(pair.operator("status").unwrap().starts_with("error"), "the answer to the first line");
-    assert_eq!(pair.operator("stop").unwrap(), "ok stop");
 }
 
 #[test]
@@ -506,36 +408,6 @@ fn preflight_sends_nothing_without_the_yes_of_the_operator() {
     assert!(output.status.code() == Some(2) && text.contains("nothing was sent"), "{text}");
 }
 
-#[test]
-fn robot_and_process_go_on_after_they_were_suspended() {
-    let mut pair = standing(&[]);
-    for _ in 0..3 {
-        pair.fake.freeze().unwrap();
-        std::thread::sleep(Duration::from_millis(30));
-        pair.fake.thaw().unwrap();
-        std::thread::sleep(Duration::from_millis(100));
-        pair.robot.freeze().unwrap();
-        std::thread::sleep(Duration::from_millis(30));
-        pair.robot.thaw().unwrap();
-        std::thread::sleep(Duration::from_millis(100));
-    }
-    // It stands, or was damped because the pauses were too long: commands are sent in either case.
-    let accepted = |pair: &mut RobotPair| pair.ask("statistics").unwrap()["accepted"].as_u64().unwrap();
-    let before = accepted(&mut pair);
-    std::thread::sleep(Duration::from_secs(1));
-    let after = accepted(&mut pair);
-    assert!(after > before + 50, "{before} commands, then {after}; {}", pair.state());
-}
-
-#[test]
-fn interrupted_robot_is_damped_before_its_commands_cease() {
-    let mut pair = standing(&[]);
-    pair.robot.interrupt().unwrap();
-    assert_eq!(pair.robot.exit_code(Duration::from_secs(30)), Some(130));
-    let pose = pair.ask("pose").unwrap();
-    assert!(pose["position"][2].as_f64().unwrap() < 0.2, "it lies: {pose}");
-}
-
 /// Walks a fake robot with a hidden effect by the client, and records what its messages say.
 fn record_walk(model: &Path, velocity: &str, recording: &Path) {
     // A virtual machine that stands still for longer than the robot waits for its states ends a walk in a fault.
@@ -594,44 +466,4 @@ fn simulator_predicts_the_next_step_of_the_robot_within_the_noise_of_its_sensors
     // The median and not the mean square: where this computer stood still, commands arrived late. The noise of the encoders
     // is 0.0005 rad at the beginning and at the end, and 0.02 rad/s for up to 20 ms.
     assert!(error < 0.0008 && error_of_other > 1.3 * error, "{error} rad, with friction {error_of_other} rad");
-}
-
-#[test]
-fn run_that_waits_for_the_operator_ends_with_the_first_interrupt() {
-    test_in_real_time(|| {
-        let pair = pair(&[]);
-        let policy = root().join("data/policies/walk.safetensors");
-        let arguments = ["run", policy.to_str().unwrap(), "--endpoint", &pair.endpoint];
-        let mut run = Process::start(&program(), &arguments.map(str::to_owned)).unwrap();
-        std::thread::sleep(Duration::from_secs(2));
-        run.interrupt().unwrap();
-        assert_eq!(run.exit_code(Duration::from_secs(30)), Some(130));
-    });
-}
-
-#[test]
-fn python_client_that_waits_for_the_operator_ends_with_an_interrupt() {
-    let Some(python) = python(&crate::python::target()).unwrap() else { return };
-    let pair = pair(&[]);
-    let script = format!(
-        "import gymnasium, twinstep\nenv = gymnasium.make('twinstep/Go2-Walk-v0', endpoint='{}')\ntry:\n    env.reset()\nfinally:\n    env.close()",
-        pair.endpoint
-    );
-    let mut agent = interruptible(&python)
-        .args(["-c", &script])
-        .env("PYTHONPATH", root().join("clients/python/src"))
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let mut lines = std::io::BufRead::lines(std::io::BufReader::new(agent.stderr.take().unwrap()));
-    assert!(lines.any(|line| line.unwrap().contains("the robot is not ready")), "it says what it waits for");
-    assert!(Command::new("kill").args(["-INT", &agent.id().to_string()]).status().unwrap().success());
-    let since = Instant::now();
-    while agent.try_wait().unwrap().is_none() {
-        if since.elapsed() > Duration::from_secs(30) {
-            agent.kill().unwrap();
-            panic!("it does not end");
-        }
-        std::thread::sleep(Duration::from_millis(50));
-    }
 }

@@ -258,6 +258,17 @@ def test_server_of_a_program_can_be_reached_by_its_user_only() -> None:
     assert not folder.exists()
 
 
+def test_server_starts_where_the_folder_for_temporary_files_has_a_long_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / ("long" * 30)
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    envs = Go2VectorEnv(1, task="counter")
+    envs.reset()
+    envs.close()
+
+
 @pytest.mark.parametrize("cause", ["exit", "SIGKILL"])
 def test_server_terminates_with_its_parent(cause: str) -> None:
     program = textwrap.dedent("""

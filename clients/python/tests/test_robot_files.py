@@ -134,6 +134,11 @@ EQUAL = {
         MOTOR, '<position joint="shoulder" kp="0"/>', '<motor joint="shoulder" ctrlrange="-1 2"/>'
     ),
     "position": motor('<position joint="shoulder" kp="50" forcerange="-7 8"/>'),
+    "velocity": motor('<velocity joint="shoulder" forcerange="-7 8"/>'),
+    "range that is none": change(('range="-1 2"', 'range="0 0"')),
+    "zeros in other words": change(
+        ("<compiler", '<compiler boundmass="0.0"'), (RAIL, '<body name="rail" pos="-0.2 0 0" gravcomp="0.0">')
+    ),
     "general": motor('<general joint="shoulder" gainprm="3" ctrlrange="-2 1"/>'),
     "one default for all actuators": change(("<default>\n", '<default>\n<position forcerange="-2 3"/>\n')),
     "default of general": change(("<default>\n", '<default>\n<general forcerange="-2 3"/>\n')),
@@ -172,6 +177,7 @@ REFUSED = {
     "equality": (change(("<actuator>", '<equality><connect name="loop" body1="lower" body2="rail" anchor="0 0 0"/></equality><actuator>')), "connect.*loop"),
     "coupled joints": (change(("<actuator>", '<equality><joint joint1="elbow" joint2="shoulder"/></equality><actuator>')), "<joint>.*<equality>"),
     "tendon": (change(("<actuator>", '<tendon><fixed name="t"><joint joint="elbow" coef="1"/></fixed></tendon><actuator>')), "<fixed>"),
+    "damper": (motor('<damper joint="shoulder" kv="2" ctrlrange="0 1"/>'), "<damper>"),
     "muscle": (motor('<muscle joint="shoulder"/>'), "<muscle>"),
     "another transmission": (motor('<motor jointinparent="shoulder"/>'), "jointinparent"),
     "gravity": (change(("<default>\n", '<option gravity="0 0 -1.62"/>\n<default>\n')), "gravity"),

@@ -15,7 +15,7 @@ const TIMESTEPS: std::ops::RangeInclusive<f64> = 1e-5..=0.02;
 
 /// Export the robot as a MuJoCo model (MJCF, XML), to compare the physics with MuJoCo.
 ///
-/// Any robot of a URDF or MJCF file can be exported: what the file has and the model does not is told. For a quadruped like the Go2
+/// Any robot of a URDF or MJCF file can be exported. Notes say what the file has and the model does not. For a quadruped like the Go2
 /// the model contains the kinematic tree, masses, inertias, armature, joint ranges and torque limits of the robot. Its
 /// contacts are those of `--engine batch`: feet, both ends of each calf, and the corners of the base against the
 /// ground. `ctrl` is torque [N·m] in the joint order FL, FR, RL, RR; hip, thigh, calf. The keyframe `default_pose` is
@@ -27,7 +27,7 @@ pub struct Args {
     /// Model file of the robot. Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
-    /// Mounting of the base: floating, or fixed 1 m above the ground.
+    /// Mounting of the base: floating, or fixed; that of the Go2 1 m above the ground. A file can fix it, too.
     #[arg(long, default_value = "floating", value_parser = base)]
     base: BaseMount,
     /// Time step of the physics [s], 0.00001 to 0.02.
@@ -87,7 +87,11 @@ fn of_robot_file(path: &Path, options: &MjcfOptions) -> Result<String, Failure> 
         Err(why) => {
             let mut notes = file.notes.clone();
             notes.push(format!("exported with its own shapes, because it is no quadruped like the Go2: {why}"));
-            (write_mjcf(&file.tree), notes)
+            let mut tree = file.tree;
+            if options.base == BaseMount::Fixed {
+                tree.base = Some(BaseMount::Fixed);
+            }
+            (write_mjcf(&tree, options.timestep), notes)
         }
     };
     for note in notes {

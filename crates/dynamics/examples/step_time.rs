@@ -7,51 +7,13 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use glam::{DAffine3, DMat3};
 use twinstep_dynamics::{FactoredTree, TreeLoad, TreeMotion, TreeParameters, TreeState, TreeStructure};
 use twinstep_model::dynamics::{FactoredDynamics, JointLoad, KinematicTree, State};
-use twinstep_model::{BaseMount, JointSpring, RobotTree, TreeBody, TreeJoint, TreeJointKind, go2};
+use twinstep_model::{RobotTree, go2};
 use twinstep_simd::{InstructionSet, SimdFloat, SimdKernel, SimdTask, with_f32};
 
 const STEPS: usize = 20_000;
 const ROUNDS: usize = 9;
-
-/// The tree of the Go2, built from its model.
-fn go2_tree() -> RobotTree {
-    let robot = go2();
-    let mut tree = RobotTree {
-        name: robot.name.clone(),
-        base: Some(BaseMount::Floating),
-        world_from_base: DAffine3::IDENTITY,
-        bodies: vec![TreeBody { name: "trunk".to_owned(), inertia: robot.trunk }],
-        joints: Vec::new(),
-        shapes: Vec::new(),
-    };
-    for joint in twinstep_model::Joint::ALL {
-        let (leg, index) = (joint.leg as usize, joint.index());
-        let parent = if joint.kind as usize == 0 { 0 } else { index };
-        tree.bodies
-            .push(TreeBody { name: joint.name().to_owned(), inertia: robot.legs[leg].bodies[joint.kind as usize] });
-        tree.joints.push(TreeJoint {
-            name: joint.name().to_owned(),
-            kind: TreeJointKind::Revolute,
-            parent,
-            parent_from_child: DAffine3::from_mat3_translation(
-                DMat3::IDENTITY,
-                robot.legs[leg].origins[joint.kind as usize],
-            ),
-            axis: twinstep_model::RobotModel::axis(joint),
-            range: robot.joints[index].range,
-            effort: None,
-            speed_limit: f64::INFINITY,
-            armature: robot.joints[index].armature,
-            damping: 0.0,
-            friction: 0.0,
-            spring: JointSpring::NONE,
-        });
-    }
-    tree
-}
 
 struct Any<'a, T> {
     structure: &'a TreeStructure,
@@ -99,7 +61,7 @@ impl SimdTask for Compare {
     type Output = ();
 
     fn run<T: SimdFloat>(self) {
-        let robot = go2_tree();
+        let robot = RobotTree::from(&go2());
         let structure = TreeStructure::new(&robot);
         let parameters = TreeParameters::<T>::splat(&robot);
         let zero = T::splat(0.0);

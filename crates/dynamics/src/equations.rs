@@ -1,6 +1,6 @@
 //! Equations of motion `M a + bias = τ`: recursive Newton–Euler algorithm and composite-rigid-body algorithm.
 
-use twinstep_model::dynamics::{Inertia, Vec3};
+use twinstep_model::dynamics::{Inertia, Vec3, spatial_matrix};
 use twinstep_simd::SimdFloat;
 
 use crate::motion::{Spatial, TreeMotion, times};
@@ -99,21 +99,4 @@ pub fn mass_matrix<T: SimdFloat>(
         }
     }
     matrix
-}
-
-/// Returns the lower triangle of a body's spatial inertia matrix: angular, then linear.
-#[inline(always)]
-pub fn spatial_matrix<T: SimdFloat>(body: &Inertia<T>) -> [[T; 6]; 6] {
-    let zero = T::splat(0.0);
-    let [xx, yy, zz, xy, xz, yz] = body.about_origin;
-    let ([hx, hy, hz], m) = (body.moment.0, body.mass);
-    [
-        [xx, zero, zero, zero, zero, zero],
-        [xy, yy, zero, zero, zero, zero],
-        [xz, yz, zz, zero, zero, zero],
-        // Force due to an angular acceleration: alpha × h.
-        [zero, hz, -hy, m, zero, zero],
-        [-hz, zero, hx, zero, m, zero],
-        [hy, -hx, zero, zero, zero, m],
-    ]
 }

@@ -5,10 +5,10 @@
 //! chapter 6.5), a solution in whitened coordinates u is `Δq̇ = L⁻¹ u`. A row `J Δq̇` that acts on one body is `y·u` with `y = L⁻ᵀ Jᵀ`,
 //! which is not zero only for the base and for the joints of the body's branch. Two rows are coupled through `y·y'`.
 
-use twinstep_model::dynamics::{Cholesky, Inertia, Vec3};
+use twinstep_model::dynamics::{Cholesky, Inertia, Vec3, spatial_matrix};
 use twinstep_simd::SimdFloat;
 
-use crate::equations::{force, spatial_matrix};
+use crate::equations::force;
 use crate::motion::{Spatial, TreeMotion, times};
 use crate::{TreeParameters, TreeState, TreeStructure};
 

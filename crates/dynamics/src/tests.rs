@@ -1,6 +1,6 @@
 //! Random trees: the equations agree with each other.
 
-use glam::{DAffine3, DMat3, DQuat, DVec3, dvec3};
+use glam::{DAffine3, DQuat, DVec3, dvec3};
 use proptest::prelude::*;
 use twinstep_model::dynamics::Vec3;
 use twinstep_model::{BaseMount, JointSpring, RigidBody, RobotTree, TreeBody, TreeJoint, TreeJointKind, go2};
@@ -174,46 +174,9 @@ proptest! {
     }
 }
 
-/// The tree of the Go2, built from its model.
-fn go2_tree() -> RobotTree {
-    let robot = go2();
-    let mut tree = RobotTree {
-        name: robot.name.clone(),
-        base: Some(BaseMount::Floating),
-        world_from_base: DAffine3::IDENTITY,
-        bodies: vec![TreeBody { name: "trunk".to_owned(), inertia: robot.trunk }],
-        joints: Vec::new(),
-        shapes: Vec::new(),
-    };
-    for joint in twinstep_model::Joint::ALL {
-        let (leg, index) = (joint.leg as usize, joint.index());
-        let parent = if joint.kind as usize == 0 { 0 } else { index };
-        tree.bodies
-            .push(TreeBody { name: joint.name().to_owned(), inertia: robot.legs[leg].bodies[joint.kind as usize] });
-        tree.joints.push(TreeJoint {
-            name: joint.name().to_owned(),
-            kind: TreeJointKind::Revolute,
-            parent,
-            parent_from_child: DAffine3::from_mat3_translation(
-                DMat3::IDENTITY,
-                robot.legs[leg].origins[joint.kind as usize],
-            ),
-            axis: twinstep_model::RobotModel::axis(joint),
-            range: robot.joints[index].range,
-            effort: None,
-            speed_limit: f64::INFINITY,
-            armature: robot.joints[index].armature,
-            damping: 0.0,
-            friction: 0.0,
-            spring: JointSpring::NONE,
-        });
-    }
-    tree
-}
-
 #[test]
 fn go2_has_the_mass_matrix_of_its_own_equations() {
-    let tree = go2_tree();
+    let tree = RobotTree::from(&go2());
     let case = Case::new(&tree, 3);
     let matrix = mass_matrix(&case.structure, &case.parameters, &case.motion);
     let q: [f64; 12] = case.state.q.clone().try_into().expect("twelve joints");

@@ -2,7 +2,7 @@
 
 use glam::{DAffine3, DMat3, DVec3};
 
-use crate::{BaseMount, JointSpring, RigidBody};
+use crate::{BaseMount, Joint, JointKind, JointSpring, RigidBody, RobotModel};
 
 /// Robot: bodies, joints and collision shapes. A body follows its parent.
 #[derive(Clone, Debug, PartialEq)]
@@ -161,5 +161,41 @@ impl RobotTree {
             shape.body_from_shape = DAffine3::from_mat3(turns[shape.body]) * shape.body_from_shape;
         }
         tree
+    }
+}
+
+/// The tree of a quadruped with a free base. Its collision shapes are left out.
+impl From<&RobotModel> for RobotTree {
+    fn from(robot: &RobotModel) -> Self {
+        let body = |name: &str, inertia: RigidBody| TreeBody { name: name.to_owned(), inertia };
+        let inertia = |joint: Joint| robot.legs[joint.leg as usize].bodies[joint.kind as usize];
+        let children = Joint::ALL.into_iter().map(|joint| body(joint.name(), inertia(joint)));
+        Self {
+            name: robot.name.clone(),
+            base: Some(BaseMount::Floating),
+            world_from_base: DAffine3::IDENTITY,
+            bodies: std::iter::once(body("trunk", robot.trunk)).chain(children).collect(),
+            joints: Joint::ALL.into_iter().map(|joint| tree_joint(robot, joint)).collect(),
+            shapes: Vec::new(),
+        }
+    }
+}
+
+fn tree_joint(robot: &RobotModel, joint: Joint) -> TreeJoint {
+    let model = &robot.joints[joint.index()];
+    TreeJoint {
+        name: joint.name().to_owned(),
+        kind: TreeJointKind::Revolute,
+        // The body before the one of a joint is that of the previous joint of its leg.
+        parent: if joint.kind == JointKind::Hip { 0 } else { joint.index() },
+        parent_from_child: DAffine3::from_translation(robot.legs[joint.leg as usize].origins[joint.kind as usize]),
+        axis: RobotModel::axis(joint),
+        range: model.range,
+        effort: Some([-model.torque_limit, model.torque_limit]),
+        speed_limit: model.speed_limit,
+        armature: model.armature,
+        damping: model.viscous_friction,
+        friction: model.coulomb_friction,
+        spring: model.spring,
     }
 }

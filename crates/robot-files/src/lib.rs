@@ -16,6 +16,7 @@ mod mesh;
 mod mjcf;
 mod orientation;
 mod quadruped;
+mod quadruped_shapes;
 mod tree_builder;
 mod urdf;
 mod write_mjcf;

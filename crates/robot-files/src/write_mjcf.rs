@@ -6,12 +6,14 @@ use glam::{DAffine3, DMat3, DQuat, DVec3};
 use twinstep_model::{BaseMount, RobotTree, TreeJoint, TreeJointKind, TreeShape, TreeShapeKind};
 
 /// Returns the MuJoCo model (MJCF, XML) of a robot. Its actuators are motors: `ctrl` is the force of each joint that has
-/// actuators, in the order of the joints. A base with mass of which nothing says that it is fixed moves freely.
-pub fn write_mjcf(tree: &RobotTree) -> String {
+/// actuators, in the order of the joints. A base with mass of which nothing says that it is fixed moves freely. `timestep` is that of
+/// the physics [s].
+pub fn write_mjcf(tree: &RobotTree, timestep: f64) -> String {
     let mut writer = Writer { tree, text: String::new() };
     let name = escaped(&tree.name);
     writer.line(0, &format!("<mujoco model=\"{name}\">"));
     writer.line(1, "<compiler angle=\"radian\" autolimits=\"true\"/>");
+    writer.line(1, &format!("<option timestep=\"{timestep}\"/>"));
     writer.line(1, "<worldbody>");
     writer.body(0, DVec3::ZERO, 2);
     writer.line(1, "</worldbody>");

@@ -74,6 +74,12 @@ pub fn check_attributes(node: Node, known: &[&[&str]]) -> Result<(), RobotFileEr
     }
 }
 
+/// Returns true if two values of an attribute are the same text, or the same numbers.
+pub fn is_same(one: &str, other: &str) -> bool {
+    let numbers = |text: &str| text.split_whitespace().map(|word| word.parse().ok()).collect::<Option<Vec<f64>>>();
+    one == other || numbers(one).is_some_and(|one| Some(one) == numbers(other))
+}
+
 /// Returns three numbers as a vector.
 pub fn vector(numbers: [f64; 3]) -> DVec3 {
     DVec3::from(numbers)

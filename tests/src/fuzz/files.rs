@@ -177,7 +177,8 @@ fn read_text(format: Format, text: &str, folder: &Path) -> Outcome {
         }
         Format::Urdf | Format::Mjcf => match read_robot(text, None) {
             Ok(file) => {
-                read_robot(&write_mjcf(&file.tree), None).expect("a robot that was read can be written and read");
+                read_robot(&write_mjcf(&file.tree, 0.001), None)
+                    .expect("a robot that was read can be written and read");
                 if let Ok((robot, _)) = quadruped(&file, &QuadrupedNames::default(), go2().control) {
                     assert!(mjcf(&robot, &MjcfOptions::default()).contains("<mujoco"), "the robot can be exported");
                 }

@@ -16,6 +16,7 @@ from .errors import Error
 _STARTUP_S = 20.0
 _SHUTDOWN_TIMEOUT_S = 5.0
 _LOG_TAIL_LINES = 15
+_MAX_FOLDER_BYTES = 70
 
 
 class ServerNotFoundError(Error):
@@ -47,6 +48,16 @@ def find_program() -> str:
     return program
 
 
+def _private_folder() -> str:
+    """Create a folder that only this user can open.
+
+    The address of a socket in it has room for 107 bytes, and Zenoh reads some characters of an address as separators.
+    """
+    usual = tempfile.gettempdir()
+    is_possible = len(os.fsencode(usual)) <= _MAX_FOLDER_BYTES and not set("?#;") & set(usual)
+    return tempfile.mkdtemp(prefix="twinstep-", dir=usual if is_possible else "/tmp")
+
+
 class EmbeddedServer:
     """A server for this user, as a child process.
 
@@ -68,7 +79,7 @@ class EmbeddedServer:
         self._owner = os.getpid()
         self._last_lines: deque[str] = deque(maxlen=_LOG_TAIL_LINES)
         program = find_program()
-        self._folder = tempfile.mkdtemp(prefix="twinstep-")
+        self._folder = _private_folder()
         listen = f"unixsock-stream/{self._folder}/server"
         command = [program, "serve", "--until-stdin-closes", "--listen", listen, *arguments]
         # A separate process group, so that Ctrl-C in a terminal reaches only the agent, which closes the environment.

@@ -204,7 +204,7 @@ fn to_base<T: SimdFloat>(force: Vec3<T>, moment: Vec3<T>, hip: Vec3<T>, hip_angl
 
 /// Returns the lower triangle of a body's spatial inertia matrix (6 × 6): angular, then linear.
 #[inline(always)]
-pub(super) fn spatial_matrix<T: SimdFloat>(body: &Inertia<T>) -> [[T; 6]; 6] {
+pub fn spatial_matrix<T: SimdFloat>(body: &Inertia<T>) -> [[T; 6]; 6] {
     let zero = T::splat(0.0);
     let [xx, yy, zz, xy, xz, yz] = body.about_origin;
     let ([hx, hy, hz], m) = (body.moment.0, body.mass);

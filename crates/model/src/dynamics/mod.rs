@@ -22,7 +22,7 @@ mod tests;
 mod tree;
 
 pub use actuators::{JointForces, SimdActuators, SimdCommands};
-pub use equations::{Acceleration, Wrench, inverse_dynamics, mass_matrix};
+pub use equations::{Acceleration, Wrench, inverse_dynamics, mass_matrix, spatial_matrix};
 pub use factored::{FactoredDynamics, FactoredLeg, JointLoad, forward_dynamics};
 pub use spatial::{Cholesky, Inertia, Vec3};
 pub use tree::{Frames, KinematicTree, LegFrames, State};

@@ -75,7 +75,7 @@ impl Actuators {
 
     fn add(&mut self, element: &Element, settings: &Settings) -> Result<(), RobotFileError> {
         let tag = element.node.tag_name().name();
-        if !matches!(tag, "general" | "motor" | "position" | "velocity" | "intvelocity" | "damper") {
+        if !matches!(tag, "general" | "motor" | "position" | "velocity" | "intvelocity") {
             return Err(unsupported(
                 element.node,
                 format!("<{tag}> is not supported: motors, position and velocity actuators are"),
@@ -108,14 +108,12 @@ impl Actuators {
         let control = element.limits("ctrlrange", "ctrllimited", settings)?.unwrap_or(endless);
         match tag {
             "motor" => Ok(control),
-            "position" | "velocity" | "intvelocity" | "damper" => {
+            "position" | "velocity" | "intvelocity" => {
                 self.has_controllers = true;
-                let gains = if tag == "position" || tag == "intvelocity" { ["kp", "kv"] } else { ["kv", "kv"] };
-                let default = if element.attribute("kp").is_none() && gains[0] == "kp" { 1.0 } else { 0.0 };
-                let without_gains = element.number(gains[0], default)? == 0.0
-                    && element.number(gains[1], if tag == "velocity" { 1.0 } else { 0.0 })? == 0.0
-                    && element.attribute("dampratio").is_none();
-                Ok(if without_gains { [0.0; 2] } else { endless })
+                let has_kp = tag != "velocity";
+                let kp = if has_kp { element.number("kp", 1.0)? } else { 0.0 };
+                let kv = element.number("kv", if has_kp { 0.0 } else { 1.0 })?;
+                Ok(if kp == 0.0 && kv == 0.0 { [0.0; 2] } else { endless })
             }
             _ => self.general(element, control),
         }

@@ -1,4 +1,4 @@
-//! Bodies and frames of MJCF files, from the base outwards.
+//! Bodies and frames of MJCF files, from one body outwards.
 
 use glam::{DAffine3, DMat3, DVec3};
 use roxmltree::Node;
@@ -11,104 +11,43 @@ use super::element::Element;
 use super::joints::BodyJoint;
 use super::meshes::Meshes;
 use super::{geoms, joints};
+use crate::RobotFileError;
 use crate::orientation::ORIENTATIONS;
 use crate::tree_builder::TreeBuilder;
 use crate::xml::{child, unsupported, vector};
-use crate::{RobotFile, RobotFileError};
 
 const OF_BODY: [&str; 7] = ["name", "childclass", "pos", "user", "gravcomp", "mocap", "sleep"];
 const OF_INERTIAL: [&str; 4] = ["pos", "mass", "diaginertia", "fullinertia"];
 /// Elements of bodies that are not part of the robot's mechanics.
 const WITHOUT_EFFECT: [&str; 3] = ["site", "camera", "light"];
 
-/// Maximum number of elements of `<worldbody>`.
-const MAX_ELEMENTS: usize = 20_000;
-
-struct Reader<'a, 'b> {
-    settings: &'b Settings,
-    classes: &'b Classes<'a>,
-    actuators: &'b Actuators,
-    meshes: &'b Meshes<'b>,
-    tree: TreeBuilder,
+/// Descends into bodies.
+pub struct Reader<'a, 'b> {
+    /// Settings of the compiler.
+    pub settings: &'b Settings,
+    /// Default classes.
+    pub classes: &'b Classes<'a>,
+    /// Actuators of all joints.
+    pub actuators: &'b Actuators,
+    /// Meshes by name.
+    pub meshes: &'b Meshes<'b>,
+    /// What was read so far.
+    pub tree: TreeBuilder,
 }
 
 /// A body or frame with what it inherits.
 #[derive(Clone, Copy)]
-struct Place<'a> {
-    node: Node<'a, 'a>,
+pub struct Place<'a> {
+    /// The element.
+    pub node: Node<'a, 'a>,
     /// Pose in the body of the tree that it belongs to.
-    pose: DAffine3,
+    pub pose: DAffine3,
     /// Class of the elements in it.
-    class: &'a str,
-}
-
-/// Reads `<worldbody>`: the robot in it, without what never moves beside it.
-pub fn read<'a>(
-    root: Node<'a, 'a>,
-    settings: &Settings,
-    classes: &Classes<'a>,
-    actuators: &Actuators,
-    meshes: &Meshes,
-) -> Result<RobotFile, RobotFileError> {
-    let name = root.attribute("model").unwrap_or("robot");
-    let world = child(root, "worldbody").ok_or_else(|| unsupported(root, "<mujoco> has no <worldbody>"))?;
-    if world.descendants().nth(MAX_ELEMENTS).is_some() {
-        return Err(unsupported(world, format!("<worldbody> has more than {MAX_ELEMENTS} elements")));
-    }
-    let place = Place { node: world, pose: DAffine3::IDENTITY, class: "main" };
-    let tree = TreeBuilder::new(name, "world", None, DAffine3::IDENTITY);
-    let mut reader = Reader { settings, classes, actuators, meshes, tree };
-    let all = reader.bodies_of(place)?;
-    let (robots, furniture): (Vec<Place>, Vec<Place>) = all.into_iter().partition(|place| moves(place.node));
-    let free: Vec<&Place> = robots.iter().filter(|place| free_joint(place.node).is_some()).collect();
-    match (&robots[..], &free[..]) {
-        ([], _) => return Err(unsupported(world, "<worldbody> has no body with a joint")),
-        (_, [one, other, ..]) => {
-            let [one, other] = [one, other].map(|place| label(place.node));
-            return Err(unsupported(
-                world,
-                format!("bodies `{one}` and `{other}` both move freely: one robot expected"),
-            ));
-        }
-        ([robot], [_]) => reader.start(name, *robot, BaseMount::Floating)?,
-        ([robot], []) if joints_of(robot.node).is_empty() => reader.start(name, *robot, BaseMount::Fixed)?,
-        (_, [one]) => {
-            let problem =
-                format!("body `{}` moves freely, and others move beside it: one robot expected", label(one.node));
-            return Err(unsupported(world, problem));
-        }
-        _ => {
-            reader.tree = TreeBuilder::new(name, "world", Some(BaseMount::Fixed), DAffine3::IDENTITY);
-            for robot in &robots {
-                reader.body(*robot, 0)?;
-            }
-        }
-    }
-    for place in furniture {
-        reader.tree.note(format!("body `{}` never moves and is not part of the robot", label(place.node)));
-    }
-    if let Some(joint) = actuators.joints().find(|joint| !reader.tree.has_joint(joint)) {
-        return Err(unsupported(
-            root,
-            format!("<actuator> has an actuator of joint `{joint}`, which the robot does not have"),
-        ));
-    }
-    if let Some(total) = settings.total_mass {
-        reader.tree.set_total_mass(total);
-    }
-    if actuators.has_controllers {
-        reader.tree.note("controllers inside the actuators of the file are left out: their force limits are kept");
-    }
-    reader.tree.finish()
-}
-
-/// Returns true if a body or one below it has a joint.
-fn moves(body: Node) -> bool {
-    body.descendants().any(|node| node.has_tag_name("joint") || node.has_tag_name("freejoint"))
+    pub class: &'a str,
 }
 
 /// Returns the joints of a body, also those in frames, without those of bodies below it.
-fn joints_of<'a>(body: Node<'a, 'a>) -> Vec<Node<'a, 'a>> {
+pub fn joints_of<'a>(body: Node<'a, 'a>) -> Vec<Node<'a, 'a>> {
     let mut joints = Vec::new();
     for node in body.children() {
         match node.tag_name().name() {
@@ -120,17 +59,19 @@ fn joints_of<'a>(body: Node<'a, 'a>) -> Vec<Node<'a, 'a>> {
     joints
 }
 
-fn free_joint<'a>(body: Node<'a, 'a>) -> Option<Node<'a, 'a>> {
+/// Returns the free joint of a body.
+pub fn free_joint<'a>(body: Node<'a, 'a>) -> Option<Node<'a, 'a>> {
     joints_of(body).into_iter().find(|joint| joint.has_tag_name("freejoint") || joint.attribute("type") == Some("free"))
 }
 
-fn label<'a>(node: Node<'a, '_>) -> &'a str {
+/// Returns the name of an element for messages.
+pub fn label<'a>(node: Node<'a, '_>) -> &'a str {
     node.attribute("name").unwrap_or("without a name")
 }
 
 impl<'a> Reader<'a, '_> {
     /// Reads the body that is the base.
-    fn start(&mut self, name: &str, robot: Place<'a>, mount: BaseMount) -> Result<(), RobotFileError> {
+    pub fn start(&mut self, name: &str, robot: Place<'a>, mount: BaseMount) -> Result<(), RobotFileError> {
         let base = Element { node: robot.node, kind: "body", class: &self.classes["main"] };
         let world_from_base = robot.pose * base.pose(self.settings)?;
         self.tree = TreeBuilder::new(name, label(robot.node), Some(mount), world_from_base);
@@ -166,7 +107,7 @@ impl<'a> Reader<'a, '_> {
     }
 
     /// Returns the bodies directly in a body or the world, also those in frames.
-    fn bodies_of(&self, place: Place<'a>) -> Result<Vec<Place<'a>>, RobotFileError> {
+    pub fn bodies_of(&self, place: Place<'a>) -> Result<Vec<Place<'a>>, RobotFileError> {
         let mut bodies = Vec::new();
         for node in place.node.children().filter(Node::is_element) {
             if node.has_tag_name("body") {
@@ -187,7 +128,7 @@ impl<'a> Reader<'a, '_> {
     }
 
     /// Reads a body that is in body `parent` of the tree: a body of the tree for each of its joints, or a part of the parent.
-    fn body(&mut self, outer: Place<'a>, parent: usize) -> Result<(), RobotFileError> {
+    pub fn body(&mut self, outer: Place<'a>, parent: usize) -> Result<(), RobotFileError> {
         let node = outer.node;
         self.check_body(node)?;
         let body = Element { node, kind: "body", class: &self.classes["main"] };

@@ -4,7 +4,7 @@ use roxmltree::Node;
 
 use crate::RobotFileError;
 use crate::orientation::Angles;
-use crate::xml::{attribute_error, check_attributes, parse_numbers, unsupported};
+use crate::xml::{attribute_error, check_attributes, is_same, parse_numbers, unsupported};
 
 /// Attributes that are resolved.
 const RESOLVED: [&str; 6] = ["angle", "eulerseq", "autolimits", "inertiafromgeom", "inertiagrouprange", "settotalmass"];
@@ -65,8 +65,9 @@ impl Settings {
             let limited: Vec<&str> = ONLY.iter().map(|(name, _)| *name).collect();
             check_attributes(*node, &[&RESOLVED, &WITHOUT_EFFECT, &limited])?;
             for (name, values) in ONLY {
-                if node.attribute(name).is_some_and(|value| !values.contains(&value)) {
-                    let value = node.attribute(name).unwrap_or_default();
+                if let Some(value) = node.attribute(name)
+                    && !values.iter().any(|other| is_same(value, other))
+                {
                     return Err(unsupported(*node, format!("`{name}=\"{value}\"` of <compiler> is not supported")));
                 }
             }

@@ -7,7 +7,7 @@ use super::compiler::Settings;
 use super::defaults::{Class, Classes};
 use crate::RobotFileError;
 use crate::orientation::rotation;
-use crate::xml::{attribute_error, parse_numbers, unsupported, vector};
+use crate::xml::{attribute_error, is_same, parse_numbers, unsupported, vector};
 
 /// Element with its default class.
 #[derive(Clone, Copy)]
@@ -57,7 +57,7 @@ impl<'a, 'b> Element<'a, 'b> {
     /// Fails if an attribute has another value than the one without effect.
     pub fn check_value(&self, name: &str, without_effect: &[&str]) -> Result<(), RobotFileError> {
         match self.attribute(name) {
-            Some(value) if !without_effect.contains(&value) => {
+            Some(value) if !without_effect.iter().any(|other| is_same(value, other)) => {
                 let element = self.node.tag_name().name();
                 Err(unsupported(self.node, format!("`{name}=\"{value}\"` of <{element}> is not supported")))
             }
@@ -113,7 +113,7 @@ impl<'a, 'b> Element<'a, 'b> {
         }
     }
 
-    /// Returns the attribute `range`, if `limited` says that it limits, or if it is there and `autolimits` says so.
+    /// Returns the attribute `range`, if `limited` says that it limits, or if it is a range and `autolimits` says so.
     pub fn limits(
         &self,
         range: &'static str,
@@ -127,7 +127,7 @@ impl<'a, 'b> Element<'a, 'b> {
                 format!("`{range}` without `{limited}`, and `autolimits` of <compiler> is false: state `{limited}`");
             return Err(unsupported(self.node, problem));
         }
-        if !self.flag(limited, given.is_some())? {
+        if !self.flag(limited, given.is_some_and(|[low, high]| low < high))? {
             return Ok(None);
         }
         match given {

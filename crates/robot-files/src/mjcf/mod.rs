@@ -2,7 +2,7 @@
 //!
 //! - [`defaults`]: default classes; [`element`]: an element with its class.
 //! - [`compiler`]: the settings of `<compiler>`.
-//! - [`bodies`]: descends from the base through bodies and frames. [`joints`], [`geoms`], [`meshes`], [`actuators`]: what is in them.
+//! - [`worldbody`]: finds the robot; [`bodies`]: descends from its base through bodies and frames. [`joints`], [`geoms`], [`meshes`], [`actuators`]: what is in them.
 
 mod actuators;
 mod bodies;
@@ -12,13 +12,14 @@ mod element;
 mod geoms;
 mod joints;
 mod meshes;
+mod worldbody;
 
 use std::path::Path;
 
 pub use compiler::Settings;
 use roxmltree::Node;
 
-use crate::xml::unsupported;
+use crate::xml::{is_same, unsupported};
 use crate::{RobotFile, RobotFileError};
 
 /// Sections that are read, and those that do not describe the robot.
@@ -45,7 +46,7 @@ pub fn read<'a>(root: Node<'a, 'a>, folder: Option<&Path>) -> Result<RobotFile, 
     let classes = defaults::read(root)?;
     let actuators = actuators::Actuators::read(root, &classes)?;
     let meshes = meshes::Meshes::read(root, folder)?;
-    bodies::read(root, &settings, &classes, &actuators, &meshes)
+    worldbody::read(root, &settings, &classes, &actuators, &meshes)
 }
 
 /// Refuses sections that add forces or constraints, by the name of the first element.
@@ -74,8 +75,8 @@ fn check_sections(root: Node) -> Result<(), RobotFileError> {
 }
 
 /// Forces of the surroundings, with the values that the engines have.
-const SURROUNDINGS: [(&str, &[f64]); 4] =
-    [("gravity", &[0.0, 0.0, -9.81]), ("density", &[0.0]), ("viscosity", &[0.0]), ("wind", &[0.0; 3])];
+const SURROUNDINGS: [(&str, &str); 4] =
+    [("gravity", "0 0 -9.81"), ("density", "0"), ("viscosity", "0"), ("wind", "0 0 0")];
 /// Flags without which a part of the mechanics is missing.
 const NEEDED: [&str; 9] =
     ["gravity", "limit", "frictionloss", "passive", "spring", "damper", "actuation", "clampctrl", "contact"];
@@ -83,14 +84,10 @@ const NEEDED: [&str; 9] =
 /// Refuses options that change forces on the robot. Those of the solver are the engines' own.
 fn check_options(root: Node) -> Result<(), RobotFileError> {
     for option in root.children().filter(|node| node.has_tag_name("option")) {
-        for (name, values) in SURROUNDINGS {
-            let Some(text) = option.attribute(name) else { continue };
-            let given: Option<Vec<f64>> = text.split_whitespace().map(|word| word.parse().ok()).collect();
-            if given.as_deref() != Some(values) {
-                return Err(unsupported(
-                    option,
-                    format!("`{name}=\"{text}\"` of <option> is not supported: {values:?} is"),
-                ));
+        for (name, own) in SURROUNDINGS {
+            if let Some(value) = option.attribute(name).filter(|value| !is_same(value, own)) {
+                let problem = format!("`{name}=\"{value}\"` of <option> is not supported: the engines have \"{own}\"");
+                return Err(unsupported(option, problem));
             }
         }
         for flag in option.children().filter(|node| node.has_tag_name("flag")) {

@@ -1,0 +1,82 @@
+//! The robot in `<worldbody>`, and what stands beside it.
+
+use glam::DAffine3;
+use roxmltree::Node;
+use twinstep_model::BaseMount;
+
+use super::actuators::Actuators;
+use super::bodies::{Place, Reader, free_joint, joints_of, label};
+use super::compiler::Settings;
+use super::defaults::Classes;
+use super::meshes::Meshes;
+use crate::tree_builder::TreeBuilder;
+use crate::xml::{child, unsupported};
+use crate::{RobotFile, RobotFileError};
+
+/// Maximum number of elements of `<worldbody>`.
+const MAX_ELEMENTS: usize = 20_000;
+
+/// Reads `<worldbody>`: the robot in it, without what never moves beside it.
+pub fn read<'a>(
+    root: Node<'a, 'a>,
+    settings: &Settings,
+    classes: &Classes<'a>,
+    actuators: &Actuators,
+    meshes: &Meshes,
+) -> Result<RobotFile, RobotFileError> {
+    let name = root.attribute("model").unwrap_or("robot");
+    let world = child(root, "worldbody").ok_or_else(|| unsupported(root, "<mujoco> has no <worldbody>"))?;
+    if world.descendants().nth(MAX_ELEMENTS).is_some() {
+        return Err(unsupported(world, format!("<worldbody> has more than {MAX_ELEMENTS} elements")));
+    }
+    let place = Place { node: world, pose: DAffine3::IDENTITY, class: "main" };
+    let tree = TreeBuilder::new(name, "world", None, DAffine3::IDENTITY);
+    let mut reader = Reader { settings, classes, actuators, meshes, tree };
+    let all = reader.bodies_of(place)?;
+    let (robots, furniture): (Vec<Place>, Vec<Place>) = all.into_iter().partition(|place| moves(place.node));
+    let free: Vec<&Place> = robots.iter().filter(|place| free_joint(place.node).is_some()).collect();
+    match (&robots[..], &free[..]) {
+        ([], _) => return Err(unsupported(world, "<worldbody> has no body with a joint")),
+        (_, [one, other, ..]) => {
+            let [one, other] = [one, other].map(|place| label(place.node));
+            return Err(unsupported(
+                world,
+                format!("bodies `{one}` and `{other}` both move freely: one robot expected"),
+            ));
+        }
+        ([robot], [_]) => reader.start(name, *robot, BaseMount::Floating)?,
+        ([robot], []) if joints_of(robot.node).is_empty() => reader.start(name, *robot, BaseMount::Fixed)?,
+        (_, [one]) => {
+            let problem =
+                format!("body `{}` moves freely, and others move beside it: one robot expected", label(one.node));
+            return Err(unsupported(world, problem));
+        }
+        _ => {
+            reader.tree = TreeBuilder::new(name, "world", Some(BaseMount::Fixed), DAffine3::IDENTITY);
+            for robot in &robots {
+                reader.body(*robot, 0)?;
+            }
+        }
+    }
+    for place in furniture {
+        reader.tree.note(format!("body `{}` never moves and is not part of the robot", label(place.node)));
+    }
+    if let Some(joint) = actuators.joints().find(|joint| !reader.tree.has_joint(joint)) {
+        return Err(unsupported(
+            root,
+            format!("<actuator> has an actuator of joint `{joint}`, which the robot does not have"),
+        ));
+    }
+    if let Some(total) = settings.total_mass {
+        reader.tree.set_total_mass(total);
+    }
+    if actuators.has_controllers {
+        reader.tree.note("controllers inside the actuators of the file are left out: their force limits are kept");
+    }
+    reader.tree.finish()
+}
+
+/// Returns true if a body or one below it has a joint.
+fn moves(body: Node) -> bool {
+    body.descendants().any(|node| node.has_tag_name("joint") || node.has_tag_name("freejoint"))
+}
