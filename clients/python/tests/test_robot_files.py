@@ -215,6 +215,9 @@ TOOL_INERTIAL = '<inertial><mass value="0.3"/>\n    <inertia ixx="0.001" ixy="0"
 
 URDF_EQUAL = {
     "base": URDF,
+    "no limits": URDF.replace('lower="-1" upper="2"', 'lower="0" upper="0"'),
+    "a fixed inertia without mass": URDF.replace('<mass value="0.1"/>', '<mass value="0"/>'),
+    "elements of others": URDF.replace('<link name="tip">', '<link name="tip"><origin xyz="1 2 3"/><speed/>'),
     "continuous": URDF.replace('type="revolute"', 'type="continuous"'),
     "no axis": URDF.replace('<axis xyz="1 2 -1"/>', ""),
     "mass of shapes": URDF.replace(TOOL_INERTIAL, '<collision><origin xyz="0.1 0 0" rpy="0.3 0 0"/><geometry><cylinder radius="0.03" length="0.2"/></geometry></collision>'),

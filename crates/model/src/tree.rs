@@ -108,6 +108,18 @@ pub enum TreeShapeKind {
     Mesh(Option<[DVec3; 2]>),
 }
 
+impl TreeShapeKind {
+    /// Returns the shortest of radii and half lengths [m]; infinite for a mesh.
+    pub fn shortest_length(self) -> f64 {
+        match self {
+            Self::Box(lengths) | Self::Ellipsoid(lengths) => lengths.min_element(),
+            Self::Sphere(radius) => radius,
+            Self::Capsule { radius, half_length } | Self::Cylinder { radius, half_length } => radius.min(half_length),
+            Self::Mesh(_) => f64::INFINITY,
+        }
+    }
+}
+
 impl RobotTree {
     /// Returns the mass of all bodies [kg].
     pub fn total_mass(&self) -> f64 {

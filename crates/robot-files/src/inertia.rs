@@ -6,6 +6,9 @@ use twinstep_model::{RigidBody, TreeShapeKind};
 /// Density of a shape that states neither mass nor density [kg/m³].
 pub const DENSITY: f64 = 1000.0;
 
+/// Length below which a shape has none [m].
+pub const MIN_LENGTH: f64 = 1e-9;
+
 /// Returns the volume of a shape [m³]. `None` for a mesh.
 pub fn volume(kind: TreeShapeKind) -> Option<f64> {
     use std::f64::consts::PI;

@@ -6,6 +6,7 @@ use twinstep_model::{
     RobotTree, Stribeck, TreeJoint, TreeJointKind, go2,
 };
 
+use crate::inertia::is_real;
 use crate::quadruped_shapes::shapes;
 use crate::{RobotFile, RobotFileError};
 
@@ -40,7 +41,7 @@ pub fn quadruped(
         let parent = if joint.kind == JointKind::Hip { trunk } else { 1 + found[joint.index() - 1] };
         check(joint, &tree.joints[found[joint.index()]], parent)?;
     }
-    if trunk != 0 || tree.bodies[0].inertia.mass == 0.0 {
+    if trunk != 0 || !is_real(&tree.bodies[0].inertia) {
         let problem = "the legs hang in it without a trunk: a body with mass and a free joint expected".to_owned();
         return Err(RobotFileError::Link { link: tree.bodies[trunk].name.clone(), problem });
     }

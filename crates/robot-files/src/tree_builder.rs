@@ -67,10 +67,17 @@ impl TreeBuilder {
 
     /// Checks the tree.
     pub fn finish(self) -> Result<RobotFile, RobotFileError> {
-        let Self { tree, notes } = self;
+        let Self { mut tree, mut notes } = self;
+        if tree.base.is_none() && tree.bodies[0].inertia.mass > 0.0 && !is_real(&tree.bodies[0].inertia) {
+            tree.base = Some(BaseMount::Fixed);
+            notes.push("the base has an inertia that no body has, so it does not move".to_owned());
+        }
         let mut names = BTreeSet::new();
         for joint in &tree.joints {
             let error = |problem: String| Err(RobotFileError::Joint { joint: joint.name.clone(), problem });
+            if !joint.parent_from_child.is_finite() {
+                return error("it is too far away".to_owned());
+            }
             if !names.insert(&joint.name) {
                 return error("two joints have this name".to_owned());
             }
@@ -86,14 +93,24 @@ impl TreeBuilder {
                 }
             }
         }
+        if let Some(shape) = tree.shapes.iter().find(|shape| !shape.body_from_shape.is_finite()) {
+            let problem = "a shape of it is too far away".to_owned();
+            return Err(RobotFileError::Link { link: shape.name.clone(), problem });
+        }
         for (index, TreeBody { name, inertia }) in tree.bodies.iter().enumerate() {
             let error = |problem: &str| Err(RobotFileError::Link { link: name.clone(), problem: problem.to_owned() });
-            let is_fixed_base = index == 0 && tree.base != Some(BaseMount::Floating);
+            let is_fixed_base = index == 0 && tree.base == Some(BaseMount::Fixed);
             let has_children = tree.joints.iter().any(|joint| joint.parent == index);
-            if inertia.mass == 0.0 && !is_fixed_base && (index == 0 || !has_children) {
+            let may_be_empty = if index == 0 { tree.base != Some(BaseMount::Floating) } else { has_children };
+            if inertia.mass == 0.0 && !may_be_empty {
                 return error("it has no mass and inertia; <inertial> expected");
             }
-            if inertia.mass != 0.0 && !is_real(inertia) {
+            let numbers = inertia.inertia.to_cols_array();
+            if !(inertia.mass.is_finite() && inertia.com.is_finite() && numbers.iter().all(|number| number.is_finite()))
+            {
+                return error("its mass, centre of mass or inertia is too large");
+            }
+            if inertia.mass != 0.0 && !is_fixed_base && !is_real(inertia) {
                 return error("its mass or inertia is not positive");
             }
         }

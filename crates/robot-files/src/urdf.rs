@@ -7,32 +7,37 @@ use glam::{DAffine3, DMat3, DVec3};
 use roxmltree::Node;
 use twinstep_model::{BaseMount, JointSpring, RigidBody, TreeJoint, TreeJointKind, TreeShapeKind};
 
-use crate::inertia::{self, DENSITY, transformed};
+use crate::inertia::{self, DENSITY, MIN_LENGTH, transformed};
 use crate::mesh::MeshFolder;
-use crate::mjcf::Settings;
+use crate::mjcf::{MassSource, Settings};
 use crate::orientation::from_rpy;
 use crate::tree_builder::TreeBuilder;
-use crate::xml::{attribute_error, check_attributes, child, line, number, optional, text, unsupported, vector};
+use crate::xml::{attribute_error, child, line, number, optional, text, unsupported, vector};
 use crate::{RobotFile, RobotFileError};
 
 const THREE: &str = "three numbers";
 /// Maximum number of links of a file.
 const MAX_LINKS: usize = 1000;
-/// Elements that do not describe the mechanics.
-const WITHOUT_EFFECT: [&str; 5] = ["material", "transmission", "gazebo", "sensor", "ros2_control"];
-const OF_JOINT: [&str; 8] =
-    ["origin", "parent", "child", "axis", "limit", "dynamics", "calibration", "safety_controller"];
+/// Size below which a shape has none [m].
+const MIN_SIZE: f64 = 2.0 * MIN_LENGTH;
+/// Elements that are read. MuJoCo reads no others, so others do not change the robot.
+const OF_ROBOT: [&str; 3] = ["link", "joint", "mujoco"];
+const OF_LINK: [&str; 3] = ["inertial", "visual", "collision"];
+const OF_JOINT: [&str; 6] = ["origin", "parent", "child", "axis", "limit", "dynamics"];
+/// Elements that are common in URDF files and describe no mechanics.
+const USUAL: [&str; 7] =
+    ["material", "transmission", "gazebo", "sensor", "ros2_control", "calibration", "safety_controller"];
 
 /// Reads the element `<robot>`.
 pub fn read(robot: Node, folder: Option<&Path>) -> Result<RobotFile, RobotFileError> {
-    let mut settings = Settings::read(robot)?;
-    for node in robot.children().filter(Node::is_element) {
-        match node.tag_name().name() {
-            "link" | "joint" => {}
-            "mujoco" => settings = Settings::read(node)?,
-            name if WITHOUT_EFFECT.contains(&name) => {}
-            name => return Err(unsupported(node, format!("<{name}> is not supported"))),
-        }
+    // MuJoCo's own extension of URDF.
+    let extension = child(robot, "mujoco").unwrap_or(robot);
+    let settings = Settings::read(extension)?;
+    if settings.mass_source != MassSource::Auto {
+        return Err(unsupported(
+            extension,
+            "`inertiafromgeom` of <compiler> in URDF is not supported: state <inertial>",
+        ));
     }
     let links: Vec<Node> = robot.children().filter(|node| node.has_tag_name("link")).collect();
     let joints: Vec<Node> = robot.children().filter(|node| node.has_tag_name("joint")).collect();
@@ -43,6 +48,7 @@ pub fn read(robot: Node, folder: Option<&Path>) -> Result<RobotFile, RobotFileEr
     let tree = TreeBuilder::new(name, base_name, mount, world_from_base);
     let meshes = MeshFolder::new(folder);
     let mut reader = Reader { links: &links, joints: &joints, meshes: &meshes, tree };
+    reader.note_others(robot, &OF_ROBOT);
     reader.merge(base_name, 0, DAffine3::IDENTITY, 0)?;
     if let Some(total) = settings.total_mass {
         reader.tree.set_total_mass(total);
@@ -55,6 +61,9 @@ fn root_of<'a>(robot: Node, links: &[Node<'a, 'a>], joints: &[Node<'a, 'a>]) -> 
     let parts = links.len().max(joints.len());
     if parts > MAX_LINKS {
         return Err(unsupported(robot, format!("the file has {parts} links or joints; at most {MAX_LINKS} are read")));
+    }
+    if links.is_empty() {
+        return Err(unsupported(robot, "it has no <link>: expand a xacro file first (`xacro robot.urdf.xacro`)"));
     }
     let (mut names, mut is_child) = (BTreeSet::new(), BTreeSet::new());
     for link in links {
@@ -124,25 +133,22 @@ impl Reader<'_, '_> {
         if depth > self.links.len() {
             return Err(unsupported(link, format!("link `{name}` is below itself")));
         }
-        check_attributes(link, &[&["name", "type"]])?;
+        self.note_others(link, &OF_LINK);
         let stated = child(link, "inertial");
         if let Some(inertial) = stated {
-            self.tree.add_mass(index, pose, mass(inertial)?);
-        }
-        for node in link.children().filter(Node::is_element) {
-            match node.tag_name().name() {
-                "inertial" | "visual" => {}
-                "collision" => {
-                    let Some(kind) = shape_kind(node, self.meshes)? else { continue };
-                    let place = pose * origin(node)?;
-                    if stated.is_none() {
-                        self.weigh(node, kind, index, place)?;
-                    }
-                    self.tree.add_shape(name, index, kind, place);
-                }
-                name if WITHOUT_EFFECT.contains(&name) => {}
-                other => return Err(unsupported(node, format!("<{other}> of <link> is not supported"))),
+            let body = mass(inertial)?;
+            // MuJoCo, too, leaves out an inertia without mass that is fixed to another link.
+            if body.mass != 0.0 {
+                self.tree.add_mass(index, pose, body);
             }
+        }
+        for collision in link.children().filter(|node| node.has_tag_name("collision")) {
+            let Some(kind) = shape_kind(collision, self.meshes)? else { continue };
+            let place = pose * origin(collision)?;
+            if stated.is_none() {
+                self.weigh(collision, kind, index, place)?;
+            }
+            self.tree.add_shape(name, index, kind, place);
         }
         for joint in self.joints {
             if linked(*joint, "parent")? == name {
@@ -150,6 +156,16 @@ impl Reader<'_, '_> {
             }
         }
         Ok(())
+    }
+
+    /// Notes the elements that are not read.
+    fn note_others(&mut self, node: Node, read: &[&str]) {
+        for part in node.children().filter(Node::is_element) {
+            let (name, outer) = (part.tag_name().name(), node.tag_name().name());
+            if !read.contains(&name) && !USUAL.contains(&name) {
+                self.tree.note(format!("<{name}> of <{outer}> has no meaning in URDF and is left out"));
+            }
+        }
     }
 
     /// Adds the mass of a shape of a link without `<inertial>`, as MuJoCo does.
@@ -166,13 +182,10 @@ impl Reader<'_, '_> {
     }
 
     fn joint(&mut self, joint: Node, index: usize, pose: DAffine3, depth: usize) -> Result<(), RobotFileError> {
-        check_attributes(joint, &[&["name", "type"]])?;
-        for part in joint.children().filter(Node::is_element) {
-            let name = part.tag_name().name();
-            if !OF_JOINT.contains(&name) {
-                return Err(unsupported(part, format!("<{name}> of <joint> is not supported")));
-            }
+        if let Some(mimic) = child(joint, "mimic") {
+            return Err(unsupported(mimic, "<mimic> of <joint> is not supported: coupled joints are not"));
         }
+        self.note_others(joint, &OF_JOINT);
         let (below, at) = (linked(joint, "child")?, pose * origin(joint)?);
         let kind = match text(joint, "type")? {
             "fixed" => return self.merge(below, index, at, depth + 1),
@@ -208,22 +221,14 @@ fn moving(joint: Node, kind: TreeJointKind, parent: usize, pose: DAffine3) -> Re
         }
     };
     let (limit, dynamics) = (child(joint, "limit"), child(joint, "dynamics"));
-    if let Some(limit) = limit {
-        check_attributes(limit, &[&["lower", "upper", "effort", "velocity"]])?;
-    }
-    if let Some(dynamics) = dynamics {
-        check_attributes(dynamics, &[&["damping", "friction", "armature"]])?;
-    }
     let of = |node: Option<Node>, attribute: &str| -> Result<Option<f64>, RobotFileError> {
         Ok(node.map_or(Ok(None), |node| optional::<1>(node, attribute, "a number"))?.map(|[value]| value))
     };
     let stated = (of(limit, "lower")?, of(limit, "upper")?);
-    let range = match stated {
-        _ if joint.attribute("type") == Some("continuous") => [f64::NEG_INFINITY, f64::INFINITY],
-        (None, None) => [f64::NEG_INFINITY, f64::INFINITY],
-        // The URDF specification: a bound that is missing is 0.
-        (lower, upper) => [lower.unwrap_or(0.0), upper.unwrap_or(0.0)],
-    };
+    // A bound that is missing is 0, and equal bounds are none, as in MuJoCo.
+    let (lower, upper) = (stated.0.unwrap_or(0.0), stated.1.unwrap_or(0.0));
+    let is_limited = joint.attribute("type") != Some("continuous") && lower != upper;
+    let range = if is_limited { [lower, upper] } else { [f64::NEG_INFINITY, f64::INFINITY] };
     Ok(TreeJoint {
         name: text(joint, "name")?.to_owned(),
         kind,
@@ -244,7 +249,6 @@ fn moving(joint: Node, kind: TreeJointKind, parent: usize, pose: DAffine3) -> Re
 /// Returns the pose that `<origin>` of an element gives.
 fn origin(node: Node) -> Result<DAffine3, RobotFileError> {
     let Some(origin) = child(node, "origin") else { return Ok(DAffine3::IDENTITY) };
-    check_attributes(origin, &[&["xyz", "rpy"]])?;
     let translation = vector(optional(origin, "xyz", THREE)?.unwrap_or_default());
     Ok(DAffine3 { matrix3: from_rpy(optional(origin, "rpy", THREE)?.unwrap_or_default()), translation })
 }
@@ -265,11 +269,11 @@ fn shape_kind(collision: Node, meshes: &MeshFolder) -> Result<Option<TreeShapeKi
     let Some(shape) = geometry.children().find(Node::is_element) else { return Ok(None) };
     let size = |attribute: &str| {
         let value = number(shape, attribute)?;
-        if value > 0.0 { Ok(value) } else { Err(attribute_error(shape, attribute, "a size above 0")) }
+        if value > MIN_SIZE { Ok(value) } else { Err(attribute_error(shape, attribute, "a size above 0")) }
     };
     Ok(Some(match shape.tag_name().name() {
         "box" => {
-            let sizes = optional(shape, "size", THREE)?.filter(|sizes| sizes.iter().all(|size| *size > 0.0));
+            let sizes = optional(shape, "size", THREE)?.filter(|sizes| sizes.iter().all(|size| *size > MIN_SIZE));
             let sizes = sizes.ok_or_else(|| attribute_error(shape, "size", "three sizes above 0"))?;
             TreeShapeKind::Box(0.5 * vector(sizes))
         }

@@ -100,7 +100,7 @@ impl<'a> Reader<'a, '_> {
         let joint = Element::new(node, "joint", class, self.classes)?;
         for name in ["armature", "damping", "frictionloss", "stiffness"] {
             if joint.number(name, 0.0)? != 0.0 {
-                return Err(unsupported(node, format!("`{name}` of a free joint is not supported")));
+                return Err(unsupported(node, format!("`{name}` of a free joint is not supported: use <freejoint/>")));
             }
         }
         Ok(())

@@ -7,7 +7,7 @@ use twinstep_model::{RigidBody, TreeShapeKind};
 use super::compiler::Settings;
 use super::element::Element;
 use crate::RobotFileError;
-use crate::inertia::{self, DENSITY};
+use crate::inertia::{self, DENSITY, MIN_LENGTH};
 use crate::orientation::ORIENTATIONS;
 use crate::xml::unsupported;
 
@@ -73,7 +73,8 @@ pub fn read(element: &Element, settings: &Settings) -> Result<Option<Geom>, Robo
         "ellipsoid" => (TreeShapeKind::Ellipsoid(DVec3::new(size[0], size[1], half_length(2))), 2),
         _ => return Err(element.error("type", "plane, sphere, capsule, cylinder, box, ellipsoid or mesh")),
     };
-    if size[..sizes].iter().any(|size| *size <= 0.0) || inertia::volume(kind).is_some_and(|volume| volume <= 0.0) {
+    let is_small = |length: f64| length < MIN_LENGTH;
+    if size[..sizes].iter().any(|size| is_small(*size)) || sizes > 0 && is_small(kind.shortest_length()) {
         return Err(element.error("size", "as many sizes above 0 as the type has"));
     }
     let pose = match span {

@@ -16,7 +16,7 @@ mod worldbody;
 
 use std::path::Path;
 
-pub use compiler::Settings;
+pub use compiler::{MassSource, Settings};
 use roxmltree::Node;
 
 use crate::xml::{is_same, unsupported};
