@@ -9,7 +9,7 @@ const MAY_USE: [(&str, &[&str]); 29] = [
     // Core.
     ("crates/files", &[]),
     ("crates/simd", &[]),
-    ("crates/model", &["simd"]),
+    ("crates/model", &[]),
     ("crates/dynamics", &["simd", "model"]),
     ("crates/robot-files", &["model"]),
     ("crates/effects", &["model", "robot-files"]),
@@ -17,10 +17,10 @@ const MAY_USE: [(&str, &[&str]); 29] = [
     ("crates/logs", &["files", "model", "effects", "unitree"]),
     ("protocol", &["model"]),
     // Leaf crates.
-    ("crates/sim", &["simd", "model"]),
+    ("crates/sim", &["simd", "model", "dynamics"]),
     ("crates/envs", &["model", "effects"]),
-    ("crates/identify", &["model", "effects", "logs"]),
-    ("crates/diagnose", &["model", "effects", "logs", "identify"]),
+    ("crates/identify", &["model", "dynamics", "effects", "logs"]),
+    ("crates/diagnose", &["model", "dynamics", "effects", "logs", "identify"]),
     ("crates/policy", &["files", "simd", "model"]),
     ("crates/learning", &["model", "policy"]),
     ("crates/agent", &["model", "logs", "policy"]),
@@ -31,7 +31,7 @@ const MAY_USE: [(&str, &[&str]); 29] = [
     // Applications.
     ("env-server", &["model", "effects", "protocol", "session", "sim", "envs", "ensemble", "policy"]),
     ("clients/rust", &["model", "protocol", "session", "policy"]),
-    ("crates/report", &["files", "model", "effects", "logs", "sim", "identify", "diagnose"]),
+    ("crates/report", &["files", "model", "dynamics", "effects", "logs", "sim", "identify", "diagnose"]),
     ("crates/hunt", &["files", "model", "effects", "logs", "sim", "identify", "diagnose"]),
     ("crates/excite", &["model", "effects", "logs", "identify", "policy", "envs", "sim"]),
     (

@@ -4,12 +4,12 @@ use std::f32::consts::PI;
 
 use glam::{DMat3, DVec3, Vec3};
 use proptest::prelude::*;
+use twinstep_dynamics::Vec3 as LaneVec3;
+use twinstep_dynamics::quadruped::{Acceleration, KinematicTree, QuadrupedState, forward_dynamics};
 use twinstep_envs::Randomisation;
 use twinstep_model::{
     Backend, BaseMount, Command, InitialState, Joint, NUM_JOINTS, PerJoint, Restorable, RobotModel, RobotStates,
-    Simulator,
-    dynamics::{Acceleration, KinematicTree, State, Vec3 as LaneVec3, forward_dynamics},
-    frames, go2, stream,
+    Simulator, frames, go2, stream,
 };
 use twinstep_sim::{Engine, SimConfig, Terrain};
 
@@ -260,12 +260,12 @@ fn acceleration_agrees_with_the_equations_of_motion() {
     let mut backend = backend(SimConfig { physics_hz: Some(4000), ..SimConfig::default() }, initial_state);
     backend.step(&[command], &[true], 1).unwrap();
 
-    let mut state = State::<f64> {
+    let mut state = QuadrupedState::<f64> {
         linear_velocity: LaneVec3(initial_state.base_linear_velocity.map(f64::from)),
         angular_velocity: LaneVec3(initial_state.base_angular_velocity.map(f64::from)),
         q: initial_state.q.map(f64::from),
         dq: initial_state.dq.map(f64::from),
-        ..State::origin()
+        ..QuadrupedState::origin(NUM_JOINTS)
     };
     for _ in 0..500 {
         let Acceleration { angular, linear, ddq } =

@@ -8,10 +8,10 @@ use std::f64::consts::TAU;
 
 use nalgebra::{Matrix2, Vector2};
 use rayon::prelude::*;
+use twinstep_dynamics::quadruped::{KinematicTree, mass_matrix};
 use twinstep_effects::{Effect, ModelFile, Scope};
 use twinstep_identify::experiment::ResidualChannel;
 use twinstep_logs::Log;
-use twinstep_model::dynamics::{KinematicTree, mass_matrix};
 use twinstep_model::{JOINT_NAMES, Joint, NUM_JOINTS, RobotModel, Rollout};
 
 use super::hypothesis::{Hypothesis, OF_ONE_EFFECT, ScoredHypothesis, selection_penalty};

@@ -9,7 +9,7 @@
 //! - [`ModelFile`]: a nominal robot and a list of entries, in TOML; [`NominalRobot`]: built in, or from a robot file.
 //! - [`RobotSampler`]: domain randomisation within the intervals of a model file.
 //!
-//! An effect only changes parameters. [`twinstep_model::dynamics::SimdActuators`] and the engines implement the laws.
+//! An effect only changes parameters. `SimdActuators` of `twinstep-dynamics` and the engines implement the laws.
 
 mod catalogue;
 mod data_requirement;

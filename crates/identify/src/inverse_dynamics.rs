@@ -5,11 +5,10 @@
 
 use std::ops::Range;
 
+use twinstep_dynamics::quadruped::{Acceleration, KinematicTree, QuadrupedState, inverse_dynamics};
+use twinstep_dynamics::{SimdActuators, SimdCommands, Vec3};
 use twinstep_logs::{Log, TorqueSensor};
-use twinstep_model::{
-    BaseMount, NUM_JOINTS, RobotModel,
-    dynamics::{Acceleration, KinematicTree, SimdActuators, SimdCommands, State, Vec3, inverse_dynamics},
-};
+use twinstep_model::{BaseMount, NUM_JOINTS, RobotModel};
 
 use twinstep_logs::operating_conditions::OperatingConditions;
 use twinstep_logs::replay::{
@@ -100,8 +99,8 @@ impl ActuatorReplay<'_> {
     fn run(&self, rows: Range<usize>, is_fixed: bool, residual: &mut InverseDynamicsResidual) {
         let (robot, t) = (self.robot, &self.log.t()[rows.clone()]);
         let (conditions, tree) = (OperatingConditions::of(self.log), KinematicTree::splat(robot));
-        let mut actuator = SimdActuators::<f64>::new(robot, robot.control.actuator_dt());
-        actuator.set(0, robot, &self.sampled(rows.start).0.map(|q| q as f32), &[0.0; NUM_JOINTS]);
+        let mut actuator = SimdActuators::new(&robot.joints, robot.control.actuator_dt(), robot.control.actuator_dt());
+        actuator.set(0, &robot.joints, &self.sampled(rows.start).0.map(|q| q as f32), &[0.0; NUM_JOINTS]);
         // Torque at the sensor in each actuator period since the start of the range [N·m].
         let mut history: Vec<[f64; NUM_JOINTS]> = Vec::new();
         for row in rows.start..rows.end - 1 {
@@ -114,7 +113,8 @@ impl ActuatorReplay<'_> {
             let mut applied = [0.0; NUM_JOINTS];
             for _ in 0..periods {
                 actuator.update_command(&commands, &q, &dq);
-                let forces = actuator.step(0, &middle.0.q, &middle.0.dq);
+                actuator.step(0, &middle.0.q, &middle.0.dq);
+                let forces = actuator.forces();
                 let mut estimated = [0.0; NUM_JOINTS];
                 for joint in 0..NUM_JOINTS {
                     let speed = middle.0.dq[joint];
@@ -160,8 +160,8 @@ impl ActuatorReplay<'_> {
     }
 
     /// Returns the measured motion at the midpoint of `row` and the next. Joints without measurement are at rest.
-    fn middle(&self, row: usize) -> (State<f64>, Acceleration<f64>) {
-        let mut state = State::<f64>::origin();
+    fn middle(&self, row: usize) -> (QuadrupedState<f64>, Acceleration<f64>) {
+        let mut state = QuadrupedState::<f64>::origin(NUM_JOINTS);
         let mut ddq = [0.0; NUM_JOINTS];
         state.q = self.robot.control.default_pose;
         for joint in self.joints.iter().map(|joint| joint.joint.index()) {

@@ -1,10 +1,10 @@
 //! Torque of a model's actuators on measured states. Nothing is simulated, so errors do not accumulate.
 
+use twinstep_dynamics::{SimdActuators, SimdCommands};
 use twinstep_logs::{Log, TorqueSensor};
 use twinstep_model::{
     Actuator, ActuatorMode, ActuatorParams, ActuatorTap, Command, JointSpring, NUM_JOINTS, PerJoint, RobotModel,
     RobotStates, Stribeck,
-    dynamics::{SimdActuators, SimdCommands},
 };
 
 use twinstep_logs::operating_conditions::OperatingConditions;
@@ -156,7 +156,7 @@ impl MeasuredTorque {
         robot.control.actuator_hz = self.actuator_hz;
         let robot = &robot;
         let dt = robot.control.actuator_dt() / self.substeps as f64;
-        let mut actuator = SimdActuators::<f64>::new(robot, dt);
+        let mut actuator = SimdActuators::new(&robot.joints, robot.control.actuator_dt(), dt);
         // The actuator adds its encoder offset, which the measured positions already contain.
         let offsets = robot.joints.map(|joint| joint.actuator.encoder_offset);
         let delay = robot.joints.map(|joint| joint.actuator.sensor_delay / dt);
@@ -169,8 +169,8 @@ impl MeasuredTorque {
                 [std::array::from_fn(|joint| row.q[joint] - offsets[joint] + time * mean(joint)), dq]
             };
             if row.after_reset {
-                actuator = SimdActuators::new(robot, dt);
-                actuator.set(0, robot, &at(0.0)[0].map(|q| q as f32), &[0.0; NUM_JOINTS]);
+                actuator = SimdActuators::new(&robot.joints, robot.control.actuator_dt(), dt);
+                actuator.set(0, &robot.joints, &at(0.0)[0].map(|q| q as f32), &[0.0; NUM_JOINTS]);
                 torques.clear();
                 if let Some(external) = &mut external {
                     external.reset(0, 0);
@@ -187,7 +187,7 @@ impl MeasuredTorque {
                         (external.mode(), external_torque(external, row.command, readings, dq.map(|dq| dq as f32)))
                     });
                     match replaced {
-                        Some((ActuatorMode::Replace(_), tau)) => actuator.set_torque(tau),
+                        Some((ActuatorMode::Replace(_), tau)) => actuator.set_torque(&tau),
                         added => {
                             actuator.update_command(&commands, &q, &dq);
                             if let Some((ActuatorMode::AddAt(tap), tau)) = added {
@@ -197,7 +197,8 @@ impl MeasuredTorque {
                     }
                 }
                 let middle = at((step as f64 + 0.5) * dt)[0];
-                let forces = actuator.step(step % self.substeps, &middle, &dq);
+                actuator.step(step % self.substeps, &middle, &dq);
+                let forces = actuator.forces();
                 torques.push(std::array::from_fn(|joint| match self.sensor {
                     TorqueSensor::JointOutput => {
                         let dry = forces.dry_friction[joint] * smooth_sign(dq[joint]);

@@ -9,8 +9,8 @@
 //! - [`Scene`]: shapes and poses for rendering; [`body_poses`]: forward kinematics;
 //!   [`FootKinematics`]: position and velocity of the feet.
 //! - [`Ground`]: a plane, or a [`HeightField`] for uneven terrain.
-//! - [`RobotTree`]: a robot of any shape; [`mjcf()`]: the robot as a MuJoCo model.
-//! - [`dynamics`]: kinematics, dynamics and actuator laws, with one robot per SIMD lane.
+//! - [`RobotTree`]: a robot of any shape; [`TreeModel`]: with its actuators and contact points, as the engines simulate it.
+//! - [`mjcf()`]: the robot as a MuJoCo model.
 //! - [`Rollout`]: simulates command sequences with many candidate robots at once.
 //! - [`stream`]: reproducible random streams, one per consumer, from one seed.
 //!
@@ -23,7 +23,6 @@ mod base_mount;
 mod body;
 mod command;
 mod command_bounds;
-pub mod dynamics;
 mod foot_kinematics;
 pub mod frames;
 mod go2;
@@ -44,6 +43,7 @@ mod spec;
 mod stream;
 mod trajectory;
 mod tree;
+mod tree_model;
 mod vec_env;
 
 pub use agent_commands::{AgentCommands, GaitCommand, VelocityCommand};
@@ -75,4 +75,5 @@ pub use spec::{EnvSpec, SpecDifference, SpecField};
 pub use stream::{Stream, standard_normal, stream};
 pub use trajectory::Trajectory;
 pub use tree::{RobotTree, TreeBody, TreeJoint, TreeJointKind, TreeShape, TreeShapeKind};
+pub use tree_model::{ContactPoint, TreeModel};
 pub use vec_env::{AutoresetMode, EndedEpisode, EnvError, ResetRequest, StepBatch, VecEnv};

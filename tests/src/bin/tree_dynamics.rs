@@ -8,9 +8,9 @@ use std::path::PathBuf;
 
 use clap::Parser;
 use serde::{Deserialize, Serialize};
-use twinstep_dynamics::{FactoredTree, TreeLoad, TreeMotion, TreeParameters, TreeState, TreeStructure, mass_matrix};
+use twinstep_dynamics::tree::{FactoredTree, TreeMotion, TreeParameters, TreeState, TreeStructure, mass_matrix};
+use twinstep_dynamics::{JointForces, Vec3};
 use twinstep_model::RobotTree;
-use twinstep_model::dynamics::Vec3;
 use twinstep_robot_files::read_robot;
 use twinstep_simd::{F32x4, SimdFloat};
 
@@ -75,12 +75,12 @@ fn equations<T: SimdFloat>(tree: &RobotTree, request: &Request) -> Equations {
         dq: splat(&request.dq),
         ..TreeState::origin(structure.num_joints())
     };
-    let mut motion = TreeMotion::empty(&structure, &parameters);
-    motion.set(&structure, &parameters, &state);
+    let mut motion = TreeMotion::empty(&parameters);
+    motion.set(&parameters, &state);
     let damping: Vec<f64> = tree.joints.iter().map(|joint| joint.damping).collect();
-    let load = TreeLoad { gravity: T::splat(GRAVITY), tau: splat(&request.tau), damping: splat(&damping) };
-    let mut factored = FactoredTree::empty(&structure, &parameters);
-    factored.set_up(&structure, &parameters, &motion, &state, &load, T::splat(request.dt));
+    let forces = JointForces { damping: splat(&damping), ..JointForces::frictionless(splat(&request.tau)) };
+    let mut factored = FactoredTree::empty(&parameters);
+    factored.set_up(&parameters, &motion, &state, &forces, T::splat(request.dt), T::splat(GRAVITY));
     let mut joints = vec![T::splat(0.0); structure.num_joints()];
     let base = factored.solution(&structure, &mut joints);
     let get = |values: &[T]| values.iter().map(|value| value.get(0)).collect::<Vec<f64>>();

@@ -10,10 +10,9 @@ mod tests;
 use std::ops::Range;
 
 use glam::{DMat3, DQuat, DVec3};
+use twinstep_dynamics::quadruped::{Acceleration, KinematicTree, LegFrames, QuadrupedState, Wrench, inverse_dynamics};
+use twinstep_dynamics::{SimdActuators, Vec3};
 use twinstep_logs::{Log, TorqueSensor};
-use twinstep_model::dynamics::{
-    Acceleration, KinematicTree, LegFrames, SimdActuators, State, Vec3, Wrench, inverse_dynamics,
-};
 use twinstep_model::{ActuatorParams, BaseMount, JOINT_NAMES, NUM_JOINTS, RobotModel};
 
 use crate::base_estimate::BaseEstimate;
@@ -40,7 +39,7 @@ pub struct MeasuredStance {
 #[derive(Clone, Debug)]
 struct StanceSample {
     row: usize,
-    state: State<f64>,
+    state: QuadrupedState<f64>,
     acceleration: Acceleration<f64>,
     /// Torques at the motors [N·m].
     torque: [f64; NUM_JOINTS],
@@ -90,8 +89,8 @@ impl MeasuredStance {
             joint.actuator = ActuatorParams { gain, ripple, encoder_offset, ..ActuatorParams::IDEAL };
         }
         let tree = KinematicTree::splat(&robot);
-        let mut actuators = SimdActuators::<f64>::new(&robot, robot.control.actuator_dt());
-        actuators.set(0, &robot, &robot.control.default_pose.map(|q| q as f32), &[0.0; NUM_JOINTS]);
+        let mut actuators = SimdActuators::new(&robot.joints, robot.control.actuator_dt(), robot.control.actuator_dt());
+        actuators.set(0, &robot.joints, &robot.control.default_pose.map(|q| q as f32), &[0.0; NUM_JOINTS]);
         self.samples.iter().map(|sample| sample.error(&robot, &tree, &mut actuators, torque_errors)).collect()
     }
 }
@@ -101,7 +100,7 @@ impl StanceSample {
         &self,
         robot: &RobotModel,
         tree: &KinematicTree<f64>,
-        actuators: &mut SimdActuators<f64>,
+        actuators: &mut SimdActuators<f64, [f64; NUM_JOINTS]>,
         torque_errors: &[f64; NUM_JOINTS],
     ) -> [f64; 6] {
         let mut state = self.state;
@@ -109,8 +108,9 @@ impl StanceSample {
             *q -= joint.actuator.encoder_offset;
         }
         state.angular_velocity = state.angular_velocity - Vec3::splat(robot.gyro_bias);
-        actuators.set_torque(std::array::from_fn(|joint| self.torque[joint] + torque_errors[joint]));
-        let forces = actuators.step(0, &state.q, &state.dq);
+        actuators.set_torque(&std::array::from_fn(|joint| self.torque[joint] + torque_errors[joint]));
+        actuators.step(0, &state.q, &state.dq);
+        let forces = actuators.forces();
         let (Wrench { mut force, mut moment }, needed) = inverse_dynamics(tree, &state, &self.acceleration, GRAVITY);
         let down = state.world_axes()[2].scaled(-robot.shapes.foot_radius);
         for leg in 0..4 {
@@ -180,12 +180,12 @@ impl<'a> StanceChannels<'a> {
             (mean_around(cells, row + half, half) - mean_around(cells, row - half, half)) / time
         };
         let rotation = mean_rotation(log, row - half..row + half + 1)?;
-        let state = State {
+        let state = QuadrupedState {
             orientation: [rotation.w, rotation.x, rotation.y, rotation.z],
             angular_velocity: Vec3(self.gyro.map(mean)),
             q: self.q.map(mean),
             dq: self.dq.map(mean),
-            ..State::origin()
+            ..QuadrupedState::origin(NUM_JOINTS)
         };
         let acceleration = Acceleration {
             angular: Vec3(self.gyro.map(slope)),

@@ -14,7 +14,7 @@ const POSE: [f64; 3] = [0.1, 0.8, -1.5];
 ///
 /// Force and moment of the ground are divided over the feet by the least squares of their norm.
 fn standing(robot: &RobotModel, pose: [f64; 3], sensor: TorqueSensor, base: BaseMount) -> Log {
-    let mut state = State::origin();
+    let mut state = QuadrupedState::origin(12);
     state.q = std::array::from_fn(|joint| if joint % 6 == 3 { -pose[0] } else { pose[joint % 3] });
     let rest = Acceleration { angular: Vec3::zero(), linear: Vec3::zero(), ddq: [0.0; NUM_JOINTS] };
     let tree = KinematicTree::splat(robot);

@@ -1,12 +1,10 @@
 //! Quantities of a simulated motion in the plot of an effect.
 
+use twinstep_dynamics::Vec3;
+use twinstep_dynamics::quadruped::{Acceleration, KinematicTree, QuadrupedState, inverse_dynamics};
 use twinstep_effects::PlotQuantity;
 use twinstep_identify::experiment::estimated_torque;
-use twinstep_model::{
-    Command, NUM_JOINTS, PerJoint, RobotModel, RobotStates,
-    dynamics::{Acceleration, KinematicTree, State, Vec3, inverse_dynamics},
-    go2,
-};
+use twinstep_model::{Command, NUM_JOINTS, PerJoint, RobotModel, RobotStates, go2};
 
 /// Gravitational acceleration [m/s²].
 const GRAVITY: f64 = 9.81;
@@ -80,7 +78,7 @@ impl SimulatedRun {
         let dt = self.robot.control.actuator_dt();
         let mean =
             |of: &[[f32; NUM_JOINTS]], joint: usize| f64::from(f32::midpoint(of[period][joint], of[period + 1][joint]));
-        let mut state = State::<f64>::origin();
+        let mut state = QuadrupedState::<f64>::origin(NUM_JOINTS);
         state.q = std::array::from_fn(|joint| mean(&self.states.measured.q, joint));
         state.dq = std::array::from_fn(|joint| mean(&self.states.measured.dq, joint));
         let speed = &self.states.measured.dq;

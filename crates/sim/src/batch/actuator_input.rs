@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use twinstep_model::dynamics::SimdCommands;
+use twinstep_dynamics::SimdCommands;
 use twinstep_model::{ActuatorMode, ActuatorTap, Command, PerJoint};
 use twinstep_simd::SimdFloat;
 
@@ -38,18 +38,18 @@ impl<'a> ActuatorInputs<'a> {
     }
 }
 
-/// Input of the actuators of one batch.
+/// Input of the actuators of one batch. `J` has a number for each joint.
 #[allow(clippy::large_enum_variant, reason = "created once per step and never moved")]
-pub enum ActuatorInput<T> {
+pub enum ActuatorInput<J> {
     /// Commands to the actuators of the robot model.
-    Commands(SimdCommands<T>),
+    Commands(SimdCommands<J>),
     /// Joint torques of an external actuator [N·m].
-    Torques([T; 12]),
+    Torques(J),
     /// Commands, and joint torques of an external actuator that are added at a tap [N·m].
-    Residual(SimdCommands<T>, ActuatorTap, [T; 12]),
+    Residual(SimdCommands<J>, ActuatorTap, J),
 }
 
-impl<T: SimdFloat> ActuatorInput<T> {
+impl<T: SimdFloat> ActuatorInput<[T; 12]> {
     /// Creates the input of at most `T::LANES` robots.
     pub fn of(inputs: ActuatorInputs) -> Self {
         match inputs {

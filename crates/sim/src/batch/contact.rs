@@ -5,135 +5,155 @@
 //! and d the impedance. b and k follow from the time constant at critical damping. Joint friction is a hard constraint:
 //! it stops the joint unless its maximum torque is reached.
 
-use twinstep_model::dynamics::{FactoredDynamics, State, Vec3};
+use twinstep_dynamics::{JointValues, State, StepEquations, Vec3};
 use twinstep_simd::SimdFloat;
 
-use super::ground::{SimdTerrain, TangentPlane};
-use super::rows::{ConstraintRow, JointRow, PointRow, SoftConstraint};
-
-/// Number of contact points of a leg: the foot, the distal end of the calf, the knee.
-pub const LEG_POINTS: usize = 3;
-/// Number of contact points of a robot: those of the legs, then the corners of the trunk.
-pub const POINTS: usize = 4 * LEG_POINTS + 8;
+use super::ground::{LocalTerrain, SimdTerrain, TangentPlane};
+use super::rows::{ConstraintRow, PointRow, SoftConstraint, complete_friction, write_joint_row};
 
 /// Parameters of contacts and joint limits.
 #[derive(Clone, Debug)]
 pub struct ContactParams<T> {
-    /// Centres of the contact spheres of each calf, in the calf frame [m].
-    pub leg_points: [[Vec3<T>; LEG_POINTS]; 4],
-    /// Radii of the contact spheres [m].
-    pub radii: [T; LEG_POINTS],
-    /// Corners of the trunk in the base frame [m].
-    pub corners: [Vec3<T>; 8],
+    /// Contact points.
+    pub points: Vec<SimdPoint<T>>,
+    /// Contact points by body.
+    pub bodies: Vec<PointsOfBody<T>>,
     /// The ground.
     pub ground: SimdTerrain<T>,
     /// Friction coefficient of the ground.
     pub friction: T,
     /// Time constant of a contact [s]; at least two steps.
     pub time_constant: T,
-    /// Lower and upper joint limits [rad].
-    pub limits: [[T; 2]; 12],
+    /// Lower and upper joint limits [rad or m].
+    pub limits: Vec<[T; 2]>,
     /// Time constant of a joint limit [s]; at least two steps.
     pub limit_time_constant: T,
-    /// 1 with a floating base, 0 with a fixed base.
+    /// 1 with a free base, 0 with a fixed base.
     pub is_floating: T,
 }
 
-/// Impulses of the last step, the initial guess of the next one.
+/// Sphere that touches the ground.
 #[derive(Clone, Copy, Debug)]
+pub struct SimdPoint<T> {
+    /// Centre in the frame of its body [m].
+    pub centre: Vec3<T>,
+    /// Radius [m].
+    pub radius: T,
+}
+
+/// Contact points of a body, and a sphere that contains them.
+#[derive(Clone, Debug)]
+pub struct PointsOfBody<T> {
+    /// Index of the body.
+    pub body: usize,
+    /// Indices of the points.
+    pub points: std::ops::Range<usize>,
+    /// Centre of the sphere in the frame of the body [m].
+    pub centre: Vec3<T>,
+    /// Radius of the sphere [m].
+    pub radius: T,
+}
+
+/// Number of points of a body from which on it is worth while to test first whether all are far from the ground.
+const MANY_POINTS: usize = 5;
+
+/// Impulses of the last step, the initial guess of the next one.
+#[derive(Clone, Debug)]
 pub struct Impulses<T> {
     /// Impulse along the normal and the two tangents of each contact point [N·s].
-    pub points: [[T; 3]; POINTS],
-    /// Impulse of the lower and upper limit of each joint [N·m·s].
-    pub limits: [[T; 2]; 12],
-    /// Impulse of the friction of each joint [N·m·s].
-    pub frictions: [T; 12],
+    pub points: Vec<[T; 3]>,
+    /// Impulse of the lower and upper limit of each joint [N·m·s or N·s].
+    pub limits: Vec<[T; 2]>,
+    /// Impulse of the friction of each joint [N·m·s or N·s].
+    pub frictions: Vec<T>,
 }
 
 impl<T: SimdFloat> Impulses<T> {
     /// Creates impulses of zero.
-    pub fn zero() -> Self {
+    pub fn zero(points: usize, joints: usize) -> Self {
         let zero = T::splat(0.0);
-        Self { points: [[zero; 3]; POINTS], limits: [[zero; 2]; 12], frictions: [zero; 12] }
+        Self { points: vec![[zero; 3]; points], limits: vec![[zero; 2]; joints], frictions: vec![zero; joints] }
+    }
+
+    /// Returns all impulses, always in the same order.
+    pub fn all_mut(&mut self) -> impl Iterator<Item = &mut T> {
+        let Self { points, limits, frictions } = self;
+        points.iter_mut().flatten().chain(limits.iter_mut().flatten()).chain(frictions)
     }
 }
 
-/// Constraint rows of an active contact point: normal and two tangents.
-#[derive(Clone, Copy)]
-struct PointBlock<T> {
-    rows: [ConstraintRow<T>; 3],
+/// Constraint rows of a contact point: normal and two tangents.
+struct PointBlock<T, B> {
+    rows: [ConstraintRow<T, B>; 3],
     /// Velocity change along each tangent per unit of normal impulse.
     couplings: [T; 2],
-    /// Index of the leg; 4 is the trunk.
-    leg: usize,
-    point: usize,
+    body: usize,
 }
 
-/// Constraint row of a joint, and the index of its impulse.
-#[derive(Clone, Copy)]
-struct JointBlock<T> {
-    row: ConstraintRow<T>,
-    leg: usize,
-    index: usize,
+/// Constraint row of a joint, and the body on which it acts.
+struct JointBlock<T, B> {
+    row: ConstraintRow<T, B>,
+    body: usize,
 }
 
-/// A vector of fixed capacity, of which the first `active` blocks are valid. Blocks are large, so written in place.
-struct Active<B, const N: usize> {
-    blocks: Box<[B; N]>,
-    active: usize,
+/// Rows of every constraint, and the indices of those that are active in a step. Rows are large, so written in place.
+pub struct Constraints<T, B> {
+    points: Vec<PointBlock<T, B>>,
+    /// Two for each joint: at the lower and at the upper limit.
+    limits: Vec<JointBlock<T, B>>,
+    frictions: Vec<JointBlock<T, B>>,
+    active_points: Vec<usize>,
+    active_limits: Vec<usize>,
+    active_frictions: Vec<usize>,
 }
 
-impl<B: Copy, const N: usize> Active<B, N> {
-    fn empty(block: B) -> Self {
-        Self { blocks: Box::new([block; N]), active: 0 }
-    }
-
-    #[inline(always)]
-    fn next(&mut self) -> &mut B {
-        self.active += 1;
-        &mut self.blocks[self.active - 1]
-    }
-
-    #[inline(always)]
-    fn all(&self) -> &[B] {
-        &self.blocks[..self.active]
-    }
-}
-
-/// Active constraints of one step.
-pub struct Constraints<T> {
-    points: Active<PointBlock<T>, POINTS>,
-    limits: Active<JointBlock<T>, 24>,
-    frictions: Active<JointBlock<T>, 12>,
-}
-
-impl<T: SimdFloat> Constraints<T> {
-    /// Creates constraints of which none is active. They are large, so the steps share them.
-    pub fn empty() -> Self {
-        let joint = JointBlock { row: ConstraintRow::empty(), leg: 0, index: 0 };
-        let point = PointBlock { rows: [ConstraintRow::empty(); 3], couplings: [T::splat(0.0); 2], leg: 0, point: 0 };
-        Self { points: Active::empty(point), limits: Active::empty(joint), frictions: Active::empty(joint) }
+impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
+    /// Creates constraints of which none is active, for points of `bodies`. They are large, so the steps share them.
+    pub fn empty<E: StepEquations<T, Branch = B>>(equations: &E, bodies: &[usize], num_joints: usize) -> Self {
+        let row = |body: usize| ConstraintRow::without_effect(equations.zero_branch(body));
+        let point = |body: &usize| PointBlock {
+            rows: [row(*body), row(*body), row(*body)],
+            couplings: [T::splat(0.0); 2],
+            body: *body,
+        };
+        let joint = |joint: usize| {
+            let body = equations.row_of_joint(joint).0;
+            JointBlock { row: row(body), body }
+        };
+        Self {
+            points: bodies.iter().map(point).collect(),
+            limits: (0..2 * num_joints).map(|index| joint(index / 2)).collect(),
+            frictions: (0..num_joints).map(joint).collect(),
+            active_points: Vec::with_capacity(bodies.len()),
+            active_limits: Vec::with_capacity(2 * num_joints),
+            active_frictions: Vec::with_capacity(num_joints),
+        }
     }
 
     /// Detects the active constraints and computes their rows. Sets the impulses of inactive constraints to zero.
     ///
-    /// `dry_friction` is the maximum torque of each joint's dry friction [N·m].
+    /// `dry_friction` is the maximum torque of each joint's dry friction [N·m or N].
     #[inline(always)]
-    pub fn detect(
+    pub fn detect<E: StepEquations<T, Branch = B>>(
         &mut self,
-        factored: &FactoredDynamics<T>,
-        state: &State<T>,
+        equations: &E,
+        state: &State<T, E::Joints>,
         surface: &ContactParams<T>,
-        dry_friction: &[T; 12],
+        dry_friction: &E::Joints,
         impulses: &mut Impulses<T>,
         dt: T,
     ) {
-        (self.points.active, self.limits.active, self.frictions.active) = (0, 0, 0);
-        self.detect_contacts(factored, state, surface, impulses, dt);
-        for joint in 0..12 {
-            self.find_limits(factored, state, surface, impulses, joint, dt);
+        self.active_points.clear();
+        self.active_limits.clear();
+        self.active_frictions.clear();
+        self.detect_contacts(equations, state, surface, impulses, dt);
+        for joint in 0..dry_friction.as_ref().len() {
+            self.find_limits(equations, state, surface, impulses, joint, dt);
             if T::splat(0.0).any_lt(dry_friction[joint]) {
-                self.find_friction(factored, state, surface, joint);
+                let row = &mut self.frictions[joint].row;
+                write_joint_row(equations, row, joint, T::splat(1.0), surface.is_floating);
+                complete_friction(row, state.dq[joint]);
+                self.active_frictions.push(joint);
             } else {
                 impulses.frictions[joint] = T::splat(0.0);
             }
@@ -141,57 +161,73 @@ impl<T: SimdFloat> Constraints<T> {
     }
 
     #[inline(always)]
-    fn detect_contacts(
+    fn detect_contacts<E: StepEquations<T, Branch = B>>(
         &mut self,
-        factored: &FactoredDynamics<T>,
-        state: &State<T>,
+        equations: &E,
+        state: &State<T, E::Joints>,
         surface: &ContactParams<T>,
         impulses: &mut Impulses<T>,
         dt: T,
     ) {
         let zero = T::splat(0.0);
         let local_ground = surface.ground.local_ground(state);
-        // Skips the corners of the trunk, which are rarely near the ground.
-        let lowest_corner = local_ground.lowest_corner(surface.corners[7]);
-        let points = if lowest_corner.any_lt(zero) { POINTS } else { 4 * LEG_POINTS };
-        for corner in &mut impulses.points[points..] {
-            *corner = [zero; 3];
-        }
-        for point in 0..points {
-            let (leg, centre, radius) = if point < 4 * LEG_POINTS {
-                let (leg, which) = (point / LEG_POINTS, point % LEG_POINTS);
-                (leg, factored.legs[leg].frames.calf_point(surface.leg_points[leg][which]), surface.radii[which])
-            } else {
-                (4, surface.corners[point - 4 * LEG_POINTS], zero)
-            };
-            let TangentPlane { height, directions } = local_ground.plane_below(centre);
-            let distance = height - radius;
-            if !distance.any_lt(zero) {
-                impulses.points[point] = [zero; 3];
-                continue;
+        for PointsOfBody { body, points, centre, radius } in &surface.bodies {
+            if points.len() >= MANY_POINTS {
+                let lowest = local_ground.lowest_within(equations.point(*body, *centre), *radius);
+                if !lowest.any_lt(zero) {
+                    impulses.points[points.clone()].fill([zero; 3]);
+                    continue;
+                }
             }
-            for impulse in &mut impulses.points[point] {
-                *impulse = distance.select_lt(zero, *impulse, zero);
-            }
-            let softness = SoftConstraint { time_constant: surface.time_constant, distance, dt };
-            let place = centre - directions[0].scaled(radius);
-            let row =
-                PointRow { factored, state, velocity: local_ground.velocity, leg, place, moving: surface.is_floating };
-            let block = self.points.next();
-            (block.leg, block.point) = (leg, point);
-            block.rows[0] = row.normal(directions[0], &softness);
-            for along in 1..3 {
-                block.rows[along] = row.tangent(directions[along], &softness, &block.rows[0]);
-                block.couplings[along - 1] = block.rows[along].response(&block.rows[0]);
+            for point in points.clone() {
+                self.detect_contact(equations, state, surface, &local_ground, &mut impulses.points[point], point, dt);
             }
         }
     }
 
     #[inline(always)]
-    fn find_limits(
+    #[allow(clippy::too_many_arguments, reason = "the parts of one loop's body")]
+    fn detect_contact<E: StepEquations<T, Branch = B>>(
         &mut self,
-        factored: &FactoredDynamics<T>,
-        state: &State<T>,
+        equations: &E,
+        state: &State<T, E::Joints>,
+        surface: &ContactParams<T>,
+        ground: &LocalTerrain<'_, T>,
+        impulses: &mut [T; 3],
+        point: usize,
+        dt: T,
+    ) {
+        let (zero, SimdPoint { centre, radius }) = (T::splat(0.0), surface.points[point]);
+        let PointBlock { rows: [normal, tangents @ ..], couplings, body } = &mut self.points[point];
+        let centre = equations.point(*body, centre);
+        let TangentPlane { height, directions } = ground.plane_below(centre);
+        let distance = height - radius;
+        if !distance.any_lt(zero) {
+            *impulses = [zero; 3];
+            return;
+        }
+        for impulse in impulses {
+            *impulse = distance.select_lt(zero, *impulse, zero);
+        }
+        let softness = SoftConstraint { time_constant: surface.time_constant, distance, dt };
+        let place = centre - directions[0].scaled(radius);
+        let row =
+            PointRow { equations, state, velocity: ground.velocity, body: *body, place, moving: surface.is_floating };
+        let velocity = row.write(normal, directions[0]);
+        softness.complete_unilateral(normal, velocity);
+        for (along, tangent) in tangents.iter_mut().enumerate() {
+            let velocity = row.write(tangent, directions[along + 1]);
+            softness.complete_tangent(tangent, velocity, normal);
+            couplings[along] = tangent.response(normal);
+        }
+        self.active_points.push(point);
+    }
+
+    #[inline(always)]
+    fn find_limits<E: StepEquations<T, Branch = B>>(
+        &mut self,
+        equations: &E,
+        state: &State<T, E::Joints>,
         surface: &ContactParams<T>,
         impulses: &mut Impulses<T>,
         joint: usize,
@@ -207,64 +243,56 @@ impl<T: SimdFloat> Constraints<T> {
             }
             *impulse = distance.select_lt(zero, *impulse, zero);
             let softness = SoftConstraint { time_constant: surface.limit_time_constant, distance, dt };
-            let row = JointRow { factored, joint, sign, moving: surface.is_floating };
-            let row = row.limit(state.dq[joint] * sign, &softness);
-            *self.limits.next() = JointBlock { row, leg: joint / 3, index: 2 * joint + side };
+            let row = &mut self.limits[2 * joint + side].row;
+            write_joint_row(equations, row, joint, sign, surface.is_floating);
+            softness.complete_unilateral(row, state.dq[joint] * sign);
+            self.active_limits.push(2 * joint + side);
         }
-    }
-
-    #[inline(always)]
-    fn find_friction(
-        &mut self,
-        factored: &FactoredDynamics<T>,
-        state: &State<T>,
-        surface: &ContactParams<T>,
-        joint: usize,
-    ) {
-        let row = JointRow { factored, joint, sign: T::splat(1.0), moving: surface.is_floating };
-        *self.frictions.next() = JointBlock { row: row.friction(state.dq[joint]), leg: joint / 3, index: joint };
     }
 
     /// Solves the constraints by sweeps of projected Gauss–Seidel.
     ///
     /// Friction at the ground is projected onto its disc, friction of a joint onto its torque range.
     #[inline(always)]
-    pub fn solve(
+    pub fn solve<E: StepEquations<T, Branch = B>>(
         &self,
-        factored: &mut FactoredDynamics<T>,
+        equations: &mut E,
         impulses: &mut Impulses<T>,
         surface: &ContactParams<T>,
-        dry: &[T; 12],
+        dry: &E::Joints,
         dt: T,
         iterations: usize,
     ) {
-        for block in self.points.all() {
-            for (row, impulse) in block.rows.iter().zip(impulses.points[block.point]) {
-                row.apply_impulse(factored, block.leg, impulse);
+        for index in &self.active_points {
+            let block = &self.points[*index];
+            for (row, impulse) in block.rows.iter().zip(impulses.points[*index]) {
+                row.apply_impulse(equations, block.body, impulse);
             }
         }
-        for block in self.limits.all() {
-            block.row.apply_impulse(factored, block.leg, impulses.limits[block.index / 2][block.index % 2]);
+        for index in &self.active_limits {
+            let JointBlock { row, body } = &self.limits[*index];
+            row.apply_impulse(equations, *body, impulses.limits[index / 2][index % 2]);
         }
-        for block in self.frictions.all() {
-            block.row.apply_impulse(factored, block.leg, impulses.frictions[block.index]);
+        for joint in &self.active_frictions {
+            let JointBlock { row, body } = &self.frictions[*joint];
+            row.apply_impulse(equations, *body, impulses.frictions[*joint]);
         }
         for _ in 0..iterations {
-            for block in self.points.all() {
-                solve_point(factored, block, &mut impulses.points[block.point], surface.friction);
+            for index in &self.active_points {
+                solve_point(equations, &self.points[*index], &mut impulses.points[*index], surface.friction);
             }
-            for block in self.limits.all() {
-                let (row, impulse) = (&block.row, &mut impulses.limits[block.index / 2][block.index % 2]);
-                let new = (*impulse - row.impulse_error(factored, block.leg, *impulse)).max(T::splat(0.0));
-                row.apply_impulse(factored, block.leg, new - *impulse);
+            for index in &self.active_limits {
+                let (block, impulse) = (&self.limits[*index], &mut impulses.limits[index / 2][index % 2]);
+                let JointBlock { row, body } = block;
+                let new = (*impulse - row.impulse_error(equations, *body, *impulse)).max(T::splat(0.0));
+                row.apply_impulse(equations, *body, new - *impulse);
                 *impulse = new;
             }
-            for block in self.frictions.all() {
-                let (row, impulse) = (&block.row, &mut impulses.frictions[block.index]);
-                let max_impulse = dry[block.index] * dt;
-                let new =
-                    (*impulse - row.impulse_error(factored, block.leg, *impulse)).max(-max_impulse).min(max_impulse);
-                row.apply_impulse(factored, block.leg, new - *impulse);
+            for joint in &self.active_frictions {
+                let (JointBlock { row, body }, impulse) = (&self.frictions[*joint], &mut impulses.frictions[*joint]);
+                let max_impulse = dry[*joint] * dt;
+                let new = (*impulse - row.impulse_error(equations, *body, *impulse)).max(-max_impulse).min(max_impulse);
+                row.apply_impulse(equations, *body, new - *impulse);
                 *impulse = new;
             }
         }
@@ -276,18 +304,18 @@ impl<T: SimdFloat> Constraints<T> {
 /// `couplings` gives the effect of the normal impulse on the tangents. The velocities are therefore read and updated
 /// once per point, whose latency limits the sweep.
 #[inline(always)]
-fn solve_point<T: SimdFloat>(
-    factored: &mut FactoredDynamics<T>,
-    block: &PointBlock<T>,
+fn solve_point<T: SimdFloat, E: StepEquations<T>>(
+    equations: &mut E,
+    block: &PointBlock<T, E::Branch>,
     impulse: &mut [T; 3],
     friction: T,
 ) {
     let [normal, first, second] = &block.rows;
-    let (zero, leg) = (T::splat(0.0), block.leg);
+    let (zero, body) = (T::splat(0.0), block.body);
     let errors = [
-        normal.velocity_error(factored, leg, impulse[0]),
-        first.velocity_error(factored, leg, impulse[1]),
-        second.velocity_error(factored, leg, impulse[2]),
+        normal.velocity_error(equations, body, impulse[0]),
+        first.velocity_error(equations, body, impulse[1]),
+        second.velocity_error(equations, body, impulse[2]),
     ];
     let normal_impulse = (impulse[0] - errors[0] * normal.inverse).max(zero);
     let normal_change = normal_impulse - impulse[0];
@@ -302,13 +330,11 @@ fn solve_point<T: SimdFloat>(
         along = [along[0] * scale, along[1] * scale];
     }
     let changes = [normal_change, along[0] - impulse[1], along[1] - impulse[2]];
-    for i in 0..6 {
-        factored.u[i] += (normal.y[i] * changes[0] + first.y[i] * changes[1]) + second.y[i] * changes[2];
-    }
-    if leg < 4 {
-        for i in 0..3 {
-            factored.g[leg][i] += (normal.z[i] * changes[0] + first.z[i] * changes[1]) + second.z[i] * changes[2];
-        }
-    }
+    equations.add_impulses(
+        body,
+        [&normal.base, &first.base, &second.base],
+        [&normal.branch, &first.branch, &second.branch],
+        changes,
+    );
     *impulse = [normal_impulse, along[0], along[1]];
 }

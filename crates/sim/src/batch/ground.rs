@@ -3,10 +3,8 @@
 use std::sync::Arc;
 
 use glam::DVec3;
-use twinstep_model::{
-    Ground, HeightField,
-    dynamics::{State, Vec3},
-};
+use twinstep_dynamics::{State, Vec3};
+use twinstep_model::{Ground, HeightField};
 use twinstep_simd::SimdFloat;
 
 /// Ground under robots in SIMD lanes.
@@ -32,7 +30,7 @@ impl<T: SimdFloat> SimdTerrain<T> {
 
     /// Returns the ground relative to the bases in this state.
     #[inline(always)]
-    pub fn local_ground(&self, state: &State<T>) -> LocalTerrain<'_, T> {
+    pub fn local_ground<J>(&self, state: &State<T, J>) -> LocalTerrain<'_, T> {
         let axes = state.world_axes();
         let (plane, height) = match self {
             Self::Plane(plane) => (*plane, plane[0].dot(state.position)),
@@ -71,13 +69,10 @@ pub struct TangentPlane<T> {
 }
 
 impl<T: SimdFloat> LocalTerrain<'_, T> {
-    /// Returns a lower bound on the heights of the corners of a box around the base origin [m].
-    ///
-    /// `half` contains the half sizes of the box [m].
+    /// Returns a lower bound on the height of every point within `radius` [m] of `centre`, a point of the base frame [m].
     #[inline(always)]
-    pub fn lowest_corner(&self, half: Vec3<T>) -> T {
-        let normal = self.directions[0].0;
-        self.height - (normal[0] * half.0[0]).abs() - (normal[1] * half.0[1]).abs() - (normal[2] * half.0[2]).abs()
+    pub fn lowest_within(&self, centre: Vec3<T>, radius: T) -> T {
+        self.height + self.directions[0].dot(centre) - radius
     }
 
     /// Returns the tangent plane below a point of the base frame.

@@ -1,8 +1,10 @@
-//! The batch engine: one Go2 per SIMD lane.
+//! The batch engine: one robot per SIMD lane.
 //!
-//! All robots have the kinematic tree of the Go2, whose mass matrix has arrow structure ([`twinstep_model::dynamics`]),
-//! and differ only in parameter values. One SIMD register therefore holds eight or sixteen robots.
+//! The robots of a batch have the same kinematic tree and differ only in parameter values. One SIMD register therefore holds eight or
+//! sixteen robots. The engine is written for any [`StepEquations`](twinstep_dynamics::StepEquations): those of any tree, or those of a
+//! quadruped, which are faster.
 //!
+//! - [`batch_robot`]: what the engine needs of a robot.
 //! - [`actuator_input`]: commands and torques of a step.
 //! - [`contact`], [`rows`] and [`ground`]: contacts, joint limits and joint friction as MuJoCo's soft constraints.
 //! - [`group`]: a [`robot_batch::RobotBatch`] is the state of the robots in one register.
@@ -16,6 +18,7 @@
 #![allow(clippy::needless_range_loop, reason = "matrix indices as in the textbook")]
 
 mod actuator_input;
+mod batch_robot;
 mod contact;
 mod ground;
 mod robot_batch;

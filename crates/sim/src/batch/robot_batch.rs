@@ -1,34 +1,54 @@
 //! State of the robots in one SIMD register, and one physics step of them.
 
-use glam::dvec3;
-use twinstep_model::{
-    BaseMount, Ground, HistoryStep, InitialState, PerJoint, RobotModel,
-    dynamics::{FactoredDynamics, JointLoad, KinematicTree, SimdActuators, SimdCommands, State, Vec3},
-};
+use glam::DVec3;
+use twinstep_dynamics::{JointValues, SimdActuators, SimdCommands, State, StepEquations, Vec3, link_armature};
+use twinstep_model::{BaseMount, Ground, HistoryStep, InitialState};
 use twinstep_simd::SimdFloat;
 
 use super::actuator_input::ActuatorInput;
-use super::contact::{Constraints, ContactParams, Impulses, LEG_POINTS, POINTS};
+use super::batch_robot::{BatchRobot, SurfacePoint};
+use super::contact::{Constraints, ContactParams, Impulses, PointsOfBody, SimdPoint};
 use super::ground::SimdTerrain;
 use crate::SimConfig;
 
 /// Gravity [m/s²].
 const GRAVITY: f64 = 9.81;
 
-/// State of the robots in one SIMD register, one per lane.
-#[derive(Clone)]
-pub struct RobotBatch<T> {
-    tree: KinematicTree<T>,
-    actuator: SimdActuators<T>,
+/// State of the robots in one SIMD register, one per lane, with the equations of motion `E`.
+pub struct RobotBatch<T: SimdFloat, E: StepEquations<T>> {
+    parameters: E::Parameters,
+    actuator: SimdActuators<T, E::Joints>,
     surface: ContactParams<T>,
-    state: State<T>,
-    /// Estimated torque, mean over the last actuator period [N·m].
-    tau: [T; 12],
+    state: State<T, E::Joints>,
+    /// Joint positions at the time of a sample [rad or m]: see [`RobotBatch::sampled_position`].
+    sampled_q: E::Joints,
+    /// Velocity changes of the joints in a step.
+    changes: E::Joints,
+    /// Estimated torque, mean over the last actuator period [N·m or N].
+    tau: E::Joints,
     /// Gyroscope bias [rad/s].
     gyro_bias: Vec3<T>,
     impulses: Impulses<T>,
     dt: T,
     iterations: usize,
+}
+
+impl<T: SimdFloat, E: StepEquations<T>> Clone for RobotBatch<T, E> {
+    fn clone(&self) -> Self {
+        Self {
+            parameters: self.parameters.clone(),
+            actuator: self.actuator.clone(),
+            surface: self.surface.clone(),
+            state: self.state.clone(),
+            sampled_q: self.sampled_q.clone(),
+            changes: self.changes.clone(),
+            tau: self.tau.clone(),
+            gyro_bias: self.gyro_bias,
+            impulses: self.impulses.clone(),
+            dt: self.dt,
+            iterations: self.iterations,
+        }
+    }
 }
 
 /// Number of steps to advance by.
@@ -41,46 +61,96 @@ pub struct StepCount {
 }
 
 /// Memory for the equations of one step. It is large, so batches and steps share it.
-pub struct Workspace<T> {
-    factored: FactoredDynamics<T>,
-    constraints: Constraints<T>,
+pub struct Workspace<T: SimdFloat, E: StepEquations<T>> {
+    equations: E,
+    constraints: Constraints<T, E::Branch>,
 }
 
-impl<T: SimdFloat> Workspace<T> {
+/// What the workspaces of a batch have in common.
+pub struct WorkspaceShape<T: SimdFloat, E: StepEquations<T>> {
+    parameters: E::Parameters,
+    /// Body of each contact point.
+    bodies: Vec<usize>,
+    num_joints: usize,
+}
+
+impl<T: SimdFloat, E: StepEquations<T>> WorkspaceShape<T, E> {
     /// Creates a workspace without equations.
-    pub fn empty() -> Self {
-        Self { factored: FactoredDynamics::empty(), constraints: Constraints::empty() }
+    pub fn workspace(&self) -> Workspace<T, E> {
+        let equations = E::empty(&self.parameters);
+        let constraints = Constraints::empty(&equations, &self.bodies, self.num_joints);
+        Workspace { equations, constraints }
     }
 }
 
 /// Sensor readings of all robots.
-pub struct SensorReadings<T> {
+pub struct SensorReadings<T, J> {
     /// Position of the base [m].
     pub position: Vec3<T>,
     /// Orientation of the base, world-from-base.
     pub orientation: [T; 4],
-    /// Encoder positions [rad].
-    pub q: [T; 12],
-    /// Encoder velocities [rad/s].
-    pub dq: [T; 12],
+    /// Encoder positions [rad or m].
+    pub q: J,
+    /// Encoder velocities [rad/s or m/s].
+    pub dq: J,
+}
+
+/// State to which a robot is reset.
+#[derive(Clone, Copy, Debug)]
+pub struct Placement<'a> {
+    /// Position of the base frame's origin in the world frame [m].
+    pub base_position: [f32; 3],
+    /// Rotation world-from-base, `[w, x, y, z]`.
+    pub base_orientation: [f32; 4],
+    /// Velocity of the base frame's origin, in the world frame [m/s].
+    pub base_linear_velocity: [f32; 3],
+    /// Angular velocity of the base, in the base frame [rad/s].
+    pub base_angular_velocity: [f32; 3],
+    /// Encoder readings of the joint positions [rad or m].
+    pub q: &'a [f32],
+    /// Joint velocities [rad/s or m/s].
+    pub dq: &'a [f32],
+}
+
+impl<'a> From<&'a InitialState> for Placement<'a> {
+    fn from(state: &'a InitialState) -> Self {
+        Self {
+            base_position: state.base_position,
+            base_orientation: state.base_orientation,
+            base_linear_velocity: state.base_linear_velocity,
+            base_angular_velocity: state.base_angular_velocity,
+            q: &state.q,
+            dq: &state.dq,
+        }
+    }
 }
 
 /// State of one robot of a batch: its lane of every number.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LaneSnapshot(Vec<f64>);
 
-impl<T: SimdFloat> RobotBatch<T> {
-    /// Creates robots in the state `initial_state`.
-    pub fn new(robot: &RobotModel, config: &SimConfig, ground: &Ground, initial_state: &InitialState) -> Self {
-        let dt = 1.0 / f64::from(config.physics_hz());
+impl<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>> RobotBatch<T, E> {
+    /// Creates robots whose actuators have the period `actuator_dt` [s] in a state.
+    pub fn new(
+        robot: &E::Robot,
+        actuator_dt: f64,
+        config: &SimConfig,
+        ground: &Ground,
+        initial_state: &Placement<'_>,
+    ) -> Self {
+        let (dt, num_joints) = (1.0 / f64::from(config.physics_hz()), robot.joints().len());
+        let surface = surface::<T, E>(robot, config, ground, dt);
+        let zero = E::Joints::filled(num_joints, T::splat(0.0));
         let mut group = Self {
-            tree: KinematicTree::splat(robot),
-            actuator: SimdActuators::new(robot, dt),
-            surface: surface(robot, config, ground, dt),
-            state: State::origin(),
-            tau: [T::splat(0.0); 12],
-            gyro_bias: Vec3::splat(robot.gyro_bias),
-            impulses: Impulses::zero(),
+            parameters: E::parameters(robot),
+            actuator: SimdActuators::new(robot.joints(), actuator_dt, dt),
+            state: State::origin(num_joints),
+            sampled_q: zero.clone(),
+            changes: zero.clone(),
+            tau: zero,
+            gyro_bias: Vec3::splat(robot.gyro_bias()),
+            impulses: Impulses::zero(surface.points.len(), num_joints),
+            surface,
             dt: T::splat(dt),
             iterations: config.solver_iterations() as usize,
         };
@@ -90,24 +160,37 @@ impl<T: SimdFloat> RobotBatch<T> {
         group
     }
 
-    /// Resets one robot to an initial state.
-    pub fn place(&mut self, lane: usize, robot: &RobotModel, initial_state: &InitialState) {
-        self.tree.set(lane, robot);
-        // An initial state contains encoder readings.
-        let q: PerJoint = std::array::from_fn(|joint| {
-            let dq = f64::from(initial_state.dq[joint]);
-            initial_state.q[joint] - robot.joints[joint].actuator.encoder_error(dq) as f32
-        });
-        let rotors = self.actuator.set(lane, robot, &q, &initial_state.dq);
-        for (armature, rotor) in self.tree.armature.iter_mut().zip(rotors) {
-            armature.set(lane, rotor);
+    /// Returns what the workspaces of batches like this one have in common.
+    pub fn workspace_shape(&self) -> WorkspaceShape<T, E> {
+        let bodies = self.surface.bodies.iter().flat_map(|of_body| of_body.points.clone().map(|_| of_body.body));
+        WorkspaceShape {
+            parameters: self.parameters.clone(),
+            bodies: bodies.collect(),
+            num_joints: self.tau.as_ref().len(),
         }
-        self.gyro_bias.set(lane, robot.gyro_bias);
-        self.surface.friction.set(lane, robot.contact.friction);
-        // At least two steps, below which the constraint is unstable (MuJoCo's `refsafe`).
-        self.surface.time_constant.set(lane, robot.contact.time_constant.max(2.0 * self.dt.get(lane)));
+    }
 
-        // `sampled_q` reads positions half a step back, so they are set half a step ahead.
+    /// Resets one robot to an initial state.
+    pub fn place(&mut self, lane: usize, robot: &E::Robot, initial_state: &Placement<'_>) {
+        E::set_robot(&mut self.parameters, lane, robot);
+        // An initial state contains encoder readings.
+        let joints = robot.joints().iter().enumerate();
+        let q: Vec<f32> = joints
+            .map(|(index, joint)| {
+                let dq = f64::from(initial_state.dq[index]);
+                initial_state.q[index] - joint.actuator.encoder_error(dq) as f32
+            })
+            .collect();
+        self.actuator.set(lane, robot.joints(), &q, initial_state.dq);
+        for (armature, joint) in E::armature(&mut self.parameters).as_mut().iter_mut().zip(robot.joints()) {
+            armature.set(lane, link_armature(joint));
+        }
+        self.gyro_bias.set(lane, robot.gyro_bias());
+        self.surface.friction.set(lane, robot.contact().friction);
+        // At least two steps, below which the constraint is unstable (MuJoCo's `refsafe`).
+        self.surface.time_constant.set(lane, robot.contact().time_constant.max(2.0 * self.dt.get(lane)));
+
+        // `sample_positions` reads positions half a step back, so they are set half a step ahead.
         let half = 0.5 * self.dt.get(lane);
         let moving = self.surface.is_floating.get(lane);
         let [linear, angular] = [initial_state.base_linear_velocity, initial_state.base_angular_velocity]
@@ -115,20 +198,16 @@ impl<T: SimdFloat> RobotBatch<T> {
         let position = Vec3(initial_state.base_position.map(f64::from)) + linear.scaled(half);
         let state = &mut self.state;
         set(&mut state.position.0, lane, position.0);
-        set(
-            &mut state.orientation,
-            lane,
-            integrate_orientation(initial_state.base_orientation.map(f64::from), angular.scaled(half)),
-        );
+        let turned = integrate_orientation(initial_state.base_orientation.map(f64::from), angular.scaled(half));
+        set(&mut state.orientation, lane, turned);
         set(&mut state.linear_velocity.0, lane, linear.0);
         set(&mut state.angular_velocity.0, lane, angular.0);
-        let dq = initial_state.dq.map(f64::from);
-        set(&mut state.q, lane, std::array::from_fn(|joint| f64::from(q[joint]) + half * dq[joint]));
-        set(&mut state.dq, lane, dq);
-        set(&mut self.tau, lane, [0.0; 12]);
-        let Impulses { points, limits, frictions } = &mut self.impulses;
-        let impulses = points.iter_mut().flatten().chain(limits.iter_mut().flatten()).chain(frictions);
-        impulses.for_each(|impulse| impulse.set(lane, 0.0));
+        for (joint, (q, dq)) in q.iter().zip(initial_state.dq).enumerate() {
+            state.q[joint].set(lane, f64::from(*q) + half * f64::from(*dq));
+            state.dq[joint].set(lane, f64::from(*dq));
+            self.tau[joint].set(lane, 0.0);
+        }
+        self.impulses.all_mut().for_each(|impulse| impulse.set(lane, 0.0));
     }
 
     /// Replays the actuator periods before the initial state into the state of the actuators.
@@ -138,17 +217,20 @@ impl<T: SimdFloat> RobotBatch<T> {
         if !self.actuator.has_memory() {
             return;
         }
-        let zero = T::splat(0.0);
-        let q = self.sampled_q();
-        let still = std::array::from_fn(|joint| self.actuator.encoder_reading(joint, q[joint], zero).0);
+        self.sample_positions();
+        let (zero, mut still) = (E::Joints::filled(self.tau.as_ref().len(), T::splat(0.0)), self.sampled_q.clone());
+        for (joint, still) in still.as_mut().iter_mut().enumerate() {
+            *still = self.actuator.encoder_reading(joint, *still, T::splat(0.0)).0;
+        }
         for age in (0..past.iter().map(|past| past.len()).max().unwrap_or(0)).rev() {
-            let (mut q, mut dq) = (still, [zero; 12]);
-            let mut commands = SimdCommands { q, dq, tau_ff: [zero; 12], kp: [zero; 12], kd: [zero; 12] };
+            let (mut q, mut dq) = (still.clone(), zero.clone());
+            let mut commands = SimdCommands::zero(zero.as_ref().len());
+            commands.q = q.clone();
             for (lane, past) in past.iter().enumerate() {
                 let Some(past) = past.len().checked_sub(age + 1).map(|index| &past[index]) else { continue };
                 commands.set(lane, &past.command);
-                set(&mut q, lane, past.q.map(f64::from));
-                set(&mut dq, lane, past.dq.map(f64::from));
+                set(q.as_mut(), lane, past.q.map(f64::from));
+                set(dq.as_mut(), lane, past.dq.map(f64::from));
             }
             self.actuator.replay_history(&commands, &q, &dq, steps);
         }
@@ -162,7 +244,7 @@ impl<T: SimdFloat> RobotBatch<T> {
     }
 
     /// Sets the factors on the torque of one robot for supply voltage and motor temperature, until its next reset.
-    pub fn set_derating(&mut self, lane: usize, factors: &PerJoint) {
+    pub fn set_derating(&mut self, lane: usize, factors: &[f32]) {
         self.actuator.set_derating(lane, factors);
     }
 
@@ -170,27 +252,30 @@ impl<T: SimdFloat> RobotBatch<T> {
     #[inline(always)]
     pub fn advance(
         &mut self,
-        input: &ActuatorInput<T>,
+        input: &ActuatorInput<E::Joints>,
         StepCount { actuator_periods, steps }: StepCount,
-        scratch: &mut Workspace<T>,
-    ) -> SensorReadings<T> {
+        scratch: &mut Workspace<T, E>,
+    ) -> SensorReadings<T, E::Joints> {
         let share = T::splat(1.0 / steps as f64);
         for _ in 0..actuator_periods {
             match input {
                 ActuatorInput::Commands(commands) => {
-                    self.actuator.update_command(commands, &self.sampled_q(), &self.state.dq);
+                    self.sample_positions();
+                    self.actuator.update_command(commands, &self.sampled_q, &self.state.dq);
                 }
-                ActuatorInput::Torques(tau) => self.actuator.set_torque(*tau),
+                ActuatorInput::Torques(tau) => self.actuator.set_torque(tau),
                 ActuatorInput::Residual(commands, tap, tau) => {
-                    self.actuator.update_command(commands, &self.sampled_q(), &self.state.dq);
-                    self.actuator.set_residual(*tap, *tau);
+                    self.sample_positions();
+                    self.actuator.update_command(commands, &self.sampled_q, &self.state.dq);
+                    self.actuator.set_residual(*tap, tau.clone());
                 }
             }
-            self.tau = [T::splat(0.0); 12];
+            self.tau.as_mut().fill(T::splat(0.0));
             for index in 0..steps {
                 self.step(index, scratch);
-                for joint in 0..12 {
-                    self.tau[joint] += self.actuator.estimated_torque()[joint] * share;
+                let estimated = self.actuator.estimated_torque().as_ref();
+                for (tau, estimated) in self.tau.as_mut().iter_mut().zip(estimated) {
+                    *tau += *estimated * share;
                 }
             }
         }
@@ -199,26 +284,26 @@ impl<T: SimdFloat> RobotBatch<T> {
 
     /// Advances by physics step `index` of the actuator period.
     #[inline(always)]
-    fn step(&mut self, index: usize, Workspace { factored, constraints }: &mut Workspace<T>) {
-        let Self { tree, actuator, state, surface, impulses, dt, .. } = self;
-        let forces = actuator.step(index, &state.q, &state.dq);
-        let load = JointLoad { tau: forces.tau, damping: forces.damping };
-        factored.set_up(tree, state, &load, *dt, T::splat(GRAVITY), surface.is_floating);
-        constraints.detect(factored, state, surface, &forces.dry_friction, impulses, *dt);
-        constraints.solve(factored, impulses, surface, &forces.dry_friction, *dt, self.iterations);
-        let (trunk, joints) = factored.solution();
-        self.integrate(trunk, joints);
+    fn step(&mut self, index: usize, Workspace { equations, constraints }: &mut Workspace<T, E>) {
+        let Self { parameters, actuator, state, surface, impulses, dt, .. } = self;
+        actuator.step(index, &state.q, &state.dq);
+        let forces = actuator.forces();
+        equations.set_up(parameters, state, forces, *dt, T::splat(GRAVITY), surface.is_floating);
+        constraints.detect(equations, state, surface, &forces.dry_friction, impulses, *dt);
+        constraints.solve(equations, impulses, surface, &forces.dry_friction, *dt, self.iterations);
+        let base = equations.solution(&mut self.changes);
+        self.integrate(base);
     }
 
     /// Integrates by semi-implicit Euler: velocities first, then positions with the new velocities.
     #[inline(always)]
-    fn integrate(&mut self, trunk: [T; 6], joints: [T; 12]) {
+    fn integrate(&mut self, [ax, ay, az, lx, ly, lz]: [T; 6]) {
         let (dt, moving, state) = (self.dt, self.surface.is_floating, &mut self.state);
-        for joint in 0..12 {
-            state.dq[joint] += joints[joint];
-            state.q[joint] += dt * state.dq[joint];
+        for joint in 0..self.changes.as_ref().len() {
+            state.dq[joint] += self.changes[joint];
+            let speed = state.dq[joint];
+            state.q[joint] += dt * speed;
         }
-        let [ax, ay, az, lx, ly, lz] = trunk;
         let axes = state.world_axes();
         let (turn, change) = (Vec3([ax, ay, az]).scaled(moving), Vec3([lx, ly, lz]).scaled(moving));
         state.angular_velocity = state.angular_velocity + turn;
@@ -229,38 +314,45 @@ impl<T: SimdFloat> RobotBatch<T> {
     }
 
     /// Returns the positions and velocities.
-    pub fn state(&self) -> &State<T> {
+    pub fn state(&self) -> &State<T, E::Joints> {
         &self.state
     }
 
     /// Returns the sensor readings.
     #[inline(always)]
-    pub fn sample(&self) -> SensorReadings<T> {
+    pub fn sample(&self) -> SensorReadings<T, E::Joints> {
         let State { position, orientation, linear_velocity, angular_velocity, dq, .. } = &self.state;
-        // The base is read half a step back, as the joints in `sampled_q`.
+        // The base is read half a step back, as the joints.
         let back = T::splat(-0.5) * self.dt;
         let mut sample = SensorReadings {
             position: *position + linear_velocity.scaled(back),
             orientation: integrate_orientation(*orientation, angular_velocity.scaled(back)),
-            q: self.sampled_q(),
-            dq: *dq,
+            q: dq.clone(),
+            dq: dq.clone(),
         };
-        for joint in 0..12 {
+        for joint in 0..dq.as_ref().len() {
             (sample.q[joint], sample.dq[joint]) =
-                self.actuator.encoder_reading(joint, sample.q[joint], sample.dq[joint]);
+                self.actuator.encoder_reading(joint, self.sampled_position(joint), dq[joint]);
         }
         sample
     }
 
-    /// Returns the joint positions at the time of a sample [rad].
+    /// Computes the joint positions at the time of a sample.
+    #[inline(always)]
+    fn sample_positions(&mut self) {
+        for joint in 0..self.sampled_q.as_ref().len() {
+            self.sampled_q[joint] = self.sampled_position(joint);
+        }
+    }
+
+    /// Returns the position of a joint at the time of a sample [rad or m].
     ///
     /// Semi-implicit Euler uses the velocity at the end of a step. For a constant acceleration `a` from rest its
     /// position is `a t (t + dt) / 2`, which is too large by `dq dt / 2`. Positions read half a step back are
     /// second-order accurate, and the steps remain stable for stiff contacts and springs.
     #[inline(always)]
-    fn sampled_q(&self) -> [T; 12] {
-        let back = T::splat(-0.5) * self.dt;
-        std::array::from_fn(|joint| self.state.q[joint] + back * self.state.dq[joint])
+    fn sampled_position(&self, joint: usize) -> T {
+        self.state.q[joint] + T::splat(-0.5) * self.dt * self.state.dq[joint]
     }
 
     /// Returns the gyroscope reading of a robot about an axis [rad/s].
@@ -268,21 +360,19 @@ impl<T: SimdFloat> RobotBatch<T> {
         self.state.angular_velocity.0[axis].get(lane) + self.gyro_bias.0[axis].get(lane)
     }
 
-    /// Returns the estimated torque, mean over the last actuator period [N·m].
-    pub fn tau(&self) -> &[T; 12] {
+    /// Returns the estimated torque, mean over the last actuator period [N·m or N].
+    pub fn tau(&self) -> &E::Joints {
         &self.tau
     }
 
-    /// Returns the normal force on a foot in the last step [N].
-    pub fn foot_force(&self, lane: usize, leg: usize) -> f64 {
-        self.impulses.points[leg * LEG_POINTS][0].get(lane) / self.dt.get(lane)
+    /// Returns the normal force on a contact point in the last step [N].
+    pub fn point_force(&self, lane: usize, point: usize) -> f64 {
+        self.impulses.points[point][0].get(lane) / self.dt.get(lane)
     }
 
-    /// Returns true if the trunk or a knee touches the ground.
-    pub fn body_contact(&self, lane: usize) -> bool {
-        (0..POINTS)
-            .filter(|point| *point >= 4 * LEG_POINTS || *point % LEG_POINTS == LEG_POINTS - 1)
-            .any(|point| self.impulses.points[point][0].get(lane) > 0.0)
+    /// Returns the number of contact points.
+    pub fn num_points(&self) -> usize {
+        self.surface.points.len()
     }
 
     /// Returns the state of one robot. Takes `&mut self` because `visit` also serves [`RobotBatch::restore`].
@@ -301,49 +391,62 @@ impl<T: SimdFloat> RobotBatch<T> {
 
     /// Visits every number that differs between robots, always in the same order.
     fn visit(&mut self, mut visit: impl FnMut(&mut T)) {
-        let Self { tree, actuator, surface, state, tau, gyro_bias, impulses, .. } = self;
-        let KinematicTree { trunk, bodies, hip, thigh, calf, armature } = tree;
-        for body in std::iter::once(trunk).chain(bodies.iter_mut().flatten()) {
-            visit(&mut body.mass);
-            body.moment.0.iter_mut().chain(&mut body.about_origin).for_each(&mut visit);
-        }
-        let origins = hip.iter_mut().chain(thigh).chain(calf);
-        origins.flat_map(|origin| &mut origin.0).for_each(&mut visit);
-        armature.iter_mut().chain(&mut gyro_bias.0).for_each(&mut visit);
+        let Self { parameters, actuator, surface, state, tau, gyro_bias, impulses, .. } = self;
+        E::visit(parameters, &mut visit);
+        gyro_bias.0.iter_mut().for_each(&mut visit);
         actuator.visit(&mut visit);
         visit(&mut surface.friction);
         visit(&mut surface.time_constant);
         let State { position, orientation, linear_velocity, angular_velocity, q, dq } = state;
         position.0.iter_mut().chain(orientation).chain(&mut linear_velocity.0).for_each(&mut visit);
-        angular_velocity.0.iter_mut().chain(q).chain(dq).chain(tau).for_each(&mut visit);
-        let Impulses { points, limits, frictions } = impulses;
-        points.iter_mut().flatten().chain(limits.iter_mut().flatten()).chain(frictions).for_each(&mut visit);
+        let joints = q.as_mut().iter_mut().chain(dq.as_mut()).chain(tau.as_mut());
+        angular_velocity.0.iter_mut().chain(joints).for_each(&mut visit);
+        impulses.all_mut().for_each(visit);
     }
 }
 
-fn set<T: SimdFloat, const N: usize>(values: &mut [T; N], lane: usize, given: [f64; N]) {
+fn set<T: SimdFloat, const N: usize>(values: &mut [T], lane: usize, given: [f64; N]) {
     for (value, given) in values.iter_mut().zip(given) {
         value.set(lane, given);
     }
 }
 
-fn surface<T: SimdFloat>(robot: &RobotModel, config: &SimConfig, ground: &Ground, dt: f64) -> ContactParams<T> {
-    let shapes = &robot.shapes;
-    let points = [shapes.foot_centre, shapes.calf_ends[1], shapes.calf_ends[0]].map(Vec3::splat);
-    let half = shapes.trunk_half_size;
-    let corner = |index: usize| {
-        let sign = |bit: usize| if index >> bit & 1 == 0 { -1.0 } else { 1.0 };
-        Vec3::splat(half * dvec3(sign(0), sign(1), sign(2)))
-    };
+fn surface<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>>(
+    robot: &E::Robot,
+    config: &SimConfig,
+    ground: &Ground,
+    dt: f64,
+) -> ContactParams<T> {
+    let given = robot.surface_points();
+    let centres: Vec<DVec3> =
+        given.iter().map(|SurfacePoint { body, centre, .. }| E::point_of_body(robot, *body, *centre)).collect();
+    let points = given.iter().zip(&centres).map(|(SurfacePoint { radius, .. }, centre)| SimdPoint {
+        centre: Vec3::splat(*centre),
+        radius: T::splat(*radius),
+    });
+    let mut bodies = Vec::new();
+    let mut start = 0;
+    for of_body in given.chunk_by(|a, b| a.body == b.body) {
+        let range = start..start + of_body.len();
+        let centre = centres[range.clone()].iter().sum::<DVec3>() / of_body.len() as f64;
+        let reach = of_body.iter().zip(&centres[range.clone()]);
+        let radius = reach.map(|(point, at)| at.distance(centre) + point.radius).fold(0.0, f64::max);
+        start = range.end;
+        bodies.push(PointsOfBody {
+            body: of_body[0].body,
+            points: range,
+            centre: Vec3::splat(centre),
+            radius: T::splat(radius),
+        });
+    }
     let zero = T::splat(0.0);
     ContactParams {
-        leg_points: [points; 4],
-        radii: [shapes.foot_radius, shapes.calf_radius, shapes.calf_radius].map(T::splat),
-        corners: std::array::from_fn(corner),
+        points: points.collect(),
+        bodies,
         ground: SimdTerrain::new(ground),
         friction: zero,
         time_constant: zero,
-        limits: robot.joints.map(|joint| joint.range.map(T::splat)),
+        limits: robot.joints().iter().map(|joint| joint.range.map(T::splat)).collect(),
         limit_time_constant: T::splat(2.0 * dt),
         is_floating: T::splat(if config.base == BaseMount::Floating { 1.0 } else { 0.0 }),
     }

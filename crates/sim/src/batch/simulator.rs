@@ -2,14 +2,16 @@
 
 use rayon::ThreadPool;
 use rayon::prelude::*;
-use twinstep_model::dynamics::SimdCommands;
+use twinstep_dynamics::quadruped::FactoredDynamics;
+use twinstep_dynamics::{SimdCommands, StepEquations};
 use twinstep_model::{
     Ground, HistoryStep, InitialState, PerJoint, RobotModel, RobotStates, RobotStatesMut, RolloutRequest,
 };
 use twinstep_simd::{InstructionSet, SimdFloat, SimdKernel, SimdTask, with_f32, with_f64};
 
 use super::actuator_input::{ActuatorInput, ActuatorInputs};
-use super::robot_batch::{LaneSnapshot, RobotBatch, SensorReadings, StepCount, Workspace};
+use super::batch_robot::{BatchRobot, foot_point, is_upper_body};
+use super::robot_batch::{LaneSnapshot, Placement, RobotBatch, SensorReadings, StepCount, Workspace, WorkspaceShape};
 use crate::SimConfig;
 
 /// Precision of the simulation.
@@ -84,45 +86,50 @@ impl SimdTask for MakeBatches<'_> {
     type Output = Box<dyn BatchSimulator>;
 
     fn run<T: SimdFloat>(self) -> Self::Output {
-        let batch = RobotBatch::<T>::new(self.model, self.config, self.ground, self.initial);
-        Box::new(RobotBatches { batches: vec![batch; self.num_robots.div_ceil(T::LANES)] })
+        let (actuator_dt, initial) = (self.model.control.actuator_dt(), Placement::from(self.initial));
+        let batch = Quadrupeds::<T>::new(self.model, actuator_dt, self.config, self.ground, &initial);
+        let shape = batch.workspace_shape();
+        Box::new(RobotBatches { shape, batches: vec![batch; self.num_robots.div_ceil(T::LANES)] })
     }
 }
 
+type Quadrupeds<T> = RobotBatch<T, FactoredDynamics<T>>;
+
 /// One call of [`RobotBatch::advance`].
-struct Advance<'a, T> {
-    batch: &'a mut RobotBatch<T>,
-    input: &'a ActuatorInput<T>,
+struct Advance<'a, T: SimdFloat, E: StepEquations<T>> {
+    batch: &'a mut RobotBatch<T, E>,
+    input: &'a ActuatorInput<E::Joints>,
     count: StepCount,
-    workspace: &'a mut Workspace<T>,
+    workspace: &'a mut Workspace<T, E>,
 }
 
-impl<T: SimdFloat> SimdKernel for Advance<'_, T> {
-    type Output = SensorReadings<T>;
+impl<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>> SimdKernel for Advance<'_, T, E> {
+    type Output = SensorReadings<T, E::Joints>;
 
     #[inline(always)]
-    fn run(self) -> SensorReadings<T> {
+    fn run(self) -> SensorReadings<T, E::Joints> {
         self.batch.advance(self.input, self.count, self.workspace)
     }
 }
 
 /// Advances one batch, compiled for the instruction set of its registers.
-fn advance<T: SimdFloat>(
-    batch: &mut RobotBatch<T>,
-    input: &ActuatorInput<T>,
+pub fn advance<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>>(
+    batch: &mut RobotBatch<T, E>,
+    input: &ActuatorInput<E::Joints>,
     count: StepCount,
-    workspace: &mut Workspace<T>,
-) -> SensorReadings<T> {
+    workspace: &mut Workspace<T, E>,
+) -> SensorReadings<T, E::Joints> {
     T::vectorise(Advance { batch, input, count, workspace })
 }
 
-struct RobotBatches<T> {
-    batches: Vec<RobotBatch<T>>,
+struct RobotBatches<T: SimdFloat> {
+    batches: Vec<Quadrupeds<T>>,
+    shape: WorkspaceShape<T, FactoredDynamics<T>>,
 }
 
 impl<T: SimdFloat> BatchSimulator for RobotBatches<T> {
     fn place(&mut self, robot: usize, model: &RobotModel, initial_state: &InitialState) {
-        self.batches[robot / T::LANES].place(robot % T::LANES, model, initial_state);
+        self.batches[robot / T::LANES].place(robot % T::LANES, model, &Placement::from(initial_state));
     }
 
     fn read(&self, robot: usize, states: &mut RobotStates) {
@@ -141,20 +148,21 @@ impl<T: SimdFloat> BatchSimulator for RobotBatches<T> {
     ) -> bool {
         let lanes = T::LANES;
         let mut chunks: Vec<_> = states.chunks_mut(lanes).collect();
-        let one = |scratch: &mut Workspace<T>,
-                   (index, (group, states)): (usize, (&mut RobotBatch<T>, &mut RobotStatesMut))| {
+        let Self { batches, shape } = self;
+        let one = |scratch: &mut Workspace<T, FactoredDynamics<T>>,
+                   (index, (group, states)): (usize, (&mut Quadrupeds<T>, &mut RobotStatesMut))| {
             let robots = index * lanes..(index * lanes + lanes).min(active.len());
             let input = ActuatorInput::of(inputs.range(robots.clone()));
             advance_active(group, &input, &active[robots], time, scratch, states)
         };
         match pool {
-            Some(pool) if self.batches.len() > 1 => pool.install(|| {
-                let groups = self.batches.par_iter_mut().zip(&mut chunks).enumerate();
-                groups.map_init(Workspace::empty, one).reduce(|| true, |finite, other| finite && other)
+            Some(pool) if batches.len() > 1 => pool.install(|| {
+                let groups = batches.par_iter_mut().zip(&mut chunks).enumerate();
+                groups.map_init(|| shape.workspace(), one).reduce(|| true, |finite, other| finite && other)
             }),
             _ => {
-                let mut scratch = Workspace::empty();
-                let groups = self.batches.iter_mut().zip(&mut chunks).enumerate();
+                let mut scratch = shape.workspace();
+                let groups = batches.iter_mut().zip(&mut chunks).enumerate();
                 // `count` steps every batch, also after one that diverged.
                 groups.map(|group| one(&mut scratch, group)).filter(|finite| !finite).count() == 0
             }
@@ -176,7 +184,7 @@ impl<T: SimdFloat> BatchSimulator for RobotBatches<T> {
     }
 
     fn play(&mut self, requests: &[&RolloutRequest], steps: usize, records: &mut [RobotStates]) {
-        let mut scratch = Workspace::empty();
+        let mut scratch = self.shape.workspace();
         let robots = requests.chunks(T::LANES).zip(records.chunks_mut(T::LANES));
         for (group, (requests, records)) in self.batches.iter_mut().zip(robots) {
             let mut records: Vec<_> = records.iter_mut().map(RobotStates::all_mut).collect();
@@ -217,11 +225,11 @@ impl<T: SimdFloat> BatchSimulator for RobotBatches<T> {
 ///
 /// Returns true if all numbers are finite.
 fn advance_active<T: SimdFloat>(
-    group: &mut RobotBatch<T>,
-    input: &ActuatorInput<T>,
+    group: &mut Quadrupeds<T>,
+    input: &ActuatorInput<[T; 12]>,
     active: &[bool],
     time: StepCount,
-    scratch: &mut Workspace<T>,
+    scratch: &mut Workspace<T, FactoredDynamics<T>>,
     states: &mut RobotStatesMut,
 ) -> bool {
     if active.iter().all(|active| !active) {
@@ -243,8 +251,8 @@ fn advance_active<T: SimdFloat>(
 
 /// Copies the state of one robot of a batch to entry `at` of `states`.
 fn read<T: SimdFloat>(
-    group: &RobotBatch<T>,
-    sample: &SensorReadings<T>,
+    group: &Quadrupeds<T>,
+    sample: &SensorReadings<T, [T; 12]>,
     lane: usize,
     states: &mut RobotStatesMut,
     at: usize,
@@ -258,8 +266,9 @@ fn read<T: SimdFloat>(
     states.q[at] = values(&sample.q, lane);
     states.dq[at] = values(&sample.dq, lane);
     states.tau[at] = values(group.tau(), lane);
-    states.foot_force[at] = std::array::from_fn(|leg| group.foot_force(lane, leg) as f32);
-    states.body_contact[at] = group.body_contact(lane);
+    states.foot_force[at] = std::array::from_fn(|leg| group.point_force(lane, foot_point(leg)) as f32);
+    let mut upper_body = (0..group.num_points()).filter(|point| is_upper_body(*point));
+    states.body_contact[at] = upper_body.any(|point| group.point_force(lane, point) > 0.0);
 }
 
 /// Returns true if all numbers of a robot are finite.

@@ -4,9 +4,9 @@ use std::f64::consts::TAU;
 
 use glam::{DVec3, Vec3};
 use rapier3d::prelude::*;
+use twinstep_dynamics::{SimdActuators, link_armature};
 use twinstep_model::{
-    BaseMount, Contact, InitialState, Joint, JointKind, Leg, NUM_JOINTS, PerJoint, RigidBody, RobotModel,
-    dynamics::SimdActuators, frames,
+    BaseMount, Contact, InitialState, Joint, JointKind, Leg, NUM_JOINTS, PerJoint, RigidBody, RobotModel, frames,
 };
 
 use super::RobotWorld;
@@ -53,7 +53,12 @@ impl RobotWorld {
             }
         }
         let mut this = Self {
-            actuator: SimdActuators::new(robot, 1.0 / f64::from(config.physics_hz())).with_sampled_positions(),
+            actuator: SimdActuators::new(
+                &robot.joints,
+                robot.control.actuator_dt(),
+                1.0 / f64::from(config.physics_hz()),
+            )
+            .with_sampled_positions(),
             gyro_bias: robot.gyro_bias.as_vec3(),
             world,
             trunk,
@@ -74,13 +79,13 @@ impl RobotWorld {
             let dq = f64::from(initial_state.dq[joint]);
             initial_state.q[joint] - robot.joints[joint].actuator.encoder_error(dq) as f32
         });
-        let rotors = self.actuator.set(0, robot, &q, &initial_state.dq);
+        self.actuator.set(0, &robot.joints, &q, &initial_state.dq);
         let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
         // Sets the pose of the root, and removes its six degrees of freedom if the base is fixed.
         multibody.forward_kinematics(&self.world.bodies, true);
         multibody.damping_mut().fill(0.0);
-        for (dof, (joint, rotor)) in robot.joints.iter().zip(rotors).enumerate() {
-            multibody.armature_mut()[root_dofs + dof] = rotor as f32;
+        for (dof, joint) in robot.joints.iter().enumerate() {
+            multibody.armature_mut()[root_dofs + dof] = link_armature(joint) as f32;
             multibody.damping_mut()[root_dofs + dof] = joint.viscous_friction as f32;
         }
         let mut displacement = vec![0.0; root_dofs + NUM_JOINTS];

@@ -20,11 +20,8 @@ mod snapshot;
 
 use glam::{Quat, Vec3};
 use rapier3d::prelude::*;
-use twinstep_model::{
-    ActuatorTap, Command, NUM_JOINTS, PerJoint, PerLeg,
-    dynamics::{JointForces, SimdActuators, SimdCommands},
-    frames,
-};
+use twinstep_dynamics::{SimdActuators, SimdCommands};
+use twinstep_model::{ActuatorTap, Command, NUM_JOINTS, PerJoint, PerLeg, frames};
 
 pub use snapshot::WorldSnapshot;
 
@@ -44,7 +41,7 @@ pub struct RobotWorld {
     root_dofs: usize,
     feet: [ColliderHandle; 4],
     upper_body: Vec<ColliderHandle>,
-    actuator: SimdActuators<f64>,
+    actuator: SimdActuators<f64, [f64; NUM_JOINTS]>,
     /// Gyroscope bias [rad/s].
     gyro_bias: Vec3,
 }
@@ -81,20 +78,25 @@ impl RobotWorld {
             ActuatorInputRef::Command(command) | ActuatorInputRef::Residual(command, ..) => {
                 self.actuator.update_command(&SimdCommands::new(std::slice::from_ref(command)), &q, &dq);
             }
-            ActuatorInputRef::Torques(tau) => self.actuator.set_torque(tau.map(f64::from)),
+            ActuatorInputRef::Torques(tau) => self.actuator.set_torque(&tau.map(f64::from)),
         }
         if let ActuatorInputRef::Residual(_, tap, tau) = input {
             self.actuator.set_residual(tap, tau.map(f64::from));
         }
         let mut estimated = [0.0; NUM_JOINTS];
         for index in 0..steps {
-            let JointForces { tau, dry_friction: dry, .. } = self.actuator.step(index, &q, &dq);
+            self.actuator.step(index, &q, &dq);
+            let forces = self.actuator.forces();
             let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
             for (joint, link) in multibody.links_mut().skip(1).enumerate() {
                 let position = link.joint().coords()[REVOLUTE_AXIS];
-                link.joint.set_spring(REVOLUTE_AXIS, TORQUE_SPRING, position + tau[joint] as f32 / TORQUE_SPRING);
+                link.joint.set_spring(
+                    REVOLUTE_AXIS,
+                    TORQUE_SPRING,
+                    position + forces.tau[joint] as f32 / TORQUE_SPRING,
+                );
             }
-            for (joint, dry) in dry.into_iter().enumerate() {
+            for (joint, dry) in forces.dry_friction.into_iter().enumerate() {
                 multibody.frictions_mut()[self.root_dofs + joint] = dry as f32;
             }
             self.world.step();

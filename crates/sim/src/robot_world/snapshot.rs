@@ -2,7 +2,8 @@
 
 use glam::Vec3;
 use rapier3d::prelude::*;
-use twinstep_model::dynamics::SimdActuators;
+use twinstep_dynamics::SimdActuators;
+use twinstep_model::NUM_JOINTS;
 
 use super::RobotWorld;
 
@@ -26,7 +27,7 @@ struct RootFrame {
     trunk_com: Vec3,
     feet: [ColliderHandle; 4],
     upper_body: Vec<ColliderHandle>,
-    actuator: SimdActuators<f64>,
+    actuator: SimdActuators<f64, [f64; NUM_JOINTS]>,
     gyro_bias: Vec3,
     /// Contains the contact compliance, which depends on the robot model.
     integration_parameters: IntegrationParameters,

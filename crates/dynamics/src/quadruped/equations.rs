@@ -3,9 +3,11 @@
 //! Recursive Newton–Euler algorithm for forces, composite-rigid-body algorithm for the mass matrix (Featherstone,
 //! "Rigid Body Dynamics Algorithms", 2008, chapters 5 and 6).
 
-use super::spatial::{Inertia, Vec3};
-use super::tree::{KinematicTree, LegFrames, State};
 use twinstep_simd::SimdFloat;
+
+use super::QuadrupedState;
+use super::kinematics::{KinematicTree, LegFrames};
+use crate::{Inertia, Vec3, spatial_matrix};
 
 /// Accelerations of base and joints.
 #[derive(Clone, Copy, Debug)]
@@ -33,7 +35,7 @@ pub struct Wrench<T> {
 #[inline(always)]
 pub fn inverse_dynamics<T: SimdFloat>(
     tree: &KinematicTree<T>,
-    state: &State<T>,
+    state: &QuadrupedState<T>,
     acceleration: &Acceleration<T>,
     gravity: T,
 ) -> (Wrench<T>, [T; 12]) {
@@ -104,7 +106,7 @@ impl<T: SimdFloat> LegForces<T> {
     #[inline(always)]
     pub fn new(
         tree: &KinematicTree<T>,
-        state: &State<T>,
+        state: &QuadrupedState<T>,
         frames: &LegFrames<T>,
         bodies: &[Inertia<T>; 3],
         leg: usize,
@@ -200,21 +202,4 @@ impl<T: SimdFloat> LegInertia<T> {
 fn to_base<T: SimdFloat>(force: Vec3<T>, moment: Vec3<T>, hip: Vec3<T>, hip_angle: (T, T)) -> (Vec3<T>, Vec3<T>) {
     let force = force.rotate_x(hip_angle);
     (force, moment.rotate_x(hip_angle) + hip.cross(force))
-}
-
-/// Returns the lower triangle of a body's spatial inertia matrix (6 × 6): angular, then linear.
-#[inline(always)]
-pub fn spatial_matrix<T: SimdFloat>(body: &Inertia<T>) -> [[T; 6]; 6] {
-    let zero = T::splat(0.0);
-    let [xx, yy, zz, xy, xz, yz] = body.about_origin;
-    let ([hx, hy, hz], m) = (body.moment.0, body.mass);
-    [
-        [xx, zero, zero, zero, zero, zero],
-        [xy, yy, zero, zero, zero, zero],
-        [xz, yz, zz, zero, zero, zero],
-        // Force due to an angular acceleration: alpha × h.
-        [zero, hz, -hy, m, zero, zero],
-        [-hz, zero, hx, zero, m, zero],
-        [hy, -hx, zero, zero, zero, m],
-    ]
 }

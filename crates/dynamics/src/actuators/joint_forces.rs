@@ -3,8 +3,10 @@
 
 use super::SimdActuators;
 use super::coefficients::Coefficients;
-use crate::ActuatorTap;
+use twinstep_model::ActuatorTap;
 use twinstep_simd::{SimdFloat, exponential};
+
+use crate::JointValues;
 
 /// Integration steps of a rotor with an elastic gear per physics step.
 const GEAR_SUBSTEPS: usize = 8;
@@ -13,31 +15,44 @@ const GEAR_DAMPING: f64 = 0.125;
 
 /// Torque and friction at the joints in one physics step.
 #[derive(Clone, Copy, Debug)]
-pub struct JointForces<T> {
-    /// Torque [N·m].
-    pub tau: [T; 12],
-    /// Coefficient of viscous friction [N·m·s/rad].
-    pub damping: [T; 12],
-    /// Maximum torque of dry friction [N·m].
-    pub dry_friction: [T; 12],
+pub struct JointForces<J> {
+    /// Torque [N·m or N].
+    pub tau: J,
+    /// Coefficient of viscous friction [N·m·s/rad or N·s/m].
+    pub damping: J,
+    /// Maximum torque of dry friction [N·m or N].
+    pub dry_friction: J,
 }
 
-impl<T: SimdFloat> SimdActuators<T> {
-    /// Advances the actuators by physics step `index` of the actuator period and returns torque and friction.
+impl<J> JointForces<J> {
+    /// Returns torques without friction.
+    pub fn frictionless<T: SimdFloat>(tau: J) -> Self
+    where
+        J: JointValues<T>,
+    {
+        let zero = J::filled(tau.as_ref().len(), T::splat(0.0));
+        Self { tau, damping: zero.clone(), dry_friction: zero }
+    }
+}
+
+impl<T: SimdFloat, J: JointValues<T>> SimdActuators<T, J> {
+    /// Advances the actuators by physics step `index` of the actuator period. Computes [`SimdActuators::forces`].
     ///
     /// `q` [rad] are the joint positions in the middle of the step, or those of [`SimdActuators::with_sampled_positions`], and
     /// `dq` [rad/s] the velocities.
     #[inline(always)]
-    pub fn step(&mut self, index: usize, q: &[T; 12], dq: &[T; 12]) -> JointForces<T> {
+    pub fn step(&mut self, index: usize, q: &J, dq: &J) {
         let active = self.active;
-        let input = if active.torque_delay { self.delayed_torque(index) } else { self.state.torque_history[0] };
+        if active.torque_delay {
+            self.delay_torque(index);
+        }
         let (zero, one) = (T::splat(0.0), T::splat(1.0));
-        let mut forces = JointForces { tau: [zero; 12], damping: [zero; 12], dry_friction: [zero; 12] };
-        for joint in 0..12 {
+        for joint in 0..q.as_ref().len() {
             let n = &self.coefficients[joint];
             // Back-EMF and ripple depend on the rotor, whose motion differs from the link's if the gear is elastic.
             let rotor_q = zero.select_lt(n.gear, self.state.rotor[0][joint], q[joint]);
             let rotor_dq = zero.select_lt(n.gear, self.state.rotor[1][joint], dq[joint]);
+            let input = if active.torque_delay { &self.delayed_torque } else { &self.state.torque_history[0] };
             let mut tau = input[joint];
             if active.back_emf {
                 let (limit, share) = (n.torque_limit, rotor_dq * n.back_emf);
@@ -61,6 +76,7 @@ impl<T: SimdFloat> SimdActuators<T> {
                 let (sin, _) = (n.ripple_cycles * rotor_q + n.ripple_phase).sin_cos();
                 tau += n.ripple_amplitude * sin;
             }
+            let forces = &mut self.forces;
             (forces.damping[joint], forces.dry_friction[joint]) = (n.viscous, n.coulomb);
             if active.speed_friction {
                 let speed = dq[joint] * n.inv_stribeck_velocity;
@@ -69,58 +85,58 @@ impl<T: SimdFloat> SimdActuators<T> {
             forces.tau[joint] = tau;
         }
         if active.elastic {
-            self.integrate_gear(&mut forces.tau, q, dq);
+            self.integrate_gear(q, dq);
         }
+        let tau = &mut self.forces.tau;
         if let Some((ActuatorTap::Output, residual)) = &self.residual {
-            for joint in 0..12 {
-                forces.tau[joint] += residual[joint];
+            for joint in 0..q.as_ref().len() {
+                tau[joint] += residual[joint];
             }
         }
         if active.spring {
-            for joint in 0..12 {
+            for joint in 0..q.as_ref().len() {
                 let n = &self.coefficients[joint];
-                forces.tau[joint] += n.spring_offset - n.spring * q[joint];
+                tau[joint] += n.spring_offset - n.spring * q[joint];
             }
         }
-        forces
     }
 
-    /// Returns the mean of the delayed torque over physics step `index` [N·m].
+    /// Returns torque and friction of the last physics step.
     #[inline(always)]
-    fn delayed_torque(&self, index: usize) -> [T; 12] {
+    pub fn forces(&self) -> &JointForces<J> {
+        &self.forces
+    }
+
+    /// Computes the mean of the delayed torque over physics step `index` [N·m].
+    #[inline(always)]
+    fn delay_torque(&mut self, index: usize) {
         let (zero, one) = (T::splat(0.0), T::splat(1.0));
         let start = self.step_fraction * T::splat(index as f64);
-        let mut delayed = [zero; 12];
-        for joint in 0..12 {
-            let from = start - self.coefficients[joint].torque_delay;
+        for (joint, n) in self.coefficients.iter().enumerate() {
+            let (from, mut delayed) = (start - n.torque_delay, zero);
             let to = from + self.step_fraction;
             for (age, torque) in self.state.torque_history.iter().enumerate() {
                 let period = T::splat(-(age as f64));
                 let shared = (to.min(period + one) - from.max(period)).max(zero);
-                delayed[joint] += shared / self.step_fraction * torque[joint];
+                delayed += shared / self.step_fraction * torque[joint];
             }
             // Without delay the exact value, so that the result does not depend on the other lanes.
-            delayed[joint] = zero.select_lt(
-                self.coefficients[joint].torque_delay,
-                delayed[joint],
-                self.state.torque_history[0][joint],
-            );
+            self.delayed_torque[joint] = zero.select_lt(n.torque_delay, delayed, self.state.torque_history[0][joint]);
         }
-        delayed
     }
 
     /// Integrates the rotors of elastic gears in substeps with constant link velocities.
     ///
     /// Each substep evaluates the torque in its middle, so that rotor and link are at the same time. Without damping, a stiff
-    /// gear between rotor and link would vibrate at a frequency that the physics step does not resolve. Replaces `tau` by the
-    /// mean torque that the gear transmits to the link [N·m].
+    /// gear between rotor and link would vibrate at a frequency that the physics step does not resolve. Replaces the torque by
+    /// the mean that the gear transmits to the link [N·m].
     #[inline(always)]
-    fn integrate_gear(&mut self, tau: &mut [T; 12], q: &[T; 12], dq: &[T; 12]) {
+    fn integrate_gear(&mut self, q: &J, dq: &J) {
         let (zero, dt) = (T::splat(0.0), T::splat(self.dt / GEAR_SUBSTEPS as f64));
         let (half, lead) = (T::splat(0.5) * dt, T::splat(self.lead));
         let damping_time = T::splat(GEAR_DAMPING * self.dt);
-        let [angle, speed] = &mut self.state.rotor;
-        for joint in 0..12 {
+        let ([angle, speed], tau) = (&mut self.state.rotor, &mut self.forces.tau);
+        for joint in 0..q.as_ref().len() {
             let Coefficients { half_backlash, gear: stiffness, rotor, .. } = self.coefficients[joint];
             let (mut link, mut mean) = (q[joint] - lead * dq[joint], zero);
             for _ in 0..GEAR_SUBSTEPS {

@@ -3,8 +3,9 @@
 use glam::{DMat3, DQuat, DVec3};
 use proptest::prelude::*;
 
-use super::super::*;
-use crate::{Pose, RigidBody, RobotModel, body_poses, go2};
+use super::*;
+use crate::{Inertia, Vec3};
+use twinstep_model::{Pose, RigidBody, RobotModel, body_poses, go2};
 
 /// Gravity [m/s²].
 const GRAVITY: f64 = 9.81;
@@ -13,14 +14,14 @@ fn numbers<const N: usize>(limit: f64) -> impl Strategy<Value = [f64; N]> {
     prop::array::uniform(-limit..limit)
 }
 
-fn state() -> impl Strategy<Value = State<f64>> {
+fn state() -> impl Strategy<Value = QuadrupedState<f64>> {
     (numbers::<4>(1.0), numbers::<12>(0.8), numbers::<12>(5.0), numbers::<3>(2.0), numbers::<3>(2.0))
         .prop_filter("an orientation", |(turn, ..)| turn.iter().map(|x| x * x).sum::<f64>() > 0.1)
         .prop_map(|(turn, offset, dq, angular, linear)| {
             let [w, x, y, z] = turn;
             let turn = DQuat::from_xyzw(x, y, z, w).normalize();
             let pose = go2().control.default_pose;
-            State {
+            QuadrupedState {
                 position: Vec3([0.3, -0.2, 0.5]),
                 orientation: [turn.w, turn.x, turn.y, turn.z],
                 linear_velocity: Vec3(linear),
@@ -43,15 +44,15 @@ fn tree() -> KinematicTree<f64> {
     KinematicTree::splat(&go2())
 }
 
-fn world_from_base(state: &State<f64>) -> DQuat {
+fn world_from_base(state: &QuadrupedState<f64>) -> DQuat {
     let [w, x, y, z] = state.orientation;
     DQuat::from_xyzw(x, y, z, w)
 }
 
 /// Returns the state after `dt` [s] at constant velocities.
-fn moved(state: &State<f64>, dt: f64) -> State<f64> {
+fn moved(state: &QuadrupedState<f64>, dt: f64) -> QuadrupedState<f64> {
     let turn = world_from_base(state) * DQuat::from_scaled_axis(DVec3::from(state.angular_velocity.0) * dt);
-    State {
+    QuadrupedState {
         position: state.position + state.linear_velocity.scaled(dt),
         orientation: [turn.w, turn.x, turn.y, turn.z],
         q: std::array::from_fn(|joint| state.q[joint] + dt * state.dq[joint]),
@@ -60,10 +61,10 @@ fn moved(state: &State<f64>, dt: f64) -> State<f64> {
 }
 
 /// Returns the state after `dt` [s] at constant accelerations, to first order.
-fn accelerated(state: &State<f64>, acceleration: &Acceleration<f64>, dt: f64) -> State<f64> {
+fn accelerated(state: &QuadrupedState<f64>, acceleration: &Acceleration<f64>, dt: f64) -> QuadrupedState<f64> {
     let later = moved(state, dt);
     let push = world_from_base(state) * DVec3::from(acceleration.linear.0) * dt;
-    State {
+    QuadrupedState {
         linear_velocity: later.linear_velocity + Vec3(push.to_array()),
         angular_velocity: later.angular_velocity + acceleration.angular.scaled(dt),
         dq: std::array::from_fn(|joint| state.dq[joint] + dt * acceleration.ddq[joint]),
@@ -72,7 +73,7 @@ fn accelerated(state: &State<f64>, acceleration: &Acceleration<f64>, dt: f64) ->
 }
 
 /// Returns each body with its position and rotation in the world frame, by independent kinematics.
-fn frames(robot: &RobotModel, state: &State<f64>) -> Vec<(RigidBody, DVec3, DQuat)> {
+fn frames(robot: &RobotModel, state: &QuadrupedState<f64>) -> Vec<(RigidBody, DVec3, DQuat)> {
     let base = (DVec3::from(state.position.0), world_from_base(state));
     let mut frames = vec![(robot.trunk, base.0, base.1)];
     for (leg, model) in robot.legs.iter().enumerate() {
@@ -87,7 +88,7 @@ fn frames(robot: &RobotModel, state: &State<f64>) -> Vec<(RigidBody, DVec3, DQua
 }
 
 /// Returns the kinetic plus potential energy [J], with the velocities of the bodies by finite differences.
-fn energy(robot: &RobotModel, state: &State<f64>) -> f64 {
+fn energy(robot: &RobotModel, state: &QuadrupedState<f64>) -> f64 {
     const DT: f64 = 1e-6;
     let (before, after) = (frames(robot, &moved(state, -DT)), frames(robot, &moved(state, DT)));
     let here = frames(robot, state);
@@ -107,7 +108,7 @@ fn energy(robot: &RobotModel, state: &State<f64>) -> f64 {
 }
 
 /// Returns the 18 generalised velocities: angular and linear of the base in base axes, then joints.
-fn velocities(state: &State<f64>) -> [f64; 18] {
+fn velocities(state: &QuadrupedState<f64>) -> [f64; 18] {
     let linear = world_from_base(state).inverse() * DVec3::from(state.linear_velocity.0);
     let base = [state.angular_velocity.0, linear.to_array()].concat();
     std::array::from_fn(|i| if i < 6 { base[i] } else { state.dq[i - 6] })
@@ -153,7 +154,7 @@ proptest! {
 
     #[test]
     fn kinetic_energy_follows_from_the_mass_matrix(state in state()) {
-        let rest = State { dq: [0.0; 12], linear_velocity: Vec3::zero(), angular_velocity: Vec3::zero(), ..state };
+        let rest = QuadrupedState { dq: [0.0; 12], linear_velocity: Vec3::zero(), angular_velocity: Vec3::zero(), ..state };
         let kinetic = energy(&go2(), &state) - energy(&go2(), &rest);
         let (matrix, v) = (mass_matrix(&tree(), &state.q), velocities(&state));
         let ours: f64 = (0..18).flat_map(|i| (0..18).map(move |j| (i, j))).map(|(i, j)| 0.5 * v[i] * matrix[i][j] * v[j]).sum();

@@ -5,7 +5,7 @@
 //! step.
 //!
 //! - [`commands`]: commands, one robot per lane.
-//! - [`coefficients`]: numbers of the laws, computed from a [`crate::JointModel`].
+//! - [`coefficients`]: numbers of the laws, computed from a [`JointModel`].
 //! - [`pd_loop`]: the laws that act once per actuator period.
 //! - [`joint_forces`]: the laws that act once per physics step.
 
@@ -13,9 +13,13 @@ mod coefficients;
 mod commands;
 mod joint_forces;
 mod pd_loop;
+#[cfg(test)]
+mod tests;
 
-use crate::{ActuatorParams, ActuatorTap, PerJoint, RobotModel};
+use twinstep_model::{ActuatorParams, ActuatorTap, JointModel};
 use twinstep_simd::SimdFloat;
+
+use crate::JointValues;
 
 use coefficients::{ActiveEffects, Coefficients, gear_stiffness};
 pub use commands::SimdCommands;
@@ -23,29 +27,35 @@ pub use joint_forces::JointForces;
 
 /// State of the actuators between physics steps.
 #[derive(Clone, Debug)]
-struct ActuatorState<T> {
+struct ActuatorState<J> {
     /// Position [rad], velocity [rad/s] and feed-forward torque [N·m] of the last commands, newest first.
-    commands: Vec<[[T; 12]; 3]>,
+    commands: Vec<[J; 3]>,
     /// Torque of the PD loop in the last actuator periods, newest first [N·m].
-    torque_history: Vec<[T; 12]>,
+    torque_history: Vec<J>,
     /// Torque after the first-order lag, proportional to the motor current [N·m].
-    current: [T; 12],
+    current: J,
     /// Position [rad] and velocity [rad/s] of the rotor of an elastic gear.
-    rotor: [[T; 12]; 2],
+    rotor: [J; 2],
 }
 
-/// Actuators of a batch of robots, one per lane.
+/// Actuators of a batch of robots, one per lane. `J` has a number for each joint. Torques of sliding joints are forces [N].
 #[derive(Clone, Debug)]
-pub struct SimdActuators<T> {
-    coefficients: [Coefficients<T>; 12],
-    state: ActuatorState<T>,
+pub struct SimdActuators<T, J> {
+    coefficients: Vec<Coefficients<T>>,
+    state: ActuatorState<J>,
     /// Torque that the current sensor measures, mean over the last physics step [N·m].
-    estimated_torque: [T; 12],
+    estimated_torque: J,
     /// Factor on the torque for supply voltage and motor temperature.
-    derating: [T; 12],
+    derating: J,
     /// Torque that is added at a tap in the current actuator period [N·m].
-    residual: Option<(ActuatorTap, [T; 12])>,
+    residual: Option<(ActuatorTap, J)>,
     active: ActiveEffects,
+    /// Position, velocity and feed-forward torque of the commands that arrive in the current actuator period.
+    arrived: [J; 3],
+    /// Torque of the PD loop after its delay [N·m].
+    delayed_torque: J,
+    /// Torque and friction of the last physics step.
+    forces: JointForces<J>,
     /// Physics step [actuator periods].
     step_fraction: T,
     /// Physics step [s].
@@ -55,27 +65,35 @@ pub struct SimdActuators<T> {
     actuator_dt: f64,
 }
 
-impl<T: SimdFloat> SimdActuators<T> {
-    /// Creates the actuators of `robot` in every lane, with zero torque, for physics steps of `dt` [s].
+/// Returns the rotor inertia that moves with the link of a joint [kg·m²]; 0 if the gear is elastic.
+pub fn link_armature(joint: &JointModel) -> f64 {
+    if gear_stiffness(&joint.actuator) > 0.0 { 0.0 } else { joint.armature }
+}
+
+impl<T: SimdFloat, J: JointValues<T>> SimdActuators<T, J> {
+    /// Creates the actuators of `joints` in every lane, with zero torque, for physics steps of `dt` [s].
     ///
     /// Link positions of a step are those of its middle, half a step after a sample.
-    pub fn new(robot: &RobotModel, dt: f64) -> Self {
-        let (zero, actuator_dt) = ([T::splat(0.0); 12], robot.control.actuator_dt());
-        let coefficients = robot.joints.map(|joint| Coefficients::splat(&joint, dt, actuator_dt));
+    pub fn new(joints: &[JointModel], actuator_dt: f64, dt: f64) -> Self {
+        let (zero, one) = (J::filled(joints.len(), T::splat(0.0)), J::filled(joints.len(), T::splat(1.0)));
+        let three = || std::array::from_fn(|_| zero.clone());
         let length = history_len(actuator_dt);
         let state = ActuatorState {
-            commands: vec![[zero; 3]; length],
-            torque_history: vec![zero; length],
-            current: zero,
-            rotor: [zero; 2],
+            commands: vec![three(); length],
+            torque_history: vec![zero.clone(); length],
+            current: zero.clone(),
+            rotor: [zero.clone(), zero.clone()],
         };
         Self {
-            coefficients,
+            coefficients: joints.iter().map(|joint| Coefficients::splat(joint, dt, actuator_dt)).collect(),
             state,
-            estimated_torque: zero,
-            derating: [T::splat(1.0); 12],
+            estimated_torque: zero.clone(),
+            derating: one,
             residual: None,
             active: ActiveEffects::default(),
+            arrived: three(),
+            delayed_torque: zero.clone(),
+            forces: JointForces { tau: zero.clone(), damping: zero.clone(), dry_friction: zero },
             step_fraction: T::splat(dt / actuator_dt),
             dt,
             lead: 0.5 * dt,
@@ -88,13 +106,9 @@ impl<T: SimdFloat> SimdActuators<T> {
         Self { lead: 0.0, ..self }
     }
 
-    /// Resets the actuators of one lane to those of `robot`, with joints at `q` [rad] and `dq` [rad/s] and zero torque.
-    ///
-    /// Returns the rotor inertia that moves with each link [kg·m²]; 0 if the gear is elastic.
-    pub fn set(&mut self, lane: usize, robot: &RobotModel, q: &PerJoint, dq: &PerJoint) -> [f64; 12] {
-        let mut on_link = [0.0; 12];
-        for (index, joint) in robot.joints.iter().enumerate() {
-            on_link[index] = if gear_stiffness(&joint.actuator) > 0.0 { 0.0 } else { joint.armature };
+    /// Resets the actuators of one lane to those of `joints`, at positions `q` and velocities `dq` of the links and zero torque.
+    pub fn set(&mut self, lane: usize, joints: &[JointModel], q: &[f32], dq: &[f32]) {
+        for (index, joint) in joints.iter().enumerate() {
             self.coefficients[index].set(lane, joint, self.dt, self.actuator_dt);
             let state = &mut self.state;
             // The command history is the initial position, so a delayed first command starts from rest.
@@ -109,15 +123,14 @@ impl<T: SimdFloat> SimdActuators<T> {
             state.current[index].set(lane, 0.0);
             state.rotor[0][index].set(lane, f64::from(q[index]));
             state.rotor[1][index].set(lane, f64::from(dq[index]));
+            self.derating[index].set(lane, 1.0);
         }
-        self.set_derating(lane, &[1.0; 12]);
         self.update_active_effects();
-        on_link
     }
 
     /// Sets the factors on the torque of one lane for supply voltage and motor temperature. A reset sets them to 1.
-    pub fn set_derating(&mut self, lane: usize, factors: &PerJoint) {
-        for (derating, factor) in self.derating.iter_mut().zip(factors) {
+    pub fn set_derating(&mut self, lane: usize, factors: &[f32]) {
+        for (derating, factor) in self.derating.as_mut().iter_mut().zip(factors) {
             derating.set(lane, f64::from(*factor));
         }
     }
@@ -131,17 +144,17 @@ impl<T: SimdFloat> SimdActuators<T> {
     /// Replays one past actuator period of `steps` physics steps into the delay and lag states.
     ///
     /// Positions do not change. `q` [rad] and `dq` [rad/s] are the encoder readings at the start of the period.
-    pub fn replay_history(&mut self, commands: &SimdCommands<T>, q: &[T; 12], dq: &[T; 12], steps: usize) {
-        let rotors = self.state.rotor;
-        let link: [T; 12] = std::array::from_fn(|joint| {
-            let n = &self.coefficients[joint];
-            q[joint] - n.encoder_offset - n.encoder_lead * dq[joint]
-        });
-        self.state.rotor = [link, *dq];
+    pub fn replay_history(&mut self, commands: &SimdCommands<J>, q: &J, dq: &J, steps: usize) {
+        let rotors = self.state.rotor.clone();
+        let mut link = q.clone();
+        for (joint, n) in self.coefficients.iter().enumerate() {
+            link[joint] = q[joint] - n.encoder_offset - n.encoder_lead * dq[joint];
+        }
+        self.state.rotor = [link.clone(), dq.clone()];
         self.update_command(commands, &link, dq);
         for index in 0..steps {
             self.step(index, &link, dq);
-            self.state.rotor = [link, *dq];
+            self.state.rotor = [link.clone(), dq.clone()];
         }
         self.state.rotor = rotors;
     }
@@ -162,7 +175,7 @@ impl<T: SimdFloat> SimdActuators<T> {
     }
 
     /// Returns the torque that the current sensors measure, mean over the last physics step [N·m].
-    pub fn estimated_torque(&self) -> &[T; 12] {
+    pub fn estimated_torque(&self) -> &J {
         &self.estimated_torque
     }
 
@@ -172,8 +185,9 @@ impl<T: SimdFloat> SimdActuators<T> {
             coefficients.visit(&mut visit);
         }
         let ActuatorState { commands, torque_history: torque, current, rotor } = &mut self.state;
-        commands.iter_mut().flatten().chain(torque).chain([current]).chain(rotor).flatten().for_each(&mut visit);
-        self.derating.iter_mut().for_each(visit);
+        let values =
+            commands.iter_mut().flatten().chain(torque).chain([current]).chain(rotor).chain([&mut self.derating]);
+        values.flat_map(AsMut::as_mut).for_each(visit);
     }
 
     /// Updates derived state; call it after [`SimdActuators::visit`] has changed values.

@@ -4,7 +4,7 @@ use std::ops::{Add, Neg, Sub};
 
 use glam::{DMat3, DVec3};
 
-use crate::RigidBody;
+use twinstep_model::RigidBody;
 use twinstep_simd::SimdFloat;
 
 /// Vector in three dimensions.
@@ -211,6 +211,23 @@ impl<T: SimdFloat> Inertia<T> {
     }
 }
 
+/// Returns the lower triangle of a body's spatial inertia matrix (6 × 6): angular, then linear.
+#[inline(always)]
+pub fn spatial_matrix<T: SimdFloat>(body: &Inertia<T>) -> [[T; 6]; 6] {
+    let zero = T::splat(0.0);
+    let [xx, yy, zz, xy, xz, yz] = body.about_origin;
+    let ([hx, hy, hz], m) = (body.moment.0, body.mass);
+    [
+        [xx, zero, zero, zero, zero, zero],
+        [xy, yy, zero, zero, zero, zero],
+        [xz, yz, zz, zero, zero, zero],
+        // Force due to an angular acceleration: alpha × h.
+        [zero, hz, -hy, m, zero, zero],
+        [-hz, zero, hx, zero, m, zero],
+        [hy, -hx, zero, zero, zero, m],
+    ]
+}
+
 /// Cholesky factor of a symmetric positive definite matrix: `matrix = factor · factorᵀ`, `factor` lower triangular.
 #[derive(Clone, Copy, Debug)]
 pub struct Cholesky<T, const N: usize> {
@@ -221,7 +238,7 @@ pub struct Cholesky<T, const N: usize> {
 
 impl<T: SimdFloat, const N: usize> Cholesky<T, N> {
     /// Returns a placeholder; overwritten before use.
-    pub(super) fn empty() -> Self {
+    pub(crate) fn empty() -> Self {
         Self { factor: [[T::splat(0.0); N]; N], inverse: [T::splat(0.0); N] }
     }
 

@@ -5,23 +5,12 @@
 //! chapter 6.5), a solution in whitened coordinates u is `Δq̇ = L⁻¹ u`. A row `J Δq̇` that acts on one body is `y·u` with `y = L⁻ᵀ Jᵀ`,
 //! which is not zero only for the base and for the joints of the body's branch. Two rows are coupled through `y·y'`.
 
-use twinstep_model::dynamics::{Cholesky, Inertia, Vec3, spatial_matrix};
+use crate::{Cholesky, Inertia, JointForces, Vec3, spatial_matrix};
 use twinstep_simd::SimdFloat;
 
-use crate::equations::force;
-use crate::motion::{Spatial, TreeMotion, times};
-use crate::{TreeParameters, TreeState, TreeStructure};
-
-/// Forces on a robot: of its joints, their viscous friction, and gravity.
-#[derive(Clone, Debug)]
-pub struct TreeLoad<T> {
-    /// Gravity along −z of the world frame [m/s²].
-    pub gravity: T,
-    /// Force of each joint [N·m or N].
-    pub tau: Vec<T>,
-    /// Coefficient of viscous friction. It is integrated implicitly, so any value is stable.
-    pub damping: Vec<T>,
-}
+use super::equations::force;
+use super::motion::{Spatial, TreeMotion, times};
+use super::{TreeParameters, TreeState, TreeStructure};
 
 /// Factored equations of one time step.
 #[derive(Clone, Debug)]
@@ -48,7 +37,8 @@ pub struct FactoredTree<T> {
 
 impl<T: SimdFloat> FactoredTree<T> {
     /// Returns a placeholder for [`FactoredTree::set_up`], to be used in every step.
-    pub fn empty(structure: &TreeStructure, parameters: &TreeParameters<T>) -> Self {
+    pub fn empty(parameters: &TreeParameters<T>) -> Self {
+        let structure = &*parameters.structure;
         let (zero, one, joints) = (T::splat(0.0), T::splat(1.0), structure.num_joints());
         let mut identity = [[zero; 6]; 6];
         (0..6).for_each(|index| identity[index][index] = one);
@@ -66,18 +56,19 @@ impl<T: SimdFloat> FactoredTree<T> {
         }
     }
 
-    /// Sets up a step of `dt` [s]. [`FactoredTree::u`] is then the solution without constraints.
+    /// Sets up a step of `dt` [s] under gravity [m/s²]. [`FactoredTree::u`] is then the solution without constraints.
     #[inline(always)]
     pub fn set_up(
         &mut self,
-        structure: &TreeStructure,
         parameters: &TreeParameters<T>,
         motion: &TreeMotion<T>,
         state: &TreeState<T>,
-        load: &TreeLoad<T>,
+        forces: &JointForces<Vec<T>>,
         dt: T,
+        gravity: T,
     ) {
-        self.set_bias(structure, motion, state, load.gravity);
+        let structure = &*parameters.structure;
+        self.set_bias(structure, motion, state, gravity);
         self.composites.copy_from_slice(&motion.inertias);
         for joint in (0..structure.num_joints()).rev() {
             let unit = times(&self.composites[joint + 1], motion.axes[joint]);
@@ -86,7 +77,7 @@ impl<T: SimdFloat> FactoredTree<T> {
             for (entry, other) in row.iter_mut().zip(branch) {
                 *entry = unit.dot(motion.axes[*other]);
             }
-            let damping = load.damping[joint];
+            let damping = forces.damping[joint];
             row[branch.len() - 1] += parameters.armature[joint] + dt * damping;
             let ([a, b, c], [d, e, f]) = (unit.angular.0, unit.linear.0);
             self.to_base[joint] = [a, b, c, d, e, f];
@@ -96,7 +87,7 @@ impl<T: SimdFloat> FactoredTree<T> {
             let bias = motion.axes[joint].dot(self.forces[joint + 1]);
             let sum = self.forces[parent].plus(self.forces[joint + 1]);
             self.forces[parent] = sum;
-            self.u[joint] = (load.tau[joint] - bias - damping * state.dq[joint]) * dt;
+            self.u[joint] = (forces.tau[joint] - bias - damping * state.dq[joint]) * dt;
         }
         self.factor(structure, dt);
     }
@@ -104,7 +95,7 @@ impl<T: SimdFloat> FactoredTree<T> {
     /// Computes the force on each body without its joints.
     #[inline(always)]
     fn set_bias(&mut self, structure: &TreeStructure, motion: &TreeMotion<T>, state: &TreeState<T>, gravity: T) {
-        self.accelerations[0] = Spatial { angular: Vec3::zero(), linear: state.upward().scaled(gravity) };
+        self.accelerations[0] = Spatial { angular: Vec3::zero(), linear: state.world_axes()[2].scaled(gravity) };
         self.forces[0] = force(&motion.inertias[0], motion.velocities[0], self.accelerations[0]);
         for joint in 0..structure.num_joints() {
             let parent = structure.parents[joint];

@@ -1,11 +1,13 @@
 //! Numbers of a batch of robots that have the same structure.
 
+use std::sync::Arc;
+
+use crate::{Inertia, Vec3};
 use glam::{DAffine3, DMat3, DQuat, DVec3};
-use twinstep_model::dynamics::{Inertia, Vec3};
 use twinstep_model::{RigidBody, RobotTree};
 use twinstep_simd::SimdFloat;
 
-use crate::structure::JointAxis;
+use super::structure::{JointAxis, TreeStructure};
 
 /// Place of a frame in another one.
 #[derive(Clone, Copy, Debug)]
@@ -63,6 +65,8 @@ impl<T: SimdFloat> Place<T> {
 /// Parameters of a batch of robots, one per lane.
 #[derive(Clone, Debug)]
 pub struct TreeParameters<T> {
+    /// Which body is where in the tree.
+    pub structure: Arc<TreeStructure>,
     /// Inertia of each body about the origin of its frame.
     pub bodies: Vec<Inertia<T>>,
     /// Place of the frame of each joint's body in that of its parent, at position 0. The frames of the robot are made parallel first.
@@ -77,6 +81,7 @@ impl<T: SimdFloat> TreeParameters<T> {
         let empty = RigidBody { mass: 0.0, com: DVec3::ZERO, inertia: DMat3::ZERO };
         let joints = robot.joints.len();
         let mut parameters = Self {
+            structure: Arc::new(TreeStructure::new(robot)),
             bodies: vec![Inertia::splat(&empty); joints + 1],
             places: vec![Place::identity(); joints],
             armature: vec![T::splat(0.0); joints],
@@ -104,6 +109,16 @@ impl<T: SimdFloat> TreeParameters<T> {
     }
 }
 
+/// Returns the rotation from the frame of each body in the robot to its frame in the batch.
+pub fn batch_from_bodies(robot: &RobotTree) -> Vec<DMat3> {
+    let mut parallel = vec![DMat3::IDENTITY];
+    for joint in &robot.joints {
+        parallel.push(parallel[joint.parent] * joint.parent_from_child.matrix3);
+    }
+    let turns = turns(&robot.with_parallel_frames());
+    turns.iter().zip(parallel).map(|(turn, parallel)| turn.transpose() * parallel).collect()
+}
+
 /// Returns the rotation from the frame of each body in the batch to its frame in the robot: see [`JointAxis`].
 fn turns(robot: &RobotTree) -> Vec<DMat3> {
     let of_joints = robot.joints.iter().map(|joint| match JointAxis::of(joint.axis) {
@@ -111,44 +126,4 @@ fn turns(robot: &RobotTree) -> Vec<DMat3> {
         JointAxis::Turned => DMat3::from_quat(DQuat::from_rotation_arc(DVec3::Z, joint.axis)),
     });
     std::iter::once(DMat3::IDENTITY).chain(of_joints).collect()
-}
-
-/// Positions and velocities of a batch of robots, one per lane.
-#[derive(Clone, Debug)]
-pub struct TreeState<T> {
-    /// Base origin in the world frame [m].
-    pub position: Vec3<T>,
-    /// World-from-base, w x y z.
-    pub orientation: [T; 4],
-    /// Velocity of the base origin in the world frame [m/s].
-    pub linear_velocity: Vec3<T>,
-    /// Angular velocity in the base frame [rad/s].
-    pub angular_velocity: Vec3<T>,
-    /// Joint positions [rad or m].
-    pub q: Vec<T>,
-    /// Joint velocities [rad/s or m/s].
-    pub dq: Vec<T>,
-}
-
-impl<T: SimdFloat> TreeState<T> {
-    /// Returns the state at the world's origin, upright and at rest, with all joints at 0.
-    pub fn origin(num_joints: usize) -> Self {
-        let (zero, one) = (T::splat(0.0), T::splat(1.0));
-        Self {
-            position: Vec3::zero(),
-            orientation: [one, zero, zero, zero],
-            linear_velocity: Vec3::zero(),
-            angular_velocity: Vec3::zero(),
-            q: vec![zero; num_joints],
-            dq: vec![zero; num_joints],
-        }
-    }
-
-    /// Returns the z axis of the world in base coordinates.
-    #[inline(always)]
-    pub fn upward(&self) -> Vec3<T> {
-        let [w, x, y, z] = self.orientation;
-        let (one, two) = (T::splat(1.0), T::splat(2.0));
-        Vec3([two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)])
-    }
 }

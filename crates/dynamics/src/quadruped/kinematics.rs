@@ -1,8 +1,9 @@
 //! Kinematic tree of the Go2: inertial parameters, geometry, state and poses of its bodies.
 
-use super::spatial::{Inertia, Vec3};
-use crate::{LegModel, RobotModel};
+use twinstep_model::{LegModel, RobotModel};
 use twinstep_simd::SimdFloat;
+
+use crate::{Inertia, Vec3};
 
 /// Inertial parameters and geometry of a batch of robots, one per lane.
 ///
@@ -51,50 +52,6 @@ impl<T: SimdFloat> KinematicTree<T> {
         for (armature, joint) in self.armature.iter_mut().zip(&robot.joints) {
             armature.set(lane, joint.armature);
         }
-    }
-}
-
-/// Positions and velocities of a batch of robots, one per lane.
-#[derive(Clone, Copy, Debug)]
-pub struct State<T> {
-    /// Base origin in the world frame [m].
-    pub position: Vec3<T>,
-    /// World-from-base, w x y z.
-    pub orientation: [T; 4],
-    /// Velocity of the base origin in the world frame [m/s].
-    pub linear_velocity: Vec3<T>,
-    /// Angular velocity in the base frame [rad/s].
-    pub angular_velocity: Vec3<T>,
-    /// Joint positions [rad].
-    pub q: [T; 12],
-    /// Joint velocities [rad/s].
-    pub dq: [T; 12],
-}
-
-impl<T: SimdFloat> State<T> {
-    /// Returns the state at the world's origin, upright and at rest, with all joints at 0.
-    pub fn origin() -> Self {
-        let (zero, one) = (T::splat(0.0), T::splat(1.0));
-        Self {
-            position: Vec3::zero(),
-            orientation: [one, zero, zero, zero],
-            linear_velocity: Vec3::zero(),
-            angular_velocity: Vec3::zero(),
-            q: [zero; 12],
-            dq: [zero; 12],
-        }
-    }
-
-    /// Returns the axes of the world frame in base coordinates.
-    #[inline(always)]
-    pub fn world_axes(&self) -> [Vec3<T>; 3] {
-        let [w, x, y, z] = self.orientation;
-        let (one, two) = (T::splat(1.0), T::splat(2.0));
-        [
-            Vec3([one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)]),
-            Vec3([two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)]),
-            Vec3([two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)]),
-        ]
     }
 }
 
@@ -160,6 +117,16 @@ impl<T: SimdFloat> LegFrames<T> {
         self.origins[2] + point.rotate_y(self.calf_angle).rotate_x(self.hip_angle)
     }
 
+    /// Returns the position in the base frame of a point given in the frame of hip (0), thigh (1) or calf (2) [m].
+    #[inline(always)]
+    pub fn point(&self, body: usize, point: Vec3<T>) -> Vec3<T> {
+        match body {
+            0 => self.origins[0] + point.rotate_x(self.hip_angle),
+            1 => self.origins[1] + point.rotate_y(self.thigh_angle).rotate_x(self.hip_angle),
+            _ => self.calf_point(point),
+        }
+    }
+
     /// Returns the columns of the Jacobian [m/rad], in base axes, of the calf's point at `point` [m, base frame].
     #[inline(always)]
     pub fn calf_jacobian(&self, point: Vec3<T>) -> [Vec3<T>; 3] {
@@ -174,7 +141,7 @@ impl<T: SimdFloat> LegFrames<T> {
 /// Poses of the bodies of all legs.
 #[derive(Clone, Copy, Debug)]
 pub struct Frames<T> {
-    /// Legs, in the order of [`crate::Leg::ALL`].
+    /// Legs, in the order of [`twinstep_model::Leg::ALL`].
     pub legs: [LegFrames<T>; 4],
 }
 

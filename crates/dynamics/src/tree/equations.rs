@@ -1,10 +1,10 @@
 //! Equations of motion `M a + bias = τ`: recursive Newton–Euler algorithm and composite-rigid-body algorithm.
 
-use twinstep_model::dynamics::{Inertia, Vec3, spatial_matrix};
+use crate::{Inertia, Vec3, spatial_matrix};
 use twinstep_simd::SimdFloat;
 
-use crate::motion::{Spatial, TreeMotion, times};
-use crate::{TreeParameters, TreeState, TreeStructure};
+use super::motion::{Spatial, TreeMotion, times};
+use super::{TreeParameters, TreeState, TreeStructure};
 
 /// Accelerations of base and joints.
 #[derive(Clone, Debug)]
@@ -40,7 +40,7 @@ pub fn inverse_dynamics<T: SimdFloat>(
     acceleration: &TreeAcceleration<T>,
     gravity: T,
 ) -> TreeForces<T> {
-    let proper = state.upward().scaled(gravity) + acceleration.linear;
+    let proper = state.world_axes()[2].scaled(gravity) + acceleration.linear;
     let mut accelerations = vec![Spatial { angular: acceleration.angular, linear: proper }];
     let mut forces = vec![force(&motion.inertias[0], motion.velocities[0], accelerations[0])];
     for joint in 0..structure.num_joints() {

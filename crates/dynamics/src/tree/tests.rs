@@ -2,13 +2,12 @@
 
 use glam::{DAffine3, DQuat, DVec3, dvec3};
 use proptest::prelude::*;
-use twinstep_model::dynamics::Vec3;
 use twinstep_model::{BaseMount, JointSpring, RigidBody, RobotTree, TreeBody, TreeJoint, TreeJointKind, go2};
 
-use crate::{
-    FactoredTree, TreeAcceleration, TreeLoad, TreeMotion, TreeParameters, TreeState, TreeStructure, inverse_dynamics,
-    mass_matrix,
+use super::{
+    FactoredTree, TreeAcceleration, TreeMotion, TreeParameters, TreeState, TreeStructure, inverse_dynamics, mass_matrix,
 };
+use crate::{JointForces, Vec3};
 
 const GRAVITY: f64 = 9.81;
 
@@ -91,8 +90,8 @@ impl Case {
             dq: values[7 + joints..].to_vec(),
             ..TreeState::origin(joints)
         };
-        let mut motion = TreeMotion::empty(&structure, &parameters);
-        motion.set(&structure, &parameters, &state);
+        let mut motion = TreeMotion::empty(&parameters);
+        motion.set(&parameters, &state);
         Self { structure, parameters, motion, state }
     }
 
@@ -135,9 +134,9 @@ proptest! {
         let case = Case::new(&tree, seed);
         let Case { structure, parameters, motion, state } = &case;
         let joints = structure.num_joints();
-        let load = TreeLoad { gravity: GRAVITY, tau: numbers(seed + 1, joints), damping: vec![0.0; joints] };
-        let mut factored = FactoredTree::empty(structure, parameters);
-        factored.set_up(structure, parameters, motion, state, &load, 1.0);
+        let load = JointForces::frictionless(numbers(seed + 1, joints));
+        let mut factored = FactoredTree::empty(parameters);
+        factored.set_up(parameters, motion, state, &load, 1.0, GRAVITY);
         let mut ddq = vec![0.0; joints];
         let base = factored.solution(structure, &mut ddq);
         let acceleration: Vec<f64> = base.into_iter().take(structure.num_base_velocities()).chain(ddq).collect();
@@ -153,9 +152,9 @@ proptest! {
         let case = Case::new(&tree, seed);
         let Case { structure, parameters, motion, state } = &case;
         let joints = structure.num_joints();
-        let load = TreeLoad { gravity: GRAVITY, tau: vec![0.0; joints], damping: vec![0.0; joints] };
-        let mut factored = FactoredTree::empty(structure, parameters);
-        factored.set_up(structure, parameters, motion, state, &load, 1.0);
+        let load = JointForces::frictionless(vec![0.0; joints]);
+        let mut factored = FactoredTree::empty(parameters);
+        factored.set_up(parameters, motion, state, &load, 1.0, GRAVITY);
         let body = seed as usize % (joints + 1);
         let branch = &structure.branches[body];
         let (base, mut along) = ([0.3, -0.2, 0.5, 0.1, 0.7, -0.4], numbers(seed, branch.len()));
@@ -180,8 +179,8 @@ fn go2_has_the_mass_matrix_of_its_own_equations() {
     let case = Case::new(&tree, 3);
     let matrix = mass_matrix(&case.structure, &case.parameters, &case.motion);
     let q: [f64; 12] = case.state.q.clone().try_into().expect("twelve joints");
-    let own = twinstep_model::dynamics::KinematicTree::<f64>::splat(&go2());
-    let expected = twinstep_model::dynamics::mass_matrix(&own, &q);
+    let own = crate::quadruped::KinematicTree::<f64>::splat(&go2());
+    let expected = crate::quadruped::mass_matrix(&own, &q);
     for (row, expected) in matrix.iter().zip(expected) {
         for (entry, expected) in row.iter().zip(expected) {
             assert!((entry - expected).abs() < 1e-12, "{entry} {expected}");

@@ -1,6 +1,6 @@
 //! Coefficients of the laws of actuators and joints, and the effects that they activate.
 
-use crate::{ActuatorParams, JointModel};
+use twinstep_model::{ActuatorParams, JointModel};
 use twinstep_simd::SimdFloat;
 
 /// Stiffness of a gear with backlash for which the model gives no stiffness [N·m/rad].
@@ -103,7 +103,7 @@ pub struct ActiveEffects {
 
 impl ActiveEffects {
     /// Returns the effects that one of the joints has in at least one lane.
-    pub fn of<T: SimdFloat>(coefficients: &[Coefficients<T>; 12]) -> Self {
+    pub fn of<T: SimdFloat>(coefficients: &[Coefficients<T>]) -> Self {
         let (zero, one, mut active) = (T::splat(0.0), T::splat(1.0), Self::default());
         for n in coefficients {
             active.command_delay |= zero.any_lt(n.command_delay);

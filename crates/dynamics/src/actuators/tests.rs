@@ -2,8 +2,8 @@
 
 use proptest::prelude::*;
 
-use super::super::{SimdActuators, SimdCommands};
-use crate::{ActuatorParams, Command, JointModel, NUM_JOINTS, Ripple, RobotModel, Stribeck, go2};
+use super::{JointForces, SimdActuators, SimdCommands, link_armature};
+use twinstep_model::{ActuatorParams, Command, JointModel, NUM_JOINTS, Ripple, RobotModel, Stribeck, go2};
 
 /// Number of physics steps per actuator period.
 const STEPS: usize = 5;
@@ -23,10 +23,21 @@ fn with_actuator(actuator: ActuatorParams) -> RobotModel {
 }
 
 /// Returns the actuators of one robot in double precision, with the joints at 0.
-fn actuator(robot: &RobotModel) -> SimdActuators<f64> {
-    let mut actuator = SimdActuators::new(robot, DT);
-    actuator.set(0, robot, &[0.0; NUM_JOINTS], &[0.0; NUM_JOINTS]);
+fn actuator(robot: &RobotModel) -> SimdActuators<f64, [f64; NUM_JOINTS]> {
+    let mut actuator = SimdActuators::new(&robot.joints, robot.control.actuator_dt(), DT);
+    actuator.set(0, &robot.joints, &[0.0; NUM_JOINTS], &[0.0; NUM_JOINTS]);
     actuator
+}
+
+/// Returns torque and friction of a physics step.
+fn forces(
+    actuator: &mut SimdActuators<f64, [f64; NUM_JOINTS]>,
+    index: usize,
+    q: &[f64; NUM_JOINTS],
+    dq: &[f64; NUM_JOINTS],
+) -> JointForces<[f64; NUM_JOINTS]> {
+    actuator.step(index, q, dq);
+    *actuator.forces()
 }
 
 fn torque(tau_ff: f64) -> Command {
@@ -42,7 +53,7 @@ fn simulate(robot: &RobotModel, commands: impl IntoIterator<Item = Command>, q: 
     let mut torques = Vec::new();
     for command in commands {
         actuator.update_command(&SimdCommands::new(&[command]), &q, &dq);
-        torques.extend((0..STEPS).map(|index| actuator.step(index, &q, &dq).tau[0]));
+        torques.extend((0..STEPS).map(|index| forces(&mut actuator, index, &q, &dq).tau[0]));
     }
     torques
 }
@@ -140,7 +151,7 @@ proptest! {
         let robot = with_actuator(ActuatorParams { gain: 0.9, ripple, ..ActuatorParams::IDEAL });
         let mut actuator = actuator(&robot);
         actuator.update_command(&SimdCommands::new(&[torque(tau)]), &[q; NUM_JOINTS], &[0.0; NUM_JOINTS]);
-        let output = actuator.step(0, &[q; NUM_JOINTS], &[0.0; NUM_JOINTS]).tau[0];
+        let output = forces(&mut actuator, 0, &[q; NUM_JOINTS], &[0.0; NUM_JOINTS]).tau[0];
         let tau = f64::from(tau as f32);
         prop_assert!((output - 0.9 * tau - 0.3 * (14.0 * q + 0.4).sin()).abs() < 1e-9);
         prop_assert!((actuator.estimated_torque()[0] - tau).abs() < 1e-12);
@@ -155,7 +166,7 @@ proptest! {
         });
         let mut actuator = actuator(&robot);
         actuator.update_command(&SimdCommands::new(&[torque(tau)]), &[0.0; NUM_JOINTS], &[dq; NUM_JOINTS]);
-        let dry = actuator.step(0, &[0.0; NUM_JOINTS], &[dq; NUM_JOINTS]).dry_friction[0];
+        let dry = forces(&mut actuator, 0, &[0.0; NUM_JOINTS], &[dq; NUM_JOINTS]).dry_friction[0];
         let expected = 0.2 + 0.5 * (-(dq / 0.3).powi(2)).exp() + 0.1 * f64::from(tau as f32).abs();
         prop_assert!((dry - expected).abs() < 1e-9, "{dry} N·m, {expected} expected");
     }
@@ -166,7 +177,7 @@ fn derating_factor_multiplies_the_torque() {
     let mut actuator = actuator(&go2());
     actuator.set_derating(0, &[0.7; NUM_JOINTS]);
     actuator.update_command(&SimdCommands::new(&[torque(4.0)]), &[0.0; NUM_JOINTS], &[0.0; NUM_JOINTS]);
-    assert!((actuator.step(0, &[0.0; NUM_JOINTS], &[0.0; NUM_JOINTS]).tau[0] - 2.8).abs() < 1e-6);
+    assert!((forces(&mut actuator, 0, &[0.0; NUM_JOINTS], &[0.0; NUM_JOINTS]).tau[0] - 2.8).abs() < 1e-6);
 }
 
 #[test]
@@ -178,7 +189,7 @@ fn encoder_offset_shifts_the_position_error() {
 
 #[test]
 fn spring_torque_is_proportional_to_the_distance_from_rest() {
-    let robot = robot(|joint| joint.spring = crate::JointSpring { stiffness: 3.0, torque_offset: 3.0 * 0.5 });
+    let robot = robot(|joint| joint.spring = twinstep_model::JointSpring { stiffness: 3.0, torque_offset: 3.0 * 0.5 });
     assert!((once(&robot, 0.0, 0.2, 0.0) - 3.0 * (0.5 - 0.2)).abs() < 1e-9);
 }
 
@@ -188,9 +199,10 @@ fn rotor_with_an_elastic_gear_oscillates_at_its_natural_frequency() {
     let robot = with_actuator(ActuatorParams { gear_stiffness: 300.0, ..ActuatorParams::IDEAL });
     let mut actuator = actuator(&robot);
     // No rotor inertia moves with the link.
-    assert_eq!(actuator.set(0, &robot, &[0.0; NUM_JOINTS], &[1.0; NUM_JOINTS]), [0.0; NUM_JOINTS]);
+    actuator.set(0, &robot.joints, &[0.0; NUM_JOINTS], &[1.0; NUM_JOINTS]);
+    assert!(robot.joints.iter().all(|joint| link_armature(joint) == 0.0));
     let zero = [0.0; NUM_JOINTS];
-    let transmitted: Vec<f64> = (0..2000).map(|_| actuator.step(0, &zero, &zero).tau[0]).collect();
+    let transmitted: Vec<f64> = (0..2000).map(|_| forces(&mut actuator, 0, &zero, &zero).tau[0]).collect();
     let crossings = transmitted.windows(2).filter(|pair| pair[0] < 0.0 && pair[1] >= 0.0).count();
     let expected = (300.0 / robot.joints[0].armature).sqrt() / std::f64::consts::TAU * 2.0;
     assert!((crossings as f64 - expected).abs() <= 1.0, "{crossings} periods in 2 s, {expected} expected");
@@ -209,10 +221,10 @@ fn rotor_moves_with_a_link_of_constant_speed() {
     let robot = with_actuator(ActuatorParams { gear_stiffness: 300.0, ..ActuatorParams::IDEAL });
     let speed = 5.0;
     for (mut actuator, lead) in [(actuator(&robot), 0.5 * DT), (actuator(&robot).with_sampled_positions(), 0.0)] {
-        actuator.set(0, &robot, &[0.0; NUM_JOINTS], &[speed as f32; NUM_JOINTS]);
+        actuator.set(0, &robot.joints, &[0.0; NUM_JOINTS], &[speed as f32; NUM_JOINTS]);
         for step in 0..100 {
             let link = speed * (DT * f64::from(step) + lead);
-            let transmitted = actuator.step(0, &[link; NUM_JOINTS], &[speed; NUM_JOINTS]).tau[0];
+            let transmitted = forces(&mut actuator, 0, &[link; NUM_JOINTS], &[speed; NUM_JOINTS]).tau[0];
             assert!(transmitted.abs() < 1e-9, "{transmitted} N·m");
         }
         let (q, dq) = actuator.encoder_reading(0, f64::NAN, f64::NAN);
@@ -227,9 +239,9 @@ fn rotor_accelerates_freely_inside_the_backlash() {
     let mut actuator = actuator(&robot);
     let zero = [0.0; NUM_JOINTS];
     let torque = [1.0; NUM_JOINTS];
-    actuator.set_torque(torque);
+    actuator.set_torque(&torque);
     for index in 0..20 {
-        assert_eq!(actuator.step(index % STEPS, &zero, &zero).tau[0], 0.0);
+        assert_eq!(forces(&mut actuator, index % STEPS, &zero, &zero).tau[0], 0.0);
     }
     let (q, dq) = actuator.encoder_reading(0, 0.0, 0.0);
     let (time, acceleration) = (20.0 * DT, 1.0 / robot.joints[0].armature);
@@ -242,9 +254,9 @@ fn gear_transmits_no_torque_inside_its_backlash() {
     let robot = with_actuator(ActuatorParams { backlash: 0.02, ..ActuatorParams::IDEAL });
     let mut actuator = actuator(&robot);
     let inside = |twist: f64| [-twist; NUM_JOINTS];
-    assert_eq!(actuator.step(0, &inside(0.009), &[0.0; NUM_JOINTS]).tau[0], 0.0);
+    assert_eq!(forces(&mut actuator, 0, &inside(0.009), &[0.0; NUM_JOINTS]).tau[0], 0.0);
     // The tolerance is for the rotor's motion within the step.
-    let transmitted = actuator.step(0, &inside(0.011), &[0.0; NUM_JOINTS]).tau[0];
+    let transmitted = forces(&mut actuator, 0, &inside(0.011), &[0.0; NUM_JOINTS]).tau[0];
     assert!((transmitted / (2000.0 * 0.001) - 1.0).abs() < 0.05, "{transmitted} N·m");
 }
 

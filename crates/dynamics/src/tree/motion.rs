@@ -1,12 +1,12 @@
 //! Places, joint axes, inertias and velocities of all bodies, in base axes at the base's origin.
 
+use crate::{Inertia, Vec3};
 use twinstep_model::TreeJointKind;
-use twinstep_model::dynamics::{Inertia, Vec3};
 use twinstep_simd::SimdFloat;
 
-use crate::parameters::Place;
-use crate::structure::JointAxis;
-use crate::{TreeParameters, TreeState, TreeStructure};
+use super::parameters::Place;
+use super::structure::JointAxis;
+use super::{TreeParameters, TreeState};
 
 /// Angular and linear part of a motion, or moment and force of a wrench, at the base's origin.
 #[derive(Clone, Copy, Debug)]
@@ -70,8 +70,8 @@ pub struct TreeMotion<T> {
 
 impl<T: SimdFloat> TreeMotion<T> {
     /// Returns a placeholder for [`TreeMotion::set`], to be used in every step.
-    pub fn empty(structure: &TreeStructure, parameters: &TreeParameters<T>) -> Self {
-        let joints = structure.num_joints();
+    pub fn empty(parameters: &TreeParameters<T>) -> Self {
+        let joints = parameters.structure.num_joints();
         Self {
             places: vec![Place::identity(); joints + 1],
             axes: vec![Spatial::zero(); joints],
@@ -82,7 +82,8 @@ impl<T: SimdFloat> TreeMotion<T> {
 
     /// Computes everything for a state.
     #[inline(always)]
-    pub fn set(&mut self, structure: &TreeStructure, parameters: &TreeParameters<T>, state: &TreeState<T>) {
+    pub fn set(&mut self, parameters: &TreeParameters<T>, state: &TreeState<T>) {
+        let structure = &*parameters.structure;
         self.velocities[0] = Spatial { angular: state.angular_velocity, linear: Vec3::zero() };
         self.inertias[0] = parameters.bodies[0];
         for joint in 0..structure.num_joints() {

@@ -1,4 +1,0 @@
-//! Tests of the SIMD dynamics in double precision.
-
-mod actuators;
-mod equations;
