@@ -95,7 +95,7 @@ impl SimEnvFactory {
             Some(learned) => learned.robot.clone(),
             None => file.robot_model().expect("the model file was checked when it was read"),
         };
-        config.sim.check(&robot.control).map_err(BackendBuildError::Config)?;
+        config.sim.check(robot.control.actuator_hz).map_err(BackendBuildError::Config)?;
         let seed = config.server.seed.unwrap_or_else(random_u64);
         let robots = if config.randomise.effects { Some(RobotSampler::new(file)?) } else { None };
         let base = match &config.task {

@@ -39,6 +39,7 @@ const MAY_USE: [(&str, &[&str]); 29] = [
         &[
             "simd",
             "model",
+            "robot-files",
             "effects",
             "logs",
             "protocol",

@@ -14,8 +14,8 @@ const MODULE: &str = "twinstep.baseline_simulators";
 /// Setup of the baseline simulators: the same robots and the same motion as for Twinstep.
 #[derive(Serialize)]
 pub struct Setup {
-    /// MuJoCo models with a position actuator, by their rate [Hz].
-    pub models: std::collections::BTreeMap<u32, String>,
+    /// MuJoCo models with position actuators and a keyframe, by the name of the baseline.
+    pub models: std::collections::BTreeMap<String, String>,
     /// Numbers of threads of EnvPool, with one baseline for each.
     pub threads: Vec<usize>,
     /// Joint position targets of each policy period of the motion [rad].
@@ -24,6 +24,8 @@ pub struct Setup {
     pub actions: Vec<Vec<f32>>,
     /// Policy period [s].
     pub policy_dt: f64,
+    /// True if the robots start anew before each cycle of the motion.
+    pub restarts: bool,
     /// Number of robots.
     pub num_envs: usize,
     /// Length of a window [s].

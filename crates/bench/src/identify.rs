@@ -172,11 +172,12 @@ fn setup(log: &Log, window_s: f64) -> Setup {
         JOINT_NAMES.iter().zip(control.default_pose).map(command).collect()
     };
     Setup {
-        models: [(hz, model)].into(),
+        models: [(format!("mujoco {hz}"), model)].into(),
         threads: Vec::new(),
         targets: (0..periods).map(target).collect(),
         actions: Vec::new(),
         policy_dt: control.actuator_dt(),
+        restarts: false,
         num_envs: MUJOCO_ROBOTS,
         window_s,
     }

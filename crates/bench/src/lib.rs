@@ -10,6 +10,7 @@ pub mod identify;
 mod link;
 pub mod remote;
 pub mod remote_training;
+pub mod robots;
 pub mod sim;
 pub mod tcp;
 pub mod throughput;

@@ -69,7 +69,7 @@ const ENVS_HZ: u32 = 1000;
 /// Number of robots in the comparison of one and two cores.
 const MANY: usize = 1024;
 /// Number of robots in the other speed measurements.
-const ROBOTS: usize = 64;
+pub(crate) const ROBOTS: usize = 64;
 /// Initial height of the base [m], from which the robots drop by some millimetres onto their feet.
 const START_HEIGHT: f32 = 0.335;
 /// Number of actuator periods of the second over which accuracy is measured.
@@ -228,7 +228,7 @@ fn alternately(
 }
 
 /// Measures env-steps/s of `once`, which steps [`ROBOTS`] robots, and of a baseline, in alternate windows.
-fn compare_with_baseline(
+pub(crate) fn compare_with_baseline(
     mut once: impl FnMut() -> Result<(), BenchError>,
     baselines: &mut Baselines,
     baseline: &str,
@@ -250,7 +250,7 @@ fn setup(window_s: f64) -> Setup {
     let model = |physics_hz: u32| {
         let actuator = MjcfActuator::Position { kp: f64::from(KP), kd: f64::from(KD) };
         let timestep = 1.0 / f64::from(physics_hz);
-        (physics_hz, mjcf(&go2(), &MjcfOptions { timestep, actuator, ..MjcfOptions::default() }))
+        (format!("mujoco {physics_hz}"), mjcf(&go2(), &MjcfOptions { timestep, actuator, ..MjcfOptions::default() }))
     };
     Setup {
         models: MUJOCO_HZ.into_iter().map(model).collect(),
@@ -258,6 +258,7 @@ fn setup(window_s: f64) -> Setup {
         targets: (0..CYCLE).map(|period| trot_target(period * control.decimation).to_vec()).collect(),
         actions: (0..CYCLE).map(|period| trot::action(period as f32 * control.policy_dt() as f32).to_vec()).collect(),
         policy_dt: control.policy_dt(),
+        restarts: false,
         num_envs: ROBOTS,
         window_s,
     }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use twinstep_bench::{
-    BenchError, Machine, Results, ensemble, identify, remote, remote_training, sim, tcp, transport, view,
+    BenchError, Machine, Results, ensemble, identify, remote, remote_training, robots, sim, tcp, transport, view,
 };
 
 use crate::exit::{CommandResult, Failure, Signals, other};
@@ -36,6 +36,8 @@ enum What {
     Transport,
     /// Physics: env-steps/s on one core at each setting, and accuracy, compared with MuJoCo and EnvPool.
     Sim,
+    /// Robots of any tree: env-steps/s on one core, compared with MuJoCo.
+    Robots,
     /// Environments with physics over Zenoh, and training on them by rollouts, compared with the same in process.
     Remote,
     /// Identification: closed-loop rollouts of the built-in recording compared with MuJoCo, and one whole run.
@@ -68,6 +70,9 @@ pub fn run(args: &Args) -> CommandResult {
     }
     if selected(What::Sim) {
         rows.extend(sim::measure(&args.python, args.window_s, &interrupted).map_err(failure)?);
+    }
+    if selected(What::Robots) {
+        rows.extend(robots::measure(&args.python, args.window_s, &interrupted).map_err(failure)?);
     }
     if selected(What::Remote) {
         rows.extend(remote::measure(args.window_s, &interrupted).map_err(failure)?);

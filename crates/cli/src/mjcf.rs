@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use twinstep_effects::is_robot_file;
 use twinstep_model::{BaseMount, MjcfOptions, go2, mjcf};
-use twinstep_robot_files::{QuadrupedNames, quadruped, read_robot, write_mjcf};
+use twinstep_robot_files::{QuadrupedNames, TreeMjcf, quadruped, read_robot, write_mjcf};
 
 use crate::exit::{CommandResult, Failure, input, other};
 use crate::robot_file::robot_model;
@@ -91,7 +91,7 @@ fn of_robot_file(path: &Path, options: &MjcfOptions) -> Result<String, Failure> 
             if options.base == BaseMount::Fixed {
                 tree.base = Some(BaseMount::Fixed);
             }
-            (write_mjcf(&tree, options.timestep), notes)
+            (write_mjcf(&tree, &TreeMjcf { timestep: options.timestep, ..TreeMjcf::default() }), notes)
         }
     };
     for note in notes {

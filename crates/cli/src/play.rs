@@ -76,7 +76,7 @@ pub fn run(args: &Args) -> CommandResult {
     let config = args.config();
     let motion = Log::open_commands(&args.motion).map_err(input)?;
     let replayed = at_log_rate(&motion, &robot).map_err(input)?;
-    config.check(&replayed.control).map_err(input)?;
+    config.check(replayed.control.actuator_hz).map_err(input)?;
     let at_rate = |learned: ActuatorNetworkRobot| learned.at_rate(replayed.control.actuator_hz);
     let learned = learned.map(at_rate).transpose().map_err(input)?;
     let actuators = || learned.as_ref().map(|learned| Box::new(learned.actuators(1, false)) as Box<dyn Actuator>);
@@ -168,7 +168,7 @@ pub fn play(
 }
 
 fn source(robot: &RobotModel, config: SimConfig) -> String {
-    let config = config.at_actuator_rate(&robot.control);
+    let config = config.at_actuator_rate(robot.control.actuator_hz);
     let (physics_hz, solver_iterations) = (config.physics_hz(), config.solver_iterations());
     let engine = match config.engine {
         Engine::Rapier => "rapier",

@@ -100,7 +100,7 @@ impl ActuatorReplay<'_> {
         let (robot, t) = (self.robot, &self.log.t()[rows.clone()]);
         let (conditions, tree) = (OperatingConditions::of(self.log), KinematicTree::splat(robot));
         let mut actuator = SimdActuators::new(&robot.joints, robot.control.actuator_dt(), robot.control.actuator_dt());
-        actuator.set(0, &robot.joints, &self.sampled(rows.start).0.map(|q| q as f32), &[0.0; NUM_JOINTS]);
+        actuator.set(0, &robot.joints, &self.sampled(rows.start).0, &[0.0; NUM_JOINTS]);
         // Torque at the sensor in each actuator period since the start of the range [N·m].
         let mut history: Vec<[f64; NUM_JOINTS]> = Vec::new();
         for row in rows.start..rows.end - 1 {

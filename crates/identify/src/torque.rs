@@ -170,7 +170,7 @@ impl MeasuredTorque {
             };
             if row.after_reset {
                 actuator = SimdActuators::new(&robot.joints, robot.control.actuator_dt(), dt);
-                actuator.set(0, &robot.joints, &at(0.0)[0].map(|q| q as f32), &[0.0; NUM_JOINTS]);
+                actuator.set(0, &robot.joints, &at(0.0)[0], &[0.0; NUM_JOINTS]);
                 torques.clear();
                 if let Some(external) = &mut external {
                     external.reset(0, 0);

@@ -3,18 +3,48 @@
 use std::fmt::Write as _;
 
 use glam::{DAffine3, DMat3, DQuat, DVec3};
-use twinstep_model::{BaseMount, RobotTree, TreeJoint, TreeJointKind, TreeShape, TreeShapeKind};
+use twinstep_model::{
+    BaseMount, MjcfActuator, RobotTree, TreeJoint, TreeJointKind, TreeModel, TreeShape, TreeShapeKind,
+};
 
-/// Returns the MuJoCo model (MJCF, XML) of a robot. Its actuators are motors: `ctrl` is the force of each joint that has
-/// actuators, in the order of the joints. A base with mass of which nothing says that it is fixed moves freely. `timestep` is that of
-/// the physics [s].
-pub fn write_mjcf(tree: &RobotTree, timestep: f64) -> String {
-    let mut writer = Writer { tree, text: String::new() };
+/// Settings of the MuJoCo model of a tree.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TreeMjcf {
+    /// Physics step [s].
+    pub timestep: f64,
+    /// Type of the actuators.
+    pub actuator: MjcfActuator,
+    /// Joint positions [rad or m] of the keyframe `start`, in which the lowest contact point of a free robot touches the ground; `None`
+    /// for no keyframe.
+    pub start: Option<Vec<f64>>,
+}
+
+impl Default for TreeMjcf {
+    /// 1 kHz, torque control, no keyframe.
+    fn default() -> Self {
+        Self { timestep: 0.001, actuator: MjcfActuator::Torque, start: None }
+    }
+}
+
+/// Returns the MuJoCo model (MJCF, XML) of a robot on flat ground.
+///
+/// There is an actuator for each joint that has actuators, in the order of the joints. A base with mass of which nothing says that it is
+/// fixed moves freely. The contact points are those of the batch engine: spheres, ends of capsules and corners of boxes. There is no
+/// self-collision. Contacts have MuJoCo's defaults.
+pub fn write_mjcf(tree: &RobotTree, options: &TreeMjcf) -> String {
+    let mut writer = Writer { tree, actuator: options.actuator, text: String::new() };
+    let timestep = options.timestep;
     let name = escaped(&tree.name);
     writer.line(0, &format!("<mujoco model=\"{name}\">"));
     writer.line(1, "<compiler angle=\"radian\" autolimits=\"true\"/>");
-    writer.line(1, &format!("<option timestep=\"{timestep}\"/>"));
+    writer
+        .line(1, &format!("<option timestep=\"{timestep}\" gravity=\"0 0 -9.81\" cone=\"elliptic\" impratio=\"30\"/>"));
+    // The shapes of the robot touch only the ground.
+    writer.line(1, "<default>");
+    writer.line(2, "<geom contype=\"0\" conaffinity=\"1\" condim=\"3\"/>");
+    writer.line(1, "</default>");
     writer.line(1, "<worldbody>");
+    writer.line(2, "<geom type=\"plane\" size=\"0 0 1\" contype=\"1\" conaffinity=\"0\"/>");
     writer.body(0, DVec3::ZERO, 2);
     writer.line(1, "</worldbody>");
     writer.line(1, "<actuator>");
@@ -22,12 +52,16 @@ pub fn write_mjcf(tree: &RobotTree, timestep: f64) -> String {
         writer.motor(joint);
     }
     writer.line(1, "</actuator>");
+    if let Some(q) = &options.start {
+        writer.keyframe(q);
+    }
     writer.line(0, "</mujoco>");
     writer.text
 }
 
 struct Writer<'a> {
     tree: &'a RobotTree,
+    actuator: MjcfActuator,
     text: String,
 }
 
@@ -140,18 +174,31 @@ impl Writer<'_> {
             TreeShapeKind::Mesh(_) => return,
         };
         let (size, place) = (numbers(&size), placed(DAffine3::from_translation(offset) * shape.body_from_shape));
-        self.line(depth, &format!("<geom type=\"{kind}\" size=\"{size}\"{place}/>"));
+        // Shapes that do not touch the ground in the batch engine do not touch it here.
+        let touches = if matches!(kind, "ellipsoid" | "cylinder") { " conaffinity=\"0\"" } else { "" };
+        self.line(depth, &format!("<geom type=\"{kind}\" size=\"{size}\"{place}{touches}/>"));
     }
 
     fn motor(&mut self, joint: &TreeJoint) {
         let name = escaped(&joint.name);
-        let limits = match joint.effort {
-            Some(effort) if effort.iter().all(|limit| limit.is_finite()) && effort[0] < effort[1] => {
-                format!(" ctrlrange=\"{}\"", numbers(&effort))
+        let limits =
+            joint.effort.filter(|effort| effort.iter().all(|limit| limit.is_finite()) && effort[0] < effort[1]);
+        let range = |key: &str| limits.map_or(String::new(), |effort| format!(" {key}=\"{}\"", numbers(&effort)));
+        let (kind, parameters) = match self.actuator {
+            MjcfActuator::Torque => ("motor", range("ctrlrange")),
+            MjcfActuator::Position { kp, kd } => {
+                ("position", format!(" kp=\"{kp}\" kv=\"{kd}\"{}", range("forcerange")))
             }
-            _ => String::new(),
         };
-        self.line(2, &format!("<motor name=\"{name}\" joint=\"{name}\"{limits}/>"));
+        self.line(2, &format!("<{kind} name=\"{name}\" joint=\"{name}\"{parameters}/>"));
+    }
+
+    fn keyframe(&mut self, q: &[f64]) {
+        let height = TreeModel::new(self.tree.clone()).standing_height(q);
+        let base = if self.is_free() { format!("0 0 {height} 1 0 0 0 ") } else { String::new() };
+        self.line(1, "<keyframe>");
+        self.line(2, &format!("<key name=\"start\" qpos=\"{base}{}\"/>", numbers(q)));
+        self.line(1, "</keyframe>");
     }
 }
 

@@ -1,7 +1,7 @@
 //! Settings of the simulation: the `[sim]` table of the server's config file.
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::{BaseMount, ControlConfig, Ground, HeightField};
+use twinstep_model::{BaseMount, Ground, HeightField};
 
 /// Maximum number of cells along a side of a height field: 4 MB.
 const MAX_CELLS: f32 = 1024.0;
@@ -210,8 +210,8 @@ impl SimConfig {
     /// Without a rate of its own the physics runs at the smallest multiple of the actuator rate that is not below the
     /// engine's recommended rate.
     #[must_use]
-    pub fn at_actuator_rate(self, control: &ControlConfig) -> Self {
-        let (actuator_hz, recommended) = (control.actuator_hz as u32, self.engine.recommended().0);
+    pub fn at_actuator_rate(self, actuator_hz: f64) -> Self {
+        let (actuator_hz, recommended) = (actuator_hz as u32, self.engine.recommended().0);
         let multiple = recommended.div_ceil(actuator_hz.max(1)) * actuator_hz;
         Self { physics_hz: Some(self.physics_hz.unwrap_or(multiple)), ..self }
     }
@@ -221,11 +221,11 @@ impl SimConfig {
         self.solver_iterations.unwrap_or(self.engine.recommended().1)
     }
 
-    /// Checks that every value is within its range for a robot with `control`.
-    pub fn check(&self, control: &ControlConfig) -> Result<(), SimConfigError> {
-        let actuator_hz = control.actuator_hz as u32;
+    /// Checks that every value is within its range for actuators of this rate [Hz].
+    pub fn check(&self, actuator_hz: f64) -> Result<(), SimConfigError> {
+        let physics_hz = self.at_actuator_rate(actuator_hz).physics_hz();
+        let actuator_hz = actuator_hz as u32;
         let reject = |field, value: String, allowed: String| Err(SimConfigError { field, value, allowed });
-        let physics_hz = self.at_actuator_rate(control).physics_hz();
         if !(actuator_hz..=20_000).contains(&physics_hz) || !physics_hz.is_multiple_of(actuator_hz) {
             let allowed = format!("a multiple of the actuator rate, {actuator_hz} Hz, up to 20000");
             return reject("physics_hz", physics_hz.to_string(), allowed);
@@ -247,8 +247,8 @@ impl SimConfig {
     }
 
     /// Returns the number of physics steps per actuator period.
-    pub fn steps_per_actuator_period(&self, control: &ControlConfig) -> usize {
-        self.physics_hz() as usize / control.actuator_hz as usize
+    pub fn steps_per_actuator_period(&self, actuator_hz: f64) -> usize {
+        self.physics_hz() as usize / actuator_hz as usize
     }
 }
 
@@ -261,7 +261,7 @@ mod tests {
     #[test]
     fn error_of_a_rate_that_is_not_a_multiple_lists_the_allowed_rates() {
         let config = SimConfig { physics_hz: Some(500), ..SimConfig::default() };
-        let error = config.check(&go2().control).expect_err("error").to_string();
+        let error = config.check(go2().control.actuator_hz).expect_err("error").to_string();
         assert_eq!(
             error,
             "`sim.physics_hz` = 500 is not allowed: a multiple of the actuator rate, 200 Hz, up to 20000"
@@ -271,7 +271,7 @@ mod tests {
     #[test]
     fn nan_slope_is_rejected() {
         let config = SimConfig { terrain: Terrain::SlopeRad(f32::NAN), ..SimConfig::default() };
-        assert!(config.check(&go2().control).is_err());
+        assert!(config.check(go2().control.actuator_hz).is_err());
     }
 
     const ROUGH: RoughTerrain = RoughTerrain { height_m: 0.05, cell_m: 0.25, size_m: 40.0, seed: 1 };
@@ -301,7 +301,7 @@ mod tests {
     fn error_of_rough_terrain_outside_its_range_has_the_allowed_range() {
         let error = |rough| {
             let config = SimConfig { terrain: Terrain::Rough(rough), ..SimConfig::default() };
-            config.check(&go2().control).expect_err("error").to_string()
+            config.check(go2().control.actuator_hz).expect_err("error").to_string()
         };
         let height = error(RoughTerrain { height_m: 0.5, ..ROUGH });
         assert_eq!(height, "`sim.terrain.rough.height_m` = 0.5 is not allowed: 0 to 0.3 m");
@@ -329,7 +329,7 @@ mod tests {
 
     #[test]
     fn error_of_steps_outside_their_range_has_the_allowed_range() {
-        let error = |text: &str| read(text).check(&go2().control).expect_err("invalid").to_string();
+        let error = |text: &str| read(text).check(go2().control.actuator_hz).expect_err("invalid").to_string();
         let high = error("terrain = { steps = { height_m = 0.4, tread_m = 0.3, seed = 1 } }");
         assert_eq!(high, "`sim.terrain.steps.height_m` = 0.4 is not allowed: 0 to 0.3 m");
         let short = error("terrain = { steps = { height_m = 0.1, tread_m = nan, seed = 1 } }");

@@ -20,7 +20,7 @@ mod robot_world;
 mod rollout;
 mod thread_pool;
 
-pub use batch::{BatchBackend, BatchSnapshot, SimdPrecision};
+pub use batch::{BatchBackend, BatchSnapshot, Placement, SimdPrecision, TreeCommand, TreeReadings, TreeSimulation};
 pub use config::{Engine, RoughTerrain, SimConfig, SimConfigError, StepTerrain, Terrain};
 pub use error::BackendBuildError;
 pub use mujoco::{MujocoBackend, MujocoPlant};

@@ -55,8 +55,8 @@ pub struct RobotSnapshot {
 impl RapierBackend {
     /// Creates `num_robots` robots that stand in their default pose.
     pub fn new(robot: RobotModel, config: SimConfig, num_robots: usize) -> Result<Self, BackendBuildError> {
-        config.check(&robot.control)?;
-        let config = config.at_actuator_rate(&robot.control);
+        config.check(robot.control.actuator_hz)?;
+        let config = config.at_actuator_rate(robot.control.actuator_hz);
         let pool = thread_pool(config.threads)?;
         let ground = config.terrain.ground();
         let ground_shapes = GroundShapes::new(&ground);
@@ -193,7 +193,7 @@ impl Backend for RapierBackend {
     fn step(&mut self, commands: &[Command], active: &[bool], actuator_periods: usize) -> Result<(), BackendError> {
         let robots = self.num_robots();
         check_lengths(commands, active, robots)?;
-        let steps = self.config.steps_per_actuator_period(&self.robot.control);
+        let steps = self.config.steps_per_actuator_period(self.robot.control.actuator_hz);
         for _ in 0..actuator_periods {
             self.actuator_period(commands, active, steps)?;
         }

@@ -36,7 +36,7 @@ pub struct BatchRollout {
 impl BatchRollout {
     /// Creates rollouts with the rates and threads of `config`. `robot` is the nominal robot.
     pub fn new(robot: &RobotModel, config: &SimConfig) -> Result<Self, BackendBuildError> {
-        config.check(&robot.control)?;
+        config.check(robot.control.actuator_hz)?;
         let pool = crate::thread_pool::thread_pool(config.threads)?;
         Ok(Self { robot: robot.clone(), config: *config, pool, actuators: None })
     }
@@ -60,7 +60,7 @@ impl BatchRollout {
         };
         let mut robot = self.robot.clone();
         robot.control.actuator_hz = jobs[0].robot.control.actuator_hz;
-        let config = SimConfig { base: jobs[0].base, ..self.config }.at_actuator_rate(&robot.control);
+        let config = SimConfig { base: jobs[0].base, ..self.config }.at_actuator_rate(robot.control.actuator_hz);
         let mut robots = batch_simulator(lanes, &robot, &config, &Ground::FLAT, &jobs[0].start, jobs.len());
         let mut start = RobotStates::new(jobs.len());
         let mut records: Vec<_> = jobs.iter().map(|job| RobotStates::new(job.commands.len() + 1)).collect();
@@ -69,7 +69,7 @@ impl BatchRollout {
             robots.read(robot, &mut start);
             record.copy_robot(0, &start, robot);
         }
-        let steps = config.steps_per_actuator_period(&robot.control);
+        let steps = config.steps_per_actuator_period(robot.control.actuator_hz);
         robots.remember(&jobs.iter().map(|job| job.history).collect::<Vec<_>>(), steps);
         match &self.actuators {
             Some(create) => {

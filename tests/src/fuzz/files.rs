@@ -11,7 +11,7 @@ use twinstep_identify::{EffectAtScope, GlobalSearch};
 use twinstep_logs::{Log, LogError};
 use twinstep_model::{BaseMount, Joint, MjcfOptions, go2, mjcf, stream};
 use twinstep_protocol::{Secret, keys};
-use twinstep_robot_files::{QuadrupedNames, RobotFileError, quadruped, read_robot, write_mjcf};
+use twinstep_robot_files::{QuadrupedNames, RobotFileError, TreeMjcf, quadruped, read_robot, write_mjcf};
 
 use super::format::{Format, Outcome, examples_in};
 use super::{log_examples, policies, weights_examples};
@@ -177,7 +177,7 @@ fn read_text(format: Format, text: &str, folder: &Path) -> Outcome {
         }
         Format::Urdf | Format::Mjcf => match read_robot(text, None) {
             Ok(file) => {
-                read_robot(&write_mjcf(&file.tree, 0.001), None)
+                read_robot(&write_mjcf(&file.tree, &TreeMjcf::default()), None)
                     .expect("a robot that was read can be written and read");
                 if let Ok((robot, _)) = quadruped(&file, &QuadrupedNames::default(), go2().control) {
                     assert!(mjcf(&robot, &MjcfOptions::default()).contains("<mujoco"), "the robot can be exported");

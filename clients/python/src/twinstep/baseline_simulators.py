@@ -26,8 +26,8 @@ def baselines(setup: dict[str, Any]) -> dict[str, Callable[[], Advance]]:
     """Return a function that prepares each installed baseline, by name."""
     found = dict[str, Callable[[], Advance]]()
     if installed("mujoco"):
-        for physics_hz, model in setup["models"].items():
-            found[f"mujoco {physics_hz}"] = lambda model=model: mujoco_trot(model, setup)
+        for name, model in setup["models"].items():
+            found[name] = lambda model=model: mujoco_trot(model, setup)
     if installed("envpool"):
         for threads in setup["threads"]:
             found[f"envpool {threads}"] = lambda threads=threads: envpool_trot(threads, setup)
@@ -57,7 +57,8 @@ def mujoco_trot(xml: str, setup: dict[str, Any]) -> Advance:
         nonlocal states
         # With one MjData, rollout uses one thread.
         trajectory, _ = rollout.rollout(model, data, states, control)
-        states = np.array(trajectory[:, -1])
+        if not setup["restarts"]:
+            states = np.array(trajectory[:, -1])
         return len(states) * len(targets)
 
     return advance

@@ -107,13 +107,13 @@ impl<T: SimdFloat, J: JointValues<T>> SimdActuators<T, J> {
     }
 
     /// Resets the actuators of one lane to those of `joints`, at positions `q` and velocities `dq` of the links and zero torque.
-    pub fn set(&mut self, lane: usize, joints: &[JointModel], q: &[f32], dq: &[f32]) {
+    pub fn set(&mut self, lane: usize, joints: &[JointModel], q: &[f64], dq: &[f64]) {
         for (index, joint) in joints.iter().enumerate() {
             self.coefficients[index].set(lane, joint, self.dt, self.actuator_dt);
             let state = &mut self.state;
             // The command history is the initial position, so a delayed first command starts from rest.
             for command in &mut state.commands {
-                command[0][index].set(lane, f64::from(q[index]) + joint.actuator.encoder_error(f64::from(dq[index])));
+                command[0][index].set(lane, q[index] + joint.actuator.encoder_error(dq[index]));
                 command[1][index].set(lane, 0.0);
                 command[2][index].set(lane, 0.0);
             }
@@ -121,8 +121,8 @@ impl<T: SimdFloat, J: JointValues<T>> SimdActuators<T, J> {
                 torque[index].set(lane, 0.0);
             }
             state.current[index].set(lane, 0.0);
-            state.rotor[0][index].set(lane, f64::from(q[index]));
-            state.rotor[1][index].set(lane, f64::from(dq[index]));
+            state.rotor[0][index].set(lane, q[index]);
+            state.rotor[1][index].set(lane, dq[index]);
             self.derating[index].set(lane, 1.0);
         }
         self.update_active_effects();

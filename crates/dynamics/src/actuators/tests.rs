@@ -221,7 +221,7 @@ fn rotor_moves_with_a_link_of_constant_speed() {
     let robot = with_actuator(ActuatorParams { gear_stiffness: 300.0, ..ActuatorParams::IDEAL });
     let speed = 5.0;
     for (mut actuator, lead) in [(actuator(&robot), 0.5 * DT), (actuator(&robot).with_sampled_positions(), 0.0)] {
-        actuator.set(0, &robot.joints, &[0.0; NUM_JOINTS], &[speed as f32; NUM_JOINTS]);
+        actuator.set(0, &robot.joints, &[0.0; NUM_JOINTS], &[speed; NUM_JOINTS]);
         for step in 0..100 {
             let link = speed * (DT * f64::from(step) + lead);
             let transmitted = forces(&mut actuator, 0, &[link; NUM_JOINTS], &[speed; NUM_JOINTS]).tau[0];

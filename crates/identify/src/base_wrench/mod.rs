@@ -90,7 +90,7 @@ impl MeasuredStance {
         }
         let tree = KinematicTree::splat(&robot);
         let mut actuators = SimdActuators::new(&robot.joints, robot.control.actuator_dt(), robot.control.actuator_dt());
-        actuators.set(0, &robot.joints, &robot.control.default_pose.map(|q| q as f32), &[0.0; NUM_JOINTS]);
+        actuators.set(0, &robot.joints, &robot.control.default_pose, &[0.0; NUM_JOINTS]);
         self.samples.iter().map(|sample| sample.error(&robot, &tree, &mut actuators, torque_errors)).collect()
     }
 }

@@ -1,7 +1,7 @@
 //! What the batch engine needs of a robot, beside its equations of motion.
 
 use glam::{DVec3, dvec3};
-use twinstep_model::{Contact, JointModel, RobotModel, TreeModel};
+use twinstep_model::{BaseMount, Contact, JointModel, RobotModel, TreeModel};
 
 /// Number of contact points of a leg: the foot, the distal end of the calf, the knee.
 const LEG_POINTS: usize = 3;
@@ -25,6 +25,8 @@ pub trait BatchRobot: Sync {
     fn joints(&self) -> &[JointModel];
     /// Returns the contact with the ground.
     fn contact(&self) -> &Contact;
+    /// Returns true if the base cannot move, however the simulation mounts it.
+    fn is_fixed(&self) -> bool;
     /// Returns the reading of the gyroscope at rest [rad/s].
     fn gyro_bias(&self) -> DVec3;
     /// Returns the points that touch the ground. Those of a body follow each other.
@@ -38,6 +40,10 @@ impl BatchRobot for RobotModel {
 
     fn contact(&self) -> &Contact {
         &self.contact
+    }
+
+    fn is_fixed(&self) -> bool {
+        false
     }
 
     fn gyro_bias(&self) -> DVec3 {
@@ -77,6 +83,10 @@ impl BatchRobot for TreeModel {
 
     fn contact(&self) -> &Contact {
         &self.contact
+    }
+
+    fn is_fixed(&self) -> bool {
+        self.tree.base == Some(BaseMount::Fixed)
     }
 
     fn gyro_bias(&self) -> DVec3 {

@@ -9,7 +9,7 @@
 //! - [`contact`], [`rows`] and [`ground`]: contacts, joint limits and joint friction as MuJoCo's soft constraints.
 //! - [`group`]: a [`robot_batch::RobotBatch`] is the state of the robots in one register.
 //! - [`simulator`]: steps batches on all cores, in the widest registers of the processor.
-//! - [`BatchBackend`]: the engine.
+//! - [`BatchBackend`]: the engine for quadrupeds. [`TreeSimulation`]: the engine for robots of any tree.
 //!
 //! The results are bitwise equal for any instruction set, batch size and number of threads; see
 //! [`twinstep_simd::SimdFloat`].
@@ -24,6 +24,7 @@ mod ground;
 mod robot_batch;
 mod rows;
 mod simulator;
+mod tree_simulation;
 
 use std::sync::Arc;
 
@@ -33,7 +34,9 @@ use twinstep_model::{
 };
 use twinstep_simd::InstructionSet;
 
+pub use robot_batch::Placement;
 pub use simulator::SimdPrecision;
+pub use tree_simulation::{TreeCommand, TreeReadings, TreeSimulation};
 
 use crate::BackendBuildError;
 use crate::rapier::{check_floating, check_lengths};
@@ -77,8 +80,8 @@ impl BatchBackend {
         num_robots: usize,
         precision: SimdPrecision,
     ) -> Result<Self, BackendBuildError> {
-        config.check(&robot.control)?;
-        let config = config.at_actuator_rate(&robot.control);
+        config.check(robot.control.actuator_hz)?;
+        let config = config.at_actuator_rate(robot.control.actuator_hz);
         check_tree(&robot)?;
         let pool = if config.threads == 1 { None } else { Some(crate::thread_pool::thread_pool(config.threads)?) };
         let ground = config.terrain.ground();
@@ -189,7 +192,7 @@ impl Backend for BatchBackend {
 
     fn step(&mut self, commands: &[Command], active: &[bool], actuator_periods: usize) -> Result<(), BackendError> {
         check_lengths(commands, active, self.num_robots())?;
-        let steps = self.config.steps_per_actuator_period(&self.robot.control);
+        let steps = self.config.steps_per_actuator_period(self.robot.control.actuator_hz);
         let Self { robots, states, actuator, pool, .. } = self;
         let pool = pool.as_deref();
         let mut finite = true;

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 use twinstep_dynamics::{JointValues, SimdActuators, SimdCommands, State, StepEquations, Vec3, link_armature};
-use twinstep_model::{BaseMount, Ground, HistoryStep, InitialState};
+use twinstep_model::{Ground, HistoryStep, InitialState};
 use twinstep_simd::SimdFloat;
 
 use super::actuator_input::ActuatorInput;
@@ -96,31 +96,45 @@ pub struct SensorReadings<T, J> {
 }
 
 /// State to which a robot is reset.
-#[derive(Clone, Copy, Debug)]
-pub struct Placement<'a> {
+#[derive(Clone, Debug, PartialEq)]
+pub struct Placement {
     /// Position of the base frame's origin in the world frame [m].
-    pub base_position: [f32; 3],
+    pub base_position: [f64; 3],
     /// Rotation world-from-base, `[w, x, y, z]`.
-    pub base_orientation: [f32; 4],
+    pub base_orientation: [f64; 4],
     /// Velocity of the base frame's origin, in the world frame [m/s].
-    pub base_linear_velocity: [f32; 3],
+    pub base_linear_velocity: [f64; 3],
     /// Angular velocity of the base, in the base frame [rad/s].
-    pub base_angular_velocity: [f32; 3],
+    pub base_angular_velocity: [f64; 3],
     /// Encoder readings of the joint positions [rad or m].
-    pub q: &'a [f32],
+    pub q: Vec<f64>,
     /// Joint velocities [rad/s or m/s].
-    pub dq: &'a [f32],
+    pub dq: Vec<f64>,
 }
 
-impl<'a> From<&'a InitialState> for Placement<'a> {
-    fn from(state: &'a InitialState) -> Self {
+impl Placement {
+    /// Returns the state at rest and upright at height `base_height` [m], with joints at `q` [rad or m].
+    pub fn at_rest(base_height: f64, q: Vec<f64>) -> Self {
         Self {
-            base_position: state.base_position,
-            base_orientation: state.base_orientation,
-            base_linear_velocity: state.base_linear_velocity,
-            base_angular_velocity: state.base_angular_velocity,
-            q: &state.q,
-            dq: &state.dq,
+            base_position: [0.0, 0.0, base_height],
+            base_orientation: [1.0, 0.0, 0.0, 0.0],
+            base_linear_velocity: [0.0; 3],
+            base_angular_velocity: [0.0; 3],
+            dq: vec![0.0; q.len()],
+            q,
+        }
+    }
+}
+
+impl From<&InitialState> for Placement {
+    fn from(state: &InitialState) -> Self {
+        Self {
+            base_position: state.base_position.map(f64::from),
+            base_orientation: state.base_orientation.map(f64::from),
+            base_linear_velocity: state.base_linear_velocity.map(f64::from),
+            base_angular_velocity: state.base_angular_velocity.map(f64::from),
+            q: state.q.map(f64::from).to_vec(),
+            dq: state.dq.map(f64::from).to_vec(),
         }
     }
 }
@@ -136,7 +150,7 @@ impl<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>> RobotBatch<T, E> {
         actuator_dt: f64,
         config: &SimConfig,
         ground: &Ground,
-        initial_state: &Placement<'_>,
+        initial_state: &Placement,
     ) -> Self {
         let (dt, num_joints) = (1.0 / f64::from(config.physics_hz()), robot.joints().len());
         let surface = surface::<T, E>(robot, config, ground, dt);
@@ -171,17 +185,14 @@ impl<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>> RobotBatch<T, E> {
     }
 
     /// Resets one robot to an initial state.
-    pub fn place(&mut self, lane: usize, robot: &E::Robot, initial_state: &Placement<'_>) {
+    pub fn place(&mut self, lane: usize, robot: &E::Robot, initial_state: &Placement) {
         E::set_robot(&mut self.parameters, lane, robot);
         // An initial state contains encoder readings.
         let joints = robot.joints().iter().enumerate();
-        let q: Vec<f32> = joints
-            .map(|(index, joint)| {
-                let dq = f64::from(initial_state.dq[index]);
-                initial_state.q[index] - joint.actuator.encoder_error(dq) as f32
-            })
+        let q: Vec<f64> = joints
+            .map(|(index, joint)| initial_state.q[index] - joint.actuator.encoder_error(initial_state.dq[index]))
             .collect();
-        self.actuator.set(lane, robot.joints(), &q, initial_state.dq);
+        self.actuator.set(lane, robot.joints(), &q, &initial_state.dq);
         for (armature, joint) in E::armature(&mut self.parameters).as_mut().iter_mut().zip(robot.joints()) {
             armature.set(lane, link_armature(joint));
         }
@@ -194,17 +205,17 @@ impl<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>> RobotBatch<T, E> {
         let half = 0.5 * self.dt.get(lane);
         let moving = self.surface.is_floating.get(lane);
         let [linear, angular] = [initial_state.base_linear_velocity, initial_state.base_angular_velocity]
-            .map(|given| Vec3(given.map(|value| moving * f64::from(value))));
-        let position = Vec3(initial_state.base_position.map(f64::from)) + linear.scaled(half);
+            .map(|given| Vec3(given.map(|value| moving * value)));
+        let position = Vec3(initial_state.base_position) + linear.scaled(half);
         let state = &mut self.state;
         set(&mut state.position.0, lane, position.0);
-        let turned = integrate_orientation(initial_state.base_orientation.map(f64::from), angular.scaled(half));
+        let turned = integrate_orientation(initial_state.base_orientation, angular.scaled(half));
         set(&mut state.orientation, lane, turned);
         set(&mut state.linear_velocity.0, lane, linear.0);
         set(&mut state.angular_velocity.0, lane, angular.0);
-        for (joint, (q, dq)) in q.iter().zip(initial_state.dq).enumerate() {
-            state.q[joint].set(lane, f64::from(*q) + half * f64::from(*dq));
-            state.dq[joint].set(lane, f64::from(*dq));
+        for (joint, (q, dq)) in q.iter().zip(&initial_state.dq).enumerate() {
+            state.q[joint].set(lane, q + half * dq);
+            state.dq[joint].set(lane, *dq);
             self.tau[joint].set(lane, 0.0);
         }
         self.impulses.all_mut().for_each(|impulse| impulse.set(lane, 0.0));
@@ -448,19 +459,20 @@ fn surface<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>>(
         time_constant: zero,
         limits: robot.joints().iter().map(|joint| joint.range.map(T::splat)).collect(),
         limit_time_constant: T::splat(2.0 * dt),
-        is_floating: T::splat(if config.base == BaseMount::Floating { 1.0 } else { 0.0 }),
+        is_floating: T::splat(if config.base.is_fixed() || robot.is_fixed() { 0.0 } else { 1.0 }),
     }
 }
 
 /// Rotates `orientation` by the rotation vector `turn` [rad] in the body frame.
 ///
-/// Uses a Taylor series of the exponential map to the third order, then normalises.
+/// Uses a Taylor series of the exponential map to the fifth order, then normalises.
 #[inline(always)]
 fn integrate_orientation<T: SimdFloat>(orientation: [T; 4], turn: Vec3<T>) -> [T; 4] {
     let half = turn.scaled(T::splat(0.5));
     let square = half.dot(half);
-    let [a, b, c] = half.scaled(T::splat(1.0) - square * T::splat(1.0 / 6.0)).0;
-    let d = T::splat(1.0) - square * T::splat(0.5);
+    let one = T::splat(1.0);
+    let [a, b, c] = half.scaled(one - square * T::splat(1.0 / 6.0) * (one - square * T::splat(1.0 / 20.0))).0;
+    let d = one - square * T::splat(0.5) * (one - square * T::splat(1.0 / 12.0));
     let [w, x, y, z] = orientation;
     let product = [
         w * d - x * a - y * b - z * c,

@@ -71,8 +71,8 @@ impl MujocoBackend {
         python: &Path,
         stand: Option<CompliantStand>,
     ) -> Result<Self, BackendBuildError> {
-        config.check(&robot.control)?;
-        let config = config.at_actuator_rate(&robot.control);
+        config.check(robot.control.actuator_hz)?;
+        let config = config.at_actuator_rate(robot.control.actuator_hz);
         if let Some(effect) = unsupported(&robot) {
             return Err(BackendBuildError::Effect { engine: ENGINE, effect });
         }
@@ -84,7 +84,7 @@ impl MujocoBackend {
             robots: num_robots,
             threads: config.threads,
             iterations: config.solver_iterations(),
-            steps: config.steps_per_actuator_period(&robot.control),
+            steps: config.steps_per_actuator_period(robot.control.actuator_hz),
         };
         let process = Process::start(python, &frames::hello(&settings, &mjcf(&robot, &options)))
             .map_err(|reason| BackendBuildError::Mujoco { python: PathBuf::from(python), reason })?;

@@ -79,7 +79,7 @@ impl RobotWorld {
             let dq = f64::from(initial_state.dq[joint]);
             initial_state.q[joint] - robot.joints[joint].actuator.encoder_error(dq) as f32
         });
-        self.actuator.set(0, &robot.joints, &q, &initial_state.dq);
+        self.actuator.set(0, &robot.joints, &q.map(f64::from), &initial_state.dq.map(f64::from));
         let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
         // Sets the pose of the root, and removes its six degrees of freedom if the base is fixed.
         multibody.forward_kinematics(&self.world.bodies, true);
