@@ -137,14 +137,18 @@ impl Motion {
         let precision = SimdPrecision::Single(InstructionSet::best());
         let mut robots =
             TreeSimulation::new(&self.model, &config, ACTUATOR_HZ.into(), precision, ROBOTS, &start).map_err(failed)?;
+        let mut commands = vec![TreeCommand::hold(self.target(0), self.gains[0], self.gains[1]); ROBOTS];
         let mut period = 0;
         Ok(move || {
             if period % CYCLE == 0 {
                 (0..ROBOTS).for_each(|robot| robots.reset(robot, &self.model, &start));
             }
-            let command = TreeCommand::hold(self.target(period % CYCLE), self.gains[0], self.gains[1]);
+            let target = self.target(period % CYCLE);
+            for command in &mut commands {
+                command.q.clone_from(&target);
+            }
             period += 1;
-            robots.step(&vec![command; ROBOTS], DECIMATION);
+            robots.step(&commands, DECIMATION);
             Ok(())
         })
     }

@@ -75,6 +75,9 @@ pub trait StepEquations<T: SimdFloat>: Send {
     /// Returns the product of a row that acts on `body` with the whitened velocity changes.
     fn velocity_change(&self, body: usize, base: &[T; 6], branch: &Self::Branch) -> T;
 
+    /// Returns the products of the three rows of a contact point with the whitened velocity changes.
+    fn velocity_changes(&self, body: usize, base: [&[T; 6]; 3], branch: [&Self::Branch; 3]) -> [T; 3];
+
     /// Adds an impulse along a row that acts on `body`.
     fn add_impulse(&mut self, body: usize, base: &[T; 6], branch: &Self::Branch, impulse: T);
 

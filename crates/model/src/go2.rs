@@ -8,7 +8,7 @@
 use glam::{DQuat, DVec3, dvec3};
 
 use crate::{
-    ActuatorParams, Contact, ControlConfig, Derating, Joint, JointKind, JointModel, JointSpring, Leg, LegModel,
+    ActuatorParams, CONTACT, ControlConfig, Derating, Joint, JointKind, JointModel, JointSpring, Leg, LegModel,
     RigidBody, RobotModel, Shapes, Stribeck,
 };
 
@@ -20,7 +20,7 @@ pub fn go2() -> RobotModel {
         legs: Leg::ALL.map(leg),
         joints: Joint::ALL.map(joint),
         shapes: shapes(),
-        contact: contact(),
+        contact: CONTACT,
         control: control(),
         gyro_bias: DVec3::ZERO,
         derating: Derating::NONE,
@@ -105,13 +105,6 @@ fn shapes() -> Shapes {
         foot_radius: 0.022,
         foot_centre: dvec3(-0.002, 0.0, -0.213),
     }
-}
-
-/// Friction: menagerie's foot. Compliance: MuJoCo's `solref="0.002 1"`, a stiff foot that penetrates less than a
-/// millimetre under the robot's weight. With menagerie's `solimp="0.015 1 0.031"` it penetrates two centimetres. The
-/// true value depends on the floor and must be identified.
-fn contact() -> Contact {
-    Contact { friction: 0.8, time_constant: 0.002, damping_ratio: 1.0 }
 }
 
 /// Rates: U2E §IV-A (policy at 50 Hz, decimation 4). Gains and pose: common values for 50 Hz policies of the Go2

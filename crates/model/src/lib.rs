@@ -64,8 +64,8 @@ pub use kinematics::{FIXED_BASE_HEIGHT, NUM_BODIES, Pose, body_poses};
 pub use mjcf::{CompliantStand, MjcfActuator, MjcfOptions, mjcf};
 pub use real_time::{RealTimeReport, ResetCause, RobotStop};
 pub use robot::{
-    ActuatorParams, Contact, ControlConfig, Derating, JointModel, JointSpring, LegModel, Ripple, RobotModel, Shapes,
-    Stribeck,
+    ActuatorParams, CONTACT, Contact, ControlConfig, Derating, JointModel, JointSpring, LegModel, Ripple, RobotModel,
+    Shapes, Stribeck,
 };
 pub use robot_sample::RobotSample;
 pub use robot_states::{GroundTruth, Measured, RobotStates, RobotStatesMut};

@@ -253,6 +253,11 @@ pub struct Contact {
     pub damping_ratio: f64,
 }
 
+/// Contact of the nominal Go2. Friction: menagerie's foot. Compliance: MuJoCo's `solref="0.002 1"`, a stiff foot that penetrates less than a
+/// millimetre under the robot's weight. With menagerie's `solimp="0.015 1 0.031"` it penetrates two centimetres. The
+/// true value depends on the floor and must be identified.
+pub const CONTACT: Contact = Contact { friction: 0.8, time_constant: 0.002, damping_ratio: 1.0 };
+
 /// Conversion of a policy's actions to commands: gains, scale, default pose and rates.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ControlConfig {

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use crate::{ActuatorParams, Contact, JointModel, RobotTree, Stribeck, TreeJoint, TreeShape, TreeShapeKind};
+use crate::{ActuatorParams, CONTACT, Contact, JointModel, RobotTree, Stribeck, TreeJoint, TreeShape, TreeShapeKind};
 
 /// Robot of any tree with its actuators, and the points at which it touches the ground.
 ///
@@ -33,7 +33,7 @@ pub struct ContactPoint {
 }
 
 impl TreeModel {
-    /// Returns the robot with ideal actuators, and MuJoCo's default contact.
+    /// Returns the robot with ideal actuators and the contact [`CONTACT`].
     ///
     /// Spheres, the ends of capsules and the corners of boxes touch the ground. Ellipsoids, cylinders and meshes do not.
     pub fn new(tree: RobotTree) -> Self {
@@ -41,7 +41,7 @@ impl TreeModel {
         let mut points: Vec<_> =
             tree.shapes.iter().enumerate().flat_map(|(index, shape)| contact_points(index, shape)).collect();
         points.sort_by_key(|point| point.body);
-        Self { tree, joints, points, contact: Contact { friction: 1.0, time_constant: 0.02, damping_ratio: 1.0 } }
+        Self { tree, joints, points, contact: CONTACT }
     }
 
     /// Returns the height [m] of an upright base at which the lowest contact point touches flat ground, with the joints at `q`.

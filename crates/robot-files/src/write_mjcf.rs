@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use twinstep_model::{
-    BaseMount, MjcfActuator, RobotTree, TreeJoint, TreeJointKind, TreeModel, TreeShape, TreeShapeKind,
+    BaseMount, CONTACT, Contact, MjcfActuator, RobotTree, TreeJoint, TreeJointKind, TreeModel, TreeShape, TreeShapeKind,
 };
 
 /// Settings of the MuJoCo model of a tree.
@@ -30,7 +30,7 @@ impl Default for TreeMjcf {
 ///
 /// There is an actuator for each joint that has actuators, in the order of the joints. A base with mass of which nothing says that it is
 /// fixed moves freely. The contact points are those of the batch engine: spheres, ends of capsules and corners of boxes. There is no
-/// self-collision. Contacts have MuJoCo's defaults.
+/// self-collision. Contacts and joint limits are as in the batch engine.
 pub fn write_mjcf(tree: &RobotTree, options: &TreeMjcf) -> String {
     let mut writer = Writer { tree, actuator: options.actuator, text: String::new() };
     let timestep = options.timestep;
@@ -41,7 +41,11 @@ pub fn write_mjcf(tree: &RobotTree, options: &TreeMjcf) -> String {
         .line(1, &format!("<option timestep=\"{timestep}\" gravity=\"0 0 -9.81\" cone=\"elliptic\" impratio=\"30\"/>"));
     // The shapes of the robot touch only the ground.
     writer.line(1, "<default>");
-    writer.line(2, "<geom contype=\"0\" conaffinity=\"1\" condim=\"3\"/>");
+    let Contact { friction, time_constant, damping_ratio } = CONTACT;
+    let contact =
+        format!("friction=\"{friction} 0 0\" solref=\"{} {damping_ratio}\"", time_constant.max(2.0 * timestep));
+    writer.line(2, &format!("<joint solreflimit=\"{} 1\"/>", 2.0 * timestep));
+    writer.line(2, &format!("<geom contype=\"0\" conaffinity=\"1\" condim=\"3\" {contact}/>"));
     writer.line(1, "</default>");
     writer.line(1, "<worldbody>");
     writer.line(2, "<geom type=\"plane\" size=\"0 0 1\" contype=\"1\" conaffinity=\"0\"/>");

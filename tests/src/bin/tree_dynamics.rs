@@ -76,16 +76,17 @@ fn equations<T: SimdFloat>(tree: &RobotTree, request: &Request) -> Equations {
         ..TreeState::origin(structure.num_joints())
     };
     let mut motion = TreeMotion::empty(&parameters);
-    motion.set(&parameters, &state);
+    motion.set(&parameters, &state, T::splat(GRAVITY));
     let damping: Vec<f64> = tree.joints.iter().map(|joint| joint.damping).collect();
     let forces = JointForces { damping: splat(&damping), ..JointForces::frictionless(splat(&request.tau)) };
     let mut factored = FactoredTree::empty(&parameters);
-    factored.set_up(&parameters, &motion, &state, &forces, T::splat(request.dt), T::splat(GRAVITY));
+    let mass = mass_matrix(&structure, &parameters, &motion);
+    factored.set_up(&parameters, &mut motion, &state, &forces, T::splat(request.dt));
     let mut joints = vec![T::splat(0.0); structure.num_joints()];
     let base = factored.solution(&structure, &mut joints);
     let get = |values: &[T]| values.iter().map(|value| value.get(0)).collect::<Vec<f64>>();
     Equations {
-        mass: mass_matrix(&structure, &parameters, &motion).iter().map(|row| get(row)).collect(),
+        mass: mass.iter().map(|row| get(row)).collect(),
         change: [get(&base[..structure.num_base_velocities()]), get(&joints)].concat(),
     }
 }

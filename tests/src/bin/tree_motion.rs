@@ -25,6 +25,8 @@ struct Arguments {
 struct Request {
     physics_hz: u32,
     actuator_hz: f64,
+    /// Iterations of the contact solver.
+    iterations: Option<u32>,
     /// True for double precision.
     double: bool,
     position: [f64; 3],
@@ -74,7 +76,12 @@ fn motion(model: &TreeModel, request: Request) -> Result<Vec<Reply>, String> {
         q: request.q,
         dq: request.dq,
     };
-    let config = SimConfig { physics_hz: Some(request.physics_hz), threads: 1, ..SimConfig::default() };
+    let config = SimConfig {
+        physics_hz: Some(request.physics_hz),
+        solver_iterations: request.iterations,
+        threads: 1,
+        ..SimConfig::default()
+    };
     let precision = if request.double { SimdPrecision::Double } else { SimdPrecision::Single(InstructionSet::best()) };
     let mut robots = TreeSimulation::new(model, &config, request.actuator_hz, precision, 1, &start)
         .map_err(|error| error.to_string())?;

@@ -213,6 +213,15 @@ impl<T: SimdFloat> StepEquations<T> for FactoredDynamics<T> {
     }
 
     #[inline(always)]
+    fn velocity_changes(&self, body: usize, y: [&[T; 6]; 3], z: [&[T; 3]; 3]) -> [T; 3] {
+        [
+            self.velocity_change(body, y[0], z[0]),
+            self.velocity_change(body, y[1], z[1]),
+            self.velocity_change(body, y[2], z[2]),
+        ]
+    }
+
+    #[inline(always)]
     fn add_impulse(&mut self, body: usize, y: &[T; 6], z: &[T; 3], impulse: T) {
         for (u, y) in self.u.iter_mut().zip(y) {
             *u += *y * impulse;

@@ -1,10 +1,10 @@
 //! Equations of motion `M a + bias = τ`: recursive Newton–Euler algorithm and composite-rigid-body algorithm.
 
-use crate::{Inertia, Vec3, spatial_matrix};
+use crate::{Vec3, spatial_matrix};
 use twinstep_simd::SimdFloat;
 
 use super::motion::{Spatial, TreeMotion, times};
-use super::{TreeParameters, TreeState, TreeStructure};
+use super::{TreeParameters, TreeStructure};
 
 /// Accelerations of base and joints.
 #[derive(Clone, Debug)]
@@ -30,44 +30,31 @@ pub struct TreeForces<T> {
 
 /// Computes inverse dynamics: the wrench on the base and the joint forces for an acceleration.
 ///
-/// `gravity` [m/s²] acts along −z of the world frame. The result is linear in the ten inertial parameters of each body.
+/// Gravity is that of `motion`. The result is linear in the ten inertial parameters of each body.
 #[inline(always)]
 pub fn inverse_dynamics<T: SimdFloat>(
     structure: &TreeStructure,
     parameters: &TreeParameters<T>,
     motion: &TreeMotion<T>,
-    state: &TreeState<T>,
     acceleration: &TreeAcceleration<T>,
-    gravity: T,
 ) -> TreeForces<T> {
-    let proper = state.world_axes()[2].scaled(gravity) + acceleration.linear;
-    let mut accelerations = vec![Spatial { angular: acceleration.angular, linear: proper }];
-    let mut forces = vec![force(&motion.inertias[0], motion.velocities[0], accelerations[0])];
+    // The motion has the acceleration of gravity already.
+    let of_base = Spatial { angular: acceleration.angular, linear: acceleration.linear };
+    let mut accelerations = vec![of_base];
     for joint in 0..structure.num_joints() {
-        let (parent, axis) = (structure.parents[joint], motion.axes[joint]);
-        let turning = motion.velocities[parent].cross(axis).scaled(state.dq[joint]);
-        let own = accelerations[parent].plus(turning).plus(axis.scaled(acceleration.ddq[joint]));
-        forces.push(force(&motion.inertias[joint + 1], motion.velocities[joint + 1], own));
-        accelerations.push(own);
+        let axis = motion.bodies[joint + 1].axis;
+        accelerations.push(accelerations[structure.parents[joint]].plus(axis.scaled(acceleration.ddq[joint])));
     }
+    let bodies = motion.bodies.iter().zip(&accelerations);
+    let mut forces: Vec<_> =
+        bodies.map(|(body, acceleration)| body.force.plus(times(&body.inertia, *acceleration))).collect();
     let mut tau = vec![T::splat(0.0); structure.num_joints()];
     for joint in (0..structure.num_joints()).rev() {
-        let parent = structure.parents[joint];
-        tau[joint] = motion.axes[joint].dot(forces[joint + 1]) + parameters.armature[joint] * acceleration.ddq[joint];
+        let (parent, axis) = (structure.parents[joint], motion.bodies[joint + 1].axis);
+        tau[joint] = axis.dot(forces[joint + 1]) + parameters.armature[joint] * acceleration.ddq[joint];
         forces[parent] = forces[parent].plus(forces[joint + 1]);
     }
     TreeForces { moment: forces[0].angular, force: forces[0].linear, tau }
-}
-
-/// Returns the force on a body for its acceleration: the change of its momentum.
-#[inline(always)]
-pub fn force<T: SimdFloat>(body: &Inertia<T>, velocity: Spatial<T>, acceleration: Spatial<T>) -> Spatial<T> {
-    let momentum = times(body, velocity);
-    let turning = Spatial {
-        angular: velocity.angular.cross(momentum.angular) + velocity.linear.cross(momentum.linear),
-        linear: velocity.angular.cross(momentum.linear),
-    };
-    times(body, acceleration).plus(turning)
 }
 
 /// Returns the symmetric mass matrix, row by row, in the order angular and linear velocity of a free base in base axes, joint
@@ -79,11 +66,11 @@ pub fn mass_matrix<T: SimdFloat>(
 ) -> Vec<Vec<T>> {
     let (base, size) = (structure.num_base_velocities(), structure.num_velocities());
     let mut matrix = vec![vec![T::splat(0.0); size]; size];
-    let mut composites = motion.inertias.clone();
+    let mut composites: Vec<_> = motion.bodies.iter().map(|body| body.inertia).collect();
     for joint in (0..structure.num_joints()).rev() {
-        let unit = times(&composites[joint + 1], motion.axes[joint]);
+        let unit = times(&composites[joint + 1], motion.bodies[joint + 1].axis);
         for other in &structure.branches[joint + 1] {
-            let entry = unit.dot(motion.axes[*other]);
+            let entry = unit.dot(motion.bodies[other + 1].axis);
             (matrix[base + joint][base + other], matrix[base + other][base + joint]) = (entry, entry);
         }
         matrix[base + joint][base + joint] += parameters.armature[joint];

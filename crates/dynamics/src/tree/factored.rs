@@ -5,11 +5,10 @@
 //! chapter 6.5), a solution in whitened coordinates u is `Δq̇ = L⁻¹ u`. A row `J Δq̇` that acts on one body is `y·u` with `y = L⁻ᵀ Jᵀ`,
 //! which is not zero only for the base and for the joints of the body's branch. Two rows are coupled through `y·y'`.
 
-use crate::{Cholesky, Inertia, JointForces, Vec3, spatial_matrix};
+use crate::{Cholesky, JointForces, spatial_matrix};
 use twinstep_simd::SimdFloat;
 
-use super::equations::force;
-use super::motion::{Spatial, TreeMotion, times};
+use super::motion::{BodyMotion, Spatial, TreeMotion, times};
 use super::{TreeParameters, TreeState, TreeStructure};
 
 /// Factored equations of one time step.
@@ -26,9 +25,6 @@ pub struct FactoredTree<T> {
     starts: Vec<usize>,
     /// Reciprocal of each joint's diagonal entry.
     inverses: Vec<T>,
-    composites: Vec<Inertia<T>>,
-    accelerations: Vec<Spatial<T>>,
-    forces: Vec<Spatial<T>>,
     /// Whitened velocity change of a free base; zero for a fixed one.
     pub base_u: [T; 6],
     /// Whitened velocity changes of the joints.
@@ -39,128 +35,116 @@ impl<T: SimdFloat> FactoredTree<T> {
     /// Returns a placeholder for [`FactoredTree::set_up`], to be used in every step.
     pub fn empty(parameters: &TreeParameters<T>) -> Self {
         let structure = &*parameters.structure;
-        let (zero, one, joints) = (T::splat(0.0), T::splat(1.0), structure.num_joints());
-        let mut identity = [[zero; 6]; 6];
-        (0..6).for_each(|index| identity[index][index] = one);
+        let (zero, joints) = (T::splat(0.0), structure.num_joints());
         Self {
-            base: Cholesky::new(identity),
+            base: Cholesky::empty(),
             to_base: vec![[zero; 6]; joints],
             rows: vec![zero; structure.branches.iter().map(Vec::len).sum()],
             starts: starts(structure),
             inverses: vec![zero; joints],
-            composites: parameters.bodies.clone(),
-            accelerations: vec![Spatial::zero(); joints + 1],
-            forces: vec![Spatial::zero(); joints + 1],
             base_u: [zero; 6],
             u: vec![zero; joints],
         }
     }
 
-    /// Sets up a step of `dt` [s] under gravity [m/s²]. [`FactoredTree::u`] is then the solution without constraints.
+    /// Sets up a step of `dt` [s]. [`FactoredTree::u`] is then the solution without constraints.
+    ///
+    /// Inertias and forces of the bodies in `motion` become those of all bodies that they move.
     #[inline(always)]
     pub fn set_up(
         &mut self,
         parameters: &TreeParameters<T>,
-        motion: &TreeMotion<T>,
+        motion: &mut TreeMotion<T>,
         state: &TreeState<T>,
         forces: &JointForces<Vec<T>>,
         dt: T,
-        gravity: T,
     ) {
-        let structure = &*parameters.structure;
-        self.set_bias(structure, motion, state, gravity);
-        self.composites.copy_from_slice(&motion.inertias);
+        let (structure, zero) = (&*parameters.structure, T::splat(0.0));
+        self.rows.fill(zero);
+        self.to_base.fill([zero; 6]);
+        self.u.fill(zero);
+        // What the elimination of the joints adds to the block and the right-hand side of the base.
+        let (mut block, mut rhs) = ([[zero; 6]; 6], [zero; 6]);
+        // From the tips to the base. Joints below have eliminated themselves from a row before its own entries are added.
         for joint in (0..structure.num_joints()).rev() {
-            let unit = times(&self.composites[joint + 1], motion.axes[joint]);
-            let branch = &structure.branches[joint + 1];
-            let row = &mut self.rows[self.starts[joint]..][..branch.len()];
-            for (entry, other) in row.iter_mut().zip(branch) {
-                *entry = unit.dot(motion.axes[*other]);
-            }
-            let damping = forces.damping[joint];
-            row[branch.len() - 1] += parameters.armature[joint] + dt * damping;
-            let ([a, b, c], [d, e, f]) = (unit.angular.0, unit.linear.0);
-            self.to_base[joint] = [a, b, c, d, e, f];
-            let parent = structure.parents[joint];
-            let composite = self.composites[parent].combined(&self.composites[joint + 1]);
-            self.composites[parent] = composite;
-            let bias = motion.axes[joint].dot(self.forces[joint + 1]);
-            let sum = self.forces[parent].plus(self.forces[joint + 1]);
-            self.forces[parent] = sum;
-            self.u[joint] = (forces.tau[joint] - bias - damping * state.dq[joint]) * dt;
-        }
-        self.factor(structure, dt);
-    }
-
-    /// Computes the force on each body without its joints.
-    #[inline(always)]
-    fn set_bias(&mut self, structure: &TreeStructure, motion: &TreeMotion<T>, state: &TreeState<T>, gravity: T) {
-        self.accelerations[0] = Spatial { angular: Vec3::zero(), linear: state.world_axes()[2].scaled(gravity) };
-        self.forces[0] = force(&motion.inertias[0], motion.velocities[0], self.accelerations[0]);
-        for joint in 0..structure.num_joints() {
-            let parent = structure.parents[joint];
-            let turning = motion.velocities[parent].cross(motion.axes[joint]).scaled(state.dq[joint]);
-            let own = self.accelerations[parent].plus(turning);
-            self.accelerations[joint + 1] = own;
-            self.forces[joint + 1] = force(&motion.inertias[joint + 1], motion.velocities[joint + 1], own);
-        }
-    }
-
-    /// Factors the matrix from the tips to the base, and whitens the right-hand side on the way.
-    #[inline(always)]
-    fn factor(&mut self, structure: &TreeStructure, dt: T) {
-        let zero = T::splat(0.0);
-        let mut block = spatial_matrix(&self.composites[0]);
-        let Spatial { angular, linear } = self.forces[0];
-        let ([a, b, c], [d, e, f]) = (angular.0, linear.0);
-        let mut rhs = [a, b, c, d, e, f];
-        for value in &mut rhs {
-            *value = -(*value * dt);
-        }
-        for joint in (0..structure.num_joints()).rev() {
-            let branch = &structure.branches[joint + 1];
-            let above = branch.len() - 1;
-            // Joints above have smaller indices.
-            let (earlier, row) = self.rows.split_at_mut(self.starts[joint]);
-            let row = &mut row[..branch.len()];
-            let root = row[above].sqrt();
-            let inverse = T::splat(1.0) / root;
-            row[above] = root;
-            self.inverses[joint] = inverse;
-            let u = self.u[joint] * inverse;
-            self.u[joint] = u;
-            for index in 0..above {
-                let entry = row[index] * inverse;
-                row[index] = entry;
-                let other = branch[index];
-                let changed = &mut earlier[self.starts[other]..][..=index];
-                for (value, inner) in changed.iter_mut().zip(&row[..=index]) {
-                    *value -= entry * *inner;
-                }
-                self.u[other] -= entry * u;
-            }
-            if structure.is_free {
-                let (earlier, own) = self.to_base.split_at_mut(joint);
-                let own = &mut own[0];
-                for i in 0..6 {
-                    own[i] = own[i] * inverse;
-                    rhs[i] -= own[i] * u;
-                    for j in 0..=i {
-                        block[i][j] -= own[i] * own[j];
-                    }
-                }
-                for (entry, other) in row[..above].iter().zip(branch) {
-                    for (value, to_base) in earlier[*other].iter_mut().zip(&*own) {
-                        *value -= *entry * *to_base;
-                    }
-                }
-            }
+            self.add_entries(parameters, motion, joint, dt * forces.damping[joint]);
+            let body = &motion.bodies[joint + 1];
+            let bias = body.axis.dot(body.force);
+            self.u[joint] += (forces.tau[joint] - bias - forces.damping[joint] * state.dq[joint]) * dt;
+            add_to_parent(motion, structure.parents[joint], joint + 1);
+            self.eliminate(structure, joint, &mut block, &mut rhs);
         }
         if structure.is_free {
+            let BodyMotion { inertia, force: Spatial { angular, linear }, .. } = &motion.bodies[0];
+            let (own, [a, b, c], [d, e, f]) = (spatial_matrix(inertia), angular.0, linear.0);
+            for (i, force) in [a, b, c, d, e, f].into_iter().enumerate() {
+                rhs[i] -= force * dt;
+                for j in 0..=i {
+                    block[i][j] += own[i][j];
+                }
+            }
             self.base = Cholesky::new(block);
             self.base_u = self.base.forward(rhs);
-        } else {
-            self.base_u = [zero; 6];
+        }
+    }
+
+    /// Adds the entries of the mass matrix to the row of a joint, and `damping` to its diagonal.
+    #[inline(always)]
+    fn add_entries(&mut self, parameters: &TreeParameters<T>, motion: &TreeMotion<T>, joint: usize, damping: T) {
+        let (structure, bodies) = (&*parameters.structure, &motion.bodies);
+        let unit = times(&bodies[joint + 1].inertia, bodies[joint + 1].axis);
+        let branch = &structure.branches[joint + 1];
+        let row = &mut self.rows[self.starts[joint]..][..branch.len()];
+        for (entry, other) in row.iter_mut().zip(branch) {
+            *entry += unit.dot(bodies[other + 1].axis);
+        }
+        row[branch.len() - 1] += parameters.armature[joint] + damping;
+        if structure.is_free {
+            let ([a, b, c], [d, e, f]) = (unit.angular.0, unit.linear.0);
+            for (entry, own) in self.to_base[joint].iter_mut().zip([a, b, c, d, e, f]) {
+                *entry += own;
+            }
+        }
+    }
+
+    /// Divides the row of a joint by the root of its diagonal entry, and eliminates it from the rows above.
+    #[inline(always)]
+    fn eliminate(&mut self, structure: &TreeStructure, joint: usize, block: &mut [[T; 6]; 6], rhs: &mut [T; 6]) {
+        let branch = &structure.branches[joint + 1];
+        let above = branch.len() - 1;
+        // Joints above have smaller indices.
+        let (earlier, row) = self.rows.split_at_mut(self.starts[joint]);
+        let row = &mut row[..branch.len()];
+        let inverse = T::splat(1.0) / row[above].sqrt();
+        self.inverses[joint] = inverse;
+        let u = self.u[joint] * inverse;
+        self.u[joint] = u;
+        for index in 0..above {
+            let entry = row[index] * inverse;
+            row[index] = entry;
+            let other = branch[index];
+            let changed = &mut earlier[self.starts[other]..][..=index];
+            for (value, inner) in changed.iter_mut().zip(&row[..=index]) {
+                *value -= entry * *inner;
+            }
+            self.u[other] -= entry * u;
+        }
+        if !structure.is_free {
+            return;
+        }
+        let (earlier, own) = self.to_base.split_at_mut(joint);
+        let own = &mut own[0];
+        for i in 0..6 {
+            own[i] = own[i] * inverse;
+            rhs[i] -= own[i] * u;
+            for j in 0..=i {
+                block[i][j] -= own[i] * own[j];
+            }
+        }
+        for (entry, other) in row[..above].iter().zip(branch) {
+            for (value, to_base) in earlier[*other].iter_mut().zip(&*own) {
+                *value -= *entry * *to_base;
+            }
         }
     }
 
@@ -176,8 +160,10 @@ impl<T: SimdFloat> FactoredTree<T> {
             for (value, factor) in along.iter_mut().zip(row) {
                 *value -= *factor * entry;
             }
-            for i in 0..6 {
-                base[i] -= self.to_base[joint][i] * entry;
+            if structure.is_free {
+                for i in 0..6 {
+                    base[i] -= self.to_base[joint][i] * entry;
+                }
             }
         }
         if structure.is_free { self.base.forward(base) } else { [T::splat(0.0); 6] }
@@ -204,6 +190,15 @@ impl<T: SimdFloat> FactoredTree<T> {
         }
         base
     }
+}
+
+/// Adds inertia and force of a body to those of its parent.
+#[inline(always)]
+fn add_to_parent<T: SimdFloat>(motion: &mut TreeMotion<T>, parent: usize, child: usize) {
+    let (earlier, own) = motion.bodies.split_at_mut(child);
+    let (parent, child) = (&mut earlier[parent], &own[0]);
+    parent.inertia = parent.inertia.combined(&child.inertia);
+    parent.force = parent.force.plus(child.force);
 }
 
 /// Returns the index of the first entry of each joint's row, if one row follows the other.

@@ -55,66 +55,97 @@ impl<T: SimdFloat> Spatial<T> {
     }
 }
 
-/// Places and motion of all bodies.
+/// Place, motion and inertia of a body.
+#[derive(Clone, Debug)]
+pub struct BodyMotion<T> {
+    /// Place of the body.
+    pub place: Place<T>,
+    /// Motion of the joint of the body at unit velocity; zero for the base.
+    pub axis: Spatial<T>,
+    /// Velocity relative to a frame that moves with the base's origin without turning.
+    pub velocity: Spatial<T>,
+    /// Acceleration in that frame without those of base and joints. Gravity accelerates it upwards.
+    pub acceleration: Spatial<T>,
+    /// Force on the body for this acceleration.
+    pub force: Spatial<T>,
+    /// Inertia about the base's origin.
+    pub inertia: Inertia<T>,
+}
+
+/// Motion of all bodies. The numbers of a body are together in memory, because those of all bodies leave the first cache.
 #[derive(Clone, Debug)]
 pub struct TreeMotion<T> {
-    /// Place of each body.
-    pub places: Vec<Place<T>>,
-    /// Motion of each joint at unit velocity.
-    pub axes: Vec<Spatial<T>>,
-    /// Inertia of each body about the base's origin.
-    pub inertias: Vec<Inertia<T>>,
-    /// Velocity of each body relative to a frame that moves with the base's origin without turning.
-    pub velocities: Vec<Spatial<T>>,
+    /// Bodies: the base, then that of each joint.
+    pub bodies: Vec<BodyMotion<T>>,
 }
 
 impl<T: SimdFloat> TreeMotion<T> {
     /// Returns a placeholder for [`TreeMotion::set`], to be used in every step.
     pub fn empty(parameters: &TreeParameters<T>) -> Self {
-        let joints = parameters.structure.num_joints();
-        Self {
-            places: vec![Place::identity(); joints + 1],
-            axes: vec![Spatial::zero(); joints],
-            inertias: parameters.bodies.clone(),
-            velocities: vec![Spatial::zero(); joints + 1],
-        }
+        let zero = Spatial::zero();
+        let body = |inertia: &Inertia<T>| BodyMotion {
+            place: Place::identity(),
+            axis: zero,
+            velocity: zero,
+            acceleration: zero,
+            force: zero,
+            inertia: *inertia,
+        };
+        Self { bodies: parameters.bodies.iter().map(body).collect() }
     }
 
-    /// Computes everything for a state.
+    /// Computes everything for a state, with gravity [m/s²] along −z of the world.
     #[inline(always)]
-    pub fn set(&mut self, parameters: &TreeParameters<T>, state: &TreeState<T>) {
+    pub fn set(&mut self, parameters: &TreeParameters<T>, state: &TreeState<T>, gravity: T) {
         let structure = &*parameters.structure;
-        self.velocities[0] = Spatial { angular: state.angular_velocity, linear: Vec3::zero() };
-        self.inertias[0] = parameters.bodies[0];
+        let base = &mut self.bodies[0];
+        base.velocity = Spatial { angular: state.angular_velocity, linear: Vec3::zero() };
+        base.acceleration = Spatial { angular: Vec3::zero(), linear: state.world_axes()[2].scaled(gravity) };
+        base.inertia = parameters.bodies[0];
+        base.force = force(&base.inertia, base.velocity, base.acceleration);
         for joint in 0..structure.num_joints() {
-            let parent = structure.parents[joint];
+            let (earlier, own) = self.bodies.split_at_mut(joint + 1);
+            let (parent, body) = (&earlier[structure.parents[joint]], &mut own[0]);
             let mut place = if structure.is_parallel[joint] {
-                self.places[parent].moved(parameters.places[joint].origin)
+                parent.place.moved(parameters.places[joint].origin)
             } else {
-                self.places[parent].after(&parameters.places[joint])
+                parent.place.after(&parameters.places[joint])
             };
             let (index, is_reversed) = match structure.axes[joint] {
                 JointAxis::Along(index, sign) => (index, sign < 0.0),
                 JointAxis::Turned => (2, false),
             };
-            let axis = if is_reversed { -place.axes[index] } else { place.axes[index] };
-            let unit = match structure.kinds[joint] {
+            let direction = if is_reversed { -place.axes[index] } else { place.axes[index] };
+            let axis = match structure.kinds[joint] {
                 TreeJointKind::Revolute => {
                     let (sine, cosine) = state.q[joint].sin_cos();
                     place.turn(index, if is_reversed { -sine } else { sine }, cosine);
-                    Spatial { angular: axis, linear: place.origin.cross(axis) }
+                    Spatial { angular: direction, linear: place.origin.cross(direction) }
                 }
                 TreeJointKind::Prismatic => {
-                    place.origin = place.origin + axis.scaled(state.q[joint]);
-                    Spatial { angular: Vec3::zero(), linear: axis }
+                    place.origin = place.origin + direction.scaled(state.q[joint]);
+                    Spatial { angular: Vec3::zero(), linear: direction }
                 }
             };
-            self.axes[joint] = unit;
-            self.velocities[joint + 1] = self.velocities[parent].plus(unit.scaled(state.dq[joint]));
-            self.inertias[joint + 1] = turned(&parameters.bodies[joint + 1], &place).shifted(place.origin);
-            self.places[joint + 1] = place;
+            let own = axis.scaled(state.dq[joint]);
+            body.velocity = parent.velocity.plus(own);
+            body.acceleration = parent.acceleration.plus(parent.velocity.cross(own));
+            body.inertia = turned(&parameters.bodies[joint + 1], &place).shifted(place.origin);
+            body.force = force(&body.inertia, body.velocity, body.acceleration);
+            (body.place, body.axis) = (place, axis);
         }
     }
+}
+
+/// Returns the force on a body for its acceleration: the change of its momentum.
+#[inline(always)]
+pub fn force<T: SimdFloat>(body: &Inertia<T>, velocity: Spatial<T>, acceleration: Spatial<T>) -> Spatial<T> {
+    let momentum = times(body, velocity);
+    let turning = Spatial {
+        angular: velocity.angular.cross(momentum.angular) + velocity.linear.cross(momentum.linear),
+        linear: velocity.angular.cross(momentum.linear),
+    };
+    times(body, acceleration).plus(turning)
 }
 
 /// Returns the inertia about the same point in the axes in which the body has this place.

@@ -69,8 +69,8 @@ impl<T: SimdFloat> StepEquations<T> for TreeEquations<T> {
         is_floating: T,
     ) {
         let Self { motion, factored, .. } = self;
-        motion.set(parameters, state);
-        factored.set_up(parameters, motion, state, forces, dt, gravity);
+        motion.set(parameters, state, gravity);
+        factored.set_up(parameters, motion, state, forces, dt);
         for value in &mut factored.base_u {
             *value = *value * is_floating;
         }
@@ -83,7 +83,7 @@ impl<T: SimdFloat> StepEquations<T> for TreeEquations<T> {
 
     #[inline(always)]
     fn point(&self, body: usize, point: Vec3<T>) -> Vec3<T> {
-        let place = &self.motion.places[body];
+        let place = &self.motion.bodies[body].place;
         place.origin + place.turned(point)
     }
 
@@ -110,7 +110,7 @@ impl<T: SimdFloat> StepEquations<T> for TreeEquations<T> {
     fn write_jacobian(&self, body: usize, place: Vec3<T>, direction: Vec3<T>, branch: &mut Vec<T>) {
         let turning = place.cross(direction);
         for (value, joint) in branch.iter_mut().zip(&self.structure.branches[body]) {
-            let axis = &self.motion.axes[*joint];
+            let axis = &self.motion.bodies[joint + 1].axis;
             *value = axis.angular.dot(turning) + axis.linear.dot(direction);
         }
     }
@@ -122,35 +122,83 @@ impl<T: SimdFloat> StepEquations<T> for TreeEquations<T> {
 
     #[inline(always)]
     fn velocity_change(&self, body: usize, y: &[T; 6], z: &Vec<T>) -> T {
-        let u = &self.factored.base_u;
-        let mut even = (y[0] * u[0] + y[1] * u[1]) + (y[2] * u[2] + y[3] * u[3]) + (y[4] * u[4] + y[5] * u[5]);
         // Two sums, because the latency of one limits a sweep of the solver.
-        let (mut odd, branch) = (T::splat(0.0), &self.structure.branches[body]);
-        for (index, (z, joint)) in z.iter().zip(branch).enumerate() {
-            let product = *z * self.factored.u[*joint];
-            if index % 2 == 0 { even += product } else { odd += product }
+        let (mut even, mut odd) = (T::splat(0.0), T::splat(0.0));
+        let mut rest = z.as_slice();
+        for run in &self.structure.runs[body] {
+            let (z, later) = rest.split_at(run.len());
+            let (z_pairs, z_last) = z.as_chunks::<2>();
+            let (u_pairs, u_last) = self.factored.u[run.clone()].as_chunks::<2>();
+            for ([z, z_next], [u, u_next]) in z_pairs.iter().zip(u_pairs) {
+                even += *z * *u;
+                odd += *z_next * *u_next;
+            }
+            if let ([z], [u]) = (z_last, u_last) {
+                even += *z * *u;
+            }
+            rest = later;
+        }
+        if self.structure.is_free {
+            let u = &self.factored.base_u;
+            even += (y[0] * u[0] + y[1] * u[1]) + (y[2] * u[2] + y[3] * u[3]);
+            odd += y[4] * u[4] + y[5] * u[5];
         }
         even + odd
     }
 
     #[inline(always)]
-    fn add_impulse(&mut self, body: usize, y: &[T; 6], z: &Vec<T>, impulse: T) {
-        for (u, y) in self.factored.base_u.iter_mut().zip(y) {
-            *u += *y * impulse;
+    fn velocity_changes(&self, body: usize, y: [&[T; 6]; 3], z: [&Vec<T>; 3]) -> [T; 3] {
+        let mut sums = [T::splat(0.0); 3];
+        let mut start = 0;
+        for run in &self.structure.runs[body] {
+            let rows = [&z[0][start..], &z[1][start..], &z[2][start..]];
+            for (((u, a), b), c) in self.factored.u[run.clone()].iter().zip(rows[0]).zip(rows[1]).zip(rows[2]) {
+                sums[0] += *a * *u;
+                sums[1] += *b * *u;
+                sums[2] += *c * *u;
+            }
+            start += run.len();
         }
-        for (z, joint) in z.iter().zip(&self.structure.branches[body]) {
-            self.factored.u[*joint] += *z * impulse;
+        if self.structure.is_free {
+            for (index, u) in self.factored.base_u.iter().enumerate() {
+                for (sum, y) in sums.iter_mut().zip(y) {
+                    *sum += y[index] * *u;
+                }
+            }
+        }
+        sums
+    }
+
+    #[inline(always)]
+    fn add_impulse(&mut self, body: usize, y: &[T; 6], z: &Vec<T>, impulse: T) {
+        let mut start = 0;
+        for run in &self.structure.runs[body] {
+            for (u, z) in self.factored.u[run.clone()].iter_mut().zip(&z[start..]) {
+                *u += *z * impulse;
+            }
+            start += run.len();
+        }
+        if self.structure.is_free {
+            for (u, y) in self.factored.base_u.iter_mut().zip(y) {
+                *u += *y * impulse;
+            }
         }
     }
 
     #[inline(always)]
     fn add_impulses(&mut self, body: usize, y: [&[T; 6]; 3], z: [&Vec<T>; 3], impulses: [T; 3]) {
-        for i in 0..6 {
-            self.factored.base_u[i] += (y[0][i] * impulses[0] + y[1][i] * impulses[1]) + y[2][i] * impulses[2];
+        let mut start = 0;
+        for run in &self.structure.runs[body] {
+            let rows = [&z[0][start..], &z[1][start..], &z[2][start..]];
+            for (((u, a), b), c) in self.factored.u[run.clone()].iter_mut().zip(rows[0]).zip(rows[1]).zip(rows[2]) {
+                *u += (*a * impulses[0] + *b * impulses[1]) + *c * impulses[2];
+            }
+            start += run.len();
         }
-        for (index, joint) in self.structure.branches[body].iter().enumerate() {
-            self.factored.u[*joint] +=
-                (z[0][index] * impulses[0] + z[1][index] * impulses[1]) + z[2][index] * impulses[2];
+        if self.structure.is_free {
+            for (index, u) in self.factored.base_u.iter_mut().enumerate() {
+                *u += (y[0][index] * impulses[0] + y[1][index] * impulses[1]) + y[2][index] * impulses[2];
+            }
         }
     }
 }

@@ -1,5 +1,7 @@
 //! Index lists of a tree.
 
+use std::ops::Range;
+
 use glam::DVec3;
 use twinstep_model::{BaseMount, RobotTree, TreeJointKind};
 
@@ -33,6 +35,8 @@ pub struct TreeStructure {
     pub is_parallel: Vec<bool>,
     /// Joints between the base and each body, from the base outwards; that of the body itself is the last.
     pub branches: Vec<Vec<usize>>,
+    /// The joints of each branch as ranges, because loops over ranges are faster.
+    pub runs: Vec<Vec<Range<usize>>>,
     /// True if the base moves freely.
     pub is_free: bool,
 }
@@ -52,7 +56,8 @@ impl TreeStructure {
             tree.with_parallel_frames().joints.iter().map(|joint| JointAxis::of(joint.axis)).collect();
         let is_turned = |body: usize| body > 0 && axes[body - 1] == JointAxis::Turned;
         let is_parallel = (0..parents.len()).map(|joint| !is_turned(joint + 1) && !is_turned(parents[joint])).collect();
-        Self { parents, kinds, axes, is_parallel, branches, is_free: tree.base != Some(BaseMount::Fixed) }
+        let runs = branches.iter().map(|branch| runs(branch)).collect();
+        Self { parents, kinds, axes, is_parallel, branches, runs, is_free: tree.base != Some(BaseMount::Fixed) }
     }
 
     /// Returns the number of joints.
@@ -69,4 +74,9 @@ impl TreeStructure {
     pub fn num_base_velocities(&self) -> usize {
         if self.is_free { 6 } else { 0 }
     }
+}
+
+/// Returns the ranges of a branch, whose joints ascend.
+fn runs(branch: &[usize]) -> Vec<Range<usize>> {
+    branch.chunk_by(|joint, next| joint + 1 == *next).map(|run| run[0]..run[0] + run.len()).collect()
 }

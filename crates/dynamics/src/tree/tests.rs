@@ -91,12 +91,12 @@ impl Case {
             ..TreeState::origin(joints)
         };
         let mut motion = TreeMotion::empty(&parameters);
-        motion.set(&parameters, &state);
+        motion.set(&parameters, &state, GRAVITY);
         Self { structure, parameters, motion, state }
     }
 
     fn inverse(&self, acceleration: &[f64]) -> Vec<f64> {
-        let Self { structure, parameters, motion, state } = self;
+        let Self { structure, parameters, motion, .. } = self;
         let base = structure.num_base_velocities();
         let of_base = |index: usize| if structure.is_free { acceleration[index] } else { 0.0 };
         let acceleration = TreeAcceleration {
@@ -104,7 +104,7 @@ impl Case {
             linear: Vec3([of_base(3), of_base(4), of_base(5)]),
             ddq: acceleration[base..].to_vec(),
         };
-        let forces = inverse_dynamics(structure, parameters, motion, state, &acceleration, GRAVITY);
+        let forces = inverse_dynamics(structure, parameters, motion, &acceleration);
         let of_base = forces.moment.0.into_iter().chain(forces.force.0).take(base);
         of_base.chain(forces.tau).collect()
     }
@@ -136,7 +136,7 @@ proptest! {
         let joints = structure.num_joints();
         let load = JointForces::frictionless(numbers(seed + 1, joints));
         let mut factored = FactoredTree::empty(parameters);
-        factored.set_up(parameters, motion, state, &load, 1.0, GRAVITY);
+        factored.set_up(parameters, &mut motion.clone(), state, &load, 1.0);
         let mut ddq = vec![0.0; joints];
         let base = factored.solution(structure, &mut ddq);
         let acceleration: Vec<f64> = base.into_iter().take(structure.num_base_velocities()).chain(ddq).collect();
@@ -154,7 +154,7 @@ proptest! {
         let joints = structure.num_joints();
         let load = JointForces::frictionless(vec![0.0; joints]);
         let mut factored = FactoredTree::empty(parameters);
-        factored.set_up(parameters, motion, state, &load, 1.0, GRAVITY);
+        factored.set_up(parameters, &mut motion.clone(), state, &load, 1.0);
         let body = seed as usize % (joints + 1);
         let branch = &structure.branches[body];
         let (base, mut along) = ([0.3, -0.2, 0.5, 0.1, 0.7, -0.4], numbers(seed, branch.len()));

@@ -312,10 +312,13 @@ fn solve_point<T: SimdFloat, E: StepEquations<T>>(
 ) {
     let [normal, first, second] = &block.rows;
     let (zero, body) = (T::splat(0.0), block.body);
+    let bases = [&normal.base, &first.base, &second.base];
+    let branches = [&normal.branch, &first.branch, &second.branch];
+    let changes = equations.velocity_changes(body, bases, branches);
     let errors = [
-        normal.velocity_error(equations, body, impulse[0]),
-        first.velocity_error(equations, body, impulse[1]),
-        second.velocity_error(equations, body, impulse[2]),
+        normal.error(changes[0], impulse[0]),
+        first.error(changes[1], impulse[1]),
+        second.error(changes[2], impulse[2]),
     ];
     let normal_impulse = (impulse[0] - errors[0] * normal.inverse).max(zero);
     let normal_change = normal_impulse - impulse[0];
@@ -330,11 +333,6 @@ fn solve_point<T: SimdFloat, E: StepEquations<T>>(
         along = [along[0] * scale, along[1] * scale];
     }
     let changes = [normal_change, along[0] - impulse[1], along[1] - impulse[2]];
-    equations.add_impulses(
-        body,
-        [&normal.base, &first.base, &second.base],
-        [&normal.branch, &first.branch, &second.branch],
-        changes,
-    );
+    equations.add_impulses(body, bases, branches, changes);
     *impulse = [normal_impulse, along[0], along[1]];
 }

@@ -50,14 +50,13 @@ impl<T: SimdFloat, B: JointValues<T>> ConstraintRow<T, B> {
     /// Returns the error of the impulse; positive if it is too large.
     #[inline(always)]
     pub fn impulse_error<E: StepEquations<T, Branch = B>>(&self, equations: &E, body: usize, impulse: T) -> T {
-        self.velocity_error(equations, body, impulse) * self.inverse
+        self.error(equations.velocity_change(body, &self.base, &self.branch), impulse) * self.inverse
     }
 
-    /// Returns the velocity error of the row [m/s].
+    /// Returns the velocity error of the row [m/s] for the velocity change along it and its impulse.
     #[inline(always)]
-    pub fn velocity_error<E: StepEquations<T, Branch = B>>(&self, equations: &E, body: usize, impulse: T) -> T {
-        equations.velocity_change(body, &self.base, &self.branch)
-            + (self.regularisation * impulse - self.target_velocity)
+    pub fn error(&self, velocity_change: T, impulse: T) -> T {
+        velocity_change + (self.regularisation * impulse - self.target_velocity)
     }
 
     /// Applies an impulse along the row.

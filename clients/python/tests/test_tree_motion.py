@@ -1,0 +1,152 @@
+"""Motion of robots of any tree in the batch engine, beside MuJoCo."""
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from test_tree_dynamics import random_robot
+
+from twinstep.server import find_program
+
+mujoco = pytest.importorskip("mujoco")
+
+Array = NDArray[np.float64]
+PHYSICS_HZ, ACTUATOR_HZ = 1000, 200
+HALF_STEP_S = 0.5 / PHYSICS_HZ
+PERIODS = ACTUATOR_HZ
+"""One second."""
+PROGRAM = Path(find_program()).with_name("tree_motion")
+ROBOTS = Path(__file__).parents[3] / "data" / "robots"
+
+G1_POSE = {"hip_pitch_joint": -0.2, "knee_joint": 0.42, "ankle_pitch_joint": -0.23}
+ANYMAL_POSE = {"F_HFE": 0.4, "F_KFE": -0.8, "H_HFE": -0.4, "H_KFE": 0.8}
+CHEETAH_POSE = {"thigh_joint": 0.8, "calf_joint": -1.6}
+SHIPPED: list[tuple[str, dict[str, float], float, float]] = [
+    ("g1", G1_POSE, 100.0, 2.0),
+    ("so101", {}, 10.0, 0.5),
+    ("anymal_c", ANYMAL_POSE, 300.0, 5.0),
+    ("mini_cheetah", CHEETAH_POSE, 30.0, 0.75),
+]
+
+pytestmark = pytest.mark.skipif(not PROGRAM.exists(), reason="a program of the Rust tests")
+
+
+class Robot:
+    """A robot file and its MuJoCo model."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.model = mujoco.MjModel.from_xml_path(str(path))
+        self.model.opt.timestep, self.model.opt.gravity = 1 / PHYSICS_HZ, [0, 0, -9.81]
+        self.is_free = bool(self.model.njnt and self.model.jnt_type[0] == 0)
+        self.joints = self.model.njnt - self.is_free
+        self.names = [self.model.joint(self.is_free + joint).name for joint in range(self.joints)]
+
+    def start(self, q: Array, dq: Array | None = None) -> dict[str, Any]:
+        """Return the state at rest at the pose of the file, with the joints in a state."""
+        base = self.model.body(1)
+        quat = [1.0, 0, 0, 0] if self.is_free else base.quat.tolist()
+        pose = {"position": base.pos.tolist(), "orientation": quat}
+        still = {"linear_velocity": [0.0] * 3, "angular_velocity": [0.0] * 3}
+        return pose | still | {"q": q.tolist(), "dq": (np.zeros(self.joints) if dq is None else dq).tolist()}
+
+    def data(self, start: dict[str, Any]) -> Any:
+        """Return the state of MuJoCo."""
+        data = mujoco.MjData(self.model)
+        base = [*start["position"], *start["orientation"]] if self.is_free else []
+        velocity = [*start["linear_velocity"], *start["angular_velocity"]] if self.is_free else []
+        data.qpos[:], data.qvel[:] = [*base, *start["q"]], [*velocity, *start["dq"]]
+        return data
+
+    def ours(self, start: dict[str, Any], gains: tuple[float, float], targets: Array, double: bool = True) -> list[Any]:
+        """Return the states of the batch engine after each actuator period."""
+        rates = {"physics_hz": PHYSICS_HZ, "actuator_hz": float(ACTUATOR_HZ), "double": double}
+        request = start | rates | {"kp": gains[0], "kd": gains[1], "targets": targets.tolist()}
+        line = json.dumps(request) + "\n"
+        reply = subprocess.run([PROGRAM, self.path], input=line, capture_output=True, text=True, check=True)
+        return json.loads(reply.stdout)
+
+
+def turned(quat: Array, rotation: Array) -> Array:
+    """Return an orientation that is turned by a rotation vector in its own axes."""
+    result = np.array(quat)
+    mujoco.mju_quatIntegrate(result, np.array(rotation), 1.0)
+    return result
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_free_motion_of_random_trees_is_that_of_mujoco(seed: int, tmp_path: Path) -> None:
+    random = np.random.default_rng(seed)
+    path = tmp_path / "robot.xml"
+    path.write_text(random_robot(random))
+    robot = Robot(path)
+    start = robot.start(random.uniform(-1, 1, robot.joints), 0.5 * random.normal(size=robot.joints))
+    if robot.is_free:
+        quat = random.normal(size=4)
+        start["orientation"] = (quat / np.linalg.norm(quat)).tolist()
+        start["linear_velocity"], start["angular_velocity"] = random.normal(size=(2, 3)).tolist()
+    theirs, shifted = robot.data(start), robot.data(start)
+    shifted.qvel[-robot.joints :] += 1e-12
+    for _ in range(PHYSICS_HZ):
+        mujoco.mj_step(robot.model, theirs)
+        mujoco.mj_step(robot.model, shifted)
+    # The engine reads positions half a step back, and places robots half a step ahead.
+    back = {name: np.array(start[name]) for name in start}
+    before = start | {
+        "position": (back["position"] - HALF_STEP_S * back["linear_velocity"]).tolist(),
+        "orientation": turned(back["orientation"], -HALF_STEP_S * back["angular_velocity"]).tolist(),
+        "q": (back["q"] - HALF_STEP_S * back["dq"]).tolist(),
+    }
+    for double, bound in ((True, 10 * np.abs(shifted.qpos - theirs.qpos).max()), (False, 5e-5)):
+        end = robot.ours(before, (0.0, 0.0), np.zeros((PERIODS, robot.joints)), double)[-1]
+        q = np.array(end["q"]) + HALF_STEP_S * np.array(end["dq"])
+        assert np.abs(q - theirs.qpos[-robot.joints :]).max() <= bound
+        if robot.is_free:
+            position = np.array(end["position"]) + HALF_STEP_S * np.array(end["linear_velocity"])
+            scale = 1.0 if double else np.abs(position).max()
+            assert np.abs(position - theirs.qpos[:3]).max() <= bound * scale
+
+
+@pytest.mark.parametrize("amplitude", [0.0, 0.1])
+@pytest.mark.parametrize(("name", "pose", "kp", "kd"), SHIPPED, ids=[robot[0] for robot in SHIPPED])
+def test_shipped_robot_holds_and_swings_as_in_mujoco(
+    name: str, pose: dict[str, float], kp: float, kd: float, amplitude: float
+) -> None:
+    robot = Robot(ROBOTS / f"{name}.xml")
+    q = np.array([next((value for end, value in pose.items() if joint.endswith(end)), 0.0) for joint in robot.names])
+    start = robot.start(q)
+    theirs = robot.data(start)
+    if robot.is_free:
+        # Puts the feet on the ground.
+        mujoco.mj_forward(robot.model, theirs)
+        spheres = np.flatnonzero(robot.model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE)
+        lowest = min(theirs.geom_xpos[geom][2] - robot.model.geom_size[geom][0] for geom in spheres)
+        theirs.qpos[2] -= lowest
+        start["position"] = theirs.qpos[:3].tolist()
+    sides = np.where(np.arange(robot.joints) % 2, 1, -1)
+    swing = amplitude * np.sin(2 * np.pi * np.arange(PERIODS) / ACTUATOR_HZ)
+    targets = q + np.outer(swing, sides)
+    expected = mujoco_motion(robot, theirs, (kp, kd), targets)
+    found = np.array([state["q"] for state in robot.ours(start, (kp, kd), targets)])
+    assert np.sqrt(np.mean((found - expected) ** 2)) <= 0.005
+
+
+def mujoco_motion(robot: Robot, data: Any, gains: tuple[float, float], targets: Array) -> Array:
+    """Return the joint positions of MuJoCo after each actuator period of PD control, read as the engine reads them."""
+    model, joints = robot.model, slice(-robot.joints, None)
+    limits = np.full(robot.joints, np.inf)
+    for motor in range(model.nu):
+        limits[model.actuator_trnid[motor, 0] - robot.is_free] = model.actuator_ctrlrange[motor, 1]
+    motion = list[Array]()
+    for target in targets:
+        dq = data.qvel[joints]
+        torque = gains[0] * (target - (data.qpos[joints] - HALF_STEP_S * dq)) - gains[1] * dq
+        data.qfrc_applied[joints] = np.clip(torque, -limits, limits)
+        for _ in range(PHYSICS_HZ // ACTUATOR_HZ):
+            mujoco.mj_step(model, data)
+        motion.append(data.qpos[joints] - HALF_STEP_S * data.qvel[joints])
+    return np.array(motion)
