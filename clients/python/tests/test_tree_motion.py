@@ -1,4 +1,4 @@
-"""Motion of robots of any tree in the batch engine, beside MuJoCo."""
+"""Motion of robots of any tree in the batch engine and in rapier, beside MuJoCo."""
 
 import json
 import subprocess
@@ -62,9 +62,17 @@ class Robot:
         data.qpos[:], data.qvel[:] = [*base, *start["q"]], [*velocity, *start["dq"]]
         return data
 
-    def ours(self, start: dict[str, Any], gains: tuple[float, float], targets: Array, double: bool = True) -> list[Any]:
-        """Return the states of the batch engine after each actuator period."""
-        rates = {"physics_hz": PHYSICS_HZ, "actuator_hz": float(ACTUATOR_HZ), "double": double}
+    def ours(
+        self,
+        start: dict[str, Any],
+        gains: tuple[float, float],
+        targets: Array,
+        double: bool = True,
+        engine: str = "batch",
+        physics_hz: int = PHYSICS_HZ,
+    ) -> list[Any]:
+        """Return the states of an engine after each actuator period."""
+        rates = {"physics_hz": physics_hz, "actuator_hz": float(ACTUATOR_HZ), "double": double, "engine": engine}
         request = start | rates | {"kp": gains[0], "kd": gains[1], "targets": targets.tolist()}
         line = json.dumps(request) + "\n"
         reply = subprocess.run([PROGRAM, self.path], input=line, capture_output=True, text=True, check=True)
@@ -131,8 +139,9 @@ def test_shipped_robot_holds_and_swings_as_in_mujoco(
     swing = amplitude * np.sin(2 * np.pi * np.arange(PERIODS) / ACTUATOR_HZ)
     targets = q + np.outer(swing, sides)
     expected = mujoco_motion(robot, theirs, (kp, kd), targets)
-    found = np.array([state["q"] for state in robot.ours(start, (kp, kd), targets)])
-    assert np.sqrt(np.mean((found - expected) ** 2)) <= 0.005
+    for engine in ("batch", "rapier"):
+        found = np.array([state["q"] for state in robot.ours(start, (kp, kd), targets, engine=engine)])
+        assert np.sqrt(np.mean((found - expected) ** 2)) <= 0.005, engine
 
 
 def mujoco_motion(robot: Robot, data: Any, gains: tuple[float, float], targets: Array) -> Array:

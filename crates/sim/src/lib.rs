@@ -7,22 +7,32 @@
 //!   threads.
 //! - [`MujocoBackend`]: MuJoCo in a Python process, for comparison with an engine that others wrote. [`MujocoPlant`]: its
 //!   robots with every effect, by equations that are not the model's.
+//! - [`TreeSimulation`]: robots of any tree, in the batch engine or in rapier; not behind [`twinstep_model::Backend`] yet.
 //!
 //! In one actuator period the PD loop samples the state once, and `physics_hz / actuator_hz` physics steps follow.
 
+mod actuator_input;
 mod batch;
+mod checks;
 mod config;
 mod error;
 mod ground_shapes;
 mod mujoco;
+mod placement;
 mod rapier;
+mod rapier_trees;
 mod robot_world;
 mod rollout;
 mod thread_pool;
+mod tree_engine;
+mod tree_simulation;
 
-pub use batch::{BatchBackend, BatchSnapshot, Placement, SimdPrecision, TreeCommand, TreeReadings, TreeSimulation};
+pub use batch::{BatchBackend, BatchSnapshot, SimdPrecision};
 pub use config::{Engine, RoughTerrain, SimConfig, SimConfigError, StepTerrain, Terrain};
 pub use error::BackendBuildError;
 pub use mujoco::{MujocoBackend, MujocoPlant};
+pub use placement::Placement;
 pub use rapier::{RapierBackend, RobotSnapshot};
 pub use rollout::BatchRollout;
+pub use tree_engine::{TreeCommand, TreeReadings};
+pub use tree_simulation::TreeSimulation;

@@ -3,15 +3,18 @@
 use std::sync::Arc;
 
 use rayon::prelude::*;
+use twinstep_dynamics::SimdCommands;
 use twinstep_model::{
     Actuator, ActuatorMode, ActuatorSnapshot, Backend, BackendError, Command, Ground, GroundTruth, InitialState,
     Measured, PerJoint, Restorable, RobotModel, RobotStates, Simulator,
 };
 
+use crate::actuator_input::ActuatorInput;
+use crate::checks::{check_floating, check_lengths};
 use crate::ground_shapes::GroundShapes;
-use crate::robot_world::{ActuatorInputRef, RobotWorld, WorldSnapshot};
+use crate::robot_world::{RobotWorld, WorldRobot, WorldSnapshot, foot_shape, is_upper_body};
 use crate::thread_pool::thread_pool;
-use crate::{BackendBuildError, SimConfig};
+use crate::{BackendBuildError, Placement, SimConfig};
 
 /// Backend that simulates each robot in a rapier3d world.
 pub struct RapierBackend {
@@ -24,24 +27,6 @@ pub struct RapierBackend {
     /// External actuator. `None`: analytic actuators only.
     actuator: Option<Box<dyn Actuator>>,
     pool: Arc<rayon::ThreadPool>,
-}
-
-/// Checks that there are one command and one flag per robot.
-pub(crate) fn check_lengths(commands: &[Command], active: &[bool], robots: usize) -> Result<(), BackendError> {
-    for (field, given) in [("commands", commands.len()), ("active", active.len())] {
-        if given != robots {
-            return Err(BackendError::WrongLength { field, given, expected: robots });
-        }
-    }
-    Ok(())
-}
-
-/// Checks that the base of a robot can be pushed.
-pub(crate) fn check_floating(robot: usize, config: &SimConfig) -> Result<(), BackendError> {
-    if config.base.is_fixed() {
-        return Err(BackendError::CannotPush { robot, reason: "its base is fixed" });
-    }
-    Ok(())
 }
 
 /// State of one robot. After a restore the simulation continues bit for bit.
@@ -61,8 +46,9 @@ impl RapierBackend {
         let ground = config.terrain.ground();
         let ground_shapes = GroundShapes::new(&ground);
         let initial_state = InitialState::standing_on(&ground, &robot, robot.control.default_pose_f32(), 0.0);
+        let (world_robot, placement) = (WorldRobot::of_quadruped(&robot), Placement::from(&initial_state));
         let worlds =
-            (0..num_robots).map(|_| RobotWorld::new(&robot, &config, &ground_shapes, &initial_state)).collect();
+            (0..num_robots).map(|_| RobotWorld::new(&world_robot, &config, &ground_shapes, &placement)).collect();
         let states = RobotStates::new(num_robots);
         let mut this = Self { robot, config, ground, ground_shapes, worlds, states, actuator: None, pool };
         for index in 0..num_robots {
@@ -83,7 +69,8 @@ impl RapierBackend {
     }
 
     fn reset_robot(&mut self, robot: usize, model: &RobotModel, initial_state: &InitialState) {
-        self.worlds[robot] = RobotWorld::new(model, &self.config, &self.ground_shapes, initial_state);
+        let (model, placement) = (WorldRobot::of_quadruped(model), Placement::from(initial_state));
+        self.worlds[robot] = RobotWorld::new(&model, &self.config, &self.ground_shapes, &placement);
         if let Some(actuator) = &mut self.actuator {
             actuator.reset(robot, initial_state.actuator_seed);
         }
@@ -95,15 +82,17 @@ impl RapierBackend {
 
     fn read_state(&mut self, robot: usize) {
         let (world, RobotStates { measured, truth }) = (&self.worlds[robot], &mut self.states);
-        world.read_joints(&mut measured.q[robot], &mut measured.dq[robot]);
+        read_joints(world, &mut measured.q[robot], &mut measured.dq[robot]);
         let base = world.read_base();
         measured.orientation[robot] = base.orientation;
         measured.gyro[robot] = base.gyro;
         truth.base_position[robot] = base.position;
         truth.base_linear_velocity[robot] = base.linear_velocity;
         truth.base_angular_velocity[robot] = base.angular_velocity;
-        truth.foot_force[robot] = world.foot_forces();
-        truth.body_contact[robot] = world.body_contact();
+        let forces: Vec<f32> = world.shape_forces().collect();
+        truth.foot_force[robot] = std::array::from_fn(|leg| forces[foot_shape(leg)]);
+        truth.body_contact[robot] =
+            forces.iter().enumerate().any(|(shape, force)| is_upper_body(shape) && *force > 0.0);
     }
 
     /// Advances all active robots by one actuator period.
@@ -117,17 +106,19 @@ impl RapierBackend {
             None => None,
         };
         let input = |robot: usize| match &external {
-            Some((ActuatorMode::Replace(_), tau)) => ActuatorInputRef::Torques(&tau[robot]),
-            Some((ActuatorMode::AddAt(tap), tau)) => ActuatorInputRef::Residual(&commands[robot], *tap, &tau[robot]),
-            None => ActuatorInputRef::Command(&commands[robot]),
+            Some((ActuatorMode::Replace(_), tau)) => ActuatorInput::Torques(wide(&tau[robot])),
+            Some((ActuatorMode::AddAt(tap), tau)) => {
+                ActuatorInput::Residual(commands_of(&commands[robot]), *tap, wide(&tau[robot]))
+            }
+            None => ActuatorInput::Commands(commands_of(&commands[robot])),
         };
         let measured = &mut self.states.measured;
         let robots = (&mut self.worlds, &mut measured.tau, &mut measured.q, &mut measured.dq, active);
         self.pool.install(|| {
             let robots = robots.into_par_iter().enumerate().filter(|(_, (.., active))| **active);
             robots.for_each(|(robot, (world, tau, q, dq, _))| {
-                *tau = world.actuator_period(input(robot), steps);
-                world.read_joints(q, dq);
+                narrow(tau, &world.actuator_period(input(robot), steps));
+                read_joints(world, q, dq);
             });
         });
         Ok(())
@@ -141,6 +132,26 @@ impl RapierBackend {
         let robots: Vec<_> = diverged.collect();
         if robots.is_empty() { Ok(()) } else { Err(BackendError::Diverged { robots }) }
     }
+}
+
+fn commands_of(command: &Command) -> SimdCommands<Vec<f64>> {
+    let mut commands = SimdCommands::zero::<f64>(command.q.len());
+    commands.set::<f64>(0, command);
+    commands
+}
+
+fn wide(values: &[f32]) -> Vec<f64> {
+    values.iter().map(|value| f64::from(*value)).collect()
+}
+
+fn narrow(read: &mut [f32], values: &[f64]) {
+    read.iter_mut().zip(values).for_each(|(read, value)| *read = *value as f32);
+}
+
+fn read_joints(world: &RobotWorld, q: &mut PerJoint, dq: &mut PerJoint) {
+    let readings = world.read_joints();
+    narrow(q, &readings.0);
+    narrow(dq, &readings.1);
 }
 
 impl Backend for RapierBackend {

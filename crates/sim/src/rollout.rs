@@ -10,7 +10,8 @@ use twinstep_model::{
 };
 use twinstep_simd::InstructionSet;
 
-use crate::batch::{ActuatorInputs, BatchSimulator, SimdPrecision, StepCount, batch_simulator};
+use crate::actuator_input::ActuatorInputs;
+use crate::batch::{BatchSimulator, SimdPrecision, StepCount, batch_simulator};
 use crate::{BackendBuildError, SimConfig};
 
 /// Returns the number of candidates in a batch: the lanes of the widest register of any processor.

@@ -1,4 +1,4 @@
-//! Motion of a robot file in the batch engine under commands that stdin has, one JSON object a line. `test_tree_motion.py` compares it
+//! Motion of a robot file in an engine under commands that stdin has, one JSON object a line. `test_tree_motion.py` compares it
 //! with MuJoCo.
 //!
 //! `target/release/tree_motion ROBOT.xml < commands`
@@ -10,7 +10,7 @@ use clap::Parser;
 use serde::{Deserialize, Serialize};
 use twinstep_model::TreeModel;
 use twinstep_robot_files::read_robot;
-use twinstep_sim::{Placement, SimConfig, SimdPrecision, TreeCommand, TreeSimulation};
+use twinstep_sim::{Engine, Placement, SimConfig, SimdPrecision, TreeCommand, TreeSimulation};
 use twinstep_simd::InstructionSet;
 
 /// Print the motion of a robot under given commands.
@@ -23,6 +23,7 @@ struct Arguments {
 /// Start of a motion, and its commands.
 #[derive(Deserialize)]
 struct Request {
+    engine: Engine,
     physics_hz: u32,
     actuator_hz: f64,
     /// Iterations of the contact solver.
@@ -51,7 +52,7 @@ struct Reply {
     q: Vec<f64>,
     dq: Vec<f64>,
     tau: Vec<f64>,
-    point_force: Vec<f64>,
+    shape_force: Vec<f64>,
 }
 
 fn main() -> Result<(), String> {
@@ -77,6 +78,7 @@ fn motion(model: &TreeModel, request: Request) -> Result<Vec<Reply>, String> {
         dq: request.dq,
     };
     let config = SimConfig {
+        engine: request.engine,
         physics_hz: Some(request.physics_hz),
         solver_iterations: request.iterations,
         threads: 1,
@@ -96,7 +98,7 @@ fn motion(model: &TreeModel, request: Request) -> Result<Vec<Reply>, String> {
             q: readings.state.q,
             dq: readings.state.dq,
             tau: readings.tau,
-            point_force: readings.point_force,
+            shape_force: readings.shape_force,
         }
     };
     Ok(request.targets.into_iter().map(reply).collect())

@@ -5,11 +5,10 @@
 //! quadruped, which are faster.
 //!
 //! - [`batch_robot`]: what the engine needs of a robot.
-//! - [`actuator_input`]: commands and torques of a step.
 //! - [`contact`], [`rows`] and [`ground`]: contacts, joint limits and joint friction as MuJoCo's soft constraints.
 //! - [`group`]: a [`robot_batch::RobotBatch`] is the state of the robots in one register.
 //! - [`simulator`]: steps batches on all cores, in the widest registers of the processor.
-//! - [`BatchBackend`]: the engine for quadrupeds. [`TreeSimulation`]: the engine for robots of any tree.
+//! - [`BatchBackend`]: the engine for quadrupeds. [`trees`]: robots of any tree.
 //!
 //! The results are bitwise equal for any instruction set, batch size and number of threads; see
 //! [`twinstep_simd::SimdFloat`].
@@ -17,14 +16,13 @@
 #![allow(clippy::inline_always, reason = "a function that is not inlined is compiled for the baseline instruction set")]
 #![allow(clippy::needless_range_loop, reason = "matrix indices as in the textbook")]
 
-mod actuator_input;
 mod batch_robot;
 mod contact;
 mod ground;
 mod robot_batch;
 mod rows;
 mod simulator;
-mod tree_simulation;
+mod trees;
 
 use std::sync::Arc;
 
@@ -34,14 +32,13 @@ use twinstep_model::{
 };
 use twinstep_simd::InstructionSet;
 
-pub use robot_batch::Placement;
 pub use simulator::SimdPrecision;
-pub use tree_simulation::{TreeCommand, TreeReadings, TreeSimulation};
+pub(crate) use trees::tree_batches;
 
 use crate::BackendBuildError;
-use crate::rapier::{check_floating, check_lengths};
+use crate::actuator_input::ActuatorInputs;
+use crate::checks::{check_floating, check_lengths};
 use crate::{SimConfig, SimConfigError};
-pub(crate) use actuator_input::ActuatorInputs;
 use robot_batch::LaneSnapshot;
 pub(crate) use robot_batch::StepCount;
 pub(crate) use simulator::{BatchSimulator, batch_simulator};

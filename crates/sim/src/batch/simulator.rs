@@ -9,10 +9,10 @@ use twinstep_model::{
 };
 use twinstep_simd::{InstructionSet, SimdFloat, SimdKernel, SimdTask, with_f32, with_f64};
 
-use super::actuator_input::{ActuatorInput, ActuatorInputs};
 use super::batch_robot::{BatchRobot, foot_point, is_upper_body};
-use super::robot_batch::{LaneSnapshot, Placement, RobotBatch, SensorReadings, StepCount, Workspace, WorkspaceShape};
-use crate::SimConfig;
+use super::robot_batch::{LaneSnapshot, RobotBatch, SensorReadings, StepCount, Workspace, WorkspaceShape};
+use crate::actuator_input::{ActuatorInput, ActuatorInputs};
+use crate::{Placement, SimConfig};
 
 /// Precision of the simulation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

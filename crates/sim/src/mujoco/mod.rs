@@ -19,7 +19,7 @@ use twinstep_model::{
     MjcfOptions, PerJoint, RobotModel, RobotStates, Simulator, mjcf,
 };
 
-use crate::rapier::check_lengths;
+use crate::checks::check_lengths;
 use crate::{BackendBuildError, SimConfig};
 use delay::CommandDelay;
 use effects::{Adjustments, unsupported};

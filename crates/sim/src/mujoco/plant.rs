@@ -9,7 +9,7 @@ use twinstep_model::{
 
 use super::MujocoBackend;
 use super::plant_actuator::{Joints, PlantActuator};
-use crate::rapier::check_lengths;
+use crate::checks::check_lengths;
 use crate::{BackendBuildError, Engine, SimConfig};
 
 /// Lowest rate of actuators and physics [Hz].

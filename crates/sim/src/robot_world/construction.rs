@@ -2,16 +2,15 @@
 
 use std::f64::consts::TAU;
 
-use glam::{DVec3, Vec3};
+use glam::{DVec3, Quat, Vec3};
 use rapier3d::prelude::*;
 use twinstep_dynamics::{SimdActuators, link_armature};
-use twinstep_model::{
-    BaseMount, Contact, InitialState, Joint, JointKind, Leg, NUM_JOINTS, PerJoint, RigidBody, RobotModel, frames,
-};
+use twinstep_model::{BaseMount, Contact, JointModel, RigidBody, TreeJointKind};
 
-use super::RobotWorld;
-use crate::SimConfig;
+use super::world_robot::{WorldLink, WorldRobot};
+use super::{PRISMATIC_AXIS, REVOLUTE_AXIS, RobotWorld};
 use crate::ground_shapes::GroundShapes;
+use crate::{Placement, SimConfig};
 
 /// MuJoCo's default impedance of a deep contact.
 const IMPEDANCE: f64 = 0.95;
@@ -22,64 +21,54 @@ const GROUND_GROUP: InteractionGroups =
 
 impl RobotWorld {
     /// Builds a robot in its initial state.
-    pub fn new(robot: &RobotModel, config: &SimConfig, ground: &GroundShapes, initial_state: &InitialState) -> Self {
+    pub fn new(robot: &WorldRobot, config: &SimConfig, ground: &GroundShapes, initial_state: &Placement) -> Self {
         let mut world = PhysicsWorld { gravity: Vec3::new(0.0, 0.0, -9.81), ..PhysicsWorld::default() };
-        world.integration_parameters = integration_parameters(robot, config);
+        world.integration_parameters = integration_parameters(&robot.contact, config);
         let friction = robot.contact.friction as f32;
         insert_ground(&mut world, ground, friction);
 
-        let trunk_com = robot.trunk.com.as_vec3();
-        let trunk = insert_trunk(&mut world, config.base, &robot.trunk, initial_state);
-        let mut upper_body = vec![insert_shape(&mut world, trunk, trunk_box(robot).translation(-trunk_com), friction)];
-        let mut feet = Vec::with_capacity(4);
+        let base_com = robot.base.com.as_vec3();
+        let base = insert_base(&mut world, config.base, &robot.base, initial_state);
+        let mut bodies = vec![base];
         let mut multibody = None;
-        for leg in Leg::ALL {
-            let mut parent = (trunk, -robot.trunk.com);
-            for kind in JointKind::ALL {
-                let joint = Joint { leg, kind };
-                let body = robot.legs[leg as usize].bodies[kind as usize];
-                let child = world.insert_body(moving_body(RigidBodyBuilder::dynamic(), &body, body.com));
-                let origin = robot.legs[leg as usize].origins[kind as usize] + parent.1;
-                multibody = world.insert_multibody_joint(parent.0, child, revolute(robot, joint, origin));
-                parent = (child, DVec3::ZERO);
-                match kind {
-                    JointKind::Hip => {}
-                    JointKind::Thigh => upper_body.push(insert_shape(&mut world, child, thigh_box(robot), friction)),
-                    JointKind::Calf => {
-                        insert_shape(&mut world, child, calf_capsule(robot), friction);
-                        feet.push(insert_shape(&mut world, child, foot_sphere(robot), friction));
-                    }
-                }
-            }
+        for (link, joint) in robot.links.iter().zip(&robot.joints) {
+            let child = world.insert_body(moving_body(RigidBodyBuilder::dynamic(), &link.body, link.body.com));
+            // The frame of the base's body is at its centre of mass.
+            let shift = if link.parent == 0 { robot.base.com } else { DVec3::ZERO };
+            multibody = world.insert_multibody_joint(bodies[link.parent], child, rapier_joint(link, joint, shift));
+            bodies.push(child);
         }
+        let shapes = robot.shapes.iter().map(|(body, shape)| {
+            let shape = if *body == 0 { shifted(shape.clone(), -base_com) } else { shape.clone() };
+            insert_shape(&mut world, bodies[*body], shape, friction)
+        });
+        let shapes = shapes.collect();
+        let axis = |link: &WorldLink| match link.kind {
+            TreeJointKind::Revolute => REVOLUTE_AXIS,
+            TreeJointKind::Prismatic => PRISMATIC_AXIS,
+        };
+        let dt = 1.0 / f64::from(config.physics_hz());
         let mut this = Self {
-            actuator: SimdActuators::new(
-                &robot.joints,
-                robot.control.actuator_dt(),
-                1.0 / f64::from(config.physics_hz()),
-            )
-            .with_sampled_positions(),
+            actuator: SimdActuators::new(&robot.joints, robot.actuator_dt, dt).with_sampled_positions(),
             gyro_bias: robot.gyro_bias.as_vec3(),
+            axes: robot.links.iter().map(axis).collect(),
             world,
-            trunk,
-            multibody: multibody.expect("the joints of a leg form no loop"),
-            trunk_com,
+            base,
+            multibody: multibody.expect("a robot has a joint, and its tree no loop"),
+            base_com,
             root_dofs: if config.base == BaseMount::Floating { 6 } else { 0 },
-            feet: feet.try_into().expect("each leg has one foot"),
-            upper_body,
+            shapes,
         };
         this.reset_joints(robot, initial_state);
         this
     }
 
-    fn reset_joints(&mut self, robot: &RobotModel, initial_state: &InitialState) {
-        let root_dofs = self.root_dofs;
+    fn reset_joints(&mut self, robot: &WorldRobot, initial_state: &Placement) {
+        let (root_dofs, num_joints) = (self.root_dofs, robot.joints.len());
         // An initial state contains encoder readings.
-        let q: PerJoint = std::array::from_fn(|joint| {
-            let dq = f64::from(initial_state.dq[joint]);
-            initial_state.q[joint] - robot.joints[joint].actuator.encoder_error(dq) as f32
-        });
-        self.actuator.set(0, &robot.joints, &q.map(f64::from), &initial_state.dq.map(f64::from));
+        let readings = robot.joints.iter().zip(initial_state.q.iter().zip(&initial_state.dq));
+        let q: Vec<f64> = readings.map(|(joint, (q, dq))| q - joint.actuator.encoder_error(*dq)).collect();
+        self.actuator.set(0, &robot.joints, &q, &initial_state.dq);
         let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
         // Sets the pose of the root, and removes its six degrees of freedom if the base is fixed.
         multibody.forward_kinematics(&self.world.bodies, true);
@@ -88,17 +77,17 @@ impl RobotWorld {
             multibody.armature_mut()[root_dofs + dof] = link_armature(joint) as f32;
             multibody.damping_mut()[root_dofs + dof] = joint.viscous_friction as f32;
         }
-        let mut displacement = vec![0.0; root_dofs + NUM_JOINTS];
-        displacement[root_dofs..].copy_from_slice(&q);
+        let mut displacement = vec![0.0; root_dofs + num_joints];
+        write(&mut displacement[root_dofs..], &q);
         multibody.apply_displacements(&displacement);
 
-        let mut velocity = vec![0.0; root_dofs + NUM_JOINTS];
-        velocity[root_dofs..].copy_from_slice(&initial_state.dq);
+        let mut velocity = vec![0.0; root_dofs + num_joints];
+        write(&mut velocity[root_dofs..], &initial_state.dq);
         if root_dofs > 0 {
-            let world_from_base = frames::world_from_base(initial_state.base_orientation);
-            let angular_world = world_from_base * Vec3::from(initial_state.base_angular_velocity);
+            let world_from_base = rotation(initial_state);
+            let angular_world = world_from_base * vector(initial_state.base_angular_velocity);
             let linear_com =
-                Vec3::from(initial_state.base_linear_velocity) + angular_world.cross(world_from_base * self.trunk_com);
+                vector(initial_state.base_linear_velocity) + angular_world.cross(world_from_base * self.base_com);
             velocity[..3].copy_from_slice(&linear_com.to_array());
             velocity[3..6].copy_from_slice(&angular_world.to_array());
         }
@@ -108,8 +97,21 @@ impl RobotWorld {
     }
 }
 
-fn integration_parameters(robot: &RobotModel, config: &SimConfig) -> IntegrationParameters {
-    let softness = softness(&robot.contact);
+fn vector(values: [f64; 3]) -> Vec3 {
+    DVec3::from(values).as_vec3()
+}
+
+fn rotation(state: &Placement) -> Quat {
+    let [w, x, y, z] = state.base_orientation.map(|value| value as f32);
+    Quat::from_xyzw(x, y, z, w)
+}
+
+fn write(values: &mut [f32], given: &[f64]) {
+    values.iter_mut().zip(given).for_each(|(value, given)| *value = *given as f32);
+}
+
+fn integration_parameters(contact: &Contact, config: &SimConfig) -> IntegrationParameters {
+    let softness = softness(contact);
     IntegrationParameters {
         dt: 1.0 / config.physics_hz() as f32,
         num_solver_iterations: config.solver_iterations() as usize,
@@ -136,20 +138,20 @@ fn insert_ground(world: &mut PhysicsWorld, ground: &GroundShapes, friction: f32)
     }
 }
 
-fn insert_trunk(
+fn insert_base(
     world: &mut PhysicsWorld,
-    base: BaseMount,
-    trunk: &RigidBody,
-    initial_state: &InitialState,
+    mount: BaseMount,
+    base: &RigidBody,
+    initial_state: &Placement,
 ) -> RigidBodyHandle {
-    let world_from_base = frames::world_from_base(initial_state.base_orientation);
-    let centre = Vec3::from(initial_state.base_position) + world_from_base * trunk.com.as_vec3();
-    let builder = match base {
+    let world_from_base = rotation(initial_state);
+    let centre = vector(initial_state.base_position) + world_from_base * base.com.as_vec3();
+    let builder = match mount {
         BaseMount::Floating => RigidBodyBuilder::dynamic(),
         BaseMount::Fixed => RigidBodyBuilder::fixed(),
     };
     let pose = Pose::from_parts(centre, world_from_base);
-    world.insert_body(moving_body(builder, trunk, DVec3::ZERO).pose(pose))
+    world.insert_body(moving_body(builder, base, DVec3::ZERO).pose(pose))
 }
 
 /// Returns a body with the mass and inertia of `body`, whose centre of mass is at `com` in its frame.
@@ -160,13 +162,28 @@ fn moving_body(builder: RigidBodyBuilder, body: &RigidBody, com: DVec3) -> Rigid
         .can_sleep(false)
 }
 
-fn revolute(robot: &RobotModel, joint: Joint, origin: DVec3) -> GenericJoint {
-    let range = robot.joints[joint.index()].range.map(|limit| limit as f32);
-    let revolute = RevoluteJointBuilder::new(RobotModel::axis(joint).as_vec3())
-        .local_anchor1(origin.as_vec3())
-        .contacts_enabled(false);
+/// Returns the joint of a link. `shift` is the origin of the parent's body in the frame of the parent [m].
+fn rapier_joint(link: &WorldLink, joint: &JointModel, shift: DVec3) -> GenericJoint {
+    let range = joint.range.map(|limit| limit as f32);
     let has_limits = range[0].is_finite() && range[1].is_finite();
-    if has_limits { revolute.limits(range).build().into() } else { revolute.build().into() }
+    let (axis, anchor) = (link.axis.as_vec3(), (link.origin - shift).as_vec3());
+    match link.kind {
+        TreeJointKind::Revolute => {
+            let joint = RevoluteJointBuilder::new(axis).local_anchor1(anchor).contacts_enabled(false);
+            if has_limits { joint.limits(range).build().into() } else { joint.build().into() }
+        }
+        TreeJointKind::Prismatic => {
+            let joint = PrismaticJointBuilder::new(axis).local_anchor1(anchor).contacts_enabled(false);
+            if has_limits { joint.limits(range).build().into() } else { joint.build().into() }
+        }
+    }
+}
+
+/// Returns a shape that is moved by `offset` [m].
+fn shifted(shape: ColliderBuilder, offset: Vec3) -> ColliderBuilder {
+    let mut pose = shape.position;
+    pose.translation += offset;
+    shape.position(pose)
 }
 
 fn insert_shape(
@@ -176,23 +193,4 @@ fn insert_shape(
     friction: f32,
 ) -> ColliderHandle {
     world.insert_collider(shape.friction(friction).density(0.0).collision_groups(ROBOT_GROUP), Some(body))
-}
-
-fn trunk_box(robot: &RobotModel) -> ColliderBuilder {
-    let half = robot.shapes.trunk_half_size.as_vec3();
-    ColliderBuilder::cuboid(half.x, half.y, half.z)
-}
-
-fn thigh_box(robot: &RobotModel) -> ColliderBuilder {
-    let half = robot.shapes.thigh_half_size.as_vec3();
-    ColliderBuilder::cuboid(half.x, half.y, half.z).translation(robot.shapes.thigh_centre.as_vec3())
-}
-
-fn calf_capsule(robot: &RobotModel) -> ColliderBuilder {
-    let [knee, shin] = [robot.shapes.calf_ends[0].as_vec3(), robot.shapes.calf_ends[1].as_vec3()];
-    ColliderBuilder::capsule_from_endpoints(knee, shin, robot.shapes.calf_radius as f32)
-}
-
-fn foot_sphere(robot: &RobotModel) -> ColliderBuilder {
-    ColliderBuilder::ball(robot.shapes.foot_radius as f32).translation(robot.shapes.foot_centre.as_vec3())
 }

@@ -1,6 +1,7 @@
-//! One Go2 in a rapier world of its own: actuation and readout.
+//! One robot in a rapier world of its own: actuation and readout.
 //!
 //! - [`construction`]: the world with the robot in its initial state.
+//! - [`world_robot`]: what a world needs of a robot.
 //! - [`snapshot`]: saves and restores the state.
 //!
 //! A legged robot in rapier 0.36 needs these corrections. Each is covered by a test in `tests/it/physics.rs`:
@@ -17,49 +18,46 @@
 
 mod construction;
 mod snapshot;
+mod world_robot;
 
 use glam::{Quat, Vec3};
 use rapier3d::prelude::*;
-use twinstep_dynamics::{SimdActuators, SimdCommands};
-use twinstep_model::{ActuatorTap, Command, NUM_JOINTS, PerJoint, PerLeg, frames};
+use twinstep_dynamics::SimdActuators;
+use twinstep_model::frames;
+
+use crate::actuator_input::ActuatorInput;
 
 pub use snapshot::WorldSnapshot;
+pub use world_robot::{WorldRobot, foot_shape, is_upper_body};
 
 /// Stiffness of the spring that applies a joint torque [N·m/rad].
 const TORQUE_SPRING: f32 = 1e-3;
 /// Index of a revolute joint's axis in rapier's six-axis layout.
 const REVOLUTE_AXIS: usize = 3;
+/// Index of a sliding joint's axis.
+const PRISMATIC_AXIS: usize = 0;
 
 /// World with one robot and the ground.
 pub struct RobotWorld {
     world: PhysicsWorld,
-    trunk: RigidBodyHandle,
+    base: RigidBodyHandle,
     multibody: MultibodyJointHandle,
-    /// Centre of mass of the trunk in the base frame [m].
-    trunk_com: Vec3,
+    /// Centre of mass of the base in its frame [m].
+    base_com: Vec3,
     /// Degrees of freedom of the root: 6, or 0 with a fixed base.
     root_dofs: usize,
-    feet: [ColliderHandle; 4],
-    upper_body: Vec<ColliderHandle>,
-    actuator: SimdActuators<f64, [f64; NUM_JOINTS]>,
+    /// Index of each joint's axis in rapier's six-axis layout.
+    axes: Vec<usize>,
+    /// Collision shapes, in the order of [`WorldRobot::shapes`].
+    shapes: Vec<ColliderHandle>,
+    actuator: SimdActuators<f64, Vec<f64>>,
     /// Gyroscope bias [rad/s].
     gyro_bias: Vec3,
 }
 
-/// Input of the actuators of one robot.
-#[derive(Clone, Copy)]
-pub enum ActuatorInputRef<'a> {
-    /// A command to the actuators of the robot model.
-    Command(&'a Command),
-    /// Joint torques of an external actuator [N·m].
-    Torques(&'a PerJoint),
-    /// A command, and joint torques of an external actuator that are added at a tap [N·m].
-    Residual(&'a Command, ActuatorTap, &'a PerJoint),
-}
-
 impl RobotWorld {
     /// Sets the factors on the torque for supply voltage and motor temperature.
-    pub fn set_derating(&mut self, factors: &PerJoint) {
+    pub fn set_derating(&mut self, factors: &[f32]) {
         self.actuator.set_derating(0, factors);
     }
 
@@ -71,33 +69,29 @@ impl RobotWorld {
         }
     }
 
-    /// Advances by one actuator period of `steps` physics steps and returns the mean estimated torque [N·m].
-    pub fn actuator_period(&mut self, input: ActuatorInputRef, steps: usize) -> PerJoint {
+    /// Advances by one actuator period of `steps` physics steps and returns the mean estimated torque [N·m or N].
+    pub fn actuator_period(&mut self, input: ActuatorInput<Vec<f64>>, steps: usize) -> Vec<f64> {
         let (mut q, mut dq) = self.joints();
         match input {
-            ActuatorInputRef::Command(command) | ActuatorInputRef::Residual(command, ..) => {
-                self.actuator.update_command(&SimdCommands::new(std::slice::from_ref(command)), &q, &dq);
+            ActuatorInput::Commands(commands) => self.actuator.update_command(&commands, &q, &dq),
+            ActuatorInput::Torques(tau) => self.actuator.set_torque(&tau),
+            ActuatorInput::Residual(commands, tap, tau) => {
+                self.actuator.update_command(&commands, &q, &dq);
+                self.actuator.set_residual(tap, tau);
             }
-            ActuatorInputRef::Torques(tau) => self.actuator.set_torque(&tau.map(f64::from)),
         }
-        if let ActuatorInputRef::Residual(_, tap, tau) = input {
-            self.actuator.set_residual(tap, tau.map(f64::from));
-        }
-        let mut estimated = [0.0; NUM_JOINTS];
+        let mut estimated = vec![0.0; q.len()];
         for index in 0..steps {
             self.actuator.step(index, &q, &dq);
             let forces = self.actuator.forces();
             let (multibody, _) = self.world.multibody_joints.get_mut(self.multibody).expect("built with the world");
             for (joint, link) in multibody.links_mut().skip(1).enumerate() {
-                let position = link.joint().coords()[REVOLUTE_AXIS];
-                link.joint.set_spring(
-                    REVOLUTE_AXIS,
-                    TORQUE_SPRING,
-                    position + forces.tau[joint] as f32 / TORQUE_SPRING,
-                );
+                let axis = self.axes[joint];
+                let position = link.joint().coords()[axis];
+                link.joint.set_spring(axis, TORQUE_SPRING, position + forces.tau[joint] as f32 / TORQUE_SPRING);
             }
-            for (joint, dry) in forces.dry_friction.into_iter().enumerate() {
-                multibody.frictions_mut()[self.root_dofs + joint] = dry as f32;
+            for (joint, dry) in forces.dry_friction.iter().enumerate() {
+                multibody.frictions_mut()[self.root_dofs + joint] = *dry as f32;
             }
             self.world.step();
             (q, dq) = self.joints();
@@ -105,19 +99,20 @@ impl RobotWorld {
                 *estimated += current / steps as f64;
             }
         }
-        estimated.map(|tau| tau as f32)
+        estimated
     }
 
-    /// Returns the positions [rad] and velocities [rad/s] of the joints.
-    fn joints(&self) -> ([f64; NUM_JOINTS], [f64; NUM_JOINTS]) {
+    /// Returns the positions [rad or m] and velocities [rad/s or m/s] of the joints.
+    fn joints(&self) -> (Vec<f64>, Vec<f64>) {
         let (multibody, _) = self.world.multibody_joints.get(self.multibody).expect("built with the world");
-        let (mut q, mut dq) = ([0.0; NUM_JOINTS], [0.0; NUM_JOINTS]);
         let velocities = multibody.generalized_velocity();
-        for (joint, link) in multibody.links().skip(1).enumerate() {
-            q[joint] = f64::from(link.joint().coords()[REVOLUTE_AXIS]);
-            dq[joint] = f64::from(velocities[self.root_dofs + joint]);
-        }
-        (q, dq)
+        let joints = multibody.links().skip(1).zip(&self.axes).enumerate();
+        joints
+            .map(|(joint, (link, axis))| {
+                let velocity = velocities[self.root_dofs + joint];
+                (f64::from(link.joint().coords()[*axis]), f64::from(velocity))
+            })
+            .unzip()
     }
 
     /// Returns true if a number became NaN or infinite in the last step. rapier then quarantines the body.
@@ -125,25 +120,23 @@ impl RobotWorld {
         !self.world.quarantine().bodies().is_empty() || !self.world.quarantine().colliders().is_empty()
     }
 
-    /// Reads the encoders: positions [rad] and velocities [rad/s].
-    pub fn read_joints(&self, q: &mut PerJoint, dq: &mut PerJoint) {
-        let (positions, velocities) = self.joints();
-        for joint in 0..NUM_JOINTS {
-            let (encoder_q, encoder_dq) = self.actuator.encoder_reading(joint, positions[joint], velocities[joint]);
-            (q[joint], dq[joint]) = (encoder_q as f32, encoder_dq as f32);
-        }
+    /// Reads the encoders: positions [rad or m] and velocities [rad/s or m/s].
+    pub fn read_joints(&self) -> (Vec<f64>, Vec<f64>) {
+        let (q, dq) = self.joints();
+        let readings = q.into_iter().zip(dq).enumerate();
+        readings.map(|(joint, (q, dq))| self.actuator.encoder_reading(joint, q, dq)).unzip()
     }
 
     /// Returns the pose and the velocity of the base frame.
     ///
-    /// The velocity is that of the joint coordinates, because the trunk body's velocity is delayed by one physics step.
+    /// The velocity is that of the joint coordinates, because the body's velocity is delayed by one physics step.
     pub fn read_base(&self) -> BaseState {
-        let trunk = &self.world.bodies[self.trunk];
-        let rotation = Quat::from_array(trunk.position().rotation.to_array());
-        let offset_world = rotation * self.trunk_com;
+        let base = &self.world.bodies[self.base];
+        let rotation = Quat::from_array(base.position().rotation.to_array());
+        let offset_world = rotation * self.base_com;
         let (linear_com, angular_world) = self.root_velocity();
         BaseState {
-            position: (trunk.translation() - offset_world).to_array(),
+            position: (base.translation() - offset_world).to_array(),
             orientation: frames::to_wxyz(rotation),
             linear_velocity: (linear_com - angular_world.cross(offset_world)).to_array(),
             angular_velocity: (rotation.inverse() * angular_world).to_array(),
@@ -151,7 +144,7 @@ impl RobotWorld {
         }
     }
 
-    /// Returns the velocity of the trunk's centre of mass [m/s] and its angular velocity [rad/s], in the world frame.
+    /// Returns the velocity of the base's centre of mass [m/s] and its angular velocity [rad/s], in the world frame.
     fn root_velocity(&self) -> (Vec3, Vec3) {
         if self.root_dofs == 0 {
             return (Vec3::ZERO, Vec3::ZERO);
@@ -161,14 +154,9 @@ impl RobotWorld {
         (Vec3::new(velocity[0], velocity[1], velocity[2]), Vec3::new(velocity[3], velocity[4], velocity[5]))
     }
 
-    /// Returns the normal force on each foot, mean over the last physics step [N].
-    pub fn foot_forces(&self) -> PerLeg {
-        self.feet.map(|foot| self.normal_impulse(foot) / self.world.integration_parameters.dt)
-    }
-
-    /// Returns true if the trunk or a thigh touches the ground.
-    pub fn body_contact(&self) -> bool {
-        self.upper_body.iter().any(|shape| self.normal_impulse(*shape) > 0.0)
+    /// Returns the normal force on each shape, mean over the last physics step [N].
+    pub fn shape_forces(&self) -> impl Iterator<Item = f32> {
+        self.shapes.iter().map(|shape| self.normal_impulse(*shape) / self.world.integration_parameters.dt)
     }
 
     fn normal_impulse(&self, shape: ColliderHandle) -> f32 {
@@ -197,8 +185,8 @@ mod tests {
     use twinstep_model::{Ground, InitialState, body_poses, go2};
 
     use super::*;
-    use crate::SimConfig;
     use crate::ground_shapes::GroundShapes;
+    use crate::{Placement, SimConfig};
 
     /// Rendering uses the forward kinematics of the model, so they must agree with the engine.
     #[test]
@@ -207,12 +195,15 @@ mod tests {
         let q = std::array::from_fn(|j| robot.control.default_pose[j] as f32 + 0.2 * (j as f32).sin());
         let tilted = Quat::from_euler(glam::EulerRot::ZYX, 0.1 * TAU, 0.05 * TAU, -0.03 * TAU);
         let initial_state = InitialState { base_orientation: frames::to_wxyz(tilted), ..InitialState::at_rest(0.6, q) };
-        let mut world =
-            RobotWorld::new(&robot, &SimConfig::default(), &GroundShapes::new(&Ground::FLAT), &initial_state);
+        let mut world = RobotWorld::new(
+            &WorldRobot::of_quadruped(&robot),
+            &SimConfig::default(),
+            &GroundShapes::new(&Ground::FLAT),
+            &Placement::from(&initial_state),
+        );
         for steps in [0, 40] {
-            world.actuator_period(ActuatorInputRef::Torques(&std::array::from_fn(|j| (j as f32).cos())), steps);
-            let (mut q, mut dq) = (PerJoint::default(), PerJoint::default());
-            world.read_joints(&mut q, &mut dq);
+            world.actuator_period(ActuatorInput::Torques((0..12).map(|joint| f64::from(joint).cos()).collect()), steps);
+            let q = std::array::from_fn(|joint| world.read_joints().0[joint] as f32);
             let base = world.read_base();
             let world_from_base = twinstep_model::Pose {
                 position: Vec3::from(base.position),

@@ -3,7 +3,6 @@
 use glam::Vec3;
 use rapier3d::prelude::*;
 use twinstep_dynamics::SimdActuators;
-use twinstep_model::NUM_JOINTS;
 
 use super::RobotWorld;
 
@@ -19,15 +18,15 @@ pub struct WorldSnapshot {
     root: RootFrame,
 }
 
-/// State of a world outside rapier's sets. A reset with another robot model changes the trunk and the handles.
+/// State of a world outside rapier's sets. A reset with another robot model changes the base and the handles.
 #[derive(Clone)]
 struct RootFrame {
-    trunk: RigidBodyHandle,
+    base: RigidBodyHandle,
     multibody: MultibodyJointHandle,
-    trunk_com: Vec3,
-    feet: [ColliderHandle; 4],
-    upper_body: Vec<ColliderHandle>,
-    actuator: SimdActuators<f64, [f64; NUM_JOINTS]>,
+    base_com: Vec3,
+    axes: Vec<usize>,
+    shapes: Vec<ColliderHandle>,
+    actuator: SimdActuators<f64, Vec<f64>>,
     gyro_bias: Vec3,
     /// Contains the contact compliance, which depends on the robot model.
     integration_parameters: IntegrationParameters,
@@ -44,11 +43,11 @@ impl RobotWorld {
             colliders: self.world.colliders.clone(),
             multibody_joints: self.world.multibody_joints.clone(),
             root: RootFrame {
-                trunk: self.trunk,
+                base: self.base,
                 multibody: self.multibody,
-                trunk_com: self.trunk_com,
-                feet: self.feet,
-                upper_body: self.upper_body.clone(),
+                base_com: self.base_com,
+                axes: self.axes.clone(),
+                shapes: self.shapes.clone(),
                 actuator: self.actuator.clone(),
                 gyro_bias: self.gyro_bias,
                 integration_parameters: self.world.integration_parameters,
@@ -71,8 +70,8 @@ impl RobotWorld {
             multibody_joints,
             ..PhysicsWorld::default()
         };
-        let RootFrame { trunk, multibody, trunk_com, feet, upper_body, actuator, gyro_bias, .. } = root;
-        (self.trunk, self.multibody, self.trunk_com, self.feet, self.upper_body, self.actuator, self.gyro_bias) =
-            (trunk, multibody, trunk_com, feet, upper_body, actuator, gyro_bias);
+        let RootFrame { base, multibody, base_com, axes, shapes, actuator, gyro_bias, .. } = root;
+        (self.base, self.multibody, self.base_com, self.axes, self.shapes, self.actuator, self.gyro_bias) =
+            (base, multibody, base_com, axes, shapes, actuator, gyro_bias);
     }
 }
