@@ -84,7 +84,7 @@ const MAY_USE: [(&str, &[&str]); 29] = [
             "viewer",
         ],
     ),
-    ("examples", &["model", "env-server", "client"]),
+    ("examples", &["model", "robot-files", "sim", "env-server", "client"]),
     (
         "tests",
         &[

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use twinstep_model::{MjcfActuator, TreeModel};
 use twinstep_robot_files::{TreeMjcf, read_robot, write_mjcf};
-use twinstep_sim::{Placement, SimConfig, SimdPrecision, TreeCommand, TreeSimulation};
+use twinstep_sim::{Placement, SimConfig, TreeCommand, TreeSimulation};
 use twinstep_simd::InstructionSet;
 
 use crate::Measurement;
@@ -134,9 +134,8 @@ impl Motion {
     fn stepping(&self) -> Result<impl FnMut() -> Result<(), BenchError>, BenchError> {
         let start = Placement::at_rest(self.model.standing_height(&self.pose), self.pose.clone());
         let config = SimConfig { physics_hz: Some(PHYSICS_HZ), threads: 1, ..SimConfig::default() };
-        let precision = SimdPrecision::Single(InstructionSet::best());
         let mut robots =
-            TreeSimulation::new(&self.model, &config, ACTUATOR_HZ.into(), precision, ROBOTS, &start).map_err(failed)?;
+            TreeSimulation::new(&self.model, &config, ACTUATOR_HZ.into(), ROBOTS, &start).map_err(failed)?;
         let mut commands = vec![TreeCommand::hold(self.target(0), self.gains[0], self.gains[1]); ROBOTS];
         let mut period = 0;
         Ok(move || {

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use twinstep_model::TreeModel;
+use twinstep_simd::InstructionSet;
 
 use crate::batch::{SimdPrecision, tree_batches};
 use crate::rapier_trees::RapierTrees;
@@ -20,11 +21,24 @@ pub struct TreeSimulation {
 }
 
 impl TreeSimulation {
-    /// Creates `num_robots` robots in a state, whose actuators have the rate `actuator_hz` [Hz].
+    /// Creates `num_robots` robots in a state, whose actuators have the rate `actuator_hz` [Hz], in single precision and the widest
+    /// registers.
     ///
-    /// The base of `robot` moves if `config` says floating and the robot's tree does not fix it. `precision` is that of the batch engine.
-    /// Fails if the engine of `config` is MuJoCo, or if the robot has no joint.
+    /// The base of `robot` moves if `config` says floating and the robot's tree does not fix it. Fails if the engine of `config` is
+    /// MuJoCo, if the robot has no joint, and if a setting is not allowed.
     pub fn new(
+        robot: &TreeModel,
+        config: &SimConfig,
+        actuator_hz: f64,
+        num_robots: usize,
+        initial_state: &Placement,
+    ) -> Result<Self, BackendBuildError> {
+        let precision = SimdPrecision::Single(InstructionSet::best());
+        Self::with_precision(robot, config, actuator_hz, precision, num_robots, initial_state)
+    }
+
+    /// Creates robots like [`TreeSimulation::new`], in the given precision. rapier has single precision only.
+    pub fn with_precision(
         robot: &TreeModel,
         config: &SimConfig,
         actuator_hz: f64,

@@ -85,7 +85,7 @@ fn motion(model: &TreeModel, request: Request) -> Result<Vec<Reply>, String> {
         ..SimConfig::default()
     };
     let precision = if request.double { SimdPrecision::Double } else { SimdPrecision::Single(InstructionSet::best()) };
-    let mut robots = TreeSimulation::new(model, &config, request.actuator_hz, precision, 1, &start)
+    let mut robots = TreeSimulation::with_precision(model, &config, request.actuator_hz, precision, 1, &start)
         .map_err(|error| error.to_string())?;
     let reply = |target: Vec<f32>| {
         robots.step(&[TreeCommand::hold(target, request.kp, request.kd)], 1);
