@@ -25,8 +25,8 @@ pub struct Config {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ServerConfig {
-    /// Name of the robot; clients select the server by it.
-    pub name: String,
+    /// Name by which clients select the server. Default: the name of the robot, such as `go2`.
+    pub name: Option<String>,
     /// Zenoh endpoint to listen at, such as `tcp/127.0.0.1:7447`. Port 0 selects a free port.
     pub listen: String,
     /// Zenoh endpoints of routers to connect to, in addition to listening.
@@ -54,10 +54,28 @@ pub struct ServerConfig {
     pub seed: Option<u64>,
 }
 
+impl ServerConfig {
+    /// Returns the name by which clients select the server of this robot.
+    pub fn name_of(&self, robot: &str) -> String {
+        self.name.clone().unwrap_or_else(|| as_name(robot))
+    }
+}
+
+/// Longest name of a server.
+const MAX_NAME: usize = 64;
+
+/// Returns the name with `_` in place of everything that is not allowed in a name.
+fn as_name(text: &str) -> String {
+    let is_allowed = |character: char| character.is_ascii_alphanumeric() || matches!(character, '-' | '_');
+    let name: String =
+        text.chars().take(MAX_NAME).map(|character| if is_allowed(character) { character } else { '_' }).collect();
+    if name.is_empty() { "_".to_owned() } else { name }
+}
+
 impl Default for ServerConfig {
     fn default() -> Self {
         Self {
-            name: "go2".to_owned(),
+            name: None,
             listen: "tcp/127.0.0.1:7447".to_owned(),
             connect: Vec::new(),
             zenoh: None,
@@ -137,9 +155,8 @@ impl Config {
     pub fn check(&self) -> Result<(), ConfigFileError> {
         let server = &self.server;
         let out_of_range = |field, value: String, allowed| Err(ConfigFileError::OutOfRange { field, value, allowed });
-        let is_name = |character: char| character.is_ascii_alphanumeric() || matches!(character, '-' | '_');
-        if server.name.is_empty() || server.name.len() > 64 || !server.name.chars().all(is_name) {
-            return out_of_range("server.name", server.name.clone(), "1 to 64 letters, digits, - and _");
+        if let Some(name) = server.name.as_ref().filter(|name| **name != as_name(name)) {
+            return out_of_range("server.name", name.clone(), "1 to 64 letters, digits, - and _");
         }
         if !(1..=1_000_000).contains(&server.envs) {
             return out_of_range("server.envs", server.envs.to_string(), "1 to 1000000");

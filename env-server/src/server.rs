@@ -141,8 +141,9 @@ impl Server {
         let control_executor = Executor::start(1).map_err(ServerError::Thread)?;
         let state = ServerState { max_rollout_steps, ..ServerState::default() };
         let (routes, state) = (Routes::new(RwLock::new(HashMap::new())), Arc::new(state));
+        let name = config.name_of(&spec.robot);
         let info = ServerInfo {
-            name: config.name.clone(),
+            name: name.clone(),
             sid: sid.clone(),
             spec,
             max_envs: config.envs,
@@ -181,7 +182,7 @@ impl Server {
             .wait()
             .map_err(|error| ServerError::Declare { key, reason: error.to_string() })?;
         // The token is declared last: a client that sees it can send requests.
-        let key = keys::live_server(&sid, &config.name);
+        let key = keys::live_server(&sid, &name);
         let token = session
             .liveliness()
             .declare_token(&key)

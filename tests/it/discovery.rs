@@ -26,7 +26,7 @@ fn behind(router: &str, task: TaskConfig, envs: usize, name: &str) -> Server {
     let mut config = config(task);
     config.server.connect = vec![router.to_owned()];
     config.server.envs = envs;
-    config.server.name = name.to_owned();
+    config.server.name = Some(name.to_owned());
     start(&config).0
 }
 

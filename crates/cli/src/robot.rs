@@ -174,9 +174,7 @@ impl Args {
     fn config(&self) -> Result<RobotConfig, Failure> {
         let mut config = RobotConfig::load(self.config.as_deref())?;
         let server = &mut config.server;
-        if let Some(name) = &self.name {
-            server.name.clone_from(name);
-        }
+        server.name = self.name.clone().or(server.name.take());
         if let Some(listen) = &self.listen {
             server.listen.clone_from(listen);
         }

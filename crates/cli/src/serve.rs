@@ -104,6 +104,7 @@ pub fn run(args: &Args) -> CommandResult {
     let config = args.config()?;
     let signals = Signals::listen_unhurried()?;
     let factory = SimEnvFactory::new(config.clone()).map_err(input)?;
+    let name = config.server.name_of(&factory.robot().name);
     let hub = Arc::new(Hub::new(scene(&config, factory.robot())));
     let _page = args.view.serve(&hub)?;
     let factory = WatchedFactory { factory, hub: Arc::clone(&hub) };
@@ -117,7 +118,7 @@ pub fn run(args: &Args) -> CommandResult {
     std::io::stdout().flush().map_err(other)?;
     eprintln!(
         "robot `{}`, task `{}`, up to {} environments, server {}; Ctrl-C stops it",
-        config.server.name,
+        name,
         config.task.name(),
         config.server.envs,
         server.sid()
@@ -137,7 +138,11 @@ fn scene(config: &Config, robot: &RobotModel) -> SceneInfo {
     let position = InitialState::standing_on(&ground, robot, q, 0.0).base_position;
     let pose = Pose { position: position.into(), rotation: Quat::IDENTITY };
     let scene = Scene::new(robot, pose, &q, &ground.crop(0.0, 0.0));
-    let info = SceneInfo::new(format!("twinstep serve, robot {}", config.server.name), &scene, robot.torque_limits());
+    let info = SceneInfo::new(
+        format!("twinstep serve, robot {}", config.server.name_of(&robot.name)),
+        &scene,
+        robot.torque_limits(),
+    );
     reward_terms(config).map_or(info.clone(), |names| info.with_reward_terms(&names))
 }
 
@@ -158,7 +163,7 @@ impl Args {
             None => Config::default(),
         };
         let server = &mut config.server;
-        set(&mut server.name, self.name.as_ref());
+        server.name = self.name.clone().or(server.name.take());
         set(&mut server.listen, self.listen.as_ref());
         set(&mut server.envs, self.envs.as_ref());
         set(&mut server.max_rollout_steps, self.max_rollout_steps.as_ref());

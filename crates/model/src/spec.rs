@@ -114,7 +114,7 @@ impl EnvSpec {
 
     /// Returns the hash of all that an agent and a robot must agree on, as 32 hexadecimal digits.
     ///
-    /// It covers the layouts of observation and action, joint order, policy period, gains, action scale and default pose: [`EnvSpec::hash_input`].
+    /// It covers the robot's name, the layouts of observation and action, joint order, policy period, gains, action scale and default pose: [`EnvSpec::hash_input`].
     pub fn hash(&self) -> String {
         let digest: [u8; 32] = Sha256::digest(self.hash_input()).into();
         let half: [u8; 16] = std::array::from_fn(|index| digest[index]);
@@ -128,8 +128,9 @@ impl EnvSpec {
         };
         let pose = self.default_pose.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
         format!(
-            "observation {}\naction {}\njoint_order {}\npolicy_dt {}\nkp {}\nkd {}\naction_scale {}\n\
+            "robot {}\nobservation {}\naction {}\njoint_order {}\npolicy_dt {}\nkp {}\nkd {}\naction_scale {}\n\
              default_pose {pose}\n",
+            self.robot,
             layout(&self.observation),
             layout(&self.action),
             self.joint_order.join(" "),

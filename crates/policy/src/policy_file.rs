@@ -18,12 +18,14 @@ use crate::policy::Policy;
 /// Metadata key of the header.
 const KEY: &str = "policy";
 /// Version of the format.
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
+/// Earlier version: its hash does not contain the robot's name.
+const FORMAT_WITHOUT_ROBOT: u32 = 1;
 
 /// Header of a policy file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PolicyHeader {
-    /// Version of the format: 1.
+    /// Version of the format: 2, or 1.
     pub format: u32,
     /// Hash of the spec: what agent and robot must agree on.
     pub spec_hash: String,
@@ -96,10 +98,10 @@ impl Policy {
         let problem = |problem: String| Err(ArrayFileError::Content { path: path.to_owned(), problem });
         let (header, mut arrays): (PolicyHeader, Arrays) = read(path, KEY)?;
         let PolicyHeader { format, spec_hash, spec, actor_sizes, .. } = &header;
-        if *format != FORMAT {
-            return problem(format!("has `format` = {format}; this program reads {FORMAT}"));
+        if ![FORMAT_WITHOUT_ROBOT, FORMAT].contains(format) {
+            return problem(format!("has `format` = {format}; this program reads {FORMAT_WITHOUT_ROBOT} and {FORMAT}"));
         }
-        if *spec_hash != spec.hash() {
+        if *format == FORMAT && *spec_hash != spec.hash() {
             return problem(format!("has `spec_hash` = {spec_hash}, but its spec has {}", spec.hash()));
         }
         let ends = (actor_sizes.first().copied(), actor_sizes.last().copied());

@@ -5,7 +5,13 @@ use twinstep_model::EnvSpec;
 use super::finding::{Blocks, Finding};
 
 /// What a wrong quantity does, and how it is mended, for each quantity of [`EnvSpec::hash_input`].
-const QUANTITIES: [(&str, &str, &str, &str); 8] = [
+const QUANTITIES: [(&str, &str, &str, &str); 9] = [
+    (
+        "robot",
+        "policy_robot",
+        "the policy was trained for another robot",
+        "use a policy that was trained for this robot, or state its model file by `--model`",
+    ),
     (
         "observation",
         "policy_observation",
