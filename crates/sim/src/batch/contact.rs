@@ -5,54 +5,12 @@
 //! and d the impedance. b and k follow from the time constant at critical damping. Joint friction is a hard constraint:
 //! it stops the joint unless its maximum torque is reached.
 
-use twinstep_dynamics::{JointValues, State, StepEquations, Vec3};
+use twinstep_dynamics::{JointValues, State, StepEquations};
 use twinstep_simd::SimdFloat;
 
-use super::ground::{LocalTerrain, SimdTerrain, TangentPlane};
+use super::ground::{LocalTerrain, TangentPlane};
 use super::rows::{ConstraintRow, PointRow, SoftConstraint, complete_friction, write_joint_row};
-
-/// Parameters of contacts and joint limits.
-#[derive(Clone, Debug)]
-pub struct ContactParams<T> {
-    /// Contact points.
-    pub points: Vec<SimdPoint<T>>,
-    /// Contact points by body.
-    pub bodies: Vec<PointsOfBody<T>>,
-    /// The ground.
-    pub ground: SimdTerrain<T>,
-    /// Friction coefficient of the ground.
-    pub friction: T,
-    /// Time constant of a contact [s]; at least two steps.
-    pub time_constant: T,
-    /// Lower and upper joint limits [rad or m].
-    pub limits: Vec<[T; 2]>,
-    /// Time constant of a joint limit [s]; at least two steps.
-    pub limit_time_constant: T,
-    /// 1 with a free base, 0 with a fixed base.
-    pub is_floating: T,
-}
-
-/// Sphere that touches the ground.
-#[derive(Clone, Copy, Debug)]
-pub struct SimdPoint<T> {
-    /// Centre in the frame of its body [m].
-    pub centre: Vec3<T>,
-    /// Radius [m].
-    pub radius: T,
-}
-
-/// Contact points of a body, and a sphere that contains them.
-#[derive(Clone, Debug)]
-pub struct PointsOfBody<T> {
-    /// Index of the body.
-    pub body: usize,
-    /// Indices of the points.
-    pub points: std::ops::Range<usize>,
-    /// Centre of the sphere in the frame of the body [m].
-    pub centre: Vec3<T>,
-    /// Radius of the sphere [m].
-    pub radius: T,
-}
+use super::surface::{ContactParams, PointsOfBody, SimdPoint};
 
 /// Number of points of a body from which on it is worth while to test first whether all are far from the ground.
 const MANY_POINTS: usize = 5;
@@ -80,6 +38,18 @@ impl<T: SimdFloat> Impulses<T> {
         let Self { points, limits, frictions } = self;
         points.iter_mut().flatten().chain(limits.iter_mut().flatten()).chain(frictions)
     }
+}
+
+/// What the constraints of one step depend on.
+pub struct Step<'a, T: SimdFloat, E: StepEquations<T>> {
+    /// Factored equations of motion.
+    pub equations: &'a E,
+    /// Positions and velocities.
+    pub state: &'a State<T, E::Joints>,
+    /// Contact points, ground and joint limits.
+    pub surface: &'a ContactParams<T>,
+    /// Physics step [s].
+    pub dt: T,
 }
 
 /// Constraint rows of a contact point: normal and two tangents.
@@ -136,23 +106,20 @@ impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
     #[inline(always)]
     pub fn detect<E: StepEquations<T, Branch = B>>(
         &mut self,
-        equations: &E,
-        state: &State<T, E::Joints>,
-        surface: &ContactParams<T>,
+        step: &Step<'_, T, E>,
         dry_friction: &E::Joints,
         impulses: &mut Impulses<T>,
-        dt: T,
     ) {
         self.active_points.clear();
         self.active_limits.clear();
         self.active_frictions.clear();
-        self.detect_contacts(equations, state, surface, impulses, dt);
+        self.detect_contacts(step, impulses);
         for joint in 0..dry_friction.as_ref().len() {
-            self.find_limits(equations, state, surface, impulses, joint, dt);
+            self.find_limits(step, impulses, joint);
             if T::splat(0.0).any_lt(dry_friction[joint]) {
                 let row = &mut self.frictions[joint].row;
-                write_joint_row(equations, row, joint, T::splat(1.0), surface.is_floating);
-                complete_friction(row, state.dq[joint]);
+                write_joint_row(step.equations, row, joint, T::splat(1.0), step.surface.is_floating);
+                complete_friction(row, step.state.dq[joint]);
                 self.active_frictions.push(joint);
             } else {
                 impulses.frictions[joint] = T::splat(0.0);
@@ -161,42 +128,32 @@ impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
     }
 
     #[inline(always)]
-    fn detect_contacts<E: StepEquations<T, Branch = B>>(
-        &mut self,
-        equations: &E,
-        state: &State<T, E::Joints>,
-        surface: &ContactParams<T>,
-        impulses: &mut Impulses<T>,
-        dt: T,
-    ) {
+    fn detect_contacts<E: StepEquations<T, Branch = B>>(&mut self, step: &Step<'_, T, E>, impulses: &mut Impulses<T>) {
         let zero = T::splat(0.0);
-        let local_ground = surface.ground.local_ground(state);
-        for PointsOfBody { body, points, centre, radius } in &surface.bodies {
+        let ground = step.surface.ground.local_ground(step.state);
+        for PointsOfBody { body, points, centre, radius } in &step.surface.bodies {
             if points.len() >= MANY_POINTS {
-                let lowest = local_ground.lowest_within(equations.point(*body, *centre), *radius);
+                let lowest = ground.lowest_within(step.equations.point(*body, *centre), *radius);
                 if !lowest.any_lt(zero) {
                     impulses.points[points.clone()].fill([zero; 3]);
                     continue;
                 }
             }
             for point in points.clone() {
-                self.detect_contact(equations, state, surface, &local_ground, &mut impulses.points[point], point, dt);
+                self.detect_contact(step, &ground, &mut impulses.points[point], point);
             }
         }
     }
 
     #[inline(always)]
-    #[allow(clippy::too_many_arguments, reason = "the parts of one loop's body")]
     fn detect_contact<E: StepEquations<T, Branch = B>>(
         &mut self,
-        equations: &E,
-        state: &State<T, E::Joints>,
-        surface: &ContactParams<T>,
+        step: &Step<'_, T, E>,
         ground: &LocalTerrain<'_, T>,
         impulses: &mut [T; 3],
         point: usize,
-        dt: T,
     ) {
+        let Step { equations, state, surface, dt } = *step;
         let (zero, SimdPoint { centre, radius }) = (T::splat(0.0), surface.points[point]);
         let PointBlock { rows: [normal, tangents @ ..], couplings, body } = &mut self.points[point];
         let centre = equations.point(*body, centre);
@@ -226,13 +183,11 @@ impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
     #[inline(always)]
     fn find_limits<E: StepEquations<T, Branch = B>>(
         &mut self,
-        equations: &E,
-        state: &State<T, E::Joints>,
-        surface: &ContactParams<T>,
+        step: &Step<'_, T, E>,
         impulses: &mut Impulses<T>,
         joint: usize,
-        dt: T,
     ) {
+        let Step { equations, state, surface, dt } = *step;
         let (zero, one) = (T::splat(0.0), T::splat(1.0));
         for (side, sign) in [one, -one].into_iter().enumerate() {
             let distance = (state.q[joint] - surface.limits[joint][side]) * sign;

@@ -1,13 +1,13 @@
 //! State of the robots in one SIMD register, and one physics step of them.
 
-use glam::DVec3;
 use twinstep_dynamics::{JointValues, SimdActuators, SimdCommands, State, StepEquations, Vec3, link_armature};
 use twinstep_model::{Ground, HistoryStep};
 use twinstep_simd::SimdFloat;
 
-use super::batch_robot::{BatchRobot, SurfacePoint};
-use super::contact::{Constraints, ContactParams, Impulses, PointsOfBody, SimdPoint};
-use super::ground::SimdTerrain;
+use super::batch_robot::BatchRobot;
+use super::contact::{Impulses, Step};
+use super::surface::ContactParams;
+use super::workspace::{Workspace, WorkspaceShape};
 use crate::actuator_input::ActuatorInput;
 use crate::{Placement, SimConfig};
 
@@ -60,29 +60,6 @@ pub struct StepCount {
     pub steps: usize,
 }
 
-/// Memory for the equations of one step. It is large, so batches and steps share it.
-pub struct Workspace<T: SimdFloat, E: StepEquations<T>> {
-    equations: E,
-    constraints: Constraints<T, E::Branch>,
-}
-
-/// What the workspaces of a batch have in common.
-pub struct WorkspaceShape<T: SimdFloat, E: StepEquations<T>> {
-    parameters: E::Parameters,
-    /// Body of each contact point.
-    bodies: Vec<usize>,
-    num_joints: usize,
-}
-
-impl<T: SimdFloat, E: StepEquations<T>> WorkspaceShape<T, E> {
-    /// Creates a workspace without equations.
-    pub fn workspace(&self) -> Workspace<T, E> {
-        let equations = E::empty(&self.parameters);
-        let constraints = Constraints::empty(&equations, &self.bodies, self.num_joints);
-        Workspace { equations, constraints }
-    }
-}
-
 /// Sensor readings of all robots.
 pub struct SensorReadings<T, J> {
     /// Position of the base [m].
@@ -109,7 +86,7 @@ impl<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>> RobotBatch<T, E> {
         initial_state: &Placement,
     ) -> Self {
         let (dt, num_joints) = (1.0 / f64::from(config.physics_hz()), robot.joints().len());
-        let surface = surface::<T, E>(robot, config, ground, dt);
+        let surface = ContactParams::new::<E>(robot, config, ground, dt);
         let zero = E::Joints::filled(num_joints, T::splat(0.0));
         let mut group = Self {
             parameters: E::parameters(robot),
@@ -256,7 +233,8 @@ impl<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>> RobotBatch<T, E> {
         actuator.step(index, &state.q, &state.dq);
         let forces = actuator.forces();
         equations.set_up(parameters, state, forces, *dt, T::splat(GRAVITY), surface.is_floating);
-        constraints.detect(equations, state, surface, &forces.dry_friction, impulses, *dt);
+        let step = Step { equations: &*equations, state, surface, dt: *dt };
+        constraints.detect(&step, &forces.dry_friction, impulses);
         constraints.solve(equations, impulses, surface, &forces.dry_friction, *dt, self.iterations);
         let base = equations.solution(&mut self.changes);
         self.integrate(base);
@@ -375,47 +353,6 @@ impl<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>> RobotBatch<T, E> {
 fn set<T: SimdFloat, const N: usize>(values: &mut [T], lane: usize, given: [f64; N]) {
     for (value, given) in values.iter_mut().zip(given) {
         value.set(lane, given);
-    }
-}
-
-fn surface<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>>(
-    robot: &E::Robot,
-    config: &SimConfig,
-    ground: &Ground,
-    dt: f64,
-) -> ContactParams<T> {
-    let given = robot.surface_points();
-    let centres: Vec<DVec3> =
-        given.iter().map(|SurfacePoint { body, centre, .. }| E::point_of_body(robot, *body, *centre)).collect();
-    let points = given.iter().zip(&centres).map(|(SurfacePoint { radius, .. }, centre)| SimdPoint {
-        centre: Vec3::splat(*centre),
-        radius: T::splat(*radius),
-    });
-    let mut bodies = Vec::new();
-    let mut start = 0;
-    for of_body in given.chunk_by(|a, b| a.body == b.body) {
-        let range = start..start + of_body.len();
-        let centre = centres[range.clone()].iter().sum::<DVec3>() / of_body.len() as f64;
-        let reach = of_body.iter().zip(&centres[range.clone()]);
-        let radius = reach.map(|(point, at)| at.distance(centre) + point.radius).fold(0.0, f64::max);
-        start = range.end;
-        bodies.push(PointsOfBody {
-            body: of_body[0].body,
-            points: range,
-            centre: Vec3::splat(centre),
-            radius: T::splat(radius),
-        });
-    }
-    let zero = T::splat(0.0);
-    ContactParams {
-        points: points.collect(),
-        bodies,
-        ground: SimdTerrain::new(ground),
-        friction: zero,
-        time_constant: zero,
-        limits: robot.joints().iter().map(|joint| joint.range.map(T::splat)).collect(),
-        limit_time_constant: T::splat(2.0 * dt),
-        is_floating: T::splat(if config.base.is_fixed() || robot.is_fixed() { 0.0 } else { 1.0 }),
     }
 }
 

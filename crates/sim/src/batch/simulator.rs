@@ -10,7 +10,8 @@ use twinstep_model::{
 use twinstep_simd::{InstructionSet, SimdFloat, SimdKernel, SimdTask, with_f32, with_f64};
 
 use super::batch_robot::{BatchRobot, foot_point, is_upper_body};
-use super::robot_batch::{LaneSnapshot, RobotBatch, SensorReadings, StepCount, Workspace, WorkspaceShape};
+use super::robot_batch::{LaneSnapshot, RobotBatch, SensorReadings, StepCount};
+use super::workspace::{Workspace, WorkspaceShape};
 use crate::actuator_input::{ActuatorInput, ActuatorInputs};
 use crate::{Placement, SimConfig};
 

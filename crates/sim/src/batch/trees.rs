@@ -6,8 +6,9 @@ use twinstep_dynamics::tree::TreeEquations;
 use twinstep_model::TreeModel;
 use twinstep_simd::{InstructionSet, SimdFloat, SimdTask, with_f32, with_f64};
 
-use super::robot_batch::{RobotBatch, SensorReadings, StepCount, Workspace, WorkspaceShape};
+use super::robot_batch::{RobotBatch, SensorReadings, StepCount};
 use super::simulator::{SimdPrecision, advance};
+use super::workspace::{Workspace, WorkspaceShape};
 use crate::actuator_input::ActuatorInput;
 use crate::tree_engine::{TreeCommand, TreeEngine, TreeReadings};
 use crate::{Placement, SimConfig};
