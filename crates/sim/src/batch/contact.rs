@@ -247,7 +247,11 @@ impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
                 let (JointBlock { row, body }, impulse) = (&self.frictions[*joint], &mut impulses.frictions[*joint]);
                 let max_impulse = dry[*joint] * dt;
                 let new = (*impulse - row.impulse_error(equations, *body, *impulse)).max(-max_impulse).min(max_impulse);
-                row.apply_impulse(equations, *body, new - *impulse);
+                // A sliding joint has reached its maximum, so that nothing changes.
+                let change = new - *impulse;
+                if T::splat(0.0).any_lt(change.abs()) {
+                    row.apply_impulse(equations, *body, change);
+                }
                 *impulse = new;
             }
         }
