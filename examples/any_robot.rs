@@ -37,7 +37,7 @@ fn main() -> miette::Result<()> {
             readings.state.base_position[2],
             readings.shape_force.iter().sum::<f64>().max(0.0)
         );
-        robots.step(std::slice::from_ref(&command), ACTUATOR_HZ as usize);
+        robots.step(std::slice::from_ref(&command), ACTUATOR_HZ as usize).into_diagnostic()?;
     }
     Ok(())
 }

@@ -12,11 +12,12 @@ def test_child_lists_and_measures_the_installed_baselines() -> None:
     command = [find_program(), "mjcf", "--timestep", "0.005"]
     model = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     setup = {
-        "models": {"200": model},
+        "models": {"mujoco 200": model},
         "threads": [1],
         "targets": [[0.0] * 12] * 2,
         "actions": [[0.0] * 12] * 2,
         "policy_dt": 0.02,
+        "restarts": False,
         "num_envs": 3,
         "window_s": 0.01,
     }

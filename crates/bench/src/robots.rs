@@ -140,15 +140,14 @@ impl Motion {
         let mut period = 0;
         Ok(move || {
             if period % CYCLE == 0 {
-                (0..ROBOTS).for_each(|robot| robots.reset(robot, &self.model, &start));
+                (0..ROBOTS).try_for_each(|robot| robots.reset(robot, &self.model, &start)).map_err(failed)?;
             }
             let target = self.target(period % CYCLE);
             for command in &mut commands {
                 command.q.clone_from(&target);
             }
             period += 1;
-            robots.step(&commands, DECIMATION);
-            Ok(())
+            robots.step(&commands, DECIMATION).map_err(failed)
         })
     }
 }

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use crate::SimConfigError;
+use crate::tree_error::TreeError;
 
 /// Reasons why a backend cannot be built.
 #[derive(Debug, thiserror::Error)]
@@ -10,6 +11,9 @@ pub enum BackendBuildError {
     /// A setting is not allowed.
     #[error(transparent)]
     Config(#[from] SimConfigError),
+    /// The initial state of a robot of any tree is not allowed.
+    #[error("initial state: {0}")]
+    InitialState(#[from] TreeError),
     /// The operating system could not start the threads.
     #[error("cannot start {threads} simulation threads: {source}")]
     Threads {

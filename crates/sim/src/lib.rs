@@ -25,6 +25,7 @@ mod robot_world;
 mod rollout;
 mod thread_pool;
 mod tree_engine;
+mod tree_error;
 mod tree_simulation;
 
 pub use batch::{BatchBackend, BatchSnapshot, SimdPrecision};
@@ -35,4 +36,5 @@ pub use placement::Placement;
 pub use rapier::{RapierBackend, RobotSnapshot};
 pub use rollout::BatchRollout;
 pub use tree_engine::{TreeCommand, TreeReadings};
+pub use tree_error::TreeError;
 pub use tree_simulation::TreeSimulation;

@@ -2,6 +2,8 @@
 
 use twinstep_model::InitialState;
 
+use crate::tree_error::{TreeError, check_finite, check_joints};
+
 /// State to which a robot is reset.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Placement {
@@ -30,6 +32,18 @@ impl Placement {
             dq: vec![0.0; q.len()],
             q,
         }
+    }
+}
+
+impl Placement {
+    /// Checks the state for a robot with this number of joints.
+    pub(crate) fn check(&self, num_joints: usize) -> Result<(), TreeError> {
+        check_joints("q", self.q.iter().copied(), num_joints)?;
+        check_joints("dq", self.dq.iter().copied(), num_joints)?;
+        check_finite("base_position", self.base_position.into_iter())?;
+        check_finite("base_orientation", self.base_orientation.into_iter())?;
+        check_finite("base_linear_velocity", self.base_linear_velocity.into_iter())?;
+        check_finite("base_angular_velocity", self.base_angular_velocity.into_iter())
     }
 }
 

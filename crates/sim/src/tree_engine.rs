@@ -3,6 +3,7 @@
 use twinstep_model::TreeModel;
 
 use crate::Placement;
+use crate::tree_error::{TreeError, check_joints};
 
 /// Commands of one robot of `n` joints for one actuator period. Each has an entry for each joint.
 ///
@@ -49,6 +50,17 @@ impl TreeReadings {
             tau: vec![0.0; joints],
             shape_force: vec![0.0; robot.tree.shapes.len()],
         }
+    }
+}
+
+impl TreeCommand {
+    /// Checks the command for a robot with this number of joints.
+    pub(crate) fn check(&self, num_joints: usize) -> Result<(), TreeError> {
+        let Self { q, dq, tau_ff, kp, kd } = self;
+        for (field, values) in [("q", q), ("dq", dq), ("tau_ff", tau_ff), ("kp", kp), ("kd", kd)] {
+            check_joints(field, values.iter().map(|value| f64::from(*value)), num_joints)?;
+        }
+        Ok(())
     }
 }
 

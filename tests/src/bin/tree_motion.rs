@@ -88,9 +88,10 @@ fn motion(model: &TreeModel, request: Request) -> Result<Vec<Reply>, String> {
     let mut robots = TreeSimulation::with_precision(model, &config, request.actuator_hz, precision, 1, &start)
         .map_err(|error| error.to_string())?;
     let reply = |target: Vec<f32>| {
-        robots.step(&[TreeCommand::hold(target, request.kp, request.kd)], 1);
+        let command = TreeCommand::hold(target, request.kp, request.kd);
+        robots.step(&[command], 1).map_err(|error| error.to_string())?;
         let readings = robots.states()[0].clone();
-        Reply {
+        Ok(Reply {
             position: readings.state.base_position,
             orientation: readings.state.base_orientation,
             linear_velocity: readings.state.base_linear_velocity,
@@ -99,7 +100,7 @@ fn motion(model: &TreeModel, request: Request) -> Result<Vec<Reply>, String> {
             dq: readings.state.dq,
             tau: readings.tau,
             shape_force: readings.shape_force,
-        }
+        })
     };
-    Ok(request.targets.into_iter().map(reply).collect())
+    request.targets.into_iter().map(reply).collect()
 }

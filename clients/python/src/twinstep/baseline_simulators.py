@@ -28,7 +28,7 @@ def baselines(setup: dict[str, Any]) -> dict[str, Callable[[], Advance]]:
     if installed("mujoco"):
         for name, model in setup["models"].items():
             found[name] = lambda model=model: mujoco_trot(model, setup)
-    if installed("envpool"):
+    if setup["threads"] and installed("envpool"):
         for threads in setup["threads"]:
             found[f"envpool {threads}"] = lambda threads=threads: envpool_trot(threads, setup)
     return found
