@@ -19,12 +19,16 @@ fn main() -> miette::Result<()> {
     let text = std::fs::read_to_string(&path).into_diagnostic()?;
     let file = read_robot(&text, path.parent()).into_diagnostic().wrap_err_with(|| path.display().to_string())?;
     file.notes.iter().for_each(|note| eprintln!("note: {note}"));
-    let robot = TreeModel::new(file.tree);
+    let robot = TreeModel::new(file.tree).into_diagnostic()?;
+    let untouched = robot.tree.shapes_without_contact();
+    if !untouched.is_empty() {
+        eprintln!("note: these shapes do not touch the ground: {}", untouched.join(", "));
+    }
 
     // All joints at 0, or at the middle of a range that does not contain it.
     let middle = |[low, high]: [f64; 2]| if low > 0.0 || high < 0.0 { f64::midpoint(low, high) } else { 0.0 };
     let pose: Vec<f64> = robot.joints.iter().map(|joint| middle(joint.range)).collect();
-    let start = Placement::at_rest(robot.standing_height(&pose), pose.clone());
+    let start = Placement::of(&robot.tree, pose.clone());
     let command = TreeCommand::hold(pose.iter().map(|q| *q as f32).collect(), GAINS[0], GAINS[1]);
 
     let config = SimConfig::default();

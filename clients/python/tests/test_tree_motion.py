@@ -134,6 +134,35 @@ def test_free_motion_of_random_trees_is_that_of_mujoco(seed: int, tmp_path: Path
     assert np.abs(motion.ours(double=False) - motion.theirs.qpos).max() <= 5e-5
 
 
+BALL_ON_A_TILTED_BASE = """
+<mujoco><compiler angle="radian"/><worldbody><body pos="0 0 1" quat="0.5 0.5 -0.3 0.2">
+  <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
+  <body pos="0.1 0 0">
+    <joint name="a" axis="1 0 0" armature="0.01"/><joint name="b" axis="0 1 0" armature="0.01"/>
+    <joint name="c" axis="0 0 1" armature="0.01"/>
+    <inertial pos="0.1 0.05 0" mass="1" diaginertia="0.01 0.02 0.015"/>
+  </body>
+</body></worldbody></mujoco>
+"""
+"""Three joints on a body, which are joints of bodies without mass in the tree."""
+
+
+@pytest.mark.parametrize("seed", [None, *range(8)])
+def test_both_engines_follow_commands_as_mujoco_does(seed: int | None, tmp_path: Path) -> None:
+    random = np.random.default_rng(seed or 0)
+    path = tmp_path / "robot.xml"
+    path.write_text(BALL_ON_A_TILTED_BASE if seed is None else random_robot(random))
+    robot, gains = Robot(path), (5.0, 0.5)
+    q = random.uniform(-0.5, 0.5, robot.joints)
+    start = robot.start(q)
+    swing = 0.2 * np.sin(2 * np.pi * np.arange(PERIODS // 2) / ACTUATOR_HZ)
+    targets = q + np.outer(swing, np.where(np.arange(robot.joints) % 2, 1, -1))
+    expected = mujoco_motion(robot, robot.data(start), gains, targets)
+    for engine, bound in (("batch", 1e-5), ("rapier", 1e-3)):
+        states = robot.ours(start, gains, targets, double=False, engine=engine)
+        assert rms(np.array([state["q"] for state in states]) - expected) <= bound, engine
+
+
 class ShippedMotion:
     """One second of a shipped robot under PD control, by MuJoCo."""
 

@@ -24,7 +24,7 @@ pub struct Setup {
     pub actions: Vec<Vec<f32>>,
     /// Policy period [s].
     pub policy_dt: f64,
-    /// True if the robots start anew before each cycle of the motion.
+    /// True if the robots are reset before each cycle of the motion.
     pub restarts: bool,
     /// Number of robots.
     pub num_envs: usize,

@@ -33,29 +33,23 @@ struct Case {
     amplitude: f64,
 }
 
-const CASES: [Case; 3] = [
-    Case {
-        name: "g1, standing",
-        text: include_str!("../../../data/robots/g1.xml"),
-        gains: [100.0, 2.0],
-        pose: &G1_POSE,
-        amplitude: 0.0,
-    },
-    Case {
-        name: "g1, sine of all joints",
-        text: include_str!("../../../data/robots/g1.xml"),
-        gains: [100.0, 2.0],
-        pose: &G1_POSE,
-        amplitude: 0.05,
-    },
-    Case {
-        name: "so101, sine of all joints",
-        text: include_str!("../../../data/robots/so101.xml"),
-        gains: [10.0, 0.5],
-        pose: &[],
-        amplitude: 0.3,
-    },
-];
+const G1: Case = Case {
+    name: "g1, standing",
+    text: include_str!("../../../data/robots/g1.xml"),
+    gains: [100.0, 2.0],
+    pose: &G1_POSE,
+    amplitude: 0.0,
+};
+
+const SO101: Case = Case {
+    name: "so101, sine of all joints",
+    text: include_str!("../../../data/robots/so101.xml"),
+    gains: [10.0, 0.5],
+    pose: &[],
+    amplitude: 0.3,
+};
+
+const CASES: [Case; 3] = [G1, Case { name: "g1, sine of all joints", amplitude: 0.05, ..G1 }, SO101];
 
 /// Bent knees, on flat feet.
 const G1_POSE: [(&str, f64); 3] = [("hip_pitch_joint", -0.2), ("knee_joint", 0.42), ("ankle_pitch_joint", -0.23)];
@@ -99,7 +93,7 @@ struct Motion {
 
 impl Motion {
     fn of(case: &Case) -> Result<Self, BenchError> {
-        let model = TreeModel::new(read_robot(case.text, None).map_err(failed)?.tree);
+        let model = TreeModel::new(read_robot(case.text, None).map_err(failed)?.tree).map_err(failed)?;
         let bent = |name: &str| case.pose.iter().find(|(suffix, _)| name.ends_with(suffix)).map_or(0.0, |(_, q)| *q);
         let pose = model.tree.joints.iter().map(|joint| bent(&joint.name)).collect();
         Ok(Self { model, gains: case.gains, pose, amplitude: case.amplitude })
@@ -130,9 +124,9 @@ impl Motion {
         }
     }
 
-    /// Returns a function that steps all robots by one policy period. They start anew each second, so that none lies on the ground.
+    /// Returns a function that steps all robots by one policy period. They are reset each second, so that none lies on the ground.
     fn stepping(&self) -> Result<impl FnMut() -> Result<(), BenchError>, BenchError> {
-        let start = Placement::at_rest(self.model.standing_height(&self.pose), self.pose.clone());
+        let start = Placement::of(&self.model.tree, self.pose.clone());
         let config = SimConfig { physics_hz: Some(PHYSICS_HZ), threads: 1, ..SimConfig::default() };
         let mut robots =
             TreeSimulation::new(&self.model, &config, ACTUATOR_HZ.into(), ROBOTS, &start).map_err(failed)?;

@@ -66,7 +66,7 @@ impl SimdTask for Compare {
     type Output = ();
 
     fn run<T: SimdFloat>(self) {
-        let (robot, own) = (TreeModel::new(RobotTree::from(&go2())), go2());
+        let (robot, own) = (TreeModel::new(RobotTree::from(&go2())).expect("equal limits"), go2());
         let mut any = timed::<T, TreeEquations<T>>(&robot);
         let mut known = timed::<T, FactoredDynamics<T>>(&own);
         let mut times: Vec<_> = (0..ROUNDS).map(|_| [any(), known()]).collect();

@@ -75,5 +75,5 @@ pub use spec::{EnvSpec, SpecDifference, SpecField};
 pub use stream::{Stream, standard_normal, stream};
 pub use trajectory::Trajectory;
 pub use tree::{RobotTree, TreeBody, TreeJoint, TreeJointKind, TreeShape, TreeShapeKind};
-pub use tree_model::{ContactPoint, TreeModel};
+pub use tree_model::{AsymmetricForce, ContactPoint, TreeModel};
 pub use vec_env::{AutoresetMode, EndedEpisode, EnvError, ResetRequest, StepBatch, VecEnv};

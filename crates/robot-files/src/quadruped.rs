@@ -2,8 +2,8 @@
 
 use glam::DVec3;
 use twinstep_model::{
-    ActuatorParams, Contact, ControlConfig, Derating, Joint, JointKind, JointModel, Leg, LegModel, RobotModel,
-    RobotTree, Stribeck, TreeJoint, TreeJointKind, go2,
+    Contact, ControlConfig, Derating, Joint, JointKind, JointModel, Leg, LegModel, RobotModel, RobotTree, TreeJoint,
+    TreeJointKind, go2,
 };
 
 use crate::inertia::is_real;
@@ -130,18 +130,7 @@ fn joint_model(joint: &TreeJoint) -> Result<JointModel, RobotFileError> {
             );
         }
     };
-    Ok(JointModel {
-        range: joint.range,
-        torque_limit,
-        speed_limit: joint.speed_limit,
-        armature: joint.armature,
-        viscous_friction: joint.damping,
-        coulomb_friction: joint.friction,
-        stribeck_friction: Stribeck::NONE,
-        load_friction: 0.0,
-        spring: joint.spring,
-        actuator: ActuatorParams::IDEAL,
-    })
+    Ok(joint.with_ideal_actuator(torque_limit))
 }
 
 #[cfg(test)]

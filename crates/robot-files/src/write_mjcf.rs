@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use twinstep_model::{
-    BaseMount, CONTACT, Contact, MjcfActuator, RobotTree, TreeJoint, TreeJointKind, TreeModel, TreeShape, TreeShapeKind,
+    BaseMount, CONTACT, Contact, MjcfActuator, RobotTree, TreeJoint, TreeJointKind, TreeShape, TreeShapeKind,
 };
 
 /// Settings of the MuJoCo model of a tree.
@@ -198,7 +198,7 @@ impl Writer<'_> {
     }
 
     fn keyframe(&mut self, q: &[f64]) {
-        let height = TreeModel::new(self.tree.clone()).standing_height(q);
+        let height = self.tree.standing_height(q);
         let base = if self.is_free() { format!("0 0 {height} 1 0 0 0 ") } else { String::new() };
         self.line(1, "<keyframe>");
         self.line(2, &format!("<key name=\"start\" qpos=\"{base}{}\"/>", numbers(q)));

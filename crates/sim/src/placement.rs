@@ -1,6 +1,7 @@
 //! Initial state of a robot of any tree.
 
-use twinstep_model::InitialState;
+use glam::DQuat;
+use twinstep_model::{BaseMount, InitialState, RobotTree};
 
 use crate::tree_error::{TreeError, check_finite, check_joints};
 
@@ -36,6 +37,20 @@ impl Placement {
 }
 
 impl Placement {
+    /// Returns the state at rest with the joints at `q`: a fixed base where its file has it, a free one upright with its lowest contact
+    /// point on flat ground.
+    pub fn of(robot: &RobotTree, q: Vec<f64>) -> Self {
+        if !robot.base.is_some_and(BaseMount::is_fixed) {
+            return Self::at_rest(robot.standing_height(&q), q);
+        }
+        let DQuat { w, x, y, z } = DQuat::from_mat3(&robot.world_from_base.matrix3);
+        Self {
+            base_position: robot.world_from_base.translation.to_array(),
+            base_orientation: [w, x, y, z],
+            ..Self::at_rest(0.0, q)
+        }
+    }
+
     /// Checks the state for a robot with this number of joints.
     pub(crate) fn check(&self, num_joints: usize) -> Result<(), TreeError> {
         check_joints("q", self.q.iter().copied(), num_joints)?;
@@ -57,5 +72,26 @@ impl From<&InitialState> for Placement {
             q: state.q.map(f64::from).to_vec(),
             dq: state.dq.map(f64::from).to_vec(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DAffine3, DVec3};
+    use twinstep_model::go2;
+
+    use super::*;
+
+    #[test]
+    fn fixed_base_is_where_its_file_has_it() {
+        let turn = DQuat::from_rotation_x(0.5);
+        let place = DAffine3::from_rotation_translation(turn, DVec3::new(0.1, 0.2, 0.3));
+        let tree = RobotTree { base: Some(BaseMount::Fixed), world_from_base: place, ..RobotTree::from(&go2()) };
+        let placement = Placement::of(&tree, vec![0.0; 12]);
+        assert_eq!(placement.base_position, [0.1, 0.2, 0.3]);
+        let [w, x, y, z] = placement.base_orientation;
+        assert!(DQuat::from_xyzw(x, y, z, w).angle_between(turn) < 1e-6);
+        let free = RobotTree { base: Some(BaseMount::Floating), ..tree };
+        assert_eq!(Placement::of(&free, vec![0.0; 12]).base_orientation, [1.0, 0.0, 0.0, 0.0]);
     }
 }

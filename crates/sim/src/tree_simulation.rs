@@ -137,7 +137,7 @@ mod tests {
     use super::*;
 
     fn robot() -> TreeModel {
-        TreeModel::new(RobotTree::from(&go2()))
+        TreeModel::new(RobotTree::from(&go2())).expect("equal limits")
     }
 
     fn start() -> Placement {

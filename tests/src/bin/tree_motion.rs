@@ -58,7 +58,8 @@ struct Reply {
 fn main() -> Result<(), String> {
     let Arguments { robot } = Arguments::parse();
     let text = std::fs::read_to_string(&robot).map_err(|error| error.to_string())?;
-    let model = TreeModel::new(read_robot(&text, robot.parent()).map_err(|error| error.to_string())?.tree);
+    let tree = read_robot(&text, robot.parent()).map_err(|error| error.to_string())?.tree;
+    let model = TreeModel::new(tree).map_err(|error| error.to_string())?;
     for line in std::io::stdin().lock().lines() {
         let line = line.map_err(|error| error.to_string())?;
         let request: Request = serde_json::from_str(&line).map_err(|error| error.to_string())?;
