@@ -3,6 +3,7 @@
 use std::ops::Range;
 
 use sha2::{Digest, Sha256};
+use twinstep_logs::replay::check_gains;
 use twinstep_logs::{Log, TorqueSensor};
 
 use crate::EnsembleError;
@@ -161,7 +162,7 @@ impl DataSet {
         if log.meta().tau_sensor != self.tau_sensor {
             return Err(EnsembleError::SensorMismatch { log: name.to_owned() });
         }
-        Ok(())
+        check_gains(log).map_err(|cause| EnsembleError::UnknownGain { log: name.to_owned(), cause })
     }
 
     /// Returns the channels of each joint with measured torque. Adds new joints to the data set.

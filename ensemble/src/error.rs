@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use twinstep_logs::replay::ReplayError;
+
 /// Reasons why an ensemble cannot be trained, loaded or used.
 #[derive(Debug, thiserror::Error)]
 pub enum EnsembleError {
@@ -72,6 +74,14 @@ pub enum EnsembleError {
         kp: f64,
         /// Velocity gain in that row [N·m·s/rad].
         kd: f64,
+    },
+    /// The gains of the log are unknown.
+    #[error("{log}: {cause}")]
+    UnknownGain {
+        /// The log.
+        log: String,
+        /// Joint and gain.
+        cause: ReplayError,
     },
     /// The log contains feed-forward torque.
     #[error(

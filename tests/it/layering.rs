@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Crate folders and the workspace crates that each may use. Leaf crates use only the core; applications combine them.
-const MAY_USE: [(&str, &[&str]); 29] = [
+const MAY_USE: [(&str, &[&str]); 30] = [
     // Core.
     ("crates/files", &[]),
     ("crates/simd", &[]),
@@ -32,6 +32,7 @@ const MAY_USE: [(&str, &[&str]); 29] = [
     ("env-server", &["model", "effects", "protocol", "session", "sim", "envs", "ensemble", "policy"]),
     ("clients/rust", &["model", "protocol", "session", "policy"]),
     ("crates/report", &["files", "model", "dynamics", "effects", "logs", "sim", "identify", "diagnose"]),
+    ("crates/inference", &["model", "effects", "logs", "identify", "sim"]),
     ("crates/hunt", &["files", "model", "effects", "logs", "sim", "identify", "diagnose"]),
     ("crates/excite", &["model", "effects", "logs", "identify", "policy", "envs", "sim"]),
     (
@@ -67,6 +68,7 @@ const MAY_USE: [(&str, &[&str]); 29] = [
             "sim",
             "envs",
             "identify",
+            "inference",
             "diagnose",
             "ensemble",
             "env-server",
@@ -99,6 +101,7 @@ const MAY_USE: [(&str, &[&str]); 29] = [
             "sim",
             "envs",
             "identify",
+            "inference",
             "diagnose",
             "policy",
             "learning",
@@ -127,7 +130,7 @@ const RESTRICTED_LIBRARIES: [(&str, &[&str]); 11] = [
     ("rustdds", &["crates/robot"]),
     ("ratatui", &["crates/cli"]),
     ("axum", &["crates/viewer"]),
-    ("nalgebra", &["crates/identify", "crates/diagnose", "crates/excite"]),
+    ("nalgebra", &["crates/identify", "crates/inference", "crates/diagnose", "crates/excite"]),
 ];
 
 fn root() -> PathBuf {

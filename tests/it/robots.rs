@@ -1,4 +1,4 @@
-//! Robots from files: the Go1 and the B2 from URDF, the A1 from MJCF, in both engines.
+//! Robots from files: Go1 and B2 from URDF, A1, Aliengo and Spot from MJCF, in both engines.
 
 use std::path::PathBuf;
 
@@ -11,7 +11,8 @@ use twinstep_sim::Engine;
 use crate::remote;
 
 /// Model file, and sum of the masses in its source [kg].
-const ROBOTS: [(&str, f64); 3] = [("go1", 12.743), ("a1", 12.453), ("b2", 61.711)];
+const ROBOTS: [(&str, f64); 5] =
+    [("go1", 12.743), ("a1", 12.453), ("b2", 61.711), ("aliengo", 24.937), ("spot", 50.340)];
 
 fn model(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).parent().unwrap().join(format!("data/robots/{name}.toml"))

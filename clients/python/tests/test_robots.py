@@ -59,7 +59,7 @@ def in_mujoco(model_file: Path, targets: Array, kp: float, kd: float) -> tuple[A
     return joints, bases
 
 
-@pytest.mark.parametrize("name", ["go1", "a1", "b2"])
+@pytest.mark.parametrize("name", ["go1", "a1", "b2", "aliengo", "spot"])
 def test_robot_stands_and_trots_as_in_mujoco(tmp_path: Path, name: str) -> None:
     model = ROBOTS / f"{name}.toml"
     control = tomllib.loads(model.read_text())["control"]

@@ -2,12 +2,17 @@
 
 use std::path::PathBuf;
 
+use twinstep_effects::TreeModelFile;
 use twinstep_identify::{Evaluation, evaluate, position_errors};
+use twinstep_inference::{Candidate, JointLog};
 use twinstep_logs::Log;
+use twinstep_model::JOINT_NAMES;
 
 use crate::exit::{CommandResult, Failure, input, other};
 use crate::open_log::open_log;
 use crate::robot_file::SimulatedRobot;
+use crate::tree_model::{actuator_hz, note_unknown_gains, tree_model};
+use twinstep_report::evaluation_plot::Errors;
 use twinstep_report::{chart, evaluation_plot};
 
 /// Measure the error of a robot model on a measured log.
@@ -17,6 +22,10 @@ use twinstep_report::{chart, evaluation_plot};
 /// a fixed base, each segment is simulated from its first measured state to its end. With a floating base, windows of
 /// 0.5 s are simulated from measured states. If the model file has a table `[actuator]`, the mean of its networks is the
 /// torque, or is added to that of the laws. Errors are root mean squares over all selected rows and joints.
+///
+/// A robot that is not like the Go2 (`--model arm.xml`, or a model file with `robot = "arm.xml"`) needs segments with a fixed base. Its
+/// torque is that of the same simulation. Gains that the log does not state are those of `[control]`, or three times the torque
+/// limit per radian. The columns have the names of the robot file's joints, or those of `[joints.rename]`.
 ///
 /// Example: `twinstep evaluate --model extended.toml data/go2_air_chirp --plot errors.svg`
 #[derive(clap::Args)]
@@ -45,11 +54,22 @@ pub struct Rows {
     /// Evaluate only rows before this time [s].
     #[arg(long, value_name = "S")]
     until: Option<f64>,
+    /// Evaluate only the segments with this name. Can be repeated.
+    #[arg(long, value_name = "NAME")]
+    segment: Vec<String>,
+}
+
+/// `--segment` is not a segment of the log.
+#[derive(Debug, thiserror::Error)]
+#[error("`--segment`: the log has no segment `{given}`; its segments are {segments}")]
+struct NoSegment {
+    given: String,
+    segments: String,
 }
 
 /// `--from` and `--until` select no row.
 #[derive(Debug, thiserror::Error)]
-#[error("`--from` and `--until` select no row: `t` of the log is {first} to {last} s")]
+#[error("`--from`, `--until` and `--segment` select no row: `t` of the log is {first} to {last} s")]
 struct NoRows {
     first: f64,
     last: f64,
@@ -59,7 +79,16 @@ impl Rows {
     /// Returns, for each row of the log, whether it is selected.
     pub fn of(&self, log: &Log) -> Result<Vec<bool>, Failure> {
         let (from, until) = (self.from.unwrap_or(f64::NEG_INFINITY), self.until.unwrap_or(f64::INFINITY));
-        let rows: Vec<bool> = log.t().iter().map(|t| (from..until).contains(t)).collect();
+        let segments: Vec<&str> = log.meta().segments.iter().map(|segment| segment.name.as_str()).collect();
+        if let Some(given) = self.segment.iter().find(|given| !segments.contains(&given.as_str())) {
+            return Err(input(NoSegment { given: given.clone(), segments: segments.join(", ") }));
+        }
+        let is_selected = |row: usize| {
+            let name = segments[log.segment()[row] as usize];
+            self.segment.is_empty() || self.segment.iter().any(|selected| selected == name)
+        };
+        let in_time = |row: usize| (from..until).contains(&log.t()[row]);
+        let rows: Vec<bool> = (0..log.rows()).map(|row| in_time(row) && is_selected(row)).collect();
         if rows.contains(&true) {
             return Ok(rows);
         }
@@ -71,14 +100,15 @@ impl Rows {
 /// Evaluates the model and prints its errors.
 pub fn run(args: &Args) -> CommandResult {
     let log = open_log(&args.log)?;
-    let SimulatedRobot { robot, mut simulator } = SimulatedRobot::load(args.model.as_deref(), &log, &args.log)?;
     let rows = args.rows.of(&log)?;
     if let Some(path) = &args.plot {
         chart::check_writable(path).map_err(input)?;
     }
-    let evaluation = evaluate(&log, &robot, &mut simulator, |row| rows[row]).map_err(input)?;
+    let (evaluation, errors) = match tree_model(args.model.as_deref(), &log)? {
+        Some(file) => errors_of_tree(&file, &log, &rows)?,
+        None => errors_of_quadruped(args, &log, &rows)?,
+    };
     if let Some(path) = &args.plot {
-        let errors = position_errors(&log, &robot, &mut simulator, |row| rows[row]).map_err(input)?;
         let model = args.model.as_ref().map_or("the ideal go2".to_owned(), |model| model.display().to_string());
         let title = format!("{model} on {}", args.log.display());
         evaluation_plot::write_svg(&log, &evaluation, &errors, &title, path).map_err(input)?;
@@ -89,6 +119,24 @@ pub fn run(args: &Args) -> CommandResult {
         print!("{}", table(&evaluation));
     }
     Ok(())
+}
+
+fn errors_of_tree(file: &TreeModelFile, log: &Log, rows: &[bool]) -> Result<(Evaluation, Errors), Failure> {
+    let joint_log = JointLog::new(log, &file.nominal.tree, |row| rows[row]).map_err(input)?;
+    note_unknown_gains(file, &joint_log);
+    let candidate = Candidate::of(file).map_err(input)?;
+    twinstep_inference::evaluate(&joint_log, &candidate, actuator_hz(file)).map_err(input)
+}
+
+fn errors_of_quadruped(args: &Args, log: &Log, rows: &[bool]) -> Result<(Evaluation, Errors), Failure> {
+    let SimulatedRobot { robot, mut simulator } = SimulatedRobot::load(args.model.as_deref(), log, &args.log)?;
+    let evaluation = evaluate(log, &robot, &mut simulator, |row| rows[row]).map_err(input)?;
+    let errors = match args.plot {
+        Some(_) => position_errors(log, &robot, &mut simulator, |row| rows[row]).map_err(input)?,
+        None => Default::default(),
+    };
+    let names = JOINT_NAMES.map(str::to_owned);
+    Ok((evaluation, names.into_iter().zip(errors).filter(|(_, errors)| !errors.is_empty()).collect()))
 }
 
 /// Returns a table of the errors with one line per joint and one over all joints.

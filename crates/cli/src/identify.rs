@@ -3,15 +3,18 @@
 use std::path::{Path, PathBuf};
 
 use indicatif::{ProgressBar, ProgressStyle};
+use twinstep_effects::{Effect, Scope};
 use twinstep_identify::{
-    DEFAULT_EFFECTS, EffectAtScope, EstimateStatus, Experiment, GlobalSearch, Identification, IdentifyOptions,
-    ParameterEstimate, Stage, WindowConfig, evaluate, identify,
+    DEFAULT_EFFECTS, EffectAtScope, EffectAtScopeError, EstimateStatus, Experiment, GlobalSearch, Identification,
+    IdentifyOptions, ParameterEstimate, Stage, WindowConfig, evaluate, identify,
 };
 
 use crate::evaluate::Rows;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::identify_tree::{self, Unwritable};
 use crate::open_log::open_log;
 use crate::robot_file::{analytic_model, simulator};
+use crate::tree_model::tree_model;
 
 /// Estimate the parameters of effects from measured logs (sampling-based parameter identification, SPI-Active).
 ///
@@ -26,7 +29,12 @@ use crate::robot_file::{analytic_model, simulator};
 /// the best estimates so far and saves the search in OUT.search.json. The same command with --resume continues from
 /// there; the refinement and the local search begin again.
 ///
-/// Example: `twinstep identify data/go2_air_chirp --until 10 --out fitted.toml`
+/// A robot that is not like the Go2 (an arm, a humanoid; `--model arm.xml`), or a log without gains, needs segments with a fixed
+/// base. There Levenberg-Marquardt alone fits the positions, and torques of motor currents, to windows of 4 s. Priors scale with the
+/// torque limits of the joints. The model file states what is added to the robot file.
+///
+/// Examples: `twinstep identify data/go2_air_chirp --until 10 --out fitted.toml` and
+/// `twinstep identify --model arm.xml arm_log --segment sines --out arm.toml`
 #[derive(clap::Args)]
 pub struct Args {
     /// Measured logs: data files, or folders that contain one. Segments may have a fixed or a floating base.
@@ -41,8 +49,11 @@ pub struct Args {
     pub start: Option<PathBuf>,
     /// Effects to estimate, with scopes, as in `coulomb_friction@calf,payload@base`. `twinstep effects` lists them.
     /// Default: armature, Coulomb and viscous friction by joint type, and the command delay.
-    #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = DEFAULT_EFFECTS, hide_default_value = true)]
-    pub effects: Vec<EffectAtScope>,
+    ///
+    /// A robot of any tree: armature, viscous_friction, coulomb_friction, command_delay and pd_gain, at `all` joints (one value),
+    /// `each` joint, or one. Default: the first three at each joint and one delay. Gains that the log does not state are estimated, too.
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub effects: Option<Vec<String>>,
     #[command(flatten)]
     pub rows: Rows,
     /// Estimate parameters that are not identifiable from the logs, too.
@@ -71,7 +82,7 @@ impl Args {
             logs: Vec::new(),
             model: None,
             start: None,
-            effects: Vec::new(),
+            effects: None,
             rows: Rows::default(),
             force: false,
             generations,
@@ -82,13 +93,18 @@ impl Args {
     }
 }
 
-/// The output file cannot be written.
+/// A flag is not for robots of any tree.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot write {}: {source}", path.display())]
-struct Unwritable {
-    path: PathBuf,
-    source: std::io::Error,
+#[error("`{flag}` is for quadrupeds like the Go2; a robot of any tree has {instead}")]
+struct FlagOfQuadrupeds {
+    flag: &'static str,
+    instead: &'static str,
 }
+
+/// An entry of `--effects` is not an effect with its scope.
+#[derive(Debug, thiserror::Error)]
+#[error("`--effects`: {0}")]
+struct EffectsError(EffectAtScopeError);
 
 /// The saved search cannot be read.
 #[derive(Debug, thiserror::Error)]
@@ -125,6 +141,13 @@ pub fn run(args: &Args) -> CommandResult {
 
 /// Estimates the parameters, prints them and writes the model.
 pub fn write_model(args: &Args, signals: &Signals) -> CommandResult {
+    let first = open_log(&args.logs[0])?;
+    if let Some(file) = tree_model(args.model.as_deref(), &first)? {
+        check_flags_of_tree(args)?;
+        let rows = args.rows.of(&first)?;
+        return identify_tree::run(&file, &first, &rows, args.effects.as_deref(), &args.out, signals);
+    }
+    let effects = effects(args.effects.as_deref())?;
     let model = analytic_model(args.model.as_deref())?;
     let robot = model.robot_model().map_err(input)?;
     let (mut experiments, mut logs) = (Vec::new(), Vec::new());
@@ -140,7 +163,6 @@ pub fn write_model(args: &Args, signals: &Signals) -> CommandResult {
     let unwritable = |source| input(Unwritable { path: args.out.clone(), source });
     std::fs::OpenOptions::new().append(true).create(true).open(&args.out).map_err(unwritable)?;
     let mut simulator = simulator(&robot)?;
-    let effects: Vec<_> = args.effects.iter().map(|EffectAtScope(effect, scope)| (*effect, *scope)).collect();
     let search = search_file(&args.out);
     let resume = if args.resume { Some(resumed(&search).map_err(input)?) } else { None };
     let start = args.start.as_deref().map(|path| analytic_model(Some(path))).transpose()?;
@@ -181,6 +203,29 @@ pub fn write_model(args: &Args, signals: &Signals) -> CommandResult {
         }
     }
     if found.checkpoint.is_some() { Err(Failure::Interrupted) } else { Ok(()) }
+}
+
+fn check_flags_of_tree(args: &Args) -> Result<(), Failure> {
+    let flags = [
+        ("--start", args.start.is_some(), "`--model`: its values are the start"),
+        ("--resume", args.resume, "no search that takes long enough to resume"),
+        ("--force", args.force, "an interval for every parameter, as wide as its prior if the log says nothing"),
+        ("LOGS", args.logs.len() > 1, "one log with several segments"),
+    ];
+    match flags.into_iter().find(|(_, given, _)| *given) {
+        Some((flag, _, instead)) => Err(input(FlagOfQuadrupeds { flag, instead })),
+        None => Ok(()),
+    }
+}
+
+/// Returns the effects that are requested of a quadruped, with their scopes.
+fn effects(given: Option<&[String]>) -> Result<Vec<(&'static Effect, Scope)>, Failure> {
+    let default: Vec<String> = DEFAULT_EFFECTS.split(',').map(str::to_owned).collect();
+    let parsed = |text: &String| match text.parse() {
+        Ok(EffectAtScope(effect, scope)) => Ok((effect, scope)),
+        Err(cause) => Err(input(EffectsError(cause))),
+    };
+    given.unwrap_or(&default).iter().map(parsed).collect()
 }
 
 fn progress_bar(generations: usize) -> ProgressBar {

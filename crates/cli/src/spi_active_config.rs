@@ -254,7 +254,7 @@ impl SpiActiveConfig {
             logs: logs.to_vec(),
             model: self.model.clone(),
             start: earlier.map(Path::to_owned),
-            effects: self.unknowns(),
+            effects: Some(self.unknowns.clone()),
             seed: self.seed,
             resume,
             ..identify::Args::new(out)

@@ -75,6 +75,7 @@ use std::collections::BTreeMap;
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, Scope};
 use twinstep_logs::Log;
+use twinstep_logs::replay::check_gains;
 use twinstep_model::{RobotModel, Rollout};
 
 use cross_validation::{Accepted, CandidateFit, FitProblem};
@@ -148,6 +149,9 @@ pub fn diagnose(
     progress: &mut DiagnoseProgress,
 ) -> Result<DiagnosisOutput, DiagnoseError> {
     let mut say = |text: &str| if progress(text) { Ok(()) } else { Err(DiagnoseError::Interrupted) };
+    for log in &logs {
+        check_gains(log).map_err(ExperimentError::from)?;
+    }
     say("fitting the ground and the nuisance parameters")?;
     let Views { robot, judged, views } = Views::new(logs, model, simulator)?;
     let mut search = ForwardSelection {

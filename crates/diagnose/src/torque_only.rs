@@ -10,6 +10,7 @@ use std::collections::BTreeMap;
 
 use twinstep_effects::{CATALOGUE, EffectEntry, Parameter, Scope, Target};
 use twinstep_logs::Log;
+use twinstep_logs::replay::check_gains;
 use twinstep_model::RobotModel;
 
 use super::affected_channels::{MAX_REMAINING_FRACTION, NEGLIGIBLE_EXCESS};
@@ -32,6 +33,9 @@ const MOST_CAUSES: usize = 12;
 
 /// Identifies the effects that ideal actuators lack, from the torques in `logs` of one robot with joints of any names.
 pub fn diagnose_torques(logs: &[Log], progress: &mut DiagnoseProgress) -> Result<Diagnosis, DiagnoseError> {
+    for log in logs {
+        check_gains(log).map_err(ExperimentError::from)?;
+    }
     let mut all = Vec::new();
     for names in logs[0].joints().chunks(TOGETHER) {
         let slots = JointSlots::new(logs, names).map_err(ExperimentError::from)?;

@@ -1,7 +1,7 @@
 //! Entries of a model file, and their application to a robot.
 
 use super::{Composition, Effect, EffectSite, Scope, Target};
-use twinstep_model::{Joint, RobotModel};
+use twinstep_model::{ActuatorParams, Joint, RobotModel};
 
 /// Effect with its scope and values.
 #[derive(Clone, Debug, PartialEq)]
@@ -130,7 +130,7 @@ pub fn apply_effects(robot: &RobotModel, entries: &[EffectEntry]) -> Result<Robo
         for site in entry.sites() {
             if !entry.is_replaced(index, site, entries) {
                 let (effect, scope) = (entry.effect.name, entry.scope);
-                (entry.effect.apply)(&mut composed, site, &entry.values).map_err(|reason| EntryError::Conflict {
+                entry.effect.apply(&mut composed, site, &entry.values).map_err(|reason| EntryError::Conflict {
                     effect,
                     scope,
                     reason,
@@ -147,6 +147,10 @@ pub fn apply_effects(robot: &RobotModel, entries: &[EffectEntry]) -> Result<Robo
 /// Returns why the robot is physically impossible, or `None` if it is possible.
 fn check_robot(robot: &RobotModel) -> Option<&'static str> {
     for joint in &robot.joints {
+        let ActuatorParams { command_delay, torque_delay, sensor_delay, .. } = joint.actuator;
+        if [command_delay, torque_delay, sensor_delay].iter().any(|delay| *delay > ActuatorParams::MAX_DELAY + 1e-9) {
+            return Some("the delays of a joint add up to more than 0.04 s");
+        }
         if joint.armature < 0.0 {
             return Some("the armature of a joint adds up to less than zero");
         }

@@ -7,6 +7,7 @@
 //! - [`Scope`]: the joints or the part of the robot to which an entry of a model file applies.
 //! - [`EffectEntry`]: an effect with a scope and values; [`apply_effects`] applies several to a robot.
 //! - [`ModelFile`]: a nominal robot and a list of entries, in TOML; [`NominalRobot`]: built in, or from a robot file.
+//! - [`TreeModelFile`]: the same for a robot of any tree, with the effects of joints.
 //! - [`RobotSampler`]: domain randomisation within the intervals of a model file.
 //!
 //! An effect only changes parameters. `SimdActuators` of `twinstep-dynamics` and the engines implement the laws.
@@ -26,8 +27,8 @@ pub use data_requirement::{DataRequirement, LOW_SPEED};
 pub use demo::{DemoMotion, EffectDemo, PlotQuantity};
 pub use entry::{EffectEntry, EntryError, apply_effects};
 pub use model_file::{
-    ActuatorNetworkConfig, EffectEntryError, MemberSampling, ModelFile, ModelFileError, NetworkMode, load_robot,
-    parse_robot,
+    ActuatorNetworkConfig, EffectEntryError, JointEffect, JointScope, MemberSampling, ModelFile, ModelFileError,
+    NetworkMode, NominalGain, TreeModelFile, load_robot, parse_robot,
 };
 pub use nominal::{ControlTable, JointsTable, NominalRobot, NominalRobotError, is_robot_file};
 pub use sampler::{RobotSampler, SamplingError};
@@ -35,7 +36,7 @@ pub use scope::{Scope, UnknownScope};
 pub use search::{BlindTestCondition, Probes, Search, Variable, Visibility};
 use search::{probes_along_axes, probes_over};
 
-use twinstep_model::RobotModel;
+use twinstep_model::{JointModel, RobotModel};
 
 /// Effect of the catalogue.
 #[derive(Debug)]
@@ -76,8 +77,17 @@ pub struct Effect {
     pub demo: EffectDemo,
     /// What a log of the blind test must contain for it to be hidden there. `None`: it is not hidden.
     pub blind_test: Option<&'static [BlindTestCondition]>,
-    /// Applies the values to the robot at one site. The values of a parameter are contiguous.
-    pub apply: fn(&mut RobotModel, EffectSite, &[f64]) -> Result<(), &'static str>,
+    /// What it changes. The values of a parameter are contiguous.
+    pub apply: Apply,
+}
+
+/// Change of a robot by an effect, given its values. Fails with the reason if it cannot be combined with earlier changes.
+#[derive(Clone, Copy, Debug)]
+pub enum Apply {
+    /// Changes a joint, of any robot.
+    Joint(fn(&mut JointModel, &[f64]) -> Result<(), &'static str>),
+    /// Changes another part of a quadruped.
+    Robot(fn(&mut RobotModel, EffectSite, &[f64]) -> Result<(), &'static str>),
 }
 
 /// Parameter of an effect.
@@ -175,27 +185,21 @@ impl Effect {
     }
 }
 
+impl Effect {
+    /// Applies the values to a quadruped at one site. The values of a parameter are contiguous.
+    pub fn apply(&self, robot: &mut RobotModel, site: EffectSite, values: &[f64]) -> Result<(), &'static str> {
+        match (self.apply, site) {
+            (Apply::Joint(change), EffectSite::Joint(index)) => change(&mut robot.joints[index], values),
+            (Apply::Joint(_), EffectSite::Global) => unreachable!("an effect of joints is applied joint by joint"),
+            (Apply::Robot(change), site) => change(robot, site, values),
+        }
+    }
+}
+
 impl PartialEq for Effect {
     fn eq(&self, other: &Self) -> bool {
         self.name == other.name
     }
-}
-
-/// Returns the joint of a site, for effects with [`Target::Joints`].
-fn joint(robot: &mut RobotModel, site: EffectSite) -> &mut twinstep_model::JointModel {
-    match site {
-        EffectSite::Joint(index) => &mut robot.joints[index],
-        EffectSite::Global => unreachable!("an effect of joints is applied joint by joint"),
-    }
-}
-
-/// Adds `more` to a delay [s]. Fails if the sum exceeds the longest delay that the actuators simulate.
-fn delayed(delay: &mut f64, more: f64) -> Result<(), &'static str> {
-    *delay += more;
-    if *delay > twinstep_model::ActuatorParams::MAX_DELAY + 1e-9 {
-        return Err("the delays of a joint add up to more than 0.04 s");
-    }
-    Ok(())
 }
 
 /// Returns the body of a site: the child link of the joint, or the trunk.

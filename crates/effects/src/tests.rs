@@ -81,7 +81,7 @@ fn prior_values_change_the_robot_and_no_effect_values_do_not() {
             let mut robot = go2();
             for joint in 0..12 {
                 let site = if effect.target == Target::Joints { EffectSite::Joint(joint) } else { EffectSite::Global };
-                (effect.apply)(&mut robot, site, &entry.values).expect("no conflict");
+                effect.apply(&mut robot, site, &entry.values).expect("no conflict");
                 if site == EffectSite::Global {
                     break;
                 }

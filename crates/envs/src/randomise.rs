@@ -138,7 +138,7 @@ fn sample([low, high]: Range, random: &mut Stream) -> f32 {
 
 fn apply(robot: &mut RobotModel, name: &str, site: EffectSite, values: &[f64]) {
     let effect = Effect::named(name).expect("an effect of the catalogue");
-    (effect.apply)(robot, site, values).expect("`check_robot` has checked the ranges");
+    effect.apply(robot, site, values).expect("`check_robot` has checked the ranges");
 }
 
 #[cfg(test)]

@@ -19,7 +19,7 @@ pub struct Evaluation {
     /// Root mean square over joints and rows of the position error in closed loop [rad].
     pub q_rmse_rad: Option<f64>,
     /// Errors of each joint.
-    pub per_joint: BTreeMap<&'static str, JointEvaluation>,
+    pub per_joint: BTreeMap<String, JointEvaluation>,
 }
 
 /// Errors of one joint in an [`Evaluation`].
@@ -53,7 +53,7 @@ pub fn evaluate(
             torque_rmse_nm: torques.and_then(|sums| root(sums[index])),
             q_rmse_rad: root(positions[index]),
         };
-        (JOINT_NAMES[index], evaluation)
+        (JOINT_NAMES[index].to_owned(), evaluation)
     });
     Ok(Evaluation {
         torque_rmse_nm: torques.and_then(|sums| whole(&sums)),

@@ -12,7 +12,7 @@ use twinstep_model::{
 use crate::base_estimate::BaseEstimate;
 use crate::error::ExperimentError;
 use crate::orientation::normalized;
-use twinstep_logs::replay::{ActuatorClock, JointCommands, command, joint_commands};
+use twinstep_logs::replay::{ActuatorClock, JointCommands, check_gains, command, joint_commands};
 
 /// Lengths of the windows of a log.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -103,6 +103,7 @@ impl Window {
 ///
 /// Rows in which a robot on the ground only brakes its motors have no window: see [`WindowBuilder::is_limp`].
 pub fn windows(log: &Log, robot: &RobotModel, horizon: WindowConfig) -> Result<Vec<Window>, ExperimentError> {
+    check_gains(log)?;
     let builder = WindowBuilder {
         log,
         robot,

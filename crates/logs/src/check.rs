@@ -14,14 +14,15 @@ use crate::table::Table;
 /// Kind of a log, which determines its required columns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum LogKind {
-    /// Measured log: positions, commands and gains.
+    /// Measured log: positions and commands.
     Measurement,
     /// Motion file: commands.
     Commands,
 }
 
 /// Validates a table and its metadata, and creates a log from them.
-pub(crate) fn assemble(mut table: Table, meta: Meta, meta_file: &Path, need: LogKind) -> Result<Log, LogError> {
+pub(crate) fn assemble(mut table: Table, mut meta: Meta, meta_file: &Path, need: LogKind) -> Result<Log, LogError> {
+    use_go2_joint_names(&mut table, &mut meta);
     check_joint_names(&table)?;
     let joints = joints_of(&table, &meta, need)?;
     ignore_other_joints(&mut table, &joints);
@@ -34,7 +35,7 @@ pub(crate) fn assemble(mut table: Table, meta: Meta, meta_file: &Path, need: Log
     check_segments(&table, &segment, &meta)?;
     check_time(&table, &segment, &episode)?;
     check_quaternion(&table)?;
-    check_gains(&table, &meta, meta_file, &joints, need)?;
+    check_gains(&meta, meta_file, &joints)?;
 
     let t = table.take("t").unwrap_or_default();
     let channels = table.columns.into_iter().collect();
@@ -104,7 +105,35 @@ fn missing(table: &Table, column: &str) -> LogError {
     }
 }
 
-/// Fails if a joint's name is one of the Go2's with a suffix or in another case.
+/// Renames joints that have the name of the Go2's in its robot file, such as `FL_hip_joint`, or in another case.
+fn use_go2_joint_names(table: &mut Table, meta: &mut Meta) {
+    let known = |joint: &str| {
+        let short = joint.strip_suffix("_joint").unwrap_or(joint);
+        JOINT_NAMES.into_iter().find(|known| *known != joint && known.eq_ignore_ascii_case(short))
+    };
+    for joint in &mut meta.joints {
+        if let Some(known) = known(joint) {
+            known.clone_into(joint);
+        }
+    }
+    let renamed = |name: &str| {
+        let column = Column::parse(name)?;
+        Some(format!("{}_{}", column.quantity.name, known(column.joint()?)?))
+    };
+    let mut example = None;
+    for index in 0..table.columns.len() {
+        let name = &table.columns[index].0;
+        if let Some(new) = renamed(name).filter(|new| table.column(new).is_none()) {
+            example.get_or_insert_with(|| {
+                format!("joints are named as in the rest of twinstep: `{name}` is read as `{new}`")
+            });
+            table.columns[index].0 = new;
+        }
+    }
+    table.notes.extend(example);
+}
+
+/// Fails if a joint's name is one of the Go2's with a suffix, such as a unit.
 fn check_joint_names(table: &Table) -> Result<(), LogError> {
     for (name, _) in &table.columns {
         let Some((column, joint)) = Column::parse(name).and_then(|column| Some((column, column.joint()?))) else {
@@ -209,8 +238,8 @@ fn check_quaternion(table: &Table) -> Result<(), LogError> {
     Ok(())
 }
 
-/// Checks that every joint has gains: its own column, the column for all joints, or the metadata.
-fn check_gains(table: &Table, meta: &Meta, meta_file: &Path, joints: &[String], need: LogKind) -> Result<(), LogError> {
+/// Checks that lists of gains in the metadata have one for each joint.
+fn check_gains(meta: &Meta, meta_file: &Path, joints: &[String]) -> Result<(), LogError> {
     for (gain, constant) in [("kp", &meta.kp), ("kd", &meta.kd)] {
         if let Some(Gain::PerJoint(gains)) = constant
             && gains.len() != joints.len()
@@ -218,12 +247,6 @@ fn check_gains(table: &Table, meta: &Meta, meta_file: &Path, joints: &[String], 
             let value = format!("{gains:?}");
             let expected = "one number, or one for each joint";
             return Err(LogError::MetaValue { file: meta_file.into(), key: gain.to_owned(), value, expected });
-        }
-        if need == LogKind::Commands || constant.is_some() || table.column(gain).is_some() {
-            continue;
-        }
-        if let Some(joint) = joints.iter().find(|joint| table.column(&format!("{gain}_{joint}")).is_none()) {
-            return Err(LogError::NoGain { file: table.file.clone(), gain, joint: joint.clone() });
         }
     }
     Ok(())

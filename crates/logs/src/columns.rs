@@ -53,7 +53,7 @@ const fn optional(name: &'static str, unit: &'static str, of: ColumnOwner) -> Qu
 }
 
 /// All quantities, in the order in which columns are written.
-pub(crate) static QUANTITIES: [Quantity; 20] = [
+pub(crate) static QUANTITIES: [Quantity; 21] = [
     required("t", "s", ColumnOwner::Robot),
     required("segment", "", ColumnOwner::Robot),
     required("episode", "", ColumnOwner::Robot),
@@ -65,6 +65,7 @@ pub(crate) static QUANTITIES: [Quantity; 20] = [
     required("q", "rad", ColumnOwner::Joint),
     optional("dq", "rad/s", ColumnOwner::Joint),
     optional("tau_measured", "N·m", ColumnOwner::Joint),
+    optional("current_abs", "", ColumnOwner::Joint),
     optional("temp", "°C", ColumnOwner::Joint),
     optional("gyro", "rad/s", XYZ),
     optional("acc", "m/s²", XYZ),

@@ -2,12 +2,12 @@
 
 use twinstep_model::Joint;
 
-use crate::columns::{Column, QUANTITIES, Quantity};
+use crate::columns::{Column, MissingCells, QUANTITIES, Quantity};
 use crate::excitation::excitation;
 use crate::falls::falls;
 use crate::identifiability::conclusions;
 use crate::missing_channels::absent;
-use crate::statistics::{quantile, standard_deviation};
+use crate::statistics::{largest, quantile, quantum, standard_deviation};
 use crate::summary::{ChannelDescription, LogSummary, MissingChannel, SegmentDescription, Timing};
 use crate::{Log, TorqueSensor};
 
@@ -83,6 +83,9 @@ impl Log {
                 quantity: quantity.name,
                 unit: quantity.unit,
                 columns: cells.len(),
+                quantum: (quantity.cells == MissingCells::Allowed || quantity.name == "q")
+                    .then(|| largest(cells.iter().filter_map(|cells| quantum(cells))))
+                    .flatten(),
                 missing_cells: cells.iter().copied().flatten().filter(|cell| cell.is_nan()).count(),
             })
         };

@@ -71,7 +71,14 @@ fn channel(channel: &ChannelDescription) -> String {
         1 => ", 1 cell empty".to_owned(),
         count => format!(", {count} cells empty"),
     };
-    format!("{:<14} {columns}{unit}{missing}", channel.quantity)
+    let quantum = channel.quantum.map_or(String::new(), |step| format!(", in steps of {}", significant(step)));
+    format!("{:<14} {columns}{unit}{quantum}{missing}", channel.quantity)
+}
+
+/// Returns a number with three significant digits.
+fn significant(value: f64) -> String {
+    let decimals = (2 - value.abs().log10().floor() as i32).clamp(0, 12) as usize;
+    format!("{value:.decimals$}")
 }
 
 /// Writes one line per joint, below two header lines.

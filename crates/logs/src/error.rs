@@ -297,6 +297,17 @@ pub enum LogError {
         /// Problem of the message.
         cause: CdrError,
     },
+    /// A measured log of unknown gains cannot be written as MCAP.
+    #[error(
+        "cannot write `{file}`: the gains of the joint `{joint}` are unknown, and a command in MCAP has gains; write Parquet \
+         or CSV, or state `kp` and `kd`"
+    )]
+    GainsNotInMcap {
+        /// The file.
+        file: PathBuf,
+        /// The joint.
+        joint: String,
+    },
     /// A number is out of the range of the robot's messages.
     #[error("{place}: {value} is out of the range of the robot's message, {range}\n  write Parquet or CSV instead")]
     NotInMcap {
@@ -325,19 +336,6 @@ pub enum LogError {
         file: PathBuf,
         /// The missing column.
         column: String,
-        /// The joint.
-        joint: String,
-    },
-    /// A joint has no gain.
-    #[error(
-        "`{file}` has no `{gain}` for the joint `{joint}`\n  \
-         add a column `{gain}` or `{gain}_{joint}`, or `\"{gain}\"` to the meta file"
-    )]
-    NoGain {
-        /// The data file.
-        file: PathBuf,
-        /// `kp` or `kd`.
-        gain: &'static str,
         /// The joint.
         joint: String,
     },

@@ -122,12 +122,12 @@ impl Log {
         self.of_joint("tau_measured", joint)
     }
 
-    /// Returns the position gain in force from a row to the next [N·m/rad]. Only a motion file may lack it.
+    /// Returns the position gain in force from a row to the next [N·m/rad]. `None` if it is unknown.
     pub fn kp(&self, joint: &str, row: usize) -> Option<f64> {
         self.gain("kp", self.meta.kp.as_ref(), joint, row)
     }
 
-    /// Returns the velocity gain in force from a row to the next [N·m·s/rad]. Only a motion file may lack it.
+    /// Returns the velocity gain in force from a row to the next [N·m·s/rad]. `None` if it is unknown.
     pub fn kd(&self, joint: &str, row: usize) -> Option<f64> {
         self.gain("kd", self.meta.kd.as_ref(), joint, row)
     }

@@ -10,8 +10,20 @@ use crate::LogError;
 use crate::columns::{Column, quantity};
 
 /// Keys of `meta.json`.
-pub(crate) const KEYS: [&str; 11] =
-    ["rate_hz", "policy_hz", "joints", "tau_sensor", "segments", "pd", "kp", "kd", "noise", "source", "licence"];
+pub(crate) const KEYS: [&str; 12] = [
+    "rate_hz",
+    "policy_hz",
+    "joints",
+    "tau_sensor",
+    "segments",
+    "pd",
+    "kp",
+    "kd",
+    "base_quat",
+    "noise",
+    "source",
+    "licence",
+];
 
 /// Metadata of a log, the content of `meta.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -37,6 +49,9 @@ pub struct Meta {
     /// Velocity gain if there is no column for it [N·m·s/rad].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub kd: Option<Gain>,
+    /// Rotation world-from-base of a fixed base, `[w, x, y, z]`, if it is not level and the log has no `quat`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub base_quat: Option<[f64; 4]>,
     /// Standard deviation of the noise of a channel (`q_FL_hip`) or a quantity (`q`), in the channel's unit.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub noise: BTreeMap<String, f64>,
@@ -93,6 +108,7 @@ impl Meta {
             pd: None,
             kp: None,
             kd: None,
+            base_quat: None,
             noise: BTreeMap::new(),
             source: None,
             licence: None,
@@ -139,6 +155,10 @@ impl Meta {
                     return refuse(key, value.to_string(), "finite and not negative");
                 }
             }
+        }
+        let norm = |quat: [f64; 4]| quat.iter().map(|part| part * part).sum::<f64>().sqrt();
+        if let Some(quat) = self.base_quat.filter(|quat| !(0.99..1.01).contains(&norm(*quat))) {
+            return refuse("base_quat", format!("{quat:?}"), "four numbers w, x, y, z of norm 1");
         }
         for (key, sigma) in &self.noise {
             if quantity(key).is_none() && Column::parse(key).is_none() {

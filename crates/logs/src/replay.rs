@@ -40,6 +40,17 @@ pub enum ReplayError {
         /// The missing quantity.
         quantity: &'static str,
     },
+    /// A gain of a measured log is unknown.
+    #[error(
+        "joint `{joint}` of the log has no `{gain}`\n  add a column `{gain}` or `{gain}_{joint}`, or `\"{gain}\"` to the meta file; \
+         `twinstep identify` estimates unknown gains"
+    )]
+    UnknownGain {
+        /// Name of the joint.
+        joint: String,
+        /// `kp` or `kd`.
+        gain: &'static str,
+    },
     /// The log has no two consecutive rows.
     #[error("the log has no two consecutive rows in a segment, so there is nothing to simulate")]
     NoSteps,
@@ -107,6 +118,18 @@ impl<'a> JointCommands<'a> {
             kp,
             kd,
         })
+    }
+}
+
+/// Checks that the gains of all joints are known.
+pub fn check_gains(log: &Log) -> Result<(), ReplayError> {
+    let unknown = |joint: &String| {
+        let [kp, kd] = [log.kp(joint, 0), log.kd(joint, 0)];
+        [(kp, "kp"), (kd, "kd")].into_iter().find(|(gain, _)| gain.is_none()).map(|(_, gain)| (joint.clone(), gain))
+    };
+    match log.joints().iter().find_map(unknown) {
+        Some((joint, gain)) => Err(ReplayError::UnknownGain { joint, gain }),
+        None => Ok(()),
     }
 }
 

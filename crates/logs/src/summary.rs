@@ -71,7 +71,7 @@ pub struct SegmentDescription {
 }
 
 /// Summary of a recorded quantity.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ChannelDescription {
     /// Name of the quantity, such as `tau_measured`.
     pub quantity: &'static str,
@@ -81,6 +81,8 @@ pub struct ChannelDescription {
     pub columns: usize,
     /// Number of empty cells in the columns.
     pub missing_cells: usize,
+    /// Step of a quantised sensor: all cells are multiples of it, the largest of all columns. `None` if the cells are not quantised.
+    pub quantum: Option<f64>,
 }
 
 /// Quantity that was not recorded.

@@ -1,5 +1,6 @@
 //! Plot of an evaluation: the error of each joint, and the worst joint over time.
 
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::Path;
 
@@ -7,7 +8,6 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::HPos;
 use twinstep_identify::{Evaluation, JointEvaluation};
 use twinstep_logs::Log;
-use twinstep_model::{Joint, NUM_JOINTS};
 
 use crate::chart::{self, Area, GREY, INK, Line, ORANGE, Panel, PlotError};
 use crate::timeline::Timeline;
@@ -19,7 +19,7 @@ const HEADER_HEIGHT: u32 = 110;
 const BARS_HEIGHT: u32 = 800;
 
 /// Simulated minus measured position [rad] with its row, by joint.
-pub type Errors = [Vec<(usize, f64)>; NUM_JOINTS];
+pub type Errors = BTreeMap<String, Vec<(usize, f64)>>;
 
 /// Plots the errors of the joints as bars, and the joint with the largest position error over time.
 pub fn write_svg(
@@ -35,13 +35,14 @@ pub fn write_svg(
         let (upper, lower) = rest.split_vertically(BARS_HEIGHT);
         let [q, torque] = [evaluation.q_rmse_rad, evaluation.torque_rmse_nm];
         let mut bars = Vec::new();
-        bars.extend(q.map(|all| ("joint position, RMSE [rad]", heights(evaluation, |joint| joint.q_rmse_rad), all)));
-        bars.extend(torque.map(|all| ("torque, RMSE [N·m]", heights(evaluation, |joint| joint.torque_rmse_nm), all)));
+        let of = |joint: fn(&JointEvaluation) -> Option<f64>| heights(log.joints(), evaluation, joint);
+        bars.extend(q.map(|all| ("joint position, RMSE [rad]", of(|joint| joint.q_rmse_rad), all)));
+        bars.extend(torque.map(|all| ("torque, RMSE [N·m]", of(|joint| joint.torque_rmse_nm), all)));
         for (area, (name, heights, all)) in upper.split_evenly((1, bars.len().max(1))).iter().zip(&bars) {
             draw_bars(area, name, heights, *all)?;
         }
         match worst(evaluation) {
-            Some(joint) => draw_joint(&lower, log, joint, &errors[joint.index()]),
+            Some(joint) => draw_joint(&lower, log, joint, errors.get(joint).map_or(&[], Vec::as_slice)),
             None => chart::text(&lower, "the log has no measured position", 40, HPos::Center, (SIZE.0 as i32, 400)),
         }
     })?;
@@ -49,19 +50,21 @@ pub fn write_svg(
 }
 
 /// Returns the joint with the largest position error.
-fn worst(evaluation: &Evaluation) -> Option<Joint> {
+fn worst(evaluation: &Evaluation) -> Option<&str> {
     let errors = evaluation.per_joint.iter().filter_map(|(name, joint)| Some((name, joint.q_rmse_rad?)));
-    let (name, _) = errors.max_by(|one, other| one.1.total_cmp(&other.1))?;
-    name.parse().ok()
+    errors.max_by(|one, other| one.1.total_cmp(&other.1)).map(|(name, _)| name.as_str())
 }
 
-/// Returns the known errors of the joints, in the order of [`Joint::ALL`].
-fn heights(evaluation: &Evaluation, of: fn(&JointEvaluation) -> Option<f64>) -> Vec<(Joint, f64)> {
-    let known = |joint: Joint| Some((joint, of(evaluation.per_joint.get(joint.name())?)?));
-    Joint::ALL.into_iter().filter_map(known).collect()
+/// Returns the known errors of the joints, in the order of `joints`.
+fn heights<'a>(
+    joints: &'a [String],
+    evaluation: &Evaluation,
+    of: fn(&JointEvaluation) -> Option<f64>,
+) -> Vec<(&'a str, f64)> {
+    joints.iter().filter_map(|joint| Some((joint.as_str(), of(evaluation.per_joint.get(joint)?)?))).collect()
 }
 
-fn draw_bars(area: &Area, name: &str, heights: &[(Joint, f64)], overall: f64) -> Result<(), PlotError> {
+fn draw_bars(area: &Area, name: &str, heights: &[(&str, f64)], overall: f64) -> Result<(), PlotError> {
     let label = |size: u32| ("sans-serif", size).into_text_style(area).color(&INK);
     let highest = heights.iter().map(|(_, height)| *height).fold(1e-6, f64::max);
     let mut chart = ChartBuilder::on(area)
@@ -73,7 +76,7 @@ fn draw_bars(area: &Area, name: &str, heights: &[(Joint, f64)], overall: f64) ->
         .build_cartesian_2d(-0.5..heights.len() as f64 - 0.5, 0.0..1.1 * highest)?;
     let joint_name = |position: &f64| {
         let joint = heights.get(position.round() as usize).filter(|_| position.fract().abs() < 1e-6);
-        joint.map_or(String::new(), |(joint, _)| joint.name().to_owned())
+        joint.map_or(String::new(), |(joint, _)| (*joint).to_owned())
     };
     let tick = |value: &f64| chart::tick_label(*value, 1.1 * highest);
     let mut mesh = chart.configure_mesh();
@@ -87,7 +90,7 @@ fn draw_bars(area: &Area, name: &str, heights: &[(Joint, f64)], overall: f64) ->
         .label_style(label(32))
         .axis_style(GREY.stroke_width(2));
     mesh.draw()?;
-    let bar = |(index, (_, height)): (usize, &(Joint, f64))| {
+    let bar = |(index, (_, height)): (usize, &(&str, f64))| {
         let middle = index as f64;
         Rectangle::new([(middle - 0.35, 0.0), (middle + 0.35, *height)], ORANGE.filled())
     };
@@ -95,11 +98,11 @@ fn draw_bars(area: &Area, name: &str, heights: &[(Joint, f64)], overall: f64) ->
     Ok(())
 }
 
-fn draw_joint(area: &Area, log: &Log, joint: Joint, errors: &[(usize, f64)]) -> Result<(), PlotError> {
+fn draw_joint(area: &Area, log: &Log, joint: &str, errors: &[(usize, f64)]) -> Result<(), PlotError> {
     let rows: Vec<usize> = errors.iter().map(|(row, _)| *row).collect();
     let at = |cells: &[f64]| rows.iter().map(|row| cells[*row]).collect::<Vec<f64>>();
     let t = at(log.t());
-    let measured = log.q(joint.name()).map_or(Vec::new(), at);
+    let measured = log.q(joint).map_or(Vec::new(), at);
     let simulated: Vec<f64> = measured.iter().zip(errors).map(|(measured, (_, error))| measured + error).collect();
     let parts = parts(log, &rows);
     let timeline = Timeline::new(&t, &parts);

@@ -1,8 +1,8 @@
 //! Rotor inertia reflected through the gear to the joint.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
-    Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -47,8 +47,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Acceleration, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
-    apply: |robot, site, values| {
-        crate::joint(robot, site).armature += values[0];
+    apply: Apply::Joint(|joint, values| {
+        joint.armature += values[0];
         Ok(())
-    },
+    }),
 };

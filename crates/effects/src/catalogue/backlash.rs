@@ -1,8 +1,8 @@
 //! Backlash in the gear between rotor and link.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
-    Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -49,8 +49,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Time, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
-    apply: |robot, site, values| {
-        crate::joint(robot, site).actuator.backlash = values[0];
+    apply: Apply::Joint(|joint, values| {
+        joint.actuator.backlash = values[0];
         Ok(())
-    },
+    }),
 };

@@ -3,8 +3,8 @@
 use glam::DVec3;
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
-    Search, Target, Variable, Visibility, demo, probes_along_axes,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Probes, Search, Target, Variable, Visibility, demo, probes_along_axes,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -50,8 +50,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Time, PlotQuantity::FrontShare],
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
-    apply: |robot, site, values| {
+    apply: Apply::Robot(|robot, site, values| {
         crate::body(robot, site).com += DVec3::new(values[0], values[1], values[2]);
         Ok(())
-    },
+    }),
 };

@@ -1,8 +1,8 @@
 //! Dry friction, independent of speed, which also holds the joint at rest.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
-    Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -55,8 +55,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Velocity, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
-    apply: |robot, site, values| {
-        crate::joint(robot, site).coulomb_friction += values[0];
+    apply: Apply::Joint(|joint, values| {
+        joint.coulomb_friction += values[0];
         Ok(())
-    },
+    }),
 };

@@ -1,8 +1,8 @@
 //! The encoder zero is offset from the joint zero.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Probes, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -52,8 +52,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Position, PlotQuantity::Height],
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
-    apply: |robot, site, values| {
-        crate::joint(robot, site).actuator.encoder_offset += values[0];
+    apply: Apply::Joint(|joint, values| {
+        joint.actuator.encoder_offset += values[0];
         Ok(())
-    },
+    }),
 };

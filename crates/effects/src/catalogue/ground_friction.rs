@@ -1,8 +1,8 @@
 //! Friction coefficient of the ground.
 
 use crate::{
-    Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search, Target,
-    Variable, Visibility, demo,
+    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search,
+    Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -43,8 +43,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Time, PlotQuantity::LateralAcceleration],
     },
     blind_test: None,
-    apply: |robot, _, values| {
+    apply: Apply::Robot(|robot, _, values| {
         robot.contact.friction = values[0];
         Ok(())
-    },
+    }),
 };

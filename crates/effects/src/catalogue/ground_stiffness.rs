@@ -1,8 +1,8 @@
 //! Compliance of the ground or of the feet.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Probes, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -46,8 +46,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Time, PlotQuantity::Force],
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
-    apply: |robot, _, values| {
+    apply: Apply::Robot(|robot, _, values| {
         robot.contact.time_constant = values[0];
         Ok(())
-    },
+    }),
 };

@@ -3,8 +3,8 @@
 use glam::DVec3;
 
 use crate::{
-    BlindTestCondition, Composition, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search,
-    Target, Variable, Visibility, demo, probes_along_axes,
+    Apply, BlindTestCondition, Composition, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
+    Search, Target, Variable, Visibility, demo, probes_along_axes,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -42,8 +42,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::RollRate, PlotQuantity::Gyro],
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
-    apply: |robot, _, values| {
+    apply: Apply::Robot(|robot, _, values| {
         robot.gyro_bias += DVec3::new(values[0], values[1], values[2]);
         Ok(())
-    },
+    }),
 };

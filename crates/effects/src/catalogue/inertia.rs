@@ -1,8 +1,8 @@
 //! Replaces all ten inertial parameters of a body.
 
 use crate::{
-    Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search, Target,
-    Variable, Visibility, demo,
+    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search,
+    Target, Variable, Visibility, demo,
 };
 use twinstep_model::RigidBody;
 
@@ -47,9 +47,9 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::VerticalAcceleration, PlotQuantity::Force],
     },
     blind_test: None,
-    apply: |robot, site, values| {
+    apply: Apply::Robot(|robot, site, values| {
         let theta: [f64; 10] = values.try_into().expect("ten values");
         *crate::body(robot, site) = RigidBody::from_log_cholesky(&theta);
         Ok(())
-    },
+    }),
 };

@@ -1,8 +1,8 @@
 //! A cable or a spring pulls the joint towards a rest position.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Probes, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -58,10 +58,10 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Position, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
-    apply: |robot, site, values| {
-        let spring = &mut crate::joint(robot, site).spring;
+    apply: Apply::Joint(|joint, values| {
+        let spring = &mut joint.spring;
         spring.stiffness += values[0];
         spring.torque_offset += values[0] * values[1];
         Ok(())
-    },
+    }),
 };

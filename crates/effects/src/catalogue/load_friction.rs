@@ -1,8 +1,8 @@
 //! Friction proportional to the magnitude of the motor torque.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
-    Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -47,8 +47,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::EstimatedTorque, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
-    apply: |robot, site, values| {
-        crate::joint(robot, site).load_friction += values[0];
+    apply: Apply::Joint(|joint, values| {
+        joint.load_friction += values[0];
         Ok(())
-    },
+    }),
 };

@@ -3,8 +3,8 @@
 use glam::DVec3;
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Probes, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -63,12 +63,12 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::VerticalAcceleration, PlotQuantity::Force],
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
-    apply: |robot, site, values| {
+    apply: Apply::Robot(|robot, site, values| {
         let body = crate::body(robot, site);
         if body.mass + values[0] <= 0.0 {
             return Err("the body's mass would be zero or less");
         }
         *body = body.with_point_mass(values[0], DVec3::new(values[1], values[2], values[3]));
         Ok(())
-    },
+    }),
 };

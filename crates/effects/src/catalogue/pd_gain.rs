@@ -1,8 +1,8 @@
 //! The gains of the PD loop differ from the commanded gains.
 
 use crate::{
-    Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search, Target,
-    Variable, Visibility, demo, probes_over,
+    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search,
+    Target, Variable, Visibility, demo, probes_over,
 };
 
 /// Prior range of the factor on kp.
@@ -66,12 +66,12 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
     },
     blind_test: None,
-    apply: |robot, site, values| {
-        let actuator = &mut crate::joint(robot, site).actuator;
+    apply: Apply::Joint(|joint, values| {
+        let actuator = &mut joint.actuator;
         actuator.kp_scale *= values[0];
         actuator.kd_scale *= values[1];
         Ok(())
-    },
+    }),
 };
 
 /// Returns scales of one gain at a time, from small to large changes.

@@ -1,8 +1,8 @@
 //! Additional friction near standstill that decays with speed.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Probes, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -50,13 +50,13 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Velocity, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
-    apply: |robot, site, values| {
-        let friction = &mut crate::joint(robot, site).stribeck_friction;
+    apply: Apply::Joint(|joint, values| {
+        let friction = &mut joint.stribeck_friction;
         if friction.breakaway_torque > 0.0 && (friction.stribeck_velocity - values[1]).abs() > 1e-9 {
             return Err("two Stribeck frictions of different `speed_rad_s` on one joint");
         }
         friction.breakaway_torque += values[0];
         friction.stribeck_velocity = values[1];
         Ok(())
-    },
+    }),
 };

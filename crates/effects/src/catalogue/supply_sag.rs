@@ -1,8 +1,8 @@
 //! Motor torque decreases with the battery voltage.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
-    Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -47,8 +47,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Voltage, PlotQuantity::DeratingFactor],
     },
     blind_test: Some(&[BlindTestCondition::Voltage]),
-    apply: |robot, _, values| {
+    apply: Apply::Robot(|robot, _, values| {
         robot.derating.voltage_exponent = values[0];
         Ok(())
-    },
+    }),
 };

@@ -1,7 +1,7 @@
 //! Motor torque decreases with the motor temperature.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, EffectSite, Parameter,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, EffectSite, Parameter,
     PlotQuantity, Probes, Search, Target, Variable, Visibility, demo,
 };
 
@@ -57,11 +57,11 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Temperature, PlotQuantity::DeratingFactor],
     },
     blind_test: Some(&[BlindTestCondition::Temperature, BlindTestCondition::FixedBase]),
-    apply: |robot, site, values| {
+    apply: Apply::Robot(|robot, site, values| {
         if let EffectSite::Joint(index) = site {
             robot.derating.per_kelvin[index] = values[0];
             robot.derating.reference_temperature_c[index] = values[1];
         }
         Ok(())
-    },
+    }),
 };

@@ -1,8 +1,8 @@
 //! The motor produces no torque for small commanded torques.
 
 use crate::{
-    Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search, Target, Variable,
-    Visibility, demo,
+    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search, Target,
+    Variable, Visibility, demo,
 };
 
 /// The motor produces no torque for small commanded torques.
@@ -50,8 +50,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
     },
     blind_test: None,
-    apply: |robot, site, values| {
-        crate::joint(robot, site).actuator.dead_zone = values[0];
+    apply: Apply::Joint(|joint, values| {
+        joint.actuator.dead_zone = values[0];
         Ok(())
-    },
+    }),
 };

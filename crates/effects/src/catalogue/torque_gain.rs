@@ -1,8 +1,8 @@
 //! The torque constant differs from the one that converts motor current to torque.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
-    Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -50,8 +50,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::EstimatedTorque, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
-    apply: |robot, site, values| {
-        crate::joint(robot, site).actuator.gain *= values[0];
+    apply: Apply::Joint(|joint, values| {
+        joint.actuator.gain *= values[0];
         Ok(())
-    },
+    }),
 };

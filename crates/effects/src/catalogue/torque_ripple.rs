@@ -1,8 +1,8 @@
 //! Motor torque ripple that depends on the joint position.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Probes, Search, Target, Variable, Visibility, demo,
 };
 use std::f64::consts::PI;
 use twinstep_model::Ripple;
@@ -62,8 +62,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Position, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
-    apply: |robot, site, values| {
-        let ripple = &mut crate::joint(robot, site).actuator.ripple;
+    apply: Apply::Joint(|joint, values| {
+        let ripple = &mut joint.actuator.ripple;
         let [amplitude, cycles, phase] = [values[0], values[1], values[2]];
         if ripple.amplitude > 0.0 && (ripple.cycles - cycles).abs() > 1e-9 {
             return Err("two ripples of different `cycles_per_turn` on one joint");
@@ -72,7 +72,7 @@ pub const EFFECT: Effect = Effect {
         let cosine = ripple.amplitude * ripple.phase.cos() + amplitude * phase.cos();
         *ripple = Ripple { amplitude: sine.hypot(cosine), cycles, phase: sine.atan2(cosine) };
         Ok(())
-    },
+    }),
 };
 
 /// Distance of the numbers of cycles of two probes.

@@ -1,8 +1,8 @@
 //! Smooth saturation of the motor torque.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
-    Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -50,8 +50,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
-    apply: |robot, site, values| {
-        crate::joint(robot, site).actuator.saturation = values[0];
+    apply: Apply::Joint(|joint, values| {
+        joint.actuator.saturation = values[0];
         Ok(())
-    },
+    }),
 };

@@ -1,8 +1,8 @@
 //! Delay of the logged torque; the motion is not delayed.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
-    Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -39,5 +39,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
     },
     blind_test: Some(&[BlindTestCondition::Torque, BlindTestCondition::FixedBase]),
-    apply: |robot, site, values| crate::delayed(&mut crate::joint(robot, site).actuator.sensor_delay, values[0]),
+    apply: Apply::Joint(|joint, values| {
+        joint.actuator.sensor_delay += values[0];
+        Ok(())
+    }),
 };

@@ -1,8 +1,8 @@
 //! Back-EMF reduces the available torque with speed.
 
 use crate::{
-    BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search,
-    Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
+    Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -45,8 +45,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Velocity, PlotQuantity::EstimatedTorque],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
-    apply: |robot, site, values| {
-        crate::joint(robot, site).actuator.no_load_speed = values[0];
+    apply: Apply::Joint(|joint, values| {
+        joint.actuator.no_load_speed = values[0];
         Ok(())
-    },
+    }),
 };

@@ -10,8 +10,18 @@ use crate::{Effect, EffectEntry, Parameter, Scope, UnknownScope};
 /// Interval of a component that was not measured, in a vector with measured components.
 const UNBOUNDED: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
 
-/// Reads an entry.
-pub fn read_entry(table: &Table) -> Result<EffectEntry, EffectEntryError> {
+/// Content of a table `[[effect]]`, before its scope is understood.
+pub struct EffectTable {
+    pub effect: &'static Effect,
+    pub scope: String,
+    /// Values of all parameters.
+    pub values: Vec<f64>,
+    /// 95 % interval of each value.
+    pub intervals: Vec<Option<[f64; 2]>>,
+}
+
+/// Reads a table.
+pub fn read_table(table: &Table) -> Result<EffectTable, EffectEntryError> {
     let text = |key: &str| match table.get(key) {
         Some(Value::String(text)) => Ok(text.clone()),
         other => Err(key_error(key, other, "a string")),
@@ -22,18 +32,23 @@ pub fn read_entry(table: &Table) -> Result<EffectEntry, EffectEntryError> {
     if let Some(key) = table.keys().find(|key| !["name", "scope", "interval"].contains(&key.as_str()) && !known(key)) {
         return Err(EffectEntryError::UnknownKey { effect: effect.name, key: key.clone() });
     }
-    let scope: Scope = text("scope")?.parse().map_err(|_: UnknownScope| {
-        let expected = "one of all, hip, thigh, calf, FL, FR, RL, RR, left, right, base, ground, or a joint such \
-                            as FL_hip";
-        key_error("scope", table.get("scope"), expected)
-    })?;
+    let scope = text("scope")?;
     let mut values = Vec::new();
     for parameter in effect.parameters {
         values.extend(read_numbers(parameter.name, table.get(parameter.name), parameter.count)?);
     }
-    let mut entry = EffectEntry::new(effect, scope, values)?;
-    entry.intervals = read_intervals(effect, table.get("interval"))?;
-    Ok(entry)
+    Ok(EffectTable { effect, scope, values, intervals: read_intervals(effect, table.get("interval"))? })
+}
+
+/// Reads an entry of a quadruped.
+pub fn read_entry(table: &Table) -> Result<EffectEntry, EffectEntryError> {
+    let EffectTable { effect, scope, values, intervals } = read_table(table)?;
+    let scope: Scope = scope.parse().map_err(|_: UnknownScope| {
+        let expected = "one of all, hip, thigh, calf, FL, FR, RL, RR, left, right, base, ground, or a joint such \
+                            as FL_hip";
+        key_error("scope", table.get("scope"), expected)
+    })?;
+    Ok(EffectEntry { intervals, ..EffectEntry::new(effect, scope, values)? })
 }
 
 fn read_intervals(effect: &'static Effect, given: Option<&Value>) -> Result<Vec<Option<[f64; 2]>>, EffectEntryError> {
@@ -91,20 +106,27 @@ fn read_numbers(key: &str, given: Option<&Value>, count: usize) -> Result<Vec<f6
     numbers.ok_or_else(|| key_error(key, given, &expected))
 }
 
-fn key_error(key: &str, found: Option<&Value>, expected: &str) -> EffectEntryError {
+pub fn key_error(key: &str, found: Option<&Value>, expected: &str) -> EffectEntryError {
     let found = found.map_or("missing".to_owned(), ToString::to_string);
     EffectEntryError::Key { key: key.to_owned(), found, expected: expected.to_owned() }
 }
 
 /// Appends the text of an entry. [`read_entry`] reads exactly the same entry from it.
 pub fn write_entry(text: &mut String, entry: &EffectEntry) {
-    writeln!(text, "\n[[effect]]\nname = \"{}\"\nscope = \"{}\"", entry.effect.name, entry.scope)
+    let EffectEntry { effect, scope, values, intervals } = entry.clone();
+    write_table(text, &EffectTable { effect, scope: scope.to_string(), values, intervals });
+}
+
+/// Appends the text of a table. [`read_table`] reads exactly the same table from it.
+pub fn write_table(text: &mut String, table: &EffectTable) {
+    let scope = Value::from(table.scope.clone());
+    writeln!(text, "\n[[effect]]\nname = \"{}\"\nscope = {scope}", table.effect.name)
         .expect("a String takes every text");
     let mut intervals = Vec::new();
-    for (parameter, values) in split_by_parameter(entry.effect, &entry.values) {
+    for (parameter, values) in split_by_parameter(table.effect, &table.values) {
         writeln!(text, "{} = {}", parameter.name, toml_value(values)).expect("a String takes every text");
     }
-    for (parameter, values) in split_by_parameter(entry.effect, &entry.intervals) {
+    for (parameter, values) in split_by_parameter(table.effect, &table.intervals) {
         if values.iter().any(Option::is_some) {
             let ends = values.iter().map(|interval| interval.unwrap_or(UNBOUNDED));
             let [low, high] = [0, 1].map(|end| toml_value(&ends.clone().map(|ends| ends[end]).collect::<Vec<_>>()));

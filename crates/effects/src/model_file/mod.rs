@@ -3,10 +3,12 @@
 //! - [`effect_table`]: reads and writes the entries `[[effect]]`.
 //! - [`actuator_network`]: the table `[actuator]`.
 //! - [`error`]: reasons why a model file is rejected.
+//! - [`tree`]: model file of a robot of any tree.
 
 mod actuator_network;
 mod effect_table;
 mod error;
+mod tree;
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -18,6 +20,7 @@ use twinstep_model::RobotModel;
 
 pub use actuator_network::{ActuatorNetworkConfig, MemberSampling, NetworkMode};
 pub use error::{EffectEntryError, ModelFileError};
+pub use tree::{JointEffect, JointScope, NominalGain, TreeModelFile};
 
 use crate::nominal::{ControlTable, JointsTable, NominalRobot, is_robot_file};
 use crate::{EffectEntry, EntryError, apply_effects};

@@ -36,6 +36,7 @@ pub(crate) fn write(log: &Log, file: &Path, target: impl Write + Seek) -> Result
     let joints: Vec<Joint> = (log.joints().iter())
         .map(|name| name.parse().map_err(|_| LogError::NotAGo2Joint { file: file.into(), joint: name.clone() }))
         .collect::<Result<_, _>>()?;
+    check_gains(log, file)?;
     check_range(log, file)?;
     let unsupported = unsupported_columns(log);
     let columns: Vec<&str> =
@@ -135,6 +136,16 @@ fn command(log: &Log, joints: &[Joint], row: usize) -> LowCmd {
         };
     }
     command
+}
+
+/// Checks that the gains of a measured log are known, because every command has gains.
+fn check_gains(log: &Log, file: &Path) -> Result<(), LogError> {
+    let unknown =
+        |joint: &&String| log.q(joint).is_some() && (log.kp(joint, 0).is_none() || log.kd(joint, 0).is_none());
+    match log.joints().iter().find(unknown) {
+        Some(joint) => Err(LogError::GainsNotInMcap { file: file.into(), joint: joint.clone() }),
+        None => Ok(()),
+    }
 }
 
 /// Checks that every cell is in the range of its field of the message.

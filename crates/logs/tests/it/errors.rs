@@ -280,7 +280,7 @@ fn values_of_the_metadata_out_of_range_are_rejected() {
 
 #[test]
 fn error_for_a_joint_name_with_a_suffix_contains_the_probable_column() {
-    for name in ["q_FL_hip_deg", "q_FL_hip [rad]", "q_FL_hip_joint", "q_fl_hip"] {
+    for name in ["q_FL_hip_deg", "q_FL_hip [rad]"] {
         let error = error(folder(&CSV.replace(",q_FL_hip", &format!(",{name}")), META).path());
         assert!(
             error.contains(&format!("column `{name}`")) && error.contains("rename the column to `q_FL_hip`, in rad"),

@@ -127,3 +127,36 @@ fn compressed_csv_equals_plain_csv() {
     assert_eq!(bytes[..2], [0x1f, 0x8b], "magic number of gzip");
     assert_eq!(Log::open(folder.path().join("small.csv.gz")).expect("a log"), log);
 }
+
+#[test]
+fn log_of_an_arm_needs_no_gains_and_describes_what_it_has() {
+    let rows = (0..40).map(|row| {
+        let t = f64::from(row) * 0.02;
+        let counts = (400.0 * (3.0 * t).sin()).round();
+        format!("{t},{},{},{}\n", 0.6 * (3.0 * t).sin(), counts * 0.0015, (counts / 40.0).abs().round() * 0.02)
+    });
+    let csv = format!("t,q_cmd_elbow,q_elbow,current_abs_elbow\n{}", rows.collect::<String>());
+    let meta = r#"{"rate_hz": 50, "tau_sensor": "none", "segments": [{"name": "sine", "base": "fixed"}],
+        "base_quat": [0.8, 0.6, 0, 0]}"#;
+    let log = Log::open(folder(&csv, meta).path()).expect("a log");
+    assert_eq!((log.kp("elbow", 0), log.gains("elbow")), (None, [None, None]));
+    assert_eq!(log.meta().base_quat, Some([0.8, 0.6, 0.0, 0.0]));
+    let text = log.describe().to_string();
+    assert!(text.contains("current_abs    1 column, in steps of 0.0200"), "{text}");
+    assert!(text.contains("kp             unknown: `identify` estimates it"), "{text}");
+    let folder = tempfile::tempdir().expect("a folder");
+    let error = log.write(folder.path().join("arm.mcap")).expect_err("no gains").to_string();
+    assert!(
+        error.contains("the gains of the joint `elbow` are unknown") || error.contains("no joint `elbow`"),
+        "{error}"
+    );
+}
+
+#[test]
+fn joint_names_of_the_robot_file_of_a_go2_are_read_as_its_joints() {
+    for name in ["FL_hip_joint", "fl_hip"] {
+        let log = Log::open(folder(&CSV.replace("FL_hip", name), META).path()).expect("a log");
+        assert_eq!(log.q("FL_hip"), Log::open(folder(CSV, META).path()).expect("a log").q("FL_hip"));
+        assert!(log.read_warnings()[0].contains("is read as"), "{:?}", log.read_warnings());
+    }
+}

@@ -1,0 +1,385 @@
+//! Model file of a robot of any tree: a robot file, its gains, and effects at its joints.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
+use twinstep_model::{JointModel, RobotTree, TreeModel, go2};
+use twinstep_robot_files::read_robot;
+
+use super::effect_table::{EffectTable, key_error, read_table, write_table};
+use super::error::{EffectEntryError, ModelFileError};
+use crate::nominal::{BUILT_IN, NominalRobotError, is_robot_file};
+use crate::{Apply, CATALOGUE, Effect};
+
+/// A robot of any tree, and the effects at its joints.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TreeModelFile {
+    /// Value of `robot`: `go2`, or the absolute path of a robot file.
+    pub robot: String,
+    /// The robot without effects, with the names of [`TreeModelFile::rename`].
+    pub nominal: TreeModel,
+    /// Names for joints of the robot file, such as those of a log. By the name in the robot file.
+    pub rename: BTreeMap<String, String>,
+    /// Position gain of each joint [N·m/rad]; `None` if it is unknown.
+    pub kp: Option<NominalGain>,
+    /// Velocity gain of each joint [N·m·s/rad].
+    pub kd: Option<NominalGain>,
+    /// Rate of the actuators [Hz]; `None` for that of the log.
+    pub actuator_hz: Option<f64>,
+    /// Effects, in the order of the file.
+    pub effects: Vec<JointEffect>,
+}
+
+/// A gain for all joints, or one for each.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged, expecting = "a number, or a table with a number for each joint, such as { elbow = 20.0 }")]
+pub enum NominalGain {
+    /// One gain for all joints.
+    All(f64),
+    /// Gains by joint.
+    PerJoint(BTreeMap<String, f64>),
+}
+
+impl NominalGain {
+    /// Returns the gain of a joint; `None` if it is unknown.
+    pub fn of(&self, joint: &str) -> Option<f64> {
+        match self {
+            Self::All(gain) => Some(*gain),
+            Self::PerJoint(gains) => gains.get(joint).copied(),
+        }
+    }
+}
+
+/// Effect at joints, with its values.
+#[derive(Clone, Debug, PartialEq)]
+pub struct JointEffect {
+    /// The effect.
+    pub effect: &'static Effect,
+    /// The joints.
+    pub scope: JointScope,
+    /// Values of all parameters, in the order of the effect's parameters.
+    pub values: Vec<f64>,
+    /// 95 % interval of each value, low and high; `None` if it was not measured.
+    pub intervals: Vec<Option<[f64; 2]>>,
+}
+
+/// Joints of a robot of any tree.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum JointScope {
+    /// All joints.
+    All,
+    /// The joint with this name.
+    Joint(String),
+}
+
+impl fmt::Display for JointScope {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::All => f.write_str("all"),
+            Self::Joint(name) => f.write_str(name),
+        }
+    }
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct TreeText {
+    robot: String,
+    #[serde(default, skip_serializing_if = "is_default")]
+    control: Control,
+    #[serde(default, skip_serializing_if = "is_default")]
+    joints: Joints,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    effect: Vec<Table>,
+}
+
+fn is_default<T: Default + PartialEq>(table: &T) -> bool {
+    *table == T::default()
+}
+
+#[derive(Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Control {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    kp: Option<NominalGain>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    kd: Option<NominalGain>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    actuator_hz: Option<f64>,
+}
+
+#[derive(Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Joints {
+    #[serde(default)]
+    rename: BTreeMap<String, String>,
+}
+
+impl TreeModelFile {
+    /// Returns the ideal Go2, whose gains are unknown.
+    pub fn go2() -> Self {
+        let nominal = TreeModel::new(RobotTree::from(&go2())).expect("its forces are the same in both directions");
+        Self::ideal(BUILT_IN, nominal)
+    }
+
+    fn ideal(robot: &str, nominal: TreeModel) -> Self {
+        let (robot, rename, effects) = (robot.to_owned(), BTreeMap::new(), Vec::new());
+        Self { robot, nominal, rename, kp: None, kd: None, actuator_hz: None, effects }
+    }
+
+    /// Returns true if a text has keys that only the model file of a tree has: names of joints, or gains by joint.
+    pub fn is_meant(text: &str) -> bool {
+        let Ok(table) = text.parse::<Table>() else { return false };
+        let is_table =
+            |name: &str, key: &str| table.get(name).and_then(|table| table.get(key)).is_some_and(Value::is_table);
+        is_table("joints", "rename") || is_table("control", "kp") || is_table("control", "kd")
+    }
+
+    /// Reads a model file, or a robot file (URDF, MJCF) as a model without effects. Paths in it become absolute.
+    pub fn load(path: impl AsRef<Path>) -> Result<Self, ModelFileError> {
+        let path = path.as_ref();
+        if is_robot_file(path) {
+            return Self::parse(&format!("robot = {}", Value::from(path.display().to_string())), "`--model`");
+        }
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| ModelFileError::Unreadable { path: path.to_owned(), source })?;
+        Self::parse_in(path.parent().unwrap_or(Path::new("")), &text, &path.display().to_string())
+    }
+
+    /// Parses the text of a model file. Errors use `name` for the file. Paths are relative to the working directory.
+    pub fn parse(text: &str, name: &str) -> Result<Self, ModelFileError> {
+        Self::parse_in(Path::new(""), text, name)
+    }
+
+    fn parse_in(folder: &Path, text: &str, name: &str) -> Result<Self, ModelFileError> {
+        let malformed = |message: String| ModelFileError::Malformed { name: name.to_owned(), message };
+        let TreeText { robot, control, joints, effect } =
+            toml::from_str(text).map_err(|error| malformed(error.to_string()))?;
+        let mut file = if robot == BUILT_IN { Self::go2() } else { Self::read_robot_file(&robot, folder, name)? };
+        file.rename_joints(joints.rename).map_err(malformed)?;
+        let Control { kp, kd, actuator_hz } = control;
+        for (key, gain) in [("kp", &kp), ("kd", &kd)] {
+            file.check_gain(key, gain.as_ref()).map_err(malformed)?;
+        }
+        if let Some(rate) = actuator_hz.filter(|rate| !(20.0..=2000.0).contains(rate)) {
+            return Err(malformed(format!("`control.actuator_hz` is {rate}; 20 to 2000 Hz expected")));
+        }
+        (file.kp, file.kd, file.actuator_hz) = (kp, kd, actuator_hz);
+        for (index, table) in effect.iter().enumerate() {
+            let refused = |problem| ModelFileError::Effect { name: name.to_owned(), number: index + 1, problem };
+            let entry = file.read_effect(table).map_err(refused)?;
+            file.effects.push(entry);
+        }
+        file.tree_model().map_err(malformed)?;
+        Ok(file)
+    }
+
+    fn read_robot_file(robot: &str, folder: &Path, name: &str) -> Result<Self, ModelFileError> {
+        let refused = |cause| ModelFileError::Robot { name: name.to_owned(), cause: Box::new(cause) };
+        if !is_robot_file(Path::new(robot)) {
+            return Err(refused(NominalRobotError::Unknown { robot: robot.to_owned() }));
+        }
+        let path = folder.join(robot);
+        let path = std::path::absolute(&path).unwrap_or(path);
+        let text = std::fs::read_to_string(&path)
+            .map_err(|source| refused(NominalRobotError::Unreadable { path: path.clone(), source }))?;
+        let file = read_robot(&text, path.parent())
+            .map_err(|cause| refused(NominalRobotError::Import { path: path.clone(), cause }))?;
+        for note in file.notes {
+            tracing::warn!("{}: {note}", path.display());
+        }
+        let nominal = TreeModel::new(file.tree).map_err(|cause| ModelFileError::Malformed {
+            name: path.display().to_string(),
+            message: cause.to_string(),
+        })?;
+        Ok(Self::ideal(&path.display().to_string(), nominal))
+    }
+
+    fn rename_joints(&mut self, rename: BTreeMap<String, String>) -> Result<(), String> {
+        let joints = &mut self.nominal.tree.joints;
+        for (old, new) in &rename {
+            let names = joints.iter().map(|joint| joint.name.as_str()).collect::<Vec<_>>().join(", ");
+            let found = joints.iter_mut().find(|joint| joint.name == *old);
+            found
+                .ok_or_else(|| format!("`joints.rename`: the robot has no joint `{old}`; its joints are {names}"))?
+                .name = new.clone();
+        }
+        let mut seen = BTreeSet::new();
+        if let Some(twice) = joints.iter().find(|joint| !seen.insert(&joint.name)) {
+            return Err(format!("`joints.rename`: two joints are named `{}`", twice.name));
+        }
+        self.rename = rename;
+        Ok(())
+    }
+
+    fn check_gain(&self, key: &str, gain: Option<&NominalGain>) -> Result<(), String> {
+        let values = match gain {
+            None => return Ok(()),
+            Some(NominalGain::All(value)) => vec![*value],
+            Some(NominalGain::PerJoint(gains)) => {
+                if let Some(joint) = gains.keys().find(|joint| self.nominal.tree.joint(joint).is_none()) {
+                    return Err(format!("`control.{key}`: the robot has no joint `{joint}`; {}", self.joints_are()));
+                }
+                gains.values().copied().collect()
+            }
+        };
+        match values.into_iter().find(|value| !(value.is_finite() && *value >= 0.0)) {
+            Some(value) => Err(format!("`control.{key}` is {value}; finite and not negative expected")),
+            None => Ok(()),
+        }
+    }
+
+    fn joints_are(&self) -> String {
+        let names: Vec<_> = self.nominal.tree.joints.iter().map(|joint| joint.name.as_str()).collect();
+        format!("its joints are {}", names.join(", "))
+    }
+
+    fn read_effect(&self, table: &Table) -> Result<JointEffect, EffectEntryError> {
+        let EffectTable { effect, scope, values, intervals } = read_table(table)?;
+        if let Apply::Robot(_) = effect.apply {
+            let of_joints = CATALOGUE.iter().filter(|effect| matches!(effect.apply, Apply::Joint(_)));
+            let names: Vec<_> = of_joints.map(|effect| effect.name).collect();
+            let expected = format!("an effect of joints, because the robot is not like the Go2: {}", names.join(", "));
+            return Err(key_error("name", table.get("name"), &expected));
+        }
+        let scope = self.scope(&scope).map_err(|expected| key_error("scope", table.get("scope"), &expected))?;
+        Ok(JointEffect { effect, scope, values, intervals })
+    }
+
+    /// Returns the scope of this name, or what is expected.
+    pub fn scope(&self, name: &str) -> Result<JointScope, String> {
+        match name {
+            "all" => Ok(JointScope::All),
+            joint if self.nominal.tree.joint(joint).is_some() => Ok(JointScope::Joint(joint.to_owned())),
+            _ => Err(format!("all, or a joint; {}", self.joints_are())),
+        }
+    }
+
+    /// Returns the robot with all effects applied, those of all joints before those of one. Fails with the reason if a joint is impossible.
+    pub fn tree_model(&self) -> Result<TreeModel, String> {
+        let mut robot = self.nominal.clone();
+        let (wide, narrow): (Vec<_>, Vec<_>) = self.effects.iter().partition(|entry| entry.scope == JointScope::All);
+        for entry in wide.into_iter().chain(narrow) {
+            let Apply::Joint(change) = entry.effect.apply else { continue };
+            for (joint, tree) in robot.joints.iter_mut().zip(&robot.tree.joints) {
+                if entry.scope != JointScope::All && entry.scope != JointScope::Joint(tree.name.clone()) {
+                    continue;
+                }
+                let problem = change(joint, &entry.values).err().or_else(|| impossible(joint));
+                if let Some(problem) = problem {
+                    return Err(format!(
+                        "`{}` on {}: {problem} of joint `{}`",
+                        entry.effect.name, entry.scope, tree.name
+                    ));
+                }
+            }
+        }
+        Ok(robot)
+    }
+
+    /// Returns the text of the file. [`TreeModelFile::parse`] reads exactly the same model from it.
+    pub fn to_toml(&self) -> String {
+        let TreeModelFile { robot, rename, kp, kd, actuator_hz, .. } = self.clone();
+        let head =
+            TreeText { robot, control: Control { kp, kd, actuator_hz }, joints: Joints { rename }, effect: Vec::new() };
+        let mut text = toml::to_string(&head).expect("numbers by names");
+        for JointEffect { effect, scope, values, intervals } in &self.effects {
+            let (scope, values, intervals) = (scope.to_string(), values.clone(), intervals.clone());
+            write_table(&mut text, &EffectTable { effect, scope, values, intervals });
+        }
+        text
+    }
+}
+
+/// Returns which number of a joint is impossible, or `None` if none is.
+fn impossible(joint: &JointModel) -> Option<&'static str> {
+    let actuator = &joint.actuator;
+    let numbers = [
+        ("a negative rotor inertia", joint.armature),
+        ("a negative viscous friction", joint.viscous_friction),
+        ("a negative Coulomb friction", joint.coulomb_friction),
+        ("a negative Stribeck friction", joint.stribeck_friction.breakaway_torque),
+        ("a negative load friction", joint.load_friction),
+        ("a negative delay of the command", actuator.command_delay),
+        ("a negative delay of the torque", actuator.torque_delay),
+        ("a negative delay of the torque sensor", actuator.sensor_delay),
+        ("a negative factor of the position gain", actuator.kp_scale),
+        ("a negative factor of the velocity gain", actuator.kd_scale),
+        ("a negative time constant", actuator.torque_time_constant),
+        ("a negative backlash", actuator.backlash),
+        ("a negative dead zone", actuator.dead_zone),
+    ];
+    let wrong = numbers.into_iter().find(|(_, value)| value.is_nan() || *value < 0.0).map(|(what, _)| what);
+    let moved = actuator.backlash > 0.0 || actuator.gear_stiffness.is_finite();
+    wrong.or_else(|| (moved && joint.armature <= 0.0).then_some("backlash or gear elasticity without rotor inertia"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ARM: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../data/robots/so101.xml");
+
+    fn read(more: &str) -> Result<TreeModelFile, ModelFileError> {
+        TreeModelFile::parse(&format!("robot = {}\n{more}", Value::from(ARM)), "arm.toml")
+    }
+
+    fn refusal(more: &str) -> String {
+        read(more).expect_err("refused").to_string()
+    }
+
+    #[test]
+    fn effect_of_one_joint_adds_to_that_of_all_and_to_the_robot_file() {
+        let effect = |scope: &str, torque: f64| {
+            format!("[[effect]]\nname = \"coulomb_friction\"\nscope = \"{scope}\"\ntorque_nm = {torque}\n")
+        };
+        let file = read(&(effect("elbow_flex", 0.2) + &effect("all", 0.1))).expect("valid");
+        let robot = file.tree_model().expect("possible");
+        let friction: Vec<f64> = robot.joints.iter().map(|joint| joint.coulomb_friction).collect();
+        assert!((friction[1] - 0.152).abs() < 1e-12 && (friction[2] - 0.352).abs() < 1e-12, "{friction:?}");
+        // The robot file has 0.052 N·m, of which an effect may take away.
+        read(&effect("all", -0.05)).expect("valid");
+        let error = refusal(&effect("all", -0.06));
+        assert!(error.contains("a negative Coulomb friction of joint `shoulder_pan`"), "{error}");
+    }
+
+    #[test]
+    fn file_is_read_back_as_it_was_written() {
+        let file = read(
+            "[control]\nactuator_hz = 500\nkd = 1.5\n[control.kp]\nElbow = 20.0\n\
+             [joints.rename]\nelbow_flex = \"Elbow\"\n\
+             [[effect]]\nname = \"pd_gain\"\nscope = \"Elbow\"\nkp_scale = 1.5\nkd_scale = 1.0\n\
+             interval = { kp_scale = [1.2, 1.8] }\n",
+        )
+        .expect("valid");
+        assert_eq!(file.kp.as_ref().map(|kp| [kp.of("Elbow"), kp.of("gripper")]), Some([Some(20.0), None]));
+        assert_eq!(TreeModelFile::parse(&file.to_toml(), "again").expect("valid"), file, "{}", file.to_toml());
+        let plain = read("").expect("valid");
+        assert_eq!(TreeModelFile::parse(&plain.to_toml(), "again").expect("valid"), plain);
+    }
+
+    #[test]
+    fn refusals_name_what_is_wrong_and_what_is_possible() {
+        let joints = "shoulder_pan, shoulder_lift, elbow_flex, wrist_flex, wrist_roll, gripper";
+        let error = refusal("[joints.rename]\nelbow = \"Elbow\"\n");
+        assert_eq!(
+            error,
+            format!("arm.toml: `joints.rename`: the robot has no joint `elbow`; its joints are {joints}")
+        );
+        let error = refusal("[joints.rename]\nelbow_flex = \"gripper\"\n");
+        assert!(error.contains("two joints are named `gripper`"), "{error}");
+        let error = refusal("[control]\nkp = -1\n");
+        assert!(error.contains("`control.kp` is -1; finite and not negative expected"), "{error}");
+        let error = refusal("[control.kd]\nelbow = 1\n");
+        assert!(error.contains("`control.kd`: the robot has no joint `elbow`"), "{error}");
+        let error = refusal("[control]\nactuator_hz = 5\n");
+        assert!(error.contains("`control.actuator_hz` is 5; 20 to 2000 Hz expected"), "{error}");
+        let error = refusal("[[effect]]\nname = \"payload\"\nscope = \"base\"\nmass_kg = 1\nposition_m = [0, 0, 0]\n");
+        assert!(error.contains("an effect of joints, because the robot is not like the Go2"), "{error}");
+        let error = refusal("[[effect]]\nname = \"backlash\"\nscope = \"calf\"\ngap_rad = 0.1\n");
+        assert!(error.contains("`scope` is \"calf\"; expected all, or a joint"), "{error}");
+    }
+}

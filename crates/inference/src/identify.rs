@@ -1,0 +1,161 @@
+//! Identification: estimates with intervals and correlations.
+
+use nalgebra::DMatrix;
+use twinstep_effects::TreeModelFile;
+
+use crate::fit::FitProblem;
+use crate::parameter::write_estimates;
+use crate::{Candidate, FreeParameter, InferenceError, JointLog, ParameterRequest, Quantity, WindowLength, windows};
+
+/// Half width of a 95 % interval [standard deviations].
+const INTERVAL: f64 = 1.96;
+/// Absolute correlation above which a pair of estimates is reported.
+const HIGH_CORRELATION: f64 = 0.95;
+/// Posterior standard deviation above which the log says little about a parameter [prior std].
+const WIDE: f64 = 0.7;
+/// Number of times that the noise is estimated.
+const ROUNDS: usize = 4;
+/// Largest number of steps of the fit in each round.
+const STEPS: usize = 15;
+/// Coordinates of unknown gains and of delays from which the fit starts [prior std]: a loop has local minima in both.
+const GAIN_STARTS: [f64; 3] = [0.0, 0.8, -0.8];
+const DELAY_STARTS: [f64; 3] = [-0.8, 0.2, 1.1];
+/// Number of windows on which the starts compete, and number of their steps.
+const START_WINDOWS: usize = 8;
+const START_STEPS: usize = 6;
+
+/// Options of an identification.
+#[derive(Clone, Debug)]
+pub struct IdentifyOptions {
+    /// What is estimated, in addition to unknown gains.
+    pub requests: Vec<ParameterRequest>,
+    /// Rate of the actuators [Hz].
+    pub actuator_hz: f64,
+}
+
+/// Estimate of one parameter.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Estimate {
+    /// The parameter.
+    pub parameter: FreeParameter,
+    /// Its value; the gain itself for a gain.
+    pub value: f64,
+    /// 95 % interval.
+    pub interval: [f64; 2],
+    /// True if the log says little: the interval is nearly that of the prior.
+    pub is_wide: bool,
+}
+
+/// Result of an identification.
+#[derive(Clone, Debug)]
+pub struct Identification {
+    /// The model with the estimates.
+    pub model: TreeModelFile,
+    /// Estimate of each parameter.
+    pub estimates: Vec<Estimate>,
+    /// Pairs of estimates that the log hardly separates: names and correlation.
+    pub correlated: Vec<(String, String, f64)>,
+    /// True if it was interrupted: the estimates are the best so far.
+    pub interrupted: bool,
+}
+
+/// Estimates parameters from a log. `progress` receives round (0: the start is chosen), number of rounds and cost, and returns false to
+/// interrupt.
+pub fn identify(
+    file: &TreeModelFile,
+    log: &JointLog,
+    options: &IdentifyOptions,
+    progress: &mut dyn FnMut(usize, usize, f64) -> bool,
+) -> Result<Identification, InferenceError> {
+    let given = Candidate::of(file)?;
+    let joints: Vec<usize> = log.joints.iter().map(|joint| joint.joint).collect();
+    let states_gains = !log.has_unknown_gains();
+    let parameters = FreeParameter::of(&options.requests, file, &joints, states_gains)?;
+    let windows = windows(log, &given.robot.tree, WindowLength::IDENTIFICATION);
+    let mut problem = FitProblem::new(log, &windows, &parameters, &given, options.actuator_hz);
+    let mut interrupted = false;
+    let few: Vec<_> = windows.iter().step_by(windows.len().div_ceil(START_WINDOWS)).cloned().collect();
+    let of_few = FitProblem::new(log, &few, &parameters, &given, options.actuator_hz);
+    let mut point = start(&of_few, &parameters, &given, |cost| {
+        interrupted |= !progress(0, ROUNDS, cost);
+        !interrupted
+    })?;
+    for round in 0..ROUNDS {
+        let each = |cost| {
+            interrupted |= !progress(round + 1, ROUNDS, cost);
+            !interrupted
+        };
+        point = problem.minimise(point, STEPS, each)?;
+        if interrupted {
+            break;
+        }
+        problem.estimate_noise(&point)?;
+    }
+    let (count, covariance) = (parameters.len(), problem.covariance(&point)?);
+    let interval = |index: usize| {
+        let half = INTERVAL * covariance[(index, index)].sqrt();
+        [point[index] - half, point[index] + half].map(|end| parameters[index].value(end))
+    };
+    let values: Vec<_> = (0..count).map(|index| (parameters[index].value(point[index]), interval(index))).collect();
+    let estimate = |(index, parameter): (usize, &FreeParameter)| {
+        let reported = |value| given.reported(parameter, value);
+        let (value, interval) = values[index];
+        let is_wide = covariance[(index, index)].sqrt() > WIDE;
+        Estimate { parameter: parameter.clone(), value: reported(value), interval: interval.map(reported), is_wide }
+    };
+    let estimates = parameters.iter().enumerate().map(estimate).collect();
+    let mut model = file.clone();
+    write_estimates(&mut model, &given, &parameters, &values, states_gains);
+    Ok(Identification { model, estimates, correlated: correlated(&parameters, &covariance), interrupted })
+}
+
+/// Returns the best point of short fits: from the given model, and from other gains and delays.
+fn start(
+    problem: &FitProblem,
+    parameters: &[FreeParameter],
+    given: &Candidate,
+    mut each: impl FnMut(f64) -> bool,
+) -> Result<Vec<f64>, InferenceError> {
+    let own = |parameter: &FreeParameter| {
+        let value = parameter.quantity.get(&given.robot.joints[parameter.joints[0]]);
+        if value > 0.0 { parameter.coordinate(value) } else { 0.0 }
+    };
+    let with = |gain: f64, delay: f64| {
+        let coordinate = |parameter: &FreeParameter| match parameter.quantity {
+            Quantity::PositionGain | Quantity::VelocityGain => gain,
+            Quantity::CommandDelay => delay,
+            _ => own(parameter),
+        };
+        parameters.iter().map(coordinate).collect::<Vec<_>>()
+    };
+    let mut starts = vec![vec![parameters.iter().map(own).collect()]];
+    starts.extend(DELAY_STARTS.map(|delay| GAIN_STARTS.map(|gain| with(gain, delay)).to_vec()));
+    let mut best = (f64::INFINITY, Vec::new());
+    for alike in starts {
+        let costs = problem.costs(&alike)?;
+        let least = (0..alike.len()).min_by(|one, other| costs[*one].total_cmp(&costs[*other])).unwrap_or(0);
+        if costs[least].is_infinite() {
+            continue;
+        }
+        let point = problem.minimise(alike[least].clone(), START_STEPS, &mut each)?;
+        let cost = problem.costs(std::slice::from_ref(&point))?[0];
+        if cost < best.0 {
+            best = (cost, point);
+        }
+    }
+    if best.0.is_finite() { Ok(best.1) } else { Err(InferenceError::Diverges) }
+}
+
+fn correlated(parameters: &[FreeParameter], covariance: &DMatrix<f64>) -> Vec<(String, String, f64)> {
+    let mut pairs = Vec::new();
+    for one in 0..parameters.len() {
+        for other in one + 1..parameters.len() {
+            let product = covariance[(one, one)] * covariance[(other, other)];
+            let correlation = covariance[(one, other)] / product.sqrt();
+            if correlation.abs() > HIGH_CORRELATION {
+                pairs.push((parameters[one].name(), parameters[other].name(), correlation));
+            }
+        }
+    }
+    pairs
+}

@@ -1,0 +1,179 @@
+//! Logs of robots of any tree: an arm whose gains nobody recorded is evaluated and identified.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::{Command as Process, Output};
+
+use twinstep_effects::TreeModelFile;
+use twinstep_inference::{Candidate, IdentifyOptions, JointLog, ParameterRequest, evaluate, identify};
+use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+use twinstep_model::{BaseMount, TreeModel};
+use twinstep_sim::{Placement, SimConfig, SimdPrecision, TreeCommand, TreeSimulation};
+use twinstep_tests::python::{Programs, root};
+
+const RATE_HZ: f64 = 100.0;
+/// Hidden numbers of every joint of the arm.
+const KP: f64 = 20.0;
+const KD: f64 = 0.6;
+const DELAY_S: f64 = 0.033;
+/// Turn of the base about x: the arm hangs on a wall.
+const WALL: [f64; 4] = [std::f64::consts::FRAC_1_SQRT_2, std::f64::consts::FRAC_1_SQRT_2, 0.0, 0.0];
+
+fn arm() -> TreeModelFile {
+    TreeModelFile::load(root().join("data/robots/so101.xml")).unwrap()
+}
+
+/// Returns the arm with its hidden numbers.
+fn hidden() -> TreeModel {
+    let mut robot = arm().nominal;
+    for (index, joint) in robot.joints.iter_mut().enumerate() {
+        joint.armature = 0.02 + 0.004 * index as f64;
+        joint.viscous_friction = 0.3;
+        joint.coulomb_friction = 0.15 - 0.02 * index as f64;
+        joint.actuator.command_delay = DELAY_S;
+    }
+    robot
+}
+
+/// Middle of the motion of a joint [rad]. The gripper does not reach its limit.
+fn middle(joint: usize) -> f64 {
+    if joint == 5 { 0.8 } else { 0.0 }
+}
+
+/// Returns the command of a joint at a time: sines, and a step every two seconds, because slow motion does not show a delay.
+fn command(joint: usize, t: f64) -> f64 {
+    let step = if (t / 2.0).floor() % 2.0 == 0.0 { 0.15 } else { -0.15 };
+    middle(joint) + 0.35 * ((2.0 + 0.7 * joint as f64) * t).sin() + 0.15 * ((7.0 + joint as f64) * t).sin() + step
+}
+
+/// Returns a log of positions alone, in steps of an encoder of 12 bits. The actuator of the simulation delays the commands.
+fn log(seconds: f64) -> Log {
+    let robot = hidden();
+    let config = SimConfig { base: BaseMount::Fixed, threads: 1, ..SimConfig::default() };
+    let start = Placement { base_orientation: WALL, ..Placement::at_rest(0.0, (0..6).map(middle).collect()) };
+    let mut arm = TreeSimulation::with_precision(&robot, &config, 1000.0, SimdPrecision::Double, 1, &start).unwrap();
+    let rows = (seconds * RATE_HZ) as usize;
+    let mut columns: BTreeMap<String, Vec<f64>> = BTreeMap::new();
+    for row in 0..rows {
+        let t = row as f64 / RATE_HZ;
+        let q_cmd: Vec<f64> = (0..6).map(|joint| command(joint, t)).collect();
+        columns.entry("t".to_owned()).or_default().push(t);
+        for (joint, tree) in robot.tree.joints.iter().enumerate() {
+            let encoder = std::f64::consts::TAU / 4096.0;
+            let q = (arm.states()[0].state.q[joint] / encoder).round() * encoder;
+            columns.entry(format!("q_{}", tree.name)).or_default().push(q);
+            columns.entry(format!("q_cmd_{}", tree.name)).or_default().push(q_cmd[joint]);
+        }
+        let command = TreeCommand::hold(q_cmd.iter().map(|q| *q as f32).collect(), KP as f32, KD as f32);
+        arm.step(&[command], 10).unwrap();
+    }
+    let segments = vec![Segment { name: "sines".to_owned(), base: BaseMount::Fixed }];
+    let meta = Meta { base_quat: Some(WALL), ..Meta::new(RATE_HZ, TorqueSensor::None, segments) };
+    Log::new(meta, columns).unwrap()
+}
+
+#[test]
+fn identification_recovers_gains_delay_friction_and_rotor_of_an_arm_on_a_wall() {
+    let (file, log) = (arm(), log(24.0));
+    let joint_log = JointLog::new(&log, &file.nominal.tree, |_| true).unwrap();
+    assert!(joint_log.has_unknown_gains());
+    let requests = ParameterRequest::DEFAULT.map(|request| ParameterRequest(request.to_owned())).to_vec();
+    let options = IdentifyOptions { requests, actuator_hz: 1000.0 };
+    let found = identify(&file, &joint_log, &options, &mut |_, _, _| true).unwrap();
+    let truth = hidden();
+    let mut covered = 0;
+    for estimate in &found.estimates {
+        let joint = estimate.parameter.joints[0];
+        let expected = match estimate.parameter.name().as_str() {
+            name if name.contains(".kp") => KP,
+            name if name.contains(".kd") => KD,
+            _ => estimate.parameter.quantity.get(&truth.joints[joint]),
+        };
+        let [low, high] = estimate.interval;
+        covered += usize::from((low..=high).contains(&expected));
+        assert!(expected > 0.5 * low && expected < 2.0 * high, "{estimate:?}, {expected}");
+    }
+    // At one gain and without commanded velocities, kd and viscous friction are one number: only their sum is known.
+    let pairs: Vec<_> = found.correlated.iter().map(|(one, other, _)| (one.as_str(), other.as_str())).collect();
+    assert!(pairs.contains(&("viscous_friction@elbow_flex", "pd_gain@elbow_flex.kd")), "{pairs:?}");
+    assert!(covered * 10 >= found.estimates.len() * 8, "{covered} of {}", found.estimates.len());
+    let delay = found.estimates.iter().find(|estimate| estimate.parameter.name() == "command_delay@all").unwrap();
+    assert!((delay.value - DELAY_S).abs() < 0.003, "{delay:?}");
+    let error = |file: &TreeModelFile| {
+        evaluate(&joint_log, &Candidate::of(file).unwrap(), 1000.0).unwrap().0.q_rmse_rad.unwrap()
+    };
+    let (before, after) = (error(&file), error(&found.model));
+    assert!(before > 0.02 && after < 0.002, "{before} -> {after} rad");
+}
+
+#[test]
+fn tilt_of_the_base_matters() {
+    let file = TreeModelFile {
+        kp: Some(twinstep_effects::NominalGain::All(KP)),
+        kd: Some(twinstep_effects::NominalGain::All(KD)),
+        ..arm()
+    };
+    let log = log(4.0);
+    let mut candidate = Candidate::of(&file).unwrap();
+    candidate.robot = hidden();
+    let mut joint_log = JointLog::new(&log, &file.nominal.tree, |_| true).unwrap();
+    let error = |log: &JointLog| evaluate(log, &candidate, 1000.0).unwrap().0.q_rmse_rad.unwrap();
+    // Half a step of the encoder, and nothing else: the shifted commands are those that the actuator delays.
+    let on_the_wall = error(&joint_log);
+    assert!(on_the_wall < 0.001, "{on_the_wall} rad");
+    joint_log.selected[0].base_orientation = None;
+    assert!(error(&joint_log) > 5.0 * on_the_wall, "{} rad", error(&joint_log));
+}
+
+fn twinstep(args: &[&str], folder: &Path) -> Output {
+    let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
+    Process::new(programs.twinstep()).args(args).current_dir(folder).output().unwrap()
+}
+
+#[test]
+fn program_identifies_an_arm_and_evaluates_it_on_other_rows() {
+    let folder = tempfile::tempdir().unwrap();
+    log(12.0).write(folder.path().join("arm")).unwrap();
+    let robot = root().join("data/robots/so101.xml");
+    let model = "[joints.rename]\nshoulder_pan = \"pan\"\n";
+    std::fs::write(folder.path().join("renamed.toml"), format!("robot = {:?}\n{model}", robot.display().to_string()))
+        .unwrap();
+    let robot = robot.to_str().unwrap();
+    let run = |args: &[&str]| {
+        let output = twinstep(args, folder.path());
+        (output.status.code(), String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap())
+    };
+    let q_rmse = |model: &str| {
+        let (code, out, error) = run(&["evaluate", "arm", "--model", model, "--from", "8", "--json"]);
+        assert_eq!(code, Some(0), "{error}");
+        serde_json::from_str::<serde_json::Value>(&out).unwrap()["q_rmse_rad"].as_f64().unwrap()
+    };
+    let effects = "coulomb_friction@each,viscous_friction@each,armature@each,command_delay@all";
+    let (code, out, error) =
+        run(&["identify", "arm", "--model", robot, "--until", "8", "--effects", effects, "--out", "fit.toml"]);
+    assert_eq!(code, Some(0), "{error}");
+    assert!(out.contains("pd_gain@elbow_flex.kp") && out.contains("95 % interval"), "{out}");
+    assert!(error.contains("the log does not state the gains"), "{error}");
+    let (before, after) = (q_rmse(robot), q_rmse("fit.toml"));
+    assert!(after < 0.2 * before, "{before} -> {after} rad on rows that were not fitted");
+
+    let (code, _, error) = run(&["evaluate", "arm", "--model", "renamed.toml"]);
+    assert_eq!(code, Some(2), "{error}");
+    assert!(
+        error.contains("the robot has no joint `shoulder_pan` of the log") && error.contains("[joints.rename]"),
+        "{error}"
+    );
+    let (_, _, error) = run(&["identify", "arm", "--model", robot, "--effects", "backlash@all", "--out", "no.toml"]);
+    assert!(error.contains("`backlash@all` cannot be estimated; possible: pd_gain, armature"), "{error}");
+    let (_, _, error) = run(&["identify", "arm", "--model", robot, "--effects", "armature@knee", "--out", "no.toml"]);
+    assert!(
+        error.contains(
+            "`knee` is not a joint of the robot; possible: all (one value), each, shoulder_pan, shoulder_lift"
+        ),
+        "{error}"
+    );
+    let (_, _, error) = run(&["evaluate", "arm", "--model", robot, "--segment", "chirp"]);
+    assert!(error.contains("the log has no segment `chirp`; its segments are sines"), "{error}");
+    let (_, _, error) = run(&["diagnose", "arm", "--out", "diagnosis"]);
+    assert!(error.contains("has no `kp`") && error.contains("identify"), "{error}");
+}
