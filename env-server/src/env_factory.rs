@@ -50,6 +50,30 @@ pub enum EnvFactoryError {
         /// Why the setting is not compatible, and which value is allowed.
         reason: &'static str,
     },
+    /// A setting is not one of robots of any tree.
+    #[error("`{field}`: {reason}")]
+    NotOfAnyTree {
+        /// The key.
+        field: &'static str,
+        /// What is allowed.
+        reason: &'static str,
+    },
+    /// A joint has no gain.
+    #[error(
+        "the model file states no `{key}` of joint `{joint}`: add `{key} = NUMBER`, or `{key} = {{ {joint} = NUMBER, ... }}`, to \
+         its table `[control]`"
+    )]
+    NoGain {
+        /// `kp` or `kd`.
+        key: &'static str,
+        /// The joint.
+        joint: String,
+    },
+    /// The task is that of another factory.
+    #[error(
+        "the task `pose` is served by `twinstep serve --task pose`, in Rust by `TreeEnvFactory`; it has no other commands yet"
+    )]
+    TaskOfTrees,
     /// Too few samples from the intervals of the model file are valid robots.
     #[error("`randomise.effects`: {0}")]
     Draws(#[from] SamplingError),
@@ -85,6 +109,9 @@ pub struct SimEnvFactory {
 impl SimEnvFactory {
     /// Reads the model file and the actuator network that it names, and checks the simulation settings.
     pub fn new(config: Config) -> Result<Self, EnvFactoryError> {
+        if let TaskConfig::Pose(_) = config.task {
+            return Err(EnvFactoryError::TaskOfTrees);
+        }
         let file = match &config.server.model {
             Some(path) => ModelFile::load(path)?,
             None => ModelFile::default(),
@@ -233,5 +260,6 @@ fn task_env(
             Ok(Box::new(TaskEnv::new(backend, walk, settings)?))
         }
         TaskConfig::Counter => Ok(Box::new(CounterEnv::new(robot, backend.num_robots(), settings.autoreset))),
+        TaskConfig::Pose(_) => Err(EnvFactoryError::TaskOfTrees),
     }
 }

@@ -2,7 +2,8 @@
 //!
 //! - [`Server`]: one run of a server. [`Server::start`] opens Zenoh and answers requests. [`Server::shutdown`] finishes
 //!   the steps in progress and notifies the clients.
-//! - [`EnvFactory`]: builds the environments of a lease. [`SimEnvFactory`] builds simulated ones from a [`Config`].
+//! - [`EnvFactory`]: builds the environments of a lease. [`SimEnvFactory`] builds simulated ones from a [`Config`],
+//!   [`TreeEnvFactory`] those of robots of any tree.
 //! - [`FramePublisher`]: shows the robots to those who only look.
 //! - [`Config`]: the config file with the tables `[server]`, `[task]`, `[sim]` and `[randomise]`.
 //!
@@ -23,9 +24,12 @@ mod protection;
 mod rollout;
 mod server;
 mod stop_listener;
+mod tree_env;
+mod tree_env_factory;
 mod worker;
 
 pub use config::{Config, ConfigFileError, ServerConfig};
 pub use env_factory::{EnvFactory, EnvFactoryError, SimEnvFactory};
 pub use frame_publisher::FramePublisher;
 pub use server::{Server, ServerError};
+pub use tree_env_factory::TreeEnvFactory;

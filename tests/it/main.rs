@@ -7,6 +7,7 @@
 static ALLOCATOR: cap::Cap<std::alloc::System> = cap::Cap::new(std::alloc::System, usize::MAX);
 
 mod any_robot;
+mod any_robot_env;
 mod any_robot_log;
 mod base_estimate;
 mod batch;

@@ -8,20 +8,20 @@ use std::time::{Duration, Instant};
 
 use glam::Quat;
 use indicatif::{ProgressBar, ProgressStyle};
-use twinstep_env_server::{Config, EnvFactory, Server, ServerError, SimEnvFactory};
+use twinstep_env_server::{Config, EnvFactory, Server, ServerConfig, ServerError, SimEnvFactory, TreeEnvFactory};
 use twinstep_envs::TaskConfig;
 use twinstep_model::{AutoresetMode, InitialState, Pose, ResetRequest, RobotModel, Scene};
 use twinstep_sim::{Engine, SimConfig};
 use twinstep_viewer::{Hub, SceneInfo};
 
-use crate::exit::{CommandResult, Signals, input, other};
+use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::frame_feed::FrameFeed;
 use crate::web_view::{ViewArgs, WatchedFactory};
 
 /// Interval at which the server checks for signals.
 const TICK: Duration = Duration::from_millis(50);
 
-/// Serve simulated Go2 environments over Zenoh.
+/// Serve simulated robots over Zenoh: the Go2, quadrupeds like it, and with `--task pose` any arm, quadruped or humanoid.
 ///
 /// Agents lease environments and call `reset` and `step`: from Rust (`twinstep-client`), from Python (`twinstep`) or,
 /// as `protocol/SPEC.md` specifies, from any language with a Zenoh client. Default: it listens on this machine only.
@@ -29,7 +29,8 @@ const TICK: Duration = Duration::from_millis(50);
 ///
 /// When the server is ready, it prints one line to stdout: `listening ENDPOINT`.
 ///
-/// Examples: `twinstep serve --envs 1024` and `twinstep serve --config server.toml --model fitted.toml`
+/// Examples: `twinstep serve --envs 1024`, `twinstep serve --config server.toml --model fitted.toml` and
+/// `twinstep serve --task pose --model data/robots/g1.toml`
 #[derive(clap::Args)]
 pub struct Args {
     /// Config file (TOML) with [server], [task], [sim] and [randomise]. Flags override its values.
@@ -38,7 +39,8 @@ pub struct Args {
     /// Name of the robot, by which clients find the server. Default: go2.
     #[arg(long)]
     name: Option<String>,
-    /// Task: walk, or counter (no physics, to measure the transport). Default: walk.
+    /// Task: walk, track, jump, gait, attitude or explore for quadrupeds like the Go2; pose (its joints follow targets) for any
+    /// robot; counter (no physics, to measure the transport). Default: walk.
     #[arg(long, value_parser = task_name)]
     task: Option<&'static str>,
     /// Maximum number of environments of all clients together. Each client requests its number with its lease.
@@ -97,23 +99,58 @@ pub struct Args {
     until_stdin_closes: bool,
 }
 
+/// The page shows quadrupeds like the Go2 only.
+#[derive(Debug, thiserror::Error)]
+#[error("`--view`: robots of the task `pose` cannot be shown yet; leave it out")]
+struct NotShown;
+
 /// Serves until a signal or, with `--until-stdin-closes`, the end of stdin.
 pub fn run(args: &Args) -> CommandResult {
     // The parent may end at any time from now on.
     let is_orphan = args.until_stdin_closes.then(OrphanCheck::new);
     let config = args.config()?;
     let signals = Signals::listen_unhurried()?;
+    if let TaskConfig::Pose(_) = config.task {
+        if args.view.is_wanted() {
+            return Err(input(NotShown));
+        }
+        let factory = TreeEnvFactory::new(&config).map_err(input)?;
+        let name = config.server.name_of(factory.robot_name());
+        let server = start(&config.server, Arc::new(factory))?;
+        let outcome = serve(args, &config, &name, &server, &signals, is_orphan.as_ref());
+        server.shutdown();
+        return outcome;
+    }
     let factory = SimEnvFactory::new(config.clone()).map_err(input)?;
     let name = config.server.name_of(&factory.robot().name);
     let hub = Arc::new(Hub::new(scene(&config, factory.robot())));
     let _page = args.view.serve(&hub)?;
     let factory = WatchedFactory { factory, hub: Arc::clone(&hub) };
-    let server = Server::start(&config.server, Arc::new(factory)).map_err(|error| match error {
+    let server = start(&config.server, Arc::new(factory))?;
+    let feed = FrameFeed::start(server.frame_publisher().map_err(other)?, hub)?;
+    let outcome = serve(args, &config, &name, &server, &signals, is_orphan.as_ref());
+    feed.stop();
+    server.shutdown();
+    outcome
+}
+
+fn start(config: &ServerConfig, factory: Arc<dyn EnvFactory>) -> Result<Server, Failure> {
+    Server::start(config, factory).map_err(|error| match error {
         ServerError::ZenohConfig { .. } | ServerError::Setting { .. } | ServerError::Host(_) => input(error),
         _ => other(error),
-    })?;
-    let feed = FrameFeed::start(server.frame_publisher().map_err(other)?, hub)?;
-    let endpoint = listening_endpoint(&server, &config);
+    })
+}
+
+/// Says where the server listens, and waits until it has to stop.
+fn serve(
+    args: &Args,
+    config: &Config,
+    name: &str,
+    server: &Server,
+    signals: &Signals,
+    is_orphan: Option<&OrphanCheck>,
+) -> CommandResult {
+    let endpoint = listening_endpoint(server, config);
     println!("listening {endpoint}");
     std::io::stdout().flush().map_err(other)?;
     eprintln!(
@@ -124,12 +161,7 @@ pub fn run(args: &Args) -> CommandResult {
         server.sid()
     );
     let stdin_closed = if args.until_stdin_closes { watch_stdin() } else { Arc::default() };
-    let outcome = watch(&server, &signals, &|| {
-        stdin_closed.load(Ordering::Acquire) || is_orphan.as_ref().is_some_and(OrphanCheck::is_orphan)
-    });
-    feed.stop();
-    server.shutdown();
-    outcome
+    watch(server, signals, &|| stdin_closed.load(Ordering::Acquire) || is_orphan.is_some_and(OrphanCheck::is_orphan))
 }
 
 /// Returns a robot that stands at the origin, with the reward terms of its task.
@@ -157,7 +189,7 @@ fn reward_terms(config: &Config) -> Option<Vec<String>> {
 }
 
 impl Args {
-    fn config(&self) -> Result<Config, crate::exit::Failure> {
+    fn config(&self) -> Result<Config, Failure> {
         let mut config = match &self.config {
             Some(path) => Config::load(path).map_err(input)?,
             None => Config::default(),

@@ -16,17 +16,14 @@ const ACTUATOR_HZ: f64 = 1000.0;
 pub fn tree_model(path: Option<&Path>, log: &Log) -> Result<Option<TreeModelFile>, Failure> {
     let unknown_gains = check_gains(log).is_err();
     let Some(path) = path else { return Ok(unknown_gains.then(TreeModelFile::go2)) };
-    let is_meant = std::fs::read_to_string(path).is_ok_and(|text| TreeModelFile::is_meant(&text));
-    if unknown_gains || is_meant {
-        return TreeModelFile::load(path).map(Some).map_err(input);
-    }
-    match ModelFile::load(path) {
-        Err(ModelFileError::Robot { cause, .. }) if matches!(*cause, NominalRobotError::Import { .. }) => {
-            TreeModelFile::load(path).map(Some).map_err(input)
-        }
-        // The quadruped's own commands say what is wrong with its file.
-        _ => Ok(None),
-    }
+    let is_tree = unknown_gains
+        || match ModelFile::load(path) {
+            Err(ModelFileError::OfTree { .. }) => true,
+            Err(ModelFileError::Robot { cause, .. }) => matches!(*cause, NominalRobotError::Import { .. }),
+            // The caller says what is wrong with the file of a quadruped.
+            _ => false,
+        };
+    if is_tree { TreeModelFile::load(path).map(Some).map_err(input) } else { Ok(None) }
 }
 
 /// Returns the rate of the actuators [Hz].

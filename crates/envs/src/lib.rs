@@ -36,6 +36,6 @@ pub use randomise::Randomisation;
 pub use task::{RobotView, Step, Task};
 pub use task_env::{TaskEnv, TaskEnvConfig};
 pub use tasks::{
-    Attitude, AttitudeConfig, ExploreConfig, Gait, GaitConfig, GaitTask, Jump, JumpConfig, TaskConfig, Track,
-    TrackConfig, Walk, WalkConfig, roll_and_pitch,
+    Attitude, AttitudeConfig, ControlledRobot, ExploreConfig, Gait, GaitConfig, GaitTask, Jump, JumpConfig, PoseConfig,
+    PoseState, PoseTask, TaskConfig, Track, TrackConfig, TreeView, Walk, WalkConfig, roll_and_pitch,
 };

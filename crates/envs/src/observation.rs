@@ -32,6 +32,7 @@ pub fn base_spec(task: &str, robot: &RobotModel, reward_terms: Vec<String>, max_
         actuator_dt: control.actuator_dt(),
         kp: control.kp,
         kd: control.kd,
+        joint_gains: Vec::new(),
         action_scale: control.action_scale,
         default_pose: control.default_pose.to_vec(),
         reward_terms,

@@ -107,6 +107,7 @@ impl<T: ToyTask> ToyEnv<T> {
             actuator_dt: 0.05,
             kp: 0.0,
             kd: 0.0,
+            joint_gains: Vec::new(),
             action_scale: 1.0,
             default_pose: Vec::new(),
             reward_terms: Vec::new(),

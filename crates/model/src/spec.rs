@@ -53,6 +53,9 @@ pub struct EnvSpec {
     pub kp: f64,
     /// Velocity gain [N·m·s/rad].
     pub kd: f64,
+    /// Position gain [N·m/rad] and velocity gain [N·m·s/rad] of each joint, if they differ. `kp` and `kd` are then those of the first joint.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub joint_gains: Vec<[f64; 2]>,
     /// Joint offset of an action of 1 [rad].
     pub action_scale: f64,
     /// Joint positions to which actions are relative [rad].
@@ -127,9 +130,11 @@ impl EnvSpec {
             fields.iter().map(|field| format!("{}:{}", field.name, field.size)).collect::<Vec<_>>().join(" ")
         };
         let pose = self.default_pose.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
+        let gains = self.joint_gains.iter().map(|[kp, kd]| format!("{kp}:{kd}")).collect::<Vec<_>>().join(" ");
+        let gains = if gains.is_empty() { gains } else { format!("joint_gains {gains}\n") };
         format!(
             "robot {}\nobservation {}\naction {}\njoint_order {}\npolicy_dt {}\nkp {}\nkd {}\naction_scale {}\n\
-             default_pose {pose}\n",
+             default_pose {pose}\n{gains}",
             self.robot,
             layout(&self.observation),
             layout(&self.action),

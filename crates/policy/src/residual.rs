@@ -303,6 +303,7 @@ mod tests {
             actuator_dt: 0.005,
             kp: 30.0,
             kd: 0.75,
+            joint_gains: Vec::new(),
             action_scale: 0.5,
             default_pose: Vec::new(),
             reward_terms: Vec::new(),

@@ -115,6 +115,7 @@ pub fn small_spec() -> EnvSpec {
         actuator_dt: 0.005,
         kp: 20.0,
         kd: 0.5,
+        joint_gains: Vec::new(),
         action_scale: 0.25,
         default_pose: vec![0.1, 0.8],
         reward_terms: vec!["tracking".to_owned(), "torque".to_owned()],

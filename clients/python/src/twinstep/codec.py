@@ -89,6 +89,7 @@ class Spec:
     actuator_dt: float
     kp: float
     kd: float
+    joint_gains: tuple[tuple[float, float], ...]
     action_scale: float
     default_pose: tuple[float, ...]
     reward_terms: tuple[str, ...]
@@ -123,7 +124,11 @@ class Spec:
 def read_spec(message: Mapping[str, Any], spec_hash: str) -> Spec:
     """Read the ``spec`` of a hello or lease reply."""
     try:
-        fields: dict[str, Any] = {"critic_observation": (), **cast(Mapping[str, Any], message["spec"])}
+        fields: dict[str, Any] = {
+            "critic_observation": (),
+            "joint_gains": (),
+            **cast(Mapping[str, Any], message["spec"]),
+        }
         for name in ("observation", "critic_observation", "action"):
             fields[name] = tuple(
                 SpecField(**{key: part[key] for key in ("name", "size", "unit", "low", "high", "description")})
@@ -131,7 +136,8 @@ def read_spec(message: Mapping[str, Any], spec_hash: str) -> Spec:
             )
         for name in ("joint_order", "default_pose", "reward_terms"):
             fields[name] = tuple(fields[name])
+        fields["joint_gains"] = tuple((float(kp), float(kd)) for kp, kd in fields["joint_gains"])
         known = set(Spec.__dataclass_fields__) - {"hash"}
         return Spec(**{name: fields[name] for name in known}, hash=spec_hash)
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise MalformedError(f"the server's spec is invalid: {error}") from error

@@ -32,6 +32,15 @@ pub enum ModelFileError {
         /// What is wrong.
         cause: Box<NominalRobotError>,
     },
+    /// The file describes a robot of any tree, and the caller needs a quadruped like the Go2.
+    #[error(
+        "{name}: this is the model file of a robot of any tree: it has [joints.rename], or gains or a pose by joint. `evaluate`, \
+         `identify` and `serve --task pose` take it; other commands need a quadruped like the Go2"
+    )]
+    OfTree {
+        /// The file, or another source of the text.
+        name: String,
+    },
     /// An entry of `[[effect]]` is wrong.
     #[error("{name}: effect {number}: {problem}")]
     Effect {

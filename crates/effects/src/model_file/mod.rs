@@ -86,6 +86,9 @@ impl ModelFile {
     }
 
     fn parse_in(folder: &Path, text: &str, name: &str) -> Result<Self, ModelFileError> {
+        if TreeModelFile::is_meant(text) {
+            return Err(ModelFileError::OfTree { name: name.to_owned() });
+        }
         let ModelText { robot, control, joints, effect, actuator } = toml::from_str(text)
             .map_err(|error| ModelFileError::Malformed { name: name.to_owned(), message: error.to_string() })?;
         let nominal = NominalRobot::read(&robot, control, joints, folder)

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
-use twinstep_model::{JointModel, RobotTree, TreeModel, go2};
+use twinstep_model::{JointModel, MjcfOptions, TreeModel, go2, mjcf};
 use twinstep_robot_files::read_robot;
 
 use super::effect_table::{EffectTable, key_error, read_table, write_table};
@@ -27,8 +27,14 @@ pub struct TreeModelFile {
     pub kp: Option<NominalGain>,
     /// Velocity gain of each joint [N·m·s/rad].
     pub kd: Option<NominalGain>,
-    /// Rate of the actuators [Hz]; `None` for that of the log.
+    /// Rate of the actuators [Hz]; `None` if the file states none.
     pub actuator_hz: Option<f64>,
+    /// Rate of the policy [Hz], of which that of the actuators is a multiple.
+    pub policy_hz: Option<f64>,
+    /// Joint offset of an action of 1 [rad].
+    pub action_scale: Option<f64>,
+    /// Joint positions to which actions are relative [rad]. Joints that are left out: 0, or the nearest position in their range.
+    pub default_pose: BTreeMap<String, f64>,
     /// Effects, in the order of the file.
     pub effects: Vec<JointEffect>,
 }
@@ -109,6 +115,12 @@ struct Control {
     kd: Option<NominalGain>,
     #[serde(skip_serializing_if = "Option::is_none")]
     actuator_hz: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    policy_hz: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    action_scale: Option<f64>,
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    default_pose: BTreeMap<String, f64>,
 }
 
 #[derive(Default, PartialEq, Serialize, Deserialize)]
@@ -121,13 +133,25 @@ struct Joints {
 impl TreeModelFile {
     /// Returns the ideal Go2, whose gains are unknown.
     pub fn go2() -> Self {
-        let nominal = TreeModel::new(RobotTree::from(&go2())).expect("its forces are the same in both directions");
+        let text = mjcf(&go2(), &MjcfOptions::default());
+        let file = read_robot(&text, None).expect("its own model is supported");
+        let nominal = TreeModel::new(file.tree).expect("its forces are the same in both directions");
         Self::ideal(BUILT_IN, nominal)
     }
 
     fn ideal(robot: &str, nominal: TreeModel) -> Self {
-        let (robot, rename, effects) = (robot.to_owned(), BTreeMap::new(), Vec::new());
-        Self { robot, nominal, rename, kp: None, kd: None, actuator_hz: None, effects }
+        Self {
+            robot: robot.to_owned(),
+            nominal,
+            rename: BTreeMap::new(),
+            kp: None,
+            kd: None,
+            actuator_hz: None,
+            policy_hz: None,
+            action_scale: None,
+            default_pose: BTreeMap::new(),
+            effects: Vec::new(),
+        }
     }
 
     /// Returns true if a text has keys that only the model file of a tree has: names of joints, or gains by joint.
@@ -135,7 +159,7 @@ impl TreeModelFile {
         let Ok(table) = text.parse::<Table>() else { return false };
         let is_table =
             |name: &str, key: &str| table.get(name).and_then(|table| table.get(key)).is_some_and(Value::is_table);
-        is_table("joints", "rename") || is_table("control", "kp") || is_table("control", "kd")
+        is_table("joints", "rename") || ["kp", "kd", "default_pose"].iter().any(|key| is_table("control", key))
     }
 
     /// Reads a model file, or a robot file (URDF, MJCF) as a model without effects. Paths in it become absolute.
@@ -160,14 +184,23 @@ impl TreeModelFile {
             toml::from_str(text).map_err(|error| malformed(error.to_string()))?;
         let mut file = if robot == BUILT_IN { Self::go2() } else { Self::read_robot_file(&robot, folder, name)? };
         file.rename_joints(joints.rename).map_err(malformed)?;
-        let Control { kp, kd, actuator_hz } = control;
+        let Control { kp, kd, actuator_hz, policy_hz, action_scale, default_pose } = control;
         for (key, gain) in [("kp", &kp), ("kd", &kd)] {
             file.check_gain(key, gain.as_ref()).map_err(malformed)?;
         }
-        if let Some(rate) = actuator_hz.filter(|rate| !(20.0..=2000.0).contains(rate)) {
-            return Err(malformed(format!("`control.actuator_hz` is {rate}; 20 to 2000 Hz expected")));
+        let ranges = [
+            ("actuator_hz", actuator_hz, 20.0..=2000.0, "20 to 2000 Hz"),
+            ("policy_hz", policy_hz, 1.0..=2000.0, "1 to 2000 Hz"),
+            ("action_scale", action_scale, 1e-3..=10.0, "0.001 to 10 rad"),
+        ];
+        for (key, value, range, expected) in ranges {
+            if let Some(value) = value.filter(|value| !range.contains(value)) {
+                return Err(malformed(format!("`control.{key}` is {value}; {expected} expected")));
+            }
         }
+        file.check_pose(&default_pose).map_err(malformed)?;
         (file.kp, file.kd, file.actuator_hz) = (kp, kd, actuator_hz);
+        (file.policy_hz, file.action_scale, file.default_pose) = (policy_hz, action_scale, default_pose);
         for (index, table) in effect.iter().enumerate() {
             let refused = |problem| ModelFileError::Effect { name: name.to_owned(), number: index + 1, problem };
             let entry = file.read_effect(table).map_err(refused)?;
@@ -232,6 +265,28 @@ impl TreeModelFile {
         }
     }
 
+    fn check_pose(&self, pose: &BTreeMap<String, f64>) -> Result<(), String> {
+        for (joint, position) in pose {
+            let Some(index) = self.nominal.tree.joint(joint) else {
+                return Err(format!("`control.default_pose`: the robot has no joint `{joint}`; {}", self.joints_are()));
+            };
+            let [low, high] = self.nominal.joints[index].range;
+            if !(low..=high).contains(position) || !position.is_finite() {
+                return Err(format!("`control.default_pose.{joint}` is {position}; {low} to {high} expected"));
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns the default pose of all joints [rad].
+    pub fn pose(&self) -> Vec<f64> {
+        let joints = self.nominal.tree.joints.iter().zip(&self.nominal.joints);
+        let position = |name: &str, [low, high]: [f64; 2]| {
+            self.default_pose.get(name).copied().unwrap_or_else(|| 0f64.clamp(low, high))
+        };
+        joints.map(|(tree, joint)| position(&tree.name, joint.range)).collect()
+    }
+
     fn joints_are(&self) -> String {
         let names: Vec<_> = self.nominal.tree.joints.iter().map(|joint| joint.name.as_str()).collect();
         format!("its joints are {}", names.join(", "))
@@ -282,9 +337,14 @@ impl TreeModelFile {
 
     /// Returns the text of the file. [`TreeModelFile::parse`] reads exactly the same model from it.
     pub fn to_toml(&self) -> String {
-        let TreeModelFile { robot, rename, kp, kd, actuator_hz, .. } = self.clone();
-        let head =
-            TreeText { robot, control: Control { kp, kd, actuator_hz }, joints: Joints { rename }, effect: Vec::new() };
+        let TreeModelFile { robot, rename, kp, kd, actuator_hz, policy_hz, action_scale, default_pose, .. } =
+            self.clone();
+        let head = TreeText {
+            robot,
+            control: Control { kp, kd, actuator_hz, policy_hz, action_scale, default_pose },
+            joints: Joints { rename },
+            effect: Vec::new(),
+        };
         let mut text = toml::to_string(&head).expect("numbers by names");
         for JointEffect { effect, scope, values, intervals } in &self.effects {
             let (scope, values, intervals) = (scope.to_string(), values.clone(), intervals.clone());
@@ -349,13 +409,14 @@ mod tests {
     #[test]
     fn file_is_read_back_as_it_was_written() {
         let file = read(
-            "[control]\nactuator_hz = 500\nkd = 1.5\n[control.kp]\nElbow = 20.0\n\
+            "[control]\nactuator_hz = 500\npolicy_hz = 50\naction_scale = 0.3\nkd = 1.5\n[control.default_pose]\nElbow = 0.5\n[control.kp]\nElbow = 20.0\n\
              [joints.rename]\nelbow_flex = \"Elbow\"\n\
              [[effect]]\nname = \"pd_gain\"\nscope = \"Elbow\"\nkp_scale = 1.5\nkd_scale = 1.0\n\
              interval = { kp_scale = [1.2, 1.8] }\n",
         )
         .expect("valid");
         assert_eq!(file.kp.as_ref().map(|kp| [kp.of("Elbow"), kp.of("gripper")]), Some([Some(20.0), None]));
+        assert_eq!(file.pose(), [0.0, 0.0, 0.5, 0.0, 0.0, 0.0]);
         assert_eq!(TreeModelFile::parse(&file.to_toml(), "again").expect("valid"), file, "{}", file.to_toml());
         let plain = read("").expect("valid");
         assert_eq!(TreeModelFile::parse(&plain.to_toml(), "again").expect("valid"), plain);
@@ -377,6 +438,8 @@ mod tests {
         assert!(error.contains("`control.kd`: the robot has no joint `elbow`"), "{error}");
         let error = refusal("[control]\nactuator_hz = 5\n");
         assert!(error.contains("`control.actuator_hz` is 5; 20 to 2000 Hz expected"), "{error}");
+        let error = refusal("[control.default_pose]\nelbow_flex = 3\n");
+        assert!(error.contains("`control.default_pose.elbow_flex` is 3; -1.69 to 1.69 expected"), "{error}");
         let error = refusal("[[effect]]\nname = \"payload\"\nscope = \"base\"\nmass_kg = 1\nposition_m = [0, 0, 0]\n");
         assert!(error.contains("an effect of joints, because the robot is not like the Go2"), "{error}");
         let error = refusal("[[effect]]\nname = \"backlash\"\nscope = \"calf\"\ngap_rad = 0.1\n");

@@ -15,6 +15,8 @@ pub mod jump;
 pub mod jump_config;
 pub mod jump_flight;
 pub mod jump_reward;
+pub mod pose;
+pub mod pose_config;
 pub mod track;
 pub mod track_config;
 pub mod walk;
@@ -28,6 +30,8 @@ pub use gait_clock::Gait;
 pub use gait_config::GaitConfig;
 pub use jump::Jump;
 pub use jump_config::JumpConfig;
+pub use pose::{ControlledRobot, PoseState, PoseTask, TreeView};
+pub use pose_config::PoseConfig;
 pub use track::Track;
 pub use track_config::TrackConfig;
 pub use walk::Walk;
@@ -49,6 +53,8 @@ pub enum TaskConfig {
     Attitude(AttitudeConfig),
     /// A residual on a frozen policy of `walk`, rewarded for the uncertainty of the actuator networks.
     Explore(ExploreConfig),
+    /// The joints of any robot follow targets.
+    Pose(PoseConfig),
     /// Counts steps without physics, to verify and measure the transport. It has no settings.
     Counter,
 }
@@ -61,7 +67,7 @@ impl Default for TaskConfig {
 
 impl TaskConfig {
     /// Names of all tasks.
-    pub const NAMES: [&str; 7] = ["walk", "track", "jump", "gait", "attitude", "explore", "counter"];
+    pub const NAMES: [&str; 8] = ["walk", "track", "jump", "gait", "attitude", "explore", "pose", "counter"];
 
     /// Returns the task of this name with default settings. Returns `None` if there is no such task.
     pub fn named(name: &str) -> Option<Self> {
@@ -72,6 +78,7 @@ impl TaskConfig {
             "gait" => Some(Self::Gait(GaitConfig::default())),
             "attitude" => Some(Self::Attitude(AttitudeConfig::default())),
             "explore" => Some(Self::Explore(ExploreConfig::default())),
+            "pose" => Some(Self::Pose(PoseConfig::default())),
             "counter" => Some(Self::Counter),
             _ => None,
         }
@@ -86,6 +93,7 @@ impl TaskConfig {
             Self::Gait(_) => "gait",
             Self::Attitude(_) => "attitude",
             Self::Explore(_) => "explore",
+            Self::Pose(_) => "pose",
             Self::Counter => "counter",
         }
     }
@@ -99,6 +107,7 @@ impl TaskConfig {
             Self::Gait(config) => config.check(),
             Self::Attitude(config) => config.check(),
             Self::Explore(config) => config.check(),
+            Self::Pose(config) => config.check(),
             Self::Counter => Ok(()),
         }
     }
@@ -125,7 +134,7 @@ impl TaskConfig {
                 ("task.walk.reward.epistemic_uncertainty", config.walk.reward.epistemic_uncertainty)
             }
             Self::Explore(config) => ("task.uncertainty_weight", config.uncertainty_weight),
-            Self::Counter => ("task", 0.0),
+            Self::Pose(_) | Self::Counter => ("task", 0.0),
         }
     }
 }
@@ -142,6 +151,7 @@ impl TryFrom<toml::Table> for TaskConfig {
             Some("gait") => over_defaults(&GaitConfig::default(), table).map(Self::Gait),
             Some("attitude") => over_defaults(&AttitudeConfig::default(), table).map(Self::Attitude),
             Some("explore") => over_defaults(&ExploreConfig::default(), table).map(Self::Explore),
+            Some("pose") => over_defaults(&PoseConfig::default(), table).map(Self::Pose),
             Some("counter") if table.is_empty() => Ok(Self::Counter),
             Some("counter") => Err("the task `counter` has no settings besides `name`".to_owned()),
             _ => Err(format!("`name` = {name} is not a task; possible: {}", Self::NAMES.join(", "))),
@@ -165,7 +175,7 @@ mod tests {
         let common = WalkConfig { tracking_sigma: 0.5, ..WalkConfig::default() };
         assert_eq!(track, TaskConfig::Track(TrackConfig { walk: common, ..config }));
         assert_eq!(parse("name = \"counter\"").expect("valid"), TaskConfig::Counter);
-        let others = ["jump", "gait"].map(|name| TaskConfig::named(name).expect("a task"));
+        let others = ["jump", "gait", "pose"].map(|name| TaskConfig::named(name).expect("a task"));
         for task in [walk, track, TaskConfig::Counter].into_iter().chain(others) {
             assert_eq!(parse(&toml::to_string(&task).expect("serialised")).expect("valid"), task);
         }
@@ -195,7 +205,7 @@ mod tests {
             in `reward`
         "#]].assert_eq(&error("[reward]\ntorques = -1.0"));
         expect![[r#"
-            `name` = "fly" is not a task; possible: walk, track, jump, gait, attitude, explore, counter
+            `name` = "fly" is not a task; possible: walk, track, jump, gait, attitude, explore, pose, counter
         "#]]
         .assert_eq(&error("name = \"fly\""));
         expect![[r#"
@@ -206,7 +216,7 @@ mod tests {
 
     #[test]
     fn defaults_are_valid() {
-        for name in ["walk", "track", "jump", "gait", "attitude", "counter"] {
+        for name in ["walk", "track", "jump", "gait", "attitude", "pose", "counter"] {
             assert_eq!(TaskConfig::named(name).expect("a task").check(), Ok(()), "{name}");
         }
         let explore = ExploreConfig::default();
