@@ -3,7 +3,9 @@
 use std::io::Write;
 use std::path::Path;
 
-use twinstep_effects::{CATALOGUE, Effect, EffectEntry, ModelFile, RobotSampler, Scope, Target};
+use twinstep_effects::{
+    CATALOGUE, Effect, EffectEntry, ModelFile, ModelFileError, RobotSampler, Scope, Target, TreeModelFile,
+};
 use twinstep_ensemble::{ActuatorNetworkRobot, Checkpoint, Ensemble, Inference};
 use twinstep_env_server::{Config, ConfigFileError, SimEnvFactory};
 use twinstep_excite::CommandSequence;
@@ -200,7 +202,17 @@ fn read_text(format: Format, text: &str, folder: &Path) -> Outcome {
 
 /// Copies the robot files that the examples of model files name, unless they are in `folder` already.
 fn copy_robots(folder: &Path) {
-    for name in ["a1.xml", "b2.urdf", "go1.urdf"] {
+    for name in [
+        "a1.xml",
+        "b2.urdf",
+        "go1.urdf",
+        "so101.xml",
+        "g1.xml",
+        "anymal_c.xml",
+        "mini_cheetah.xml",
+        "aliengo.xml",
+        "spot.xml",
+    ] {
         if !folder.join(name).exists() {
             let content = examples_in("data/robots", name, "").remove(0);
             write(folder, name, &content);
@@ -219,9 +231,24 @@ fn read_model(path: &Path, text: &str) -> Outcome {
             }
             Outcome::Accepted
         }
+        Err(ModelFileError::OfTree { .. }) => read_tree_model(path),
         Err(error) => {
             assert!(!error.to_string().is_empty(), "an error has a text");
             if text.parse::<toml::Table>().is_ok() { Outcome::Decoded } else { Outcome::Refused }
+        }
+    }
+}
+
+fn read_tree_model(path: &Path) -> Outcome {
+    match TreeModelFile::load(path) {
+        Ok(file) => {
+            let again = TreeModelFile::parse(&file.to_toml(), "the written file").expect("a written file can be read");
+            assert!(file == again, "a written file has the same content");
+            Outcome::Accepted
+        }
+        Err(error) => {
+            assert!(!error.to_string().is_empty(), "an error has a text");
+            Outcome::Decoded
         }
     }
 }

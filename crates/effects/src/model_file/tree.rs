@@ -300,6 +300,12 @@ impl TreeModelFile {
             let expected = format!("an effect of joints, because the robot is not like the Go2: {}", names.join(", "));
             return Err(key_error("name", table.get("name"), &expected));
         }
+        let parameters = effect.parameters.iter().flat_map(|parameter| std::iter::repeat_n(parameter, parameter.count));
+        for (parameter, value) in parameters.zip(&values) {
+            if !value.is_finite() && *value != parameter.no_effect_value {
+                return Err(key_error(parameter.name, table.get(parameter.name), "a finite number"));
+            }
+        }
         let scope = self.scope(&scope).map_err(|expected| key_error("scope", table.get("scope"), &expected))?;
         Ok(JointEffect { effect, scope, values, intervals })
     }
@@ -442,6 +448,8 @@ mod tests {
         assert!(error.contains("`control.default_pose.elbow_flex` is 3; -1.69 to 1.69 expected"), "{error}");
         let error = refusal("[[effect]]\nname = \"payload\"\nscope = \"base\"\nmass_kg = 1\nposition_m = [0, 0, 0]\n");
         assert!(error.contains("an effect of joints, because the robot is not like the Go2"), "{error}");
+        let error = refusal("[[effect]]\nname = \"backlash\"\nscope = \"all\"\ngap_rad = nan\n");
+        assert!(error.contains("`gap_rad` is nan; expected a finite number"), "{error}");
         let error = refusal("[[effect]]\nname = \"backlash\"\nscope = \"calf\"\ngap_rad = 0.1\n");
         assert!(error.contains("`scope` is \"calf\"; expected all, or a joint"), "{error}");
     }
