@@ -1,8 +1,10 @@
 //! Environments of the task `pose` on robots of any tree.
 
+use glam::{DAffine3, DQuat};
 use twinstep_envs::{PoseState, PoseTask, TreeView};
 use twinstep_model::{
-    AutoresetMode, EndedEpisode, EnvError, EnvSpec, ResetRequest, StepBatch, Stream, TreeModel, VecEnv, stream,
+    AutoresetMode, EndedEpisode, EnvError, EnvSpec, Ground, ResetRequest, Scene, StepBatch, Stream, TreeModel, VecEnv,
+    stream,
 };
 use twinstep_sim::{Placement, TreeCommand, TreeError, TreeReadings, TreeSimulation};
 
@@ -206,6 +208,19 @@ impl VecEnv for TreeEnv {
             }
         }
         Ok(&self.batch)
+    }
+
+    fn scene(&self, env: usize) -> Result<Scene, EnvError> {
+        let num_envs = self.num_envs();
+        let episode = self.episodes.get(env).ok_or(EnvError::EnvOutOfRange { env, num_envs })?;
+        if !episode.running && episode.length == 0 {
+            return Err(EnvError::NeedsReset { env });
+        }
+        let state = &self.simulation.states()[env].state;
+        let [w, x, y, z] = state.base_orientation;
+        let rotation = DQuat::from_xyzw(x, y, z, w).normalize();
+        let base = DAffine3::from_rotation_translation(rotation, state.base_position.into());
+        Ok(Scene::of_tree(&self.robot.tree, base, &state.q, &Ground::FLAT))
     }
 }
 

@@ -39,6 +39,17 @@ def test_spec_has_the_joints_and_gains_of_the_humanoid() -> None:
         envs.close()
 
 
+def test_humanoid_is_rendered() -> None:
+    env = gym.make("twinstep/Pose-v0", model=str(ROBOTS / "g1.toml"), render_mode="rgb_array")
+    try:
+        env.reset(seed=1)
+        image = np.asarray(env.render())
+        assert image.ndim == 3
+        assert image.std() > 5
+    finally:
+        env.close()
+
+
 def test_humanoid_without_gains_is_refused_with_what_is_missing() -> None:
     with pytest.raises(twinstep.ServerStartError, match=r"states no `kp` of joint `left_hip_pitch_joint`"):
         gym.make_vec("twinstep/Pose-v0", num_envs=1, model=str(ROBOTS / "g1.xml"))

@@ -14,7 +14,7 @@ use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::identify_tree::{self, Unwritable};
 use crate::open_log::open_log;
 use crate::robot_file::{analytic_model, simulator};
-use crate::tree_model::tree_model;
+use crate::tree_model::{of_any_tree, tree_model};
 
 /// Estimate the parameters of effects from measured logs (sampling-based parameter identification, SPI-Active).
 ///
@@ -29,8 +29,8 @@ use crate::tree_model::tree_model;
 /// the best estimates so far and saves the search in OUT.search.json. The same command with --resume continues from
 /// there; the refinement and the local search begin again.
 ///
-/// A robot that is not like the Go2 (an arm, a humanoid; `--model arm.xml`), or a log without gains, needs segments with a fixed
-/// base. There Levenberg-Marquardt alone fits the positions, and torques of motor currents, to windows of 4 s. Priors scale with the
+/// A robot that is not like the Go2 (an arm, a humanoid; `--model arm.xml`), a log without gains, and effects `@each` joint need segments
+/// with a fixed base. There Levenberg-Marquardt alone fits the positions, and torques of motor currents, to windows of 4 s. Priors scale with the
 /// torque limits of the joints. The model file states what is added to the robot file.
 ///
 /// Examples: `twinstep identify data/go2_air_chirp --until 10 --out fitted.toml` and
@@ -142,7 +142,10 @@ pub fn run(args: &Args) -> CommandResult {
 /// Estimates the parameters, prints them and writes the model.
 pub fn write_model(args: &Args, signals: &Signals) -> CommandResult {
     let first = open_log(&args.logs[0])?;
-    if let Some(file) = tree_model(args.model.as_deref(), &first)? {
+    let each = args.effects.iter().flatten().any(|effect| effect.ends_with("@each"));
+    let tree =
+        if each { Some(of_any_tree(args.model.as_deref())?) } else { tree_model(args.model.as_deref(), &first)? };
+    if let Some(file) = tree {
         check_flags_of_tree(args)?;
         let rows = args.rows.of(&first)?;
         return identify_tree::run(&file, &first, &rows, args.effects.as_deref(), &args.out, signals);

@@ -77,6 +77,9 @@ fn text(found: &Identification) -> String {
 
 /// Returns a positive number with three significant digits.
 fn significant(value: f64) -> String {
-    let decimals = (2 - value.max(1e-9).log10().floor() as i32).clamp(0, 9) as usize;
+    if value < 1e-3 {
+        return format!("{value:.2e}");
+    }
+    let decimals = (2 - value.log10().floor() as i32).clamp(0, 9) as usize;
     format!("{value:.decimals$}")
 }

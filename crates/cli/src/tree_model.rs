@@ -23,7 +23,12 @@ pub fn tree_model(path: Option<&Path>, log: &Log) -> Result<Option<TreeModelFile
             // The caller says what is wrong with the file of a quadruped.
             _ => false,
         };
-    if is_tree { TreeModelFile::load(path).map(Some).map_err(input) } else { Ok(None) }
+    if is_tree { of_any_tree(Some(path)).map(Some) } else { Ok(None) }
+}
+
+/// Returns the model of a tree, also for a quadruped; the ideal Go2 for `None`.
+pub fn of_any_tree(path: Option<&Path>) -> Result<TreeModelFile, Failure> {
+    path.map_or_else(|| Ok(TreeModelFile::go2()), |path| TreeModelFile::load(path).map_err(input))
 }
 
 /// Returns the rate of the actuators [Hz].

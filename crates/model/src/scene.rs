@@ -1,10 +1,10 @@
 //! Scene for rendering one robot: bodies, their shapes and poses, and the ground.
 
-use glam::{DVec3, Quat, Vec3};
+use glam::{DAffine3, DVec3, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
 use crate::kinematics::{Pose, body_poses};
-use crate::{Ground, JOINT_NAMES, Leg, PerJoint, PerLeg, RobotModel};
+use crate::{Ground, JOINT_NAMES, Leg, PerJoint, PerLeg, RobotModel, RobotTree, TreeShape, TreeShapeKind};
 
 /// Scene for rendering. Poses are `[x, y, z, w, x, y, z]`: position [m], then quaternion.
 #[derive(Clone, Debug, PartialEq)]
@@ -76,6 +76,60 @@ impl Scene {
     }
 }
 
+impl Scene {
+    /// Returns the scene of a robot of any tree: its shapes, and rods from each joint to the next, because many files have no shapes.
+    pub fn of_tree(tree: &RobotTree, world_from_base: DAffine3, q: &[f64], ground: &Ground) -> Self {
+        let pose = |body: DAffine3| pose_of(world_from_base * body).to_array();
+        let longest = tree.joints.iter().map(|joint| joint.parent_from_child.translation.length()).fold(0.0, f64::max);
+        let rods = tree.joints.iter().filter(|joint| joint.parent_from_child.translation.length() > 1e-3);
+        let rod = |joint: &crate::TreeJoint| {
+            capsule(joint.parent as u32, 0.06 * longest, [DVec3::ZERO, joint.parent_from_child.translation])
+        };
+        let position = world_from_base.translation;
+        Self {
+            bodies: tree.bodies.iter().map(|body| body.name.clone()).collect(),
+            pose: tree.base_from_bodies(q).into_iter().map(pose).collect(),
+            shapes: tree.shapes.iter().filter_map(tree_shape).chain(rods.map(rod)).collect(),
+            ground: ground.crop(position.x as f32, position.y as f32),
+            command: None,
+            velocity: None,
+            torque: None,
+            foot_force: None,
+            reward_terms: Vec::new(),
+            uncertainty: None,
+        }
+    }
+}
+
+fn pose_of(frame: DAffine3) -> Pose {
+    let (_, rotation, position) = frame.to_scale_rotation_translation();
+    Pose { position: position.as_vec3(), rotation: rotation.as_quat() }
+}
+
+/// Returns a shape as it is drawn: a cylinder as a capsule, an ellipsoid and a mesh as the box around them. `None` for a mesh without bounds.
+fn tree_shape(shape: &TreeShape) -> Option<SceneShape> {
+    let mut frame = shape.body_from_shape;
+    let (kind, size) = match shape.kind {
+        TreeShapeKind::Box(half) | TreeShapeKind::Ellipsoid(half) => (ShapeKind::Box, half),
+        TreeShapeKind::Sphere(radius) => (ShapeKind::Sphere, DVec3::new(radius, 0.0, 0.0)),
+        TreeShapeKind::Capsule { radius, half_length } => (ShapeKind::Capsule, DVec3::new(radius, half_length, 0.0)),
+        TreeShapeKind::Cylinder { radius, half_length } => {
+            (ShapeKind::Capsule, DVec3::new(radius, (half_length - radius).max(0.0), 0.0))
+        }
+        TreeShapeKind::Mesh(bounds) => {
+            let [low, high] = bounds?;
+            frame *= DAffine3::from_translation(0.5 * (low + high));
+            (ShapeKind::Box, 0.5 * (high - low))
+        }
+    };
+    Some(SceneShape {
+        body: shape.body as u32,
+        kind,
+        size: size.as_vec3().to_array(),
+        offset: pose_of(frame).to_array(),
+    })
+}
+
 /// Returns the collision shapes, and shapes only for rendering: head, hip actuators, and thigh and calf capsules.
 fn shapes(robot: &RobotModel) -> Vec<SceneShape> {
     let collision = &robot.shapes;
@@ -140,6 +194,18 @@ mod tests {
         for body in 0..NUM_BODIES as u32 {
             assert!(scene.shapes.iter().any(|shape| shape.body == body), "{}", scene.bodies[body as usize]);
         }
+    }
+
+    #[test]
+    fn scene_of_a_tree_has_the_poses_of_the_quadruped_and_a_rod_for_each_link() {
+        let (robot, quadruped) = (go2(), standing());
+        let base = DAffine3::from_translation(DVec3::new(0.0, 0.0, 0.32));
+        let scene = Scene::of_tree(&RobotTree::from(&robot), base, &robot.control.default_pose, &Ground::FLAT);
+        assert_eq!(scene.bodies, quadruped.bodies);
+        for (one, other) in scene.pose.iter().flatten().zip(quadruped.pose.iter().flatten()) {
+            assert!((one - other).abs() < 1e-5, "{one} {other}");
+        }
+        assert_eq!(scene.shapes.len(), 12);
     }
 
     #[test]
