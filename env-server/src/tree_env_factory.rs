@@ -78,14 +78,20 @@ fn refused(field: &'static str, reason: &'static str) -> EnvFactoryError {
 }
 
 fn model(path: &Path) -> Result<TreeModelFile, EnvFactoryError> {
-    let mut file = TreeModelFile::load(path)?;
-    if file.robot == "go2" {
-        let own = file;
-        file = ideal_go2();
-        (file.kp, file.kd) = (own.kp.or(file.kp), own.kd.or(file.kd));
-        file.effects = own.effects;
+    let file = TreeModelFile::load(path)?;
+    if file.robot != "go2" {
+        return Ok(file);
     }
-    Ok(file)
+    // What a file leaves out is that of the policies of the Go2.
+    let default = ideal_go2();
+    let default_pose = if file.default_pose.is_empty() { default.default_pose } else { file.default_pose };
+    Ok(TreeModelFile {
+        kp: file.kp.or(default.kp),
+        kd: file.kd.or(default.kd),
+        action_scale: file.action_scale.or(default.action_scale),
+        default_pose,
+        ..file
+    })
 }
 
 /// Returns the ideal Go2 with the gains and the pose of its policies.

@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::{Command as Process, Output};
 
-use twinstep_effects::TreeModelFile;
+use twinstep_effects::{Effect, JointEffect, JointScope, NominalGain, TreeModelFile};
 use twinstep_inference::{Candidate, IdentifyOptions, JointLog, ParameterRequest, evaluate, identify};
-use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
+use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{BaseMount, TreeModel};
 use twinstep_sim::{Placement, SimConfig, SimdPrecision, TreeCommand, TreeSimulation};
 use twinstep_tests::python::{Programs, root};
@@ -107,12 +107,58 @@ fn identification_recovers_gains_delay_friction_and_rotor_of_an_arm_on_a_wall() 
 }
 
 #[test]
-fn tilt_of_the_base_matters() {
-    let file = TreeModelFile {
-        kp: Some(twinstep_effects::NominalGain::All(KP)),
-        kd: Some(twinstep_effects::NominalGain::All(KD)),
-        ..arm()
+fn only_unknown_gains_become_those_of_the_model_file_and_other_joints_keep_their_effects() {
+    let mut file = arm();
+    file.effects.push(JointEffect {
+        effect: Effect::named("coulomb_friction").unwrap(),
+        scope: JointScope::All,
+        values: vec![0.05],
+        intervals: vec![None],
+    });
+    let mut log = log(6.0);
+    let meta = Meta { kp: Some(Gain::Uniform(KP)), ..log.meta().clone() };
+    log = Log::new(meta, columns_of(&log)).unwrap();
+    let joint_log = JointLog::new(&log, &file.nominal.tree, |_| true).unwrap();
+    let requests = vec![ParameterRequest("coulomb_friction@gripper".to_owned())];
+    let options = IdentifyOptions { requests, actuator_hz: 1000.0 };
+    let found = identify(&file, &joint_log, &options, &mut |_, _, _| true).unwrap().model;
+    assert_eq!(found.kp, None, "the log states kp");
+    assert!(found.kd.as_ref().unwrap().of("gripper").is_some());
+    let friction = |file: &TreeModelFile, joint: usize| file.tree_model().unwrap().joints[joint].coulomb_friction;
+    assert!((friction(&found, 0) - friction(&file, 0)).abs() < 1e-12, "an effect of all joints stays at the others");
+    let error = |file: &TreeModelFile| {
+        evaluate(&joint_log, &Candidate::of(file).unwrap(), 1000.0).unwrap().0.q_rmse_rad.unwrap()
     };
+    assert!(error(&found) < error(&file), "{} -> {} rad", error(&file), error(&found));
+}
+
+#[test]
+fn selections_that_are_too_short_gaps_and_missing_cells_are_no_panic() {
+    let (file, whole) = (arm(), log(4.0));
+    let short = JointLog::new(&whole, &file.nominal.tree, |row| (100..120).contains(&row)).unwrap();
+    let requests = vec![ParameterRequest("armature@all".to_owned())];
+    let options = IdentifyOptions { requests, actuator_hz: 1000.0 };
+    let error = identify(&file, &short, &options, &mut |_, _, _| true).unwrap_err().to_string();
+    assert!(error.contains("shorter than 0.4 s"), "{error}");
+
+    let mut columns = columns_of(&whole);
+    columns.insert("dq_gripper".to_owned(), vec![f64::NAN; whole.rows()]);
+    let missing = Log::new(whole.meta().clone(), columns.clone()).unwrap();
+    let missing = JointLog::new(&missing, &file.nominal.tree, |_| true).unwrap();
+    assert!(evaluate(&missing, &Candidate::of(&file).unwrap(), 1000.0).is_ok());
+
+    columns.get_mut("t").unwrap().iter_mut().skip(200).for_each(|t| *t += 1e6);
+    let gap = Log::new(whole.meta().clone(), columns.clone()).unwrap();
+    assert_eq!(JointLog::new(&gap, &file.nominal.tree, |_| true).unwrap().selected.len(), 2);
+    columns.get_mut("t").unwrap().iter_mut().for_each(|t| *t *= 1e9);
+    let nanoseconds = Log::new(whole.meta().clone(), columns).unwrap();
+    let error = JointLog::new(&nanoseconds, &file.nominal.tree, |_| true).unwrap_err().to_string();
+    assert!(error.contains("20 to 2000 Hz"), "{error}");
+}
+
+#[test]
+fn tilt_of_the_base_matters() {
+    let file = TreeModelFile { kp: Some(NominalGain::All(KP)), kd: Some(NominalGain::All(KD)), ..arm() };
     let log = log(4.0);
     let mut candidate = Candidate::of(&file).unwrap();
     candidate.robot = hidden();
@@ -123,6 +169,11 @@ fn tilt_of_the_base_matters() {
     assert!(on_the_wall < 0.001, "{on_the_wall} rad");
     joint_log.selected[0].base_orientation = None;
     assert!(error(&joint_log) > 5.0 * on_the_wall, "{} rad", error(&joint_log));
+}
+
+fn columns_of(log: &Log) -> BTreeMap<String, Vec<f64>> {
+    let channels = log.channels().map(|(name, cells)| (name.to_owned(), cells.to_vec()));
+    channels.chain([("t".to_owned(), log.t().to_vec())]).collect()
 }
 
 fn twinstep(args: &[&str], folder: &Path) -> Output {
@@ -153,7 +204,7 @@ fn program_identifies_an_arm_and_evaluates_it_on_other_rows() {
         run(&["identify", "arm", "--model", robot, "--until", "8", "--effects", effects, "--out", "fit.toml"]);
     assert_eq!(code, Some(0), "{error}");
     assert!(out.contains("pd_gain@elbow_flex.kp") && out.contains("95 % interval"), "{out}");
-    assert!(error.contains("the log does not state the gains"), "{error}");
+    assert!(error.contains("neither log nor model file states kp of elbow_flex"), "{error}");
     let (before, after) = (q_rmse(robot), q_rmse("fit.toml"));
     assert!(after < 0.2 * before, "{before} -> {after} rad on rows that were not fitted");
 

@@ -11,7 +11,7 @@ use twinstep_model::JOINT_NAMES;
 use crate::exit::{CommandResult, Failure, input, other};
 use crate::open_log::open_log;
 use crate::robot_file::SimulatedRobot;
-use crate::tree_model::{actuator_hz, note_unknown_gains, tree_model};
+use crate::tree_model::{actuator_hz, note_assumptions, tree_model};
 use twinstep_report::evaluation_plot::Errors;
 use twinstep_report::{chart, evaluation_plot};
 
@@ -123,7 +123,7 @@ pub fn run(args: &Args) -> CommandResult {
 
 fn errors_of_tree(file: &TreeModelFile, log: &Log, rows: &[bool]) -> Result<(Evaluation, Errors), Failure> {
     let joint_log = JointLog::new(log, &file.nominal.tree, |row| rows[row]).map_err(input)?;
-    note_unknown_gains(file, &joint_log);
+    note_assumptions(file, &joint_log);
     let candidate = Candidate::of(file).map_err(input)?;
     twinstep_inference::evaluate(&joint_log, &candidate, actuator_hz(file)).map_err(input)
 }

@@ -59,7 +59,7 @@ pub struct Args {
     /// Estimate parameters that are not identifiable from the logs, too.
     #[arg(long)]
     pub force: bool,
-    /// Maximum number of generations of CMA-ES. With 0 there is no local search either: gradient steps alone
+    /// Maximum number of generations of CMA-ES, which a robot of any tree does not need. With 0 there is no local search either: gradient steps alone
     /// (Levenberg–Marquardt), from the values of --start or of the model.
     #[arg(long, value_name = "N", default_value_t = IdentifyOptions::default().generations)]
     pub generations: usize,
@@ -133,7 +133,7 @@ pub fn run(args: &Args) -> CommandResult {
     if matches!(identified, Ok(()) | Err(Failure::Interrupted)) {
         println!("written to {}; evaluate it on other rows: twinstep evaluate --model", args.out.display());
     }
-    if matches!(identified, Err(Failure::Interrupted)) {
+    if matches!(identified, Err(Failure::Interrupted)) && search_file(&args.out).exists() {
         println!("interrupted; the same command with --resume continues");
     }
     identified

@@ -10,7 +10,7 @@ use twinstep_inference::{
 use twinstep_logs::Log;
 
 use crate::exit::{CommandResult, Failure, Signals, input};
-use crate::tree_model::{actuator_hz, note_unknown_gains};
+use crate::tree_model::{actuator_hz, note_assumptions};
 
 /// The output file cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -30,7 +30,7 @@ pub fn run(
     signals: &Signals,
 ) -> CommandResult {
     let joint_log = JointLog::new(log, &file.nominal.tree, |row| rows[row]).map_err(input)?;
-    note_unknown_gains(file, &joint_log);
+    note_assumptions(file, &joint_log);
     let unwritable = |source| input(Unwritable { path: out.to_owned(), source });
     std::fs::OpenOptions::new().append(true).create(true).open(out).map_err(unwritable)?;
     let requests = match requests {

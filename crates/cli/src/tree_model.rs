@@ -12,9 +12,17 @@ use crate::exit::{Failure, input};
 /// Rate of the actuators of a robot of any tree [Hz], if its model file states none.
 const ACTUATOR_HZ: f64 = 1000.0;
 
+/// Distance from its range at which a position is probably not in radians [rad].
+const FAR_RAD: f64 = 0.5;
+
 /// Returns the model of a tree, if the robot is not like the Go2 or the gains of the log are unknown.
 pub fn tree_model(path: Option<&Path>, log: &Log) -> Result<Option<TreeModelFile>, Failure> {
-    let unknown_gains = check_gains(log).is_err();
+    let gains = check_gains(log);
+    let unknown_gains = gains.is_err();
+    if !log.segments().any(|(segment, _)| segment.base.is_fixed()) {
+        // Unknown gains of a robot with a free base cannot be estimated.
+        gains.map_err(input)?;
+    }
     let Some(path) = path else { return Ok(unknown_gains.then(TreeModelFile::go2)) };
     let is_tree = unknown_gains
         || match ModelFile::load(path) {
@@ -36,18 +44,27 @@ pub fn actuator_hz(file: &TreeModelFile) -> f64 {
     file.actuator_hz.unwrap_or(ACTUATOR_HZ)
 }
 
-/// Says on stderr what stands for gains that the log does not state.
-pub fn note_unknown_gains(file: &TreeModelFile, log: &JointLog) {
-    if !log.has_unknown_gains() {
-        return;
+/// Says on stderr what stands for gains that the log does not state, and which positions are far outside the range of their joint.
+pub fn note_assumptions(file: &TreeModelFile, log: &JointLog) {
+    let tree = &file.nominal.tree;
+    let stated =
+        |gains: &Option<NominalGain>, joint: &str| gains.as_ref().is_some_and(|gains| gains.of(joint).is_some());
+    for channels in &log.joints {
+        let name = &tree.joints[channels.joint].name;
+        let gains = [("kp", &channels.kp, &file.kp, "3"), ("kd", &channels.kd, &file.kd, "0.1 s")];
+        for (key, of_log, of_file, share) in gains {
+            if of_log.is_none() && !stated(of_file, name) {
+                eprintln!(
+                    "note: neither log nor model file states {key} of {name}; {share} times the torque limit per radian stands for it"
+                );
+            }
+        }
+        let [low, high] = file.nominal.joints[channels.joint].range;
+        let beyond = |q: &&f64| **q < low - FAR_RAD || **q > high + FAR_RAD;
+        if let Some(q) = channels.q.iter().chain(&channels.q_cmd).find(beyond) {
+            eprintln!(
+                "note: {name} is at {q:.2}, and its range is {low:.2} to {high:.2} rad: is the log in degrees, or its zero another one?"
+            );
+        }
     }
-    let stated = |gains: &Option<NominalGain>| {
-        log.joints.iter().all(|joint| gains.as_ref().is_some_and(|gains| gains.of(&joint.name).is_some()))
-    };
-    let source = if stated(&file.kp) && stated(&file.kd) {
-        "those of the model file stand for them"
-    } else {
-        "3 (kp) and 0.1 s (kd) times the torque limit per radian stand for them"
-    };
-    eprintln!("note: the log does not state the gains of all joints; {source}");
 }

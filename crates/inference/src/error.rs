@@ -1,5 +1,6 @@
 //! Reasons why a log or a request cannot be used.
 
+use twinstep_logs::replay::ReplayError;
 use twinstep_sim::{BackendBuildError, TreeError};
 
 /// Reason why a log cannot be compared with a robot, or a parameter cannot be estimated.
@@ -7,8 +8,8 @@ use twinstep_sim::{BackendBuildError, TreeError};
 pub enum InferenceError {
     /// The robot has no joint of this name.
     #[error(
-        "the robot has no joint `{joint}` of the log\n  its joints are {joints}\n  name them as in the log: \
-         `[joints.rename]` of the model file, such as `{example} = \"{joint}\"`"
+        "the robot has no joint `{joint}` of the log\n  its joints are {joints}\n  another robot: `--model FILE` (default: the Go2); \
+         other names: `[joints.rename]` of the model file, such as `{example} = \"{joint}\"`"
     )]
     UnknownJoint {
         /// Name in the log.
@@ -27,7 +28,9 @@ pub enum InferenceError {
         other: String,
     },
     /// The log lacks a required column.
-    #[error("joint `{joint}` of the log has no `{quantity}`")]
+    #[error(
+        "joint `{joint}` of the log has no `{quantity}`: add a column `{quantity}_{joint}`, or leave the joint out of `joints` in the meta file"
+    )]
     Missing {
         /// Name of the joint.
         joint: String,
@@ -37,9 +40,12 @@ pub enum InferenceError {
     /// No selected rows can be simulated.
     #[error(
         "there is nothing to simulate: the selected rows have no two consecutive rows in a segment with base \"fixed\"; a \
-         floating base is simulated for quadrupeds like the Go2 only"
+         floating base needs a quadruped like the Go2, and gains in the log"
     )]
     NothingToSimulate,
+    /// The selected rows within a range are shorter than the time in which an initial state decays.
+    #[error("the selected rows are shorter than 0.4 s: select more with `--from`, `--until` and `--segment`")]
+    TooShort,
     /// The name is not one of a quantity that can be estimated.
     #[error(
         "`{given}` cannot be estimated; possible: {possible}, each with @all, @each or @JOINT, as in coulomb_friction@each"
@@ -75,6 +81,9 @@ pub enum InferenceError {
     /// A robot cannot be reset or stepped.
     #[error(transparent)]
     Tree(#[from] TreeError),
+    /// The log cannot be replayed.
+    #[error(transparent)]
+    Replay(#[from] ReplayError),
     /// The effects of the model cannot be combined.
     #[error("the model: {0}")]
     Model(String),

@@ -72,7 +72,7 @@ impl<'a> FitProblem<'a> {
         }
     }
 
-    /// Returns the errors of each channel at each point, simulated minus measured; missing cells have none. `None` if it diverges.
+    /// Returns the errors of each channel at each point, simulated minus measured; NaN where a cell is missing. `None` if it diverges.
     fn errors(&self, points: &[Vec<f64>]) -> Result<Vec<Option<Vec<Vec<f64>>>>, InferenceError> {
         let candidates: Vec<_> = points.iter().map(|point| self.given.at(self.parameters, point)).collect();
         let simulated = simulate(self.log, self.windows, &candidates, self.actuator_hz)?;
@@ -88,14 +88,15 @@ impl<'a> FitProblem<'a> {
                         Channel::Torque(joint) => trace.tau[joint][inner],
                     };
                     let is_last_torque = matches!(channel, Channel::Torque(_)) && row + 1 == window.rows.end;
-                    errors.push(if measured.is_nan() || is_last_torque { 0.0 } else { simulated - measured });
+                    errors.push(if is_last_torque { f64::NAN } else { simulated - measured });
                 }
             }
             errors
         };
         let of_point = |traces: Vec<crate::Trace>| {
             let errors: Vec<_> = self.channels.iter().map(|channel| of_channel(&traces, *channel)).collect();
-            errors.iter().flatten().all(|error| error.is_finite()).then_some(errors)
+            let diverges = traces.iter().flat_map(|trace| trace.q.iter().flatten()).any(|q| !q.is_finite());
+            (!diverges).then_some(errors)
         };
         Ok(simulated.into_iter().map(of_point).collect())
     }
@@ -103,8 +104,9 @@ impl<'a> FitProblem<'a> {
     /// Returns the weighted residuals at each point.
     fn residuals(&self, points: &[Vec<f64>]) -> Result<Vec<Option<DVector<f64>>>, InferenceError> {
         let weighted = |errors: Vec<Vec<f64>>| {
-            let each =
-                errors.iter().zip(&self.std).flat_map(|(errors, std)| errors.iter().map(move |error| error / std));
+            let each = errors.iter().zip(&self.std).flat_map(|(errors, std)| {
+                errors.iter().map(move |error| if error.is_nan() { 0.0 } else { error / std })
+            });
             DVector::from_vec(each.collect())
         };
         Ok(self.errors(points)?.into_iter().map(|errors| errors.map(weighted)).collect())

@@ -68,10 +68,11 @@ pub fn identify(
     progress: &mut dyn FnMut(usize, usize, f64) -> bool,
 ) -> Result<Identification, InferenceError> {
     let given = Candidate::of(file)?;
-    let joints: Vec<usize> = log.joints.iter().map(|joint| joint.joint).collect();
-    let states_gains = !log.has_unknown_gains();
-    let parameters = FreeParameter::of(&options.requests, file, &joints, states_gains)?;
+    let parameters = FreeParameter::of(&options.requests, file, log)?;
     let windows = windows(log, &given.robot.tree, WindowLength::IDENTIFICATION);
+    if windows.is_empty() {
+        return Err(InferenceError::TooShort);
+    }
     let mut problem = FitProblem::new(log, &windows, &parameters, &given, options.actuator_hz);
     let mut interrupted = false;
     let few: Vec<_> = windows.iter().step_by(windows.len().div_ceil(START_WINDOWS)).cloned().collect();
@@ -105,7 +106,7 @@ pub fn identify(
     };
     let estimates = parameters.iter().enumerate().map(estimate).collect();
     let mut model = file.clone();
-    write_estimates(&mut model, &given, &parameters, &values, states_gains);
+    write_estimates(&mut model, &given, log, &parameters, &values);
     Ok(Identification { model, estimates, correlated: correlated(&parameters, &covariance), interrupted })
 }
 

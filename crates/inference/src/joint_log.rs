@@ -2,10 +2,14 @@
 
 use std::ops::Range;
 
+use twinstep_logs::replay::ReplayError;
 use twinstep_logs::{Log, TorqueSensor};
 use twinstep_model::RobotTree;
 
-use crate::InferenceError;
+use crate::{InferenceError, Quantity};
+
+/// Longest time between two rows of a range [s].
+const LONGEST_GAP_S: f64 = 1.0;
 
 /// Commands and measurements of one joint, with one entry per row.
 #[derive(Clone, Debug)]
@@ -65,8 +69,11 @@ impl JointLog {
         let joints = log.joints().iter().zip(indices).map(|(name, joint)| channels(log, name, joint));
         let mut joints = joints.collect::<Result<Vec<_>, _>>()?;
         joints.sort_by_key(|channels| channels.joint);
+        check_rate(log)?;
         let mut selected = Vec::new();
-        for (segment, range) in log.segments() {
+        for (segment, range) in
+            log.segments().flat_map(|(segment, range)| split_at_gaps(log, range).map(move |part| (segment, part)))
+        {
             if !segment.base.is_fixed() {
                 continue;
             }
@@ -83,10 +90,41 @@ impl JointLog {
         Ok(Self { t: log.t().to_vec(), selected, joints, rate_hz: log.meta().rate_hz })
     }
 
-    /// Returns true if the gains of a joint are unknown.
+    /// Returns true if a gain of a joint is unknown.
     pub fn has_unknown_gains(&self) -> bool {
         self.joints.iter().any(|joint| joint.kp.is_none() || joint.kd.is_none())
     }
+
+    /// Returns true if the log states the gain of a joint of the robot. True for other quantities.
+    pub fn states_gain(&self, quantity: Quantity, joint: usize) -> bool {
+        let channels = self.joints.iter().filter(|channels| channels.joint == joint);
+        let mut stated = channels.map(|channels| match quantity {
+            Quantity::PositionGain => channels.kp.is_some(),
+            Quantity::VelocityGain => channels.kd.is_some(),
+            _ => true,
+        });
+        stated.all(|stated| stated)
+    }
+}
+
+/// Checks that the rows have a rate that can be simulated, as in `twinstep_logs::replay`.
+fn check_rate(log: &Log) -> Result<(), InferenceError> {
+    let mut steps: Vec<f64> =
+        log.segments().flat_map(|(_, rows)| log.t()[rows].windows(2).map(|pair| pair[1] - pair[0])).collect();
+    steps.sort_by(f64::total_cmp);
+    let Some(median) = steps.get(steps.len() / 2) else { return Err(InferenceError::NothingToSimulate) };
+    if (0.0004..=0.051).contains(median) {
+        return Ok(());
+    }
+    Err(ReplayError::Rate { period_ms: 1e3 * median }.into())
+}
+
+/// Splits a contiguous range of rows where the log has no row for [`LONGEST_GAP_S`].
+fn split_at_gaps(log: &Log, range: Range<usize>) -> impl Iterator<Item = Range<usize>> {
+    let t = log.t();
+    let starts = (range.start + 1..range.end).filter(|row| t[*row] - t[row - 1] > LONGEST_GAP_S);
+    let starts: Vec<usize> = std::iter::once(range.start).chain(starts).chain([range.end]).collect();
+    (1..starts.len()).map(move |part| starts[part - 1]..starts[part])
 }
 
 /// Returns the joint of the robot for each joint of the log.

@@ -13,20 +13,31 @@ pub fn effective_std(errors: &[f64], lengths: &[usize]) -> f64 {
     (variance * rows_as_one).sqrt()
 }
 
-/// Returns the mean product of errors that are `lag` rows apart in their window.
+/// Returns the mean product of errors that are `lag` rows apart in their window. Missing errors are NaN, and do not count.
 fn covariance(errors: &[f64], lengths: &[usize], lag: usize) -> f64 {
     let (mut sum, mut rest) = (0.0, errors);
     for length in lengths {
         let (window, after) = rest.split_at(*length);
-        sum += window.iter().zip(&window[lag.min(window.len())..]).map(|(one, other)| one * other).sum::<f64>();
+        let products = window.iter().zip(&window[lag.min(window.len())..]).map(|(one, other)| one * other);
+        sum += products.filter(|product| !product.is_nan()).sum::<f64>();
         rest = after;
     }
-    sum / errors.len().max(1) as f64
+    let known = errors.iter().filter(|error| !error.is_nan()).count();
+    sum / known.max(1) as f64
 }
 
 #[cfg(test)]
 mod tests {
     use super::effective_std;
+
+    #[test]
+    fn missing_errors_do_not_count() {
+        let errors: Vec<f64> = (0..1000).map(|row| if row % 10 == 0 { 0.5 } else { f64::NAN }).collect();
+        assert!((effective_std(&errors, &[1000]) / 0.5).powi(2) > 0.99);
+        let white: Vec<f64> =
+            (0..1000).map(|row| if row % 10 == 0 { (row % 20) as f64 / 10.0 - 0.5 } else { f64::NAN }).collect();
+        assert!((effective_std(&white, &[1000]) - 0.5).abs() < 0.1, "{}", effective_std(&white, &[1000]));
+    }
 
     #[test]
     fn repeated_errors_count_once() {

@@ -1,9 +1,11 @@
 //! Free parameters, and the candidates that they make.
 
-use twinstep_effects::{Effect, JointEffect, JointScope, NominalGain, TreeModelFile};
-use twinstep_model::TreeModel;
+use std::collections::BTreeMap;
 
-use crate::{InferenceError, JointScale, Quantity};
+use twinstep_effects::{Effect, JointEffect, JointScope, NominalGain, TreeModelFile};
+use twinstep_model::{TreeJointKind, TreeModel};
+
+use crate::{InferenceError, JointLog, JointScale, Quantity};
 
 /// Request of the user: an effect with a scope, as in `coulomb_friction@each`.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -63,33 +65,47 @@ pub struct FreeParameter {
     pub prior: [f64; 2],
     /// Unit of the value.
     pub unit: &'static str,
+    /// True for a gain that the log states: the value is the factor on it.
+    pub is_factor: bool,
 }
 
 impl FreeParameter {
-    /// Returns the parameters that are requested, on the `joints` of a log.
+    /// Returns the parameters that are requested at the joints of a log, and the gains that it does not state.
     pub fn of(
         requests: &[ParameterRequest],
         file: &TreeModelFile,
-        joints: &[usize],
-        known_gains: bool,
+        log: &JointLog,
     ) -> Result<Vec<Self>, InferenceError> {
-        let scales = JointScale::of(&file.nominal);
-        let gains = (!known_gains).then(|| ParameterRequest("pd_gain@each".to_owned()));
-        let is_gain = |request: &ParameterRequest| request.0.starts_with("pd_gain@");
-        let gains = gains.filter(|_| !requests.iter().any(is_gain));
-        let mut all = Vec::<Self>::new();
-        for request in gains.iter().chain(requests) {
-            for (quantity, joints) in request.parameters(file, joints)? {
-                let priors: Vec<_> = joints.iter().map(|joint| quantity.prior(&scales[*joint], known_gains)).collect();
-                let log_median = priors.iter().map(|[median, _]| median.ln()).sum::<f64>() / priors.len() as f64;
-                let scope = match joints.as_slice() {
-                    [joint] => JointScope::Joint(file.nominal.tree.joints[*joint].name.clone()),
-                    _ => JointScope::All,
-                };
-                let prior = [log_median.exp(), priors[0][1]];
-                all.push(Self { quantity, unit: unit(quantity), joints, scope, prior });
+        let joints: Vec<usize> = log.joints.iter().map(|joint| joint.joint).collect();
+        let mut meant = Vec::new();
+        for request in requests {
+            meant.extend(request.parameters(file, &joints)?);
+        }
+        for quantity in [Quantity::PositionGain, Quantity::VelocityGain] {
+            for joint in joints.iter().filter(|joint| !log.states_gain(quantity, **joint)) {
+                let is_requested = meant.iter().any(|(other, joints)| *other == quantity && joints.contains(joint));
+                if !is_requested {
+                    meant.push((quantity, vec![*joint]));
+                }
             }
         }
+        let scales = JointScale::of(&file.nominal);
+        let parameter = |(quantity, joints): (Quantity, Vec<usize>)| {
+            let stated = |joint: &usize| log.states_gain(quantity, *joint);
+            let priors: Vec<_> = joints.iter().map(|joint| quantity.prior(&scales[*joint], stated(joint))).collect();
+            let log_median = priors.iter().map(|[median, _]| median.ln()).sum::<f64>() / priors.len() as f64;
+            let widest = priors.iter().map(|[_, std]| *std).fold(0.0, f64::max);
+            let is_gain = matches!(quantity, Quantity::PositionGain | Quantity::VelocityGain);
+            let is_factor = is_gain && (joints.len() > 1 || joints.iter().all(stated));
+            let scope = match joints.as_slice() {
+                [joint] => JointScope::Joint(file.nominal.tree.joints[*joint].name.clone()),
+                _ => JointScope::All,
+            };
+            let is_slide = joints.iter().all(|joint| file.nominal.tree.joints[*joint].kind == TreeJointKind::Prismatic);
+            let unit = if is_factor { "" } else { unit(quantity, is_slide) };
+            Self { quantity, unit, joints, scope, prior: [log_median.exp(), widest], is_factor }
+        };
+        let mut all: Vec<Self> = meant.into_iter().map(parameter).collect();
         all.sort_by_key(|parameter| (parameter.quantity, parameter.joints.clone()));
         let twice = |pair: &&[Self]| {
             pair[0].quantity == pair[1].quantity && pair[1].joints.iter().any(|joint| pair[0].joints.contains(joint))
@@ -122,13 +138,17 @@ impl FreeParameter {
     }
 }
 
-fn unit(quantity: Quantity) -> &'static str {
-    match quantity {
-        Quantity::Armature => "kg·m²",
-        Quantity::ViscousFriction | Quantity::VelocityGain => "N·m·s/rad",
-        Quantity::CoulombFriction => "N·m",
-        Quantity::CommandDelay => "s",
-        Quantity::PositionGain => "N·m/rad",
+fn unit(quantity: Quantity, is_slide: bool) -> &'static str {
+    match (quantity, is_slide) {
+        (Quantity::Armature, false) => "kg·m²",
+        (Quantity::Armature, true) => "kg",
+        (Quantity::ViscousFriction | Quantity::VelocityGain, false) => "N·m·s/rad",
+        (Quantity::ViscousFriction | Quantity::VelocityGain, true) => "N·s/m",
+        (Quantity::CoulombFriction, false) => "N·m",
+        (Quantity::CoulombFriction, true) => "N",
+        (Quantity::CommandDelay, _) => "s",
+        (Quantity::PositionGain, false) => "N·m/rad",
+        (Quantity::PositionGain, true) => "N/m",
     }
 }
 
@@ -168,8 +188,11 @@ impl Candidate {
         moved
     }
 
-    /// Returns the value that a report states: the gain itself in place of its factor.
+    /// Returns the value that a report states: an unknown gain itself in place of its factor.
     pub fn reported(&self, parameter: &FreeParameter, value: f64) -> f64 {
+        if parameter.is_factor {
+            return value;
+        }
         match (parameter.quantity, parameter.joints.as_slice()) {
             (Quantity::PositionGain, [joint]) => value * self.kp[*joint],
             (Quantity::VelocityGain, [joint]) => value * self.kd[*joint],
@@ -180,36 +203,44 @@ impl Candidate {
 
 /// Writes estimated values, with their intervals, to the model file.
 ///
-/// A file states what is added to the robot file. Gains become those of the file, with a factor of 1 that carries the interval.
+/// A file states what is added to the robot file. Gains that the log does not state become those of the file, with a factor of 1 that
+/// carries the interval.
 pub fn write_estimates(
     file: &mut TreeModelFile,
     before: &Candidate,
+    log: &JointLog,
     parameters: &[FreeParameter],
     values: &[(f64, [f64; 2])],
-    states_gains: bool,
 ) {
     let names: Vec<String> = file.nominal.tree.joints.iter().map(|joint| joint.name.clone()).collect();
-    let estimated = |effect: &str| parameters.iter().any(|parameter| parameter.quantity.effect() == effect);
-    file.effects.retain(|entry| !estimated(entry.effect.name));
+    let estimated = |effect: &str, joint: usize| {
+        parameters.iter().any(|parameter| parameter.quantity.effect() == effect && parameter.joints.contains(&joint))
+    };
+    file.effects = std::mem::take(&mut file.effects)
+        .into_iter()
+        .flat_map(|entry| without(entry, &names, &|effect, joint| estimated(effect, joint)))
+        .collect();
     let kept = file.tree_model().expect("it was possible with more entries");
-    let mut gains = [before.kp.clone(), before.kd.clone()];
-    let mut entries = std::collections::BTreeMap::<(&str, usize), (Vec<f64>, Vec<Option<[f64; 2]>>)>::new();
+    let mut entries = BTreeMap::<(&str, usize), (Vec<f64>, Vec<Option<[f64; 2]>>)>::new();
     for (parameter, (value, interval)) in parameters.iter().zip(values) {
         for joint in &parameter.joints {
             let effect = parameter.quantity.effect();
-            let count = Effect::named(effect).map_or(1, Effect::num_values);
-            let neutral = if effect == "pd_gain" { 1.0 } else { 0.0 };
+            let actuator = &before.robot.joints[*joint].actuator;
+            let start = if effect == "pd_gain" { vec![actuator.kp_scale, actuator.kd_scale] } else { vec![0.0] };
             let (numbers, intervals) =
-                entries.entry((effect, *joint)).or_insert_with(|| (vec![neutral; count], vec![None; count]));
-            let slot = usize::from(parameter.quantity == Quantity::VelocityGain);
+                entries.entry((effect, *joint)).or_insert_with(|| (start.clone(), vec![None; start.len()]));
+            let (slot, gains, table) = match parameter.quantity {
+                Quantity::VelocityGain => (1, &before.kd, &mut file.kd),
+                _ => (0, &before.kp, &mut file.kp),
+            };
             let own = parameter.quantity.get(&kept.joints[*joint]);
             if effect != "pd_gain" {
                 (numbers[slot], intervals[slot]) = (value - own, Some(interval.map(|end| end - own)));
-            } else if states_gains {
+            } else if log.states_gain(parameter.quantity, *joint) {
                 (numbers[slot], intervals[slot]) = (*value, Some(*interval));
             } else {
-                gains[slot][*joint] *= value;
-                intervals[slot] = Some(interval.map(|end| end / value));
+                set_gain(table, &names, *joint, gains[*joint] * value);
+                (numbers[slot], intervals[slot]) = (1.0, Some(interval.map(|end| end / value)));
             }
         }
     }
@@ -217,9 +248,29 @@ pub fn write_estimates(
         let effect = Effect::named(effect).expect("a quantity has an effect of the catalogue");
         file.effects.push(JointEffect { effect, scope: JointScope::Joint(names[joint].clone()), values, intervals });
     }
-    if !states_gains {
-        let by_joint =
-            |gains: &[f64]| NominalGain::PerJoint(names.iter().cloned().zip(gains.iter().copied()).collect());
-        (file.kp, file.kd) = (Some(by_joint(&gains[0])), Some(by_joint(&gains[1])));
+}
+
+/// Returns an entry without the joints at which its effect is estimated: itself, none, or one for each other joint.
+fn without(entry: JointEffect, names: &[String], estimated: &dyn Fn(&str, usize) -> bool) -> Vec<JointEffect> {
+    let effect = entry.effect.name;
+    if (0..names.len()).all(|joint| !estimated(effect, joint)) {
+        return vec![entry];
     }
+    let applies = |joint: usize| match &entry.scope {
+        JointScope::All => true,
+        JointScope::Joint(name) => *name == names[joint],
+    };
+    let others = (0..names.len()).filter(|joint| applies(*joint) && !estimated(effect, *joint));
+    others.map(|joint| JointEffect { scope: JointScope::Joint(names[joint].clone()), ..entry.clone() }).collect()
+}
+
+/// Sets the gain of one joint in the table of a model file.
+fn set_gain(table: &mut Option<NominalGain>, names: &[String], joint: usize, gain: f64) {
+    let mut gains = match table.take() {
+        None => BTreeMap::new(),
+        Some(NominalGain::All(gain)) => names.iter().map(|name| (name.clone(), gain)).collect(),
+        Some(NominalGain::PerJoint(gains)) => gains,
+    };
+    gains.insert(names[joint].clone(), gain);
+    *table = Some(NominalGain::PerJoint(gains));
 }

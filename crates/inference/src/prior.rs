@@ -1,6 +1,6 @@
 //! What can be estimated at a joint, and its prior.
 
-use twinstep_model::{JointModel, RobotTree, TreeModel};
+use twinstep_model::{JointModel, RobotTree, TreeJointKind, TreeModel};
 
 /// Gravity [m/s²].
 const GRAVITY: f64 = 9.81;
@@ -126,16 +126,22 @@ impl JointScale {
     }
 }
 
-/// Returns the torque that holds the links beyond a joint level and accelerates them by 20 rad/s² [N·m], at position 0 of all joints.
+/// Returns the torque that holds the links beyond a joint level and accelerates them by 20 rad/s² [N·m], at position 0 of all joints. A slide
+/// lifts them and accelerates them by 20 m/s² [N].
 fn outer_torque(tree: &RobotTree, index: usize) -> f64 {
     let poses = tree.base_from_bodies(&vec![0.0; tree.joints.len()]);
     let origin = poses[index + 1].translation;
     let mut moved = vec![false; tree.bodies.len()];
+    let is_slide = tree.joints[index].kind == TreeJointKind::Prismatic;
     let (mut torque, mut inertia) = (0.0, 0.0);
     for body in index + 1..tree.bodies.len() {
         moved[body] = body == index + 1 || moved[tree.joints[body - 1].parent];
         if moved[body] {
             let link = &tree.bodies[body].inertia;
+            if is_slide {
+                torque += link.mass * (GRAVITY + 20.0);
+                continue;
+            }
             let arm = poses[body].transform_point3(link.com).distance(origin);
             torque += link.mass * GRAVITY * arm;
             inertia += link.mass * arm * arm + link.inertia.x_axis.x.max(link.inertia.y_axis.y);

@@ -92,6 +92,9 @@ fn smoothed(t: &[f64], cells: &[f64], row: usize) -> [f64; 2] {
     let near = (0..cells.len())
         .filter(|other| (other.abs_diff(row) <= 2 || (t[*other] - t[row]).abs() < 0.0201) && cells[*other].is_finite());
     let near: Vec<_> = near.map(|other| (t[other] - t[row], cells[other])).collect();
+    if near.is_empty() {
+        return [cells[row], 0.0];
+    }
     let order = near.len().min(3);
     let scale = near.iter().map(|(t, _)| t.abs()).fold(1e-3, f64::max);
     let design = DMatrix::from_fn(near.len(), order, |row, power| (near[row].0 / scale).powi(power as i32));

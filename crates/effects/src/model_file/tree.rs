@@ -6,12 +6,12 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
-use twinstep_model::{JointModel, MjcfOptions, TreeModel, go2, mjcf};
+use twinstep_model::{JOINT_NAMES, JointModel, MjcfOptions, NUM_JOINTS, TreeModel, go2, mjcf};
 use twinstep_robot_files::read_robot;
 
 use super::effect_table::{EffectTable, key_error, read_table, write_table};
 use super::error::{EffectEntryError, ModelFileError};
-use crate::nominal::{BUILT_IN, NominalRobotError, is_robot_file};
+use crate::nominal::{BUILT_IN, JointsTable, NominalRobotError, is_robot_file};
 use crate::{Apply, CATALOGUE, Effect};
 
 /// A robot of any tree, and the effects at its joints.
@@ -119,15 +119,34 @@ struct Control {
     policy_hz: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     action_scale: Option<f64>,
-    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    default_pose: BTreeMap<String, f64>,
+    #[serde(default, skip_serializing_if = "is_default")]
+    default_pose: Pose,
+}
+
+/// Default pose: by joint, or as in the model file of a quadruped, in the order FL, FR, RL, RR; hip, thigh, calf.
+#[derive(Clone, PartialEq, Serialize, Deserialize)]
+#[serde(
+    untagged,
+    expecting = "a table with a position for each joint, such as { elbow = 0.5 }, or the twelve positions of a quadruped"
+)]
+enum Pose {
+    PerJoint(BTreeMap<String, f64>),
+    Quadruped([f64; NUM_JOINTS]),
+}
+
+impl Default for Pose {
+    fn default() -> Self {
+        Self::PerJoint(BTreeMap::new())
+    }
 }
 
 #[derive(Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 struct Joints {
     #[serde(default)]
     rename: BTreeMap<String, String>,
+    /// Names of the joints of a quadruped, and its feet, which a tree does not need.
+    #[serde(flatten)]
+    of_quadruped: JointsTable,
 }
 
 impl TreeModelFile {
@@ -198,6 +217,10 @@ impl TreeModelFile {
                 return Err(malformed(format!("`control.{key}` is {value}; {expected} expected")));
             }
         }
+        let default_pose = match default_pose {
+            Pose::PerJoint(pose) => pose,
+            Pose::Quadruped(pose) => file.quadruped_pose(pose, joints.of_quadruped.names).map_err(malformed)?,
+        };
         file.check_pose(&default_pose).map_err(malformed)?;
         (file.kp, file.kd, file.actuator_hz) = (kp, kd, actuator_hz);
         (file.policy_hz, file.action_scale, file.default_pose) = (policy_hz, action_scale, default_pose);
@@ -263,6 +286,23 @@ impl TreeModelFile {
             Some(value) => Err(format!("`control.{key}` is {value}; finite and not negative expected")),
             None => Ok(()),
         }
+    }
+
+    /// Returns the pose of a quadruped by the names of its joints: `names`, or those of the Go2 with or without `_joint`.
+    fn quadruped_pose(
+        &self,
+        pose: [f64; NUM_JOINTS],
+        names: Option<[String; NUM_JOINTS]>,
+    ) -> Result<BTreeMap<String, f64>, String> {
+        let names = names.unwrap_or_else(|| JOINT_NAMES.map(str::to_owned));
+        let own = |name: String| {
+            let long = format!("{name}_joint");
+            let found = [&name, &long].into_iter().find(|name| self.nominal.tree.joint(name).is_some()).cloned();
+            found.ok_or_else(|| {
+                format!("`control.default_pose` is a list, and the robot has no joint `{name}`; {}", self.joints_are())
+            })
+        };
+        names.into_iter().map(own).zip(pose).map(|(name, position)| Ok((name?, position))).collect()
     }
 
     fn check_pose(&self, pose: &BTreeMap<String, f64>) -> Result<(), String> {
@@ -347,8 +387,15 @@ impl TreeModelFile {
             self.clone();
         let head = TreeText {
             robot,
-            control: Control { kp, kd, actuator_hz, policy_hz, action_scale, default_pose },
-            joints: Joints { rename },
+            control: Control {
+                kp,
+                kd,
+                actuator_hz,
+                policy_hz,
+                action_scale,
+                default_pose: Pose::PerJoint(default_pose),
+            },
+            joints: Joints { rename, of_quadruped: JointsTable::default() },
             effect: Vec::new(),
         };
         let mut text = toml::to_string(&head).expect("numbers by names");
@@ -426,6 +473,17 @@ mod tests {
         assert_eq!(TreeModelFile::parse(&file.to_toml(), "again").expect("valid"), file, "{}", file.to_toml());
         let plain = read("").expect("valid");
         assert_eq!(TreeModelFile::parse(&plain.to_toml(), "again").expect("valid"), plain);
+    }
+
+    #[test]
+    fn model_file_of_a_quadruped_is_that_of_a_tree_too() {
+        for name in ["go1", "a1", "b2", "aliengo", "spot"] {
+            let path = format!("{}/../../data/robots/{name}.toml", env!("CARGO_MANIFEST_DIR"));
+            let file = TreeModelFile::load(&path).unwrap_or_else(|error| panic!("{error}"));
+            let knee =
+                file.nominal.tree.joints.iter().position(|joint| joint.name.starts_with("RR_calf")).expect("a knee");
+            assert!(file.pose()[knee] < -1.0 && file.kp.is_some(), "{name}: {:?}", file.pose());
+        }
     }
 
     #[test]
