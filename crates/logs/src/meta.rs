@@ -202,6 +202,7 @@ mod tests {
             pd: Some(String::new()),
             kp: Some(Gain::Uniform(30.0)),
             kd: Some(Gain::Uniform(1.0)),
+            base_quat: Some([1.0, 0.0, 0.0, 0.0]),
             noise: [("q".to_owned(), 0.001)].into(),
             source: Some(String::new()),
             licence: Some(String::new()),

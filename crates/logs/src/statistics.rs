@@ -47,7 +47,7 @@ mod tests {
 
     #[test]
     fn step_of_a_quantised_signal_is_found_and_a_smooth_signal_has_none() {
-        let smooth: Vec<f64> = (0..4000).map(|row| (f64::from(row) * 0.01).sin()).collect();
+        let smooth: Vec<f64> = (0..4000).map(|row| 0.3 * (f64::from(row) * 0.01).sin()).collect();
         let rounded: Vec<f64> = smooth.iter().map(|value| (value / 0.0015).round() * 0.0015).collect();
         assert!((quantum(&rounded).expect("quantised") - 0.0015).abs() < 1e-9);
         assert_eq!(quantum(&smooth), None);

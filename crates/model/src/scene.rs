@@ -77,7 +77,7 @@ impl Scene {
 }
 
 impl Scene {
-    /// Returns the scene of a robot of any tree: its shapes, and rods from each joint to the next, because many files have no shapes.
+    /// Returns the scene of a robot of any tree: its shapes, and rods from each joint to the next and to its spheres, because many files have no other shapes.
     pub fn of_tree(tree: &RobotTree, world_from_base: DAffine3, q: &[f64], ground: &Ground) -> Self {
         let pose = |body: DAffine3| pose_of(world_from_base * body).to_array();
         let longest = tree.joints.iter().map(|joint| joint.parent_from_child.translation.length()).fold(0.0, f64::max);
@@ -85,11 +85,16 @@ impl Scene {
         let rod = |joint: &crate::TreeJoint| {
             capsule(joint.parent as u32, 0.06 * longest, [DVec3::ZERO, joint.parent_from_child.translation])
         };
+        let feet = tree.shapes.iter().filter(|shape| matches!(shape.kind, TreeShapeKind::Sphere(_)));
+        let feet = feet.filter(|shape| shape.body_from_shape.translation.length() > 1e-3);
+        let shank = |shape: &TreeShape| {
+            capsule(shape.body as u32, 0.04 * longest, [DVec3::ZERO, shape.body_from_shape.translation])
+        };
         let position = world_from_base.translation;
         Self {
             bodies: tree.bodies.iter().map(|body| body.name.clone()).collect(),
             pose: tree.base_from_bodies(q).into_iter().map(pose).collect(),
-            shapes: tree.shapes.iter().filter_map(tree_shape).chain(rods.map(rod)).collect(),
+            shapes: tree.shapes.iter().filter_map(tree_shape).chain(rods.map(rod)).chain(feet.map(shank)).collect(),
             ground: ground.crop(position.x as f32, position.y as f32),
             command: None,
             velocity: None,

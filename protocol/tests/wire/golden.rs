@@ -18,10 +18,11 @@ use twinstep_protocol::tensor::as_bytes;
 use twinstep_protocol::{ErrorCode, ErrorReply, PROTOCOL, decode, encode};
 
 /// Name of every golden file, without `.msgpack`.
-pub const NAMES: [&str; 33] = [
+pub const NAMES: [&str; 34] = [
     "hello_request",
     "hello_reply",
     "hello_reply_real_time",
+    "hello_reply_joint_gains",
     "lease_request",
     "lease_request_reclaim",
     "lease_request_critic",
@@ -152,6 +153,8 @@ fn hello_has_its_golden_bytes() {
         state: "ready".to_owned(),
         stop_port: Some(7448),
     };
+    let spec = EnvSpec { joint_gains: vec![[30.0, 0.75], [40.0, 1.0]], ..small_spec() };
+    check("hello_reply_joint_gains", &HelloReply { spec_hash: spec.hash(), spec, ..reply.clone() });
     check("hello_reply_real_time", &HelloReply { max_envs: 1, real_time: Some(real_time), ..reply });
 }
 

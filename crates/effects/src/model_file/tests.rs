@@ -120,7 +120,7 @@ fn errors_in_an_effect_contain_the_allowed_values() {
         &expect![[r#"robot.toml: effect 1: `interval.torque_nm` is [2, 1]; expected low <= high"#]],
     );
     check_refusal(
-        &FRICTION.replace("RR_thigh", "RR_knee"),
+        &format!("{}torque_nm = 1", FRICTION.replace("RR_thigh", "RR_knee")),
         &expect![[
             r#"robot.toml: effect 1: `scope` is "RR_knee"; expected one of all, hip, thigh, calf, FL, FR, RL, RR, left, right, base, ground, or a joint such as FL_hip"#
         ]],

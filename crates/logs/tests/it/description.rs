@@ -25,7 +25,7 @@ fn summary_of_the_real_recording() {
           tau_ff         assumed zero: a commanded torque is attributed to an effect
           temp           a drift of friction is confounded with motor temperature
           battery_V      supply sag is confounded with weak motors
-          quat           the base is assumed level: a tilt is attributed to a load
+          quat           a fixed base is assumed level without `base_quat` in meta.json: a tilt is attributed to a load
         joints             position [rad]          speed [rad/s]        torque [N·m]     reversals   frequency
                          low    high  to limit    RMS   peak  limit    RMS   peak  limit              [Hz]
           FL_hip       -0.047   0.485     0.562    0.45   1.07    4 %   1.79   3.12   13 %      12   0.34–0.48
@@ -101,7 +101,7 @@ fn summary_of_a_log_with_gaps_missing_channels_and_warnings() {
           dq_cmd         assumed zero: a commanded velocity is attributed to a wrong damping
           tau_ff         assumed zero: a commanded torque is attributed to an effect
           temp           a drift of friction is confounded with motor temperature
-          quat           the base is assumed level: a tilt is attributed to a load
+          quat           a fixed base is assumed level without `base_quat` in meta.json: a tilt is attributed to a load
           gyro           base rotation is not compared, and a gyro bias is not identifiable
           acc            base acceleration is not compared
           pos            base height is estimated from the feet, and not compared

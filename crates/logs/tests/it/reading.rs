@@ -130,7 +130,7 @@ fn compressed_csv_equals_plain_csv() {
 
 #[test]
 fn log_of_an_arm_needs_no_gains_and_describes_what_it_has() {
-    let rows = (0..40).map(|row| {
+    let rows = (0..400).map(|row| {
         let t = f64::from(row) * 0.02;
         let counts = (400.0 * (3.0 * t).sin()).round();
         format!("{t},{},{},{}\n", 0.6 * (3.0 * t).sin(), counts * 0.0015, (counts / 40.0).abs().round() * 0.02)

@@ -22,6 +22,8 @@ _CAMERA_SMOOTHING = 0.2
 """Fraction of the distance to the robot by which the camera moves per image, so that a trot does not shake it."""
 _NEAR_CLIP_M = 1.0
 """Distance from the camera's target to the robot above which the camera jumps, as after a reset."""
+_REACH_M = 0.75
+"""Largest distance of a body from the ground under the base at the usual distance of the camera. A Go2 reaches less."""
 
 
 class Viewer:
@@ -47,6 +49,7 @@ class Viewer:
             raise ValueError(f'`mode` = {mode!r} is not allowed: "rgb_array" or "human"')
         self._width, self._height = width, height
         self._target: Array | None = None
+        self._zoom = np.float32(0)
         self._backdrop: Backdrop | None = None
         self._window = Window(width, height, fps) if mode == "human" else None
 
@@ -66,7 +69,12 @@ class Viewer:
         shapes = shapes_of(scene)
         ground = cast(Mapping[str, Any], scene["ground"])
         point, normal = (np.asarray(ground[key], dtype=np.float32) for key in ("point", "normal"))
-        base = np.frombuffer(cast(bytes, scene["pose"]), dtype="<f4", count=3).astype(np.float32)
+        bodies = np.frombuffer(cast(bytes, scene["pose"]), dtype="<f4").astype(np.float32).reshape(-1, 7)[:, :3]
+        base = bodies[0]
+        if self._zoom == 0:
+            # A taller robot is seen from further away, during the whole episode alike.
+            reach = np.linalg.norm(bodies - np.append(base[:2], np.float32(0)), axis=1).max()
+            self._zoom = np.float32(max(1.0, float(reach) / _REACH_M))
         field = None if ground.get("height_field") is None else HeightField.read(ground["height_field"])
         if field is not None:
             # The camera follows the point of the ground under the robot.
@@ -103,9 +111,9 @@ class Viewer:
             last = under
         smoothed = last + np.float32(_CAMERA_SMOOTHING) * (under - last)
         self._target = smoothed
-        target = smoothed + np.float32(0.17) * normal
+        target = smoothed + self._zoom * np.float32(0.17) * normal
         backward = _CAMERA_OFFSET_M / np.float32(np.linalg.norm(_CAMERA_OFFSET_M))
         right = np.cross(np.array([0, 0, 1], dtype=np.float32), backward)
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(backward, right), backward], axis=1).astype(np.float32)
-        return Camera(target + _CAMERA_OFFSET_M, axes, self._width, self._height)
+        return Camera(target + self._zoom * _CAMERA_OFFSET_M, axes, self._width, self._height)
