@@ -1,6 +1,6 @@
 //! The task `pose`: the joints of any robot follow targets, and a robot with a free base does not fall.
 //!
-//! Every robot can do it: an arm reaches, a humanoid stands and moves. The targets of all joints are drawn anew after a random time.
+//! Every robot can do it: an arm reaches, a humanoid stands and moves. New targets of all joints are drawn after a random time.
 
 use rand::RngExt;
 use twinstep_model::{EnvSpec, SpecField, Stream, frames};
