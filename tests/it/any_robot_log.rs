@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::{Command as Process, Output};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use twinstep_effects::{Effect, JointEffect, JointScope, NominalGain, TreeModelFile};
 use twinstep_inference::{Candidate, IdentifyOptions, JointLog, ParameterRequest, evaluate, identify};
@@ -78,8 +80,8 @@ fn identification_recovers_gains_delay_friction_and_rotor_of_an_arm_on_a_wall() 
     let joint_log = JointLog::new(&log, &file.nominal.tree, |_| true).unwrap();
     assert!(joint_log.has_unknown_gains());
     let requests = ParameterRequest::DEFAULT.map(|request| ParameterRequest(request.to_owned())).to_vec();
-    let options = IdentifyOptions { requests, actuator_hz: 1000.0 };
-    let found = identify(&file, &joint_log, &options, &mut |_, _, _| true).unwrap();
+    let options = IdentifyOptions { requests, actuator_hz: 1000.0, stop: Arc::default() };
+    let found = identify(&file, &joint_log, &options, &mut |_, _, _| {}).unwrap();
     let truth = hidden();
     let mut covered = 0;
     for estimate in &found.estimates {
@@ -120,8 +122,8 @@ fn only_unknown_gains_become_those_of_the_model_file_and_other_joints_keep_their
     log = Log::new(meta, columns_of(&log)).unwrap();
     let joint_log = JointLog::new(&log, &file.nominal.tree, |_| true).unwrap();
     let requests = vec![ParameterRequest("coulomb_friction@gripper".to_owned())];
-    let options = IdentifyOptions { requests, actuator_hz: 1000.0 };
-    let found = identify(&file, &joint_log, &options, &mut |_, _, _| true).unwrap().model;
+    let options = IdentifyOptions { requests, actuator_hz: 1000.0, stop: Arc::default() };
+    let found = identify(&file, &joint_log, &options, &mut |_, _, _| {}).unwrap().model;
     assert_eq!(found.kp, None, "the log states kp");
     assert!(found.kd.as_ref().unwrap().of("gripper").is_some());
     let friction = |file: &TreeModelFile, joint: usize| file.tree_model().unwrap().joints[joint].coulomb_friction;
@@ -137,8 +139,8 @@ fn selections_that_are_too_short_gaps_and_missing_cells_are_no_panic() {
     let (file, whole) = (arm(), log(4.0));
     let short = JointLog::new(&whole, &file.nominal.tree, |row| (100..120).contains(&row)).unwrap();
     let requests = vec![ParameterRequest("armature@all".to_owned())];
-    let options = IdentifyOptions { requests, actuator_hz: 1000.0 };
-    let error = identify(&file, &short, &options, &mut |_, _, _| true).unwrap_err().to_string();
+    let options = IdentifyOptions { requests, actuator_hz: 1000.0, stop: Arc::default() };
+    let error = identify(&file, &short, &options, &mut |_, _, _| {}).unwrap_err().to_string();
     assert!(error.contains("shorter than 0.4 s"), "{error}");
 
     let mut columns = columns_of(&whole);
@@ -154,6 +156,18 @@ fn selections_that_are_too_short_gaps_and_missing_cells_are_no_panic() {
     let nanoseconds = Log::new(whole.meta().clone(), columns).unwrap();
     let error = JointLog::new(&nanoseconds, &file.nominal.tree, |_| true).unwrap_err().to_string();
     assert!(error.contains("20 to 2000 Hz"), "{error}");
+}
+
+#[test]
+fn interrupted_identification_gives_the_best_values_so_far_with_the_intervals_of_the_priors() {
+    let (file, log) = (arm(), log(4.0));
+    let joint_log = JointLog::new(&log, &file.nominal.tree, |_| true).unwrap();
+    let requests = vec![ParameterRequest("armature@each".to_owned())];
+    let stop = Arc::new(AtomicBool::new(true));
+    let options = IdentifyOptions { requests, actuator_hz: 1000.0, stop };
+    let found = identify(&file, &joint_log, &options, &mut |_, _, _| {}).unwrap();
+    assert!(found.interrupted && found.estimates.iter().all(|estimate| estimate.is_wide), "{:?}", found.estimates);
+    assert!(found.model.tree_model().is_ok());
 }
 
 #[test]

@@ -7,7 +7,7 @@ use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, EffectEntry, Scope, apply_effects};
 use twinstep_identify::evaluate;
 use twinstep_logs::{Log, Meta, TorqueSensor};
-use twinstep_model::{JOINT_NAMES, Joint, RobotModel, go2, standard_normal, stream};
+use twinstep_model::{JOINT_NAMES, Joint, JointKind, RobotModel, go2, standard_normal, stream};
 use twinstep_sim::{BatchRollout, SimConfig};
 use twinstep_tests::browser::{browser, layout};
 use twinstep_tests::ground_truth_actuator::{DRIVES, Motion, NOISE_NM};
@@ -32,7 +32,7 @@ fn diagnosis_of(recording: &Log, folder: &Path) -> Diagnosis {
     let page = std::fs::read_to_string(out.join("report.html")).unwrap();
     assert!(page.starts_with("<!doctype html>") && page.len() > 10_000);
     let extended = ModelFile::load(out.join(&diagnosis.extended_model)).unwrap();
-    assert_eq!(extended.effects.len(), diagnosis.findings.len());
+    assert_eq!(extended.effects.len(), diagnosis.findings.len() + diagnosis.joint_gains.len());
     diagnosis
 }
 
@@ -171,15 +171,15 @@ fn ideal_robot_has_no_finding() {
     assert!(!folder.path().join("diagnosis/next_experiment").exists());
 }
 
-/// Returns a log of [`log_of`] with the torques of PD loops whose position gains have these scales, and noise.
-fn with_motor_torques(log: &Log, kp_scale: [f64; 12]) -> Log {
+/// Returns a log of [`log_of`] with the torques of a law, given joint and both parts of the torque of an ideal PD loop, and noise.
+fn with_motor_torques(log: &Log, law: impl Fn(usize, [f64; 2]) -> f64) -> Log {
     let mut meta = log.meta().clone();
     meta.tau_sensor = TorqueSensor::MotorCurrent;
     meta.noise.insert("tau_measured".to_owned(), NOISE_NM);
     let mut random = stream(6, "torque noise", 0);
-    let torques = JOINT_NAMES.iter().zip(kp_scale).map(|(joint, scale)| {
+    let torques = JOINT_NAMES.iter().enumerate().map(|(index, joint)| {
         let [q, dq, q_cmd] = ["q", "dq", "q_cmd"].map(|quantity| log.channel(&format!("{quantity}_{joint}")).unwrap());
-        let torque = |row: usize| scale * 25.0 * (q_cmd[row] - q[row]) - 0.6 * dq[row];
+        let torque = |row: usize| law(index, [25.0 * (q_cmd[row] - q[row]), -0.6 * dq[row]]);
         let measured = (0..log.rows()).map(|row| torque(row) + NOISE_NM * standard_normal(&mut random));
         (format!("tau_measured_{joint}"), measured.collect())
     });
@@ -197,7 +197,7 @@ fn gains_that_differ_from_joint_to_joint_are_in_the_extended_model_and_no_cause(
     let entry = |(joint, scale): (Joint, f64)| EffectEntry::new(effect, Scope::Joint(joint), vec![scale, 1.0]).unwrap();
     let robot = apply_effects(&go2(), &Joint::ALL.into_iter().zip(kp).map(entry).collect::<Vec<_>>()).unwrap();
     let log = folder.path().join("log.parquet");
-    with_motor_torques(&log_of(&robot), kp).write(&log).unwrap();
+    with_motor_torques(&log_of(&robot), |joint, [p, d]| kp[joint] * p + d).write(&log).unwrap();
     let out = folder.path().join("diagnosis");
     let output = twinstep(&["diagnose", log.to_str().unwrap(), "--out", out.to_str().unwrap()]);
     let printed = String::from_utf8_lossy(&output.stdout);
@@ -212,6 +212,42 @@ fn gains_that_differ_from_joint_to_joint_are_in_the_extended_model_and_no_cause(
     for (joint, scale) in extended.joints.iter().zip(kp) {
         assert!((joint.actuator.kp_scale - scale).abs() < 0.01, "{:?}", diagnosis.joint_gains);
     }
+}
+
+/// Diagnoses a robot with one effect at some joints, whose motors have the torques of a law. Returns its only cause.
+fn only_cause(effect: &str, scope: Scope, values: &[f64], law: impl Fn(usize, [f64; 2]) -> f64) -> (Cause, Diagnosis) {
+    let folder = tempfile::tempdir().unwrap();
+    let entry = EffectEntry::new(Effect::named(effect).unwrap(), scope, values.to_vec()).unwrap();
+    let robot = apply_effects(&go2(), &[entry]).unwrap();
+    let diagnosis = diagnosis_of(&with_motor_torques(&log_of(&robot), law), folder.path());
+    let [cause] = diagnosis.findings.as_slice() else { panic!("{:#?}", diagnosis.findings) };
+    assert_eq!((cause.effect.as_str(), cause.scope.as_str()), (effect, scope.to_string().as_str()));
+    (cause.clone(), diagnosis)
+}
+
+fn number(cause: &Cause, parameter: &str) -> f64 {
+    match cause.parameters[parameter].value {
+        ParameterValue::Number(value) => value,
+        ParameterValue::Vector(_) => panic!("a number"),
+    }
+}
+
+#[test]
+fn saturation_of_all_motors_is_named_alone_and_leaves_the_noise_of_the_sensor() {
+    let law = |_: usize, [p, d]: [f64; 2]| 8.0 * ((p + d) / 8.0).tanh();
+    let (cause, diagnosis) = only_cause("torque_saturation", Scope::All, &[8.0], law);
+    assert!((number(&cause, "kappa_nm") / 8.0 - 1.0).abs() < 0.05, "{:?}", cause.parameters);
+    assert!(diagnosis.extended.torque_rmse_nm.unwrap() < 1.1 * NOISE_NM, "{:?}", diagnosis.extended);
+    assert!(!diagnosis.decisions.is_empty());
+}
+
+#[test]
+fn velocity_gain_that_is_wrong_at_one_type_of_joints_is_named() {
+    let is_thigh = |joint: usize| joint % 3 == 1;
+    let law = move |joint: usize, [p, d]: [f64; 2]| p + if is_thigh(joint) { 0.65 } else { 1.0 } * d;
+    let (cause, _) = only_cause("pd_gain", Scope::Kind(JointKind::Thigh), &[1.0, 0.65], law);
+    assert!((number(&cause, "kd_scale") - 0.65).abs() < 0.03, "{:?}", cause.parameters);
+    assert!((number(&cause, "kp_scale") - 1.0).abs() < 0.02, "{:?}", cause.parameters);
 }
 
 /// A delay of the torque in the loop would explain the same torques.

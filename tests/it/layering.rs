@@ -20,7 +20,7 @@ const MAY_USE: [(&str, &[&str]); 30] = [
     ("crates/sim", &["simd", "model", "dynamics"]),
     ("crates/envs", &["model", "effects"]),
     ("crates/identify", &["model", "dynamics", "effects", "logs"]),
-    ("crates/diagnose", &["model", "dynamics", "effects", "logs", "identify"]),
+    ("crates/diagnose", &["model", "dynamics", "effects", "logs", "identify", "inference"]),
     ("crates/policy", &["files", "simd", "model"]),
     ("crates/learning", &["model", "policy"]),
     ("crates/agent", &["model", "logs", "policy"]),
@@ -32,7 +32,7 @@ const MAY_USE: [(&str, &[&str]); 30] = [
     ("env-server", &["model", "effects", "protocol", "session", "sim", "envs", "ensemble", "policy"]),
     ("clients/rust", &["model", "protocol", "session", "policy"]),
     ("crates/report", &["files", "model", "dynamics", "effects", "logs", "sim", "identify", "diagnose"]),
-    ("crates/inference", &["model", "effects", "logs", "identify", "sim"]),
+    ("crates/inference", &["model", "dynamics", "effects", "logs", "identify", "sim"]),
     ("crates/hunt", &["files", "model", "effects", "logs", "sim", "identify", "diagnose"]),
     ("crates/excite", &["model", "effects", "logs", "identify", "policy", "envs", "sim"]),
     (

@@ -107,7 +107,14 @@ pub fn run(args: &Args) -> CommandResult {
     let mut simulator = simulator(&robot)?;
     let (output, learned) = with_progress(|progress| {
         let output = diagnose(logs.clone(), &model, &mut simulator, progress).map_err(failure)?;
-        let learned = learned_residual::learn(&logs, &output, progress)?;
+        // What was found must not be lost with the networks.
+        let learned = match learned_residual::learn(&logs, &output, progress) {
+            Err(Failure::Input(error) | Failure::Other(error)) => {
+                eprintln!("note: the torque that no cause explains was not learned: {error}");
+                None
+            }
+            learned => learned?,
+        };
         Ok((output, learned))
     })?;
     let DiagnosisOutput { mut diagnosis, mut extended, next, .. } = output;

@@ -37,18 +37,21 @@ pub fn run(
         Some(given) => given.iter().map(|request| ParameterRequest(request.clone())).collect(),
         None => ParameterRequest::DEFAULT.map(|request| ParameterRequest(request.to_owned())).to_vec(),
     };
-    let options = IdentifyOptions { requests, actuator_hz: actuator_hz(file) };
+    let options = IdentifyOptions { requests, actuator_hz: actuator_hz(file), stop: signals.flag() };
     let bar = ProgressBar::new_spinner()
         .with_style(ProgressStyle::with_template("{spinner} {elapsed}  {msg}").expect("a template"));
     let found = identify(file, &joint_log, &options, &mut |round, rounds, cost| {
         bar.set_message(format!("round {round} of {rounds}, cost {cost:.4e}"));
         bar.tick();
-        !signals.check().unwrap_or(true)
     });
     bar.finish_and_clear();
     let found = found.map_err(input)?;
     twinstep_files::write(out, found.model.to_toml()).map_err(unwritable)?;
     print!("{}", text(&found));
+    if found.interrupted {
+        println!("interrupted: the values are the best so far, the intervals those of the priors");
+        return Err(Failure::Interrupted);
+    }
     let error = |file: &TreeModelFile| {
         let candidate = Candidate::of(file).map_err(input)?;
         Ok(evaluate(&joint_log, &candidate, options.actuator_hz).map_err(input)?.0.q_rmse_rad)
@@ -56,7 +59,7 @@ pub fn run(
     if let (Some(before), Some(after)) = (error(file)?, error(&found.model)?) {
         println!("closed-loop joint RMSE {before:.4} -> {after:.4} rad on the rows it was fitted to");
     }
-    if found.interrupted { Err(Failure::Interrupted) } else { Ok(()) }
+    Ok(())
 }
 
 /// Returns a table with one line per parameter, and the highly correlated pairs.

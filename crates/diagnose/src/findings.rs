@@ -30,6 +30,10 @@ pub struct Diagnosis {
     /// discriminates.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next_experiment: Option<NextExperiment>,
+    /// Why a cause was added, changed or removed, in order: the evidence of each candidate that was fitted [nat]. Empty if the log has no
+    /// motor currents.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub decisions: Vec<String>,
     /// File name of the corrected model, in the same folder.
     pub extended_model: String,
 }

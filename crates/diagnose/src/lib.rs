@@ -34,6 +34,7 @@
 
 mod affected_channels;
 mod backward_elimination;
+mod by_equations;
 mod candidates;
 mod confounders;
 mod cross_validation;
@@ -152,6 +153,11 @@ pub fn diagnose(
     for log in &logs {
         check_gains(log).map_err(ExperimentError::from)?;
     }
+    if let [log] = logs.as_slice()
+        && let Some(output) = by_equations::diagnose_by_equations(log, model, simulator, &mut say)?
+    {
+        return Ok(output);
+    }
     say("fitting the ground and the nuisance parameters")?;
     let Views { robot, judged, views } = Views::new(logs, model, simulator)?;
     let mut search = ForwardSelection {
@@ -203,6 +209,7 @@ pub fn diagnose(
         unexplained,
         learned_residual: None,
         next_experiment: next.as_ref().map(|next| next.summary.clone()),
+        decisions: Vec::new(),
         extended_model: String::new(),
     };
     let held_out = evidence.logs().iter().map(held_out_rows).collect();

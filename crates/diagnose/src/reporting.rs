@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::DMatrix;
-use twinstep_effects::{ModelFile, Target};
+use twinstep_effects::{Effect, ModelFile, Target};
 
 use super::cross_validation::{CandidateFit, FitProblem};
 use super::hypothesis::Hypothesis;
@@ -59,23 +59,25 @@ pub fn with_intervals(
         for (j, other) in fit.unknowns.iter().enumerate().take(i) {
             let correlation = covariance.map_or(0.0, |covariance| covariance[(i, j)] / (deviation(i) * deviation(j)));
             if correlation.abs() >= CORRELATED && one.effect != other.effect {
-                let experiment_between = |from: &'static twinstep_effects::Effect, to: &str| {
-                    from.confounders
-                        .iter()
-                        .find(|confusion| confusion.effect == to)
-                        .map(|confusion| confusion.discriminating_experiment)
-                };
-                let experiment = experiment_between(one.effect, other.effect.name)
-                    .or(experiment_between(other.effect, one.effect.name));
                 confusable.push(CorrelatedPair {
                     effects: [other.effect.name.to_owned(), one.effect.name.to_owned()],
                     correlation,
-                    experiment: experiment.unwrap_or("A different motion, with other speeds and loads.").to_owned(),
+                    experiment: experiment_between(one.effect, other.effect),
                 });
             }
         }
     }
     (model, confusable)
+}
+
+/// Returns the experiment that discriminates between two effects.
+pub fn experiment_between(one: &Effect, other: &Effect) -> String {
+    let told = |from: &Effect, to: &Effect| {
+        let mut confounders = from.confounders.iter();
+        confounders.find(|confounder| confounder.effect == to.name).map(|found| found.discriminating_experiment)
+    };
+    let experiment = told(one, other).or_else(|| told(other, one));
+    experiment.unwrap_or("A different motion, with other speeds and loads.").to_owned()
 }
 
 /// Returns the values of a cause with the intervals of its entry in the extended model.

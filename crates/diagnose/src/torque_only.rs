@@ -53,6 +53,7 @@ pub fn diagnose_torques(logs: &[Log], progress: &mut DiagnoseProgress) -> Result
     let ([baseline, noise_floor], [extended, _]) = (sums(|part| part.before), sums(|part| part.after));
     let unexplained = all.iter().map(|part| part.unexplained.clone());
     Ok(Diagnosis {
+        decisions: Vec::new(),
         baseline,
         extended,
         noise_floor,

@@ -72,6 +72,9 @@ pub enum InferenceError {
         /// Name of the parameter.
         name: String,
     },
+    /// `stop` was set.
+    #[error("interrupted before completion")]
+    Interrupted,
     /// The simulation of the given model diverges.
     #[error("the simulation of the given model diverges on this log: start from a model that does not diverge")]
     Diverges,

@@ -1,6 +1,7 @@
 //! Errors of a model on a log.
 
 use std::collections::BTreeMap;
+use std::sync::atomic::AtomicBool;
 
 use twinstep_identify::{Evaluation, JointEvaluation};
 
@@ -18,7 +19,8 @@ pub fn evaluate(
     actuator_hz: f64,
 ) -> Result<(Evaluation, PositionErrors), InferenceError> {
     let windows = windows(log, &candidate.robot.tree, WindowLength::WholeRanges);
-    let traces = simulate(log, &windows, std::slice::from_ref(candidate), actuator_hz)?.remove(0);
+    let traces =
+        simulate(log, &windows, std::slice::from_ref(candidate), actuator_hz, &AtomicBool::new(false))?.remove(0);
     let (mut errors, mut per_joint) = (PositionErrors::new(), BTreeMap::new());
     let (mut all_q, mut all_tau) = (Vec::new(), Vec::new());
     for (index, channels) in log.joints.iter().enumerate() {

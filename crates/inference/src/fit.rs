@@ -7,7 +7,7 @@ use twinstep_identify::least_squares::Linearisation;
 use twinstep_identify::refine::information;
 
 use crate::noise::effective_std;
-use crate::{Candidate, FreeParameter, InferenceError, JointLog, Window, simulate};
+use crate::{Candidate, FreeParameter, IdentifyOptions, InferenceError, JointLog, Window, simulate};
 
 /// Decrease of the cost below which the fit has converged; one standard deviation is a cost of 1.
 const COST_TOLERANCE: f64 = 0.1;
@@ -31,7 +31,7 @@ pub struct FitProblem<'a> {
     windows: &'a [Window],
     parameters: &'a [FreeParameter],
     given: &'a Candidate,
-    actuator_hz: f64,
+    options: &'a IdentifyOptions,
     channels: Vec<Channel>,
     /// Standard deviation of the errors of each channel, times the root of the number of rows that count as one.
     std: Vec<f64>,
@@ -44,11 +44,11 @@ impl<'a> FitProblem<'a> {
         windows: &'a [Window],
         parameters: &'a [FreeParameter],
         given: &'a Candidate,
-        actuator_hz: f64,
+        options: &'a IdentifyOptions,
     ) -> Self {
         let torques = (0..log.joints.len()).filter(|joint| log.joints[*joint].tau.is_some()).map(Channel::Torque);
         let channels: Vec<_> = (0..log.joints.len()).map(Channel::Position).chain(torques).collect();
-        let mut problem = Self { log, windows, parameters, given, actuator_hz, channels, std: Vec::new() };
+        let mut problem = Self { log, windows, parameters, given, options, channels, std: Vec::new() };
         let deviation = |channel: &Channel| {
             let cells: Vec<f64> = problem.rows().map(|row| problem.measured(*channel)[row]).collect();
             let cells: Vec<f64> = cells.into_iter().filter(|cell| cell.is_finite()).collect();
@@ -75,7 +75,7 @@ impl<'a> FitProblem<'a> {
     /// Returns the errors of each channel at each point, simulated minus measured; NaN where a cell is missing. `None` if it diverges.
     fn errors(&self, points: &[Vec<f64>]) -> Result<Vec<Option<Vec<Vec<f64>>>>, InferenceError> {
         let candidates: Vec<_> = points.iter().map(|point| self.given.at(self.parameters, point)).collect();
-        let simulated = simulate(self.log, self.windows, &candidates, self.actuator_hz)?;
+        let simulated = simulate(self.log, self.windows, &candidates, self.options.actuator_hz, &self.options.stop)?;
         let of_channel = |traces: &[crate::Trace], channel: Channel| {
             let measured = self.measured(channel);
             let mut errors = Vec::new();
@@ -139,15 +139,18 @@ impl<'a> FitProblem<'a> {
         Ok(Linearisation { residuals, jacobian })
     }
 
-    /// Minimises the cost from a point in at most `steps` steps. `each` receives the cost after every step and returns false to interrupt.
+    /// Minimises the cost from a point in at most `steps` steps. If it is interrupted, it returns the best point so far. `each` receives the cost after every step.
     pub fn minimise(
         &self,
         mut point: Vec<f64>,
         steps: usize,
-        mut each: impl FnMut(f64) -> bool,
+        mut each: impl FnMut(f64),
     ) -> Result<Vec<f64>, InferenceError> {
         for _ in 0..steps {
-            let here = self.linearise(&point)?;
+            let here = match self.linearise(&point) {
+                Err(InferenceError::Interrupted) => break,
+                here => here?,
+            };
             let prior = DVector::from_column_slice(&point);
             let now = here.residuals.norm_squared() + prior.norm_squared();
             let gradient = here.jacobian.tr_mul(&here.residuals) + &prior;
@@ -161,11 +164,15 @@ impl<'a> FitProblem<'a> {
                 Some(point.iter().zip(step.iter()).map(|(x, step)| (x - step).clamp(-FURTHEST, FURTHEST)).collect())
             };
             let points: Vec<Vec<f64>> = DAMPING.iter().filter_map(step).collect();
-            let costs = self.costs(&points)?;
+            let costs = match self.costs(&points) {
+                Err(InferenceError::Interrupted) => break,
+                costs => costs?,
+            };
             let best = (0..points.len()).min_by(|one, other| costs[*one].total_cmp(&costs[*other]));
             let Some(best) = best.filter(|best| costs[*best] < now) else { break };
             point.clone_from(&points[best]);
-            if !each(costs[best]) || now - costs[best] < COST_TOLERANCE {
+            each(costs[best]);
+            if now - costs[best] < COST_TOLERANCE {
                 break;
             }
         }

@@ -1,11 +1,13 @@
 //! Identification: estimates with intervals and correlations.
 
+use std::sync::atomic::Ordering;
+
 use nalgebra::DMatrix;
 use twinstep_effects::TreeModelFile;
 
 use crate::fit::FitProblem;
 use crate::parameter::write_estimates;
-use crate::{Candidate, FreeParameter, InferenceError, JointLog, ParameterRequest, Quantity, WindowLength, windows};
+use crate::{Candidate, FreeParameter, IdentifyOptions, InferenceError, JointLog, Quantity, WindowLength, windows};
 
 /// Half width of a 95 % interval [standard deviations].
 const INTERVAL: f64 = 1.96;
@@ -23,15 +25,6 @@ const DELAY_STARTS: [f64; 3] = [-0.8, 0.2, 1.1];
 /// Number of windows on which the starts compete, and number of their steps.
 const START_WINDOWS: usize = 8;
 const START_STEPS: usize = 6;
-
-/// Options of an identification.
-#[derive(Clone, Debug)]
-pub struct IdentifyOptions {
-    /// What is estimated, in addition to unknown gains.
-    pub requests: Vec<ParameterRequest>,
-    /// Rate of the actuators [Hz].
-    pub actuator_hz: f64,
-}
 
 /// Estimate of one parameter.
 #[derive(Clone, Debug, PartialEq)]
@@ -55,17 +48,16 @@ pub struct Identification {
     pub estimates: Vec<Estimate>,
     /// Pairs of estimates that the log hardly separates: names and correlation.
     pub correlated: Vec<(String, String, f64)>,
-    /// True if it was interrupted: the estimates are the best so far.
+    /// True if it was interrupted: the estimates are the best so far, with the intervals of their priors.
     pub interrupted: bool,
 }
 
-/// Estimates parameters from a log. `progress` receives round (0: the start is chosen), number of rounds and cost, and returns false to
-/// interrupt.
+/// Estimates parameters from a log. `progress` receives round (0: the start is chosen), number of rounds and cost.
 pub fn identify(
     file: &TreeModelFile,
     log: &JointLog,
     options: &IdentifyOptions,
-    progress: &mut dyn FnMut(usize, usize, f64) -> bool,
+    progress: &mut dyn FnMut(usize, usize, f64),
 ) -> Result<Identification, InferenceError> {
     let given = Candidate::of(file)?;
     let parameters = FreeParameter::of(&options.requests, file, log)?;
@@ -73,26 +65,23 @@ pub fn identify(
     if windows.is_empty() {
         return Err(InferenceError::TooShort);
     }
-    let mut problem = FitProblem::new(log, &windows, &parameters, &given, options.actuator_hz);
-    let mut interrupted = false;
+    let mut problem = FitProblem::new(log, &windows, &parameters, &given, options);
+    let is_stopped = || options.stop.load(Ordering::Relaxed);
     let few: Vec<_> = windows.iter().step_by(windows.len().div_ceil(START_WINDOWS)).cloned().collect();
-    let of_few = FitProblem::new(log, &few, &parameters, &given, options.actuator_hz);
-    let mut point = start(&of_few, &parameters, &given, |cost| {
-        interrupted |= !progress(0, ROUNDS, cost);
-        !interrupted
-    })?;
-    for round in 0..ROUNDS {
-        let each = |cost| {
-            interrupted |= !progress(round + 1, ROUNDS, cost);
-            !interrupted
-        };
-        point = problem.minimise(point, STEPS, each)?;
-        if interrupted {
-            break;
+    let of_few = FitProblem::new(log, &few, &parameters, &given, options);
+    let mut point = start(&of_few, &parameters, &given, |cost| progress(0, ROUNDS, cost))?;
+    for round in 1..=ROUNDS {
+        point = problem.minimise(point, STEPS, |cost| progress(round, ROUNDS, cost))?;
+        match problem.estimate_noise(&point) {
+            Err(InferenceError::Interrupted) => break,
+            estimated => estimated?,
         }
-        problem.estimate_noise(&point)?;
     }
-    let (count, covariance) = (parameters.len(), problem.covariance(&point)?);
+    let count = parameters.len();
+    let covariance = match problem.covariance(&point) {
+        Err(InferenceError::Interrupted) => DMatrix::identity(count, count),
+        covariance => covariance?,
+    };
     let interval = |index: usize| {
         let half = INTERVAL * covariance[(index, index)].sqrt();
         [point[index] - half, point[index] + half].map(|end| parameters[index].value(end))
@@ -107,7 +96,7 @@ pub fn identify(
     let estimates = parameters.iter().enumerate().map(estimate).collect();
     let mut model = file.clone();
     write_estimates(&mut model, &given, log, &parameters, &values);
-    Ok(Identification { model, estimates, correlated: correlated(&parameters, &covariance), interrupted })
+    Ok(Identification { model, estimates, correlated: correlated(&parameters, &covariance), interrupted: is_stopped() })
 }
 
 /// Returns the best point of short fits: from the given model, and from other gains and delays.
@@ -115,7 +104,7 @@ fn start(
     problem: &FitProblem,
     parameters: &[FreeParameter],
     given: &Candidate,
-    mut each: impl FnMut(f64) -> bool,
+    mut each: impl FnMut(f64),
 ) -> Result<Vec<f64>, InferenceError> {
     let own = |parameter: &FreeParameter| {
         let value = parameter.quantity.get(&given.robot.joints[parameter.joints[0]]);
@@ -131,20 +120,31 @@ fn start(
     };
     let mut starts = vec![vec![parameters.iter().map(own).collect()]];
     starts.extend(DELAY_STARTS.map(|delay| GAIN_STARTS.map(|gain| with(gain, delay)).to_vec()));
-    let mut best = (f64::INFINITY, Vec::new());
+    let mut best = (f64::INFINITY, starts[0][0].clone());
     for alike in starts {
-        let costs = problem.costs(&alike)?;
-        let least = (0..alike.len()).min_by(|one, other| costs[*one].total_cmp(&costs[*other])).unwrap_or(0);
-        if costs[least].is_infinite() {
-            continue;
-        }
-        let point = problem.minimise(alike[least].clone(), START_STEPS, &mut each)?;
-        let cost = problem.costs(std::slice::from_ref(&point))?[0];
-        if cost < best.0 {
-            best = (cost, point);
+        match fit_best(problem, &alike, &mut each) {
+            Err(InferenceError::Interrupted) => return Ok(best.1),
+            Ok((cost, point)) if cost < best.0 => best = (cost, point),
+            tried => drop(tried?),
         }
     }
     if best.0.is_finite() { Ok(best.1) } else { Err(InferenceError::Diverges) }
+}
+
+/// Fits from the best of some points in a few steps. Returns cost and point; the cost is infinite if all of them diverge.
+fn fit_best(
+    problem: &FitProblem,
+    points: &[Vec<f64>],
+    each: &mut dyn FnMut(f64),
+) -> Result<(f64, Vec<f64>), InferenceError> {
+    let costs = problem.costs(points)?;
+    let least = (0..points.len()).min_by(|one, other| costs[*one].total_cmp(&costs[*other])).unwrap_or(0);
+    if costs[least].is_infinite() {
+        return Ok((f64::INFINITY, points[least].clone()));
+    }
+    let point = problem.minimise(points[least].clone(), START_STEPS, each)?;
+    let cost = problem.costs(std::slice::from_ref(&point))?[0];
+    Ok((cost, point))
 }
 
 fn correlated(parameters: &[FreeParameter], covariance: &DMatrix<f64>) -> Vec<(String, String, f64)> {

@@ -1,4 +1,5 @@
-//! Evaluation and identification of robots of any tree with a fixed base, from logs with any channels.
+//! What a log says about a robot: evaluation and identification of robots of any tree with a fixed base, from logs with any channels,
+//! and diagnosis by one likelihood ([`equations`]).
 //!
 //! - [`JointLog`]: a log on the joints of a robot: columns by the robot's joint names, unknown gains, a tilted base.
 //! - [`Window`]: rows that are simulated from their first measured state; [`simulate`]: simulates candidates in windows.
@@ -9,12 +10,14 @@
 //! Priors scale with the robot: see [`JointScale`]. Quadrupeds with a floating base and known gains have more methods in
 //! `twinstep-identify`.
 
+pub mod equations;
 mod error;
 mod evaluate;
 mod fit;
 mod identify;
 mod joint_log;
 mod noise;
+mod options;
 mod parameter;
 mod prior;
 mod simulate;
@@ -22,8 +25,9 @@ mod window;
 
 pub use error::InferenceError;
 pub use evaluate::evaluate;
-pub use identify::{Estimate, Identification, IdentifyOptions, identify};
+pub use identify::{Estimate, Identification, identify};
 pub use joint_log::JointLog;
+pub use options::IdentifyOptions;
 pub use parameter::{Candidate, FreeParameter, ParameterRequest};
 pub use prior::{JointScale, Quantity};
 pub use simulate::{Trace, simulate};

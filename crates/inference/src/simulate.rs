@@ -1,5 +1,7 @@
 //! Simulation of candidates in the windows of a log.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use rayon::prelude::*;
 use twinstep_model::{BaseMount, TreeModel};
 use twinstep_sim::{SimConfig, SimdPrecision, TreeCommand, TreeSimulation};
@@ -20,13 +22,14 @@ pub struct Trace {
 
 /// Simulates each candidate in each window, in double precision, with actuators of the rate `actuator_hz` [Hz].
 ///
-/// The base is fixed, the robot touches nothing, and joint ranges include the measured positions. Commands arrive after their delay: the
+/// Ends with [`InferenceError::Interrupted`] soon after `stop` is true. The base is fixed, the robot touches nothing, and joint ranges include the measured positions. Commands arrive after their delay: the
 /// commands of the log are shifted, so a delay may be of any length.
 pub fn simulate(
     log: &JointLog,
     windows: &[Window],
     candidates: &[Candidate],
     actuator_hz: f64,
+    stop: &AtomicBool,
 ) -> Result<Vec<Vec<Trace>>, InferenceError> {
     let clocks: Vec<_> = windows.iter().map(|window| Clock::new(log, window, actuator_hz)).collect();
     let robots: Vec<_> = candidates.iter().map(|candidate| in_the_air(&candidate.robot, log)).collect();
@@ -34,7 +37,8 @@ pub fn simulate(
         .flat_map(|candidate| windows.iter().zip(&clocks).map(move |(window, clock)| (candidate, window, clock)))
         .map(|(index, window, clock)| Job { log, robot: &robots[index], candidate: &candidates[index], window, clock })
         .collect();
-    let groups: Vec<_> = jobs.par_chunks(TOGETHER).map(|jobs| run(jobs, actuator_hz)).collect::<Result<_, _>>()?;
+    let groups: Vec<_> =
+        jobs.par_chunks(TOGETHER).map(|jobs| run(jobs, actuator_hz, stop)).collect::<Result<_, _>>()?;
     let mut traces = groups.into_iter().flatten();
     Ok(candidates.iter().map(|_| traces.by_ref().take(windows.len()).collect()).collect())
 }
@@ -64,7 +68,7 @@ fn in_the_air(robot: &TreeModel, log: &JointLog) -> TreeModel {
     robot
 }
 
-fn run(jobs: &[Job], actuator_hz: f64) -> Result<Vec<Trace>, InferenceError> {
+fn run(jobs: &[Job], actuator_hz: f64, stop: &AtomicBool) -> Result<Vec<Trace>, InferenceError> {
     let config = SimConfig { base: BaseMount::Fixed, threads: 1, ..SimConfig::default() };
     let first = &jobs[0];
     let mut simulation = TreeSimulation::with_precision(
@@ -82,6 +86,9 @@ fn run(jobs: &[Job], actuator_hz: f64) -> Result<Vec<Trace>, InferenceError> {
     }
     let periods = jobs.iter().map(|job| job.clock.num_periods()).max().unwrap_or(0);
     for period in 0..periods {
+        if stop.load(Ordering::Relaxed) {
+            return Err(InferenceError::Interrupted);
+        }
         for (job, command) in jobs.iter().zip(&mut commands) {
             job.set_command(period, command);
         }

@@ -23,7 +23,7 @@ mod tests;
 pub use equations::{TreeAcceleration, TreeForces, inverse_dynamics, mass_matrix};
 pub use factored::FactoredTree;
 pub use motion::TreeMotion;
-pub use parameters::TreeParameters;
+pub use parameters::{TreeParameters, batch_from_bodies};
 pub use step::TreeEquations;
 pub use structure::{JointAxis, TreeStructure};
 

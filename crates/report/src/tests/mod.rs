@@ -56,6 +56,7 @@ fn nothing() -> Diagnosis {
         unexplained: Unexplained::default(),
         learned_residual: None,
         next_experiment: None,
+        decisions: Vec::new(),
         extended_model: "extended.toml".to_owned(),
     }
 }

@@ -92,6 +92,7 @@ pub fn findings() -> (Diagnosis, ModelFile) {
             text: "Run steps, 10 s of small steps. It discriminates between armature@calf and command_delay@calf."
                 .to_owned(),
         }),
+        decisions: Vec::new(),
         extended_model: "extended.toml".to_owned(),
     };
     (diagnosis, extended)

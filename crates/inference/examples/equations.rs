@@ -1,0 +1,26 @@
+//! Prints what explains logs of a Go2 with motor currents.
+
+use twinstep_inference::equations::explain;
+use twinstep_logs::Log;
+use twinstep_model::go2;
+
+fn main() {
+    for path in std::env::args().skip(1) {
+        let start = std::time::Instant::now();
+        let log = Log::open(&path).expect("a log");
+        let Some(found) = explain(&log, &go2(), |_| true, &mut |line| {
+            eprintln!("{:.1} s: {line}", start.elapsed().as_secs_f64());
+            true
+        }) else {
+            println!("{path}: the equations need motor currents, velocities and gains of all joints");
+            continue;
+        };
+        println!("{path}: {:.1} s", start.elapsed().as_secs_f64());
+        for cause in &found.causes {
+            let (name, scope, gain) = (cause.effect.name, cause.scope, cause.gain);
+            println!("  {name}@{scope} {gain:.1} nat {:.4?} {:.4?}", cause.values, cause.intervals);
+        }
+        println!("  left {:.3} {:?}", found.left, found.unknown.first());
+        found.decisions.iter().for_each(|line| eprintln!("{line}"));
+    }
+}

@@ -1,0 +1,155 @@
+//! The causes of a log, in the terms of the catalogue.
+
+use twinstep_effects::{Effect, Scope};
+use twinstep_logs::Log;
+use twinstep_model::{Joint, RobotModel};
+
+use super::law::{Law, laws};
+use super::measurements::{Measurements, Regime};
+use super::robot::Robot;
+use super::search::{Cause, Found, ScopeSites, Search, UnknownLaw};
+use super::system::{Site, System};
+
+/// Half width of the central 95 % interval of a normal distribution [standard deviations].
+const TWO_SIDED_95: f64 = 1.96;
+/// Relative standard deviation of a value because no law is exact.
+const LAW_ERROR: f64 = 0.015;
+/// Variance that is left in an equation, relative to that of its noise, which wrong statements about the noise allow.
+const UNEXPLAINED: f64 = 2.0;
+
+/// An effect on a scope, with values.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Explanation {
+    /// The effect.
+    pub effect: &'static Effect,
+    /// The scope.
+    pub scope: Scope,
+    /// Values of all parameters: means over the scope.
+    pub values: Vec<f64>,
+    /// 95 % interval of each value.
+    pub intervals: Vec<[f64; 2]>,
+    /// Evidence of all causes minus that without this one [nat].
+    pub gain: f64,
+    /// Share of the root mean square of the residuals that it explains, in the equations that it changes.
+    pub explained: f64,
+    /// Effects in its place, with their evidence minus that of the cause [nat].
+    pub rivals: Vec<(&'static Effect, Scope, Vec<f64>, f64)>,
+}
+
+/// What explains a log.
+#[derive(Clone, Debug)]
+pub struct Explained {
+    /// Causes, the strongest first.
+    pub causes: Vec<Explanation>,
+    /// Correlation of the estimates of two causes, by their places.
+    pub correlations: Vec<(usize, usize, f64)>,
+    /// Variance above noise that is left, relative to that of the given robot.
+    pub left: f64,
+    /// Factors on position and velocity gain of each joint, beside the causes; empty if none differs from 1 by more than it is uncertain.
+    pub gain_factors: Vec<[f64; 2]>,
+    /// Laws that the catalogue does not have, the strongest first.
+    pub unknown: Vec<UnknownLaw>,
+    /// Decisions of the search, as sentences.
+    pub decisions: Vec<String>,
+}
+
+/// Finds what `robot` lacks, from the rows of `log` that are used.
+///
+/// Returns `None` if the log has no motor currents, no velocities or unknown gains at a joint, or not all joints of the robot, and if the
+/// base moves but the log has no rows in which it is fixed, or stands on all feet with its orientation, angular velocity and acceleration. `go_on`
+/// gets a line of progress; the search ends with `None` if it returns false.
+pub fn explain(
+    log: &Log,
+    robot: &RobotModel,
+    is_used: impl Fn(usize) -> bool,
+    go_on: &mut dyn FnMut(&str) -> bool,
+) -> Option<Explained> {
+    let robot = Robot::from(robot);
+    let measured = Measurements::new(log, &robot, is_used)?;
+    let system = System::new(measured, &robot);
+    let is_free = system.measured.regime.iter().any(|regime| *regime != Regime::Hang);
+    let hangs = system.measured.regime.contains(&Regime::Hang);
+    if is_free && !(hangs && system.balance.stands()) {
+        return None;
+    }
+    let laws = laws();
+    let found = Search::new(&system, &laws, scopes(), robot).run(go_on)?;
+    Some(explained(found, &laws))
+}
+
+/// Returns the scopes with their prior probabilities: joints of one type are alike, and what one has, all may have.
+fn scopes() -> Vec<ScopeSites> {
+    let of_joints = Scope::of_joints().into_iter().map(|scope| {
+        let contained = Joint::ALL.into_iter().enumerate().filter(|(_, joint)| scope.contains(*joint));
+        let probability = match scope {
+            Scope::All | Scope::Base => 0.3,
+            Scope::Kind(_) => 0.1,
+            Scope::Joint(_) => 0.3 / 12.0,
+            Scope::Leg(_) | Scope::Left | Scope::Right | Scope::Ground => 0.1 / 6.0,
+        };
+        ScopeSites {
+            name: scope.to_string(),
+            sites: contained.map(|(index, _)| Site::Joint(index)).collect(),
+            probability,
+        }
+    });
+    let base = ScopeSites { name: "base".to_owned(), sites: vec![Site::Base], probability: 0.5 };
+    of_joints.chain([base]).collect()
+}
+
+fn explained(found: Found, laws: &[Law]) -> Explained {
+    let mean = |cause: &Cause| -> Vec<f64> {
+        let sites = cause.values.len() as f64;
+        (0..cause.values[0].len())
+            .map(|unknown| cause.values.iter().map(|values| values[unknown]).sum::<f64>() / sites)
+            .collect()
+    };
+    let in_terms = |cause: &Cause| {
+        let law = &laws[cause.law];
+        let scope: Scope = cause.scope.name.parse().expect("the name of a scope");
+        let bounds =
+            law.effect.parameters.iter().flat_map(|parameter| std::iter::repeat_n(parameter.bounds, parameter.count));
+        let values = (law.values)(&mean(cause), cause.shape);
+        let values: Vec<f64> =
+            values.into_iter().zip(bounds).map(|(value, [low, high])| value.clamp(low, high)).collect();
+        (law.effect, scope, values)
+    };
+    let causes = found.causes.iter().map(|found| {
+        let (effect, scope, values) = in_terms(&found.cause);
+        let law = &laws[found.cause.law];
+        let mean = mean(&found.cause);
+        let mut intervals: Vec<[f64; 2]> = values.iter().map(|value| [*value; 2]).collect();
+        for (unknown, std) in found.stds.iter().enumerate() {
+            let half = TWO_SIDED_95 * std.hypot(LAW_ERROR * mean[unknown]);
+            for side in [-half, half] {
+                let mut moved = mean.clone();
+                moved[unknown] += side;
+                for (interval, value) in intervals.iter_mut().zip((law.values)(&moved, found.cause.shape)) {
+                    *interval = [interval[0].min(value), interval[1].max(value)];
+                }
+            }
+        }
+        let rivals = found.rivals.iter().map(|(cause, behind)| {
+            let (effect, scope, values) = in_terms(cause);
+            (effect, scope, values, *behind)
+        });
+        let rivals = rivals.collect();
+        let bounds =
+            effect.parameters.iter().flat_map(|parameter| std::iter::repeat_n(parameter.bounds, parameter.count));
+        for (interval, [low, high]) in intervals.iter_mut().zip(bounds) {
+            *interval = interval.map(|end| end.clamp(low, high));
+        }
+        Explanation { effect, scope, values, intervals, gain: found.gain, explained: found.explained, rivals }
+    });
+    let causes: Vec<Explanation> = causes.collect();
+    let excess = |power: f64| (power - UNEXPLAINED).max(0.0);
+    let sum = |side: usize| found.left.iter().map(|(_, powers)| excess(powers[side])).sum::<f64>();
+    Explained {
+        left: if sum(0) > 0.0 { sum(1) / sum(0) } else { 0.0 },
+        gain_factors: found.gain_errors.iter().map(|errors| errors.map(|error| 1.0 + error)).collect(),
+        unknown: found.unknown,
+        correlations: found.correlations,
+        decisions: found.decisions,
+        causes,
+    }
+}

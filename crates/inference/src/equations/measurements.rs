@@ -1,0 +1,230 @@
+//! The channels of a log that the equations use, by joint of the robot.
+
+use std::ops::Range;
+
+use twinstep_logs::{Log, TorqueSensor};
+
+use super::robot::Robot;
+
+/// Speed of the joints above which a robot on the ground moves: root mean square over [`REGIME_S`] [rad/s].
+const MOVING_SPEED: f64 = 0.7;
+/// Time over which the speed is averaged [s].
+const REGIME_S: f64 = 0.5;
+/// Rows before and after one whose mean replaces it where noise must not be in a column.
+const SMOOTH_ROWS: usize = 3;
+/// Longest time without a row in a range [s].
+const LONGEST_GAP_S: f64 = 0.1;
+
+/// What the robot does in a row.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Regime {
+    /// The base is fixed.
+    Hang,
+    /// The base is free and the joints move slowly.
+    Stand,
+    /// The base is free and the joints move fast.
+    Move,
+}
+
+/// Commands and measurements of one joint, by row.
+#[derive(Clone, Debug)]
+pub struct JointRows {
+    /// Index of the joint in the robot.
+    pub joint: usize,
+    /// Measured position [rad].
+    pub q: Vec<f64>,
+    /// Measured velocity [rad/s].
+    pub dq: Vec<f64>,
+    /// Position [rad] and velocity [rad/s] with less noise: parabolas through the rows around each.
+    pub smooth: [Vec<f64>; 2],
+    /// Measured torque, mean from the row to the next [N·m].
+    pub torque: Vec<f64>,
+    /// Commanded position [rad], velocity [rad/s] and torque [N·m].
+    pub command: [Vec<f64>; 3],
+    /// Position gain [N·m/rad] and velocity gain [N·m·s/rad].
+    pub gains: [Vec<f64>; 2],
+    /// Motor temperature [°C]; empty if it was not measured.
+    pub temperature: Vec<f64>,
+}
+
+/// Measurements at the base, by row.
+#[derive(Clone, Debug)]
+pub struct BaseRows {
+    /// World-from-base, w x y z.
+    pub orientation: Vec<[f64; 4]>,
+    /// Reading of the gyroscope [rad/s].
+    pub gyro: Vec<[f64; 3]>,
+    /// Reading of the accelerometer [m/s²]; empty if it was not measured.
+    pub acceleration: Vec<[f64; 3]>,
+    /// Velocity in the world frame [m/s]; empty if it was not measured.
+    pub velocity: Vec<[f64; 3]>,
+}
+
+/// Measurements of a log.
+#[derive(Clone, Debug)]
+pub struct Measurements {
+    /// Time of each row [s].
+    pub t: Vec<f64>,
+    /// Median time between rows [s].
+    pub dt: f64,
+    /// Contiguous ranges of rows.
+    pub ranges: Vec<Range<usize>>,
+    /// What the robot does in each row.
+    pub regime: Vec<Regime>,
+    /// The joints of the log, in the order of the robot.
+    pub joints: Vec<JointRows>,
+    /// The base, if orientation and angular velocity were measured.
+    pub base: Option<BaseRows>,
+    /// True where a foot touches the ground, by foot and row; empty if it was not measured.
+    pub contact: Vec<Vec<bool>>,
+    /// Supply voltage divided by the highest of the log; empty if it was not measured.
+    pub voltage_share: Vec<f64>,
+    /// Standard deviation of the noise of position [rad], velocity [rad/s] and torque [N·m].
+    pub noise: [f64; 3],
+}
+
+impl Measurements {
+    /// Collects the channels of `log`, and the torques of the rows that are used. Returns `None` if it has no torque, no velocity or unknown gains at a joint, or a joint that the
+    /// robot lacks.
+    pub fn new(log: &Log, robot: &Robot, is_used: impl Fn(usize) -> bool) -> Option<Self> {
+        if log.meta().tau_sensor != TorqueSensor::MotorCurrent {
+            return None;
+        }
+        let plain = |name: &str| name.to_lowercase().trim_end_matches("_joint").to_owned();
+        let mut joints = Vec::new();
+        for name in log.joints() {
+            let joint = robot.tree.joints.iter().position(|joint| plain(&joint.name) == plain(name))?;
+            joints.push(joint_rows(log, name, joint)?);
+        }
+        joints.sort_by_key(|rows: &JointRows| rows.joint);
+        for rows in &mut joints {
+            // A drive remembers the rows that are not used, but their torques are not compared.
+            rows.torque
+                .iter_mut()
+                .enumerate()
+                .filter(|(row, _)| !is_used(*row))
+                .for_each(|(_, torque)| *torque = f64::NAN);
+        }
+        if joints.len() != robot.joints.len() {
+            return None;
+        }
+        let t = log.t().to_vec();
+        let ranges: Vec<Range<usize>> = log.segments().flat_map(|(_, range)| split_at_gaps(&t, range)).collect();
+        for rows in &mut joints {
+            rows.smooth = [smoothed(&rows.q, &ranges), smoothed(&rows.dq, &ranges)];
+        }
+        let mut steps: Vec<f64> =
+            ranges.iter().flat_map(|range| t[range.clone()].windows(2).map(|pair| pair[1] - pair[0])).collect();
+        steps.sort_by(f64::total_cmp);
+        let dt = *steps.get(steps.len() / 2)?;
+        let mut regime = vec![Regime::Hang; t.len()];
+        for (_, range) in log.segments().filter(|(segment, _)| !segment.base.is_fixed()) {
+            let speeds = mean_square_speed(&joints, range.clone(), (REGIME_S / dt).round() as usize);
+            for (row, speed) in range.zip(speeds) {
+                regime[row] = if speed > MOVING_SPEED * MOVING_SPEED { Regime::Move } else { Regime::Stand };
+            }
+        }
+        let stated = |channel: &str, usual: f64| {
+            let all = log.joints().iter().filter_map(|joint| log.noise(&format!("{channel}_{joint}")));
+            let (sum, count) = all.fold((0.0, 0.0), |(sum, count), noise| (sum + noise, count + 1.0));
+            if count > 0.0 && sum > 0.0 { sum / count } else { usual }
+        };
+        let noise = [stated("q", 1e-4), stated("dq", 0.01), stated("tau_measured", 0.05)];
+        let highest = log.channel("battery_V").map_or(0.0, |cells| cells.iter().copied().fold(0.0, f64::max));
+        let voltage = log.channel("battery_V").filter(|_| highest > 0.0);
+        let share = |cell: &f64| if cell.is_finite() { cell / highest } else { 1.0 };
+        Some(Self {
+            base: base_rows(log),
+            contact: contact_rows(log, robot),
+            voltage_share: voltage.map_or(Vec::new(), |cells| cells.iter().map(share).collect()),
+            t,
+            dt,
+            ranges,
+            regime,
+            joints,
+            noise,
+        })
+    }
+}
+
+fn joint_rows(log: &Log, name: &str, joint: usize) -> Option<JointRows> {
+    let or_zero = |cells: Option<&[f64]>| cells.map_or(vec![0.0; log.rows()], <[f64]>::to_vec);
+    let [kp, kd] = log.gains(name);
+    Some(JointRows {
+        joint,
+        smooth: [Vec::new(), Vec::new()],
+        q: log.q(name)?.to_vec(),
+        dq: log.dq(name)?.to_vec(),
+        torque: log.tau_measured(name)?.to_vec(),
+        command: [log.q_cmd(name)?.to_vec(), or_zero(log.dq_cmd(name)), or_zero(log.tau_ff(name))],
+        gains: [kp?, kd?],
+        temperature: log.channel(&format!("temp_{name}")).map_or(Vec::new(), <[f64]>::to_vec),
+    })
+}
+
+/// Returns the values of parabolas through [`SMOOTH_ROWS`] rows before and after each; near the ends of a range, the series itself.
+fn smoothed(series: &[f64], ranges: &[Range<usize>]) -> Vec<f64> {
+    let n = SMOOTH_ROWS as f64;
+    // Savitzky and Golay 1964: the weights of a parabola's value in the middle.
+    let weight = |offset: f64| {
+        3.0 * (3.0 * n * n + 3.0 * n - 1.0 - 5.0 * offset * offset)
+            / ((2.0 * n + 1.0) * (2.0 * n - 1.0) * (2.0 * n + 3.0))
+    };
+    let mut smooth = series.to_vec();
+    for range in ranges {
+        for row in range.start + SMOOTH_ROWS..range.end.saturating_sub(SMOOTH_ROWS) {
+            let near = &series[row - SMOOTH_ROWS..=row + SMOOTH_ROWS];
+            let value: f64 = near.iter().enumerate().map(|(index, value)| weight(index as f64 - n) * value).sum();
+            if value.is_finite() {
+                smooth[row] = value;
+            }
+        }
+    }
+    smooth
+}
+
+fn vectors<const N: usize>(log: &Log, names: [&str; N]) -> Option<Vec<[f64; N]>> {
+    let channels: Option<Vec<&[f64]>> = names.into_iter().map(|name| log.channel(name)).collect();
+    let channels = channels?;
+    Some((0..log.rows()).map(|row| std::array::from_fn(|axis| channels[axis][row])).collect())
+}
+
+fn base_rows(log: &Log) -> Option<BaseRows> {
+    Some(BaseRows {
+        orientation: vectors(log, ["quat_w", "quat_x", "quat_y", "quat_z"])?,
+        gyro: vectors(log, ["gyro_x", "gyro_y", "gyro_z"])?,
+        acceleration: vectors(log, ["acc_x", "acc_y", "acc_z"]).unwrap_or_default(),
+        velocity: vectors(log, ["vel_x", "vel_y", "vel_z"]).unwrap_or_default(),
+    })
+}
+
+fn contact_rows(log: &Log, robot: &Robot) -> Vec<Vec<bool>> {
+    let of = |name: &str| log.channel(&format!("contact_{name}"));
+    let channels: Option<Vec<&[f64]>> = robot.feet.iter().map(|foot| of(&foot.name)).collect();
+    channels
+        .map_or(Vec::new(), |all| all.into_iter().map(|cells| cells.iter().map(|cell| *cell > 0.5).collect()).collect())
+}
+
+fn split_at_gaps(t: &[f64], range: Range<usize>) -> Vec<Range<usize>> {
+    let breaks = (range.start + 1..range.end).filter(|row| t[*row] - t[row - 1] > LONGEST_GAP_S);
+    let starts: Vec<usize> = std::iter::once(range.start).chain(breaks).chain([range.end]).collect();
+    starts.windows(2).map(|pair| pair[0]..pair[1]).filter(|range| range.len() > 20).collect()
+}
+
+/// Returns the mean square speed of the joints around each row.
+fn mean_square_speed(joints: &[JointRows], range: Range<usize>, half: usize) -> Vec<f64> {
+    let squares = |row: usize| {
+        let finite = joints.iter().map(|joint| joint.dq[row]).filter(|speed| speed.is_finite());
+        finite.map(|speed| speed * speed).sum::<f64>() / joints.len() as f64
+    };
+    let mut sums = vec![0.0];
+    for row in range.clone() {
+        sums.push(sums[sums.len() - 1] + squares(row));
+    }
+    (0..range.len())
+        .map(|index| {
+            let (from, to) = (index.saturating_sub(half), (index + half + 1).min(range.len()));
+            (sums[to] - sums[from]) / (to - from) as f64
+        })
+        .collect()
+}

@@ -1,0 +1,178 @@
+//! What every robot has a little of: unknowns that are never reported, with narrow priors.
+
+use glam::{DMat3, DVec3};
+use rayon::prelude::*;
+use twinstep_model::RigidBody;
+
+use super::block::Column;
+use super::gaussian::Group;
+use super::law::Law;
+use super::robot::Robot;
+use super::system::{Predicted, Site, System, apply};
+
+/// Standard deviation of an effect's first unknowns where it is too small to be reported: name and values in its unit.
+///
+/// Gains, friction and rotors differ between equal motors by a few per cent of their torque; the numbers are those of identifications
+/// of the Go2's and the ANYmal's drives (see `docs/references.md`). Delays are a fraction of a period of a field bus.
+const SMALL: [(&str, &[f64]); 15] = [
+    ("command_delay", &[0.005]),
+    ("pd_gain", &[0.02, 0.04]),
+    ("supply_sag", &[0.01]),
+    ("torque_saturation", &[0.03]),
+    ("torque_speed_limit", &[0.05]),
+    ("torque_delay", &[0.01]),
+    ("torque_dead_zone", &[0.007]),
+    ("drive_lag", &[0.007]),
+    ("torque_sensor_delay", &[0.005]),
+    ("torque_gain", &[0.01]),
+    ("coulomb_friction", &[0.05]),
+    ("viscous_friction", &[0.025]),
+    ("load_friction", &[0.005]),
+    ("armature", &[0.0015]),
+    ("joint_spring", &[0.05, 0.02]),
+];
+/// The same for effects on the motion of a link.
+const SMALL_MOTION: [(&str, f64); 2] = [("encoder_offset", 0.0015), ("joint_elasticity", 1e-4)];
+/// Standard deviation of the friction at low speed [N·m], for two speeds [rad/s].
+const LOW_SPEED: [(f64, f64); 2] = [(0.04, 0.2), (0.03, 0.8)];
+/// Standard deviation of the tilt of a fixed base [rad].
+const TILT: f64 = 0.005;
+/// Standard deviation of an offset of the accelerometer, by its bias and its mounting [m/s²].
+const ACCELERATION: f64 = 0.1;
+/// Standard deviation of an offset of a torque sensor [N·m].
+const TORQUE_OFFSET: f64 = 0.02;
+/// Standard deviation of the torque with which a joint sticks while the robot stands [N·m].
+const STICK: f64 = 0.1;
+/// Standard deviations of a link's mass, and of its inertia relative to the trace; that of its centre of mass [m].
+const BODY: [f64; 3] = [0.03, 0.04, 0.003];
+
+/// Returns the small unknowns whose columns depend on the causes that were found: those of drives and joints.
+pub fn of_joints(system: &System, laws: &[Law], robot: &Robot, predicted: &Predicted) -> Vec<Group> {
+    let (mut small, mut gains) = (Vec::new(), Vec::new());
+    for (name, stds) in SMALL {
+        let law = named(laws, name);
+        for (unknown, std) in stds.iter().enumerate() {
+            if name == "pd_gain" {
+                let columns = by_joint(system, law, robot, predicted, unknown, law.shapes[0], *std);
+                let group = |(joint, (column, std)): (usize, (Column, f64))| Group {
+                    gain_of: Some((joint, unknown)),
+                    ..Group::single(column, std)
+                };
+                gains.extend(columns.into_iter().enumerate().map(group));
+                continue;
+            }
+            small.extend(by_joint(system, law, robot, predicted, unknown, law.shapes[0], *std));
+        }
+    }
+    for (std, speed) in LOW_SPEED {
+        small.extend(by_joint(system, named(laws, "stribeck_friction"), robot, predicted, 0, speed, std));
+    }
+    let ones = vec![1.0; system.balance.samples.len()];
+    for joint in 0..robot.joints.len() {
+        small.push((system.torque_offset(joint), TORQUE_OFFSET));
+        small.push((system.balance.joint_column(joint, &ones), STICK));
+    }
+    [gains, grouped(small)].concat()
+}
+
+/// Returns the small unknowns whose columns do not depend on the causes: those of bodies and their motion.
+pub fn of_bodies(system: &System, laws: &[Law], robot: &Robot, predicted: &Predicted) -> Vec<Group> {
+    let mut small = bodies(system, robot);
+    for (name, std) in SMALL_MOTION {
+        small.extend(by_joint(system, named(laws, name), robot, predicted, 0, 0.0, std));
+    }
+    small.extend([0, 1].map(|axis| (system.balance.tilt_column(axis), TILT)));
+    small.extend([0, 1, 2].map(|axis| (system.balance.acceleration_column(axis), ACCELERATION)));
+    grouped(small)
+}
+
+fn named<'a>(laws: &'a [Law], name: &str) -> &'a Law {
+    let own = laws.iter().filter(|law| law.effect.name == name);
+    own.max_by_key(|law| law.units.len()).expect("a law of each effect")
+}
+
+fn grouped(small: Vec<(Column, f64)>) -> Vec<Group> {
+    let kept = small.into_iter().filter(|(column, ..)| !column.is_zero());
+    kept.map(|(column, std)| Group::single(column, std)).collect()
+}
+
+/// Returns the column of a small change of an unknown at each joint, per unit.
+fn by_joint(
+    system: &System,
+    law: &Law,
+    robot: &Robot,
+    predicted: &Predicted,
+    unknown: usize,
+    shape: f64,
+    std: f64,
+) -> Vec<(Column, f64)> {
+    let column = |joint: usize| {
+        let mut unknowns = vec![0.0; law.units.len()];
+        unknowns[unknown] = 2.0 * std;
+        let mut before = robot.clone();
+        if law.effect.name == "stribeck_friction" {
+            // Two frictions of different speeds cannot be combined, but their columns are independent.
+            before.joints[joint].stribeck_friction.breakaway_torque = 0.0;
+        }
+        let mut after = before.clone();
+        add(&mut after, law, joint, &unknowns, shape);
+        let site = Site::Joint(joint);
+        (system.column(law, site, (&before, predicted), &after).scaled(1.0 / (2.0 * std)), std)
+    };
+    (0..robot.joints.len()).into_par_iter().map(column).collect()
+}
+
+/// Adds a small effect to what a joint has of it already.
+fn add(robot: &mut Robot, law: &Law, joint: usize, unknowns: &[f64], shape: f64) {
+    let actuator = &mut robot.joints[joint].actuator;
+    match law.effect.name {
+        "torque_dead_zone" => actuator.dead_zone += 1.5 * unknowns[0],
+        "drive_lag" => actuator.torque_time_constant += 0.015 * unknowns[0],
+        "torque_saturation" => actuator.saturation = 1.0 / (1.0 / actuator.saturation + unknowns[0] / 15.0),
+        "torque_speed_limit" => actuator.no_load_speed = 1.0 / (1.0 / actuator.no_load_speed + unknowns[0] / 12.0),
+        "joint_elasticity" => {
+            let compliance = 1.0 / actuator.gear_stiffness + unknowns[0];
+            actuator.gear_stiffness = 1.0 / compliance;
+        }
+        "supply_sag" => robot.voltage_exponent += 2.0 * unknowns[0],
+        _ => apply(robot, law, Site::Joint(joint), unknowns, shape),
+    }
+}
+
+/// Returns the ten inertial unknowns of each body.
+fn bodies(system: &System, robot: &Robot) -> Vec<(Column, f64)> {
+    let unit = |index: usize| {
+        let mut inertia = DMat3::ZERO;
+        let (row, column) = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)][index];
+        inertia.col_mut(column)[row] = 1.0;
+        inertia.col_mut(row)[column] = 1.0;
+        inertia
+    };
+    let of_body = |body: usize| {
+        let RigidBody { mass, com, inertia } = robot.tree.bodies[body].inertia;
+        let trace = inertia.x_axis.x + inertia.y_axis.y + inertia.z_axis.z;
+        let column = |added: RigidBody| system.balance.inertia_column(&robot.tree, robot, body, added);
+        let mut columns = vec![(column(RigidBody { mass: 1.0, com, inertia: DMat3::ZERO }), BODY[0] * mass)];
+        for axis in [DVec3::X, DVec3::Y, DVec3::Z] {
+            // Moving the centre of mass by d changes the first moment by m d, which a pair of opposite masses has.
+            let one = column(RigidBody { mass, com: com + 1e-3 * axis, inertia: DMat3::ZERO });
+            let other = column(RigidBody { mass, com, inertia: DMat3::ZERO });
+            columns.push((difference(&one, &other).scaled(1e3), BODY[2]));
+        }
+        for index in 0..6 {
+            let added = RigidBody { mass: 0.0, com: DVec3::ZERO, inertia: unit(index) };
+            columns.push((column(added), BODY[1] * trace));
+        }
+        columns
+    };
+    (0..robot.tree.bodies.len()).into_par_iter().flat_map_iter(of_body).collect()
+}
+
+fn difference(one: &Column, other: &Column) -> Column {
+    let part = |(block, rows): &(usize, Vec<f64>)| {
+        let second = other.parts.iter().find(|(index, _)| index == block).map(|(_, rows)| rows);
+        let rows = rows.iter().enumerate().map(|(row, value)| value - second.map_or(0.0, |rows| rows[row])).collect();
+        (*block, rows)
+    };
+    Column { parts: one.parts.iter().map(part).collect() }
+}

@@ -1,0 +1,67 @@
+//! A robot as the equations see it: the tree, the joints, the feet, and what its sensors add.
+
+use glam::DVec3;
+use twinstep_model::{JointModel, Leg, RobotModel, RobotTree};
+
+/// Foot: a sphere at the end of a limb.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Foot {
+    /// Name, as in `contact_<name>`.
+    pub name: String,
+    /// Index of the body.
+    pub body: usize,
+    /// Centre in the frame of the body [m].
+    pub centre: DVec3,
+    /// Radius [m].
+    pub radius: f64,
+}
+
+/// Robot with everything that effects change.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Robot {
+    /// Bodies and joints. Its numbers of joints are not used.
+    pub tree: RobotTree,
+    /// Joints with their actuators.
+    pub joints: Vec<JointModel>,
+    /// Feet.
+    pub feet: Vec<Foot>,
+    /// Exponent n of the supply law `τ (V / V_ref)ⁿ`.
+    pub voltage_exponent: f64,
+    /// Loss of torque [1/K] above a temperature [°C], by joint.
+    pub thermal: Vec<[f64; 2]>,
+    /// Reading of the gyroscope at rest [rad/s].
+    pub gyro_bias: DVec3,
+    /// Friction coefficient of the ground.
+    pub ground_friction: f64,
+    /// Time constant of the contact with the ground [s].
+    pub contact_time: f64,
+}
+
+impl From<&RobotModel> for Robot {
+    fn from(robot: &RobotModel) -> Self {
+        let mut tree = RobotTree::from(robot);
+        tree.joints.iter_mut().for_each(|joint| joint.armature = 0.0);
+        let foot = |leg: Leg| Foot {
+            name: format!("{leg:?}"),
+            body: 3 * (leg as usize + 1),
+            centre: robot.shapes.foot_centre,
+            radius: robot.shapes.foot_radius,
+        };
+        let derating = &robot.derating;
+        Self {
+            tree,
+            joints: robot.joints.to_vec(),
+            feet: Leg::ALL.into_iter().map(foot).collect(),
+            voltage_exponent: derating.voltage_exponent,
+            thermal: derating
+                .per_kelvin
+                .into_iter()
+                .zip(derating.reference_temperature_c)
+                .map(|(a, b)| [a, b])
+                .collect(),
+            gyro_bias: robot.gyro_bias,
+            ground_friction: robot.contact.friction,
+            contact_time: robot.contact.time_constant,
+        }
+    }
+}

@@ -1,0 +1,382 @@
+//! All equations of a log: blocks of residuals, and the column of any change of the robot.
+
+use glam::DVec3;
+use rayon::prelude::*;
+use twinstep_effects::Apply;
+
+use super::balance::{Balance, advanced};
+use super::block::{Block, Column};
+use super::drive::sensed_torque;
+use super::law::{Law, Place};
+use super::measurements::{JointRows, Measurements, Regime};
+use super::robot::Robot;
+
+/// Rows at the start of a range in which a drive has the commands of before [s].
+const HISTORY_S: f64 = 0.05;
+/// Mass above which a payload changes the inertia of a body, too [kg], if it is no farther from the body's origin than this [m].
+const LEAST_PAYLOAD: f64 = 0.05;
+const LONGEST_ARM: f64 = 0.5;
+/// Time between samples of the gyroscope [s].
+const GYRO_S: f64 = 0.05;
+
+/// Where a law acts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Site {
+    /// A joint, or its link.
+    Joint(usize),
+    /// The base.
+    Base,
+}
+
+/// The equations of a log.
+pub struct System {
+    /// What was measured.
+    pub measured: Measurements,
+    /// Force balance.
+    pub balance: Balance,
+    /// Blocks with the residuals of the robot for which they were written last.
+    pub blocks: Vec<Block>,
+    /// Block and rows of the log of the torques of each joint.
+    drive_rows: Vec<Vec<(usize, Vec<usize>)>>,
+    /// Blocks of the gyroscope, with the rows of the log.
+    gyro_rows: Vec<(usize, Vec<usize>)>,
+    /// Measured torques minus those of the reference on the readings, plus those on smooth readings, by joint and row [N·m].
+    ///
+    /// Torques of other robots are computed on smooth readings, unless the controller had those of the log. With noise that is not in the
+    /// torques, a lag of the drive would reduce it.
+    first_residual: Vec<Vec<f64>>,
+    /// The robot whose residuals are from measured torques.
+    reference: Robot,
+}
+
+/// Torques that a robot's drives have on the measured states, by joint.
+pub struct Predicted {
+    /// At the sensor, by row [N·m].
+    sensed: Vec<Vec<f64>>,
+    /// At the motor, by joint and sample [N·m].
+    motor: Vec<Vec<f64>>,
+    /// At motors that are in balance with the motion, by sample and joint [N·m].
+    balanced: Vec<Vec<f64>>,
+    /// Moment and force at the base, and torques of the joints, that the motion needs, by sample.
+    needed: Vec<Vec<f64>>,
+}
+
+impl Predicted {
+    /// Returns the torque at the sensor of a joint, by row [N·m].
+    pub fn sensed(&self, joint: usize) -> &[f64] {
+        &self.sensed[joint]
+    }
+
+    /// Returns the torques of motors that are in balance with the motion of a sample, by joint [N·m].
+    pub fn balanced(&self, sample: usize) -> &[f64] {
+        &self.balanced[sample]
+    }
+}
+
+impl System {
+    /// Returns blocks and rows of the torques of a joint.
+    pub fn drive_rows(&self, joint: usize) -> &[(usize, Vec<usize>)] {
+        &self.drive_rows[joint]
+    }
+
+    /// Collects the equations of a log.
+    pub fn new(mut measured: Measurements, robot: &Robot) -> Self {
+        let mut blocks = Vec::new();
+        let drive_rows = drive_blocks(&measured, robot, &mut blocks);
+        let gyro_rows = gyro_blocks(&measured, &mut blocks);
+        let balance = Balance::new(&measured, robot, &mut blocks);
+        let lacking = |smooth: bool| -> Vec<Vec<f64>> {
+            let of = |rows: &JointRows| {
+                let readings = if smooth { [&rows.smooth[0], &rows.smooth[1]] } else { [&rows.q, &rows.dq] };
+                let sensed = sensed_torque(&measured, rows, readings.map(Vec::as_slice), robot);
+                rows.torque.iter().zip(&sensed).map(|(measured, sensed)| measured - sensed).collect()
+            };
+            measured.joints.par_iter().map(of).collect()
+        };
+        let [raw, smooth] = [lacking(false), lacking(true)];
+        let has_readings = roughness(&raw) < roughness(&smooth);
+        if has_readings {
+            for rows in &mut measured.joints {
+                rows.smooth = [rows.q.clone(), rows.dq.clone()];
+            }
+        }
+        // The part of the readings that is not in the smooth ones is in the torque of the reference only.
+        let of_smooth = measured
+            .joints
+            .par_iter()
+            .map(|rows| sensed_torque(&measured, rows, [&rows.smooth[0], &rows.smooth[1]], robot));
+        let of_smooth: Vec<Vec<f64>> = of_smooth.collect();
+        let first_residual = raw
+            .iter()
+            .zip(&of_smooth)
+            .map(|(lacking, sensed)| lacking.iter().zip(sensed).map(|(lacking, sensed)| lacking + sensed).collect());
+        let first_residual = first_residual.collect();
+        Self { measured, balance, blocks, drive_rows, gyro_rows, first_residual, reference: robot.clone() }
+    }
+
+    /// Returns the torques of the drives of a robot.
+    pub fn predicted(&self, robot: &Robot) -> Predicted {
+        let joints = &self.measured.joints;
+        let sensed: Vec<Vec<f64>> = joints.par_iter().map(|rows| self.sensed(rows, robot)).collect();
+        let motor =
+            joints.par_iter().zip(&sensed).map(|(rows, sensed)| self.motor(robot, rows.joint, sensed)).collect();
+        let mut rigid = robot.clone();
+        for joint in &mut rigid.joints {
+            (joint.actuator.backlash, joint.actuator.gear_stiffness) = (0.0, f64::INFINITY);
+        }
+        let shift = |joint: usize| {
+            let is_rigid = robot.joints[joint] == rigid.joints[joint];
+            if is_rigid { Vec::new() } else { self.link_motion(joint, &rigid, robot) }
+        };
+        let shifts: Vec<_> = (0..robot.joints.len()).map(shift).collect();
+        let needed = self.balance.needed_by(robot, &shifts);
+        let motor: Vec<Vec<f64>> = motor;
+        let balanced = self.balance.balanced_motors(robot, &needed, &motor);
+        Predicted { sensed, motor, balanced, needed }
+    }
+
+    /// Returns the torque at the sensor of a joint for smooth readings, by row [N·m].
+    fn sensed(&self, rows: &JointRows, robot: &Robot) -> Vec<f64> {
+        sensed_torque(&self.measured, rows, [&rows.smooth[0], &rows.smooth[1]], robot)
+    }
+
+    /// Returns the mean torque of a motor by sample, given that at its sensor by row.
+    fn motor(&self, robot: &Robot, joint: usize, sensed: &[f64]) -> Vec<f64> {
+        let at_motor = advanced(&self.measured, joint, robot, sensed);
+        let or_zero = |value: f64| if value.is_finite() { value } else { 0.0 };
+        self.balance.samples.iter().map(|sample| or_zero(sample.mean(&at_motor))).collect()
+    }
+
+    /// Returns the blocks with the residuals of a robot.
+    pub fn residuals(&self, robot: &Robot, predicted: &Predicted) -> Vec<Block> {
+        let mut blocks = self.blocks.clone();
+        for (joint, parts) in self.drive_rows.iter().enumerate() {
+            for (block, rows) in parts {
+                let [first, change] = [&self.first_residual[joint], &predicted.sensed[joint]];
+                let residual = |row: &usize| first[*row] - change[*row];
+                blocks[*block].y = rows.iter().map(residual).collect();
+            }
+        }
+        if let Some(base) = &self.measured.base {
+            for (axis, (block, rows)) in self.gyro_rows.iter().enumerate() {
+                let length = rows_of(GYRO_S, &self.measured);
+                let mean = |row: &usize| {
+                    base.gyro[*row..row + length].iter().map(|gyro| gyro[axis]).sum::<f64>() / length as f64
+                };
+                blocks[*block].y = rows.iter().map(|row| mean(row) - robot.gyro_bias[axis]).collect();
+            }
+        }
+        let late = |joint: usize| {
+            if robot.joints[joint].actuator.sensor_delay == self.reference.joints[joint].actuator.sensor_delay {
+                return Vec::new();
+            }
+            let on_time = self.motor(&self.reference, joint, &predicted.sensed[joint]);
+            predicted.motor[joint].iter().zip(on_time).map(|(now, before)| now - before).collect()
+        };
+        let late: Vec<Vec<f64>> = (0..robot.joints.len()).map(late).collect();
+        self.balance.write_residuals(robot, &predicted.needed, &predicted.balanced, &late, &mut blocks);
+        blocks
+    }
+
+    /// Returns what a law changes at a site: the column of `after` minus `before`.
+    pub fn column(&self, law: &Law, site: Site, before: (&Robot, &Predicted), after: &Robot) -> Column {
+        let (robot, predicted) = before;
+        match (law.place, site) {
+            (Place::Drive, Site::Joint(joint)) => self.drive_column(joint, predicted, after),
+            (Place::Joint, Site::Joint(joint)) => self.joint_column(joint, robot, after, predicted),
+            (Place::Sensor, Site::Joint(joint)) => {
+                let mut column = self.drive_column(joint, predicted, after);
+                let moved = self.motor(after, joint, &predicted.sensed[joint]);
+                let change = |(index, motor): (usize, &f64)| {
+                    let sample = &self.balance.samples[index];
+                    sample.link_torque(robot, joint, *motor)
+                        - sample.link_torque(robot, joint, predicted.motor[joint][index])
+                };
+                let changes: Vec<f64> = moved.iter().enumerate().map(change).collect();
+                column.parts.extend(self.balance.joint_column(joint, &changes).parts);
+                column
+            }
+            (Place::Link, Site::Joint(joint)) => {
+                self.balance.motion_column(joint, &self.link_motion(joint, robot, after))
+            }
+            (Place::Body, _) => self.balance.body_column(&after.tree, robot),
+            (Place::Gyro, _) => self.gyro_column(robot, after),
+            (_, Site::Base) => Column::default(),
+        }
+    }
+
+    /// Returns the column of an offset of a joint's torque sensor, per N·m.
+    pub fn torque_offset(&self, joint: usize) -> Column {
+        let mut parts: Vec<(usize, Vec<f64>)> =
+            self.drive_rows[joint].iter().map(|(block, rows)| (*block, vec![1.0; rows.len()])).collect();
+        // The motor has less torque than the sensor reads.
+        let lacking = vec![-1.0; self.balance.samples.len()];
+        parts.extend(self.balance.joint_column(joint, &lacking).parts);
+        Column { parts }
+    }
+
+    fn drive_column(&self, joint: usize, predicted: &Predicted, after: &Robot) -> Column {
+        let sensed = self.sensed(&self.measured.joints[joint], after);
+        let part = |(block, rows): &(usize, Vec<usize>)| {
+            let change = |row: &usize| sensed[*row] - predicted.sensed[joint][*row];
+            (*block, rows.iter().map(change).collect())
+        };
+        Column { parts: self.drive_rows[joint].iter().map(part).collect() }
+    }
+
+    fn joint_column(&self, joint: usize, before: &Robot, after: &Robot, predicted: &Predicted) -> Column {
+        let change = |(sample, motors): (&super::balance::Sample, &Vec<f64>)| {
+            sample.link_torque(after, joint, motors[joint]) - sample.link_torque(before, joint, motors[joint])
+        };
+        let changes: Vec<f64> = self.balance.samples.iter().zip(&predicted.balanced).map(change).collect();
+        self.balance.joint_column(joint, &changes)
+    }
+
+    /// Returns how the motion of a link changes: position, velocity and acceleration, by sample.
+    fn link_motion(&self, joint: usize, before: &Robot, after: &Robot) -> Vec<[f64; 3]> {
+        let torque = |index: usize| self.balance.needed[index][6 + joint];
+        let lag = |robot: &Robot, index: usize| {
+            let actuator = &robot.joints[joint].actuator;
+            let twist =
+                torque(index) / actuator.gear_stiffness + 0.5 * actuator.backlash * (torque(index) / 0.05).tanh();
+            // The encoder is ahead of the link by the twist and by its offset.
+            -twist - actuator.encoder_offset
+        };
+        let shift: Vec<f64> =
+            (0..self.balance.samples.len()).map(|index| lag(after, index) - lag(before, index)).collect();
+        let samples = &self.balance.samples;
+        let near = |index: usize| {
+            index > 0
+                && index + 1 < samples.len()
+                && samples[index - 1].rows.contains(&samples[index].rows.start)
+                && samples[index].rows.contains(&samples[index + 1].rows.start)
+        };
+        let motion = |index: usize| {
+            let time = 0.5 * samples[index].rows.len() as f64 * self.measured.dt;
+            let [dq, ddq] = if near(index) {
+                let (earlier, now, later) = (shift[index - 1], shift[index], shift[index + 1]);
+                [(later - earlier) / (2.0 * time), (later - 2.0 * now + earlier) / (time * time)]
+            } else {
+                [0.0; 2]
+            };
+            [shift[index], dq, ddq]
+        };
+        (0..shift.len()).map(motion).collect()
+    }
+
+    fn gyro_column(&self, before: &Robot, after: &Robot) -> Column {
+        let change = after.gyro_bias - before.gyro_bias;
+        let part = |(axis, (block, rows)): (usize, &(usize, Vec<usize>))| (*block, vec![change[axis]; rows.len()]);
+        Column {
+            parts: self
+                .gyro_rows
+                .iter()
+                .enumerate()
+                .map(part)
+                .filter(|(_, rows)| rows.iter().any(|row| *row != 0.0))
+                .collect(),
+        }
+    }
+}
+
+/// Returns the mean square of the differences of neighbouring torques, which are noise rather than what a model lacks.
+///
+/// It shows whether the controller had the readings of the log: their noise then is in the measured torques, too.
+fn roughness(torques: &[Vec<f64>]) -> f64 {
+    let steps = torques.iter().flat_map(|rows| rows.windows(2).map(|pair| (pair[1] - pair[0]).powi(2)));
+    let (sum, count) =
+        steps.filter(|step| step.is_finite()).fold((0.0, 0.0), |(sum, count), step| (sum + step, count + 1.0));
+    sum / f64::max(count, 1.0)
+}
+
+fn rows_of(time: f64, measured: &Measurements) -> usize {
+    ((time / measured.dt).round() as usize).max(1)
+}
+
+fn drive_blocks(measured: &Measurements, robot: &Robot, blocks: &mut Vec<Block>) -> Vec<Vec<(usize, Vec<usize>)>> {
+    let skipped = rows_of(HISTORY_S, measured);
+    let mut all = Vec::new();
+    for rows in &measured.joints {
+        let sensed = sensed_torque(measured, rows, [&rows.q, &rows.dq], robot);
+        let mut parts = Vec::new();
+        for regime in [Regime::Hang, Regime::Stand, Regime::Move] {
+            let own = |row: &usize| {
+                measured.regime[*row] == regime && rows.torque[*row].is_finite() && sensed[*row].is_finite()
+            };
+            let inner = measured.ranges.iter().flat_map(|range| range.start + skipped..range.end.saturating_sub(2));
+            let kept: Vec<usize> = inner.filter(own).collect();
+            if kept.is_empty() {
+                continue;
+            }
+            let name = format!("torque {} {regime:?}", robot.tree.joints[rows.joint].name).to_lowercase();
+            let t = kept.iter().map(|row| measured.t[*row]).collect();
+            blocks.push(Block { name, t, y: vec![0.0; kept.len()], sigma: measured.noise[2] });
+            parts.push((blocks.len() - 1, kept));
+        }
+        all.push(parts);
+    }
+    all
+}
+
+fn gyro_blocks(measured: &Measurements, blocks: &mut Vec<Block>) -> Vec<(usize, Vec<usize>)> {
+    let Some(base) = &measured.base else { return Vec::new() };
+    let length = rows_of(GYRO_S, measured);
+    let hanging = measured.ranges.iter().filter(|range| measured.regime[range.start] == Regime::Hang);
+    let rows: Vec<usize> = hanging
+        .flat_map(|range| (range.start..range.end.saturating_sub(length)).step_by(length))
+        .filter(|row| base.gyro[*row..row + length].iter().flatten().all(|cell| cell.is_finite()))
+        .collect();
+    if rows.is_empty() {
+        return Vec::new();
+    }
+    (0..3)
+        .map(|axis| {
+            let t = rows.iter().map(|row| measured.t[*row]).collect();
+            let sigma = 0.02 / (length as f64).sqrt();
+            blocks.push(Block { name: format!("gyro {axis}"), t, y: vec![0.0; rows.len()], sigma });
+            (blocks.len() - 1, rows.clone())
+        })
+        .collect()
+}
+
+/// Changes a robot by a law at a site.
+pub fn apply(robot: &mut Robot, law: &Law, site: Site, unknowns: &[f64], shape: f64) {
+    if unknowns.iter().all(|unknown| *unknown == 0.0) {
+        return;
+    }
+    let values = (law.values)(unknowns, shape);
+    match (law.effect.name, site) {
+        ("supply_sag", _) => robot.voltage_exponent = values[0],
+        ("thermal_derating", Site::Joint(joint)) => robot.thermal[joint] = [values[0], values[1]],
+        ("gyro_bias", _) => robot.gyro_bias += DVec3::new(values[0], values[1], values[2]),
+        ("payload", site) => {
+            // The unknowns are mass and first moment, in which forces are nearly linear.
+            let body = &mut robot.tree.bodies[body_of(site)].inertia;
+            let mass = unknowns[0].max(-0.9 * body.mass);
+            let moment = DVec3::new(unknowns[1], unknowns[2], unknowns[3]);
+            if mass.abs() > LEAST_PAYLOAD && (moment / mass).length() < LONGEST_ARM {
+                *body = body.with_point_mass(mass, moment / mass);
+            } else {
+                let total = body.mass + mass;
+                body.com = (body.mass * body.com + moment) / total;
+                body.mass = total;
+            }
+        }
+        ("com_shift", site) => {
+            robot.tree.bodies[body_of(site)].inertia.com += DVec3::new(values[0], values[1], values[2]);
+        }
+        (_, Site::Joint(joint)) => {
+            if let Apply::Joint(change) = law.effect.apply {
+                let _ = change(&mut robot.joints[joint], &values);
+            }
+        }
+        (_, Site::Base) => {}
+    }
+}
+
+fn body_of(site: Site) -> usize {
+    match site {
+        Site::Joint(joint) => joint + 1,
+        Site::Base => 0,
+    }
+}
