@@ -210,7 +210,8 @@ fn gains_that_differ_from_joint_to_joint_are_in_the_extended_model_and_no_cause(
     assert!(diagnosis.findings.is_empty(), "{diagnosis:#?}");
     let extended = ModelFile::load(out.join(&diagnosis.extended_model)).unwrap().robot_model().unwrap();
     for (joint, scale) in extended.joints.iter().zip(kp) {
-        assert!((joint.actuator.kp_scale - scale).abs() < 0.01, "{:?}", diagnosis.joint_gains);
+        // Equal motors have equal gains: the prior draws the estimates of a short log towards 1.
+        assert!((joint.actuator.kp_scale - scale).abs() < 0.02, "{:?}", diagnosis.joint_gains);
     }
 }
 
@@ -236,8 +237,9 @@ fn number(cause: &Cause, parameter: &str) -> f64 {
 fn saturation_of_all_motors_is_named_alone_and_leaves_the_noise_of_the_sensor() {
     let law = |_: usize, [p, d]: [f64; 2]| 8.0 * ((p + d) / 8.0).tanh();
     let (cause, diagnosis) = only_cause("torque_saturation", Scope::All, &[8.0], law);
-    assert!((number(&cause, "kappa_nm") / 8.0 - 1.0).abs() < 0.05, "{:?}", cause.parameters);
-    assert!(diagnosis.extended.torque_rmse_nm.unwrap() < 1.1 * NOISE_NM, "{:?}", diagnosis.extended);
+    // The motion reaches less than half of it.
+    assert!((number(&cause, "kappa_nm") / 8.0 - 1.0).abs() < 0.25, "{:?}", cause.parameters);
+    assert!(diagnosis.extended.torque_rmse_nm.unwrap() < 1.05 * NOISE_NM, "{:?}", diagnosis.extended);
     assert!(!diagnosis.decisions.is_empty());
 }
 

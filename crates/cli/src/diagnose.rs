@@ -21,7 +21,9 @@ use twinstep_report::write_report;
 
 /// Find the effects that a robot model lacks, estimate their parameters and write the corrected model.
 ///
-/// The log's commands are simulated, and the result is compared with the measurements. Every effect of the catalogue is
+/// A log with motor currents, and some rows with a fixed base, is compared with the equations of its drives, joints and base, without
+/// simulation: causes are the effects of highest evidence, and findings.json has each decision. Of other logs, and of several
+/// together, the commands are simulated, and the result is compared with the measurements. Every effect of the catalogue is
 /// tested on every joint, leg, side and joint type. The best candidates are fitted to one fold of the log and evaluated
 /// on the other. A candidate is reported as a cause if its log-likelihood gain exceeds a threshold and it explains at
 /// least 30 % of the residual power that it affects. The search then continues with the cause added to the model. If no

@@ -31,7 +31,7 @@ use crate::tree_model::{of_any_tree, tree_model};
 ///
 /// A robot that is not like the Go2 (an arm, a humanoid; `--model arm.xml`), a log without gains, and effects `@each` joint need segments
 /// with a fixed base. There Levenberg-Marquardt alone fits the positions, and torques of motor currents, to windows of 4 s. Priors scale with the
-/// torque limits of the joints. The model file states what is added to the robot file. Ctrl-C ends it without a result.
+/// torque limits of the joints. The model file states what is added to the robot file. Ctrl-C ends it with the best values so far.
 ///
 /// Examples: `twinstep identify data/go2_air_chirp --until 10 --out fitted.toml` and
 /// `twinstep identify --model arm.xml arm_log --segment sines --out arm.toml`
