@@ -211,7 +211,7 @@ fn gains_that_differ_from_joint_to_joint_are_in_the_extended_model_and_no_cause(
     let extended = ModelFile::load(out.join(&diagnosis.extended_model)).unwrap().robot_model().unwrap();
     for (joint, scale) in extended.joints.iter().zip(kp) {
         // Equal motors have equal gains: the prior draws the estimates of a short log towards 1.
-        assert!((joint.actuator.kp_scale - scale).abs() < 0.02, "{:?}", diagnosis.joint_gains);
+        assert!((joint.actuator.kp_scale - scale).abs() < 0.03, "{:?}", diagnosis.joint_gains);
     }
 }
 
