@@ -58,40 +58,61 @@ pub fn chirp_log(robot: &RobotModel, rows: u32) -> Log {
 
 /// Returns a log like [`chirp_log`] that starts at this frequency [Hz], of a robot with an external actuator.
 pub fn chirp_log_with(robot: &RobotModel, rows: u32, external: Option<Box<dyn Actuator>>, from_hz: f64) -> Log {
-    let config = SimConfig {
-        engine: Engine::Rapier,
-        base: BaseMount::Fixed,
-        physics_hz: Some(2000),
-        threads: 1,
-        ..SimConfig::default()
-    };
-    let backend = RapierBackend::new(robot.clone(), config, 1).unwrap();
-    let mut backend = if let Some(external) = external { backend.with_actuator(external) } else { backend };
-    let pose = go2().control.default_pose_f32();
-    backend.reset(&[(0, InitialState::at_rest(FIXED_BASE_HEIGHT as f32, pose))]).unwrap();
-    let mut columns = BTreeMap::<String, Vec<f64>>::new();
-    let mut random = stream(5, "noise", 0);
-    for row in 0..rows {
-        let t = f64::from(row) * 0.005;
-        let phase = std::f64::consts::TAU * (from_hz + 0.15 * t) * t;
-        let mut command = Command::hold(pose, 25.0, 0.6);
-        columns.entry("t".to_owned()).or_default().push(t);
-        for (joint, name) in JOINT_NAMES.iter().enumerate() {
-            command.q[joint] += (0.3 * (phase + joint as f64).sin()) as f32;
-            let noise = 0.002 * (random.random::<f64>() + random.random::<f64>() + random.random::<f64>() - 1.5);
-            // Resolution of the encoder.
-            let measured = ((f64::from(backend.measured().q[0][joint]) + noise) / 0.0005).round() * 0.0005;
-            columns.entry(format!("q_{name}")).or_default().push(measured);
-            columns.entry(format!("dq_{name}")).or_default().push(f64::from(backend.measured().dq[0][joint]));
-            columns.entry(format!("q_cmd_{name}")).or_default().push(f64::from(command.q[joint]));
+    let chirp = Chirp { rows, from_hz, amplitude: 0.3, gains: [25.0, 0.6] };
+    chirp.log(robot, external)
+}
+
+/// Chirp of all joints around the default pose.
+pub struct Chirp {
+    /// Number of rows of 5 ms.
+    pub rows: u32,
+    /// Frequency at the start [Hz].
+    pub from_hz: f64,
+    /// Amplitude of the commands [rad].
+    pub amplitude: f64,
+    /// Position gain [N·m/rad] and velocity gain [N·m·s/rad].
+    pub gains: [f64; 2],
+}
+
+impl Chirp {
+    /// Returns the log of a robot with a fixed base, with noisy encoders.
+    pub fn log(&self, robot: &RobotModel, external: Option<Box<dyn Actuator>>) -> Log {
+        let [kp, kd] = self.gains;
+        let config = SimConfig {
+            engine: Engine::Rapier,
+            base: BaseMount::Fixed,
+            physics_hz: Some(2000),
+            threads: 1,
+            ..SimConfig::default()
+        };
+        let backend = RapierBackend::new(robot.clone(), config, 1).unwrap();
+        let mut backend = if let Some(external) = external { backend.with_actuator(external) } else { backend };
+        let pose = go2().control.default_pose_f32();
+        backend.reset(&[(0, InitialState::at_rest(FIXED_BASE_HEIGHT as f32, pose))]).unwrap();
+        let mut columns = BTreeMap::<String, Vec<f64>>::new();
+        let mut random = stream(5, "noise", 0);
+        for row in 0..self.rows {
+            let t = f64::from(row) * 0.005;
+            let phase = std::f64::consts::TAU * (self.from_hz + 0.15 * t) * t;
+            let mut command = Command::hold(pose, kp as f32, kd as f32);
+            columns.entry("t".to_owned()).or_default().push(t);
+            for (joint, name) in JOINT_NAMES.iter().enumerate() {
+                command.q[joint] += (self.amplitude * (phase + joint as f64).sin()) as f32;
+                let noise = 0.002 * (random.random::<f64>() + random.random::<f64>() + random.random::<f64>() - 1.5);
+                // Resolution of the encoder.
+                let measured = ((f64::from(backend.measured().q[0][joint]) + noise) / 0.0005).round() * 0.0005;
+                columns.entry(format!("q_{name}")).or_default().push(measured);
+                columns.entry(format!("dq_{name}")).or_default().push(f64::from(backend.measured().dq[0][joint]));
+                columns.entry(format!("q_cmd_{name}")).or_default().push(f64::from(command.q[joint]));
+            }
+            backend.step(&[command], &[true], 1).unwrap();
         }
-        backend.step(&[command], &[true], 1).unwrap();
+        let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
+        let mut meta = Meta::new(200.0, TorqueSensor::None, segments);
+        (meta.kp, meta.kd) = (Some(Gain::Uniform(kp)), Some(Gain::Uniform(kd)));
+        meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
+        Log::new(meta, columns).unwrap()
     }
-    let segments = vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }];
-    let mut meta = Meta::new(200.0, TorqueSensor::None, segments);
-    (meta.kp, meta.kd) = (Some(Gain::Uniform(25.0)), Some(Gain::Uniform(0.6)));
-    meta.joints = JOINT_NAMES.map(str::to_owned).to_vec();
-    Log::new(meta, columns).unwrap()
 }
 
 #[test]

@@ -1,18 +1,21 @@
 //! Diagnosis of a log with motor currents: its causes are those of highest evidence in the equations of the log.
 //!
-//! [`twinstep_inference::equations`] finds them without simulation, in the rows that are not held out. Simulations only measure the
-//! errors in the held-out rows, and choose the next experiment.
+//! [`twinstep_inference::equations`] finds them without simulation, in the rows that are not held out. Simulations estimate the gains of
+//! the joints where the equations show that they differ, measure the errors in the held-out rows, and choose the next experiment.
 
-use twinstep_effects::{Composition, Effect, EffectEntry, ModelFile, Scope};
+use std::collections::BTreeMap;
+
+use twinstep_effects::{Composition, EffectEntry, ModelFile, Scope};
 use twinstep_identify::window::WindowConfig;
 use twinstep_inference::equations::{Explained, Explanation, UnknownLaw, explain};
 use twinstep_logs::Log;
-use twinstep_model::{JOINT_NAMES, Joint, Rollout};
+use twinstep_model::Rollout;
 
 use super::cross_validation::{Accepted, CandidateFit};
 use super::data_split::DataSplit;
 use super::findings::{Cause, CorrelatedPair, Diagnosis, Unexplained, WeightedHypothesis};
 use super::hypothesis::Hypothesis;
+use super::joint_gains::JointGains;
 use super::residual_data::ResidualData;
 use super::{DiagnoseError, DiagnosisOutput, errors, experiment_design, held_out_rows, reporting, unexplained};
 
@@ -40,9 +43,11 @@ pub fn diagnose_by_equations(
     let found = explain(log, &robot, |row| !split.is_held_out(row), &mut go_on);
     interrupted?;
     let Some(found) = found else { return Ok(None) };
-    let extended = extended(model, &found)?;
-    say("simulating the held-out rows")?;
+    say("simulating the log")?;
     let evidence = ResidualData::new(vec![log.clone()], &robot, WindowConfig::DIAGNOSIS)?;
+    let with_causes = extended(model, &found.causes)?;
+    let gains = found.gains_differ.then(|| JointGains::fit(&evidence, &with_causes, LEAST_GAIN, simulator)).flatten();
+    let extended = gains.as_ref().map_or(with_causes.clone(), |gains| gains.added_to(&with_causes));
     if evidence.residual_power(simulator, &robot).diverged() {
         return Err(DiagnoseError::Diverges);
     }
@@ -60,11 +65,7 @@ pub fn diagnose_by_equations(
         extended: after?,
         noise_floor: reporting::noise_floor(&evidence),
         findings: found.causes.iter().map(|cause| finding(cause, &extended)).collect(),
-        joint_gains: JOINT_NAMES
-            .iter()
-            .map(|name| (*name).to_owned())
-            .zip(found.gain_factors.iter().copied())
-            .collect(),
+        joint_gains: gains.map_or(BTreeMap::new(), |gains| gains.by_joint()),
         confusable,
         unexplained,
         learned_residual: None,
@@ -97,14 +98,10 @@ fn unexplained_law(found: &Explained) -> Unexplained {
     Unexplained { fraction: found.left, depends_on: vec![channel], text }
 }
 
-/// Returns the model with the gains of the joints, the causes and their intervals.
-fn extended(model: &ModelFile, found: &Explained) -> Result<ModelFile, DiagnoseError> {
+/// Returns the model with the causes and their intervals.
+fn extended(model: &ModelFile, causes: &[Explanation]) -> Result<ModelFile, DiagnoseError> {
     let mut extended = model.clone();
-    for (joint, factors) in Joint::ALL.into_iter().zip(&found.gain_factors) {
-        let gain = Effect::named("pd_gain").expect("an effect of the catalogue");
-        extended.effects.push(EffectEntry::new(gain, Scope::Joint(joint), factors.to_vec())?);
-    }
-    for cause in &found.causes {
+    for cause in causes {
         if cause.effect.composition == Composition::Replace {
             extended.effects.retain(|entry| entry.effect != cause.effect || entry.scope != cause.scope);
         }

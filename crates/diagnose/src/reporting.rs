@@ -72,11 +72,11 @@ pub fn with_intervals(
 
 /// Returns the experiment that discriminates between two effects.
 pub fn experiment_between(one: &Effect, other: &Effect) -> String {
-    let told = |from: &Effect, to: &Effect| {
+    let known = |from: &Effect, to: &Effect| {
         let mut confounders = from.confounders.iter();
         confounders.find(|confounder| confounder.effect == to.name).map(|found| found.discriminating_experiment)
     };
-    let experiment = told(one, other).or_else(|| told(other, one));
+    let experiment = known(one, other).or_else(|| known(other, one));
     experiment.unwrap_or("A different motion, with other speeds and loads.").to_owned()
 }
 

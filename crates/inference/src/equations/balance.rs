@@ -315,6 +315,32 @@ impl Balance {
         })
     }
 
+    /// Returns the column of the time by which the positions of a joint's encoder are ahead of its velocities [s].
+    pub fn lead_column(&self, joint: usize) -> Column {
+        let accelerations: Vec<f64> = self.samples.iter().map(|sample| sample.instrument.ddq[joint]).collect();
+        let change = |index: usize| [0.0, accelerations[index], self.slope(&accelerations, index)];
+        self.motion_column(joint, &(0..accelerations.len()).map(change).collect::<Vec<_>>())
+    }
+
+    /// Returns the derivative of a series by sample; zero at the ends of a contiguous range.
+    pub fn slope(&self, series: &[f64], index: usize) -> f64 {
+        self.step_around(index).map_or(0.0, |step| (series[index + 1] - series[index - 1]) / (2.0 * step))
+    }
+
+    /// Returns the second derivative of a series by sample; zero at the ends of a contiguous range.
+    pub fn curvature(&self, series: &[f64], index: usize) -> f64 {
+        let second = |step: f64| (series[index + 1] - 2.0 * series[index] + series[index - 1]) / (step * step);
+        self.step_around(index).map_or(0.0, second)
+    }
+
+    /// Returns the time to the samples before and after one [s]; `None` if one of them is missing.
+    fn step_around(&self, index: usize) -> Option<f64> {
+        let [earlier, now, later] = [index.checked_sub(1)?, index, index + 1].map(|index| self.samples.get(index));
+        let (earlier, now, later) = (earlier?, now?, later?);
+        let contiguous = earlier.rows.contains(&now.rows.start) && now.rows.contains(&later.rows.start);
+        contiguous.then_some(0.5 * (later.t - earlier.t))
+    }
+
     /// Returns the column of an acceleration of a base that stands, along an axis of the base [m/s²].
     pub fn acceleration_column(&self, axis: usize) -> Column {
         self.needed_column(|index, sample| {

@@ -7,11 +7,9 @@ use twinstep_model::{Joint, RobotModel};
 use super::law::{Law, laws};
 use super::measurements::{Measurements, Regime};
 use super::robot::Robot;
-use super::search::{Cause, Found, ScopeSites, Search, UnknownLaw};
+use super::search::{Cause, Found, ScopeSites, Search, TWO_SIDED_95, UnknownLaw};
 use super::system::{Site, System};
 
-/// Half width of the central 95 % interval of a normal distribution [standard deviations].
-const TWO_SIDED_95: f64 = 1.96;
 /// Relative standard deviation of a value because no law is exact.
 const LAW_ERROR: f64 = 0.015;
 /// Variance that is left in an equation, relative to that of its noise, which wrong statements about the noise allow.
@@ -45,8 +43,8 @@ pub struct Explained {
     pub correlations: Vec<(usize, usize, f64)>,
     /// Variance above noise that is left, relative to that of the given robot.
     pub left: f64,
-    /// Factors on position and velocity gain of each joint, beside the causes; empty if none differs from 1 by more than it is uncertain.
-    pub gain_factors: Vec<[f64; 2]>,
+    /// True if the gains of the joints differ, beside the causes, by more than they are uncertain.
+    pub gains_differ: bool,
     /// Laws that the catalogue does not have, the strongest first.
     pub unknown: Vec<UnknownLaw>,
     /// Decisions of the search, as sentences.
@@ -146,7 +144,7 @@ fn explained(found: Found, laws: &[Law]) -> Explained {
     let sum = |side: usize| found.left.iter().map(|(_, powers)| excess(powers[side])).sum::<f64>();
     Explained {
         left: if sum(0) > 0.0 { sum(1) / sum(0) } else { 0.0 },
-        gain_factors: found.gain_errors.iter().map(|errors| errors.map(|error| 1.0 + error)).collect(),
+        gains_differ: found.gains_differ,
         unknown: found.unknown,
         correlations: found.correlations,
         decisions: found.decisions,

@@ -59,8 +59,8 @@ pub struct Group {
     pub mean: DVector<f64>,
     /// Prior covariance.
     pub covariance: DMatrix<f64>,
-    /// Joint, and 0 for the position gain or 1 for the velocity gain, if the unknown is the relative error of a gain.
-    pub gain_of: Option<(usize, usize)>,
+    /// 0 for the position gain, 1 for the velocity gain, if the unknown is the relative error of the gain of a joint.
+    pub gain: Option<usize>,
 }
 
 impl Group {
@@ -76,7 +76,7 @@ impl Group {
             columns,
             mean: DVector::zeros(size),
             covariance: DMatrix::identity(size, size) * (std * std),
-            gain_of: None,
+            gain: None,
         }
     }
 }

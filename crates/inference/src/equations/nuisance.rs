@@ -35,6 +35,9 @@ const SMALL: [(&str, &[f64]); 15] = [
 const SMALL_MOTION: [(&str, f64); 2] = [("encoder_offset", 0.0015), ("joint_elasticity", 1e-4)];
 /// Standard deviation of the friction at low speed [N·m], for two speeds [rad/s].
 const LOW_SPEED: [(f64, f64); 2] = [(0.04, 0.2), (0.03, 0.8)];
+/// Standard deviation of the time by which the positions of an encoder are ahead of its velocities [s]: drives filter the velocity, and
+/// simulators update positions with the new one.
+const LEAD: f64 = 4e-4;
 /// Standard deviation of the tilt of a fixed base [rad].
 const TILT: f64 = 0.005;
 /// Standard deviation of an offset of the accelerometer, by its bias and its mounting [m/s²].
@@ -54,11 +57,8 @@ pub fn of_joints(system: &System, laws: &[Law], robot: &Robot, predicted: &Predi
         for (unknown, std) in stds.iter().enumerate() {
             if name == "pd_gain" {
                 let columns = by_joint(system, law, robot, predicted, unknown, law.shapes[0], *std);
-                let group = |(joint, (column, std)): (usize, (Column, f64))| Group {
-                    gain_of: Some((joint, unknown)),
-                    ..Group::single(column, std)
-                };
-                gains.extend(columns.into_iter().enumerate().map(group));
+                let group = |(column, std)| Group { gain: Some(unknown), ..Group::single(column, std) };
+                gains.extend(columns.into_iter().map(group));
                 continue;
             }
             small.extend(by_joint(system, law, robot, predicted, unknown, law.shapes[0], *std));
@@ -81,9 +81,18 @@ pub fn of_bodies(system: &System, laws: &[Law], robot: &Robot, predicted: &Predi
     for (name, std) in SMALL_MOTION {
         small.extend(by_joint(system, named(laws, name), robot, predicted, 0, 0.0, std));
     }
+    small.extend((0..robot.joints.len()).map(|joint| (system.balance.lead_column(joint), LEAD)));
     small.extend([0, 1].map(|axis| (system.balance.tilt_column(axis), TILT)));
     small.extend([0, 1, 2].map(|axis| (system.balance.acceleration_column(axis), ACCELERATION)));
     grouped(small)
+}
+
+/// Returns the standard deviation of an unknown of an effect that is too small to be reported.
+pub fn small_std(effect: &str, unknown: usize) -> f64 {
+    let of_joint = SMALL.iter().find(|(name, _)| *name == effect).and_then(|(_, stds)| stds.get(unknown).copied());
+    let of_motion = SMALL_MOTION.iter().find(|(name, _)| *name == effect).map(|(_, std)| *std);
+    let of_body = (effect == "com_shift").then_some(BODY[2]);
+    of_joint.or(of_motion).or(of_body).unwrap_or(0.0)
 }
 
 fn named<'a>(laws: &'a [Law], name: &str) -> &'a Law {

@@ -31,6 +31,9 @@ const LARGE: f64 = 0.3;
 const OTHER_SCOPES: usize = 3;
 /// Iterations of a fit that is compared with another one of the same causes.
 const CONVERGED: usize = 8;
+/// Standard deviations of a normal distribution within which 95 % are, on both sides and below.
+pub const TWO_SIDED_95: f64 = 1.96;
+const ONE_SIDED_95: f64 = 1.645;
 /// Most causes.
 const MOST_CAUSES: usize = 6;
 /// Causes that were added and removed again, after which the search ends.
@@ -100,8 +103,8 @@ pub struct Found {
     pub decisions: Vec<String>,
     /// Laws that the catalogue does not have, the strongest first.
     pub unknown: Vec<UnknownLaw>,
-    /// Relative errors of position and velocity gain of each joint, beside the causes; empty if all are as good as zero.
-    pub gain_errors: Vec<[f64; 2]>,
+    /// True if the gains of the joints differ, beside the causes, by more than they are uncertain.
+    pub gains_differ: bool,
     /// Correlation of the first unknowns of each pair of causes, by their places.
     pub correlations: Vec<(usize, usize, f64)>,
 }
@@ -391,17 +394,41 @@ impl<'a> Search<'a> {
             let gain = best.evidence - without.evidence;
             causes.push(FoundCause { cause: cause.clone(), gain, stds, explained, rivals });
         }
-        let pairs = (0..causes.len()).flat_map(|one| (0..one).map(move |other| (other, one)));
+        // Places in the fit of the causes that are large, the strongest first.
+        let mut order: Vec<usize> = (0..causes.len()).filter(|index| self.is_large(&causes[*index])).collect();
+        order.sort_by(|one, other| causes[*other].gain.total_cmp(&causes[*one].gain));
+        let pairs = (0..order.len()).flat_map(|one| (0..one).map(move |other| (other, one)));
         let correlation = |(one, other): (usize, usize)| {
-            let together = of_means([one, other], [0, 0]);
-            (one, other, together / (of_means([one; 2], [0; 2]) * of_means([other; 2], [0; 2])).sqrt())
+            let [first, second] = [order[one], order[other]];
+            let together = of_means([first, second], [0, 0]);
+            (one, other, together / (of_means([first; 2], [0; 2]) * of_means([second; 2], [0; 2])).sqrt())
         };
         let correlations = pairs.map(correlation).collect();
+        let causes = order.iter().map(|index| causes[*index].clone()).collect();
         let left = best.blocks.iter().zip(&best.posterior.noise).zip(given);
         let left = left.map(|((block, noise), given)| (block.name.clone(), [*given, power(noise)])).collect();
         let unknown = self.unknown_laws(&best, small);
-        let gain_errors = gain_errors(&best, small, self.base.joints.len());
-        Found { gain_errors, causes, left, decisions: std::mem::take(&mut self.decisions), unknown, correlations }
+        Found {
+            gains_differ: gains_differ(&best, small),
+            causes,
+            left,
+            decisions: std::mem::take(&mut self.decisions),
+            unknown,
+            correlations,
+        }
+    }
+
+    /// Returns true if an unknown of a cause is larger than in 95 % of all robots, with a probability of 95 %.
+    ///
+    /// Everything is a little present in every robot, so evidence alone does not make a cause.
+    fn is_large(&self, found: &FoundCause) -> bool {
+        let sites = found.cause.values.len() as f64;
+        let mean = |unknown: usize| found.cause.values.iter().map(|values| values[unknown]).sum::<f64>() / sites;
+        let effect = self.laws[found.cause.law].effect.name;
+        let exceeds = |(unknown, std): (usize, &f64)| {
+            mean(unknown).abs() - TWO_SIDED_95 * nuisance::small_std(effect, unknown) > ONE_SIDED_95 * std
+        };
+        found.stds.iter().enumerate().any(exceeds)
     }
 
     /// Returns the joints at which functions of what they measure explain what the causes leave.
@@ -520,7 +547,7 @@ impl<'a> Search<'a> {
             let unit = law.units[unknown] * law.units[unknown];
             unit * (1.0 + if site == other_site { SPREAD * SPREAD } else { 0.0 })
         });
-        Group { columns, mean, covariance, gain_of: None }
+        Group { columns, mean, covariance, gain: None }
     }
 
     /// Returns the best candidates for a further cause, with their gains at the noise of the current fit.
@@ -680,25 +707,19 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Returns the relative errors of the gains of each joint; empty if they are not larger than they are uncertain.
-fn gain_errors(best: &Fitted, small: &[Group], joints: usize) -> Vec<[f64; 2]> {
-    let mut errors = vec![[0.0; 2]; joints];
-    // Squares of the estimates and of their standard deviations, for either gain.
+/// Returns true if the errors of either gain are twice as large as they are uncertain, root mean square over the joints.
+fn gains_differ(best: &Fitted, small: &[Group]) -> bool {
+    // Squares of the estimates and of their standard deviations.
     let mut squares = [[0.0; 2]; 2];
     let mut place = 0;
     for group in small {
-        if let Some((joint, gain)) = group.gain_of {
-            errors[joint][gain] = best.posterior.mean[place];
+        if let Some(gain) = group.gain {
             squares[gain][0] += best.posterior.mean[place].powi(2);
             squares[gain][1] += best.posterior.covariance[(place, place)];
         }
         place += group.columns.len();
     }
-    let differs = squares.map(|[estimates, variances]| estimates > 4.0 * variances);
-    for joint in &mut errors {
-        (0..2).filter(|gain| !differs[*gain]).for_each(|gain| joint[gain] = 0.0);
-    }
-    if differs.contains(&true) { errors } else { Vec::new() }
+    squares.iter().any(|[estimates, variances]| *estimates > 4.0 * variances)
 }
 
 /// Returns the logarithm of the probability that the mean of a cause's first unknown is allowed.

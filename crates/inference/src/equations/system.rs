@@ -244,23 +244,8 @@ impl System {
         };
         let shift: Vec<f64> =
             (0..self.balance.samples.len()).map(|index| lag(after, index) - lag(before, index)).collect();
-        let samples = &self.balance.samples;
-        let near = |index: usize| {
-            index > 0
-                && index + 1 < samples.len()
-                && samples[index - 1].rows.contains(&samples[index].rows.start)
-                && samples[index].rows.contains(&samples[index + 1].rows.start)
-        };
-        let motion = |index: usize| {
-            let time = 0.5 * samples[index].rows.len() as f64 * self.measured.dt;
-            let [dq, ddq] = if near(index) {
-                let (earlier, now, later) = (shift[index - 1], shift[index], shift[index + 1]);
-                [(later - earlier) / (2.0 * time), (later - 2.0 * now + earlier) / (time * time)]
-            } else {
-                [0.0; 2]
-            };
-            [shift[index], dq, ddq]
-        };
+        let motion =
+            |index: usize| [shift[index], self.balance.slope(&shift, index), self.balance.curvature(&shift, index)];
         (0..shift.len()).map(motion).collect()
     }
 
