@@ -4,10 +4,12 @@ use twinstep_effects::{Effect, Scope};
 use twinstep_logs::Log;
 use twinstep_model::{Joint, RobotModel};
 
+use super::causes::{Cause, Found, ScopeSites, UnknownLaw};
 use super::law::{Law, laws};
 use super::measurements::{Measurements, Regime};
+use super::outcome::TWO_SIDED_95;
+use super::problem::Search;
 use super::robot::Robot;
-use super::search::{Cause, Found, ScopeSites, Search, TWO_SIDED_95, UnknownLaw};
 use super::system::{Site, System};
 
 /// Relative standard deviation of a value because no law is exact.
@@ -92,7 +94,8 @@ fn scopes() -> Vec<ScopeSites> {
         }
     });
     let base = ScopeSites { name: "base".to_owned(), sites: vec![Site::Base], probability: 0.5 };
-    of_joints.chain([base]).collect()
+    let supply = ScopeSites { name: "all".to_owned(), sites: vec![Site::Base], probability: 0.5 };
+    of_joints.chain([base, supply]).collect()
 }
 
 fn explained(found: Found, laws: &[Law]) -> Explained {

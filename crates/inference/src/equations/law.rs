@@ -9,6 +9,8 @@ use twinstep_effects::Effect;
 pub enum Place {
     /// The torque at the motor-current sensor.
     Drive,
+    /// The torque at the motor-current sensors of all joints together.
+    Supply,
     /// The torque on the link of a joint.
     Joint,
     /// The torque at the sensor, and when it was on the link.
@@ -69,7 +71,7 @@ pub fn laws() -> Vec<Law> {
         law("pd_gain", Place::Drive, &[0.3], |c, _| vec![1.0, 1.0 + c[0]]),
         law("pd_gain", Place::Drive, &[0.15, 0.3], |c, _| vec![1.0 + c[0], 1.0 + c[1]]),
         strength("torque_saturation", Place::Drive, |c, _| vec![15.0 / c[0].max(1e-3)]),
-        strength("supply_sag", Place::Drive, |c, _| vec![2.0 * c[0].max(0.0)]),
+        strength("supply_sag", Place::Supply, |c, _| vec![2.0 * c[0].max(0.0)]),
         Law {
             shapes: periods(25.0, 45.0, 2.5),
             ..positive(law("thermal_derating", Place::Drive, &[0.0025], |c, above| vec![c[0].max(0.0), above]))

@@ -3,23 +3,32 @@
 //! - [`explain`]: what explains a log, in the terms of the catalogue.
 //! - [`measurements`]: the channels of a log; [`robot`]: what effects change.
 //! - [`system`]: blocks of residuals without simulation, and the column of any change of the robot. [`drive`]: the torque of each drive;
-//!   [`balance`]: the balance of each joint and of the base; the gyroscope.
+//!   [`balance`]: the balance of each joint and of the base in [`samples`] of the log, with its [`columns`]; the gyroscope.
 //! - [`gaussian`]: the evidence of residuals that are linear in unknowns with normal priors; [`block`]: the noise that is left.
 //! - [`law`]: an effect with its unknowns. [`nuisance`]: what every robot has a little of.
-//! - [`search`]: the set of causes of highest evidence. [`unknown`]: functions that explain what the causes leave.
+//! - [`search`]: the set of causes of highest evidence, by [`screening`] of all effects and a [`fit`] of the best; [`outcome`]: what it found. [`unknown`]: functions that explain what the causes leave.
 
 mod balance;
 mod block;
+mod causes;
+mod columns;
 mod drive;
 mod explain;
+mod fit;
 mod gaussian;
 mod law;
 mod measurements;
 mod nuisance;
+mod outcome;
+mod problem;
 mod robot;
+mod samples;
+mod screening;
 mod search;
 mod system;
+#[cfg(test)]
+mod tests;
 mod unknown;
 
+pub use causes::UnknownLaw;
 pub use explain::{Explained, Explanation, explain};
-pub use search::UnknownLaw;

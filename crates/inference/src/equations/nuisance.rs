@@ -12,8 +12,8 @@ use super::system::{Predicted, Site, System, apply};
 
 /// Standard deviation of an effect's first unknowns where it is too small to be reported: name and values in its unit.
 ///
-/// Gains, friction and rotors differ between equal motors by a few per cent of their torque; the numbers are those of identifications
-/// of the Go2's and the ANYmal's drives (see `docs/references.md`). Delays are a fraction of a period of a field bus.
+/// Assumed: equal motors differ by a few per cent of their gains and of the torque that they have in slow motion, and delays by a fraction
+/// of a period of a field bus. What twice or half of these numbers changes in the rates was not examined.
 const SMALL: [(&str, &[f64]); 15] = [
     ("command_delay", &[0.005]),
     ("pd_gain", &[0.02, 0.04]),
@@ -91,8 +91,12 @@ pub fn of_bodies(system: &System, laws: &[Law], robot: &Robot, predicted: &Predi
 pub fn small_std(effect: &str, unknown: usize) -> f64 {
     let of_joint = SMALL.iter().find(|(name, _)| *name == effect).and_then(|(_, stds)| stds.get(unknown).copied());
     let of_motion = SMALL_MOTION.iter().find(|(name, _)| *name == effect).map(|(_, std)| *std);
-    let of_body = (effect == "com_shift").then_some(BODY[2]);
-    of_joint.or(of_motion).or(of_body).unwrap_or(0.0)
+    let of_others = match effect {
+        "stribeck_friction" => LOW_SPEED[0].0,
+        "com_shift" => BODY[2],
+        _ => 0.0,
+    };
+    of_joint.or(of_motion).unwrap_or(of_others)
 }
 
 fn named<'a>(laws: &'a [Law], name: &str) -> &'a Law {

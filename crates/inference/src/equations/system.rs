@@ -10,6 +10,7 @@ use super::drive::sensed_torque;
 use super::law::{Law, Place};
 use super::measurements::{JointRows, Measurements, Regime};
 use super::robot::Robot;
+use super::samples::Sample;
 
 /// Rows at the start of a range in which a drive has the commands of before [s].
 const HISTORY_S: f64 = 0.05;
@@ -182,7 +183,11 @@ impl System {
     pub fn column(&self, law: &Law, site: Site, before: (&Robot, &Predicted), after: &Robot) -> Column {
         let (robot, predicted) = before;
         match (law.place, site) {
-            (Place::Drive, Site::Joint(joint)) => self.drive_column(joint, predicted, after),
+            (Place::Drive | Place::Supply, Site::Joint(joint)) => self.drive_column(joint, predicted, after),
+            (Place::Supply, Site::Base) => {
+                let columns = (0..robot.joints.len()).map(|joint| self.drive_column(joint, predicted, after));
+                Column { parts: columns.flat_map(|column| column.parts).collect() }
+            }
             (Place::Joint, Site::Joint(joint)) => self.joint_column(joint, robot, after, predicted),
             (Place::Sensor, Site::Joint(joint)) => {
                 let mut column = self.drive_column(joint, predicted, after);
@@ -199,7 +204,7 @@ impl System {
             (Place::Link, Site::Joint(joint)) => {
                 self.balance.motion_column(joint, &self.link_motion(joint, robot, after))
             }
-            (Place::Body, _) => self.balance.body_column(&after.tree, robot),
+            (Place::Body, _) => self.balance.body_column(robot, after),
             (Place::Gyro, _) => self.gyro_column(robot, after),
             (_, Site::Base) => Column::default(),
         }
@@ -225,7 +230,7 @@ impl System {
     }
 
     fn joint_column(&self, joint: usize, before: &Robot, after: &Robot, predicted: &Predicted) -> Column {
-        let change = |(sample, motors): (&super::balance::Sample, &Vec<f64>)| {
+        let change = |(sample, motors): (&Sample, &Vec<f64>)| {
             sample.link_torque(after, joint, motors[joint]) - sample.link_torque(before, joint, motors[joint])
         };
         let changes: Vec<f64> = self.balance.samples.iter().zip(&predicted.balanced).map(change).collect();
@@ -252,15 +257,10 @@ impl System {
     fn gyro_column(&self, before: &Robot, after: &Robot) -> Column {
         let change = after.gyro_bias - before.gyro_bias;
         let part = |(axis, (block, rows)): (usize, &(usize, Vec<usize>))| (*block, vec![change[axis]; rows.len()]);
-        Column {
-            parts: self
-                .gyro_rows
-                .iter()
-                .enumerate()
-                .map(part)
-                .filter(|(_, rows)| rows.iter().any(|row| *row != 0.0))
-                .collect(),
-        }
+        let mut parts: Vec<(usize, Vec<f64>)> = self.gyro_rows.iter().enumerate().map(part).collect();
+        parts.extend(self.balance.body_column(before, after).parts);
+        parts.retain(|(_, rows)| rows.iter().any(|row| *row != 0.0));
+        Column { parts }
     }
 }
 

@@ -1,0 +1,73 @@
+//! Causes, and what a search finds.
+
+use super::system::Site;
+
+/// Joints, or a part of a robot, on which an effect may act.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ScopeSites {
+    /// Name, as in the model file.
+    pub name: String,
+    /// Sites.
+    pub sites: Vec<Site>,
+    /// Prior probability.
+    pub probability: f64,
+}
+
+/// An effect on a scope, with values.
+#[derive(Clone, Debug)]
+pub struct Cause {
+    /// Index of the law.
+    pub law: usize,
+    /// Where it acts.
+    pub scope: ScopeSites,
+    /// Shape of the law.
+    pub shape: f64,
+    /// Unknowns at each site.
+    pub values: Vec<Vec<f64>>,
+    /// Logarithm of the prior probability.
+    pub log_prior: f64,
+}
+
+/// A cause with its evidence.
+#[derive(Clone, Debug)]
+pub struct FoundCause {
+    /// The cause.
+    pub cause: Cause,
+    /// Evidence of the set with it minus that without it [nat].
+    pub gain: f64,
+    /// Standard deviation of the mean of each unknown over the sites.
+    pub stds: Vec<f64>,
+    /// Share of the root mean square of the residuals that it explains, in the equations that it changes.
+    pub explained: f64,
+    /// Causes in its place, with their evidence minus that of the cause [nat], the best first.
+    pub rivals: Vec<(Cause, f64)>,
+}
+
+/// A law that the catalogue does not have.
+#[derive(Clone, Debug)]
+pub struct UnknownLaw {
+    /// Name of the joint.
+    pub joint: String,
+    /// True if the torque at the sensor shows it, false if only the torque on the link does.
+    pub of_drive: bool,
+    /// What it depends on most, as the prefix of a channel of the log.
+    pub variable: &'static str,
+    /// Gain of the evidence [nat].
+    pub gain: f64,
+}
+
+/// Result of a search.
+pub struct Found {
+    /// Causes, the strongest first.
+    pub causes: Vec<FoundCause>,
+    /// Names of the equations, with the variance of what is left, relative to that of the sensors' noise: without and with the causes.
+    pub left: Vec<(String, [f64; 2])>,
+    /// Decisions, in order.
+    pub decisions: Vec<String>,
+    /// Laws that the catalogue does not have, the strongest first.
+    pub unknown: Vec<UnknownLaw>,
+    /// True if the gains of the joints differ, beside the causes, by more than they are uncertain.
+    pub gains_differ: bool,
+    /// Correlation of the first unknowns of each pair of causes, by their places.
+    pub correlations: Vec<(usize, usize, f64)>,
+}

@@ -1,0 +1,145 @@
+//! What a search has found: causes that are large, with their evidence, and what they leave.
+
+use std::collections::BTreeSet;
+
+use nalgebra::{DMatrix, DVector};
+
+use super::block::Column;
+use super::causes::{Found, FoundCause, UnknownLaw};
+use super::fit::Fitted;
+use super::gaussian::{Group, Scores, gain};
+use super::law::Place;
+use super::problem::{Rivals, Search, power};
+use super::{nuisance, unknown};
+
+/// Prior probability of a law that the catalogue does not have at a joint, and the gain from which it is reported [nat].
+const UNKNOWN_PROBABILITY: f64 = 0.001;
+const LEAST_UNKNOWN: f64 = 10.0;
+/// Standard deviations of a normal distribution within which 95 % are, on both sides and below.
+pub const TWO_SIDED_95: f64 = 1.96;
+const ONE_SIDED_95: f64 = 1.645;
+
+impl Search<'_> {
+    pub fn found(&mut self, best: Fitted, small: &[Group], given: &[f64]) -> Found {
+        let first: usize = small.iter().map(|group| group.columns.len()).sum();
+        let starts: Vec<usize> = best
+            .causes
+            .iter()
+            .scan(first, |next, cause| {
+                let start = *next;
+                *next += cause.values.len() * cause.values[0].len();
+                Some(start)
+            })
+            .collect();
+        let (covariance, causes_of_fit, starts) = (&best.posterior.covariance, &best.causes, &starts);
+        // Covariance of the means over the sites of two unknowns.
+        let of_means = &|[one, other]: [usize; 2], [first, second]: [usize; 2]| {
+            let places = |cause: usize, unknown: usize| {
+                let size = causes_of_fit[cause].values[0].len();
+                (0..causes_of_fit[cause].values.len()).map(move |site| starts[cause] + site * size + unknown)
+            };
+            let count = (causes_of_fit[one].values.len() * causes_of_fit[other].values.len()) as f64;
+            let mut sum = 0.0;
+            for row in places(one, first) {
+                sum += places(other, second).map(|column| covariance[(row, column)]).sum::<f64>();
+            }
+            sum / count
+        };
+        let mut causes = Vec::new();
+        for (index, cause) in best.causes.iter().enumerate() {
+            let mut others = best.causes.clone();
+            others.remove(index);
+            let without = self.fit(others, small, 2, Some(&best));
+            let stds = (0..cause.values[0].len()).map(|unknown| of_means([index; 2], [unknown; 2]).sqrt()).collect();
+            let known = |rivals: &&Rivals| rivals.law == cause.law && rivals.scope == cause.scope.name;
+            let rivals = self.rivals.iter().rfind(known).map_or(Vec::new(), |rivals| rivals.others.clone());
+            let parts = best.groups[index].columns.iter().flat_map(|column| &column.parts);
+            let changed: BTreeSet<usize> = parts.map(|(block, _)| *block).collect();
+            let sum = |fit: &Fitted| -> f64 {
+                let of = |block: &usize| fit.blocks[*block].y.len() as f64 * power(&fit.posterior.noise[*block]);
+                changed.iter().map(of).sum()
+            };
+            let explained = 1.0 - (sum(&best) / sum(&without)).sqrt();
+            let gain = best.evidence - without.evidence;
+            causes.push(FoundCause { cause: cause.clone(), gain, stds, explained, rivals });
+        }
+        // Places in the fit of the causes that are large, the strongest first.
+        let mut order: Vec<usize> = (0..causes.len()).filter(|index| self.is_large(&causes[*index])).collect();
+        order.sort_by(|one, other| causes[*other].gain.total_cmp(&causes[*one].gain));
+        let pairs = (0..order.len()).flat_map(|one| (0..one).map(move |other| (other, one)));
+        let correlation = |(one, other): (usize, usize)| {
+            let [first, second] = [order[one], order[other]];
+            let together = of_means([first, second], [0, 0]);
+            (one, other, together / (of_means([first; 2], [0; 2]) * of_means([second; 2], [0; 2])).sqrt())
+        };
+        let correlations = pairs.map(correlation).collect();
+        let causes = order.iter().map(|index| causes[*index].clone()).collect();
+        let left = best.blocks.iter().zip(&best.posterior.noise).zip(given);
+        let left = left.map(|((block, noise), given)| (block.name.clone(), [*given, power(noise)])).collect();
+        let unknown = self.unknown_laws(&best, small);
+        Found {
+            gains_differ: gains_differ(&best, small),
+            causes,
+            left,
+            decisions: std::mem::take(&mut self.decisions),
+            unknown,
+            correlations,
+        }
+    }
+
+    /// Returns true if an unknown of a cause is larger than in 95 % of all robots, with a probability of 95 %.
+    ///
+    /// Everything is a little present in every robot, so evidence alone does not make a cause.
+    fn is_large(&self, found: &FoundCause) -> bool {
+        let sites = found.cause.values.len() as f64;
+        let mean = |unknown: usize| found.cause.values.iter().map(|values| values[unknown]).sum::<f64>() / sites;
+        let effect = self.laws[found.cause.law].effect.name;
+        let exceeds = |(unknown, std): (usize, &f64)| {
+            mean(unknown).abs() - TWO_SIDED_95 * nuisance::small_std(effect, unknown) > ONE_SIDED_95 * std
+        };
+        found.stds.iter().enumerate().any(exceeds)
+    }
+
+    /// Returns the joints at which functions of what they measure explain what the causes leave.
+    ///
+    /// They come after the catalogue: together, they imitate any of its laws.
+    fn unknown_laws(&self, best: &Fitted, small: &[Group]) -> Vec<UnknownLaw> {
+        let groups: Vec<&Group> = small.iter().chain(&best.groups).collect();
+        let mut found = Vec::new();
+        for joint in 0..self.base.joints.len() {
+            for place in [Place::Drive, Place::Joint] {
+                let (variables, columns): (Vec<_>, Vec<Column>) =
+                    unknown::columns(self.system, &best.predicted, joint, place).into_iter().unzip();
+                let size = columns.len();
+                let scores = Scores::new(&best.blocks, &groups, &best.posterior, &columns.iter().collect::<Vec<_>>());
+                let with_residual = DVector::from_fn(size, |row, _| scores.with_residual[row]);
+                let products = DMatrix::from_fn(size, size, |row, column| scores.product(row, column));
+                let covariance = DMatrix::identity(size, size) * (unknown::STD * unknown::STD);
+                let (gain, mean, _) = gain(&with_residual, &products, &DVector::zeros(size), &covariance);
+                let gain = gain + UNKNOWN_PROBABILITY.ln();
+                if gain > LEAST_UNKNOWN {
+                    let joint = self.base.tree.joints[joint].name.clone();
+                    let variable = variables[mean.icamax()];
+                    found.push(UnknownLaw { joint, of_drive: place == Place::Drive, variable, gain });
+                }
+            }
+        }
+        found.sort_by(|one, other| other.gain.total_cmp(&one.gain));
+        found
+    }
+}
+
+/// Returns true if the errors of either gain are twice as large as they are uncertain, root mean square over the joints.
+fn gains_differ(best: &Fitted, small: &[Group]) -> bool {
+    // Squares of the estimates and of their standard deviations.
+    let mut squares = [[0.0; 2]; 2];
+    let mut place = 0;
+    for group in small {
+        if let Some(gain) = group.gain {
+            squares[gain][0] += best.posterior.mean[place].powi(2);
+            squares[gain][1] += best.posterior.covariance[(place, place)];
+        }
+        place += group.columns.len();
+    }
+    squares.iter().any(|[estimates, variances]| *estimates > 4.0 * variances)
+}

@@ -1,0 +1,56 @@
+//! What a search for causes works on, and what it remembers.
+
+use super::block::SHAPES;
+use super::causes::{Cause, ScopeSites};
+use super::gaussian::Cache;
+use super::law::Law;
+use super::robot::Robot;
+use super::system::System;
+
+/// Standard deviation of a joint's value around that of its scope, relative to the prior's.
+pub const SPREAD: f64 = 0.15;
+/// Prior probability that an effect is a cause.
+pub const EFFECT_PROBABILITY: f64 = 1.0 / 12.0;
+
+/// Search for causes.
+pub struct Search<'a> {
+    pub system: &'a System,
+    pub laws: &'a [Law],
+    pub scopes: Vec<ScopeSites>,
+    pub base: Robot,
+    pub decisions: Vec<String>,
+    pub cache: Cache,
+    /// Causes that were removed: law and scope. They are not tried again.
+    pub removed: Vec<(usize, String)>,
+    /// Candidates that were fitted when a cause was added.
+    pub rivals: Vec<Rivals>,
+}
+
+/// Candidates in the place of a cause.
+pub struct Rivals {
+    pub law: usize,
+    pub scope: String,
+    /// With their evidence minus that of the cause [nat].
+    pub others: Vec<(Cause, f64)>,
+}
+
+impl<'a> Search<'a> {
+    /// Prepares a search for what `base` lacks.
+    pub fn new(system: &'a System, laws: &'a [Law], scopes: Vec<ScopeSites>, base: Robot) -> Self {
+        Self {
+            system,
+            laws,
+            scopes,
+            base,
+            decisions: Vec::new(),
+            cache: Cache::default(),
+            removed: Vec::new(),
+            rivals: Vec::new(),
+        }
+    }
+}
+
+/// Returns the variance of noise, relative to that of the sensor.
+pub fn power((shape, scale): &(usize, f64)) -> f64 {
+    scale * (1.0 + SHAPES[*shape].ratio)
+}

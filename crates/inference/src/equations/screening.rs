@@ -1,0 +1,185 @@
+//! Screening: the gain of every effect on every scope, at the noise of the causes that were found.
+
+use nalgebra::{DMatrix, DVector};
+use rayon::prelude::*;
+use twinstep_effects::Target;
+
+use super::block::Column;
+use super::causes::{Cause, ScopeSites};
+use super::fit::Fitted;
+use super::gaussian::{Group, Scores, gain};
+use super::law::Law;
+use super::problem::{EFFECT_PROBABILITY, SPREAD, Search};
+use super::system::{Site, apply};
+
+/// Standard deviation of a strength around one that is tried, relative to it.
+const CELL: f64 = 0.3;
+/// Candidates that are fitted in full after each screening, and at most of one effect.
+const FITTED: [usize; 2] = [6, 3];
+
+/// Column of one unknown of a law at one site.
+struct Candidate {
+    law: usize,
+    /// Index of the strength or of the shape.
+    variant: usize,
+    site: Site,
+    unknown: usize,
+    column: Column,
+}
+
+impl Search<'_> {
+    /// Returns the best candidates for a further cause, with their gains at the noise of the current fit.
+    pub fn screen(&self, best: &Fitted, small: &[Group]) -> Vec<(f64, Cause)> {
+        let candidates = self.candidates(best);
+        let columns: Vec<&Column> = candidates.iter().map(|candidate| &candidate.column).collect();
+        let groups: Vec<&Group> = small.iter().chain(&best.groups).collect();
+        let scores = Scores::new(&best.blocks, &groups, &best.posterior, &columns);
+        let mut hypotheses: Vec<(f64, Cause)> = Vec::new();
+        for law in 0..self.laws.len() {
+            for shape in 0..self.variants(law) {
+                let own: Vec<usize> = (0..candidates.len())
+                    .filter(|index| candidates[*index].law == law && candidates[*index].variant == shape)
+                    .collect();
+                if own.is_empty() {
+                    continue;
+                }
+                hypotheses.extend(self.hypotheses(law, shape, &own, &candidates, &scores, best));
+            }
+        }
+        hypotheses.sort_by(|one, other| other.0.total_cmp(&one.0));
+        let mut chosen: Vec<(f64, Cause)> = Vec::new();
+        for (gain, cause) in hypotheses {
+            let effect = self.laws[cause.law].effect.name;
+            let same = chosen.iter().filter(|(_, other)| self.laws[other.law].effect.name == effect).count();
+            let twice =
+                |(_, other): &(f64, Cause)| self.laws[other.law].effect.name == effect && other.scope == cause.scope;
+            if chosen.iter().any(twice) {
+                continue;
+            }
+            if same < FITTED[1] && chosen.len() < FITTED[0] && gain > 0.0 {
+                chosen.push((gain, cause));
+            }
+        }
+        // The noise of the current fit makes large effects smaller, so that the order below the best is not that of the fits.
+        let most = chosen.first().map_or(0.0, |(gain, _)| *gain);
+        chosen.retain(|(gain, _)| *gain > (0.1 * most).max(1.0));
+        chosen
+    }
+
+    fn variants(&self, law: usize) -> usize {
+        self.laws[law].strengths.len().max(self.laws[law].shapes.len())
+    }
+
+    fn candidates(&self, best: &Fitted) -> Vec<Candidate> {
+        let mut all: Vec<(usize, usize, Site, usize)> = Vec::new();
+        for (index, law) in self.laws.iter().enumerate() {
+            let mut sites: Vec<Site> = self.scopes_of(law).flat_map(|scope| scope.sites.iter().copied()).collect();
+            sites.sort();
+            sites.dedup();
+            for site in sites {
+                for variant in 0..self.variants(index) {
+                    all.extend((0..law.units.len()).map(|unknown| (index, variant, site, unknown)));
+                }
+            }
+        }
+        all.par_iter()
+            .map(|(index, variant, site, unknown)| {
+                let law = &self.laws[*index];
+                let mut unknowns = vec![0.0; law.units.len()];
+                unknowns[*unknown] = law.strengths.get(*variant).copied().unwrap_or(0.5 * law.units[*unknown]);
+                let shape = law.shapes.get(*variant).copied().unwrap_or(law.shapes[0]);
+                let mut after = best.robot.clone();
+                apply(&mut after, law, *site, &unknowns, shape);
+                let step = if law.strengths.is_empty() { unknowns[*unknown] } else { 1.0 };
+                let column = self.system.column(law, *site, (&best.robot, &best.predicted), &after).scaled(1.0 / step);
+                Candidate { law: *index, variant: *variant, site: *site, unknown: *unknown, column }
+            })
+            .filter(|candidate| !candidate.column.is_zero())
+            .collect()
+    }
+
+    pub fn scopes_of<'b>(&'b self, law: &'b Law) -> impl Iterator<Item = &'b ScopeSites> {
+        self.scopes.iter().filter(move |scope| match law.effect.target {
+            Target::Joints => scope.sites.iter().all(|site| *site != Site::Base),
+            Target::Supply => scope.name == "all" && scope.sites == [Site::Base],
+            Target::Bodies => scope.name != "all" && scope.sites.len() == 1,
+            Target::Imu => scope.name == "base",
+            Target::Ground => false,
+        })
+    }
+
+    fn hypotheses(
+        &self,
+        law_index: usize,
+        variant: usize,
+        own: &[usize],
+        candidates: &[Candidate],
+        scores: &Scores,
+        best: &Fitted,
+    ) -> Vec<(f64, Cause)> {
+        let law = &self.laws[law_index];
+        let products = DMatrix::from_fn(own.len(), own.len(), |row, column| {
+            if row <= column { scores.product(own[row], own[column]) } else { 0.0 }
+        });
+        let is_strength = !law.strengths.is_empty();
+        let mut found = Vec::new();
+        for scope in self.scopes_of(law) {
+            let known = |cause: &Cause| {
+                self.laws[cause.law].effect == law.effect
+                    && cause.scope.sites.iter().any(|site| scope.sites.contains(site))
+            };
+            let removed = |(law, name): &(usize, String)| *law == law_index && *name == scope.name;
+            if best.causes.iter().any(known) || self.removed.iter().any(removed) {
+                continue;
+            }
+            let members: Vec<usize> =
+                (0..own.len()).filter(|index| scope.sites.contains(&candidates[own[*index]].site)).collect();
+            if members.is_empty() {
+                continue;
+            }
+            let size = members.len();
+            let with_residual = DVector::from_fn(size, |row, _| scores.with_residual[own[members[row]]]);
+            let inner = DMatrix::from_fn(size, size, |row, column| {
+                let (one, other) = (members[row].min(members[column]), members[row].max(members[column]));
+                products[(one, other)]
+            });
+            let mean = DVector::from_element(size, if is_strength { 1.0 } else { 0.0 });
+            let covariance = DMatrix::from_fn(size, size, |row, column| {
+                let (one, other) = (&candidates[own[members[row]]], &candidates[own[members[column]]]);
+                if one.unknown != other.unknown {
+                    return 0.0;
+                }
+                let unit = if is_strength { CELL } else { law.units[one.unknown] };
+                unit * unit * (1.0 + if one.site == other.site { SPREAD * SPREAD } else { 0.0 })
+            });
+            let (gain, posterior, spread) = gain(&with_residual, &inner, &mean, &covariance);
+            let variants = self.variants(law_index) as f64;
+            let mut log_prior = EFFECT_PROBABILITY.ln() + scope.probability.ln();
+            let mut log_grid = -variants.ln();
+            if law.is_positive && !is_strength {
+                // The half of the prior that is allowed has twice the density.
+                let deviation = posterior.mean() / (spread[(0, 0)].sqrt() + 1e-12);
+                log_prior += std::f64::consts::LN_2;
+                log_grid += if deviation < 0.0 { -0.5 * deviation * deviation } else { 0.0 };
+            }
+            if is_strength {
+                log_prior += std::f64::consts::LN_2;
+            }
+            let mut values = vec![vec![0.0; law.units.len()]; scope.sites.len()];
+            for (row, member) in members.iter().enumerate() {
+                let candidate = &candidates[own[*member]];
+                let site = scope.sites.iter().position(|site| *site == candidate.site).expect("a site of the scope");
+                let strength = law.strengths.get(candidate.variant).copied().unwrap_or(1.0);
+                let value = strength * posterior[row];
+                values[site][candidate.unknown] =
+                    if law.is_positive && candidate.unknown == 0 { value.max(1e-3 * strength) } else { value };
+            }
+            let shape = law.shapes.get(variant).copied().unwrap_or(law.shapes[0]);
+            let log_shapes = -(law.shapes.len() as f64).ln();
+            let cause =
+                Cause { law: law_index, scope: scope.clone(), shape, values, log_prior: log_prior + log_shapes };
+            found.push((gain + log_prior + log_grid, cause));
+        }
+        found
+    }
+}
