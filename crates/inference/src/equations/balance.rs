@@ -15,9 +15,6 @@ use super::measurements::{Measurements, Regime};
 use super::robot::Robot;
 use super::samples::{GRAVITY, Motion, Sample, samples, weights};
 
-/// Speed below which dry friction is not determined [rad/s].
-const LEAST_SPEED: f64 = 0.05;
-
 /// Samples, and where their residuals are in the blocks.
 pub struct Balance {
     /// The samples.
@@ -74,23 +71,28 @@ impl Balance {
             (torque * torque + (inertial * measured.noise[1] * steps).powi(2)).sqrt()
         };
         let mut series: Vec<Block> = Vec::new();
-        for joint in 0..self.joints {
-            let name = format!("joint {} hang", robot.tree.joints[joint].name);
-            let sigma = noise(Regime::Hang);
-            series.push(Block { name, t: Vec::new(), y: Vec::new(), sigma });
+        for regime in [Regime::Hang, Regime::Move] {
+            for joint in &robot.tree.joints {
+                let name = format!("joint {} {}", joint.name, if regime == Regime::Hang { "hang" } else { "swing" });
+                series.push(Block { name, t: Vec::new(), y: Vec::new(), sigma: noise(regime) });
+            }
         }
-        for axis in ["mx", "my", "mz", "fx", "fy", "fz"] {
-            let lever = if axis.starts_with('f') { 10.0 } else { 2.0 };
-            let sigma = lever * noise(Regime::Stand);
-            series.push(Block { name: format!("base {axis} stand"), t: Vec::new(), y: Vec::new(), sigma });
+        for regime in [Regime::Stand, Regime::Move] {
+            for axis in ["mx", "my", "mz", "fx", "fy", "fz"] {
+                let lever = if axis.starts_with('f') { 10.0 } else { 2.0 };
+                let name = format!("base {axis} {regime:?}").to_lowercase();
+                series.push(Block { name, t: Vec::new(), y: Vec::new(), sigma: lever * noise(regime) });
+            }
         }
         let first = self.first_block;
         for sample in &self.samples {
+            let free = (0..self.joints).filter(|joint| sample.is_free[*joint] && sample.turns[*joint]);
             let residuals: Vec<usize> = match sample.regime {
-                Regime::Hang => {
-                    (0..self.joints).filter(|joint| sample.instrument.dq[*joint].abs() > LEAST_SPEED).collect()
+                Regime::Hang => free.collect(),
+                Regime::Stand => (2 * self.joints..2 * self.joints + 6).collect(),
+                Regime::Move => {
+                    free.map(|joint| self.joints + joint).chain(2 * self.joints + 6..2 * self.joints + 12).collect()
                 }
-                _ => (self.joints..self.joints + 6).collect(),
             };
             let place = |residual: usize| (residual, first + residual, series[residual].t.len());
             let places: Vec<_> = residuals.iter().map(|residual| place(*residual)).collect();
@@ -155,10 +157,11 @@ impl Balance {
     pub fn balanced_motors(&self, robot: &Robot, needed: &[Vec<f64>], drives: &[Vec<f64>]) -> Vec<Vec<f64>> {
         let balanced = |(index, sample): (usize, &Sample)| {
             let needed = &needed[index];
-            let mut links: Vec<f64> = match sample.regime {
-                Regime::Hang => needed[6..].to_vec(),
-                _ => (0..self.joints).map(|joint| sample.link_torque(robot, joint, drives[joint][index])).collect(),
+            let link = |joint: usize| match sample.is_free[joint] {
+                true => needed[6 + joint],
+                false => sample.link_torque(robot, joint, drives[joint][index]),
             };
+            let mut links: Vec<f64> = (0..self.joints).map(link).collect();
             if sample.regime != Regime::Hang {
                 let per = DMatrix::from_fn(6, self.joints, |axis, joint| sample.base_per_torque[joint][axis]);
                 let lacking: Vec<f64> = needed
@@ -166,8 +169,10 @@ impl Balance {
                     .enumerate()
                     .map(|(row, force)| if row < 6 { -force } else { links[row - 6] - force })
                     .collect();
-                let left = DVector::from_fn(6, |axis, _| self.projected(sample, &lacking, self.joints + axis));
+                let left = DVector::from_fn(6, |axis, _| self.projected(sample, &lacking, 2 * self.joints + axis));
+                // Two feet exert no moment about the line between them.
                 let square = &per * per.transpose();
+                let square = &square + DMatrix::identity(6, 6) * (1e-6 * square.trace() + 1e-12);
                 if let Some(share) = square.cholesky() {
                     let change = per.transpose() * share.solve(&left);
                     links.iter_mut().zip(change.iter()).for_each(|(link, change)| *link += change);
@@ -177,11 +182,6 @@ impl Balance {
             (0..self.joints).map(|joint| motor_torque(&robot.joints[joint], links[joint], motion(joint))).collect()
         };
         self.samples.par_iter().enumerate().map(balanced).collect()
-    }
-
-    /// Returns true if the log has samples of a robot that stands.
-    pub fn stands(&self) -> bool {
-        self.samples.iter().any(|sample| sample.regime == Regime::Stand)
     }
 
     /// Writes the residuals of a robot, given what its motion needs and the torques of its motors in balance.
@@ -214,10 +214,10 @@ impl Balance {
 
     /// Returns a residual, given moment and force at the base and the torques of the joints.
     pub fn projected(&self, sample: &Sample, forces: &[f64], residual: usize) -> f64 {
-        if residual < self.joints {
-            return forces[6 + residual];
+        if residual < 2 * self.joints {
+            return forces[6 + residual % self.joints];
         }
-        let axis = residual - self.joints;
+        let axis = (residual - 2 * self.joints) % 6;
         let of_joints = sample.base_per_torque.iter().enumerate().map(|(joint, per)| per[axis] * forces[6 + joint]);
         forces[axis] - of_joints.sum::<f64>()
     }

@@ -16,10 +16,10 @@ impl Balance {
     pub fn joint_column(&self, joint: usize, change: &[f64]) -> Column {
         self.column(|index, residual| {
             let sample = &self.samples[index];
-            match sample.regime {
-                Regime::Hang if residual == joint => -change[index],
-                Regime::Hang => 0.0,
-                _ => sample.base_per_torque[joint][residual - self.joints] * change[index],
+            match residual.checked_sub(2 * self.joints) {
+                None if residual % self.joints == joint => -change[index],
+                None => 0.0,
+                Some(axis) => sample.base_per_torque[joint][axis % 6] * change[index],
             }
         })
     }

@@ -8,13 +8,17 @@ use twinstep_dynamics::Vec3;
 use twinstep_dynamics::tree::{TreeMotion, TreeParameters, TreeState, TreeStructure};
 
 use super::drive::link_torque;
-use super::measurements::{Measurements, Regime};
+use super::measurements::{JointRows, Measurements, Regime};
 use super::robot::Robot;
 
 /// Gravitational acceleration [m/s²].
 pub const GRAVITY: f64 = 9.81;
-/// Time between samples of a fixed base, and of one that stands [s]. A sample is a mean over twice that time.
-const SAMPLE_S: [f64; 2] = [0.02, 0.05];
+/// Time between samples of a fixed base, of one that stands, and of one that moves [s]. A sample is a mean over twice that time.
+const SAMPLE_S: [f64; 3] = [0.02, 0.05, 0.02];
+/// Speed below which dry friction is not determined [rad/s].
+const LEAST_SPEED: f64 = 0.05;
+/// Time before and after a sample in which no foot touches down or lifts off [s].
+const SETTLED_S: f64 = 0.02;
 
 /// Motion in a sample.
 #[derive(Clone, Debug)]
@@ -59,14 +63,31 @@ pub struct Sample {
     pub instrument: Motion,
     /// Weights of the rows.
     pub weights: Arc<Vec<f64>>,
-    /// Forces and moments at the base per torque of a joint, by joint; empty for a fixed base.
+    /// Forces and moments at the base per torque of a joint, by joint: not zero where the limb stands. Empty for a fixed base.
     pub base_per_torque: Vec<[f64; 6]>,
+    /// True for a joint whose limb touches nothing, by joint.
+    pub is_free: Vec<bool>,
+    /// True for a joint that turns in one direction all the time, so that its dry friction is known, by joint.
+    pub turns: Vec<bool>,
 }
 
 impl Sample {
     /// Returns the mean of a series of torques, each from its row to the next.
     pub fn mean(&self, series: &[f64]) -> f64 {
         self.rows.clone().zip(self.weights.iter()).map(|(row, weight)| weight * series[row]).sum()
+    }
+
+    /// Returns mean, derivative and second derivative of a series of positions.
+    pub fn motion(&self, measured: &Measurements, series: &[f64]) -> [f64; 3] {
+        let dt = (measured.t[self.rows.end] - measured.t[self.rows.start]) / self.rows.len() as f64;
+        let mut motion = [0.0; 3];
+        for (row, weight) in self.rows.clone().zip(self.weights.iter()) {
+            let [before, now, next, later] = [row - 1, row, row + 1, row + 2].map(|row| series[row]);
+            motion[0] += weight * 0.5 * (now + next);
+            motion[1] += weight * (next - now) / dt;
+            motion[2] += weight * (later - next - now + before) / (2.0 * dt * dt);
+        }
+        motion
     }
 
     /// Returns the link torque of the instrument for a motor torque [N·m].
@@ -96,21 +117,20 @@ pub fn samples(measured: &Measurements, robot: &Robot) -> Vec<Sample> {
     let mut samples = Vec::new();
     let structure = TreeStructure::new(&robot.tree);
     let bodies = TreeParameters::splat(&robot.tree);
+    let steps = SAMPLE_S.map(|time| ((time / measured.dt).round() as usize).max(1));
+    let weights = steps.map(|step| Arc::new(weights(2 * step)));
     for range in &measured.ranges {
-        let hangs = measured.regime[range.start] == Regime::Hang;
-        let step = ((SAMPLE_S[usize::from(!hangs)] / measured.dt).round() as usize).max(1);
-        let weights = Arc::new(weights(2 * step));
         let mut start = range.start + MARGIN;
-        while start + 2 * step + MARGIN < range.end {
+        while start + MARGIN < range.end {
+            let regime = measured.regime[start];
+            let step = steps[regime as usize];
             let rows = start..start + 2 * step;
             start += step;
-            let regime = measured.regime[rows.start];
-            if regime == Regime::Move || measured.regime[rows.end] != regime {
+            if rows.end + MARGIN >= range.end || measured.regime[rows.end] != regime {
                 continue;
             }
-            if let Some(mut sample) = sample(measured, rows, regime, &weights) {
-                let stands = regime == Regime::Stand;
-                if stands && !sample.set_feet(measured, robot, &structure, &bodies) {
+            if let Some(mut sample) = sample(measured, rows, regime, &weights[regime as usize]) {
+                if regime != Regime::Hang && !sample.set_feet(measured, robot, &structure, &bodies) {
                     continue;
                 }
                 samples.push(sample);
@@ -161,7 +181,13 @@ fn sample(measured: &Measurements, rows: Range<usize>, regime: Regime, weights: 
     let known = torques.is_finite() && numbers.copied().all(f64::is_finite);
     let t = 0.5 * (measured.t[rows.start] + measured.t[rows.end]);
     let weights = weights.clone();
-    known.then_some(Sample { rows, t, regime, response, instrument, weights, base_per_torque: Vec::new() })
+    let turns = |joint: &JointRows| {
+        let speeds = &joint.smooth[1][rows.start..=rows.end];
+        speeds.iter().all(|speed| *speed > LEAST_SPEED) || speeds.iter().all(|speed| *speed < -LEAST_SPEED)
+    };
+    let turns = joints().map(turns).collect();
+    let (is_free, base_per_torque) = (vec![true; measured.joints.len()], Vec::new());
+    known.then_some(Sample { rows, t, regime, response, instrument, weights, base_per_torque, is_free, turns })
 }
 
 /// Returns mean and derivative over the rows of a sample, given a value of each row.
@@ -209,7 +235,8 @@ fn base_motion(measured: &Measurements, rows: &Range<usize>, regime: Regime, of:
 }
 
 impl Sample {
-    /// Computes the force at the base per torque of a joint. Returns false if not all feet stand at the end of three joints.
+    /// Computes the force at the base per torque of a joint. Returns false if it is not known which feet stand, or they are not at the end
+    /// of three joints.
     fn set_feet(
         &mut self,
         measured: &Measurements,
@@ -217,18 +244,23 @@ impl Sample {
         structure: &TreeStructure,
         bodies: &TreeParameters<f64>,
     ) -> bool {
-        let in_contact = |foot: usize| {
-            measured.contact.get(foot).is_none_or(|rows| rows[self.rows.clone()].iter().all(|touches| *touches))
+        let settled = (SETTLED_S / measured.dt).round() as usize;
+        let rows = self.rows.start.saturating_sub(settled)..(self.rows.end + settled).min(measured.t.len());
+        let stands = |foot: usize| match measured.contact.get(foot) {
+            Some(touches) => {
+                let first = touches[rows.start];
+                touches[rows.clone()].iter().all(|now| *now == first).then_some(first)
+            }
+            None => (self.regime == Regime::Stand).then_some(true),
         };
-        if robot.feet.is_empty() || !(0..robot.feet.len()).all(in_contact) {
-            return false;
-        }
+        let standing: Option<Vec<bool>> = (0..robot.feet.len()).map(stands).collect();
+        let Some(standing) = standing else { return false };
         let state = self.state(robot, &self.response, [0.0; 3]);
         let mut places = TreeMotion::empty(bodies);
         places.set(bodies, &state, GRAVITY);
         let turns = twinstep_dynamics::tree::batch_from_bodies(&robot.tree);
         self.base_per_torque = vec![[0.0; 6]; robot.joints.len()];
-        for foot in &robot.feet {
+        for (foot, _) in robot.feet.iter().zip(standing).filter(|(_, stands)| *stands) {
             let branch = &structure.branches[foot.body];
             if branch.len() != 3 {
                 return false;
@@ -251,6 +283,7 @@ impl Sample {
             for (index, joint) in branch.iter().enumerate() {
                 let force = force_per_torque.col(index);
                 let moment = DVec3::from_array(contact.0).cross(force);
+                self.is_free[*joint] = false;
                 self.base_per_torque[*joint] = [moment.x, moment.y, moment.z, force.x, force.y, force.z];
             }
         }

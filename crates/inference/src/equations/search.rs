@@ -1,5 +1,8 @@
 //! The search for the set of causes of highest evidence.
 
+use std::collections::BTreeMap;
+
+use super::block::Column;
 use super::causes::{Cause, Found, ScopeSites};
 use super::fit::Fitted;
 use super::gaussian::{Group, posterior};
@@ -19,6 +22,8 @@ const OTHER_SCOPES: usize = 3;
 const CONVERGED: usize = 8;
 /// Most causes.
 const MOST_CAUSES: usize = 6;
+/// Error of the form of a law of the catalogue, as the size of each function that it lacks, relative to its own.
+const FORM_ERROR: f64 = 0.03;
 /// Causes that were added and removed again, after which the search ends.
 const MOST_REMOVED: usize = 2;
 
@@ -197,15 +202,27 @@ impl Search<'_> {
             let without = self.fit(others, small, 2, Some(&best));
             let place_of_functions =
                 if matches!(law.place, Place::Drive | Place::Sensor) { Place::Drive } else { Place::Joint };
-            let functions = joints.iter().map(|joint| {
-                let columns = unknown::columns(self.system, &without.predicted, *joint, place_of_functions);
-                Group::independent(columns.into_iter().map(|(_, column)| column).collect(), unknown::STD)
-            });
-            let groups: Vec<Group> = without.groups.iter().cloned().chain(functions).collect();
+            let functions = |predicted: &Predicted, joint: usize, std: f64| {
+                let columns = unknown::columns(self.system, predicted, joint, place_of_functions);
+                Group::independent(columns.into_iter().map(|(_, column)| column).collect(), std)
+            };
             let noise = Some(best.posterior.noise.as_slice());
-            let imitated = posterior(&without.blocks, [small, &groups], noise, &self.cache);
-            let log_prior: f64 = without.causes.iter().map(|cause| cause.log_prior).sum();
-            let evidence = imitated.evidence + log_prior + (EFFECT_PROBABILITY * cause.scope.probability).ln();
+            let evidence = |fit: &Fitted, functions: Vec<Group>| {
+                let groups: Vec<Group> = fit.groups.iter().cloned().chain(functions).collect();
+                let log_prior: f64 = fit.causes.iter().map(|cause| cause.log_prior).sum();
+                posterior(&fit.blocks, [small, &groups], noise, &self.cache).evidence + log_prior
+            };
+            let free = joints.iter().map(|joint| functions(&without.predicted, *joint, unknown::STD)).collect();
+            let imitated = evidence(&without, free) + (EFFECT_PROBABILITY * cause.scope.probability).ln();
+            // A law of the catalogue may have a slightly different form.
+            let unknowns = law.units.len();
+            let near = joints.iter().enumerate().map(|(site, joint)| {
+                let columns = &best.groups[place].columns[site * unknowns..(site + 1) * unknowns];
+                let size = root_mean_square(columns, &cause.values[site]);
+                functions(&best.predicted, *joint, (FORM_ERROR * size).max(1e-4))
+            });
+            let named = evidence(&best, near.collect());
+            let evidence = best.evidence + imitated - named;
             let line = format!("  another law in place of {}: {:.1} nat", self.name(&cause), evidence - best.evidence);
             self.note(line);
             if evidence > best.evidence + LEAST_GAIN {
@@ -216,4 +233,15 @@ impl Search<'_> {
         }
         best
     }
+}
+
+/// Returns the root mean square of columns times their values, in the equations of joints and drives.
+fn root_mean_square(columns: &[Column], values: &[f64]) -> f64 {
+    let mut rows: BTreeMap<(usize, usize), f64> = BTreeMap::new();
+    for (column, value) in columns.iter().zip(values) {
+        for (block, part) in &column.parts {
+            part.iter().enumerate().for_each(|(row, change)| *rows.entry((*block, row)).or_default() += value * change);
+        }
+    }
+    (rows.values().map(|change| change * change).sum::<f64>() / rows.len().max(1) as f64).sqrt()
 }

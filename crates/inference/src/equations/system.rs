@@ -6,7 +6,7 @@ use twinstep_effects::Apply;
 
 use super::balance::{Balance, advanced};
 use super::block::{Block, Column};
-use super::drive::sensed_torque;
+use super::drive::{link_torque, sensed_torque};
 use super::law::{Law, Place};
 use super::measurements::{JointRows, Measurements, Regime};
 use super::robot::Robot;
@@ -17,6 +17,8 @@ const HISTORY_S: f64 = 0.05;
 /// Mass above which a payload changes the inertia of a body, too [kg], if it is no farther from the body's origin than this [m].
 const LEAST_PAYLOAD: f64 = 0.05;
 const LONGEST_ARM: f64 = 0.5;
+/// Torque within which the teeth of a gear with backlash change sides [N·m].
+const SLACK: f64 = 0.05;
 /// Time between samples of the gyroscope [s].
 const GYRO_S: f64 = 0.05;
 
@@ -127,7 +129,7 @@ impl System {
         }
         let shift = |joint: usize| {
             let is_rigid = robot.joints[joint] == rigid.joints[joint];
-            if is_rigid { Vec::new() } else { self.link_motion(joint, &rigid, robot) }
+            if is_rigid { Vec::new() } else { self.link_motion(joint, &sensed[joint], &rigid, robot) }
         };
         let shifts: Vec<_> = (0..robot.joints.len()).map(shift).collect();
         let needed = self.balance.needed_by(robot, &shifts);
@@ -202,7 +204,7 @@ impl System {
                 column
             }
             (Place::Link, Site::Joint(joint)) => {
-                self.balance.motion_column(joint, &self.link_motion(joint, robot, after))
+                self.balance.motion_column(joint, &self.link_motion(joint, &predicted.sensed[joint], robot, after))
             }
             (Place::Body, _) => self.balance.body_column(robot, after),
             (Place::Gyro, _) => self.gyro_column(robot, after),
@@ -238,20 +240,28 @@ impl System {
     }
 
     /// Returns how the motion of a link changes: position, velocity and acceleration, by sample.
-    fn link_motion(&self, joint: usize, before: &Robot, after: &Robot) -> Vec<[f64; 3]> {
-        let torque = |index: usize| self.balance.needed[index][6 + joint];
-        let lag = |robot: &Robot, index: usize| {
-            let actuator = &robot.joints[joint].actuator;
-            let twist =
-                torque(index) / actuator.gear_stiffness + 0.5 * actuator.backlash * (torque(index) / 0.05).tanh();
-            // The encoder is ahead of the link by the twist and by its offset.
-            -twist - actuator.encoder_offset
+    ///
+    /// The gear is twisted by the torque of the motor that turns neither the rotor nor its friction.
+    fn link_motion(&self, joint: usize, predicted: &[f64], before: &Robot, after: &Robot) -> Vec<[f64; 3]> {
+        let measured = &self.measured;
+        let [q, dq] = &measured.joints[joint].smooth;
+        let last = measured.t.len() - 1;
+        let shift = |row: usize| {
+            let ddq = (dq[(row + 1).min(last)] - dq[row.saturating_sub(1)]) / (2.0 * measured.dt);
+            let lag = |robot: &Robot| {
+                let actuator = &robot.joints[joint].actuator;
+                // The torque of the row before acts until the row.
+                let motor = 0.5 * (predicted[row.saturating_sub(1)] + predicted[row]);
+                let torque = link_torque(&robot.joints[joint], motor, [q[row], dq[row], ddq]);
+                let gap = 0.5 * actuator.backlash * (torque / SLACK).tanh();
+                // The encoder is ahead of the link by the twist and by its offset.
+                -torque / actuator.gear_stiffness - gap - actuator.encoder_offset
+            };
+            lag(after) - lag(before)
         };
-        let shift: Vec<f64> =
-            (0..self.balance.samples.len()).map(|index| lag(after, index) - lag(before, index)).collect();
-        let motion =
-            |index: usize| [shift[index], self.balance.slope(&shift, index), self.balance.curvature(&shift, index)];
-        (0..shift.len()).map(motion).collect()
+        let shift: Vec<f64> = (0..=last).map(shift).collect();
+        let or_zero = |motion: [f64; 3]| if motion.iter().all(|one| one.is_finite()) { motion } else { [0.0; 3] };
+        self.balance.samples.iter().map(|sample| or_zero(sample.motion(measured, &shift))).collect()
     }
 
     fn gyro_column(&self, before: &Robot, after: &Robot) -> Column {

@@ -79,7 +79,6 @@ fn site_of(law: &Law) -> Site {
 #[test]
 fn column_of_every_law_is_what_a_small_effect_takes_from_the_residuals() {
     let (system, robot) = system();
-    assert!(system.balance.stands());
     let (predicted, before) = (system.predicted(&robot), residuals(&system, &robot));
     for law in laws() {
         for unknown in 0..law.units.len() {
