@@ -69,12 +69,6 @@ impl Balance {
         self.step_around(index).map_or(0.0, |step| (series[index + 1] - series[index - 1]) / (2.0 * step))
     }
 
-    /// Returns the second derivative of a series by sample; zero at the ends of a contiguous range.
-    pub fn curvature(&self, series: &[f64], index: usize) -> f64 {
-        let second = |step: f64| (series[index + 1] - 2.0 * series[index] + series[index - 1]) / (step * step);
-        self.step_around(index).map_or(0.0, second)
-    }
-
     /// Returns the time to the samples before and after one [s]; `None` if one of them is missing.
     fn step_around(&self, index: usize) -> Option<f64> {
         let [earlier, now, later] = [index.checked_sub(1)?, index, index + 1].map(|index| self.samples.get(index));
@@ -91,6 +85,23 @@ impl Balance {
             }
             let mut motion = sample.instrument.clone();
             motion.base.linear_acceleration[axis] += 1.0;
+            less(self.needed(&self.bodies, &self.reference, sample, &motion, [0.0; 3]), &self.needed[index])
+        })
+    }
+
+    /// Returns the column of the position of the accelerometer along an axis of a base that is not fixed [m].
+    pub fn lever_column(&self, axis: usize) -> Column {
+        let mut lever = DVec3::ZERO;
+        lever[axis] = 1.0;
+        self.needed_column(|index, sample| {
+            if sample.regime == Regime::Hang {
+                return vec![0.0; 6 + self.joints];
+            }
+            let mut motion = sample.instrument.clone();
+            let [turning, speeding] =
+                [motion.base.angular_velocity, motion.base.angular_acceleration].map(DVec3::from_array);
+            let felt = speeding.cross(lever) + turning.cross(turning.cross(lever));
+            motion.base.linear_acceleration = (DVec3::from_array(motion.base.linear_acceleration) - felt).to_array();
             less(self.needed(&self.bodies, &self.reference, sample, &motion, [0.0; 3]), &self.needed[index])
         })
     }

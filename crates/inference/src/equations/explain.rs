@@ -10,7 +10,7 @@ use super::measurements::Measurements;
 use super::outcome::TWO_SIDED_95;
 use super::problem::Search;
 use super::robot::Robot;
-use super::system::{Site, System};
+use super::system::{Site, System, apply, body_of};
 
 /// Relative standard deviation of a value because no law is exact.
 const LAW_ERROR: f64 = 0.015;
@@ -71,8 +71,8 @@ pub fn explain(
         return None;
     }
     let laws = laws();
-    let found = Search::new(&system, &laws, scopes(), robot).run(go_on)?;
-    Some(explained(found, &laws))
+    let found = Search::new(&system, &laws, scopes(), robot.clone()).run(go_on)?;
+    Some(explained(found, &laws, &robot))
 }
 
 /// Returns the scopes with their prior probabilities: joints of one type are alike, and what one has, all may have.
@@ -96,26 +96,34 @@ fn scopes() -> Vec<ScopeSites> {
     of_joints.chain([base, supply]).collect()
 }
 
-fn explained(found: Found, laws: &[Law]) -> Explained {
+fn explained(found: Found, laws: &[Law], robot: &Robot) -> Explained {
     let mean = |cause: &Cause| -> Vec<f64> {
         let sites = cause.values.len() as f64;
         (0..cause.values[0].len())
             .map(|unknown| cause.values.iter().map(|values| values[unknown]).sum::<f64>() / sites)
             .collect()
     };
+    let values_of = |cause: &Cause, unknowns: &[f64]| -> Vec<f64> {
+        let law = &laws[cause.law];
+        if law.effect.name != "inertia" {
+            return (law.values)(unknowns, cause.shape);
+        }
+        let (mut changed, site) = (robot.clone(), cause.scope.sites[0]);
+        apply(&mut changed, law, site, unknowns, cause.shape);
+        changed.tree.bodies[body_of(site)].inertia.log_cholesky().to_vec()
+    };
     let in_terms = |cause: &Cause| {
         let law = &laws[cause.law];
         let scope: Scope = cause.scope.name.parse().expect("the name of a scope");
         let bounds =
             law.effect.parameters.iter().flat_map(|parameter| std::iter::repeat_n(parameter.bounds, parameter.count));
-        let values = (law.values)(&mean(cause), cause.shape);
+        let values = values_of(cause, &mean(cause));
         let values: Vec<f64> =
             values.into_iter().zip(bounds).map(|(value, [low, high])| value.clamp(low, high)).collect();
         (law.effect, scope, values)
     };
     let causes = found.causes.iter().map(|found| {
         let (effect, scope, values) = in_terms(&found.cause);
-        let law = &laws[found.cause.law];
         let mean = mean(&found.cause);
         let mut intervals: Vec<[f64; 2]> = values.iter().map(|value| [*value; 2]).collect();
         for (unknown, std) in found.stds.iter().enumerate() {
@@ -123,7 +131,7 @@ fn explained(found: Found, laws: &[Law]) -> Explained {
             for side in [-half, half] {
                 let mut moved = mean.clone();
                 moved[unknown] += side;
-                for (interval, value) in intervals.iter_mut().zip((law.values)(&moved, found.cause.shape)) {
+                for (interval, value) in intervals.iter_mut().zip(values_of(&found.cause, &moved)) {
                     *interval = [interval[0].min(value), interval[1].max(value)];
                 }
             }

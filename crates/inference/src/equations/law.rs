@@ -103,10 +103,12 @@ pub fn laws() -> Vec<Law> {
             vec![stiffness, c[1] / stiffness]
         }),
         law("encoder_offset", Place::Link, &[0.025], |c, _| vec![c[0]]),
-        law("payload", Place::Body, &[2.0, 0.2, 0.2, 0.2], |c, _| {
+        law("payload", Place::Body, &[2.0, 0.2, 0.1, 0.1], |c, _| {
             let mass = if c[0].abs() < 1e-6 { 1e-6 } else { c[0] };
             vec![mass, c[1] / mass, c[2] / mass, c[3] / mass]
         }),
+        // Second moments along the axes of the body; the parameters of the effect depend on the body.
+        law("inertia", Place::Body, &[0.4, 0.4, 0.4], |c, _| c.to_vec()),
         law("com_shift", Place::Body, &[0.02, 0.02, 0.02], |c, _| c.to_vec()),
         law("gyro_bias", Place::Gyro, &[0.01, 0.01, 0.01], |c, _| c.to_vec()),
     ]

@@ -33,11 +33,11 @@ pub struct JointRows {
     pub joint: usize,
     /// Measured position [rad].
     pub q: Vec<f64>,
-    /// Measured velocity [rad/s].
+    /// Measured velocity, or slope of the position if it was not measured [rad/s].
     pub dq: Vec<f64>,
     /// Position [rad] and velocity [rad/s] with less noise: parabolas through the rows around each.
     pub smooth: [Vec<f64>; 2],
-    /// Measured torque, mean from the row to the next [N·m].
+    /// Measured torque, mean from the row to the next; zero if it was not measured. Not a number in rows that are not used [N·m].
     pub torque: Vec<f64>,
     /// Commanded position [rad], velocity [rad/s] and torque [N·m].
     pub command: [Vec<f64>; 3],
@@ -79,22 +79,26 @@ pub struct Measurements {
     pub contact: Vec<Vec<bool>>,
     /// Supply voltage divided by the highest of the log; empty if it was not measured.
     pub voltage_share: Vec<f64>,
+    /// True if the currents of the motors were measured.
+    pub has_torque: bool,
     /// Standard deviation of the noise of position [rad], velocity [rad/s] and torque [N·m].
     pub noise: [f64; 3],
 }
 
 impl Measurements {
-    /// Collects the channels of `log`, and the torques of the rows that are used. Returns `None` if it has no torque, no velocity or unknown gains at a joint, or a joint that the
-    /// robot lacks.
+    /// Collects the channels of `log`, and the torques of the rows that are used. Returns `None` if its torques are those at the output, gains
+    /// of a joint are not known, or the joints are not those of the robot.
     pub fn new(log: &Log, robot: &Robot, is_used: impl Fn(usize) -> bool) -> Option<Self> {
-        if log.meta().tau_sensor != TorqueSensor::MotorCurrent {
-            return None;
-        }
+        let has_torque = match log.meta().tau_sensor {
+            TorqueSensor::MotorCurrent => true,
+            TorqueSensor::None => false,
+            TorqueSensor::JointOutput => return None,
+        };
         let plain = |name: &str| name.to_lowercase().trim_end_matches("_joint").to_owned();
         let mut joints = Vec::new();
         for name in log.joints() {
             let joint = robot.tree.joints.iter().position(|joint| plain(&joint.name) == plain(name))?;
-            joints.push(joint_rows(log, name, joint)?);
+            joints.push(joint_rows(log, name, joint, has_torque)?);
         }
         joints.sort_by_key(|rows: &JointRows| rows.joint);
         for rows in &mut joints {
@@ -111,6 +115,9 @@ impl Measurements {
         let t = log.t().to_vec();
         let ranges: Vec<Range<usize>> = log.segments().flat_map(|(_, range)| split_at_gaps(&t, range)).collect();
         for rows in &mut joints {
+            if rows.dq.is_empty() {
+                rows.dq = slopes(&rows.q, &t, &ranges);
+            }
             rows.smooth = [smoothed(&rows.q, &ranges), smoothed(&rows.dq, &ranges)];
         }
         let mut steps: Vec<f64> =
@@ -129,7 +136,12 @@ impl Measurements {
             let (sum, count) = all.fold((0.0, 0.0), |(sum, count), noise| (sum + noise, count + 1.0));
             if count > 0.0 && sum > 0.0 { sum / count } else { usual }
         };
-        let noise = [stated("q", 1e-4), stated("dq", 0.01), stated("tau_measured", 0.05)];
+        let position = stated("q", 1e-4);
+        // Differences over two rows.
+        let of_slopes = position / (std::f64::consts::SQRT_2 * dt);
+        let has_velocity = log.joints().iter().all(|joint| log.dq(joint).is_some());
+        let velocity = if has_velocity { stated("dq", 0.01) } else { of_slopes };
+        let noise = [position, velocity, stated("tau_measured", 0.05)];
         let highest = log.channel("battery_V").map_or(0.0, |cells| cells.iter().copied().fold(0.0, f64::max));
         let voltage = log.channel("battery_V").filter(|_| highest > 0.0);
         let share = |cell: &f64| if cell.is_finite() { cell / highest } else { 1.0 };
@@ -142,20 +154,32 @@ impl Measurements {
             ranges,
             regime,
             joints,
+            has_torque,
             noise,
         })
     }
 }
 
-fn joint_rows(log: &Log, name: &str, joint: usize) -> Option<JointRows> {
+impl Measurements {
+    /// Returns the standard deviation of the noise of a motor's torque: that of its sensor, or of the readings that make it [N·m].
+    pub fn torque_noise(&self) -> f64 {
+        if self.has_torque {
+            return self.noise[2];
+        }
+        let of = |rows: &JointRows| (rows.gains[0][0] * self.noise[0]).hypot(rows.gains[1][0] * self.noise[1]);
+        self.joints.iter().map(of).sum::<f64>() / self.joints.len() as f64
+    }
+}
+
+fn joint_rows(log: &Log, name: &str, joint: usize, has_torque: bool) -> Option<JointRows> {
     let or_zero = |cells: Option<&[f64]>| cells.map_or(vec![0.0; log.rows()], <[f64]>::to_vec);
     let [kp, kd] = log.gains(name);
     Some(JointRows {
         joint,
         smooth: [Vec::new(), Vec::new()],
         q: log.q(name)?.to_vec(),
-        dq: log.dq(name)?.to_vec(),
-        torque: log.tau_measured(name)?.to_vec(),
+        dq: log.dq(name).map_or(Vec::new(), <[f64]>::to_vec),
+        torque: if has_torque { log.tau_measured(name)?.to_vec() } else { vec![0.0; log.rows()] },
         command: [log.q_cmd(name)?.to_vec(), or_zero(log.dq_cmd(name)), or_zero(log.tau_ff(name))],
         gains: [kp?, kd?],
         temperature: log.channel(&format!("temp_{name}")).map_or(Vec::new(), <[f64]>::to_vec),
@@ -181,6 +205,18 @@ fn smoothed(series: &[f64], ranges: &[Range<usize>]) -> Vec<f64> {
         }
     }
     smooth
+}
+
+/// Returns the slope of a series between the rows before and after each; at the ends of a range, that of one side.
+fn slopes(series: &[f64], t: &[f64], ranges: &[Range<usize>]) -> Vec<f64> {
+    let mut slopes = vec![f64::NAN; series.len()];
+    for range in ranges {
+        for row in range.clone() {
+            let (before, after) = (row.max(range.start + 1) - 1, (row + 1).min(range.end - 1));
+            slopes[row] = (series[after] - series[before]) / (t[after] - t[before]);
+        }
+    }
+    slopes
 }
 
 fn vectors<const N: usize>(log: &Log, names: [&str; N]) -> Option<Vec<[f64; N]>> {

@@ -32,7 +32,7 @@ const SMALL: [(&str, &[f64]); 15] = [
     ("joint_spring", &[0.05, 0.02]),
 ];
 /// The same for effects on the motion of a link.
-const SMALL_MOTION: [(&str, f64); 2] = [("encoder_offset", 0.0015), ("joint_elasticity", 1e-4)];
+const SMALL_MOTION: [(&str, f64); 2] = [("encoder_offset", 0.0015), ("joint_elasticity", 2.5e-4)];
 /// Standard deviation of the friction at low speed [N·m], for two speeds [rad/s].
 const LOW_SPEED: [(f64, f64); 2] = [(0.04, 0.2), (0.03, 0.8)];
 /// Standard deviation of the time by which the positions of an encoder are ahead of its velocities [s]: drives filter the velocity, and
@@ -42,12 +42,16 @@ const LEAD: f64 = 4e-4;
 const TILT: f64 = 0.005;
 /// Standard deviation of an offset of the accelerometer, by its bias and its mounting [m/s²].
 const ACCELERATION: f64 = 0.1;
+/// Standard deviation of the position of the accelerometer in the base, along each axis [m].
+const LEVER: f64 = 0.05;
 /// Standard deviation of an offset of a torque sensor [N·m].
 const TORQUE_OFFSET: f64 = 0.02;
 /// Standard deviation of the torque with which a joint sticks while the robot stands [N·m].
 const STICK: f64 = 0.1;
 /// Standard deviations of a link's mass, and of its inertia relative to the trace; that of its centre of mass [m].
 const BODY: [f64; 3] = [0.03, 0.04, 0.003];
+/// Standard deviation of the mass of the base, relative to it: it is the robot's that was weighed.
+const BASE_MASS: f64 = 0.015;
 
 /// Returns the small unknowns whose columns depend on the causes that were found: those of drives and joints.
 pub fn of_joints(system: &System, laws: &[Law], robot: &Robot, predicted: &Predicted) -> Vec<Group> {
@@ -84,6 +88,7 @@ pub fn of_bodies(system: &System, laws: &[Law], robot: &Robot, predicted: &Predi
     small.extend((0..robot.joints.len()).map(|joint| (system.balance.lead_column(joint), LEAD)));
     small.extend([0, 1].map(|axis| (system.balance.tilt_column(axis), TILT)));
     small.extend([0, 1, 2].map(|axis| (system.balance.acceleration_column(axis), ACCELERATION)));
+    small.extend([0, 1, 2].map(|axis| (system.balance.lever_column(axis), LEVER)));
     grouped(small)
 }
 
@@ -94,6 +99,8 @@ pub fn small_std(effect: &str, unknown: usize) -> f64 {
     let of_others = match effect {
         "stribeck_friction" => LOW_SPEED[0].0,
         "com_shift" => BODY[2],
+        // A second moment is the sum of two moments of inertia minus the third, half of it.
+        "inertia" => 2.0 * BODY[1],
         _ => 0.0,
     };
     of_joint.or(of_motion).unwrap_or(of_others)
@@ -165,7 +172,10 @@ fn bodies(system: &System, robot: &Robot) -> Vec<(Column, f64)> {
         let RigidBody { mass, com, inertia } = robot.tree.bodies[body].inertia;
         let trace = inertia.x_axis.x + inertia.y_axis.y + inertia.z_axis.z;
         let column = |added: RigidBody| system.balance.inertia_column(&robot.tree, robot, body, added);
-        let mut columns = vec![(column(RigidBody { mass: 1.0, com, inertia: DMat3::ZERO }), BODY[0] * mass)];
+        let mut columns = vec![(
+            column(RigidBody { mass: 1.0, com, inertia: DMat3::ZERO }),
+            mass * if body == 0 { BASE_MASS } else { BODY[0] },
+        )];
         for axis in [DVec3::X, DVec3::Y, DVec3::Z] {
             // Moving the centre of mass by d changes the first moment by m d, which a pair of opposite masses has.
             let one = column(RigidBody { mass, com: com + 1e-3 * axis, inertia: DMat3::ZERO });

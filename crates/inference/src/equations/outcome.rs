@@ -108,6 +108,9 @@ impl Search<'_> {
         let mut found = Vec::new();
         for joint in 0..self.base.joints.len() {
             for place in [Place::Drive, Place::Joint] {
+                if place == Place::Drive && !self.system.measured.has_torque {
+                    continue;
+                }
                 let (variables, columns): (Vec<_>, Vec<Column>) =
                     unknown::columns(self.system, &best.predicted, joint, place).into_iter().unzip();
                 let size = columns.len();

@@ -227,9 +227,11 @@ fn base_motion(measured: &Measurements, rows: &Range<usize>, regime: Regime, of:
         [felt, of_velocity.unwrap_or([0.0; 3])]
     };
     let angular_velocity = gyro.map(|of| of[0]);
-    let response =
-        BaseMotion { angular_velocity, angular_acceleration: gyro.map(|of| of[1]), linear_acceleration, ..turned[0] };
-    let instrument = BaseMotion { angular_velocity, linear_acceleration: of_columns, ..turned[1] };
+    // Orientations are too noisy for angular accelerations, and those of the gyroscope have little noise.
+    let angular_acceleration = gyro.map(|of| of[1]);
+    let response = BaseMotion { angular_velocity, angular_acceleration, linear_acceleration, ..turned[0] };
+    let instrument =
+        BaseMotion { angular_velocity, angular_acceleration, linear_acceleration: of_columns, ..turned[1] };
     let numbers = response.angular_velocity.iter().chain(&response.angular_acceleration);
     numbers.chain(&response.linear_acceleration).copied().all(f64::is_finite).then_some([response, instrument])
 }

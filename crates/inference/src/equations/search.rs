@@ -39,6 +39,17 @@ impl Search<'_> {
         };
         let mut small = small_of(&self, &self.base, &predicted);
         let mut best = self.fit(Vec::new(), &small, 1, None);
+        for (block, (shape, scale)) in best.blocks.iter().zip(&best.posterior.noise) {
+            let rms = (block.y.iter().map(|y| y * y).sum::<f64>() / block.y.len().max(1) as f64).sqrt();
+            let mean = block.y.iter().sum::<f64>() / block.y.len().max(1) as f64;
+            eprintln!(
+                "DBG {} n {} sigma {:.4} rms {rms:.4} mean {mean:.4} {:?} scale {scale:.2}",
+                block.name,
+                block.y.len(),
+                block.sigma,
+                super::block::SHAPES[*shape]
+            );
+        }
         let given: Vec<f64> = best.posterior.noise.iter().map(power).collect();
         self.note(format!("no cause: {:.1} nat", best.evidence));
         while best.causes.len() < MOST_CAUSES && self.removed.len() < MOST_REMOVED {
