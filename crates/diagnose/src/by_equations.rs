@@ -1,13 +1,13 @@
-//! Diagnosis of a log with motor currents: its causes are those of highest evidence in the equations of the log.
+//! Diagnosis of a log with velocities: its causes are those of highest evidence in the equations of the log.
 //!
 //! [`twinstep_inference::equations`] finds them without simulation, in the rows that are not held out. Simulations estimate the gains of
 //! the joints where the equations show that they differ, measure the errors in the held-out rows, and choose the next experiment.
 
 use std::collections::BTreeMap;
 
-use twinstep_effects::{Composition, EffectEntry, ModelFile, Scope};
+use twinstep_effects::{Composition, Effect, EffectEntry, EntryError, ModelFile, Scope};
 use twinstep_identify::window::WindowConfig;
-use twinstep_inference::equations::{Explained, Explanation, UnknownLaw, explain};
+use twinstep_inference::equations::{Explained, Explanation, OfJoint, UnknownLaw, explain};
 use twinstep_logs::Log;
 use twinstep_model::Rollout;
 
@@ -26,7 +26,7 @@ const AMBIGUOUS: f64 = 3.0;
 /// Absolute correlation of two estimates from which they are reported.
 const CORRELATED: f64 = 0.9;
 
-/// Diagnoses a log. Returns `None` if the equations do not apply to it: it lacks motor currents, velocities, or gains of a joint.
+/// Diagnoses a log. Returns `None` if the equations do not apply to it: it lacks velocities or gains of a joint, or its torques are those at the output.
 pub fn diagnose_by_equations(
     log: &Log,
     model: &ModelFile,
@@ -64,7 +64,7 @@ pub fn diagnose_by_equations(
         baseline: baseline?,
         extended: after?,
         noise_floor: reporting::noise_floor(&evidence),
-        findings: found.causes.iter().map(|cause| finding(cause, &extended)).collect(),
+        findings: found.causes.iter().map(|cause| finding(cause, &extended)).collect::<Result<_, _>>()?,
         joint_gains: gains.map_or(BTreeMap::new(), |gains| gains.by_joint()),
         confusable,
         unexplained,
@@ -105,11 +105,24 @@ fn extended(model: &ModelFile, causes: &[Explanation]) -> Result<ModelFile, Diag
         if cause.effect.composition == Composition::Replace {
             extended.effects.retain(|entry| entry.effect != cause.effect || entry.scope != cause.scope);
         }
-        let entry = EffectEntry::new(cause.effect, cause.scope, cause.values.clone())?;
-        let intervals = cause.intervals.iter().map(|interval| Some(*interval)).collect();
-        extended.effects.push(EffectEntry { intervals, ..entry });
+        if cause.by_joint.is_empty() {
+            extended.effects.push(entry(cause.effect, cause.scope, &cause.values, &cause.intervals)?);
+        }
+        for own in &cause.by_joint {
+            extended.effects.push(entry(cause.effect, Scope::Joint(own.joint), &own.values, &own.intervals)?);
+        }
     }
     Ok(extended)
+}
+
+fn entry(
+    effect: &'static Effect,
+    scope: Scope,
+    values: &[f64],
+    intervals: &[[f64; 2]],
+) -> Result<EffectEntry, EntryError> {
+    let entry = EffectEntry::new(effect, scope, values.to_vec())?;
+    Ok(EffectEntry { intervals: intervals.iter().map(|interval| Some(*interval)).collect(), ..entry })
 }
 
 /// Returns a cause and its rivals as hypotheses.
@@ -141,7 +154,7 @@ fn confusable(found: &Explained) -> Vec<CorrelatedPair> {
     found.correlations.iter().filter(is_high).map(pair).collect()
 }
 
-fn finding(cause: &Explanation, extended: &ModelFile) -> Cause {
+fn finding(cause: &Explanation, extended: &ModelFile) -> Result<Cause, DiagnoseError> {
     let (own, close) = candidates(cause);
     let hypothesis = &own.hypothesis;
     let weights: Vec<f64> = close.iter().map(|rival| (rival.score - cause.gain).exp()).collect();
@@ -169,10 +182,18 @@ fn finding(cause: &Explanation, extended: &ModelFile) -> Cause {
         let rival = effect.name.replace('_', " ");
         evidence = format!("{evidence} In its place, {rival} at {scope} is {:.0} nat behind.", -behind);
     }
-    Cause {
+    let mut described = extended.clone();
+    if !cause.by_joint.is_empty() {
+        let of = |own: &OfJoint| format!("{} {:.3}", own.joint, own.values[0]);
+        let all: Vec<String> = cause.by_joint.iter().map(of).collect();
+        evidence = format!("{evidence} Each joint has its own: {}.", all.join(", "));
+        // The model has the value of each joint, the finding their mean.
+        described.effects.push(entry(cause.effect, cause.scope, &cause.values, &cause.intervals)?);
+    }
+    Ok(Cause {
         effect: cause.effect.name.to_owned(),
         scope: cause.scope.to_string(),
-        parameters: reporting::estimates(hypothesis, extended),
+        parameters: reporting::estimates(hypothesis, &described),
         held_out_gain: cause.explained,
         score_nats: cause.gain,
         threshold_nats: LEAST_GAIN,
@@ -182,5 +203,5 @@ fn finding(cause: &Explanation, extended: &ModelFile) -> Cause {
         remedy: cause.effect.remedy.to_owned(),
         rivals: close.iter().map(reporting::rival).collect(),
         evidence: evidence + " " + cause.effect.signature,
-    }
+    })
 }

@@ -19,6 +19,9 @@ fn main() {
         for cause in &found.causes {
             let (name, scope, gain) = (cause.effect.name, cause.scope, cause.gain);
             println!("  {name}@{scope} {gain:.1} nat {:.4?} {:.4?}", cause.values, cause.intervals);
+            for own in &cause.by_joint {
+                println!("    {} {:.4?} {:.4?}", own.joint, own.values, own.intervals);
+            }
         }
         println!("  left {:.3} {:?}", found.left, found.unknown.first());
         found.decisions.iter().for_each(|line| eprintln!("{line}"));

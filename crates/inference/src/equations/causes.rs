@@ -2,6 +2,9 @@
 
 use super::system::Site;
 
+/// Standard deviation of a joint's value around that of its scope, where they are alike, relative to the prior's.
+const SPREAD: f64 = 0.15;
+
 /// Joints, or a part of a robot, on which an effect may act.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ScopeSites {
@@ -11,6 +14,22 @@ pub struct ScopeSites {
     pub sites: Vec<Site>,
     /// Prior probability.
     pub probability: f64,
+    /// True if the values at the sites are alike, false if each is its own.
+    pub is_alike: bool,
+}
+
+impl ScopeSites {
+    /// Returns the name, with that each joint has its own value.
+    pub fn label(&self) -> String {
+        if self.is_alike { self.name.clone() } else { format!("each of {}", self.name) }
+    }
+
+    /// Returns the prior covariance of the values of an unknown at two sites, relative to the variance at one.
+    pub fn covariance(&self, is_same_site: bool) -> f64 {
+        let shared = if self.is_alike { 1.0 } else { 0.0 };
+        let own = if self.is_alike { SPREAD * SPREAD } else { 1.0 };
+        shared + if is_same_site { own } else { 0.0 }
+    }
 }
 
 /// An effect on a scope, with values.
@@ -28,6 +47,15 @@ pub struct Cause {
     pub log_prior: f64,
 }
 
+impl Cause {
+    /// Returns the mean of each unknown over the sites.
+    pub fn mean(&self) -> Vec<f64> {
+        let sites = self.values.len() as f64;
+        let of = |unknown: usize| self.values.iter().map(|values| values[unknown]).sum::<f64>() / sites;
+        (0..self.values[0].len()).map(of).collect()
+    }
+}
+
 /// A cause with its evidence.
 #[derive(Clone, Debug)]
 pub struct FoundCause {
@@ -37,6 +65,8 @@ pub struct FoundCause {
     pub gain: f64,
     /// Standard deviation of the mean of each unknown over the sites.
     pub stds: Vec<f64>,
+    /// Standard deviation of each unknown at each site.
+    pub site_stds: Vec<Vec<f64>>,
     /// Share of the root mean square of the residuals that it explains, in the equations that it changes.
     pub explained: f64,
     /// Causes in its place, with their evidence minus that of the cause [nat], the best first.

@@ -14,8 +14,21 @@ use super::system::{Site, System, apply, body_of};
 
 /// Relative standard deviation of a value because no law is exact.
 const LAW_ERROR: f64 = 0.015;
+/// Prior probability that each joint of all, or of a type, has its own value.
+const EACH: f64 = 0.1;
 /// Variance that is left in an equation, relative to that of its noise, which wrong statements about the noise allow.
 const UNEXPLAINED: f64 = 2.0;
+
+/// Values of an effect at a joint.
+#[derive(Clone, Debug, PartialEq)]
+pub struct OfJoint {
+    /// The joint.
+    pub joint: Joint,
+    /// Values of all parameters.
+    pub values: Vec<f64>,
+    /// 95 % interval of each value.
+    pub intervals: Vec<[f64; 2]>,
+}
 
 /// An effect on a scope, with values.
 #[derive(Clone, Debug, PartialEq)]
@@ -28,6 +41,8 @@ pub struct Explanation {
     pub values: Vec<f64>,
     /// 95 % interval of each value.
     pub intervals: Vec<[f64; 2]>,
+    /// Values of each joint, where they are not alike; else empty.
+    pub by_joint: Vec<OfJoint>,
     /// Evidence of all causes minus that without this one [nat].
     pub gain: f64,
     /// Share of the root mean square of the residuals that it explains, in the equations that it changes.
@@ -89,20 +104,25 @@ fn scopes() -> Vec<ScopeSites> {
             name: scope.to_string(),
             sites: contained.map(|(index, _)| Site::Joint(index)).collect(),
             probability,
+            is_alike: true,
         }
     });
-    let base = ScopeSites { name: "base".to_owned(), sites: vec![Site::Base], probability: 0.5 };
-    let supply = ScopeSites { name: "all".to_owned(), sites: vec![Site::Base], probability: 0.5 };
-    of_joints.chain([base, supply]).collect()
+    let of_joints: Vec<ScopeSites> = of_joints.collect();
+    let types = of_joints.iter().filter(|scope| scope.probability >= EACH && scope.sites.len() > 1);
+    let each: Vec<ScopeSites> =
+        types.map(|scope| ScopeSites { probability: EACH, is_alike: false, ..scope.clone() }).collect();
+    let of_base =
+        |name: &str| ScopeSites { name: name.to_owned(), sites: vec![Site::Base], probability: 0.5, is_alike: true };
+    of_joints.into_iter().chain(each).chain([of_base("base"), of_base("all")]).collect()
+}
+
+/// Returns parameters of an effect within their bounds.
+fn clamped(effect: &Effect, values: Vec<f64>) -> Vec<f64> {
+    let bounds = effect.parameters.iter().flat_map(|parameter| std::iter::repeat_n(parameter.bounds, parameter.count));
+    values.into_iter().zip(bounds).map(|(value, [low, high])| value.clamp(low, high)).collect()
 }
 
 fn explained(found: Found, laws: &[Law], robot: &Robot) -> Explained {
-    let mean = |cause: &Cause| -> Vec<f64> {
-        let sites = cause.values.len() as f64;
-        (0..cause.values[0].len())
-            .map(|unknown| cause.values.iter().map(|values| values[unknown]).sum::<f64>() / sites)
-            .collect()
-    };
     let values_of = |cause: &Cause, unknowns: &[f64]| -> Vec<f64> {
         let law = &laws[cause.law];
         if law.effect.name != "inertia" {
@@ -115,38 +135,45 @@ fn explained(found: Found, laws: &[Law], robot: &Robot) -> Explained {
     let in_terms = |cause: &Cause| {
         let law = &laws[cause.law];
         let scope: Scope = cause.scope.name.parse().expect("the name of a scope");
-        let bounds =
-            law.effect.parameters.iter().flat_map(|parameter| std::iter::repeat_n(parameter.bounds, parameter.count));
-        let values = values_of(cause, &mean(cause));
-        let values: Vec<f64> =
-            values.into_iter().zip(bounds).map(|(value, [low, high])| value.clamp(low, high)).collect();
+        let values = clamped(law.effect, values_of(cause, &cause.mean()));
         (law.effect, scope, values)
     };
-    let causes = found.causes.iter().map(|found| {
-        let (effect, scope, values) = in_terms(&found.cause);
-        let mean = mean(&found.cause);
-        let mut intervals: Vec<[f64; 2]> = values.iter().map(|value| [*value; 2]).collect();
-        for (unknown, std) in found.stds.iter().enumerate() {
-            let half = TWO_SIDED_95 * std.hypot(LAW_ERROR * mean[unknown]);
+    let intervals_of = |cause: &Cause, unknowns: &[f64], stds: &[f64]| {
+        let effect = laws[cause.law].effect;
+        let middle = clamped(effect, values_of(cause, unknowns));
+        let mut intervals: Vec<[f64; 2]> = middle.into_iter().map(|value| [value; 2]).collect();
+        for (unknown, std) in stds.iter().enumerate() {
+            let half = TWO_SIDED_95 * std.hypot(LAW_ERROR * unknowns[unknown]);
             for side in [-half, half] {
-                let mut moved = mean.clone();
+                let mut moved = unknowns.to_vec();
                 moved[unknown] += side;
-                for (interval, value) in intervals.iter_mut().zip(values_of(&found.cause, &moved)) {
+                let ends = clamped(effect, values_of(cause, &moved));
+                for (interval, value) in intervals.iter_mut().zip(ends) {
                     *interval = [interval[0].min(value), interval[1].max(value)];
                 }
             }
         }
+        intervals
+    };
+    let causes = found.causes.iter().map(|found| {
+        let (effect, scope, values) = in_terms(&found.cause);
+        let intervals = intervals_of(&found.cause, &found.cause.mean(), &found.stds);
+        let sites = found.cause.scope.sites.iter().zip(found.cause.values.iter().zip(&found.site_stds));
+        let by_joint = sites.filter_map(|(site, (unknowns, stds))| match site {
+            Site::Joint(joint) if !found.cause.scope.is_alike => Some(OfJoint {
+                joint: Joint::ALL[*joint],
+                values: clamped(effect, values_of(&found.cause, unknowns)),
+                intervals: intervals_of(&found.cause, unknowns, stds),
+            }),
+            _ => None,
+        });
+        let by_joint = by_joint.collect();
         let rivals = found.rivals.iter().map(|(cause, behind)| {
             let (effect, scope, values) = in_terms(cause);
             (effect, scope, values, *behind)
         });
         let rivals = rivals.collect();
-        let bounds =
-            effect.parameters.iter().flat_map(|parameter| std::iter::repeat_n(parameter.bounds, parameter.count));
-        for (interval, [low, high]) in intervals.iter_mut().zip(bounds) {
-            *interval = interval.map(|end| end.clamp(low, high));
-        }
-        Explanation { effect, scope, values, intervals, gain: found.gain, explained: found.explained, rivals }
+        Explanation { effect, scope, values, intervals, by_joint, gain: found.gain, explained: found.explained, rivals }
     });
     let causes: Vec<Explanation> = causes.collect();
     let excess = |power: f64| (power - UNEXPLAINED).max(0.0);

@@ -6,9 +6,12 @@ use rayon::prelude::*;
 use super::block::{Block, Column};
 use super::causes::Cause;
 use super::gaussian::{Group, Posterior, posterior};
-use super::problem::{SPREAD, Search};
+use super::problem::Search;
 use super::robot::Robot;
 use super::system::{Predicted, apply};
+
+/// Evidence of causes whose parameters are not possible [nat].
+const IMPOSSIBLE: f64 = -1e6;
 
 /// A set of causes, fitted.
 pub struct Fitted {
@@ -68,7 +71,9 @@ impl Search<'_> {
             iteration += 1;
             let log_prior: f64 = causes.iter().map(|cause| cause.log_prior).sum();
             if iteration >= iterations.max(1) || largest < 0.02 {
-                let evidence = posterior.evidence + log_prior + log_allowed;
+                let is_allowed = |cause: &Cause| self.laws[cause.law].allows(&cause.mean(), cause.shape);
+                let impossible = if moved.iter().all(is_allowed) { 0.0 } else { IMPOSSIBLE };
+                let evidence = posterior.evidence + log_prior + log_allowed + impossible;
                 return Fitted { causes: moved, evidence, posterior, robot, predicted, blocks, groups };
             }
             causes = moved;
@@ -107,8 +112,7 @@ impl Search<'_> {
             if unknown != other {
                 return 0.0;
             }
-            let unit = law.units[unknown] * law.units[unknown];
-            unit * (1.0 + if site == other_site { SPREAD * SPREAD } else { 0.0 })
+            law.units[unknown] * law.units[unknown] * cause.scope.covariance(site == other_site)
         });
         Group { columns, mean, covariance, gain: None }
     }

@@ -42,6 +42,20 @@ pub struct Law {
     pub values: fn(&[f64], f64) -> Vec<f64>,
 }
 
+impl Law {
+    /// Returns true if the parameters of the effect are within their bounds.
+    pub fn allows(&self, unknowns: &[f64], shape: f64) -> bool {
+        // The parameters of other bodies depend on the body.
+        let is_of_body = self.place == Place::Body;
+        let bounds = self.effect.parameters.iter().flat_map(|one| std::iter::repeat_n(one.bounds, one.count));
+        is_of_body
+            || (self.values)(unknowns, shape)
+                .into_iter()
+                .zip(bounds)
+                .all(|(value, [low, high])| value >= low && value <= high)
+    }
+}
+
 /// Strengths that are tried, relative to the end of the prior range.
 const STRENGTHS: [f64; 12] = [0.03, 0.06, 0.1, 0.15, 0.22, 0.32, 0.45, 0.6, 0.8, 1.0, 1.25, 1.6];
 

@@ -33,7 +33,7 @@ pub struct JointRows {
     pub joint: usize,
     /// Measured position [rad].
     pub q: Vec<f64>,
-    /// Measured velocity, or slope of the position if it was not measured [rad/s].
+    /// Measured velocity [rad/s].
     pub dq: Vec<f64>,
     /// Position [rad] and velocity [rad/s] with less noise: parabolas through the rows around each.
     pub smooth: [Vec<f64>; 2],
@@ -86,7 +86,7 @@ pub struct Measurements {
 }
 
 impl Measurements {
-    /// Collects the channels of `log`, and the torques of the rows that are used. Returns `None` if its torques are those at the output, gains
+    /// Collects the channels of `log`, and the torques of the rows that are used. Returns `None` if its torques are those at the output, velocities or gains
     /// of a joint are not known, or the joints are not those of the robot.
     pub fn new(log: &Log, robot: &Robot, is_used: impl Fn(usize) -> bool) -> Option<Self> {
         let has_torque = match log.meta().tau_sensor {
@@ -115,9 +115,6 @@ impl Measurements {
         let t = log.t().to_vec();
         let ranges: Vec<Range<usize>> = log.segments().flat_map(|(_, range)| split_at_gaps(&t, range)).collect();
         for rows in &mut joints {
-            if rows.dq.is_empty() {
-                rows.dq = slopes(&rows.q, &t, &ranges);
-            }
             rows.smooth = [smoothed(&rows.q, &ranges), smoothed(&rows.dq, &ranges)];
         }
         let mut steps: Vec<f64> =
@@ -136,12 +133,7 @@ impl Measurements {
             let (sum, count) = all.fold((0.0, 0.0), |(sum, count), noise| (sum + noise, count + 1.0));
             if count > 0.0 && sum > 0.0 { sum / count } else { usual }
         };
-        let position = stated("q", 1e-4);
-        // Differences over two rows.
-        let of_slopes = position / (std::f64::consts::SQRT_2 * dt);
-        let has_velocity = log.joints().iter().all(|joint| log.dq(joint).is_some());
-        let velocity = if has_velocity { stated("dq", 0.01) } else { of_slopes };
-        let noise = [position, velocity, stated("tau_measured", 0.05)];
+        let noise = [stated("q", 1e-4), stated("dq", 0.01), stated("tau_measured", 0.05)];
         let highest = log.channel("battery_V").map_or(0.0, |cells| cells.iter().copied().fold(0.0, f64::max));
         let voltage = log.channel("battery_V").filter(|_| highest > 0.0);
         let share = |cell: &f64| if cell.is_finite() { cell / highest } else { 1.0 };
@@ -178,7 +170,7 @@ fn joint_rows(log: &Log, name: &str, joint: usize, has_torque: bool) -> Option<J
         joint,
         smooth: [Vec::new(), Vec::new()],
         q: log.q(name)?.to_vec(),
-        dq: log.dq(name).map_or(Vec::new(), <[f64]>::to_vec),
+        dq: log.dq(name)?.to_vec(),
         torque: if has_torque { log.tau_measured(name)?.to_vec() } else { vec![0.0; log.rows()] },
         command: [log.q_cmd(name)?.to_vec(), or_zero(log.dq_cmd(name)), or_zero(log.tau_ff(name))],
         gains: [kp?, kd?],
@@ -205,18 +197,6 @@ fn smoothed(series: &[f64], ranges: &[Range<usize>]) -> Vec<f64> {
         }
     }
     smooth
-}
-
-/// Returns the slope of a series between the rows before and after each; at the ends of a range, that of one side.
-fn slopes(series: &[f64], t: &[f64], ranges: &[Range<usize>]) -> Vec<f64> {
-    let mut slopes = vec![f64::NAN; series.len()];
-    for range in ranges {
-        for row in range.clone() {
-            let (before, after) = (row.max(range.start + 1) - 1, (row + 1).min(range.end - 1));
-            slopes[row] = (series[after] - series[before]) / (t[after] - t[before]);
-        }
-    }
-    slopes
 }
 
 fn vectors<const N: usize>(log: &Log, names: [&str; N]) -> Option<Vec<[f64; N]>> {

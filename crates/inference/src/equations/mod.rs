@@ -31,4 +31,4 @@ mod tests;
 mod unknown;
 
 pub use causes::UnknownLaw;
-pub use explain::{Explained, Explanation, explain};
+pub use explain::{Explained, Explanation, OfJoint, explain};

@@ -53,6 +53,9 @@ const BODY: [f64; 3] = [0.03, 0.04, 0.003];
 /// Standard deviation of the mass of the base, relative to it: it is the robot's that was weighed.
 const BASE_MASS: f64 = 0.015;
 
+/// Norm of what a small unknown changes in an equation, relative to the noise of a row, below which the equation does not show it.
+const LEAST_SEEN: f64 = 0.1;
+
 /// Returns the small unknowns whose columns depend on the causes that were found: those of drives and joints.
 pub fn of_joints(system: &System, laws: &[Law], robot: &Robot, predicted: &Predicted) -> Vec<Group> {
     let (mut small, mut gains) = (Vec::new(), Vec::new());
@@ -76,7 +79,7 @@ pub fn of_joints(system: &System, laws: &[Law], robot: &Robot, predicted: &Predi
         small.push((system.torque_offset(joint), TORQUE_OFFSET));
         small.push((system.balance.joint_column(joint, &ones), STICK));
     }
-    [gains, grouped(small)].concat()
+    [gains, grouped(system, small)].concat()
 }
 
 /// Returns the small unknowns whose columns do not depend on the causes: those of bodies and their motion.
@@ -89,7 +92,7 @@ pub fn of_bodies(system: &System, laws: &[Law], robot: &Robot, predicted: &Predi
     small.extend([0, 1].map(|axis| (system.balance.tilt_column(axis), TILT)));
     small.extend([0, 1, 2].map(|axis| (system.balance.acceleration_column(axis), ACCELERATION)));
     small.extend([0, 1, 2].map(|axis| (system.balance.lever_column(axis), LEVER)));
-    grouped(small)
+    grouped(system, small)
 }
 
 /// Returns the standard deviation of an unknown of an effect that is too small to be reported.
@@ -111,8 +114,16 @@ fn named<'a>(laws: &'a [Law], name: &str) -> &'a Law {
     own.max_by_key(|law| law.units.len()).expect("a law of each effect")
 }
 
-fn grouped(small: Vec<(Column, f64)>) -> Vec<Group> {
-    let kept = small.into_iter().filter(|(column, ..)| !column.is_zero());
+/// Returns unknowns of their own, without the equations in which they are much smaller than the noise.
+fn grouped(system: &System, small: Vec<(Column, f64)>) -> Vec<Group> {
+    let seen = |(mut column, std): (Column, f64)| {
+        column.parts.retain(|(block, rows)| {
+            let size = rows.iter().map(|row| row * row).sum::<f64>().sqrt();
+            std * size > LEAST_SEEN * system.blocks[*block].sigma
+        });
+        (column, std)
+    };
+    let kept = small.into_iter().map(seen).filter(|(column, _)| !column.is_zero());
     kept.map(|(column, std)| Group::single(column, std)).collect()
 }
 

@@ -50,8 +50,16 @@ impl Search<'_> {
             let mut others = best.causes.clone();
             others.remove(index);
             let without = self.fit(others, small, 2, Some(&best));
+            let unknowns = cause.values[0].len();
+            let own = |site: usize, unknown: usize| {
+                let place = starts[index] + site * unknowns + unknown;
+                covariance[(place, place)].sqrt()
+            };
+            let site_stds =
+                (0..cause.values.len()).map(|site| (0..unknowns).map(|unknown| own(site, unknown)).collect());
+            let site_stds = site_stds.collect();
             let stds = (0..cause.values[0].len()).map(|unknown| of_means([index; 2], [unknown; 2]).sqrt()).collect();
-            let known = |rivals: &&Rivals| rivals.law == cause.law && rivals.scope == cause.scope.name;
+            let known = |rivals: &&Rivals| rivals.law == cause.law && rivals.scope == cause.scope.label();
             let rivals = self.rivals.iter().rfind(known).map_or(Vec::new(), |rivals| rivals.others.clone());
             let parts = best.groups[index].columns.iter().flat_map(|column| &column.parts);
             let changed: BTreeSet<usize> = parts.map(|(block, _)| *block).collect();
@@ -61,7 +69,7 @@ impl Search<'_> {
             };
             let explained = 1.0 - (sum(&best) / sum(&without)).sqrt();
             let gain = best.evidence - without.evidence;
-            causes.push(FoundCause { cause: cause.clone(), gain, stds, explained, rivals });
+            causes.push(FoundCause { cause: cause.clone(), gain, stds, site_stds, explained, rivals });
         }
         // Places in the fit of the causes that are large, the strongest first.
         let mut order: Vec<usize> = (0..causes.len()).filter(|index| self.is_large(&causes[*index])).collect();

@@ -7,8 +7,6 @@ use super::law::Law;
 use super::robot::Robot;
 use super::system::System;
 
-/// Standard deviation of a joint's value around that of its scope, relative to the prior's.
-pub const SPREAD: f64 = 0.15;
 /// Prior probability that an effect is a cause.
 pub const EFFECT_PROBABILITY: f64 = 1.0 / 12.0;
 

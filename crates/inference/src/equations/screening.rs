@@ -9,7 +9,7 @@ use super::causes::{Cause, ScopeSites};
 use super::fit::Fitted;
 use super::gaussian::{Group, Scores, gain};
 use super::law::Law;
-use super::problem::{EFFECT_PROBABILITY, SPREAD, Search};
+use super::problem::{EFFECT_PROBABILITY, Search};
 use super::system::{Site, apply};
 
 /// Standard deviation of a strength around one that is tried, relative to it.
@@ -128,7 +128,7 @@ impl Search<'_> {
                 self.laws[cause.law].effect == law.effect
                     && cause.scope.sites.iter().any(|site| scope.sites.contains(site))
             };
-            let removed = |(law, name): &(usize, String)| *law == law_index && *name == scope.name;
+            let removed = |(law, name): &(usize, String)| *law == law_index && *name == scope.label();
             if best.causes.iter().any(known) || self.removed.iter().any(removed) {
                 continue;
             }
@@ -150,20 +150,17 @@ impl Search<'_> {
                     return 0.0;
                 }
                 let unit = if is_strength { CELL } else { law.units[one.unknown] };
-                unit * unit * (1.0 + if one.site == other.site { SPREAD * SPREAD } else { 0.0 })
+                unit * unit * scope.covariance(one.site == other.site)
             });
             let (gain, posterior, spread) = gain(&with_residual, &inner, &mean, &covariance);
             let variants = self.variants(law_index) as f64;
             let mut log_prior = EFFECT_PROBABILITY.ln() + scope.probability.ln();
             let mut log_grid = -variants.ln();
-            if law.is_positive && !is_strength {
+            if law.is_positive {
                 // The half of the prior that is allowed has twice the density.
                 let deviation = posterior.mean() / (spread[(0, 0)].sqrt() + 1e-12);
                 log_prior += std::f64::consts::LN_2;
                 log_grid += if deviation < 0.0 { -0.5 * deviation * deviation } else { 0.0 };
-            }
-            if is_strength {
-                log_prior += std::f64::consts::LN_2;
             }
             let mut values = vec![vec![0.0; law.units.len()]; scope.sites.len()];
             for (row, member) in members.iter().enumerate() {
@@ -178,7 +175,9 @@ impl Search<'_> {
             let log_shapes = -(law.shapes.len() as f64).ln();
             let cause =
                 Cause { law: law_index, scope: scope.clone(), shape, values, log_prior: log_prior + log_shapes };
-            found.push((gain + log_prior + log_grid, cause));
+            if law.allows(&cause.mean(), shape) {
+                found.push((gain + log_prior + log_grid, cause));
+            }
         }
         found
     }

@@ -39,17 +39,6 @@ impl Search<'_> {
         };
         let mut small = small_of(&self, &self.base, &predicted);
         let mut best = self.fit(Vec::new(), &small, 1, None);
-        for (block, (shape, scale)) in best.blocks.iter().zip(&best.posterior.noise) {
-            let rms = (block.y.iter().map(|y| y * y).sum::<f64>() / block.y.len().max(1) as f64).sqrt();
-            let mean = block.y.iter().sum::<f64>() / block.y.len().max(1) as f64;
-            eprintln!(
-                "DBG {} n {} sigma {:.4} rms {rms:.4} mean {mean:.4} {:?} scale {scale:.2}",
-                block.name,
-                block.y.len(),
-                block.sigma,
-                super::block::SHAPES[*shape]
-            );
-        }
         let given: Vec<f64> = best.posterior.noise.iter().map(power).collect();
         self.note(format!("no cause: {:.1} nat", best.evidence));
         while best.causes.len() < MOST_CAUSES && self.removed.len() < MOST_REMOVED {
@@ -85,7 +74,7 @@ impl Search<'_> {
                 break;
             }
             let added = &next.causes[next.causes.len() - 1];
-            self.rivals.push(Rivals { law: added.law, scope: added.scope.name.clone(), others: rivals });
+            self.rivals.push(Rivals { law: added.law, scope: added.scope.label(), others: rivals });
             let line = format!(
                 "+ {}: {:.1} nat",
                 self.name(&next.causes[next.causes.len() - 1]),
@@ -119,7 +108,7 @@ impl Search<'_> {
     }
 
     pub fn name(&self, cause: &Cause) -> String {
-        format!("{}@{}", self.laws[cause.law].effect.name, cause.scope.name)
+        format!("{}@{}", self.laws[cause.law].effect.name, cause.scope.label())
     }
 
     /// Tries other scopes of the last cause: those that contain the sites where it is large, the narrowest first.
@@ -160,7 +149,7 @@ impl Search<'_> {
             let other = self.fit(causes, small, CONVERGED, Some(&best));
             if other.evidence > best.evidence {
                 let line =
-                    format!("  scope {}: {:.1} nat", other.causes[last].scope.name, other.evidence - best.evidence);
+                    format!("  scope {}: {:.1} nat", other.causes[last].scope.label(), other.evidence - best.evidence);
                 self.note(line);
                 best = other;
             }
@@ -182,7 +171,7 @@ impl Search<'_> {
                 break;
             }
             let cause = &best.causes[removed];
-            self.removed.push((cause.law, cause.scope.name.clone()));
+            self.removed.push((cause.law, cause.scope.label()));
             let line = format!("- {}: {:.1} nat", self.name(&best.causes[removed]), best.evidence - without.evidence);
             self.note(line);
             best = without;
