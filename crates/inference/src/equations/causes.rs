@@ -48,6 +48,20 @@ pub struct Cause {
 }
 
 impl Cause {
+    /// Returns the size at each site: the largest of its unknowns, each relative to a unit.
+    pub fn sizes(&self, units: &[f64]) -> Vec<f64> {
+        let largest =
+            |values: &Vec<f64>| values.iter().zip(units).map(|(value, unit)| (value / unit).abs()).fold(0.0, f64::max);
+        self.values.iter().map(largest).collect()
+    }
+
+    /// Returns the smallest size of a site, relative to the largest.
+    pub fn smallest_share(&self, units: &[f64]) -> f64 {
+        let sizes = self.sizes(units);
+        let [least, most] = [f64::min, f64::max].map(|which| sizes.iter().copied().reduce(which).unwrap_or(0.0));
+        least / most
+    }
+
     /// Returns the mean of each unknown over the sites.
     pub fn mean(&self) -> Vec<f64> {
         let sites = self.values.len() as f64;

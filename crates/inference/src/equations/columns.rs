@@ -19,7 +19,7 @@ impl Balance {
             match residual.checked_sub(2 * self.joints) {
                 None if residual % self.joints == joint => -change[index],
                 None => 0.0,
-                Some(axis) => sample.base_per_torque[joint][axis % 6] * change[index],
+                Some(axis) => sample.base_per_torque[joint][axis] * change[index],
             }
         })
     }

@@ -117,7 +117,7 @@ pub fn laws() -> Vec<Law> {
             vec![stiffness, c[1] / stiffness]
         }),
         law("encoder_offset", Place::Link, &[0.025], |c, _| vec![c[0]]),
-        law("payload", Place::Body, &[2.0, 0.2, 0.1, 0.1], |c, _| {
+        law("payload", Place::Body, &[2.0, 0.2, 0.2, 0.2], |c, _| {
             let mass = if c[0].abs() < 1e-6 { 1e-6 } else { c[0] };
             vec![mass, c[1] / mass, c[2] / mass, c[3] / mass]
         }),

@@ -50,8 +50,6 @@ const TORQUE_OFFSET: f64 = 0.02;
 const STICK: f64 = 0.1;
 /// Standard deviations of a link's mass, and of its inertia relative to the trace; that of its centre of mass [m].
 const BODY: [f64; 3] = [0.03, 0.04, 0.003];
-/// Standard deviation of the mass of the base, relative to it: it is the robot's that was weighed.
-const BASE_MASS: f64 = 0.015;
 
 /// Norm of what a small unknown changes in an equation, relative to the noise of a row, below which the equation does not show it.
 const LEAST_SEEN: f64 = 0.1;
@@ -183,10 +181,7 @@ fn bodies(system: &System, robot: &Robot) -> Vec<(Column, f64)> {
         let RigidBody { mass, com, inertia } = robot.tree.bodies[body].inertia;
         let trace = inertia.x_axis.x + inertia.y_axis.y + inertia.z_axis.z;
         let column = |added: RigidBody| system.balance.inertia_column(&robot.tree, robot, body, added);
-        let mut columns = vec![(
-            column(RigidBody { mass: 1.0, com, inertia: DMat3::ZERO }),
-            mass * if body == 0 { BASE_MASS } else { BODY[0] },
-        )];
+        let mut columns = vec![(column(RigidBody { mass: 1.0, com, inertia: DMat3::ZERO }), BODY[0] * mass)];
         for axis in [DVec3::X, DVec3::Y, DVec3::Z] {
             // Moving the centre of mass by d changes the first moment by m d, which a pair of opposite masses has.
             let one = column(RigidBody { mass, com: com + 1e-3 * axis, inertia: DMat3::ZERO });

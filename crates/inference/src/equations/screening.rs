@@ -14,6 +14,8 @@ use super::system::{Site, apply};
 
 /// Standard deviation of a strength around one that is tried, relative to it.
 const CELL: f64 = 0.3;
+/// Size at a site above which a cause is large there, relative to its largest.
+pub const LARGE: f64 = 0.3;
 /// Candidates that are fitted in full after each screening, and at most of one effect.
 const FITTED: [usize; 2] = [6, 3];
 
@@ -175,7 +177,9 @@ impl Search<'_> {
             let log_shapes = -(law.shapes.len() as f64).ln();
             let cause =
                 Cause { law: law_index, scope: scope.clone(), shape, values, log_prior: log_prior + log_shapes };
-            if law.allows(&cause.mean(), shape) {
+            // Joints of which some have nothing are another scope.
+            let is_scope = cause.scope.is_alike || cause.smallest_share(&law.units) > LARGE;
+            if is_scope && law.allows(&cause.mean(), shape) {
                 found.push((gain + log_prior + log_grid, cause));
             }
         }

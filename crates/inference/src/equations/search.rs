@@ -9,13 +9,12 @@ use super::gaussian::{Group, posterior};
 use super::law::Place;
 use super::problem::{EFFECT_PROBABILITY, Rivals, Search, power};
 use super::robot::Robot;
+use super::screening::LARGE;
 use super::system::{Predicted, Site};
 use super::{nuisance, unknown};
 
 /// Gain of the evidence above which a cause is added or kept [nat].
 pub const LEAST_GAIN: f64 = 3.0;
-/// Size at a site above which a cause is large there, relative to its largest.
-const LARGE: f64 = 0.3;
 /// Other scopes of a cause that are tried.
 const OTHER_SCOPES: usize = 3;
 /// Iterations of a fit that is compared with another one of the same causes.
@@ -116,13 +115,10 @@ impl Search<'_> {
         let last = best.causes.len() - 1;
         let cause = best.causes[last].clone();
         let law = &self.laws[cause.law];
-        let size = |values: &Vec<f64>| {
-            values.iter().zip(&law.units).map(|(value, unit)| (value / unit).abs()).fold(0.0, f64::max)
-        };
-        let largest = cause.values.iter().map(size).fold(0.0, f64::max);
-        let values = cause.scope.sites.iter().zip(&cause.values);
-        let large: Vec<Site> =
-            values.filter(|(_, values)| size(values) > LARGE * largest).map(|(site, _)| *site).collect();
+        let sizes = cause.sizes(&law.units);
+        let largest = sizes.iter().copied().fold(0.0, f64::max);
+        let sites = cause.scope.sites.iter().zip(&sizes);
+        let large: Vec<Site> = sites.filter(|(_, size)| **size > LARGE * largest).map(|(site, _)| *site).collect();
         let mut scopes: Vec<ScopeSites> = self
             .scopes_of(law)
             .filter(|scope| *scope != &cause.scope && large.iter().all(|site| scope.sites.contains(site)))
@@ -147,7 +143,8 @@ impl Search<'_> {
             let mut causes = best.causes.clone();
             causes[last] = Cause { scope, values, log_prior, ..cause.clone() };
             let other = self.fit(causes, small, CONVERGED, Some(&best));
-            if other.evidence > best.evidence {
+            let is_scope = other.causes[last].scope.is_alike || other.causes[last].smallest_share(&law.units) > LARGE;
+            if is_scope && other.evidence > best.evidence {
                 let line =
                     format!("  scope {}: {:.1} nat", other.causes[last].scope.label(), other.evidence - best.evidence);
                 self.note(line);
