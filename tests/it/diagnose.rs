@@ -32,6 +32,7 @@ fn diagnosis_of(recording: &Log, folder: &Path) -> Diagnosis {
     let page = std::fs::read_to_string(out.join("report.html")).unwrap();
     assert!(page.starts_with("<!doctype html>") && page.len() > 10_000);
     let extended = ModelFile::load(out.join(&diagnosis.extended_model)).unwrap();
+    // A cause whose values differ from joint to joint has an entry for each.
     assert!(extended.effects.len() >= diagnosis.findings.len() + diagnosis.joint_gains.len(), "{diagnosis:#?}");
     diagnosis
 }

@@ -231,6 +231,11 @@ impl Balance {
         self.samples.par_iter().enumerate().map(balanced).collect()
     }
 
+    /// Returns true if the log has samples of a robot that stands.
+    pub fn stands(&self) -> bool {
+        self.samples.iter().any(|sample| sample.regime == Regime::Stand)
+    }
+
     /// Writes the residuals of a robot, given what its motion needs and the torques of its motors in balance.
     ///
     /// `changed` is by how much the torques of the motors differ from those of the reference, if they were not measured, and `delayed` by

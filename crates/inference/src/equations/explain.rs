@@ -6,7 +6,7 @@ use twinstep_model::{Joint, RobotModel};
 
 use super::causes::{Cause, Found, ScopeSites, UnknownLaw};
 use super::law::{Law, laws};
-use super::measurements::Measurements;
+use super::measurements::{Measurements, Regime};
 use super::outcome::TWO_SIDED_95;
 use super::problem::Search;
 use super::robot::Robot;
@@ -82,7 +82,9 @@ pub fn explain(
     let robot = Robot::from(robot);
     let measured = Measurements::new(log, &robot, is_used)?;
     let system = System::new(measured, &robot);
-    if system.balance.samples.is_empty() {
+    let is_free = system.measured.regime.iter().any(|regime| *regime != Regime::Hang);
+    let hangs = system.measured.regime.contains(&Regime::Hang);
+    if is_free && !(hangs && system.balance.stands()) {
         return None;
     }
     let laws = laws();

@@ -11,7 +11,7 @@ use super::robot::Robot;
 use super::system::{Predicted, apply};
 
 /// Evidence of causes whose parameters are not possible [nat].
-const IMPOSSIBLE: f64 = -1e6;
+pub const IMPOSSIBLE: f64 = -1e6;
 
 /// A set of causes, fitted.
 pub struct Fitted {

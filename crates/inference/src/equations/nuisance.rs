@@ -32,7 +32,7 @@ const SMALL: [(&str, &[f64]); 15] = [
     ("joint_spring", &[0.05, 0.02]),
 ];
 /// The same for effects on the motion of a link.
-const SMALL_MOTION: [(&str, f64); 2] = [("encoder_offset", 0.0015), ("joint_elasticity", 2.5e-4)];
+const SMALL_MOTION: [(&str, f64); 3] = [("encoder_offset", 0.0015), ("joint_elasticity", 2.5e-4), ("backlash", 0.002)];
 /// Standard deviation of the friction at low speed [N·m], for two speeds [rad/s].
 const LOW_SPEED: [(f64, f64); 2] = [(0.04, 0.2), (0.03, 0.8)];
 /// Standard deviation of the time by which the positions of an encoder are ahead of its velocities [s]: drives filter the velocity, and

@@ -22,7 +22,7 @@ const CONVERGED: usize = 8;
 /// Most causes.
 const MOST_CAUSES: usize = 6;
 /// Error of the form of a law of the catalogue, as the size of each function that it lacks, relative to its own.
-const FORM_ERROR: f64 = 0.03;
+const FORM_ERROR: f64 = 0.01;
 /// Causes that were added and removed again, after which the search ends.
 const MOST_REMOVED: usize = 2;
 
@@ -222,7 +222,7 @@ impl Search<'_> {
             let evidence = best.evidence + imitated - named;
             let line = format!("  another law in place of {}: {:.1} nat", self.name(&cause), evidence - best.evidence);
             self.note(line);
-            if evidence > best.evidence + LEAST_GAIN {
+            if evidence > best.evidence {
                 best = without;
             } else {
                 place += 1;
