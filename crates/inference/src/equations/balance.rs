@@ -204,9 +204,12 @@ impl Balance {
     pub fn balanced_motors(&self, robot: &Robot, needed: &[Vec<f64>], drives: &[Vec<f64>]) -> Vec<Vec<f64>> {
         let balanced = |(index, sample): (usize, &Sample)| {
             let needed = &needed[index];
-            let link = |joint: usize| match sample.is_free[joint] {
-                true => needed[6 + joint],
-                false => sample.link_torque(robot, joint, drives[joint][index]),
+            let link = |joint: usize| {
+                if sample.is_free[joint] {
+                    needed[6 + joint]
+                } else {
+                    sample.link_torque(robot, joint, drives[joint][index])
+                }
             };
             let mut links: Vec<f64> = (0..self.joints).map(link).collect();
             if sample.regime != Regime::Hang {
