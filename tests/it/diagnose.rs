@@ -32,9 +32,20 @@ fn diagnosis_of(recording: &Log, folder: &Path) -> Diagnosis {
     let page = std::fs::read_to_string(out.join("report.html")).unwrap();
     assert!(page.starts_with("<!doctype html>") && page.len() > 10_000);
     let extended = ModelFile::load(out.join(&diagnosis.extended_model)).unwrap();
-    // A cause whose values differ from joint to joint has an entry for each.
-    assert!(extended.effects.len() >= diagnosis.findings.len() + diagnosis.joint_gains.len(), "{diagnosis:#?}");
+    let of_causes: usize = diagnosis.findings.iter().map(|cause| entries_of(cause, &extended)).sum();
+    assert_eq!(extended.effects.len(), of_causes + diagnosis.joint_gains.len());
     diagnosis
+}
+
+/// Returns how many entries a cause has in a model: one, or one for each joint whose values are not alike.
+fn entries_of(cause: &Cause, model: &ModelFile) -> usize {
+    let scope: Scope = cause.scope.parse().unwrap();
+    let is_own = |entry: &EffectEntry| entry.effect.name == cause.effect && entry.scope == scope;
+    if model.effects.iter().any(is_own) {
+        1
+    } else {
+        Joint::ALL.into_iter().filter(|joint| scope.contains(*joint)).count()
+    }
 }
 
 #[test]
@@ -252,6 +263,32 @@ fn velocity_gain_that_is_wrong_at_one_type_of_joints_is_named() {
     let (cause, _) = only_cause("pd_gain", Scope::Kind(JointKind::Thigh), &[1.0, 0.65], law);
     assert!((number(&cause, "kd_scale") - 0.65).abs() < 0.03, "{:?}", cause.parameters);
     assert!((number(&cause, "kp_scale") - 1.0).abs() < 0.02, "{:?}", cause.parameters);
+}
+
+#[test]
+fn friction_that_differs_three_times_between_the_calves_is_one_cause_with_a_value_of_each() {
+    let folder = tempfile::tempdir().unwrap();
+    let effect = Effect::named("coulomb_friction").unwrap();
+    let truth: Vec<EffectEntry> = Joint::ALL
+        .into_iter()
+        .filter(|joint| Scope::Kind(JointKind::Calf).contains(*joint))
+        .zip([0.4, 1.2, 0.8, 0.6])
+        .map(|(joint, torque)| EffectEntry::new(effect, Scope::Joint(joint), vec![torque]).unwrap())
+        .collect();
+    let robot = apply_effects(&go2(), &truth).unwrap();
+    let chirp = Chirp { rows: 1600, from_hz: 1.0, amplitude: 0.6, gains: [50.0, 1.0] };
+    let log = with_motor_torques(&chirp.log(&robot, None), |_, [p, d]| p + d);
+    let diagnosis = diagnosis_of(&log, folder.path());
+    let [cause] = diagnosis.findings.as_slice() else { panic!("{:#?}", diagnosis.findings) };
+    assert_eq!((cause.effect.as_str(), cause.scope.as_str()), ("coulomb_friction", "calf"));
+    assert!(cause.evidence.contains("Each joint has its own: FL_calf 0."), "{}", cause.evidence);
+    let extended = ModelFile::load(folder.path().join("diagnosis").join(&diagnosis.extended_model)).unwrap();
+    for hidden in &truth {
+        let found = extended.effects.iter().find(|entry| entry.scope == hidden.scope).unwrap();
+        assert!((found.values[0] / hidden.values[0] - 1.0).abs() < 0.1, "{found:?} {hidden:?}");
+        let [low, high] = found.intervals[0].unwrap();
+        assert!(low < hidden.values[0] && hidden.values[0] < high, "{found:?} {hidden:?}");
+    }
 }
 
 /// A delay of the torque in the loop would explain the same torques.

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use twinstep_effects::{Composition, Effect, EffectEntry, EntryError, ModelFile, Scope};
 use twinstep_identify::window::WindowConfig;
 use twinstep_inference::equations::{Explained, Explanation, OfJoint, UnknownLaw, explain};
-use twinstep_logs::{Log, TorqueSensor};
+use twinstep_logs::Log;
 use twinstep_model::Rollout;
 
 use super::cross_validation::{Accepted, CandidateFit};
@@ -33,10 +33,6 @@ pub fn diagnose_by_equations(
     simulator: &mut dyn Rollout,
     say: &mut dyn FnMut(&str) -> Result<(), DiagnoseError>,
 ) -> Result<Option<DiagnosisOutput>, DiagnoseError> {
-    // Without currents the equations name causes, too, but not yet as reliably as the search in simulations.
-    if log.meta().tau_sensor != TorqueSensor::MotorCurrent {
-        return Ok(None);
-    }
     let robot = model.robot_model()?;
     let split = DataSplit::new(log);
     let mut interrupted = Ok(());
@@ -106,14 +102,16 @@ fn unexplained_law(found: &Explained) -> Unexplained {
 fn extended(model: &ModelFile, causes: &[Explanation]) -> Result<ModelFile, DiagnoseError> {
     let mut extended = model.clone();
     for cause in causes {
-        if cause.effect.composition == Composition::Replace {
-            extended.effects.retain(|entry| entry.effect != cause.effect || entry.scope != cause.scope);
+        let each = cause.by_joint.iter().map(|own| (Scope::Joint(own.joint), &own.values, &own.intervals));
+        let mut added: Vec<_> = each.collect();
+        if added.is_empty() {
+            added.push((cause.scope, &cause.values, &cause.intervals));
         }
-        if cause.by_joint.is_empty() {
-            extended.effects.push(entry(cause.effect, cause.scope, &cause.values, &cause.intervals)?);
-        }
-        for own in &cause.by_joint {
-            extended.effects.push(entry(cause.effect, Scope::Joint(own.joint), &own.values, &own.intervals)?);
+        for (scope, values, intervals) in added {
+            if cause.effect.composition == Composition::Replace {
+                extended.effects.retain(|entry| entry.effect != cause.effect || entry.scope != scope);
+            }
+            extended.effects.push(entry(cause.effect, scope, values, intervals)?);
         }
     }
     Ok(extended)

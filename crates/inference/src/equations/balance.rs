@@ -4,8 +4,6 @@
 //! three joints of its limb give it, and the base must balance with the forces of all feet. Nothing is simulated, and contact needs no
 //! model.
 
-use std::ops::RangeInclusive;
-
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 use twinstep_dynamics::Vec3;
@@ -16,9 +14,6 @@ use super::drive::{link_torque, motor_torque};
 use super::measurements::{Measurements, Regime};
 use super::robot::Robot;
 use super::samples::{GRAVITY, Motion, Sample, samples, weights};
-
-/// Distance from the median, in median distances, from which a row of a robot on the ground is an impact.
-const OUTLIER: f64 = 10.0;
 
 /// Samples, and where their residuals are in the blocks.
 pub struct Balance {
@@ -41,8 +36,8 @@ pub struct Balance {
 }
 
 impl Balance {
-    /// Collects the samples, and adds their blocks. `torques` are those of the motors, by joint and row.
-    pub fn new(measured: &Measurements, robot: &Robot, torques: &[&[f64]], blocks: &mut Vec<Block>) -> Self {
+    /// Collects the samples, and adds their blocks.
+    pub fn new(measured: &Measurements, robot: &Robot, blocks: &mut Vec<Block>) -> Self {
         let samples = samples(measured, robot);
         let joints = robot.joints.len();
         let mut balance = Self {
@@ -59,7 +54,7 @@ impl Balance {
         };
         let needed = |sample: &Sample| balance.needed(&balance.bodies, robot, sample, &sample.instrument, [0.0; 3]);
         balance.needed = balance.samples.par_iter().map(needed).collect();
-        balance.first_lacking = balance.lacking(torques);
+        balance.first_lacking = balance.lacking(measured);
         balance.add_blocks(measured, robot, blocks);
         balance
     }
@@ -71,7 +66,7 @@ impl Balance {
             // Torque, and a link's inertia times the acceleration: differences of the weights.
             let padded: Vec<f64> = std::iter::once(0.0).chain(rows.iter().copied()).chain([0.0]).collect();
             let steps = padded.windows(2).map(|pair| (pair[1] - pair[0]).powi(2)).sum::<f64>().sqrt() / measured.dt;
-            let torque = measured.torque_noise() * rows.iter().map(|weight| weight * weight).sum::<f64>().sqrt();
+            let torque = measured.noise[2] * rows.iter().map(|weight| weight * weight).sum::<f64>().sqrt();
             let inertial = if regime == Regime::Hang { 0.03 } else { 0.05 };
             (torque * torque + (inertial * measured.noise[1] * steps).powi(2)).sqrt()
         };
@@ -88,11 +83,8 @@ impl Balance {
             series.push(Block { name: format!("base {axis} stand"), t: Vec::new(), y: Vec::new(), sigma });
         }
         let first = self.first_block;
-        let of_sample: Vec<Vec<usize>> = self.samples.iter().map(|sample| self.residuals_of(sample)).collect();
-        let common = self.common_ranges(&of_sample);
-        let kept: Vec<Vec<usize>> =
-            of_sample.into_iter().enumerate().map(|(index, own)| self.common(index, own, &common)).collect();
-        for (sample, residuals) in self.samples.iter().zip(kept) {
+        for sample in &self.samples {
+            let residuals = self.residuals_of(sample);
             let place = |residual: usize| (residual, first + residual, series[residual].t.len());
             let places: Vec<_> = residuals.iter().map(|residual| place(*residual)).collect();
             for residual in residuals {
@@ -117,52 +109,16 @@ impl Balance {
         }
     }
 
-    /// Returns the range of each residual in which all but a few rows are, for the reference.
-    fn common_ranges(&self, of_sample: &[Vec<usize>]) -> Vec<RangeInclusive<f64>> {
-        let mut values: Vec<Vec<f64>> = vec![Vec::new(); 2 * self.joints + 6];
-        for (index, residuals) in of_sample.iter().enumerate() {
-            for residual in residuals {
-                values[*residual].push(self.projected(&self.samples[index], &self.first_lacking[index], *residual));
-            }
-        }
-        let median = |values: &mut Vec<f64>| {
-            values.sort_by(f64::total_cmp);
-            values.get(values.len() / 2).copied().unwrap_or(0.0)
-        };
-        let range = |(residual, mut values): (usize, Vec<f64>)| {
-            if residual < self.joints {
-                return f64::NEG_INFINITY..=f64::INFINITY;
-            }
-            let middle = median(&mut values);
-            let mut distances = values.iter().map(|value| (value - middle).abs()).collect();
-            let far = OUTLIER * median(&mut distances);
-            middle - far..=middle + far
-        };
-        values.into_iter().enumerate().map(range).collect()
-    }
-
-    /// Returns the equations of a sample whose residuals are in the ranges that are common; those of the base all or none.
-    fn common(&self, index: usize, mut own: Vec<usize>, common: &[RangeInclusive<f64>]) -> Vec<usize> {
-        let is_common = |residual: &usize| {
-            common[*residual].contains(&self.projected(&self.samples[index], &self.first_lacking[index], *residual))
-        };
-        let of_base = |residual: &usize| *residual >= 2 * self.joints;
-        // A foot may have touched the ground for less than a row.
-        let has_impact = own.iter().any(|residual| of_base(residual) && !is_common(residual));
-        own.retain(|residual| is_common(residual) && !(of_base(residual) && has_impact));
-        own
-    }
-
-    /// Returns what is lacking for the robot of the columns, by sample: the torques of the motors minus what the motion needs.
-    fn lacking(&self, torques: &[&[f64]]) -> Vec<Vec<f64>> {
+    /// Returns what is lacking for the robot of the columns, by sample: the measured torques minus what the motion needs.
+    fn lacking(&self, measured: &Measurements) -> Vec<Vec<f64>> {
         let robot = &self.reference;
         let lacking = |sample: &Sample| {
             let mut lacking = self.needed(&self.bodies, robot, sample, &sample.response, [0.0; 3]);
             for force in &mut lacking {
                 *force = -*force;
             }
-            for (joint, torque) in torques.iter().enumerate() {
-                let motor = sample.mean(torque);
+            for (joint, rows) in measured.joints.iter().enumerate() {
+                let motor = sample.mean(&rows.torque);
                 lacking[6 + joint] += link_torque(&robot.joints[joint], motor, sample.response.of(joint));
             }
             lacking
@@ -212,7 +168,7 @@ impl Balance {
                 }
             };
             let mut links: Vec<f64> = (0..self.joints).map(link).collect();
-            if sample.regime != Regime::Hang {
+            if sample.regime == Regime::Stand {
                 let per = DMatrix::from_fn(6, self.joints, |axis, joint| sample.base_per_torque[joint][axis]);
                 let lacking: Vec<f64> = needed
                     .iter()
@@ -241,14 +197,13 @@ impl Balance {
 
     /// Writes the residuals of a robot, given what its motion needs and the torques of its motors in balance.
     ///
-    /// `changed` is by how much the torques of the motors differ from those of the reference, if they were not measured, and `delayed` by
-    /// how much because a sensor is late; by joint and sample.
+    /// `delayed` is by how much the torque of a motor differs because its sensor is late, by joint and sample.
     pub fn write_residuals(
         &self,
         robot: &Robot,
         needed: &[Vec<f64>],
         motors: &[Vec<f64>],
-        [changed, delayed]: [&[Vec<f64>]; 2],
+        delayed: &[Vec<f64>],
         blocks: &mut [Block],
     ) {
         for (index, sample) in self.samples.iter().enumerate() {
@@ -258,10 +213,9 @@ impl Balance {
             }
             for joint in 0..self.joints {
                 let motor = motors[index][joint];
-                let of = |changes: &[Vec<f64>]| changes[joint].get(index).copied().unwrap_or(0.0);
-                all[6 + joint] += sample.link_torque(robot, joint, motor)
-                    - sample.link_torque(&self.reference, joint, motor - of(changed))
-                    + of(delayed);
+                let late = delayed[joint].get(index).copied().unwrap_or(0.0);
+                all[6 + joint] +=
+                    sample.link_torque(robot, joint, motor) - sample.link_torque(&self.reference, joint, motor) + late;
             }
             for (residual, block, row) in &self.places[index] {
                 blocks[*block].y[*row] = self.projected(sample, &all, *residual);

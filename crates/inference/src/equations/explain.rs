@@ -70,7 +70,7 @@ pub struct Explained {
 
 /// Finds what `robot` lacks, from the rows of `log` that are used.
 ///
-/// Returns `None` if the log has torques of the outputs, no velocities or unknown gains at a joint, or not all joints of the robot, and if the
+/// Returns `None` if the log has no motor currents, no velocities or unknown gains at a joint, or not all joints of the robot, and if the
 /// base moves but the log has no rows in which it is fixed, or stands on all feet with its orientation, angular velocity and acceleration. `go_on`
 /// gets a line of progress; the search ends with `None` if it returns false.
 pub fn explain(

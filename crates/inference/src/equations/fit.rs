@@ -10,12 +10,11 @@ use super::problem::Search;
 use super::robot::Robot;
 use super::system::{Predicted, apply};
 
-/// Evidence of causes whose parameters are not possible [nat].
-pub const IMPOSSIBLE: f64 = -1e6;
-
 /// A set of causes, fitted.
 pub struct Fitted {
     pub causes: Vec<Cause>,
+    /// True if all parameters are within their bounds.
+    pub is_possible: bool,
     pub evidence: f64,
     pub posterior: Posterior,
     pub robot: Robot,
@@ -72,9 +71,9 @@ impl Search<'_> {
             let log_prior: f64 = causes.iter().map(|cause| cause.log_prior).sum();
             if iteration >= iterations.max(1) || largest < 0.02 {
                 let is_allowed = |cause: &Cause| self.laws[cause.law].allows(&cause.mean(), cause.shape);
-                let impossible = if moved.iter().all(is_allowed) { 0.0 } else { IMPOSSIBLE };
-                let evidence = posterior.evidence + log_prior + log_allowed + impossible;
-                return Fitted { causes: moved, evidence, posterior, robot, predicted, blocks, groups };
+                let is_possible = moved.iter().all(is_allowed);
+                let evidence = posterior.evidence + log_prior + log_allowed;
+                return Fitted { causes: moved, is_possible, evidence, posterior, robot, predicted, blocks, groups };
             }
             causes = moved;
         }

@@ -37,7 +37,7 @@ pub struct JointRows {
     pub dq: Vec<f64>,
     /// Position [rad] and velocity [rad/s] with less noise: parabolas through the rows around each.
     pub smooth: [Vec<f64>; 2],
-    /// Measured torque, mean from the row to the next; zero if it was not measured. Not a number in rows that are not used [N·m].
+    /// Measured torque, mean from the row to the next. Not a number in rows that are not used [N·m].
     pub torque: Vec<f64>,
     /// Commanded position [rad], velocity [rad/s] and torque [N·m].
     pub command: [Vec<f64>; 3],
@@ -79,26 +79,23 @@ pub struct Measurements {
     pub contact: Vec<Vec<bool>>,
     /// Supply voltage divided by the highest of the log; empty if it was not measured.
     pub voltage_share: Vec<f64>,
-    /// True if the currents of the motors were measured.
-    pub has_torque: bool,
     /// Standard deviation of the noise of position [rad], velocity [rad/s] and torque [N·m].
     pub noise: [f64; 3],
 }
 
 impl Measurements {
-    /// Collects the channels of `log`, and the torques of the rows that are used. Returns `None` if its torques are those at the output, velocities or gains
-    /// of a joint are not known, or the joints are not those of the robot.
+    /// Collects the channels of `log`, and the torques of the rows that are used.
+    ///
+    /// Returns `None` if it has no motor currents, velocities or gains of a joint, or the joints are not those of the robot.
     pub fn new(log: &Log, robot: &Robot, is_used: impl Fn(usize) -> bool) -> Option<Self> {
-        let has_torque = match log.meta().tau_sensor {
-            TorqueSensor::MotorCurrent => true,
-            TorqueSensor::None => false,
-            TorqueSensor::JointOutput => return None,
-        };
+        if log.meta().tau_sensor != TorqueSensor::MotorCurrent {
+            return None;
+        }
         let plain = |name: &str| name.to_lowercase().trim_end_matches("_joint").to_owned();
         let mut joints = Vec::new();
         for name in log.joints() {
             let joint = robot.tree.joints.iter().position(|joint| plain(&joint.name) == plain(name))?;
-            joints.push(joint_rows(log, name, joint, has_torque)?);
+            joints.push(joint_rows(log, name, joint)?);
         }
         joints.sort_by_key(|rows: &JointRows| rows.joint);
         for rows in &mut joints {
@@ -146,24 +143,12 @@ impl Measurements {
             ranges,
             regime,
             joints,
-            has_torque,
             noise,
         })
     }
 }
 
-impl Measurements {
-    /// Returns the standard deviation of the noise of a motor's torque: that of its sensor, or of the readings that make it [N·m].
-    pub fn torque_noise(&self) -> f64 {
-        if self.has_torque {
-            return self.noise[2];
-        }
-        let of = |rows: &JointRows| (rows.gains[0][0] * self.noise[0]).hypot(rows.gains[1][0] * self.noise[1]);
-        self.joints.iter().map(of).sum::<f64>() / self.joints.len() as f64
-    }
-}
-
-fn joint_rows(log: &Log, name: &str, joint: usize, has_torque: bool) -> Option<JointRows> {
+fn joint_rows(log: &Log, name: &str, joint: usize) -> Option<JointRows> {
     let or_zero = |cells: Option<&[f64]>| cells.map_or(vec![0.0; log.rows()], <[f64]>::to_vec);
     let [kp, kd] = log.gains(name);
     Some(JointRows {
@@ -171,7 +156,7 @@ fn joint_rows(log: &Log, name: &str, joint: usize, has_torque: bool) -> Option<J
         smooth: [Vec::new(), Vec::new()],
         q: log.q(name)?.to_vec(),
         dq: log.dq(name)?.to_vec(),
-        torque: if has_torque { log.tau_measured(name)?.to_vec() } else { vec![0.0; log.rows()] },
+        torque: log.tau_measured(name)?.to_vec(),
         command: [log.q_cmd(name)?.to_vec(), or_zero(log.dq_cmd(name)), or_zero(log.tau_ff(name))],
         gains: [kp?, kd?],
         temperature: log.channel(&format!("temp_{name}")).map_or(Vec::new(), <[f64]>::to_vec),

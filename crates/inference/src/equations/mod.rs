@@ -1,4 +1,4 @@
-//! Diagnosis by one likelihood, from logs with velocities, and best with motor currents: which effects of the catalogue a robot has that its model lacks.
+//! Diagnosis by one likelihood, from logs with motor currents: which effects of the catalogue a robot has that its model lacks.
 //!
 //! - [`explain`]: what explains a log, in the terms of the catalogue.
 //! - [`measurements`]: the channels of a log; [`robot`]: what effects change.

@@ -6,7 +6,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::block::Column;
 use super::causes::{Found, FoundCause, UnknownLaw};
-use super::fit::{Fitted, IMPOSSIBLE};
+use super::fit::Fitted;
 use super::gaussian::{Group, Scores, gain};
 use super::law::Place;
 use super::problem::{Rivals, Search, power};
@@ -69,8 +69,6 @@ impl Search<'_> {
             };
             let explained = 1.0 - (sum(&best) / sum(&without)).sqrt();
             let gain = best.evidence - without.evidence;
-            // Without it, another cause may only explain the log with parameters that are not possible.
-            let gain = if gain > -0.5 * IMPOSSIBLE { gain + IMPOSSIBLE } else { gain };
             causes.push(FoundCause { cause: cause.clone(), gain, stds, site_stds, explained, rivals });
         }
         // Places in the fit of the causes that are large, the strongest first.
@@ -118,9 +116,6 @@ impl Search<'_> {
         let mut found = Vec::new();
         for joint in 0..self.base.joints.len() {
             for place in [Place::Drive, Place::Joint] {
-                if place == Place::Drive && !self.system.measured.has_torque {
-                    continue;
-                }
                 let (variables, columns): (Vec<_>, Vec<Column>) =
                     unknown::columns(self.system, &best.predicted, joint, place).into_iter().unzip();
                 let size = columns.len();

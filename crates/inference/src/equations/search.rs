@@ -63,7 +63,7 @@ impl Search<'_> {
                 );
                 self.note(line);
             }
-            let mut fits: Vec<Fitted> = fits.into_iter().map(|(_, fit)| fit).collect();
+            let mut fits: Vec<Fitted> = fits.into_iter().map(|(_, fit)| fit).filter(|fit| fit.is_possible).collect();
             fits.sort_by(|one, other| other.evidence.total_cmp(&one.evidence));
             let mut fits = fits.into_iter();
             let Some(next) = fits.next() else { break };
@@ -88,6 +88,9 @@ impl Search<'_> {
             small = small_of(&self, &best.robot, &best.predicted);
             best = self.fit(best.causes.clone(), &small, CONVERGED, Some(&best));
             best = self.with_best_scope(best, &small);
+            if !best.is_possible {
+                best = self.without_last(best, &small);
+            }
             best = self.without_surplus(best, &small);
         }
         if !go_on(&self.progress(&best)) {
@@ -144,7 +147,7 @@ impl Search<'_> {
             causes[last] = Cause { scope, values, log_prior, ..cause.clone() };
             let other = self.fit(causes, small, CONVERGED, Some(&best));
             let is_scope = other.causes[last].scope.is_alike || other.causes[last].smallest_share(&law.units) > LARGE;
-            if is_scope && other.evidence > best.evidence {
+            if is_scope && other.is_possible && other.evidence > best.evidence {
                 let line =
                     format!("  scope {}: {:.1} nat", other.causes[last].scope.label(), other.evidence - best.evidence);
                 self.note(line);
@@ -152,6 +155,15 @@ impl Search<'_> {
             }
         }
         best
+    }
+
+    /// Removes the cause that was added last, because its best parameters are not possible.
+    fn without_last(&mut self, best: Fitted, small: &[Group]) -> Fitted {
+        let mut causes = best.causes.clone();
+        let Some(cause) = causes.pop() else { return best };
+        self.note(format!("- {}: its parameters are not possible", self.name(&cause)));
+        self.removed.push((cause.law, cause.scope.label()));
+        self.fit(causes, small, 2, Some(&best))
     }
 
     /// Removes causes that no longer have evidence beside the others.

@@ -50,8 +50,6 @@ pub struct System {
     /// Torques of other robots are computed on smooth readings, unless the controller had those of the log. With noise that is not in the
     /// torques, a lag of the drive would reduce it.
     first_residual: Vec<Vec<f64>>,
-    /// Torques of the motors of the reference, by joint and sample [N·m].
-    first_motor: Vec<Vec<f64>>,
     /// The robot whose residuals are from measured torques.
     reference: Robot,
 }
@@ -91,13 +89,7 @@ impl System {
         let mut blocks = Vec::new();
         let drive_rows = drive_blocks(&measured, robot, &mut blocks);
         let gyro_rows = gyro_blocks(&measured, &mut blocks);
-        let drives: Vec<Vec<f64>> =
-            measured.joints.par_iter().map(|rows| sensed_torque(&measured, rows, [&rows.q, &rows.dq], robot)).collect();
-        let torques = measured.joints.iter().zip(&drives);
-        let torques: Vec<&[f64]> = torques
-            .map(|(rows, drive)| if measured.has_torque { rows.torque.as_slice() } else { drive.as_slice() })
-            .collect();
-        let balance = Balance::new(&measured, robot, &torques, &mut blocks);
+        let balance = Balance::new(&measured, robot, &mut blocks);
         let lacking = |smooth: bool| -> Vec<Vec<f64>> {
             let of = |rows: &JointRows| {
                 let readings = if smooth { [&rows.smooth[0], &rows.smooth[1]] } else { [&rows.q, &rows.dq] };
@@ -124,19 +116,7 @@ impl System {
             .zip(&of_smooth)
             .map(|(lacking, sensed)| lacking.iter().zip(sensed).map(|(lacking, sensed)| lacking + sensed).collect());
         let first_residual = first_residual.collect();
-        let reference = robot.clone();
-        let mut system = Self {
-            measured,
-            balance,
-            blocks,
-            drive_rows,
-            gyro_rows,
-            first_residual,
-            first_motor: Vec::new(),
-            reference,
-        };
-        system.first_motor = system.predicted(robot).motor;
-        system
+        Self { measured, balance, blocks, drive_rows, gyro_rows, first_residual, reference: robot.clone() }
     }
 
     /// Returns the torques of the drives of a robot.
@@ -199,15 +179,7 @@ impl System {
             predicted.motor[joint].iter().zip(on_time).map(|(now, before)| now - before).collect()
         };
         let late: Vec<Vec<f64>> = (0..robot.joints.len()).map(late).collect();
-        let changed = |joint: usize| -> Vec<f64> {
-            if self.measured.has_torque {
-                return Vec::new();
-            }
-            let [now, before] = [&predicted.motor[joint], &self.first_motor[joint]];
-            now.iter().zip(before).map(|(now, before)| now - before).collect()
-        };
-        let changed: Vec<Vec<f64>> = (0..robot.joints.len()).map(changed).collect();
-        self.balance.write_residuals(robot, &predicted.needed, &predicted.balanced, [&changed, &late], &mut blocks);
+        self.balance.write_residuals(robot, &predicted.needed, &predicted.balanced, &late, &mut blocks);
         blocks
     }
 
@@ -215,15 +187,14 @@ impl System {
     pub fn column(&self, law: &Law, site: Site, before: (&Robot, &Predicted), after: &Robot) -> Column {
         let (robot, predicted) = before;
         match (law.place, site) {
-            (Place::Drive | Place::Supply, Site::Joint(joint)) => self.drive_column(joint, before, after),
+            (Place::Drive | Place::Supply, Site::Joint(joint)) => self.drive_column(joint, predicted, after),
             (Place::Supply, Site::Base) => {
-                let columns = (0..robot.joints.len()).map(|joint| self.drive_column(joint, before, after));
+                let columns = (0..robot.joints.len()).map(|joint| self.drive_column(joint, predicted, after));
                 Column { parts: columns.flat_map(|column| column.parts).collect() }
             }
             (Place::Joint, Site::Joint(joint)) => self.joint_column(joint, robot, after, predicted),
-            (Place::Sensor, _) if !self.measured.has_torque => Column::default(),
             (Place::Sensor, Site::Joint(joint)) => {
-                let mut column = self.drive_column(joint, before, after);
+                let mut column = self.drive_column(joint, predicted, after);
                 let moved = self.motor(after, joint, &predicted.sensed[joint]);
                 let change = |(index, motor): (usize, &f64)| {
                     let sample = &self.balance.samples[index];
@@ -253,34 +224,13 @@ impl System {
         Column { parts }
     }
 
-    fn drive_column(&self, joint: usize, (before, predicted): (&Robot, &Predicted), after: &Robot) -> Column {
+    fn drive_column(&self, joint: usize, predicted: &Predicted, after: &Robot) -> Column {
         let sensed = self.sensed(&self.measured.joints[joint], after);
-        if !self.measured.has_torque {
-            return self.unmeasured_column(joint, (before, predicted), &self.motor(after, joint, &sensed));
-        }
         let part = |(block, rows): &(usize, Vec<usize>)| {
             let change = |row: &usize| sensed[*row] - predicted.sensed[joint][*row];
             (*block, rows.iter().map(change).collect())
         };
         Column { parts: self.drive_rows[joint].iter().map(part).collect() }
-    }
-
-    /// Returns the column of other torques of a motor whose current was not measured, by sample.
-    ///
-    /// What the model lacks is in the torque of a drive on measured states. As far as the change scales that torque, its column has the
-    /// torque that is in balance, so that a robot with smaller gains and masses does not lack less.
-    fn unmeasured_column(&self, joint: usize, (before, predicted): (&Robot, &Predicted), after: &[f64]) -> Column {
-        let drive = &predicted.motor[joint];
-        let change: Vec<f64> = after.iter().zip(drive).map(|(after, drive)| after - drive).collect();
-        let product = |one: &[f64], other: &[f64]| one.iter().zip(other).map(|(one, other)| one * other).sum::<f64>();
-        let share = product(&change, drive) / product(drive, drive).max(1e-12);
-        let samples = self.balance.samples.iter().zip(&predicted.balanced).zip(drive.iter().zip(&change));
-        let on_link = samples.map(|((sample, balanced), (drive, change))| {
-            let balanced = balanced[joint];
-            let change = change - share * (drive - balanced);
-            sample.link_torque(before, joint, balanced + change) - sample.link_torque(before, joint, balanced)
-        });
-        self.balance.joint_column(joint, &on_link.collect::<Vec<f64>>())
     }
 
     fn joint_column(&self, joint: usize, before: &Robot, after: &Robot, predicted: &Predicted) -> Column {
@@ -344,10 +294,6 @@ fn drive_blocks(measured: &Measurements, robot: &Robot, blocks: &mut Vec<Block>)
     let skipped = rows_of(HISTORY_S, measured);
     let mut all = Vec::new();
     for rows in &measured.joints {
-        if !measured.has_torque {
-            all.push(Vec::new());
-            continue;
-        }
         let sensed = sensed_torque(measured, rows, [&rows.q, &rows.dq], robot);
         let mut parts = Vec::new();
         for regime in [Regime::Hang, Regime::Stand, Regime::Move] {

@@ -1,4 +1,4 @@
-//! Properties of the equations on a hanging and swaying robot, whose signals are sines.
+//! Properties of the equations on a robot that hangs, sways and trots, whose signals are sines.
 
 use std::collections::BTreeMap;
 
@@ -11,18 +11,23 @@ use super::measurements::Measurements;
 use super::robot::Robot;
 use super::system::{Site, System, apply};
 
-const ROWS: usize = 800;
+const ROWS: usize = 1200;
+const LEGS: [&str; 4] = ["FL", "FR", "RL", "RR"];
 
-/// Returns a log of 4 s: half of it hanging, half standing.
+/// Returns a log of 6 s: 2 s each of hanging, standing, and moving with two feet in the air.
 fn log() -> Log {
     let mut columns = BTreeMap::<String, Vec<f64>>::new();
     let mut push = |name: String, value: f64| columns.entry(name).or_default().push(value);
     for row in 0..ROWS {
-        let (t, stands) = (0.005 * row as f64, row >= ROWS / 2);
+        let (t, part) = (0.005 * row as f64, 3 * row / ROWS);
         push("t".to_owned(), t);
-        push("segment".to_owned(), if stands { 1.0 } else { 0.0 });
+        push("segment".to_owned(), part as f64);
         push("battery_V".to_owned(), 30.0 - t);
-        let amplitude = if stands { 0.03 } else { 0.3 };
+        let amplitude = if part == 1 { 0.03 } else { 0.3 };
+        for leg in LEGS {
+            let is_in_air = part == 2 && ["FR", "RL"].contains(&leg);
+            push(format!("contact_{leg}"), if is_in_air { 0.0 } else { 1.0 });
+        }
         for (joint, name) in JOINT_NAMES.iter().enumerate() {
             let rate = 6.0 + joint as f64;
             let pose = go2().control.default_pose[joint];
@@ -42,7 +47,8 @@ fn log() -> Log {
         }
     }
     let segment = |name: &str, base| Segment { name: name.to_owned(), base };
-    let segments = vec![segment("air", BaseMount::Fixed), segment("ground", BaseMount::Floating)];
+    let on_ground = ["sway", "trot"].map(|name| segment(name, BaseMount::Floating));
+    let segments = [vec![segment("air", BaseMount::Fixed)], on_ground.to_vec()].concat();
     let mut meta = Meta::new(200.0, TorqueSensor::MotorCurrent, segments);
     (meta.kp, meta.kd) = (Some(Gain::Uniform(30.0)), Some(Gain::Uniform(0.8)));
     Log::new(meta, columns).expect("a log")
@@ -74,6 +80,26 @@ fn difference(before: &[Block], after: &[Block], column: &Column) -> [f64; 2] {
 
 fn site_of(law: &Law) -> Site {
     if matches!(law.place, Place::Body | Place::Gyro | Place::Supply) { Site::Base } else { Site::Joint(4) }
+}
+
+#[test]
+fn joints_of_legs_in_the_air_have_equations_while_the_base_moves_and_those_of_standing_legs_have_none() {
+    let (system, _) = system();
+    let rows = |leg: &str| {
+        let name = format!("joint {leg}_thigh swing");
+        system.blocks.iter().find(|block| block.name == name).map_or(0, |block| block.y.len())
+    };
+    assert!(rows("FR") > 20 && rows("RL") > 20);
+    assert_eq!([rows("FL"), rows("RR")], [0, 0]);
+}
+
+#[test]
+fn gain_below_its_bound_is_not_allowed() {
+    let all = laws();
+    let both =
+        all.iter().find(|law| law.effect.name == "pd_gain" && law.units.len() == 2).expect("a law of both gains");
+    assert!(both.allows(&[-0.5, 0.0], 0.0));
+    assert!(!both.allows(&[-1.5, 0.0], 0.0));
 }
 
 #[test]

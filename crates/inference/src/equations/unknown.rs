@@ -69,8 +69,7 @@ pub fn columns(system: &System, predicted: &Predicted, joint: usize, place: Plac
         let error = rows.command[0][middle] - q;
         [q, dq, error, predicted.balanced(index)[joint], temperature(middle), system.measured.t[middle]]
     };
-    // What a drive does without a measured current shows on the link only.
-    let drive = place == Place::Drive && system.measured.has_torque;
+    let drive = place == Place::Drive;
     let parts = system.drive_rows(joint);
     let raw: Vec<[f64; 6]> = if drive {
         parts.iter().flat_map(|(_, rows)| rows).map(|row| of_row(*row)).collect()
@@ -89,14 +88,7 @@ pub fn columns(system: &System, predicted: &Predicted, joint: usize, place: Plac
         let parts = parts.iter().map(|(block, rows)| (*block, next.by_ref().take(rows.len()).collect())).collect();
         (function.variable, Column { parts })
     };
-    // Of a joint in balance, what the drive has and what the link needs would together be all that the model lacks.
-    let is_other_side = |function: &&Function| function.variable == "tau_measured" && !system.measured.has_torque;
-    FUNCTIONS
-        .iter()
-        .filter(|function| !is_other_side(function))
-        .map(column)
-        .filter(|(_, column)| !column.is_zero())
-        .collect()
+    FUNCTIONS.iter().map(column).filter(|(_, column)| !column.is_zero()).collect()
 }
 
 /// Returns the measurements relative to their means (that of the velocity is zero) and standard deviations.
