@@ -110,6 +110,8 @@ def build(robot: Robot, xml: str, *, fixed: bool, late: bool = False) -> mujoco.
         spec.delete(spec.joint("base"))
         trunk.pos = [0.0, 0.0, 1.0]
         trunk.quat = small_turn(n["tilt"])
+    # Errors of the second moments may leave the triangle inequality.
+    spec.compiler.balanceinertia = True
     spec.option.timestep = PHYSICS_DT / (GEAR_SUBSTEPS if bool(np.any(geared)) else 1)
     model = spec.compile()
     model.dof_solref[:] = [0.002, 1.0]
