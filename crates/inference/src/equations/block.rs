@@ -26,6 +26,16 @@ impl Column {
         self.parts.iter().all(|(_, rows)| rows.iter().all(|row| *row == 0.0))
     }
 
+    /// Adds another column.
+    pub fn add(&mut self, other: &Self) {
+        for (block, rows) in &other.parts {
+            match self.parts.iter_mut().find(|(own, _)| own == block) {
+                Some((_, own)) => own.iter_mut().zip(rows).for_each(|(own, row)| *own += row),
+                None => self.parts.push((*block, rows.clone())),
+            }
+        }
+    }
+
     /// Returns the column times a number.
     #[must_use]
     pub fn scaled(&self, factor: f64) -> Self {

@@ -7,25 +7,32 @@ use super::block::{Block, Column};
 use super::causes::Cause;
 use super::gaussian::{Group, Posterior, posterior};
 use super::problem::Search;
+use super::residuals::Residuals;
 use super::robot::Robot;
-use super::system::{Predicted, apply};
+use super::site::apply;
 
 /// A set of causes, fitted.
-pub struct Fitted {
+pub struct Fitted<P> {
     pub causes: Vec<Cause>,
     /// True if all parameters are within their bounds.
     pub is_possible: bool,
     pub evidence: f64,
     pub posterior: Posterior,
     pub robot: Robot,
-    pub predicted: Predicted,
+    pub predicted: P,
     pub blocks: Vec<Block>,
     pub groups: Vec<Group>,
 }
 
-impl Search<'_> {
+impl<S: Residuals> Search<'_, S> {
     /// Fits the values of causes: their columns are computed again at each estimate.
-    pub fn fit(&self, mut causes: Vec<Cause>, small: &[Group], iterations: usize, earlier: Option<&Fitted>) -> Fitted {
+    pub fn fit(
+        &self,
+        mut causes: Vec<Cause>,
+        small: &[Group],
+        iterations: usize,
+        earlier: Option<&Fitted<S::Predicted>>,
+    ) -> Fitted<S::Predicted> {
         let mut iteration = 0;
         loop {
             let mut robot = self.base.clone();
@@ -79,14 +86,14 @@ impl Search<'_> {
         }
     }
 
-    fn apply(&self, robot: &mut Robot, cause: &Cause) {
+    pub fn apply(&self, robot: &mut Robot, cause: &Cause) {
         for (site, values) in cause.scope.sites.iter().zip(&cause.values) {
             apply(robot, &self.laws[cause.law], *site, values, cause.shape);
         }
     }
 
     /// Returns the unknowns of a cause: how its values differ from those of the robot.
-    fn group(&self, causes: &[Cause], index: usize, cause: &Cause, robot: &Robot, predicted: &Predicted) -> Group {
+    fn group(&self, causes: &[Cause], index: usize, cause: &Cause, robot: &Robot, predicted: &S::Predicted) -> Group {
         let law = &self.laws[cause.law];
         let (sites, size) = (cause.scope.sites.len(), law.units.len());
         let steps: Vec<(usize, usize)> =
@@ -113,7 +120,7 @@ impl Search<'_> {
             }
             law.units[unknown] * law.units[unknown] * cause.scope.covariance(site == other_site)
         });
-        Group { columns, mean, covariance, gain: None }
+        Group { columns, mean, covariance, small: None }
     }
 }
 

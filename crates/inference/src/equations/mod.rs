@@ -16,18 +16,26 @@ mod drive;
 mod explain;
 mod fit;
 mod gaussian;
+mod hanging;
+mod imitations;
 mod law;
 mod measurements;
+mod motion_residuals;
+#[cfg(test)]
+mod motion_tests;
 mod nuisance;
 mod outcome;
 mod problem;
+mod residuals;
+mod response;
 mod robot;
 mod samples;
 mod screening;
 mod search;
-mod system;
+mod site;
 #[cfg(test)]
 mod tests;
+mod torque_residuals;
 mod unknown;
 
 pub use causes::UnknownLaw;

@@ -10,7 +10,8 @@ use super::fit::Fitted;
 use super::gaussian::{Group, Scores, gain};
 use super::law::Law;
 use super::problem::{EFFECT_PROBABILITY, Search};
-use super::system::{Site, apply};
+use super::residuals::Residuals;
+use super::site::{Site, apply};
 
 /// Standard deviation of a strength around one that is tried, relative to it.
 const CELL: f64 = 0.3;
@@ -29,9 +30,9 @@ struct Candidate {
     column: Column,
 }
 
-impl Search<'_> {
+impl<S: Residuals> Search<'_, S> {
     /// Returns the best candidates for a further cause, with their gains at the noise of the current fit.
-    pub fn screen(&self, best: &Fitted, small: &[Group]) -> Vec<(f64, Cause)> {
+    pub fn screen(&self, best: &Fitted<S::Predicted>, small: &[Group]) -> Vec<(f64, Cause)> {
         let candidates = self.candidates(best);
         let columns: Vec<&Column> = candidates.iter().map(|candidate| &candidate.column).collect();
         let groups: Vec<&Group> = small.iter().chain(&best.groups).collect();
@@ -72,7 +73,7 @@ impl Search<'_> {
         self.laws[law].strengths.len().max(self.laws[law].shapes.len())
     }
 
-    fn candidates(&self, best: &Fitted) -> Vec<Candidate> {
+    fn candidates(&self, best: &Fitted<S::Predicted>) -> Vec<Candidate> {
         let mut all: Vec<(usize, usize, Site, usize)> = Vec::new();
         for (index, law) in self.laws.iter().enumerate() {
             let mut sites: Vec<Site> = self.scopes_of(law).flat_map(|scope| scope.sites.iter().copied()).collect();
@@ -117,7 +118,7 @@ impl Search<'_> {
         own: &[usize],
         candidates: &[Candidate],
         scores: &Scores,
-        best: &Fitted,
+        best: &Fitted<S::Predicted>,
     ) -> Vec<(f64, Cause)> {
         let law = &self.laws[law_index];
         let products = DMatrix::from_fn(own.len(), own.len(), |row, column| {
@@ -160,7 +161,7 @@ impl Search<'_> {
             let mut log_grid = -variants.ln();
             if law.is_positive {
                 // The half of the prior that is allowed has twice the density.
-                let deviation = posterior.mean() / (spread[(0, 0)].sqrt() + 1e-12);
+                let deviation = posterior.sum() / (spread.sum().sqrt() + 1e-12);
                 log_prior += std::f64::consts::LN_2;
                 log_grid += if deviation < 0.0 { -0.5 * deviation * deviation } else { 0.0 };
             }

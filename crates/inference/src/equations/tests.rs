@@ -8,8 +8,10 @@ use twinstep_model::{BaseMount, JOINT_NAMES, go2};
 use super::block::{Block, Column};
 use super::law::{Law, Place, laws};
 use super::measurements::Measurements;
+use super::residuals::Residuals;
 use super::robot::Robot;
-use super::system::{Site, System, apply};
+use super::site::{Site, apply};
+use super::torque_residuals::TorqueResiduals;
 
 const ROWS: usize = 1200;
 const LEGS: [&str; 4] = ["FL", "FR", "RL", "RR"];
@@ -54,13 +56,13 @@ fn log() -> Log {
     Log::new(meta, columns).expect("a log")
 }
 
-fn system() -> (System, Robot) {
+fn system() -> (TorqueResiduals, Robot) {
     let robot = Robot::from(&go2());
     let measured = Measurements::new(&log(), &robot, |_| true).expect("motor currents");
-    (System::new(measured, &robot), robot)
+    (TorqueResiduals::new(measured, &robot), robot)
 }
 
-fn residuals(system: &System, robot: &Robot) -> Vec<Block> {
+fn residuals(system: &TorqueResiduals, robot: &Robot) -> Vec<Block> {
     system.residuals(robot, &system.predicted(robot))
 }
 
