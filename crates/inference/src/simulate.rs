@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use rayon::prelude::*;
 use twinstep_model::{BaseMount, TreeModel};
-use twinstep_sim::{Placement, SimConfig, SimdPrecision, TreeCommand, TreeReadings, TreeSimulation};
+use twinstep_sim::{SimConfig, SimdPrecision, TreeCommand, TreeSimulation};
 
 use crate::{Candidate, InferenceError, JointLog, Window};
 
@@ -37,68 +37,10 @@ pub fn simulate(
         .flat_map(|candidate| windows.iter().zip(&clocks).map(move |(window, clock)| (candidate, window, clock)))
         .map(|(index, window, clock)| Job { log, robot: &robots[index], candidate: &candidates[index], window, clock })
         .collect();
-    let traces = |jobs: &[Job]| {
-        let mut traces: Vec<_> = jobs.iter().map(Job::trace).collect();
-        let mut record = |job: usize, period: usize, readings: &TreeReadings| {
-            jobs[job].record(period, &readings.state.q, &readings.tau, &mut traces[job]);
-        };
-        run(jobs, actuator_hz, stop, &mut record)?;
-        Ok::<_, InferenceError>(traces)
-    };
-    let groups: Vec<_> = jobs.par_chunks(TOGETHER).map(traces).collect::<Result<_, _>>()?;
+    let groups: Vec<_> =
+        jobs.par_chunks(TOGETHER).map(|jobs| run(jobs, actuator_hz, stop)).collect::<Result<_, _>>()?;
     let mut traces = groups.into_iter().flatten();
     Ok(candidates.iter().map(|_| traces.by_ref().take(windows.len()).collect()).collect())
-}
-
-/// Motion of a window on a regular grid, which begins at its first row.
-#[derive(Clone, Debug)]
-pub struct GridMotion {
-    /// Row of the window whose interval contains each point.
-    pub row: Vec<usize>,
-    /// Encoder readings by joint of the robot and point [rad].
-    pub q: Vec<Vec<f64>>,
-    /// Velocities by joint of the robot and point [rad/s].
-    pub dq: Vec<Vec<f64>>,
-}
-
-/// Simulates a candidate in each window like [`simulate`], and returns its motion on a grid of `stride` actuator periods.
-pub fn simulate_on_grid(
-    log: &JointLog,
-    windows: &[Window],
-    candidate: &Candidate,
-    actuator_hz: f64,
-    stride: usize,
-) -> Result<Vec<GridMotion>, InferenceError> {
-    let clocks: Vec<_> = windows.iter().map(|window| Clock::new(log, window, actuator_hz)).collect();
-    let robot = in_the_air(&candidate.robot, log);
-    let job = |(window, clock)| Job { log, robot: &robot, candidate, window, clock };
-    let jobs: Vec<Job> = windows.iter().zip(&clocks).map(job).collect();
-    let motions = |jobs: &[Job]| {
-        let start = |job: &Job| {
-            let Placement { q, dq, .. } = &job.window.start;
-            let [q, dq] = [q, dq].map(|cells| cells.iter().map(|cell| vec![*cell]).collect());
-            GridMotion { row: vec![0], q, dq }
-        };
-        let mut motions: Vec<GridMotion> = jobs.iter().map(start).collect();
-        let mut record = |job: usize, period: usize, readings: &TreeReadings| {
-            let rows = &jobs[job].clock.row_of_period;
-            if (period + 1).is_multiple_of(stride) {
-                let motion = &mut motions[job];
-                motion.row.push(rows[(period + 1).min(rows.len() - 1)]);
-                for (cells, value) in motion.q.iter_mut().zip(&readings.state.q) {
-                    cells.push(*value);
-                }
-                for (cells, value) in motion.dq.iter_mut().zip(&readings.state.dq) {
-                    cells.push(*value);
-                }
-            }
-        };
-        run(jobs, actuator_hz, &AtomicBool::new(false), &mut record)?;
-        Ok::<_, InferenceError>(motions)
-    };
-    let together = jobs.len().div_ceil(rayon::current_num_threads()).clamp(1, TOGETHER);
-    let groups: Vec<_> = jobs.par_chunks(together).map(motions).collect::<Result<_, _>>()?;
-    Ok(groups.into_iter().flatten().collect())
 }
 
 /// One candidate in one window.
@@ -126,13 +68,7 @@ fn in_the_air(robot: &TreeModel, log: &JointLog) -> TreeModel {
     robot
 }
 
-/// Simulates the jobs together. `observe` gets job, period and readings at the end of each actuator period.
-fn run(
-    jobs: &[Job],
-    actuator_hz: f64,
-    stop: &AtomicBool,
-    observe: &mut dyn FnMut(usize, usize, &TreeReadings),
-) -> Result<(), InferenceError> {
+fn run(jobs: &[Job], actuator_hz: f64, stop: &AtomicBool) -> Result<Vec<Trace>, InferenceError> {
     let config = SimConfig { base: BaseMount::Fixed, threads: 1, ..SimConfig::default() };
     let first = &jobs[0];
     let mut simulation = TreeSimulation::with_precision(
@@ -144,6 +80,7 @@ fn run(
         &first.window.start,
     )?;
     let mut commands: Vec<_> = jobs.iter().map(Job::hold).collect();
+    let mut traces: Vec<_> = jobs.iter().map(Job::trace).collect();
     for (robot, job) in jobs.iter().enumerate() {
         simulation.reset(robot, job.robot, &job.window.start)?;
     }
@@ -156,13 +93,11 @@ fn run(
             job.set_command(period, command);
         }
         simulation.step(&commands, 1)?;
-        for (index, (job, readings)) in jobs.iter().zip(simulation.states()).enumerate() {
-            if period < job.clock.num_periods() {
-                observe(index, period, readings);
-            }
+        for ((job, trace), readings) in jobs.iter().zip(&mut traces).zip(simulation.states()) {
+            job.record(period, &readings.state.q, &readings.tau, trace);
         }
     }
-    Ok(())
+    Ok(traces)
 }
 
 impl Job<'_> {
@@ -213,6 +148,9 @@ impl Job<'_> {
 
     /// Records the readings at the end of an actuator period.
     fn record(&self, period: usize, q: &[f64], tau: &[f64], trace: &mut Trace) {
+        if period >= self.clock.num_periods() {
+            return;
+        }
         let row = self.clock.row_of_period[period];
         let length = self.clock.sample[row + 1] - self.clock.sample[row];
         let ends = self.clock.sample[row + 1] == period + 1;

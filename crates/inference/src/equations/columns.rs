@@ -35,7 +35,12 @@ impl Balance {
 
     /// Returns the column of additional inertia of one body.
     pub fn inertia_column(&self, tree: &RobotTree, robot: &Robot, body: usize, added: RigidBody) -> Column {
-        let parameters = TreeParameters::splat(&only(tree, body, added));
+        let mut only = tree.clone();
+        only.bodies.iter_mut().for_each(|body| {
+            body.inertia = RigidBody { mass: 0.0, com: DVec3::ZERO, inertia: DMat3::ZERO };
+        });
+        only.bodies[body].inertia = added;
+        let parameters = TreeParameters::splat(&only);
         self.needed_column(|_, sample| self.needed(&parameters, robot, sample, &sample.instrument, [0.0; 3]))
     }
 
@@ -132,16 +137,6 @@ impl Balance {
         parts.retain(|(_, rows)| rows.iter().any(|row| *row != 0.0));
         Column { parts }
     }
-}
-
-/// Returns a tree of which only one body has inertia.
-pub fn only(tree: &RobotTree, body: usize, inertia: RigidBody) -> RobotTree {
-    let mut only = tree.clone();
-    only.bodies.iter_mut().for_each(|body| {
-        body.inertia = RigidBody { mass: 0.0, com: DVec3::ZERO, inertia: DMat3::ZERO };
-    });
-    only.bodies[body].inertia = inertia;
-    only
 }
 
 fn less(mut forces: Vec<f64>, others: &[f64]) -> Vec<f64> {

@@ -7,9 +7,6 @@ use twinstep_model::JointModel;
 use super::measurements::{JointRows, Measurements};
 use super::robot::Robot;
 
-/// Torque within which the teeth of a gear with backlash change sides [N·m].
-const SLACK: f64 = 0.05;
-
 /// Returns the torque that the motor-current sensor of a joint reads, by row [N·m].
 ///
 /// The PD loop uses positions and velocities of the encoder by row, and is updated once per row.
@@ -75,14 +72,6 @@ pub fn link_torque(joint: &JointModel, motor: f64, [q, dq, ddq]: [f64; 3]) -> f6
         + joint.load_friction * torque.abs();
     let spring = joint.spring.torque_offset - joint.spring.stiffness * (q - actuator.encoder_offset);
     torque - joint.viscous_friction * dq - dry * smooth_sign(dq) + spring - joint.armature * ddq
-}
-
-/// Returns by how much the link of a joint is ahead of its encoder [rad], given the torque that twists the gear [N·m].
-pub fn link_lead(joint: &JointModel, torque: f64) -> f64 {
-    let actuator = &joint.actuator;
-    let gap = 0.5 * actuator.backlash * (torque / SLACK).tanh();
-    // The encoder is ahead of the link by the twist and by its offset.
-    -torque / actuator.gear_stiffness - gap - actuator.encoder_offset
 }
 
 /// Returns the torque of the motor [N·m] that has this torque on the link, the inverse of [`link_torque`].

@@ -2,22 +2,16 @@
 
 use twinstep_effects::{Effect, Scope};
 use twinstep_logs::Log;
-use twinstep_logs::replay::at_log_rate;
 use twinstep_model::{Joint, RobotModel};
 
 use super::causes::{Cause, Found, ScopeSites, UnknownLaw};
 use super::law::{Law, laws};
 use super::measurements::{Measurements, Regime};
-use super::motion_residuals::MotionResiduals;
 use super::outcome::TWO_SIDED_95;
 use super::problem::Search;
-use super::residuals::Residuals;
 use super::robot::Robot;
-use super::site::{Site, apply, body_of};
-use super::torque_residuals::TorqueResiduals;
+use super::system::{Site, System, apply, body_of};
 
-/// Rate of drives that update their torques faster than the log shows [Hz].
-const FAST_DRIVE_HZ: f64 = 1000.0;
 /// Relative standard deviation of a value because no law is exact.
 const LAW_ERROR: f64 = 0.015;
 /// Prior probability that each joint of all, or of a type, has its own value.
@@ -74,38 +68,27 @@ pub struct Explained {
     pub decisions: Vec<String>,
 }
 
-/// Finds what `model` lacks, from the rows of `log` that are used.
+/// Finds what `robot` lacks, from the rows of `log` that are used.
 ///
 /// Returns `None` if the log has no motor currents, no velocities or unknown gains at a joint, or not all joints of the robot, and if the
 /// base moves but the log has no rows in which it is fixed, or stands on all feet with its orientation, angular velocity and acceleration. `go_on`
 /// gets a line of progress; the search ends with `None` if it returns false.
 pub fn explain(
     log: &Log,
-    model: &RobotModel,
+    robot: &RobotModel,
     is_used: impl Fn(usize) -> bool,
     go_on: &mut dyn FnMut(&str) -> bool,
 ) -> Option<Explained> {
-    let robot = Robot::from(model);
-    if let Some(measured) = Measurements::new(log, &robot, &is_used) {
-        let residuals = TorqueResiduals::new(measured, &robot);
-        let is_free = residuals.measured.regime.iter().any(|regime| *regime != Regime::Hang);
-        let hangs = residuals.measured.regime.contains(&Regime::Hang);
-        return (!is_free || hangs && residuals.balance.stands()).then(|| search(&residuals, robot, go_on)).flatten();
+    let robot = Robot::from(robot);
+    let measured = Measurements::new(log, &robot, is_used)?;
+    let system = System::new(measured, &robot);
+    let is_free = system.measured.regime.iter().any(|regime| *regime != Regime::Hang);
+    let hangs = system.measured.regime.contains(&Regime::Hang);
+    if is_free && !(hangs && system.balance.stands()) {
+        return None;
     }
-    let mut rates = vec![FAST_DRIVE_HZ];
-    rates.extend(at_log_rate(log, model).ok().map(|robot| robot.control.actuator_hz));
-    let of_rate = |hz: f64| MotionResiduals::new(log, &robot, &is_used, hz);
     let laws = laws();
-    let evidence =
-        |residuals: &MotionResiduals| Search::new(residuals, &laws, Vec::new(), robot.clone()).evidence_of_no_cause();
-    let best = rates.into_iter().filter_map(of_rate).map(|residuals| (evidence(&residuals), residuals));
-    let (_, residuals) = best.max_by(|one, other| one.0.total_cmp(&other.0))?;
-    search(&residuals, robot, go_on)
-}
-
-fn search<S: Residuals>(residuals: &S, robot: Robot, go_on: &mut dyn FnMut(&str) -> bool) -> Option<Explained> {
-    let laws = laws();
-    let found = Search::new(residuals, &laws, scopes(), robot.clone()).run(go_on)?;
+    let found = Search::new(&system, &laws, scopes(), robot.clone()).run(go_on)?;
     Some(explained(found, &laws, &robot))
 }
 

@@ -7,32 +7,25 @@ use super::block::{Block, Column};
 use super::causes::Cause;
 use super::gaussian::{Group, Posterior, posterior};
 use super::problem::Search;
-use super::residuals::Residuals;
 use super::robot::Robot;
-use super::site::apply;
+use super::system::{Predicted, apply};
 
 /// A set of causes, fitted.
-pub struct Fitted<P> {
+pub struct Fitted {
     pub causes: Vec<Cause>,
     /// True if all parameters are within their bounds.
     pub is_possible: bool,
     pub evidence: f64,
     pub posterior: Posterior,
     pub robot: Robot,
-    pub predicted: P,
+    pub predicted: Predicted,
     pub blocks: Vec<Block>,
     pub groups: Vec<Group>,
 }
 
-impl<S: Residuals> Search<'_, S> {
+impl Search<'_> {
     /// Fits the values of causes: their columns are computed again at each estimate.
-    pub fn fit(
-        &self,
-        mut causes: Vec<Cause>,
-        small: &[Group],
-        iterations: usize,
-        earlier: Option<&Fitted<S::Predicted>>,
-    ) -> Fitted<S::Predicted> {
+    pub fn fit(&self, mut causes: Vec<Cause>, small: &[Group], iterations: usize, earlier: Option<&Fitted>) -> Fitted {
         let mut iteration = 0;
         loop {
             let mut robot = self.base.clone();
@@ -86,14 +79,14 @@ impl<S: Residuals> Search<'_, S> {
         }
     }
 
-    pub fn apply(&self, robot: &mut Robot, cause: &Cause) {
+    fn apply(&self, robot: &mut Robot, cause: &Cause) {
         for (site, values) in cause.scope.sites.iter().zip(&cause.values) {
             apply(robot, &self.laws[cause.law], *site, values, cause.shape);
         }
     }
 
     /// Returns the unknowns of a cause: how its values differ from those of the robot.
-    fn group(&self, causes: &[Cause], index: usize, cause: &Cause, robot: &Robot, predicted: &S::Predicted) -> Group {
+    fn group(&self, causes: &[Cause], index: usize, cause: &Cause, robot: &Robot, predicted: &Predicted) -> Group {
         let law = &self.laws[cause.law];
         let (sites, size) = (cause.scope.sites.len(), law.units.len());
         let steps: Vec<(usize, usize)> =
@@ -120,7 +113,7 @@ impl<S: Residuals> Search<'_, S> {
             }
             law.units[unknown] * law.units[unknown] * cause.scope.covariance(site == other_site)
         });
-        Group { columns, mean, covariance, small: None }
+        Group { columns, mean, covariance, gain: None }
     }
 }
 

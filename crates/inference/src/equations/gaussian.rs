@@ -50,17 +50,6 @@ fn mixed(hash: u64, number: u64) -> u64 {
     (hash ^ number).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(29)
 }
 
-/// An unknown of an effect at a joint, of which every robot has a little.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub struct SmallEffect {
-    /// Name of the effect.
-    pub effect: &'static str,
-    /// Place of the unknown in its law.
-    pub unknown: usize,
-    /// Index of the joint.
-    pub joint: usize,
-}
-
 /// Unknowns with their columns and their prior.
 #[derive(Clone, Debug)]
 pub struct Group {
@@ -70,8 +59,8 @@ pub struct Group {
     pub mean: DVector<f64>,
     /// Prior covariance.
     pub covariance: DMatrix<f64>,
-    /// The effect of which the unknown is a little, if it is one of an effect at a joint.
-    pub small: Option<SmallEffect>,
+    /// 0 for the position gain, 1 for the velocity gain, if the unknown is the relative error of the gain of a joint.
+    pub gain: Option<usize>,
 }
 
 impl Group {
@@ -87,7 +76,7 @@ impl Group {
             columns,
             mean: DVector::zeros(size),
             covariance: DMatrix::identity(size, size) * (std * std),
-            small: None,
+            gain: None,
         }
     }
 }

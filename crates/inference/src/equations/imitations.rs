@@ -3,11 +3,11 @@
 
 use super::block::Column;
 use super::fit::Fitted;
-use super::gaussian::{Group, posterior};
+use super::gaussian::{Group, Posterior, posterior};
 use super::law::Place;
 use super::problem::{EFFECT_PROBABILITY, Search, UNKNOWN_PROBABILITY};
-use super::residuals::{Residuals, State};
-use super::site::Site;
+use super::search::LEAST_GAIN;
+use super::system::{Predicted, Site, State};
 use super::unknown;
 
 /// Error of the form of a law of the catalogue, as the size of each function that it lacks, relative to its own.
@@ -15,11 +15,11 @@ const FORM_ERROR: f64 = 0.01;
 /// Standard deviation of the relative change of a law's size with each of [`MODULATORS`]: of a law of the catalogue, and of another one.
 const FORM_CHANGE: [f64; 2] = [0.05, 0.5];
 /// Least standard deviation of a function of the state; one that changes less is constant.
-const LEAST_CHANGE: f64 = 1e-3;
+const LEAST_CHANGE: f64 = 0.05;
 
-impl<S: Residuals> Search<'_, S> {
+impl Search<'_> {
     /// Removes causes whose law is another one.
-    pub fn without_imitations(&mut self, mut best: Fitted<S::Predicted>, small: &[Group]) -> Fitted<S::Predicted> {
+    pub fn without_imitations(&mut self, mut best: Fitted, small: &[Group]) -> Fitted {
         let mut place = 0;
         while place < best.causes.len() {
             let name = self.name(&best.causes[place]);
@@ -29,7 +29,7 @@ impl<S: Residuals> Search<'_, S> {
             if let Some(gain) = replaced {
                 self.note(format!("  another law in place of {name}: {gain:.1} nat"));
             }
-            if changing > 0.0 || replaced.is_some_and(|gain| gain > 0.0) {
+            if changing > LEAST_GAIN || replaced.is_some_and(|gain| gain > 0.0) {
                 best = without;
             } else {
                 place += 1;
@@ -40,12 +40,7 @@ impl<S: Residuals> Search<'_, S> {
 
     /// Returns the fit without a cause, and by how much functions of what its joints measure are better in its place; `None` if they
     /// cannot take it.
-    fn replaced(
-        &self,
-        best: &Fitted<S::Predicted>,
-        small: &[Group],
-        place: usize,
-    ) -> (Fitted<S::Predicted>, Option<f64>) {
+    fn replaced(&self, best: &Fitted, small: &[Group], place: usize) -> (Fitted, Option<f64>) {
         let mut others = best.causes.clone();
         let cause = others.remove(place);
         let law = &self.laws[cause.law];
@@ -58,8 +53,8 @@ impl<S: Residuals> Search<'_, S> {
         if joints.is_empty() || law.place == Place::Body {
             return (without, None);
         }
-        let functions = |predicted: &S::Predicted, joint: usize| -> Vec<Column> {
-            self.system.functions(predicted, joint, law.place).into_iter().map(|(_, column)| column).collect()
+        let functions = |predicted: &Predicted, joint: usize| -> Vec<Column> {
+            unknown::columns(self.system, predicted, joint, law.place).into_iter().map(|(_, column)| column).collect()
         };
         let free = joints.iter().map(|joint| Group::independent(functions(&without.predicted, *joint), unknown::STD));
         let imitated = self.evidence_with(&without, small, best, free.collect())
@@ -80,7 +75,7 @@ impl<S: Residuals> Search<'_, S> {
     }
 
     /// Returns by how much the law of a cause is better with a size that changes with the state: nothing of the catalogue does that.
-    fn gain_of_changes(&self, best: &Fitted<S::Predicted>, small: &[Group], place: usize) -> f64 {
+    fn gain_of_changes(&self, best: &Fitted, small: &[Group], place: usize) -> f64 {
         let cause = &best.causes[place];
         let unknowns = self.laws[cause.law].units.len();
         let mut changes = vec![Column::default(); MODULATORS.len()];
@@ -96,22 +91,18 @@ impl<S: Residuals> Search<'_, S> {
             }
         }
         changes.retain(|change| !change.is_zero());
-        let [form, other] = FORM_CHANGE
-            .map(|std| self.evidence_with(best, small, best, vec![Group::independent(changes.clone(), std)]));
-        other - form + UNKNOWN_PROBABILITY.ln()
+        let count = changes.len();
+        let found = self.posterior_with(best, small, best, vec![Group::independent(changes, FORM_CHANGE[0])]);
+        let first = found.mean.len() - count;
+        let gain = |index: usize| gain_of_change(found.mean[index], found.covariance[(index, index)]);
+        (first..first + count).map(gain).fold(f64::NEG_INFINITY, f64::max) + UNKNOWN_PROBABILITY.ln()
     }
 
-    /// Returns an effect times a function of the state, which has no mean over the effect and a root mean square of one.
-    fn modulated(
-        &self,
-        predicted: &S::Predicted,
-        joint: Option<usize>,
-        effect: &Column,
-        function: Modulator,
-    ) -> Column {
+    /// Returns an effect times a function of the state, which has no mean over the effect and a root mean square of one, or less.
+    fn modulated(&self, predicted: &Predicted, joint: Option<usize>, effect: &Column, function: Modulator) -> Column {
         let size = root_mean_square(effect).max(1e-12);
         let part = |(block, rows): &(usize, Vec<f64>)| {
-            let times = &self.system.blocks()[*block].t;
+            let times = &self.system.blocks[*block].t;
             let value = |(row, entry): (usize, &f64)| {
                 let state = joint.map(|joint| self.system.state(predicted, joint, times[row]));
                 function(entry / size, times[row], state)
@@ -127,26 +118,38 @@ impl<S: Residuals> Search<'_, S> {
             sum / f64::max(total, 1e-12)
         };
         let mean = weighted(&|factor| factor);
-        let std = weighted(&|factor| (factor - mean).powi(2)).sqrt();
+        let std = weighted(&|factor| (factor - mean).powi(2)).sqrt().max(LEAST_CHANGE);
         let change = |((block, rows), (_, factors)): (&(usize, Vec<f64>), &(usize, Vec<f64>))| {
-            let of = |(row, factor): (&f64, &f64)| if std > LEAST_CHANGE { row * (factor - mean) / std } else { 0.0 };
+            let of = |(row, factor): (&f64, &f64)| row * (factor - mean) / std;
             (*block, rows.iter().zip(factors).map(of).collect())
         };
         Column { parts: effect.parts.iter().zip(&factors).map(change).collect() }
     }
 
     /// Returns the evidence of a fit with further unknowns, with the noise of `best`.
-    fn evidence_with(
-        &self,
-        fit: &Fitted<S::Predicted>,
-        small: &[Group],
-        best: &Fitted<S::Predicted>,
-        further: Vec<Group>,
-    ) -> f64 {
-        let groups: Vec<Group> = fit.groups.iter().cloned().chain(further).collect();
+    fn evidence_with(&self, fit: &Fitted, small: &[Group], best: &Fitted, further: Vec<Group>) -> f64 {
         let log_prior: f64 = fit.causes.iter().map(|cause| cause.log_prior).sum();
-        posterior(&fit.blocks, [small, &groups], Some(&best.posterior.noise), &self.cache).evidence + log_prior
+        self.posterior_with(fit, small, best, further).evidence + log_prior
     }
+
+    fn posterior_with(&self, fit: &Fitted, small: &[Group], best: &Fitted, further: Vec<Group>) -> Posterior {
+        let groups: Vec<Group> = fit.groups.iter().cloned().chain(further).collect();
+        posterior(&fit.blocks, [small, &groups], Some(&best.posterior.noise), &self.cache)
+    }
+}
+
+/// Returns by how much another law explains a change better than a law of the catalogue [nat], given mean and variance of the change with the
+/// prior of the latter.
+fn gain_of_change(mean: f64, variance: f64) -> f64 {
+    let [form, other] = FORM_CHANGE;
+    // What the log says of the change, without its prior.
+    let of_log = 1.0 / (1.0 / variance - 1.0 / (form * form)).max(1e-9);
+    let change = of_log * mean / variance;
+    let log_density = |std: f64| {
+        let variance = std * std + of_log;
+        -0.5 * change * change / variance - 0.5 * variance.ln()
+    };
+    log_density(other) - log_density(form)
 }
 
 /// Function of an effect in a row, relative to its root mean square, of time, and of the state of its joint.
@@ -174,4 +177,20 @@ fn sum(columns: &[Column], values: &[f64]) -> Column {
 fn root_mean_square(column: &Column) -> f64 {
     let rows = || column.parts.iter().flat_map(|(_, rows)| rows);
     (rows().map(|row| row * row).sum::<f64>() / rows().count().max(1) as f64).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_large_change_that_the_log_shows_is_another_law_and_one_that_it_does_not_show_is_not() {
+        let odds = |change: f64, std: f64| {
+            let variance = 1.0 / (1.0 / (std * std) + 1.0 / FORM_CHANGE[0].powi(2));
+            gain_of_change(variance * change / (std * std), variance) + UNKNOWN_PROBABILITY.ln()
+        };
+        assert!(odds(0.33, 0.01) > LEAST_GAIN);
+        assert!(odds(0.05, 0.01) < 0.0);
+        assert!(odds(0.33, 1.0) < 0.0);
+    }
 }

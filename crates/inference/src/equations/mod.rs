@@ -6,7 +6,8 @@
 //!   [`balance`]: the balance of each joint and of the base in [`samples`] of the log, with its [`columns`]; the gyroscope.
 //! - [`gaussian`]: the evidence of residuals that are linear in unknowns with normal priors; [`block`]: the noise that is left.
 //! - [`law`]: an effect with its unknowns. [`nuisance`]: what every robot has a little of.
-//! - [`search`]: the set of causes of highest evidence, by [`screening`] of all effects and a [`fit`] of the best; [`outcome`]: what it found. [`unknown`]: functions that explain what the causes leave.
+//! - [`search`]: the set of causes of highest evidence, by [`screening`] of all effects and a [`fit`] of the best; [`imitations`]: causes that only imitate
+//!   another law; [`outcome`]: what it found. [`unknown`]: functions that explain what the causes leave.
 
 mod balance;
 mod block;
@@ -16,26 +17,19 @@ mod drive;
 mod explain;
 mod fit;
 mod gaussian;
-mod hanging;
 mod imitations;
 mod law;
 mod measurements;
-mod motion_residuals;
-#[cfg(test)]
-mod motion_tests;
 mod nuisance;
 mod outcome;
 mod problem;
-mod residuals;
-mod response;
 mod robot;
 mod samples;
 mod screening;
 mod search;
-mod site;
+mod system;
 #[cfg(test)]
 mod tests;
-mod torque_residuals;
 mod unknown;
 
 pub use causes::UnknownLaw;

@@ -1,18 +1,14 @@
 //! What every robot has a little of: unknowns that are never reported, with narrow priors.
 
-use std::collections::HashMap;
-
 use glam::{DMat3, DVec3};
-use nalgebra::DVector;
 use rayon::prelude::*;
 use twinstep_model::RigidBody;
 
 use super::block::Column;
-use super::gaussian::{Group, SmallEffect};
+use super::gaussian::Group;
 use super::law::Law;
-use super::residuals::Residuals;
 use super::robot::Robot;
-use super::site::{Site, apply};
+use super::system::{Predicted, Site, System, apply};
 
 /// Standard deviation of an effect's first unknowns where it is too small to be reported: name and values in its unit.
 ///
@@ -39,88 +35,62 @@ const SMALL: [(&str, &[f64]); 15] = [
 const SMALL_MOTION: [(&str, f64); 3] = [("encoder_offset", 0.0015), ("joint_elasticity", 2.5e-4), ("backlash", 0.002)];
 /// Standard deviation of the friction at low speed [N·m], for two speeds [rad/s].
 const LOW_SPEED: [(f64, f64); 2] = [(0.04, 0.2), (0.03, 0.8)];
+/// Standard deviation of the time by which the positions of an encoder are ahead of its velocities [s]: drives filter the velocity, and
+/// simulators update positions with the new one.
+const LEAD: f64 = 4e-4;
 /// Standard deviation of the tilt of a fixed base [rad].
-pub const TILT: f64 = 0.005;
-/// Standard deviation of the torque with which a joint sticks while the robot stands [N·m].
-pub const STICK: f64 = 0.1;
+const TILT: f64 = 0.005;
+/// Standard deviation of an offset of the accelerometer, by its bias and its mounting [m/s²].
+const ACCELERATION: f64 = 0.1;
+/// Standard deviation of the position of the accelerometer in the base, along each axis [m].
+const LEVER: f64 = 0.05;
+/// Standard deviation of an offset of a torque sensor [N·m].
+const TORQUE_OFFSET: f64 = 0.02;
+/// Standard deviation of a constant torque at a joint: cables, a preload, friction at rest [N·m].
+const STICK: f64 = 0.1;
 /// Standard deviations of a link's mass, and of its inertia relative to the trace; that of its centre of mass [m].
 const BODY: [f64; 3] = [0.03, 0.04, 0.003];
 
-/// Effects of which the little that a robot has is simulated, and whether it may be negative.
-const SIMULATED: [(&str, bool); 8] = [
-    ("pd_gain", true),
-    ("torque_gain", true),
-    ("coulomb_friction", false),
-    ("viscous_friction", false),
-    ("load_friction", false),
-    ("armature", false),
-    ("torque_delay", false),
-    ("command_delay", false),
-];
 /// Norm of what a small unknown changes in an equation, relative to the noise of a row, below which the equation does not show it.
 const LEAST_SEEN: f64 = 0.1;
 
-/// Small effects that are simulated: how much of each the robot has.
-pub type Included = HashMap<SmallEffect, f64>;
-
-/// Returns the small unknowns whose columns depend on the causes that were found: those of drives and joints. A robot that has an effect
-/// already has its unknown relative to that.
-pub fn of_joints<S: Residuals>(
-    system: &S,
-    laws: &[Law],
-    robot: &Robot,
-    predicted: &S::Predicted,
-    included: &Included,
-) -> Vec<Group> {
+/// Returns the small unknowns whose columns depend on the causes that were found: those of drives and joints.
+pub fn of_joints(system: &System, laws: &[Law], robot: &Robot, predicted: &Predicted) -> Vec<Group> {
     let (mut small, mut gains) = (Vec::new(), Vec::new());
-    for (effect, stds) in SMALL {
-        let law = named(laws, effect);
+    for (name, stds) in SMALL {
+        let law = named(laws, name);
         for (unknown, std) in stds.iter().enumerate() {
-            let columns = by_joint(system, law, robot, predicted, unknown, law.shapes[0], *std);
-            let group = |(joint, (column, std)): (usize, (Column, f64))| {
-                let own = SmallEffect { effect, unknown, joint };
-                let mean = DVector::from_element(1, -included.get(&own).copied().unwrap_or(0.0));
-                Group { small: Some(own), mean, ..Group::single(column, std) }
-            };
-            let groups = columns.into_iter().enumerate().map(group);
-            if effect == "pd_gain" { gains.extend(groups) } else { small.extend(groups) }
+            if name == "pd_gain" {
+                let columns = by_joint(system, law, robot, predicted, unknown, law.shapes[0], *std);
+                let group = |(column, std)| Group { gain: Some(unknown), ..Group::single(column, std) };
+                gains.extend(columns.into_iter().map(group));
+                continue;
+            }
+            small.extend(by_joint(system, law, robot, predicted, unknown, law.shapes[0], *std));
         }
     }
-    let mut others = Vec::new();
     for (std, speed) in LOW_SPEED {
-        others.extend(by_joint(system, named(laws, "stribeck_friction"), robot, predicted, 0, speed, std));
+        small.extend(by_joint(system, named(laws, "stribeck_friction"), robot, predicted, 0, speed, std));
     }
-    others.extend((0..robot.joints.len()).flat_map(|joint| system.small_at_joint(predicted, joint)));
-    small.extend(others.into_iter().map(|(column, std)| Group::single(column, std)));
-    [gains, seen(system, small)].concat()
+    let ones = vec![1.0; system.balance.samples.len()];
+    for joint in 0..robot.joints.len() {
+        small.push((system.torque_offset(joint), TORQUE_OFFSET));
+        small.push((system.balance.joint_column(joint, &ones), STICK));
+    }
+    [gains, grouped(system, small)].concat()
 }
 
 /// Returns the small unknowns whose columns do not depend on the causes: those of bodies and their motion.
-pub fn of_bodies<S: Residuals>(system: &S, laws: &[Law], robot: &Robot, predicted: &S::Predicted) -> Vec<Group> {
-    let mut small = bodies(system, robot, predicted);
+pub fn of_bodies(system: &System, laws: &[Law], robot: &Robot, predicted: &Predicted) -> Vec<Group> {
+    let mut small = bodies(system, robot);
     for (name, std) in SMALL_MOTION {
         small.extend(by_joint(system, named(laws, name), robot, predicted, 0, 0.0, std));
     }
-    small.extend(system.small_of_motion(robot, predicted));
-    seen(system, small.into_iter().map(|(column, std)| Group::single(column, std)).collect())
-}
-
-/// Includes estimates of small effects in a robot, as far as they can be simulated: frictions and delays that are not negative.
-pub fn include(robot: &mut Robot, laws: &[Law], estimates: &Included) -> Included {
-    let mut included = Included::new();
-    for (small, estimate) in estimates {
-        let Some(has_sign) = SIMULATED.iter().find(|(name, _)| *name == small.effect).map(|(_, has_sign)| *has_sign)
-        else {
-            continue;
-        };
-        let value = if has_sign { *estimate } else { estimate.max(0.0) };
-        let law = named(laws, small.effect);
-        let mut unknowns = vec![0.0; law.units.len()];
-        unknowns[small.unknown] = value;
-        add(robot, law, small.joint, &unknowns, law.shapes[0]);
-        included.insert(*small, value);
-    }
-    included
+    small.extend((0..robot.joints.len()).map(|joint| (system.balance.lead_column(joint), LEAD)));
+    small.extend([0, 1].map(|axis| (system.balance.tilt_column(axis), TILT)));
+    small.extend([0, 1, 2].map(|axis| (system.balance.acceleration_column(axis), ACCELERATION)));
+    small.extend([0, 1, 2].map(|axis| (system.balance.lever_column(axis), LEVER)));
+    grouped(system, small)
 }
 
 /// Returns the standard deviation of an unknown of an effect that is too small to be reported.
@@ -142,25 +112,25 @@ fn named<'a>(laws: &'a [Law], name: &str) -> &'a Law {
     own.max_by_key(|law| law.units.len()).expect("a law of each effect")
 }
 
-/// Returns unknowns without the equations in which they are much smaller than the noise.
-fn seen<S: Residuals>(system: &S, small: Vec<Group>) -> Vec<Group> {
-    let seen = |mut group: Group| {
-        let std = group.covariance[(0, 0)].sqrt();
-        group.columns[0].parts.retain(|(block, rows)| {
+/// Returns unknowns of their own, without the equations in which they are much smaller than the noise.
+fn grouped(system: &System, small: Vec<(Column, f64)>) -> Vec<Group> {
+    let seen = |(mut column, std): (Column, f64)| {
+        column.parts.retain(|(block, rows)| {
             let size = rows.iter().map(|row| row * row).sum::<f64>().sqrt();
-            std * size > LEAST_SEEN * system.blocks()[*block].sigma
+            std * size > LEAST_SEEN * system.blocks[*block].sigma
         });
-        group
+        (column, std)
     };
-    small.into_iter().map(seen).filter(|group| !group.columns[0].is_zero()).collect()
+    let kept = small.into_iter().map(seen).filter(|(column, _)| !column.is_zero());
+    kept.map(|(column, std)| Group::single(column, std)).collect()
 }
 
 /// Returns the column of a small change of an unknown at each joint, per unit.
-fn by_joint<S: Residuals>(
-    system: &S,
+fn by_joint(
+    system: &System,
     law: &Law,
     robot: &Robot,
-    predicted: &S::Predicted,
+    predicted: &Predicted,
     unknown: usize,
     shape: f64,
     std: f64,
@@ -199,7 +169,7 @@ fn add(robot: &mut Robot, law: &Law, joint: usize, unknowns: &[f64], shape: f64)
 }
 
 /// Returns the ten inertial unknowns of each body.
-fn bodies<S: Residuals>(system: &S, robot: &Robot, predicted: &S::Predicted) -> Vec<(Column, f64)> {
+fn bodies(system: &System, robot: &Robot) -> Vec<(Column, f64)> {
     let unit = |index: usize| {
         let mut inertia = DMat3::ZERO;
         let (row, column) = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)][index];
@@ -210,7 +180,7 @@ fn bodies<S: Residuals>(system: &S, robot: &Robot, predicted: &S::Predicted) -> 
     let of_body = |body: usize| {
         let RigidBody { mass, com, inertia } = robot.tree.bodies[body].inertia;
         let trace = inertia.x_axis.x + inertia.y_axis.y + inertia.z_axis.z;
-        let column = |added: RigidBody| system.inertia_column(robot, predicted, body, added);
+        let column = |added: RigidBody| system.balance.inertia_column(&robot.tree, robot, body, added);
         let mut columns = vec![(column(RigidBody { mass: 1.0, com, inertia: DMat3::ZERO }), BODY[0] * mass)];
         for axis in [DVec3::X, DVec3::Y, DVec3::Z] {
             // Moving the centre of mass by d changes the first moment by m d, which a pair of opposite masses has.

@@ -7,10 +7,9 @@ use nalgebra::{DMatrix, DVector};
 use super::block::Column;
 use super::causes::{Found, FoundCause, UnknownLaw};
 use super::fit::Fitted;
-use super::gaussian::{Group, Scores, SmallEffect, gain};
+use super::gaussian::{Group, Scores, gain};
 use super::law::Place;
 use super::problem::{Rivals, Search, UNKNOWN_PROBABILITY, power};
-use super::residuals::Residuals;
 use super::{nuisance, unknown};
 
 /// Gain from which a law that the catalogue does not have is reported [nat].
@@ -19,8 +18,8 @@ const LEAST_UNKNOWN: f64 = 10.0;
 pub const TWO_SIDED_95: f64 = 1.96;
 const ONE_SIDED_95: f64 = 1.645;
 
-impl<S: Residuals> Search<'_, S> {
-    pub fn found(&mut self, best: Fitted<S::Predicted>, small: &[Group], given: &[f64]) -> Found {
+impl Search<'_> {
+    pub fn found(&mut self, best: Fitted, small: &[Group], given: &[f64]) -> Found {
         let first: usize = small.iter().map(|group| group.columns.len()).sum();
         let starts: Vec<usize> = best
             .causes
@@ -63,7 +62,7 @@ impl<S: Residuals> Search<'_, S> {
             let rivals = self.rivals.iter().rfind(known).map_or(Vec::new(), |rivals| rivals.others.clone());
             let parts = best.groups[index].columns.iter().flat_map(|column| &column.parts);
             let changed: BTreeSet<usize> = parts.map(|(block, _)| *block).collect();
-            let sum = |fit: &Fitted<S::Predicted>| -> f64 {
+            let sum = |fit: &Fitted| -> f64 {
                 let of = |block: &usize| fit.blocks[*block].y.len() as f64 * power(&fit.posterior.noise[*block]);
                 changed.iter().map(of).sum()
             };
@@ -111,13 +110,13 @@ impl<S: Residuals> Search<'_, S> {
     /// Returns the joints at which functions of what they measure explain what the causes leave.
     ///
     /// They come after the catalogue: together, they imitate any of its laws.
-    fn unknown_laws(&self, best: &Fitted<S::Predicted>, small: &[Group]) -> Vec<UnknownLaw> {
+    fn unknown_laws(&self, best: &Fitted, small: &[Group]) -> Vec<UnknownLaw> {
         let groups: Vec<&Group> = small.iter().chain(&best.groups).collect();
         let mut found = Vec::new();
         for joint in 0..self.base.joints.len() {
-            for place in self.system.places().iter().copied() {
+            for place in [Place::Drive, Place::Joint] {
                 let (variables, columns): (Vec<_>, Vec<Column>) =
-                    self.system.functions(&best.predicted, joint, place).into_iter().unzip();
+                    unknown::columns(self.system, &best.predicted, joint, place).into_iter().unzip();
                 let size = columns.len();
                 let scores = Scores::new(&best.blocks, &groups, &best.posterior, &columns.iter().collect::<Vec<_>>());
                 let with_residual = DVector::from_fn(size, |row, _| scores.with_residual[row]);
@@ -138,12 +137,12 @@ impl<S: Residuals> Search<'_, S> {
 }
 
 /// Returns true if the errors of either gain are twice as large as they are uncertain, root mean square over the joints.
-fn gains_differ<P>(best: &Fitted<P>, small: &[Group]) -> bool {
+fn gains_differ(best: &Fitted, small: &[Group]) -> bool {
     // Squares of the estimates and of their standard deviations.
     let mut squares = [[0.0; 2]; 2];
     let mut place = 0;
     for group in small {
-        if let Some(SmallEffect { effect: "pd_gain", unknown: gain, .. }) = group.small {
+        if let Some(gain) = group.gain {
             squares[gain][0] += best.posterior.mean[place].powi(2);
             squares[gain][1] += best.posterior.covariance[(place, place)];
         }

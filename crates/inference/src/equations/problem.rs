@@ -4,9 +4,8 @@ use super::block::SHAPES;
 use super::causes::{Cause, ScopeSites};
 use super::gaussian::Cache;
 use super::law::Law;
-use super::nuisance::Included;
-use super::residuals::Residuals;
 use super::robot::Robot;
+use super::system::System;
 
 /// Prior probability that an effect is a cause.
 pub const EFFECT_PROBABILITY: f64 = 1.0 / 12.0;
@@ -15,15 +14,11 @@ pub const EFFECT_PROBABILITY: f64 = 1.0 / 12.0;
 pub const UNKNOWN_PROBABILITY: f64 = 0.001;
 
 /// Search for causes.
-pub struct Search<'a, S> {
-    pub system: &'a S,
+pub struct Search<'a> {
+    pub system: &'a System,
     pub laws: &'a [Law],
     pub scopes: Vec<ScopeSites>,
-    /// The robot whose lack is looked for.
-    pub given: Robot,
-    /// The same with the small effects that are simulated.
     pub base: Robot,
-    pub included: Included,
     pub decisions: Vec<String>,
     pub cache: Cache,
     /// Causes that were removed: law and scope. They are not tried again.
@@ -40,16 +35,14 @@ pub struct Rivals {
     pub others: Vec<(Cause, f64)>,
 }
 
-impl<'a, S: Residuals> Search<'a, S> {
+impl<'a> Search<'a> {
     /// Prepares a search for what `base` lacks.
-    pub fn new(system: &'a S, laws: &'a [Law], scopes: Vec<ScopeSites>, base: Robot) -> Self {
+    pub fn new(system: &'a System, laws: &'a [Law], scopes: Vec<ScopeSites>, base: Robot) -> Self {
         Self {
             system,
             laws,
             scopes,
-            given: base.clone(),
             base,
-            included: Included::new(),
             decisions: Vec::new(),
             cache: Cache::default(),
             removed: Vec::new(),

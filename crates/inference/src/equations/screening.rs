@@ -10,8 +10,7 @@ use super::fit::Fitted;
 use super::gaussian::{Group, Scores, gain};
 use super::law::Law;
 use super::problem::{EFFECT_PROBABILITY, Search};
-use super::residuals::Residuals;
-use super::site::{Site, apply};
+use super::system::{Site, apply};
 
 /// Standard deviation of a strength around one that is tried, relative to it.
 const CELL: f64 = 0.3;
@@ -30,9 +29,9 @@ struct Candidate {
     column: Column,
 }
 
-impl<S: Residuals> Search<'_, S> {
+impl Search<'_> {
     /// Returns the best candidates for a further cause, with their gains at the noise of the current fit.
-    pub fn screen(&self, best: &Fitted<S::Predicted>, small: &[Group]) -> Vec<(f64, Cause)> {
+    pub fn screen(&self, best: &Fitted, small: &[Group]) -> Vec<(f64, Cause)> {
         let candidates = self.candidates(best);
         let columns: Vec<&Column> = candidates.iter().map(|candidate| &candidate.column).collect();
         let groups: Vec<&Group> = small.iter().chain(&best.groups).collect();
@@ -73,7 +72,7 @@ impl<S: Residuals> Search<'_, S> {
         self.laws[law].strengths.len().max(self.laws[law].shapes.len())
     }
 
-    fn candidates(&self, best: &Fitted<S::Predicted>) -> Vec<Candidate> {
+    fn candidates(&self, best: &Fitted) -> Vec<Candidate> {
         let mut all: Vec<(usize, usize, Site, usize)> = Vec::new();
         for (index, law) in self.laws.iter().enumerate() {
             let mut sites: Vec<Site> = self.scopes_of(law).flat_map(|scope| scope.sites.iter().copied()).collect();
@@ -118,7 +117,7 @@ impl<S: Residuals> Search<'_, S> {
         own: &[usize],
         candidates: &[Candidate],
         scores: &Scores,
-        best: &Fitted<S::Predicted>,
+        best: &Fitted,
     ) -> Vec<(f64, Cause)> {
         let law = &self.laws[law_index];
         let products = DMatrix::from_fn(own.len(), own.len(), |row, column| {

@@ -3,17 +3,14 @@
 use super::causes::{Cause, Found, ScopeSites};
 use super::fit::Fitted;
 use super::gaussian::Group;
-use super::nuisance::{self, Included};
+use super::nuisance;
 use super::problem::{Rivals, Search, power};
-use super::residuals::Residuals;
 use super::robot::Robot;
 use super::screening::LARGE;
-use super::site::Site;
+use super::system::{Predicted, Site};
 
 /// Gain of the evidence above which a cause is added or kept [nat].
 pub const LEAST_GAIN: f64 = 3.0;
-/// Times that small effects are estimated and simulated before the search.
-const ROUNDS: usize = 2;
 /// Other scopes of a cause that are tried.
 const OTHER_SCOPES: usize = 3;
 /// Iterations of a fit that is compared with another one of the same causes.
@@ -23,16 +20,18 @@ const MOST_CAUSES: usize = 6;
 /// Causes that were added and removed again, after which the search ends.
 const MOST_REMOVED: usize = 2;
 
-impl<S: Residuals> Search<'_, S> {
+impl Search<'_> {
     /// Searches. `go_on` gets a line of progress, and ends the search if it returns false.
     pub fn run(mut self, go_on: &mut dyn FnMut(&str) -> bool) -> Option<Found> {
         let predicted = self.system.predicted(&self.base);
         let of_bodies = nuisance::of_bodies(self.system, self.laws, &self.base, &predicted);
-        let mut small = self.small_of(&of_bodies, &self.base, &predicted);
+        let small_of = |this: &Self, robot: &Robot, predicted: &Predicted| {
+            this.cache.clear();
+            let of_joints = nuisance::of_joints(this.system, this.laws, robot, predicted);
+            [of_bodies.as_slice(), &of_joints].concat()
+        };
+        let mut small = small_of(&self, &self.base, &predicted);
         let mut best = self.fit(Vec::new(), &small, 1, None);
-        for _ in 0..ROUNDS {
-            best = self.with_small_effects(best, &mut small, &of_bodies);
-        }
         let given: Vec<f64> = best.posterior.noise.iter().map(power).collect();
         self.note(format!("no cause: {:.1} nat", best.evidence));
         while best.causes.len() < MOST_CAUSES && self.removed.len() < MOST_REMOVED {
@@ -40,7 +39,7 @@ impl<S: Residuals> Search<'_, S> {
                 return None;
             }
             let candidates = self.screen(&best, &small);
-            let mut fits: Vec<(f64, Fitted<S::Predicted>)> = Vec::new();
+            let mut fits: Vec<(f64, Fitted)> = Vec::new();
             for (screened, cause) in candidates {
                 if !go_on(&format!("{}, trying {}", self.progress(&best), self.name(&cause))) {
                     return None;
@@ -58,13 +57,11 @@ impl<S: Residuals> Search<'_, S> {
                 );
                 self.note(line);
             }
-            let mut fits: Vec<Fitted<S::Predicted>> =
-                fits.into_iter().map(|(_, fit)| fit).filter(|fit| fit.is_possible).collect();
+            let mut fits: Vec<Fitted> = fits.into_iter().map(|(_, fit)| fit).filter(|fit| fit.is_possible).collect();
             fits.sort_by(|one, other| other.evidence.total_cmp(&one.evidence));
             let mut fits = fits.into_iter();
             let Some(next) = fits.next() else { break };
-            let rival =
-                |fit: Fitted<S::Predicted>| (fit.causes[fit.causes.len() - 1].clone(), fit.evidence - next.evidence);
+            let rival = |fit: Fitted| (fit.causes[fit.causes.len() - 1].clone(), fit.evidence - next.evidence);
             let rivals: Vec<(Cause, f64)> = fits.map(rival).collect();
             if next.evidence - best.evidence < LEAST_GAIN {
                 break;
@@ -82,9 +79,8 @@ impl<S: Residuals> Search<'_, S> {
             if !go_on(&self.progress(&best)) {
                 return None;
             }
-            small = self.small_of(&of_bodies, &best.robot, &best.predicted);
+            small = small_of(&self, &best.robot, &best.predicted);
             best = self.fit(best.causes.clone(), &small, CONVERGED, Some(&best));
-            best = self.with_small_effects(best, &mut small, &of_bodies);
             best = self.with_best_scope(best, &small);
             if !best.is_possible {
                 best = self.without_last(best, &small);
@@ -98,55 +94,11 @@ impl<S: Residuals> Search<'_, S> {
         Some(self.found(best, &small, &given))
     }
 
-    /// Returns the evidence of the robot without causes [nat].
-    pub fn evidence_of_no_cause(&self) -> f64 {
-        let predicted = self.system.predicted(&self.base);
-        let of_bodies = nuisance::of_bodies(self.system, self.laws, &self.base, &predicted);
-        let small = self.small_of(&of_bodies, &self.base, &predicted);
-        self.fit(Vec::new(), &small, 1, None).evidence
-    }
-
-    fn small_of(&self, of_bodies: &[Group], robot: &Robot, predicted: &S::Predicted) -> Vec<Group> {
-        self.cache.clear();
-        let of_joints = nuisance::of_joints(self.system, self.laws, robot, predicted, &self.included);
-        [of_bodies, &of_joints].concat()
-    }
-
-    /// Simulates the small effects as they are estimated, where residuals are not linear in them, and fits the causes again.
-    fn with_small_effects(
-        &mut self,
-        best: Fitted<S::Predicted>,
-        small: &mut Vec<Group>,
-        of_bodies: &[Group],
-    ) -> Fitted<S::Predicted> {
-        if self.system.is_linear() {
-            return best;
-        }
-        let mut estimates = Included::new();
-        let mut place = 0;
-        for group in small.iter() {
-            if let Some(effect) = group.small {
-                let own = self.included.get(&effect).copied().unwrap_or(0.0);
-                estimates.insert(effect, own + best.posterior.mean[place]);
-            }
-            place += group.columns.len();
-        }
-        let mut robot = self.given.clone();
-        self.included = nuisance::include(&mut robot, self.laws, &estimates);
-        self.base = robot;
-        let mut robot = self.base.clone();
-        best.causes.iter().for_each(|cause| self.apply(&mut robot, cause));
-        *small = self.small_of(of_bodies, &robot, &self.system.predicted(&robot));
-        let fit = self.fit(best.causes.clone(), small, 2, Some(&best));
-        self.note(format!("  with small effects simulated: {:.1} nat", fit.evidence - best.evidence));
-        fit
-    }
-
     pub fn note(&mut self, line: String) {
         self.decisions.push(line);
     }
 
-    fn progress(&self, best: &Fitted<S::Predicted>) -> String {
+    fn progress(&self, best: &Fitted) -> String {
         let names: Vec<String> = best.causes.iter().map(|cause| self.name(cause)).collect();
         if names.is_empty() { "looking for causes".to_owned() } else { format!("found {}", names.join(", ")) }
     }
@@ -156,7 +108,7 @@ impl<S: Residuals> Search<'_, S> {
     }
 
     /// Tries other scopes of the last cause: those that contain the sites where it is large, the narrowest first.
-    fn with_best_scope(&mut self, mut best: Fitted<S::Predicted>, small: &[Group]) -> Fitted<S::Predicted> {
+    fn with_best_scope(&mut self, mut best: Fitted, small: &[Group]) -> Fitted {
         let last = best.causes.len() - 1;
         let cause = best.causes[last].clone();
         let law = &self.laws[cause.law];
@@ -200,7 +152,7 @@ impl<S: Residuals> Search<'_, S> {
     }
 
     /// Removes the cause that was added last, because its best parameters are not possible.
-    fn without_last(&mut self, best: Fitted<S::Predicted>, small: &[Group]) -> Fitted<S::Predicted> {
+    fn without_last(&mut self, best: Fitted, small: &[Group]) -> Fitted {
         let mut causes = best.causes.clone();
         let Some(cause) = causes.pop() else { return best };
         self.note(format!("- {}: its parameters are not possible", self.name(&cause)));
@@ -209,7 +161,7 @@ impl<S: Residuals> Search<'_, S> {
     }
 
     /// Removes causes that no longer have evidence beside the others.
-    fn without_surplus(&mut self, mut best: Fitted<S::Predicted>, small: &[Group]) -> Fitted<S::Predicted> {
+    fn without_surplus(&mut self, mut best: Fitted, small: &[Group]) -> Fitted {
         while !best.causes.is_empty() {
             let fits = (0..best.causes.len()).map(|removed| {
                 let mut causes = best.causes.clone();

@@ -8,10 +8,8 @@ use twinstep_model::{BaseMount, JOINT_NAMES, go2};
 use super::block::{Block, Column};
 use super::law::{Law, Place, laws};
 use super::measurements::Measurements;
-use super::residuals::Residuals;
 use super::robot::Robot;
-use super::site::{Site, apply};
-use super::torque_residuals::TorqueResiduals;
+use super::system::{Site, System, apply};
 
 const ROWS: usize = 1200;
 const LEGS: [&str; 4] = ["FL", "FR", "RL", "RR"];
@@ -56,13 +54,13 @@ fn log() -> Log {
     Log::new(meta, columns).expect("a log")
 }
 
-fn system() -> (TorqueResiduals, Robot) {
+fn system() -> (System, Robot) {
     let robot = Robot::from(&go2());
     let measured = Measurements::new(&log(), &robot, |_| true).expect("motor currents");
-    (TorqueResiduals::new(measured, &robot), robot)
+    (System::new(measured, &robot), robot)
 }
 
-fn residuals(system: &TorqueResiduals, robot: &Robot) -> Vec<Block> {
+fn residuals(system: &System, robot: &Robot) -> Vec<Block> {
     system.residuals(robot, &system.predicted(robot))
 }
 

@@ -1,5 +1,9 @@
 //! Laws that the catalogue does not have: functions of what a joint measures, that explain what the causes leave.
 
+use super::block::Column;
+use super::law::Place;
+use super::system::{Predicted, System};
+
 /// Standard deviation of the torque of each function [N·m], root mean square over its rows.
 pub const STD: f64 = 0.2;
 
@@ -48,16 +52,43 @@ const FUNCTIONS: [Function; 19] = [
     function("t", |now| now.time),
 ];
 
-/// Returns the functions of what was measured: position, velocity, error, torque, temperature and time of each row. Each has what it depends
-/// on, and its values, relative to their root mean square.
-pub fn functions(raw: &[[f64; 6]]) -> Vec<(&'static str, Vec<f64>)> {
-    let measured = standardised(raw);
-    let of = |function: &Function| {
+/// Returns the columns of the functions at a joint, with what each depends on: on the torque of the drive, or of the link.
+pub fn columns(system: &System, predicted: &Predicted, joint: usize, place: Place) -> Vec<(&'static str, Column)> {
+    let rows = &system.measured.joints[joint];
+    let temperature = |row: usize| rows.temperature.get(row).copied().unwrap_or(0.0);
+    let of_row = |row: usize| {
+        let error = rows.command[0][row] - rows.q[row];
+        let torque = predicted.sensed(joint)[row];
+        [rows.q[row], rows.dq[row], error, torque, temperature(row), system.measured.t[row]]
+    };
+    let samples = &system.balance.samples;
+    let of_sample = |index: usize| {
+        let sample = &samples[index];
+        let middle = usize::midpoint(sample.rows.start, sample.rows.end);
+        let [q, dq, _] = sample.instrument.of(joint);
+        let error = rows.command[0][middle] - q;
+        [q, dq, error, predicted.balanced(index)[joint], temperature(middle), system.measured.t[middle]]
+    };
+    let drive = matches!(place, Place::Drive | Place::Sensor);
+    let parts = system.drive_rows(joint);
+    let raw: Vec<[f64; 6]> = if drive {
+        parts.iter().flat_map(|(_, rows)| rows).map(|row| of_row(*row)).collect()
+    } else {
+        (0..samples.len()).map(of_sample).collect()
+    };
+    let measured = standardised(&raw);
+    let column = |function: &Function| {
         let values: Vec<f64> = measured.iter().map(function.value).collect();
         let scale = (values.iter().map(|value| value * value).sum::<f64>() / values.len() as f64).sqrt();
-        (function.variable, values.iter().map(|value| value / scale.max(1e-9)).collect())
+        let values: Vec<f64> = values.iter().map(|value| value / scale.max(1e-9)).collect();
+        if !drive {
+            return (function.variable, system.balance.joint_column(joint, &values));
+        }
+        let mut next = values.into_iter();
+        let parts = parts.iter().map(|(block, rows)| (*block, next.by_ref().take(rows.len()).collect())).collect();
+        (function.variable, Column { parts })
     };
-    FUNCTIONS.iter().map(of).filter(|(_, values): &(_, Vec<f64>)| values.iter().any(|value| *value != 0.0)).collect()
+    FUNCTIONS.iter().map(column).filter(|(_, column)| !column.is_zero()).collect()
 }
 
 /// Returns the measurements relative to their means (that of the velocity is zero) and standard deviations.

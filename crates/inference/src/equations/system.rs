@@ -1,36 +1,51 @@
-//! Equations of a log with motor currents: torques of drives, balance of forces, gyroscope.
+//! All equations of a log: blocks of residuals, and the column of any change of the robot.
 
+use glam::{DMat3, DVec3};
 use rayon::prelude::*;
-use twinstep_model::RigidBody;
+use twinstep_effects::Apply;
 
 use super::balance::{Balance, advanced};
 use super::block::{Block, Column};
-use super::drive::{link_lead, link_torque, sensed_torque};
+use super::drive::{link_torque, sensed_torque};
 use super::law::{Law, Place};
 use super::measurements::{JointRows, Measurements, Regime};
-use super::nuisance::{STICK, TILT};
-use super::residuals::{Residuals, State};
 use super::robot::Robot;
 use super::samples::Sample;
-use super::site::Site;
-use super::unknown;
 
 /// Rows at the start of a range in which a drive has the commands of before [s].
 const HISTORY_S: f64 = 0.05;
-/// Standard deviation of the time by which the positions of an encoder are ahead of its velocities [s]: drives filter the velocity, and
-/// simulators update positions with the new one.
-const LEAD: f64 = 4e-4;
-/// Standard deviation of an offset of the accelerometer, by its bias and its mounting [m/s²].
-const ACCELERATION: f64 = 0.1;
-/// Standard deviation of the position of the accelerometer in the base, along each axis [m].
-const LEVER: f64 = 0.05;
-/// Standard deviation of an offset of a torque sensor [N·m].
-const TORQUE_OFFSET: f64 = 0.02;
+/// Mass above which a payload changes the inertia of a body, too [kg], if it is no farther from the body's origin than this [m].
+const LEAST_PAYLOAD: f64 = 0.05;
+const LONGEST_ARM: f64 = 0.5;
+/// Least factor on the second moment of a body along an axis.
+const LEAST_MOMENT: f64 = 0.1;
+/// Torque within which the teeth of a gear with backlash change sides [N·m].
+const SLACK: f64 = 0.05;
 /// Time between samples of the gyroscope [s].
 const GYRO_S: f64 = 0.05;
 
+/// Where a law acts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Site {
+    /// A joint, or its link.
+    Joint(usize),
+    /// The base.
+    Base,
+}
+
+/// State of a joint.
+#[derive(Clone, Copy, Debug)]
+pub struct State {
+    /// Position [rad].
+    pub q: f64,
+    /// Velocity [rad/s].
+    pub dq: f64,
+    /// Torque of the drive [N·m].
+    pub torque: f64,
+}
+
 /// The equations of a log.
-pub struct TorqueResiduals {
+pub struct System {
     /// What was measured.
     pub measured: Measurements,
     /// Force balance.
@@ -62,7 +77,31 @@ pub struct Predicted {
     needed: Vec<Vec<f64>>,
 }
 
-impl TorqueResiduals {
+impl Predicted {
+    /// Returns the torque at the sensor of a joint, by row [N·m].
+    pub fn sensed(&self, joint: usize) -> &[f64] {
+        &self.sensed[joint]
+    }
+
+    /// Returns the torques of motors that are in balance with the motion of a sample, by joint [N·m].
+    pub fn balanced(&self, sample: usize) -> &[f64] {
+        &self.balanced[sample]
+    }
+}
+
+impl System {
+    /// Returns blocks and rows of the torques of a joint.
+    pub fn drive_rows(&self, joint: usize) -> &[(usize, Vec<usize>)] {
+        &self.drive_rows[joint]
+    }
+
+    /// Returns the state of a joint at a time of the log [s].
+    pub fn state(&self, predicted: &Predicted, joint: usize, t: f64) -> State {
+        let row = self.measured.t.partition_point(|time| *time < t).min(self.measured.t.len() - 1);
+        let [q, dq] = [0, 1].map(|quantity| self.measured.joints[joint].smooth[quantity][row]);
+        State { q, dq, torque: predicted.sensed[joint][row] }
+    }
+
     /// Collects the equations of a log.
     pub fn new(mut measured: Measurements, robot: &Robot) -> Self {
         let mut blocks = Vec::new();
@@ -98,6 +137,27 @@ impl TorqueResiduals {
         Self { measured, balance, blocks, drive_rows, gyro_rows, first_residual, reference: robot.clone() }
     }
 
+    /// Returns the torques of the drives of a robot.
+    pub fn predicted(&self, robot: &Robot) -> Predicted {
+        let joints = &self.measured.joints;
+        let sensed: Vec<Vec<f64>> = joints.par_iter().map(|rows| self.sensed(rows, robot)).collect();
+        let motor =
+            joints.par_iter().zip(&sensed).map(|(rows, sensed)| self.motor(robot, rows.joint, sensed)).collect();
+        let mut rigid = robot.clone();
+        for joint in &mut rigid.joints {
+            (joint.actuator.backlash, joint.actuator.gear_stiffness) = (0.0, f64::INFINITY);
+        }
+        let shift = |joint: usize| {
+            let is_rigid = robot.joints[joint] == rigid.joints[joint];
+            if is_rigid { Vec::new() } else { self.link_motion(joint, &sensed[joint], &rigid, robot) }
+        };
+        let shifts: Vec<_> = (0..robot.joints.len()).map(shift).collect();
+        let needed = self.balance.needed_by(robot, &shifts);
+        let motor: Vec<Vec<f64>> = motor;
+        let balanced = self.balance.balanced_motors(robot, &needed, &motor);
+        Predicted { sensed, motor, balanced, needed }
+    }
+
     /// Returns the torque at the sensor of a joint for smooth readings, by row [N·m].
     fn sensed(&self, rows: &JointRows, robot: &Robot) -> Vec<f64> {
         sensed_torque(&self.measured, rows, [&rows.smooth[0], &rows.smooth[1]], robot)
@@ -108,6 +168,68 @@ impl TorqueResiduals {
         let at_motor = advanced(&self.measured, joint, robot, sensed);
         let or_zero = |value: f64| if value.is_finite() { value } else { 0.0 };
         self.balance.samples.iter().map(|sample| or_zero(sample.mean(&at_motor))).collect()
+    }
+
+    /// Returns the blocks with the residuals of a robot.
+    pub fn residuals(&self, robot: &Robot, predicted: &Predicted) -> Vec<Block> {
+        let mut blocks = self.blocks.clone();
+        for (joint, parts) in self.drive_rows.iter().enumerate() {
+            for (block, rows) in parts {
+                let [first, change] = [&self.first_residual[joint], &predicted.sensed[joint]];
+                let residual = |row: &usize| first[*row] - change[*row];
+                blocks[*block].y = rows.iter().map(residual).collect();
+            }
+        }
+        if let Some(base) = &self.measured.base {
+            for (axis, (block, rows)) in self.gyro_rows.iter().enumerate() {
+                let length = rows_of(GYRO_S, &self.measured);
+                let mean = |row: &usize| {
+                    base.gyro[*row..row + length].iter().map(|gyro| gyro[axis]).sum::<f64>() / length as f64
+                };
+                blocks[*block].y = rows.iter().map(|row| mean(row) - robot.gyro_bias[axis]).collect();
+            }
+        }
+        let late = |joint: usize| {
+            if robot.joints[joint].actuator.sensor_delay == self.reference.joints[joint].actuator.sensor_delay {
+                return Vec::new();
+            }
+            let on_time = self.motor(&self.reference, joint, &predicted.sensed[joint]);
+            predicted.motor[joint].iter().zip(on_time).map(|(now, before)| now - before).collect()
+        };
+        let late: Vec<Vec<f64>> = (0..robot.joints.len()).map(late).collect();
+        self.balance.write_residuals(robot, &predicted.needed, &predicted.balanced, &late, &mut blocks);
+        blocks
+    }
+
+    /// Returns what a law changes at a site: the column of `after` minus `before`.
+    pub fn column(&self, law: &Law, site: Site, before: (&Robot, &Predicted), after: &Robot) -> Column {
+        let (robot, predicted) = before;
+        match (law.place, site) {
+            (Place::Drive | Place::Supply, Site::Joint(joint)) => self.drive_column(joint, predicted, after),
+            (Place::Supply, Site::Base) => {
+                let columns = (0..robot.joints.len()).map(|joint| self.drive_column(joint, predicted, after));
+                Column { parts: columns.flat_map(|column| column.parts).collect() }
+            }
+            (Place::Joint, Site::Joint(joint)) => self.joint_column(joint, robot, after, predicted),
+            (Place::Sensor, Site::Joint(joint)) => {
+                let mut column = self.drive_column(joint, predicted, after);
+                let moved = self.motor(after, joint, &predicted.sensed[joint]);
+                let change = |(index, motor): (usize, &f64)| {
+                    let sample = &self.balance.samples[index];
+                    sample.link_torque(robot, joint, *motor)
+                        - sample.link_torque(robot, joint, predicted.motor[joint][index])
+                };
+                let changes: Vec<f64> = moved.iter().enumerate().map(change).collect();
+                column.parts.extend(self.balance.joint_column(joint, &changes).parts);
+                column
+            }
+            (Place::Link, Site::Joint(joint)) => {
+                self.balance.motion_column(joint, &self.link_motion(joint, &predicted.sensed[joint], robot, after))
+            }
+            (Place::Body, _) => self.balance.body_column(robot, after),
+            (Place::Gyro, _) => self.gyro_column(robot, after),
+            (_, Site::Base) => Column::default(),
+        }
     }
 
     /// Returns the column of an offset of a joint's torque sensor, per N·m.
@@ -146,13 +268,16 @@ impl TorqueResiduals {
         let last = measured.t.len() - 1;
         let shift = |row: usize| {
             let ddq = (dq[(row + 1).min(last)] - dq[row.saturating_sub(1)]) / (2.0 * measured.dt);
-            // The torque of the row before acts until the row.
-            let motor = 0.5 * (predicted[row.saturating_sub(1)] + predicted[row]);
-            let lead = |robot: &Robot| {
-                let model = &robot.joints[joint];
-                link_lead(model, link_torque(model, motor, [q[row], dq[row], ddq]))
+            let lag = |robot: &Robot| {
+                let actuator = &robot.joints[joint].actuator;
+                // The torque of the row before acts until the row.
+                let motor = 0.5 * (predicted[row.saturating_sub(1)] + predicted[row]);
+                let torque = link_torque(&robot.joints[joint], motor, [q[row], dq[row], ddq]);
+                let gap = 0.5 * actuator.backlash * (torque / SLACK).tanh();
+                // The encoder is ahead of the link by the twist and by its offset.
+                -torque / actuator.gear_stiffness - gap - actuator.encoder_offset
             };
-            lead(after) - lead(before)
+            lag(after) - lag(before)
         };
         let shift: Vec<f64> = (0..=last).map(shift).collect();
         let or_zero = |motion: [f64; 3]| if motion.iter().all(|one| one.is_finite()) { motion } else { [0.0; 3] };
@@ -166,160 +291,6 @@ impl TorqueResiduals {
         parts.extend(self.balance.body_column(before, after).parts);
         parts.retain(|(_, rows)| rows.iter().any(|row| *row != 0.0));
         Column { parts }
-    }
-}
-
-impl Residuals for TorqueResiduals {
-    type Predicted = Predicted;
-
-    fn is_linear(&self) -> bool {
-        true
-    }
-
-    fn blocks(&self) -> &[Block] {
-        &self.blocks
-    }
-
-    fn predicted(&self, robot: &Robot) -> Predicted {
-        let joints = &self.measured.joints;
-        let sensed: Vec<Vec<f64>> = joints.par_iter().map(|rows| self.sensed(rows, robot)).collect();
-        let motor =
-            joints.par_iter().zip(&sensed).map(|(rows, sensed)| self.motor(robot, rows.joint, sensed)).collect();
-        let mut rigid = robot.clone();
-        for joint in &mut rigid.joints {
-            (joint.actuator.backlash, joint.actuator.gear_stiffness) = (0.0, f64::INFINITY);
-        }
-        let shift = |joint: usize| {
-            let is_rigid = robot.joints[joint] == rigid.joints[joint];
-            if is_rigid { Vec::new() } else { self.link_motion(joint, &sensed[joint], &rigid, robot) }
-        };
-        let shifts: Vec<_> = (0..robot.joints.len()).map(shift).collect();
-        let needed = self.balance.needed_by(robot, &shifts);
-        let motor: Vec<Vec<f64>> = motor;
-        let balanced = self.balance.balanced_motors(robot, &needed, &motor);
-        Predicted { sensed, motor, balanced, needed }
-    }
-
-    fn residuals(&self, robot: &Robot, predicted: &Predicted) -> Vec<Block> {
-        let mut blocks = self.blocks.clone();
-        for (joint, parts) in self.drive_rows.iter().enumerate() {
-            for (block, rows) in parts {
-                let [first, change] = [&self.first_residual[joint], &predicted.sensed[joint]];
-                let residual = |row: &usize| first[*row] - change[*row];
-                blocks[*block].y = rows.iter().map(residual).collect();
-            }
-        }
-        if let Some(base) = &self.measured.base {
-            for (axis, (block, rows)) in self.gyro_rows.iter().enumerate() {
-                let length = rows_of(GYRO_S, &self.measured);
-                let mean = |row: &usize| {
-                    base.gyro[*row..row + length].iter().map(|gyro| gyro[axis]).sum::<f64>() / length as f64
-                };
-                blocks[*block].y = rows.iter().map(|row| mean(row) - robot.gyro_bias[axis]).collect();
-            }
-        }
-        let late = |joint: usize| {
-            if robot.joints[joint].actuator.sensor_delay == self.reference.joints[joint].actuator.sensor_delay {
-                return Vec::new();
-            }
-            let on_time = self.motor(&self.reference, joint, &predicted.sensed[joint]);
-            predicted.motor[joint].iter().zip(on_time).map(|(now, before)| now - before).collect()
-        };
-        let late: Vec<Vec<f64>> = (0..robot.joints.len()).map(late).collect();
-        self.balance.write_residuals(robot, &predicted.needed, &predicted.balanced, &late, &mut blocks);
-        blocks
-    }
-
-    fn column(&self, law: &Law, site: Site, before: (&Robot, &Predicted), after: &Robot) -> Column {
-        let (robot, predicted) = before;
-        match (law.place, site) {
-            (Place::Drive | Place::Supply, Site::Joint(joint)) => self.drive_column(joint, predicted, after),
-            (Place::Supply, Site::Base) => {
-                let columns = (0..robot.joints.len()).map(|joint| self.drive_column(joint, predicted, after));
-                Column { parts: columns.flat_map(|column| column.parts).collect() }
-            }
-            (Place::Joint, Site::Joint(joint)) => self.joint_column(joint, robot, after, predicted),
-            (Place::Sensor, Site::Joint(joint)) => {
-                let mut column = self.drive_column(joint, predicted, after);
-                let moved = self.motor(after, joint, &predicted.sensed[joint]);
-                let change = |(index, motor): (usize, &f64)| {
-                    let sample = &self.balance.samples[index];
-                    sample.link_torque(robot, joint, *motor)
-                        - sample.link_torque(robot, joint, predicted.motor[joint][index])
-                };
-                let changes: Vec<f64> = moved.iter().enumerate().map(change).collect();
-                column.parts.extend(self.balance.joint_column(joint, &changes).parts);
-                column
-            }
-            (Place::Link, Site::Joint(joint)) => {
-                self.balance.motion_column(joint, &self.link_motion(joint, &predicted.sensed[joint], robot, after))
-            }
-            (Place::Body, _) => self.balance.body_column(robot, after),
-            (Place::Gyro, _) => self.gyro_column(robot, after),
-            (_, Site::Base) => Column::default(),
-        }
-    }
-
-    fn inertia_column(&self, robot: &Robot, _: &Predicted, body: usize, added: RigidBody) -> Column {
-        self.balance.inertia_column(&robot.tree, robot, body, added)
-    }
-
-    fn small_at_joint(&self, _: &Predicted, joint: usize) -> Vec<(Column, f64)> {
-        let ones = vec![1.0; self.balance.samples.len()];
-        vec![(self.torque_offset(joint), TORQUE_OFFSET), (self.balance.joint_column(joint, &ones), STICK)]
-    }
-
-    fn small_of_motion(&self, robot: &Robot, _: &Predicted) -> Vec<(Column, f64)> {
-        let balance = &self.balance;
-        let lead = (0..robot.joints.len()).map(|joint| (balance.lead_column(joint), LEAD));
-        let tilt = [0, 1].map(|axis| (balance.tilt_column(axis), TILT));
-        let acceleration = [0, 1, 2].map(|axis| (balance.acceleration_column(axis), ACCELERATION));
-        let lever = [0, 1, 2].map(|axis| (balance.lever_column(axis), LEVER));
-        lead.chain(tilt).chain(acceleration).chain(lever).collect()
-    }
-
-    fn state(&self, predicted: &Predicted, joint: usize, t: f64) -> State {
-        let row = self.measured.t.partition_point(|time| *time < t).min(self.measured.t.len() - 1);
-        let [q, dq] = [0, 1].map(|quantity| self.measured.joints[joint].smooth[quantity][row]);
-        State { q, dq, torque: predicted.sensed[joint][row] }
-    }
-
-    fn places(&self) -> &[Place] {
-        &[Place::Drive, Place::Joint]
-    }
-
-    fn functions(&self, predicted: &Predicted, joint: usize, place: Place) -> Vec<(&'static str, Column)> {
-        let rows = &self.measured.joints[joint];
-        let temperature = |row: usize| rows.temperature.get(row).copied().unwrap_or(0.0);
-        let of_row = |row: usize| {
-            let error = rows.command[0][row] - rows.q[row];
-            let torque = predicted.sensed[joint][row];
-            [rows.q[row], rows.dq[row], error, torque, temperature(row), self.measured.t[row]]
-        };
-        let samples = &self.balance.samples;
-        let of_sample = |index: usize| {
-            let sample = &samples[index];
-            let middle = usize::midpoint(sample.rows.start, sample.rows.end);
-            let [q, dq, _] = sample.instrument.of(joint);
-            let error = rows.command[0][middle] - q;
-            [q, dq, error, predicted.balanced[index][joint], temperature(middle), self.measured.t[middle]]
-        };
-        let parts = &self.drive_rows[joint];
-        let is_drive = matches!(place, Place::Drive | Place::Supply | Place::Sensor);
-        let raw: Vec<[f64; 6]> = if is_drive {
-            parts.iter().flat_map(|(_, rows)| rows).map(|row| of_row(*row)).collect()
-        } else {
-            (0..samples.len()).map(of_sample).collect()
-        };
-        let column = |values: Vec<f64>| {
-            if !is_drive {
-                return self.balance.joint_column(joint, &values);
-            }
-            let mut next = values.into_iter();
-            let part = |(block, rows): &(usize, Vec<usize>)| (*block, next.by_ref().take(rows.len()).collect());
-            Column { parts: parts.iter().map(part).collect() }
-        };
-        unknown::functions(&raw).into_iter().map(|(variable, values)| (variable, column(values))).collect()
     }
 }
 
@@ -381,4 +352,56 @@ fn gyro_blocks(measured: &Measurements, blocks: &mut Vec<Block>) -> Vec<(usize, 
             (blocks.len() - 1, rows.clone())
         })
         .collect()
+}
+
+/// Changes a robot by a law at a site.
+pub fn apply(robot: &mut Robot, law: &Law, site: Site, unknowns: &[f64], shape: f64) {
+    if unknowns.iter().all(|unknown| *unknown == 0.0) {
+        return;
+    }
+    let values = (law.values)(unknowns, shape);
+    match (law.effect.name, site) {
+        ("supply_sag", _) => robot.voltage_exponent = values[0],
+        ("thermal_derating", Site::Joint(joint)) => robot.thermal[joint] = [values[0], values[1]],
+        ("gyro_bias", _) => robot.gyro_bias += DVec3::new(values[0], values[1], values[2]),
+        ("payload", site) => {
+            // The unknowns are mass and first moment, in which forces are nearly linear.
+            let body = &mut robot.tree.bodies[body_of(site)].inertia;
+            let mass = unknowns[0].max(-0.9 * body.mass);
+            let moment = DVec3::new(unknowns[1], unknowns[2], unknowns[3]);
+            if mass.abs() > LEAST_PAYLOAD && (moment / mass).length() < LONGEST_ARM {
+                *body = body.with_point_mass(mass, moment / mass);
+            } else {
+                let total = body.mass + mass;
+                body.com = (body.mass * body.com + moment) / total;
+                body.mass = total;
+            }
+        }
+        ("inertia", site) => {
+            let body = &mut robot.tree.bodies[body_of(site)].inertia;
+            let trace = |matrix: &DMat3| matrix.x_axis.x + matrix.y_axis.y + matrix.z_axis.z;
+            let factor = |axis: usize| (1.0 + unknowns[axis]).max(LEAST_MOMENT).sqrt();
+            let stretch = DMat3::from_diagonal(DVec3::new(factor(0), factor(1), factor(2)));
+            let moments = DMat3::from_diagonal(DVec3::splat(0.5 * trace(&body.inertia))) - body.inertia;
+            let moments = stretch * moments * stretch;
+            body.inertia = DMat3::from_diagonal(DVec3::splat(trace(&moments))) - moments;
+        }
+        ("com_shift", site) => {
+            robot.tree.bodies[body_of(site)].inertia.com += DVec3::new(values[0], values[1], values[2]);
+        }
+        (_, Site::Joint(joint)) => {
+            if let Apply::Joint(change) = law.effect.apply {
+                let _ = change(&mut robot.joints[joint], &values);
+            }
+        }
+        (_, Site::Base) => {}
+    }
+}
+
+/// Returns the index of the body at a site.
+pub fn body_of(site: Site) -> usize {
+    match site {
+        Site::Joint(joint) => joint + 1,
+        Site::Base => 0,
+    }
 }
