@@ -119,11 +119,11 @@ impl Search<'_> {
         };
         let mean = weighted(&|factor| factor);
         let std = weighted(&|factor| (factor - mean).powi(2)).sqrt().max(LEAST_CHANGE);
-        let change = |((block, rows), (_, factors)): (&(usize, Vec<f64>), &(usize, Vec<f64>))| {
-            let of = |(row, factor): (&f64, &f64)| row * (factor - mean) / std;
-            (*block, rows.iter().zip(factors).map(of).collect())
-        };
-        Column { parts: effect.parts.iter().zip(&factors).map(change).collect() }
+        let mut modulated = effect.clone();
+        for ((_, rows), (_, factors)) in modulated.parts.iter_mut().zip(&factors) {
+            rows.iter_mut().zip(factors).for_each(|(row, factor)| *row *= (factor - mean) / std);
+        }
+        modulated
     }
 
     /// Returns the evidence of a fit with further unknowns, with the noise of `best`.
